@@ -27,9 +27,9 @@ import numpy as np
 
 from benchmarks.gate import Metric, alone
 from jaxslam import monte_carlo, sensors
-from jaxslam.charts import right_invariant
-from jaxslam.filters import ekf_slam
-from jaxslam.linearize import unscented
+from jaxslam.charts import RightInvariant
+from jaxslam.filters import EkfSlam
+from jaxslam.linearize import Unscented
 from jaxslam.math.stats import chi2_band
 from jaxslam.simulation.scenarios import circle, cloister
 
@@ -53,8 +53,10 @@ def worlds():
         scenario = dataclasses.replace(
             world, name=f"{world.name}, bearings", sensor=camera, filter_options={}, published={}
         )
-        ekf = partial(ekf_slam, scenario.motion, capacity=len(scenario.landmarks), update="joint")
-        better = {"chart": right_invariant(rays=True), "linearize": unscented()}
+        ekf = partial(
+            EkfSlam, scenario.motion, capacity=len(scenario.landmarks), correction="joint"
+        )
+        better = {"chart": RightInvariant(rays=True), "linearize": Unscented()}
         yield (
             scenario,
             {

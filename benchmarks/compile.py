@@ -1,7 +1,7 @@
 """What a first run waits for: `python -m benchmarks.compile [--only NAMES] [--quick]`.
 
 Seconds of tracing, lowering and XLA's compilation of one `run` of every filter of the catalogue, of
-`delayed_slam`, `team_slam`, an EKF with merging and pruning, the smoother and the batch solution,
+`DelayedSlam`, `TeamSlam`, an EKF with life and merging, the smoother and the batch solution,
 and of gradients through runs of an EKF; how many programs XLA compiled when the same was run again
 with every noise, gate and map value changed (asked: none); and what a second call of `run` costs
 beyond its program. Compilation does not depend on the number of steps. Idle machine, please.
@@ -20,9 +20,8 @@ import numpy as np
 from benchmarks.delayed import named
 from benchmarks.gate import Metric, alone
 from jaxslam import catalog, life, motion, programs, sensors, smoothing, team
-from jaxslam.filters import ekf_slam, team_slam
-from jaxslam.filters.map_management.merging import merging
-from jaxslam.filters.map_management.pruning import pruning
+from jaxslam.filters import EkfSlam, TeamSlam
+from jaxslam.filters.map_management.merging import Merging
 from jaxslam.protocols import Filter
 from jaxslam.run import run
 from jaxslam.sensors import Part, Suite
@@ -56,7 +55,7 @@ def crew(scale: float) -> tuple[Scenario, Filter]:
     robots = [team.Robot(moves, sees), team.Robot(moves, sees, second)]
     points = 3.0 * scale * np.stack([np.cos(np.arange(8)), np.sin(np.arange(8))], axis=1)
     controls = np.tile([0.12, 0.1, 0.12, -0.1], (STEPS, 1))
-    return team_world(robots, points, controls), team_slam(robots, 8)
+    return team_world(robots, points, controls), TeamSlam(robots, 8)
 
 
 def cases() -> dict[str, Callable[[float], tuple[Scenario, Any]]]:
@@ -76,10 +75,10 @@ def cases() -> dict[str, Callable[[float], tuple[Scenario, Any]]]:
 
     def managed(scale: float) -> tuple[Scenario, Any]:
         there = world(scale)
-        keeps = life.existence(there.visible, detected=0.9 * scale, patience=50)
+        keeps = life.Existence(there.visible, detected=0.9 * scale, patience=50)
         count = len(there.landmarks)
-        plain = ekf_slam(there.motion, there.sensor, count, update="joint")
-        return there, pruning(merging(plain, 0.5 * scale), keeps)
+        plain = EkfSlam(there.motion, there.sensor, count, correction="joint", life=keeps)
+        return there, Merging(plain, 0.5 * scale)
 
     def smoother(make: Callable[..., Any]) -> Callable[[float], tuple[Scenario, Any]]:
         def of(scale: float) -> tuple[Scenario, Any]:
@@ -93,8 +92,8 @@ def cases() -> dict[str, Callable[[float], tuple[Scenario, Any]]]:
         "delayed_slam": delayed,
         "team_slam": crew,
         "life and merging": managed,
-        "smooth": smoother(smoothing.smooth),
-        "batch_map": smoother(smoothing.batch_map),
+        "smooth": smoother(smoothing.Smoother),
+        "batch_map": smoother(smoothing.BatchMap),
     }
 
 
@@ -159,16 +158,16 @@ def gradients(key: jax.Array) -> list[Metric]:
     _, log = simulate(there, key)
     at = jnp.asarray([0.3, 0.03, 0.0, 0.0, 0.0])
     metrics = []
-    for update in ("joint", "sequential"):
+    for correction in ("joint", "sequential"):
 
-        def cost(p: jax.Array, log: Any, update: str = update) -> jax.Array:
+        def cost(p: jax.Array, log: Any, correction: str = correction) -> jax.Array:
             sensor = sensors.RangeBearing(jnp.diag(p[:2]) ** 2, mount=p[2:])
-            ekf = ekf_slam(there.motion, sensor, len(there.landmarks), update=update)
+            ekf = EkfSlam(there.motion, sensor, len(there.landmarks), correction=correction)
             trace = run(ekf, log, there.pose, there.pose_cov, key)
             return trace.info.log_likelihood.sum()
 
         taken = seconds(jax.value_and_grad(cost), at, log)
-        name = f"gradient, {update}"
+        name = f"gradient, {correction}"
         print(f"{name:24} " + " ".join(f"{x:7.2f}" for x in taken) + f" {sum(taken):8.2f}")
         metrics.append(Metric(f"{name}: first run [s]", sum(taken), high=GATE))
     return metrics
@@ -177,7 +176,7 @@ def gradients(key: jax.Array) -> list[Metric]:
 def overhead(key: jax.Array) -> list[Metric]:
     """What `run` costs beyond its program, when it is called again with the same objects."""
     there = world(1.0)
-    ekf = ekf_slam(there.motion, there.sensor, len(there.landmarks), update="joint")
+    ekf = EkfSlam(there.motion, there.sensor, len(there.landmarks), correction="joint")
     _, log = simulate(there, key)
     arguments = log, jnp.asarray(there.pose, float), jnp.asarray(there.pose_cov, float), key
 

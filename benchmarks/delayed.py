@@ -26,8 +26,8 @@ import numpy as np
 import jaxslam
 from benchmarks.gate import Metric, alone
 from jaxslam import motion, sensors
-from jaxslam.association import nearest
-from jaxslam.filters import delayed_slam, ekf_slam
+from jaxslam.association import Nearest
+from jaxslam.filters import DelayedSlam, EkfSlam
 from jaxslam.filters.delayed.settings import Hypotheses, Promotion, StoredMeasurements
 from jaxslam.math.angles import wrap
 from jaxslam.math.gaussians import mahalanobis_squared
@@ -57,9 +57,9 @@ def named(every):
     }
     once = Promotion(persistence=2, lead=0)
     return scenario, {
-        "delayed": delayed_slam(*parts, **tables),
-        "delayed, once": delayed_slam(*parts, promotion=once, **tables),
-        "inverse_depth": ekf_slam(world.motion, rays, count, update="joint"),
+        "delayed": DelayedSlam(*parts, **tables),
+        "delayed, once": DelayedSlam(*parts, promotion=once, **tables),
+        "inverse_depth": EkfSlam(world.motion, rays, count, correction="joint"),
     }
 
 
@@ -73,14 +73,14 @@ def nameless():
         controls=np.tile([0.2, 0.08], (120, 1)),
     )
     gates = chi2_quantile(0.99, 1), chi2_quantile(0.9999, 1)
-    filter = delayed_slam(
+    filter = DelayedSlam(
         scenario.motion,
         camera,
         8,
         stored=StoredMeasurements(capacity=40),
         hypotheses=Hypotheses(capacity=40, decay=0.7),
         promotion=Promotion(persistence=6),
-        associate=nearest(*gates),
+        associate=Nearest(*gates),
     )
     return scenario, filter
 

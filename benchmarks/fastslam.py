@@ -27,7 +27,7 @@ import numpy as np
 
 from benchmarks.gate import Metric, report
 from jaxslam import monte_carlo, motion, run, sensors, simulate
-from jaxslam.filters import ekf_slam, fastslam
+from jaxslam.filters import EkfSlam, FastSlam
 from jaxslam.results.plot.style import PAGE, band, caption, curve, panels_of, png
 from jaxslam.simulation.scenarios import webmap
 from jaxslam.simulation.worlds import Scenario
@@ -41,9 +41,9 @@ ROWS = ("rmse_position", "rmse_heading_deg", "nees_pose", "nees_heading", "nis_p
 def filters_of(world: Scenario, particles):
     """The EKF and FastSLAM by name, none with more slots than there are landmarks."""
     capacity = len(world.landmarks)
-    out = {"ekf": ekf_slam(world.motion, world.sensor, capacity, **world.filter_options)}
+    out = {"ekf": EkfSlam(world.motion, world.sensor, capacity, **world.filter_options)}
     for count in particles:
-        out[f"{count} particles"] = fastslam(world.motion, world.sensor, capacity, count)
+        out[f"{count} particles"] = FastSlam(world.motion, world.sensor, capacity, count)
     return out
 
 
@@ -153,7 +153,7 @@ def crowd(measured=10):
 def seconds_a_run(repeats=5, batch=None, **options):
     """Of a compiled run of 1000 particles on `crowd`, the least of some; batch: of so many runs."""
     world = crowd()
-    filter = fastslam(world.motion, world.sensor, 100, 1000, **options)
+    filter = FastSlam(world.motion, world.sensor, 100, 1000, **options)
     _, log = jax.jit(partial(simulate, world))(jax.random.key(1))
 
     def one(key):

@@ -33,10 +33,10 @@ def cases() -> dict[str, tuple[Any, Any]]:
     )
     return {
         "ekf": (cloister, catalog.variant(cloister)),
-        "fastslam": (noisy, filters.fastslam(noisy.motion, noisy.sensor, 36, 100)),
+        "fastslam": (noisy, filters.FastSlam(noisy.motion, noisy.sensor, 36, 100)),
         "seif": (
             loop,
-            filters.seif(loop.motion, loop.sensor, 20, active=8, links=6, whole=True),
+            filters.Seif(loop.motion, loop.sensor, 20, active=8, links=6, whole=True),
         ),
     }
 

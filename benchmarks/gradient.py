@@ -14,7 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.gate import Metric, report
-from jaxslam.filters.ekf.ekf_slam import ekf_slam
+from jaxslam.filters.ekf.ekf_slam import EkfSlam
 from jaxslam.motion.ackermann import Ackermann
 from jaxslam.run import run
 from jaxslam.sensors.range_bearing import RangeBearing
@@ -31,7 +31,7 @@ def models(p):
     return car, RangeBearing(jnp.diag(p[2:4]) ** 2, mount=p[4:7])
 
 
-def measure(update: str = "joint") -> list[Metric]:
+def measure(correction: str = "joint") -> list[Metric]:
     car, sensor = models(AT)
     steering = np.arctan(0.05 * WHEELBASE / (SPEED * DT))
     controls = np.tile([SPEED, steering, DT], (200, 1))
@@ -40,7 +40,7 @@ def measure(update: str = "joint") -> list[Metric]:
 
     def log_likelihood(p, log):
         car, sensor = models(p)
-        ekf = ekf_slam(car, sensor, 36, update=update, births=1)
+        ekf = EkfSlam(car, sensor, 36, correction=correction, births=1)
         key = jax.random.key(1)
         trace = run(ekf, log, world.pose, world.pose_cov, key)
         return trace.info.log_likelihood.sum()
@@ -51,7 +51,7 @@ def measure(update: str = "joint") -> list[Metric]:
     ]
     forward, both = _seconds(programs, log)
     held = programs[1].memory_analysis().temp_size_in_bytes / 1e6
-    name, gate = f"cloister, {update}, ", 6.0 if update == "joint" else float("inf")
+    name, gate = f"cloister, {correction}, ", 6.0 if correction == "joint" else float("inf")
     return [
         Metric(name + "forward run [s]", forward),
         Metric(name + "gradient / forward", both / forward, high=gate, note=f"{held:.1f} MB"),

@@ -86,7 +86,7 @@ def in_single(model):
 def tempering_field(runs, sigma=0.03):
     """Of the likelihood field; σ is that of the laser and of half a cell."""
     world = office(beams=BEAMS)
-    model = grids.likelihood_field(sigma, max_range=world.laser.max_range)
+    model = grids.LikelihoodField(sigma, max_range=world.laser.max_range)
     return tempering("office", world, office_map(), model, f"σ = {sigma} m", EXPONENTS, runs)
 
 
@@ -95,7 +95,7 @@ def tempering_rays(runs):
     world, grid = office(beams=BEAMS), office_map()
     mixture = learnt(grid, office())
     far = world.laser.max_range
-    model = in_single(grids.ray_cast(mixture, max_range=far))
+    model = in_single(grids.RayCast(mixture, max_range=far))
     told = ", ".join(f"{name} {value:.4f}" for name, value in mixture._asdict().items())
     return tempering("office, ray_cast", world, grid, model, told, RAY_EXPONENTS, runs)
 
@@ -105,7 +105,7 @@ def tempering(name, world, grid, model, settings, exponents, runs, particles=500
 
     def judged(exponent):
         """The coverage, and the row of the table."""
-        filter = grids.localize(
+        filter = grids.GridLocalization(
             grid, model, world.motion, particles, least=particles, exponent=exponent
         )
         key = jax.random.key(0)
@@ -164,8 +164,8 @@ def honest_exponent(covered, exponents):
 def anywhere(runs, particles=5000):
     """The office from anywhere: when found, how many are lost."""
     world = office(beams=BEAMS // 2)
-    model = grids.likelihood_field(0.2, max_range=world.laser.max_range)
-    filter = grids.localize(
+    model = grids.LikelihoodField(0.2, max_range=world.laser.max_range)
+    filter = grids.GridLocalization(
         office_map(), model, world.motion, particles,
         start="uniform", exponent=0.1, forget=(0.05, 0.5),
     )  # fmt: skip
@@ -210,8 +210,8 @@ def single_log(log):
 def filter_of(grid, particles, sigma=0.1, shares=None, **options):
     """The likelihood-field filter; shares: `hit` and `random` of the model."""
     moves = motion.Odometry(motion.OdometryNoise(ALPHA))
-    model = grids.likelihood_field(sigma, max_range=FAR, **(shares or {}))
-    return grids.localize(grid, model, moves, particles, **options)
+    model = grids.LikelihoodField(sigma, max_range=FAR, **(shares or {}))
+    return grids.GridLocalization(grid, model, moves, particles, **options)
 
 
 def in_map(grid, log, rows, share=0.5):

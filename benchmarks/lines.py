@@ -56,7 +56,7 @@ def drive(world, count: int, control, scans) -> Any:
     key = jax.random.key(0)
 
     def filter_of(cov):
-        return filters.ekf_slam(world.motion, sensors.Line(cov), count)
+        return filters.EkfSlam(world.motion, sensors.Line(cov), count)
 
     def step(state, row):
         control, lines = row

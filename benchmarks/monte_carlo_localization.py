@@ -24,7 +24,7 @@ import numpy as np
 
 from benchmarks.gate import Metric, alone
 from jaxslam import run, sensors, simulate
-from jaxslam.filters import localization, particle_localization
+from jaxslam.filters import Localization, ParticleLocalization
 from jaxslam.filters.particles.states import region
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.results.plot.style import HUES, INK, PAGE, TEXT, caption, curve, panels_of, png
@@ -56,7 +56,7 @@ def filters_of(world, particles):
     gate = chi2_quantile(0.999, 2)
     return {
         "particles": (
-            particle_localization(
+            ParticleLocalization(
                 world.motion,
                 blunt,
                 world.landmarks,
@@ -67,8 +67,8 @@ def filters_of(world, particles):
             ),
             *anywhere,
         ),
-        "EKF, box, no gate": (localization(*models), *anywhere),
-        "EKF, start, gate": (localization(*models, gate=gate), *known),
+        "EKF, box, no gate": (Localization(*models), *anywhere),
+        "EKF, start, gate": (Localization(*models, gate=gate), *known),
     }
 
 

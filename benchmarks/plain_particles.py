@@ -88,7 +88,7 @@ def measure(runs: int = 20, particles: int = 500) -> list[Metric]:
     ratios = []
     for count in LANDMARKS:
         scene = world(count)
-        filter = filters.fastslam(scene.motion, scene.sensor, count, particles)
+        filter = filters.FastSlam(scene.motion, scene.sensor, count, particles)
 
         def one(key, scene=scene, filter=filter, count=count):
             truth, log = simulate(scene, key)

@@ -1,7 +1,7 @@
 """Range-only SLAM on recorded data, beacons unknown: `python -m benchmarks.plaza [--figure]`.
 
 Plaza1 (Djugash, Hamner & Roth 2009, as with GTSAM): a lawn mower drives 1.9 km in half an hour and
-measures its distance from four radio beacons, one at a time. `delayed_slam` gets odometry and
+measures its distance from four radio beacons, one at a time. `DelayedSlam` gets odometry and
 ranges alone; which beacon a range is of is known, where the beacons stand is not. Scored after the
 SE(2) motion that fits the path best onto the ground truth; the same motion carries the beacons.
 
@@ -22,7 +22,7 @@ import numpy as np
 import jaxslam
 from benchmarks.gate import Metric, alone
 from jaxslam import datasets, metrics
-from jaxslam.filters import delayed_slam
+from jaxslam.filters import DelayedSlam
 from jaxslam.filters.delayed.settings import StoredMeasurements
 from jaxslam.results.plot.style import COLORS, FAINT, INK, PAGE, SHADE, caption, panels_of, png
 from jaxslam.types import Status
@@ -71,7 +71,7 @@ def beacons(motion, estimate, data):
 
 def measure(figure=False):
     data, raw = read(), read(range_bias=(0.0, 0.0))
-    slam = delayed_slam(data.motion, data.sensor, data.capacity, stored=STORED)
+    slam = DelayedSlam(data.motion, data.sensor, data.capacity, stored=STORED)
 
     @jax.jit
     def go(log):

@@ -18,7 +18,7 @@ import jaxslam
 from benchmarks.gate import Metric, alone
 from jaxslam import datasets
 from jaxslam.datasets import Dataset
-from jaxslam.filters import ekf_slam
+from jaxslam.filters import EkfSlam
 from jaxslam.metrics import align_map
 from jaxslam.types import Status
 
@@ -46,7 +46,7 @@ def measure() -> list[Metric]:
         begin = time.perf_counter()
         data = reader()
         read = time.perf_counter() - begin
-        ekf = ekf_slam(data.motion, data.sensor, data.capacity, **data.filter_options)
+        ekf = EkfSlam(data.motion, data.sensor, data.capacity, **data.filter_options)
 
         @jax.jit
         def go(log, data=data, ekf=ekf):

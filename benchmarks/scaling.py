@@ -56,7 +56,7 @@ def start(filter):
 
 
 def ekf(points):
-    filter = filters.ekf_slam(MOTION, SENSOR, len(points), update="joint")
+    filter = filters.EkfSlam(MOTION, SENSOR, len(points), correction="joint")
     return filter, known(start(filter), points)
 
 
@@ -75,7 +75,7 @@ def known(joint, points):
 def seif(points):
     """20 landmarks active, 30 links; each is linked to the 8 around it, all passive so far."""
     count = len(points)
-    filter = filters.seif(MOTION, SENSOR, count, active=min(20, count), links=30)
+    filter = filters.Seif(MOTION, SENSOR, count, active=min(20, count), links=30)
     state = start(filter)
     near = (np.arange(count)[:, None] + np.array([-4, -3, -2, -1, 1, 2, 3, 4])) % count
     links, index = np.zeros(state.links.shape), np.array(state.neighbours)
@@ -91,7 +91,7 @@ def seif(points):
 
 def fastslam(points):
     count = len(points)
-    filter = filters.fastslam(MOTION, SENSOR, count, PARTICLES)
+    filter = filters.FastSlam(MOTION, SENSOR, count, PARTICLES)
     state = start(filter)
     return filter, state._replace(
         landmarks=jnp.broadcast_to(jnp.asarray(points), state.landmarks.shape),
@@ -102,7 +102,7 @@ def fastslam(points):
 
 
 def localization(points):
-    filter = filters.localization(MOTION, SENSOR, points, update="joint")
+    filter = filters.Localization(MOTION, SENSOR, points, correction="joint")
     return filter, start(filter)
 
 

@@ -111,9 +111,9 @@ def compared(world, runs, setups) -> dict[str, dict[str, float]]:
     """The EKF, and SEIF of each setup (active, links)."""
     count = len(world.landmarks)
     models = world.motion, world.sensor, count
-    candidates = {"EKF": filters.ekf_slam(*models, update="joint")}
+    candidates = {"EKF": filters.EkfSlam(*models, correction="joint")}
     for active, links in setups:
-        candidates[f"SEIF, {active} active"] = filters.seif(*models, active=active, links=links)
+        candidates[f"SEIF, {active} active"] = filters.Seif(*models, active=active, links=links)
     print(
         f"\n{world.name}, {runs} runs of {world.steps} steps; a consistent filter has a NEES of 3"
     )
@@ -158,9 +158,9 @@ def park(path: str | None = None, active: int = 20, links: int = 150) -> list[Me
     options = {"active": active, "links": links}
     all_means = {"passive": data.capacity, "sweeps": 3}
     candidates = {
-        "EKF": filters.ekf_slam(*models, update="joint"),
-        "SEIF": filters.seif(*models, **options),
-        "SEIF, all means": filters.seif(*models, **options, **all_means),
+        "EKF": filters.EkfSlam(*models, correction="joint"),
+        "SEIF": filters.Seif(*models, **options),
+        "SEIF, all means": filters.Seif(*models, **options, **all_means),
     }
     found, metrics = {}, []
     places = data.log.scan.tag.shape[1]

@@ -4,9 +4,9 @@
 
 `circle` and `cloister`, the same draws for all three, association known and nothing gated:
 
-- `ekf`: `ekf_slam(update="joint")`, each pose by what came before it;
-- `smooth`: `smoothing.smooth`, each pose by the whole log, in the EKF's own linear system;
-- `batch`: `smoothing.batch_map`, the maximum a posteriori path and map of the models themselves.
+- `ekf`: `EkfSlam(correction="joint")`, each pose by what came before it;
+- `smooth`: `smoothing.Smoother`, each pose by the whole log, in the EKF's own linear system;
+- `batch`: `smoothing.BatchMap`, the maximum a posteriori path and map of the models themselves.
 
 RMSE of the path and of the final map, and the NEES of pose and landmarks, 3 and 2 for an honest
 one. The smoother and the EKF end at the same pose and map, so they have one map RMSE; what the
@@ -31,10 +31,10 @@ import numpy as np
 
 from benchmarks.gate import Metric, report
 from jaxslam import datasets, monte_carlo
-from jaxslam.filters import ekf_slam
+from jaxslam.filters import EkfSlam
 from jaxslam.graphs import Ending
 from jaxslam.simulation.scenarios import circle, cloister
-from jaxslam.smoothing import batch_map, smooth
+from jaxslam.smoothing import BatchMap, Smoother
 
 TOL = 1e-6
 ROWS = (
@@ -53,13 +53,13 @@ def measure(runs=100, steps=None):
     metrics = []
     for make in (circle, cloister):
         world = make() if steps is None else make(steps)
-        world = dataclasses.replace(world, filter_options={"update": "joint"})
+        world = dataclasses.replace(world, filter_options={"correction": "joint"})
         capacity = len(world.landmarks)
         arguments = world.motion, world.sensor, capacity, world.pose, world.pose_cov
         methods = {
-            "ekf": ekf_slam(world.motion, world.sensor, capacity, update="joint"),
-            "smooth": lambda truth: smooth(*arguments),
-            "batch": lambda truth: batch_map(*arguments),
+            "ekf": EkfSlam(world.motion, world.sensor, capacity, correction="joint"),
+            "smooth": lambda truth: Smoother(*arguments),
+            "batch": lambda truth: BatchMap(*arguments),
         }
         # A small block: a smoother holds the gains of all steps.
         campaign = monte_carlo(world, methods, runs, jax.random.key(0), block=10, workers=1)
@@ -100,7 +100,7 @@ def park():
     from benchmarks.victoria_park import Solution, compare, run_batch
 
     data = datasets.victoria_park(gtsam.findExampleDataFile("victoria_park.txt"))
-    method = batch_map(data.motion, data.sensor, data.capacity, data.pose, data.pose_cov)
+    method = BatchMap(data.motion, data.sensor, data.capacity, data.pose, data.pose_cov)
     go = jax.jit(method).lower(data.log, jax.random.key(0)).compile()
     began = time.perf_counter()
     trace = jax.block_until_ready(go(data.log, jax.random.key(0)))

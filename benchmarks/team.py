@@ -21,7 +21,7 @@ import jaxslam
 from benchmarks.gate import Metric, alone
 from benchmarks.real_data import DATA
 from jaxslam import datasets, se2
-from jaxslam.filters import ekf_slam, team_slam
+from jaxslam.filters import EkfSlam, TeamSlam
 from jaxslam.metrics import align_map
 from jaxslam.results.plot.style import (
     HUES,
@@ -66,8 +66,8 @@ def measure(steps=None, out=FIGURE):
     apart = log._replace(
         scan=log.scan._replace(valid=log.scan.valid & (log.scan.tag < data.capacity))
     )
-    alone = ekf_slam(data.motion, data.sensor, data.capacity, **data.filter_options)
-    team = team_slam(data.robots, data.capacity, **data.filter_options)
+    alone = EkfSlam(data.motion, data.sensor, data.capacity, **data.filter_options)
+    team = TeamSlam(data.robots, data.capacity, **data.filter_options)
     print(f"{data.name}: {len(log.control):,} rows, dropped {data.dropped}")
     print("".join(f"{name:>{20 if i == 0 else 10}}" for i, name in enumerate(HEADER.split())))
     runs, metrics = {}, []

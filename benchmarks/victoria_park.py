@@ -25,12 +25,12 @@ import jaxslam
 from benchmarks.gate import Metric, report
 from jaxslam import charts, datasets, metrics, plot
 from jaxslam.datasets import Dataset
-from jaxslam.filters import ekf_slam
+from jaxslam.filters import EkfSlam
 from jaxslam.results.plot.style import INK, PAGE, SHADE, Figure, caption, panels_of, png, titled
 from jaxslam.types import Status
 
-FILTERS = {"EKF": {}, "invariant EKF": {"chart": charts.right_invariant()}}
-"""Options of `ekf_slam` over those of the data set."""
+FILTERS = {"EKF": {}, "invariant EKF": {"chart": charts.RightInvariant()}}
+"""Options of `EkfSlam` over those of the data set."""
 
 
 class Solution(NamedTuple):
@@ -63,7 +63,7 @@ class Batch(NamedTuple):
 
 def run_filter(data: Dataset, **variant) -> Filtered:
     options = data.filter_options | variant
-    ekf = ekf_slam(data.motion, data.sensor, data.capacity, **options)
+    ekf = EkfSlam(data.motion, data.sensor, data.capacity, **options)
 
     @jax.jit
     def go(log):

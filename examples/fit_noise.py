@@ -48,7 +48,7 @@ def simulated(runs: int = 8, steps: int = 200, seed: int = 0) -> Callable[[jax.A
     _, logs = jax.jit(jax.vmap(partial(jaxslam.simulate, world)))(keys)
 
     def info(sigma: jax.Array) -> Info:
-        ekf = jaxslam.filters.ekf_slam(*models(sigma), capacity=len(POINTS), update="joint")
+        ekf = jaxslam.filters.EkfSlam(*models(sigma), capacity=len(POINTS), correction="joint")
 
         def of_run(log: Any, key: jax.Array) -> Info:
             return jaxslam.run(ekf, log, world.pose, world.pose_cov, key).info
@@ -68,7 +68,7 @@ def recorded(data: Any, steps: int) -> Callable[[jax.Array], Info]:
     def info(sigma: jax.Array) -> Info:
         motion = jaxslam.motion.Unicycle(white_noise(sigma[0] ** 2, sigma[1] ** 2))
         sensor = jaxslam.sensors.RangeBearing(jnp.diag(sigma[2:] ** 2))
-        ekf = jaxslam.filters.ekf_slam(motion, sensor, data.capacity, **data.filter_options)
+        ekf = jaxslam.filters.EkfSlam(motion, sensor, data.capacity, **data.filter_options)
         return jaxslam.run(ekf, log, data.pose, data.pose_cov, jax.random.key(0)).info
 
     return info

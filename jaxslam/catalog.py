@@ -6,82 +6,81 @@ line run them side by side.
 """
 
 from collections.abc import Callable
-from typing import Literal, Unpack
+from typing import Any, Literal, Unpack
 
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.charts.left_invariant import left_invariant
-from jaxslam.charts.right_invariant import right_invariant
-from jaxslam.filters.ekf.ekf_slam import ekf_slam
-from jaxslam.filters.ekf.observability import monitored
+from jaxslam.charts.left_invariant import LeftInvariant
+from jaxslam.charts.right_invariant import RightInvariant
+from jaxslam.filters.ekf.ekf_slam import EkfSlam
+from jaxslam.filters.ekf.observability import Monitored
 from jaxslam.filters.ekf.settings import EkfOptions
-from jaxslam.filters.information.eif_slam import eif_slam
-from jaxslam.filters.information.in_pieces import in_pieces
-from jaxslam.filters.information.seif import seif
-from jaxslam.filters.known.dead_reckoning import dead_reckoning
-from jaxslam.filters.known.localization import localization
-from jaxslam.filters.known.mapping import mapping
-from jaxslam.filters.particles.fastslam import fastslam
-from jaxslam.filters.particles.particle_localization import particle_localization
-from jaxslam.linearize.at_truth import at_truth
-from jaxslam.linearize.first_estimate import first_estimate
-from jaxslam.linearize.observability import observability
-from jaxslam.linearize.unscented import unscented
+from jaxslam.filters.information.eif_slam import EifSlam
+from jaxslam.filters.information.in_pieces import InPieces
+from jaxslam.filters.information.seif import Seif
+from jaxslam.filters.known.dead_reckoning import DeadReckoning
+from jaxslam.filters.known.localization import Localization
+from jaxslam.filters.known.mapping import Mapping
+from jaxslam.filters.particles.fastslam import FastSlam
+from jaxslam.filters.particles.particle_localization import ParticleLocalization
+from jaxslam.linearize.at_truth import AtTruth
+from jaxslam.linearize.first_estimate import FirstEstimate
+from jaxslam.linearize.observability import Observability
+from jaxslam.linearize.unscented import Unscented
 from jaxslam.protocols import Candidate, Estimator, Filter
 from jaxslam.run import run
 from jaxslam.simulation.worlds import Scenario
-from jaxslam.smoothing.batch_map import batch_map
-from jaxslam.smoothing.fixed_lag import fixed_lag
+from jaxslam.smoothing.batch_map import BatchMap
+from jaxslam.smoothing.fixed_lag import FixedLag
 from jaxslam.types import Truth
 from jaxslam.validation.names import Named
 
 
 def variant(scenario: Scenario, *, watch: bool = False, **options: Unpack[EkfOptions]) -> Filter:
-    """EKF-SLAM with the scenario's options, which these arguments of `filters.ekf_slam` replace.
+    """EKF-SLAM with the scenario's options, which these arguments of `filters.EkfSlam` replace.
 
-    watch: with an observability monitor (`filters.monitored`).
+    watch: with an observability monitor (`filters.Monitored`).
     """
-    capacity = int(np.shape(scenario.landmarks)[0])
-    filter = ekf_slam(
-        scenario.motion, scenario.sensor, capacity, **(scenario.filter_options | options)
+    filter = EkfSlam(
+        scenario.motion,
+        scenario.sensor,
+        _capacity(scenario),
+        **(scenario.filter_options | options),
     )
-    return monitored(filter) if watch else filter
+    return Monitored(filter) if watch else filter
 
 
 def ideal(scenario: Scenario, **options: Unpack[EkfOptions]) -> Callable[[Truth], Filter]:
     """The ideal EKF, with Jacobians at the truth: a function of the truth that returns a filter."""
-    return lambda truth: variant(scenario, **(options | {"linearize": at_truth(truth)}))
+    return lambda truth: variant(scenario, **(options | {"linearize": AtTruth(truth)}))
 
 
 def without_measurements(scenario: Scenario, **options: Unpack[EkfOptions]) -> Filter:
-    """Dead reckoning in a scenario; it has none of the options of `ekf_slam`."""
-    return dead_reckoning(scenario.motion, scenario.sensor)
+    """Dead reckoning in a scenario; it has none of the options of `EkfSlam`."""
+    return DeadReckoning(scenario.motion, scenario.sensor)
+
+
+def _options(scenario: Scenario, more: EkfOptions, *names: str) -> dict[str, Any]:
+    """Those of the scenario's options and of some more that have these names."""
+    given = {**scenario.filter_options, **more}
+    return {name: given[name] for name in names if name in given}
+
+
+_OF_MAPS = "gate", "associate", "births"
+"""The options of filters that start landmarks, beside those of `EkfSlam` alone."""
 
 
 def in_a_known_map(scenario: Scenario, **options: Unpack[EkfOptions]) -> Callable[[Truth], Filter]:
-    """Localization in the true map, with those options of `ekf_slam` that it has."""
-    asked = scenario.filter_options | options
-    return lambda truth: localization(
-        scenario.motion,
-        scenario.sensor,
-        truth.landmarks,
-        update=asked.get("update", "sequential"),
-        gate=asked.get("gate"),
-        iterations=asked.get("iterations", 1),
-    )
+    """Localization in the true map, with those options of `EkfSlam` that it has."""
+    mine = _options(scenario, options, "correction", "gate", "iterations")
+    return lambda truth: Localization(scenario.motion, scenario.sensor, truth.landmarks, **mine)
 
 
 def on_given_poses(scenario: Scenario, **options: Unpack[EkfOptions]) -> Filter:
-    """Mapping, whose controls are the poses, with those options of `ekf_slam` that it has."""
-    asked = scenario.filter_options | options
-    return mapping(
-        scenario.sensor,
-        int(np.shape(scenario.landmarks)[0]),
-        gate=asked.get("gate"),
-        associate=asked.get("associate"),
-        births=asked.get("births"),
-    )
+    """Mapping, whose controls are the poses, with those options of `EkfSlam` that it has."""
+    mine = _options(scenario, options, *_OF_MAPS)
+    return Mapping(scenario.sensor, _capacity(scenario), **mine)
 
 
 def on_the_true_path(
@@ -101,18 +100,14 @@ def on_the_true_path(
 def by_particles(
     scenario: Scenario, proposal: Literal["motion", "measurement"], **options: Unpack[EkfOptions]
 ) -> Filter:
-    """FastSLAM of 50 particles, with those options of `ekf_slam` that it has."""
-    asked = scenario.filter_options | options
-    capacity = int(np.shape(scenario.landmarks)[0])
-    return fastslam(
+    """FastSLAM of 50 particles, with those options of `EkfSlam` that it has."""
+    return FastSlam(
         scenario.motion,
         scenario.sensor,
-        capacity,
+        _capacity(scenario),
         SLAM_PARTICLES,
         proposal=proposal,
-        gate=asked.get("gate"),
-        associate=asked.get("associate"),
-        births=asked.get("births"),
+        **_options(scenario, options, *_OF_MAPS),
     )
 
 
@@ -120,54 +115,42 @@ def by_particles_in_a_known_map(
     scenario: Scenario, **options: Unpack[EkfOptions]
 ) -> Callable[[Truth], Filter]:
     """Monte-Carlo localization in the true map, of 300 particles; options as above."""
-    asked = scenario.filter_options | options
-    count = LOCALIZATION_PARTICLES
-    return lambda truth: particle_localization(
+    count, mine = LOCALIZATION_PARTICLES, _options(scenario, options, "gate", "associate")
+    return lambda truth: ParticleLocalization(
         scenario.motion,
         scenario.sensor,
         truth.landmarks,
         count,
         least=count,
         threshold=0.5,
-        gate=asked.get("gate"),
-        associate=asked.get("associate"),
+        **mine,
     )
 
 
 def in_a_window(
     scenario: Scenario, *, first_estimates: bool = False, **options: Unpack[EkfOptions]
 ) -> Filter:
-    """The fixed-lag smoother of 5 steps, with those options of `ekf_slam` that it has."""
-    asked = scenario.filter_options | options
-    capacity = int(np.shape(scenario.landmarks)[0])
+    """The fixed-lag smoother of 5 steps, with those options of `EkfSlam` that it has."""
+    capacity = _capacity(scenario)
     false = 0 if scenario.spurious is None else scenario.spurious.places
-    return fixed_lag(
+    return FixedLag(
         scenario.motion,
         scenario.sensor,
         capacity,
         (scenario.places or capacity) + false,
         window=WINDOW,
         first_estimates=first_estimates,
-        gate=asked.get("gate"),
-        associate=asked.get("associate"),
-        births=asked.get("births"),
+        **_options(scenario, options, *_OF_MAPS),
     )
 
 
 def in_one_batch(scenario: Scenario, **options: Unpack[EkfOptions]) -> Callable[[Truth], Estimator]:
-    """The graph of the whole log (`smoothing.batch_map`), with those options of `ekf_slam` that it
+    """The graph of the whole log (`smoothing.BatchMap`), with those options of `EkfSlam` that it
     has: a function of the truth, which it does not use, that returns the estimator."""
-    asked = scenario.filter_options | options
-    capacity = int(np.shape(scenario.landmarks)[0])
     start = np.asarray(scenario.pose), np.asarray(scenario.pose_cov)
-    return lambda truth: batch_map(
-        scenario.motion,
-        scenario.sensor,
-        capacity,
-        *start,
-        gate=asked.get("gate"),
-        associate=asked.get("associate"),
-        births=asked.get("births"),
+    mine = _options(scenario, options, *_OF_MAPS)
+    return lambda truth: BatchMap(
+        scenario.motion, scenario.sensor, _capacity(scenario), *start, **mine
     )
 
 
@@ -181,41 +164,42 @@ LOCALIZATION_PARTICLES = 300
 """of Monte-Carlo localization in the catalog, at every step"""
 
 
-def in_canonical_form(
-    scenario: Scenario,
-    make: Callable[..., Filter],
-    sparse: bool = True,
-    **options: Unpack[EkfOptions],
-) -> Filter:
-    """An information filter in a scenario; of the options of `ekf_slam` it takes the gate.
+def in_canonical_form(scenario: Scenario, **options: Unpack[EkfOptions]) -> Filter:
+    """The exact information filter in a scenario; of the options of `EkfSlam` it takes the gate."""
+    mine = _options(scenario, options, "gate")
+    return EifSlam(scenario.motion, scenario.sensor, _capacity(scenario), **mine)
 
-    A sparse one has half the map active, 8 landmarks at least and 20 at most, and all links. It
-    reports covariances from its whole Ω, not from Markov-blanket marginals, so that a campaign
-    evaluates the sparsification alone. With all of the map active it would be `eif_slam` by
-    definition. All landmarks that a scan measures must be active at once; so a scan of more
-    measurement slots than half of what is active (in `cloister` all 36 columns are measured in
-    every step) is divided (`in_pieces`).
+
+def sparse_in_canonical_form(scenario: Scenario, **options: Unpack[EkfOptions]) -> Filter:
+    """The sparse information filter in a scenario; of the options of `EkfSlam` it takes the gate.
+
+    It has half the map active, 8 landmarks at least and 20 at most, and all links. It reports
+    covariances from its whole Ω, not from Markov-blanket marginals, so that a campaign evaluates
+    the sparsification alone. With all of the map active it would be `EifSlam` by definition. All
+    landmarks that a scan measures must be active at once; so a scan of more measurement slots than
+    half of what is active (in `cloister` all 36 columns are measured in every step) is divided
+    (`InPieces`).
     """
-    count = int(np.shape(scenario.landmarks)[0])
-    asked = scenario.filter_options | options
-    gate = asked.get("gate")
-    if not sparse:
-        return make(scenario.motion, scenario.sensor, count, gate=gate)
+    count = _capacity(scenario)
     active = min(max(min(LARGEST_AREA, count // 2), LEAST_AREA), count)
-    filter = make(
+    filter = Seif(
         scenario.motion,
         scenario.sensor,
         count,
-        gate=gate,
         active=active,
         links=max(1, count - 1),
         whole=True,
+        **_options(scenario, options, "gate"),
     )
-    return filter if active == count else in_pieces(filter, active // 2)
+    return filter if active == count else InPieces(filter, active // 2)
+
+
+def _capacity(scenario: Scenario) -> int:
+    return int(np.shape(scenario.landmarks)[0])
 
 
 LEAST_AREA, LARGEST_AREA = 8, 20
-"""active landmarks of the sparse information filters in the catalog"""
+"""active landmarks of the sparse information filter in the catalog"""
 
 
 FILTERS: Named[Callable[..., Candidate]] = Named(
@@ -223,18 +207,18 @@ FILTERS: Named[Callable[..., Candidate]] = Named(
         "ekf": variant,
         "ideal": ideal,
         "iterated": lambda world, **more: variant(world, iterations=3, **more),
-        "fej": lambda world, **more: variant(world, linearize=first_estimate(), **more),
-        "oc": lambda world, **more: variant(world, linearize=observability(), **more),
-        "right_invariant": lambda world, **more: variant(world, chart=right_invariant(), **more),
-        "left_invariant": lambda world, **more: variant(world, chart=left_invariant(), **more),
-        "ukf": lambda world, **more: variant(world, linearize=unscented(), **more),
+        "fej": lambda world, **more: variant(world, linearize=FirstEstimate(), **more),
+        "oc": lambda world, **more: variant(world, linearize=Observability(), **more),
+        "right_invariant": lambda world, **more: variant(world, chart=RightInvariant(), **more),
+        "left_invariant": lambda world, **more: variant(world, chart=LeftInvariant(), **more),
+        "ukf": lambda world, **more: variant(world, linearize=Unscented(), **more),
         "ukf_right": lambda world, **more: variant(
-            world, chart=right_invariant(), linearize=unscented(), **more
+            world, chart=RightInvariant(), linearize=Unscented(), **more
         ),
         "square_root": lambda world, **more: variant(world, covariance="square_root", **more),
     }
 )
-"""By name; each takes a scenario, further options of `ekf_slam`, and `watch` of `variant`, and
+"""By name; each takes a scenario, further options of `EkfSlam`, and `watch` of `variant`, and
 returns what `monte_carlo` runs on it."""
 
 BASELINES: Named[Callable[..., Candidate]] = Named(
@@ -257,10 +241,7 @@ PARTICLES: Named[Callable[..., Candidate]] = Named(
 """The particle filters; as FILTERS."""
 
 CANONICAL: Named[Callable[..., Candidate]] = Named(
-    {
-        "eif_slam": lambda world, **more: in_canonical_form(world, eif_slam, sparse=False, **more),
-        "seif": lambda world, **more: in_canonical_form(world, seif, **more),
-    }
+    {"eif_slam": in_canonical_form, "seif": sparse_in_canonical_form}
 )
 """The information filters, exact and sparse; as FILTERS."""
 

@@ -9,7 +9,7 @@ parameters; s (K,) landmark parameters that z does not determine (K = 0 if none)
 
 import inspect
 import re
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
@@ -19,7 +19,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int, PyTree
 
 from jaxslam.core.numbers import check_mount, held_array
-from jaxslam.core.record import set_field
+from jaxslam.core.record import record, set_field
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
 from jaxslam.math.arrays import (
@@ -51,41 +51,13 @@ def unfit_signature(function: Callable[..., object], count: int) -> str | None:
     return None
 
 
-def _check_fields(
-    record: PyTree,
-    functions: Iterable[str] | Mapping[str, str],
-    names: tuple[str, ...] = (),
-    optional: tuple[str, ...] = (),
-) -> None:
-    """Raise ValueError unless functions are functions, of the parameters that a mapping gives, and
-    names tuples of str.
-
-    Those of models are not of fixed parameters here: the verifier reports them.
-    """
-    what = f"{type(record).__name__} {record.name!r}"
-    if not isinstance(record.name, str):
-        raise ValueError(f"{what}: expected a name, got {type(record.name).__name__}")
-    for field in names:
-        value = getattr(record, field)
-        if not isinstance(value, tuple) or not all(isinstance(name, str) for name in value):
-            raise ValueError(
-                f'{what}: expected {field} to be a tuple of names as ("x [m]",), got {value!r}'
-            )
-    for field in (*functions, *optional):
-        value = getattr(record, field)
-        if not callable(value) and not (value is None and field in optional):
-            got, wanted = type(value).__name__, "a function"
-            if hasattr(value, "shape"):
-                got, wanted = f"an array of shape {value.shape}", "a function that returns one"
-            raise ValueError(f"{what}: expected {field} to be {wanted}, got {got}")
-    for field, taken in functions.items() if isinstance(functions, Mapping) else ():
-        unfit = unfit_signature(getattr(record, field), taken.count(",") + 1)
-        if unfit is not None:
-            raise ValueError(f"{what}: expected {field} to take ({taken}), got {unfit}")
+def _lower(cls: type) -> str:
+    """The name of a class in lower case, words divided by underscores."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower()
 
 
-class Model:
-    """What motion models and sensors share: a name, and noise."""
+class Component:
+    """What models, rules and filters share: a name, and a check of what a subclass defines."""
 
     name: str
     """lower case, for tables, files and messages; by default that of the class"""
@@ -93,32 +65,50 @@ class Model:
 
     def __init_subclass__(cls) -> None:
         super().__init_subclass__()
-        if "name" not in cls.__dict__:
-            cls.name = re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower()
+        if "name" not in cls.__dict__ and not isinstance(getattr(cls, "name", None), property):
+            cls.name = _lower(cls)
 
     def __init__(self, *_: object, **__: object) -> None:  # a record has its own
         raise ValueError(f"{type(self).__name__}: expected @record above the class, of core.record")
 
-    def _check(
-        self, base: type, functions: tuple[str, ...], names: tuple[str, ...], noises: str
-    ) -> None:
-        """Check what a subclass of `base` declares, and make its noise_cov what can be called."""
+    def _check(self, base: type, methods: Mapping[str, str]) -> None:
+        """Check that a subclass of `base` is a record and defines methods of these parameters.
+
+        methods: the parameters of each by its name, "" where `verify` reports other ones.
+        """
         what = type(self).__name__
         if "__dataclass_fields__" not in type(self).__dict__:
-            Model.__init__(self)
-        for name in functions:
+            Component.__init__(self)
+        for name, taken in methods.items():
             if getattr(type(self), name) is getattr(base, name):
                 raise ValueError(f"{what}: expected a method {name}")
-        for name in names:
+            got = unfit_signature(getattr(self, name), taken.count(",") + 1) if taken else None
+            if got is not None:
+                raise ValueError(f"{what}: expected {name} to take ({taken}), got {got}")
+
+    def _check_names(self, *fields: str) -> None:
+        """Check that these are tuples of names."""
+        for name in fields:
             value = getattr(self, name, None)
             if not isinstance(value, tuple) or not all(isinstance(one, str) for one in value):
                 raise ValueError(
-                    f'{what}: expected {name} to be a tuple of names as ("x [m]",), got {value!r}'
+                    f'{type(self).__name__}: expected {name} to be a tuple of names as ("x [m]",), '
+                    f"got {value!r}"
                 )
+
+
+class Model(Component):
+    """What motion models and sensors share: noise."""
+
+    def _check_model(self, base: type, methods: tuple[str, ...], names: tuple[str, ...]) -> None:
+        """Check a subclass of `base`, and make its noise_cov what can be called; the last of the
+        names is of what has noise."""
+        self._check(base, dict.fromkeys(methods, ""))
+        self._check_names(*names)
         if not hasattr(self, "noise_cov"):
-            raise ValueError(f"{what}: expected a field or a method noise_cov")
+            raise ValueError(f"{type(self).__name__}: expected a field or a method noise_cov")
         if "noise_cov" in self.__dict__:
-            hold_noise(self, len(getattr(self, noises)))
+            hold_noise(self, len(getattr(self, names[-1])))
 
 
 class Motion(Model):
@@ -142,7 +132,7 @@ class Motion(Model):
     """(pose, u, w) -> by pose (3, 3), by u (3, U), by w (3, W); hand-derived, to verify against."""
 
     def __post_init__(self) -> None:
-        self._check(Motion, ("step",), ("controls", "noises"), "noises")
+        self._check_model(Motion, ("step",), ("controls", "noises"))
 
     def step(self, pose: Pose, u: Control, w: ProcessNoise) -> Pose:
         """The pose after a control, θ wrapped."""
@@ -204,7 +194,7 @@ class Sensor(Model):
     """the points that landmarks may turn into; None where they never do"""
 
     def __post_init__(self) -> None:
-        self._check(Sensor, ("observe", "invert"), ("measurements", "landmark"), "measurements")
+        self._check_model(Sensor, ("observe", "invert"), ("landmark", "measurements"))
         free = self.__dict__.get("free", type(self).free)
         if not isinstance(free, Free | property):
             what = f"{type(self).__name__}: expected free to be a Free(mean, cov)"
@@ -276,29 +266,32 @@ class Basis(NamedTuple):
     """(L, L) ∂l/∂dl; None says identity, without products."""
 
 
-@dataclass(frozen=True, eq=False)
-class Chart:
+class Chart(Component):
     """Error coordinates of the covariance, on a pair of the pose and one landmark.
 
-    The pose's retraction must not depend on a landmark, nor one landmark's on another.
+    A subclass is a record (`core.record`) that defines `retract` and `local`. The pose's retraction
+    must not depend on a landmark, nor one landmark's on another.
     """
 
-    name: str
-    retract: Callable[[Array, Array, Array, Array], tuple[Array, Array]]
-    """(pose, l, dx (3,), dl (L,)) -> (pose, l)."""
-    local: Callable[[Array, Array, Array, Array], tuple[Array, Array]]
-    """(pose0, l0, pose, l) -> (dx, dl) with retract(pose0, l0, dx, dl) = (pose, l)."""
-    basis: Callable[[Array, Array], Basis] | None = None
+    basis: Any = None
     """(pose, l) -> the derivative of retract at zero; None says identity, without products."""
     landmark_size: int | None = None
     """numbers L of the landmarks it acts on; None where any."""
 
     def __post_init__(self) -> None:
-        _check_fields(
-            self,
-            {"retract": "pose, l, dx, dl", "local": "pose0, l0, pose, l"},
-            optional=("basis",),
-        )
+        self._check(Chart, {"retract": "pose, l, dx, dl", "local": "pose0, l0, pose, l"})
+
+    def retract(
+        self, pose: Pose, landmark: Landmark, dx: Pose, dl: Landmark
+    ) -> tuple[Pose, Landmark]:
+        """Pose and landmark moved by errors dx (3,) and dl (L,)."""
+        raise NotImplementedError
+
+    def local(
+        self, pose0: Pose, landmark0: Landmark, pose: Pose, landmark: Landmark
+    ) -> tuple[Pose, Landmark]:
+        """The errors (dx, dl) with retract(pose0, l0, dx, dl) = (pose, l)."""
+        raise NotImplementedError
 
 
 class Here(NamedTuple):
@@ -317,29 +310,15 @@ class Here(NamedTuple):
     """(L,) its estimate, for `observe`"""
 
 
-@dataclass(frozen=True, eq=False)
-class Linearizer:
+class Linearizer(Component):
     """An affine approximation, with added noise, of the models near a Gaussian.
 
+    A subclass is a record (`core.record`) that defines `motion`, `observe` and `invert`.
     First-order linearizers evaluate Jacobians at a point; statistical ones fit over the covariance.
-    Each may keep a memory inside the filter's state. Derivatives are by the
+    Each may keep a memory inside the filter's state, `joint.lin`. Derivatives are by the
     *coordinates* of pose and landmark, whatever the chart.
     """
 
-    name: str
-    init: Callable[[Array, Array], PyTree]
-    """(pose, landmarks (N, L) zeros) -> memory, a pytree of arrays of fixed shape."""
-    motion: Callable[[Motion, Array, Here], tuple[Array, Array, Array, PyTree]]
-    """(motion, u, here) -> the new pose, its derivative by the old one (3, 3), the covariance that
-    the noise adds to it (3, 3), memory."""
-    observe: Callable[[Sensor, Here], tuple[Array, Array, Array, Array]]
-    """(sensor, here) -> the predicted z, its derivatives by pose (Z, 3) and by l (Z, L), and a
-    covariance (Z, Z) to add to that of the measurement noise."""
-    invert: Callable[[Sensor, Array, Array, Here], tuple[Array, Array, Array]]
-    """(sensor, z, tag (), here) -> the new l, its derivative by the pose (L, 3), its covariance for
-    a known pose (L, L)."""
-    born: Callable[[Joint, Array], PyTree]
-    """(joint, born (N,) bool) -> memory, after new landmarks entered the map."""
     euclidean: bool = False
     """whether it is meant for the Euclidean chart and landmarks that are points (x, y) alone."""
     iterates: bool = True
@@ -348,16 +327,34 @@ class Linearizer:
     """whether it linearizes at landmarks other than the estimates; not for known maps then."""
 
     def __post_init__(self) -> None:
-        _check_fields(
-            self,
-            {
-                "init": "pose, landmarks",
-                "motion": "motion, u, here",
-                "observe": "sensor, here",
-                "invert": "sensor, z, tag, here",
-                "born": "joint, born",
-            },
+        self._check(
+            Linearizer,
+            {"motion": "motion, u, here", "observe": "sensor, here", "invert": "s, z, tag, here"},
         )
+
+    def init(self, pose: Pose, landmarks: Float[Array, "N L"]) -> PyTree:
+        """The first memory, of a start with landmarks (N, L) zeros: arrays of fixed shape."""
+        return ()
+
+    def motion(self, motion: Motion, u: Control, here: Here) -> tuple[Array, Array, Array, PyTree]:
+        """The new pose, its derivative by the old one (3, 3), the covariance that the noise adds to
+        it (3, 3), and the memory."""
+        raise NotImplementedError
+
+    def observe(self, sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
+        """The predicted z, its derivatives by pose (Z, 3) and by l (Z, L), and a covariance (Z, Z)
+        to add to that of the measurement noise."""
+        raise NotImplementedError
+
+    def invert(
+        self, sensor: Sensor, z: Measurement, tag: Int[Array, ""], here: Here
+    ) -> tuple[Array, Array, Array]:
+        """The new l, its derivative by the pose (L, 3), its covariance for a known pose (L, L)."""
+        raise NotImplementedError
+
+    def born(self, joint: Joint, born: Bool[Array, "N"]) -> PyTree:
+        """The memory after the landmarks of the slots `born` entered the map."""
+        return joint.lin
 
 
 class Pairs(NamedTuple):
@@ -403,7 +400,8 @@ class Association(NamedTuple):
 
 
 Associate = Callable[[Prediction, Scan], Association]
-"""Association methods. They are not differentiated: what they return are integers."""
+"""Association methods, records with `__call__` or functions. They are not differentiated: what they
+return are integers."""
 
 
 Resample = Callable[[Array, Array], Array]
@@ -415,59 +413,151 @@ Differentiable = Callable[[Array, Array], tuple[Array, Array]]
 the weights before. Do not normalize it again: the gradient of its sum may be part of the method."""
 
 
-@dataclass(frozen=True, eq=False)
-class Life:
-    """A rule that decides after each scan which landmarks stay in the map; see `pruning`."""
+class Life(Component):
+    """A rule that decides after each scan which landmarks stay in the map, an argument of filters.
 
-    name: str
-    init: Callable[[Array, Array], PyTree]
-    """(pose, landmarks (N, L) zeros) -> memory, a pytree of arrays of fixed shape."""
-    after: Callable[[Joint, Info, Callable[[], Estimate]], tuple[PyTree, Array]]
-    """(joint, info, estimate) -> memory, slots to remove (N,) bool; called after a scan, with its
-    info. `joint.life` is the memory so far, estimate() the moments in map coordinates."""
-    make_room: Callable[[Joint, Array, Array], Array] | None = None
+    A subclass is a record (`core.record`) that defines `init` and `after`.
+    """
+
+    make_room: Any = None
     """(joint, needed () int, measured (N,) bool) -> slots (N,) bool to remove before new landmarks
     enter a map that lacks so many slots, none of those this scan measured; None if nothing is
     removed from a full map."""
 
+    def __post_init__(self) -> None:
+        self._check(Life, {"init": "pose, landmarks", "after": "joint, info, estimate"})
 
-@dataclass(frozen=True, eq=False)
-class Filter:
-    """A recursive estimator, as `run` and `monte_carlo` take it."""
+    def init(self, pose: Pose, landmarks: Float[Array, "N L"]) -> PyTree:
+        """The first memory, of a start with landmarks (N, L) zeros: arrays of fixed shape."""
+        raise NotImplementedError
 
-    name: str
-    controls: tuple[str, ...]
-    """What u holds, with units, as `Motion.controls`."""
-    measurements: tuple[str, ...]
-    """What z holds, with units, as `Sensor.measurements`."""
-    init: Callable[[Array, Array], PyTree]
-    """(pose, pose_cov (3, 3)) -> S."""
-    predict: Callable[[PyTree, Array, Array], PyTree]
-    """(S, u, key) -> S."""
-    update: Callable[[PyTree, Scan, Array], tuple[PyTree, Info]]
-    """(S, scan, key) -> S, info."""
-    estimate: Callable[[PyTree], Estimate]
-    """(S) -> moments in map coordinates."""
+    def after(
+        self, joint: Joint, info: Info, estimate: Callable[[], Estimate]
+    ) -> tuple[PyTree, Bool[Array, "N"]]:
+        """The memory after a scan, and the slots to remove.
+
+        joint.life is the memory so far, estimate() the moments in map coordinates.
+        """
+        raise NotImplementedError
+
+
+class Filter(Component):
+    """A recursive estimator, as `run` and `monte_carlo` take it.
+
+    A subclass is a record (`core.record`) that defines `init`, `predict`, `update` and `estimate`,
+    whose state is a pytree of arrays of fixed shapes, and has a field motion and a field sensor, or
+    declares controls and measurements.
+
+    Raises ValueError, at construction, on a missing method, or one of other arguments.
+    """
+
     chart: Chart
-    places: tuple[int, ...] = ()
-    """number of measurement slots of each sensor, in order; () where all are of one sensor."""
+    """the error coordinates of its covariance"""
     square_root: bool = False
     """whether its state is a `slots.Joint` with a root of the covariance."""
     landmark: tuple[str, ...] = ()
     """what a landmark of its `slots.Joint` holds, with units, as `Sensor.landmark`; () where its
     state is none."""
+    linearized: Any = None
+    """the `LinearizedSteps` of a filter whose steps return the linear system they use."""
 
     def __post_init__(self) -> None:
-        _check_fields(
-            self,
+        self._check(
+            Filter,
             {
                 "init": "pose, pose_cov",
-                "predict": "S, u, key",
-                "update": "S, scan, key",
-                "estimate": "S",
+                "predict": "state, u, key",
+                "update": "state, scan, key",
+                "estimate": "state",
             },
-            ("controls", "measurements"),
         )
+        self._check_names("controls", "measurements")
+
+    @property
+    def controls(self) -> tuple[str, ...]:
+        """What u holds, with units."""
+        motion: Motion = self.motion  # type: ignore[attr-defined]
+        return motion.controls
+
+    @property
+    def measurements(self) -> tuple[str, ...]:
+        """What z holds, with units."""
+        sensor: Sensor = self.sensor  # type: ignore[attr-defined]
+        return sensor.measurements
+
+    @property
+    def places(self) -> tuple[int, ...]:
+        """The measurement slots of each sensor of a suite, in order; () of a single sensor."""
+        return getattr(getattr(self, "sensor", None), "places", ())
+
+    def init(self, pose: Pose, pose_cov: Float[Array, "3 3"]) -> PyTree:
+        """The state at the start."""
+        raise NotImplementedError
+
+    def predict(self, state: PyTree, u: Control, key: Array) -> PyTree:
+        """The state after a control."""
+        raise NotImplementedError
+
+    def update(self, state: PyTree, scan: Scan, key: Array) -> tuple[PyTree, Info]:
+        """The state after a scan, and what became of its measurements."""
+        raise NotImplementedError
+
+    def estimate(self, state: PyTree) -> Estimate:
+        """The moments of a state in map coordinates."""
+        raise NotImplementedError
+
+
+@record
+class Wrapper(Filter):
+    """A filter that holds another, and does as that one does unless it defines a method itself."""
+
+    filter: Filter
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.filter, Filter):
+            got = type(self.filter).__name__
+            raise ValueError(f"{type(self).__name__}: expected a filter, got {got}")
+        super().__post_init__()
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        return f"{_lower(type(self))} {self.filter.name}"
+
+    @property
+    def controls(self) -> tuple[str, ...]:
+        return self.filter.controls
+
+    @property
+    def measurements(self) -> tuple[str, ...]:
+        return self.filter.measurements
+
+    @property
+    def places(self) -> tuple[int, ...]:
+        return self.filter.places
+
+    @property
+    def chart(self) -> Chart:  # type: ignore[override]
+        return self.filter.chart
+
+    @property
+    def square_root(self) -> bool:  # type: ignore[override]
+        return self.filter.square_root
+
+    @property
+    def landmark(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self.filter.landmark
+
+    def init(self, pose: Pose, pose_cov: Float[Array, "3 3"]) -> PyTree:
+        return self.filter.init(pose, pose_cov)
+
+    def predict(self, state: PyTree, u: Control, key: Array) -> PyTree:
+        return self.filter.predict(state, u, key)
+
+    def update(self, state: PyTree, scan: Scan, key: Array) -> tuple[PyTree, Info]:
+        return self.filter.update(state, scan, key)
+
+    def estimate(self, state: PyTree) -> Estimate:
+        return self.filter.estimate(state)
 
 
 Estimator = Callable[[Log, Array], Trace]

@@ -1,6 +1,6 @@
 """The robots of a team, and the layout of their controls, scans and states.
 
-`filters.team_slam` is their filter, and `simulation.team_world` simulates their worlds.
+`filters.TeamSlam` is their filter, and `simulation.team_world` simulates their worlds.
 """
 
 from collections.abc import Sequence
@@ -76,7 +76,7 @@ def sizes(robots: Sequence[Robot]) -> tuple[list[int], list[int], int]:
 def poses(
     joint: Joint, robots: int
 ) -> tuple[Float[Array, "R 3"], Float[Array, "R 3 3"], Bool[Array, "R"]]:
-    """The pose of each robot in a state of `filters.team_slam`, its covariance, and whether it is
+    """The pose of each robot in a state of `filters.TeamSlam`, its covariance, and whether it is
     in the map.
 
     As a probe, of a whole run: `run(filter, …, probe=partial(poses, robots=3))`. A robot that is

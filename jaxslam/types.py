@@ -47,9 +47,9 @@ class Status(IntEnum):
     UNMATCHED = 8
     """Association found it neither of a landmark nor new (between two gates, ambiguous, or of
     unknown identity where a tag is required), a robot it concerns has no pose in the map yet, or it
-    is a beam that entered no weight (`grids.localize`); dropped."""
+    is a beam that entered no weight (`grids.GridLocalization`); dropped."""
     SIGHTED = 9
-    """Of no landmark yet; kept as a stored measurement (`filters.delayed_slam`)."""
+    """Of no landmark yet; kept as a stored measurement (`filters.DelayedSlam`)."""
 
 
 class Scan(NamedTuple):

@@ -14,8 +14,8 @@ import jaxslam
 PACKAGE = Path(jaxslam.__file__).parent
 
 FLOORS = [
-    "math programs _field_docs",
-    "core types protocols slots validation noise logs",
+    "math _field_docs",
+    "core programs types protocols slots validation noise logs",
     "motion sensors charts linearize association resampling life team",
     "run filters smoothing graphs grids matching simulation features topology",
     "consistency monte_carlo verify catalog calibration metrics laser_slam",

@@ -9,10 +9,21 @@ import pytest
 from own_models import changed, motion_of, sensor_of
 
 import jaxslam
-from jaxslam import association, charts, filters, life, linearize, motion, sensors, smoothing, team
+from jaxslam import (
+    association,
+    charts,
+    filters,
+    life,
+    linearize,
+    motion,
+    protocols,
+    sensors,
+    smoothing,
+    team,
+)
+from jaxslam.core.record import record
 from jaxslam.filters import reporting
-from jaxslam.filters.map_management import merging
-from jaxslam.filters.map_management.closing import closing
+from jaxslam.filters.map_management.closing import Closing
 from jaxslam.filters.map_management.loop_closure import LoopSettings
 from jaxslam.protocols import Free
 from jaxslam.types import Log, Scan
@@ -23,18 +34,18 @@ SEES = sensors.RangeBearing(np.diag([1e-2, 1e-4]))
 BEARING = sensors.BearingOnly(np.diag([1e-4]))
 POINTS = np.array([[1.0, 2.0]])
 
-FACTORIES = {
-    "ekf_slam": lambda m, s, **o: filters.ekf_slam(m, s, 3, **o),
-    "compressed_ekf_slam": lambda m, s, **o: filters.compressed_ekf_slam(m, s, 3, area=2, **o),
-    "localization": lambda m, s, **o: filters.localization(m, s, POINTS, **o),
-    "particle_localization": lambda m, s, **o: filters.particle_localization(m, s, POINTS, 4, **o),
-    "fastslam": lambda m, s, **o: filters.fastslam(m, s, 3, 4, **o),
-    "eif_slam": lambda m, s, **o: filters.eif_slam(m, s, 3, **o),
-    "seif": lambda m, s, **o: filters.seif(m, s, 3, active=2, links=2, **o),
-    "delayed_slam": lambda m, s, **o: filters.delayed_slam(m, s, 3, **o),
-    "dead_reckoning": lambda m, s, **o: filters.dead_reckoning(m, s, **o),
-    "smooth": lambda m, s, **o: smoothing.smooth(m, s, 3, np.zeros(3), np.eye(3), **o),
-    "batch_map": lambda m, s, **o: smoothing.batch_map(m, s, 3, np.zeros(3), np.eye(3), **o),
+KINDS = {
+    "EkfSlam": lambda m, s, **o: filters.EkfSlam(m, s, 3, **o),
+    "Localization": lambda m, s, **o: filters.Localization(m, s, POINTS, **o),
+    "ParticleLocalization": lambda m, s, **o: filters.ParticleLocalization(m, s, POINTS, 4, **o),
+    "FastSlam": lambda m, s, **o: filters.FastSlam(m, s, 3, 4, **o),
+    "EifSlam": lambda m, s, **o: filters.EifSlam(m, s, 3, **o),
+    "Seif": lambda m, s, **o: filters.Seif(m, s, 3, active=2, links=2, **o),
+    "DelayedSlam": lambda m, s, **o: filters.DelayedSlam(m, s, 3, **o),
+    "DeadReckoning": lambda m, s, **o: filters.DeadReckoning(m, s, **o),
+    "Smoother": lambda m, s, **o: smoothing.Smoother(m, s, 3, np.zeros(3), np.eye(3), **o),
+    "BatchMap": lambda m, s, **o: smoothing.BatchMap(m, s, 3, np.zeros(3), np.eye(3), **o),
+    "FixedLag": lambda m, s, **o: smoothing.FixedLag(m, s, 3, 3, **o),
 }
 
 
@@ -44,63 +55,59 @@ def one_line(caught):
     return message
 
 
-@pytest.mark.parametrize("name", FACTORIES)
-def test_swapped_models_are_told_by_the_factory_that_got_them(name):
-    sensor = BEARING if name == "delayed_slam" else SEES
+@pytest.mark.parametrize("name", KINDS)
+def test_swapped_models_are_told_by_the_class_that_got_them(name):
+    sensor = BEARING if name == "DelayedSlam" else SEES
     with pytest.raises(
         ValueError, match=f"^{name}: expected a Motion, then a Sensor.*swapped"
     ) as e:
-        FACTORIES[name](sensor, MOVE)
+        KINDS[name](sensor, MOVE)
     one_line(e)
 
 
-@pytest.mark.parametrize("name", FACTORIES)
+@pytest.mark.parametrize("name", KINDS)
 def test_a_model_that_was_not_called_or_is_none_is_told(name):
     with pytest.raises(
         ValueError, match=rf"^{name}: expected motion to be a Motion.*call it, Velo"
     ):
-        FACTORIES[name](motion.Velocity, SEES)
+        KINDS[name](motion.Velocity, SEES)
     with pytest.raises(ValueError, match=rf"^{name}: expected sensor to be a Sensor, got int"):
-        FACTORIES[name](MOVE, 3)
+        KINDS[name](MOVE, 3)
 
 
 def test_mapping_and_teams_look_at_their_models_too():
-    with pytest.raises(ValueError, match=r"^mapping: expected sensor to be a Sensor.*call it"):
-        filters.mapping(sensors.RangeBearing, 3)
+    with pytest.raises(ValueError, match=r"^Mapping: expected sensor to be a Sensor.*call it"):
+        filters.Mapping(sensors.RangeBearing, 3)
     wrong = changed(SEES, observe=lambda pose, at: pose)
     robot = team.Robot(MOVE, sensors.Suite(((wrong, 2),)))
-    with pytest.raises(ValueError, match=r"^team_slam: expected range_bearing.observe"):
-        filters.team_slam([robot], 3)
+    with pytest.raises(ValueError, match=r"^TeamSlam: expected range_bearing.observe"):
+        filters.TeamSlam([robot], 3)
 
 
-@pytest.mark.parametrize("name", ["ekf_slam", "localization", "dead_reckoning"])
+@pytest.mark.parametrize("name", ["EkfSlam", "Localization", "DeadReckoning"])
 def test_a_chart_or_linearizer_that_was_not_called_is_told(name):
-    make = FACTORIES[name]
+    make = KINDS[name]
     with pytest.raises(
-        ValueError, match=rf"^{name}: expected chart to be a Chart.*right_invariant\("
+        ValueError, match=rf"^{name}: expected chart to be a Chart.*RightInvariant\("
     ):
-        make(MOVE, SEES, chart=charts.right_invariant)
-    with pytest.raises(
-        ValueError, match=rf"^{name}: expected linearize.*call it, first_estimate\("
-    ):
-        make(MOVE, SEES, linearize=linearize.first_estimate)
+        make(MOVE, SEES, chart=charts.RightInvariant)
+    with pytest.raises(ValueError, match=rf"^{name}: expected linearize.*call it, FirstEstimate\("):
+        make(MOVE, SEES, linearize=linearize.FirstEstimate)
     with pytest.raises(ValueError, match=rf"^{name}: expected chart to be a Chart, got str"):
         make(MOVE, SEES, chart="euclidean")
 
 
-@pytest.mark.parametrize("name", sorted(set(FACTORIES) - {"dead_reckoning", "eif_slam", "seif"}))
+@pytest.mark.parametrize("name", sorted(set(KINDS) - {"DeadReckoning", "EifSlam", "Seif"}))
 def test_an_association_that_was_not_called_or_is_none_is_told(name):
-    if name == "compressed_ekf_slam":
-        return  # it takes none
-    sensor = BEARING if name == "delayed_slam" else SEES
+    sensor = BEARING if name == "DelayedSlam" else SEES
     for wrong, told in (
-        (association.known, r"got the factory known: call it"),
-        (association.nearest, r"got the factory nearest: call it"),
+        (association.Known, r"got the class Known: call it"),
+        (association.Nearest, r"got the class Nearest: call it"),
         (lambda prediction: None, "too many positional arguments"),
         ("known", "got str"),
     ):
         with pytest.raises(ValueError, match=f"^{name}: expected associate to be.*{told}") as e:
-            FACTORIES[name](MOVE, sensor, associate=wrong)
+            KINDS[name](MOVE, sensor, associate=wrong)
         one_line(e)
 
 
@@ -182,28 +189,34 @@ def test_names_are_tuples_of_strings():
         own_sensor(free=None)
 
 
-def test_charts_linearizers_and_filters_hold_functions():
-    with pytest.raises(ValueError, match=r"^Chart 'euclidean': expected retract to be a function"):
-        dataclasses.replace(charts.euclidean(), retract=None)
-    with pytest.raises(
-        ValueError, match=r"^Linearizer 'at_estimate': expected born to be a functi"
-    ):
-        dataclasses.replace(linearize.at_estimate(), born=0)
-    with pytest.raises(ValueError, match=r"^Filter 'ekf_slam': expected predict to be a function"):
-        dataclasses.replace(FACTORIES["ekf_slam"](MOVE, SEES), predict="predict")
+def test_charts_linearizers_and_filters_define_their_methods():
+    @record
+    class Chart(protocols.Chart):
+        def retract(self, pose, dx):
+            return pose
 
+    @record
+    class Filter(protocols.Filter):
+        controls = ("x [m]",)
+        measurements = ("x [m]",)
 
-def test_the_functions_of_a_filter_take_its_arguments():
-    ekf = FACTORIES["ekf_slam"](MOVE, SEES)
-    with pytest.raises(
-        ValueError,
-        match=r"^Filter 'ekf_slam': expected predict to take \(S, u, key\), got \(s, u\)$",
+        def init(self, pose, pose_cov):
+            return pose
+
+        def predict(self, s, u):
+            return s
+
+    @record
+    class Linearizer(protocols.Linearizer):
+        pass
+
+    for made, told in (
+        (Chart, r"^Chart: expected retract to take \(pose, l, dx, dl\), got \(pose, dx\)$"),
+        (Filter, r"^Filter: expected predict to take \(state, u, key\), got \(s, u\)$"),
+        (Linearizer, "^Linearizer: expected a method motion$"),
     ):
-        dataclasses.replace(ekf, predict=lambda s, u: s)
-    with pytest.raises(
-        ValueError, match=r"^Chart 'euclidean': expected retract to take \(pose, l, dx, d"
-    ):
-        dataclasses.replace(charts.euclidean(), retract=lambda pose, dx: pose)
+        with pytest.raises(ValueError, match=told):
+            made()
 
 
 def test_what_a_filter_of_ones_own_returns_is_told():
@@ -260,22 +273,22 @@ def test_what_a_filter_of_ones_own_returns_is_told():
 
 
 def test_localization_is_named_by_its_own_name():
-    for wrong in ({"gate": 0.0}, {"iterations": 0}, {"update": "at once"}):
-        with pytest.raises(ValueError, match=r"^localization: "):
-            filters.localization(MOVE, SEES, POINTS, **wrong)
+    for wrong in ({"gate": 0.0}, {"iterations": 0}, {"correction": "at once"}):
+        with pytest.raises(ValueError, match=r"^Localization: "):
+            filters.Localization(MOVE, SEES, POINTS, **wrong)
 
 
 def test_a_compressed_filter_refuses_to_merge():
-    with pytest.raises(ValueError, match=r"^compressed_ekf_slam: make_room is not supported"):
-        FACTORIES["compressed_ekf_slam"](MOVE, SEES, make_room=life.recency())
-    with pytest.raises(ValueError, match=r"^merging: landmarks of compressed_ekf_slam"):
-        merging.merging(FACTORIES["compressed_ekf_slam"](MOVE, SEES), 1.0)
+    with pytest.raises(ValueError, match=r"^CompressedEkfSlam: a life is not supported"):
+        filters.CompressedEkfSlam(filters.EkfSlam(MOVE, SEES, 3, life=life.Recency()), area=2)
+    with pytest.raises(ValueError, match=r"^Merging: landmarks of compressed_ekf_slam"):
+        filters.Merging(filters.CompressedEkfSlam(filters.EkfSlam(MOVE, SEES, 3), area=2), 1.0)
 
 
 def test_closing_checks_its_options_when_it_is_made():
-    ekf = filters.ekf_slam(MOVE, SEES, 3)
-    with pytest.raises(ValueError, match=r"^closing: expected settings to be a LoopSettings"):
-        closing(ekf, settings={"least": 3})
+    ekf = filters.EkfSlam(MOVE, SEES, 3)
+    with pytest.raises(ValueError, match=r"^Closing: expected settings to be a LoopSettings"):
+        Closing(ekf, settings={"least": 3})
     with pytest.raises(ValueError, match=r"^LoopSettings: .*least"):
         LoopSettings(least=2)
     with pytest.raises(ValueError, match=r"^LoopSettings: .*drift"):
@@ -289,13 +302,13 @@ def test_calibration_is_reached_from_the_package():
 
 KEY = jax.random.key(0)
 WORLD = jaxslam.scenarios.circle(steps=3)
-EKF = filters.ekf_slam(WORLD.motion, WORLD.sensor, 2)
+EKF = filters.EkfSlam(WORLD.motion, WORLD.sensor, 2)
 LOG = Log(np.zeros((3, 3)), Scan(np.zeros((3, 1, 2)), np.zeros((3, 1), int), np.ones((3, 1), bool)))
-SMOOTH = smoothing.smooth(WORLD.motion, WORLD.sensor, 2, np.zeros(3), np.eye(3))
+SMOOTH = smoothing.Smoother(WORLD.motion, WORLD.sensor, 2, np.zeros(3), np.eye(3))
 
 
 def blind(scenario):
-    return filters.dead_reckoning(scenario.motion, scenario.sensor)
+    return filters.DeadReckoning(scenario.motion, scenario.sensor)
 
 
 def run_from(pose, pose_cov=WORLD.pose_cov):
@@ -347,7 +360,7 @@ def run_from(pose, pose_cov=WORLD.pose_cov):
         ),
         (
             lambda: SMOOTH(LOG._replace(control=np.zeros((3, 2))), KEY),
-            r"^smooth: log.control: expected shape \(T, 3\), got \(3, 2\)",
+            r"^smoother: log.control: expected shape \(T, 3\), got \(3, 2\)",
         ),
     ],
 )

@@ -13,11 +13,10 @@ import numpy as np
 import jaxslam
 from jaxslam import association, charts, motion, sensors
 from jaxslam.consistency.associations import identities
-from jaxslam.filters import ekf_slam
-from jaxslam.filters.map_management.closing import closing
+from jaxslam.filters import EkfSlam
+from jaxslam.filters.map_management.closing import Closing
 from jaxslam.filters.map_management.loop_closure import LoopSettings
-from jaxslam.filters.map_management.pruning import pruning
-from jaxslam.life import recency
+from jaxslam.life import Recency
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.results.plot.style import COLORS, INK, PAGE, SHADE, caption, panels_of, titled
 from jaxslam.simulation.scenarios import between_ranges
@@ -73,20 +72,20 @@ def world(seed=0):
 def methods(scenario):
     """By name, all in the right-invariant chart, whose covariance is honest about the heading."""
     make = partial(
-        ekf_slam,
+        EkfSlam,
         scenario.motion,
         scenario.sensor,
         CAPACITY,
-        chart=charts.right_invariant(),
-        update="joint",
+        chart=charts.RightInvariant(),
+        correction="joint",
     )
-    near = association.certain(association.nearest(GATE), 0.6)
+    near = association.Certain(association.Nearest(GATE), 0.6)
     return {
         "known": make(),
-        "nearest": make(associate=association.nearest(GATE)),
-        "joint": make(associate=association.joint(0.99, budget=500)),
-        "cluster": closing(
-            pruning(make(associate=near), recency()), every=4, reach=2.0, settings=SEARCH
+        "nearest": make(associate=association.Nearest(GATE)),
+        "joint": make(associate=association.JointCompatibility(0.99, budget=500)),
+        "cluster": Closing(
+            make(associate=near, life=Recency()), every=4, reach=2.0, settings=SEARCH
         ),
     }
 

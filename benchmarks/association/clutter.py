@@ -6,9 +6,8 @@ import jax
 import numpy as np
 
 from jaxslam import association, motion
-from jaxslam.filters import ekf_slam
-from jaxslam.filters.map_management.pruning import pruning
-from jaxslam.life import existence
+from jaxslam.filters import EkfSlam
+from jaxslam.life import Existence
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.monte_carlo import monte_carlo
 from jaxslam.results.plot.style import INK, PAGE, caption, curve, panels_of, titled
@@ -23,10 +22,10 @@ NOISE = (1.0, 2.0, 3.0)
 """times the scenario's σ of the odometry"""
 GATE, NEW = chi2_quantile(0.99, 2), chi2_quantile(0.9999, 2)
 METHODS = {
-    "nearest": association.nearest(GATE, NEW),
-    "maximum_likelihood": association.maximum_likelihood(GATE, NEW),
-    "global_nearest": association.global_nearest(GATE, NEW),
-    "joint": association.joint(0.99, NEW, budget=500),
+    "nearest": association.Nearest(GATE, NEW),
+    "maximum_likelihood": association.MaximumLikelihood(GATE, NEW),
+    "global_nearest": association.GlobalNearest(GATE, NEW),
+    "joint": association.JointCompatibility(0.99, NEW, budget=500),
 }
 ROWS = ("precision", "recall", "false_landmarks", "nees_pose", "rmse_position")
 
@@ -51,10 +50,10 @@ def measure(clutter, noise):
     """{method: {measure: value}} with the share of divergent runs; `known` believes the tags."""
     scenario = world(clutter, noise)
     parts = scenario.motion, scenario.sensor, CAPACITY
-    life = existence(near(0.8 * REACH), patience=20)
-    filters = {"known": ekf_slam(*parts)}
+    life = Existence(near(0.8 * REACH), patience=20)
+    filters = {"known": EkfSlam(*parts)}
     for name, method in METHODS.items():
-        filters[name] = pruning(ekf_slam(*parts, associate=method), life)
+        filters[name] = EkfSlam(*parts, associate=method, life=life)
     campaign = monte_carlo(scenario, filters, RUNS, jax.random.key(0))
     out = {}
     for name, summary in campaign.filters.items():

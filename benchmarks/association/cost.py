@@ -13,12 +13,11 @@ import numpy as np
 
 from benchmarks.speed.timing import together
 from jaxslam import association, life, run
-from jaxslam.filters import ekf_slam
+from jaxslam.filters import EkfSlam
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.steps.predicted_measurements import prediction_of
 from jaxslam.filters.ekf.steps.sequential_update import correct_in_turn
-from jaxslam.filters.map_management.merging import merging
-from jaxslam.filters.map_management.pruning import pruning
+from jaxslam.filters.map_management.merging import Merging
 from jaxslam.simulation.scenarios import cloister
 from jaxslam.slots import Joint
 from jaxslam.types import Log, Scan
@@ -26,10 +25,10 @@ from jaxslam.types import Log, Scan
 COUNT, SEEN, RUNS = 200, 20, 16
 GATE = 9.21
 METHODS = {
-    "nearest": association.nearest(GATE),
-    "maximum_likelihood": association.maximum_likelihood(GATE),
-    "global_nearest": association.global_nearest(GATE),
-    "joint": association.joint(0.99),
+    "nearest": association.Nearest(GATE),
+    "maximum_likelihood": association.MaximumLikelihood(GATE),
+    "global_nearest": association.GlobalNearest(GATE),
+    "joint": association.JointCompatibility(0.99),
 }
 
 
@@ -80,12 +79,12 @@ def compile_seconds():
     world, found = cloister(), {}
     scans = Scan(jnp.ones((50, SEEN, 2)), jnp.full((50, SEEN), -1), jnp.ones((50, SEEN), bool))
     log = Log(jnp.ones((50, len(world.motion.controls))), scans)
-    near = life.existence(lambda pose, point: ((point - pose[:2]) ** 2).sum() < 9.0, replace=True)
+    near = life.Existence(lambda pose, point: ((point - pose[:2]) ** 2).sum() < 9.0, replace=True)
 
     def loss(noise, log, method):
         sensor = dataclasses.replace(world.sensor, noise_cov=lambda z: noise)
-        plain = ekf_slam(world.motion, sensor, COUNT, associate=METHODS[method], make_room=near)
-        filter = pruning(merging(plain, 0.3), near)
+        plain = EkfSlam(world.motion, sensor, COUNT, associate=METHODS[method], life=near)
+        filter = Merging(plain, 0.3)
         trace = run(filter, log, world.pose, world.pose_cov, jax.random.key(0))
         return trace.info.log_likelihood.sum(), trace
 

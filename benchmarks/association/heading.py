@@ -27,10 +27,10 @@ SIGMAS = np.array([0.5, 2, 4, 6, 8, 10, 12, 15, 20, 25, 30, 35, 40, 45])
 SENSOR = RangeBearing(np.diag([0.1, np.deg2rad(1.0)]) ** 2)
 GATE = chi2_quantile(0.99, 2)
 METHODS = {
-    "nearest": association.nearest(GATE),
-    "maximum_likelihood": association.maximum_likelihood(GATE),
-    "global_nearest": association.global_nearest(GATE),
-    "joint": association.joint(0.99, budget=20_000, candidates=COUNT),
+    "nearest": association.Nearest(GATE),
+    "maximum_likelihood": association.MaximumLikelihood(GATE),
+    "global_nearest": association.GlobalNearest(GATE),
+    "joint": association.JointCompatibility(0.99, budget=20_000, candidates=COUNT),
 }
 
 

@@ -35,9 +35,8 @@ import numpy as np
 import jaxslam
 from jaxslam import association, charts, datasets, motion, sensors
 from jaxslam.calibration import calibrate
-from jaxslam.filters import ekf_slam
-from jaxslam.filters.map_management.pruning import pruning
-from jaxslam.life import recency
+from jaxslam.filters import EkfSlam
+from jaxslam.life import Recency
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.results.plot.style import COLORS, INK, PAGE, SHADE, caption, panels_of
 from jaxslam.types import Status
@@ -89,13 +88,13 @@ def corrected(p, control):
 
 
 def filter_of(capacity, method, odometry, measurement, **options):
-    return ekf_slam(
+    return EkfSlam(
         motion.PoseIncrement(jnp.diag(jnp.asarray(odometry)) ** 2),
         sensors.RelativePosition(measurement**2 * jnp.eye(2)),
         capacity,
         associate=method,
-        chart=charts.right_invariant(),
-        update="joint",
+        chart=charts.RightInvariant(),
+        correction="joint",
         **options,
     )
 
@@ -103,8 +102,8 @@ def filter_of(capacity, method, odometry, measurement, **options):
 def calibration_of(data):
     """The four parameters, without identities."""
     log = jax.tree.map(jnp.asarray, data.log)
-    near, local = association.nearest(GATE), recency(patience=PATIENCE)
-    filter = pruning(filter_of(LOCAL, near, *NARROW), local)
+    near, local = association.Nearest(GATE), Recency(patience=PATIENCE)
+    filter = filter_of(LOCAL, near, *NARROW, life=local)
 
     def info(p):
         own = log._replace(control=corrected(p, log.control))
@@ -219,8 +218,8 @@ def measure():
     """{setting: figures}, which setting was taken, and the maps made with it."""
     data = read()
     tags = np.asarray(data.log.scan.tag)
-    known = runner(data, data.capacity, association.known)
-    near = runner(data, CAPACITY, lambda gate: association.nearest(gate, NEW_GATE))
+    known = runner(data, data.capacity, association.Known)
+    near = runner(data, CAPACITY, lambda gate: association.Nearest(gate, NEW_GATE))
     calibration = calibration_of(data)
     values = zip(calibration.parameters, np.sqrt(np.diag(calibration.cov)), strict=True)
     print("calibrated: " + ", ".join(f"{p:.5f} ± {s:.5f}" for p, s in values))

@@ -16,7 +16,7 @@ def campaigns(runs=20, steps=None, names=tuple(WORLDS)):
     found = {}
     for name in names:
         world = WORLDS[name]() if steps is None else WORLDS[name](steps=steps)
-        world = dataclasses.replace(world, filter_options={"update": "joint"})
+        world = dataclasses.replace(world, filter_options={"correction": "joint"})
         methods = {each: catalog.ALL[each](world) for each in FILTERS}
         found[name] = monte_carlo(world, methods, runs, jax.random.key(0), block=10, workers=1)
     return found

@@ -63,7 +63,7 @@ def campaign(records: list[tuple[np.ndarray, np.ndarray]]) -> Campaign:
         landmarks=np.zeros((1, 2)),  # none is seen
         name="office, laser odometry",
     )
-    ekf = {"ekf": filters.dead_reckoning(motion, sensor)}
+    ekf = {"ekf": filters.DeadReckoning(motion, sensor)}
     return monte_carlo(world, ekf, len(records), jax.random.key(0), progress=False)
 
 

@@ -8,7 +8,7 @@ EKF-SLAM and the right-invariant EKF of each robot alone: with the default noise
 these constants and of the scale adds to the covariance (`calibration.consider_cov`); and, for
 reference, with constants and noise fitted on each robot's own truth. The smoother `batch_map`,
 whose path follows from the whole log, with the constants of the own log, without and with their
-uncertainty. Then robots 2 to 5 in one map (`team_slam`), constants of their own logs, without and
+uncertainty. Then robots 2 to 5 in one map (`TeamSlam`), constants of their own logs, without and
 with their sightings of each other. Last, what the noise alone allows the filter: runs simulated
 along the true paths (`benchmarks.mrclam.replays`).
 
@@ -35,7 +35,7 @@ from jaxslam import charts, datasets, metrics, smoothing
 from jaxslam.calibration import consider_cov
 from jaxslam.consistency.nees import block_nees, pose_error
 from jaxslam.datasets import MRCLAM_FITTED
-from jaxslam.filters import ekf_slam, team_slam
+from jaxslam.filters import EkfSlam, TeamSlam
 from jaxslam.math.stats import sigma_gate
 from jaxslam.team import poses
 from jaxslam.types import Status
@@ -137,10 +137,10 @@ def longest_unseen(time, seen):
 
 def invariant_ekf(data, row):
     """(log, motion, sensor) -> the trace of the right-invariant EKF."""
-    options = data.filter_options | {"gate": GATE, "chart": charts.right_invariant()}
+    options = data.filter_options | {"gate": GATE, "chart": charts.RightInvariant()}
 
     def go(log, motion, sensor):
-        filter = ekf_slam(motion, sensor, data.capacity, **options)
+        filter = EkfSlam(motion, sensor, data.capacity, **options)
         start = jnp.asarray(data.true_path[row]), data.pose_cov, jax.random.key(0)
         return jaxslam.run(filter, log, *start)
 
@@ -152,7 +152,7 @@ def smoother(data, row):
 
     def go(log, motion, sensor):
         start = jnp.asarray(data.true_path[row]), data.pose_cov
-        estimator = smoothing.batch_map(
+        estimator = smoothing.BatchMap(
             motion, sensor, data.capacity, *start, gate=GATE, iterations=STEPS
         )
         return estimator(log, jax.random.key(0))
@@ -192,7 +192,7 @@ def run_alone(folder, robot, calibration, chart):
     data = datasets.mrclam(folder, robot, calibration=calibration)
     row, log = from_first_scan(data)
     options = data.filter_options | {"gate": GATE, "chart": chart}
-    filter = ekf_slam(data.motion, data.sensor, data.capacity, **options)
+    filter = EkfSlam(data.motion, data.sensor, data.capacity, **options)
     start = data.true_path[row], data.pose_cov, jax.random.key(0)
     trace = jax.device_get(jaxslam.run(filter, log, *start))
     time = data.time[row:]
@@ -211,7 +211,7 @@ def run_team(folder, sightings, calibrations):
     landmark = log.scan.tag < data.capacity
     if not sightings:
         log = log._replace(scan=log.scan._replace(valid=log.scan.valid & landmark))
-    filter = team_slam(data.robots, data.capacity, gate=GATE, **data.filter_options)
+    filter = TeamSlam(data.robots, data.capacity, gate=GATE, **data.filter_options)
 
     @jax.jit
     def go(log):
@@ -240,7 +240,7 @@ def measure(fit=False, out=FIGURE):
     metrics = fitting.measure(folder)
     if fit:
         return metrics
-    kinds = {"EKF": None, "invariant EKF": charts.right_invariant()}
+    kinds = {"EKF": None, "invariant EKF": charts.RightInvariant()}
     robots = range(1, 6)
     own = {robot: datasets.mrclam_calibration(folder, robot) for robot in robots}
     true = {robot: fitting.fit(folder, robot, turned=True) for robot in robots}

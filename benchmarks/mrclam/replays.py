@@ -13,7 +13,7 @@ from benchmarks.mrclam import fit as fitting
 from jaxslam import charts, datasets, linearize
 from jaxslam.consistency.nees import block_nees, pose_error
 from jaxslam.core.record import record
-from jaxslam.filters import ekf_slam
+from jaxslam.filters import EkfSlam
 from jaxslam.math import se2
 from jaxslam.motion import PoseIncrement
 from jaxslam.protocols import Motion, Sensor
@@ -113,11 +113,11 @@ def replay(folder: Path, robot: int, runs: int = RUNS) -> Replayed:
         z = at.scan.z + deviation(at.scan.z) * jax.random.normal(seen, at.scan.z.shape)
         start = jax.random.multivariate_normal(first, at.truth.start, at.start_cov)
         kind = (
-            {"linearize": linearize.at_truth(at.truth)}
+            {"linearize": linearize.AtTruth(at.truth)}
             if ideal
-            else {"chart": charts.right_invariant()}
+            else {"chart": charts.RightInvariant()}
         )
-        filter = ekf_slam(at.motion, at.sensor, capacity, **at.options, **kind)
+        filter = EkfSlam(at.motion, at.sensor, capacity, **at.options, **kind)
         log = Log(control, at.scan._replace(z=z))
         estimate = jaxslam.run(filter, log, start, at.start_cov, rest).estimate
         return estimate.pose, estimate.pose_cov

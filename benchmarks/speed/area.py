@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.speed.timing import best
-from jaxslam.filters import compressed_ekf_slam, ekf_slam
+from jaxslam.filters import CompressedEkfSlam, EkfSlam
 from jaxslam.filters.ekf.compressed_ekf_slam import opened
 from jaxslam.slots import Joint
 
@@ -53,6 +53,6 @@ def compressed(scenario, log, sizes):
     for count in sizes:
         joint = map_of(count, scenario)
         parts = scenario.motion, scenario.sensor, count
-        filter = compressed_ekf_slam(*parts, area=AREA, **options)
+        filter = CompressedEkfSlam(EkfSlam(*parts, **options), area=AREA)
         by_landmarks.append(seconds_a_step(filter, opened(joint, AREA), log))
-    return by_landmarks, seconds_a_step(ekf_slam(*parts, **options), joint, log)
+    return by_landmarks, seconds_a_step(EkfSlam(*parts, **options), joint, log)

@@ -18,7 +18,7 @@ from benchmarks.speed.area import compressed
 from benchmarks.speed.dense import dense_ekf
 from benchmarks.speed.peers import Mrpt, dynamax_ekf
 from jaxslam.catalog import FILTERS
-from jaxslam.filters.ekf.ekf_slam import ekf_slam
+from jaxslam.filters.ekf.ekf_slam import EkfSlam
 from jaxslam.math.xla import hot_options
 from jaxslam.run import run
 from jaxslam.simulation.scenarios import cloister
@@ -149,7 +149,7 @@ def scaling():
             tag=np.pad(scan.tag, [(0, 0), (0, spare)], constant_values=-1),
             valid=np.pad(scan.valid, [(0, 0), (0, spare)]),
         )
-        filter = ekf_slam(
+        filter = EkfSlam(
             scenario.motion,
             scenario.sensor,
             capacity,

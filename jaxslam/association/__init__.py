@@ -1,10 +1,17 @@
 """Data association: methods that match measurements with landmarks."""
 
-from jaxslam.association.certain import certain
-from jaxslam.association.global_nearest import global_nearest
-from jaxslam.association.joint import joint
-from jaxslam.association.known import known
-from jaxslam.association.maximum_likelihood import maximum_likelihood
-from jaxslam.association.nearest import nearest
+from jaxslam.association.certain import Certain
+from jaxslam.association.global_nearest import GlobalNearest
+from jaxslam.association.joint_compatibility import JointCompatibility
+from jaxslam.association.known import Known
+from jaxslam.association.maximum_likelihood import MaximumLikelihood
+from jaxslam.association.nearest import Nearest
 
-__all__ = ["certain", "global_nearest", "joint", "known", "maximum_likelihood", "nearest"]
+__all__ = [
+    "Certain",
+    "GlobalNearest",
+    "JointCompatibility",
+    "Known",
+    "MaximumLikelihood",
+    "Nearest",
+]

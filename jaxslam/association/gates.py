@@ -9,33 +9,30 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.core.numbers import is_concrete
+from jaxslam.math.arrays import Number
 from jaxslam.protocols import Pairs, Prediction
 from jaxslam.types import Scan
 
 
-def check_gates(name: str, gate: float, new_gate: float | None) -> float:
-    """The gate for new landmarks, by default that for associations.
-
-    Raises:
-        ValueError: on a gate below 0 or that is no number, or a new_gate below it.
-    """
+def check_gates(name: str, gate: Number, new_gate: Number | None) -> None:
+    """Raise ValueError on a gate below 0 or that is no number, or a new_gate below it."""
     for each in (gate, new_gate):
         if each is not None and not isinstance(each, Real | np.ndarray | jax.Array):
             called = isinstance(each, Prediction | Scan)
             again = f": as associate, give {name}(gate), not {name}" if called else ""
             raise ValueError(f"{name}: expected a number as gate, got {type(each).__name__}{again}")
-    if is_concrete(gate) and not gate >= 0:
+    if is_concrete(gate) and not np.asarray(gate) >= 0:
         raise ValueError(f"{name}: expected a gate of at least 0, got {gate}")
-    if new_gate is None:
-        return gate
-    if is_concrete((gate, new_gate)) and not new_gate >= gate:
+    if new_gate is not None and is_concrete((gate, new_gate)) and not new_gate >= gate:
         raise ValueError(f"{name}: expected new_gate >= gate = {gate}, got {new_gate}")
-    return new_gate
 
 
-def far_from_all(pairs: Pairs, scan: Scan, new_gate: float) -> Bool[Array, "M"]:
-    """Whether a measurement lies beyond the gate of every landmark of the map."""
-    near = pairs.possible & (pairs.distance <= new_gate)
+def far_from_all(
+    pairs: Pairs, scan: Scan, gate: Number, new_gate: Number | None
+) -> Bool[Array, "M"]:
+    """Whether a measurement lies beyond the gate for new landmarks, by default the other one, of
+    every landmark of the map."""
+    near = pairs.possible & (pairs.distance <= (gate if new_gate is None else new_gate))
     return scan.valid & ~near.any(axis=1)
 
 

@@ -1,11 +1,14 @@
 """Maximum-likelihood association of each measurement on its own."""
 
 from jaxslam.association.gates import check_gates, far_from_all, mutual
-from jaxslam.protocols import Associate, Association, Prediction
+from jaxslam.core.record import record
+from jaxslam.math.arrays import Number
+from jaxslam.protocols import Association, Prediction
 from jaxslam.types import Scan
 
 
-def maximum_likelihood(gate: float, new_gate: float | None = None) -> Associate:
+@record
+class MaximumLikelihood:
     """Maximum-likelihood association: as `nearest`, by the least d² + log |S|.
 
     d² + log |S| is -2 log N(ν; 0, S) up to a constant. The determinant matters: a landmark of large
@@ -15,12 +18,15 @@ def maximum_likelihood(gate: float, new_gate: float | None = None) -> Associate:
     Raises:
         ValueError: on a negative gate, or a new_gate below it.
     """
-    beyond = check_gates("maximum_likelihood", gate, new_gate)
 
-    def associate(prediction: Prediction, scan: Scan) -> Association:
+    gate: Number
+    new_gate: Number | None = None
+
+    def __post_init__(self) -> None:
+        check_gates("MaximumLikelihood", self.gate, self.new_gate)
+
+    def __call__(self, prediction: Prediction, scan: Scan) -> Association:
         pairs = prediction.pairs(scan)
-        compatible = pairs.possible & (pairs.distance <= gate)
+        compatible = pairs.possible & (pairs.distance <= self.gate)
         slot = mutual(pairs.distance + pairs.log_det, compatible)
-        return Association(slot, far_from_all(pairs, scan, beyond) & (slot < 0))
-
-    return associate
+        return Association(slot, far_from_all(pairs, scan, self.gate, self.new_gate) & (slot < 0))

@@ -3,16 +3,14 @@
 from typing import Literal
 
 from jaxslam.association.gates import check_gates, far_from_all, mutual
-from jaxslam.protocols import Associate, Association, Prediction
+from jaxslam.core.record import record, static
+from jaxslam.math.arrays import Number
+from jaxslam.protocols import Association, Prediction
 from jaxslam.types import Scan
 
 
-def nearest(
-    gate: float,
-    new_gate: float | None = None,
-    *,
-    ambiguous: Literal["nearest", "leave"] = "nearest",
-) -> Associate:
+@record
+class Nearest:
     """Individual compatibility nearest neighbour (ICNN; Neira & Tardós 2001, section II).
 
     A pair is compatible if d² = νᵀ S⁻¹ ν <= gate. A measurement is associated with the landmark
@@ -21,27 +19,30 @@ def nearest(
     ignored (the two gates of Bailey, "Mobile robot localisation and mapping in extensive outdoor
     environments", 2002, section 2.3). Tags are not used.
 
-    Args:
-        gate: of squared Mahalanobis distance, 0 (nothing is compatible but a perfect match) to
-            infinity; `stats.chi2_quantile` gives it by probability.
-        new_gate: at least the gate; the same by default.
-        ambiguous: "leave" ignores a measurement that is compatible with several landmarks, and
-            several that are compatible with one.
-    Raises:
-        ValueError: on a negative gate, a new_gate below it, or an unknown policy.
+    Raises ValueError on a negative gate, a new_gate below it, or an unknown policy.
     """
-    beyond = check_gates("nearest", gate, new_gate)
-    if ambiguous not in ("nearest", "leave"):
-        raise ValueError(f'nearest: expected ambiguous "nearest" or "leave", got {ambiguous!r}')
 
-    def associate(prediction: Prediction, scan: Scan) -> Association:
+    gate: Number
+    """of squared Mahalanobis distance, 0 (nothing is compatible but a perfect match) to infinity;
+    `stats.chi2_quantile` gives it by probability"""
+    new_gate: Number | None = None
+    """at least the gate; the same by default"""
+    ambiguous: Literal["nearest", "leave"] = static(default="nearest", kw_only=True)
+    """"leave" ignores a measurement that is compatible with several landmarks, and several that are
+    compatible with one"""
+
+    def __post_init__(self) -> None:
+        check_gates("Nearest", self.gate, self.new_gate)
+        if self.ambiguous not in ("nearest", "leave"):
+            raise ValueError(
+                f'Nearest: expected ambiguous "nearest" or "leave", got {self.ambiguous!r}'
+            )
+
+    def __call__(self, prediction: Prediction, scan: Scan) -> Association:
         pairs = prediction.pairs(scan)
-        compatible = pairs.possible & (pairs.distance <= gate)
-        allowed = compatible
-        if ambiguous == "leave":
+        allowed = compatible = pairs.possible & (pairs.distance <= self.gate)
+        if self.ambiguous == "leave":
             allowed = compatible & (compatible.sum(axis=1) == 1)[:, None]
             allowed = allowed & (compatible.sum(axis=0) == 1)[None, :]
         slot = mutual(pairs.distance, allowed)
-        return Association(slot, far_from_all(pairs, scan, beyond) & (slot < 0))
-
-    return associate
+        return Association(slot, far_from_all(pairs, scan, self.gate, self.new_gate) & (slot < 0))

@@ -50,7 +50,7 @@ def calibrate(
     Gaussian noise and S does not depend on p it is the maximum-likelihood estimate.
 
     Associations are recomputed at each p and not differentiated. They need not be given: a filter
-    with `association.nearest` and `life.recency(patience=…)` keeps a local map, in which landmarks
+    with `association.Nearest` and `life.Recency(patience=…)` keeps a local map, in which landmarks
     seen close in time are associated whatever the drift, and no loop is closed.
 
     Each measurement of a scan is whitened by its own S; the correlation between those of one joint

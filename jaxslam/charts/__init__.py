@@ -1,16 +1,14 @@
 """Charts: error coordinates of the covariance."""
 
-from collections.abc import Callable
-
-from jaxslam.charts.euclidean import euclidean
-from jaxslam.charts.left_invariant import left_invariant
-from jaxslam.charts.right_invariant import right_invariant
+from jaxslam.charts.euclidean import Euclidean
+from jaxslam.charts.left_invariant import LeftInvariant
+from jaxslam.charts.right_invariant import RightInvariant
 from jaxslam.protocols import Chart
 
-REGISTRY: dict[str, Callable[[], Chart]] = {
-    "euclidean": euclidean,
-    "left_invariant": left_invariant,
-    "right_invariant": right_invariant,
+REGISTRY: dict[str, type[Chart]] = {
+    "euclidean": Euclidean,
+    "left_invariant": LeftInvariant,
+    "right_invariant": RightInvariant,
 }
 
-__all__ = ["REGISTRY", "euclidean", "left_invariant", "right_invariant"]
+__all__ = ["REGISTRY", "Euclidean", "LeftInvariant", "RightInvariant"]

@@ -2,61 +2,67 @@
 
 import jax.numpy as jnp
 
+from jaxslam.core.record import record, static
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
 from jaxslam.math.arrays import Landmark, Pose
 from jaxslam.protocols import Basis, Chart
 
 
-def right_invariant(rays: bool = False) -> Chart:
+@record
+class RightInvariant(Chart):
     """The right-invariant chart: (R, t, l) ← exp(ξ)·(R, t, l), ξ in the Lie algebra of SE_{1+N}(2).
 
     With dx = (ρ, φ): θ ← θ + φ, t ← R(φ)t + V(φ)ρ, l ← R(φ)l + V(φ)dl, V as in `se2.exp`. A turn φ
     of the whole map about the origin leaves ρ and dl at zero, so the unobservable directions do not
     depend on the estimate, and the filter cannot gain information along them (Barrau & Bonnabel
-    2015, arXiv:1510.06263; Zhang et al. 2017). For point landmarks l = (x, y), or with
-
-    rays: for l = (x0, y0, α, ρ), as of `sensors.BearingInverseDepth`: (x0, y0) changes as a point
-    does, the direction rotates with the map, α ← α + φ + dα, and ρ ← ρ + dρ.
+    2015, arXiv:1510.06263; Zhang et al. 2017). For point landmarks l = (x, y), or rays.
 
     Raises ValueError where `retract` gets a landmark of another size.
     """
-    name = "right_invariant, rays" if rays else "right_invariant"
-    size = 4 if rays else 2
 
-    def retract(pose: Pose, landmark: Landmark, dx: Pose, dl: Landmark) -> tuple[Pose, Landmark]:
-        if landmark.shape != (size,):
+    rays: bool = static(default=False)
+    """for l = (x0, y0, α, ρ), as of `sensors.BearingInverseDepth`: (x0, y0) changes as a point
+    does, the direction rotates with the map, α ← α + φ + dα, and ρ ← ρ + dρ"""
+
+    @property
+    def landmark_size(self) -> int:  # type: ignore[override]
+        return 4 if self.rays else 2
+
+    def retract(
+        self, pose: Pose, landmark: Landmark, dx: Pose, dl: Landmark
+    ) -> tuple[Pose, Landmark]:
+        if landmark.shape != (self.landmark_size,):
             raise ValueError(
-                f"{name}: expected a landmark of shape ({size},), got {landmark.shape}"
+                f"RightInvariant(rays={self.rays}): expected a landmark of shape "
+                f"({self.landmark_size},), got {landmark.shape}"
             )
         moved = se2.exp(dx)
         shift = se2.exp(jnp.concatenate([dl[:2], dx[2:]]))
         point = se2.from_frame(shift, landmark[:2])
-        if rays:
+        if self.rays:
             turned = wrap(landmark[2:3] + dx[2:] + dl[2:3])
             point = jnp.concatenate([point, turned, landmark[3:] + dl[3:]])
         return se2.compose(moved, pose), point
 
     def local(
-        pose0: Pose, landmark0: Landmark, pose: Pose, landmark: Landmark
+        self, pose0: Pose, landmark0: Landmark, pose: Pose, landmark: Landmark
     ) -> tuple[Pose, Landmark]:
         turn = wrap(pose[2:] - pose0[2:])
         moved = se2.log(se2.compose(pose, se2.inverse(pose0)))
         offset = landmark[:2] - se2.rotation(turn[0]) @ landmark0[:2]
         error = se2.log(jnp.concatenate([offset, turn]))[:2]
-        if rays:
+        if self.rays:
             turned = wrap(landmark[2:3] - landmark0[2:3] - turn)
             error = jnp.concatenate([error, turned, landmark[3:] - landmark0[3:]])
         return moved, error
 
-    def basis(pose: Pose, landmark: Landmark) -> Basis:
+    def basis(self, pose: Pose, landmark: Landmark) -> Basis:
         eye = jnp.eye(3, dtype=pose.dtype)
-        cross = jnp.zeros((size, 3), pose.dtype)
+        cross = jnp.zeros((self.landmark_size, 3), pose.dtype)
         cross = cross.at[0, 2].set(-landmark[1]).at[1, 2].set(landmark[0])
         return Basis(
             pose=eye.at[0, 2].set(-pose[1]).at[1, 2].set(pose[0]),
-            cross=cross.at[2, 2].set(1.0) if rays else cross,
+            cross=cross.at[2, 2].set(1.0) if self.rays else cross,
             landmark=None,
         )
-
-    return Chart(name, retract, local, basis, landmark_size=size)

@@ -10,10 +10,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.consistency.score import snapshot_steps
-from jaxslam.filters.ekf.ekf_slam import ekf_slam
+from jaxslam.filters.ekf.ekf_slam import EkfSlam
 from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.linearize import derivatives
-from jaxslam.linearize.at_truth import at_truth
+from jaxslam.linearize.at_truth import AtTruth
 from jaxslam.linearize.first_order import with_lever_arm
 from jaxslam.math.linalg import root_psd
 from jaxslam.protocols import Sensor
@@ -42,10 +42,10 @@ def conditional_bound(scenario: Scenario, truth: Truth, log: Log, key: Array) ->
     options: EkfOptions = scenario.filter_options | {
         "gate": None,
         "births": None,
-        "linearize": at_truth(truth),
+        "linearize": AtTruth(truth),
     }
     capacity = truth.landmarks.shape[0]
-    ideal = ekf_slam(scenario.motion, scenario.sensor, capacity, **options)
+    ideal = EkfSlam(scenario.motion, scenario.sensor, capacity, **options)
     return run(ideal, log, scenario.pose, scenario.pose_cov, key).estimate
 
 

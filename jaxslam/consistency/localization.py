@@ -86,7 +86,7 @@ def judge_localization(
     after the other in one program.
 
     Args:
-        filter: of `grids.localize`.
+        filter: of `grids.GridLocalization`.
         start_cov: (3, 3), which may be zero.
         same_log: one history for all runs, which differ in the filter's own draws alone.
         every: scores are computed at each n-th step, from the n-th on.
@@ -147,7 +147,7 @@ def score_localization(
     """The scores of one run, without the leading R; traceable: `jax.lax.map` it over keys.
 
     Args:
-        filter: whose state is a `PoseParticles`, as of `grids.localize`.
+        filter: whose state is a `PoseParticles`, as of `grids.GridLocalization`.
         log, pose, pose_cov: as `run` takes them. truth: true poses.
         every: score each n-th step, from the n-th on.
     """

@@ -18,7 +18,7 @@ from jaxtyping import Bool, Float, Int, PyTree
 
 from jaxslam.consistency.nees import DOF, Nees, block_nees, pose_error
 from jaxslam.consistency.statistics import RunStatistics
-from jaxslam.filters.ekf.observability import Monitor, Monitored
+from jaxslam.filters.ekf.observability import Monitor, MonitoredState
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.types import Info, Status, Trace, Truth
 
@@ -194,7 +194,7 @@ def _covered(nees: Nees, dof: int) -> Int[np.ndarray, "R LEVELS"]:
 
 def monitor_of(state: PyTree) -> Monitor | None:
     """The observability monitor in the state of a `monitored` filter; None in another state."""
-    return state.monitor if isinstance(state, Monitored) else None
+    return state.monitor if isinstance(state, MonitoredState) else None
 
 
 def _null_space(

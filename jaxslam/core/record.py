@@ -1,7 +1,7 @@
 """Records: frozen dataclasses that JAX knows as pytrees."""
 
 import dataclasses
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
@@ -73,6 +73,30 @@ def is_record(value: object) -> bool:
 def set_field(of: Any, name: str, value: Any) -> None:
     """Set a field in `__post_init__`, for one that is given in another form."""
     object.__setattr__(of, name, value)
+
+
+@record
+class Function:
+    """A plain function as a record without numbers, compared by identity."""
+
+    function: Callable[..., Any] = static()
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self.function(*arguments)
+
+
+def hold_function(of: Any, name: str, parameters: str) -> None:
+    """Make a field that is a plain function a record, in `__post_init__`.
+
+    Raises ValueError unless it is a function, or a record with `__call__`.
+    """
+    value = getattr(of, name)
+    if not callable(value) or isinstance(value, type):
+        got = f"the class {value.__name__}: call it" if callable(value) else type(value).__name__
+        what = f"{type(of).__name__}: expected {name} to be a function of ({parameters})"
+        raise ValueError(f"{what}, got {got}")
+    if not is_record(value):
+        set_field(of, name, Function(value))
 
 
 def _check_kinds(of: Any) -> None:

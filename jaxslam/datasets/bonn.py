@@ -88,7 +88,7 @@ def bonn(
         motion=PoseIncrement(odometry_cov),
         sensor=RangeBearing(measurement_cov),
         tags=names,
-        filter_options={"update": "joint"},
+        filter_options={"correction": "joint"},
         landmarks=landmarks,
         dropped=dropped,
         source=SOURCE,

@@ -34,7 +34,7 @@ class Dataset:
     """A recorded log of T rows and N landmarks, with models and options to filter it.
 
         data = jaxslam.datasets.bonn(folder)
-        ekf = ekf_slam(data.motion, data.sensor, data.capacity, **data.filter_options)
+        ekf = EkfSlam(data.motion, data.sensor, data.capacity, **data.filter_options)
         trace = jaxslam.run(ekf, data.log, data.pose, data.pose_cov, key)
 
     Arrays are NumPy's, in float64. Raises ValueError where their shapes do not fit together.
@@ -54,7 +54,7 @@ class Dataset:
     pose_cov: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.zeros((3, 3)))
     """zero, since the first pose defines the frame"""
     filter_options: EkfOptions = field(default_factory=EkfOptions)
-    """keyword arguments of `filters.ekf_slam` for this data set (update, gate)"""
+    """keyword arguments of `filters.EkfSlam` for this data set (update, gate)"""
     landmarks: Float[np.ndarray, "N 2"] | None = None
     """surveyed positions [m] in the order of tags, in a frame of their own; None if unknown"""
     true_path: Float[np.ndarray, "T 3"] | None = None
@@ -82,7 +82,7 @@ class Dataset:
     source: str = ""
     """the publication of the data"""
     robots: tuple[Robot, ...] = ()
-    """the robots of a log of several, for `filters.team_slam(data.robots, data.capacity)`. They
+    """the robots of a log of several, for `filters.TeamSlam(data.robots, data.capacity)`. They
     have the tags N, N+1, …; `motion` and `sensor` are those of the first robot."""
 
     def __post_init__(self) -> None:

@@ -7,10 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxslam.association.known import Known
 from jaxslam.calibration import NoiseFit, as_associated, fit_noise
 from jaxslam.core.numbers import check_count
 from jaxslam.datasets.dataset import Adjustable, Dataset
-from jaxslam.filters.ekf.ekf_slam import ekf_slam
+from jaxslam.filters.ekf.ekf_slam import EkfSlam
 from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.logs.tables import POSE, split_unit
 from jaxslam.math.stats import normal_quantile
@@ -69,13 +70,13 @@ def fit(
     check_count("fit: rounds", rounds)
     names, values, free = _parameters(models, mount, tuple(fixed))
     count, key = len(models.deviations), jax.random.key(0)
-    decided = data.filter_options | {"gate": None, "associate": None}
+    decided = data.filter_options | {"gate": None, "associate": Known()}
 
     def filter(whole: JaxOrNumPy, options: EkfOptions) -> Filter:
         fitted = mount and models.mount is not None
         place = whole[count:] if fitted else models.mount
         motion, sensor = models.models(whole[:count], place)
-        return ekf_slam(motion, sensor, data.capacity, **options)
+        return EkfSlam(motion, sensor, data.capacity, **options)
 
     def info(p: jax.Array, log: Log) -> Info:
         whole = jnp.asarray(values, p.dtype).at[free].set(p)

@@ -103,7 +103,7 @@ def victoria_park(
         motion=PoseIncrement(odometry_file if odometry_cov is None else odometry_cov),
         sensor=RelativePosition(landmark_noise.cov if measurement_cov is None else measurement_cov),
         tags=names,
-        filter_options={"update": "joint"},
+        filter_options={"correction": "joint"},
         source=SOURCE,
     )
 

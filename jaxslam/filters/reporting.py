@@ -44,7 +44,7 @@ def status_of(
 
     A singular S is SINGULAR whatever the gate, since d² = νᵀ S⁻¹ ν needs S⁻¹. A measurement
     without a finite value is REJECTED by `run` before a filter
-    sees it, and one that concerns a robot without a pose in the map is UNMATCHED (`team_slam`).
+    sees it, and one that concerns a robot without a pose in the map is UNMATCHED (`TeamSlam`).
 
     Args:
         valid: there is a measurement.

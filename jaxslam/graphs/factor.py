@@ -164,7 +164,7 @@ def from_motion(motion: Motion) -> Factor:
 
         e = w with step(x, u, w) = x', z = u
 
-    The cost wᵀ Q⁻¹ w is the one of `smoothing.batch_map`. The pose error of the nominal motion with
+    The cost wᵀ Q⁻¹ w is the one of `smoothing.BatchMap`. The pose error of the nominal motion with
     the covariance G Q Gᵀ, G = ∂step/∂w at w = 0, is the same to first order in w, and exactly
     where step is affine in w; its optimum is another elsewhere. w is found by Newton's method from
     w = 0: ten steps without derivatives, then two with them, whose error is of the fourth order in

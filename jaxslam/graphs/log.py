@@ -41,7 +41,7 @@ def of_log(
         motion   from_motion(motion), z = u, Ω = Q⁻¹; or nominal_motion    T
         sensor   from_sensor(sensor), Ω = R⁻¹                              T·M
 
-    χ² of the graph is twice the cost of `smoothing.batch_map`, and `pose_id` t is the pose after t
+    χ² of the graph is twice the cost of `smoothing.BatchMap`, and `pose_id` t is the pose after t
     controls. Poses start along the nominal motion, points at their first measurement, where Q and R
     are evaluated: as data of the graph they are fixed.
 

@@ -2,18 +2,18 @@
 
 from jaxslam.grids.beam_models import (
     BeamModel,
+    LikelihoodField,
     Mixture,
+    RayCast,
     fit,
-    likelihood_field,
     log_likelihood,
-    ray_cast,
 )
 from jaxslam.grids.cast import RayMap, cast, ray_map
 from jaxslam.grids.distance import distance_field, gradient
 from jaxslam.grids.files import read_map, write_map
 from jaxslam.grids.grid import Field, Grid, centers, check_grid, to_cells
 from jaxslam.grids.interpolation import interpolate
-from jaxslam.grids.localization import Clusters, beam_log, clusters, localize
+from jaxslam.grids.localization import Clusters, GridLocalization, beam_log, clusters
 from jaxslam.grids.mapping import Counts, count, entropy, occupancy, reflection
 from jaxslam.grids.resampling import correlation, crop, resample
 
@@ -23,7 +23,10 @@ __all__ = [
     "Counts",
     "Field",
     "Grid",
+    "GridLocalization",
+    "LikelihoodField",
     "Mixture",
+    "RayCast",
     "RayMap",
     "beam_log",
     "cast",
@@ -38,11 +41,8 @@ __all__ = [
     "fit",
     "gradient",
     "interpolate",
-    "likelihood_field",
-    "localize",
     "log_likelihood",
     "occupancy",
-    "ray_cast",
     "ray_map",
     "read_map",
     "reflection",

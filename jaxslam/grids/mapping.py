@@ -1,6 +1,5 @@
 """Maps from scans at known poses: hits and misses of each cell, and the log-odds they add to it."""
 
-import functools
 from numbers import Integral
 from typing import NamedTuple
 
@@ -15,6 +14,7 @@ from jaxslam.core.numbers import check_mount, check_positive, is_concrete
 from jaxslam.grids.beam_models.beam_model import usable_beams
 from jaxslam.grids.grid import Grid, check_frame, to_cells
 from jaxslam.math import se2
+from jaxslam.math.arrays import Number
 from jaxslam.types import Beams, JaxOrNumPy
 
 FARTHEST = 2.0**29
@@ -72,9 +72,8 @@ def count(
         raise ValueError(f"count: expected no_return from 0 to {max_range}, got {no_return}")
     frame = jnp.asarray(origin, float), jnp.asarray(resolution, float)
     eye = jnp.asarray(mount, float)
-    return programs.call(
-        _count, (_shape(*shape),), *frame, jnp.asarray(poses), beams, max_range, free, eye
-    )
+    size = int(shape[0]), int(shape[1])
+    return programs.call(_count, size, *frame, jnp.asarray(poses), beams, max_range, free, eye)
 
 
 def _check_shape(shape: tuple[int, int]) -> None:
@@ -83,12 +82,6 @@ def _check_shape(shape: tuple[int, int]) -> None:
         raise ValueError(
             f"count: expected a shape (H, W), integers, of at least one cell, got {shape!r}"
         )
-
-
-@functools.cache
-def _shape(height: int, width: int) -> tuple[int, int]:
-    """The same object for the same shape, as `programs.call` wants it."""
-    return height, width
 
 
 def _check_scans(poses: JaxOrNumPy, beams: Beams, max_range: float) -> None:
@@ -115,7 +108,8 @@ def _check_scans(poses: JaxOrNumPy, beams: Beams, max_range: float) -> None:
 
 
 def _count(
-    shape: tuple[int, int],
+    height: int,
+    width: int,
     origin: Array,
     resolution: Array,
     poses: Array,
@@ -124,6 +118,8 @@ def _count(
     free: Array,
     mount: Array,
 ) -> Counts:
+    shape = height, width
+
     def add(total: PyTree, row: tuple[Array, Beams]) -> tuple[PyTree, None]:
         hits, misses, outside, unusable = total
         pose, scan = row
@@ -148,7 +144,7 @@ def _add_scan(
     resolution: Array,
     eye: Float[Array, "3"],
     scan: Beams,
-    max_range: ArrayLike,
+    max_range: Number,
     free: ArrayLike,
 ) -> tuple[Int[Array, "HW"], Int[Array, "HW"], Int[Array, ""]]:
     """The counts with one scan more, and the number of usable beams if its pose is off the map.
@@ -215,7 +211,7 @@ def _cross(
     return misses, last[:, 1] * width + last[:, 0]
 
 
-def occupancy(counts: Counts, *, hit: ArrayLike = 0.7, miss: ArrayLike = 0.4) -> Grid:
+def occupancy(counts: Counts, *, hit: Number = 0.7, miss: ArrayLike = 0.4) -> Grid:
     """The log-odds of an inverse sensor model: hits · logit(hit) + misses · logit(miss).
 
     As the occupancy-grid filter sums them beam by beam, with a prior of ½ (Thrun, Burgard & Fox

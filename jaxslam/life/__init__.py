@@ -1,6 +1,6 @@
 """Rules that decide after each scan which landmarks stay in the map."""
 
-from jaxslam.life.existence import existence
-from jaxslam.life.recency import recency
+from jaxslam.life.existence import Existence
+from jaxslam.life.recency import Recency
 
-__all__ = ["existence", "recency"]
+__all__ = ["Existence", "Recency"]

@@ -8,12 +8,13 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import slots
 from jaxslam.core.numbers import check_count
+from jaxslam.core.record import record, static
 from jaxslam.protocols import Life
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Info, Status
 
 
-class Recency(NamedTuple):
+class Times(NamedTuple):
     """Times of the first and last measurement of each landmark, in scans; zero where dead."""
 
     now: Int[Array, ""]
@@ -26,39 +27,41 @@ class Recency(NamedTuple):
     """scans that measured it"""
 
 
-def recency(patience: int | None = None) -> Life:
-    """The rule that removes landmarks not measured for long; `closing` reads the times it keeps.
+@record
+class Recency(Life):
+    """The rule that removes landmarks not measured for long; `Closing` reads the times it keeps.
 
-    Args:
-        patience: a landmark not measured for so many scans, empty ones too, is removed, so that
-            a local map is left. None removes no landmark.
-    Raises:
-        ValueError: on a patience below 1.
+    Raises ValueError on a patience below 1.
     """
-    if patience is not None:
-        check_count("recency: patience", patience)
 
-    def init(pose: Float[Array, "3"], landmarks: Float[Array, "N L"]) -> Recency:
+    patience: int | None = static(default=None)
+    """a landmark not measured for so many scans, empty ones too, is removed, so that a local map is
+    left. None removes no landmark."""
+
+    def __post_init__(self) -> None:
+        if self.patience is not None:
+            check_count("Recency: patience", self.patience)
+        super().__post_init__()
+
+    def init(self, pose: Float[Array, "3"], landmarks: Float[Array, "N L"]) -> Times:
         none = jnp.zeros(landmarks.shape[0], jnp.int32)
-        return Recency(jnp.zeros((), jnp.int32), none, none, none)
+        return Times(jnp.zeros((), jnp.int32), none, none, none)
 
     def after(
-        joint: Joint, info: Info, estimate: Callable[[], Estimate]
-    ) -> tuple[Recency, Bool[Array, "N"]]:
-        known: Recency = joint.life
+        self, joint: Joint, info: Info, estimate: Callable[[], Estimate]
+    ) -> tuple[Times, Bool[Array, "N"]]:
+        known: Times = joint.life
         now = known.now + 1
         count = len(joint.alive)
         born = slots.concerned(info.slot, info.status == Status.BORN, count)
         hit = born | slots.concerned(info.slot, info.status == Status.FUSED, count)
         zero = jnp.zeros_like(known.last)
-        memory = Recency(
+        memory = Times(
             now,
             jnp.where(born, now, jnp.where(joint.alive, known.born, zero)),
             jnp.where(hit, now, jnp.where(joint.alive, known.last, zero)),
             jnp.where(born, 1, jnp.where(joint.alive, known.seen + hit, zero)),
         )
-        if patience is None:
+        if self.patience is None:
             return memory, jnp.zeros_like(joint.alive)
-        return memory, joint.alive & (now - memory.last >= patience)
-
-    return Life("recency", init, after)
+        return memory, joint.alive & (now - memory.last >= self.patience)

@@ -2,15 +2,14 @@
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
+from jax import Array
 
+from jaxslam.core.record import record
 from jaxslam.linearize import first_order
 from jaxslam.linearize.first_order import with_lever_arm
 from jaxslam.protocols import Here, Linearizer, Motion, Sensor
 from jaxslam.slots import Joint
-
-Array = jax.Array
 
 
 class First(NamedTuple):
@@ -22,7 +21,8 @@ class First(NamedTuple):
     """(N, L) as they entered the map"""
 
 
-def first_estimate() -> Linearizer:
+@record
+class FirstEstimate(Linearizer):
     """The FEJ linearizer: a pose at its prediction, a landmark at its first estimate.
 
     With x̂_k the predicted pose of step k and x̂_k⁺ the corrected one, the transition becomes
@@ -39,31 +39,28 @@ def first_estimate() -> Linearizer:
     The process noise is that of the standard EKF. Euclidean chart and point landmarks only.
     """
 
-    def motion_at(motion: Motion, u: Array, here: Here) -> tuple[Array, Array, Array, First]:
+    euclidean = True
+    own_landmarks = True
+
+    def init(self, pose: Array, landmarks: Array) -> First:
+        return First(pose, landmarks)
+
+    def motion(self, motion: Motion, u: Array, here: Here) -> tuple[Array, Array, Array, First]:
         first = here.joint.lin
         moved, by_pose, noise = first_order.motion_at(motion, here.pose, u, here.pose)
         by_pose = with_lever_arm(by_pose, here.pose[:2] - first.pose[:2])
         return moved, by_pose, noise, first._replace(pose=moved)
 
-    def observe_at(sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
+    def observe(self, sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
         first = here.joint.lin
         return first_order.observe_at(sensor, here, first.pose, first.landmarks[here.slot])
 
-    def invert_at(sensor: Sensor, z: Array, tag: Array, here: Here) -> tuple[Array, Array, Array]:
+    def invert(
+        self, sensor: Sensor, z: Array, tag: Array, here: Here
+    ) -> tuple[Array, Array, Array]:
         landmark, by_pose, own = first_order.invert_at(sensor, here.pose, z, here.pose, z)
         return landmark, with_lever_arm(by_pose, here.pose[:2] - here.joint.lin.pose[:2]), own
 
-    def born(joint: Joint, born: Array) -> First:
+    def born(self, joint: Joint, born: Array) -> First:
         landmarks = jnp.where(born[:, None], joint.landmarks, joint.lin.landmarks)
         return First(joint.lin.pose, landmarks)
-
-    return Linearizer(
-        name="first_estimate",
-        init=First,
-        motion=motion_at,
-        observe=observe_at,
-        invert=invert_at,
-        born=born,
-        euclidean=True,
-        own_landmarks=True,
-    )

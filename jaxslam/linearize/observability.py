@@ -2,16 +2,15 @@
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
+from jax import Array
 
 from jaxslam.core.numbers import largest
+from jaxslam.core.record import record
 from jaxslam.linearize import first_order
 from jaxslam.linearize.first_order import with_lever_arm
 from jaxslam.protocols import Here, Linearizer, Motion, Sensor
 from jaxslam.slots import Joint
-
-Array = jax.Array
 
 
 class Constraint(NamedTuple):
@@ -25,7 +24,8 @@ class Constraint(NamedTuple):
     """(N, 2) β_i [m]: and the landmarks by J β_i"""
 
 
-def observability() -> Linearizer:
+@record
+class Observability(Linearizer):
     """The OC linearizer: points nearest to the estimates that satisfy the observability constraint.
 
     A rotation of robot and map, (Jα, 1, Jβ_1, …) in the errors of robot position, heading and
@@ -41,7 +41,15 @@ def observability() -> Linearizer:
     process noise is that of the standard EKF. Euclidean chart and point landmarks only.
     """
 
-    def motion_at(motion: Motion, u: Array, here: Here) -> tuple[Array, Array, Array, Constraint]:
+    euclidean = True
+    own_landmarks = True
+
+    def init(self, pose: Array, landmarks: Array) -> Constraint:
+        return Constraint(pose, pose[:2], landmarks)
+
+    def motion(
+        self, motion: Motion, u: Array, here: Here
+    ) -> tuple[Array, Array, Array, Constraint]:
         joint, old = here.joint, here.joint.lin
         moved, by_pose, noise = first_order.motion_at(motion, here.pose, u, here.pose)
         arms = joint.landmarks - joint.pose[None, :2] - old.landmarks + old.robot[None]
@@ -52,26 +60,17 @@ def observability() -> Linearizer:
         robot = old.robot + moved[:2] - joint.pose[:2] - shift
         return moved, with_lever_arm(by_pose, -shift), noise, old._replace(pose=moved, robot=robot)
 
-    def observe_at(sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
+    def observe(self, sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
         own = here.joint.lin
         at_landmark = own.pose[:2] + own.landmarks[here.slot] - own.robot
         return first_order.observe_at(sensor, here, own.pose, at_landmark)
 
-    def invert_at(sensor: Sensor, z: Array, tag: Array, here: Here) -> tuple[Array, Array, Array]:
+    def invert(
+        self, sensor: Sensor, z: Array, tag: Array, here: Here
+    ) -> tuple[Array, Array, Array]:
         return first_order.invert_at(sensor, here.pose, z, here.pose, z)
 
-    def born(joint: Joint, born: Array) -> Constraint:
+    def born(self, joint: Joint, born: Array) -> Constraint:
         arms = joint.lin.robot[None] + joint.landmarks - joint.pose[None, :2]
         landmarks = jnp.where(born[:, None], arms, joint.lin.landmarks)
         return Constraint(joint.lin.pose, joint.lin.robot, landmarks)
-
-    return Linearizer(
-        name="observability",
-        init=lambda pose, landmarks: Constraint(pose, pose[:2], landmarks),
-        motion=motion_at,
-        observe=observe_at,
-        invert=invert_at,
-        born=born,
-        euclidean=True,
-        own_landmarks=True,
-    )

@@ -5,12 +5,13 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+from jax import Array
 
 from jaxslam.core.numbers import is_concrete
+from jaxslam.core.record import record
 from jaxslam.math import linalg
+from jaxslam.math.arrays import Number
 from jaxslam.protocols import Here, Linearizer, Motion, Sensor
-
-Array = jax.Array
 
 
 class Regression(NamedTuple):
@@ -24,7 +25,8 @@ class Regression(NamedTuple):
     """(m, m) covariance of y that no affine function of ξ has"""
 
 
-def unscented(alpha: float | None = None) -> Linearizer:
+@record
+class Unscented(Linearizer):
     """The linearizer of the UKF: sigma points of the pose, or of pose and landmark, in the chart.
 
     With n variables and P = L Lᵀ, points at 0 and ±α√n L_j, weights 1/(2α²n) and, for the centre,
@@ -38,19 +40,20 @@ def unscented(alpha: float | None = None) -> Linearizer:
     new landmark are those of the centre. In the charts `right_invariant` and `left_invariant` this
     is their UKF on SE_{1+N}(2).
 
-    Args:
-        alpha: spread of the sigma points; default 1e-3 in float64, as theirs, with which the UKF
-            equals an EKF to rounding, and 0.1 in float32, because of rounding. 1 reaches √n σ.
-    Raises:
-        ValueError: unless 0 < alpha <= 1.
+    Raises ValueError unless 0 < alpha <= 1.
     """
-    if alpha is not None and is_concrete(alpha) and not 0 < alpha <= 1:
-        raise ValueError(f"unscented: expected alpha in (0, 1], got {alpha}")
 
-    def fit(f: Callable[[Array], Array], root: Array) -> Regression:
-        return regress(f, root, alpha if alpha is not None else _spread(root))
+    alpha: Number | None = None
+    """spread of the sigma points; default 1e-3 in float64, as theirs, with which the UKF equals an
+    EKF to rounding, and 0.1 in float32, because of rounding. 1 reaches √n σ."""
+    iterates = False
 
-    def motion_at(motion: Motion, u: Array, here: Here) -> tuple[Array, Array, Array, tuple[()]]:
+    def __post_init__(self) -> None:
+        if self.alpha is not None and is_concrete(self.alpha) and not 0 < self.alpha <= 1:
+            raise ValueError(f"Unscented: expected alpha in (0, 1], got {self.alpha}")
+        super().__post_init__()
+
+    def motion(self, motion: Motion, u: Array, here: Here) -> tuple[Array, Array, Array, tuple[()]]:
         pose, chart, width = here.pose, here.chart, len(motion.noises)
         ground = jnp.zeros(here.joint.landmarks.shape[1], pose.dtype)
         moved = motion.step(pose, u, jnp.zeros(width, pose.dtype))
@@ -61,7 +64,7 @@ def unscented(alpha: float | None = None) -> Linearizer:
             start, _ = chart.retract(pose, ground, xi[:3], ground)
             return chart.local(moved, ground, motion.step(start, u, xi[3:]), ground)[0]
 
-        by = fit(f, jax.scipy.linalg.block_diag(root, root_noise))
+        by = self._fit(f, jax.scipy.linalg.block_diag(root, root_noise))
         by_pose = by_variables(by.slope[:, :3], root)
         noise = linalg.matmul(by.slope[:, 3:], by.slope[:, 3:].T) + by.rest
         if chart.basis is not None:
@@ -70,7 +73,7 @@ def unscented(alpha: float | None = None) -> Linearizer:
             noise = after @ noise @ after.T
         return moved, by_pose, noise, ()
 
-    def observe_at(sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
+    def observe(self, sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
         pose, landmark, chart = here.pose, here.landmark, here.chart
         root = _root(here.cov)
         centre = sensor.observe(pose, landmark)
@@ -80,7 +83,7 @@ def unscented(alpha: float | None = None) -> Linearizer:
                 sensor.observe(*chart.retract(pose, landmark, xi[:3], xi[3:])), centre
             )
 
-        by = fit(h, root)
+        by = self._fit(h, root)
         slope = by_variables(by.slope, root)
         by_pose, by_landmark = slope[:, :3], slope[:, 3:]
         if chart.basis is not None:
@@ -90,7 +93,9 @@ def unscented(alpha: float | None = None) -> Linearizer:
             by_pose = (by_pose - by_landmark @ basis.cross) @ linalg.inverse(basis.pose)
         return centre + by.mean, by_pose, by_landmark, by.rest
 
-    def invert_at(sensor: Sensor, z: Array, tag: Array, here: Here) -> tuple[Array, Array, Array]:
+    def invert(
+        self, sensor: Sensor, z: Array, tag: Array, here: Here
+    ) -> tuple[Array, Array, Array]:
         pose, chart, size_z = here.pose, here.chart, z.shape[0]
         mean, cov_s = (jnp.asarray(part, z.dtype) for part in sensor.free)
         centre = sensor.invert(pose, z, mean)
@@ -103,7 +108,7 @@ def unscented(alpha: float | None = None) -> Linearizer:
             landmark = sensor.invert(seen_from, z + xi[3 : 3 + size_z], mean + xi[3 + size_z :])
             return chart.local(pose, centre, seen_from, landmark)[1]
 
-        by = fit(g, jax.scipy.linalg.block_diag(root, *own_roots))
+        by = self._fit(g, jax.scipy.linalg.block_diag(root, *own_roots))
         by_pose = by_variables(by.slope[:, :3], root)
         own = linalg.matmul(by.slope[:, 3:], by.slope[:, 3:].T) + by.rest
         if chart.basis is not None:
@@ -113,15 +118,9 @@ def unscented(alpha: float | None = None) -> Linearizer:
             by_pose = (basis.cross + by_pose) @ linalg.inverse(basis.pose)
         return centre, by_pose, own
 
-    return Linearizer(
-        name="unscented",
-        init=lambda pose, landmarks: (),
-        motion=motion_at,
-        observe=observe_at,
-        invert=invert_at,
-        born=lambda joint, born: joint.lin,
-        iterates=False,
-    )
+    def _fit(self, f: Callable[[Array], Array], root: Array) -> Regression:
+        alpha = _spread(root) if self.alpha is None else jnp.asarray(self.alpha, root.dtype)
+        return regress(f, root, alpha)
 
 
 def regress(f: Callable[[Array], Array], root: Array, alpha: float | Array) -> Regression:

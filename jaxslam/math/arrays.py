@@ -17,6 +17,8 @@ from jaxtyping import Float, PyTree
 _T = TypeVar("_T")
 
 Scalar = Float[Array, ""]
+Number = float | Array
+"""of Python, or an array ()"""
 Pose = Float[Array, "3"]
 """(x, y, θ) [m, m, rad]; θ in (-π, π] where a pose is returned"""
 Point = Float[Array, "2"]

@@ -13,7 +13,7 @@ from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
 from jaxslam import programs
-from jaxslam.charts.euclidean import euclidean
+from jaxslam.charts.euclidean import Euclidean
 from jaxslam.consistency import monitor_of
 from jaxslam.core.numbers import check_covariance, is_concrete
 from jaxslam.logs.tables import split_unit
@@ -163,7 +163,7 @@ def check_fits(name: str, candidate: Candidate, scenario: Scenario) -> None:
                 ) from None
             raise ValueError(
                 f"monte_carlo: expected {name} to be a function of the truth alone; an estimator "
-                "of (log, key), as from smoothing.smooth, is given as lambda truth: estimator"
+                "of (log, key), as from smoothing.Smoother, is given as lambda truth: estimator"
             ) from None
         return
     for what, taken, given in (
@@ -213,7 +213,7 @@ def estimator_of(candidate: Candidate, truth: Truth, scenario: Scenario) -> tupl
     """
     method = candidate if isinstance(candidate, Filter) else _of_truth(candidate, truth)
     if not isinstance(method, Filter):
-        return method, euclidean()
+        return method, Euclidean()
     check_fits(method.name, method, scenario)
 
     def gained(state: PyTree) -> jax.Array | None:

@@ -3,22 +3,22 @@
 `call` runs a function of records of functions (a filter, a scenario) and arrays. Within a trace it
 is the plain call. Outside, three steps lead to the program, each skipped where possible:
 
-1. The same objects and the same shapes as before: the program is known. Nothing is traced.
-2. The function is traced to a jaxpr. What a factory closed over (noises, maps, mounts, gates,
-   priors) is in it as constants and literals; `hoisting` turns them into inputs. The rest is the
-   structure.
+1. The same structure and the same shapes as before: the program is known. Nothing is traced.
+2. The function is traced to a jaxpr. The numbers of records are its inputs. What a plain function
+   closed over is in it as constants and literals; `hoisting` turns them into inputs. The rest is
+   the structure.
 3. The structure is lowered. If the same text was compiled before, that program is used; else XLA
    compiles it.
 
-So another noise, map or gate of the same shapes costs tracing alone. An integer, and a number that
-`hoisting` leaves in the structure (0, ±1, ±π …), costs one compilation for each value.
+So another noise, map or gate of the same shapes costs nothing, another plain function that differs
+in numbers costs tracing alone. An integer in it, and a number that `hoisting` leaves in the
+structure (0, ±1, ±π …), costs one compilation for each value.
 
 The programs least recently used are dropped beyond `ROOM`, and half of them where they have taken
 half of the memory maps that Linux grants a process: a program has some hundred. `clear` drops all.
 Concurrent threads that need the same program compile it once: the others wait.
 """
 
-import functools
 import hashlib
 import threading
 import weakref
@@ -34,6 +34,7 @@ from jax._src import config as jax_config
 from jax._src import core as jax_core
 from jaxtyping import PyTree
 
+from jaxslam.core.record import is_record, record, static
 from jaxslam.math.xla import hot_options
 from jaxslam.programs.hoisting import hoisted
 
@@ -109,17 +110,31 @@ def clear() -> None:
         kept.clear()
 
 
+@record
+class _Option:
+    """An argument that is part of the structure."""
+
+    value: Hashable = static()
+
+
 class Same:
     """An object as a key, compared by identity and kept alive."""
 
     def __init__(self, what: PyTree) -> None:
-        self._what = what
+        self.what = what
 
     def __hash__(self) -> int:
-        return id(self._what)
+        return id(self.what)
 
     def __eq__(self, other: object) -> bool:
-        return isinstance(other, Same) and self._what is other._what
+        return isinstance(other, Same) and self.what is other.what
+
+
+def _held(each: PyTree) -> PyTree:
+    """The object that an argument of a program stands for."""
+    if not isinstance(each, _Option):
+        return each
+    return each.value.what if isinstance(each.value, Same) else each.value
 
 
 def call(function: Callable[..., _T], objects: tuple[PyTree, ...], *arguments: PyTree) -> _T:
@@ -129,19 +144,26 @@ def call(function: Callable[..., _T], objects: tuple[PyTree, ...], *arguments: P
 
     Args:
         function: pure; not a lambda created at each call, which would be traced at each call.
-        objects: the first arguments of the function: records of functions, options. The same
-            objects are not traced again; they are kept alive.
+        objects: the first arguments of the function: records and options. The numbers of records
+            are arguments of the program. Integers and strings are compared by value, all else by
+            identity, and kept alive.
         arguments: trees of arrays.
     """
-    if not outside(arguments) or jax_config.disable_jit.value:
+    if not outside(arguments, objects) or jax_config.disable_jit.value:
         return function(*objects, *arguments)
-    leaves, tree = jax.tree.flatten(arguments)
+    held = tuple(
+        each if is_record(each) else _Option(each if isinstance(each, int | str) else Same(each))
+        for each in objects
+    )
+    leaves, tree = jax.tree.flatten((held, arguments))
     leaves = [leaf if isinstance(leaf, jax.Array) else on_device(leaf) for leaf in leaves]
     shapes = tuple(map(_shape_of, leaves))
-    key = (Same(function), *map(Same, objects), tree, shapes, context())
-    run, numbers, out = _BY_OBJECTS.get(
-        key, lambda: _program(functools.partial(function, *objects), tree, shapes)
-    )
+
+    def with_objects(held: tuple[PyTree, ...], arguments: PyTree) -> _T:
+        return function(*map(_held, held), *arguments)
+
+    key = Same(function), tree, shapes, context()
+    run, numbers, out = _BY_OBJECTS.get(key, lambda: _program(with_objects, tree, shapes))
     if numbers is None:  # it closes over tracers
         return function(*objects, *arguments)
     return cast(_T, jax.tree.unflatten(out, run(numbers, *leaves)))

@@ -8,13 +8,14 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.core.numbers import is_concrete
+from jaxslam.math.arrays import Number
 from jaxslam.math.stats import normal_quantile
 
 # Bins are counted in int32, and a pose may be anywhere.
 _FARTHEST = float(2**30)
 
 
-def kld_bound(bins: Int[Array, "*K"], error: float, confidence: float) -> Float[Array, "*K"]:
+def kld_bound(bins: Int[Array, "*K"], error: Number, confidence: float) -> Float[Array, "*K"]:
     """The number of particles that k = `bins` occupied bins require; 0 where k <= 1.
 
         n = (k-1)/(2ε) · (1 - 2/(9(k-1)) + √(2/(9(k-1))) z)³
@@ -64,7 +65,7 @@ def occupied(bins: Int[Array, "P 3"]) -> Int[Array, "P"]:
 
 
 def enough(
-    bins: Int[Array, "P 3"], least: int, error: float, confidence: float
+    bins: Int[Array, "P 3"], least: int, error: Number, confidence: float
 ) -> tuple[Int[Array, ""], Bool[Array, ""]]:
     """The sufficient number of P exchangeable draws, int32, and whether P are too few.
 

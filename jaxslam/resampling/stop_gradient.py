@@ -5,12 +5,14 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxslam.protocols import Differentiable, Resample
+from jaxslam.core.record import hold_function, record
+from jaxslam.protocols import Resample
 from jaxslam.resampling.systematic import systematic
 from jaxslam.resampling.weights import even, normalized
 
 
-def stop_gradient(resample: Resample = systematic) -> Differentiable:
+@record
+class StopGradient:
     """The stop-gradient estimator (Ścibior & Wood 2021, "Differentiable particle filtering without
     modifying the forward pass"): a copy of j has the weight
 
@@ -27,19 +29,20 @@ def stop_gradient(resample: Resample = systematic) -> Differentiable:
     are lost.
 
     A caller must not normalize these weights again: their sum is 1, but its gradient is not 0.
-
-    Args:
-        resample: how indices are drawn; unbiased, as those of `jaxslam.resampling` are.
     """
 
-    def method(
-        log_weights: Float[Array, "P"], key: Array
+    resample: Resample = systematic
+    """how indices are drawn; unbiased, as those of `jaxslam.resampling` are"""
+
+    def __post_init__(self) -> None:
+        hold_function(self, "resample", "log_weights, key")
+
+    def __call__(
+        self, log_weights: Float[Array, "P"], key: Array
     ) -> tuple[Int[Array, "P"], Float[Array, "P"]]:
         log_w, _, some = normalized(log_weights)
-        ancestor = resample(jax.lax.stop_gradient(log_weights), key)
+        ancestor = self.resample(jax.lax.stop_gradient(log_weights), key)
         chosen = jnp.where(some, log_w, 0.0)[ancestor]
         # Particles of weight zero are not drawn; the where keeps gradients of the others finite.
         chosen = jnp.where(jnp.isfinite(chosen), chosen, 0.0)
         return ancestor, even(log_weights) + (chosen - jax.lax.stop_gradient(chosen))
-
-    return method

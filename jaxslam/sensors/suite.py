@@ -63,7 +63,7 @@ class Suite(Sensor):
     A tag may occur once a part. Absent measurements are slots that are not valid.
 
         eyes = Suite([(RangeBearing(R, mount=front), 8), Part(Compass(S), 1, every=10)])
-        filter = ekf_slam(motion, eyes, capacity)
+        filter = EkfSlam(motion, eyes, capacity)
 
     The first slots of a scan are the first part's, the next ones the second's, and so on. Rows of
     z are padded with zeros to the largest measurement. As a `Sensor` it only gives the sizes of

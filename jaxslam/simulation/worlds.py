@@ -63,7 +63,7 @@ class Scenario:
     """clutter, misses, outliers and wrong labels; where given, if only as `Spurious()`, the truth
     says which landmark each measurement is of, and associations are scored."""
     filter_options: EkfOptions = field(default_factory=EkfOptions)
-    """keyword arguments of `filters.ekf_slam` that belong to the experiment: update, gate, …"""
+    """keyword arguments of `filters.EkfSlam` that belong to the experiment: update, gate, …"""
     draw: Callable[["Scenario", Array], tuple[Truth, Log]] | None = None
     """(scenario, key) -> truth, log: a world of another kind (`team_world`); None for `simulate`'s
     own."""

@@ -3,8 +3,8 @@
 Each is the graph of the log, solved along the path (`jaxslam.graphs.chain`).
 """
 
-from jaxslam.smoothing.batch_map import batch_map
-from jaxslam.smoothing.fixed_lag import fixed_lag
-from jaxslam.smoothing.smooth import smooth
+from jaxslam.smoothing.batch_map import BatchMap
+from jaxslam.smoothing.fixed_lag import FixedLag
+from jaxslam.smoothing.smooth import Smoother
 
-__all__ = ["batch_map", "fixed_lag", "smooth"]
+__all__ = ["BatchMap", "FixedLag", "Smoother"]

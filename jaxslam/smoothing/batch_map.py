@@ -1,5 +1,6 @@
 """The maximum a posteriori (MAP) path and landmarks of a log, a reference for accuracy."""
 
+import dataclasses
 import math
 from typing import NamedTuple
 
@@ -8,19 +9,18 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.core.numbers import check_count, is_concrete
+from jaxslam.core.numbers import check_count
+from jaxslam.core.record import record, static
 from jaxslam.graphs.chain.elimination import Chain
 from jaxslam.graphs.chain.gauss_newton import Iterations, optimize_chain
 from jaxslam.graphs.chain.problem import Iterate, Problem
 from jaxslam.graphs.solver.search import Ending
-from jaxslam.protocols import Associate, Estimator, Motion, Sensor
+from jaxslam.protocols import Motion, Sensor
 from jaxslam.slots import Joint
 from jaxslam.smoothing.forward_pass import (
     ForwardPass,
-    compiled_once,
-    forward_filter,
+    LogEstimator,
     log_in_one_dtype,
-    run_forward,
 )
 from jaxslam.smoothing.linearization import chain_of, noise_roots, start_of
 from jaxslam.smoothing.smooth import solution, with_singular
@@ -28,7 +28,7 @@ from jaxslam.types import Estimate, Info, Log, Trace
 
 
 class BatchSolution(NamedTuple):
-    """The `final` of the trace of `batch_map`."""
+    """The `final` of the trace of `BatchMap`."""
 
     start: Float[Array, "3"]
     """pose before the first control"""
@@ -56,32 +56,21 @@ class BatchSolution(NamedTuple):
     """a `graphs.Ending`: converged, stalled or exhausted"""
 
 
-def batch_map(
-    motion: Motion,
-    sensor: Sensor,
-    capacity: int,
-    pose: ArrayLike,
-    pose_cov: ArrayLike,
-    *,
-    iterations: int = 30,
-    tolerance: float | None = 1e-6,
-    associate: Associate | None = None,
-    gate: float | None = None,
-    births: int | None = None,
-) -> Estimator:
+@record
+class BatchMap(LogEstimator):
     """The MAP estimator: Gauss-Newton on all poses and landmarks, which minimizes `problem.cost`.
 
         ½ |x_0 ⊖ pose|²_{P0} + ½ Σ_t |w_t|²_{Q_t} + ½ Σ_{t,i} |z_ti ⊖ h(x_t, l_i)|²_{R_ti}
         with x_t = f(x_{t-1}, u_t, w_t)
 
     over x_0, w_1 … w_T and the landmarks, which have no prior. EKF-SLAM gives the initial path; its
-    smoother (`smooth`) is the first step. Each further step linearizes the models along the newest
-    path and solves for all unknowns (`eliminate`): a Gauss-Newton step is a smoother, and
+    `Smoother` is the first step. Each further step linearizes the models along the newest path and
+    solves for all unknowns (`eliminate`): a Gauss-Newton step is a smoother, and
     iterating the smoother is Gauss-Newton (Bell 1994, "The iterated Kalman smoother as a
     Gauss-Newton method", SIAM J. Optimization 4(3)). A step is shortened until the cost falls
     (Armijo). P0 and Q may be singular; O(T N²) a step.
 
-    What it returns maps (log, key) to a `Trace`: estimates with leading T, the poses at the optimum
+    It maps (log, key) to a `Trace`: estimates with leading T, the poses at the optimum
     with their covariances there (Laplace's), the map the same at every step; the infos of the
     filter, the last one `exhausted` where the batch did not converge, so that campaigns count it;
     and a `BatchSolution`. Every measurement is used that the filter fused or initialized a landmark
@@ -93,38 +82,35 @@ def batch_map(
     motion is a constraint, and the run itself says which landmark each measurement is of; the
     sparse plan of `graphs.optimize` has to know that on the host.
 
-    Args:
-        motion, sensor: the models; Jacobians come from `jax.jacfwd`. The sensor must determine its
-            landmark (K = 0), or be an absolute one.
-        capacity: landmark slots N.
-        pose, pose_cov: (3,) and (3, 3) of the robot before the first control.
-        iterations: at most so many steps.
-        tolerance: end when the next step is shorter than so many posterior standard deviations
-            (the Newton decrement), or than √eps of the dtype, 3e-4 in float32, or where steps do
-            not get shorter because of rounding. None runs all iterations in a loop of fixed
-            length, which supports reverse-mode derivatives; they are those of the optimum if the
-            search has converged.
-        associate, gate, births: of the filter, as for `ekf_slam`.
-    Raises:
-        ValueError: as `smooth` does; on a sensor with K > 0, iterations below 1, or a tolerance
-            that is not above 0.
+    Raises ValueError as `LogEstimator`; on a sensor with K > 0, iterations below 1, or a tolerance
+    that is not above 0.
     """
-    check_count("batch_map: iterations", iterations)
-    if tolerance is not None and is_concrete(tolerance) and not 0 < tolerance < math.inf:
-        raise ValueError(f"batch_map: expected a tolerance above 0, got {tolerance}")
-    filter = forward_filter(
-        motion, sensor, capacity, name="batch_map", associate=associate, gate=gate, births=births
-    )
-    if sensor.free.mean.shape[0] > 0:
-        raise ValueError(
-            f"batch_map: expected a sensor that measures all of a landmark, got {sensor.name}, "
-            f"which leaves {sensor.free.mean.shape[0]} of its parameters free"
-        )
 
-    def solve(log: Log, key: Array) -> Trace:
-        passed = run_forward(filter, log, pose, pose_cov, key)
+    _: dataclasses.KW_ONLY
+    iterations: int = static(default=30)
+    """at most so many steps"""
+    tolerance: float | None = static(default=1e-6)
+    """end when the next step is shorter than so many posterior standard deviations (the Newton
+    decrement), or than √eps of the dtype, 3e-4 in float32, or where steps do not get shorter
+    because of rounding. None runs all iterations in a loop of fixed length, which supports
+    reverse-mode derivatives; they are those of the optimum if the search has converged"""
+
+    def __post_init__(self) -> None:
+        check_count("BatchMap: iterations", self.iterations)
+        if self.tolerance is not None and not 0 < self.tolerance < math.inf:
+            raise ValueError(f"BatchMap: expected a tolerance above 0, got {self.tolerance}")
+        super().__post_init__()
+        free = self.sensor.free.mean.shape[0]
+        if free > 0:
+            raise ValueError(
+                "BatchMap: expected a sensor that measures all of a landmark, got "
+                f"{self.sensor.name}, which leaves {free} of its parameters free"
+            )
+
+    def solve(self, log: Log, key: Array) -> Trace:
+        motion, sensor, passed = self.motion, self.sensor, self._forward(log, key)
         log = log_in_one_dtype(log)
-        problem, start, chain = _problem_of(motion, sensor, passed, log, pose, pose_cov)
+        problem, start, chain = _problem_of(motion, sensor, passed, log, self.pose, self.pose_cov)
         search = optimize_chain(
             motion,
             sensor,
@@ -132,15 +118,13 @@ def batch_map(
             start,
             chain,
             passed.trace.final.alive,
-            iterations=iterations,
-            tolerance=tolerance,
+            iterations=self.iterations,
+            tolerance=self.tolerance,
         )
         estimate, solved = _solved(sensor, search, passed)
         info = with_singular(passed.trace.info, problem.used)
-        info = info if tolerance is None else _with_exhausted(info, search.ending)
+        info = info if self.tolerance is None else _with_exhausted(info, search.ending)
         return Trace(estimate, info, solved, None)
-
-    return compiled_once(filter, pose, pose_cov, solve)
 
 
 def _problem_of(

@@ -8,8 +8,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxslam import validation
+from jaxslam.association.known import Known
+from jaxslam.charts.euclidean import Euclidean
 from jaxslam.core.numbers import check_count
-from jaxslam.filters.ekf.ekf_slam import ekf_slam
+from jaxslam.core.record import hold_function, record, static
+from jaxslam.filters.ekf.ekf_slam import EkfSlam
+from jaxslam.filters.ekf.settings import check_ekf_options
 from jaxslam.graphs.chain.window import (
     WindowIterate,
     WindowPrior,
@@ -21,6 +25,7 @@ from jaxslam.graphs.chain.window import (
     solve_window,
 )
 from jaxslam.math import linalg
+from jaxslam.math.arrays import Number
 from jaxslam.protocols import Associate, Filter, Motion, Sensor
 from jaxslam.sensors.suite import Suite
 from jaxslam.slots import Joint
@@ -30,7 +35,7 @@ POINT = ("x [m]", "y [m]")
 
 
 class WindowState(NamedTuple):
-    """The state of `fixed_lag`."""
+    """The state of `FixedLag`."""
 
     joint: Joint
     """the newest pose and the map"""
@@ -41,19 +46,8 @@ class WindowState(NamedTuple):
     """the path in the window, and the map"""
 
 
-def fixed_lag(
-    motion: Motion,
-    sensor: Sensor,
-    capacity: int,
-    places: int,
-    *,
-    window: int = 5,
-    first_estimates: bool = False,
-    iterations: int = 2,
-    associate: Associate | None = None,
-    gate: float | None = None,
-    births: int | None = None,
-) -> Filter:
+@record
+class FixedLag(Filter):
     """Fixed-lag smoothing SLAM: Gauss-Newton over the last `window` motions and scans, and the map.
 
     At each scan EKF-SLAM predicts, associates, gates and starts landmarks; then the poses of the
@@ -67,92 +61,122 @@ def fixed_lag(
     becomes certain without reason. With first_estimates Jacobians by a variable of the prior are
     taken where that was linearized, and there are three (Dong-Si & Mourikis 2011, "Motion tracking
     with fixed-lag smoothing: algorithm and consistency analysis", ICRA). A window as long as the
-    log marginalizes nothing: then the newest pose and the map are those of `batch_map`.
+    log marginalizes nothing: then the newest pose and the map are those of `BatchMap`.
 
     A measurement with a singular R is dropped as `Status.SINGULAR`. Where the numbers of the window
     are not finite (it is optimized without step control), it begins anew from the EKF-SLAM's state,
     and `exhausted` is set. O(W N²) for the window, and
     O(N³) for the prior, an iteration.
 
-    Args:
-        motion, sensor: the models; Jacobians come from `jax.jacfwd`. A measurement must determine
-            its landmark and have as many numbers (K = 0, Z = L).
-        capacity: landmark slots N.
-        places: most measurement slots M of a scan; the window stores scans.
-        window: motions and scans W that are optimized.
-        first_estimates: as above; for landmarks that are points (x, y).
-        iterations: Gauss-Newton steps at each scan.
-        associate, gate, births: of the EKF-SLAM, as for `ekf_slam`. NIS is that of its innovations.
-    Raises:
-        ValueError: as `ekf_slam` does; on a sensor of another kind, and on a places, window or
-            iterations below 1; from `update`, on a scan of more measurement slots.
+    Raises ValueError as `EkfSlam` does; on a sensor of another kind, and on a slots, window or
+    iterations below 1; from `update`, on a scan of more measurement slots.
     """
-    validation.check_models("fixed_lag", motion, sensor)
-    ekf = ekf_slam(
-        motion, sensor, capacity, associate=associate, update="joint", gate=gate, births=births
-    )
-    numbers = len(sensor.measurements), len(sensor.landmark)
-    free = sensor.free.mean.shape[0]
-    if isinstance(sensor, Suite) or sensor.reduced is not None or free or numbers[0] != numbers[1]:
-        raise ValueError(
-            "fixed_lag: expected one sensor whose measurement determines its landmark by as many "
-            f"numbers as it has, got {sensor.name}"
-        )
-    if first_estimates and sensor.landmark != POINT:
-        raise ValueError(
-            f"fixed_lag: expected landmarks (x, y) for first_estimates, got {sensor.landmark}"
-        )
-    for name, value in (("places", places), ("window", window), ("iterations", iterations)):
-        check_count(f"fixed_lag: {name}", value)
 
-    def init(pose: Array, pose_cov: Array) -> WindowState:
-        return begun(ekf.init(pose, pose_cov))
+    motion: Motion
+    sensor: Sensor
+    """the models; Jacobians come from `jax.jacfwd`. A measurement must determine its landmark and
+    have as many numbers (K = 0, Z = L)"""
+    capacity: int = static()
+    """landmark slots N"""
+    slots: int = static()
+    """most measurement slots M of a scan; the window stores scans"""
+    _: dataclasses.KW_ONLY
+    window: int = static(default=5)
+    """motions and scans W that are optimized"""
+    first_estimates: bool = static(default=False)
+    """as above; for landmarks that are points (x, y)"""
+    iterations: int = static(default=2)
+    """Gauss-Newton steps at each scan"""
+    associate: Associate = Known()
+    gate: Number | None = None
+    births: int | None = static(default=None)
+    """these three of the EKF-SLAM, as for `EkfSlam`. NIS is that of its innovations"""
+    chart = Euclidean()
 
-    def begun(joint: Joint) -> WindowState:
-        return empty_window(joint, (len(motion.controls), len(motion.noises)), (window, places))
+    def __post_init__(self) -> None:
+        name, sensor = type(self).__name__, self.sensor
+        validation.check_models(name, self.motion, sensor)
+        validation.check_parts(name, associate=self.associate)
+        hold_function(self, "associate", "prediction, scan")
+        check_ekf_options(name, self.capacity, "joint", self.gate, self.iterations, self.births)
+        same = len(sensor.measurements) == len(sensor.landmark)
+        several = isinstance(sensor, Suite) or sensor.reduced is not None
+        if several or sensor.free.mean.shape[0] or not same:
+            raise ValueError(
+                f"{name}: expected one sensor whose measurement determines its landmark by as many "
+                f"numbers as it has, got {sensor.name}"
+            )
+        if self.first_estimates and sensor.landmark != POINT:
+            raise ValueError(
+                f"{name}: expected landmarks (x, y) for first_estimates, got {sensor.landmark}"
+            )
+        check_count(f"{name}: slots", self.slots)
+        check_count(f"{name}: window", self.window)
+        super().__post_init__()
 
-    def predict(state: WindowState, u: Array, key: Array) -> WindowState:
-        joint = ekf.predict(state.joint, u, key)
+    @property
+    def landmark(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self.sensor.landmark
+
+    def init(self, pose: Array, pose_cov: Array) -> WindowState:
+        return self._begun(self._ekf.init(pose, pose_cov))
+
+    def predict(self, state: WindowState, u: Array, key: Array) -> WindowState:
+        motion, joint = self.motion, self._ekf.predict(state.joint, u, key)
         system = linearize_window(
-            motion, sensor, state.prior, state.steps, state.at, first_estimates
+            motion, self.sensor, state.prior, state.steps, state.at, self.first_estimates
         )
         prior = marginalize_oldest(state.prior, system, state.steps, state.at, joint.tag)
-        state = finite_or(state._replace(prior=prior), begun(state.joint))
+        state = finite_or(state._replace(prior=prior), self._begun(state.joint))
         root = linalg.root_psd(motion.noise_cov(state.joint.pose, u))
         steps, at = shift(state.steps, state.at, u, root, joint.pose)
         return WindowState(joint, state.prior, steps, at)
 
-    def update(state: WindowState, scan: Scan, key: Array) -> tuple[WindowState, Info]:
-        if scan.z.shape[0] > places:
+    def update(self, state: WindowState, scan: Scan, key: Array) -> tuple[WindowState, Info]:
+        motion, sensor = self.motion, self.sensor
+        if scan.z.shape[0] > self.slots:
             raise ValueError(
-                f"fixed_lag: expected scans of at most {places} measurement slots, as `places` "
+                f"FixedLag: expected scans of at most {self.slots} measurement slots, as `slots` "
                 f"says, got {scan.z.shape[0]}"
             )
         # The window weights by R⁻¹.
         regular = jax.vmap(lambda z: linalg.cholesky(sensor.noise_cov(z))[1])(scan.z)
         lost = scan.valid & ~regular
-        joint, info = ekf.update(state.joint, scan._replace(valid=scan.valid & regular), key)
+        kept = scan._replace(valid=scan.valid & regular)
+        joint, info = self._ekf.update(state.joint, kept, key)
         status = jnp.where(lost, jnp.int32(Status.SINGULAR), info.status)
         info = info._replace(status=status.astype(info.status.dtype))
         steps = with_scan(state.steps, scan, info)
         born = joint.alive & ~state.joint.alive
         landmarks = jnp.where(born[:, None], joint.landmarks, state.at.landmarks)
         at = state.at._replace(landmarks=landmarks)
-        for _ in range(iterations):
-            system = linearize_window(motion, sensor, state.prior, steps, at, first_estimates)
+        for _ in range(self.iterations):
+            system = linearize_window(motion, sensor, state.prior, steps, at, self.first_estimates)
             solved = solve_window(state.prior, system, at, joint.alive)
             at = moved_by(motion, steps, at, solved)
         newest = with_newest(joint, at, newest_cov(system, solved))
         after = WindowState(newest, state.prior, steps, at)
         exhausted = jnp.asarray(info.exhausted) | ~is_finite(after)
-        return finite_or(after, begun(joint)), info._replace(exhausted=exhausted)
+        return finite_or(after, self._begun(joint)), info._replace(exhausted=exhausted)
 
-    def estimate(state: WindowState) -> Estimate:
-        return ekf.estimate(state.joint)
+    def estimate(self, state: WindowState) -> Estimate:
+        return self._ekf.estimate(state.joint)
 
-    return dataclasses.replace(
-        ekf, name="fixed_lag", init=init, predict=predict, update=update, estimate=estimate
-    )
+    @property
+    def _ekf(self) -> EkfSlam:
+        return EkfSlam(
+            self.motion,
+            self.sensor,
+            self.capacity,
+            associate=self.associate,
+            correction="joint",
+            gate=self.gate,
+            births=self.births,
+        )
+
+    def _begun(self, joint: Joint) -> WindowState:
+        sizes = len(self.motion.controls), len(self.motion.noises)
+        return empty_window(joint, sizes, (self.window, self.slots))
 
 
 def empty_window(joint: Joint, sizes: tuple[int, int], shape: tuple[int, int]) -> WindowState:

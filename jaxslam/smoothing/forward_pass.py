@@ -9,8 +9,13 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxslam import programs, validation
-from jaxslam.filters.ekf.ekf_slam import ekf_slam
-from jaxslam.protocols import Associate, Estimator, Filter, Motion, Sensor
+from jaxslam.association.known import Known
+from jaxslam.core.numbers import held_array
+from jaxslam.core.record import hold_function, record, set_field, static
+from jaxslam.filters.ekf.ekf_slam import EkfSlam
+from jaxslam.filters.ekf.settings import check_ekf_options
+from jaxslam.math.arrays import Number
+from jaxslam.protocols import Associate, Component, Filter, Motion, Sensor, Wrapper
 from jaxslam.run import check_run, run
 from jaxslam.sensors.suite import Suite
 from jaxslam.slots import Joint
@@ -42,82 +47,104 @@ class _State(NamedTuple):
     predicted_map: Array
 
 
-def forward_filter(
-    motion: Motion,
-    sensor: Sensor,
-    capacity: int,
-    *,
-    name: str,
-    associate: Associate | None = None,
-    gate: float | None = None,
-    births: int | None = None,
-) -> Filter:
-    """The EKF-SLAM of a forward pass: joint correction, Euclidean chart, state `_State`.
+@record
+class _Forward(Wrapper):
+    """The EKF-SLAM of a forward pass, which keeps its linearization points; state `_State`."""
 
-    Raises ValueError as `ekf_slam` does, and for sensors that the smoother does not support: a
-    suite, landmarks that become points, or landmarks with parameters that are exact given the pose
-    (the anchor of a ray).
-    """
-    validation.check_models(name, motion, sensor)
-    validation.check_parts(name, associate=associate)
-    if isinstance(sensor, Suite) or sensor.reduced is not None:
-        raise ValueError(
-            f"{name}: expected one sensor of landmarks, not a suite or landmarks that are "
-            f"converted to points, got {sensor.name}"
-        )
-    if len(sensor.landmark) > len(sensor.measurements) + sensor.free.mean.shape[0]:
-        raise ValueError(
-            f"{name}: expected landmarks that measurement and prior determine, got "
-            f"{sensor.landmark} of {sensor.name}"
-        )
-    ekf = ekf_slam(
-        motion, sensor, capacity, associate=associate, update="joint", gate=gate, births=births
-    )
+    filter: Filter
 
-    def init(pose: Array, pose_cov: Array) -> _State:
-        joint = ekf.init(pose, pose_cov)
+    def init(self, pose: Array, pose_cov: Array) -> _State:
+        joint = self.filter.init(pose, pose_cov)
         return _State(joint, pose, pose, joint.landmarks)
 
-    def predict(state: _State, u: Array, key: Array) -> _State:
-        joint = ekf.predict(state.joint, u, key)
+    def predict(self, state: _State, u: Array, key: Array) -> _State:
+        joint = self.filter.predict(state.joint, u, key)
         return _State(joint, state.joint.pose, joint.pose, joint.landmarks)
 
-    def update(state: _State, scan: Scan, key: Array) -> tuple[_State, Info]:
-        joint, info = ekf.update(state.joint, scan, key)
+    def update(self, state: _State, scan: Scan, key: Array) -> tuple[_State, Info]:
+        joint, info = self.filter.update(state.joint, scan, key)
         return state._replace(joint=joint), info
 
-    def estimate(state: _State) -> Estimate:
-        return ekf.estimate(state.joint)
-
-    return dataclasses.replace(
-        ekf, name=name, init=init, predict=predict, update=update, estimate=estimate
-    )
+    def estimate(self, state: _State) -> Estimate:
+        return self.filter.estimate(state.joint)
 
 
-def run_forward(
-    filter: Filter, log: Log, pose: ArrayLike, pose_cov: ArrayLike, key: Array
-) -> ForwardPass:
-    """The forward pass of a `forward_filter`; arguments and errors are those of `run`."""
+@record
+class LogEstimator(Component):
+    """What estimators of a whole log share: models, start, and the EKF-SLAM of the forward pass.
 
-    def linearized_at(state: _State) -> tuple[Array, ...]:
-        joint = state.joint
-        return state.before, state.predicted, state.predicted_map, joint.pose, joint.landmarks
+    A subclass is a record that defines `solve`. Called with (log, key) it gives a `Trace`. Raises
+    ValueError as `EkfSlam` does, and for sensors that it does not support: a suite, landmarks that
+    become points, or landmarks with parameters that are exact given the pose (the anchor of a ray);
+    and, when called, as `run` does.
+    """
 
-    trace = run(filter, log, pose, pose_cov, key, probe=linearized_at)
-    return ForwardPass(trace._replace(final=trace.final.joint, probe=None), *trace.probe)
+    motion: Motion
+    sensor: Sensor
+    """the models; Jacobians come from `jax.jacfwd`"""
+    capacity: int = static()
+    """landmark slots N"""
+    pose: ArrayLike = dataclasses.field()
+    """(3,) of the robot before the first control"""
+    pose_cov: ArrayLike = dataclasses.field()
+    """(3, 3)"""
+    _: dataclasses.KW_ONLY
+    associate: Associate = Known()
+    gate: Number | None = None
+    births: int | None = static(default=None)
+    """these three of the filter, as for `EkfSlam`"""
 
+    def __post_init__(self) -> None:
+        name, sensor = type(self).__name__, self.sensor
+        validation.check_models(name, self.motion, sensor)
+        validation.check_parts(name, associate=self.associate)
+        hold_function(self, "associate", "prediction, scan")
+        if isinstance(sensor, Suite) or sensor.reduced is not None:
+            raise ValueError(
+                f"{name}: expected one sensor of landmarks, not a suite or landmarks that are "
+                f"converted to points, got {sensor.name}"
+            )
+        if len(sensor.landmark) > len(sensor.measurements) + sensor.free.mean.shape[0]:
+            raise ValueError(
+                f"{name}: expected landmarks that measurement and prior determine, got "
+                f"{sensor.landmark} of {sensor.name}"
+            )
+        for field in ("pose", "pose_cov"):
+            set_field(self, field, held_array(getattr(self, field)))
+        check_ekf_options(name, self.capacity, "joint", self.gate, 1, self.births)
+        self._check(LogEstimator, {"solve": "log, key"})
 
-def compiled_once(
-    filter: Filter, pose: ArrayLike, pose_cov: ArrayLike, solve: Estimator
-) -> Estimator:
-    """The estimator that checks its arguments as `run` does, under its own name, and calls `solve`,
-    compiled as `run` is."""
+    def solve(self, log: Log, key: Array) -> Trace:
+        """The estimates of a checked log."""
+        raise NotImplementedError
 
-    def estimator(log: Log, key: Array) -> Trace:
-        check_run(filter.name, filter, log, pose, pose_cov)
-        return programs.call(solve, (), log, key)
+    def __call__(self, log: Log, key: Array) -> Trace:
+        check_run(self.name, self._filter, log, self.pose, self.pose_cov)
+        return programs.call(type(self).solve, (self,), log, key)
 
-    return estimator
+    @property
+    def _filter(self) -> Filter:
+        """EKF-SLAM with joint correction in the Euclidean chart."""
+        ekf = EkfSlam(
+            self.motion,
+            self.sensor,
+            self.capacity,
+            associate=self.associate,
+            correction="joint",
+            gate=self.gate,
+            births=self.births,
+        )
+        return _Forward(ekf)
+
+    def _forward(self, log: Log, key: Array) -> ForwardPass:
+        """The forward pass; arguments and errors are those of `run`."""
+
+        def linearized_at(state: _State) -> tuple[Array, ...]:
+            joint = state.joint
+            return state.before, state.predicted, state.predicted_map, joint.pose, joint.landmarks
+
+        trace = run(self._filter, log, self.pose, self.pose_cov, key, probe=linearized_at)
+        return ForwardPass(trace._replace(final=trace.final.joint, probe=None), *trace.probe)
 
 
 def log_in_one_dtype(log: Log) -> Log:

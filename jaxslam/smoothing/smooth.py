@@ -4,22 +4,20 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from jaxslam.charts.euclidean import euclidean
+from jaxslam.charts.euclidean import Euclidean
+from jaxslam.core.record import record
 from jaxslam.filters.ekf.coordinates.map_coordinates import estimate_of
 from jaxslam.graphs.chain.elimination import Chain, Policy, eliminate
 from jaxslam.graphs.chain.marginals import chain_marginals
 from jaxslam.math.angles import wrap
-from jaxslam.protocols import Associate, Estimator, Motion, Sensor
+from jaxslam.protocols import Sensor
 from jaxslam.slots import Joint
 from jaxslam.smoothing.forward_pass import (
     ForwardPass,
-    compiled_once,
-    forward_filter,
+    LogEstimator,
     log_in_one_dtype,
-    run_forward,
 )
 from jaxslam.smoothing.linearization import chain_of, noise_roots
 from jaxslam.types import Estimate, Info, Log, Status, Trace
@@ -39,18 +37,9 @@ class Smoothed(NamedTuple):
     """with leading T, of the filter"""
 
 
-def smooth(
-    motion: Motion,
-    sensor: Sensor,
-    capacity: int,
-    pose: ArrayLike,
-    pose_cov: ArrayLike,
-    *,
-    associate: Associate | None = None,
-    gate: float | None = None,
-    births: int | None = None,
-) -> Estimator:
-    """The Rauch-Tung-Striebel smoother of `ekf_slam(update="joint")`, without D×D matrices.
+@record
+class Smoother(LogEstimator):
+    """The Rauch-Tung-Striebel smoother of `EkfSlam(correction="joint")`, without D×D matrices.
 
     p(x_t | all scans) of the linear system of the EKF: the Jacobians are those of the filter, so
     the last pose and the map equal the filter's, to rounding, and every earlier pose uses the later
@@ -60,40 +49,28 @@ def smooth(
     `eliminate` gives the same numbers from the Jacobians alone, O(T N²). A landmark has no
     prior: its initialization is a measurement of it.
 
-    What it returns maps (log, key) to a `Trace`: estimates with leading T, the poses smoothed and
+    It maps (log, key) to a `Trace`: estimates with leading T, the poses smoothed and
     the final map at every step; the filter's infos, in which measurements of singular noise, which
     the smoother cannot use, become `Status.SINGULAR`; and a `Smoothed`.
 
-        estimator = smooth(world.motion, world.sensor, 20, world.pose, world.pose_cov)
+        estimator = Smoother(world.motion, world.sensor, 20, world.pose, world.pose_cov)
         trace = estimator(log, jax.random.key(0))
 
-    Args:
-        motion, sensor: the models; Jacobians come from `jax.jacfwd`.
-        capacity: landmark slots N.
-        pose, pose_cov: (3,) and (3, 3) of the robot before the first control.
-        associate, gate, births: of the filter, as for `ekf_slam`.
-    Raises:
-        ValueError: as `ekf_slam` does; for a suite, landmarks that become points, or landmarks with
-            parameters that are neither measured nor have a prior (rays); and, when called, as
-            `run` does.
+    Raises ValueError as `LogEstimator`.
     """
-    filter = forward_filter(
-        motion, sensor, capacity, name="smooth", associate=associate, gate=gate, births=births
-    )
 
-    def solve(log: Log, key: Array) -> Trace:
-        passed = run_forward(filter, log, pose, pose_cov, key)
+    def solve(self, log: Log, key: Array) -> Trace:
+        passed = self._forward(log, key)
         log = log_in_one_dtype(log)
-        mean, cov = (jnp.asarray(given, log.control.dtype) for given in (pose, pose_cov))
-        roots = noise_roots(motion, passed, log.control)
-        chain, used = chain_of(motion, sensor, passed, log, cov, roots)
+        kind = log.control.dtype
+        mean, cov = jnp.asarray(self.pose, kind), jnp.asarray(self.pose_cov, kind)
+        roots = noise_roots(self.motion, passed, log.control)
+        chain, used = chain_of(self.motion, self.sensor, passed, log, cov, roots)
         final = passed.trace.final
         policy = eliminate(chain, final.alive)
         path = jnp.concatenate([mean[None], passed.corrected])
-        estimate, smoothed = solution(sensor, chain, policy, path, final, passed)
+        estimate, smoothed = solution(self.sensor, chain, policy, path, final, passed)
         return Trace(estimate, with_singular(passed.trace.info, used), smoothed, None)
-
-    return compiled_once(filter, pose, pose_cov, solve)
 
 
 def solution(
@@ -110,7 +87,7 @@ def solution(
     poses = poses.at[:, 2].set(wrap(poses[:, 2]))
     landmarks = jnp.where(joint.alive[:, None], joint.landmarks + policy.landmarks, 0.0)
     last = joint._replace(pose=poses[-1], landmarks=landmarks, cov=found.cov)
-    at_end = estimate_of(last, sensor, euclidean())
+    at_end = estimate_of(last, sensor, Euclidean())
     steps = path.shape[0] - 1
     always = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (steps, *leaf.shape)), at_end)
     estimate = always._replace(pose=poses[1:], pose_cov=found.covs[1:])

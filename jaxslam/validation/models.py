@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.protocols import Chart, Linearizer, Motion, Sensor, unfit_signature
+from jaxslam.protocols import Chart, Life, Linearizer, Motion, Sensor, unfit_signature
 
 _Shape = tuple[int, ...]
 _Record = TypeVar("_Record")
@@ -72,18 +72,20 @@ def check_sensor(name: str, sensor: object) -> None:
 
 def check_parts(
     name: str,
-    *,
     chart: object = None,
     linearize: object = None,
     associate: object = None,
+    life: object = None,
 ) -> None:
-    """Raise ValueError unless each part has its type; None stands for the default."""
+    """Raise ValueError unless each part has its type; one that is None is absent."""
     if chart is not None:
         check_record(name, "chart", chart, Chart)
     if linearize is not None:
         check_record(name, "linearize", linearize, Linearizer)
     if associate is not None:
         check_associate(name, associate)
+    if life is not None:
+        check_record(name, "life", life, Life)
 
 
 def check_record(name: str, what: str, value: object, kind: type[_Record]) -> _Record:
@@ -112,12 +114,10 @@ def check_associate(name: str, associate: object) -> None:
             f"{name}: expected associate to be a function of (prediction, scan), got "
             f"{type(associate).__name__}"
         )
-    called = getattr(associate, "__qualname__", "")
-    ours = getattr(associate, "__module__", "").startswith("jaxslam.association.")
-    if ours and "<locals>" not in called:
+    if isinstance(associate, type):
         raise ValueError(
-            f"{name}: expected associate to be a function of (prediction, scan), got the factory "
-            f"{called}: call it, {called}(…)"
+            f"{name}: expected associate to be a function of (prediction, scan), got the class "
+            f"{associate.__name__}: call it, {associate.__name__}(…)"
         )
     try:
         inspect.signature(associate).bind(None, None)

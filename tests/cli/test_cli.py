@@ -125,7 +125,7 @@ def test_a_filter_that_cannot_run_a_scenario_is_refused_by_name(tmp_path, refuse
     asked = ["consistency", "--scenario", "signs", "--steps", "5", "--filters", "ekf,fej"]
     parts = (
         "--filters: fej cannot run scenario 'ring'",
-        "needs landmarks (x, y), not those of range_bearing_signature: choose linearize.at_est",
+        "needs landmarks (x, y), not those of range_bearing_signature: choose linearize.AtEst",
         "those of the catalog that can: --filters ekf,ideal,iterated,ukf,",
     )
     said = refused([*asked, "--out", tmp_path], *parts)

@@ -8,6 +8,7 @@ import pytest
 
 from jaxslam import charts
 from jaxslam.cli.run.piecewise import run_in_pieces
+from jaxslam.core.record import record
 from jaxslam.filters.reporting import nothing_of
 from jaxslam.protocols import Filter
 from jaxslam.types import Estimate, Log, Scan
@@ -18,30 +19,33 @@ STEPS = 11
 def toy(traced):
     """A filter whose pose is the sum of its controls."""
 
-    def predict(pose, u, key):
-        traced.append(1)
-        return pose + u
+    @record
+    class Toy(Filter):
+        controls = ("x", "y", "theta")
+        measurements = ("x", "y")
+        chart = charts.Euclidean()
 
-    def estimate(pose):
-        return Estimate(
-            pose=pose,
-            pose_cov=jnp.outer(pose, pose),
-            points=jnp.zeros((1, 2)),
-            point_covs=jnp.zeros((1, 2, 2)),
-            alive=jnp.zeros(1, bool),
-            tag=jnp.full(1, -1),
-        )
+        def init(self, pose, pose_cov):
+            return pose
 
-    return Filter(
-        name="toy",
-        controls=("x", "y", "theta"),
-        measurements=("x", "y"),
-        init=lambda pose, pose_cov: pose,
-        predict=predict,
-        update=lambda pose, scan, key: (pose, nothing_of(scan)._replace(log_likelihood=pose[0])),
-        estimate=estimate,
-        chart=charts.euclidean(),
-    )
+        def predict(self, pose, u, key):
+            traced.append(1)
+            return pose + u
+
+        def update(self, pose, scan, key):
+            return pose, nothing_of(scan)._replace(log_likelihood=pose[0])
+
+        def estimate(self, pose):
+            return Estimate(
+                pose=pose,
+                pose_cov=jnp.outer(pose, pose),
+                points=jnp.zeros((1, 2)),
+                point_covs=jnp.zeros((1, 2, 2)),
+                alive=jnp.zeros(1, bool),
+                tag=jnp.full(1, -1),
+            )
+
+    return Toy()
 
 
 def log_of(steps=STEPS):

@@ -14,6 +14,7 @@ from jaxslam.simulation.worlds import Scenario
 MINE = """
 import dataclasses
 import jaxslam
+from jaxslam.core.record import record
 
 print("loaded")
 factor = 2.0
@@ -23,22 +24,33 @@ number = 3.0
 def short(steps=3):
     return dataclasses.replace(jaxslam.scenarios.circle(steps), name="short")
 
-def blind(scenario):
-    # Takes no measurement, and doubts its motion.
-    filter = jaxslam.filters.dead_reckoning(scenario.motion, scenario.sensor)
+@record
+class Doubting(jaxslam.filters.Wrapper):
+    name = "dead_reckoning"
 
-    def predict(state, u, key):
-        state = filter.predict(state, u, key)
+    def predict(self, state, u, key):
+        state = self.filter.predict(state, u, key)
         return state._replace(cov=factor * state.cov)
 
-    return dataclasses.replace(filter, predict=predict)
+@record
+class Untraceable(Doubting):
+    def update(self, state, scan, key):
+        return undefined(state)
+
+@record
+class Named(Doubting):
+    name = "my filter"
+
+def blind(scenario):
+    # Takes no measurement, and doubts its motion.
+    return Doubting(jaxslam.filters.DeadReckoning(scenario.motion, scenario.sensor))
 
 ready = blind(world)
 alike = lambda scenario: lambda truth: blind(scenario)
 wrong = lambda scenario: scenario.nothing
 of_two = lambda scenario, capacity: ready
-untraceable = lambda scenario: dataclasses.replace(ready, update=lambda s, scan, key: undefined(s))
-named = dataclasses.replace(ready, name="my filter")
+untraceable = lambda scenario: Untraceable(ready)
+named = Named(ready.filter)
 """
 
 
@@ -90,10 +102,10 @@ def test_a_scenario_of_a_file_may_be_a_function_of_its_steps(mine):
         ),
         (
             ["--filters", "mine.py:wrong"],
-            "mine.py:wrong: called with the scenario, it fails: mine.py:25: AttributeError: 'Scen",
+            "mine.py:wrong: called with the scenario, it fails: mine.py:37: AttributeError: 'Scen",
         ),
         (["--filters", "mine.py:of_two"], "mine.py:of_two is called with one argument: missing a"),
-        (["--filters", "mine.py:untraceable"], "mine.py:27: NameError: name 'undefined'"),
+        (["--filters", "mine.py:untraceable"], "mine.py:25: NameError: name 'undefined'"),
         (["--filters", "mine.py:blind,mine.py:blind"], "expected each name once, got blind twice"),
         (
             ["--scenario", "mine.py:number"],

@@ -7,9 +7,8 @@ import pytest
 
 from jaxslam import association, motion, run, sensors
 from jaxslam.calibration import calibrate, consider_cov
-from jaxslam.filters import ekf_slam
-from jaxslam.filters.map_management.pruning import pruning
-from jaxslam.life import recency
+from jaxslam.filters import EkfSlam
+from jaxslam.life import Recency
 from jaxslam.types import Info, Log, Scan
 
 KEY = jax.random.key(0)
@@ -26,7 +25,9 @@ def test_it_is_generalized_least_squares_where_all_is_linear():
     scan = Scan(z[:, None], np.zeros((steps, 1), np.int32), np.ones((steps, 1), bool))
 
     def info(p):
-        filter = ekf_slam(motion.PoseIncrement(Q), sensors.RelativePosition(R), 1, update="joint")
+        filter = EkfSlam(
+            motion.PoseIncrement(Q), sensors.RelativePosition(R), 1, correction="joint"
+        )
         scaled = control * jnp.concatenate([1 + p, jnp.ones(1)])[None]
         return run(filter, Log(scaled, scan), np.zeros(3), np.zeros((3, 3)), KEY).info
 
@@ -53,7 +54,9 @@ def test_a_pose_covariance_with_what_parameters_add_is_that_of_the_joint_estimat
     scan = Scan(z[:, None], np.zeros((steps, 1), np.int32), np.ones((steps, 1), bool))
 
     def trace(p):
-        filter = ekf_slam(motion.PoseIncrement(Q), sensors.RelativePosition(R), 1, update="joint")
+        filter = EkfSlam(
+            motion.PoseIncrement(Q), sensors.RelativePosition(R), 1, correction="joint"
+        )
         scaled = control * jnp.concatenate([1 + p, jnp.ones(1)])[None]
         known = np.diag([start, start, 0.0])
         return run(filter, Log(scaled, scan), np.zeros(3), known, KEY)
@@ -141,8 +144,8 @@ def test_odometry_is_calibrated_without_identities():
     logs = [drive(seed) for seed in range(4)]
     together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *logs)
     model, sensor = motion.PoseIncrement(NOISE), sensors.RelativePosition(R)
-    near, local = association.nearest(11.8), recency(patience=20)
-    filter = pruning(ekf_slam(model, sensor, 20, associate=near, update="joint"), local)
+    near, local = association.Nearest(11.8), Recency(patience=20)
+    filter = EkfSlam(model, sensor, 20, associate=near, correction="joint", life=local)
 
     def info(p):
         def one(log):

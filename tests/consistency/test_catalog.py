@@ -11,7 +11,7 @@ import worlds
 from layouts import kept_programs, wrong_layouts
 
 from jaxslam import catalog, charts, linearize, motion, sensors
-from jaxslam.filters import ekf_slam
+from jaxslam.filters import EkfSlam
 from jaxslam.protocols import Filter, Here
 from jaxslam.run import run
 from jaxslam.simulation.scenarios import SCENARIOS, loop, stationary
@@ -138,7 +138,7 @@ def test_with_points_close_together_it_is_the_ekf_of_the_same_chart(chart):
     calm = around(noise=0.01)
     options = {"chart": charts.REGISTRY[chart]()}
     first = drive_monitored(calm, "ekf", **options)
-    options |= {"linearize": linearize.unscented(1e-3)}
+    options |= {"linearize": linearize.Unscented(1e-3)}
     fitted = drive_monitored(calm, "ekf", **options)  # by a program of the catalog, where one is
     np.testing.assert_allclose(fitted.estimate.pose, first.estimate.pose, atol=2e-3)
     np.testing.assert_allclose(
@@ -222,7 +222,7 @@ def test_first_estimates_stay_where_they_were():
 def test_linearization_points_solve_the_constrained_least_squares():
     """Against a general solver of min |p* - p̂|² + Σ|l*_i - l̂_i|², l*_i - p* = d_i."""
     world, rng = loop(steps=2), np.random.default_rng(0)
-    oc = linearize.observability()
+    oc = linearize.Observability()
     init = jax.jit(catalog.FILTERS["oc"](world).init)
     joint = jax.device_get(init(np.array([1.0, 2.0, 0.3]), np.eye(3) * 0.01))
     alive = np.arange(20) < 3
@@ -233,7 +233,7 @@ def test_linearization_points_solve_the_constrained_least_squares():
     u = np.array([0.25, 0.025, 1.0])
     moved, by_pose, _, after = jax.jit(
         lambda joint: oc.motion(
-            world.motion, u, Here(joint, charts.euclidean(), joint.pose, jnp.eye(3))
+            world.motion, u, Here(joint, charts.Euclidean(), joint.pose, jnp.eye(3))
         )
     )(joint)
     # Unknown p*; l*_i = p* + d_i: stacked, each coordinate is a mean of p̂ and the l̂_i - d_i.
@@ -250,13 +250,13 @@ def test_all_variants_have_the_process_noise_of_the_standard_filter():
     world = loop(steps=2)
     u = jnp.array([0.26, 0.02, 1.0])
     noises = []
-    for make in (linearize.at_estimate, linearize.first_estimate, linearize.observability):
+    for make in (linearize.AtEstimate, linearize.FirstEstimate, linearize.Observability):
         linearizer = make()
-        filter = ekf_slam(world.motion, world.sensor, 3, linearize=linearizer)
+        filter = EkfSlam(world.motion, world.sensor, 3, linearize=linearizer)
 
         def noise(pose, filter=filter, linearizer=linearizer):
             joint = filter.init(pose, jnp.eye(3) * 0.01)
-            here = Here(joint, charts.euclidean(), joint.pose, jnp.eye(3))
+            here = Here(joint, charts.Euclidean(), joint.pose, jnp.eye(3))
             return linearizer.motion(world.motion, u, here)[2]
 
         noises.append(jax.jit(noise)(np.array([1.0, 2.0, 0.3])))
@@ -288,7 +288,7 @@ def test_gradients_are_finite_from_a_start_that_is_known_exactly(name, options):
             "sensor": sensors.RangeBearing(sigma[2] ** 2 * jnp.eye(2)),
         }
         there = dataclasses.replace(world, **models)
-        filter = catalog.FILTERS[name](there, update="joint", **options)
+        filter = catalog.FILTERS[name](there, correction="joint", **options)
         joint = filter.init(jnp.asarray(world.pose, float), jnp.zeros((3, 3)))
         lin = joint.lin._replace(landmarks=jnp.asarray(mapped)) if name == "oc" else joint.lin
         joint = joint._replace(
@@ -325,7 +325,7 @@ def test_gradients_are_finite_from_a_start_that_is_known_exactly(name, options):
         ("ekf", {}),
         ("right_invariant", {}),
         ("left_invariant", {}),
-        ("ekf", {"update": "sequential", "gate": 9.0, "births": 1}),
+        ("ekf", {"correction": "sequential", "gate": 9.0, "births": 1}),
     ],
     ids=["joint", "right", "left", "sequential"],
 )
@@ -354,7 +354,7 @@ def test_in_float32_the_square_root_survives_what_the_covariance_does_not():
     single = jax.tree.map(lambda a: a.astype("f4") if a.dtype == float else a, worlds.draw(world))
     smallest = {}
     for covariance in ("plain", "square_root"):
-        options = {"update": "joint", "covariance": covariance}
+        options = {"correction": "joint", "covariance": covariance}
         trace = drive((world, *single), "ekf", lambda state: state.cov, **options)
         cov = trace.probe.astype(float)
         cov = cov @ cov.transpose(0, 2, 1) if covariance == "square_root" else cov
@@ -404,8 +404,8 @@ def test_variants_for_points_refuse_other_landmarks(name):
 @pytest.mark.parametrize(
     ("options", "why"),
     [
-        ({"linearize": linearize.first_estimate(), "chart": charts.right_invariant()}, "Euclidean"),
-        ({"linearize": linearize.unscented(), "iterations": 2}, "does not iterate"),
+        ({"linearize": linearize.FirstEstimate(), "chart": charts.RightInvariant()}, "Euclidean"),
+        ({"linearize": linearize.Unscented(), "iterations": 2}, "does not iterate"),
         ({"covariance": "root"}, 'or "joseph" or "square_root", got \'root\''),
     ],
 )

@@ -184,11 +184,11 @@ def test_landmark_nees_and_own_coordinates():
     np.testing.assert_allclose(summary.measures["nees_landmarks"].value, nees.mean(), rtol=1e-9)
 
     own = jax.jit(
-        jax.vmap(partial(consistency.own_error_of, charts.right_invariant(), worlds.ring().sensor))
+        jax.vmap(partial(consistency.own_error_of, charts.RightInvariant(), worlds.ring().sensor))
     )
     total, steps = scored(trace, truth, own).measures["nees_own"]
     found = total / steps
-    local = jax.jit(jax.vmap(charts.right_invariant().local, (0, None, 0, None)))
+    local = jax.jit(jax.vmap(charts.RightInvariant().local, (0, None, 0, None)))
     for run in range(6):
         xi = local(trace.estimate.pose[run], np.zeros(2), truth.pose[run], np.zeros(2))[0]
         total = 0.0

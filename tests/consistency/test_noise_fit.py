@@ -144,7 +144,7 @@ def world(steps=100):
 
 
 def followed(p, log):
-    ekf = filters.ekf_slam(*models(p), capacity=len(POINTS), update="joint")
+    ekf = filters.EkfSlam(*models(p), capacity=len(POINTS), correction="joint")
     return jaxslam.run(ekf, log, np.zeros(3), np.zeros((3, 3)), KEY).info
 
 
@@ -173,14 +173,14 @@ def test_decisions_are_held_in_the_log():
     z = np.array(log.scan.z)
     z[20, 1] += [0.25, 0]
     log = log._replace(scan=log.scan._replace(z=z, tag=np.full_like(log.scan.tag, -1)))
-    nearest = association.nearest(stats.chi2_quantile(0.999, 2), stats.chi2_quantile(0.9999999, 2))
-    options = {"capacity": 5, "update": "joint"}
+    nearest = association.Nearest(stats.chi2_quantile(0.999, 2), stats.chi2_quantile(0.9999999, 2))
+    options = {"capacity": 5, "correction": "joint"}
     start = np.zeros(3), np.zeros((3, 3)), KEY
-    by_gate = filters.ekf_slam(*models(TRUE), associate=nearest, **options)
+    by_gate = filters.EkfSlam(*models(TRUE), associate=nearest, **options)
     first = jaxslam.run(by_gate, log, *start)
     held = as_associated(log, first.info)
     assert (~held.scan.valid & log.scan.valid).sum() == 1 and not held.scan.valid[20, 1]
-    again = jaxslam.run(filters.ekf_slam(*models(TRUE), **options), held, *start)
+    again = jaxslam.run(filters.EkfSlam(*models(TRUE), **options), held, *start)
     np.testing.assert_allclose(again.estimate.pose, first.estimate.pose, atol=1e-12)
     np.testing.assert_array_equal(
         again.info.slot[held.scan.valid], first.info.slot[held.scan.valid]

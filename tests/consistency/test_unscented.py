@@ -55,4 +55,4 @@ def test_of_an_affine_function_nothing_is_left_over():
 @pytest.mark.parametrize("alpha", [0.0, 1.5, -1e-3])
 def test_a_spread_out_of_range_is_refused(alpha):
     with pytest.raises(ValueError, match="alpha"):
-        linearize.unscented(alpha)
+        linearize.Unscented(alpha)

@@ -4,6 +4,7 @@ import copy
 import dataclasses
 import pickle
 
+import chex
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,10 +12,11 @@ import pytest
 import worlds
 from own_models import motion_of, sensor_of
 
-from jaxslam import filters, motion, run, sensors, simulate
+from jaxslam import catalog, filters, motion, resampling, run, sensors, simulate
 from jaxslam.core.record import is_record, record, static
 from jaxslam.motion import OdometryNoise
 from jaxslam.protocols import Motion, Sensor
+from jaxslam.types import Log, Scan
 
 R = np.diag([0.04, 0.01])
 MOUNT = np.array([0.3, 0.0, 0.1])
@@ -157,7 +159,7 @@ def test_a_gradient_by_a_sensor_through_a_filter_is_that_by_its_covariance():
     truth, log = simulate(scenario, jax.random.key(0))
 
     def loss(sensor: Sensor):
-        ekf = filters.ekf_slam(scenario.motion, sensor, 6)
+        ekf = filters.EkfSlam(scenario.motion, sensor, 6)
         trace = run(ekf, log, scenario.pose, scenario.pose_cov, jax.random.key(1))
         return trace.info.log_likelihood.sum()
 
@@ -168,3 +170,131 @@ def test_a_gradient_by_a_sensor_through_a_filter_is_that_by_its_covariance():
     assert type(slope) is sensors.RangeBearing
     np.testing.assert_allclose(slope.noise_cov.cov, expected, rtol=1e-12)
     assert np.all(np.isfinite(expected)) and np.any(expected != 0)
+
+
+TRACED = []
+
+
+@record
+class Counted(motion.Increment):
+    """A motion model that counts how often it is traced."""
+
+    def step(self, pose, u, w):
+        TRACED.append(1)
+        return super().step(pose, u, w)
+
+
+def standing(steps=3):
+    """The log of a robot that stands at the origin and measures six landmarks around it."""
+    rng, around = np.random.default_rng(0), np.linspace(-2.5, 2.5, 6)
+    z = np.stack([3.0 + 0.1 * around, around], axis=1) + 0.05 * rng.normal(size=(steps, 6, 2))
+    tags = np.tile(np.arange(6, dtype=np.int32), (steps, 1))
+    return Log(np.zeros((steps, 2)), Scan(z, tags, np.ones((steps, 6), bool)))
+
+
+LOG, START = standing(), (np.zeros(3), np.diag([0.1, 0.1, 0.01]) ** 2, jax.random.key(0))
+
+
+def toy_filter(noise=1.0):
+    model = Counted(noise * np.diag([0.01, 0.01]) ** 2)
+    return filters.EkfSlam(model, sensors.RangeBearing(R, MOUNT), 6, gate=50.0 * noise)
+
+
+def driven(filter):
+    """Outside a trace, one program for all tests below."""
+    return run(filter, LOG, *START)
+
+
+def likelihood(filter):
+    return driven(filter).info.log_likelihood.sum()
+
+
+def test_the_gradient_of_a_filter_is_one():
+    filter = toy_filter()
+    slope = jax.jit(jax.grad(likelihood))(filter)
+    assert type(slope) is filters.EkfSlam
+    assert jax.tree.structure(slope) == jax.tree.structure(filter)
+    chex.assert_tree_all_finite(slope)
+    step = 1e-4 * R[0, 0] * np.array([[1.0, 0.0], [0.0, 0.0]])
+    ends = [
+        likelihood(dataclasses.replace(filter, sensor=sensors.RangeBearing(cov, MOUNT)))
+        for cov in (R + step, R - step)
+    ]
+    by_differences = (ends[0] - ends[1]) / (2 * step[0, 0])
+    assert by_differences != 0
+    np.testing.assert_allclose(slope.sensor.noise_cov.cov[0, 0], by_differences, rtol=1e-6)
+
+
+def test_a_batch_of_filters_is_the_loop_over_them():
+    each = [toy_filter(noise) for noise in (0.5, 1.0, 2.0)]
+    stack = jax.tree.map(lambda *leaves: jnp.stack(leaves), *each)
+    batched = jax.jit(jax.vmap(run, in_axes=(0, None, None, None, None)))
+    many = batched(stack, LOG, *START)
+    loop = jax.tree.map(lambda *leaves: np.stack(leaves), *map(driven, each))
+    chex.assert_trees_all_close(many, loop, rtol=1e-12, atol=1e-12)
+
+
+@pytest.mark.parametrize("copied", [copy.deepcopy, lambda one: pickle.loads(pickle.dumps(one))])
+def test_a_copy_of_a_filter_gives_the_same(copied):
+    filter = toy_filter()
+    again = copied(filter)
+    assert jax.tree.structure(again) == jax.tree.structure(filter)
+    chex.assert_trees_all_equal(driven(again), driven(filter))
+
+
+def test_other_numbers_cost_no_trace_and_no_program():
+    first = driven(toy_filter())
+    other = toy_filter(3.0)
+    TRACED.clear()
+    with worlds.compilations() as compiled:
+        second = driven(other)
+        assert compiled() == 0
+    assert not TRACED
+    assert not np.allclose(first.final.cov, second.final.cov)
+
+
+@pytest.mark.parametrize("name", catalog.ALL)
+def test_filters_of_the_catalog_hold_numbers_alone(name):
+    world, truth = worlds.ring(3), worlds.draw(worlds.ring(3))[0]
+
+    def made():
+        if name == "mapping":  # its entry is a function, of a log on the true path
+            return catalog.on_given_poses(world)
+        candidate = catalog.ALL[name](world)
+        return candidate if isinstance(candidate, filters.Filter) else candidate(truth)
+
+    one, other = jax.tree.structure(made()), jax.tree.structure(made())
+    assert one == other and hash(one) == hash(other)
+    leaves = jax.tree.leaves(made())
+    assert leaves and all(np.asarray(leaf).dtype.kind in "biuf" for leaf in leaves)
+
+
+@pytest.mark.parametrize(
+    "filter",
+    [
+        filters.FastSlam(
+            motion.Increment(np.eye(2)),
+            sensors.RangeBearing(R),
+            6,
+            4,
+            gate=9.0,
+            proposal="measurement",
+            resample=resampling.Soft(0.5),
+        ),
+        filters.ParticleLocalization(
+            motion.Increment(np.eye(2)),
+            sensors.RangeBearing(R),
+            np.zeros((6, 2)),
+            4,
+            gate=9.0,
+            slack=2.0,
+            forget=(0.1, 0.2),
+        ),
+    ],
+    ids=["fastslam", "particle_localization"],
+)
+def test_numbers_in_float64_leave_a_run_in_float32(filter):
+    """As `run` gives them to its program."""
+    given = jax.tree.map(np.asarray, filter), worlds.narrow(LOG)
+    trace = jax.eval_shape(lambda one, log: run(one, log, *START), *given)
+    assert {leaf.dtype for leaf in jax.tree.leaves(trace)}.isdisjoint({np.dtype("f8")})

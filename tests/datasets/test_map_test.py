@@ -65,10 +65,10 @@ def test_a_map_without_a_regular_covariance_or_a_frame_is_not_judged():
     assert judge_map(SURVEY, SURVEY, OWN, flat, True) is None
 
 
-@pytest.mark.parametrize("chart", [None, charts.right_invariant()])
+@pytest.mark.parametrize("chart", [charts.Euclidean(), charts.RightInvariant()])
 def test_the_joint_covariance_has_the_filters_own_blocks(chart):
     world = worlds.ring(5)
-    ekf = filters.ekf_slam(world.motion, world.sensor, COUNT, chart=chart)
+    ekf = filters.EkfSlam(world.motion, world.sensor, COUNT, chart=chart)
     state = ekf.init(np.array([1.0, 2.0, 0.5]), np.zeros((3, 3)))
     root = RNG.normal(size=(3 + 2 * COUNT,) * 2)
     state = state._replace(landmarks=SURVEY, cov=root @ root.T, alive=np.ones(COUNT, bool))

@@ -177,8 +177,8 @@ def executed():
 
 def test_a_page_is_run_again_when_code_that_it_reaches_has_changed(tmp_path):
     extension = executed()
-    names = extension.named(ast.parse("import jaxslam\nf = jaxslam.filters.seif"))
-    assert names == {"jaxslam:filters.seif"}
+    names = extension.named(ast.parse("import jaxslam\nf = jaxslam.filters.Seif"))
+    assert names == {"jaxslam:filters.Seif"}
     files = {p.relative_to(ROOT / "jaxslam").as_posix() for p in extension.reached(names)}
     assert "filters/information/seif.py" in files
     assert "filters/information/sparse/mean_recovery.py" in files  # a step of it

@@ -1,4 +1,4 @@
-"""compressed_ekf_slam: the numbers of ekf_slam, whatever the area and however often it is left."""
+"""CompressedEkfSlam: the numbers of EkfSlam, whatever the area and however often it is left."""
 
 import dataclasses
 from functools import cache, partial
@@ -10,7 +10,7 @@ import pytest
 from worlds import draw
 
 from jaxslam import charts, linearize, sensors
-from jaxslam.filters import compressed_ekf_slam, ekf_slam
+from jaxslam.filters import CompressedEkfSlam, EkfSlam
 from jaxslam.filters.ekf.compressed_ekf_slam import opened, up_to_date
 from jaxslam.run import run
 from jaxslam.simulation.scenarios import cloister
@@ -40,7 +40,7 @@ CASES = {
     "in turn": (PLACES, GATED),
     "at once": (
         9,
-        {"update": "joint", "covariance": "joseph", "linearize": linearize.unscented()},
+        {"correction": "joint", "covariance": "joseph", "linearize": linearize.Unscented()},
     ),
 }
 
@@ -50,8 +50,8 @@ def drivers(case):
     """The ordinary filter and the compressed one, both as a program of two logs to their traces."""
     world, _ = tour()
     area, options = CASES[case]
-    plain = ekf_slam(world.motion, world.sensor, CAPACITY, **options)
-    compressed = compressed_ekf_slam(world.motion, world.sensor, CAPACITY, area=area, **options)
+    plain = EkfSlam(world.motion, world.sensor, CAPACITY, **options)
+    compressed = CompressedEkfSlam(plain, area)
 
     def drive(filter, probe, log):
         trace = run(filter, log, world.pose, world.pose_cov, KEY, probe=probe)
@@ -99,7 +99,7 @@ def test_a_run_does_not_depend_on_the_runs_beside_it():
 def test_from_a_map_at_hand():
     world, logs = tour()
     rest = jax.tree.map(lambda x: x[0, STEPS - 20 :], logs)
-    small = compressed_ekf_slam(world.motion, world.sensor, CAPACITY, area=PLACES, **GATED)
+    small = CompressedEkfSlam(EkfSlam(world.motion, world.sensor, CAPACITY, **GATED), PLACES)
     plain, final = jax.tree.map(lambda x: x[0], driven("in turn")[0])
     joint = jax.tree.map(lambda x: x[STEPS - 21], plain.probe)
 
@@ -120,7 +120,8 @@ def test_gradients_pass_through_a_change_of_area():
 
     def loss(sigma):
         sensor = sensors.RangeBearing(jnp.diag(jnp.stack([sigma, 0.02])) ** 2)
-        filter = compressed_ekf_slam(world.motion, sensor, CAPACITY, area=PLACES, update="joint")
+        plain = EkfSlam(world.motion, sensor, CAPACITY, correction="joint")
+        filter = CompressedEkfSlam(plain, PLACES)
         trace = run(filter, log, world.pose, world.pose_cov, KEY, probe=lambda state: state.slot)
         points = (trace.estimate.points[-1] ** 2).sum()
         return points + trace.info.log_likelihood.sum(), trace.probe
@@ -136,10 +137,13 @@ def test_gradients_pass_through_a_change_of_area():
     ("options", "message"),
     [
         ({"area": 0}, "area"),
-        ({"area": 4, "covariance": "square_root"}, "got 'square_root'"),
-        ({"area": 4, "chart": charts.right_invariant()}, "right_invariant"),
-        ({"area": 4, "linearize": linearize.first_estimate()}, "first_estimate"),
-        ({"area": 4, "sensor": sensors.Compass(np.eye(1))}, "a sensor of landmarks, got compass"),
+        ({"area": 4, "covariance": "square_root"}, 'the covariance "square_root" is not'),
+        ({"area": 4, "chart": charts.RightInvariant()}, "right_invariant"),
+        ({"area": 4, "linearize": linearize.FirstEstimate()}, "first_estimate"),
+        (
+            {"area": 4, "sensor": sensors.Compass(np.eye(1))},
+            "the sensor compass, which has no landmarks",
+        ),
         (
             {"area": PLACES - 1},
             f"area >= {PLACES}, the measurement slots of a scan, got {PLACES - 1}",
@@ -149,8 +153,8 @@ def test_gradients_pass_through_a_change_of_area():
 def test_refusals(options, message):
     world, logs = tour()
     options = {"sensor": world.sensor} | options
-    sensor = options.pop("sensor")
+    sensor, area = options.pop("sensor"), options.pop("area")
     with pytest.raises(ValueError, match=message):
-        filter = compressed_ekf_slam(world.motion, sensor, CAPACITY, **options)
+        filter = CompressedEkfSlam(EkfSlam(world.motion, sensor, CAPACITY, **options), area)
         state = jax.eval_shape(filter.init, jnp.zeros(3), jnp.eye(3))
         jax.eval_shape(filter.update, state, jax.tree.map(lambda x: x[0, 0], logs).scan, KEY)

@@ -11,7 +11,7 @@ from own_models import changed
 from worlds import narrow
 
 from jaxslam import charts, linearize, motion, sensors
-from jaxslam.filters import ekf_slam
+from jaxslam.filters import EkfSlam
 from jaxslam.run import run
 from jaxslam.simulation.worlds import Scenario, simulate
 from jaxslam.slots import Joint
@@ -57,17 +57,17 @@ assert_same = functools.partial(chex.assert_trees_all_close, rtol=0)
 
 @functools.cache
 def updater(**options):
-    """A compiled update of `ekf_slam` with these options; "chart" by name."""
+    """A compiled update of `EkfSlam` with these options; "chart" by name."""
     options = dict(options)
     chart = charts.REGISTRY[options.pop("chart", "euclidean")]()
-    filter = ekf_slam(MOTION, SENSOR, CAPACITY, chart=chart, **options)
+    filter = EkfSlam(MOTION, SENSOR, CAPACITY, chart=chart, **options)
     update = jax.jit(lambda joint, scan: filter.update(joint, scan, KEY))
     return lambda joint, scan: jax.device_get(update(joint, scan))
 
 
 @functools.cache
 def estimator(name):
-    return jax.jit(ekf_slam(MOTION, SENSOR, CAPACITY, chart=charts.REGISTRY[name]()).estimate)
+    return jax.jit(EkfSlam(MOTION, SENSOR, CAPACITY, chart=charts.REGISTRY[name]()).estimate)
 
 
 # --- dense oracle: numeric Jacobians in chart coordinates, textbook products ---------------------
@@ -186,7 +186,7 @@ def test_prediction_is_a_p_at_plus_b_q_bt(name):
 
     both = dense.jacobian(error_after, np.zeros(dense.size + 2))
     a, b = both[:, : dense.size], both[:, dense.size :]
-    filter = ekf_slam(SLOPING, SENSOR, CAPACITY, chart=charts.REGISTRY[name]())
+    filter = EkfSlam(SLOPING, SENSOR, CAPACITY, chart=charts.REGISTRY[name]())
     out = jax.device_get(jax.jit(filter.predict)(joint, u, KEY))
     np.testing.assert_allclose(out.cov, a @ dense.p @ a.T + b @ Q @ b.T, rtol=0, atol=1e-8)
     np.testing.assert_array_equal(out.cov, out.cov.T)
@@ -194,7 +194,7 @@ def test_prediction_is_a_p_at_plus_b_q_bt(name):
     assert_same(joint[1:2] + joint[3:6], out[1:2] + out[3:6], atol=0)
 
 
-PASSES = {"update": "joint", "iterations": 2}
+PASSES = {"correction": "joint", "iterations": 2}
 
 
 @pytest.mark.parametrize("name", CHARTS)
@@ -264,7 +264,7 @@ def test_augmentation_and_estimate_are_first_order_propagation(name):
 @pytest.mark.parametrize("name", CHARTS)
 def test_initial_covariance_is_given_in_map_coordinates(name):
     root = np.random.default_rng(5).normal(size=(3, 3))
-    filter = ekf_slam(MOTION, SENSOR, CAPACITY, chart=charts.REGISTRY[name]())
+    filter = EkfSlam(MOTION, SENSOR, CAPACITY, chart=charts.REGISTRY[name]())
     start = jax.jit(filter.init)(np.array([5.0, -3.0, 2.0]), root @ root.T)
     estimate = estimator(name)(start)
     np.testing.assert_allclose(estimate.pose_cov, root @ root.T, atol=1e-11)
@@ -308,17 +308,17 @@ def test_sequential_correction_is_joint_correction_one_landmark_at_a_time():
     one_by_one = joint
     for i in range(2):
         alone = scan._replace(valid=np.arange(2) == i)
-        one_by_one, _ = updater(update="joint")(one_by_one, alone)
+        one_by_one, _ = updater(correction="joint")(one_by_one, alone)
     assert_same(at_once, one_by_one, atol=1e-13)
-    together, _ = updater(update="joint")(joint, scan)
+    together, _ = updater(correction="joint")(joint, scan)
     assert np.abs(together.pose - at_once.pose).max() > 1e-5  # not on a nonlinear model
 
 
 def test_joseph_form_is_the_plain_form():
     joint = some_joint()
     scan = some_scan(joint, [13, 11])
-    plain, plain_info = updater(update="joint")(joint, scan)
-    joseph, info = updater(update="joint", covariance="joseph")(joint, scan)
+    plain, plain_info = updater(correction="joint")(joint, scan)
+    joseph, info = updater(correction="joint", covariance="joseph")(joint, scan)
     assert_same((joseph, info), (plain, plain_info), atol=1e-12)
     assert np.abs(plain.cov - joint.cov).max() > 1e-3
 
@@ -347,7 +347,7 @@ def logs():
 def runner(capacity, **options):
     """A whole-log run of the tiny world's filter, to compile or map."""
     scenario = tiny()
-    filter = ekf_slam(scenario.motion, scenario.sensor, capacity, **options)
+    filter = EkfSlam(scenario.motion, scenario.sensor, capacity, **options)
 
     def go(log):
         return run(filter, log, scenario.pose, scenario.pose_cov, KEY, probe=lambda s: s)
@@ -389,7 +389,7 @@ class TestOneStep(chex.TestCase):
 
     @chex.variants(with_jit=True, without_jit=True, with_device=True, without_device=True)
     def test_compiled_or_not_of_host_or_device_arrays(self):
-        joint, filter = some_joint((True, False)), ekf_slam(MOTION, SENSOR, 2)
+        joint, filter = some_joint((True, False)), EkfSlam(MOTION, SENSOR, 2)
 
         def step(joint, u):
             joint = filter.predict(joint, u, KEY)
@@ -403,9 +403,9 @@ class TestOneStep(chex.TestCase):
     "options",
     [
         {},
-        {"update": "joint", "gate": 9.0, "births": 1},
+        {"correction": "joint", "gate": 9.0, "births": 1},
         {"chart": "right_invariant", "iterations": 2, "covariance": "joseph"},
-        {"chart": "right_invariant", "update": "joint"},
+        {"chart": "right_invariant", "correction": "joint"},
     ],
 )
 def test_float32_logs_give_float32_outputs_although_float64_is_on(logs, options):
@@ -428,7 +428,7 @@ def test_jacobians_at_the_truth_make_the_covariance_independent_of_the_data(logs
 
     @jax.jit
     def ideal(truth, log):
-        filter = ekf_slam(MOTION, SENSOR, 8, linearize=linearize.at_truth(truth))
+        filter = EkfSlam(MOTION, SENSOR, 8, linearize=linearize.AtTruth(truth))
         return run(filter, log, scenario.pose, scenario.pose_cov, KEY, probe=lambda s: s.cov)
 
     truth, log = take(truths, 0), take(drawn, 0)

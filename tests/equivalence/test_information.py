@@ -37,8 +37,8 @@ def drawn():
 def pair(gate):
     """The two filters of 36 landmarks, for all tests; the floor is of a singular start alone."""
     scene = world()
-    ekf = filters.ekf_slam(scene.motion, scene.sensor, 36, update="joint", gate=gate)
-    return ekf, filters.eif_slam(scene.motion, scene.sensor, 36, gate=gate, floor=1e-3)
+    ekf = filters.EkfSlam(scene.motion, scene.sensor, 36, correction="joint", gate=gate)
+    return ekf, filters.EifSlam(scene.motion, scene.sensor, 36, gate=gate, floor=1e-3)
 
 
 def driven(filter, scene, log, dtype=np.float64, pose_cov=None):
@@ -98,8 +98,8 @@ def test_other_models_full_maps_unknown_tags_and_empty_scans():
     tag[:, 0] = -1
     valid[7] = False
     log = log._replace(scan=log.scan._replace(tag=tag, valid=valid))
-    a = driven(filters.ekf_slam(scene.motion, scene.sensor, 5, update="joint"), scene, log)
-    b = driven(filters.eif_slam(scene.motion, scene.sensor, 5), scene, log)
+    a = driven(filters.EkfSlam(scene.motion, scene.sensor, 5, correction="joint"), scene, log)
+    b = driven(filters.EifSlam(scene.motion, scene.sensor, 5), scene, log)
     assert_same(a, b)
     assert (b.info.status == Status.OVERFLOW).any()
     assert (b.info.status == Status.UNMATCHED).any()
@@ -138,7 +138,7 @@ def test_gradients_and_batches():
 
     def loss(sigma, z):
         sensor = sensors.RangeBearing(jnp.diag(jnp.stack([sigma, np.deg2rad(1.0)])) ** 2)
-        eif = filters.eif_slam(world().motion, sensor, 36, floor=1e-3)
+        eif = filters.EifSlam(world().motion, sensor, 36, floor=1e-3)
         changed = log._replace(scan=log.scan._replace(z=z))
         return run(eif, changed, world().pose, P0, KEY).estimate.pose[-1, :2].sum()
 
@@ -166,4 +166,4 @@ def test_refusals(changes, message):
     scene = world(2)
     options = {"motion": scene.motion, "sensor": scene.sensor, "capacity": 36} | changes
     with pytest.raises(ValueError, match=message):
-        filters.eif_slam(**options)
+        filters.EifSlam(**options)

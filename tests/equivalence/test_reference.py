@@ -9,7 +9,7 @@ import pytest
 from reference import ekf_slam as plain
 from worlds import draw
 
-from jaxslam.filters import ekf_slam
+from jaxslam.filters import EkfSlam
 from jaxslam.run import run
 from jaxslam.simulation.scenarios import circle, cloister
 from jaxslam.types import Status
@@ -62,11 +62,11 @@ def assert_equal_at_every_step(states, steps):
 
 
 CASES = {
-    "cloister": (cloister(60), {"update": "sequential", "gate": 9.0, "births": 1}),
-    "circle": (circle(150), {"update": "joint"}),
+    "cloister": (cloister(60), {"correction": "sequential", "gate": 9.0, "births": 1}),
+    "circle": (circle(150), {"correction": "joint"}),
     "cloister joint with gate": (
         dataclasses.replace(cloister(60), noise_on="odometry"),
-        {"update": "joint", "gate": 5.0, "births": 3},
+        {"correction": "joint", "gate": 5.0, "births": 3},
     ),
 }
 
@@ -76,7 +76,7 @@ def filtered(case):
     """Log and trace."""
     scenario, options = CASES[case]
     size = len(scenario.landmarks)
-    filter = ekf_slam(scenario.motion, scenario.sensor, size, **options)
+    filter = EkfSlam(scenario.motion, scenario.sensor, size, **options)
     _, log = draw(scenario, 0)
     start = scenario.pose, scenario.pose_cov, jax.random.key(0)
     return log, jax.device_get(run(filter, log, *start, probe=lambda state: state))
@@ -89,7 +89,7 @@ def reference(case, log, steps=None, **changes):
         scenario.pose_cov,
         np.asarray(log.control)[:steps],
         scans_of(log)[:steps],
-        joint=options["update"] == "joint",
+        joint=options["correction"] == "joint",
         gate=options.get("gate", np.inf),
         births=options.get("births"),
         **(MODELS[scenario.name] | changes),

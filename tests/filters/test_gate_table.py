@@ -119,19 +119,21 @@ def seen_in_the_map():
 MOVE = motion.PoseIncrement(np.diag([1e-4, 1e-4, 1e-6]))
 KNOWN = np.concatenate([LANDMARKS[:3], np.full((2, 2), 77.0)])
 FAMILIES = {
-    "ekf_slam": lambda s: filters.ekf_slam(MOVE, s, 5, gate=20.0),
-    "ekf_slam, at once": lambda s: filters.ekf_slam(MOVE, s, 5, gate=20.0, update="joint"),
-    "compressed_ekf_slam": lambda s: filters.compressed_ekf_slam(MOVE, s, 5, area=9, gate=20.0),
-    "eif_slam": lambda s: filters.eif_slam(MOVE, s, 5, gate=20.0),
-    "fastslam": lambda s: filters.fastslam(MOVE, s, 5, 3, gate=20.0),
-    "mapping": lambda s: filters.mapping(s, 5, gate=20.0),
-    "localization": lambda s: filters.localization(MOVE, s, LANDMARKS[:3], gate=20.0),
-    "particle_localization": lambda s: filters.particle_localization(
+    "ekf_slam": lambda s: filters.EkfSlam(MOVE, s, 5, gate=20.0),
+    "ekf_slam, at once": lambda s: filters.EkfSlam(MOVE, s, 5, gate=20.0, correction="joint"),
+    "compressed_ekf_slam": lambda s: filters.CompressedEkfSlam(
+        filters.EkfSlam(MOVE, s, 5, gate=20.0), area=9
+    ),
+    "eif_slam": lambda s: filters.EifSlam(MOVE, s, 5, gate=20.0),
+    "fastslam": lambda s: filters.FastSlam(MOVE, s, 5, 3, gate=20.0),
+    "mapping": lambda s: filters.Mapping(s, 5, gate=20.0),
+    "localization": lambda s: filters.Localization(MOVE, s, LANDMARKS[:3], gate=20.0),
+    "particle_localization": lambda s: filters.ParticleLocalization(
         MOVE, s, LANDMARKS[:3], 3, gate=20.0
     ),
 }
 SPARSE = {
-    "seif": lambda s: filters.seif(MOVE, s, 5, active=9, links=4, gate=20.0),
+    "seif": lambda s: filters.Seif(MOVE, s, 5, active=9, links=4, gate=20.0),
 }
 
 
@@ -231,7 +233,7 @@ def test_a_delayed_filter_reports_bearings_by_the_table():
         return jnp.where(jnp.abs(z[0]) > 3.0, -1e4, 1e-4)[None, None]
 
     sensor = changed(sensors.BearingOnly(noise), residual=lambda z, zh: z - zh)
-    filter = filters.delayed_slam(
+    filter = filters.DelayedSlam(
         MOVE,
         sensor,
         2,

@@ -13,7 +13,7 @@ from reference import graph as plain
 
 from jaxslam import graphs, motion, sensors, simulate
 from jaxslam.graphs import Ending
-from jaxslam.smoothing import batch_map
+from jaxslam.smoothing import BatchMap
 from jaxslam.types import Log, Scan
 
 KEY = jax.random.key(0)
@@ -106,7 +106,7 @@ def test_it_has_the_optimum_of_scipy(known):
 def test_it_has_the_optimum_of_batch_map(known):
     here, log, graph, _, solution = solved(known)
     cov = np.zeros((3, 3)) if known else START_COV
-    trace = batch_map(here.motion, here.sensor, 6, START, cov, tolerance=1e-9)(log, KEY)
+    trace = BatchMap(here.motion, here.sensor, 6, START, cov, tolerance=1e-9)(log, KEY)
     batch = trace.final
     assert batch.ending == Ending.CONVERGED
     np.testing.assert_allclose(solution.chi2, 2 * batch.cost, rtol=1e-8)

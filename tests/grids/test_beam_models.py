@@ -9,12 +9,12 @@ from scipy import integrate, stats
 
 from jaxslam import grids
 from jaxslam.grids.beam_models import (
+    LikelihoodField,
     Mixture,
+    RayCast,
     fit,
-    likelihood_field,
     log_likelihood,
     mixture_log_density,
-    ray_cast,
 )
 from jaxslam.simulation.walls import rasterize, walls
 from jaxslam.types import Beams
@@ -56,9 +56,7 @@ def test_the_density_is_the_mixture_of_four_and_sums_to_one():
 
 
 def test_the_likelihood_field_by_hand(room):
-    model = likelihood_field(
-        0.2, max_range=FAR, hit=0.7, random=0.2, maximum=0.1, mount=(0.1, 0, 0)
-    )
+    model = LikelihoodField(0.2, max_range=FAR, hit=0.7, random=0.2, maximum=0.1, mount=(0.1, 0, 0))
     field = model.prepare(room)
     pose, scan = np.array([2.0, 1.2, 0.4]), beams()
     use = scan.valid & (scan.range >= 0)
@@ -79,7 +77,7 @@ def test_the_ray_cast_model_of_a_laser_off_the_centre_by_hand():
     log_odds = np.full((34, 54), 2.0)
     log_odds[2:-2, 2:-2] = -2.0
     empty = grids.Grid(log_odds, np.array([-0.2, -0.2, 0.0]), np.float64(0.1))
-    model = ray_cast(MIXTURE, max_range=FAR, mount=(0.3, -0.2, 0.7))
+    model = RayCast(MIXTURE, max_range=FAR, mount=(0.3, -0.2, 0.7))
     prepared, pose = model.prepare(empty), np.array([2.0, 1.2, 0.4])
     angles = np.delete(np.linspace(-3, 3, 12), 8)  # the ninth ends in a corner, which is rounded
     c, s = np.cos(0.4), np.sin(0.4)
@@ -96,7 +94,7 @@ def test_the_ray_cast_model_of_a_laser_off_the_centre_by_hand():
     assert float(found) == pytest.approx(np.log(density).sum(), rel=1e-9)
 
 
-@pytest.mark.parametrize("make", [likelihood_field, ray_cast])
+@pytest.mark.parametrize("make", [LikelihoodField, RayCast])
 def test_gradients_are_finite_at_walls_in_obstacles_and_off_the_map(room, make):
     model = make(max_range=FAR)
     prepared = model.prepare(room)
@@ -111,7 +109,7 @@ def test_gradients_are_finite_at_walls_in_obstacles_and_off_the_map(room, make):
     assert float(half) == pytest.approx(float(whole))
 
 
-@pytest.mark.parametrize("make", [likelihood_field, ray_cast])
+@pytest.mark.parametrize("make", [LikelihoodField, RayCast])
 def test_the_true_pose_is_the_most_likely_one(room, make):
     model = make(max_range=8.0)
     prepared = model.prepare(room)
@@ -124,14 +122,14 @@ def test_the_true_pose_is_the_most_likely_one(room, make):
 
 
 def test_a_pose_may_be_a_list_of_whole_numbers(room):
-    model = likelihood_field(max_range=FAR, mount=(0.3, 0, 0))
+    model = LikelihoodField(max_range=FAR, mount=(0.3, 0, 0))
     field = model.prepare(room)
     found = [log_likelihood(model, field, p, beams()) for p in ([2, 1, 0], np.array([2.0, 1, 0]))]
     assert float(found[0]) == float(found[1])
 
 
 def test_a_beam_that_is_not_valid_may_have_any_angle(room):
-    model = likelihood_field(max_range=FAR, mount=(0.3, 0, 0))
+    model = LikelihoodField(max_range=FAR, mount=(0.3, 0, 0))
     field, pose, valid = model.prepare(room), np.array([2.0, 1, 0]), beams().valid & True
     valid[0] = False
     angle = np.where(valid, beams().angle, np.nan)
@@ -199,32 +197,32 @@ def test_both_fits_find_the_parameters():
             lambda m, f: log_likelihood(m, grids.Grid(*f), np.zeros(3), beams()),
             "expected what model.prepare makes of the grid",
         ),
-        (lambda m, f: likelihood_field(max_range=1.0, truncate=-1.0), "expected truncate above 0"),
-        (lambda m, f: likelihood_field(max_range=1.0, mount=(0, 0)), "field: expected a mounting"),
-        (lambda m, f: ray_cast(max_range=1.0, mount=(0, 0, np.nan)), "cast: the mounting pose"),
-        (lambda m, f: ray_cast(max_range=0.0), "ray_cast: expected max_range above 0"),
+        (lambda m, f: LikelihoodField(max_range=1.0, truncate=-1.0), "expected truncate above 0"),
+        (lambda m, f: LikelihoodField(max_range=1.0, mount=(0, 0)), "Field: expected a mounting"),
+        (lambda m, f: RayCast(max_range=1.0, mount=(0, 0, np.nan)), "Cast: the mounting pose"),
+        (lambda m, f: RayCast(max_range=0.0), "RayCast: expected max_range above 0"),
         (
-            lambda m, f: ray_cast(Mixture(0.7, 0.1, 0.1, 0.1, 0, 1), max_range=1.0),
-            "ray_cast: expected sigma above 0",
+            lambda m, f: RayCast(Mixture(0.7, 0.1, 0.1, 0.1, 0, 1), max_range=1.0),
+            "RayCast: expected sigma above 0",
         ),
         (
-            lambda m, f: ray_cast(Mixture(0.7, 0.1, 0.1, 0.1, 1, -1), max_range=1.0),
-            "ray_cast: expected rate above 0",
+            lambda m, f: RayCast(Mixture(0.7, 0.1, 0.1, 0.1, 1, -1), max_range=1.0),
+            "RayCast: expected rate above 0",
         ),
-        (lambda m, f: ray_cast(max_range=1.0, method="lut"), "ray_cast: expected a method"),
+        (lambda m, f: RayCast(max_range=1.0, method="lut"), "RayCast: expected a method"),
         (lambda m, f: fit(np.ones(3), np.ones(3), 0.0), "fit: expected max_range above 0"),
         (lambda m, f: fit(np.ones(3), -np.ones(3), FAR), "fit: expected predicted ranges"),
         (
-            lambda m, f: likelihood_field(0.0, max_range=1.0),
-            "likelihood_field: expected sigma above 0, got 0.0",
+            lambda m, f: LikelihoodField(0.0, max_range=1.0),
+            "LikelihoodField: expected sigma above 0, got 0.0",
         ),
         (
-            lambda m, f: likelihood_field(max_range=1.0, hit=0.5),
-            "likelihood_field: expected shares",
+            lambda m, f: LikelihoodField(max_range=1.0, hit=0.5),
+            "LikelihoodField: expected shares",
         ),
         (
-            lambda m, f: ray_cast(Mixture(1.2, -0.2, 0, 0, 1, 1), max_range=1.0),
-            "ray_cast: expected shares",
+            lambda m, f: RayCast(Mixture(1.2, -0.2, 0, 0, 1, 1), max_range=1.0),
+            "RayCast: expected shares",
         ),
         (lambda m, f: fit(np.ones(3), np.ones(4), FAR), "and as many as expected ones"),
         (lambda m, f: fit(np.ones(0), np.ones(0), FAR), "fit: expected at least one range"),
@@ -240,6 +238,6 @@ def test_both_fits_find_the_parameters():
     ],
 )
 def test_bad_input_is_refused(room, call, reason):
-    model = likelihood_field(max_range=FAR)
+    model = LikelihoodField(max_range=FAR)
     with pytest.raises(ValueError, match=reason):
         call(model, grids.Field(np.zeros((2, 2)), np.zeros(3), np.float64(1)))

@@ -249,7 +249,7 @@ def test_the_method_is_chosen_by_the_map():
     scans = share._replace(log_odds=np.where(share.log_odds > 4, 0.0, share.log_odds))
     assert same_rays(scans, "cells")  # cells within walls that no beam reached
     assert same_rays(share, "cells", jax.jit(grids.ray_map))
-    model = grids.ray_cast(max_range=5.0)
+    model = grids.RayCast(max_range=5.0)
     assert same_rays(share, "surface", model.prepare)
     assert same_rays(grid, "cells", model.prepare)
 

@@ -16,7 +16,7 @@ KEY = jax.random.key(3)
 ROOM = walls([[0, 0], [5, 0], [5, 2], [3, 2], [3, 3], [0, 3]])  # no two poses look alike
 GRID = rasterize(ROOM, 0.1)
 FAR = 8.0
-MODEL = grids.likelihood_field(0.1, max_range=FAR)
+MODEL = grids.LikelihoodField(0.1, max_range=FAR)
 MOVE = motion.Unicycle(np.diag([0.1, 0.1]) ** 2)
 CONTROLS = np.tile([0.2, 0.3, 0.25], (60, 1))
 WORLD = LaserWorld(
@@ -32,7 +32,7 @@ EXACT = np.zeros((3, 3))
 
 
 def of(count=PARTICLES, **options):
-    return grids.localize(GRID, MODEL, MOVE, count, **options)
+    return grids.GridLocalization(GRID, MODEL, MOVE, count, **options)
 
 
 def kept(state):
@@ -151,10 +151,10 @@ def test_particles_of_no_weight_from_the_start_are_drawn_anew_until_one_has_some
 def test_the_ray_cast_model_keeps_the_robot_on_the_draws_that_both_models_get():
     """From a pose known roughly, 20 steps: same truths for both, and both stay within 0.15 m."""
     world = dataclasses.replace(WORLD, controls=CONTROLS[:20])
-    ray_cast = grids.ray_cast(max_range=FAR, method="cells")
+    ray_cast = grids.RayCast(max_range=FAR, method="cells")
     truths = []
     for model, count in ((MODEL, 200), (ray_cast, 150)):
-        filter = grids.localize(GRID, model, MOVE, count, exponent=0.2)
+        filter = grids.GridLocalization(GRID, model, MOVE, count, exponent=0.2)
         scores = consistency.judge_localization(
             world, filter, 2, KEY, start_cov=np.diag([0.1, 0.1, 0.05]) ** 2, every=5
         )
@@ -239,18 +239,26 @@ def test_a_log_of_beams_drops_what_says_nothing():
     ("call", "reason"),
     [
         (
-            lambda: grids.localize(GRID._replace(log_odds=abs(GRID.log_odds)), MODEL, MOVE, 9),
-            "localize: the map has no free cell",
+            lambda: grids.GridLocalization(
+                GRID._replace(log_odds=abs(GRID.log_odds)), MODEL, MOVE, 9
+            ),
+            "GridLocalization: the map has no free cell",
         ),
-        (lambda: of(box=[[50, 50], [51, 51]]), "localize: no free cell of the map is in the box"),
-        (lambda: of(box=[[1, 1], [0, 0]]), "localize: expected a box"),
-        (lambda: of(exponent=0.0), "localize: expected an exponent above 0"),
-        (lambda: of(every=0), "localize: every"),
-        (lambda: of(0), "localize: particles"),
-        (lambda: of(start="somewhere"), "localize: expected start"),
-        (lambda: of(forget=(1, 0.1)), "localize: expected forget"),
-        (lambda: grids.localize(3, MODEL, MOVE, 9), "localize: expected a Grid"),
-        (lambda: grids.localize(GRID, MOVE, MODEL, 9), "localize: expected a BeamModel"),
+        (
+            lambda: of(box=[[50, 50], [51, 51]]),
+            "GridLocalization: no free cell of the map is in the box",
+        ),
+        (lambda: of(box=[[1, 1], [0, 0]]), "GridLocalization: expected a box"),
+        (lambda: of(exponent=0.0), "GridLocalization: expected exponent above 0"),
+        (lambda: of(every=0), "GridLocalization: every"),
+        (lambda: of(0), "GridLocalization: particles"),
+        (lambda: of(start="somewhere"), "GridLocalization: expected start"),
+        (lambda: of(forget=(1, 0.1)), "GridLocalization: expected forget"),
+        (lambda: grids.GridLocalization(3, MODEL, MOVE, 9), "GridLocalization: expected a Grid"),
+        (
+            lambda: grids.GridLocalization(GRID, MOVE, MODEL, 9),
+            "GridLocalization: expected model to be a BeamModel",
+        ),
         (
             lambda: grids.beam_log(
                 np.zeros((2, 3)), Beams(*np.zeros((2, 2, 4)), np.zeros((2, 4), bool))

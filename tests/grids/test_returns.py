@@ -50,8 +50,8 @@ def fitted(beams):
     "of",
     [
         counted,
-        likelihood(grids.likelihood_field(max_range=FAR, hit=0.8, random=0.1, maximum=0.1)),
-        likelihood(grids.ray_cast(max_range=FAR, method="cells")),
+        likelihood(grids.LikelihoodField(max_range=FAR, hit=0.8, random=0.1, maximum=0.1)),
+        likelihood(grids.RayCast(max_range=FAR, method="cells")),
         lambda beams: matching.points(beams, FAR),
         lambda beams: features.segments(beams, sigma=0.01, max_range=FAR),
         lambda beams: grids.beam_log(np.zeros((1, 2)), rows(beams)).scan.valid,

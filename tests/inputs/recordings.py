@@ -11,7 +11,7 @@ import pytest
 
 import jaxslam
 from jaxslam import datasets, se2
-from jaxslam.filters import ekf_slam
+from jaxslam.filters import EkfSlam
 from jaxslam.types import Status
 
 DATA = Path(os.environ.get("JAXSLAM_DATA", Path(__file__).parents[3] / "shared" / "data"))
@@ -139,7 +139,7 @@ def mapped(data, probe=None):
 
     It has info, final, probe, nis_per_dof and, where there is a survey, rmse of the aligned map.
     """
-    ekf = ekf_slam(data.motion, data.sensor, data.capacity, **data.filter_options)
+    ekf = EkfSlam(data.motion, data.sensor, data.capacity, **data.filter_options)
 
     @jax.jit
     def go(log):

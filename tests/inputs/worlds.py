@@ -9,6 +9,7 @@ import numpy as np
 from own_models import changed
 
 from jaxslam import filters, linearize, motion, sensors
+from jaxslam.core.record import record
 from jaxslam.math.stats import t_quantile
 from jaxslam.monte_carlo import monte_carlo
 from jaxslam.simulation.worlds import Scenario, simulate
@@ -75,18 +76,21 @@ def compilations():
 
 
 def ekf(scenario, **options):
-    return filters.ekf_slam(scenario.motion, scenario.sensor, len(scenario.landmarks), **options)
+    return filters.EkfSlam(scenario.motion, scenario.sensor, len(scenario.landmarks), **options)
+
+
+@record
+class Transposed(linearize.AtEstimate):
+    """Returns Fᵀ in place of F."""
+
+    def motion(self, motion, u, here):
+        moved, by_pose, noise, memory = super().motion(motion, u, here)
+        return moved, by_pose.T, noise, memory
 
 
 def transposed_motion(scenario):
     """Propagates Fᵀ P F (the slip in the Notes' EKF)."""
-    right = linearize.at_estimate()
-
-    def motion_at(*arguments):
-        moved, by_pose, noise, memory = right.motion(*arguments)
-        return moved, by_pose.T, noise, memory
-
-    return ekf(scenario, linearize=dataclasses.replace(right, motion=motion_at))
+    return ekf(scenario, linearize=Transposed())
 
 
 def process_noise_as_measurement_noise(scenario):
@@ -94,16 +98,18 @@ def process_noise_as_measurement_noise(scenario):
     u = jnp.asarray(scenario.controls[0])
     q = np.asarray(scenario.motion.noise_cov(jnp.zeros(3), u))
     sensor = dataclasses.replace(scenario.sensor, noise_cov=lambda z: jnp.asarray(q, z.dtype))
-    return filters.ekf_slam(scenario.motion, sensor, len(scenario.landmarks))
+    return filters.EkfSlam(scenario.motion, sensor, len(scenario.landmarks))
 
 
-def no_cross_covariance(scenario):
+@record
+class NoCrossCovariance(filters.Wrapper):
     """Starts a landmark with the right covariance, but uncorrelated with the map."""
-    right = ekf(scenario)
-    size = len(scenario.sensor.landmark)
 
-    def update(joint, scan, key):
-        after, info = right.update(joint, scan, key)
+    filter: filters.Filter
+
+    def update(self, joint, scan, key):
+        after, info = self.filter.update(joint, scan, key)
+        size = len(self.landmark)
         born = jnp.repeat(after.alive & ~joint.alive, size)
         mask = jnp.concatenate([jnp.zeros(3, bool), born])
         slot = jnp.concatenate([jnp.full(3, -1), jnp.repeat(jnp.arange(len(joint.alive)), size)])
@@ -111,25 +117,27 @@ def no_cross_covariance(scenario):
         cut = (mask[:, None] | mask[None, :]) & foreign
         return after._replace(cov=jnp.where(cut, 0.0, after.cov)), info
 
-    return dataclasses.replace(right, update=update)
+
+def no_cross_covariance(scenario):
+    return NoCrossCovariance(ekf(scenario))
 
 
 def no_wrap(scenario):
     """Subtracts bearings without wrapping the difference."""
     sensor = changed(scenario.sensor, residual=lambda z, z_hat: z - z_hat)
-    return filters.ekf_slam(scenario.motion, sensor, len(scenario.landmarks))
+    return filters.EkfSlam(scenario.motion, sensor, len(scenario.landmarks))
 
 
-def iterated_on_its_posterior(scenario):
+@record
+class IteratedOnItsPosterior(filters.Wrapper):
     """Feeds each scan three times, the posterior of one pass being the prior of the next."""
-    right = ekf(scenario)
 
-    def update(joint, scan, key):
-        joint, info = right.update(joint, scan, key)
-        again = lambda _, joint: right.update(joint, scan, key)[0]  # noqa: E731
+    filter: filters.Filter
+
+    def update(self, joint, scan, key):
+        joint, info = self.filter.update(joint, scan, key)
+        again = lambda _, joint: self.filter.update(joint, scan, key)[0]  # noqa: E731
         return jax.lax.fori_loop(0, 2, again, joint), info
-
-    return dataclasses.replace(right, update=update)
 
 
 WRONG = {
@@ -137,7 +145,7 @@ WRONG = {
     "process_noise_as_measurement_noise": process_noise_as_measurement_noise,
     "no_cross_covariance": no_cross_covariance,
     "no_wrap": no_wrap,
-    "iterated_on_its_posterior": iterated_on_its_posterior,
+    "iterated_on_its_posterior": lambda scenario: IteratedOnItsPosterior(ekf(scenario)),
 }
 
 

@@ -57,7 +57,7 @@ def test_a_filter_is_driven_by_the_matches(drive):
     np.testing.assert_allclose(laser_slam.match_controls(found), control, rtol=1e-6, atol=1e-12)
     nothing = len(control), 1
     scan = Scan(np.zeros((*nothing, 2)), np.full(nothing, -1), np.zeros(nothing, bool))
-    ekf = filters.dead_reckoning(laser_slam.MatchMotion(), sensors.RangeBearing(np.eye(2)))
+    ekf = filters.DeadReckoning(laser_slam.MatchMotion(), sensors.RangeBearing(np.eye(2)))
     start = log.raw[0], np.zeros((3, 3))
     path = run(ekf, Log(control, scan), *start, jax.random.key(0)).estimate
     np.testing.assert_allclose(path.pose, odometry.poses[keys], atol=1e-9)

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from jaxslam import run
-from jaxslam.filters import ekf_slam
+from jaxslam.filters import EkfSlam
 from jaxslam.logs import streams
 from jaxslam.motion import PoseIncrement, Unicycle
 from jaxslam.sensors import Compass, Part, RangeBearing, Suite
@@ -119,7 +119,7 @@ def test_sensors_with_rates_of_their_own_are_one_log():
     np.testing.assert_array_equal(log.scan.tag[1], [1, 0, -1, -1])
     np.testing.assert_allclose(log.scan.z[1], [[2, 0.25], [3, -0.5], [0, 0], [0.3, 0]])
     start = np.zeros(3), np.eye(3)
-    trace = run(ekf_slam(DRIVE, EYES, 2), log, *start, jax.random.key(0))
+    trace = run(EkfSlam(DRIVE, EYES, 2), log, *start, jax.random.key(0))
     assert int(trace.info.tally(Status.FUSED)[3]) == 1
 
 

@@ -10,7 +10,7 @@ import scipy.stats
 from reference.plane import wrap
 
 from jaxslam import charts, linearize, motion, sensors
-from jaxslam.filters import ekf_slam
+from jaxslam.filters import EkfSlam
 from jaxslam.run import run
 from jaxslam.simulation.worlds import Scenario, simulate
 from jaxslam.types import Log, Scan, Status
@@ -94,14 +94,14 @@ def drive(name, mount, seed=1):
 def compiled(name, **options):
     def go(log, mount, gate, pose_cov, q, r):
         sensor = sensors.REGISTRY[name](r * R[name], mount=mount)
-        filter = ekf_slam(motion.Increment(q * Q), sensor, 2, gate=gate, **options)
+        filter = EkfSlam(motion.Increment(q * Q), sensor, 2, gate=gate, **options)
         return run(filter, log, START, pose_cov, KEY, probe=lambda joint: joint.cov)
 
     return jax.jit(go)
 
 
 def filtered(name, log, mount=MOUNT, gate=np.inf, pose_cov=SPREAD, q=1.0, r=1.0, **options):
-    go = compiled(name, **({"update": "sequential"} | options))
+    go = compiled(name, **({"correction": "sequential"} | options))
     return jax.device_get(go(log, np.asarray(mount), float(gate), pose_cov, q, r))
 
 
@@ -115,7 +115,7 @@ def assert_same(a, b):
 @pytest.mark.parametrize("name", R)
 def test_the_ekf_is_the_plain_one_of_the_pose(name, update):
     log = drive(name, MOUNT)
-    trace = filtered(name, log, update=update)
+    trace = filtered(name, log, correction=update)
     poses, covs, likelihoods = plain_ekf(name, log, MOUNT, joint=update == "joint")
     gap = trace.estimate.pose - poses
     np.testing.assert_allclose(gap[:, :2], 0, atol=1e-9)
@@ -146,7 +146,7 @@ def test_joint_is_sequential_where_the_measurement_is_linear(name):
     log = drive(name, np.zeros(3))
     assert (log.scan.valid.sum(axis=1) > 1).any()
     one_by_one = filtered(name, log, mount=np.zeros(3))
-    together = filtered(name, log, mount=np.zeros(3), update="joint")
+    together = filtered(name, log, mount=np.zeros(3), correction="joint")
     assert_same(one_by_one, together)
     total = one_by_one.info.log_likelihood
     np.testing.assert_allclose(total, together.info.log_likelihood, atol=1e-9)
@@ -257,9 +257,9 @@ def test_unknown_tags_may_repeat_within_a_scan():
 def test_a_chart_of_landmarks_and_an_empty_capacity_are_refused(name):
     sensor = sensors.REGISTRY[name](R[name])
     with pytest.raises(ValueError, match=f"right_invariant.*absolute sensor {name} has none"):
-        ekf_slam(motion.Increment(Q), sensor, 1, chart=charts.right_invariant())
-    with pytest.raises(ValueError, match="ekf_slam: capacity"):
-        ekf_slam(motion.Increment(Q), sensor, 0)
+        EkfSlam(motion.Increment(Q), sensor, 1, chart=charts.RightInvariant())
+    with pytest.raises(ValueError, match="EkfSlam: capacity"):
+        EkfSlam(motion.Increment(Q), sensor, 0)
 
 
 @pytest.mark.parametrize("name", R)
@@ -268,8 +268,8 @@ def test_the_ideal_ekf_takes_them_too(name):
 
     def ideal(key):
         truth, log = simulate(scenario, key)
-        at_truth = linearize.at_truth(truth)
-        filter = ekf_slam(scenario.motion, scenario.sensor, 1, linearize=at_truth)
+        at_truth = linearize.AtTruth(truth)
+        filter = EkfSlam(scenario.motion, scenario.sensor, 1, linearize=at_truth)
         return run(filter, log, START, SPREAD, key).estimate
 
     assert jax.eval_shape(ideal, KEY).pose.shape == (STEPS, 3)

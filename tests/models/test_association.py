@@ -17,10 +17,10 @@ from jaxslam.protocols import Association, Pairs, Prediction
 from jaxslam.types import Scan
 
 METHODS = {
-    "nearest": partial(association.nearest, 9.0),
-    "maximum_likelihood": partial(association.maximum_likelihood, 9.0),
-    "global_nearest": partial(association.global_nearest, 9.0),
-    "joint": association.joint,
+    "nearest": partial(association.Nearest, 9.0),
+    "maximum_likelihood": partial(association.MaximumLikelihood, 9.0),
+    "global_nearest": partial(association.GlobalNearest, 9.0),
+    "joint": association.JointCompatibility,
 }
 
 
@@ -119,7 +119,7 @@ def exhaustive(innovation, cross, noise, probability):
 @pytest.fixture(scope="module")
 def thorough():
     """Joint compatibility of (many) 8 measurements and 12 landmarks, with all candidates."""
-    method = association.joint(0.95, budget=20_000, candidates=12)
+    method = association.JointCompatibility(0.95, budget=20_000, candidates=12)
     return jax.jit(jax.vmap(partial(plainly, method)))
 
 
@@ -166,7 +166,7 @@ def test_a_budget_that_does_not_suffice_is_said(thorough):
     def search(*parts):
         options = ({"budget": 1}, {"budget": 30}, {"budget": 20_000, "candidates": 1})
         return [
-            plainly(association.joint(0.95, **{"candidates": 12} | each), *parts)
+            plainly(association.JointCompatibility(0.95, **{"candidates": 12} | each), *parts)
             for each in options
         ]
 
@@ -182,8 +182,8 @@ def test_a_budget_that_does_not_suffice_is_said(thorough):
 def by_rule():
     """Association.slot of two measurements and two landmarks by each rule, in one program."""
     rules = {name: METHODS[name]() for name in METHODS if name != "joint"}
-    rules["careful"] = association.nearest(9.0, ambiguous="leave")
-    rules["joint"] = association.joint(0.98)
+    rules["careful"] = association.Nearest(9.0, ambiguous="leave")
+    rules["joint"] = association.JointCompatibility(0.98)
     return jax.jit(lambda *parts: {name: plainly(rule, *parts) for name, rule in rules.items()})
 
 
@@ -263,47 +263,48 @@ def test_everything_is_new_in_an_empty_map_and_nothing_in_an_empty_scan(batch):
     assert jax.eval_shape(partial(plainly, method), *nothing).slot.shape == (0,)
 
 
-@pytest.mark.parametrize("name", ["nearest", "maximum_likelihood", "global_nearest"])
-def test_gates_of_nothing_and_of_everything(name):
-    factory = getattr(association, name)
+@pytest.mark.parametrize(
+    "method", [association.Nearest, association.MaximumLikelihood, association.GlobalNearest]
+)
+def test_gates_of_nothing_and_of_everything(method):
     parts = posed(*problem(np.random.default_rng(1), 3, 5))
     gates = np.array([0.0, 0.0, np.inf]), np.array([0.0, np.inf, np.inf])
 
     def of_gates(gate, new_gate, *parts):
-        return plainly(factory(gate, new_gate), *parts)
+        return plainly(method(gate, new_gate), *parts)
 
     over = jax.jit(jax.vmap(of_gates, (0, 0, *[None] * len(parts))))
     slot, is_new, _ = jax.device_get(over(*gates, *parts))
     assert (slot[0] == -1).all()
     np.testing.assert_array_equal(is_new, [[True] * 3, [False] * 3, [False] * 3])
-    if name == "global_nearest":
+    if method is association.GlobalNearest:
         best = scipy.optimize.linear_sum_assignment(parts[0].distance)[1]
         np.testing.assert_array_equal(slot[2], best)
 
 
 def test_joint_probabilities_of_nothing_and_of_everything():
     parts = posed(*problem(np.random.default_rng(1), 3, 5))
-    assert associated(association.joint(0.0), *parts).is_new.all()
-    everything = associated(association.joint(1.0, budget=10_000), *parts)
+    assert associated(association.JointCompatibility(0.0), *parts).is_new.all()
+    everything = associated(association.JointCompatibility(1.0, budget=10_000), *parts)
     assert (np.asarray(everything.slot) >= 0).all()
 
 
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: association.nearest(-1.0), "at least 0"),
-        (lambda: association.nearest(np.nan), "at least 0"),
-        (lambda: association.nearest("9"), "nearest: expected a number as gate, got str$"),
+        (lambda: association.Nearest(-1.0), "at least 0"),
+        (lambda: association.Nearest(np.nan), "at least 0"),
+        (lambda: association.Nearest("9"), "Nearest: .*gate.* got str$"),
         (
-            lambda: plainly(association.nearest, *posed(*problem(np.random.default_rng(1), 3, 5))),
-            r"expected a number .*: as associate, give nearest\(gate\), not nearest$",
+            lambda: plainly(association.Nearest, *posed(*problem(np.random.default_rng(1), 3, 5))),
+            r"expected a number .*: as associate, give Nearest\(gate\), not Nearest$",
         ),
-        (lambda: association.maximum_likelihood(9.0, 4.0), "new_gate >= gate"),
-        (lambda: association.global_nearest(9.0, 4.0), "new_gate >= gate"),
-        (lambda: association.nearest(9.0, ambiguous="guess"), "guess"),
-        (lambda: association.joint(1.5), "probability"),
-        (lambda: association.joint(budget=0), "budget"),
-        (lambda: association.joint(candidates=0), "candidates"),
+        (lambda: association.MaximumLikelihood(9.0, 4.0), "new_gate >= gate"),
+        (lambda: association.GlobalNearest(9.0, 4.0), "new_gate >= gate"),
+        (lambda: association.Nearest(9.0, ambiguous="guess"), "guess"),
+        (lambda: association.JointCompatibility(1.5), "probability"),
+        (lambda: association.JointCompatibility(budget=0), "budget"),
+        (lambda: association.JointCompatibility(candidates=0), "candidates"),
     ],
 )
 def test_refusals(make, message):
@@ -314,4 +315,4 @@ def test_refusals(make, message):
 def test_joint_refuses_a_gate_for_new_ones_below_its_own():
     parts = posed(*problem(np.random.default_rng(1), 3, 5))
     with pytest.raises(ValueError, match="new_gate >= gate"):
-        associated(association.joint(0.99, new_gate=1.0), *parts)
+        associated(association.JointCompatibility(0.99, new_gate=1.0), *parts)

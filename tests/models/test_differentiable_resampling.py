@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from jaxslam.resampling import kld, kld_bound, soft, stop_gradient, systematic
+from jaxslam.resampling import Soft, StopGradient, kld, kld_bound, systematic
 from jaxslam.resampling.weights import normalized, survivors
 
 # x' = a x + q ε, z = x + r η; x_0 ~ N(0, 1) before the first step
@@ -52,9 +52,9 @@ def estimated(a, key, method, count):
 
 METHODS = {
     "plain": systematic,
-    "stop_gradient": stop_gradient(),
-    "soft": soft(0.5),
-    "soft, all of w": soft(1.0),
+    "stop_gradient": StopGradient(),
+    "soft": Soft(0.5),
+    "soft, all of w": Soft(1.0),
 }
 
 
@@ -98,18 +98,18 @@ def test_the_weights_of_soft_copies_are_the_ratio_to_what_they_were_drawn_from()
     w = np.array([0.5, 0.3, 0.2, 0.0])
     with np.errstate(divide="ignore"):
         log_w = np.log(w) + 50
-    ancestor, after = jax.jit(soft(0.6))(log_w, jax.random.key(3))
+    ancestor, after = jax.jit(Soft(0.6))(log_w, jax.random.key(3))
     q = 0.6 * w + 0.4 / 4
     share = (w / q)[np.asarray(ancestor)]
     np.testing.assert_allclose(np.exp(after), share / share.sum(), rtol=1e-12)
     # over many draws, the weighted counts are the weights
     keys = jax.random.split(jax.random.key(4), 4000)
-    ancestor, _ = jax.jit(jax.vmap(soft(0.6), (None, 0)))(log_w, keys)
+    ancestor, _ = jax.jit(jax.vmap(Soft(0.6), (None, 0)))(log_w, keys)
     found = [(np.asarray(ancestor) == j).mean() * (w / q)[j] for j in range(4)]
     np.testing.assert_allclose(found, w, atol=0.01)
 
 
-@pytest.mark.parametrize("method", [soft(0.5), stop_gradient()], ids=["soft", "stop_gradient"])
+@pytest.mark.parametrize("method", [Soft(0.5), StopGradient()], ids=["soft", "stop_gradient"])
 @pytest.mark.parametrize(
     "log_w", [[[0.0, -1.0, -np.inf], [-np.inf] * 3, [np.nan, 0.0, -1e308]], [[3.0]]]
 )
@@ -127,7 +127,7 @@ def test_gradients_stay_finite_and_the_sum_is_one(method, log_w):
 def test_bad_shares_are_refused():
     for share in (-0.1, 1.1, np.nan):
         with pytest.raises(ValueError, match="share from 0 to 1"):
-            soft(share)
+            Soft(share)
 
 
 # --- KLD sampling -------------------------------------------------------------------------------

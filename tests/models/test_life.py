@@ -10,9 +10,8 @@ import pytest
 from worlds import narrow
 
 from jaxslam import life, motion, run, sensors, slots
-from jaxslam.filters import eif_slam, ekf_slam
-from jaxslam.filters.map_management.pruning import pruning
-from jaxslam.life.existence import Existence
+from jaxslam.filters import EkfSlam
+from jaxslam.life.existence import Evidence
 from jaxslam.slots import Joint
 from jaxslam.types import Log, Scan, Status
 
@@ -39,9 +38,8 @@ def log_of(seen):
 
 
 def managed(manager, capacity, **options):
-    """An EKF pruned by the manager, which makes room in it too if it does so at all."""
-    make_room = manager if manager.make_room else None
-    return pruning(ekf_slam(MOTION, SENSOR, capacity, make_room=make_room, **options), manager)
+    """An EKF whose landmarks live as the manager decides."""
+    return EkfSlam(MOTION, SENSOR, capacity, life=manager, **options)
 
 
 def removed_in(trace):
@@ -68,10 +66,10 @@ def seen_by_turns(second, steps=12):
 def driver(replace=False, **options):
     """Drives a filter that removes landmarks for all reasons there are; with a map of 2 or 3 slots."""
     if replace:
-        filter = managed(life.existence(always, replace=True), 2)
+        filter = managed(life.Existence(always, replace=True), 2)
     else:
         visible = lambda pose, landmark: pose[0] < UNSEEING[0] / 2  # noqa: E731
-        filter = managed(life.existence(visible, patience=5, spread=0.5), 3, **options)
+        filter = managed(life.Existence(visible, patience=5, spread=0.5), 3, **options)
 
     @jax.jit
     def go(log, pose, variance):
@@ -108,7 +106,7 @@ def test_what_is_left_is_the_marginal():
     seen = seen_by_turns({0: 1})
     with_life = driven(seen).final
     start = np.zeros(3), np.eye(3) * 1e-4, KEY
-    without = run(ekf_slam(MOTION, SENSOR, 3), log_of(seen), *start).final
+    without = run(EkfSlam(MOTION, SENSOR, 3), log_of(seen), *start).final
     marginal = jax.jit(slots.remove)(without, np.array([False, True, False]))
     np.testing.assert_allclose(with_life.cov, marginal.cov, atol=1e-14)
     np.testing.assert_allclose(with_life.landmarks, marginal.landmarks, atol=1e-14)
@@ -164,8 +162,8 @@ def test_gradients_pass_through_births_and_deaths():
 
     def loss(sigma):
         sensor = sensors.RangeBearing(jnp.diag(jnp.stack([sigma, 0.02])) ** 2)
-        ekf = ekf_slam(MOTION, sensor, 3, update="joint")
-        filter = pruning(ekf, life.existence(always))
+        rule = life.Existence(always)
+        filter = EkfSlam(MOTION, sensor, 3, correction="joint", life=rule)
         trace = run(filter, log, np.zeros(3), np.eye(3) * 1e-4, KEY)
         likely = trace.info.log_likelihood.sum()
         return likely + (trace.estimate.points[-1] ** 2).sum(), removed_in(trace)
@@ -207,9 +205,9 @@ def test_nothing_ever_seen():
 
 
 def test_making_room_takes_the_least_likely_provisional_ones():
-    manager = life.existence(always, replace=True)
+    manager = life.Existence(always, replace=True)
     alive = np.array([True, True, True, False])
-    memory = Existence(
+    memory = Evidence(
         np.array([-1.0, -2.0, 3.0, 0.0]), np.array([False, False, True, False]), 0, 0, 0
     )
     joint = Joint(0, 0, 0, alive, 0, 0, life=memory)
@@ -233,33 +231,9 @@ def test_a_landmark_that_the_scan_measured_stays_in_a_full_map():
 
 def test_what_is_no_manager_is_refused():
     with pytest.raises(ValueError, match="function"):
-        life.existence(None)
-    plain, manager = ekf_slam(MOTION, SENSOR, 3), life.existence(always)
-    with pytest.raises(ValueError, match="pruning: expected life to be a Life"):
-        pruning(plain, life.existence)
-    with pytest.raises(
-        ValueError, match=r"pruning: expected a filter whose state is a slots.Joint.* got eif_slam"
-    ):
-        jax.eval_shape(pruning(eif_slam(MOTION, SENSOR, 3), manager).init, np.zeros(3), np.eye(3))
-    for wrong in (life.existence, manager):
-        with pytest.raises(ValueError, match="ekf_slam: expected make_room to be a Life that"):
-            ekf_slam(MOTION, SENSOR, 3, make_room=wrong)
-
-
-def test_making_room_takes_a_filter_and_a_manager_that_know_of_each_other():
-    manager = life.existence(always, replace=True)
-    forgetful, ignorant = (
-        ekf_slam(MOTION, SENSOR, 3, make_room=manager),
-        ekf_slam(MOTION, SENSOR, 3),
-    )
-    scan = jax.tree.map(lambda leaf: leaf[0], log_of([[0, 1]]).scan)
-    for filter, message in (
-        (forgetful, "ekf_slam: make_room=existence needs the record that pruning keeps"),
-        (pruning(ignorant, manager), "pruning: existence makes room in a full map"),
-    ):
-        state = jax.eval_shape(filter.init, np.zeros(3), np.eye(3))
-        with pytest.raises(ValueError, match=message):
-            jax.eval_shape(filter.update, state, scan, KEY)
+        life.Existence(None)
+    with pytest.raises(ValueError, match="EkfSlam: expected life to be a Life, got the class Exi"):
+        EkfSlam(MOTION, SENSOR, 3, life=life.Existence)
 
 
 @pytest.mark.parametrize(
@@ -275,4 +249,4 @@ def test_making_room_takes_a_filter_and_a_manager_that_know_of_each_other():
 )
 def test_refusals(options, message):
     with pytest.raises(ValueError, match=message):
-        life.existence(always, **options)
+        life.Existence(always, **options)

@@ -70,11 +70,11 @@ def test_both_signs_are_one_set_of_points():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda s: filters.ekf_slam(MOVES, s, 4, linearize=linearize.first_estimate()), "line"),
-        (lambda s: filters.ekf_slam(MOVES, s, 4, chart=charts.right_invariant()), "line"),
-        (lambda s: filters.seif(MOVES, s, 4, active=2, links=2), "line"),
+        (lambda s: filters.EkfSlam(MOVES, s, 4, linearize=linearize.FirstEstimate()), "line"),
+        (lambda s: filters.EkfSlam(MOVES, s, 4, chart=charts.RightInvariant()), "line"),
+        (lambda s: filters.Seif(MOVES, s, 4, active=2, links=2), "line"),
         (lambda s: sensors.Suite(((s, 2), (s, 2))), r"share landmarks \(x, y\)"),
-        (lambda s: filters.merging(filters.ekf_slam(MOVES, s, 4), 0.5), "cannot be merged"),
+        (lambda s: filters.Merging(filters.EkfSlam(MOVES, s, 4), 0.5), "cannot be merged"),
         (
             lambda s: seen_points(s, Scan(jnp.zeros((1, 2)), jnp.zeros(1, int), jnp.ones(1, bool))),
             "expected a sensor that measures points",
@@ -89,5 +89,5 @@ def test_what_is_for_points_refuses_lines(make, message):
 def test_a_line_may_stand_beside_a_compass():
     both = sensors.Suite(((sensors.Line(NOISE), 2), (sensors.Compass([[1e-4]]), 1)))
     assert not both.of_points
-    filters.ekf_slam(MOVES, both, 4)
+    filters.EkfSlam(MOVES, both, 4)
     assert jaxslam.sensors.RangeBearing(NOISE).of_points

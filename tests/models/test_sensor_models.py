@@ -7,7 +7,7 @@ import pytest
 from reference.plane import mounted, wrap
 
 from jaxslam import motion, sensors
-from jaxslam.filters import ekf_slam
+from jaxslam.filters import EkfSlam
 from jaxslam.run import run
 from jaxslam.simulation.worlds import Scenario, simulate
 
@@ -325,7 +325,7 @@ def test_inverse_depth_in_the_ekf_starts_from_the_prior_and_finds_the_distance()
         controls=np.tile([0.2, 0.0], (60, 1)),
         pose_cov=np.diag([0.01, 0.02, 0.005]) ** 2,
     )
-    filter = ekf_slam(scenario.motion, sensor, 5)
+    filter = EkfSlam(scenario.motion, sensor, 5)
 
     @jax.jit
     def go(key):

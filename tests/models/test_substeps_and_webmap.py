@@ -8,7 +8,7 @@ import pytest
 from own_models import changed
 
 from jaxslam import motion, run
-from jaxslam.filters import ekf_slam
+from jaxslam.filters import EkfSlam
 from jaxslam.motion.substeps import Substeps
 from jaxslam.simulation.scenarios.webmap import webmap
 from jaxslam.simulation.worlds import simulate
@@ -253,7 +253,7 @@ def test_steps_may_be_given():
 def test_ekf_slam_runs_on_it():
     scenario = webmap(20)
     landmarks = np.asarray(scenario.landmarks)
-    ekf = ekf_slam(scenario.motion, scenario.sensor, len(landmarks), **scenario.filter_options)
+    ekf = EkfSlam(scenario.motion, scenario.sensor, len(landmarks), **scenario.filter_options)
     truth, log = jax.device_get(simulate(scenario, jax.random.key(1)))
     trace = run(ekf, log, scenario.pose, scenario.pose_cov, jax.random.key(2))
     chex.assert_tree_all_finite((trace.estimate, trace.info))

@@ -13,7 +13,7 @@ from worlds import draw, ring
 
 import jaxslam
 from jaxslam import charts, filters, linearize, motion, sensors
-from jaxslam.filters import ekf_slam
+from jaxslam.filters import EkfSlam
 from jaxslam.sensors import Part, Suite
 from jaxslam.simulation.scenarios import between_ranges
 from jaxslam.simulation.spurious import Spurious
@@ -54,7 +54,7 @@ def drawn():
 def estimated():
     """The same filter for all logs of the world, so that it is traced once."""
     scenario = world()
-    return scenario, ekf_slam(scenario.motion, scenario.sensor, 6)
+    return scenario, EkfSlam(scenario.motion, scenario.sensor, 6)
 
 
 def driven(ekf, scenario, log):
@@ -87,7 +87,7 @@ def places(scan, first, count, size=2):
 
 def test_a_suite_of_one_is_the_sensor():
     scenario, _ = estimated()
-    pair = [ekf_slam(scenario.motion, s, 6) for s in (EYES, Suite(((EYES, 4),)))]
+    pair = [EkfSlam(scenario.motion, s, 6) for s in (EYES, Suite(((EYES, 4),)))]
 
     @jax.jit
     def both(state, scan):
@@ -104,9 +104,9 @@ def test_a_suite_of_one_is_the_sensor():
 def test_sensors_in_turn_are_filters_in_turn():
     """Each part by hand: the state of one filter handed to another, of its own sensor. In the chart
     whose basis turns the map; the others have a simpler one."""
-    scenario, chart = world(), charts.right_invariant()
-    whole = ekf_slam(scenario.motion, scenario.sensor, 6, chart=chart)
-    eyes, laser = (ekf_slam(scenario.motion, s, 6, chart=chart) for s in (EYES, LASER))
+    scenario, chart = world(), charts.RightInvariant()
+    whole = EkfSlam(scenario.motion, scenario.sensor, 6, chart=chart)
+    eyes, laser = (EkfSlam(scenario.motion, s, 6, chart=chart) for s in (EYES, LASER))
     # A compass among landmarks by hand: a sensor of points that ignores them.
     blind = changed(
         COMPASS,
@@ -114,7 +114,7 @@ def test_sensors_in_turn_are_filters_in_turn():
         observe=lambda pose, point: COMPASS.observe(pose, point[:0]),
         invert=lambda pose, z, s: jnp.zeros(2),
     )
-    heading = ekf_slam(
+    heading = EkfSlam(
         scenario.motion,
         blind,
         6,
@@ -175,7 +175,7 @@ def test_info_is_of_all_places():
 def test_campaigns_judge_a_suite():
     """An honest filter of all three, and one that believes its compass too much is found out."""
     scenario, honest = estimated()
-    proud = ekf_slam(scenario.motion, of_all(sensors.Compass([[0.004**2]])), 6)
+    proud = EkfSlam(scenario.motion, of_all(sensors.Compass([[0.004**2]])), 6)
     tried = {"honest": honest, "proud": proud}
     options = {"block": 100, "devices": jax.devices()[:1]}
     campaign = jaxslam.monte_carlo(scenario, tried, 100, jax.random.key(1), **options)
@@ -201,7 +201,7 @@ def test_gradients_reach_every_part():
         compass = sensors.Compass(theta[2:3, None] ** 2)
         laser = sensors.RelativePosition(jnp.eye(2) * theta[3] ** 2)
         both = Suite(((eyes, 4), (laser, 6), (compass, 1), Part(EYES, 2, sees="robots")))
-        ekf = ekf_slam(scenario.motion, both, 6, update="joint")
+        ekf = EkfSlam(scenario.motion, both, 6, correction="joint")
         return ekf.update(state, scan, jax.random.key(0))[1].log_likelihood
 
     theta = np.array([0.05, 0.02, 0.03, 0.05, 0.1, 0.0, 0.3])
@@ -248,12 +248,12 @@ def signature():
         (lambda: world(places=3), "each Part has its own places"),
         (lambda: world(spurious=Spurious()), "each Part has its own places"),
         (
-            lambda: ekf_slam(ring().motion, world().sensor, 6, linearize=linearize.observability()),
-            "needs a suite without absolute sensors, not .*: choose linearize.at_estimate",
+            lambda: EkfSlam(ring().motion, world().sensor, 6, linearize=linearize.Observability()),
+            "needs a suite without absolute sensors, not .*: choose linearize.AtEstimate",
         ),
         (
-            lambda: filters.compressed_ekf_slam(ring().motion, world().sensor, 6, area=3),
-            "not a suite",
+            lambda: filters.CompressedEkfSlam(EkfSlam(ring().motion, world().sensor, 6), area=3),
+            "a suite is not supported",
         ),
         (
             lambda: Suite(((EYES, 1),)).observe(jnp.zeros(3), jnp.zeros(2)),
@@ -276,7 +276,7 @@ def test_absolute_sensors_alone_in_both_precisions():
         controls=np.tile([0.1, 0.05], (30, 1)),
     )
     truth, log = draw(scenario, 0)
-    ekf = ekf_slam(scenario.motion, scenario.sensor, 1)
+    ekf = EkfSlam(scenario.motion, scenario.sensor, 1)
     trace = driven(ekf, scenario, log)
     assert (trace.info.status == Status.FUSED).all()
     assert np.abs(trace.estimate.pose - truth.pose).max() < 0.2

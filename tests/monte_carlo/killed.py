@@ -30,7 +30,7 @@ _IDENTITY = {"campaign": "toy"}
 def campaign(**options):
     """A campaign of dead reckoning in blocks of two runs."""
     world = worlds.ring(20)
-    candidates = {"reckoning": filters.dead_reckoning(world.motion, world.sensor)}
+    candidates = {"reckoning": filters.DeadReckoning(world.motion, world.sensor)}
     options |= {"block": BLOCK, "devices": jax.devices()[:1], "identity": _IDENTITY}
     return monte_carlo(world, candidates, RUNS, worlds.key(), **options)
 

@@ -13,6 +13,7 @@ import pytest
 import worlds
 
 from jaxslam import filters, sensors, store
+from jaxslam.core.record import record
 from jaxslam.monte_carlo import fingerprint as module
 from jaxslam.monte_carlo import monte_carlo
 from jaxslam.monte_carlo.fingerprint import digest, fingerprint
@@ -24,7 +25,7 @@ def world(steps=12, sigma=0.05, **changes):
 
 
 def blind(scenario):
-    return filters.dead_reckoning(scenario.motion, scenario.sensor)
+    return filters.DeadReckoning(scenario.motion, scenario.sensor)
 
 
 def campaign(scenario=None, name="blind", make=blind, key=0):
@@ -32,14 +33,17 @@ def campaign(scenario=None, name="blind", make=blind, key=0):
     return {"scenario": scenario, "filters": {name: make(scenario)}, "key": jax.random.key(key)}
 
 
+@record
+class Drifting(filters.Wrapper):
+    name = "dead_reckoning"
+
+    def predict(self, state, u, key):
+        return self.filter.predict(state, 1.0001 * u, key)
+
+
 def drifting(scenario):
     """The same filter by another line of code."""
-    filter = blind(scenario)
-
-    def predict(state, u, key):
-        return filter.predict(state, 1.0001 * u, key)
-
-    return dataclasses.replace(filter, predict=predict)
+    return Drifting(blind(scenario))
 
 
 ELSEWHERE = np.asarray(worlds.ring(12).landmarks) + [1e-15, 0.0]

@@ -12,6 +12,7 @@ import worlds
 from own_models import changed
 
 from jaxslam import catalog, filters, grids, motion, run, sensors, simulate, store
+from jaxslam.core.record import record
 from jaxslam.filters import reporting
 from jaxslam.grids.localization.localize import info_of_beams
 from jaxslam.monte_carlo import Interrupted, missing, monte_carlo, work
@@ -264,7 +265,7 @@ def test_blocks_share_one_trace():
         return WORLD.motion.step(pose, u, w)
 
     watched = changed(WORLD.motion, step=counted)
-    ekf = filters.ekf_slam(watched, WORLD.sensor, 6)
+    ekf = filters.EkfSlam(watched, WORLD.sensor, 6)
     counts = []
     for runs in (4, 10):
         options = {"block": 4, "bound": True, "devices": jax.devices()[:1]}
@@ -283,21 +284,26 @@ def test_float32_sees_the_worlds_of_float64(in_fours):
 
 
 def test_drops_and_losses_are_counted_and_leave_the_others_valid(in_fours):
-    reckoning = filters.dead_reckoning(WORLD.motion, WORLD.sensor)
+    reckoning = filters.DeadReckoning(WORLD.motion, WORLD.sensor)
 
-    def poisoned(joint, scan, key):
-        joint, info = reckoning.update(joint, scan, key)
-        # A scan that starts with a long range in about half of the runs.
-        bad = scan.z[0, 0] > 3.68
-        return joint._replace(pose=jnp.where(bad, jnp.nan, joint.pose)), info
+    @record
+    class Poisoned(filters.Wrapper):
+        def update(self, joint, scan, key):
+            joint, info = self.filter.update(joint, scan, key)
+            # A scan that starts with a long range in about half of the runs.
+            bad = scan.z[0, 0] > 3.68
+            return joint._replace(pose=jnp.where(bad, jnp.nan, joint.pose)), info
+
+    @record
+    class Lost(filters.Wrapper):
+        def predict(self, joint, u, key):
+            return joint._replace(pose=joint.pose * jnp.nan)
 
     candidates = {
         "ekf": EKF,
-        "poisoned": dataclasses.replace(reckoning, update=poisoned),
-        "small": filters.ekf_slam(WORLD.motion, WORLD.sensor, 4),
-        "always lost": dataclasses.replace(
-            reckoning, predict=lambda joint, u, key: joint._replace(pose=joint.pose * jnp.nan)
-        ),
+        "poisoned": Poisoned(reckoning),
+        "small": filters.EkfSlam(WORLD.motion, WORLD.sensor, 4),
+        "always lost": Lost(reckoning),
     }
     campaign = campaign_of(candidates)
     same(campaign.filters["ekf"], in_fours.filters["ekf"])
@@ -312,7 +318,7 @@ def test_drops_and_losses_are_counted_and_leave_the_others_valid(in_fours):
 
 
 def test_a_filter_of_beams_without_innovations_runs_in_a_world_that_draws_a_log_of_beams():
-    """Dead reckoning that says of beams what `grids.localize` does: there is nothing to whiten."""
+    """Dead reckoning that says of beams what `grids.GridLocalization` does: there is nothing to whiten."""
     room = square(beams=3)
 
     def draw(scenario, key):
@@ -330,13 +336,14 @@ def test_a_filter_of_beams_without_innovations_runs_in_a_world_that_draws_a_log_
         pose=room.pose,
         draw=draw,
     )
-    reckoning = filters.dead_reckoning(room.motion, WORLD.sensor)
+    reckoning = filters.DeadReckoning(room.motion, WORLD.sensor)
 
-    def update(joint, scan, key):
-        return joint, info_of_beams(scan, 1, jnp.zeros(()), jnp.asarray(True))
+    @record
+    class Silent(filters.Wrapper):
+        def update(self, joint, scan, key):
+            return joint, info_of_beams(scan, 1, jnp.zeros(()), jnp.asarray(True))
 
-    silent = dataclasses.replace(reckoning, update=update)
-    found = worlds.campaign(world, {"silent": silent}, 3).filters["silent"]
+    found = worlds.campaign(world, {"silent": Silent(reckoning)}, 3).filters["silent"]
     assert found.counts["fused"] > 0 and found.counts["not_finite"] == 0
     assert all(np.isfinite(m.value) for m in found.measures.values())
 
@@ -355,13 +362,15 @@ def test_a_sensor_without_noise_is_told_where_it_left_nothing_to_judge():
     """Nothing is wrong with it in dead reckoning, which takes no measurements."""
     exact = sensors.RangeBearing(np.diag([0.1, 0.0]), mount=(0.1, -0.05, 0.3))
     still = dataclasses.replace(WORLD, sensor=exact)  # drawn by the program of WORLD
-    reckoning = filters.dead_reckoning(still.motion, exact)
+    reckoning = filters.DeadReckoning(still.motion, exact)
 
-    def singular(joint, scan, key):
-        info = reporting.nothing_of(scan)
-        return joint, info._replace(status=jnp.full_like(info.status, Status.SINGULAR))
+    @record
+    class Singular(filters.Wrapper):
+        def update(self, joint, scan, key):
+            info = reporting.nothing_of(scan)
+            return joint, info._replace(status=jnp.full_like(info.status, Status.SINGULAR))
 
-    candidates = {"a": reckoning, "b": dataclasses.replace(reckoning, update=singular)}
+    candidates = {"a": reckoning, "b": Singular(reckoning)}
     found = worlds.campaign(still, candidates, 2)
     a, b = (found.filters[name].doubts for name in candidates)
     assert not any("without noise" in doubt for doubt in a)
@@ -422,12 +431,12 @@ def test_wrong_filters_are_found_out(lineup, name):
         ({"filters": {}}, "at least one"),
         ({"filters": {"x": 3}}, "expected x to be a Filter"),
         ({"filters": {"x": lambda log, key: None}}, "lambda truth"),
-        ({"filters": {"x": filters.ekf_slam}}, "'x' is a factory: call it, x(motion, …)"),
-        ({"filters": {"x": filters.dead_reckoning}}, "call it, x(motion, …)"),
+        ({"filters": {"x": filters.EkfSlam}}, "'x' is a factory: call it, x(motion, …)"),
+        ({"filters": {"x": filters.DeadReckoning}}, "call it, x(motion, …)"),
         ({"filters": catalog.FILTERS}, "'ekf' is a factory: call it, ekf(scenario, …)"),
         ({"filters": {"fej": catalog.FILTERS["fej"]}}, "call it, fej(world, …)"),
         (
-            {"filters": {"x": filters.ekf_slam(motion.Unicycle(np.eye(2)), WORLD.sensor, 2)}},
+            {"filters": {"x": filters.EkfSlam(motion.Unicycle(np.eye(2)), WORLD.sensor, 2)}},
             "takes controls (v [m/s], omega [rad/s], dt [s]), the scenario ring gives (forward [m], ",
         ),
         ({"filters": {"x": lambda a, b, key: None}}, "'x' is a factory: call it, x(a, b, key)"),

@@ -16,7 +16,7 @@ from jaxslam.results import campaign_files
 from jaxslam.results.campaign_folder import block_file
 
 WORLD = worlds.ring(20)
-RECKONING = filters.dead_reckoning(WORLD.motion, WORLD.sensor)
+RECKONING = filters.DeadReckoning(WORLD.motion, WORLD.sensor)
 SCRIPT = Path(__file__).parents[2] / "examples" / "slurm_campaign.sh"
 
 

@@ -1,6 +1,5 @@
 """Programs are compiled once for a structure: another number, object or key compiles nothing."""
 
-import dataclasses
 import threading
 
 import chex
@@ -12,6 +11,7 @@ import worlds
 from layouts import wrong_layouts
 
 from jaxslam import catalog, filters, programs, run, simulate, smoothing
+from jaxslam.core.record import record
 from jaxslam.programs import cache
 from jaxslam.types import Status
 
@@ -52,7 +52,7 @@ def test_other_numbers_run_what_is_there_place_by_place(compilations):
 def test_a_program_gives_what_the_function_does():
     """Hoisted numbers stand where they stood: the same trace as under `jax.jit`, to rounding."""
     there = worlds.scaled(1.0)
-    ekf = worlds.ekf(there, gate=5.991, update="joint")
+    ekf = worlds.ekf(there, gate=5.991, correction="joint")
     key = jax.random.key(0)
     truth, log = simulate(there, key)
     plain = jax.jit(lambda log: run(ekf, log, there.pose, there.pose_cov, key))(log)
@@ -60,7 +60,9 @@ def test_a_program_gives_what_the_function_does():
     chex.assert_trees_all_close(plain, ours, rtol=1e-9, atol=1e-12)
     drawn = jax.jit(lambda key: simulate(there, key))(key)
     chex.assert_trees_all_close(drawn, (truth, log), rtol=1e-9, atol=1e-12)
-    none = run(worlds.ekf(there, gate=1e-6, update="joint"), log, there.pose, there.pose_cov, key)
+    none = run(
+        worlds.ekf(there, gate=1e-6, correction="joint"), log, there.pose, there.pose_cov, key
+    )
     assert int(none.info.tally(Status.REJECTED).sum()) > int(ours.info.tally(Status.REJECTED).sum())
 
 
@@ -70,7 +72,7 @@ def test_a_smoother_with_other_numbers(compilations):
     def trace(scale):
         there = worlds.scaled(scale, steps=4)
         _, log = simulate(there, jax.random.key(0))
-        estimator = smoothing.smooth(there.motion, there.sensor, 6, there.pose, there.pose_cov)
+        estimator = smoothing.Smoother(there.motion, there.sensor, 6, there.pose, there.pose_cov)
         return estimator(log, jax.random.key(0))
 
     first = trace(1.0)
@@ -79,23 +81,28 @@ def test_a_smoother_with_other_numbers(compilations):
     assert compilations() == before
 
 
-def test_the_same_objects_are_not_traced_again():
+@record
+class Scale:
+    factor: float
+
+
+def test_records_of_one_structure_are_not_traced_again():
     traced = []
 
-    def scaled(factor, x):
-        traced.append(factor)
-        return x * factor
+    def scaled(scale, x):
+        traced.append(scale)
+        return x * scale.factor
 
-    factor, x = np.float64(3.7), jnp.arange(3.0)
-    for _ in range(2):
-        np.testing.assert_allclose(programs.call(scaled, (factor,), x), 3.7 * np.arange(3))
+    x = jnp.arange(3.0)
+    for factor in (3.7, 3.9):  # another number is another argument
+        found = programs.call(scaled, (Scale(factor),), x)
+        np.testing.assert_allclose(found, factor * np.arange(3))
     assert len(traced) == 1
-    programs.call(scaled, (factor,), x[:2])
-    programs.call(scaled, (np.float64(3.7),), x)
-    assert len(traced) == 3
+    programs.call(scaled, (Scale(3.7),), x[:2])
+    assert len(traced) == 2
     programs.clear()
-    programs.call(scaled, (factor,), x)
-    assert len(traced) == 4
+    programs.call(scaled, (Scale(3.7),), x)
+    assert len(traced) == 3
 
 
 def ones(rows):
@@ -120,6 +127,15 @@ def test_arrays_of_numpy_need_no_program_of_their_own_and_are_copied(compilation
     second, _ = programs.call(scaled, (), x, y)
     assert (np.asarray(first) == 1.0).all()
     assert (np.asarray(second) == 3.0).all()
+
+
+def test_an_option_is_part_of_the_structure():
+    def powers(twice, count, x):
+        return [x**k for k in range(count)] if twice else x
+
+    assert len(programs.call(powers, (True, 3), np.ones(2))) == 3
+    assert len(programs.call(powers, (True, 5), np.ones(2))) == 5
+    assert programs.call(powers, (False, 3), np.ones(2)).shape == (2,)
 
 
 def test_within_a_trace_it_is_the_function():
@@ -261,7 +277,7 @@ def test_float32_and_float64_are_two_programs():
 
 def test_an_error_of_the_function_comes_as_it_is():
     ring = worlds.ring(3)
-    ekf = filters.ekf_slam(ring.motion, ring.sensor, 6)
+    ekf = filters.EkfSlam(ring.motion, ring.sensor, 6)
     _, log = simulate(ring, jax.random.key(0))
     with pytest.raises(ValueError, match="expected shape"):
         run(
@@ -275,11 +291,16 @@ def test_an_error_of_the_function_comes_as_it_is():
 
 def test_an_update_without_info_and_a_key_that_is_none_are_refused():
     ring = worlds.ring(3)
-    ekf = filters.ekf_slam(ring.motion, ring.sensor, 6)
+    ekf = filters.EkfSlam(ring.motion, ring.sensor, 6)
     _, log = simulate(ring, jax.random.key(0))
-    bare = dataclasses.replace(ekf, update=lambda joint, scan, key: ekf.update(joint, scan, key)[0])
+
+    @record
+    class Bare(filters.Wrapper):
+        def update(self, joint, scan, key):
+            return self.filter.update(joint, scan, key)[0]
+
     with pytest.raises(ValueError, match=r"expected update to return \(state, Info\), got Joint"):
-        run(bare, log, ring.pose, ring.pose_cov, jax.random.key(0))
+        run(Bare(ekf), log, ring.pose, ring.pose_cov, jax.random.key(0))
     with pytest.raises(ValueError, match="run: expected a PRNG key"):
         run(ekf, log, ring.pose, ring.pose_cov, 0)
     with pytest.raises(ValueError, match="simulate: expected a PRNG key"):

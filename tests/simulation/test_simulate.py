@@ -404,7 +404,7 @@ def test_cloister_is_the_guides_simulation():
     z_cov = np.diag([0.01, np.deg2rad(1) ** 2])
     np.testing.assert_allclose(scenario.sensor.noise_cov(jnp.zeros(2)), z_cov)
     assert scenario.noise_on == "robot"
-    assert scenario.filter_options == {"update": "sequential", "gate": 9.0, "births": 1}
+    assert scenario.filter_options == {"correction": "sequential", "gate": 9.0, "births": 1}
 
 
 @pytest.mark.parametrize("n", [4, 7, 9])

@@ -11,8 +11,7 @@ import worlds
 
 from jaxslam import association, life, monte_carlo, run, sensors, simulate
 from jaxslam.consistency.associations import associations, identities
-from jaxslam.filters import ekf_slam
-from jaxslam.filters.map_management.pruning import pruning
+from jaxslam.filters import EkfSlam
 from jaxslam.protocols import Association
 from jaxslam.simulation.spurious import Spurious, spoil
 from jaxslam.types import Estimate, Info, Scan, Status, Trace
@@ -117,10 +116,10 @@ def test_associations_are_counted_by_what_a_slot_was_born_of():
 
 
 METHODS = {
-    "nearest": association.nearest(16.0, 36.0),
-    "maximum_likelihood": association.maximum_likelihood(16.0, 36.0),
-    "global_nearest": association.global_nearest(16.0, 36.0),
-    "joint": association.joint(0.999, 36.0),
+    "nearest": association.Nearest(16.0, 36.0),
+    "maximum_likelihood": association.MaximumLikelihood(16.0, 36.0),
+    "global_nearest": association.GlobalNearest(16.0, 36.0),
+    "joint": association.JointCompatibility(0.999, 36.0),
 }
 
 
@@ -151,10 +150,10 @@ def ruined():
     wrong = Spurious(clutter=1.0, missed=0.1, outliers=0.05, mislabelled=0.2, reach=4.0)
     world = dataclasses.replace(worlds.ring(steps=30), spurious=wrong)
     parts = world.motion, world.sensor, 20
-    manager = life.existence(lambda pose, landmark: jnp.asarray(True))
+    manager = life.Existence(lambda pose, landmark: jnp.asarray(True))
     filters = {
-        "trusting": ekf_slam(*parts),
-        "careful": pruning(ekf_slam(*parts, associate=METHODS["nearest"]), manager),
+        "trusting": EkfSlam(*parts),
+        "careful": EkfSlam(*parts, associate=METHODS["nearest"], life=manager),
     }
     options = {"block": 6, "devices": jax.devices()[:1]}
     return monte_carlo(world, filters, 6, jax.random.key(0), **options).filters

@@ -15,8 +15,8 @@ import worlds
 from test_smoothing import KEY, P0, START, arguments, linear_log, linear_world
 
 from jaxslam import motion, run, sensors, simulate
-from jaxslam.filters import ekf_slam
-from jaxslam.smoothing import batch_map, fixed_lag
+from jaxslam.filters import EkfSlam
+from jaxslam.smoothing import BatchMap, FixedLag
 from jaxslam.types import Log, Scan, Status
 
 
@@ -31,14 +31,14 @@ def short():
 
 def lag(world, **options):
     count = len(world.landmarks)
-    return fixed_lag(world.motion, world.sensor, count, count, **options)
+    return FixedLag(world.motion, world.sensor, count, count, **options)
 
 
 def test_a_window_as_long_as_the_log_is_the_batch(short):
     world, log = short
     filter = lag(world, window=4, iterations=5)
     trace = run(filter, log, world.pose, world.pose_cov, KEY)
-    batch = batch_map(*arguments(world))(log, KEY)
+    batch = BatchMap(*arguments(world))(log, KEY)
     for name in ("pose", "pose_cov", "points", "point_covs"):
         ours, theirs = (np.asarray(getattr(t.estimate, name))[-1] for t in (trace, batch))
         np.testing.assert_allclose(ours, theirs, rtol=1e-6, atol=1e-9)
@@ -66,8 +66,8 @@ def test_in_a_linear_world_it_is_the_kalman_filter():
     """What leaves the window is marginalized without loss; landmarks enter at any time."""
     log = linear_log(steps=9)
     moves, sees = linear_world()
-    kalman = run(ekf_slam(moves, sees, 4, update="joint"), regular(log), START, P0, KEY)
-    trace = run(fixed_lag(moves, sees, 4, 4, window=3, iterations=1), log, START, P0, KEY)
+    kalman = run(EkfSlam(moves, sees, 4, correction="joint"), regular(log), START, P0, KEY)
+    trace = run(FixedLag(moves, sees, 4, 4, window=3, iterations=1), log, START, P0, KEY)
     for ours, theirs in zip(trace.estimate, kalman.estimate, strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-8, atol=1e-10)
     np.testing.assert_allclose(trace.final.joint.cov, kalman.final.cov, rtol=1e-8, atol=1e-10)
@@ -111,7 +111,7 @@ def test_float32_and_gradients(short):
     [
         ({"window": 0}, "window"),
         ({"iterations": 0}, "iterations"),
-        ({"places": 0}, "places"),
+        ({"slots": 0}, "slots"),
         ({"sensor": sensors.BearingOnly(np.eye(1))}, "as many numbers"),
         ({"sensor": sensors.Compass(np.eye(1))}, "as many numbers"),
         (
@@ -122,12 +122,12 @@ def test_float32_and_gradients(short):
 )
 def test_what_does_not_fit_is_refused(options, why):
     given = {"motion": worlds.ring().motion, "sensor": worlds.ring().sensor}
-    given |= {"capacity": 3, "places": 3} | options
+    given |= {"capacity": 3, "slots": 3} | options
     with pytest.raises(ValueError, match=why):
-        fixed_lag(**given)
+        FixedLag(**given)
 
 
 def test_a_scan_that_is_too_large_is_refused(short):
     world, log = short
     with pytest.raises(ValueError, match="at most 2 measurement slots"):
-        run(fixed_lag(world.motion, world.sensor, 6, 2), log, world.pose, world.pose_cov, KEY)
+        run(FixedLag(world.motion, world.sensor, 6, 2), log, world.pose, world.pose_cov, KEY)

@@ -16,7 +16,7 @@ from jaxslam import filters, motion, run, sensors, simulate
 from jaxslam.graphs import Ending
 from jaxslam.math.stats import chi2_band
 from jaxslam.protocols import Free
-from jaxslam.smoothing import batch_map, smooth
+from jaxslam.smoothing import BatchMap, Smoother
 from jaxslam.types import Log, Scan, Status
 
 KEY = jax.random.key(0)
@@ -126,7 +126,7 @@ def solve_linear(kind):
     options = {"iterations": 2, "tolerance": None} if kind == np.float64 else {}
 
     def solve(pose):
-        trace = batch_map(*linear_world(), 4, pose, P0, **options)(log, KEY)
+        trace = BatchMap(*linear_world(), 4, pose, P0, **options)(log, KEY)
         return trace.estimate.pose[-1, 0], trace
 
     if kind == np.float64:
@@ -247,7 +247,7 @@ def test_it_is_the_rauch_tung_striebel_smoother():
         path.append(x)
         path_covs.append(p)
     path, path_covs = np.array(path[::-1]), np.array(path_covs[::-1])
-    trace = jax.jit(smooth(*arguments(world)))(log, KEY)
+    trace = jax.jit(Smoother(*arguments(world)))(log, KEY)
     np.testing.assert_allclose(trace.estimate.pose, path[:, :3], rtol=0, atol=1e-9)
     np.testing.assert_allclose(trace.estimate.pose_cov, path_covs[:, :3, :3], rtol=0, atol=1e-9)
 
@@ -283,12 +283,12 @@ def test_it_ends_where_the_filter_ends(make, options):
     world = make()
     _, log = simulate(world, jax.random.key(6))
     size = len(world.landmarks)
-    ekf = filters.ekf_slam(world.motion, world.sensor, size, update="joint", **options)
+    ekf = filters.EkfSlam(world.motion, world.sensor, size, correction="joint", **options)
 
     @jax.jit
     def both(log):
         wanted = run(ekf, log, world.pose, world.pose_cov, KEY)
-        return wanted, smooth(*arguments(world), **options)(log, KEY)
+        return wanted, Smoother(*arguments(world), **options)(log, KEY)
 
     wanted, trace = jax.device_get(both(log))
     joint, final = trace.final.joint, wanted.final
@@ -349,7 +349,7 @@ RUNS, STEPS = 40, 10
 def many():
     """Truths, logs, and traces of smoother and batch on the same draws of `step_ring`, by vmap."""
     world = step_ring(STEPS)
-    smoother, batch = smooth(*arguments(world)), batch_map(*arguments(world), tolerance=1e-9)
+    smoother, batch = Smoother(*arguments(world)), BatchMap(*arguments(world), tolerance=1e-9)
 
     @jax.jit
     @jax.vmap
@@ -480,7 +480,7 @@ EMPTY = Log(
 RAYS = sensors.BearingInverseDepth(np.eye(1), min_distance=1.0)
 
 
-@pytest.mark.parametrize("method", [smooth, batch_map])
+@pytest.mark.parametrize("method", [Smoother, BatchMap])
 @pytest.mark.parametrize(
     ("change", "message"),
     [
@@ -504,9 +504,9 @@ def test_bad_input_is_refused(method, change, message):
 def test_the_batch_refuses():
     world = ring(5)
     with pytest.raises(ValueError, match="iterations"):
-        batch_map(*arguments(world), iterations=0)
+        BatchMap(*arguments(world), iterations=0)
     for tolerance in (0.0, np.nan, np.inf):
         with pytest.raises(ValueError, match="tolerance"):
-            batch_map(*arguments(world), tolerance=tolerance)
+            BatchMap(*arguments(world), tolerance=tolerance)
     with pytest.raises(ValueError, match="leaves 1"):
-        batch_map(*arguments(camera_ring(5)))
+        BatchMap(*arguments(camera_ring(5)))

@@ -75,7 +75,7 @@ def test_a_right_claim_passes(verify):
 
 
 def test_a_chart_beside_it_is_said_to_be_left_out(verify):
-    text = "import jax.numpy as jnp\nfrom jaxslam import charts\n\nmine = charts.euclidean()\n"
+    text = "import jax.numpy as jnp\nfrom jaxslam import charts\n\nmine = charts.Euclidean()\n"
     text += "\n\ndef f(v):\n    return v\n\n\ndef f_jacobian(v):\n    return jnp.eye(1)\n\n\n"
     text += 'f_arguments = {"v": ("v [m]",)}\n'
     verify.says(text, 0, "verified, with 1 note", "not verified: mine (no chart")

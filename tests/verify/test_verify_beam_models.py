@@ -1,12 +1,12 @@
 """Beam models under `verify`: both pass, a wrong derivative does not, and a file may define one."""
 
-import dataclasses
 from functools import partial
 
 import jax.numpy as jnp
 import pytest
 
 from jaxslam import cli
+from jaxslam.core.record import record
 from jaxslam.grids import beam_models
 from jaxslam.verify import build, verify_jacobians
 from jaxslam.verify.inputs.user_files import UnusableFile, load, verify_file
@@ -20,12 +20,12 @@ def test_beam_models_are_verified(make):
 
 
 def test_a_wrong_derivative_by_the_heading_is_found():
-    right = build(beam_models.likelihood_field)
+    @record
+    class Wrong(beam_models.LikelihoodField):
+        def jacobian(self, prepared, pose, beams):
+            return super().jacobian(prepared, pose, beams) * jnp.array([[1.0, 1.0, -1.0]])
 
-    def wrong(prepared, pose, beams):
-        return right.jacobian(prepared, pose, beams) * jnp.array([[1.0, 1.0, -1.0]])
-
-    report = verify_jacobians(dataclasses.replace(right, jacobian=wrong), count=4)
+    report = verify_jacobians(build(Wrong), count=4)
     assert not report.passed
     assert "theta" in str(report) and "hand disagrees" in str(report), str(report)
 
@@ -33,9 +33,11 @@ def test_a_wrong_derivative_by_the_heading_is_found():
 def test_a_file_may_define_a_beam_model_whose_jacobian_is_held(tmp_path):
     path = tmp_path / "mine.py"
     path.write_text(
-        "import dataclasses\nfrom jaxslam.grids import likelihood_field\n"
-        "mine = likelihood_field(0.2, max_range=40.0)\n"
-        "wrong = dataclasses.replace(mine, jacobian=lambda *at: -mine.jacobian(*at))\n",
+        "import dataclasses\nfrom jaxslam.core.record import record\n"
+        "from jaxslam.grids import LikelihoodField\n"
+        "@record\nclass Wrong(LikelihoodField):\n"
+        "    def jacobian(self, *at):\n        return -super(Wrong, self).jacobian(*at)\n"
+        "mine = LikelihoodField(0.2, max_range=40.0)\nwrong = Wrong(0.2, max_range=40.0)\n",
         encoding="utf-8",
     )
     right, wrong = verify_file(str(path), partial(verify_jacobians, count=4))

@@ -9,7 +9,7 @@ from jaxslam.datasets.evaluation import evaluate
 
 jax.config.update("jax_enable_x64", True)
 data = jaxslam.datasets.mrclam(sys.argv[1], robot=1)
-filter = jaxslam.filters.ekf_slam(data.motion, data.sensor, data.capacity, **data.filter_options)
+filter = jaxslam.filters.EkfSlam(data.motion, data.sensor, data.capacity, **data.filter_options)
 trace = jaxslam.run(filter, data.log, data.pose, data.pose_cov, jax.random.key(0))
 found = evaluate(data, trace.estimate, jax.tree.map(lambda leaf: leaf[-1], trace.estimate))
 figure = jaxslam.plot.map_figure(

@@ -10,7 +10,7 @@ from jaxslam.filters.delayed.settings import StoredMeasurements
 jax.config.update("jax_enable_x64", True)
 data = jaxslam.datasets.plaza(gtsam.findExampleDataFile("Plaza1_.mat"))
 stored = StoredMeasurements(capacity=40, spacing=2.0)
-filter = jaxslam.filters.delayed_slam(data.motion, data.sensor, data.capacity, stored=stored)
+filter = jaxslam.filters.DelayedSlam(data.motion, data.sensor, data.capacity, stored=stored)
 trace = jaxslam.run(filter, data.log, data.pose, data.pose_cov, jax.random.key(0))
 found = evaluate(data, trace.estimate, jax.tree.map(lambda leaf: leaf[-1], trace.estimate))
 figure = jaxslam.plot.map_figure(

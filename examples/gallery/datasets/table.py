@@ -20,6 +20,6 @@ scan = log.scan
 rows = np.c_[np.repeat(time, 36), scan.tag.ravel(), scan.z.reshape(-1, 2)]
 save(folder / "measurements.csv", rows, header="t [s],tag,range [m],bearing [rad]")
 data = jaxslam.datasets.table(folder)
-filter = jaxslam.filters.ekf_slam(data.motion, data.sensor, data.capacity, **data.filter_options)
+filter = jaxslam.filters.EkfSlam(data.motion, data.sensor, data.capacity, **data.filter_options)
 trace = jaxslam.run(filter, data.log, data.pose, data.pose_cov, jax.random.key(0))
 figure = jaxslam.plot.map_figure(trace.estimate, title="a folder of CSV files")

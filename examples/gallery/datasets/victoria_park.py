@@ -7,8 +7,8 @@ import jaxslam
 
 jax.config.update("jax_enable_x64", True)
 data = jaxslam.datasets.victoria_park(gtsam.findExampleDataFile("victoria_park.txt"))
-chart = jaxslam.charts.right_invariant()
-filter = jaxslam.filters.ekf_slam(
+chart = jaxslam.charts.RightInvariant()
+filter = jaxslam.filters.EkfSlam(
     data.motion, data.sensor, data.capacity, chart=chart, **data.filter_options
 )
 trace = jaxslam.run(filter, data.log, data.pose, data.pose_cov, jax.random.key(0))

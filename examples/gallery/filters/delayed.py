@@ -16,6 +16,6 @@ world = jaxslam.Scenario(
     controls=np.tile([0.2, 0.08], (120, 1)),
 )
 truth, log = jaxslam.simulate(world, jax.random.key(2))
-filter = jaxslam.filters.delayed_slam(motion, radio, capacity=3)
+filter = jaxslam.filters.DelayedSlam(motion, radio, capacity=3)
 trace = jaxslam.run(filter, log, world.pose, world.pose_cov, jax.random.key(0))
 figure = jaxslam.plot.map_figure(trace.estimate, truth=truth, title="delayed_slam: ranges alone")

@@ -17,7 +17,7 @@ world = jaxslam.team_world(crew, posts, np.tile([0.2, 0.08, 0.2, 0.05], (40, 1))
 truth, log = jaxslam.simulate(world, jax.random.key(1))
 found = {}
 for robot in (0, 1):
-    filter = jaxslam.filters.team_slam(crew, capacity=6, update="joint", report=robot)
+    filter = jaxslam.filters.TeamSlam(crew, capacity=6, correction="joint", report=robot)
     start = world.pose, world.pose_cov, jax.random.key(0)
     found[f"robot {robot + 1}"] = jaxslam.run(filter, log, *start).estimate
 first = found.pop("robot 1")

@@ -10,7 +10,7 @@ jax.config.update("jax_enable_x64", True)
 world = jaxslam.scenarios.loop(steps=80)
 truth, log = jaxslam.simulate(world, jax.random.key(0))
 sensor = jaxslam.sensors.RelativePosition(0.5**2 * np.eye(2))  # wider than the world's
-filter = jaxslam.filters.particle_localization(
+filter = jaxslam.filters.ParticleLocalization(
     world.motion, sensor, truth.landmarks, 2000, box=[[-14, -6], [14, 26]], start="uniform"
 )
 start = world.pose, world.pose_cov, jax.random.key(1)

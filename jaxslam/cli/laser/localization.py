@@ -30,7 +30,7 @@ to 3.5° (RMS) a step of 0.5 m to 1 m; the rest is for robots with worse wheels.
 
 
 class _Weighing(TypedDict):
-    """Options of `grids.localize`."""
+    """Options of `grids.GridLocalization`."""
 
     exponent: float
     """of the likelihood"""
@@ -80,9 +80,9 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> Job:
         )
     options_of = ANYWHERE if pose is None else TRACKING
     sigma = SIGMA["anywhere" if pose is None else "pose"]
-    filter = grids.localize(
+    filter = grids.GridLocalization(
         grid,
-        grids.likelihood_field(sigma, max_range=log.max_range, mount=log.mount),
+        grids.LikelihoodField(sigma, max_range=log.max_range, mount=log.mount),
         motion.Odometry(motion.OdometryNoise(ODOMETRY_NOISE)),
         options.particles,
         start="uniform" if pose is None else "gaussian",

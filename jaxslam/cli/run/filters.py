@@ -6,10 +6,12 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
+from jaxslam.association.known import Known
 from jaxslam.catalog import ALL, CANONICAL, SMOOTHERS, on_given_poses
 from jaxslam.cli.common import pick
 from jaxslam.datasets import Dataset
 from jaxslam.datasets.table.association import association_options
+from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.protocols import Candidate, Filter
 from jaxslam.simulation.worlds import Scenario
 from jaxslam.types import Log, Truth
@@ -33,7 +35,8 @@ def with_options(data: Dataset, options: argparse.Namespace) -> Dataset:
     assumed = (
         line for line in data.assumed if not line.startswith(tuple(f"[filter] {n}" for n in asked))
     )
-    mine = data.filter_options | {"gate": None, "associate": None} | own
+    plain: EkfOptions = {"gate": None, "associate": Known()}
+    mine = data.filter_options | plain | own
     return dataclasses.replace(data, filter_options=mine, assumed=tuple(assumed))
 
 

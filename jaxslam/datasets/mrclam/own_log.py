@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.calibration import Calibration, calibrate
-from jaxslam.charts import right_invariant
+from jaxslam.charts import RightInvariant
 from jaxslam.core.numbers import is_concrete
 from jaxslam.datasets.mrclam.calibration import (
     MRCLAM_CALIBRATION,
@@ -17,7 +17,8 @@ from jaxslam.datasets.mrclam.calibration import (
     check_calibration,
 )
 from jaxslam.datasets.mrclam.reader import mrclam
-from jaxslam.filters.ekf.ekf_slam import ekf_slam
+from jaxslam.filters.ekf.ekf_slam import EkfSlam
+from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.math.stats import sigma_gate
 from jaxslam.motion import Unicycle
 from jaxslam.protocols import Motion, Sensor
@@ -38,7 +39,7 @@ class OwnCalibration(NamedTuple):
 
         def poses(p):
             log, motion, sensor = own.at(p[:-1], scale=1 + p[-1])
-            filter = ekf_slam(motion, sensor, data.capacity, **data.filter_options)
+            filter = EkfSlam(motion, sensor, data.capacity, **data.filter_options)
             return run(filter, log, data.pose, data.pose_cov, key).estimate.pose
 
         p = [*own.found.parameters, 0.0]
@@ -114,8 +115,9 @@ def mrclam_calibration(
 
     def info(p: jax.Array) -> Info:
         log, motion, sensor = at(p)
-        options = data.filter_options | {"gate": sigma_gate(gate), "chart": right_invariant()}
-        filter = ekf_slam(motion, sensor, data.capacity, **options)
+        more: EkfOptions = {"gate": sigma_gate(gate), "chart": RightInvariant()}
+        options = data.filter_options | more
+        filter = EkfSlam(motion, sensor, data.capacity, **options)
         return run(filter, log, jnp.zeros(3), jnp.zeros((3, 3)), jax.random.key(0)).info
 
     found = calibrate(info, [getattr(known, name) for name in MRCLAM_FITTED])

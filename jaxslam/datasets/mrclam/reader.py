@@ -84,7 +84,7 @@ def mrclam(
         motion=motion,
         sensor=sensor,
         tags=names,
-        filter_options={"update": "sequential"},
+        filter_options={"correction": "sequential"},
         landmarks=points,
         dropped=dropped,
         corrections=(*corrections, *own.corrections),

@@ -49,7 +49,7 @@ def mrclam_team(
     and counted; all else is as in `mrclam`.
 
         data = mrclam_team(folder)
-        filter = team_slam(data.robots, data.capacity)
+        filter = TeamSlam(data.robots, data.capacity)
 
     Args:
         folder: where the files of one data set are.
@@ -119,7 +119,7 @@ def mrclam_team(
         motion=TeamMotion(tuple(robot.motion for robot in team), 0),
         sensor=sensors_of(team, 0),
         tags=names,
-        filter_options={"update": "sequential"},
+        filter_options={"correction": "sequential"},
         landmarks=points,
         dropped=dropped,
         corrections=(*corrections, *(line for own in files for line in own.corrections)),

@@ -1,10 +1,19 @@
 """The association method of a table by name, and its gate by probability."""
 
+from collections.abc import Callable
+
 import numpy as np
 
-from jaxslam import association
+from jaxslam.association import (
+    GlobalNearest,
+    JointCompatibility,
+    Known,
+    MaximumLikelihood,
+    Nearest,
+)
 from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.math import stats
+from jaxslam.protocols import Associate
 
 GATE = 0.99
 """Default probability of the gate of an association."""
@@ -12,11 +21,17 @@ GATE = 0.99
 NEW_GATE = 0.9999
 """Probability beyond which a measurement is of a new landmark."""
 
-METHODS = ("nearest", "global_nearest", "maximum_likelihood", "joint", "known")
+METHODS: dict[str, Callable[..., Associate]] = {
+    "nearest": Nearest,
+    "global_nearest": GlobalNearest,
+    "maximum_likelihood": MaximumLikelihood,
+    "joint": JointCompatibility,
+    "known": Known,
+}
 
 
 def association_options(method: object, gate: object, size: int) -> EkfOptions:
-    """Options of `ekf_slam` for a method by name and a gate by probability.
+    """Options of `EkfSlam` for a method by name and a gate by probability.
 
     Raises ValueError, "associate: …" or "gate: …", on a name that is none and a gate that is no
     probability. Known identities need no gate (None); other methods take `GATE`.
@@ -34,7 +49,7 @@ def association_options(method: object, gate: object, size: int) -> EkfOptions:
     inner = GATE if probability is None else probability
     beyond = stats.chi2_quantile(max(inner, NEW_GATE), size)
     limit = inner if method == "joint" else stats.chi2_quantile(inner, size)
-    return {"associate": getattr(association, method)(limit, beyond)}
+    return {"associate": METHODS[method](limit, beyond)}
 
 
 def _probability(gate: object) -> float:

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 
 from jaxslam import motion, sensors
 from jaxslam.core.record import record, static
-from jaxslam.datasets.table.association import GATE, METHODS, association_options, is_number
+from jaxslam.datasets.table.association import GATE, association_options, is_number
 from jaxslam.datasets.table.models import Parametric, fitting_model, of_no_noise
 from jaxslam.datasets.table.settings_text import line_number
 from jaxslam.filters.ekf.settings import EkfOptions
@@ -150,7 +150,7 @@ class TableSettings:
         return Parametric(names, tuple(deviations), None if mount is None else tuple(mount), model)
 
     def filter_options(self, size: int, unknown: bool) -> EkfOptions:
-        """The options of `ekf_slam`. size: of a measurement; unknown: whether tags are unknown."""
+        """The options of `EkfSlam`. size: of a measurement; unknown: whether tags are unknown."""
         section = self._filter()
         update = section.get("update")
         if update is None:
@@ -159,10 +159,10 @@ class TableSettings:
             raise ValueError(
                 f'{self._at("filter", "update")}: expected "sequential" or "joint", got {update!r}'
             )
-        options: EkfOptions = {"update": update}
+        options: EkfOptions = {"correction": update}
         method, gate = section.get("associate"), section.get("gate")
         if method is None:
-            method = self._default("filter", "associate", METHODS[0] if unknown else "known")
+            method = self._default("filter", "associate", "nearest" if unknown else "known")
         try:
             options |= association_options(method, gate, size)
         except ValueError as problem:

@@ -66,7 +66,9 @@ def confirm_hypotheses(
     )
 
     contradicted = compared.any(axis=1) & ~confirmed
-    lost = jnp.where(contradicted, settings.hypotheses.decay, 0.0)
+    lost = jnp.where(
+        contradicted, jnp.asarray(settings.hypotheses.decay, state.persistence.dtype), 0.0
+    )
     persistence = state.persistence + jnp.where(confirmed, 1.0, 0.0) - lost
     confirmed_at = jnp.where(confirmed, state.clock, state.confirmed_at)
     stale = (state.clock - confirmed_at > settings.hypotheses.patience) & new.wanted.any()

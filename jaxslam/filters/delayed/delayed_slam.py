@@ -1,11 +1,16 @@
 """EKF-SLAM with delayed initialization of landmarks, from intersections of measurements."""
 
+import dataclasses
 from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
 
+from jaxslam import validation
+from jaxslam.association.known import Known
+from jaxslam.charts.euclidean import Euclidean
+from jaxslam.core.record import hold_function, record, set_field, static
 from jaxslam.filters.delayed.confirmation import confirm_hypotheses
 from jaxslam.filters.delayed.intersection import intersect_measurements
 from jaxslam.filters.delayed.promotion import Promoted, promote_hypotheses
@@ -14,44 +19,38 @@ from jaxslam.filters.delayed.settings import (
     Hypotheses,
     Promotion,
     StoredMeasurements,
-    delayed_settings,
 )
 from jaxslam.filters.delayed.state import (
     SIZE,
     DelayedState,
     NewMeasurements,
+    TableLayout,
     empty_state,
 )
 from jaxslam.filters.delayed.stored_measurements import store_measurements
-from jaxslam.filters.delayed.triangulation import Triangulation
-from jaxslam.filters.ekf.ekf_slam import ekf_slam
+from jaxslam.filters.delayed.triangulation import Triangulation, triangulation_of
+from jaxslam.filters.ekf.coordinates.map_coordinates import estimate_of
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.steps.innovation import Correction
+from jaxslam.filters.ekf.steps.predict import propagate
 from jaxslam.filters.ekf.steps.scan import associate_scan
 from jaxslam.filters.ekf.steps.sequential_update import correct_in_turn
 from jaxslam.filters.reporting import info_of, seen_before, status_of
+from jaxslam.math.arrays import Number
+from jaxslam.math.stats import chi2_quantile
 from jaxslam.math.xla import where_any
 from jaxslam.protocols import Associate, Association, Filter, Motion, Sensor
+from jaxslam.sensors.suite import on_ground
 from jaxslam.types import Estimate, Info, Scan
 
 
-def delayed_slam(
-    motion: Motion,
-    sensor: Sensor,
-    capacity: int,
-    *,
-    triangulation: Triangulation | None = None,
-    stored: StoredMeasurements | None = None,
-    hypotheses: Hypotheses | None = None,
-    promotion: Promotion | None = None,
-    gate: float | None = None,
-    associate: Associate | None = None,
-) -> Filter:
+@record
+class DelayedSlam(Filter):
     """EKF-SLAM with bearings or ranges alone, and delayed initialization of landmarks.
 
     After Costa, Kantor & Choset, "Bearing-only landmark initialization with unknown data
     association", ICRA 2004, as summarized in Tacher §2, with the correlations that they neglect.
-    Measurements of landmarks of the map correct it, within the gate, as in `ekf_slam`. One without
+    Measurements of landmarks of the map correct it, within the gate, as in `EkfSlam`. One without
     a landmark in the map becomes a *stored measurement*, a variable of the state (`state` has a
     diagram). Then
 
@@ -75,41 +74,67 @@ def delayed_slam(
     before its persistence exceeds that of the other by `lead` and it fits its measurements clearly
     better than its mirror solution. So a range-only landmark needs a path that is not straight.
 
-    Args:
-        motion, sensor: the models; the sensor measures one bearing or one range of points.
-        capacity: landmarks N.
-        triangulation: how stored measurements intersect; default `triangulation.rays` or
-            `triangulation.circles`, by what the sensor measures.
-        stored, hypotheses, promotion: `settings.StoredMeasurements`, `settings.Hypotheses` and
-            `settings.Promotion`, which document their fields; default all defaults.
-        gate: chi-square, of one degree of freedom, of every comparison; default that of 99 %.
-        associate: default `association.known()`, and only measurements of one tag intersect. With
-            any other method, the measurements it declares new intersect all others, and tags only
-            name the landmarks.
-    Raises:
-        ValueError: on a capacity below 1, a gate not above 0, a part of another kind, or a sensor
-            that does not fit.
+    Raises ValueError on a capacity below 1, a gate not above 0, a part of another kind, or a sensor
+    that does not fit.
     """
-    settings = delayed_settings(
-        motion,
-        sensor,
-        capacity,
-        triangulation=triangulation,
-        stored=stored,
-        hypotheses=hypotheses,
-        promotion=promotion,
-        gate=gate,
-        associate=associate,
-    )
-    ekf = ekf_slam(motion, settings.sensor, capacity)
 
-    def init(pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> DelayedState:
-        return empty_state(settings.layout, pose, pose_cov)
+    motion: Motion
+    sensor: Sensor
+    """of one bearing or one range of points"""
+    capacity: int = static()
+    """landmarks N"""
+    _: dataclasses.KW_ONLY
+    triangulation: Triangulation | None = None
+    """how stored measurements intersect; default `triangulation.Rays` or `triangulation.Circles`,
+    by what the sensor measures"""
+    stored: StoredMeasurements = StoredMeasurements()
+    hypotheses: Hypotheses = Hypotheses()
+    promotion: Promotion = Promotion()
+    gate: Number | None = None
+    """chi-square, of one degree of freedom, of every comparison; default that of 99 %"""
+    associate: Associate = Known()
+    """with `Known` only measurements of one tag intersect. With any other method, the measurements
+    it declares new intersect all others, and tags only name the landmarks"""
+    chart = Euclidean()
 
-    def predict(state: DelayedState, u: Float[Array, "U"], key: Array) -> DelayedState:
-        return state._replace(joint=ekf.predict(state.joint, u, key))
+    def __post_init__(self) -> None:
+        name, sensor = type(self).__name__, self.sensor
+        validation.check_models(name, self.motion, sensor)
+        validation.check_parts(name, associate=self.associate)
+        hold_function(self, "associate", "prediction, scan")
+        if len(sensor.measurements) != 1 or not sensor.of_points:
+            raise ValueError(
+                f"{name}: expected a sensor of one bearing or one range of points (x, y), got "
+                f"{sensor.name} with {sensor.measurements} of {sensor.landmark}"
+            )
+        validation.check_count(f"{name}: capacity", self.capacity)
+        validation.check_gate(name, self.gate)
+        triangulation = self.triangulation or triangulation_of(sensor)
+        set_field(self, "triangulation", triangulation)
+        kinds = {
+            "triangulation": Triangulation,
+            "stored": StoredMeasurements,
+            "hypotheses": Hypotheses,
+            "promotion": Promotion,
+        }
+        for field, kind in kinds.items():
+            validation.check_record(name, field, getattr(self, field), kind)
+        if sensor.measurements != (triangulation.measurement,):
+            raise ValueError(
+                f"{name}: expected a sensor of one {triangulation.measurement}, got "
+                f"{sensor.name} with {sensor.measurements}"
+            )
+        super().__post_init__()
 
-    def update(state: DelayedState, scan: Scan, key: Array) -> tuple[DelayedState, Info]:
+    def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> DelayedState:
+        return empty_state(self._settings.layout, pose, pose_cov)
+
+    def predict(self, state: DelayedState, u: Float[Array, "U"], key: Array) -> DelayedState:
+        settings = _ekf_settings(self._settings)
+        return state._replace(joint=propagate(state.joint, u, self.motion, settings)[0])
+
+    def update(self, state: DelayedState, scan: Scan, key: Array) -> tuple[DelayedState, Info]:
+        settings = self._settings
         # Padding may hold any number, and is multiplied by zero below.
         scan = scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
         state = state._replace(clock=state.clock + 1)
@@ -131,26 +156,31 @@ def delayed_slam(
         state, outcome = where_any(new.wanted.any(), steps, leave, state)
         return state, _reported(scan, found, matched, correction, new, outcome)
 
-    def estimate(state: DelayedState) -> Estimate:
-        joint, size = state.joint, 3 + SIZE * capacity
+    def estimate(self, state: DelayedState) -> Estimate:
+        joint, capacity, size = state.joint, self.capacity, 3 + SIZE * self.capacity
         landmarks = joint._replace(
             landmarks=joint.landmarks[:capacity],
             cov=joint.cov[:size, :size],
             alive=joint.alive[:capacity],
             tag=joint.tag[:capacity],
         )
-        return ekf.estimate(landmarks)
+        return estimate_of(landmarks, self._settings.sensor, self.chart)
 
-    return Filter(
-        name="delayed_slam",
-        controls=motion.controls,
-        measurements=sensor.measurements,
-        init=init,
-        predict=predict,
-        update=update,
-        estimate=estimate,
-        chart=ekf.chart,
-    )
+    @property
+    def _settings(self) -> DelayedSettings:
+        capacities = self.hypotheses.capacity, self.stored.capacity
+        assert self.triangulation is not None
+        return DelayedSettings(
+            sensor=on_ground(self.sensor, SIZE),
+            triangulation=self.triangulation,
+            layout=TableLayout(self.capacity, *capacities),
+            associate=self.associate,
+            by_tag=isinstance(self.associate, Known),
+            gate=chi2_quantile(0.99, 1) if self.gate is None else self.gate,
+            stored=self.stored,
+            hypotheses=self.hypotheses,
+            promotion=self.promotion,
+        )
 
 
 class _Outcome(NamedTuple):
@@ -161,7 +191,7 @@ class _Outcome(NamedTuple):
 
 
 def _ekf_settings(settings: DelayedSettings) -> EkfSettings:
-    """The settings of `ekf_slam`, by which landmarks of the map are associated and corrected."""
+    """The settings of `EkfSlam`, by which landmarks of the map are associated and corrected."""
     return EkfSettings(sensor=settings.sensor, associate=settings.associate, gate=settings.gate)
 
 

@@ -11,6 +11,7 @@ from jaxslam.filters.delayed.settings import Distance
 from jaxslam.filters.delayed.state import SIZE, TableLayout, covariance_blocks
 from jaxslam.filters.delayed.triangulation import Triangulation
 from jaxslam.math import uncertain_poses
+from jaxslam.math.arrays import Number
 from jaxslam.math.uncertain_poses import Frame
 from jaxslam.math.xla import materialize
 from jaxslam.slots import Joint
@@ -92,7 +93,7 @@ def relative_spread(points: UncertainPoints) -> Float[Array, "*n"]:
 
 
 def closer_than(
-    distance: Distance, limit: float, points: UncertainPoints, others: UncertainPoints
+    distance: Distance, limit: Number, points: UncertainPoints, others: UncertainPoints
 ) -> Bool[Array, "p q"]:
     """Whether the distance of each of p points from each of q others is below a limit.
 

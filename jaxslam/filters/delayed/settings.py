@@ -1,21 +1,20 @@
-"""The settings of `delayed_slam`: three records with defaults, validated when they are created."""
+"""The settings of `DelayedSlam`: three records with defaults, validated when they are created."""
 
 from dataclasses import dataclass
 from typing import Literal, get_args
 
-from jaxslam import validation
-from jaxslam.association.known import known
-from jaxslam.core.numbers import check_count, check_gate, is_concrete
-from jaxslam.filters.delayed.state import SIZE, TableLayout
-from jaxslam.filters.delayed.triangulation import Triangulation, triangulation_of
+from jaxslam.core.numbers import check_count, is_concrete
+from jaxslam.core.record import record, static
+from jaxslam.filters.delayed.state import TableLayout
+from jaxslam.filters.delayed.triangulation import Triangulation
+from jaxslam.math.arrays import Number
 from jaxslam.math.stats import chi2_quantile
-from jaxslam.protocols import Associate, Motion, Sensor
-from jaxslam.sensors.suite import on_ground
+from jaxslam.protocols import Associate, Sensor
 
 Distance = Literal["mahalanobis", "bhattacharyya"]
 
 
-@dataclass(frozen=True)
+@record
 class StoredMeasurements:
     """Limits of the stored measurements: how many are kept, and which.
 
@@ -23,9 +22,9 @@ class StoredMeasurements:
         ValueError: on a capacity below 1 or a negative spacing.
     """
 
-    capacity: int = 32
+    capacity: int = static(default=32)
     """W: where all slots are taken, the oldest stored measurement is marginalized out"""
-    spacing: float = 0.2
+    spacing: Number = 0.2
     """[m] measurements of one identity are stored only from positions at least so far apart;
     one from nearer is `Status.DEFERRED`"""
 
@@ -34,7 +33,7 @@ class StoredMeasurements:
         _check_not_negative(self, "spacing")
 
 
-@dataclass(frozen=True)
+@record
 class Hypotheses:
     """Criteria by which intersections become hypotheses, and hypotheses are deleted.
 
@@ -43,22 +42,22 @@ class Hypotheses:
             unknown distance.
     """
 
-    capacity: int = 16
+    capacity: int = static(default=16)
     """C: where all slots are taken, intersections are refused, and counted"""
-    spread: float = 0.3
+    spread: Number = 0.3
     """[1] the largest standard deviation of the intersection relative to the sensor, over their
     distance, with which a hypothesis may begin; with a larger one it is not Gaussian"""
-    distance: Distance = "mahalanobis"
+    distance: Distance = static(default="mahalanobis")
     """between intersection and hypothesis as Gaussians relative to the sensor: d² of mahalanobis,
     or bhattacharyya"""
-    same: float | None = None
+    same: Number | None = None
     """[1] an intersection at less than this distance from a hypothesis is that hypothesis; default
     the 99 % quantile of chi-square with two degrees of freedom for mahalanobis, 0.5 for
     bhattacharyya"""
-    decay: float = 0.5
+    decay: Number = 0.5
     """persistence lost by each measurement of its tag that does not confirm it; deleted at 0, so
     persistence / decay outliers in a row are survived"""
-    patience: int = 200
+    patience: int = static(default=200)
     """scans without confirmation after which a hypothesis is deleted"""
 
     def __post_init__(self) -> None:
@@ -73,14 +72,14 @@ class Hypotheses:
             )
 
     @property
-    def same_below(self) -> float:
+    def same_below(self) -> Number:
         """`same`, or its default."""
         if self.same is not None:
             return self.same
         return chi2_quantile(0.99, 2) if self.distance == "mahalanobis" else 0.5
 
 
-@dataclass(frozen=True)
+@record
 class Promotion:
     """Criteria by which a hypothesis becomes a landmark.
 
@@ -88,14 +87,14 @@ class Promotion:
         ValueError: on a count below 1, a persistence or spread not above 0, or a negative lead.
     """
 
-    persistence: float = 4.0
+    persistence: Number = 4.0
     """the persistence needed: 1 of the intersection, and 1 of each confirmation"""
-    lead: float = 2.0
+    lead: Number = 2.0
     """by how much its persistence must exceed that of each hypothesis that excludes it"""
-    spread: float = 0.3
+    spread: Number = 0.3
     """[1] the largest standard deviation of its position relative to the sensor, over its range,
     with which it may become a landmark"""
-    per_scan: int = 2
+    per_scan: int = static(default=2)
     """at most so many promotions a scan"""
 
     def __post_init__(self) -> None:
@@ -106,7 +105,7 @@ class Promotion:
 
 @dataclass(frozen=True, eq=False)
 class DelayedSettings:
-    """All settings that the steps of `delayed_slam` take."""
+    """All settings that the steps of `DelayedSlam` take."""
 
     sensor: Sensor
     """of the landmarks of the table, whose third parameter it ignores"""
@@ -115,55 +114,11 @@ class DelayedSettings:
     associate: Associate
     by_tag: bool
     """identities are known: only measurements of one tag intersect"""
-    gate: float
+    gate: Number
     """of squared Mahalanobis distances of one degree of freedom"""
     stored: StoredMeasurements
     hypotheses: Hypotheses
     promotion: Promotion
-
-
-def delayed_settings(
-    motion: Motion,
-    sensor: Sensor,
-    capacity: int,
-    *,
-    triangulation: Triangulation | None,
-    stored: StoredMeasurements | None,
-    hypotheses: Hypotheses | None,
-    promotion: Promotion | None,
-    gate: float | None,
-    associate: Associate | None,
-) -> DelayedSettings:
-    """The settings of `delayed_slam` from its arguments, checked; None is for the default."""
-    name = "delayed_slam"
-    validation.check_models(name, motion, sensor)
-    validation.check_parts(name, associate=associate)
-    if len(sensor.measurements) != 1 or not sensor.of_points:
-        raise ValueError(
-            f"{name}: expected a sensor of one bearing or one range of points (x, y), got "
-            f"{sensor.name} with {sensor.measurements} of {sensor.landmark}"
-        )
-    check_count(f"{name}: capacity", capacity)
-    check_gate(name, gate)
-    triangulation = triangulation_of(sensor) if triangulation is None else triangulation
-    stored = StoredMeasurements() if stored is None else stored
-    hypotheses = Hypotheses() if hypotheses is None else hypotheses
-    promotion = Promotion() if promotion is None else promotion
-    validation.check_record(name, "triangulation", triangulation, Triangulation)
-    validation.check_record(name, "stored", stored, StoredMeasurements)
-    validation.check_record(name, "hypotheses", hypotheses, Hypotheses)
-    validation.check_record(name, "promotion", promotion, Promotion)
-    return DelayedSettings(
-        sensor=on_ground(sensor, SIZE),
-        triangulation=triangulation,
-        layout=TableLayout(capacity, hypotheses.capacity, stored.capacity),
-        associate=known() if associate is None else associate,
-        by_tag=associate is None,
-        gate=chi2_quantile(0.99, 1) if gate is None else gate,
-        stored=stored,
-        hypotheses=hypotheses,
-        promotion=promotion,
-    )
 
 
 def _check_positive(record: object, *fields: str) -> None:

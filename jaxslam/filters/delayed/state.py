@@ -1,4 +1,4 @@
-"""The state of `delayed_slam`: landmarks, hypotheses and stored measurements in one joint Gaussian.
+"""The state of `DelayedSlam`: landmarks, hypotheses and stored measurements in one joint Gaussian.
 
 All three are rows of the landmark table of one `slots.Joint`, three parameters in each slot:
 

@@ -1,5 +1,7 @@
 """The first step of delayed initialization: new measurements become variables of the state."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -26,7 +28,7 @@ def store_measurements(
     tag. Where the table is full the oldest are marginalized out.
     """
     layout, joint = settings.layout, state.joint
-    store = settings.triangulation.store
+    store = partial(settings.triangulation.store, settings.sensor)
     values = jax.vmap(store, (None, 0))(joint.pose, new.z)
     by_pose, by_z = jax.vmap(jax.jacfwd(store, argnums=(0, 1)), (None, 0))(joint.pose, new.z)
     alive, tag = joint.alive[layout.of_stored], joint.tag[layout.of_stored]

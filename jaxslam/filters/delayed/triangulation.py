@@ -5,18 +5,17 @@ sensor's position and the measurement, in the map's frame. A bearing gives the r
 the direction q [rad], a range the circle of radius q [m] about it.
 """
 
-from collections.abc import Callable
-from dataclasses import dataclass
-
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxslam.core.numbers import is_concrete
+from jaxslam.core.record import record
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
-from jaxslam.protocols import Sensor
+from jaxslam.math.arrays import Number
+from jaxslam.protocols import Component, Sensor
 
 Stored = Float[Array, "3"]
 """a stored measurement s = (x, y, q)"""
@@ -26,86 +25,104 @@ Solutions = tuple[Float[Array, "A 2"], Bool[Array, "A"]]
 """points, and whether each is one"""
 
 
-@dataclass(frozen=True, eq=False)
-class Triangulation:
-    """The triangulation functions of one type of sensor, for pairs of stored measurements."""
+class Triangulation(Component):
+    """The triangulation of one type of sensor, for pairs of stored measurements; a subclass is a
+    record."""
 
-    name: str
-    store: Callable[[Float[Array, "3"], Float[Array, "1"]], Stored]
-    """(pose, z) -> s, the measurement as a variable of the map"""
-    intersect: Callable[[Stored, Stored], Solutions]
-    """(s, s') -> the A points in which two can intersect, and whether each is one: where it is not,
-    or badly conditioned, the point is finite and without meaning"""
-    residual: Callable[[Stored, Point], Float[Array, ""]]
-    """(s, point) -> g: the measurement minus its prediction from that point, zero for the true
-    point without noise [rad or m]"""
-    mirror_solutions: Callable[[Stored, Stored, Point], Float[Array, "B 2"]]
-    """(s, s', point) -> the other A - 1 points that two measurements of a landmark there allow"""
+    measurement: str
+    """the measurement of the sensor, with its unit"""
+
+    def __post_init__(self) -> None:
+        methods = ("store", "intersect", "residual", "mirror_solutions")
+        self._check(Triangulation, dict.fromkeys(methods, ""))
+
+    def store(self, sensor: Sensor, pose: Float[Array, "3"], z: Float[Array, "1"]) -> Stored:
+        """The measurement as a variable of the map."""
+        raise NotImplementedError
+
+    def intersect(self, a: Stored, b: Stored) -> Solutions:
+        """The A points in which two can intersect, and whether each is one: where it is not, or
+        badly conditioned, the point is finite and without meaning."""
+        raise NotImplementedError
+
+    def residual(self, s: Stored, point: Point) -> Float[Array, ""]:
+        """The measurement minus its prediction from a point, zero for the true point without noise
+        [rad or m]."""
+        raise NotImplementedError
+
+    def mirror_solutions(self, a: Stored, b: Stored, point: Point) -> Float[Array, "B 2"]:
+        """The other A - 1 points that two measurements of a landmark there allow."""
+        raise NotImplementedError
 
 
-def rays(sensor: Sensor, *, parallax: float = 0.1) -> Triangulation:
+@record
+class Rays(Triangulation):
     """Triangulation of bearings: rays p + t (cos q, sin q), t > 0, intersect in at most one point.
 
     With δ = p' - p and c = sin(q' - q), the lengths are t = δ × d'/c and t' = δ × d/c. The
     intersection lies in front of both sensors, where the rays cross at an angle of at least
     `parallax`.
 
-    Args:
-        sensor: a bearing z (1,) of points, as `sensors.BearingOnly`; its mounting is computed
-            from its `invert`, whatever the prior of the range.
-        parallax: [rad] in (0, π/2).
-    Raises:
-        ValueError: on another sensor, or a parallax out of range.
-    """
-    _check("rays", sensor, "bearing [rad]", parallax)
-    least = float(np.sin(parallax)) if is_concrete(parallax) else jnp.sin(parallax)
+    The sensor's mounting is computed from its `invert`, whatever the prior of the range.
 
-    def store(pose: Float[Array, "3"], z: Float[Array, "1"]) -> Stored:
-        start = sensor.invert(pose, z, jnp.zeros(1, z.dtype))
-        ahead = sensor.invert(pose, z, jnp.ones(1, z.dtype)) - start
+    Raises ValueError on a parallax out of range.
+    """
+
+    parallax: Number = 0.1
+    """[rad] in (0, π/2)"""
+    measurement = "bearing [rad]"
+
+    def __post_init__(self) -> None:
+        _check_angle("Rays", "parallax", self.parallax)
+        super().__post_init__()
+
+    def store(self, sensor: Sensor, pose: Float[Array, "3"], z: Float[Array, "1"]) -> Stored:
+        start = sensor.invert(pose, z, jnp.zeros(1, z.dtype))[:2]
+        ahead = sensor.invert(pose, z, jnp.ones(1, z.dtype))[:2] - start
         return jnp.concatenate([start, jnp.arctan2(ahead[1], ahead[0])[None]])
 
-    def intersect(a: Stored, b: Stored) -> Solutions:
+    def intersect(self, a: Stored, b: Stored) -> Solutions:
         toward_a, toward_b = _unit(a[2]), _unit(b[2])
         delta = b[:2] - a[:2]
         sine = _cross(toward_a, toward_b)
-        crossing = jnp.abs(sine) >= least
+        crossing = jnp.abs(sine) >= jnp.sin(self.parallax)
         safe = jnp.where(crossing, sine, 1.0)
         along_a, along_b = _cross(delta, toward_b) / safe, _cross(delta, toward_a) / safe
         point = a[:2] + along_a * toward_a
         return point[None], (crossing & (along_a > 0) & (along_b > 0))[None]
 
-    def residual(s: Stored, point: Point) -> Float[Array, ""]:
+    def residual(self, s: Stored, point: Point) -> Float[Array, ""]:
         return wrap(s[2] - se2.polar(point - s[:2])[1])
 
-    def mirror_solutions(a: Stored, b: Stored, point: Point) -> Float[Array, "B 2"]:
+    def mirror_solutions(self, a: Stored, b: Stored, point: Point) -> Float[Array, "B 2"]:
         return jnp.zeros((0, 2), point.dtype)
 
-    return Triangulation("rays", store, intersect, residual, mirror_solutions)
 
-
-def circles(sensor: Sensor, *, angle: float = 0.3) -> Triangulation:
+@record
+class Circles(Triangulation):
     """Triangulation of ranges: circles |x - p| = q intersect in two mirrored points.
 
     With δ = p' - p, d = |δ|, a = (d² + q² - q'²)/(2d) and h² = q² - a², the points are
     p + (a δ ± h δ^⊥)/d. The circles must cross at an angle φ, sin φ = d h/(q q'), of at least
     `angle` from tangency, where h is undetermined.
 
-    Args:
-        sensor: a range z (1,) of points, as `sensors.RangeOnly`.
-        angle: [rad] in (0, π/2).
-    Raises:
-        ValueError: on another sensor, or an angle out of range.
+    Raises ValueError on an angle out of range.
     """
-    _check("circles", sensor, "range [m]", angle)
-    least = float(np.sin(angle)) if is_concrete(angle) else jnp.sin(angle)
 
-    def store(pose: Float[Array, "3"], z: Float[Array, "1"]) -> Stored:
+    angle: Number = 0.3
+    """[rad] in (0, π/2)"""
+    measurement = "range [m]"
+
+    def __post_init__(self) -> None:
+        _check_angle("Circles", "angle", self.angle)
+        super().__post_init__()
+
+    def store(self, sensor: Sensor, pose: Float[Array, "3"], z: Float[Array, "1"]) -> Stored:
         # The sensor is halfway between the ends of a diameter.
-        ends = [sensor.invert(pose, z, jnp.full(1, s, z.dtype)) for s in (0.0, np.pi)]
+        ends = [sensor.invert(pose, z, jnp.full(1, s, z.dtype))[:2] for s in (0.0, np.pi)]
         return jnp.concatenate([0.5 * (ends[0] + ends[1]), z])
 
-    def intersect(a: Stored, b: Stored) -> Solutions:
+    def intersect(self, a: Stored, b: Stored) -> Solutions:
         delta = b[:2] - a[:2]
         square = (delta**2).sum()
         apart = (square > 0) & (a[2] > 0) & (b[2] > 0)
@@ -114,16 +131,16 @@ def circles(sensor: Sensor, *, angle: float = 0.3) -> Triangulation:
         rest = jnp.where(apart, a[2] ** 2 / safe - share**2, 0.0)  # h²/d²
         # sin φ = d h/(q q'), compared by squares to avoid roots of negative numbers
         size = jnp.where(apart, (a[2] * b[2]) ** 2, 1.0)
-        crossing = apart & (rest > 0) & (safe**2 * rest >= least**2 * size)
+        crossing = apart & (rest > 0) & (safe**2 * rest >= jnp.sin(self.angle) ** 2 * size)
         height = jnp.sqrt(jnp.where(crossing, rest, 1.0))
         across = jnp.stack([-delta[1], delta[0]])
         points = (a[:2] + share * delta)[None] + jnp.stack([height * across, -height * across])
         return points, jnp.stack([crossing, crossing])
 
-    def residual(s: Stored, point: Point) -> Float[Array, ""]:
+    def residual(self, s: Stored, point: Point) -> Float[Array, ""]:
         return s[2] - se2.polar(point - s[:2])[0]
 
-    def mirror_solutions(a: Stored, b: Stored, point: Point) -> Float[Array, "B 2"]:
+    def mirror_solutions(self, a: Stored, b: Stored, point: Point) -> Float[Array, "B 2"]:
         axis = b[:2] - a[:2]
         square = (axis**2).sum()
         offset = point - a[:2]
@@ -131,24 +148,15 @@ def circles(sensor: Sensor, *, angle: float = 0.3) -> Triangulation:
         mirrored = a[:2] + 2 * along * axis - offset
         return jnp.where(square > 0, mirrored, point)[None]
 
-    return Triangulation("circles", store, intersect, residual, mirror_solutions)
-
 
 def triangulation_of(sensor: Sensor) -> Triangulation:
-    """`rays` for bearings or `circles` for ranges; ValueError for other measurements."""
-    if sensor.measurements == ("range [m]",):
-        return circles(sensor)
-    return rays(sensor)
+    """`Circles` for a sensor of ranges, else `Rays`."""
+    return Circles() if sensor.measurements == (Circles.measurement,) else Rays()
 
 
-def _check(name: str, sensor: Sensor, measurement: str, angle: float) -> None:
-    if sensor.measurements != (measurement,) or not sensor.of_points:
-        raise ValueError(
-            f"{name}: expected a sensor of one {measurement} of points (x, y), got {sensor.name} "
-            f"with {sensor.measurements} of {sensor.landmark}"
-        )
-    if is_concrete(angle) and not 0 < angle < np.pi / 2:
-        raise ValueError(f"{name}: expected an angle in (0, π/2), got {angle}")
+def _check_angle(name: str, field: str, angle: Number) -> None:
+    if is_concrete(angle) and not 0 < np.asarray(angle) < np.pi / 2:
+        raise ValueError(f"{name}: expected {field} in (0, π/2), got {angle}")
 
 
 def _unit(angle: Float[Array, ""]) -> Point:

@@ -1,17 +1,20 @@
 """Compressed EKF-SLAM: updates of a local area, with those of the rest of the map postponed."""
 
-from typing import NamedTuple, Unpack
+import dataclasses
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 
 from jaxslam import slots, validation
+from jaxslam.association.known import Known
 from jaxslam.core.numbers import check_count
-from jaxslam.filters.ekf.ekf_slam import ekf_slam
-from jaxslam.filters.ekf.settings import EkfOptions, check_covariance_form
+from jaxslam.core.record import record, static
+from jaxslam.filters.ekf.ekf_slam import EkfSlam
 from jaxslam.math import linalg
 from jaxslam.math.xla import where_any
-from jaxslam.protocols import Filter, Motion, Sensor
+from jaxslam.protocols import Sensor, Wrapper
+from jaxslam.sensors.suite import Suite
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Info, Scan
 
@@ -41,10 +44,9 @@ class Compressed(NamedTuple):
     """(K,) the slots of the map in the area, ascending"""
 
 
-def compressed_ekf_slam(
-    motion: Motion, sensor: Sensor, capacity: int, *, area: int, **options: Unpack[EkfOptions]
-) -> Filter:
-    """`ekf_slam` with the same results, at a cost a step that depends on the area, not on the map.
+@record
+class CompressedEkfSlam(Wrapper):
+    """EKF-SLAM with the same results, at a cost a step that depends on the area, not on the map.
 
     A step costs O(K²) for K = area landmarks. Only when a scan measures a landmark outside the area
     is the whole map updated, O(K·N²), and a new area chosen: the landmarks of the scan, room
@@ -56,74 +58,71 @@ def compressed_ekf_slam(
     that are not used cost nothing under `jit`. `up_to_date` gives the whole map as a `Joint`, and
     `opened` makes a state of one.
 
-    Args:
-        area: number K of landmarks in the area; at least the measurement slots of a scan.
-        options: those of `ekf_slam` in the Euclidean chart, with a linearizer without memory
-            (at_estimate, unscented), except associate, make_room and the covariance
-            "square_root".
-    Raises:
-        ValueError: as `ekf_slam`; on an area below 1, an option that is not for this filter; and,
-            when a scan has more measurement slots than the area, from `update`.
+    Raises ValueError on an area below 1 or an `EkfSlam` that is not as here; and, when a scan has
+    more measurement slots than the area, from `update`.
     """
-    validation.check_models("compressed_ekf_slam", motion, sensor)
-    check_count("compressed_ekf_slam: capacity", capacity)
-    check_count("compressed_ekf_slam: area", area)
-    for name in ("associate", "make_room"):
-        if options.get(name):
-            raise ValueError(f"compressed_ekf_slam: {name} is not supported")
-    check_covariance_form(
-        "compressed_ekf_slam", options.get("covariance", "plain"), ("plain", "joseph")
-    )
-    if sensor.reduced is not None:
-        raise ValueError(
-            f"compressed_ekf_slam: the landmarks of {sensor.name} are converted to points, which "
-            "is not supported"
-        )
-    whole = ekf_slam(motion, sensor, capacity, **options)
-    size, own = len(sensor.landmark), min(area, capacity)
-    if size == 0:
-        raise ValueError(f"compressed_ekf_slam: expected a sensor of landmarks, got {sensor.name}")
-    if whole.places:
-        raise ValueError("compressed_ekf_slam: expected one sensor, not a suite")
-    if whole.chart.basis is not None:
-        raise ValueError(
-            f"compressed_ekf_slam: expected the chart euclidean, got {whole.chart.name}, in which "
-            "a motion changes the covariance of every landmark"
-        )
-    local = ekf_slam(motion, sensor, own + _more(own, size), **options)
-    most = options.get("births")
 
-    def init(pose: jax.Array, pose_cov: jax.Array) -> Compressed:
-        joint = whole.init(pose, pose_cov)
-        if jax.tree.leaves(joint.lin):
-            linearizer = options["linearize"]
-            assert linearizer is not None  # the default keeps nothing
+    filter: EkfSlam
+    """in the Euclidean chart, of one sensor of landmarks, with a linearizer without memory
+    (AtEstimate, Unscented), associating by tags, without a life and the covariance
+    "square_root\""""
+    area: int = static()
+    """number K of landmarks in the area; at least the measurement slots of a scan"""
+    square_root = False
+    landmark = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        name, filter = "CompressedEkfSlam", self.filter
+        validation.check_record(name, "filter", filter, EkfSlam)
+        check_count(f"{name}: area", self.area)
+        sensor = filter.sensor
+        joint = jax.eval_shape(filter.init, jnp.zeros(3), jnp.eye(3))
+        for what, unfit in {
+            "a life": filter.life is not None,
+            "an association other than by tags": not isinstance(filter.associate, Known),
+            'the covariance "square_root"': filter.square_root,
+            "a suite": isinstance(sensor, Suite),
+            f"the sensor {sensor.name}, whose landmarks are converted to points,": (
+                sensor.reduced is not None
+            ),
+            f"the sensor {sensor.name}, which has no landmarks,": not sensor.landmark,
+            f"the chart {filter.chart.name}, in which a motion changes the covariance of every "
+            "landmark,": filter.chart.basis is not None,
+            f"the linearizer {filter.linearize.name}, which keeps former estimates,": bool(
+                jax.tree.leaves(joint.lin)
+            ),
+        }.items():
+            if unfit:
+                raise ValueError(f"{name}: {what} is not supported")
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        return "compressed_ekf_slam"
+
+    def init(self, pose: jax.Array, pose_cov: jax.Array) -> Compressed:
+        return opened(self.filter.init(pose, pose_cov), self.area)
+
+    def predict(self, state: Compressed, u: jax.Array, key: jax.Array) -> Compressed:
+        return state._replace(area=self._local.predict(state.area, u, key))
+
+    def update(self, state: Compressed, scan: Scan, key: jax.Array) -> tuple[Compressed, Info]:
+        if len(scan.tag) > self.area:
             raise ValueError(
-                f"compressed_ekf_slam: the linearizer {linearizer.name} keeps former estimates, "
-                "which is not supported"
+                f"CompressedEkfSlam: expected area >= {len(scan.tag)}, the measurement slots of "
+                f"a scan, got {self.area}"
             )
-        return opened(joint, own)
-
-    def predict(state: Compressed, u: jax.Array, key: jax.Array) -> Compressed:
-        return state._replace(area=local.predict(state.area, u, key))
-
-    def update(state: Compressed, scan: Scan, key: jax.Array) -> tuple[Compressed, Info]:
-        if len(scan.tag) > area:
-            raise ValueError(
-                f"compressed_ekf_slam: expected area >= {len(scan.tag)}, the measurement slots of "
-                f"a scan, got {area}"
-            )
-        state = _with_area_of(scan, state, sensor, most)
-        inside, info = local.update(state.area, scan, key)
+        state = _with_area_of(scan, state, self.filter.sensor, self.filter.births)
+        inside, info = self._local.update(state.area, scan, key)
         in_map = jnp.where(info.slot >= 0, state.slot[jnp.maximum(info.slot, 0)], -1)
         return _with_updated_area(state, inside), info._replace(slot=in_map)
 
-    def estimate(state: Compressed) -> Estimate:
+    def estimate(self, state: Compressed) -> Estimate:
         def one(*of_landmark: jax.Array) -> Estimate:
             landmark, alive, tag, own, with_robot = of_landmark
             cov = jnp.block([[robot, with_robot], [with_robot.T, own]])
             place = state.area.pose, landmark[None], cov, alive[None], tag[None]
-            return whole.estimate(Joint(*place, ()))
+            return self.filter.estimate(Joint(*place, ()))
 
         robot, joint = state.area.cov[:3, :3], state.whole
         each = jax.vmap(one)(_moved_map(state), joint.alive, joint.tag, *_marginals(state))
@@ -136,20 +135,16 @@ def compressed_ekf_slam(
             tag=joint.tag,
         )
 
-    return Filter(
-        name="compressed_ekf_slam",
-        controls=whole.controls,
-        measurements=whole.measurements,
-        init=init,
-        predict=predict,
-        update=update,
-        estimate=estimate,
-        chart=whole.chart,
-    )
+    @property
+    def _local(self) -> EkfSlam:
+        """The filter of the area, with slots for what is postponed."""
+        own = min(self.area, self.filter.capacity)
+        more = _more(own, len(self.filter.sensor.landmark))
+        return dataclasses.replace(self.filter, capacity=own + more)
 
 
 def opened(joint: Joint, area: int) -> Compressed:
-    """A state of `compressed_ekf_slam` of a map, the area (min(area, N)) at its first slots."""
+    """A state of `CompressedEkfSlam` of a map, the area (min(area, N)) at its first slots."""
     return _opened_at(joint, jnp.arange(min(area, joint.landmarks.shape[0]), dtype=jnp.int32))
 
 

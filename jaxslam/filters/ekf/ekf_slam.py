@@ -1,49 +1,37 @@
-"""EKF-SLAM; the published variants are arguments of one filter."""
+"""EKF-SLAM; the published variants are fields of one filter."""
 
-import jax
+import dataclasses
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam import slots, validation
-from jaxslam.association.known import known as known_association
-from jaxslam.charts.euclidean import euclidean
+from jaxslam.association.known import Known
+from jaxslam.charts.euclidean import Euclidean
+from jaxslam.core.record import hold_function, record, static
 from jaxslam.filters.ekf.coordinates import to_points
 from jaxslam.filters.ekf.coordinates.linear_system import LinearizedSteps, LinearSystem
 from jaxslam.filters.ekf.coordinates.map_coordinates import estimate_of
 from jaxslam.filters.ekf.settings import (
+    CorrectionOrder,
     Covariance,
     EkfSettings,
-    Update,
     check_ekf_options,
-    check_make_room,
     check_settings,
 )
 from jaxslam.filters.ekf.steps.predict import propagate
-from jaxslam.filters.ekf.steps.scan import turns_of, update_by_scan
+from jaxslam.filters.ekf.steps.scan import turns_of, update_by_scan, without_landmarks
 from jaxslam.filters.reporting import with_extra, with_removed
-from jaxslam.linearize.at_estimate import at_estimate
+from jaxslam.linearize.at_estimate import AtEstimate
 from jaxslam.math import linalg
+from jaxslam.math.arrays import Number
 from jaxslam.protocols import Associate, Chart, Filter, Life, Linearizer, Motion, Sensor
-from jaxslam.sensors.suite import Suite
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Info, Scan
 
 
-def ekf_slam(
-    motion: Motion,
-    sensor: Sensor,
-    capacity: int,
-    *,
-    chart: Chart | None = None,
-    linearize: Linearizer | None = None,
-    associate: Associate | None = None,
-    update: Update = "sequential",
-    gate: float | None = None,
-    iterations: int = 1,
-    covariance: Covariance = "plain",
-    births: int | None = None,
-    make_room: Life | None = None,
-) -> Filter:
+@record
+class EkfSlam(Filter):
     """Extended Kalman filter SLAM in a map of fixed capacity (Solà 2).
 
     Each step propagates the robot (14)-(17); each scan corrects (26)-(30), then starts its new
@@ -54,95 +42,119 @@ def ekf_slam(
 
     Several sensors are one `sensors.Suite`, whose parts are processed one after the other.
 
-    Args:
-        motion, sensor: the models; Jacobians come from `jax.jacfwd`.
-        capacity: landmark slots N. A new landmark that finds the map full is dropped and marked
-            `Status.OVERFLOW`.
-        chart: the error coordinates of P; default `charts.euclidean()`.
-        linearize: where Jacobians are taken; default `linearize.at_estimate()`.
-        associate: default `association.known()`.
-        update: "sequential" corrects by one measurement after the other, linearizing anew each
-            time, as the guide does; "joint" corrects by the whole scan at once.
-        gate: reject a measurement whose squared Mahalanobis distance exceeds this; default none.
-            The guide's 3 σ is `stats.sigma_gate(3)`, and `stats.chi2_quantile` gives a probability.
-        iterations: passes of the iterated EKF, each from the same prior; 1 is the plain EKF.
-        covariance: "plain"; "joseph", Joseph's form of the update, which costs more and is safer in
-            float32; or "square_root", a root X of P = X Xᵀ instead of P, as accurate in float32 as
-            P is in float64, at a higher cost (the prediction is O(N³)).
-        births: at most so many new landmarks a scan, the first ones in its order (that of tags in
-            simulated scans), the rest `Status.DEFERRED`. The guide starts one, picked at random.
-            Default no limit.
-        make_room: a `Life` that removes landmarks from a full map before new ones enter it; only
-            for filters wrapped as `map_management.pruning(filter, make_room)`, which keeps its
-            memory. Default: none is removed.
-    Raises:
-        ValueError: on models, charts, linearizers or associations of another type or size
-            (`validation`), a capacity, iterations or births below 1, a gate not above 0, an unknown
-            update or covariance, a chart or linearizer that does not fit the sensor's landmarks or
-            one another, a `Life` without `make_room`, several iterations of a statistical
-            linearizer, or a linearizer of landmarks for a suite with an absolute sensor; from
-            `update`, on a make_room without `pruning`.
+    Raises ValueError on models, charts, linearizers or associations of another type or size
+    (`validation`), a capacity, iterations or births below 1, a gate not above 0, an unknown
+    correction or covariance, a chart or linearizer that does not fit the sensor's landmarks or one
+    another, several iterations of a statistical linearizer, or a linearizer of landmarks for a
+    suite with an absolute sensor.
     """
-    validation.check_models("ekf_slam", motion, sensor)
-    validation.check_parts("ekf_slam", chart=chart, linearize=linearize, associate=associate)
-    check_ekf_options("ekf_slam", capacity, update, gate, iterations, births, covariance)
-    settings = EkfSettings(
-        sensor=sensor,
-        chart=chart or euclidean(),
-        linearize=linearize or at_estimate(),
-        associate=associate or known_association(),
-        update=update,
-        gate=gate,
-        iterations=iterations,
-        covariance=covariance,
-        births=births,
-        make_room=make_room,
-    )
-    check_settings(settings)
-    check_make_room(make_room)
-    chart, square_root = settings.chart, settings.square_root
-    turns = turns_of(sensor, settings)
-    places = sensor.places if isinstance(sensor, Suite) else ()
 
-    def init(pose: jax.Array, pose_cov: jax.Array) -> Joint:
-        return initial_state(pose, pose_cov, capacity, settings)
+    motion: Motion
+    sensor: Sensor
+    """the models; Jacobians come from `jax.jacfwd`"""
+    capacity: int = static()
+    """landmark slots N. A new landmark that finds the map full is dropped and marked
+    `Status.OVERFLOW`"""
+    _: dataclasses.KW_ONLY
+    chart: Chart = Euclidean()
+    """the error coordinates of P"""
+    linearize: Linearizer = AtEstimate()
+    """where Jacobians are taken"""
+    associate: Associate = Known()
+    """which landmark a measurement is of"""
+    correction: CorrectionOrder = static(default="sequential")
+    """"sequential" corrects by one measurement after the other, linearizing anew each time, as the
+    guide does; "joint" corrects by the whole scan at once"""
+    gate: Number | None = None
+    """reject a measurement whose squared Mahalanobis distance exceeds this; None: none. The guide's
+    3 σ is `stats.sigma_gate(3)`, and `stats.chi2_quantile` gives a probability"""
+    iterations: int = static(default=1)
+    """passes of the iterated EKF, each from the same prior; 1 is the plain EKF"""
+    covariance: Covariance = static(default="plain")
+    """"plain"; "joseph", Joseph's form of the update, which costs more and is safer in float32; or
+    "square_root", a root X of P = X Xᵀ instead of P, as accurate in float32 as P is in float64, at
+    a higher cost (the prediction is O(N³))"""
+    births: int | None = static(default=None)
+    """at most so many new landmarks a scan, the first ones in its order (that of tags in simulated
+    scans), the rest `Status.DEFERRED`. The guide starts one, picked at random. None: no limit"""
+    life: Life | None = None
+    """a rule that removes landmarks after each scan, and may make room in a full map. Its memory is
+    `Joint.life`; `info.extra["pruning"].removed` (N,) bool marks the slots"""
 
-    def predict(joint: Joint, u: jax.Array, key: jax.Array) -> tuple[Joint, LinearSystem]:
-        joint, moved = propagate(joint, u, motion, settings)
+    def __post_init__(self) -> None:
+        name = type(self).__name__
+        validation.check_models(name, self.motion, self.sensor)
+        validation.check_parts(name, self.chart, self.linearize, self.associate, self.life)
+        hold_function(self, "associate", "prediction, scan")
+        check_ekf_options(
+            name,
+            self.capacity,
+            self.correction,
+            self.gate,
+            self.iterations,
+            self.births,
+            self.covariance,
+        )
+        check_settings(name, self._settings)
+        super().__post_init__()
+
+    @property
+    def square_root(self) -> bool:  # type: ignore[override]
+        return self.covariance == "square_root"
+
+    @property
+    def landmark(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self.sensor.landmark
+
+    @property
+    def linearized(self) -> LinearizedSteps | None:
+        """The steps with their linear system; None of a class that overrides one."""
+        plain = type(self).predict is EkfSlam.predict and type(self).update is EkfSlam.update
+        return LinearizedSteps(self._predict, self._update) if plain else None
+
+    def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:
+        joint = initial_state(pose, pose_cov, self.capacity, self._settings)
+        if self.life is None:
+            return joint
+        return joint._replace(life=self.life.init(pose, joint.landmarks))
+
+    def predict(self, state: Joint, u: Float[Array, "U"], key: Array) -> Joint:
+        return self._predict(state, u, key)[0]
+
+    def update(self, state: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
+        return self._update(state, scan, key)[:2]
+
+    def estimate(self, state: Joint) -> Estimate:
+        return estimate_of(state, self.sensor, self.chart, square_root=self.square_root)
+
+    @property
+    def _settings(self) -> EkfSettings:
+        names = [field.name for field in dataclasses.fields(EkfSettings)]
+        return EkfSettings(**{name: getattr(self, name) for name in names if hasattr(self, name)})
+
+    def _predict(
+        self, joint: Joint, u: Float[Array, "U"], key: Array
+    ) -> tuple[Joint, LinearSystem]:
+        joint, moved = propagate(joint, u, self.motion, self._settings)
         return joint, (moved,)
 
-    def update_map(joint: Joint, scan: Scan, key: jax.Array) -> tuple[Joint, Info, LinearSystem]:
-        if make_room is not None and joint.life is None:
-            raise ValueError(
-                f"ekf_slam: make_room={make_room.name} needs the record that pruning keeps: "
-                "expected pruning(ekf_slam(…, make_room=life), life)"
-            )
+    def _update(self, joint: Joint, scan: Scan, key: Array) -> tuple[Joint, Info, LinearSystem]:
+        turns = turns_of(self.sensor, self._settings)
         joint, info, evicted, system = update_by_scan(joint, scan, turns)
-        if make_room is not None:
-            info = with_removed(info, evicted)
-        if sensor.reduced is not None:
-            joint, which, reduced = to_points.reduced_where_ready(joint, sensor, square_root)
+        if self.sensor.reduced is not None:
+            joint, which, reduced = to_points.reduced_where_ready(
+                joint, self.sensor, self.square_root
+            )
             info = with_extra(info, "points", to_points.ToPoints(which))
             system = (*system, reduced)
+        if self.life is not None:
+            before = joint
+            memory, dead = self.life.after(before, info, lambda: self.estimate(before))
+            joint = without_landmarks(
+                joint._replace(life=memory), dead, square_root=self.square_root
+            )
+            info = with_removed(info, evicted | dead)
         return joint, info, system
-
-    def estimate(joint: Joint) -> Estimate:
-        return estimate_of(joint, sensor, chart, square_root=square_root)
-
-    steps = LinearizedSteps(predict, update_map)
-    return Filter(
-        name="ekf_slam",
-        controls=motion.controls,
-        measurements=sensor.measurements,
-        init=init,
-        predict=steps.predict,
-        update=steps.update,
-        estimate=estimate,
-        chart=chart,
-        places=places,
-        square_root=square_root,
-        landmark=sensor.landmark,
-    )
 
 
 def initial_state(

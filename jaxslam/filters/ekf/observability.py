@@ -1,21 +1,19 @@
 """The observability monitor: information gained along directions that should stay unobservable."""
 
-import dataclasses
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
-from jaxslam import validation
+from jaxslam.core.record import record
 from jaxslam.filters.ekf.coordinates.linear_system import (
     LinearLandmarks,
     LinearMeasurements,
     LinearSystem,
-    linearized_steps,
 )
 from jaxslam.math import linalg
-from jaxslam.protocols import Filter
+from jaxslam.protocols import Filter, Wrapper
 from jaxslam.types import Estimate, Info, Scan
 
 _TINY = 1e-30
@@ -40,7 +38,7 @@ class Monitor(NamedTuple):
     """the combination of directions that rotates robot and map about the origin by 1 rad"""
 
 
-class Monitored(NamedTuple):
+class MonitoredState(NamedTuple):
     """The state of a monitored filter."""
 
     state: PyTree
@@ -48,56 +46,49 @@ class Monitored(NamedTuple):
     monitor: Monitor
 
 
-def monitored(filter: Filter) -> Filter:
+@record
+class Monitored(Wrapper):
     """The filter with an observability monitor of its own linearized system, for campaigns.
 
-    The state is a `Monitored`; estimates and infos are the filter's. A landmark merged into another
-    is not a measurement here.
+    The state is a `MonitoredState`; estimates and infos are the filter's. A landmark merged into
+    another is not a measurement here.
 
-    Args:
-        filter: of `ekf_slam`, or that pruned, merged or with loops closed.
-    Raises:
-        ValueError: on a filter of another type, or that does not return its linear system.
+    Raises ValueError on a filter of another type, or that does not return its linear system.
     """
-    validation.check_record("monitored", "filter", filter, Filter)
-    steps, chart = linearized_steps(filter), filter.chart
-    if steps is None:
-        raise ValueError(
-            f"monitored: the steps of {filter.name} do not return the linear system they use, as "
-            "those of ekf_slam do; wrap that first"
-        )
 
-    def init(pose: Array, pose_cov: Array) -> Monitored:
-        state = filter.init(pose, pose_cov)
+    filter: Filter
+    """an `EkfSlam`, or one merged or with loops closed"""
+    square_root = False
+    landmark = ()
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if self.filter.linearized is None:
+            raise ValueError(
+                f"Monitored: the steps of {self.filter.name} do not return the linear system they "
+                "use, as those of EkfSlam do; wrap that first"
+            )
+
+    def init(self, pose: Array, pose_cov: Array) -> MonitoredState:
+        state, chart = self.filter.init(pose, pose_cov), self.chart
         turn = jnp.stack([-pose[1], pose[0], jnp.ones_like(pose[0])])
         if chart.basis is not None:
-            ground = jnp.zeros(len(filter.landmark), pose.dtype)
+            ground = jnp.zeros(len(self.filter.landmark), pose.dtype)
             turn = linalg.inverse(chart.basis(pose, ground).pose) @ turn
         nothing = jnp.zeros((3, 3), pose.dtype)
         directions = jnp.eye(state.cov.shape[0], 3, dtype=pose.dtype)
-        return Monitored(state, Monitor(directions, nothing, nothing[0], turn))
+        return MonitoredState(state, Monitor(directions, nothing, nothing[0], turn))
 
-    def predict(whole: Monitored, u: Array, key: Array) -> Monitored:
-        state, system = steps.predict_linearized(whole.state, u, key)
-        return Monitored(state, after(whole.monitor, system))
+    def predict(self, state: MonitoredState, u: Array, key: Array) -> MonitoredState:
+        inner, system = self.filter.linearized.predict(state.state, u, key)
+        return MonitoredState(inner, after(state.monitor, system))
 
-    def update(whole: Monitored, scan: Scan, key: Array) -> tuple[Monitored, Info]:
-        state, info, system = steps.update_linearized(whole.state, scan, key)
-        return Monitored(state, after(whole.monitor, system)), info
+    def update(self, state: MonitoredState, scan: Scan, key: Array) -> tuple[MonitoredState, Info]:
+        inner, info, system = self.filter.linearized.update(state.state, scan, key)
+        return MonitoredState(inner, after(state.monitor, system)), info
 
-    def estimate(whole: Monitored) -> Estimate:
-        return filter.estimate(whole.state)
-
-    return dataclasses.replace(
-        filter,
-        name=f"monitored {filter.name}",
-        init=init,
-        predict=predict,
-        update=update,
-        estimate=estimate,
-        square_root=False,
-        landmark=(),
-    )
+    def estimate(self, state: MonitoredState) -> Estimate:
+        return self.filter.estimate(state.state)
 
 
 def after(monitor: Monitor, system: LinearSystem) -> Monitor:

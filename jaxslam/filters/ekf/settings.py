@@ -7,52 +7,53 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from jaxslam.association.known import known
-from jaxslam.charts.euclidean import euclidean
+from jaxslam.association.known import Known
+from jaxslam.charts.euclidean import Euclidean
 from jaxslam.core.numbers import check_count, check_gate
-from jaxslam.linearize.at_estimate import at_estimate
+from jaxslam.linearize.at_estimate import AtEstimate
+from jaxslam.math.arrays import Number
 from jaxslam.protocols import Associate, Chart, Life, Linearizer, Sensor
 from jaxslam.sensors.suite import Suite
 
-Update = Literal["sequential", "joint"]
+CorrectionOrder = Literal["sequential", "joint"]
 
 Covariance = Literal["plain", "joseph", "square_root"]
 """P ← P - Vᵀ V; Joseph's (I-KH) P (I-KH)ᵀ + K R Kᵀ; or the update of a root X of P = X Xᵀ"""
 
 
 class EkfOptions(TypedDict, total=False):
-    """The keyword arguments of `ekf_slam`, where they are handed on."""
+    """The options of `EkfSlam`, where they are handed on."""
 
-    chart: Chart | None
-    linearize: Linearizer | None
-    associate: Associate | None
-    update: Update
-    gate: float | None
+    chart: Chart
+    linearize: Linearizer
+    associate: Associate
+    correction: CorrectionOrder
+    gate: Number | None
     iterations: int
     covariance: Covariance
     births: int | None
-    make_room: Life | None
+    life: Life | None
 
 
 @dataclass(frozen=True, eq=False)
 class EkfSettings:
     """The models and options of a Kalman-type SLAM filter, the last argument of each step.
 
-    A factory creates and validates it once; `dataclasses.replace` makes one for each sensor of a
-    suite. The options are those of `ekf_slam`.
+    A filter makes it of its fields within a trace; `dataclasses.replace` makes one for each sensor
+    of a suite. The options are those of `EkfSlam`.
     """
 
     sensor: Sensor
-    chart: Chart = field(default_factory=euclidean)
-    linearize: Linearizer = field(default_factory=at_estimate)
-    associate: Associate = field(default_factory=known)
-    update: Update = "sequential"
-    gate: float | None = None
+    chart: Chart = field(default_factory=Euclidean)
+    linearize: Linearizer = field(default_factory=AtEstimate)
+    associate: Associate = field(default_factory=Known)
+    correction: CorrectionOrder = "sequential"
+    gate: Number | None = None
     iterations: int = 1
     covariance: Covariance = "plain"
     births: int | None = None
     """new landmarks a scan, at most; None for no limit, 0 for none at all"""
-    make_room: Life | None = None
+    life: Life | None = None
     """which landmarks make room for new ones"""
     absolute: bool = False
     """every valid measurement corrects the robot, whatever its tag"""
@@ -68,18 +69,20 @@ class EkfSettings:
 def check_ekf_options(
     filter: str,
     capacity: int,
-    update: str,
-    gate: float | None,
+    correction: str,
+    gate: Number | None,
     iterations: int,
     births: int | None,
     covariance: str = "plain",
 ) -> None:
-    """Raise ValueError, which names the filter, on invalid counts, gate, update or covariance."""
+    """Raise ValueError, which names the filter, on invalid options."""
     for name, value in (("capacity", capacity), ("iterations", iterations), ("births", births)):
         if value is not None or name != "births":
             check_count(f"{filter}: {name}", value)
-    if update not in ("sequential", "joint"):
-        raise ValueError(f'{filter}: expected update "sequential" or "joint", got {update!r}')
+    if correction not in ("sequential", "joint"):
+        raise ValueError(
+            f'{filter}: expected correction "sequential" or "joint", got {correction!r}'
+        )
     check_gate(filter, gate)
     check_covariance_form(filter, covariance, get_args(Covariance))
 
@@ -100,7 +103,7 @@ def check_iterations(filter: str, linearize: Linearizer, iterations: int) -> Non
         )
 
 
-def check_chart(sensor: Sensor, chart: Chart) -> None:
+def check_chart(filter: str, sensor: Sensor, chart: Chart) -> None:
     """Raise ValueError unless the chart acts on landmarks of the sensor's size."""
     pose, landmark = jnp.zeros(3), jnp.zeros(len(sensor.landmark))
     try:
@@ -110,20 +113,20 @@ def check_chart(sensor: Sensor, chart: Chart) -> None:
         fits = False
     if not fits and landmark.size == 0:
         raise ValueError(
-            f"ekf_slam: the chart {chart.name} acts on landmarks, and the absolute sensor "
+            f"{filter}: the chart {chart.name} acts on landmarks, and the absolute sensor "
             f"{sensor.name} has none"
         )
     if not fits:
         raise ValueError(
-            f"ekf_slam: the chart {chart.name} does not act on the {landmark.shape[0]}-parameter "
-            f"landmarks of the sensor {sensor.name}: choose charts.euclidean()"
+            f"{filter}: the chart {chart.name} does not act on the {landmark.shape[0]}-parameter "
+            f"landmarks of the sensor {sensor.name}: choose charts.Euclidean()"
         )
 
 
-def check_settings(settings: EkfSettings) -> None:
+def check_settings(filter: str, settings: EkfSettings) -> None:
     """Raise ValueError unless sensor, chart, linearizer and covariance form are compatible."""
     sensor, chart, linearize = settings.sensor, settings.chart, settings.linearize
-    check_chart(sensor, chart)
+    check_chart(filter, sensor, chart)
     if linearize.euclidean:
         unfit = [f"the Euclidean chart, not {chart.name}"] * (chart.basis is not None)
         unfit += [f"landmarks (x, y), not those of {sensor.name}"] * (not sensor.of_points)
@@ -131,24 +134,15 @@ def check_settings(settings: EkfSettings) -> None:
             unfit += [f"a suite without absolute sensors, not {sensor.name}"]
         if unfit:
             raise ValueError(
-                f"ekf_slam: the linearizer {linearize.name} needs {', and '.join(unfit)}: choose "
-                "linearize.at_estimate()"
+                f"{filter}: the linearizer {linearize.name} needs {', and '.join(unfit)}: choose "
+                "linearize.AtEstimate()"
             )
-    check_iterations("ekf_slam", linearize, settings.iterations)
+    check_iterations(filter, linearize, settings.iterations)
     if sensor.reduced is not None and chart.basis is not None:
         ground = jnp.zeros(len(sensor.landmark))
         if chart.basis(jnp.zeros(3), ground).landmark is not None:
             raise ValueError(
-                f"ekf_slam: the landmarks of {sensor.name} are converted to points, which the "
+                f"{filter}: the landmarks of {sensor.name} are converted to points, which the "
                 f"chart {chart.name} does not support, since its errors of landmarks turn with the "
                 "robot"
             )
-
-
-def check_make_room(make_room: Life | None) -> None:
-    """Raise ValueError unless `life` is a `Life` with `make_room`."""
-    if make_room is not None and (not isinstance(make_room, Life) or make_room.make_room is None):
-        raise ValueError(
-            "ekf_slam: expected make_room to be a Life that makes room, as from "
-            f"life.existence(…, replace=True), got {make_room!r}"
-        )

@@ -12,30 +12,28 @@ filters", IJRR 23(7-8), 2004; the Notes, with the corrections of the errata.
 """
 
 import math
-from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool, Float, Int, PyTree
+from jaxtyping import Bool, Float, Int
 
-from jaxslam.charts.euclidean import euclidean
 from jaxslam.filters.information.innovation import CanonicalInnovations, stack_jacobians
-from jaxslam.filters.information.settings import InformationSettings
 from jaxslam.filters.information.tag_association import TagAssociation
 from jaxslam.filters.reporting import info_of, status_of
 from jaxslam.linearize import first_order
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
-from jaxslam.protocols import Filter, Motion, Sensor
-from jaxslam.types import Estimate, Info, Scan
+from jaxslam.math.arrays import Number
+from jaxslam.protocols import Motion, Sensor
+from jaxslam.types import Info, Scan
 
 
-def initial_information(pose_cov: Float[Array, "3 3"], floor: float) -> Float[Array, "3 3"]:
+def initial_information(pose_cov: Float[Array, "3 3"], floor: Number) -> Float[Array, "3 3"]:
     """The first information P0⁻¹, or (P0 + floor² I)⁻¹ where P0 is not positive definite."""
     eye = jnp.eye(3, dtype=pose_cov.dtype)
     positive = linalg.cholesky(pose_cov)[1]
-    safe = jnp.where(positive, pose_cov, pose_cov + floor**2 * eye)
+    safe = jnp.where(positive, pose_cov, pose_cov + jnp.asarray(floor, eye.dtype) ** 2 * eye)
     return linalg.symmetrize(linalg.solve_psd(safe, eye)[0])
 
 
@@ -133,49 +131,29 @@ def diagonal_loading(omega: Float[Array, "D D"]) -> Float[Array, "D D"]:
 
 def report(
     scan: Scan,
-    association: TagAssociation,
+    measured: TagAssociation,
     of: CanonicalInnovations,
     initialized: Bool[Array, "M"],
 ) -> Info:
     """The `Info` of a scan."""
     status = status_of(
         scan.valid,
-        matched=association.known,
+        matched=measured.known,
         positive=of.positive,
         inside=of.inside,
-        new=association.new,
-        repeated=association.repeated,
+        new=measured.new,
+        repeated=measured.repeated,
         granted=initialized,
-        singular=association.has_slot,
+        singular=measured.has_slot,
     )
     return info_of(
         status,
         of.compared,
         size=scan.z.shape[1],
-        slot=association.slot,
-        born=association.slot,
+        slot=measured.slot,
+        born=measured.slot,
         nis=of.nis,
         innovation=of.innovation,
         innovation_cov=of.innovation_cov,
         log_likelihood=of.log_likelihood.sum(),
-    )
-
-
-def information_filter(
-    settings: InformationSettings,
-    init: Callable[[Array, Array], PyTree],
-    predict: Callable[[PyTree, Array, Array], PyTree],
-    update: Callable[[PyTree, Scan, Array], tuple[PyTree, Info]],
-    estimate: Callable[[PyTree], Estimate],
-) -> Filter:
-    """The `Filter` of these functions, with its error in map coordinates."""
-    return Filter(
-        name=settings.name,
-        controls=settings.motion.controls,
-        measurements=settings.sensor.measurements,
-        init=init,
-        predict=predict,
-        update=update,
-        estimate=estimate,
-        chart=euclidean(),
     )

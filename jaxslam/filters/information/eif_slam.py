@@ -6,13 +6,12 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.charts.euclidean import euclidean
+from jaxslam.core.record import record
 from jaxslam.filters.ekf.coordinates.map_coordinates import estimate_of
 from jaxslam.filters.information import canonical, innovation
-from jaxslam.filters.information.settings import InformationSettings
+from jaxslam.filters.information.settings import InformationFilter
 from jaxslam.filters.information.tag_association import associate_by_table
 from jaxslam.math import linalg
-from jaxslam.protocols import Filter, Motion, Sensor
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Info, Scan
 
@@ -39,39 +38,23 @@ class CanonicalState(NamedTuple):
         return self.omega @ mean + self.residual
 
 
-def eif_slam(
-    motion: Motion,
-    sensor: Sensor,
-    capacity: int,
-    *,
-    gate: float | None = None,
-    floor: float = 1e-4,
-) -> Filter:
-    """Extended information filter SLAM: `ekf_slam(update="joint")` in canonical form.
+@record
+class EifSlam(InformationFilter):
+    """Extended information filter SLAM: `EkfSlam(correction="joint")` in canonical form.
 
     The steps are those of `canonical`; the mean is Ω⁻¹ ξ, solved for after each scan, O(D³). The
-    results equal those of the EKF to rounding, at a higher cost; `seif` approximates this filter.
+    results equal those of the EKF to rounding, at a higher cost; `Seif` approximates this filter.
     Measurements are associated with landmarks by their tags.
 
     Where rounding has made Ω indefinite (float32), the scan is refused: its measurements are
     `Status.SINGULAR`, `CanonicalState.refused` counts it, and √eps of Ω's diagonal is added to Ω,
     which may make it positive definite for the next scan.
-
-    Args:
-        motion, sensor: the models; Jacobians come from `jax.jacfwd`, at the estimate.
-        capacity: landmark slots N; a new landmark in a full map is `Status.OVERFLOW`.
-        gate: reject a measurement whose squared Mahalanobis distance exceeds this; default none.
-        floor: standard deviation [m, rad] added to a singular pose_cov, which has no inverse.
-    Raises:
-        ValueError: on a capacity below 1, a gate or floor not above 0, a suite, or a sensor that
-            has no landmarks or whose landmarks become points.
     """
-    settings = InformationSettings("eif_slam", motion, sensor, capacity, gate, floor)
 
-    def init(pose: Array, pose_cov: Array) -> CanonicalState:
-        size = len(sensor.landmark)
+    def init(self, pose: Array, pose_cov: Array) -> CanonicalState:
+        capacity, size = self.capacity, len(self.sensor.landmark)
         d = 3 + capacity * size
-        information = canonical.initial_information(pose_cov, floor).astype(pose.dtype)
+        information = canonical.initial_information(pose_cov, self.floor).astype(pose.dtype)
         return CanonicalState(
             pose=pose,
             landmarks=jnp.zeros((capacity, size), pose.dtype),
@@ -82,24 +65,29 @@ def eif_slam(
             refused=jnp.zeros((), jnp.int32),
         )
 
-    def predict(state: CanonicalState, u: Array, key: Array) -> CanonicalState:
+    def predict(self, state: CanonicalState, u: Array, key: Array) -> CanonicalState:
         pose, omega, residual = canonical.motion_update(
-            motion, state.pose, u, state.omega, state.residual
+            self.motion, state.pose, u, state.omega, state.residual
         )
         return state._replace(pose=pose, omega=omega, residual=residual)
 
-    def update(state: CanonicalState, scan: Scan, key: Array) -> tuple[CanonicalState, Info]:
+    def update(self, state: CanonicalState, scan: Scan, key: Array) -> tuple[CanonicalState, Info]:
         measured = associate_by_table(state.tag, state.alive, scan)
         innovations = innovation.innovations(
-            settings, state.omega, state.pose, state.landmarks, scan, measured.slot, measured.known
+            self, state.omega, state.pose, state.landmarks, scan, measured.slot, measured.known
         )
         omega, residual = canonical.measurement_update(state.omega, state.residual, innovations)
         error, solved = canonical.mean_error(omega, residual, innovations.omega_positive)
         pose, landmarks = corrected_means(state, error)
         omega, new_landmarks, initialized = canonical.initialize_landmarks(
-            sensor, omega, pose, scan.z, measured.slot, measured.new & measured.has_slot & solved
+            self.sensor,
+            omega,
+            pose,
+            scan.z,
+            measured.slot,
+            measured.new & measured.has_slot & solved,
         )
-        into = jnp.where(initialized, measured.slot, capacity)
+        into = jnp.where(initialized, measured.slot, self.capacity)
         after = state._replace(
             pose=pose,
             landmarks=landmarks.at[into].set(new_landmarks, mode="drop"),
@@ -112,12 +100,10 @@ def eif_slam(
         innovations = innovation.refuse_unless(solved, innovations)
         return after, canonical.report(scan, measured, innovations, initialized)
 
-    def estimate(state: CanonicalState) -> Estimate:
+    def estimate(self, state: CanonicalState) -> Estimate:
         cov = linalg.inverse_psd(state.omega)
         joint = Joint(state.pose, state.landmarks, cov, state.alive, state.tag, ())
-        return estimate_of(joint, sensor, euclidean())
-
-    return canonical.information_filter(settings, init, predict, update, estimate)
+        return estimate_of(joint, self.sensor, self.chart)
 
 
 def corrected_means(

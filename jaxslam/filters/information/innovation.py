@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.filters.information.settings import InformationSettings
+from jaxslam.filters.information.settings import InformationFilter
 from jaxslam.linearize.derivatives import observe_jacobians
 from jaxslam.math import linalg
 from jaxslam.math.gaussians import gaussian_terms, log_density, log_det_of_pivots
@@ -40,7 +40,7 @@ class CanonicalInnovations(NamedTuple):
 
 
 def innovations(
-    settings: InformationSettings,
+    settings: InformationFilter,
     omega: Float[Array, "D D"],
     pose: Float[Array, "3"],
     landmarks: Float[Array, "A L"],

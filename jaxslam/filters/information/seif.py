@@ -1,12 +1,16 @@
 """The sparse extended information filter (SEIF), whose steps take constant time."""
 
+import dataclasses
+
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
+from jaxslam.core.numbers import check_count
+from jaxslam.core.record import record, static
 from jaxslam.filters.information import canonical, innovation
 from jaxslam.filters.information.innovation import CanonicalInnovations
-from jaxslam.filters.information.settings import SparseSettings
+from jaxslam.filters.information.settings import InformationFilter
 from jaxslam.filters.information.sparse.active_set import (
     activate,
     active_matches,
@@ -28,24 +32,11 @@ from jaxslam.filters.information.sparse.sparse_state import (
 )
 from jaxslam.filters.information.sparse.sparsification import cut_robot_links
 from jaxslam.filters.information.tag_association import TagAssociation, associate_by_index
-from jaxslam.protocols import Filter, Motion, Sensor
 from jaxslam.types import Estimate, Info, Scan
 
 
-def seif(
-    motion: Motion,
-    sensor: Sensor,
-    capacity: int,
-    *,
-    active: int,
-    links: int,
-    passive: int = 10,
-    sweeps: int = 1,
-    conservative: bool = False,
-    whole: bool = False,
-    gate: float | None = None,
-    floor: float = 1e-4,
-) -> Filter:
+@record
+class Seif(InformationFilter):
     """Sparse extended information filter (Thrun et al. 2004; the Notes, corrected by the errata).
 
     The robot is linked to at most `active` landmarks, the most recent ones, each landmark to at
@@ -62,77 +53,89 @@ def seif(
     measurement, and only makes the room that the scan needs, so that a scan without another
     landmark drops nothing.
 
-    With active = capacity it is `eif_slam`. `sparsification` documents what is dropped, and
+    With active = capacity it is `EifSlam`. `sparsification` documents what is dropped, and
     `SparseState.counts` counts it. NIS, gate and, unless `whole`, `estimate` use covariances of
     Markov blankets (`marginals`), which hold all other landmarks at their means: less than the true
     ones, by much in a map that has drifted as a whole. Sparsification is overconfident
     too. Landmarks are points associated by their tags, and the tag of one is its slot.
 
-    An active block that is not positive definite: as in `eif_slam`, counted in
+    An active block that is not positive definite: as in `EifSlam`, counted in
     `ApproximationCounts.refused`.
 
-    Args:
-        motion, sensor: the models; Jacobians come from `jax.jacfwd`, at the estimate.
-        capacity: landmarks N; a tag beyond is `Status.OVERFLOW`.
-        active: most active landmarks, at least as many as a scan has measurement slots; capped at
-            the capacity.
-        links: most links K of a landmark to others while one of both is passive.
-        passive: landmarks whose means are recovered in rotation each scan, beside the active ones.
-        sweeps: rounds of mean recovery a scan: passive landmarks, then the active block.
-        conservative: how a full list drops its weakest link, `sparsification.drop_link`. False:
-            overconfidently, Ω stays positive definite. True: with loss of information; where a map
-            needs many more links than it may have, Ω does not stay positive definite.
-        whole: `estimate` inverts Ω of all landmarks, O(N³): the filter's exact marginals.
-        gate: reject a measurement whose squared Mahalanobis distance exceeds this; default none.
-        floor: standard deviation [m, rad] added to a singular pose_cov, which has no inverse.
-    Raises:
-        ValueError: as `eif_slam`; on an active, links, passive or sweeps below 1; on landmarks that
-            are not points (x, y); and, from `update`, on a scan with more measurement slots than
-            `active`.
+    Raises ValueError as `EifSlam`; on an active, links, passive or sweeps below 1; on landmarks
+    that are not points (x, y); and, from `update`, on a scan with more measurement slots than
+    `active`.
     """
-    settings = SparseSettings(
-        "seif",
-        motion,
-        sensor,
-        capacity,
-        gate,
-        floor,
-        active=active,
-        links=links,
-        passive=passive,
-        sweeps=sweeps,
-        conservative=conservative,
-        whole=whole,
-    )
 
-    def update(state: SparseState, scan: Scan, key: Array) -> tuple[SparseState, Info]:
-        _check_scan_size(settings, scan)
-        state = recover_passive_means(state, settings.recovered)
-        measured = associate_by_index(state.alive, scan)
-        state, index = _sparsify_and_activate(settings, state, measured)
-        state, omega, innovations, solved = _correct_active(
-            settings, state, scan, index, measured.known
+    _: dataclasses.KW_ONLY
+    active: int = static()
+    """most active landmarks, at least as many as a scan has measurement slots; capped at the
+    capacity"""
+    links: int = static()
+    """most links K of a landmark to others while one of both is passive"""
+    passive: int = static(default=10)
+    """landmarks whose means are recovered in rotation each scan, beside the active ones"""
+    sweeps: int = static(default=1)
+    """rounds of mean recovery a scan: passive landmarks, then the active block"""
+    conservative: bool = static(default=False)
+    """how a full list drops its weakest link, `sparsification.drop_link`. False: overconfidently, Ω
+    stays positive definite. True: with loss of information; where a map needs many more links than
+    it may have, Ω does not stay positive definite"""
+    whole: bool = static(default=False)
+    """`estimate` inverts Ω of all landmarks, O(N³): the filter's exact marginals"""
+
+    def __post_init__(self) -> None:
+        for option in ("active", "links", "passive", "sweeps"):
+            check_count(f"Seif: {option}", getattr(self, option))
+        super().__post_init__()
+        if not self.sensor.of_points:
+            raise ValueError(
+                f"Seif: expected landmarks (x, y), got {self.sensor.landmark} of {self.sensor.name}"
+            )
+
+    @property
+    def active_size(self) -> int:
+        """The size A of the active set."""
+        return min(self.active, self.capacity)
+
+    @property
+    def recovered(self) -> int:
+        """The number of passive means that a round of mean recovery updates."""
+        return min(self.passive, self.capacity)
+
+    def init(self, pose: Array, pose_cov: Array) -> SparseState:
+        information = canonical.initial_information(pose_cov, self.floor).astype(pose.dtype)
+        return empty_map(pose, information, self.capacity, self.active_size, self.links)
+
+    def predict(self, state: SparseState, u: Array, key: Array) -> SparseState:
+        pose, omega, residual = canonical.motion_update(
+            self.motion, state.pose, u, state.omega, active_residual(state)
         )
-        state = repeat_recovery(settings, state, omega, solved)
+        return with_active_residual(state._replace(pose=pose, omega=omega), residual)
+
+    def update(self, state: SparseState, scan: Scan, key: Array) -> tuple[SparseState, Info]:
+        size = scan.tag.shape[0]
+        if size > self.active:
+            raise ValueError(
+                f"Seif: expected active >= {size}, the measurement slots of a scan, got "
+                f"{self.active}"
+            )
+        state = recover_passive_means(state, self.recovered)
+        measured = associate_by_index(state.alive, scan)
+        state, index = _sparsify_and_activate(self, state, measured)
+        state, omega, innovations, solved = _correct_active(
+            self, state, scan, index, measured.known
+        )
+        state = repeat_recovery(state, omega, solved, self.recovered, self.sweeps)
         room = measured.new & measured.has_slot & solved
         state, omega, initialized = _initialize_active(
-            settings, state, omega, scan, measured.slot, index, room
+            self, state, omega, scan, measured.slot, index, room
         )
         state = _finish_scan(state, scan, index, measured.has_slot, omega, solved)
         return state, canonical.report(scan, measured, innovations, initialized)
 
-    def init(pose: Array, pose_cov: Array) -> SparseState:
-        information = canonical.initial_information(pose_cov, settings.floor).astype(pose.dtype)
-        return empty_map(pose, information, settings.capacity, settings.active_size, settings.links)
-
-    def predict(state: SparseState, u: Array, key: Array) -> SparseState:
-        pose, omega, residual = canonical.motion_update(
-            settings.motion, state.pose, u, state.omega, active_residual(state)
-        )
-        return with_active_residual(state._replace(pose=pose, omega=omega), residual)
-
-    def estimate(state: SparseState) -> Estimate:
-        marginals = whole_marginals if settings.whole else blanket_marginals
+    def estimate(self, state: SparseState) -> Estimate:
+        marginals = whole_marginals if self.whole else blanket_marginals
         pose_cov, point_covs = marginals(state)
         unit = jnp.eye(2, dtype=point_covs.dtype)[None]
         alive = state.alive
@@ -142,14 +145,12 @@ def seif(
             points=jnp.where(alive[:, None], state.landmarks, 0.0),
             point_covs=jnp.where(alive[:, None, None], point_covs, unit),
             alive=alive,
-            tag=jnp.where(alive, jnp.arange(settings.capacity), -1).astype(jnp.int32),
+            tag=jnp.where(alive, jnp.arange(self.capacity), -1).astype(jnp.int32),
         )
-
-    return canonical.information_filter(settings, init, predict, update, estimate)
 
 
 def _sparsify_and_activate(
-    settings: SparseSettings, state: SparseState, measured: TagAssociation
+    filter: Seif, state: SparseState, measured: TagAssociation
 ) -> tuple[SparseState, Int[Array, "M"]]:
     """The state with all measured landmarks active, and their indices in the active set.
 
@@ -158,28 +159,18 @@ def _sparsify_and_activate(
     """
     matches = active_matches(state, measured)
     enters = measured.has_slot & ~matches.any(axis=1)
-    empty = state.active >= settings.capacity
+    empty = state.active >= filter.capacity
     order = jnp.where(matches.any(axis=0), jnp.iinfo(jnp.int32).max, state.last_measured)
     order = jnp.where(empty, -1, order)
     index, given = assign_indices(order, jnp.cumsum(enters) - 1, enters, matches)
     leaving, most = given & ~empty, min(matches.shape)
     state = cut_robot_links(state, leaving)
-    state = deactivate(state, leaving, most, settings.conservative)
+    state = deactivate(state, leaving, most, filter.conservative)
     return activate(state, index, measured.slot, enters), index
 
 
-def _check_scan_size(settings: SparseSettings, scan: Scan) -> None:
-    """Raise ValueError unless all landmarks of a scan can be active at once."""
-    size = scan.tag.shape[0]
-    if size > settings.active:
-        raise ValueError(
-            f"{settings.name}: expected active >= {size}, the measurement slots of a scan, got "
-            f"{settings.active}"
-        )
-
-
 def _correct_active(
-    settings: SparseSettings,
+    filter: Seif,
     state: SparseState,
     scan: Scan,
     index: Int[Array, "M"],
@@ -188,7 +179,7 @@ def _correct_active(
     """The state with its mean corrected by measurements of active landmarks, Ω after them, their
     innovations, and whether the mean could be solved for."""
     found = innovation.innovations(
-        settings, state.omega, state.pose, active_means(state), scan, index, known
+        filter, state.omega, state.pose, active_means(state), scan, index, known
     )
     omega, residual = canonical.measurement_update(state.omega, active_residual(state), found)
     state, solved = recover_active_means(state, omega, residual, found.omega_positive)
@@ -196,7 +187,7 @@ def _correct_active(
 
 
 def _initialize_active(
-    settings: SparseSettings,
+    filter: Seif,
     state: SparseState,
     omega: Float[Array, "D D"],
     scan: Scan,
@@ -207,7 +198,7 @@ def _initialize_active(
     """The state with new landmarks in their slots where wanted, Ω with them, and which were
     started."""
     omega, landmarks, initialized = canonical.initialize_landmarks(
-        settings.sensor, omega, state.pose, scan.z, index, wanted
+        filter.sensor, omega, state.pose, scan.z, index, wanted
     )
     into = jnp.where(initialized, slot, state.alive.shape[0])
     state = state._replace(

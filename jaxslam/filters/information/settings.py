@@ -1,34 +1,42 @@
-"""The settings of the information filters, validated once."""
+"""What the information filters share: their models and options, checked where one is made."""
 
-from dataclasses import dataclass
+import dataclasses
 
 from jaxslam import validation
-from jaxslam.core.numbers import check_count, check_gate
-from jaxslam.protocols import Motion, Sensor
+from jaxslam.charts.euclidean import Euclidean
+from jaxslam.core.numbers import check_count, check_gate, check_positive
+from jaxslam.core.record import record, static
+from jaxslam.math.arrays import Number
+from jaxslam.protocols import Filter, Motion, Sensor
 from jaxslam.sensors.suite import Suite
 
 
-@dataclass(frozen=True, eq=False)
-class InformationSettings:
-    """Models and options of an information filter. Raises ValueError, by its name, if invalid."""
+@record
+class InformationFilter(Filter):
+    """Models and options of an information filter, whose error is in map coordinates.
 
-    name: str
+    Raises ValueError on a capacity below 1, a gate or floor not above 0, a suite, or a sensor that
+    has no landmarks or whose landmarks become points.
+    """
+
     motion: Motion
     sensor: Sensor
-    capacity: int
-    """landmark slots N"""
-    gate: float | None
-    """greatest squared Mahalanobis distance of an innovation"""
-    floor: float
-    """standard deviation [m, rad] added to a singular initial covariance"""
+    """the models; Jacobians come from `jax.jacfwd`, at the estimate"""
+    capacity: int = static()
+    """landmark slots N; a new landmark in a full map is `Status.OVERFLOW`"""
+    _: dataclasses.KW_ONLY
+    gate: Number | None = None
+    """reject a measurement whose squared Mahalanobis distance exceeds this"""
+    floor: Number = 1e-4
+    """standard deviation [m, rad] added to a singular pose_cov, which has no inverse"""
+    chart = Euclidean()
 
     def __post_init__(self) -> None:
-        name, sensor = self.name, self.sensor
+        name, sensor = type(self).__name__, self.sensor
         validation.check_models(name, self.motion, sensor)
         check_count(f"{name}: capacity", self.capacity)
         check_gate(name, self.gate)
-        if not self.floor > 0:
-            raise ValueError(f"{name}: expected a floor above 0, got {self.floor}")
+        check_positive(name, floor=self.floor)
         if isinstance(sensor, Suite):
             raise ValueError(f"{name}: expected one sensor, not a suite")
         if len(sensor.landmark) == 0:
@@ -38,41 +46,4 @@ class InformationSettings:
                 f"{name}: the landmarks of {sensor.name} are converted to points, which is not "
                 "supported"
             )
-
-
-@dataclass(frozen=True, eq=False)
-class SparseSettings(InformationSettings):
-    """The settings of a filter with an active set and lists of links."""
-
-    active: int
-    """landmarks that may be active, if the map has as many"""
-    links: int
-    """K, most links in the list of a landmark"""
-    passive: int
-    """landmarks whose means are recovered in rotation each scan, if the map has as many"""
-    sweeps: int
-    """rounds of mean recovery a scan"""
-    conservative: bool
-    """a full list drops a link so that Ω loses information, where it stays positive definite"""
-    whole: bool
-    """covariances of the estimate are of the whole Ω, not of Markov blankets"""
-
-    def __post_init__(self) -> None:
         super().__post_init__()
-        for option in ("active", "links", "passive", "sweeps"):
-            check_count(f"{self.name}: {option}", getattr(self, option))
-        if not self.sensor.of_points:
-            raise ValueError(
-                f"{self.name}: expected landmarks (x, y), got {self.sensor.landmark} of "
-                f"{self.sensor.name}"
-            )
-
-    @property
-    def active_size(self) -> int:
-        """The size A of the active set."""
-        return min(self.active, self.capacity)
-
-    @property
-    def recovered(self) -> int:
-        """The number of passive means that a round of mean recovery updates."""
-        return min(self.passive, self.capacity)

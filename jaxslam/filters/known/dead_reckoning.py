@@ -2,33 +2,54 @@
 
 import dataclasses
 
-from jaxtyping import Array
+from jaxtyping import Array, Float
 
 from jaxslam import validation
-from jaxslam.filters.ekf.ekf_slam import ekf_slam
+from jaxslam.charts.euclidean import Euclidean
+from jaxslam.core.record import record
+from jaxslam.filters.ekf.coordinates.map_coordinates import estimate_of
+from jaxslam.filters.ekf.ekf_slam import initial_state
+from jaxslam.filters.ekf.settings import EkfSettings, check_settings
+from jaxslam.filters.ekf.steps.predict import propagate
 from jaxslam.filters.reporting import nothing_of
+from jaxslam.linearize.at_estimate import AtEstimate
 from jaxslam.protocols import Chart, Filter, Linearizer, Motion, Sensor
 from jaxslam.slots import Joint
-from jaxslam.types import Info, Scan
+from jaxslam.types import Estimate, Info, Scan
 
 
-def dead_reckoning(
-    motion: Motion,
-    sensor: Sensor,
-    *,
-    chart: Chart | None = None,
-    linearize: Linearizer | None = None,
-) -> Filter:
+@record
+class DeadReckoning(Filter):
     """The predicted pose alone, x ← f(x, u, 0) and P ← F P Fᵀ + W Q Wᵀ (Solà (14), (15)).
 
     Every measurement is `Status.UNMATCHED`, and the map stays empty. The sensor only gives the size
-    of measurements; chart and linearize are those of `ekf_slam`, with the same errors.
+    of measurements; chart and linearize are those of `EkfSlam`, with the same errors.
     """
-    validation.check_models("dead_reckoning", motion, sensor)
-    validation.check_parts("dead_reckoning", chart=chart, linearize=linearize)
-    filter = ekf_slam(motion, sensor, 1, chart=chart, linearize=linearize)
 
-    def update(joint: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
-        return joint, nothing_of(scan)
+    motion: Motion
+    sensor: Sensor
+    _: dataclasses.KW_ONLY
+    chart: Chart = Euclidean()
+    linearize: Linearizer = AtEstimate()
 
-    return dataclasses.replace(filter, name="dead_reckoning", update=update)
+    def __post_init__(self) -> None:
+        validation.check_models("DeadReckoning", self.motion, self.sensor)
+        validation.check_parts("DeadReckoning", self.chart, self.linearize)
+        check_settings("DeadReckoning", self._settings)
+        super().__post_init__()
+
+    def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:
+        return initial_state(pose, pose_cov, 1, self._settings)
+
+    def predict(self, state: Joint, u: Float[Array, "U"], key: Array) -> Joint:
+        return propagate(state, u, self.motion, self._settings)[0]
+
+    def update(self, state: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
+        return state, nothing_of(scan)
+
+    def estimate(self, state: Joint) -> Estimate:
+        return estimate_of(state, self.sensor, self.chart)
+
+    @property
+    def _settings(self) -> EkfSettings:
+        return EkfSettings(self.sensor, self.chart, self.linearize)

@@ -1,30 +1,33 @@
 """EKF localization: the robot's pose in a known map."""
 
 import dataclasses
+from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import PyTree
+from jaxtyping import Int, PyTree
 from numpy.typing import ArrayLike
 
 from jaxslam import slots, validation
-from jaxslam.association.known import known as known_association
-from jaxslam.charts.euclidean import euclidean
-from jaxslam.core.numbers import is_concrete
-from jaxslam.core.record import record
+from jaxslam.association.known import Known
+from jaxslam.charts.euclidean import Euclidean
+from jaxslam.core.numbers import held_array, is_concrete
+from jaxslam.core.record import hold_function, record, set_field, static
 from jaxslam.filters.ekf.settings import (
+    CorrectionOrder,
     Covariance,
     EkfSettings,
-    Update,
     check_covariance_form,
     check_ekf_options,
     check_iterations,
 )
 from jaxslam.filters.ekf.steps.predict import propagate
 from jaxslam.filters.ekf.steps.scan import SensorTurn, update_by_scan
-from jaxslam.linearize.at_estimate import at_estimate
+from jaxslam.linearize.at_estimate import AtEstimate
 from jaxslam.math import linalg
+from jaxslam.math.arrays import Number
 from jaxslam.protocols import (
     NOTHING_FREE,
     Associate,
@@ -46,20 +49,8 @@ from jaxslam.types import Estimate, Info, Scan
 Array = jax.Array
 
 
-def localization(
-    motion: Motion,
-    sensor: Sensor,
-    landmarks: ArrayLike,
-    *,
-    tags: ArrayLike | None = None,
-    chart: Chart | None = None,
-    linearize: Linearizer | None = None,
-    associate: Associate | None = None,
-    update: Update = "sequential",
-    gate: float | None = None,
-    iterations: int = 1,
-    covariance: Covariance = "plain",
-) -> Filter:
+@record
+class Localization(Filter):
     """Extended Kalman filter of the pose in a known map without errors (Williams, localization).
 
     The equations of EKF-SLAM with P_ll = 0: z = h(x, l_j) with H by the pose only, P (3, 3). A step
@@ -70,113 +61,122 @@ def localization(
     The state is a `slots.Joint` whose landmarks have no parameters. A measurement without a
     landmark in the map is `Status.UNMATCHED`.
 
-    Args:
-        motion, sensor: as for `ekf_slam`.
-        landmarks: (N, L) the map, in the sensor's parameters.
-        tags: (N,) int, different; default the row numbers.
-        chart: the error coordinates of P; its pose part. Default `charts.euclidean()`.
-        linearize: one without a memory of landmarks (at_estimate, unscented).
-        associate, update, gate, iterations: as for `ekf_slam`.
-        covariance: "plain" or "joseph", as there.
-    Raises:
-        ValueError: on a map that is not finite (N, L), tags that are not N different numbers from 0
-            on, a chart or linearizer that needs the landmarks' errors, and as `ekf_slam` does.
+    Raises ValueError on a map that is not finite (N, L), tags that are not N different numbers from
+    0 on, a chart or linearizer that needs the landmarks' errors, and as `EkfSlam` does.
     """
-    validation.check_models("localization", motion, sensor)
-    validation.check_parts("localization", chart=chart, linearize=linearize, associate=associate)
-    points, names = checked_map("localization", sensor, landmarks, tags)
-    capacity = points.shape[0]
-    chart = _of_pose(chart or euclidean())
-    linearize = linearize or at_estimate()
-    check_ekf_options("localization", capacity, update, gate, iterations, None)
-    check_covariance_form("localization", covariance, ("plain", "joseph"))
-    if linearize.own_landmarks:
-        raise ValueError(
-            f"localization: the linearizer {linearize.name} is for estimated maps, not for a known "
-            "one"
-        )
-    check_iterations("localization", linearize, iterations)
-    settings = EkfSettings(
-        sensor=sensor,
-        chart=chart,
-        linearize=linearize,
-        associate=_never_new(associate or known_association()),
-        update=update,
-        gate=gate,
-        iterations=iterations,
-        covariance=covariance,
-        births=0,
-    )
-    places = sensor.places if isinstance(sensor, Suite) else ()
-    turns = [SensorTurn(None, _in_map(sensor, points, settings))]
-    if isinstance(sensor, Suite):
-        turns = [
-            SensorTurn(
-                part.places,
-                None if part.sees == "robots" else _in_map(part.sensor, points, settings),
-            )
-            for part in sensor.parts
-        ]
 
-    def init(pose: Array, pose_cov: Array) -> Joint:
+    motion: Motion
+    sensor: Sensor
+    landmarks: ArrayLike
+    """(N, L) the map, in the sensor's parameters"""
+    _: dataclasses.KW_ONLY
+    tags: tuple[int, ...] | None = static(default=None)
+    """N different ones, in any form; default the row numbers"""
+    chart: Chart = Euclidean()
+    """the error coordinates of P; its pose part"""
+    linearize: Linearizer = AtEstimate()
+    """one without a memory of landmarks (AtEstimate, Unscented)"""
+    associate: Associate = Known()
+    correction: CorrectionOrder = static(default="sequential")
+    gate: Number | None = None
+    iterations: int = static(default=1)
+    """these four as for `EkfSlam`"""
+    covariance: Covariance = static(default="plain")
+    """"plain" or "joseph", as there"""
+
+    def __post_init__(self) -> None:
+        name, linearize = "Localization", self.linearize
+        validation.check_models(name, self.motion, self.sensor)
+        validation.check_parts(name, self.chart, linearize, self.associate)
+        hold_function(self, "associate", "prediction, scan")
+        hold_map(self)
+        check_ekf_options(name, 1, self.correction, self.gate, self.iterations, None)
+        check_covariance_form(name, self.covariance, ("plain", "joseph"))
+        if linearize.own_landmarks:
+            raise ValueError(
+                f"{name}: the linearizer {linearize.name} is for estimated maps, not for a known "
+                "one"
+            )
+        check_iterations(name, linearize, self.iterations)
+        super().__post_init__()
+
+    def init(self, pose: Array, pose_cov: Array) -> Joint:
+        chart, capacity = _OfPose(self.chart), np.shape(self.landmarks)[0]
         ground = jnp.zeros((capacity, 0), pose.dtype)
         if chart.basis is not None:
             undo = linalg.inverse(chart.basis(pose, ground[0]).pose)
             pose_cov = undo @ pose_cov @ undo.T
-        joint = slots.empty(pose, pose_cov, capacity, 0, linearize.init(pose, ground))
-        return joint._replace(alive=jnp.ones(capacity, bool), tag=jnp.asarray(names))
+        joint = slots.empty(pose, pose_cov, capacity, 0, self.linearize.init(pose, ground))
+        return joint._replace(alive=jnp.ones(capacity, bool), tag=map_tags(self))
 
-    def predict(joint: Joint, u: Array, key: Array) -> Joint:
-        return propagate(joint, u, motion, settings)[0]
+    def predict(self, state: Joint, u: Array, key: Array) -> Joint:
+        return propagate(state, u, self.motion, self._settings(self.sensor))[0]
 
-    def update_pose(joint: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
-        return update_by_scan(joint, scan, turns)[:2]
+    def update(self, state: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
+        turns = [SensorTurn(None, self._settings(self.sensor))]
+        if isinstance(self.sensor, Suite):
+            turns = [
+                SensorTurn(
+                    part.places, None if part.sees == "robots" else self._settings(part.sensor)
+                )
+                for part in self.sensor.parts
+            ]
+        return update_by_scan(state, scan, turns)[:2]
 
-    def estimate(joint: Joint) -> Estimate:
-        cov = joint.cov
+    def estimate(self, state: Joint) -> Estimate:
+        cov, chart = state.cov, _OfPose(self.chart)
         if chart.basis is not None:
-            basis = chart.basis(joint.pose, joint.landmarks[0]).pose
+            basis = chart.basis(state.pose, state.landmarks[0]).pose
             cov = basis @ cov @ basis.T
-        where = jax.vmap(sensor.position)(jnp.asarray(points, joint.pose.dtype))
+        points = jnp.asarray(self.landmarks, state.pose.dtype)
         return Estimate(
-            pose=joint.pose,
+            pose=state.pose,
             pose_cov=cov,
-            points=where,
-            point_covs=jnp.zeros((capacity, 2, 2), cov.dtype),
-            alive=joint.alive,
-            tag=joint.tag,
+            points=jax.vmap(self.sensor.position)(points),
+            point_covs=jnp.zeros((len(points), 2, 2), cov.dtype),
+            alive=state.alive,
+            tag=state.tag,
         )
 
-    return Filter(
-        name="localization",
-        controls=motion.controls,
-        measurements=sensor.measurements,
-        init=init,
-        predict=predict,
-        update=update_pose,
-        estimate=estimate,
-        chart=chart,
-        places=places,
-    )
+    def _settings(self, sensor: Sensor) -> EkfSettings:
+        """The settings for one sensor of known landmarks, or for an absolute sensor."""
+        absolute = not sensor.landmark
+        linearize = self.linearize if absolute else _OnMap(self.linearize, self.landmarks)
+        return EkfSettings(
+            sensor=_OfRobot(sensor),
+            chart=_OfPose(self.chart),
+            linearize=linearize,
+            associate=_NeverNew(self.associate),
+            correction=self.correction,
+            gate=self.gate,
+            iterations=self.iterations,
+            covariance=self.covariance,
+            births=0,
+            absolute=absolute,
+        )
 
 
-def _in_map(sensor: Sensor, points: PyTree, settings: EkfSettings) -> EkfSettings:
-    """The settings for one sensor of known landmarks, or for an absolute sensor."""
-    absolute = not sensor.landmark
-    linearize = settings.linearize if absolute else _on_map(settings.linearize, points)
-    return dataclasses.replace(
-        settings, sensor=_OfRobot(sensor), linearize=linearize, absolute=absolute
-    )
+@record
+class _OnMap(Linearizer):
+    """A linearizer with the landmark of a slot as a constant of the sensor."""
 
+    linearize: Linearizer
+    points: PyTree
 
-def _on_map(linearize: Linearizer, points: PyTree) -> Linearizer:
-    """The linearizer with the landmark of a slot as a constant of the sensor."""
+    def init(self, pose: Array, landmarks: Array) -> PyTree:
+        return self.linearize.init(pose, landmarks)
 
-    def observe(sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
-        landmark = jnp.asarray(points, here.pose.dtype)[here.slot]
-        return linearize.observe(dataclasses.replace(sensor, known=landmark), here)
+    def motion(self, motion: Motion, u: Array, here: Here) -> tuple[Array, Array, Array, PyTree]:
+        return self.linearize.motion(motion, u, here)
 
-    return dataclasses.replace(linearize, observe=observe)
+    def observe(self, sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
+        landmark = jnp.asarray(self.points, here.pose.dtype)[here.slot]
+        return self.linearize.observe(dataclasses.replace(sensor, known=landmark), here)
+
+    def invert(
+        self, sensor: Sensor, z: Array, tag: Array, here: Here
+    ) -> tuple[Array, Array, Array]:
+        return self.linearize.invert(sensor, z, tag, here)
 
 
 @record
@@ -202,56 +202,72 @@ class _OfRobot(Wrapped):
         return jnp.zeros(0, pose.dtype)
 
 
-def _of_pose(chart: Chart) -> Chart:
-    """The chart restricted to the pose, for landmarks without parameters."""
-    whole_basis = chart.basis
-    size = 2 if chart.landmark_size is None else chart.landmark_size
+@record
+class _OfPose(Chart):
+    """A chart restricted to the pose, for landmarks without parameters."""
 
-    def ground(landmark: Array) -> Array:
-        return jnp.zeros(size, landmark.dtype)
+    chart: Chart
 
-    def retract(pose: Array, landmark: Array, dx: Array, dl: Array) -> tuple[Array, Array]:
-        at = ground(landmark)
-        return chart.retract(pose, at, dx, at)[0], landmark
+    def retract(self, pose: Array, landmark: Array, dx: Array, dl: Array) -> tuple[Array, Array]:
+        at = self._ground(landmark)
+        return self.chart.retract(pose, at, dx, at)[0], landmark
 
-    def local(pose0: Array, landmark0: Array, pose: Array, landmark: Array) -> tuple[Array, Array]:
-        at = ground(landmark)
-        return chart.local(pose0, at, pose, at)[0], jnp.zeros(0, landmark.dtype)
+    def local(
+        self, pose0: Array, landmark0: Array, pose: Array, landmark: Array
+    ) -> tuple[Array, Array]:
+        at = self._ground(landmark)
+        return self.chart.local(pose0, at, pose, at)[0], jnp.zeros(0, landmark.dtype)
 
-    def basis(pose: Array, landmark: Array) -> Basis:
-        assert whole_basis is not None
-        by_pose = whole_basis(pose, ground(landmark)).pose
+    @property
+    def basis(self) -> Callable[[Array, Array], Basis] | None:
+        return None if self.chart.basis is None else self._basis
+
+    def _basis(self, pose: Array, landmark: Array) -> Basis:
+        by_pose = self.chart.basis(pose, self._ground(landmark)).pose
         return Basis(by_pose, jnp.zeros((0, 3), pose.dtype), None)
 
-    return Chart(chart.name, retract, local, None if whole_basis is None else basis)
+    def _ground(self, landmark: Array) -> Array:
+        size = 2 if self.chart.landmark_size is None else self.chart.landmark_size
+        return jnp.zeros(size, landmark.dtype)
 
 
-def _never_new(associate: Associate) -> Associate:
-    def within(prediction: Prediction, scan: Scan) -> Association:
-        found = Association(*associate(prediction, scan))
+@record
+class _NeverNew:
+    """An association method that starts no landmark."""
+
+    associate: Associate
+
+    def __call__(self, prediction: Prediction, scan: Scan) -> Association:
+        found = Association(*self.associate(prediction, scan))
         return found._replace(is_new=jnp.zeros_like(found.is_new))
 
-    return within
 
+def hold_map(filter: Any) -> None:
+    """Check and hold the fields landmarks (N, L) and tags of a filter, in `__post_init__`.
 
-def checked_map(
-    name: str, sensor: Sensor, landmarks: ArrayLike, tags: ArrayLike | None
-) -> tuple[PyTree, np.ndarray]:
-    """The landmarks and their tags (N,) int32, or a ValueError that begins with a filter's name."""
-    size = len(sensor.landmark)
-    if np.ndim(landmarks) != 2 or np.shape(landmarks)[1] != size or np.shape(landmarks)[0] == 0:
-        raise ValueError(
-            f"{name}: expected landmarks of shape (at least 1, {size}), got {np.shape(landmarks)}"
-        )
+    Raises ValueError, which begins with its class, on invalid ones.
+    """
+    name, landmarks, tags = type(filter).__name__, held_array(filter.landmarks), filter.tags
+    set_field(filter, "landmarks", landmarks)
+    size, shape = len(filter.sensor.landmark), np.shape(landmarks)
+    if len(shape) != 2 or shape[1] != size or shape[0] == 0:
+        raise ValueError(f"{name}: expected landmarks of shape (at least 1, {size}), got {shape}")
     if not np.issubdtype(jnp.result_type(landmarks), np.number) or jnp.iscomplexobj(landmarks):
         raise ValueError(f"{name}: expected a map of real numbers")
     if is_concrete(landmarks) and not np.isfinite(np.asarray(landmarks)).all():
         raise ValueError(f"{name}: the map is not finite")
-    count = np.shape(landmarks)[0]
-    names: np.ndarray = np.arange(count) if tags is None else np.asarray(tags)
-    good = names.shape == (count,) and np.issubdtype(names.dtype, np.integer)
-    most = np.iinfo(np.int32).max
-    if not good or len(set(names.tolist())) != count or not 0 <= names.min() <= names.max() <= most:
-        raise ValueError(f"{name}: expected {count} different tags from 0 to {most}, got {tags!r}")
-    points = landmarks if hasattr(landmarks, "shape") else np.asarray(landmarks)
-    return points, names.astype(np.int32)
+    if tags is None:
+        return
+    most, values = np.iinfo(np.int32).max, np.asarray(tags)
+    good = values.shape == shape[:1] and np.issubdtype(values.dtype, np.integer)
+    if not good or len(np.unique(values)) != shape[0] or values.min() < 0 or values.max() > most:
+        raise ValueError(
+            f"{name}: expected {shape[0]} different tags from 0 to {most}, got {tags!r}"
+        )
+    set_field(filter, "tags", tuple(values.tolist()))
+
+
+def map_tags(filter: Any) -> Int[Array, "N"]:
+    """The tags (N,) int32 of the known map of a filter."""
+    count = np.shape(filter.landmarks)[0]
+    return jnp.asarray(range(count) if filter.tags is None else filter.tags, jnp.int32)

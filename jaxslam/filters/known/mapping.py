@@ -1,18 +1,22 @@
 """Mapping from known poses, with independent landmarks."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Float, PyTree
 from numpy.typing import ArrayLike
 
 from jaxslam import validation
-from jaxslam.charts.euclidean import euclidean
+from jaxslam.association.known import Known
+from jaxslam.charts.euclidean import Euclidean
+from jaxslam.core.record import record, static
 from jaxslam.filters.particles.landmark_ekf import update_map
 from jaxslam.filters.particles.proposal import associate_particle, propose_pose
 from jaxslam.filters.particles.scan_association import zero_padding
-from jaxslam.filters.particles.settings import particle_map_settings
+from jaxslam.filters.particles.settings import check_particle_map, particle_map_settings
 from jaxslam.filters.particles.states.moments import slam_estimate
 from jaxslam.filters.particles.states.slam_state import (
     SlamParticles,
@@ -20,74 +24,83 @@ from jaxslam.filters.particles.states.slam_state import (
     initial_slam_particles,
 )
 from jaxslam.math.angles import wrap
-from jaxslam.protocols import Associate, Filter, Life, Sensor
+from jaxslam.math.arrays import Number
+from jaxslam.protocols import Associate, Filter, Life, Sensor, Wrapper
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Info, Scan
 
 
-def mapping(
-    sensor: Sensor,
-    capacity: int,
-    *,
-    associate: Associate | None = None,
-    gate: float | None = None,
-    births: int | None = None,
-    life: Life | None = None,
-) -> Filter:
+@record
+class Mapping(Filter):
     """A filter of the map alone, for known poses (Williams): the control *is* the pose.
 
     Given the path, landmarks are independent: each has an EKF of its own, l ← l + C Hᵀ S⁻¹ ν with
     S = H C Hᵀ + R, and a measurement costs O(1) for any size of the map. This is the map update of
-    one particle of `fastslam`, without a joint covariance.
+    one particle of `FastSlam`, without a joint covariance.
 
     The state is one particle of a `SlamParticles`. `log._replace(control=poses)` makes a log
-    of recorded poses (T, 3) and scans; `as_prior` makes the map the initial state of `ekf_slam`.
+    of recorded poses (T, 3) and scans; `as_prior` makes the map the initial state of `EkfSlam`.
 
-    Args:
-        sensor: of landmarks; Jacobians come from `jax.jacfwd`.
-        capacity: landmark slots N.
-        associate, gate, births, life: as for `ekf_slam`.
-    Raises:
-        ValueError: on a capacity or births below 1, a gate not above 0, or a sensor that is a
-            suite, absolute, or whose landmarks turn into points.
+    Raises ValueError on a capacity or births below 1, a gate not above 0, or a sensor that is a
+    suite, absolute, or whose landmarks turn into points.
     """
-    name = "mapping"
-    validation.check_sensor(name, sensor)
-    settings = particle_map_settings(
-        name, sensor, capacity, associate=associate, gate=gate, births=births, life=life
-    )
 
-    def init(pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> SlamParticles:
-        known = jnp.zeros_like(pose_cov)
-        state = initial_slam_particles(pose, known, 1, capacity, len(sensor.landmark))
+    sensor: Sensor
+    """of landmarks; Jacobians come from `jax.jacfwd`"""
+    capacity: int = static()
+    """landmark slots N"""
+    _: dataclasses.KW_ONLY
+    associate: Associate = Known()
+    gate: Number | None = None
+    births: int | None = static(default=None)
+    life: Life | None = None
+    """these four as for `EkfSlam`"""
+    controls = ("x [m]", "y [m]", "theta [rad]")
+    chart = Euclidean()
+
+    def __post_init__(self) -> None:
+        validation.check_sensor("Mapping", self.sensor)
+        check_particle_map(self)
+        super().__post_init__()
+
+    def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> SlamParticles:
+        known, size = jnp.zeros_like(pose_cov), len(self.sensor.landmark)
+        state = initial_slam_particles(pose, known, 1, self.capacity, size)
         one: SlamParticles = jax.tree.map(lambda leaf: leaf[0], state._replace(best=None))
-        return one if life is None else one._replace(life=life.init(pose, one.landmarks))
+        if self.life is None:
+            return one
+        return one._replace(life=self.life.init(pose, one.landmarks))
 
-    def predict(state: SlamParticles, u: Float[Array, "3"], key: Array) -> SlamParticles:
+    def predict(self, state: SlamParticles, u: Float[Array, "3"], key: Array) -> SlamParticles:
         return state._replace(pose=jnp.concatenate([u[:2], wrap(u[2:])]))
 
-    def update(state: SlamParticles, scan: Scan, key: Array) -> tuple[SlamParticles, Info]:
-        scan = zero_padding(scan)
+    def update(self, state: SlamParticles, scan: Scan, key: Array) -> tuple[SlamParticles, Info]:
+        scan, settings = zero_padding(scan), particle_map_settings(self)
         association = associate_particle(state, scan, settings)
         # The pose is known, so the proposal does not change it; the other results are used.
         proposed, innovations = propose_pose(state, association, scan, settings)
         state, info = update_map(state, association, innovations, scan, settings)
         return state, info._replace(log_likelihood=proposed.log_matched)
 
-    def estimate(state: SlamParticles) -> Estimate:
-        believed = slam_estimate(as_only_particle(state), sensor)
+    def estimate(self, state: SlamParticles) -> Estimate:
+        believed = slam_estimate(as_only_particle(state), self.sensor)
         return believed._replace(pose=state.pose, pose_cov=state.pose_cov)
 
-    return Filter(
-        name=name,
-        controls=("x [m]", "y [m]", "theta [rad]"),
-        measurements=sensor.measurements,
-        init=init,
-        predict=predict,
-        update=update,
-        estimate=estimate,
-        chart=euclidean(),
-    )
+
+@record
+class StartingAt(Wrapper):
+    """A filter whose first state is given, as of `as_prior`, or the final one of another run."""
+
+    filter: Filter
+    state: PyTree
+    """whatever `init` is called with"""
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        return self.filter.name
+
+    def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> PyTree:
+        return jax.tree.map(jnp.asarray, self.state)
 
 
 def as_prior(
@@ -98,11 +111,11 @@ def as_prior(
 ) -> Joint:
     """The initial state of a SLAM filter with this map as an uncorrelated prior.
 
-    Used by `run` with `dataclasses.replace(filter, init=partial(as_prior, final, filter))`.
+    `run(StartingAt(filter, as_prior(final, filter, pose, pose_cov)), …)` begins with it.
 
     Args:
         state: the final state of `mapping`.
-        filter: an `ekf_slam` of as many landmarks, in the Euclidean chart.
+        filter: an `EkfSlam` of as many landmarks, in the Euclidean chart.
         pose, pose_cov: (3,) and (3, 3) where its robot begins.
     Raises:
         ValueError: on other shapes; on a filter whose state is no `slots.Joint` of as many

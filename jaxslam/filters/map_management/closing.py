@@ -1,20 +1,24 @@
 """A filter wrapper that closes long loops and merges successive duplicates."""
 
+import dataclasses
+
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam import validation
-from jaxslam.core.numbers import check_count
+from jaxslam.core.numbers import check_count, check_positive
+from jaxslam.core.record import record, static
 from jaxslam.filters.map_management.loop_closure import (
-    Closing,
+    LoopReport,
     LoopSettings,
     check_recency,
     close_loop,
     no_closing,
 )
 from jaxslam.filters.map_management.successive import merge_histories, successive_duplicate
-from jaxslam.filters.map_management.wrapping import joint_of, managed
+from jaxslam.filters.map_management.wrapping import Managed
 from jaxslam.filters.reporting import with_extra, with_removed
+from jaxslam.math.arrays import Number
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.math.xla import change_where
 from jaxslam.protocols import Filter
@@ -22,70 +26,69 @@ from jaxslam.slots import Joint
 from jaxslam.types import Info, Scan
 
 
-def closing(
-    filter: Filter,
-    *,
-    every: int = 1,
-    reach: float | None = None,
-    spread: float = 0.5,
-    settings: LoopSettings | None = None,
-) -> Filter:
+@record
+class Closing(Managed):
     """The filter with a search for a closed loop after each scan (`close_loop`).
 
-    `info.extra["closing"]` is the `Closing` of the step; a landmark merged into an older one counts
-    as removed (`info.extra["pruning"]`). The filter must keep times and associate without tags, as
-    `pruning(ekf_slam(…, associate=association.certain(…)), life.recency())`.
+    `info.extra["closing"]` is the `LoopReport` of the step; a landmark merged into an older one
+    counts as removed (`info.extra["pruning"]`).
 
-    Args:
-        filter: the filter.
-        every: scans from one search to the next.
-        reach: [m] where given, two landmarks closer than that, of which one was initialized after
-            the other was last measured, are merged if δ = 0 is within 99 % and √(tr cov(δ)/2) is at
-            most spread, one pair a scan: so duplicates that were initialized before the loop closed
-            are merged too.
-        spread: [m]
-        settings: of the search; default `LoopSettings()`.
-    Raises:
-        ValueError: on no filter or a square-root filter, on every below 1, a reach or spread not
-            above 0, settings that are none; from `init`, on a state that is no `slots.Joint` or
-            keeps no times.
+    Raises ValueError on no filter or a square-root filter, on every below 1, a reach or spread not
+    above 0, settings that are none; from `init`, on a state that is no `slots.Joint` or keeps no
+    times.
     """
-    validation.check_record("closing", "filter", filter, Filter)
-    check_count("closing: every", every)
-    settings = LoopSettings() if settings is None else settings
-    validation.check_record("closing", "settings", settings, LoopSettings)
-    if not (reach is None or reach > 0) or not spread > 0:
-        raise ValueError(f"closing: expected a reach and a spread above 0, got {reach}, {spread}")
-    if filter.square_root:
-        raise ValueError(
-            f"closing: expected a filter that keeps its covariance, got {filter.name}, which keeps "
-            "the square root of it"
-        )
-    chart, gate = filter.chart, chi2_quantile(0.99, 2)
 
-    def init(pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:
-        joint = joint_of("closing", filter, filter.init(pose, pose_cov))
-        check_recency("closing", joint, chart)
+    filter: Filter
+    """one that keeps times and associates without tags, as
+    `EkfSlam(…, associate=association.Certain(…), life=life.Recency())`"""
+    _: dataclasses.KW_ONLY
+    every: int = static(default=1)
+    """scans from one search to the next"""
+    reach: Number | None = None
+    """[m] where given, two landmarks closer than that, of which one was initialized after the other
+    was last measured, are merged if δ = 0 is within 99 % and √(tr cov(δ)/2) is at most spread, one
+    pair a scan: so duplicates that were initialized before the loop closed are merged too"""
+    spread: Number = 0.5
+    """[m]"""
+    settings: LoopSettings = static(default=LoopSettings())
+    """of the search"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_count("Closing: every", self.every)
+        validation.check_record("Closing", "settings", self.settings, LoopSettings)
+        check_positive("Closing", spread=self.spread)
+        if self.reach is not None:
+            check_positive("Closing", reach=self.reach)
+        if self.filter.square_root:
+            raise ValueError(
+                f"Closing: expected a filter that keeps its covariance, got {self.filter.name}, "
+                "which keeps the square root of it"
+            )
+
+    def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:
+        joint = super().init(pose, pose_cov)
+        check_recency("Closing", joint, self.chart)
         return joint
 
-    def manage(joint: Joint, scan: Scan, info: Info) -> tuple[Joint, Info]:
+    def manage(self, joint: Joint, scan: Scan, info: Info) -> tuple[Joint, Info]:
         before = joint.alive
         joint, report = change_where(
-            (joint.life.now % every == 0) & scan.valid.any(),
-            lambda state: close_loop(state[0], chart, settings),
+            (joint.life.now % self.every == 0) & scan.valid.any(),
+            lambda state: close_loop(state[0], self.chart, self.settings),
             (joint, no_closing()),
         )
-        if reach is not None:
-            joint, report = merge_successive(joint, report, reach)
+        if self.reach is not None:
+            joint, report = self._merge_successive(joint, report, self.reach)
         info = with_removed(info, before & ~joint.alive)
         return joint, with_extra(info, "closing", report)
 
-    def merge_successive(joint: Joint, report: Closing, reach: float) -> tuple[Joint, Closing]:
-        older, younger, distance = successive_duplicate(joint, chart, reach, spread)
-        same = distance <= gate
+    def _merge_successive(
+        self, joint: Joint, report: LoopReport, reach: Number
+    ) -> tuple[Joint, LoopReport]:
+        older, younger, distance = successive_duplicate(joint, self.chart, reach, self.spread)
+        same = distance <= chi2_quantile(0.99, 2)
         joint = change_where(
-            same, lambda joint: merge_histories(joint, chart, older, younger), joint
+            same, lambda joint: merge_histories(joint, self.chart, older, younger), joint
         )
         return joint, report._replace(duplicates=same.astype(jnp.int32))
-
-    return managed("closing", filter, init, manage)

@@ -19,7 +19,7 @@ from jaxslam.filters.map_management.merging import squared_distance
 from jaxslam.filters.map_management.point_pairs import PointSets, difference_covs
 from jaxslam.filters.map_management.relocalization import check_point_map, check_policy
 from jaxslam.filters.map_management.successive import merge_histories
-from jaxslam.life.recency import Recency
+from jaxslam.life.recency import Times
 from jaxslam.math import linalg
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.math.xla import change_where
@@ -27,7 +27,7 @@ from jaxslam.protocols import Chart
 from jaxslam.slots import Joint
 
 
-class Closing(NamedTuple):
+class LoopReport(NamedTuple):
     """The result of one search for a closed loop; `info.extra["closing"]`."""
 
     explained: Int[Array, ""]
@@ -43,7 +43,7 @@ class Closing(NamedTuple):
     refused: Bool[Array, ""]
     """enough landmarks match, but another hypothesis has nearly as many, or D² is too large"""
     duplicates: Int[Array, ""]
-    """landmarks merged one by one, 0 or 1, by `closing(…, reach=…)`"""
+    """landmarks merged one by one, 0 or 1, by `Closing(…, reach=…)`"""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -82,16 +82,16 @@ class LoopSettings:
 
 
 def check_recency(caller: str, joint: Joint, chart: Chart) -> None:
-    """Raise ValueError unless landmarks are points and their times are kept (`life.recency`)."""
+    """Raise ValueError unless landmarks are points and their times are kept (`life.Recency`)."""
     check_point_map(caller, joint, chart)
-    if not isinstance(joint.life, Recency):
+    if not isinstance(joint.life, Times):
         raise ValueError(
-            f"{caller}: expected a filter that keeps times of landmarks, as pruning(…, "
-            "life.recency())"
+            f"{caller}: expected a filter that keeps times of landmarks, as EkfSlam(…, "
+            "life=life.Recency())"
         )
 
 
-def close_loop(joint: Joint, chart: Chart, settings: LoopSettings) -> tuple[Joint, Closing]:
+def close_loop(joint: Joint, chart: Chart, settings: LoopSettings) -> tuple[Joint, LoopReport]:
     """The map with recent landmarks matched with the old map and merged, and the report.
 
     A landmark is recent if it was measured within the last `window` scans, and it may be an old one
@@ -108,7 +108,7 @@ def close_loop(joint: Joint, chart: Chart, settings: LoopSettings) -> tuple[Join
     to the consistency of EKF-based SLAM", IAV 2004, one at a time.
 
     Args:
-        joint: whose `life` is that of `life.recency()`.
+        joint: whose `life` is that of `life.Recency()`.
     Raises:
         ValueError: on a life that is not recency, or a chart, linearizer or
             landmarks that `lost` refuses.
@@ -126,17 +126,17 @@ def close_loop(joint: Joint, chart: Chart, settings: LoopSettings) -> tuple[Join
     return joint, report
 
 
-def no_closing() -> Closing:
+def no_closing() -> LoopReport:
     """The report where nothing was searched for."""
     none, no = jnp.zeros((), jnp.int32), jnp.asarray(False)
-    return Closing(none, none, no, none, no, no, none)
+    return LoopReport(none, none, no, none, no, no, none)
 
 
 def recent_cluster(
     joint: Joint, settings: LoopSettings
 ) -> tuple[Int[Array, "M"], Bool[Array, "M N"]]:
     """The slots of the M recent landmarks measured last, and their candidate old landmarks."""
-    known: Recency = joint.life
+    known: Times = joint.life
     capacity = joint.landmarks.shape[0]
     recent = joint.alive & (known.now - known.last <= settings.window)
     recent = recent & (known.seen >= settings.sightings)
@@ -152,7 +152,7 @@ def old_slots(
     recent: Int[Array, "M"],
     candidates: Bool[Array, "M N"],
     settings: LoopSettings,
-) -> tuple[Int[Array, "M"], Closing]:
+) -> tuple[Int[Array, "M"], LoopReport]:
     """The old slot of each recent landmark, -1 where none is to be merged, and the report."""
     capacity, m = joint.landmarks.shape[0], recent.shape[0]
     levels = jnp.asarray(
@@ -172,12 +172,12 @@ def old_slots(
     allowed = candidates & (distance <= levels[1])
     points = PointSets(joint.landmarks[recent], joint.landmarks, own, cov, shared, allowed)
 
-    def compare(_: PyTree) -> tuple[Array, Closing]:
+    def compare(_: PyTree) -> tuple[Array, LoopReport]:
         found = match_points(points, limits)
         likely = _joint_distance(delta, points, found) <= levels[found.explained]
         enough = found.explained >= settings.least
         ok = enough & (found.explained - found.runner_up >= settings.margin) & likely
-        report = Closing(
+        report = LoopReport(
             explained=found.explained,
             runner_up=found.runner_up,
             likely=likely,

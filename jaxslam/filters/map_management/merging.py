@@ -6,12 +6,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam import slots, validation
-from jaxslam.core.numbers import is_concrete
+from jaxslam import slots
+from jaxslam.core.numbers import check_positive, is_concrete
+from jaxslam.core.record import record, static
 from jaxslam.filters.ekf.coordinates.map_coordinates import retracted
-from jaxslam.filters.map_management.wrapping import joint_of, managed
+from jaxslam.filters.map_management.wrapping import Managed
 from jaxslam.filters.reporting import with_extra
 from jaxslam.math import linalg
+from jaxslam.math.arrays import Number
 from jaxslam.math.gaussians import gaussian_terms
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.math.xla import change_where
@@ -27,7 +29,8 @@ class Merged(NamedTuple):
     """the slot of the landmark kept and the slot freed, or -1, -1 where none were merged"""
 
 
-def merging(filter: Filter, reach: float, probability: float = 0.95) -> Filter:
+@record
+class Merging(Managed):
     """The filter, which after each scan merges the pair of landmarks most likely to be duplicates.
 
     Two landmarks may be duplicates if they are within reach, the joint test of their difference
@@ -35,52 +38,52 @@ def merging(filter: Filter, reach: float, probability: float = 0.95) -> Filter:
     measurement a scan. The pairs that were measured together are `Joint.co_observed`;
     `info.extra["merging"]` is a `Merged`.
 
-    Args:
-        filter: whose state is a `slots.Joint`.
-        reach: [m] no two true landmarks are as near to one another. The test alone cannot separate
-            two landmarks from one where their difference is less certain than that.
-        probability: of the test, that two estimates of one landmark are merged.
-    Raises:
-        ValueError: on no filter, a reach not above 0, a probability outside 0 to 1, landmarks whose
-            parameters are not unique (an inverse depth) or no place (a line); from `init`, on
-            another state.
+    Raises ValueError on no filter, a reach not above 0, a probability outside 0 to 1, landmarks
+    whose parameters are not unique (an inverse depth) or no place (a line); from `init`, on another
+    state.
     """
-    validation.check_record("merging", "filter", filter, Filter)
-    if not reach > 0:
-        raise ValueError(f"merging: expected a reach above 0, got {reach}")
-    if not 0 < probability < 1:
-        raise ValueError(f"merging: expected 0 < probability < 1, got {probability}")
-    unique = len(filter.landmark) > 1 and all(name.endswith("[m]") for name in filter.landmark[:2])
-    if not unique or "rho [1/m]" in filter.landmark:
-        raise ValueError(
-            f"merging: landmarks of {filter.name} with parameters {filter.landmark} cannot be "
-            "merged: equal parameters do not mean equal positions"
-        )
-    gate = chi2_quantile(probability, len(filter.landmark))
 
-    def init(pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:
-        joint = joint_of("merging", filter, filter.init(pose, pose_cov))
+    filter: Filter
+    """whose state is a `slots.Joint`"""
+    reach: Number
+    """[m] no two true landmarks are as near to one another. The test alone cannot separate two
+    landmarks from one where their difference is less certain than that."""
+    probability: float = static(default=0.95)
+    """of the test, that two estimates of one landmark are merged"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_positive("Merging", reach=self.reach)
+        if not 0 < self.probability < 1:
+            raise ValueError(f"Merging: expected 0 < probability < 1, got {self.probability}")
+        names = self.filter.landmark
+        unique = len(names) > 1 and all(name.endswith("[m]") for name in names[:2])
+        if not unique or "rho [1/m]" in names:
+            raise ValueError(
+                f"Merging: landmarks of {self.filter.name} with parameters {names} cannot be "
+                "merged: equal parameters do not mean equal positions"
+            )
+
+    def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:
+        joint = super().init(pose, pose_cov)
         capacity = joint.alive.shape[0]
         return joint._replace(co_observed=jnp.zeros((capacity, capacity), bool))
 
-    def manage(joint: Joint, scan: Scan, info: Info) -> tuple[Joint, Info]:
-        together = co_observed(joint, info, filter.places)
+    def manage(self, joint: Joint, scan: Scan, info: Info) -> tuple[Joint, Info]:
+        chart, square_root = self.chart, self.square_root
+        together = co_observed(joint, info, self.places)
         joint = joint._replace(co_observed=together)
         kept, freed, distance = closest_pair(
-            joint, filter.chart, reach, ~together, square_root=filter.square_root
+            joint, chart, self.reach, ~together, square_root=square_root
         )
-        same = distance <= gate
+        same = distance <= chi2_quantile(self.probability, len(self.landmark))
         joint = change_where(
             same,
-            lambda joint: merge_landmarks(
-                joint, filter.chart, kept, freed, square_root=filter.square_root
-            ),
+            lambda joint: merge_landmarks(joint, chart, kept, freed, square_root=square_root),
             joint,
         )
         pair = jnp.where(same, jnp.stack([kept, freed]), -1).astype(jnp.int32)
         return joint, with_extra(info, "merging", Merged(pair))
-
-    return managed("merging", filter, init, manage)
 
 
 def co_observed(joint: Joint, info: Info, places: tuple[int, ...] = ()) -> Bool[Array, "N N"]:
@@ -103,7 +106,7 @@ def co_observed(joint: Joint, info: Info, places: tuple[int, ...] = ()) -> Bool[
 def closest_pair(
     joint: Joint,
     chart: Chart,
-    reach: float,
+    reach: Number,
     allowed: Array | None = None,
     *,
     square_root: bool = False,

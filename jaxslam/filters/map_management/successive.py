@@ -5,7 +5,8 @@ from jaxtyping import Array, Float, Int
 
 from jaxslam.filters.ekf.coordinates.map_coordinates import cov_of_coordinates
 from jaxslam.filters.map_management.merging import closest_pair, merge_landmarks
-from jaxslam.life.recency import Recency
+from jaxslam.life.recency import Times
+from jaxslam.math.arrays import Number
 from jaxslam.math.xla import where_any
 from jaxslam.protocols import Chart
 from jaxslam.slots import Joint
@@ -14,7 +15,7 @@ from jaxslam.slots import Joint
 def merge_histories(joint: Joint, chart: Chart, old: Int[Array, ""], new: Int[Array, ""]) -> Joint:
     """The map with slot new merged into slot old, including their times; unchanged if equal."""
     after = merge_landmarks(joint, chart, old, new)
-    known: Recency = joint.life
+    known: Times = joint.life
     freed = joint.alive & ~after.alive
     happened = freed.any()
 
@@ -30,14 +31,14 @@ def merge_histories(joint: Joint, chart: Chart, old: Int[Array, ""], new: Int[Ar
 
 
 def successive_duplicate(
-    joint: Joint, chart: Chart, reach: float, spread: float
+    joint: Joint, chart: Chart, reach: Number, spread: Number
 ) -> tuple[Int[Array, ""], Int[Array, ""], Float[Array, ""]]:
     """The older and the younger slot of the likeliest duplicates, and their squared distance.
 
     Of pairs within reach [m] of which one was initialized after the other was last measured, and
     whose difference is known to √(tr cov(δ)/2) <= spread [m]; infinite where there is none.
     """
-    known: Recency = joint.life
+    known: Times = joint.life
     capacity = joint.alive.shape[0]
     later = known.born[:, None] > known.last[None, :]
     near = ((joint.landmarks[:, None] - joint.landmarks[None, :]) ** 2).sum(axis=2) <= reach**2

@@ -1,65 +1,50 @@
 """What map managers share: the check of the filter's state, and the step after each update."""
 
-import dataclasses
-from collections.abc import Callable
-
 from jaxtyping import Array, Float, PyTree
 
 from jaxslam import validation
-from jaxslam.filters.ekf.coordinates.linear_system import (
-    LinearizedSteps,
-    LinearSystem,
-    linearized_steps,
-)
-from jaxslam.protocols import Filter
+from jaxslam.filters.ekf.coordinates.linear_system import LinearizedSteps, LinearSystem
+from jaxslam.protocols import Wrapper
 from jaxslam.slots import Joint
 from jaxslam.types import Info, Scan
 
 
-def joint_of(manager: str, filter: Filter, state: PyTree) -> Joint:
-    """The filter's state; ValueError, which names the manager, unless it is a `slots.Joint`."""
-    if not isinstance(state, Joint):
-        raise ValueError(
-            f"{manager}: expected a filter whose state is a slots.Joint, as from ekf_slam, got "
-            f"{filter.name}"
-        )
-    return state
+class Managed(Wrapper):
+    """A filter on a `slots.Joint`, each of whose updates is followed by `manage`.
 
-
-def managed(
-    manager: str,
-    filter: Filter,
-    init: Callable[[Float[Array, "3"], Float[Array, "3 3"]], Joint],
-    manage: Callable[[Joint, Scan, Info], tuple[Joint, Info]],
-) -> Filter:
-    """The filter with another `init`, whose updates are followed by `manage`.
-
-    It returns its linear system (`monitored`) if the filter does; what `manage` does is no part
-    of it.
+    It returns its linear system (`Monitored`) if the filter does; what `manage` does is no part
+    of it. A subclass defines `manage`, and may extend `init`.
     """
 
-    def checked(joint: Joint, scan: Scan, found: PyTree) -> tuple[Joint, Info]:
-        found = validation.state_and_info(f"{manager}: {filter.name}", joint, scan, found)
-        return manage(found[0], scan, found[1])
+    def manage(self, joint: Joint, scan: Scan, info: Info) -> tuple[Joint, Info]:
+        """The map and the info after a scan."""
+        raise NotImplementedError
 
-    def update(joint: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
-        return checked(joint, scan, filter.update(joint, scan, key))
+    def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:
+        joint = self.filter.init(pose, pose_cov)
+        if not isinstance(joint, Joint):
+            raise ValueError(
+                f"{type(self).__name__}: expected a filter whose state is a slots.Joint, as of "
+                f"EkfSlam, got {self.filter.name}"
+            )
+        return joint
 
-    steps = linearized_steps(filter)
-    if steps is not None:
-        of_filter = steps.update_linearized
+    def update(self, state: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
+        return self._managed(state, scan, self.filter.update(state, scan, key))
 
-        def update_linearized(
-            joint: Joint, scan: Scan, key: Array
-        ) -> tuple[Joint, Info, LinearSystem]:
-            after, info, system = of_filter(joint, scan, key)
-            return *checked(joint, scan, (after, info)), system
+    @property
+    def linearized(self) -> LinearizedSteps | None:
+        steps = self.filter.linearized
+        if steps is None:
+            return None
 
-        steps = LinearizedSteps(steps.predict_linearized, update_linearized)
-    return dataclasses.replace(
-        filter,
-        name=f"{manager} {filter.name}",
-        init=init,
-        predict=steps.predict if steps else filter.predict,
-        update=steps.update if steps else update,
-    )
+        def update(joint: Joint, scan: Scan, key: Array) -> tuple[Joint, Info, LinearSystem]:
+            after, info, system = steps.update(joint, scan, key)
+            return *self._managed(joint, scan, (after, info)), system
+
+        return LinearizedSteps(steps.predict, update)
+
+    def _managed(self, joint: Joint, scan: Scan, found: PyTree) -> tuple[Joint, Info]:
+        name = f"{type(self).__name__}: {self.filter.name}"
+        found = validation.state_and_info(name, joint, scan, found)
+        return self.manage(found[0], scan, found[1])

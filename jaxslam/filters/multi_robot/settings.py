@@ -1,14 +1,13 @@
-"""The settings of `team_slam`, and their validation."""
+"""The settings of `TeamSlam`, and their validation."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 
-from jaxslam.core.numbers import check_count, check_gate
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.steps.scan import SensorTurn
-from jaxslam.protocols import Chart, Sensor
+from jaxslam.protocols import Sensor
 from jaxslam.team import Robot
 
 SIZE = 3
@@ -49,41 +48,19 @@ class TeamSettings:
         return self.capacity - 1 + robot
 
 
-def check_team_options(
-    robots: Sequence[Robot],
-    report: int,
-    chart: Chart | None,
-    update: str,
-    gate: float | None,
-    iterations: int,
-    births: int | None,
-) -> None:
-    """Raise ValueError unless `team_slam` supports these options."""
-    for name, value in (("iterations", iterations), ("births", births)):
-        if value is not None:
-            check_count(f"team_slam: {name}", value)
-    if type(report) is not int or not 0 <= report < len(robots):
-        raise ValueError(f"team_slam: expected report from 0 to {len(robots) - 1}, got {report!r}")
-    if chart is not None and chart.basis is not None:
-        raise ValueError(f"team_slam: expected the chart euclidean, got {chart.name}")
-    if update not in ("sequential", "joint"):
-        raise ValueError(f'team_slam: expected update "sequential" or "joint", got {update!r}')
-    check_gate("team_slam", gate)
-
-
 def check_sensors(robots: Sequence[Robot]) -> None:
     """Raise ValueError unless landmarks are points, and unstarted robots can be initialized."""
     for b, robot in enumerate(robots):
         for part in robot.sensors.parts:
             if part.sensor.landmark and not part.sensor.of_points:
                 raise ValueError(
-                    f"team_slam: expected landmarks (x, y), got {part.sensor.landmark} of "
+                    f"TeamSlam: expected landmarks (x, y), got {part.sensor.landmark} of "
                     f"{part.sensor.name}"
                 )
         able = any(measures_points(part.sensor) for part in robot.sensors.parts)
         if b > 0 and robot.start is None and not able:
             raise ValueError(
-                f"team_slam: robot {b} needs a start, or a sensor that measures both range and "
+                f"TeamSlam: robot {b} needs a start, or a sensor that measures both range and "
                 "bearing to find it by"
             )
 

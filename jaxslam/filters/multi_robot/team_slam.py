@@ -1,7 +1,6 @@
 """EKF-SLAM of several robots in one joint state (Solà's loop over robots, sensors, landmarks)."""
 
 import dataclasses
-from collections.abc import Sequence
 
 import jax
 import jax.numpy as jnp
@@ -9,10 +8,17 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxslam import slots, validation
-from jaxslam.association.known import known as known_association
-from jaxslam.charts.euclidean import euclidean
+from jaxslam.association.known import Known
+from jaxslam.charts.euclidean import Euclidean
 from jaxslam.core.numbers import check_count
-from jaxslam.filters.ekf.settings import Covariance, EkfSettings, Update, check_covariance_form
+from jaxslam.core.record import hold_function, record, set_field, static
+from jaxslam.filters.ekf.settings import (
+    CorrectionOrder,
+    Covariance,
+    EkfSettings,
+    check_covariance_form,
+    check_ekf_options,
+)
 from jaxslam.filters.ekf.steps.predict import propagate
 from jaxslam.filters.ekf.steps.scan import SensorTurn, turn_of, update_by_scan
 from jaxslam.filters.multi_robot.pose_initialization import best_initialization, observed_points
@@ -20,7 +26,6 @@ from jaxslam.filters.multi_robot.settings import (
     SIZE,
     TeamSettings,
     check_sensors,
-    check_team_options,
 )
 from jaxslam.filters.multi_robot.team_state import (
     InitialPose,
@@ -32,34 +37,23 @@ from jaxslam.filters.multi_robot.team_state import (
 from jaxslam.filters.reporting import joined_info
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
+from jaxslam.math.arrays import Number
 from jaxslam.math.xla import where_any
-from jaxslam.protocols import Associate, Chart, Filter
+from jaxslam.protocols import Associate, Filter
 from jaxslam.sensors.suite import Part, split_scan
 from jaxslam.slots import Joint
 from jaxslam.team import Robot, check_team, poses, sizes
 from jaxslam.types import Estimate, Info, Scan, Status
 
 
-def team_slam(
-    robots: Sequence[Robot],
-    capacity: int,
-    *,
-    tags: Sequence[int] | None = None,
-    report: int = 0,
-    chart: Chart | None = None,
-    associate: Associate | None = None,
-    update: Update = "sequential",
-    gate: float | None = None,
-    iterations: int = 1,
-    covariance: Covariance = "plain",
-    births: int | None = None,
-) -> Filter:
+@record
+class TeamSlam(Filter):
     """EKF-SLAM of R robots and one map, with all their cross-covariances.
 
     The state is a `slots.Joint`: robot 0 is its pose, slots 0 … N-1 hold landmarks (x, y, padding),
     and slot N - 1 + b robot b = 1 … R-1, as a landmark (x, y, θ). Robot b moves and measures by
     exchanging it with robot 0. So a measurement of one robot by another is the correction of a
-    landmark, and with R = 1 this is `ekf_slam`. Jacobians are taken at the estimate.
+    landmark, and with R = 1 this is `EkfSlam`. Jacobians are taken at the estimate.
 
     The control of a step is (u_0, …, u_{R-1}); the measurement slots of a scan are those of robot
     0's sensors in order, then robot 1's, and so on. All robots move; then each in turn (those
@@ -77,54 +71,79 @@ def team_slam(
     has the least variance. The two measurements used are `Status.BORN` with its slot, and the rest
     of its scan corrects. This requires tags, and sensors whose measurement determines a point.
 
-    Args:
-        robots: `team.Robot`s; robot 0 starts where the run does, the others relative to it.
-        capacity: landmark slots N.
-        tags: (R,) that mean robots; default N, N + 1, ….
-        report: which robot `estimate` is of; `team.poses` has all.
-        chart: `charts.euclidean()` or None; no other.
-        associate, update, gate, iterations, covariance, births: as for `ekf_slam`, but for the
-            covariance "square_root"; births is a limit for each sensor.
-    Raises:
-        ValueError: without robots, on tags that clash, another chart, no such robot to report,
-            landmarks that are not (x, y), a robot without start whose sensors cannot tell where
-            it is, or as `ekf_slam` does.
+    Raises ValueError without robots, on tags that clash, no such robot to report, landmarks that
+    are not (x, y), a robot without start whose sensors cannot tell where it is, or as `EkfSlam`
+    does.
     """
-    check_count("team_slam: capacity", capacity)
-    tags = check_team("team_slam", robots, tags, int(capacity))
-    for robot in robots:
-        validation.check_models("team_slam", robot.motion, robot.sensors)
-    validation.check_parts("team_slam", chart=chart, associate=associate)
-    check_team_options(robots, report, chart, update, gate, iterations, births)
-    check_sensors(robots)
-    check_covariance_form("team_slam", covariance, ("plain", "joseph"))
-    ekf = EkfSettings(
-        sensor=robots[0].sensors,
-        chart=_headings_wrapped(),
-        associate=associate or known_association(),
-        update=update,
-        gate=gate,
-        iterations=iterations,
-        covariance=covariance,
-        births=births,
-        reserved=np.arange(capacity + len(robots) - 1) >= capacity,
-    )
-    turns = tuple([_turn_of(part, ekf) for part in robot.sensors.parts] for robot in robots)
-    settings = TeamSettings(tuple(robots), int(capacity), tags, ekf, turns)
-    control_ends, place_ends, size_z = sizes(robots)
 
-    def init(pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:
-        return initial_team_state(pose, pose_cov, settings)
+    robots: tuple[Robot, ...]
+    """`team.Robot`s, in a list or tuple; robot 0 starts where the run does, the others relative to
+    it"""
+    capacity: int = static()
+    """landmark slots N"""
+    _: dataclasses.KW_ONLY
+    tags: tuple[int, ...] | None = static(default=None)
+    """R that mean robots; default N, N + 1, …"""
+    report: int = static(default=0)
+    """which robot `estimate` is of; `team.poses` has all"""
+    associate: Associate = Known()
+    correction: CorrectionOrder = static(default="sequential")
+    gate: Number | None = None
+    iterations: int = static(default=1)
+    """these four as for `EkfSlam`"""
+    covariance: Covariance = static(default="plain")
+    """"plain" or "joseph", as there"""
+    births: int | None = static(default=None)
+    """as there, a limit for each sensor"""
+    chart = Euclidean()
 
-    def predict(joint: Joint, u: Float[Array, "U"], key: Array) -> Joint:
-        for b, own in enumerate(jnp.split(u, control_ends[:-1])):
-            joint = predicted_robot(joint, b, own, settings)
-        return joint
+    def __post_init__(self) -> None:
+        name, robots = "TeamSlam", self.robots
+        check_count(f"{name}: capacity", self.capacity)
+        tags = check_team(name, robots, self.tags, self.capacity)
+        set_field(self, "robots", tuple(robots))
+        if self.tags is not None:
+            set_field(self, "tags", tags)
+        for robot in robots:
+            validation.check_models(name, robot.motion, robot.sensors)
+        validation.check_parts(name, associate=self.associate)
+        hold_function(self, "associate", "prediction, scan")
+        check_ekf_options(
+            name, self.capacity, self.correction, self.gate, self.iterations, self.births
+        )
+        check_covariance_form(name, self.covariance, ("plain", "joseph"))
+        if type(self.report) is not int or not 0 <= self.report < len(robots):
+            raise ValueError(
+                f"{name}: expected report from 0 to {len(robots) - 1}, got {self.report!r}"
+            )
+        check_sensors(robots)
+        super().__post_init__()
 
-    def update_map(joint: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
+    @property
+    def controls(self) -> tuple[str, ...]:
+        return tuple(name for robot in self.robots for name in robot.motion.controls)
+
+    @property
+    def measurements(self) -> tuple[str, ...]:
+        return tuple(f"entry {i} of its sensor" for i in range(sizes(self.robots)[2]))
+
+    @property
+    def places(self) -> tuple[int, ...]:
+        return tuple(places for robot in self.robots for places in robot.sensors.places)
+
+    def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:
+        return initial_team_state(pose, pose_cov, self._settings)
+
+    def predict(self, state: Joint, u: Float[Array, "U"], key: Array) -> Joint:
+        for b, own in enumerate(jnp.split(u, sizes(self.robots)[0][:-1])):
+            state = predicted_robot(state, b, own, self._settings)
+        return state
+
+    def update(self, state: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
+        settings, (_, place_ends, size_z) = self._settings, sizes(self.robots)
         if scan.tag.shape[0] != place_ends[-1]:
             raise ValueError(
-                f"team_slam: expected {place_ends[-1]} measurement slots in a scan, got "
+                f"TeamSlam: expected {place_ends[-1]} measurement slots in a scan, got "
                 f"{scan.tag.shape[0]}"
             )
         scans = split_scan(scan, settings.places)
@@ -132,41 +151,48 @@ def team_slam(
         used: dict[int, list[Array]] = {}
         for b in settings.started + settings.unstarted:
             if b in settings.unstarted:
-                joint, used[b] = initialized(joint, b, scans, settings)
+                state, used[b] = initialized(state, b, scans, settings)
                 scans = [
                     own._replace(valid=own.valid & ~mask)
                     for own, mask in zip(scans, used[b], strict=True)
                 ]
-            joint, infos[b] = corrected(joint, b, scans[b], settings)
+            state, infos[b] = corrected(state, b, scans[b], settings)
         for b, masks in used.items():
             for a, mask in enumerate(masks):
                 infos[a] = _reported_initialized(infos[a], mask, settings.slot_of(b))
-        return joint, joined_info([infos[b] for b in range(len(robots))], size_z)
+        return state, joined_info([infos[b] for b in range(len(self.robots))], size_z)
 
-    def estimate(joint: Joint) -> Estimate:
-        means, covs, _ = poses(joint, len(robots))
+    def estimate(self, state: Joint) -> Estimate:
+        capacity, report = self.capacity, self.report
+        means, covs, _ = poses(state, len(self.robots))
         every = jnp.arange(capacity)
-        blocks = joint.cov[3 : 3 + capacity * SIZE, 3 : 3 + capacity * SIZE]
+        blocks = state.cov[3 : 3 + capacity * SIZE, 3 : 3 + capacity * SIZE]
         return Estimate(
             pose=means[report],
             pose_cov=covs[report],
-            points=joint.landmarks[:capacity, :2],
+            points=state.landmarks[:capacity, :2],
             point_covs=blocks.reshape(capacity, SIZE, capacity, SIZE)[every, :2, every, :2],
-            alive=joint.alive[:capacity],
-            tag=joint.tag[:capacity],
+            alive=state.alive[:capacity],
+            tag=state.tag[:capacity],
         )
 
-    return Filter(
-        name="team_slam",
-        controls=tuple(name for robot in robots for name in robot.motion.controls),
-        measurements=tuple(f"entry {i} of its sensor" for i in range(size_z)),
-        init=init,
-        predict=predict,
-        update=update_map,
-        estimate=estimate,
-        chart=euclidean(),
-        places=tuple(places for robot in robots for places in robot.sensors.places),
-    )
+    @property
+    def _settings(self) -> TeamSettings:
+        capacity, robots = self.capacity, self.robots
+        ekf = EkfSettings(
+            sensor=robots[0].sensors,
+            chart=_HeadingsWrapped(),
+            associate=self.associate,
+            correction=self.correction,
+            gate=self.gate,
+            iterations=self.iterations,
+            covariance=self.covariance,
+            births=self.births,
+            reserved=np.arange(capacity + len(robots) - 1) >= capacity,
+        )
+        turns = tuple([_turn_of(part, ekf) for part in robot.sensors.parts] for robot in robots)
+        tags = self.tags or tuple(range(capacity, capacity + len(robots)))
+        return TeamSettings(robots, capacity, tags, ekf, turns)
 
 
 def _turn_of(part: Part, ekf: EkfSettings) -> SensorTurn:
@@ -175,15 +201,13 @@ def _turn_of(part: Part, ekf: EkfSettings) -> SensorTurn:
     return turn_of(part, SIZE, dataclasses.replace(ekf, births=births))
 
 
-def _headings_wrapped() -> Chart:
+@record
+class _HeadingsWrapped(Euclidean):
     """The Euclidean chart of landmarks that are robots, (x, y, θ)."""
-    plain = euclidean()
 
-    def retract(pose: Array, landmark: Array, dx: Array, dl: Array) -> tuple[Array, Array]:
-        pose, landmark = plain.retract(pose, landmark, dx, dl)
+    def retract(self, pose: Array, landmark: Array, dx: Array, dl: Array) -> tuple[Array, Array]:
+        pose, landmark = super().retract(pose, landmark, dx, dl)
         return pose, jnp.concatenate([landmark[:2], wrap(landmark[2:])])
-
-    return dataclasses.replace(plain, retract=retract)
 
 
 def initial_team_state(

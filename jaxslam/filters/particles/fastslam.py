@@ -1,5 +1,6 @@
 """FastSLAM 1.0 and 2.0: particles for the robot's path, and a small EKF for each landmark."""
 
+import dataclasses
 from collections.abc import Callable
 from functools import partial
 from typing import Literal, TypeVar
@@ -10,7 +11,9 @@ from jax import Array
 from jaxtyping import Bool, Float, Int, PyTree
 
 from jaxslam import validation
-from jaxslam.charts.euclidean import euclidean
+from jaxslam.association.known import Known
+from jaxslam.charts.euclidean import Euclidean
+from jaxslam.core.record import record, static
 from jaxslam.filters.particles.landmark_ekf import update_map
 from jaxslam.filters.particles.proposal import (
     PoseProposal,
@@ -22,6 +25,7 @@ from jaxslam.filters.particles.proposal import (
 from jaxslam.filters.particles.scan_association import zero_padding
 from jaxslam.filters.particles.settings import (
     ParticleMapSettings,
+    check_particle_map,
     check_resampling,
     particle_map_settings,
 )
@@ -34,6 +38,7 @@ from jaxslam.filters.particles.states.slam_state import (
     with_finite_poses,
 )
 from jaxslam.filters.reporting import has_distance, with_extra
+from jaxslam.math.arrays import Number
 from jaxslam.protocols import Associate, Differentiable, Filter, Life, Motion, Resample, Sensor
 from jaxslam.resampling.systematic import systematic
 from jaxslam.resampling.weights import normalized, resampled_where
@@ -42,20 +47,8 @@ from jaxslam.types import Estimate, Info, Scan
 _T = TypeVar("_T")
 
 
-def fastslam(
-    motion: Motion,
-    sensor: Sensor,
-    capacity: int,
-    particles: int,
-    *,
-    proposal: Literal["motion", "measurement"] = "measurement",
-    resample: Resample | Differentiable = systematic,
-    threshold: float = 0.5,
-    associate: Associate | None = None,
-    gate: float | None = None,
-    births: int | None = None,
-    life: Life | None = None,
-) -> Filter:
+@record
+class FastSlam(Filter):
     """FastSLAM: weighted particles for the posterior of the path, and for each path independent
     landmark Gaussians (exact except for linearization). The state is a
     `slam_state.SlamParticles`.
@@ -83,55 +76,69 @@ def fastslam(
     measurements that a particle has landmarks for. `info.extra["particles"]` is a `ParticleInfo`.
     Estimates: `moments.slam_estimate`.
 
-    Args:
-        motion, sensor: the models; Jacobians come from `jax.jacfwd`.
-        capacity: landmark slots N of each particle. A new landmark that finds a particle's map full
-            is dropped there (`Status.OVERFLOW`, and `SlamParticles.lost` for each particle).
-        particles: P, at least 1.
-        proposal: what poses are drawn from.
-        resample: one of `jaxslam.resampling`. Through `stop_gradient` of one, the gradient of
-            `Info.log_likelihood` is consistent; through `soft` it is biased, and more so without
-            either, since the effect of resampling is then ignored.
-        threshold: of ESS, as a share of P; 0 never resamples, 1 in every step with unequal weights.
-        associate: default `association.known()`. Other methods associate by each particle's map.
-        gate: reject a measurement whose squared Mahalanobis distance exceeds this; default none.
-        births: at most so many new landmarks a scan and particle, the rest `Status.DEFERRED`.
-        life: rule that removes landmarks from each particle's map (`jaxslam.life`), e.g. by
-            negative evidence: `life.existence` keeps log-odds (P, N) in `SlamParticles.life`.
-            Default none.
-    Raises:
-        ValueError: on a capacity, particles or births below 1, a threshold outside [0, 1], a
-            gate not above 0, an unknown proposal, a life that is none, a resample that is no
-            function, or a sensor that is a suite, absolute, or whose landmarks turn into points.
+    Raises ValueError on a capacity, particles or births below 1, a threshold outside [0, 1], a gate
+    not above 0, an unknown proposal, a life that is none, a resample that is no function, or a
+    sensor that is a suite, absolute, or whose landmarks turn into points.
     """
+
+    motion: Motion
+    sensor: Sensor
+    """the models; Jacobians come from `jax.jacfwd`"""
+    capacity: int = static()
+    """landmark slots N of each particle. A new landmark that finds a particle's map full is dropped
+    there (`Status.OVERFLOW`, and `SlamParticles.lost` for each particle)"""
+    particles: int = static()
+    """P, at least 1"""
+    _: dataclasses.KW_ONLY
+    proposal: Literal["motion", "measurement"] = static(default="measurement")
+    """what poses are drawn from"""
+    resample: Resample | Differentiable = systematic
+    """one of `jaxslam.resampling`. Through `StopGradient` of one, the gradient of
+    `Info.log_likelihood` is consistent; through `Soft` it is biased, and more so without either,
+    since the effect of resampling is then ignored"""
+    threshold: Number = 0.5
+    """of ESS, as a share of P; 0 never resamples, 1 in every step with unequal weights"""
+    associate: Associate = Known()
+    """other methods associate by each particle's map"""
+    gate: Number | None = None
+    """reject a measurement whose squared Mahalanobis distance exceeds this"""
+    births: int | None = static(default=None)
+    """at most so many new landmarks a scan and particle, the rest `Status.DEFERRED`"""
+    life: Life | None = None
+    """rule that removes landmarks from each particle's map (`jaxslam.life`), e.g. by negative
+    evidence: `life.Existence` keeps log-odds (P, N) in `SlamParticles.life`"""
     name = "fastslam"
-    validation.check_models(name, motion, sensor)
-    validation.check_count(f"{name}: particles", particles)
-    if proposal not in ("motion", "measurement"):
-        raise ValueError(f'{name}: expected proposal "motion" or "measurement", got {proposal!r}')
-    check_resampling(name, resample, threshold)
-    settings = particle_map_settings(
-        name, sensor, capacity, associate=associate, gate=gate, births=births, life=life
-    )
+    chart = Euclidean()
 
-    def init(pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> SlamParticles:
-        size = len(sensor.landmark)
-        state = initial_slam_particles(pose, pose_cov, particles, capacity, size)
-        if life is None:
+    def __post_init__(self) -> None:
+        validation.check_models("FastSlam", self.motion, self.sensor)
+        validation.check_count("FastSlam: particles", self.particles)
+        if self.proposal not in ("motion", "measurement"):
+            raise ValueError(
+                f'FastSlam: expected proposal "motion" or "measurement", got {self.proposal!r}'
+            )
+        check_resampling(self)
+        check_particle_map(self)
+        super().__post_init__()
+
+    def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> SlamParticles:
+        size = len(self.sensor.landmark)
+        state = initial_slam_particles(pose, pose_cov, self.particles, self.capacity, size)
+        if self.life is None:
             return state
-        return state._replace(life=jax.vmap(life.init)(state.pose, state.landmarks))
+        return state._replace(life=jax.vmap(self.life.init)(state.pose, state.landmarks))
 
-    def predict(state: SlamParticles, u: Float[Array, "U"], key: Array) -> SlamParticles:
-        if proposal == "measurement":
-            ahead = jax.vmap(partial(predict_pose, motion, u=u))
+    def predict(self, state: SlamParticles, u: Float[Array, "U"], key: Array) -> SlamParticles:
+        if self.proposal == "measurement":
+            ahead = jax.vmap(partial(predict_pose, self.motion, u=u))
             return with_finite_poses(state, *ahead(state.pose, state.pose_cov))
         key_pending, key_noise = jax.random.split(key)
         state = state._replace(pose=draw_poses(state, key_pending))
-        moved = sample_motion(motion, state.pose, u, key_noise)
+        moved = sample_motion(self.motion, state.pose, u, key_noise)
         return with_finite_poses(state, moved, jnp.zeros_like(state.pose_cov))
 
-    def update(state: SlamParticles, scan: Scan, key: Array) -> tuple[SlamParticles, Info]:
-        each = partial(of_each_particle, zero_padding(scan), settings)
+    def update(self, state: SlamParticles, scan: Scan, key: Array) -> tuple[SlamParticles, Info]:
+        each = partial(of_each_particle, zero_padding(scan), particle_map_settings(self))
         key_resample, key_draw = jax.random.split(key)
         state = state._replace(best=None)
         association = each(associate_particle, state)
@@ -140,10 +147,10 @@ def fastslam(
         weight, log_likelihood, some = weight_particles(state, proposed)
         nis = weighted_nis(innovations.nis, association.matched, weight)
         ess = 1.0 / jnp.exp(2 * weight).sum()
-        due = ess < threshold * particles
+        due = ess < self.threshold * self.particles
         found = ParticleInfo(ess, resampled=due, underflow=~some, invalid=state.invalid.sum())
         (state, association, innovations, before), weight = resampled_where(
-            due, (state, association, innovations, weight), weight, resample, key_resample
+            due, (state, association, innovations, weight), weight, self.resample, key_resample
         )
         state = with_drawn_poses(state._replace(log_weight=weight), key_draw)
         state, infos = each(update_map, state, association, innovations)
@@ -151,19 +158,8 @@ def fastslam(
         info = report_best(infos, best, nis, log_likelihood, association.exhausted)
         return state._replace(best=best), with_extra(info, "particles", found)
 
-    def estimate(state: SlamParticles) -> Estimate:
-        return slam_estimate(state, sensor)
-
-    return Filter(
-        name=name,
-        controls=motion.controls,
-        measurements=sensor.measurements,
-        init=init,
-        predict=predict,
-        update=update,
-        estimate=estimate,
-        chart=euclidean(),
-    )
+    def estimate(self, state: SlamParticles) -> Estimate:
+        return slam_estimate(state, self.sensor)
 
 
 def of_each_particle(

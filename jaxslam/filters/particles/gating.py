@@ -6,6 +6,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
 
+from jaxslam.math.arrays import Number
+
 
 class GatedDistance(NamedTuple):
     """A squared Mahalanobis distance d² after the gate, of any shape."""
@@ -18,9 +20,11 @@ class GatedDistance(NamedTuple):
     """d², a large number where it is not finite"""
 
 
-def gate_distance(distance: Float[Array, "*M"], gate: float | None) -> GatedDistance:
+def gate_distance(distance: Float[Array, "*M"], gate: Number | None) -> GatedDistance:
     """The gated distance: whether d² passes, and its values for weights and for `Info`."""
     finite = jnp.isfinite(distance)
+    if gate is not None:
+        gate = jnp.asarray(gate, distance.dtype)
     inside = finite if gate is None else finite & (distance <= gate)
     counted = distance if gate is None else jnp.where(inside, distance, gate)
     largest = 0.5 * float(jnp.finfo(distance.dtype).max)

@@ -96,7 +96,8 @@ def sensor_likelihood(
     nu, terms = jax.vmap(compare)(scan.z, slot, noise)
     gated = gate_distance(terms.distance, settings.gate)
     of_map = matched & terms.positive
-    unmatched = jnp.where(scan.valid, settings.unmatched_distance, 0.0)
+    far = jnp.asarray(settings.unmatched_distance, scan.z.dtype)
+    unmatched = jnp.where(scan.valid, far, 0.0)
     counted = jnp.where(of_map, gated.counted, unmatched)
     density = log_density(counted, terms.log_det, size_z)
     return ScanLikelihood(

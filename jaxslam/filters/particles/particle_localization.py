@@ -1,8 +1,7 @@
 """Monte-Carlo localization in a known map, including global localization."""
 
-import math
+import dataclasses
 from functools import partial
-from typing import Literal
 
 import jax
 import jax.numpy as jnp
@@ -11,50 +10,25 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam import validation
-from jaxslam.filters.known.localization import checked_map
+from jaxslam.association.known import Known
+from jaxslam.core.record import hold_function, record, static
+from jaxslam.filters.known.localization import hold_map, map_tags
 from jaxslam.filters.particles.likelihood import ScanLikelihood, scan_likelihood
-from jaxslam.filters.particles.pose_steps import pose_filter, weigh_particles
+from jaxslam.filters.particles.pose_steps import MonteCarloFilter
 from jaxslam.filters.particles.scan_association import zero_padding
-from jaxslam.filters.particles.settings import (
-    MonteCarloSettings,
-    checked_box,
-    checked_least,
-    known_map_sensors,
-)
+from jaxslam.filters.particles.settings import known_map_sensors
 from jaxslam.filters.particles.states.moments import weighted_nis
-from jaxslam.filters.particles.states.pose_state import (
-    PoseParticles,
-    draw_start,
-)
-from jaxslam.filters.particles.states.region import box_region
+from jaxslam.filters.particles.states.pose_state import PoseParticles, draw_start
+from jaxslam.filters.particles.states.region import Box
 from jaxslam.filters.reporting import info_of, status_of, with_extra
-from jaxslam.protocols import Associate, Differentiable, Filter, Motion, Resample, Sensor
-from jaxslam.resampling.systematic import systematic
+from jaxslam.math.arrays import Number
+from jaxslam.protocols import Associate, Motion, Sensor
 from jaxslam.resampling.weights import normalized
-from jaxslam.sensors.suite import Suite
-from jaxslam.types import Info, Scan
+from jaxslam.types import Estimate, Info, Scan
 
 
-def particle_localization(
-    motion: Motion,
-    sensor: Sensor,
-    landmarks: ArrayLike,
-    particles: int,
-    *,
-    tags: ArrayLike | None = None,
-    box: ArrayLike | None = None,
-    start: Literal["gaussian", "uniform"] = "gaussian",
-    associate: Associate | None = None,
-    gate: float | None = None,
-    resample: Resample | Differentiable = systematic,
-    threshold: float = 1.0,
-    bins: tuple[float, float, float] = (0.5, 0.5, math.radians(15)),
-    error: float = 0.05,
-    confidence: float = 0.99,
-    least: int | None = None,
-    forget: tuple[float, float] | None = (0.01, 0.1),
-    slack: float = 1.0,
-) -> Filter:
+@record
+class ParticleLocalization(MonteCarloFilter):
     """Monte-Carlo localization with an adaptive number of particles, and recovery when lost.
 
     Poses are drawn from the motion with its noise and weighted by the scan, p(z | x, map), the map
@@ -80,7 +54,7 @@ def particle_localization(
     modes. Where all weights underflow, all in use become equal (`underflow`). A motion
     that leaves a non-finite pose is undone, and the particle gets weight zero (`invalid`).
     The measurements in an `Info` are those of the most likely particle, and nis is the mean over
-    the particles by weight, as of `fastslam`; log_likelihood is log Σ w p(scan | x) of measurements
+    the particles by weight, as of `FastSlam`; log_likelihood is log Σ w p(scan | x) of measurements
     matched to a landmark.
 
     Shapes are fixed, so the cost of a step depends on the capacity, not on the particles in use.
@@ -89,74 +63,57 @@ def particle_localization(
     converge to a wrong position. Then take more particles, or inflate the sensor noise, as is
     customary; the estimate is then conservative.
 
-    Args:
-        motion, sensor: any; with a `sensors.Suite`, absolute sensors enter the weights too.
-        landmarks: (N, L) the map, in the sensor's parameters.
-        particles: the capacity P, at least 1.
-        tags: (N,) int, different; default the row numbers.
-        box: (2, 2) the lowest and the highest (x, y) [m] where the robot may be; without one,
-            nothing is injected.
-        start: "gaussian", the pose and covariance given to `run` (the latter may be zero), or
-            "uniform", the whole box and any heading, whatever is given (global localization).
-        associate: default `association.known()`, by tag. Any other decides for each particle, by
-            its pose alone (maximum_likelihood with an infinite gate: the most likely landmark).
-        gate: a measurement whose squared Mahalanobis distance exceeds this counts as one on the
-            gate, and is reported as rejected; default none.
-        resample: one of `jaxslam.resampling`; also `soft` or `stop_gradient` of one.
-        threshold: of ESS, as a share; 1 resamples (and chooses the number) in every step with
-            unequal weights, 0 only to inject. Where odometry is precise beside the scans, copies
-            stay together, and a lower threshold gives a more consistent covariance.
-        bins: sizes in x [m], y [m], θ [rad].
-        error, confidence: of the bound: with this probability the Kullback-Leibler divergence is
-            below the error.
-        least: never fewer particles; default 50, or the capacity if that is less. As many as the
-            capacity: a fixed number.
-        forget: α_slow, α_fast with 0 < α_slow <= α_fast <= 1; None injects nothing.
-        slack: above 0.
-    Raises:
-        ValueError: on counts below 1 or least above particles, a map or tags as `localization`
-            refuses them, a box that is not finite or has no inside, start "uniform" without a box,
-            a threshold outside [0, 1], a gate, bins, error or slack not above 0, a confidence not
-            within (0, 1), or invalid rates.
+    Raises ValueError as `MonteCarloFilter`, on a map or tags as `Localization` refuses them, or a
+    gate not above 0.
     """
-    validation.check_models("particle_localization", motion, sensor)
-    points, names = checked_map("particle_localization", sensor, landmarks, tags)
-    if start == "uniform" and box is None:
-        raise ValueError("particle_localization: expected a box with a uniform start, got none")
-    limits = checked_box("particle_localization", box)
-    settings = MonteCarloSettings(
-        name="particle_localization",
-        motion=motion,
-        particles=particles,
-        region=None if limits is None else box_region(limits),
-        start=start,
-        resample=resample,
-        threshold=threshold,
-        bins=bins,
-        error=error,
-        confidence=confidence,
-        least=checked_least("particle_localization", particles, least),
-        rates=forget,
-        slack=slack,
-    )
-    sensors = known_map_sensors("particle_localization", sensor, points, names, associate, gate)
 
-    def update(state: PoseParticles, scan: Scan, key: Array) -> tuple[PoseParticles, Info]:
-        state, scan = draw_start(state, key, settings), zero_padding(scan)
+    motion: Motion
+    sensor: Sensor
+    """any; with a `sensors.Suite`, absolute sensors enter the weights too"""
+    landmarks: ArrayLike
+    """(N, L) the map, in the sensor's parameters"""
+    particles: int = static()
+    """the capacity P, at least 1"""
+    _: dataclasses.KW_ONLY
+    tags: tuple[int, ...] | None = static(default=None)
+    """N different ones, in any form; default the row numbers"""
+    associate: Associate = Known()
+    """any other than by tag decides for each particle, by its pose alone (MaximumLikelihood with an
+    infinite gate: the most likely landmark)"""
+    gate: Number | None = None
+    """a measurement whose squared Mahalanobis distance exceeds this counts as one on the gate, and
+    is reported as rejected"""
+
+    def __post_init__(self) -> None:
+        name = type(self).__name__
+        validation.check_models(name, self.motion, self.sensor)
+        validation.check_parts(name, associate=self.associate)
+        hold_function(self, "associate", "prediction, scan")
+        validation.check_gate(name, self.gate)
+        hold_map(self)
+        if self.start == "uniform" and self.box is None:
+            raise ValueError(f"{name}: expected a box with a uniform start, got none")
+        super().__post_init__()
+
+    @property
+    def region(self) -> Box | None:
+        return None if self.box is None else Box(self.box)
+
+    def update(self, state: PoseParticles, scan: Scan, key: Array) -> tuple[PoseParticles, Info]:
+        state, scan = draw_start(state, key, self._start_region), zero_padding(scan)
+        sensors = known_map_sensors(self)
         likelihood = jax.vmap(partial(scan_likelihood, scan=scan, sensors=sensors))(state.pose)
         log_likelihood = normalized(state.log_weight + likelihood.log_density.sum(axis=1))[1]
         # Besides d², a weight has the term log |2πR|, which is the same for all.
         misfit = 0.5 * likelihood.counted.sum(axis=1)
         measured = likelihood.measured[0].sum()
-        state, found = weigh_particles(state, misfit, misfit, measured, settings)
+        state, found = self.weigh(state, misfit, misfit, measured)
         info = info_of_scan(scan, likelihood, state.log_weight, log_likelihood)
         return state, with_extra(info, "particles", found)
 
-    def known_points(pose: Float[Array, "3"]) -> Float[Array, "N 2"]:
-        return jax.vmap(sensor.position)(jnp.asarray(points, pose.dtype))
-
-    places = sensor.places if isinstance(sensor, Suite) else ()
-    return pose_filter(settings, update, sensor.measurements, known_points, names, places)
+    def estimate(self, state: PoseParticles) -> Estimate:
+        points = jnp.asarray(self.landmarks, state.pose.dtype)
+        return self.pose_estimate(state, jax.vmap(self.sensor.position)(points), map_tags(self))
 
 
 def info_of_scan(

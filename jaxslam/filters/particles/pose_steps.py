@@ -1,17 +1,23 @@
-"""Monte-Carlo localization in any known map: motion, number, weights, recovery, and the filter."""
+"""Monte-Carlo localization in any known map: motion, number, weights and recovery."""
 
-from collections.abc import Callable
+import dataclasses
+import math
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike
 
-from jaxslam.charts.euclidean import euclidean
+from jaxslam import validation
+from jaxslam.charts.euclidean import Euclidean
+from jaxslam.core.numbers import check_positive, is_concrete
+from jaxslam.core.record import record, static
 from jaxslam.filters.particles.proposal import sample_motion
 from jaxslam.filters.particles.recovery import resample_and_inject, update_averages
-from jaxslam.filters.particles.settings import MonteCarloSettings
+from jaxslam.filters.particles.settings import check_resampling
 from jaxslam.filters.particles.states.particle_info import ParticleInfo
 from jaxslam.filters.particles.states.pose_state import (
     ParticleEvents,
@@ -22,122 +28,182 @@ from jaxslam.filters.particles.states.pose_state import (
     no_events,
     pose_particle_moments,
 )
-from jaxslam.protocols import Filter
+from jaxslam.filters.particles.states.region import Region, hold_box
+from jaxslam.math.arrays import Number
+from jaxslam.protocols import Differentiable, Filter, Motion, Resample
 from jaxslam.resampling.kld import bins_of, enough
+from jaxslam.resampling.systematic import systematic
 from jaxslam.resampling.weights import effective_size, normalized
-from jaxslam.types import Estimate, Info, Scan
+from jaxslam.types import Estimate
 
-Update = Callable[[PoseParticles, Scan, Array], tuple[PoseParticles, Info]]
+# The default least number of particles.
+_LEAST = 50
 
 
-def pose_filter(
-    settings: MonteCarloSettings,
-    update: Update,
-    measurements: tuple[str, ...],
-    points: Callable[[Float[Array, "3"]], Float[Array, "N 2"]],
-    tags: Int[np.ndarray, "N"],
-    places: tuple[int, ...] = (),
-) -> Filter:
-    """The `Filter` of particles in a known map, with this update.
+class _Particles(Filter):
+    """What a subclass of `MonteCarloFilter` declares."""
 
-    Args:
-        points, tags: of the map, which is without error; the points in the dtype of a pose.
-        places: the parts of a suite's scan.
+    motion: Motion
+    particles: int
+    """the capacity P"""
+    region: Any
+    """the `Region` where the robot may be, or None"""
+
+
+@record
+class MonteCarloFilter(_Particles):
+    """What particle filters in a known map share: start, number, resampling and recovery.
+
+    Raises ValueError on counts below 1 or least above particles, a box that is not finite or has no
+    inside, start "uniform" without a region, a threshold outside [0, 1], bins, error or slack not
+    above 0, a confidence not within (0, 1), or invalid rates.
     """
 
-    def init(pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> PoseParticles:
-        return initial_pose_particles(pose, pose_cov, settings)
+    _: dataclasses.KW_ONLY
+    start: Literal["gaussian", "uniform"] = static(default="gaussian")
+    """"gaussian", the pose and covariance given to `run` (the latter may be zero), or "uniform",
+    anywhere with any heading, whatever is given (global localization)"""
+    box: ArrayLike | None = None
+    """(2, 2) the lowest and the highest (x, y) [m] where the robot may be"""
+    resample: Resample | Differentiable = systematic
+    """one of `jaxslam.resampling`; also `Soft` or `StopGradient` of one"""
+    threshold: Number = 1.0
+    """of ESS, as a share; 1 resamples (and chooses the number) in every step with unequal weights,
+    0 only to inject. Where odometry is precise beside the scans, copies stay together, and a lower
+    threshold gives a more consistent covariance"""
+    bins: tuple[float, float, float] = static(default=(0.5, 0.5, math.radians(15)))
+    """sizes in x [m], y [m], θ [rad]"""
+    error: Number = 0.05
+    """of the bound on the number of particles: the Kullback-Leibler divergence is below it"""
+    confidence: float = static(default=0.99)
+    """with this probability"""
+    least: int | None = static(default=None)
+    """never fewer particles; default 50, or the capacity if that is less. As many as the capacity:
+    a fixed number"""
+    forget: tuple[Number, Number] | None = (0.01, 0.1)
+    """α_slow, α_fast with 0 < α_slow <= α_fast <= 1; None injects nothing"""
+    slack: Number = 1.0
+    """above 0"""
+    chart = Euclidean()
 
-    def predict(state: PoseParticles, u: Float[Array, "U"], key: Array) -> PoseParticles:
-        return predict_particles(state, u, key, settings)
+    def __post_init__(self) -> None:
+        name, bins, rates = type(self).__name__, self.bins, self.forget
+        validation.check_count(f"{name}: particles", self.particles)
+        check_resampling(self)
+        hold_box(self)
+        if self.least is not None:
+            validation.check_count(f"{name}: least", self.least)
+            if self.least > self.particles:
+                raise ValueError(
+                    f"{name}: expected least <= particles = {self.particles}, got {self.least}"
+                )
+        if self.start not in ("gaussian", "uniform"):
+            raise ValueError(f'{name}: expected start "gaussian" or "uniform", got {self.start!r}')
+        if np.shape(bins) != (3,) or not all(np.isfinite(b) and b > 0 for b in bins):
+            raise ValueError(f"{name}: expected bins of three sizes above 0, got {bins!r}")
+        check_positive(name, error=self.error, slack=self.slack)
+        if not 0 < self.confidence < 1:
+            raise ValueError(
+                f"{name}: expected a confidence between 0 and 1, got {self.confidence}"
+            )
+        if rates is not None and len(rates) != 2:
+            raise ValueError(f"{name}: expected forget = (slow, fast), got {rates!r}")
+        if rates is not None and is_concrete(rates) and not 0 < rates[0] <= rates[1] <= 1:
+            raise ValueError(
+                f"{name}: expected forget = (slow, fast) with 0 < slow <= fast <= 1, got {rates!r}"
+            )
+        super().__post_init__()
 
-    def estimate(state: PoseParticles) -> Estimate:
+    @property
+    def fewest(self) -> int:
+        """`least`, or its default."""
+        return min(_LEAST, self.particles) if self.least is None else self.least
+
+    def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> PoseParticles:
+        return initial_pose_particles(pose, pose_cov, self.particles, self._start_region)
+
+    def predict(self, state: PoseParticles, u: Float[Array, "U"], key: Array) -> PoseParticles:
+        """The particles resampled where due and moved, as many as the KLD bound requires."""
+        key_start, key_renew, key_noise = jax.random.split(key, 3)
+        state = draw_start(state, key_start, self._start_region)
+        due = state.due
+        drawn = resample_and_inject(
+            state, key_renew, self.resample, None if self.forget is None else self.region
+        )
+        old = jnp.where(due, drawn.pose, state.pose)
+        moved = sample_motion(self.motion, old, u, key_noise)
+        good = jnp.isfinite(moved).all(axis=1)
+        pose = jnp.where(good[:, None], moved, old)
+        bins = bins_of(pose, self.bins)
+        count, few = enough(bins, self.fewest, self.error, self.confidence)
+        active = jnp.where(due, count, state.active)
+        used = jnp.arange(self.particles) < active
+        log_weight = jnp.where(used, drawn.log_weight, -jnp.inf)
+        # The sum becomes 1; its gradient is the resampling method's.
+        log_weight = log_weight - normalized(jax.lax.stop_gradient(log_weight))[1]
+        log_weight = jnp.where(due, log_weight, state.log_weight)
+        before = state.events
+        return state._replace(
+            pose=pose,
+            log_weight=jnp.where(good, log_weight, -jnp.inf),
+            active=active,
+            due=jnp.asarray(False),
+            injection=jnp.zeros_like(state.injection),
+            events=ParticleEvents(
+                resampled=before.resampled | due,
+                injected=before.injected + (due & drawn.injected & used).sum().astype(jnp.int32),
+                invalid=before.invalid + (used & ~good).sum().astype(jnp.int32),
+                capped=before.capped | (due & few),
+            ),
+        )
+
+    def weigh(
+        self,
+        state: PoseParticles,
+        misfit: Float[Array, "P"],
+        fit: Float[Array, "P"],
+        measured: Int[Array, ""],
+    ) -> tuple[PoseParticles, ParticleInfo]:
+        """The particles weighted by exp(-misfit), with what is decided for the next motion.
+
+        Args:
+            misfit: the negative log-likelihood of the scan at each particle, up to a constant.
+            fit: what recovery compares with other scans, as `update_averages` takes it.
+            measured: how many measurements the scan has.
+        """
+        weight, some = weight_poses(state, misfit)
+        ess = effective_size(weight)
+        found = ParticleInfo(
+            ess=ess, underflow=~some, active=state.active, **state.events._asdict()
+        )
+        state = update_averages(state, fit, measured, self.forget, self.slack)
+        injects = self.region is not None and self.forget is not None
+        lost = injects & (state.injection > 0)
+        state = state._replace(
+            log_weight=weight,
+            best=jnp.argmax(weight).astype(jnp.int32),
+            due=(ess < self.threshold * state.active) | lost,
+            events=no_events(),
+        )
+        return state, found
+
+    def pose_estimate(
+        self, state: PoseParticles, points: Float[Array, "N 2"], tags: Int[Array, "N"]
+    ) -> Estimate:
+        """The estimate of the pose in a map of points without error."""
         pose, cov = pose_particle_moments(state)
-        known = points(pose)
         return Estimate(
             pose=pose,
             pose_cov=cov,
-            points=known,
-            point_covs=jnp.zeros((len(known), 2, 2), pose.dtype),
-            alive=jnp.ones(len(known), bool),
-            tag=jnp.asarray(tags),
+            points=points,
+            point_covs=jnp.zeros((len(points), 2, 2), pose.dtype),
+            alive=jnp.ones(len(points), bool),
+            tag=tags,
         )
 
-    return Filter(
-        name=settings.name,
-        controls=settings.motion.controls,
-        measurements=measurements,
-        init=init,
-        predict=predict,
-        update=update,
-        estimate=estimate,
-        chart=euclidean(),
-        places=places,
-    )
-
-
-def predict_particles(
-    state: PoseParticles, u: Float[Array, "U"], key: Array, settings: MonteCarloSettings
-) -> PoseParticles:
-    """The particles resampled where due and moved, as many as the KLD bound requires."""
-    key_start, key_renew, key_noise = jax.random.split(key, 3)
-    state = draw_start(state, key_start, settings)
-    due, particles = state.due, settings.particles
-    drawn = resample_and_inject(state, key_renew, settings)
-    old = jnp.where(due, drawn.pose, state.pose)
-    moved = sample_motion(settings.motion, old, u, key_noise)
-    good = jnp.isfinite(moved).all(axis=1)
-    pose = jnp.where(good[:, None], moved, old)
-    bins = bins_of(pose, settings.bins)
-    count, few = enough(bins, settings.least, settings.error, settings.confidence)
-    active = jnp.where(due, count, state.active)
-    used = jnp.arange(particles) < active
-    log_weight = jnp.where(used, drawn.log_weight, -jnp.inf)
-    # The sum becomes 1; its gradient is the resampling method's.
-    log_weight = log_weight - normalized(jax.lax.stop_gradient(log_weight))[1]
-    log_weight = jnp.where(due, log_weight, state.log_weight)
-    before = state.events
-    return state._replace(
-        pose=pose,
-        log_weight=jnp.where(good, log_weight, -jnp.inf),
-        active=active,
-        due=jnp.asarray(False),
-        injection=jnp.zeros_like(state.injection),
-        events=ParticleEvents(
-            resampled=before.resampled | due,
-            injected=before.injected + (due & drawn.injected & used).sum().astype(jnp.int32),
-            invalid=before.invalid + (used & ~good).sum().astype(jnp.int32),
-            capped=before.capped | (due & few),
-        ),
-    )
-
-
-def weigh_particles(
-    state: PoseParticles,
-    misfit: Float[Array, "P"],
-    fit: Float[Array, "P"],
-    measured: Int[Array, ""],
-    settings: MonteCarloSettings,
-) -> tuple[PoseParticles, ParticleInfo]:
-    """The particles weighted by exp(-misfit), with what is decided for the next motion.
-
-    Args:
-        misfit: the negative log-likelihood of the scan at each particle, up to a constant.
-        fit: what recovery compares with other scans, as `update_averages` takes it.
-        measured: how many measurements the scan has.
-    """
-    weight, some = weight_poses(state, misfit)
-    ess = effective_size(weight)
-    found = ParticleInfo(ess=ess, underflow=~some, active=state.active, **state.events._asdict())
-    state = update_averages(state, fit, measured, settings)
-    lost = settings.injects & (state.injection > 0)
-    state = state._replace(
-        log_weight=weight,
-        best=jnp.argmax(weight).astype(jnp.int32),
-        due=(ess < settings.threshold * state.active) | lost,
-        events=no_events(),
-    )
-    return state, found
+    @property
+    def _start_region(self) -> Region | None:
+        return self.region if self.start == "uniform" else None
 
 
 def weight_poses(

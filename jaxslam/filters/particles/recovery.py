@@ -11,8 +11,10 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.filters.particles.settings import MonteCarloSettings
 from jaxslam.filters.particles.states.pose_state import PoseParticles
+from jaxslam.filters.particles.states.region import Region
+from jaxslam.math.arrays import Number
+from jaxslam.protocols import Differentiable, Resample
 from jaxslam.resampling.weights import survivors
 
 
@@ -20,7 +22,8 @@ def update_averages(
     state: PoseParticles,
     misfit: Float[Array, "P"],
     measured: Int[Array, ""],
-    settings: MonteCarloSettings,
+    rates: tuple[Number, Number] | None,
+    slack: Number,
 ) -> PoseParticles:
     """The state with updated likelihood averages and the injection probability.
 
@@ -30,8 +33,9 @@ def update_averages(
         misfit: of each particle: Σ d²/2, or the negative log-likelihood of the scan; a constant
             does not matter, since only the ratio of the averages does.
         measured: how many measurements the scan has.
+        rates: of the long-term and of the short-term average; None injects nothing.
     """
-    if settings.rates is None:
+    if rates is None:
         return state._replace(injection=jnp.zeros_like(state.fast))
     finite = jnp.isfinite(misfit)
     exponent = -jnp.where(finite, misfit, 0.0) / jnp.maximum(measured, 1)
@@ -39,12 +43,14 @@ def update_averages(
     fit = jax.lax.stop_gradient((jnp.exp(state.log_weight) * each).sum())
     first = state.slow <= 0
     slow, fast = (
-        jnp.where(first, fit, before + rate * (fit - before))
-        for before, rate in zip((state.slow, state.fast), settings.rates, strict=True)
+        jnp.where(first, fit, before + jnp.asarray(rate, fit.dtype) * (fit - before))
+        for before, rate in zip((state.slow, state.fast), rates, strict=True)
     )
     safe = jnp.where(slow > 0, slow, 1.0)
     # Without an average no particle has a weight, now or before: all are lost.
-    injection = jnp.where(slow > 0, jnp.maximum(0.0, 1 - settings.slack * fast / safe), 1.0)
+    injection = jnp.where(
+        slow > 0, jnp.maximum(0.0, 1 - jnp.asarray(slack, fit.dtype) * fast / safe), 1.0
+    )
     some = measured > 0
     return state._replace(
         fast=jnp.where(some, fast, state.fast),
@@ -63,20 +69,23 @@ class DrawnPoses(NamedTuple):
 
 
 def resample_and_inject(
-    state: PoseParticles, key: Array, settings: MonteCarloSettings
+    state: PoseParticles,
+    key: Array,
+    resample: Resample | Differentiable,
+    region: Region | None,
 ) -> DrawnPoses:
-    """Poses resampled by weight or, with the state's injection probability, drawn from the
+    """Poses resampled by weight or, with the state's injection probability, drawn from a
     region."""
-    particles = settings.particles
+    particles = len(state.pose)
     key_resample, key_order, key_which, key_anywhere = jax.random.split(key, 4)
-    ancestor, log_weight = survivors(settings.resample, state.log_weight, key_resample)
+    ancestor, log_weight = survivors(resample, state.log_weight, key_resample)
     # Ancestors ascend, and only the first so many may be used.
     order = jax.random.permutation(key_order, particles)
     pose, log_weight = state.pose[ancestor[order]], log_weight[order]
-    if settings.region is None or settings.rates is None:
+    if region is None:
         return DrawnPoses(pose, log_weight, jnp.zeros(particles, bool))
     injected = jax.random.uniform(key_which, (particles,), pose.dtype) < state.injection
-    anywhere = settings.region.draw(particles, key_anywhere, pose.dtype)
+    anywhere = region.draw(particles, key_anywhere, pose.dtype)
     return DrawnPoses(
         jnp.where(injected[:, None], anywhere, pose),
         jnp.where(injected, -math.log(particles), log_weight),

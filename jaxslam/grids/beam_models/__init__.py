@@ -1,25 +1,23 @@
 """How likely the ranges of a laser are at a pose in a grid."""
 
-from collections.abc import Callable
-
 from jaxslam.grids.beam_models.beam_model import BeamModel, log_likelihood
 from jaxslam.grids.beam_models.fitting import fit
-from jaxslam.grids.beam_models.likelihood_field import likelihood_field
-from jaxslam.grids.beam_models.ray_cast import Mixture, mixture_log_density, ray_cast
+from jaxslam.grids.beam_models.likelihood_field import LikelihoodField
+from jaxslam.grids.beam_models.ray_cast import Mixture, RayCast, mixture_log_density
 
-REGISTRY: dict[str, Callable[..., BeamModel]] = {
-    "likelihood_field": likelihood_field,
-    "ray_cast": ray_cast,
+REGISTRY: dict[str, type[BeamModel]] = {
+    "likelihood_field": LikelihoodField,
+    "ray_cast": RayCast,
 }
 """By name; each takes max_range and the mount of the laser."""
 
 __all__ = [
     "REGISTRY",
     "BeamModel",
+    "LikelihoodField",
     "Mixture",
+    "RayCast",
     "fit",
-    "likelihood_field",
     "log_likelihood",
     "mixture_log_density",
-    "ray_cast",
 ]

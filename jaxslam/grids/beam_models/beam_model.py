@@ -1,33 +1,53 @@
-"""The record of a beam model, and the log-likelihood of a scan under it."""
+"""The base class of beam models, and the log-likelihood of a scan under it."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
+from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxslam.core.numbers import check_count, is_concrete, shape_told
+from jaxslam.core.numbers import check_count, check_mount, held_array, is_concrete, shape_told
+from jaxslam.core.record import set_field
 from jaxslam.grids.grid import Grid
+from jaxslam.math import se2
+from jaxslam.math.arrays import Number
+from jaxslam.protocols import Component
 from jaxslam.types import Beams, JaxOrNumPy
 
 
-@dataclass(frozen=True, eq=False)
-class BeamModel:
-    """A density of the range of each beam, given pose and map."""
+class BeamModel(Component):
+    """A density of the range of each beam, given pose and map; a subclass is a record."""
 
-    name: str
-    prepare: Callable[[Grid], PyTree]
-    """(grid) -> what the model needs of the map, once for all scans: a pytree of arrays"""
-    each: Callable[[PyTree, Array, Beams], Array]
-    """(prepared, pose (3,) of the robot, beams) -> (B,) log-densities, finite also where a beam is
-    not valid"""
-    jacobian: Callable[[PyTree, Array, Beams], Array] | None = None
+    jacobian: Any = None
     """(prepared, pose, beams) -> (B, 3), their derivatives by the pose, derived by hand: `verify`
     compares them with automatic differentiation and differences"""
-    mount: ArrayLike | tuple[float, ...] = (0.0, 0.0, 0.0)
+    mount: ArrayLike | None = None
     """(3,) pose of the laser on the robot, which `each` takes into account"""
+
+    def __post_init__(self) -> None:
+        self._check(BeamModel, {"prepare": "grid", "each": "prepared, pose, beams"})
+
+    def prepare(self, grid: Grid) -> PyTree:
+        """What the model needs of the map, once for all scans: a pytree of arrays."""
+        raise NotImplementedError
+
+    def each(self, prepared: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
+        """The log-densities of the beams, finite also where a beam is not valid."""
+        raise NotImplementedError
+
+    def frame(self, pose: Array) -> Array:
+        """The pose of the laser, pose ∘ mount."""
+        if self.mount is None:
+            return pose
+        return se2.compose(pose, jnp.asarray(self.mount, pose.dtype))
+
+
+def hold_mount(model: BeamModel) -> None:
+    """Check and hold the field mount, in `__post_init__`."""
+    if model.mount is not None:
+        check_mount(type(model).__name__, model.mount)
+        set_field(model, "mount", held_array(model.mount))
 
 
 def log_likelihood(
@@ -37,7 +57,7 @@ def log_likelihood(
     beams: Beams,
     *,
     every: int = 1,
-    exponent: ArrayLike = 1.0,
+    exponent: Number = 1.0,
 ) -> Float[Array, ""]:
     """The log-likelihood of a scan at a pose (3,): exponent · Σ log p(z_k) over its valid beams.
 

@@ -83,7 +83,7 @@ def _mixture(x: Float[Array, "6"]) -> Mixture:
 
 def _cost_and_slope(x: Array, z: Array, stars: Array, max_range: Array) -> tuple[Array, Array]:
     def cost(x: Array) -> Array:
-        return -mixture_log_density(_mixture(x), z, stars, max_range).mean()  # type: ignore[arg-type]
+        return -mixture_log_density(_mixture(x), z, stars, max_range).mean()
 
     return jax.value_and_grad(cost)(x)
 

@@ -1,5 +1,6 @@
 """The range of a beam against the one that the map predicts: a mixture of four components."""
 
+import dataclasses
 import math
 from typing import NamedTuple
 
@@ -10,26 +11,27 @@ from jax.scipy.special import ndtr
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
-from jaxslam.core.numbers import check_mount, check_positive, is_concrete
-from jaxslam.grids.beam_models.beam_model import BeamModel
+from jaxslam.core.numbers import check_positive, is_concrete
+from jaxslam.core.record import record, static
+from jaxslam.grids.beam_models.beam_model import BeamModel, hold_mount
 from jaxslam.grids.cast import RayMap, cast, check_method, ray_map
 from jaxslam.grids.grid import Grid
-from jaxslam.math import se2
+from jaxslam.math.arrays import Number
 from jaxslam.types import Beams
 
 
 class Mixture(NamedTuple):
-    """The parameters of `ray_cast`."""
+    """The parameters of `RayCast`."""
 
-    hit: ArrayLike
+    hit: Number
     """share of beams that end at the obstacle of the map, with Gaussian noise"""
     short: ArrayLike
     """share that ends earlier, at what the map does not have"""
-    maximum: ArrayLike
+    maximum: Number
     """share that returns nothing, and so max_range"""
-    random: ArrayLike
+    random: Number
     """share of any range"""
-    sigma: ArrayLike
+    sigma: Number
     """standard deviation of a hit [m]"""
     rate: ArrayLike
     """rate λ of the exponential density of short ones [1/m]"""
@@ -40,7 +42,7 @@ USUAL = Mixture(0.75, 0.1, 0.05, 0.1, 0.1, 0.5)
 
 
 def mixture_log_density(
-    mixture: Mixture, z: Float[Array, "*n"], expected: Float[Array, "*n"], max_range: float
+    mixture: Mixture, z: Float[Array, "*n"], expected: Float[Array, "*n"], max_range: Number
 ) -> Float[Array, "*n"]:
     """The log-density of ranges z given those expected: a density below max_range, a mass there.
 
@@ -66,7 +68,7 @@ def mixture_log_density(
 
 
 def density_slope(
-    mixture: Mixture, z: Float[Array, "*n"], expected: Float[Array, "*n"], max_range: float
+    mixture: Mixture, z: Float[Array, "*n"], expected: Float[Array, "*n"], max_range: Number
 ) -> Float[Array, "*n"]:
     """The derivative of `mixture_log_density` by the expected range z*, by hand.
 
@@ -89,52 +91,54 @@ def density_slope(
     return jnp.where(known, rise / jnp.where(near > 0, near, 1.0), 0.0)
 
 
-def ray_cast(
-    mixture: Mixture = USUAL,
-    *,
-    max_range: float,
-    method: str | None = None,
-    mount: ArrayLike | tuple[float, ...] = (0.0, 0.0, 0.0),
-) -> BeamModel:
+@record
+class RayCast(BeamModel):
     """The ray-cast model: `mixture_log_density` of each range given that of `grids.cast`.
 
     Differentiable by the parameters, and by the pose in the sense of `cast`, with either method.
 
-    Args:
-        mixture: parameters, which `fit` learns from data; the four shares have sum 1.
-        max_range: [m]. method: of `ray_map`; None chooses by the map.
-        mount: (3,) pose of the laser on the robot.
-    Raises:
-        ValueError: numbers out of range, an unknown method, a mount that is no pose.
+    Raises ValueError on numbers out of range, an unknown method, a mount that is no pose.
     """
-    check_positive("ray_cast", max_range=max_range, sigma=mixture.sigma, rate=mixture.rate)
-    if method is not None:
-        check_method("ray_cast", method)
-    check_mount("ray_cast", mount)
-    check_weights("ray_cast", dict(zip(Mixture._fields[:4], mixture[:4], strict=True)))
 
-    def prepare(grid: Grid) -> RayMap:
-        return ray_map(grid, method=method)
+    mixture: Mixture = USUAL
+    """parameters, which `fit` learns from data; the four shares have sum 1"""
+    _: dataclasses.KW_ONLY
+    max_range: Number
+    """[m]"""
+    method: str | None = static(default=None)
+    """of `ray_map`; None chooses by the map"""
+    mount: ArrayLike | None = None
+    """(3,) pose of the laser on the robot"""
 
-    def each(rays: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
-        eye = se2.compose(pose, jnp.asarray(mount, pose.dtype))
-        expected = cast(rays, eye, beams.angle, max_range)
-        z = jnp.where(beams.returns(max_range)[1], max_range, beams.range)
-        return mixture_log_density(mixture, z, expected, max_range)
+    def __post_init__(self) -> None:
+        name, mixture = type(self).__name__, self.mixture
+        check_positive(name, max_range=self.max_range, sigma=mixture.sigma, rate=mixture.rate)
+        if self.method is not None:
+            check_method(name, self.method)
+        hold_mount(self)
+        check_weights(name, dict(zip(Mixture._fields[:4], mixture[:4], strict=True)))
+        super().__post_init__()
 
-    def jacobian(rays: PyTree, pose: Array, beams: Beams) -> Float[Array, "B 3"]:
+    def prepare(self, grid: Grid) -> RayMap:
+        return ray_map(grid, method=self.method)
+
+    def each(self, prepared: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
+        expected = self._expected(prepared, pose, beams)
+        far = jnp.asarray(self.max_range, expected.dtype)
+        z = jnp.where(beams.returns(far)[1], far, beams.range)
+        return mixture_log_density(self.mixture, z, expected, far)
+
+    def jacobian(self, prepared: PyTree, pose: Array, beams: Beams) -> Float[Array, "B 3"]:
         """The derivative by z*, times that of z*, for which `cast` has its own rule."""
-        frame = jnp.asarray(mount, pose.dtype)
-
-        def expected_at(pose: Array) -> Float[Array, "B"]:
-            return cast(rays, se2.compose(pose, frame), beams.angle, max_range)
-
-        expected, by_pose = expected_at(pose), jax.jacfwd(expected_at)(pose)
-        z = jnp.where(beams.returns(max_range)[1], max_range, beams.range)
-        by_range: Array = density_slope(mixture, z, expected, max_range)
+        expected = self._expected(prepared, pose, beams)
+        by_pose = jax.jacfwd(lambda pose: self._expected(prepared, pose, beams))(pose)
+        far = jnp.asarray(self.max_range, expected.dtype)
+        z = jnp.where(beams.returns(far)[1], far, beams.range)
+        by_range: Array = density_slope(self.mixture, z, expected, far)
         return by_range[:, None] * jnp.asarray(by_pose)
 
-    return BeamModel("ray_cast", prepare, each, jacobian, mount)
+    def _expected(self, rays: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
+        return cast(rays, self.frame(pose), beams.angle, self.max_range)
 
 
 def check_weights(name: str, weights: dict[str, ArrayLike]) -> None:

@@ -2,6 +2,6 @@
 
 from jaxslam.grids.localization.beam_log import beam_log
 from jaxslam.grids.localization.clusters import Clusters, clusters
-from jaxslam.grids.localization.localize import localize
+from jaxslam.grids.localization.localize import GridLocalization
 
-__all__ = ["Clusters", "beam_log", "clusters", "localize"]
+__all__ = ["Clusters", "GridLocalization", "beam_log", "clusters"]

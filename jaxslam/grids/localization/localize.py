@@ -1,65 +1,38 @@
 """Monte-Carlo localization in an occupancy grid, from the beams of a laser."""
 
-import math
+import dataclasses
 from functools import partial
-from typing import Literal
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
-from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, PyTree
 
 from jaxslam import validation
-from jaxslam.core.numbers import is_concrete
-from jaxslam.filters.particles.pose_steps import pose_filter, weigh_particles
-from jaxslam.filters.particles.settings import (
-    MonteCarloSettings,
-    checked_box,
-    checked_least,
-)
-from jaxslam.filters.particles.states.pose_state import (
-    PoseParticles,
-    active_mask,
-    draw_start,
-)
+from jaxslam.core.numbers import check_positive, is_concrete
+from jaxslam.core.record import record, set_field, static
+from jaxslam.filters.particles.pose_steps import MonteCarloFilter
+from jaxslam.filters.particles.states.pose_state import PoseParticles, active_mask, draw_start
+from jaxslam.filters.particles.states.region import hold_box
 from jaxslam.filters.reporting import info_of, status_of, with_extra
 from jaxslam.grids.beam_models.beam_model import BeamModel, log_likelihood
 from jaxslam.grids.grid import Grid, check_grid, to_cells
 from jaxslam.grids.localization.beam_log import BEAM, beams_of
-from jaxslam.grids.localization.free_space import free_region
-from jaxslam.math.arrays import in_dtype
+from jaxslam.grids.localization.free_space import FreeSpace, free_space
+from jaxslam.math.arrays import Number, in_dtype
 from jaxslam.math.xla import no_inline
-from jaxslam.protocols import Filter, Motion, Resample
-from jaxslam.resampling.systematic import systematic
+from jaxslam.protocols import Motion
 from jaxslam.resampling.weights import normalized
-from jaxslam.types import Beams, Info, Scan
+from jaxslam.types import Beams, Estimate, Info, Scan
 from jaxslam.validation.models import check_motion
 
 
-def localize(
-    grid: Grid,
-    model: BeamModel,
-    motion: Motion,
-    particles: int,
-    *,
-    start: Literal["gaussian", "uniform"] = "gaussian",
-    box: ArrayLike | None = None,
-    exponent: ArrayLike = 0.1,
-    every: int = 1,
-    resample: Resample = systematic,
-    threshold: float = 1.0,
-    bins: tuple[float, float, float] = (0.5, 0.5, math.radians(15)),
-    error: float = 0.05,
-    confidence: float = 0.99,
-    least: int | None = None,
-    forget: tuple[float, float] | None = (0.01, 0.1),
-    slack: float = 1.0,
-) -> Filter:
+@record
+class GridLocalization(MonteCarloFilter):
     """Monte-Carlo localization in a grid: particles weighted by a beam model, KLD, recovery.
 
-    `filters.particle_localization` with the beams of a laser in place of landmarks: the same
+    `filters.ParticleLocalization` with the beams of a laser in place of landmarks: the same
     motion, number of particles (Fox 2003) and resampling. It takes the log of `beam_log`. A weight
     is multiplied by
 
@@ -84,74 +57,68 @@ def localize(
     weight (`underflow`), as where all are off the map. log_likelihood is
     log Σ w p(z | x)^exponent.
 
-    Args:
-        grid: a map with a free cell, outside a trace.
-        model: as `likelihood_field` or `ray_cast`.
-        motion: any; for odometry `motion.Odometry` with `odometry_controls`.
-        particles: the capacity P, at least 1. Its cost is that of P · B/every look-ups a step.
-        start: "gaussian", the pose and covariance given to `run` (the latter may be zero), or
-            "uniform", anywhere free, whatever is given.
-        box: (2, 2) the lowest and the highest (x, y) [m] where the robot may be; default the map.
-        exponent: of the likelihood, above 0; differentiable.
-        every: use each n-th beam, at least 1.
-        resample, threshold, bins, error, confidence, least, forget, slack: as in
-            `filters.particle_localization`.
-    Raises:
-        ValueError: a grid that is none or has no free cell (in the box), a model that is none,
-            an exponent or a number out of range.
+    Raises ValueError as `MonteCarloFilter`, on a grid that is none, is a tracer, or has no free
+    cell (in the box), a model that is none, an exponent not above 0 or every below 1.
     """
-    check_grid("localize", grid)
-    if not is_concrete(grid):
-        raise ValueError(
-            "localize: expected a grid outside a trace, since its free cells are found"
-        )
-    if not isinstance(model, BeamModel):
-        raise ValueError(f"localize: expected a BeamModel, got {type(model).__name__}")
-    check_motion("localize", motion)
-    validation.check_count("localize: every", every)
-    if is_concrete(exponent) and not 0 < float(np.asarray(exponent)) < np.inf:
-        raise ValueError(f"localize: expected an exponent above 0, got {exponent!r}")
-    limits = checked_box("localize", box)
-    settings = MonteCarloSettings(
-        name="localize",
-        motion=motion,
-        particles=particles,
-        region=free_region("localize", grid, limits),
-        start=start,
-        resample=resample,
-        threshold=threshold,
-        bins=bins,
-        error=error,
-        confidence=confidence,
-        least=checked_least("localize", particles, least),
-        rates=forget,
-        slack=slack,
-    )
-    prepared = model.prepare(grid)
 
-    def update(state: PoseParticles, scan: Scan, key: Array) -> tuple[PoseParticles, Info]:
-        state, beams = draw_start(state, key, settings), beams_of(scan, every)
+    grid: Grid
+    """a map with a free cell"""
+    model: BeamModel
+    """as `LikelihoodField` or `RayCast`"""
+    motion: Motion
+    """any; for odometry `motion.Odometry` with `odometry_controls`"""
+    particles: int = static()
+    """the capacity P, at least 1. Its cost is that of P · B/every look-ups a step"""
+    _: dataclasses.KW_ONLY
+    exponent: Number = 0.1
+    """of the likelihood, above 0; differentiable"""
+    every: int = static(default=1)
+    """use each n-th beam, at least 1"""
+    prepared: PyTree = dataclasses.field(init=False, repr=False)
+    """what the model needs of the map"""
+    region: FreeSpace = dataclasses.field(init=False, repr=False)
+    """where the robot may be: the free cells of the map (in the box)"""
+    measurements = BEAM
+
+    def __post_init__(self) -> None:
+        name = type(self).__name__
+        check_grid(name, self.grid)
+        if not is_concrete(self.grid):
+            raise ValueError(
+                f"{name}: expected a grid outside a trace, since its free cells are found"
+            )
+        validation.check_record(name, "model", self.model, BeamModel)
+        check_motion(name, self.motion)
+        validation.check_count(f"{name}: every", self.every)
+        check_positive(name, exponent=self.exponent)
+        hold_box(self)
+        box = None if self.box is None else np.asarray(self.box)
+        set_field(self, "region", free_space(name, self.grid, box))
+        set_field(self, "prepared", self.model.prepare(self.grid))
+        super().__post_init__()
+
+    def update(self, state: PoseParticles, scan: Scan, key: Array) -> tuple[PoseParticles, Info]:
+        state, beams = draw_start(state, key, self._start_region), beams_of(scan, self.every)
 
         def fit_of(poses: Float[Array, "P 3"], map_of: PyTree, beams: Beams) -> Float[Array, "P"]:
-            one = partial(log_likelihood, model, map_of, beams=beams)
+            one = partial(log_likelihood, self.model, map_of, beams=beams)
             return -jax.vmap(one)(poses)
 
         # Else XLA computes it again in each of its consumers.
-        fit = no_inline(fit_of, state.pose, in_dtype(prepared, state.pose.dtype), beams)
-        blocked = _blocked(grid, state.pose)
+        fit = no_inline(fit_of, state.pose, in_dtype(self.prepared, state.pose.dtype), beams)
+        blocked = _blocked(self.grid, state.pose)
         fit = jnp.where(blocked, jnp.inf, fit)
-        misfit = jnp.where(blocked, jnp.inf, jnp.asarray(exponent, fit.dtype) * fit)
+        misfit = jnp.where(blocked, jnp.inf, jnp.asarray(self.exponent, fit.dtype) * fit)
         evidence = normalized(state.log_weight - misfit)[1]
         blocked = blocked & active_mask(state)
-        state, found = weigh_particles(state, misfit, fit, beams.valid.sum(), settings)
+        state, found = self.weigh(state, misfit, fit, beams.valid.sum())
         found = found._replace(blocked=blocked.sum(dtype=jnp.int32))
-        info = info_of_beams(scan, every, evidence, ~found.underflow)
+        info = info_of_beams(scan, self.every, evidence, ~found.underflow)
         return state, with_extra(info, "particles", found)
 
-    def no_points(pose: Float[Array, "3"]) -> Float[Array, "0 2"]:
-        return jnp.zeros((0, 2), pose.dtype)
-
-    return pose_filter(settings, update, BEAM, no_points, np.zeros(0, np.int32))
+    def estimate(self, state: PoseParticles) -> Estimate:
+        none = jnp.zeros((0, 2), state.pose.dtype)
+        return self.pose_estimate(state, none, jnp.zeros(0, jnp.int32))
 
 
 def _blocked(grid: Grid, pose: Float[Array, "P 3"]) -> Bool[Array, "P"]:

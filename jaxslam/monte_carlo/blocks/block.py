@@ -9,7 +9,7 @@ from jaxtyping import PyTree
 
 from jaxslam.consistency import Score, condense, score
 from jaxslam.consistency.tally import condensed_sums
-from jaxslam.filters.ekf.observability import Monitored
+from jaxslam.filters.ekf.observability import MonitoredState
 from jaxslam.monte_carlo.blocks.limit import divergence_limit, first_run
 from jaxslam.monte_carlo.blocks.plan import CampaignPlan, Promises, run_numbers
 from jaxslam.monte_carlo.blocks.programs import FilterResults, World
@@ -130,7 +130,7 @@ def _on_host(results: FilterResults) -> Trace:
     found: tuple[Estimate, Info, PyTree] = jax.tree.map(
         lambda leaf: np.swapaxes(leaf, 0, 1), jax.device_get(by_time)
     )
-    final: Monitored | None = None
+    final: MonitoredState | None = None
     if results.monitor is not None:
-        final = Monitored(None, jax.device_get(results.monitor._replace(directions=absent)))
+        final = MonitoredState(None, jax.device_get(results.monitor._replace(directions=absent)))
     return Trace(found[0], found[1], final, found[2])

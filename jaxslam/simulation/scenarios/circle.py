@@ -47,7 +47,7 @@ def circle(steps: int = 2500) -> Scenario:
         noise_on="odometry",
         visible=between_ranges(1.0, 5.0),
         places=max(fullest, 1),
-        filter_options={"update": "joint"},
+        filter_options={"correction": "joint"},
         published=published if steps == 2500 else {},
         source="Brossard, Barrau, Bonnabel, UKF-M, ICRA 2020, arXiv:2002.00878; 100 runs",
     )

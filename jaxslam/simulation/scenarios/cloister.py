@@ -28,7 +28,7 @@ def cloister(steps: int = 200) -> Scenario:
         landmarks=cloister_landmarks(-4.0, 4.0, 7),
         controls=np.tile([0.1, 0.05], (steps, 1)),
         pose=(0.0, -2.0, 0.0),
-        filter_options={"update": "sequential", "gate": sigma_gate(3), "births": 1},
+        filter_options={"correction": "sequential", "gate": sigma_gate(3), "births": 1},
         source="Solà, EKF-SLAM guide, 2014, appendix C.3",
     )
 
@@ -64,6 +64,6 @@ def cloister_noisy(steps: int = 400) -> Scenario:
         sensor=RangeBearing(np.diag([0.1, np.deg2rad(3.0)]) ** 2),
         visible=between_ranges(0.0, 3.0),
         places=14,
-        filter_options={"update": "sequential"},
+        filter_options={"correction": "sequential"},
         source="the world of Solà, EKF-SLAM guide, 2014, appendix C.3; noise ours",
     )

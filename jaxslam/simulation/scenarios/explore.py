@@ -27,6 +27,6 @@ def explore(steps: int = 100) -> Scenario:
         controls=np.tile([1.0, 0.0], (steps, 1)),
         visible=between_ranges(0.0, 12.0),
         places=12,
-        filter_options={"update": "joint"},
+        filter_options={"correction": "joint"},
         source="parameters ours",
     )

@@ -55,7 +55,7 @@ def _lines(name: str, world: LaserWorld, steps: int | None, places: int) -> Scen
         noise_on="odometry",
         visible=_met_by_beams(walls, world.laser.max_range),
         places=places,
-        filter_options={"update": "joint"},
+        filter_options={"correction": "joint"},
         source="parameters ours",
     )
 

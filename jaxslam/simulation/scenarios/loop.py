@@ -74,6 +74,6 @@ def _loop(name: str, sensor: Sensor, steps: int, map_seed: int) -> Scenario:
         noise_on="odometry",
         visible=between_ranges(0.5, 5.0),
         places=max(fullest, 1),
-        filter_options={"update": "joint"},
+        filter_options={"correction": "joint"},
         source=SOURCE,
     )

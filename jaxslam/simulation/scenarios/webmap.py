@@ -81,7 +81,7 @@ def webmap(steps: int | None = None, loops: int = 2) -> Scenario:
         noise_on="odometry",
         visible=_visible,
         places=fullest,
-        filter_options={"update": "joint"},
+        filter_options={"correction": "joint"},
         source='after Bailey et al., "Consistency of the EKF-SLAM Algorithm", IROS 2006; our map',
     )
 

@@ -82,7 +82,7 @@ _OFFSETS = np.array([9.0, 8.0, 8.5, 7.5])
 def beam_samples(model: BeamModel, count: int, seed: int) -> Samples:
     """Poses in the room, with ranges beside the true ones; the first are random, others have
     difficult headings."""
-    mount = np.asarray(model.mount, np.float64)
+    mount = np.zeros(3) if model.mount is None else np.asarray(model.mount, np.float64)
     rng = np.random.default_rng(seed)
     headings = np.concatenate([rng.uniform(-np.pi, np.pi, count), _HEADINGS])
     labels = ("random",) * count + tuple(f"pose theta = {h:.4g}" for h in _HEADINGS)

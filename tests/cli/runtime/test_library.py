@@ -47,7 +47,7 @@ def test_a_campaign_runs_from_what_another_has_compiled():
 
     def watched(truth):
         traced.append(1)
-        return filters.dead_reckoning(there.motion, there.sensor)
+        return filters.DeadReckoning(there.motion, there.sensor)
 
     with cache.jax_settings(jax_compilation_cache_dir=None):
         first = campaign(watched, shelf)

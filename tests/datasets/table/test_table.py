@@ -59,7 +59,7 @@ def test_a_table_by_hand_with_every_setting(tmp_path):
     assert not np.any(data.motion.noise_cov(np.zeros(3), 0 * U))
     np.testing.assert_allclose(data.sensor.noise_cov(np.zeros(2)), np.diag([0.05, 0.02]) ** 2)
     np.testing.assert_allclose(data.sensor.observe(np.zeros(3), np.array([2.1, 0])), [2, 0])
-    assert data.filter_options == {"update": "joint", "gate": stats.chi2_quantile(0.999, 2)}
+    assert data.filter_options == {"correction": "joint", "gate": stats.chi2_quantile(0.999, 2)}
     np.testing.assert_array_equal(data.pose, [1, 2, 0.5])
     np.testing.assert_allclose(data.pose_cov, np.diag([0.01, 0.04, 0.09]))
     assert data.one_frame

@@ -12,21 +12,21 @@ from worlds import draw, judged, nameless, narrow
 
 import jaxslam
 from jaxslam import Scenario, motion, sensors
-from jaxslam.association import nearest
-from jaxslam.filters import dead_reckoning, delayed_slam
+from jaxslam.association import Nearest
+from jaxslam.filters import DeadReckoning, DelayedSlam
 from jaxslam.filters.delayed.confirmation import constraints_of, correct_hypotheses
 from jaxslam.filters.delayed.hypotheses import UncertainPoints, closer_than, point_residuals
 from jaxslam.filters.delayed.initialization import add_landmark, initial_estimate
 from jaxslam.filters.delayed.intersection import add_hypotheses
 from jaxslam.filters.delayed.settings import Hypotheses, Promotion, StoredMeasurements
 from jaxslam.filters.delayed.state import TableLayout
-from jaxslam.filters.delayed.triangulation import circles, rays, triangulation_of
+from jaxslam.filters.delayed.triangulation import Circles, Rays, triangulation_of
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.types import Status
 
 CAMERA = sensors.BearingOnly([[0.01**2]])
 BEACON = sensors.RangeOnly([[0.05**2]])
-KINDS = {"rays": rays(CAMERA), "circles": circles(BEACON)}
+KINDS = {"rays": Rays(), "circles": Circles()}
 RESIDUAL = {kind: jax.jit(jax.vmap(model.residual)) for kind, model in KINDS.items()}
 
 
@@ -104,17 +104,21 @@ def test_a_measurement_is_stored_where_the_sensor_is_mounted(kind):
     pose, point = np.array([1.0, 2.0, 2.5]), np.array([-3.0, 4.0])
     c, s = np.cos(pose[2]), np.sin(pose[2])
     place = pose[:2] + np.array([[c, -s], [s, c]]) @ mount[:2]
-    seen = triangulation_of(sensor).store(jnp.asarray(pose), sensor.observe(pose, point))
+    seen = KINDS[kind].store(sensor, jnp.asarray(pose), sensor.observe(pose, point))
+    assert type(triangulation_of(sensor)) is type(KINDS[kind])
     np.testing.assert_allclose(seen, seen_by(kind, place[None], point)[0], atol=1e-12)
 
 
 def test_bad_triangulations_are_refused():
+    move = motion.Increment(np.eye(2))
     with pytest.raises(ValueError, match="one bearing"):
-        rays(BEACON)
+        DelayedSlam(move, BEACON, 3, triangulation=Rays())
     with pytest.raises(ValueError, match="one range"):
-        circles(CAMERA)
-    with pytest.raises(ValueError, match="angle in"):
-        rays(CAMERA, parallax=2.0)
+        DelayedSlam(move, CAMERA, 3, triangulation=Circles())
+    with pytest.raises(ValueError, match=r"^Rays: expected parallax in"):
+        Rays(parallax=2.0)
+    with pytest.raises(ValueError, match=r"^Circles: expected angle in"):
+        Circles(angle=0.0)
 
 
 # --- hypotheses in the table --------------------------------------------------------------------
@@ -331,7 +335,7 @@ RUNS = 40
 def many(request):
     """Of one kind, truths, logs and traces of all runs: one program for all tests."""
     scenario = world(request.param)
-    filter = delayed_slam(
+    filter = DelayedSlam(
         scenario.motion,
         scenario.sensor,
         5,
@@ -414,7 +418,7 @@ def small(kind, capacity=3):
     """A filter that compiles fast, and a short log of three landmarks."""
     scenario = world(kind, steps=60)
     scenario = dataclasses.replace(scenario, landmarks=scenario.landmarks[:3])
-    return scenario, delayed_slam(scenario.motion, scenario.sensor, capacity, **SMALL)
+    return scenario, DelayedSlam(scenario.motion, scenario.sensor, capacity, **SMALL)
 
 
 @pytest.fixture(scope="module")
@@ -447,7 +451,7 @@ def test_a_full_map_refuses_and_says_so_in_float32_too(poor):
 def test_spurious_bearings_move_no_robot_and_empty_scans_neither(poor):
     """Random bearings make no landmark, so all is as without them."""
     scenario, filter, (_, _, empty, _), _, (_, *traces) = poor
-    alone = go(dead_reckoning(scenario.motion, scenario.sensor), empty).estimate
+    alone = go(DeadReckoning(scenario.motion, scenario.sensor), empty).estimate
     for trace in traces:
         assert not trace.estimate.alive.any()
         np.testing.assert_allclose(trace.estimate.pose, alone.pose, atol=1e-6)
@@ -477,7 +481,7 @@ def test_derivatives_reach_the_noise_and_are_finite():
 
     def likelihood(sigma):
         sensor = sensors.RangeOnly(sigma[None, None] ** 2)
-        filter = delayed_slam(scenario.motion, sensor, 3, **SMALL)
+        filter = DelayedSlam(scenario.motion, sensor, 3, **SMALL)
         trace = jaxslam.run(filter, log, np.zeros(3), np.zeros((3, 3)), jax.random.key(0))
         return trace.info.log_likelihood.sum()
 
@@ -543,14 +547,14 @@ def test_without_names_intersections_find_the_landmarks():
     """Every bearing may be of any landmark; the names in the log are not looked at."""
     scenario = world("rays")
     gates = chi2_quantile(0.99, 1), chi2_quantile(0.9999, 1)
-    filter = delayed_slam(
+    filter = DelayedSlam(
         scenario.motion,
         scenario.sensor,
         8,
         stored=StoredMeasurements(capacity=40),
         hypotheses=Hypotheses(capacity=40, decay=0.7),
         promotion=Promotion(persistence=6.0),
-        associate=nearest(*gates),
+        associate=Nearest(*gates),
     )
     truth, log = draw(scenario, 4)
     final = jax.tree.map(lambda x: np.asarray(x[-1]), driven(filter, nameless(log)).estimate)
@@ -564,19 +568,19 @@ def test_without_names_intersections_find_the_landmarks():
     ("options", "message"),
     [
         ({"sensor": sensors.RangeBearing(np.eye(2))}, "one bearing or one range"),
-        ({"capacity": 0}, "delayed_slam: capacity"),
-        ({"gate": 0}, "delayed_slam: expected a gate above 0"),
-        ({"triangulation": 3}, "delayed_slam: expected triangulation to be a Triangulation"),
-        ({"triangulation": rays}, "got the function rays: call it"),
-        ({"stored": 32}, "delayed_slam: expected stored to be a StoredMeasurements, got int"),
-        ({"hypotheses": 16}, "delayed_slam: expected hypotheses to be a Hypotheses, got int"),
-        ({"promotion": 2}, "delayed_slam: expected promotion to be a Promotion, got int"),
+        ({"capacity": 0}, "DelayedSlam: capacity"),
+        ({"gate": 0}, "DelayedSlam: expected a gate above 0"),
+        ({"triangulation": 3}, "DelayedSlam: expected triangulation to be a Triangulation"),
+        ({"triangulation": Rays}, "got the class Rays: call it"),
+        ({"stored": 32}, "DelayedSlam: expected stored to be a StoredMeasurements, got int"),
+        ({"hypotheses": 16}, "DelayedSlam: expected hypotheses to be a Hypotheses, got int"),
+        ({"promotion": 2}, "DelayedSlam: expected promotion to be a Promotion, got int"),
     ],
 )
 def test_bad_arguments_are_refused(options, message):
     options = {"sensor": CAMERA, "capacity": 3} | options
     with pytest.raises(ValueError, match=message):
-        delayed_slam(motion.Increment(np.eye(2)), **options)
+        DelayedSlam(motion.Increment(np.eye(2)), **options)
 
 
 @pytest.mark.parametrize(

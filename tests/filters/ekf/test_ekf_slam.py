@@ -10,7 +10,7 @@ import pytest
 import scipy.stats
 
 from jaxslam import motion, sensors, slots
-from jaxslam.filters import ekf_slam
+from jaxslam.filters import EkfSlam
 from jaxslam.run import run
 from jaxslam.simulation.scenarios import cloister
 from jaxslam.simulation.worlds import simulate
@@ -33,7 +33,7 @@ def scan_of(*measured):
 @functools.cache
 def compiled_update(**options):
     def update(joint, scan, noise):
-        filter = ekf_slam(MOTION, sensors.RangeBearing(noise), CAPACITY, **options)
+        filter = EkfSlam(MOTION, sensors.RangeBearing(noise), CAPACITY, **options)
         return filter.update(joint, scan, KEY)
 
     return jax.jit(update)
@@ -41,7 +41,7 @@ def compiled_update(**options):
 
 def updater(noise=1.0, **options):
     """(joint, scan) -> joint, info; compiled once for a set of options."""
-    update = compiled_update(**({"update": "sequential"} | options))
+    update = compiled_update(**({"correction": "sequential"} | options))
     return lambda joint, scan: jax.device_get(update(joint, scan, noise * R))
 
 
@@ -99,7 +99,7 @@ def test_what_is_dropped_is_told_and_leaves_no_trace(case):
 @pytest.mark.parametrize("update", ["sequential", "joint"])
 def test_the_gate_rejects_by_the_mahalanobis_distance_of_the_place_alone(update):
     joint = with_landmarks(3)
-    gated = updater(update=update, gate=9.0)
+    gated = updater(correction=update, gate=9.0)
     cov, h = joint.cov, np.zeros((2, 9))
     h[:, :3], h[:, 5:7] = SENSOR.observe_jacobians(
         *map(jnp.asarray, (joint.pose, joint.landmarks[1]))
@@ -135,7 +135,7 @@ def test_a_singular_innovation_is_dropped_and_all_stays_finite(update, gate):
     """A perfect sensor in a world known exactly: S = 0."""
     joint = known_exactly(with_landmarks(3))
     z = expected_z(joint, 1) + 0.01
-    after, info = updater(noise=0.0, update=update, gate=gate)(joint, scan_of((1, *z)))
+    after, info = updater(noise=0.0, correction=update, gate=gate)(joint, scan_of((1, *z)))
     assert list(info.status) == [Status.SINGULAR, Status.EMPTY, Status.EMPTY]
     chex.assert_trees_all_equal(joint, after)
     chex.assert_tree_all_finite(info)
@@ -151,7 +151,7 @@ def test_a_half_singular_innovation_is_dropped_whole(update):
     joint.cov[2, 2] = 0.1
     joint = joint._replace(landmarks=np.array([[5.0, 5.0], [2.0, 0.0], [5.0, -5.0]]))
     noise = np.diag([0.0, 0.01])
-    after, info = compiled_update(update=update)(joint, scan_of((1, 2.1, 0.1)), noise)
+    after, info = compiled_update(correction=update)(joint, scan_of((1, 2.1, 0.1)), noise)
     assert not info.innovation_cov[0, 0].any()
     assert int(info.status[0]) == Status.SINGULAR
     chex.assert_trees_all_equal(joint, after)
@@ -168,7 +168,7 @@ def test_one_singular_place_does_not_keep_the_others_from_correcting(places):
     joint.cov[5:7, 5:7] = 0.01 * np.eye(2)
     z = [expected_z(joint, 0), expected_z(joint, 1) + 0.01, *[(9.0, 9.0)] * (places - 2)]
     tag, valid = np.array([0, 1, *[7] * (places - 2)], np.int32), np.arange(places) < 2
-    after, info = updater(noise=0.0, update="joint")(joint, Scan(np.array(z), tag, valid))
+    after, info = updater(noise=0.0, correction="joint")(joint, Scan(np.array(z), tag, valid))
     assert list(info.status) == [Status.SINGULAR, Status.FUSED, *[Status.EMPTY] * (places - 2)]
     np.testing.assert_allclose(expected_z(after, 1), z[1], atol=1e-3)
     np.testing.assert_allclose(after.cov[5:7, 5:7], 0, atol=1e-12)
@@ -179,8 +179,8 @@ def test_padding_may_hold_nan():
     good = scan_of((1, *(expected_z(joint, 1) + 0.01)))
     spoiled = good._replace(z=np.where(good.valid[:, None], good.z, np.nan))
     for update in ("sequential", "joint"):
-        expected = updater(update=update, gate=9.0)(joint, good)
-        got = updater(update=update, gate=9.0)(joint, spoiled)
+        expected = updater(correction=update, gate=9.0)(joint, good)
+        got = updater(correction=update, gate=9.0)(joint, spoiled)
         chex.assert_tree_all_finite(got)
         chex.assert_trees_all_equal(expected, got)
 
@@ -221,7 +221,7 @@ def test_joint_nis_and_log_likelihood_are_the_dense_formulas():
         (2, *(expected_z(joint, 2) + [0.1, -0.03])),
         (0, *(expected_z(joint, 0) + [-0.2, 0.05])),
     ]
-    _, info = updater(update="joint")(joint, scan_of(*seen))
+    _, info = updater(correction="joint")(joint, scan_of(*seen))
     h = np.zeros((4, 9))
     for i, slot in enumerate((2, 0)):
         by_pose, by_landmark = SENSOR.observe_jacobians(
@@ -273,7 +273,7 @@ def likelihood():
         p = parameters
         robot = motion.Increment(jnp.diag(p[:2]) ** 2)
         sensor = sensors.RangeBearing(jnp.diag(p[2:4]) ** 2, mount=p[4:7])
-        filter = ekf_slam(robot, sensor, 36, births=4, update="joint")
+        filter = EkfSlam(robot, sensor, 36, births=4, correction="joint")
         trace = run(filter, log, p[7:10], jnp.zeros((3, 3)), KEY)
         return trace.info.log_likelihood.sum() + trace.final.pose.sum()
 
@@ -325,7 +325,7 @@ BAD_OPTIONS = {
     "iterations 0": ({"iterations": 0}, "iterations"),
     "iterations -1": ({"iterations": -1}, "iterations"),
     "births 0": ({"births": 0}, "births"),
-    "update": ({"update": "x"}, "update"),
+    "correction": ({"correction": "x"}, "correction"),
     "gate 0": ({"gate": 0.0}, "gate"),
     "gate -1": ({"gate": -1}, "gate"),
     "gate nan": ({"gate": float("nan")}, "gate"),
@@ -335,8 +335,8 @@ BAD_OPTIONS = {
 @pytest.mark.parametrize("case", BAD_OPTIONS)
 def test_bad_options_are_refused(case):
     options, message = BAD_OPTIONS[case]
-    with pytest.raises(ValueError, match=f"ekf_slam: .*{message}"):
-        ekf_slam(MOTION, SENSOR, **({"capacity": 3} | options))
+    with pytest.raises(ValueError, match=f"EkfSlam: .*{message}"):
+        EkfSlam(MOTION, SENSOR, **({"capacity": 3} | options))
 
 
 def good_log(steps=3):
@@ -353,7 +353,7 @@ def spoiled(field, row, value):
 
 @pytest.fixture(scope="module")
 def good_trace():
-    filter = ekf_slam(MOTION, SENSOR, CAPACITY)
+    filter = EkfSlam(MOTION, SENSOR, CAPACITY)
     go = jax.jit(lambda log: run(filter, log, np.zeros(3), np.eye(3), KEY, probe=lambda s: s.tag))
     return lambda log: jax.device_get(go(log))
 
@@ -361,7 +361,7 @@ def good_trace():
 def test_run_predicts_then_updates_and_records_every_step(good_trace):
     log = good_log()
     trace = good_trace(log)
-    filter = ekf_slam(MOTION, SENSOR, CAPACITY)
+    filter = EkfSlam(MOTION, SENSOR, CAPACITY)
     state = jax.jit(filter.init)(np.zeros(3), np.eye(3))
     predict = jax.jit(lambda s, u: filter.predict(s, u, KEY))
     for t in range(3):
@@ -405,7 +405,7 @@ def test_a_log_without_rows_is_a_log():
         np.full((steps, places), -1, np.int32),
         np.zeros((steps, places), bool),
     )
-    filter = ekf_slam(MOTION, sensors.RangeBearing(R), 1, update="joint")
+    filter = EkfSlam(MOTION, sensors.RangeBearing(R), 1, correction="joint")
     trace = run(filter, Log(np.zeros((steps, 2)), scan), np.zeros(3), np.zeros((3, 3)), KEY)
     assert trace.estimate.pose.shape == (steps, 3)
     assert not trace.info.log_likelihood.any()

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from worlds import draw, narrow
 
-from jaxslam.filters import ekf_slam
+from jaxslam.filters import EkfSlam
 from jaxslam.run import run
 from jaxslam.simulation.scenarios import circle
 
@@ -16,7 +16,7 @@ from jaxslam.simulation.scenarios import circle
 def traces():
     """The EKF over 2500 steps of the circle in float32 and in float64, on the same log."""
     scenario = circle(2500)
-    filter = ekf_slam(scenario.motion, scenario.sensor, 20, **scenario.filter_options)
+    filter = EkfSlam(scenario.motion, scenario.sensor, 20, **scenario.filter_options)
     single = narrow(draw(scenario, 11)[1])
     # Rounding the log to float32 and back leaves one log for both.
     double = jax.tree.map(lambda a: a.astype("f8") if a.dtype == np.float32 else a, single)

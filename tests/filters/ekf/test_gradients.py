@@ -9,7 +9,7 @@ import pytest
 import worlds
 
 from jaxslam import charts, linearize, motion, sensors
-from jaxslam.filters import ekf_slam
+from jaxslam.filters import EkfSlam
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.steps.predict import propagate
 from jaxslam.filters.ekf.steps.sequential_update import correct_in_turn
@@ -56,7 +56,7 @@ def log_likelihood(p, log, *, capacity=36, gate=None):
     there that differences could agree with.
     """
     car, sensor = models(p)
-    filter = ekf_slam(car, sensor, capacity, births=1, gate=gate)
+    filter = EkfSlam(car, sensor, capacity, births=1, gate=gate)
     start = cloister()
     info = run(filter, log, start.pose, start.pose_cov, KEY).info
     return info.log_likelihood.sum(), info.status
@@ -133,7 +133,7 @@ def test_gradients_are_finite_in_float32_with_gate_overflow_and_empty_scans(gate
 
 
 FORMS = {
-    "sigma points": {"chart": charts.right_invariant(), "linearize": linearize.unscented()},
+    "sigma points": {"chart": charts.RightInvariant(), "linearize": linearize.Unscented()},
     "square root": {"covariance": "square_root"},
 }
 

@@ -9,17 +9,38 @@ import pytest
 import worlds
 
 from jaxslam import catalog, filters, life
-from jaxslam.filters import monitored, pruning
-from jaxslam.linearize import first_estimate
+from jaxslam.core.record import record
+from jaxslam.filters import Closing, EkfSlam, Filter, Monitored, Wrapper
+from jaxslam.linearize import FirstEstimate
 from jaxslam.run import run
 
 WORLD = worlds.ring(steps=40)
-FEJ = catalog.variant(WORLD, linearize=first_estimate(), update="joint")
+FEJ = catalog.variant(WORLD, linearize=FirstEstimate(), correction="joint")
+
+
+def managed(rule):
+    """The filter with a rule for the life of its landmarks."""
+    return dataclasses.replace(FEJ, life=rule)
+
+
+@record
+class Wrapped(Wrapper):
+    """A filter as it is, whose steps return no linear system."""
+
+    filter: Filter
+
+
+@record
+class Corrected(EkfSlam):
+    """One with an update of its own."""
+
+    def update(self, state, scan, key):
+        return super().update(state, scan, key)
 
 
 def test_landmarks_that_leave_the_map_and_come_back_tell_nothing_of_a_turn():
     """First estimates keep the turn unobservable; a slot begins anew with each landmark."""
-    filter = monitored(pruning(FEJ, life.existence(lambda pose, point: point[0] < 100.0)))
+    filter = Monitored(managed(life.Existence(lambda pose, point: point[0] < 100.0)))
     _, log = worlds.draw(WORLD)
     valid = log.scan.valid & (np.arange(40) // 5 % 3 == 0)[:, None]
     log = log._replace(scan=log.scan._replace(valid=valid))
@@ -37,21 +58,22 @@ def test_landmarks_that_leave_the_map_and_come_back_tell_nothing_of_a_turn():
 @pytest.mark.parametrize(
     ("filter", "why"),
     [
-        (filters.dead_reckoning(WORLD.motion, WORLD.sensor), "dead_reckoning do not return"),
-        (filters.eif_slam(WORLD.motion, WORLD.sensor, 4), "eif_slam do not return"),
-        (dataclasses.replace(FEJ, update=lambda *given: FEJ.update(*given)), "do not return"),
-        (filters.ekf_slam, "expected filter to be a Filter"),
+        (filters.DeadReckoning(WORLD.motion, WORLD.sensor), "dead_reckoning do not return"),
+        (filters.EifSlam(WORLD.motion, WORLD.sensor, 4), "eif_slam do not return"),
+        (Wrapped(FEJ), "wrapped ekf_slam do not return"),
+        (Corrected(WORLD.motion, WORLD.sensor, 4), "corrected do not return"),
+        (filters.EkfSlam, "expected a filter, got type"),
     ],
 )
 def test_a_filter_without_a_linear_system_is_refused(filter, why):
-    with pytest.raises(ValueError, match=f"monitored.*{why}"):
-        monitored(filter)
+    with pytest.raises(ValueError, match=f"^Monitored: .*{why}"):
+        Monitored(filter)
 
 
 def test_a_map_is_managed_inside_the_monitor():
-    outside = pruning(monitored(FEJ), life.recency())
+    outside = Closing(Monitored(managed(life.Recency())))
     with pytest.raises(
         ValueError,
-        match=r"pruning: expected a filter whose state is a slots.Joint, as from ekf_slam, got monitored ekf_slam",
+        match=r"^Closing: expected a filter whose state is a slots.Joint, .* got monitored ekf_slam",
     ):
         jax.eval_shape(outside.init, jnp.zeros(3), jnp.eye(3))

@@ -92,7 +92,7 @@ def test_pairs_and_cross_covariances_are_those_of_dense_algebra(name, square_roo
 def test_a_scan_judged_for_association_is_judged_alike_in_the_correction():
     joint = some_joint()
     scan = some_scan(joint)
-    settings = EkfSettings(SENSOR, linearize=linearize.unscented())
+    settings = EkfSettings(SENSOR, linearize=linearize.Unscented())
     slot, each = np.array([3, 0, 1]), np.arange(3)
 
     @jax.jit

@@ -1,6 +1,5 @@
 """Rays that converted to points: the same map in fewer parameters, and the same filter from then on."""
 
-import dataclasses
 from functools import cache
 
 import chex
@@ -8,12 +7,13 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from own_models import changed
 
 from jaxslam import charts, motion, run, sensors, slots
-from jaxslam.charts import right_invariant
-from jaxslam.filters import compressed_ekf_slam, ekf_slam
+from jaxslam.charts import RightInvariant
+from jaxslam.filters import CompressedEkfSlam, EkfSlam
 from jaxslam.filters.ekf.coordinates.to_points import ready, reduce, reduction
-from jaxslam.linearize import unscented
+from jaxslam.linearize import Unscented
 from jaxslam.protocols import Basis
 from jaxslam.types import Log, Scan, Status
 
@@ -52,7 +52,7 @@ def driven(filter, log, **options):
     return run(filter, log, *start, **options)
 
 
-CHARTS = {"euclidean": charts.euclidean, "right_invariant": lambda: right_invariant(rays=True)}
+CHARTS = {"euclidean": charts.Euclidean, "right_invariant": lambda: RightInvariant(rays=True)}
 
 
 FORMS = pytest.mark.parametrize(
@@ -69,7 +69,7 @@ def traced(name, square_root, to_point):
     """A run whose probe is the state after every step; one program for every `to_point`."""
     covariance = "square_root" if square_root else "plain"
     options = {"chart": CHARTS[name](), "covariance": covariance}
-    filter = ekf_slam(MOTION, camera(to_point=to_point), 4, **options)
+    filter = EkfSlam(MOTION, camera(to_point=to_point), 4, **options)
     return jax.device_get(driven(filter, a_log(), probe=state_of)._replace(final=()))
 
 
@@ -124,7 +124,7 @@ def test_nothing_to_reduce_changes_nothing(name, square_root):
     chex.assert_trees_all_equal(same, joint)
 
 
-@pytest.mark.parametrize("options", [{}, {"linearize": unscented(), "update": "joint"}])
+@pytest.mark.parametrize("options", [{}, {"linearize": Unscented(), "correction": "joint"}])
 def test_a_reduced_map_is_filtered_as_one_of_points(options):
     """From the moment of conversion on, the filter on 4-vectors is that on points (x, y)."""
     log = a_log()
@@ -141,7 +141,7 @@ def test_a_reduced_map_is_filtered_as_one_of_points(options):
     of_points = sensors.BearingOnly(NOISE, free=((1.0,), ((1.0,),)))
     finals = []
     for state, model in ((start, SENSOR), (point, of_points)):
-        filter = ekf_slam(MOTION, model, 4, **options)
+        filter = EkfSlam(MOTION, model, 4, **options)
 
         @jax.jit
         def step(state, row, filter=filter):
@@ -232,7 +232,7 @@ def test_gradients_and_float32():
 
     def last(sigma):
         sensor = sensors.BearingInverseDepth(sigma[None, None] ** 2, to_point=1.0)
-        trace = driven(ekf_slam(MOTION, sensor, 3), log)
+        trace = driven(EkfSlam(MOTION, sensor, 3), log)
         return trace.estimate.pose[-1].sum() + trace.estimate.points.sum(), trace
 
     (_, trace), slope = jax.jit(jax.value_and_grad(last, has_aux=True))(jnp.float32(0.01))
@@ -244,14 +244,14 @@ def test_gradients_and_float32():
 def test_refusals():
     with pytest.raises(ValueError, match="to_point above 0"):
         camera(to_point=0.0)
-    turning = dataclasses.replace(
-        right_invariant(rays=True), basis=lambda x, y: Basis(jnp.eye(3), y[:, None], jnp.eye(4))
+    turning = changed(
+        RightInvariant(rays=True), basis=lambda x, y: Basis(jnp.eye(3), y[:, None], jnp.eye(4))
     )
     with pytest.raises(ValueError, match="turn with the robot"):
-        ekf_slam(MOTION, camera(to_point=0.1), 4, chart=turning)
+        EkfSlam(MOTION, camera(to_point=0.1), 4, chart=turning)
     with pytest.raises(ValueError, match="does not act on the 4-parameter"):
-        ekf_slam(MOTION, camera(), 4, chart=right_invariant())
+        EkfSlam(MOTION, camera(), 4, chart=RightInvariant())
     with pytest.raises(ValueError, match="does not act on the 2-parameter"):
-        ekf_slam(MOTION, sensors.RangeBearing(np.eye(2)), 4, chart=right_invariant(rays=True))
+        EkfSlam(MOTION, sensors.RangeBearing(np.eye(2)), 4, chart=RightInvariant(rays=True))
     with pytest.raises(ValueError, match="converted to points"):
-        compressed_ekf_slam(MOTION, camera(to_point=0.1), 8, area=4)
+        CompressedEkfSlam(EkfSlam(MOTION, camera(to_point=0.1), 8), area=4)

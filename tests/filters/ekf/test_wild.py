@@ -9,9 +9,8 @@ import numpy as np
 import pytest
 
 from jaxslam import association, life, motion, run, sensors
-from jaxslam.filters import ekf_slam
-from jaxslam.filters.map_management.merging import merging
-from jaxslam.filters.map_management.pruning import pruning
+from jaxslam.filters import EkfSlam
+from jaxslam.filters.map_management.merging import Merging
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.protocols import Association
 from jaxslam.types import Log, Scan, Status
@@ -21,10 +20,10 @@ MOTION = motion.Increment(np.diag([0.01, 0.01]) ** 2)
 SENSOR = sensors.RangeBearing(np.diag([0.05, 0.02]) ** 2)
 GATE, NEW = chi2_quantile(0.99, 2), chi2_quantile(0.9999, 2)
 MAKERS = {
-    "nearest": association.nearest,
-    "maximum_likelihood": association.maximum_likelihood,
-    "global_nearest": association.global_nearest,
-    "joint": lambda _, new: association.joint(0.99, new, budget=50),
+    "nearest": association.Nearest,
+    "maximum_likelihood": association.MaximumLikelihood,
+    "global_nearest": association.GlobalNearest,
+    "joint": lambda _, new: association.JointCompatibility(0.99, new, budget=50),
 }
 METHODS = {name: (name, GATE, NEW) for name in MAKERS} | {
     "gates of 0 and ∞": ("nearest", 0.0, np.inf),
@@ -36,7 +35,7 @@ CASES = [(method, 6) for method in METHODS] + [("joint", 1)]
 @cache
 def program(capacity, names):
     """A run as a program of the log, the number of the method and the gates: one for all methods."""
-    manager = life.existence(
+    manager = life.Existence(
         lambda pose, point: ((point - pose[:2]) ** 2).sum() < 25, patience=5, replace=True
     )
 
@@ -47,8 +46,8 @@ def program(capacity, names):
             branches = [lambda m=m: Association(*m(prediction, scan)) for m in methods]
             return jax.lax.switch(which, branches)
 
-        plain = ekf_slam(MOTION, SENSOR, capacity, associate=chosen, make_room=manager)
-        filter = pruning(merging(plain, 0.3), manager)
+        plain = EkfSlam(MOTION, SENSOR, capacity, associate=chosen, life=manager)
+        filter = Merging(plain, 0.3)
         return run(filter, log, jnp.zeros(3), jnp.zeros((3, 3)), jax.random.key(0))
 
     return jax.jit(one)

@@ -39,7 +39,7 @@ def world(steps=40):
 @functools.cache
 def made(active=10, links=COUNT - 1, passive=5):
     scene, _ = world()
-    f = filters.seif(scene.motion, scene.sensor, COUNT, active=active, links=links, passive=passive)
+    f = filters.Seif(scene.motion, scene.sensor, COUNT, active=active, links=links, passive=passive)
     return f, jax.jit(f.predict), jax.jit(f.update)
 
 
@@ -327,7 +327,7 @@ def test_gradients_and_batches():
     def loss(sigma, state):
         sensor = sensors.RangeBearing(jnp.diag(jnp.stack([sigma, np.deg2rad(1.0)])) ** 2)
         options = {"active": 10, "links": COUNT - 1, "passive": 5}
-        f = filters.seif(world()[0].motion, sensor, COUNT, **options)
+        f = filters.Seif(world()[0].motion, sensor, COUNT, **options)
         return f.update(f.predict(state, row[0], KEY), row[1], KEY)[0].pose.sum()
 
     both = jax.jit(jax.vmap(jax.value_and_grad(loss), (0, None)))
@@ -352,12 +352,12 @@ def test_refusals(changes, message):
     scene, _ = world()
     options = {"motion": scene.motion, "sensor": scene.sensor, "capacity": COUNT}
     with pytest.raises(ValueError, match=message):
-        filters.seif(**(options | {"active": 10, "links": 10} | changes))
+        filters.Seif(**(options | {"active": 10, "links": 10} | changes))
 
 
 def test_an_area_smaller_than_a_scan_is_refused():
     scene, log = world()
-    f = filters.seif(scene.motion, scene.sensor, COUNT, active=7, links=10)
+    f = filters.Seif(scene.motion, scene.sensor, COUNT, active=7, links=10)
     with pytest.raises(
         ValueError, match="expected active >= 8, the measurement slots of a scan, got 7"
     ):

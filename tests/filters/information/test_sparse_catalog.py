@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from jaxslam import catalog, scenarios
-from jaxslam.charts import euclidean
-from jaxslam.filters.information.in_pieces import in_pieces
+from jaxslam.charts import Euclidean
+from jaxslam.core.record import record
+from jaxslam.filters.information.in_pieces import InPieces
 from jaxslam.filters.reporting import nothing_of
 from jaxslam.protocols import Filter
 from jaxslam.types import Scan
@@ -27,25 +28,31 @@ def test_fewer_landmarks_are_active_than_the_map_has(scenario, active):
     assert info.status.shape == (places,) and info.innovation_cov.shape == (places, 2, 2)
 
 
-def test_a_scan_in_pieces_loses_and_moves_nothing():
-    def update(state, scan, key):
+@record
+class Toy(Filter):
+    """A filter that adds up what it measures, three measurements at once."""
+
+    controls = ("a", "b", "c")
+    measurements = ("x [m]", "y [m]")
+    chart = Euclidean()
+
+    def init(self, pose, pose_cov):
+        return pose[0]
+
+    def predict(self, state, u, key):
+        return state
+
+    def update(self, state, scan, key):
         assert scan.tag.shape == (3,)
         info = nothing_of(scan)._replace(slot=scan.tag, log_likelihood=scan.z.sum())
         return state + jnp.where(scan.valid, scan.z[:, 0], 0.0).sum(), info
 
-    seen = in_pieces(
-        Filter(
-            "toy",
-            ("a", "b", "c"),
-            ("x [m]", "y [m]"),
-            lambda p, c: p[0],
-            lambda s, u, k: s,
-            update,
-            lambda s: s,
-            euclidean(),
-        ),
-        3,
-    )
+    def estimate(self, state):
+        return state
+
+
+def test_a_scan_in_pieces_loses_and_moves_nothing():
+    seen = InPieces(Toy(), 3)
     tag = jnp.asarray([7, 3, 9, 1, 4, 8, 0])
     scan = Scan(jnp.stack([tag, -tag], axis=1) * 1.0 + 1.0, tag, tag != 9)
     state, info = jax.jit(seen.update)(jnp.zeros(()), scan, jax.random.key(0))

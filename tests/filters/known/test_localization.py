@@ -1,6 +1,6 @@
 """Localization is EKF-SLAM in a map without error, and dead reckoning is that without measurements."""
 
-import dataclasses
+from dataclasses import replace
 from functools import cache
 
 import jax
@@ -10,7 +10,7 @@ import pytest
 from worlds import draw, judged, nameless, narrow, ring
 
 from jaxslam import association, charts, linearize, run, sensors, simulate
-from jaxslam.filters import dead_reckoning, ekf_slam, localization
+from jaxslam.filters import DeadReckoning, EkfSlam, Localization, StartingAt
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.sensors import Part, Suite
 from jaxslam.types import Log, Status
@@ -22,13 +22,13 @@ GATE, NEW = chi2_quantile(0.999, 2), chi2_quantile(0.99999, 2)
 
 @cache
 def world():
-    scenario = dataclasses.replace(ring(40), pose=START, pose_cov=SPREAD)
+    scenario = replace(ring(40), pose=START, pose_cov=SPREAD)
     return scenario, draw(scenario, 3)
 
 
 def here(**options):
     scenario, _ = world()
-    return localization(scenario.motion, scenario.sensor, scenario.landmarks, **options)
+    return Localization(scenario.motion, scenario.sensor, scenario.landmarks, **options)
 
 
 def driven(filter, log):
@@ -40,28 +40,25 @@ def slam_in_a_known_map(scenario, log, chart_name, options):
     chart = charts.REGISTRY[chart_name]()
     points = np.asarray(scenario.landmarks)
     count = len(points)
-    filter = ekf_slam(scenario.motion, scenario.sensor, count, chart=chart, **options)
+    filter = EkfSlam(scenario.motion, scenario.sensor, count, chart=chart, **options)
 
-    def known(pose, cov):
-        joint = filter.init(pose, cov)
-        rows = [jnp.eye(3)]
-        if chart.basis is None:
-            rows += [jnp.zeros((2, 3))] * count
-        else:  # coordinates without error: cross dx + B dl = 0
-            for point in points:
-                basis = chart.basis(joint.pose, point)
-                own = jnp.eye(2) if basis.landmark is None else basis.landmark
-                rows.append(-jnp.linalg.solve(own, basis.cross))
-        lift = jnp.concatenate(rows)
-        return joint._replace(
-            landmarks=jnp.asarray(points),
-            cov=lift @ joint.cov[:3, :3] @ lift.T,
-            alive=jnp.ones(count, bool),
-            tag=jnp.arange(count, dtype=jnp.int32),
-        )
-
-    slam = dataclasses.replace(filter, init=known)
-    return driven(slam, log).estimate
+    joint = filter.init(jnp.asarray(START), jnp.asarray(SPREAD))
+    rows = [jnp.eye(3)]
+    if chart.basis is None:
+        rows += [jnp.zeros((2, 3))] * count
+    else:  # coordinates without error: cross dx + B dl = 0
+        for point in points:
+            basis = chart.basis(joint.pose, point)
+            own = jnp.eye(2) if basis.landmark is None else basis.landmark
+            rows.append(-jnp.linalg.solve(own, basis.cross))
+    lift = jnp.concatenate(rows)
+    known = joint._replace(
+        landmarks=jnp.asarray(points),
+        cov=lift @ joint.cov[:3, :3] @ lift.T,
+        alive=jnp.ones(count, bool),
+        tag=jnp.arange(count, dtype=jnp.int32),
+    )
+    return driven(StartingAt(filter, known), log).estimate
 
 
 @pytest.mark.parametrize(
@@ -69,7 +66,7 @@ def slam_in_a_known_map(scenario, log, chart_name, options):
     [
         ("euclidean", {"iterations": 3, "covariance": "joseph", "gate": 4.0}),
         ("right_invariant", {}),
-        ("left_invariant", {"update": "joint"}),
+        ("left_invariant", {"correction": "joint"}),
     ],
 )
 def test_it_is_slam_in_a_map_without_error(chart, options):
@@ -136,7 +133,7 @@ def test_it_is_the_textbooks_filter_with_absolute_sensors_too(with_compass):
             ),
         )
     poses, covs = by_hand(scenario, log, angles)
-    filter = localization(scenario.motion, sensor, scenario.landmarks)
+    filter = Localization(scenario.motion, sensor, scenario.landmarks)
     trace = driven(filter, jax.tree.map(jnp.asarray, log))
     np.testing.assert_allclose(trace.estimate.pose, poses, atol=1e-9)
     np.testing.assert_allclose(trace.estimate.pose_cov, covs, rtol=1e-7, atol=1e-12)
@@ -146,7 +143,7 @@ def test_it_is_the_textbooks_filter_with_absolute_sensors_too(with_compass):
 @pytest.mark.parametrize("method", ["nearest", "joint"])
 def test_it_finds_its_landmarks_without_tags(method):
     scenario, (_, log) = world()
-    make = getattr(association, method)
+    make = {"nearest": association.Nearest, "joint": association.JointCompatibility}[method]
     associate = make(0.999, NEW) if method == "joint" else make(GATE, NEW)
     trace = driven(here(associate=associate), nameless(log))
     fused = np.asarray(trace.info.status == Status.FUSED)
@@ -157,7 +154,7 @@ def test_it_finds_its_landmarks_without_tags(method):
 
 def test_what_is_not_in_the_map_is_counted_and_not_started():
     scenario, (_, log) = world()
-    part = localization(
+    part = Localization(
         scenario.motion, scenario.sensor, np.asarray(scenario.landmarks)[:4], tags=[5, 1, 2, 3]
     )
     trace = driven(part, log)
@@ -169,7 +166,7 @@ def test_what_is_not_in_the_map_is_counted_and_not_started():
 
 def test_sigma_points_are_close_to_jacobians():
     _, (_, log) = world()
-    plain, sigma = (driven(here(**o), log) for o in ({}, {"linearize": linearize.unscented()}))
+    plain, sigma = (driven(here(**o), log) for o in ({}, {"linearize": linearize.Unscented()}))
     np.testing.assert_allclose(sigma.estimate.pose, plain.estimate.pose, atol=0.02)
     assert not np.array_equal(sigma.estimate.pose, plain.estimate.pose)
 
@@ -177,7 +174,7 @@ def test_sigma_points_are_close_to_jacobians():
 def test_it_is_honest_and_dead_reckoning_is_what_it_says():
     """The pose NEES of 200 runs in its interval, with a start that is not known either."""
     scenario, _ = world()
-    filters = here(update="joint"), dead_reckoning(scenario.motion, scenario.sensor)
+    filters = here(correction="joint"), DeadReckoning(scenario.motion, scenario.sensor)
 
     @jax.jit
     @jax.vmap
@@ -195,7 +192,7 @@ def test_it_is_honest_and_dead_reckoning_is_what_it_says():
 
 def test_dead_reckoning_is_the_motion_alone():
     scenario, (_, log) = world()
-    trace = driven(dead_reckoning(scenario.motion, scenario.sensor), log)
+    trace = driven(DeadReckoning(scenario.motion, scenario.sensor), log)
     pose, move = START, jax.jit(scenario.motion.step)
     for u, estimate in zip(log.control, trace.estimate.pose, strict=True):
         pose = move(pose, u, np.zeros(2))
@@ -208,7 +205,7 @@ def test_gradient_and_float32():
     short = jax.tree.map(lambda leaf: leaf[:5], log)
 
     def last(landmarks):
-        filter = localization(scenario.motion, scenario.sensor, landmarks)
+        filter = Localization(scenario.motion, scenario.sensor, landmarks)
         trace = run(filter, short, START, SPREAD, KEY)
         return (trace.estimate.pose[-1] ** 2).sum()
 
@@ -225,9 +222,9 @@ BAD = {
     "nan": ({"landmarks": np.full((2, 2), np.nan)}, "not finite"),
     "tags": ({"tags": [0, 0, 1, 2, 3, 4]}, "different tags"),
     "negative tag": ({"tags": [-1, 0, 1, 2, 3, 4]}, "different tags"),
-    "linearizer": ({"linearize": linearize.first_estimate()}, "is for estimated maps"),
-    "iterated": ({"linearize": linearize.unscented(), "iterations": 2}, "does not iterate"),
-    "update": ({"update": "whole"}, "sequential"),
+    "linearizer": ({"linearize": linearize.FirstEstimate()}, "is for estimated maps"),
+    "iterated": ({"linearize": linearize.Unscented(), "iterations": 2}, "does not iterate"),
+    "correction": ({"correction": "whole"}, "sequential"),
 }
 
 
@@ -237,4 +234,4 @@ def test_refusals(case):
     scenario, _ = world()
     options = {"landmarks": scenario.landmarks} | options
     with pytest.raises(ValueError, match=message):
-        localization(scenario.motion, scenario.sensor, options.pop("landmarks"), **options)
+        Localization(scenario.motion, scenario.sensor, options.pop("landmarks"), **options)

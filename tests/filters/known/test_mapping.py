@@ -11,7 +11,7 @@ from own_models import changed
 from worlds import draw, nameless, ring
 
 from jaxslam import association, charts, linearize, motion, run, sensors, simulate
-from jaxslam.filters import ekf_slam, mapping
+from jaxslam.filters import EkfSlam, Mapping
 from jaxslam.filters.known.mapping import as_prior
 from jaxslam.math.stats import chi2_band, chi2_quantile
 from jaxslam.types import Status
@@ -37,9 +37,9 @@ def test_it_is_slam_of_a_robot_that_knows_where_it_is(options):
     capacity = 8
     # A motion without noise whose control is the pose: P_RR stays zero, and P block-diagonal.
     exact = changed(motion.PoseIncrement(np.zeros((3, 3))), step=lambda pose, u, w: u + 0 * w)
-    slam = ekf_slam(exact, scenario.sensor, capacity, update="joint", **options)
+    slam = EkfSlam(exact, scenario.sensor, capacity, correction="joint", **options)
     expected = on_poses(slam, truth, log)
-    trace = on_poses(mapping(scenario.sensor, capacity, **options), truth, log)
+    trace = on_poses(Mapping(scenario.sensor, capacity, **options), truth, log)
     chex.assert_trees_all_close(trace.estimate, expected.estimate, rtol=1e-9, atol=1e-12)
     for name in ("status", "slot", "nis", "dof", "innovation_cov"):
         actual, wanted = getattr(trace.info, name), getattr(expected.info, name)
@@ -50,8 +50,8 @@ def test_it_is_slam_of_a_robot_that_knows_where_it_is(options):
 def test_it_is_honest():
     """NEES of the landmarks over 200 worlds in the chi-square band of so many."""
     scenario, _, _ = world()
-    filter = mapping(scenario.sensor, 6)
-    slam = ekf_slam(scenario.motion, scenario.sensor, 6)
+    filter = Mapping(scenario.sensor, 6)
+    slam = EkfSlam(scenario.motion, scenario.sensor, 6)
 
     @jax.jit
     @jax.vmap
@@ -71,9 +71,9 @@ def test_it_is_honest():
 def test_a_prior_for_slam():
     """Filtered on from the map, and from the map's inverse variances by hand."""
     scenario, truth, log = world()
-    final = on_poses(mapping(scenario.sensor, 8), truth, log).final
+    final = on_poses(Mapping(scenario.sensor, 8), truth, log).final
     pose, cov = np.array([0.1, 0.2, 0.3]), np.diag([0.1, 0.2, 0.01])
-    slam = ekf_slam(scenario.motion, scenario.sensor, 8)
+    slam = EkfSlam(scenario.motion, scenario.sensor, 8)
     joint = jax.device_get(
         jax.jit(lambda *parts: as_prior(parts[0], slam, *parts[1:]))(final, pose, cov)
     )
@@ -92,15 +92,15 @@ def test_a_prior_for_slam():
 
 def test_without_tags():
     scenario, truth, log = world()
-    method = association.joint(0.999, chi2_quantile(0.99999, 2))
-    trace = on_poses(mapping(scenario.sensor, 8, associate=method), truth, nameless(log))
+    method = association.JointCompatibility(0.999, chi2_quantile(0.99999, 2))
+    trace = on_poses(Mapping(scenario.sensor, 8, associate=method), truth, nameless(log))
     assert (trace.final.alive).sum() == 6
     np.testing.assert_array_equal(trace.info.slot, log.scan.tag)
 
 
 def test_a_full_map_refuses():
     scenario, truth, log = world()
-    trace = on_poses(mapping(scenario.sensor, 1), truth, log)
+    trace = on_poses(Mapping(scenario.sensor, 1), truth, log)
     status = np.asarray(trace.info.status)
     assert (status[:, 1:] == Status.OVERFLOW).all() and (status[1:, 0] == Status.FUSED).all()
     assert trace.final.lost == 40 * 5
@@ -109,24 +109,24 @@ def test_a_full_map_refuses():
 def test_refusals():
     sensor = ring(3).sensor
     for options, message in (({"capacity": 0}, "capacity"), ({"gate": 0.0}, "gate above 0")):
-        with pytest.raises(ValueError, match=f"mapping: .*{message}"):
-            mapping(sensor, **({"capacity": 3} | options))
+        with pytest.raises(ValueError, match=f"Mapping: .*{message}"):
+            Mapping(sensor, **({"capacity": 3} | options))
     with pytest.raises(ValueError, match="absolute"):
-        mapping(sensors.Compass(np.eye(1)), 3)
-    final = jax.eval_shape(mapping(sensor, 2).init, np.zeros(3), np.eye(3))
+        Mapping(sensors.Compass(np.eye(1)), 3)
+    final = jax.eval_shape(Mapping(sensor, 2).init, np.zeros(3), np.eye(3))
 
     def prior(slam, pose):
         return jax.eval_shape(lambda final: as_prior(final, slam, pose, np.eye(3)), final)
 
-    assert prior(ekf_slam(ring(3).motion, sensor, 2), np.zeros(3)).cov.shape == (7, 7)
+    assert prior(EkfSlam(ring(3).motion, sensor, 2), np.zeros(3)).cov.shape == (7, 7)
     with pytest.raises(ValueError, match=r"pose \(3,\)"):
-        prior(ekf_slam(ring(3).motion, sensor, 2), np.zeros(2))
+        prior(EkfSlam(ring(3).motion, sensor, 2), np.zeros(2))
     for options, message in (
         ({"capacity": 3}, "a filter of 2 landmarks"),
-        ({"chart": charts.right_invariant()}, "Euclidean"),
+        ({"chart": charts.RightInvariant()}, "Euclidean"),
         ({"covariance": "square_root"}, "covariance"),
-        ({"linearize": linearize.first_estimate()}, "Jacobians"),
+        ({"linearize": linearize.FirstEstimate()}, "Jacobians"),
     ):
-        other = ekf_slam(ring(3).motion, sensor, **({"capacity": 2} | options))
+        other = EkfSlam(ring(3).motion, sensor, **({"capacity": 2} | options))
         with pytest.raises(ValueError, match=message):
             prior(other, np.zeros(3))

@@ -9,18 +9,17 @@ import numpy as np
 import pytest
 
 from jaxslam import association, charts, motion, programs, sensors, slots
-from jaxslam.filters import eif_slam, ekf_slam
-from jaxslam.filters.map_management.closing import closing
+from jaxslam.filters import EifSlam, EkfSlam
+from jaxslam.filters.map_management.closing import Closing
 from jaxslam.filters.map_management.loop_closure import LoopSettings, close_loop
 from jaxslam.filters.map_management.merging import merge_landmarks
-from jaxslam.filters.map_management.pruning import pruning
-from jaxslam.life import recency
-from jaxslam.life.recency import Recency
+from jaxslam.life import Recency
+from jaxslam.life.recency import Times
 from jaxslam.protocols import Pairs, Prediction
 from jaxslam.slots import Joint
 from jaxslam.types import Info, Scan
 
-EUCLIDEAN = charts.euclidean()
+EUCLIDEAN = charts.Euclidean()
 OPTIONS = {"window": 20, "cluster": 6, "least": 4}
 
 
@@ -48,7 +47,7 @@ def two_visits(seed=0, drift=4.0, shape=0.05, symmetric=False):
     cov = np.where(dead[:, None] | dead[None], np.eye(size), cov)
     born = np.where(alive, np.where(np.arange(15) < 8, 1, 90), 0)
     last = np.where(alive, np.where(np.arange(15) < 8, 20, 100), 0)
-    life = Recency(*map(jnp.asarray, (100, born, last, np.where(alive, 3, 0))))
+    life = Times(*map(jnp.asarray, (100, born, last, np.where(alive, 3, 0))))
     tag = np.where(alive, np.arange(15), -1)
     joint = Joint(*map(jnp.asarray, (np.zeros(3), points, cov, alive, tag)), (), life=life)
     return joint, of
@@ -110,8 +109,7 @@ def test_a_symmetric_old_map_is_ambiguous():
 
 def test_recency_remembers():
     model = motion.PoseIncrement(1e-4 * np.eye(3))
-    plain = ekf_slam(model, sensors.RelativePosition(0.01 * np.eye(2)), 4)
-    filter = pruning(plain, recency())
+    filter = EkfSlam(model, sensors.RelativePosition(0.01 * np.eye(2)), 4, life=Recency())
     state = jax.jit(filter.init)(np.zeros(3), np.zeros((3, 3)))
     update = jax.jit(filter.update)
     key = jax.random.key(0)
@@ -132,7 +130,7 @@ def test_recency_remembers():
 def test_recency_with_patience_forgets():
     """Seen at scans 1 and 2 the first landmark goes at 2 + 3, whether or not scans are empty."""
     info = Info(*[None] * 4, slot=None, status=None, log_likelihood=None)
-    keeper = recency(patience=3)
+    keeper = Recency(patience=3)
     joint = slots.empty(jnp.zeros(3), jnp.eye(3), 2, 2, ())
     joint = joint._replace(life=keeper.init(joint.pose, joint.landmarks))
     gone = []
@@ -144,8 +142,8 @@ def test_recency_with_patience_forgets():
         gone.append([bool(d) for d in dead])
     none, first, second = [False, False], [True, False], [False, True]
     assert gone == [none, none, none, none, first, second]
-    with pytest.raises(ValueError, match="recency: patience"):
-        recency(patience=0)
+    with pytest.raises(ValueError, match="Recency: patience"):
+        Recency(patience=0)
 
 
 def test_certain_hides_what_cannot_be_foretold():
@@ -154,10 +152,10 @@ def test_certain_hides_what_cannot_be_foretold():
     pairs = Pairs(jnp.zeros((1, 2, 2)), cov, distance, jnp.zeros((1, 2)), jnp.ones((1, 2), bool))
     prediction = Prediction(jnp.full(2, -1), jnp.ones(2, bool), lambda scan: pairs, lambda: None)
     scan = Scan(jnp.zeros((1, 2)), jnp.array([-1]), jnp.array([True]))
-    near = association.nearest(9.0)
+    near = association.Nearest(9.0)
     assert int(near(prediction, scan).slot[0]) == 1
-    assert int(association.certain(near, 0.5)(prediction, scan).slot[0]) == 0
-    hidden = association.certain(near, 0.05)(prediction, scan)
+    assert int(association.Certain(near, 0.5)(prediction, scan).slot[0]) == 0
+    hidden = association.Certain(near, 0.05)(prediction, scan)
     assert int(hidden.slot[0]) == -1 and bool(hidden.is_new[0])
 
 
@@ -165,17 +163,15 @@ def test_a_whole_run_ends_with_each_landmark_once():
     """Eight landmarks seen, a long way blind, and the same eight again: one loop, closed once."""
     rng = np.random.default_rng(2)
     points = rng.uniform(-6, 6, (8, 2))
-    filter = closing(
-        pruning(
-            ekf_slam(
-                motion.PoseIncrement(np.diag([0.05, 0.05, 0.008]) ** 2),
-                sensors.RelativePosition(0.05**2 * np.eye(2)),
-                20,
-                chart=charts.right_invariant(),
-                update="joint",
-                associate=association.certain(association.nearest(9.21, 30.0), 0.4),
-            ),
-            recency(),
+    filter = Closing(
+        EkfSlam(
+            motion.PoseIncrement(np.diag([0.05, 0.05, 0.008]) ** 2),
+            sensors.RelativePosition(0.05**2 * np.eye(2)),
+            20,
+            chart=charts.RightInvariant(),
+            correction="joint",
+            associate=association.Certain(association.Nearest(9.21, 30.0), 0.4),
+            life=Recency(),
         ),
         reach=1.0,
         settings=LoopSettings(window=10, cluster=8, sightings=2, least=5),
@@ -217,26 +213,26 @@ def test_refusals():
     ):
         with pytest.raises(ValueError, match=message):
             LoopSettings(**options)
-    with pytest.raises(ValueError, match="recency"):
+    with pytest.raises(ValueError, match="keeps times"):
         close_loop(joint._replace(life=None), EUCLIDEAN, LoopSettings())
     with pytest.raises(ValueError, match="spread"):
-        association.certain(association.nearest(9.0), 0.0)
-    plain = ekf_slam(motion.PoseIncrement(np.eye(3)), sensors.RelativePosition(np.eye(2)), 3)
+        association.Certain(association.Nearest(9.0), 0.0)
+    plain = EkfSlam(motion.PoseIncrement(np.eye(3)), sensors.RelativePosition(np.eye(2)), 3)
     with pytest.raises(ValueError, match="every"):
-        closing(plain, every=0)
+        Closing(plain, every=0)
     with pytest.raises(ValueError, match="reach"):
-        closing(plain, reach=-1.0)
-    with pytest.raises(ValueError, match="recency"):
-        closing(plain).init(jnp.zeros(3), jnp.eye(3))
+        Closing(plain, reach=-1.0)
+    with pytest.raises(ValueError, match="keeps times"):
+        Closing(plain).init(jnp.zeros(3), jnp.eye(3))
     models = motion.PoseIncrement(np.eye(3)), sensors.RelativePosition(np.eye(2)), 3
     with pytest.raises(ValueError, match="root"):
-        closing(pruning(ekf_slam(*models, covariance="square_root"), recency()))
+        Closing(EkfSlam(*models, covariance="square_root", life=Recency()))
     with pytest.raises(ValueError, match="Joint"):
-        closing(eif_slam(*models)).init(jnp.zeros(3), jnp.eye(3))
+        Closing(EifSlam(*models)).init(jnp.zeros(3), jnp.eye(3))
 
 
 def test_a_filter_of_several_sensors_keeps_its_places():
     one = sensors.RelativePosition(np.eye(2))
     both = sensors.Suite(((one, 2), (one, 2)))
-    filter = pruning(ekf_slam(motion.PoseIncrement(np.eye(3)), both, 4), recency())
-    assert closing(filter).places == filter.places == (2, 2)
+    filter = EkfSlam(motion.PoseIncrement(np.eye(3)), both, 4, life=Recency())
+    assert Closing(filter).places == filter.places == (2, 2)

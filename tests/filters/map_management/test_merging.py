@@ -1,6 +1,5 @@
 """Merging two landmarks that are one: the joint test, the constraint, and what it equals."""
 
-import dataclasses
 from functools import cache
 
 import chex
@@ -10,12 +9,13 @@ import numpy as np
 import pytest
 
 from jaxslam import charts, motion, run, sensors, slots
-from jaxslam.filters import ekf_slam
-from jaxslam.filters.map_management.merging import closest_pair, merge_landmarks, merging
+from jaxslam.core.record import record
+from jaxslam.filters import EkfSlam
+from jaxslam.filters.map_management.merging import Merging, closest_pair, merge_landmarks
 from jaxslam.slots import Joint
 from jaxslam.types import Log, Scan
 
-EUCLIDEAN = charts.euclidean()
+EUCLIDEAN = charts.Euclidean()
 MOTION = motion.PoseIncrement(np.diag([0.1, 0.1, 0.05]) ** 2)
 SENSOR = sensors.RelativePosition(0.1**2 * np.eye(2))
 KEY = jax.random.key(0)
@@ -104,7 +104,7 @@ def test_two_sightings_merged_are_one_landmark_seen_twice(chart):
         return Scan(np.array([z]), np.array([tag]), np.array([True]))
 
     # The heading is known: the model is linear, and order does not matter.
-    still = ekf_slam(motion.PoseIncrement(np.diag([0.1, 0.1, 0.0]) ** 2), SENSOR, 3, chart=chart)
+    still = EkfSlam(motion.PoseIncrement(np.diag([0.1, 0.1, 0.0]) ** 2), SENSOR, 3, chart=chart)
     update, predict = jax.jit(still.update), jax.jit(still.predict)
     start = jax.jit(still.init)(np.zeros(3), np.diag([0.2, 0.3, 0.0]) ** 2)
     joint = update(start, scan(0, [2.0, 1.0]), KEY)[0]
@@ -151,8 +151,10 @@ def state_of(joint):
 @cache
 def driver(reach=0.5, chart="euclidean", dtype=np.float64, **options):
     """A filter that merges within a reach, and its runs: by one program whatever the reach."""
-    plain = ekf_slam(MOTION, SENSOR, 4, chart=charts.REGISTRY[chart](), update="joint", **options)
-    filter, start = merging(plain, reach), (np.zeros(3, dtype), np.zeros((3, 3), dtype), KEY)
+    plain = EkfSlam(
+        MOTION, SENSOR, 4, chart=charts.REGISTRY[chart](), correction="joint", **options
+    )
+    filter, start = Merging(plain, reach), (np.zeros(3, dtype), np.zeros((3, 3), dtype), KEY)
     return plain, lambda log: run(filter, log, *start, probe=state_of)
 
 
@@ -236,19 +238,19 @@ def test_merging_in_float32_and_its_gradient():
 
 
 def test_refusals_of_merging():
-    plain = ekf_slam(MOTION, SENSOR, 3)
+    plain = EkfSlam(MOTION, SENSOR, 3)
     for bad in ({"reach": 0.0}, {"reach": 1.0, "probability": 1.0}):
-        with pytest.raises(ValueError, match="merging: expected"):
-            merging(plain, **bad)
+        with pytest.raises(ValueError, match=r"^Merging: expected"):
+            Merging(plain, **bad)
     rays = sensors.BearingInverseDepth(np.eye(1))
     for sensor in (rays, sensors.Compass(np.eye(1))):
         with pytest.raises(ValueError, match="cannot be merged"):
-            merging(ekf_slam(MOTION, sensor, 3), 0.5)
-    other = dataclasses.replace(plain, init=lambda pose, pose_cov: pose)
+            Merging(EkfSlam(MOTION, sensor, 3), 0.5)
+    other = Poses(MOTION, SENSOR, 3)
     with pytest.raises(
-        ValueError, match=r"merging: expected a filter whose state is a slots.Joint"
+        ValueError, match=r"^Merging: expected a filter whose state is a slots.Joint"
     ):
-        merging(other, 0.5).init(np.zeros(3), np.eye(3))
+        Merging(other, 0.5).init(np.zeros(3), np.eye(3))
 
 
 def test_landmarks_that_differ_stay_two():
@@ -257,16 +259,27 @@ def test_landmarks_that_differ_stay_two():
     In square roots, whose closest pair is that of the covariance (above).
     """
     sensor = sensors.RangeBearing(np.diag([0.02, 0.01]) ** 2)
-    filter = merging(ekf_slam(MOTION, sensor, 4, covariance="square_root", update="joint"), 0.5)
+    filter = Merging(Still(MOTION, sensor, 4, covariance="square_root", correction="joint"), 0.5)
     z = np.array([[[2.0, 0.0]], [[2.0, 0.225]]] * 5)
     scan = Scan(z, np.array([[0], [1]] * 5, np.int32), np.ones((10, 1), bool))
     log = Log(np.zeros((10, 3)), scan)
     start = np.zeros(3), np.zeros((3, 3)), KEY
-    trace = jax.jit(lambda log: run(ekf_slam_still(filter), log, *start))(log)
+    trace = jax.jit(lambda log: run(filter, log, *start))(log)
     assert (pairs_in(trace) == -1).all()
     assert trace.estimate.alive[-1].sum() == 2
 
 
-def ekf_slam_still(filter):
+@record
+class Still(EkfSlam):
     """Without the noise of motion, which would make the two one in the robot's eyes."""
-    return dataclasses.replace(filter, predict=lambda state, u, key: state)
+
+    def predict(self, state, u, key):
+        return state
+
+
+@record
+class Poses(EkfSlam):
+    """One whose state is a pose."""
+
+    def init(self, pose, pose_cov):
+        return pose

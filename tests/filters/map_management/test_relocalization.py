@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from jaxslam import charts, motion, se2, sensors
-from jaxslam.filters import ekf_slam
+from jaxslam.filters import EkfSlam
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.steps.update import correct
 from jaxslam.filters.map_management.relocalization import (
@@ -20,7 +20,7 @@ from jaxslam.filters.map_management.relocalization import (
     relocated,
     seen_points,
 )
-from jaxslam.linearize import first_estimate
+from jaxslam.linearize import FirstEstimate
 from jaxslam.math.stats import chi2_band, chi2_quantile
 from jaxslam.slots import Joint
 from jaxslam.types import Scan, Status
@@ -324,7 +324,7 @@ def test_relocated_is_the_limit_of_an_update_from_a_large_covariance(name):
 
 def test_the_relocated_pose_is_honest():
     """NEES of pose and of pose with map over 300 draws of map and scan."""
-    chart, count, runs = charts.euclidean(), 6, 300
+    chart, count, runs = charts.Euclidean(), 6, 300
     rng, points, cov = world(7, count)
     # A common turn of 0.1 rad (1 σ) is beyond first order; what is linear is tested here.
     cov = 0.05 * cov
@@ -358,7 +358,7 @@ def test_the_relocated_pose_is_honest():
 
 
 def test_two_pairs_are_enough_and_fewer_change_nothing():
-    joint, chart = some_joint(), charts.euclidean()
+    joint, chart = some_joint(), charts.Euclidean()
     rng = np.random.default_rng(0)
     seen, covs = seen_from(rng, [2.0, 1.0, -1.0], np.asarray(joint.landmarks)[[0, 4]])
     found = RELOCATED(joint, chart, np.array([0, 4]), seen, covs)
@@ -370,13 +370,15 @@ def test_two_pairs_are_enough_and_fewer_change_nothing():
 
 def test_a_kidnapped_robot_finds_itself_and_goes_on():
     """Put elsewhere without a word: scans no longer fit, it is lost, it is found, it is honest."""
-    chart = charts.right_invariant()
+    chart = charts.RightInvariant()
     rng = np.random.default_rng(11)
     move = jax.jit(se2.compose)
     landmarks = rng.uniform(-12, 12, (25, 2))
     model = motion.PoseIncrement(np.diag([0.02, 0.02, 0.01]) ** 2)
     sensor = sensors.RangeBearing(np.diag([0.05, 0.01]) ** 2)
-    filter = ekf_slam(model, sensor, 25, chart=chart, gate=chi2_quantile(0.9999, 2), update="joint")
+    filter = EkfSlam(
+        model, sensor, 25, chart=chart, gate=chi2_quantile(0.9999, 2), correction="joint"
+    )
     predict, update = jax.jit(filter.predict), jax.jit(filter.update)
     look = jax.jit(jax.vmap(sensor.observe, (None, 0)))
     points_of = jax.jit(partial(seen_points, sensor))
@@ -437,16 +439,16 @@ def test_refusals():
         relocalize(points, cov[:4], yes, seen, covs, yes)
     joint = some_joint()
     with pytest.raises(ValueError, match="covariance"):
-        lost(joint, charts.euclidean(), -np.eye(3))
+        lost(joint, charts.Euclidean(), -np.eye(3))
     with pytest.raises(ValueError, match="keeps former estimates"):
         lost(
-            joint._replace(lin=first_estimate().init(joint.pose, joint.landmarks)),
-            charts.euclidean(),
+            joint._replace(lin=FirstEstimate().init(joint.pose, joint.landmarks)),
+            charts.Euclidean(),
             np.eye(3),
         )
     with pytest.raises(ValueError, match="landmarks"):
-        points_of_map(joint._replace(landmarks=jnp.zeros((4, 3))), charts.euclidean())
+        points_of_map(joint._replace(landmarks=jnp.zeros((4, 3))), charts.Euclidean())
     with pytest.raises(ValueError, match="scans"):
         relocated(
-            joint, charts.euclidean(), jnp.array([0, 1]), jnp.zeros((3, 2)), jnp.zeros((3, 2, 2))
+            joint, charts.Euclidean(), jnp.array([0, 1]), jnp.zeros((3, 2)), jnp.zeros((3, 2, 2))
         )

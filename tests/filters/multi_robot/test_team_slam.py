@@ -12,8 +12,8 @@ from reference.team import Team
 from worlds import draw, judged, narrow, nees, ring
 
 import jaxslam
-from jaxslam import charts, filters, motion, sensors, team
-from jaxslam.filters import ekf_slam, team_slam
+from jaxslam import filters, motion, sensors, team
+from jaxslam.filters import EkfSlam, TeamSlam
 from jaxslam.filters.multi_robot import pose_initialization
 from jaxslam.sensors import Part, Suite
 from jaxslam.simulation import team_world
@@ -64,7 +64,7 @@ def crew_slam(count, known):
     That of three has room for four landmarks more than there are, and tags of its own.
     """
     robots = crew(count) if known else unknown(crew(count))
-    return team_slam(robots, 8) if count < 3 else team_slam(robots, 12, tags=(20, 21, 22))
+    return TeamSlam(robots, 8) if count < 3 else TeamSlam(robots, 12, tags=(20, 21, 22))
 
 
 @cache
@@ -116,8 +116,8 @@ def reference_of(robots, tags, scenario):
 def test_a_team_of_one_is_ekf_slam():
     alone = ring(60)
     log = draw(alone, 0)[1]
-    one = team_slam([team.Robot(alone.motion, Suite(((alone.sensor, 6),)))], 6)
-    a, b = (go(f, alone, log) for f in (ekf_slam(alone.motion, alone.sensor, 6), one))
+    one = TeamSlam([team.Robot(alone.motion, Suite(((alone.sensor, 6),)))], 6)
+    a, b = (go(f, alone, log) for f in (EkfSlam(alone.motion, alone.sensor, 6), one))
     chex.assert_trees_all_close((a.estimate, a.info), (b.estimate, b.info), rtol=0, atol=1e-12)
 
 
@@ -278,7 +278,7 @@ def hundred(report, first):
 def many():
     """One program of a filter for 100 logs, both robots unknown; `probe` has the estimates of both."""
     robots, scenario, *_ = hundred(0, 0)
-    report = [team_slam(unknown(robots), 8, report=b, update="joint") for b in range(2)]
+    report = [TeamSlam(unknown(robots), 8, report=b, correction="joint") for b in range(2)]
 
     def go(log):
         return jaxslam.run(
@@ -319,7 +319,7 @@ def nees_at_worst(truth, estimate):
 def test_a_team_in_a_campaign():
     """With the cheapest of filters: campaigns draw, bound and score worlds of teams."""
     scenario = hundred(1, 10)[1]
-    still = filters.dead_reckoning(scenario.motion, scenario.sensor)
+    still = filters.DeadReckoning(scenario.motion, scenario.sensor)
     options = {"block": 2, "devices": jax.devices()[:1]}
     campaign = jaxslam.monte_carlo(scenario, {"still": still}, 2, jax.random.key(2), **options)
     assert campaign.filters["still"].counts["runs"] == 2
@@ -345,7 +345,7 @@ def driven_by(theta, log):
     """A run of two robots, one from an unknown place, by all parameters of their models."""
     eyes = sensors.RangeBearing(jnp.diag(theta[:2]) ** 2, mount=theta[2:5])
     robot = team.Robot(motion.Increment(jnp.diag(theta[5:7]) ** 2), Suite(((eyes, 3),)))
-    filter = team_slam([robot, robot], 8, update="joint")
+    filter = TeamSlam([robot, robot], 8, correction="joint")
     return jaxslam.run(filter, log, np.zeros(3), NOTHING, jax.random.key(0))
 
 
@@ -383,19 +383,18 @@ def signs():
 @pytest.mark.parametrize(
     ("make", "message"),
     [
-        (lambda: team_slam([], 3), "at least one robot"),
-        (lambda: team_slam([ring()], 3), "expected a team.Robot"),
-        (lambda: team_slam(crew(2)[::-1], 3), "expected no start of robot 0"),
-        (lambda: team_slam(crew(2), 3, tags=(7, 7)), "2 different tags"),
-        (lambda: team_slam(crew(2), 3, tags=(7,)), "2 different tags"),
-        (lambda: team_slam(crew(2), 3, tags=(7, -1)), "integers >= 0"),
-        (lambda: team_slam(crew(2), 0), "capacity"),
-        (lambda: team_slam(crew(2), 3, report=2), "expected report from 0 to"),
-        (lambda: team_slam(crew(2), 3, chart=charts.right_invariant()), "chart euclidean"),
-        (lambda: team_slam(crew(2), 3, gate=0.0), "gate above 0"),
-        (lambda: team_slam(crew(2), 3, update="at once"), "expected update"),
-        (lambda: team_slam([signs()], 3), "expected landmarks \\(x, y\\)"),
-        (lambda: team_slam([crew(1)[0], compass_only()], 3), "robot 1 needs a start"),
+        (lambda: TeamSlam([], 3), "at least one robot"),
+        (lambda: TeamSlam([ring()], 3), "expected a team.Robot"),
+        (lambda: TeamSlam(crew(2)[::-1], 3), "expected no start of robot 0"),
+        (lambda: TeamSlam(crew(2), 3, tags=(7, 7)), "2 different tags"),
+        (lambda: TeamSlam(crew(2), 3, tags=(7,)), "2 different tags"),
+        (lambda: TeamSlam(crew(2), 3, tags=(7, -1)), "integers >= 0"),
+        (lambda: TeamSlam(crew(2), 0), "capacity"),
+        (lambda: TeamSlam(crew(2), 3, report=2), "expected report from 0 to"),
+        (lambda: TeamSlam(crew(2), 3, gate=0.0), "gate above 0"),
+        (lambda: TeamSlam(crew(2), 3, correction="at once"), "expected correction"),
+        (lambda: TeamSlam([signs()], 3), "expected landmarks \\(x, y\\)"),
+        (lambda: TeamSlam([crew(1)[0], compass_only()], 3), "robot 1 needs a start"),
         (
             lambda: team.Robot(motion.Increment(Q), ring().sensor),
             "a motion and a Suite, got Increment and RangeBearing",

@@ -12,7 +12,7 @@ import worlds
 
 from jaxslam import association, life, motion, programs, resampling, sensors
 from jaxslam.consistency.score import _counted
-from jaxslam.filters import fastslam
+from jaxslam.filters import FastSlam
 from jaxslam.filters.particles.states import moments
 from jaxslam.filters.particles.states.slam_state import SlamParticles
 from jaxslam.run import run
@@ -36,7 +36,7 @@ STILL = dataclasses.replace(
 
 
 def of(world=RING, count=COUNT, capacity=6, **options):
-    return fastslam(world.motion, world.sensor, capacity, count, **options)
+    return FastSlam(world.motion, world.sensor, capacity, count, **options)
 
 
 def drive(filter, log, world=RING, key=KEY):
@@ -237,7 +237,9 @@ def test_the_start_is_reported_before_anything_is_drawn():
 
 def test_unknown_identities_of_landmarks_far_apart_give_the_same_filter():
     known, _, log = driven()
-    unknown = jax.device_get(drive(of(associate=association.joint(0.9999)), worlds.nameless(log)))
+    unknown = jax.device_get(
+        drive(of(associate=association.JointCompatibility(0.9999)), worlds.nameless(log))
+    )
     assert np.all(unknown.estimate.alive.sum(axis=1)[-1] == 6)
     np.testing.assert_allclose(unknown.estimate.pose, known.estimate.pose, atol=1e-9)
     np.testing.assert_allclose(unknown.final.landmarks, known.final.landmarks, atol=1e-9)
@@ -324,7 +326,7 @@ def test_negative_evidence_removes_a_landmark_from_every_map():
     _, log = worlds.draw(world)
     gone = (log.scan.tag == 5) & (np.arange(6) > 0)[:, None]
     log = log._replace(scan=log.scan._replace(valid=log.scan.valid & ~gone))
-    filter = of(world, 8, life=life.existence(lambda pose, landmark: jnp.asarray(True)))
+    filter = of(world, 8, life=life.Existence(lambda pose, landmark: jnp.asarray(True)))
     trace = jax.device_get(drive(filter, log, world))
     assert trace.final.life.log_odds.shape == (8, 6)
     np.testing.assert_array_equal(np.sort(trace.final.tag), [[-1, 0, 1, 2, 3, 4]] * 8)
@@ -423,7 +425,7 @@ def test_gradients_are_finite_where_the_pose_is_known_exactly(proposal):
     )
     start = jax.tree.map(jnp.asarray, start)
     scan = scan_of([(0, 1.1, -0.35), (1, 2.05, -0.42), (7, 3.0, 0.5)])
-    method = resampling.stop_gradient() if proposal == "motion" else resampling.systematic
+    method = resampling.StopGradient() if proposal == "motion" else resampling.systematic
 
     def cost(sigma):
         models = {
@@ -465,4 +467,4 @@ def test_gradients_are_finite_where_the_pose_is_known_exactly(proposal):
 def test_bad_input_is_refused(change, why):
     arguments = {"motion": RING.motion, "sensor": RING.sensor, "capacity": 6, "particles": 5}
     with pytest.raises(ValueError, match=why):
-        fastslam(**(arguments | change))
+        FastSlam(**(arguments | change))

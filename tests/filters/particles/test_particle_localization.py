@@ -13,7 +13,7 @@ import worlds
 from own_models import changed
 
 from jaxslam import association, motion, resampling, run, sensors
-from jaxslam.filters import fastslam, localization, particle_localization
+from jaxslam.filters import FastSlam, Localization, ParticleLocalization
 from jaxslam.filters.particles.states import region
 from jaxslam.sensors import Part, Suite
 from jaxslam.types import Scan, Status
@@ -27,7 +27,7 @@ BOX = np.array([[-4.0, -3.0], [4.0, 5.0]])
 
 
 def of(count, sensor=WORLD.sensor, move=WORLD.motion, **options):
-    return particle_localization(move, sensor, WORLD.landmarks, count, **options)
+    return ParticleLocalization(move, sensor, WORLD.landmarks, count, **options)
 
 
 def drive(filter, log, pose=(0.0, 0.0, 0.0), cov=None):
@@ -52,7 +52,7 @@ def test_many_particles_are_the_posterior_of_the_ekf():
     """Mean within 5 standard errors, covariance within 15 %, and the evidence of the log."""
     _, log = history(6)
     start = (0.02, -0.03, 0.01), np.diag([0.05, 0.05, 0.02]) ** 2
-    theirs = run(localization(WORLD.motion, WORLD.sensor, WORLD.landmarks), log, *start, KEY)
+    theirs = run(Localization(WORLD.motion, WORLD.sensor, WORLD.landmarks), log, *start, KEY)
     ours = drive(of(2000, least=2000), log, *start)
     mean, cov = np.asarray(theirs.estimate.pose[-1]), np.asarray(theirs.estimate.pose_cov[-1])
     error = np.asarray(ours.estimate.pose[-1]) - mean
@@ -136,7 +136,7 @@ def test_weights_are_the_scans_densities(gate):
 
 def test_landmarks_far_apart_are_known_without_tags_by_each_particle():
     truth, log = history(8)
-    likeliest = association.maximum_likelihood(1e6)
+    likeliest = association.MaximumLikelihood(1e6)
     trace = drive(
         of(60, BLUNT, associate=likeliest), worlds.nameless(log), cov=np.diag([0.1, 0.1, 0.05]) ** 2
     )
@@ -175,7 +175,7 @@ def carried():
     keys = jax.random.split(KEY, 6)
     go = jax.jit(jax.vmap(lambda key: run(lost, log, np.zeros(3), np.zeros((3, 3)), key)))
     ours = go(keys)
-    ekf = localization(WORLD.motion, BLUNT, WORLD.landmarks, gate=16.0)
+    ekf = Localization(WORLD.motion, BLUNT, WORLD.landmarks, gate=16.0)
     theirs = drive(ekf, log, (0.5, 1.0, 2.0))  # which is told where it starts
     off = np.linalg.norm(np.asarray(ours.estimate.pose)[:, :, :2] - truth[:, :2], axis=2)
     ekf_off = np.linalg.norm(np.asarray(theirs.estimate.pose)[:, :2] - truth[:, :2], axis=1)
@@ -256,7 +256,7 @@ def test_poses_that_are_not_finite_weigh_nothing_and_are_counted(kind):
         if kind == "localization":
             filter = of(16, BLUNT, breaking(level))
         else:
-            filter = fastslam(breaking(level), BLUNT, 6, 16, proposal="motion")
+            filter = FastSlam(breaking(level), BLUNT, 6, 16, proposal="motion")
         probe = lambda s: (s.pose, s.log_weight)  # noqa: E731
         return run(filter, log, np.zeros(3), np.zeros((3, 3)), KEY, probe=probe)
 
@@ -336,7 +336,7 @@ def test_gradients_are_finite_from_a_start_that_is_known_exactly():
     def cost(sigma):
         move = motion.Increment(jnp.diag(sigma[:2]) ** 2)
         sensor = sensors.RangeBearing(sigma[2] ** 2 * jnp.eye(2), mount=MOUNT)
-        filter = of(12, sensor, move, resample=resampling.stop_gradient(), box=BOX)
+        filter = of(12, sensor, move, resample=resampling.StopGradient(), box=BOX)
         trace = run(filter, log, np.zeros(3), np.zeros((3, 3)), KEY)
         return trace.info.log_likelihood.sum() + trace.estimate.pose_cov[-1].sum()
 
@@ -350,7 +350,7 @@ BAD = {
     "half": ({"particles": 2.5}, "particles: expected an integer"),
     "least": ({"least": 0}, "least: expected an integer"),
     "more": ({"least": 6}, "least <= particles = 5"),
-    "map": ({"landmarks": np.zeros((3, 3))}, "particle_localization: expected landmarks of shape"),
+    "map": ({"landmarks": np.zeros((3, 3))}, "ParticleLocalization: expected landmarks of shape"),
     "tags": ({"tags": [0, 0, 1, 2, 3, 4]}, "different tags"),
     "start": ({"start": "anywhere"}, 'start "gaussian" or "uniform"'),
     "no box": ({"start": "uniform"}, "expected a box"),
@@ -372,7 +372,7 @@ def test_bad_input_is_refused(case):
     change, why = BAD[case]
     options = {"landmarks": WORLD.landmarks, "particles": 5} | change
     with pytest.raises(ValueError, match=why):
-        particle_localization(
+        ParticleLocalization(
             WORLD.motion,
             WORLD.sensor,
             options.pop("landmarks"),

@@ -343,7 +343,7 @@ def test_information_gained_is_drawn_for_watched_filters_and_zeros_below_the_axi
     assert high > 50
     nobody = plot.gained_figure(drawn.campaign(["dead_reckoning"]))
     assert [text.get_text() for text in nobody.axes[0].texts] == [
-        "no filter has an observability monitor (filters.monitored)"
+        "no filter has an observability monitor (filters.Monitored)"
     ]
 
 

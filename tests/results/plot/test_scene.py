@@ -385,7 +385,7 @@ def test_mapping_from_a_known_path_is_filmed():
     world = worlds.ring(4)
     truth, log = jaxslam.simulate(world, jax.random.key(0))
     log, start = log._replace(control=truth.pose), (np.zeros(3), np.zeros((3, 3)))
-    mapping = filters.mapping(world.sensor, 6)
+    mapping = filters.Mapping(world.sensor, 6)
     trace = jaxslam.run(mapping, log, *start, jax.random.key(1), probe=plot.probe)
     film = plot.animate(trace, log, truth)
     assert film.said[0] == "step 1 of 4 · 6 measurements: 0 fused, 6 new, 0 dropped"

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam.math import linalg
-from jaxslam.protocols import Chart, Filter
+from jaxslam.protocols import Chart
 from jaxslam.types import Info, Scan
 
 
@@ -89,27 +89,12 @@ LinearSystem = tuple[Transition | LinearMeasurements | LinearLandmarks, ...]
 
 @dataclass(frozen=True, eq=False)
 class LinearizedSteps:
-    """The steps of a filter with the linear system of each; `predict` and `update` are without."""
+    """The steps of a filter with the linear system of each, `Filter.linearized`."""
 
-    predict_linearized: Callable[[PyTree, Array, Array], tuple[PyTree, LinearSystem]]
+    predict: Callable[[PyTree, Array, Array], tuple[PyTree, LinearSystem]]
     """(S, u, key) -> S, system."""
-    update_linearized: Callable[[PyTree, Scan, Array], tuple[PyTree, Info, LinearSystem]]
+    update: Callable[[PyTree, Scan, Array], tuple[PyTree, Info, LinearSystem]]
     """(S, scan, key) -> S, info, system."""
-
-    def predict(self, state: PyTree, u: Array, key: Array) -> PyTree:
-        """The prediction step, as `Filter.predict`."""
-        return self.predict_linearized(state, u, key)[0]
-
-    def update(self, state: PyTree, scan: Scan, key: Array) -> tuple[PyTree, Info]:
-        """The update with a scan, as `Filter.update`."""
-        return self.update_linearized(state, scan, key)[:2]
-
-
-def linearized_steps(filter: Filter) -> LinearizedSteps | None:
-    """The record whose methods the steps of a filter are; None where they are other functions."""
-    steps = getattr(filter.update, "__self__", None)
-    known = isinstance(steps, LinearizedSteps) and filter.predict == steps.predict
-    return steps if known else None
 
 
 def basis_of_each(

@@ -116,7 +116,7 @@ def update_by_sensor(joint: Joint, scan: Scan, settings: EkfSettings) -> ScanUpd
     # Padding may hold any number, and is multiplied by zero below.
     scan = scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
     found, matched = associate_scan(joint, scan, settings)
-    at_once = settings.update == "joint" and len(scan.tag) > 0
+    at_once = settings.correction == "joint" and len(scan.tag) > 0
     by_scan = correct if at_once else correct_in_turn
     slot = jnp.maximum(found.slot, 0)
     joint, done = by_scan(joint, scan.z, slot, matched, settings)
@@ -197,11 +197,11 @@ def _with_room(
     settings: EkfSettings,
 ) -> tuple[Joint, Bool[Array, "N"]]:
     """The map without the landmarks that `Life.make_room` removes for new ones, and which."""
-    if settings.make_room is None or settings.make_room.make_room is None:
+    if settings.life is None or settings.life.make_room is None:
         return joint, jnp.zeros_like(joint.alive)
     needed = wanted.sum() - (~joint.alive).sum()
     measured = slots.concerned(slot, used, len(joint.alive))
-    evicted = settings.make_room.make_room(joint, needed, measured)
+    evicted = settings.life.make_room(joint, needed, measured)
     return without_landmarks(joint, evicted, square_root=settings.square_root), evicted
 
 

@@ -10,7 +10,6 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.filters.information import canonical
-from jaxslam.filters.information.settings import SparseSettings
 from jaxslam.filters.information.sparse.sparse_state import (
     SparseState,
     active_residual,
@@ -72,13 +71,14 @@ def recover_active_means(
 
 
 def repeat_recovery(
-    settings: SparseSettings,
     state: SparseState,
     omega: Float[Array, "D D"],
     solved: Bool[Array, ""],
+    recovered: int,
+    sweeps: int,
 ) -> SparseState:
     """Mean recovery, the rounds after the first: passive landmarks, then the active block."""
-    for _ in range(settings.sweeps - 1):
-        state = recover_passive_means(state, settings.recovered)
+    for _ in range(sweeps - 1):
+        state = recover_passive_means(state, recovered)
         state, _ = recover_active_means(state, omega, active_residual(state), solved)
     return state

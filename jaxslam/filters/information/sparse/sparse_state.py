@@ -1,4 +1,4 @@
-"""The sparse canonical form of `filters.seif`: a dense active block of Ω, and lists of links.
+"""The sparse canonical form of `filters.Seif`: a dense active block of Ω, and lists of links.
 
 Ω of the robot and the A active landmarks is one dense block. A passive landmark has no link to the
 robot; its links to other landmarks are in its list of at most K. A pair of which both are active is

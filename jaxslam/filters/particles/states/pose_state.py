@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.filters.particles.settings import MonteCarloSettings
 from jaxslam.filters.particles.states.moments import weighted_pose_moments
+from jaxslam.filters.particles.states.region import Region
 from jaxslam.filters.particles.states.slam_state import draw_pose
 from jaxslam.math.xla import change_where
 
@@ -58,14 +58,16 @@ def no_events() -> ParticleEvents:
 
 
 def initial_pose_particles(
-    pose: Float[Array, "3"], start_cov: Float[Array, "3 3"], settings: MonteCarloSettings
+    pose: Float[Array, "3"],
+    start_cov: Float[Array, "3 3"],
+    particles: int,
+    region: Region | None = None,
 ) -> PoseParticles:
-    """The initial state: P copies of the pose, to be drawn from N(pose, start_cov) or the
+    """The initial state: P copies of the pose, to be drawn from N(pose, start_cov), or from a
     region."""
-    kind, particles = pose.dtype, settings.particles
-    if settings.start == "uniform":
-        assert settings.region is not None
-        pose, start_cov = settings.region.moments(kind)
+    kind = pose.dtype
+    if region is not None:
+        pose, start_cov = region.moments(kind)
     zero, no = jnp.zeros((), kind), jnp.asarray(False)
     return PoseParticles(
         pose=jnp.broadcast_to(pose, (particles, 3)),
@@ -82,13 +84,12 @@ def initial_pose_particles(
     )
 
 
-def draw_start(state: PoseParticles, key: Array, settings: MonteCarloSettings) -> PoseParticles:
-    """The state with its initial poses drawn, if not done before."""
+def draw_start(state: PoseParticles, key: Array, region: Region | None) -> PoseParticles:
+    """The state with its initial poses drawn, if not done before; from a region, where given."""
 
     def drawn(poses: Float[Array, "P 3"]) -> Float[Array, "P 3"]:
-        if settings.start == "uniform":
-            assert settings.region is not None
-            return settings.region.draw(settings.particles, key, poses.dtype)
+        if region is not None:
+            return region.draw(len(poses), key, poses.dtype)
         return draw_gaussian_poses(poses, state.start_cov, key)
 
     return state._replace(

@@ -151,7 +151,7 @@ def gained_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
         axes.set(yscale="log", xlim=step_limits(campaign.steps), ylim=(_NOTHING * 10**-strip, top))
         _label_powers(axes, strip, decades)
     if not curves:
-        said = "no filter has an observability monitor (filters.monitored)"
+        said = "no filter has an observability monitor (filters.Monitored)"
         axes.text(0.5, 0.6, said, transform=axes.transAxes, ha="center", fontsize=8)
     title = (
         f"{head(campaign)}: information gained on a turn of the whole frame, {runs_of(campaign)}"

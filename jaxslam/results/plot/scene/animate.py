@@ -44,7 +44,7 @@ def animate(
         film.save("slam.mp4")  # or .gif, .html
 
     With a trace of `run(…, probe=jaxslam.plot.probe)` it shows the particles of a particle filter,
-    the links of an information filter, and the hypotheses of `delayed_slam`. Of more than `frames`
+    the links of an information filter, and the hypotheses of `DelayedSlam`. Of more than `frames`
     steps so many are shown, evenly in time; a frame has the beams of the steps since the one
     before. `Film.note` says so.
 

@@ -39,7 +39,7 @@ class Hypotheses(NamedTuple):
 
 
 def probe(state: PyTree) -> Cloud | Links | Hypotheses | None:
-    """What `animate` shows of the state of a particle filter, information filter or `delayed_slam`.
+    """What `animate` shows of the state of a particle filter, information filter or `DelayedSlam`.
 
         trace = jaxslam.run(filter, log, pose, pose_cov, key, probe=jaxslam.plot.probe)
 

@@ -10,19 +10,16 @@ from jaxtyping import Bool, Float, Int
 
 from jaxslam.association.gates import check_gates, far_from_all
 from jaxslam.core.numbers import check_count
+from jaxslam.core.record import record, static
 from jaxslam.math import linalg
+from jaxslam.math.arrays import Number
 from jaxslam.math.stats import chi2_quantile
-from jaxslam.protocols import Associate, Association, Pairs, Prediction
+from jaxslam.protocols import Association, Pairs, Prediction
 from jaxslam.types import Scan
 
 
-def joint(
-    probability: float = 0.99,
-    new_gate: float | None = None,
-    *,
-    budget: int = 2000,
-    candidates: int = 8,
-) -> Associate:
+@record
+class JointCompatibility:
     """JCBB: the largest jointly compatible set of pairs; of several, that of least distance.
 
     Of a hypothesis H = {(i, j)} with m pairs, D² = ν_Hᵀ S_H⁻¹ ν_H with all cross-covariances, and
@@ -36,36 +33,45 @@ def joint(
     their order.) Without a measurement's landmark at most `new_gate` away it is new; by default
     that is χ²(Z, p).
 
-    Args:
-        probability: p of both tests, 0 to 1.
-        budget: nodes of the search. Where they do not suffice, the best so far is returned, and
-            `Association.exhausted` is set.
-        candidates: compatible landmarks a measurement is tried with, the nearest; where there are
-            more, `exhausted` is set.
-    Raises:
-        ValueError: on a probability outside 0 to 1, or a budget or candidates below 1; from the
-            filter's update, on a new_gate below the gate of single pairs.
+    Raises ValueError on a probability outside 0 to 1, or a budget or candidates below 1; from the
+    filter's update, on a new_gate below the gate of single pairs.
     """
-    if not 0 <= probability <= 1:
-        raise ValueError(f"joint: expected a probability from 0 to 1, got {probability}")
-    check_count("joint: budget", budget)
-    check_count("joint: candidates", candidates)
 
-    def associate(prediction: Prediction, scan: Scan) -> Association:
+    probability: float = static(default=0.99)
+    """p of both tests, 0 to 1"""
+    new_gate: Number | None = None
+    """of squared distance, for new landmarks"""
+    budget: int = static(default=2000, kw_only=True)
+    """nodes of the search. Where they do not suffice, the best so far is returned, and
+    `Association.exhausted` is set"""
+    candidates: int = static(default=8, kw_only=True)
+    """compatible landmarks a measurement is tried with, the nearest; where there are more,
+    `exhausted` is set"""
+
+    def __post_init__(self) -> None:
+        what = "JointCompatibility"
+        if not 0 <= self.probability <= 1:
+            raise ValueError(f"{what}: expected a probability from 0 to 1, got {self.probability}")
+        check_count(f"{what}: budget", self.budget)
+        check_count(f"{what}: candidates", self.candidates)
+
+    def __call__(self, prediction: Prediction, scan: Scan) -> Association:
         pairs: Pairs = jax.lax.stop_gradient(prediction.pairs(scan))
         m, _, size_z = pairs.innovation.shape
         if m == 0:
             return Association(jnp.full(0, -1, jnp.int32), scan.valid, jnp.asarray(False))
-        quantiles = _quantiles(probability, m, size_z)
-        beyond = check_gates("joint", float(quantiles[1]), new_gate)
+        quantiles = _quantiles(self.probability, m, size_z)
+        gate = float(quantiles[1])
+        check_gates("JointCompatibility", gate, self.new_gate)
         levels = jnp.asarray(quantiles, pairs.distance.dtype)
-        problem = _problem(pairs, jax.lax.stop_gradient(prediction.cross()), levels, candidates)
-        found = _search(problem, budget)
+        cross = jax.lax.stop_gradient(prediction.cross())
+        problem = _problem(pairs, cross, levels, self.candidates)
+        found = _search(problem, self.budget)
         exhausted = (found.level >= 0) | problem.cut
         slot = found.best
-        return Association(slot, far_from_all(pairs, scan, beyond) & (slot < 0), exhausted)
-
-    return associate
+        return Association(
+            slot, far_from_all(pairs, scan, gate, self.new_gate) & (slot < 0), exhausted
+        )
 
 
 def _quantiles(probability: float, m: int, size_z: int) -> np.ndarray:
