@@ -42,7 +42,7 @@ def run(
     mode stores one state a step, and recomputes each step in the backward pass.
 
     Args:
-        filter: made by a factory of `jaxslam.filters`.
+        filter: a record, as of `jaxslam.filters`.
         log: T rows; control (T, U), scans of M measurement slots.
         pose: (3,) where the robot is before the first control.
         pose_cov: (3, 3) its covariance; zero is allowed.

@@ -33,7 +33,7 @@ def of_log(
     tags: ArrayLike | None = None,
     capacity: int | None = None,
 ) -> tuple[Graph, dict[str, Factor]]:
-    """The graph of a log of T steps, and its factors: its optimum is that of `batch_map`.
+    """The graph of a log of T steps, and its factors: its optimum is that of `BatchMap`.
 
     Its tables, their factors, and the number of their rows:
 
@@ -49,7 +49,7 @@ def of_log(
     is given, the factor of the motion is `nominal_motion` with Ω = (G Q Gᵀ + s² I)⁻¹. With fewer
     components (`Unicycle`, `Increment`, `Ackermann`) the motion is a constraint, which s > 0, the
     standard deviation of each coordinate [m, m, rad], makes soft: the optimum differs from that of
-    `batch_map` by the order of s², and the condition of the problem is worse by s⁻².
+    `BatchMap` by the order of s², and the condition of the problem is worse by s⁻².
 
     With `capacity` a tag is the number of its point, and all shapes are known, so that logs may be
     traced and batched; points that no scan saw are fixed at the origin. Without, the points are the

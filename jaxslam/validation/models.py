@@ -20,7 +20,7 @@ _SOUND: weakref.WeakSet[Motion | Sensor] = weakref.WeakSet()
 
 
 def check_models(name: str, motion: object, sensor: object) -> None:
-    """Raise ValueError, which begins with a factory's name, unless these are a Motion and a Sensor.
+    """Raise ValueError, which begins with a caller's name, unless these are a Motion and a Sensor.
 
     Their functions are evaluated on shapes alone (`jax.eval_shape`): they must take the arguments
     that `protocols` says and return arrays of the sizes that their names say.
@@ -89,7 +89,7 @@ def check_parts(
 
 
 def check_record(name: str, what: str, value: object, kind: type[_Record]) -> _Record:
-    """The value, if it is such a record; ValueError if not, as on a factory that was not called."""
+    """The value, if it is such a record; ValueError if not, as on a class that was not called."""
     if isinstance(value, kind):
         return value
     what = f"{what} to be {'an' if kind.__name__[0] in 'AEIO' else 'a'} {kind.__name__}"

@@ -1,4 +1,4 @@
-"""The prior of the unmeasured landmark parameters: Solà's s ~ N(s̄, S), checked by the factory."""
+"""The prior of the unmeasured landmark parameters: Solà's s ~ N(s̄, S), checked by the sensor."""
 
 import jax.numpy as jnp
 import numpy as np
