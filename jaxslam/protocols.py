@@ -515,7 +515,10 @@ class Wrapper(Filter):
 
     def __post_init__(self) -> None:
         if not isinstance(self.filter, Filter):
-            got = type(self.filter).__name__
+            made = isinstance(self.filter, type)
+            got = (
+                f"the class {self.filter.__name__}: call it" if made else type(self.filter).__name__
+            )
             raise ValueError(f"{type(self).__name__}: expected a filter, got {got}")
         super().__post_init__()
 

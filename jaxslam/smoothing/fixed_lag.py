@@ -29,6 +29,7 @@ from jaxslam.math.arrays import Number
 from jaxslam.protocols import Associate, Filter, Motion, Sensor
 from jaxslam.sensors.suite import Suite
 from jaxslam.slots import Joint
+from jaxslam.smoothing.forward_pass import joint_ekf
 from jaxslam.types import Estimate, Info, Scan, Status
 
 POINT = ("x [m]", "y [m]")
@@ -164,15 +165,7 @@ class FixedLag(Filter):
 
     @property
     def _ekf(self) -> EkfSlam:
-        return EkfSlam(
-            self.motion,
-            self.sensor,
-            self.capacity,
-            associate=self.associate,
-            correction="joint",
-            gate=self.gate,
-            births=self.births,
-        )
+        return joint_ekf(self)
 
     def _begun(self, joint: Joint) -> WindowState:
         sizes = len(self.motion.controls), len(self.motion.noises)

@@ -1,7 +1,7 @@
 """The forward pass of a smoother: EKF-SLAM over the log, which stores its linearization points."""
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -69,6 +69,19 @@ class _Forward(Wrapper):
         return self.filter.estimate(state.joint)
 
 
+def joint_ekf(of: Any) -> EkfSlam:
+    """The EKF-SLAM with joint correction in the Euclidean chart of an estimator's fields."""
+    return EkfSlam(
+        of.motion,
+        of.sensor,
+        of.capacity,
+        associate=of.associate,
+        correction="joint",
+        gate=of.gate,
+        births=of.births,
+    )
+
+
 @record
 class LogEstimator(Component):
     """What estimators of a whole log share: models, start, and the EKF-SLAM of the forward pass.
@@ -124,17 +137,7 @@ class LogEstimator(Component):
 
     @property
     def _filter(self) -> Filter:
-        """EKF-SLAM with joint correction in the Euclidean chart."""
-        ekf = EkfSlam(
-            self.motion,
-            self.sensor,
-            self.capacity,
-            associate=self.associate,
-            correction="joint",
-            gate=self.gate,
-            births=self.births,
-        )
-        return _Forward(ekf)
+        return _Forward(joint_ekf(self))
 
     def _forward(self, log: Log, key: Array) -> ForwardPass:
         """The forward pass; arguments and errors are those of `run`."""

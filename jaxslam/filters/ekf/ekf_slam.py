@@ -129,8 +129,18 @@ class EkfSlam(Filter):
 
     @property
     def _settings(self) -> EkfSettings:
-        names = [field.name for field in dataclasses.fields(EkfSettings)]
-        return EkfSettings(**{name: getattr(self, name) for name in names if hasattr(self, name)})
+        return EkfSettings(
+            sensor=self.sensor,
+            chart=self.chart,
+            linearize=self.linearize,
+            associate=self.associate,
+            correction=self.correction,
+            gate=self.gate,
+            iterations=self.iterations,
+            covariance=self.covariance,
+            births=self.births,
+            life=self.life,
+        )
 
     def _predict(
         self, joint: Joint, u: Float[Array, "U"], key: Array

@@ -16,6 +16,10 @@ class Managed(Wrapper):
     of it. A subclass defines `manage`, and may extend `init`.
     """
 
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        self._check(Managed, {"manage": "joint, scan, info"})
+
     def manage(self, joint: Joint, scan: Scan, info: Info) -> tuple[Joint, Info]:
         """The map and the info after a scan."""
         raise NotImplementedError

@@ -1,6 +1,6 @@
 """The landmark EKFs of one particle, given its drawn pose.
 
-All functions act on one particle; `fastslam` vmaps them, `mapping` has only one.
+All functions act on one particle; `FastSlam` vmaps them, `Mapping` has only one.
 """
 
 from typing import NamedTuple

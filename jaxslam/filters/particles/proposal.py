@@ -1,6 +1,6 @@
 """Proposal distributions of a particle's pose: from the motion, or from motion and scan.
 
-The functions of a `SlamParticles` act on one particle; `fastslam` vmaps them.
+The functions of a `SlamParticles` act on one particle; `FastSlam` vmaps them.
 """
 
 from typing import NamedTuple

@@ -36,7 +36,7 @@ class AssociationSettings:
 
 @dataclass(frozen=True, eq=False)
 class ParticleMapSettings(AssociationSettings):
-    """The settings of one particle's map update, of `fastslam` and `mapping`."""
+    """The settings of one particle's map update, of `FastSlam` and `Mapping`."""
 
     quota: int | None
     """new landmarks a scan at the most"""
