@@ -14,7 +14,6 @@ would put them into the mapped part. The folder is JAXSLAM_DATA, by default ../s
 that are not there are left out.
 """
 
-import dataclasses
 import os
 import sys
 import time
@@ -29,6 +28,7 @@ from benchmarks.gate import Metric, alone
 from benchmarks.real_data import DATA
 from jaxslam import consistency, datasets, grids, motion, run
 from jaxslam.consistency.nees import pose_error
+from jaxslam.core.record import record
 from jaxslam.simulation import laser, walls
 from jaxslam.simulation.scenarios import office
 
@@ -74,13 +74,12 @@ def learnt(grid, world):
     return grids.fit(np.asarray(log.beams.range)[seen], np.asarray(expected)[seen], far)
 
 
-def in_single(model):
-    """The model in float32, in half the time; the draws of the world stay in float64."""
+@record
+class SingleRayCast(grids.RayCast):
+    """The ray-cast model in float32, in half the time; the world's draws stay in float64."""
 
-    def each(prepared, pose, beams):
-        return model.each(*single_log((prepared, pose, beams))).astype(pose.dtype)
-
-    return dataclasses.replace(model, each=each)
+    def each(self, prepared, pose, beams):
+        return super().each(*single_log((prepared, pose, beams))).astype(pose.dtype)
 
 
 def tempering_field(runs, sigma=0.03):
@@ -95,7 +94,7 @@ def tempering_rays(runs):
     world, grid = office(beams=BEAMS), office_map()
     mixture = learnt(grid, office())
     far = world.laser.max_range
-    model = in_single(grids.RayCast(mixture, max_range=far))
+    model = SingleRayCast(mixture, max_range=far)
     told = ", ".join(f"{name} {value:.4f}" for name, value in mixture._asdict().items())
     return tempering("office, ray_cast", world, grid, model, told, RAY_EXPONENTS, runs)
 
