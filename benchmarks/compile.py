@@ -1,6 +1,6 @@
 """What a first run waits for: `python -m benchmarks.compile [--only NAMES] [--quick]`.
 
-Seconds of tracing, lowering and XLA's compilation of one `run` of every filter of the catalogue, of
+Seconds of tracing, lowering and XLA's compilation of one run of every filter of the catalogue, of
 `DelayedSlam`, `TeamSlam`, an EKF with life and merging, the smoother and the batch solution,
 and of gradients through runs of an EKF; how many programs XLA compiled when the same was run again
 with every noise, gate and map value changed (asked: none); and what a second call of `run` costs
@@ -8,11 +8,10 @@ beyond its program. Compilation does not depend on the number of steps. Idle mac
 """
 
 import dataclasses
-import inspect
 import itertools
 import time
 from collections.abc import Callable
-from typing import Any, cast
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -20,15 +19,17 @@ import numpy as np
 
 from benchmarks.delayed import named
 from benchmarks.gate import Metric, alone
-from jaxslam import catalog, life, motion, programs, sensors, smoothing, team
+from jaxslam import catalog, life, motion, sensors, smoothing, team
 from jaxslam.filters import EkfSlam, TeamSlam
 from jaxslam.filters.map_management.merging import Merging
+from jaxslam.monte_carlo.candidates import estimator_of
 from jaxslam.protocols import Filter
 from jaxslam.run import run
 from jaxslam.sensors import Part, Suite
 from jaxslam.simulation.scenarios import circle
-from jaxslam.simulation.team_world import team_world
-from jaxslam.simulation.worlds import Scenario, simulate
+from jaxslam.simulation.team_world import TeamWorld
+from jaxslam.simulation.worlds import Scenario, World, simulate
+from jaxslam.types import Log, Trace, Truth
 
 GATE, DELAYED_GATE = 8.0, 10.0
 STEPS = 20
@@ -48,7 +49,7 @@ def world(scale: float) -> Scenario:
     )
 
 
-def crew(scale: float) -> tuple[Scenario, Filter]:
+def crew(scale: float) -> tuple[World, Filter]:
     eyes = sensors.RangeBearing(np.diag([0.05, 0.02]) ** 2 * scale)
     sees = Suite((Part(eyes, 4), Part(eyes, 1, every=2, sees="robots")))
     moves = motion.Increment(np.diag([0.01, 0.01]) ** 2 * scale)
@@ -56,33 +57,33 @@ def crew(scale: float) -> tuple[Scenario, Filter]:
     robots = [team.Robot(moves, sees), team.Robot(moves, sees, second)]
     points = 3.0 * scale * np.stack([np.cos(np.arange(8)), np.sin(np.arange(8))], axis=1)
     controls = np.tile([0.12, 0.1, 0.12, -0.1], (STEPS, 1))
-    return team_world(robots, points, controls), TeamSlam(robots, 8)
+    return TeamWorld(robots, points, controls), TeamSlam(robots, 8)
 
 
-def cases() -> dict[str, Callable[[float], tuple[Scenario, Any]]]:
-    """By name: (scale) -> a scenario and a filter, or an estimator, with every number scaled."""
+def cases() -> dict[str, Callable[[float], tuple[World, Any]]]:
+    """By name: (scale) -> a world and a filter, or an estimator, with every number scaled."""
 
-    def of_family(name: str) -> Callable[[float], tuple[Scenario, Any]]:
-        def make(scale: float) -> tuple[Scenario, Any]:
+    def of_family(name: str) -> Callable[[float], tuple[World, Any]]:
+        def make(scale: float) -> tuple[World, Any]:
             there = world(scale)
             return there, catalog.ALL[name](there, gate=9.21 * scale)
 
         return make
 
-    def delayed(scale: float) -> tuple[Scenario, Any]:
+    def delayed(scale: float) -> tuple[World, Any]:
         there, filters = named(6)
         controls = np.asarray(there.controls)[:STEPS] * scale
         return dataclasses.replace(there, controls=controls), filters["delayed"]
 
-    def managed(scale: float) -> tuple[Scenario, Any]:
+    def managed(scale: float) -> tuple[World, Any]:
         there = world(scale)
         keeps = life.Existence(there.visible, detected=0.9 * scale, patience=50)
         count = len(there.landmarks)
         plain = EkfSlam(there.motion, there.sensor, count, correction="joint", life=keeps)
         return there, Merging(plain, 0.5 * scale)
 
-    def smoother(make: Callable[..., Any]) -> Callable[[float], tuple[Scenario, Any]]:
-        def of(scale: float) -> tuple[Scenario, Any]:
+    def smoother(make: Callable[..., Any]) -> Callable[[float], tuple[World, Any]]:
+        def of(scale: float) -> tuple[World, Any]:
             there = world(scale)
             count = len(there.landmarks)
             return there, make(there.motion, there.sensor, count, there.pose, there.pose_cov)
@@ -98,22 +99,19 @@ def cases() -> dict[str, Callable[[float], tuple[Scenario, Any]]]:
     }
 
 
-def estimator(there: Scenario, method: Any, truth: Any) -> Callable[..., Any]:
-    """(log, key) -> trace."""
-    if not isinstance(method, Filter) and len(inspect.signature(method).parameters) == 1:
-        method = method(truth)
-    if not isinstance(method, Filter):
-        return cast(Callable[..., Any], method)
-    return lambda log, key: run(method, log, there.pose, there.pose_cov, key)
+@jax.jit
+def drive(method: Any, there: World, truth: Truth, log: Log, key: jax.Array) -> Trace:
+    """The trace of a campaign's candidate over a log."""
+    estimate, _ = estimator_of(method, truth, there)
+    return estimate(log, key)
 
 
-def seconds(function: Callable[..., Any], *arguments: Any) -> tuple[float, float, float]:
-    """Of tracing, lowering and compiling a function, its numbers as arguments."""
+def seconds(program: Any, *arguments: Any) -> tuple[float, float, float]:
+    """Of tracing, lowering and compiling a jitted function."""
     began = time.perf_counter()
-    traced = programs.trace(function, *arguments)
-    assert traced is not None
+    traced = program.trace(*arguments)
     at = time.perf_counter()
-    lowered = jax.jit(traced.call).lower(traced.numbers, *jax.tree.leaves(arguments))
+    lowered = traced.lower()
     then = time.perf_counter()
     lowered.compile()
     return at - began, then - at, time.perf_counter() - then
@@ -134,19 +132,19 @@ def measure(only: str = "", quick: bool = False) -> list[Metric]:
     for name, make in chosen.items():
         there, method = make(1.0)
         truth, log = simulate(there, key)
-        taken = seconds(estimator(there, method, truth), log, key)
+        taken = seconds(drive, method, there, truth, log, key)
         print(f"{name:24} " + " ".join(f"{x:7.2f}" for x in taken) + f" {sum(taken):8.2f}")
         high = DELAYED_GATE if name == "delayed_slam" else GATE
         metrics.append(Metric(f"{name}: first run [s]", sum(taken), high=high))
         if quick:
             continue
-        estimator(there, method, truth)(log, key)
+        jax.block_until_ready(drive(method, there, truth, log, key))
         there, method = make(1.07)
         truth, log = simulate(there, key)
-        drive, before = estimator(there, method, truth), count[0]
-        drive(log, key)
+        before = count[0]
+        jax.block_until_ready(drive(method, there, truth, log, key))
         metrics.append(Metric(f"{name}: compiled for other numbers", count[0] - before, high=0.0))
-        programs.clear()
+        jax.clear_caches()
     if not wanted:
         metrics += gradients(key) + overhead(key)
     jax.monitoring.unregister_event_duration_listener(listen)
@@ -167,7 +165,7 @@ def gradients(key: jax.Array) -> list[Metric]:
             trace = run(ekf, log, there.pose, there.pose_cov, key)
             return trace.info.log_likelihood.sum()
 
-        taken = seconds(jax.value_and_grad(cost), at, log)
+        taken = seconds(jax.jit(jax.value_and_grad(cost)), at, log)
         name = f"gradient, {correction}"
         print(f"{name:24} " + " ".join(f"{x:7.2f}" for x in taken) + f" {sum(taken):8.2f}")
         metrics.append(Metric(f"{name}: first run [s]", sum(taken), high=GATE))
@@ -187,13 +185,13 @@ def overhead(key: jax.Array) -> list[Metric]:
     _, log = simulate(there, key)
     arguments = log, jnp.asarray(there.pose, float), jnp.asarray(there.pose_cov, float), key
 
-    def drive(log: Any, pose: Any, pose_cov: Any, key: jax.Array) -> Any:
+    def again(log: Any, pose: Any, pose_cov: Any, key: jax.Array) -> Any:
         return run(ekf, log, pose, pose_cov, key)
 
     def rebuilt(log: Any, pose: Any, pose_cov: Any, key: jax.Array) -> Any:
         return run(next(others), log, pose, pose_cov, key)
 
-    compiled = jax.jit(drive).lower(*arguments).compile()
+    compiled = jax.jit(again).lower(*arguments).compile()
 
     def median(call: Callable[..., Any]) -> float:
         taken = []
@@ -204,7 +202,7 @@ def overhead(key: jax.Array) -> list[Metric]:
         return float(np.median(taken[1:])) * 1e3
 
     program = median(compiled)
-    beyond, beyond_rebuilt = median(drive) - program, median(rebuilt) - program
+    beyond, beyond_rebuilt = median(again) - program, median(rebuilt) - program
     draw = median(lambda *_: simulate(there, key))
     return [
         Metric("run again, beyond its program [ms]", beyond, high=OVERHEAD_MS),

@@ -22,7 +22,7 @@ from jaxslam import datasets, filters
 from jaxslam.filters.information.sparse.marginals import blanket_marginals, whole_marginals
 from jaxslam.math.gaussians import mahalanobis_squared
 from jaxslam.simulation.scenarios import circle, cloister
-from jaxslam.simulation.scenarios.view import between_ranges
+from jaxslam.simulation.scenarios.view import BetweenRanges
 from jaxslam.simulation.worlds import simulate
 
 KEY = jax.random.key(0)
@@ -125,7 +125,7 @@ def measure(runs: int = 10, steps: int = 300) -> list[Metric]:
     start = np.diag([0.01, 0.01, 0.005]) ** 2
     ring = dataclasses.replace(circle(steps), pose_cov=start)
     near = dataclasses.replace(
-        cloister(steps), visible=between_ranges(0.0, 3.0), places=14, pose_cov=start
+        cloister(steps), visible=BetweenRanges(0.0, 3.0), places=14, pose_cov=start
     )
     metrics = []
     # On circle 20 active are all there are, and SEIF is the EIF; so 8 as well, for the table.

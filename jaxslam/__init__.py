@@ -39,7 +39,7 @@ from jaxslam.monte_carlo import Campaign, Interrupted, monte_carlo
 from jaxslam.run import run
 from jaxslam.simulation import scenarios, spurious
 from jaxslam.simulation.recorded import recorded_world
-from jaxslam.simulation.team_world import team_world
+from jaxslam.simulation.team_world import TeamWorld
 from jaxslam.simulation.worlds import Scenario, simulate
 from jaxslam.verify import linearity, verify_jacobians
 from jaxslam.verify.linearity import linearity_index
@@ -48,6 +48,7 @@ __all__ = [
     "Campaign",
     "Interrupted",
     "Scenario",
+    "TeamWorld",
     "association",
     "calibration",
     "catalog",
@@ -79,7 +80,6 @@ __all__ = [
     "spurious",
     "stats",
     "team",
-    "team_world",
     "topology",
     "uncertain_poses",
     "verify_jacobians",

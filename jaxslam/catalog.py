@@ -6,13 +6,16 @@ line run them side by side.
 """
 
 from collections.abc import Callable
+from dataclasses import replace
 from typing import Any, Literal, Unpack
 
 import jax.numpy as jnp
 import numpy as np
+from numpy.typing import ArrayLike
 
 from jaxslam.charts.left_invariant import LeftInvariant
 from jaxslam.charts.right_invariant import RightInvariant
+from jaxslam.core.record import record, static
 from jaxslam.filters.ekf.ekf_slam import EkfSlam
 from jaxslam.filters.ekf.observability import Monitored
 from jaxslam.filters.ekf.settings import EkfOptions
@@ -30,14 +33,14 @@ from jaxslam.linearize.observability import Observability
 from jaxslam.linearize.unscented import Unscented
 from jaxslam.protocols import Candidate, Estimator, Filter
 from jaxslam.run import run
-from jaxslam.simulation.worlds import Scenario
+from jaxslam.simulation.worlds import World
 from jaxslam.smoothing.batch_map import BatchMap
 from jaxslam.smoothing.fixed_lag import FixedLag
 from jaxslam.types import Truth
 from jaxslam.validation.names import Named
 
 
-def variant(scenario: Scenario, *, watch: bool = False, **options: Unpack[EkfOptions]) -> Filter:
+def variant(scenario: World, *, watch: bool = False, **options: Unpack[EkfOptions]) -> Filter:
     """EKF-SLAM with the scenario's options, which these arguments of `filters.EkfSlam` replace.
 
     watch: with an observability monitor (`filters.Monitored`).
@@ -51,17 +54,55 @@ def variant(scenario: Scenario, *, watch: bool = False, **options: Unpack[EkfOpt
     return Monitored(filter) if watch else filter
 
 
-def ideal(scenario: Scenario, **options: Unpack[EkfOptions]) -> Callable[[Truth], Filter]:
+def ideal(
+    scenario: World, *, watch: bool = False, **options: Unpack[EkfOptions]
+) -> Callable[[Truth], Filter]:
     """The ideal EKF, with Jacobians at the truth: a function of the truth that returns a filter."""
-    return lambda truth: variant(scenario, **(options | {"linearize": AtTruth(truth)}))
+    return _AtTheTruth(variant(scenario, **options), watch)
 
 
-def without_measurements(scenario: Scenario, **options: Unpack[EkfOptions]) -> Filter:
+@record
+class _AtTheTruth:
+    """An EKF, as a function of the truth that it is linearized at."""
+
+    ekf: Filter
+    watch: bool = static()
+
+    def __call__(self, truth: Truth) -> Filter:
+        filter: Filter = replace(self.ekf, linearize=AtTruth(truth))
+        return Monitored(filter) if self.watch else filter
+
+
+@record
+class _InTheTrueMap:
+    """A localization filter, as a function of the truth whose map it is given."""
+
+    filter: Localization | ParticleLocalization
+
+    def __call__(self, truth: Truth) -> Filter:
+        return replace(self.filter, landmarks=truth.landmarks)
+
+
+@record
+class _OnTheTruePath:
+    """A filter of mapping, as a function of the truth whose poses it is given."""
+
+    filter: Filter
+    start: ArrayLike
+
+    def __call__(self, truth: Truth) -> Estimator:
+        poses = jnp.asarray(truth.pose)
+        return lambda log, key: run(
+            self.filter, log._replace(control=poses), self.start, np.zeros((3, 3)), key
+        )
+
+
+def without_measurements(scenario: World, **options: Unpack[EkfOptions]) -> Filter:
     """Dead reckoning in a scenario; it has none of the options of `EkfSlam`."""
     return DeadReckoning(scenario.motion, scenario.sensor)
 
 
-def _options(scenario: Scenario, more: EkfOptions, *names: str) -> dict[str, Any]:
+def _options(scenario: World, more: EkfOptions, *names: str) -> dict[str, Any]:
     """Those of the scenario's options and of some more that have these names."""
     given = {**scenario.filter_options, **more}
     return {name: given[name] for name in names if name in given}
@@ -71,34 +112,27 @@ _OF_MAPS = "gate", "associate", "births"
 """The options of filters that start landmarks, beside those of `EkfSlam` alone."""
 
 
-def in_a_known_map(scenario: Scenario, **options: Unpack[EkfOptions]) -> Callable[[Truth], Filter]:
+def in_a_known_map(scenario: World, **options: Unpack[EkfOptions]) -> Callable[[Truth], Filter]:
     """Localization in the true map, with those options of `EkfSlam` that it has."""
     mine = _options(scenario, options, "correction", "gate", "iterations")
-    return lambda truth: Localization(scenario.motion, scenario.sensor, truth.landmarks, **mine)
+    return _InTheTrueMap(Localization(scenario.motion, scenario.sensor, scenario.landmarks, **mine))
 
 
-def on_given_poses(scenario: Scenario, **options: Unpack[EkfOptions]) -> Filter:
+def on_given_poses(scenario: World, **options: Unpack[EkfOptions]) -> Filter:
     """Mapping, whose controls are the poses, with those options of `EkfSlam` that it has."""
     mine = _options(scenario, options, *_OF_MAPS)
     return Mapping(scenario.sensor, _capacity(scenario), **mine)
 
 
 def on_the_true_path(
-    scenario: Scenario, **options: Unpack[EkfOptions]
+    scenario: World, **options: Unpack[EkfOptions]
 ) -> Callable[[Truth], Estimator]:
     """Mapping from the true path; options as above. Its pose has no NEES: it is exact."""
-    filter = on_given_poses(scenario, **options)
-    start = np.asarray(scenario.pose), np.zeros((3, 3))
-
-    def estimator(truth: Truth) -> Estimator:
-        poses = jnp.asarray(truth.pose)
-        return lambda log, key: run(filter, log._replace(control=poses), *start, key)
-
-    return estimator
+    return _OnTheTruePath(on_given_poses(scenario, **options), np.asarray(scenario.pose))
 
 
 def by_particles(
-    scenario: Scenario, proposal: Literal["motion", "measurement"], **options: Unpack[EkfOptions]
+    scenario: World, proposal: Literal["motion", "measurement"], **options: Unpack[EkfOptions]
 ) -> Filter:
     """FastSLAM of 50 particles, with those options of `EkfSlam` that it has."""
     return FastSlam(
@@ -112,23 +146,25 @@ def by_particles(
 
 
 def by_particles_in_a_known_map(
-    scenario: Scenario, **options: Unpack[EkfOptions]
+    scenario: World, **options: Unpack[EkfOptions]
 ) -> Callable[[Truth], Filter]:
     """Monte-Carlo localization in the true map, of 300 particles; options as above."""
     count, mine = LOCALIZATION_PARTICLES, _options(scenario, options, "gate", "associate")
-    return lambda truth: ParticleLocalization(
-        scenario.motion,
-        scenario.sensor,
-        truth.landmarks,
-        count,
-        least=count,
-        threshold=0.5,
-        **mine,
+    return _InTheTrueMap(
+        ParticleLocalization(
+            scenario.motion,
+            scenario.sensor,
+            scenario.landmarks,
+            count,
+            least=count,
+            threshold=0.5,
+            **mine,
+        )
     )
 
 
 def in_a_window(
-    scenario: Scenario, *, first_estimates: bool = False, **options: Unpack[EkfOptions]
+    scenario: World, *, first_estimates: bool = False, **options: Unpack[EkfOptions]
 ) -> Filter:
     """The fixed-lag smoother of 5 steps, with those options of `EkfSlam` that it has."""
     capacity = _capacity(scenario)
@@ -144,14 +180,12 @@ def in_a_window(
     )
 
 
-def in_one_batch(scenario: Scenario, **options: Unpack[EkfOptions]) -> Callable[[Truth], Estimator]:
+def in_one_batch(scenario: World, **options: Unpack[EkfOptions]) -> BatchMap:
     """The graph of the whole log (`smoothing.BatchMap`), with those options of `EkfSlam` that it
-    has: a function of the truth, which it does not use, that returns the estimator."""
+    has."""
     start = np.asarray(scenario.pose), np.asarray(scenario.pose_cov)
     mine = _options(scenario, options, *_OF_MAPS)
-    return lambda truth: BatchMap(
-        scenario.motion, scenario.sensor, _capacity(scenario), *start, **mine
-    )
+    return BatchMap(scenario.motion, scenario.sensor, _capacity(scenario), *start, **mine)
 
 
 WINDOW = 5
@@ -164,13 +198,13 @@ LOCALIZATION_PARTICLES = 300
 """of Monte-Carlo localization in the catalog, at every step"""
 
 
-def in_canonical_form(scenario: Scenario, **options: Unpack[EkfOptions]) -> Filter:
+def in_canonical_form(scenario: World, **options: Unpack[EkfOptions]) -> Filter:
     """The exact information filter in a scenario; of the options of `EkfSlam` it takes the gate."""
     mine = _options(scenario, options, "gate")
     return EifSlam(scenario.motion, scenario.sensor, _capacity(scenario), **mine)
 
 
-def sparse_in_canonical_form(scenario: Scenario, **options: Unpack[EkfOptions]) -> Filter:
+def sparse_in_canonical_form(scenario: World, **options: Unpack[EkfOptions]) -> Filter:
     """The sparse information filter in a scenario; of the options of `EkfSlam` it takes the gate.
 
     It has half the map active, 8 landmarks at least and 20 at most, and all links. It reports
@@ -194,7 +228,7 @@ def sparse_in_canonical_form(scenario: Scenario, **options: Unpack[EkfOptions]) 
     return filter if active == count else InPieces(filter, active // 2)
 
 
-def _capacity(scenario: Scenario) -> int:
+def _capacity(scenario: World) -> int:
     return int(np.shape(scenario.landmarks)[0])
 
 

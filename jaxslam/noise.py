@@ -4,6 +4,7 @@ from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxslam.core.numbers import check_covariance, held_array
@@ -21,6 +22,11 @@ class Constant:
     """(n, n)"""
 
     def __call__(self, *arguments: jax.Array) -> jax.Array:
+        if np.ndim(self.cov) > 2:
+            raise ValueError(
+                f"noise_cov: expected a covariance (n, n), got {np.shape(self.cov)}: run a stack "
+                "of filters as jax.vmap(run, in_axes=(0, None, None, None, None))(stack, …)"
+            )
         return jnp.asarray(self.cov, arguments[0].dtype)
 
 

@@ -566,6 +566,6 @@ class Wrapper(Filter):
 Estimator = Callable[[Log, Array], Trace]
 """(log, key) -> trace: `partial(run, filter, …)`, or a batch method."""
 
-Candidate = Filter | Callable[[Truth], Filter | Estimator]
-"""An entry of a campaign: a filter, or a function of the run's truth that returns a filter or an
-estimator."""
+Candidate = Filter | Estimator | Callable[[Truth], Filter | Estimator]
+"""An entry of a campaign: a filter, a smoother, or a function of the run's truth that returns a
+filter or an estimator."""

@@ -1,6 +1,7 @@
 """The driver of all filters: one `lax.scan` over a log."""
 
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -8,7 +9,6 @@ import numpy as np
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
-from jaxslam import programs
 from jaxslam.core.numbers import (
     check_covariance,
     check_key,
@@ -33,13 +33,12 @@ def run(
 ) -> Trace:
     """Run a filter over a log: at each row, predict with the control, then update with the scan.
 
-    Traceable: wrap it in `jax.jit`, `jax.vmap` over logs and keys, or `jax.grad`. Called outside a
-    trace it is compiled once for a structure: another call, with other values or a filter with
-    other noises, runs the same program (`programs`). The arithmetic runs in
-    the wider dtype of the log's controls and measurements. A valid measurement that is not finite
-    or beyond `core.numbers.largest` is refused where its value is concrete, and dropped as
-    `Status.REJECTED` under a trace. Reverse
-    mode stores one state a step, and recomputes each step in the backward pass.
+    Traceable: wrap it in `jax.jit`, `jax.vmap` over filters, logs and keys, or `jax.grad`. It is
+    compiled once for a structure: another call, with other values or a filter with other noises,
+    runs the same program. The arithmetic runs in the wider dtype of the log's controls and
+    measurements. A valid measurement that is not finite or beyond `core.numbers.largest` is refused
+    where its value is concrete, and dropped as `Status.REJECTED` under a trace. Reverse mode stores
+    one state a step, and recomputes each step in the backward pass.
 
     Args:
         filter: a record, as of `jaxslam.filters`.
@@ -59,7 +58,7 @@ def run(
     check_record("run", "log", log, Log)
     check_run("run", filter, log, pose, pose_cov)
     check_key("run", key)
-    return programs.call(_drive, (filter, probe), log, pose, pose_cov, key)
+    return _drive(filter, log, pose, pose_cov, key, probe)
 
 
 def check_run(name: str, filter: Filter, log: Log, pose: ArrayLike, pose_cov: ArrayLike) -> None:
@@ -83,20 +82,19 @@ def check_run(name: str, filter: Filter, log: Log, pose: ArrayLike, pose_cov: Ar
     check_covariance(f"{name}: pose_cov", pose_cov, 3)
 
 
+@partial(jax.jit, static_argnames="probe", inline=True)
 def _drive(
     filter: Filter,
-    probe: Callable[[PyTree], PyTree] | None,
     log: Log,
-    pose: jax.Array,
-    pose_cov: jax.Array,
+    pose: ArrayLike,
+    pose_cov: ArrayLike,
     key: jax.Array,
+    probe: Callable[[PyTree], PyTree] | None,
 ) -> Trace:
     """The trace of a filter over a checked log."""
-    log = jax.tree.map(jnp.asarray, log)
-    if jax.__version_info__ < (0, 11):
-        # Its XLA compiles some loops over a constant `valid` (`run` in a user's jit, the log closed
-        # over) to wrong numbers.
-        log = jax.lax.optimization_barrier(log)
+    # XLA before jaxlib 0.11 compiles some loops over a constant `valid` (`run` in a user's jit, the
+    # log closed over) to wrong numbers.
+    log = jax.lax.optimization_barrier(jax.tree.map(jnp.asarray, log))
     dtype = jnp.result_type(log.control, log.scan.z)
     tag = log.scan.tag.astype(jnp.int32)  # of any integers, unsigned ones too
     log = Log(log.control.astype(dtype), Scan(log.scan.z.astype(dtype), tag, log.scan.valid))

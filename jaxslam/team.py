@@ -1,6 +1,6 @@
 """The robots of a team, and the layout of their controls, scans and states.
 
-`filters.TeamSlam` is their filter, and `simulation.team_world` simulates their worlds.
+`filters.TeamSlam` is their filter, and `TeamWorld` simulates their worlds.
 """
 
 from collections.abc import Sequence

@@ -19,7 +19,7 @@ from jaxslam.filters.map_management.loop_closure import LoopSettings
 from jaxslam.life import Recency
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.results.plot.style import COLORS, INK, PAGE, SHADE, caption, panels_of, titled
-from jaxslam.simulation.scenarios import between_ranges
+from jaxslam.simulation.scenarios import BetweenRanges
 from jaxslam.simulation.spurious import Spurious
 from jaxslam.simulation.worlds import Scenario, simulate
 from jaxslam.types import Status
@@ -53,7 +53,7 @@ def world(seed=0):
         if all(np.hypot(*(point - other)) > 2.0 for other in points):
             points.append(point)
     points = np.asarray(points)
-    view = between_ranges(0.5, 9.0)
+    view = BetweenRanges(0.5, 9.0)
     heading = 2 * np.pi * np.arange(ROUND) / ROUND
     path = RADIUS * np.stack([np.sin(heading), 1 - np.cos(heading)], axis=1)
     places = int((np.hypot(*(path[:, None] - points).transpose(2, 0, 1)) < 9.5).sum(axis=1).max())

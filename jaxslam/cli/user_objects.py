@@ -17,7 +17,7 @@ from jaxslam.cli.common import pick
 from jaxslam.monte_carlo.candidates import check_fits, check_noise
 from jaxslam.protocols import Candidate, Filter
 from jaxslam.simulation.scenarios import SCENARIOS
-from jaxslam.simulation.worlds import Scenario
+from jaxslam.simulation.worlds import World
 from jaxslam.verify.errors import describe_error
 from jaxslam.verify.inputs.user_files import import_file, names_in, split_target
 
@@ -35,7 +35,7 @@ class UserObjects:
         """Whether anything came from a file."""
         return bool(self._modules)
 
-    def scenario(self, asked: str, steps: int | None) -> Scenario:
+    def scenario(self, asked: str, steps: int | None) -> World:
         """A scenario, by name or from a file; steps: None for its own number of them.
 
         Raises ValueError where there is none, and where a `Scenario` is to have other steps.
@@ -45,22 +45,22 @@ class UserObjects:
             return pick("scenario", asked, SCENARIOS, _OWN)(*arguments)
         _, own = self._find("--scenario", asked)
         made = own
-        if isinstance(made, Scenario) and steps is not None:
+        if isinstance(made, World) and steps is not None:
             raise ValueError(
                 f"--steps: {asked} is a Scenario, which has {made.steps}; "
                 "expected a function of the number of steps"
             )
-        if not isinstance(made, Scenario) and callable(made):
+        if not isinstance(made, World) and callable(made):
             told = "the number of steps" if arguments else "nothing"
             made = self._call(asked, told, made, *arguments)
-        if not isinstance(made, Scenario):
+        if not isinstance(made, World):
             raise ValueError(
                 f"{asked}: expected a Scenario, or a function that returns one, {_got(own, made)}"
             )
         check_noise(made)
         return made
 
-    def filters(self, asked: str, scenario: Scenario) -> dict[str, Candidate]:
+    def filters(self, asked: str, scenario: World) -> dict[str, Candidate]:
         """The filters of a comma-separated list, or all of the catalog, by name.
 
         Raises ValueError where there is none, and with its name if one cannot run the scenario.
@@ -105,7 +105,7 @@ class UserObjects:
             raise ValueError(f"{option}: there is no {name!r} in {path.name}{names_in(module)}")
         return name, getattr(module, name)
 
-    def _own(self, asked: str, scenario: Scenario) -> tuple[str, Candidate]:
+    def _own(self, asked: str, scenario: World) -> tuple[str, Candidate]:
         """The name of a user's filter, and the filter for the scenario.
 
         It is the filter's own, or NAME for one that still has that of a filter of the library.
@@ -151,7 +151,7 @@ def _in_file(asked: str) -> bool:
     return ":" in asked or asked.endswith(".py")
 
 
-def _of_catalog(name: str, scenario: Scenario) -> tuple[str, Candidate]:
+def _of_catalog(name: str, scenario: World) -> tuple[str, Candidate]:
     """The name and a filter of the catalog; raises ValueError if it cannot run the scenario."""
     make = pick("filters", name, ALL, _OWN)
     try:
@@ -164,7 +164,7 @@ def _of_catalog(name: str, scenario: Scenario) -> tuple[str, Candidate]:
         ) from error
 
 
-def _can_run(name: str, scenario: Scenario) -> bool:
+def _can_run(name: str, scenario: World) -> bool:
     """Whether a filter of the catalog can be made for the scenario."""
     try:
         ALL[name](scenario)

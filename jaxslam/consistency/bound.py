@@ -19,11 +19,12 @@ from jaxslam.math.linalg import root_psd
 from jaxslam.protocols import Sensor
 from jaxslam.run import run
 from jaxslam.sensors.suite import Suite
-from jaxslam.simulation.worlds import Scenario
+from jaxslam.simulation.recorded import RecordedWorld
+from jaxslam.simulation.worlds import Scenario, World
 from jaxslam.types import Estimate, Log, Truth
 
 
-def conditional_bound(scenario: Scenario, truth: Truth, log: Log, key: Array) -> Estimate:
+def conditional_bound(scenario: World, truth: Truth, log: Log, key: Array) -> Estimate:
     """The Cramér-Rao bound given a true trajectory, as the covariances of an `Estimate` (T,).
 
     It bounds the covariance of estimators that are unbiased *given that trajectory and map*; the
@@ -50,7 +51,7 @@ def conditional_bound(scenario: Scenario, truth: Truth, log: Log, key: Array) ->
 
 
 def posterior_bound(
-    scenario: Scenario, truth: Truth, log: Log, steps: Sequence[int] | None = None
+    scenario: World, truth: Truth, log: Log, steps: Sequence[int] | None = None
 ) -> tuple[Int[np.ndarray, "K"], Float[np.ndarray, "K 3 3"]]:
     """Steps, and at each of them the bound on the mean square pose error of all estimators.
 
@@ -78,7 +79,8 @@ def posterior_bound(
         ValueError: on a world of spurious data or of several robots, arrays without runs, or a
             measurement noise that is singular.
     """
-    if scenario.draw is not None or scenario.spurious is not None:
+    one = isinstance(scenario, Scenario | RecordedWorld)
+    if not one or scenario.spurious is not None:
         raise ValueError(
             "posterior_bound: expected a scenario of one robot without spurious measurements"
         )
@@ -145,7 +147,7 @@ class RunJacobians(NamedTuple):
     landmarks: Float[Array, "N L"]
 
 
-def jacobians_at_truth(scenario: Scenario, truth: Truth, log: Log) -> RunJacobians:
+def jacobians_at_truth(scenario: World, truth: Truth, log: Log) -> RunJacobians:
     """The Jacobians of the models along the true path of one run; traceable, for `vmap` over runs.
 
     For the world of one robot, nothing spurious, tags known.

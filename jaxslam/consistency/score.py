@@ -1,6 +1,6 @@
 """`score` returns what each run says of a filter, the numbers that a campaign adds up or keeps.
 
-Called by `monte_carlo.blocks.block` on the results of a block of runs; `tally.condense` takes what
+Called by `monte_carlo.block` on the results of a block of runs; `tally.condense` takes what
 it returns.
 
 A run's error is compared with the covariance the filter claims for it. With e = truth - estimate,

@@ -1,6 +1,6 @@
 """What a score needs of one run's maps and innovations: sums over its steps.
 
-Compiled and called by `monte_carlo.blocks.programs`; `score` takes what it returns.
+Compiled and called by `monte_carlo.programs`; `score` takes what it returns.
 """
 
 from typing import NamedTuple

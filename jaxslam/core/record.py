@@ -1,7 +1,7 @@
 """Records: frozen dataclasses that JAX knows as pytrees."""
 
 import dataclasses
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Any, TypeVar, dataclass_transform
 
 import jax
@@ -68,6 +68,22 @@ def record(cls: type[_T]) -> type[_T]:
 def is_record(value: object) -> bool:
     """Whether a value is a record."""
     return dataclasses.is_dataclass(value) and not jax.tree_util.all_leaves([value])
+
+
+class FrozenDict(dict[Any, Any]):
+    """A dict that hashes, as a static field needs; do not change it."""
+
+    @classmethod
+    def of(cls, name: str, value: Mapping[Any, Any]) -> "FrozenDict":
+        """A dict, and those in it, frozen; ValueError, which begins with the name, on an array."""
+        made = {k: cls.of(name, v) if isinstance(v, Mapping) else v for k, v in value.items()}
+        for key, each in made.items():
+            if isinstance(each, np.ndarray | jax.Array | list):
+                raise ValueError(f"{name}: {key}: expected a value that is compared by ==")
+        return cls(made)
+
+    def __hash__(self) -> int:  # type: ignore[override]
+        return hash(frozenset(self.items()))
 
 
 def set_field(of: Any, name: str, value: Any) -> None:

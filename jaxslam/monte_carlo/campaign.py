@@ -17,9 +17,7 @@ from jax.typing import DTypeLike
 
 from jaxslam.consistency import Summary, Tally, summarize
 from jaxslam.core.numbers import check_count, check_key
-from jaxslam.monte_carlo.blocks.block import BOUND
-from jaxslam.monte_carlo.blocks.blockwise import Library
-from jaxslam.monte_carlo.blocks.plan import CampaignPlan
+from jaxslam.monte_carlo.block import BOUND, CampaignPlan
 from jaxslam.monte_carlo.candidates import (
     check_dtype,
     check_fits,
@@ -27,18 +25,18 @@ from jaxslam.monte_carlo.candidates import (
     fitting_block,
     without_noise,
 )
-from jaxslam.monte_carlo.fingerprint import fingerprint
+from jaxslam.monte_carlo.identity import identity
 from jaxslam.monte_carlo.kept import Keep, add_kept
 from jaxslam.monte_carlo.pieces import check_part, cores, in_part, missing
 from jaxslam.monte_carlo.record import Campaign, Interrupted
 from jaxslam.monte_carlo.work import Work, shown_progress
 from jaxslam.protocols import Candidate
-from jaxslam.simulation.worlds import Scenario, with_positions
+from jaxslam.simulation.worlds import World, with_positions
 from jaxslam.validation import check_record
 
 
 def monte_carlo(
-    scenario: Scenario,
+    scenario: World,
     filters: Mapping[str, Candidate],
     runs: int,
     key: jax.Array,
@@ -51,8 +49,6 @@ def monte_carlo(
     keep: Keep | None = None,
     part: tuple[int, int] | None = None,
     progress: Callable[[int, int], None] | Literal[False] | None = None,
-    library: Library | None = None,
-    identity: Mapping[str, str] | None = None,
 ) -> Campaign:
     """Run every filter over the same `runs` worlds of a scenario and sum up its consistency.
 
@@ -73,7 +69,7 @@ def monte_carlo(
             are drawn in float64 and then rounded: both see the same. Default what JAX is set to.
         keep: blocks are saved there as they finish, and those found there are not run again. It
             holds one campaign: what must agree (key, scenario, models, filters, precision,
-            versions) is told by `fingerprint`. More runs than it has extend it.
+            versions) is its `identity`. More runs than it has extend it.
         part: (i, n) with 1 <= i <= n: only the blocks i - 1, i - 1 + n, … are computed, and the
             campaign returned is of them. So n jobs that know nothing of each other compute a
             campaign, each with a `keep` from `store.join` on one folder, with the same block and
@@ -81,10 +77,6 @@ def monte_carlo(
             computed.
         progress: called with (runs done, runs) after each block. Default a bar with
             rate and remaining time, on a terminal and in a notebook alone; False: none.
-        library: compiled programs are taken from there, without a trace, and put there. The caller
-            answers for it: its programs are of this scenario and these filters, by name.
-        identity: what `keep` is told instead of the fingerprint, where the caller knows without a
-            trace what the campaign is, as from names and the source that they stand for.
     Returns:
         Campaign.
     Raises:
@@ -104,7 +96,7 @@ def monte_carlo(
     names = (*filters, BOUND)
     tallies = {name: Tally() for name in names}
     size = int(block or fitting_block(scenario, filters, devices[0]))
-    plan = CampaignPlan(scenario, filters, key, devices, size, bound, dtype, library)
+    plan = CampaignPlan(scenario, filters, key, devices, size, bound, dtype)
     if part is not None and (part[0] - 1) * plan.wide >= runs:
         raise ValueError(
             f"monte_carlo: part: expected one of the {-(-runs // plan.wide)} blocks of {plan.wide} "
@@ -112,8 +104,7 @@ def monte_carlo(
         )
     done: list[tuple[int, int]] = []
     if keep is not None:
-        told = identity or fingerprint(scenario, filters, key, devices[0].platform, bound, dtype)
-        keep.claim(told)
+        keep.claim(identity(scenario, filters, key, devices[0].platform, bound, dtype))
         done = add_kept(tallies, keep, runs, lambda first: in_part(first, plan.wide, part))
     pieces = missing(done, runs, plan.wide)
     todo = [piece for piece in pieces if in_part(piece[0], plan.wide, part)]
@@ -135,7 +126,7 @@ def monte_carlo(
 
 
 def _check(
-    scenario: Scenario,
+    scenario: World,
     filters: Mapping[str, Candidate],
     runs: int,
     key: jax.Array,
@@ -152,8 +143,8 @@ def _check(
             check_count(f"monte_carlo: {name}", value)
     if part is not None:
         check_part("monte_carlo: part", part)
-    check_record("monte_carlo", "scenario", scenario, Scenario)
-    if scenario.recorded is not None and runs > (most := len(scenario.recorded[0].pose)):
+    check_record("monte_carlo", "scenario", scenario, World)
+    if (most := scenario.recorded_runs) is not None and runs > most:
         raise ValueError(
             f"monte_carlo: runs: expected at most {most}, the recorded runs of {scenario.name}, "
             f"got {runs}"
@@ -219,7 +210,7 @@ def _summed_up(
     )
 
 
-def _qualified(found: dict[str, Summary], scenario: Scenario) -> dict[str, Summary]:
+def _qualified(found: dict[str, Summary], scenario: World) -> dict[str, Summary]:
     """The summaries, with a doubt on those that an exact sensor left without a covariance."""
     dropped = {name: one.counts.get("singular", 0) for name, one in found.items()}
     exact = without_noise(scenario) if any(dropped.values()) else ""

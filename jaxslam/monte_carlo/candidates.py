@@ -2,7 +2,6 @@
 
 import inspect
 from collections.abc import Callable, Mapping
-from functools import partial
 from typing import TypeVar
 
 import jax
@@ -12,7 +11,6 @@ from jax.typing import DTypeLike
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
-from jaxslam import programs
 from jaxslam.charts.euclidean import Euclidean
 from jaxslam.consistency import monitor_of
 from jaxslam.core.numbers import check_covariance, is_concrete
@@ -20,13 +18,14 @@ from jaxslam.logs.tables import split_unit
 from jaxslam.protocols import Candidate, Chart, Estimator, Filter, Motion, Sensor
 from jaxslam.run import run
 from jaxslam.sensors.suite import Suite
-from jaxslam.simulation.worlds import Scenario, simulate
+from jaxslam.simulation.worlds import World
+from jaxslam.smoothing.forward_pass import LogEstimator
 from jaxslam.types import Log, Trace, Truth
 
 _T = TypeVar("_T")
 
 
-def fitting_block(scenario: Scenario, filters: Mapping[str, Candidate], device: jax.Device) -> int:
+def fitting_block(scenario: World, filters: Mapping[str, Candidate], device: jax.Device) -> int:
     """The number of runs computed together on a device: 16 on a CPU, whose caches they fit.
 
     On an accelerator as many as take a quarter of its memory, counting a run's world and what the
@@ -40,7 +39,7 @@ def fitting_block(scenario: Scenario, filters: Mapping[str, Candidate], device: 
         return 1024
 
     def one(key: jax.Array) -> PyTree:
-        truth, log = simulate(scenario, key)
+        truth, log = scenario.draw(key)
         method, _ = estimator_of(next(iter(filters.values())), truth, scenario)
         trace = method(log, key)
         return truth, log, trace.estimate, trace.info
@@ -72,7 +71,7 @@ def rounded(tree: _T, dtype: DTypeLike | None) -> _T:
     return out
 
 
-def check_noise(scenario: Scenario) -> None:
+def check_noise(scenario: World) -> None:
     """Raise ValueError where a model of the scenario states a noise that is no covariance.
 
     A `noise_cov` that is a function can only be looked at where it is called. That of the motion is
@@ -83,18 +82,16 @@ def check_noise(scenario: Scenario) -> None:
         return
     motion = scenario.motion
     pose, control = _number(scenario.pose), _number(scenario.controls)[0]
-    _check_stated(
-        motion.name, len(motion.noises), partial(programs.call, motion.noise_cov, (), pose, control)
-    )
+    _check_stated(motion.name, len(motion.noises), motion, pose, control)
     for model in _sensors(scenario):
         size, nothing = len(model.measurements), _number(np.zeros(len(model.measurements)))
         try:
-            _check_stated(model.name, size, partial(programs.call, model.noise_cov, (), nothing))
+            _check_stated(model.name, size, model, nothing)
         except ValueError:
-            _check_stated(model.name, size, model.noise_cov, _seen_first(model, scenario))
+            _check_stated(model.name, size, model, _seen_first(model, scenario))
 
 
-def without_noise(scenario: Scenario) -> str:
+def without_noise(scenario: World) -> str:
     """In words, what the scenario's sensors measure without noise; "" where there is none.
 
     Looked at where `check_noise` looks; a noise that grows from 0 with z is one.
@@ -104,7 +101,7 @@ def without_noise(scenario: Scenario) -> str:
     found = []
     for model in _sensors(scenario):
         for z in (_number(np.zeros(len(model.measurements))), _seen_first(model, scenario)):
-            exact = _exact(model, np.asarray(programs.call(model.noise_cov, (), z), np.float64))
+            exact = _exact(model, np.asarray(_noise_cov(model, z), np.float64))
             if not exact:
                 break
         if exact:
@@ -121,31 +118,43 @@ def _exact(sensor: Sensor, cov: np.ndarray) -> str:
     return "" if whole else f"a combination of {', '.join(sensor.measurements)}"
 
 
-def _sensors(scenario: Scenario) -> list[Sensor]:
+def _sensors(scenario: World) -> list[Sensor]:
     sensor = scenario.sensor
     return [part.sensor for part in sensor.parts] if isinstance(sensor, Suite) else [sensor]
 
 
-def _seen_first(sensor: Sensor, scenario: Scenario) -> jax.Array:
+def _seen_first(sensor: Sensor, scenario: World) -> jax.Array:
     """The first landmark as measured from the start, (Z,)."""
     landmark = _number(scenario.landmarks)[0, : len(sensor.landmark)]
-    return programs.call(sensor.observe, (), _number(scenario.pose), landmark)
+    return _observe(sensor, _number(scenario.pose), landmark)
+
+
+@jax.jit
+def _observe(sensor: Sensor, pose: jax.Array, landmark: jax.Array) -> jax.Array:
+    return sensor.observe(pose, landmark)
+
+
+@jax.jit
+def _noise_cov(model: Motion | Sensor, *at: jax.Array) -> jax.Array:
+    return model.noise_cov(*at)
 
 
 def _number(values: ArrayLike) -> np.ndarray:
     return np.asarray(values, jnp.result_type(float))
 
 
-def _check_stated(name: str, size: int, noise_cov: Callable[..., jax.Array], *at: object) -> None:
+def _check_stated(name: str, size: int, model: Motion | Sensor, *at: PyTree) -> None:
     try:
-        check_covariance(name, programs.call(noise_cov, (), *at), size)
+        check_covariance(name, _noise_cov(model, *at), size)
     except ValueError as error:
         said = str(error).removeprefix(f"{name}: ")
         raise ValueError(f"monte_carlo: noise_cov of {name}: {said}") from None
 
 
-def check_fits(name: str, candidate: Candidate, scenario: Scenario) -> None:
+def check_fits(name: str, candidate: Candidate, scenario: World) -> None:
     """Raise ValueError unless a candidate takes what the scenario's log has."""
+    if isinstance(candidate, LogEstimator):
+        return
     if not isinstance(candidate, Filter):
         if not callable(candidate):
             raise ValueError(
@@ -162,8 +171,8 @@ def check_fits(name: str, candidate: Candidate, scenario: Scenario) -> None:
                     f"monte_carlo: {name!r} is a factory: call it, {name}({parameters})"
                 ) from None
             raise ValueError(
-                f"monte_carlo: expected {name} to be a function of the truth alone; an estimator "
-                "of (log, key), as from smoothing.Smoother, is given as lambda truth: estimator"
+                f"monte_carlo: expected {name} to be a function of the truth alone; a function of "
+                "(log, key) is given as lambda truth: estimator"
             ) from None
         return
     for what, taken, given in (
@@ -190,7 +199,7 @@ def check_called(name: str, candidate: Callable[..., object]) -> None:
         return
     ours = getattr(candidate, "__module__", "").startswith("jaxslam.")
     named = first.name in ("motion", "sensor", "robots", "scenario", "world")
-    if (ours and named) or first.annotation in (Motion, Sensor, Scenario):
+    if (ours and named) or first.annotation in (Motion, Sensor, World):
         raise ValueError(f"monte_carlo: {name!r} is a factory: call it, {name}({first.name}, …)")
 
 
@@ -206,21 +215,23 @@ def _of_truth(candidate: Callable[[Truth], Estimator | Filter], truth: Truth) ->
         ) from error
 
 
-def estimator_of(candidate: Candidate, truth: Truth, scenario: Scenario) -> tuple[Estimator, Chart]:
+def estimator_of(candidate: Candidate, truth: Truth, scenario: World) -> tuple[Estimator, Chart]:
     """The estimator that a candidate is, and the chart of its errors.
 
     Its probe is the information in the filter's observability monitor, where it has one.
     """
-    method = candidate if isinstance(candidate, Filter) else _of_truth(candidate, truth)
+    known = isinstance(candidate, Filter | LogEstimator)
+    method = candidate if known else _of_truth(candidate, truth)
     if not isinstance(method, Filter):
         return method, Euclidean()
     check_fits(method.name, method, scenario)
 
-    def gained(state: PyTree) -> jax.Array | None:
-        monitor = monitor_of(state)
-        return None if monitor is None else monitor.information
-
     def drive(log: Log, key: jax.Array) -> Trace:
-        return run(method, log, scenario.pose, scenario.pose_cov, key, probe=gained)
+        return run(method, log, scenario.pose, scenario.pose_cov, key, probe=_gained)
 
     return drive, method.chart
+
+
+def _gained(state: PyTree) -> jax.Array | None:
+    monitor = monitor_of(state)
+    return None if monitor is None else monitor.information

@@ -11,7 +11,7 @@ from jaxslam.consistency import Tally
 class Keep(Protocol):
     """Where finished blocks are kept: `store.Store`, for one. Claimed before it is read."""
 
-    def claim(self, fingerprint: Mapping[str, str]) -> None:
+    def claim(self, identity: Mapping[str, str]) -> None:
         """Note what campaign this is, once; ValueError where it is another that was noted."""
 
     def save(self, first: int, arrays: Mapping[str, np.ndarray], runs: int) -> object:

@@ -1,7 +1,6 @@
 """The missing blocks of a campaign, computed several at once, and the bar of progress."""
 
 import contextlib
-import time
 import warnings
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
@@ -12,9 +11,7 @@ import numpy as np
 from threadpoolctl import threadpool_limits
 
 from jaxslam.consistency import Tally
-from jaxslam.monte_carlo.blocks.block import BOUND, BlockRunner
-from jaxslam.monte_carlo.blocks.plan import CampaignPlan, Promises
-from jaxslam.monte_carlo.blocks.programs import compile_programs
+from jaxslam.monte_carlo.block import BOUND, BlockRunner, CampaignPlan
 from jaxslam.monte_carlo.kept import Keep, add_block, flat
 from jaxslam.monte_carlo.pieces import missing
 from jaxslam.monte_carlo.progress import Progress
@@ -65,28 +62,19 @@ class Work:
             for first, count in todo
             for piece in missing([(0, first), *before], first + count, plan.wide)
         ][::-1]
-        plan = replace(plan, with_first=any(first == 0 for first, _ in queue))
-        promises = Promises(list(plan.filters))
-        runner = BlockRunner(plan, promises)
+        runner = BlockRunner(plan)
+        self.compile_seconds += runner.compile_seconds
         done = sum(count for _, count in before)
         total = sum(count for _, count in todo)
-        early = len(queue) > self.workers
         flight: dict[Future[dict[str, dict[str, np.ndarray]]], tuple[int, int]] = {}
         stop: BaseException | None = None
         # XLA uses the cores; threads of the BLAS below its LAPACK would only spin beside it.
         with threadpool_limits(1, "blas"), ThreadPoolExecutor(self.workers) as pool:
-            try:
-                while queue and len(flight) <= self.workers:
-                    first, count = queue.pop()
-                    flight[pool.submit(runner.block, first, count, early)] = first, count
-                began = time.perf_counter()
-                compile_programs(plan, promises)
-                self.compile_seconds += time.perf_counter() - began
-            except BaseException as error:
-                stop = error
-                promises.give_up(error)
-            while flight:
+            while flight or (queue and stop is None):
                 try:
+                    while queue and stop is None and len(flight) <= self.workers:
+                        first, count = queue.pop()
+                        flight[pool.submit(runner.block, first, count)] = first, count
                     for future in wait(flight, return_when=FIRST_COMPLETED).done:
                         first, count = flight.pop(future)
                         if stop is not None and (future.cancelled() or future.exception()):
@@ -98,9 +86,6 @@ class Work:
                         done += count
                         if self.progress is not None:
                             self.progress(done, total)
-                    while queue and stop is None and len(flight) <= self.workers:
-                        first, count = queue.pop()
-                        flight[pool.submit(runner.block, first, count, True)] = first, count
                 except BaseException as error:
                     if stop is not None:
                         raise

@@ -10,7 +10,7 @@ from typing import TYPE_CHECKING
 
 from jaxslam.consistency import Tally
 from jaxslam.monte_carlo import Campaign, missing
-from jaxslam.monte_carlo.blocks.block import BOUND
+from jaxslam.monte_carlo.block import BOUND
 from jaxslam.monte_carlo.campaign import summaries_of
 from jaxslam.monte_carlo.kept import add_kept
 from jaxslam.results import report, store

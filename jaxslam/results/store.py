@@ -2,7 +2,7 @@
 
 A block is an npz file (`block_file`) that appears only when it is complete, so an interrupted
 program loses no other block than the current one. A file that is damaged or belongs to another
-campaign is renamed and not counted. A manifest holds the caller's settings and the fingerprint of
+campaign is renamed and not counted. A manifest holds the caller's settings and the identity of
 the campaign.
 """
 
@@ -59,17 +59,17 @@ class Store:
     runs: int | None = None
     """number of runs that the campaign is to have, if known; it may be extended"""
     campaign: dict[str, str] = field(default_factory=dict)
-    """the fingerprint of the campaign that claimed the folder; empty until one does"""
+    """the identity of the campaign that claimed the folder; empty until one does"""
     set_aside: list[str] = field(default_factory=list)
     """a sentence on each file that `blocks` found bad and renamed"""
 
-    def claim(self, fingerprint: Mapping[str, str]) -> None:
+    def claim(self, identity: Mapping[str, str]) -> None:
         """Note in a new folder the campaign it belongs to; check it in any other folder.
 
         The number of runs is noted, too, which may extend the campaign. Raises ValueError that
-        names every difference of fingerprints, as "key: … there, … here", and what to do then.
+        names every difference of identities, as "key: … there, … here", and what to do then.
         """
-        mine = {str(name): str(value) for name, value in fingerprint.items()}
+        mine = {str(name): str(value) for name, value in identity.items()}
         if not (self.folder / MANIFEST).exists():  # of `join`
             with contextlib.suppress(FileExistsError):
                 write_manifest(self.folder, self.settings, mine, self.runs, new=True)
@@ -149,7 +149,7 @@ def create(
 ) -> Store:
     """The store of a new campaign in a folder, which is created if needed.
 
-    `monte_carlo(keep=…)` notes the fingerprint of the campaign in it.
+    `monte_carlo(keep=…)` notes the identity of the campaign in it.
 
     Args:
         folder: the folder.
@@ -177,8 +177,8 @@ def join(
 ) -> Store:
     """The store of a campaign that independent processes compute, each a part of it.
 
-    The first to claim it makes the manifest, with the fingerprint; the others must have the same
-    settings and the same fingerprint.
+    The first to claim it makes the manifest, with the identity; the others must have the same
+    settings and the same identity.
 
     Args:
         folder: the folder, which is created if needed; all of them see it.

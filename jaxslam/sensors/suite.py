@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxslam.core.numbers import check_count
-from jaxslam.core.record import record, set_field, static
+from jaxslam.core.record import hold_function, record, set_field, static
 from jaxslam.math.arrays import Landmark, Measurement, Point, Pose, Unmeasured
 from jaxslam.protocols import Free, Reduced, Sensor
 from jaxslam.sensors.wrapped import Wrapped
@@ -27,7 +27,7 @@ class Part:
     """in a simulation it measures every so many steps,"""
     start: int = static(default=0)
     """beginning with this one; a filter uses `Scan.valid` alone"""
-    visible: Callable[[Array, Array], Array] | None = static(default=None)
+    visible: Callable[[Array, Array], Array] | None = None
     """(pose, l) -> (): its field of view in a simulation; None for that of the scenario"""
     sees: Literal["landmarks", "robots"] = static(default="landmarks")
     """what its slots measure in a simulation. A filter of one robot ignores measurements of
@@ -42,6 +42,8 @@ class Part:
             raise ValueError(f"Part: expected a start of at least 0, got {self.start!r}")
         if self.sees not in ("landmarks", "robots"):
             raise ValueError(f'Part: expected sees "landmarks" or "robots", got {self.sees!r}')
+        if self.visible is not None:
+            hold_function(self, "visible", "pose, l")
         if not self.sensor.landmark and self.places != 1:
             raise ValueError(
                 f"Part: expected places=1 of the absolute sensor {self.sensor.name}, got "

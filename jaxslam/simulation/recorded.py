@@ -1,27 +1,72 @@
 """Worlds of runs that were recorded, or simulated by other means, for campaigns."""
 
-from collections.abc import Sequence
-from typing import TypedDict, Unpack
+from collections.abc import Mapping, Sequence
+from dataclasses import field
 
 import jax
+import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 from numpy.typing import ArrayLike
 
-from jaxslam.core.numbers import check_array
+from jaxslam.core.numbers import check_array, is_concrete
+from jaxslam.core.record import FrozenDict, record, static
 from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.sensors.suite import Suite
-from jaxslam.simulation.worlds import Scenario
+from jaxslam.simulation.worlds import World
 from jaxslam.types import Log, Truth
 from jaxslam.validation import check_log, check_record
 
 
-class RecordedOptions(TypedDict, total=False):
-    """Fields of `Scenario` that a world of recorded runs may have, too."""
+@record
+class RecordedWorld(World):
+    """A world of R runs that were recorded: run i of a campaign is record i (`recorded_world`)."""
 
-    filter_options: EkfOptions
-    published: dict[str, dict[str, float]]
-    source: str
+    name: str = static()
+    motion: Motion = field()
+    sensor: Sensor = field()
+    truth: Truth = field()
+    """(R, …)"""
+    log: Log = field()
+    """(R, …)"""
+    pose: ArrayLike = (0.0, 0.0, 0.0)
+    pose_cov: ArrayLike = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    filter_options: EkfOptions = static(default=FrozenDict())
+    published: Mapping[str, Mapping[str, float]] = static(default=FrozenDict())
+    source: str = static(default="")
+    """these as of `Scenario`"""
+
+    __repr__ = World.__repr__
+
+    @property
+    def landmarks(self) -> ArrayLike:  # type: ignore[override]
+        return self.truth.landmarks[0]
+
+    @property
+    def controls(self) -> ArrayLike:  # type: ignore[override]
+        return self.log.control[0]
+
+    @property
+    def recorded_runs(self) -> int:  # type: ignore[override]
+        return len(self.truth.pose)
+
+    def draw(self, key: Array) -> tuple[Truth, Log]:
+        return self._record(jax.random.randint(key, (), 0, self.recorded_runs))
+
+    def run(self, key: Array, number: int | Array) -> tuple[Truth, Log]:
+        if is_concrete(number) and not 0 <= int(number) < self.recorded_runs:
+            raise ValueError(
+                f"RecordedWorld {self.name!r}: expected a run from 0 to {self.recorded_runs - 1}, "
+                f"the recorded ones, got {number}"
+            )
+        return self._record(number)
+
+    def _record(self, number: int | Array) -> tuple[Truth, Log]:
+        both: tuple[Truth, Log] = jax.tree.map(
+            lambda leaf: jnp.asarray(leaf)[number], (self.truth, self.log)
+        )
+        return both
 
 
 def recorded_world(
@@ -36,9 +81,11 @@ def recorded_world(
     pose_cov: ArrayLike = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
     starts: ArrayLike | None = None,
     origin: ArrayLike | None = None,
-    **options: Unpack[RecordedOptions],
-) -> Scenario:
-    """A `Scenario` of R runs with known truth, in which run i of a campaign is record i.
+    filter_options: EkfOptions | None = None,
+    published: Mapping[str, Mapping[str, float]] | None = None,
+    source: str = "",
+) -> RecordedWorld:
+    """A world of R runs with known truth, in which run i of a campaign is record i.
 
     So logs of another simulator, of robots under motion capture, or of a front end that is no pure
     function (laser odometry) are judged as draws are. `simulate` takes one of the records by its
@@ -55,7 +102,7 @@ def recorded_world(
         starts: (R, 3) true pose before the first control; default `pose`.
         origin: (R, T, M) tag of the landmark that each measurement is truly of, -1 of none, where
             associations are to be scored.
-        options: other fields of `Scenario`, see `RecordedOptions`.
+        filter_options, published, source: as of `Scenario`.
     Raises:
         ValueError: on no runs, a log that `run` would refuse (which), runs of different shapes, a
             tag without a landmark, a truth that is not finite, and as `Scenario` does.
@@ -111,14 +158,15 @@ def recorded_world(
             f"recorded_world: expected tags below {table.shape[1]}, the number of landmarks, got "
             f"{tags.max()} (run {run}, row {row})"
         )
-    return Scenario(
+    return RecordedWorld(
         name=name,
         motion=motion,
         sensor=sensor,
-        landmarks=table[0],
-        controls=log.control[0],
+        truth=truth,
+        log=log,
         pose=pose,
         pose_cov=pose_cov,
-        recorded=(truth, log),
-        **options,
+        filter_options=filter_options or {},
+        published=published or {},
+        source=source,
     )

@@ -1,19 +1,19 @@
 """Sensor faults beyond noise: clutter, missed detections, outliers and wrong tags."""
 
-from dataclasses import dataclass
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.core.numbers import is_concrete
+from jaxslam.core.record import record, static
+from jaxslam.math.arrays import Number
 from jaxslam.math.linalg import root_psd
 from jaxslam.protocols import Sensor
 from jaxslam.types import Scan
 
 
-@dataclass(frozen=True)
+@record
 class Spurious:
     """The rates of sensor faults.
 
@@ -22,16 +22,16 @@ class Spurious:
     false measurements without a reach.
     """
 
-    clutter: float = 0.0
+    clutter: float = static(default=0.0)
     """false measurements a scan, on average: binomial, over 2·clutter further slots, rounded up"""
-    missed: float = 0.0
+    missed: Number = 0.0
     """probability that a landmark in view is not measured"""
-    outliers: float = 0.0
+    outliers: Number = 0.0
     """probability that a measurement is false, though its tag is right"""
-    mislabelled: float = 0.0
+    mislabelled: Number = 0.0
     """probability that a tag is wrong: the wrong ones of a scan are permuted in a cycle (a single
     one keeps its own)"""
-    reach: float = 0.0
+    reach: Number = 0.0
     """[m]"""
 
     def __post_init__(self) -> None:
@@ -42,7 +42,9 @@ class Spurious:
         if not (self.clutter >= 0 and np.isfinite(self.clutter)):
             raise ValueError(f"Spurious: expected clutter of at least 0, got {self.clutter}")
         needs_reach = self.clutter > 0 or not is_concrete(self.outliers) or self.outliers > 0
-        if not np.isfinite(self.reach) or self.reach < 0 or (self.reach == 0 and needs_reach):
+        if is_concrete(self.reach) and (
+            not np.isfinite(self.reach) or self.reach < 0 or (self.reach == 0 and needs_reach)
+        ):
             raise ValueError(
                 f"Spurious: expected a reach above 0 with false measurements, got {self.reach}"
             )

@@ -1,6 +1,7 @@
 """The forward pass of a smoother: EKF-SLAM over the log, which stores its linearization points."""
 
 import dataclasses
+from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -8,7 +9,7 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxslam import programs, validation
+from jaxslam import validation
 from jaxslam.association.known import Known
 from jaxslam.core.numbers import held_array
 from jaxslam.core.record import hold_function, record, set_field, static
@@ -133,7 +134,7 @@ class LogEstimator(Component):
 
     def __call__(self, log: Log, key: Array) -> Trace:
         check_run(self.name, self._filter, log, self.pose, self.pose_cov)
-        return programs.call(type(self).solve, (self,), log, key)
+        return _solve(self, log, key)
 
     @property
     def _filter(self) -> Filter:
@@ -148,6 +149,11 @@ class LogEstimator(Component):
 
         trace = run(self._filter, log, self.pose, self.pose_cov, key, probe=linearized_at)
         return ForwardPass(trace._replace(final=trace.final.joint, probe=None), *trace.probe)
+
+
+@partial(jax.jit, inline=True)
+def _solve(estimator: LogEstimator, log: Log, key: Array) -> Trace:
+    return estimator.solve(log, key)
 
 
 def log_in_one_dtype(log: Log) -> Log:

@@ -173,7 +173,7 @@ def test_a_campaign_of_a_file_is_resumed_while_the_file_computes_the_same(
     mine.write_text(MINE.replace("factor = 2.0", "factor = 3.0"))
     message = refused(
         [*again, "--runs", "4"],
-        f"{out / 'blocks'} holds another campaign: filter blind: computes something else than in "
-        "the stored runs (was its file edited?); choose another folder, or replace",
+        f"{out / 'blocks'} holds another campaign: filter blind: has other numbers "
+        "or other code than in the stored runs; choose another folder, or replace",
     )
     assert "--overwrite" in message

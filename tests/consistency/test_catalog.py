@@ -16,6 +16,7 @@ from jaxslam.protocols import Filter, Here
 from jaxslam.run import run
 from jaxslam.simulation.scenarios import SCENARIOS, loop, stationary
 from jaxslam.simulation.worlds import simulate
+from jaxslam.smoothing import LogEstimator
 from jaxslam.types import Status
 
 KEY = jax.random.key(0)
@@ -33,7 +34,7 @@ def drive(drawn, name, probe=None, **options):
     world, truth, log = drawn
     candidate = catalog.ALL[name](world, **options)
     filter = candidate
-    if not isinstance(candidate, Filter):
+    if not isinstance(candidate, Filter | LogEstimator):
         filter = candidate(jax.tree.map(jnp.asarray, truth))
     if not isinstance(filter, Filter):  # an estimator of the whole log
         return jax.device_get(filter(log, KEY))

@@ -19,6 +19,7 @@ from jaxslam.filters.map_management.merging import Merged
 from jaxslam.filters.particles.states.moments import weighted_pose_moments
 from jaxslam.filters.particles.states.particle_info import ParticleInfo
 from jaxslam.filters.reporting import Pruned
+from jaxslam.simulation.spurious import Spurious
 from jaxslam.simulation.worlds import simulate
 from jaxslam.types import Estimate, Info, Log, Scan, Status, Trace, Truth
 
@@ -283,7 +284,7 @@ def test_what_is_called_a_bound_bounds():
 
 @pytest.mark.parametrize(
     ("change", "message"),
-    [({"draw": lambda scenario, key: None}, "one robot"), ({}, "leading axis")],
+    [({"spurious": Spurious()}, "one robot"), ({}, "leading axis")],
 )
 def test_a_posterior_bound_of_what_it_cannot_take_is_refused(change, message):
     world = dataclasses.replace(worlds.ring(steps=2), **change)

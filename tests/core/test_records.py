@@ -12,12 +12,15 @@ import pytest
 import worlds
 from own_models import motion_of, sensor_of
 
+import jaxslam
 from jaxslam import catalog, filters, motion, resampling, run, sensors, simulate
 from jaxslam.core.record import is_record, record, static
 from jaxslam.motion import OdometryNoise
 from jaxslam.protocols import Motion, Sensor
+from jaxslam.simulation.worlds import World
 from jaxslam.types import Log, Scan
 
+KEY = jax.random.key(0)
 R = np.diag([0.04, 0.01])
 MOUNT = np.array([0.3, 0.0, 0.1])
 
@@ -255,13 +258,8 @@ def test_other_numbers_cost_no_trace_and_no_program():
 
 @pytest.mark.parametrize("name", catalog.ALL)
 def test_filters_of_the_catalog_hold_numbers_alone(name):
-    world, truth = worlds.ring(3), worlds.draw(worlds.ring(3))[0]
-
     def made():
-        if name == "mapping":  # its entry is a function, of a log on the true path
-            return catalog.on_given_poses(world)
-        candidate = catalog.ALL[name](world)
-        return candidate if isinstance(candidate, filters.Filter) else candidate(truth)
+        return catalog.ALL[name](worlds.ring(3))
 
     one, other = jax.tree.structure(made()), jax.tree.structure(made())
     assert one == other and hash(one) == hash(other)
@@ -298,3 +296,104 @@ def test_numbers_in_float64_leave_a_run_in_float32(filter):
     given = jax.tree.map(np.asarray, filter), worlds.narrow(LOG)
     trace = jax.eval_shape(lambda one, log: run(one, log, *START), *given)
     assert {leaf.dtype for leaf in jax.tree.leaves(trace)}.isdisjoint({np.dtype("f8")})
+
+
+def test_a_stack_needs_vmap():
+    stack = jax.tree.map(lambda leaf: jnp.stack([jnp.asarray(leaf)] * 2), toy_filter())
+    with pytest.raises(ValueError, match=r"got \(2, 2, 2\): run a stack of filters as jax.vmap"):
+        driven(stack)
+
+
+# --- worlds ----------------------------------------------------------------------------------------
+
+
+def team(scale=1.0):
+    seen = sensors.Suite([(sensors.RangeBearing(R * scale), 2)])
+    moving = motion.Increment(np.diag([0.01, 0.02]) * scale)
+    robots = [
+        jaxslam.team.Robot(moving, seen),
+        jaxslam.team.Robot(moving, seen, start=((1.0, 0.5, 0.1), np.eye(3) * 0.01)),
+    ]
+    return jaxslam.TeamWorld(robots, np.ones((2, 2)), np.full((3, 4), 0.1 * scale))
+
+
+def recorded(scale=1.0):
+    world = worlds.scaled(scale, 3)
+    truth, log = worlds.draw(world)
+    return jaxslam.recorded_world(
+        world.motion, world.sensor, [log], truth.pose[None], truth.landmarks
+    )
+
+
+WORLDS = {
+    "scenario": lambda scale=1.0: worlds.scaled(scale, 3),
+    "faults": lambda scale=1.0: dataclasses.replace(
+        worlds.scaled(scale, 3),
+        spurious=jaxslam.spurious.Spurious(1.0, 0.1 * scale, 0.1, 0.1, reach=5.0 * scale),
+        visible=jaxslam.scenarios.BetweenRanges(0.1, 9.0 * scale),
+        filter_options={"correction": "joint", "gate": 9.0},
+        published={"ekf": {"nees_pose": 3.0}},
+    ),
+    "team": team,
+    "recorded": recorded,
+}
+
+
+@pytest.mark.parametrize("name", WORLDS)
+def test_a_world_of_other_numbers_is_drawn_by_the_same_program(name):
+    world = WORLDS[name]()
+    leaves = jax.tree.leaves(world)
+    assert leaves and all(np.asarray(leaf).dtype.kind in "biuf" for leaf in leaves)
+    first = simulate(world, KEY)
+    with worlds.compilations() as compiled:
+        second = simulate(WORLDS[name](1.5), KEY)
+        again = simulate(pickle.loads(pickle.dumps(world)), KEY)
+        assert compiled() == 0
+    assert not np.allclose(first[1].control, second[1].control) or name in ("scenario", "faults")
+    assert not np.allclose(first[0].landmarks, second[0].landmarks) or name == "team"
+    chex.assert_trees_all_equal(first, again)
+
+
+def test_a_gradient_of_a_world_is_a_world():
+    world = worlds.scaled(1.0, 3)
+
+    def spread(world):
+        return (simulate(world, KEY)[0].pose ** 2).sum()
+
+    by_world = jax.grad(spread, allow_int=True)(world)
+    assert type(by_world) is type(world)
+    noise, h = world.motion.noise_cov.cov, 1e-9
+    more = dataclasses.replace(
+        world, motion=dataclasses.replace(world.motion, noise_cov=noise + h * np.eye(2))
+    )
+    slope = (spread(more) - spread(world)) / h
+    np.testing.assert_allclose(np.trace(by_world.motion.noise_cov.cov), slope, rtol=1e-4)
+    assert np.isfinite(by_world.controls).all() and np.abs(by_world.controls).max() > 0
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"landmarks": np.zeros((2, 3))}, r"Scenario 'ring': landmarks: expected shape \(N, 2\)"),
+        ({"pose_cov": -np.eye(3)}, "Scenario 'ring': pose_cov"),
+        (
+            {"visible": 3.0},
+            r"Scenario: expected visible to be a function of \(pose, l\), got float",
+        ),
+        ({"filter_options": {"gate": np.ones(2)}}, "filter_options: gate: expected a value"),
+        ({"noise_on": "wheels"}, "expected noise_on"),
+    ],
+)
+def test_a_world_names_what_is_wrong_in_it(change, message):
+    with pytest.raises(ValueError, match=message):
+        dataclasses.replace(worlds.ring(3), **change)
+
+
+def test_a_world_without_draw_is_refused():
+    @record
+    class Still(World):
+        motion: object
+        sensor: object
+
+    with pytest.raises(ValueError, match="Still: expected a method draw"):
+        Still(worlds.ring(3).motion, worlds.ring(3).sensor)

@@ -13,7 +13,7 @@ from worlds import draw
 from jaxslam import filters, sensors
 from jaxslam.run import run
 from jaxslam.simulation.scenarios import cloister
-from jaxslam.simulation.scenarios.view import between_ranges
+from jaxslam.simulation.scenarios.view import BetweenRanges
 from jaxslam.types import Status
 
 KEY = jax.random.key(0)
@@ -23,7 +23,7 @@ UNGATED = 1e6
 
 def world(steps=60, **changes):
     """Three metres of sight in the cloister, from a start that is not exactly known."""
-    changes = {"visible": between_ranges(0.0, 3.0), "places": 14, "pose_cov": P0} | changes
+    changes = {"visible": BetweenRanges(0.0, 3.0), "places": 14, "pose_cov": P0} | changes
     return dataclasses.replace(cloister(steps), **changes)
 
 

@@ -15,7 +15,7 @@ import jaxslam
 from jaxslam import charts, filters, linearize, motion, sensors
 from jaxslam.filters import EkfSlam
 from jaxslam.sensors import Part, Suite
-from jaxslam.simulation.scenarios import between_ranges
+from jaxslam.simulation.scenarios import BetweenRanges
 from jaxslam.simulation.spurious import Spurious
 from jaxslam.simulation.worlds import Scenario
 from jaxslam.types import Status
@@ -30,7 +30,7 @@ def of_all(compass):
     """Three kinds of sensors, and two places for other robots."""
     return Suite(
         (
-            Part(EYES, 4, visible=between_ranges(0.0, 4.0)),
+            Part(EYES, 4, visible=BetweenRanges(0.0, 4.0)),
             Part(LASER, 6, every=3, start=1),
             Part(compass, 1, every=5),
             Part(EYES, 2, sees="robots"),

@@ -18,28 +18,27 @@ import numpy as np
 import worlds
 
 from jaxslam import filters, store
-from jaxslam.cli.runtime.library import ProgramFolder
 from jaxslam.monte_carlo import monte_carlo
 
 RUNS, BLOCK = 240, 2
 FULL = 28
 """Exit code of a process whose disk was full."""
-_IDENTITY = {"campaign": "toy"}
 
 
 def campaign(**options):
     """A campaign of dead reckoning in blocks of two runs."""
     world = worlds.ring(20)
     candidates = {"reckoning": filters.DeadReckoning(world.motion, world.sensor)}
-    options |= {"block": BLOCK, "devices": jax.devices()[:1], "identity": _IDENTITY}
+    options |= {"block": BLOCK, "devices": jax.devices()[:1]}
     return monte_carlo(world, candidates, RUNS, worlds.key(), **options)
 
 
 def _begin(folder, programs, full_after):
     """The target of a process. full_after: from so many blocks on no file of this size is written."""
     jax.config.update("jax_enable_x64", True)
-    jax.config.update("jax_compilation_cache_dir", None)
-    programs.mkdir(exist_ok=True)
+    jax.config.update("jax_compilation_cache_dir", str(programs))
+    jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.0)
+    jax.config.update("jax_persistent_cache_min_entry_size_bytes", -1)
 
     def fill(done=0, total=0):
         if done >= full_after * BLOCK:
@@ -49,8 +48,7 @@ def _begin(folder, programs, full_after):
     try:
         if limited:
             fill()
-        keep, library = store.join(folder, runs=RUNS), ProgramFolder(programs, _IDENTITY)
-        campaign(keep=keep, library=library, progress=fill if limited else False)
+        campaign(keep=store.join(folder, runs=RUNS), progress=fill if limited else False)
     except OSError as error:
         full = error.errno == errno.EFBIG and "cannot write" in str(error)
         os._exit(FULL if full else 1)

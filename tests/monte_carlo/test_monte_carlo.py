@@ -11,13 +11,11 @@ import pytest
 import worlds
 from own_models import changed
 
-from jaxslam import catalog, filters, grids, motion, run, sensors, simulate, store
+from jaxslam import Scenario, catalog, filters, grids, motion, run, sensors, simulate, store
 from jaxslam.core.record import record
 from jaxslam.filters import reporting
 from jaxslam.grids.localization.localize import info_of_beams
 from jaxslam.monte_carlo import Interrupted, missing, monte_carlo, work
-from jaxslam.monte_carlo.blocks.block import BlockRunner
-from jaxslam.monte_carlo.blocks.plan import CampaignPlan, Promises
 from jaxslam.monte_carlo.candidates import fitting_block, without_noise
 from jaxslam.simulation.laser import scan_world
 from jaxslam.simulation.scenarios import square
@@ -96,8 +94,8 @@ class Spy:
     def __init__(self, store, fails=()):
         self.store, self.saved, self.fails = store, [], list(fails)
 
-    def claim(self, fingerprint):
-        self.store.claim(fingerprint)
+    def claim(self, identity):
+        self.store.claim(identity)
 
     def save(self, first, arrays, runs):
         if self.fails and self.fails.pop(0):
@@ -129,7 +127,7 @@ def test_a_stopped_campaign_goes_on_and_no_run_comes_twice(tmp_path, in_fours):
 
     third = Spy(store.resume(tmp_path))
     campaign = campaign_of(devices=2, keep=third)
-    worlds.assert_identical(campaign.filters["ekf"], in_fours.filters["ekf"])
+    same(campaign.filters["ekf"], in_fours.filters["ekf"])
     pieces = sorted(first.saved + second.saved + third.saved)
     assert [run for at, runs in pieces for run in range(at, at + runs)] == list(range(10))
 
@@ -138,14 +136,14 @@ def test_a_stopped_campaign_goes_on_and_no_run_comes_twice(tmp_path, in_fours):
     assert finished.saved == []
     assert began.compile_seconds == 0
     assert began.divergence_limit == in_fours.divergence_limit
-    worlds.assert_identical(began.filters["ekf"], in_fours.filters["ekf"])
+    worlds.assert_identical(began.filters["ekf"], campaign.filters["ekf"])
 
 
 def test_an_interrupt_before_any_block_has_no_campaign(monkeypatch):
     def interrupted(*arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(work, "compile_programs", interrupted)
+    monkeypatch.setattr(work, "BlockRunner", interrupted)
     with pytest.raises(Interrupted, match="0 of 10") as stopped:
         campaign_of()
     assert stopped.value.campaign is None
@@ -153,15 +151,15 @@ def test_an_interrupt_before_any_block_has_no_campaign(monkeypatch):
 
 def test_out_of_memory_tries_smaller_blocks(monkeypatch, in_fours):
     tried = []
-    compile_programs = work.compile_programs
+    runner = work.BlockRunner
 
-    def little_memory(plan, promises):
+    def little_memory(plan):
         tried.append(plan.wide)
         if plan.wide > 4:
             raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 1 byte")
-        compile_programs(plan, promises)
+        return runner(plan)
 
-    monkeypatch.setattr(work, "compile_programs", little_memory)
+    monkeypatch.setattr(work, "BlockRunner", little_memory)
     with pytest.warns(UserWarning, match="continuing with block=") as warned:
         campaign = campaign_of(block=18)
     assert (tried, len(warned)) == ([18, 9, 4], 2)
@@ -172,7 +170,7 @@ def test_out_of_memory_for_one_run_says_so(monkeypatch):
     def no_memory(*arguments):
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")
 
-    monkeypatch.setattr(work, "compile_programs", no_memory)
+    monkeypatch.setattr(work, "BlockRunner", no_memory)
     with pytest.raises(MemoryError, match="block=1"):
         campaign_of(block=1)
 
@@ -181,7 +179,7 @@ def test_other_errors_of_the_runtime_are_not_taken_for_memory(monkeypatch):
     def broken(*arguments):
         raise jax.errors.JaxRuntimeError("INTERNAL: something else")
 
-    monkeypatch.setattr(work, "compile_programs", broken)
+    monkeypatch.setattr(work, "BlockRunner", broken)
     with pytest.raises(jax.errors.JaxRuntimeError, match="something else"):
         campaign_of()
 
@@ -192,14 +190,6 @@ def test_a_model_that_cannot_be_traced_stops_the_campaign_whatever_waits_for_it(
 
     with pytest.raises(ValueError, match="no filter for this truth"):
         campaign_of({"ekf": EKF, "broken": broken}, workers=2)
-
-
-def test_steps_are_timed_while_nothing_is_compiled():
-    plan = CampaignPlan(WORLD, {"a": EKF, "b": EKF}, worlds.key(), jax.devices()[:1], block=2)
-    runner = BlockRunner(plan, Promises([]))
-    runner._spent["a"] += [(False, 8.0), (True, 1.0), (True, 3.0)]
-    runner._spent["b"] += [(False, 4.0)]
-    assert runner.run_seconds() == {"a": 1.0, "b": 2.0}
 
 
 def test_every_filter_gets_the_same_draws(in_fours):
@@ -321,21 +311,16 @@ def test_a_filter_of_beams_without_innovations_runs_in_a_world_that_draws_a_log_
     """Dead reckoning that says of beams what `grids.GridLocalization` does: there is nothing to whiten."""
     room = square(beams=3)
 
-    def draw(scenario, key):
-        log = scan_world(room, key)
-        nothing = jnp.zeros(len(log.pose), jnp.int32)
-        start = jnp.asarray(room.pose, log.pose.dtype)
-        truth = Truth(log.pose, jnp.zeros((1, 2)), nothing, start)
-        return truth, grids.beam_log(log.control, log.beams)
+    @record
+    class OfBeams(Scenario):
+        def draw(self, key):
+            log = scan_world(room, key)
+            nothing = jnp.zeros(len(log.pose), jnp.int32)
+            start = jnp.asarray(room.pose, log.pose.dtype)
+            truth = Truth(log.pose, jnp.zeros((1, 2)), nothing, start)
+            return truth, grids.beam_log(log.control, log.beams)
 
-    world = dataclasses.replace(
-        WORLD,
-        motion=room.motion,
-        landmarks=np.zeros((1, 2)),
-        controls=room.controls,
-        pose=room.pose,
-        draw=draw,
-    )
+    world = OfBeams("beams", room.motion, WORLD.sensor, np.zeros((1, 2)), room.controls, room.pose)
     reckoning = filters.DeadReckoning(room.motion, WORLD.sensor)
 
     @record

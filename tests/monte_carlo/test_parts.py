@@ -80,7 +80,7 @@ def test_a_part_without_a_block_says_so():
 
 @pytest.mark.parametrize("links", [True, False])
 def test_of_processes_that_begin_at_once_one_makes_the_manifest(tmp_path, links, monkeypatch):
-    """In each round four threads have one fingerprint, and four another: all of one kind go on."""
+    """In each round four threads have one identity, and four another: all of one kind go on."""
     if not links:  # as on a file system without; then not all at once
 
         def no_links(*_):

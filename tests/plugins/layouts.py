@@ -2,22 +2,21 @@
 
 import re
 
-from jaxslam.programs import cache
+import jax
 
 _COMPUTATION = re.compile(r"(?:ENTRY )?%?([\w.\-]+) \(.*\) -> .*\{$")
 _INSTRUCTION = re.compile(r"\s+(ROOT )?%([\w.\-]+) = (\([^=]*?\)|\S+) ([\w\-]+)\((.*)$")
 
 
 def kept_programs():
-    """The keys of the programs that are kept."""
-    return set(cache._BY_TEXT._found)
+    """The compiled programs that the process keeps."""
+    return set(jax.devices()[0].client.live_executables())
 
 
 def wrong_layouts(before=()):
     """Calls in the kept programs, but for those of `before`, with another layout than their
     computation was compiled for, which give wrong numbers (jaxlib 0.12)."""
-    kept = cache._BY_TEXT._found.items()
-    texts = (made.result().as_text() for key, made in kept if key not in before)
+    texts = (program.hlo_modules()[0].to_string() for program in kept_programs() - set(before))
     return [one for text in texts for one in mismatches(text)[0]]
 
 

@@ -60,15 +60,15 @@ def test_a_campaign_of_records_is_that_of_the_draws(tmp_path):
 
 def test_simulate_takes_one_of_the_records():
     world = recorded()
-    poses = np.asarray(world.recorded[0].pose)
+    poses = np.asarray(world.truth.pose)
     for seed in range(3):
         truth, log = simulate(world, jax.random.key(seed))
         (i,) = np.flatnonzero((poses == np.asarray(truth.pose)).all(axis=(1, 2)))
-        chex.assert_trees_all_equal(log.control, world.recorded[1].control[i])
+        chex.assert_trees_all_equal(log.control, world.log.control[i])
 
 
 def ragged():
-    logs = recorded().recorded[1]
+    logs = recorded().log
     rows = [jax.tree.map(lambda leaf, i=i: leaf[i], logs) for i in range(5)]
     return [*rows[:4], jax.tree.map(lambda leaf: leaf[:-1], rows[4])]
 

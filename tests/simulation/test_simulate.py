@@ -19,7 +19,7 @@ from reference.plane import mounted, wrap
 from jaxslam import motion, sensors
 from jaxslam.simulation.scenarios import (
     SCENARIOS,
-    between_ranges,
+    BetweenRanges,
     circle,
     cloister,
     cloister_landmarks,
@@ -244,7 +244,7 @@ def test_filters_get_the_precision_jax_is_set_to():
 
 @pytest.mark.parametrize("places", [2, 9])
 def test_a_scan_holds_what_is_in_view_lowest_tags_first(places):
-    near = between_ranges(1.0, 4.0)
+    near = BetweenRanges(1.0, 4.0)
     controls = np.tile([0.15, 0.05], (100, 1))
     scenario = world(controls=controls, visible=near, places=places)
     truth, log = draw(scenario)
@@ -275,8 +275,8 @@ def test_everything_is_in_view_by_default():
     assert not truth.missed.any()
 
 
-def test_between_ranges_excludes_both_ends_and_reads_the_position_alone():
-    visible = between_ranges(1.0, 2.0)
+def test_BetweenRanges_excludes_both_ends_and_reads_the_position_alone():
+    visible = BetweenRanges(1.0, 2.0)
     pose = jnp.array([0.0, 0.0, 1.0])
     for x, expected in ((0.999, 0), (1.0, 0), (1.001, 1), (1.999, 1), (2.0, 0), (2.001, 0)):
         assert bool(visible(pose, jnp.array([0.0, x, 77.0]))) == expected

@@ -7,7 +7,7 @@ import jax
 import jaxslam
 
 jax.config.update("jax_enable_x64", True)
-view = jaxslam.scenarios.between_ranges
+view = jaxslam.scenarios.BetweenRanges
 clutter = jaxslam.spurious.Spurious(clutter=1.0, missed=0.05, reach=4.0)
 world = jaxslam.scenarios.cloister(steps=100)
 world = dataclasses.replace(world, visible=view(0.0, 4.0), places=36, spurious=clutter)

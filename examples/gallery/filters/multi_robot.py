@@ -13,7 +13,7 @@ sees = jaxslam.sensors.Suite(((eye, 6), jaxslam.sensors.Part(eye, 1, sees="robot
 start = (2.0, -1.0, 0.5), np.diag([0.05, 0.05, 0.02]) ** 2
 crew = [team.Robot(motion, sees), team.Robot(motion, sees, start=start)]
 posts = [[4.0, 5.0], [-3.0, 4.0], [5.0, -1.0], [0.0, 8.0], [-2.0, -1.0], [3.0, 1.5]]
-world = jaxslam.team_world(crew, posts, np.tile([0.2, 0.08, 0.2, 0.05], (40, 1)))
+world = jaxslam.TeamWorld(crew, posts, np.tile([0.2, 0.08, 0.2, 0.05], (40, 1)))
 truth, log = jaxslam.simulate(world, jax.random.key(1))
 found = {}
 for robot in (0, 1):

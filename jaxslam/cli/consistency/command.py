@@ -6,7 +6,6 @@ import shutil
 import sys
 import threading
 from collections.abc import Mapping
-from contextlib import AbstractContextManager, nullcontext
 from dataclasses import replace
 
 import jax
@@ -19,15 +18,14 @@ from jaxslam.cli.consistency.folder import (
     open_store,
     resumed,
 )
-from jaxslam.cli.runtime import devices, library
+from jaxslam.cli.runtime import devices
 from jaxslam.cli.user_objects import UserObjects
 from jaxslam.core.numbers import check_count
-from jaxslam.monte_carlo import Interrupted, Library, monte_carlo
+from jaxslam.monte_carlo import Interrupted, monte_carlo
 from jaxslam.monte_carlo.candidates import estimator_of, fitting_block, rounded
-from jaxslam.monte_carlo.fingerprint import fingerprint
 from jaxslam.protocols import Candidate
 from jaxslam.results import campaign_files, run_table, store
-from jaxslam.simulation.worlds import Scenario, run_keys, world_of_run
+from jaxslam.simulation.worlds import World, run_keys
 from jaxslam.types import Estimate, Truth
 
 
@@ -58,7 +56,6 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     assert isinstance(most, int | None)
     here = devices.chosen_devices(options.devices, most)
     key = jax.random.key(asked.seed)
-    identity, programs = _identity(asked, files, scenario, filters, key, here[0].platform)
     if part is not None and options.block is None:
         options.block = fitting_block(scenario, filters, here[0])
     if part is not None and (part[0] - 1) * options.block * len(here) >= asked.runs:
@@ -73,7 +70,7 @@ def consistency(options: argparse.Namespace, command: str) -> int:
         # compiled code when the interpreter exits.
         threading.Thread(target=_prepare_drawing).start()
     try:
-        with files.located_errors(), programs as kept:
+        with files.located_errors():
             campaign = monte_carlo(
                 scenario,
                 filters,
@@ -85,8 +82,6 @@ def consistency(options: argparse.Namespace, command: str) -> int:
                 dtype=asked.dtype,
                 keep=keep,
                 part=part,
-                identity=identity,
-                library=kept,
             )
     except Interrupted as stop:
         if stop.campaign is None:
@@ -172,28 +167,6 @@ def _part(options: argparse.Namespace) -> tuple[int, int] | None:
     return int(found[1]), int(found[2])
 
 
-def _identity(
-    asked: CampaignOptions,
-    files: UserObjects,
-    scenario: Scenario,
-    filters: Mapping[str, Candidate],
-    key: jax.Array,
-    platform: str,
-) -> tuple[dict[str, str], AbstractContextManager[Library | None]]:
-    """What tells the campaign from others, and its compiled programs in the cache folder.
-
-    By the names and the source of the package, without a trace. What comes from a user's file may
-    depend on anything, as other files: it is told by what it computes (`fingerprint`), which takes
-    a trace, and its programs are found in JAX's own cache, by their text.
-    """
-    if not files.used:
-        identity = library.identity(asked._asdict(), platform)
-        return identity, library.program_folder(identity)
-    with files.located_errors():
-        found = fingerprint(scenario, filters, key, platform, asked.bound, asked.dtype)
-    return found, nullcontext()
-
-
 def _prepare_drawing() -> None:
     """Load what draws the figures."""
     from jaxslam.results import page, plot  # noqa: F401
@@ -202,10 +175,10 @@ def _prepare_drawing() -> None:
 
 
 def _run_zero(
-    scenario: Scenario, candidate: Candidate, key: jax.Array, dtype: str
+    scenario: World, candidate: Candidate, key: jax.Array, dtype: str
 ) -> tuple[Truth, Estimate]:
     """Run 0 of a filter, computed again where an earlier command computed it."""
-    truth, log = rounded(world_of_run(scenario, key, 0), dtype)
+    truth, log = rounded(scenario.run(key, 0), dtype)
     method, _ = estimator_of(candidate, truth, scenario)
     estimate = method(log, run_keys(key, 0)[1]).estimate
     found: tuple[Truth, Estimate] = jax.device_get((truth, estimate))

@@ -10,14 +10,14 @@ from jaxslam.cli.films import film_files
 from jaxslam.monte_carlo.progress import Progress
 from jaxslam.protocols import Candidate
 from jaxslam.results.files import write_files
-from jaxslam.simulation.worlds import Scenario
+from jaxslam.simulation.worlds import World
 
 if TYPE_CHECKING:  # Pillow is slow to load
     from jaxslam.results.film import Film
 
 
 def write_films(
-    out: Path, scenario: Scenario, filters: Mapping[str, Candidate], seed: int, dtype: str
+    out: Path, scenario: World, filters: Mapping[str, Candidate], seed: int, dtype: str
 ) -> "dict[str, Film]":
     """Write the film of run 0 of every filter, which runs once more, and print what was written.
 

@@ -5,13 +5,10 @@ import time
 
 import jax
 
-from jaxslam.monte_carlo.blocks.blockwise import RESTORED
-
 _PARTS = (
     "/jax/core/compile/jaxpr_trace_duration",
     "/jax/core/compile/jaxpr_to_mlir_module_duration",
     "/jax/core/compile/backend_compile_duration",
-    RESTORED,
 )
 
 
@@ -70,8 +67,7 @@ class CompileClock:
             with self._lock:
                 self._spans.append((now - duration_secs, now))
                 # JAX reports a cached program as compiled, too.
-                self.programs += event in _PARTS[-2:]
-                self.cached += event == RESTORED
+                self.programs += event == _PARTS[-1]
 
     def _happened(self, event: str, **_: str | int) -> None:
         if event == "/jax/compilation_cache/cache_hits":

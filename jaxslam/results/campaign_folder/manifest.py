@@ -1,4 +1,4 @@
-"""The manifest of a campaign's folder: settings, fingerprint, digest, and the number of runs."""
+"""The manifest of a campaign's folder: settings, identity, digest, and the number of runs."""
 
 import hashlib
 import json
@@ -16,10 +16,10 @@ FORMAT = 2
 """Format of the folder, written in its manifest; others are refused."""
 
 MANIFEST = "manifest.json"
-"""File with the format, the settings, the fingerprint, their digest, and the number of runs."""
+"""File with the format, the settings, the identity, their digest, and the number of runs."""
 
 _DIGEST = re.compile("[0-9a-f]{16}")
-"""Digest of what is computed, in a fingerprint; its digits tell a user nothing."""
+"""Digest of a part of an identity; its digits tell a user nothing."""
 
 
 def read_manifest(folder: Path) -> Json:
@@ -92,7 +92,7 @@ def differences_of(
                 and plain
                 and all(_DIGEST.fullmatch(str(value)) for value in values)
             ):
-                how = "computes something else than in the stored runs (was its file edited?)"
+                how = "has other numbers or other code than in the stored runs"
             else:
                 how = f"{old} there, {new} here"
             found.append(f"{above}{key}: {how}")

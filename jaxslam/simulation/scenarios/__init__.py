@@ -9,7 +9,7 @@ from jaxslam.simulation.scenarios.lines import office_lines, square_lines
 from jaxslam.simulation.scenarios.loop import loop, loop_bearing, loop_landmarks
 from jaxslam.simulation.scenarios.rooms import ROOMS, circular_room, corridor, office, square
 from jaxslam.simulation.scenarios.stationary import stationary
-from jaxslam.simulation.scenarios.view import between_ranges
+from jaxslam.simulation.scenarios.view import BetweenRanges
 from jaxslam.simulation.scenarios.webmap import webmap
 from jaxslam.simulation.worlds import Scenario
 
@@ -30,7 +30,7 @@ SCENARIOS: dict[str, Callable[..., Scenario]] = {
 __all__ = [
     "ROOMS",
     "SCENARIOS",
-    "between_ranges",
+    "BetweenRanges",
     "circle",
     "circular_room",
     "cloister",

@@ -5,7 +5,7 @@ import numpy as np
 from jaxslam.core.numbers import check_count
 from jaxslam.motion.unicycle import Unicycle
 from jaxslam.sensors.relative_position import RelativePosition
-from jaxslam.simulation.scenarios.view import between_ranges
+from jaxslam.simulation.scenarios.view import BetweenRanges
 from jaxslam.simulation.worlds import Scenario
 
 
@@ -45,7 +45,7 @@ def circle(steps: int = 2500) -> Scenario:
         landmarks=landmarks,
         controls=np.tile([v, omega, 1.0], (steps, 1)),
         noise_on="odometry",
-        visible=between_ranges(1.0, 5.0),
+        visible=BetweenRanges(1.0, 5.0),
         places=max(fullest, 1),
         filter_options={"correction": "joint"},
         published=published if steps == 2500 else {},

@@ -8,7 +8,7 @@ from jaxslam.core.numbers import check_count
 from jaxslam.math.stats import sigma_gate
 from jaxslam.motion.increment import Increment
 from jaxslam.sensors.range_bearing import RangeBearing
-from jaxslam.simulation.scenarios.view import between_ranges
+from jaxslam.simulation.scenarios.view import BetweenRanges
 from jaxslam.simulation.worlds import Scenario
 
 
@@ -62,7 +62,7 @@ def cloister_noisy(steps: int = 400) -> Scenario:
         name="cloister_noisy",
         motion=Increment(np.diag([0.05, np.deg2rad(3.0)]) ** 2),
         sensor=RangeBearing(np.diag([0.1, np.deg2rad(3.0)]) ** 2),
-        visible=between_ranges(0.0, 3.0),
+        visible=BetweenRanges(0.0, 3.0),
         places=14,
         filter_options={"correction": "sequential"},
         source="the world of Solà, EKF-SLAM guide, 2014, appendix C.3; noise ours",

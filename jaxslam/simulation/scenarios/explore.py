@@ -5,7 +5,7 @@ import numpy as np
 from jaxslam.core.numbers import check_count
 from jaxslam.motion.increment import Increment
 from jaxslam.sensors.range_bearing import RangeBearing
-from jaxslam.simulation.scenarios.view import between_ranges
+from jaxslam.simulation.scenarios.view import BetweenRanges
 from jaxslam.simulation.worlds import Scenario
 
 
@@ -25,7 +25,7 @@ def explore(steps: int = 100) -> Scenario:
         sensor=RangeBearing(np.diag([0.1, np.deg2rad(1.0)]) ** 2),
         landmarks=np.concatenate([left, right]),
         controls=np.tile([1.0, 0.0], (steps, 1)),
-        visible=between_ranges(0.0, 12.0),
+        visible=BetweenRanges(0.0, 12.0),
         places=12,
         filter_options={"correction": "joint"},
         source="parameters ours",

@@ -1,12 +1,12 @@
 """Rooms whose walls are the landmarks, lines by distance and direction: an office, a square."""
 
-from collections.abc import Callable
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.core.numbers import check_count
+from jaxslam.core.record import record
+from jaxslam.math.arrays import Landmark, Number, Pose
 from jaxslam.sensors.line import Line
 from jaxslam.simulation.laser import LaserWorld
 from jaxslam.simulation.scenarios.rooms import office, square
@@ -53,7 +53,7 @@ def _lines(name: str, world: LaserWorld, steps: int | None, places: int) -> Scen
         landmarks=wall_lines(walls)[0],
         controls=controls,
         noise_on="odometry",
-        visible=_met_by_beams(walls, world.laser.max_range),
+        visible=_MetByBeams(walls, world.laser.max_range),
         places=places,
         filter_options={"correction": "joint"},
         source="parameters ours",
@@ -68,18 +68,19 @@ def from_start(world: LaserWorld) -> Walls:
     return Walls(segments, np.zeros((0, 3)))
 
 
-def _met_by_beams(walls: Walls, max_range: float) -> Callable[[jax.Array, jax.Array], jax.Array]:
+@record
+class _MetByBeams:
     """The field of view of a laser that needs some beams on a wall to measure it."""
-    around = 2 * np.pi * np.arange(BEAMS) / BEAMS
 
-    def visible(pose: jax.Array, landmark: jax.Array) -> jax.Array:
-        angles = jnp.asarray(around, pose.dtype)
-        ranges = exact_ranges(walls, pose, angles, max_range)
+    walls: Walls
+    max_range: Number
+
+    def __call__(self, pose: Pose, landmark: Landmark) -> jax.Array:
+        angles = jnp.asarray(2 * np.pi * np.arange(BEAMS) / BEAMS, pose.dtype)
+        ranges = exact_ranges(self.walls, pose, angles, self.max_range)
         heading = pose[2] + angles
         e = jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=-1)
         normal = jnp.stack([jnp.cos(landmark[1]), jnp.sin(landmark[1])])
         off = (pose[None, :2] + ranges[:, None] * e) @ normal - landmark[0]
-        met = (ranges < max_range) & (jnp.abs(off) < 1e-3) & (e @ normal > SLANT)
+        met = (ranges < self.max_range) & (jnp.abs(off) < 1e-3) & (e @ normal > SLANT)
         return jnp.asarray(met.sum() >= HITS)
-
-    return visible

@@ -9,7 +9,7 @@ from jaxslam.motion.unicycle import Unicycle
 from jaxslam.protocols import Sensor
 from jaxslam.sensors.range_bearing import RangeBearing
 from jaxslam.sensors.relative_position import RelativePosition
-from jaxslam.simulation.scenarios.view import between_ranges
+from jaxslam.simulation.scenarios.view import BetweenRanges
 from jaxslam.simulation.worlds import Scenario
 
 SPEED, TURN = 0.25, 0.025
@@ -38,11 +38,11 @@ def loop(steps: int = 2500, map_seed: int = 0) -> Scenario:
 
 def loop_bearing(steps: int = 2500, map_seed: int = 0) -> Scenario:
     """`loop` with ranges and bearings, σ_r = 10 % of the range, σ_φ = 10°."""
+    return _loop("loop_bearing", RangeBearing(_noise_cov), steps, map_seed)
 
-    def noise_cov(z: jax.Array) -> jax.Array:
-        return jnp.diag(jnp.stack([0.1 * z[0], jnp.full_like(z[0], np.deg2rad(10.0))]) ** 2)
 
-    return _loop("loop_bearing", RangeBearing(noise_cov), steps, map_seed)
+def _noise_cov(z: jax.Array) -> jax.Array:
+    return jnp.diag(jnp.stack([0.1 * z[0], jnp.full_like(z[0], np.deg2rad(10.0))]) ** 2)
 
 
 def loop_landmarks(map_seed: int) -> np.ndarray:
@@ -72,7 +72,7 @@ def _loop(name: str, sensor: Sensor, steps: int, map_seed: int) -> Scenario:
         controls=np.tile([SPEED, TURN, 1.0], (steps, 1)),
         pose_cov=1e-8 * np.eye(3),
         noise_on="odometry",
-        visible=between_ranges(0.5, 5.0),
+        visible=BetweenRanges(0.5, 5.0),
         places=max(fullest, 1),
         filter_options={"correction": "joint"},
         source=SOURCE,

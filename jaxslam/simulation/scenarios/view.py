@@ -1,23 +1,34 @@
 """Fields of view: which landmarks a simulated sensor reports."""
 
-from collections.abc import Callable
-
 import jax
 import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.core.numbers import is_concrete
+from jaxslam.core.record import record
+from jaxslam.math.arrays import Landmark, Number, Pose
 
 
-def between_ranges(nearest: float, farthest: float) -> Callable[[jax.Array, jax.Array], jax.Array]:
+@record
+class BetweenRanges:
     """A field of view all around, from nearest to farthest metres (both excluded).
 
     Raises ValueError unless 0 <= nearest < farthest.
     """
-    if not 0 <= nearest < farthest:
-        raise ValueError(
-            f"between_ranges: expected 0 <= nearest < farthest, got {nearest} and {farthest}"
-        )
 
-    def visible(pose: jax.Array, landmark: jax.Array) -> jax.Array:
+    nearest: Number
+    farthest: Number
+
+    def __post_init__(self) -> None:
+        if is_concrete(self.nearest, self.farthest) and not np.all(
+            (np.asarray(self.nearest) >= 0) & (self.nearest < np.asarray(self.farthest))
+        ):
+            raise ValueError(
+                f"BetweenRanges: expected 0 <= nearest < farthest, got {self.nearest} and "
+                f"{self.farthest}"
+            )
+
+    def __call__(self, pose: Pose, landmark: Landmark) -> jax.Array:
         squared = jnp.sum((landmark[:2] - pose[:2]) ** 2)
+        nearest, farthest = (jnp.asarray(x, pose.dtype) for x in (self.nearest, self.farthest))
         return (squared > nearest**2) & (squared < farthest**2)
-
-    return visible

@@ -14,7 +14,7 @@ from numpy.typing import ArrayLike
 from jaxslam.graphs import Factor
 from jaxslam.grids.beam_models import BeamModel
 from jaxslam.protocols import Chart, Filter, Linearizer, Motion, Sensor
-from jaxslam.simulation.worlds import Scenario
+from jaxslam.simulation.worlds import World
 from jaxslam.verify import Check, Report, build
 from jaxslam.verify.errors import describe_error, is_user_file, place_of_error
 from jaxslam.verify.examination import Model
@@ -204,7 +204,7 @@ def names_in(module: ModuleType) -> str:
         if not name.startswith("_")
         and not (isinstance(value, type) and not issubclass(value, Motion | Sensor))
         and (
-            isinstance(value, Motion | Sensor | Factor | BeamModel | Filter | Scenario)
+            isinstance(value, Motion | Sensor | Factor | BeamModel | Filter | World)
             or (callable(value) and getattr(value, "__module__", "") == module.__name__)
         )
     ]

@@ -20,7 +20,7 @@ from jaxslam.filters.information.sparse.marginals import (
 from jaxslam.filters.information.sparse.mean_recovery import recover_passive_means
 from jaxslam.run import run
 from jaxslam.simulation.scenarios import cloister
-from jaxslam.simulation.scenarios.view import between_ranges
+from jaxslam.simulation.scenarios.view import BetweenRanges
 from jaxslam.types import Status
 
 KEY = jax.random.key(0)
@@ -31,7 +31,7 @@ P0 = np.diag([0.1, 0.1, 0.05]) ** 2
 def world(steps=40):
     """Few landmarks in sight at a time, in the cloister; its log."""
     scene = dataclasses.replace(
-        cloister(steps), visible=between_ranges(0.0, 2.2), places=8, pose_cov=P0
+        cloister(steps), visible=BetweenRanges(0.0, 2.2), places=8, pose_cov=P0
     )
     return scene, draw(scene)[1]
 

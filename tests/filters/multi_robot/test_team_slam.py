@@ -16,8 +16,8 @@ from jaxslam import filters, motion, sensors, team
 from jaxslam.filters import EkfSlam, TeamSlam
 from jaxslam.filters.multi_robot import pose_initialization
 from jaxslam.sensors import Part, Suite
-from jaxslam.simulation import team_world
-from jaxslam.simulation.scenarios import between_ranges
+from jaxslam.simulation.scenarios import BetweenRanges
+from jaxslam.simulation.team_world import TeamWorld
 from jaxslam.simulation.worlds import simulate
 from jaxslam.types import Log, Scan, Status
 
@@ -35,7 +35,7 @@ NOTHING = np.zeros((3, 3))
 def crew(count=2, mutual=True, reach=3.2):
     eyes = sensors.RangeBearing(R1, mount=MOUNT)
     back = sensors.RangeBearing(R2, mount=(0.0, 0.0, 3.0))
-    parts = [Part(eyes, 4, visible=between_ranges(0.0, reach))]
+    parts = [Part(eyes, 4, visible=BetweenRanges(0.0, reach))]
     if count < 3:  # three robots of three sensors would compile for long
         parts.append(Part(back, 2, every=3))
     if mutual and count > 1:
@@ -54,7 +54,7 @@ def world(robots, steps=40, **options):
     points = np.stack([radius * np.cos(around), 1.0 + radius * np.sin(around)], axis=1)
     turns = [4 * np.pi / 100, -0.1, 0.15][: len(robots)]
     controls = np.tile(np.ravel([(0.12, turn) for turn in turns]), (steps, 1))
-    return team_world.team_world(robots, points, controls, **options)
+    return TeamWorld(robots, points, controls, **options)
 
 
 @cache
@@ -261,7 +261,7 @@ RUNS = 100
 def hundred(report, first):
     """Truth of one of two robots and logs of 100 runs; robot 1 sees landmarks from a step on."""
     eyes = sensors.RangeBearing(R1, mount=MOUNT)
-    sight = between_ranges(0.0, 3.2)
+    sight = BetweenRanges(0.0, 3.2)
     other = Part(eyes, 1, every=2, sees="robots")
     robots = [
         team.Robot(
@@ -332,7 +332,7 @@ def test_a_world_is_the_same_whatever_is_reported():
     @jax.jit
     def all_of_them(key):
         truths, logs = zip(*(simulate(scenario, key) for scenario in scenarios), strict=True)
-        return truths, logs, team_world.histories(scenarios[0], robots, key)
+        return truths, logs, scenarios[0].histories(key)
 
     truths, logs, (starts, paths, _) = all_of_them(jax.random.key(0))
     chex.assert_trees_all_equal(*logs)
@@ -352,7 +352,7 @@ def driven_by(theta, log):
 def test_gradients_are_finite_and_float32_is_near():
     """Through births, corrections and the way in by two landmarks."""
     eyes = sensors.RangeBearing(R1, mount=MOUNT)
-    sight = Suite((Part(eyes, 3, visible=between_ranges(0.0, 3.2)),))
+    sight = Suite((Part(eyes, 3, visible=BetweenRanges(0.0, 3.2)),))
     scenario = world([team.Robot(motion.Increment(Q), sight, at) for at in STARTS[:2]], 4)
     _, log = draw(scenario, 0)
 
@@ -403,7 +403,6 @@ def signs():
         (lambda: world(crew(2), tags=(3, 9)), "expected tags of robots from"),
         (lambda: world(unknown(crew(2))), "expected a start of every robot"),
         (lambda: world(crew(2), report=2), "expected report from 0 to"),
-        (lambda: world(crew(2), places=2), "places is not supported"),
     ],
 )
 def test_bad_input(make, message):

@@ -17,7 +17,7 @@ from jaxslam.results.plot.scene.render import render
 from jaxslam.results.plot.scene.run_scene import run_scene
 from jaxslam.results.plot.style import PAGE
 from jaxslam.run import run
-from jaxslam.simulation.worlds import Scenario, run_keys, with_positions, world_of_run
+from jaxslam.simulation.worlds import World, run_keys, with_positions
 from jaxslam.types import Log, Trace, Truth
 from jaxslam.validation import check_record
 
@@ -76,7 +76,7 @@ def animate(
 
 
 def animate_world(
-    scenario: Scenario,
+    scenario: World,
     candidate: Candidate,
     key: jax.Array,
     *,
@@ -97,8 +97,8 @@ def animate_world(
         key: of the campaign. number: of the run. dtype: of the filter, by default that of JAX.
         options: of `animate`.
     """
-    check_record("animate_world", "scenario", scenario, Scenario)
-    truth, log = rounded(world_of_run(scenario, key, number), dtype)
+    check_record("animate_world", "scenario", scenario, World)
+    truth, log = rounded(scenario.run(key, number), dtype)
     of_filter = run_keys(key, number)[1]
     method = candidate if isinstance(candidate, Filter) else candidate(truth)
     if isinstance(method, Filter):

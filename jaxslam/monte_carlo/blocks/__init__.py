@@ -1,1 +1,0 @@
-"""A block of runs: the programs that draw, filter and score it, and how they are compiled."""

@@ -1,0 +1,174 @@
+"""The identity of a campaign: what must agree for two blocks of runs to be of one campaign.
+
+World, filters and key are data, so it is their structure and their numbers, bit by bit, with the
+versions and a digest of the package's source. Of classes and functions outside the package it is
+their code too, with what that refers to: an edited line of a user's model is another campaign; a
+comment or a renamed file is not. Not seen: what other packages compute, and flags of XLA.
+"""
+
+import dataclasses
+import functools
+import hashlib
+import inspect
+from collections.abc import Callable, Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from types import CodeType, FunctionType
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import DTypeLike
+
+import jaxslam
+from jaxslam.core.record import is_record
+from jaxslam.protocols import Candidate
+from jaxslam.simulation.worlds import World
+
+_OF_WORLD = ("landmarks", "controls", "pose", "pose_cov", "motion", "sensor")
+"""Parts of a world that are named where they differ."""
+
+_NO_PART_OF_DRAWS = frozenset({"name", "published", "source", "filter_options"})
+"""Fields of a world that do not change what is drawn."""
+
+
+def identity(
+    scenario: World,
+    filters: Mapping[str, Candidate],
+    key: jax.Array,
+    platform: str,
+    bound: bool = False,
+    dtype: DTypeLike | None = None,
+) -> dict[str, str]:
+    """A short text by the name of each thing that must agree.
+
+    The number of runs is no part of it: run i has a key of its own. platform: of the devices that
+    compute, as "cpu"; rounding differs between platforms.
+    """
+    parts = {name: digest(getattr(scenario, name)) for name in _OF_WORLD}
+    fields = {field.name for field in dataclasses.fields(scenario)} - _NO_PART_OF_DRAWS  # type: ignore[arg-type]
+    rest = {name: getattr(scenario, name) for name in fields - set(_OF_WORLD)}
+    return {
+        **{name: _version(name) for name in ("jaxslam", "jax", "jaxlib")},
+        "source": _source(),
+        "platform": platform,
+        "dtype": str(jnp.result_type(float) if dtype is None else jnp.dtype(dtype)),
+        "drawn in": str(jnp.result_type(float)),
+        "key": _key(key),
+        "bound": "yes" if bound else "no",
+        "filters": ", ".join(filters),
+        "scenario": scenario.name,
+        "steps": str(scenario.steps),
+        **parts,
+        "world": digest((type(scenario), rest)),
+        **{f"filter {name}": digest(candidate) for name, candidate in filters.items()},
+    }
+
+
+def digest(value: object) -> str:
+    """A digest of records, arrays, functions and what they hold."""
+    return _short(_text(value, ()))
+
+
+def _text(value: object, within: tuple[object, ...]) -> str:
+    """A value as text, the same in every process. within: the functions that refer to it."""
+    if value is None or isinstance(value, str | bytes | bool | int | float | complex):
+        return repr(value)
+    if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
+        return _key(value)
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
+        array = np.ascontiguousarray(value)
+        return f"{array.shape} {array.dtype} {hashlib.sha256(array.tobytes()).hexdigest()}"
+    if isinstance(value, Mapping):
+        return str([(str(k), _text(value[k], within)) for k in sorted(value, key=str)])
+    if is_record(value):
+        fields = [field.name for field in dataclasses.fields(value)]  # type: ignore[arg-type]
+        held = [(name, _text(getattr(value, name), within)) for name in fields]
+        return f"{_text(type(value), within)} {held}"
+    if isinstance(value, tuple | list):
+        return f"{type(value).__qualname__} {[_text(part, within) for part in value]}"
+    if isinstance(value, functools.partial):
+        return _text((value.func, value.args, value.keywords), within)
+    if isinstance(value, type):
+        return _text_of_class(value, within)
+    inner = getattr(value, "__wrapped__", getattr(value, "__func__", value))
+    if isinstance(inner, FunctionType):
+        bound = _text(getattr(value, "__self__", None), within)
+        return f"{bound} {_text_of_function(inner, within)}"
+    if isinstance(value, CodeType):
+        return str([value.co_code.hex(), value.co_names, _text(value.co_consts, within)])
+    return _name(value)
+
+
+def _text_of_class(cls: type, within: tuple[object, ...]) -> str:
+    if not _of_user(cls) or cls in within:
+        return _name(cls)
+    within = (*within, cls)
+    methods = [
+        (name, _text(getattr(part, "fget", part), within))
+        for name, part in sorted(vars(cls).items())
+        if isinstance(part, FunctionType | property)
+        and not getattr(part, "__module__", cls.__module__).startswith("jaxslam.")
+    ]
+    return f"{cls.__qualname__} {methods} {[_text(base, within) for base in cls.__bases__]}"
+
+
+def _text_of_function(function: FunctionType, within: tuple[object, ...]) -> str:
+    if not _of_user(function) or function in within:
+        return _name(function)
+    within = (*within, function)
+    held = inspect.getclosurevars(function)
+    values = {**held.globals, **held.nonlocals}
+    parts = (function.__code__, function.__defaults__, function.__kwdefaults__, values)
+    return _text(parts, within)
+
+
+def _of_user(value: Callable[..., object]) -> bool:
+    """Whether code is neither of the package nor of another one that is installed."""
+    try:
+        path = Path(inspect.getfile(value))
+    except (TypeError, OSError):  # built in, or typed at a prompt
+        return value.__module__ in ("__main__", None)
+    package = Path(jaxslam.__file__).parent
+    installed = {"site-packages", "dist-packages"} & set(path.parts)
+    return not (path.is_relative_to(package) or installed or _standard(value.__module__))
+
+
+def _standard(module: str) -> bool:
+    import sys
+
+    return module.partition(".")[0] in sys.stdlib_module_names
+
+
+def _name(value: object) -> str:
+    of = value if hasattr(value, "__qualname__") else type(value)
+    return f"{of.__module__}.{of.__qualname__}"  # type: ignore[attr-defined]
+
+
+def _short(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _key(key: jax.Array) -> str:
+    """A PRNG key as text: its kind and its numbers."""
+    typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
+    data = np.asarray(jax.random.key_data(key) if typed else key)
+    kind = str(jax.random.key_impl(key)) if typed else "raw"
+    return f"{kind} {':'.join(map(str, data.ravel().tolist()))}"
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:  # run from its source, as by PYTHONPATH
+        return "not installed"
+
+
+@functools.cache
+def _source() -> str:
+    """A digest of every source file of the package."""
+    package, total = Path(jaxslam.__file__).parent, hashlib.sha256()
+    for path in sorted(package.rglob("*.py")):
+        total.update(f"{path.relative_to(package).as_posix()}\n".encode())
+        total.update(path.read_bytes().replace(b"\r\n", b"\n"))
+    return total.hexdigest()[:16]
