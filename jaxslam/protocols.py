@@ -33,7 +33,7 @@ from jaxslam.math.arrays import (
 )
 from jaxslam.noise import hold_noise
 from jaxslam.slots import Joint
-from jaxslam.types import Estimate, Info, JaxOrNumPy, Log, Scan, Trace, Truth
+from jaxslam.types import Estimate, Info, JaxOrNumPy, Log, Scan, Trace
 
 Array = jax.Array
 
@@ -566,6 +566,6 @@ class Wrapper(Filter):
 Estimator = Callable[[Log, Array], Trace]
 """(log, key) -> trace: `partial(run, filter, …)`, or a batch method."""
 
-Candidate = Filter | Estimator | Callable[[Truth], Filter | Estimator]
+Candidate = Filter | Callable[..., Any]
 """An entry of a campaign: a filter, a smoother, or a function of the run's truth that returns a
 filter or an estimator."""

@@ -58,7 +58,8 @@ def run(
     check_record("run", "log", log, Log)
     check_run("run", filter, log, pose, pose_cov)
     check_key("run", key)
-    return _drive(filter, log, pose, pose_cov, key, probe)
+    trace: Trace = _drive(filter, log, pose, pose_cov, key, probe)
+    return trace
 
 
 def check_run(name: str, filter: Filter, log: Log, pose: ArrayLike, pose_cov: ArrayLike) -> None:

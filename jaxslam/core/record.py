@@ -101,6 +101,11 @@ class Function:
         return self.function(*arguments)
 
 
+def as_record(value: Any) -> Any:
+    """The value where it is a record, else the `Function` that it is."""
+    return value if is_record(value) else Function(value)
+
+
 def hold_function(of: Any, name: str, parameters: str) -> None:
     """Make a field that is a plain function a record, in `__post_init__`.
 
@@ -111,8 +116,7 @@ def hold_function(of: Any, name: str, parameters: str) -> None:
         got = f"the class {value.__name__}: call it" if callable(value) else type(value).__name__
         what = f"{type(of).__name__}: expected {name} to be a function of ({parameters})"
         raise ValueError(f"{what}, got {got}")
-    if not is_record(value):
-        set_field(of, name, Function(value))
+    set_field(of, name, as_record(value))
 
 
 def _check_kinds(of: Any) -> None:

@@ -9,12 +9,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import NamedSharding
-from jax.typing import DTypeLike
 from jaxtyping import Float, PyTree
 
 from jaxslam.consistency import Score, condense, final_covariance, score
 from jaxslam.consistency.tally import condensed_sums
-from jaxslam.core.record import Function, is_record
+from jaxslam.core.record import as_record
 from jaxslam.filters.ekf.observability import MonitoredState
 from jaxslam.monte_carlo.pieces import cores
 from jaxslam.monte_carlo.programs import (
@@ -47,7 +46,7 @@ class CampaignPlan:
     """runs a device"""
     bound: bool = False
     """whether the conditional Cramér-Rao bound of every run is taken"""
-    dtype: DTypeLike | None = None
+    dtype: np.dtype | None = None
     """of the worlds; None for that of JAX"""
 
     @property
@@ -75,8 +74,7 @@ class BlockRunner:
         self._world: World = jax.device_put(plan.scenario, everywhere)
         self._key = jax.device_put(plan.key, everywhere)
         self._filters: dict[str, Candidate] = {
-            name: jax.device_put(one if is_record(one) else Function(one), everywhere)
-            for name, one in plan.filters.items()
+            name: jax.device_put(as_record(one), everywhere) for name, one in plan.filters.items()
         }
         self.first: dict[str, tuple[Truth, Estimate]] = {}
         """run 0 of each filter, once its block has run"""

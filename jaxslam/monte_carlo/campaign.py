@@ -193,7 +193,7 @@ def _summed_up(
     return Campaign(
         scenario=scenario.name,
         source=scenario.source,
-        published=scenario.published,
+        published={name: dict(told) for name, told in scenario.published.items()},
         steps=scenario.steps,
         runs=done,
         dtype=str(limit.dtype),

@@ -126,7 +126,8 @@ def _sensors(scenario: World) -> list[Sensor]:
 def _seen_first(sensor: Sensor, scenario: World) -> jax.Array:
     """The first landmark as measured from the start, (Z,)."""
     landmark = _number(scenario.landmarks)[0, : len(sensor.landmark)]
-    return _observe(sensor, _number(scenario.pose), landmark)
+    z: jax.Array = _observe(sensor, _number(scenario.pose), landmark)
+    return z
 
 
 @jax.jit
@@ -136,7 +137,8 @@ def _observe(sensor: Sensor, pose: jax.Array, landmark: jax.Array) -> jax.Array:
 
 @jax.jit
 def _noise_cov(model: Motion | Sensor, *at: jax.Array) -> jax.Array:
-    return model.noise_cov(*at)
+    cov: jax.Array = model.noise_cov(*at)
+    return cov
 
 
 def _number(values: ArrayLike) -> np.ndarray:
@@ -203,12 +205,18 @@ def check_called(name: str, candidate: Callable[..., object]) -> None:
         raise ValueError(f"monte_carlo: {name!r} is a factory: call it, {name}({first.name}, …)")
 
 
-def _of_truth(candidate: Callable[[Truth], Estimator | Filter], truth: Truth) -> Estimator | Filter:
-    """What a candidate makes of the truth; ValueError where it fails on it, as one of the world."""
+def method_of(candidate: Candidate, truth: Truth) -> Filter | Estimator:
+    """A filter or an estimator: a candidate, or what it makes of the truth.
+
+    Raises ValueError where it fails on the truth, as a function of the world.
+    """
+    if isinstance(candidate, Filter | LogEstimator):
+        return candidate
     try:
-        return candidate(truth)
+        made: Filter | Estimator = candidate(truth)
+        return made
     except AttributeError as error:
-        name = getattr(candidate, "__name__", str(candidate))
+        name = getattr(getattr(candidate, "function", candidate), "__name__", str(candidate))
         raise ValueError(
             f"monte_carlo: {name} was called with the truth (poses and landmarks) and fails: "
             f"{error}; of a function of the scenario give what it returns, {name}(scenario)"
@@ -220,8 +228,7 @@ def estimator_of(candidate: Candidate, truth: Truth, scenario: World) -> tuple[E
 
     Its probe is the information in the filter's observability monitor, where it has one.
     """
-    known = isinstance(candidate, Filter | LogEstimator)
-    method = candidate if known else _of_truth(candidate, truth)
+    method = method_of(candidate, truth)
     if not isinstance(method, Filter):
         return method, Euclidean()
     check_fits(method.name, method, scenario)

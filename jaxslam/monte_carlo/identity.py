@@ -10,7 +10,7 @@ import dataclasses
 import functools
 import hashlib
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from types import CodeType, FunctionType
@@ -31,6 +31,9 @@ _OF_WORLD = ("landmarks", "controls", "pose", "pose_cov", "motion", "sensor")
 _NO_PART_OF_DRAWS = frozenset({"name", "published", "source", "filter_options"})
 """Fields of a world that do not change what is drawn."""
 
+_BY_DATACLASS = frozenset({"__init__", "__repr__", "__setattr__", "__delattr__", "__replace__"})
+"""Methods that are made of the fields."""
+
 
 def identity(
     scenario: World,
@@ -46,7 +49,7 @@ def identity(
     compute, as "cpu"; rounding differs between platforms.
     """
     parts = {name: digest(getattr(scenario, name)) for name in _OF_WORLD}
-    fields = {field.name for field in dataclasses.fields(scenario)} - _NO_PART_OF_DRAWS  # type: ignore[arg-type]
+    fields = {field.name for field in dataclasses.fields(scenario)} - _NO_PART_OF_DRAWS
     rest = {name: getattr(scenario, name) for name in fields - set(_OF_WORLD)}
     return {
         **{name: _version(name) for name in ("jaxslam", "jax", "jaxlib")},
@@ -101,16 +104,16 @@ def _text(value: object, within: tuple[object, ...]) -> str:
 
 
 def _text_of_class(cls: type, within: tuple[object, ...]) -> str:
-    if not _of_user(cls) or cls in within:
+    parts = {name: getattr(part, "fget", part) for name, part in vars(cls).items()}
+    methods = {
+        name: part
+        for name, part in sorted(parts.items())
+        if isinstance(part, FunctionType) and _of_user(part) and name not in _BY_DATACLASS
+    }
+    if not methods or cls in within or cls.__module__.startswith("jaxslam."):
         return _name(cls)
     within = (*within, cls)
-    methods = [
-        (name, _text(getattr(part, "fget", part), within))
-        for name, part in sorted(vars(cls).items())
-        if isinstance(part, FunctionType | property)
-        and not getattr(part, "__module__", cls.__module__).startswith("jaxslam.")
-    ]
-    return f"{cls.__qualname__} {methods} {[_text(base, within) for base in cls.__bases__]}"
+    return f"{cls.__qualname__} {_text((methods, cls.__bases__), within)}"
 
 
 def _text_of_function(function: FunctionType, within: tuple[object, ...]) -> str:
@@ -123,26 +126,17 @@ def _text_of_function(function: FunctionType, within: tuple[object, ...]) -> str
     return _text(parts, within)
 
 
-def _of_user(value: Callable[..., object]) -> bool:
-    """Whether code is neither of the package nor of another one that is installed."""
-    try:
-        path = Path(inspect.getfile(value))
-    except (TypeError, OSError):  # built in, or typed at a prompt
-        return value.__module__ in ("__main__", None)
-    package = Path(jaxslam.__file__).parent
+def _of_user(function: FunctionType) -> bool:
+    """Whether code is neither of the package, nor of Python, nor of an installed package."""
+    path = Path(function.__code__.co_filename)
+    package, python = Path(jaxslam.__file__).parent, Path(inspect.__file__).parent
     installed = {"site-packages", "dist-packages"} & set(path.parts)
-    return not (path.is_relative_to(package) or installed or _standard(value.__module__))
-
-
-def _standard(module: str) -> bool:
-    import sys
-
-    return module.partition(".")[0] in sys.stdlib_module_names
+    return not (installed or path.is_relative_to(package) or path.is_relative_to(python))
 
 
 def _name(value: object) -> str:
     of = value if hasattr(value, "__qualname__") else type(value)
-    return f"{of.__module__}.{of.__qualname__}"  # type: ignore[attr-defined]
+    return f"{of.__module__}.{of.__qualname__}"
 
 
 def _short(text: str) -> str:

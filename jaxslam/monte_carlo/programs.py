@@ -76,7 +76,7 @@ class Programs(NamedTuple):
 
 
 @functools.cache
-def programs(devices: Sequence[jax.Device], dtype: DTypeLike | None) -> Programs:
+def programs(devices: Sequence[jax.Device], dtype: np.dtype | None) -> Programs:
     """The programs on these devices; dtype: of the worlds, None for that of JAX."""
     mesh, platform = mesh_of(devices), devices[0].platform
     hot, quick = hot_options(platform), quick_options(platform)

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import ArrayLike
 
-from jaxslam.core.numbers import check_array, is_concrete
+from jaxslam.core.numbers import check_array
 from jaxslam.core.record import FrozenDict, record, static
 from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.protocols import Motion, Sensor
@@ -55,11 +55,6 @@ class RecordedWorld(World):
         return self._record(jax.random.randint(key, (), 0, self.recorded_runs))
 
     def run(self, key: Array, number: int | Array) -> tuple[Truth, Log]:
-        if is_concrete(number) and not 0 <= int(number) < self.recorded_runs:
-            raise ValueError(
-                f"RecordedWorld {self.name!r}: expected a run from 0 to {self.recorded_runs - 1}, "
-                f"the recorded ones, got {number}"
-            )
         return self._record(number)
 
     def _record(self, number: int | Array) -> tuple[Truth, Log]:

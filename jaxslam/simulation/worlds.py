@@ -205,12 +205,32 @@ def simulate(scenario: World, key: Array) -> tuple[Truth, Log]:
     """
     check_record("simulate", "scenario", scenario, World)
     check_key("simulate", key)
-    return _draw(scenario, key)
+    drawn: tuple[Truth, Log] = _draw(scenario, key)
+    return drawn
 
 
 @partial(jax.jit, inline=True)
 def _draw(scenario: World, key: Array) -> tuple[Truth, Log]:
     return scenario.draw(key)
+
+
+def world_of_run(scenario: World, key: Array, number: int) -> tuple[Truth, Log]:
+    """The truth and the log of run `number` of a campaign with that key.
+
+    Raises ValueError where that run is not among the recorded ones.
+    """
+    most = scenario.recorded_runs
+    if most is not None and not 0 <= number < most:
+        raise ValueError(
+            f"{scenario.name}: expected a run from 0 to {most - 1}, the recorded ones, got {number}"
+        )
+    drawn: tuple[Truth, Log] = _draw_run(scenario, key, number)
+    return drawn
+
+
+@jax.jit
+def _draw_run(scenario: World, key: Array, number: int) -> tuple[Truth, Log]:
+    return scenario.run(key, number)
 
 
 def run_keys(key: Array, number: int | Array) -> Array:

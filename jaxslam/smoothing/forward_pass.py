@@ -134,7 +134,8 @@ class LogEstimator(Component):
 
     def __call__(self, log: Log, key: Array) -> Trace:
         check_run(self.name, self._filter, log, self.pose, self.pose_cov)
-        return _solve(self, log, key)
+        trace: Trace = _solve(self, log, key)
+        return trace
 
     @property
     def _filter(self) -> Filter:

@@ -1,6 +1,7 @@
 """The command `jaxslam consistency`: a Monte-Carlo campaign, its table and its files."""
 
 import argparse
+import contextlib
 import re
 import shutil
 import sys
@@ -25,7 +26,7 @@ from jaxslam.monte_carlo import Interrupted, monte_carlo
 from jaxslam.monte_carlo.candidates import estimator_of, fitting_block, rounded
 from jaxslam.protocols import Candidate
 from jaxslam.results import campaign_files, run_table, store
-from jaxslam.simulation.worlds import World, run_keys
+from jaxslam.simulation.worlds import World, run_keys, world_of_run
 from jaxslam.types import Estimate, Truth
 
 
@@ -61,6 +62,7 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     if part is not None and (part[0] - 1) * options.block * len(here) >= asked.runs:
         print(f"part {part[0]} of {part[1]} has no block of the {asked.runs:,} runs")
         return 0
+    fresh = not out.exists()
     keep = open_store(options, out, asked, settings, part and len(here))
     earlier = None if part else earlier_results(out, keep)
     names = campaign_files.file_names(formats) + [f"runs.{kind}" for kind in tables]
@@ -83,10 +85,13 @@ def consistency(options: argparse.Namespace, command: str) -> int:
                 keep=keep,
                 part=part,
             )
-    except Interrupted as stop:
-        if stop.campaign is None:
-            if not keep.spans() and part is None:  # other jobs may have saved some
-                shutil.rmtree(keep.folder, ignore_errors=True)
+    except BaseException as stop:
+        if not keep.spans() and part is None:  # other jobs may have saved some
+            shutil.rmtree(keep.folder, ignore_errors=True)
+            if fresh:
+                with contextlib.suppress(OSError):
+                    out.rmdir()
+        if not isinstance(stop, Interrupted) or stop.campaign is None:
             raise
         print(stop.campaign)
         print(f"\njaxslam: interrupted, {stop}; --resume {out} continues it", file=sys.stderr)
@@ -178,7 +183,7 @@ def _run_zero(
     scenario: World, candidate: Candidate, key: jax.Array, dtype: str
 ) -> tuple[Truth, Estimate]:
     """Run 0 of a filter, computed again where an earlier command computed it."""
-    truth, log = rounded(scenario.run(key, 0), dtype)
+    truth, log = rounded(world_of_run(scenario, key, 0), dtype)
     method, _ = estimator_of(candidate, truth, scenario)
     estimate = method(log, run_keys(key, 0)[1]).estimate
     found: tuple[Truth, Estimate] = jax.device_get((truth, estimate))

@@ -8,7 +8,7 @@ import numpy as np
 from jax.typing import DTypeLike
 from numpy.typing import ArrayLike
 
-from jaxslam.monte_carlo.candidates import rounded
+from jaxslam.monte_carlo.candidates import method_of, rounded
 from jaxslam.protocols import Candidate, Filter
 from jaxslam.results.film import MOST, Film
 from jaxslam.results.plot.scene.history import history_of
@@ -17,7 +17,7 @@ from jaxslam.results.plot.scene.render import render
 from jaxslam.results.plot.scene.run_scene import run_scene
 from jaxslam.results.plot.style import PAGE
 from jaxslam.run import run
-from jaxslam.simulation.worlds import World, run_keys, with_positions
+from jaxslam.simulation.worlds import World, run_keys, with_positions, world_of_run
 from jaxslam.types import Log, Trace, Truth
 from jaxslam.validation import check_record
 
@@ -98,9 +98,9 @@ def animate_world(
         options: of `animate`.
     """
     check_record("animate_world", "scenario", scenario, World)
-    truth, log = rounded(scenario.run(key, number), dtype)
+    truth, log = rounded(world_of_run(scenario, key, number), dtype)
     of_filter = run_keys(key, number)[1]
-    method = candidate if isinstance(candidate, Filter) else candidate(truth)
+    method = method_of(candidate, truth)
     if isinstance(method, Filter):
         trace = run(method, log, scenario.pose, scenario.pose_cov, of_filter, probe=probe)
     else:
