@@ -85,6 +85,11 @@ class Function:
         return self.function(*arguments)
 
 
+def as_record(function: Callable[..., _T]) -> Callable[..., _T]:
+    """A function that is no record as one, to be an argument of a jitted function."""
+    return function if is_record(function) else Function(function)
+
+
 def hold_function(of: Any, name: str, parameters: str) -> None:
     """Make a field that is a plain function a record, in `__post_init__`.
 
@@ -95,8 +100,7 @@ def hold_function(of: Any, name: str, parameters: str) -> None:
         got = f"the class {value.__name__}: call it" if callable(value) else type(value).__name__
         what = f"{type(of).__name__}: expected {name} to be a function of ({parameters})"
         raise ValueError(f"{what}, got {got}")
-    if not is_record(value):
-        set_field(of, name, Function(value))
+    set_field(of, name, as_record(value))
 
 
 def _check_kinds(of: Any) -> None:

@@ -11,7 +11,6 @@ from scipy.sparse.csgraph import dijkstra
 from jaxslam.grids import to_cells
 from jaxslam.topology.places import TopologicalMap, cell_centers, neighbours
 
-
 _to_cells = jax.jit(to_cells, inline=True)
 
 
