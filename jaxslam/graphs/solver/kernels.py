@@ -117,7 +117,7 @@ class Truncated(_OfWidth):
 
     def weight(self, s: Array) -> Array:
         _, square = self._widths(s)
-        return jnp.where(s <= square, 1.0, 0.0)
+        return (s <= square).astype(s.dtype)
 
     def ratio(self, s: Array) -> Array:
         """s/c², above 1 for what is left out."""

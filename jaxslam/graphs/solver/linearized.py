@@ -200,6 +200,18 @@ def _moved(factor: Factor, steps: Float[Array, "K d"], own: tuple[Array, ...]) -
     )
 
 
+@jax.custom_jvp
+def _barrier(values: PyTree) -> PyTree:
+    """`optimization_barrier`, whose own derivative JAX cannot transpose where some of the values
+    have none."""
+    return jax.lax.optimization_barrier(values)
+
+
+@_barrier.defjvp
+def _slope_of_barrier(primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
+    return _barrier(*primals), tangents[0]
+
+
 def _jacobians(
     factor: Factor, who: Array, variables: Variables, z: Array, width: int
 ) -> tuple[Float[Array, "E R B"], Float[Array, "E R K d B"]]:
@@ -212,7 +224,7 @@ def _jacobians(
     own = _taken(factor, who, variables)
     e, slope = jax.linearize(lambda *own: _over_rows(factor.residual, own, z), *own)
     slope, common = jax.closure_convert(slope, *own)
-    e, common = jax.lax.optimization_barrier((e, common))
+    e, common = _barrier((e, common))
 
     def by_coordinate(k: int) -> Array:
         """(size, E, R, B)"""
