@@ -82,7 +82,8 @@ def _differentiated(
             )
         return value, value
 
-    return jax.jacfwd(both, has_aux=True)(p)
+    found: tuple[Array, Array] = jax.jacfwd(both, has_aux=True)(p)
+    return found
 
 
 def _covariance(cov: ArrayLike, size: int) -> Float[np.ndarray, "P P"]:

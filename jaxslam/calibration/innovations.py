@@ -143,4 +143,5 @@ def _step(
         w = jax.vmap(linalg.solve_lower)(factor, residual).reshape(-1)
         return w, (w, jnp.where(fused, found.dof, 0).sum())
 
-    return jax.jacfwd(whitened, has_aux=True)(p)
+    found: tuple[Array, tuple[Array, Array]] = jax.jacfwd(whitened, has_aux=True)(p)
+    return found

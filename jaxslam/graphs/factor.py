@@ -187,7 +187,7 @@ class FromSensor(Factor):
         return self.sensor.residual(z, self.sensor.observe(variables[0], landmark))
 
     @property
-    def predict(self) -> Any:  # type: ignore[override]
+    def predict(self) -> Any:
         return self._inverse if self.sensor.landmark else None
 
     def _inverse(self, pose: Array, z: Array) -> Array:

@@ -65,7 +65,7 @@ def optimize(
     own, fill = graph, plan is None and is_concrete(graph)
     graph = padded_graph(graph, room) if fill else graph
     plan = plan_for(caller, graph, model.factors, plan, room=room)
-    found = _optimize(model, graph, plan, iterations, tolerance)
+    found: Solution = _optimize(model, graph, plan, iterations, tolerance)
     if not fill:
         return found
     singular = own_number(found.singular, own, graph)
@@ -82,7 +82,8 @@ def chi2(
     kernel: Kernel | Mapping[str, Kernel] | None = None,
 ) -> Float[Array, ""]:
     """The cost χ² = Σ ρ(eᵀ Ω e) of a graph as it is, without a factor ½."""
-    return _chi2(model_of("graphs.chi2", graph, factors, kernel), graph)
+    cost: Array = _chi2(model_of("graphs.chi2", graph, factors, kernel), graph)
+    return cost
 
 
 @partial(jax.jit, inline=True)

@@ -38,6 +38,15 @@ def test_a_factory_of_a_factor_is_one(tmp_path):
     assert [(t.name, t.model.name) for t in user_files.load(str(path))] == [("mine", "prior")]
 
 
-def test_a_factory_in_the_place_of_a_factor_is_to_be_called():
+def test_a_class_of_a_factor_without_fields_is_one(tmp_path):
+    path = tmp_path / "mine.py"
+    path.write_text(
+        "from jaxslam import graphs\nfrom jaxslam.core.record import record\n\n\n"
+        "@record\nclass Mine(graphs.Prior):\n    pass\n"
+    )
+    assert [(t.name, t.model.name) for t in user_files.load(str(path))] == [("Mine", "mine")]
+
+
+def test_a_class_in_the_place_of_a_factor_is_to_be_called():
     with pytest.raises(ValueError, match=r"got the class Prior of one: call it, as in Prior\(\)"):
         verify_jacobians(graphs.Prior)

@@ -107,7 +107,8 @@ def certificate(
                 f"{caller}: expected one pose that is fixed or has a prior, got {held.sum()}; the "
                 "dual is of a graph that is free but for that"
             )
-    return _certificate(model, graph, plan)
+    proved: Certificate = _certificate(model, graph, plan)
+    return proved
 
 
 def _held(model: Model, plan: Plan, graph: Graph) -> Bool[Array, "N *B"]:

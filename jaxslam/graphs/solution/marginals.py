@@ -81,9 +81,9 @@ def marginals(
         rows = np.zeros((padded_size(max(len(wanted), 4 * room), LEAST), 2), int)
         rows[: len(wanted)] = padded_number(wanted, graph, more)
         plan = plan_for(caller, more, model.factors, None, marginals=True, pairs=rows, room=room)
-        found = _marginals(model, more, plan)
-        poses, points, pairs = cut(found[:3], (graph.poses, graph.points, wanted))
-        found = Marginals(poses, points, pairs, own_number(found.singular, graph, more))
+        whole: Marginals = _marginals(model, more, plan)
+        poses, points, pairs = cut(whole[:3], (graph.poses, graph.points, wanted))
+        found = Marginals(poses, points, pairs, own_number(whole.singular, graph, more))
     else:
         plan = plan_for(caller, graph, model.factors, plan, marginals=True, pairs=wanted)
         found = _marginals(model, graph, plan)

@@ -79,7 +79,7 @@ def cut(found: _T, like: PyTree) -> _T:
 
 def _by_numpy(change: Callable[[PyTree], PyTree], x: jax.Array) -> jax.Array:
     """The changed array, by NumPy unless it is traced: on the device each size is a program."""
-    if is_concrete(x):
-        return jax.device_put(np.array(change(np.asarray(x))))
-    changed: jax.Array = change(x)
-    return changed
+    return cast(
+        jax.Array,
+        jax.device_put(np.array(change(np.asarray(x)))) if is_concrete(x) else change(x),
+    )

@@ -162,4 +162,5 @@ def with_points(
 def _predicted(factor: Factor, poses: jax.Array, z: jax.Array) -> jax.Array:
     """The second variables that rows measure."""
     assert factor.predict is not None
-    return jax.vmap(factor.predict)(poses, z)
+    second: jax.Array = jax.vmap(factor.predict)(poses, z)
+    return second
