@@ -35,7 +35,7 @@ FILES = {
 SHARES = (0.0, 0.01, 0.05, 0.1, 0.3)
 NEAR = 0.1
 """[m]"""
-LOG = {"relative_pose": graphs.relative_pose_log()}
+LOG = {"relative_pose": graphs.RelativePoseLog()}
 """GTSAM's residual: its runs are compared with the optimum of this one, ours with that of g2o's."""
 KERNELS = {name: {LOOPS: make()} for name, make in graphs.KERNELS.items()}
 DEFAULT = ("truncated", "several")

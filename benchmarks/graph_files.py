@@ -40,7 +40,7 @@ TRUE = {
 NOT_FROM = {("MIT", "given")}
 """Files and starts from which the known optimum is not reached."""
 
-ERRORS = {"log": graphs.relative_pose_log(), "pose": graphs.relative_pose()}
+ERRORS = {"log": graphs.RelativePoseLog(), "pose": graphs.RelativePose()}
 ITERATIONS = 1000
 
 

@@ -31,7 +31,7 @@ from benchmarks.real_data import DATA
 from jaxslam import graphs
 from jaxslam.math import se2
 
-FACTORS = {"relative_pose": graphs.relative_pose_log()}
+FACTORS = {"relative_pose": graphs.RelativePoseLog()}
 TOLERANCE = 5e-7
 MANY = 256
 SIZES = (500, 1000, 2000, 5000, 10000)

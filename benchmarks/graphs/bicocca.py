@@ -30,7 +30,7 @@ GAP = 1.0
 NEAR = np.array([3.0, 3.0, 0.5])
 """what a loop may differ from the true path in [m, m, rad]"""
 TRUSTED = "relative_pose"
-FACTORS = {"relative_pose": graphs.relative_pose_log()}
+FACTORS = {"relative_pose": graphs.RelativePoseLog()}
 
 
 def compare(share: float) -> dict[str, dict[str, float]]:

@@ -9,7 +9,7 @@ import numpy as np
 
 from benchmarks.scan_matching.pairs import START, Known, drawn, known
 from jaxslam import matching
-from jaxslam.graphs import cauchy
+from jaxslam.graphs import Cauchy
 from jaxslam.matching import MatchStatus
 from jaxslam.matching import covariance as ways
 from jaxslam.math.stats import chi2_band, chi2_quantile
@@ -23,7 +23,7 @@ MATCHERS = {
     "point_to_point": matching.point_to_point(),
     "point_to_line": matching.point_to_line(),
     "point_to_line, Cauchy": matching.point_to_line(
-        matching.IcpSettings(kernel=cauchy(), scale=0.05)
+        matching.IcpSettings(kernel=Cauchy(), scale=0.05)
     ),
     "field": matching.field(),
     "correlative": matching.correlative(

@@ -1,6 +1,7 @@
 """What uncertain parameters add to the covariance of a result."""
 
 from collections.abc import Callable
+from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -8,8 +9,8 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jaxslam import programs
 from jaxslam.core.numbers import is_concrete
+from jaxslam.core.record import as_record
 
 
 def consider_cov(
@@ -35,7 +36,8 @@ def consider_cov(
     covariance of the joint estimate of state and constants, and in general too large before.
 
     Args:
-        result: p (P,) -> an array (*shape, n), as poses (T, 3). Traced once.
+        result: p (P,) -> an array (*shape, n), as poses (T, 3). Traced once; of a record with
+            `__call__` once for all its numbers.
         parameters: where J is taken; a number counts as (1,).
         cov: (P, P) C, or a number for one parameter.
     Raises:
@@ -56,6 +58,19 @@ def consider_cov(
         )
     c = _covariance(cov, p.size)
 
+    found = jax.device_get(_differentiated(as_record(result), p))
+    jacobian, value = (np.asarray(each, np.float64) for each in found)
+    if not (np.isfinite(jacobian).all() and np.isfinite(value).all()):
+        raise ValueError(f"consider_cov: the result or its derivatives at {p} are not finite")
+    return np.asarray(jacobian @ c @ np.swapaxes(jacobian, -1, -2))
+
+
+@partial(jax.jit, inline=True)
+def _differentiated(
+    result: Callable[[Float[Array, "P"]], Float[Array, "*shape n"]], p: Float[Array, "P"]
+) -> tuple[Float[Array, "*shape n P"], Float[Array, "*shape n"]]:
+    """The derivative of a result, and the result."""
+
     def both(p: Float[Array, "P"]) -> tuple[Array, Array]:
         value = result(p)
         array = isinstance(value, jax.Array)
@@ -67,12 +82,8 @@ def consider_cov(
             )
         return value, value
 
-    differentiated = jax.jacfwd(both, has_aux=True)
-    found = jax.device_get(programs.call(differentiated, (), jnp.asarray(p)))
-    jacobian, value = (np.asarray(each, np.float64) for each in found)
-    if not (np.isfinite(jacobian).all() and np.isfinite(value).all()):
-        raise ValueError(f"consider_cov: the result or its derivatives at {p} are not finite")
-    return np.asarray(jacobian @ c @ np.swapaxes(jacobian, -1, -2))
+    found: tuple[Array, Array] = jax.jacfwd(both, has_aux=True)(p)
+    return found
 
 
 def _covariance(cov: ArrayLike, size: int) -> Float[np.ndarray, "P P"]:

@@ -1,6 +1,7 @@
 """Calibration of model parameters (systematic errors) from a filter's own innovations."""
 
 from collections.abc import Callable
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -9,8 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
-from jaxslam import programs
 from jaxslam.core.numbers import check_count
+from jaxslam.core.record import as_record
 from jaxslam.math import linalg
 from jaxslam.types import Info, Status
 
@@ -60,7 +61,8 @@ def calibrate(
         info: p (P,) -> the `Info` of a run, `lambda p: jaxslam.run(…).info`, where p may enter the
             controls, the models or the mounting. Neither a noise covariance nor the size of the
             measurements may depend on it: the innovations would be least where the noise is
-            largest, or the measurements smallest; `fit_noise` finds such parameters. Traced once.
+            largest, or the measurements smallest; `fit_noise` finds such parameters. Traced once;
+            of a record with `__call__` once for all its numbers.
         start: (P,), or a number.
         iterations: steps at most.
         tolerance: done when no parameter moves by more than so many of its standard deviations.
@@ -78,31 +80,10 @@ def calibrate(
     if not tolerance > 0:
         raise ValueError(f"calibrate: expected a tolerance above 0, got {tolerance}")
 
-    def whitened(
-        p: Float[Array, "P"],
-    ) -> tuple[Float[Array, "K"], tuple[Float[Array, "K"], Int[Array, ""]]]:
-        """The whitened innovations, twice (one for `jacfwd`), and their degrees of freedom."""
-        found = info(p)
-        if not isinstance(found, Info):
-            raise ValueError(
-                "calibrate: expected info to return the Info of a run, `run(…).info`, got "
-                f"{type(found).__name__}"
-            )
-        fused = found.status == Status.FUSED
-        count, size = fused.size, found.innovation.shape[-1]
-        there = fused.reshape(count)
-        cov = jax.lax.stop_gradient(found.innovation_cov).reshape(count, size, size)
-        # Masked before and after the factor: an empty slot then has no effect on derivatives.
-        cov = jnp.where(there[:, None, None], cov, jnp.eye(size, dtype=cov.dtype))
-        factor = jax.vmap(lambda s: linalg.cholesky(s)[0])(cov)
-        residual = jnp.where(there[:, None], found.innovation.reshape(count, size), 0.0)
-        w = jax.vmap(linalg.solve_lower)(factor, residual).reshape(-1)
-        return w, (w, jnp.where(fused, found.dof, 0).sum())
-
-    step = jax.jacfwd(whitened, has_aux=True)
+    of_run = as_record(info)
     path, misfit, dofs, converged = [p], [], [], False
     for _ in range(iterations):
-        jacobian, (w, dof) = jax.device_get(programs.call(step, (), jnp.asarray(p)))
+        jacobian, (w, dof) = jax.device_get(_step(of_run, p))
         rounding = np.sqrt(np.finfo(jacobian.dtype).eps)
         jacobian, w, dof = np.asarray(jacobian, np.float64), np.asarray(w, np.float64), int(dof)
         if not dof:
@@ -133,3 +114,34 @@ def calibrate(
         if converged:
             break
     return Calibration(p, cov, np.array(path), np.array(misfit), np.array(dofs), converged)
+
+
+@partial(jax.jit, inline=True)
+def _step(
+    info: Callable[[jax.Array], Info], p: Float[Array, "P"]
+) -> tuple[Float[Array, "K P"], tuple[Float[Array, "K"], Int[Array, ""]]]:
+    """The derivative of the whitened innovations, these, and their degrees of freedom."""
+
+    def whitened(
+        p: Float[Array, "P"],
+    ) -> tuple[Float[Array, "K"], tuple[Float[Array, "K"], Int[Array, ""]]]:
+        """The whitened innovations, twice (one for `jacfwd`), and their degrees of freedom."""
+        found = info(p)
+        if not isinstance(found, Info):
+            raise ValueError(
+                "calibrate: expected info to return the Info of a run, `run(…).info`, got "
+                f"{type(found).__name__}"
+            )
+        fused = found.status == Status.FUSED
+        count, size = fused.size, found.innovation.shape[-1]
+        there = fused.reshape(count)
+        cov = jax.lax.stop_gradient(found.innovation_cov).reshape(count, size, size)
+        # Masked before and after the factor: an empty slot then has no effect on derivatives.
+        cov = jnp.where(there[:, None, None], cov, jnp.eye(size, dtype=cov.dtype))
+        factor = jax.vmap(lambda s: linalg.cholesky(s)[0])(cov)
+        residual = jnp.where(there[:, None], found.innovation.reshape(count, size), 0.0)
+        w = jax.vmap(linalg.solve_lower)(factor, residual).reshape(-1)
+        return w, (w, jnp.where(fused, found.dof, 0).sum())
+
+    found: tuple[Array, tuple[Array, Array]] = jax.jacfwd(whitened, has_aux=True)(p)
+    return found

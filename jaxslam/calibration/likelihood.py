@@ -1,6 +1,7 @@
 """Noises fitted to a log by maximum likelihood, with the likelihood that a filter computes."""
 
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -9,7 +10,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 from numpy.typing import ArrayLike
 
-from jaxslam import programs
 from jaxslam.calibration.errors import (
     BOUND,
     LikelihoodPoint,
@@ -19,6 +19,7 @@ from jaxslam.calibration.errors import (
     upper_limit,
 )
 from jaxslam.core.numbers import check_count
+from jaxslam.core.record import as_record
 from jaxslam.types import Info, Log, Status
 
 LOOSE = 1.0
@@ -86,7 +87,8 @@ def fit_noise(
 
     Args:
         info: (p (P,), *data) -> the `Info` of a run, `lambda p, log: jaxslam.run(…).info`, in which
-            factories are called with p. Traced once for a function and shapes of the data.
+            models are made of p. Traced once for a function and shapes of the data; of a record
+            with `__call__` once for all its numbers.
         start: (P,) parameters to compare with.
         data: trees of arrays for info, as the log.
         names: of the parameters, for messages; default "p0", …
@@ -102,8 +104,10 @@ def fit_noise(
     """
     first, begin, logged, told = _checked(start, guess, names, deviation, iterations, tolerance)
 
+    of_run = as_record(info)
+
     def tried(q: np.ndarray) -> LikelihoodPoint:
-        found = jax.device_get(programs.call(_evaluate, (info,), q, logged, data))
+        found = jax.device_get(_evaluate(of_run, q, logged, data))
         value, gradient, spread, nis, dof = (np.asarray(part, np.float64) for part in found)
         return LikelihoodPoint(q, float(value), gradient, spread, float(nis), int(dof))
 
@@ -186,6 +190,7 @@ def as_associated(log: Log, info: Info) -> Log:
     return log._replace(scan=log.scan._replace(tag=held, valid=used))
 
 
+@partial(jax.jit, inline=True)
 def _evaluate(
     info: Callable[..., Info],
     q: Float[Array, "P"],

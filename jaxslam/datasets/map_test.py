@@ -6,13 +6,14 @@ import jax
 import numpy as np
 from jaxtyping import Float, PyTree
 
-from jaxslam import programs
 from jaxslam.consistency import LEVEL, percentage
 from jaxslam.filters.ekf.coordinates.map_coordinates import cov_of_coordinates
 from jaxslam.math.stats import chi2_band, chi2_quantile
 from jaxslam.metrics.paths import alignment, carried
-from jaxslam.protocols import Chart, Filter
+from jaxslam.protocols import Filter
 from jaxslam.slots import Joint
+
+_in_coordinates = jax.jit(cov_of_coordinates, static_argnames="square_root", inline=True)
 
 _POINT = ("x [m]", "y [m]")
 _ITERATIONS = 20
@@ -56,13 +57,9 @@ def joint_map_cov(filter: Filter, state: PyTree) -> Float[np.ndarray, "N 2 N 2"]
     """
     if not isinstance(state, Joint) or filter.landmark != _POINT:
         return None
-    cov = np.asarray(programs.call(_in_coordinates, (filter.chart, filter.square_root), state))
+    cov = np.asarray(_in_coordinates(state, filter.chart, square_root=filter.square_root))
     count = state.landmarks.shape[0]
     return cov[3:, 3:].reshape(count, 2, count, 2)
-
-
-def _in_coordinates(chart: Chart, square_root: bool, state: Joint) -> jax.Array:
-    return cov_of_coordinates(state, chart, square_root=square_root)
 
 
 def judge_map(

@@ -7,15 +7,15 @@ relative pose e = Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ) as (x, y, θ wrapped), without
 from jaxslam.graphs import starts
 from jaxslam.graphs.factor import (
     REGISTRY,
+    Bearing,
     Factor,
-    bearing,
-    from_motion,
-    from_sensor,
-    nominal_motion,
-    prior,
-    relative_pose,
-    relative_pose_log,
-    relative_position,
+    FromMotion,
+    FromSensor,
+    NominalMotion,
+    Prior,
+    RelativePose,
+    RelativePoseLog,
+    RelativePosition,
 )
 from jaxslam.graphs.files import read, write
 from jaxslam.graphs.graph import Graph, Table, with_loops_apart
@@ -24,7 +24,13 @@ from jaxslam.graphs.optimize import chi2, optimize
 from jaxslam.graphs.solution.certificate import Certificate, certificate
 from jaxslam.graphs.solution.marginals import Marginals, marginals
 from jaxslam.graphs.solver.kernels import REGISTRY as KERNELS
-from jaxslam.graphs.solver.kernels import Kernel, cauchy, dcs, huber, truncated
+from jaxslam.graphs.solver.kernels import (
+    Cauchy,
+    DynamicCovarianceScaling,
+    Huber,
+    Kernel,
+    Truncated,
+)
 from jaxslam.graphs.solver.plan import Plan, plan
 from jaxslam.graphs.solver.residuals import degrees_of_freedom, squared_residuals
 from jaxslam.graphs.solver.search import Ending, Solution
@@ -33,38 +39,38 @@ from jaxslam.graphs.validation import check_graph, with_gauge
 __all__ = [
     "KERNELS",
     "REGISTRY",
+    "Bearing",
+    "Cauchy",
     "Certificate",
+    "DynamicCovarianceScaling",
     "Ending",
     "Factor",
+    "FromMotion",
+    "FromSensor",
     "Graph",
+    "Huber",
     "Kernel",
     "Marginals",
+    "NominalMotion",
     "Plan",
+    "Prior",
+    "RelativePose",
+    "RelativePoseLog",
+    "RelativePosition",
     "Solution",
     "Table",
-    "bearing",
-    "cauchy",
+    "Truncated",
     "certificate",
     "check_graph",
     "chi2",
-    "dcs",
     "degrees_of_freedom",
-    "from_motion",
-    "from_sensor",
-    "huber",
     "marginals",
-    "nominal_motion",
     "of_log",
     "optimize",
     "plan",
-    "prior",
     "read",
-    "relative_pose",
-    "relative_pose_log",
-    "relative_position",
     "squared_residuals",
     "starts",
-    "truncated",
     "with_gauge",
     "with_loops_apart",
     "write",

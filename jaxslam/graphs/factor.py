@@ -1,41 +1,39 @@
 """Factors: the residual of a measurement between variables of a graph."""
 
-import functools
-from collections.abc import Callable, Mapping
-from dataclasses import dataclass, replace
-from types import MappingProxyType
+from typing import Any
 
 import jax
 import jax.numpy as jnp
-import numpy as np
-from jaxtyping import PyTree
 
-from jaxslam import sensors
+from jaxslam.core.record import record
 from jaxslam.graphs.solution.chordal import PRIOR, RELATIVE_POSE, RELATIVE_POSITION, Chordal
 from jaxslam.math import se2
 from jaxslam.math.angles import sin_cos, wrap
-from jaxslam.protocols import Motion, Sensor
+from jaxslam.protocols import Component, Motion, Sensor
 
 Array = jax.Array
 
+POSE = ("x [m]", "y [m]", "theta [rad]")
 
-@dataclass(frozen=True, eq=False)
-class Factor:
-    """A kind of measurement between K variables of a graph, as a pure function."""
 
-    name: str
+class Factor(Component):
+    """A kind of measurement between K variables of a graph.
+
+    A subclass is a record (`core.record`) that declares variables, measurements and errors, and
+    defines `residual`. Raises ValueError, at construction, where one of these is missing, on names
+    that are no tuple of strings, and on a kind of variable that graphs do not have.
+    """
+
     variables: tuple[str, ...]
     """the kind of each variable, "pose" or "point", in the order of `Table.who`; its length is K"""
     measurements: tuple[str, ...]
     """what z holds, with units; its length is Z"""
     errors: tuple[str, ...]
     """what the residual holds, with units; its length is R"""
-    residual: Callable[[tuple[Array, ...], Array], Array]
-    """(variables, z) -> e (R,), angles wrapped, on one row: each pose (3,), each point (L,)"""
-    jacobians: Callable[[tuple[Array, ...], Array], tuple[Array, ...]] | None = None
+    jacobians: Any = None
     """(variables, z) -> by the coordinates of each variable, (R, 3) or (R, L); hand-derived, to
     verify against"""
-    predict: Callable[[Array, Array], Array] | None = None
+    predict: Any = None
     """(first variable, z) -> the second of two, where the residual is zero: what `starts` places
     variables with; None where z does not tell it"""
     chordal: Chordal | None = None
@@ -43,15 +41,16 @@ class Factor:
     where there is none"""
 
     def __post_init__(self) -> None:
-        """Raise ValueError on a kind of variable that graphs do not have."""
+        self._check(Factor, {"residual": ""})
+        self._check_names("variables", "measurements", "errors")
         if lost := [kind for kind in self.variables if kind not in ("pose", "point")]:
             raise ValueError(
-                f"graphs.Factor: {self.name}: expected variables 'pose' and 'point', "
-                f"got {lost[0]!r}"
+                f"{type(self).__name__}: expected variables 'pose' and 'point', got {lost[0]!r}"
             )
 
-
-POSE = ("x [m]", "y [m]", "theta [rad]")
+    def residual(self, variables: tuple[Array, ...], z: Array) -> Array:
+        """The error e (R,) of one row, angles wrapped: each pose (3,), each point (L,)."""
+        raise NotImplementedError
 
 
 def _between(a: Array, b: Array) -> Array:
@@ -61,105 +60,164 @@ def _between(a: Array, b: Array) -> Array:
     return jnp.stack([c * dx + s * dy, c * dy - s * dx, wrap(b[2] - a[2])])
 
 
-def relative_pose() -> Factor:
+class BetweenPoses(Factor):
+    """What factors of a relative pose share: z is the second pose in the frame of the first."""
+
+    variables = ("pose", "pose")
+    measurements = errors = POSE
+    chordal = RELATIVE_POSE
+
+    def predict(self, pose: Array, z: Array) -> Array:
+        return se2.compose(pose, z)
+
+
+@record
+class RelativePose(BetweenPoses):
     """The factor of a relative pose: e = Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ) as (x, y, θ wrapped), no logarithm.
 
     Kümmerle et al. 2011, "g2o: A general framework for graph optimization", ICRA: the error of
     its `EDGE_SE2`.
     """
 
-    def residual(variables: tuple[Array, ...], z: Array) -> Array:
+    def residual(self, variables: tuple[Array, ...], z: Array) -> Array:
         first, second = variables
         return _between(z, _between(first, second))
 
-    def jacobians(variables: tuple[Array, ...], z: Array) -> tuple[Array, ...]:
+    def jacobians(self, variables: tuple[Array, ...], z: Array) -> tuple[Array, ...]:
         first, second = variables
         by_relative = se2.between_jacobians(z, se2.between(first, second))[1]
         by_first, by_second = se2.between_jacobians(first, second)
         return by_relative @ by_first, by_relative @ by_second
 
-    return Factor(
-        "relative_pose",
-        ("pose", "pose"),
-        POSE,
-        POSE,
-        residual,
-        jacobians,
-        predict=se2.compose,
-        chordal=RELATIVE_POSE,
-    )
 
-
-def relative_pose_log() -> Factor:
+@record
+class RelativePoseLog(BetweenPoses):
     """The factor of a relative pose by its logarithm: e = log(Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ)), a twist.
 
-    The error of GTSAM's `BetweenFactorPose2` (4.3). Its θ is that of `relative_pose`, its (x, y)
+    The error of GTSAM's `BetweenFactorPose2` (4.3). Its θ is that of `RelativePose`, its (x, y)
     turned by -θ/2 and shorter by (θ/2)/tan(θ/2): optima differ by the square of the residuals. To
-    take it for a file, give `optimize` {"relative_pose": relative_pose_log()}.
+    take it for a file, give `optimize` {"relative_pose": RelativePoseLog()}.
     """
 
-    def residual(variables: tuple[Array, ...], z: Array) -> Array:
+    def residual(self, variables: tuple[Array, ...], z: Array) -> Array:
         first, second = variables
         return se2.log(_between(z, _between(first, second)))
 
-    poses = ("pose", "pose")
-    return Factor(
-        "relative_pose_log",
-        poses,
-        POSE,
-        POSE,
-        residual,
-        predict=se2.compose,
-        chordal=RELATIVE_POSE,
-    )
 
-
-def prior() -> Factor:
+@record
+class Prior(Factor):
     """The factor of a prior of a pose: e = Z⁻¹ ∘ X as (x, y, θ wrapped)."""
 
-    def residual(variables: tuple[Array, ...], z: Array) -> Array:
+    variables = ("pose",)
+    measurements = errors = POSE
+    chordal = PRIOR
+
+    def residual(self, variables: tuple[Array, ...], z: Array) -> Array:
         return se2.between(z, variables[0])
 
-    def jacobians(variables: tuple[Array, ...], z: Array) -> tuple[Array, ...]:
+    def jacobians(self, variables: tuple[Array, ...], z: Array) -> tuple[Array, ...]:
         return (se2.between_jacobians(z, variables[0])[1],)
 
-    return Factor("prior", ("pose",), POSE, POSE, residual, jacobians, chordal=PRIOR)
 
-
-def relative_position() -> Factor:
+@record
+class RelativePosition(Factor):
     """The factor of a point in the frame of a pose: e = z - R(θ)ᵀ(l - t), g2o's `EDGE_SE2_XY`."""
-    return replace(from_sensor(sensors.RelativePosition(np.eye(2))), chordal=RELATIVE_POSITION)
+
+    variables = ("pose", "point")
+    measurements = errors = ("ahead [m]", "left [m]")
+    chordal = RELATIVE_POSITION
+
+    def residual(self, variables: tuple[Array, ...], z: Array) -> Array:
+        return z - se2.to_frame(*variables)
+
+    def predict(self, pose: Array, z: Array) -> Array:
+        return se2.from_frame(pose, z)
 
 
-def bearing() -> Factor:
+@record
+class Bearing(Factor):
     """The factor of the bearing of a point: e = z - (atan2(l - t) - θ), wrapped.
 
     g2o's `EDGE_BEARING_SE2_XY`. `predict` places the point 10 m away.
     """
-    return from_sensor(sensors.BearingOnly(np.eye(1)))
+
+    variables = ("pose", "point")
+    measurements = errors = ("bearing [rad]",)
+
+    def residual(self, variables: tuple[Array, ...], z: Array) -> Array:
+        return wrap(z - se2.polar_in_frame(*variables)[1:])
+
+    def predict(self, pose: Array, z: Array) -> Array:
+        away = jnp.full(1, 10.0, z.dtype)
+        return se2.from_frame(pose, se2.rectangular(jnp.concatenate([away, z])))
 
 
-def from_sensor(sensor: Sensor) -> Factor:
+@record
+class FromSensor(Factor):
     """The factor of a sensor: e = z ⊖ h(x, l), `sensor.residual(z, sensor.observe(x, l))`.
 
     With an absolute sensor (L = 0) the pose is the only variable. What z does not determine of a
-    landmark, `predict` takes from the mean of `sensor.free`.
+    landmark, `predict` takes from the mean of `sensor.free`. The name is that of the sensor.
     """
-    absolute = not sensor.landmark
 
-    def residual(variables: tuple[Array, ...], z: Array) -> Array:
-        landmark: PyTree = variables[1] if not absolute else z[:0]
-        return sensor.residual(z, sensor.observe(variables[0], landmark))
+    sensor: Sensor
 
-    def predict(pose: Array, z: Array) -> Array:
-        return sensor.invert(pose, z, jnp.asarray(sensor.free.mean, z.dtype))
+    def __post_init__(self) -> None:
+        _check_model("FromSensor", "sensor", self.sensor, Sensor)
+        super().__post_init__()
 
-    who = ("pose",) if absolute else ("pose", "point")
-    names = sensor.measurements
-    return Factor(sensor.name, who, names, names, residual, predict=None if absolute else predict)
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        return self.sensor.name
+
+    @property
+    def variables(self) -> tuple[str, ...]:  # type: ignore[override]
+        return ("pose", "point") if self.sensor.landmark else ("pose",)
+
+    @property
+    def measurements(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self.sensor.measurements
+
+    @property
+    def errors(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self.sensor.measurements
+
+    def residual(self, variables: tuple[Array, ...], z: Array) -> Array:
+        landmark = variables[1] if self.sensor.landmark else z[:0]
+        return self.sensor.residual(z, self.sensor.observe(variables[0], landmark))
+
+    @property
+    def predict(self) -> Any:
+        return self._inverse if self.sensor.landmark else None
+
+    def _inverse(self, pose: Array, z: Array) -> Array:
+        return self.sensor.invert(pose, z, jnp.asarray(self.sensor.free.mean, z.dtype))
 
 
-def from_motion(motion: Motion) -> Factor:
+class _OfMotion(Factor):
+    """What factors of a motion model between two poses share: z is the control."""
+
+    variables = ("pose", "pose")
+    motion: Motion
+
+    def __post_init__(self) -> None:
+        _check_model(type(self).__name__, "motion", self.motion, Motion)
+        super().__post_init__()
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        return self.motion.name
+
+    @property
+    def measurements(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self.motion.controls
+
+    def predict(self, pose: Array, z: Array) -> Array:
+        return self.motion.step(pose, z, jnp.zeros(len(self.motion.noises), z.dtype))
+
+
+@record
+class FromMotion(_OfMotion):
     """The factor of a motion model between two poses: the noise w that leads from one to the other.
 
         e = w with step(x, u, w) = x', z = u
@@ -172,17 +230,35 @@ def from_motion(motion: Motion) -> Factor:
     singular (a robot that stands still, with `Odometry`) a step is not taken.
 
     Raises ValueError unless the noise has three components, which the two poses determine; see
-    `nominal_motion`.
+    `NominalMotion`.
     """
-    if len(motion.noises) != 3:
-        raise ValueError(
-            f"graphs.from_motion: expected a motion whose noise has 3 components, which two poses "
-            f"determine, got {motion.name} with {len(motion.noises)}: {', '.join(motion.noises)}"
-        )
 
-    def newton(w: Array, first: Array, second: Array, u: Array) -> Array:
+    motion: Motion
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if len(self.motion.noises) != 3:
+            raise ValueError(
+                "FromMotion: expected a motion whose noise has 3 components, which two poses "
+                f"determine, got {self.name} with {len(self.errors)}: {', '.join(self.errors)}"
+            )
+
+    @property
+    def errors(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self.motion.noises
+
+    def residual(self, variables: tuple[Array, ...], z: Array) -> Array:
+        first, second = variables
+        held, *still = jax.lax.stop_gradient((self, first, second, z))
+        w = jax.lax.fori_loop(0, 10, lambda _, w: held._newton(w, *still), jnp.zeros(3, z.dtype))
+        w = jax.lax.stop_gradient(w)
+        return self._newton(self._newton(w, first, second, z), first, second, z)
+
+    def _newton(self, w: Array, first: Array, second: Array, u: Array) -> Array:
+        """A step of Newton's method."""
+
         def miss(w: Array) -> Array:
-            return se2.between(second, motion.step(first, u, w))
+            return se2.between(second, self.motion.step(first, u, w))
 
         a, b, c = jax.jacfwd(miss)(w)
         adjugate = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)
@@ -191,21 +267,9 @@ def from_motion(motion: Motion) -> Factor:
         step = adjugate @ miss(w) / jnp.where(regular, volume, 1.0)
         return jnp.where(regular, w - step, w)
 
-    def residual(variables: tuple[Array, ...], z: Array) -> Array:
-        first, second = variables
-        still = jax.lax.stop_gradient((first, second, z))
-        w = jax.lax.fori_loop(0, 10, lambda _, w: newton(w, *still), jnp.zeros(3, z.dtype))
-        w = jax.lax.stop_gradient(w)
-        return newton(newton(w, first, second, z), first, second, z)
 
-    def predict(pose: Array, z: Array) -> Array:
-        return motion.step(pose, z, jnp.zeros(3, z.dtype))
-
-    poses = ("pose", "pose")
-    return Factor(motion.name, poses, motion.controls, motion.noises, residual, predict=predict)
-
-
-def nominal_motion(motion: Motion) -> Factor:
+@record
+class NominalMotion(_OfMotion):
     """The factor of a motion model between two poses: the error of the motion without noise.
 
         e = step(x, u, 0)⁻¹ ∘ x', z = u
@@ -214,27 +278,24 @@ def nominal_motion(motion: Motion) -> Factor:
     information (`of_log`): exactly where e is affine in w, as for `Unicycle` and `Increment`.
     """
 
-    def residual(variables: tuple[Array, ...], z: Array) -> Array:
+    motion: Motion
+    errors = POSE
+
+    def residual(self, variables: tuple[Array, ...], z: Array) -> Array:
         first, second = variables
-        return se2.between(predict(first, z), second)
-
-    def predict(pose: Array, z: Array) -> Array:
-        return motion.step(pose, z, jnp.zeros(len(motion.noises), z.dtype))
-
-    poses = ("pose", "pose")
-    return Factor(motion.name, poses, motion.controls, POSE, residual, predict=predict)
+        return se2.between(self.predict(first, z), second)
 
 
-REGISTRY: dict[str, Callable[[], Factor]] = {
-    "bearing": bearing,
-    "prior": prior,
-    "relative_pose": relative_pose,
-    "relative_position": relative_position,
+def _check_model(name: str, field: str, value: object, kind: type) -> None:
+    if not isinstance(value, kind):
+        got = f"the class {value.__name__}: call it" if isinstance(value, type) else repr(value)
+        raise ValueError(f"{name}: expected {field} to be a {kind.__name__}, got {got}")
+
+
+REGISTRY: dict[str, Factor] = {
+    "bearing": Bearing(),
+    "prior": Prior(),
+    "relative_pose": RelativePose(),
+    "relative_position": RelativePosition(),
 }
-"""Factories of the factors of files, by the name of their table; none has parameters."""
-
-
-@functools.cache
-def of_files() -> Mapping[str, Factor]:
-    """The factors of `REGISTRY`, each made once, so that what is compiled for them is kept."""
-    return MappingProxyType({name: make() for name, make in REGISTRY.items()})
+"""The factors of files, by the name of their table."""

@@ -67,7 +67,7 @@ def with_loops_apart(graph: Graph) -> Graph:
 
     They are the rows of `relative_pose` between poses that do not follow each other in the order of
     the ids; those of the odometry stay. The order of poses and rows has no influence.
-    `graphs.optimize(graph, kernel={"relative_pose/loops": graphs.dcs()})`
+    `graphs.optimize(graph, kernel={"relative_pose/loops": graphs.Cauchy()})`
     then doubts the loops alone. Concrete graphs only; a table without rows is left out. A graph
     that has a table of loops is returned as it is.
     """

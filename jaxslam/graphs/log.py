@@ -1,5 +1,6 @@
 """The graph of a log: its motions, measurements and prior as factors."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -8,9 +9,9 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam import programs, validation
+from jaxslam import validation
 from jaxslam.core.numbers import is_concrete
-from jaxslam.graphs.factor import Factor, from_motion, from_sensor, nominal_motion, of_files
+from jaxslam.graphs.factor import Factor, FromMotion, FromSensor, NominalMotion, Prior
 from jaxslam.graphs.graph import Graph, Table
 from jaxslam.linearize.derivatives import motion_jacobians
 from jaxslam.math import linalg, se2
@@ -37,16 +38,16 @@ def of_log(
 
     Its tables, their factors, and the number of their rows:
 
-        prior    prior() of the pose before the first control              1; none where P0 = 0
-        motion   from_motion(motion), z = u, Ω = Q⁻¹; or nominal_motion    T
-        sensor   from_sensor(sensor), Ω = R⁻¹                              T·M
+        prior    Prior() of the pose before the first control              1; none where P0 = 0
+        motion   FromMotion(motion), z = u, Ω = Q⁻¹; or NominalMotion     T
+        sensor   FromSensor(sensor), Ω = R⁻¹                              T·M
 
     χ² of the graph is twice the cost of `smoothing.BatchMap`, and `pose_id` t is the pose after t
     controls. Poses start along the nominal motion, points at their first measurement, where Q and R
     are evaluated: as data of the graph they are fixed.
 
     A noise of other than three components is not determined by two poses. Then, and where `slack` s
-    is given, the factor of the motion is `nominal_motion` with Ω = (G Q Gᵀ + s² I)⁻¹. With fewer
+    is given, the factor of the motion is `NominalMotion` with Ω = (G Q Gᵀ + s² I)⁻¹. With fewer
     components (`Unicycle`, `Increment`, `Ackermann`) the motion is a constraint, which s > 0, the
     standard deviation of each coordinate [m, m, rad], makes soft: the optimum differs from that of
     `BatchMap` by the order of s², and the condition of the problem is worse by s⁻².
@@ -79,8 +80,8 @@ def of_log(
         )
     exact = len(motion.noises) == 3 and slack is None
     _check_slack(name, motion, slack)
-    of_motion = from_motion(motion) if exact else nominal_motion(motion)
-    factors = {"motion": of_motion, "sensor": from_sensor(sensor)}
+    of_motion = FromMotion(motion) if exact else NominalMotion(motion)
+    factors: dict[str, Factor] = {"motion": of_motion, "sensor": FromSensor(sensor)}
     validation.check_covariance(f"{name}: pose_cov", pose_cov, 3)
     size_u, size_z = len(motion.controls), len(sensor.measurements)
     validation.check_log(name, log, control_size=size_u, measurement_size=size_z)
@@ -92,10 +93,10 @@ def of_log(
     index, valid, ids = _points_of(name, log, sensor, tags, capacity)
     arguments = jnp.asarray(pose), jnp.asarray(pose_cov), index, valid, ids
     soft = None if exact else np.asarray(slack or 0.0)
-    graph, noise = programs.call(_graph_of, (motion, sensor, known), log, *arguments, soft)
+    graph, noise = _graph_of(motion, sensor, known, log, *arguments, soft)
     _check_noise(name, noise, motion, sensor, valid, known)
     if not known:
-        factors["prior"] = of_files()["prior"]
+        factors["prior"] = Prior()
     return graph, factors
 
 
@@ -160,6 +161,7 @@ def _points_of(
     return np.where(here, np.searchsorted(ids, asked), 0).astype(np.int32), here, ids
 
 
+@partial(jax.jit, static_argnames="known", inline=True)
 def _graph_of(
     motion: Motion,
     sensor: Sensor,

@@ -1,22 +1,20 @@
 """The optimum of a graph: Levenberg-Marquardt on sparse blocks."""
 
-import functools
-from collections.abc import Callable, Mapping
-from typing import cast
+from collections.abc import Mapping
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
-from jaxslam import programs
 from jaxslam.core.numbers import check_count, is_concrete
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.solver.batch import graph_in_one_dtype, over_batch, with_batch
 from jaxslam.graphs.solver.gnc import graduated
 from jaxslam.graphs.solver.implicit import followed
-from jaxslam.graphs.solver.kernels import Kernel
+from jaxslam.graphs.solver.kernels import Kernel, Truncated
 from jaxslam.graphs.solver.linearized import chi2_of, data_of, variables_of
 from jaxslam.graphs.solver.model import Model, model_of
 from jaxslam.graphs.solver.padding import cut, own_number, padded_graph
@@ -45,7 +43,7 @@ def optimize(
         graph: outside of a trace it is checked.
         factors: the factor of each table; those of files by default. A table "name/part" takes the
             factor "name".
-        kernel: robust kernels, one for all tables or by table. With `truncated` the iterations are
+        kernel: robust kernels, one for all tables or by table. With `Truncated` the iterations are
             rounds of graduated non-convexity (`gnc`), and `iterations` is the limit of each.
         iterations: steps at most; with 0 the solution is of the graph as it is.
         tolerance: done when a step lowers χ² by less than this share of it, as the quadratic model
@@ -63,13 +61,11 @@ def optimize(
             f"{caller}: expected tolerance to be a finite number >= 0, got {tolerance}"
         )
     model = model_of(caller, graph, factors, kernel)
-    known = dict(model.factors)
-    check_graph(caller, graph, known)
-    limits = np.asarray(iterations), np.asarray(tolerance, float)
-    own, fill = graph, plan is None and programs.outside(graph)
+    check_graph(caller, graph, model.factors)
+    own, fill = graph, plan is None and is_concrete(graph)
     graph = padded_graph(graph, room) if fill else graph
-    plan = plan_for(caller, graph, known, plan, room=room)
-    found = programs.call(_optimize, (model,), graph, plan, *limits)
+    plan = plan_for(caller, graph, model.factors, plan, room=room)
+    found: Solution = _optimize(model, graph, plan, iterations, tolerance)
     if not fill:
         return found
     singular = own_number(found.singular, own, graph)
@@ -86,10 +82,11 @@ def chi2(
     kernel: Kernel | Mapping[str, Kernel] | None = None,
 ) -> Float[Array, ""]:
     """The cost χ² = Σ ρ(eᵀ Ω e) of a graph as it is, without a factor ½."""
-    model = model_of("graphs.chi2", graph, factors, kernel)
-    return programs.call(_chi2, (model,), graph)
+    cost: Array = _chi2(model_of("graphs.chi2", graph, factors, kernel), graph)
+    return cost
 
 
+@partial(jax.jit, inline=True)
 def _chi2(model: Model, graph: Graph) -> Float[Array, ""]:
     graph = graph_in_one_dtype(graph)
     who = {name: jnp.asarray(table.who) for name, table in graph.tables.items()}
@@ -98,29 +95,39 @@ def _chi2(model: Model, graph: Graph) -> Float[Array, ""]:
     return chi2_of(model, who, variables_of(batch), data_of(batch, none))[0]
 
 
+@partial(jax.jit, inline=True)
 def _optimize(
     model: Model, graph: Graph, plan: Plan, iterations: Array, tolerance: Array
 ) -> Solution:
     graph = graph_in_one_dtype(graph)
-    return _solver(model)(graph, plan, iterations, tolerance.astype(graph.poses.dtype))
+    return _solved(model, graph, plan, iterations, jnp.asarray(tolerance, graph.poses.dtype))
 
 
-@functools.lru_cache(maxsize=256)
-def _solver(model: Model) -> Callable[..., Solution]:
-    """The solution of one graph, with derivatives, and batched by `vmap`."""
-    search = graduated if any(k.limit is not None for _, k in model.kernels) else minimize
-    solve = over_batch("graphs.optimize", functools.partial(search, model))
+def _search(
+    model: Model, plan: Plan, iterations: Array, tolerance: Array, graph: Graph
+) -> Solution:
+    """The solutions of graphs with a last axis B."""
+    rounds = any(isinstance(kernel, Truncated) for kernel in model.kernels.values())
+    return (graduated if rounds else minimize)(model, plan, iterations, tolerance, graph)
 
-    @jax.custom_jvp
-    def solved(graph: Graph, *shared: PyTree) -> Solution:
-        return solve(shared, graph)
 
-    @solved.defjvp
-    def slope(primals: PyTree, tangents: PyTree) -> tuple[Solution, PyTree]:
-        graph, plan, *_ = primals
-        found = solved(*primals)
-        return found, jax.jvp(
-            lambda graph: followed(model, plan, graph, found), (graph,), tangents[:1]
-        )[1]
+_solve = over_batch("graphs.optimize", _search)
 
-    return cast(Callable[..., Solution], solved)
+
+@jax.custom_jvp
+def _solved(
+    model: Model, graph: Graph, plan: Plan, iterations: Array, tolerance: Array
+) -> Solution:
+    """The solution of one graph, with derivatives by the graph and by the numbers of the model."""
+    return _solve((model, plan, iterations, tolerance), graph)
+
+
+@_solved.defjvp
+def _slope(primals: PyTree, tangents: PyTree) -> tuple[Solution, PyTree]:
+    model, graph, plan, *_ = primals
+    found = _solved(*primals)
+
+    def near(model: Model, graph: Graph) -> Solution:
+        return followed(model, plan, graph, found)
+
+    return found, jax.jvp(near, (model, graph), tangents[:2])[1]

@@ -2,14 +2,16 @@
 
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
-from jaxslam import programs
 from jaxslam.grids import Grid, centers
 from jaxslam.topology.skeleton import Skeleton, skeleton
+
+_centers = jax.jit(centers, inline=True)
 
 _HALF = ((0, 1), (1, -1), (1, 0), (1, 1))
 """(row, column) steps to half of the neighbours; each pair of cells once"""
@@ -152,7 +154,7 @@ def _middle(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "2"]:
 
 def cell_centers(grid: Grid) -> Float[np.ndarray, "n 2"]:
     """The centres of all cells in the world [m], row by row."""
-    return np.asarray(programs.call(centers, (), grid), np.float64).reshape(-1, 2)
+    return np.asarray(_centers(grid), np.float64).reshape(-1, 2)
 
 
 def neighbours(cells: Bool[np.ndarray, "H W"]) -> csr_matrix:

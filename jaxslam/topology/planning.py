@@ -2,14 +2,16 @@
 
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 from scipy.sparse.csgraph import dijkstra
 
-from jaxslam import programs
 from jaxslam.grids import to_cells
 from jaxslam.topology.places import TopologicalMap, cell_centers, neighbours
+
+_to_cells = jax.jit(to_cells, inline=True)
 
 
 class Route(NamedTuple):
@@ -73,7 +75,7 @@ def place_of(places: TopologicalMap, points: ArrayLike) -> Int[np.ndarray, "n"]:
     """The place of each point or pose (n, 2 or 3); -1 in a wall, off the map or in no place."""
     table = np.atleast_2d(np.asarray(points, np.float64))
     grid = places.grid
-    found = np.asarray(programs.call(to_cells, (), grid.origin, grid.resolution, table[:, :2]))
+    found = np.asarray(_to_cells(grid.origin, grid.resolution, table[:, :2]))
     j, i = np.floor(found).astype(int).T
     height, width = places.label.shape
     inside = (i >= 0) & (j >= 0) & (i < height) & (j < width)

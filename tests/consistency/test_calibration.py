@@ -4,9 +4,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+import worlds
 
 from jaxslam import association, motion, run, sensors
 from jaxslam.calibration import calibrate, consider_cov
+from jaxslam.core.record import record
 from jaxslam.filters import EkfSlam
 from jaxslam.life import Recency
 from jaxslam.types import Info, Log, Scan
@@ -175,6 +177,46 @@ def plain(innovation, status=1):
         status=jnp.array([[status, 0]]),
         log_likelihood=None,
     )
+
+
+TRACED = []
+
+
+@record
+class Parabola:
+    """p² - y, counting how often it is traced."""
+
+    y: float
+
+    def __call__(self, p):
+        TRACED.append(1)
+        return p**2 - self.y
+
+
+@record
+class Run:
+    """The Info of a run whose innovation is that of a parabola."""
+
+    of: Parabola
+
+    def __call__(self, p):
+        return plain(self.of(p))
+
+
+def test_other_numbers_of_a_record_cost_no_trace_and_no_program():
+    def both(y):
+        found = calibrate(Run(Parabola(y)), 1.5)
+        added = consider_cov(Parabola(y), found.parameters, 1.0)
+        return found.parameters[0], added[0, 0]
+
+    both(3.0)
+    TRACED.clear()
+    with worlds.compilations() as compiled:
+        root, added = both(2.0)
+        assert compiled() == 0
+    assert not TRACED
+    np.testing.assert_allclose(root, np.sqrt(2), rtol=1e-4)
+    np.testing.assert_allclose(added, 8.0, rtol=1e-3)
 
 
 def test_what_is_empty_does_not_count_and_a_number_will_do():

@@ -4,15 +4,15 @@ import jax
 import numpy as np
 import pytest
 import small_graphs
+from own_models import made
 from reference import graph as plain
 
 from jaxslam import graphs, motion, sensors
-from jaxslam.graphs.factor import of_files
 
 
 def test_the_factors_of_files_are_their_equations():
     graph = small_graphs.drawn(noise=1.0)
-    for kind, factor in of_files().items():
+    for kind, factor in graphs.REGISTRY.items():
         table = graph.tables[kind]
         values = [
             (graph.poses if of == "pose" else graph.points)[table.who[:, k]]
@@ -27,7 +27,7 @@ def test_the_factors_of_files_are_their_equations():
 
 @pytest.mark.parametrize("kind", ["relative_pose", "prior"])
 def test_jacobians_by_hand(kind, assert_jacobians):
-    factor, random = of_files()[kind], np.random.default_rng(0)
+    factor, random = graphs.REGISTRY[kind], np.random.default_rng(0)
     drawn = [random.normal(size=(6, 3)) for _ in (*factor.variables, "z")]
     assert_jacobians(
         lambda *v: factor.residual(v[:-1], v[-1]),
@@ -43,31 +43,31 @@ def _by_measurement(factor):
 def test_what_is_predicted_has_no_residual():
     random = np.random.default_rng(1)
     turning = motion.Velocity(np.eye(3))
-    made = {
-        "relative_pose": graphs.relative_pose(),
-        "relative_position": graphs.relative_position(),
-        "bearing": graphs.bearing(),
-        "sensor": graphs.from_sensor(sensors.RangeBearing(np.eye(2), mount=(0.3, 0.1, 0.5))),
-        "motion": graphs.from_motion(turning),
+    kinds = {
+        "relative_pose": graphs.RelativePose(),
+        "relative_position": graphs.RelativePosition(),
+        "bearing": graphs.Bearing(),
+        "sensor": graphs.FromSensor(sensors.RangeBearing(np.eye(2), mount=(0.3, 0.1, 0.5))),
+        "motion": graphs.FromMotion(turning),
     }
     pose = random.normal(size=3)
-    z = {kind: random.uniform(0.5, 1.0, len(f.measurements)) for kind, f in made.items()}
+    z = {kind: random.uniform(0.5, 1.0, len(f.measurements)) for kind, f in kinds.items()}
 
     @jax.jit
     def left(pose, z):
-        return {k: f.residual((pose, f.predict(pose, z[k])), z[k]) for k, f in made.items()}
+        return {k: f.residual((pose, f.predict(pose, z[k])), z[k]) for k, f in kinds.items()}
 
     for kind, residual in left(pose, z).items():
         assert np.abs(residual).max() < 1e-12, kind
-    assert graphs.prior().predict is None
-    assert graphs.from_sensor(sensors.Compass([[1.0]])).variables == ("pose",)
+    assert graphs.Prior().predict is None
+    assert graphs.FromSensor(sensors.Compass([[1.0]])).variables == ("pose",)
 
 
 @pytest.mark.parametrize("make", [motion.Odometry, motion.Velocity])
 def test_the_residual_of_a_motion_is_its_noise(make):
     """And its derivatives are those of w where step(x, u, w) = x'."""
     model, random = make(np.eye(3)), np.random.default_rng(2)
-    factor = graphs.from_motion(model)
+    factor = graphs.FromMotion(model)
     first, w = random.normal(size=(5, 3)), 0.1 * random.normal(size=(5, 3))
     u = random.uniform(0.4, 1.0, (5, 3))
 
@@ -88,7 +88,7 @@ def test_the_residual_of_a_motion_is_its_noise(make):
 def test_the_noise_curves_as_the_motion_does():
     """The residual of a motion at the pose that w leads to is w, so its second derivative is 0."""
     model = motion.Odometry(np.eye(3))
-    factor = graphs.from_motion(model)
+    factor = graphs.FromMotion(model)
     x, u, w = np.array([0.5, -1.0, 2.0]), np.array([0.4, 0.8, -0.3]), np.array([0.1, -0.1, 0.05])
 
     def around(v):
@@ -103,19 +103,24 @@ def test_the_noise_curves_as_the_motion_does():
 
 
 def test_where_the_noise_does_not_move_the_pose_nothing_is_infinite():
-    factor = graphs.from_motion(motion.Odometry(np.eye(3)))
+    factor = graphs.FromMotion(motion.Odometry(np.eye(3)))
     x, still = np.ones(3), np.zeros(3)
     slopes = jax.jit(jax.jacrev(lambda a, b: factor.residual((a, b), still), argnums=(0, 1)))
     assert np.isfinite(slopes(x, x)).all()
 
 
 def test_a_variable_is_a_pose_or_a_point():
+    names = {"measurements": ("x [m]",), "errors": ("x [m]",)}
+    with pytest.raises(ValueError, match="Own: expected variables 'pose' and 'point', got 'place'"):
+        made(graphs.Factor, variables=("place",), residual=lambda v, z: z, **names)
+    with pytest.raises(ValueError, match="Own: expected a method residual"):
+        made(graphs.Factor, variables=("pose",), **names)
     with pytest.raises(
-        ValueError, match="mine: expected variables 'pose' and 'point', got 'place'"
+        ValueError, match="FromSensor: expected sensor to be a Sensor, got the class"
     ):
-        graphs.Factor("mine", ("place",), ("x [m]",), ("x [m]",), lambda v, z: z)
+        graphs.FromSensor(sensors.Compass)
 
 
 def test_a_motion_of_two_noises_is_refused():
     with pytest.raises(ValueError, match=r"3 components.*unicycle with 2: v"):
-        graphs.from_motion(motion.Unicycle(np.eye(2)))
+        graphs.FromMotion(motion.Unicycle(np.eye(2)))

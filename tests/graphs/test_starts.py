@@ -107,8 +107,8 @@ def test_factors_of_models_start_as_those_of_files():
     truth = small_graphs.only(small_graphs.drawn(noise=0.2), "relative_pose", "relative_position")
     table = truth.tables["relative_pose"]
     factors = {
-        "relative_pose": graphs.from_motion(motion.PoseIncrement(np.eye(3))),
-        "relative_position": graphs.from_sensor(sensors.RelativePosition(np.eye(2))),
+        "relative_pose": graphs.FromMotion(motion.PoseIncrement(np.eye(3))),
+        "relative_position": graphs.FromSensor(sensors.RelativePosition(np.eye(2))),
     }
     # e of the model is additive in z, that of the file in the frame of z.
     c, s = np.cos(table.z[:, 2]), np.sin(table.z[:, 2])
@@ -152,7 +152,7 @@ def shuffled(graph):
 
     def row_order(key, table):
         rows = random.permutation(len(table.z))
-        kinds = graphs.REGISTRY[key]().variables
+        kinds = graphs.REGISTRY[key].variables
         who = np.stack([at[kind][table.who[:, k]] for k, kind in enumerate(kinds)], axis=1)
         return graphs.Table(who[rows], table.z[rows], table.information[rows], table.valid[rows])
 

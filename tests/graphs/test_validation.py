@@ -3,9 +3,9 @@
 import numpy as np
 import pytest
 import small_graphs
+from own_models import made
 
 from jaxslam import graphs
-from jaxslam.graphs.factor import of_files
 
 
 def spoiled(graph, table, field, at, value):
@@ -114,20 +114,20 @@ SPOILS = {
 def test_what_is_refused(name):
     spoil, message = SPOILS[name]
     graph = small_graphs.drawn()
-    graphs.check_graph("optimize", graph, of_files())
+    graphs.check_graph("optimize", graph, graphs.REGISTRY)
     with pytest.raises(ValueError, match=f"optimize: .*{message}"):
-        graphs.check_graph("optimize", spoil(graph), of_files())
+        graphs.check_graph("optimize", spoil(graph), graphs.REGISTRY)
 
 
 def test_what_is_not_valid_is_not_judged():
     graph = spoiled(small_graphs.drawn(), "relative_pose", "information", (9, 0, 0), -1.0)
     graph = spoiled(graph, "relative_pose", "who", 9, -7)
     graph = spoiled(graph, "relative_pose", "valid", 9, False)
-    graphs.check_graph("optimize", graph, of_files())
+    graphs.check_graph("optimize", graph, graphs.REGISTRY)
 
 
 def test_parts_with_a_gauge_each_are_a_graph():
-    graphs.check_graph("optimize", loose(small_graphs.drawn(), fixed=True), of_files())
+    graphs.check_graph("optimize", loose(small_graphs.drawn(), fixed=True), graphs.REGISTRY)
 
 
 def test_a_part_that_is_fixed_needs_no_gauge():
@@ -138,13 +138,13 @@ def test_a_part_that_is_fixed_needs_no_gauge():
         fixed_point=np.append(graph.fixed_point, True),
         point_id=np.append(graph.point_id, 99),
     )
-    graphs.check_graph("optimize", unseen, of_files())
+    graphs.check_graph("optimize", unseen, graphs.REGISTRY)
     free = small_graphs.only(at(unseen, "fixed_pose", 0, False), "relative_pose")
     free = free._replace(points=unseen.points[-1:], fixed_point=np.ones(1, bool))
     free = free._replace(point_id=unseen.point_id[-1:])
     with pytest.raises(ValueError, match="the graph has no gauge"):
-        graphs.check_graph("optimize", free, of_files())
-    graphs.check_graph("optimize", graphs.with_gauge(free), of_files())
+        graphs.check_graph("optimize", free, graphs.REGISTRY)
+    graphs.check_graph("optimize", graphs.with_gauge(free), graphs.REGISTRY)
 
 
 def test_another_kind_of_number_is_refused():
@@ -194,7 +194,7 @@ def test_rounding_of_a_file_is_not_indefinite():
     graph = small_graphs.drawn()
     flat = np.diag([1e4, 1e4, -1e-3])
     graph = spoiled(graph, "relative_pose", "information", 0, flat)
-    graphs.check_graph("optimize", graph, of_files())
+    graphs.check_graph("optimize", graph, graphs.REGISTRY)
 
 
 def test_the_first_pose_is_fixed_where_nothing_is():
@@ -216,7 +216,8 @@ def test_the_first_pose_is_fixed_where_nothing_is():
 def test_a_residual_of_another_shape_is_refused(residual, got):
     """By all that takes factors: optimization, χ², residuals, and the plan."""
     names = ("x [m]", "y [m]", "theta [rad]")
-    factors = {"prior": graphs.Factor("mine", ("pose",), names, names, residual)}
+    names = {"measurements": names, "errors": names, "name": "mine"}
+    factors = {"prior": made(graphs.Factor, variables=("pose",), residual=residual, **names)}
     graph = small_graphs.only(small_graphs.drawn(), "prior")
     told = r"the factor 'mine' of table 'prior': expected a residual of shape \(3,\), as its errors"
     for use in (graphs.optimize, graphs.chi2, graphs.squared_residuals, graphs.plan):
@@ -235,20 +236,20 @@ GRAPH = small_graphs.drawn()
         (lambda: graphs.starts.chordal("x.g2o"), "starts: expected a Graph, .*, got 'x.g2o'"),
         (lambda: graphs.plan(GRAPH.tables), "plan: expected a Graph, .*, got a dict"),
         (
-            lambda: graphs.optimize(GRAPH, kernel=graphs.dcs),
-            r"optimize: expected a Kernel, as graphs.huber\(\), got the function dcs",
+            lambda: graphs.optimize(GRAPH, kernel=graphs.DynamicCovarianceScaling),
+            r"optimize: expected a Kernel, as graphs.Huber\(\), got the class Dyn",
         ),
         (
             lambda: graphs.chi2(GRAPH, kernel={"bearing": "dcs"}),
-            r"chi2: expected a Kernel, as graphs.huber\(\), got 'dcs'",
+            r"chi2: expected a Kernel, as graphs.Huber\(\), got 'dcs'",
         ),
         (
-            lambda: graphs.optimize(GRAPH, {"bearing": graphs.bearing}),
-            r"optimize: expected a Factor, as graphs.relative_pose\(\), got the function bearing",
+            lambda: graphs.optimize(GRAPH, {"bearing": graphs.Bearing}),
+            r"optimize: expected a Factor, as graphs.RelativePose\(\), got the class Bearing",
         ),
         (
-            lambda: graphs.optimize(GRAPH, graphs.bearing()),
-            "optimize: expected factors as a dict by table, got a Factor",
+            lambda: graphs.optimize(GRAPH, graphs.Bearing()),
+            "optimize: expected factors as a dict by table, got a Bearing",
         ),
         (lambda: graphs.optimize(GRAPH, iterations=-1), "iterations: expected an integer >= 0"),
         (lambda: graphs.marginals(GRAPH), "marginals: expected a Solution, .* got a Graph"),

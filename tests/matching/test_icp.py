@@ -8,7 +8,7 @@ import pytest
 from scanned_rooms import BEAMS, by_polynomial, moved, pairs, points_at, stacked
 
 from jaxslam import matching
-from jaxslam.graphs import huber
+from jaxslam.graphs import Huber
 from jaxslam.matching import IcpSettings, MatchStatus, Points, Prior
 from jaxslam.types import Beams
 
@@ -183,7 +183,7 @@ def test_in_a_corridor_the_prior_decides_whatever_it_is_worth(make, sigma):
 @pytest.mark.parametrize("make", [matching.point_to_point, matching.point_to_line])
 def test_a_prior_holds_what_the_scans_do_not_determine(make):
     """At the end the slope of the cost is zero; in the corridor x is that of the prior."""
-    matcher = make(IcpSettings(**OPTIONS, tolerance=1e-9, kernel=huber(), scale=0.05))
+    matcher = make(IcpSettings(**OPTIONS, tolerance=1e-9, kernel=Huber(), scale=0.05))
     information = np.diag([0.5, 0.5, 0.5]) + 0.2
     prior = Prior(STARTS + [0.03, -0.02, 0.01], np.tile(information, (COUNT, 1, 1)))
     found = jax.device_get(matching.match(matcher, REFERENCES, SCANS, STARTS, prior))
@@ -210,7 +210,7 @@ def test_trimming_and_a_kernel_bear_outliers_and_forward_derivatives_are_finite(
     references = Points(*(part[:GOOD] for part in REFERENCES))
     error = {}
     for name, options in {
-        "plain": {}, "trimmed": {"trim": 0.75}, "kernel": {"kernel": huber(), "scale": 0.02}
+        "plain": {}, "trimmed": {"trim": 0.75}, "kernel": {"kernel": Huber(), "scale": 0.02}
     }.items():  # fmt: skip
         end = matching.match(
             matching.point_to_line(IcpSettings(**OPTIONS, least_score=0.1, **options)),

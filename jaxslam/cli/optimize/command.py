@@ -17,7 +17,7 @@ from jaxslam.cli.runtime.compile_clock import CompileClock
 from jaxslam.core.numbers import check_count
 from jaxslam.datasets.formats import g2o
 from jaxslam.graphs import Ending, Graph, starts
-from jaxslam.graphs.factor import Factor, of_files
+from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import TRUSTED
 from jaxslam.graphs.validation import label, variables_in
 from jaxslam.monte_carlo.progress import Progress
@@ -25,8 +25,8 @@ from jaxslam.results.files import csv_text, json_number, json_text, versions, wr
 from jaxslam.types import JaxOrNumPy
 
 ERRORS = {
-    "pose": (graphs.relative_pose, "e = Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ) as (x, y, θ)"),
-    "log": (graphs.relative_pose_log, "e = log(Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ))"),
+    "pose": (graphs.RelativePose(), "e = Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ) as (x, y, θ)"),
+    "log": (graphs.RelativePoseLog(), "e = log(Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ))"),
 }
 """The residual of a relative pose by its name: g2o's, and GTSAM's."""
 
@@ -44,7 +44,7 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
         pick("start", options.start, starts.STARTS)
     kernel = None if options.kernel is None else pick("kernel", options.kernel, graphs.KERNELS)()
     relative, equation = pick("error", options.error, ERRORS)
-    if options.animate and kernel is not None and kernel.limit is not None:
+    if options.animate and isinstance(kernel, graphs.Truncated):
         raise ValueError(
             f"--animate: the kernel {options.kernel} is solved in rounds of many iterations each; "
             "films show the iterations of one"
@@ -52,7 +52,7 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
     check_count("--iterations", options.iterations)
     loaded = g2o.load(options.path)
     check_out(options.out, "optimize")
-    known = {**of_files(), "relative_pose": relative()}
+    known = {**graphs.REGISTRY, "relative_pose": relative}
     factors = {key: known[key] for key in loaded.graph.tables}
     held = graphs.with_gauge(loaded.graph, factors)
     graphs.check_graph(str(options.path), held, factors)

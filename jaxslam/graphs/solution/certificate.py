@@ -1,7 +1,7 @@
 """A certificate of global optimality: a lower bound of the chordal cost of a pose graph."""
 
-import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -9,12 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxslam import programs
 from jaxslam.core.numbers import is_concrete
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.solution.chordal import PRIOR
-from jaxslam.graphs.solution.dual import chordal_factor, chordal_weights, dual
+from jaxslam.graphs.solution.dual import Relaxed, chordal_weights, dual
 from jaxslam.graphs.solver.batch import graph_in_one_dtype, over_batch
 from jaxslam.graphs.solver.linearized import data_of, variables_of
 from jaxslam.graphs.solver.model import Model, model_of
@@ -87,18 +86,18 @@ def certificate(
     """
     caller = "graphs.certificate"
     model = model_of(caller, graph, factors)
-    for name, factor in model.factors:
+    for name, factor in model.factors.items():
         if factor.chordal is None:
             raise ValueError(
                 f"{caller}: the table {name!r} has no chordal cost: its factor is {factor.name}, "
                 "and relative poses, relative positions and priors have one"
             )
-    check_graph(caller, graph, dict(model.factors))
-    plan = plan_for(caller, graph, dict(model.factors), plan)
+    check_graph(caller, graph, model.factors)
+    plan = plan_for(caller, graph, model.factors, plan)
     if is_concrete(graph):
         # NumPy, since each operation on a new shape would be a program.
         held = np.array(graph.fixed_pose)
-        for name, factor in model.factors:
+        for name, factor in model.factors.items():
             if factor.chordal is PRIOR:
                 held[
                     np.asarray(graph.tables[name].who)[np.asarray(graph.tables[name].valid), 0]
@@ -108,25 +107,22 @@ def certificate(
                 f"{caller}: expected one pose that is fixed or has a prior, got {held.sum()}; the "
                 "dual is of a graph that is free but for that"
             )
-    return programs.call(_certificate, (model,), graph, plan)
+    proved: Certificate = _certificate(model, graph, plan)
+    return proved
 
 
 def _held(model: Model, plan: Plan, graph: Graph) -> Bool[Array, "N *B"]:
     """The poses that are fixed or have a prior."""
     held = jnp.asarray(graph.fixed_pose)
-    for name, factor in model.factors:
+    for name, factor in model.factors.items():
         if factor.chordal is PRIOR:
             held = held.at[plan.who[name][:, 0]].max(graph.tables[name].valid)
     return held
 
 
+@partial(jax.jit, inline=True)
 def _certificate(model: Model, graph: Graph, plan: Plan) -> Certificate:
-    return _batched(model)((plan,), graph_in_one_dtype(graph))
-
-
-@functools.lru_cache(maxsize=256)
-def _batched(model: Model) -> Callable[..., Certificate]:
-    return over_batch("graphs.certificate", functools.partial(_proved, model))
+    return over_batch("graphs.certificate", _proved)((model, plan), graph_in_one_dtype(graph))
 
 
 def _proved(model: Model, plan: Plan, graph: Graph) -> Certificate:
@@ -134,13 +130,13 @@ def _proved(model: Model, plan: Plan, graph: Graph) -> Certificate:
     poses, dtype = len(graph.poses), graph.poses.dtype
     held = _held(model, plan, graph)
     tables = {}
-    for name, factor in model.factors:
+    for name, factor in model.factors.items():
         table = graph.tables[name]
         assert factor.chordal is not None
         weights = chordal_weights(factor.chordal, table.information)
         unit = jnp.eye(weights.shape[1], dtype=dtype)[None, ..., None]
         tables[name] = table._replace(information=unit * weights[:, None])
-    chordal = Model(tuple((name, chordal_factor(factor)) for name, factor in model.factors))
+    chordal = Model({name: Relaxed(factor) for name, factor in model.factors.items()}, {})
     surrogate = graph._replace(tables=tables, fixed_pose=held)
     tolerance = jnp.asarray(1e-13, dtype)
     found = minimize(chordal, plan, jnp.asarray(100), tolerance, surrogate)

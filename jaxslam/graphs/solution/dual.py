@@ -1,11 +1,9 @@
 """The dual matrix of a pose graph's chordal cost, and that cost as factors of a graph."""
 
-import functools
-from dataclasses import replace
-
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxslam.core.record import record
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.solution.chordal import Chordal
 from jaxslam.graphs.solver.linearized import Data, Variables, variable_numbers
@@ -16,14 +14,31 @@ from jaxslam.math.linalg import total
 from jaxslam.types import JaxOrNumPy
 
 
-@functools.lru_cache(maxsize=256)
-def chordal_factor(factor: Factor) -> Factor:
+@record
+class Relaxed(Factor):
     """The factor of the same measurement with chordal residuals, `Factor.chordal`."""
-    assert factor.chordal is not None
-    own = factor.chordal
-    return replace(
-        factor, errors=("",) * own.size, residual=own.residual, jacobians=None, predict=None
-    )
+
+    factor: Factor
+
+    @property
+    def variables(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self.factor.variables
+
+    @property
+    def measurements(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self.factor.measurements
+
+    @property
+    def errors(self) -> tuple[str, ...]:  # type: ignore[override]
+        return ("",) * self.chordal.size
+
+    @property
+    def chordal(self) -> Chordal:  # type: ignore[override]
+        assert self.factor.chordal is not None
+        return self.factor.chordal
+
+    def residual(self, variables: tuple[Array, ...], z: Array) -> Array:
+        return self.chordal.residual(variables, z)
 
 
 def chordal_weights(
@@ -55,7 +70,7 @@ def dual(
         jnp.array([True, True, False, False])[None, :, None] | is_pose[plan.order][:, None, None]
     )
     blocks, gradients = [], []
-    for name, factor in chordal.factors:
+    for name, factor in chordal.factors.items():
         who, valid, k = plan.who[name], data.valid[name], len(factor.variables)
         rows, size = len(who), len(factor.errors)
         if factor.chordal is None or factor.chordal.rows is None:

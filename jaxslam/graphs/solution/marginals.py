@@ -1,15 +1,15 @@
 """Marginal covariances of poses and points, from the information matrix of a graph."""
 
-import functools
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
+from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from jaxslam import programs
 from jaxslam.core.numbers import is_concrete
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
@@ -73,21 +73,20 @@ def marginals(
             f"{type(solution).__name__}; of a graph as it is: graphs.optimize(graph, iterations=0)"
         )
     model = model_of(caller, solution.graph, factors)
-    known = dict(model.factors)
-    check_graph(caller, solution.graph, known)
+    check_graph(caller, solution.graph, model.factors)
     graph = _weighted(solution)
     wanted = checked_pairs(caller, pairs, len(graph.poses) + len(graph.points))
-    if plan is None and programs.outside(graph):
+    if plan is None and is_concrete(graph):
         more = padded_graph(graph, room)
         rows = np.zeros((padded_size(max(len(wanted), 4 * room), LEAST), 2), int)
         rows[: len(wanted)] = padded_number(wanted, graph, more)
-        new = plan_for(caller, more, known, None, marginals=True, pairs=rows, room=room)
-        found = programs.call(_marginals, (model,), more, new)
-        poses, points, pairs = cut(found[:3], (graph.poses, graph.points, wanted))
-        found = Marginals(poses, points, pairs, own_number(found.singular, graph, more))
+        plan = plan_for(caller, more, model.factors, None, marginals=True, pairs=rows, room=room)
+        whole: Marginals = _marginals(model, more, plan)
+        poses, points, pairs = cut(whole[:3], (graph.poses, graph.points, wanted))
+        found = Marginals(poses, points, pairs, own_number(whole.singular, graph, more))
     else:
-        plan = plan_for(caller, graph, known, plan, marginals=True, pairs=wanted)
-        found = programs.call(_marginals, (model,), graph, plan)
+        plan = plan_for(caller, graph, model.factors, plan, marginals=True, pairs=wanted)
+        found = _marginals(model, graph, plan)
     if is_concrete(found.singular) and np.ndim(found.singular) == 0 and found.singular >= 0:
         raise ValueError(
             f"{caller}: the measurements do not determine {label(graph, int(found.singular))}"
@@ -97,7 +96,7 @@ def marginals(
 
 def _weighted(solution: Solution) -> Graph:
     """The graph of a solution, each information multiplied by the weight of its row."""
-    array = np.asarray if programs.outside(solution) else jnp.asarray  # no program for each shape
+    array = np.asarray if is_concrete(solution) else jnp.asarray  # no program for each shape
     tables = {
         name: table._replace(
             information=array(table.information) * array(solution.weights[name])[:, None, None]
@@ -107,13 +106,9 @@ def _weighted(solution: Solution) -> Graph:
     return solution.graph._replace(tables=tables)
 
 
+@partial(jax.jit, inline=True)
 def _marginals(model: Model, graph: Graph, plan: Plan) -> Marginals:
-    return _batched(model)((plan,), graph_in_one_dtype(graph))
-
-
-@functools.lru_cache(maxsize=256)
-def _batched(model: Model) -> Callable[..., Marginals]:
-    return over_batch("graphs.marginals", functools.partial(_inverted, model))
+    return over_batch("graphs.marginals", _inverted)((model, plan), graph_in_one_dtype(graph))
 
 
 def _inverted(model: Model, plan: Plan, graph: Graph) -> Marginals:

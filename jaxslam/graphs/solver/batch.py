@@ -40,7 +40,9 @@ def over_batch(name: str, function: Callable[..., _T]) -> Callable[[PyTree, PyTr
     @whole.def_vmap
     def rule(size: int, batched: PyTree, shared: PyTree, own: PyTree) -> tuple[_T, PyTree]:
         if any(jax.tree.leaves(batched[0])):
-            raise ValueError(f"{name}: expected one plan and one set of limits for a batch")
+            raise ValueError(
+                f"{name}: expected one model, one plan and one set of limits for a batch"
+            )
 
         if size > GROUP:
             groups = -(-size // GROUP)

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.graphs.graph import Graph
+from jaxslam.graphs.solver.kernels import Truncated
 from jaxslam.graphs.solver.linearized import (
     chi2_of,
     data_of,
@@ -56,8 +57,9 @@ def graduated(
     zeros and ones where s <= c² for half of the rows or more: false loops can bend the plain
     optimum by more than later rounds mend, and a good start must not be given up for it.
     """
-    truncated = {name: k.limit for name, k in model.kernels if k.limit is not None}
-    plain = Model(model.factors, tuple((name, k) for name, k in model.kernels if k.limit is None))
+    kernels = model.kernels.items()
+    truncated = {name: kernel for name, kernel in kernels if isinstance(kernel, Truncated)}
+    plain = Model(model.factors, {name: k for name, k in kernels if name not in truncated})
     data = data_of(graph, plan.column)
 
     def solved(graph: Graph, weights: dict[str, Array], tolerance: Array) -> Solution:
@@ -70,7 +72,7 @@ def graduated(
     def ratios(found: Solution) -> dict[str, Array]:
         """s/c² of the rows that can be left out."""
         out = {}
-        for name, factor in model.factors:
+        for name, factor in model.factors.items():
             if name in truncated:
                 s = row_costs(
                     factor,
@@ -80,7 +82,7 @@ def graduated(
                     data.z[name],
                     data.information[name],
                 )[1]
-                out[name] = jnp.where(data.valid[name], s, 0.0) / truncated[name] ** 2
+                out[name] = truncated[name].ratio(jnp.where(data.valid[name], s, 0.0))
         return out
 
     def convex(ratio: dict[str, Array]) -> Float[Array, "B"]:

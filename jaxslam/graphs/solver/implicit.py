@@ -1,4 +1,4 @@
-"""Derivatives of the optimum of a graph by what was measured: implicit differentiation."""
+"""Derivatives of the optimum of a graph by what it depends on: implicit differentiation."""
 
 import jax
 import jax.numpy as jnp
@@ -22,19 +22,19 @@ from jaxslam.graphs.sparse.cholesky import factorize, substitute
 
 
 def followed(model: Model, plan: Plan, graph: Graph, found: Solution) -> Solution:
-    """The solution as a function of the graph: the same numbers, with derivatives.
+    """The solution as a function of graph and model: the same numbers, with derivatives.
 
     At the optimum F(δ; θ) = ½ ∂χ²/∂δ = 0, so that dδ = -(∂F/∂δ)⁻¹ (∂F/∂θ) dθ: a Newton step from
     the optimum, of which only F is differentiated. ∂F/∂δ is half the Hessian of χ² with its second
-    derivatives of the residuals, not Gauss-Newton's. θ are the measurements, the information, and
-    the variables that are fixed.
+    derivatives of the residuals, not Gauss-Newton's. θ are the measurements, the information,
+    the variables that are fixed, and the numbers of factors and kernels.
     """
     still = jax.lax.stop_gradient((found.graph.poses, found.graph.points))
     poses = jnp.where(graph.fixed_pose[:, None], graph.poses, still[0])
     points = jnp.where(graph.fixed_point[:, None], graph.points, still[1])
     there = with_batch(graph._replace(poses=poses, points=points))
     variables, data = variables_of(there), data_of(there, plan.column)
-    blocks = jax.lax.stop_gradient(half_hessian(model, plan, variables, data))
+    blocks = half_hessian(*jax.lax.stop_gradient((model, plan, variables, data)))
     gradient = linearize(model, plan, variables, data).gradient
     step = _solved(plan, blocks[..., 0], gradient[..., 0])
     end = retract(variables, -step[..., None], plan)

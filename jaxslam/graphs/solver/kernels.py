@@ -1,87 +1,134 @@
 """Robust kernels: what a measurement costs, by its squared residual s = eᵀ Ω e."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
-
 import jax
 import jax.numpy as jnp
 
 from jaxslam.core.numbers import check_positive
+from jaxslam.core.record import record
+from jaxslam.math.arrays import Number
+from jaxslam.protocols import Component
 
 Array = jax.Array
 
 
-@dataclass(frozen=True, eq=False)
-class Kernel:
-    """A robust cost ρ(s) of a squared residual s, with ρ(s) ≈ s at zero; both elementwise."""
+class Kernel(Component):
+    """A robust cost ρ(s) of a squared residual s, with ρ(s) ≈ s at zero.
 
-    name: str
-    cost: Callable[[Array], Array]
-    """ρ(s), what stands in χ² in place of s"""
-    weight: Callable[[Array], Array]
-    """ρ'(s), what multiplies the information in a Gauss-Newton step"""
-    limit: float | None = None
-    """of a truncated kernel, c: `optimize` reaches it by graduated non-convexity (`gnc`)"""
+    A subclass is a record (`core.record`) that defines `cost` and `weight`, both elementwise.
+    """
+
+    def __post_init__(self) -> None:
+        self._check(Kernel, {"cost": "s", "weight": "s"})
+
+    def cost(self, s: Array) -> Array:
+        """ρ(s), what stands in χ² in place of s."""
+        raise NotImplementedError
+
+    def weight(self, s: Array) -> Array:
+        """ρ'(s), what multiplies the information in a Gauss-Newton step."""
+        raise NotImplementedError
 
 
-def huber(limit: float = 1.345) -> Kernel:
+class _OfWidth(Kernel):
+    """What kernels of one number share. Raises ValueError on a width not above 0."""
+
+    width: Number
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_positive(type(self).__name__, width=self.width)
+
+    def _widths(self, s: Array) -> tuple[Array, Array]:
+        """The width and its square, in the dtype of s."""
+        return jnp.asarray(self.width, s.dtype), jnp.asarray(self.width**2, s.dtype)
+
+
+@record
+class Huber(_OfWidth):
     """Huber's kernel: s below k², else 2k√s - k² (Huber 1964; k = 1.345 keeps 95 % efficiency for
     one Gaussian residual)."""
-    check_positive("graphs.huber", limit=limit)
 
-    def cost(s: Array) -> Array:
-        near = s <= limit**2
-        root = jnp.sqrt(jnp.where(near, limit**2, s))
-        return jnp.where(near, s, 2 * limit * root - limit**2)
+    width: Number = 1.345
+    """k"""
 
-    def weight(s: Array) -> Array:
-        near = s <= limit**2
-        return jnp.where(near, 1.0, limit / jnp.sqrt(jnp.where(near, 1.0, s)))
+    def cost(self, s: Array) -> Array:
+        width, square = self._widths(s)
+        near = s <= square
+        root = jnp.sqrt(jnp.where(near, square, s))
+        return jnp.where(near, s, 2 * width * root - square)
 
-    return Kernel("huber", cost, weight)
+    def weight(self, s: Array) -> Array:
+        width, square = self._widths(s)
+        near = s <= square
+        return jnp.where(near, 1.0, width / jnp.sqrt(jnp.where(near, 1.0, s)))
 
 
-def cauchy(limit: float = 2.385) -> Kernel:
+@record
+class Cauchy(_OfWidth):
     """Cauchy's kernel: k² log(1 + s/k²) (k = 2.385: 95 % efficiency for one Gaussian residual)."""
-    check_positive("graphs.cauchy", limit=limit)
-    return Kernel(
-        "cauchy",
-        lambda s: limit**2 * jnp.log1p(s / limit**2),
-        lambda s: 1.0 / (1.0 + s / limit**2),
-    )
+
+    width: Number = 2.385
+    """k"""
+
+    def cost(self, s: Array) -> Array:
+        _, square = self._widths(s)
+        return square * jnp.log1p(s / square)
+
+    def weight(self, s: Array) -> Array:
+        _, square = self._widths(s)
+        return 1.0 / (1.0 + s / square)
 
 
-def dcs(limit: float = 1.0) -> Kernel:
+@record
+class DynamicCovarianceScaling(_OfWidth):
     """Dynamic covariance scaling: s below Φ, else Φ (3s - Φ)/(s + Φ), which tends to 3Φ.
 
     Agarwal et al. 2013, "Robust map optimization using dynamic covariance scaling", ICRA: the
     information is multiplied by c², c = min(1, 2Φ/(Φ + s)); ρ is the integral of c² (s).
     """
-    check_positive("graphs.dcs", limit=limit)
 
-    def cost(s: Array) -> Array:
-        return jnp.where(s <= limit, s, limit * (3 * s - limit) / (s + limit))
+    name = "dcs"
+    width: Number = 1.0
+    """Φ, of s itself"""
 
-    def weight(s: Array) -> Array:
-        return jnp.minimum(1.0, 2 * limit / (limit + s)) ** 2
+    def cost(self, s: Array) -> Array:
+        width, _ = self._widths(s)
+        return jnp.where(s <= width, s, width * (3 * s - width) / (s + width))
 
-    return Kernel("dcs", cost, weight)
+    def weight(self, s: Array) -> Array:
+        width, _ = self._widths(s)
+        return jnp.minimum(1.0, 2 * width / (width + s)) ** 2
 
 
-def truncated(limit: float = 3.37) -> Kernel:
+@record
+class Truncated(_OfWidth):
     """Truncated least squares: min(s, c²), so that a measurement is kept or costs c².
 
     c² should be a quantile of χ² with as many degrees of freedom as residuals: c = 3.37 is that of
-    99 % for three. `optimize` finds its minimum by graduated non-convexity.
+    99 % for three. `optimize` finds its minimum by graduated non-convexity (`gnc`).
     """
-    check_positive("graphs.truncated", limit=limit)
-    return Kernel(
-        "truncated",
-        lambda s: jnp.minimum(s, limit**2),
-        lambda s: jnp.where(s <= limit**2, 1.0, 0.0),
-        limit,
-    )
+
+    width: Number = 3.37
+    """c"""
+
+    def cost(self, s: Array) -> Array:
+        _, square = self._widths(s)
+        return jnp.minimum(s, square)
+
+    def weight(self, s: Array) -> Array:
+        _, square = self._widths(s)
+        return (s <= square).astype(s.dtype)
+
+    def ratio(self, s: Array) -> Array:
+        """s/c², above 1 for what is left out."""
+        _, square = self._widths(s)
+        return s / square
 
 
-REGISTRY = {"huber": huber, "cauchy": cauchy, "dcs": dcs, "truncated": truncated}
-"""Factories of kernels by name."""
+REGISTRY: dict[str, type[Huber | Cauchy | DynamicCovarianceScaling | Truncated]] = {
+    "huber": Huber,
+    "cauchy": Cauchy,
+    "dcs": DynamicCovarianceScaling,
+    "truncated": Truncated,
+}
+"""The kernels by name."""

@@ -93,10 +93,10 @@ def chi2_of(
 ) -> Float[Array, "B"]:
     """The cost χ² of the graph at some variables."""
     parts = []
-    for name, factor in model.factors:
+    for name, factor in model.factors.items():
         rows = row_costs(
             factor,
-            model.kernel(name),
+            model.kernels.get(name),
             who[name],
             variables,
             data.z[name],
@@ -111,8 +111,8 @@ def row_weights(
 ) -> dict[str, Float[Array, "_ B"]]:
     """The weights ρ'(s) of the rows of each table: 1 without a kernel, 0 where not valid."""
     weights = {}
-    for name, factor in model.factors:
-        z, info, kernel = data.z[name], data.information[name], model.kernel(name)
+    for name, factor in model.factors.items():
+        z, info, kernel = data.z[name], data.information[name], model.kernels.get(name)
         if kernel is None:
             weight = jnp.ones_like(z, shape=data.valid[name].shape)
         else:
@@ -125,10 +125,10 @@ def linearize(model: Model, plan: Plan, variables: Variables, data: Data) -> Sys
     """The normal equations about the variables."""
     width, poses = data.free.shape[1], len(variables.poses)
     chi2, gradients, blocks = [], [], []
-    for name, factor in model.factors:
+    for name, factor in model.factors.items():
         e, jacobian = _jacobians(factor, plan.who[name], variables, data.z[name], width)
         info, valid = data.information[name], data.valid[name]
-        s, kernel = squared(info, e), model.kernel(name)
+        s, kernel = squared(info, e), model.kernels.get(name)
         chi2.append(jnp.where(valid, s if kernel is None else kernel.cost(s), 0.0).sum(axis=0))
         weight = 1.0 if kernel is None else kernel.weight(s)
         info = info * jnp.where(valid, weight, 0.0)[:, None, None]
@@ -165,8 +165,8 @@ def half_hessian(
     """Half the second derivative of χ² by the increments, as `System.blocks`."""
     width, poses = data.free.shape[1], len(variables.poses)
     blocks = []
-    for name, factor in model.factors:
-        kernel, count = model.kernel(name), len(factor.variables)
+    for name, factor in model.factors.items():
+        kernel, count = model.kernels.get(name), len(factor.variables)
 
         def half(steps: Array, own: tuple[Array, ...], z: Array, info: Array) -> Array:
             e = factor.residual(_moved(factor, steps, own), z)  # noqa: B023
@@ -200,6 +200,18 @@ def _moved(factor: Factor, steps: Float[Array, "K d"], own: tuple[Array, ...]) -
     )
 
 
+@jax.custom_jvp
+def _barrier(values: PyTree) -> PyTree:
+    """`optimization_barrier`, whose own derivative JAX cannot transpose where some of the values
+    have none."""
+    return jax.lax.optimization_barrier(values)
+
+
+@_barrier.defjvp
+def _slope_of_barrier(primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
+    return _barrier(*primals), tangents[0]
+
+
 def _jacobians(
     factor: Factor, who: Array, variables: Variables, z: Array, width: int
 ) -> tuple[Float[Array, "E R B"], Float[Array, "E R K d B"]]:
@@ -212,7 +224,7 @@ def _jacobians(
     own = _taken(factor, who, variables)
     e, slope = jax.linearize(lambda *own: _over_rows(factor.residual, own, z), *own)
     slope, common = jax.closure_convert(slope, *own)
-    e, common = jax.lax.optimization_barrier((e, common))
+    e, common = _barrier((e, common))
 
     def by_coordinate(k: int) -> Array:
         """(size, E, R, B)"""

@@ -1,32 +1,27 @@
 """The functions of a graph: a factor for each table, and a robust kernel where there is one."""
 
-import functools
 from collections.abc import Mapping
-from dataclasses import dataclass
-from inspect import isfunction
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import PyTree
 
-from jaxslam.graphs.factor import Factor, of_files
+from jaxslam.core.record import record
+from jaxslam.graphs.factor import REGISTRY, Factor
 from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.solver.kernels import Kernel
 
 
-@dataclass(frozen=True)
+@record
 class Model:
-    """Factors and kernels by table; one object for the same functions (`model_of`)."""
+    """Factors and kernels by table."""
 
-    factors: tuple[tuple[str, Factor], ...]
-    kernels: tuple[tuple[str, Kernel], ...] = ()
-
-    def kernel(self, table: str) -> Kernel | None:
-        """The kernel of a table."""
-        return dict(self.kernels).get(table)
-
-
-_same = functools.lru_cache(maxsize=256)(Model)
+    factors: dict[str, Factor]
+    """in the order of the names"""
+    kernels: dict[str, Kernel]
+    """of the tables that have one"""
 
 
 def model_of(
@@ -40,13 +35,13 @@ def model_of(
     if kernel is not None and not isinstance(kernel, Mapping):
         kernel = dict.fromkeys(graph.tables, kernel)
     for each in (kernel or {}).values():
-        _check_made(name, each, Kernel, "graphs.huber()")
+        _check_made(name, each, Kernel, "graphs.Huber()")
     if lost := sorted(set(kernel or ()) - set(graph.tables)):
         raise ValueError(
             f"{name}: kernels of tables that are not in the graph: {', '.join(lost)}; "
             f"there are: {', '.join(graph.tables)}"
         )
-    return _same(tuple(known.items()), tuple(sorted(kernel.items())) if kernel else ())
+    return Model(known, dict(kernel or {}))
 
 
 def factors_of(name: str, graph: Graph, factors: Mapping[str, Factor] | None) -> dict[str, Factor]:
@@ -61,12 +56,12 @@ def factors_of(name: str, graph: Graph, factors: Mapping[str, Factor] | None) ->
         raise ValueError(
             f"{name}: expected a Graph, as graphs.read(path) or the graph of a solution, got {got}"
         )
-    known = of_files() if factors is None else factors
+    known = REGISTRY if factors is None else factors
     if not isinstance(known, Mapping):
         got = type(known).__name__
         raise ValueError(f"{name}: expected factors as a dict by table, got a {got}")
     for each in known.values():
-        _check_made(name, each, Factor, "graphs.relative_pose()")
+        _check_made(name, each, Factor, "graphs.RelativePose()")
     out = {}
     for key in sorted(graph.tables):
         found = known.get(key, known.get(key.split("/")[0]))
@@ -86,17 +81,22 @@ def factors_of(name: str, graph: Graph, factors: Mapping[str, Factor] | None) ->
 
 
 def _check_made(name: str, value: object, kind: type, example: str) -> None:
-    """Raise ValueError unless a value is of a kind, e.g. on the function that makes one."""
+    """Raise ValueError unless a value is of a kind, e.g. on the class of one."""
     if not isinstance(value, kind):
-        got = f"the function {value.__name__}" if isfunction(value) else repr(value)
+        got = f"the class {value.__name__}" if isinstance(value, type) else repr(value)
         raise ValueError(f"{name}: expected a {kind.__name__}, as {example}, got {got}")
 
 
-@functools.lru_cache(maxsize=256)
 def _residual_shape(factor: Factor, point_size: int) -> object:
     """The shape of what a factor's residual returns; the type's name if that is no array."""
     sizes, number = {"pose": 3, "point": point_size}, jnp.result_type(float)
     own = tuple(jax.ShapeDtypeStruct((sizes[kind],), number) for kind in factor.variables)
     z = jax.ShapeDtypeStruct((len(factor.measurements),), number)
-    found = jax.eval_shape(factor.residual, own, z)
+    found = jax.eval_shape(_residual, factor, own, z)
     return getattr(found, "shape", type(found).__name__)
+
+
+@partial(jax.jit, inline=True)
+def _residual(factor: Factor, variables: tuple[jax.Array, ...], z: jax.Array) -> PyTree:
+    """The residual, jitted so that its shape is found by one trace for all factors of a kind."""
+    return factor.residual(variables, z)

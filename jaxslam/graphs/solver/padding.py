@@ -4,13 +4,14 @@ A program is compiled for the sizes of its arrays. Those of a graph are the numb
 and rows, which differ from log to log and from round to round of loop closing.
 """
 
+from collections.abc import Callable
 from typing import TypeVar, cast
 
 import jax
 import numpy as np
 from jaxtyping import Int, PyTree
 
-from jaxslam import programs
+from jaxslam.core.numbers import is_concrete
 from jaxslam.graphs.graph import Graph, Table
 from jaxslam.graphs.sparse.sweeps import padded_size
 
@@ -63,15 +64,22 @@ def padded_number(
 
 def own_number(variable: jax.Array, graph: Graph, more: Graph) -> jax.Array:
     """The number of a variable in the graph, by that in the padded one."""
-    count, number = len(more.poses), np.asarray(variable)
-    return programs.on_device(number - (count - len(graph.poses)) * (number >= count))
+    count, shift = len(more.poses), len(more.poses) - len(graph.poses)
+    return _by_numpy(lambda number: number - shift * (number >= count), variable)
 
 
 def cut(found: _T, like: PyTree) -> _T:
     """The arrays without the rows that are beyond those of others."""
 
     def one(x: jax.Array, other: PyTree) -> jax.Array:
-        # By NumPy: a slice on the device is a program for each size.
-        return x if len(x) == len(other) else programs.on_device(np.asarray(x)[: len(other)])
+        return x if len(x) == len(other) else _by_numpy(lambda x: x[: len(other)], x)
 
     return cast(_T, jax.tree.map(one, found, like))
+
+
+def _by_numpy(change: Callable[[PyTree], PyTree], x: jax.Array) -> jax.Array:
+    """The changed array, by NumPy unless it is traced: on the device each size is a program."""
+    return cast(
+        jax.Array,
+        jax.device_put(np.array(change(np.asarray(x)))) if is_concrete(x) else change(x),
+    )

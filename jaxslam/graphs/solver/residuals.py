@@ -1,12 +1,13 @@
 """The squared residuals of a graph, row by row."""
 
 from collections.abc import Mapping
+from functools import partial
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam import programs
+from jaxslam.core.numbers import is_concrete
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.solver.model import factors_of
@@ -22,10 +23,7 @@ def squared_residuals(
     degrees of freedom. factors, room: as for `optimize`.
     """
     factors = factors_of("graphs.squared_residuals", graph, factors)
-    of = tuple(factors[key] for key in sorted(graph.tables))
-    if not programs.outside(graph):
-        return _squared(*of, graph)
-    found = programs.call(_squared, of, padded_graph(graph, room))
+    found = _squared(factors, padded_graph(graph, room) if is_concrete(graph) else graph)
     return {key: cut(square, graph.tables[key].valid) for key, square in found.items()}
 
 
@@ -39,12 +37,11 @@ def degrees_of_freedom(graph: Graph, factors: Mapping[str, Factor] | None = None
     return residuals - free - graph.points.shape[1] * int((~graph.fixed_point).sum())
 
 
-def _squared(*arguments: Factor | Graph) -> dict[str, Float[Array, "E"]]:
-    *factors, graph = arguments
-    assert isinstance(graph, Graph)
+@partial(jax.jit, inline=True)
+def _squared(factors: dict[str, Factor], graph: Graph) -> dict[str, Float[Array, "E"]]:
     found = {}
-    for factor, (key, table) in zip(factors, sorted(graph.tables.items()), strict=True):
-        assert isinstance(factor, Factor)
+    for key, factor in factors.items():
+        table = graph.tables[key]
 
         def square(who: Array, z: Array, information: Array, factor: Factor = factor) -> Array:
             values = tuple(

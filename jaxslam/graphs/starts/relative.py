@@ -1,6 +1,7 @@
 """What all starts share: relative poses of all tables, anchors, and the placing of points."""
 
 from collections.abc import Mapping
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -10,8 +11,7 @@ from jaxtyping import Bool, Float, Int
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from jaxslam import programs
-from jaxslam.graphs.factor import Factor
+from jaxslam.graphs.factor import BetweenPoses, Factor
 from jaxslam.graphs.graph import Graph, ranks
 from jaxslam.graphs.solver.model import factors_of
 from jaxslam.math import se2
@@ -45,8 +45,8 @@ def measured_relative_poses(graph: Graph, factors: Factors | None) -> Relative:
         who, z, information = (
             np.asarray(part)[valid] for part in (table.who, table.z, table.information)
         )
-        if factor.predict is not se2.compose:
-            z, by_error = map(np.asarray, programs.call(_measured, (factor,), z))
+        if not isinstance(factor, BetweenPoses):
+            z, by_error = map(np.asarray, _measured(factor, z))
             information = np.einsum("eri,ers,esj->eij", by_error, information, by_error)
         found.append(
             Relative(who[:, 0], who[:, 1], np.asarray(z, float), np.asarray(information, float))
@@ -67,6 +67,7 @@ def _by_id(graph: Graph, who: Int[np.ndarray, "E K"], z: Float[np.ndarray, "E Z"
     return np.lexsort((*z.T, np.linalg.norm(z, axis=1), *ranks(graph)[who].T[::-1]))
 
 
+@partial(jax.jit, inline=True)
 def _measured(factor: Factor, z: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The relative poses of rows, and the derivatives of the residual by an error of them."""
 
@@ -152,12 +153,14 @@ def with_points(
         at = at[~done[found]]
         if len(at):
             poses = np.asarray(graph.poses)[who[at, 0]]
-            points[who[at, 1]] = programs.call(_predicted, (factor,), poses, z[at])
+            points[who[at, 1]] = _predicted(factor, poses, z[at])
             done[who[at, 1]] = True
     return graph._replace(points=as_before(graph.points, points))
 
 
+@partial(jax.jit, inline=True)
 def _predicted(factor: Factor, poses: jax.Array, z: jax.Array) -> jax.Array:
     """The second variables that rows measure."""
     assert factor.predict is not None
-    return jax.vmap(factor.predict)(poses, z)
+    second: jax.Array = jax.vmap(factor.predict)(poses, z)
+    return second

@@ -31,7 +31,7 @@ from jaxslam.laser_slam.scans import ROWS, Scans
 from jaxslam.laser_slam.settings import Settings
 from jaxslam.math.stats import chi2_quantile
 
-KERNEL = {LOOPS: graphs.cauchy()}
+KERNEL = {LOOPS: graphs.Cauchy()}
 """One object, so that the optimum is traced once."""
 
 

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
-from jaxslam.graphs import cauchy
+from jaxslam.graphs import Cauchy
 from jaxslam.laser_slam import covariances
 from jaxslam.laser_slam.scans import Scans
 from jaxslam.laser_slam.settings import Settings
@@ -86,7 +86,7 @@ def search(distance: float, angle: float, turn: float, *, ambiguous: float = PEA
 
 # What the walls hardly determine is not held at the start, which is of a lattice: the covariance
 # tells it, and the prior bounds it.
-_OF_WALLS = IcpSettings(kernel=cauchy(), scale=0.05, lone=0.5, iterations=10, least_condition=0.0)
+_OF_WALLS = IcpSettings(kernel=Cauchy(), scale=0.05, lone=0.5, iterations=10, least_condition=0.0)
 WALLS = point_to_line(replace(_OF_WALLS, reach=0.5))
 NEAR_WALLS = point_to_line(replace(_OF_WALLS, reach=0.15))
 """From where `WALLS` ends: its pairs are the points that lie on walls."""

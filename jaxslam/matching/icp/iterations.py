@@ -36,7 +36,7 @@ class IcpSettings:
     trim: float = 1.0
     """share of the pairs that is kept at each step, those of the smallest residuals"""
     kernel: Kernel | None = None
-    """robust, as `graphs.huber()`, of (residual/scale)²; None for squares"""
+    """robust, as `graphs.Huber()`, of (residual/scale)²; None for squares"""
     scale: float = 0.1
     """[m] of the kernel and of `Match.score`"""
     span: int = 5

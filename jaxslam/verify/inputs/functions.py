@@ -234,16 +234,16 @@ def _has_signature(call: Callable[..., object]) -> bool:
 
 
 def makes_a_model(factory: Callable[..., object]) -> bool:
-    """Whether `build` makes a model of this: a class of motion models or sensors whose fields have
-    defaults, except noise_cov; a function annotated as a factory, `def mine(noise_cov, mount=…) ->
-    Sensor`, or, without required parameters, `def mine() -> Factor`."""
+    """Whether `build` makes a model of this: a class of motion models, sensors or factors whose
+    fields have defaults, except noise_cov; a function annotated as a factory, `def mine(noise_cov,
+    mount=…) -> Sensor`, or, without required parameters, `def mine() -> Factor`."""
     try:
         signature = inspect.signature(factory)
     except (TypeError, ValueError):
         return False
     required = [p.name for p in signature.parameters.values() if p.default is p.empty]
     if isinstance(factory, type):
-        return issubclass(factory, Motion | Sensor) and required in ([], ["noise_cov"])
+        return issubclass(factory, Motion | Sensor | Factor) and required in ([], ["noise_cov"])
     returns = signature.return_annotation
     named = returns if isinstance(returns, str) else getattr(returns, "__name__", "")
     wanted = {"Motion": 1, "Sensor": 1, "Factor": 0}

@@ -76,10 +76,10 @@ def load(target: str) -> list[Target]:
     """The models and functions that `file.py` or `file.py:name` defines, in the order of the file.
 
     These are objects of the types `Motion`, `Sensor`, `graphs.Factor` and `grids.BeamModel`;
-    classes of motion models and sensors whose only required field is noise_cov; factories annotated
-    to return one, whose only required parameter is a noise covariance, or a factor, without
-    required parameters; and functions f with a function f_jacobian (or f_jacobians), whose entries
-    may be named as
+    classes of motion models and sensors whose only required field is noise_cov, and of factors
+    without required fields; factories annotated to return one, whose only required parameter is a
+    noise covariance, or a factor, without required parameters; and functions f with a function
+    f_jacobian (or f_jacobians), whose entries may be named as
     f_arguments = {"pose": ("x [m]", …), …} and f_outputs = ("range [m]", …), and their states given
     as f_states = (array (S, n), …).
 
@@ -202,7 +202,7 @@ def names_in(module: ModuleType) -> str:
         name
         for name, value in vars(module).items()
         if not name.startswith("_")
-        and not (isinstance(value, type) and not issubclass(value, Motion | Sensor))
+        and not (isinstance(value, type) and not issubclass(value, Motion | Sensor | Factor))
         and (
             isinstance(value, Motion | Sensor | Factor | BeamModel | Filter | World)
             or (callable(value) and getattr(value, "__module__", "") == module.__name__)

@@ -104,7 +104,7 @@ def test_a_sensor_of_the_same_name_on_a_mount_is_refused():
     seen = graphs.Table(
         np.zeros((1, 2), np.int32), np.zeros((1, 2)), np.eye(2)[None], np.ones(1, bool)
     )
-    mounted = graphs.from_sensor(sensors.RelativePosition(np.eye(2), mount=[1.0, 0.0, 0.5]))
+    mounted = graphs.FromSensor(sensors.RelativePosition(np.eye(2), mount=[1.0, 0.0, 0.5]))
     with pytest.raises(ValueError, match="'seen' has no chordal cost: its factor is relative_pos"):
         graphs.certificate(
             graph._replace(
@@ -113,5 +113,5 @@ def test_a_sensor_of_the_same_name_on_a_mount_is_refused():
                 fixed_point=np.ones(1, bool),
                 point_id=np.zeros(1, int),
             ),
-            {"relative_pose": graphs.relative_pose(), "seen": mounted},
+            {"relative_pose": graphs.RelativePose(), "seen": mounted},
         )

@@ -56,7 +56,7 @@ def test_the_robust_start_is_good_and_is_kept():
     off = np.asarray(graphs.starts.odometry(graph).poses)[:, :2] - poses[:, :2]
     left = start.poses[:, :2] - poses[:, :2]
     assert np.abs(left).max() < 0.2 * np.abs(off).max() and start.tables is graph.tables
-    found = graphs.optimize(start, kernel={"relative_pose/loops": graphs.truncated()})
+    found = graphs.optimize(start, kernel={"relative_pose/loops": graphs.Truncated()})
     np.testing.assert_allclose(found.graph.poses[:, :2], poses[:, :2], atol=1e-6)
     assert found.iterations < 10  # weights of zero and one at once, without rounds
 
@@ -90,7 +90,9 @@ def test_the_weight_of_a_kernel_is_the_slope_of_its_cost(name):
 
 
 @pytest.mark.parametrize("name", graphs.KERNELS)
-def test_a_limit_is_above_zero(name):
-    for limit in (0.0, -1.0, np.nan, np.inf):
-        with pytest.raises(ValueError, match=f"graphs.{name}: expected limit above 0"):
-            graphs.KERNELS[name](limit)
+def test_a_width_is_above_zero(name):
+    for width in (0.0, -1.0, np.nan, np.inf):
+        with pytest.raises(
+            ValueError, match=f"^{graphs.KERNELS[name].__name__}: expected width above 0"
+        ):
+            graphs.KERNELS[name](width)

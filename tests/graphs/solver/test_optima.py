@@ -20,7 +20,7 @@ def test_they_are_gtsams(name, start, best):
         pytest.skip(f"{path} is not there")
     graph = graphs.with_gauge(graphs.read(path))
     begun = starts.STARTS[start](graph)
-    found = graphs.optimize(begun, {"relative_pose": graphs.relative_pose_log()})
+    found = graphs.optimize(begun, {"relative_pose": graphs.RelativePoseLog()})
     assert found.status == Ending.CONVERGED
     np.testing.assert_allclose(found.chi2, best, rtol=1e-6)
     assert found.gradient < 1e-6 * found.gradient_start

@@ -9,7 +9,7 @@ from jaxslam import graphs
 from jaxslam.graphs.graph import LOOPS
 
 ROOM = 64
-KERNEL = {LOOPS: graphs.cauchy()}
+KERNEL = {LOOPS: graphs.Cauchy()}
 PAIRS = np.array([[3, 4], [9, 2], [7, 19], [0, 11]])
 
 

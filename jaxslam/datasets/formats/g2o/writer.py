@@ -7,7 +7,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxslam.datasets.formats.g2o.kinds import EDGES, ENDINGS, G2O, Format
-from jaxslam.graphs.factor import of_files
+from jaxslam.graphs.factor import REGISTRY
 from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.validation import check_numbers
 from jaxslam.results.files import write_files
@@ -58,8 +58,8 @@ def _check_readable(graph: Graph) -> None:
     ids = np.concatenate([np.asarray(graph.pose_id), np.asarray(graph.point_id)])
     if (ids < 0).any():
         raise ValueError(f"graphs.write: expected ids >= 0, got {ids.min()}")
-    known = of_files()
-    check_numbers("graphs.write", graph, {key: known[key.split("/")[0]] for key in graph.tables})
+    known = {key: REGISTRY[key.split("/")[0]] for key in graph.tables}
+    check_numbers("graphs.write", graph, known)
 
 
 def _check_writable(graph: Graph, form: Format) -> None:
