@@ -1,26 +1,26 @@
 """Robust kernels: what a measurement costs, by its squared residual s = eᵀ Ω e."""
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 
 from jaxslam.core.numbers import check_positive
+from jaxslam.core.record import record, static
 
 Array = jax.Array
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class Kernel:
     """A robust cost ρ(s) of a squared residual s, with ρ(s) ≈ s at zero; both elementwise."""
 
-    name: str
-    cost: Callable[[Array], Array]
+    name: str = static()
+    cost: Callable[[Array], Array] = static()
     """ρ(s), what stands in χ² in place of s"""
-    weight: Callable[[Array], Array]
+    weight: Callable[[Array], Array] = static()
     """ρ'(s), what multiplies the information in a Gauss-Newton step"""
-    limit: float | None = None
+    limit: float | None = static(default=None)
     """of a truncated kernel, c: `optimize` reaches it by graduated non-convexity (`gnc`)"""
 
 
