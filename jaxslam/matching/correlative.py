@@ -151,9 +151,8 @@ class Correlative(Matcher):
             at = here[nodes.turn] + nodes.shift[:, None, :]
             row, column = jnp.clip(at[..., 0], 0, height - 1), jnp.clip(at[..., 1], 0, width - 1)
             flat = (nodes.level[:, None] * height + row) * width + column
-            return (
-                jnp.where(points.valid, prepared.table.reshape(-1)[flat], 0.0).sum(axis=1) / count
-            )
+            score = prepared.table.reshape(-1)[flat]
+            return jnp.where(points.valid, score, 0.0).sum(axis=1) / count
 
         def taken(nodes: Nodes) -> Float[Array, "n"]:
             """The score that a prior takes at least within each block.
@@ -221,9 +220,8 @@ class Correlative(Matcher):
     def cost(
         self, prepared: Scores, points: Points, pose: Float[Array, "3"], match: Match
     ) -> Float[Array, ""]:
-        return field_cost(prepared.field, points, pose, match.weight) + prior_cost(
-            match.prior, pose
-        )
+        of_points = field_cost(prepared.field, points, pose, match.weight)
+        return of_points + prior_cost(match.prior, pose)
 
 
 def _square(axis: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n*n 2"]:

@@ -185,7 +185,7 @@ class FieldMatcher(Matcher):
         return _At(cost, residual, weight, curvature, slope)
 
     def _robust_cost(self, residual: Array, points: Points) -> Float[Array, ""]:
-        """The sum of ρ over the valid points, also those beyond reach, so that leaving is no gain."""
+        """The sum of ρ over the valid points, also beyond reach, so that leaving is no gain."""
         square = residual**2
         if self.kernel is not None:
             square = self.scale**2 * self.kernel.cost(square / self.scale**2)

@@ -182,7 +182,7 @@ def test_the_information_of_a_scan_through_glass_is_that_of_both_walls_by_their_
         (lambda: Laser([0.0], sigma=0.0), "Laser: expected sigma above 0"),
         (lambda: Laser([0.0], max_range=np.inf), "Laser: expected max_range above 0, got inf"),
         (lambda: Laser([0.0], dropout=2.0), "dropout in"),
-        (lambda: Laser([0.0], mount=(0, 0)), "Laser: expected a mount that is a pose"),
+        (lambda: Laser([0.0], mount=(0, 0)), "Laser: expected a mounting pose of shape"),
         (lambda: rasterize(square().walls, 0.0), "rasterize: expected a resolution"),
         (
             lambda: scan_information(Laser([0.0], max_range=0.1), square().walls, [3, 3, 0]),

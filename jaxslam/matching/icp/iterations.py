@@ -35,7 +35,7 @@ class IcpSettings:
     reach: Number = 0.5
     """largest distance of partners [m]"""
     trim: Number | None = None
-    """share of the pairs that is kept at each step, those of the smallest residuals; None for all"""
+    """share of the pairs kept at each step, those of the smallest residuals; None for all"""
     kernel: Kernel | None = None
     """robust, as `graphs.huber()`, of (residual/scale)²; None for squares"""
     scale: Number = 0.1
@@ -87,7 +87,7 @@ _State: TypeAlias = tuple[Array, Array, Array, Array]
 
 
 class Icp(Matcher):
-    """An iterative closest point method: a subclass has the cost of pairs, and its exact minimum."""
+    """An iterative closest point method: a subclass has the cost of pairs and its minimum."""
 
     settings: IcpSettings
 
