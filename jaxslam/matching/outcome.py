@@ -17,7 +17,7 @@ from jaxslam.math.arrays import Number
 class Limits(NamedTuple):
     """Below which a match gets a status."""
 
-    fewest: Number = 10
+    fewest: int = 10
     """points with a partner"""
     score: Number = 0.5
     """of `Match.score`"""

@@ -51,7 +51,7 @@ class IcpSettings:
     """at most"""
     tolerance: Number = 1e-6
     """of convergence: the motion of a step [m], angles times the RMS range"""
-    fewest: Number = 10
+    fewest: int = static(default=10)
     """pairs below which the status is TOO_FEW"""
     least_score: Number = 0.5
     """`Match.score` below which it is UNLIKE"""
@@ -67,6 +67,7 @@ class IcpSettings:
                 check_positive(name, **{optional: getattr(self, optional)})
         check_count(f"{name}: span", self.span)
         check_count(f"{name}: iterations", self.iterations)
+        check_count(f"{name}: fewest", self.fewest, 0)
         if trim is not None and is_concrete(trim) and not 0 < trim <= 1:
             raise ValueError(f"{name}: expected trim in (0, 1], got {trim}")
 
