@@ -14,6 +14,7 @@ from jaxslam.grids.distance import squared_distances
 from jaxslam.grids.grid import Grid, check_grid, to_cells
 from jaxslam.grids.interpolation import interpolated
 from jaxslam.grids.traversal import MOST, OFF, STOP, march
+from jaxslam.math.xla import hot_jit
 
 GRAZING = 0.05
 """Least |cos| of the angle between a ray and the normal of a wall in a derivative."""
@@ -172,8 +173,7 @@ def cast(
     if isinstance(grid, Grid):
         grid = ray_map(grid, skip=False)
     _check_on_map(grid, pose)
-    ranges: Array = _cast(grid, pose, angles, max_range)
-    return ranges
+    return _cast(grid, pose, angles, max_range)
 
 
 def _check_rays(pose: Array, angles: Array, max_range: ArrayLike) -> None:
@@ -206,7 +206,7 @@ def _check_on_map(grid: RayMap, pose: Array) -> None:
         )
 
 
-@partial(jax.jit, inline=True)
+@hot_jit
 def _cast(
     grid: RayMap, pose: Float[Array, "*poses 3"], angles: Float[Array, "B"], max_range: Array
 ) -> Float[Array, "*poses B"]:

@@ -15,6 +15,7 @@ from jaxslam.grids.beam_models.beam_model import usable_beams
 from jaxslam.grids.grid import Grid, check_frame, to_cells
 from jaxslam.math import se2
 from jaxslam.math.arrays import Number
+from jaxslam.math.xla import hot_jit
 from jaxslam.types import Beams, JaxOrNumPy
 
 FARTHEST = 2.0**29
@@ -73,8 +74,7 @@ def count(
     frame = jnp.asarray(origin, float), jnp.asarray(resolution, float)
     eye = jnp.asarray(mount, float)
     size = int(shape[0]), int(shape[1])
-    counts: Counts = _count(size, *frame, poses, beams, max_range, free, eye)
-    return counts
+    return _count(size, *frame, poses, beams, max_range, free, eye)
 
 
 def _check_shape(shape: tuple[int, int]) -> None:
@@ -108,7 +108,7 @@ def _check_scans(poses: JaxOrNumPy, beams: Beams, max_range: float) -> None:
         raise ValueError("count: no scan has a valid beam")
 
 
-@partial(jax.jit, static_argnames="shape", inline=True)
+@partial(hot_jit, static_argnames=("shape",))
 def _count(
     shape: tuple[int, int],
     origin: Array,
