@@ -9,10 +9,11 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam.core.numbers import check_real, is_concrete
 from jaxslam.grids.grid import Field, Grid, check_grid
+from jaxslam.math.arrays import Number
 from jaxslam.types import JaxOrNumPy
 
 
-def distance_field(grid: Grid, *, threshold: float = 0.0, truncate: float | None = None) -> Field:
+def distance_field(grid: Grid, *, threshold: Number = 0.0, truncate: Number | None = None) -> Field:
     """The distance [m] from each cell's centre to that of the nearest occupied cell.
 
     Exact, in time linear in the number of cells (`squared_distances`). Without an occupied cell it

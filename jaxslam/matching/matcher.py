@@ -135,8 +135,8 @@ def match(
     dtype = jnp.result_type(points.position, *floats(reference), jnp.float32)
     start = jnp.asarray(start, dtype)
     reference, points, prior = in_dtype((reference, points, prior), dtype)
-    call = _many if batch else _one
-    return call(matcher, reference, points, start, prior)
+    found: Match = (_many if batch else _one)(matcher, reference, points, start, prior)
+    return found
 
 
 def floats(tree: PyTree) -> list[Array]:

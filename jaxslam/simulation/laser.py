@@ -196,7 +196,8 @@ def scan_information(
     if not met.any():
         raise ValueError(f"scan_information: no beam from {place} meets a wall within max_range")
     g = slopes[met]
-    information = (1 - laser.dropout) / laser.sigma**2 * (share[met] * g.T) @ g
+    dropout, sigma = (float(np.asarray(number)) for number in (laser.dropout, laser.sigma))
+    information = (1 - dropout) / sigma**2 * (share[met] * g.T) @ g
     unit = np.array([1.0, 1.0, 1.0 / float(np.median(ranges[met]))])
     values, vectors = np.linalg.eigh(unit[:, None] * information * unit)
     seen = values > tolerance * values[-1]

@@ -80,7 +80,8 @@ def covariance(
     many = begin.ndim == 2
     keys = jax.random.split(key, len(begin)) if many else key
     scans = MatchedScans(reference, points, found, begin, keys)
-    return (_many if many else _one)(way, matcher, scans)
+    cov: Array = (_many if many else _one)(way, matcher, scans)
+    return cov
 
 
 @partial(jax.jit, inline=True)

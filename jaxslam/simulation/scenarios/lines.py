@@ -7,6 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.core.numbers import check_count
+from jaxslam.math.arrays import Number
 from jaxslam.sensors.line import Line
 from jaxslam.simulation.laser import LaserWorld
 from jaxslam.simulation.scenarios.rooms import office, square
@@ -68,7 +69,7 @@ def from_start(world: LaserWorld) -> Walls:
     return Walls(segments, np.zeros((0, 3)))
 
 
-def _met_by_beams(walls: Walls, max_range: float) -> Callable[[jax.Array, jax.Array], jax.Array]:
+def _met_by_beams(walls: Walls, max_range: Number) -> Callable[[jax.Array, jax.Array], jax.Array]:
     """The field of view of a laser that needs some beams on a wall to measure it."""
     around = 2 * np.pi * np.arange(BEAMS) / BEAMS
 
