@@ -32,7 +32,7 @@ def speed() -> list[Metric]:
 def accuracy(runs: int) -> list[Metric]:
     """σ = 0.01 m on worlds that determine the pose; the share of the runs within the limits."""
     metrics = []
-    matcher = matching.point_to_line()
+    matcher = matching.PointToLine()
     for world in ("square", "office"):
         pairs = drawn(world, runs, beams=361, sigma=0.01, seed=5)
         found = matching.match(matcher, pairs.reference, pairs.scan, pairs.start)
@@ -67,13 +67,13 @@ def convergence(beams: int = 1440, steps: int = 30) -> dict[str, np.ndarray]:
     reference, scan = seen(first), seen(second)
     start = second + jnp.array([0.12, -0.08, 0.06])
     found = {}
-    for make in (matching.point_to_point, matching.point_to_line):
+    for make in (matching.PointToPoint, matching.PointToLine):
         one = make(matching.IcpSettings(iterations=1))
         poses = [np.asarray(start)]
         while len(poses) < 400 and (len(poses) < 2 or np.any(poses[-1] != poses[-2])):
             poses.append(np.asarray(matching.match(one, reference, scan, poses[-1]).pose))
         away = np.stack(poses[: steps + 1]) - poses[-1]
-        found[make.__name__] = np.hypot(away[:, 0], away[:, 1]) + 4.0 * np.abs(away[:, 2])
+        found[make.name] = np.hypot(away[:, 0], away[:, 1]) + 4.0 * np.abs(away[:, 2])
     return found
 
 
@@ -109,7 +109,7 @@ def measured_speed() -> dict[str, float]:
             lambda a, dtype=dtype: a.astype(dtype) if jnp.issubdtype(a.dtype, jnp.floating) else a,
             (pairs.reference, pairs.scan, pairs.start),
         )
-        for matcher in (matching.point_to_line(), matching.point_to_point()):
+        for matcher in (matching.PointToLine(), matching.PointToPoint()):
             best = np.inf
             for _ in range(6):
                 began = time.process_time()

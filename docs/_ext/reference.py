@@ -50,7 +50,6 @@ INTRODUCED = {
     "jaxslam.math": "Mathematics",
     "jaxslam.noise": "Noise models",
     "jaxslam.slots": "The table of landmarks",
-    "jaxslam.programs": "Compiled programs",
     "jaxslam.validation": "What is refused",
 }
 """Title of each page, in the order of the contents; a module that is not listed comes after."""

@@ -1,5 +1,6 @@
 """Is a particle filter in a known map honest? Coverage, NEES, energy score, share of runs lost."""
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -8,7 +9,6 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from jaxslam import programs
 from jaxslam.consistency.intervals import Measure, interval, positive_interval
 from jaxslam.consistency.nees import block_nees, pose_error
 from jaxslam.core.numbers import check_count, check_covariance, check_key
@@ -109,9 +109,11 @@ def judge_localization(
         jax.random.split(key_start, runs),
         jax.random.split(key_filter, runs),
     )
-    return programs.call(_judge, (world, filter, every), keys, np.asarray(start_cov, float))
+    scores: LocalizationScores = _judge(world, filter, every, keys, np.asarray(start_cov, float))
+    return scores
 
 
+@partial(jax.jit, static_argnames="every", inline=True)
 def _judge(
     world: LaserWorld,
     filter: Filter,

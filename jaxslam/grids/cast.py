@@ -9,12 +9,12 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree, UInt8
 
-from jaxslam import programs
 from jaxslam.core.numbers import check_real, is_concrete, shape_told
 from jaxslam.grids.distance import squared_distances
 from jaxslam.grids.grid import Grid, check_grid, to_cells
 from jaxslam.grids.interpolation import interpolated
 from jaxslam.grids.traversal import MOST, OFF, STOP, march
+from jaxslam.math.xla import hot_jit
 
 GRAZING = 0.05
 """Least |cos| of the angle between a ray and the normal of a wall in a derivative."""
@@ -52,7 +52,8 @@ def ray_map(grid: Grid, *, method: str | None = None, skip: bool = True) -> RayM
     check_method("ray_map", method)
     if is_concrete(grid.log_odds) and not np.any(np.asarray(grid.log_odds) < 0):
         raise ValueError("ray_map: the map has no free cell (log-odds below 0)")
-    return programs.call(_ray_map, (_SQUARES[method], skip), grid)
+    rays: RayMap = _ray_map(grid, method, skip)
+    return rays
 
 
 def default_method(grid: Grid) -> str:
@@ -78,9 +79,10 @@ def check_method(name: str, method: str) -> None:
         raise ValueError(f"{name}: expected a method of {', '.join(METHODS)}, got {method!r}")
 
 
-def _ray_map(squares: PyTree, skip: bool, grid: Grid) -> RayMap:
+@partial(jax.jit, static_argnames=("method", "skip"), inline=True)
+def _ray_map(grid: Grid, method: str, skip: bool) -> RayMap:
     solid = jnp.where(grid.known, grid.probability, 0.0) - 0.5
-    stops = squares(solid)
+    stops = _SQUARES[method](solid)
     ahead = jnp.zeros(stops.shape, jnp.uint8)
     if skip:
         # Beyond the border it is as if all were occupied: no step leads off the map. The distance
@@ -171,7 +173,7 @@ def cast(
     if isinstance(grid, Grid):
         grid = ray_map(grid, skip=False)
     _check_on_map(grid, pose)
-    return programs.call(_cast, (), grid, pose, angles, max_range)
+    return _cast(grid, pose, angles, max_range)
 
 
 def _check_rays(pose: Array, angles: Array, max_range: ArrayLike) -> None:
@@ -204,6 +206,7 @@ def _check_on_map(grid: RayMap, pose: Array) -> None:
         )
 
 
+@hot_jit
 def _cast(
     grid: RayMap, pose: Float[Array, "*poses 3"], angles: Float[Array, "B"], max_range: Array
 ) -> Float[Array, "*poses B"]:

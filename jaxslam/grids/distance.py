@@ -7,13 +7,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxslam import programs
 from jaxslam.core.numbers import check_real, is_concrete
 from jaxslam.grids.grid import Field, Grid, check_grid
+from jaxslam.math.arrays import Number
 from jaxslam.types import JaxOrNumPy
 
 
-def distance_field(grid: Grid, *, threshold: float = 0.0, truncate: float | None = None) -> Field:
+def distance_field(grid: Grid, *, threshold: Number = 0.0, truncate: Number | None = None) -> Field:
     """The distance [m] from each cell's centre to that of the nearest occupied cell.
 
     Exact, in time linear in the number of cells (`squared_distances`). Without an occupied cell it
@@ -33,9 +33,11 @@ def distance_field(grid: Grid, *, threshold: float = 0.0, truncate: float | None
     if truncate is not None and is_concrete(truncate) and not truncate > 0:
         raise ValueError(f"distance_field: expected truncate above 0, got {truncate}")
     largest = jnp.inf if truncate is None else truncate
-    return programs.call(_distance_field, (), grid, threshold, largest)
+    field: Field = _distance_field(grid, threshold, largest)
+    return field
 
 
+@functools.partial(jax.jit, inline=True)
 def _distance_field(grid: Grid, threshold: Array, largest: Array) -> Field:
     squared = squared_distances(grid.log_odds > threshold)
     cells = jnp.sqrt(squared.astype(jnp.result_type(grid.log_odds, float)))

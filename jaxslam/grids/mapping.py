@@ -1,5 +1,6 @@
 """Maps from scans at known poses: hits and misses of each cell, and the log-odds they add to it."""
 
+from functools import partial
 from numbers import Integral
 from typing import NamedTuple
 
@@ -9,12 +10,12 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, PyTree
 
-from jaxslam import programs
 from jaxslam.core.numbers import check_mount, check_positive, is_concrete
 from jaxslam.grids.beam_models.beam_model import usable_beams
 from jaxslam.grids.grid import Grid, check_frame, to_cells
 from jaxslam.math import se2
 from jaxslam.math.arrays import Number
+from jaxslam.math.xla import hot_jit
 from jaxslam.types import Beams, JaxOrNumPy
 
 FARTHEST = 2.0**29
@@ -73,7 +74,7 @@ def count(
     frame = jnp.asarray(origin, float), jnp.asarray(resolution, float)
     eye = jnp.asarray(mount, float)
     size = int(shape[0]), int(shape[1])
-    return programs.call(_count, size, *frame, jnp.asarray(poses), beams, max_range, free, eye)
+    return _count(size, *frame, poses, beams, max_range, free, eye)
 
 
 def _check_shape(shape: tuple[int, int]) -> None:
@@ -107,9 +108,9 @@ def _check_scans(poses: JaxOrNumPy, beams: Beams, max_range: float) -> None:
         raise ValueError("count: no scan has a valid beam")
 
 
+@partial(hot_jit, static_argnames=("shape",))
 def _count(
-    height: int,
-    width: int,
+    shape: tuple[int, int],
     origin: Array,
     resolution: Array,
     poses: Array,
@@ -118,8 +119,6 @@ def _count(
     free: Array,
     mount: Array,
 ) -> Counts:
-    shape = height, width
-
     def add(total: PyTree, row: tuple[Array, Beams]) -> tuple[PyTree, None]:
         hits, misses, outside, unusable = total
         pose, scan = row

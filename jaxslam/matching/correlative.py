@@ -1,5 +1,6 @@
 """The best of all poses of a window: correlative scan matching, exact on its lattice."""
 
+import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -7,6 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from jaxslam.core.numbers import check_positive, is_concrete
+from jaxslam.core.record import record, static
 from jaxslam.grids.distance import near_distances
 from jaxslam.grids.grid import Field, Grid, to_cells
 from jaxslam.grids.interpolation import interpolate
@@ -19,6 +22,7 @@ from jaxslam.matching.prior import Prior, prior_cost
 from jaxslam.matching.surface import surface, surface_information
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
+from jaxslam.math.arrays import Number, in_dtype
 
 
 class Scores(NamedTuple):
@@ -35,22 +39,8 @@ REACH = 4.0
 """Distance in σ beyond which a point scores 0, where exp(-d²/2σ²) is below 3.4e-4."""
 
 
-def correlative(
-    *,
-    window: float = 0.3,
-    turn_window: float = float(np.deg2rad(20.0)),
-    turn: float = float(np.deg2rad(0.5)),
-    cell: float = 0.05,
-    sigma: float = 0.05,
-    block: int = 4,
-    ambiguous: float = 0.95,
-    apart: float = 0.3,
-    span: int = 5,
-    gap: float = 0.5,
-    fewest: int = 10,
-    least_score: float = 0.5,
-    least_condition: float = 0.01,
-) -> Matcher:
+@record
+class Correlative(Matcher):
     """The pose of a window with the highest mean score of the points, exp(-d²/2σ²) each.
 
     The window holds the headings start ± turn_window in steps of `turn` [rad], and shifts of the
@@ -64,63 +54,94 @@ def correlative(
 
     Olson 2009, "Real-time correlative scan matching", ICRA; bounds over sliding blocks as Hess et
     al. 2016, "Real-time loop closure in 2D LIDAR SLAM", ICRA. The pose is one of the lattice:
-    `field` from there refines it. The reference is a `Grid`.
+    `FieldMatcher` from there refines it. The reference is a `Grid`. A point takes part within 3 σ
+    of an occupied cell; the lines that tell what the scan determines, and when a match is refused,
+    are those of `IcpSettings()`.
 
-    Args:
-        cell: resolution of the grids [m], which fixes the number of shifts; that of another grid
-            counts in place of it, with as many cells.
-        sigma: [m] of the score.
-        block: shifts along each axis that are bounded together at first: 2, 4, 8, …
-        ambiguous: the status is AMBIGUOUS where a pose more than `apart` [m] away from the best
-            (angles times the RMS range) scores above this share of it; 1 does not look for one.
-        span, gap: of the lines through the points of the scan, which tell what it determines, as
-            in `IcpSettings`.
-        fewest, least_score, least_condition: as in `IcpSettings`; a point takes part within 3 σ of
-            an occupied cell.
-    Raises:
-        ValueError: a number out of range.
+    What fixes the number of shifts, headings and cells is static: another one is another program.
+
+    Raises ValueError on a number out of range.
     """
-    if not (window >= 0 and turn_window >= 0 and turn > 0 and cell > 0 and sigma > 0):
-        raise ValueError(
-            "correlative: expected windows not below 0, and turn, cell and sigma above 0, got "
-            f"{window}, {turn_window}, {turn}, {cell}, {sigma}"
-        )
-    if block < 2 or block & (block - 1) or not 0 < ambiguous <= 1 or not apart > 0:
-        raise ValueError(
-            "correlative: expected block 2, 4, 8, …, ambiguous in (0, 1] and apart above 0, got "
-            f"{block}, {ambiguous}, {apart}"
-        )
-    shifts = int(np.ceil(window / cell - 1e-9))
-    steps = int(np.ceil(turn_window / turn - 1e-9))
-    levels = block.bit_length() - 1
-    reach = int(np.ceil(REACH * sigma / cell))
-    offsets = turn * np.arange(-steps, steps + 1)
-    limits = Limits(fewest, least_score, least_condition)
-    corners = _square(np.arange(-shifts, shifts + 1, block))
 
-    def prepare(grid: Grid) -> Scores:
-        squared = near_distances(grid.log_odds > 0, reach)
-        dtype = grid.log_odds.dtype
-        d = jnp.asarray(grid.resolution, dtype) * jnp.sqrt(squared.astype(dtype))
+    _: dataclasses.KW_ONLY
+    window: float = static(default=0.3)
+    """[m] to either side"""
+    turn_window: float = static(default=float(np.deg2rad(20.0)))
+    """[rad] to either side"""
+    turn: float = static(default=float(np.deg2rad(0.5)))
+    """[rad] between headings"""
+    cell: float = static(default=0.05)
+    """resolution of the grids [m], which fixes the number of shifts; that of another grid counts in
+    place of it, with as many cells"""
+    sigma: float = static(default=0.05)
+    """[m] of the score"""
+    block: int = static(default=4)
+    """shifts along each axis that are bounded together at first: 2, 4, 8, …"""
+    ambiguous: Number | None = 0.95
+    """the status is AMBIGUOUS where a pose more than `apart` away from the best scores above this
+    share of it; None does not look for one"""
+    apart: Number = 0.3
+    """[m], angles times the RMS range"""
+    of_grid = True
+
+    def __post_init__(self) -> None:
+        name = "Correlative"
+        check_positive(name, turn=self.turn, cell=self.cell, sigma=self.sigma, apart=self.apart)
+        if not (0 <= self.window < np.inf and 0 <= self.turn_window < np.inf):
+            got = f"{self.window}, {self.turn_window}"
+            raise ValueError(f"{name}: expected window and turn_window of at least 0, got {got}")
+        if self.block < 2 or self.block & (self.block - 1):
+            raise ValueError(f"{name}: expected block 2, 4, 8, …, got {self.block}")
+        share = self.ambiguous
+        if share is not None and is_concrete(share) and not 0 < share < 1:
+            raise ValueError(f"{name}: expected ambiguous in (0, 1), or None, got {share}")
+        super().__post_init__()
+
+    @property
+    def _shifts(self) -> int:
+        """The largest shift along an axis [cells]."""
+        return int(np.ceil(self.window / self.cell - 1e-9))
+
+    @property
+    def _levels(self) -> int:
+        """Divisions of a block."""
+        return self.block.bit_length() - 1
+
+    def prepare(self, reference: Grid) -> Scores:
+        sigma, block = self.sigma, self.block
+        reach = int(np.ceil(REACH * sigma / self.cell))
+        squared = near_distances(reference.log_odds > 0, reach)
+        dtype = reference.log_odds.dtype
+        d = jnp.asarray(reference.resolution, dtype) * jnp.sqrt(squared.astype(dtype))
         score = jnp.where(squared <= reach**2, jnp.exp(-0.5 * (d / sigma) ** 2), 0.0)
         tables = [jnp.pad(score, block)]
-        for level in range(levels):
+        for level in range(self._levels):
             right = jnp.maximum(tables[-1], jnp.roll(tables[-1], -(2**level), 1))
             tables.append(jnp.maximum(right, jnp.roll(right, -(2**level), 0)))
-        frame = jnp.asarray(grid.origin), jnp.asarray(grid.resolution)
+        frame = jnp.asarray(reference.origin), jnp.asarray(reference.resolution)
         return Scores(jnp.stack(tables), Field(d, *frame))
 
-    def match(of: Scores, points: Points, start: Array, prior: Prior | None = None) -> Match:
-        turns = start[2] + jnp.asarray(offsets, start.dtype)
+    def match(
+        self,
+        prepared: Scores,
+        points: Points,
+        start: Float[Array, "3"],
+        prior: Prior | None = None,
+    ) -> Match:
+        sigma, block, shifts, levels = self.sigma, self.block, self._shifts, self._levels
+        ambiguous, apart = in_dtype((self.ambiguous, self.apart), start.dtype)
+        corners = _square(np.arange(-shifts, shifts + 1, block))
+        steps = int(np.ceil(self.turn_window / self.turn - 1e-9))
+        turns = start[2] + jnp.asarray(self.turn * np.arange(-steps, steps + 1), start.dtype)
         count = jnp.maximum(points.valid.sum(), 1)
-        _, height, width = of.table.shape
-        cell_size = of.field.resolution
-        axes = cell_size * se2.rotation(of.field.origin[2])[:, ::-1]  # of a row, of a column
+        _, height, width = prepared.table.shape
+        cell_size = prepared.field.resolution
+        axes = cell_size * se2.rotation(prepared.field.origin[2])[:, ::-1]  # of a row, of a column
 
         def cells(turn: Array) -> Int[Array, "N 2"]:
             """The cells (row, column) of the points at the start, turned so."""
             moved = points.position @ se2.rotation(turn).T + start[None, :2]
-            at = to_cells(of.field.origin, of.field.resolution, moved)[:, ::-1]
+            at = to_cells(prepared.field.origin, prepared.field.resolution, moved)[:, ::-1]
             return jnp.floor(at).astype(jnp.int32) + block
 
         here = jax.vmap(cells)(turns)
@@ -130,7 +151,8 @@ def correlative(
             at = here[nodes.turn] + nodes.shift[:, None, :]
             row, column = jnp.clip(at[..., 0], 0, height - 1), jnp.clip(at[..., 1], 0, width - 1)
             flat = (nodes.level[:, None] * height + row) * width + column
-            return jnp.where(points.valid, of.table.reshape(-1)[flat], 0.0).sum(axis=1) / count
+            score = prepared.table.reshape(-1)[flat]
+            return jnp.where(points.valid, score, 0.0).sum(axis=1) / count
 
         def taken(nodes: Nodes) -> Float[Array, "n"]:
             """The score that a prior takes at least within each block.
@@ -156,13 +178,13 @@ def correlative(
             full = jnp.full(len(corners), levels, jnp.int32)
             return Nodes(full, jnp.broadcast_to(turn, full.shape), jnp.asarray(corners))
 
-        numbers = jnp.arange(len(offsets), dtype=jnp.int32)
+        numbers = jnp.arange(len(turns), dtype=jnp.int32)
         bounds = jax.lax.map(lambda turn: bound_of(roots_of(turn)), numbers).reshape(-1)
         roots = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), jax.vmap(roots_of)(numbers))
         best = best_shift(bound_of, roots, bounds, levels, shifts)
         elsewhere: Array | bool = False
-        if ambiguous < 1:
-            by_turn = length_of(points) * turn
+        if ambiguous is not None:
+            by_turn = length_of(points) * self.turn
 
             def far(nodes: Nodes) -> Array:
                 way = cell_size * (nodes.shift - best.shift[None])
@@ -175,7 +197,7 @@ def correlative(
             elsewhere = other.value > limit
         pose = jnp.concatenate([start[:2] + axes @ best.shift, wrap(turns[best.turn])[None]])
         moved = points.position @ se2.rotation(pose[2]).T + pose[None, :2]
-        residual = interpolate(of.field, moved)
+        residual = interpolate(prepared.field, moved)
         weight = (points.valid & (residual < 3 * sigma)).astype(residual.dtype)
         only = Nodes(jnp.zeros(1, jnp.int32), best.turn[None], best.shift[None])
         return concluded(
@@ -185,20 +207,21 @@ def correlative(
             residual=residual,
             weight=weight,
             pair=jnp.zeros(weight.shape, jnp.int32),
-            information=surface_information(surface(points, span, gap), pose, weight),
+            information=surface_information(surface(points), pose, weight),
             spread=sigma,
             iterations=best.divided,
             converged=jnp.ones((), bool),
-            limits=limits,
+            limits=Limits(),
             ambiguous=elsewhere,
             score=seen(only)[0],
             prior=prior,
         )
 
-    def cost(of: Scores, points: Points, pose: Array, found: Match) -> Array:
-        return field_cost(of.field, points, pose, found.weight) + prior_cost(found.prior, pose)
-
-    return Matcher("correlative", prepare, match, cost, of_grid=True)
+    def cost(
+        self, prepared: Scores, points: Points, pose: Float[Array, "3"], match: Match
+    ) -> Float[Array, ""]:
+        of_points = field_cost(prepared.field, points, pose, match.weight)
+        return of_points + prior_cost(match.prior, pose)
 
 
 def _square(axis: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n*n 2"]:

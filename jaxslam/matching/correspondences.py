@@ -1,12 +1,11 @@
 """The nearest point of a reference to each point of a scan, and which of these pairs count."""
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.graphs.solver.kernels import Kernel
+from jaxslam.math.arrays import Number
 
 FAR = 1e6
 """Coordinate [m] of a reference point that is not there, so that others are nearer."""
@@ -30,35 +29,29 @@ def nearest_points(reference: Float[Array, "M 2"], query: Float[Array, "N 2"]) -
     return (key.min(axis=0) & last).astype(jnp.int32)
 
 
-class Rule(NamedTuple):
-    """Which pairs count, and how much."""
-
-    reach: float
-    """largest distance of partners [m]"""
-    trim: float
-    """share of the pairs within reach that is kept, those of the smallest residuals"""
-    kernel: Kernel | None
-    """of the residual over `scale`, None for none"""
-    scale: float
-    """[m]"""
-
-
 def weights(
-    rule: Rule, residual: Float[Array, "N"], possible: Bool[Array, "N"]
+    residual: Float[Array, "N"],
+    possible: Bool[Array, "N"],
+    kernel: Kernel | None,
+    scale: Number,
+    trim: Number | None = None,
 ) -> Float[Array, "N"]:
     """The weight of each pair: 0 where not possible or trimmed, else that of the kernel.
 
     Trimmed least squares keeps the ⌈trim · n⌉ of n possible pairs with the smallest residuals
     (Chetverikov et al. 2002, "The trimmed iterative closest point algorithm", ICPR).
+
+    Args:
+        kernel: of (residual/scale)².
     """
     kept = possible
-    if rule.trim < 1:
+    if trim is not None:
         size = jnp.where(possible, jnp.abs(residual), jnp.inf)
-        count = jnp.ceil(rule.trim * possible.sum()).astype(jnp.int32)
+        count = jnp.ceil(trim * possible.sum()).astype(jnp.int32)
         limit = jnp.sort(size)[jnp.clip(count - 1, 0, len(size) - 1)]
         kept = possible & (size <= limit)
     weight = kept.astype(residual.dtype)
-    if rule.kernel is None:
+    if kernel is None:
         return weight
-    square = jnp.where(kept, residual / rule.scale, 0.0) ** 2
-    return jnp.asarray(jax.lax.stop_gradient(weight * rule.kernel.weight(square)))
+    square = jnp.where(kept, residual / scale, 0.0) ** 2
+    return jnp.asarray(jax.lax.stop_gradient(weight * kernel.weight(square)))

@@ -1,16 +1,19 @@
 """Levenberg's method on the distance field of a grid."""
 
+import dataclasses
 from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
+from jaxslam.core.numbers import check_count, check_positive
+from jaxslam.core.record import record, static
 from jaxslam.graphs.solver.kernels import Kernel
 from jaxslam.grids.distance import distance_field
 from jaxslam.grids.grid import Field, Grid, to_cells
 from jaxslam.grids.interpolation import interpolate
-from jaxslam.matching.correspondences import Rule, weights
+from jaxslam.matching.correspondences import weights
 from jaxslam.matching.matcher import Match, Matcher
 from jaxslam.matching.outcome import (
     Limits,
@@ -25,6 +28,7 @@ from jaxslam.matching.prior import Prior, prior_cost, prior_terms
 from jaxslam.matching.surface import surface, surface_information
 from jaxslam.math import linalg, se2
 from jaxslam.math.angles import wrap
+from jaxslam.math.arrays import Number, in_dtype
 
 _DAMPING = (1e-3, 1e-9, 1e9)
 """At first, at least, at most; relative to the diagonal of the information."""
@@ -46,19 +50,8 @@ _State: TypeAlias = tuple[Array, Array, _At, Array, Array]
 """iterations, pose, linearization there, damping, whether the last step was small"""
 
 
-def field(
-    *,
-    reach: float = 0.5,
-    kernel: Kernel | None = None,
-    scale: float = 0.1,
-    span: int = 5,
-    gap: float = 0.5,
-    iterations: int = 50,
-    tolerance: float = 1e-6,
-    fewest: int = 10,
-    least_score: float = 0.5,
-    least_condition: float = 0.01,
-) -> Matcher:
+@record
+class FieldMatcher(Matcher):
     """The pose that minimizes Σ ρ(d(T ∘ p_i)²), d the distance to the nearest occupied cell.
 
     d [m] is truncated at reach, and interpolated between centres of cells, so that the cost is
@@ -71,37 +64,57 @@ def field(
     `Match.information` are by the lines of the scan (`surface_information`), and a step has no part
     along what these do not determine.
 
-    Arguments are those of `IcpSettings`.
     Fitzgibbon 2003, "Robust registration of 2D and 3D point sets", Image and Vision Computing 21.
 
     Raises ValueError on a number out of range.
     """
-    if not (reach > 0 and scale > 0 and gap > 0 and tolerance > 0) or min(iterations, span) < 1:
-        raise ValueError(
-            "field: expected reach, scale, gap and tolerance above 0 and span and iterations >= 1, "
-            f"got {reach}, {scale}, {gap}, {tolerance}, {span}, {iterations}"
-        )
-    rule = Rule(reach, 1.0, kernel, scale)
-    limits = Limits(fewest, least_score, least_condition)
 
-    def at_pose(of: Field, points: Points, pose: Array, prior: Prior | None) -> _At:
-        residual, jacobian = field_residuals(of, points, pose)
-        there = points.valid & _on_map(of, points, pose) & (residual < reach)
-        weight = weights(rule, residual, there)
-        curvature, slope = information_of(jacobian, weight), (weight * residual) @ jacobian
-        cost = _robust_cost(rule, residual, points) + 2 * prior_cost(prior, pose)
-        return _At(cost, residual, weight, curvature, slope)
+    _: dataclasses.KW_ONLY
+    reach: Number = 0.5
+    """largest distance that counts [m]"""
+    kernel: Kernel | None = None
+    """ρ, as `graphs.Huber()`, of (d/scale)²; None for squares"""
+    scale: Number = 0.1
+    """[m] of the kernel and of `Match.score`"""
+    iterations: int = static(default=50)
+    """at most"""
+    tolerance: Number = 1e-6
+    """of convergence: the motion of a step [m], angles times the RMS range"""
+    least_score: Number = 0.5
+    """`Match.score` below which the status is UNLIKE"""
+    least_condition: Number | None = 0.01
+    """`Match.condition` below which it is DEGENERATE; None: never"""
+    name = "field"
+    of_grid = True
 
-    def match(of: Field, points: Points, start: Array, prior: Prior | None = None) -> Match:
-        length, lines = length_of(points), surface(points, span, gap)
+    def __post_init__(self) -> None:
+        name = "FieldMatcher"
+        check_positive(name, reach=self.reach, scale=self.scale, tolerance=self.tolerance)
+        if self.least_condition is not None:
+            check_positive(name, least_condition=self.least_condition)
+        check_count(f"{name}: iterations", self.iterations)
+        super().__post_init__()
+
+    def prepare(self, reference: Grid) -> Field:
+        return distance_field(reference, truncate=in_dtype(self, reference.log_odds.dtype).reach)
+
+    def match(
+        self,
+        prepared: Field,
+        points: Points,
+        start: Float[Array, "3"],
+        prior: Prior | None = None,
+    ) -> Match:
+        matcher = in_dtype(self, start.dtype)
+        length, lines = length_of(points), surface(points)
         low, high = _DAMPING[1:]
 
         def unfinished(state: _State) -> Array:
-            return jnp.asarray((state[0] < iterations) & ~state[4])
+            return jnp.asarray((state[0] < self.iterations) & ~state[4])
 
         def onto_of(pose: Array, at: _At) -> Array:
             information = surface_information(lines, pose, at.weight)
-            return determined(information, length, least_condition)
+            return determined(information, length, matcher.least_condition)
 
         def moved(pose: Array, move: Array) -> Array:
             return jnp.concatenate([pose[:2] + move[:2], wrap(pose[2] + move[2])[None]])
@@ -115,9 +128,9 @@ def field(
             curvature, slope = fused(damped, at.slope, prior_terms(prior, pose), onto, length)
             move, _ = linalg.solve_psd(curvature, -slope)
             tried = moved(pose, move)
-            there = at_pose(of, points, tried, prior)
+            there = matcher._at(prepared, points, tried, prior)
             better = there.cost < at.cost
-            small = jnp.hypot(move[0], move[1]) + length * jnp.abs(move[2]) <= tolerance
+            small = jnp.hypot(move[0], move[1]) + length * jnp.abs(move[2]) <= matcher.tolerance
             pose = jnp.where(better, tried, pose)
             at = jax.tree.map(lambda new, old: jnp.where(better, new, old), there, at)
             damping = jnp.clip(jnp.where(better, 0.1 * damping, 10 * damping), low, high)
@@ -127,7 +140,7 @@ def field(
         if prior is not None:
             # Along what the scan does not determine it begins where the prior has it: a step that
             # the roughness of a field of cells might refuse.
-            onto = onto_of(start, at_pose(of, points, start, prior))
+            onto = onto_of(start, matcher._at(prepared, points, start, prior))
             free = jnp.eye(3, dtype=start.dtype) - onto
             known, slope = prior_terms(prior, start)
             held = jnp.diag(jnp.stack([jnp.ones_like(length), jnp.ones_like(length), length**2]))
@@ -138,7 +151,7 @@ def field(
         first = (
             jnp.zeros((), jnp.int32),
             begin,
-            at_pose(of, points, begin, prior),
+            matcher._at(prepared, points, begin, prior),
             jnp.asarray(_DAMPING[0], start.dtype),
             jnp.zeros((), bool),
         )
@@ -151,20 +164,32 @@ def field(
             weight=at.weight,
             pair=jnp.zeros(at.weight.shape, jnp.int32),
             information=surface_information(lines, pose, at.weight),
-            spread=scale,
+            spread=matcher.scale,
             iterations=k,
             converged=small,
-            limits=limits,
+            limits=Limits(score=matcher.least_score, condition=matcher.least_condition),
             prior=prior,
         )
 
-    def cost(of: Field, points: Points, pose: Array, found: Match) -> Array:
-        return field_cost(of, points, pose, found.weight) + prior_cost(found.prior, pose)
+    def cost(
+        self, prepared: Field, points: Points, pose: Float[Array, "3"], match: Match
+    ) -> Float[Array, ""]:
+        return field_cost(prepared, points, pose, match.weight) + prior_cost(match.prior, pose)
 
-    def prepare(grid: Grid) -> Field:
-        return distance_field(grid, truncate=reach)
+    def _at(self, of: Field, points: Points, pose: Array, prior: Prior | None) -> _At:
+        residual, jacobian = field_residuals(of, points, pose)
+        there = points.valid & _on_map(of, points, pose) & (residual < self.reach)
+        weight = weights(residual, there, self.kernel, self.scale)
+        curvature, slope = information_of(jacobian, weight), (weight * residual) @ jacobian
+        cost = self._robust_cost(residual, points) + 2 * prior_cost(prior, pose)
+        return _At(cost, residual, weight, curvature, slope)
 
-    return Matcher("field", prepare, match, cost, of_grid=True)
+    def _robust_cost(self, residual: Array, points: Points) -> Float[Array, ""]:
+        """The sum of ρ over the valid points, also beyond reach, so that leaving is no gain."""
+        square = residual**2
+        if self.kernel is not None:
+            square = self.scale**2 * self.kernel.cost(square / self.scale**2)
+        return jnp.where(points.valid, square, 0.0).sum()
 
 
 def _on_map(of: Field, points: Points, pose: Float[Array, "3"]) -> Bool[Array, "N"]:
@@ -197,11 +222,3 @@ def field_cost(
     moved = points.position @ se2.rotation(pose[2]).T + pose[None, :2]
     d = interpolate(of, moved)
     return 0.5 * (weight * jnp.where(weight > 0, d, 0.0) ** 2).sum()
-
-
-def _robust_cost(rule: Rule, residual: Array, points: Points) -> Float[Array, ""]:
-    """The sum of ρ over the valid points, also those beyond reach, so that leaving is no gain."""
-    square = residual**2
-    if rule.kernel is not None:
-        square = rule.scale**2 * rule.kernel.cost(square / rule.scale**2)
-    return jnp.where(points.valid, square, 0.0).sum()

@@ -1,9 +1,8 @@
-"""The record of a matcher and of what it finds; `match` calls one outside traces."""
+"""The base class of matchers, and what they find; `match` calls one outside traces."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from enum import IntEnum
-from typing import NamedTuple, TypeAlias, TypeVar
+from functools import partial
+from typing import ClassVar, NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
@@ -11,14 +10,12 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, PyTree
 
-from jaxslam import programs
 from jaxslam.core.numbers import is_concrete, shape_told
 from jaxslam.grids.grid import Grid, check_grid
 from jaxslam.matching.points import Points
 from jaxslam.matching.prior import Prior
 from jaxslam.math.arrays import in_dtype
-
-_T = TypeVar("_T")
+from jaxslam.protocols import Component
 
 Reference: TypeAlias = Points | Grid
 
@@ -48,7 +45,7 @@ class Match(NamedTuple):
     status: Int[Array, ""]
     """see `MatchStatus`"""
     iterations: Int[Array, ""]
-    """steps taken; of `correlative` the blocks of the lattice that were divided"""
+    """steps taken; of `Correlative` the blocks of the lattice that were divided"""
     residual: Float[Array, ""]
     """weighted root mean square of the residuals that took part [m]"""
     inliers: Float[Array, ""]
@@ -73,22 +70,42 @@ class Match(NamedTuple):
     """with which it was found"""
 
 
-@dataclass(frozen=True, eq=False)
-class Matcher:
-    """A way to match a scan to a reference. The functions are pure and of one pair: vmap them."""
+class Matcher(Component):
+    """A way to match a scan to a reference; a subclass is a record.
 
-    name: str
-    prepare: Callable[[PyTree], PyTree]
-    """(reference) -> what the matcher needs of it, once for all scans: a pytree of arrays. The
-    reference is `Points`, or a `Grid` where `of_grid`."""
-    match: Callable[[PyTree, Points, Array, Prior | None], Match]
-    """(prepared, points, start (3,), prior or None) -> match. By while loops: forward derivatives
-    alone."""
-    cost: Callable[[PyTree, Points, Array, Match], Array]
-    """(prepared, points, pose, match) -> () ½ Σ w e² [m²] and the prior's, the match's pairs,
-    weights and prior kept; differentiable by the pose, the points, and by the reference through
-    `prepare`."""
-    of_grid: bool = False
+    The methods are pure and of one pair: vmap them.
+    """
+
+    of_grid: ClassVar[bool] = False
+    """whether the reference is a `Grid`, else `Points`"""
+
+    def __post_init__(self) -> None:
+        prepared = "prepared, points"
+        methods = {"prepare": "reference", "match": f"{prepared}, start, prior"}
+        self._check(Matcher, methods | {"cost": f"{prepared}, pose, match"})
+
+    def prepare(self, reference: PyTree) -> PyTree:
+        """What the matcher needs of a reference, once for all scans: a pytree of arrays."""
+        raise NotImplementedError
+
+    def match(
+        self,
+        prepared: PyTree,
+        points: Points,
+        start: Float[Array, "3"],
+        prior: Prior | None = None,
+    ) -> Match:
+        """The match of a scan. By while loops: forward derivatives alone."""
+        raise NotImplementedError
+
+    def cost(
+        self, prepared: PyTree, points: Points, pose: Float[Array, "3"], match: Match
+    ) -> Float[Array, ""]:
+        """The cost ½ Σ w e² [m²] and the prior's, with the pairs, weights and prior of a match.
+
+        Differentiable by the pose, the points, and by the reference through `prepare`.
+        """
+        raise NotImplementedError
 
 
 def match(
@@ -98,7 +115,7 @@ def match(
     start: ArrayLike,
     prior: Prior | None = None,
 ) -> Match:
-    """The match of a scan to a reference, by a program that is compiled once a structure.
+    """The match of a scan to a reference.
 
     Args:
         reference: `Points`, or a `Grid` where `matcher.of_grid`; with a leading axis on all of its
@@ -118,8 +135,8 @@ def match(
     dtype = jnp.result_type(points.position, *floats(reference), jnp.float32)
     start = jnp.asarray(start, dtype)
     reference, points, prior = in_dtype((reference, points, prior), dtype)
-    call = _many if batch else _one
-    return programs.call(call, (matcher,), reference, points, start, prior)
+    found: Match = (_many if batch else _one)(matcher, reference, points, start, prior)
+    return found
 
 
 def floats(tree: PyTree) -> list[Array]:
@@ -128,12 +145,14 @@ def floats(tree: PyTree) -> list[Array]:
     return [leaf for leaf in leaves if jnp.issubdtype(jnp.result_type(leaf), jnp.floating)]
 
 
+@partial(jax.jit, inline=True)
 def _one(
     matcher: Matcher, reference: Reference, points: Points, start: Array, prior: Prior | None
 ) -> Match:
     return matcher.match(matcher.prepare(reference), points, start, prior)
 
 
+@partial(jax.jit, inline=True)
 def _many(
     matcher: Matcher, reference: Reference, points: Points, start: Array, prior: Prior | None
 ) -> Match:

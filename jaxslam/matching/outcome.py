@@ -11,17 +11,18 @@ from jaxslam.matching.matcher import Match, MatchStatus
 from jaxslam.matching.points import Points
 from jaxslam.matching.prior import Prior
 from jaxslam.math import linalg
+from jaxslam.math.arrays import Number
 
 
 class Limits(NamedTuple):
     """Below which a match gets a status."""
 
-    fewest: int
+    fewest: int = 10
     """points with a partner"""
-    score: float
+    score: Number = 0.5
     """of `Match.score`"""
-    condition: float
-    """of `Match.condition`"""
+    condition: Number | None = 0.01
+    """of `Match.condition`; None: no match is DEGENERATE"""
 
 
 def concluded(
@@ -33,7 +34,7 @@ def concluded(
     weight: Float[Array, "N"],
     pair: Array,
     information: Float[Array, "3 3"],
-    spread: float | Array,
+    spread: Number,
     iterations: Array,
     converged: Array,
     limits: Limits,
@@ -59,7 +60,7 @@ def concluded(
     for applies, value in (
         (~converged, MatchStatus.NOT_CONVERGED),
         (ambiguous, MatchStatus.AMBIGUOUS),
-        (condition < limits.condition, MatchStatus.DEGENERATE),
+        (limits.condition is not None and condition < limits.condition, MatchStatus.DEGENERATE),
         (score < limits.score, MatchStatus.UNLIKE),
         (few, MatchStatus.TOO_FEW),
     ):
@@ -134,16 +135,17 @@ def weakest_direction(
 
 
 def determined(
-    information: Float[Array, "3 3"], length: Float[Array, ""], least: float
+    information: Float[Array, "3 3"], length: Float[Array, ""], least: Number | None
 ) -> Float[Array, "3 3"]:
-    """The projection D of a motion onto what the scans determine; the identity where that is all.
+    """The projection D of a motion onto what the scans determine; the identity where that is all,
+    or `least` is None.
 
     With lengths in RMS ranges, the directions of the eigenvectors whose eigenvalue is at least
     `least` of the largest are kept (Zhang, Kaess & Singh 2016, "On degeneracy of optimization-based
     state estimation problems", ICRA). A constant for derivatives.
     """
     eye = jnp.eye(3, dtype=information.dtype)
-    if least <= 0:
+    if least is None:
         return eye
     scale = jnp.stack([jnp.ones_like(length), jnp.ones_like(length), 1 / length])
     a = jax.lax.stop_gradient(scale[:, None] * information * scale[None, :])

@@ -10,6 +10,13 @@ from jaxslam.matching.correspondences import FAR
 from jaxslam.matching.outcome import information_along
 from jaxslam.matching.points import Points
 from jaxslam.math import se2
+from jaxslam.math.arrays import Number
+
+SPAN = 5
+"""Neighbours on each side of a point that a line is fitted to."""
+
+GAP = 0.5
+"""[m] between points beyond which they are not neighbours."""
 
 _BENT = 4.0
 """A line whose points scatter by more than this times the median variance goes round a corner."""
@@ -34,7 +41,9 @@ class Surface(NamedTuple):
     about it as they do elsewhere, so that it goes round no corner"""
 
 
-def surface(of: Points, span: int | Array, gap: float, *, most: int | None = None) -> Surface:
+def surface(
+    of: Points, span: int | Array = SPAN, gap: Number = GAP, *, most: int | None = None
+) -> Surface:
     """The lines through up to 2 span + 1 neighbours, in the order of the beams.
 
     Neighbours are those up to which no two points that follow each other are more than `gap` [m]

@@ -149,3 +149,28 @@ def change_where(flag: jax.Array, change: Callable[[_T], _T], state: _T) -> _T:
         return cast(_T, jax.tree.map(lambda a, b: jnp.where(flag, a, b), change(state), state))
 
     return where_any(flag, changed, lambda state: state, state)
+
+
+def hot_jit(
+    function: Callable[..., _T], *, static_argnames: tuple[str, ...] = ()
+) -> Callable[..., _T]:
+    """The jitted function, for long passes over arrays called from the host; see `hot_options`.
+
+    JAX takes options for a whole program alone, so within a trace it is a plain jitted function.
+    """
+    within = jax.jit(function, static_argnames=static_argnames, inline=True)
+
+    @functools.cache  # at the first call, since to ask for the backend starts it
+    def alone() -> Callable[..., _T]:
+        options = hot_options(jax.default_backend())
+        made = jax.jit(function, static_argnames=static_argnames, compiler_options=options)
+        return cast(Callable[..., _T], made)
+
+    @functools.wraps(function)
+    def call(*arguments: PyTree) -> _T:
+        # A new array is a tracer where a trace is active, also where all arguments are constants.
+        leaves = jax.tree.leaves((jnp.asarray(0.0), arguments))
+        traced = any(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
+        return cast(_T, (within if traced else alone())(*arguments))
+
+    return call

@@ -1,6 +1,6 @@
 """A laser scanner in a world of exact walls, and what its scan can say of the pose."""
 
-from dataclasses import dataclass
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -9,54 +9,70 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
-from jaxslam import programs
-from jaxslam.core.numbers import check_key, check_positive
+from jaxslam.core.numbers import check_key, check_mount, check_positive, held_array, is_concrete
+from jaxslam.core.record import record, set_field, static
 from jaxslam.math import se2
+from jaxslam.math.arrays import Number, Pose
 from jaxslam.protocols import Motion
 from jaxslam.simulation.walls import Walls, exact_ranges, wall_ranges
 from jaxslam.simulation.worlds import drive
-from jaxslam.types import Beams
+from jaxslam.types import Beams, JaxOrNumPy
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class Laser:
     """A 2-D laser scanner. Raises ValueError on numbers out of range."""
 
-    angles: ArrayLike
-    """(B,) directions of the beams in the frame of the mount [rad]"""
-    sigma: float = 0.02
+    angles: Float[JaxOrNumPy, "B"]
+    """directions of the beams in the frame of the mount [rad]"""
+    sigma: Number = 0.02
     """standard deviation of a range [m]"""
-    max_range: float = 10.0
+    max_range: Number = 10.0
     """[m]; a beam that meets nothing nearer has this range, without noise"""
-    dropout: float = 0.0
+    dropout: Number = 0.0
     """share of the beams that return nothing, in [0, 1]; they are not valid"""
-    mount: ArrayLike = (0.0, 0.0, 0.0)
+    mount: ArrayLike | None = None
     """(3,) pose on the robot"""
 
     def __post_init__(self) -> None:
-        angles, mount = np.asarray(self.angles), np.asarray(self.mount)
-        if angles.ndim != 1 or angles.size == 0 or not np.all(np.isfinite(angles)):
-            raise ValueError(f"Laser: expected finite angles (at least 1,), got {angles.shape}")
-        if mount.shape != (3,) or not np.all(np.isfinite(mount)):
-            raise ValueError(f"Laser: expected a mount that is a pose (x, y, θ), got {mount}")
+        set_field(self, "angles", held_array(self.angles))
+        shape = np.shape(self.angles)
+        if (
+            len(shape) != 1
+            or 0 in shape
+            or (is_concrete(self.angles) and not np.all(np.isfinite(self.angles)))
+        ):
+            raise ValueError(f"Laser: expected finite angles (at least 1,), got {shape}")
         check_positive("Laser", sigma=self.sigma, max_range=self.max_range)
-        if not 0 <= self.dropout <= 1:
+        if is_concrete(self.dropout) and not 0 <= self.dropout <= 1:
             raise ValueError(f"Laser: expected dropout in [0, 1], got {self.dropout}")
+        if self.mount is not None:
+            check_mount("Laser", self.mount)
+            set_field(self, "mount", held_array(self.mount))
+
+    def frame(self, pose: Pose) -> Pose:
+        """The pose of the laser, pose ∘ mount."""
+        if self.mount is None:
+            return pose
+        return se2.compose(pose, jnp.asarray(self.mount, pose.dtype))
 
 
-@dataclass(frozen=True, eq=False)
+@record
 class LaserWorld:
     """A robot that drives among exact walls with a laser; `scan_world` draws a history of it."""
 
-    name: str
+    name: str = static()
     walls: Walls
     laser: Laser
     motion: Motion
     """its noise is on the odometry in the log; the robot drives as the controls say"""
-    controls: ArrayLike
-    """(T, U)"""
-    pose: ArrayLike
-    """(3,) before the first control"""
+    controls: Float[JaxOrNumPy, "T U"]
+    pose: Float[JaxOrNumPy, "3"]
+    """before the first control"""
+
+    def __post_init__(self) -> None:
+        for name in ("controls", "pose"):
+            set_field(self, name, held_array(getattr(self, name)))
 
 
 class LaserHistory(NamedTuple):
@@ -80,7 +96,7 @@ def true_ranges(
 
     passes: which segments each beam goes through, as through glass; None for none.
     """
-    eye = se2.compose(pose, jnp.asarray(laser.mount, pose.dtype))
+    eye = laser.frame(pose)
     return exact_ranges(walls, eye, jnp.asarray(laser.angles, pose.dtype), laser.max_range, passes)
 
 
@@ -96,7 +112,7 @@ def scan(laser: Laser, walls: Walls, pose: Float[Array, "3"], key: Array) -> Bea
     else:
         key_noise, key_drop, key_glass = jax.random.split(key, 3)
         share = jnp.asarray(walls.glass, pose.dtype)
-        drawn = jax.random.uniform(key_glass, (np.size(laser.angles), len(share)), pose.dtype)
+        drawn = jax.random.uniform(key_glass, (len(laser.angles), len(share)), pose.dtype)
         exact = true_ranges(laser, walls, pose, drawn < share[None])
     noise = laser.sigma * jax.random.normal(key_noise, exact.shape, exact.dtype)
     noisy = jnp.clip(exact + noise, 0.0, laser.max_range)
@@ -110,7 +126,8 @@ def scan_world(world: LaserWorld, key: Array) -> LaserHistory:
     """A random history of a world: its path, odometry and scans; traceable, as `simulate` is."""
     check_world("scan_world", world)
     check_key("scan_world", key)
-    return programs.call(_scan_world, (world,), key)
+    history: LaserHistory = _scan_world(world, key)
+    return history
 
 
 def check_world(name: str, world: object) -> None:
@@ -119,6 +136,7 @@ def check_world(name: str, world: object) -> None:
         raise ValueError(f"{name}: expected a LaserWorld, got {type(world).__name__}")
 
 
+@partial(jax.jit, inline=True)
 def _scan_world(world: LaserWorld, key: Array) -> LaserHistory:
     dtype = jnp.result_type(float)
     key_motion, key_scan = jax.random.split(key)
@@ -165,7 +183,7 @@ def scan_information(
     place = np.asarray(pose, np.float64)
     if place.shape != (3,):
         raise ValueError(f"scan_information: expected a pose (x, y, θ), got {place.shape}")
-    found = programs.call(_ranges_and_slopes, (laser, walls), place)
+    found = _ranges_and_slopes(laser, walls, place)
     ranges, slopes = (np.asarray(part, np.float64) for part in found)
     passed = np.zeros(ranges.shape[1])
     passed[: len(walls.segments)] = 0.0 if walls.glass is None else walls.glass
@@ -178,7 +196,8 @@ def scan_information(
     if not met.any():
         raise ValueError(f"scan_information: no beam from {place} meets a wall within max_range")
     g = slopes[met]
-    information = (1 - laser.dropout) / laser.sigma**2 * (share[met] * g.T) @ g
+    dropout, sigma = (float(np.asarray(number)) for number in (laser.dropout, laser.sigma))
+    information = (1 - dropout) / sigma**2 * (share[met] * g.T) @ g
     unit = np.array([1.0, 1.0, 1.0 / float(np.median(ranges[met]))])
     values, vectors = np.linalg.eigh(unit[:, None] * information * unit)
     seen = values > tolerance * values[-1]
@@ -190,12 +209,12 @@ def scan_information(
     return Observability(information, bound, free, tuple(_named(d, place, unit[2]) for d in free))
 
 
+@partial(jax.jit, inline=True)
 def _ranges_and_slopes(laser: Laser, walls: Walls, pose: Array) -> tuple[Array, Array]:
     angles = jnp.asarray(laser.angles, pose.dtype)
 
     def ranges(pose: Array) -> Array:
-        eye = se2.compose(pose, jnp.asarray(laser.mount, pose.dtype))
-        return wall_ranges(walls, eye, angles, laser.max_range)
+        return wall_ranges(walls, laser.frame(pose), angles, laser.max_range)
 
     return ranges(pose), jax.jacfwd(ranges)(pose)
 

@@ -10,10 +10,10 @@ from jaxslam.matching import MatchStatus
 
 CELL, WINDOW, TURN_WINDOW, TURN, SPREAD = 0.1, 0.3, 0.1, 0.02, 0.1
 COUNT = 4
-MATCHER = matching.correlative(
+MATCHER = matching.Correlative(
     cell=CELL, window=WINDOW, turn_window=TURN_WINDOW, turn=TURN, sigma=SPREAD, block=4
 )
-STRICT = matching.correlative(
+STRICT = matching.Correlative(
     cell=CELL, window=WINDOW, turn_window=TURN_WINDOW, turn=TURN, sigma=SPREAD,
     apart=0.15, ambiguous=0.8,
 )  # fmt: skip
@@ -29,7 +29,7 @@ def found():
     grids = RASTERS(REFERENCES)
     prepared = jax.jit(lambda g: jax.lax.map(MATCHER.prepare, g))(grids)
     coarse = jax.jit(jax.vmap(MATCHER.match))(prepared, SCANS, STARTS, PRIOR)
-    fine = matching.match(matching.field(least_score=0.3), grids, SCANS, coarse.pose)
+    fine = matching.match(matching.FieldMatcher(least_score=0.3), grids, SCANS, coarse.pose)
     return jax.tree.map(np.asarray, (grids, prepared, coarse, fine))
 
 
@@ -93,7 +93,7 @@ def test_what_a_scan_does_not_determine_is_named(name):
     references = stacked([halls[0], round_room(at, 600)])
     scans = stacked([halls[1], round_room(at, 60)])
     grids = RASTERS(references)
-    matcher = {"field": matching.field(least_score=0.3), "correlative": STRICT}[name]
+    matcher = {"field": matching.FieldMatcher(least_score=0.3), "correlative": STRICT}[name]
     start = np.array([[0.1, 0.05, 0.02], [0.0, 0.05, 0.02]])
     found = jax.device_get(matching.match(matcher, grids, scans, start))
     assert list(found.status) == [MatchStatus.DEGENERATE] * 2

@@ -41,7 +41,7 @@ REFERENCES, SCANS, TRUTH, STARTS = batch()
 
 @pytest.fixture(scope="module")
 def found():
-    makers = {"points": matching.point_to_point, "lines": matching.point_to_line}
+    makers = {"points": matching.PointToPoint, "lines": matching.PointToLine}
     return {
         (name, steps): jax.device_get(
             matching.match(
@@ -120,7 +120,7 @@ def test_numbers_of_other_types_are_those_of_the_scans(found):
     """A start of integers or of float32, and a prior of float32, beside scans in float64."""
     one = jax.tree.map(lambda part: part[0], (REFERENCES, SCANS))
     whole = matching.Prior(np.zeros(3, np.float32), np.zeros((3, 3), np.float32))
-    matcher = matching.point_to_line()
+    matcher = matching.PointToLine()
     ends = [
         matching.match(matcher, *one, start, prior).pose
         for start, prior in (([0, 0, 0], whole), (np.zeros(3, np.float32), whole))
@@ -148,7 +148,9 @@ def test_a_corridor_is_degenerate_along_itself(found):
     assert abs(found["lines", None].pose[7, 1]) < 0.01
 
 
-@pytest.mark.parametrize("make", [matching.point_to_line, matching.point_to_point, matching.field])
+@pytest.mark.parametrize(
+    "make", [matching.PointToLine, matching.PointToPoint, matching.FieldMatcher]
+)
 @pytest.mark.parametrize("sigma", [0.0, 0.02])
 def test_in_a_corridor_the_prior_decides_whatever_it_is_worth(make, sigma):
     """Walls at y = ±1, both scans from one place: the scans do not depend on x.
@@ -180,7 +182,7 @@ def test_in_a_corridor_the_prior_decides_whatever_it_is_worth(make, sigma):
     np.testing.assert_allclose((alone.pose[:, :2] * along).sum(axis=1), 0, atol=2e-3)
 
 
-@pytest.mark.parametrize("make", [matching.point_to_point, matching.point_to_line])
+@pytest.mark.parametrize("make", [matching.PointToPoint, matching.PointToLine])
 def test_a_prior_holds_what_the_scans_do_not_determine(make):
     """At the end the slope of the cost is zero; in the corridor x is that of the prior."""
     matcher = make(IcpSettings(**OPTIONS, tolerance=1e-9, kernel=Huber(), scale=0.05))
@@ -213,13 +215,13 @@ def test_trimming_and_a_kernel_bear_outliers_and_forward_derivatives_are_finite(
         "plain": {}, "trimmed": {"trim": 0.75}, "kernel": {"kernel": Huber(), "scale": 0.02}
     }.items():  # fmt: skip
         end = matching.match(
-            matching.point_to_line(IcpSettings(**OPTIONS, least_score=0.1, **options)),
+            matching.PointToLine(IcpSettings(**OPTIONS, least_score=0.1, **options)),
             references, scans, STARTS[:GOOD],
         )  # fmt: skip
         error[name] = np.abs(np.asarray(end.pose) - TRUTH[:GOOD])[:, :2].mean()
     assert error["trimmed"] < 0.5 * error["plain"] and error["kernel"] < 0.7 * error["plain"]
 
-    matcher = matching.point_to_line(IcpSettings(**OPTIONS))
+    matcher = matching.PointToLine(IcpSettings(**OPTIONS))
     of, scan = (Points(*(part[0] for part in p)) for p in (REFERENCES, SCANS))
     pose, slope = jax.jit(
         lambda by: jax.jvp(
@@ -262,13 +264,13 @@ def test_trimming_and_a_kernel_bear_outliers_and_forward_derivatives_are_finite(
         (lambda m, p: matching.match(m, p, p, np.zeros(3), Prior(np.full(3, np.nan), np.eye(3))),
          "expected a finite prior"),
         (lambda m, p: IcpSettings(reach=0), "IcpSettings: expected reach"),
-        (lambda m, p: IcpSettings(span=0), "IcpSettings: expected span"),
-        (lambda m, p: matching.field(scale=-1), "field: expected reach"),
-        (lambda m, p: matching.correlative(block=0), "correlative: expected block"),
+        (lambda m, p: IcpSettings(span=0), "IcpSettings: span: expected an integer >= 1, got 0"),
+        (lambda m, p: matching.FieldMatcher(scale=-1), "FieldMatcher: expected scale above 0, got -1"),
+        (lambda m, p: matching.Correlative(block=0), "Correlative: expected block"),
         (lambda m, p: matching.raster(p, 0.0, 1.0), "raster: expected resolution"),
     ],
 )  # fmt: skip
 def test_bad_input_is_refused(call, reason):
     p = points_at(np.zeros(3), np.random.default_rng(0))
     with pytest.raises(ValueError, match=reason):
-        call(matching.point_to_line(), p)
+        call(matching.PointToLine(), p)

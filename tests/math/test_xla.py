@@ -1,5 +1,6 @@
 """What XLA is told: the same numbers, and a program that is as told."""
 
+import functools
 import re
 
 import jax
@@ -9,6 +10,7 @@ import pytest
 
 from jaxslam.math.xla import (
     anywhere,
+    hot_jit,
     hot_options,
     materialize,
     no_inline,
@@ -89,6 +91,21 @@ def test_hot_programs_are_compiled_for_the_processor():
         program = jax.jit(lambda x: 2 * x + 1).lower(np.arange(9.0)).compile(options)
         np.testing.assert_array_equal(program(np.arange(9.0)), 2 * np.arange(9.0) + 1)
     assert hot_options("gpu") is None
+
+
+def test_a_hot_function_is_a_program_alone_and_part_of_another():
+    traced = []
+
+    @functools.partial(hot_jit, static_argnames=("power",))
+    def raised(power, x):
+        traced.append(power)
+        return x**power
+
+    np.testing.assert_array_equal([raised(2, 3.0), raised(2, 4.0), raised(3, 2.0)], [9, 16, 8])
+    assert traced == [2, 3]
+    assert jax.jit(lambda: raised(2, 5.0))() == 25  # of constants alone
+    assert jax.jit(jax.grad(raised, 1), static_argnums=0)(2, 3.0) == 6
+    np.testing.assert_array_equal(jax.vmap(lambda x: raised(2, x))(np.arange(3.0)), [0, 1, 4])
 
 
 @pytest.mark.parametrize("kept", [True, False])

@@ -1,8 +1,13 @@
 """Worlds of exact walls: ranges by hand, scans as their laser says, and what a scan cannot see."""
 
+import dataclasses
+import pickle
+
 import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
+import worlds
 
 from jaxslam.simulation.laser import Laser, scan, scan_information, scan_world, true_ranges
 from jaxslam.simulation.scenarios import ROOMS, circular_room, corridor, office, square
@@ -170,6 +175,28 @@ def test_the_information_of_a_scan_through_glass_is_that_of_both_walls_by_their_
     assert np.all(clear > np.diag(scan_information(plain.laser, plain.walls, at).bound))
 
 
+def test_a_laser_and_its_world_hold_numbers_alone():
+    world = dataclasses.replace(
+        square(beams=8), laser=Laser(np.linspace(-3, 3, 8), 0.02, mount=(0.2, 0, 0))
+    )
+    assert [np.shape(leaf) for leaf in jax.tree.leaves(world.laser)] == [(8,), (), (), (), (3,)]
+    assert jax.tree.structure(world) == jax.tree.structure(pickle.loads(pickle.dumps(world)))
+    assert jax.tree.structure(world) != jax.tree.structure(dataclasses.replace(world, name="b"))
+    first, key = scan_world(world, jax.random.key(0)), jax.random.key(0)
+    laser = dataclasses.replace(world.laser, sigma=0.1, mount=np.array([-0.3, 0.1, 0.2]))
+    other = dataclasses.replace(world, laser=laser)
+    with worlds.compilations() as compiled:
+        second = scan_world(other, key)
+        assert compiled() == 0
+    np.testing.assert_array_equal(first.pose, second.pose)
+    assert np.all(first.beams.range != second.beams.range)
+    at, along = jnp.array([3.0, 3.0, 0.0]), Laser([0.0], mount=np.array([0.2, 0.1, 0.0]))
+    slope = jax.grad(lambda laser: true_ranges(laser, world.walls, at).sum())(along)
+    # The wall is at x = 6: the range is (6 - x)/cos θ.
+    np.testing.assert_allclose(slope.mount, [-1, 0, 0], atol=1e-12)
+    assert type(slope) is Laser and slope.sigma == 0
+
+
 @pytest.mark.parametrize(
     ("call", "reason"),
     [
@@ -182,7 +209,7 @@ def test_the_information_of_a_scan_through_glass_is_that_of_both_walls_by_their_
         (lambda: Laser([0.0], sigma=0.0), "Laser: expected sigma above 0"),
         (lambda: Laser([0.0], max_range=np.inf), "Laser: expected max_range above 0, got inf"),
         (lambda: Laser([0.0], dropout=2.0), "dropout in"),
-        (lambda: Laser([0.0], mount=(0, 0)), "Laser: expected a mount that is a pose"),
+        (lambda: Laser([0.0], mount=(0, 0)), "Laser: expected a mounting pose of shape"),
         (lambda: rasterize(square().walls, 0.0), "rasterize: expected a resolution"),
         (
             lambda: scan_information(Laser([0.0], max_range=0.1), square().walls, [3, 3, 0]),

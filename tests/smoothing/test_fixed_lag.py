@@ -22,7 +22,7 @@ from jaxslam.types import Log, Scan, Status
 
 @pytest.fixture(scope="module")
 def short():
-    """Four steps, drawn by a program of tests/programs."""
+    """Four steps, drawn by a program of tests/core."""
     ring = worlds.ring(steps=8)
     controls, start = ring.controls[:4], np.diag([0.01, 0.0, 0.003])
     world = dataclasses.replace(ring, controls=controls, pose_cov=start)

@@ -8,7 +8,6 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxslam import programs
 from jaxslam.core.numbers import check_positive
 from jaxslam.grids.beam_models.ray_cast import Mixture, check_weights, mixture_log_density
 from jaxslam.types import Beams
@@ -68,7 +67,7 @@ def fit(
     from scipy.optimize import minimize  # slow to load
 
     def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
-        value, slope = programs.call(_cost_and_slope, (), x, ranges, stars, max_range)
+        value, slope = _cost_and_slope(x, ranges, stars, max_range)
         return float(value), np.asarray(slope, np.float64)
 
     first = np.log(np.maximum([float(np.asarray(value)) for value in start], 1e-6))
@@ -81,6 +80,7 @@ def _mixture(x: Float[Array, "6"]) -> Mixture:
     return Mixture(shares[0], shares[1], shares[2], shares[3], scales[0], scales[1])
 
 
+@jax.jit
 def _cost_and_slope(x: Array, z: Array, stars: Array, max_range: Array) -> tuple[Array, Array]:
     def cost(x: Array) -> Array:
         return -mixture_log_density(_mixture(x), z, stars, max_range).mean()

@@ -4,6 +4,7 @@ import itertools
 import math
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
@@ -12,7 +13,6 @@ from numpy.typing import ArrayLike
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from jaxslam import programs
 from jaxslam.filters.particles.states.moments import weighted_pose_moments
 
 
@@ -74,12 +74,13 @@ def clusters(
     label = np.full(len(poses), -1)
     label[used] = rank[group]
     safe = np.where(np.isfinite(poses), poses, 0.0)
-    found = [programs.call(_moments, (), safe, weights, label == k) for k in range(len(order))]
+    found = [_moments(safe, weights, label == k) for k in range(len(order))]
     mean = np.array([np.asarray(m) for m, _ in found]).reshape(-1, 3)
     cov = np.array([np.asarray(c) for _, c in found]).reshape(-1, 3, 3)
     return Clusters(total[order], mean, cov, np.bincount(group)[order], label)
 
 
+@jax.jit
 def _moments(pose: Array, log_weight: Array, mine: Array) -> tuple[Array, Array]:
     """Mean and covariance of the particles that are marked."""
     own = jnp.where(mine, log_weight, -jnp.inf)

@@ -14,14 +14,14 @@ from jaxslam.laser_slam import covariances
 from jaxslam.laser_slam.scans import Scans
 from jaxslam.laser_slam.settings import Settings
 from jaxslam.matching import (
+    Correlative,
     IcpSettings,
     Match,
     Matcher,
     MatchStatus,
     Points,
+    PointToLine,
     Prior,
-    correlative,
-    point_to_line,
     raster,
     transformed,
 )
@@ -70,9 +70,11 @@ class ScanMatch(NamedTuple):
     """share of the reference's points in view that the scan's beams pass through"""
 
 
-def search(distance: float, angle: float, turn: float, *, ambiguous: float = PEAK) -> Matcher:
+def search(
+    distance: float, angle: float, turn: float, *, ambiguous: float | None = PEAK
+) -> Matcher:
     """The search over a window of the reference's grid, [m] and [rad] to either side."""
-    return correlative(
+    return Correlative(
         window=distance,
         turn_window=angle,
         turn=turn,
@@ -86,9 +88,9 @@ def search(distance: float, angle: float, turn: float, *, ambiguous: float = PEA
 
 # What the walls hardly determine is not held at the start, which is of a lattice: the covariance
 # tells it, and the prior bounds it.
-_OF_WALLS = IcpSettings(kernel=Cauchy(), scale=0.05, lone=0.5, iterations=10, least_condition=0.0)
-WALLS = point_to_line(replace(_OF_WALLS, reach=0.5))
-NEAR_WALLS = point_to_line(replace(_OF_WALLS, reach=0.15))
+_OF_WALLS = IcpSettings(kernel=Cauchy(), scale=0.05, lone=0.5, iterations=10, least_condition=None)
+WALLS = PointToLine(replace(_OF_WALLS, reach=0.5))
+NEAR_WALLS = PointToLine(replace(_OF_WALLS, reach=0.15))
 """From where `WALLS` ends: its pairs are the points that lie on walls."""
 ANY = search(1.0, 0.5, 0.1)
 """Whose table serves all searches, since they differ by their windows alone."""

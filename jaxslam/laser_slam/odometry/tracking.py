@@ -21,7 +21,7 @@ from jaxslam.laser_slam.settings import Settings
 from jaxslam.matching import Matcher, Points
 from jaxslam.math import numpy_poses as poses
 
-NEAR = search(0.6, np.deg2rad(22.0), np.deg2rad(2.0), ambiguous=1.0)
+NEAR = search(0.6, np.deg2rad(22.0), np.deg2rad(2.0), ambiguous=None)
 """About raw odometry."""
 FAR = search(*FARTHEST, np.deg2rad(2.5))
 """Where that finds little, or raw odometry is no guess."""

@@ -1,20 +1,20 @@
 """Covariances of a match, each of the published ways, to be held against the truth."""
 
-from jaxslam.matching.covariance.along_normals import along_normals
-from jaxslam.matching.covariance.hessian import hessian
-from jaxslam.matching.covariance.implicit import implicit
-from jaxslam.matching.covariance.lattice import lattice
+from jaxslam.matching.covariance.along_normals import AlongNormals
+from jaxslam.matching.covariance.hessian import Hessian
+from jaxslam.matching.covariance.implicit import Implicit
+from jaxslam.matching.covariance.lattice import Lattice
 from jaxslam.matching.covariance.record import MatchCovariance, MatchedScans, covariance
-from jaxslam.matching.covariance.sampling import sampling, unscented
+from jaxslam.matching.covariance.sampling import Sampling, Unscented
 
 __all__ = [
+    "AlongNormals",
+    "Hessian",
+    "Implicit",
+    "Lattice",
     "MatchCovariance",
     "MatchedScans",
-    "along_normals",
+    "Sampling",
+    "Unscented",
     "covariance",
-    "hessian",
-    "implicit",
-    "lattice",
-    "sampling",
-    "unscented",
 ]

@@ -1,26 +1,30 @@
 """The closed form with residuals across the surface alone (Bonnabel, Barczyk & Goulette 2016)."""
 
+import dataclasses
+
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxslam.core.numbers import check_positive
+from jaxslam.core.numbers import check_count, check_positive
+from jaxslam.core.record import record, static
 from jaxslam.matching.covariance.record import (
     MatchCovariance,
     MatchedScans,
     beside_prior,
     propagated,
-    stated,
 )
 from jaxslam.matching.matcher import Matcher
 from jaxslam.matching.outcome import information_of
 from jaxslam.matching.points import Points
-from jaxslam.matching.surface import surface
+from jaxslam.matching.surface import GAP, SPAN, surface
 from jaxslam.math import se2
+from jaxslam.math.arrays import Number
 
 
-def along_normals(sigma: ArrayLike, *, span: int = 5, gap: float = 0.5) -> MatchCovariance:
+@record
+class AlongNormals(MatchCovariance):
     """The covariance A⁻¹ B A⁻¹, A = Σ w J Jᵀ, J = (n, n·∂(R p)/∂θ), B the noise of Σ w J e.
 
     A scan that slides along a wall finds other partners, so that the part of a residual along the
@@ -35,20 +39,27 @@ def along_normals(sigma: ArrayLike, *, span: int = 5, gap: float = 0.5) -> Match
     s_j the sum of w_i J_i over the partners i of j. A prior adds Λ to A and σ² Λ to B.
 
     References are `Points`.
-
-    Args:
-        sigma: standard deviation of a range [m].
-        span, gap: of the lines, as in `point_to_line`.
     """
-    check_positive("along_normals", sigma=sigma)
 
-    def of(matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
+    sigma: ArrayLike
+    """standard deviation of a range [m]"""
+    _: dataclasses.KW_ONLY
+    span: int = static(default=SPAN)
+    gap: Number = GAP
+    """of the lines, as in `IcpSettings`"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_count("AlongNormals: span", self.span)
+        check_positive("AlongNormals", gap=self.gap)
+
+    def of_usable(self, matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
         reference, points, found, *_ = scans
         if not isinstance(reference, Points):
             raise ValueError(
-                f"along_normals: takes a reference of Points, got {type(reference).__name__}"
+                f"AlongNormals: takes a reference of Points, got {type(reference).__name__}"
             )
-        lines = surface(reference, span, gap)
+        lines = surface(reference, self.span, self.gap)
         j = jnp.maximum(found.pair, 0)
         weight = jnp.where(lines.straight[j], found.weight, 0.0)
         turn = se2.rotation(found.pose[2]).T
@@ -61,6 +72,4 @@ def along_normals(sigma: ArrayLike, *, span: int = 5, gap: float = 0.5) -> Match
         of_partner = jax.ops.segment_sum(weight[:, None] * jacobian, j, len(reference.valid))
         by_reference = (lines.normal * reference.ray).sum(axis=1)[:, None] * of_partner
         noise = by_scan.T @ by_scan + by_reference.T @ by_reference
-        return propagated(found, beside_prior(found, shape), noise, jnp.asarray(sigma))
-
-    return stated("along_normals", of, sigma)
+        return propagated(found, beside_prior(found, shape), noise, self.sigma)

@@ -5,21 +5,21 @@ import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
-from jaxslam.core.numbers import check_positive
+from jaxslam.core.record import record
 from jaxslam.matching.covariance.record import (
     MatchCovariance,
     MatchedScans,
     curvature,
     propagated,
     range_count,
-    stated,
     with_ranges,
 )
 from jaxslam.matching.matcher import Matcher
 from jaxslam.matching.points import Points, moved_along_rays
 
 
-def implicit(sigma: ArrayLike) -> MatchCovariance:
+@record
+class Implicit(MatchCovariance):
     """The covariance A⁻¹ B σ² Bᵀ A⁻¹, A = ∂²E/∂x², B = ∂²E/∂x∂z, with the ranges z of both scans.
 
     From ∂E/∂x = 0 at the minimum: dx/dz = -(∂²E/∂x²)⁻¹ ∂²E/∂z∂x. The derivatives are those of the
@@ -27,16 +27,15 @@ def implicit(sigma: ArrayLike) -> MatchCovariance:
     pairs and weights are kept. Of a grid only the noise of the scan counts. A prior adds the noise
     of its pose, σ² Λ in the middle.
     Where pairs follow the scan, as those of point-to-point along a wall, keeping them feigns
-    information (Bonnabel et al. 2016; see `along_normals`).
+    information (Bonnabel et al. 2016; see `AlongNormals`).
 
     Censi 2007, "An accurate closed-form estimate of ICP's covariance", ICRA.
-
-    Args:
-        sigma: standard deviation of a range [m].
     """
-    check_positive("implicit", sigma=sigma)
 
-    def of(matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
+    sigma: ArrayLike
+    """standard deviation of a range [m]"""
+
+    def of_usable(self, matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
         reference, points, found, *_ = scans
         prepared = matcher.prepare(reference)
 
@@ -53,6 +52,4 @@ def implicit(sigma: ArrayLike) -> MatchCovariance:
         zeros = jnp.zeros(range_count(reference), dtype), jnp.zeros(len(points.valid), dtype)
         by_ranges = jnp.concatenate(jax.jacrev(slope, argnums=(0, 1))(*zeros), axis=1)
         shape = curvature(matcher, prepared, points, found)
-        return propagated(found, shape, by_ranges @ by_ranges.T, jnp.asarray(sigma))
-
-    return stated("implicit", of, sigma)
+        return propagated(found, shape, by_ranges @ by_ranges.T, self.sigma)

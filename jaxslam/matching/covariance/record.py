@@ -1,20 +1,19 @@
-"""The record of a way to state the covariance of a match, and what several of them share."""
+"""The base class of covariances of a match, and what several of them share."""
 
-import functools
-from collections.abc import Callable
-from dataclasses import dataclass
-from typing import NamedTuple
+from functools import partial
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, PyTree
 
-from jaxslam import programs
+from jaxslam.core.numbers import check_positive
 from jaxslam.matching.matcher import Match, Matcher, MatchStatus, Reference
 from jaxslam.matching.points import Points, moved_along_rays
 from jaxslam.matching.prior import prior_terms
 from jaxslam.math import linalg
+from jaxslam.protocols import Component
 
 
 class MatchedScans(NamedTuple):
@@ -29,37 +28,37 @@ class MatchedScans(NamedTuple):
     """for covariances that draw"""
 
 
-@dataclass(frozen=True, eq=False)
-class MatchCovariance:
-    """A covariance of the pose of a match, in its coordinates (x, y, θ)."""
+class MatchCovariance(Component):
+    """A covariance of the pose of a match, in its coordinates (x, y, θ); a subclass is a record."""
 
-    name: str
-    of: Callable[[Matcher, MatchedScans], Float[Array, "3 3"]]
-    """(matcher, scans) -> (3, 3), finite. Traceable; of one pair: vmap it. One of your own should
-    go through `record.stated`, so that a match that failed is not certain."""
+    sigma: Any
+    """standard deviation of a range or residual [m]; a subclass without one does not know it"""
 
+    def __post_init__(self) -> None:
+        self._check(MatchCovariance, {"of_usable": "matcher, scans"})
+        if hasattr(self, "sigma"):
+            check_positive(type(self).__name__, sigma=self.sigma)
 
-def stated(
-    name: str,
-    of: Callable[[Matcher, MatchedScans], Float[Array, "3 3"]],
-    sigma: ArrayLike | None = None,
-) -> MatchCovariance:
-    """The record of a covariance, which of a match that failed says what the prior alone does.
+    def of_usable(self, matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
+        """The covariance of a match that did not fail; finite of any. Of one pair: vmap it."""
+        raise NotImplementedError
 
-    That is σ² Λ⁻¹ with the σ of a residual, if that is known; what no prior tells, or all without
-    one, is known to a kilometre or a thousand radians. A match failed if its status is UNLIKE or
-    TOO_FEW.
-    """
+    def of(self, matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
+        """The covariance of a match; of one that failed it says what the prior alone does.
 
-    def unless_failed(matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
+        That is σ² Λ⁻¹ with the σ of a residual, if that is known; what no prior tells, or all
+        without one, is known to a kilometre or a thousand radians. A match failed if its status is
+        UNLIKE or TOO_FEW.
+        """
         found = scans.found
-        nothing = jnp.zeros_like(found.information)
-        scale = jnp.asarray(1.0 if sigma is None else sigma, nothing.dtype)
-        known = nothing if sigma is None else prior_terms(found.prior, found.pose)[0]
+        nothing = known = jnp.zeros_like(found.information)
+        scale = jnp.ones((), known.dtype)
+        if hasattr(self, "sigma"):
+            scale = jnp.asarray(self.sigma, known.dtype)
+            known = prior_terms(found.prior, found.pose)[0]
         unknown = scale**2 * inverse_of(known, nothing, sigma=scale)
-        return jnp.where(found.status >= MatchStatus.UNLIKE, unknown, of(matcher, scans))
-
-    return MatchCovariance(name, unless_failed)
+        usable = self.of_usable(matcher, scans)
+        return jnp.where(found.status >= MatchStatus.UNLIKE, unknown, usable)
 
 
 def covariance(
@@ -71,7 +70,7 @@ def covariance(
     start: ArrayLike,
     key: Array,
 ) -> Array:
-    """The covariance (3, 3) of a match, by a program that is compiled once a structure.
+    """The covariance (3, 3) of a match.
 
     With a leading axis on the start, and so on all arrays but the key, (B, 3, 3). Of a match
     that is UNLIKE or TOO_FEW it says what the prior does, and else (1 km)² and (1000 rad)². Along
@@ -81,15 +80,18 @@ def covariance(
     many = begin.ndim == 2
     keys = jax.random.split(key, len(begin)) if many else key
     scans = MatchedScans(reference, points, found, begin, keys)
-    return programs.call(_many if many else _one, (way, matcher), scans)
+    cov: Array = (_many if many else _one)(way, matcher, scans)
+    return cov
 
 
+@partial(jax.jit, inline=True)
 def _one(way: MatchCovariance, matcher: Matcher, scans: MatchedScans) -> Array:
     return way.of(matcher, scans)
 
 
+@partial(jax.jit, inline=True)
 def _many(way: MatchCovariance, matcher: Matcher, scans: MatchedScans) -> Array:
-    return jax.vmap(functools.partial(way.of, matcher))(scans)
+    return jax.vmap(partial(way.of, matcher))(scans)
 
 
 def inverse_of(
@@ -108,12 +110,13 @@ def inverse_of(
 
 
 def propagated(
-    found: Match, shape: Float[Array, "3 3"], noise: Float[Array, "3 3"], sigma: Array
+    found: Match, shape: Float[Array, "3 3"], noise: Float[Array, "3 3"], sigma: ArrayLike
 ) -> Float[Array, "3 3"]:
     """The covariance σ² A⁻¹ B A⁻¹ of a curvature A, with a prior's, and the scans' noise σ² B.
 
     What neither scans nor prior determine has the noise of `inverse_of`'s floor: a kilometre.
     """
+    sigma = jnp.asarray(sigma, noise.dtype)
     gain = inverse_of(shape, beside_prior(found, found.information), sigma=sigma)
     floor = (sigma * 1e-3) ** 2 * jnp.eye(3, dtype=noise.dtype)
     return sigma**2 * gain @ (beside_prior(found, noise) + floor) @ gain.T

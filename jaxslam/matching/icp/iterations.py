@@ -1,15 +1,15 @@
 """The loop that the iterative closest point methods share: pairs, a closed-form step, again."""
 
-from collections.abc import Callable
-from dataclasses import dataclass
 from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxslam.core.numbers import check_count, check_positive, is_concrete
+from jaxslam.core.record import record, static
 from jaxslam.graphs.solver.kernels import Kernel
-from jaxslam.matching.correspondences import Rule, nearest_points, weights
+from jaxslam.matching.correspondences import nearest_points, weights
 from jaxslam.matching.icp.closed_form import Quadratic, added, least, linearized, of_prior
 from jaxslam.matching.matcher import Match, Matcher
 from jaxslam.matching.outcome import (
@@ -22,56 +22,54 @@ from jaxslam.matching.outcome import (
 )
 from jaxslam.matching.points import Points
 from jaxslam.matching.prior import Prior, prior_cost, prior_terms
-from jaxslam.matching.surface import Surface, surface
+from jaxslam.matching.surface import GAP, SPAN, Surface, surface
 from jaxslam.math import linalg, se2
 from jaxslam.math.angles import wrap
+from jaxslam.math.arrays import Number, in_dtype
 
 
-@dataclass(frozen=True)
+@record
 class IcpSettings:
-    """The numbers of `point_to_point` and `point_to_line`; ValueError if out of range."""
+    """The numbers of `PointToPoint` and `PointToLine`; ValueError if out of range."""
 
-    reach: float = 0.5
+    reach: Number = 0.5
     """largest distance of partners [m]"""
-    trim: float = 1.0
-    """share of the pairs that is kept at each step, those of the smallest residuals"""
+    trim: Number | None = None
+    """share of the pairs kept at each step, those of the smallest residuals; None for all"""
     kernel: Kernel | None = None
     """robust, as `graphs.Huber()`, of (residual/scale)²; None for squares"""
-    scale: float = 0.1
+    scale: Number = 0.1
     """[m] of the kernel and of `Match.score`"""
-    span: int = 5
+    span: int = static(default=SPAN)
     """neighbours on each side that a line is fitted to"""
-    gap: float = 0.5
+    gap: Number = GAP
     """[m] between points beyond which they are not neighbours"""
-    lone: float = 0.0
-    """of `point_to_line`: the factor of the distance from a point that has no line, as in clutter;
-    0 leaves such points out"""
-    iterations: int = 200
+    lone: Number | None = None
+    """of `PointToLine`: the factor of the distance from a point that has no line, as in clutter;
+    None leaves such points out"""
+    iterations: int = static(default=200)
     """at most"""
-    tolerance: float = 1e-6
+    tolerance: Number = 1e-6
     """of convergence: the motion of a step [m], angles times the RMS range"""
-    fewest: int = 10
+    fewest: int = static(default=10)
     """pairs below which the status is TOO_FEW"""
-    least_score: float = 0.5
+    least_score: Number = 0.5
     """`Match.score` below which it is UNLIKE"""
-    least_condition: float = 0.01
-    """`Match.condition` below which it is DEGENERATE"""
+    least_condition: Number | None = 0.01
+    """`Match.condition` below which it is DEGENERATE; None: never"""
 
     def __post_init__(self) -> None:
-        lengths = (self.reach, self.scale, self.gap, self.tolerance)
-        if not (all(length > 0 for length in lengths) and 0 < self.trim <= 1):
-            raise ValueError(
-                "IcpSettings: expected reach, scale, gap and tolerance above 0 and trim in (0, 1], "
-                f"got {self.reach}, {self.scale}, {self.gap}, {self.tolerance}, {self.trim}"
-            )
-        if self.span < 1 or self.iterations < 1 or not (self.lone >= 0 and self.fewest >= 0):
-            raise ValueError(
-                "IcpSettings: expected span and iterations >= 1, lone and fewest >= 0, got "
-                f"{self.span}, {self.iterations}, {self.lone}, {self.fewest}"
-            )
-
-
-DEFAULT = IcpSettings()
+        name, trim = "IcpSettings", self.trim
+        check_positive(name, reach=self.reach, scale=self.scale, gap=self.gap)
+        check_positive(name, tolerance=self.tolerance)
+        for optional in ("lone", "least_condition"):
+            if getattr(self, optional) is not None:
+                check_positive(name, **{optional: getattr(self, optional)})
+        check_count(f"{name}: span", self.span)
+        check_count(f"{name}: iterations", self.iterations)
+        check_count(f"{name}: fewest", self.fewest, 0)
+        if trim is not None and is_concrete(trim) and not 0 < trim <= 1:
+            raise ValueError(f"{name}: expected trim in (0, 1], got {trim}")
 
 
 class PairedPoints(NamedTuple):
@@ -85,39 +83,52 @@ class PairedPoints(NamedTuple):
     weight: Float[Array, "N"]
 
 
-class Metric(NamedTuple):
-    """The cost that an ICP minimizes: its residuals, its pairs and its quadratic form."""
-
-    residual: Callable[[Surface, Array, Array], Array]
-    """(surface, moved points, partners) -> (N,) [m]"""
-    usable: Callable[[Surface], Bool[Array, "M"]]
-    """which points of the reference may be partners"""
-    quadratic: Callable[[Surface, PairedPoints, Array], Quadratic]
-    """(surface, pairs, middle (2,)) -> Σ w e² of a motion about the middle"""
-    cost: Callable[[Surface, Array, Array, Array], Array]
-    """(surface, moved points, partners, weights) -> ½ Σ w e²"""
-
-
 _State: TypeAlias = tuple[Array, Array, Array, Array]
 """iterations, pose, the pose before, how far the last step went"""
 
 
-def icp(name: str, metric: Metric, settings: IcpSettings) -> Matcher:
-    """The matcher of a metric."""
-    reach, iterations, tolerance = settings.reach, settings.iterations, settings.tolerance
-    rule = Rule(reach, settings.trim, settings.kernel, settings.scale)
-    limits = Limits(settings.fewest, settings.least_score, settings.least_condition)
+class Icp(Matcher):
+    """An iterative closest point method: a subclass has the cost of pairs and its minimum."""
 
-    def pairs_at(of: Surface, points: Points, pose: Array) -> PairedPoints:
-        moved = points.position @ se2.rotation(pose[2]).T + pose[None, :2]
-        partner = nearest_points(of.position, moved)
-        distance = ((moved - of.position[partner]) ** 2).sum(axis=1)
-        possible = points.valid & (distance < reach**2) & metric.usable(of)[partner]
-        residual = jnp.where(possible, metric.residual(of, moved, partner), 0.0)
-        return PairedPoints(moved, partner, residual, weights(rule, residual, possible))
+    settings: IcpSettings
 
-    def match(of: Surface, points: Points, start: Array, prior: Prior | None = None) -> Match:
-        length = length_of(points)
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not isinstance(self.settings, IcpSettings):
+            got = type(self.settings).__name__
+            raise ValueError(f"{type(self).__name__}: expected settings of IcpSettings, got {got}")
+
+    def residual(self, of: Surface, moved: Array, partner: Array) -> Float[Array, "N"]:
+        """The residual [m] of each point of a scan and its partner."""
+        raise NotImplementedError
+
+    def usable(self, of: Surface) -> Bool[Array, "M"]:
+        """Which points of the reference may be partners."""
+        return jnp.ones_like(of.straight)
+
+    def quadratic(self, of: Surface, pairs: PairedPoints, middle: Array) -> Quadratic:
+        """The cost Σ w e² of a motion about a middle (2,)."""
+        raise NotImplementedError
+
+    def cost_of_pairs(
+        self, of: Surface, moved: Array, partner: Array, weight: Array
+    ) -> Float[Array, ""]:
+        """The cost ½ Σ w e²."""
+        raise NotImplementedError
+
+    def prepare(self, reference: Points) -> Surface:
+        return surface(reference, self.settings.span, self.settings.gap)
+
+    def match(
+        self,
+        prepared: Surface,
+        points: Points,
+        start: Float[Array, "3"],
+        prior: Prior | None = None,
+    ) -> Match:
+        icp = in_dtype(self, start.dtype)
+        settings, length = icp.settings, length_of(points)
+        limits = Limits(settings.fewest, settings.least_score, settings.least_condition)
 
         def within(of: Quadratic, middle: Array, onto: Array, pose: Array) -> Array:
             arm = middle - pose[:2]
@@ -129,18 +140,18 @@ def icp(name: str, metric: Metric, settings: IcpSettings) -> Matcher:
 
         def unfinished(state: _State) -> Array:
             k, _, _, change = state
-            return jnp.asarray((k < iterations) & (change > tolerance))
+            return jnp.asarray((k < settings.iterations) & (change > settings.tolerance))
 
         def step(state: _State) -> _State:
             k, pose, before, _ = state
-            pairs = pairs_at(of, points, pose)
+            pairs = icp._pairs(prepared, points, pose)
             total = pairs.weight.sum()
             middle = pairs.weight @ pairs.moved / jnp.where(total > 0, total, 1.0)
-            quadratic = metric.quadratic(of, pairs, middle)
+            quadratic = icp.quadratic(prepared, pairs, middle)
             both = quadratic
             if prior is not None:
                 both = added(quadratic, of_prior(prior, pose, middle))
-            information = _information(of, pairs, pose[:2], settings.lone)
+            information = _information(prepared, pairs, pose[:2], settings.lone)
             onto = determined(information, length, limits.condition)
             # The exact step where the scans determine all of it, else that of Gauss and Newton.
             moved = jnp.where(
@@ -157,7 +168,7 @@ def icp(name: str, metric: Metric, settings: IcpSettings) -> Matcher:
         far = jnp.full(3, jnp.inf, start.dtype).at[2].set(0.0)
         first = jnp.zeros((), jnp.int32), start, far, jnp.asarray(jnp.inf, start.dtype)
         k, pose, _, change = jax.lax.while_loop(unfinished, step, first)
-        at = pairs_at(of, points, pose)
+        at = icp._pairs(prepared, points, pose)
         return concluded(
             start,
             pose,
@@ -165,23 +176,32 @@ def icp(name: str, metric: Metric, settings: IcpSettings) -> Matcher:
             residual=at.residual,
             weight=at.weight,
             pair=at.partner,
-            information=_information(of, at, pose[:2], settings.lone),
+            information=_information(prepared, at, pose[:2], settings.lone),
             spread=settings.scale,
             iterations=k,
-            converged=change <= tolerance,
+            converged=change <= settings.tolerance,
             limits=limits,
             prior=prior,
         )
 
-    def cost(of: Surface, points: Points, pose: Array, found: Match) -> Array:
+    def cost(
+        self, prepared: Surface, points: Points, pose: Float[Array, "3"], match: Match
+    ) -> Float[Array, ""]:
+        icp = in_dtype(self, pose.dtype)
         moved = points.position @ se2.rotation(pose[2]).T + pose[None, :2]
-        of_pairs = metric.cost(of, moved, jnp.maximum(found.pair, 0), found.weight)
-        return of_pairs + prior_cost(found.prior, pose)
+        partner = jnp.maximum(match.pair, 0)
+        of_pairs = icp.cost_of_pairs(prepared, moved, partner, match.weight)
+        return of_pairs + prior_cost(match.prior, pose)
 
-    def prepare(reference: Points) -> Surface:
-        return surface(reference, settings.span, settings.gap)
-
-    return Matcher(name, prepare, match, cost)
+    def _pairs(self, of: Surface, points: Points, pose: Array) -> PairedPoints:
+        settings = self.settings
+        moved = points.position @ se2.rotation(pose[2]).T + pose[None, :2]
+        partner = nearest_points(of.position, moved)
+        distance = ((moved - of.position[partner]) ** 2).sum(axis=1)
+        possible = points.valid & (distance < settings.reach**2) & self.usable(of)[partner]
+        residual = jnp.where(possible, self.residual(of, moved, partner), 0.0)
+        weight = weights(residual, possible, settings.kernel, settings.scale, settings.trim)
+        return PairedPoints(moved, partner, residual, weight)
 
 
 def _size(a: Array, b: Array, length: Array) -> Array:
@@ -190,13 +210,13 @@ def _size(a: Array, b: Array, length: Array) -> Array:
 
 
 def _information(
-    of: Surface, at: PairedPoints, pivot: Float[Array, "2"], lone: float
+    of: Surface, at: PairedPoints, pivot: Float[Array, "2"], lone: Number | None
 ) -> Float[Array, "3 3"]:
     """The information Σ w J Jᵀ about the pivot, of partners with a line and of those without."""
     j, arm = at.partner, at.moved - pivot[None]
     straight = of.straight[j]
     by_lines = information_along(of.normal[j], of.tilt[j], arm, jnp.where(straight, at.weight, 0.0))
-    if lone == 0:
+    if lone is None:
         return by_lines
     weight = lone**2 * jnp.where(straight, 0.0, at.weight)
     axis = jnp.zeros_like(arm).at[:, 0].set(1.0)

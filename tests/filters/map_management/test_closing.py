@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam import association, charts, motion, programs, sensors, slots
+from jaxslam import association, charts, motion, sensors, slots
 from jaxslam.filters import EifSlam, EkfSlam
 from jaxslam.filters.map_management.closing import Closing
 from jaxslam.filters.map_management.loop_closure import LoopSettings, close_loop
@@ -56,7 +56,7 @@ def two_visits(seed=0, drift=4.0, shape=0.05, symmetric=False):
 def look(joint, **options):
     """By a program for all values of the options that are no integers."""
     closed = partial(close_loop, chart=EUCLIDEAN, settings=LoopSettings(**(OPTIONS | options)))
-    return programs.call(closed, (), joint)
+    return jax.jit(closed)(joint)
 
 
 MERGE = jax.jit(lambda joint, k, m: merge_landmarks(joint, EUCLIDEAN, k, m))

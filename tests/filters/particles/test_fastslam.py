@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import worlds
 
-from jaxslam import association, life, motion, programs, resampling, sensors
+from jaxslam import association, life, motion, resampling, sensors
 from jaxslam.consistency.score import _counted
 from jaxslam.filters import FastSlam
 from jaxslam.filters.particles.states import moments
@@ -52,9 +52,10 @@ def driven(world="ring", proposal="measurement", **options):
     return jax.device_get(drive(filter, log, world)), truth, log
 
 
+@jax.jit
 def updated(filter, state, scan):
     """One update, by a program that filters of one structure share."""
-    return jax.device_get(programs.call(filter.update, (), state, scan, KEY))
+    return filter.update(state, scan, KEY)
 
 
 PROPOSALS = pytest.mark.parametrize("proposal", ["motion", "measurement"])
