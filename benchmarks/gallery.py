@@ -2,13 +2,11 @@
 
 A picture is made by a script of its name in `examples/gallery/`, which binds `figure`. Those of
 data sets take a folder as their argument; where it is absent, their pictures are left as they are
-(JAXSLAM_DATA, by default ../shared/data beside the checkout). A picture holds the hash of its
-script, so that a test finds one that is no longer its script's.
+(JAXSLAM_DATA, by default ../shared/data beside the checkout).
 """
 
 import argparse
 import ast
-import hashlib
 import io
 import runpy
 import sys
@@ -16,7 +14,6 @@ import time
 from pathlib import Path
 
 from PIL import Image
-from PIL.PngImagePlugin import PngInfo
 
 from benchmarks.real_data import DATA
 
@@ -95,11 +92,6 @@ def scripts() -> dict[str, Path]:
     return {path.stem: path for kind in PARTS for path in sorted((SCRIPTS / kind).glob("*.py"))}
 
 
-def digest(script: Path) -> str:
-    """What a picture holds of its script."""
-    return hashlib.sha256(script.read_text(encoding="utf-8").encode()).hexdigest()
-
-
 def draw(name: str, script: Path) -> Path | None:
     """Run a script and write its picture; None where its data is absent."""
     folder = FOLDERS.get(name)
@@ -112,11 +104,9 @@ def draw(name: str, script: Path) -> Path | None:
         sys.argv = before
     drawn = io.BytesIO()
     figure.savefig(drawn, format="png", dpi=DOTS)
-    made_by = PngInfo()
-    made_by.add_text("script", digest(script))
     PICTURES.mkdir(parents=True, exist_ok=True)
     path = PICTURES / f"{name}.png"
-    Image.open(drawn).convert("RGB").quantize(COLOURS).save(path, optimize=True, pnginfo=made_by)
+    Image.open(drawn).convert("RGB").quantize(COLOURS).save(path, optimize=True)
     return path
 
 

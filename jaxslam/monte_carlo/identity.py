@@ -9,6 +9,7 @@ comment or a renamed file is not. Not seen: what other packages compute, and fla
 import dataclasses
 import functools
 import hashlib
+import importlib.resources
 import inspect
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
@@ -20,10 +21,11 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
 
-import jaxslam
 from jaxslam.core.record import is_record
 from jaxslam.protocols import Candidate
 from jaxslam.simulation.worlds import World
+
+_PACKAGE = Path(str(importlib.resources.files("jaxslam")))
 
 _OF_WORLD = ("landmarks", "controls", "pose", "pose_cov", "motion", "sensor")
 """Parts of a world that are named where they differ."""
@@ -129,9 +131,9 @@ def _text_of_function(function: FunctionType, within: tuple[object, ...]) -> str
 def _of_user(function: FunctionType) -> bool:
     """Whether code is neither of the package, nor of Python, nor of an installed package."""
     path = Path(function.__code__.co_filename)
-    package, python = Path(jaxslam.__file__).parent, Path(inspect.__file__).parent
+    python = Path(inspect.__file__).parent
     installed = {"site-packages", "dist-packages"} & set(path.parts)
-    return not (installed or path.is_relative_to(package) or path.is_relative_to(python))
+    return not (installed or path.is_relative_to(_PACKAGE) or path.is_relative_to(python))
 
 
 def _name(value: object) -> str:
@@ -161,8 +163,8 @@ def _version(name: str) -> str:
 @functools.cache
 def _source() -> str:
     """A digest of every source file of the package."""
-    package, total = Path(jaxslam.__file__).parent, hashlib.sha256()
-    for path in sorted(package.rglob("*.py")):
-        total.update(f"{path.relative_to(package).as_posix()}\n".encode())
+    total = hashlib.sha256()
+    for path in sorted(_PACKAGE.rglob("*.py")):
+        total.update(f"{path.relative_to(_PACKAGE).as_posix()}\n".encode())
         total.update(path.read_bytes().replace(b"\r\n", b"\n"))
     return total.hexdigest()[:16]

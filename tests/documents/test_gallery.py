@@ -1,4 +1,4 @@
-"""The gallery shows everything, and its pictures are those of its scripts.
+"""The gallery shows everything.
 
 The scripts are run by `make docs` and `python -m benchmarks.gallery`; here one of them is, and the
 names in the others are looked up.
@@ -10,7 +10,6 @@ import runpy
 from pathlib import Path
 
 import pytest
-from PIL import Image
 
 import jaxslam
 from benchmarks import gallery
@@ -50,22 +49,13 @@ def test_the_page_shows_every_script_with_its_picture():
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
-def test_a_picture_is_small_and_of_its_script(name):
-    path = gallery.PICTURES / f"{name}.png"
-    assert path.stat().st_size < 60_000
-    with Image.open(path) as picture:
-        assert picture.text["script"] == gallery.digest(SCRIPTS[name]), (
-            f"the script has changed since: python -m benchmarks.gallery {name}"
-        )
-
-
-@pytest.mark.parametrize("name", SCRIPTS)
 def test_a_script_is_short_and_names_what_there_is(name):
     tree = ast.parse(SCRIPTS[name].read_text(encoding="utf-8"))
     said = ast.get_docstring(tree)
     assert said and "\n" not in said
     body = [node for node in tree.body[1:] if not isinstance(node, ast.Import | ast.ImportFrom)]
     assert len(body) <= 14
+    assert (gallery.PICTURES / f"{name}.png").stat().st_size < 60_000
     for node in ast.walk(tree):
         if isinstance(node, ast.Attribute):
             path = ast.unparse(node)
