@@ -16,6 +16,7 @@ from jaxslam.core.numbers import (
     largest,
     shape_told,
 )
+from jaxslam.math.xla import hot_jit
 from jaxslam.protocols import Filter
 from jaxslam.types import Log, Scan, Status, Trace
 from jaxslam.validation import check_record, checked_estimate, same_state, state_and_info
@@ -58,8 +59,7 @@ def run(
     check_record("run", "log", log, Log)
     check_run("run", filter, log, pose, pose_cov)
     check_key("run", key)
-    trace: Trace = _drive(filter, log, pose, pose_cov, key, probe)
-    return trace
+    return _drive(filter, log, pose, pose_cov, key, probe)
 
 
 def check_run(name: str, filter: Filter, log: Log, pose: ArrayLike, pose_cov: ArrayLike) -> None:
@@ -83,7 +83,7 @@ def check_run(name: str, filter: Filter, log: Log, pose: ArrayLike, pose_cov: Ar
     check_covariance(f"{name}: pose_cov", pose_cov, 3)
 
 
-@partial(jax.jit, static_argnames="probe", inline=True)
+@partial(hot_jit, static_argnames=("probe",))
 def _drive(
     filter: Filter,
     log: Log,

@@ -1,7 +1,6 @@
 """The forward pass of a smoother: EKF-SLAM over the log, which stores its linearization points."""
 
 import dataclasses
-from functools import partial
 from typing import Any, NamedTuple
 
 import jax
@@ -16,6 +15,7 @@ from jaxslam.core.record import hold_function, record, set_field, static
 from jaxslam.filters.ekf.ekf_slam import EkfSlam
 from jaxslam.filters.ekf.settings import check_ekf_options
 from jaxslam.math.arrays import Number
+from jaxslam.math.xla import hot_jit
 from jaxslam.protocols import Associate, Component, Filter, Motion, Sensor, Wrapper
 from jaxslam.run import check_run, run
 from jaxslam.sensors.suite import Suite
@@ -134,8 +134,7 @@ class LogEstimator(Component):
 
     def __call__(self, log: Log, key: Array) -> Trace:
         check_run(self.name, self._filter, log, self.pose, self.pose_cov)
-        trace: Trace = _solve(self, log, key)
-        return trace
+        return _solve(self, log, key)
 
     @property
     def _filter(self) -> Filter:
@@ -152,7 +151,7 @@ class LogEstimator(Component):
         return ForwardPass(trace._replace(final=trace.final.joint, probe=None), *trace.probe)
 
 
-@partial(jax.jit, inline=True)
+@hot_jit
 def _solve(estimator: LogEstimator, log: Log, key: Array) -> Trace:
     return estimator.solve(log, key)
 
