@@ -3,7 +3,7 @@
     python -m benchmarks [--quick] [--only NAME,…] [--record]
 
 A table of every metric with the range it must lie in; the exit status is 1 if one is missed.
-`--record` writes RESULTS.md. Most parts are also a program of their own, with options.
+`--record` writes records/NAME.json and RESULTS.md. Most parts are also a program of their own, with options.
 """
 
 import argparse
@@ -158,7 +158,7 @@ def main(names: Sequence[str] = ()) -> int:
     parser = argparse.ArgumentParser(prog="python -m benchmarks", description=__doc__)
     parser.add_argument("--quick", action="store_true", help="fewer runs, no campaigns of cloister")
     parser.add_argument("--only", default="", help="names of benchmarks, separated by commas")
-    parser.add_argument("--record", action="store_true", help="write RESULTS.md")
+    parser.add_argument("--record", action="store_true", help="write records and RESULTS.md")
     options = parser.parse_args()
     known = parts(options.quick)
     wanted = (

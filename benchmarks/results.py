@@ -1,11 +1,12 @@
-"""RESULTS.md: what the benchmarks printed, written by themselves, a section for each."""
+"""The record of each benchmark, records/NAME.json, and RESULTS.md: a table of each."""
 
 import contextlib
 import datetime
 import io
+import json
+import math
 import os
 import platform
-import re
 import sys
 from collections.abc import Callable, Iterator
 from importlib.metadata import version
@@ -14,13 +15,13 @@ from pathlib import Path
 from benchmarks.consistency.markdown import table
 from benchmarks.gate import Metric
 
-FILE = Path(__file__).with_name("RESULTS.md")
+FILE, RECORDS = Path(__file__).with_name("RESULTS.md"), Path(__file__).with_name("records")
 LIBRARIES = ("jax", "numpy")
 HEAD = """# Results
 
-Written by `python -m benchmarks --record [--only NAME,…]`, a section for each benchmark; nothing
-here is typed by hand. [README.md](README.md) says what each benchmark does. A gate is the range in
-which a result must lie.
+Written by `python -m benchmarks --record [--only NAME,…]`, a table for each benchmark; nothing here
+is typed by hand. [README.md](README.md) says what each benchmark does. A gate is the range in which
+a result must lie. All numbers, and what each printed, are in [records](records), a file each.
 """
 
 
@@ -57,47 +58,55 @@ def processor() -> str:
 
 
 def measured(name: str, measure: Callable[[], list[Metric]], command: str) -> list[Metric]:
-    """The metrics of a benchmark; they and what it printed become its section of RESULTS.md."""
+    """The metrics of a benchmark; they and what it printed become its record."""
     with screen() as kept:
         metrics = measure()
     versions = ", ".join(
         [f"Python {platform.python_version()}", *(f"{each} {version(each)}" for each in LIBRARIES)]
     )
-    lines = [f"`{command}`, {datetime.date.today().isoformat()}; {processor()}; {versions}.", ""]
-    if metrics:
-        rows = [[m.name, f"{m.value:.4g}", gate(m), m.note] for m in metrics]
-        lines += [table(["metric", "value", "gate", ""], rows), ""]
-    if printed := kept.getvalue().strip("\n"):
-        lines += [printed if "| --- |" in printed else f"```text\n{printed}\n```", ""]
-    write(name, "\n".join(lines))
+    record = {
+        "command": command,
+        "date": datetime.date.today().isoformat(),
+        "processor": processor(),
+        "versions": versions,
+        "metrics": [
+            {
+                "name": m.name,
+                "value": float(f"{m.value:.6g}"),
+                "low": m.low if m.low > float("-inf") else None,
+                "high": m.high if m.high < float("inf") else None,
+                "note": m.note,
+            }
+            for m in metrics
+        ],
+        "printed": kept.getvalue().strip("\n").split("\n"),
+    }
+    text = json.dumps(record, indent=1, ensure_ascii=False) + "\n"
+    (RECORDS / f"{name}.json").write_text(text, encoding="utf-8")
+    FILE.write_text(page(), encoding="utf-8")
     return metrics
 
 
-def gate(metric: Metric) -> str:
+def page() -> str:
+    """RESULTS.md: of each record its metrics with their gates."""
+    parts = [HEAD]
+    for path in sorted(RECORDS.glob("*.json")):
+        record = json.loads(path.read_text(encoding="utf-8"))
+        made = ", ".join(record[part] for part in ("date", "processor", "versions"))
+        parts.append(f"## {path.stem}\n\n{made}\n")
+        rows = [[m["name"], f"{m['value']:.4g}", gate(**m), m["note"]] for m in record["metrics"]]
+        heads = ["metric", "value", "gate", "note"]
+        if not any(m["note"] for m in record["metrics"]):
+            rows, heads = [row[:3] for row in rows], heads[:3]
+        parts.append(table(heads, rows).strip() + "\n")
+    return "\n".join(parts)
+
+
+def gate(value: float, low: float | None, high: float | None, **_: str) -> str:
     """The range of a metric in words, and whether it was missed."""
-    low, high = metric.low, metric.high
-    text = {
-        (False, False): "",
-        (True, False): f"at least {low:.4g}",
-        (False, True): f"at most {high:.4g}",
-        (True, True): f"{low:.4g} to {high:.4g}",
-    }[low > float("-inf"), high < float("inf")]
-    return text if metric.passes else f"{text} (missed)"
-
-
-def recorded() -> dict[str, str]:
-    """The sections of RESULTS.md, by name."""
-    if not FILE.exists():
-        return {}
-    parts = re.split(r"^## (\w+)$", FILE.read_text(encoding="utf-8"), flags=re.MULTILINE)
-    return dict(zip(parts[1::2], parts[2::2], strict=True))
-
-
-def write(name: str, text: str) -> None:
-    """Put a section in its place among the others, in alphabetical order; the rest stays."""
-    sections = recorded()
-    sections[name] = f"\n\n{text.strip()}\n\n"
-    body = "".join(f"## {each}{sections[each]}" for each in sorted(sections))
-    written = FILE.with_suffix(".new")
-    written.write_text(f"{HEAD}\n{body}".rstrip() + "\n", encoding="utf-8")
-    written.replace(FILE)
+    if low is None and high is None:
+        return ""
+    text = f"{low:.4g} … {high:.4g}" if low is not None and high is not None else ""
+    text = text or (f"≥ {low:.4g}" if high is None else f"≤ {high:.4g}")
+    least, most = (-math.inf if low is None else low), (math.inf if high is None else high)
+    return text if least <= value <= most else f"{text} (missed)"

@@ -1,4 +1,4 @@
-"""Scan matching: `python -m benchmarks.scan_matching [--quick] [--redraw]`.
+"""Scan matching: `python -m benchmarks.scan_matching [--quick]`.
 
 Censi's experiment (square, corridor, circular room; σ = 0.03 m; 300 runs) and `office`: pairs of
 scans at random poses of the world's path, the second up to 0.2 m, 0.1 m and 0.1 rad from the first,
@@ -7,15 +7,14 @@ over the directions that the exact world says the scans determine, and errors be
 bound. What the documentation recommends is judged again on other draws: the scale of its kernel was
 chosen on the first.
 Then 361-beam scans: matches a second and core, errors at σ = 0.01 m, errors over iterations.
-Draws `figures/scan_matching_nees.png` and `figures/scan_matching_convergence.png`. `--redraw` draws
-the first of the numbers in RESULTS.md, without a run.
+Draws `figures/scan_matching_nees.png` and `figures/scan_matching_convergence.png`.
 """
 
 import numpy as np
 
 from benchmarks.consistency.markdown import table
 from benchmarks.gate import Metric, alone
-from benchmarks.scan_matching import draw, numbers, record
+from benchmarks.scan_matching import draw, numbers
 from benchmarks.scan_matching.honesty import (
     COVARIANCES,
     MATCHERS,
@@ -27,10 +26,7 @@ from benchmarks.scan_matching.honesty import (
 )
 
 
-def measure(quick: bool = False, redraw: bool = False) -> list[Metric]:
-    if redraw:
-        draw.save(draw.nees(*record.tables()), "scan_matching_nees")
-        return []
+def measure(quick: bool = False) -> list[Metric]:
     matcher = RECOMMENDED[0]
     first, other = judged(30 if quick else 300, {0: tuple(MATCHERS), 1000: (matcher,)}).values()
     rows, errors = first
@@ -97,6 +93,5 @@ def honest(rows: list[Row], draws: str) -> list[Metric]:
 
 
 if __name__ == "__main__":
-    told = {"quick": "30 runs", "redraw": "the figure alone, of the recorded numbers"}
-    flags = {name: {"action": "store_true", "help": text} for name, text in told.items()}
-    raise SystemExit(alone("scan_matching", measure, **flags))
+    quick = {"action": "store_true", "help": "30 runs"}
+    raise SystemExit(alone("scan_matching", measure, quick=quick))

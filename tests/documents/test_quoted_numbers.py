@@ -1,12 +1,15 @@
-"""Numbers that pages quote from benchmarks are those of benchmarks/RESULTS.md."""
+"""Numbers that pages quote from benchmarks are those of benchmarks/records."""
 
 import functools
+import json
 import re
 from collections.abc import Iterator
 from typing import NamedTuple
 
 import numpy as np
 from test_docs import PAGES, ROOT
+
+from benchmarks import results
 
 NUMBER = r"-?\d[\d,]*(?:\.\d+)?(?:e[+-]?\d+)?"
 QUOTED = rf"(?<![\w.,/-]){NUMBER}(?![\w/])"
@@ -92,12 +95,16 @@ def is_result(page: str, number: str) -> bool:
 @functools.cache
 def sections() -> dict[str, str]:
     """The record by benchmark, without dates, versions and gates."""
-    text = (ROOT / "benchmarks" / "RESULTS.md").read_text(encoding="utf-8")
-    text = re.sub(r"^`python -m benchmarks.*$", "", text, flags=re.MULTILINE)
-    gate = r"^(\|[^|\n]*\|[^|\n]*\|) (?:at most|at least|\S+ to) [^|\n]*(\|[^|\n]*\|)$"
-    text = re.sub(gate, r"\1\2", text, flags=re.MULTILINE)
-    parts = re.split(r"^## (\w+)$", text, flags=re.MULTILINE)
-    return dict(zip(parts[1::2], parts[2::2], strict=True))
+    out = {}
+    for path in (ROOT / "benchmarks" / "records").glob("*.json"):
+        record = json.loads(path.read_text(encoding="utf-8"))
+        rows = [f"| {m['name']} | {m['value']} | {m['note']} |" for m in record["metrics"]]
+        out[path.stem] = "\n".join([*rows, *record["printed"]])
+    return out
+
+
+def test_the_page_of_results_is_that_of_the_records():
+    assert results.FILE.read_text(encoding="utf-8") == results.page()
 
 
 @functools.cache
