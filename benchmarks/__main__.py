@@ -3,7 +3,8 @@
     python -m benchmarks [--quick] [--only NAME,…] [--record]
 
 A table of every metric with the range it must lie in; the exit status is 1 if one is missed.
-`--record` writes records/NAME.json and RESULTS.md. Most parts are also a program of their own, with options.
+`--record` writes records/NAME.json and RESULTS.md. Most parts are also a program of their own, with
+options.
 """
 
 import argparse
