@@ -319,7 +319,7 @@ def run_from(pose, pose_cov=WORLD.pose_cov):
     ("call", "told"),
     [
         (lambda: jaxslam.simulate(jaxslam.scenarios.circle, KEY), "call it, circle"),
-        (lambda: jaxslam.simulate(KEY, WORLD), "scenario to be a Scenario"),
+        (lambda: jaxslam.simulate(KEY, WORLD), "scenario to be a World"),
         (lambda: jaxslam.run(WORLD, LOG, np.zeros(3), np.eye(3), KEY), "filter to be a Filter"),
         (lambda: jaxslam.run(EKF, WORLD, np.zeros(3), np.eye(3), KEY), "log to be a Log, got Scen"),
         (
