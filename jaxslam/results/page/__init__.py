@@ -39,7 +39,6 @@ def page(
     versions: Mapping[str, str],
     figures: Mapping[str, tuple[str, Figure]],
     draw: Callable[[Figure], bytes] = png,
-    film: str = "",
 ) -> str:
     """The HTML report of a campaign.
 
@@ -52,8 +51,6 @@ def page(
         figures: in order, by name, each with its caption. Those of the names of `curves.py` are
             drawn by the script, too.
         draw: makes a PNG file of a figure; with a cache where the files are needed elsewhere, too.
-        film: a fragment of HTML above the figures. It is not escaped; its scripts run if they stand
-            in it, in elements without attributes.
     """
     heading = f"{campaign.scenario}: consistency of {with_noun(len(campaign.filters), 'filter')}"
     shown = _figures(figures, draw)
@@ -83,7 +80,6 @@ same draws.</p>
 <h2>How to read it</h2>
 {_conventions(campaign)}
 </section>
-{f"<section><h2>Film</h2>{film}</section>" if film else ""}
 {f"<section><h2>Figures</h2>{shown}</section>" if shown else ""}
 <section>
 <h2>Parameters</h2>
@@ -91,7 +87,7 @@ same draws.</p>
 </section>
 </main>
 {scripts}"""
-    return html_page(heading, policy(film + scripts), CSS, body)
+    return html_page(heading, policy(scripts), CSS, body)
 
 
 def fragment(

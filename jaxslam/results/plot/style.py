@@ -9,6 +9,7 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Figure  # re-exported: only this package imports Matplotlib
+from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 
 Share: TypeAlias = bool | Literal["none", "all", "row", "col"]
@@ -62,13 +63,6 @@ def png(figure: Figure, dpi: float = 200) -> bytes:
     return out.getvalue()
 
 
-def warm_up() -> None:
-    """Load fonts and the formula renderer, which takes half a second once a process."""
-    figure, (axes, *_) = panels_of(1.0, 1.0, 1)
-    axes.set_title("$x^2$")
-    png(figure, dpi=10)
-
-
 def describe(figure: Figure) -> str:
     """A sentence that describes the figure, for readers who cannot see it."""
     panels = [
@@ -91,7 +85,8 @@ class _ShownFigure(Figure):
 
     def savefig(self, *args: Any, **options: Any) -> None:
         """Write the figure, as Matplotlib does it."""
-        if any(axes.get_aspect() != "auto" for axes in self.axes):
+        laid_out = isinstance(self.get_layout_engine(), ConstrainedLayoutEngine)
+        if laid_out and any(axes.get_aspect() != "auto" for axes in self.axes):
             self.draw_without_rendering()
         super().savefig(*args, **options)
 
