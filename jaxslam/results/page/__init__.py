@@ -1,8 +1,6 @@
-"""The report of a campaign as one self-contained HTML5 file; and as a fragment, without scripts.
+"""The report of a campaign as one self-contained HTML5 file; and as a fragment for a notebook.
 
-Figures are embedded, and the page forbids the browser to load anything else. Its script (`live.js`)
-draws the figures that have curves again, to be explored, from the numbers of `curves.py`; on paper
-and without JavaScript the page shows the static figures.
+Figures are embedded; there are no scripts, and the page forbids the browser to load anything else.
 """
 
 from collections.abc import Callable, Mapping, Sequence
@@ -10,8 +8,6 @@ from html import escape
 
 from jaxslam.consistency import LEVEL
 from jaxslam.monte_carlo import Campaign
-from jaxslam.results.files import html_page
-from jaxslam.results.page import curves
 from jaxslam.results.page.parts import (
     VERDICTS,
     badge,
@@ -20,7 +16,7 @@ from jaxslam.results.page.parts import (
     measures_table,
     verdict_list,
 )
-from jaxslam.results.page.style import CSS, FRAGMENT_CSS, SCRIPT, policy
+from jaxslam.results.page.style import CSS, FRAGMENT_CSS
 from jaxslam.results.page.text import duration, percentage, with_noun
 from jaxslam.results.plot import Figure, png
 
@@ -47,18 +43,16 @@ def page(
             label that starts with a space is indented. Rows that no filter has are left out.
         command, seed: those of the campaign; None where there was no seed.
         versions: of the software, by name.
-        figures: in order, by name, each with its caption. Those of the names of `curves.py` are
-            drawn by the script, too.
+        figures: in order, by name, each with its caption.
         draw: makes a PNG file of a figure; with a cache where the files are needed elsewhere, too.
     """
     heading = f"{campaign.scenario}: consistency of {with_noun(len(campaign.filters), 'filter')}"
-    data = curves.embedded_curves(campaign)
     sections = {
         "Verdicts": verdict_list(campaign),
         "Measures": measures_table(campaign, table) + measure_notes(campaign),
         "How to read it": _conventions(campaign),
         "Figures": _figures(figures, draw),
-        "Parameters": _parameters(campaign, command, seed, versions, data),
+        "Parameters": _parameters(campaign, command, seed, versions),
     }
     broad = {"Measures": ' class="broad"'} if len(campaign.filters) > _UPRIGHT else {}
     main = "\n".join(
@@ -66,9 +60,19 @@ def page(
         for title, content in sections.items()
         if content
     )
-    scripts = f"""<script type="application/json" id="curves">{data.text}</script>
-<script>{SCRIPT}</script>"""
-    body = f"""<header>
+    return f"""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<meta http-equiv="Content-Security-Policy"
+content="default-src 'none'; img-src data:; style-src 'unsafe-inline'">
+<title>{escape(heading)}</title>
+<style>{CSS}</style>
+</head>
+<body>
+<header>
 <p class="kicker">jaxslam · consistency report</p>
 <h1>{escape(heading)}</h1>
 <p class="lead">{_setup(campaign)}; every filter on the same draws.</p>
@@ -76,8 +80,9 @@ def page(
 <main>
 {main}
 </main>
-{scripts}"""
-    return html_page(heading, policy(scripts), CSS, body)
+</body>
+</html>
+"""
 
 
 def fragment(
@@ -112,8 +117,8 @@ def _setup(campaign: Campaign) -> str:
 def _figures(figures: Mapping[str, tuple[str, Figure]], draw: Callable[[Figure], bytes]) -> str:
     """The figures as HTML, numbered."""
     return "\n".join(
-        embedded_figure(i, name, caption, figure, draw(figure))
-        for i, (name, (caption, figure)) in enumerate(figures.items(), 1)
+        embedded_figure(i, caption, figure, draw(figure))
+        for i, (caption, figure) in enumerate(figures.values(), 1)
     )
 
 
@@ -136,16 +141,10 @@ of campaigns. An asterisk marks a verdict with a reservation:</p>
 
 
 def _parameters(
-    campaign: Campaign,
-    command: str,
-    seed: int | None,
-    versions: Mapping[str, str],
-    data: curves.Curves,
+    campaign: Campaign, command: str, seed: int | None, versions: Mapping[str, str]
 ) -> str:
     """The parameters of the campaign as HTML."""
     compiling = duration(campaign.compile_seconds)
-    size = f"{len(data.text.encode()) / 1e3:,.0f} kB, four digits, "
-    each = f"least and greatest of each {data.each} steps (consistency.csv has every step)"
     rows = {
         "scenario": campaign.scenario,
         "source": campaign.source,
@@ -156,7 +155,6 @@ def _parameters(
         "command": command,
         "divergence limit": f"{campaign.divergence_limit:.4g} m",
         "time": f"{duration(campaign.seconds)}, {compiling} of it compilation",
-        "curves on this page": size + ("every step" if data.each == 1 else each),
         "versions": ", ".join(f"{name} {number}" for name, number in versions.items()),
     }
     shown = (f"<dt>{name}</dt><dd>{escape(value)}</dd>" for name, value in rows.items() if value)

@@ -141,12 +141,12 @@ def measure_notes(campaign: Campaign) -> str:
     )
 
 
-def embedded_figure(number: int, name: str, caption: str, figure: Figure, drawn: bytes) -> str:
-    """A figure with its caption as HTML, the PNG file embedded; the script knows it by its name."""
+def embedded_figure(number: int, caption: str, figure: Figure, drawn: bytes) -> str:
+    """A figure with its caption as HTML, the PNG file embedded."""
     width, height = (round(96 * inches) for inches in figure.get_size_inches())
     data = base64.b64encode(drawn).decode("ascii")
     return (
-        f'<figure data-chart="{escape(name)}"><img width="{width}" height="{height}" '
+        f'<figure><img width="{width}" height="{height}" '
         f'alt="{escape(describe(figure))}" '
         f'src="data:image/png;base64,{data}">'
         f"<figcaption><strong>Figure {number}.</strong> {escape(caption)}</figcaption></figure>"

@@ -30,7 +30,7 @@ INK, FAINT, SHADE, RULE = "#333333", "#777777", "#bdbdbd", "#dddddd"
 """Colours of what is no filter's: lines and text, dead reckoning, bands, the grid."""
 
 HUES = (*COLORS[:4], "#c98500", "#7d5f1f")
-"""Colours of filters, those of the page too: its yellow and brown can be seen on a grey band."""
+"""Colours of filters; yellow and brown can be seen on a grey band."""
 
 _DASHES = ("-", (0, (5, 1.4)), (0, (1.4, 1.1)), (0, (6, 1.3, 1.4, 1.3)), (4.5, (9, 2)))
 _MARKS = ("o", "s", "^", "D", "v")
