@@ -12,7 +12,7 @@ from PIL import Image
 from jaxslam import plot
 from jaxslam.results.plot.scene.history import MOST, frame_steps
 
-COLORS = [(200, 0, 0), (0, 200, 0), (0, 0, 200)]
+COLORS = [(204, 0, 0), (0, 204, 0), (0, 0, 204)]
 
 
 @pytest.fixture

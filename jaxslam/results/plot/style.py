@@ -9,7 +9,6 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Figure  # re-exported: only this package imports Matplotlib
-from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.lines import Line2D
 
 Share: TypeAlias = bool | Literal["none", "all", "row", "col"]
@@ -85,8 +84,7 @@ class _ShownFigure(Figure):
 
     def savefig(self, *args: Any, **options: Any) -> None:
         """Write the figure, as Matplotlib does it."""
-        laid_out = isinstance(self.get_layout_engine(), ConstrainedLayoutEngine)
-        if laid_out and any(axes.get_aspect() != "auto" for axes in self.axes):
+        if any(axes.get_aspect() != "auto" for axes in self.axes):
             self.draw_without_rendering()
         super().savefig(*args, **options)
 

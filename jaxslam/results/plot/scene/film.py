@@ -25,7 +25,6 @@ from matplotlib.axes import Axes
 from matplotlib.backends.backend_agg import FigureCanvasAgg
 from matplotlib.figure import Figure
 from matplotlib.layout_engine import ConstrainedLayoutEngine
-from matplotlib.text import Text
 
 from jaxslam.core.numbers import check_count
 from jaxslam.results.plot.style import INK, PAGE, TEXT, TITLE, panels_of, titled
@@ -47,6 +46,9 @@ _SECONDS, _FASTEST, _SLOWEST = 10.0, 25.0, 2.0
 
 _EMBEDDED = 100.0
 """largest size of the player [MB]; Matplotlib leaves frames out above"""
+
+_LEVELS = (17 * np.rint(np.arange(256) / 17)).astype(np.uint8)
+"""The 16 levels of a colour that frames have: it is hardly seen, and halves their PNG files."""
 
 _ICON_FONT = """<link rel="stylesheet"
 href="https://maxcdn.bootstrapcdn.com/font-awesome/4.4.0/css/font-awesome.min.css">"""
@@ -108,16 +110,18 @@ class Film(FuncAnimation):
             if not 0 < value < np.inf:
                 raise ValueError(f"Film: expected {name} above 0, got {value}")
         self.scene = scene
-        figure, text, draws = _stage(scene, width)
+        stage = _Stage(scene, width)
+        figure = Figure(figsize=stage.size, dpi=_DPI)
+        axes = figure.add_axes((0, 0, 1, 1))
+        axes.set_axis_off()
+        image = axes.imshow(stage.picture(0), aspect="auto", interpolation="nearest")
 
-        def frame(k: int) -> list[Artist]:
-            for draw in draws:
-                draw(k)
-            text.set_text(scene.said(k))
-            return []
+        def draw(k: int) -> list[Artist]:
+            image.set_data(stage.picture(k))
+            return [image]
 
         options: dict[str, Any] = {"repeat": False, "cache_frame_data": False}
-        super().__init__(figure, frame, scene.frames, interval=1000 / fps, **options)
+        super().__init__(figure, draw, scene.frames, interval=1000 / fps, **options)
 
     def __del__(self) -> None:
         """Say nothing of a film that was never drawn, as Matplotlib would."""
@@ -163,46 +167,64 @@ def _writer_of(filename: str | Path) -> str:
     return "pillow" if kind == ".gif" else "ffmpeg"
 
 
-def _stage(scene: Scene, width: float) -> tuple[Figure, Text, list[Draw]]:
-    """The figure of a scene, its line of text, and the functions that draw a frame."""
-    height, widths = 0.645 * width, (2.15, 1.0)
-    if scene.beside is None:  # a column for the legend, and as low as the panel is
-        widths = (4.0, 1.0)
-        share = np.ptp(scene.main.ylim) / np.ptp(scene.main.xlim)
-        height = float(np.clip(0.75 * width * share + 0.4, 0.3 * width, 0.75 * width))
-    height += _HEAD
-    figure, (main, beside) = panels_of(width, height, 1, 2, share=(False, False), widths=widths)
-    FigureCanvasAgg(figure)
-    figure.set_dpi(_DPI)
-    engine = figure.get_layout_engine()
-    assert isinstance(engine, ConstrainedLayoutEngine)
-    engine.set(rect=(0.0, 0.0, 1.0, 1.0 - _HEAD / height))
-    draws = _furnish(main, scene.main)
-    beside.set_anchor("N")
-    if scene.beside is None:
-        beside.set_axis_off()
-    else:
-        draws += _furnish(beside, scene.beside)
-    _legend(main, beside)
-    left, line = 0.06 / width, 0.19 / height
-    figure.text(left, 1 - 0.04 / height, scene.title, size=TITLE, va="top", color=INK)
-    text = figure.text(left, 1 - 0.05 / height - line, "", size=TEXT, va="top")
-    for _ in range(2):  # the layout of axes of equal aspect takes two passes
-        figure.draw_without_rendering()
-    figure.set_layout_engine(None)  # or Matplotlib would draw each frame twice
-    return figure, text, draws
+class _Stage:
+    """The figure of a scene; what its layers have not made is drawn once, for speed."""
+
+    def __init__(self, scene: Scene, width: float) -> None:
+        height, widths = 0.645 * width, (2.15, 1.0)
+        if scene.beside is None:  # a column for the legend, and as low as the panel is
+            widths = (4.0, 1.0)
+            share = np.ptp(scene.main.ylim) / np.ptp(scene.main.xlim)
+            height = float(np.clip(0.75 * width * share + 0.4, 0.3 * width, 0.75 * width))
+        # Both sides even, as MP4 wants them.
+        across, tall = (2 * round(_DPI * part / 2) for part in (width, height + _HEAD))
+        self.size = across / _DPI, tall / _DPI
+        figure, (main, beside) = panels_of(*self.size, 1, 2, share=(False, False), widths=widths)
+        figure.set_dpi(_DPI)
+        self._canvas, self._said = FigureCanvasAgg(figure), scene.said
+        engine = figure.get_layout_engine()
+        assert isinstance(engine, ConstrainedLayoutEngine)
+        engine.set(rect=(0.0, 0.0, 1.0, 1.0 - _HEAD / self.size[1]))
+        self._draws, self._moving = _furnish(main, scene.main)
+        beside.set_anchor("N")
+        if scene.beside is None:
+            beside.set_axis_off()
+        else:
+            draws, moving = _furnish(beside, scene.beside)
+            self._draws, self._moving = self._draws + draws, self._moving + moving
+        _legend(main, beside)
+        left, line = 0.06 / self.size[0], 0.19 / self.size[1]
+        top = 1 - 0.05 / self.size[1]
+        figure.text(left, top, scene.title, size=TITLE, va="top", color=INK)
+        self._text = figure.text(left, top - line, "", size=TEXT, va="top", animated=True)
+        figure.draw_without_rendering()  # the layout of axes of equal aspect takes two passes
+        self._canvas.draw()
+        self._still = self._canvas.copy_from_bbox(figure.bbox)
+
+    def picture(self, k: int) -> np.ndarray:
+        """Frame k as an array (height, width, 3) of bytes."""
+        for draw in self._draws:
+            draw(k)
+        self._text.set_text(self._said(k))
+        self._canvas.restore_region(self._still)
+        for artist in (*self._moving, self._text):
+            self._canvas.figure.draw_artist(artist)
+        return _LEVELS[np.asarray(self._canvas.buffer_rgba())[:, :, :3]]
 
 
-def _furnish(axes: Axes, panel: Panel) -> list[Draw]:
-    """Set up the axes of a panel; returns the functions that draw a frame on them."""
+def _furnish(axes: Axes, panel: Panel) -> tuple[list[Draw], list[Artist]]:
+    """Set up the axes of a panel; returns what draws a frame, and what the layers made."""
     axes.set(xlim=panel.xlim, ylim=panel.ylim, xlabel=panel.xlabel, ylabel=panel.ylabel)
     axes.set(aspect="equal", autoscale_on=False)
     if panel.title:
         titled(axes, panel.title)
+    before = set(axes.get_children())
     draws = [layer(axes) for layer in panel.layers]
-    for line in axes.lines:  # an unclipped one without points would count as one at the corner
-        line.set_in_layout(False)
-    return draws
+    made = [artist for artist in axes.get_children() if artist not in before]
+    for artist in made:
+        artist.set_animated(True)
+        artist.set_in_layout(False)
+    return draws, sorted(made, key=lambda artist: artist.get_zorder())
 
 
 def _legend(main: Axes, beside: Axes) -> None:
