@@ -5,17 +5,18 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:  # Pillow is slow to load
-    from jaxslam.results.film import Film
+from jaxslam.monte_carlo.progress import Progress
+from jaxslam.results.files import Files
+
+if TYPE_CHECKING:  # Matplotlib is slow to load
+    from jaxslam.results.plot import Film
 
 
 NAMES = ("film.gif", "film.mp4", "film.html", "film-*.gif", "film-*.mp4", "film-*.html")
 """Patterns of the names of films: those of an earlier command do not stay beside its results."""
 
 
-def film_files(
-    films: Mapping[str, "Film"], *, suffixed: bool
-) -> dict[str, Callable[[Path], object]]:
+def film_files(films: Mapping[str, "Film"], *, suffixed: bool) -> Files:
     """The functions that write each film as MP4, or else GIF, and as a page; by file name.
 
     Prints in a line how many steps are shown, and why there is no MP4.
@@ -23,21 +24,28 @@ def film_files(
     Args:
         films: by the name of the filter, which the file has where suffixed.
     """
-    files: dict[str, Callable[[Path], object]] = {}
-    said: dict[str, None] = {}
-    for name, film in films.items():
-        kind, content, why = film.moving()
-        said |= dict.fromkeys(filter(None, (film.note, why)))
-        stem = f"film-{name}" if suffixed else "film"
-        for ending, held in ((kind, content), ("html", film.encoded("html"))):
-            files[f"{stem}.{ending}"] = _writer(held)
+    from jaxslam.results import plot  # matplotlib is slow to load
+
+    notes = dict.fromkeys(film.scene.note for film in films.values() if film.scene.note)
+    kind = "mp4" if plot.has_ffmpeg() else "gif"
+    said = [*notes, *(["ffmpeg is not installed: GIF instead of MP4"] if kind == "gif" else [])]
     if said:
         print("\nfilm: " + "; ".join(said))
+    files: Files = {}
+    for name, film in films.items():
+        stem = f"film-{name}" if suffixed else "film"
+        files |= {f"{stem}.{kind}": _with_progress(film, name), f"{stem}.html": film.save}
     return files
 
 
-def _writer(content: bytes) -> Callable[[Path], object]:
-    return lambda path: path.write_bytes(content)
+def _with_progress(film: "Film", name: str) -> Callable[[Path], object]:
+    """The function that saves a film and shows how many frames are drawn."""
+
+    def save(path: Path) -> None:
+        with Progress(f"{name}: film", "frames") as progress:
+            film.save(path, progress_callback=lambda k, of: progress(k + 1, of))
+
+    return save
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:

@@ -67,14 +67,12 @@ def save_campaign(
     overwrite: bool = False,
     command: str = "",
     seed: int | None = None,
-    film: str = "",
 ) -> list[Path]:
     """Write the files of a campaign's report, and return their paths; see `Campaign.save`.
 
     Args:
         command, seed: those of the campaign, for the page and the JSON; "" and None where it has
             none.
-        film: of a run, as `Film.player()` gives it, for the page.
     """
     formats = check_figure_formats("Campaign.save", figures)
     if not isinstance(folder, str | os.PathLike) or not str(folder).strip():
@@ -105,7 +103,6 @@ def save_campaign(
             versions(),
             drawn,
             lambda figure: encode(figure, "png"),
-            film,
         ),
         RESULT: report.as_json(campaign, command, seed),
         CURVES: report.as_csv(campaign),

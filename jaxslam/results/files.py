@@ -1,4 +1,4 @@
-"""Files of results: JSON, CSV and HTML as text, and files that are written whole or not at all."""
+"""Files of results: JSON and CSV as text, and files that are written whole or not at all."""
 
 import contextlib
 import csv
@@ -9,7 +9,6 @@ import os
 import platform
 import tempfile
 from collections.abc import Callable, Mapping, Sequence
-from html import escape
 from importlib.metadata import version
 from pathlib import Path
 from typing import SupportsFloat, TypeAlias
@@ -30,28 +29,6 @@ def json_number(value: SupportsFloat) -> float | None:
     """The number, or None (null) where it is not finite, which JSON does not have."""
     number = float(value)
     return number if math.isfinite(number) else None
-
-
-def html_page(title: str, policy: str, style: str, body: str) -> str:
-    """A page of HTML that stands alone, in the colours of the reader's browser.
-
-    policy: of its contents (Content-Security-Policy); only the title is escaped.
-    """
-    return f"""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta name="color-scheme" content="light dark">
-<meta http-equiv="Content-Security-Policy" content="{policy}">
-<title>{escape(title)}</title>
-<style>{style}</style>
-</head>
-<body>
-{body}
-</body>
-</html>
-"""
 
 
 def csv_text(header: list[str], rows: list[list[str]]) -> str:

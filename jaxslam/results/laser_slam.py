@@ -17,7 +17,7 @@ from jaxslam.results.files import Files, csv_text
 from jaxslam.types import Estimate
 
 if TYPE_CHECKING:  # Pillow and Matplotlib are slow to load
-    from jaxslam.results.film import Film
+    from jaxslam.results.plot import Film
     from jaxslam.results.plot.style import Figure
 
 HELD = 12
@@ -76,14 +76,7 @@ def figures(
     }
 
 
-def film(
-    log: LogOfScans,
-    solved: Solved,
-    settings: Settings,
-    *,
-    title: str = "",
-    progress: Callable[[int, int], object] | None = None,
-) -> "Film":
+def film(log: LogOfScans, solved: Solved, settings: Settings, *, title: str = "") -> "Film":
     """The film of a map that grows by laser odometry alone, and of the map after closing.
 
     Arguments are those of `laser_slam.solve` and its result.
@@ -105,7 +98,7 @@ def film(
         said,
         title=title,
     )
-    return plot.render(scene, progress=progress)
+    return plot.Film(scene)
 
 
 def result_summary(solved: Solved) -> dict[str, object]:

@@ -6,12 +6,12 @@ import json
 import jax
 import numpy as np
 import pytest
+from matplotlib.animation import FFMpegWriter
 
 from jaxslam import cli
 from jaxslam.cli.run.command import positive_definite
 from jaxslam.cli.run.filters import NAMES
 from jaxslam.results import plot
-from jaxslam.results.film import encoding
 
 
 def write_bonn(folder):
@@ -59,9 +59,9 @@ def test_run_filters_a_data_set_and_writes_its_results(tmp_path, capsys, monkeyp
 
 
 def test_run_writes_films_and_says_what_is_missing(tmp_path, capsys, monkeypatch):
-    monkeypatch.setattr(encoding, "ffmpeg", lambda: None)
-    scenes, render = [], plot.render
-    monkeypatch.setattr(plot, "render", lambda scene, **more: scenes.append(scene) or render(scene))
+    monkeypatch.setattr(FFMpegWriter, "isAvailable", lambda: False)
+    scenes, film = [], plot.Film
+    monkeypatch.setattr(plot, "Film", lambda scene: scenes.append(scene) or film(scene))
     data, out = write_bonn(tmp_path / "bonn"), tmp_path / "out"
     filters = ["--filters", "ekf,dead_reckoning", "--check-every", "0"]
     run = ["run", "--dataset", "bonn", str(data), *filters, "--animate", "--out", str(out)]
@@ -72,7 +72,7 @@ def test_run_writes_films_and_says_what_is_missing(tmp_path, capsys, monkeypatch
     assert likely.endswith(" -")  # dead reckoning has no innovation
     for name in ("ekf", "dead_reckoning"):
         assert (out / f"film-{name}.gif").read_bytes().startswith(b"GIF")
-        assert "jaxslam-film" in (out / f"film-{name}.html").read_text()
+        assert "data:image/png;base64," in (out / f"film-{name}.html").read_text()
     assert [scene.title for scene in scenes] == ["bonn: ekf", "bonn: dead_reckoning"]
     assert [scenes[0].said(k).split(": ")[1] for k in range(3)] == [
         "0 fused, 2 new, 0 dropped",

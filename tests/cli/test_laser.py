@@ -8,13 +8,13 @@ import jax
 import numpy as np
 import pytest
 from laser_slam.ring_of_rooms import FAR, ranges_of
+from matplotlib.animation import FFMpegWriter
 
 from jaxslam import cli, grids
 from jaxslam.cli.laser.mapping import TOGETHER
 from jaxslam.cli.laser.options import read_log
 from jaxslam.math import numpy_poses as poses
 from jaxslam.results import plot
-from jaxslam.results.film import encoding
 from jaxslam.simulation.laser import scan_world
 from jaxslam.simulation.scenarios import square
 from jaxslam.simulation.walls import is_free, rasterize, walls
@@ -167,14 +167,14 @@ def test_a_path_too_short_to_be_scored_is_told(log_file, tmp_path, undrawn):
 def test_laser_slam_writes_a_film_of_the_map_growing(
     log_file, tmp_path, capsys, undrawn, monkeypatch
 ):
-    monkeypatch.setattr(encoding, "ffmpeg", lambda: None)
-    scenes, render = [], plot.render
-    monkeypatch.setattr(plot, "render", lambda scene, **more: scenes.append(scene) or render(scene))
+    monkeypatch.setattr(FFMpegWriter, "isAvailable", lambda: False)
+    scenes, film = [], plot.Film
+    monkeypatch.setattr(plot, "Film", lambda scene: scenes.append(scene) or film(scene))
     out = tmp_path / "out"
     assert run(log_file.path, out, "--scans", ":2", "--max-range", "10", "--animate") == 0
     assert "\nfilm: ffmpeg is not installed: GIF instead of MP4\n" in capsys.readouterr().out
     assert (out / "film.gif").read_bytes().startswith(b"GIF")
-    assert "jaxslam-film" in (out / "film.html").read_text()
+    assert "data:image/png;base64," in (out / "film.html").read_text()
     (scene,) = scenes
     assert scene.title == "room"
     assert [scene.said(k) for k in range(3)] == [

@@ -13,9 +13,15 @@ from jaxslam import cli, graphs
 from jaxslam.cli.optimize import command
 from jaxslam.results import plot
 
-FILM = SimpleNamespace(
-    moving=lambda: ("gif", b"GIF", ""), encoded=lambda kind: kind.encode(), note=""
-)
+
+class Film:
+    """A film that is not drawn."""
+
+    def __init__(self, scene, fps):
+        self.scene = scene
+
+    def save(self, path, **options):
+        path.write_text("film")
 
 
 def small():
@@ -41,9 +47,10 @@ def test_it_writes_the_optimum(file, tmp_path, capsys, monkeypatch):
         drawn.update(before=before, after=after, **more)
         return draw(before, after, squared, **more)
 
-    scenes = {}
+    films = []
     monkeypatch.setattr(plot, "graph_figure", graph_figure)
-    monkeypatch.setattr(plot, "render", lambda scene, **more: scenes.update(scene=scene) or FILM)
+    monkeypatch.setattr(plot, "has_ffmpeg", lambda: False)
+    monkeypatch.setattr(plot, "Film", lambda *a, **b: films.append(Film(*a, **b)) or films[-1])
     out = tmp_path / "out"
     assert (
         cli.main(
@@ -83,7 +90,7 @@ def test_it_writes_the_optimum(file, tmp_path, capsys, monkeypatch):
     np.testing.assert_array_equal(drawn["after"].poses, found)
     assert "converged: χ² = " in drawn["subtitles"][1]
     # The film's last iterate is the optimum.
-    scene = scenes["scene"]
+    (scene,) = [film.scene for film in films]
     assert scene.frames == 1 + summary["iterations"]
     assert scene.said(0) == f"start, χ² = {summary['chi2 at the start']:.6g}"
     assert scene.said(summary["iterations"]).endswith(f"χ² = {summary['chi2']:.6g}")

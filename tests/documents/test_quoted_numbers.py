@@ -20,7 +20,7 @@ AFTER = r"(?:[\s\d.,;±–\[\]()-]|\b(?:to|and|or)\b)*" + UNIT
 CITED = r"--record --only (\w+)"
 GIVEN = {
     "docs/background/limits.md": {"3.11", "0.10"},  # versions of Python and jaxlib
-    "docs/guide/animation.md": {"250"},  # frames
+    "docs/guide/animation.md": {"100"},  # frames
     "docs/guide/campaigns.md": {"200"},  # steps
     "docs/guide/consistency.md": {"0.95"},  # a coverage
     "docs/guide/differentiating.md": {"200"},  # steps

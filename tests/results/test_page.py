@@ -2,7 +2,6 @@
 
 import base64
 import dataclasses
-import json
 from html.parser import HTMLParser
 
 import numpy as np
@@ -11,8 +10,7 @@ import pytest
 from jaxslam import plot, report
 from jaxslam.consistency import DOF, LEVELS, Measure, Summary
 from jaxslam.monte_carlo import Campaign
-from jaxslam.results.page import VERDICTS, curves, page
-from jaxslam.results.page.style import SCRIPT
+from jaxslam.results.page import VERDICTS, page
 
 STEPS, RUNS = 7, 30
 EVIL = "<script>alert(1)</script>&\"'"
@@ -114,7 +112,6 @@ def text():
             "nees": ("NEES & its band", plot.nees_figure(world)),
             "coverage": ("Coverage", plot.coverage_figure(world)),
         },
-        film="<p>A film.</p><script>let film = 1;</script>",
     )
 
 
@@ -130,29 +127,24 @@ def row(read, label):
     return found
 
 
-def test_nothing_is_loaded_and_only_scripts_of_the_page_run(text, read):
-    """`test_live_page` holds the policy against a browser."""
+def test_nothing_is_loaded_and_no_script_runs(text, read):
     assert text.startswith("<!DOCTYPE html>")
-    assert not {"link", "iframe", "object", "base"} & set(read.tags)
-    assert read.tags.count("script") == 3  # the film's, the data, and what draws it
-    assert len(SCRIPT.encode()) < 30_000
+    assert not {"script", "link", "iframe", "object", "base"} & set(read.tags)
     loads = [value for _, name, value in read.attributes if name in ("src", "href", "srcset")]
     assert len(loads) == 2
     assert all(value.startswith("data:image/png;base64,") for value in loads)
     assert not any(name.startswith("on") for _, name, _ in read.attributes)
-    assert "@import" not in text
-    assert "url(" not in text.replace("url(#", "")  # within the page
-    policy = [v for _, name, v in read.attributes if name == "content" and "default-src" in v]
-    assert "default-src 'none'" in policy[0] and "script-src 'sha256-" in policy[0]
-    assert policy[0].count("sha256-") == 2 and "unsafe-inline'; script" in policy[0]
+    assert "@import" not in text and "url(" not in text
+    (policy,) = (v for _, name, v in read.attributes if name == "content" and "default-src" in v)
+    assert policy == "default-src 'none'; img-src data:; style-src 'unsafe-inline'"
 
 
 def test_names_are_escaped(text, read):
-    assert text.count("<script") == 3
+    assert "<script" not in text
     words = "".join(read.words)
     assert f"world {EVIL}: consistency of 3 filters" in words
     assert f"jaxslam consistency {EVIL}" in words
-    assert f"{EVIL} was not finite in 2 of 30 runs, which its figures leave out: 4, 17." in words
+    assert f"{EVIL} was not finite in 2 of 30 runs, which its measures leave out: 4, 17." in words
 
 
 def test_filters_verdicts_and_measures_stand_in_the_table(read):
@@ -218,55 +210,6 @@ def test_figures_are_embedded_with_captions_and_alternative_text(read):
         if (tag, name) == ("img", "src"):
             png = base64.b64decode(value.split(",")[1], validate=True)
             assert png.startswith(b"\x89PNG\r\n")
-
-
-def data_of(text):
-    """What the script reads."""
-    return json.loads(text.split('id="curves">')[1].split("</script>")[0])
-
-
-def test_the_curves_stand_in_the_page_as_they_are(text):
-    data = data_of(text)
-    assert data["filters"] == ["good", EVIL, "lost"]
-    assert (data["steps"], data["each"]) == (STEPS, 1)
-    charts = {chart["figure"]: chart["panels"] for chart in data["charts"]}
-    assert [panel["title"] for panel in charts["nees"]] == [
-        *(f"{block} NEES (dof {dof})" for block, dof in DOF.items())
-    ]
-    pose = charts["nees"][0]
-    assert pose["values"] == [[3.0] * STEPS] * 3
-    assert pose["bands"] == [[[1.5] * STEPS, [4.5] * STEPS]] and pose["banded"] == [0, 0, 0]
-    assert charts["coverage"][0]["values"][0] == charts["coverage"][0]["at"]
-    assert "gained" not in charts  # no filter is monitored
-    assert "four digits, every step" in " ".join(text.split())
-
-
-def test_curves_that_are_long_are_bounded_in_size_and_lose_no_extreme():
-    steps, each = 20_001, {}
-    long = {}
-    for name in map(str, range(12)):
-        values = np.random.default_rng(int(name)).normal(5.0, 1.0, steps)
-        values[7_000 + int(name)] = 4321.25  # one step alone
-        values[-3:] = np.nan
-        flat = summary("consistent", GOOD)
-        of_time = {key: np.resize(curve, steps) for key, curve in flat.curves.items()}
-        long[name] = dataclasses.replace(flat, curves=of_time | {"nees_pose": values})
-        each[name] = values
-    world = dataclasses.replace(campaign(**long), steps=steps)
-    data = curves.embedded_curves(world)
-    found = json.loads(data.text)
-    assert len(data.text) < 1_000_000 and found["each"] == data.each > 1
-    for (_, values), (low, high) in zip(
-        each.items(), found["charts"][0]["panels"][0]["values"], strict=True
-    ):
-        assert len(low) == len(high) == -(-steps // data.each)
-        for j in (0, 7_000 // data.each, len(low) - 1):
-            group = values[j * data.each : (j + 1) * data.each]
-            group = group[np.isfinite(group)]
-            expected = (None, None) if not len(group) else (group.min(), group.max())
-            for mine, right in zip((low[j], high[j]), expected, strict=True):
-                assert mine is right or mine == pytest.approx(right, rel=1e-3)
-        assert max(h for h in high if h is not None) == 4321.0
 
 
 def test_cells_hold_the_number_they_are_sorted_by(read):

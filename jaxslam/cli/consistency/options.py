@@ -6,7 +6,7 @@ from jaxslam.catalog import ALL
 from jaxslam.cli import films
 from jaxslam.cli.common import OUT, add_figures
 from jaxslam.cli.consistency.command import consistency
-from jaxslam.cli.consistency.folder import CampaignOptions
+from jaxslam.cli.consistency.spec import CampaignOptions
 from jaxslam.cli.runtime import cache
 from jaxslam.results.campaign_files import FORMATS
 from jaxslam.results.run_table import FORMATS as RUN_FORMATS

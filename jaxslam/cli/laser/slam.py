@@ -25,8 +25,7 @@ def run_slam(log: LaserLog, options: argparse.Namespace) -> Job:
     solved = _solved(log, settings)
     files = results.result_files(solved)
     if options.animate:
-        with Progress(f"{log.name}: film", "frames") as progress:
-            made = results.film(log, solved, settings, title=log.name, progress=progress)
+        made = results.film(log, solved, settings, title=log.name)
         files |= film_files({"slam": made}, suffixed=False)
     told = ""
     more: Json = {}

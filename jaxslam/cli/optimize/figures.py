@@ -12,6 +12,7 @@ from jaxslam.cli import films
 from jaxslam.graphs import Graph
 from jaxslam.graphs.factor import Factor
 from jaxslam.monte_carlo.progress import Progress
+from jaxslam.results.files import Files
 
 WORST = 10
 """Number of rows with the largest residuals in the summary and the figure."""
@@ -49,7 +50,7 @@ def film_writers(
     factors: Mapping[str, Factor],
     kernel: Mapping[str, graphs.Kernel] | None,
     solution: graphs.Solution,
-) -> dict[str, Callable[[Path], object]]:
+) -> Files:
     """The functions that write the film of the iterations, by file name.
 
     Iterate k is where the same optimization stops after k steps; the limit is no part of the
@@ -60,7 +61,7 @@ def film_writers(
     taken = int(solution.iterations)
     shown = np.unique(np.linspace(1, taken, min(taken, FRAMES)).round().astype(int)).tolist()
     iterates, costs = [begun], [float(solution.chi2_start)]
-    with Progress(f"{Path(options.path).name}: film", "frames") as progress:
+    with Progress(f"{Path(options.path).name}: film", "iterations") as progress:
         for done, steps in enumerate(shown):
             at = graphs.optimize(begun, factors, kernel=kernel, iterations=steps)
             iterates.append(jax.tree.map(np.asarray, at.graph))
@@ -75,7 +76,7 @@ def film_writers(
         title=Path(options.path).name,
         note=note,
     )
-    return films.film_files({"optimize": plot.render(scene, fps=2.0)}, suffixed=False)
+    return films.film_files({"optimize": plot.Film(scene, fps=2.0)}, suffixed=False)
 
 
 def as_text(value: object) -> str:

@@ -1,7 +1,6 @@
 """The films that `jaxslam run --animate` writes."""
 
-from collections.abc import Callable, Mapping
-from pathlib import Path
+from collections.abc import Mapping
 
 import numpy as np
 from jaxtyping import Float, Int, PyTree
@@ -10,14 +9,14 @@ from jaxslam.cli.films import film_files
 from jaxslam.cli.run.piecewise import PiecewiseRun
 from jaxslam.datasets import Dataset
 from jaxslam.datasets.evaluation import Evaluation
-from jaxslam.monte_carlo.progress import Progress
+from jaxslam.results.files import Files
 
 
 def film_steps(data: Dataset) -> Int[np.ndarray, "F"]:
     """The steps that a film of the data set shows."""
-    from jaxslam.results.film import frame_steps  # Pillow is slow to load
+    from jaxslam.results import plot  # matplotlib is slow to load
 
-    return frame_steps(data.steps, time=data.time)
+    return plot.frame_steps(data.steps, time=data.time)
 
 
 def shown_state(state: PyTree) -> PyTree:
@@ -29,7 +28,7 @@ def shown_state(state: PyTree) -> PyTree:
 
 def films(
     data: Dataset, runs: Mapping[str, tuple[PiecewiseRun, Evaluation]], at: Int[np.ndarray, "F"]
-) -> dict[str, Callable[[Path], object]]:
+) -> Files:
     """The functions that write the film of each filter, by file name; see `film_files`."""
     from jaxslam.results import plot  # matplotlib is slow to load
 
@@ -50,8 +49,7 @@ def films(
             true_path=_true_path(data, found),
             title=f"{data.name}: {name}",
         )
-        with Progress(f"{data.name}, {name}: film", "frames") as progress:
-            made[name] = plot.render(scene, progress=progress)
+        made[name] = plot.Film(scene)
     return film_files(made, suffixed=len(made) > 1)
 
 

@@ -1,14 +1,14 @@
-"""Parts of the page as HTML: verdicts, the table of measures, lost runs, figures."""
+"""Parts of the page as HTML: verdicts, the table of measures, figures."""
 
 import base64
 from collections.abc import Iterable, Sequence
 from html import escape
 from itertools import repeat
 
-from jaxslam.consistency import DOF, LEVEL, Summary, power_of
+from jaxslam.consistency import DOF, LEVEL, Summary
 from jaxslam.consistency.verdict import TESTS
 from jaxslam.monte_carlo import Campaign
-from jaxslam.results import meanings
+from jaxslam.results import meanings, report
 from jaxslam.results.page.text import (
     breakable,
     cell,
@@ -32,45 +32,33 @@ VERDICTS = {
 }
 """Each verdict with its sign and its meaning."""
 
-_SHOWN = 20
-"""largest number of runs listed as not finite"""
-
 _ALWAYS = ("runs", "not_finite", "divergent")
 
 
 def verdict_list(campaign: Campaign) -> str:
-    """The verdicts as HTML: for each filter its name, badge, measures tested, power and doubts."""
-    out = []
+    """Name, badge and tested measures of each filter as HTML, and what qualifies the verdicts."""
+    items = []
     for name, summary in campaign.filters.items():
-        there = [key for key in TESTS if key in summary.measures]
-        said = [f"{TESTS[key]} {cell(summary.measures[key])}" for key in there]
-        power = power_of(summary.noticed)
-        if power and summary.verdict in ("consistent", "incomplete", "undecided"):
-            said.append(f"not rejected; {power}")
-        said += summary.doubts
-        lines = "".join(f'<span class="why">{line}</span>' for line in said or ["no pose NEES"])
-        out.append(
-            f'<li><span class="name">{breakable(name)}</span>{badge(summary.verdict, summary)}'
-            f"{lines}</li>"
-        )
-    return "\n".join(out)
+        tests = {TESTS[key]: summary.measures[key] for key in TESTS if key in summary.measures}
+        said = [f"{test} {cell(measure)}" for test, measure in tests.items()] or ["no pose NEES"]
+        lines = "".join(f'<span class="why">{line}</span>' for line in said)
+        label = f'<span class="name">{breakable(name)}</span>'
+        items.append(f"<li>{label}{badge(summary.verdict, summary)}{lines}</li>")
+    sentences = [*report.qualified(campaign), *report.not_finite(campaign)]
+    notes = (f'<p class="note">{escape(sentence)}.</p>' for sentence in sentences)
+    return "\n".join(['<ul class="verdicts">', *items, "</ul>", *notes])
 
 
 def badge(verdict: str, summary: Summary | None = None) -> str:
     """A verdict as HTML, with the tests that rejected; grey and with an asterisk if in doubt."""
-    sign, meaning = VERDICTS.get(verdict, ("·", ""))
+    sign, meaning = VERDICTS[verdict]
+    rejected = [TESTS[test] for test in summary.by] if summary is not None else []
     doubts = summary.doubts if summary is not None else ()
-    kind = verdict if verdict in VERDICTS else "undecided"
-    if doubts:
-        sign += "*"
-        kind = "undecided" if verdict == "consistent" else kind
-    rejected = ", ".join(TESTS[test] for test in (summary.by if summary is not None else ()))
-    title = "; ".join([meaning, *doubts])
-    tested = f" ({rejected})" * bool(rejected)
-    return (
-        f'<span class="badge {kind}" title="{escape(title)}"><span aria-hidden="true">{sign}'
-        f"</span> {escape(verdict)}{escape(tested)}</span>"
-    )
+    kind = "undecided" if doubts and verdict == "consistent" else verdict
+    title = escape("; ".join([meaning, *doubts]))
+    text = escape(verdict + f" ({', '.join(rejected)})" * bool(rejected))
+    mark = f'<span aria-hidden="true">{sign}{"*" * bool(doubts)}</span>'
+    return f'<span class="badge {kind}" title="{title}">{mark} {text}</span>'
 
 
 def measures_table(campaign: Campaign, table: Sequence[tuple[str, str, str]]) -> str:
@@ -153,26 +141,12 @@ def measure_notes(campaign: Campaign) -> str:
     )
 
 
-def lost_runs(campaign: Campaign) -> str:
-    """A sentence on each filter that was not finite in some runs, with their numbers, as HTML."""
-    out = []
-    for name, summary in campaign.filters.items():
-        lost = summary.not_finite_runs
-        if lost:
-            numbers = ", ".join(map(str, lost[:_SHOWN])) + (", …" if len(lost) > _SHOWN else "")
-            out.append(
-                f'<p class="note"><strong>{escape(name)}</strong> was not finite in {len(lost):,} '
-                f"of {campaign.runs:,} runs, which its figures leave out: {numbers}.</p>"
-            )
-    return "\n".join(out)
-
-
-def embedded_figure(number: int, name: str, caption: str, figure: Figure, drawn: bytes) -> str:
-    """A figure with its caption as HTML, the PNG file embedded; the script knows it by its name."""
+def embedded_figure(number: int, caption: str, figure: Figure, drawn: bytes) -> str:
+    """A figure with its caption as HTML, the PNG file embedded."""
     width, height = (round(96 * inches) for inches in figure.get_size_inches())
     data = base64.b64encode(drawn).decode("ascii")
     return (
-        f'<figure data-chart="{escape(name)}"><img width="{width}" height="{height}" '
+        f'<figure><img width="{width}" height="{height}" '
         f'alt="{escape(describe(figure))}" '
         f'src="data:image/png;base64,{data}">'
         f"<figcaption><strong>Figure {number}.</strong> {escape(caption)}</figcaption></figure>"

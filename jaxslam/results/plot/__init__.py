@@ -22,26 +22,21 @@ from jaxslam.results.plot.maps.landmarks import map_figure, run_map_figure
 from jaxslam.results.plot.maps.lines import walls_figure
 from jaxslam.results.plot.maps.loops import loops_figure, maps_before_after
 from jaxslam.results.plot.maps.topology import topology_figure
-from jaxslam.results.plot.scene import (
-    History,
-    Layer,
-    Panel,
-    Scene,
-    animate,
-    animate_world,
-    graph_scene,
-    map_scene,
-    probe,
-    render,
-    run_scene,
-)
-from jaxslam.results.plot.style import COLORS, COLUMN, PAGE, Figure, describe, png, warm_up
+from jaxslam.results.plot.scene.animate import animate, animate_world
+from jaxslam.results.plot.scene.film import Film, Layer, Panel, Scene, has_ffmpeg
+from jaxslam.results.plot.scene.graph_scene import graph_scene
+from jaxslam.results.plot.scene.history import History, frame_steps
+from jaxslam.results.plot.scene.map_scene import map_scene
+from jaxslam.results.plot.scene.probe import probe
+from jaxslam.results.plot.scene.run_scene import run_scene
+from jaxslam.results.plot.style import COLORS, COLUMN, PAGE, Figure, describe, png
 
 __all__ = [
     "COLORS",
     "COLUMN",
     "PAGE",
     "Figure",
+    "Film",
     "History",
     "Layer",
     "Panel",
@@ -54,10 +49,12 @@ __all__ = [
     "ellipse",
     "encode",
     "errors_figure",
+    "frame_steps",
     "gained_figure",
     "graph_figure",
     "graph_scene",
     "grid_figure",
+    "has_ffmpeg",
     "loops_figure",
     "map_figure",
     "map_scene",
@@ -65,13 +62,11 @@ __all__ = [
     "nees_figure",
     "png",
     "probe",
-    "render",
     "rmse_figure",
     "run_errors_figure",
     "run_map_figure",
     "run_scene",
     "topology_figure",
     "walls_figure",
-    "warm_up",
     "whiteness_figure",
 ]

@@ -29,7 +29,7 @@ INK, FAINT, SHADE, RULE = "#333333", "#777777", "#bdbdbd", "#dddddd"
 """Colours of what is no filter's: lines and text, dead reckoning, bands, the grid."""
 
 HUES = (*COLORS[:4], "#c98500", "#7d5f1f")
-"""Colours of filters, those of the page too: its yellow and brown can be seen on a grey band."""
+"""Colours of filters; yellow and brown can be seen on a grey band."""
 
 _DASHES = ("-", (0, (5, 1.4)), (0, (1.4, 1.1)), (0, (6, 1.3, 1.4, 1.3)), (4.5, (9, 2)))
 _MARKS = ("o", "s", "^", "D", "v")
@@ -60,13 +60,6 @@ def png(figure: Figure, dpi: float = 200) -> bytes:
     out = io.BytesIO()
     figure.savefig(out, format="png", dpi=dpi)
     return out.getvalue()
-
-
-def warm_up() -> None:
-    """Load fonts and the formula renderer, which takes half a second once a process."""
-    figure, (axes, *_) = panels_of(1.0, 1.0, 1)
-    axes.set_title("$x^2$")
-    png(figure, dpi=10)
 
 
 def describe(figure: Figure) -> str:

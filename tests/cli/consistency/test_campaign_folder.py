@@ -3,7 +3,6 @@
 import dataclasses
 import json
 import shutil
-import threading
 
 import drawn
 import numpy as np
@@ -40,24 +39,6 @@ def test_an_interrupt_shows_what_is_done_and_how_to_go_on(tmp_path, capsys, monk
     told = capsys.readouterr()
     assert str(done) in told.out
     assert f"--resume {out} continues it" in told.err
-
-
-def test_an_interrupted_command_leaves_no_thread_that_would_be_torn_down(tmp_path, monkeypatch):
-    """At exit Python waits for threads, but for daemons, which crash in compiled code."""
-    ended = threading.Event()
-
-    def interrupted(*arguments, **options):
-        raise Interrupted(None, 3)
-
-    monkeypatch.setattr(cli.consistency.command, "monte_carlo", interrupted)
-    monkeypatch.setattr(cli.consistency.command, "_prepare_drawing", ended.wait)
-    before = set(threading.enumerate())
-    try:
-        assert cli.main([*QUICK, "--out", str(tmp_path / "out")]) == 130
-        begun = set(threading.enumerate()) - before
-        assert len(begun) == 1 and not any(thread.daemon for thread in begun)
-    finally:
-        ended.set()
 
 
 def kept(out):
@@ -153,14 +134,14 @@ def test_an_unfinished_campaign_is_not_overwritten_unasked(tmp_path, monkeypatch
         raise Interrupted(None, 3)
 
     monkeypatch.setattr(cli.consistency.command, "monte_carlo", stopped)
-    monkeypatch.setattr(cli.consistency.command.shutil, "rmtree", lambda *a, **k: None)
+    monkeypatch.setattr(cli.consistency.folder.shutil, "rmtree", lambda *a, **k: None)
     assert cli.main([*QUICK, "--out", str(out)]) == 130
     monkeypatch.undo()
     refused([*QUICK, "--out", out], "2 of 3 runs done", "--resume", "--overwrite")
     monkeypatch.setattr(cli.consistency.command, "monte_carlo", lambda *a, **k: 1 / 0)
     with pytest.raises(ZeroDivisionError):
         cli.main([*QUICK, "--out", str(out), "--overwrite"])
-    assert store.resume(out / "blocks").spans() == []
+    assert not (out / "blocks").exists()
 
 
 def test_a_finished_campaign_is_not_overwritten_unasked(tmp_path, monkeypatch, refused):
@@ -189,7 +170,7 @@ def test_a_finished_campaign_is_not_overwritten_unasked(tmp_path, monkeypatch, r
         assert cli.main([*asked, accepted]) == 130
         assert not mine.exists()
     # Results without their blocks are results all the same.
-    cli.consistency.command.shutil.rmtree(out / "blocks")
+    cli.consistency.folder.shutil.rmtree(out / "blocks")
     (out / "consistency.json").write_text("{}")
     refused([*asked, "--again"], f"{out} holds the results of a campaign: add --overwrite")
     assert cli.main([*asked, "--overwrite"]) == 130

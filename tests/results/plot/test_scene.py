@@ -1,6 +1,5 @@
 """Scenes: the numbers that artists have in each frame, what is refused, and that frames differ."""
 
-import io
 import sys
 
 import drawn
@@ -9,7 +8,6 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
-from PIL import Image
 
 import jaxslam
 from jaxslam import catalog, filters, plot
@@ -17,8 +15,9 @@ from jaxslam.filters.delayed.state import TableLayout, empty_state
 from jaxslam.filters.information.eif_slam import CanonicalState
 from jaxslam.filters.information.sparse.sparse_state import empty_map
 from jaxslam.filters.particles.states.slam_state import initial_slam_particles
-from jaxslam.results.film import MOST
-from jaxslam.results.plot.scene import Cloud, Hypotheses, Links, history_of, layers
+from jaxslam.results.plot.scene import layers
+from jaxslam.results.plot.scene.history import MOST, history_of
+from jaxslam.results.plot.scene.probe import Cloud, Hypotheses, Links
 from jaxslam.results.plot.style import panels_of
 from jaxslam.types import Info, Log, Scan, Status, Trace
 
@@ -235,41 +234,40 @@ def test_hypotheses_are_drawn_until_they_are_landmarks():
 # --- frames -------------------------------------------------------------------------------------
 
 
-def test_frames_differ_have_one_palette_and_even_sides_and_need_no_display(monkeypatch):
+def pictures(film):
+    """The pixels of each frame."""
+    shown = []
+    for k in range(film.scene.frames):
+        film._draw_frame(k)
+        shown.append(np.array(film._fig.axes[0].images[0].get_array()))
+    return shown
+
+
+def test_frames_differ_and_need_no_display(monkeypatch, tmp_path):
     monkeypatch.delenv("DISPLAY", raising=False)
     monkeypatch.setitem(sys.modules, "matplotlib.pyplot", None)  # an import would fail
     trace, log, truth = run_of()
     done = []
-    film = plot.animate(
-        trace, log, truth, title="ring", width=3.5, progress=lambda k, n: done.append((k, n))
-    )
-    assert done == [(1, 3), (2, 3), (3, 3)] and film.fps == 2.0 and film.seconds == 1.5
-    assert len(film.said) == len(set(film.frames)) == 3 and film.title == "ring"
-    read = [Image.open(io.BytesIO(frame)) for frame in film.frames]
-    assert len({tuple(each.getpalette()) for each in read}) == 1
-    assert {each.size for each in read} == {film.size} and not any(side % 2 for side in film.size)
-    assert read[0].convert("RGB").getpixel((1, 1)) == (255, 255, 255)
-    assert film._repr_html_() == film.player()
+    film = plot.animate(trace, log, truth, title="ring")
+    film.save(tmp_path / "a.gif", dpi=40, progress_callback=lambda k, n: done.append((k, n)))
+    assert done == [(0, 3), (1, 3), (2, 3)] and film.scene.title == "ring"
+    assert len({picture.tobytes() for picture in pictures(film)}) == 3
 
 
 def test_another_film_is_another_layer():
     images = np.stack([np.full((2, 2), k / 2) for k in range(3)])
 
     def growing(axes):
-        image = axes.imshow(
-            images[0], cmap="gray", vmin=0, vmax=1, extent=(0, 1, 0, 1), animated=True
-        )
+        image = axes.imshow(images[0], cmap="gray", vmin=0, vmax=1, extent=(0, 1, 0, 1))
         return lambda k: image.set_data(images[k])
 
     panel = plot.Panel(
         [growing, layers.still(np.array([[0.5, 0.5]]), color="white")], (0, 1), (0, 1)
     )
-    film = plot.render(plot.Scene(3, panel), width=2.0, dpi=50, fps=4)
-    middle = [
-        Image.open(io.BytesIO(frame)).convert("RGB").getpixel((30, 35)) for frame in film.frames
-    ]
-    assert film.fps == 4 and film.said == ("frame 1", "frame 2", "frame 3")
-    np.testing.assert_allclose(np.array(middle)[:, 0], [0, 128, 255], atol=20)
+    film = plot.Film(plot.Scene(3, panel), width=4.0, fps=4)
+    middle = [picture[110, 100, 0] for picture in pictures(film)]
+    assert [film.scene.said(k) for k in range(3)] == ["frame 1", "frame 2", "frame 3"]
+    np.testing.assert_allclose(middle, [0, 128, 255], atol=20)
 
 
 # --- bad input ----------------------------------------------------------------------------------
@@ -284,7 +282,6 @@ def test_arrays_that_do_not_belong_together_are_refused():
         ((trace, log), {"true_path": np.zeros((3, 2))}, r"path of shape \(3, 3\), got \(3, 2\)"),
         ((trace, log), {"true_points": np.zeros(2)}, r"points of shape \(N, 2\), got \(2,\)"),
         ((trace, log), {"frames": 0}, "frames: expected an integer >= 1, got 0"),
-        ((trace, log), {"time": [1.0]}, "expected 3 finite times"),
         ((trace.estimate, log), {}, "animate: expected .*Trace"),
         ((trace, truth), {}, "animate: expected .*Log"),
         ((trace, log, log), {}, "animate: expected .*Truth"),
@@ -299,9 +296,10 @@ def test_arrays_that_do_not_belong_together_are_refused():
         ValueError, match=r"the trace of one run, with poses \(T, 3\), got \(1, 3, 3\)"
     ):
         plot.animate(batch, log)
+    scene, *_ = scene_of()
     for more in ({"fps": 0}, {"width": -1.0}):
-        with pytest.raises(ValueError, match=f"render: expected {next(iter(more))} above 0"):
-            plot.animate(trace, log, **more)
+        with pytest.raises(ValueError, match=f"Film: expected {next(iter(more))} above 0"):
+            plot.Film(scene, **more)
 
 
 def test_a_run_that_is_not_finite_is_drawn_as_far_as_it_goes_and_says_so():
@@ -309,8 +307,10 @@ def test_a_run_that_is_not_finite_is_drawn_as_far_as_it_goes_and_says_so():
     pose, covs = trace.estimate.pose.copy(), trace.estimate.point_covs.copy()
     pose[2], covs[1, 0] = np.nan, -np.eye(2)
     broken = trace._replace(estimate=trace.estimate._replace(pose=pose, point_covs=covs))
-    film = plot.animate(broken, log, truth, width=3.5)
-    assert film.said[1].endswith("1 without ellipse") and film.said[2].endswith("pose not finite")
+    film = plot.animate(broken, log, truth)
+    said = film.scene.said
+    assert said(1).endswith("1 without ellipse") and said(2).endswith("pose not finite")
+    assert len(pictures(film)) == 3
 
 
 # --- what is seen of a filter's state -----------------------------------------------------------
@@ -376,8 +376,9 @@ def test_of_delayed_initialization_the_hypotheses_are_seen():
 def test_a_filter_is_filmed_in_a_world_by_itself():
     world = worlds.ring(4)
     film = plot.animate_world(world, catalog.BASELINES["dead_reckoning"](world), jax.random.key(0))
-    assert len(set(film.frames)) == 4 and film.title == "ring"
-    assert film.said[0] == "step 1 of 4 · 6 measurements: 0 fused, 0 new, 6 dropped"
+    assert len({picture.tobytes() for picture in pictures(film)}) == 4
+    assert film.scene.title == "ring"
+    assert film.scene.said(0) == "step 1 of 4 · 6 measurements: 0 fused, 0 new, 6 dropped"
 
 
 def test_mapping_from_a_known_path_is_filmed():
@@ -388,9 +389,9 @@ def test_mapping_from_a_known_path_is_filmed():
     mapping = filters.Mapping(world.sensor, 6)
     trace = jaxslam.run(mapping, log, *start, jax.random.key(1), probe=plot.probe)
     film = plot.animate(trace, log, truth)
-    assert film.said[0] == "step 1 of 4 · 6 measurements: 0 fused, 6 new, 0 dropped"
-    assert film.said[3] == "step 4 of 4 · 6 measurements: 6 fused, 0 new, 0 dropped"
-    assert len(set(film.frames)) == 4
+    assert film.scene.said(0) == "step 1 of 4 · 6 measurements: 0 fused, 6 new, 0 dropped"
+    assert film.scene.said(3) == "step 4 of 4 · 6 measurements: 6 fused, 0 new, 0 dropped"
+    assert len({picture.tobytes() for picture in pictures(film)}) == 4
 
 
 def test_a_map_scene_has_as_many_paths_as_maps():

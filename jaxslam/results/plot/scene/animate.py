@@ -1,6 +1,5 @@
 """The film of a run: of a trace, or of a filter in a simulated world."""
 
-from collections.abc import Callable
 from typing import Any
 
 import jax
@@ -10,12 +9,10 @@ from numpy.typing import ArrayLike
 
 from jaxslam.monte_carlo.candidates import method_of, rounded
 from jaxslam.protocols import Candidate, Filter
-from jaxslam.results.film import MOST, Film
-from jaxslam.results.plot.scene.history import history_of
+from jaxslam.results.plot.scene.film import Film
+from jaxslam.results.plot.scene.history import MOST, history_of
 from jaxslam.results.plot.scene.probe import probe
-from jaxslam.results.plot.scene.render import render
 from jaxslam.results.plot.scene.run_scene import run_scene
-from jaxslam.results.plot.style import PAGE
 from jaxslam.run import run
 from jaxslam.simulation.worlds import World, run_keys, with_positions, world_of_run
 from jaxslam.types import Log, Trace, Truth
@@ -29,39 +26,30 @@ def animate(
     *,
     true_points: ArrayLike | None = None,
     true_path: ArrayLike | None = None,
-    time: ArrayLike | None = None,
     frames: int = MOST,
-    fps: float | None = None,
-    n_sigma: float = 3.0,
     title: str = "",
-    width: float = PAGE,
-    progress: Callable[[int, int], object] | None = None,
 ) -> Film:
-    """The film of a run: the robot with its ellipse, beams to the landmarks that are measured,
+    """The film of a run: the robot with its 3 σ ellipse, beams to the landmarks that are measured,
     landmarks with ellipses, the path so far, and the truth in grey.
 
         film = jaxslam.plot.animate(trace, log, truth)
-        film.save("slam.mp4")  # or .gif, .html
+        film.save("slam.gif")  # or .html, .mp4
 
     With a trace of `run(…, probe=jaxslam.plot.probe)` it shows the particles of a particle filter,
     the links of an information filter, and the hypotheses of `DelayedSlam`. Of more than `frames`
     steps so many are shown, evenly in time; a frame has the beams of the steps since the one
-    before. `Film.note` says so.
+    before. `film.scene.note` says so.
 
     Args:
         trace, log: of `run`, T steps.
         truth: of a simulated world; or
         true_points: (N, 2) landmarks [m], and
         true_path: (T, 3) poses, NaN where unknown, in the frame of the map.
-        time: (T,) of the steps, for frames evenly in time; default evenly in steps.
         frames: the largest number of frames.
-        fps: frames a second; default so that the film lasts 10 s, at most 25.
-        n_sigma: size of the ellipses. width: [in].
-        progress: called with the frames done and their number.
     Raises:
         ValueError: on arrays that do not belong together, or a trace without steps.
     """
-    history = history_of(trace, log, frames, None if time is None else np.asarray(time))
+    history = history_of(trace, log, frames)
     if truth is not None:
         check_record("animate", "truth", truth, Truth)
         true_points, true_path = np.asarray(truth.landmarks)[:, :2], truth.pose
@@ -69,10 +57,9 @@ def animate(
         history,
         true_points=None if true_points is None else np.asarray(true_points),
         true_path=None if true_path is None else np.asarray(true_path),
-        n_sigma=n_sigma,
         title=title,
     )
-    return render(scene, fps=fps, width=width, progress=progress)
+    return Film(scene)
 
 
 def animate_world(

@@ -7,8 +7,8 @@ import numpy as np
 from jaxslam.graphs import Factor, Graph
 from jaxslam.graphs.graph import successive
 from jaxslam.graphs.solver.model import factors_of
+from jaxslam.results.plot.scene.film import Layer, Panel, Scene
 from jaxslam.results.plot.scene.layers import lines_between, marks, still
-from jaxslam.results.plot.scene.render import Layer, Panel, Scene
 from jaxslam.results.plot.style import COLORS, FAINT, INK, SHADE
 
 

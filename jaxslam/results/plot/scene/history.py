@@ -6,10 +6,38 @@ import jax
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxslam.results.film import MOST, frame_steps
+from jaxslam.core.numbers import check_count
 from jaxslam.results.plot.scene.probe import Cloud, Hypotheses, Links
 from jaxslam.types import Estimate, Log, Status, Trace
 from jaxslam.validation import check_record
+
+MOST = 100
+"""default of the largest number of frames"""
+
+
+def frame_steps(
+    steps: int, most: int = MOST, time: Float[np.ndarray, "T"] | None = None
+) -> Int[np.ndarray, "F"]:
+    """The steps 0 … steps - 1 that are shown: all, or `most` of them, evenly in time.
+
+    The first and the last are shown. time: of each step, which does not go back; default: evenly in
+    steps. In a gap of the times a step is shown several times.
+
+    Raises ValueError without a step, on a `most` below 1, or on other times.
+    """
+    if steps < 1:
+        raise ValueError(f"animate: expected at least one step, got {steps}")
+    check_count("animate: frames", most)
+    time = np.arange(steps, dtype=float) if time is None else np.asarray(time, float)
+    if time.shape != (steps,) or not np.isfinite(time).all() or (np.diff(time) < 0).any():
+        raise ValueError(f"animate: expected {steps} finite times that do not go back")
+    if steps <= most:
+        return np.arange(steps)
+    if most == 1:
+        return np.array([steps - 1])
+    at = np.searchsorted(time, np.linspace(time[0], time[-1], most), side="right") - 1
+    at[0], at[-1] = 0, steps - 1
+    return at
 
 
 class History(NamedTuple):
@@ -29,13 +57,8 @@ class History(NamedTuple):
     """with leading F"""
 
 
-def history_of(
-    trace: Trace,
-    log: Log,
-    frames: int = MOST,
-    time: Float[np.ndarray, "T"] | None = None,
-) -> History:
-    """The history of a trace, at `film.frame_steps`.
+def history_of(trace: Trace, log: Log, frames: int = MOST) -> History:
+    """The history of a trace, at `frame_steps`.
 
     Raises ValueError on a trace that is not of one run over this log, or has no step.
     """
@@ -46,7 +69,7 @@ def history_of(
         raise ValueError(
             f"animate: expected the trace of one run, with poses (T, 3), got {path.shape}"
         )
-    steps = frame_steps(len(path), frames, time)
+    steps = frame_steps(len(path), frames)
     rows = np.shape(log.control)[0]
     if rows != len(path) or np.shape(log.scan.tag) != status.shape:
         raise ValueError(

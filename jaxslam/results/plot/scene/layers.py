@@ -14,7 +14,7 @@ from matplotlib.colors import to_rgba
 from matplotlib.patches import Polygon
 
 from jaxslam.results.plot.maps.geometry import ellipses
-from jaxslam.results.plot.scene.render import Draw, Layer
+from jaxslam.results.plot.scene.film import Draw, Layer
 
 _TRIANGLE = np.array([[1.0, 0.0], [-0.6, 0.55], [-0.6, -0.55]])
 
@@ -33,7 +33,7 @@ def track(path: Float[np.ndarray, "T C"], until: Int[np.ndarray, "F"], **look: A
     """The layer of a path that grows: in frame k its points up to until[k]; NaN interrupts it."""
 
     def layer(axes: Axes) -> Draw:
-        (line,) = axes.plot([], [], animated=True, **look)
+        (line,) = axes.plot([], [], **look)
         return lambda k: line.set_data(*path[: until[k] + 1, :2].T)
 
     return layer
@@ -43,7 +43,7 @@ def marks(points: Float[np.ndarray, "F N 2"], shown: Bool[np.ndarray, "F N"], **
     """The layer of points that are others in each frame."""
 
     def layer(axes: Axes) -> Draw:
-        (line,) = axes.plot([], [], ls="none", animated=True, **look)
+        (line,) = axes.plot([], [], ls="none", **look)
         return lambda k: line.set_data(*points[k][shown[k]].T)
 
     return layer
@@ -53,7 +53,7 @@ def triangle(poses: Float[np.ndarray, "F 3"], size: float, **look: Any) -> Layer
     """The layer of a robot: a triangle, `size` long from its position to its tip."""
 
     def layer(axes: Axes) -> Draw:
-        patch = Polygon(size * _TRIANGLE, closed=True, animated=True, **look)
+        patch = Polygon(size * _TRIANGLE, closed=True, **look)
         axes.add_patch(patch)
 
         def draw(k: int) -> None:
@@ -72,16 +72,15 @@ def rings(
     means: Float[np.ndarray, "F N 2"],
     covs: Float[np.ndarray, "F N 2 2"],
     shown: Bool[np.ndarray, "F N"],
-    n_sigma: float,
     **look: Any,
 ) -> Layer:
-    """The layer of n σ ellipses that grow and shrink; a covariance that has none is left out."""
+    """The layer of 3 σ ellipses that grow and shrink; a covariance that has none is left out."""
 
     def layer(axes: Axes) -> Draw:
-        (line,) = axes.plot([], [], animated=True, **look)
+        (line,) = axes.plot([], [], **look)
 
         def draw(k: int) -> None:
-            contours = ellipses(means[k][shown[k]], covs[k][shown[k]], n_sigma, 48)
+            contours = ellipses(means[k][shown[k]], covs[k][shown[k]], points=48)
             line.set_data(*_apart(contours).T)
 
         return draw
@@ -93,7 +92,7 @@ def lines_between(ends: Sequence[Float[np.ndarray, "E 2 2"]], **look: Any) -> La
     """The layer of lines between two points each, others in every frame."""
 
     def layer(axes: Axes) -> Draw:
-        (line,) = axes.plot([], [], animated=True, **look)
+        (line,) = axes.plot([], [], **look)
         return lambda k: line.set_data(*_apart(ends[k]).T)
 
     return layer
@@ -113,7 +112,7 @@ def weighted_segments(
     """
 
     def layer(axes: Axes) -> Draw:
-        lines = LineCollection([], animated=True, color=color, linewidth=width, **look)
+        lines = LineCollection([], color=color, linewidth=width, **look)
         axes.add_collection(lines, autolim=False)
 
         def draw(k: int) -> None:
@@ -134,7 +133,7 @@ def cloud(
     areas = 4.0 * weight * weight.shape[1]
 
     def layer(axes: Axes) -> Draw:
-        dots = axes.scatter([], [], animated=True, **look)
+        dots = axes.scatter([], [], **look)
 
         def draw(k: int) -> None:
             there = weight[k] > 0

@@ -7,8 +7,8 @@ from jaxtyping import Float
 from matplotlib.axes import Axes
 
 from jaxslam.results.plot.maps.grids import shades_of_occupancy, shown_occupancy
+from jaxslam.results.plot.scene.film import Draw, Layer, Panel, Scene
 from jaxslam.results.plot.scene.layers import triangle
-from jaxslam.results.plot.scene.render import Draw, Layer, Panel, Scene
 from jaxslam.results.plot.style import COLORS
 
 
@@ -58,7 +58,6 @@ def _image(
             extent=extent,
             origin="lower",
             interpolation="nearest",
-            animated=True,
             zorder=1,
             cmap=shades_of_occupancy(),
             vmin=0,
@@ -73,7 +72,7 @@ def _path(paths: Sequence[Float[np.ndarray, "n 3"]]) -> Layer:
     """The path of each frame: one that grows, or another one."""
 
     def layer(axes: Axes) -> Draw:
-        (line,) = axes.plot([], [], animated=True, color=COLORS[0], lw=1.0, label="path", zorder=3)
+        (line,) = axes.plot([], [], color=COLORS[0], lw=1.0, label="path", zorder=3)
         return lambda k: line.set_data(*paths[k][:, :2].T)
 
     return layer

@@ -5,9 +5,9 @@ from collections.abc import Callable
 import numpy as np
 
 from jaxslam.results.plot.maps.geometry import Limits, ellipses, extent, square_limits
+from jaxslam.results.plot.scene.film import Layer, Panel, Scene
 from jaxslam.results.plot.scene.history import History, Measured, measured
 from jaxslam.results.plot.scene.layers import (
-    cloud,
     lines_between,
     marks,
     rings,
@@ -15,9 +15,13 @@ from jaxslam.results.plot.scene.layers import (
     track,
     triangle,
 )
-from jaxslam.results.plot.scene.links import link_layers
-from jaxslam.results.plot.scene.probe import Cloud, Hypotheses
-from jaxslam.results.plot.scene.render import Layer, Panel, Scene
+from jaxslam.results.plot.scene.probe import (
+    Cloud,
+    Hypotheses,
+    hypothesis_layers,
+    link_layers,
+    particle_layer,
+)
 from jaxslam.results.plot.style import COLORS, FAINT, INK, Look
 
 _NEAR = 1.5
@@ -43,10 +47,9 @@ def run_scene(
     *,
     true_points: np.ndarray | None = None,
     true_path: np.ndarray | None = None,
-    n_sigma: float = 3.0,
     title: str = "",
 ) -> Scene:
-    """The scene of a run: robot, beams, landmarks with n σ ellipses, and the truth in grey.
+    """The scene of a run: robot, beams, landmarks with 3 σ ellipses, and the truth in grey.
 
     A history with particles, links or hypotheses shows these, too. Beside the map is the error of
     the robot's position within its ellipse, on a fixed scale. The limits are those of the truth, or
@@ -69,35 +72,33 @@ def run_scene(
         )
     true = None if true_path is None else np.asarray(true_path, float)
     found = measured(history)
-    limits = _limits(history, true_points, true, n_sigma)
+    limits = _limits(history, true_points, true)
     side = limits[0][1] - limits[0][0]
     layers = [
         *_truth(history, true_points, true, _ROBOT * side),
-        *link_layers(history),
+        *link_layers(history.seen, history.estimate),
         *_beams(found),
-        *_hypotheses(history, n_sigma),
-        *_map(history, n_sigma),
-        *_robot(history, n_sigma, _ROBOT * side),
+        *hypothesis_layers(history.seen),
+        *_map(history),
+        *_robot(history, _ROBOT * side),
     ]
     return Scene(
         len(history.step),
         Panel(layers, *limits),
-        _nearby(history, true, n_sigma),
-        _text(history, found, n_sigma),
+        _nearby(history, true),
+        _text(history, found),
         title,
         f"{len(history.step):,} of {steps:,} steps are shown, evenly in time"
         * (len(history.step) < steps),
     )
 
 
-def _limits(
-    history: History, points: np.ndarray | None, path: np.ndarray | None, n_sigma: float
-) -> Limits:
+def _limits(history: History, points: np.ndarray | None, path: np.ndarray | None) -> Limits:
     """The limits of the map: of the truth, else the estimate; and of what is near of the rest."""
     alive = history.estimate.alive
     mapped = np.asarray(history.estimate.points)[alive]
     covs = np.asarray(history.estimate.point_covs)[alive]
-    reach = n_sigma * np.sqrt(np.maximum(np.diagonal(covs, axis1=1, axis2=2), 0.0))
+    reach = 3 * np.sqrt(np.maximum(np.diagonal(covs, axis1=1, axis2=2), 0.0))
     estimated = [history.path[:, :2], mapped]
     clouds = [np.asarray(each, float)[:, :2] for each in (points, path) if each is not None]
     clouds = clouds or estimated
@@ -133,7 +134,7 @@ def _beams(found: Measured) -> list[Layer]:
     ]
 
 
-def _map(history: History, n_sigma: float) -> list[Layer]:
+def _map(history: History) -> list[Layer]:
     """The layers of the map's landmarks with their ellipses; none of a filter without a map."""
     _, _, points, covs, alive, _ = map(np.asarray, history.estimate)
     if not np.any(alive):
@@ -143,25 +144,11 @@ def _map(history: History, n_sigma: float) -> list[Layer]:
     dots: Look = {"color": COLORS[1], "marker": "o", "ms": size, "zorder": 4.1}
     return [
         marks(points, alive, label="_", **dots),
-        rings(points, covs, alive, n_sigma, label=f"landmark, {n_sigma:g} σ", **ring),
+        rings(points, covs, alive, label="landmark, 3 σ", **ring),
     ]
 
 
-def _hypotheses(history: History, n_sigma: float) -> list[Layer]:
-    """The layers of points that may become landmarks, with their ellipses."""
-    if not isinstance(history.seen, Hypotheses):
-        return []
-    points, covs, persistence = map(np.asarray, history.seen)
-    shown = persistence > 0
-    ring: Look = {"color": COLORS[3], "lw": 0.9, "ls": (0, (2, 1.2)), "zorder": 3.8}
-    dots: Look = {"color": COLORS[3], "marker": "D", "mfc": "white", "ms": 3.5, "zorder": 3.9}
-    return [
-        rings(points, covs, shown, n_sigma, label=f"hypothesis, {n_sigma:g} σ", **ring),
-        marks(points, shown, label="_", **dots),
-    ]
-
-
-def _robot(history: History, n_sigma: float, size: float) -> list[Layer]:
+def _robot(history: History, size: float) -> list[Layer]:
     """The layers of the path so far, particles, the robot's ellipse, and the robot."""
     pose, cov = (np.asarray(part) for part in history.estimate[:2])
     line: Look = {"color": COLORS[0], "lw": 1.4, "zorder": 3.5}
@@ -169,35 +156,28 @@ def _robot(history: History, n_sigma: float, size: float) -> list[Layer]:
     robot: Look = {"fc": COLORS[0], "ec": "white", "lw": 0.6, "zorder": 5}
     layers = [track(history.path, history.step, label="estimate: path, robot", **line)]
     if isinstance(history.seen, Cloud):
-        layers.append(_particles(history.seen, np.zeros((len(pose), 2)), "particles"))
+        layers.append(particle_layer(history.seen, np.zeros((len(pose), 2)), "particles"))
     here = np.ones((len(pose), 1), bool)
     return [
         *layers,
         triangle(pose, size, **robot),
-        rings(pose[:, None, :2], cov[:, None, :2, :2], here, n_sigma, label="_", **ring),
+        rings(pose[:, None, :2], cov[:, None, :2, :2], here, label="_", **ring),
     ]
 
 
-def _particles(seen: Cloud, origin: np.ndarray, label: str) -> Layer:
-    """The positions of particles, from an origin (F, 2)."""
-    look: Look = {"color": COLORS[7], "lw": 0, "alpha": 0.6, "zorder": 5.1}
-    at = np.asarray(seen.pose)[..., :2] - origin[:, None]
-    return cloud(at, np.asarray(seen.weight), label=label, **look)
-
-
-def _nearby(history: History, path: np.ndarray | None, n_sigma: float) -> Panel:
+def _nearby(history: History, path: np.ndarray | None) -> Panel:
     """The robot's position as seen from its estimate: the ellipse, the truth, particles."""
     pose, cov = (np.asarray(part) for part in history.estimate[:2])
     cov = cov[:, None, :2, :2]
     middle, here = np.zeros((len(pose), 1, 2)), np.ones((len(pose), 1), bool)
-    contours = ellipses(middle[:, 0], cov[:, 0], n_sigma)
+    contours = ellipses(middle[:, 0], cov[:, 0])
     reach = np.abs(contours[np.isfinite(contours)]).max(initial=0.0)
     ring: Look = {"color": COLORS[0], "lw": 1.0, "ls": (0, (3, 1)), "zorder": 4}
-    layers = [rings(middle, cov, here, n_sigma, label=f"robot, {n_sigma:g} σ", **ring)]
+    layers = [rings(middle, cov, here, label="robot, 3 σ", **ring)]
     dot: Look = {"color": COLORS[0], "marker": "+", "ms": 7, "mew": 1.2, "zorder": 5}
     layers.append(marks(middle, here, label="_", **dot))
     if isinstance(history.seen, Cloud):
-        layers.insert(0, _particles(history.seen, pose[:, :2], "_"))
+        layers.insert(0, particle_layer(history.seen, pose[:, :2], "_"))
         away = np.abs(np.asarray(history.seen.pose)[..., :2] - pose[:, None, :2])
         away = np.append(away[np.isfinite(away)], 0.0)
         reach = max(reach, float(np.quantile(away, 0.995)))
@@ -223,12 +203,12 @@ def _nearby(history: History, path: np.ndarray | None, n_sigma: float) -> Panel:
     )
 
 
-def _text(history: History, found: Measured, n_sigma: float) -> Callable[[int], str]:
+def _text(history: History, found: Measured) -> Callable[[int], str]:
     """The line above frame k: its step, and what became of the measurements since the last."""
     total = len(history.path)
     lost = []
     for covs, alive in zip(history.estimate.point_covs, history.estimate.alive, strict=True):
-        contours = ellipses(np.zeros((alive.sum(), 2)), covs[alive], n_sigma, points=1)
+        contours = ellipses(np.zeros((alive.sum(), 2)), covs[alive], points=1)
         lost.append(int(np.isnan(contours).all(axis=(1, 2)).sum()))
 
     def said(k: int) -> str:
