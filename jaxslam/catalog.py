@@ -13,8 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxslam.charts.left_invariant import LeftInvariant
-from jaxslam.charts.right_invariant import RightInvariant
+from jaxslam.charts import LeftInvariant, RightInvariant
 from jaxslam.core.record import record, static
 from jaxslam.filters.ekf.ekf_slam import EkfSlam
 from jaxslam.filters.ekf.observability import Monitored
@@ -27,9 +26,7 @@ from jaxslam.filters.known.localization import Localization
 from jaxslam.filters.known.mapping import Mapping
 from jaxslam.filters.particles.fastslam import FastSlam
 from jaxslam.filters.particles.particle_localization import ParticleLocalization
-from jaxslam.linearize.at_truth import AtTruth
-from jaxslam.linearize.first_estimate import FirstEstimate
-from jaxslam.linearize.observability import Observability
+from jaxslam.linearize.other_points import AtTruth, FirstEstimate, Observability
 from jaxslam.linearize.unscented import Unscented
 from jaxslam.protocols import Candidate, Estimator, Filter
 from jaxslam.run import run

@@ -6,7 +6,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.graphs.chain.elimination import Chain, LinearizedStep, Start
 from jaxslam.graphs.chain.rows import Rows, pose_difference, whitened_rows
-from jaxslam.linearize import derivatives
+from jaxslam.linearize import first_order
 from jaxslam.math import linalg
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.smoothing.forward_pass import ForwardPass
@@ -57,7 +57,7 @@ def _motions(
     def one(
         before: Array, predicted: Array, corrected: Array, u: Array, root: Array
     ) -> tuple[Array, Array, Array]:
-        by_pose, by_noise = derivatives.motion_jacobians(motion, before, u)
+        by_pose, by_noise = first_order.motion_jacobians(motion, before, u)
         return by_pose, by_noise @ root, pose_difference(predicted, corrected)
 
     return jax.vmap(one)(passed.before, passed.predicted, passed.corrected, control, roots)
@@ -107,7 +107,7 @@ def _new_landmark_rows(sensor: Sensor, z: Float[Array, "Z"], pose: Float[Array, 
     """The rows of a new landmark: C^{-1/2} times -G_pose, I and 0, C = G_z R G_zᵀ + G_s S G_sᵀ."""
     size = len(sensor.landmark)
     mean, cov_s = (jnp.asarray(part, z.dtype) for part in sensor.free)
-    by_pose, by_z, by_s = derivatives.invert_jacobians(sensor, pose, z, mean)
+    by_pose, by_z, by_s = first_order.invert_jacobians(sensor, pose, z, mean)
     own = by_z @ sensor.noise_cov(z) @ by_z.T + by_s @ cov_s @ by_s.T
     factor, positive = linalg.cholesky(own)
     a = linalg.solve_lower(factor, -by_pose)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxslam.charts.euclidean import Euclidean
+from jaxslam.charts import Euclidean
 from jaxslam.core.record import record
 from jaxslam.filters.ekf.coordinates.map_coordinates import estimate_of
 from jaxslam.graphs.chain.elimination import Chain, Policy, eliminate

@@ -6,7 +6,7 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.association.known import Known
+from jaxslam.association.rules import Known
 from jaxslam.catalog import ALL, CANONICAL, SMOOTHERS, on_given_poses
 from jaxslam.cli.common import pick
 from jaxslam.datasets import Dataset

@@ -8,8 +8,8 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxslam import validation
-from jaxslam.association.known import Known
-from jaxslam.charts.euclidean import Euclidean
+from jaxslam.association.rules import Known
+from jaxslam.charts import Euclidean
 from jaxslam.core.record import hold_function, record, set_field, static
 from jaxslam.filters.delayed.confirmation import confirm_hypotheses
 from jaxslam.filters.delayed.intersection import intersect_measurements

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam import slots, validation
-from jaxslam.association.known import Known
+from jaxslam.association.rules import Known
 from jaxslam.core.numbers import check_count
 from jaxslam.core.record import record, static
 from jaxslam.filters.ekf.ekf_slam import EkfSlam

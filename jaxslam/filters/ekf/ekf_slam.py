@@ -6,8 +6,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam import slots, validation
-from jaxslam.association.known import Known
-from jaxslam.charts.euclidean import Euclidean
+from jaxslam.association.rules import Known
+from jaxslam.charts import Euclidean
 from jaxslam.core.record import hold_function, record, static
 from jaxslam.filters.ekf.coordinates import to_points
 from jaxslam.filters.ekf.coordinates.linear_system import LinearizedSteps, LinearSystem
@@ -22,7 +22,7 @@ from jaxslam.filters.ekf.settings import (
 from jaxslam.filters.ekf.steps.predict import propagate
 from jaxslam.filters.ekf.steps.scan import turns_of, update_by_scan, without_landmarks
 from jaxslam.filters.reporting import with_extra, with_removed
-from jaxslam.linearize.at_estimate import AtEstimate
+from jaxslam.linearize.first_order import AtEstimate
 from jaxslam.math import linalg
 from jaxslam.math.arrays import Number
 from jaxslam.protocols import Associate, Chart, Filter, Life, Linearizer, Motion, Sensor

@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from jaxslam.association.known import Known
-from jaxslam.charts.euclidean import Euclidean
+from jaxslam.association.rules import Known
+from jaxslam.charts import Euclidean
 from jaxslam.core.numbers import check_count, check_gate
-from jaxslam.linearize.at_estimate import AtEstimate
+from jaxslam.linearize.first_order import AtEstimate
 from jaxslam.math.arrays import Number
 from jaxslam.protocols import Associate, Chart, Life, Linearizer, Sensor
 from jaxslam.sensors.suite import Suite

@@ -8,7 +8,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.filters.information.settings import InformationFilter
-from jaxslam.linearize.derivatives import observe_jacobians
+from jaxslam.linearize.first_order import observe_jacobians
 from jaxslam.math import linalg
 from jaxslam.math.gaussians import gaussian_terms, log_density, log_det_of_pivots
 from jaxslam.types import Scan

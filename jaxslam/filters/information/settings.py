@@ -3,7 +3,7 @@
 import dataclasses
 
 from jaxslam import validation
-from jaxslam.charts.euclidean import Euclidean
+from jaxslam.charts import Euclidean
 from jaxslam.core.numbers import check_count, check_gate, check_positive
 from jaxslam.core.record import record, static
 from jaxslam.math.arrays import Number

@@ -11,8 +11,8 @@ from jaxtyping import Int, PyTree
 from numpy.typing import ArrayLike
 
 from jaxslam import slots, validation
-from jaxslam.association.known import Known
-from jaxslam.charts.euclidean import Euclidean
+from jaxslam.association.rules import Known
+from jaxslam.charts import Euclidean
 from jaxslam.core.numbers import held_array, is_concrete
 from jaxslam.core.record import hold_function, record, set_field, static
 from jaxslam.filters.ekf.settings import (
@@ -25,7 +25,7 @@ from jaxslam.filters.ekf.settings import (
 )
 from jaxslam.filters.ekf.steps.predict import propagate
 from jaxslam.filters.ekf.steps.scan import SensorTurn, update_by_scan
-from jaxslam.linearize.at_estimate import AtEstimate
+from jaxslam.linearize.first_order import AtEstimate
 from jaxslam.math import linalg
 from jaxslam.math.arrays import Number
 from jaxslam.protocols import (

@@ -10,8 +10,8 @@ from jaxtyping import Float, PyTree
 from numpy.typing import ArrayLike
 
 from jaxslam import validation
-from jaxslam.association.known import Known
-from jaxslam.charts.euclidean import Euclidean
+from jaxslam.association.rules import Known
+from jaxslam.charts import Euclidean
 from jaxslam.core.record import record, static
 from jaxslam.filters.particles.landmark_ekf import update_map
 from jaxslam.filters.particles.proposal import associate_particle, propose_pose

@@ -19,7 +19,7 @@ from jaxslam.filters.map_management.merging import squared_distance
 from jaxslam.filters.map_management.point_pairs import PointSets, difference_covs
 from jaxslam.filters.map_management.relocalization import check_point_map, check_policy
 from jaxslam.filters.map_management.successive import merge_histories
-from jaxslam.life.recency import Times
+from jaxslam.life import Times
 from jaxslam.math import linalg
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.math.xla import change_where

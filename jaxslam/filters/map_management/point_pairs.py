@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.association.gates import mutual
+from jaxslam.association.rules import mutual
 
 
 class PointSets(NamedTuple):

@@ -5,7 +5,7 @@ from jaxtyping import Array, Float, Int
 
 from jaxslam.filters.ekf.coordinates.map_coordinates import cov_of_coordinates
 from jaxslam.filters.map_management.merging import closest_pair, merge_landmarks
-from jaxslam.life.recency import Times
+from jaxslam.life import Times
 from jaxslam.math.arrays import Number
 from jaxslam.math.xla import where_any
 from jaxslam.protocols import Chart

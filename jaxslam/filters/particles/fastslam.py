@@ -11,8 +11,8 @@ from jax import Array
 from jaxtyping import Bool, Float, Int, PyTree
 
 from jaxslam import validation
-from jaxslam.association.known import Known
-from jaxslam.charts.euclidean import Euclidean
+from jaxslam.association.rules import Known
+from jaxslam.charts import Euclidean
 from jaxslam.core.record import record, static
 from jaxslam.filters.particles.landmark_ekf import update_map
 from jaxslam.filters.particles.proposal import (
@@ -40,7 +40,7 @@ from jaxslam.filters.particles.states.slam_state import (
 from jaxslam.filters.reporting import has_distance, with_extra
 from jaxslam.math.arrays import Number
 from jaxslam.protocols import Associate, Differentiable, Filter, Life, Motion, Resample, Sensor
-from jaxslam.resampling.systematic import systematic
+from jaxslam.resampling.rules import systematic
 from jaxslam.resampling.weights import normalized, resampled_where
 from jaxslam.types import Estimate, Info, Scan
 

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam import validation
-from jaxslam.association.known import Known
+from jaxslam.association.rules import Known
 from jaxslam.core.record import hold_function, record, static
 from jaxslam.filters.known.localization import hold_map, map_tags
 from jaxslam.filters.particles.likelihood import ScanLikelihood, scan_likelihood

@@ -12,7 +12,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam import validation
-from jaxslam.charts.euclidean import Euclidean
+from jaxslam.charts import Euclidean
 from jaxslam.core.numbers import check_positive, is_concrete
 from jaxslam.core.record import record, static
 from jaxslam.filters.particles.proposal import sample_motion
@@ -32,7 +32,7 @@ from jaxslam.filters.particles.states.region import Region, hold_box
 from jaxslam.math.arrays import Number
 from jaxslam.protocols import Differentiable, Filter, Motion, Resample
 from jaxslam.resampling.kld import bins_of, enough
-from jaxslam.resampling.systematic import systematic
+from jaxslam.resampling.rules import systematic
 from jaxslam.resampling.weights import effective_size, normalized
 from jaxslam.types import Estimate
 

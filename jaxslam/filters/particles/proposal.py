@@ -15,7 +15,7 @@ from jaxslam.filters.particles.gating import gate_distance
 from jaxslam.filters.particles.scan_association import ParticleAssociation, particle_association
 from jaxslam.filters.particles.settings import ParticleMapSettings
 from jaxslam.filters.particles.states.slam_state import SlamParticles
-from jaxslam.linearize import derivatives, first_order
+from jaxslam.linearize import first_order
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
 from jaxslam.math.gaussians import gaussian_terms, log_density, log_det_of
@@ -106,7 +106,7 @@ def propose_pose(
     ) -> tuple[tuple[Array, Array, Array, Array], ParticleInnovations]:
         x, p, log_matched, log_unmatched = carry
         z, landmark, cov, matched, valid = row
-        by_pose, by_landmark = derivatives.observe_jacobians(sensor, x, landmark)
+        by_pose, by_landmark = first_order.observe_jacobians(sensor, x, landmark)
         noise = sensor.noise_cov(z)
         nu = sensor.residual(z, sensor.observe(x, landmark))
         hp = linalg.matmul(by_pose, p)
@@ -148,7 +148,7 @@ def predict_measurements(particle: SlamParticles, sensor: Sensor) -> Prediction:
         """The prediction ẑ, H_x and H_l C H_lᵀ of each landmark."""
 
         def one(landmark: Array, cov: Array) -> tuple[Array, Array, Array]:
-            by_pose, by_landmark = derivatives.observe_jacobians(sensor, particle.pose, landmark)
+            by_pose, by_landmark = first_order.observe_jacobians(sensor, particle.pose, landmark)
             own = linalg.matmul(linalg.matmul(by_landmark, cov), by_landmark.T)
             return sensor.observe(particle.pose, landmark), by_pose, own
 

@@ -2,7 +2,7 @@
 
 from jaxtyping import Array, Float
 
-from jaxslam.linearize import derivatives
+from jaxslam.linearize import first_order
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
 from jaxslam.protocols import Sensor
@@ -16,7 +16,7 @@ def whitened_rows(
     sensor: Sensor, z: Float[Array, "Z"], pose: Float[Array, "3"], landmark: Float[Array, "L"]
 ) -> Rows:
     """The rows of a measurement: R^{-1/2} times H_pose, H_l and z ⊖ h."""
-    by_pose, by_landmark = derivatives.observe_jacobians(sensor, pose, landmark)
+    by_pose, by_landmark = first_order.observe_jacobians(sensor, pose, landmark)
     innovation = sensor.residual(z, sensor.observe(pose, landmark))
     factor, positive = linalg.cholesky(sensor.noise_cov(z))
     a, b, r = (linalg.solve_lower(factor, part) for part in (by_pose, by_landmark, innovation))

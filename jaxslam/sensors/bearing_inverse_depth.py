@@ -21,8 +21,7 @@ from jaxslam.math.arrays import (
 )
 from jaxslam.noise import NoiseCov
 from jaxslam.protocols import Free, Reduced, Sensor
-from jaxslam.sensors.partial.bearing_only import BearingOnly
-from jaxslam.sensors.partial.prior import FreeLike, free_parameters
+from jaxslam.sensors.partial import BearingOnly, FreeLike, free_parameters
 
 _FAR = 1e-6
 """[1/m] least inverse distance that `position` uses."""
