@@ -3,11 +3,14 @@ them with.
 
 A variant is a chart, a linearizer or an option, given in one line; `monte_carlo` and the command
 line run them side by side.
+
+Looked up by name; the error of an unknown one has suggestions for typos.
 """
 
-from collections.abc import Callable
+import difflib
+from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import Any, Literal, Unpack
+from typing import Any, Literal, NoReturn, TypeVar, Unpack
 
 import jax.numpy as jnp
 import numpy as np
@@ -34,7 +37,30 @@ from jaxslam.simulation.worlds import World
 from jaxslam.smoothing.batch_map import BatchMap
 from jaxslam.smoothing.fixed_lag import FixedLag
 from jaxslam.types import Truth
-from jaxslam.validation.names import Named
+
+_V = TypeVar("_V")
+
+
+class UnknownName(KeyError):
+    """A name that is none of those known."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])  # a KeyError shows it in quotes
+
+
+class Named(dict[str, _V]):
+    """A dict whose lookup error lists the known names and the closest match."""
+
+    def __missing__(self, name: object) -> NoReturn:
+        """Refuse a name."""
+        known = ", ".join(self)
+        raise UnknownName(f"expected one of {known}, got {name!r}{meant(name, self)}")
+
+
+def meant(name: object, known: Iterable[str]) -> str:
+    """The closest of the known names, as a question in brackets; else nothing."""
+    alike = difflib.get_close_matches(str(name), known, 1)
+    return "".join(f" (did you mean {each}?)" for each in alike)
 
 
 def variant(scenario: World, *, watch: bool = False, **options: Unpack[EkfOptions]) -> Filter:

@@ -170,7 +170,7 @@ def section(module: str, names: list[Name], top: bool) -> str:
 
 
 def hidden(module: str) -> bool:
-    """Whether the package has a function of the module's name, as `jaxslam.charts` is."""
+    """Whether the package has a function of the module's name, as `jaxslam.run` is."""
     package, _, name = module.rpartition(".")
     return bool(package) and not inspect.ismodule(getattr(importlib.import_module(package), name))
 
