@@ -9,16 +9,15 @@ from functools import partial
 from pathlib import Path
 
 from jaxslam.datasets.bonn import bonn
-from jaxslam.datasets.carmen.log import LaserLog
-from jaxslam.datasets.carmen.reader import carmen
+from jaxslam.datasets.carmen.reader import LaserLog, carmen
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.mrclam.calibration import MRCLAM_CALIBRATION, RobotCalibration
-from jaxslam.datasets.mrclam.own_log import (
+from jaxslam.datasets.mrclam.reader import (
     MRCLAM_FITTED,
     OwnCalibration,
+    mrclam,
     mrclam_calibration,
 )
-from jaxslam.datasets.mrclam.reader import mrclam
 from jaxslam.datasets.mrclam.team import mrclam_team
 from jaxslam.datasets.noise_fit import DatasetFit, fit
 from jaxslam.datasets.plaza import plaza

@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxslam.datasets.dataset import Dataset
-from jaxslam.datasets.formats.lines import TextFile
+from jaxslam.datasets.lines import TextFile
 from jaxslam.logs.streams import as_recorded
 from jaxslam.motion import PoseIncrement
 from jaxslam.noise import NoiseCov

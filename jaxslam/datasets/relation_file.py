@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.datasets.formats.lines import TextFile
+from jaxslam.datasets.lines import TextFile
 from jaxslam.math.numpy_poses import wrapped
 
 _FIELDS = "t1", "t2", "x", "y", "z", "roll", "pitch", "yaw"

@@ -9,7 +9,7 @@ from numpy.typing import ArrayLike, NDArray
 
 from jaxslam.core.numbers import check_covariance
 from jaxslam.datasets.dataset import Dataset
-from jaxslam.datasets.formats.lines import TextFile
+from jaxslam.datasets.lines import TextFile
 from jaxslam.logs.streams import as_recorded
 from jaxslam.motion import PoseIncrement
 from jaxslam.noise import NoiseCov

@@ -1,4 +1,4 @@
-"""Graphs in files: the public names of what `datasets.formats.g2o` reads and writes."""
+"""Graphs in files: the public names of what `datasets.g2o` reads and writes."""
 
 from pathlib import Path
 
@@ -23,7 +23,7 @@ def read(path: str | Path) -> Graph:
     Poses and points are in the order of the file; the last five name tables.
     Numbers are those of the file. Comments (`#`), scans (`ROBOTLASER1`), notes (`VERTEX_TAG`,
     `VERTEX_ELLIPSE`) and offsets of sensors (`PARAMS_SE2OFFSET`, to which no edge that is read
-    refers) are skipped; `datasets.formats.g2o.load` counts them. In a file without vertices, poses
+    refers) are skipped; `datasets.g2o.load` counts them. In a file without vertices, poses
     and points have the order of their ids and are placed along the edges, `starts.odometry`. The
     cost of what is read is χ² = Σ eᵀ Ω e, with e as `graphs.REGISTRY` has it and no factor ½.
 
@@ -36,7 +36,7 @@ def read(path: str | Path) -> Graph:
             twice, an edge to a vertex that is nowhere or from one to itself, and an information
             that is not positive semidefinite.
     """
-    from jaxslam.datasets.formats import g2o
+    from jaxslam.datasets import g2o
 
     return g2o.load(path).graph
 
@@ -57,6 +57,6 @@ def write(path: str | Path, graph: Graph) -> None:
     what `read` refuses: ids twice or below zero, numbers that are not finite, and informations that
     are not symmetric and positive semidefinite.
     """
-    from jaxslam.datasets.formats import g2o
+    from jaxslam.datasets import g2o
 
     g2o.save(path, graph)

@@ -1,4 +1,4 @@
-"""Maps in files: the public names of what `datasets.formats.ros_map` reads and writes."""
+"""Maps in files: the public names of what `datasets.ros_map` reads and writes."""
 
 from pathlib import Path
 
@@ -20,7 +20,7 @@ def read_map(path: str | Path) -> Grid:
     Another key, as `map_type`, is named in a warning. Shades have 8 or 16 bits; a colour counts as
     the mean of its channels.
 
-    An occupied cell gets the log-odds `datasets.formats.ros_map.CERTAIN`, a free one the negative
+    An occupied cell gets the log-odds `datasets.ros_map.CERTAIN`, a free one the negative
     of it, an unknown one 0. In mode `scale` a cell between the thresholds has the probability
     (p - free_thresh)/(occupied_thresh - free_thresh), bounded in the same way.
 
@@ -31,7 +31,7 @@ def read_map(path: str | Path) -> Grid:
             a resolution that is not above 0, an origin that is no pose, thresholds out of order, a
             mode `raw`, and an image that is missing, transparent, of another format, or damaged.
     """
-    from jaxslam.datasets.formats import ros_map
+    from jaxslam.datasets import ros_map
 
     return ros_map.load(path)
 
@@ -46,6 +46,6 @@ def write_map(path: str | Path, grid: Grid, *, mode: str = "trinary") -> list[Pa
 
     Raises ValueError on a grid that is none, another mode, and a path that does not end in .yaml.
     """
-    from jaxslam.datasets.formats import ros_map
+    from jaxslam.datasets import ros_map
 
     return ros_map.save(path, grid, mode)

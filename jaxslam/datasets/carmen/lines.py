@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.datasets.formats.lines import TextFile
+from jaxslam.datasets.lines import TextFile
 
 POSE = ("x", "y", "theta")
 TIMES = ("timestamp", "logger time")

@@ -7,7 +7,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.datasets.formats.lines import TextFile
+from jaxslam.datasets.lines import TextFile
 from jaxslam.math import numpy_poses as poses
 
 JOINED = 1e-3

@@ -7,7 +7,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam.datasets.carmen.lines import Scan
-from jaxslam.datasets.formats.lines import TextFile
+from jaxslam.datasets.lines import TextFile
 from jaxslam.math import numpy_poses as poses
 from jaxslam.types import Beams
 

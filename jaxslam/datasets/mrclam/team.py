@@ -7,7 +7,7 @@ from typing import Literal
 import numpy as np
 
 from jaxslam.datasets.dataset import Dataset
-from jaxslam.datasets.formats.lines import stored
+from jaxslam.datasets.lines import stored
 from jaxslam.datasets.mrclam.calibration import RobotCalibration, check_calibration
 from jaxslam.datasets.mrclam.files import ROBOTS, read_landmarks
 from jaxslam.datasets.mrclam.robot import (

@@ -13,8 +13,14 @@ from numpy.typing import ArrayLike
 
 from jaxslam import motion, sensors
 from jaxslam.core.record import record, static
-from jaxslam.datasets.table.association import GATE, association_options, is_number
-from jaxslam.datasets.table.models import Parametric, fitting_model, of_no_noise
+from jaxslam.datasets.table.models import (
+    GATE,
+    Parametric,
+    association_options,
+    fitting_model,
+    is_number,
+    of_no_noise,
+)
 from jaxslam.datasets.table.settings_text import line_number
 from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.logs.tables import INTERVAL, POSE, odometry_columns, split_unit

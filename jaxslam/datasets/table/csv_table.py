@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxslam.datasets.formats.lines import read_bytes
+from jaxslam.datasets.lines import read_bytes
 from jaxslam.logs.tables import TAG, UNITS, Columns, split_unit, unit_divisor
 
 
