@@ -13,7 +13,7 @@ from jaxslam import metrics
 from jaxslam.consistency import LEVEL, percentage
 from jaxslam.consistency.nees import block_nees, pose_error
 from jaxslam.datasets.dataset import Dataset
-from jaxslam.filters.ekf.coordinates.map_coordinates import cov_of_coordinates
+from jaxslam.filters.ekf.map_coordinates import cov_of_coordinates
 from jaxslam.math.stats import chi2_band, chi2_quantile
 from jaxslam.metrics.paths import alignment, carried
 from jaxslam.protocols import Filter

@@ -7,10 +7,9 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.core.record import record
-from jaxslam.filters.ekf.coordinates.map_coordinates import estimate_of
+from jaxslam.filters.ekf.map_coordinates import estimate_of
 from jaxslam.filters.information import canonical, innovation
-from jaxslam.filters.information.settings import InformationFilter
-from jaxslam.filters.information.tag_association import associate_by_table
+from jaxslam.filters.information.innovation import InformationFilter, associate_by_table
 from jaxslam.math import linalg
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Info, Scan

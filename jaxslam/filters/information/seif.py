@@ -9,29 +9,33 @@ from jaxtyping import Bool, Float, Int
 from jaxslam.core.numbers import check_count
 from jaxslam.core.record import record, static
 from jaxslam.filters.information import canonical, innovation
-from jaxslam.filters.information.innovation import CanonicalInnovations
-from jaxslam.filters.information.settings import InformationFilter
-from jaxslam.filters.information.sparse.active_set import (
+from jaxslam.filters.information.active_set import (
     activate,
     active_matches,
     assign_indices,
     deactivate,
 )
-from jaxslam.filters.information.sparse.marginals import blanket_marginals, whole_marginals
-from jaxslam.filters.information.sparse.mean_recovery import (
+from jaxslam.filters.information.innovation import (
+    CanonicalInnovations,
+    InformationFilter,
+    TagAssociation,
+    associate_by_index,
+)
+from jaxslam.filters.information.marginals import (
+    blanket_marginals,
     recover_active_means,
     recover_passive_means,
     repeat_recovery,
+    whole_marginals,
 )
-from jaxslam.filters.information.sparse.sparse_state import (
+from jaxslam.filters.information.sparse_state import (
     SparseState,
     active_means,
     active_residual,
     empty_map,
     with_active_residual,
 )
-from jaxslam.filters.information.sparse.sparsification import cut_robot_links
-from jaxslam.filters.information.tag_association import TagAssociation, associate_by_index
+from jaxslam.filters.information.sparsification import cut_robot_links
 from jaxslam.types import Estimate, Info, Scan
 
 

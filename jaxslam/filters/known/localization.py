@@ -15,6 +15,8 @@ from jaxslam.association.rules import Known
 from jaxslam.charts import Euclidean
 from jaxslam.core.numbers import held_array, is_concrete
 from jaxslam.core.record import hold_function, record, set_field, static
+from jaxslam.filters.ekf.predict import propagate
+from jaxslam.filters.ekf.scan import SensorTurn, update_by_scan
 from jaxslam.filters.ekf.settings import (
     CorrectionOrder,
     Covariance,
@@ -23,8 +25,6 @@ from jaxslam.filters.ekf.settings import (
     check_ekf_options,
     check_iterations,
 )
-from jaxslam.filters.ekf.steps.predict import propagate
-from jaxslam.filters.ekf.steps.scan import SensorTurn, update_by_scan
 from jaxslam.linearize.first_order import AtEstimate
 from jaxslam.math import linalg
 from jaxslam.math.arrays import Number

@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxslam.core.numbers import check_count, check_covariance
-from jaxslam.filters.ekf.coordinates.map_coordinates import (
+from jaxslam.filters.ekf.map_coordinates import (
     cov_of_coordinates,
     with_cov_of_coordinates,
 )

@@ -13,8 +13,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import slots
-from jaxslam.filters.multi_robot.settings import SIZE, TeamSettings, measures_points
-from jaxslam.filters.multi_robot.team_state import InitialPose, pose_of, rows_of
+from jaxslam.filters.multi_robot.team_state import (
+    SIZE,
+    InitialPose,
+    TeamSettings,
+    measures_points,
+    pose_of,
+    rows_of,
+)
 from jaxslam.linearize import first_order
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap

@@ -12,6 +12,8 @@ from jaxslam.association.rules import Known
 from jaxslam.charts import Euclidean
 from jaxslam.core.numbers import check_count
 from jaxslam.core.record import hold_function, record, set_field, static
+from jaxslam.filters.ekf.predict import propagate
+from jaxslam.filters.ekf.scan import SensorTurn, turn_of, update_by_scan
 from jaxslam.filters.ekf.settings import (
     CorrectionOrder,
     Covariance,
@@ -19,16 +21,12 @@ from jaxslam.filters.ekf.settings import (
     check_covariance_form,
     check_ekf_options,
 )
-from jaxslam.filters.ekf.steps.predict import propagate
-from jaxslam.filters.ekf.steps.scan import SensorTurn, turn_of, update_by_scan
 from jaxslam.filters.multi_robot.pose_initialization import best_initialization, observed_points
-from jaxslam.filters.multi_robot.settings import (
+from jaxslam.filters.multi_robot.team_state import (
     SIZE,
+    InitialPose,
     TeamSettings,
     check_sensors,
-)
-from jaxslam.filters.multi_robot.team_state import (
-    InitialPose,
     robots_in_map,
     seen_from,
     seen_from_first,

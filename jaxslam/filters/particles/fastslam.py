@@ -15,6 +15,7 @@ from jaxslam.association.rules import Known
 from jaxslam.charts import Euclidean
 from jaxslam.core.record import record, static
 from jaxslam.filters.particles.landmark_ekf import update_map
+from jaxslam.filters.particles.pose_particles import weighted_nis
 from jaxslam.filters.particles.proposal import (
     PoseProposal,
     associate_particle,
@@ -29,12 +30,12 @@ from jaxslam.filters.particles.settings import (
     check_resampling,
     particle_map_settings,
 )
-from jaxslam.filters.particles.states.moments import slam_estimate, weighted_nis
-from jaxslam.filters.particles.states.particle_info import ParticleInfo
-from jaxslam.filters.particles.states.slam_state import (
+from jaxslam.filters.particles.slam_particles import (
+    ParticleInfo,
     SlamParticles,
     draw_poses,
     initial_slam_particles,
+    slam_estimate,
     with_finite_poses,
 )
 from jaxslam.filters.reporting import has_distance, with_extra

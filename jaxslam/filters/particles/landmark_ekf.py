@@ -14,8 +14,7 @@ from jaxslam import slots
 from jaxslam.filters.particles.proposal import ParticleInnovations
 from jaxslam.filters.particles.scan_association import ParticleAssociation
 from jaxslam.filters.particles.settings import ParticleMapSettings
-from jaxslam.filters.particles.states.moments import slam_estimate
-from jaxslam.filters.particles.states.slam_state import SlamParticles, as_only_particle
+from jaxslam.filters.particles.slam_particles import SlamParticles, as_only_particle, slam_estimate
 from jaxslam.filters.reporting import info_of, seen_before, status_of, with_removed
 from jaxslam.linearize import first_order
 from jaxslam.math import linalg

@@ -12,8 +12,11 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.association.predicted import predicted
-from jaxslam.filters.particles.gating import gate_distance
-from jaxslam.filters.particles.scan_association import ParticleAssociation, particle_association
+from jaxslam.filters.particles.scan_association import (
+    ParticleAssociation,
+    gate_distance,
+    particle_association,
+)
 from jaxslam.filters.particles.settings import KnownMapSensor
 from jaxslam.math.gaussians import GaussianTerms, gaussian_terms, log_density
 from jaxslam.protocols import Prediction

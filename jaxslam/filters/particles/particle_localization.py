@@ -14,12 +14,10 @@ from jaxslam.association.rules import Known
 from jaxslam.core.record import hold_function, record, static
 from jaxslam.filters.known.localization import hold_map, map_tags
 from jaxslam.filters.particles.likelihood import ScanLikelihood, scan_likelihood
+from jaxslam.filters.particles.pose_particles import Box, PoseParticles, draw_start, weighted_nis
 from jaxslam.filters.particles.pose_steps import MonteCarloFilter
 from jaxslam.filters.particles.scan_association import zero_padding
 from jaxslam.filters.particles.settings import known_map_sensors
-from jaxslam.filters.particles.states.moments import weighted_nis
-from jaxslam.filters.particles.states.pose_state import PoseParticles, draw_start
-from jaxslam.filters.particles.states.region import Box
 from jaxslam.filters.reporting import info_of, status_of, with_extra
 from jaxslam.math.arrays import Number
 from jaxslam.protocols import Associate, Motion, Sensor

@@ -15,20 +15,21 @@ from jaxslam import validation
 from jaxslam.charts import Euclidean
 from jaxslam.core.numbers import check_positive, is_concrete
 from jaxslam.core.record import record, static
-from jaxslam.filters.particles.proposal import sample_motion
-from jaxslam.filters.particles.recovery import resample_and_inject, update_averages
-from jaxslam.filters.particles.settings import check_resampling
-from jaxslam.filters.particles.states.particle_info import ParticleInfo
-from jaxslam.filters.particles.states.pose_state import (
+from jaxslam.filters.particles.pose_particles import (
     ParticleEvents,
     PoseParticles,
+    Region,
     active_mask,
     draw_start,
+    hold_box,
     initial_pose_particles,
     no_events,
     pose_particle_moments,
 )
-from jaxslam.filters.particles.states.region import Region, hold_box
+from jaxslam.filters.particles.proposal import sample_motion
+from jaxslam.filters.particles.recovery import resample_and_inject, update_averages
+from jaxslam.filters.particles.settings import check_resampling
+from jaxslam.filters.particles.slam_particles import ParticleInfo
 from jaxslam.math.arrays import Number
 from jaxslam.protocols import Differentiable, Filter, Motion, Resample
 from jaxslam.resampling.kld import bins_of, enough

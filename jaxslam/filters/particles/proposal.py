@@ -11,10 +11,13 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxslam.association.predicted import predicted
-from jaxslam.filters.particles.gating import gate_distance
-from jaxslam.filters.particles.scan_association import ParticleAssociation, particle_association
+from jaxslam.filters.particles.scan_association import (
+    ParticleAssociation,
+    gate_distance,
+    particle_association,
+)
 from jaxslam.filters.particles.settings import ParticleMapSettings
-from jaxslam.filters.particles.states.slam_state import SlamParticles
+from jaxslam.filters.particles.slam_particles import SlamParticles
 from jaxslam.linearize import first_order
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap

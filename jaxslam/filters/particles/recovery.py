@@ -11,8 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.filters.particles.states.pose_state import PoseParticles
-from jaxslam.filters.particles.states.region import Region
+from jaxslam.filters.particles.pose_particles import PoseParticles, Region
 from jaxslam.math.arrays import Number
 from jaxslam.protocols import Differentiable, Resample
 from jaxslam.resampling.weights import survivors

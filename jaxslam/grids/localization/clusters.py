@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
-from jaxslam.filters.particles.states.moments import weighted_pose_moments
+from jaxslam.filters.particles.pose_particles import weighted_pose_moments
 
 
 class Clusters(NamedTuple):

@@ -11,7 +11,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam.core.record import record
-from jaxslam.filters.particles.states.region import Region
+from jaxslam.filters.particles.pose_particles import Region
 from jaxslam.grids.grid import Grid
 from jaxslam.math.angles import wrap
 

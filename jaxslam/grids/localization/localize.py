@@ -12,9 +12,13 @@ from jaxtyping import Bool, Float, PyTree
 from jaxslam import validation
 from jaxslam.core.numbers import check_positive, is_concrete
 from jaxslam.core.record import record, set_field, static
+from jaxslam.filters.particles.pose_particles import (
+    PoseParticles,
+    active_mask,
+    draw_start,
+    hold_box,
+)
 from jaxslam.filters.particles.pose_steps import MonteCarloFilter
-from jaxslam.filters.particles.states.pose_state import PoseParticles, active_mask, draw_start
-from jaxslam.filters.particles.states.region import hold_box
 from jaxslam.filters.reporting import info_of, status_of, with_extra
 from jaxslam.grids.beam_models.beam_model import BeamModel, log_likelihood
 from jaxslam.grids.grid import Grid, check_grid, to_cells

@@ -15,8 +15,8 @@ import jaxslam
 from jaxslam import catalog, filters, plot
 from jaxslam.filters.delayed.state import TableLayout, empty_state
 from jaxslam.filters.information.eif_slam import CanonicalState
-from jaxslam.filters.information.sparse.sparse_state import empty_map
-from jaxslam.filters.particles.states.slam_state import initial_slam_particles
+from jaxslam.filters.information.sparse_state import empty_map
+from jaxslam.filters.particles.slam_particles import initial_slam_particles
 from jaxslam.results.film import MOST
 from jaxslam.results.plot.scene import Cloud, Hypotheses, Links, history_of, layers
 from jaxslam.results.plot.style import panels_of

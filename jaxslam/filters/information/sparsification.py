@@ -16,7 +16,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.filters.information.sparse.sparse_state import (
+from jaxslam.filters.information.sparse_state import (
     ApproximationCounts,
     SparseState,
     linked_to_robot,

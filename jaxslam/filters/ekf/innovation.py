@@ -12,11 +12,11 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam import slots
-from jaxslam.filters.ekf.coordinates.linear_system import basis_of_each
-from jaxslam.filters.ekf.coordinates.to_points import at_slot
+from jaxslam.filters.ekf.linear_system import basis_of_each
+from jaxslam.filters.ekf.map_coordinates import at_slot
+from jaxslam.filters.ekf.predicted_measurements import in_chart, projected_cov
 from jaxslam.filters.ekf.settings import EkfSettings
-from jaxslam.filters.ekf.steps.predicted_measurements import in_chart, projected_cov
-from jaxslam.filters.ekf.steps.whitening import InnovationFactor, factor_of, whiten, whitened_by
+from jaxslam.filters.ekf.whitening import InnovationFactor, factor_of, whiten, whitened_by
 from jaxslam.math import linalg
 from jaxslam.math.gaussians import log_density, log_det_of_pivots
 from jaxslam.math.xla import materialize, no_inline

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxslam import slots
-from jaxslam.filters.ekf.coordinates.linear_system import Transition
+from jaxslam.filters.ekf.linear_system import Transition
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.math import linalg
 from jaxslam.math.xla import materialize
