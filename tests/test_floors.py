@@ -28,7 +28,7 @@ ROOF = len(FLOORS)  # jaxslam/__init__.py sees everything, and nothing sees it
 # `campaign.save(folder)` are where a user looks for them, and results are drawn and written above;
 # so are `graphs.read(path)` and `grids.read_map(path)`, and files are read above.
 WITHIN_CALLS = {
-    "graphs.files": "datasets",
+    "graphs.graph": "datasets",
     "grids.files": "datasets",
     "monte_carlo.record": "results",
 }

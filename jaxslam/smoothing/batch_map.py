@@ -12,8 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxslam.core.numbers import check_count
 from jaxslam.core.record import record, static
 from jaxslam.graphs.chain.elimination import Chain
-from jaxslam.graphs.chain.gauss_newton import Iterations, optimize_chain
-from jaxslam.graphs.chain.problem import Iterate, Problem
+from jaxslam.graphs.chain.problem import Iterate, Iterations, Problem, optimize_chain
 from jaxslam.graphs.solver.search import Ending
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.slots import Joint

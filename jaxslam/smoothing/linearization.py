@@ -4,8 +4,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.graphs.chain.elimination import Chain, LinearizedStep, Start
-from jaxslam.graphs.chain.rows import Rows, pose_difference, whitened_rows
+from jaxslam.graphs.chain.elimination import (
+    Chain,
+    LinearizedStep,
+    Rows,
+    Start,
+    pose_difference,
+    whitened_rows,
+)
 from jaxslam.linearize import first_order
 from jaxslam.math import linalg
 from jaxslam.protocols import Motion, Sensor

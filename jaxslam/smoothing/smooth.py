@@ -9,8 +9,7 @@ from jaxtyping import Array, Bool, Float
 from jaxslam.charts import Euclidean
 from jaxslam.core.record import record
 from jaxslam.filters.ekf.map_coordinates import estimate_of
-from jaxslam.graphs.chain.elimination import Chain, Policy, eliminate
-from jaxslam.graphs.chain.marginals import chain_marginals
+from jaxslam.graphs.chain.elimination import Chain, Policy, chain_marginals, eliminate
 from jaxslam.math.angles import wrap
 from jaxslam.protocols import Sensor
 from jaxslam.slots import Joint

@@ -15,8 +15,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import slots
-from jaxslam.graphs.chain.elimination import CostToGo, Gain, LinearizedStep, eliminate_steps
-from jaxslam.graphs.chain.rows import pose_difference, whitened_rows
+from jaxslam.graphs.chain.elimination import (
+    CostToGo,
+    Gain,
+    LinearizedStep,
+    eliminate_steps,
+    pose_difference,
+    whitened_rows,
+)
 from jaxslam.linearize.first_order import with_lever_arm
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap

@@ -12,9 +12,8 @@ from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.solver.model import factors_of
 from jaxslam.graphs.sparse.cholesky import CholeskyTables, block_count, cholesky_tables
-from jaxslam.graphs.sparse.gathered import Stages, stages
 from jaxslam.graphs.sparse.inverse import InverseTables, inverse_tables
-from jaxslam.graphs.sparse.sweeps import index_table
+from jaxslam.graphs.sparse.sweeps import Stages, index_table, stages
 from jaxslam.graphs.sparse.symbolic import factor_pattern
 
 

@@ -9,6 +9,8 @@ scatter is needed, and the size of the compiled program does not depend on that 
 
 Tables and arrays are longer than they need be (`padded_size`), so that patterns of about one size
 share their compiled programs: rows beyond the last level are not visited.
+
+Sums of rows by target are gathers: no scatter, and the same order of terms on every device.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,7 +19,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 TARGETS = 8
 """T, targets that are computed together"""
@@ -216,3 +218,45 @@ def finish(
 
     out: jax.Array = jax.lax.fori_loop(tables.ends[level], tables.ends[level + 1], chunk, target)
     return out
+
+
+_SUMMED = 4
+_LEAST_STAGES = 2
+"""stages at least, which up to sixteen rows of a target need: fewer would be another program"""
+
+Stages = tuple[Int[Array, "_ terms"], ...]
+
+
+def stages(target: Int[np.ndarray, "rows"], size: int, room: int = 0) -> Stages:
+    """The tables of sums of rows into so many targets; a target of -1 drops its row.
+
+    With room there are four stages at least, enough for 256 rows of a target, of so many rows.
+
+    Each stage sums up to four rows; it gives its targets in order, until each has one row.
+    """
+    used = np.flatnonzero(target >= 0)
+    numbers = used[np.argsort(target[used], kind="stable")]
+    absent, owner, out = len(target), target[numbers], list[Array]()
+    while True:
+        counts = np.bincount(owner, minlength=size)
+        last = counts.max(initial=0) <= _SUMMED
+        groups = np.ones(size, int) if last else -(-counts // _SUMMED)
+        begin, group_begin = np.cumsum(counts) - counts, np.cumsum(groups) - groups
+        sums = np.full((groups.sum(), _SUMMED), absent, np.int32)
+        rank = np.arange(len(owner)) - begin[owner]
+        sums[group_begin[owner] + rank // _SUMMED, rank % _SUMMED] = numbers
+        done = last and len(out) + 1 >= (4 if room else _LEAST_STAGES)
+        rows = len(sums) if done else padded_size(max(len(sums), room))
+        out.append(index_table(sums, rows, absent))
+        if done:
+            return tuple(out)
+        owner = np.repeat(np.arange(size), groups)
+        numbers, absent = np.arange(len(owner)), rows
+
+
+def summed(stages: Stages, rows: Float[Array, "rows *rest"]) -> Float[Array, "size *rest"]:
+    """The sums of the rows of each target; zero where it has none."""
+    for sums in stages:
+        taken = rows.at[sums].get(mode="fill", fill_value=0)
+        rows = taken[:, 0] + taken[:, 1] + (taken[:, 2] + taken[:, 3])
+    return rows

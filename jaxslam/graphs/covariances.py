@@ -13,10 +13,17 @@ from numpy.typing import ArrayLike
 from jaxslam.core.numbers import is_concrete
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
-from jaxslam.graphs.solver.batch import graph_in_one_dtype, over_batch
+from jaxslam.graphs.solver.batch import (
+    LEAST,
+    cut,
+    graph_in_one_dtype,
+    over_batch,
+    own_number,
+    padded_graph,
+    padded_number,
+)
 from jaxslam.graphs.solver.linearized import data_of, linearize, variables_of
 from jaxslam.graphs.solver.model import Model, model_of
-from jaxslam.graphs.solver.padding import LEAST, cut, own_number, padded_graph, padded_number
 from jaxslam.graphs.solver.plan import Plan, checked_pairs, plan_for
 from jaxslam.graphs.solver.search import Solution
 from jaxslam.graphs.sparse.cholesky import by, by_transposed, factorize
