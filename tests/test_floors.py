@@ -29,7 +29,7 @@ ROOF = len(FLOORS)  # jaxslam/__init__.py sees everything, and nothing sees it
 # so are `graphs.read(path)` and `grids.read_map(path)`, and files are read above.
 WITHIN_CALLS = {
     "graphs.graph": "datasets",
-    "grids.files": "datasets",
+    "grids.grid": "datasets",
     "monte_carlo.record": "results",
 }
 

@@ -11,8 +11,7 @@ from jaxtyping import Array, Bool, Float, PyTree, UInt8
 
 from jaxslam.core.numbers import check_real, is_concrete, shape_told
 from jaxslam.grids.distance import squared_distances
-from jaxslam.grids.grid import Grid, check_grid, to_cells
-from jaxslam.grids.interpolation import interpolated
+from jaxslam.grids.grid import Grid, check_grid, interpolated, to_cells
 from jaxslam.grids.traversal import MOST, OFF, STOP, march
 from jaxslam.math.xla import hot_jit
 

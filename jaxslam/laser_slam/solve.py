@@ -9,9 +9,8 @@ import numpy as np
 from jaxslam import graphs
 from jaxslam.laser_slam import covariances
 from jaxslam.laser_slam.assembly import ROOM
-from jaxslam.laser_slam.loops.closing import closed
+from jaxslam.laser_slam.loops.closing import closed, give_back
 from jaxslam.laser_slam.mapping import frame_of, map_of
-from jaxslam.laser_slam.memory import give_back
 from jaxslam.laser_slam.odometry.pieces import laser_odometry
 from jaxslam.laser_slam.odometry.raw import Steps, steps_of
 from jaxslam.laser_slam.odometry.tracking import Odometry

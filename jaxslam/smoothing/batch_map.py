@@ -21,8 +21,7 @@ from jaxslam.smoothing.forward_pass import (
     LogEstimator,
     log_in_one_dtype,
 )
-from jaxslam.smoothing.linearization import chain_of, noise_roots, start_of
-from jaxslam.smoothing.smooth import solution, with_singular
+from jaxslam.smoothing.smoother import chain_of, noise_roots, solution, start_of, with_singular
 from jaxslam.types import Estimate, Info, Log, Trace
 
 

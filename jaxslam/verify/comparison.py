@@ -6,8 +6,8 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.verify.derivatives.jacobians import Evaluated, Jacobians
 from jaxslam.verify.inputs.samples import LARGE, NOMINAL, Samples
+from jaxslam.verify.jacobians import Evaluated, Jacobians
 from jaxslam.verify.record import Finding, WorstState, WrongEntry
 
 Values: TypeAlias = Float[np.ndarray, "_ _ _"]

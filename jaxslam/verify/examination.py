@@ -13,7 +13,6 @@ from jaxslam.math.arrays import float64
 from jaxslam.math.xla import quick_jit
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.verify import properties
-from jaxslam.verify.derivatives.jacobians import Evaluated, evaluate_jacobians
 from jaxslam.verify.errors import describe_error
 from jaxslam.verify.finite import singular_notes
 from jaxslam.verify.inputs import samples
@@ -23,6 +22,7 @@ from jaxslam.verify.inputs.functions import (
     sensor_functions,
 )
 from jaxslam.verify.inputs.samples import Samples
+from jaxslam.verify.jacobians import Evaluated, evaluate_jacobians
 from jaxslam.verify.linearity import motion_linearity, sensor_linearity
 from jaxslam.verify.record import Check
 

@@ -13,11 +13,11 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam.core.numbers import check_count
 from jaxslam.filters.ekf.map_coordinates import cov_of_coordinates
-from jaxslam.filters.map_management.alignment import with_unit_blocks
 from jaxslam.filters.map_management.geometric_matching import (
     GeometricMatch,
     match_points,
     search_limits,
+    with_unit_blocks,
 )
 from jaxslam.filters.map_management.merging import closest_pair, merge_landmarks, squared_distance
 from jaxslam.filters.map_management.point_pairs import PointSets, difference_covs

@@ -12,9 +12,9 @@ from jaxslam.filters.ekf.map_coordinates import (
     cov_of_coordinates,
     with_cov_of_coordinates,
 )
-from jaxslam.filters.map_management.alignment import align_points
 from jaxslam.filters.map_management.geometric_matching import (
     GeometricMatch,
+    align_points,
     match_points,
     search_limits,
 )

@@ -18,8 +18,7 @@ from jaxslam.simulation.worlds import World
 from jaxslam.verify import Check, Report, build
 from jaxslam.verify.errors import describe_error, is_user_file, place_of_error
 from jaxslam.verify.examination import Model
-from jaxslam.verify.inputs.claims import Claim
-from jaxslam.verify.inputs.functions import makes_a_model
+from jaxslam.verify.inputs.functions import Claim, makes_a_model
 
 CLAIMS = ("_jacobian", "_jacobians")
 """Endings of names: f_jacobian is the hand-derived Jacobian of f."""

@@ -1,19 +1,28 @@
-"""Monte-Carlo localization in an occupancy grid, from the beams of a laser."""
+"""Monte-Carlo localization in an occupancy grid, from the beams of a laser.
+
+With the log that `run` takes, made of odometry and laser scans, and the free cells of a map as the
+region where a robot may be.
+"""
 
 import dataclasses
+import math
 from functools import partial
+from types import ModuleType
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import Array
+from jax.typing import DTypeLike
 from jaxtyping import Bool, Float, PyTree
+from numpy.typing import ArrayLike
 
 from jaxslam import validation
 from jaxslam.core.numbers import check_positive, is_concrete
 from jaxslam.core.record import record, set_field, static
 from jaxslam.filters.particles.pose_particles import (
     PoseParticles,
+    Region,
     active_mask,
     draw_start,
     hold_box,
@@ -22,14 +31,122 @@ from jaxslam.filters.particles.pose_steps import MonteCarloFilter
 from jaxslam.filters.reporting import info_of, status_of, with_extra
 from jaxslam.grids.beam_models.beam_model import BeamModel, log_likelihood
 from jaxslam.grids.grid import Grid, check_grid, to_cells
-from jaxslam.grids.localization.beam_log import BEAM, beams_of
-from jaxslam.grids.localization.free_space import FreeSpace, free_space
+from jaxslam.math.angles import wrap
 from jaxslam.math.arrays import Number, in_dtype
 from jaxslam.math.xla import no_inline
 from jaxslam.protocols import Motion
 from jaxslam.resampling.weights import normalized
-from jaxslam.types import Beams, Estimate, Info, Scan
+from jaxslam.types import Beams, Estimate, Info, Log, Scan
 from jaxslam.validation.models import check_motion
+
+BEAM = ("range [m]", "angle [rad]")
+"""The measurements of such a log."""
+
+BEAM = ("range [m]", "angle [rad]")
+"""The measurements of such a log."""
+
+NOTHING = 1e6
+"""Range [m] in a log of a beam that met nothing and is infinite in the scan: a log is finite."""
+
+
+def beam_log(control: ArrayLike, beams: Beams) -> Log:
+    """The log of T controls and T scans of B beams: measurements (range, angle), without tags.
+
+    A beam that says nothing (`Beams`) is not valid in the log. An infinite range becomes `NOTHING`.
+    Arrays are NumPy's, within a trace JAX's.
+
+    Args:
+        control: (T, U) of the motion model; row t led to where scan t was taken.
+        beams: with leading T.
+    Raises:
+        ValueError: shapes that do not fit; outside a trace, angles of valid beams that are not
+            finite, or no valid beam at all.
+    """
+    if not isinstance(beams, Beams):
+        raise ValueError(f"beam_log: expected Beams, got {type(beams).__name__}")
+    shapes = [np.shape(part) for part in beams]
+    if len(shapes[0]) != 2 or len(set(shapes)) != 1:
+        told = ", ".join(map(str, shapes))
+        raise ValueError(f"beam_log: expected as many ranges, angles and masks (T, B), got {told}")
+    steps = shapes[0][0]
+    if np.ndim(control) != 2 or np.shape(control)[0] != steps:
+        raise ValueError(
+            f"beam_log: expected a control (U,) for each of {steps} scans, got {np.shape(control)}"
+        )
+    concrete = is_concrete(control, beams)
+    xp: ModuleType = np if concrete else jnp
+    moved, ranges, angle, valid = (xp.asarray(part) for part in (control, *beams))
+    met, free = Beams(ranges, angle, valid).returns()
+    usable = xp.asarray(met | free)
+    if concrete:
+        lost = valid & (ranges > 0) & ~np.isfinite(angle)
+        if lost.any():
+            step = int(np.argmax(lost.any(axis=1)))
+            raise ValueError(f"beam_log: scan {step}: the angle of a valid beam is not finite")
+        if not usable.any():
+            raise ValueError(f"beam_log: none of {steps} scans has a valid beam")
+    z = xp.stack([xp.minimum(ranges, NOTHING), angle], axis=-1)
+    scan = Scan(
+        z=xp.where(usable[..., None], z, 0.0).astype(moved.dtype),
+        tag=xp.full(shapes[0], -1, np.int32),
+        valid=usable,
+    )
+    return Log(moved, scan)
+
+
+def beams_of(scan: Scan, every: int) -> Beams:
+    """Each n-th beam of a scan of such a log; those not valid are of range 0."""
+    z, there = scan.z[::every], scan.valid[::every]
+    used = there & (z[:, 0] > 0)
+    clean = jnp.where(used[:, None], z, 0.0)
+    return Beams(clean[:, 0], clean[:, 1], used)
+
+
+@record
+class FreeSpace(Region):
+    """The free cells of a map."""
+
+    places: ArrayLike
+    """(K, 2) their centres"""
+    sides: ArrayLike
+    """(2, 2) of a cell, as rows"""
+
+    def draw(self, count: int, key: Array, dtype: DTypeLike) -> Float[Array, "P 3"]:
+        key_which, key_where = jax.random.split(key)
+        places = jnp.asarray(self.places, dtype)
+        which = jax.random.randint(key_which, (count,), 0, len(places))
+        share = jax.random.uniform(key_where, (count, 3), dtype) - 0.5
+        place = places[which] + share[:, :2] @ jnp.asarray(self.sides, dtype)
+        return jnp.concatenate([place, wrap(2 * math.pi * share[:, 2:])], axis=1)
+
+    def moments(self, dtype: DTypeLike) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
+        places, sides = jnp.asarray(self.places, dtype), jnp.asarray(self.sides, dtype)
+        mean = places.mean(axis=0)
+        spread = (places - mean[None]).T @ (places - mean[None]) / len(
+            places
+        ) + sides.T @ sides / 12
+        cov = jnp.zeros((3, 3), dtype).at[:2, :2].set(spread).at[2, 2].set(math.pi**2 / 3)
+        return jnp.concatenate([mean, jnp.zeros(1, dtype)]), cov
+
+
+def free_space(name: str, grid: Grid, box: Float[np.ndarray, "2 2"] | None) -> FreeSpace:
+    """The free cells of a map whose centres lie in a box, None for all.
+
+    Raises ValueError, which begins with a caller's name, where there is none.
+    """
+    free = np.asarray(grid.log_odds) < 0
+    if not free.any():
+        raise ValueError(f"{name}: the map has no free cell (log-odds below 0)")
+    origin, cell = np.asarray(grid.origin, np.float64), float(np.asarray(grid.resolution))
+    c, s = np.cos(origin[2]), np.sin(origin[2])
+    sides = cell * np.array([[c, s], [-s, c]])
+    i, j = np.indices(free.shape) + 0.5
+    middle = np.stack([j, i], axis=-1) @ sides + origin[:2]
+    if box is not None:
+        free = free & ((middle >= box[0]) & (middle <= box[1])).all(axis=2)
+        if not free.any():
+            raise ValueError(f"{name}: no free cell of the map is in the box {box.tolist()}")
+    return FreeSpace(middle[free], sides)
 
 
 @record

@@ -1,4 +1,7 @@
-"""The loop that the iterative closest point methods share: pairs, a closed-form step, again."""
+"""Iterative closest point: pairs of nearest points and an exact step, again and again.
+
+With distances between points, or from points to lines (PL-ICP).
+"""
 
 from typing import NamedTuple, TypeAlias
 
@@ -9,8 +12,15 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxslam.core.numbers import check_count, check_positive, is_concrete
 from jaxslam.core.record import record, static
 from jaxslam.graphs.solver.kernels import Kernel
-from jaxslam.matching.correspondences import nearest_points, weights
-from jaxslam.matching.icp.closed_form import Quadratic, added, least, linearized, of_prior
+from jaxslam.matching.closed_form import (
+    Quadratic,
+    added,
+    least,
+    linearized,
+    of_lines,
+    of_points,
+    of_prior,
+)
 from jaxslam.matching.matcher import Match, Matcher
 from jaxslam.matching.outcome import (
     Limits,
@@ -20,9 +30,8 @@ from jaxslam.matching.outcome import (
     information_along,
     length_of,
 )
-from jaxslam.matching.points import Points
-from jaxslam.matching.prior import Prior, prior_cost, prior_terms
-from jaxslam.matching.surface import GAP, SPAN, Surface, surface
+from jaxslam.matching.points import Points, Prior, prior_cost, prior_terms
+from jaxslam.matching.surface import GAP, SPAN, Surface, nearest_points, surface, weights
 from jaxslam.math import linalg, se2
 from jaxslam.math.angles import wrap
 from jaxslam.math.arrays import Number, in_dtype
@@ -226,3 +235,91 @@ def _information(
         + information_along(axis, none, arm, weight)
         + information_along(axis[:, ::-1], none, arm, weight)
     )
+
+
+@record
+class PointToPoint(Icp):
+    """ICP: the pose that minimizes Σ w |T ∘ p_i - q_j(i)|², q_j(i) the nearest point.
+
+    Each step is the exact minimum for its pairs (`closed_form.least`); its error falls by a
+    constant factor a step. Besl & McKay 1992, "A method for registration of 3-D shapes", IEEE
+    PAMI 14; Lu & Milios 1997. Lines serve the status alone.
+    """
+
+    settings: IcpSettings = IcpSettings()
+
+    def residual(self, of: Surface, moved: Array, partner: Array) -> Float[Array, "N"]:
+        return distance(of, moved, partner)
+
+    def quadratic(self, of: Surface, pairs: PairedPoints, middle: Array) -> Quadratic:
+        used = (pairs.weight > 0)[:, None]
+        source = jnp.where(used, pairs.moved - middle[None], 0.0)
+        target = jnp.where(used, of.position[pairs.partner] - middle[None], 0.0)
+        return of_points(source, target, pairs.weight)
+
+    def cost_of_pairs(
+        self, of: Surface, moved: Array, partner: Array, weight: Array
+    ) -> Float[Array, ""]:
+        apart = jnp.where((weight > 0)[:, None], moved - of.position[partner], 0.0)
+        return 0.5 * (weight * (apart**2).sum(axis=1)).sum()
+
+
+def distance(of: Surface, moved: Array, partner: Array) -> Float[Array, "N"]:
+    """The distance [m] of each point from its partner."""
+    square = ((moved - of.position[partner]) ** 2).sum(axis=1)
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+
+
+@record
+class PointToLine(Icp):
+    """PL-ICP: the pose that minimizes Σ w (n_j · (T ∘ p_i - m_j))², j(i) the nearest point.
+
+    The line (m_j, n_j) is fitted to point j of the reference and its neighbours (`Surface`); each
+    step is the exact minimum for its pairs (`closed_form.least`), so that it converges
+    quadratically. Censi 2008, "An ICP variant using a point-to-line metric", ICRA, where the line
+    joins the two nearest points. Where there is no line, the residual is `lone` |T ∘ p_i - q_j|.
+    """
+
+    settings: IcpSettings = IcpSettings()
+
+    def residual(self, of: Surface, moved: Array, partner: Array) -> Float[Array, "N"]:
+        across = (of.normal[partner] * (moved - of.middle[partner])).sum(axis=1)
+        lone = self.settings.lone
+        if lone is None:
+            return across
+        return jnp.where(of.straight[partner], across, lone * distance(of, moved, partner))
+
+    def usable(self, of: Surface) -> Bool[Array, "M"]:
+        return of.straight if self.settings.lone is None else super().usable(of)
+
+    def quadratic(self, of: Surface, pairs: PairedPoints, middle: Array) -> Quadratic:
+        j, lone = pairs.partner, self.settings.lone
+        by_line, by_point = _weights(of, j, pairs.weight)
+
+        def about(points: Array, weight: Array) -> Array:
+            return jnp.where((weight > 0)[:, None], points - middle[None], 0.0)
+
+        source = about(pairs.moved, pairs.weight)
+        lines = of_lines(source, about(of.middle[j], by_line), of.normal[j], by_line)
+        if lone is None:
+            return lines
+        points = of_points(source, about(of.position[j], by_point), lone**2 * by_point)
+        return added(lines, points)
+
+    def cost_of_pairs(
+        self, of: Surface, moved: Array, partner: Array, weight: Array
+    ) -> Float[Array, ""]:
+        by_line, by_point = _weights(of, partner, weight)
+        apart = jnp.where((by_line > 0)[:, None], moved - of.middle[partner], 0.0)
+        total = (by_line * (of.normal[partner] * apart).sum(axis=1) ** 2).sum()
+        lone = self.settings.lone
+        if lone is not None:
+            apart = jnp.where((by_point > 0)[:, None], moved - of.position[partner], 0.0)
+            total = total + lone**2 * (by_point * (apart**2).sum(axis=1)).sum()
+        return 0.5 * total
+
+
+def _weights(of: Surface, partner: Array, weight: Array) -> tuple[Array, Array]:
+    """The weights of pairs with a line, and of those without."""
+    straight = of.straight[partner]
+    return jnp.where(straight, weight, 0.0), jnp.where(straight, 0.0, weight)

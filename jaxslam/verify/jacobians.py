@@ -11,10 +11,9 @@ import numpy as np
 from jaxtyping import Float, PyTree
 
 from jaxslam.math.xla import quick_jit
-from jaxslam.verify.derivatives.differences import Batch, Quotient, complex_step, quotients
+from jaxslam.verify.differences import Batch, Quotient, complex_step, quotients
 from jaxslam.verify.errors import describe_error
-from jaxslam.verify.inputs.claims import as_claim, split_claim
-from jaxslam.verify.inputs.functions import Function, periods
+from jaxslam.verify.inputs.functions import Function, as_claim, periods, split_claim
 from jaxslam.verify.inputs.samples import Samples
 from jaxslam.verify.record import Check
 
