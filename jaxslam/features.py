@@ -14,7 +14,7 @@ from jaxslam.types import Beams
 _ITERATIONS = 4
 
 
-def ends_of(
+def _ends_of(
     angle: Float[np.ndarray, "n"], distance: Float[np.ndarray, "n"]
 ) -> Float[np.ndarray, "n 2"]:
     """The ends of beams [m]."""
@@ -52,7 +52,7 @@ def fit_line(
             f"fit_line: expected as many angles as ranges, got shapes {np.shape(angle)} and "
             f"{np.shape(distance)}"
         )
-    points = ends_of(angle, distance)
+    points = _ends_of(angle, distance)
     if not np.isfinite(points).all():
         raise ValueError("fit_line: expected finite angles and ranges")
     if len(points) < 2 or not np.ptp(points, axis=0).max() > 0:
@@ -80,7 +80,7 @@ def fit_line(
     return line, cov, float((weight * off**2).sum())
 
 
-def misfit_of_parabola(
+def _misfit_of_parabola(
     angle: Float[np.ndarray, "n"],
     distance: Float[np.ndarray, "n"],
     sigma: float,
@@ -219,7 +219,7 @@ def segments(
     more = chi2_quantile(probability, 1)
 
     def parabola(run: Int[np.ndarray, "n"]) -> float:
-        return misfit_of_parabola(angle[run], distance[run], *noise)
+        return _misfit_of_parabola(angle[run], distance[run], *noise)
 
     def arc(k: int) -> bool:
         """Whether a piece and the next one are of one arc."""
@@ -239,7 +239,7 @@ def segments(
         if not chi2 <= min(chi2_quantile(probability, len(run) - 2), parabola(run) + more):
             continue
         n = np.array([np.cos(line[1]), np.sin(line[1])])
-        ends = ends_of(angle[run[[0, -1]]], distance[run[[0, -1]]])
+        ends = _ends_of(angle[run[[0, -1]]], distance[run[[0, -1]]])
         ends = ends - (ends @ n - line[0])[:, None] * n
         found.append((line, cov, ends, len(run), chi2))
         counted += len(run)
@@ -265,7 +265,7 @@ def _runs(angle: np.ndarray, distance: np.ndarray, sigma: float) -> list[Int[np.
     near = np.minimum(distance, distance[after])
     # Across a wall at the least slant, λ: near sin(Δφ)/sin(λ - Δφ).
     reach = np.where(turn < _SLANT, np.sin(turn) / np.sin(np.maximum(_SLANT - turn, 1e-3)), 0.0)
-    points = ends_of(angle, distance)
+    points = _ends_of(angle, distance)
     gap = np.linalg.norm(points[after] - points, axis=1)
     breaks = gap > near * reach + 3 * np.sqrt(2) * sigma
     starts = np.flatnonzero(breaks) + 1
@@ -281,7 +281,7 @@ def _divided(
     """The straight pieces of a run: divided at the point furthest from the chord, in σ."""
     if len(run) < 3:
         return [run]
-    points = ends_of(angle[run], distance[run])
+    points = _ends_of(angle[run], distance[run])
     chord = points[-1] - points[0]
     length = np.hypot(*chord)
     if length == 0:

@@ -21,11 +21,11 @@ BOUND = 1.35
 """By how much log L falls at the 95 % upper limit of a parameter whose estimate is 0: half the 0.90
 quantile of χ² with one degree of freedom, since half of the estimates are 0 where the truth is."""
 
-CONFOUNDED = 0.9
+_CONFOUNDED = 0.9
 """Correlation of two estimates above which they are named together."""
 
 
-class LikelihoodPoint(NamedTuple):
+class _LikelihoodPoint(NamedTuple):
     """The likelihood at one set of parameters, by the coordinates q."""
 
     q: np.ndarray
@@ -37,7 +37,7 @@ class LikelihoodPoint(NamedTuple):
     dof: int
 
 
-def newton_step(observed: np.ndarray, gradient: np.ndarray) -> tuple[np.ndarray, float]:
+def _newton_step(observed: np.ndarray, gradient: np.ndarray) -> tuple[np.ndarray, float]:
     """Newton's step, in each direction at most 1, and the gain of log L that it promises.
 
     Where log L is convex the step goes uphill by as much as it would where it is concave.
@@ -48,8 +48,8 @@ def newton_step(observed: np.ndarray, gradient: np.ndarray) -> tuple[np.ndarray,
     return vectors @ step, float(np.abs(along * step).sum() / 2)
 
 
-def observed_information(
-    at: Callable[[np.ndarray], LikelihoodPoint], here: LikelihoodPoint, logged: np.ndarray
+def _observed_information(
+    at: Callable[[np.ndarray], _LikelihoodPoint], here: _LikelihoodPoint, logged: np.ndarray
 ) -> Float[np.ndarray, "P P"]:
     """The observed information -∂²log L/∂q², from differences of the gradient over part of a σ."""
     rows = []
@@ -62,8 +62,8 @@ def observed_information(
     return np.asarray((found + found.T) / 2)
 
 
-def upper_limit(
-    at: Callable[[np.ndarray], LikelihoodPoint], here: LikelihoodPoint, i: int
+def _upper_limit(
+    at: Callable[[np.ndarray], _LikelihoodPoint], here: _LikelihoodPoint, i: int
 ) -> float:
     """The deviation, above that of parameter i, at which log L is lower by `BOUND`; to 2 %."""
     unit, low, high = np.eye(len(here.q))[i], 0.0, np.log(2.0)
@@ -76,7 +76,7 @@ def upper_limit(
     return float(np.exp(here.q[i] + (low + high) / 2))
 
 
-def standard_errors(
+def _standard_errors(
     observed: np.ndarray, spread: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, list[list[int]]]:
     """The inverse of the observed information, robust errors, and confounded parameters of each.
@@ -96,7 +96,7 @@ def standard_errors(
     cov[keep] = inverse
     robust[~lost] = np.sqrt(np.diag(inverse @ spread[keep] @ inverse))
     related = part.astype(int) @ part.T > 0
-    related[keep] = np.abs(inverse / np.outer(error, error)) > CONFOUNDED
+    related[keep] = np.abs(inverse / np.outer(error, error)) > _CONFOUNDED
     np.fill_diagonal(related, False)
     return cov, robust, [list(np.flatnonzero(row)) for row in related]
 
@@ -185,12 +185,12 @@ def fit_noise(
 
     of_run = as_record(info)
 
-    def tried(q: np.ndarray) -> LikelihoodPoint:
+    def tried(q: np.ndarray) -> _LikelihoodPoint:
         found = jax.device_get(_evaluate(of_run, q, logged, data))
         value, gradient, spread, nis, dof = (np.asarray(part, np.float64) for part in found)
-        return LikelihoodPoint(q, float(value), gradient, spread, float(nis), int(dof))
+        return _LikelihoodPoint(q, float(value), gradient, spread, float(nis), int(dof))
 
-    def at(q: np.ndarray) -> LikelihoodPoint:
+    def at(q: np.ndarray) -> _LikelihoodPoint:
         point = tried(q)
         _check_point(point, logged)
         return point
@@ -218,9 +218,9 @@ def fit_noise(
         options={"gtol": scale * tolerance, "maxiter": iterations},
     )
     here = at(np.asarray(found.x))
-    observed = observed_information(at, here, logged)
+    observed = _observed_information(at, here, logged)
     for _ in range(_POLISH):
-        step, gain = newton_step(observed, here.gradient)
+        step, gain = _newton_step(observed, here.gradient)
         if gain <= tolerance:
             break
         there = at(here.q + step)
@@ -228,8 +228,8 @@ def fit_noise(
             break
         here = there
         path.append(here.q)
-        observed = observed_information(at, here, logged)
-    cov, robust, related = standard_errors(observed, here.spread)
+        observed = _observed_information(at, here, logged)
+    cov, robust, related = _standard_errors(observed, here.spread)
     deviations = np.where(logged, np.exp(here.q), 1.0)
     error = np.sqrt(np.diag(cov))
     wide = ~np.isfinite(error) | (logged & (error > LOOSE))
@@ -246,8 +246,8 @@ def fit_noise(
         nis_per_dof=(before.nis / before.dof, here.nis / here.dof),
         dof=here.dof,
         path=np.where(logged, np.exp(np.where(logged, path, 0.0)), path),
-        converged=newton_step(observed, here.gradient)[1] <= tolerance,
-        upper={told[i]: upper_limit(at, here, int(i)) for i in np.flatnonzero(falling)},
+        converged=_newton_step(observed, here.gradient)[1] <= tolerance,
+        upper={told[i]: _upper_limit(at, here, int(i)) for i in np.flatnonzero(falling)},
         loose={
             told[i]: tuple(told[j] for j in related[i]) for i in np.flatnonzero(wide & ~falling)
         },
@@ -320,7 +320,7 @@ def _checked(
     return first, begin, logged, told
 
 
-def _check_point(point: LikelihoodPoint, logged: np.ndarray) -> None:
+def _check_point(point: _LikelihoodPoint, logged: np.ndarray) -> None:
     where = f"at parameters {np.where(logged, np.exp(point.q), point.q)}"
     if not point.dof:
         raise ValueError(f"fit_noise: expected fused measurements, got none {where}")
@@ -328,7 +328,7 @@ def _check_point(point: LikelihoodPoint, logged: np.ndarray) -> None:
         raise ValueError(f"fit_noise: the likelihood or its gradient is not finite {where}")
 
 
-def _check_same(one: LikelihoodPoint, other: LikelihoodPoint, logged: np.ndarray) -> None:
+def _check_same(one: _LikelihoodPoint, other: _LikelihoodPoint, logged: np.ndarray) -> None:
     if one.dof != other.dof:
         p, q = (np.where(logged, np.exp(point.q), point.q) for point in (one, other))
         raise ValueError(

@@ -15,14 +15,14 @@ from jaxslam.types import Log
 SOURCE = (
     "C. Stachniss, Robot Mapping, course exercises, University of Freiburg and University of Bonn"
 )
-ODOMETRY_COV = np.diag([0.001, 0.001, 0.001]) ** 2
+_ODOMETRY_COV = np.diag([0.001, 0.001, 0.001]) ** 2
 MEASUREMENT_COV = np.diag([0.1, 0.05]) ** 2
 
 
 def bonn(
     folder: str | Path,
     *,
-    odometry_cov: NoiseCov = ODOMETRY_COV,
+    odometry_cov: NoiseCov = _ODOMETRY_COV,
     measurement_cov: NoiseCov = MEASUREMENT_COV,
 ) -> Dataset:
     """The data set in the files `world.dat` (landmarks: id x y) and `sensor_data.dat` of a folder.

@@ -15,7 +15,7 @@ from jaxslam.graphs.validation import check_numbers, indefinite
 from jaxslam.results.files import write_files
 
 
-class Edge(NamedTuple):
+class _Edge(NamedTuple):
     """What a line of one kind holds."""
 
     table: str
@@ -27,25 +27,25 @@ class Edge(NamedTuple):
 
 
 _BY_ROWS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
-TORO_ORDER = ((0, 0), (0, 1), (1, 1), (2, 2), (0, 2), (1, 2))
+_TORO_ORDER = ((0, 0), (0, 1), (1, 1), (2, 2), (0, 2), (1, 2))
 _POSE = ("x", "y", "theta")
 EDGES = {
-    "EDGE_SE2": Edge("relative_pose", ("pose", "pose"), _POSE, _BY_ROWS),
-    "EDGE2": Edge("relative_pose", ("pose", "pose"), _POSE, TORO_ORDER),
-    "EDGE": Edge("relative_pose", ("pose", "pose"), _POSE, TORO_ORDER),
-    "EDGE_PRIOR_SE2": Edge("prior", ("pose",), _POSE, _BY_ROWS),
-    "EDGE_SE2_XY": Edge(
+    "EDGE_SE2": _Edge("relative_pose", ("pose", "pose"), _POSE, _BY_ROWS),
+    "EDGE2": _Edge("relative_pose", ("pose", "pose"), _POSE, _TORO_ORDER),
+    "EDGE": _Edge("relative_pose", ("pose", "pose"), _POSE, _TORO_ORDER),
+    "EDGE_PRIOR_SE2": _Edge("prior", ("pose",), _POSE, _BY_ROWS),
+    "EDGE_SE2_XY": _Edge(
         "relative_position", ("pose", "point"), ("x", "y"), ((0, 0), (0, 1), (1, 1))
     ),
-    "EDGE_BEARING_SE2_XY": Edge("bearing", ("pose", "point"), ("bearing",), ((0, 0),)),
+    "EDGE_BEARING_SE2_XY": _Edge("bearing", ("pose", "point"), ("bearing",), ((0, 0),)),
 }
-VERTICES = {
+_VERTICES = {
     "VERTEX_SE2": ("pose", _POSE),
     "VERTEX2": ("pose", _POSE),
     "VERTEX": ("pose", _POSE),
     "VERTEX_XY": ("point", ("x", "y")),
 }
-SKIPPED = {
+_SKIPPED = {
     "ROBOTLASER1": "laser scans",
     "PARAMS_SE2OFFSET": "sensor offsets",  # no edge of EDGES refers to one
     "VERTEX_TAG": "notes",
@@ -66,14 +66,14 @@ class Format(NamedTuple):
     """whether a variable can be held"""
 
 
-G2O = Format(
+_G2O = Format(
     "g2o",
     {"pose": "VERTEX_SE2", "point": "VERTEX_XY"},
-    {edge.table: kind for kind, edge in EDGES.items() if edge.entries != TORO_ORDER},
+    {edge.table: kind for kind, edge in EDGES.items() if edge.entries != _TORO_ORDER},
     fix=True,
 )
 TORO = Format("TORO", {"pose": "VERTEX2"}, {"relative_pose": "EDGE2"}, fix=False)
-ENDINGS = {".toro": TORO, ".graph": TORO}
+_ENDINGS = {".toro": TORO, ".graph": TORO}
 """How the names of files end that are not written as g2o."""
 
 
@@ -96,7 +96,7 @@ class _Rows(NamedTuple):
     ids: list[list[int]]
     numbers: list[list[float]]
     lines: list[int]
-    kinds: list[Edge]
+    kinds: list[_Edge]
 
 
 def load(path: str | Path) -> Loaded:
@@ -109,17 +109,17 @@ def load(path: str | Path) -> Loaded:
     for line, (kind, *fields) in file:
         if kind in EDGES:
             _read_edge(file, line, EDGES[kind], fields, rows)
-        elif kind in VERTICES:
-            _read_vertex(file, line, *VERTICES[kind], fields, vertices)
+        elif kind in _VERTICES:
+            _read_vertex(file, line, *_VERTICES[kind], fields, vertices)
         elif kind == "FIX":
             if not fields:
                 raise file.error(line, "expected at least 1 field (id), got 0")
             fixed += [(line, _identity(file, line, field, "id")) for field in fields]
-        elif kind in SKIPPED or kind.startswith("#"):
-            what = SKIPPED.get(kind, "comments")
+        elif kind in _SKIPPED or kind.startswith("#"):
+            what = _SKIPPED.get(kind, "comments")
             skipped[what] = skipped.get(what, 0) + 1
         else:
-            known = ", ".join([*VERTICES, "FIX", *EDGES])
+            known = ", ".join([*_VERTICES, "FIX", *EDGES])
             raise file.error(line, f"unknown kind {kind!r}; known: {known}")
     if not rows:
         raise file.end_error("no edge in the file")
@@ -153,7 +153,7 @@ def _read_vertex(
 
 
 def _read_edge(
-    file: TextFile, line: int, edge: Edge, fields: list[str], rows: dict[str, _Rows]
+    file: TextFile, line: int, edge: _Edge, fields: list[str], rows: dict[str, _Rows]
 ) -> None:
     """Add an edge to its table; raises ValueError on a malformed line."""
     names = (*"ij"[: len(edge.who)], *edge.measured, *(f"I{i + 1}{j + 1}" for i, j in edge.entries))
@@ -259,7 +259,7 @@ def save(path: str | Path, graph: Graph) -> None:
     path = Path(path)
     packed = path.suffix == ".gz"
     ending = path.with_suffix("").suffix if packed else path.suffix
-    text = text_of(graph, ENDINGS.get(ending, G2O))
+    text = text_of(graph, _ENDINGS.get(ending, _G2O))
     _check_readable(graph)
 
     def pack(target: Path) -> None:
@@ -268,7 +268,7 @@ def save(path: str | Path, graph: Graph) -> None:
     write_files(path.parent, {path.name: pack if packed else text})
 
 
-def text_of(graph: Graph, form: Format = G2O) -> str:
+def text_of(graph: Graph, form: Format = _G2O) -> str:
     """The graph in a format; raises ValueError as `graphs.write` does."""
     _check_writable(graph, form)
     ids = {"pose": np.asarray(graph.pose_id), "point": np.asarray(graph.point_id)}

@@ -106,22 +106,22 @@ _TABLES = {"DR": 3, "TD": 4, "TL": 3, "GT": 4}
 MOST = 1e30
 """No number of a table is larger: sums of them are what a filter takes."""
 _COLUMNS = "DR: t, distance, turn; TD: t, sender, receiver, range; TL: id, x, y; GT: t, x, y, θ"
-RANGE_BIAS = (0.03, 0.069)
+_RANGE_BIAS = (0.03, 0.069)
 """Offset [m] and scale by which the ranges of both files exceed the distances: the least-squares
 line through all ranges against the distances between survey and ground truth. It stands for a radio
 calibrated beforehand; no estimator here finds it."""
-RANGE_COV = ((0.5**2,),)
+_RANGE_COV = ((0.5**2,),)
 """Variance of the ranges after that correction [m²]; successive ranges of a beacon are white."""
-TRAVEL_DENSITY = (0.03**2, 0.03**2, 0.003**2)
+_TRAVEL_DENSITY = (0.03**2, 0.03**2, 0.003**2)
 """Variance of forward [m²/m], sideways [m²/m] and heading motion [rad²/m] per metre of travel."""
 
 
 def plaza(
     path: str | Path,
     *,
-    range_bias: tuple[float, float] = RANGE_BIAS,
+    range_bias: tuple[float, float] = _RANGE_BIAS,
     odometry_cov: NoiseCov | None = None,
-    measurement_cov: NoiseCov = RANGE_COV,
+    measurement_cov: NoiseCov = _RANGE_COV,
 ) -> Dataset:
     """The data set in `Plaza1_.mat` or `Plaza2_.mat`: odometry, ranges, survey and ground truth.
 
@@ -142,7 +142,7 @@ def plaza(
         path: the file.
         range_bias: (offset [m], scale) of the ranges; (0, 0) leaves them as they are.
         odometry_cov: (3, 3) covariance of (dx, dy, dθ), or a function of (pose, u); by default
-            `TRAVEL_DENSITY` times the distance.
+            `_TRAVEL_DENSITY` times the distance.
         measurement_cov: (1, 1) covariance of a range, or a function of z.
     Raises:
         ValueError: `path: reason` where the file cannot be read, lacks a table, has a table of
@@ -228,8 +228,8 @@ def _read(path: Path) -> dict[str, Float[np.ndarray, "_ _"]]:
 
 
 def _by_travel(pose: jax.Array, u: jax.Array) -> jax.Array:
-    """The noise covariance: `TRAVEL_DENSITY` times the distance travelled."""
+    """The noise covariance: `_TRAVEL_DENSITY` times the distance travelled."""
     square = u[0] ** 2 + u[1] ** 2
     moved = square > 0
     travel = jnp.where(moved, jnp.sqrt(jnp.where(moved, square, 1.0)), 0.0)
-    return travel * jnp.diag(jnp.asarray(TRAVEL_DENSITY, u.dtype))
+    return travel * jnp.diag(jnp.asarray(_TRAVEL_DENSITY, u.dtype))

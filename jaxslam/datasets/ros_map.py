@@ -21,7 +21,7 @@ from jaxslam.results.files import write_files
 _BY_MATPLOTLIB = {b"\x89PNG": "png", b"BM": "bmp"}
 
 
-def read_shades(path: Path) -> NDArray[np.float64]:
+def _read_shades(path: Path) -> NDArray[np.float64]:
     """The shades of an image (rows, columns), 0 black to 1 white; the first row is at the top.
 
     A colour counts as the mean of its three channels, as in `map_server`.
@@ -100,7 +100,7 @@ def _fields(path: Path, data: bytes, at: int, count: int) -> tuple[list[int], in
     return [int(word) for word in words], at
 
 
-def pgm_bytes(image: NDArray[np.int64], top: int) -> bytes:
+def _pgm_bytes(image: NDArray[np.int64], top: int) -> bytes:
     """A binary PGM file (P5) of shades (rows, columns), 0 to top <= 255, the first row on top."""
     height, width = image.shape
     return f"P5\n{width} {height}\n{top}\n".encode() + image.astype(np.uint8).tobytes()
@@ -118,7 +118,7 @@ _UNKNOWN = 205
 
 def load(path: str | Path) -> Grid:
     """The grid in a map file; `grids.read_map` says what is read."""
-    head = Header(path)
+    head = _Header(path)
     resolution = head.number("resolution")
     if not resolution > 0:
         raise head.error("resolution", f"expected a resolution above 0, got {resolution:g}")
@@ -134,7 +134,7 @@ def load(path: str | Path) -> Grid:
     image = head.file.path.parent / head.text("image")
     if not image.is_file():
         raise head.error("image", f"no image {image}")
-    shade = read_shades(image)
+    shade = _read_shades(image)
     p = shade if negate else 1.0 - shade
     between = np.full(p.shape, 0.5) if mode == "trinary" else (p - free) / (occupied - free)
     p = np.where(p > occupied, 1.0, np.where(p < free, 0.0, between))
@@ -169,7 +169,7 @@ def map_files(
         f"image: {_scalar(f'{stem}.pgm')}\nmode: {mode}\nresolution: {float(grid.resolution)!r}\n"
         f"origin: [{numbers}]\nnegate: 0\noccupied_thresh: {occupied}\nfree_thresh: {free}\n"
     )
-    data = pgm_bytes(image, levels)
+    data = _pgm_bytes(image, levels)
     return {f"{stem}.yaml": text, f"{stem}.pgm": lambda target: target.write_bytes(data)}
 
 
@@ -193,7 +193,7 @@ def _levels(log_odds: NDArray[np.float64]) -> tuple[NDArray[np.int64], int]:
     return images[top], top
 
 
-class Header:
+class _Header:
     """The keys of a map file and their values; a key that `load` does not read gives a warning.
 
     PyYAML parses the file to nodes, which keep the text and the line of each value.

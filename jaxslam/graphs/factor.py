@@ -55,8 +55,8 @@ def _point_rows(z: Array) -> Rows:
     return [rows[:2] for rows in _pose_rows(jnp.concatenate([z, jnp.zeros_like(z[:, :1])], axis=1))]
 
 
-RELATIVE_POSE = Chordal(_pose_error, 4, _pose_rows)
-RELATIVE_POSITION = Chordal(_point_error, 2, _point_rows)
+_RELATIVE_POSE = Chordal(_pose_error, 4, _pose_rows)
+_RELATIVE_POSITION = Chordal(_point_error, 2, _point_rows)
 PRIOR = Chordal(_no_error, 1, None)
 
 
@@ -112,7 +112,7 @@ class BetweenPoses(Factor):
 
     variables = ("pose", "pose")
     measurements = errors = POSE
-    chordal = RELATIVE_POSE
+    chordal = _RELATIVE_POSE
 
     def predict(self, pose: Array, z: Array) -> Array:
         return se2.compose(pose, z)
@@ -172,7 +172,7 @@ class RelativePosition(Factor):
 
     variables = ("pose", "point")
     measurements = errors = ("ahead [m]", "left [m]")
-    chordal = RELATIVE_POSITION
+    chordal = _RELATIVE_POSITION
 
     def residual(self, variables: tuple[Array, ...], z: Array) -> Array:
         return z - se2.to_frame(*variables)

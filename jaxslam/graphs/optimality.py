@@ -35,7 +35,7 @@ from jaxslam.types import JaxOrNumPy
 
 
 @record
-class Relaxed(Factor):
+class _Relaxed(Factor):
     """The factor of the same measurement with chordal residuals, `Factor.chordal`."""
 
     factor: Factor
@@ -61,7 +61,7 @@ class Relaxed(Factor):
         return self.chordal.residual(variables, z)
 
 
-def chordal_weights(
+def _chordal_weights(
     form: Chordal, information: Float[JaxOrNumPy, "E R R B"]
 ) -> Float[Array, "E S B"]:
     """The weights τ, τ, κ, κ or τ, τ of the chordal residuals; zero for a prior."""
@@ -133,7 +133,7 @@ SHARE = 1e-6
 ENOUGH = 1e-5
 """The gap that counts as none."""
 
-POWERS = 100
+_POWERS = 100
 """iterations for the smallest eigenvalue"""
 
 
@@ -238,10 +238,10 @@ def _proved(model: Model, plan: Plan, graph: Graph) -> Certificate:
     for name, factor in model.factors.items():
         table = graph.tables[name]
         assert factor.chordal is not None
-        weights = chordal_weights(factor.chordal, table.information)
+        weights = _chordal_weights(factor.chordal, table.information)
         unit = jnp.eye(weights.shape[1], dtype=dtype)[None, ..., None]
         tables[name] = table._replace(information=unit * weights[:, None])
-    chordal = Model({name: Relaxed(factor) for name, factor in model.factors.items()}, {})
+    chordal = Model({name: _Relaxed(factor) for name, factor in model.factors.items()}, {})
     surrogate = graph._replace(tables=tables, fixed_pose=held)
     tolerance = jnp.asarray(1e-13, dtype)
     found = minimize(chordal, plan, jnp.asarray(100), tolerance, surrogate)
@@ -285,7 +285,7 @@ def _proved(model: Model, plan: Plan, graph: Graph) -> Certificate:
     first = jnp.broadcast_to(of_turns * first[..., None], (*first.shape, *value.shape))
     first = first / jnp.sqrt((first * first).sum((0, 1)))[None, None]
     first = jnp.broadcast_to(first, (*first.shape[:2], *shift.shape))
-    smallest = jax.lax.fori_loop(0, POWERS, power, (first, jnp.zeros_like(shift)))[1]
+    smallest = jax.lax.fori_loop(0, _POWERS, power, (first, jnp.zeros_like(shift)))[1]
     gap = value - bound + poses * shift
     away = found.graph.poses - graph.poses
     turned = jnp.arctan2(jnp.sin(away[:, 2]), jnp.cos(away[:, 2]))

@@ -15,7 +15,7 @@ from jaxslam.grids.grid import Grid, check_grid, interpolated, to_cells
 from jaxslam.grids.traversal import MOST, OFF, STOP, march
 from jaxslam.math.xla import hot_jit
 
-GRAZING = 0.05
+_GRAZING = 0.05
 """Least |cos| of the angle between a ray and the normal of a wall in a derivative."""
 
 METHODS = ("surface", "cells")
@@ -47,7 +47,7 @@ def ray_map(grid: Grid, *, method: str | None = None, skip: bool = True) -> RayM
         ValueError: a grid that is none, or without a free cell; an unknown method.
     """
     check_grid("ray_map", grid)
-    method = default_method(grid) if method is None else method
+    method = _default_method(grid) if method is None else method
     check_method("ray_map", method)
     if is_concrete(grid.log_odds) and not np.any(np.asarray(grid.log_odds) < 0):
         raise ValueError("ray_map: the map has no free cell (log-odds below 0)")
@@ -55,7 +55,7 @@ def ray_map(grid: Grid, *, method: str | None = None, skip: bool = True) -> RayM
     return rays
 
 
-def default_method(grid: Grid) -> str:
+def _default_method(grid: Grid) -> str:
     """The method of `ray_map` for a grid: "surface" where p may be the share of a cell that is
     solid.
 
@@ -152,8 +152,8 @@ def cast(
     dr = -n·(dt + r dφ e⊥)/(n·e), with e the direction, φ its angle, dt the shift of the origin, and
     n the normal of the wall: the slope of p around the hit, over two cells. So it is not the
     derivative of a staircase of cells, and only near that of the range as computed. It is 0 where
-    nothing is hit. |n·e|/|n| below `GRAZING`, of a beam along the wall, counts as that. That a beam
-    passes an edge or hits it is a jump, which no derivative knows.
+    nothing is hit. |n·e|/|n| below `_GRAZING`, of a beam along the wall, counts as that. That a
+    beam passes an edge or hits it is a jump, which no derivative knows.
 
     Args:
         grid: a `Grid`, or a `RayMap` of it, which is faster for many rays.
@@ -248,7 +248,7 @@ def _derivative(primals: PyTree, tangents: PyTree) -> PyTree:
     length, hit = _lengths(*primals)
     normal = _slope(grid.solid, start + length[:, None] * direction)
     steep = (normal * direction).sum(axis=-1)
-    least = GRAZING * jnp.sqrt((normal * normal).sum(axis=-1))
+    least = _GRAZING * jnp.sqrt((normal * normal).sum(axis=-1))
     steep = jnp.where(steep < 0, jnp.minimum(steep, -least), jnp.maximum(steep, least))
     sure = hit & (steep != 0)
     rate = jnp.where(sure, 1.0 / jnp.where(sure, steep, 1.0), 0.0)

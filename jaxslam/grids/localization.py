@@ -39,10 +39,10 @@ from jaxslam.resampling.weights import normalized
 from jaxslam.types import Beams, Estimate, Info, Log, Scan
 from jaxslam.validation.models import check_motion
 
-BEAM = ("range [m]", "angle [rad]")
+_BEAM = ("range [m]", "angle [rad]")
 """The measurements of such a log."""
 
-BEAM = ("range [m]", "angle [rad]")
+_BEAM = ("range [m]", "angle [rad]")
 """The measurements of such a log."""
 
 NOTHING = 1e6
@@ -103,7 +103,7 @@ def beams_of(scan: Scan, every: int) -> Beams:
 
 
 @record
-class FreeSpace(Region):
+class _FreeSpace(Region):
     """The free cells of a map."""
 
     places: ArrayLike
@@ -129,7 +129,7 @@ class FreeSpace(Region):
         return jnp.concatenate([mean, jnp.zeros(1, dtype)]), cov
 
 
-def free_space(name: str, grid: Grid, box: Float[np.ndarray, "2 2"] | None) -> FreeSpace:
+def _free_space(name: str, grid: Grid, box: Float[np.ndarray, "2 2"] | None) -> _FreeSpace:
     """The free cells of a map whose centres lie in a box, None for all.
 
     Raises ValueError, which begins with a caller's name, where there is none.
@@ -146,7 +146,7 @@ def free_space(name: str, grid: Grid, box: Float[np.ndarray, "2 2"] | None) -> F
         free = free & ((middle >= box[0]) & (middle <= box[1])).all(axis=2)
         if not free.any():
             raise ValueError(f"{name}: no free cell of the map is in the box {box.tolist()}")
-    return FreeSpace(middle[free], sides)
+    return _FreeSpace(middle[free], sides)
 
 
 @record
@@ -197,9 +197,9 @@ class GridLocalization(MonteCarloFilter):
     """use each n-th beam, at least 1"""
     prepared: PyTree = dataclasses.field(init=False, repr=False)
     """what the model needs of the map"""
-    region: FreeSpace = dataclasses.field(init=False, repr=False)
+    region: _FreeSpace = dataclasses.field(init=False, repr=False)
     """where the robot may be: the free cells of the map (in the box)"""
-    measurements = BEAM
+    measurements = _BEAM
 
     def __post_init__(self) -> None:
         name = type(self).__name__
@@ -214,7 +214,7 @@ class GridLocalization(MonteCarloFilter):
         check_positive(name, exponent=self.exponent)
         hold_box(self)
         box = None if self.box is None else np.asarray(self.box)
-        set_field(self, "region", free_space(name, self.grid, box))
+        set_field(self, "region", _free_space(name, self.grid, box))
         set_field(self, "prepared", self.model.prepare(self.grid))
         super().__post_init__()
 

@@ -117,7 +117,7 @@ class FirstEstimate(Linearizer):
         return First(joint.lin.pose, landmarks)
 
 
-class Constraint(NamedTuple):
+class _Constraint(NamedTuple):
     """The unobservable rotation direction of the linearized system, as lever arms."""
 
     pose: Array
@@ -148,12 +148,12 @@ class Observability(Linearizer):
     euclidean = True
     own_landmarks = True
 
-    def init(self, pose: Array, landmarks: Array) -> Constraint:
-        return Constraint(pose, pose[:2], landmarks)
+    def init(self, pose: Array, landmarks: Array) -> _Constraint:
+        return _Constraint(pose, pose[:2], landmarks)
 
     def motion(
         self, motion: Motion, u: Array, here: Here
-    ) -> tuple[Array, Array, Array, Constraint]:
+    ) -> tuple[Array, Array, Array, _Constraint]:
         joint, old = here.joint, here.joint.lin
         moved, by_pose, noise = first_order.motion_at(motion, here.pose, u, here.pose)
         arms = joint.landmarks - joint.pose[None, :2] - old.landmarks + old.robot[None]
@@ -174,7 +174,7 @@ class Observability(Linearizer):
     ) -> tuple[Array, Array, Array]:
         return first_order.invert_at(sensor, here.pose, z, here.pose, z)
 
-    def born(self, joint: Joint, born: Array) -> Constraint:
+    def born(self, joint: Joint, born: Array) -> _Constraint:
         arms = joint.lin.robot[None] + joint.landmarks - joint.pose[None, :2]
         landmarks = jnp.where(born[:, None], arms, joint.lin.landmarks)
-        return Constraint(joint.lin.pose, joint.lin.robot, landmarks)
+        return _Constraint(joint.lin.pose, joint.lin.robot, landmarks)

@@ -137,12 +137,12 @@ def least(of: Quadratic) -> Float[Array, "3"]:
     inverse = linalg.inverse(of.shift + pulled(of.shift) * eye)
     s = linalg.symmetrize(of.turn + turn_pull * eye - of.cross.T @ inverse @ of.cross)
     h = -2 * (of.turn_slope + turn_pull * eye[0] - of.cross.T @ inverse @ of.shift_slope)
-    r = on_circle(s, h)
+    r = _on_circle(s, h)
     shift = inverse @ (of.shift_slope - of.cross @ r)
     return jnp.concatenate([shift, jnp.arctan2(r[1], r[0])[None]])
 
 
-def on_circle(s: Float[Array, "2 2"], h: Float[Array, "2"]) -> Float[Array, "2"]:
+def _on_circle(s: Float[Array, "2 2"], h: Float[Array, "2"]) -> Float[Array, "2"]:
     """The unit vector r of the least rᵀ S r + hᵀ r, by the secular equation of `least`."""
     mean, half, off = 0.5 * (s[0, 0] + s[1, 1]), 0.5 * (s[0, 0] - s[1, 1]), s[0, 1]
     square = half**2 + off**2

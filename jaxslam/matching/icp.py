@@ -81,7 +81,7 @@ class IcpSettings:
             raise ValueError(f"{name}: expected trim in (0, 1], got {trim}")
 
 
-class PairedPoints(NamedTuple):
+class _PairedPoints(NamedTuple):
     """A scan at a pose, and its partners."""
 
     moved: Float[Array, "N 2"]
@@ -96,7 +96,7 @@ _State: TypeAlias = tuple[Array, Array, Array, Array]
 """iterations, pose, the pose before, how far the last step went"""
 
 
-class Icp(Matcher):
+class _Icp(Matcher):
     """An iterative closest point method: a subclass has the cost of pairs and its minimum."""
 
     settings: IcpSettings
@@ -115,7 +115,7 @@ class Icp(Matcher):
         """Which points of the reference may be partners."""
         return jnp.ones_like(of.straight)
 
-    def quadratic(self, of: Surface, pairs: PairedPoints, middle: Array) -> Quadratic:
+    def quadratic(self, of: Surface, pairs: _PairedPoints, middle: Array) -> Quadratic:
         """The cost Σ w e² of a motion about a middle (2,)."""
         raise NotImplementedError
 
@@ -202,7 +202,7 @@ class Icp(Matcher):
         of_pairs = icp.cost_of_pairs(prepared, moved, partner, match.weight)
         return of_pairs + prior_cost(match.prior, pose)
 
-    def _pairs(self, of: Surface, points: Points, pose: Array) -> PairedPoints:
+    def _pairs(self, of: Surface, points: Points, pose: Array) -> _PairedPoints:
         settings = self.settings
         moved = points.position @ se2.rotation(pose[2]).T + pose[None, :2]
         partner = nearest_points(of.position, moved)
@@ -210,7 +210,7 @@ class Icp(Matcher):
         possible = points.valid & (distance < settings.reach**2) & self.usable(of)[partner]
         residual = jnp.where(possible, self.residual(of, moved, partner), 0.0)
         weight = weights(residual, possible, settings.kernel, settings.scale, settings.trim)
-        return PairedPoints(moved, partner, residual, weight)
+        return _PairedPoints(moved, partner, residual, weight)
 
 
 def _size(a: Array, b: Array, length: Array) -> Array:
@@ -219,7 +219,7 @@ def _size(a: Array, b: Array, length: Array) -> Array:
 
 
 def _information(
-    of: Surface, at: PairedPoints, pivot: Float[Array, "2"], lone: Number | None
+    of: Surface, at: _PairedPoints, pivot: Float[Array, "2"], lone: Number | None
 ) -> Float[Array, "3 3"]:
     """The information Σ w J Jᵀ about the pivot, of partners with a line and of those without."""
     j, arm = at.partner, at.moved - pivot[None]
@@ -238,7 +238,7 @@ def _information(
 
 
 @record
-class PointToPoint(Icp):
+class PointToPoint(_Icp):
     """ICP: the pose that minimizes Σ w |T ∘ p_i - q_j(i)|², q_j(i) the nearest point.
 
     Each step is the exact minimum for its pairs (`closed_form.least`); its error falls by a
@@ -251,7 +251,7 @@ class PointToPoint(Icp):
     def residual(self, of: Surface, moved: Array, partner: Array) -> Float[Array, "N"]:
         return distance(of, moved, partner)
 
-    def quadratic(self, of: Surface, pairs: PairedPoints, middle: Array) -> Quadratic:
+    def quadratic(self, of: Surface, pairs: _PairedPoints, middle: Array) -> Quadratic:
         used = (pairs.weight > 0)[:, None]
         source = jnp.where(used, pairs.moved - middle[None], 0.0)
         target = jnp.where(used, of.position[pairs.partner] - middle[None], 0.0)
@@ -271,7 +271,7 @@ def distance(of: Surface, moved: Array, partner: Array) -> Float[Array, "N"]:
 
 
 @record
-class PointToLine(Icp):
+class PointToLine(_Icp):
     """PL-ICP: the pose that minimizes Σ w (n_j · (T ∘ p_i - m_j))², j(i) the nearest point.
 
     The line (m_j, n_j) is fitted to point j of the reference and its neighbours (`Surface`); each
@@ -292,7 +292,7 @@ class PointToLine(Icp):
     def usable(self, of: Surface) -> Bool[Array, "M"]:
         return of.straight if self.settings.lone is None else super().usable(of)
 
-    def quadratic(self, of: Surface, pairs: PairedPoints, middle: Array) -> Quadratic:
+    def quadratic(self, of: Surface, pairs: _PairedPoints, middle: Array) -> Quadratic:
         j, lone = pairs.partner, self.settings.lone
         by_line, by_point = _weights(of, j, pairs.weight)
 

@@ -59,7 +59,7 @@ def _is_real(array: JaxOrNumPy) -> bool:
     return bool(np.issubdtype(array.dtype, np.number)) and not np.iscomplexobj(array)
 
 
-class PolarCoordinate(Sensor):
+class _PolarCoordinate(Sensor):
     """The sensor of one row of z = polar(to_frame(pose ∘ mount, l)), the other row being free.
 
     A subclass has a field `free`, mean (1,) and covariance (1, 1) of the other row.
@@ -103,7 +103,7 @@ TEN_METRES = ((10.0,), ((25.0,),))
 
 
 @record
-class BearingOnly(PolarCoordinate):
+class BearingOnly(_PolarCoordinate):
     """The bearing-only sensor of point landmarks.
 
     z = (bearing [rad]) of l = (x, y): the direction of R(θ_S)ᵀ(l - t_S), S = pose ∘ mount.
@@ -133,7 +133,7 @@ ANY_DIRECTION = ((0.0,), ((np.pi**2 / 3,),))
 
 
 @record
-class RangeOnly(PolarCoordinate):
+class RangeOnly(_PolarCoordinate):
     """The range-only sensor of point landmarks.
 
     z = (range [m]) of l = (x, y): |l - t_S| with S = pose ∘ mount, the first row of Solà (63).

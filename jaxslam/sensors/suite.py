@@ -172,11 +172,11 @@ def split_scan(scan: Scan, places: Sequence[int]) -> list[Scan]:
 
 def on_ground(sensor: Sensor, size: int) -> Sensor:
     """The sensor for landmarks of `size` numbers, of which it uses the first."""
-    return sensor if len(sensor.landmark) == size else OnGround(sensor, size)
+    return sensor if len(sensor.landmark) == size else _OnGround(sensor, size)
 
 
 @record
-class OnGround(Wrapped):
+class _OnGround(Wrapped):
     """A sensor for landmarks of more numbers than it uses.
 
     A measurement does not depend on the others: an absolute sensor ignores them all, and in a new

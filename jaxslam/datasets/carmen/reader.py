@@ -68,7 +68,7 @@ class LaserLog:
 
 
 ODOMETRY = (*POSE, "v", "omega", "acceleration", "time", "host", "logger time")
-PREFERRED = ("FLASER", "ROBOTLASER1", "RAWLASER1", "RLASER")
+_PREFERRED = ("FLASER", "ROBOTLASER1", "RAWLASER1", "RLASER")
 """Kinds of scans in the order in which they are taken where there are as many of each."""
 
 
@@ -200,7 +200,7 @@ def _kind(file: TextFile, counts: Counter[str], asked: str | None) -> str:
             "expected a line FLASER, RLASER, ROBOTLASER1 or RAWLASER1, and so on, got none"
         )
     if asked is None:
-        first = {kind: rank for rank, kind in enumerate(PREFERRED)}
+        first = {kind: rank for rank, kind in enumerate(_PREFERRED)}
         rank = [
             (not has_poses(kind), -count, first.get(kind, len(first)), kind)
             for kind, count in counts.items()

@@ -49,7 +49,7 @@ from jaxslam.sensors.suite import on_ground
 from jaxslam.types import Estimate, Info, Scan
 
 
-def store_measurements(
+def _store_measurements(
     settings: DelayedSettings, state: DelayedState, new: NewMeasurements
 ) -> tuple[DelayedState, Int[Array, "M"], Bool[Array, "M"]]:
     """The state with new measurements stored; their slots, and which were stored.
@@ -186,7 +186,7 @@ class DelayedSlam(Filter):
         new = _new_measurements(settings, scan, found)
 
         def initialize(state: DelayedState) -> tuple[DelayedState, _Outcome]:
-            state, slot, stored = store_measurements(settings, state, new)
+            state, slot, stored = _store_measurements(settings, state, new)
             state, explained, by = confirm_hypotheses(settings, state, new, slot, stored)
             state = intersect_measurements(settings, state, new, slot, stored & ~explained)
             state, promoted = promote_hypotheses(settings, state, new, by)

@@ -42,7 +42,7 @@ class Correction(NamedTuple):
     """the coordinates by the errors in the chart; None says identity"""
 
 
-class View(NamedTuple):
+class _View(NamedTuple):
     """The rows of P, or of its square root, that m measurements involve."""
 
     robot: Float[Array, "3 D"]
@@ -102,17 +102,17 @@ class _Gated(NamedTuple):
     fuse: Bool[Array, "m"]
 
 
-def view_of(joint: Joint, slot: Int[Array, "m"], square_root: bool = False) -> View:
+def view_of(joint: Joint, slot: Int[Array, "m"], square_root: bool = False) -> _View:
     """The view of measurements of the landmarks in slot (m,)."""
     own = jax.vmap(slots.gather, in_axes=(None, 0))(joint, slot)[1]
     local = jax.vmap(partial(slots.local_cov, joint, square_root=square_root))(slot)
-    return View(joint.cov[:3], own, local)
+    return _View(joint.cov[:3], own, local)
 
 
 def innovate(
     joint: Joint,
     slot: Int[Array, "m"],
-    view: View,
+    view: _View,
     z: Float[Array, "m Z"],
     known: Bool[Array, "m"],
     memory: tuple[Joint, Int[Array, "m"]],
@@ -176,7 +176,7 @@ def innovate(
 def _linearize(
     joint: Joint,
     slot: Int[Array, "m"],
-    view: View,
+    view: _View,
     z: Float[Array, "m Z"],
     memory: tuple[Joint, Int[Array, "m"]],
     xi: Float[Array, "D"] | None,
@@ -224,10 +224,10 @@ def _split_rows(
 
 
 def _project(
-    rows: Float[Array, "m Z C"], view: View, joint: Joint, settings: EkfSettings
+    rows: Float[Array, "m Z C"], view: _View, joint: Joint, settings: EkfSettings
 ) -> tuple[Float[Array, "m Z D"], Float[Array, "m Z D"]]:
     """The products H X and H P of a square-root filter; else H P twice."""
-    hp = hx = no_inline(seen_rows, rows, view.robot, view.own)
+    hp = hx = no_inline(_seen_rows, rows, view.robot, view.own)
     if settings.square_root:
         m, size_z = rows.shape[:2]
         hp = materialize((hx.reshape(m * size_z, -1) @ joint.cov.T).reshape(hx.shape))
@@ -276,7 +276,7 @@ def _report(
 
 
 @linalg.kept_whole
-def seen_rows(
+def _seen_rows(
     rows: Float[Array, "m Z C"], robot: Float[Array, "3 D"], own: Float[Array, "m L D"]
 ) -> Float[Array, "m Z D"]:
     """The product H P from the blocks of H, by rows, and P of the robot and the landmarks seen."""

@@ -32,7 +32,7 @@ def propagate(
         pose = materialize(pose)
         over_map = jax.vmap(chart.basis, in_axes=(None, 0))
         before, after = over_map(joint.pose, joint.landmarks), over_map(pose, joint.landmarks)
-        moved = in_charts(by_pose, before, after, joint.alive)
+        moved = _in_charts(by_pose, before, after, joint.alive)
     if square_root:
         size = joint.cov.shape[0]
         added = moved.lift(size) @ linalg.cholesky(noise)[0]
@@ -42,7 +42,7 @@ def propagate(
     return joint._replace(pose=pose, cov=cov, lin=lin), moved
 
 
-def in_charts(
+def _in_charts(
     by_pose: Float[Array, "3 3"], before: Basis, after: Basis, alive: Bool[Array, "N"]
 ) -> Transition:
     """The blocks of E(x')⁻¹ F E(x) and E(x')⁻¹, with dead slots unchanged."""

@@ -2,7 +2,7 @@
 
 The steps are those of the textbook, one function each: `associate_scan` predicts the measurements
 and associates them, `update.correct` gates and corrects, `initialize_landmarks` starts the new
-landmarks (the state augmentation), and `report_scan` makes the `Info`.
+landmarks (the state augmentation), and `_report_scan` makes the `Info`.
 """
 
 import dataclasses
@@ -79,7 +79,7 @@ class SensorTurn(NamedTuple):
     """None where its measurements are ignored: `Status.UNMATCHED`"""
 
 
-class NewLandmarks(NamedTuple):
+class _NewLandmarks(NamedTuple):
     """The outcome of the measurements without a landmark in the map, (M,) each."""
 
     slot: Int[Array, "M"]
@@ -92,7 +92,7 @@ class NewLandmarks(NamedTuple):
     """derivatives of the errors of those granted, by that of the pose"""
 
 
-class ScanUpdate(NamedTuple):
+class _ScanUpdate(NamedTuple):
     """The result of an update by a scan."""
 
     joint: Joint
@@ -125,14 +125,14 @@ def turn_of(part: Part, size: int, settings: EkfSettings) -> SensorTurn:
     )
 
 
-def update_by_scan(joint: Joint, scan: Scan, turns: Sequence[SensorTurn]) -> ScanUpdate:
+def update_by_scan(joint: Joint, scan: Scan, turns: Sequence[SensorTurn]) -> _ScanUpdate:
     """The update by each sensor in turn.
 
     Raises ValueError if the scan does not have their measurement slots.
     """
     first = turns[0]
     if first.places is None and first.settings is not None:
-        return update_by_sensor(joint, scan, first.settings)
+        return _update_by_sensor(joint, scan, first.settings)
     system: LinearSystem = ()
     infos, evicted = [], jnp.zeros_like(joint.alive)
     counts = [turn.places or 0 for turn in turns]
@@ -141,13 +141,13 @@ def update_by_scan(joint: Joint, scan: Scan, turns: Sequence[SensorTurn]) -> Sca
             infos.append(nothing_of(own))
             continue
         own = own._replace(z=own.z[:, : len(turn.settings.sensor.measurements)])
-        joint, info, gone, more = update_by_sensor(joint, own, turn.settings)
+        joint, info, gone, more = _update_by_sensor(joint, own, turn.settings)
         infos.append(info)
         evicted, system = evicted | gone, (*system, *more)
-    return ScanUpdate(joint, joined_info(infos, scan.z.shape[1]), evicted, system)
+    return _ScanUpdate(joint, joined_info(infos, scan.z.shape[1]), evicted, system)
 
 
-def update_by_sensor(joint: Joint, scan: Scan, settings: EkfSettings) -> ScanUpdate:
+def _update_by_sensor(joint: Joint, scan: Scan, settings: EkfSettings) -> _ScanUpdate:
     """The update by the scan of one sensor."""
     # Padding may hold any number, and is multiplied by zero below.
     scan = scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
@@ -157,7 +157,7 @@ def update_by_sensor(joint: Joint, scan: Scan, settings: EkfSettings) -> ScanUpd
     slot = jnp.maximum(found.slot, 0)
     joint, done = by_scan(joint, scan.z, slot, matched, settings)
     joint, new = initialize_landmarks(joint, scan, found, matched, done, settings)
-    info = report_scan(scan, found, matched, done, new, settings)
+    info = _report_scan(scan, found, matched, done, new, settings)
     seen = LinearMeasurements(
         jacobian=done.jacobian,
         basis=done.basis,
@@ -166,7 +166,7 @@ def update_by_sensor(joint: Joint, scan: Scan, settings: EkfSettings) -> ScanUpd
         fused=matched & done.inside & done.positive,
     )
     born = LinearLandmarks(new.slot, new.granted, new.by_pose)
-    return ScanUpdate(joint, info, new.evicted, (seen, born))
+    return _ScanUpdate(joint, info, new.evicted, (seen, born))
 
 
 def associate_scan(
@@ -191,14 +191,14 @@ def initialize_landmarks(
     matched: Bool[Array, "M"],
     done: Correction,
     settings: EkfSettings,
-) -> tuple[Joint, NewLandmarks]:
+) -> tuple[Joint, _NewLandmarks]:
     """The map with the new landmarks of a scan, up to `births` and the free slots.
 
     matched, done: the measurements of known landmarks, and their correction; landmarks that were
     corrected do not make room for new ones.
     """
     is_new, none = found.is_new, jnp.zeros_like(found.is_new)
-    nothing = NewLandmarks(
+    nothing = _NewLandmarks(
         slot=jnp.zeros_like(found.slot),
         granted=none,
         deferred=none,
@@ -209,7 +209,7 @@ def initialize_landmarks(
     if settings.births == 0:
         return joint, nothing._replace(deferred=is_new)
 
-    def start(joint: Joint) -> tuple[Joint, NewLandmarks]:
+    def start(joint: Joint) -> tuple[Joint, _NewLandmarks]:
         repeated = is_new & seen_before(scan.tag, is_new)
         wanted = is_new & ~repeated
         rank = jnp.cumsum(wanted)
@@ -220,7 +220,7 @@ def initialize_landmarks(
         used = matched & done.inside & done.positive
         joint, evicted = _with_room(joint, wanted, found.slot, used, settings)
         joint, slot, granted, by_pose = _started(joint, scan, wanted, rank, settings)
-        return joint, NewLandmarks(slot, granted, deferred, repeated, evicted, by_pose)
+        return joint, _NewLandmarks(slot, granted, deferred, repeated, evicted, by_pose)
 
     return where_any(is_new.any(), start, lambda joint: (joint, nothing), joint)
 
@@ -248,7 +248,7 @@ def _started(
     rank: Int[Array, "M"],
     settings: EkfSettings,
 ) -> tuple[Joint, Int[Array, "M"], Bool[Array, "M"], Float[Array, "M L 3"]]:
-    """The map with landmarks started in free slots; slot, granted and by_pose of `NewLandmarks`.
+    """The map with landmarks started in free slots; slot, granted and by_pose of `_NewLandmarks`.
 
     rank: (M,) the number wanted up to each measurement.
     """
@@ -267,12 +267,12 @@ def _started(
     return joint, slot[mine], wanted & granted[mine], by_pose[mine]
 
 
-def report_scan(
+def _report_scan(
     scan: Scan,
     found: Association,
     matched: Bool[Array, "M"],
     done: Correction,
-    new: NewLandmarks,
+    new: _NewLandmarks,
     settings: EkfSettings,
 ) -> Info:
     """The `Info` of the measurements of one sensor."""

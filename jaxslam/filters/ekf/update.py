@@ -51,7 +51,7 @@ def correct(
     view = view_of(joint, slot, settings.square_root)
     found = innovate(joint, slot, view, z, known, (joint, slot), settings)
     cov = _corrected_cov(joint.cov, found, settings.covariance)
-    return retract_means(joint, found.xi, settings.chart)._replace(cov=cov), found.correction
+    return _retract_means(joint, found.xi, settings.chart)._replace(cov=cov), found.correction
 
 
 def _corrected_cov(
@@ -75,7 +75,7 @@ def _corrected_cov(
     return cov - linalg.gram(v, materialize(linalg.solve_lower(root, hx)))
 
 
-def retract_means(joint: Joint, xi: Float[Array, "D"], chart: Chart) -> Joint:
+def _retract_means(joint: Joint, xi: Float[Array, "D"], chart: Chart) -> Joint:
     """The means retracted by ξ; P is not changed."""
     pose, landmarks = retracted(chart, joint, xi)
     return joint._replace(pose=pose, landmarks=landmarks)
@@ -144,7 +144,7 @@ def correct_in_turn(
     if cached:
         joint = joint._replace(cov=jnp.pad(joint.cov, ((0, 0), (0, -size % _LANES))))
     joint, done = _in_groups(
-        lambda joint, part: correct_group(joint, part, settings),
+        lambda joint, part: _correct_group(joint, part, settings),
         joint,
         measurements,
         group,
@@ -192,7 +192,7 @@ def _in_groups(
     return state, jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[2:])[:m], done)
 
 
-def correct_group(
+def _correct_group(
     joint: Joint, part: Measurements, settings: EkfSettings
 ) -> tuple[Joint, Correction]:
     """The joint corrected by g measurements in turn: local states by each, then P by all at once.
@@ -243,7 +243,7 @@ def _correct_local(
     memory = whole._replace(pose=local.pose), slot
     found = innovate(local, i, view_of(local, i), z, known, memory, settings)
     v, reach = found.v[:, :width], found.v[:, width:]
-    moved = retract_means(local, found.xi[:width], settings.chart)
+    moved = _retract_means(local, found.xi[:width], settings.chart)
     moved = moved._replace(cov=local.cov - linalg.gram(v, found.v))
     done = jax.tree.map(lambda leaf: leaf[0], found.correction)
     return moved, (reach, found.whitened, done)
@@ -276,7 +276,7 @@ def _moved_map(
         return retracted(chart, joint, xi)[1]
 
     def move(joint: Joint, one: tuple[jax.Array, jax.Array]) -> tuple[Joint, None]:
-        return retract_means(joint, linalg.gram(one[0], one[1][:, None])[:, 0], chart), None
+        return _retract_means(joint, linalg.gram(one[0], one[1][:, None])[:, 0], chart), None
 
     each = v.reshape(*whitened.shape, -1)
     return jax.lax.scan(move, joint, (each, whitened))[0].landmarks

@@ -66,7 +66,7 @@ def enter_link(
     return state._replace(diagonal=diagonal, counts=counts, neighbours=index, links=links)
 
 
-def enter_links(
+def _enter_links(
     state: SparseState,
     i: Int[Array, ""],
     j: Int[Array, "A"],
@@ -144,7 +144,7 @@ def deactivate(
 
     def enter_row(state: SparseState, of: tuple[Array, ...]) -> tuple[SparseState, None]:
         a, on = of
-        return enter_links(state, state.active[a], state.active, blocks[a], on), None
+        return _enter_links(state, state.active[a], state.active, blocks[a], on), None
 
     if state.neighbours.shape[1] >= n - 1:
         state, _ = jax.lax.scan(enter_row, state, (order, entered))

@@ -77,7 +77,7 @@ class EifSlam(InformationFilter):
         )
         omega, residual = canonical.measurement_update(state.omega, state.residual, innovations)
         error, solved = canonical.mean_error(omega, residual, innovations.omega_positive)
-        pose, landmarks = corrected_means(state, error)
+        pose, landmarks = _corrected_means(state, error)
         omega, new_landmarks, initialized = canonical.initialize_landmarks(
             self.sensor,
             omega,
@@ -105,7 +105,7 @@ class EifSlam(InformationFilter):
         return estimate_of(joint, self.sensor, self.chart)
 
 
-def corrected_means(
+def _corrected_means(
     state: CanonicalState, error: Float[Array, "D"]
 ) -> tuple[Float[Array, "3"], Float[Array, "N L"]]:
     """Pose and landmarks corrected by the error of the mean."""

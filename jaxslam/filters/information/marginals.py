@@ -29,7 +29,7 @@ from jaxslam.math import linalg
 from jaxslam.math.xla import materialize
 
 
-def move_landmarks(
+def _move_landmarks(
     state: SparseState, slot: Int[Array, "B"], step: Float[Array, "B 2"]
 ) -> SparseState:
     """The state with the means of landmarks moved, and the residuals of linked ones updated."""
@@ -55,7 +55,7 @@ def recover_passive_means(state: SparseState, count: int) -> SparseState:
         step, positive = linalg.solve_psd(state.diagonal[slot], state.landmark_residual[slot])
         on = state.alive[slot] & positive & ~(state.active == slot).any()
         step = jnp.where(on, step, 0.0)
-        state = move_landmarks(state, slot[None], step[None])
+        state = _move_landmarks(state, slot[None], step[None])
         left = state.landmark_residual.at[jnp.where(on, slot, n)].set(0.0, mode="drop")
         return state._replace(landmark_residual=left), None
 
@@ -77,7 +77,7 @@ def recover_active_means(
     error, solved = canonical.mean_error(omega, residual, omega_positive)
     state = with_active_residual(state, jnp.where(solved, 0.0, active_residual(state)))
     state = state._replace(pose=canonical.correct_pose(state.pose, error[:3]))
-    return move_landmarks(state, state.active, error[3:].reshape(-1, 2)), solved
+    return _move_landmarks(state, state.active, error[3:].reshape(-1, 2)), solved
 
 
 def repeat_recovery(

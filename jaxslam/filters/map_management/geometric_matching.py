@@ -25,7 +25,7 @@ from jaxslam.math import linalg, se2
 from jaxslam.math.stats import chi2_quantile
 
 
-class Alignment(NamedTuple):
+class _Alignment(NamedTuple):
     """A weighted alignment of M cluster points, of which some have a map point."""
 
     pose: Float[Array, "3"]
@@ -55,7 +55,7 @@ class _Residuals(NamedTuple):
     positive: Bool[Array, ""]
 
 
-def align_points(points: PointSets, slot: Int[Array, "M"]) -> Alignment:
+def align_points(points: PointSets, slot: Int[Array, "M"]) -> _Alignment:
     """The pose that aligns cluster points with their map points, -1 for none.
 
     The closed form without weights (as `se2.align`), and from there one step of generalized least
@@ -85,7 +85,7 @@ def align_points(points: PointSets, slot: Int[Array, "M"]) -> Alignment:
     shift = map_centroid + centred[:2] - se2.rotation(centred[2]) @ centroid
     heading = jnp.arctan2(jnp.sin(centred[2:]), jnp.cos(centred[2:]))
     by_turn = jnp.where(there[:, None], quarter_turned(target - shift[None, :]), 0.0)
-    return Alignment(
+    return _Alignment(
         pose=jnp.concatenate([shift, heading]),
         distance=((whitened - by_pose @ step) ** 2).sum(),
         each=jnp.where(there, each, 0.0),
@@ -149,7 +149,7 @@ class GeometricMatch(NamedTuple):
     """more pairs of points agreed than there was room for"""
 
 
-class SearchLimits(NamedTuple):
+class _SearchLimits(NamedTuple):
     """The limits of a search; made by `search_limits`."""
 
     single: tuple[float, float]
@@ -162,7 +162,7 @@ class SearchLimits(NamedTuple):
 
 def search_limits(
     caller: str, size: int, probability: float, pairs: int, candidates: int
-) -> SearchLimits:
+) -> _SearchLimits:
     """The limits of a search over M = size cluster points.
 
     Raises ValueError, which names the caller, on a probability not between 0 and 1, or pairs or
@@ -174,7 +174,7 @@ def search_limits(
     check_count(f"{caller}: candidates", candidates)
     joint = [chi2_quantile(probability, max(2 * n - 3, 1)) for n in range(size + 1)]
     single = chi2_quantile(probability, 1), chi2_quantile(probability, 2)
-    return SearchLimits(single, np.asarray(joint), pairs, candidates)
+    return _SearchLimits(single, np.asarray(joint), pairs, candidates)
 
 
 class _Hypotheses(NamedTuple):
@@ -189,7 +189,7 @@ class _Hypotheses(NamedTuple):
     """more candidates agreed than C"""
 
 
-def match_points(points: PointSets, limits: SearchLimits) -> GeometricMatch:
+def match_points(points: PointSets, limits: _SearchLimits) -> GeometricMatch:
     """The match with the most cluster points; among equals, that of least D².
 
     Each of a few pairs (a, b) of cluster points, the longest, is compared with all pairs (j, k) of
@@ -202,7 +202,7 @@ def match_points(points: PointSets, limits: SearchLimits) -> GeometricMatch:
     """
     found = _hypotheses(points, limits)
     finalists = found.slot.reshape(-1, len(points.cluster))[_finalists(found)]
-    fits = jax.vmap(lambda slot: fit_hypothesis(points, slot, limits))(finalists)
+    fits = jax.vmap(lambda slot: _fit_hypothesis(points, slot, limits))(finalists)
     best: GeometricMatch = jax.tree.map(
         lambda leaf: leaf[jnp.argmax(_merit(fits.explained, fits.distance))], fits
     )
@@ -211,7 +211,7 @@ def match_points(points: PointSets, limits: SearchLimits) -> GeometricMatch:
     return best._replace(runner_up=other.astype(jnp.int32), exhausted=found.exhausted.any())
 
 
-def _hypotheses(points: PointSets, limits: SearchLimits) -> _Hypotheses:
+def _hypotheses(points: PointSets, limits: _SearchLimits) -> _Hypotheses:
     """Hypotheses of the longest cluster pairs with the map pairs whose lengths agree best."""
     n = points.map.shape[0]
     room = min(limits.candidates, n * n)
@@ -247,8 +247,8 @@ def _finalists(found: _Hypotheses) -> Int[Array, "K"]:
     return jnp.concatenate([heads, jax.lax.top_k(every, min(_FINALISTS, len(every)))[1]])
 
 
-def fit_hypothesis(
-    points: PointSets, slot: Int[Array, "M"], limits: SearchLimits
+def _fit_hypothesis(
+    points: PointSets, slot: Int[Array, "M"], limits: _SearchLimits
 ) -> GeometricMatch:
     """The match of one hypothesis: the least-squares frame of the pairs that fit.
 

@@ -168,10 +168,10 @@ def close_loop(joint: Joint, chart: Chart, settings: LoopSettings) -> tuple[Join
             landmarks that `lost` refuses.
     """
     check_recency("close_loop", joint, chart)
-    recent, candidates = recent_cluster(joint, settings)
+    recent, candidates = _recent_cluster(joint, settings)
     old, report = change_where(
         candidates.any(axis=1).sum() >= settings.least,
-        lambda _: old_slots(joint, chart, recent, candidates, settings),
+        lambda _: _old_slots(joint, chart, recent, candidates, settings),
         (jnp.full(recent.shape, -1, jnp.int32), no_closing()),
     )
     joint = change_where(
@@ -186,7 +186,7 @@ def no_closing() -> LoopReport:
     return LoopReport(none, none, no, none, no, no, none)
 
 
-def recent_cluster(
+def _recent_cluster(
     joint: Joint, settings: LoopSettings
 ) -> tuple[Int[Array, "M"], Bool[Array, "M N"]]:
     """The slots of the M recent landmarks measured last, and their candidate old landmarks."""
@@ -200,7 +200,7 @@ def recent_cluster(
     return cluster, recent[cluster][:, None] & joint.alive[None, :] & later
 
 
-def old_slots(
+def _old_slots(
     joint: Joint,
     chart: Chart,
     recent: Int[Array, "M"],

@@ -139,13 +139,13 @@ class FastSlam(Filter):
         return with_finite_poses(state, moved, jnp.zeros_like(state.pose_cov))
 
     def update(self, state: SlamParticles, scan: Scan, key: Array) -> tuple[SlamParticles, Info]:
-        each = partial(of_each_particle, zero_padding(scan), particle_map_settings(self))
+        each = partial(_of_each_particle, zero_padding(scan), particle_map_settings(self))
         key_resample, key_draw = jax.random.split(key)
         state = state._replace(best=None)
         association = each(associate_particle, state)
         proposed, innovations = each(propose_pose, state, association)
         state = with_finite_poses(state, proposed.pose, proposed.pose_cov)
-        weight, log_likelihood, some = weight_particles(state, proposed)
+        weight, log_likelihood, some = _weight_particles(state, proposed)
         nis = weighted_nis(innovations.nis, association.matched, weight)
         ess = 1.0 / jnp.exp(2 * weight).sum()
         due = ess < self.threshold * self.particles
@@ -153,24 +153,24 @@ class FastSlam(Filter):
         (state, association, innovations, before), weight = resampled_where(
             due, (state, association, innovations, weight), weight, self.resample, key_resample
         )
-        state = with_drawn_poses(state._replace(log_weight=weight), key_draw)
+        state = _with_drawn_poses(state._replace(log_weight=weight), key_draw)
         state, infos = each(update_map, state, association, innovations)
         best = jnp.argmax(before).astype(jnp.int32)
-        info = report_best(infos, best, nis, log_likelihood, association.exhausted)
+        info = _report_best(infos, best, nis, log_likelihood, association.exhausted)
         return state._replace(best=best), with_extra(info, "particles", found)
 
     def estimate(self, state: SlamParticles) -> Estimate:
         return slam_estimate(state, self.sensor)
 
 
-def of_each_particle(
+def _of_each_particle(
     scan: Scan, settings: ParticleMapSettings, step: Callable[..., _T], *of_particles: PyTree
 ) -> _T:
     """The results of step(*of_particle, scan=…, settings=…) for every particle."""
     return jax.vmap(partial(step, scan=scan, settings=settings))(*of_particles)
 
 
-def report_best(
+def _report_best(
     infos: Info,
     best: Int[Array, ""],
     nis: Float[Array, "M"],
@@ -186,7 +186,7 @@ def report_best(
     )
 
 
-def weight_particles(
+def _weight_particles(
     state: SlamParticles, proposed: PoseProposal
 ) -> tuple[Float[Array, "P"], Float[Array, ""], Bool[Array, ""]]:
     """Log-weights log w_p p(scan | particle) with Σ w = 1, the log-likelihood of measurements with
@@ -196,7 +196,7 @@ def weight_particles(
     return weight, normalized(seen)[1], some
 
 
-def with_drawn_poses(state: SlamParticles, key: Array) -> SlamParticles:
+def _with_drawn_poses(state: SlamParticles, key: Array) -> SlamParticles:
     """The state with each pose drawn from its Gaussian, all finite."""
     return state._replace(
         pose=draw_poses(state, key),

@@ -106,7 +106,7 @@ class ParticleLocalization(MonteCarloFilter):
         misfit = 0.5 * likelihood.counted.sum(axis=1)
         measured = likelihood.measured[0].sum()
         state, found = self.weigh(state, misfit, misfit, measured)
-        info = info_of_scan(scan, likelihood, state.log_weight, log_likelihood)
+        info = _info_of_scan(scan, likelihood, state.log_weight, log_likelihood)
         return state, with_extra(info, "particles", found)
 
     def estimate(self, state: PoseParticles) -> Estimate:
@@ -114,7 +114,7 @@ class ParticleLocalization(MonteCarloFilter):
         return self.pose_estimate(state, jax.vmap(self.sensor.position)(points), map_tags(self))
 
 
-def info_of_scan(
+def _info_of_scan(
     scan: Scan,
     likelihood: ScanLikelihood,
     log_weight: Float[Array, "P"],

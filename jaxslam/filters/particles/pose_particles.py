@@ -208,7 +208,7 @@ def draw_start(state: PoseParticles, key: Array, region: Region | None) -> PoseP
     def drawn(poses: Float[Array, "P 3"]) -> Float[Array, "P 3"]:
         if region is not None:
             return region.draw(len(poses), key, poses.dtype)
-        return draw_gaussian_poses(poses, state.start_cov, key)
+        return _draw_gaussian_poses(poses, state.start_cov, key)
 
     return state._replace(
         pose=change_where(state.fresh, drawn, state.pose),
@@ -230,7 +230,7 @@ def pose_particle_moments(
     return mean, spread + state.start_cov
 
 
-def draw_gaussian_poses(
+def _draw_gaussian_poses(
     pose: Float[Array, "P 3"], cov: Float[Array, "3 3"], key: Array
 ) -> Float[Array, "P 3"]:
     """Poses drawn from N(pose_p, cov); cov may be singular or zero."""

@@ -172,7 +172,7 @@ class MonteCarloFilter(_Particles):
             fit: what recovery compares with other scans, as `update_averages` takes it.
             measured: how many measurements the scan has.
         """
-        weight, some = weight_poses(state, misfit)
+        weight, some = _weight_poses(state, misfit)
         ess = effective_size(weight)
         found = ParticleInfo(
             ess=ess, underflow=~some, active=state.active, **state.events._asdict()
@@ -207,7 +207,7 @@ class MonteCarloFilter(_Particles):
         return self.region if self.start == "uniform" else None
 
 
-def weight_poses(
+def _weight_poses(
     state: PoseParticles, misfit: Float[Array, "P"]
 ) -> tuple[Float[Array, "P"], Bool[Array, ""]]:
     """Log-weights log w exp(-misfit) with Σ w = 1, equal where all underflow, and whether any

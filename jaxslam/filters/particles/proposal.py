@@ -50,7 +50,7 @@ def associate_particle(
     particle: SlamParticles, scan: Scan, settings: ParticleMapSettings
 ) -> ParticleAssociation:
     """The association of a scan with the map of one particle, before the scan corrects its pose."""
-    prediction = predict_measurements(particle, settings.sensor)
+    prediction = _predict_measurements(particle, settings.sensor)
     return particle_association(prediction, scan, settings.associate)
 
 
@@ -144,7 +144,7 @@ def propose_pose(
     return PoseProposal(*done), innovations
 
 
-def predict_measurements(particle: SlamParticles, sensor: Sensor) -> Prediction:
+def _predict_measurements(particle: SlamParticles, sensor: Sensor) -> Prediction:
     """The `Prediction` of one particle's map, with landmarks correlated by the pose alone."""
 
     def linearized() -> tuple[Float[Array, "N Z"], Float[Array, "N Z 3"], Float[Array, "N Z Z"]]:

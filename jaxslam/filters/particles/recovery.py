@@ -58,7 +58,7 @@ def update_averages(
     )
 
 
-class DrawnPoses(NamedTuple):
+class _DrawnPoses(NamedTuple):
     """P resampled or injected poses, in random order."""
 
     pose: Float[Array, "P 3"]
@@ -72,7 +72,7 @@ def resample_and_inject(
     key: Array,
     resample: Resample | Differentiable,
     region: Region | None,
-) -> DrawnPoses:
+) -> _DrawnPoses:
     """Poses resampled by weight or, with the state's injection probability, drawn from a
     region."""
     particles = len(state.pose)
@@ -82,10 +82,10 @@ def resample_and_inject(
     order = jax.random.permutation(key_order, particles)
     pose, log_weight = state.pose[ancestor[order]], log_weight[order]
     if region is None:
-        return DrawnPoses(pose, log_weight, jnp.zeros(particles, bool))
+        return _DrawnPoses(pose, log_weight, jnp.zeros(particles, bool))
     injected = jax.random.uniform(key_which, (particles,), pose.dtype) < state.injection
     anywhere = region.draw(particles, key_anywhere, pose.dtype)
-    return DrawnPoses(
+    return _DrawnPoses(
         jnp.where(injected[:, None], anywhere, pose),
         jnp.where(injected, -math.log(particles), log_weight),
         injected,

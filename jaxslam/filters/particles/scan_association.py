@@ -40,7 +40,7 @@ def zero_padding(scan: Scan) -> Scan:
     return scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
 
 
-class GatedDistance(NamedTuple):
+class _GatedDistance(NamedTuple):
     """A squared Mahalanobis distance d² after the gate, of any shape."""
 
     inside: Bool[Array, "..."]
@@ -51,7 +51,7 @@ class GatedDistance(NamedTuple):
     """d², a large number where it is not finite"""
 
 
-def gate_distance(distance: Float[Array, "*M"], gate: Number | None) -> GatedDistance:
+def gate_distance(distance: Float[Array, "*M"], gate: Number | None) -> _GatedDistance:
     """The gated distance: whether d² passes, and its values for weights and for `Info`."""
     finite = jnp.isfinite(distance)
     if gate is not None:
@@ -59,4 +59,4 @@ def gate_distance(distance: Float[Array, "*M"], gate: Number | None) -> GatedDis
     inside = finite if gate is None else finite & (distance <= gate)
     counted = distance if gate is None else jnp.where(inside, distance, gate)
     largest = 0.5 * float(jnp.finfo(distance.dtype).max)
-    return GatedDistance(inside, counted, jnp.where(finite, distance, largest))
+    return _GatedDistance(inside, counted, jnp.where(finite, distance, largest))

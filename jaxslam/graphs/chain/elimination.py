@@ -242,7 +242,7 @@ def _solve_upper(factor: Array, rhs: Array) -> Array:
     return linalg.solve_lower(factor[::-1, ::-1].T, rhs[::-1])[::-1]
 
 
-class ChainMarginals(NamedTuple):
+class _ChainMarginals(NamedTuple):
     """The marginals of the Gaussian of a chain: of each pose, and of the last pose with the map."""
 
     path: Float[Array, "T+1 3"]
@@ -252,7 +252,7 @@ class ChainMarginals(NamedTuple):
     """of the last pose and the map, D = 3 + NL; unit variance at dead slots"""
 
 
-def chain_marginals(chain: Chain, policy: Policy) -> ChainMarginals:
+def chain_marginals(chain: Chain, policy: Policy) -> _ChainMarginals:
     """The marginals of a chain, in O(T N) plus one triangular system of 3T columns.
 
     With n standard normal and M = R Rᵀ the matrix of the gain,
@@ -295,7 +295,7 @@ def chain_marginals(chain: Chain, policy: Policy) -> ChainMarginals:
         jnp.concatenate([one[None], more]) for one, more in zip(start, rest, strict=True)
     )
     if wide == 0:
-        return ChainMarginals(path, own, own[-1])
+        return _ChainMarginals(path, own, own[-1])
     poses = path.shape[0]
     spread = linalg.solve_lower(policy.map_factor, by_map.reshape(poses * 3, wide).T)
     spread = spread.reshape(wide, poses, 3)
@@ -304,4 +304,4 @@ def chain_marginals(chain: Chain, policy: Policy) -> ChainMarginals:
     of_map = unit.T @ unit
     cross = by_map[-1] @ of_map
     cov = jnp.block([[covs[-1], cross], [cross.T, of_map]])
-    return ChainMarginals(path, covs, cov)
+    return _ChainMarginals(path, covs, cov)

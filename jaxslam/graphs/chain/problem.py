@@ -70,7 +70,7 @@ def cost(sensor: Sensor, problem: Problem, at: Iterate) -> Float[Array, ""]:
     return 0.5 * ((at.start**2).sum() + (at.noise**2).sum() + each.sum())
 
 
-def linearize_at(motion: Motion, sensor: Sensor, problem: Problem, at: Iterate) -> Chain:
+def _linearize_at(motion: Motion, sensor: Sensor, problem: Problem, at: Iterate) -> Chain:
     """The chain of the Gauss-Newton step: the models linearized at an iterate.
 
     It has as many rows a measurement as the chain of a filter (`smoothing.linearization`).
@@ -179,7 +179,7 @@ def optimize_chain(
         may = (search.taken < iterations) & ~converged
         after, value, lower = _line_search(motion, sensor, problem, search, policy)
         moved = may & lower
-        there = after, linearize_at(motion, sensor, problem, after), value
+        there = after, _linearize_at(motion, sensor, problem, after), value
         here = search.at, search.chain, search.cost
         at, chain, value = jax.tree.map(lambda a, b: jnp.where(moved, a, b), there, here)
         ending = jnp.where(converged, Ending.CONVERGED, Ending.EXHAUSTED)

@@ -88,7 +88,7 @@ def _by_numpy(change: Callable[[PyTree], PyTree], x: jax.Array) -> jax.Array:
     )
 
 
-GROUP = 16
+_GROUP = 16
 """Graphs of a batch that are computed together; groups follow each other. 256 of 434 poses at once
 are a tenth as fast on a CPU, since their arrays leave its caches, and all wait for the slowest."""
 Array = jax.Array
@@ -118,17 +118,17 @@ def over_batch(name: str, function: Callable[..., _T]) -> Callable[[PyTree, PyTr
                 f"{name}: expected one model, one plan and one set of limits for a batch"
             )
 
-        if size > GROUP:
-            groups = -(-size // GROUP)
-            rows = np.arange(groups * GROUP) % size  # the last group is filled up with the first
+        if size > _GROUP:
+            groups = -(-size // _GROUP)
+            rows = np.arange(groups * _GROUP) % size  # the last group is filled up with the first
 
             def parted(x: Array, one: bool) -> Array:
                 x = x if one else jnp.broadcast_to(x[None], (size, *x.shape))
-                return x[rows].reshape(groups, GROUP, *x.shape[1:])
+                return x[rows].reshape(groups, _GROUP, *x.shape[1:])
 
             together = jax.vmap(lambda own: whole(shared, own))
             out = jax.lax.map(together, jax.tree.map(parted, own, batched[1]))
-            out = jax.tree.map(lambda x: x.reshape(groups * GROUP, *x.shape[2:])[:size], out)
+            out = jax.tree.map(lambda x: x.reshape(groups * _GROUP, *x.shape[2:])[:size], out)
             return out, jax.tree.map(lambda _: True, out)
 
         def fold(x: Array, one: bool) -> Array:

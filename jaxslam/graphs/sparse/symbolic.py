@@ -14,7 +14,7 @@ from scipy.sparse import coo_matrix, diags_array
 from scipy.sparse.linalg import splu
 
 
-def minimum_degree(
+def _minimum_degree(
     size: int, first: Int[np.ndarray, "E"], second: Int[np.ndarray, "E"]
 ) -> Int[np.ndarray, "size"]:
     """The variables in a minimum-degree order, for a graph with edges first-second.
@@ -93,7 +93,7 @@ def factor_pattern(size: int, first: Ints, second: Ints) -> Pattern:
     The rows below the diagonal of a column are those of A and of the columns whose parent it is in
     the elimination tree (Davis 2006, "Direct methods for sparse linear systems", chapter 4).
     """
-    order = minimum_degree(size, first, second)
+    order = _minimum_degree(size, first, second)
     position = np.empty(size, int)
     position[order] = np.arange(size)
     one, other = position[first], position[second]

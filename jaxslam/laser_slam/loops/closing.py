@@ -52,7 +52,7 @@ def give_back() -> None:
 
 NARROW, WIDE = (0.8, float(np.deg2rad(14.0))), (4.0, float(np.deg2rad(40.0)))
 """Windows of the search, [m] and [rad] to either side."""
-SEARCHES = [search(*window, np.deg2rad(2.0)) for window in (NARROW, WIDE)]
+_SEARCHES = [search(*window, np.deg2rad(2.0)) for window in (NARROW, WIDE)]
 WINDOW = np.diag(1 / np.square([WIDE[0], *WIDE]))
 """Information of the window, which bounds what the walls do not tell."""
 
@@ -87,7 +87,7 @@ def matched(
         rows = np.flatnonzero(candidates.first == middle)
         for row in rows:
             fit = match(
-                SEARCHES[int(candidates.wide[row])],
+                _SEARCHES[int(candidates.wide[row])],
                 submap,
                 taken(scans.points, keyframe[candidates.second[row]]),
                 candidates.z[row],
@@ -130,7 +130,7 @@ KERNEL = {LOOPS: graphs.Cauchy()}
 """One object, so that the optimum is traced once."""
 
 
-class Closed(NamedTuple):
+class _Closed(NamedTuple):
     """The graph of keyframes with its loops."""
 
     graph: Graph
@@ -144,7 +144,7 @@ def closed(
     odometry: Odometry,
     settings: Settings,
     progress: Callable[[int, int], object] | None = None,
-) -> Closed:
+) -> _Closed:
     """The graph after all rounds.
 
     In each round candidates are found by the marginals of the graph so far, matched, and added to
@@ -226,7 +226,7 @@ def _final(
     kept: np.ndarray,
     keyframe: np.ndarray,
     settings: Settings,
-) -> Closed:
+) -> _Closed:
     """The optimum without a kernel, of the loops that the graph does not contradict.
 
     chain: of the matches with the covariances of those in doubt, which takes the place of that
@@ -242,7 +242,7 @@ def _final(
     if kept.any():
         graph = _host(graphs.optimize(graph, room=ROOM).graph)
     loops = loops._replace(first=keyframe[loops.first], second=keyframe[loops.second])
-    return Closed(graph, loops, 0)
+    return _Closed(graph, loops, 0)
 
 
 def _with(place: Candidates, pairs: np.ndarray) -> Candidates:

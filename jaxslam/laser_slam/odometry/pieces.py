@@ -33,7 +33,7 @@ from jaxslam.math.arrays import Control, Pose, ProcessNoise, ProcessNoiseCov
 from jaxslam.protocols import Motion
 
 ENDS = ("x [m]", "y [m]", "θ [rad]")
-ROOTS = ("Lxx [m]", "Lyx [m]", "Lyy [m]", "Lθx [rad]", "Lθy [rad]", "Lθθ [rad]")
+_ROOTS = ("Lxx [m]", "Lyx [m]", "Lyy [m]", "Lθx [rad]", "Lθy [rad]", "Lθθ [rad]")
 
 
 @record
@@ -45,7 +45,7 @@ class MatchMotion(Motion):
     robot after z. `match_controls` makes u of the matches of laser odometry.
     """
 
-    controls = (*ENDS, *ROOTS)
+    controls = (*ENDS, *_ROOTS)
     noises = ENDS
 
     def step(self, pose: Pose, u: Control, w: ProcessNoise) -> Pose:

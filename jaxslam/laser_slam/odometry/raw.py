@@ -10,15 +10,15 @@ from jaxslam.math import numpy_poses as poses
 
 FARTHEST = (3.0, float(np.deg2rad(100.0)))
 """The longest step [m] and turn [rad] between two scans that is searched."""
-FASTER = 1.5
+_FASTER = 1.5
 """times the usual largest speed is faster than the robot can be"""
 ENOUGH = 20
 """steps in which the robot moves, for a largest speed to be known"""
 MOVES = (0.02, 0.02)
 """[m], [rad] of a step in which it moves"""
-AS_BEFORE = 0.6
+_AS_BEFORE = 0.6
 """of the reach, by which a step that is not known differs from the one before"""
-MUCH = (0.3, 0.35)
+_MUCH = (0.3, 0.35)
 """[m], [rad]: shorter steps are not timed well enough to be called too fast"""
 
 
@@ -86,7 +86,7 @@ def steps_of(
     steps = Steps(step, cov, reach, jump, frozen, lags, duration > 2.5 * usual)
     doubtful = jump | lags
     cov[doubtful] += reach_cov(reach[doubtful])
-    cov[frozen] += reach_cov(AS_BEFORE * reach[frozen])
+    cov[frozen] += reach_cov(_AS_BEFORE * reach[frozen])
     return steps
 
 
@@ -103,12 +103,12 @@ def _by_speeds(
     reach = np.broadcast_to(FARTHEST, size.shape).copy()
     lags = np.zeros(len(size), bool)
     timed = duration > 0
-    for column, (least, much) in enumerate(zip(MOVES, MUCH, strict=True)):
+    for column, (least, much) in enumerate(zip(MOVES, _MUCH, strict=True)):
         way = size[:, column]
         moves = timed & ~useless & (way > least)
         if moves.sum() < ENOUGH:
             continue
-        fastest = FASTER * np.quantile(way[moves] / duration[moves], 0.95)
+        fastest = _FASTER * np.quantile(way[moves] / duration[moves], 0.95)
         can = fastest * duration
         reach[timed, column] = np.minimum(FARTHEST[column], can[timed])
         # Two steps, the first too slow and the second too fast, together of usual speed.

@@ -71,7 +71,7 @@ def split_claim(
 
 POSE = ("x [m]", "y [m]", "theta [rad]")
 POINT = ("x [m]", "y [m]")
-GLOSSARY = {
+_GLOSSARY = {
     "pose": POSE,
     "frame": POSE,
     "landmark": POINT,
@@ -80,7 +80,7 @@ GLOSSARY = {
 }
 """Default entries of an argument by its name."""
 
-PERIODS = {"[rad]": 2 * np.pi, "[deg]": 360.0, "[°]": 360.0}
+_PERIODS = {"[rad]": 2 * np.pi, "[deg]": 360.0, "[°]": 360.0}
 """A whole turn by its unit."""
 
 
@@ -118,7 +118,7 @@ def at_state(function: Function, state: Sequence[ArrayLike]) -> str:
 
 def periods(names: Sequence[str]) -> Float[np.ndarray, "m"]:
     """The periods of quantities by their units: 2π of [rad], 360 of [deg], inf of all else."""
-    return np.array([PERIODS.get(name.split(" ")[-1], np.inf) for name in names])
+    return np.array([_PERIODS.get(name.split(" ")[-1], np.inf) for name in names])
 
 
 def motion_functions(motion: Motion) -> tuple[Function]:
@@ -227,7 +227,7 @@ def plain_function(
         raise ValueError(
             f"{name}: expected a function with a parameter to differentiate by, got none"
         )
-    named = {p: _entries(name, p, given.get(p, GLOSSARY.get(p))) for p in parameters}
+    named = {p: _entries(name, p, given.get(p, _GLOSSARY.get(p))) for p in parameters}
     shapes = [np.shape(table) for table in (() if states is None else states)]
     if len(shapes) == len(parameters) and all(len(shape) == 2 for shape in shapes):
         pairs = zip(parameters, shapes, strict=True)
