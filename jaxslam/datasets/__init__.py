@@ -18,6 +18,7 @@ from jaxslam.datasets.mrclam.reader import (
     mrclam,
     mrclam_calibration,
 )
+from jaxslam.datasets.mrclam.robot import white_noise
 from jaxslam.datasets.mrclam.team import mrclam_team
 from jaxslam.datasets.noise_fit import DatasetFit, fit
 from jaxslam.datasets.plaza import plaza
@@ -70,4 +71,5 @@ __all__ = [
     "relation_file",
     "table",
     "victoria_park",
+    "white_noise",
 ]

@@ -96,7 +96,7 @@ _State: TypeAlias = tuple[Array, Array, Array, Array]
 """iterations, pose, the pose before, how far the last step went"""
 
 
-class _Icp(Matcher):
+class Icp(Matcher):
     """An iterative closest point method: a subclass has the cost of pairs and its minimum."""
 
     settings: IcpSettings
@@ -238,7 +238,7 @@ def _information(
 
 
 @record
-class PointToPoint(_Icp):
+class PointToPoint(Icp):
     """ICP: the pose that minimizes Σ w |T ∘ p_i - q_j(i)|², q_j(i) the nearest point.
 
     Each step is the exact minimum for its pairs (`closed_form.least`); its error falls by a
@@ -271,7 +271,7 @@ def distance(of: Surface, moved: Array, partner: Array) -> Float[Array, "N"]:
 
 
 @record
-class PointToLine(_Icp):
+class PointToLine(Icp):
     """PL-ICP: the pose that minimizes Σ w (n_j · (T ∘ p_i - m_j))², j(i) the nearest point.
 
     The line (m_j, n_j) is fitted to point j of the reference and its neighbours (`Surface`); each

@@ -5,7 +5,7 @@ The conformance tests run over `REGISTRY`."""
 from collections.abc import Callable
 
 from jaxslam.protocols import Sensor
-from jaxslam.sensors.absolute import Compass, PositionFix
+from jaxslam.sensors.absolute import Absolute, Compass, PositionFix
 from jaxslam.sensors.bearing_inverse_depth import BearingInverseDepth
 from jaxslam.sensors.line import Line
 from jaxslam.sensors.partial import BearingOnly, RangeOnly
@@ -28,6 +28,7 @@ REGISTRY: dict[str, Callable[..., Sensor]] = {
 
 __all__ = [
     "REGISTRY",
+    "Absolute",
     "BearingInverseDepth",
     "BearingOnly",
     "Compass",
