@@ -8,7 +8,6 @@ from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.lines import TextFile
 from jaxslam.logs.streams import as_recorded
 from jaxslam.motion import PoseIncrement
-from jaxslam.noise import NoiseCov
 from jaxslam.sensors import RangeBearing
 from jaxslam.types import Log
 
@@ -19,12 +18,7 @@ _ODOMETRY_COV = np.diag([0.001, 0.001, 0.001]) ** 2
 MEASUREMENT_COV = np.diag([0.1, 0.05]) ** 2
 
 
-def bonn(
-    folder: str | Path,
-    *,
-    odometry_cov: NoiseCov = _ODOMETRY_COV,
-    measurement_cov: NoiseCov = MEASUREMENT_COV,
-) -> Dataset:
+def bonn(folder: str | Path) -> Dataset:
     """The data set in the files `world.dat` (landmarks: id x y) and `sensor_data.dat` of a folder.
 
     The latter has a line `ODOMETRY rot1 trans rot2` for each step, followed by lines `SENSOR id
@@ -40,8 +34,6 @@ def bonn(
 
     Args:
         folder: the folder of the two files.
-        odometry_cov: (3, 3) covariance of the pose increment, or a function of (pose, u).
-        measurement_cov: (2, 2) covariance of (range, bearing), or a function of z.
     Raises:
         ValueError: `path:line: reason` on a malformed line, a landmark that is not in `world.dat`
             or is measured twice in a step, or a SENSOR line before the first ODOMETRY.
@@ -85,8 +77,8 @@ def bonn(
         name="bonn",
         log=Log.from_streams((time, controls), (time[rows], tags, z), as_recorded, time),
         time=time,
-        motion=PoseIncrement(odometry_cov),
-        sensor=RangeBearing(measurement_cov),
+        motion=PoseIncrement(_ODOMETRY_COV),
+        sensor=RangeBearing(MEASUREMENT_COV),
         tags=names,
         filter_options={"correction": "joint"},
         landmarks=landmarks,

@@ -22,7 +22,6 @@ from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.lines import read_bytes
 from jaxslam.logs.streams import divide, interpolate_poses
 from jaxslam.motion import PoseIncrement
-from jaxslam.noise import NoiseCov
 from jaxslam.sensors import RangeOnly
 from jaxslam.types import Log
 
@@ -120,8 +119,6 @@ def plaza(
     path: str | Path,
     *,
     range_bias: tuple[float, float] = _RANGE_BIAS,
-    odometry_cov: NoiseCov | None = None,
-    measurement_cov: NoiseCov = _RANGE_COV,
 ) -> Dataset:
     """The data set in `Plaza1_.mat` or `Plaza2_.mat`: odometry, ranges, survey and ground truth.
 
@@ -141,9 +138,6 @@ def plaza(
     Args:
         path: the file.
         range_bias: (offset [m], scale) of the ranges; (0, 0) leaves them as they are.
-        odometry_cov: (3, 3) covariance of (dx, dy, dθ), or a function of (pose, u); by default
-            `_TRAVEL_DENSITY` times the distance.
-        measurement_cov: (1, 1) covariance of a range, or a function of z.
     Raises:
         ValueError: `path: reason` where the file cannot be read, lacks a table, has a table of
             another shape or not finite, times of odometry or ground truth that do not increase, a
@@ -189,8 +183,8 @@ def plaza(
             times,
         ),
         time=times,
-        motion=PoseIncrement(_by_travel if odometry_cov is None else odometry_cov),
-        sensor=RangeOnly(measurement_cov),
+        motion=PoseIncrement(_by_travel),
+        sensor=RangeOnly(_RANGE_COV),
         tags=names,
         landmarks=np.array([points[name] for name in names]),
         true_path=interpolate_poses(truth[:, 0], truth[:, 1:], times),

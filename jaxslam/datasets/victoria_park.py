@@ -25,12 +25,7 @@ _ODOMETRY = ("i", "j", "dx", "dy", "dtheta", "c_xx", "c_xy", "c_xt", "c_yy", "c_
 _LANDMARK = ("i", "j", "x", "y", "c_xx", "c_xy", "c_yy")
 
 
-def victoria_park(
-    path: str | Path,
-    *,
-    odometry_cov: NoiseCov | None = None,
-    measurement_cov: NoiseCov | None = None,
-) -> Dataset:
+def victoria_park(path: str | Path) -> Dataset:
     """The data set in `victoria_park.txt`: pose increments, and landmarks in the robot's frame.
 
     The file has lines `ODOMETRY i j dx dy dθ` and `LANDMARK i j x y`, each followed by the upper
@@ -46,9 +41,6 @@ def victoria_park(
 
     Args:
         path: the file.
-        odometry_cov: (3, 3) covariance of (dx, dy, dθ), or a function of (pose, u), instead of the
-            file's.
-        measurement_cov: (2, 2) covariance of (x, y), or a function of z, instead of the file's.
     Raises:
         ValueError: `path:line: reason` on a line that is malformed or against these rules.
     """
@@ -100,8 +92,8 @@ def victoria_park(
         name="victoria_park",
         log=Log.from_streams((time, controls), seen, as_recorded, time),
         time=time,
-        motion=PoseIncrement(odometry_file if odometry_cov is None else odometry_cov),
-        sensor=RelativePosition(landmark_noise.cov if measurement_cov is None else measurement_cov),
+        motion=PoseIncrement(odometry_file),
+        sensor=RelativePosition(landmark_noise.cov),
         tags=names,
         filter_options={"correction": "joint"},
         source=SOURCE,

@@ -33,7 +33,6 @@ from jaxslam.filters.ekf.ekf_slam import EkfSlam
 from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.math.stats import sigma_gate
 from jaxslam.motion import Unicycle
-from jaxslam.noise import NoiseCov
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.run import run
 from jaxslam.sensors import RangeBearing
@@ -45,8 +44,6 @@ def mrclam(
     robot: int = 1,
     *,
     calibration: RobotCalibration | None = None,
-    odometry_cov: NoiseCov | None = None,
-    measurement_cov: NoiseCov | None = None,
     errata: bool = True,
 ) -> Dataset:
     """The data of one robot in the files of a folder, each `NAME.dat` or `NAME.dat.gz`.
@@ -81,8 +78,6 @@ def mrclam(
         folder: where the files of one data set are.
         robot: number of the robot, 1 to 5.
         calibration: corrects odometry and ranges, and gives the noise. Default: as recorded.
-        odometry_cov: (2, 2) covariance of (v, ω) over a row's Δt, or a function of (pose, u).
-        measurement_cov: (2, 2) covariance of (range, bearing), or a function of z.
         errata: exchange the positions of subjects 11 and 17 if they are those of data set 1, see
             `mrclam.files.EXCHANGED`; `Dataset.corrections` then says so.
     Raises:
@@ -98,7 +93,7 @@ def mrclam(
     own = read_lines(Path(folder), robot, calibration)
     time = np.unique(np.concatenate([own.odometry[:, 0], own.seen[:, 0]]))
     row, tag, kept, dropped = associated(own.seen, time, subject_of, names)
-    motion, sensor = models_of(calibration, odometry_cov, measurement_cov)
+    motion, sensor = models_of(calibration)
     return Dataset(
         name=f"mrclam robot {robot}",
         log=log_of(own.odometry, time, row, tag, own.seen[kept, 2:]),

@@ -8,14 +8,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numpy.typing import ArrayLike
 
 from jaxslam.datasets.mrclam.calibration import RobotCalibration, per_interval, recorded
 from jaxslam.datasets.mrclam.files import read_robot, read_truth
 from jaxslam.logs.streams import hold, interpolate_poses
 from jaxslam.motion import Unicycle
 from jaxslam.noise import NoiseCov
-from jaxslam.protocols import Motion, Sensor
 from jaxslam.sensors import RangeBearing
 from jaxslam.types import Log
 
@@ -99,21 +97,12 @@ def read_lines(folder: Path, robot: int, calibration: RobotCalibration | None) -
     return Recorded(odometry, seen, truth, tuple(corrections))
 
 
-def models_of(
-    calibration: RobotCalibration | None,
-    odometry_cov: NoiseCov | None,
-    measurement_cov: NoiseCov | None,
-) -> tuple[Motion, Sensor]:
-    """The motion model and the sensor, with the noise that is given or the default."""
-    default_moved: NoiseCov = white_noise(*ODOMETRY_DENSITY)
-    default_seen: NoiseCov = MEASUREMENT_COV
-    mount: ArrayLike | None = None
-    if calibration is not None:
-        default_moved, default_seen = calibration.odometry_cov(), calibration.measurement_cov()
-        mount = calibration.mount
-    moved = default_moved if odometry_cov is None else odometry_cov
-    seen = default_seen if measurement_cov is None else measurement_cov
-    return Unicycle(moved), RangeBearing(seen, mount=mount)
+def models_of(calibration: RobotCalibration | None) -> tuple[Unicycle, RangeBearing]:
+    """The motion model and the sensor of a robot, calibrated or as recorded."""
+    if calibration is None:
+        return Unicycle(white_noise(*ODOMETRY_DENSITY)), RangeBearing(MEASUREMENT_COV)
+    sensor = RangeBearing(calibration.measurement_cov(), mount=calibration.mount)
+    return Unicycle(calibration.odometry_cov()), sensor
 
 
 def true_fields(files: Sequence[Recorded], time: Float[np.ndarray, "T"]) -> TrueFields:

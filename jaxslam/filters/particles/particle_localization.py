@@ -42,10 +42,10 @@ class ParticleLocalization(MonteCarloFilter):
 
         slow ← slow + α_slow (c - slow)     fast ← fast + α_fast (c - fast)
 
-    each particle drawn is from the box with probability max(0, 1 - slack · fast/slow) instead
+    each particle drawn is from the box with probability max(0, 1 - fast/slow) instead
     (`injected`). c is the table's likelihood in units of its peak and per measurement, so that it
     does not depend on how many landmarks are in view; the first scan sets both averages; scans
-    without a measurement change nothing. slack above 1 injects less (Gutmann & Fox 2002).
+    without a measurement change nothing.
 
     The estimate is that of the weighted particles after a scan, before resampling:
     `moments.weighted_pose_moments`, a single mean and covariance even if the particles form several

@@ -22,7 +22,6 @@ def update_averages(
     misfit: Float[Array, "P"],
     measured: Int[Array, ""],
     rates: tuple[Number, Number] | None,
-    slack: Number,
 ) -> PoseParticles:
     """The state with updated likelihood averages and the injection probability.
 
@@ -47,9 +46,7 @@ def update_averages(
     )
     safe = jnp.where(slow > 0, slow, 1.0)
     # Without an average no particle has a weight, now or before: all are lost.
-    injection = jnp.where(
-        slow > 0, jnp.maximum(0.0, 1 - jnp.asarray(slack, fit.dtype) * fast / safe), 1.0
-    )
+    injection = jnp.where(slow > 0, jnp.maximum(0.0, 1 - fast / safe), 1.0)
     some = measured > 0
     return state._replace(
         fast=jnp.where(some, fast, state.fast),

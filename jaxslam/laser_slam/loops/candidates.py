@@ -42,6 +42,12 @@ MOST = 2_500
 of them loops abound."""
 PLACES = 12
 """Submaps near a keyframe whose relative pose is examined by odometry, which costs little."""
+CANDIDATES = 3
+"""Submaps that a keyframe is matched with in a round, at most."""
+REACH = 3.0
+"""Distance [m] between two places that share walls."""
+_PROBABILITY = 0.999
+"""Of the ellipse in which a place is sought."""
 SAME = 15
 """Keyframes between submaps that are taken to be of one place."""
 
@@ -111,8 +117,8 @@ def by_place(
 ) -> Candidates:
     """The pairs whose ellipse of uncertainty fits into a window, at most some for each keyframe.
 
-    A place is sought where it is within `loop_reach` of the keyframe, by the ellipse of
-    `loop_probability`.
+    A place is sought where it is within `REACH` of the keyframe, by the ellipse of
+    `_PROBABILITY`.
 
     Args:
         pairs: `near`, of each keyframe the nearest first.
@@ -120,17 +126,17 @@ def by_place(
         tried: (first, second, wide) of rounds before.
         narrow, wide: windows, [m] and [rad] to either side.
     """
-    sigmas = np.sqrt(-2 * np.log(1 - settings.loop_probability))
+    sigmas = np.sqrt(-2 * np.log(1 - _PROBABILITY))
     z = poses.between(path[pairs[:, 0]], path[pairs[:, 1]])
     position = sigmas * np.sqrt(np.linalg.eigvalsh(cov[:, :2, :2])[:, 1])
     heading = sigmas * np.sqrt(cov[:, 2, 2])
     far = np.hypot(z[:, 0], z[:, 1])
     small = (position < narrow[0]) & (heading < narrow[1])
-    fits = (position < wide[0]) & (heading < wide[1]) & (far < settings.loop_reach + position)
+    fits = (position < wide[0]) & (heading < wide[1]) & (far < REACH + position)
     rows = np.flatnonzero(fits)
-    # The first `candidates` of each keyframe, whose pairs follow each other.
+    # The first `CANDIDATES` of each keyframe, whose pairs follow each other.
     rank = np.arange(len(rows)) - np.searchsorted(pairs[rows, 1], pairs[rows, 1])
-    rows = rows[rank < settings.candidates]
+    rows = rows[rank < CANDIDATES]
     new = [(*pairs[row].tolist(), not small[row]) not in tried for row in rows]
     take = rows[np.array(new, bool)]
     return Candidates(

@@ -20,8 +20,10 @@ from jaxslam.graphs.graph import LOOPS
 from jaxslam.laser_slam import covariances
 from jaxslam.laser_slam.assembly import ROOM, graph_of, relative_covs, table_of
 from jaxslam.laser_slam.loops.candidates import (
+    CANDIDATES,
     MOST,
     PLACES,
+    REACH,
     Candidates,
     by_appearance,
     by_place,
@@ -31,7 +33,7 @@ from jaxslam.laser_slam.loops.candidates import (
 )
 from jaxslam.laser_slam.loops.pairwise import clique, consistent
 from jaxslam.laser_slam.odometry.reference import Reference, match, reference_of, search, taken
-from jaxslam.laser_slam.odometry.tracking import Odometry
+from jaxslam.laser_slam.odometry.tracking import LOOP_INLIERS, Odometry
 from jaxslam.laser_slam.records import LoopOutcome, Loops
 from jaxslam.laser_slam.scans import ROWS, Scans
 from jaxslam.laser_slam.settings import Settings
@@ -55,6 +57,9 @@ NARROW, WIDE = (0.8, float(np.deg2rad(14.0))), (4.0, float(np.deg2rad(40.0)))
 _SEARCHES = [search(*window, np.deg2rad(2.0)) for window in (NARROW, WIDE)]
 WINDOW = np.diag(1 / np.square([WIDE[0], *WIDE]))
 """Information of the window, which bounds what the walls do not tell."""
+
+_CONSISTENCY = 0.999
+"""Probability below which two loops agree."""
 
 
 class Matches(NamedTuple):
@@ -96,7 +101,7 @@ def matched(
                 settings,
             )
             z[row], cov[row], score[row] = fit.pose, fit.cov, fit.inliers
-            if fit.inliers < settings.loop_inliers:
+            if fit.inliers < LOOP_INLIERS:
                 outcome[row] = LoopOutcome.POOR
             elif fit.ambiguous:
                 outcome[row] = LoopOutcome.AMBIGUOUS
@@ -150,7 +155,7 @@ def closed(
     In each round candidates are found by the marginals of the graph so far, matched, and added to
     those of the rounds before; of all that match, the largest set that agrees pairwise is kept, and
     the graph is optimized with Cauchy's kernel on them. In the end loops whose squared residual is
-    above the quantile of `settings.consistency` are left out, and the graph is optimized without a
+    above the quantile of `_CONSISTENCY` are left out, and the graph is optimized without a
     kernel.
 
     A keyframe whose match is in doubt begins and ends no loop. Until the last optimum the steps of
@@ -180,8 +185,8 @@ def closed(
         path = np.asarray(graph.poses, np.float64)
         # By the graph few places, since each pair of which the covariance is computed fills its
         # factor; after a first optimum the nearest ones fit a window.
-        most = PLACES if turn == 0 else settings.candidates
-        reach = settings.loop_reach + WIDE[0]
+        most = PLACES if turn == 0 else CANDIDATES
+        reach = REACH + WIDE[0]
         pairs = near(path, middle, usable, ends, most, reach, settings.loop_gap)
         cov = (
             covariances.relative_cov(total, at, pairs[:, 0], pairs[:, 1])
@@ -189,7 +194,7 @@ def closed(
             else relative_covs(solution, pairs)
         )
         new = by_place(path, pairs, cov, done, settings, NARROW, WIDE)
-        if turn == 0 and settings.appearance:
+        if turn == 0:
             new = _with(new, by_appearance(looks, middle, usable, settings))
         new, out = thinned(new)
         left_out += out
@@ -235,7 +240,7 @@ def _final(
     tables = {**graph.tables, "relative_pose": chain}
     if kept.any():
         square = np.asarray(graphs.squared_residuals(graph, room=ROOM)[LOOPS])
-        doubted = square > chi2_quantile(settings.consistency, 3)
+        doubted = square > chi2_quantile(_CONSISTENCY, 3)
         loops.outcome[np.flatnonzero(kept)[doubted]] = LoopOutcome.DOUBTED
         tables[LOOPS] = tables[LOOPS]._replace(valid=~doubted)
     graph = graph._replace(tables=tables)
@@ -274,7 +279,7 @@ def _agreeing(
     outcome = by.outcome.copy()
     good = np.flatnonzero(outcome == LoopOutcome.KEPT)
     parts = of.first[good], of.second[good], by.z[good], by.cov[good]
-    agree = consistent(at, total, *parts, settings.consistency)
+    agree = consistent(at, total, *parts, _CONSISTENCY)
     out = ~clique(agree, by.score[good])
     outcome[good[out]] = LoopOutcome.INCONSISTENT
     loops = Loops(of.first, of.second, by.z, by.cov, by.score, of.appearance.astype(int), outcome)

@@ -103,7 +103,7 @@ def laser_odometry(
     The pose in the frame of the last keyframe minimizes the squared distances of the points from
     the lines of the reference, and the error of raw odometry from the scan before, by their
     covariances; its covariance is (H/σ² + P⁻¹)⁻¹ + floor², H the information of the lines divided
-    by `settings.correlation`.
+    by 2, for beams that err together.
 
     Where fewer than 0.6 of the points meet a wall, and where raw odometry is no guess (a jump, a
     frozen step, one that lags), all poses are searched that the robot can have reached in that time

@@ -12,6 +12,10 @@ FARTHEST = (3.0, float(np.deg2rad(100.0)))
 """The longest step [m] and turn [rad] between two scans that is searched."""
 _FASTER = 1.5
 """times the usual largest speed is faster than the robot can be"""
+_BASE = (0.03, 0.02)
+"""Standard deviation of a step of raw odometry, [m] and [rad]"""
+_SHARE = (0.10, 0.15, 0.05)
+"""and more of it: position by distance, heading by turn, heading by distance [rad/m]."""
 ENOUGH = 20
 """steps in which the robot moves, for a largest speed to be known"""
 MOVES = (0.02, 0.02)
@@ -78,9 +82,9 @@ def steps_of(
     size = np.stack([np.hypot(step[:, 0], step[:, 1]), np.abs(step[:, 2])], axis=1)
     reach, lags = _by_speeds(size, duration, jump | frozen)
     usual = float(np.median(duration[duration > 0])) if (duration > 0).any() else np.inf
-    by_far, by_turn, turn_by_far = settings.odometry_share
-    position = settings.odometry_base[0] + by_far * size[:, 0]
-    heading = settings.odometry_base[1] + by_turn * size[:, 1] + turn_by_far * size[:, 0]
+    by_far, by_turn, turn_by_far = _SHARE
+    position = _BASE[0] + by_far * size[:, 0]
+    heading = _BASE[1] + by_turn * size[:, 1] + turn_by_far * size[:, 0]
     cov = np.stack([position, position, heading], axis=1)[:, :, None] ** 2 * np.eye(3)
     cov[0] = 0.0
     steps = Steps(step, cov, reach, jump, frozen, lags, duration > 2.5 * usual)

@@ -88,6 +88,10 @@ def search(
 
 # What the walls hardly determine is not held at the start, which is of a lattice: the covariance
 # tells it, and the prior bounds it.
+_CORRELATION = 2.0
+"""Beams that err together: the information of a match is divided by it."""
+_FLOOR = (0.005, 0.005, 0.002)
+"""Standard deviations of x, y [m], θ [rad] added to each match, for what the lines miss."""
 _OF_WALLS = IcpSettings(kernel=Cauchy(), scale=0.05, lone=0.5, iterations=10, least_condition=None)
 WALLS = PointToLine(replace(_OF_WALLS, reach=0.5))
 _NEAR_WALLS = PointToLine(replace(_OF_WALLS, reach=0.15))
@@ -133,7 +137,7 @@ def match(
     prior = np.zeros((3, 3))
     if prior_cov is not None:
         known = np.linalg.inv(covariances.of_coordinates(prior_cov, guess))
-        prior = settings.correlation * known
+        prior = _CORRELATION * known
     found = np.asarray(
         _match(
             matcher,
@@ -147,11 +151,11 @@ def match(
     )
     pose, information = found[:3], found[3:12].reshape(3, 3)
     inliers, residual, ambiguous, through = found[12:]
-    sigma = max(settings.sigma, residual) ** 2 * settings.correlation
+    sigma = max(settings.sigma, residual) ** 2 * _CORRELATION
     cov = np.linalg.inv(covariances.semidefinite(information) / sigma + known)
     return ScanMatch(
         pose,
-        covariances.at_end(cov, pose) + np.diag(np.square(settings.floor)),
+        covariances.at_end(cov, pose) + np.diag(np.square(_FLOOR)),
         float(inliers),
         float(residual),
         bool(ambiguous),

@@ -27,6 +27,12 @@ FAR = search(*FARTHEST, np.deg2rad(2.5))
 """Where that finds little, or raw odometry is no guess."""
 _INFLATION = 16.0
 """Of raw odometry's covariance in the wider search."""
+_KEY_TURN = 0.35
+"""Turn [rad] from the last keyframe above which a scan is one."""
+_LEAST_INLIERS = 0.4
+"""Share of a scan's points on the walls of the reference, for a match in odometry."""
+LOOP_INLIERS = 0.65
+"""The same for a loop."""
 _MIN_INLIERS = 0.6
 """Share of points on walls below which the wider search is made, and a match is in doubt."""
 _MIN_GAIN = 0.2
@@ -151,7 +157,7 @@ def tracked(
         # Nothing speaks for a match in doubt where odometry is frozen.
         result.cov_if_right[scan] = cov + doubt if steps.frozen[scan] else cov
         result.poses[scan] = poses.compose(result.poses[keys[-1]], z)
-        far = np.hypot(z[0], z[1]) > settings.key_distance or abs(z[2]) > settings.key_turn
+        far = np.hypot(z[0], z[1]) > settings.key_distance or abs(z[2]) > _KEY_TURN
         # Where odometry is frozen the robot is soon farther off than is searched.
         restart = missed > (0 if steps.frozen[scan] else LOST) or reference is None
         if scans.usable[scan] and (restart or (far and result.matched[scan])):
@@ -209,7 +215,7 @@ def _matched(
     def by(matcher: Matcher, prior: np.ndarray) -> ScanMatch:
         return match(matcher, reference, points, guess, prior, NO_FLOOR, settings)
 
-    least = settings.least_inliers
+    least = _LEAST_INLIERS
     if how.unknown:
         fit = by(FAR, prior)
         sure = _sure(fit, settings)
@@ -232,7 +238,7 @@ def _matched(
 
 def _sure(fit: ScanMatch, settings: Settings) -> bool:
     """Whether a match may be believed without raw odometry: as good as that of a loop."""
-    good = fit.inliers >= settings.loop_inliers and fit.through <= _MAX_THROUGH
+    good = fit.inliers >= LOOP_INLIERS and fit.through <= _MAX_THROUGH
     return good and not fit.ambiguous
 
 

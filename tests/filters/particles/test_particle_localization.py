@@ -358,11 +358,7 @@ BAD = {
     "inside out": ({"box": [[1, 1], [0, 2]]}, "a box of"),
     "threshold": ({"threshold": 1.5}, "threshold from 0 to 1"),
     "gate": ({"gate": 0.0}, "gate above 0"),
-    "bins": ({"bins": (0.5, 0.0, 0.1)}, "three sizes above 0"),
-    "error": ({"error": 0.0}, "error above 0"),
-    "confidence": ({"confidence": 1.0}, "confidence between 0 and 1"),
     "forget": ({"forget": (0.2, 0.1)}, "0 < slow <= fast <= 1"),
-    "slack": ({"slack": 0.0}, "slack above 0"),
     "resample": ({"resample": "systematic"}, "resample to be a function"),
 }
 
