@@ -21,8 +21,7 @@ from jaxslam.core.record import record, static
 from jaxslam.filters.ekf.ekf_slam import EkfSlam
 from jaxslam.filters.ekf.observability import Monitored
 from jaxslam.filters.ekf.settings import EkfOptions
-from jaxslam.filters.information.eif_slam import EifSlam
-from jaxslam.filters.information.in_pieces import InPieces
+from jaxslam.filters.information.eif_slam import EifSlam, InPieces
 from jaxslam.filters.information.seif import Seif
 from jaxslam.filters.known.dead_reckoning import DeadReckoning
 from jaxslam.filters.known.localization import Localization

@@ -3,10 +3,9 @@
 from jaxslam.laser_slam.odometry.pieces import MatchMotion, laser_odometry, match_controls
 from jaxslam.laser_slam.odometry.raw import Steps, steps_of
 from jaxslam.laser_slam.odometry.tracking import Odometry
-from jaxslam.laser_slam.records import LoopOutcome, Loops, ScanLog, Solved
+from jaxslam.laser_slam.records import LoopOutcome, Loops, ScanLog, Settings, Solved
 from jaxslam.laser_slam.scans import Scans, scans_of
 from jaxslam.laser_slam.score import ClosureScore, closure_score, relation_covs, relation_nees
-from jaxslam.laser_slam.settings import Settings
 from jaxslam.laser_slam.solve import solve
 
 __all__ = [

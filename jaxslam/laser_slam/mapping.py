@@ -8,9 +8,8 @@ from jaxtyping import Bool, Float, Int
 
 from jaxslam import grids
 from jaxslam.grids import Counts, Grid
-from jaxslam.laser_slam.records import LogOfScans
+from jaxslam.laser_slam.records import LogOfScans, Settings
 from jaxslam.laser_slam.scans import ROWS, WIDTH, met_something
-from jaxslam.laser_slam.settings import Settings
 from jaxslam.math import numpy_poses as poses
 from jaxslam.types import Beams
 

@@ -6,8 +6,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.laser_slam.records import LogOfScans
-from jaxslam.laser_slam.settings import Settings
+from jaxslam.laser_slam.records import LogOfScans, Settings
 from jaxslam.matching import Points
 from jaxslam.matching.surface import Surface, surface
 from jaxslam.types import Beams

@@ -14,9 +14,8 @@ from jaxslam.laser_slam.mapping import frame_of, map_of
 from jaxslam.laser_slam.odometry.pieces import laser_odometry
 from jaxslam.laser_slam.odometry.raw import Steps, steps_of
 from jaxslam.laser_slam.odometry.tracking import Odometry
-from jaxslam.laser_slam.records import LogOfScans, LoopOutcome, Loops, Solved
+from jaxslam.laser_slam.records import LogOfScans, LoopOutcome, Loops, Settings, Solved
 from jaxslam.laser_slam.scans import check_laser_log, scans_of
-from jaxslam.laser_slam.settings import Settings
 from jaxslam.math import numpy_poses as poses
 from jaxslam.math.arrays import float64
 

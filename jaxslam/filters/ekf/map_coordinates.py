@@ -17,7 +17,7 @@ from jaxslam.math import linalg
 from jaxslam.math.arrays import Landmark, Measurement, Point, Pose
 from jaxslam.math.xla import where_any
 from jaxslam.protocols import Chart, Sensor
-from jaxslam.sensors.wrapped import Wrapped
+from jaxslam.sensors.suite import Wrapped
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate
 

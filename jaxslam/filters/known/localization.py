@@ -41,8 +41,7 @@ from jaxslam.protocols import (
     Prediction,
     Sensor,
 )
-from jaxslam.sensors.suite import Suite
-from jaxslam.sensors.wrapped import Wrapped
+from jaxslam.sensors.suite import Suite, Wrapped
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Info, Scan
 

@@ -11,8 +11,13 @@ from jaxslam.core.numbers import is_concrete
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.solver.model import factors_of
-from jaxslam.graphs.sparse.cholesky import CholeskyTables, block_count, cholesky_tables
-from jaxslam.graphs.sparse.inverse import InverseTables, inverse_tables
+from jaxslam.graphs.sparse.cholesky import (
+    CholeskyTables,
+    InverseTables,
+    block_count,
+    cholesky_tables,
+    inverse_tables,
+)
 from jaxslam.graphs.sparse.sweeps import Stages, index_table, stages
 from jaxslam.graphs.sparse.symbolic import factor_pattern
 

@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.laser_slam.settings import Settings
+from jaxslam.laser_slam.records import Settings
 from jaxslam.math import numpy_poses as poses
 
 RINGS, SECTORS = 12, 60

@@ -34,9 +34,8 @@ from jaxslam.laser_slam.loops.candidates import (
 from jaxslam.laser_slam.loops.pairwise import clique, consistent
 from jaxslam.laser_slam.odometry.reference import Reference, match, reference_of, search, taken
 from jaxslam.laser_slam.odometry.tracking import LOOP_INLIERS, Odometry
-from jaxslam.laser_slam.records import LoopOutcome, Loops
+from jaxslam.laser_slam.records import LoopOutcome, Loops, Settings
 from jaxslam.laser_slam.scans import ROWS, Scans
-from jaxslam.laser_slam.settings import Settings
 from jaxslam.math.stats import chi2_quantile
 
 

@@ -24,9 +24,8 @@ from jaxslam.laser_slam.odometry.tracking import (
     place_unmatched,
     tracked,
 )
-from jaxslam.laser_slam.records import Solved
+from jaxslam.laser_slam.records import Settings, Solved
 from jaxslam.laser_slam.scans import Scans
-from jaxslam.laser_slam.settings import Settings
 from jaxslam.math import numpy_poses as poses
 from jaxslam.math import se2
 from jaxslam.math.arrays import Control, Pose, ProcessNoise, ProcessNoiseCov

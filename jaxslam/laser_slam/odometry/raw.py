@@ -5,7 +5,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-from jaxslam.laser_slam.settings import Settings
+from jaxslam.laser_slam.records import Settings
 from jaxslam.math import numpy_poses as poses
 
 FARTHEST = (3.0, float(np.deg2rad(100.0)))

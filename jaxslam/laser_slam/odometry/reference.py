@@ -11,8 +11,8 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from jaxslam.graphs import Cauchy
 from jaxslam.laser_slam import covariances
+from jaxslam.laser_slam.records import Settings
 from jaxslam.laser_slam.scans import Scans
-from jaxslam.laser_slam.settings import Settings
 from jaxslam.matching import (
     Correlative,
     IcpSettings,

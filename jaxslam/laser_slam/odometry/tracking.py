@@ -16,8 +16,8 @@ from jaxslam.laser_slam.odometry.reference import (
     search,
     taken,
 )
+from jaxslam.laser_slam.records import Settings
 from jaxslam.laser_slam.scans import Scans
-from jaxslam.laser_slam.settings import Settings
 from jaxslam.matching import Matcher, Points
 from jaxslam.math import numpy_poses as poses
 
