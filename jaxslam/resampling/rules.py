@@ -105,7 +105,7 @@ class Soft:
     **Biased**: expectations are correct, but the draws from q depend on the parameters too, and
     the gradient ignores this. share = 1 is plain resampling, whose copies all have weight 1/P and
     pass no gradient; share = 0 has an unbiased gradient, and does not resample by weight.
-    `stop_gradient` is unbiased for any method.
+    `StopGradient` is unbiased for any method.
 
     Raises ValueError on a share outside [0, 1].
     """

@@ -120,7 +120,7 @@ def deactivate(
 ) -> SparseState:
     """The state with at most `most` active landmarks without robot links made passive.
 
-    Their links to active landmarks go to the lists; a full list drops one (`link_lists`).
+    Their links to active landmarks go to the lists; a full list drops one (`enter_link`).
     """
     n, count = state.alive.shape[0], leaving.shape[0]
     omega = state.omega

@@ -50,7 +50,7 @@ class Seif(InformationFilter):
     2. sparsification (`sparsification.sparsify`): the least recently measured active landmarks
        lose their links to the robot, as many as the scan needs indices for;
     3. measurement update and new landmarks (`canonical`);
-    4. mean recovery (`mean_recovery`), one block at a time: the block of robot and active
+    4. mean recovery (`marginals`), one block at a time: the block of robot and active
        landmarks, and `passive` landmarks in rotation.
 
     The sources sparsify last, after measurement and mean. Here sparsification comes before the

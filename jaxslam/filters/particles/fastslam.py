@@ -52,7 +52,7 @@ _T = TypeVar("_T")
 class FastSlam(Filter):
     """FastSLAM: weighted particles for the posterior of the path, and for each path independent
     landmark Gaussians (exact except for linearization). The state is a
-    `slam_state.SlamParticles`.
+    `SlamParticles`.
 
     "motion", FastSLAM 1.0 (Montemerlo, Thrun, Koller & Wegbreit 2002, "FastSLAM: A factored
     solution to the simultaneous localization and mapping problem"): poses are drawn from the motion
@@ -75,7 +75,7 @@ class FastSlam(Filter):
     Σ_p w_p E_{N_p} d²_p, while that of the most likely particle is biased low by selection. Its
     log_likelihood is that of the scan given all before, log Σ w p(scan | particle), of the
     measurements that a particle has landmarks for. `info.extra["particles"]` is a `ParticleInfo`.
-    Estimates: `moments.slam_estimate`.
+    Estimates: `slam_estimate`.
 
     Raises ValueError on a capacity, particles or births below 1, a threshold outside [0, 1], a gate
     not above 0, an unknown proposal, a life that is none, a resample that is no function, or a

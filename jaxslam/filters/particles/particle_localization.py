@@ -48,8 +48,8 @@ class ParticleLocalization(MonteCarloFilter):
     without a measurement change nothing.
 
     The estimate is that of the weighted particles after a scan, before resampling:
-    `moments.weighted_pose_moments`, a single mean and covariance even if the particles form several
-    modes. Where all weights underflow, all in use become equal (`underflow`). A motion
+    `weighted_pose_moments`, a single mean and covariance even if the particles form several modes.
+    Where all weights underflow, all in use become equal (`underflow`). A motion
     that leaves a non-finite pose is undone, and the particle gets weight zero (`invalid`).
     The measurements in an `Info` are those of the most likely particle, and nis is the mean over
     the particles by weight, as of `FastSlam`; log_likelihood is log Σ w p(scan | x) of measurements
