@@ -30,7 +30,7 @@ from jaxslam.graphs.solver.kernels import (
     Kernel,
     Truncated,
 )
-from jaxslam.graphs.solver.plan import Plan, plan
+from jaxslam.graphs.solver.plans import Plan, plan
 from jaxslam.graphs.solver.search import Ending, Solution
 from jaxslam.graphs.validation import check_graph, with_gauge
 

@@ -24,7 +24,7 @@ from jaxslam.graphs.solver.batch import (
 )
 from jaxslam.graphs.solver.linearized import data_of, linearize, variables_of
 from jaxslam.graphs.solver.model import Model, model_of
-from jaxslam.graphs.solver.plan import Plan, checked_pairs, plan_for
+from jaxslam.graphs.solver.plans import Plan, checked_pairs, plan_for
 from jaxslam.graphs.solver.search import Solution
 from jaxslam.graphs.sparse.cholesky import by, by_transposed, factorize, selected_inverse
 from jaxslam.graphs.sparse.sweeps import padded_size

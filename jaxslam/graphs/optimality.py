@@ -25,7 +25,7 @@ from jaxslam.graphs.solver.linearized import (
     variables_of,
 )
 from jaxslam.graphs.solver.model import Model, model_of
-from jaxslam.graphs.solver.plan import Plan, plan_for
+from jaxslam.graphs.solver.plans import Plan, plan_for
 from jaxslam.graphs.solver.search import minimize
 from jaxslam.graphs.sparse.cholesky import factorize, substitute
 from jaxslam.graphs.sparse.sweeps import summed

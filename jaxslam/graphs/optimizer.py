@@ -34,7 +34,7 @@ from jaxslam.graphs.solver.linearized import (
     variables_of,
 )
 from jaxslam.graphs.solver.model import Model, factors_of, model_of
-from jaxslam.graphs.solver.plan import Plan, plan_for
+from jaxslam.graphs.solver.plans import Plan, plan_for
 from jaxslam.graphs.solver.search import Solution, minimize
 from jaxslam.graphs.sparse.cholesky import factorize, substitute
 from jaxslam.graphs.validation import check_graph

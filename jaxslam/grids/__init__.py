@@ -8,7 +8,6 @@ from jaxslam.grids.beam_models import (
     fit,
     log_likelihood,
 )
-from jaxslam.grids.cast import RayMap, cast, ray_map
 from jaxslam.grids.distance import distance_field, gradient
 from jaxslam.grids.grid import (
     Field,
@@ -23,6 +22,7 @@ from jaxslam.grids.grid import (
 from jaxslam.grids.localization import GridLocalization, beam_log
 from jaxslam.grids.mapping import Counts, count, entropy, occupancy, reflection
 from jaxslam.grids.pose_clusters import Clusters, clusters
+from jaxslam.grids.rays import RayMap, cast, ray_map
 from jaxslam.grids.resampling import correlation, crop, resample
 
 __all__ = [

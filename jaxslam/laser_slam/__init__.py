@@ -6,7 +6,7 @@ from jaxslam.laser_slam.odometry.tracking import Odometry
 from jaxslam.laser_slam.records import LoopOutcome, Loops, ScanLog, Settings, Solved
 from jaxslam.laser_slam.scans import Scans, scans_of
 from jaxslam.laser_slam.score import ClosureScore, closure_score, relation_covs, relation_nees
-from jaxslam.laser_slam.solve import solve
+from jaxslam.laser_slam.solver import solve
 
 __all__ = [
     "ClosureScore",

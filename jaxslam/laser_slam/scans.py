@@ -8,7 +8,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.laser_slam.records import LogOfScans, Settings
 from jaxslam.matching import Points
-from jaxslam.matching.surface import Surface, surface
+from jaxslam.matching.surfaces import Surface, surface
 from jaxslam.types import Beams
 
 GAP = 0.5

@@ -14,7 +14,7 @@ from jaxslam.laser_slam import covariances
 from jaxslam.laser_slam.assembly import ROOM, relative_covs
 from jaxslam.laser_slam.records import LoopOutcome, Loops, Solved
 from jaxslam.math import numpy_poses as poses
-from jaxslam.metrics.relations import Relations
+from jaxslam.metrics.relative import Relations
 
 TOGETHER = 512
 """Pairs of keyframes whose marginals are computed at once. A pair adds a block to the Cholesky

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam.matching.points import Prior
+from jaxslam.matching.point_sets import Prior
 from jaxslam.math import linalg
 
 _NEWTON = 12

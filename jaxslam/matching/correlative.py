@@ -19,8 +19,8 @@ from jaxslam.grids.grid import Field, Grid, interpolate, to_cells
 from jaxslam.matching.field import field_cost
 from jaxslam.matching.matcher import Match, Matcher
 from jaxslam.matching.outcome import Limits, concluded, length_of
-from jaxslam.matching.points import Points, Prior, prior_cost
-from jaxslam.matching.surface import surface, surface_information
+from jaxslam.matching.point_sets import Points, Prior, prior_cost
+from jaxslam.matching.surfaces import surface, surface_information
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
 from jaxslam.math.arrays import Number, in_dtype

@@ -21,8 +21,8 @@ from jaxslam.matching.outcome import (
     information_of,
     length_of,
 )
-from jaxslam.matching.points import Points, Prior, prior_cost, prior_terms
-from jaxslam.matching.surface import surface, surface_information, weights
+from jaxslam.matching.point_sets import Points, Prior, prior_cost, prior_terms
+from jaxslam.matching.surfaces import surface, surface_information, weights
 from jaxslam.math import linalg, se2
 from jaxslam.math.angles import wrap
 from jaxslam.math.arrays import Number, in_dtype

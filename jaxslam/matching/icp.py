@@ -30,8 +30,8 @@ from jaxslam.matching.outcome import (
     information_along,
     length_of,
 )
-from jaxslam.matching.points import Points, Prior, prior_cost, prior_terms
-from jaxslam.matching.surface import GAP, SPAN, Surface, nearest_points, surface, weights
+from jaxslam.matching.point_sets import Points, Prior, prior_cost, prior_terms
+from jaxslam.matching.surfaces import GAP, SPAN, Surface, nearest_points, surface, weights
 from jaxslam.math import linalg, se2
 from jaxslam.math.angles import wrap
 from jaxslam.math.arrays import Number, in_dtype

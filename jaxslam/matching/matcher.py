@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from jaxslam.core.numbers import is_concrete, shape_told
 from jaxslam.grids.grid import Grid, check_grid
-from jaxslam.matching.points import Points, Prior
+from jaxslam.matching.point_sets import Points, Prior
 from jaxslam.math.arrays import in_dtype
 from jaxslam.protocols import Component
 

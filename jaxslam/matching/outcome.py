@@ -8,7 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxslam.matching.matcher import Match, MatchStatus
-from jaxslam.matching.points import Points, Prior
+from jaxslam.matching.point_sets import Points, Prior
 from jaxslam.math import linalg
 from jaxslam.math.arrays import Number
 

@@ -5,7 +5,7 @@ correlation. On the host, by NumPy in float64.
 
 from jaxslam.grids import correlation
 from jaxslam.metrics.paths import PathErrors, align_map, alignment, ate, carried, map_entropy
-from jaxslam.metrics.relations import (
+from jaxslam.metrics.relative import (
     Errors,
     MeanAndStd,
     Relations,

@@ -2,7 +2,7 @@
 
 from jaxslam.topology.places import Door, PathPlaces, TopologicalMap, path_places, topological_map
 from jaxslam.topology.planning import Route, place_of, place_weights, route
-from jaxslam.topology.skeleton import Skeleton, skeleton
+from jaxslam.topology.voronoi import Skeleton, skeleton
 
 __all__ = [
     "Door",

@@ -14,7 +14,7 @@ from scipy.sparse import csr_matrix
 from scipy.sparse.csgraph import dijkstra
 
 from jaxslam.grids import Grid, centers
-from jaxslam.topology.skeleton import Skeleton, skeleton
+from jaxslam.topology.voronoi import Skeleton, skeleton
 
 _centers = jax.jit(centers, inline=True)
 

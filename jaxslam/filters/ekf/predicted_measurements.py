@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxslam.association.predicted import predicted
+from jaxslam.association.prediction import predicted
 from jaxslam.filters.ekf.map_coordinates import at_slot
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.math import linalg

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
 
-from jaxslam.association.predicted import predicted
+from jaxslam.association.prediction import predicted
 from jaxslam.filters.particles.scan_association import (
     ParticleAssociation,
     gate_distance,

@@ -18,7 +18,7 @@ from jaxslam.graphs.solver.linearized import (
     variables_of,
 )
 from jaxslam.graphs.solver.model import Model
-from jaxslam.graphs.solver.plan import Plan
+from jaxslam.graphs.solver.plans import Plan
 from jaxslam.graphs.sparse.cholesky import factorize, substitute
 
 

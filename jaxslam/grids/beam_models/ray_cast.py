@@ -14,8 +14,8 @@ from jaxtyping import Array, Float, PyTree
 from jaxslam.core.numbers import check_positive, is_concrete
 from jaxslam.core.record import record, static
 from jaxslam.grids.beam_models.beam_model import BeamModel, hold_mount
-from jaxslam.grids.cast import RayMap, cast, check_method, ray_map
 from jaxslam.grids.grid import Grid
+from jaxslam.grids.rays import RayMap, cast, check_method, ray_map
 from jaxslam.math.arrays import Number
 from jaxslam.types import Beams
 

@@ -25,7 +25,7 @@ from jaxslam.matching import (
     raster,
     transformed,
 )
-from jaxslam.matching.surface import Surface, surface_at
+from jaxslam.matching.surfaces import Surface, surface_at
 from jaxslam.math import numpy_poses as poses
 from jaxslam.math import se2
 

@@ -26,8 +26,8 @@ from jaxslam.matching.covariance.record import (
 )
 from jaxslam.matching.matcher import Matcher
 from jaxslam.matching.outcome import information_of
-from jaxslam.matching.points import Points, moved_along_rays
-from jaxslam.matching.surface import GAP, SPAN, surface
+from jaxslam.matching.point_sets import Points, moved_along_rays
+from jaxslam.matching.surfaces import GAP, SPAN, surface
 from jaxslam.math import se2
 from jaxslam.math.arrays import Number
 

@@ -25,7 +25,7 @@ from jaxslam.matching.covariance.record import (
     with_ranges,
 )
 from jaxslam.matching.matcher import Matcher
-from jaxslam.matching.points import Points, moved_along_rays, prior_cost
+from jaxslam.matching.point_sets import Points, moved_along_rays, prior_cost
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
 from jaxslam.math.arrays import Number

@@ -11,7 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.graphs.solver.kernels import Kernel
 from jaxslam.matching.outcome import information_along
-from jaxslam.matching.points import Points
+from jaxslam.matching.point_sets import Points
 from jaxslam.math import se2
 from jaxslam.math.arrays import Number
 
