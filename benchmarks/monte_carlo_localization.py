@@ -25,7 +25,7 @@ import numpy as np
 from benchmarks.gate import Metric, alone
 from jaxslam import run, sensors, simulate
 from jaxslam.filters import Localization, ParticleLocalization
-from jaxslam.filters.particles.states import region
+from jaxslam.filters.particles import pose_particles
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.results.plot.style import HUES, INK, PAGE, TEXT, caption, curve, panels_of, png
 from jaxslam.simulation.scenarios import circle
@@ -50,7 +50,7 @@ def carried(world, key):
 def filters_of(world, particles):
     """Filter, and what it is told of the start, by name."""
     blunt = sensors.RelativePosition(0.5**2 * np.eye(2))
-    anywhere = region.uniform_pose_moments(jnp.asarray(BOX))
+    anywhere = pose_particles.uniform_pose_moments(jnp.asarray(BOX))
     known = jnp.array([0.0, 0.5 / np.deg2rad(1.5), np.pi]), jnp.zeros((3, 3))
     models = world.motion, world.sensor, world.landmarks
     gate = chi2_quantile(0.999, 2)

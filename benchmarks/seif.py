@@ -19,7 +19,7 @@ import numpy as np
 
 from benchmarks.gate import Metric, report
 from jaxslam import datasets, filters
-from jaxslam.filters.information.sparse.marginals import blanket_marginals, whole_marginals
+from jaxslam.filters.information.marginals import blanket_marginals, whole_marginals
 from jaxslam.math.gaussians import mahalanobis_squared
 from jaxslam.simulation.scenarios import circle, cloister
 from jaxslam.simulation.scenarios.view import BetweenRanges

@@ -3,33 +3,32 @@ them with.
 
 A variant is a chart, a linearizer or an option, given in one line; `monte_carlo` and the command
 line run them side by side.
+
+Looked up by name; the error of an unknown one has suggestions for typos.
 """
 
-from collections.abc import Callable
+import difflib
+from collections.abc import Callable, Iterable
 from dataclasses import replace
-from typing import Any, Literal, Unpack
+from typing import Any, Literal, NoReturn, TypeVar, Unpack
 
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxslam.charts.left_invariant import LeftInvariant
-from jaxslam.charts.right_invariant import RightInvariant
+from jaxslam.charts import LeftInvariant, RightInvariant
 from jaxslam.core.record import record, static
 from jaxslam.filters.ekf.ekf_slam import EkfSlam
 from jaxslam.filters.ekf.observability import Monitored
 from jaxslam.filters.ekf.settings import EkfOptions
-from jaxslam.filters.information.eif_slam import EifSlam
-from jaxslam.filters.information.in_pieces import InPieces
+from jaxslam.filters.information.eif_slam import EifSlam, InPieces
 from jaxslam.filters.information.seif import Seif
 from jaxslam.filters.known.dead_reckoning import DeadReckoning
 from jaxslam.filters.known.localization import Localization
 from jaxslam.filters.known.mapping import Mapping
 from jaxslam.filters.particles.fastslam import FastSlam
 from jaxslam.filters.particles.particle_localization import ParticleLocalization
-from jaxslam.linearize.at_truth import AtTruth
-from jaxslam.linearize.first_estimate import FirstEstimate
-from jaxslam.linearize.observability import Observability
+from jaxslam.linearize.other_points import AtTruth, FirstEstimate, Observability
 from jaxslam.linearize.unscented import Unscented
 from jaxslam.protocols import Candidate, Estimator, Filter
 from jaxslam.run import run
@@ -37,7 +36,30 @@ from jaxslam.simulation.worlds import World
 from jaxslam.smoothing.batch_map import BatchMap
 from jaxslam.smoothing.fixed_lag import FixedLag
 from jaxslam.types import Truth
-from jaxslam.validation.names import Named
+
+_V = TypeVar("_V")
+
+
+class _UnknownName(KeyError):
+    """A name that is none of those known."""
+
+    def __str__(self) -> str:
+        return str(self.args[0])  # a KeyError shows it in quotes
+
+
+class Named(dict[str, _V]):
+    """A dict whose lookup error lists the known names and the closest match."""
+
+    def __missing__(self, name: object) -> NoReturn:
+        """Refuse a name."""
+        known = ", ".join(self)
+        raise _UnknownName(f"expected one of {known}, got {name!r}{meant(name, self)}")
+
+
+def meant(name: object, known: Iterable[str]) -> str:
+    """The closest of the known names, as a question in brackets; else nothing."""
+    alike = difflib.get_close_matches(str(name), known, 1)
+    return "".join(f" (did you mean {each}?)" for each in alike)
 
 
 def variant(scenario: World, *, watch: bool = False, **options: Unpack[EkfOptions]) -> Filter:
@@ -97,7 +119,7 @@ class _OnTheTruePath:
         )
 
 
-def without_measurements(scenario: World, **options: Unpack[EkfOptions]) -> Filter:
+def _without_measurements(scenario: World, **options: Unpack[EkfOptions]) -> Filter:
     """Dead reckoning in a scenario; it has none of the options of `EkfSlam`."""
     return DeadReckoning(scenario.motion, scenario.sensor)
 
@@ -112,7 +134,7 @@ _OF_MAPS = "gate", "associate", "births"
 """The options of filters that start landmarks, beside those of `EkfSlam` alone."""
 
 
-def in_a_known_map(scenario: World, **options: Unpack[EkfOptions]) -> Callable[[Truth], Filter]:
+def _in_a_known_map(scenario: World, **options: Unpack[EkfOptions]) -> Callable[[Truth], Filter]:
     """Localization in the true map, with those options of `EkfSlam` that it has."""
     mine = _options(scenario, options, "correction", "gate", "iterations")
     return _InTheTrueMap(Localization(scenario.motion, scenario.sensor, scenario.landmarks, **mine))
@@ -124,14 +146,14 @@ def on_given_poses(scenario: World, **options: Unpack[EkfOptions]) -> Filter:
     return Mapping(scenario.sensor, _capacity(scenario), **mine)
 
 
-def on_the_true_path(
+def _on_the_true_path(
     scenario: World, **options: Unpack[EkfOptions]
 ) -> Callable[[Truth], Estimator]:
     """Mapping from the true path; options as above. Its pose has no NEES: it is exact."""
     return _OnTheTruePath(on_given_poses(scenario, **options), np.asarray(scenario.pose))
 
 
-def by_particles(
+def _by_particles(
     scenario: World, proposal: Literal["motion", "measurement"], **options: Unpack[EkfOptions]
 ) -> Filter:
     """FastSLAM of 50 particles, with those options of `EkfSlam` that it has."""
@@ -139,17 +161,17 @@ def by_particles(
         scenario.motion,
         scenario.sensor,
         _capacity(scenario),
-        SLAM_PARTICLES,
+        _SLAM_PARTICLES,
         proposal=proposal,
         **_options(scenario, options, *_OF_MAPS),
     )
 
 
-def by_particles_in_a_known_map(
+def _by_particles_in_a_known_map(
     scenario: World, **options: Unpack[EkfOptions]
 ) -> Callable[[Truth], Filter]:
     """Monte-Carlo localization in the true map, of 300 particles; options as above."""
-    count, mine = LOCALIZATION_PARTICLES, _options(scenario, options, "gate", "associate")
+    count, mine = _LOCALIZATION_PARTICLES, _options(scenario, options, "gate", "associate")
     return _InTheTrueMap(
         ParticleLocalization(
             scenario.motion,
@@ -163,7 +185,7 @@ def by_particles_in_a_known_map(
     )
 
 
-def in_a_window(
+def _in_a_window(
     scenario: World, *, first_estimates: bool = False, **options: Unpack[EkfOptions]
 ) -> Filter:
     """The fixed-lag smoother of 5 steps, with those options of `EkfSlam` that it has."""
@@ -180,7 +202,7 @@ def in_a_window(
     )
 
 
-def in_one_batch(scenario: World, **options: Unpack[EkfOptions]) -> BatchMap:
+def _in_one_batch(scenario: World, **options: Unpack[EkfOptions]) -> BatchMap:
     """The graph of the whole log (`smoothing.BatchMap`), with those options of `EkfSlam` that it
     has."""
     start = np.asarray(scenario.pose), np.asarray(scenario.pose_cov)
@@ -191,20 +213,20 @@ def in_one_batch(scenario: World, **options: Unpack[EkfOptions]) -> BatchMap:
 WINDOW = 5
 """motions and scans in the window of the fixed-lag smoother in the catalog"""
 
-SLAM_PARTICLES = 50
+_SLAM_PARTICLES = 50
 """number of particles of FastSLAM in the catalog; small, for campaigns of all filters."""
 
-LOCALIZATION_PARTICLES = 300
+_LOCALIZATION_PARTICLES = 300
 """of Monte-Carlo localization in the catalog, at every step"""
 
 
-def in_canonical_form(scenario: World, **options: Unpack[EkfOptions]) -> Filter:
+def _in_canonical_form(scenario: World, **options: Unpack[EkfOptions]) -> Filter:
     """The exact information filter in a scenario; of the options of `EkfSlam` it takes the gate."""
     mine = _options(scenario, options, "gate")
     return EifSlam(scenario.motion, scenario.sensor, _capacity(scenario), **mine)
 
 
-def sparse_in_canonical_form(scenario: World, **options: Unpack[EkfOptions]) -> Filter:
+def _sparse_in_canonical_form(scenario: World, **options: Unpack[EkfOptions]) -> Filter:
     """The sparse information filter in a scenario; of the options of `EkfSlam` it takes the gate.
 
     It has half the map active, 8 landmarks at least and 20 at most, and all links. It reports
@@ -257,9 +279,9 @@ returns what `monte_carlo` runs on it."""
 
 BASELINES: Named[Callable[..., Candidate]] = Named(
     {
-        "dead_reckoning": without_measurements,
-        "localization": in_a_known_map,
-        "mapping": on_the_true_path,
+        "dead_reckoning": _without_measurements,
+        "localization": _in_a_known_map,
+        "mapping": _on_the_true_path,
     }
 )
 """The worst and the best cases of a SLAM filter: no measurements, a known map, and a known path; as
@@ -267,23 +289,23 @@ FILTERS."""
 
 PARTICLES: Named[Callable[..., Candidate]] = Named(
     {
-        "fastslam1": lambda world, **more: by_particles(world, "motion", **more),
-        "fastslam2": lambda world, **more: by_particles(world, "measurement", **more),
-        "particle_localization": by_particles_in_a_known_map,
+        "fastslam1": lambda world, **more: _by_particles(world, "motion", **more),
+        "fastslam2": lambda world, **more: _by_particles(world, "measurement", **more),
+        "particle_localization": _by_particles_in_a_known_map,
     }
 )
 """The particle filters; as FILTERS."""
 
 CANONICAL: Named[Callable[..., Candidate]] = Named(
-    {"eif_slam": in_canonical_form, "seif": sparse_in_canonical_form}
+    {"eif_slam": _in_canonical_form, "seif": _sparse_in_canonical_form}
 )
 """The information filters, exact and sparse; as FILTERS."""
 
 SMOOTHERS: Named[Callable[..., Candidate]] = Named(
     {
-        "fixed_lag": in_a_window,
-        "fixed_lag_fej": lambda world, **more: in_a_window(world, first_estimates=True, **more),
-        "batch_map": in_one_batch,
+        "fixed_lag": _in_a_window,
+        "fixed_lag_fej": lambda world, **more: _in_a_window(world, first_estimates=True, **more),
+        "batch_map": _in_one_batch,
     }
 )
 """The fixed-lag smoothers, and the batch solution of the whole log; as FILTERS."""

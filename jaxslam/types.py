@@ -224,7 +224,7 @@ class Info(NamedTuple):
     """the search for the best association ended at its budget; None where there is no search"""
     extra: dict[str, PyTree] | None = None
     """records of one family or wrapper of filters alone, by name, as
-    "particles" for a `filters.particles.states.particle_info.ParticleInfo`."""
+    "particles" for a `filters.ParticleInfo`."""
 
     @property
     def overflow(self) -> jax.Array:

@@ -28,14 +28,14 @@ ROOF = len(FLOORS)  # jaxslam/__init__.py sees everything, and nothing sees it
 # `campaign.save(folder)` are where a user looks for them, and results are drawn and written above;
 # so are `graphs.read(path)` and `grids.read_map(path)`, and files are read above.
 WITHIN_CALLS = {
-    "graphs.files": "datasets",
-    "grids.files": "datasets",
+    "graphs.graph": "datasets",
+    "grids.grid": "datasets",
     "monte_carlo.record": "results",
 }
 
 # What only these modules may touch.
 KEPT = {
-    "matplotlib": {"results.plot", "datasets.formats.images"},
+    "matplotlib": {"results.plot", "datasets.ros_map"},
     "argparse": {"cli"},
     "jax.config": {"cli", "__main__", "verify"},  # verify: float64 within a block, then as before
 }

@@ -14,9 +14,9 @@ import numpy as np
 from benchmarks.speed.timing import together
 from jaxslam import association, life, run
 from jaxslam.filters import EkfSlam
+from jaxslam.filters.ekf.predicted_measurements import prediction_of
 from jaxslam.filters.ekf.settings import EkfSettings
-from jaxslam.filters.ekf.steps.predicted_measurements import prediction_of
-from jaxslam.filters.ekf.steps.sequential_update import correct_in_turn
+from jaxslam.filters.ekf.update import correct_in_turn
 from jaxslam.filters.map_management.merging import Merging
 from jaxslam.simulation.scenarios import cloister
 from jaxslam.slots import Joint

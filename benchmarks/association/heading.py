@@ -12,8 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam import association
+from jaxslam.filters.ekf.predicted_measurements import prediction_of
 from jaxslam.filters.ekf.settings import EkfSettings
-from jaxslam.filters.ekf.steps.predicted_measurements import prediction_of
 from jaxslam.math.angles import wrap
 from jaxslam.math.linalg import root_psd
 from jaxslam.math.stats import chi2_quantile

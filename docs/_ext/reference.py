@@ -1,7 +1,8 @@
 """Sphinx extension: writes the pages of the API reference from the package.
 
-A name is public if neither it nor its module begins with an underscore. It is shown under the
-shortest path that reaches it: the package that lists it in `__all__`, else its own module.
+A name is public if a package lists it in `__all__`, or if its module stands directly below
+`jaxslam` or is one of `OPEN`; and if neither it nor its module begins with an underscore. It is
+shown under the shortest path that reaches it: the package that lists it, else its own module.
 """
 
 import ast
@@ -55,6 +56,33 @@ INTRODUCED = {
 """Title of each page, in the order of the contents; a module that is not listed comes after."""
 
 
+OPEN = {
+    "jaxslam.consistency.nees",
+    "jaxslam.core.numbers",
+    "jaxslam.core.record",
+    "jaxslam.datasets.evaluation",
+    "jaxslam.filters.information.canonical",
+    "jaxslam.filters.map_management.relocalization",
+    "jaxslam.filters.reporting",
+    "jaxslam.linearize.first_order",
+    "jaxslam.logs.streams",
+    "jaxslam.logs.tables",
+    "jaxslam.math.angles",
+    "jaxslam.math.gaussians",
+    "jaxslam.math.se2",
+    "jaxslam.math.stats",
+    "jaxslam.math.uncertain_poses",
+    "jaxslam.results.plot.style",
+    "jaxslam.results.report",
+    "jaxslam.results.store",
+    "jaxslam.simulation.laser",
+    "jaxslam.simulation.scenarios.lines",
+    "jaxslam.simulation.walls",
+    "jaxslam.simulation.worlds",
+}
+"""Modules within packages whose names a user's own filter, sensor, world or figure may call."""
+
+
 class Name(NamedTuple):
     """A public name under the path that a reader uses."""
 
@@ -77,8 +105,8 @@ def modules() -> list[ModuleType]:
 
 
 def public_names() -> dict[str, list[Name]]:
-    """The public names of each module; a name stands once."""
-    walked = modules()
+    """The public names of each module that has some; a name stands once."""
+    walked = [m for m in modules() if hasattr(m, "__all__") or is_open(m.__name__)]
     listed: dict[tuple[int, str], Name] = {}
     pages: dict[str, list[Name]] = {module.__name__: [] for module in walked}
     for module in walked:
@@ -98,6 +126,11 @@ def public_names() -> dict[str, list[Name]]:
             if own and not foreign:
                 pages[module.__name__].append(Name(module.__name__, name, kind))
     return pages
+
+
+def is_open(module: str) -> bool:
+    """Whether the names of a module are public that no package lists."""
+    return module.count(".") < 2 or module in OPEN
 
 
 def key_of(name: str, value: Any) -> tuple[int, str]:
@@ -170,7 +203,7 @@ def section(module: str, names: list[Name], top: bool) -> str:
 
 
 def hidden(module: str) -> bool:
-    """Whether the package has a function of the module's name, as `jaxslam.charts.euclidean` is."""
+    """Whether the package has a function of the module's name, as `jaxslam.run` is."""
     package, _, name = module.rpartition(".")
     return bool(package) and not inspect.ismodule(getattr(importlib.import_module(package), name))
 

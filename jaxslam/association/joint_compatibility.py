@@ -8,7 +8,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.association.gates import check_gates, far_from_all
+from jaxslam.association.rules import check_gates, far_from_all
 from jaxslam.core.numbers import check_count
 from jaxslam.core.record import record, static
 from jaxslam.math import linalg

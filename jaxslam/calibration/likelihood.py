@@ -1,4 +1,7 @@
-"""Noises fitted to a log by maximum likelihood, with the likelihood that a filter computes."""
+"""Noises fitted to a log by maximum likelihood, with the likelihood that a filter computes.
+
+Their standard errors and limits are from the observed information.
+"""
 
 from collections.abc import Callable, Sequence
 from functools import partial
@@ -10,17 +13,93 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 from numpy.typing import ArrayLike
 
-from jaxslam.calibration.errors import (
-    BOUND,
-    LikelihoodPoint,
-    newton_step,
-    observed_information,
-    standard_errors,
-    upper_limit,
-)
 from jaxslam.core.numbers import check_count
 from jaxslam.core.record import as_record
 from jaxslam.types import Info, Log, Status
+
+BOUND = 1.35
+"""By how much log L falls at the 95 % upper limit of a parameter whose estimate is 0: half the 0.90
+quantile of χ² with one degree of freedom, since half of the estimates are 0 where the truth is."""
+
+_CONFOUNDED = 0.9
+"""Correlation of two estimates above which they are named together."""
+
+
+class _LikelihoodPoint(NamedTuple):
+    """The likelihood at one set of parameters, by the coordinates q."""
+
+    q: np.ndarray
+    value: float
+    gradient: np.ndarray
+    spread: np.ndarray
+    """Σ g gᵀ over the rows"""
+    nis: float
+    dof: int
+
+
+def _newton_step(observed: np.ndarray, gradient: np.ndarray) -> tuple[np.ndarray, float]:
+    """Newton's step, in each direction at most 1, and the gain of log L that it promises.
+
+    Where log L is convex the step goes uphill by as much as it would where it is concave.
+    """
+    values, vectors = np.linalg.eigh(observed)
+    along = vectors.T @ gradient
+    step = np.clip(along / np.maximum(np.abs(values), 1e-300), -1.0, 1.0)
+    return vectors @ step, float(np.abs(along * step).sum() / 2)
+
+
+def _observed_information(
+    at: Callable[[np.ndarray], _LikelihoodPoint], here: _LikelihoodPoint, logged: np.ndarray
+) -> Float[np.ndarray, "P P"]:
+    """The observed information -∂²log L/∂q², from differences of the gradient over part of a σ."""
+    rows = []
+    for i, scale in enumerate(np.diag(here.spread)):
+        h = 0.05 / np.sqrt(scale) if scale > 0 else 1e-3
+        move = (min(h, 0.01) if logged[i] else h) * np.eye(len(here.q))[i]
+        slopes = [at(here.q + sign * move).gradient for sign in (-1, 1)]
+        rows.append((slopes[0] - slopes[1]) / (2 * move[i]))
+    found: np.ndarray = np.array(rows)
+    return np.asarray((found + found.T) / 2)
+
+
+def _upper_limit(
+    at: Callable[[np.ndarray], _LikelihoodPoint], here: _LikelihoodPoint, i: int
+) -> float:
+    """The deviation, above that of parameter i, at which log L is lower by `BOUND`; to 2 %."""
+    unit, low, high = np.eye(len(here.q))[i], 0.0, np.log(2.0)
+    while at(here.q + high * unit).value > here.value - BOUND and high < 20:
+        low, high = high, high + np.log(2.0)
+    for _ in range(5):
+        middle = (low + high) / 2
+        inside = at(here.q + middle * unit).value > here.value - BOUND
+        low, high = (middle, high) if inside else (low, middle)
+    return float(np.exp(here.q[i] + (low + high) / 2))
+
+
+def _standard_errors(
+    observed: np.ndarray, spread: np.ndarray
+) -> tuple[np.ndarray, np.ndarray, list[list[int]]]:
+    """The inverse of the observed information, robust errors, and confounded parameters of each.
+
+    A parameter that has part in a direction without information has no error, and the others have
+    that which they have when it is known.
+    """
+    scale = np.sqrt(np.maximum(np.diag(observed), 0.0))
+    unit = np.where(scale > 0, scale, 1.0)
+    values, vectors = np.linalg.eigh(observed / np.outer(unit, unit))
+    part = np.abs(vectors[:, values < 1e-6]) > 0.3
+    lost = (scale == 0) | part.any(axis=1)
+    keep = np.ix_(~lost, ~lost)
+    inverse = np.linalg.inv(observed[keep])
+    error = np.sqrt(np.diag(inverse))
+    cov, robust = np.diag(np.where(lost, np.inf, 0.0)), np.where(lost, np.inf, 0.0)
+    cov[keep] = inverse
+    robust[~lost] = np.sqrt(np.diag(inverse @ spread[keep] @ inverse))
+    related = part.astype(int) @ part.T > 0
+    related[keep] = np.abs(inverse / np.outer(error, error)) > _CONFOUNDED
+    np.fill_diagonal(related, False)
+    return cov, robust, [list(np.flatnonzero(row)) for row in related]
+
 
 LOOSE = 1.0
 """Standard error of log σ above which a log does not determine σ: a factor e either way."""
@@ -106,12 +185,12 @@ def fit_noise(
 
     of_run = as_record(info)
 
-    def tried(q: np.ndarray) -> LikelihoodPoint:
+    def tried(q: np.ndarray) -> _LikelihoodPoint:
         found = jax.device_get(_evaluate(of_run, q, logged, data))
         value, gradient, spread, nis, dof = (np.asarray(part, np.float64) for part in found)
-        return LikelihoodPoint(q, float(value), gradient, spread, float(nis), int(dof))
+        return _LikelihoodPoint(q, float(value), gradient, spread, float(nis), int(dof))
 
-    def at(q: np.ndarray) -> LikelihoodPoint:
+    def at(q: np.ndarray) -> _LikelihoodPoint:
         point = tried(q)
         _check_point(point, logged)
         return point
@@ -139,9 +218,9 @@ def fit_noise(
         options={"gtol": scale * tolerance, "maxiter": iterations},
     )
     here = at(np.asarray(found.x))
-    observed = observed_information(at, here, logged)
+    observed = _observed_information(at, here, logged)
     for _ in range(_POLISH):
-        step, gain = newton_step(observed, here.gradient)
+        step, gain = _newton_step(observed, here.gradient)
         if gain <= tolerance:
             break
         there = at(here.q + step)
@@ -149,8 +228,8 @@ def fit_noise(
             break
         here = there
         path.append(here.q)
-        observed = observed_information(at, here, logged)
-    cov, robust, related = standard_errors(observed, here.spread)
+        observed = _observed_information(at, here, logged)
+    cov, robust, related = _standard_errors(observed, here.spread)
     deviations = np.where(logged, np.exp(here.q), 1.0)
     error = np.sqrt(np.diag(cov))
     wide = ~np.isfinite(error) | (logged & (error > LOOSE))
@@ -167,8 +246,8 @@ def fit_noise(
         nis_per_dof=(before.nis / before.dof, here.nis / here.dof),
         dof=here.dof,
         path=np.where(logged, np.exp(np.where(logged, path, 0.0)), path),
-        converged=newton_step(observed, here.gradient)[1] <= tolerance,
-        upper={told[i]: upper_limit(at, here, int(i)) for i in np.flatnonzero(falling)},
+        converged=_newton_step(observed, here.gradient)[1] <= tolerance,
+        upper={told[i]: _upper_limit(at, here, int(i)) for i in np.flatnonzero(falling)},
         loose={
             told[i]: tuple(told[j] for j in related[i]) for i in np.flatnonzero(wide & ~falling)
         },
@@ -241,7 +320,7 @@ def _checked(
     return first, begin, logged, told
 
 
-def _check_point(point: LikelihoodPoint, logged: np.ndarray) -> None:
+def _check_point(point: _LikelihoodPoint, logged: np.ndarray) -> None:
     where = f"at parameters {np.where(logged, np.exp(point.q), point.q)}"
     if not point.dof:
         raise ValueError(f"fit_noise: expected fused measurements, got none {where}")
@@ -249,7 +328,7 @@ def _check_point(point: LikelihoodPoint, logged: np.ndarray) -> None:
         raise ValueError(f"fit_noise: the likelihood or its gradient is not finite {where}")
 
 
-def _check_same(one: LikelihoodPoint, other: LikelihoodPoint, logged: np.ndarray) -> None:
+def _check_same(one: _LikelihoodPoint, other: _LikelihoodPoint, logged: np.ndarray) -> None:
     if one.dof != other.dof:
         p, q = (np.where(logged, np.exp(point.q), point.q) for point in (one, other))
         raise ValueError(

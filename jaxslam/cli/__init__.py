@@ -12,6 +12,7 @@ from typing import Any, NoReturn
 import jax
 from threadpoolctl import threadpool_limits
 
+from jaxslam.catalog import meant
 from jaxslam.cli import fit, models
 from jaxslam.cli.common import INTERRUPTED, as_folders
 from jaxslam.cli.consistency import options as consistency_options
@@ -21,7 +22,6 @@ from jaxslam.cli.optimize.command import COST, ERRORS
 from jaxslam.cli.run import options as run_options
 from jaxslam.cli.runtime import cache, devices
 from jaxslam.cli.runtime.compile_clock import CompileClock
-from jaxslam.validation.names import meant
 
 __all__ = ["main"]
 

@@ -12,9 +12,9 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxslam.consistency.score import snapshot_steps
 from jaxslam.filters.ekf.ekf_slam import EkfSlam
 from jaxslam.filters.ekf.settings import EkfOptions
-from jaxslam.linearize import derivatives
-from jaxslam.linearize.at_truth import AtTruth
+from jaxslam.linearize import first_order
 from jaxslam.linearize.first_order import with_lever_arm
+from jaxslam.linearize.other_points import AtTruth
 from jaxslam.math.linalg import root_psd
 from jaxslam.protocols import Sensor
 from jaxslam.run import run
@@ -158,7 +158,7 @@ def jacobians_at_truth(scenario: World, truth: Truth, log: Log) -> RunJacobians:
     still = jnp.zeros(len(motion.noises), dtype)
 
     def moved(old: Array, new: Array, u: Array) -> tuple[Array, Array]:
-        by_pose, by_noise = derivatives.motion_jacobians(motion, old, u)
+        by_pose, by_noise = first_order.motion_jacobians(motion, old, u)
         ahead = motion.step(old, u, still)
         root = root_psd(motion.noise_cov(old, u))
         return with_lever_arm(by_pose, new[:2] - ahead[:2]), by_noise @ root
@@ -179,7 +179,7 @@ def jacobians_at_truth(scenario: World, truth: Truth, log: Log) -> RunJacobians:
             pose: Array, z: Array, tag: Array, model: Sensor = model
         ) -> tuple[Array, Array, Array]:
             landmark = landmarks[tag][: len(model.landmark)]
-            return *derivatives.observe_jacobians(model, pose, landmark), model.noise_cov(z)
+            return *first_order.observe_jacobians(model, pose, landmark), model.noise_cov(z)
 
         z, tag, valid = (leaf[:, first : first + places] for leaf in log.scan)
         tag = jnp.maximum(tag, 0)

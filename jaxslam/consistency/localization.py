@@ -12,8 +12,8 @@ from numpy.typing import ArrayLike
 from jaxslam.consistency.intervals import Measure, interval, positive_interval
 from jaxslam.consistency.nees import block_nees, pose_error
 from jaxslam.core.numbers import check_count, check_covariance, check_key
-from jaxslam.filters.particles.states.pose_state import PoseParticles
-from jaxslam.grids.localization.beam_log import beam_log
+from jaxslam.filters.particles.pose_particles import PoseParticles
+from jaxslam.grids.localization import beam_log
 from jaxslam.math.angles import wrap
 from jaxslam.math.linalg import root_psd
 from jaxslam.protocols import Filter

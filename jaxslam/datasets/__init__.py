@@ -8,23 +8,23 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from jaxslam.datasets.bonn import bonn
-from jaxslam.datasets.carmen.log import LaserLog
-from jaxslam.datasets.carmen.reader import carmen
+from jaxslam.datasets.bonn_reader import bonn
+from jaxslam.datasets.carmen.reader import LaserLog, carmen
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.mrclam.calibration import MRCLAM_CALIBRATION, RobotCalibration
-from jaxslam.datasets.mrclam.own_log import (
+from jaxslam.datasets.mrclam.reader import (
     MRCLAM_FITTED,
     OwnCalibration,
+    mrclam,
     mrclam_calibration,
 )
-from jaxslam.datasets.mrclam.reader import mrclam
+from jaxslam.datasets.mrclam.robot import white_noise
 from jaxslam.datasets.mrclam.team import mrclam_team
 from jaxslam.datasets.noise_fit import DatasetFit, fit
-from jaxslam.datasets.plaza import plaza
-from jaxslam.datasets.relation_file import StampedRelations, relation_file
+from jaxslam.datasets.plaza_reader import plaza
+from jaxslam.datasets.relation_reader import StampedRelations, relation_file
 from jaxslam.datasets.table.reader import table
-from jaxslam.datasets.victoria_park import victoria_park
+from jaxslam.datasets.victoria_park_reader import victoria_park
 
 Reader = Callable[[str | Path, int | None], Dataset]
 
@@ -71,4 +71,5 @@ __all__ = [
     "relation_file",
     "table",
     "victoria_park",
+    "white_noise",
 ]

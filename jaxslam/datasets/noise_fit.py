@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.association.known import Known
+from jaxslam.association.rules import Known
 from jaxslam.calibration import NoiseFit, as_associated, fit_noise
 from jaxslam.core.numbers import check_count
 from jaxslam.datasets.dataset import Adjustable, Dataset

@@ -1,22 +1,30 @@
 """Filters: recursive estimators, all of type `Filter`."""
 
 from jaxslam.filters.delayed.delayed_slam import DelayedSlam
+from jaxslam.filters.delayed.settings import Hypotheses, Promotion, StoredMeasurements
 from jaxslam.filters.ekf.compressed_ekf_slam import CompressedEkfSlam
 from jaxslam.filters.ekf.ekf_slam import EkfSlam
+from jaxslam.filters.ekf.linear_system import LinearizedSteps
 from jaxslam.filters.ekf.observability import Monitored
 from jaxslam.filters.information.eif_slam import EifSlam
+from jaxslam.filters.information.innovation import InformationFilter
 from jaxslam.filters.information.seif import Seif
+from jaxslam.filters.information.sparse_state import ApproximationCounts
 from jaxslam.filters.known.dead_reckoning import DeadReckoning
 from jaxslam.filters.known.localization import Localization
 from jaxslam.filters.known.mapping import Mapping, StartingAt
 from jaxslam.filters.map_management.closing import Closing
+from jaxslam.filters.map_management.loop_closure import LoopSettings
 from jaxslam.filters.map_management.merging import Merging
 from jaxslam.filters.multi_robot.team_slam import TeamSlam
 from jaxslam.filters.particles.fastslam import FastSlam
 from jaxslam.filters.particles.particle_localization import ParticleLocalization
+from jaxslam.filters.particles.pose_steps import MonteCarloFilter
+from jaxslam.filters.particles.slam_particles import ParticleInfo
 from jaxslam.protocols import Filter, Wrapper
 
 __all__ = [
+    "ApproximationCounts",
     "Closing",
     "CompressedEkfSlam",
     "DeadReckoning",
@@ -25,13 +33,21 @@ __all__ = [
     "EkfSlam",
     "FastSlam",
     "Filter",
+    "Hypotheses",
+    "InformationFilter",
+    "LinearizedSteps",
     "Localization",
+    "LoopSettings",
     "Mapping",
     "Merging",
     "Monitored",
+    "MonteCarloFilter",
+    "ParticleInfo",
     "ParticleLocalization",
+    "Promotion",
     "Seif",
     "StartingAt",
+    "StoredMeasurements",
     "TeamSlam",
     "Wrapper",
 ]

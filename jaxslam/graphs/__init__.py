@@ -5,6 +5,7 @@ relative pose e = Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ) as (x, y, θ wrapped), without
 """
 
 from jaxslam.graphs import starts
+from jaxslam.graphs.covariances import Marginals, marginals
 from jaxslam.graphs.factor import (
     REGISTRY,
     Bearing,
@@ -17,12 +18,10 @@ from jaxslam.graphs.factor import (
     RelativePoseLog,
     RelativePosition,
 )
-from jaxslam.graphs.files import read, write
-from jaxslam.graphs.graph import Graph, Table, with_loops_apart
+from jaxslam.graphs.graph import Graph, Table, read, with_loops_apart, write
 from jaxslam.graphs.log import of_log
-from jaxslam.graphs.optimize import chi2, optimize
-from jaxslam.graphs.solution.certificate import Certificate, certificate
-from jaxslam.graphs.solution.marginals import Marginals, marginals
+from jaxslam.graphs.optimality import Certificate, certificate
+from jaxslam.graphs.optimizer import chi2, degrees_of_freedom, optimize, squared_residuals
 from jaxslam.graphs.solver.kernels import REGISTRY as KERNELS
 from jaxslam.graphs.solver.kernels import (
     Cauchy,
@@ -31,8 +30,7 @@ from jaxslam.graphs.solver.kernels import (
     Kernel,
     Truncated,
 )
-from jaxslam.graphs.solver.plan import Plan, plan
-from jaxslam.graphs.solver.residuals import degrees_of_freedom, squared_residuals
+from jaxslam.graphs.solver.plans import Plan, plan
 from jaxslam.graphs.solver.search import Ending, Solution
 from jaxslam.graphs.validation import check_graph, with_gauge
 

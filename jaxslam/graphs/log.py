@@ -13,7 +13,7 @@ from jaxslam import validation
 from jaxslam.core.numbers import is_concrete
 from jaxslam.graphs.factor import Factor, FromMotion, FromSensor, NominalMotion, Prior
 from jaxslam.graphs.graph import Graph, Table
-from jaxslam.linearize.derivatives import motion_jacobians
+from jaxslam.linearize.first_order import motion_jacobians
 from jaxslam.math import linalg, se2
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.sensors.suite import Suite

@@ -15,7 +15,7 @@ from jaxslam.graphs.graph import Graph, Table
 from jaxslam.graphs.solver.model import factors_of
 from jaxslam.types import JaxOrNumPy
 
-INDEFINITE = 1e-6
+_INDEFINITE = 1e-6
 """An eigenvalue of an information above minus this share of its largest entry is one of rounding:
 files have about six digits."""
 
@@ -66,7 +66,7 @@ def check_numbers(name: str, graph: Graph, factors: Mapping[str, Factor]) -> Non
         _check_rows(name, graph, key, table, factors[key])
 
 
-def parts_of(graph: Graph, factors: Mapping[str, Factor]) -> Parts:
+def _parts_of(graph: Graph, factors: Mapping[str, Factor]) -> Parts:
     """The connected parts of a graph, and which have a gauge.
 
     A row whose information is zero neither joins its variables nor holds one.
@@ -101,7 +101,7 @@ def indefinite(information: Float[np.ndarray, "E R R"]) -> Bool[np.ndarray, "E"]
     if information.size == 0:
         return np.zeros(len(information), bool)
     scale = np.abs(information).max(axis=(1, 2))
-    return np.asarray(np.linalg.eigvalsh(information)[:, 0] < -INDEFINITE * scale)
+    return np.asarray(np.linalg.eigvalsh(information)[:, 0] < -_INDEFINITE * scale)
 
 
 def label(graph: Graph, variable: int) -> str:
@@ -188,7 +188,7 @@ def _check_rows(name: str, graph: Graph, key: str, table: Table, factor: Factor)
         (twice, "joins a variable to itself"),
         (~np.isfinite(z).all(axis=1), "z is not finite"),
         (~finite, "the information is not finite"),
-        (finite & (skew > INDEFINITE * scale), "the information is not symmetric"),
+        (finite & (skew > _INDEFINITE * scale), "the information is not symmetric"),
         (indefinite(clean), "the information is not positive semidefinite"),
     ):
         if (bad & valid).any():
@@ -199,7 +199,7 @@ def _check_rows(name: str, graph: Graph, key: str, table: Table, factor: Factor)
 
 
 def _check_gauge(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None:
-    parts = parts_of(graph, factors)
+    parts = _parts_of(graph, factors)
     loose = np.flatnonzero(~parts.anchored & parts.free)
     if not len(loose):
         return
@@ -225,7 +225,7 @@ def with_gauge(graph: Graph, factors: Mapping[str, Factor] | None = None) -> Gra
     that has a gauge is returned as it is: the same object.
     """
     known = factors_of("graphs.with_gauge", graph, factors)
-    parts = parts_of(graph, known)
+    parts = _parts_of(graph, known)
     if not len(graph.poses) or parts.anchored.any():
         return graph
     fixed = np.asarray(graph.fixed_pose).copy()

@@ -8,13 +8,21 @@ from jaxslam.grids.beam_models import (
     fit,
     log_likelihood,
 )
-from jaxslam.grids.cast import RayMap, cast, ray_map
 from jaxslam.grids.distance import distance_field, gradient
-from jaxslam.grids.files import read_map, write_map
-from jaxslam.grids.grid import Field, Grid, centers, check_grid, to_cells
-from jaxslam.grids.interpolation import interpolate
-from jaxslam.grids.localization import Clusters, GridLocalization, beam_log, clusters
+from jaxslam.grids.grid import (
+    Field,
+    Grid,
+    centers,
+    check_grid,
+    interpolate,
+    read_map,
+    to_cells,
+    write_map,
+)
+from jaxslam.grids.localization import GridLocalization, beam_log
 from jaxslam.grids.mapping import Counts, count, entropy, occupancy, reflection
+from jaxslam.grids.pose_clusters import Clusters, clusters
+from jaxslam.grids.rays import RayMap, cast, ray_map
 from jaxslam.grids.resampling import correlation, crop, resample
 
 __all__ = [

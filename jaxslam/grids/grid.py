@@ -1,10 +1,9 @@
-"""The data of an occupancy grid, and its coordinates.
+"""The data of a grid map and of a field over one: coordinates, interpolation, files.
 
-Cell (i, j), row i and column j, is the square [j, j+1] × [i, i+1] times the resolution in the frame
-of the grid, whose pose in the world is `origin`: row 0 is at the bottom. Continuous coordinates
-(x, y) in cells, as `to_cells` has them, are (0.5, 0.5) at the centre of cell (0, 0).
+`read_map` and `write_map` are the public names of what `datasets.ros_map` does.
 """
 
+from pathlib import Path
 from typing import NamedTuple
 
 import jax
@@ -106,3 +105,107 @@ def check_frame(name: str, origin: ArrayLike, resolution: ArrayLike) -> None:
         raise ValueError(f"{name}: expected a finite origin, got {np.asarray(origin)}")
     if not 0 < float(np.asarray(resolution)) < np.inf:
         raise ValueError(f"{name}: expected a resolution above 0, got {resolution}")
+
+
+def interpolate(field: Field, points: ArrayLike) -> Float[Array, "*n"]:
+    """The values of a field at points (..., 2) of the world [m], bilinear between centres of cells.
+
+    Off the map, and within half a cell of its border, the value is that of the nearest point of the
+    rectangle of centres: continuous everywhere, and the gradient by a point is finite everywhere;
+    across the border it is zero. At a line between four centres the gradient is of one side.
+
+    Raises ValueError on what is no field, and on points of a shape other than (..., 2).
+    """
+    if not isinstance(field, Field):
+        raise ValueError(f"interpolate: expected a Field, got a {type(field).__name__}")
+    points = jnp.asarray(points)
+    if points.ndim == 0 or points.shape[-1] != 2:
+        raise ValueError(f"interpolate: expected points (x, y), got shape {points.shape}")
+    return interpolated(field.values, to_cells(field.origin, field.resolution, points) - 0.5)
+
+
+def interpolated(values: Float[Array, "H W"], at: Float[Array, "*n 2"]) -> Float[Array, "*n"]:
+    """The bilinear interpolation of a table at (x, y) = (column, row) coordinates.
+
+    f = a (1-u)(1-v) + b u (1-v) + c (1-u) v + d u v on the unit square of the four entries around.
+    """
+    (a, b, c, d), (u, v) = _around(values, at)
+    bottom, top = a + u * (b - a), c + u * (d - c)
+    return bottom + v * (top - bottom)
+
+
+def slope(field: Field, points: Float[Array, "*n 2"]) -> Float[Array, "*n 2"]:
+    """The gradient of `interpolate` by the point, in the world's x and y, derived by hand.
+
+    ∂f/∂u = (b - a)(1-v) + (d - c) v and ∂f/∂v = (c - a)(1-u) + (d - b) u, over the resolution and
+    turned by the heading of the grid; 0 along an axis on which the point is off the centres.
+    """
+    at = to_cells(field.origin, field.resolution, points) - 0.5
+    (a, b, c, d), (u, v) = _around(field.values, at)
+    height, width = field.values.shape
+    x, y = at[..., 0], at[..., 1]
+    along = jnp.where((x >= 0) & (x <= width - 1), (b - a) * (1 - v) + (d - c) * v, 0.0)
+    across = jnp.where((y >= 0) & (y <= height - 1), (c - a) * (1 - u) + (d - b) * u, 0.0)
+    along, across = along / field.resolution, across / field.resolution
+    cos, sin = jnp.cos(field.origin[2]), jnp.sin(field.origin[2])
+    return jnp.stack([cos * along - sin * across, sin * along + cos * across], axis=-1)
+
+
+def _around(
+    values: Float[Array, "H W"], at: Float[Array, "*n 2"]
+) -> tuple[tuple[Array, Array, Array, Array], tuple[Array, Array]]:
+    """The four entries a, b, c, d around (x, y), and where between them it is: (u, v)."""
+    height, width = values.shape
+    values = jnp.asarray(values)
+    x, y = jnp.clip(at[..., 0], 0, width - 1), jnp.clip(at[..., 1], 0, height - 1)
+    j = jnp.clip(jnp.floor(x).astype(jnp.int32), 0, max(width - 2, 0))
+    i = jnp.clip(jnp.floor(y).astype(jnp.int32), 0, max(height - 2, 0))
+    right, up = jnp.minimum(j + 1, width - 1), jnp.minimum(i + 1, height - 1)
+    entries = values[i, j], values[i, right], values[up, j], values[up, right]
+    return entries, (x - j, y - i)
+
+
+def read_map(path: str | Path) -> Grid:
+    """The occupancy grid in a map file of ROS, `NAME.yaml` with its image; arrays are NumPy's.
+
+    | key | meaning |
+    |---|---|
+    | `image` | a PGM (P5 or P2), PNG or BMP file, relative to the folder of the YAML file |
+    | `resolution` | side of a cell [m] |
+    | `origin` | [x, y, yaw], pose of the lower left corner of the lower left cell [m, m, rad] |
+    | `negate` | 0: dark is occupied, p = 1 - shade; 1: p = shade; shade in [0, 1] |
+    | `occupied_thresh`, `free_thresh` | above, below which p a cell is occupied, free |
+    | `mode` | `trinary` (default): all else is unknown; `scale`: all else is in between |
+
+    Another key, as `map_type`, is named in a warning. Shades have 8 or 16 bits; a colour counts as
+    the mean of its channels.
+
+    An occupied cell gets the log-odds `datasets.ros_map.CERTAIN`, a free one the negative
+    of it, an unknown one 0. In mode `scale` a cell between the thresholds has the probability
+    (p - free_thresh)/(occupied_thresh - free_thresh), bounded in the same way.
+
+    Source: the map format of the ROS package `map_server`, wiki.ros.org/map_server.
+
+    Raises:
+        ValueError: `path:line: reason` for what is not YAML, a key that is missing or occurs twice,
+            a resolution that is not above 0, an origin that is no pose, thresholds out of order, a
+            mode `raw`, and an image that is missing, transparent, of another format, or damaged.
+    """
+    from jaxslam.datasets import ros_map
+
+    return ros_map.load(path)
+
+
+def write_map(path: str | Path, grid: Grid, *, mode: str = "trinary") -> list[Path]:
+    """Write a grid as a map of ROS, `NAME.yaml` and `NAME.pgm` beside it; returns their paths.
+
+    Mode `trinary` has black, white and grey 205 for log-odds above, below and equal to 0: what was
+    read from a trinary map is read again as the same numbers. Mode `scale` has the probability in
+    255 levels, or in 254, of which one is ½, where that alone gives the same grid again or where
+    cells are unknown; its thresholds are 1 and 0. Either both files are written or none.
+
+    Raises ValueError on a grid that is none, another mode, and a path that does not end in .yaml.
+    """
+    from jaxslam.datasets import ros_map
+
+    return ros_map.save(path, grid, mode)

@@ -6,8 +6,7 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jaxslam.core.numbers import check_real, is_concrete
-from jaxslam.grids.grid import Field, Grid, centers, check_grid
-from jaxslam.grids.interpolation import interpolate
+from jaxslam.grids.grid import Field, Grid, centers, check_grid, interpolate
 from jaxslam.math import se2
 
 

@@ -18,7 +18,7 @@ processor's cache."""
 _ROUNDING = 1e-3
 """[squares] by which a ray may end off the map."""
 
-CHUNK = 32
+_CHUNK = 32
 """Rays that a CPU advances together. A loop runs until the longest ray of a chunk ends, so the
 fewer the better; 32 fill its vectors."""
 
@@ -64,13 +64,13 @@ def _march(
     ahead: Array, corners: Array | None, start: Array, direction: Array, limit: Array
 ) -> tuple[Array, Array]:
     count = start.shape[0]
-    if count <= CHUNK or jax.default_backend() != "cpu":
+    if count <= _CHUNK or jax.default_backend() != "cpu":
         return one_kernel(_together, ahead, corners, start, direction, limit)
-    parts = -(-count // CHUNK)
-    padded = parts * CHUNK - count
+    parts = -(-count // _CHUNK)
+    padded = parts * _CHUNK - count
 
     def split(x: Array) -> Array:
-        return jnp.pad(x, [(0, padded), (0, 0)], mode="edge").reshape(parts, CHUNK, 2)
+        return jnp.pad(x, [(0, padded), (0, 0)], mode="edge").reshape(parts, _CHUNK, 2)
 
     length, hit = jax.lax.map(
         lambda rays: one_kernel(_together, ahead, corners, rays[0], rays[1], limit),

@@ -9,38 +9,38 @@ from jaxtyping import Float
 
 from jaxslam.math.numpy_poses import Poses, adjoint, inverse
 
-Covs = Float[np.ndarray, "... 3 3"]
+_Covs = Float[np.ndarray, "... 3 3"]
 
 
-def propagated(by: Float[np.ndarray, "... 3 k"], cov: Float[np.ndarray, "... k k"]) -> Covs:
+def propagated(by: Float[np.ndarray, "... 3 k"], cov: Float[np.ndarray, "... k k"]) -> _Covs:
     """The covariance J Σ Jᵀ of J e, where that of e is Σ."""
     return np.asarray(by @ cov @ np.swapaxes(by, -1, -2))
 
 
-def moved(cov: Covs, by: Poses) -> Covs:
+def moved(cov: _Covs, by: Poses) -> _Covs:
     """The covariance of the end of z ∘ by, where by is certain and that of the end of z is cov."""
     ad = adjoint(inverse(by))
     return propagated(ad, cov)
 
 
-def composed_cov(cov: Covs, step: Poses, step_cov: Covs) -> Covs:
+def composed_cov(cov: _Covs, step: Poses, step_cov: _Covs) -> _Covs:
     """The covariance of the end of z ∘ step, both uncertain and independent."""
     return np.asarray(moved(cov, step) + step_cov)
 
 
-def at_end(cov: Covs, z: Poses) -> Covs:
+def at_end(cov: _Covs, z: Poses) -> _Covs:
     """The covariance of the end of z from that of its coordinates (x, y, θ)."""
     turn = turns(-z[..., 2])
     return propagated(turn, cov)
 
 
-def of_coordinates(cov: Covs, z: Poses) -> Covs:
+def of_coordinates(cov: _Covs, z: Poses) -> _Covs:
     """The covariance of the coordinates (x, y, θ) of z from that of its end."""
     turn = turns(z[..., 2])
     return propagated(turn, cov)
 
 
-def along(poses: Float[np.ndarray, "N 3"], covs: Float[np.ndarray, "m 3 3"]) -> Covs:
+def along(poses: Float[np.ndarray, "N 3"], covs: Float[np.ndarray, "m 3 3"]) -> _Covs:
     """(N, 3, 3) sums S of the covariances of the steps of a chain, all in the world's frame.
 
     The covariance of the end of the pose j relative to the pose i ≤ j is, to first order,
@@ -52,14 +52,14 @@ def along(poses: Float[np.ndarray, "N 3"], covs: Float[np.ndarray, "m 3 3"]) -> 
     return total
 
 
-def relative_cov(total: Covs, poses: Poses, i: np.ndarray, j: np.ndarray) -> Covs:
+def relative_cov(total: _Covs, poses: Poses, i: np.ndarray, j: np.ndarray) -> _Covs:
     """The covariance of the end of pose j relative to pose i along a chain, in either order."""
     difference = total[np.maximum(i, j)] - total[np.minimum(i, j)]
     ad = adjoint(inverse(poses[j]))
     return propagated(ad, difference)
 
 
-def semidefinite(information: Covs) -> Covs:
+def semidefinite(information: _Covs) -> _Covs:
     """The symmetric matrix without its negative eigenvalues.
 
     Of the information of walls what their noise feigns is subtracted, which can be too much.
@@ -68,7 +68,7 @@ def semidefinite(information: Covs) -> Covs:
     return np.asarray((vectors * np.maximum(values, 0.0)) @ np.swapaxes(vectors, -1, -2))
 
 
-def turns(angle: Float[np.ndarray, "..."]) -> Covs:
+def turns(angle: Float[np.ndarray, "..."]) -> _Covs:
     """R(angle) for x and y, 1 for θ."""
     c, s = np.cos(angle), np.sin(angle)
     zero, one = np.zeros_like(c), np.ones_like(c)

@@ -8,20 +8,19 @@ from jaxtyping import Bool, Float, Int
 
 from jaxslam import grids
 from jaxslam.grids import Counts, Grid
-from jaxslam.laser_slam.records import LogOfScans
+from jaxslam.laser_slam.records import LogOfScans, Settings
 from jaxslam.laser_slam.scans import ROWS, WIDTH, met_something
-from jaxslam.laser_slam.settings import Settings
 from jaxslam.math import numpy_poses as poses
 from jaxslam.types import Beams
 
-LARGEST = 4_000
+_LARGEST = 4_000
 """cells along a side of the map; a larger world has larger cells"""
 FILM = 400
 """cells along a side of a map in a film"""
 WINDOW = 1024
 """Cells along a side of the window in which scans are counted: one program for all maps, but for
 scans that are larger."""
-ASIDE = np.array([0.37, 0.29])
+_ASIDE = np.array([0.37, 0.29])
 """Cells from the origin of `raw` to a corner of a cell: a robot that starts there, or drives along
 an axis, has no beams along the borders of cells, where rounding decides what they cross."""
 
@@ -38,8 +37,8 @@ def frame_of(
             rows = slice(begin, begin + ROWS)
             first, last = _boxes(laser[rows], _used(log, settings, every, rows))
             low, high = np.minimum(low, first.min(axis=0)), np.maximum(high, last.max(axis=0))
-    resolution = max(settings.resolution, float((high - low).max()) / LARGEST)
-    low = (np.floor(low / resolution - 4) + ASIDE) * resolution
+    resolution = max(settings.resolution, float((high - low).max()) / _LARGEST)
+    low = (np.floor(low / resolution - 4) + _ASIDE) * resolution
     width, height = (int(n) for n in np.ceil((high - low) / resolution) + 4)
     # Whole pieces of 64 cells: maps of nearly the same size share a program.
     return (-(-height // 64) * 64, -(-width // 64) * 64), np.array([*low, 0.0]), resolution

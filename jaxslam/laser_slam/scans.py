@@ -6,17 +6,16 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.laser_slam.records import LogOfScans
-from jaxslam.laser_slam.settings import Settings
+from jaxslam.laser_slam.records import LogOfScans, Settings
 from jaxslam.matching import Points
-from jaxslam.matching.surface import Surface, surface
+from jaxslam.matching.surfaces import Surface, surface
 from jaxslam.types import Beams
 
 GAP = 0.5
 """[m] between points beyond which they are not of one wall"""
 SPAN = np.deg2rad(2.0)
 """Angle to either side of a point within which its neighbours lie."""
-MAX_NEIGHBOURS = 8
+_MAX_NEIGHBOURS = 8
 """to either side"""
 WIDTH, ROWS = 384, 64
 """Beams and scans of one call that fits lines: logs are cut and filled up to these, so that all
@@ -87,7 +86,7 @@ def scans_of(log: LogOfScans, settings: Settings) -> Scans:
     some = slice(None, None, -(-count // ROWS))
     angles, there = np.asarray(log.beams.angle)[some], np.asarray(log.beams.valid)[some] > 0
     spacing = max(_spacing(angles[:, ::stride], there[:, ::stride]), 1e-3)
-    span = np.int32(np.clip(round(SPAN / spacing), 2, MAX_NEIGHBOURS))
+    span = np.int32(np.clip(round(SPAN / spacing), 2, _MAX_NEIGHBOURS))
     every, kept = -(-len(range(0, beams, stride)) // settings.beams), settings.beams
     changed = []
     scans: Any = None
@@ -144,7 +143,7 @@ def _filled(points: Points) -> Points:
 
 @jax.jit
 def _surfaces(points: Points, span: Int[Array, ""]) -> Surface:
-    found: Surface = jax.vmap(lambda of: surface(of, span, GAP, most=MAX_NEIGHBOURS))(points)
+    found: Surface = jax.vmap(lambda of: surface(of, span, GAP, most=_MAX_NEIGHBOURS))(points)
     return found
 
 

@@ -14,7 +14,7 @@ from jaxslam.math.arrays import Number
 from jaxslam.protocols import Here, Linearizer, Motion, Sensor
 
 
-class Regression(NamedTuple):
+class _Regression(NamedTuple):
     """The affine fit y ≈ mean + slope · ξ + rest, ξ ~ N(0, L Lᵀ), through sigma points."""
 
     mean: Array
@@ -118,12 +118,12 @@ class Unscented(Linearizer):
             by_pose = (basis.cross + by_pose) @ linalg.inverse(basis.pose)
         return centre, by_pose, own
 
-    def _fit(self, f: Callable[[Array], Array], root: Array) -> Regression:
+    def _fit(self, f: Callable[[Array], Array], root: Array) -> _Regression:
         alpha = _spread(root) if self.alpha is None else jnp.asarray(self.alpha, root.dtype)
         return regress(f, root, alpha)
 
 
-def regress(f: Callable[[Array], Array], root: Array, alpha: float | Array) -> Regression:
+def regress(f: Callable[[Array], Array], root: Array, alpha: float | Array) -> _Regression:
     """The unscented transform of f: (n,) -> (m,), f(0) = 0, over ξ ~ N(0, L Lᵀ), L = root (n, n).
 
     With o_j and e_j the odd and even parts of f at α√n L_j, the transform's sums come to
@@ -136,7 +136,7 @@ def regress(f: Callable[[Array], Array], root: Array, alpha: float | Array) -> R
     odd, even = (ahead - back) / 2, (ahead + back) / 2
     mean = even.sum(axis=0) / reach2
     rest = linalg.gram(even, even) / reach2 + (2 - alpha**2) * mean[:, None] * mean[None, :]
-    return Regression(mean, odd.T / jnp.sqrt(reach2), rest)
+    return _Regression(mean, odd.T / jnp.sqrt(reach2), rest)
 
 
 def by_variables(slope: Array, root: Array) -> Array:

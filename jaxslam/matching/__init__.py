@@ -3,14 +3,14 @@
 from jaxslam.matching import covariance
 from jaxslam.matching.correlative import Correlative
 from jaxslam.matching.field import FieldMatcher
-from jaxslam.matching.icp import IcpSettings, PointToLine, PointToPoint
+from jaxslam.matching.icp import Icp, IcpSettings, PointToLine, PointToPoint
 from jaxslam.matching.matcher import Match, Matcher, MatchStatus, match
-from jaxslam.matching.points import Points, moved_along_rays, points, raster, transformed
-from jaxslam.matching.prior import Prior
+from jaxslam.matching.point_sets import Points, Prior, moved_along_rays, points, raster, transformed
 
 __all__ = [
     "Correlative",
     "FieldMatcher",
+    "Icp",
     "IcpSettings",
     "Match",
     "MatchStatus",

@@ -1,28 +1,134 @@
-"""The best of all poses of a window: correlative scan matching, exact on its lattice."""
+"""The best of all poses of a window: correlative scan matching, exact on its lattice.
+
+By branch and bound: blocks of shifts are bounded, divided and left out.
+"""
 
 import dataclasses
+from collections.abc import Callable
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.core.numbers import check_positive, is_concrete
 from jaxslam.core.record import record, static
 from jaxslam.grids.distance import near_distances
-from jaxslam.grids.grid import Field, Grid, to_cells
-from jaxslam.grids.interpolation import interpolate
-from jaxslam.matching.branch_and_bound import Nodes, best_shift
+from jaxslam.grids.grid import Field, Grid, interpolate, to_cells
 from jaxslam.matching.field import field_cost
 from jaxslam.matching.matcher import Match, Matcher
 from jaxslam.matching.outcome import Limits, concluded, length_of
-from jaxslam.matching.points import Points
-from jaxslam.matching.prior import Prior, prior_cost
-from jaxslam.matching.surface import surface, surface_information
+from jaxslam.matching.point_sets import Points, Prior, prior_cost
+from jaxslam.matching.surfaces import surface, surface_information
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
 from jaxslam.math.arrays import Number, in_dtype
+
+_CHUNK = 16
+"""Blocks that are divided in one step."""
+
+
+class _Nodes(NamedTuple):
+    """Blocks of 2^level × 2^level shifts at a heading each."""
+
+    level: Int[Array, "n"]
+    turn: Int[Array, "n"]
+    """number of the heading"""
+    shift: Int[Array, "n 2"]
+    """(rows, columns), the lower left one of the block"""
+
+
+class _Best(NamedTuple):
+    """The best pose found."""
+
+    value: Float[Array, ""]
+    """-inf of none"""
+    turn: Int[Array, ""]
+    shift: Int[Array, "2"]
+    divided: Int[Array, ""]
+    """how many blocks were"""
+
+
+def _best_shift(
+    bound_of: Callable[[_Nodes], Float[Array, "n"]],
+    roots: _Nodes,
+    bounds: Float[Array, "n"],
+    levels: int,
+    shifts: int,
+    *,
+    above: Array | float = -jnp.inf,
+    counts: Callable[[_Nodes], Bool[Array, "n"]] | None = None,
+    first: bool = False,
+) -> _Best:
+    """The best shift of all blocks, by depth first search with the best bound ahead.
+
+    A block whose bound is not above the best value so far is left out; others are divided into four
+    (Hess et al. 2016, "Real-time loop closure in 2D LIDAR SLAM", ICRA).
+
+    Args:
+        bound_of: an upper bound of the values in each block; at level 0 the value.
+        roots, bounds: of one level, `levels` at least 1.
+        shifts: those farther than this are outside the window.
+        above: only poses of a greater value count.
+        counts: which poses count, of nodes at level 0; default all.
+        first: whether the first pose that counts will do.
+    """
+    order = jnp.argsort(bounds)
+    count = len(bounds)
+    room = 4 * _CHUNK * levels
+    # Deeper blocks lie above shallower ones, so that those of a level are divided before any more
+    # of it come: at most 4 · chunk of each at a time.
+    value = jnp.concatenate([bounds[order], jnp.zeros(room, bounds.dtype)])
+    stack = _Nodes(
+        *(jnp.concatenate([p[order], jnp.zeros((room, *p.shape[1:]), p.dtype)]) for p in roots)
+    )
+    corner = jnp.asarray(np.array([[0, 0], [0, 1], [1, 0], [1, 1]], np.int32))
+
+    def unfinished(state: tuple[Array, _Nodes, Array, _Best]) -> Array:
+        size, _, value, best = state
+        rest_is_worse = (size <= count) & (value[jnp.maximum(size - 1, 0)] <= best.value)
+        more = (size > 0) & ~rest_is_worse
+        return jnp.asarray(more & (best.value <= above) if first else more)
+
+    def step(state: tuple[Array, _Nodes, Array, _Best]) -> tuple[Array, _Nodes, Array, _Best]:
+        size, stack, value, best = state
+        at = size - 1 - jnp.arange(_CHUNK)
+        live = (at >= 0) & (value[jnp.maximum(at, 0)] > best.value)
+        parent = jax.tree.map(lambda part: jnp.repeat(part[jnp.maximum(at, 0)], 4, axis=0), stack)
+        level = parent.level - 1
+        shift = parent.shift + (1 << level)[:, None] * jnp.tile(corner, (_CHUNK, 1))
+        child = _Nodes(level, parent.turn, shift)
+        bound = bound_of(child)
+        good = jnp.repeat(live, 4) & jnp.all(shift <= shifts, axis=1) & (bound > best.value)
+        leaf = level == 0
+        score = jnp.where(good & leaf, bound, -jnp.inf)
+        if counts is not None:
+            score = jnp.where(counts(child), score, -jnp.inf)
+        top = jnp.argmax(score)
+        better = score[top] > best.value
+        best = _Best(
+            jnp.where(better, score[top], best.value),
+            jnp.where(better, child.turn[top], best.turn),
+            jnp.where(better, shift[top], best.shift),
+            best.divided + live.sum(dtype=jnp.int32),
+        )
+        kept = good & ~leaf & (bound > best.value)
+        rank = jnp.lexsort((bound, -level, ~kept))
+        base = size - jnp.minimum(size, _CHUNK)
+
+        def pushed(onto: Array, these: Array) -> Array:
+            begin = (base, *[jnp.zeros_like(base)] * (onto.ndim - 1))
+            return jax.lax.dynamic_update_slice(onto, these[rank], begin)
+
+        stack = jax.tree.map(pushed, stack, child)
+        return base + kept.sum(dtype=jnp.int32), stack, pushed(value, bound), best
+
+    zero = jnp.zeros((), jnp.int32)
+    none = _Best(jnp.asarray(above, bounds.dtype), zero, jnp.zeros(2, jnp.int32), zero)
+    size = jnp.asarray(count, jnp.int32)
+    *_, best = jax.lax.while_loop(unfinished, step, (size, stack, value, none))
+    return best
 
 
 class Scores(NamedTuple):
@@ -50,7 +156,7 @@ class Correlative(Matcher):
 
     The maximum is exact on this lattice: blocks of shifts are scored by the largest score of any
     cell that a point meets within the block, less what the prior takes at least there: an upper
-    bound. Those that may hold the best are divided, down to single shifts (`best_shift`).
+    bound. Those that may hold the best are divided, down to single shifts (`_best_shift`).
 
     Olson 2009, "Real-time correlative scan matching", ICRA; bounds over sliding blocks as Hess et
     al. 2016, "Real-time loop closure in 2D LIDAR SLAM", ICRA. The pose is one of the lattice:
@@ -146,7 +252,7 @@ class Correlative(Matcher):
 
         here = jax.vmap(cells)(turns)
 
-        def seen(nodes: Nodes) -> Float[Array, "n"]:
+        def seen(nodes: _Nodes) -> Float[Array, "n"]:
             """The mean score of the points."""
             at = here[nodes.turn] + nodes.shift[:, None, :]
             row, column = jnp.clip(at[..., 0], 0, height - 1), jnp.clip(at[..., 1], 0, width - 1)
@@ -154,7 +260,7 @@ class Correlative(Matcher):
             score = prepared.table.reshape(-1)[flat]
             return jnp.where(points.valid, score, 0.0).sum(axis=1) / count
 
-        def taken(nodes: Nodes) -> Float[Array, "n"]:
+        def taken(nodes: _Nodes) -> Float[Array, "n"]:
             """The score that a prior takes at least within each block.
 
             At the middle it is √(eᵀ Λ e); at a corner it is less by √(uᵀ Λ u) at most."""
@@ -171,27 +277,27 @@ class Correlative(Matcher):
             least = jnp.where(nodes.level == 0, square, least**2)
             return least / (2 * sigma**2 * count)
 
-        def bound_of(nodes: Nodes) -> Float[Array, "n"]:
+        def bound_of(nodes: _Nodes) -> Float[Array, "n"]:
             return seen(nodes) - taken(nodes)
 
-        def roots_of(turn: Array) -> Nodes:
+        def roots_of(turn: Array) -> _Nodes:
             full = jnp.full(len(corners), levels, jnp.int32)
-            return Nodes(full, jnp.broadcast_to(turn, full.shape), jnp.asarray(corners))
+            return _Nodes(full, jnp.broadcast_to(turn, full.shape), jnp.asarray(corners))
 
         numbers = jnp.arange(len(turns), dtype=jnp.int32)
         bounds = jax.lax.map(lambda turn: bound_of(roots_of(turn)), numbers).reshape(-1)
         roots = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), jax.vmap(roots_of)(numbers))
-        best = best_shift(bound_of, roots, bounds, levels, shifts)
+        best = _best_shift(bound_of, roots, bounds, levels, shifts)
         elsewhere: Array | bool = False
         if ambiguous is not None:
             by_turn = length_of(points) * self.turn
 
-            def far(nodes: Nodes) -> Array:
+            def far(nodes: _Nodes) -> Array:
                 way = cell_size * (nodes.shift - best.shift[None])
                 return jnp.hypot(*way.T) + by_turn * jnp.abs(nodes.turn - best.turn) > apart
 
             limit = ambiguous * best.value
-            other = best_shift(
+            other = _best_shift(
                 bound_of, roots, bounds, levels, shifts, above=limit, counts=far, first=True
             )
             elsewhere = other.value > limit
@@ -199,7 +305,7 @@ class Correlative(Matcher):
         moved = points.position @ se2.rotation(pose[2]).T + pose[None, :2]
         residual = interpolate(prepared.field, moved)
         weight = (points.valid & (residual < 3 * sigma)).astype(residual.dtype)
-        only = Nodes(jnp.zeros(1, jnp.int32), best.turn[None], best.shift[None])
+        only = _Nodes(jnp.zeros(1, jnp.int32), best.turn[None], best.shift[None])
         return concluded(
             start,
             pose,

@@ -11,9 +11,7 @@ from jaxslam.core.numbers import check_count, check_positive
 from jaxslam.core.record import record, static
 from jaxslam.graphs.solver.kernels import Kernel
 from jaxslam.grids.distance import distance_field
-from jaxslam.grids.grid import Field, Grid, to_cells
-from jaxslam.grids.interpolation import interpolate
-from jaxslam.matching.correspondences import weights
+from jaxslam.grids.grid import Field, Grid, interpolate, to_cells
 from jaxslam.matching.matcher import Match, Matcher
 from jaxslam.matching.outcome import (
     Limits,
@@ -23,9 +21,8 @@ from jaxslam.matching.outcome import (
     information_of,
     length_of,
 )
-from jaxslam.matching.points import Points
-from jaxslam.matching.prior import Prior, prior_cost, prior_terms
-from jaxslam.matching.surface import surface, surface_information
+from jaxslam.matching.point_sets import Points, Prior, prior_cost, prior_terms
+from jaxslam.matching.surfaces import surface, surface_information, weights
 from jaxslam.math import linalg, se2
 from jaxslam.math.angles import wrap
 from jaxslam.math.arrays import Number, in_dtype

@@ -12,8 +12,7 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from jaxslam.core.numbers import is_concrete, shape_told
 from jaxslam.grids.grid import Grid, check_grid
-from jaxslam.matching.points import Points
-from jaxslam.matching.prior import Prior
+from jaxslam.matching.point_sets import Points, Prior
 from jaxslam.math.arrays import in_dtype
 from jaxslam.protocols import Component
 
@@ -156,10 +155,10 @@ def _one(
 def _many(
     matcher: Matcher, reference: Reference, points: Points, start: Array, prior: Prior | None
 ) -> Match:
-    return jax.vmap(matcher.match)(prepared_all(matcher, reference), points, start, prior)
+    return jax.vmap(matcher.match)(_prepared_all(matcher, reference), points, start, prior)
 
 
-def prepared_all(matcher: Matcher, references: Reference) -> PyTree:
+def _prepared_all(matcher: Matcher, references: Reference) -> PyTree:
     """What the matcher needs of each reference; grids one after another, as loops over cells go
     slowly side by side."""
     if matcher.of_grid:
@@ -182,9 +181,9 @@ def _checked(
     batch: tuple[int, ...] = np.shape(start)[:-1]
     if len(batch) > 1 or np.shape(start)[-1:] != (3,):
         raise ValueError(f"match: expected a start of poses (x, y, θ), got {shape_told(start)}")
-    check_points("match: points", points, batch)
+    _check_points("match: points", points, batch)
     if isinstance(reference, Points):
-        check_points("match: reference", reference, batch)
+        _check_points("match: reference", reference, batch)
         if not reference.valid.shape[-1]:
             raise ValueError("match: expected a reference of at least one point, valid or not")
     elif not batch:
@@ -221,7 +220,7 @@ def _check_prior(prior: object, batch: tuple[int, ...]) -> None:
             )
 
 
-def check_points(name: str, of: object, batch: tuple[int, ...] = ()) -> None:
+def _check_points(name: str, of: object, batch: tuple[int, ...] = ()) -> None:
     """Raise ValueError, which begins with a caller's name, unless they are finite `Points`."""
     if not isinstance(of, Points):
         raise ValueError(f"{name}: expected Points, got {type(of).__name__}")

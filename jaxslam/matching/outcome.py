@@ -8,8 +8,7 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from jaxslam.matching.matcher import Match, MatchStatus
-from jaxslam.matching.points import Points
-from jaxslam.matching.prior import Prior
+from jaxslam.matching.point_sets import Points, Prior
 from jaxslam.math import linalg
 from jaxslam.math.arrays import Number
 
@@ -54,7 +53,7 @@ def concluded(
         closeness = jnp.where(took_part, jnp.exp(-0.5 * (residual / spread) ** 2), 0.0)
         score = closeness.sum() / count
     length = length_of(points)
-    condition, weakest = weakest_direction(information, length)
+    condition, weakest = _weakest_direction(information, length)
     few = took_part.sum() < limits.fewest
     status = jnp.asarray(MatchStatus.CONVERGED, jnp.int32)
     for applies, value in (
@@ -118,7 +117,7 @@ def information_along(
     return both - information_of(by_motion(along), weight * tilt)
 
 
-def weakest_direction(
+def _weakest_direction(
     information: Float[Array, "3 3"], length: Float[Array, ""]
 ) -> tuple[Float[Array, ""], Float[Array, "3"]]:
     """The least over the largest eigenvalue, in [0, 1], and the eigenvector of the least.
@@ -128,7 +127,7 @@ def weakest_direction(
     """
     scale = jnp.stack([jnp.ones_like(length), jnp.ones_like(length), 1 / length])
     a = jax.lax.stop_gradient(scale[:, None] * information * scale[None, :])
-    least, largest = extreme_eigenvalues(a)
+    least, largest = _extreme_eigenvalues(a)
     positive = largest > 0
     condition = jnp.clip(least / jnp.where(positive, largest, 1.0), 0.0, 1.0)
     return jnp.where(positive, condition, 0.0), eigenvector(a, least) * scale
@@ -149,7 +148,7 @@ def determined(
         return eye
     scale = jnp.stack([jnp.ones_like(length), jnp.ones_like(length), 1 / length])
     a = jax.lax.stop_gradient(scale[:, None] * information * scale[None, :])
-    low, high = extreme_eigenvalues(a)
+    low, high = _extreme_eigenvalues(a)
     some = high > 0
 
     def below(value: Array) -> Array:
@@ -184,7 +183,7 @@ def fused(
     return onto.T @ curvature @ onto + prior[0] + keep * free.T @ free, onto.T @ slope + prior[1]
 
 
-def extreme_eigenvalues(a: Float[Array, "3 3"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+def _extreme_eigenvalues(a: Float[Array, "3 3"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
     """The least and the largest eigenvalue of a symmetric matrix.
 
     By the roots of its characteristic polynomial as cosines: with q = tr A/3, p² = |A - q I|²/6

@@ -10,7 +10,7 @@ from jaxtyping import Bool, Float
 from jaxslam.math import linalg
 from jaxslam.math.arrays import Scalar
 
-LOG_2PI = math.log(2 * math.pi)
+_LOG_2PI = math.log(2 * math.pi)
 
 
 class GaussianTerms(NamedTuple):
@@ -54,7 +54,7 @@ def log_density(
     distance: Float[Array, "..."], log_det: Float[Array, "..."], size: int
 ) -> Float[Array, "..."]:
     """The log-density of errors of `size` entries, by their d² and log |cov|."""
-    return -0.5 * (distance + log_det + size * LOG_2PI)
+    return -0.5 * (distance + log_det + size * _LOG_2PI)
 
 
 def mahalanobis_squared(

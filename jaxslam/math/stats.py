@@ -1,23 +1,12 @@
-"""Chi-square tails, quantiles and bands, the distributions of a consistent filter's NEES and NIS.
+"""Chi-square quantiles and bands, of the distributions of a consistent filter's NEES and NIS.
 
-The tail is traceable and differentiable; quantiles and bands are host numbers, from SciPy (which
-JAX itself depends on), because they become constants of a gate, a table or a plot. They are taken
-from its special functions, because importing its distributions takes longer than importing jaxslam.
+They are host numbers, from SciPy (which JAX itself depends on), because they become constants of a
+gate, a table or a plot; from its special functions, because importing its distributions takes
+longer than importing jaxslam.
 """
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import scipy.special
-from jax.typing import ArrayLike
-
-
-def chi2_tail(x: ArrayLike, dof: ArrayLike) -> jax.Array:
-    """P(χ²_dof > x) = Q(dof/2, x/2), traceable and differentiable in x; 1 where x <= 0."""
-    x = jnp.asarray(x)
-    inside = x > 0
-    upper = jax.scipy.special.gammaincc(jnp.asarray(dof) / 2, jnp.where(inside, x, 1.0) / 2)
-    return jnp.where(inside, upper, 1.0)
 
 
 def chi2_quantile(p: float, dof: float) -> float:

@@ -4,22 +4,19 @@ correlation. On the host, by NumPy in float64.
 """
 
 from jaxslam.grids import correlation
-from jaxslam.metrics.maps import align_map, map_entropy
-from jaxslam.metrics.paths import PathErrors, alignment, ate, carried
-from jaxslam.metrics.relations import (
+from jaxslam.metrics.paths import PathErrors, align_map, alignment, ate, carried, map_entropy
+from jaxslam.metrics.relative import (
     Errors,
+    MeanAndStd,
     Relations,
+    Statistics,
+    benchmark_figures,
     given,
     joined,
     relation_errors,
     relations,
     revisits,
     rpe,
-)
-from jaxslam.metrics.statistics import (
-    MeanAndStd,
-    Statistics,
-    benchmark_figures,
     statistics,
     summary,
 )

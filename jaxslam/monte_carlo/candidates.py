@@ -11,7 +11,7 @@ from jax.typing import DTypeLike
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
-from jaxslam.charts.euclidean import Euclidean
+from jaxslam.charts import Euclidean
 from jaxslam.consistency import monitor_of
 from jaxslam.core.numbers import check_covariance, is_concrete
 from jaxslam.logs.tables import split_unit

@@ -3,14 +3,13 @@
 from collections.abc import Callable
 
 from jaxslam.motion.ackermann import Ackermann
-from jaxslam.motion.increment import Increment
+from jaxslam.motion.increments import Increment, PoseIncrement
 from jaxslam.motion.odometry import (
     Odometry,
     OdometryNoise,
     odometry_control,
     odometry_controls,
 )
-from jaxslam.motion.pose_increment import PoseIncrement
 from jaxslam.motion.substeps import Substeps
 from jaxslam.motion.unicycle import Unicycle
 from jaxslam.motion.velocity import Velocity, VelocityNoise

@@ -5,12 +5,14 @@
 
 from jaxslam.protocols import Resample
 from jaxslam.resampling.kld import kld_bound
-from jaxslam.resampling.multinomial import multinomial
-from jaxslam.resampling.residual import residual
-from jaxslam.resampling.soft import Soft
-from jaxslam.resampling.stop_gradient import StopGradient
-from jaxslam.resampling.stratified import stratified
-from jaxslam.resampling.systematic import systematic
+from jaxslam.resampling.rules import (
+    Soft,
+    StopGradient,
+    multinomial,
+    residual,
+    stratified,
+    systematic,
+)
 
 REGISTRY: dict[str, Resample] = {
     "multinomial": multinomial,

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
-from jaxslam.datasets.formats import g2o
+from jaxslam.datasets import g2o
 from jaxslam.grids import Grid, write_map
 from jaxslam.laser_slam import LoopOutcome, Settings, Solved
 from jaxslam.laser_slam.mapping import growing_maps

@@ -1,13 +1,14 @@
-"""Sensors, one a file: those that determine a landmark here, others in `partial` and `absolute`.
+"""Sensors: those that determine a landmark are one a file, others in `partial` and `absolute`.
 
 The conformance tests run over `REGISTRY`."""
 
 from collections.abc import Callable
 
 from jaxslam.protocols import Sensor
-from jaxslam.sensors.absolute import Compass, PositionFix
+from jaxslam.sensors.absolute import Absolute, Compass, PositionFix
+from jaxslam.sensors.bearing_inverse_depth import BearingInverseDepth
 from jaxslam.sensors.line import Line
-from jaxslam.sensors.partial import BearingInverseDepth, BearingOnly, RangeOnly
+from jaxslam.sensors.partial import BearingOnly, RangeOnly
 from jaxslam.sensors.range_bearing import RangeBearing
 from jaxslam.sensors.range_bearing_signature import RangeBearingSignature
 from jaxslam.sensors.relative_position import RelativePosition
@@ -27,6 +28,7 @@ REGISTRY: dict[str, Callable[..., Sensor]] = {
 
 __all__ = [
     "REGISTRY",
+    "Absolute",
     "BearingInverseDepth",
     "BearingOnly",
     "Compass",

@@ -56,7 +56,7 @@ class Line(Sensor):
         return jnp.stack([distance, wrap(landmark[1] - frame[2])])
 
     def invert(self, pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
-        return line_from_frame(self.frame(pose), z)
+        return _line_from_frame(self.frame(pose), z)
 
     def observe_jacobians(self, pose: Pose, landmark: Landmark) -> ObserveJacobians:
         frame = self.frame(pose)
@@ -79,10 +79,10 @@ class Line(Sensor):
         return se2.polar(point)
 
     def carry(self, frame: Pose, landmark: Landmark) -> Landmark:
-        return line_from_frame(frame, landmark)
+        return _line_from_frame(frame, landmark)
 
 
-def line_from_frame(frame: Pose, landmark: Landmark) -> Landmark:
+def _line_from_frame(frame: Pose, landmark: Landmark) -> Landmark:
     """A line (r, α) of a frame in the coordinates that its pose is in: (r + n·t, α + θ)."""
     alpha = landmark[1] + frame[2]
     return jnp.stack([landmark[0] + _along(alpha, frame), wrap(alpha)])

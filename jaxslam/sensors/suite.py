@@ -1,4 +1,7 @@
-"""Several sensors on one robot, each with its own model, mount, rate and measurement slots."""
+"""Several sensors on one robot, each with its own model, mount, rate and measurement slots.
+
+And the base class of sensors that change some methods of another.
+"""
 
 import itertools
 from collections.abc import Callable, Sequence
@@ -12,8 +15,48 @@ from jaxslam.core.numbers import check_count
 from jaxslam.core.record import hold_function, record, set_field, static
 from jaxslam.math.arrays import Landmark, Measurement, Point, Pose, Unmeasured
 from jaxslam.protocols import Free, Reduced, Sensor
-from jaxslam.sensors.wrapped import Wrapped
 from jaxslam.types import Scan
+
+
+class Wrapped(Sensor):
+    """A sensor that holds another, with whose methods it answers unless it defines them."""
+
+    sensor: Sensor
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        return self.sensor.name
+
+    @property
+    def measurements(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self.sensor.measurements
+
+    @property
+    def landmark(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self.sensor.landmark
+
+    @property
+    def free(self) -> Free:  # type: ignore[override]
+        return self.sensor.free
+
+    def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
+        return self.sensor.observe(pose, landmark)
+
+    def residual(self, z: Measurement, z_hat: Measurement) -> Measurement:
+        return self.sensor.residual(z, z_hat)
+
+    def noise_cov(self, z: Measurement) -> Array:
+        cov: Array = self.sensor.noise_cov(z)
+        return cov
+
+    def invert(self, pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
+        return self.sensor.invert(pose, z, s)
+
+    def position(self, landmark: Landmark) -> Point:
+        return self.sensor.position(landmark)
+
+    def embed(self, pose: Pose, point: Point) -> Landmark:
+        return self.sensor.embed(pose, point)
 
 
 @record
@@ -172,11 +215,11 @@ def split_scan(scan: Scan, places: Sequence[int]) -> list[Scan]:
 
 def on_ground(sensor: Sensor, size: int) -> Sensor:
     """The sensor for landmarks of `size` numbers, of which it uses the first."""
-    return sensor if len(sensor.landmark) == size else OnGround(sensor, size)
+    return sensor if len(sensor.landmark) == size else _OnGround(sensor, size)
 
 
 @record
-class OnGround(Wrapped):
+class _OnGround(Wrapped):
     """A sensor for landmarks of more numbers than it uses.
 
     A measurement does not depend on the others: an absolute sensor ignores them all, and in a new

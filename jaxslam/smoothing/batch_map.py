@@ -12,8 +12,7 @@ from jaxtyping import Array, Bool, Float, Int
 from jaxslam.core.numbers import check_count
 from jaxslam.core.record import record, static
 from jaxslam.graphs.chain.elimination import Chain
-from jaxslam.graphs.chain.gauss_newton import Iterations, optimize_chain
-from jaxslam.graphs.chain.problem import Iterate, Problem
+from jaxslam.graphs.chain.problem import Iterate, Iterations, Problem, optimize_chain
 from jaxslam.graphs.solver.search import Ending
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.slots import Joint
@@ -22,8 +21,7 @@ from jaxslam.smoothing.forward_pass import (
     LogEstimator,
     log_in_one_dtype,
 )
-from jaxslam.smoothing.linearization import chain_of, noise_roots, start_of
-from jaxslam.smoothing.smooth import solution, with_singular
+from jaxslam.smoothing.smoother import chain_of, noise_roots, solution, start_of, with_singular
 from jaxslam.types import Estimate, Info, Log, Trace
 
 

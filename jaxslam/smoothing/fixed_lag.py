@@ -8,8 +8,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxslam import validation
-from jaxslam.association.known import Known
-from jaxslam.charts.euclidean import Euclidean
+from jaxslam.association.rules import Known
+from jaxslam.charts import Euclidean
 from jaxslam.core.numbers import check_count
 from jaxslam.core.record import hold_function, record, static
 from jaxslam.filters.ekf.ekf_slam import EkfSlam
@@ -35,7 +35,7 @@ from jaxslam.types import Estimate, Info, Scan, Status
 POINT = ("x [m]", "y [m]")
 
 
-class WindowState(NamedTuple):
+class _WindowState(NamedTuple):
     """The state of `FixedLag`."""
 
     joint: Joint
@@ -119,21 +119,21 @@ class FixedLag(Filter):
     def landmark(self) -> tuple[str, ...]:  # type: ignore[override]
         return self.sensor.landmark
 
-    def init(self, pose: Array, pose_cov: Array) -> WindowState:
+    def init(self, pose: Array, pose_cov: Array) -> _WindowState:
         return self._begun(self._ekf.init(pose, pose_cov))
 
-    def predict(self, state: WindowState, u: Array, key: Array) -> WindowState:
+    def predict(self, state: _WindowState, u: Array, key: Array) -> _WindowState:
         motion, joint = self.motion, self._ekf.predict(state.joint, u, key)
         system = linearize_window(
             motion, self.sensor, state.prior, state.steps, state.at, self.first_estimates
         )
         prior = marginalize_oldest(state.prior, system, state.steps, state.at, joint.tag)
-        state = finite_or(state._replace(prior=prior), self._begun(state.joint))
+        state = _finite_or(state._replace(prior=prior), self._begun(state.joint))
         root = linalg.root_psd(motion.noise_cov(state.joint.pose, u))
         steps, at = shift(state.steps, state.at, u, root, joint.pose)
-        return WindowState(joint, state.prior, steps, at)
+        return _WindowState(joint, state.prior, steps, at)
 
-    def update(self, state: WindowState, scan: Scan, key: Array) -> tuple[WindowState, Info]:
+    def update(self, state: _WindowState, scan: Scan, key: Array) -> tuple[_WindowState, Info]:
         motion, sensor = self.motion, self.sensor
         if scan.z.shape[0] > self.slots:
             raise ValueError(
@@ -147,7 +147,7 @@ class FixedLag(Filter):
         joint, info = self._ekf.update(state.joint, kept, key)
         status = jnp.where(lost, jnp.int32(Status.SINGULAR), info.status)
         info = info._replace(status=status.astype(info.status.dtype))
-        steps = with_scan(state.steps, scan, info)
+        steps = _with_scan(state.steps, scan, info)
         born = joint.alive & ~state.joint.alive
         landmarks = jnp.where(born[:, None], joint.landmarks, state.at.landmarks)
         at = state.at._replace(landmarks=landmarks)
@@ -155,24 +155,24 @@ class FixedLag(Filter):
             system = linearize_window(motion, sensor, state.prior, steps, at, self.first_estimates)
             solved = solve_window(state.prior, system, at, joint.alive)
             at = moved_by(motion, steps, at, solved)
-        newest = with_newest(joint, at, newest_cov(system, solved))
-        after = WindowState(newest, state.prior, steps, at)
-        exhausted = jnp.asarray(info.exhausted) | ~is_finite(after)
-        return finite_or(after, self._begun(joint)), info._replace(exhausted=exhausted)
+        newest = _with_newest(joint, at, newest_cov(system, solved))
+        after = _WindowState(newest, state.prior, steps, at)
+        exhausted = jnp.asarray(info.exhausted) | ~_is_finite(after)
+        return _finite_or(after, self._begun(joint)), info._replace(exhausted=exhausted)
 
-    def estimate(self, state: WindowState) -> Estimate:
+    def estimate(self, state: _WindowState) -> Estimate:
         return self._ekf.estimate(state.joint)
 
     @property
     def _ekf(self) -> EkfSlam:
         return joint_ekf(self)
 
-    def _begun(self, joint: Joint) -> WindowState:
+    def _begun(self, joint: Joint) -> _WindowState:
         sizes = len(self.motion.controls), len(self.motion.noises)
-        return empty_window(joint, sizes, (self.window, self.slots))
+        return _empty_window(joint, sizes, (self.window, self.slots))
 
 
-def empty_window(joint: Joint, sizes: tuple[int, int], shape: tuple[int, int]) -> WindowState:
+def _empty_window(joint: Joint, sizes: tuple[int, int], shape: tuple[int, int]) -> _WindowState:
     """The state before the first step. sizes: of a control and its noise; shape: W and M."""
     (control, noise), (window, places), kind = sizes, shape, joint.pose.dtype
     steps = WindowSteps(
@@ -185,18 +185,18 @@ def empty_window(joint: Joint, sizes: tuple[int, int], shape: tuple[int, int]) -
     )
     path = jnp.tile(joint.pose, (window + 1, 1))
     at = WindowIterate(path, jnp.zeros((window, noise), kind), joint.landmarks)
-    return WindowState(joint, WindowPrior(joint, (joint.pose, joint.landmarks)), steps, at)
+    return _WindowState(joint, WindowPrior(joint, (joint.pose, joint.landmarks)), steps, at)
 
 
-def is_finite(state: WindowState) -> Bool[Array, ""]:
+def _is_finite(state: _WindowState) -> Bool[Array, ""]:
     """Whether all numbers of a state are finite."""
     return jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(state)]).all()
 
 
-def finite_or(state: WindowState, other: WindowState) -> WindowState:
+def _finite_or(state: _WindowState, other: _WindowState) -> _WindowState:
     """The state if all its numbers are finite, else the other one."""
-    finite = is_finite(state)
-    chosen: WindowState = jax.tree.map(lambda a, b: jnp.where(finite, a, b), state, other)
+    finite = _is_finite(state)
+    chosen: _WindowState = jax.tree.map(lambda a, b: jnp.where(finite, a, b), state, other)
     return chosen
 
 
@@ -223,7 +223,7 @@ def shift(
     return after, at._replace(path=append(at.path, pose), noise=append(at.noise, 0.0))
 
 
-def with_scan(steps: WindowSteps, scan: Scan, info: Info) -> WindowSteps:
+def _with_scan(steps: WindowSteps, scan: Scan, info: Info) -> WindowSteps:
     """The window with the measurements of its newest scan that were fused or started landmarks."""
     used = (info.status == Status.FUSED) | (info.status == Status.BORN)
     z = jnp.where(scan.valid[:, None], scan.z, 0.0)
@@ -235,7 +235,7 @@ def with_scan(steps: WindowSteps, scan: Scan, info: Info) -> WindowSteps:
     )
 
 
-def with_newest(joint: Joint, at: WindowIterate, cov: Float[Array, "D D"]) -> Joint:
+def _with_newest(joint: Joint, at: WindowIterate, cov: Float[Array, "D D"]) -> Joint:
     """The joint with the newest pose and the map of a window; unit variance at dead slots."""
     there = jnp.repeat(joint.alive, joint.landmarks.shape[1])
     there = jnp.concatenate([jnp.ones(3, bool), there])

@@ -9,7 +9,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Float
 
 from jaxslam import validation
-from jaxslam.association.known import Known
+from jaxslam.association.rules import Known
 from jaxslam.core.numbers import held_array
 from jaxslam.core.record import hold_function, record, set_field, static
 from jaxslam.filters.ekf.ekf_slam import EkfSlam

@@ -1,9 +1,8 @@
 """Topological maps: places and doors from a grid, routes, and the place of a particle set."""
 
-from jaxslam.topology.path_places import PathPlaces, path_places
-from jaxslam.topology.places import Door, TopologicalMap, topological_map
+from jaxslam.topology.places import Door, PathPlaces, TopologicalMap, path_places, topological_map
 from jaxslam.topology.planning import Route, place_of, place_weights, route
-from jaxslam.topology.skeleton import Skeleton, skeleton
+from jaxslam.topology.voronoi import Skeleton, skeleton
 
 __all__ = [
     "Door",

@@ -17,8 +17,10 @@ from jaxslam.validation.models import (
     check_parts,
     check_record,
     check_sensor,
+    checked_estimate,
+    same_state,
+    state_and_info,
 )
-from jaxslam.validation.returned import checked_estimate, same_state, state_and_info
 
 __all__ = [
     "check_alpha",

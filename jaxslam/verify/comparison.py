@@ -6,14 +6,14 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.verify.derivatives.jacobians import Evaluated, Jacobians
 from jaxslam.verify.inputs.samples import LARGE, NOMINAL, Samples
+from jaxslam.verify.jacobians import Evaluated, Jacobians
 from jaxslam.verify.record import Finding, WorstState, WrongEntry
 
 Values: TypeAlias = Float[np.ndarray, "_ _ _"]
 """Jacobians (S, m, n)."""
 
-DIFFERENCES_TOLERANCE = 1e-6
+_DIFFERENCES_TOLERANCE = 1e-6
 """relative tolerance of the quotients, beyond ten times their estimated error"""
 _CONVERGED = 1e-3
 """largest relative error of a quotient that counts as converged"""
@@ -90,7 +90,7 @@ def _compare(evaluation: Jacobians, tolerance: float, float32_tolerance: float) 
         own = np.abs(value).max(axis=2, keepdims=True, initial=0.0)
         trusted = ((error <= _CONVERGED * own) | (error <= _NOTHING)) & ~kink
         away = np.where(trusted, np.where(np.isfinite(away), away, np.inf), 0.0)
-        excess_away = _relative(away, DIFFERENCES_TOLERANCE * scale + 10 * error)
+        excess_away = _relative(away, _DIFFERENCES_TOLERANCE * scale + 10 * error)
         # At a kink any value between the one-sided derivatives is accepted. Elsewhere, if the
         # quotients do not converge, the result of autodiff may depend on rounding; where its two
         # modes differ, the entries are not compared.
@@ -142,7 +142,7 @@ def _finding(
         near = room
         if evaluation.quotient is not None:
             values["differences"] = float(evaluation.quotient.value[s, i, j])
-            near += DIFFERENCES_TOLERANCE * size + 10 * float(evaluation.quotient.error[s, i, j])
+            near += _DIFFERENCES_TOLERANCE * size + 10 * float(evaluation.quotient.error[s, i, j])
         return WrongEntry(
             row=function.outputs[i],
             column=argument.entries[j],
@@ -177,7 +177,7 @@ def _finding(
         float32=float(compared.relative32.max(initial=0.0)) if evaluation.single else None,
         float32_tolerance=float32_tolerance,
         differences=float(compared.from_quotient.max(initial=0.0)) if has_quotient else None,
-        differences_tolerance=DIFFERENCES_TOLERANCE,
+        differences_tolerance=_DIFFERENCES_TOLERANCE,
         quotient=evaluation.how,
         samples=len(samples.labels),
         no_derivative=compared.no_derivative,

@@ -13,7 +13,6 @@ from jaxslam.math.arrays import float64
 from jaxslam.math.xla import quick_jit
 from jaxslam.protocols import Motion, Sensor
 from jaxslam.verify import properties
-from jaxslam.verify.derivatives.jacobians import Evaluated, evaluate_jacobians
 from jaxslam.verify.errors import describe_error
 from jaxslam.verify.finite import singular_notes
 from jaxslam.verify.inputs import samples
@@ -23,13 +22,14 @@ from jaxslam.verify.inputs.functions import (
     sensor_functions,
 )
 from jaxslam.verify.inputs.samples import Samples
+from jaxslam.verify.jacobians import Evaluated, evaluate_jacobians
 from jaxslam.verify.linearity import motion_linearity, sensor_linearity
 from jaxslam.verify.record import Check
 
 Model: TypeAlias = Motion | Sensor | Factor | BeamModel | Callable[..., jax.Array]
 
 
-class Examined(NamedTuple):
+class _Examined(NamedTuple):
     """All Jacobians of a model at all states, and the results of the other checks."""
 
     evaluated: tuple[Evaluated, ...]
@@ -44,7 +44,7 @@ def examine(
     given: Samples | None = None,
     count: int = 24,
     seed: int = 0,
-) -> Examined:
+) -> _Examined:
     """Evaluate all Jacobians of a model, and run the other checks, in float64.
 
     Args:
@@ -74,7 +74,7 @@ def examine(
         singular: list[str] = []
         if given is None and not isinstance(model, Motion | Sensor):
             singular = [note for one in evaluated for note in singular_notes(one)]
-    return Examined(evaluated, tuple(checks), tuple(singular))
+    return _Examined(evaluated, tuple(checks), tuple(singular))
 
 
 def functions_of(model: Motion | Sensor) -> tuple[Function, ...]:
@@ -93,7 +93,7 @@ def _model_checks(model: Model, drawn: tuple[Samples, ...]) -> Iterator[Check]:
         yield Check("the remaining checks", False, describe_error(error))
 
 
-def typical_linearity(model: Model, examined: Examined) -> float | None:
+def typical_linearity(model: Model, examined: _Examined) -> float | None:
     """The median linearity index over the random states; None for a function or if it fails.
 
     Standard deviations follow from the units.

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.math.xla import quick_jit
-from jaxslam.verify.derivatives.jacobians import Evaluated
 from jaxslam.verify.errors import place_of_error
 from jaxslam.verify.inputs.functions import Function, at_state
 from jaxslam.verify.inputs.samples import coincident
+from jaxslam.verify.jacobians import Evaluated
 from jaxslam.verify.record import Check
 
 State = Sequence[np.ndarray]

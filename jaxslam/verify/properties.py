@@ -12,12 +12,12 @@ from numpy.typing import ArrayLike
 from jaxslam.core.numbers import check_covariance
 from jaxslam.math.xla import quick_jit
 from jaxslam.protocols import Motion, Sensor
-from jaxslam.verify.derivatives.differences import modulo_periods
-from jaxslam.verify.derivatives.jacobians import Evaluated
+from jaxslam.verify.differences import modulo_periods
 from jaxslam.verify.errors import describe_error
 from jaxslam.verify.finite import finite_check
 from jaxslam.verify.inputs.functions import Function, at_state, periods, sensor_functions
 from jaxslam.verify.inputs.samples import NOMINAL, Samples
+from jaxslam.verify.jacobians import Evaluated
 from jaxslam.verify.record import Check
 
 Values: TypeAlias = np.ndarray

@@ -13,8 +13,8 @@ from jaxslam.protocols import Motion, Sensor
 from jaxslam.verify.comparison import compare_methods
 from jaxslam.verify.examination import Model, examine, functions_of, typical_linearity
 from jaxslam.verify.inputs.beam_models import FAR, beam_function, beam_samples
-from jaxslam.verify.inputs.claims import Claim
 from jaxslam.verify.inputs.functions import (
+    Claim,
     Function,
     factor_function,
     makes_a_model,

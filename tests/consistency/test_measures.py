@@ -13,11 +13,11 @@ from test_consistency import STEPS, plain_nees, scored, summed, synthetic
 from jaxslam import charts, consistency, motion, sensors
 from jaxslam.consistency.nees import block_nees
 from jaxslam.consistency.score import EVENTS, _null_space
-from jaxslam.filters.ekf.coordinates.to_points import ToPoints
+from jaxslam.filters.ekf.map_coordinates import ToPoints
 from jaxslam.filters.ekf.observability import Monitor
 from jaxslam.filters.map_management.merging import Merged
-from jaxslam.filters.particles.states.moments import weighted_pose_moments
-from jaxslam.filters.particles.states.particle_info import ParticleInfo
+from jaxslam.filters.particles.pose_particles import weighted_pose_moments
+from jaxslam.filters.particles.slam_particles import ParticleInfo
 from jaxslam.filters.reporting import Pruned
 from jaxslam.simulation.spurious import Spurious
 from jaxslam.simulation.worlds import simulate

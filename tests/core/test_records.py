@@ -285,7 +285,6 @@ def test_filters_of_the_catalog_hold_numbers_alone(name):
             np.zeros((6, 2)),
             4,
             gate=9.0,
-            slack=2.0,
             forget=(0.1, 0.2),
         ),
     ],

@@ -33,11 +33,15 @@ def test_a_data_set_that_does_not_fit_together_is_refused(tmp_path):
 
 
 @pytest.mark.parametrize("name", SMALL)
-def test_noise_can_be_overridden(tmp_path, name):
+def test_noise_can_be_replaced(tmp_path, name):
     files, read = SMALL[name]
     noises = (3 * np.eye(2 if name == "mrclam" else 3), 2 * np.eye(2))
-    options = dict(zip(("odometry_cov", "measurement_cov"), noises, strict=True))
-    assert_noises(read(write(tmp_path, files), **options), *noises)
+    data = read(write(tmp_path, files))
+    models = (data.motion, data.sensor)
+    moved, seen = (
+        dataclasses.replace(model, noise_cov=cov) for model, cov in zip(models, noises, strict=True)
+    )
+    assert_noises(dataclasses.replace(data, motion=moved, sensor=seen), *noises)
 
 
 @pytest.mark.parametrize(

@@ -12,7 +12,7 @@ from test_plaza import written
 from test_table import OWN, SETTINGS, TRUTH
 
 from jaxslam import datasets, grids
-from jaxslam.datasets.formats import g2o, ros_map
+from jaxslam.datasets import g2o, ros_map
 
 WIDE = int(os.environ.get("JAXSLAM_FUZZ", "1"))
 """How many times as many examples are tried, as by `python -m benchmarks.fuzz`."""

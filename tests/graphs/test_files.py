@@ -9,7 +9,7 @@ import small_graphs
 from recordings import DATA
 
 from jaxslam import graphs
-from jaxslam.datasets.formats import g2o
+from jaxslam.datasets import g2o
 
 SMALL = """# by hand
 VERTEX_SE2 7 0.5 -1.25 0.1

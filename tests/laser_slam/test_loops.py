@@ -6,7 +6,7 @@ import pytest
 from jaxslam import graphs
 from jaxslam.laser_slam import covariances
 from jaxslam.laser_slam.assembly import ROOM, graph_of, relative_covs, table_of
-from jaxslam.laser_slam.loops.descriptor import SECTORS, descriptors
+from jaxslam.laser_slam.loops.candidates import SECTORS, descriptors
 from jaxslam.laser_slam.loops.pairwise import clique, consistent
 from jaxslam.math import numpy_poses as poses
 

@@ -8,7 +8,7 @@ from ring_of_rooms import SETTINGS, driven
 
 from jaxslam import laser_slam, metrics
 from jaxslam.laser_slam import covariances
-from jaxslam.laser_slam import relations as module
+from jaxslam.laser_slam import score as module
 from jaxslam.math import numpy_poses as poses
 
 

@@ -5,7 +5,7 @@ import numpy as np
 from scanned_rooms import by_polynomial, line_cost
 
 from jaxslam.matching import Prior
-from jaxslam.matching.icp.closed_form import added, least, of_lines, of_points, of_prior
+from jaxslam.matching.closed_form import added, least, of_lines, of_points, of_prior
 
 rng = np.random.default_rng(4)
 COUNT, CASES = 12, 6

@@ -11,7 +11,7 @@ from jaxslam.core.record import record
 from jaxslam.grids import Field
 from jaxslam.matching import IcpSettings, MatchStatus, Prior, covariance
 from jaxslam.matching.field import field_residuals
-from jaxslam.matching.points import Points
+from jaxslam.matching.point_sets import Points
 from jaxslam.math.stats import chi2_band
 
 SIGMA, RUNS = 0.03, 60

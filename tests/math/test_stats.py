@@ -1,9 +1,7 @@
-"""stats: chi-square tails, quantiles and bands against SciPy, published tables and sampling."""
+"""stats: chi-square quantiles and bands against SciPy, published tables and sampling."""
 
-import jax
 import numpy as np
 import pytest
-import scipy.integrate
 import scipy.stats
 
 from jaxslam import stats
@@ -11,47 +9,18 @@ from jaxslam import stats
 DOFS = [1, 2, 3, 5, 40]
 
 
-def density(x, dof):
-    """χ²'s density from its formula."""
-    log_gamma = scipy.special.gammaln(dof / 2)
-    return np.exp((dof / 2 - 1) * np.log(x) - x / 2 - dof / 2 * np.log(2) - log_gamma)
-
-
 @pytest.mark.parametrize("dof", DOFS)
-def test_tail_is_the_integral_of_the_density(dof):
-    for x in (0.1, 1.0, dof, 3.0 * dof):
-        area, _ = scipy.integrate.quad(density, x, np.inf, args=(dof,))
-        np.testing.assert_allclose(stats.chi2_tail(x, dof), area, atol=1e-8)
-    far = np.array([50.0, 200.0])
-    np.testing.assert_allclose(stats.chi2_tail(far, dof), scipy.stats.chi2.sf(far, dof), rtol=1e-9)
-
-
-@pytest.mark.parametrize("dof", DOFS)
-def test_slope_of_the_tail_is_minus_the_density(dof):
-    x = np.array([0.1, 0.7, 1.0, 3.0, 20.0, 45.0])
-    slope = jax.jit(jax.vmap(jax.grad(lambda x: stats.chi2_tail(x, dof))))(x)
-    np.testing.assert_allclose(slope, -density(x, dof), rtol=1e-9)
-
-
-def test_tail_is_one_at_and_below_zero_with_finite_slope():
-    x = np.array([0.0, -1.0])
-    np.testing.assert_array_equal(stats.chi2_tail(x, 2), [1, 1])
-    np.testing.assert_array_equal(jax.vmap(jax.grad(lambda x: stats.chi2_tail(x, 2)))(x), [0, 0])
-    assert stats.chi2_tail(np.float32(1), 2).dtype == np.float32
-
-
-@pytest.mark.parametrize("dof", DOFS)
-def test_quantile_undoes_the_tail(dof):
+def test_quantile_undoes_the_tail_of_scipy(dof):
     for p in (1e-4, 0.025, 0.5, 0.95, 0.9999):
         x = stats.chi2_quantile(p, dof)
         assert isinstance(x, float)
-        np.testing.assert_allclose(stats.chi2_tail(x, dof), 1 - p, rtol=1e-9)
+        np.testing.assert_allclose(scipy.stats.chi2.sf(x, dof), 1 - p, rtol=1e-9)
 
 
 def test_sigma_ellipses_hold_what_solas_table_says():
     """Solà B.3.1 Table 3, with the digits of the errata, per cent."""
     for dof, table in ((2, [39.35, 86.47, 98.89, 99.97]), (3, [19.87, 73.85, 97.07, 99.89])):
-        held = [100 * (1 - float(stats.chi2_tail(stats.sigma_gate(n), dof))) for n in (1, 2, 3, 4)]
+        held = [100 * scipy.stats.chi2.cdf(stats.sigma_gate(n), dof) for n in (1, 2, 3, 4)]
         np.testing.assert_allclose(held, table, atol=0.005)
     assert stats.sigma_gate(3) == 9
     assert stats.sigma_gate(0.5) == 0.25

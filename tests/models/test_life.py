@@ -11,7 +11,7 @@ from worlds import narrow
 
 from jaxslam import life, motion, run, sensors, slots
 from jaxslam.filters import EkfSlam
-from jaxslam.life.existence import Evidence
+from jaxslam.life import Evidence
 from jaxslam.slots import Joint
 from jaxslam.types import Log, Scan, Status
 

@@ -14,7 +14,7 @@ from own_models import changed
 from jaxslam import Scenario, catalog, filters, grids, motion, run, sensors, simulate, store
 from jaxslam.core.record import record
 from jaxslam.filters import reporting
-from jaxslam.grids.localization.localize import info_of_beams
+from jaxslam.grids.localization import info_of_beams
 from jaxslam.monte_carlo import Interrupted, missing, monte_carlo, work
 from jaxslam.monte_carlo.candidates import fitting_block, without_noise
 from jaxslam.simulation.laser import scan_world

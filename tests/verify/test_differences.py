@@ -3,8 +3,7 @@
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.verify import verify_jacobians
-from jaxslam.verify.derivatives import differences
+from jaxslam.verify import differences, verify_jacobians
 
 
 def smooth(x):

@@ -11,8 +11,7 @@ from jaxslam import grids
 from jaxslam.cli.laser.job import Job, figure_files
 from jaxslam.cli.laser.options import check_poses
 from jaxslam.cli.run.piecewise import padded_rows
-from jaxslam.datasets import LaserLog
-from jaxslam.datasets.formats import ros_map
+from jaxslam.datasets import LaserLog, ros_map
 from jaxslam.grids import Counts, Grid
 from jaxslam.math import numpy_poses as poses
 from jaxslam.monte_carlo.progress import Progress

@@ -15,7 +15,7 @@ from jaxslam.cli.common import SUMMARY, check_out, pick
 from jaxslam.cli.optimize.figures import WORST, as_text, figure_writer, film_writers
 from jaxslam.cli.runtime.compile_clock import CompileClock
 from jaxslam.core.numbers import check_count
-from jaxslam.datasets.formats import g2o
+from jaxslam.datasets import g2o
 from jaxslam.graphs import Ending, Graph, starts
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import TRUSTED

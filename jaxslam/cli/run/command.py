@@ -26,8 +26,7 @@ from jaxslam.cli.run.film import film_steps, films, shown_state
 from jaxslam.cli.run.filters import chosen_filters, on_true_poses, with_options
 from jaxslam.cli.run.piecewise import PiecewiseRun, run_in_pieces
 from jaxslam.datasets import READERS, Dataset, Reader
-from jaxslam.datasets.evaluation import Evaluation, evaluate
-from jaxslam.datasets.map_test import joint_map_cov
+from jaxslam.datasets.evaluation import Evaluation, evaluate, joint_map_cov
 from jaxslam.monte_carlo.progress import Progress
 from jaxslam.protocols import Filter
 from jaxslam.results import report

@@ -6,11 +6,11 @@ import dataclasses
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.association.known import Known
+from jaxslam.association.rules import Known
 from jaxslam.catalog import ALL, CANONICAL, SMOOTHERS, on_given_poses
 from jaxslam.cli.common import pick
 from jaxslam.datasets import Dataset
-from jaxslam.datasets.table.association import association_options
+from jaxslam.datasets.table.models import association_options
 from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.protocols import Candidate, Filter
 from jaxslam.simulation.worlds import Scenario

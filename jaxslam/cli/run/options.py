@@ -9,7 +9,7 @@ from jaxslam.cli.run.command import run_dataset
 from jaxslam.cli.run.filters import NAMES
 from jaxslam.cli.runtime import cache
 from jaxslam.datasets import READERS
-from jaxslam.datasets.table.association import METHODS
+from jaxslam.datasets.table.models import METHODS
 from jaxslam.results.campaign_files import FORMATS
 
 

@@ -6,11 +6,11 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.datasets.formats.lines import TextFile
+from jaxslam.datasets.lines import TextFile
 
 POSE = ("x", "y", "theta")
-TIMES = ("timestamp", "logger time")
-BEFORE = 9
+_TIMES = ("timestamp", "logger time")
+_BEFORE = 9
 """Fields of ROBOTLASER and RAWLASER before the ranges."""
 
 
@@ -58,11 +58,11 @@ def _flaser(file: TextFile, line: int, fields: list[str], row: int) -> Scan:
     ranges = _ranges(file, line, fields[2 : 2 + count])
     laser = file.numbers(line, fields[2 + count : 5 + count], POSE)
     robot = file.numbers(line, fields[5 + count : 8 + count], POSE)
-    times = file.numbers(line, [fields[-3], fields[-1]], TIMES)
-    return Scan(line, ranges, angles_of(count), laser, robot, times, np.inf, False, row)
+    times = file.numbers(line, [fields[-3], fields[-1]], _TIMES)
+    return Scan(line, ranges, _angles_of(count), laser, robot, times, np.inf, False, row)
 
 
-def angles_of(count: int) -> Float[np.ndarray, "n"]:
+def _angles_of(count: int) -> Float[np.ndarray, "n"]:
     """The angles of n beams of FLASER [rad], which has none: those of a SICK LMS, as in CARMEN.
 
     1° apart for 180, ½° for 360, from -90° on: there the last beam is left out. ¼° apart for 400
@@ -79,11 +79,11 @@ def _configured_laser(file: TextFile, line: int, fields: list[str], row: int) ->
     remission-mode n r… m remission… time host t`, before the time of ROBOTLASER two poses and five
     more fields."""
     after = 14 if has_poses(fields[0]) else 3
-    count = _count(file, line, fields, BEFORE - 1)
-    remissions = _count(file, line, fields, BEFORE + count)
-    _expect(file, line, fields, BEFORE + count + 1 + remissions + after)
+    count = _count(file, line, fields, _BEFORE - 1)
+    remissions = _count(file, line, fields, _BEFORE + count)
+    _expect(file, line, fields, _BEFORE + count + 1 + remissions + after)
     first, step = file.numbers(line, [fields[2], fields[4]], ("start angle", "resolution"))
-    ranges = _ranges(file, line, fields[BEFORE : BEFORE + count])
+    ranges = _ranges(file, line, fields[_BEFORE : _BEFORE + count])
     stated = _ranges(file, line, [fields[5]], "the maximum range")[0]
     good = 0 < stated < np.finfo(float).max
     limit = float(stated) if good else np.inf
@@ -91,7 +91,7 @@ def _configured_laser(file: TextFile, line: int, fields: list[str], row: int) ->
     if has_poses(fields[0]):
         laser = file.numbers(line, fields[-after : 3 - after], POSE)
         robot = file.numbers(line, fields[3 - after : 6 - after], POSE)
-    times = file.numbers(line, [fields[-3], fields[-1]], TIMES)
+    times = file.numbers(line, [fields[-3], fields[-1]], _TIMES)
     angles = first + step * np.arange(count)
     return Scan(line, ranges, angles, laser, robot, times, limit, not good, row)
 

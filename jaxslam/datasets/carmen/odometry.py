@@ -7,10 +7,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.datasets.formats.lines import TextFile
+from jaxslam.datasets.lines import TextFile
 from jaxslam.math import numpy_poses as poses
 
-JOINED = 1e-3
+_JOINED = 1e-3
 """[s] within which a stamp of a file of odometry is that of a scan."""
 
 
@@ -123,7 +123,7 @@ def of_file(
 ) -> tuple[RawOdometry, Float[np.ndarray, "K"], str]:
     """The odometry of a file, lines `t x y θ`, at each scan, the scans' times, and how they join.
 
-    Each scan takes the line whose stamp is nearest, within `JOINED`. Where there are as many lines
+    Each scan takes the line whose stamp is nearest, within `_JOINED`. Where there are as many lines
     as scans and no stamp contradicts that, they join in order, and the lines' stamps are the times.
 
     Raises ValueError, with file and line, on lines that are none; on stamps that do not join.
@@ -138,7 +138,7 @@ def of_file(
     after = np.clip(np.searchsorted(stamps[order], time), 1, max(len(rows) - 1, 1))
     pair = order[np.minimum(np.stack([after - 1, after]), len(rows) - 1)]
     row = np.take_along_axis(pair, np.abs(stamps[pair] - time).argmin(axis=0)[None], axis=0)[0]
-    joins = np.abs(stamps[row] - time) <= JOINED
+    joins = np.abs(stamps[row] - time) <= _JOINED
     told = f"raw odometry is of {file.path}: {len(rows):,} lines, "
     if joins.all():
         used = len(np.unique(row))
@@ -150,7 +150,7 @@ def of_file(
         raise ValueError(
             f"{file.path}: stamps from {stamps.min():.6f} s to {stamps.max():.6f} s join "
             f"{int(joins.sum())} of the {scans} scans of {source}, from {time.min():.6f} s to "
-            f"{time.max():.6f} s, within {JOINED:g} s; expected all, or a line for each scan"
+            f"{time.max():.6f} s, within {_JOINED:g} s; expected all, or a line for each scan"
         )
     path_of = table[:, 1:]
     everywhere = np.ones(scans, bool)

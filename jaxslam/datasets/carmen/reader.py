@@ -2,17 +2,20 @@
 
 Source of the public logs: Radish, the robotics data set repository (Howard & Roy 2003); corrected
 by the particle filter of GMapping (Grisetti, Stachniss & Burgard 2007).
+
+The record of a laser log.
 """
 
 from collections import Counter
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam.datasets.carmen.lines import POSE, Scan, has_poses, is_scan, scan_of
-from jaxslam.datasets.carmen.log import LaserLog
 from jaxslam.datasets.carmen.odometry import (
     RawOdometry,
     chained,
@@ -21,11 +24,51 @@ from jaxslam.datasets.carmen.odometry import (
     without_lines,
 )
 from jaxslam.datasets.carmen.scans import beams_of, checked_mount, clock_of, mount_of, robot_poses
-from jaxslam.datasets.formats.lines import TextFile
+from jaxslam.datasets.lines import TextFile
 from jaxslam.math import numpy_poses as poses
+from jaxslam.types import Beams
+
+
+@dataclass(frozen=True, eq=False)
+class LaserLog:
+    """A laser log: K scans of at most B beams, T lines of raw odometry; poses are the robot's."""
+
+    name: str
+    source: str
+    laser: str
+    """the kind of the lines that hold the scans, as FLASER"""
+    placed: bool
+    """whether these have poses: else `corrected` is zero"""
+    time: Float[np.ndarray, "K"]
+    """[s] at which each scan was taken; may repeat where the file has few digits"""
+    beams: Beams
+    """with leading K, in the frame of the laser; shorter scans are padded by beams that are not
+    valid"""
+    corrected: Float[np.ndarray, "K 3"]
+    """the robot's pose that stands in the line of the scan: a reference, not the truth"""
+    raw: Float[np.ndarray, "K 3"]
+    """raw odometry at each scan"""
+    odometry_known: Bool[np.ndarray, "K"]
+    """whether raw odometry tells of the step from the scan before; where not, it stands still. True
+    for the first"""
+    row: Int[np.ndarray, "K"]
+    """the last line of raw odometry before each scan, as an index of `odometry`; -1 where there is
+    none before"""
+    odometry: Float[np.ndarray, "T 3"]
+    odometry_time: Float[np.ndarray, "T"]
+    """[s] as logged: 0 or anything in a line that sets the odometry"""
+    max_range: float
+    """[m]: ranges from here on are of beams that met nothing, and are set to it"""
+    mount: Float[np.ndarray, "3"]
+    """the laser's pose on the robot"""
+    dropped: Mapping[str, int]
+    """what the reader left out, by kind"""
+    corrections: tuple[str, ...]
+    """what it changed, in words"""
+
 
 ODOMETRY = (*POSE, "v", "omega", "acceleration", "time", "host", "logger time")
-PREFERRED = ("FLASER", "ROBOTLASER1", "RAWLASER1", "RLASER")
+_PREFERRED = ("FLASER", "ROBOTLASER1", "RAWLASER1", "RLASER")
 """Kinds of scans in the order in which they are taken where there are as many of each."""
 
 
@@ -157,7 +200,7 @@ def _kind(file: TextFile, counts: Counter[str], asked: str | None) -> str:
             "expected a line FLASER, RLASER, ROBOTLASER1 or RAWLASER1, and so on, got none"
         )
     if asked is None:
-        first = {kind: rank for rank, kind in enumerate(PREFERRED)}
+        first = {kind: rank for rank, kind in enumerate(_PREFERRED)}
         rank = [
             (not has_poses(kind), -count, first.get(kind, len(first)), kind)
             for kind, count in counts.items()

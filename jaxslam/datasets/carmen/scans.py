@@ -7,14 +7,14 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam.datasets.carmen.lines import Scan
-from jaxslam.datasets.formats.lines import TextFile
+from jaxslam.datasets.lines import TextFile
 from jaxslam.math import numpy_poses as poses
 from jaxslam.types import Beams
 
 LOOSE = 0.01, np.deg2rad(0.5)
 """[m], [rad] by which the mount may differ between lines."""
 
-REAR = np.array([0.0, 0.0, np.pi])
+_REAR = np.array([0.0, 0.0, np.pi])
 
 
 def clock_of(scans: list[Scan], corrections: list[str]) -> int:
@@ -98,7 +98,7 @@ def mount_of(file: TextFile, kind: str, scans: list[Scan]) -> Float[np.ndarray, 
     Raises ValueError, with file and line, where it differs between lines.
     """
     if not kind.startswith("ROBOTLASER"):
-        return REAR.copy() if kind == "RLASER" else np.zeros(3)
+        return _REAR.copy() if kind == "RLASER" else np.zeros(3)
     laser, robot = (np.array([getattr(scan, of) for scan in scans]) for of in ("laser", "robot"))
     mounts = poses.between(robot, laser)
     off = poses.between(mounts[0], mounts)

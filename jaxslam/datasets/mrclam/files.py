@@ -5,7 +5,7 @@ from pathlib import Path
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.datasets.formats.lines import TextFile, stored
+from jaxslam.datasets.lines import TextFile, stored
 
 ROBOTS = range(1, 6)
 """Subjects 1 to 5 are the robots; they carry barcodes like the landmarks, 6 to 20."""

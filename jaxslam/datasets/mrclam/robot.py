@@ -8,17 +8,49 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
-from numpy.typing import ArrayLike
 
 from jaxslam.datasets.mrclam.calibration import RobotCalibration, per_interval, recorded
 from jaxslam.datasets.mrclam.files import read_robot, read_truth
-from jaxslam.datasets.mrclam.truth import START_COV, cut_after, true_poses
-from jaxslam.logs.streams import hold
+from jaxslam.logs.streams import hold, interpolate_poses
 from jaxslam.motion import Unicycle
 from jaxslam.noise import NoiseCov
-from jaxslam.protocols import Motion, Sensor
 from jaxslam.sensors import RangeBearing
 from jaxslam.types import Log
+
+GAP = 0.2
+"""Time between lines of the truth beyond which it is unknown between them [s]."""
+START_COV = np.diag([0.01, 0.01, 0.03]) ** 2
+"""Covariance of a true pose. Of robot 1 of data set 6, headings that two landmarks give agree with
+the recorded ones to 0.03 rad, with errors that last for tens of seconds."""
+
+
+def cut_after(
+    odometry: Float[np.ndarray, "K 3"], end: float
+) -> tuple[Float[np.ndarray, "J 3"], int]:
+    """Odometry without the (0, 0) lines at its end that are later than `end`, and their number.
+
+    A recorder that goes on after the robot has stopped writes such lines. The first of them stays,
+    so that the robot stands still from there on.
+    """
+    moving = np.flatnonzero(odometry[:, 1:].any(axis=1) | (odometry[:, 0] <= end))
+    keep = min(int(moving[-1]) + 2 if moving.size else 1, len(odometry))
+    return odometry[:keep], len(odometry) - keep
+
+
+def true_poses(
+    truth: Float[np.ndarray, "K 4"], time: Float[np.ndarray, "T"]
+) -> tuple[Float[np.ndarray, "T 3"], Bool[np.ndarray, "T"]]:
+    """True poses at some times, linear between lines of the truth, and where they are known.
+
+    They are unknown before the first line, after the last, and between lines more than `GAP` apart.
+    """
+    clock = truth[:, 0]
+    after = np.clip(np.searchsorted(clock, time), 1, max(len(clock) - 1, 1))
+    last = np.minimum(after, len(clock) - 1)
+    near = clock[last] - clock[after - 1] <= GAP
+    known = (time >= clock[0]) & (time <= clock[-1]) & (near | np.isin(time, clock))
+    return interpolate_poses(clock, truth[:, 1:], time), known
+
 
 SOURCE = (
     "K. Y. K. Leung, Y. Halpern, T. D. Barfoot, H. H. T. Liu, The UTIAS multi-robot cooperative "
@@ -65,21 +97,12 @@ def read_lines(folder: Path, robot: int, calibration: RobotCalibration | None) -
     return Recorded(odometry, seen, truth, tuple(corrections))
 
 
-def models_of(
-    calibration: RobotCalibration | None,
-    odometry_cov: NoiseCov | None,
-    measurement_cov: NoiseCov | None,
-) -> tuple[Motion, Sensor]:
-    """The motion model and the sensor, with the noise that is given or the default."""
-    default_moved: NoiseCov = white_noise(*ODOMETRY_DENSITY)
-    default_seen: NoiseCov = MEASUREMENT_COV
-    mount: ArrayLike | None = None
-    if calibration is not None:
-        default_moved, default_seen = calibration.odometry_cov(), calibration.measurement_cov()
-        mount = calibration.mount
-    moved = default_moved if odometry_cov is None else odometry_cov
-    seen = default_seen if measurement_cov is None else measurement_cov
-    return Unicycle(moved), RangeBearing(seen, mount=mount)
+def models_of(calibration: RobotCalibration | None) -> tuple[Unicycle, RangeBearing]:
+    """The motion model and the sensor of a robot, calibrated or as recorded."""
+    if calibration is None:
+        return Unicycle(white_noise(*ODOMETRY_DENSITY)), RangeBearing(MEASUREMENT_COV)
+    sensor = RangeBearing(calibration.measurement_cov(), mount=calibration.mount)
+    return Unicycle(calibration.odometry_cov()), sensor
 
 
 def true_fields(files: Sequence[Recorded], time: Float[np.ndarray, "T"]) -> TrueFields:

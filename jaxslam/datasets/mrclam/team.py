@@ -1,13 +1,14 @@
 """Reader of several robots of MRCLAM in one log."""
 
 from collections.abc import Mapping
+from dataclasses import replace
 from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from jaxslam.datasets.dataset import Dataset
-from jaxslam.datasets.formats.lines import stored
+from jaxslam.datasets.lines import stored
 from jaxslam.datasets.mrclam.calibration import RobotCalibration, check_calibration
 from jaxslam.datasets.mrclam.files import ROBOTS, read_landmarks
 from jaxslam.datasets.mrclam.robot import (
@@ -31,8 +32,6 @@ def mrclam_team(
     robots: tuple[int, ...] = (1, 2, 3),
     *,
     calibration: RobotCalibration | Mapping[int, RobotCalibration] | None = None,
-    odometry_cov: NoiseCov | None = None,
-    measurement_cov: NoiseCov | None = None,
     sighting_cov: NoiseCov | None = None,
     errata: bool = True,
 ) -> Dataset:
@@ -55,9 +54,9 @@ def mrclam_team(
         folder: where the files of one data set are.
         robots: their numbers, each from 1 to 5, none twice.
         calibration: as for `mrclam`; or one for each robot, by its number.
-        odometry_cov, measurement_cov, errata: as for `mrclam`.
+        errata: as for `mrclam`.
         sighting_cov: (2, 2) covariance of (range, bearing) of another robot, or a function of z;
-            default measurement_cov.
+            default that of a landmark.
     Raises:
         ValueError: as `mrclam`, on a robot that measured nothing, on one without calibration where
             others have one, and unless robots are different numbers from 1 to 5.
@@ -80,10 +79,10 @@ def mrclam_team(
     files = [read_lines(Path(folder), *one) for one in zip(asked, each, strict=True)]
     time = np.unique(np.concatenate([t[:, 0] for own in files for t in (own.odometry, own.seen)]))
     team, scans, controls, dropped = [], [], [], dict.fromkeys(DROPS, 0)
-    models = {one: models_of(one, odometry_cov, measurement_cov) for one in set(each)}
+    models = {one: models_of(one) for one in set(each)}
     sights = {one: eye for one, (_, eye) in models.items()}
     if sighting_cov is not None:
-        sights = {one: models_of(one, None, sighting_cov)[1] for one in models}
+        sights = {one: replace(eye, noise_cov=sighting_cov) for one, eye in sights.items()}
     for robot, own, constants in zip(asked, files, each, strict=True):
         (model, eye), sight = models[constants], sights[constants]
         row, tag, kept, lost = associated(own.seen, time, subject_of, names + asked)

@@ -5,8 +5,8 @@ from pathlib import Path
 import numpy as np
 
 from jaxslam.datasets.dataset import Adjustable, Dataset
-from jaxslam.datasets.formats.csv_table import CsvTable
-from jaxslam.datasets.formats.lines import stored
+from jaxslam.datasets.lines import stored
+from jaxslam.datasets.table.csv_table import CsvTable
 from jaxslam.datasets.table.models import Parametric
 from jaxslam.datasets.table.settings import TableSettings
 from jaxslam.logs import tables

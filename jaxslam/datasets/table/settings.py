@@ -13,8 +13,14 @@ from numpy.typing import ArrayLike
 
 from jaxslam import motion, sensors
 from jaxslam.core.record import record, static
-from jaxslam.datasets.table.association import GATE, association_options, is_number
-from jaxslam.datasets.table.models import Parametric, fitting_model, of_no_noise
+from jaxslam.datasets.table.models import (
+    GATE,
+    Parametric,
+    association_options,
+    fitting_model,
+    is_number,
+    of_no_noise,
+)
 from jaxslam.datasets.table.settings_text import line_number
 from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.logs.tables import INTERVAL, POSE, odometry_columns, split_unit
@@ -24,8 +30,8 @@ from jaxslam.types import JaxOrNumPy
 _Model = TypeVar("_Model", bound=Motion | Sensor)
 _Value = TypeVar("_Value")
 
-MOTION_NOISE = {"m/s": 0.1, "rad/s": 0.1, "m": 0.02, "rad": 0.02}
-MEASUREMENT_NOISE = {"m": 0.1, "rad": 0.05, "1": 1.0}
+_MOTION_NOISE = {"m/s": 0.1, "rad/s": 0.1, "m": 0.02, "rad": 0.02}
+_MEASUREMENT_NOISE = {"m": 0.1, "rad": 0.05, "1": 1.0}
 """Default standard deviations by unit."""
 ROOM = 100
 """Default number of landmarks, where identities are unknown."""
@@ -125,7 +131,7 @@ class TableSettings:
             plain = self._built("motion", factory, options, noise)
             return _WithInterval(plain, noise) if from_poses else plain
 
-        deviations = self._noise("motion", shell.noises, MOTION_NOISE)
+        deviations = self._noise("motion", shell.noises, _MOTION_NOISE)
         return Parametric(shell.noises, tuple(deviations), None, model)
 
     def sensor(self, given: Sequence[str]) -> Parametric[Sensor]:
@@ -135,7 +141,7 @@ class TableSettings:
         if "mount" in options:
             mount = self._numbers("sensor", "mount", options.pop("mount"), POSE)
         names = self._built("sensor", factory, options, of_no_noise).measurements
-        deviations = self._noise("sensor", names, MEASUREMENT_NOISE)
+        deviations = self._noise("sensor", names, _MEASUREMENT_NOISE)
         if not all(deviations):
             raise ValueError(f"{self._at('sensor', 'noise')}: expected numbers above 0")
         if has_mount and mount is None:

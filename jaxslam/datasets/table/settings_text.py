@@ -5,11 +5,11 @@ import tomllib
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 
-Changes = Mapping[str, Mapping[str, Sequence[float]]]
+_Changes = Mapping[str, Mapping[str, Sequence[float]]]
 """numbers by section and key"""
 
 
-def toml_lines(changes: Changes, comments: Mapping[str, str] | None = None) -> str:
+def toml_lines(changes: _Changes, comments: Mapping[str, str] | None = None) -> str:
     """The changes as TOML, ready to paste. comments: by "section.key"."""
     told = comments or {}
     parts = []
@@ -23,7 +23,7 @@ def toml_lines(changes: Changes, comments: Mapping[str, str] | None = None) -> s
     return "\n".join(parts)
 
 
-def changed(path: Path, changes: Changes) -> str:
+def changed(path: Path, changes: _Changes) -> str:
     """The text of a file of settings with these numbers, else as it is; of no file, the fragment.
 
     A list of numbers that stands on one line is replaced, its comment stays; others are inserted

@@ -83,7 +83,7 @@ def confirm_hypotheses(
     return state, within.any(axis=0), jnp.where(confirmed & ~vanished, best, -1)
 
 
-class Constraints(NamedTuple):
+class _Constraints(NamedTuple):
     """m constraints g = 0, each between one point and one stored measurement; H = ∂g."""
 
     value: Float[Array, "m"]
@@ -101,7 +101,7 @@ def constraints_of(
     value: Float[Array, "m"],
     by_point: Float[Array, "m 2"],
     by_stored: Float[Array, "m 3"],
-) -> Constraints:
+) -> _Constraints:
     """The constraints between the points in these slots and the stored measurements in those."""
     by_point = jnp.pad(by_point, [(0, 0), (0, SIZE - 2)])
     rows = covariance_rows(joint)
@@ -110,11 +110,11 @@ def constraints_of(
     columns = hp[:, 3:].reshape(len(points), -1, SIZE)
     cov = jnp.einsum("mni,ni->mn", columns[:, points], by_point)
     cov = cov + jnp.einsum("mni,ni->mn", columns[:, stored], by_stored)
-    return materialize(Constraints(value, hp, linalg.symmetrize(cov)))
+    return materialize(_Constraints(value, hp, linalg.symmetrize(cov)))
 
 
 def correct_hypotheses(
-    joint: Joint, layout: TableLayout, constraints: Constraints, which: Bool[Array, "C"]
+    joint: Joint, layout: TableLayout, constraints: _Constraints, which: Bool[Array, "C"]
 ) -> Joint:
     """The joint with each hypothesis corrected by its own constraint, and nothing else changed.
 

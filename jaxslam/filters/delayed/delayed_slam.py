@@ -1,15 +1,17 @@
 """EKF-SLAM with delayed initialization of landmarks, from intersections of measurements."""
 
 import dataclasses
+from functools import partial
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
-from jaxslam import validation
-from jaxslam.association.known import Known
-from jaxslam.charts.euclidean import Euclidean
+from jaxslam import slots, validation
+from jaxslam.association.rules import Known
+from jaxslam.charts import Euclidean
 from jaxslam.core.record import hold_function, record, set_field, static
 from jaxslam.filters.delayed.confirmation import confirm_hypotheses
 from jaxslam.filters.delayed.intersection import intersect_measurements
@@ -25,16 +27,19 @@ from jaxslam.filters.delayed.state import (
     DelayedState,
     NewMeasurements,
     TableLayout,
+    delete_slots_if_any,
     empty_state,
+    increased,
+    is_newer,
+    slots_where,
 )
-from jaxslam.filters.delayed.stored_measurements import store_measurements
 from jaxslam.filters.delayed.triangulation import Triangulation, triangulation_of
-from jaxslam.filters.ekf.coordinates.map_coordinates import estimate_of
+from jaxslam.filters.ekf.innovation import Correction
+from jaxslam.filters.ekf.map_coordinates import estimate_of
+from jaxslam.filters.ekf.predict import propagate
+from jaxslam.filters.ekf.scan import associate_scan
 from jaxslam.filters.ekf.settings import EkfSettings
-from jaxslam.filters.ekf.steps.innovation import Correction
-from jaxslam.filters.ekf.steps.predict import propagate
-from jaxslam.filters.ekf.steps.scan import associate_scan
-from jaxslam.filters.ekf.steps.sequential_update import correct_in_turn
+from jaxslam.filters.ekf.update import correct_in_turn
 from jaxslam.filters.reporting import info_of, seen_before, status_of
 from jaxslam.math.arrays import Number
 from jaxslam.math.stats import chi2_quantile
@@ -42,6 +47,44 @@ from jaxslam.math.xla import where_any
 from jaxslam.protocols import Associate, Association, Filter, Motion, Sensor
 from jaxslam.sensors.suite import on_ground
 from jaxslam.types import Estimate, Info, Scan
+
+
+def _store_measurements(
+    settings: DelayedSettings, state: DelayedState, new: NewMeasurements
+) -> tuple[DelayedState, Int[Array, "M"], Bool[Array, "M"]]:
+    """The state with new measurements stored; their slots, and which were stored.
+
+    One is stored if the sensor is far enough from its positions at other measurements of the same
+    tag. Where the table is full the oldest are marginalized out.
+    """
+    layout, joint = settings.layout, state.joint
+    store = partial(settings.triangulation.store, settings.sensor)
+    values = jax.vmap(store, (None, 0))(joint.pose, new.z)
+    by_pose, by_z = jax.vmap(jax.jacfwd(store, argnums=(0, 1)), (None, 0))(joint.pose, new.z)
+    alive, tag = joint.alive[layout.of_stored], joint.tag[layout.of_stored]
+    offset = values[:, None, :2] - joint.landmarks[None, layout.of_stored, :2]
+    close = ((offset**2).sum(axis=2) < settings.stored.spacing**2) & alive[None]
+    wanted = new.wanted & ~(close & (new.tag[:, None] == tag[None])).any(axis=1)
+
+    needed = wanted.sum() - (~alive).sum()
+    age = jnp.where(alive, state.taken_at, state.clock + 1)
+    evicted = alive & (is_newer(age).sum(axis=0) < needed)
+    state = delete_slots_if_any(layout, state, slots_where(layout, stored=evicted))
+
+    joint = state.joint
+    place, stored = slots.allocate(joint.alive[layout.of_stored], wanted)
+    noise_cov = jax.vmap(settings.sensor.noise_cov)(new.z)
+    own_cov = jnp.einsum("mij,mjk,mlk->mil", by_z, noise_cov, by_z)
+    slot = layout.first_stored + place
+    joint = slots.scatter(joint, slot, stored, values, by_pose, own_cov, new.tag)
+    at = jnp.where(stored, place, layout.stored)  # beyond the end: dropped
+    state = state._replace(
+        joint=joint,
+        taken_at=state.taken_at.at[at].set(state.clock, mode="drop"),
+        noise_var=state.noise_var.at[at].set(own_cov[:, 2, 2], mode="drop"),
+        counts=state.counts._replace(evicted=increased(state.counts.evicted, evicted)),
+    )
+    return state, slot, stored
 
 
 @record
@@ -143,7 +186,7 @@ class DelayedSlam(Filter):
         new = _new_measurements(settings, scan, found)
 
         def initialize(state: DelayedState) -> tuple[DelayedState, _Outcome]:
-            state, slot, stored = store_measurements(settings, state, new)
+            state, slot, stored = _store_measurements(settings, state, new)
             state, explained, by = confirm_hypotheses(settings, state, new, slot, stored)
             state = intersect_measurements(settings, state, new, slot, stored & ~explained)
             state, promoted = promote_hypotheses(settings, state, new, by)

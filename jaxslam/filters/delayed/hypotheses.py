@@ -22,7 +22,7 @@ _DISTANCES = {
 }
 
 
-class PointResiduals(NamedTuple):
+class _PointResiduals(NamedTuple):
     """The residuals g(s, x) of p points x against q stored measurements s, and their moments."""
 
     value: Float[Array, "p q"]
@@ -43,7 +43,7 @@ class PointResiduals(NamedTuple):
 
 def point_residuals(
     joint: Joint, triangulation: Triangulation, points: Int[Array, "p"], stored: Int[Array, "q"]
-) -> PointResiduals:
+) -> _PointResiduals:
     """The residuals of the points in these slots against the stored measurements in those.
 
     With the Jacobians G_x, G_s: var(g) = G_x P_xx G_xᵀ + G_s P_ss G_sᵀ + 2 G_x P_xs G_sᵀ.
@@ -60,7 +60,7 @@ def point_residuals(
     variance = jnp.einsum("pqi,pij,pqj->pq", by_point, p_xx, by_point)
     variance = variance + jnp.einsum("pqi,qij,pqj->pq", by_stored, p_ss, by_stored)
     variance = variance + 2 * jnp.einsum("pqi,piqj,pqj->pq", by_point, p_xs, by_stored)
-    return materialize(PointResiduals(value, variance, by_point, by_stored))
+    return materialize(_PointResiduals(value, variance, by_point, by_stored))
 
 
 class UncertainPoints(NamedTuple):

@@ -79,7 +79,7 @@ def _sharpest(
 ) -> _Sharpest:
     """The intersections of least spread of unexplained measurements, one a hypothesis slot."""
     layout, joint = settings.layout, state.joint
-    found = intersections_of(joint, layout, settings.triangulation, slot)
+    found = _intersections_of(joint, layout, settings.triangulation, slot)
     older = joint.alive[layout.of_stored] & (state.taken_at < state.clock)
     allowed = unexplained[:, None] & older[None, :]
     allowed = allowed & (new.tag[:, None] == joint.tag[None, layout.of_stored])
@@ -150,7 +150,7 @@ def _duplicates(settings: DelayedSettings, joint: Joint, found: _Sharpest) -> Bo
     return of_sharper.any(axis=1) | of_old.any(axis=1)
 
 
-class Intersections(NamedTuple):
+class _Intersections(NamedTuple):
     """The points where each of q stored measurements intersects each of all W."""
 
     points: Float[Array, "q W A 2"]
@@ -162,9 +162,9 @@ class Intersections(NamedTuple):
     """√(largest eigenvalue of that) over the distance, infinite where not ok"""
 
 
-def intersections_of(
+def _intersections_of(
     joint: Joint, layout: TableLayout, triangulation: Triangulation, stored: Int[Array, "q"]
-) -> Intersections:
+) -> _Intersections:
     """The intersections of the measurements in these slots; J P Jᵀ with the P of each two.
 
     Relative to the sensor's position, so that the uncertainty of the robot's own pose in the map
@@ -198,7 +198,7 @@ def intersections_of(
     pairs = jnp.concatenate([top, jnp.concatenate([p_ba, p_bb], axis=3)], axis=2)
     of_pairs = jax.vmap(jax.vmap(one, (None, 0, 0)), (0, None, 0))
     a, b = joint.landmarks[stored], joint.landmarks[first:]
-    return materialize(Intersections(*of_pairs(a, b, pairs)))
+    return materialize(_Intersections(*of_pairs(a, b, pairs)))
 
 
 def add_hypotheses(

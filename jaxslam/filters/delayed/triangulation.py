@@ -21,7 +21,7 @@ Stored = Float[Array, "3"]
 """a stored measurement s = (x, y, q)"""
 Point = Float[Array, "2"]
 """(x, y) [m]"""
-Solutions = tuple[Float[Array, "A 2"], Bool[Array, "A"]]
+_Solutions = tuple[Float[Array, "A 2"], Bool[Array, "A"]]
 """points, and whether each is one"""
 
 
@@ -40,7 +40,7 @@ class Triangulation(Component):
         """The measurement as a variable of the map."""
         raise NotImplementedError
 
-    def intersect(self, a: Stored, b: Stored) -> Solutions:
+    def intersect(self, a: Stored, b: Stored) -> _Solutions:
         """The A points in which two can intersect, and whether each is one: where it is not, or
         badly conditioned, the point is finite and without meaning."""
         raise NotImplementedError
@@ -81,7 +81,7 @@ class Rays(Triangulation):
         ahead = sensor.invert(pose, z, jnp.ones(1, z.dtype))[:2] - start
         return jnp.concatenate([start, jnp.arctan2(ahead[1], ahead[0])[None]])
 
-    def intersect(self, a: Stored, b: Stored) -> Solutions:
+    def intersect(self, a: Stored, b: Stored) -> _Solutions:
         toward_a, toward_b = _unit(a[2]), _unit(b[2])
         delta = b[:2] - a[:2]
         sine = _cross(toward_a, toward_b)
@@ -122,7 +122,7 @@ class Circles(Triangulation):
         ends = [sensor.invert(pose, z, jnp.full(1, s, z.dtype))[:2] for s in (0.0, np.pi)]
         return jnp.concatenate([0.5 * (ends[0] + ends[1]), z])
 
-    def intersect(self, a: Stored, b: Stored) -> Solutions:
+    def intersect(self, a: Stored, b: Stored) -> _Solutions:
         delta = b[:2] - a[:2]
         square = (delta**2).sum()
         apart = (square > 0) & (a[2] > 0) & (b[2] > 0)

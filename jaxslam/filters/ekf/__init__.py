@@ -1,1 +1,1 @@
-"""EKF-SLAM and its steps, one a file."""
+"""EKF-SLAM and its steps."""

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam import slots, validation
-from jaxslam.association.known import Known
+from jaxslam.association.rules import Known
 from jaxslam.core.numbers import check_count
 from jaxslam.core.record import record, static
 from jaxslam.filters.ekf.ekf_slam import EkfSlam
@@ -22,7 +22,7 @@ from jaxslam.types import Estimate, Info, Scan
 _NONE = -2
 
 
-class Compressed(NamedTuple):
+class _Compressed(NamedTuple):
     """A map, its active area, and the postponed update of the landmarks outside the area.
 
     With A the errors of the robot and the K landmarks of the area, B those of all others, and
@@ -54,7 +54,7 @@ class CompressedEkfSlam(Wrapper):
     of the simultaneous localization and map-building algorithm for real-time implementation", IEEE
     T-RA 17(3), 2001. Landmarks are associated by their tags.
 
-    The state is a `Compressed`. `estimate` gives the moments of all landmarks, O(K²·N); moments
+    The state is a `_Compressed`. `estimate` gives the moments of all landmarks, O(K²·N); moments
     that are not used cost nothing under `jit`. `up_to_date` gives the whole map as a `Joint`, and
     `opened` makes a state of one.
 
@@ -100,13 +100,13 @@ class CompressedEkfSlam(Wrapper):
     def name(self) -> str:  # type: ignore[override]
         return "compressed_ekf_slam"
 
-    def init(self, pose: jax.Array, pose_cov: jax.Array) -> Compressed:
+    def init(self, pose: jax.Array, pose_cov: jax.Array) -> _Compressed:
         return opened(self.filter.init(pose, pose_cov), self.area)
 
-    def predict(self, state: Compressed, u: jax.Array, key: jax.Array) -> Compressed:
+    def predict(self, state: _Compressed, u: jax.Array, key: jax.Array) -> _Compressed:
         return state._replace(area=self._local.predict(state.area, u, key))
 
-    def update(self, state: Compressed, scan: Scan, key: jax.Array) -> tuple[Compressed, Info]:
+    def update(self, state: _Compressed, scan: Scan, key: jax.Array) -> tuple[_Compressed, Info]:
         if len(scan.tag) > self.area:
             raise ValueError(
                 f"CompressedEkfSlam: expected area >= {len(scan.tag)}, the measurement slots of "
@@ -117,7 +117,7 @@ class CompressedEkfSlam(Wrapper):
         in_map = jnp.where(info.slot >= 0, state.slot[jnp.maximum(info.slot, 0)], -1)
         return _with_updated_area(state, inside), info._replace(slot=in_map)
 
-    def estimate(self, state: Compressed) -> Estimate:
+    def estimate(self, state: _Compressed) -> Estimate:
         def one(*of_landmark: jax.Array) -> Estimate:
             landmark, alive, tag, own, with_robot = of_landmark
             cov = jnp.block([[robot, with_robot], [with_robot.T, own]])
@@ -143,12 +143,12 @@ class CompressedEkfSlam(Wrapper):
         return dataclasses.replace(self.filter, capacity=own + more)
 
 
-def opened(joint: Joint, area: int) -> Compressed:
+def opened(joint: Joint, area: int) -> _Compressed:
     """A state of `CompressedEkfSlam` of a map, the area (min(area, N)) at its first slots."""
     return _opened_at(joint, jnp.arange(min(area, joint.landmarks.shape[0]), dtype=jnp.int32))
 
 
-def up_to_date(state: Compressed) -> Joint:
+def up_to_date(state: _Compressed) -> Joint:
     """The map with the postponed update applied, O(K·N²)."""
     joint = state.whole
     at = _rows(state.slot, joint.landmarks.shape[1])
@@ -163,7 +163,7 @@ def up_to_date(state: Compressed) -> Joint:
     )
 
 
-def _with_area_of(scan: Scan, state: Compressed, sensor: Sensor, most: int | None) -> Compressed:
+def _with_area_of(scan: Scan, state: _Compressed, sensor: Sensor, most: int | None) -> _Compressed:
     """The state with an area that holds the landmarks of a scan: the same, or another one.
 
     most: new landmarks a scan.
@@ -177,18 +177,18 @@ def _with_area_of(scan: Scan, state: Compressed, sensor: Sensor, most: int | Non
     outside = seen & ~jnp.zeros(joint.alive.shape, bool).at[state.slot].set(True)
     leave = outside.any() | ((new > room) & (room_anywhere > room))
 
-    def anew(state: Compressed) -> Compressed:
+    def anew(state: _Compressed) -> _Compressed:
         joint = up_to_date(state)
         # The result of a run must not depend on other runs of the batch.
         other = _opened_at(joint, _chosen(joint, own, sensor, seen, new))
-        both: Compressed = jax.tree.map(lambda a, b: jnp.where(leave, a, b), other, state)
+        both: _Compressed = jax.tree.map(lambda a, b: jnp.where(leave, a, b), other, state)
         return both
 
-    after: Compressed = where_any(leave, anew, lambda state: state, state)
+    after: _Compressed = where_any(leave, anew, lambda state: state, state)
     return after
 
 
-def _with_updated_area(state: Compressed, area: Joint) -> Compressed:
+def _with_updated_area(state: _Compressed, area: Joint) -> _Compressed:
     """The state with its area updated, and tags and alive slots of the map as in the area."""
     joint, own = state.whole, state.slot.shape[0]
     joint = joint._replace(
@@ -198,7 +198,7 @@ def _with_updated_area(state: Compressed, area: Joint) -> Compressed:
     return state._replace(whole=joint, area=area)
 
 
-def _moved_map(state: Compressed) -> jax.Array:
+def _moved_map(state: _Compressed) -> jax.Array:
     """The current landmarks (N, L)."""
     landmarks, own = state.whole.landmarks, state.slot.shape[0]
     theta = _postponed(state)[2]
@@ -208,7 +208,7 @@ def _moved_map(state: Compressed) -> jax.Array:
     )
 
 
-def _marginals(state: Compressed) -> tuple[jax.Array, jax.Array]:
+def _marginals(state: _Compressed) -> tuple[jax.Array, jax.Array]:
     """The current P of each landmark with itself (N, L, L) and with the robot (N, 3, L)."""
     capacity, size = state.whole.landmarks.shape
     own, at = state.slot.shape[0], _rows(state.slot, size)
@@ -231,7 +231,7 @@ def _marginals(state: Compressed) -> tuple[jax.Array, jax.Array]:
     )
 
 
-def _postponed(state: Compressed) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _postponed(state: _Compressed) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The postponed update Φ, Ψ (W, W) and θ (W,), W = 3 + K·L."""
     area, own = state.area, state.slot.shape[0]
     width = 3 + own * area.landmarks.shape[1]
@@ -243,7 +243,7 @@ def _postponed(state: Compressed) -> tuple[jax.Array, jax.Array, jax.Array]:
     )
 
 
-def _opened_at(joint: Joint, slot: jax.Array) -> Compressed:
+def _opened_at(joint: Joint, slot: jax.Array) -> _Compressed:
     """The state with nothing postponed and the landmarks of slots (K,) as its area."""
     own, size = slot.shape[0], joint.landmarks.shape[1]
     at, more = _rows(slot, size), _more(own, size)
@@ -260,7 +260,7 @@ def _opened_at(joint: Joint, slot: jax.Array) -> Compressed:
         tag=jnp.concatenate([joint.tag[slot], jnp.full(more, _NONE, joint.tag.dtype)]),
         lin=joint.lin,
     )
-    return Compressed(joint, area, slot)
+    return _Compressed(joint, area, slot)
 
 
 def _chosen(joint: Joint, own: int, sensor: Sensor, seen: jax.Array, new: jax.Array) -> jax.Array:

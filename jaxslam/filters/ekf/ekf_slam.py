@@ -6,12 +6,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam import slots, validation
-from jaxslam.association.known import Known
-from jaxslam.charts.euclidean import Euclidean
+from jaxslam.association.rules import Known
+from jaxslam.charts import Euclidean
 from jaxslam.core.record import hold_function, record, static
-from jaxslam.filters.ekf.coordinates import to_points
-from jaxslam.filters.ekf.coordinates.linear_system import LinearizedSteps, LinearSystem
-from jaxslam.filters.ekf.coordinates.map_coordinates import estimate_of
+from jaxslam.filters.ekf import map_coordinates
+from jaxslam.filters.ekf.linear_system import LinearizedSteps, LinearSystem
+from jaxslam.filters.ekf.map_coordinates import estimate_of
+from jaxslam.filters.ekf.predict import propagate
+from jaxslam.filters.ekf.scan import turns_of, update_by_scan, without_landmarks
 from jaxslam.filters.ekf.settings import (
     CorrectionOrder,
     Covariance,
@@ -19,10 +21,8 @@ from jaxslam.filters.ekf.settings import (
     check_ekf_options,
     check_settings,
 )
-from jaxslam.filters.ekf.steps.predict import propagate
-from jaxslam.filters.ekf.steps.scan import turns_of, update_by_scan, without_landmarks
 from jaxslam.filters.reporting import with_extra, with_removed
-from jaxslam.linearize.at_estimate import AtEstimate
+from jaxslam.linearize.first_order import AtEstimate
 from jaxslam.math import linalg
 from jaxslam.math.arrays import Number
 from jaxslam.protocols import Associate, Chart, Filter, Life, Linearizer, Motion, Sensor
@@ -152,10 +152,10 @@ class EkfSlam(Filter):
         turns = turns_of(self.sensor, self._settings)
         joint, info, evicted, system = update_by_scan(joint, scan, turns)
         if self.sensor.reduced is not None:
-            joint, which, reduced = to_points.reduced_where_ready(
+            joint, which, reduced = map_coordinates.reduced_where_ready(
                 joint, self.sensor, self.square_root
             )
-            info = with_extra(info, "points", to_points.ToPoints(which))
+            info = with_extra(info, "points", map_coordinates.ToPoints(which))
             system = (*system, reduced)
         if self.life is not None:
             before = joint

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
 from jaxslam.core.record import record
-from jaxslam.filters.ekf.coordinates.linear_system import (
+from jaxslam.filters.ekf.linear_system import (
     LinearLandmarks,
     LinearMeasurements,
     LinearSystem,

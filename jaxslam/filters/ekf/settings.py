@@ -7,10 +7,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from jaxslam.association.known import Known
-from jaxslam.charts.euclidean import Euclidean
+from jaxslam.association.rules import Known
+from jaxslam.charts import Euclidean
 from jaxslam.core.numbers import check_count, check_gate
-from jaxslam.linearize.at_estimate import AtEstimate
+from jaxslam.linearize.first_order import AtEstimate
 from jaxslam.math.arrays import Number
 from jaxslam.protocols import Associate, Chart, Life, Linearizer, Sensor
 from jaxslam.sensors.suite import Suite
@@ -103,7 +103,7 @@ def check_iterations(filter: str, linearize: Linearizer, iterations: int) -> Non
         )
 
 
-def check_chart(filter: str, sensor: Sensor, chart: Chart) -> None:
+def _check_chart(filter: str, sensor: Sensor, chart: Chart) -> None:
     """Raise ValueError unless the chart acts on landmarks of the sensor's size."""
     pose, landmark = jnp.zeros(3), jnp.zeros(len(sensor.landmark))
     try:
@@ -126,7 +126,7 @@ def check_chart(filter: str, sensor: Sensor, chart: Chart) -> None:
 def check_settings(filter: str, settings: EkfSettings) -> None:
     """Raise ValueError unless sensor, chart, linearizer and covariance form are compatible."""
     sensor, chart, linearize = settings.sensor, settings.chart, settings.linearize
-    check_chart(filter, sensor, chart)
+    _check_chart(filter, sensor, chart)
     if linearize.euclidean:
         unfit = [f"the Euclidean chart, not {chart.name}"] * (chart.basis is not None)
         unfit += [f"landmarks (x, y), not those of {sensor.name}"] * (not sensor.of_points)

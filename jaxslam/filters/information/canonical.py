@@ -18,8 +18,11 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.filters.information.innovation import CanonicalInnovations, stack_jacobians
-from jaxslam.filters.information.tag_association import TagAssociation
+from jaxslam.filters.information.innovation import (
+    CanonicalInnovations,
+    TagAssociation,
+    stack_jacobians,
+)
 from jaxslam.filters.reporting import info_of, status_of
 from jaxslam.linearize import first_order
 from jaxslam.math import linalg

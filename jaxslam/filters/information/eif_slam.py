@@ -1,17 +1,21 @@
-"""EIF-SLAM: the extended Kalman filter in exact canonical (information) form."""
+"""EIF-SLAM: the extended Kalman filter in exact canonical (information) form.
+
+And a wrapper that takes a scan in pieces, for filters with room for few measurements at once.
+"""
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float, Int, PyTree
 
-from jaxslam.core.record import record
-from jaxslam.filters.ekf.coordinates.map_coordinates import estimate_of
+from jaxslam.core.record import record, static
+from jaxslam.filters.ekf.map_coordinates import estimate_of
 from jaxslam.filters.information import canonical, innovation
-from jaxslam.filters.information.settings import InformationFilter
-from jaxslam.filters.information.tag_association import associate_by_table
+from jaxslam.filters.information.innovation import InformationFilter, associate_by_table
 from jaxslam.math import linalg
+from jaxslam.protocols import Filter, Wrapper
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Info, Scan
 
@@ -78,7 +82,7 @@ class EifSlam(InformationFilter):
         )
         omega, residual = canonical.measurement_update(state.omega, state.residual, innovations)
         error, solved = canonical.mean_error(omega, residual, innovations.omega_positive)
-        pose, landmarks = corrected_means(state, error)
+        pose, landmarks = _corrected_means(state, error)
         omega, new_landmarks, initialized = canonical.initialize_landmarks(
             self.sensor,
             omega,
@@ -106,7 +110,7 @@ class EifSlam(InformationFilter):
         return estimate_of(joint, self.sensor, self.chart)
 
 
-def corrected_means(
+def _corrected_means(
     state: CanonicalState, error: Float[Array, "D"]
 ) -> tuple[Float[Array, "3"], Float[Array, "N L"]]:
     """Pose and landmarks corrected by the error of the mean."""
@@ -115,3 +119,43 @@ def corrected_means(
         canonical.correct_pose(state.pose, error[:3]),
         jnp.where(state.alive[:, None], moved, 0.0),
     )
+
+
+@record
+class InPieces(Wrapper):
+    """A filter applied in turn to pieces of a scan, each of `size` measurement slots.
+
+    Slot i is in piece i mod their number. Numbers that an `Info` has for a whole scan are summed
+    over the pieces, and flags are true where one of a piece is.
+    """
+
+    filter: Filter
+    size: int = static()
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        return self.filter.name
+
+    def update(self, state: PyTree, scan: Scan, key: jax.Array) -> tuple[PyTree, Info]:
+        m, size = scan.tag.shape[0], self.size
+        if m <= size:
+            return self.filter.update(state, scan, key)
+        pieces = -(-m // size)
+
+        def dealt(leaf: jax.Array) -> jax.Array:
+            wide = jnp.pad(leaf, [(0, pieces * size - m), *[(0, 0)] * (leaf.ndim - 1)])
+            return wide.reshape(size, pieces, *leaf.shape[1:]).swapaxes(0, 1)
+
+        def one(state: PyTree, piece: tuple[Scan, jax.Array]) -> tuple[PyTree, Info]:
+            return self.filter.update(state, *piece)
+
+        each = jax.tree.map(dealt, scan), jax.random.split(key, pieces)
+        state, infos = jax.lax.scan(one, state, each)
+
+        def whole(leaf: jax.Array) -> jax.Array:
+            if leaf.ndim == 1:  # of a scan, not of its measurement slots
+                return leaf.any() if leaf.dtype == bool else leaf.sum()
+            return leaf.swapaxes(0, 1).reshape(size * pieces, *leaf.shape[2:])[:m]
+
+        info: Info = jax.tree.map(whole, infos)
+        return state, info

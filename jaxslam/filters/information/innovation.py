@@ -1,5 +1,9 @@
-"""The gated innovations of a scan in the canonical form, and their information."""
+"""Innovations of the information filters, after association by tags and the gate.
 
+With what these filters share: their models and options, checked where a filter is made.
+"""
+
+import dataclasses
 from typing import NamedTuple
 
 import jax
@@ -7,11 +11,99 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.filters.information.settings import InformationFilter
-from jaxslam.linearize.derivatives import observe_jacobians
+from jaxslam import slots, validation
+from jaxslam.charts import Euclidean
+from jaxslam.core.numbers import check_count, check_gate, check_positive
+from jaxslam.core.record import record, static
+from jaxslam.filters.reporting import seen_before
+from jaxslam.linearize.first_order import observe_jacobians
 from jaxslam.math import linalg
+from jaxslam.math.arrays import Number
 from jaxslam.math.gaussians import gaussian_terms, log_density, log_det_of_pivots
+from jaxslam.protocols import Filter, Motion, Sensor
+from jaxslam.sensors.suite import Suite
 from jaxslam.types import Scan
+
+
+@record
+class InformationFilter(Filter):
+    """Models and options of an information filter, whose error is in map coordinates.
+
+    Raises ValueError on a capacity below 1, a gate or floor not above 0, a suite, or a sensor that
+    has no landmarks or whose landmarks become points.
+    """
+
+    motion: Motion
+    sensor: Sensor
+    """the models; Jacobians come from `jax.jacfwd`, at the estimate"""
+    capacity: int = static()
+    """landmark slots N; a new landmark in a full map is `Status.OVERFLOW`"""
+    _: dataclasses.KW_ONLY
+    gate: Number | None = None
+    """reject a measurement whose squared Mahalanobis distance exceeds this"""
+    floor: Number = 1e-4
+    """standard deviation [m, rad] added to a singular pose_cov, which has no inverse"""
+    chart = Euclidean()
+
+    def __post_init__(self) -> None:
+        name, sensor = type(self).__name__, self.sensor
+        validation.check_models(name, self.motion, sensor)
+        check_count(f"{name}: capacity", self.capacity)
+        check_gate(name, self.gate)
+        check_positive(name, floor=self.floor)
+        if isinstance(sensor, Suite):
+            raise ValueError(f"{name}: expected one sensor, not a suite")
+        if len(sensor.landmark) == 0:
+            raise ValueError(f"{name}: expected a sensor of landmarks, got {sensor.name}")
+        if sensor.reduced is not None:
+            raise ValueError(
+                f"{name}: the landmarks of {sensor.name} are converted to points, which is not "
+                "supported"
+            )
+        super().__post_init__()
+
+
+class TagAssociation(NamedTuple):
+    """The landmarks of the M measurements of a scan; measurements without a tag have none."""
+
+    known: Bool[Array, "M"]
+    """the landmark is in the map"""
+    new: Bool[Array, "M"]
+    """it is not, or its tag occurs earlier in the scan"""
+    repeated: Bool[Array, "M"]
+    """its tag occurs earlier in the scan"""
+    has_slot: Bool[Array, "M"]
+    """the landmark has a slot, or a slot is free for a new landmark"""
+    slot: Int[Array, "M"]
+    """this slot; any number where there is none"""
+
+
+def associate_by_table(tag: Int[Array, "N"], alive: Bool[Array, "N"], scan: Scan) -> TagAssociation:
+    """Association by a table of tags; new landmarks get the free slots, lowest first.
+
+    A known landmark may be measured twice in a scan.
+    """
+    tagged = scan.valid & (scan.tag >= 0)
+    found_slot, found = slots.find(tag, alive, scan.tag)
+    known, new = tagged & found, tagged & ~found
+    repeated = new & seen_before(scan.tag, new)
+    free_slot, free = slots.allocate(alive, new & ~repeated)
+    slot = jnp.where(new, free_slot, found_slot)
+    return TagAssociation(known, new, repeated, known | free, slot)
+
+
+def associate_by_index(alive: Bool[Array, "N"], scan: Scan) -> TagAssociation:
+    """Association where a landmark's slot is its tag; measurements without a tag get slot N.
+
+    Of several measurements of one landmark the first is used, the others are REPEATED.
+    """
+    capacity = alive.shape[0]
+    tagged = scan.valid & (scan.tag >= 0)
+    repeated = tagged & seen_before(scan.tag, tagged)
+    has_slot = tagged & ~repeated & (scan.tag < capacity)
+    slot = jnp.where(has_slot, scan.tag, capacity).astype(jnp.int32)
+    known = has_slot & alive.at[slot].get(mode="fill", fill_value=False)
+    return TagAssociation(known, tagged & ~known, repeated, has_slot, slot)
 
 
 class CanonicalInnovations(NamedTuple):

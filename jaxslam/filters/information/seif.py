@@ -9,29 +9,33 @@ from jaxtyping import Bool, Float, Int
 from jaxslam.core.numbers import check_count
 from jaxslam.core.record import record, static
 from jaxslam.filters.information import canonical, innovation
-from jaxslam.filters.information.innovation import CanonicalInnovations
-from jaxslam.filters.information.settings import InformationFilter
-from jaxslam.filters.information.sparse.active_set import (
+from jaxslam.filters.information.active_set import (
     activate,
     active_matches,
     assign_indices,
     deactivate,
 )
-from jaxslam.filters.information.sparse.marginals import blanket_marginals, whole_marginals
-from jaxslam.filters.information.sparse.mean_recovery import (
+from jaxslam.filters.information.innovation import (
+    CanonicalInnovations,
+    InformationFilter,
+    TagAssociation,
+    associate_by_index,
+)
+from jaxslam.filters.information.marginals import (
+    blanket_marginals,
     recover_active_means,
     recover_passive_means,
     repeat_recovery,
+    whole_marginals,
 )
-from jaxslam.filters.information.sparse.sparse_state import (
+from jaxslam.filters.information.sparse_state import (
     SparseState,
     active_means,
     active_residual,
     empty_map,
     with_active_residual,
 )
-from jaxslam.filters.information.sparse.sparsification import cut_robot_links
-from jaxslam.filters.information.tag_association import TagAssociation, associate_by_index
+from jaxslam.filters.information.sparsification import cut_robot_links
 from jaxslam.types import Estimate, Info, Scan
 
 
@@ -46,7 +50,7 @@ class Seif(InformationFilter):
     2. sparsification (`sparsification.sparsify`): the least recently measured active landmarks
        lose their links to the robot, as many as the scan needs indices for;
     3. measurement update and new landmarks (`canonical`);
-    4. mean recovery (`mean_recovery`), one block at a time: the block of robot and active
+    4. mean recovery (`marginals`), one block at a time: the block of robot and active
        landmarks, and `passive` landmarks in rotation.
 
     The sources sparsify last, after measurement and mean. Here sparsification comes before the

@@ -5,14 +5,14 @@ import dataclasses
 from jaxtyping import Array, Float
 
 from jaxslam import validation
-from jaxslam.charts.euclidean import Euclidean
+from jaxslam.charts import Euclidean
 from jaxslam.core.record import record
-from jaxslam.filters.ekf.coordinates.map_coordinates import estimate_of
 from jaxslam.filters.ekf.ekf_slam import initial_state
+from jaxslam.filters.ekf.map_coordinates import estimate_of
+from jaxslam.filters.ekf.predict import propagate
 from jaxslam.filters.ekf.settings import EkfSettings, check_settings
-from jaxslam.filters.ekf.steps.predict import propagate
 from jaxslam.filters.reporting import nothing_of
-from jaxslam.linearize.at_estimate import AtEstimate
+from jaxslam.linearize.first_order import AtEstimate
 from jaxslam.protocols import Chart, Filter, Linearizer, Motion, Sensor
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Info, Scan

@@ -10,18 +10,18 @@ from jaxtyping import Float, PyTree
 from numpy.typing import ArrayLike
 
 from jaxslam import validation
-from jaxslam.association.known import Known
-from jaxslam.charts.euclidean import Euclidean
+from jaxslam.association.rules import Known
+from jaxslam.charts import Euclidean
 from jaxslam.core.record import record, static
 from jaxslam.filters.particles.landmark_ekf import update_map
 from jaxslam.filters.particles.proposal import associate_particle, propose_pose
 from jaxslam.filters.particles.scan_association import zero_padding
 from jaxslam.filters.particles.settings import check_particle_map, particle_map_settings
-from jaxslam.filters.particles.states.moments import slam_estimate
-from jaxslam.filters.particles.states.slam_state import (
+from jaxslam.filters.particles.slam_particles import (
     SlamParticles,
     as_only_particle,
     initial_slam_particles,
+    slam_estimate,
 )
 from jaxslam.math.angles import wrap
 from jaxslam.math.arrays import Number

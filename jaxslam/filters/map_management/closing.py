@@ -13,10 +13,11 @@ from jaxslam.filters.map_management.loop_closure import (
     LoopSettings,
     check_recency,
     close_loop,
+    merge_histories,
     no_closing,
+    successive_duplicate,
 )
-from jaxslam.filters.map_management.successive import merge_histories, successive_duplicate
-from jaxslam.filters.map_management.wrapping import Managed
+from jaxslam.filters.map_management.merging import Managed
 from jaxslam.filters.reporting import with_extra, with_removed
 from jaxslam.math.arrays import Number
 from jaxslam.math.stats import chi2_quantile

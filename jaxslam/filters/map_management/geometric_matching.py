@@ -1,7 +1,8 @@
 """Geometric matching of a cluster of points with points of a map, by pairwise distances.
 
 The cluster's frame is arbitrary: that of a scan of a lost robot, or of a part of the map whose
-position has drifted. The full joint covariance of both is used.
+position has drifted. The full joint covariance of both is used, and the alignment is by weighted
+least squares.
 """
 
 from typing import NamedTuple
@@ -12,14 +13,120 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.core.numbers import check_count
-from jaxslam.filters.map_management.alignment import align_points
 from jaxslam.filters.map_management.point_pairs import (
     PointSets,
     equal_lengths,
     extend_pair,
     longest_pairs,
+    mahalanobis_of_pairs,
+    quarter_turned,
 )
+from jaxslam.math import linalg, se2
 from jaxslam.math.stats import chi2_quantile
+
+
+class _Alignment(NamedTuple):
+    """A weighted alignment of M cluster points, of which some have a map point."""
+
+    pose: Float[Array, "3"]
+    """T with map = T ∘ cluster"""
+    distance: Float[Array, ""]
+    """D² = rᵀ Σ⁻¹ r"""
+    each: Float[Array, "M"]
+    """r_iᵀ Σ_ii⁻¹ r_i of the pairs, else 0"""
+    regular: Bool[Array, ""]
+    """Σ is positive definite, and the pose is determined"""
+    residual: Float[Array, "2*M"]
+    """r at the pose, to first order"""
+    jacobian: Float[Array, "2*M 3"]
+    """∂r/∂T"""
+    factor: Float[Array, "2*M 2*M"]
+    """Cholesky factor of Σ; the identity where there is no pair"""
+
+
+class _Residuals(NamedTuple):
+    """The residuals r_i = T z_i - m_i about the centroids, their covariance and derivative."""
+
+    error: Float[Array, "2*M"]
+    jacobian: Float[Array, "2*M 3"]
+    covs: Float[Array, "M 2 2"]
+    """of each alone"""
+    factor: Float[Array, "2*M 2*M"]
+    positive: Bool[Array, ""]
+
+
+def align_points(points: PointSets, slot: Int[Array, "M"]) -> _Alignment:
+    """The pose that aligns cluster points with their map points, -1 for none.
+
+    The closed form without weights (as `se2.align`), and from there one step of generalized least
+    squares. Further steps would change the linearization point but not the map, and drift along the
+    most uncertain directions. For the same reason ∂r/∂θ is evaluated at the map points, (m - t)⊥
+    and not (R z)⊥, which differ by the residual: then a rotation of the whole map rotates the pose
+    with it, and the residuals do not depend on it.
+    """
+    there, target = slot >= 0, points.map[jnp.maximum(slot, 0)]
+    weight = jnp.where(there, 1.0, 0.0).astype(target.dtype)
+    total = jnp.maximum(weight.sum(), 1.0)
+    centroid = (weight[:, None] * points.cluster).sum(axis=0) / total
+    map_centroid = (weight[:, None] * target).sum(axis=0) / total
+    z, goal = points.cluster - centroid[None, :], target - map_centroid[None, :]
+    dot = (weight[:, None] * z * goal).sum()
+    cross = (weight * (z[:, 0] * goal[:, 1] - z[:, 1] * goal[:, 0])).sum()
+    start = jnp.concatenate([jnp.zeros(2, z.dtype), se2.polar(jnp.stack([dot, cross]))[1:]])
+
+    r = _residuals(points, slot, z, goal, start)
+    whitened = linalg.solve_lower(r.factor, r.error)
+    by_pose = linalg.solve_lower(r.factor, r.jacobian)
+    step, solvable = linalg.solve_psd(by_pose.T @ by_pose, by_pose.T @ whitened)
+    left = r.error - r.jacobian @ step
+    each, _ = mahalanobis_of_pairs(left.reshape(-1, 2), r.covs)
+    # About the centroids the numbers are small; the pose is that of the frames themselves.
+    centred = start - step
+    shift = map_centroid + centred[:2] - se2.rotation(centred[2]) @ centroid
+    heading = jnp.arctan2(jnp.sin(centred[2:]), jnp.cos(centred[2:]))
+    by_turn = jnp.where(there[:, None], quarter_turned(target - shift[None, :]), 0.0)
+    return _Alignment(
+        pose=jnp.concatenate([shift, heading]),
+        distance=((whitened - by_pose @ step) ** 2).sum(),
+        each=jnp.where(there, each, 0.0),
+        regular=r.positive & solvable,
+        residual=left,
+        jacobian=r.jacobian.at[:, 2].set(by_turn.reshape(-1)),
+        factor=r.factor,
+    )
+
+
+def _residuals(
+    points: PointSets,
+    slot: Int[Array, "M"],
+    z: Float[Array, "M 2"],
+    goal: Float[Array, "M 2"],
+    pose: Float[Array, "3"],
+) -> _Residuals:
+    """The residuals of points z and goals about their centroids; 0 and identity without a pair."""
+    m, there, at = slot.shape[0], slot >= 0, jnp.maximum(slot, 0)
+    rotation = se2.rotation(pose[2])
+    mixed = jnp.einsum("xy,iyjw->ixjw", rotation, points.cross_cov[:, :, at])
+    cov = jnp.einsum("xy,iyjw,vw->ixjv", rotation, points.cluster_cov, rotation)
+    cov = cov + points.map_cov[at][:, :, at] - mixed - mixed.transpose(2, 3, 0, 1)
+    cov = with_unit_blocks(cov, there)
+    factor, positive = linalg.cholesky(linalg.symmetrize(cov.reshape(2 * m, 2 * m)))
+    error = jnp.where(there[:, None], z @ rotation.T + pose[None, :2] - goal, 0.0)
+    eye = jnp.broadcast_to(jnp.eye(2, dtype=z.dtype), (m, 2, 2))
+    by_turn = quarter_turned(goal - pose[None, :2])[:, :, None]
+    jacobian = jnp.where(there[:, None, None], jnp.concatenate([eye, by_turn], 2), 0.0)
+    own = cov[jnp.arange(m), :, jnp.arange(m)]
+    return _Residuals(error.reshape(-1), jacobian.reshape(2 * m, 3), own, factor, positive)
+
+
+def with_unit_blocks(
+    cov: Float[Array, "M 2 M 2"], there: Bool[Array, "M"]
+) -> Float[Array, "M 2 M 2"]:
+    """The covariance with the identity in the rows and columns of absent points."""
+    m = there.shape[0]
+    both = jnp.broadcast_to(there[:, None, None, None] & there[None, None, :, None], cov.shape)
+    return jnp.where(both, cov, jnp.eye(2 * m, dtype=cov.dtype).reshape(m, 2, m, 2))
+
 
 _BLOCK = 32  # candidates that are scored together; more cost memory
 _FINALISTS = 8  # hypotheses that are tried jointly
@@ -42,7 +149,7 @@ class GeometricMatch(NamedTuple):
     """more pairs of points agreed than there was room for"""
 
 
-class SearchLimits(NamedTuple):
+class _SearchLimits(NamedTuple):
     """The limits of a search; made by `search_limits`."""
 
     single: tuple[float, float]
@@ -55,7 +162,7 @@ class SearchLimits(NamedTuple):
 
 def search_limits(
     caller: str, size: int, probability: float, pairs: int, candidates: int
-) -> SearchLimits:
+) -> _SearchLimits:
     """The limits of a search over M = size cluster points.
 
     Raises ValueError, which names the caller, on a probability not between 0 and 1, or pairs or
@@ -67,7 +174,7 @@ def search_limits(
     check_count(f"{caller}: candidates", candidates)
     joint = [chi2_quantile(probability, max(2 * n - 3, 1)) for n in range(size + 1)]
     single = chi2_quantile(probability, 1), chi2_quantile(probability, 2)
-    return SearchLimits(single, np.asarray(joint), pairs, candidates)
+    return _SearchLimits(single, np.asarray(joint), pairs, candidates)
 
 
 class _Hypotheses(NamedTuple):
@@ -82,7 +189,7 @@ class _Hypotheses(NamedTuple):
     """more candidates agreed than C"""
 
 
-def match_points(points: PointSets, limits: SearchLimits) -> GeometricMatch:
+def match_points(points: PointSets, limits: _SearchLimits) -> GeometricMatch:
     """The match with the most cluster points; among equals, that of least D².
 
     Each of a few pairs (a, b) of cluster points, the longest, is compared with all pairs (j, k) of
@@ -95,7 +202,7 @@ def match_points(points: PointSets, limits: SearchLimits) -> GeometricMatch:
     """
     found = _hypotheses(points, limits)
     finalists = found.slot.reshape(-1, len(points.cluster))[_finalists(found)]
-    fits = jax.vmap(lambda slot: fit_hypothesis(points, slot, limits))(finalists)
+    fits = jax.vmap(lambda slot: _fit_hypothesis(points, slot, limits))(finalists)
     best: GeometricMatch = jax.tree.map(
         lambda leaf: leaf[jnp.argmax(_merit(fits.explained, fits.distance))], fits
     )
@@ -104,7 +211,7 @@ def match_points(points: PointSets, limits: SearchLimits) -> GeometricMatch:
     return best._replace(runner_up=other.astype(jnp.int32), exhausted=found.exhausted.any())
 
 
-def _hypotheses(points: PointSets, limits: SearchLimits) -> _Hypotheses:
+def _hypotheses(points: PointSets, limits: _SearchLimits) -> _Hypotheses:
     """Hypotheses of the longest cluster pairs with the map pairs whose lengths agree best."""
     n = points.map.shape[0]
     room = min(limits.candidates, n * n)
@@ -140,8 +247,8 @@ def _finalists(found: _Hypotheses) -> Int[Array, "K"]:
     return jnp.concatenate([heads, jax.lax.top_k(every, min(_FINALISTS, len(every)))[1]])
 
 
-def fit_hypothesis(
-    points: PointSets, slot: Int[Array, "M"], limits: SearchLimits
+def _fit_hypothesis(
+    points: PointSets, slot: Int[Array, "M"], limits: _SearchLimits
 ) -> GeometricMatch:
     """The match of one hypothesis: the least-squares frame of the pairs that fit.
 

@@ -1,4 +1,8 @@
-"""Loop closure by matching a cluster of recent landmarks with the old map."""
+"""Loop closure by matching a cluster of recent landmarks with the old map.
+
+Afterwards successive duplicates are merged: of two landmarks, one was initialized after the other
+was last measured.
+"""
 
 import dataclasses
 from typing import NamedTuple
@@ -8,23 +12,73 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam.core.numbers import check_count
-from jaxslam.filters.ekf.coordinates.map_coordinates import cov_of_coordinates
-from jaxslam.filters.map_management.alignment import with_unit_blocks
+from jaxslam.filters.ekf.map_coordinates import cov_of_coordinates
 from jaxslam.filters.map_management.geometric_matching import (
     GeometricMatch,
     match_points,
     search_limits,
+    with_unit_blocks,
 )
-from jaxslam.filters.map_management.merging import squared_distance
+from jaxslam.filters.map_management.merging import closest_pair, merge_landmarks, squared_distance
 from jaxslam.filters.map_management.point_pairs import PointSets, difference_covs
 from jaxslam.filters.map_management.relocalization import check_point_map, check_policy
-from jaxslam.filters.map_management.successive import merge_histories
-from jaxslam.life.recency import Times
+from jaxslam.life import Times
 from jaxslam.math import linalg
+from jaxslam.math.arrays import Number
 from jaxslam.math.stats import chi2_quantile
-from jaxslam.math.xla import change_where
+from jaxslam.math.xla import change_where, where_any
 from jaxslam.protocols import Chart
 from jaxslam.slots import Joint
+
+
+def merge_histories(joint: Joint, chart: Chart, old: Int[Array, ""], new: Int[Array, ""]) -> Joint:
+    """The map with slot new merged into slot old, including their times; unchanged if equal."""
+    after = merge_landmarks(joint, chart, old, new)
+    known: Times = joint.life
+    freed = joint.alive & ~after.alive
+    happened = freed.any()
+
+    def of_both(times: Array, value: Array) -> Array:
+        return jnp.where(freed, 0, times.at[old].set(jnp.where(happened, value, times[old])))
+
+    life = known._replace(
+        born=of_both(known.born, jnp.minimum(known.born[old], known.born[new])),
+        last=of_both(known.last, jnp.maximum(known.last[old], known.last[new])),
+        seen=of_both(known.seen, known.seen[old] + known.seen[new]),
+    )
+    return after._replace(life=life)
+
+
+def successive_duplicate(
+    joint: Joint, chart: Chart, reach: Number, spread: Number
+) -> tuple[Int[Array, ""], Int[Array, ""], Float[Array, ""]]:
+    """The older and the younger slot of the likeliest duplicates, and their squared distance.
+
+    Of pairs within reach [m] of which one was initialized after the other was last measured, and
+    whose difference is known to √(tr cov(δ)/2) <= spread [m]; infinite where there is none.
+    """
+    known: Times = joint.life
+    capacity = joint.alive.shape[0]
+    later = known.born[:, None] > known.last[None, :]
+    near = ((joint.landmarks[:, None] - joint.landmarks[None, :]) ** 2).sum(axis=2) <= reach**2
+    pairs = (later | later.T) & joint.alive[:, None] & joint.alive[None, :] & near
+
+    def search(joint: Joint) -> tuple[Array, Array, Array]:
+        cov = cov_of_coordinates(joint, chart)[3:, 3:].reshape(capacity, 2, capacity, 2)
+        every = jnp.arange(capacity)
+        own = jnp.trace(cov[every, :, every], axis1=1, axis2=2)
+        mixed = cov[:, 0, :, 0] + cov[:, 1, :, 1]
+        variance = own[:, None] + own[None, :] - 2 * mixed
+        i, j, distance = closest_pair(joint, chart, reach, pairs & (variance <= 2 * spread**2))
+        first = known.born[i] <= known.born[j]
+        i, j = jnp.where(first, i, j), jnp.where(first, j, i)
+        return i.astype(jnp.int32), j.astype(jnp.int32), distance
+
+    def nothing(joint: Joint) -> tuple[Array, Array, Array]:
+        zero = jnp.zeros((), jnp.int32)
+        return zero, zero, jnp.full((), jnp.inf, joint.cov.dtype)
+
+    return where_any(pairs.any(), search, nothing, joint)
 
 
 class LoopReport(NamedTuple):
@@ -114,10 +168,10 @@ def close_loop(joint: Joint, chart: Chart, settings: LoopSettings) -> tuple[Join
             landmarks that `lost` refuses.
     """
     check_recency("close_loop", joint, chart)
-    recent, candidates = recent_cluster(joint, settings)
+    recent, candidates = _recent_cluster(joint, settings)
     old, report = change_where(
         candidates.any(axis=1).sum() >= settings.least,
-        lambda _: old_slots(joint, chart, recent, candidates, settings),
+        lambda _: _old_slots(joint, chart, recent, candidates, settings),
         (jnp.full(recent.shape, -1, jnp.int32), no_closing()),
     )
     joint = change_where(
@@ -132,7 +186,7 @@ def no_closing() -> LoopReport:
     return LoopReport(none, none, no, none, no, no, none)
 
 
-def recent_cluster(
+def _recent_cluster(
     joint: Joint, settings: LoopSettings
 ) -> tuple[Int[Array, "M"], Bool[Array, "M N"]]:
     """The slots of the M recent landmarks measured last, and their candidate old landmarks."""
@@ -146,7 +200,7 @@ def recent_cluster(
     return cluster, recent[cluster][:, None] & joint.alive[None, :] & later
 
 
-def old_slots(
+def _old_slots(
     joint: Joint,
     chart: Chart,
     recent: Int[Array, "M"],

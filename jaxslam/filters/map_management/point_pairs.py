@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.association.gates import mutual
+from jaxslam.association.rules import mutual
 
 
 class PointSets(NamedTuple):
@@ -97,8 +97,8 @@ def extend_pair(
     Returns:
         The map point (M,) of each cluster point, -1 for none; how many; Σ d² with the test.
     """
-    frame = frame_of_pair(points, ends, slots)
-    covs, cross_covs = moved_covs(points, ends, slots, frame)
+    frame = _frame_of_pair(points, ends, slots)
+    covs, cross_covs = _moved_covs(points, ends, slots, frame)
     every, at = jnp.arange(len(points.cluster)), jnp.arange(len(points.map))
     error_covs = difference_covs(covs, points.map_cov[at, :, at], cross_covs)
     error = frame.moved[:, None] - points.map[None, :]
@@ -114,7 +114,7 @@ def extend_pair(
     return slot, (slot >= 0).sum(), jnp.where(agreed, test + total, 0.0)
 
 
-class PairFrame(NamedTuple):
+class _PairFrame(NamedTuple):
     """The rigid motion T that carries a cluster pair onto a map pair, midpoint onto midpoint."""
 
     rotation: Float[Array, "2 2"]
@@ -124,7 +124,7 @@ class PairFrame(NamedTuple):
     """Jacobians of T z_i, through T, by z_a, z_b, m_j and m_k"""
 
 
-def frame_of_pair(points: PointSets, ends: Int[Array, "2"], slots: Int[Array, "2"]) -> PairFrame:
+def _frame_of_pair(points: PointSets, ends: Int[Array, "2"], slots: Int[Array, "2"]) -> _PairFrame:
     """The transformation T that carries cluster points a, b = ends onto map points j, k = slots.
 
     dθ = v⊥·(δm_k - δm_j)/|m_k - m_j| - v⊥·R(δz_b - δz_a)/|z_b - z_a|, with v the direction of the
@@ -141,15 +141,15 @@ def frame_of_pair(points: PointSets, ends: Int[Array, "2"], slots: Int[Array, "2
     by_map = jnp.stack([half - swing / r, half + swing / r], axis=1)
     by_ends = jnp.stack([-half + swing / s, -half - swing / s], axis=1) @ rotation
     jacobians = jnp.concatenate([by_ends, by_map], axis=1).transpose(0, 2, 1, 3)
-    return PairFrame(
+    return _PairFrame(
         rotation=rotation,
         moved=arm + (0.5 * (m_j + m_k))[None, :],
         jacobians=jacobians.reshape(len(points.cluster), 2, 8),
     )
 
 
-def moved_covs(
-    points: PointSets, ends: Int[Array, "2"], slots: Int[Array, "2"], frame: PairFrame
+def _moved_covs(
+    points: PointSets, ends: Int[Array, "2"], slots: Int[Array, "2"], frame: _PairFrame
 ) -> tuple[Float[Array, "M 2 2"], Float[Array, "M N 2 2"]]:
     """Covariances of T z_i, and with the map: errors are G of z_a, z_b, m_j, m_k, and R of z_i."""
     (m, n), g, rotation = points.allowed.shape, frame.jacobians, frame.rotation

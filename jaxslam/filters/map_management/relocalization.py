@@ -8,13 +8,13 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxslam.core.numbers import check_count, check_covariance
-from jaxslam.filters.ekf.coordinates.map_coordinates import (
+from jaxslam.filters.ekf.map_coordinates import (
     cov_of_coordinates,
     with_cov_of_coordinates,
 )
-from jaxslam.filters.map_management.alignment import align_points
 from jaxslam.filters.map_management.geometric_matching import (
     GeometricMatch,
+    align_points,
     match_points,
     search_limits,
 )
@@ -25,7 +25,7 @@ from jaxslam.slots import Joint
 from jaxslam.types import Scan
 
 
-class Relocalization(NamedTuple):
+class _Relocalization(NamedTuple):
     """The pose from which a scan was taken, and its match with the map."""
 
     pose: Float[Array, "3"]
@@ -80,7 +80,7 @@ def relocalize(
     margin: int = 2,
     pairs: int = 8,
     candidates: int = 512,
-) -> Relocalization:
+) -> _Relocalization:
     """The pose of a scan in a map without a prior, by distances between pairs of points.
 
     `match_points` has the search. Another hypothesis is one that shares fewer than two of the
@@ -133,9 +133,9 @@ def check_policy(caller: str, least: int, margin: int) -> None:
         raise ValueError(f"{caller}: expected least >= 3, got {least}")
 
 
-def _judged(found: GeometricMatch, least: int, margin: int) -> Relocalization:
+def _judged(found: GeometricMatch, least: int, margin: int) -> _Relocalization:
     ok = (found.explained >= least) & (found.explained - found.runner_up >= margin)
-    return Relocalization(
+    return _Relocalization(
         pose=found.pose,
         slot=found.slot,
         explained=found.explained,

@@ -13,8 +13,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import slots
-from jaxslam.filters.multi_robot.settings import SIZE, TeamSettings, measures_points
-from jaxslam.filters.multi_robot.team_state import InitialPose, pose_of, rows_of
+from jaxslam.filters.multi_robot.team_state import (
+    SIZE,
+    InitialPose,
+    TeamSettings,
+    measures_points,
+    pose_of,
+    rows_of,
+)
 from jaxslam.linearize import first_order
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
@@ -25,7 +31,7 @@ from jaxslam.slots import Joint
 from jaxslam.types import Scan
 
 
-class ObservedPoints(NamedTuple):
+class _ObservedPoints(NamedTuple):
     """The measurements of a robot as points in its own frame."""
 
     point: Float[Array, "M 2"]
@@ -43,7 +49,7 @@ Candidate = tuple[InitialPose, list[Bool[Array, "M"]]]
 def best_initialization(
     joint: Joint,
     robot: int,
-    observed: list[ObservedPoints],
+    observed: list[_ObservedPoints],
     there: Bool[Array, "R"],
     settings: TeamSettings,
 ) -> Candidate:
@@ -68,7 +74,7 @@ def _mutual_candidate(
     joint: Joint,
     robot: int,
     other: int,
-    observed: list[ObservedPoints],
+    observed: list[_ObservedPoints],
     there: Bool[Array, ""],
     settings: TeamSettings,
 ) -> Candidate:
@@ -90,12 +96,12 @@ def _mutual_candidate(
 
 
 def _landmark_candidate(
-    joint: Joint, robot: int, observed: list[ObservedPoints], settings: TeamSettings
+    joint: Joint, robot: int, observed: list[_ObservedPoints], settings: TeamSettings
 ) -> Candidate:
     """The pose from the two measured landmarks of the map that are farthest apart."""
     mine, capacity = observed[robot], settings.capacity
     slot, known = slots.find(joint.tag[:capacity], joint.alive[:capacity], mine.tag)
-    i, j, two = farthest_pair(mine.point, known & mine.valid)
+    i, j, two = _farthest_pair(mine.point, known & mine.valid)
     pair, which = jnp.stack([i, j]), jnp.stack([slot[i], slot[j]])
     at_pair = (3 + which[:, None] * SIZE + jnp.arange(2)[None, :]).reshape(-1)
     rows = joint.cov[at_pair]
@@ -107,28 +113,28 @@ def _landmark_candidate(
     return InitialPose(*found, two & (which[0] != which[1])), used
 
 
-def _none_of(observed: list[ObservedPoints]) -> list[Array]:
+def _none_of(observed: list[_ObservedPoints]) -> list[Array]:
     return [jnp.zeros_like(each.valid) for each in observed]
 
 
-def _first(observed: ObservedPoints, tag: int) -> tuple[Int[Array, ""], Bool[Array, ""]]:
+def _first(observed: _ObservedPoints, tag: int) -> tuple[Int[Array, ""], Bool[Array, ""]]:
     """The first measurement with a tag, and whether there is one."""
     match = observed.valid & (observed.tag == tag)
     return jnp.argmax(match), match.any()
 
 
-def observed_points(sensors: Suite, scan: Scan) -> ObservedPoints:
+def observed_points(sensors: Suite, scan: Scan) -> _ObservedPoints:
     """A robot's scan as points; valid if a measurement has a tag and determines a point."""
     found = []
     for part, own in zip(sensors.parts, split_scan(scan, sensors.places), strict=True):
         if measures_points(part.sensor):
             points, covs = _points_of(part.sensor, own)
-            found.append(ObservedPoints(points, covs, own.tag, own.valid & (own.tag >= 0)))
+            found.append(_ObservedPoints(points, covs, own.tag, own.valid & (own.tag >= 0)))
         else:
             m, dtype = part.places, scan.z.dtype
             nothing = jnp.zeros((m, 2), dtype), jnp.zeros((m, 2, 2), dtype)
-            found.append(ObservedPoints(*nothing, own.tag, jnp.zeros(m, bool)))
-    return ObservedPoints(*(jnp.concatenate(leaves) for leaves in zip(*found, strict=True)))
+            found.append(_ObservedPoints(*nothing, own.tag, jnp.zeros(m, bool)))
+    return _ObservedPoints(*(jnp.concatenate(leaves) for leaves in zip(*found, strict=True)))
 
 
 def _points_of(sensor: Sensor, scan: Scan) -> tuple[Float[Array, "M 2"], Float[Array, "M 2 2"]]:
@@ -205,7 +211,7 @@ def by_two_landmarks(
     return _wrapped(pose(points, seen)), by_points @ rows, own
 
 
-def farthest_pair(
+def _farthest_pair(
     points: Float[Array, "M 2"], usable: Bool[Array, "M"]
 ) -> tuple[Int[Array, ""], Int[Array, ""], Bool[Array, ""]]:
     """Indices i < j of the usable points farthest from each other, and whether two differ."""

@@ -8,10 +8,12 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxslam import slots, validation
-from jaxslam.association.known import Known
-from jaxslam.charts.euclidean import Euclidean
+from jaxslam.association.rules import Known
+from jaxslam.charts import Euclidean
 from jaxslam.core.numbers import check_count
 from jaxslam.core.record import hold_function, record, set_field, static
+from jaxslam.filters.ekf.predict import propagate
+from jaxslam.filters.ekf.scan import SensorTurn, turn_of, update_by_scan
 from jaxslam.filters.ekf.settings import (
     CorrectionOrder,
     Covariance,
@@ -19,16 +21,12 @@ from jaxslam.filters.ekf.settings import (
     check_covariance_form,
     check_ekf_options,
 )
-from jaxslam.filters.ekf.steps.predict import propagate
-from jaxslam.filters.ekf.steps.scan import SensorTurn, turn_of, update_by_scan
 from jaxslam.filters.multi_robot.pose_initialization import best_initialization, observed_points
-from jaxslam.filters.multi_robot.settings import (
+from jaxslam.filters.multi_robot.team_state import (
     SIZE,
+    InitialPose,
     TeamSettings,
     check_sensors,
-)
-from jaxslam.filters.multi_robot.team_state import (
-    InitialPose,
     robots_in_map,
     seen_from,
     seen_from_first,
@@ -132,11 +130,11 @@ class TeamSlam(Filter):
         return tuple(places for robot in self.robots for places in robot.sensors.places)
 
     def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:
-        return initial_team_state(pose, pose_cov, self._settings)
+        return _initial_team_state(pose, pose_cov, self._settings)
 
     def predict(self, state: Joint, u: Float[Array, "U"], key: Array) -> Joint:
         for b, own in enumerate(jnp.split(u, sizes(self.robots)[0][:-1])):
-            state = predicted_robot(state, b, own, self._settings)
+            state = _predicted_robot(state, b, own, self._settings)
         return state
 
     def update(self, state: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
@@ -210,7 +208,7 @@ class _HeadingsWrapped(Euclidean):
         return pose, jnp.concatenate([landmark[:2], wrap(landmark[2:])])
 
 
-def initial_team_state(
+def _initial_team_state(
     pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"], settings: TeamSettings
 ) -> Joint:
     """The initial state: robot 0 at a pose, the others relative to it, x_b = x_0 ∘ start_b."""
@@ -228,7 +226,7 @@ def initial_team_state(
     return joint
 
 
-def predicted_robot(
+def _predicted_robot(
     joint: Joint, robot: int, u: Float[Array, "U"], settings: TeamSettings
 ) -> Joint:
     """The state after the prediction of one robot, if it is in the map."""

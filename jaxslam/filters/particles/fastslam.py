@@ -11,10 +11,11 @@ from jax import Array
 from jaxtyping import Bool, Float, Int, PyTree
 
 from jaxslam import validation
-from jaxslam.association.known import Known
-from jaxslam.charts.euclidean import Euclidean
+from jaxslam.association.rules import Known
+from jaxslam.charts import Euclidean
 from jaxslam.core.record import record, static
 from jaxslam.filters.particles.landmark_ekf import update_map
+from jaxslam.filters.particles.pose_particles import weighted_nis
 from jaxslam.filters.particles.proposal import (
     PoseProposal,
     associate_particle,
@@ -29,18 +30,18 @@ from jaxslam.filters.particles.settings import (
     check_resampling,
     particle_map_settings,
 )
-from jaxslam.filters.particles.states.moments import slam_estimate, weighted_nis
-from jaxslam.filters.particles.states.particle_info import ParticleInfo
-from jaxslam.filters.particles.states.slam_state import (
+from jaxslam.filters.particles.slam_particles import (
+    ParticleInfo,
     SlamParticles,
     draw_poses,
     initial_slam_particles,
+    slam_estimate,
     with_finite_poses,
 )
 from jaxslam.filters.reporting import has_distance, with_extra
 from jaxslam.math.arrays import Number
 from jaxslam.protocols import Associate, Differentiable, Filter, Life, Motion, Resample, Sensor
-from jaxslam.resampling.systematic import systematic
+from jaxslam.resampling.rules import systematic
 from jaxslam.resampling.weights import normalized, resampled_where
 from jaxslam.types import Estimate, Info, Scan
 
@@ -51,7 +52,7 @@ _T = TypeVar("_T")
 class FastSlam(Filter):
     """FastSLAM: weighted particles for the posterior of the path, and for each path independent
     landmark Gaussians (exact except for linearization). The state is a
-    `slam_state.SlamParticles`.
+    `SlamParticles`.
 
     "motion", FastSLAM 1.0 (Montemerlo, Thrun, Koller & Wegbreit 2002, "FastSLAM: A factored
     solution to the simultaneous localization and mapping problem"): poses are drawn from the motion
@@ -74,7 +75,7 @@ class FastSlam(Filter):
     Σ_p w_p E_{N_p} d²_p, while that of the most likely particle is biased low by selection. Its
     log_likelihood is that of the scan given all before, log Σ w p(scan | particle), of the
     measurements that a particle has landmarks for. `info.extra["particles"]` is a `ParticleInfo`.
-    Estimates: `moments.slam_estimate`.
+    Estimates: `slam_estimate`.
 
     Raises ValueError on a capacity, particles or births below 1, a threshold outside [0, 1], a gate
     not above 0, an unknown proposal, a life that is none, a resample that is no function, or a
@@ -138,13 +139,13 @@ class FastSlam(Filter):
         return with_finite_poses(state, moved, jnp.zeros_like(state.pose_cov))
 
     def update(self, state: SlamParticles, scan: Scan, key: Array) -> tuple[SlamParticles, Info]:
-        each = partial(of_each_particle, zero_padding(scan), particle_map_settings(self))
+        each = partial(_of_each_particle, zero_padding(scan), particle_map_settings(self))
         key_resample, key_draw = jax.random.split(key)
         state = state._replace(best=None)
         association = each(associate_particle, state)
         proposed, innovations = each(propose_pose, state, association)
         state = with_finite_poses(state, proposed.pose, proposed.pose_cov)
-        weight, log_likelihood, some = weight_particles(state, proposed)
+        weight, log_likelihood, some = _weight_particles(state, proposed)
         nis = weighted_nis(innovations.nis, association.matched, weight)
         ess = 1.0 / jnp.exp(2 * weight).sum()
         due = ess < self.threshold * self.particles
@@ -152,24 +153,24 @@ class FastSlam(Filter):
         (state, association, innovations, before), weight = resampled_where(
             due, (state, association, innovations, weight), weight, self.resample, key_resample
         )
-        state = with_drawn_poses(state._replace(log_weight=weight), key_draw)
+        state = _with_drawn_poses(state._replace(log_weight=weight), key_draw)
         state, infos = each(update_map, state, association, innovations)
         best = jnp.argmax(before).astype(jnp.int32)
-        info = report_best(infos, best, nis, log_likelihood, association.exhausted)
+        info = _report_best(infos, best, nis, log_likelihood, association.exhausted)
         return state._replace(best=best), with_extra(info, "particles", found)
 
     def estimate(self, state: SlamParticles) -> Estimate:
         return slam_estimate(state, self.sensor)
 
 
-def of_each_particle(
+def _of_each_particle(
     scan: Scan, settings: ParticleMapSettings, step: Callable[..., _T], *of_particles: PyTree
 ) -> _T:
     """The results of step(*of_particle, scan=…, settings=…) for every particle."""
     return jax.vmap(partial(step, scan=scan, settings=settings))(*of_particles)
 
 
-def report_best(
+def _report_best(
     infos: Info,
     best: Int[Array, ""],
     nis: Float[Array, "M"],
@@ -185,7 +186,7 @@ def report_best(
     )
 
 
-def weight_particles(
+def _weight_particles(
     state: SlamParticles, proposed: PoseProposal
 ) -> tuple[Float[Array, "P"], Float[Array, ""], Bool[Array, ""]]:
     """Log-weights log w_p p(scan | particle) with Σ w = 1, the log-likelihood of measurements with
@@ -195,7 +196,7 @@ def weight_particles(
     return weight, normalized(seen)[1], some
 
 
-def with_drawn_poses(state: SlamParticles, key: Array) -> SlamParticles:
+def _with_drawn_poses(state: SlamParticles, key: Array) -> SlamParticles:
     """The state with each pose drawn from its Gaussian, all finite."""
     return state._replace(
         pose=draw_poses(state, key),

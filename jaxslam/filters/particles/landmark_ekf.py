@@ -14,8 +14,7 @@ from jaxslam import slots
 from jaxslam.filters.particles.proposal import ParticleInnovations
 from jaxslam.filters.particles.scan_association import ParticleAssociation
 from jaxslam.filters.particles.settings import ParticleMapSettings
-from jaxslam.filters.particles.states.moments import slam_estimate
-from jaxslam.filters.particles.states.slam_state import SlamParticles, as_only_particle
+from jaxslam.filters.particles.slam_particles import SlamParticles, as_only_particle, slam_estimate
 from jaxslam.filters.reporting import info_of, seen_before, status_of, with_removed
 from jaxslam.linearize import first_order
 from jaxslam.math import linalg
@@ -37,9 +36,9 @@ def update_map(
 
     The log-likelihood of the `Info` is left at 0.
     """
-    particle = correct_landmarks(particle, association.slot, innovations.used, scan, settings)
-    particle, evicted = evict_for_new(particle, association, innovations.used, settings.life)
-    particle, new = initialize_particle_landmarks(particle, association.is_new, scan, settings)
+    particle = _correct_landmarks(particle, association.slot, innovations.used, scan, settings)
+    particle, evicted = _evict_for_new(particle, association, innovations.used, settings.life)
+    particle, new = _initialize_particle_landmarks(particle, association.is_new, scan, settings)
     status = status_of(
         scan.valid,
         matched=association.matched,
@@ -64,10 +63,10 @@ def update_map(
         log_likelihood=jnp.zeros((), scan.z.dtype),
         exhausted=association.exhausted,
     )
-    return remove_landmarks(particle, info, evicted, settings)
+    return _remove_landmarks(particle, info, evicted, settings)
 
 
-def correct_landmarks(
+def _correct_landmarks(
     particle: SlamParticles,
     slot: Int[Array, "M"],
     used: Bool[Array, "M"],
@@ -96,7 +95,7 @@ def correct_landmarks(
     )
 
 
-def evict_for_new(
+def _evict_for_new(
     particle: SlamParticles,
     association: ParticleAssociation,
     used: Bool[Array, "M"],
@@ -112,7 +111,7 @@ def evict_for_new(
     return _without_landmarks(particle, evicted), evicted
 
 
-class AllocatedSlots(NamedTuple):
+class _AllocatedSlots(NamedTuple):
     """The slots of new landmarks, and the outcome of measurements without a landmark."""
 
     slot: Int[Array, "M"]
@@ -124,20 +123,20 @@ class AllocatedSlots(NamedTuple):
     """of a tag that occurs earlier in the scan"""
 
 
-def initialize_particle_landmarks(
+def _initialize_particle_landmarks(
     particle: SlamParticles, is_new: Bool[Array, "M"], scan: Scan, settings: ParticleMapSettings
-) -> tuple[SlamParticles, AllocatedSlots]:
+) -> tuple[SlamParticles, _AllocatedSlots]:
     """The particle with new landmarks in free slots, as many as fit."""
     kind, m = particle.landmarks.dtype, is_new.shape[0]
     capacity, size = particle.landmarks.shape
 
-    def initialize(own: SlamParticles) -> tuple[AllocatedSlots, Array, Array]:
-        allocated = allocate_slots(is_new, scan.tag, own.alive, settings.quota)
-        return allocated, *invert_scan(own.pose, scan.z, settings.sensor)
+    def initialize(own: SlamParticles) -> tuple[_AllocatedSlots, Array, Array]:
+        allocated = _allocate_slots(is_new, scan.tag, own.alive, settings.quota)
+        return allocated, *_invert_scan(own.pose, scan.z, settings.sensor)
 
-    def nothing_new(own: SlamParticles) -> tuple[AllocatedSlots, Array, Array]:
+    def nothing_new(own: SlamParticles) -> tuple[_AllocatedSlots, Array, Array]:
         no = jnp.zeros_like(is_new)
-        allocated = AllocatedSlots(jnp.zeros(m, jnp.int32), no, no, no)
+        allocated = _AllocatedSlots(jnp.zeros(m, jnp.int32), no, no, no)
         return allocated, jnp.zeros((m, size), kind), jnp.zeros((m, size, size), kind)
 
     new, landmarks, covs = where_any(is_new.any(), initialize, nothing_new, particle)
@@ -151,7 +150,7 @@ def initialize_particle_landmarks(
     return particle, new
 
 
-def invert_scan(
+def _invert_scan(
     pose: Float[Array, "3"], z: Float[Array, "M Z"], sensor: Sensor
 ) -> tuple[Float[Array, "M L"], Float[Array, "M L L"]]:
     """The new landmarks of measurements, and their covariances.
@@ -166,18 +165,18 @@ def invert_scan(
     return jax.vmap(one)(z)
 
 
-def allocate_slots(
+def _allocate_slots(
     is_new: Bool[Array, "M"], tag: Int[Array, "M"], alive: Bool[Array, "N"], quota: int | None
-) -> AllocatedSlots:
+) -> _AllocatedSlots:
     """A free slot for each new landmark, in the order of the scan."""
     repeated = is_new & seen_before(tag, is_new)
     wanted = is_new & ~repeated
     deferred = wanted & (jnp.cumsum(wanted) > (tag.shape[0] if quota is None else quota))
     slot, granted = slots.allocate(alive, wanted & ~deferred)
-    return AllocatedSlots(slot, granted, deferred, repeated)
+    return _AllocatedSlots(slot, granted, deferred, repeated)
 
 
-def remove_landmarks(
+def _remove_landmarks(
     particle: SlamParticles, info: Info, evicted: Bool[Array, "N"], settings: ParticleMapSettings
 ) -> tuple[SlamParticles, Info]:
     """The particle without the landmarks that its `Life` removes; `Pruned.removed` marks them."""

@@ -11,9 +11,12 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.association.predicted import predicted
-from jaxslam.filters.particles.gating import gate_distance
-from jaxslam.filters.particles.scan_association import ParticleAssociation, particle_association
+from jaxslam.association.prediction import predicted
+from jaxslam.filters.particles.scan_association import (
+    ParticleAssociation,
+    gate_distance,
+    particle_association,
+)
 from jaxslam.filters.particles.settings import KnownMapSensor
 from jaxslam.math.gaussians import GaussianTerms, gaussian_terms, log_density
 from jaxslam.protocols import Prediction
@@ -61,7 +64,7 @@ def scan_likelihood(
     found = []
     for each, own in zip(sensors, split_scan(scan, counts), strict=True):
         size = len(each.sensor.measurements)
-        of_sensor = ignored_likelihood if each.ignored else sensor_likelihood
+        of_sensor = _ignored_likelihood if each.ignored else _sensor_likelihood
         one, spare = of_sensor(pose, own._replace(z=own.z[:, :size]), each), widest - size
         innovation = jnp.pad(one.innovation, [(0, 0), (0, spare)])
         cov = jnp.pad(one.innovation_cov, [(0, 0), (0, spare), (0, spare)])
@@ -71,7 +74,7 @@ def scan_likelihood(
     return whole._replace(exhausted=whole.exhausted.any())
 
 
-def sensor_likelihood(
+def _sensor_likelihood(
     pose: Float[Array, "3"], scan: Scan, settings: KnownMapSensor
 ) -> ScanLikelihood:
     """The likelihood of one sensor's measurements.
@@ -84,7 +87,7 @@ def sensor_likelihood(
     size_z, size_l = len(sensor.measurements), len(sensor.landmark)
     # In a suite an absolute sensor, whose landmarks have no parameters, shares the others' map.
     landmarks = jnp.asarray(settings.landmarks, pose.dtype)[:, :size_l]
-    slot, matched, _, exhausted = associate_known(pose, scan, landmarks, settings)
+    slot, matched, _, exhausted = _associate_known(pose, scan, landmarks, settings)
     noise = jax.vmap(sensor.noise_cov)(scan.z)
 
     def compare(
@@ -116,7 +119,7 @@ def sensor_likelihood(
     )
 
 
-def ignored_likelihood(
+def _ignored_likelihood(
     pose: Float[Array, "3"], scan: Scan, settings: KnownMapSensor
 ) -> ScanLikelihood:
     """The likelihood of ignored measurements, as of other robots: zero terms."""
@@ -138,7 +141,7 @@ def ignored_likelihood(
     )
 
 
-def associate_known(
+def _associate_known(
     pose: Float[Array, "3"],
     scan: Scan,
     landmarks: Float[Array, "N L"],
@@ -148,11 +151,11 @@ def associate_known(
     if not settings.sensor.landmark:
         none = jnp.zeros(scan.tag.shape, jnp.int32)
         return ParticleAssociation(none, scan.valid, jnp.zeros_like(scan.valid), jnp.asarray(False))
-    prediction = predict_known(pose, landmarks, settings)
+    prediction = _predict_known(pose, landmarks, settings)
     return particle_association(prediction, scan, settings.associate)
 
 
-def predict_known(
+def _predict_known(
     pose: Float[Array, "3"], landmarks: Float[Array, "N L"], settings: KnownMapSensor
 ) -> Prediction:
     """The `Prediction` of a known map from an exact pose: S_ij = R_i."""

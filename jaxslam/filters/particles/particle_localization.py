@@ -10,16 +10,14 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam import validation
-from jaxslam.association.known import Known
+from jaxslam.association.rules import Known
 from jaxslam.core.record import hold_function, record, static
 from jaxslam.filters.known.localization import hold_map, map_tags
 from jaxslam.filters.particles.likelihood import ScanLikelihood, scan_likelihood
+from jaxslam.filters.particles.pose_particles import Box, PoseParticles, draw_start, weighted_nis
 from jaxslam.filters.particles.pose_steps import MonteCarloFilter
 from jaxslam.filters.particles.scan_association import zero_padding
 from jaxslam.filters.particles.settings import known_map_sensors
-from jaxslam.filters.particles.states.moments import weighted_nis
-from jaxslam.filters.particles.states.pose_state import PoseParticles, draw_start
-from jaxslam.filters.particles.states.region import Box
 from jaxslam.filters.reporting import info_of, status_of, with_extra
 from jaxslam.math.arrays import Number
 from jaxslam.protocols import Associate, Motion, Sensor
@@ -44,14 +42,14 @@ class ParticleLocalization(MonteCarloFilter):
 
         slow ← slow + α_slow (c - slow)     fast ← fast + α_fast (c - fast)
 
-    each particle drawn is from the box with probability max(0, 1 - slack · fast/slow) instead
+    each particle drawn is from the box with probability max(0, 1 - fast/slow) instead
     (`injected`). c is the table's likelihood in units of its peak and per measurement, so that it
     does not depend on how many landmarks are in view; the first scan sets both averages; scans
-    without a measurement change nothing. slack above 1 injects less (Gutmann & Fox 2002).
+    without a measurement change nothing.
 
     The estimate is that of the weighted particles after a scan, before resampling:
-    `moments.weighted_pose_moments`, a single mean and covariance even if the particles form several
-    modes. Where all weights underflow, all in use become equal (`underflow`). A motion
+    `weighted_pose_moments`, a single mean and covariance even if the particles form several modes.
+    Where all weights underflow, all in use become equal (`underflow`). A motion
     that leaves a non-finite pose is undone, and the particle gets weight zero (`invalid`).
     The measurements in an `Info` are those of the most likely particle, and nis is the mean over
     the particles by weight, as of `FastSlam`; log_likelihood is log Σ w p(scan | x) of measurements
@@ -108,7 +106,7 @@ class ParticleLocalization(MonteCarloFilter):
         misfit = 0.5 * likelihood.counted.sum(axis=1)
         measured = likelihood.measured[0].sum()
         state, found = self.weigh(state, misfit, misfit, measured)
-        info = info_of_scan(scan, likelihood, state.log_weight, log_likelihood)
+        info = _info_of_scan(scan, likelihood, state.log_weight, log_likelihood)
         return state, with_extra(info, "particles", found)
 
     def estimate(self, state: PoseParticles) -> Estimate:
@@ -116,7 +114,7 @@ class ParticleLocalization(MonteCarloFilter):
         return self.pose_estimate(state, jax.vmap(self.sensor.position)(points), map_tags(self))
 
 
-def info_of_scan(
+def _info_of_scan(
     scan: Scan,
     likelihood: ScanLikelihood,
     log_weight: Float[Array, "P"],

@@ -6,38 +6,43 @@ from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam import validation
-from jaxslam.charts.euclidean import Euclidean
-from jaxslam.core.numbers import check_positive, is_concrete
+from jaxslam.charts import Euclidean
+from jaxslam.core.numbers import is_concrete
 from jaxslam.core.record import record, static
-from jaxslam.filters.particles.proposal import sample_motion
-from jaxslam.filters.particles.recovery import resample_and_inject, update_averages
-from jaxslam.filters.particles.settings import check_resampling
-from jaxslam.filters.particles.states.particle_info import ParticleInfo
-from jaxslam.filters.particles.states.pose_state import (
+from jaxslam.filters.particles.pose_particles import (
     ParticleEvents,
     PoseParticles,
+    Region,
     active_mask,
     draw_start,
+    hold_box,
     initial_pose_particles,
     no_events,
     pose_particle_moments,
 )
-from jaxslam.filters.particles.states.region import Region, hold_box
+from jaxslam.filters.particles.proposal import sample_motion
+from jaxslam.filters.particles.recovery import resample_and_inject, update_averages
+from jaxslam.filters.particles.settings import check_resampling
+from jaxslam.filters.particles.slam_particles import ParticleInfo
 from jaxslam.math.arrays import Number
 from jaxslam.protocols import Differentiable, Filter, Motion, Resample
 from jaxslam.resampling.kld import bins_of, enough
-from jaxslam.resampling.systematic import systematic
+from jaxslam.resampling.rules import systematic
 from jaxslam.resampling.weights import effective_size, normalized
 from jaxslam.types import Estimate
 
 # The default least number of particles.
 _LEAST = 50
+
+# The bound on their number: with this confidence the Kullback-Leibler divergence is below the
+# error, by bins of these sizes in x [m], y [m], θ [rad] (Fox 2003).
+_BINS = (0.5, 0.5, math.radians(15))
+_ERROR, _CONFIDENCE = 0.05, 0.99
 
 
 class _Particles(Filter):
@@ -55,8 +60,7 @@ class MonteCarloFilter(_Particles):
     """What particle filters in a known map share: start, number, resampling and recovery.
 
     Raises ValueError on counts below 1 or least above particles, a box that is not finite or has no
-    inside, start "uniform" without a region, a threshold outside [0, 1], bins, error or slack not
-    above 0, a confidence not within (0, 1), or invalid rates.
+    inside, start "uniform" without a region, a threshold outside [0, 1], or invalid rates.
     """
 
     _: dataclasses.KW_ONLY
@@ -71,23 +75,15 @@ class MonteCarloFilter(_Particles):
     """of ESS, as a share; 1 resamples (and chooses the number) in every step with unequal weights,
     0 only to inject. Where odometry is precise beside the scans, copies stay together, and a lower
     threshold gives a more consistent covariance"""
-    bins: tuple[float, float, float] = static(default=(0.5, 0.5, math.radians(15)))
-    """sizes in x [m], y [m], θ [rad]"""
-    error: Number = 0.05
-    """of the bound on the number of particles: the Kullback-Leibler divergence is below it"""
-    confidence: float = static(default=0.99)
-    """with this probability"""
     least: int | None = static(default=None)
     """never fewer particles; default 50, or the capacity if that is less. As many as the capacity:
     a fixed number"""
     forget: tuple[Number, Number] | None = (0.01, 0.1)
     """α_slow, α_fast with 0 < α_slow <= α_fast <= 1; None injects nothing"""
-    slack: Number = 1.0
-    """above 0"""
     chart = Euclidean()
 
     def __post_init__(self) -> None:
-        name, bins, rates = type(self).__name__, self.bins, self.forget
+        name, rates = type(self).__name__, self.forget
         validation.check_count(f"{name}: particles", self.particles)
         check_resampling(self)
         hold_box(self)
@@ -99,13 +95,6 @@ class MonteCarloFilter(_Particles):
                 )
         if self.start not in ("gaussian", "uniform"):
             raise ValueError(f'{name}: expected start "gaussian" or "uniform", got {self.start!r}')
-        if np.shape(bins) != (3,) or not all(np.isfinite(b) and b > 0 for b in bins):
-            raise ValueError(f"{name}: expected bins of three sizes above 0, got {bins!r}")
-        check_positive(name, error=self.error, slack=self.slack)
-        if not 0 < self.confidence < 1:
-            raise ValueError(
-                f"{name}: expected a confidence between 0 and 1, got {self.confidence}"
-            )
         if rates is not None and len(rates) != 2:
             raise ValueError(f"{name}: expected forget = (slow, fast), got {rates!r}")
         if rates is not None and is_concrete(rates) and not 0 < rates[0] <= rates[1] <= 1:
@@ -134,8 +123,7 @@ class MonteCarloFilter(_Particles):
         moved = sample_motion(self.motion, old, u, key_noise)
         good = jnp.isfinite(moved).all(axis=1)
         pose = jnp.where(good[:, None], moved, old)
-        bins = bins_of(pose, self.bins)
-        count, few = enough(bins, self.fewest, self.error, self.confidence)
+        count, few = enough(bins_of(pose, _BINS), self.fewest, _ERROR, _CONFIDENCE)
         active = jnp.where(due, count, state.active)
         used = jnp.arange(self.particles) < active
         log_weight = jnp.where(used, drawn.log_weight, -jnp.inf)
@@ -171,12 +159,12 @@ class MonteCarloFilter(_Particles):
             fit: what recovery compares with other scans, as `update_averages` takes it.
             measured: how many measurements the scan has.
         """
-        weight, some = weight_poses(state, misfit)
+        weight, some = _weight_poses(state, misfit)
         ess = effective_size(weight)
         found = ParticleInfo(
             ess=ess, underflow=~some, active=state.active, **state.events._asdict()
         )
-        state = update_averages(state, fit, measured, self.forget, self.slack)
+        state = update_averages(state, fit, measured, self.forget)
         injects = self.region is not None and self.forget is not None
         lost = injects & (state.injection > 0)
         state = state._replace(
@@ -206,7 +194,7 @@ class MonteCarloFilter(_Particles):
         return self.region if self.start == "uniform" else None
 
 
-def weight_poses(
+def _weight_poses(
     state: PoseParticles, misfit: Float[Array, "P"]
 ) -> tuple[Float[Array, "P"], Bool[Array, ""]]:
     """Log-weights log w exp(-misfit) with Σ w = 1, equal where all underflow, and whether any

@@ -10,12 +10,15 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
 
-from jaxslam.association.predicted import predicted
-from jaxslam.filters.particles.gating import gate_distance
-from jaxslam.filters.particles.scan_association import ParticleAssociation, particle_association
+from jaxslam.association.prediction import predicted
+from jaxslam.filters.particles.scan_association import (
+    ParticleAssociation,
+    gate_distance,
+    particle_association,
+)
 from jaxslam.filters.particles.settings import ParticleMapSettings
-from jaxslam.filters.particles.states.slam_state import SlamParticles
-from jaxslam.linearize import derivatives, first_order
+from jaxslam.filters.particles.slam_particles import SlamParticles
+from jaxslam.linearize import first_order
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
 from jaxslam.math.gaussians import gaussian_terms, log_density, log_det_of
@@ -47,7 +50,7 @@ def associate_particle(
     particle: SlamParticles, scan: Scan, settings: ParticleMapSettings
 ) -> ParticleAssociation:
     """The association of a scan with the map of one particle, before the scan corrects its pose."""
-    prediction = predict_measurements(particle, settings.sensor)
+    prediction = _predict_measurements(particle, settings.sensor)
     return particle_association(prediction, scan, settings.associate)
 
 
@@ -106,7 +109,7 @@ def propose_pose(
     ) -> tuple[tuple[Array, Array, Array, Array], ParticleInnovations]:
         x, p, log_matched, log_unmatched = carry
         z, landmark, cov, matched, valid = row
-        by_pose, by_landmark = derivatives.observe_jacobians(sensor, x, landmark)
+        by_pose, by_landmark = first_order.observe_jacobians(sensor, x, landmark)
         noise = sensor.noise_cov(z)
         nu = sensor.residual(z, sensor.observe(x, landmark))
         hp = linalg.matmul(by_pose, p)
@@ -141,14 +144,14 @@ def propose_pose(
     return PoseProposal(*done), innovations
 
 
-def predict_measurements(particle: SlamParticles, sensor: Sensor) -> Prediction:
+def _predict_measurements(particle: SlamParticles, sensor: Sensor) -> Prediction:
     """The `Prediction` of one particle's map, with landmarks correlated by the pose alone."""
 
     def linearized() -> tuple[Float[Array, "N Z"], Float[Array, "N Z 3"], Float[Array, "N Z Z"]]:
         """The prediction ẑ, H_x and H_l C H_lᵀ of each landmark."""
 
         def one(landmark: Array, cov: Array) -> tuple[Array, Array, Array]:
-            by_pose, by_landmark = derivatives.observe_jacobians(sensor, particle.pose, landmark)
+            by_pose, by_landmark = first_order.observe_jacobians(sensor, particle.pose, landmark)
             own = linalg.matmul(linalg.matmul(by_landmark, cov), by_landmark.T)
             return sensor.observe(particle.pose, landmark), by_pose, own
 

@@ -11,8 +11,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.filters.particles.states.pose_state import PoseParticles
-from jaxslam.filters.particles.states.region import Region
+from jaxslam.filters.particles.pose_particles import PoseParticles, Region
 from jaxslam.math.arrays import Number
 from jaxslam.protocols import Differentiable, Resample
 from jaxslam.resampling.weights import survivors
@@ -23,7 +22,6 @@ def update_averages(
     misfit: Float[Array, "P"],
     measured: Int[Array, ""],
     rates: tuple[Number, Number] | None,
-    slack: Number,
 ) -> PoseParticles:
     """The state with updated likelihood averages and the injection probability.
 
@@ -48,9 +46,7 @@ def update_averages(
     )
     safe = jnp.where(slow > 0, slow, 1.0)
     # Without an average no particle has a weight, now or before: all are lost.
-    injection = jnp.where(
-        slow > 0, jnp.maximum(0.0, 1 - jnp.asarray(slack, fit.dtype) * fast / safe), 1.0
-    )
+    injection = jnp.where(slow > 0, jnp.maximum(0.0, 1 - fast / safe), 1.0)
     some = measured > 0
     return state._replace(
         fast=jnp.where(some, fast, state.fast),
@@ -59,7 +55,7 @@ def update_averages(
     )
 
 
-class DrawnPoses(NamedTuple):
+class _DrawnPoses(NamedTuple):
     """P resampled or injected poses, in random order."""
 
     pose: Float[Array, "P 3"]
@@ -73,7 +69,7 @@ def resample_and_inject(
     key: Array,
     resample: Resample | Differentiable,
     region: Region | None,
-) -> DrawnPoses:
+) -> _DrawnPoses:
     """Poses resampled by weight or, with the state's injection probability, drawn from a
     region."""
     particles = len(state.pose)
@@ -83,10 +79,10 @@ def resample_and_inject(
     order = jax.random.permutation(key_order, particles)
     pose, log_weight = state.pose[ancestor[order]], log_weight[order]
     if region is None:
-        return DrawnPoses(pose, log_weight, jnp.zeros(particles, bool))
+        return _DrawnPoses(pose, log_weight, jnp.zeros(particles, bool))
     injected = jax.random.uniform(key_which, (particles,), pose.dtype) < state.injection
     anywhere = region.draw(particles, key_anywhere, pose.dtype)
-    return DrawnPoses(
+    return _DrawnPoses(
         jnp.where(injected[:, None], anywhere, pose),
         jnp.where(injected, -math.log(particles), log_weight),
         injected,

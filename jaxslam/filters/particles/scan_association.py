@@ -1,11 +1,12 @@
-"""Data association of a scan with the landmarks of one particle."""
+"""Data association of a scan with the landmarks of one particle, and the gate in its weights."""
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool, Int
+from jaxtyping import Bool, Float, Int
 
+from jaxslam.math.arrays import Number
 from jaxslam.protocols import Associate, Association, Prediction
 from jaxslam.types import Scan
 
@@ -37,3 +38,25 @@ def particle_association(
 def zero_padding(scan: Scan) -> Scan:
     """The scan with its padding set to zero; padding may hold any value."""
     return scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
+
+
+class _GatedDistance(NamedTuple):
+    """A squared Mahalanobis distance d² after the gate, of any shape."""
+
+    inside: Bool[Array, "..."]
+    """within the gate; without one, d² is finite"""
+    counted: Float[Array, "..."]
+    """d² in the weight, clipped at the gate"""
+    reported: Float[Array, "..."]
+    """d², a large number where it is not finite"""
+
+
+def gate_distance(distance: Float[Array, "*M"], gate: Number | None) -> _GatedDistance:
+    """The gated distance: whether d² passes, and its values for weights and for `Info`."""
+    finite = jnp.isfinite(distance)
+    if gate is not None:
+        gate = jnp.asarray(gate, distance.dtype)
+    inside = finite if gate is None else finite & (distance <= gate)
+    counted = distance if gate is None else jnp.where(inside, distance, gate)
+    largest = 0.5 * float(jnp.finfo(distance.dtype).max)
+    return _GatedDistance(inside, counted, jnp.where(finite, distance, largest))

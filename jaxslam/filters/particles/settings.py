@@ -19,7 +19,7 @@ _NEAR = 0.99
 
 
 @dataclass(frozen=True, eq=False)
-class AssociationSettings:
+class _AssociationSettings:
     """The association method, gate and new-landmark options of one sensor."""
 
     sensor: Sensor
@@ -35,7 +35,7 @@ class AssociationSettings:
 
 
 @dataclass(frozen=True, eq=False)
-class ParticleMapSettings(AssociationSettings):
+class ParticleMapSettings(_AssociationSettings):
     """The settings of one particle's map update, of `FastSlam` and `Mapping`."""
 
     quota: int | None
@@ -44,7 +44,7 @@ class ParticleMapSettings(AssociationSettings):
 
 
 @dataclass(frozen=True, eq=False)
-class KnownMapSensor(AssociationSettings):
+class KnownMapSensor(_AssociationSettings):
     """One sensor in a known map, for the weights of `particle_localization`."""
 
     landmarks: ArrayLike

@@ -15,8 +15,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam import slots
-from jaxslam.graphs.chain.elimination import CostToGo, Gain, LinearizedStep, eliminate_steps
-from jaxslam.graphs.chain.rows import pose_difference, whitened_rows
+from jaxslam.graphs.chain.elimination import (
+    CostToGo,
+    Gain,
+    LinearizedStep,
+    eliminate_steps,
+    pose_difference,
+    whitened_rows,
+)
 from jaxslam.linearize.first_order import with_lever_arm
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
@@ -55,7 +61,7 @@ class WindowIterate(NamedTuple):
     landmarks: Float[Array, "N L"]
 
 
-class WindowSolution(NamedTuple):
+class _WindowSolution(NamedTuple):
     """The deviations from an iterate that solve its linearized problem."""
 
     pose: Float[Array, "3"]
@@ -114,7 +120,7 @@ def linearize_window(
 
 def solve_window(
     prior: WindowPrior, system: LinearizedStep, at: WindowIterate, alive: Bool[Array, "N"]
-) -> WindowSolution:
+) -> _WindowSolution:
     """The solution of a linearized window. alive: the landmarks of the map.
 
     With Λ and y of all steps (`eliminate_steps`) and e = (x_0, m) - μ at the iterate, the
@@ -137,7 +143,7 @@ def solve_window(
     rows = jnp.where(known[:, None], cov, jnp.diag(new.astype(y.dtype)))
     delta, of_delta = jnp.linalg.solve(matrix, right), jnp.linalg.solve(matrix, rows)
     landmarks = delta[3:].reshape(capacity, size)
-    return WindowSolution(delta[:3], landmarks, gains, linalg.symmetrize(of_delta))
+    return _WindowSolution(delta[:3], landmarks, gains, linalg.symmetrize(of_delta))
 
 
 def _joined(cost: CostToGo) -> tuple[Float[Array, "D D"], Float[Array, "D"]]:
@@ -146,7 +152,7 @@ def _joined(cost: CostToGo) -> tuple[Float[Array, "D D"], Float[Array, "D"]]:
 
 
 def moved_by(
-    motion: Motion, steps: WindowSteps, at: WindowIterate, solved: WindowSolution
+    motion: Motion, steps: WindowSteps, at: WindowIterate, solved: _WindowSolution
 ) -> WindowIterate:
     """The iterate after the Gauss-Newton step, by the nonlinear models (see `problem.roll_out`)."""
     delta, gains = solved.landmarks.reshape(-1), solved.gains
@@ -169,7 +175,7 @@ def moved_by(
     )
 
 
-def newest_cov(system: LinearizedStep, solved: WindowSolution) -> Float[Array, "D D"]:
+def newest_cov(system: LinearizedStep, solved: _WindowSolution) -> Float[Array, "D D"]:
     """The covariance of the newest pose and the map.
 
     With n standard normal and M = R Rᵀ the matrix of a gain,

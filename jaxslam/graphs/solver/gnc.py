@@ -16,20 +16,20 @@ from jaxslam.graphs.solver.linearized import (
     variables_of,
 )
 from jaxslam.graphs.solver.model import Model
-from jaxslam.graphs.solver.plan import Plan
+from jaxslam.graphs.solver.plans import Plan
 from jaxslam.graphs.solver.search import Ending, Solution, minimize
 
 ROUNDS = 100
 """at most"""
-GROWTH = 1.4
+_GROWTH = 1.4
 """of μ in each round"""
-SHARP = 1e6
+_SHARP = 1e6
 """a μ with which nearly all weights are zeros or ones"""
 LOOSE = 1e-6
 """tolerance of the rounds before the last"""
 
 
-class Round(NamedTuple):
+class _Round(NamedTuple):
     """The state of the rounds of B graphs."""
 
     found: Solution
@@ -88,12 +88,12 @@ def graduated(
     def convex(ratio: dict[str, Array]) -> Float[Array, "B"]:
         """The μ up to which the surrogate is convex over all rows, from s/c²."""
         worst = jnp.stack([r.max(axis=0, initial=0.0) for r in ratio.values()]).max(axis=0)
-        return 1.0 / jnp.maximum(2 * worst - 1.0, 1.0 / SHARP)
+        return 1.0 / jnp.maximum(2 * worst - 1.0, 1.0 / _SHARP)
 
-    def again(state: Round) -> Array:
+    def again(state: _Round) -> Array:
         return ~state.settled.all() & (state.rounds < ROUNDS)
 
-    def work(state: Round) -> Round:
+    def work(state: _Round) -> _Round:
         """The optimum with the weights, then the weights there."""
         binary = jnp.stack([_binary(w) for w in state.weights.values()]).all(axis=0)
         new = solved(state.found.graph, state.weights, jnp.where(binary, tolerance, loose))
@@ -108,11 +108,11 @@ def graduated(
             lambda a, b: jnp.where(state.settled[(None,) * (a.ndim - 1)], b, a), new, state.found
         )
         ratio = ratios(found)
-        control = jnp.maximum(GROWTH * state.control, convex(ratio))
+        control = jnp.maximum(_GROWTH * state.control, convex(ratio))
         weights = {name: _weight(r, control[None]) for name, r in ratio.items()}
         same = [(weights[name] == state.weights[name]).all(axis=0) for name in weights]
         settled = state.settled | (binary & jnp.stack(same).all(axis=0))
-        return Round(found, weights, control, settled, state.rounds + 1)
+        return _Round(found, weights, control, settled, state.rounds + 1)
 
     batch = graph.poses.shape[-1:]
     zero, none = jnp.zeros(batch, graph.poses.dtype), jnp.zeros(batch, jnp.int32)
@@ -123,9 +123,9 @@ def graduated(
     rows = jnp.concatenate([data.valid[name] for name in ratio])
     fitting = rows & (jnp.concatenate(list(ratio.values())) <= 1.0)
     good = 2 * fitting.sum(axis=0) >= rows.sum(axis=0)
-    control = jnp.where(good, SHARP, convex(ratio))
+    control = jnp.where(good, _SHARP, convex(ratio))
     weights = {name: _weight(r, control[None]) for name, r in ratio.items()}
-    state = Round(start, weights, control, jnp.zeros(batch, bool), jnp.zeros((), jnp.int32))
+    state = _Round(start, weights, control, jnp.zeros(batch, bool), jnp.zeros((), jnp.int32))
     end = jax.lax.while_loop(again, work, state)
     found, converged = end.found, end.found.status == Ending.CONVERGED
     return found._replace(

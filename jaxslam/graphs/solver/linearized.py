@@ -16,8 +16,8 @@ from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.solver.kernels import Kernel
 from jaxslam.graphs.solver.model import Model
-from jaxslam.graphs.solver.plan import Plan
-from jaxslam.graphs.sparse.gathered import summed
+from jaxslam.graphs.solver.plans import Plan
+from jaxslam.graphs.sparse.sweeps import summed
 from jaxslam.math import se2
 from jaxslam.math.angles import sin_cos
 from jaxslam.math.linalg import total

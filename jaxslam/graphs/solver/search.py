@@ -18,10 +18,44 @@ from jaxslam.graphs.solver.linearized import (
     variables_of,
 )
 from jaxslam.graphs.solver.model import Model
-from jaxslam.graphs.solver.plan import Plan
-from jaxslam.graphs.solver.steps import dot, marquardt
+from jaxslam.graphs.solver.plans import Plan
+from jaxslam.graphs.sparse.cholesky import factorize, substitute
 
-FIRST_DAMPING = 1e-7
+
+class _Step(NamedTuple):
+    """An increment, and what the quadratic model of χ² says of it."""
+
+    increments: Float[Array, "n d B"]
+    predicted: Float[Array, "B"]
+    """decrease of χ²: -2 gᵀδ - δᵀHδ = λ δᵀDδ - gᵀδ"""
+    regular: Bool[Array, "n B"]
+    """of each column of the factor"""
+
+
+def dot(a: Float[Array, "n d B"], b: Float[Array, "n d B"]) -> Float[Array, "B"]:
+    """The inner product Σ a b over all variables."""
+    return (a * b).sum(axis=(0, 1))
+
+
+def _marquardt(plan: Plan, system: System, damping: Float[Array, "B"]) -> _Step:
+    """The step of (H + λD) δ = -g, D = diag H.
+
+    Marquardt 1963, "An algorithm for least-squares estimation of nonlinear parameters", J. SIAM
+    11(2).
+    """
+    width = system.blocks.shape[1]
+    unit = jnp.eye(width, dtype=bool)[None, ..., None] & plan.on_diagonal[:, None, None, None]
+    # What no measurement sees has a diagonal of zero, and stays where it is.
+    scale = jnp.where(system.blocks == 0, 1.0, system.blocks)
+    blocks = system.blocks + jnp.where(unit, damping, 0.0) * scale
+    factored = factorize(plan.cholesky, blocks)
+    step = substitute(plan.cholesky, factored, -system.gradient)
+    diagonal = jnp.diagonal(system.blocks[plan.cholesky.diagonal], axis1=1, axis2=2)
+    square = dot(step * jnp.moveaxis(diagonal, 2, 1), step)
+    return _Step(step, damping * square - dot(step, system.gradient), factored.regular)
+
+
+_FIRST_DAMPING = 1e-7
 """λ after an undamped step that fails, as a share of the diagonal."""
 
 
@@ -65,7 +99,7 @@ class Solution(NamedTuple):
     information: 1 without a kernel, 0 of rows that are not valid"""
 
 
-class Search(NamedTuple):
+class _Search(NamedTuple):
     """The state of the iterations of B graphs."""
 
     trial: Variables
@@ -103,7 +137,7 @@ def minimize(
     eps = float(jnp.finfo(dtype).eps)
     none, no = jnp.zeros(batch, jnp.int32), jnp.zeros(batch, bool)
     zero = jnp.zeros(batch, dtype)
-    begin = Search(
+    begin = _Search(
         trial=start,
         predicted=zero,
         stepped=~no,
@@ -120,7 +154,7 @@ def minimize(
         judged=no,
     )
 
-    def iterate(carry: tuple[Search, Array, Array]) -> tuple[Search, Array, Array]:
+    def iterate(carry: tuple[_Search, Array, Array]) -> tuple[_Search, Array, Array]:
         search, first_chi2, first_gradient = carry
         search = judged(search)
         starts = search.taken == 0
@@ -129,7 +163,7 @@ def minimize(
         first_gradient = jnp.where(starts, norm, first_gradient)
         return proposed(search), first_chi2, first_gradient
 
-    def judged(search: Search) -> Search:
+    def judged(search: _Search) -> _Search:
         """The search after its trial is taken or refused."""
         there = linearize(model, plan, search.trial, data)
         finite, began = jnp.isfinite(there.chi2), search.taken < 0
@@ -139,7 +173,7 @@ def minimize(
         # valleys along which damped steps crawl (Grippo, Lampariello and Lucidi 1986, "A
         # nonmonotone line search technique for Newton's method", SIAM J. Num. Analysis 23(4)).
         above = jnp.maximum(search.former - search.system.chi2, 0.0)
-        slack = jnp.where(search.damping <= FIRST_DAMPING, above, 0.0)
+        slack = jnp.where(search.damping <= _FIRST_DAMPING, above, 0.0)
         good = finite & (began | (gain + slack > 1e-3 * search.predicted))
         asked = search.going & search.stepped
         take = asked & good
@@ -162,7 +196,7 @@ def minimize(
             judged=search.judged & ~take,
         )
 
-    def damping_after(search: Search, good: Array, ratio: Array) -> Array:
+    def damping_after(search: _Search, good: Array, ratio: Array) -> Array:
         """The damping λ after a step: less after good ones, down to none; more after refused ones.
 
         The first good step after a refused one leaves it as it is.
@@ -172,13 +206,13 @@ def minimize(
         less = jnp.where(search.damping < 1e-10, least, search.damping / 10)
         kept = jnp.where((ratio > 0.25) & ~search.careful, less, search.damping)
         more = jnp.where(search.careful, 100.0, 10.0) * search.damping
-        return jnp.where(good, kept, jnp.maximum(more, FIRST_DAMPING))
+        return jnp.where(good, kept, jnp.maximum(more, _FIRST_DAMPING))
 
-    def proposed(search: Search) -> Search:
+    def proposed(search: _Search) -> _Search:
         """The search with its next trial, or at its end."""
         plain = search.damping == 0
         known = search.singular >= 0
-        step = marquardt(plan, search.system, search.damping)
+        step = _marquardt(plan, search.system, search.damping)
         regular = step.regular.all(axis=0)
         culprit = plan.order[jnp.argmin(step.regular, axis=0)].astype(jnp.int32)
         singular = jnp.where(plain & ~regular & ~known, culprit, search.singular)
@@ -195,7 +229,7 @@ def minimize(
         stalled = ~plain | (stuck & (step.predicted != 0))
         ending = jnp.where(~known & stalled, Ending.STALLED, ending)
         # Without a step: an undamped factor that failed, or that has to confirm convergence.
-        more = jnp.maximum(10 * search.damping, FIRST_DAMPING)
+        more = jnp.maximum(10 * search.damping, _FIRST_DAMPING)
         damping = jnp.where(regular, search.damping, more)
         again = regular & small & ~plain & ~done
         damping = jnp.where(again, 0.0, damping)

@@ -9,6 +9,8 @@ scatter is needed, and the size of the compiled program does not depend on that 
 
 Tables and arrays are longer than they need be (`padded_size`), so that patterns of about one size
 share their compiled programs: rows beyond the last level are not visited.
+
+Sums of rows by target are gathers: no scatter, and the same order of terms on every device.
 """
 
 from collections.abc import Callable, Sequence
@@ -17,18 +19,18 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Int
+from jaxtyping import Array, Bool, Float, Int
 
 TARGETS = 8
 """T, targets that are computed together"""
-TERMS = 2
+_TERMS = 2
 """K, products of a target that are computed together"""
 
 PART = 1 << 12
 """Chunks whose tables are made at once: a large graph has some hundred thousand of them."""
 
 Ints = Int[np.ndarray, "_"]
-Product = Callable[[Array, Array], Array]
+_Product = Callable[[Array, Array], Array]
 
 
 class Sums(NamedTuple):
@@ -134,7 +136,7 @@ def sweep(sums: Sums, left: Ints, right: Ints, end: Ints, room: int = 0) -> Swee
     rounds, ends, end_base = [0], [0], list[int]()
     for low, high in zip(first[:-1].tolist(), first[1:].tolist(), strict=True):
         rounds.append(rounds[-1])
-        for shift in range(0, int(count[low]), TERMS):
+        for shift in range(0, int(count[low]), _TERMS):
             stop = low + int(np.count_nonzero(count[low:high] > shift))
             base = np.arange(low, stop, TARGETS)
             chunks.append(np.stack([base, np.full_like(base, shift), np.full_like(base, stop)]))
@@ -147,13 +149,13 @@ def sweep(sums: Sums, left: Ints, right: Ints, end: Ints, room: int = 0) -> Swee
     ending = order[np.minimum(end_place, size - 1)]
     width = padded_table_size(len(bases), 16 * room)
     finished = padded_table_size(len(end_base), 4 * room)
-    tables = [np.full((width, TARGETS, TERMS), at[-1], np.int32) for at in (left, right)]
-    flips = None if sums.flip is None else np.zeros((width, TARGETS, TERMS), bool)
+    tables = [np.full((width, TARGETS, _TERMS), at[-1], np.int32) for at in (left, right)]
+    flips = None if sums.flip is None else np.zeros((width, TARGETS, _TERMS), bool)
     for part in range(0, len(bases), PART):
         some = slice(part, min(part + PART, len(bases)))
         place = bases[some, None] + np.arange(TARGETS)
         there = np.minimum(place, size - 1)[..., None]
-        term = shifts[some, None, None] + np.arange(TERMS)
+        term = shifts[some, None, None] + np.arange(_TERMS)
         real = (place < stops[some, None])[..., None] & (term < count[there])
         product = by_target[np.where(real, begin[there] + term, 0)]
         for table, factor, at in zip(tables, (sums.left, sums.right), (left, right), strict=True):
@@ -180,7 +182,7 @@ def subtract_products(
     target: jax.Array,
     left: jax.Array | None,
     right: jax.Array | None,
-    product: Product,
+    product: _Product,
 ) -> jax.Array:
     """The targets (M, …) after the rounds of a level; a factor of None is a target itself."""
     if not len(tables.base):  # no measurement joins two variables
@@ -192,7 +194,7 @@ def subtract_products(
         if tables.flip is not None:
             a = jnp.where(tables.flip[c][..., None, None, None], jnp.swapaxes(a, 2, 3), a)
         held = jax.lax.dynamic_slice_in_dim(target, tables.base[c], TARGETS)
-        for k in range(TERMS):
+        for k in range(_TERMS):
             held = held - product(a[:, k], b[:, k])
         return jax.lax.dynamic_update_slice_in_dim(target, held, tables.base[c], 0)
 
@@ -203,7 +205,7 @@ def subtract_products(
 
 
 def finish(
-    tables: Sweep, level: jax.Array, target: jax.Array, by: jax.Array, product: Product
+    tables: Sweep, level: jax.Array, target: jax.Array, by: jax.Array, product: _Product
 ) -> jax.Array:
     """The targets (M, …) after those of a level are multiplied."""
     if not len(tables.end_base):
@@ -216,3 +218,45 @@ def finish(
 
     out: jax.Array = jax.lax.fori_loop(tables.ends[level], tables.ends[level + 1], chunk, target)
     return out
+
+
+_SUMMED = 4
+_LEAST_STAGES = 2
+"""stages at least, which up to sixteen rows of a target need: fewer would be another program"""
+
+Stages = tuple[Int[Array, "_ terms"], ...]
+
+
+def stages(target: Int[np.ndarray, "rows"], size: int, room: int = 0) -> Stages:
+    """The tables of sums of rows into so many targets; a target of -1 drops its row.
+
+    With room there are four stages at least, enough for 256 rows of a target, of so many rows.
+
+    Each stage sums up to four rows; it gives its targets in order, until each has one row.
+    """
+    used = np.flatnonzero(target >= 0)
+    numbers = used[np.argsort(target[used], kind="stable")]
+    absent, owner, out = len(target), target[numbers], list[Array]()
+    while True:
+        counts = np.bincount(owner, minlength=size)
+        last = counts.max(initial=0) <= _SUMMED
+        groups = np.ones(size, int) if last else -(-counts // _SUMMED)
+        begin, group_begin = np.cumsum(counts) - counts, np.cumsum(groups) - groups
+        sums = np.full((groups.sum(), _SUMMED), absent, np.int32)
+        rank = np.arange(len(owner)) - begin[owner]
+        sums[group_begin[owner] + rank // _SUMMED, rank % _SUMMED] = numbers
+        done = last and len(out) + 1 >= (4 if room else _LEAST_STAGES)
+        rows = len(sums) if done else padded_size(max(len(sums), room))
+        out.append(index_table(sums, rows, absent))
+        if done:
+            return tuple(out)
+        owner = np.repeat(np.arange(size), groups)
+        numbers, absent = np.arange(len(owner)), rows
+
+
+def summed(stages: Stages, rows: Float[Array, "rows *rest"]) -> Float[Array, "size *rest"]:
+    """The sums of the rows of each target; zero where it has none."""
+    for sums in stages:
+        taken = rows.at[sums].get(mode="fill", fill_value=0)
+        rows = taken[:, 0] + taken[:, 1] + (taken[:, 2] + taken[:, 3])
+    return rows

@@ -1,6 +1,7 @@
 """Symbolic factorization: the blocks of the Cholesky factor and the products that make them.
 
-All of it is NumPy on the host, done once for a pattern of variables and measurements.
+All of it is NumPy on the host, done once for a pattern of variables and measurements. The order of
+elimination is one that keeps the factor sparse.
 """
 
 import itertools
@@ -9,8 +10,28 @@ from functools import cached_property
 
 import numpy as np
 from jaxtyping import Int
+from scipy.sparse import coo_matrix, diags_array
+from scipy.sparse.linalg import splu
 
-from jaxslam.graphs.sparse.ordering import minimum_degree
+
+def _minimum_degree(
+    size: int, first: Int[np.ndarray, "E"], second: Int[np.ndarray, "E"]
+) -> Int[np.ndarray, "size"]:
+    """The variables in a minimum-degree order, for a graph with edges first-second.
+
+    SuperLU's multiple minimum degree (Liu 1985, "Modification of the minimum-degree algorithm by
+    multiple elimination", ACM TOMS 11(2)) on the pattern of A + Aᵀ. SciPy gives it only with a
+    factorization, here of a diagonally dominant matrix with one number a block.
+    """
+    links = coo_matrix((-np.ones(len(first)), (first, second)), (size, size))
+    links = links + links.T
+    dominant = diags_array(1.0 + np.asarray(abs(links).sum(axis=0)).ravel()) + links
+    options = {"SymmetricMode": True}
+    factors = splu(
+        dominant.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options
+    )
+    return np.argsort(factors.perm_c)
+
 
 Ints = Int[np.ndarray, "_"]
 
@@ -72,7 +93,7 @@ def factor_pattern(size: int, first: Ints, second: Ints) -> Pattern:
     The rows below the diagonal of a column are those of A and of the columns whose parent it is in
     the elimination tree (Davis 2006, "Direct methods for sparse linear systems", chapter 4).
     """
-    order = minimum_degree(size, first, second)
+    order = _minimum_degree(size, first, second)
     position = np.empty(size, int)
     position[order] = np.arange(size)
     one, other = position[first], position[second]

@@ -9,10 +9,9 @@ other influence on the optimum.
 from collections.abc import Callable
 
 from jaxslam.graphs.graph import Graph
-from jaxslam.graphs.starts.chordal import chordal
+from jaxslam.graphs.starts.chordal_relaxation import chordal
 from jaxslam.graphs.starts.relative import Factors
-from jaxslam.graphs.starts.robust import robust
-from jaxslam.graphs.starts.tree import odometry, spanning_tree
+from jaxslam.graphs.starts.tree import odometry, robust, spanning_tree
 
 
 def given(graph: Graph, factors: Factors | None = None) -> Graph:

@@ -1,4 +1,7 @@
-"""Starts along a tree of relative poses: the path of the odometry, or the fewest edges."""
+"""Starts along a tree of relative poses: the path of the odometry, or the fewest edges.
+
+And the robust start: the odometry, drawn by the loops that agree with it.
+"""
 
 import math
 
@@ -6,11 +9,14 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
 
-from jaxslam.graphs.graph import Graph, ranks
+from jaxslam.graphs.graph import TRUSTED, Graph, ranks, with_loops_apart
+from jaxslam.graphs.optimizer import optimize
+from jaxslam.graphs.solver.kernels import DynamicCovarianceScaling
 from jaxslam.graphs.starts.relative import (
     Factors,
     Relative,
     anchors_of,
+    as_before,
     measured_relative_poses,
     with_points,
     with_poses,
@@ -87,3 +93,20 @@ def _compose(a: list[float], b: list[float]) -> list[float]:
 def _inverse(a: list[float]) -> list[float]:
     c, s = math.cos(a[2]), math.sin(a[2])
     return [-c * a[0] - s * a[1], s * a[0] - c * a[1], -a[2]]
+
+
+def robust(graph: Graph, factors: Factors | None = None) -> Graph:
+    """The graph at the minimum next to its odometry with dynamic covariance scaling.
+
+    Odometry and priors are trusted, all other rows have that kernel. A loop that contradicts
+    the odometry hardly pulls, one that agrees with it does, and the next ones agree better: a start
+    for graphs with false loops, unless the odometry is so poor that it contradicts the true ones.
+
+    Agarwal et al. 2013, "Robust map optimization using dynamic covariance scaling", ICRA. Arguments
+    and errors are those of `odometry` and of `graphs.optimize`.
+    """
+    apart = with_loops_apart(odometry(graph, factors))
+    doubted = {key: DynamicCovarianceScaling() for key in apart.tables if key not in TRUSTED}
+    found = optimize(apart, factors, kernel=doubted).graph
+    points = as_before(graph.points, np.asarray(found.points))
+    return with_poses(graph, np.array(found.poses))._replace(points=points)

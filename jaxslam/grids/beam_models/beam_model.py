@@ -67,10 +67,10 @@ def log_likelihood(
     an exponent below 1 tempers the likelihood; both make it wider. Differentiable by pose and
     exponent; `jax.vmap` it over poses.
 
-    Raises ValueError on beams that `check_beams` refuses, a pose that is not (3,), every below 1,
+    Raises ValueError on beams that `_check_beams` refuses, a pose that is not (3,), every below 1,
     an exponent below 0, and a grid in place of what `model.prepare` makes of it.
     """
-    check_beams("log_likelihood", beams)
+    _check_beams("log_likelihood", beams)
     if np.shape(pose) != (3,):
         raise ValueError(f"log_likelihood: expected a pose (x, y, θ), got {shape_told(pose)}")
     if is_concrete(pose) and not np.all(np.isfinite(np.asarray(pose))):
@@ -97,7 +97,7 @@ def usable_beams(beams: Beams) -> Bool[JaxOrNumPy, "*n"]:
     return met | free
 
 
-def check_beams(name: str, beams: object) -> None:
+def _check_beams(name: str, beams: object) -> None:
     """Raise ValueError, which begins with a caller's name, unless beams are one scan.
 
     Ranges, angles and masks must be as many, and outside a trace at least one beam must be usable,

@@ -12,8 +12,7 @@ from jaxslam.core.record import record, static
 from jaxslam.grids.beam_models.beam_model import BeamModel, hold_mount
 from jaxslam.grids.beam_models.ray_cast import check_weights
 from jaxslam.grids.distance import distance_field
-from jaxslam.grids.grid import Field, Grid
-from jaxslam.grids.interpolation import interpolate, slope
+from jaxslam.grids.grid import Field, Grid, interpolate, slope
 from jaxslam.math.arrays import Number
 from jaxslam.types import Beams, JaxOrNumPy
 

@@ -14,8 +14,8 @@ from jaxtyping import Array, Float, PyTree
 from jaxslam.core.numbers import check_positive, is_concrete
 from jaxslam.core.record import record, static
 from jaxslam.grids.beam_models.beam_model import BeamModel, hold_mount
-from jaxslam.grids.cast import RayMap, cast, check_method, ray_map
 from jaxslam.grids.grid import Grid
+from jaxslam.grids.rays import RayMap, cast, check_method, ray_map
 from jaxslam.math.arrays import Number
 from jaxslam.types import Beams
 
@@ -37,7 +37,7 @@ class Mixture(NamedTuple):
     """rate λ of the exponential density of short ones [1/m]"""
 
 
-USUAL = Mixture(0.75, 0.1, 0.05, 0.1, 0.1, 0.5)
+_USUAL = Mixture(0.75, 0.1, 0.05, 0.1, 0.1, 0.5)
 """Parameters of a laser in a building whose map is good."""
 
 
@@ -67,7 +67,7 @@ def mixture_log_density(
     return jnp.log(jnp.maximum(jnp.where(z >= max_range, far, near), least))
 
 
-def density_slope(
+def _density_slope(
     mixture: Mixture, z: Float[Array, "*n"], expected: Float[Array, "*n"], max_range: Number
 ) -> Float[Array, "*n"]:
     """The derivative of `mixture_log_density` by the expected range z*, by hand.
@@ -100,7 +100,7 @@ class RayCast(BeamModel):
     Raises ValueError on numbers out of range, an unknown method, a mount that is no pose.
     """
 
-    mixture: Mixture = USUAL
+    mixture: Mixture = _USUAL
     """parameters, which `fit` learns from data; the four shares have sum 1"""
     _: dataclasses.KW_ONLY
     max_range: Number
@@ -134,7 +134,7 @@ class RayCast(BeamModel):
         by_pose = jax.jacfwd(lambda pose: self._expected(prepared, pose, beams))(pose)
         far = jnp.asarray(self.max_range, expected.dtype)
         z = jnp.where(beams.returns(far)[1], far, beams.range)
-        by_range: Array = density_slope(self.mixture, z, expected, far)
+        by_range: Array = _density_slope(self.mixture, z, expected, far)
         return by_range[:, None] * jnp.asarray(by_pose)
 
     def _expected(self, rays: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:

@@ -1,18 +1,53 @@
-"""Candidates of loops: places that the graph says may be the same, and scans that look alike."""
+"""Candidates of loops: places that the graph says may be the same, and scans that look alike.
+
+Scans are compared by a descriptor that does not change when the robot turns on the spot.
+"""
 
 from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.laser_slam.settings import Settings
+from jaxslam.laser_slam.records import Settings
 from jaxslam.math import numpy_poses as poses
+
+RINGS, SECTORS = 12, 60
+
+
+def descriptors(
+    points: Float[np.ndarray, "n B 2"], valid: Bool[np.ndarray, "n B"], *, reach: float = 12.0
+) -> Float[np.ndarray, "n D"]:
+    """The descriptors of n scans, of length one (zero for a scan without points).
+
+    Points are counted in rings and sectors about the robot, and a turn of the robot shifts the
+    sectors: the sizes of the Fourier coefficients along them stay, up to the size of a sector. The
+    table is that of Kim & Kim 2018, "Scan context", IROS, which compares shifts instead.
+    """
+    far = np.hypot(points[..., 0], points[..., 1])
+    turn = np.arctan2(points[..., 1], points[..., 0]) / (2 * np.pi) % 1.0
+    ring = np.minimum((RINGS * np.sqrt(far / reach)).astype(int), RINGS - 1)
+    sector = np.minimum((SECTORS * turn).astype(int), SECTORS - 1)
+    table = np.zeros((len(points), RINGS, SECTORS))
+    which = np.broadcast_to(np.arange(len(points))[:, None], valid.shape)
+    np.add.at(table, (which[valid], ring[valid], sector[valid]), 1.0)
+    sizes = np.abs(np.fft.rfft(np.sqrt(table), axis=2))[:, :, : SECTORS // 4]
+    sizes[:, :, 0] *= 0.5
+    flat = sizes.reshape(len(points), -1)
+    length = np.linalg.norm(flat, axis=1, keepdims=True)
+    return np.divide(flat, length, out=np.zeros_like(flat), where=length > 0)
+
 
 MOST = 2_500
 """Candidates that are matched in a round, and keyframes that are tried, at most: in a log with more
 of them loops abound."""
 PLACES = 12
 """Submaps near a keyframe whose relative pose is examined by odometry, which costs little."""
+CANDIDATES = 3
+"""Submaps that a keyframe is matched with in a round, at most."""
+REACH = 3.0
+"""Distance [m] between two places that share walls."""
+_PROBABILITY = 0.999
+"""Of the ellipse in which a place is sought."""
 SAME = 15
 """Keyframes between submaps that are taken to be of one place."""
 
@@ -82,8 +117,8 @@ def by_place(
 ) -> Candidates:
     """The pairs whose ellipse of uncertainty fits into a window, at most some for each keyframe.
 
-    A place is sought where it is within `loop_reach` of the keyframe, by the ellipse of
-    `loop_probability`.
+    A place is sought where it is within `REACH` of the keyframe, by the ellipse of
+    `_PROBABILITY`.
 
     Args:
         pairs: `near`, of each keyframe the nearest first.
@@ -91,17 +126,17 @@ def by_place(
         tried: (first, second, wide) of rounds before.
         narrow, wide: windows, [m] and [rad] to either side.
     """
-    sigmas = np.sqrt(-2 * np.log(1 - settings.loop_probability))
+    sigmas = np.sqrt(-2 * np.log(1 - _PROBABILITY))
     z = poses.between(path[pairs[:, 0]], path[pairs[:, 1]])
     position = sigmas * np.sqrt(np.linalg.eigvalsh(cov[:, :2, :2])[:, 1])
     heading = sigmas * np.sqrt(cov[:, 2, 2])
     far = np.hypot(z[:, 0], z[:, 1])
     small = (position < narrow[0]) & (heading < narrow[1])
-    fits = (position < wide[0]) & (heading < wide[1]) & (far < settings.loop_reach + position)
+    fits = (position < wide[0]) & (heading < wide[1]) & (far < REACH + position)
     rows = np.flatnonzero(fits)
-    # The first `candidates` of each keyframe, whose pairs follow each other.
+    # The first `CANDIDATES` of each keyframe, whose pairs follow each other.
     rank = np.arange(len(rows)) - np.searchsorted(pairs[rows, 1], pairs[rows, 1])
-    rows = rows[rank < settings.candidates]
+    rows = rows[rank < CANDIDATES]
     new = [(*pairs[row].tolist(), not small[row]) not in tried for row in rows]
     take = rows[np.array(new, bool)]
     return Candidates(

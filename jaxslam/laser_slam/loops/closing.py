@@ -1,11 +1,18 @@
-"""Loop closing in rounds: candidates, matches, the loops that agree, the optimum."""
+"""Loop closing in rounds: candidates, matches, the loops that agree, the optimum.
 
+A candidate is a keyframe in a submap; it is accepted or refused by correlation and lines.
+"""
+
+import ctypes
+import os
+import sys
 from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor
 from typing import NamedTuple
 
 import jax
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, Int
 
 from jaxslam import graphs
 from jaxslam.graphs import Graph, Table
@@ -13,29 +20,121 @@ from jaxslam.graphs.graph import LOOPS
 from jaxslam.laser_slam import covariances
 from jaxslam.laser_slam.assembly import ROOM, graph_of, relative_covs, table_of
 from jaxslam.laser_slam.loops.candidates import (
+    CANDIDATES,
     MOST,
     PLACES,
+    REACH,
     Candidates,
     by_appearance,
     by_place,
+    descriptors,
     near,
     thinned,
 )
-from jaxslam.laser_slam.loops.descriptor import descriptors
-from jaxslam.laser_slam.loops.matching import NARROW, WIDE, Matches, matched
 from jaxslam.laser_slam.loops.pairwise import clique, consistent
-from jaxslam.laser_slam.memory import give_back
-from jaxslam.laser_slam.odometry.tracking import Odometry
-from jaxslam.laser_slam.records import LoopOutcome, Loops
+from jaxslam.laser_slam.odometry.reference import Reference, match, reference_of, search, taken
+from jaxslam.laser_slam.odometry.tracking import LOOP_INLIERS, Odometry
+from jaxslam.laser_slam.records import LoopOutcome, Loops, Settings
 from jaxslam.laser_slam.scans import ROWS, Scans
-from jaxslam.laser_slam.settings import Settings
 from jaxslam.math.stats import chi2_quantile
+
+
+def give_back() -> None:
+    """Give the system what this process has freed, where the C library can (glibc).
+
+    XLA compiles in several threads, and glibc keeps what these free, some hundred MB after each
+    compilation, for the same thread alone.
+    """
+    if sys.platform == "linux":
+        trim = getattr(ctypes.CDLL(None), "malloc_trim", None)
+        if trim is not None:
+            trim(ctypes.c_size_t(0))
+
+
+NARROW, WIDE = (0.8, float(np.deg2rad(14.0))), (4.0, float(np.deg2rad(40.0)))
+"""Windows of the search, [m] and [rad] to either side."""
+_SEARCHES = [search(*window, np.deg2rad(2.0)) for window in (NARROW, WIDE)]
+WINDOW = np.diag(1 / np.square([WIDE[0], *WIDE]))
+"""Information of the window, which bounds what the walls do not tell."""
+
+_CONSISTENCY = 0.999
+"""Probability below which two loops agree."""
+
+
+class Matches(NamedTuple):
+    """Candidates that were matched."""
+
+    z: Float[np.ndarray, "M 3"]
+    cov: Float[np.ndarray, "M 3 3"]
+    """of the end of z"""
+    score: Float[np.ndarray, "M"]
+    outcome: Int[np.ndarray, "M"]
+    """KEPT, POOR or AMBIGUOUS"""
+
+
+def matched(
+    scans: Scans,
+    keyframe: Int[np.ndarray, "N"],
+    path: Float[np.ndarray, "N 3"],
+    candidates: Candidates,
+    settings: Settings,
+    progress: Callable[[], object],
+) -> Matches:
+    """The match of each candidate, submap by submap, on every core."""
+    count = len(candidates.first)
+    z, cov = np.zeros((count, 3)), np.zeros((count, 3, 3))
+    score, outcome = np.zeros(count), np.zeros(count, int)
+
+    def of_submap(middle: np.integer) -> int:
+        """The candidates of one submap; how many."""
+        submap = _submap(scans, keyframe, path, int(middle), settings)
+        rows = np.flatnonzero(candidates.first == middle)
+        for row in rows:
+            fit = match(
+                _SEARCHES[int(candidates.wide[row])],
+                submap,
+                taken(scans.points, keyframe[candidates.second[row]]),
+                candidates.z[row],
+                None,
+                WINDOW,
+                settings,
+            )
+            z[row], cov[row], score[row] = fit.pose, fit.cov, fit.inliers
+            if fit.inliers < LOOP_INLIERS:
+                outcome[row] = LoopOutcome.POOR
+            elif fit.ambiguous:
+                outcome[row] = LoopOutcome.AMBIGUOUS
+        return len(rows)
+
+    submaps = np.unique(candidates.first)
+    for _ in range(of_submap(submaps[0]) if count else 0):  # compiles what the others share
+        progress()
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        try:
+            for done in pool.map(of_submap, submaps[1:]):
+                for _ in range(done):
+                    progress()
+        except BaseException:
+            pool.shutdown(cancel_futures=True)
+            raise
+    return Matches(z, cov, score, outcome)
+
+
+def _submap(
+    scans: Scans, keyframe: np.ndarray, path: np.ndarray, middle: int, settings: Settings
+) -> Reference:
+    """The keyframes around one, in its frame."""
+    low = max(middle - settings.submap, 0)
+    around = np.arange(low, min(middle + settings.submap + 1, len(keyframe)))
+    size = settings.scans_of_reference
+    return reference_of(scans, keyframe[around], path[around], path[middle], size)
+
 
 KERNEL = {LOOPS: graphs.Cauchy()}
 """One object, so that the optimum is traced once."""
 
 
-class Closed(NamedTuple):
+class _Closed(NamedTuple):
     """The graph of keyframes with its loops."""
 
     graph: Graph
@@ -49,13 +148,13 @@ def closed(
     odometry: Odometry,
     settings: Settings,
     progress: Callable[[int, int], object] | None = None,
-) -> Closed:
+) -> _Closed:
     """The graph after all rounds.
 
     In each round candidates are found by the marginals of the graph so far, matched, and added to
     those of the rounds before; of all that match, the largest set that agrees pairwise is kept, and
     the graph is optimized with Cauchy's kernel on them. In the end loops whose squared residual is
-    above the quantile of `settings.consistency` are left out, and the graph is optimized without a
+    above the quantile of `_CONSISTENCY` are left out, and the graph is optimized without a
     kernel.
 
     A keyframe whose match is in doubt begins and ends no loop. Until the last optimum the steps of
@@ -85,8 +184,8 @@ def closed(
         path = np.asarray(graph.poses, np.float64)
         # By the graph few places, since each pair of which the covariance is computed fills its
         # factor; after a first optimum the nearest ones fit a window.
-        most = PLACES if turn == 0 else settings.candidates
-        reach = settings.loop_reach + WIDE[0]
+        most = PLACES if turn == 0 else CANDIDATES
+        reach = REACH + WIDE[0]
         pairs = near(path, middle, usable, ends, most, reach, settings.loop_gap)
         cov = (
             covariances.relative_cov(total, at, pairs[:, 0], pairs[:, 1])
@@ -94,7 +193,7 @@ def closed(
             else relative_covs(solution, pairs)
         )
         new = by_place(path, pairs, cov, done, settings, NARROW, WIDE)
-        if turn == 0 and settings.appearance:
+        if turn == 0:
             new = _with(new, by_appearance(looks, middle, usable, settings))
         new, out = thinned(new)
         left_out += out
@@ -131,7 +230,7 @@ def _final(
     kept: np.ndarray,
     keyframe: np.ndarray,
     settings: Settings,
-) -> Closed:
+) -> _Closed:
     """The optimum without a kernel, of the loops that the graph does not contradict.
 
     chain: of the matches with the covariances of those in doubt, which takes the place of that
@@ -140,14 +239,14 @@ def _final(
     tables = {**graph.tables, "relative_pose": chain}
     if kept.any():
         square = np.asarray(graphs.squared_residuals(graph, room=ROOM)[LOOPS])
-        doubted = square > chi2_quantile(settings.consistency, 3)
+        doubted = square > chi2_quantile(_CONSISTENCY, 3)
         loops.outcome[np.flatnonzero(kept)[doubted]] = LoopOutcome.DOUBTED
         tables[LOOPS] = tables[LOOPS]._replace(valid=~doubted)
     graph = graph._replace(tables=tables)
     if kept.any():
         graph = _host(graphs.optimize(graph, room=ROOM).graph)
     loops = loops._replace(first=keyframe[loops.first], second=keyframe[loops.second])
-    return Closed(graph, loops, 0)
+    return _Closed(graph, loops, 0)
 
 
 def _with(place: Candidates, pairs: np.ndarray) -> Candidates:
@@ -179,7 +278,7 @@ def _agreeing(
     outcome = by.outcome.copy()
     good = np.flatnonzero(outcome == LoopOutcome.KEPT)
     parts = of.first[good], of.second[good], by.z[good], by.cov[good]
-    agree = consistent(at, total, *parts, settings.consistency)
+    agree = consistent(at, total, *parts, _CONSISTENCY)
     out = ~clique(agree, by.score[good])
     outcome[good[out]] = LoopOutcome.INCONSISTENT
     loops = Loops(of.first, of.second, by.z, by.cov, by.score, of.appearance.astype(int), outcome)

@@ -13,7 +13,7 @@ from jaxslam.math import se2
 from jaxslam.math.arrays import float64
 from jaxslam.math.stats import chi2_quantile
 
-TILE = 256
+_TILE = 256
 """Loops that are compared with as many others at once, so that any number shares one program."""
 
 STARTS = 10
@@ -55,12 +55,12 @@ def consistent(
     parts = path[second], end, moved, own, total[first], total[second], first, second
     with float64():
         tiles = [
-            _Loop(*(jnp.asarray(_filled(part[begin : begin + TILE])) for part in parts))
-            for begin in range(0, count, TILE)
+            _Loop(*(jnp.asarray(_filled(part[begin : begin + _TILE])) for part in parts))
+            for begin in range(0, count, _TILE)
         ]
         for i, a in enumerate(tiles):
             for j, b in enumerate(tiles[i:], i):
-                rows, columns = (slice(k * TILE, min((k + 1) * TILE, count)) for k in (i, j))
+                rows, columns = (slice(k * _TILE, min((k + 1) * _TILE, count)) for k in (i, j))
                 square = np.asarray(_squared(a, b))
                 square = square[: rows.stop - rows.start, : columns.stop - columns.start]
                 out[rows, columns] = square < limit
@@ -88,7 +88,7 @@ class _Loop(NamedTuple):
 
 def _filled(part: np.ndarray) -> np.ndarray:
     """A part of the loops, its last one repeated up to the size of a tile."""
-    return np.concatenate([part, np.repeat(part[-1:], TILE - len(part), axis=0)])
+    return np.concatenate([part, np.repeat(part[-1:], _TILE - len(part), axis=0)])
 
 
 @jax.jit

@@ -1,4 +1,7 @@
-"""Laser odometry of a log, tracked in pieces side by side."""
+"""Laser odometry of a log, tracked in pieces side by side; and as the input of a filter.
+
+The input is the pose of each keyframe relative to the one before.
+"""
 
 import itertools
 import os
@@ -6,9 +9,11 @@ import threading
 from collections.abc import Callable
 from concurrent.futures import ThreadPoolExecutor, as_completed
 
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
+from jaxslam.core.record import record
 from jaxslam.laser_slam.odometry.raw import Steps
 from jaxslam.laser_slam.odometry.reference import match, reference_of, taken
 from jaxslam.laser_slam.odometry.tracking import (
@@ -19,9 +24,65 @@ from jaxslam.laser_slam.odometry.tracking import (
     place_unmatched,
     tracked,
 )
+from jaxslam.laser_slam.records import Settings, Solved
 from jaxslam.laser_slam.scans import Scans
-from jaxslam.laser_slam.settings import Settings
 from jaxslam.math import numpy_poses as poses
+from jaxslam.math import se2
+from jaxslam.math.arrays import Control, Pose, ProcessNoise, ProcessNoiseCov
+from jaxslam.protocols import Motion
+
+ENDS = ("x [m]", "y [m]", "θ [rad]")
+_ROOTS = ("Lxx [m]", "Lyx [m]", "Lyy [m]", "Lθx [rad]", "Lθy [rad]", "Lθθ [rad]")
+
+
+@record
+class MatchMotion(Motion):
+    """The motion model of a relative pose whose covariance is part of the control: pose ∘ z ∘ w.
+
+    u = (z, L): z = (x [m], y [m], θ [rad]) in the robot's frame, and by rows the lower triangular
+    root of the covariance of its end. w ~ N(0, L Lᵀ), (x [m], y [m], θ [rad]) in the frame of the
+    robot after z. `match_controls` makes u of the matches of laser odometry.
+    """
+
+    controls = (*ENDS, *_ROOTS)
+    noises = ENDS
+
+    def step(self, pose: Pose, u: Control, w: ProcessNoise) -> Pose:
+        return se2.compose(se2.compose(pose, u[:3]), w)
+
+    def noise_cov(self, pose: Pose, u: Control) -> ProcessNoiseCov:
+        xx, yx, yy, tx, ty, tt = u[3:]
+        zero = jnp.zeros_like(xx)
+        rows = [xx, zero, zero], [yx, yy, zero], [tx, ty, tt]
+        root = jnp.stack([jnp.stack(row) for row in rows])
+        return root @ root.T
+
+
+def match_controls(of: Odometry | Solved) -> Float[np.ndarray, "N 9"]:
+    """The controls (N, 9) of `MatchMotion` along the N keyframes of laser odometry, in NumPy.
+
+    Row n led to keyframe n, and row 0 is no motion: with the scans of `of.keyframe` they make a
+    `Log`. Loops take no part. The filter takes noises of successive rows to be independent; matches
+    that share scans are not.
+
+    Args:
+        of: what `laser_odometry` or `solve` found.
+    Raises:
+        ValueError: on anything else.
+    """
+    if isinstance(of, Odometry):
+        z, cov = of.z[of.keyframe[1:]], of.cov[of.keyframe[1:]]
+    elif isinstance(of, Solved):
+        steps = of.graph.tables["relative_pose"]
+        z, cov = np.asarray(steps.z), np.linalg.inv(np.asarray(steps.information, np.float64))
+    else:
+        raise ValueError(f"match_controls: expected Odometry or Solved, got {type(of).__name__}")
+    controls = np.zeros((len(of.keyframe), 9))
+    controls[1:, :3] = z
+    row, column = np.tril_indices(3)
+    controls[1:, 3:] = np.linalg.cholesky(cov)[:, row, column]
+    return controls
+
 
 PIECE = 400
 """Scans of a piece of a log, at least."""
@@ -41,7 +102,7 @@ def laser_odometry(
     The pose in the frame of the last keyframe minimizes the squared distances of the points from
     the lines of the reference, and the error of raw odometry from the scan before, by their
     covariances; its covariance is (H/σ² + P⁻¹)⁻¹ + floor², H the information of the lines divided
-    by `settings.correlation`.
+    by 2, for beams that err together.
 
     Where fewer than 0.6 of the points meet a wall, and where raw odometry is no guess (a jump, a
     frozen step, one that lags), all poses are searched that the robot can have reached in that time

@@ -11,8 +11,8 @@ from jaxtyping import Array, Float, Int, PyTree
 
 from jaxslam.graphs import Cauchy
 from jaxslam.laser_slam import covariances
+from jaxslam.laser_slam.records import Settings
 from jaxslam.laser_slam.scans import Scans
-from jaxslam.laser_slam.settings import Settings
 from jaxslam.matching import (
     Correlative,
     IcpSettings,
@@ -25,22 +25,22 @@ from jaxslam.matching import (
     raster,
     transformed,
 )
-from jaxslam.matching.surface import Surface, surface_at
+from jaxslam.matching.surfaces import Surface, surface_at
 from jaxslam.math import numpy_poses as poses
 from jaxslam.math import se2
 
 CELL = 0.1
 """[m] side of a cell that is searched"""
-BLUR = 0.1
+_BLUR = 0.1
 """[m] standard deviation of the score of a point by its distance from the reference"""
 HALF = 16.0
 """[m] from the middle of a reference to the border of its grid"""
-PEAK = 0.9
+_PEAK = 0.9
 """A pose elsewhere of this share of the best score makes a match ambiguous."""
 
 SECTORS = 180
 """of a turn, in which beams are compared with the reference"""
-CLEAR = 0.4
+_CLEAR = 0.4
 """[m] by which a point lies before what a beam met, at least, to be passed through"""
 
 
@@ -71,7 +71,7 @@ class ScanMatch(NamedTuple):
 
 
 def search(
-    distance: float, angle: float, turn: float, *, ambiguous: float | None = PEAK
+    distance: float, angle: float, turn: float, *, ambiguous: float | None = _PEAK
 ) -> Matcher:
     """The search over a window of the reference's grid, [m] and [rad] to either side."""
     return Correlative(
@@ -79,7 +79,7 @@ def search(
         turn_window=angle,
         turn=turn,
         cell=CELL,
-        sigma=BLUR,
+        sigma=_BLUR,
         block=8,
         ambiguous=ambiguous,
         apart=0.5,
@@ -88,9 +88,13 @@ def search(
 
 # What the walls hardly determine is not held at the start, which is of a lattice: the covariance
 # tells it, and the prior bounds it.
+_CORRELATION = 2.0
+"""Beams that err together: the information of a match is divided by it."""
+_FLOOR = (0.005, 0.005, 0.002)
+"""Standard deviations of x, y [m], θ [rad] added to each match, for what the lines miss."""
 _OF_WALLS = IcpSettings(kernel=Cauchy(), scale=0.05, lone=0.5, iterations=10, least_condition=None)
 WALLS = PointToLine(replace(_OF_WALLS, reach=0.5))
-NEAR_WALLS = PointToLine(replace(_OF_WALLS, reach=0.15))
+_NEAR_WALLS = PointToLine(replace(_OF_WALLS, reach=0.15))
 """From where `WALLS` ends: its pairs are the points that lie on walls."""
 ANY = search(1.0, 0.5, 0.1)
 """Whose table serves all searches, since they differ by their windows alone."""
@@ -133,7 +137,7 @@ def match(
     prior = np.zeros((3, 3))
     if prior_cov is not None:
         known = np.linalg.inv(covariances.of_coordinates(prior_cov, guess))
-        prior = settings.correlation * known
+        prior = _CORRELATION * known
     found = np.asarray(
         _match(
             matcher,
@@ -147,11 +151,11 @@ def match(
     )
     pose, information = found[:3], found[3:12].reshape(3, 3)
     inliers, residual, ambiguous, through = found[12:]
-    sigma = max(settings.sigma, residual) ** 2 * settings.correlation
+    sigma = max(settings.sigma, residual) ** 2 * _CORRELATION
     cov = np.linalg.inv(covariances.semidefinite(information) / sigma + known)
     return ScanMatch(
         pose,
-        covariances.at_end(cov, pose) + np.diag(np.square(settings.floor)),
+        covariances.at_end(cov, pose) + np.diag(np.square(_FLOOR)),
         float(inliers),
         float(residual),
         bool(ambiguous),
@@ -181,11 +185,11 @@ def _match(
 
     information: of the prior, beside points of variance 1.
     """
-    coarse = Prior(guess, BLUR**2 * information)
+    coarse = Prior(guess, _BLUR**2 * information)
     found = matcher.match(reference.table, _thinned(scan), guess, coarse)
     fine = Prior(guess, sigma**2 * information)
     near: Match = WALLS.match(reference.surface, scan, found.pose, fine)
-    near = NEAR_WALLS.match(reference.surface, scan, near.pose, fine)
+    near = _NEAR_WALLS.match(reference.surface, scan, near.pose, fine)
     ambiguous = (found.status == MatchStatus.AMBIGUOUS).astype(guess.dtype)
     through = _seen_through(reference.points, scan, near.pose)
     rest = jnp.stack([near.inliers, near.residual, ambiguous, through])
@@ -211,7 +215,7 @@ def _seen_through(reference: Points, scan: Points, pose: Array) -> Array:
     own = (reference.position - pose[None, :2]) @ se2.rotation(pose[2])
     r, at = jnp.sqrt((own**2).sum(axis=1)), sector(own)
     met = reference.valid & jnp.isfinite(nearest[at])
-    before = met & (r < nearest[at] - CLEAR - 0.02 * r)
+    before = met & (r < nearest[at] - _CLEAR - 0.02 * r)
     in_view = met & (r < farthest[at] + 0.2)
     return (before.sum() / jnp.maximum(in_view.sum(), 1)).astype(far.dtype)
 

@@ -16,8 +16,8 @@ from jaxslam.laser_slam.odometry.reference import (
     search,
     taken,
 )
+from jaxslam.laser_slam.records import Settings
 from jaxslam.laser_slam.scans import Scans
-from jaxslam.laser_slam.settings import Settings
 from jaxslam.matching import Matcher, Points
 from jaxslam.math import numpy_poses as poses
 
@@ -25,15 +25,21 @@ NEAR = search(0.6, np.deg2rad(22.0), np.deg2rad(2.0), ambiguous=None)
 """About raw odometry."""
 FAR = search(*FARTHEST, np.deg2rad(2.5))
 """Where that finds little, or raw odometry is no guess."""
-INFLATION = 16.0
+_INFLATION = 16.0
 """Of raw odometry's covariance in the wider search."""
-MIN_INLIERS = 0.6
+_KEY_TURN = 0.35
+"""Turn [rad] from the last keyframe above which a scan is one."""
+_LEAST_INLIERS = 0.4
+"""Share of a scan's points on the walls of the reference, for a match in odometry."""
+LOOP_INLIERS = 0.65
+"""The same for a loop."""
+_MIN_INLIERS = 0.6
 """Share of points on walls below which the wider search is made, and a match is in doubt."""
-MIN_GAIN = 0.2
+_MIN_GAIN = 0.2
 """Extra share of points on walls, less those passed through, that the wider search must reach."""
-MAX_THROUGH = 0.15
+_MAX_THROUGH = 0.15
 """Share of points that beams pass through, above which a match is of another place."""
-MAX_THROUGH_LIKELY = 0.4
+_MAX_THROUGH_LIKELY = 0.4
 """The same about raw odometry, and where that is frozen: a pose without a match would be farther
 off than most wrong matches, so these are taken, and are in doubt."""
 GATE = 30.66
@@ -151,7 +157,7 @@ def tracked(
         # Nothing speaks for a match in doubt where odometry is frozen.
         result.cov_if_right[scan] = cov + doubt if steps.frozen[scan] else cov
         result.poses[scan] = poses.compose(result.poses[keys[-1]], z)
-        far = np.hypot(z[0], z[1]) > settings.key_distance or abs(z[2]) > settings.key_turn
+        far = np.hypot(z[0], z[1]) > settings.key_distance or abs(z[2]) > _KEY_TURN
         # Where odometry is frozen the robot is soon farther off than is searched.
         restart = missed > (0 if steps.frozen[scan] else LOST) or reference is None
         if scans.usable[scan] and (restart or (far and result.matched[scan])):
@@ -209,30 +215,30 @@ def _matched(
     def by(matcher: Matcher, prior: np.ndarray) -> ScanMatch:
         return match(matcher, reference, points, guess, prior, NO_FLOOR, settings)
 
-    least = settings.least_inliers
+    least = _LEAST_INLIERS
     if how.unknown:
         fit = by(FAR, prior)
         sure = _sure(fit, settings)
-        likely = fit.inliers >= least and fit.through <= MAX_THROUGH_LIKELY
+        likely = fit.inliers >= least and fit.through <= _MAX_THROUGH_LIKELY
         accepted = sure or (how.frozen and likely)
     else:
         fit = by(NEAR, prior)
-        if fit.inliers < MIN_INLIERS:
+        if fit.inliers < _MIN_INLIERS:
             bound = reach_cov(reach)
-            wide = by(FAR, INFLATION * prior + bound)
-            better = _sure(wide, settings) and _quality(wide) > _quality(fit) + MIN_GAIN
+            wide = by(FAR, _INFLATION * prior + bound)
+            better = _sure(wide, settings) and _quality(wide) > _quality(fit) + _MIN_GAIN
             if better and _reached(wide, guess, prior, reach):
                 fit = wide
                 prior = prior + bound if how.gap else prior
-        accepted = fit.inliers >= least and fit.through <= MAX_THROUGH_LIKELY
-        sure = fit.inliers >= MIN_INLIERS
+        accepted = fit.inliers >= least and fit.through <= _MAX_THROUGH_LIKELY
+        sure = fit.inliers >= _MIN_INLIERS
     parts = fit.pose, fit.cov, prior, fit.inliers, fit.residual
     return _Found(*parts, accepted, sure, _quality(fit))
 
 
 def _sure(fit: ScanMatch, settings: Settings) -> bool:
     """Whether a match may be believed without raw odometry: as good as that of a loop."""
-    good = fit.inliers >= settings.loop_inliers and fit.through <= MAX_THROUGH
+    good = fit.inliers >= LOOP_INLIERS and fit.through <= _MAX_THROUGH
     return good and not fit.ambiguous
 
 
@@ -292,7 +298,7 @@ def place_unmatched(result: Odometry, scans: Scans, steps: Steps, settings: Sett
         prior = steps.cov[scan] + reach_cov(np.array([np.hypot(way[0], way[1]), abs(way[2])]))
         points = taken(scans.points, scan)
         fit = match(FAR, reference, points, guess, prior, NO_FLOOR, settings)
-        if fit.inliers < MIN_INLIERS - 0.1 or fit.through > MAX_THROUGH or fit.ambiguous:
+        if fit.inliers < _MIN_INLIERS - 0.1 or fit.through > _MAX_THROUGH or fit.ambiguous:
             continue
         result.matched[scan] = True
         result.inliers[scan], result.residual[scan] = fit.inliers, fit.residual

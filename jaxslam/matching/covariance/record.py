@@ -10,8 +10,7 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxslam.core.numbers import check_positive
 from jaxslam.matching.matcher import Match, Matcher, MatchStatus, Reference
-from jaxslam.matching.points import Points, moved_along_rays
-from jaxslam.matching.prior import prior_terms
+from jaxslam.matching.point_sets import Points, moved_along_rays, prior_terms
 from jaxslam.math import linalg
 from jaxslam.protocols import Component
 

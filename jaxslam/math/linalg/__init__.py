@@ -1,6 +1,6 @@
 """Small linear algebra: products, Cholesky factors, inverses and roots of a filter's matrices."""
 
-from jaxslam.math.linalg.cholesky import cholesky, solve_lower, solve_psd
+from jaxslam.math.linalg.factors import cholesky, root_psd, solve_lower, solve_psd, triangular_root
 from jaxslam.math.linalg.inverses import inverse, inverse_psd, whitener, whitener_by_rows
 from jaxslam.math.linalg.products import (
     gram,
@@ -11,7 +11,6 @@ from jaxslam.math.linalg.products import (
     symmetrize,
     total,
 )
-from jaxslam.math.linalg.roots import root_psd, triangular_root
 
 __all__ = [
     "cholesky",

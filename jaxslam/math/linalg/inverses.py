@@ -7,7 +7,7 @@ from jax import Array
 from jaxtyping import Bool, Float, PyTree
 
 from jaxslam.math.linalg import batched
-from jaxslam.math.linalg.cholesky import (
+from jaxslam.math.linalg.factors import (
     UNROLLED,
     cholesky,
     lower_half,

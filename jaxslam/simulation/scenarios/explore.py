@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxslam.core.numbers import check_count
-from jaxslam.motion.increment import Increment
+from jaxslam.motion.increments import Increment
 from jaxslam.sensors.range_bearing import RangeBearing
 from jaxslam.simulation.scenarios.view import BetweenRanges
 from jaxslam.simulation.worlds import Scenario

@@ -32,7 +32,7 @@ def beam_function(model: BeamModel) -> Function:
     differences of the values agree. Close to kinks, as the lines between cells, differences take
     smaller steps.
     """
-    prepared = model.prepare(trial_map())
+    prepared = model.prepare(_trial_map())
 
     def beams_of(ranges: jax.Array) -> Beams:
         angles = jnp.asarray(_ANGLES, ranges.dtype)
@@ -62,7 +62,7 @@ def beam_function(model: BeamModel) -> Function:
 
 
 @functools.cache
-def trial_map() -> Grid:
+def _trial_map() -> Grid:
     """The map of the room."""
     height, width = 64, 70
     x, y = np.meshgrid(_CELL * (np.arange(width) + 0.5), _CELL * (np.arange(height) + 0.5))

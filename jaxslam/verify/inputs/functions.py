@@ -1,23 +1,77 @@
-"""Functions to verify, with names and units of their arguments and outputs."""
+"""Functions to verify, with names and units of their arguments and outputs.
+
+And what a hand-derived Jacobian may return, split by the function's arguments.
+"""
 
 import copy
 import inspect
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
+from itertools import pairwise
+from typing import TypeAlias
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Float, PyTree
 from numpy.typing import ArrayLike
 
 from jaxslam.core.record import set_field
 from jaxslam.graphs import Factor
 from jaxslam.protocols import Motion, Sensor, unfit_signature
-from jaxslam.verify.inputs.claims import Claim
+
+Claim: TypeAlias = Callable[..., ArrayLike | Sequence[ArrayLike | None]]
+"""A hand-derived Jacobian: arguments -> one array, or one array or None for each argument."""
+
+
+def as_claim(claim: PyTree) -> PyTree:
+    """A claimed Jacobian as one array or a tuple of arrays; a list of rows is one array."""
+    if claim is None:
+        raise ValueError("returns None: is a `return` missing?")
+    if isinstance(claim, list):
+        nested = all(isinstance(row, list | tuple) for row in claim)
+        return jnp.asarray(claim) if nested else tuple(claim)
+    return claim
+
+
+def split_claim(
+    claim: PyTree, rows: int, names: Sequence[str], sizes: Sequence[int]
+) -> list[PyTree]:
+    """A claimed Jacobian split by argument, None where there is no claim.
+
+    Args:
+        claim: as from `as_claim`: arrays, or their shapes, with any number of leading axes.
+        rows: m, the length of the function's value.
+        names, sizes: of its arguments, the names and the lengths n_k.
+    Returns:
+        One (m, n_k) or None for each argument: the parts of a tuple, the columns of one array
+        (m, Σ n_k), or one array (m, n_0) by the first argument.
+    Raises:
+        ValueError: on any other shape.
+    """
+    if not isinstance(claim, tuple | list):
+        total = sum(sizes)
+        if np.shape(claim)[-2:] == (rows, total) and len(sizes) > 1:
+            if isinstance(claim, jax.ShapeDtypeStruct):
+                return [jax.ShapeDtypeStruct((rows, n), claim.dtype) for n in sizes]
+            edges = [0, *np.cumsum(sizes).tolist()]
+            return [claim[..., a:b] for a, b in pairwise(edges)]
+        claim = (claim, *(None for _ in sizes[1:]))
+    if len(claim) != len(sizes):
+        raise ValueError(
+            f"returns {len(claim)} Jacobians where the function has {len(sizes)} arguments"
+        )
+    for part, size, name in zip(claim, sizes, names, strict=True):
+        if part is not None and np.shape(part)[-2:] != (rows, size):
+            raise ValueError(
+                f"has shape {np.shape(part)[-2:]} by {name}; expected ({rows}, {size})"
+            )
+    return list(claim)
+
 
 POSE = ("x [m]", "y [m]", "theta [rad]")
 POINT = ("x [m]", "y [m]")
-GLOSSARY = {
+_GLOSSARY = {
     "pose": POSE,
     "frame": POSE,
     "landmark": POINT,
@@ -26,7 +80,7 @@ GLOSSARY = {
 }
 """Default entries of an argument by its name."""
 
-PERIODS = {"[rad]": 2 * np.pi, "[deg]": 360.0, "[°]": 360.0}
+_PERIODS = {"[rad]": 2 * np.pi, "[deg]": 360.0, "[°]": 360.0}
 """A whole turn by its unit."""
 
 
@@ -64,7 +118,7 @@ def at_state(function: Function, state: Sequence[ArrayLike]) -> str:
 
 def periods(names: Sequence[str]) -> Float[np.ndarray, "m"]:
     """The periods of quantities by their units: 2π of [rad], 360 of [deg], inf of all else."""
-    return np.array([PERIODS.get(name.split(" ")[-1], np.inf) for name in names])
+    return np.array([_PERIODS.get(name.split(" ")[-1], np.inf) for name in names])
 
 
 def motion_functions(motion: Motion) -> tuple[Function]:
@@ -173,7 +227,7 @@ def plain_function(
         raise ValueError(
             f"{name}: expected a function with a parameter to differentiate by, got none"
         )
-    named = {p: _entries(name, p, given.get(p, GLOSSARY.get(p))) for p in parameters}
+    named = {p: _entries(name, p, given.get(p, _GLOSSARY.get(p))) for p in parameters}
     shapes = [np.shape(table) for table in (() if states is None else states)]
     if len(shapes) == len(parameters) and all(len(shape) == 2 for shape in shapes):
         pairs = zip(parameters, shapes, strict=True)

@@ -16,7 +16,7 @@ Values: TypeAlias = Float[np.ndarray, "_ _"]
 
 FAR = 1e5
 """Distance from the origin, as of survey coordinates [m]."""
-OUT_OF_SIGHT = 16.0
+_OUT_OF_SIGHT = 16.0
 """Distance from the robot to a far landmark, along each axis [m]."""
 NEAR = 2.0**-10
 """Distance from the robot to a close landmark [m]; a power of two is exact in float32, too."""
@@ -37,7 +37,7 @@ _HARD = {
     "[1/m]": (0.0, _SEAM, -_SEAM, -0.5),
 }
 
-Group: TypeAlias = tuple[str, tuple[Values, ...]]
+_Group: TypeAlias = tuple[str, tuple[Values, ...]]
 """A label, and states (S, n) for each argument."""
 
 
@@ -52,7 +52,7 @@ def argument_samples(arguments: tuple[Argument, ...], count: int, seed: int) -> 
     """Samples of a function's arguments by their units: random, difficult, near, far and zero."""
     rng = np.random.default_rng(seed)
     base = tuple(_sampled_argument(rng, argument, count) for argument in arguments)
-    groups: list[Group] = [("random", base)]
+    groups: list[_Group] = [("random", base)]
     for k, argument in enumerate(arguments):
         groups += list(_one_at_a_time(base, k, argument))
         if not _is_place(argument):
@@ -107,7 +107,7 @@ def sensor_samples(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samp
     first[:, :2] = np.round(first[:, :2] * 64) / 64
     landmark = at(elsewhere, pose[:, :2] + offset)
     base = (pose, landmark)
-    groups: list[Group] = [("random", base)]
+    groups: list[_Group] = [("random", base)]
     for k, argument in enumerate((Argument("pose", POSE), Argument("landmark", sensor.landmark))):
         groups += list(_one_at_a_time(base, k, argument))
 
@@ -125,7 +125,7 @@ def sensor_samples(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samp
             ("landmark close to the robot", (first[few], at(first[few], close))),
             ("landmark behind, on the seam", (pose[few], at(elsewhere[few], ahead))),
             ("landmark at the robot", (pose[few], at(pose[few], pose[few, :2]))),
-            ("landmark far", (pose[few], at(pose[few], pose[few, :2] + OUT_OF_SIGHT))),
+            ("landmark far", (pose[few], at(pose[few], pose[few, :2] + _OUT_OF_SIGHT))),
         ]
         for label, scale in (("landmark close to the sensor", NEAR), ("landmark at the sensor", 0)):
             seen = np.where(metres, z[few] * scale, z[few])
@@ -138,7 +138,7 @@ def sensor_samples(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samp
     groups.append((LARGE, (away, at(away, away[:, :2] + offset[:2]))))
     observed = _concatenated(groups)
 
-    back: list[Group] = [("random", (pose, z, s))]
+    back: list[_Group] = [("random", (pose, z, s))]
     back += list(_one_at_a_time((pose, z, s), 0, Argument("pose", POSE)))
     angular = np.isfinite(periods(sensor.measurements))
     seen = np.asarray(quick_jit(jax.vmap(sensor.observe))(*observed.values), np.float64)
@@ -205,7 +205,7 @@ def _is_place(argument: Argument) -> bool:
     return argument.entries[:2] == POSE[:2]
 
 
-def _one_at_a_time(base: tuple[Values, ...], which: int, argument: Argument) -> Iterable[Group]:
+def _one_at_a_time(base: tuple[Values, ...], which: int, argument: Argument) -> Iterable[_Group]:
     """States in which one entry of an argument has a difficult value."""
     for column, name in enumerate(argument.entries):
         hard = np.array(_HARD.get(name.split(" ")[-1], ()))
@@ -236,7 +236,7 @@ def _shifted(base: tuple[Values, ...], places: list[int], shift: Values) -> Iter
         yield rows
 
 
-def _concatenated(groups: list[Group]) -> Samples:
+def _concatenated(groups: list[_Group]) -> Samples:
     labels = tuple(label for label, parts in groups for _ in range(len(parts[0])))
     parts = zip(*(parts for _, parts in groups), strict=True)
     return Samples(tuple(np.concatenate(part) for part in parts), labels)

@@ -18,13 +18,12 @@ from jaxslam.simulation.worlds import World
 from jaxslam.verify import Check, Report, build
 from jaxslam.verify.errors import describe_error, is_user_file, place_of_error
 from jaxslam.verify.examination import Model
-from jaxslam.verify.inputs.claims import Claim
-from jaxslam.verify.inputs.functions import makes_a_model
+from jaxslam.verify.inputs.functions import Claim, makes_a_model
 
-CLAIMS = ("_jacobian", "_jacobians")
+_CLAIMS = ("_jacobian", "_jacobians")
 """Endings of names: f_jacobian is the hand-derived Jacobian of f."""
 
-ABOUT = ("arguments", "outputs", "states")
+_ABOUT = ("arguments", "outputs", "states")
 """Endings of names: f_arguments and others are arguments of `verify_jacobians` for f."""
 
 
@@ -33,7 +32,7 @@ class UnusableFile(ValueError):
 
 
 @dataclasses.dataclass(frozen=True)
-class Target:
+class _Target:
     """A model or function of a user's file: the arguments of `verify_jacobians`."""
 
     name: str
@@ -46,7 +45,7 @@ class Target:
     """for the report"""
 
 
-class PrintRecorder(io.TextIOBase):
+class _PrintRecorder(io.TextIOBase):
     """A replacement of standard output that records which lines of a user's file write to it."""
 
     def __init__(self) -> None:
@@ -65,14 +64,14 @@ class PrintRecorder(io.TextIOBase):
 
 
 @contextlib.contextmanager
-def recorded_prints() -> Iterator[PrintRecorder]:
+def _recorded_prints() -> Iterator[_PrintRecorder]:
     """A block in which printed text is recorded instead of shown."""
-    printed = PrintRecorder()
+    printed = _PrintRecorder()
     with contextlib.redirect_stdout(printed):
         yield printed
 
 
-def load(target: str) -> list[Target]:
+def load(target: str) -> list[_Target]:
     """The models and functions that `file.py` or `file.py:name` defines, in the order of the file.
 
     These are objects of the types `Motion`, `Sensor`, `graphs.Factor` and `grids.BeamModel`;
@@ -99,7 +98,7 @@ def load(target: str) -> list[Target]:
             raise UnusableFile(
                 f"{path.name}: expected {name} to be a Motion, a Sensor, a class of one whose only "
                 "required field is noise_cov, a factory of one, a Factor, a BeamModel, or a "
-                f"function with its Jacobian: define {name}{CLAIMS[0]}, or call "
+                f"function with its Jacobian: define {name}{_CLAIMS[0]}, or call "
                 f"jaxslam.verify_jacobians({name}) from Python, which needs none"
             )
         if not found:
@@ -120,7 +119,7 @@ def verify_file(target: str, verify_one: Callable[..., Report]) -> list[Report]:
 
     Raises UnusableFile as `load` does, and if none of them can be verified.
     """
-    with recorded_prints() as printed:
+    with _recorded_prints() as printed:
         targets = load(target)
     notes = tuple(f"{line} prints when the file is loaded" for line in printed.lines)
     reports, unusable = [], []
@@ -136,9 +135,9 @@ def verify_file(target: str, verify_one: Callable[..., Report]) -> list[Report]:
     return [dataclasses.replace(reports[0], notes=(*notes, *reports[0].notes)), *reports[1:]]
 
 
-def _verified(target: Target, verify_one: Callable[..., Report]) -> Report:
+def _verified(target: _Target, verify_one: Callable[..., Report]) -> Report:
     """The report on a target, with a check that it prints nothing, since it must be pure."""
-    with recorded_prints() as printed:
+    with _recorded_prints() as printed:
         report = verify_one(
             target.model,
             target.jacobian,
@@ -211,22 +210,22 @@ def names_in(module: ModuleType) -> str:
     return f"; it defines: {', '.join(found)}" if found else "; it defines nothing"
 
 
-def _target(module: ModuleType, name: str) -> Target | None:
+def _target(module: ModuleType, name: str) -> _Target | None:
     """What a name of the module stands for, or None where there is nothing to verify."""
     value = getattr(module, name)
     if isinstance(value, Motion | Sensor | Factor | BeamModel):
-        return Target(name, value)
+        return _Target(name, value)
     if not callable(value):
         return None
-    claims = [getattr(module, name + end) for end in CLAIMS if hasattr(module, name + end)]
+    claims = [getattr(module, name + end) for end in _CLAIMS if hasattr(module, name + end)]
     if len(claims) > 1:
         raise UnusableFile(f"expected {name}_jacobian or {name}_jacobians, got both")
     if claims:
-        arguments, outputs, states = (getattr(module, f"{name}_{what}", None) for what in ABOUT)
-        return Target(name, value, claims[0], arguments, outputs, states)
+        arguments, outputs, states = (getattr(module, f"{name}_{what}", None) for what in _ABOUT)
+        return _Target(name, value, claims[0], arguments, outputs, states)
     if getattr(value, "__module__", "") == module.__name__ and makes_a_model(value):
         try:
-            return Target(name, build(value))
+            return _Target(name, build(value))
         except Exception as error:
             what = "class" if isinstance(value, type) else "factory"
             raise UnusableFile(f"the {what} {name}: {describe_error(error)}") from error

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.io
 
-from jaxslam.datasets.formats.mat_file import read_matrices
+from jaxslam.datasets.plaza_reader import read_matrices
 
 
 @pytest.mark.parametrize("compressed", [False, True])

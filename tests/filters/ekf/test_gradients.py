@@ -10,9 +10,9 @@ import worlds
 
 from jaxslam import charts, linearize, motion, sensors
 from jaxslam.filters import EkfSlam
+from jaxslam.filters.ekf.predict import propagate
 from jaxslam.filters.ekf.settings import EkfSettings
-from jaxslam.filters.ekf.steps.predict import propagate
-from jaxslam.filters.ekf.steps.sequential_update import correct_in_turn
+from jaxslam.filters.ekf.update import correct_in_turn
 from jaxslam.math.stats import sigma_gate
 from jaxslam.run import run
 from jaxslam.simulation.scenarios import cloister

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from jaxslam import charts, linearize, sensors
+from jaxslam.filters.ekf.predicted_measurements import prediction_of
 from jaxslam.filters.ekf.settings import EkfSettings
-from jaxslam.filters.ekf.steps.predicted_measurements import prediction_of
-from jaxslam.filters.ekf.steps.update import correct
+from jaxslam.filters.ekf.update import correct
 from jaxslam.slots import Joint
 from jaxslam.types import Scan
 

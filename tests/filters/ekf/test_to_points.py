@@ -12,7 +12,7 @@ from own_models import changed
 from jaxslam import charts, motion, run, sensors, slots
 from jaxslam.charts import RightInvariant
 from jaxslam.filters import CompressedEkfSlam, EkfSlam
-from jaxslam.filters.ekf.coordinates.to_points import ready, reduce, reduction
+from jaxslam.filters.ekf.map_coordinates import ready, reduce, reduction
 from jaxslam.linearize import Unscented
 from jaxslam.protocols import Basis
 from jaxslam.types import Log, Scan, Status

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.filters.information.sparse.marginals import local_information
+from jaxslam.filters.information.marginals import local_information
 
 COUNT = 36
 """landmarks of the cloister"""

@@ -11,13 +11,13 @@ from dense_form import COUNT, canonical, close, dense, dtypes, initialized, meas
 from worlds import draw, narrow
 
 from jaxslam import filters, sensors
-from jaxslam.filters.information.sparse import link_lists, sparse_state, sparsification
-from jaxslam.filters.information.sparse.marginals import (
+from jaxslam.filters.information import active_set, sparse_state, sparsification
+from jaxslam.filters.information.marginals import (
     blanket_cov,
     blanket_marginals,
+    recover_passive_means,
     whole_information,
 )
-from jaxslam.filters.information.sparse.mean_recovery import recover_passive_means
 from jaxslam.run import run
 from jaxslam.simulation.scenarios import cloister
 from jaxslam.simulation.scenarios.view import BetweenRanges
@@ -239,7 +239,7 @@ def test_a_full_list_drops_its_weakest_link(conservative):
     """Three links enter a list of two: the weakest goes, on both sides, and Ω̃ ⪰ Ω, or ⪯."""
     state = jax.jit(lambda: sparse_state.empty_map(jnp.zeros(3), jnp.eye(3), 5, 1, 2))()
     state = state._replace(diagonal=100.0 * np.asarray(state.diagonal))
-    enter = jax.jit(functools.partial(link_lists.enter_link, conservative=conservative))
+    enter = jax.jit(functools.partial(active_set.enter_link, conservative=conservative))
     link = np.array([[-2.0, 0.5], [0.1, -1.0]])
     yes = np.array(True)
     at = [np.array(k) for k in range(5)]

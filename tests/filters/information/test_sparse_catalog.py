@@ -8,7 +8,7 @@ import pytest
 from jaxslam import catalog, scenarios
 from jaxslam.charts import Euclidean
 from jaxslam.core.record import record
-from jaxslam.filters.information.in_pieces import InPieces
+from jaxslam.filters.information.eif_slam import InPieces
 from jaxslam.filters.reporting import nothing_of
 from jaxslam.protocols import Filter
 from jaxslam.types import Scan

@@ -13,8 +13,7 @@ from jaxslam.filters import EifSlam, EkfSlam
 from jaxslam.filters.map_management.closing import Closing
 from jaxslam.filters.map_management.loop_closure import LoopSettings, close_loop
 from jaxslam.filters.map_management.merging import merge_landmarks
-from jaxslam.life import Recency
-from jaxslam.life.recency import Times
+from jaxslam.life import Recency, Times
 from jaxslam.protocols import Pairs, Prediction
 from jaxslam.slots import Joint
 from jaxslam.types import Info, Scan

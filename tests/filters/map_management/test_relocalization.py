@@ -12,7 +12,7 @@ import pytest
 from jaxslam import charts, motion, se2, sensors
 from jaxslam.filters import EkfSlam
 from jaxslam.filters.ekf.settings import EkfSettings
-from jaxslam.filters.ekf.steps.update import correct
+from jaxslam.filters.ekf.update import correct
 from jaxslam.filters.map_management.relocalization import (
     lost,
     points_of_map,

@@ -13,8 +13,8 @@ import worlds
 from jaxslam import association, life, motion, resampling, sensors
 from jaxslam.consistency.score import _counted
 from jaxslam.filters import FastSlam
-from jaxslam.filters.particles.states import moments
-from jaxslam.filters.particles.states.slam_state import SlamParticles
+from jaxslam.filters.particles import slam_particles
+from jaxslam.filters.particles.slam_particles import SlamParticles
 from jaxslam.run import run
 from jaxslam.types import Scan, Status
 
@@ -139,7 +139,7 @@ def test_moments_of_the_pose_against_plain_arithmetic():
     state = random_particles(np.random.default_rng(0))
     w = np.exp(state.log_weight)
     assert np.ptp(state.pose[:, 2]) > 6  # a plain mean of headings would be far off
-    mean, cov = jax.jit(moments.slam_pose_moments)(state)
+    mean, cov = jax.jit(slam_particles.slam_pose_moments)(state)
     circle = np.angle((w * np.exp(1j * state.pose[:, 2])).sum())
     theta = circle + w @ np.angle(np.exp(1j * (state.pose[:, 2] - circle)))
     np.testing.assert_allclose(mean, [*(w @ state.pose[:, :2]), theta], atol=1e-12)
@@ -156,7 +156,9 @@ def test_the_covariance_is_the_mean_square_of_truth_minus_mean():
     root = np.diag([0.3, 0.1, 0.05])
     draws = rng.normal(size=(20000, 7, 3)) @ root
     start = random_particles(rng, 6)._replace(log_weight=np.full(6, -np.log(6)))
-    one = jax.jit(jax.vmap(lambda poses: moments.slam_pose_moments(start._replace(pose=poses))))
+    one = jax.jit(
+        jax.vmap(lambda poses: slam_particles.slam_pose_moments(start._replace(pose=poses)))
+    )
     mean, cov = one(jnp.asarray(draws[:, :6]))
     error = draws[:, 6] - np.asarray(mean)
     np.testing.assert_allclose(np.asarray(cov).mean(0).diagonal(), error.var(0), rtol=0.04)
@@ -174,7 +176,7 @@ def test_the_map_is_a_mixture_by_slot_where_tags_agree():
     state.alive[other[1], 0], state.tag[other[1], 0] = False, -1
     state.tag[:, 1] = -1  # unknown: the most likely particle's own
     state.alive[best, 2], state.tag[best, 2] = False, -1
-    out = jax.jit(partial(moments.slam_estimate, sensor=RING.sensor))(state)
+    out = jax.jit(partial(slam_particles.slam_estimate, sensor=RING.sensor))(state)
     keep = np.array([p not in other[:2] for p in range(7)])
     w = np.exp(state.log_weight) * keep
     w = w / w.sum()
@@ -194,7 +196,7 @@ def test_headings_that_cancel_have_no_mean_and_no_nan():
     state.pose[:, 2] = [0.0, np.pi]
     mean, slope = jax.jit(
         jax.value_and_grad(
-            lambda pose: moments.slam_pose_moments(state._replace(pose=pose))[0].sum()
+            lambda pose: slam_particles.slam_pose_moments(state._replace(pose=pose))[0].sum()
         )
     )(state.pose)
     chex.assert_tree_all_finite((mean, slope))

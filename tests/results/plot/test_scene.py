@@ -13,8 +13,8 @@ import jaxslam
 from jaxslam import catalog, filters, plot
 from jaxslam.filters.delayed.state import TableLayout, empty_state
 from jaxslam.filters.information.eif_slam import CanonicalState
-from jaxslam.filters.information.sparse.sparse_state import empty_map
-from jaxslam.filters.particles.states.slam_state import initial_slam_particles
+from jaxslam.filters.information.sparse_state import empty_map
+from jaxslam.filters.particles.slam_particles import initial_slam_particles
 from jaxslam.results.plot.scene import layers
 from jaxslam.results.plot.scene.history import MOST, history_of
 from jaxslam.results.plot.scene.probe import Cloud, Hypotheses, Links

@@ -8,10 +8,10 @@ from jaxtyping import Array, Float, PyTree
 
 from jaxslam.filters.delayed.state import DelayedState, covariance_blocks
 from jaxslam.filters.information.eif_slam import CanonicalState
-from jaxslam.filters.information.sparse.marginals import local_information
-from jaxslam.filters.information.sparse.sparse_state import SparseState
-from jaxslam.filters.particles.states.pose_state import PoseParticles
-from jaxslam.filters.particles.states.slam_state import SlamParticles
+from jaxslam.filters.information.marginals import local_information
+from jaxslam.filters.information.sparse_state import SparseState
+from jaxslam.filters.particles.pose_particles import PoseParticles
+from jaxslam.filters.particles.slam_particles import SlamParticles
 from jaxslam.results.plot.scene.film import Layer
 from jaxslam.results.plot.scene.layers import cloud, lines_between, marks, rings, weighted_segments
 from jaxslam.results.plot.style import COLORS, INK, Look

@@ -1,1 +1,0 @@
-"""Readers and writers of file formats, with errors that name the place."""

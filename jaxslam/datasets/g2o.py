@@ -1,0 +1,336 @@
+"""Reader and writer of graphs as files of g2o and TORO; see `graphs.read`, `graphs.write`."""
+
+import gzip
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxslam.datasets.lines import TextFile
+from jaxslam.graphs.factor import REGISTRY
+from jaxslam.graphs.graph import Graph, Table
+from jaxslam.graphs.starts import odometry
+from jaxslam.graphs.validation import check_numbers, indefinite
+from jaxslam.results.files import write_files
+
+
+class _Edge(NamedTuple):
+    """What a line of one kind holds."""
+
+    table: str
+    who: tuple[str, ...]
+    """kinds of the variables, "pose" or "point" """
+    measured: tuple[str, ...]
+    entries: tuple[tuple[int, int], ...]
+    """where in Ω each number stands"""
+
+
+_BY_ROWS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+_TORO_ORDER = ((0, 0), (0, 1), (1, 1), (2, 2), (0, 2), (1, 2))
+_POSE = ("x", "y", "theta")
+EDGES = {
+    "EDGE_SE2": _Edge("relative_pose", ("pose", "pose"), _POSE, _BY_ROWS),
+    "EDGE2": _Edge("relative_pose", ("pose", "pose"), _POSE, _TORO_ORDER),
+    "EDGE": _Edge("relative_pose", ("pose", "pose"), _POSE, _TORO_ORDER),
+    "EDGE_PRIOR_SE2": _Edge("prior", ("pose",), _POSE, _BY_ROWS),
+    "EDGE_SE2_XY": _Edge(
+        "relative_position", ("pose", "point"), ("x", "y"), ((0, 0), (0, 1), (1, 1))
+    ),
+    "EDGE_BEARING_SE2_XY": _Edge("bearing", ("pose", "point"), ("bearing",), ((0, 0),)),
+}
+_VERTICES = {
+    "VERTEX_SE2": ("pose", _POSE),
+    "VERTEX2": ("pose", _POSE),
+    "VERTEX": ("pose", _POSE),
+    "VERTEX_XY": ("point", ("x", "y")),
+}
+_SKIPPED = {
+    "ROBOTLASER1": "laser scans",
+    "PARAMS_SE2OFFSET": "sensor offsets",  # no edge of EDGES refers to one
+    "VERTEX_TAG": "notes",
+    "VERTEX_ELLIPSE": "notes",
+}
+"""Lines that are no part of the graph, and what they are counted as."""
+
+
+class Format(NamedTuple):
+    """The kinds of lines that a graph is written in."""
+
+    name: str
+    vertices: dict[str, str]
+    """of "pose" and "point" """
+    edges: dict[str, str]
+    """by table"""
+    fix: bool
+    """whether a variable can be held"""
+
+
+_G2O = Format(
+    "g2o",
+    {"pose": "VERTEX_SE2", "point": "VERTEX_XY"},
+    {edge.table: kind for kind, edge in EDGES.items() if edge.entries != _TORO_ORDER},
+    fix=True,
+)
+TORO = Format("TORO", {"pose": "VERTEX2"}, {"relative_pose": "EDGE2"}, fix=False)
+_ENDINGS = {".toro": TORO, ".graph": TORO}
+"""How the names of files end that are not written as g2o."""
+
+
+_LARGEST = 2**31 - 1
+
+
+class Loaded(NamedTuple):
+    """A graph as a file has it, and what was done to it."""
+
+    graph: Graph
+    skipped: dict[str, int]
+    """lines that are not in the graph, by what they are"""
+    placed: int
+    """poses and points without a line of their own, placed along the edges"""
+
+
+class _Rows(NamedTuple):
+    """The lines of one table."""
+
+    ids: list[list[int]]
+    numbers: list[list[float]]
+    lines: list[int]
+    kinds: list[_Edge]
+
+
+def load(path: str | Path) -> Loaded:
+    """The graph in a file; see `graphs.read`, which says what is read and what is refused."""
+    file = TextFile(path)
+    vertices: dict[str, dict[int, list[float]]] = {"pose": {}, "point": {}}
+    rows: dict[str, _Rows] = {}
+    fixed: list[tuple[int, int]] = []
+    skipped: dict[str, int] = {}
+    for line, (kind, *fields) in file:
+        if kind in EDGES:
+            _read_edge(file, line, EDGES[kind], fields, rows)
+        elif kind in _VERTICES:
+            _read_vertex(file, line, *_VERTICES[kind], fields, vertices)
+        elif kind == "FIX":
+            if not fields:
+                raise file.error(line, "expected at least 1 field (id), got 0")
+            fixed += [(line, _identity(file, line, field, "id")) for field in fields]
+        elif kind in _SKIPPED or kind.startswith("#"):
+            what = _SKIPPED.get(kind, "comments")
+            skipped[what] = skipped.get(what, 0) + 1
+        else:
+            known = ", ".join([*_VERTICES, "FIX", *EDGES])
+            raise file.error(line, f"unknown kind {kind!r}; known: {known}")
+    if not rows:
+        raise file.end_error("no edge in the file")
+    unplaced = not vertices["pose"] and not vertices["point"]
+    if unplaced:
+        vertices = _named_by_edges(file, rows)
+    return _assembled(file, vertices, rows, fixed, skipped, unplaced)
+
+
+def _identity(file: TextFile, line: int, field: str, name: str) -> int:
+    found = file.identity(line, field, name)
+    if found > _LARGEST:
+        raise file.error(line, f"{name} is above {_LARGEST}: {field}")
+    return found
+
+
+def _read_vertex(
+    file: TextFile,
+    line: int,
+    kind: str,
+    names: tuple[str, ...],
+    fields: list[str],
+    vertices: dict[str, dict[int, list[float]]],
+) -> None:
+    """Add a vertex; raises ValueError on a malformed line and on an id that occurred before."""
+    file.expect(line, fields, ("id", *names))
+    vertex = _identity(file, line, fields[0], "id")
+    if any(vertex in known for known in vertices.values()):
+        raise file.error(line, f"vertex {vertex} occurs twice")
+    vertices[kind][vertex] = file.numbers(line, fields[1:], names)
+
+
+def _read_edge(
+    file: TextFile, line: int, edge: _Edge, fields: list[str], rows: dict[str, _Rows]
+) -> None:
+    """Add an edge to its table; raises ValueError on a malformed line."""
+    names = (*"ij"[: len(edge.who)], *edge.measured, *(f"I{i + 1}{j + 1}" for i, j in edge.entries))
+    file.expect(line, fields, names)
+    count = len(edge.who)
+    ids = [_identity(file, line, field, n) for field, n in zip(fields[:count], names, strict=False)]
+    if len(set(ids)) < count:
+        raise file.error(line, f"an edge from vertex {ids[0]} to itself")
+    table = rows.setdefault(edge.table, _Rows([], [], [], []))
+    table.ids.append(ids)
+    table.numbers.append(file.numbers(line, fields[count:], names[count:]))
+    table.lines.append(line)
+    table.kinds.append(edge)
+
+
+def _named_by_edges(file: TextFile, rows: dict[str, _Rows]) -> dict[str, dict[int, list[float]]]:
+    """The vertices that edges name, at the origin, in the order of their ids."""
+    found: dict[str, set[int]] = {"pose": set(), "point": set()}
+    for table in rows.values():
+        for ids, edge, line in zip(table.ids, table.kinds, table.lines, strict=True):
+            for vertex, kind in zip(ids, edge.who, strict=True):
+                found[kind].add(vertex)
+                if vertex in found["point" if kind == "pose" else "pose"]:
+                    raise file.error(
+                        line, f"vertex {vertex} is a pose in one edge, a point in another"
+                    )
+    return {
+        kind: {vertex: [0.0] * (3 if kind == "pose" else 2) for vertex in sorted(ids)}
+        for kind, ids in found.items()
+    }
+
+
+def _assembled(
+    file: TextFile,
+    vertices: dict[str, dict[int, list[float]]],
+    rows: dict[str, _Rows],
+    fixed: list[tuple[int, int]],
+    skipped: dict[str, int],
+    unplaced: bool,
+) -> Loaded:
+    """The graph of the lines of a file; raises ValueError where they do not fit together."""
+    index = {
+        kind: {vertex: at for at, vertex in enumerate(named)} for kind, named in vertices.items()
+    }
+    held = {kind: np.zeros(len(named), bool) for kind, named in vertices.items()}
+    for line, vertex in fixed:
+        for kind, known in index.items():
+            if vertex in known:
+                held[kind][known[vertex]] = True
+        if not any(vertex in known for known in index.values()):
+            raise file.error(line, f"vertex {vertex} is nowhere in the file")
+    values = {
+        kind: np.array(list(named.values())).reshape(-1, 3 if kind == "pose" else 2)
+        for kind, named in vertices.items()
+    }
+    ids = {kind: np.array(list(named), np.int32) for kind, named in vertices.items()}
+    graph = Graph(
+        poses=values["pose"],
+        points=values["point"],
+        tables={key: _table(file, table, index) for key, table in rows.items()},
+        fixed_pose=held["pose"],
+        fixed_point=held["point"],
+        pose_id=ids["pose"],
+        point_id=ids["point"],
+    )
+    if not unplaced:
+        return Loaded(graph, skipped, 0)
+    try:
+        return Loaded(odometry(graph), skipped, len(ids["pose"]) + len(ids["point"]))
+    except ValueError as problem:
+        why = str(problem).removeprefix("odometry: ")
+        raise file.end_error(f"no vertices in the file to start from, and {why}") from problem
+
+
+def _table(file: TextFile, rows: _Rows, index: dict[str, dict[int, int]]) -> Table:
+    """A table; raises ValueError on a vertex that is nowhere and an indefinite information."""
+    who = []
+    for line, ids, edge in zip(rows.lines, rows.ids, rows.kinds, strict=True):
+        for vertex, kind in zip(ids, edge.who, strict=True):
+            if vertex not in index[kind]:
+                elsewhere = any(vertex in known for known in index.values())
+                why = f"is no {kind}" if elsewhere else "is nowhere in the file"
+                raise file.error(line, f"vertex {vertex} {why}")
+        who.append([index[kind][vertex] for vertex, kind in zip(ids, edge.who, strict=True)])
+    numbers, size = np.array(rows.numbers), len(rows.kinds[0].measured)
+    information = np.zeros((len(who), size, size))
+    for edge in set(rows.kinds):
+        mine = np.array([kind is edge for kind in rows.kinds])
+        for (i, j), column in zip(edge.entries, numbers[:, size:].T, strict=True):
+            information[mine, i, j] = information[mine, j, i] = column[mine]
+    bad = indefinite(information)
+    if bad.any():
+        row = int(bad.argmax())
+        why = "the information is not positive semidefinite"
+        if size == 3:
+            why += "; EDGE2 has the order I11 I12 I22 I33 I13 I23, EDGE_SE2 that of the rows"
+        raise file.error(rows.lines[row], why)
+    return Table(np.array(who, np.int32), numbers[:, :size], information, np.ones(len(who), bool))
+
+
+def save(path: str | Path, graph: Graph) -> None:
+    """Write a graph as a file of g2o, or TORO by the file's ending; see `graphs.write`."""
+    path = Path(path)
+    packed = path.suffix == ".gz"
+    ending = path.with_suffix("").suffix if packed else path.suffix
+    text = text_of(graph, _ENDINGS.get(ending, _G2O))
+    _check_readable(graph)
+
+    def pack(target: Path) -> None:
+        target.write_bytes(gzip.compress(text.encode("utf-8"), mtime=0))
+
+    write_files(path.parent, {path.name: pack if packed else text})
+
+
+def text_of(graph: Graph, form: Format = _G2O) -> str:
+    """The graph in a format; raises ValueError as `graphs.write` does."""
+    _check_writable(graph, form)
+    ids = {"pose": np.asarray(graph.pose_id), "point": np.asarray(graph.point_id)}
+    values = {"pose": np.asarray(graph.poses), "point": np.asarray(graph.points)}
+    held = {"pose": np.asarray(graph.fixed_pose), "point": np.asarray(graph.fixed_point)}
+    lines = [
+        _line(name, [one], row)
+        for kind, name in form.vertices.items()
+        for one, row in zip(ids[kind], values[kind], strict=True)
+    ]
+    for key, table in graph.tables.items():
+        name = form.edges[key.split("/")[0]]
+        edge = EDGES[name]
+        valid = np.asarray(table.valid)
+        information = np.asarray(table.information)[valid]
+        entries = np.stack([information[:, i, j] for i, j in edge.entries], axis=1)
+        numbers = np.concatenate([np.asarray(table.z)[valid], entries], axis=1)
+        who = np.asarray(table.who)[valid]
+        names = np.stack([ids[kind][who[:, k]] for k, kind in enumerate(edge.who)], axis=1)
+        lines += [_line(name, *row) for row in zip(names, numbers, strict=True)]
+    # Last: GTSAM's readG2o stops at a line that does not begin with two numbers, as `FIX 0` does.
+    lines += [f"FIX {one}" for kind in form.vertices for one in ids[kind][held[kind]]]
+    return "\n".join(lines) + "\n"
+
+
+def _check_readable(graph: Graph) -> None:
+    """Raise ValueError on what `read` refuses."""
+    ids = np.concatenate([np.asarray(graph.pose_id), np.asarray(graph.point_id)])
+    if (ids < 0).any():
+        raise ValueError(f"graphs.write: expected ids >= 0, got {ids.min()}")
+    known = {key: REGISTRY[key.split("/")[0]] for key in graph.tables}
+    check_numbers("graphs.write", graph, known)
+
+
+def _check_writable(graph: Graph, form: Format) -> None:
+    """Raise ValueError on what a format has no line for."""
+    if len(both := np.intersect1d(graph.pose_id, graph.point_id)):
+        raise ValueError(
+            f"graphs.write: {both[0]} is the id of a pose and of a point, which {form.name} does "
+            "not allow"
+        )
+    if len(graph.points) and "point" not in form.vertices:
+        raise ValueError(
+            f"graphs.write: {form.name} has no line for points, and the graph has "
+            f"{len(graph.points)}"
+        )
+    if len(graph.points) and graph.points.shape[1] != 2:
+        raise ValueError(
+            f"graphs.write: expected points (x, y), got {graph.points.shape[1]} numbers"
+        )
+    held = np.asarray(graph.pose_id)[np.asarray(graph.fixed_pose)]
+    if len(held) and not form.fix:
+        raise ValueError(
+            f"graphs.write: {form.name} has no line for fixed poses, and pose {held[0]} is fixed"
+        )
+    for key in graph.tables:
+        if key.split("/")[0] not in form.edges:
+            raise ValueError(
+                f"graphs.write: {form.name} has no line for table {key!r}; it has some for "
+                f"{', '.join(form.edges)}"
+            )
+
+
+def _line(kind: str, ids: Sequence[int], numbers: np.ndarray) -> str:
+    return " ".join([kind, *map(str, ids), *map(repr, np.asarray(numbers, float).tolist())])

@@ -1,1 +1,0 @@
-"""Coordinates of the error state, and changes between them."""

@@ -1,1 +1,0 @@
-"""The steps of a scan, in the order of the textbook."""

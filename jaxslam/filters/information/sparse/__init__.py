@@ -1,1 +1,0 @@
-"""The sparse canonical form: state, links, sparsification, mean recovery."""

@@ -1,1 +1,0 @@
-"""Weighted particles: their states and moments."""

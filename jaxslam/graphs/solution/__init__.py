@@ -1,1 +1,0 @@
-"""What is said of an optimum: marginal covariances, a certificate."""

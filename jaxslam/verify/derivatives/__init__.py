@@ -1,1 +1,0 @@
-"""Derivatives of a function: computed in several ways, and where they fail."""
