@@ -114,7 +114,7 @@ _SLANT = np.deg2rad(10.0)
 """Least angle between a beam and a wall on which neighbouring beams count as connected."""
 _SPLIT = 4.0
 """[σ] from a chord to a point at which a run of points is divided."""
-_SAME = chi2_quantile(0.999, 2)
+_SAME = -2 * np.log(0.001)  # the 99.9 % quantile of χ² with two degrees of freedom
 
 
 class Segments(NamedTuple):

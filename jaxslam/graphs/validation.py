@@ -5,9 +5,8 @@ from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
+import scipy  # its parts load where they are used
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from jaxslam.core.numbers import is_concrete
 from jaxslam.graphs.factor import Factor
@@ -81,8 +80,10 @@ def _parts_of(graph: Graph, factors: Mapping[str, Factor]) -> Parts:
         if factors[key].variables == ("pose",):
             held[who[:, 0]] = True
     first, second = np.concatenate(pairs).T
-    joined = coo_array((np.ones(len(first)), (first, second)), shape=(poses + points,) * 2)
-    count, part = connected_components(joined, directed=False)
+    joined = scipy.sparse.coo_array(
+        (np.ones(len(first)), (first, second)), shape=(poses + points,) * 2
+    )
+    count, part = scipy.sparse.csgraph.connected_components(joined, directed=False)
     anchored = np.bincount(part[:poses], held, minlength=count) > 0
     fixed = np.bincount(part[poses:], np.asarray(graph.fixed_point), minlength=count)
     loose = np.concatenate([~np.asarray(graph.fixed_pose), ~np.asarray(graph.fixed_point)])

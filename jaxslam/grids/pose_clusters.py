@@ -7,11 +7,10 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy  # its parts load where they are used
 from jax import Array
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from jaxslam.filters.particles.pose_particles import weighted_pose_moments
 
@@ -100,6 +99,8 @@ def _connected(cells: Int[np.ndarray, "C 3"], turns: int) -> Int[np.ndarray, "C"
         if (near := index.get((x + i, y + j, (h + t) % turns))) is not None
     ]
     rows, columns = np.array(pairs).T
-    table = coo_array((np.ones(len(pairs), bool), (rows, columns)), shape=(len(cells), len(cells)))
-    group: np.ndarray = connected_components(table, directed=False)[1]
+    table = scipy.sparse.coo_array(
+        (np.ones(len(pairs), bool), (rows, columns)), shape=(len(cells), len(cells))
+    )
+    group: np.ndarray = scipy.sparse.csgraph.connected_components(table, directed=False)[1]
     return group

@@ -6,7 +6,7 @@ longer than importing jaxslam.
 """
 
 import numpy as np
-import scipy.special
+import scipy  # its parts load where they are used
 
 
 def chi2_quantile(p: float, dof: float) -> float:

@@ -8,10 +8,9 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+import scipy  # its parts load where they are used
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
-from scipy.sparse import csr_matrix
-from scipy.sparse.csgraph import dijkstra
 
 from jaxslam.grids import Grid, centers
 from jaxslam.topology.voronoi import Skeleton, skeleton
@@ -128,7 +127,7 @@ def _labelled(
     free = away > 0
     weights = neighbours(free.reshape(shape))
     size = float(np.asarray(grid.resolution))
-    _, _, source = dijkstra(
+    _, _, source = scipy.sparse.csgraph.dijkstra(
         weights, directed=False, indices=starts, min_only=True, return_predecessors=True
     )
     place = np.full(len(away), -1)
@@ -162,7 +161,7 @@ def cell_centers(grid: Grid) -> Float[np.ndarray, "n 2"]:
     return np.asarray(_centers(grid), np.float64).reshape(-1, 2)
 
 
-def neighbours(cells: Bool[np.ndarray, "H W"]) -> csr_matrix:
+def neighbours(cells: Bool[np.ndarray, "H W"]) -> "scipy.sparse.csr_matrix":
     """The graph of cells and their eight neighbours among them, weighted by distance in cells."""
     height, width = cells.shape
     index = np.arange(height * width).reshape(height, width)
@@ -175,7 +174,7 @@ def neighbours(cells: Bool[np.ndarray, "H W"]) -> csr_matrix:
         columns.append(there[both])
         weights.append(np.full(int(both.sum()), np.hypot(i, j)))
     pairs = np.concatenate(rows), np.concatenate(columns)
-    return csr_matrix((np.concatenate(weights), pairs), shape=(height * width,) * 2)
+    return scipy.sparse.csr_matrix((np.concatenate(weights), pairs), shape=(height * width,) * 2)
 
 
 class PathPlaces(NamedTuple):

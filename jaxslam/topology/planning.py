@@ -4,9 +4,9 @@ from typing import NamedTuple
 
 import jax
 import numpy as np
+import scipy  # its parts load where they are used
 from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
-from scipy.sparse.csgraph import dijkstra
 
 from jaxslam.grids import to_cells
 from jaxslam.topology.places import TopologicalMap, cell_centers, neighbours
@@ -48,7 +48,9 @@ def route(places: TopologicalMap, start: ArrayLike, goal: ArrayLike) -> Route:
         own = np.flatnonzero(cells & (places.label.reshape(-1) == label))
         at.append(int(own[np.argmin(((where[own] - end) ** 2).sum(axis=1))]))
     graph = neighbours(places.skeleton.cells)
-    distance, before = dijkstra(graph, directed=False, indices=at[0], return_predecessors=True)
+    distance, before = scipy.sparse.csgraph.dijkstra(
+        graph, directed=False, indices=at[0], return_predecessors=True
+    )
     if not np.isfinite(distance[at[1]]):
         raise ValueError(f"route: no way leads from place {labels[0]} to place {labels[1]}")
     way = [at[1]]

@@ -14,7 +14,7 @@ only delays this. For consistency take `whole_marginals`.
 import jax
 import jax.numpy as jnp
 import numpy as np
-import scipy.sparse
+import scipy  # its parts load where they are used
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
@@ -152,7 +152,7 @@ def whole_marginals(state: SparseState) -> tuple[Float[Array, "3 3"], Float[Arra
     return cov[:3, :3], points
 
 
-def whole_information(state: SparseState) -> scipy.sparse.csc_array:
+def whole_information(state: SparseState) -> "scipy.sparse.csc_array":
     """The whole Ω (3 + 2N, 3 + 2N), of robot and all N landmarks; not traceable."""
     active = np.asarray(state.active)
     n, index = len(state.alive), np.flatnonzero(active < len(state.alive))

@@ -9,9 +9,8 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+import scipy  # its parts load where they are used
 from jaxtyping import Int
-from scipy.sparse import coo_matrix, diags_array
-from scipy.sparse.linalg import splu
 
 
 def _minimum_degree(
@@ -23,11 +22,11 @@ def _minimum_degree(
     multiple elimination", ACM TOMS 11(2)) on the pattern of A + Aᵀ. SciPy gives it only with a
     factorization, here of a diagonally dominant matrix with one number a block.
     """
-    links = coo_matrix((-np.ones(len(first)), (first, second)), (size, size))
+    links = scipy.sparse.coo_matrix((-np.ones(len(first)), (first, second)), (size, size))
     links = links + links.T
-    dominant = diags_array(1.0 + np.asarray(abs(links).sum(axis=0)).ravel()) + links
+    dominant = scipy.sparse.diags_array(1.0 + np.asarray(abs(links).sum(axis=0)).ravel()) + links
     options = {"SymmetricMode": True}
-    factors = splu(
+    factors = scipy.sparse.linalg.splu(
         dominant.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options
     )
     return np.argsort(factors.perm_c)

@@ -1,9 +1,8 @@
 """The chordal start: headings from a linear relaxation, then positions."""
 
 import numpy as np
+import scipy  # its parts load where they are used
 from jaxtyping import Bool, Float
-from scipy.sparse import coo_array, csc_array
-from scipy.sparse.linalg import splu
 
 from jaxslam.graphs.graph import Graph, Table
 from jaxslam.graphs.starts.relative import (
@@ -49,7 +48,7 @@ def _headings(
     i, j, rows = relative.first, relative.second, np.arange(len(relative.first))
     root = np.sqrt(np.maximum(relative.information[:, 2, 2], 0.0))
     turn = np.exp(1j * relative.pose[:, 2])
-    system = coo_array(
+    system = scipy.sparse.coo_array(
         (np.concatenate([root, -root * turn]), (np.tile(rows, 2), np.concatenate([j, i]))),
         shape=(len(rows), len(anchors)),
     ).tocsc()
@@ -83,7 +82,7 @@ def _positions(
         np.broadcast_to(2 * end[:, None, None] + np.arange(2)[None, None], turn.shape)
         for end in (second, first)
     ]
-    system = coo_array(
+    system = scipy.sparse.coo_array(
         (
             np.concatenate([turn.ravel(), -turn.ravel()]),
             (np.tile(rows.ravel(), 2), np.concatenate([part.ravel() for part in columns])),
@@ -91,7 +90,7 @@ def _positions(
         shape=(2 * len(first), 2 * len(held)),
     ).tocsc()
     within = [np.broadcast_to(axis, information.shape) for axis in (rows, np.swapaxes(rows, 1, 2))]
-    weight = coo_array(
+    weight = scipy.sparse.coo_array(
         (information.ravel(), tuple(part.ravel() for part in within)), shape=(2 * len(first),) * 2
     ).tocsc()
     of_free = np.repeat(free, 2)
@@ -132,17 +131,17 @@ def _rotations(angles: Float[np.ndarray, "E"]) -> Float[np.ndarray, "E 2 2"]:
     return np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
 
 
-def _least_squares(a: csc_array, b: np.ndarray) -> np.ndarray:
+def _least_squares(a: "scipy.sparse.csc_array", b: np.ndarray) -> np.ndarray:
     """The x that minimizes |a x - b|²."""
     return _solve(a.conj().T @ a, a.conj().T @ b)
 
 
-def _solve(matrix: csc_array, right: np.ndarray) -> np.ndarray:
+def _solve(matrix: "scipy.sparse.csc_array", right: np.ndarray) -> np.ndarray:
     """The solution matrix⁻¹ right of a sparse positive definite matrix."""
     if matrix.shape[0] == 0:
         return np.zeros(0)
     try:
-        factor = splu(
+        factor = scipy.sparse.linalg.splu(
             matrix.tocsc(),
             permc_spec="MMD_AT_PLUS_A",
             diag_pivot_thresh=0.0,

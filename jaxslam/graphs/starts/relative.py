@@ -7,9 +7,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import scipy  # its parts load where they are used
 from jaxtyping import Bool, Float, Int
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from jaxslam.graphs.factor import BetweenPoses, Factor
 from jaxslam.graphs.graph import Graph, ranks
@@ -94,10 +93,10 @@ def anchors_of(
     poses = np.array(graph.poses, np.float64)
     anchors = np.asarray(graph.fixed_pose).copy()
     count, lowest = len(poses), np.argmin(graph.pose_id) if len(poses) else 0
-    joined = coo_array(
+    joined = scipy.sparse.coo_array(
         (np.ones(len(relative.first)), (relative.first, relative.second)), shape=(count, count)
     )
-    parts, part = connected_components(joined, directed=False)
+    parts, part = scipy.sparse.csgraph.connected_components(joined, directed=False)
     held = np.bincount(part, anchors, minlength=parts) > 0
     if "prior" in graph.tables:
         table = graph.tables["prior"]

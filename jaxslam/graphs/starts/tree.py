@@ -6,8 +6,7 @@ And the robust start: the odometry, drawn by the loops that agree with it.
 import math
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import breadth_first_order, minimum_spanning_tree
+import scipy  # its parts load where they are used
 
 from jaxslam.graphs.graph import TRUSTED, Graph, ranks, with_loops_apart
 from jaxslam.graphs.optimizer import optimize
@@ -67,10 +66,10 @@ def _along_a_tree(name: str, graph: Graph, relative: Relative, nearest: bool) ->
     cost = np.ones(len(ends[0]))
     if nearest:
         cost[: len(first)] += np.abs(second - first)
-    tree = coo_array((cost[at], tuple(edges.T)), shape=(count + 1, count + 1)).tocsr()
+    tree = scipy.sparse.coo_array((cost[at], tuple(edges.T)), shape=(count + 1, count + 1)).tocsr()
     if nearest:
-        tree = minimum_spanning_tree(tree)
-    order, before = breadth_first_order(tree, count, directed=False)
+        tree = scipy.sparse.csgraph.minimum_spanning_tree(tree)
+    order, before = scipy.sparse.csgraph.breadth_first_order(tree, count, directed=False)
     row_of = {(int(i), int(j)): int(row) for (i, j), row in zip(edges, at, strict=True)}
     rows = relative.pose.tolist()
     placed = poses.tolist()
