@@ -6,9 +6,9 @@ from collections.abc import Collection, Mapping
 from pathlib import Path
 from typing import TypeVar
 
+from jaxslam.consistency.measures.counts import count_label
 from jaxslam.results.campaign_files import RESULT
 from jaxslam.results.files import check_writable
-from jaxslam.results.meanings import count_label
 from jaxslam.validation.names import meant
 
 _T = TypeVar("_T")

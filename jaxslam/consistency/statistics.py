@@ -3,13 +3,15 @@
 Compiled and called by `monte_carlo.programs`; `score` takes what it returns.
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxslam.consistency.associations import associations, identities
+from jaxslam.consistency.measures.associations import associations, identities
+from jaxslam.consistency.measures.measure import Measure, RunStatistics
 from jaxslam.math import linalg
 from jaxslam.protocols import Sensor
 from jaxslam.types import Estimate, Info, Status, Trace, Truth
@@ -21,26 +23,6 @@ _UNROLLED = 4
 """Measurement slots that are looked at in one piece of compiled code."""
 
 
-class RunStatistics(NamedTuple):
-    """The sums over the steps of one run; with a leading axis, of many."""
-
-    finite: Bool[Array, ""]
-    """every number of its estimates and infos is finite."""
-    landmark_nees: Float[Array, "T"]
-    """summed over the landmarks of the map."""
-    regular_landmarks: Float[Array, "T"]
-    """how many of them have a NEES."""
-    landmark_squares: Float[Array, "2"]
-    """of the final map, unaligned: Σ |p̂ - p|² [m²], and over how many landmarks that is; 0 of a map
-    that is known, without covariances."""
-    autocorrelation: Float[Array, "LAGS 3"]
-    """of whitened innovations: Σ w_tᵀ w_{t+l}, √(Σ|w_t|² Σ|w_{t+l}|²), and how many
-    products of numbers that is. Of the same landmark at t and t + l, w = L⁻¹ν with S = L Lᵀ;
-    without a map, of one measurement slot."""
-    associations: dict[str, tuple[Array, Array]]
-    """of a world of spurious data; see `associations.associations`."""
-
-
 class _Sums(NamedTuple):
     poison: Array
     """() 0 times every number so far: NaN once one was not finite"""
@@ -50,8 +32,14 @@ class _Sums(NamedTuple):
     """(LAGS, N) each: Σ wᵀw', |w|²|there'|, |there||w'|², |there||there'|"""
 
 
-def run_statistics(trace: Trace, truth: Truth, sensor: Sensor) -> RunStatistics:
-    """The sums over one run that `score` is made of. For `vmap`, over runs."""
+def run_statistics(
+    trace: Trace, truth: Truth, sensor: Sensor, measures: Sequence[Measure] = ()
+) -> RunStatistics:
+    """The sums over one run that `score` is made of. For `vmap`, over runs.
+
+    measures: those with `of_run` are taken, too. Raises ValueError on one that returns neither a
+    number nor one a step.
+    """
     estimate, info = trace.estimate, trace.info
     held = jnp.where(estimate.alive, estimate.tag, -1)
     found: dict[str, tuple[Array, Array]] = {}
@@ -109,7 +97,23 @@ def run_statistics(trace: Trace, truth: Truth, sensor: Sensor) -> RunStatistics:
         landmark_squares=jnp.stack([square, named.sum().astype(dtype)]),
         autocorrelation=jnp.stack([product, length, pairs * size], axis=1),
         associations=found,
+        values={
+            each.key: _value(each, trace, truth) for each in measures if each.of_run is not None
+        },
     )
+
+
+def _value(measure: Measure, trace: Trace, truth: Truth) -> Array:
+    """What a measure is in one run, () or (T,)."""
+    assert measure.of_run is not None
+    dtype, steps = trace.estimate.pose.dtype, len(trace.estimate.pose)
+    value = jnp.asarray(measure.of_run(truth, trace), dtype)
+    if value.shape not in ((), (steps,)):
+        raise ValueError(
+            f"measure {measure.key}: expected of_run to return a number or one for each of the "
+            f"{steps} steps, got an array of shape {value.shape}"
+        )
+    return value
 
 
 def _numbers(tree: PyTree) -> Float[Array, "K"]:

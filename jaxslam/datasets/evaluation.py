@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam import metrics
-from jaxslam.consistency.nees import block_nees, pose_error
+from jaxslam.consistency.measures.nees import block_nees, pose_error
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.map_test import MapTest, judge_map
 from jaxslam.types import Estimate

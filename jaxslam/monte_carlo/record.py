@@ -115,9 +115,9 @@ class Campaign:
             raise ImportError(
                 "Campaign.to_dataframe needs pandas, which is not installed: pip install pandas"
             ) from None
-        from jaxslam.results import run_table
+        from jaxslam.results import report
 
-        return pandas.DataFrame(run_table.columns(self))
+        return pandas.DataFrame(report.run_columns(self))
 
     def save_runs(self, path: str | Path) -> Path:
         """Write the table of `to_dataframe` to a file, and return its path; it is replaced.
@@ -128,9 +128,9 @@ class Campaign:
             ValueError: on another ending.
             OSError: if the folder cannot be written.
         """
-        from jaxslam.results import run_table
+        from jaxslam.results import report
 
-        return run_table.save_table(self, path)
+        return report.save_runs(self, path)
 
 
 class Interrupted(KeyboardInterrupt):

@@ -99,7 +99,6 @@ def save_campaign(
     files: dict[str, str | Callable[[Path], object]] = {
         PAGE: page.page(
             campaign,
-            report.ROWS,
             command,
             seed,
             versions(),
@@ -176,7 +175,7 @@ def notebook(campaign: Campaign) -> str:
     drawings = _drawings(campaign, None)
     shown = ((name, *drawings[name]) for name in _IN_NOTEBOOK)
     figures = {name: (caption, make()) for name, caption, make in shown}
-    return page.fragment(campaign, report.ROWS, figures, partial(plot.png, dpi=110))
+    return page.fragment(campaign, figures, partial(plot.png, dpi=110))
 
 
 def _drawings(

@@ -13,7 +13,7 @@ import pytest
 from test_page import EVIL, GOOD, RUNS, STEPS, Reader, campaign, summary
 
 from jaxslam import plot, report
-from jaxslam.consistency import Measure
+from jaxslam.consistency import Average
 from jaxslam.results import campaign_files
 from jaxslam.types import Estimate, Truth
 
@@ -36,7 +36,7 @@ def run_zero():
 def found():
     per_run = {"nees_pose": np.arange(3.0), "square_position": np.ones(3)}
     good = dataclasses.replace(summary("consistent", GOOD), per_run=per_run)
-    mapping = summary("optimistic", {"rmse_landmarks": Measure(1.0, 0.9, 1.1)})
+    mapping = summary("optimistic", {"rmse_landmarks": Average(1.0, 0.9, 1.1)})
     other = dataclasses.replace(
         mapping, per_run={"nees_pose": np.array([5.0, np.nan, 7.0])}, not_finite_runs=[4]
     )

@@ -17,8 +17,8 @@ import numpy as np
 import pytest
 from test_page import EVIL, GOOD, campaign, summary
 
-from jaxslam import plot, report
-from jaxslam.consistency import Measure
+from jaxslam import plot
+from jaxslam.consistency import Average
 from jaxslam.results.page import page
 
 STEPS = 40
@@ -58,7 +58,7 @@ def html():
     for i, (name, verdict) in enumerate(
         (("good", "consistent"), (EVIL, "optimistic"), ("lost", "diverged"))
     ):
-        base = summary(verdict, GOOD | {"nees_pose": Measure((4.0, 9.0, 2.0)[i], 1.0, 20.0)})
+        base = summary(verdict, GOOD | {"nees_pose": Average((4.0, 9.0, 2.0)[i], 1.0, 20.0)})
         curves = {key: np.resize(curve, STEPS) for key, curve in base.curves.items()}
         curves |= {"nees_pose": 3 + i * step / 10, "rmse_position": 1.0 * step}
         if i == 2:
@@ -70,7 +70,7 @@ def html():
         "rmse": ("RMSE", plot.rmse_figure(world)),
         "cost": ("Cost", plot.cost_figure(world)),
     }
-    return page(world, report.ROWS, f"jaxslam {EVIL}", 1, {}, figures)
+    return page(world, f"jaxslam {EVIL}", 1, {}, figures)
 
 
 def browse(html, tmp_path, script="", flags=("--dump-dom",), width=1400):

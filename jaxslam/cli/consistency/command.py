@@ -25,7 +25,7 @@ from jaxslam.core.numbers import check_count
 from jaxslam.monte_carlo import Interrupted, monte_carlo
 from jaxslam.monte_carlo.candidates import estimator_of, fitting_block, rounded
 from jaxslam.protocols import Candidate
-from jaxslam.results import campaign_files, run_table, store
+from jaxslam.results import campaign_files, report, store
 from jaxslam.simulation.worlds import World, run_keys, world_of_run
 from jaxslam.types import Estimate, Truth
 
@@ -38,9 +38,9 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     # Worlds are drawn in float64 whatever the filters compute in, so both precisions see the same.
     jax.config.update("jax_enable_x64", True)
     formats = campaign_files.check_figure_formats("--figures", options.figures.split(","))
-    there = [kind for kind in run_table.FORMATS if (out / f"runs.{kind}").exists()]  # up to date
+    there = [kind for kind in report.RUN_FORMATS if (out / f"runs.{kind}").exists()]  # up to date
     asked_for = filter(None, options.table.split(","))
-    tables = run_table.check_table_formats("--table", [*asked_for, *there])
+    tables = report.check_run_formats("--table", [*asked_for, *there])
     if asked.steps is not None:
         check_count("--steps", asked.steps)
     files = UserObjects()

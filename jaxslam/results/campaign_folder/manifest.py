@@ -12,7 +12,7 @@ from jaxslam.results.campaign_folder.block_file import (
 )
 from jaxslam.results.files import Json
 
-FORMAT = 2
+FORMAT = 3
 """Format of the folder, written in its manifest; others are refused."""
 
 MANIFEST = "manifest.json"

@@ -5,7 +5,7 @@ draws the figures that have curves again, to be explored, from the numbers of `c
 and without JavaScript the page shows the static figures.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from html import escape
 
 from jaxslam.consistency import DOF, LEVEL
@@ -15,14 +15,16 @@ from jaxslam.results.page import curves
 from jaxslam.results.page.parts import (
     VERDICTS,
     badge,
+    duration,
     embedded_figure,
     lost_runs,
     measure_notes,
     measures_table,
+    percentage,
     verdict_list,
+    with_noun,
 )
 from jaxslam.results.page.style import CSS, FRAGMENT_CSS, SCRIPT, policy
-from jaxslam.results.page.text import duration, percentage, with_noun
 from jaxslam.results.plot import Figure, png
 
 __all__ = ["VERDICTS", "fragment", "page"]
@@ -33,7 +35,6 @@ _UPRIGHT = 5
 
 def page(
     campaign: Campaign,
-    table: Sequence[tuple[str, str, str]],
     command: str,
     seed: int | None,
     versions: Mapping[str, str],
@@ -45,8 +46,6 @@ def page(
 
     Args:
         campaign: the campaign.
-        table: the rows, each (key of `Summary.measures`, label, value of a consistent filter); a
-            label that starts with a space is indented. Rows that no filter has are left out.
         command, seed: those of the campaign; None where there was no seed.
         versions: of the software, by name.
         figures: in order, by name, each with its caption. Those of the names of `curves.py` are
@@ -75,7 +74,7 @@ same draws.</p>
 </section>
 <section{' class="broad"' if len(campaign.filters) > _UPRIGHT else ""}>
 <h2>Measures</h2>
-{measures_table(campaign, table)}
+{measures_table(campaign)}
 {measure_notes(campaign)}
 {lost_runs(campaign)}
 </section>
@@ -96,7 +95,6 @@ same draws.</p>
 
 def fragment(
     campaign: Campaign,
-    table: Sequence[tuple[str, str, str]],
     figures: Mapping[str, tuple[str, Figure]],
     draw: Callable[[Figure], bytes] = png,
 ) -> str:
@@ -113,7 +111,7 @@ def fragment(
 </ul>
 {_figures(figures, draw)}
 <details><summary>All measures</summary>
-{measures_table(campaign, table)}
+{measures_table(campaign)}
 {measure_notes(campaign)}
 </details>
 {lost_runs(campaign)}

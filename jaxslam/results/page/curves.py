@@ -12,6 +12,8 @@ import numpy as np
 from jaxtyping import Float
 
 from jaxslam.consistency import DOF, LEVELS
+from jaxslam.consistency.measures import Measure, in_figure
+from jaxslam.consistency.measures.errors import bound_curve
 from jaxslam.monte_carlo import Campaign
 from jaxslam.results.files import Json
 from jaxslam.results.plot.campaigns.layout import numbers_of
@@ -45,34 +47,11 @@ def embedded_curves(campaign: Campaign) -> Curves:
     make = _Panels(campaign, each)
     lags = [*range(1, len(next(iter(campaign.filters.values())).autocorrelation) + 1)]
     charts = [
-        _chart(
-            "nees",
-            "step",
-            [
-                make.panel(
-                    f"{block} NEES (dof {dof})", "log", f"nees_{block}", reference=("honest", dof)
-                )
-                for block, dof in DOF.items()
-            ]
-            + [make.panel("NIS / dof", "log", "nis_per_dof", reference=("honest", 1))],
-        ),
-        _chart(
-            "rmse",
-            "step",
-            [
-                make.panel("position RMSE [m]", "zero", "rmse_position", bound="bound_position"),
-                make.panel(
-                    "heading RMSE [°]", "zero", "rmse_heading_deg", bound="bound_heading_deg"
-                ),
-            ],
-        ),
+        _chart("nees", "step", [make.panel(one, "log") for one in in_figure("nees")]),
+        _chart("rmse", "step", [make.panel(one, "zero") for one in in_figure("rmse")]),
         _chart("coverage", "probability p", [make.coverage(block) for block in DOF], beside=True),
         _chart("whiteness", "lag [steps]", [make.whiteness(lags)]),
-        _chart(
-            "gained",
-            "step",
-            [make.panel("information [1/rad²]", "floor", "rotation_information")],
-        ),
+        _chart("gained", "step", [make.panel(one, "floor") for one in in_figure("gained")]),
     ]
     numbers = numbers_of(list(campaign.filters))
     content = {
@@ -98,15 +77,9 @@ class _Panels:
         self.campaign, self.each = campaign, each
         self.summaries = list(campaign.filters.values())
 
-    def panel(
-        self,
-        title: str,
-        scale: str,
-        key: str,
-        reference: tuple[str, float] | None = None,
-        bound: str = "",
-    ) -> Json | None:
-        """A panel over the steps, or None where no filter has such a curve."""
+    def panel(self, measure: Measure, scale: str) -> Json | None:
+        """The panel of a measure over the steps, or None where no filter has such a curve."""
+        key, bound = measure.key, bound_curve(measure)
         found = [s.curves.get(key) for s in self.summaries]
         values = [None if curve is None else self._thinned(curve) for curve in found]
         if all(value is None for value in values):
@@ -129,14 +102,14 @@ class _Panels:
                 "label": "conditional Cramér-Rao bound",
                 "values": self._thinned(bounds[0]),
             }
-        elif reference:
-            line = {"label": reference[0], "values": reference[1]}
+        elif measure.honest:
+            line = {"label": "honest", "values": measure.honest}
         return out | {
-            "title": title,
+            "title": measure.axis,
             "scale": scale,
             "values": values,
             "reference": line,
-            "honest": reference[1] if reference else None,
+            "honest": measure.honest or None,
             "floor": _NOTHING,
         }
 

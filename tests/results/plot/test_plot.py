@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgb
 
 from jaxslam import plot
 from jaxslam.catalog import ALL, KINDS
-from jaxslam.consistency import DOF, LAGS, LEVELS, Measure
+from jaxslam.consistency import DOF, LAGS, LEVELS, Average
 from jaxslam.results.page.curves import embedded_curves
 from jaxslam.results.page.style import CSS
 from jaxslam.results.plot.campaigns.cost import INTERVAL
@@ -283,12 +283,12 @@ def test_points_of_cost_stay_off_the_frame(five):
 def test_intervals_of_cost_set_the_scale_and_have_an_arrow_where_they_leave_it(names):
     found = drawn.campaign(names)
     measures = {
-        "dead_reckoning": Measure(1.0, 0.3, 4.0),
-        "ekf": Measure(0.5, 0.4, np.inf),
-        "fej": Measure(0.5, 1e-4, 2.0),
+        "dead_reckoning": Average(1.0, 0.3, 4.0),
+        "ekf": Average(0.5, 0.4, np.inf),
+        "fej": Average(0.5, 1e-4, 2.0),
     }
     for name, s in found.filters.items():
-        s.measures["rmse_position"] = measures.get(name, Measure(0.5, 0.4, 0.6))
+        s.measures["rmse_position"] = measures.get(name, Average(0.5, 0.4, 0.6))
     figure = plot.cost_figure(found)
     axes = figure.axes[1 if len(names) > 5 else 0]
     along = 0 if len(names) > 5 else 1

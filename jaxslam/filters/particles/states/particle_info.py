@@ -29,3 +29,9 @@ class ParticleInfo(NamedTuple):
     blocked: Int[Array, "*T"] | None = None
     """particles in use that are off the map or in an occupied cell, of a filter in a grid; they
     have weight zero"""
+
+    def counts(self) -> dict[str, Array]:
+        """What a campaign counts: of the fields that the filter has."""
+        names = ("resampled", "underflow", "invalid", "injected", "capped")
+        events = {name: getattr(self, name) for name in names}
+        return {name: happened for name, happened in events.items() if happened is not None}

@@ -4,7 +4,8 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxslam.consistency import DOF, Measure
+from jaxslam.consistency import DOF, Average
+from jaxslam.consistency.measures import REGISTRY
 from jaxslam.monte_carlo import Campaign
 from jaxslam.results.plot.campaigns.layout import TOGETHER, head, kinds_of, numbers_of, runs_of
 from jaxslam.results.plot.campaigns.scale import mark_beyond, power, set_positive
@@ -25,9 +26,9 @@ from jaxslam.validation import check_record
 
 _ERROR, _NEES = "rmse_position", "nees_pose"
 
-_LABELS = {_ERROR: "position RMSE [m]", _NEES: f"pose NEES (dof {DOF['pose']})"}
+_LABELS = {key: REGISTRY[key].axis for key in (_ERROR, _NEES)}
 
-_NONE = Measure(np.nan, np.nan, np.nan)
+_NONE = Average(np.nan, np.nan, np.nan)
 
 _CAP = 100.0
 """The scale of the NEES ends at so many times dof."""
@@ -90,7 +91,7 @@ def _listed(campaign: Campaign, times: dict[str, float], width: float) -> Figure
         middle.append(at + (len(members) - 1) / 2)
         for name in members:
             i, measures = numbers[name], campaign.filters[name].measures
-            _point(panels[0], i, at, name, Measure(times[name], np.nan, np.nan))
+            _point(panels[0], i, at, name, Average(times[name], np.nan, np.nan))
             for axes, key in zip(panels[1:], _LABELS, strict=True):
                 _point(axes, i, at, name, measures.get(key, _NONE))
             names.append(plain(name))
@@ -112,7 +113,7 @@ def _listed(campaign: Campaign, times: dict[str, float], width: float) -> Figure
     return figure
 
 
-def _point(axes: Axes, i: int, at: float, name: str, measure: Measure) -> None:
+def _point(axes: Axes, i: int, at: float, name: str, measure: Average) -> None:
     """Draw a measure with its interval at a height; beyond the scale a triangle with its value."""
     value = measure.value
     if not np.isfinite(value):
@@ -138,7 +139,7 @@ def _point(axes: Axes, i: int, at: float, name: str, measure: Measure) -> None:
     axes.plot(value, at, ms=5.0, label=plain(name), **mark)
 
 
-def _interval(axes: Axes, at: float, measure: Measure, color: str, which: str) -> None:
+def _interval(axes: Axes, at: float, measure: Average, color: str, which: str) -> None:
     """Draw the interval of a measure along an axis (x or y); an arrow where it leaves the scale."""
     if not np.isfinite([at, measure.value, measure.low]).all():
         return

@@ -1,7 +1,57 @@
 """The noncredibility of Li & Zhao: how far a claimed covariance is from the actual one."""
 
+from dataclasses import dataclass
+
 import numpy as np
 from jaxtyping import Bool, Float
+
+from jaxslam.consistency.measures.measure import Measure
+
+
+@dataclass(frozen=True, eq=False)
+class Credibility(Measure):
+    """One of the two numbers of `credibility`."""
+
+    part: int = 0
+
+    def of_snapshots(
+        self,
+        errors: Float[np.ndarray, "R K 3"],
+        covs: Float[np.ndarray, "R K 3 3"],
+        regular: Bool[np.ndarray, "R K"],
+    ) -> Float[np.ndarray, "R"] | None:
+        """It of each run, by the actual covariance of all."""
+        found = credibility(errors, covs, regular)
+        return None if found is None else found[self.part]
+
+
+MEASURES = (
+    Credibility(
+        "noncredibility",
+        "noncredibility",
+        part=0,
+        unit="dB",
+        honest=0,
+        positive=True,
+        note=(
+            "noncredibility",
+            "mean of 10 |log10 ρ|, with ρ the NEES over that by the actual covariance of the "
+            "errors; a covariance wrong by a factor of 2 has 3 dB",
+        ),
+    ),
+    Credibility(
+        "inclination",
+        "inclination",
+        part=1,
+        unit="dB",
+        honest=0,
+        note=(
+            "inclination",
+            "mean of 10 log10 ρ; above 0 where covariances are claimed too small, below 0 where "
+            "too large",
+        ),
+    ),
+)
 
 
 def credibility(

@@ -1,14 +1,18 @@
-"""The NEES eᵀ P⁻¹ e of a pose and of its blocks, e = truth - estimate, in (x, y, θ) and in the
-filter's own error coordinates; on the host, by NumPy in float64.
+"""NEES: eᵀ P⁻¹ e of a pose and of its blocks, e = truth - estimate, in (x, y, θ) and in the
+filter's own error coordinates; on the host, by NumPy in float64. And of landmarks.
 """
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
+from jaxslam.consistency.intervals import LEVEL
+from jaxslam.consistency.measures.measure import Measure, Nees, Runs, RunScores, Sums, ratio
+from jaxslam.math.stats import chi2_quantiles
 from jaxslam.protocols import Chart, Sensor
 from jaxslam.types import Trace, Truth
 
@@ -19,13 +23,84 @@ ROUNDING = 32
 """A claimed deviation of at most so many ulp of its coordinate is taken for zero."""
 
 
-class Nees(NamedTuple):
-    """The NEES of one block of the pose error, at each step."""
+@dataclass(frozen=True, eq=False)
+class NeesMeasure(Measure):
+    """The NEES of a block of `Runs.nees`. That of a pose block has a curve with a band."""
 
-    value: Float[np.ndarray, "..."]
-    """0 where there is none."""
-    regular: Bool[np.ndarray, "..."]
-    """whether there is one"""
+    block: str = ""
+
+    def of_runs(self, runs: Runs) -> RunScores:
+        """Its sum over the steps with a regular covariance."""
+        value, regular = runs.nees[self.block]
+        sums = {}
+        if self.block in DOF:
+            sums = {
+                f"nees_{self.block}": value,
+                f"regular_{self.block}": regular.astype(np.float64),
+            }
+        return RunScores(value.sum(axis=1), regular.sum(axis=1), sums)
+
+    def curves(self, sums: Sums, runs: int) -> dict[str, np.ndarray]:
+        """The average NEES, its 95 % band, and over how many runs it is."""
+        if self.block not in DOF:
+            return {}
+        count = sums[f"regular_{self.block}"]
+        low, high = _bands(count, DOF[self.block])
+        return {
+            self.key: ratio(sums[self.key], count),
+            f"{self.key}_low": low,
+            f"{self.key}_high": high,
+            f"runs_{self.block}": count,
+        }
+
+
+MEASURES = (
+    NeesMeasure(
+        "nees_pose",
+        "pose NEES (x, y, θ)",
+        block="pose",
+        honest=DOF["pose"],
+        positive=True,
+        figure="nees",
+        axis=f"pose NEES (dof {DOF['pose']})",
+    ),
+    NeesMeasure(
+        "nees_own", "pose NEES, in its chart", block="own", honest=DOF["pose"], positive=True
+    ),
+    *(
+        NeesMeasure(
+            f"nees_{block}",
+            f"{block} NEES",
+            block=block,
+            honest=DOF[block],
+            positive=True,
+            figure="nees",
+            axis=f"{block} NEES (dof {DOF[block]})",
+        )
+        for block in ("position", "heading")
+    ),
+    NeesMeasure("nees_landmarks", "landmark NEES", block="landmarks", honest=2, positive=True),
+)
+
+
+def inside_bands(curves: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """The share of the steps whose average NEES lies in its band, by block."""
+    found = {}
+    for block in DOF:
+        mean, has = curves[f"nees_{block}"], curves[f"runs_{block}"] > 0
+        if has.any():
+            low, high = curves[f"nees_{block}_low"], curves[f"nees_{block}_high"]
+            found[block] = float(np.mean((mean >= low)[has] & (mean <= high)[has]))
+    return found
+
+
+def _bands(count: np.ndarray, dof: int) -> tuple[np.ndarray, np.ndarray]:
+    """Two-sided chi-square band of the mean of count χ²_dof variables, step by step."""
+    tail = (1 - LEVEL) / 2
+    safe = np.maximum(count, 1)
+    edges = [chi2_quantiles(p, dof * safe) / safe for p in (tail, 1 - tail)]
+    low, high = (np.where(count > 0, edge, np.nan) for edge in edges)
+    return low, high
 
 
 def pose_error(
