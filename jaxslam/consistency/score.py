@@ -1,7 +1,8 @@
-"""`score` returns what each run says of a filter, the numbers that a campaign adds up or keeps.
+"""The scores of runs: what each run says of a filter, the numbers a campaign adds up or keeps.
 
-Called by `monte_carlo.block` on the results of a block of runs; `tally.condense` takes what
-it returns.
+`run_statistics` takes sums over one run's maps and innovations, in JAX; `monte_carlo.programs`
+compiles it. `score` takes them, and the poses and infos of many runs, to the measures of each run;
+`tally.condense` takes what that returns.
 
 A run's error is compared with the covariance the filter claims for it. With e = truth - estimate,
 heading wrapped, NEES = eᵀ P⁻¹ e has mean dof for an honest filter; it is *not* divided by dof
@@ -10,17 +11,28 @@ anywhere here. While P is singular (a start with P0 = 0, or a deviation that is 
 (Bar-Shalom, Li, Kirubarajan 2001, 5.4; Bailey et al. 2006.)
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxslam.consistency.measures import REGISTRY
+from jaxslam.consistency.measures.associations import associations, identities
 from jaxslam.consistency.measures.counts import counted
-from jaxslam.consistency.measures.measure import Nees, Runs, RunStatistics
+from jaxslam.consistency.measures.measure import Measure, Nees, Runs, RunStatistics
 from jaxslam.consistency.measures.nees import block_nees, pose_error
-from jaxslam.types import Trace, Truth
+from jaxslam.math import linalg
+from jaxslam.protocols import Sensor
+from jaxslam.types import Estimate, Info, Status, Trace, Truth
+
+LAGS = 10
+"""The autocorrelation of innovations is taken up to so many steps."""
+
+_UNROLLED = 4
+"""Measurement slots that are looked at in one piece of compiled code."""
 
 SNAPSHOTS = 25
 """Steps of each run at which error and covariance are kept as they are."""
@@ -90,3 +102,150 @@ def score(
         snapshots=(error[:, at], cov[:, at], nees["pose"].regular[:, at]),
         sums=sums,
     )
+
+
+class _Sums(NamedTuple):
+    poison: Array
+    """() 0 times every number so far: NaN once one was not finite"""
+    recent: list[Array]
+    """(LAGS, N) each, the latest steps first: the numbers of w, |w|² and whether there is one"""
+    pairs: list[Array]
+    """(LAGS, N) each: Σ wᵀw', |w|²|there'|, |there||w'|², |there||there'|"""
+
+
+def run_statistics(
+    trace: Trace, truth: Truth, sensor: Sensor, measures: Sequence[Measure] = ()
+) -> RunStatistics:
+    """The sums over one run that `score` is made of. For `vmap`, over runs.
+
+    measures: those with `of_run` are taken, too. Raises ValueError on one that returns neither a
+    number nor one a step.
+    """
+    estimate, info = trace.estimate, trace.info
+    held = jnp.where(estimate.alive, estimate.tag, -1)
+    found: dict[str, tuple[Array, Array]] = {}
+    if truth.origin is not None:
+        origin = jnp.asarray(truth.origin)
+        held = identities(trace, origin)
+        found = associations(trace, origin, held)
+    points = jax.vmap(sensor.position)(jnp.asarray(truth.landmarks))
+    size, count = info.innovation.shape[2], estimate.alive.shape[1] or info.slot.shape[1]
+    dtype = estimate.pose.dtype
+
+    def step(sums: _Sums, row: tuple[Estimate, Info, Array]) -> tuple[_Sums, PyTree]:
+        estimate, info, held = row
+        off = points[jnp.maximum(held, 0)] - estimate.points
+        nees, regular = _planar_nees(off, jnp.asarray(estimate.point_covs))
+        counts = regular & (held >= 0)
+        white = _white(estimate, info)
+        *w, energy, there = sums.recent
+        *w_now, energy_now, there_now = white
+        products = [
+            linalg.total(old * new[None] for old, new in zip(w, w_now, strict=True))
+            if size
+            else jnp.zeros_like(energy),
+            energy * there_now[None],
+            there * energy_now[None],
+            there * there_now[None],
+        ]
+        sums = _Sums(
+            poison=sums.poison + 0 * _numbers((estimate, info)),
+            recent=[
+                jnp.concatenate([new[None], old[:-1]])
+                for new, old in zip(white, sums.recent, strict=True)
+            ],
+            pairs=[old + new for old, new in zip(sums.pairs, products, strict=True)],
+        )
+        return sums, (jnp.where(counts, nees, 0.0).sum(), counts.sum().astype(dtype))
+
+    first = jax.tree.map(lambda leaf: leaf[0], (estimate, info))
+    nothing = _Sums(
+        poison=jnp.zeros_like(_numbers(first)),
+        recent=[jnp.zeros((LAGS, count), dtype)] * (size + 2),
+        pairs=[jnp.zeros((LAGS, count), dtype)] * 4,
+    )
+    sums, (nees, regular) = jax.lax.scan(step, nothing, (estimate, info, held))
+    product, left, right, pairs = (pair.sum(axis=1) for pair in sums.pairs)
+    both = left * right
+    length = jnp.where(both > 0, jnp.sqrt(jnp.where(both > 0, both, 1.0)), 0.0)
+    named = (held[-1] >= 0) & (estimate.point_covs[-1] != 0).any()  # a known map has no errors
+    off = points[jnp.maximum(held[-1], 0)] - estimate.points[-1]
+    square = jnp.where(named, (off**2).sum(axis=-1), 0.0).sum()
+    return RunStatistics(
+        finite=jnp.isfinite(sums.poison).all(),
+        landmark_nees=nees,
+        regular_landmarks=regular,
+        landmark_squares=jnp.stack([square, named.sum().astype(dtype)]),
+        autocorrelation=jnp.stack([product, length, pairs * size], axis=1),
+        associations=found,
+        values={
+            each.key: _value(each, trace, truth) for each in measures if each.of_run is not None
+        },
+    )
+
+
+def _value(measure: Measure, trace: Trace, truth: Truth) -> Array:
+    """What a measure is in one run, () or (T,)."""
+    assert measure.of_run is not None
+    dtype, steps = trace.estimate.pose.dtype, len(trace.estimate.pose)
+    value = jnp.asarray(measure.of_run(truth, trace), dtype)
+    if value.shape not in ((), (steps,)):
+        raise ValueError(
+            f"measure {measure.key}: expected of_run to return a number or one for each of the "
+            f"{steps} steps, got an array of shape {value.shape}"
+        )
+    return value
+
+
+def _numbers(tree: PyTree) -> Float[Array, "K"]:
+    """Every floating-point number of a tree, in one row."""
+    leaves = map(jnp.asarray, jax.tree.leaves(tree))
+    return jnp.concatenate(
+        [leaf.ravel() for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    )
+
+
+def _planar_nees(
+    error: Float[Array, "N 2"], cov: Float[Array, "N 2 2"]
+) -> tuple[Float[Array, "N"], Bool[Array, "N"]]:
+    """The NEES eᵀ P⁻¹ e of each landmark, and whether P is regular: 1 - ρ² > 200 eps.
+
+    a²/p₁ + (b - a p₁₂/p₁)²/(p₂(1 - ρ²)); 0 where P is not regular or e not finite.
+    """
+    p1, p12, p2 = cov[:, 0, 0], cov[:, 1, 0], cov[:, 1, 1]
+    there = (p1 > 0) & (p2 > 0) & jnp.isfinite(error).all(axis=1)
+    p1, p2 = (jnp.where(there, p, 1.0) for p in (p1, p2))
+    left = 1 - (p12 / p1) * (p12 / p2)
+    regular = there & (left > 200 * float(jnp.finfo(cov.dtype).eps))
+    a = error[:, 0]
+    b = error[:, 1] - a * (p12 / p1)
+    nees = a**2 / p1 + b**2 / (p2 * jnp.where(regular, left, 1.0))
+    return jnp.where(regular, nees, 0.0), regular
+
+
+def _white(estimate: Estimate, info: Info) -> list[Array]:
+    """The numbers of the whitened innovation w, |w|², and 1 where there is one, else 0; (N,) each.
+
+    By landmark, of the first measurement fused with it; by measurement slot where there is no map.
+    """
+    fused = info.status == Status.FUSED
+
+    def whiten(nu: Array, cov: Array) -> Array:
+        return linalg.solve_lower(linalg.cholesky(cov)[0], nu)
+
+    white = jax.vmap(whiten)(info.innovation, info.innovation_cov)
+    white = jnp.where(fused[:, None], white, 0.0)
+    rows = [*white.T, (white**2).sum(axis=1), fused.astype(white.dtype)]
+    count = estimate.alive.shape[0]
+    if count == 0:
+        return rows
+    slot = jnp.where(fused, info.slot, -1)
+
+    def place(kept: list[Array], at: tuple[list[Array], Array]) -> tuple[PyTree, None]:
+        row, slot = at
+        mine = jnp.arange(count) == slot
+        return [jnp.where(mine, new, old) for new, old in zip(row, kept, strict=True)], None
+
+    nothing = [jnp.zeros(count, white.dtype)] * len(rows)
+    unroll = max(min(len(slot), _UNROLLED), 1)
+    return jax.lax.scan(place, nothing, (rows, slot), reverse=True, unroll=unroll)[0]

@@ -7,7 +7,6 @@ from collections.abc import Iterable
 
 from jaxslam.consistency.measures import (
     associations,
-    coverage,
     credibility,
     errors,
     innovations,
@@ -21,8 +20,8 @@ BUILT_IN: tuple[Measure, ...] = (
     *nees.MEASURES,
     innovations.NIS,
     innovations.AUTOCORRELATION,
-    *coverage.MEASURES,
-    *credibility.MEASURES,
+    *credibility.COVERAGE,
+    *credibility.CREDIBILITY,
     *errors.MEASURES,
     *associations.MEASURES,
     *observability.MEASURES,

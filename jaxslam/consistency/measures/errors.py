@@ -13,15 +13,23 @@ from jaxslam.consistency.measures.measure import Measure, Runs, RunScores, Sums,
 class Rmse(Measure):
     """The root of the mean square error. Each run's number is its mean square, in m² or rad²."""
 
+    positive: bool = True
     scale: float = 1.0
     """of the unit, from that of the squares"""
+    coordinates: tuple[int, int] | None = None
+    """of the pose, from the first to before the second, for all steps; None: of the final map"""
+
+    def of_runs(self, runs: Runs) -> RunScores:
+        """The squares, summed over the steps or over the landmarks."""
+        if self.coordinates is None:
+            return RunScores(*np.asarray(runs.statistics.landmark_squares).T)
+        squares = (runs.error[..., slice(*self.coordinates)] ** 2).sum(axis=2)
+        return RunScores(squares.sum(axis=1), squares.shape[1], {self.column: squares})
 
     def average(self, per_run: np.ndarray, sums: Sums) -> Average | None:
         """The root of the mean square, and those of the ends of its interval."""
         found = positive_interval(per_run)
-        if found is None:
-            return None
-        return Average(*(self.scale * float(np.sqrt(value)) for value in found))
+        return found and Average(*(self.scale * float(np.sqrt(value)) for value in found))
 
     def curves(self, sums: Sums, runs: int) -> dict[str, np.ndarray]:
         """The error at each step, over all runs."""
@@ -30,61 +38,34 @@ class Rmse(Measure):
         return {self.key: self.scale * np.sqrt(ratio(sums[self.column], np.asarray(runs)))}
 
 
-@dataclass(frozen=True, eq=False)
-class PoseRmse(Rmse):
-    """That of some coordinates of the pose, with a curve over the steps."""
-
-    coordinates: tuple[int, int] = (0, 3)
-    """of the pose, from the first to before the second"""
-
-    def of_runs(self, runs: Runs) -> RunScores:
-        """The squares, summed over the steps."""
-        squares = (runs.error[..., slice(*self.coordinates)] ** 2).sum(axis=2)
-        return RunScores(squares.sum(axis=1), squares.shape[1], {self.column: squares})
-
-
-@dataclass(frozen=True, eq=False)
-class MapRmse(Rmse):
-    """That of the landmarks of the final map, unaligned; there is none of a known map."""
-
-    def of_runs(self, runs: Runs) -> RunScores:
-        """The squares, summed over the landmarks."""
-        total, count = np.asarray(runs.statistics.landmark_squares).T
-        return RunScores(total, count)
-
-
-MEASURES = (
-    PoseRmse(
-        "rmse_position",
-        "position RMSE",
-        unit="m",
-        coordinates=(0, 2),
-        positive=True,
-        figure="rmse",
-        column="square_position",
-    ),
-    Measure(
-        "bound_ratio_position",
-        "  over conditional bound",
-        honest=1,
-        note=("conditional bound", "the Cramér-Rao bound of an RMSE, given the true path"),
-    ),
-    PoseRmse(
-        "rmse_heading_deg",
-        "heading RMSE",
-        unit="°",
-        scale=float(np.rad2deg(1.0)),
-        coordinates=(2, 3),
-        positive=True,
-        figure="rmse",
-        column="square_heading",
-    ),
-    Measure("bound_ratio_heading", "  over conditional bound", honest=1),
-    MapRmse("rmse_landmarks", "landmark RMSE", unit="m", positive=True, column="square_landmarks"),
+POSITION = Rmse(
+    "rmse_position",
+    "position RMSE",
+    unit="m",
+    coordinates=(0, 2),
+    figure="rmse",
+    column="square_position",
 )
 
-_BOUNDED = {"position": MEASURES[0], "heading": MEASURES[2]}
-"""What the conditional bound is of."""
+HEADING = Rmse(
+    "rmse_heading_deg",
+    "heading RMSE",
+    unit="°",
+    scale=float(np.rad2deg(1.0)),
+    coordinates=(2, 3),
+    figure="rmse",
+    column="square_heading",
+)
+
+_BOUND = "conditional bound", "the Cramér-Rao bound of an RMSE, given the true path"
+
+MEASURES = (
+    POSITION,
+    Measure("bound_ratio_position", "  over conditional bound", honest=1, note=_BOUND),
+    HEADING,
+    Measure("bound_ratio_heading", "  over conditional bound", honest=1),
+    Rmse("rmse_landmarks", "landmark RMSE", unit="m", column="square_landmarks"),
+)
 
 
 def over_bound(
@@ -95,7 +76,7 @@ def over_bound(
     bound: position [m²] and heading [rad²], (T,) each.
     """
     ratios, curves = {}, {}
-    for name, measure in _BOUNDED.items():
+    for name, measure in (("position", POSITION), ("heading", HEADING)):
         if measure.key in averages and bound[name].mean() > 0:
             least = measure.scale * np.sqrt(bound[name].mean())
             ratios[f"bound_ratio_{name}"] = Average(*(x / least for x in averages[measure.key]))

@@ -27,59 +27,46 @@ ROUNDING = 32
 class NeesMeasure(Measure):
     """The NEES of a block of `Runs.nees`. That of a pose block has a curve with a band."""
 
+    positive: bool = True
     block: str = ""
 
     def of_runs(self, runs: Runs) -> RunScores:
         """Its sum over the steps with a regular covariance."""
         value, regular = runs.nees[self.block]
-        sums = {}
-        if self.block in DOF:
-            sums = {
-                f"nees_{self.block}": value,
-                f"regular_{self.block}": regular.astype(np.float64),
-            }
-        return RunScores(value.sum(axis=1), regular.sum(axis=1), sums)
+        sums = {self.key: value, f"regular_{self.block}": regular.astype(np.float64)}
+        return RunScores(value.sum(axis=1), regular.sum(axis=1), sums if self.block in DOF else {})
 
     def curves(self, sums: Sums, runs: int) -> dict[str, np.ndarray]:
         """The average NEES, its 95 % band, and over how many runs it is."""
         if self.block not in DOF:
             return {}
-        count = sums[f"regular_{self.block}"]
-        low, high = _bands(count, DOF[self.block])
+        count, dof = sums[f"regular_{self.block}"], DOF[self.block]
+        safe, tail = np.maximum(count, 1), (1 - LEVEL) / 2
+        band = {"low": tail, "high": 1 - tail}
+        edges = {end: chi2_quantiles(p, dof * safe) / safe for end, p in band.items()}
         return {
             self.key: ratio(sums[self.key], count),
-            f"{self.key}_low": low,
-            f"{self.key}_high": high,
+            **{f"{self.key}_{end}": np.where(count > 0, x, np.nan) for end, x in edges.items()},
             f"runs_{self.block}": count,
         }
 
 
-MEASURES = (
+MEASURES = tuple(
     NeesMeasure(
-        "nees_pose",
-        "pose NEES (x, y, θ)",
-        block="pose",
-        honest=DOF["pose"],
-        positive=True,
-        figure="nees",
-        axis=f"pose NEES (dof {DOF['pose']})",
-    ),
-    NeesMeasure(
-        "nees_own", "pose NEES, in its chart", block="own", honest=DOF["pose"], positive=True
-    ),
-    *(
-        NeesMeasure(
-            f"nees_{block}",
-            f"{block} NEES",
-            block=block,
-            honest=DOF[block],
-            positive=True,
-            figure="nees",
-            axis=f"{block} NEES (dof {DOF[block]})",
-        )
-        for block in ("position", "heading")
-    ),
-    NeesMeasure("nees_landmarks", "landmark NEES", block="landmarks", honest=2, positive=True),
+        f"nees_{block}",
+        label,
+        honest=dof,
+        block=block,
+        figure="nees" if block in DOF else "",
+        axis=f"{block} NEES (dof {dof})",
+    )
+    for block, label, dof in (
+        ("pose", "pose NEES (x, y, θ)", DOF["pose"]),
+        ("own", "pose NEES, in its chart", DOF["pose"]),
+        ("position", "position NEES", DOF["position"]),
+        ("heading", "heading NEES", DOF["heading"]),
+        ("landmarks", "landmark NEES", 2),
+    )
 )
 
 
@@ -92,15 +79,6 @@ def inside_bands(curves: Mapping[str, np.ndarray]) -> dict[str, float]:
             low, high = curves[f"nees_{block}_low"], curves[f"nees_{block}_high"]
             found[block] = float(np.mean((mean >= low)[has] & (mean <= high)[has]))
     return found
-
-
-def _bands(count: np.ndarray, dof: int) -> tuple[np.ndarray, np.ndarray]:
-    """Two-sided chi-square band of the mean of count χ²_dof variables, step by step."""
-    tail = (1 - LEVEL) / 2
-    safe = np.maximum(count, 1)
-    edges = [chi2_quantiles(p, dof * safe) / safe for p in (tail, 1 - tail)]
-    low, high = (np.where(count > 0, edge, np.nan) for edge in edges)
-    return low, high
 
 
 def pose_error(
