@@ -14,7 +14,7 @@ from jaxslam.monte_carlo.block import BOUND
 from jaxslam.monte_carlo.campaign import summaries_of
 from jaxslam.monte_carlo.kept import add_kept
 from jaxslam.results import report, store
-from jaxslam.results.files import check_writable, versions, write_files
+from jaxslam.results.files import check_formats, check_writable, versions, write_files
 
 if TYPE_CHECKING:  # Matplotlib is slow to load
     from jaxslam.results.plot import Figure
@@ -40,18 +40,9 @@ def file_names(formats: Iterable[str], figures: Iterable[str] = FIGURES) -> list
     return [PAGE, RESULT, CURVES, *(f"{name}.{kind}" for name in figures for kind in kinds)]
 
 
-def check_figure_formats(caller: str, asked: str | Iterable[str]) -> tuple[str, ...]:
-    """The formats that were asked for, each once; raises ValueError that names another one."""
-    try:
-        kinds = tuple(dict.fromkeys([asked] if isinstance(asked, str) else asked))
-    except TypeError:
-        raise ValueError(
-            f"{caller}: expected formats of {', '.join(FORMATS)}, or () for none, got {asked!r}"
-        ) from None
-    for kind in kinds:
-        if kind not in FORMATS:
-            raise ValueError(f"{caller}: expected formats of {', '.join(FORMATS)}, got {kind!r}")
-    return kinds
+def check_figure_formats(caller: str, given: str | Iterable[str]) -> tuple[str, ...]:
+    """The formats of figures, each once; raises ValueError that names another one."""
+    return check_formats(caller, given, FORMATS)
 
 
 def filter_of_run_zero(campaign: Campaign) -> str:

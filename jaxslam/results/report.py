@@ -12,6 +12,7 @@ from jaxslam.consistency import LEVEL, LEVELS, Average, Summary, lopsided, perce
 from jaxslam.consistency.verdict import POWER, TESTS
 from jaxslam.monte_carlo import Campaign
 from jaxslam.results.files import (
+    check_formats,
     check_writable,
     csv_text,
     json_number,
@@ -19,7 +20,7 @@ from jaxslam.results.files import (
     versions,
     write_files,
 )
-from jaxslam.results.table import VERDICTS, Cell, notes_on, rows_of
+from jaxslam.results.table import VERDICTS, Cell, lost_runs, notes_on, rows_of
 from jaxslam.types import Estimate
 
 RUN_FORMATS = ("csv", "json")
@@ -52,7 +53,7 @@ def campaign_table(campaign: Campaign) -> str:
     ]
     notes += [f"{term}: {said}." for term, said in notes_on(campaign)]
     notes += qualified(campaign)
-    notes += not_finite(campaign)
+    notes += [f"{name} {said}" for name, said in lost_runs(campaign)]
     if campaign.dtype == "float32":
         notes.append(
             "The filters ran in float32: for float64, set jax_enable_x64 in Python, or leave out "
@@ -67,7 +68,7 @@ def campaign_table(campaign: Campaign) -> str:
 def _explained(campaign: Campaign) -> list[str]:
     """The meanings of the verdicts that this campaign has."""
     found = {summary.verdict for summary in campaign.filters.values()}
-    return [f"{word}: {meaning}." for word, meaning in VERDICTS.items() if word in found]
+    return [f"{word}: {meaning}." for word, (_, meaning) in VERDICTS.items() if word in found]
 
 
 def qualified(campaign: Campaign) -> list[str]:
@@ -91,20 +92,6 @@ def qualified(campaign: Campaign) -> list[str]:
         *(f"{power} {tests} outside: {'; '.join(told)}" for tests, told in powers.items()),
         *(f"{', '.join(names)}*: {doubt}" for doubt, names in doubts.items()),
     ]
-
-
-def not_finite(campaign: Campaign) -> list[str]:
-    """A sentence on each filter that was not finite in some runs, with their numbers."""
-    out = []
-    for name, summary in campaign.filters.items():
-        lost = summary.not_finite_runs
-        if lost:
-            shown = ", ".join(map(str, lost[:20])) + (", …" if len(lost) > 20 else "")
-            out.append(
-                f"{name} was not finite in {len(lost)} of {campaign.runs} runs, which its measures "
-                f"leave out: {shown}"
-            )
-    return out
 
 
 def as_json(campaign: Campaign, command: str = "", seed: int | None = None) -> str:
@@ -200,17 +187,6 @@ def run_columns(campaign: Campaign) -> dict[str, np.ndarray]:
     return found
 
 
-def check_run_formats(caller: str, asked: Iterable[str]) -> tuple[str, ...]:
-    """The formats, each once; raises ValueError that names another."""
-    kinds = tuple(dict.fromkeys(asked))
-    for kind in kinds:
-        if kind not in RUN_FORMATS:
-            raise ValueError(
-                f"{caller}: expected formats of {', '.join(RUN_FORMATS)}, got {kind!r}"
-            )
-    return kinds
-
-
 def save_runs(campaign: Campaign, path: str | Path) -> Path:
     """Write the table to a file of the format that its name ends in, whole or not at all.
 
@@ -219,7 +195,7 @@ def save_runs(campaign: Campaign, path: str | Path) -> Path:
     Raises ValueError on another format.
     """
     path = Path(path)
-    (kind,) = check_run_formats("Campaign.save_runs", [path.suffix.removeprefix(".")])
+    (kind,) = check_formats("Campaign.save_runs", path.suffix.removeprefix("."), RUN_FORMATS)
     check_writable(path.parent)
     found = run_columns(campaign)
     if kind == "json":

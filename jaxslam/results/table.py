@@ -11,17 +11,26 @@ from jaxslam.consistency.measures.counts import MEANINGS, count_label
 from jaxslam.monte_carlo import Campaign
 
 VERDICTS = {
-    "consistent": "neither test rejects, which is no proof",
-    "optimistic": "the interval of pose NEES or of NIS / dof lies above the honest value: "
-    "covariances are claimed too small",
-    "pessimistic": "the interval of pose NEES or of NIS / dof lies below the honest value: "
-    "covariances are claimed too large",
-    "diverged": "over half of the runs diverged or were not finite",
-    "incomplete": "not rejected, but over half of the measurements were dropped",
-    "undecided": "too few runs, or too unequal, to reject even a pose NEES of 6: take more "
-    "runs; a pose that is known exactly, as by mapping, has no NEES",
+    "consistent": ("✓", "neither test rejects, which is no proof"),
+    "optimistic": (
+        "▲",
+        "the interval of pose NEES or of NIS / dof lies above the honest value: covariances are "
+        "claimed too small",
+    ),
+    "pessimistic": (
+        "▼",
+        "the interval of pose NEES or of NIS / dof lies below the honest value: covariances are "
+        "claimed too large",
+    ),
+    "diverged": ("✕", "over half of the runs diverged or were not finite"),
+    "incomplete": ("–", "not rejected, but over half of the measurements were dropped"),
+    "undecided": (
+        "?",
+        "too few runs, or too unequal, to reject even a pose NEES of 6: take more runs; a pose "
+        "that is known exactly, as by mapping, has no NEES",
+    ),
 }
-"""Verdicts."""
+"""Verdicts, each with its sign and its meaning."""
 
 _ALWAYS = ("runs", "not_finite", "divergent")
 """Counts that are shown though they are 0."""
@@ -134,3 +143,15 @@ def notes_on(campaign: Campaign) -> list[tuple[str, str]]:
     there = {name for s in summaries.values() for name, count in s.counts.items() if count}
     told = [f"{count_label(name)}, {what}" for name, what in MEANINGS.items() if name in there]
     return out + [("counts, over all runs", "; ".join(told))] * bool(told)
+
+
+def lost_runs(campaign: Campaign) -> list[tuple[str, str]]:
+    """The filters that were not finite in some runs, each with a phrase that numbers them."""
+    out = []
+    for name, summary in campaign.filters.items():
+        lost = summary.not_finite_runs
+        if lost:
+            numbers = ", ".join(map(str, lost[:20])) + (", …" if len(lost) > 20 else "")
+            of = f"{len(lost):,} of {campaign.runs:,} runs"
+            out.append((name, f"was not finite in {of}, which its measures leave out: {numbers}"))
+    return out

@@ -152,7 +152,7 @@ def test_names_are_escaped(text, read):
     words = "".join(read.words)
     assert f"world {EVIL}: consistency of 3 filters" in words
     assert f"jaxslam consistency {EVIL}" in words
-    assert f"{EVIL} was not finite in 2 of 30 runs, which its figures leave out: 4, 17." in words
+    assert f"{EVIL} was not finite in 2 of 30 runs, which its measures leave out: 4, 17." in words
 
 
 def test_filters_verdicts_and_measures_stand_in_the_table(read):

@@ -26,6 +26,7 @@ from jaxslam.monte_carlo import Interrupted, monte_carlo
 from jaxslam.monte_carlo.candidates import estimator_of, fitting_block, rounded
 from jaxslam.protocols import Candidate
 from jaxslam.results import campaign_files, report, store
+from jaxslam.results.files import check_formats
 from jaxslam.simulation.worlds import World, run_keys, world_of_run
 from jaxslam.types import Estimate, Truth
 
@@ -40,7 +41,7 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     formats = campaign_files.check_figure_formats("--figures", options.figures.split(","))
     there = [kind for kind in report.RUN_FORMATS if (out / f"runs.{kind}").exists()]  # up to date
     asked_for = filter(None, options.table.split(","))
-    tables = report.check_run_formats("--table", [*asked_for, *there])
+    tables = check_formats("--table", [*asked_for, *there], report.RUN_FORMATS)
     if asked.steps is not None:
         check_count("--steps", asked.steps)
     files = UserObjects()

@@ -13,7 +13,6 @@ from jaxslam.monte_carlo import Campaign
 from jaxslam.results.files import html_page
 from jaxslam.results.page import curves
 from jaxslam.results.page.parts import (
-    VERDICTS,
     badge,
     duration,
     embedded_figure,
@@ -26,6 +25,7 @@ from jaxslam.results.page.parts import (
 )
 from jaxslam.results.page.style import CSS, FRAGMENT_CSS, SCRIPT, policy
 from jaxslam.results.plot import Figure, png
+from jaxslam.results.table import VERDICTS
 
 __all__ = ["VERDICTS", "fragment", "page"]
 

@@ -12,22 +12,7 @@ from jaxslam.consistency.verdict import TESTS
 from jaxslam.monte_carlo import Campaign
 from jaxslam.results import table
 from jaxslam.results.plot import Figure, describe
-
-VERDICTS = {
-    word: (sign, table.VERDICTS[word])
-    for word, sign in (
-        ("consistent", "✓"),
-        ("optimistic", "▲"),
-        ("pessimistic", "▼"),
-        ("diverged", "✕"),
-        ("incomplete", "–"),
-        ("undecided", "?"),
-    )
-}
-"""Each verdict with its sign and its meaning."""
-
-_SHOWN = 20
-"""largest number of runs listed as not finite"""
+from jaxslam.results.table import VERDICTS
 
 
 def verdict_list(campaign: Campaign) -> str:
@@ -133,17 +118,11 @@ def measure_notes(campaign: Campaign) -> str:
 
 
 def lost_runs(campaign: Campaign) -> str:
-    """A sentence on each filter that was not finite in some runs, with their numbers, as HTML."""
-    out = []
-    for name, summary in campaign.filters.items():
-        lost = summary.not_finite_runs
-        if lost:
-            numbers = ", ".join(map(str, lost[:_SHOWN])) + (", …" if len(lost) > _SHOWN else "")
-            out.append(
-                f'<p class="note"><strong>{escape(name)}</strong> was not finite in {len(lost):,} '
-                f"of {campaign.runs:,} runs, which its figures leave out: {numbers}.</p>"
-            )
-    return "\n".join(out)
+    """A sentence on each filter that was not finite in some runs, as HTML."""
+    return "\n".join(
+        f'<p class="note"><strong>{escape(name)}</strong> {said}.</p>'
+        for name, said in table.lost_runs(campaign)
+    )
 
 
 def embedded_figure(number: int, name: str, caption: str, figure: Figure, drawn: bytes) -> str:
