@@ -123,11 +123,11 @@ def run_statistics(
     """
     estimate, info = trace.estimate, trace.info
     held = jnp.where(estimate.alive, estimate.tag, -1)
-    found: dict[str, tuple[Array, Array]] = {}
+    values: dict[str, Array | tuple[Array, Array]] = {}
     if truth.origin is not None:
         origin = jnp.asarray(truth.origin)
         held = identities(trace, origin)
-        found = associations(trace, origin, held)
+        values |= associations(trace, origin, held)
     points = jax.vmap(sensor.position)(jnp.asarray(truth.landmarks))
     size, count = info.innovation.shape[2], estimate.alive.shape[1] or info.slot.shape[1]
     dtype = estimate.pose.dtype
@@ -177,10 +177,7 @@ def run_statistics(
         regular_landmarks=regular,
         landmark_squares=jnp.stack([square, named.sum().astype(dtype)]),
         autocorrelation=jnp.stack([product, length, pairs * size], axis=1),
-        associations=found,
-        values={
-            each.key: _value(each, trace, truth) for each in measures if each.of_run is not None
-        },
+        values=values | {one.key: _value(one, trace, truth) for one in measures if one.of_run},
     )
 
 

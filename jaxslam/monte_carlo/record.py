@@ -80,9 +80,10 @@ class Campaign:
         """Write the report into a folder, and return the paths of its files.
 
         They are report.html (one page with its figures embedded), consistency.json (verdicts,
-        measures and counts), consistency.csv (the averages of every step) and the figures. All of
-        them appear when all are complete, or none. Two figures show run 0 of each filter; they are
-        left out where this process did not compute that run (`first`).
+        measures and counts), measures.csv (the table of them), consistency.csv (the averages of
+        every step) and the figures. All of them appear when all are complete, or none. Two figures
+        show run 0 of each filter; they are left out where this process did not compute that run
+        (`first`).
 
         Args:
             folder: it is created if needed.

@@ -22,6 +22,9 @@ if TYPE_CHECKING:  # Matplotlib is slow to load
 PAGE, RESULT, CURVES = "report.html", "consistency.json", "consistency.csv"
 """The page; the verdicts, measures and counts; the averages of every step."""
 
+TABLE = "measures.csv"
+"""The table of the page."""
+
 BLOCKS = "blocks"
 """The folder of a campaign's finished blocks, beside its results."""
 
@@ -37,7 +40,7 @@ _IN_NOTEBOOK = ("nees", "rmse")
 def file_names(formats: Iterable[str], figures: Iterable[str] = FIGURES) -> list[str]:
     """The names of the files of a campaign's report, with figures of these formats."""
     kinds = list(formats)
-    return [PAGE, RESULT, CURVES, *(f"{name}.{kind}" for name in figures for kind in kinds)]
+    return [PAGE, RESULT, CURVES, TABLE, *(f"{name}.{kind}" for name in figures for kind in kinds)]
 
 
 def check_figure_formats(caller: str, given: str | Iterable[str]) -> tuple[str, ...]:
@@ -99,6 +102,7 @@ def save_campaign(
         ),
         RESULT: report.as_json(campaign, command, seed),
         CURVES: report.as_csv(campaign),
+        TABLE: report.table_csv(campaign),
     }
     for name, (_, figure) in drawn.items():
         files |= {f"{name}.{kind}": saved(figure, kind) for kind in formats}
@@ -183,7 +187,7 @@ def _drawings(
             partial(plot.rmse_figure, campaign),
         ),
         "cost": (
-            "Error and NEES against the time of a step",
+            "Time of a step, error and NEES",
             partial(plot.cost_figure, campaign),
         ),
         "coverage": ("Coverage of the ellipsoids", partial(plot.coverage_figure, campaign)),

@@ -104,7 +104,8 @@ def test_files_are_those_asked_for_and_without_run_0_its_figures_are_left_out(
     found, tmp_path, undrawn
 ):
     only = found.save(tmp_path / "bare", figures=())
-    assert [path.name for path in only] == ["report.html", "consistency.json", "consistency.csv"]
+    names = ["report.html", "consistency.json", "consistency.csv", "measures.csv"]
+    assert [path.name for path in only] == names
     elsewhere = dataclasses.replace(found, first={})
     kept = {path.stem for path in elsewhere.save(tmp_path / "no run 0", "svg")}
     assert FIGURES - kept == {"errors", "map"}

@@ -1,32 +1,16 @@
 """How often a filter associates a measurement with the landmark that was truly measured."""
 
-from dataclasses import dataclass
-
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Int
 
-from jaxslam.consistency.measures.measure import Measure, Runs, RunScores
+from jaxslam.consistency.measures.measure import Measure
 from jaxslam.types import Status, Trace
 
-
-@dataclass(frozen=True, eq=False)
-class Associations(Measure):
-    """One of the numbers of `associations`, by its key; of worlds of spurious data alone."""
-
-    def of_runs(self, runs: Runs) -> RunScores | None:
-        """Its sum and its weight in each run."""
-        if self.key not in runs.statistics.associations:
-            return None
-        total, weight = runs.statistics.associations[self.key]
-        return RunScores(np.asarray(total), np.asarray(weight))
-
-
 MEASURES = (
-    Associations("precision", "associations: precision", honest=1),
-    Associations("recall", "associations: recall", honest=1),
-    Associations("false_landmarks", "false landmarks", honest=0),
+    Measure("precision", "associations: precision", honest=1),
+    Measure("recall", "associations: recall", honest=1),
+    Measure("false_landmarks", "false landmarks", honest=0),
 )
 
 

@@ -45,10 +45,9 @@ class RunStatistics(NamedTuple):
     """of whitened innovations: Σ w_tᵀ w_{t+l}, √(Σ|w_t|² Σ|w_{t+l}|²), and how many
     products of numbers that is. Of the same landmark at t and t + l, w = L⁻¹ν with S = L Lᵀ;
     without a map, of one measurement slot."""
-    associations: dict[str, tuple[Array, Array]]
-    """of a world of spurious data; see `associations.associations`."""
-    values: dict[str, Array]
-    """what `Measure.of_run` returned, by key"""
+    values: dict[str, Array | tuple[Array, Array]]
+    """by key of a measure, what its `of_run` returned; in a world of spurious data, sum and weight
+    of each of `associations`"""
 
 
 class Runs(NamedTuple):
@@ -104,9 +103,8 @@ class Measure:
     """name of each run's number in `Summary.per_run`; default the key"""
 
     def __post_init__(self) -> None:
-        shown = f"{self.label} [{self.unit}]" if self.unit else self.label
         object.__setattr__(self, "column", self.column or self.key)
-        object.__setattr__(self, "axis", self.axis or shown)
+        object.__setattr__(self, "axis", self.axis or self.title)
 
     @property
     def title(self) -> str:
@@ -118,6 +116,8 @@ class Measure:
         found = runs.statistics.values.get(self.key)
         if found is None:
             return None
+        if isinstance(found, tuple):
+            return RunScores(np.asarray(found[0]), np.asarray(found[1]))
         there = np.isfinite(found)
         values = np.where(there, found, 0.0).astype(np.float64)
         if values.ndim == 1:
@@ -132,17 +132,14 @@ class Measure:
         regular: Bool[np.ndarray, "R K"],
     ) -> Float[np.ndarray, "R"] | None:
         """The measure of each run where it takes several runs together; None of any other."""
-        del errors, covs, regular
         return None
 
     def average(self, per_run: Float[np.ndarray, "R"], sums: Sums) -> Average | None:
         """The average over all runs with its interval; None where no run has a number."""
-        del sums
         return positive_interval(per_run) if self.positive else interval(per_run)
 
     def curves(self, sums: Sums, runs: int) -> dict[str, np.ndarray]:
         """The curves (T,) over the steps, averages over the runs, by name; {} without sums."""
-        del runs
         count = sums.get(f"runs_{self.key}")
         return {} if count is None else {self.key: ratio(sums[self.key], count)}
 

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 import numpy as np
 from jaxtyping import Float, Int, PyTree
 
-from jaxslam.consistency.measures.measure import Measure, Runs, RunScores, Sums, ratio
+from jaxslam.consistency.measures.measure import Measure, Runs, RunScores
 from jaxslam.filters.ekf.observability import Monitor, MonitoredState
 
 
@@ -30,11 +30,8 @@ class RotationInformation(Measure):
             return None
         information, turn = runs.trace.probe.astype(np.float64), monitor.turn
         gained = np.einsum("rtij,ri,rj->rt", information, turn, turn)
-        return RunScores(gained[:, -1], 1, {self.key: gained})
-
-    def curves(self, sums: Sums, runs: int) -> dict[str, np.ndarray]:
-        """The average of each step over the runs."""
-        return {self.key: ratio(sums[self.key], np.asarray(runs))} if self.key in sums else {}
+        sums = {self.key: gained, f"runs_{self.key}": np.ones_like(gained)}
+        return RunScores(gained[:, -1], 1, sums)
 
 
 MEASURES = (
