@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.gate import Metric, alone
 from benchmarks.real_data import DATA
 from jaxslam import graphs
-from jaxslam.consistency.nees import pose_error
+from jaxslam.consistency.measures.nees import pose_error
 from jaxslam.graphs import Ending, Solution, starts
 
 FOLDER = DATA / "graphs"

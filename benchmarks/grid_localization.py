@@ -27,7 +27,7 @@ from benchmarks.consistency.markdown import table
 from benchmarks.gate import Metric, alone
 from benchmarks.real_data import DATA
 from jaxslam import consistency, datasets, grids, motion, run
-from jaxslam.consistency.nees import pose_error
+from jaxslam.consistency.measures.nees import pose_error
 from jaxslam.core.record import record
 from jaxslam.simulation import laser, walls
 from jaxslam.simulation.scenarios import office

@@ -16,7 +16,7 @@ import numpy as np
 
 from benchmarks.gate import Metric, alone
 from jaxslam import features, filters, scenarios, sensors
-from jaxslam.consistency.nees import block_nees, pose_error
+from jaxslam.consistency.measures.nees import block_nees, pose_error
 from jaxslam.math.stats import t_quantile
 from jaxslam.simulation import laser, walls
 from jaxslam.types import Beams, Scan

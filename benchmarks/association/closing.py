@@ -12,7 +12,7 @@ import numpy as np
 
 import jaxslam
 from jaxslam import association, charts, motion, sensors
-from jaxslam.consistency.associations import identities
+from jaxslam.consistency.measures.associations import identities
 from jaxslam.filters import EkfSlam
 from jaxslam.filters.map_management.closing import Closing
 from jaxslam.filters.map_management.loop_closure import LoopSettings

@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.consistency.markdown import Section, table
 from benchmarks.gate import Metric
 from jaxslam.catalog import FILTERS
-from jaxslam.consistency import Measure
+from jaxslam.consistency import Average
 from jaxslam.math.stats import t_quantile
 from jaxslam.monte_carlo import monte_carlo
 from jaxslam.simulation.scenarios import circle
@@ -60,7 +60,7 @@ def measure(runs: int = 1000, seed: int = 0) -> tuple[Section, list[Metric]]:
     return Section("circle", "UKF-M's 2-D SLAM benchmark", text), metrics
 
 
-def central(key: str, found: Measure, runs: int) -> tuple[float, float]:
+def central(key: str, found: Average, runs: int) -> tuple[float, float]:
     """The central 99 % of averages over PUBLISHED_RUNS runs, from the interval over `runs`."""
     # The interval of a root mean square is that of the mean square, where averages live.
     power = 2 if key.startswith("rmse") else 1

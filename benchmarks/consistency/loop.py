@@ -15,7 +15,7 @@ from benchmarks.consistency.markdown import Section, table
 from benchmarks.gate import Metric
 from jaxslam.catalog import FILTERS
 from jaxslam.consistency import own_error_of, score
-from jaxslam.consistency.statistics import run_statistics
+from jaxslam.consistency.score import run_statistics
 from jaxslam.protocols import Filter, Motion, Sensor
 from jaxslam.results.plot.style import INK, PAGE, Figure, caption, curve, panels_of
 from jaxslam.run import run

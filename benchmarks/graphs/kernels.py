@@ -7,7 +7,7 @@ import numpy as np
 
 from benchmarks.graphs.worlds import measured, with_false_closures
 from jaxslam import graphs
-from jaxslam.consistency.nees import block_nees, pose_error
+from jaxslam.consistency.measures.nees import block_nees, pose_error
 from jaxslam.math import stats
 
 SHARES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)

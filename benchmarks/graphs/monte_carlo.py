@@ -17,7 +17,7 @@ import scipy.stats
 
 from benchmarks.graphs.worlds import measured
 from jaxslam import graphs
-from jaxslam.consistency.nees import pose_error
+from jaxslam.consistency.measures.nees import pose_error
 from jaxslam.math import stats
 
 SCALES = (1.0, 3.0, 10.0)

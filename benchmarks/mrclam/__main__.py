@@ -33,7 +33,7 @@ from benchmarks.mrclam import replays
 from benchmarks.real_data import DATA
 from jaxslam import charts, datasets, metrics, smoothing
 from jaxslam.calibration import consider_cov
-from jaxslam.consistency.nees import block_nees, pose_error
+from jaxslam.consistency.measures.nees import block_nees, pose_error
 from jaxslam.datasets import MRCLAM_FITTED
 from jaxslam.filters import EkfSlam, TeamSlam
 from jaxslam.math.stats import sigma_gate

@@ -7,9 +7,9 @@ from pathlib import Path
 from typing import TypeVar
 
 from jaxslam.catalog import meant
+from jaxslam.consistency.measures.counts import count_label
 from jaxslam.results.campaign_files import RESULT
 from jaxslam.results.files import check_writable
-from jaxslam.results.meanings import count_label
 
 _T = TypeVar("_T")
 

@@ -8,10 +8,9 @@ from jaxslam.consistency.bound import (
     posterior_bound,
     van_trees,
 )
-from jaxslam.consistency.credibility import credibility
 from jaxslam.consistency.intervals import (
     LEVEL,
-    Measure,
+    Average,
     interval,
     lopsided,
     percentage,
@@ -27,9 +26,12 @@ from jaxslam.consistency.localization import (
     seed_spread,
     summarize_localization,
 )
-from jaxslam.consistency.nees import DOF, own_error_of
-from jaxslam.consistency.score import LANDMARK_DOF, LEVELS, Score, monitor_of, score
-from jaxslam.consistency.statistics import LAGS, RunStatistics, run_statistics
+from jaxslam.consistency.measures import Measure, register
+from jaxslam.consistency.measures.credibility import LEVELS, credibility
+from jaxslam.consistency.measures.measure import RunStatistics
+from jaxslam.consistency.measures.nees import DOF, own_error_of
+from jaxslam.consistency.measures.observability import monitor_of
+from jaxslam.consistency.score import LAGS, Score, run_statistics, score
 from jaxslam.consistency.summary import Summary, summarize
 from jaxslam.consistency.tally import Tally, condense
 from jaxslam.consistency.verdict import Verdict, judge, power_of
@@ -37,9 +39,9 @@ from jaxslam.consistency.verdict import Verdict, judge, power_of
 __all__ = [
     "DOF",
     "LAGS",
-    "LANDMARK_DOF",
     "LEVEL",
     "LEVELS",
+    "Average",
     "LocalizationScores",
     "LocalizationSummary",
     "Measure",
@@ -66,6 +68,7 @@ __all__ = [
     "positive_interval",
     "posterior_bound",
     "power_of",
+    "register",
     "run_statistics",
     "score",
     "score_localization",

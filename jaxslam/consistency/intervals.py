@@ -19,7 +19,7 @@ def percentage(share: float, digits: int = 0) -> str:
     return f"{100 * share:.{digits}f} %"
 
 
-class Measure(NamedTuple):
+class Average(NamedTuple):
     """An average over all runs, with its 95 % interval from the spread between runs."""
 
     value: float
@@ -27,10 +27,10 @@ class Measure(NamedTuple):
     high: float
 
 
-def lopsided(measure: Measure) -> bool:
+def lopsided(average: Average) -> bool:
     """Whether one side of the interval is over a quarter longer than the other, so that ± would
     mislead."""
-    sides = sorted((measure.value - measure.low, measure.high - measure.value))
+    sides = sorted((average.value - average.low, average.high - average.value))
     return not sides[1] <= 1.25 * sides[0]
 
 
@@ -98,7 +98,7 @@ def spread(
 
 def positive_interval(
     values: np.ndarray | Sequence[float], level: float = LEVEL, skewed: bool = True
-) -> Measure | None:
+) -> Average | None:
     """The mean of positive numbers with the interval of `Spread`; None where there are none.
 
     Of a single number the interval is all that is positive, (0, ∞).
@@ -107,11 +107,11 @@ def positive_interval(
     if found is None:
         return None
     if not np.isfinite(found.error):
-        return Measure(found.mean, 0.0, np.inf)
-    return Measure(found.mean, found.low, found.high)
+        return Average(found.mean, 0.0, np.inf)
+    return Average(found.mean, found.low, found.high)
 
 
-def interval(values: np.ndarray | Sequence[float]) -> Measure | None:
+def interval(values: np.ndarray | Sequence[float]) -> Average | None:
     """Mean of independent runs with its t interval, NaN left out; None where nothing is left.
 
     For what may be of either sign; what cannot be negative has `positive_interval`.
@@ -121,9 +121,9 @@ def interval(values: np.ndarray | Sequence[float]) -> Measure | None:
         return None
     mean = float(there.mean())
     if there.size < 2:
-        return Measure(mean, -np.inf, np.inf)
+        return Average(mean, -np.inf, np.inf)
     half = t_quantile(0.5 + LEVEL / 2, there.size - 1) * there.std(ddof=1) / np.sqrt(there.size)
-    return Measure(mean, mean - float(half), mean + float(half))
+    return Average(mean, mean - float(half), mean + float(half))
 
 
 def _numbers(values: np.ndarray | Sequence[float]) -> np.ndarray:

@@ -9,8 +9,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from jaxslam.consistency.intervals import Measure, interval, positive_interval
-from jaxslam.consistency.nees import block_nees, pose_error
+from jaxslam.consistency.intervals import Average, interval, positive_interval
+from jaxslam.consistency.measures.nees import block_nees, pose_error
 from jaxslam.core.numbers import check_count, check_covariance, check_key
 from jaxslam.filters.particles.pose_particles import PoseParticles
 from jaxslam.grids.localization import beam_log
@@ -52,15 +52,15 @@ class LocalizationScores(NamedTuple):
 class LocalizationSummary(NamedTuple):
     """Averages over the runs, with 95 % intervals from the spread between runs."""
 
-    coverage: Measure | None
+    coverage: Average | None
     """share of the steps in which the 95 % set of the particles covers the truth"""
-    nees: Measure | None
+    nees: Average | None
     """mean pose NEES where the particles are one group; 3 is honest; None where they never are"""
     unimodal: float
     """share of the steps in which they are"""
-    energy: Measure | None
+    energy: Average | None
     """mean energy score of the position [m]: less is better"""
-    rmse: Measure | None
+    rmse: Average | None
     """of the position [m], of runs that are not lost"""
     heading: float
     """median of the size of the heading error [rad], of runs that are not lost"""

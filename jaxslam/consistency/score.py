@@ -1,7 +1,8 @@
-"""`score` returns what each run says of a filter, the numbers that a campaign adds up or keeps.
+"""The scores of runs: what each run says of a filter, the numbers a campaign adds up or keeps.
 
-Called by `monte_carlo.block` on the results of a block of runs; `tally.condense` takes what
-it returns.
+`run_statistics` takes sums over one run's maps and innovations, in JAX; `monte_carlo.programs`
+compiles it. `score` takes them, and the poses and infos of many runs, to the measures of each run;
+`tally.condense` takes what that returns.
 
 A run's error is compared with the covariance the filter claims for it. With e = truth - estimate,
 heading wrapped, NEES = eᵀ P⁻¹ e has mean dof for an honest filter; it is *not* divided by dof
@@ -10,49 +11,28 @@ anywhere here. While P is singular (a start with P0 = 0, or a deviation that is 
 (Bar-Shalom, Li, Kirubarajan 2001, 5.4; Bailey et al. 2006.)
 """
 
+from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
+import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Bool, Float, Int, PyTree
+from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxslam.consistency.nees import DOF, Nees, block_nees, pose_error
-from jaxslam.consistency.statistics import RunStatistics
-from jaxslam.filters.ekf.observability import Monitor, MonitoredState
-from jaxslam.math.stats import chi2_quantile
-from jaxslam.types import Info, Status, Trace, Truth
+from jaxslam.consistency.measures import REGISTRY
+from jaxslam.consistency.measures.associations import associations, identities
+from jaxslam.consistency.measures.counts import counted
+from jaxslam.consistency.measures.measure import Measure, Nees, Runs, RunStatistics
+from jaxslam.consistency.measures.nees import block_nees, pose_error
+from jaxslam.math import linalg
+from jaxslam.protocols import Sensor
+from jaxslam.types import Estimate, Info, Status, Trace, Truth
 
-LANDMARK_DOF = 2
-"""of the NEES of one landmark's position."""
+LAGS = 10
+"""The autocorrelation of innovations is taken up to so many steps."""
 
-KEPT = (Status.FUSED, Status.BORN, Status.SIGHTED)
-"""What a measurement does for the map; each is counted."""
-
-DROPS = (
-    Status.REJECTED,
-    Status.OVERFLOW,
-    Status.DEFERRED,
-    Status.REPEATED,
-    Status.SINGULAR,
-    Status.UNMATCHED,
-)
-"""What can keep a measurement from the map; each is counted."""
-
-EVENTS: dict[str, tuple[str | None, str]] = {
-    "removed": ("pruning", "removed"),
-    "merged": ("merging", "pair"),
-    "reduced": ("points", "reduced"),
-    "exhausted": (None, "exhausted"),
-    **{
-        name: ("particles", name)
-        for name in ("resampled", "underflow", "invalid", "injected", "capped")
-    },
-}
-"""What not every filter reports, and where: the record in `Info.extra`, or None for a field of
-`Info`, and the field. Each is counted where it is there."""
-
-LEVELS = tuple(np.round(np.arange(0.05, 0.96, 0.05), 2).tolist()) + (0.99,)
-"""Probabilities of the coverage curves."""
+_UNROLLED = 4
+"""Measurement slots that are looked at in one piece of compiled code."""
 
 SNAPSHOTS = 25
 """Steps of each run at which error and covariance are kept as they are."""
@@ -68,7 +48,7 @@ class Score(NamedTuple):
     snapshots: tuple[np.ndarray, np.ndarray, np.ndarray]
     """pose error (R, K, 3), its covariance (R, K, 3, 3), whether that is regular (R, K)."""
     sums: dict[str, np.ndarray]
-    """what is added up over runs: (R, T) curves, (R, LEVELS) and (R, LAGS, 3) sums, (R,) drops."""
+    """what is added up over runs: counts (R,), and (R, …) of measures."""
 
 
 def snapshot_steps(steps: int) -> np.ndarray:
@@ -92,125 +72,177 @@ def score(
         own_error: the pose errors in the filter's own coordinates (see `own_error_of`), by default
             those in (x, y, θ).
     """
-    info, (pose, cov) = trace.info, map(np.asarray, trace.estimate[:2])
+    pose, cov = map(np.asarray, trace.estimate[:2])
     error = pose_error(np.asarray(truth.pose), pose)
     steps = error.shape[1]
     nees = block_nees(pose, error, error if own_error is None else own_error, cov)
-    nees["landmarks"] = Nees(*(np.asarray(x, np.float64) for x in found[1:3]))
-    fused = info.status == Status.FUSED
-    curves = {f"nees_{block}": nees[block].value for block in DOF}
-    curves |= {f"regular_{block}": nees[block].regular.astype(np.float64) for block in DOF}
-    curves |= {
-        "square_position": (error[..., :2] ** 2).sum(axis=2),
-        "square_heading": error[..., 2] ** 2,
-        "nis": np.where(fused, info.nis, 0.0).sum(axis=2, dtype=np.float64),
-        "nis_dof": np.asarray(info.dof).sum(axis=2, dtype=np.float64),
+    landmarks = found.landmark_nees, found.regular_landmarks
+    nees["landmarks"] = Nees(*(np.asarray(x, np.float64) for x in landmarks))
+    sums: dict[str, np.ndarray] = {
+        **counted(trace.info),
+        "missed": np.asarray(truth.missed).sum(axis=1),
+        "singular_steps": steps - nees["pose"].regular.sum(axis=1),
     }
-    measures: dict[str, tuple[PyTree, PyTree]] = dict(found.associations)
-    sums: dict[str, np.ndarray] = {}
-    monitor = monitor_of(trace.final)
-    if monitor is not None:
-        gained, dimensions = _null_space(monitor, trace.probe)
-        curves["rotation_information"] = gained
-        measures["rotation_information"] = gained[:, -1], 1
-        measures["unobservable"] = dimensions, 1
-    for block in DOF:
-        count = nees[block].regular.sum(axis=1)
-        covered = _covered(nees[block], DOF[block])
-        sums[f"coverage_{block}"] = covered / np.maximum(count, 1)[:, None]
-        sums[f"coverage_runs_{block}"] = (count > 0).astype(np.float64)
-        measures[f"coverage_95_{block}"] = covered[:, LEVELS.index(0.95)], count
-    for block, (value, regular) in nees.items():
-        measures[f"nees_{block}"] = value.sum(axis=1), regular.sum(axis=1)
-    for name in ("square_position", "square_heading"):
-        measures[name] = curves[name].sum(axis=1), steps
-    measures["square_landmarks"] = found.landmark_squares[:, 0], found.landmark_squares[:, 1]
-    measures["nis_per_dof"] = curves["nis"].sum(axis=1), curves["nis_dof"].sum(axis=1)
-    measures["log_likelihood"] = (
-        info.log_likelihood.sum(axis=1, dtype=np.float64),
-        curves["nis_dof"].any(axis=1),  # none without an innovation
-    )
-    sums["autocorrelation"] = np.asarray(found.autocorrelation)
-    measures["autocorrelation"] = found.autocorrelation[:, 0, 0], found.autocorrelation[:, 0, 1]
-
-    sums |= _counted(info)
-    sums["missed"] = np.asarray(truth.missed).sum(axis=1)
-    sums["singular_steps"] = steps - nees["pose"].regular.sum(axis=1)
+    runs = Runs(truth, trace, found, error, nees)
+    measures: dict[str, tuple[np.ndarray, np.ndarray]] = {}
     finite = np.array(found.finite)
-    for rows in jax.tree.leaves((measures, sums, curves)):
-        finite &= _finite(rows)
-
+    for measure in REGISTRY.values():
+        each = measure.of_runs(runs)
+        if each is None:
+            continue
+        total, weight = np.asarray(each.total), np.broadcast_to(each.weight, finite.shape)
+        measures[measure.column] = total, weight
+        sums |= each.sums
+    for rows in jax.tree.leaves((measures, sums)):
+        finite &= np.isfinite(rows).reshape(len(rows), -1).all(axis=1)
     at = snapshot_steps(steps)
     return Score(
         finite=finite,
-        measures={
-            name: (np.asarray(whole), np.broadcast_to(weight, finite.shape))
-            for name, (whole, weight) in measures.items()
-        },
+        measures=measures,
         snapshots=(error[:, at], cov[:, at], nees["pose"].regular[:, at]),
-        sums=sums | curves,
+        sums=sums,
     )
 
 
-def _finite(rows: np.ndarray) -> Bool[np.ndarray, "..."]:
-    """Whether every number of a run is finite, (R,); () of a number that all runs share."""
-    out: np.ndarray = np.isfinite(rows)
-    return out.reshape(len(out), -1).all(axis=1) if out.ndim else out
+class _Sums(NamedTuple):
+    poison: Array
+    """() 0 times every number so far: NaN once one was not finite"""
+    recent: list[Array]
+    """(LAGS, N) each, the latest steps first: the numbers of w, |w|² and whether there is one"""
+    pairs: list[Array]
+    """(LAGS, N) each: Σ wᵀw', |w|²|there'|, |there||w'|², |there||there'|"""
 
 
-def _counted(info: Info) -> dict[str, Int[np.ndarray, "R"]]:
-    """How many measurements became what, and how often each of `EVENTS` happened."""
-    runs = len(info.status)
-    at = np.asarray(info.status).reshape(runs, -1) + np.arange(runs)[:, None] * len(Status)
-    became = np.bincount(at.ravel(), minlength=runs * len(Status)).reshape(runs, -1)
-    out = {status.name.lower(): became[:, status] for status in KEPT + DROPS}
-    for name in EVENTS:
-        happened = _event(info, name)
-        if happened is not None:
-            out[name] = happened.reshape(runs, -1).sum(axis=1)
-    return out
+def run_statistics(
+    trace: Trace, truth: Truth, sensor: Sensor, measures: Sequence[Measure] = ()
+) -> RunStatistics:
+    """The sums over one run that `score` is made of. For `vmap`, over runs.
 
-
-def _event(info: Info, name: str) -> np.ndarray | None:
-    """How often one of `EVENTS` happened, (R, T, …); None where the filter does not report it."""
-    record, field = EVENTS[name]
-    holder = info if record is None else (info.extra or {}).get(record)
-    found = getattr(holder, field, None)
-    if found is None:
-        return None
-    return np.asarray(found[..., 0] >= 0 if name == "merged" else found)
-
-
-def _covered(nees: Nees, dof: int) -> Int[np.ndarray, "R LEVELS"]:
-    """At how many steps the truth lies in the ellipsoid of each of the probabilities `LEVELS`."""
-    runs, bins = len(nees.value), len(LEVELS) + 1
-    radii = [chi2_quantile(p, dof) for p in LEVELS]
-    beyond = np.searchsorted(radii, np.where(nees.regular, nees.value, np.inf))
-    at = beyond + np.arange(runs)[:, None] * bins
-    within = np.bincount(at.ravel(), minlength=runs * bins).reshape(runs, bins)
-    out: np.ndarray = within.cumsum(axis=1)[:, :-1]
-    return out
-
-
-def monitor_of(state: PyTree) -> Monitor | None:
-    """The observability monitor in the state of a `monitored` filter; None in another state."""
-    return state.monitor if isinstance(state, MonitoredState) else None
-
-
-def _null_space(
-    monitor: Monitor, information: Float[np.ndarray, "R T 3 3"]
-) -> tuple[Float[np.ndarray, "R T"], Int[np.ndarray, "R"]]:
-    """Information gained along a turn of the whole frame by each step, and the dimension of the
-    unobservable subspace of the filter's linearized system.
-
-    A direction is unobservable if what was gained along it is below 1e-9 of the same sum of squares
-    with absolute values, in float32 eps^(3/4): rounding leaves 1e-32 of it, the higher moments that
-    sigma points do not see 1e-10, an EKF's changing Jacobians 1e-5 after a hundred steps.
+    measures: those with `of_run` are taken, too. Raises ValueError on one that returns neither a
+    number nor one a step.
     """
-    least = max(1e-9, float(np.finfo(information.dtype).eps) ** 0.75)
-    scale = np.sqrt(np.where(monitor.scale > 0, monitor.scale, 1.0).astype(np.float64))
-    unit = monitor.information / scale[:, :, None] / scale[:, None, :]
-    regular = np.isfinite(unit).all(axis=(1, 2))
-    size = np.linalg.eigvalsh(np.where(regular[:, None, None], unit, 0.0))
-    gained = np.einsum("rtij,ri,rj->rt", information.astype(np.float64), monitor.turn, monitor.turn)
-    return gained, (size < least).sum(axis=1)
+    estimate, info = trace.estimate, trace.info
+    held = jnp.where(estimate.alive, estimate.tag, -1)
+    values: dict[str, Array | tuple[Array, Array]] = {}
+    if truth.origin is not None:
+        origin = jnp.asarray(truth.origin)
+        held = identities(trace, origin)
+        values |= associations(trace, origin, held)
+    points = jax.vmap(sensor.position)(jnp.asarray(truth.landmarks))
+    size, count = info.innovation.shape[2], estimate.alive.shape[1] or info.slot.shape[1]
+    dtype = estimate.pose.dtype
+
+    def step(sums: _Sums, row: tuple[Estimate, Info, Array]) -> tuple[_Sums, PyTree]:
+        estimate, info, held = row
+        off = points[jnp.maximum(held, 0)] - estimate.points
+        nees, regular = _planar_nees(off, jnp.asarray(estimate.point_covs))
+        counts = regular & (held >= 0)
+        white = _white(estimate, info)
+        *w, energy, there = sums.recent
+        *w_now, energy_now, there_now = white
+        products = [
+            linalg.total(old * new[None] for old, new in zip(w, w_now, strict=True))
+            if size
+            else jnp.zeros_like(energy),
+            energy * there_now[None],
+            there * energy_now[None],
+            there * there_now[None],
+        ]
+        sums = _Sums(
+            poison=sums.poison + 0 * _numbers((estimate, info)),
+            recent=[
+                jnp.concatenate([new[None], old[:-1]])
+                for new, old in zip(white, sums.recent, strict=True)
+            ],
+            pairs=[old + new for old, new in zip(sums.pairs, products, strict=True)],
+        )
+        return sums, (jnp.where(counts, nees, 0.0).sum(), counts.sum().astype(dtype))
+
+    first = jax.tree.map(lambda leaf: leaf[0], (estimate, info))
+    nothing = _Sums(
+        poison=jnp.zeros_like(_numbers(first)),
+        recent=[jnp.zeros((LAGS, count), dtype)] * (size + 2),
+        pairs=[jnp.zeros((LAGS, count), dtype)] * 4,
+    )
+    sums, (nees, regular) = jax.lax.scan(step, nothing, (estimate, info, held))
+    product, left, right, pairs = (pair.sum(axis=1) for pair in sums.pairs)
+    both = left * right
+    length = jnp.where(both > 0, jnp.sqrt(jnp.where(both > 0, both, 1.0)), 0.0)
+    named = (held[-1] >= 0) & (estimate.point_covs[-1] != 0).any()  # a known map has no errors
+    off = points[jnp.maximum(held[-1], 0)] - estimate.points[-1]
+    square = jnp.where(named, (off**2).sum(axis=-1), 0.0).sum()
+    return RunStatistics(
+        finite=jnp.isfinite(sums.poison).all(),
+        landmark_nees=nees,
+        regular_landmarks=regular,
+        landmark_squares=jnp.stack([square, named.sum().astype(dtype)]),
+        autocorrelation=jnp.stack([product, length, pairs * size], axis=1),
+        values=values | {one.key: _value(one, trace, truth) for one in measures if one.of_run},
+    )
+
+
+def _value(measure: Measure, trace: Trace, truth: Truth) -> Array:
+    """What a measure is in one run, () or (T,)."""
+    assert measure.of_run is not None
+    dtype, steps = trace.estimate.pose.dtype, len(trace.estimate.pose)
+    value = jnp.asarray(measure.of_run(truth, trace), dtype)
+    if value.shape not in ((), (steps,)):
+        raise ValueError(
+            f"measure {measure.key}: expected of_run to return a number or one for each of the "
+            f"{steps} steps, got an array of shape {value.shape}"
+        )
+    return value
+
+
+def _numbers(tree: PyTree) -> Float[Array, "K"]:
+    """Every floating-point number of a tree, in one row."""
+    leaves = map(jnp.asarray, jax.tree.leaves(tree))
+    return jnp.concatenate(
+        [leaf.ravel() for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    )
+
+
+def _planar_nees(
+    error: Float[Array, "N 2"], cov: Float[Array, "N 2 2"]
+) -> tuple[Float[Array, "N"], Bool[Array, "N"]]:
+    """The NEES eᵀ P⁻¹ e of each landmark, and whether P is regular: 1 - ρ² > 200 eps.
+
+    a²/p₁ + (b - a p₁₂/p₁)²/(p₂(1 - ρ²)); 0 where P is not regular or e not finite.
+    """
+    p1, p12, p2 = cov[:, 0, 0], cov[:, 1, 0], cov[:, 1, 1]
+    there = (p1 > 0) & (p2 > 0) & jnp.isfinite(error).all(axis=1)
+    p1, p2 = (jnp.where(there, p, 1.0) for p in (p1, p2))
+    left = 1 - (p12 / p1) * (p12 / p2)
+    regular = there & (left > 200 * float(jnp.finfo(cov.dtype).eps))
+    a = error[:, 0]
+    b = error[:, 1] - a * (p12 / p1)
+    nees = a**2 / p1 + b**2 / (p2 * jnp.where(regular, left, 1.0))
+    return jnp.where(regular, nees, 0.0), regular
+
+
+def _white(estimate: Estimate, info: Info) -> list[Array]:
+    """The numbers of the whitened innovation w, |w|², and 1 where there is one, else 0; (N,) each.
+
+    By landmark, of the first measurement fused with it; by measurement slot where there is no map.
+    """
+    fused = info.status == Status.FUSED
+
+    def whiten(nu: Array, cov: Array) -> Array:
+        return linalg.solve_lower(linalg.cholesky(cov)[0], nu)
+
+    white = jax.vmap(whiten)(info.innovation, info.innovation_cov)
+    white = jnp.where(fused[:, None], white, 0.0)
+    rows = [*white.T, (white**2).sum(axis=1), fused.astype(white.dtype)]
+    count = estimate.alive.shape[0]
+    if count == 0:
+        return rows
+    slot = jnp.where(fused, info.slot, -1)
+
+    def place(kept: list[Array], at: tuple[list[Array], Array]) -> tuple[PyTree, None]:
+        row, slot = at
+        mine = jnp.arange(count) == slot
+        return [jnp.where(mine, new, old) for new, old in zip(row, kept, strict=True)], None
+
+    nothing = [jnp.zeros(count, white.dtype)] * len(rows)
+    unroll = max(min(len(slot), _UNROLLED), 1)
+    return jax.lax.scan(place, nothing, (rows, slot), reverse=True, unroll=unroll)[0]

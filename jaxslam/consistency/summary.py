@@ -7,28 +7,17 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 
 import numpy as np
-from jaxtyping import PyTree
 
-from jaxslam.consistency.credibility import credibility
-from jaxslam.consistency.intervals import LEVEL, Measure, interval, positive_interval
-from jaxslam.consistency.nees import DOF
-from jaxslam.consistency.score import DROPS, EVENTS, KEPT
+from jaxslam.consistency.intervals import Average
+from jaxslam.consistency.measures import measures_of
+from jaxslam.consistency.measures.credibility import coverage_curves
+from jaxslam.consistency.measures.errors import over_bound
+from jaxslam.consistency.measures.innovations import autocorrelation_of, nis_band
+from jaxslam.consistency.measures.nees import inside_bands
 from jaxslam.consistency.tally import SHOTS, Tally
 from jaxslam.consistency.verdict import judge
-from jaxslam.math.stats import chi2_quantile, chi2_quantiles, normal_quantile
-
-NORMAL = normal_quantile(0.5 + LEVEL / 2)
-
-COUNTS = tuple(status.name.lower() for status in (*KEPT, *DROPS)) + (
-    *("missed", "singular_steps"),
-    *EVENTS,
-)
-"""The sums that are reported as counts."""
 
 _IN_REPR = ("nees_pose", "nis_per_dof", "rmse_position")
-
-POSITIVE = ("nees", "nis", "square", "noncredibility")
-"""How the names of measures begin that cannot be negative."""
 
 
 @dataclass(frozen=True, repr=False)
@@ -37,7 +26,7 @@ class Summary:
 
     verdict: str
     """consistent, optimistic, pessimistic, diverged, incomplete or undecided; see `judge`."""
-    measures: dict[str, Measure]
+    measures: dict[str, Average]
     """Each with its interval over the runs; names without a number (nothing to average) are absent.
 
     NEES, none divided by its dof: nees_pose (3), nees_position (2), nees_heading (1) in (x, y, θ),
@@ -95,69 +84,33 @@ def summarize(tally: Tally, bound: Mapping[str, np.ndarray] | None = None) -> Su
     bound: position [m²] and heading [rad²], (T,) each, the mean conditional bound over the runs.
     """
     sums, finite = tally.sums, tally.flags("finite")
-    runs = int(finite.sum())
+    runs, per_run = int(finite.sum()), tally.measures()
+    every, snapshots = measures_of(per_run), tally.snapshots()
+    of_snapshots = np.flatnonzero(finite & (tally.numbers() < SHOTS))
+    measures: dict[str, Average] = {}
     curves: dict[str, np.ndarray] = {}
-    inside: dict[str, float] = {}
-    coverage: dict[str, np.ndarray] = {}
-    for block, dof in DOF.items():
-        count = sums[f"regular_{block}"]
-        mean = _ratio(sums[f"nees_{block}"], count)
-        low, high = _bands(count, dof)
-        curves |= {f"nees_{block}": mean, f"nees_{block}_low": low, f"nees_{block}_high": high}
-        curves[f"runs_{block}"] = count
-        has = count > 0
-        if has.any():
-            inside[block] = float(np.mean((mean >= low)[has] & (mean <= high)[has]))
-        coverage[block] = _ratio(sums[f"coverage_{block}"], sums[f"coverage_runs_{block}"])
-    curves["rmse_position"] = np.sqrt(_ratio(sums["square_position"], np.asarray(runs)))
-    curves["rmse_heading_deg"] = np.rad2deg(
-        np.sqrt(_ratio(sums["square_heading"], np.asarray(runs)))
-    )
-    curves["nis_per_dof"] = _ratio(sums["nis"], sums["nis_dof"])
-    if "rotation_information" in sums:
-        curves["rotation_information"] = _ratio(sums["rotation_information"], np.asarray(runs))
-
-    per_run = tally.measures()
-    shot = credibility(*tally.snapshots())
-    if shot is not None:
-        looked_at = np.flatnonzero(finite & (tally.numbers() < SHOTS))
-        for name, values in zip(("noncredibility", "inclination"), shot, strict=True):
-            per_run[name] = np.full(len(finite), np.nan)
-            per_run[name][looked_at] = values
-    measures: dict[str, Measure] = {}
-    for name, values in per_run.items():
-        bounded = name.startswith(POSITIVE)
-        skewed = name != "nis_per_dof"
-        measure = positive_interval(values, skewed=skewed) if bounded else interval(values)
-        if measure is not None:
-            measures |= _as_reported(name, measure)
-    for name, key, one in (
-        ("position", "rmse_position", 1.0),
-        ("heading", "rmse_heading_deg", np.rad2deg(1.0)),
-    ):
-        # The bound is averaged over all runs, so it is no yardstick where some were lost.
-        if bound is not None and finite.all() and key in measures and bound[name].mean() > 0:
-            least = one * np.sqrt(bound[name].mean())
-            measures[f"bound_ratio_{name}"] = Measure(*(x / least for x in measures[key]))
-            curves[key.replace("rmse", "bound")] = one * np.sqrt(bound[name])
+    for measure in every:
+        shot = measure.of_snapshots(*snapshots)
+        if shot is not None:
+            per_run[measure.column] = np.full(len(finite), np.nan)
+            per_run[measure.column][of_snapshots] = shot
+        if measure.column in per_run:
+            average = measure.average(per_run[measure.column], sums)
+            if average is not None:
+                measures[measure.key] = average
+        curves |= measure.curves(sums, runs)
+    # The bound is averaged over all runs, so it is no yardstick where some were lost.
+    if bound is not None and finite.all():
+        ratios, bounds = over_bound(measures, bound)
+        measures, curves = measures | ratios, curves | bounds
     total_dof = float(np.sum(sums["nis_dof"]))
-    nis_band = None
-    if total_dof > 0:
-        share = float(np.sum(sums["nis"])) / total_dof
-        by_runs = measures["nis_per_dof"]
-        scale = share / by_runs.value if by_runs.value > 0 else 1.0
-        measures["nis_per_dof"] = Measure(share, scale * by_runs.low, scale * by_runs.high)
-        tail = (1 - LEVEL) / 2
-        nis_band = (
-            chi2_quantile(tail, total_dof) / total_dof,
-            chi2_quantile(1 - tail, total_dof) / total_dof,
-        )
+    autocorrelation, band = autocorrelation_of(sums)
     counts = {
         "runs": runs,
         "not_finite": int((~finite).sum()),
         "divergent": int(tally.flags("divergent").sum()),
     }
-    counts |= {name: int(value) for name, value in sums.items() if name in COUNTS}
+    counts |= {name: int(value) for name, value in sums.items() if value.ndim == 0}
     verdict = judge(per_run, counts, total_dof)
     return Summary(
         verdict=verdict.word,
@@ -166,37 +119,13 @@ def summarize(tally: Tally, bound: Mapping[str, np.ndarray] | None = None) -> Su
         doubts=verdict.doubts,
         honest_nis=verdict.honest_nis,
         measures=measures,
-        nis_band=nis_band,
-        inside=inside,
+        nis_band=nis_band(total_dof),
+        inside=inside_bands(curves),
         curves=curves,
-        coverage=coverage,
-        autocorrelation_band=_ratio(NORMAL, np.sqrt(sums["autocorrelation"][:, 2])),
-        autocorrelation=_ratio(sums["autocorrelation"][:, 0], sums["autocorrelation"][:, 1]),
+        coverage=coverage_curves(sums, per_run),
+        autocorrelation=autocorrelation,
+        autocorrelation_band=band,
         counts=counts,
         per_run=per_run,
         not_finite_runs=tally.numbers()[~finite].tolist(),
     )
-
-
-def _as_reported(name: str, measure: Measure) -> dict[str, Measure]:
-    """Mean squares become roots, as do the ends of their intervals; radians become degrees."""
-    kind, _, what = name.partition("_")
-    if kind != "square":
-        return {name: measure}
-    unit = np.rad2deg(1.0) if what == "heading" else 1.0
-    name = "rmse_heading_deg" if what == "heading" else f"rmse_{what}"
-    return {name: Measure(*(unit * float(np.sqrt(value)) for value in measure))}
-
-
-def _ratio(total: PyTree, count: np.ndarray) -> np.ndarray:
-    safe = np.where(count > 0, count, 1.0)
-    return np.where(count > 0, np.asarray(total, np.float64) / safe, np.nan)
-
-
-def _bands(count: np.ndarray, dof: int) -> tuple[np.ndarray, np.ndarray]:
-    """Two-sided chi-square band of the mean of count χ²_dof variables, step by step."""
-    tail = (1 - LEVEL) / 2
-    safe = np.maximum(count, 1)
-    edges = [chi2_quantiles(p, dof * safe) / safe for p in (tail, 1 - tail)]
-    low, high = (np.where(count > 0, edge, np.nan) for edge in edges)
-    return low, high

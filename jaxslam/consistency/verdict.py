@@ -12,8 +12,8 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxslam.consistency.intervals import LEVEL, Spread, percentage, spread
-from jaxslam.consistency.nees import DOF
-from jaxslam.consistency.score import DROPS, KEPT
+from jaxslam.consistency.measures.counts import DROPS, KEPT
+from jaxslam.consistency.measures.nees import DOF
 from jaxslam.math.stats import normal_quantile, truncated_chi2_mean
 from jaxslam.types import Status
 

@@ -11,7 +11,7 @@ from jaxtyping import Float, PyTree
 
 from jaxslam import metrics
 from jaxslam.consistency import LEVEL, percentage
-from jaxslam.consistency.nees import block_nees, pose_error
+from jaxslam.consistency.measures.nees import block_nees, pose_error
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.filters.ekf.map_coordinates import cov_of_coordinates
 from jaxslam.math.stats import chi2_band, chi2_quantile

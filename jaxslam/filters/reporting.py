@@ -171,7 +171,11 @@ def seen_before(tag: jax.Array, among: jax.Array) -> jax.Array:
 
 
 def with_extra(info: Info, name: str, record: PyTree) -> Info:
-    """The `Info` with a named record of one filter family or wrapper."""
+    """The `Info` with a named record of one filter family or wrapper.
+
+    A campaign counts what the record's method `counts` returns, if it has one: arrays by name, the
+    sums of which over the steps are the counts.
+    """
     return info._replace(extra={**(info.extra or {}), name: record})
 
 
@@ -180,6 +184,10 @@ class Pruned(NamedTuple):
 
     removed: jax.Array
     """(N,) bool: slots whose landmark was removed in this step"""
+
+    def counts(self) -> dict[str, jax.Array]:
+        """What a campaign counts."""
+        return {"removed": self.removed}
 
 
 def with_removed(info: Info, removed: jax.Array) -> Info:

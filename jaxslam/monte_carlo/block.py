@@ -12,6 +12,7 @@ from jax.sharding import NamedSharding
 from jaxtyping import Float, PyTree
 
 from jaxslam.consistency import Score, condense, final_covariance, score
+from jaxslam.consistency.measures import REGISTRY
 from jaxslam.consistency.tally import condensed_sums
 from jaxslam.core.record import as_record
 from jaxslam.filters.ekf.observability import MonitoredState
@@ -23,6 +24,7 @@ from jaxslam.monte_carlo.programs import (
     mesh_of,
     programs,
     spec,
+    statistics_program,
     structs,
 )
 from jaxslam.protocols import Candidate
@@ -69,6 +71,8 @@ class BlockRunner:
     def __init__(self, plan: CampaignPlan) -> None:
         self.plan, self._devices = plan, tuple(plan.devices)
         self.programs = programs(self._devices, plan.dtype)
+        traced = tuple(one for one in REGISTRY.values() if one.of_run is not None)
+        self._statistics = statistics_program(self._devices, traced)
         # The numbers of world and filters are put on every device once.
         everywhere = NamedSharding(mesh_of(self._devices), spec(None))
         self._world: World = jax.device_put(plan.scenario, everywhere)
@@ -107,7 +111,7 @@ class BlockRunner:
             for one in self._filters.values():
                 shapes = start(made.drive, world, one, self._key, runs, draws)
                 results: FilterResults = structs(shapes, devices, RUN_AXES)
-                start(made.statistics, world.sensor, draws[0], results.estimate, results.info)
+                start(self._statistics, world.sensor, draws[0], results.estimate, results.info)
             if plan.limit_by_bound:
                 start(made.bound, world, self._key, runs, draws)
             for each in compiling.values():
@@ -171,8 +175,9 @@ class BlockRunner:
 
     def _score(self, results: FilterResults, drawn: Truth, truth: Truth, mine: slice) -> Score:
         """The scores of the runs mine. drawn: the truth on the devices, truth: on the host."""
-        made, sensor = self.programs, self._world.sensor
-        found = jax.device_get(made.statistics(sensor, drawn, results.estimate, results.info))
+        found = jax.device_get(
+            self._statistics(self._world.sensor, drawn, results.estimate, results.info)
+        )
         own = np.swapaxes(jax.device_get(results.own_error), 0, 1)
         trace = _on_host(results)
         return score(*jax.tree.map(lambda leaf: leaf[mine], (trace, truth, found, own)))

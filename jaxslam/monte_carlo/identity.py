@@ -21,6 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import DTypeLike
 
+from jaxslam.consistency.measures import BUILT_IN, REGISTRY
 from jaxslam.core.record import is_record
 from jaxslam.protocols import Candidate
 from jaxslam.simulation.worlds import World
@@ -51,6 +52,7 @@ def identity(
     compute, as "cpu"; rounding differs between platforms.
     """
     parts = {name: digest(getattr(scenario, name)) for name in _OF_WORLD}
+    registered = [one for one in REGISTRY.values() if one not in BUILT_IN]
     fields = {field.name for field in dataclasses.fields(scenario)} - _NO_PART_OF_DRAWS
     rest = {name: getattr(scenario, name) for name in fields - set(_OF_WORLD)}
     return {
@@ -67,6 +69,7 @@ def identity(
         **parts,
         "world": digest((type(scenario), rest)),
         **{f"filter {name}": digest(candidate) for name, candidate in filters.items()},
+        **{f"measure {one.key}": digest((type(one), one.of_run)) for one in registered},
     }
 
 

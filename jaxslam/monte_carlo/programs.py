@@ -4,7 +4,7 @@
 
     draw                           world, key, numbers (B,)               truth, log (B, …)
      ├─> drive, one a filter       world, filter, key, numbers, draws     `FilterResults` (T, B, …)
-     │    └─> statistics           sensor, truth, estimate, info          `Statistics` (B, …)
+     │    └─> statistics           sensor, truth, estimate, info          `RunStatistics` (B, …)
      ├─> bound, where needed       world, key, numbers, draws             variances (B, T)
      └─> jacobians, else           world, truth, log of run 0             `RunJacobians` (T, …)
 
@@ -29,6 +29,7 @@ from jax.typing import DTypeLike
 from jaxtyping import Array, Float, Int, PyTree
 
 from jaxslam.consistency import (
+    Measure,
     RunStatistics,
     conditional_bound,
     jacobians_at_truth,
@@ -70,7 +71,6 @@ class Programs(NamedTuple):
 
     draw: PyTree
     drive: PyTree
-    statistics: PyTree
     bound: PyTree
     jacobians: PyTree
 
@@ -78,26 +78,35 @@ class Programs(NamedTuple):
 @functools.cache
 def programs(devices: Sequence[jax.Device], dtype: np.dtype | None) -> Programs:
     """The programs on these devices; dtype: of the worlds, None for that of JAX."""
-    mesh, platform = mesh_of(devices), devices[0].platform
+    platform = devices[0].platform
     hot, quick = hot_options(platform), quick_options(platform)
-
-    def over_runs(function: Callable[..., PyTree], axes: PyTree, out: PyTree) -> PyTree:
-        """The function with runs divided over the devices; axes: those over runs, or None."""
-        inputs, outputs = (jax.tree.map(spec, one, is_leaf=_is_none) for one in (axes, out))
-        return jax.shard_map(
-            function, mesh=mesh, in_specs=inputs, out_specs=outputs, check_vma=False
-        )
-
-    draw = over_runs(functools.partial(draw_worlds, dtype), (None, None, 0), 0)
-    drive = over_runs(drive_filter, (None, None, None, 0, 0), RUN_AXES)
-    statistics = over_runs(statistics_of_runs, (None, 0, 1, 1), 0)
-    bound = over_runs(bound_variances, (None, None, 0, 0), 0)
+    of_draw = functools.partial(draw_worlds, dtype)
+    draw = over_runs(devices, of_draw, (None, None, 0), 0)
+    drive = over_runs(devices, drive_filter, (None, None, None, 0, 0), RUN_AXES)
+    bound = over_runs(devices, bound_variances, (None, None, 0, 0), 0)
     return Programs(
         jax.jit(draw, compiler_options=quick),
         jax.jit(drive, compiler_options=hot),
-        jax.jit(statistics, compiler_options=hot),
         jax.jit(bound, compiler_options=hot),
         jax.jit(jacobians_at_truth, compiler_options=quick),
+    )
+
+
+@functools.cache
+def statistics_program(devices: Sequence[jax.Device], measures: tuple[Measure, ...]) -> PyTree:
+    """The statistics program on these devices. measures: those with `of_run`."""
+    of_runs = functools.partial(statistics_of_runs, measures)
+    statistics = over_runs(devices, of_runs, (None, 0, 1, 1), 0)
+    return jax.jit(statistics, compiler_options=hot_options(devices[0].platform))
+
+
+def over_runs(
+    devices: Sequence[jax.Device], function: Callable[..., PyTree], axes: PyTree, out: PyTree
+) -> PyTree:
+    """The function with runs divided over the devices; axes: those over runs, or None."""
+    inputs, outputs = (jax.tree.map(spec, one, is_leaf=_is_none) for one in (axes, out))
+    return jax.shard_map(
+        function, mesh=mesh_of(devices), in_specs=inputs, out_specs=outputs, check_vma=False
     )
 
 
@@ -160,12 +169,12 @@ def drive_filter(
 
 
 def statistics_of_runs(
-    sensor: Sensor, truth: Truth, estimate: Estimate, info: Info
+    measures: tuple[Measure, ...], sensor: Sensor, truth: Truth, estimate: Estimate, info: Info
 ) -> RunStatistics:
     """The statistics (B, …) of each run."""
 
     def one(truth: Truth, estimate: Estimate, info: Info) -> RunStatistics:
-        return run_statistics(Trace(estimate, info, None, None), truth, sensor)
+        return run_statistics(Trace(estimate, info, None, None), truth, sensor, measures)
 
     found: RunStatistics = jax.vmap(one, in_axes=(0, 1, 1))(truth, estimate, info)
     return found

@@ -80,9 +80,10 @@ class Campaign:
         """Write the report into a folder, and return the paths of its files.
 
         They are report.html (one page with its figures embedded), consistency.json (verdicts,
-        measures and counts), consistency.csv (the averages of every step) and the figures. All of
-        them appear when all are complete, or none. Two figures show run 0 of each filter; they are
-        left out where this process did not compute that run (`first`).
+        measures and counts), measures.csv (the table of them), consistency.csv (the averages of
+        every step) and the figures. All of them appear when all are complete, or none. Two figures
+        show run 0 of each filter; they are left out where this process did not compute that run
+        (`first`).
 
         Args:
             folder: it is created if needed.
@@ -115,9 +116,9 @@ class Campaign:
             raise ImportError(
                 "Campaign.to_dataframe needs pandas, which is not installed: pip install pandas"
             ) from None
-        from jaxslam.results import run_table
+        from jaxslam.results import report
 
-        return pandas.DataFrame(run_table.columns(self))
+        return pandas.DataFrame(report.run_columns(self))
 
     def save_runs(self, path: str | Path) -> Path:
         """Write the table of `to_dataframe` to a file, and return its path; it is replaced.
@@ -128,9 +129,9 @@ class Campaign:
             ValueError: on another ending.
             OSError: if the folder cannot be written.
         """
-        from jaxslam.results import run_table
+        from jaxslam.results import report
 
-        return run_table.save_table(self, path)
+        return report.save_runs(self, path)
 
 
 class Interrupted(KeyboardInterrupt):

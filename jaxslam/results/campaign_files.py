@@ -14,13 +14,16 @@ from jaxslam.monte_carlo.block import BOUND
 from jaxslam.monte_carlo.campaign import summaries_of
 from jaxslam.monte_carlo.kept import add_kept
 from jaxslam.results import report, store
-from jaxslam.results.files import check_writable, versions, write_files
+from jaxslam.results.files import check_formats, check_writable, versions, write_files
 
 if TYPE_CHECKING:  # Matplotlib is slow to load
     from jaxslam.results.plot import Figure
 
 PAGE, RESULT, CURVES = "report.html", "consistency.json", "consistency.csv"
 """The page; the verdicts, measures and counts; the averages of every step."""
+
+TABLE = "measures.csv"
+"""The table of the page."""
 
 BLOCKS = "blocks"
 """The folder of a campaign's finished blocks, beside its results."""
@@ -37,21 +40,12 @@ _IN_NOTEBOOK = ("nees", "rmse")
 def file_names(formats: Iterable[str], figures: Iterable[str] = FIGURES) -> list[str]:
     """The names of the files of a campaign's report, with figures of these formats."""
     kinds = list(formats)
-    return [PAGE, RESULT, CURVES, *(f"{name}.{kind}" for name in figures for kind in kinds)]
+    return [PAGE, RESULT, CURVES, TABLE, *(f"{name}.{kind}" for name in figures for kind in kinds)]
 
 
-def check_figure_formats(caller: str, asked: str | Iterable[str]) -> tuple[str, ...]:
-    """The formats that were asked for, each once; raises ValueError that names another one."""
-    try:
-        kinds = tuple(dict.fromkeys([asked] if isinstance(asked, str) else asked))
-    except TypeError:
-        raise ValueError(
-            f"{caller}: expected formats of {', '.join(FORMATS)}, or () for none, got {asked!r}"
-        ) from None
-    for kind in kinds:
-        if kind not in FORMATS:
-            raise ValueError(f"{caller}: expected formats of {', '.join(FORMATS)}, got {kind!r}")
-    return kinds
+def check_figure_formats(caller: str, given: str | Iterable[str]) -> tuple[str, ...]:
+    """The formats of figures, each once; raises ValueError that names another one."""
+    return check_formats(caller, given, FORMATS)
 
 
 def filter_of_run_zero(campaign: Campaign) -> str:
@@ -97,7 +91,6 @@ def save_campaign(
     files: dict[str, str | Callable[[Path], object]] = {
         PAGE: page.page(
             campaign,
-            report.ROWS,
             command,
             seed,
             versions(),
@@ -106,6 +99,7 @@ def save_campaign(
         ),
         RESULT: report.as_json(campaign, command, seed),
         CURVES: report.as_csv(campaign),
+        TABLE: report.table_csv(campaign),
     }
     for name, (_, figure) in drawn.items():
         files |= {f"{name}.{kind}": saved(figure, kind) for kind in formats}
@@ -173,7 +167,7 @@ def notebook(campaign: Campaign) -> str:
     drawings = _drawings(campaign, None)
     shown = ((name, *drawings[name]) for name in _IN_NOTEBOOK)
     figures = {name: (caption, make()) for name, caption, make in shown}
-    return page.fragment(campaign, report.ROWS, figures, partial(plot.png, dpi=110))
+    return page.fragment(campaign, figures, partial(plot.png, dpi=110))
 
 
 def _drawings(
@@ -190,7 +184,7 @@ def _drawings(
             partial(plot.rmse_figure, campaign),
         ),
         "cost": (
-            "Error and NEES against the time of a step",
+            "Time of a step, error and NEES",
             partial(plot.cost_figure, campaign),
         ),
         "coverage": ("Coverage of the ellipsoids", partial(plot.coverage_figure, campaign)),

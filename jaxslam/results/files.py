@@ -8,7 +8,7 @@ import math
 import os
 import platform
 import tempfile
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from importlib.metadata import version
 from pathlib import Path
 from typing import SupportsFloat, TypeAlias
@@ -45,6 +45,19 @@ def versions() -> dict[str, str]:
     return {"python": platform.python_version()} | {
         name: version(name) for name in ("jax", "numpy")
     }
+
+
+def check_formats(caller: str, given: str | Iterable[str], known: Sequence[str]) -> tuple[str, ...]:
+    """The formats given, each once; raises ValueError that names one that is not known."""
+    expected = f"{caller}: expected formats of {', '.join(known)}"
+    try:
+        kinds = tuple(dict.fromkeys([given] if isinstance(given, str) else given))
+    except TypeError:
+        raise ValueError(f"{expected}, or () for none, got {given!r}") from None
+    for kind in kinds:
+        if kind not in known:
+            raise ValueError(f"{expected}, got {kind!r}")
+    return kinds
 
 
 def check_writable(folder: Path) -> None:

@@ -1,51 +1,30 @@
-"""Results as text: a campaign's table, JSON and CSV, and CSV of a single run."""
+"""Results as text: a campaign's table, JSON and CSV, the table of its runs, CSV of one run."""
 
+import json
 import math
 import textwrap
 from collections.abc import Iterable, Sequence
+from pathlib import Path
 
 import numpy as np
 
-from jaxslam.consistency import (
-    DOF,
-    LANDMARK_DOF,
-    LEVEL,
-    LEVELS,
-    Measure,
-    Summary,
-    lopsided,
-    percentage,
-)
+from jaxslam.consistency import LEVEL, LEVELS, Average, Summary, lopsided, percentage
 from jaxslam.consistency.verdict import POWER, TESTS
 from jaxslam.monte_carlo import Campaign
-from jaxslam.results.files import csv_text, json_number, json_text, versions
-from jaxslam.results.meanings import VERDICTS, count_label, notes_on
+from jaxslam.results.files import (
+    check_formats,
+    check_writable,
+    csv_text,
+    json_number,
+    json_text,
+    versions,
+    write_files,
+)
+from jaxslam.results.table import VERDICTS, Cell, lost_runs, notes_on, rows_of
 from jaxslam.types import Estimate
 
-ROWS = (
-    ("nees_pose", "pose NEES (x, y, θ)", f"{DOF['pose']}"),
-    ("nees_own", "pose NEES, in its chart", f"{DOF['pose']}"),
-    ("nees_position", "position NEES", f"{DOF['position']}"),
-    ("nees_heading", "heading NEES", f"{DOF['heading']}"),
-    ("nees_landmarks", "landmark NEES", f"{LANDMARK_DOF}"),
-    ("nis_per_dof", "NIS / dof", "1"),
-    ("autocorrelation", "innovation autocorr., lag 1", "0"),
-    ("coverage_95_pose", "pose in 95 % ellipsoid", "0.95"),
-    ("noncredibility", "noncredibility [dB]", "0"),
-    ("inclination", "inclination [dB]", "0"),
-    ("rmse_position", "position RMSE [m]", ""),
-    ("bound_ratio_position", "  over conditional bound", "1"),
-    ("rmse_heading_deg", "heading RMSE [°]", ""),
-    ("bound_ratio_heading", "  over conditional bound", "1"),
-    ("rmse_landmarks", "landmark RMSE [m]", ""),
-    ("precision", "associations: precision", "1"),
-    ("recall", "associations: recall", "1"),
-    ("false_landmarks", "false landmarks", "0"),
-    ("unobservable", "unobservable directions", "3"),
-    ("rotation_information", "rotation information [1/rad²]", "0"),
-    ("log_likelihood", "log-likelihood", ""),
-)
-"""Rows of the table: key of the measure, label, and the value of a consistent filter."""
+RUN_FORMATS = ("csv", "json")
+"""Of `save_runs`."""
 
 _COLUMNS = 5
 
@@ -74,7 +53,7 @@ def campaign_table(campaign: Campaign) -> str:
     ]
     notes += [f"{term}: {said}." for term, said in notes_on(campaign)]
     notes += qualified(campaign)
-    notes += not_finite(campaign)
+    notes += [f"{name} {said}" for name, said in lost_runs(campaign)]
     if campaign.dtype == "float32":
         notes.append(
             "The filters ran in float32: for float64, set jax_enable_x64 in Python, or leave out "
@@ -89,7 +68,7 @@ def campaign_table(campaign: Campaign) -> str:
 def _explained(campaign: Campaign) -> list[str]:
     """The meanings of the verdicts that this campaign has."""
     found = {summary.verdict for summary in campaign.filters.values()}
-    return [f"{word}: {meaning}." for word, meaning in VERDICTS.items() if word in found]
+    return [f"{word}: {meaning}." for word, (_, meaning) in VERDICTS.items() if word in found]
 
 
 def qualified(campaign: Campaign) -> list[str]:
@@ -115,20 +94,6 @@ def qualified(campaign: Campaign) -> list[str]:
     ]
 
 
-def not_finite(campaign: Campaign) -> list[str]:
-    """A sentence on each filter that was not finite in some runs, with their numbers."""
-    out = []
-    for name, summary in campaign.filters.items():
-        lost = summary.not_finite_runs
-        if lost:
-            shown = ", ".join(map(str, lost[:20])) + (", …" if len(lost) > 20 else "")
-            out.append(
-                f"{name} was not finite in {len(lost)} of {campaign.runs} runs, which its measures "
-                f"leave out: {shown}"
-            )
-    return out
-
-
 def as_json(campaign: Campaign, command: str = "", seed: int | None = None) -> str:
     """The campaign without its curves as JSON, with versions, seed and command; NaN is null."""
     filters = {
@@ -138,8 +103,8 @@ def as_json(campaign: Campaign, command: str = "", seed: int | None = None) -> s
             "noticed": {key: _finite_or_none(np.asarray(ends)) for key, ends in s.noticed.items()},
             "doubts": s.doubts,
             "measures": {
-                key: dict(zip(Measure._fields, _finite_or_none(measure), strict=True))
-                for key, measure in s.measures.items()
+                key: dict(zip(Average._fields, _finite_or_none(average), strict=True))
+                for key, average in s.measures.items()
             },
             "nis_band": s.nis_band,
             "honest_nis": s.honest_nis,
@@ -173,6 +138,29 @@ def as_json(campaign: Campaign, command: str = "", seed: int | None = None) -> s
     return json_text(head | {"filters": filters})
 
 
+def table_csv(campaign: Campaign) -> str:
+    """The table as CSV: a row a measure; of each filter the value and the ends of its interval.
+
+    A verdict is a word, a band a text; cells without a number are empty.
+    """
+    names = list(campaign.filters)
+    ends = [f"{name}{end}" for name in names for end in ("", " low", " high")]
+    rows = [
+        [row.label.strip(), row.honest, *(text for cell in row.cells for text in _three(cell))]
+        for row in rows_of(campaign, names)
+    ]
+    return csv_text(["measure", "honest", *ends], rows)
+
+
+def _three(cell: Cell) -> list[str]:
+    """A cell as three of CSV: the value, and the ends of its interval."""
+    if isinstance(cell, Average):
+        return [_blank(value) for value in cell]
+    if cell is None or isinstance(cell, Summary):
+        return [cell.verdict if cell else "", "", ""]
+    return [cell.text if cell.value is None else _blank(cell.value), "", ""]
+
+
 def as_csv(campaign: Campaign) -> str:
     """The curves as CSV: a row for each filter and step; cells without a number are empty."""
     keys = list(dict.fromkeys(key for s in campaign.filters.values() for key in s.curves))
@@ -182,6 +170,50 @@ def as_csv(campaign: Campaign) -> str:
         columns = [map(_blank, s.curves.get(key, nothing).tolist()) for key in keys]
         rows += [[name, str(step + 1), *row] for step, row in enumerate(zip(*columns, strict=True))]
     return csv_text(["filter", "step", *keys], rows)
+
+
+def run_columns(campaign: Campaign) -> dict[str, np.ndarray]:
+    """The columns of a table with a row for each run of each filter; `Campaign.to_dataframe`."""
+    numbers, filters = campaign.run_numbers, campaign.filters
+    none = np.full(len(numbers), np.nan)
+    names = dict.fromkeys(name for s in filters.values() for name in s.per_run)
+    found: dict[str, np.ndarray] = {
+        "filter": np.repeat(np.array(list(filters), object), len(numbers)),
+        "run": np.tile(numbers, len(filters)),
+        "finite": np.concatenate([~np.isin(numbers, s.not_finite_runs) for s in filters.values()]),
+    }
+    for name in names:
+        found[name] = np.concatenate([s.per_run.get(name, none) for s in filters.values()])
+    return found
+
+
+def save_runs(campaign: Campaign, path: str | Path) -> Path:
+    """Write the table to a file of the format that its name ends in, whole or not at all.
+
+    In CSV what is not finite is an empty cell, in JSON (a list a column) null.
+
+    Raises ValueError on another format.
+    """
+    path = Path(path)
+    (kind,) = check_formats("Campaign.save_runs", path.suffix.removeprefix("."), RUN_FORMATS)
+    check_writable(path.parent)
+    found = run_columns(campaign)
+    if kind == "json":
+        made = json.dumps({name: _plain(column) for name, column in found.items()}) + "\n"
+    else:
+        cells = [
+            ["" if value is None else str(value) for value in _plain(column)]
+            for column in found.values()
+        ]
+        made = csv_text(list(found), [list(row) for row in zip(*cells, strict=True)])
+    return write_files(path.parent, {path.name: made})[0]
+
+
+def _plain(column: np.ndarray) -> list[object]:
+    """The values as Python's own, None where not finite."""
+    if column.dtype.kind != "f":
+        return list(column.tolist())
+    return [value if np.isfinite(value) else None for value in column.tolist()]
 
 
 def trajectory_csv(time: np.ndarray, estimate: Estimate) -> str:
@@ -224,36 +256,12 @@ def map_csv(estimate: Estimate, names: Sequence[int]) -> str:
 
 def _columns(campaign: Campaign, names: list[str]) -> str:
     """The table of some filters."""
-    summaries = [campaign.filters[name] for name in names]
     lines = [["", "honest", *names]]
-    lines.append(["verdict", "consistent", *map(_verdict, summaries)])
-    for key, label, honest in ROWS:
-        cells = [_cell(s.measures.get(key)) for s in summaries]
-        if any(cell != "-" for cell in cells):
-            lines.append([label, honest, *cells])
-        note = [campaign.published.get(name, {}).get(key) for name in names]
-        if any(figure is not None for figure in note):
-            figures = ["" if figure is None else f"{figure:.4g}" for figure in note]
-            lines.append(["  published", "", *figures])
-    lines.append(
-        [f"NIS / dof, {percentage(LEVEL)} band", "", *(_band_text(s.nis_band) for s in summaries)]
-    )
-    first = [s.autocorrelation_band[0] for s in summaries]
-    lags = [f"± {half:.4f}" if np.isfinite(half) else "-" for half in first]
-    lines.append([f"autocorrelation, {percentage(LEVEL)} band", "", *lags])
-    for block in DOF:
-        shares = [percentage(s.inside[block], 1) if block in s.inside else "-" for s in summaries]
-        lines.append([f"steps in {block} band", percentage(LEVEL, 1), *shares])
-    took = [campaign.step_seconds.get(name) for name in names]
-    if any(took):
-        cells = ["-" if one is None else f"{1e6 * one:.3g}" for one in took]
-        lines.append(["time of a step [µs]", "", *cells])
-    always = ("runs", "not_finite", "divergent")
-    for key in dict.fromkeys(key for s in summaries for key in s.counts):
-        counts = [s.counts.get(key) for s in summaries]
-        if key in always or any(counts):
-            shown = ("-" if count is None else f"{count:,}" for count in counts)
-            lines.append([count_label(key), "", *shown])
+    for row in rows_of(campaign, names):
+        lines.append([row.label, row.honest, *map(_cell, row.cells)])
+        if row.published:
+            told = ("" if value is None else f"{value:.4g}" for value in row.published)
+            lines.append(["  published", "", *told])
     widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
     text = [
         "  ".join(
@@ -274,20 +282,20 @@ def _verdict(summary: Summary) -> str:
     return summary.verdict + f" ({rejected})" * bool(rejected) + "*" * bool(summary.doubts)
 
 
-def _cell(measure: Measure | None) -> str:
-    """A measure with its interval, as text."""
-    if measure is None:
+def _cell(cell: Cell) -> str:
+    """A cell of the table as text."""
+    if cell is None:
         return "-"
-    value, low, high = measure
+    if isinstance(cell, Summary):
+        return _verdict(cell)
+    if not isinstance(cell, Average):
+        return cell.text
+    value, low, high = cell
     if not (np.isfinite(low) or np.isfinite(high)) or (low, high) == (0.0, np.inf):
         return f"{value:.4g}"
-    if lopsided(measure):
+    if lopsided(cell):
         return f"{value:.4g} [{low:.3g}, {high:.3g}]".replace("inf", "∞")
     return f"{value:.4g} ± {(high - low) / 2:.2g}"
-
-
-def _band_text(band: tuple[float, float] | None) -> str:
-    return "-" if band is None else f"[{band[0]:.4f}, {band[1]:.4f}]"
 
 
 def _finite_or_none(values: Iterable[float]) -> list[float | None]:

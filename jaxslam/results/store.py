@@ -1,6 +1,6 @@
 """The folder of a campaign's finished blocks of runs, from which a campaign can be resumed.
 
-A block is an npz file (`block_file`) that appears only when it is complete, so an interrupted
+A block is an npz file (`campaign_folder`) that appears only when it is complete, so an interrupted
 program loses no other block than the current one. A file that is damaged or belongs to another
 campaign is renamed and not counted. A manifest holds the caller's settings and the identity of
 the campaign.
@@ -15,21 +15,19 @@ from pathlib import Path
 import numpy as np
 
 from jaxslam.monte_carlo.pieces import missing
-from jaxslam.results.campaign_folder.block_file import (
-    Block,
-    block_order,
-    is_unfinished,
-    read_block,
-    runs_of_name,
-    write_block,
-)
-from jaxslam.results.campaign_folder.manifest import (
+from jaxslam.results.campaign_folder import (
     FORMAT,
     MANIFEST,
+    Block,
     as_stored,
+    block_order,
     differences_of,
     digest_of,
+    is_unfinished,
+    read_block,
     read_manifest,
+    runs_of_name,
+    write_block,
     write_manifest,
 )
 

@@ -44,6 +44,7 @@ def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys, monk
         "report.html",
         "consistency.json",
         "consistency.csv",
+        "measures.csv",
         *(f"{n}.png" for n in ("nees", "rmse", "cost", "coverage", "whiteness", "gained")),
         *(f"{n}.png" for n in ("errors", "map")),
     }

@@ -2,6 +2,7 @@
 
 import dataclasses
 from functools import partial
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -11,8 +12,9 @@ import worlds
 from test_consistency import STEPS, plain_nees, scored, summed, synthetic
 
 from jaxslam import charts, consistency, motion, sensors
-from jaxslam.consistency.nees import block_nees
-from jaxslam.consistency.score import EVENTS, _null_space
+from jaxslam.consistency.measures.counts import DROPS, KEPT, MEANINGS, counted
+from jaxslam.consistency.measures.nees import block_nees
+from jaxslam.consistency.measures.observability import unobservable_directions
 from jaxslam.filters.ekf.map_coordinates import ToPoints
 from jaxslam.filters.ekf.observability import Monitor
 from jaxslam.filters.map_management.merging import Merged
@@ -22,6 +24,8 @@ from jaxslam.filters.reporting import Pruned
 from jaxslam.simulation.spurious import Spurious
 from jaxslam.simulation.worlds import simulate
 from jaxslam.types import Estimate, Info, Log, Scan, Status, Trace, Truth
+
+STATUSES = [status.name.lower() for status in (*KEPT, *DROPS)]
 
 
 def test_coverage_is_the_share_of_truth_inside_the_ellipsoids():
@@ -305,16 +309,33 @@ def test_runs_that_are_not_finite_are_named():
         assert np.flatnonzero(np.isnan(summary.per_run[name])).tolist() == [2, 5]
 
 
-def test_every_event_that_is_counted_is_a_field_of_its_record():
-    records = {
-        None: Info,
-        "pruning": Pruned,
-        "merging": Merged,
-        "points": ToPoints,
-        "particles": ParticleInfo,
+def test_what_filters_report_of_themselves_is_counted():
+    """Two runs of three steps; a record without `counts`, and a count that is not known, too."""
+
+    class Mine(NamedTuple):
+        odd: np.ndarray
+
+        def counts(self):
+            return {"odd": self.odd}
+
+    flags = np.array([[True, False, True], [False, False, False]])
+    extra = {
+        "pruning": Pruned(np.stack([flags, flags], axis=2)),
+        "merging": Merged(np.where(flags[..., None], [4, 5], -1)),
+        "points": ToPoints(flags[..., None]),
+        "particles": ParticleInfo(*[3 * flags] * 4, active=flags),
+        "mine": Mine(flags),
+        "other": (flags,),
     }
-    for record, field in EVENTS.values():
-        assert field in records[record]._fields
+    trace, _, _ = synthetic(np.random.default_rng(0), runs=2)
+    info = jax.tree.map(lambda leaf: leaf[:, :3], trace.info)
+    found = counted(info._replace(extra=extra, exhausted=flags))
+    events = {name: each.tolist() for name, each in found.items() if name not in STATUSES}
+    thrice = {key: [6, 0] for key in ("resampled", "underflow", "invalid")}
+    once = {key: [2, 0] for key in ("merged", "reduced", "exhausted")}
+    assert events == {"removed": [4, 0], **once, **thrice, "odd": [2, 0]}
+    assert list(events) == [*(name for name in MEANINGS if name in events), "odd"]
+    assert (found["fused"] == 3).all() and (found["born"] == 0).all()
 
 
 def test_poses_on_a_plane_have_no_nees():
@@ -340,5 +361,4 @@ def test_a_direction_is_unobservable_below_a_share_of_what_was_measured(dtype):
     information = np.zeros((3, 3, 3))
     information[:, 2, 2] = gained * scale[:, 2]
     monitor = Monitor(None, information.astype(dtype), scale.astype(dtype), np.ones((3, 3)))
-    _, dimensions = _null_space(monitor, np.zeros((3, 1, 3, 3), dtype))
-    np.testing.assert_array_equal(dimensions, [3, 3, 2])
+    np.testing.assert_array_equal(unobservable_directions(monitor), [3, 3, 2])

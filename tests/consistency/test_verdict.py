@@ -10,7 +10,7 @@ import scipy.stats
 from benchmarks.verdict import averages, problem, rejected, verdicts
 from jaxslam import motion, sensors, stats
 from jaxslam.consistency import judge, lopsided, positive_interval, power_of
-from jaxslam.consistency.intervals import Measure, spread
+from jaxslam.consistency.intervals import Average, spread
 from jaxslam.monte_carlo import monte_carlo
 from jaxslam.monte_carlo.candidates import check_noise
 from jaxslam.simulation.worlds import Scenario
@@ -208,7 +208,7 @@ def test_a_noise_that_zero_has_none_of_is_taken_where_it_is():
 
 
 def test_lopsided_is_what_plus_minus_would_hide():
-    assert lopsided(Measure(3.0, 2.0, 5.0))
-    assert lopsided(Measure(3.0, 2.0, np.inf))
-    assert not lopsided(Measure(3.0, 2.0, 4.1))
-    assert not lopsided(Measure(3.0, 3.0, 3.0))
+    assert lopsided(Average(3.0, 2.0, 5.0))
+    assert lopsided(Average(3.0, 2.0, np.inf))
+    assert not lopsided(Average(3.0, 2.0, 4.1))
+    assert not lopsided(Average(3.0, 3.0, 3.0))

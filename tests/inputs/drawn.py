@@ -4,7 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from jaxslam.consistency import DOF, LAGS, LEVELS, Measure
+from jaxslam.consistency import DOF, LAGS, LEVELS, Average
 from jaxslam.consistency.summary import Summary
 from jaxslam.monte_carlo import Campaign
 from jaxslam.types import Estimate, Truth
@@ -36,7 +36,7 @@ def summary(name, seed=0, steps=STEPS):
     values = {"nees_pose": 3 * worse, "rmse_position": 0.5 * far}
     return Summary(
         verdict="optimistic" if worse > 1.3 else "consistent",
-        measures={key: Measure(value, 0.8 * value, np.inf) for key, value in values.items()},
+        measures={key: Average(value, 0.8 * value, np.inf) for key, value in values.items()},
         nis_band=None,
         inside={},
         curves=curves,

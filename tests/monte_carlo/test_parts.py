@@ -12,8 +12,7 @@ import worlds
 
 from jaxslam import cli, filters, store
 from jaxslam.monte_carlo import monte_carlo
-from jaxslam.results import campaign_files
-from jaxslam.results.campaign_folder import block_file
+from jaxslam.results import campaign_files, campaign_folder
 
 WORLD = worlds.ring(20)
 RECKONING = filters.DeadReckoning(WORLD.motion, WORLD.sensor)
@@ -120,11 +119,11 @@ def test_of_processes_that_begin_at_once_one_makes_the_manifest(tmp_path, links,
 
 
 def test_of_two_that_create_a_campaign_one_is_refused(tmp_path, monkeypatch):
-    def created_meanwhile(*arguments, original=block_file.os.link):
+    def created_meanwhile(*arguments, original=campaign_folder.os.link):
         original(*arguments)
         return original(*arguments)
 
-    monkeypatch.setattr(block_file.os, "link", created_meanwhile)
+    monkeypatch.setattr(campaign_folder.os, "link", created_meanwhile)
     with pytest.raises(ValueError, match=r"holds a campaign with 0 runs done"):
         store.create(tmp_path)
 

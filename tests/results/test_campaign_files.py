@@ -13,7 +13,7 @@ import pytest
 from test_page import EVIL, GOOD, RUNS, STEPS, Reader, campaign, summary
 
 from jaxslam import plot, report
-from jaxslam.consistency import Measure
+from jaxslam.consistency import Average
 from jaxslam.results import campaign_files
 from jaxslam.types import Estimate, Truth
 
@@ -36,7 +36,7 @@ def run_zero():
 def found():
     per_run = {"nees_pose": np.arange(3.0), "square_position": np.ones(3)}
     good = dataclasses.replace(summary("consistent", GOOD), per_run=per_run)
-    mapping = summary("optimistic", {"rmse_landmarks": Measure(1.0, 0.9, 1.1)})
+    mapping = summary("optimistic", {"rmse_landmarks": Average(1.0, 0.9, 1.1)})
     other = dataclasses.replace(
         mapping, per_run={"nees_pose": np.array([5.0, np.nan, 7.0])}, not_finite_runs=[4]
     )
@@ -104,7 +104,8 @@ def test_files_are_those_asked_for_and_without_run_0_its_figures_are_left_out(
     found, tmp_path, undrawn
 ):
     only = found.save(tmp_path / "bare", figures=())
-    assert [path.name for path in only] == ["report.html", "consistency.json", "consistency.csv"]
+    names = ["report.html", "consistency.json", "consistency.csv", "measures.csv"]
+    assert [path.name for path in only] == names
     elsewhere = dataclasses.replace(found, first={})
     kept = {path.stem for path in elsewhere.save(tmp_path / "no run 0", "svg")}
     assert FIGURES - kept == {"errors", "map"}

@@ -7,8 +7,9 @@ from html.parser import HTMLParser
 import numpy as np
 import pytest
 
-from jaxslam import plot, report
-from jaxslam.consistency import DOF, LEVELS, Measure, Summary
+from jaxslam import plot
+from jaxslam.consistency import DOF, LEVELS, Average, Summary
+from jaxslam.consistency.measures import BUILT_IN
 from jaxslam.monte_carlo import Campaign
 from jaxslam.results.page import VERDICTS, page
 
@@ -55,12 +56,12 @@ def campaign(**filters):
 
 
 GOOD = {
-    "nees_pose": Measure(3.0412, 2.9912, 3.0912),
-    "rmse_position": Measure(1.2, 1.1, 1.3),
-    "bound_ratio_position": Measure(1.0, -np.inf, np.inf),
-    "unobservable": Measure(3.0, 3.0, 3.0),
-    "rotation_information": Measure(3e-26, 2e-26, 4e-26),
-    "log_likelihood": Measure(-12345.6, -12445.6, -12245.6),
+    "nees_pose": Average(3.0412, 2.9912, 3.0912),
+    "rmse_position": Average(1.2, 1.1, 1.3),
+    "bound_ratio_position": Average(1.0, -np.inf, np.inf),
+    "unobservable": Average(3.0, 3.0, 3.0),
+    "rotation_information": Average(3e-26, 2e-26, 4e-26),
+    "log_likelihood": Average(-12345.6, -12445.6, -12245.6),
 }
 
 
@@ -99,12 +100,11 @@ class Reader(HTMLParser):
 def text():
     world = campaign(
         good=summary("consistent", GOOD),
-        **{EVIL: summary("optimistic", {"nees_pose": Measure(9.0, 8.0, 10.0)}, lost=(4, 17))},
+        **{EVIL: summary("optimistic", {"nees_pose": Average(9.0, 8.0, 10.0)}, lost=(4, 17))},
         lost=summary("diverged", {}),
     )
     return page(
         world,
-        report.ROWS,
         f"jaxslam consistency {EVIL}",
         1234,
         {"jax": "9.8.7"},
@@ -162,16 +162,16 @@ def test_filters_verdicts_and_measures_stand_in_the_table(read):
     labels = [cells[0] for cells in read.rows]
     assert "heading NEES" not in labels  # no filter has it
     assert "rejected" not in labels  # nothing was
-    measured = [label.strip() for key, label, _ in report.ROWS if key in GOOD]
+    measured = [one.title.strip() for one in BUILT_IN if one.key in GOOD]
     assert [label for label in labels if label in measured] == measured
 
 
 def test_every_label_of_the_table_is_shown_where_it_is_measured():
-    every = {key: Measure(1.0, 0.5, 1.5) for key, _, _ in report.ROWS}
-    reader = Reader(page(campaign(a=summary("undecided", every)), report.ROWS, "", None, {}, {}))
+    every = {one.key: Average(1.0, 0.5, 1.5) for one in BUILT_IN}
+    reader = Reader(page(campaign(a=summary("undecided", every)), "", None, {}, {}))
     labels = [cells[0] for cells in reader.rows]
-    for _, label, _ in report.ROWS:
-        assert label.strip() in labels
+    for one in BUILT_IN:
+        assert (one.title.strip() in labels) == one.row
     assert "Figures" not in reader.words
     assert "consistency of 1 filter" in "".join(reader.words)
 
@@ -179,7 +179,7 @@ def test_every_label_of_the_table_is_shown_where_it_is_measured():
 def test_notes_of_the_measures_stand_below_them():
     of = dataclasses.replace(summary("consistent", GOOD), honest_nis=0.95)
     of.counts.update(born=3, fused=9, rejected=2)
-    reader = Reader(page(campaign(a=of), report.ROWS, "", None, {}, {}))
+    reader = Reader(page(campaign(a=of), "", None, {}, {}))
     words = " ".join("".join(reader.words).split())
     assert "so that NIS / dof is honest from 0.950 (a) to 1" in words
     assert "initialized, measurements that started a landmark" in words

@@ -10,7 +10,7 @@ import pytest
 import worlds
 
 from jaxslam import association, life, monte_carlo, run, sensors, simulate
-from jaxslam.consistency.associations import associations, identities
+from jaxslam.consistency.measures.associations import associations, identities
 from jaxslam.filters import EkfSlam
 from jaxslam.protocols import Association
 from jaxslam.simulation.spurious import Spurious, spoil

@@ -9,7 +9,7 @@ from jaxslam.cli.consistency.command import consistency
 from jaxslam.cli.consistency.spec import CampaignOptions
 from jaxslam.cli.runtime import cache
 from jaxslam.results.campaign_files import FORMATS
-from jaxslam.results.run_table import FORMATS as RUN_FORMATS
+from jaxslam.results.report import RUN_FORMATS
 from jaxslam.simulation.scenarios import SCENARIOS
 
 

@@ -12,7 +12,8 @@ import jax
 from jaxslam.cli.common import OUT, check_out
 from jaxslam.cli.runtime import devices
 from jaxslam.core.numbers import check_count
-from jaxslam.results import campaign_files, run_table, store
+from jaxslam.results import campaign_files, report, store
+from jaxslam.results.files import check_formats
 
 
 class CampaignOptions(NamedTuple):
@@ -57,9 +58,9 @@ def spec_of(options: argparse.Namespace) -> Spec:
     campaign, settings, block = _campaign(options)
     out = options.resume or options.out or OUT
     formats = campaign_files.check_figure_formats("--figures", options.figures.split(","))
-    existing = [kind for kind in run_table.FORMATS if (out / f"runs.{kind}").exists()]
+    existing = [kind for kind in report.RUN_FORMATS if (out / f"runs.{kind}").exists()]
     given = filter(None, options.table.split(","))
-    tables = run_table.check_table_formats("--table", [*given, *existing])
+    tables = check_formats("--table", [*given, *existing], report.RUN_FORMATS)
     for name, count in (("steps", campaign.steps), ("runs", campaign.runs), ("block", block)):
         if count is not None:
             check_count(f"--{name}", count)

@@ -25,6 +25,7 @@ from jaxslam.cli.laser.options import refuse_laser_options
 from jaxslam.cli.run.film import film_steps, films, shown_state
 from jaxslam.cli.run.filters import chosen_filters, on_true_poses, with_options
 from jaxslam.cli.run.piecewise import PiecewiseRun, run_in_pieces
+from jaxslam.consistency.measures.counts import count_label
 from jaxslam.datasets import READERS, Dataset, Reader
 from jaxslam.datasets.evaluation import Evaluation, evaluate, joint_map_cov
 from jaxslam.monte_carlo.progress import Progress
@@ -32,7 +33,6 @@ from jaxslam.protocols import Filter
 from jaxslam.results import report
 from jaxslam.results.campaign_files import check_figure_formats
 from jaxslam.results.files import Json, json_text, versions, write_files
-from jaxslam.results.meanings import count_label
 from jaxslam.slots import Joint
 from jaxslam.types import Estimate, Status
 

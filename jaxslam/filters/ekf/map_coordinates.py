@@ -28,6 +28,10 @@ class ToPoints(NamedTuple):
     reduced: Bool[Array, "N"]
     """slots whose landmark became a point in this step"""
 
+    def counts(self) -> dict[str, Array]:
+        """What a campaign counts."""
+        return {"reduced": self.reduced}
+
 
 def _seen_as(sensor: Sensor, reduced: Bool[Array, ""] | None) -> Sensor:
     """The sensor for a landmark that may be a point (x, y, padding); None: no landmark is one."""

@@ -76,6 +76,10 @@ class Merged(NamedTuple):
     pair: Int[Array, "2"]
     """the slot of the landmark kept and the slot freed, or -1, -1 where none were merged"""
 
+    def counts(self) -> dict[str, Array]:
+        """What a campaign counts."""
+        return {"merged": self.pair[..., 0] >= 0}
+
 
 @record
 class Merging(Managed):

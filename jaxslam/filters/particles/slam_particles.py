@@ -119,6 +119,12 @@ class ParticleInfo(NamedTuple):
     """particles in use that are off the map or in an occupied cell, of a filter in a grid; they
     have weight zero"""
 
+    def counts(self) -> dict[str, Array]:
+        """What a campaign counts: of the fields that the filter has."""
+        names = ("resampled", "underflow", "invalid", "injected", "capped")
+        events = {name: getattr(self, name) for name in names}
+        return {name: happened for name, happened in events.items() if happened is not None}
+
 
 def slam_pose_moments(state: SlamParticles) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
     """Mean and covariance of the pose: `weighted_pose_moments` plus Σ w_p P_p, with P_p the

@@ -3,22 +3,24 @@
 Figures are embedded; there are no scripts, and the page forbids the browser to load anything else.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Mapping
 from html import escape
 
 from jaxslam.consistency import LEVEL
 from jaxslam.monte_carlo import Campaign
 from jaxslam.results.page.parts import (
-    VERDICTS,
     badge,
+    duration,
     embedded_figure,
     measure_notes,
     measures_table,
+    percentage,
     verdict_list,
+    with_noun,
 )
 from jaxslam.results.page.style import CSS, FRAGMENT_CSS
-from jaxslam.results.page.text import duration, percentage, with_noun
 from jaxslam.results.plot import Figure, png
+from jaxslam.results.table import VERDICTS
 
 __all__ = ["VERDICTS", "fragment", "page"]
 
@@ -28,7 +30,6 @@ _UPRIGHT = 5
 
 def page(
     campaign: Campaign,
-    table: Sequence[tuple[str, str, str]],
     command: str,
     seed: int | None,
     versions: Mapping[str, str],
@@ -39,8 +40,6 @@ def page(
 
     Args:
         campaign: the campaign.
-        table: the rows, each (key of `Summary.measures`, label, value of a consistent filter); a
-            label that starts with a space is indented. Rows that no filter has are left out.
         command, seed: those of the campaign; None where there was no seed.
         versions: of the software, by name.
         figures: in order, by name, each with its caption.
@@ -49,7 +48,7 @@ def page(
     heading = f"{campaign.scenario}: consistency of {with_noun(len(campaign.filters), 'filter')}"
     sections = {
         "Verdicts": verdict_list(campaign),
-        "Measures": measures_table(campaign, table) + measure_notes(campaign),
+        "Measures": measures_table(campaign) + measure_notes(campaign),
         "How to read it": _conventions(campaign),
         "Figures": _figures(figures, draw),
         "Parameters": _parameters(campaign, command, seed, versions),
@@ -87,7 +86,6 @@ content="default-src 'none'; img-src data:; style-src 'unsafe-inline'">
 
 def fragment(
     campaign: Campaign,
-    table: Sequence[tuple[str, str, str]],
     figures: Mapping[str, tuple[str, Figure]],
     draw: Callable[[Figure], bytes] = png,
 ) -> str:
@@ -101,7 +99,7 @@ def fragment(
 {verdict_list(campaign)}
 {_figures(figures, draw)}
 <details><summary>All measures</summary>
-{measures_table(campaign, table)}
+{measures_table(campaign)}
 {measure_notes(campaign)}
 </details>
 </div>

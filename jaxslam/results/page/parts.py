@@ -1,50 +1,31 @@
-"""Parts of the page as HTML: verdicts, the table of measures, figures."""
+"""Parts of the page as HTML: verdicts, the table of measures, figures; and numbers."""
 
 import base64
-from collections.abc import Iterable, Sequence
 from html import escape
-from itertools import repeat
+from itertools import groupby
 
-from jaxslam.consistency import DOF, LEVEL, Summary
+import numpy as np
+
+from jaxslam.consistency import LEVEL, Average, Summary, lopsided
+from jaxslam.consistency import percentage as plain_percentage
 from jaxslam.consistency.verdict import TESTS
 from jaxslam.monte_carlo import Campaign
-from jaxslam.results import meanings, report
-from jaxslam.results.page.text import (
-    breakable,
-    cell,
-    interval_title,
-    percentage,
-    published_note,
-    sortable,
-)
+from jaxslam.results import report, table
 from jaxslam.results.plot import Figure, describe
-
-VERDICTS = {
-    word: (sign, meanings.VERDICTS[word])
-    for word, sign in (
-        ("consistent", "✓"),
-        ("optimistic", "▲"),
-        ("pessimistic", "▼"),
-        ("diverged", "✕"),
-        ("incomplete", "–"),
-        ("undecided", "?"),
-    )
-}
-"""Each verdict with its sign and its meaning."""
-
-_ALWAYS = ("runs", "not_finite", "divergent")
+from jaxslam.results.table import VERDICTS
 
 
 def verdict_list(campaign: Campaign) -> str:
     """Name, badge and tested measures of each filter as HTML, and what qualifies the verdicts."""
     items = []
     for name, summary in campaign.filters.items():
-        tests = {TESTS[key]: summary.measures[key] for key in TESTS if key in summary.measures}
-        said = [f"{test} {cell(measure)}" for test, measure in tests.items()] or ["no pose NEES"]
-        lines = "".join(f'<span class="why">{line}</span>' for line in said)
+        there = [key for key in TESTS if key in summary.measures]
+        said = [f"{TESTS[key]} {_average(summary.measures[key])}" for key in there]
+        lines = "".join(f'<span class="why">{line}</span>' for line in said or ["no pose NEES"])
         label = f'<span class="name">{breakable(name)}</span>'
         items.append(f"<li>{label}{badge(summary.verdict, summary)}{lines}</li>")
-    sentences = [*report.qualified(campaign), *report.not_finite(campaign)]
+    lost = (f"{name} {said}" for name, said in table.lost_runs(campaign))
+    sentences = [*report.qualified(campaign), *lost]
     notes = (f'<p class="note">{escape(sentence)}.</p>' for sentence in sentences)
     return "\n".join(['<ul class="verdicts">', *items, "</ul>", *notes])
 
@@ -61,83 +42,70 @@ def badge(verdict: str, summary: Summary | None = None) -> str:
     return f'<span class="badge {kind}" title="{title}">{mark} {text}</span>'
 
 
-def measures_table(campaign: Campaign, table: Sequence[tuple[str, str, str]]) -> str:
+def measures_table(campaign: Campaign) -> str:
     """The table of measures × filters as HTML; published values below our own."""
-    summaries = campaign.filters
-    head = "".join(f'<th scope="col">{breakable(name)}</th>' for name in summaries)
-    ranks = list(VERDICTS)
-    verdicts = "".join(
-        f"<td{sortable(ranks.index(s.verdict) if s.verdict in ranks else None)}>"
-        f"{badge(s.verdict, s)}</td>"
-        for s in summaries.values()
-    )
-    body = [_row("verdict", "consistent", verdicts)]
-    for key, label, honest in table:
-        published = [campaign.published.get(name, {}).get(key) for name in summaries]
-        measures = [s.measures.get(key) for s in summaries.values()]
-        if any(m is not None for m in measures) or any(p is not None for p in published):
-            cells = "".join(
-                f"<td{sortable(m and m.value)}{interval_title(m)}>{cell(m)}{published_note(p)}</td>"
-                for m, p in zip(measures, published, strict=True)
-            )
-            body.append(_row(label, honest, cells))
-    bands = [
-        _row(
-            f"NIS / dof, {percentage(LEVEL)} band",
-            "",
-            _cells(map(_nis_interval, summaries.values())),
-        )
-    ]
-    first = [s.autocorrelation_band[0] for s in summaries.values()]
-    white = (f"± {half:.4f}" if half < float("inf") else "–" for half in first)
-    bands.append(_row(f"autocorrelation, {percentage(LEVEL)} band", "", _cells(white)))
-    for block in DOF:
-        inside = [s.inside.get(block) for s in summaries.values()]
-        shares = ["–" if share is None else percentage(share, 1) for share in inside]
-        bands.append(_row(f"steps in {block} band", percentage(LEVEL, 1), _cells(shares, inside)))
-    counts = []
-    for key in dict.fromkeys(key for s in summaries.values() for key in s.counts):
-        found = [s.counts.get(key, 0) for s in summaries.values()]
-        if key in _ALWAYS or any(found):
-            label = "finite runs" if key == "runs" else meanings.count_label(key)
-            counts.append(_row(label, "", _cells((f"{n:,}" for n in found), found)))
-    groups = (("", body), ("Bands", bands), ("Counts", counts))
-    span = len(summaries) + 2
-    parts = "\n".join(
-        "<tbody>"
-        + (f'<tr class="group"><th colspan="{span}" scope="rowgroup">{name}</th></tr>' * bool(name))
-        + "\n".join(rows)
-        + "</tbody>"
-        for name, rows in groups
-    )
+    names = list(campaign.filters)
+    head = "".join(f'<th scope="col">{breakable(name)}</th>' for name in names)
+    parts = []
+    for group, rows in groupby(table.rows_of(campaign, names), lambda row: row.group):
+        title = f'<th colspan="{len(names) + 2}" scope="rowgroup">{group}</th>'
+        lines = [f'<tr class="group">{title}</tr>'] * bool(group) + [_row(row) for row in rows]
+        parts.append("<tbody>" + "\n".join(lines) + "</tbody>")
+    body = "\n".join(parts)
     return (
         '<div class="scroll" tabindex="0" role="region" aria-label="Measures of every filter">'
         f'<table><thead><tr><th scope="col">measure</th><th scope="col">honest</th>{head}</tr>'
-        f"</thead>\n{parts}</table></div>"
+        f"</thead>\n{body}</table></div>"
     )
 
 
-def _row(label: str, honest: str, cells: str) -> str:
+def _row(row: table.Row) -> str:
     """A row of the table as HTML."""
-    kind = ' class="sub"' if label.startswith(" ") else ""
-    honest = escape(honest.replace(">=", "≥").replace("<=", "≤"))
+    kind = ' class="sub"' if row.label.startswith(" ") else ""
+    published = row.published or [None] * len(row.cells)
+    cells = (_cell(cell, value) for cell, value in zip(row.cells, published, strict=True))
     return (
-        f'<tr><th scope="row"{kind}>{escape(label.strip())}</th><td class="honest">{honest}</td>'
-        f"{cells}</tr>"
+        f'<tr><th scope="row"{kind}>{escape(row.label.strip())}</th>'
+        f'<td class="honest">{escape(_unbroken(row.honest))}</td>{"".join(cells)}</tr>'
     )
 
 
-def _cells(texts: Iterable[str], values: Iterable[float | None] | None = None) -> str:
-    """Cells of the table as HTML, with the values by which filters are sorted if there are any."""
-    pairs = zip(texts, repeat(None) if values is None else values, strict=False)
-    return "".join(f"<td{sortable(value)}>{text}</td>" for text, value in pairs)
+def _cell(cell: table.Cell, published: float | None) -> str:
+    """A cell of the table as HTML, with the number by which the script sorts filters."""
+    value: float | None = None
+    title, text = "", "–"
+    if isinstance(cell, Summary):
+        ranks = list(VERDICTS)
+        value = ranks.index(cell.verdict) if cell.verdict in ranks else None
+        text = badge(cell.verdict, cell)
+    elif isinstance(cell, Average):
+        value, title, text = cell.value, _interval(cell), _average(cell)
+    elif cell is not None:
+        value, text = cell.value, escape(_unbroken(cell.text))
+    key = "" if value is None or not np.isfinite(value) else f' data-v="{value:.6g}"'
+    note = "" if published is None else f"published {number(published, 4)}"
+    return (
+        f"<td{key}{title}>{text}" + f'<span class="published">{note}</span>' * bool(note) + "</td>"
+    )
+
+
+def _interval(measure: Average) -> str:
+    """The HTML attribute that shows a measure's interval under the pointer."""
+    if not np.isfinite(measure.high):
+        return ""
+    return f' title="{percentage(LEVEL)} interval {measure.low:.5g} to {measure.high:.5g}"'
+
+
+def _unbroken(text: str) -> str:
+    """A text whose percentages do not break."""
+    return text.replace(" %", "\N{NO-BREAK SPACE}%")
 
 
 def measure_notes(campaign: Campaign) -> str:
     """What must be known of the measures, as HTML."""
     return "\n".join(
         f'<p class="note"><strong>{escape(term)}</strong>: {escape(said)}.</p>'
-        for term, said in meanings.notes_on(campaign)
+        for term, said in table.notes_on(campaign)
     )
 
 
@@ -153,6 +121,50 @@ def embedded_figure(number: int, caption: str, figure: Figure, drawn: bytes) -> 
     )
 
 
-def _nis_interval(summary: Summary) -> str:
-    band = summary.nis_band
-    return "–" if band is None else f"{band[0]:.4f} – {band[1]:.4f}"
+def _average(measure: Average) -> str:
+    """A measure as value ± half-width to two digits, or with [low, high] if that is asymmetric."""
+    half = (measure.high - measure.low) / 2
+    if not np.isfinite(measure.high) and measure.low <= 0:
+        return number(measure.value, 4)
+    if lopsided(measure):
+        ends = (number(end, 3) if np.isfinite(end) else "∞" for end in measure[1:])
+        return f"{number(measure.value, 4)} [{', '.join(ends)}]"
+    if half == 0:
+        return f"{number(measure.value, 4)} ± 0"
+    size = max(abs(measure.value), half)
+    power = 0 if 1e-3 <= size < 1e6 else int(np.floor(np.log10(size)))
+    value, half = measure.value / 10.0**power, half / 10.0**power
+    digits = min(max(1 - int(np.floor(np.log10(half))), 0), 6)
+    text = f"{value:,.{digits}f} ± {half:,.{digits}f}"
+    return (f"({text})·10<sup>{power}</sup>" if power else text).replace("-", "−")
+
+
+def number(value: float, digits: int) -> str:
+    """A number with some significant digits; small and large ones with a power of ten."""
+    if value == 0 or 1e-3 <= abs(value) < 1e6:
+        return f"{value:.{digits}g}".replace("-", "−")
+    mantissa, power = f"{value:.{digits - 1}e}".split("e")
+    return f"{mantissa}·10<sup>{int(power)}</sup>".replace("-", "−")
+
+
+def percentage(share: float, digits: int = 0) -> str:
+    """A share as a percentage, with a no-break space."""
+    return _unbroken(plain_percentage(share, digits))
+
+
+def with_noun(number: int, noun: str) -> str:
+    """A number with its noun: 1 run, 2 runs."""
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
+def duration(seconds: float) -> str:
+    """A duration in seconds, minutes or hours."""
+    if seconds < 120:
+        return f"{seconds:.1f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def breakable(name: str) -> str:
+    """A name escaped for HTML, with places where it may break."""
+    return escape(name).replace("_", "_<wbr>")

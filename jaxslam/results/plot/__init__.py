@@ -10,11 +10,10 @@ from jaxslam.results.plot.campaigns.errors import errors_figure, run_errors_figu
 from jaxslam.results.plot.campaigns.measures import (
     coverage_figure,
     gained_figure,
+    nees_figure,
     rmse_figure,
     whiteness_figure,
 )
-from jaxslam.results.plot.campaigns.nees import nees_figure
-from jaxslam.results.plot.formats import encode
 from jaxslam.results.plot.maps.geometry import ellipse
 from jaxslam.results.plot.maps.graph import graph_figure
 from jaxslam.results.plot.maps.grids import grid_figure
@@ -29,7 +28,7 @@ from jaxslam.results.plot.scene.history import History, frame_steps
 from jaxslam.results.plot.scene.map_scene import map_scene
 from jaxslam.results.plot.scene.probe import probe
 from jaxslam.results.plot.scene.run_scene import run_scene
-from jaxslam.results.plot.style import COLORS, COLUMN, PAGE, Figure, describe, png
+from jaxslam.results.plot.style import COLORS, COLUMN, PAGE, Figure, describe, encode, png
 
 __all__ = [
     "COLORS",

@@ -5,6 +5,7 @@ import textwrap
 from collections.abc import Sequence
 from typing import Any, Literal, TypeAlias
 
+import matplotlib
 import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
@@ -40,6 +41,8 @@ CURVE = "curve"
 _FEW = 12
 """A curve of so many values has a mark at each."""
 
+_NO_DATE = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
+
 
 def look(i: int) -> Look:
     """Options of the line of filter number i: colour, dashes and mark, each another.
@@ -59,6 +62,17 @@ def png(figure: Figure, dpi: float = 200) -> bytes:
     """The figure as a PNG file with dpi dots an inch."""
     out = io.BytesIO()
     figure.savefig(out, format="png", dpi=dpi)
+    return out.getvalue()
+
+
+def encode(figure: Figure, kind: str) -> bytes:
+    """The figure as a file of a kind, png, pdf or svg; the same bytes every time."""
+    if kind == "png":
+        return png(figure)
+    out = io.BytesIO()
+    # TrueType fonts in PDF, as publishers ask; the same names of parts in every SVG file.
+    with matplotlib.rc_context({"pdf.fonttype": 42, "svg.hashsalt": "jaxslam"}):
+        figure.savefig(out, format=kind, metadata=_NO_DATE[kind])
     return out.getvalue()
 
 

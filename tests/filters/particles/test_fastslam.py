@@ -11,7 +11,7 @@ import pytest
 import worlds
 
 from jaxslam import association, life, motion, resampling, sensors
-from jaxslam.consistency.score import _counted
+from jaxslam.consistency.measures.counts import counted
 from jaxslam.filters import FastSlam
 from jaxslam.filters.particles import slam_particles
 from jaxslam.filters.particles.slam_particles import SlamParticles
@@ -357,7 +357,7 @@ def test_it_resamples_where_the_threshold_says_and_it_is_counted():
     assert np.all((told.ess > 1 - 1e-9) & (told.ess < COUNT + 1e-9))
     assert of_never.ess[-1] < told.ess[-1]
     assert np.ptp(often.final.log_weight) == 0 or not told.resampled[-1]
-    counts = _counted(jax.tree.map(lambda leaf: leaf[None], often.info))  # of one run
+    counts = counted(jax.tree.map(lambda leaf: leaf[None], often.info))  # of one run
     assert (counts["resampled"], counts["underflow"]) == (told.resampled.sum(), 0)
 
 

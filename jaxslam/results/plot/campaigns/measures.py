@@ -1,13 +1,17 @@
-"""Figures of a campaign's filters: errors, coverage, whiteness, information gained."""
+"""Figures of a campaign's filters: NEES, errors, coverage, whiteness, information gained."""
+
+from collections.abc import Sequence
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxslam.consistency import DOF, LEVELS
+from jaxslam.consistency.measures import REGISTRY, in_figure
+from jaxslam.consistency.measures.errors import bound_curve
 from jaxslam.monte_carlo import Campaign
 from jaxslam.results.plot.campaigns.layout import add_legends, head, runs_of, sheet
-from jaxslam.results.plot.campaigns.scale import common_top, mark_beyond, scale_setters
+from jaxslam.results.plot.campaigns.scale import common_top, mark_beyond, nees_scale, scale_setters
 from jaxslam.results.plot.style import INK, PAGE, RULE, band, curve, plain, step_limits
 from jaxslam.validation import check_record
 
@@ -21,35 +25,61 @@ _ASIDE = 0.12
 """Distance of two filters at the same lag [steps]."""
 
 
+def nees_figure(
+    campaign: Campaign, *, blocks: Sequence[str] = tuple(DOF), width: float = PAGE
+) -> Figure:
+    """Average NEES over the steps for every filter of a campaign, with the 95 % chi-square band.
+
+    The band is that of the filter with the most finite runs, the narrowest. More than five filters
+    are drawn in a row of panels for each kind of filter (`catalog.KINDS`). The scale ends at 100
+    times dof, or sooner where the band would be too narrow to be seen; marks at the edge are of
+    larger values, and the largest is written above. width [in]: `COLUMN` is that of a paper.
+    """
+    titles = [REGISTRY[f"nees_{block}"].axis for block in blocks]
+    figure, rows = sheet(campaign, titles, width=width)
+    step = np.arange(1, campaign.steps + 1)
+    for axes, block in zip(rows[0].panels, blocks, strict=True):
+        nees_scale(axes, campaign, block)
+    for row in rows:
+        for axes, block in zip(row.panels, blocks, strict=True):
+            _draw_band(axes, campaign, block)
+            for name, i in row.names.items():
+                summary = campaign.filters[name]
+                label = f"{name} ({summary.verdict})"
+                curve(axes, i, step, summary.curves[f"nees_{block}"], label, absent="no NEES")
+            axes.set_xlim(step_limits(campaign.steps))
+            mark_beyond(axes)
+    add_legends(figure, rows, f"{head(campaign)}: NEES, average over {runs_of(campaign)}", "step")
+    return figure
+
+
 def rmse_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     """RMSE of position and heading over the steps, with the conditional Cramér-Rao bound if known.
+
+    So is every other measure whose figure is "rmse".
 
     More than five filters are drawn by kind. Filters that fuse no measurement, that diverge, or
     whose error is over three times the median of the others do not set the scale: marks at the
     edge mark what lies beyond, and the largest value is written above. width [in].
     """
-    quantities = {"position": "position RMSE [m]", "heading_deg": "heading RMSE [°]"}
-    figure, rows = sheet(campaign, list(quantities.values()), width=width)
+    every = list(campaign.filters.values())
+    shown = [one for one in in_figure("rmse") if any(one.key in s.curves for s in every)]
+    figure, rows = sheet(campaign, [one.axis for one in shown], width=width)
     step = np.arange(1, campaign.steps + 1)
     setters = scale_setters(campaign)
-    bounds = {
-        key: [
-            s.curves[f"bound_{key}"]
-            for s in campaign.filters.values()
-            if f"bound_{key}" in s.curves
-        ]
-        for key in quantities
-    }
-    for j, key in enumerate(quantities):
-        curves = {name: s.curves[f"rmse_{key}"] for name, s in campaign.filters.items()}
+    nothing = np.full(campaign.steps, np.nan)
+    for j, measure in enumerate(shown):
+        curves = {n: s.curves.get(measure.key, nothing) for n, s in campaign.filters.items()}
+        key = bound_curve(measure)
+        bounds = [s.curves[key] for s in every if key in s.curves][:1]
         top = common_top({name: _peak(values) for name, values in curves.items()}, setters)
-        top = max(top, *(_peak(bound) for bound in bounds[key][:1]), 0.0)
+        top = max(top, *map(_peak, bounds), 0.0)
         for row in rows:
             axes = row.panels[j]
             axes.set(xlim=step_limits(campaign.steps), ylim=(0.0, 1.06 * top or 1.0))
             for name, i in row.names.items():
                 curve(axes, i, step, curves[name], name)
-            for bound in bounds[key][:1]:
+            for bound in bounds:
                 label = "conditional Cramér-Rao bound"
                 axes.plot(
                     step, bound, color=INK, lw=2.0, label=label, zorder=2.5, marker=_lone(bound)
@@ -132,7 +162,7 @@ def gained_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     kind. width [in].
     """
     check_record("gained_figure", "the first argument", campaign, Campaign)
-    key, what = "rotation_information", "information [1/rad²]"
+    key, what = "rotation_information", REGISTRY["rotation_information"].axis
     curves = {name: s.curves[key] for name, s in campaign.filters.items() if key in s.curves}
     others = [name for name in campaign.filters if name not in curves]
     figure, rows = sheet(campaign, [what], width=width, height=2.6, only=curves)
@@ -159,6 +189,14 @@ def gained_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     title += f". Not monitored: {', '.join(map(plain, others))}" * bool(others and curves)
     add_legends(figure, rows, title, "step")
     return figure
+
+
+def _draw_band(axes: Axes, campaign: Campaign, block: str) -> None:
+    """Draw the 95 % band of the NEES, and its dof."""
+    most = max(campaign.filters.values(), key=lambda summary: summary.counts["runs"]).curves
+    step = np.arange(1, campaign.steps + 1)
+    band(axes, step, most[f"nees_{block}_low"], most[f"nees_{block}_high"], "95 % band")
+    axes.axhline(DOF[block], color=INK, lw=0.8, zorder=1.5, label="honest")
 
 
 def _label_powers(axes: Axes, strip: float, decades: float) -> None:

@@ -100,10 +100,11 @@ def set_positive(
     axes.set(**{f"{which}scale": "log"})
     room = (high / low) ** margin
     set_limits(low / room, high * room)
-    axis.set_major_locator(LogLocator(numticks=_POWERS))
-    axis.set_major_formatter(_short)
     length, label = (axes.bbox.height, 11) if which == "y" else (axes.bbox.width, 28)  # [pt]
-    decade = 72 / axes.figure.dpi * length / np.log10(high / low)
+    length *= 72 / axes.figure.dpi
+    axis.set_major_locator(LogLocator(numticks=int(np.clip(length / label, 2, _POWERS))))
+    axis.set_major_formatter(_short)
+    decade = length / np.log10(high / low)
     digits = next((d for d in ("25", "3") if np.log10(int(d[0])) * decade > label), "")
     if digits:
         axis.set_minor_formatter(lambda x, _: _short(x) if f"{x:.0e}"[0] in digits else "")

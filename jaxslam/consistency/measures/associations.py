@@ -4,7 +4,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Int
 
+from jaxslam.consistency.measures.measure import Measure
 from jaxslam.types import Status, Trace
+
+MEASURES = (
+    Measure("precision", "associations: precision", honest=1),
+    Measure("recall", "associations: recall", honest=1),
+    Measure("false_landmarks", "false landmarks", honest=0),
+)
 
 
 def identities(trace: Trace, origin: Int[Array, "T M"]) -> Int[Array, "T N"]:

@@ -1,14 +1,18 @@
-"""The NEES eᵀ P⁻¹ e of a pose and of its blocks, e = truth - estimate, in (x, y, θ) and in the
-filter's own error coordinates; on the host, by NumPy in float64.
+"""NEES: eᵀ P⁻¹ e of a pose and of its blocks, e = truth - estimate, in (x, y, θ) and in the
+filter's own error coordinates; on the host, by NumPy in float64. And of landmarks.
 """
 
-from typing import NamedTuple
+from collections.abc import Mapping
+from dataclasses import dataclass
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
+from jaxslam.consistency.intervals import LEVEL
+from jaxslam.consistency.measures.measure import Measure, Nees, Runs, RunScores, Sums, ratio
+from jaxslam.math.stats import chi2_quantiles
 from jaxslam.protocols import Chart, Sensor
 from jaxslam.types import Trace, Truth
 
@@ -19,13 +23,62 @@ ROUNDING = 32
 """A claimed deviation of at most so many ulp of its coordinate is taken for zero."""
 
 
-class Nees(NamedTuple):
-    """The NEES of one block of the pose error, at each step."""
+@dataclass(frozen=True, eq=False)
+class NeesMeasure(Measure):
+    """The NEES of a block of `Runs.nees`. That of a pose block has a curve with a band."""
 
-    value: Float[np.ndarray, "..."]
-    """0 where there is none."""
-    regular: Bool[np.ndarray, "..."]
-    """whether there is one"""
+    positive: bool = True
+    block: str = ""
+
+    def of_runs(self, runs: Runs) -> RunScores:
+        """Its sum over the steps with a regular covariance."""
+        value, regular = runs.nees[self.block]
+        sums = {self.key: value, f"regular_{self.block}": regular.astype(np.float64)}
+        return RunScores(value.sum(axis=1), regular.sum(axis=1), sums if self.block in DOF else {})
+
+    def curves(self, sums: Sums, runs: int) -> dict[str, np.ndarray]:
+        """The average NEES, its 95 % band, and over how many runs it is."""
+        if self.block not in DOF:
+            return {}
+        count, dof = sums[f"regular_{self.block}"], DOF[self.block]
+        safe, tail = np.maximum(count, 1), (1 - LEVEL) / 2
+        band = {"low": tail, "high": 1 - tail}
+        edges = {end: chi2_quantiles(p, dof * safe) / safe for end, p in band.items()}
+        return {
+            self.key: ratio(sums[self.key], count),
+            **{f"{self.key}_{end}": np.where(count > 0, x, np.nan) for end, x in edges.items()},
+            f"runs_{self.block}": count,
+        }
+
+
+MEASURES = tuple(
+    NeesMeasure(
+        f"nees_{block}",
+        label,
+        honest=dof,
+        block=block,
+        figure="nees" if block in DOF else "",
+        axis=f"{block} NEES (dof {dof})",
+    )
+    for block, label, dof in (
+        ("pose", "pose NEES (x, y, θ)", DOF["pose"]),
+        ("own", "pose NEES, in its chart", DOF["pose"]),
+        ("position", "position NEES", DOF["position"]),
+        ("heading", "heading NEES", DOF["heading"]),
+        ("landmarks", "landmark NEES", 2),
+    )
+)
+
+
+def inside_bands(curves: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """The share of the steps whose average NEES lies in its band, by block."""
+    found = {}
+    for block in DOF:
+        mean, has = curves[f"nees_{block}"], curves[f"runs_{block}"] > 0
+        if has.any():
+            low, high = curves[f"nees_{block}_low"], curves[f"nees_{block}_high"]
+            found[block] = float(np.mean((mean >= low)[has] & (mean <= high)[has]))
+    return found
 
 
 def pose_error(

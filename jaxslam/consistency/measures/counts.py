@@ -1,0 +1,67 @@
+"""What a campaign counts: what became of each measurement, and the events that filters report."""
+
+import numpy as np
+from jaxtyping import Int
+
+from jaxslam.types import Info, Status
+
+KEPT = (Status.FUSED, Status.BORN, Status.SIGHTED)
+"""What a measurement does for the map; each is counted."""
+
+DROPS = (
+    Status.REJECTED,
+    Status.OVERFLOW,
+    Status.DEFERRED,
+    Status.REPEATED,
+    Status.SINGULAR,
+    Status.UNMATCHED,
+)
+"""What can keep a measurement from the map; each is counted."""
+
+MEANINGS = {
+    "fused": "measurements that corrected the estimate",
+    "born": "measurements that started a landmark",
+    "sighted": "measurements kept until a landmark can be started from them",
+    "rejected": "measurements too far from the prediction, which the gate dropped, or not finite",
+    "overflow": "measurements of new landmarks, dropped because the map was full",
+    "deferred": "measurements of landmarks that were put off to a later scan",
+    "repeated": "measurements of a new landmark that was in the same scan before",
+    "singular": "measurements whose innovation covariance has no inverse",
+    "unmatched": "measurements that were assigned to no landmark, old or new",
+    "missed": "landmarks in view for which the scan had no place",
+    "singular_steps": "steps without a NEES, since the covariance of the pose has no inverse",
+    "removed": "landmarks removed from the map",
+    "merged": "pairs of landmarks made one",
+    "reduced": "landmarks converted to points",
+    "exhausted": "scans whose search for an association ended at its limit",
+    "resampled": "scans after which particles were drawn anew by their weights",
+    "underflow": "scans that left no particle a weight",
+    "invalid": "particles whose pose was not finite",
+    "injected": "particles drawn anywhere, to find a lost robot",
+    "capped": "steps that asked for more particles than the filter can have",
+}
+"""Counts, by their names in `Summary.counts`. A filter may report others, without a meaning."""
+
+
+def count_label(name: str) -> str:
+    """The name of a count, as a user reads it."""
+    return {"born": "initialized", "runs": "finite runs"}.get(name, name.replace("_", " "))
+
+
+def counted(info: Info) -> dict[str, Int[np.ndarray, "R"]]:
+    """How many measurements of R runs became what, and what the filter counts itself.
+
+    A filter counts what a record of `Info.extra` returns by its method `counts`: arrays (R, T, …),
+    by name.
+    """
+    runs = len(info.status)
+    at = np.asarray(info.status).reshape(runs, -1) + np.arange(runs)[:, None] * len(Status)
+    became = np.bincount(at.ravel(), minlength=runs * len(Status)).reshape(runs, -1)
+    found = {status.name.lower(): became[:, status] for status in KEPT + DROPS}
+    reports = [each.counts() for each in (info.extra or {}).values() if hasattr(each, "counts")]
+    if info.exhausted is not None:
+        reports.append({"exhausted": info.exhausted})
+    events = {name: happened for report in reports for name, happened in report.items()}
+    for name in sorted(events, key=[*MEANINGS, *events].index):
+        found[name] = np.asarray(events[name]).reshape(runs, -1).sum(axis=1)
+    return found

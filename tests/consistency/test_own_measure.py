@@ -1,0 +1,106 @@
+"""A measure that a user adds by a function and a line: in the summary, the tables and the files."""
+
+import csv
+import io
+import json
+import re
+
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import worlds
+
+import jaxslam
+from jaxslam import plot, report, store
+from jaxslam.consistency import Measure, register
+from jaxslam.consistency.measures import REGISTRY
+from jaxslam.results.page import curves, page
+
+WORLD = worlds.ring()
+
+
+def claimed_sigma(truth, trace):
+    cov = trace.estimate.pose_cov
+    sigma = jnp.sqrt(cov[:, 0, 0] + cov[:, 1, 1])
+    return jnp.where(jnp.arange(len(sigma)) < 3, jnp.nan, sigma)
+
+
+def farthest(truth, trace):
+    return jnp.hypot(*(truth.pose - trace.estimate.pose)[:, :2].T).max()
+
+
+@pytest.fixture
+def registered():
+    register(Measure("claimed", "claimed σ", claimed_sigma, unit="m", positive=True, figure="rmse"))
+    register(Measure("farthest", "farthest", farthest, honest=0.25, note=("far", "largest error")))
+    yield
+    del REGISTRY["claimed"], REGISTRY["farthest"]
+
+
+def test_a_measure_of_ones_own_is_everywhere(registered, tmp_path):
+    keep = store.create(tmp_path / "blocks")
+    options = {"block": 4, "bound": True, "keep": keep}
+    campaign = jaxslam.monte_carlo(WORLD, {"ekf": worlds.ekf(WORLD)}, 6, worlds.key(), **options)
+    summary = campaign.filters["ekf"]
+    per_run, claimed = summary.per_run, summary.curves["claimed"]
+    assert np.isnan(claimed[:3]).all() and np.isfinite(claimed[3:]).all()
+    truth, estimate = campaign.first["ekf"]
+    sigma = np.sqrt(estimate.pose_cov[3:, 0, 0] + estimate.pose_cov[3:, 1, 1])
+    np.testing.assert_allclose(per_run["claimed"][0], sigma.mean())
+    far = np.hypot(*(truth.pose - estimate.pose)[:, :2].T).max()
+    np.testing.assert_allclose(per_run["farthest"][0], far)
+    average = summary.measures["claimed"]
+    np.testing.assert_allclose([average.value, np.nanmean(claimed)], per_run["claimed"].mean())
+    assert average.low > 0
+
+    text, html = str(campaign), page(campaign, "", None, {}, {})
+    assert re.search(rf"claimed σ \[m\] +{average.value:.4g} ", text)
+    assert re.search(r"farthest +0.25 ", text) and "far: largest error." in text
+    assert "claimed σ [m]" in html and "<strong>far</strong>: largest error." in html
+    campaign.save(tmp_path, figures=())
+    rows = {row["measure"]: row for row in _rows((tmp_path / "measures.csv").read_text())}
+    assert float(rows["claimed σ [m]"]["ekf low"]) == pytest.approx(average.low, rel=1e-8)
+    assert rows["farthest"]["honest"] == "0.25" and rows["verdict"]["ekf"] == summary.verdict
+    assert "claimed" in _rows(report.as_csv(campaign))[0]
+    assert "claimed" in _rows(campaign.save_runs(tmp_path / "runs.csv").read_text())[0]
+    assert json.loads(report.as_json(campaign))["filters"]["ekf"]["measures"]["claimed"]
+    panels = {chart["figure"]: chart["panels"] for chart in _charts(campaign)}
+    assert [one["title"] for one in panels["rmse"]][-1] == "claimed σ [m]"
+    assert plot.rmse_figure(campaign).axes[-1].get_ylabel() == "claimed σ [m]"
+
+    jaxslam.monte_carlo(WORLD, {"ekf": worlds.ekf(WORLD)}, 6, worlds.key(), **options)
+    del REGISTRY["claimed"]
+    with pytest.raises(ValueError, match=r"measure claimed: .* there, absent here"):
+        jaxslam.monte_carlo(WORLD, {"ekf": worlds.ekf(WORLD)}, 6, worlds.key(), **options)
+    again = jaxslam.load(tmp_path).filters["ekf"]  # without the file that registers it
+    np.testing.assert_array_equal(again.curves["claimed"], claimed)
+    assert again.measures["claimed"].value == average.value
+    REGISTRY["claimed"] = Measure("claimed", "claimed σ", claimed_sigma)
+
+
+def _rows(text):
+    return list(csv.DictReader(io.StringIO(text)))
+
+
+def _charts(campaign):
+    return json.loads(curves.embedded_curves(campaign).text)["charts"]
+
+
+@pytest.mark.parametrize(
+    ("measure", "message"),
+    [
+        (Measure("nees_pose", "mine", farthest), "'nees_pose' is the key of a measure of jaxslam"),
+        (Measure("square_heading", "mine", farthest), "'square_heading' is the key"),
+        (Measure("removed", "mine", farthest), "'removed' is the key"),
+        (Measure("mine", "mine"), "measure 'mine' has no of_run"),
+    ],
+)
+def test_a_measure_that_cannot_be_registered_is_refused(measure, message):
+    with pytest.raises(ValueError, match=f"register: {message}"):
+        register(measure)
+
+
+def test_a_measure_of_another_shape_is_refused(registered):
+    register(Measure("farthest", "farthest", lambda truth, trace: truth.pose))
+    with pytest.raises(ValueError, match=r"measure farthest: expected .* 100 steps, got .*100, 3"):
+        worlds.campaign(WORLD, {"ekf": worlds.ekf(WORLD)}, 2)
