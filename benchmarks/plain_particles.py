@@ -16,7 +16,7 @@ import numpy as np
 from benchmarks.gate import Metric, alone
 from jaxslam import filters, motion, run, sensors
 from jaxslam.math import gaussians, linalg
-from jaxslam.resampling import rules
+from jaxslam.resampling import systematic
 from jaxslam.simulation.worlds import Scenario, simulate
 
 MOTION = motion.Increment(np.diag([0.01, 0.01]) ** 2)
@@ -74,7 +74,7 @@ def plain(log, key, count: int, particles: int):
         weight = jax.vmap(lambda p, m: jax.vmap(density, (None, 0, 0))(p, m, z).sum())(poses, maps)
         weight = jnp.where(born, weight, 0.0)
         ess = 1 / (jax.nn.softmax(weight) ** 2).sum()
-        chosen = rules(weight, again)
+        chosen = systematic(weight, again)
         return (poses[chosen], maps[chosen], key, jnp.asarray(True)), ess
 
     maps = jnp.zeros((particles, count, 2))

@@ -19,7 +19,13 @@ from jaxslam.core.numbers import (
 from jaxslam.math.xla import hot_jit
 from jaxslam.protocols import Filter
 from jaxslam.types import Log, Scan, Status, Trace
-from jaxslam.validation import check_record, checked_estimate, same_state, state_and_info
+from jaxslam.validation import (
+    call_traced,
+    check_record,
+    checked_estimate,
+    same_state,
+    state_and_info,
+)
 from jaxslam.validation.logs import check_log
 
 
@@ -99,21 +105,25 @@ def _drive(
     dtype = jnp.result_type(log.control, log.scan.z)
     tag = log.scan.tag.astype(jnp.int32)  # of any integers, unsigned ones too
     log = Log(log.control.astype(dtype), Scan(log.scan.z.astype(dtype), tag, log.scan.valid))
-    start = filter.init(jnp.asarray(pose, dtype), jnp.asarray(pose_cov, dtype))
     name, most = f"run: {filter.name}", largest(log.control)
+    at = jnp.asarray(pose, dtype), jnp.asarray(pose_cov, dtype)
+    start = call_traced(f"{name}: init", filter.init, *at)
     keys = jax.random.split(key, (log.control.shape[0], 2))
 
     def step(state: PyTree, row: tuple[Log, jax.Array]) -> tuple[PyTree, PyTree]:
         (control, scan), (key_predict, key_update) = row
-        state = same_state(f"{name}: predict", state, filter.predict(state, control, key_predict))
+        predict = f"{name}: predict"
+        moved = call_traced(predict, filter.predict, state, control, key_predict)
+        state = same_state(predict, state, moved)
         # Under jit values are not checked before, and a NaN would spread through the whole state.
         lost = scan.valid & ~(jnp.abs(scan.z) <= most).all(axis=1)
         scan = scan._replace(valid=scan.valid & ~lost)
-        found = filter.update(state, scan, key_update)
+        found = call_traced(f"{name}: update", filter.update, state, scan, key_update)
         state, info = state_and_info(name, state, scan, found)
         status = jnp.where(lost, jnp.int32(Status.REJECTED), info.status)
         info = info._replace(status=status.astype(info.status.dtype))
-        estimate = checked_estimate(name, filter.estimate(state), dtype)
+        moments = call_traced(f"{name}: estimate", filter.estimate, state)
+        estimate = checked_estimate(name, moments, dtype)
         return state, (estimate, info, None if probe is None else probe(state))
 
     # XLA cannot merge the body of a scan with its recomputation, so no barrier is needed.

@@ -41,7 +41,11 @@ def record(cls: type[_T]) -> type[_T]:
         _check_kinds(self)
 
     cls.__post_init__ = __post_init__  # type: ignore[attr-defined]
-    made = dataclasses.dataclass(frozen=True, eq=False)(cls)
+    # A repr of its own is kept by subclasses; that of the fields is made anew.
+    of_fields = cls.__repr__ in (object.__repr__, getattr(cls, "_repr_of_fields", None))
+    made = dataclasses.dataclass(frozen=True, eq=False, repr=of_fields)(cls)
+    if of_fields:
+        made._repr_of_fields = made.__repr__  # type: ignore[attr-defined]
     fields = dataclasses.fields(made)  # type: ignore[arg-type]
     leaves = tuple(field.name for field in fields if not field.metadata.get("static"))
     statics = tuple(field.name for field in fields if field.metadata.get("static"))
@@ -122,10 +126,25 @@ def hold_function(of: Any, name: str, parameters: str) -> None:
 def _check_kinds(of: Any) -> None:
     for field in dataclasses.fields(of):
         value, where = getattr(of, field.name), f"{type(of).__name__}: {field.name}"
-        if not field.metadata.get("static"):
+        if field.metadata.get("static"):
+            _check_static(where, value)
+        else:
             _check_child(where, value)
-        elif isinstance(value, np.ndarray | jax.Array):
-            raise ValueError(f"{where}: expected a value that is compared by ==, got an array")
+
+
+def _check_static(where: str, value: Any) -> None:
+    """Check that a value cannot change and holds no numbers of its own to differentiate by."""
+    if isinstance(value, tuple | frozenset):
+        for each in value:
+            _check_static(where, each)
+    elif isinstance(value, np.ndarray | jax.Array):
+        raise ValueError(f"{where}: expected a value that is compared by ==, got an array")
+    elif is_record(value) and jax.tree.leaves(value):
+        got = f"the record {type(value).__name__}, whose numbers belong in a field of data"
+        raise ValueError(f"{where}: expected a choice, a size or a function, got {got}")
+    elif isinstance(value, dict | list | set) and not isinstance(value, FrozenDict):
+        got = type(value).__name__
+        raise ValueError(f"{where}: expected a value that cannot change, as a tuple, got a {got}")
 
 
 def _check_child(where: str, value: Any) -> None:
@@ -136,6 +155,8 @@ def _check_child(where: str, value: Any) -> None:
         wanted = "an array, as of numpy.asarray" if isinstance(value, list) else _WANTED
         got = repr(value) if isinstance(value, str) else f"a {type(value).__name__}"
         raise ValueError(f"{where}: expected {wanted}, got {got}")
+    elif isinstance(value, type):
+        raise ValueError(f"{where}: expected {_WANTED}, got the class {value.__name__}: call it")
     elif jax.tree_util.all_leaves([value]) and not _is_number(value):
         raise ValueError(f"{where}: expected {_WANTED}, got {type(value).__name__}")
 

@@ -335,7 +335,9 @@ class NominalMotion(_OfMotion):
 
 def _check_model(name: str, field: str, value: object, kind: type) -> None:
     if not isinstance(value, kind):
-        got = f"the class {value.__name__}: call it" if isinstance(value, type) else repr(value)
+        got = type(value).__name__
+        if isinstance(value, type):
+            got = f"the class {value.__name__}: call it"
         raise ValueError(f"{name}: expected {field} to be a {kind.__name__}, got {got}")
 
 

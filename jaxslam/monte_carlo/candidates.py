@@ -157,6 +157,9 @@ def check_fits(name: str, candidate: Candidate, scenario: World) -> None:
     """Raise ValueError unless a candidate takes what the scenario's log has."""
     if isinstance(candidate, LogEstimator):
         return
+    if isinstance(candidate, type):
+        got = f"the class {candidate.__name__}: call it"
+        raise ValueError(f"monte_carlo: expected {name} to be a filter, got {got}")
     if not isinstance(candidate, Filter):
         if not callable(candidate):
             raise ValueError(
@@ -214,13 +217,18 @@ def method_of(candidate: Candidate, truth: Truth) -> Filter | Estimator:
         return candidate
     try:
         made: Filter | Estimator = candidate(truth)
-        return made
     except AttributeError as error:
         name = getattr(getattr(candidate, "function", candidate), "__name__", str(candidate))
         raise ValueError(
             f"monte_carlo: {name} was called with the truth (poses and landmarks) and fails: "
             f"{error}; of a function of the scenario give what it returns, {name}(scenario)"
         ) from error
+    if not callable(made) and not isinstance(made, Filter):
+        raise ValueError(
+            "monte_carlo: expected a function of the truth to return a filter or an estimator, got "
+            f"{type(made).__name__}"
+        )
+    return made
 
 
 def estimator_of(candidate: Candidate, truth: Truth, scenario: World) -> tuple[Estimator, Chart]:
@@ -236,7 +244,7 @@ def estimator_of(candidate: Candidate, truth: Truth, scenario: World) -> tuple[E
     def drive(log: Log, key: jax.Array) -> Trace:
         return run(method, log, scenario.pose, scenario.pose_cov, key, probe=_gained)
 
-    return drive, method.chart
+    return drive, getattr(method, "chart", Euclidean())
 
 
 def _gained(state: PyTree) -> jax.Array | None:

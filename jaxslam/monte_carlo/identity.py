@@ -54,7 +54,10 @@ def identity(
     parts = {name: digest(getattr(scenario, name)) for name in _OF_WORLD}
     registered = [one for one in REGISTRY.values() if one not in BUILT_IN]
     fields = {field.name for field in dataclasses.fields(scenario)} - _NO_PART_OF_DRAWS
-    rest = {name: getattr(scenario, name) for name in fields - set(_OF_WORLD)}
+    rest = {
+        f"world's {name}": digest(getattr(scenario, name))
+        for name in sorted(fields - set(_OF_WORLD))
+    }
     return {
         **{name: _version(name) for name in ("jaxslam", "jax", "jaxlib")},
         "source": _source(),
@@ -67,7 +70,8 @@ def identity(
         "scenario": scenario.name,
         "steps": str(scenario.steps),
         **parts,
-        "world": digest((type(scenario), rest)),
+        "world": digest(type(scenario)),
+        **rest,
         **{f"filter {name}": digest(candidate) for name, candidate in filters.items()},
         **{f"measure {one.key}": digest((type(one), one.of_run)) for one in registered},
     }

@@ -243,17 +243,18 @@ def differences_of(
             found += differences_of(inner[0], inner[1], f"{above}{key}.")
         elif len(values) < 2 or canonical_json(values[0]) != canonical_json(values[1]):
             plain = all(isinstance(value, str) for value in values)
+            unknown = plain and all(_DIGEST.fullmatch(str(value)) for value in values)
             old, new = (
-                (str(side[key]) if plain else json.dumps(side[key], ensure_ascii=False))
-                if key in side
-                else "absent"
+                "absent"
+                if key not in side
+                else "present"
+                if unknown
+                else str(side[key])
+                if plain
+                else json.dumps(side[key], ensure_ascii=False)
                 for side in (there, here)
             )
-            if (
-                len(values) == 2
-                and plain
-                and all(_DIGEST.fullmatch(str(value)) for value in values)
-            ):
+            if len(values) == 2 and unknown:
                 how = "has other numbers or other code than in the stored runs"
             else:
                 how = f"{old} there, {new} here"

@@ -37,8 +37,6 @@ class RecordedWorld(World):
     source: str = static(default="")
     """these as of `Scenario`"""
 
-    __repr__ = World.__repr__
-
     @property
     def landmarks(self) -> ArrayLike:  # type: ignore[override]
         return self.truth.landmarks[0]

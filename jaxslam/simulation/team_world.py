@@ -55,8 +55,6 @@ class TeamWorld(World):
     source: str = static(default="")
     """these three as of `Scenario`"""
 
-    __repr__ = World.__repr__
-
     def __post_init__(self) -> None:
         count = int(np.shape(self.landmarks)[0]) if np.ndim(self.landmarks) == 2 else 0
         tags = check_team("TeamWorld", self.robots, self.tags, count)

@@ -29,7 +29,7 @@ from jaxslam.simulation.scans import (
 )
 from jaxslam.simulation.spurious import Spurious, spoil
 from jaxslam.types import Log, Scan, Truth
-from jaxslam.validation import check_record
+from jaxslam.validation import call_traced, check_record
 
 
 class World(Component):
@@ -94,7 +94,7 @@ class World(Component):
 
     def run(self, key: Array, number: int | Array) -> tuple[Truth, Log]:
         """The history of run `number` of a campaign with that key; traceable."""
-        return self.draw(run_keys(key, number)[0])
+        return drawn(self, run_keys(key, number)[0])
 
 
 @record
@@ -132,8 +132,6 @@ class Scenario(World):
     """figures of the paper, by filter and by the names of `consistency.Summary.measures`."""
     source: str = static(default="")
     """where the experiment is published."""
-
-    __repr__ = World.__repr__
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -205,13 +203,24 @@ def simulate(scenario: World, key: Array) -> tuple[Truth, Log]:
     """
     check_record("simulate", "scenario", scenario, World)
     check_key("simulate", key)
-    drawn: tuple[Truth, Log] = _draw(scenario, key)
-    return drawn
+    found: tuple[Truth, Log] = _draw(scenario, key)
+    return found
 
 
 @partial(jax.jit, inline=True)
 def _draw(scenario: World, key: Array) -> tuple[Truth, Log]:
-    return scenario.draw(key)
+    return drawn(scenario, key)
+
+
+def drawn(scenario: World, key: Array) -> tuple[Truth, Log]:
+    """What a world draws; ValueError where that is no truth and log."""
+    name = f"{scenario.name}: draw"
+    found = call_traced(name, scenario.draw, key)
+    kinds = tuple(map(type, found)) if isinstance(found, tuple) else (type(found),)
+    if kinds != (Truth, Log):
+        got = ", ".join(kind.__name__ for kind in kinds)
+        raise ValueError(f"{name}: expected (Truth, Log), got {got}")
+    return found
 
 
 def world_of_run(scenario: World, key: Array, number: int) -> tuple[Truth, Log]:
@@ -224,8 +233,8 @@ def world_of_run(scenario: World, key: Array, number: int) -> tuple[Truth, Log]:
         raise ValueError(
             f"{scenario.name}: expected a run from 0 to {most - 1}, the recorded ones, got {number}"
         )
-    drawn: tuple[Truth, Log] = _draw_run(scenario, key, number)
-    return drawn
+    found: tuple[Truth, Log] = _draw_run(scenario, key, number)
+    return found
 
 
 @jax.jit

@@ -11,6 +11,7 @@ from jaxslam.core.numbers import (
 )
 from jaxslam.validation.logs import check_log
 from jaxslam.validation.models import (
+    call_traced,
     check_associate,
     check_models,
     check_motion,
@@ -23,6 +24,7 @@ from jaxslam.validation.models import (
 )
 
 __all__ = [
+    "call_traced",
     "check_alpha",
     "check_associate",
     "check_count",

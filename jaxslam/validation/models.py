@@ -5,8 +5,10 @@ was expected.
 """
 
 import inspect
+import traceback
 import weakref
 from collections.abc import Callable
+from pathlib import Path
 from typing import TypeVar
 
 import jax
@@ -21,9 +23,34 @@ from jaxslam.types import Estimate, Info, Scan
 
 _Shape = tuple[int, ...]
 _Record = TypeVar("_Record")
+_Result = TypeVar("_Result")
 
 _SOUND: weakref.WeakSet[Motion | Sensor] = weakref.WeakSet()
 """Models whose sizes have been checked."""
+
+
+_NEEDS_VALUES = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+)
+
+
+def call_traced(name: str, function: Callable[..., _Result], *arguments: PyTree) -> _Result:
+    """The result of a user's function within a trace.
+
+    Raises ValueError, which begins with a name, where it needs the value of an array.
+    """
+    try:
+        return function(*arguments)
+    except _NEEDS_VALUES as error:
+        frames = traceback.extract_tb(error.__traceback__)
+        at = [frame for frame in frames if "site-packages" not in frame.filename][-1]
+        raise ValueError(
+            f"{name}: {Path(at.filename).name}:{at.lineno} needs the value of an array, which is "
+            "not known while JAX traces: write jnp.where or lax.cond in place of `if`, jax.numpy "
+            "in place of NumPy, and no float(…)"
+        ) from error
 
 
 def check_models(name: str, motion: object, sensor: object) -> None:

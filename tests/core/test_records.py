@@ -388,6 +388,43 @@ def test_a_world_names_what_is_wrong_in_it(change, message):
         dataclasses.replace(worlds.ring(3), **change)
 
 
+@pytest.mark.parametrize("value", [{"k": 1}, [1], {1}, (1, [2]), Pair(2.0), (np.ones(2),)])
+def test_a_static_field_holds_what_cannot_change_and_has_no_numbers(value):
+    @record
+    class Choice:
+        choice: object = static()
+
+    with pytest.raises(ValueError, match="Choice: choice: expected a"):
+        Choice(value)
+
+
+def test_what_cannot_be_traced_is_told_by_method_and_line():
+    @record
+    class Branching(filters.Wrapper):
+        def predict(self, state, u, key):
+            return self.filter.predict(state, u, key) if u[0] > 0 else state
+
+    @record
+    class Drawn(jaxslam.Scenario):
+        def draw(self, key):
+            return 3
+
+    @record
+    class Counted(jaxslam.Scenario):
+        def draw(self, key):
+            return float(jax.random.uniform(key))
+
+    world = worlds.ring(3)
+    with pytest.raises(ValueError, match=r"dead_reckoning: predict: test_records.py:\d+ needs the"):
+        driven(Branching(filters.DeadReckoning(world.motion, world.sensor)))
+    fields = {field.name: getattr(world, field.name) for field in dataclasses.fields(world)}
+    with pytest.raises(ValueError, match=r"ring: draw: expected \(Truth, Log\), got int"):
+        simulate(Drawn(**fields), KEY)
+    with pytest.raises(ValueError, match=r"ring: draw: test_records.py:\d+ needs the value"):
+        simulate(Counted(**fields), KEY)
+    assert "\n" not in repr(Drawn(**fields))
+
+
 def test_a_world_without_draw_is_refused():
     @record
     class Still(World):

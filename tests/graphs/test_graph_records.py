@@ -121,7 +121,9 @@ def test_a_graph_within_a_trace_is_solved_as_outside():
 def test_one_model_for_a_batch():
     plan = graphs.plan(GRAPH)
     widths = jnp.array([1.0, 2.0])
-    with pytest.raises(ValueError, match=r"^graphs\.optimize: expected one model, one plan and"):
+    with pytest.raises(
+        ValueError, match=r"^graphs\.optimize: expected the same factors, kernels, plan and"
+    ):
         jax.vmap(lambda k: graphs.optimize(GRAPH, plan=plan, kernel=graphs.Huber(k)))(widths)
 
 

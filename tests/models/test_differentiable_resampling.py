@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import scipy.stats
 
-from jaxslam.resampling import Soft, StopGradient, kld, kld_bound, rules
+from jaxslam.resampling import Soft, StopGradient, kld, kld_bound, systematic
 from jaxslam.resampling.weights import normalized, survivors
 
 # x' = a x + q ε, z = x + r η; x_0 ~ N(0, 1) before the first step
@@ -51,7 +51,7 @@ def estimated(a, key, method, count):
 
 
 METHODS = {
-    "plain": rules,
+    "plain": systematic,
     "stop_gradient": StopGradient(),
     "soft": Soft(0.5),
     "soft, all of w": Soft(1.0),

@@ -63,7 +63,10 @@ def folder(tmp_path_factory):
         ({"scenario": world(steps=13)}, {"steps", "controls"}),
         ({"scenario": world(landmarks=ELSEWHERE)}, {"landmarks"}),
         ({"scenario": world(name="circus")}, {"scenario"}),
-        ({"scenario": world(visible=lambda pose, landmark: landmark[0] > pose[0])}, {"world"}),
+        (
+            {"scenario": world(visible=lambda pose, landmark: landmark[0] > pose[0])},
+            {"world's visible"},
+        ),
         ({"name": "deaf"}, {"filters", "filter blind", "filter deaf"}),
         ({"make": drifting}, {"filter blind"}),
         ({"make": worlds.ekf}, {"filter blind"}),

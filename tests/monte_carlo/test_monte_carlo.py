@@ -192,6 +192,18 @@ def test_a_model_that_cannot_be_traced_stops_the_campaign_whatever_waits_for_it(
         campaign_of({"ekf": EKF, "broken": broken}, workers=2)
 
 
+@pytest.mark.parametrize(
+    ("candidate", "message"),
+    [
+        (filters.EkfSlam, "expected it to be a filter, got the class EkfSlam: call it"),
+        (lambda truth: 3, "function of the truth to return a filter or an estimator, got int"),
+    ],
+)
+def test_what_is_no_filter_is_refused(candidate, message):
+    with pytest.raises(ValueError, match=f"monte_carlo: expected .*{message}|{message}"):
+        campaign_of({"it": candidate})
+
+
 def test_every_filter_gets_the_same_draws(in_fours):
     same(in_fours.filters["ekf"], in_fours.filters["again"], rtol=0)
 

@@ -115,7 +115,8 @@ def over_batch(name: str, function: Callable[..., _T]) -> Callable[[PyTree, PyTr
     def rule(size: int, batched: PyTree, shared: PyTree, own: PyTree) -> tuple[_T, PyTree]:
         if any(jax.tree.leaves(batched[0])):
             raise ValueError(
-                f"{name}: expected one model, one plan and one set of limits for a batch"
+                f"{name}: expected the same factors, kernels, plan and limits for all graphs "
+                "of a batch"
             )
 
         if size > _GROUP:
