@@ -55,9 +55,9 @@ class Closing(Managed):
     """of the search"""
 
     def __post_init__(self) -> None:
+        validation.check_record("Closing", "settings", self.settings, LoopSettings)
         super().__post_init__()
         check_count("Closing: every", self.every)
-        validation.check_record("Closing", "settings", self.settings, LoopSettings)
         check_positive("Closing", spread=self.spread)
         if self.reach is not None:
             check_positive("Closing", reach=self.reach)
