@@ -428,7 +428,10 @@ def test_wrong_filters_are_found_out(lineup, name):
         ({"filters": {}}, "at least one"),
         ({"filters": {"x": 3}}, "expected x to be a Filter"),
         ({"filters": {"x": lambda log, key: None}}, "lambda truth"),
-        ({"filters": {"x": filters.EkfSlam}}, "expected x to be a filter, got the class EkfSlam: call it"),
+        (
+            {"filters": {"x": filters.EkfSlam}},
+            "expected x to be a filter, got the class EkfSlam: call it",
+        ),
         ({"filters": {"x": filters.DeadReckoning}}, "got the class DeadReckoning: call it"),
         ({"filters": catalog.FILTERS}, "'ekf' is a factory: call it, ekf(scenario, …)"),
         ({"filters": {"fej": catalog.FILTERS["fej"]}}, "call it, fej(world, …)"),
