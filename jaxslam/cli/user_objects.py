@@ -30,11 +30,6 @@ class UserObjects:
     def __init__(self) -> None:
         self._modules: dict[Path, ModuleType] = {}
 
-    @property
-    def used(self) -> bool:
-        """Whether anything came from a file."""
-        return bool(self._modules)
-
     def scenario(self, asked: str, steps: int | None) -> World:
         """A scenario, by name or from a file; steps: None for its own number of them.
 

@@ -37,6 +37,9 @@ _NO_PART_OF_DRAWS = frozenset({"name", "published", "source", "filter_options"})
 _BY_DATACLASS = frozenset({"__init__", "__repr__", "__setattr__", "__delattr__", "__replace__"})
 """Methods that are made of the fields."""
 
+_CONSTANT = (str, bytes, bool, int, float, complex, tuple, frozenset, np.ndarray, jax.Array)
+"""Attributes of a user's class that its methods may read."""
+
 
 def identity(
     scenario: World,
@@ -99,6 +102,8 @@ def _text(value: object, within: tuple[object, ...]) -> str:
         return f"{_text(type(value), within)} {held}"
     if isinstance(value, tuple | list):
         return f"{type(value).__qualname__} {[_text(part, within) for part in value]}"
+    if isinstance(value, frozenset):
+        return f"frozenset {sorted(_text(part, within) for part in value)}"
     if isinstance(value, functools.partial):
         return _text((value.func, value.args, value.keywords), within)
     if isinstance(value, type):
@@ -113,16 +118,24 @@ def _text(value: object, within: tuple[object, ...]) -> str:
 
 
 def _text_of_class(cls: type, within: tuple[object, ...]) -> str:
-    parts = {name: getattr(part, "fget", part) for name, part in vars(cls).items()}
+    parts = {
+        name: getattr(part, "fget", getattr(part, "__func__", part))
+        for name, part in vars(cls).items()
+    }
     methods = {
         name: part
-        for name, part in sorted(parts.items())
+        for name, part in parts.items()
         if isinstance(part, FunctionType) and _of_user(part) and name not in _BY_DATACLASS
     }
     if not methods or cls in within or cls.__module__.startswith("jaxslam."):
         return _name(cls)
+    constants = {
+        name: part
+        for name, part in parts.items()
+        if not name.startswith("__") and isinstance(part, _CONSTANT)
+    }
     within = (*within, cls)
-    return f"{cls.__qualname__} {_text((methods, cls.__bases__), within)}"
+    return f"{cls.__qualname__} {_text((methods, constants, cls.__bases__), within)}"
 
 
 def _text_of_function(function: FunctionType, within: tuple[object, ...]) -> str:

@@ -64,13 +64,11 @@ def mine(tmp_path):
 def test_filters_of_a_file_stand_beside_those_of_the_catalog(mine, capsys):
     files = UserObjects()
     world = scenarios.circle(3)
-    assert not files.used
     asked = f"ekf, {mine}:blind,{mine}:ready,{mine}:alike,{mine}:named"
     found = files.filters(asked, world)
     assert list(found) == ["ekf", "blind", "ready", "alike", "my filter"]
     assert all(isinstance(found[name], Filter) for name in ("ekf", "blind", "ready"))
     assert isinstance(found["alike"](None), Filter)
-    assert files.used
     assert capsys.readouterr().out == "loaded\n"  # once
     assert list(files.filters("all", world)) == list(catalog.ALL)
 

@@ -172,3 +172,23 @@ def test_a_digest_of_a_class_is_of_its_methods():
         return Faster
 
     assert digest(made(1.0)) == digest(made(1.0)) != digest(made(2.0))
+
+
+def test_a_digest_of_a_class_is_of_its_constants_and_of_sets_in_its_code():
+    def made(scale, among):
+        @record
+        class Scaled(filters.Wrapper):
+            factor = scale
+
+            @staticmethod
+            def known(tag):
+                return tag in among
+
+            def predict(self, state, u, key):
+                return self.filter.predict(state, self.factor * u, key)
+
+        return Scaled
+
+    one, two = frozenset({1, 2}), frozenset({2, 3})
+    assert digest(made(1.0, one)) == digest(made(1.0, frozenset({2, 1})))
+    assert len({digest(made(*each)) for each in ((1.0, one), (2.0, one), (1.0, two))}) == 3
