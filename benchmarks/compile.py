@@ -20,16 +20,16 @@ import numpy as np
 from benchmarks.delayed import named
 from benchmarks.gate import Metric, alone
 from jaxslam import catalog, life, motion, sensors, smoothing, team
+from jaxslam.consistency.campaign.candidates import estimator_of
+from jaxslam.core.protocols import Filter
+from jaxslam.core.types import Log, Trace, Truth
 from jaxslam.filters import EkfSlam, TeamSlam
 from jaxslam.filters.map_management.merging import Merging
-from jaxslam.monte_carlo.candidates import estimator_of
-from jaxslam.protocols import Filter
 from jaxslam.run import run
 from jaxslam.sensors import Part, Suite
 from jaxslam.simulation.scenarios import circle
 from jaxslam.simulation.team_world import TeamWorld
 from jaxslam.simulation.worlds import Scenario, World, simulate
-from jaxslam.types import Log, Trace, Truth
 
 GATE, DELAYED_GATE = 8.0, 10.0
 STEPS = 20

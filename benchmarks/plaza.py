@@ -22,10 +22,10 @@ import numpy as np
 import jaxslam
 from benchmarks.gate import Metric, alone
 from jaxslam import datasets, metrics
+from jaxslam.core.types import Status
 from jaxslam.filters import DelayedSlam
 from jaxslam.filters.delayed.settings import StoredMeasurements
 from jaxslam.results.plot.style import COLORS, FAINT, INK, PAGE, SHADE, caption, panels_of, png
-from jaxslam.types import Status
 
 FIGURE = Path(__file__).parent / "figures" / "plaza1.png"
 STORED = StoredMeasurements(capacity=40, spacing=2.0)

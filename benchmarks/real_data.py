@@ -17,10 +17,10 @@ import numpy as np
 import jaxslam
 from benchmarks.gate import Metric, alone
 from jaxslam import datasets
+from jaxslam.consistency.metrics import align_map
+from jaxslam.core.types import Status
 from jaxslam.datasets import Dataset
 from jaxslam.filters import EkfSlam
-from jaxslam.metrics import align_map
-from jaxslam.types import Status
 
 DATA = Path(os.environ.get("JAXSLAM_DATA", Path(__file__).parents[2] / "shared" / "data"))
 GATES = {"bonn": 0.2, "mrclam robot 1": 0.5, "mrclam robot 2": 0.5, "mrclam robot 3": 0.5}

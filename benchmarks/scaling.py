@@ -20,8 +20,8 @@ import numpy as np
 
 from benchmarks.gate import Metric, alone
 from jaxslam import filters, motion, sensors
+from jaxslam.core.types import Log, Scan
 from jaxslam.results.plot.style import PAGE, caption, curve, panels_of, png
-from jaxslam.types import Log, Scan
 
 FIGURE = Path(__file__).parent / "figures" / "scaling.png"
 KEY = jax.random.key(0)

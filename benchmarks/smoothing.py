@@ -33,8 +33,8 @@ from benchmarks.gate import Metric, report
 from jaxslam import datasets, monte_carlo
 from jaxslam.filters import EkfSlam
 from jaxslam.graphs import Ending
+from jaxslam.graphs.smoothing import BatchMap, Smoother
 from jaxslam.simulation.scenarios import circle, cloister
-from jaxslam.smoothing import BatchMap, Smoother
 
 TOL = 1e-6
 ROWS = (

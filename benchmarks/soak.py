@@ -50,7 +50,7 @@ def share(runs: int, stop_at: int, folder: str) -> None:
     signal.signal(signal.SIGINT, signal.default_int_handler)
 
     from jaxslam import catalog, monte_carlo, scenarios, store
-    from jaxslam.monte_carlo import Interrupted
+    from jaxslam.consistency.campaign import Interrupted
 
     world = scenarios.cloister(steps=50)
     filters = {name: catalog.FILTERS[name](world) for name in ("ekf", "right_invariant")}

@@ -21,8 +21,10 @@ import jaxslam
 from benchmarks.gate import Metric, alone
 from benchmarks.real_data import DATA
 from jaxslam import datasets, se2
+from jaxslam.consistency.metrics import align_map
+from jaxslam.core.types import Status
 from jaxslam.filters import EkfSlam, TeamSlam
-from jaxslam.metrics import align_map
+from jaxslam.filters.multi_robot.team import poses
 from jaxslam.results.plot.style import (
     HUES,
     INK,
@@ -33,8 +35,6 @@ from jaxslam.results.plot.style import (
     png,
     titled,
 )
-from jaxslam.team import poses
-from jaxslam.types import Status
 
 FIGURE = Path(__file__).parent / "figures" / "team.png"
 HEADER = "run robots fused sightings unused NIS/dof theirs RMSE[m] σ1[m] σ2[m] σ3[m] run[s]"

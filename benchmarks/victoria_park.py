@@ -24,10 +24,10 @@ from gtsam.symbol_shorthand import L, X
 import jaxslam
 from benchmarks.gate import Metric, report
 from jaxslam import charts, datasets, metrics, plot
+from jaxslam.core.types import Status
 from jaxslam.datasets import Dataset
 from jaxslam.filters import EkfSlam
 from jaxslam.results.plot.style import INK, PAGE, SHADE, Figure, caption, panels_of, png, titled
-from jaxslam.types import Status
 
 FILTERS = {"EKF": {}, "invariant EKF": {"chart": charts.RightInvariant()}}
 """Options of `EkfSlam` over those of the data set."""

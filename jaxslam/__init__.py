@@ -1,6 +1,6 @@
 """jaxslam: pure-functional, differentiable 2-D SLAM.
 
-A SLAM method is a record of pure functions (`protocols`). `run` applies it to a log, and
+A SLAM method is a record of pure functions (`jaxslam.protocols`). `run` applies it to a log, and
 `monte_carlo` to thousands of simulated worlds. Importing the package does not change the
 configuration of JAX; for float64 set `jax_enable_x64` yourself, as the command line does.
 """
@@ -15,26 +15,22 @@ from jaxslam import (
     catalog,
     charts,
     consistency,
-    features,
     filters,
     graphs,
-    grids,
-    laser_slam,
     life,
     linearize,
-    matching,
-    metrics,
     motion,
     resampling,
     sensors,
-    slots,
-    smoothing,
-    team,
-    topology,
 )
-from jaxslam._field_docs import attach_field_docs
+from jaxslam.consistency import metrics
+from jaxslam.consistency.campaign import Campaign, Interrupted, monte_carlo
+from jaxslam.core import protocols, slots, types
+from jaxslam.core._field_docs import attach_field_docs
+from jaxslam.filters.multi_robot import team
+from jaxslam.graphs import smoothing
+from jaxslam.laser import features, grids, laser_slam, matching, topology
 from jaxslam.math import se2, stats, uncertain_poses
-from jaxslam.monte_carlo import Campaign, Interrupted, monte_carlo
 from jaxslam.run import run
 from jaxslam.simulation import scenarios, spurious
 from jaxslam.simulation.recorded import recorded_world
@@ -66,6 +62,7 @@ __all__ = [
     "metrics",
     "monte_carlo",
     "motion",
+    "protocols",
     "recorded_world",
     "resampling",
     "run",
@@ -79,6 +76,7 @@ __all__ = [
     "stats",
     "team",
     "topology",
+    "types",
     "uncertain_poses",
     "verify_jacobians",
 ]

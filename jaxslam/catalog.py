@@ -17,7 +17,9 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxslam.charts import LeftInvariant, RightInvariant
+from jaxslam.core.protocols import Candidate, Estimator, Filter
 from jaxslam.core.record import record, static
+from jaxslam.core.types import Truth
 from jaxslam.filters.ekf.ekf_slam import EkfSlam
 from jaxslam.filters.ekf.observability import Monitored
 from jaxslam.filters.ekf.settings import EkfOptions
@@ -28,14 +30,12 @@ from jaxslam.filters.known.localization import Localization
 from jaxslam.filters.known.mapping import Mapping
 from jaxslam.filters.particles.fastslam import FastSlam
 from jaxslam.filters.particles.particle_localization import ParticleLocalization
+from jaxslam.graphs.smoothing.batch_map import BatchMap
+from jaxslam.graphs.smoothing.fixed_lag import FixedLag
 from jaxslam.linearize.other_points import AtTruth, FirstEstimate, Observability
 from jaxslam.linearize.unscented import Unscented
-from jaxslam.protocols import Candidate, Estimator, Filter
 from jaxslam.run import run
 from jaxslam.simulation.worlds import World
-from jaxslam.smoothing.batch_map import BatchMap
-from jaxslam.smoothing.fixed_lag import FixedLag
-from jaxslam.types import Truth
 
 _V = TypeVar("_V")
 

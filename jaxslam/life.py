@@ -11,13 +11,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam import slots
+from jaxslam.core import slots
 from jaxslam.core.numbers import check_count, is_concrete
+from jaxslam.core.protocols import Life
 from jaxslam.core.record import hold_function, record, static
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Estimate, Info, Status
 from jaxslam.math.arrays import Number
-from jaxslam.protocols import Life
-from jaxslam.slots import Joint
-from jaxslam.types import Estimate, Info, Status
 
 
 class Times(NamedTuple):

@@ -16,17 +16,17 @@ from jaxslam.core.numbers import (
     largest,
     shape_told,
 )
-from jaxslam.math.xla import hot_jit
-from jaxslam.protocols import Filter
-from jaxslam.types import Log, Scan, Status, Trace
-from jaxslam.validation import (
+from jaxslam.core.protocols import Filter
+from jaxslam.core.types import Log, Scan, Status, Trace
+from jaxslam.core.validation import (
     call_traced,
     check_record,
     checked_estimate,
     same_state,
     state_and_info,
 )
-from jaxslam.validation.logs import check_log
+from jaxslam.core.validation.logs import check_log
+from jaxslam.math.xla import hot_jit
 
 
 def run(

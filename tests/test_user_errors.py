@@ -21,13 +21,13 @@ from jaxslam import (
     smoothing,
     team,
 )
+from jaxslam.core.protocols import Free
 from jaxslam.core.record import record
+from jaxslam.core.types import Log, Scan
+from jaxslam.core.validation import check_models, checked_estimate, state_and_info
 from jaxslam.filters import reporting
 from jaxslam.filters.map_management.closing import Closing
 from jaxslam.filters.map_management.loop_closure import LoopSettings
-from jaxslam.protocols import Free
-from jaxslam.types import Log, Scan
-from jaxslam.validation import check_models, checked_estimate, state_and_info
 
 MOVE = motion.PoseIncrement(np.diag([1e-4, 1e-4, 1e-6]))
 SEES = sensors.RangeBearing(np.diag([1e-2, 1e-4]))
@@ -220,7 +220,7 @@ def test_charts_linearizers_and_filters_define_their_methods():
 
 
 def test_what_a_filter_of_ones_own_returns_is_told():
-    scan = jaxslam.types.Scan(jnp.zeros((1, 2)), jnp.zeros(1, int), jnp.ones(1, bool))
+    scan = jaxslam.core.types.Scan(jnp.zeros((1, 2)), jnp.zeros(1, int), jnp.ones(1, bool))
     info, state = reporting.nothing_of(scan), jnp.zeros(3)
     assert state_and_info("run: mine", state, scan, (state, info)) == (state, info)
     for wrong, told in (
@@ -252,7 +252,7 @@ def test_what_a_filter_of_ones_own_returns_is_told():
     ):
         with pytest.raises(ValueError, match=rf"^run: mine: {told}"):
             state_and_info("run: mine", state, scan, wrong)
-    believed = jaxslam.types.Estimate(
+    believed = jaxslam.core.types.Estimate(
         *(jnp.zeros(shape) for shape in [(3,), (3, 3), (2, 2), (2, 2, 2), (2,), (2,)])
     )
     real = jnp.zeros(0).dtype

@@ -13,6 +13,7 @@ import numpy as np
 import jaxslam
 from jaxslam import association, charts, motion, sensors
 from jaxslam.consistency.measures.associations import identities
+from jaxslam.core.types import Status
 from jaxslam.filters import EkfSlam
 from jaxslam.filters.map_management.closing import Closing
 from jaxslam.filters.map_management.loop_closure import LoopSettings
@@ -22,7 +23,6 @@ from jaxslam.results.plot.style import COLORS, INK, PAGE, SHADE, caption, panels
 from jaxslam.simulation.scenarios import BetweenRanges
 from jaxslam.simulation.spurious import Spurious
 from jaxslam.simulation.worlds import Scenario, simulate
-from jaxslam.types import Status
 
 RUNS, BLOCK = 50, 10
 RADIUS, COUNT, CAPACITY = 30.0, 72, 120

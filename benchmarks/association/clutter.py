@@ -6,10 +6,10 @@ import jax
 import numpy as np
 
 from jaxslam import association, motion
+from jaxslam.consistency.campaign import monte_carlo
 from jaxslam.filters import EkfSlam
 from jaxslam.life import Existence
 from jaxslam.math.stats import chi2_quantile
-from jaxslam.monte_carlo import monte_carlo
 from jaxslam.results.plot.style import INK, PAGE, caption, curve, panels_of, titled
 from jaxslam.simulation.scenarios import cloister
 from jaxslam.simulation.spurious import Spurious

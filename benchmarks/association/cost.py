@@ -13,14 +13,14 @@ import numpy as np
 
 from benchmarks.speed.timing import together
 from jaxslam import association, life, run
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Log, Scan
 from jaxslam.filters import EkfSlam
 from jaxslam.filters.ekf.predicted_measurements import prediction_of
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.update import correct_in_turn
 from jaxslam.filters.map_management.merging import Merging
 from jaxslam.simulation.scenarios import cloister
-from jaxslam.slots import Joint
-from jaxslam.types import Log, Scan
 
 COUNT, SEEN, RUNS = 200, 20, 16
 GATE = 9.21

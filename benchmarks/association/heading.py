@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam import association
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Scan
 from jaxslam.filters.ekf.predicted_measurements import prediction_of
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.math.angles import wrap
@@ -19,8 +21,6 @@ from jaxslam.math.linalg import root_psd
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.results.plot.style import PAGE, caption, curve, panels_of, titled
 from jaxslam.sensors import RangeBearing
-from jaxslam.slots import Joint
-from jaxslam.types import Scan
 
 COUNT, SEEN, DRAWS = 14, 8, 500
 SIGMAS = np.array([0.5, 2, 4, 6, 8, 10, 12, 15, 20, 25, 30, 35, 40, 45])

@@ -35,11 +35,11 @@ import numpy as np
 import jaxslam
 from jaxslam import association, charts, datasets, motion, sensors
 from jaxslam.calibration import calibrate
+from jaxslam.core.types import Status
 from jaxslam.filters import EkfSlam
 from jaxslam.life import Recency
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.results.plot.style import COLORS, INK, PAGE, SHADE, caption, panels_of
-from jaxslam.types import Status
 
 CAPACITY, LOCAL, PATIENCE = 200, 16, 30
 NARROW, WIDE = ((0.02, 0.02, 0.003), 0.3), ((0.03, 0.03, 0.006), 0.3)

@@ -11,8 +11,8 @@ from benchmarks.consistency.markdown import Section, table
 from benchmarks.gate import Metric
 from jaxslam.catalog import FILTERS
 from jaxslam.consistency import Average
+from jaxslam.consistency.campaign import monte_carlo
 from jaxslam.math.stats import t_quantile
-from jaxslam.monte_carlo import monte_carlo
 from jaxslam.simulation.scenarios import circle
 
 PUBLISHED_RUNS = 100

@@ -16,7 +16,7 @@ from benchmarks.gate import Metric
 from jaxslam.catalog import FILTERS
 from jaxslam.consistency import own_error_of, score
 from jaxslam.consistency.score import run_statistics
-from jaxslam.protocols import Filter, Motion, Sensor
+from jaxslam.core.protocols import Filter, Motion, Sensor
 from jaxslam.results.plot.style import INK, PAGE, Figure, caption, curve, panels_of
 from jaxslam.run import run
 from jaxslam.simulation.scenarios import loop, loop_landmarks

@@ -8,8 +8,8 @@ import numpy as np
 from benchmarks.consistency.markdown import Section, table
 from benchmarks.gate import Metric
 from jaxslam.catalog import FILTERS
-from jaxslam.monte_carlo import Campaign, monte_carlo
-from jaxslam.protocols import Candidate
+from jaxslam.consistency.campaign import Campaign, monte_carlo
+from jaxslam.core.protocols import Candidate
 from jaxslam.results.plot.style import PAGE, Figure, caption, curve, panels_of
 from jaxslam.simulation.scenarios import stationary
 

@@ -6,7 +6,7 @@ import numpy as np
 from benchmarks.consistency.markdown import Section, table
 from benchmarks.gate import Metric
 from jaxslam.catalog import FILTERS
-from jaxslam.monte_carlo import monte_carlo
+from jaxslam.consistency.campaign import monte_carlo
 from jaxslam.results.plot import nees_figure
 from jaxslam.results.plot.style import Figure
 from jaxslam.simulation.scenarios import webmap

@@ -10,7 +10,7 @@ import numpy as np
 from benchmarks.gate import Metric
 from benchmarks.real_data import DATA
 from jaxslam import datasets, laser_slam, metrics
-from jaxslam.laser_slam import LoopOutcome
+from jaxslam.laser.laser_slam import LoopOutcome
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.results import plot
 
@@ -127,7 +127,7 @@ def _by_relations(name: str, log: datasets.LaserLog, solved: laser_slam.Solved) 
     read = datasets.relation_file(DATA / "relations" / str(LOGS[name].relations))
     of, lost = metrics.given(log.time, read.first, read.second, read.pose, tolerance=TOLERANCE)
     far = np.abs(log.time[of.first] - log.time[of.second]) > LONG
-    inside = laser_slam.relation_nees(solved, of) <= chi2_quantile(0.95, 3)
+    inside = laser_slam.relation_nees(solved, *of) <= chi2_quantile(0.95, 3)
     print(f"{len(of.pose)} relations of {len(of.pose) + lost} join, {far.sum()} over {LONG:g} s")
     print("path             relations     translation [m]       squared [m²]      rotation [deg]")
     found = []

@@ -15,10 +15,10 @@ from jaxslam import (
     scenarios,
     sensors,
 )
-from jaxslam.laser_slam import ScanLog, Settings, covariances
+from jaxslam.core.types import Log, Scan
+from jaxslam.laser.laser_slam import ScanLog, Settings, covariances
 from jaxslam.math import numpy_poses as poses
 from jaxslam.simulation.laser import scan_world
-from jaxslam.types import Log, Scan
 
 EVERY = 4
 """Scans of the world of which one is used: half a metre, or 45°."""

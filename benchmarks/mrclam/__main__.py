@@ -34,11 +34,11 @@ from benchmarks.real_data import DATA
 from jaxslam import charts, datasets, metrics, smoothing
 from jaxslam.calibration import consider_cov
 from jaxslam.consistency.measures.nees import block_nees, pose_error
+from jaxslam.core.types import Status
 from jaxslam.datasets import MRCLAM_FITTED
 from jaxslam.filters import EkfSlam, TeamSlam
+from jaxslam.filters.multi_robot.team import poses
 from jaxslam.math.stats import sigma_gate
-from jaxslam.team import poses
-from jaxslam.types import Status
 
 FIGURE = Path(__file__).parents[1] / "figures" / "mrclam.png"
 ASKED = 0.15, 6.0

@@ -12,13 +12,13 @@ import jaxslam
 from benchmarks.mrclam import fit as fitting
 from jaxslam import charts, datasets, linearize
 from jaxslam.consistency.measures.nees import block_nees, pose_error
+from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.record import record
+from jaxslam.core.types import Log, Scan, Truth
 from jaxslam.filters import EkfSlam
 from jaxslam.math import se2
 from jaxslam.motion import PoseIncrement
-from jaxslam.protocols import Motion, Sensor
 from jaxslam.sensors import RangeBearing
-from jaxslam.types import Log, Scan, Truth
 
 RUNS = 300
 WHITE = 2.0

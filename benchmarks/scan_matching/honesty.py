@@ -11,8 +11,8 @@ from benchmarks.scan_matching.pairs import START, Known, drawn, known
 from jaxslam import matching
 from jaxslam.core.record import record
 from jaxslam.graphs import Cauchy
-from jaxslam.matching import MatchStatus
-from jaxslam.matching import covariance as ways
+from jaxslam.laser.matching import MatchStatus
+from jaxslam.laser.matching import covariance as ways
 from jaxslam.math.stats import chi2_band, chi2_quantile
 
 WORLDS = ("square", "corridor", "circular_room", "office")

@@ -5,9 +5,9 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.speed.timing import best
+from jaxslam.core.slots import Joint
 from jaxslam.filters import CompressedEkfSlam, EkfSlam
 from jaxslam.filters.ekf.compressed_ekf_slam import opened
-from jaxslam.slots import Joint
 
 AREA = 40
 """landmarks K worked on"""

@@ -1,7 +1,7 @@
 """Sphinx extension: writes the pages of the API reference from the package.
 
 A name is public if a package lists it in `__all__`, or if its module stands directly below
-`jaxslam` or is one of `OPEN`; and if neither it nor its module begins with an underscore. It is
+`jaxslam` or is one of `INTRODUCED` or `OPEN`; and if neither it nor its module begins with an underscore. It is
 shown under the shortest path that reaches it: the package that lists it, else its own module.
 """
 
@@ -20,8 +20,8 @@ FOLDER = Path(__file__).parents[1] / "reference" / "api"
 INTRODUCED = {
     "jaxslam": "The driver, the harness and the verifier",
     "jaxslam.core": "Records, and checks of numbers",
-    "jaxslam.types": "Records of data",
-    "jaxslam.protocols": "Protocols",
+    "jaxslam.core.types": "Records of data",
+    "jaxslam.core.protocols": "Protocols",
     "jaxslam.motion": "Motion models",
     "jaxslam.sensors": "Sensors",
     "jaxslam.filters": "Filters",
@@ -30,28 +30,28 @@ INTRODUCED = {
     "jaxslam.association": "Data association",
     "jaxslam.life": "Which landmarks exist",
     "jaxslam.resampling": "Resampling",
-    "jaxslam.smoothing": "Smoothing and batch estimation",
+    "jaxslam.graphs.smoothing": "Smoothing and batch estimation",
     "jaxslam.graphs": "Graphs of poses and points",
-    "jaxslam.grids": "Occupancy grids and rays",
-    "jaxslam.laser_slam": "Laser SLAM",
-    "jaxslam.matching": "Scan matching",
-    "jaxslam.features": "Features of scans",
-    "jaxslam.topology": "Topological maps",
-    "jaxslam.team": "Several robots",
+    "jaxslam.laser.grids": "Occupancy grids and rays",
+    "jaxslam.laser.laser_slam": "Laser SLAM",
+    "jaxslam.laser.matching": "Scan matching",
+    "jaxslam.laser.features": "Features of scans",
+    "jaxslam.laser.topology": "Topological maps",
+    "jaxslam.filters.multi_robot.team": "Several robots",
     "jaxslam.simulation": "Simulated worlds",
-    "jaxslam.monte_carlo": "Monte-Carlo campaigns",
+    "jaxslam.consistency.campaign": "Monte-Carlo campaigns",
     "jaxslam.consistency": "Measures of consistency",
-    "jaxslam.metrics": "Errors of paths and maps",
+    "jaxslam.consistency.metrics": "Errors of paths and maps",
     "jaxslam.verify": "Verification of Jacobians",
     "jaxslam.catalog": "The filters of a campaign by name",
     "jaxslam.datasets": "Data sets",
-    "jaxslam.logs": "Logs from tables and streams",
+    "jaxslam.core.logs": "Logs from tables and streams",
     "jaxslam.calibration": "Calibration and noises",
     "jaxslam.results": "Reports, figures and files",
     "jaxslam.math": "Mathematics",
-    "jaxslam.noise": "Noise models",
-    "jaxslam.slots": "The table of landmarks",
-    "jaxslam.validation": "What is refused",
+    "jaxslam.core.noise": "Noise models",
+    "jaxslam.core.slots": "The table of landmarks",
+    "jaxslam.core.validation": "What is refused",
 }
 """Title of each page, in the order of the contents; a module that is not listed comes after."""
 
@@ -65,8 +65,8 @@ OPEN = {
     "jaxslam.filters.map_management.relocalization",
     "jaxslam.filters.reporting",
     "jaxslam.linearize.first_order",
-    "jaxslam.logs.streams",
-    "jaxslam.logs.tables",
+    "jaxslam.core.logs.streams",
+    "jaxslam.core.logs.tables",
     "jaxslam.math.angles",
     "jaxslam.math.gaussians",
     "jaxslam.math.se2",
@@ -130,7 +130,7 @@ def public_names() -> dict[str, list[Name]]:
 
 def is_open(module: str) -> bool:
     """Whether the names of a module are public that no package lists."""
-    return module.count(".") < 2 or module in OPEN
+    return module.count(".") < 2 or module in INTRODUCED or module in OPEN
 
 
 def key_of(name: str, value: Any) -> tuple[int, str]:
@@ -162,8 +162,10 @@ def assigned(module: ModuleType) -> set[str]:
 
 
 def page_of(module: str) -> str:
-    """The page that a module stands on: its top-level part."""
-    return ".".join(module.split(".")[:2])
+    """The page that a module stands on: that of the nearest package in INTRODUCED, or its own."""
+    parts = module.split(".")
+    above = (".".join(parts[:n]) for n in range(len(parts), 1, -1))
+    return next((name for name in above if name in INTRODUCED), ".".join(parts[:2]))
 
 
 def write_pages(app: Any = None) -> None:

@@ -10,12 +10,12 @@ from jaxtyping import Bool, Float, Int
 
 from jaxslam.association.rules import check_gates, far_from_all
 from jaxslam.core.numbers import check_count
+from jaxslam.core.protocols import Association, Pairs, Prediction
 from jaxslam.core.record import record, static
+from jaxslam.core.types import Scan
 from jaxslam.math import linalg
 from jaxslam.math.arrays import Number
 from jaxslam.math.stats import chi2_quantile
-from jaxslam.protocols import Association, Pairs, Prediction
-from jaxslam.types import Scan
 
 
 @record

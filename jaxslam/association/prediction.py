@@ -7,9 +7,9 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
+from jaxslam.core.protocols import Pairs, Prediction, Sensor
+from jaxslam.core.types import Scan
 from jaxslam.math.gaussians import gaussian_terms
-from jaxslam.protocols import Pairs, Prediction, Sensor
-from jaxslam.types import Scan
 
 
 def predicted(

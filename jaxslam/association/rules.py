@@ -10,13 +10,13 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxslam import slots
+from jaxslam.core import slots
 from jaxslam.core.numbers import check_positive, is_concrete
+from jaxslam.core.protocols import Associate, Association, Pairs, Prediction
 from jaxslam.core.record import hold_function, record, static
+from jaxslam.core.types import Scan
 from jaxslam.math.arrays import Number
 from jaxslam.math.assignment import assign
-from jaxslam.protocols import Associate, Association, Pairs, Prediction
-from jaxslam.types import Scan
 
 
 def check_gates(name: str, gate: Number, new_gate: Number | None) -> None:

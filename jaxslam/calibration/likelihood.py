@@ -15,7 +15,7 @@ from numpy.typing import ArrayLike
 
 from jaxslam.core.numbers import check_count
 from jaxslam.core.record import as_record
-from jaxslam.types import Info, Log, Status
+from jaxslam.core.types import Info, Log, Status
 
 BOUND = 1.35
 """By how much log L falls at the 95 % upper limit of a parameter whose estimate is 0: half the 0.90

@@ -15,8 +15,8 @@ from numpy.typing import ArrayLike
 
 from jaxslam.core.numbers import check_count, is_concrete
 from jaxslam.core.record import as_record
+from jaxslam.core.types import Info, Status
 from jaxslam.math import linalg
-from jaxslam.types import Info, Status
 
 
 class Calibration(NamedTuple):

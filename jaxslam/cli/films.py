@@ -5,7 +5,7 @@ from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from jaxslam.monte_carlo.progress import Progress
+from jaxslam.consistency.campaign.progress import Progress
 from jaxslam.results.files import Files
 
 if TYPE_CHECKING:  # Matplotlib is slow to load

@@ -8,9 +8,9 @@ import numpy as np
 
 from jaxslam.cli.common import add_out
 from jaxslam.cli.runtime import cache
+from jaxslam.core.logs.tables import POSE
 from jaxslam.datasets import Dataset, DatasetFit, fit, table
 from jaxslam.datasets.table.settings_text import changed, toml_lines
-from jaxslam.logs.tables import POSE
 from jaxslam.results.files import (
     Json,
     check_writable,

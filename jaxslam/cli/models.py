@@ -10,8 +10,8 @@ from functools import partial
 from jaxslam import motion, sensors, verify
 from jaxslam.cli.common import add_out
 from jaxslam.cli.runtime import cache
-from jaxslam.grids import beam_models
-from jaxslam.monte_carlo.progress import Progress
+from jaxslam.consistency.campaign.progress import Progress
+from jaxslam.laser.grids import beam_models
 from jaxslam.results.files import check_writable, json_text, versions, write_files
 from jaxslam.verify.inputs import user_files
 

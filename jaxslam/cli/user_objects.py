@@ -14,8 +14,8 @@ from types import ModuleType
 from jaxslam import filters
 from jaxslam.catalog import ALL
 from jaxslam.cli.common import pick
-from jaxslam.monte_carlo.candidates import check_fits, check_noise
-from jaxslam.protocols import Candidate, Filter
+from jaxslam.consistency.campaign.candidates import check_fits, check_noise
+from jaxslam.core.protocols import Candidate, Filter
 from jaxslam.simulation.scenarios import SCENARIOS
 from jaxslam.simulation.worlds import World
 from jaxslam.verify.errors import describe_error

@@ -10,18 +10,18 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.consistency.score import snapshot_steps
+from jaxslam.core.protocols import Sensor
+from jaxslam.core.types import Estimate, Log, Truth
 from jaxslam.filters.ekf.ekf_slam import EkfSlam
 from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.linearize import first_order
 from jaxslam.linearize.first_order import with_lever_arm
 from jaxslam.linearize.other_points import AtTruth
 from jaxslam.math.linalg import root_psd
-from jaxslam.protocols import Sensor
 from jaxslam.run import run
 from jaxslam.sensors.suite import Suite
 from jaxslam.simulation.recorded import RecordedWorld
 from jaxslam.simulation.worlds import Scenario, World
-from jaxslam.types import Estimate, Log, Truth
 
 
 def conditional_bound(scenario: World, truth: Truth, log: Log, key: Array) -> Estimate:

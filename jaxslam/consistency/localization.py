@@ -12,15 +12,15 @@ from numpy.typing import ArrayLike
 from jaxslam.consistency.intervals import Average, interval, positive_interval
 from jaxslam.consistency.measures.nees import block_nees, pose_error
 from jaxslam.core.numbers import check_count, check_covariance, check_key
+from jaxslam.core.protocols import Filter
+from jaxslam.core.types import JaxOrNumPy, Log
 from jaxslam.filters.particles.pose_particles import PoseParticles
-from jaxslam.grids.localization import beam_log
+from jaxslam.laser.grids.localization import beam_log
 from jaxslam.math.angles import wrap
 from jaxslam.math.linalg import root_psd
-from jaxslam.protocols import Filter
 from jaxslam.resampling.weights import at_points, weights_of
 from jaxslam.run import run
 from jaxslam.simulation.laser import LaserWorld, check_world, scan_world
-from jaxslam.types import JaxOrNumPy, Log
 
 DRAWS = 199
 """Draws from the particles that represent them in a step; with the truth they are 200."""

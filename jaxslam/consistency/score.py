@@ -24,9 +24,9 @@ from jaxslam.consistency.measures.associations import associations, identities
 from jaxslam.consistency.measures.counts import counted
 from jaxslam.consistency.measures.measure import Measure, Nees, Runs, RunStatistics
 from jaxslam.consistency.measures.nees import block_nees, pose_error
+from jaxslam.core.protocols import Sensor
+from jaxslam.core.types import Estimate, Info, Status, Trace, Truth
 from jaxslam.math import linalg
-from jaxslam.protocols import Sensor
-from jaxslam.types import Estimate, Info, Status, Trace, Truth
 
 LAGS = 10
 """The autocorrelation of innovations is taken up to so many steps."""

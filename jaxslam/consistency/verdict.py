@@ -14,8 +14,8 @@ import numpy as np
 from jaxslam.consistency.intervals import LEVEL, Spread, percentage, spread
 from jaxslam.consistency.measures.counts import DROPS, KEPT
 from jaxslam.consistency.measures.nees import DOF
+from jaxslam.core.types import Status
 from jaxslam.math.stats import normal_quantile, truncated_chi2_mean
-from jaxslam.types import Status
 
 TESTS = {"nees_pose": "pose NEES", "nis_per_dof": "NIS / dof"}
 """The measures that are tested, and their names in messages."""

@@ -4,12 +4,12 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxslam.core.logs.streams import as_recorded
+from jaxslam.core.types import Log
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.lines import TextFile
-from jaxslam.logs.streams import as_recorded
 from jaxslam.motion import PoseIncrement
 from jaxslam.sensors import RangeBearing
-from jaxslam.types import Log
 
 SOURCE = (
     "C. Stachniss, Robot Mapping, course exercises, University of Freiburg and University of Bonn"

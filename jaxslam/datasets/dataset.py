@@ -8,12 +8,12 @@ import numpy as np
 from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
+from jaxslam.core.protocols import Motion, Sensor
+from jaxslam.core.types import JaxOrNumPy, Log
+from jaxslam.core.validation.logs import check_log
 from jaxslam.filters.ekf.settings import EkfOptions
-from jaxslam.protocols import Motion, Sensor
+from jaxslam.filters.multi_robot.team import Robot
 from jaxslam.sensors.suite import Suite
-from jaxslam.team import Robot
-from jaxslam.types import JaxOrNumPy, Log
-from jaxslam.validation.logs import check_log
 
 
 class Adjustable(NamedTuple):

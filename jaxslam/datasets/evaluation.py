@@ -9,16 +9,15 @@ import jax
 import numpy as np
 from jaxtyping import Float, PyTree
 
-from jaxslam import metrics
-from jaxslam.consistency import LEVEL, percentage
+from jaxslam.consistency import LEVEL, metrics, percentage
 from jaxslam.consistency.measures.nees import block_nees, pose_error
+from jaxslam.consistency.metrics.paths import alignment, carried
+from jaxslam.core.protocols import Filter
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Estimate
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.filters.ekf.map_coordinates import cov_of_coordinates
 from jaxslam.math.stats import chi2_band, chi2_quantile
-from jaxslam.metrics.paths import alignment, carried
-from jaxslam.protocols import Filter
-from jaxslam.slots import Joint
-from jaxslam.types import Estimate
 
 _in_coordinates = jax.jit(cov_of_coordinates, static_argnames="square_root", inline=True)
 

@@ -9,15 +9,15 @@ import numpy as np
 
 from jaxslam.association.rules import Known
 from jaxslam.calibration import NoiseFit, as_associated, fit_noise
+from jaxslam.core.logs.tables import POSE, split_unit
 from jaxslam.core.numbers import check_count
+from jaxslam.core.protocols import Filter
+from jaxslam.core.types import Info, JaxOrNumPy, Log, Status
 from jaxslam.datasets.dataset import Adjustable, Dataset
 from jaxslam.filters.ekf.ekf_slam import EkfSlam
 from jaxslam.filters.ekf.settings import EkfOptions
-from jaxslam.logs.tables import POSE, split_unit
 from jaxslam.math.stats import normal_quantile
-from jaxslam.protocols import Filter
 from jaxslam.run import run
-from jaxslam.types import Info, JaxOrNumPy, Log, Status
 
 
 class DatasetFit(NamedTuple):

@@ -18,12 +18,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxslam.core.logs.streams import divide, interpolate_poses
+from jaxslam.core.types import Log
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.lines import read_bytes
-from jaxslam.logs.streams import divide, interpolate_poses
 from jaxslam.motion import PoseIncrement
 from jaxslam.sensors import RangeOnly
-from jaxslam.types import Log
 
 _HEADER = 128
 _INTEGERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 12: "i8", 13: "u8"}

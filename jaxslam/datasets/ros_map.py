@@ -15,7 +15,7 @@ import yaml
 from numpy.typing import NDArray
 
 from jaxslam.datasets.lines import TextFile, read_bytes
-from jaxslam.grids.grid import Grid, check_grid
+from jaxslam.laser.grids.grid import Grid, check_grid
 from jaxslam.results.files import write_files
 
 _BY_MATPLOTLIB = {b"\x89PNG": "png", b"BM": "bmp"}

@@ -7,14 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
+from jaxslam.core.logs.streams import as_recorded
+from jaxslam.core.noise import NoiseCov
 from jaxslam.core.numbers import check_covariance
+from jaxslam.core.types import Log
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.lines import TextFile
-from jaxslam.logs.streams import as_recorded
 from jaxslam.motion import PoseIncrement
-from jaxslam.noise import NoiseCov
 from jaxslam.sensors import RelativePosition
-from jaxslam.types import Log
 
 SOURCE = (
     "Victoria Park: J. Guivant and E. Nebot, Optimization of the simultaneous localization and "

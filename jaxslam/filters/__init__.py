@@ -1,5 +1,6 @@
 """Filters: recursive estimators, all of type `Filter`."""
 
+from jaxslam.core.protocols import Filter, Wrapper
 from jaxslam.filters.delayed.delayed_slam import DelayedSlam
 from jaxslam.filters.delayed.settings import Hypotheses, Promotion, StoredMeasurements
 from jaxslam.filters.ekf.compressed_ekf_slam import CompressedEkfSlam
@@ -21,7 +22,6 @@ from jaxslam.filters.particles.fastslam import FastSlam
 from jaxslam.filters.particles.particle_localization import ParticleLocalization
 from jaxslam.filters.particles.pose_steps import MonteCarloFilter
 from jaxslam.filters.particles.slam_particles import ParticleInfo
-from jaxslam.protocols import Filter, Wrapper
 
 __all__ = [
     "ApproximationCounts",

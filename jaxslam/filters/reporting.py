@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
-from jaxslam.types import Info, Scan, Status
+from jaxslam.core.types import Info, Scan, Status
 
 Mask = jax.Array | None
 

@@ -10,10 +10,10 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxslam.core.protocols import Component, Motion, Sensor
 from jaxslam.core.record import record
 from jaxslam.math import se2
 from jaxslam.math.angles import sin_cos, wrap
-from jaxslam.protocols import Component, Motion, Sensor
 
 Rows = list[list[list[Array]]]
 

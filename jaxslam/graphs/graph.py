@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.types import JaxOrNumPy
+from jaxslam.core.types import JaxOrNumPy
 
 LOOPS = "relative_pose/loops"
 """Loop edges in a table of their own, so that they can have a robust kernel."""

@@ -9,15 +9,15 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam import validation
+from jaxslam.core import validation
 from jaxslam.core.numbers import is_concrete
+from jaxslam.core.protocols import Motion, Sensor
+from jaxslam.core.types import JaxOrNumPy, Log
 from jaxslam.graphs.factor import Factor, FromMotion, FromSensor, NominalMotion, Prior
 from jaxslam.graphs.graph import Graph, Table
 from jaxslam.linearize.first_order import motion_jacobians
 from jaxslam.math import linalg, se2
-from jaxslam.protocols import Motion, Sensor
 from jaxslam.sensors.suite import Suite
-from jaxslam.types import JaxOrNumPy, Log
 
 _STILL = 1e-9
 """∂step/∂w with columns of length one and a determinant below this is singular."""

@@ -9,10 +9,10 @@ import scipy  # its parts load where they are used
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.core.numbers import is_concrete
+from jaxslam.core.types import JaxOrNumPy
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph, Table
 from jaxslam.graphs.solver.model import factors_of
-from jaxslam.types import JaxOrNumPy
 
 _INDEFINITE = 1e-6
 """An eigenvalue of an information above minus this share of its largest entry is one of rounding:

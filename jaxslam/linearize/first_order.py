@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float
 
+from jaxslam.core.protocols import Here, Linearizer, Motion, Sensor
 from jaxslam.core.record import record
 from jaxslam.math.arrays import (
     Control,
@@ -21,7 +22,6 @@ from jaxslam.math.arrays import (
     Unmeasured,
 )
 from jaxslam.math.linalg import matmul
-from jaxslam.protocols import Here, Linearizer, Motion, Sensor
 
 
 def motion_jacobians(

@@ -10,12 +10,12 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxslam.core.numbers import largest
+from jaxslam.core.protocols import Here, Linearizer, Motion, Sensor
 from jaxslam.core.record import record
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Truth
 from jaxslam.linearize import first_order
 from jaxslam.linearize.first_order import with_lever_arm
-from jaxslam.protocols import Here, Linearizer, Motion, Sensor
-from jaxslam.slots import Joint
-from jaxslam.types import Truth
 
 
 @record

@@ -8,10 +8,10 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxslam.core.numbers import is_concrete
+from jaxslam.core.protocols import Here, Linearizer, Motion, Sensor
 from jaxslam.core.record import record
 from jaxslam.math import linalg
 from jaxslam.math.arrays import Number
-from jaxslam.protocols import Here, Linearizer, Motion, Sensor
 
 
 class _Regression(NamedTuple):

@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+from jaxslam.core.protocols import Motion
 from jaxslam.motion.ackermann import Ackermann
 from jaxslam.motion.increments import Increment, PoseIncrement
 from jaxslam.motion.odometry import (
@@ -13,7 +14,6 @@ from jaxslam.motion.odometry import (
 from jaxslam.motion.substeps import Substeps
 from jaxslam.motion.unicycle import Unicycle
 from jaxslam.motion.velocity import Velocity, VelocityNoise
-from jaxslam.protocols import Motion
 
 REGISTRY: dict[str, Callable[..., Motion]] = {
     "ackermann": Ackermann,

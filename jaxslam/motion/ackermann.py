@@ -5,12 +5,12 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
+from jaxslam.core.noise import NoiseCov
 from jaxslam.core.numbers import held_array, is_concrete
+from jaxslam.core.protocols import Motion
 from jaxslam.core.record import record, set_field
 from jaxslam.math import se2
 from jaxslam.math.arrays import Control, Pose, ProcessNoise, StepJacobians
-from jaxslam.noise import NoiseCov
-from jaxslam.protocols import Motion
 
 
 @record

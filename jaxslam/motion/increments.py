@@ -2,11 +2,11 @@
 
 import jax.numpy as jnp
 
+from jaxslam.core.noise import NoiseCov
+from jaxslam.core.protocols import Motion
 from jaxslam.core.record import record
 from jaxslam.math import se2
 from jaxslam.math.arrays import Control, Pose, ProcessNoise, StepJacobians
-from jaxslam.noise import NoiseCov
-from jaxslam.protocols import Motion
 
 
 @record

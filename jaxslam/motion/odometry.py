@@ -6,13 +6,13 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from jaxslam.core.noise import NoiseCov
 from jaxslam.core.numbers import check_alpha, held_array
+from jaxslam.core.protocols import Motion
 from jaxslam.core.record import record, set_field
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
 from jaxslam.math.arrays import Control, Pose, ProcessNoise, ProcessNoiseCov, StepJacobians
-from jaxslam.noise import NoiseCov
-from jaxslam.protocols import Motion
 
 
 @record

@@ -7,9 +7,9 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxslam.core.numbers import check_count
+from jaxslam.core.protocols import Motion
 from jaxslam.core.record import record, static
 from jaxslam.math.arrays import Control, Pose, ProcessNoise, StepJacobians
-from jaxslam.protocols import Motion
 
 _Rows = tuple[Array, Array]
 _Jacobians = tuple[Array, Array, Array]

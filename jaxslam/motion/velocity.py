@@ -4,12 +4,12 @@ import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
 
+from jaxslam.core.noise import NoiseCov
 from jaxslam.core.numbers import check_alpha, held_array
+from jaxslam.core.protocols import Motion
 from jaxslam.core.record import record, set_field
 from jaxslam.math import se2
 from jaxslam.math.arrays import Control, Pose, ProcessNoise, ProcessNoiseCov, StepJacobians
-from jaxslam.noise import NoiseCov
-from jaxslam.protocols import Motion
 
 
 @record

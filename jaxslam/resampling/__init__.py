@@ -3,7 +3,7 @@
 `Soft` and `StopGradient` make a method differentiable; `kld` says how many particles suffice.
 """
 
-from jaxslam.protocols import Resample
+from jaxslam.core.protocols import Resample
 from jaxslam.resampling.kld import kld_bound
 from jaxslam.resampling.rules import (
     Soft,

@@ -10,9 +10,9 @@ from jax import Array
 from jaxtyping import Float, Int
 
 from jaxslam.core.numbers import is_concrete
+from jaxslam.core.protocols import Resample
 from jaxslam.core.record import hold_function, record
 from jaxslam.math.arrays import Number
-from jaxslam.protocols import Resample
 from jaxslam.resampling.weights import at_points, even, normalized, weights_of
 
 

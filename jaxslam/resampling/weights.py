@@ -7,8 +7,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
+from jaxslam.core.protocols import Differentiable, Resample
 from jaxslam.math.xla import where_any
-from jaxslam.protocols import Differentiable, Resample
 
 _T = TypeVar("_T")
 

@@ -9,10 +9,10 @@ from pathlib import Path
 from typing import TYPE_CHECKING
 
 from jaxslam.consistency import Tally
-from jaxslam.monte_carlo import Campaign, missing
-from jaxslam.monte_carlo.block import BOUND
-from jaxslam.monte_carlo.campaign import summaries_of
-from jaxslam.monte_carlo.kept import add_kept
+from jaxslam.consistency.campaign import Campaign, missing
+from jaxslam.consistency.campaign.block import BOUND
+from jaxslam.consistency.campaign.harness import summaries_of
+from jaxslam.consistency.campaign.kept import add_kept
 from jaxslam.results import report, store
 from jaxslam.results.files import check_formats, check_writable, versions, write_files
 

@@ -7,14 +7,14 @@ from typing import TYPE_CHECKING
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxslam.core.types import Estimate
 from jaxslam.datasets import g2o
-from jaxslam.grids import Grid, write_map
-from jaxslam.laser_slam import LoopOutcome, Settings, Solved
-from jaxslam.laser_slam.mapping import growing_maps
-from jaxslam.laser_slam.records import LogOfScans
+from jaxslam.laser.grids import Grid, write_map
+from jaxslam.laser.laser_slam import LoopOutcome, Settings, Solved
+from jaxslam.laser.laser_slam.mapping import growing_maps
+from jaxslam.laser.laser_slam.records import LogOfScans
 from jaxslam.results import report
 from jaxslam.results.files import Files, csv_text
-from jaxslam.types import Estimate
 
 if TYPE_CHECKING:  # Pillow and Matplotlib are slow to load
     from jaxslam.results.plot import Film

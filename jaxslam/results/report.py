@@ -9,8 +9,9 @@ from pathlib import Path
 import numpy as np
 
 from jaxslam.consistency import LEVEL, LEVELS, Average, Summary, lopsided, percentage
+from jaxslam.consistency.campaign import Campaign
 from jaxslam.consistency.verdict import POWER, TESTS
-from jaxslam.monte_carlo import Campaign
+from jaxslam.core.types import Estimate
 from jaxslam.results.files import (
     check_formats,
     check_writable,
@@ -21,7 +22,6 @@ from jaxslam.results.files import (
     write_files,
 )
 from jaxslam.results.table import VERDICTS, Cell, lost_runs, notes_on, rows_of
-from jaxslam.types import Estimate
 
 RUN_FORMATS = ("csv", "json")
 """Of `save_runs`."""

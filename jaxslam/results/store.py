@@ -14,7 +14,7 @@ from pathlib import Path
 
 import numpy as np
 
-from jaxslam.monte_carlo.pieces import missing
+from jaxslam.consistency.campaign.pieces import missing
 from jaxslam.results.campaign_folder import (
     FORMAT,
     MANIFEST,

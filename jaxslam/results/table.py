@@ -6,9 +6,9 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from jaxslam.consistency import DOF, LEVEL, Average, Summary, percentage
+from jaxslam.consistency.campaign import Campaign
 from jaxslam.consistency.measures import Measure, measures_of
 from jaxslam.consistency.measures.counts import MEANINGS, count_label
-from jaxslam.monte_carlo import Campaign
 
 VERDICTS = {
     "consistent": ("✓", "neither test rejects, which is no proof"),

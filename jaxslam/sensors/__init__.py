@@ -4,7 +4,7 @@ The conformance tests run over `REGISTRY`."""
 
 from collections.abc import Callable
 
-from jaxslam.protocols import Sensor
+from jaxslam.core.protocols import Sensor
 from jaxslam.sensors.absolute import Absolute, Compass, PositionFix
 from jaxslam.sensors.bearing_inverse_depth import BearingInverseDepth
 from jaxslam.sensors.line import Line

@@ -6,7 +6,9 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
+from jaxslam.core.noise import NoiseCov
 from jaxslam.core.numbers import is_concrete
+from jaxslam.core.protocols import Free, Reduced, Sensor
 from jaxslam.core.record import record, set_field
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
@@ -19,8 +21,6 @@ from jaxslam.math.arrays import (
     Pose,
     Unmeasured,
 )
-from jaxslam.noise import NoiseCov
-from jaxslam.protocols import Free, Reduced, Sensor
 from jaxslam.sensors.partial import BearingOnly, FreeLike, free_parameters
 
 _FAR = 1e-6

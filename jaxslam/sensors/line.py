@@ -4,6 +4,8 @@ import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
 
+from jaxslam.core.noise import NoiseCov
+from jaxslam.core.protocols import Sensor
 from jaxslam.core.record import record
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
@@ -16,8 +18,6 @@ from jaxslam.math.arrays import (
     Pose,
     Unmeasured,
 )
-from jaxslam.noise import NoiseCov
-from jaxslam.protocols import Sensor
 
 
 @record

@@ -8,8 +8,11 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
+from jaxslam.core.noise import NoiseCov
 from jaxslam.core.numbers import check_covariance, is_concrete
+from jaxslam.core.protocols import Free, Sensor
 from jaxslam.core.record import record, set_field
+from jaxslam.core.types import JaxOrNumPy
 from jaxslam.math import se2
 from jaxslam.math.arrays import (
     InvertJacobians,
@@ -19,9 +22,6 @@ from jaxslam.math.arrays import (
     Pose,
     Unmeasured,
 )
-from jaxslam.noise import NoiseCov
-from jaxslam.protocols import Free, Sensor
-from jaxslam.types import JaxOrNumPy
 
 FreeLike = Free | tuple[ArrayLike, ArrayLike]
 

@@ -3,6 +3,8 @@
 import jax.numpy as jnp
 from numpy.typing import ArrayLike
 
+from jaxslam.core.noise import NoiseCov
+from jaxslam.core.protocols import Sensor
 from jaxslam.core.record import record
 from jaxslam.math import se2
 from jaxslam.math.arrays import (
@@ -13,8 +15,6 @@ from jaxslam.math.arrays import (
     Pose,
     Unmeasured,
 )
-from jaxslam.noise import NoiseCov
-from jaxslam.protocols import Sensor
 
 
 @record

@@ -12,10 +12,10 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxslam.core.numbers import check_count
+from jaxslam.core.protocols import Free, Reduced, Sensor
 from jaxslam.core.record import hold_function, record, set_field, static
+from jaxslam.core.types import Scan
 from jaxslam.math.arrays import Landmark, Measurement, Point, Pose, Unmeasured
-from jaxslam.protocols import Free, Reduced, Sensor
-from jaxslam.types import Scan
 
 
 class Wrapped(Sensor):

@@ -10,13 +10,13 @@ from jaxtyping import Array, Bool, Float
 from numpy.typing import ArrayLike
 
 from jaxslam.core.numbers import check_key, check_mount, check_positive, held_array, is_concrete
+from jaxslam.core.protocols import Motion
 from jaxslam.core.record import record, set_field, static
+from jaxslam.core.types import Beams, JaxOrNumPy
 from jaxslam.math import se2
 from jaxslam.math.arrays import Number, Pose
-from jaxslam.protocols import Motion
 from jaxslam.simulation.walls import Walls, exact_ranges, wall_ranges
 from jaxslam.simulation.worlds import drive
-from jaxslam.types import Beams, JaxOrNumPy
 
 
 @record

@@ -10,13 +10,13 @@ from jaxtyping import Array
 from numpy.typing import ArrayLike
 
 from jaxslam.core.numbers import check_array
+from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.record import FrozenDict, record, static
+from jaxslam.core.types import Log, Truth
+from jaxslam.core.validation import check_log, check_record
 from jaxslam.filters.ekf.settings import EkfOptions
-from jaxslam.protocols import Motion, Sensor
 from jaxslam.sensors.suite import Suite
 from jaxslam.simulation.worlds import World
-from jaxslam.types import Log, Truth
-from jaxslam.validation import check_log, check_record
 
 
 @record

@@ -6,10 +6,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxslam.core.protocols import Sensor
+from jaxslam.core.types import Scan
 from jaxslam.math.linalg import root_psd
-from jaxslam.protocols import Sensor
 from jaxslam.sensors.suite import Part
-from jaxslam.types import Scan
 
 Visible = Callable[[jax.Array, jax.Array], jax.Array]
 """(pose, l) -> () bool: whether a sensor reports the landmark from there."""

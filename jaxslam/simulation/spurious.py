@@ -6,11 +6,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.core.numbers import is_concrete
+from jaxslam.core.protocols import Sensor
 from jaxslam.core.record import record, static
+from jaxslam.core.types import Scan
 from jaxslam.math.arrays import Number
 from jaxslam.math.linalg import root_psd
-from jaxslam.protocols import Sensor
-from jaxslam.types import Scan
 
 
 @record

@@ -9,13 +9,13 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.record import FrozenDict, hold_function, record, set_field, static
+from jaxslam.core.types import Log, Scan, Truth
+from jaxslam.filters.multi_robot.team import Robot, TeamMotion, check_team, sensors_of, sizes
 from jaxslam.math import se2
-from jaxslam.protocols import Motion, Sensor
 from jaxslam.simulation.scans import Visible, everywhere, part_scan, side_by_side
 from jaxslam.simulation.worlds import World, drawn_near, drive
-from jaxslam.team import Robot, TeamMotion, check_team, sensors_of, sizes
-from jaxslam.types import Log, Scan, Truth
 
 
 @record

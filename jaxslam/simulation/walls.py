@@ -8,8 +8,8 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from jaxslam.grids.grid import Grid
-from jaxslam.types import JaxOrNumPy
+from jaxslam.core.types import JaxOrNumPy
+from jaxslam.laser.grids.grid import Grid
 
 
 class Walls(NamedTuple):

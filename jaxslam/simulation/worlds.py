@@ -13,10 +13,12 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam.core.numbers import check_covariance, check_key, held_array, is_concrete
+from jaxslam.core.protocols import Component, Motion, Sensor
 from jaxslam.core.record import FrozenDict, hold_function, record, set_field, static
+from jaxslam.core.types import Log, Scan, Truth
+from jaxslam.core.validation import call_traced, check_record
 from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.math.angles import wrap
-from jaxslam.protocols import Component, Motion, Sensor
 from jaxslam.sensors.suite import Suite
 from jaxslam.simulation.scans import (
     Visible,
@@ -28,8 +30,6 @@ from jaxslam.simulation.scans import (
     side_by_side,
 )
 from jaxslam.simulation.spurious import Spurious, spoil
-from jaxslam.types import Log, Scan, Truth
-from jaxslam.validation import call_traced, check_record
 
 
 class World(Component):

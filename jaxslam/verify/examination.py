@@ -7,11 +7,11 @@ from typing import NamedTuple, TypeAlias
 import jax
 import numpy as np
 
+from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.graphs import Factor
-from jaxslam.grids.beam_models import BeamModel
+from jaxslam.laser.grids.beam_models import BeamModel
 from jaxslam.math.arrays import float64
 from jaxslam.math.xla import quick_jit
-from jaxslam.protocols import Motion, Sensor
 from jaxslam.verify import properties
 from jaxslam.verify.errors import describe_error
 from jaxslam.verify.finite import singular_notes

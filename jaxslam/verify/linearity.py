@@ -10,8 +10,8 @@ from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
 from jaxslam.core.numbers import check_covariance, is_concrete
+from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.math.linalg import root_psd
-from jaxslam.protocols import Motion, Sensor
 
 _DIRECTIONS = 64
 _RADII = (1.0, 0.5)

@@ -10,8 +10,8 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam.core.numbers import check_covariance
+from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.math.xla import quick_jit
-from jaxslam.protocols import Motion, Sensor
 from jaxslam.verify.differences import modulo_periods
 from jaxslam.verify.errors import describe_error
 from jaxslam.verify.finite import finite_check

@@ -6,10 +6,10 @@ from collections.abc import Callable, Mapping, Sequence
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.graphs import Factor
-from jaxslam.grids.beam_models import BeamModel
+from jaxslam.laser.grids.beam_models import BeamModel
 from jaxslam.math.arrays import float64
-from jaxslam.protocols import Motion, Sensor
 from jaxslam.verify.comparison import compare_methods
 from jaxslam.verify.examination import Model, examine, functions_of, typical_linearity
 from jaxslam.verify.inputs.beam_models import FAR, beam_function, beam_samples

@@ -13,7 +13,7 @@ from worlds import three_parameters
 
 from jaxslam import catalog, cli, scenarios
 from jaxslam.cli.runtime import devices
-from jaxslam.monte_carlo import Interrupted
+from jaxslam.consistency.campaign import Interrupted
 from jaxslam.results import campaign_files, files
 
 QUICK = ["consistency", "--scenario", "circle", "--steps", "8", "--runs", "3"]

@@ -7,8 +7,8 @@ import numpy as np
 import pytest
 
 from jaxslam import cli, datasets
+from jaxslam.core.types import Info, Status
 from jaxslam.datasets.noise_fit import autocorrelation
-from jaxslam.types import Info, Status
 
 POINTS = {3: (3.0, 1.0), 5: (-1.0, 4.0), 8: (-3.0, -1.0)}
 SETTINGS = """[motion]

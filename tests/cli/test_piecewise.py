@@ -8,10 +8,10 @@ import pytest
 
 from jaxslam import charts
 from jaxslam.cli.run.piecewise import run_in_pieces
+from jaxslam.core.protocols import Filter
 from jaxslam.core.record import record
+from jaxslam.core.types import Estimate, Log, Scan
 from jaxslam.filters.reporting import nothing_of
-from jaxslam.protocols import Filter
-from jaxslam.types import Estimate, Log, Scan
 
 STEPS = 11
 

@@ -8,7 +8,7 @@ from own_models import changed
 
 from jaxslam import catalog, cli, scenarios
 from jaxslam.cli.user_objects import UserObjects
-from jaxslam.protocols import Filter
+from jaxslam.core.protocols import Filter
 from jaxslam.simulation.worlds import Scenario
 
 MINE = """

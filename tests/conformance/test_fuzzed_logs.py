@@ -17,9 +17,9 @@ from hypothesis import given, settings
 
 from jaxslam import catalog, run
 from jaxslam.core.numbers import largest
-from jaxslam.protocols import Filter
-from jaxslam.types import Log, Scan, Status
-from jaxslam.validation.logs import check_log
+from jaxslam.core.protocols import Filter
+from jaxslam.core.types import Log, Scan, Status
+from jaxslam.core.validation.logs import check_log
 
 WIDE = int(os.environ.get("JAXSLAM_FUZZ", "1"))
 STEPS, PLACES, LANDMARKS, LOGS = 4, 3, 4, 48

@@ -7,7 +7,7 @@ import pytest
 from own_models import changed
 
 from jaxslam import motion, sensors
-from jaxslam.protocols import Motion
+from jaxslam.core.protocols import Motion
 from jaxslam.verify import build, verify_jacobians
 from jaxslam.verify.comparison import compare_methods
 from jaxslam.verify.examination import examine, functions_of

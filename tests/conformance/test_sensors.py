@@ -15,7 +15,7 @@ import pytest
 from owed import DTYPES, bad_covariances, of_rows, random_covariance
 from reference.plane import mounted, wrap
 
-from jaxslam.protocols import Free
+from jaxslam.core.protocols import Free
 from jaxslam.sensors import REGISTRY
 
 MOUNT = np.array([0.4, -0.3, 0.9])

@@ -9,9 +9,9 @@ import worlds
 from jaxslam import association, motion, run, sensors
 from jaxslam.calibration import calibrate, consider_cov
 from jaxslam.core.record import record
+from jaxslam.core.types import Info, Log, Scan
 from jaxslam.filters import EkfSlam
 from jaxslam.life import Recency
-from jaxslam.types import Info, Log, Scan
 
 KEY = jax.random.key(0)
 Q, R = np.diag([0.03, 0.02, 0.0]) ** 2, 0.1**2 * np.eye(2)

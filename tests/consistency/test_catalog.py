@@ -11,13 +11,13 @@ import worlds
 from layouts import kept_programs, wrong_layouts
 
 from jaxslam import catalog, charts, linearize, motion, sensors
+from jaxslam.core.protocols import Filter, Here
+from jaxslam.core.types import Status
 from jaxslam.filters import EkfSlam
-from jaxslam.protocols import Filter, Here
+from jaxslam.graphs.smoothing import LogEstimator
 from jaxslam.run import run
 from jaxslam.simulation.scenarios import SCENARIOS, loop, stationary
 from jaxslam.simulation.worlds import simulate
-from jaxslam.smoothing import LogEstimator
-from jaxslam.types import Status
 
 KEY = jax.random.key(0)
 CURES = ["ideal", "fej", "oc", "right_invariant", "ukf_right"]

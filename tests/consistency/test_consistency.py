@@ -7,7 +7,7 @@ import scipy.stats
 import worlds
 
 from jaxslam import consistency
-from jaxslam.types import Estimate, Info, Status, Trace, Truth
+from jaxslam.core.types import Estimate, Info, Status, Trace, Truth
 
 STEPS, PLACES, SLOTS = 12, 2, 3
 TOGETHER = 40

@@ -15,6 +15,7 @@ from jaxslam import charts, consistency, motion, sensors
 from jaxslam.consistency.measures.counts import DROPS, KEPT, MEANINGS, counted
 from jaxslam.consistency.measures.nees import block_nees
 from jaxslam.consistency.measures.observability import unobservable_directions
+from jaxslam.core.types import Estimate, Info, Log, Scan, Status, Trace, Truth
 from jaxslam.filters.ekf.map_coordinates import ToPoints
 from jaxslam.filters.ekf.observability import Monitor
 from jaxslam.filters.map_management.merging import Merged
@@ -23,7 +24,6 @@ from jaxslam.filters.particles.slam_particles import ParticleInfo
 from jaxslam.filters.reporting import Pruned
 from jaxslam.simulation.spurious import Spurious
 from jaxslam.simulation.worlds import simulate
-from jaxslam.types import Estimate, Info, Log, Scan, Status, Trace, Truth
 
 STATUSES = [status.name.lower() for status in (*KEPT, *DROPS)]
 

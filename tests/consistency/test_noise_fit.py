@@ -8,8 +8,8 @@ import pytest
 import jaxslam
 from jaxslam import association, filters, motion, sensors
 from jaxslam.calibration import as_associated, fit_noise
+from jaxslam.core.types import Info, Status
 from jaxslam.math import stats
-from jaxslam.types import Info, Status
 
 RNG = np.random.default_rng(2)
 X = RNG.normal(0.3, 2.0, 400)

@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 
 from jaxslam.consistency import Score, Tally, condense
+from jaxslam.consistency.campaign import missing
 from jaxslam.consistency.tally import Sum, plus, sum_rows
-from jaxslam.monte_carlo import missing
 
 
 def test_a_total_is_exact_where_a_plain_sum_is_not():

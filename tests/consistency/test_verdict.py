@@ -10,9 +10,9 @@ import scipy.stats
 from benchmarks.verdict import averages, problem, rejected, verdicts
 from jaxslam import motion, sensors, stats
 from jaxslam.consistency import judge, lopsided, positive_interval, power_of
+from jaxslam.consistency.campaign import monte_carlo
+from jaxslam.consistency.campaign.candidates import check_noise
 from jaxslam.consistency.intervals import Average, spread
-from jaxslam.monte_carlo import monte_carlo
-from jaxslam.monte_carlo.candidates import check_noise
 from jaxslam.simulation.worlds import Scenario
 
 SENSOR = sensors.RangeBearing(np.eye(2))

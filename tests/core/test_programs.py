@@ -13,7 +13,7 @@ from layouts import kept_programs, wrong_layouts
 import jaxslam
 from jaxslam import catalog, filters, run, simulate, smoothing
 from jaxslam.core.record import record
-from jaxslam.types import Status
+from jaxslam.core.types import Status
 
 
 @pytest.fixture

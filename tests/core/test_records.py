@@ -14,11 +14,11 @@ from own_models import motion_of, sensor_of
 
 import jaxslam
 from jaxslam import catalog, filters, motion, resampling, run, sensors, simulate
+from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.record import is_record, record, static
+from jaxslam.core.types import Log, Scan
 from jaxslam.motion import OdometryNoise
-from jaxslam.protocols import Motion, Sensor
 from jaxslam.simulation.worlds import World
-from jaxslam.types import Log, Scan
 
 KEY = jax.random.key(0)
 R = np.diag([0.04, 0.01])
@@ -310,8 +310,10 @@ def team(scale=1.0):
     seen = sensors.Suite([(sensors.RangeBearing(R * scale), 2)])
     moving = motion.Increment(np.diag([0.01, 0.02]) * scale)
     robots = [
-        jaxslam.team.Robot(moving, seen),
-        jaxslam.team.Robot(moving, seen, start=((1.0, 0.5, 0.1), np.eye(3) * 0.01)),
+        jaxslam.filters.multi_robot.team.Robot(moving, seen),
+        jaxslam.filters.multi_robot.team.Robot(
+            moving, seen, start=((1.0, 0.5, 0.1), np.eye(3) * 0.01)
+        ),
     ]
     return jaxslam.TeamWorld(robots, np.ones((2, 2)), np.full((3, 4), 0.1 * scale))
 

@@ -5,7 +5,7 @@ import pytest
 from recordings import BONN, assert_log, assert_spoiled, folder, mapped, write
 
 from jaxslam import datasets
-from jaxslam.types import Status
+from jaxslam.core.types import Status
 
 
 def test_bonn_by_hand(tmp_path):

@@ -9,7 +9,7 @@ import pytest
 from recordings import COV, VICTORIA, assert_log, assert_noises, assert_spoiled, mapped, write
 
 from jaxslam import datasets
-from jaxslam.types import Status
+from jaxslam.core.types import Status
 
 FILE = "victoria_park.txt"
 

@@ -9,10 +9,10 @@ import pytest
 from reference import ekf_slam as plain
 from worlds import draw
 
+from jaxslam.core.types import Status
 from jaxslam.filters import EkfSlam
 from jaxslam.run import run
 from jaxslam.simulation.scenarios import circle, cloister
-from jaxslam.types import Status
 
 MODELS = {
     "cloister": {

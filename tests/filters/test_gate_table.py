@@ -11,9 +11,9 @@ import pytest
 from own_models import changed
 
 from jaxslam import filters, motion, sensors
+from jaxslam.core.types import Scan, Status
 from jaxslam.filters.delayed.settings import Hypotheses, StoredMeasurements
 from jaxslam.filters.reporting import info_of, nothing_of, status_of
-from jaxslam.types import Scan, Status
 
 MASKS = (
     "valid", "matched", "positive", "inside",

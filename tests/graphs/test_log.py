@@ -12,9 +12,9 @@ from reference import ekf_slam
 from reference import graph as plain
 
 from jaxslam import graphs, motion, sensors, simulate
+from jaxslam.core.types import Log, Scan
 from jaxslam.graphs import Ending
-from jaxslam.smoothing import BatchMap
-from jaxslam.types import Log, Scan
+from jaxslam.graphs.smoothing import BatchMap
 
 KEY = jax.random.key(0)
 STEPS = 8

@@ -5,9 +5,9 @@ import dataclasses
 import numpy as np
 
 from jaxslam.consistency import DOF, LAGS, LEVELS, Average
+from jaxslam.consistency.campaign import Campaign
 from jaxslam.consistency.summary import Summary
-from jaxslam.monte_carlo import Campaign
-from jaxslam.types import Estimate, Truth
+from jaxslam.core.types import Estimate, Truth
 
 STEPS, RUNS = 200, 32
 LANDMARKS = np.array([[4.0, 1.0], [0.0, 5.0], [-4.0, 0.0]])

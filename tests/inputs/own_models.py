@@ -2,8 +2,8 @@
 
 import dataclasses
 
+from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.record import record
-from jaxslam.protocols import Motion, Sensor
 
 
 def _method(value):

@@ -11,8 +11,8 @@ import pytest
 
 import jaxslam
 from jaxslam import datasets, se2
+from jaxslam.core.types import Status
 from jaxslam.filters import EkfSlam
-from jaxslam.types import Status
 
 DATA = Path(os.environ.get("JAXSLAM_DATA", Path(__file__).parents[3] / "shared" / "data"))
 

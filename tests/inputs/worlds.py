@@ -9,11 +9,11 @@ import numpy as np
 from own_models import changed
 
 from jaxslam import filters, linearize, motion, sensors
+from jaxslam.consistency.campaign import monte_carlo
 from jaxslam.core.record import record
+from jaxslam.core.types import Status
 from jaxslam.math.stats import t_quantile
-from jaxslam.monte_carlo import monte_carlo
 from jaxslam.simulation.worlds import Scenario, simulate
-from jaxslam.types import Status
 
 
 def ring(steps: int = 100, seed: int = 3) -> Scenario:

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam import validation
+from jaxslam.core import validation
 from jaxslam.math import gaussians, linalg
 
 UNROLLED, LAPACK = [1, 2, 3, 6, 8], [9, 20]  # 8 is the largest that is unrolled

@@ -10,11 +10,11 @@ import scipy.stats
 from reference.plane import wrap
 
 from jaxslam import charts, linearize, motion, sensors
+from jaxslam.core.types import Log, Scan, Status
+from jaxslam.core.validation import check_log
 from jaxslam.filters import EkfSlam
 from jaxslam.run import run
 from jaxslam.simulation.worlds import Scenario, simulate
-from jaxslam.types import Log, Scan, Status
-from jaxslam.validation import check_log
 
 KEY = jax.random.key(0)
 STEPS, PLACES = 50, 3

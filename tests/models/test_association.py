@@ -11,10 +11,10 @@ import scipy.optimize
 from worlds import narrow
 
 from jaxslam import association
+from jaxslam.core.protocols import Association, Pairs, Prediction
+from jaxslam.core.types import Scan
 from jaxslam.math.assignment import assign
 from jaxslam.math.stats import chi2_quantile
-from jaxslam.protocols import Association, Pairs, Prediction
-from jaxslam.types import Scan
 
 METHODS = {
     "nearest": partial(association.Nearest, 9.0),

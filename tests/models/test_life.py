@@ -10,10 +10,10 @@ import pytest
 from worlds import narrow
 
 from jaxslam import life, motion, run, sensors, slots
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Log, Scan, Status
 from jaxslam.filters import EkfSlam
 from jaxslam.life import Evidence
-from jaxslam.slots import Joint
-from jaxslam.types import Log, Scan, Status
 
 MOTION = motion.Increment(np.diag([0.02, 0.01]) ** 2)
 SENSOR = sensors.RangeBearing(np.diag([0.05, 0.02]) ** 2)

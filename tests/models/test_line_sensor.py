@@ -7,9 +7,9 @@ import pytest
 
 import jaxslam
 from jaxslam import charts, filters, linearize, motion, sensors
+from jaxslam.core.types import Scan
 from jaxslam.filters.map_management.relocalization import seen_points
 from jaxslam.sensors.line import facing
-from jaxslam.types import Scan
 
 NOISE = np.diag([0.02, 0.02]) ** 2
 MOVES = motion.Increment(1e-4 * np.eye(2))

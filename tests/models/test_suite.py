@@ -13,12 +13,12 @@ from worlds import draw, ring
 
 import jaxslam
 from jaxslam import charts, filters, linearize, motion, sensors
+from jaxslam.core.types import Status
 from jaxslam.filters import EkfSlam
 from jaxslam.sensors import Part, Suite
 from jaxslam.simulation.scenarios import BetweenRanges
 from jaxslam.simulation.spurious import Spurious
 from jaxslam.simulation.worlds import Scenario
-from jaxslam.types import Status
 
 EYES = sensors.RangeBearing(np.diag([0.05, 0.02]) ** 2, mount=(0.1, -0.05, 0.3))
 LASER = sensors.RelativePosition(np.diag([0.04, 0.06]) ** 2, mount=(-0.2, 0.0, 3.0))

@@ -26,15 +26,15 @@ HEAVY = tuple(
     f"tests/{folder}/test_{name}.py"
     for folder, names in (
         ("consistency", "catalog"),
-        ("monte_carlo", "monte_carlo"),
+        ("consistency/campaign", "monte_carlo"),
         ("filters/multi_robot", "team_slam"),
         ("filters/particles", "fastslam"),
         ("filters/delayed", "delayed_slam"),
         ("filters/ekf", "gradients"),
-        ("laser_slam", "solve"),
+        ("laser/laser_slam", "solve"),
         ("graphs", "log"),
         ("conformance", "fuzzed_logs"),
-        ("smoothing", "smoothing fixed_lag"),
+        ("graphs/smoothing", "smoothing fixed_lag"),
         ("equivalence", "information ekf"),
         ("core", "programs records"),
         ("filters/particles", "particle_localization"),

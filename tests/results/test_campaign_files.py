@@ -14,8 +14,8 @@ from test_page import EVIL, GOOD, RUNS, STEPS, Reader, campaign, summary
 
 from jaxslam import plot, report
 from jaxslam.consistency import Average
+from jaxslam.core.types import Estimate, Truth
 from jaxslam.results import campaign_files
-from jaxslam.types import Estimate, Truth
 
 FIGURES = {*campaign_files.FIGURES}
 

@@ -9,8 +9,8 @@ import pytest
 
 from jaxslam import plot
 from jaxslam.consistency import DOF, LEVELS, Average, Summary
+from jaxslam.consistency.campaign import Campaign
 from jaxslam.consistency.measures import BUILT_IN
-from jaxslam.monte_carlo import Campaign
 from jaxslam.results.page import VERDICTS, page
 
 STEPS, RUNS = 7, 30

@@ -13,8 +13,8 @@ from jaxslam import report
 from jaxslam.catalog import BASELINES
 from jaxslam.consistency import Average
 from jaxslam.consistency.measures import BUILT_IN
+from jaxslam.core.types import Estimate
 from jaxslam.results import files
-from jaxslam.types import Estimate
 
 WORLD = worlds.ring()
 

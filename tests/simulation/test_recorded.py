@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from jaxslam import Scenario, catalog, monte_carlo, motion, recorded_world, sensors, simulate, store
+from jaxslam.core.types import Log, Scan
 from jaxslam.results import plot
-from jaxslam.types import Log, Scan
 
 KEY = jax.random.key(3)
 DRAWN = Scenario(

@@ -17,6 +17,7 @@ from own_models import changed
 from reference.plane import mounted, wrap
 
 from jaxslam import motion, sensors
+from jaxslam.core.validation import check_log
 from jaxslam.simulation.scenarios import (
     SCENARIOS,
     BetweenRanges,
@@ -25,7 +26,6 @@ from jaxslam.simulation.scenarios import (
     cloister_landmarks,
 )
 from jaxslam.simulation.worlds import Scenario, simulate
-from jaxslam.validation import check_log
 
 Q = np.array([[0.002, 0.0005], [0.0005, 0.001]])
 R = np.array([[0.04, -0.01], [-0.01, 0.01]]) * 0.25

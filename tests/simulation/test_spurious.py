@@ -11,10 +11,10 @@ import worlds
 
 from jaxslam import association, life, monte_carlo, run, sensors, simulate
 from jaxslam.consistency.measures.associations import associations, identities
+from jaxslam.core.protocols import Association
+from jaxslam.core.types import Estimate, Info, Scan, Status, Trace
 from jaxslam.filters import EkfSlam
-from jaxslam.protocols import Association
 from jaxslam.simulation.spurious import Spurious, spoil
-from jaxslam.types import Estimate, Info, Scan, Status, Trace
 
 SENSOR = sensors.RangeBearing(np.diag([0.1, 0.02]) ** 2)
 M, RUNS = 12, 4000

@@ -9,9 +9,9 @@ from own_models import changed, sensor_of
 from verified import failed
 
 from jaxslam import motion, sensors
+from jaxslam.core.protocols import Sensor
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
-from jaxslam.protocols import Sensor
 from jaxslam.verify import Check, Report, build, properties, verify_jacobians
 from jaxslam.verify.inputs import samples
 from jaxslam.verify.inputs.functions import motion_functions

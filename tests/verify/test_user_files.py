@@ -114,7 +114,7 @@ def test_williams_and_the_notes_are_caught(verify):
 MODELS = """
 import numpy as np
 import jaxslam
-from jaxslam.protocols import Motion, Sensor
+from jaxslam.core.protocols import Motion, Sensor
 
 robot = jaxslam.motion.Unicycle(0.01 * np.eye(2))
 
@@ -231,7 +231,7 @@ def test_a_path_with_a_name_is_split():
 
 FACTORIES = """
 from jaxslam import sensors
-from jaxslam.protocols import Sensor
+from jaxslam.core.protocols import Sensor
 
 good = sensors.RangeBearing([[0.1, 0.0], [0.0, 0.1]])
 
@@ -247,7 +247,7 @@ CLASSES = """
 import jax.numpy as jnp
 from jaxslam.core.record import record
 from jaxslam.motion import Unicycle
-from jaxslam.protocols import Motion, Sensor
+from jaxslam.core.protocols import Motion, Sensor
 
 class Shared(Motion):
     controls = noises = ("dx [m]",)

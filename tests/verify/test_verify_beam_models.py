@@ -7,7 +7,7 @@ import pytest
 
 from jaxslam import cli
 from jaxslam.core.record import record
-from jaxslam.grids import beam_models
+from jaxslam.laser.grids import beam_models
 from jaxslam.verify import build, verify_jacobians
 from jaxslam.verify.inputs.user_files import UnusableFile, load, verify_file
 
@@ -34,7 +34,7 @@ def test_a_file_may_define_a_beam_model_whose_jacobian_is_held(tmp_path):
     path = tmp_path / "mine.py"
     path.write_text(
         "import dataclasses\nfrom jaxslam.core.record import record\n"
-        "from jaxslam.grids import LikelihoodField\n"
+        "from jaxslam.laser.grids import LikelihoodField\n"
         "@record\nclass Wrong(LikelihoodField):\n"
         "    def jacobian(self, *at):\n        return -super(Wrong, self).jacobian(*at)\n"
         "mine = LikelihoodField(0.2, max_range=40.0)\nwrong = Wrong(0.2, max_range=40.0)\n",

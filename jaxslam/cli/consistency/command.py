@@ -14,9 +14,9 @@ from jaxslam.cli.consistency.folder import Earlier, earlier_results, open_store
 from jaxslam.cli.consistency.run_zero import run_zero, write_films
 from jaxslam.cli.consistency.spec import Spec, spec_of
 from jaxslam.cli.user_objects import UserObjects
-from jaxslam.monte_carlo import Campaign, Interrupted, monte_carlo
-from jaxslam.monte_carlo.candidates import fitting_block
-from jaxslam.protocols import Candidate
+from jaxslam.consistency.campaign import Campaign, Interrupted, monte_carlo
+from jaxslam.consistency.campaign.candidates import fitting_block
+from jaxslam.core.protocols import Candidate
 from jaxslam.results import campaign_files, store
 from jaxslam.simulation.worlds import World
 

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import NamedTuple
 
 from jaxslam.cli.consistency.spec import Spec, differences
-from jaxslam.monte_carlo import missing
+from jaxslam.consistency.campaign import missing
 from jaxslam.results import store
 from jaxslam.results.campaign_files import BLOCKS, RESULT
 

@@ -6,11 +6,11 @@ from pathlib import Path
 import jax
 
 from jaxslam.cli.films import film_files
-from jaxslam.monte_carlo.candidates import estimator_of, rounded
-from jaxslam.protocols import Candidate
+from jaxslam.consistency.campaign.candidates import estimator_of, rounded
+from jaxslam.core.protocols import Candidate
+from jaxslam.core.types import Estimate, Truth
 from jaxslam.results.files import write_files
 from jaxslam.simulation.worlds import World, run_keys, world_of_run
-from jaxslam.types import Estimate, Truth
 
 
 def run_zero(

@@ -8,17 +8,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PyTree
 
-from jaxslam import grids, motion
+from jaxslam import motion
 from jaxslam.cli.laser.job import Job, figure_files, scored
 from jaxslam.cli.laser.options import start_pose
 from jaxslam.cli.run.piecewise import run_in_pieces
+from jaxslam.consistency.campaign.progress import Progress
+from jaxslam.core.types import Info
 from jaxslam.datasets import LaserLog
-from jaxslam.grids import Grid
+from jaxslam.laser import grids
+from jaxslam.laser.grids import Grid
 from jaxslam.math.numpy_poses import compose
-from jaxslam.monte_carlo.progress import Progress
 from jaxslam.results import report
 from jaxslam.results.files import Files, Json
-from jaxslam.types import Info
 
 START_DEVIATION = np.array([0.2, 0.2, np.deg2rad(10.0)])
 """Standard deviations of the pose at the start [m, m, rad]."""

@@ -7,18 +7,18 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam import grids
 from jaxslam.cli.laser.job import Job, figure_files
 from jaxslam.cli.laser.options import check_poses
 from jaxslam.cli.run.piecewise import padded_rows
+from jaxslam.consistency.campaign.progress import Progress
+from jaxslam.core.types import Beams, Estimate
 from jaxslam.datasets import LaserLog, ros_map
-from jaxslam.grids import Counts, Grid
+from jaxslam.laser import grids
+from jaxslam.laser.grids import Counts, Grid
 from jaxslam.math import numpy_poses as poses
-from jaxslam.monte_carlo.progress import Progress
 from jaxslam.results import report
 from jaxslam.results.files import Files
 from jaxslam.results.laser_slam import map_size
-from jaxslam.types import Beams, Estimate
 
 TOGETHER = 64
 """Scans between two updates of the progress."""

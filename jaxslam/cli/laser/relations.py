@@ -6,9 +6,10 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam import laser_slam, metrics
 from jaxslam.cli.common import summary_table
+from jaxslam.consistency import metrics
 from jaxslam.datasets import LaserLog, relation_file
+from jaxslam.laser import laser_slam
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.results.files import Json
 
@@ -71,7 +72,7 @@ def given_relations(path: str, log: LaserLog) -> GivenRelations:
 
 def scores_of(given: GivenRelations, solved: laser_slam.Solved) -> dict[str, Score]:
     """The scores of all relations, and of those whose scans are far apart."""
-    nees = laser_slam.relation_nees(solved, given.joined)
+    nees = laser_slam.relation_nees(solved, *given.joined)
     paths = {
         "laser SLAM": solved.poses,
         "laser odometry": solved.odometry,

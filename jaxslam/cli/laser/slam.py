@@ -4,12 +4,13 @@ import argparse
 
 import numpy as np
 
-from jaxslam import laser_slam, metrics
 from jaxslam.cli.films import film_files
 from jaxslam.cli.laser.job import Job, scored
 from jaxslam.cli.laser.relations import given_relations, score_entries, score_text, scores_of
+from jaxslam.consistency import metrics
+from jaxslam.consistency.campaign.progress import Progress
 from jaxslam.datasets import LaserLog
-from jaxslam.monte_carlo.progress import Progress
+from jaxslam.laser import laser_slam
 from jaxslam.results import laser_slam as results
 from jaxslam.results.files import Json
 

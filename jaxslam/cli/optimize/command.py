@@ -14,15 +14,15 @@ from jaxslam.cli import films
 from jaxslam.cli.common import SUMMARY, check_out, pick
 from jaxslam.cli.optimize.figures import WORST, as_text, figure_writer, film_writers
 from jaxslam.cli.runtime.compile_clock import CompileClock
+from jaxslam.consistency.campaign.progress import Progress
 from jaxslam.core.numbers import check_count
+from jaxslam.core.types import JaxOrNumPy
 from jaxslam.datasets import g2o
 from jaxslam.graphs import Ending, Graph, starts
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import TRUSTED
 from jaxslam.graphs.validation import label, variables_in
-from jaxslam.monte_carlo.progress import Progress
 from jaxslam.results.files import csv_text, json_number, json_text, versions, write_files
-from jaxslam.types import JaxOrNumPy
 
 ERRORS = {
     "pose": (graphs.RelativePose(), "e = Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ) as (x, y, θ)"),

@@ -9,9 +9,9 @@ import numpy as np
 
 from jaxslam import graphs
 from jaxslam.cli import films
+from jaxslam.consistency.campaign.progress import Progress
 from jaxslam.graphs import Graph
 from jaxslam.graphs.factor import Factor
-from jaxslam.monte_carlo.progress import Progress
 from jaxslam.results.files import Files
 
 WORST = 10

@@ -25,16 +25,16 @@ from jaxslam.cli.laser.options import refuse_laser_options
 from jaxslam.cli.run.film import film_steps, films, shown_state
 from jaxslam.cli.run.filters import chosen_filters, on_true_poses, with_options
 from jaxslam.cli.run.piecewise import PiecewiseRun, run_in_pieces
+from jaxslam.consistency.campaign.progress import Progress
 from jaxslam.consistency.measures.counts import count_label
+from jaxslam.core.protocols import Filter
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Estimate, Status
 from jaxslam.datasets import READERS, Dataset, Reader
 from jaxslam.datasets.evaluation import Evaluation, evaluate, joint_map_cov
-from jaxslam.monte_carlo.progress import Progress
-from jaxslam.protocols import Filter
 from jaxslam.results import report
 from jaxslam.results.campaign_files import check_figure_formats
 from jaxslam.results.files import Json, json_text, versions, write_files
-from jaxslam.slots import Joint
-from jaxslam.types import Estimate, Status
 
 
 def run_dataset(options: argparse.Namespace, command: str) -> int:

@@ -9,12 +9,12 @@ import numpy as np
 from jaxslam.association.rules import Known
 from jaxslam.catalog import ALL, CANONICAL, SMOOTHERS, on_given_poses
 from jaxslam.cli.common import pick
+from jaxslam.core.protocols import Candidate, Filter
+from jaxslam.core.types import Log, Truth
 from jaxslam.datasets import Dataset
 from jaxslam.datasets.table.models import association_options
 from jaxslam.filters.ekf.settings import EkfOptions
-from jaxslam.protocols import Candidate, Filter
 from jaxslam.simulation.worlds import Scenario
-from jaxslam.types import Log, Truth
 
 NAMES = tuple(name for name in ALL if name not in ("ideal", "batch_map"))
 """Those that run on a data set: no truth is needed, and no whole log at once."""
@@ -93,7 +93,7 @@ def _filter(name: str, candidate: Candidate, data: Dataset) -> Filter:
     if name in SMOOTHERS:
         raise ValueError(
             f"--filters: {name} takes a whole log at once, which `jaxslam run` does not: call "
-            f"jaxslam.smoothing.{name} from Python"
+            f"jaxslam.graphs.smoothing.{name} from Python"
         )
     if name == "ideal" or not data.one_frame or data.landmarks is None:
         needs = (

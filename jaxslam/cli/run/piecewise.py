@@ -8,8 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int, PyTree
 
-from jaxslam.protocols import Filter
-from jaxslam.types import Estimate, Info, JaxOrNumPy, Log
+from jaxslam.core.protocols import Filter
+from jaxslam.core.types import Estimate, Info, JaxOrNumPy, Log
 
 State: TypeAlias = PyTree
 """A filter's own state, a pytree."""

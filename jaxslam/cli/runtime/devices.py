@@ -5,7 +5,7 @@ import contextlib
 
 import jax
 
-from jaxslam.monte_carlo.pieces import cores
+from jaxslam.consistency.campaign.pieces import cores
 
 
 def prepare(options: argparse.Namespace) -> None:

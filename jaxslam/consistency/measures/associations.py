@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Int
 
 from jaxslam.consistency.measures.measure import Measure
-from jaxslam.types import Status, Trace
+from jaxslam.core.types import Status, Trace
 
 MEASURES = (
     Measure("precision", "associations: precision", honest=1),

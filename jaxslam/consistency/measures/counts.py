@@ -3,7 +3,7 @@
 import numpy as np
 from jaxtyping import Int
 
-from jaxslam.types import Info, Status
+from jaxslam.core.types import Info, Status
 
 KEPT = (Status.FUSED, Status.BORN, Status.SIGHTED)
 """What a measurement does for the map; each is counted."""

@@ -6,8 +6,8 @@ import numpy as np
 
 from jaxslam.consistency.intervals import LEVEL, Average, positive_interval
 from jaxslam.consistency.measures.measure import Measure, Runs, RunScores, Sums, ratio
+from jaxslam.core.types import Status
 from jaxslam.math.stats import chi2_quantile, normal_quantile
-from jaxslam.types import Status
 
 
 @dataclass(frozen=True, eq=False)

@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxslam.consistency.intervals import Average, interval, positive_interval
-from jaxslam.types import Trace, Truth
+from jaxslam.core.types import Trace, Truth
 
 Sums = Mapping[str, np.ndarray]
 """Sums over all runs of a campaign, by name."""

@@ -12,9 +12,9 @@ from jaxtyping import Array, Float
 
 from jaxslam.consistency.intervals import LEVEL
 from jaxslam.consistency.measures.measure import Measure, Nees, Runs, RunScores, Sums, ratio
+from jaxslam.core.protocols import Chart, Sensor
+from jaxslam.core.types import Trace, Truth
 from jaxslam.math.stats import chi2_quantiles
-from jaxslam.protocols import Chart, Sensor
-from jaxslam.types import Trace, Truth
 
 DOF = {"pose": 3, "position": 2, "heading": 1}
 """Blocks of the pose error whose NEES is taken, and the mean of an honest one."""

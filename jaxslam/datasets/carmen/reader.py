@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
+from jaxslam.core.types import Beams
 from jaxslam.datasets.carmen.lines import POSE, Scan, has_poses, is_scan, scan_of
 from jaxslam.datasets.carmen.odometry import (
     RawOdometry,
@@ -26,7 +27,6 @@ from jaxslam.datasets.carmen.odometry import (
 from jaxslam.datasets.carmen.scans import beams_of, checked_mount, clock_of, mount_of, robot_poses
 from jaxslam.datasets.lines import TextFile
 from jaxslam.math import numpy_poses as poses
-from jaxslam.types import Beams
 
 
 @dataclass(frozen=True, eq=False)

@@ -6,10 +6,10 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+from jaxslam.core.types import Beams
 from jaxslam.datasets.carmen.lines import Scan
 from jaxslam.datasets.lines import TextFile
 from jaxslam.math import numpy_poses as poses
-from jaxslam.types import Beams
 
 LOOSE = 0.01, np.deg2rad(0.5)
 """[m], [rad] by which the mount may differ between lines."""

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.noise import NoiseCov
+from jaxslam.core.noise import NoiseCov
 
 Numbers = TypeVar("Numbers", np.ndarray, jax.Array)
 

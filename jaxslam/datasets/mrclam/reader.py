@@ -14,6 +14,8 @@ import numpy as np
 from jaxslam.calibration import Calibration, calibrate
 from jaxslam.charts import RightInvariant
 from jaxslam.core.numbers import is_concrete
+from jaxslam.core.protocols import Motion, Sensor
+from jaxslam.core.types import Info, Log
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.mrclam.calibration import (
     MRCLAM_CALIBRATION,
@@ -33,10 +35,8 @@ from jaxslam.filters.ekf.ekf_slam import EkfSlam
 from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.math.stats import sigma_gate
 from jaxslam.motion import Unicycle
-from jaxslam.protocols import Motion, Sensor
 from jaxslam.run import run
 from jaxslam.sensors import RangeBearing
-from jaxslam.types import Info, Log
 
 
 def mrclam(

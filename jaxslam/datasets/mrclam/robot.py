@@ -9,13 +9,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxslam.core.logs.streams import hold, interpolate_poses
+from jaxslam.core.noise import NoiseCov
+from jaxslam.core.types import Log
 from jaxslam.datasets.mrclam.calibration import RobotCalibration, per_interval, recorded
 from jaxslam.datasets.mrclam.files import read_robot, read_truth
-from jaxslam.logs.streams import hold, interpolate_poses
 from jaxslam.motion import Unicycle
-from jaxslam.noise import NoiseCov
 from jaxslam.sensors import RangeBearing
-from jaxslam.types import Log
 
 GAP = 0.2
 """Time between lines of the truth beyond which it is unknown between them [s]."""

@@ -7,6 +7,9 @@ from typing import Literal
 
 import numpy as np
 
+from jaxslam.core.logs.streams import Rows, hold
+from jaxslam.core.noise import NoiseCov
+from jaxslam.core.types import Log
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.lines import stored
 from jaxslam.datasets.mrclam.calibration import RobotCalibration, check_calibration
@@ -20,11 +23,8 @@ from jaxslam.datasets.mrclam.robot import (
     read_lines,
     true_fields,
 )
-from jaxslam.logs.streams import Rows, hold
-from jaxslam.noise import NoiseCov
+from jaxslam.filters.multi_robot.team import Robot, TeamMotion, sensors_of
 from jaxslam.sensors import Part, Suite
-from jaxslam.team import Robot, TeamMotion, sensors_of
-from jaxslam.types import Log
 
 
 def mrclam_team(

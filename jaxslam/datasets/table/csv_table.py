@@ -8,8 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxslam.core.logs.tables import TAG, UNITS, Columns, split_unit, unit_divisor
 from jaxslam.datasets.lines import read_bytes
-from jaxslam.logs.tables import TAG, UNITS, Columns, split_unit, unit_divisor
 
 
 class CsvTable:

@@ -18,11 +18,11 @@ from jaxslam.association import (
     MaximumLikelihood,
     Nearest,
 )
+from jaxslam.core.logs.tables import odometry_columns, split_unit
+from jaxslam.core.protocols import Associate, Motion, Sensor
+from jaxslam.core.types import JaxOrNumPy
 from jaxslam.filters.ekf.settings import EkfOptions
-from jaxslam.logs.tables import odometry_columns, split_unit
 from jaxslam.math import stats
-from jaxslam.protocols import Associate, Motion, Sensor
-from jaxslam.types import JaxOrNumPy
 
 _Model = TypeVar("_Model", bound=Motion | Sensor)
 

@@ -4,16 +4,16 @@ from pathlib import Path
 
 import numpy as np
 
+from jaxslam.core.logs import tables
+from jaxslam.core.logs.streams import interpolate_poses
+from jaxslam.core.logs.tables import POSE, TAG, TIME
+from jaxslam.core.protocols import Motion, Sensor
+from jaxslam.core.types import Log
 from jaxslam.datasets.dataset import Adjustable, Dataset
 from jaxslam.datasets.lines import stored
 from jaxslam.datasets.table.csv_table import CsvTable
 from jaxslam.datasets.table.models import Parametric
 from jaxslam.datasets.table.settings import TableSettings
-from jaxslam.logs import tables
-from jaxslam.logs.streams import interpolate_poses
-from jaxslam.logs.tables import POSE, TAG, TIME
-from jaxslam.protocols import Motion, Sensor
-from jaxslam.types import Log
 
 ODOMETRY, MEASUREMENTS = "odometry.csv", "measurements.csv"
 

@@ -12,7 +12,10 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxslam import motion, sensors
+from jaxslam.core.logs.tables import INTERVAL, POSE, odometry_columns, split_unit
+from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.record import record, static
+from jaxslam.core.types import JaxOrNumPy
 from jaxslam.datasets.table.models import (
     GATE,
     Parametric,
@@ -23,9 +26,6 @@ from jaxslam.datasets.table.models import (
 )
 from jaxslam.datasets.table.settings_text import line_number
 from jaxslam.filters.ekf.settings import EkfOptions
-from jaxslam.logs.tables import INTERVAL, POSE, odometry_columns, split_unit
-from jaxslam.protocols import Motion, Sensor
-from jaxslam.types import JaxOrNumPy
 
 _Model = TypeVar("_Model", bound=Motion | Sensor)
 _Value = TypeVar("_Value")

@@ -6,6 +6,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
+from jaxslam.core.slots import Joint
 from jaxslam.filters.delayed.hypotheses import point_residuals
 from jaxslam.filters.delayed.settings import DelayedSettings
 from jaxslam.filters.delayed.state import (
@@ -20,7 +21,6 @@ from jaxslam.filters.delayed.state import (
 )
 from jaxslam.math import linalg
 from jaxslam.math.xla import materialize
-from jaxslam.slots import Joint
 
 
 def confirm_hypotheses(

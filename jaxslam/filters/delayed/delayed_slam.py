@@ -9,10 +9,12 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxslam import slots, validation
 from jaxslam.association.rules import Known
 from jaxslam.charts import Euclidean
+from jaxslam.core import slots, validation
+from jaxslam.core.protocols import Associate, Association, Filter, Motion, Sensor
 from jaxslam.core.record import hold_function, record, set_field, static
+from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.filters.delayed.confirmation import confirm_hypotheses
 from jaxslam.filters.delayed.intersection import intersect_measurements
 from jaxslam.filters.delayed.promotion import Promoted, promote_hypotheses
@@ -44,9 +46,7 @@ from jaxslam.filters.reporting import info_of, seen_before, status_of
 from jaxslam.math.arrays import Number
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.math.xla import where_any
-from jaxslam.protocols import Associate, Association, Filter, Motion, Sensor
 from jaxslam.sensors.suite import on_ground
-from jaxslam.types import Estimate, Info, Scan
 
 
 def _store_measurements(

@@ -7,6 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
+from jaxslam.core.slots import Joint
 from jaxslam.filters.delayed.settings import Distance
 from jaxslam.filters.delayed.state import SIZE, TableLayout, covariance_blocks
 from jaxslam.filters.delayed.triangulation import Triangulation
@@ -14,7 +15,6 @@ from jaxslam.math import uncertain_poses
 from jaxslam.math.arrays import Number
 from jaxslam.math.uncertain_poses import Frame
 from jaxslam.math.xla import materialize
-from jaxslam.slots import Joint
 
 _DISTANCES = {
     "mahalanobis": uncertain_poses.mahalanobis_squared,

@@ -7,13 +7,13 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int, PyTree
 
+from jaxslam.core.slots import Joint
 from jaxslam.filters.delayed.hypotheses import UncertainPoints, relative_spread, safe_root
 from jaxslam.filters.delayed.state import SIZE, covariance_blocks, covariance_rows
 from jaxslam.filters.delayed.triangulation import Triangulation
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
 from jaxslam.math.xla import materialize
-from jaxslam.slots import Joint
 
 # The number of Gauss-Newton steps; the hypothesis is a good initial value.
 _STEPS = 4

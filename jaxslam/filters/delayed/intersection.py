@@ -7,7 +7,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxslam import slots
+from jaxslam.core import slots
+from jaxslam.core.slots import Joint
 from jaxslam.filters.delayed.hypotheses import (
     UncertainPoints,
     closer_than,
@@ -25,7 +26,6 @@ from jaxslam.filters.delayed.state import (
 )
 from jaxslam.filters.delayed.triangulation import Triangulation
 from jaxslam.math.xla import materialize, where_any
-from jaxslam.slots import Joint
 
 
 def intersect_measurements(

@@ -4,12 +4,12 @@ from dataclasses import dataclass
 from typing import Literal, get_args
 
 from jaxslam.core.numbers import check_count, is_concrete
+from jaxslam.core.protocols import Associate, Sensor
 from jaxslam.core.record import record, static
 from jaxslam.filters.delayed.state import TableLayout
 from jaxslam.filters.delayed.triangulation import Triangulation
 from jaxslam.math.arrays import Number
 from jaxslam.math.stats import chi2_quantile
-from jaxslam.protocols import Associate, Sensor
 
 Distance = Literal["mahalanobis", "bhattacharyya"]
 

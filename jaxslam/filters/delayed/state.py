@@ -31,9 +31,9 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxslam import slots
+from jaxslam.core import slots
+from jaxslam.core.slots import Joint
 from jaxslam.math.xla import where_any
-from jaxslam.slots import Joint
 
 SIZE = 3
 """parameters of a slot"""

@@ -11,11 +11,11 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxslam.core.numbers import is_concrete
+from jaxslam.core.protocols import Component, Sensor
 from jaxslam.core.record import record
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
 from jaxslam.math.arrays import Number
-from jaxslam.protocols import Component, Sensor
 
 Stored = Float[Array, "3"]
 """a stored measurement s = (x, y, q)"""

@@ -6,17 +6,17 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 
-from jaxslam import slots, validation
 from jaxslam.association.rules import Known
+from jaxslam.core import slots, validation
 from jaxslam.core.numbers import check_count
+from jaxslam.core.protocols import Sensor, Wrapper
 from jaxslam.core.record import record, static
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.filters.ekf.ekf_slam import EkfSlam
 from jaxslam.math import linalg
 from jaxslam.math.xla import where_any
-from jaxslam.protocols import Sensor, Wrapper
 from jaxslam.sensors.suite import Suite
-from jaxslam.slots import Joint
-from jaxslam.types import Estimate, Info, Scan
 
 # The tag of slots that are no landmark: not -1, which is the tag of a measurement without one.
 _NONE = -2

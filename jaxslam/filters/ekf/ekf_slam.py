@@ -5,10 +5,13 @@ import dataclasses
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam import slots, validation
 from jaxslam.association.rules import Known
 from jaxslam.charts import Euclidean
+from jaxslam.core import slots, validation
+from jaxslam.core.protocols import Associate, Chart, Filter, Life, Linearizer, Motion, Sensor
 from jaxslam.core.record import hold_function, record, static
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.filters.ekf import map_coordinates
 from jaxslam.filters.ekf.linear_system import LinearizedSteps, LinearSystem
 from jaxslam.filters.ekf.map_coordinates import estimate_of
@@ -25,9 +28,6 @@ from jaxslam.filters.reporting import with_extra, with_removed
 from jaxslam.linearize.first_order import AtEstimate
 from jaxslam.math import linalg
 from jaxslam.math.arrays import Number
-from jaxslam.protocols import Associate, Chart, Filter, Life, Linearizer, Motion, Sensor
-from jaxslam.slots import Joint
-from jaxslam.types import Estimate, Info, Scan
 
 
 @record

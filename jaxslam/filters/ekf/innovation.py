@@ -11,7 +11,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxslam import slots
+from jaxslam.core import slots
+from jaxslam.core.protocols import Here
+from jaxslam.core.slots import Joint
 from jaxslam.filters.ekf.linear_system import basis_of_each
 from jaxslam.filters.ekf.map_coordinates import at_slot
 from jaxslam.filters.ekf.predicted_measurements import in_chart, projected_cov
@@ -20,8 +22,6 @@ from jaxslam.filters.ekf.whitening import InnovationFactor, factor_of, whiten, w
 from jaxslam.math import linalg
 from jaxslam.math.gaussians import log_density, log_det_of_pivots
 from jaxslam.math.xla import materialize, no_inline
-from jaxslam.protocols import Here
-from jaxslam.slots import Joint
 
 
 class Correction(NamedTuple):

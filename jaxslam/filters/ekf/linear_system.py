@@ -12,9 +12,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from jaxslam.core.protocols import Chart
+from jaxslam.core.types import Info, Scan
 from jaxslam.math import linalg
-from jaxslam.protocols import Chart
-from jaxslam.types import Info, Scan
 
 
 class Transition(NamedTuple):

@@ -9,17 +9,17 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxslam import slots
+from jaxslam.core import slots
+from jaxslam.core.protocols import Chart, Sensor
 from jaxslam.core.record import record
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Estimate
 from jaxslam.filters.ekf.linear_system import Transition
 from jaxslam.filters.ekf.predict import moved_cov
 from jaxslam.math import linalg
 from jaxslam.math.arrays import Landmark, Measurement, Point, Pose
 from jaxslam.math.xla import where_any
-from jaxslam.protocols import Chart, Sensor
 from jaxslam.sensors.suite import Wrapped
-from jaxslam.slots import Joint
-from jaxslam.types import Estimate
 
 
 class ToPoints(NamedTuple):

@@ -6,15 +6,15 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PyTree
 
+from jaxslam.core.protocols import Filter, Wrapper
 from jaxslam.core.record import record
+from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.filters.ekf.linear_system import (
     LinearLandmarks,
     LinearMeasurements,
     LinearSystem,
 )
 from jaxslam.math import linalg
-from jaxslam.protocols import Filter, Wrapper
-from jaxslam.types import Estimate, Info, Scan
 
 _TINY = 1e-30
 

@@ -4,13 +4,13 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxslam import slots
+from jaxslam.core import slots
+from jaxslam.core.protocols import Basis, Here, Motion
+from jaxslam.core.slots import Joint
 from jaxslam.filters.ekf.linear_system import Transition
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.math import linalg
 from jaxslam.math.xla import materialize
-from jaxslam.protocols import Basis, Here, Motion
-from jaxslam.slots import Joint
 
 
 def propagate(

@@ -14,7 +14,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam import slots
+from jaxslam.core import slots
+from jaxslam.core.protocols import Association, Here, Sensor
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Info, Scan
 from jaxslam.filters.ekf.innovation import Correction
 from jaxslam.filters.ekf.linear_system import (
     LinearLandmarks,
@@ -27,10 +30,7 @@ from jaxslam.filters.ekf.update import correct, correct_in_turn
 from jaxslam.filters.reporting import info_of, joined_info, nothing_of, seen_before, status_of
 from jaxslam.math import linalg
 from jaxslam.math.xla import change_where, materialize, where_any
-from jaxslam.protocols import Association, Here, Sensor
 from jaxslam.sensors.suite import Part, Suite, on_ground, split_scan
-from jaxslam.slots import Joint
-from jaxslam.types import Info, Scan
 
 
 def augment(

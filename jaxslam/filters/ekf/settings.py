@@ -10,9 +10,9 @@ from jaxtyping import PyTree
 from jaxslam.association.rules import Known
 from jaxslam.charts import Euclidean
 from jaxslam.core.numbers import check_count, check_gate
+from jaxslam.core.protocols import Associate, Chart, Life, Linearizer, Sensor
 from jaxslam.linearize.first_order import AtEstimate
 from jaxslam.math.arrays import Number
-from jaxslam.protocols import Associate, Chart, Life, Linearizer, Sensor
 from jaxslam.sensors.suite import Suite
 
 CorrectionOrder = Literal["sequential", "joint"]

@@ -13,6 +13,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from jaxslam.core.protocols import Chart
+from jaxslam.core.slots import Joint
 from jaxslam.filters.ekf.innovation import (
     Correction,
     Innovation,
@@ -23,8 +25,6 @@ from jaxslam.filters.ekf.map_coordinates import retracted
 from jaxslam.filters.ekf.settings import Covariance, EkfSettings
 from jaxslam.math import linalg
 from jaxslam.math.xla import materialize, no_inline, where_any
-from jaxslam.protocols import Chart
-from jaxslam.slots import Joint
 
 
 def correct(

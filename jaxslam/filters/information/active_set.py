@@ -9,7 +9,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxslam import slots
+from jaxslam.core import slots
 from jaxslam.filters.information.innovation import TagAssociation
 from jaxslam.filters.information.sparse_state import (
     SparseState,

@@ -18,6 +18,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
+from jaxslam.core.protocols import Motion, Sensor
+from jaxslam.core.types import Info, Scan
 from jaxslam.filters.information.innovation import (
     CanonicalInnovations,
     TagAssociation,
@@ -28,8 +30,6 @@ from jaxslam.linearize import first_order
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
 from jaxslam.math.arrays import Number
-from jaxslam.protocols import Motion, Sensor
-from jaxslam.types import Info, Scan
 
 
 def initial_information(pose_cov: Float[Array, "3 3"], floor: Number) -> Float[Array, "3 3"]:

@@ -10,14 +10,14 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int, PyTree
 
+from jaxslam.core.protocols import Filter, Wrapper
 from jaxslam.core.record import record, static
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.filters.ekf.map_coordinates import estimate_of
 from jaxslam.filters.information import canonical, innovation
 from jaxslam.filters.information.innovation import InformationFilter, associate_by_table
 from jaxslam.math import linalg
-from jaxslam.protocols import Filter, Wrapper
-from jaxslam.slots import Joint
-from jaxslam.types import Estimate, Info, Scan
 
 
 class CanonicalState(NamedTuple):

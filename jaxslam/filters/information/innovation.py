@@ -11,18 +11,18 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxslam import slots, validation
 from jaxslam.charts import Euclidean
+from jaxslam.core import slots, validation
 from jaxslam.core.numbers import check_count, check_gate, check_positive
+from jaxslam.core.protocols import Filter, Motion, Sensor
 from jaxslam.core.record import record, static
+from jaxslam.core.types import Scan
 from jaxslam.filters.reporting import seen_before
 from jaxslam.linearize.first_order import observe_jacobians
 from jaxslam.math import linalg
 from jaxslam.math.arrays import Number
 from jaxslam.math.gaussians import gaussian_terms, log_density, log_det_of_pivots
-from jaxslam.protocols import Filter, Motion, Sensor
 from jaxslam.sensors.suite import Suite
-from jaxslam.types import Scan
 
 
 @record

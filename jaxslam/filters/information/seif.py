@@ -8,6 +8,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxslam.core.numbers import check_count
 from jaxslam.core.record import record, static
+from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.filters.information import canonical, innovation
 from jaxslam.filters.information.active_set import (
     activate,
@@ -36,7 +37,6 @@ from jaxslam.filters.information.sparse_state import (
     with_active_residual,
 )
 from jaxslam.filters.information.sparsification import cut_robot_links
-from jaxslam.types import Estimate, Info, Scan
 
 
 @record

@@ -10,11 +10,26 @@ import numpy as np
 from jaxtyping import Int, PyTree
 from numpy.typing import ArrayLike
 
-from jaxslam import slots, validation
 from jaxslam.association.rules import Known
 from jaxslam.charts import Euclidean
+from jaxslam.core import slots, validation
 from jaxslam.core.numbers import held_array, is_concrete
+from jaxslam.core.protocols import (
+    NOTHING_FREE,
+    Associate,
+    Association,
+    Basis,
+    Chart,
+    Filter,
+    Here,
+    Linearizer,
+    Motion,
+    Prediction,
+    Sensor,
+)
 from jaxslam.core.record import hold_function, record, set_field, static
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.filters.ekf.predict import propagate
 from jaxslam.filters.ekf.scan import SensorTurn, update_by_scan
 from jaxslam.filters.ekf.settings import (
@@ -28,22 +43,7 @@ from jaxslam.filters.ekf.settings import (
 from jaxslam.linearize.first_order import AtEstimate
 from jaxslam.math import linalg
 from jaxslam.math.arrays import Number
-from jaxslam.protocols import (
-    NOTHING_FREE,
-    Associate,
-    Association,
-    Basis,
-    Chart,
-    Filter,
-    Here,
-    Linearizer,
-    Motion,
-    Prediction,
-    Sensor,
-)
 from jaxslam.sensors.suite import Suite, Wrapped
-from jaxslam.slots import Joint
-from jaxslam.types import Estimate, Info, Scan
 
 Array = jax.Array
 

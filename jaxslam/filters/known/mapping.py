@@ -9,10 +9,13 @@ from jax import Array
 from jaxtyping import Float, PyTree
 from numpy.typing import ArrayLike
 
-from jaxslam import validation
 from jaxslam.association.rules import Known
 from jaxslam.charts import Euclidean
+from jaxslam.core import validation
+from jaxslam.core.protocols import Associate, Filter, Life, Sensor, Wrapper
 from jaxslam.core.record import record, static
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.filters.particles.landmark_ekf import update_map
 from jaxslam.filters.particles.proposal import associate_particle, propose_pose
 from jaxslam.filters.particles.scan_association import zero_padding
@@ -25,9 +28,6 @@ from jaxslam.filters.particles.slam_particles import (
 )
 from jaxslam.math.angles import wrap
 from jaxslam.math.arrays import Number
-from jaxslam.protocols import Associate, Filter, Life, Sensor, Wrapper
-from jaxslam.slots import Joint
-from jaxslam.types import Estimate, Info, Scan
 
 
 @record

@@ -5,9 +5,12 @@ import dataclasses
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam import validation
+from jaxslam.core import validation
 from jaxslam.core.numbers import check_count, check_positive
+from jaxslam.core.protocols import Filter
 from jaxslam.core.record import record, static
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Info, Scan
 from jaxslam.filters.map_management.loop_closure import (
     LoopReport,
     LoopSettings,
@@ -22,9 +25,6 @@ from jaxslam.filters.reporting import with_extra, with_removed
 from jaxslam.math.arrays import Number
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.math.xla import change_where
-from jaxslam.protocols import Filter
-from jaxslam.slots import Joint
-from jaxslam.types import Info, Scan
 
 
 @record

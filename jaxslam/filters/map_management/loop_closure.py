@@ -12,6 +12,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam.core.numbers import check_count
+from jaxslam.core.protocols import Chart
+from jaxslam.core.slots import Joint
 from jaxslam.filters.ekf.map_coordinates import cov_of_coordinates
 from jaxslam.filters.map_management.geometric_matching import (
     GeometricMatch,
@@ -27,8 +29,6 @@ from jaxslam.math import linalg
 from jaxslam.math.arrays import Number
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.math.xla import change_where, where_any
-from jaxslam.protocols import Chart
-from jaxslam.slots import Joint
 
 
 def merge_histories(joint: Joint, chart: Chart, old: Int[Array, ""], new: Int[Array, ""]) -> Joint:

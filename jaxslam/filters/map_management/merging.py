@@ -9,9 +9,12 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxslam import slots, validation
+from jaxslam.core import slots, validation
 from jaxslam.core.numbers import check_positive, is_concrete
+from jaxslam.core.protocols import Chart, Filter, Wrapper
 from jaxslam.core.record import record, static
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Info, Scan, Status
 from jaxslam.filters.ekf.linear_system import LinearizedSteps, LinearSystem
 from jaxslam.filters.ekf.map_coordinates import retracted
 from jaxslam.filters.reporting import with_extra
@@ -20,9 +23,6 @@ from jaxslam.math.arrays import Number
 from jaxslam.math.gaussians import gaussian_terms
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.math.xla import change_where
-from jaxslam.protocols import Chart, Filter, Wrapper
-from jaxslam.slots import Joint
-from jaxslam.types import Info, Scan, Status
 
 
 class Managed(Wrapper):

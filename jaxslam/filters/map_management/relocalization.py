@@ -8,6 +8,9 @@ import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
 from jaxslam.core.numbers import check_count, check_covariance
+from jaxslam.core.protocols import Chart, Sensor
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Scan
 from jaxslam.filters.ekf.map_coordinates import (
     cov_of_coordinates,
     with_cov_of_coordinates,
@@ -20,9 +23,6 @@ from jaxslam.filters.map_management.geometric_matching import (
 )
 from jaxslam.filters.map_management.point_pairs import PointSets
 from jaxslam.math import linalg
-from jaxslam.protocols import Chart, Sensor
-from jaxslam.slots import Joint
-from jaxslam.types import Scan
 
 
 class _Relocalization(NamedTuple):

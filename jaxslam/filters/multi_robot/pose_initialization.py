@@ -12,7 +12,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam import slots
+from jaxslam.core import slots
+from jaxslam.core.protocols import Sensor
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Scan
 from jaxslam.filters.multi_robot.team_state import (
     SIZE,
     InitialPose,
@@ -25,10 +28,7 @@ from jaxslam.linearize import first_order
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
 from jaxslam.math.linalg import symmetrize
-from jaxslam.protocols import Sensor
 from jaxslam.sensors.suite import Suite, split_scan
-from jaxslam.slots import Joint
-from jaxslam.types import Scan
 
 
 class _ObservedPoints(NamedTuple):

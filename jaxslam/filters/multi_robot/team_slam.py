@@ -7,11 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxslam import slots, validation
 from jaxslam.association.rules import Known
 from jaxslam.charts import Euclidean
+from jaxslam.core import slots, validation
 from jaxslam.core.numbers import check_count
+from jaxslam.core.protocols import Associate, Filter
 from jaxslam.core.record import hold_function, record, set_field, static
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Estimate, Info, Scan, Status
 from jaxslam.filters.ekf.predict import propagate
 from jaxslam.filters.ekf.scan import SensorTurn, turn_of, update_by_scan
 from jaxslam.filters.ekf.settings import (
@@ -22,6 +25,7 @@ from jaxslam.filters.ekf.settings import (
     check_ekf_options,
 )
 from jaxslam.filters.multi_robot.pose_initialization import best_initialization, observed_points
+from jaxslam.filters.multi_robot.team import Robot, check_team, poses, sizes
 from jaxslam.filters.multi_robot.team_state import (
     SIZE,
     InitialPose,
@@ -37,11 +41,7 @@ from jaxslam.math import se2
 from jaxslam.math.angles import wrap
 from jaxslam.math.arrays import Number
 from jaxslam.math.xla import where_any
-from jaxslam.protocols import Associate, Filter
 from jaxslam.sensors.suite import Part, split_scan
-from jaxslam.slots import Joint
-from jaxslam.team import Robot, check_team, poses, sizes
-from jaxslam.types import Estimate, Info, Scan, Status
 
 
 @record

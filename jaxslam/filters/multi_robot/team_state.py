@@ -12,11 +12,11 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
+from jaxslam.core.protocols import Sensor
+from jaxslam.core.slots import Joint
 from jaxslam.filters.ekf.scan import SensorTurn
 from jaxslam.filters.ekf.settings import EkfSettings
-from jaxslam.protocols import Sensor
-from jaxslam.slots import Joint
-from jaxslam.team import Robot
+from jaxslam.filters.multi_robot.team import Robot
 
 SIZE = 3
 """Numbers of a slot: x, y and the heading of a robot; of a landmark the third is padding."""

@@ -10,10 +10,12 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int, PyTree
 
-from jaxslam import validation
 from jaxslam.association.rules import Known
 from jaxslam.charts import Euclidean
+from jaxslam.core import validation
+from jaxslam.core.protocols import Associate, Differentiable, Filter, Life, Motion, Resample, Sensor
 from jaxslam.core.record import record, static
+from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.filters.particles.landmark_ekf import update_map
 from jaxslam.filters.particles.pose_particles import weighted_nis
 from jaxslam.filters.particles.proposal import (
@@ -40,10 +42,8 @@ from jaxslam.filters.particles.slam_particles import (
 )
 from jaxslam.filters.reporting import has_distance, with_extra
 from jaxslam.math.arrays import Number
-from jaxslam.protocols import Associate, Differentiable, Filter, Life, Motion, Resample, Sensor
 from jaxslam.resampling.rules import systematic
 from jaxslam.resampling.weights import normalized, resampled_where
-from jaxslam.types import Estimate, Info, Scan
 
 _T = TypeVar("_T")
 

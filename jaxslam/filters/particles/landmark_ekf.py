@@ -10,7 +10,10 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxslam import slots
+from jaxslam.core import slots
+from jaxslam.core.protocols import Life, Sensor
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Estimate, Info, Scan, Status
 from jaxslam.filters.particles.proposal import ParticleInnovations
 from jaxslam.filters.particles.scan_association import ParticleAssociation
 from jaxslam.filters.particles.settings import ParticleMapSettings
@@ -20,9 +23,6 @@ from jaxslam.linearize import first_order
 from jaxslam.math import linalg
 from jaxslam.math.gaussians import gaussian_terms
 from jaxslam.math.xla import where_any
-from jaxslam.protocols import Life, Sensor
-from jaxslam.slots import Joint
-from jaxslam.types import Estimate, Info, Scan, Status
 
 
 def update_map(

@@ -12,6 +12,8 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.association.prediction import predicted
+from jaxslam.core.protocols import Prediction
+from jaxslam.core.types import Scan
 from jaxslam.filters.particles.scan_association import (
     ParticleAssociation,
     gate_distance,
@@ -19,9 +21,7 @@ from jaxslam.filters.particles.scan_association import (
 )
 from jaxslam.filters.particles.settings import KnownMapSensor
 from jaxslam.math.gaussians import GaussianTerms, gaussian_terms, log_density
-from jaxslam.protocols import Prediction
 from jaxslam.sensors.suite import split_scan
-from jaxslam.types import Scan
 
 
 class ScanLikelihood(NamedTuple):

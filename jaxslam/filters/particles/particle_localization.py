@@ -9,9 +9,11 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from jaxslam import validation
 from jaxslam.association.rules import Known
+from jaxslam.core import validation
+from jaxslam.core.protocols import Associate, Motion, Sensor
 from jaxslam.core.record import hold_function, record, static
+from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.filters.known.localization import hold_map, map_tags
 from jaxslam.filters.particles.likelihood import ScanLikelihood, scan_likelihood
 from jaxslam.filters.particles.pose_particles import Box, PoseParticles, draw_start, weighted_nis
@@ -20,9 +22,7 @@ from jaxslam.filters.particles.scan_association import zero_padding
 from jaxslam.filters.particles.settings import known_map_sensors
 from jaxslam.filters.reporting import info_of, status_of, with_extra
 from jaxslam.math.arrays import Number
-from jaxslam.protocols import Associate, Motion, Sensor
 from jaxslam.resampling.weights import normalized
-from jaxslam.types import Estimate, Info, Scan
 
 
 @record

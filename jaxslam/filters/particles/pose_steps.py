@@ -10,10 +10,12 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from jaxslam import validation
 from jaxslam.charts import Euclidean
+from jaxslam.core import validation
 from jaxslam.core.numbers import is_concrete
+from jaxslam.core.protocols import Differentiable, Filter, Motion, Resample
 from jaxslam.core.record import record, static
+from jaxslam.core.types import Estimate
 from jaxslam.filters.particles.pose_particles import (
     ParticleEvents,
     PoseParticles,
@@ -30,11 +32,9 @@ from jaxslam.filters.particles.recovery import resample_and_inject, update_avera
 from jaxslam.filters.particles.settings import check_resampling
 from jaxslam.filters.particles.slam_particles import ParticleInfo
 from jaxslam.math.arrays import Number
-from jaxslam.protocols import Differentiable, Filter, Motion, Resample
 from jaxslam.resampling.kld import bins_of, enough
 from jaxslam.resampling.rules import systematic
 from jaxslam.resampling.weights import effective_size, normalized
-from jaxslam.types import Estimate
 
 # The default least number of particles.
 _LEAST = 50

@@ -11,6 +11,8 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxslam.association.prediction import predicted
+from jaxslam.core.protocols import Motion, Prediction, Sensor
+from jaxslam.core.types import Scan
 from jaxslam.filters.particles.scan_association import (
     ParticleAssociation,
     gate_distance,
@@ -22,8 +24,6 @@ from jaxslam.linearize import first_order
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
 from jaxslam.math.gaussians import gaussian_terms, log_density, log_det_of
-from jaxslam.protocols import Motion, Prediction, Sensor
-from jaxslam.types import Scan
 
 
 def sample_motion(

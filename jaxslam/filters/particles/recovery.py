@@ -11,9 +11,9 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
+from jaxslam.core.protocols import Differentiable, Resample
 from jaxslam.filters.particles.pose_particles import PoseParticles, Region
 from jaxslam.math.arrays import Number
-from jaxslam.protocols import Differentiable, Resample
 from jaxslam.resampling.weights import survivors
 
 

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
+from jaxslam.core.protocols import Associate, Association, Prediction
+from jaxslam.core.types import Scan
 from jaxslam.math.arrays import Number
-from jaxslam.protocols import Associate, Association, Prediction
-from jaxslam.types import Scan
 
 
 class ParticleAssociation(NamedTuple):

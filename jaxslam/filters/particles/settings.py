@@ -6,12 +6,12 @@ from typing import Any
 from jax import Array
 from numpy.typing import ArrayLike
 
-from jaxslam import validation
+from jaxslam.core import validation
+from jaxslam.core.protocols import Associate, Life, Sensor
 from jaxslam.core.record import hold_function
 from jaxslam.filters.known.localization import map_tags
 from jaxslam.math.arrays import Number
 from jaxslam.math.stats import chi2_quantile
-from jaxslam.protocols import Associate, Life, Sensor
 from jaxslam.sensors.suite import Suite
 
 # The probability that a measurement of a landmark lies within d², where there is no gate.

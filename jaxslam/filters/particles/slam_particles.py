@@ -7,10 +7,10 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int, PyTree
 
+from jaxslam.core.protocols import Sensor
+from jaxslam.core.types import Estimate
 from jaxslam.filters.particles.pose_particles import draw_pose, weighted_pose_moments
 from jaxslam.math import linalg
-from jaxslam.protocols import Sensor
-from jaxslam.types import Estimate
 
 
 class SlamParticles(NamedTuple):

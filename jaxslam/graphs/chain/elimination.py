@@ -20,10 +20,10 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxslam.core.protocols import Sensor
 from jaxslam.linearize import first_order
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
-from jaxslam.protocols import Sensor
 
 Rows = tuple[Array, Array, Array, Array]
 """A (Z, 3), B (Z, L) and b (Z,) of a measurement, as in `LinearizedStep`, in units of its

@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.graphs.chain.elimination import (
     Chain,
     LinearizedStep,
@@ -23,7 +24,6 @@ from jaxslam.graphs.chain.elimination import (
 from jaxslam.graphs.solver.search import Ending
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
-from jaxslam.protocols import Motion, Sensor
 
 
 class Problem(NamedTuple):

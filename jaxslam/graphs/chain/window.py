@@ -14,7 +14,9 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam import slots
+from jaxslam.core import slots
+from jaxslam.core.protocols import Motion, Sensor
+from jaxslam.core.slots import Joint
 from jaxslam.graphs.chain.elimination import (
     CostToGo,
     Gain,
@@ -26,8 +28,6 @@ from jaxslam.graphs.chain.elimination import (
 from jaxslam.linearize.first_order import with_lever_arm
 from jaxslam.math import linalg
 from jaxslam.math.angles import wrap
-from jaxslam.protocols import Motion, Sensor
-from jaxslam.slots import Joint
 
 
 class WindowPrior(NamedTuple):

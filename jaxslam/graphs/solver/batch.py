@@ -13,10 +13,10 @@ import numpy as np
 from jaxtyping import Int, PyTree
 
 from jaxslam.core.numbers import is_concrete
+from jaxslam.core.types import JaxOrNumPy
 from jaxslam.graphs.graph import Graph, Table
 from jaxslam.graphs.sparse.sweeps import padded_size
 from jaxslam.math.arrays import in_dtype
-from jaxslam.types import JaxOrNumPy
 
 _T = TypeVar("_T")
 

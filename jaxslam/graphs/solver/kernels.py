@@ -4,9 +4,9 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam.core.numbers import check_positive
+from jaxslam.core.protocols import Component
 from jaxslam.core.record import record
 from jaxslam.math.arrays import Number
-from jaxslam.protocols import Component
 
 Array = jax.Array
 

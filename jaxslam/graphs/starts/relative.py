@@ -10,11 +10,11 @@ import numpy as np
 import scipy  # its parts load where they are used
 from jaxtyping import Bool, Float, Int
 
+from jaxslam.core.types import JaxOrNumPy
 from jaxslam.graphs.factor import BetweenPoses, Factor
 from jaxslam.graphs.graph import Graph, ranks
 from jaxslam.graphs.solver.model import factors_of
 from jaxslam.math import se2
-from jaxslam.types import JaxOrNumPy
 
 Factors = Mapping[str, Factor]
 

@@ -7,7 +7,7 @@ from collections.abc import Callable, Mapping
 from html import escape
 
 from jaxslam.consistency import LEVEL
-from jaxslam.monte_carlo import Campaign
+from jaxslam.consistency.campaign import Campaign
 from jaxslam.results.page.parts import (
     badge,
     duration,

@@ -8,8 +8,8 @@ import numpy as np
 
 from jaxslam.consistency import LEVEL, Average, Summary, lopsided
 from jaxslam.consistency import percentage as plain_percentage
+from jaxslam.consistency.campaign import Campaign
 from jaxslam.consistency.verdict import TESTS
-from jaxslam.monte_carlo import Campaign
 from jaxslam.results import report, table
 from jaxslam.results.plot import Figure, describe
 from jaxslam.results.table import VERDICTS

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.core.numbers import check_count
+from jaxslam.core.protocols import Sensor
 from jaxslam.motion.unicycle import Unicycle
-from jaxslam.protocols import Sensor
 from jaxslam.sensors.range_bearing import RangeBearing
 from jaxslam.sensors.relative_position import RelativePosition
 from jaxslam.simulation.scenarios.view import BetweenRanges

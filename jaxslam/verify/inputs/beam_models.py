@@ -7,9 +7,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.grids.beam_models.beam_model import BeamModel
-from jaxslam.grids.grid import Grid
-from jaxslam.types import Beams
+from jaxslam.core.types import Beams
+from jaxslam.laser.grids.beam_models.beam_model import BeamModel
+from jaxslam.laser.grids.grid import Grid
 from jaxslam.verify.inputs.functions import POSE, Argument, Function
 from jaxslam.verify.inputs.samples import Samples
 

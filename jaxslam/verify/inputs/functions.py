@@ -16,9 +16,9 @@ import numpy as np
 from jaxtyping import Float, PyTree
 from numpy.typing import ArrayLike
 
+from jaxslam.core.protocols import Motion, Sensor, unfit_signature
 from jaxslam.core.record import set_field
 from jaxslam.graphs import Factor
-from jaxslam.protocols import Motion, Sensor, unfit_signature
 
 Claim: TypeAlias = Callable[..., ArrayLike | Sequence[ArrayLike | None]]
 """A hand-derived Jacobian: arguments -> one array, or one array or None for each argument."""

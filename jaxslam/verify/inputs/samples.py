@@ -7,8 +7,8 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
+from jaxslam.core.protocols import Sensor
 from jaxslam.math.xla import quick_jit
-from jaxslam.protocols import Sensor
 from jaxslam.verify.inputs.functions import POSE, Argument, periods
 
 Values: TypeAlias = Float[np.ndarray, "_ _"]

@@ -11,9 +11,9 @@ from types import ModuleType
 
 from numpy.typing import ArrayLike
 
+from jaxslam.core.protocols import Chart, Filter, Linearizer, Motion, Sensor
 from jaxslam.graphs import Factor
-from jaxslam.grids.beam_models import BeamModel
-from jaxslam.protocols import Chart, Filter, Linearizer, Motion, Sensor
+from jaxslam.laser.grids.beam_models import BeamModel
 from jaxslam.simulation.worlds import World
 from jaxslam.verify import Check, Report, build
 from jaxslam.verify.errors import describe_error, is_user_file, place_of_error

@@ -11,7 +11,7 @@ import pytest
 import jaxslam
 from jaxslam import cli, plot, store
 from jaxslam.cli.common import check_out
-from jaxslam.monte_carlo import Interrupted
+from jaxslam.consistency.campaign import Interrupted
 from jaxslam.results import report
 
 QUICK = ["consistency", "--scenario", "circle", "--steps", "8", "--runs", "3"]

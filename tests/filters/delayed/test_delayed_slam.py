@@ -13,6 +13,7 @@ from worlds import draw, judged, nameless, narrow
 import jaxslam
 from jaxslam import Scenario, motion, sensors
 from jaxslam.association import Nearest
+from jaxslam.core.types import Status
 from jaxslam.filters import DeadReckoning, DelayedSlam
 from jaxslam.filters.delayed.confirmation import constraints_of, correct_hypotheses
 from jaxslam.filters.delayed.hypotheses import UncertainPoints, closer_than, point_residuals
@@ -22,7 +23,6 @@ from jaxslam.filters.delayed.settings import Hypotheses, Promotion, StoredMeasur
 from jaxslam.filters.delayed.state import TableLayout
 from jaxslam.filters.delayed.triangulation import Circles, Rays, triangulation_of
 from jaxslam.math.stats import chi2_quantile
-from jaxslam.types import Status
 
 CAMERA = sensors.BearingOnly([[0.01**2]])
 BEACON = sensors.RangeOnly([[0.05**2]])
@@ -139,7 +139,7 @@ def table(kind, seed=0, scale=0.01):
     size = 3 + 3 * LAYOUT.slots
     root = rng.normal(size=(size, size)) * scale
     cov = root @ root.T / size**0.5
-    joint = jaxslam.slots.empty(jnp.asarray([0.1, 0.2, 0.3]), jnp.eye(3), LAYOUT.slots, 3)
+    joint = jaxslam.core.slots.empty(jnp.asarray([0.1, 0.2, 0.3]), jnp.eye(3), LAYOUT.slots, 3)
     # One landmark, no hypothesis, stored measurements.
     alive = np.array([True, False, False, False, True, True, True, True])
     live = np.concatenate([np.ones(3, bool), np.repeat(alive, 3)])

@@ -10,11 +10,11 @@ import pytest
 import scipy.stats
 
 from jaxslam import motion, sensors, slots
+from jaxslam.core.types import Log, Scan, Status
 from jaxslam.filters import EkfSlam
 from jaxslam.run import run
 from jaxslam.simulation.scenarios import cloister
 from jaxslam.simulation.worlds import simulate
-from jaxslam.types import Log, Scan, Status
 
 Q, R = np.diag([0.05, 0.03]) ** 2, np.diag([0.1, 0.05]) ** 2
 MOTION, SENSOR = motion.Increment(Q), sensors.RangeBearing(R)

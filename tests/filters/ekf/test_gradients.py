@@ -9,6 +9,8 @@ import pytest
 import worlds
 
 from jaxslam import charts, linearize, motion, sensors
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Status
 from jaxslam.filters import EkfSlam
 from jaxslam.filters.ekf.predict import propagate
 from jaxslam.filters.ekf.settings import EkfSettings
@@ -17,8 +19,6 @@ from jaxslam.math.stats import sigma_gate
 from jaxslam.run import run
 from jaxslam.simulation.scenarios import cloister
 from jaxslam.simulation.worlds import simulate
-from jaxslam.slots import Joint
-from jaxslam.types import Status
 
 KEY = jax.random.key(0)
 WHEELBASE, SPEED, DT = 0.5, 1.0, 0.1

@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from jaxslam import charts, linearize, sensors
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Scan
 from jaxslam.filters.ekf.predicted_measurements import prediction_of
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.update import correct
-from jaxslam.slots import Joint
-from jaxslam.types import Scan
 
 SENSOR = sensors.RangeBearing(np.diag([0.1, 0.02]) ** 2, mount=(0.2, -0.1, 0.4))
 COUNT = 4

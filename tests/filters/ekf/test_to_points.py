@@ -11,11 +11,11 @@ from own_models import changed
 
 from jaxslam import charts, motion, run, sensors, slots
 from jaxslam.charts import RightInvariant
+from jaxslam.core.protocols import Basis
+from jaxslam.core.types import Log, Scan, Status
 from jaxslam.filters import CompressedEkfSlam, EkfSlam
 from jaxslam.filters.ekf.map_coordinates import ready, reduce, reduction
 from jaxslam.linearize import Unscented
-from jaxslam.protocols import Basis
-from jaxslam.types import Log, Scan, Status
 
 MOTION = motion.Increment(np.diag([0.02, 0.02]) ** 2)
 NOISE = np.array([[0.01**2]])

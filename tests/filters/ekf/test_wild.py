@@ -9,11 +9,11 @@ import numpy as np
 import pytest
 
 from jaxslam import association, life, motion, run, sensors
+from jaxslam.core.protocols import Association
+from jaxslam.core.types import Log, Scan, Status
 from jaxslam.filters import EkfSlam
 from jaxslam.filters.map_management.merging import Merging
 from jaxslam.math.stats import chi2_quantile
-from jaxslam.protocols import Association
-from jaxslam.types import Log, Scan, Status
 
 STEPS, PLACES = 400, 4
 MOTION = motion.Increment(np.diag([0.01, 0.01]) ** 2)

@@ -11,6 +11,7 @@ from dense_form import COUNT, canonical, close, dense, dtypes, initialized, meas
 from worlds import draw, narrow
 
 from jaxslam import filters, sensors
+from jaxslam.core.types import Status
 from jaxslam.filters.information import active_set, sparse_state, sparsification
 from jaxslam.filters.information.marginals import (
     blanket_cov,
@@ -21,7 +22,6 @@ from jaxslam.filters.information.marginals import (
 from jaxslam.run import run
 from jaxslam.simulation.scenarios import cloister
 from jaxslam.simulation.scenarios.view import BetweenRanges
-from jaxslam.types import Status
 
 KEY = jax.random.key(0)
 P0 = np.diag([0.1, 0.1, 0.05]) ** 2

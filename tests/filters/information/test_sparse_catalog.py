@@ -7,11 +7,11 @@ import pytest
 
 from jaxslam import catalog, scenarios
 from jaxslam.charts import Euclidean
+from jaxslam.core.protocols import Filter
 from jaxslam.core.record import record
+from jaxslam.core.types import Scan
 from jaxslam.filters.information.eif_slam import InPieces
 from jaxslam.filters.reporting import nothing_of
-from jaxslam.protocols import Filter
-from jaxslam.types import Scan
 
 
 @pytest.mark.parametrize(("scenario", "active"), [("cloister", 18), ("circle", 10)])

@@ -10,10 +10,10 @@ import pytest
 from worlds import draw, judged, nameless, narrow, ring
 
 from jaxslam import association, charts, linearize, run, sensors, simulate
+from jaxslam.core.types import Log, Status
 from jaxslam.filters import DeadReckoning, EkfSlam, Localization, StartingAt
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.sensors import Part, Suite
-from jaxslam.types import Log, Status
 
 KEY = jax.random.key(0)
 START, SPREAD = np.array([0.1, -0.05, 0.02]), np.diag([0.2, 0.1, 0.05]) ** 2

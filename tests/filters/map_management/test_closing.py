@@ -9,14 +9,14 @@ import numpy as np
 import pytest
 
 from jaxslam import association, charts, motion, sensors, slots
+from jaxslam.core.protocols import Pairs, Prediction
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Info, Scan
 from jaxslam.filters import EifSlam, EkfSlam
 from jaxslam.filters.map_management.closing import Closing
 from jaxslam.filters.map_management.loop_closure import LoopSettings, close_loop
 from jaxslam.filters.map_management.merging import merge_landmarks
 from jaxslam.life import Recency, Times
-from jaxslam.protocols import Pairs, Prediction
-from jaxslam.slots import Joint
-from jaxslam.types import Info, Scan
 
 EUCLIDEAN = charts.Euclidean()
 OPTIONS = {"window": 20, "cluster": 6, "least": 4}

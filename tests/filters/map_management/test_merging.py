@@ -10,10 +10,10 @@ import pytest
 
 from jaxslam import charts, motion, run, sensors, slots
 from jaxslam.core.record import record
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Log, Scan
 from jaxslam.filters import EkfSlam
 from jaxslam.filters.map_management.merging import Merging, closest_pair, merge_landmarks
-from jaxslam.slots import Joint
-from jaxslam.types import Log, Scan
 
 EUCLIDEAN = charts.Euclidean()
 MOTION = motion.PoseIncrement(np.diag([0.1, 0.1, 0.05]) ** 2)

@@ -10,6 +10,8 @@ import numpy as np
 import pytest
 
 from jaxslam import charts, motion, se2, sensors
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Scan, Status
 from jaxslam.filters import EkfSlam
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.update import correct
@@ -22,8 +24,6 @@ from jaxslam.filters.map_management.relocalization import (
 )
 from jaxslam.linearize import FirstEstimate
 from jaxslam.math.stats import chi2_band, chi2_quantile
-from jaxslam.slots import Joint
-from jaxslam.types import Scan, Status
 
 SENSOR = sensors.RangeBearing(np.diag([0.05, 0.01]) ** 2, mount=(0.2, 0.1, 0.3))
 FIND, ALIGN = jax.jit(relocalize), jax.jit(se2.align)

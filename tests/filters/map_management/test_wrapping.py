@@ -8,11 +8,11 @@ import numpy as np
 import pytest
 
 from jaxslam import charts, motion, sensors
+from jaxslam.core.types import Scan
 from jaxslam.filters import EkfSlam
 from jaxslam.filters.map_management.closing import Closing
 from jaxslam.filters.map_management.merging import Merging
 from jaxslam.life import Existence, Recency
-from jaxslam.types import Scan
 
 MANAGERS = {
     "merging": lambda filter: Merging(filter, 0.5),

@@ -13,10 +13,10 @@ import worlds
 from own_models import changed
 
 from jaxslam import association, motion, resampling, run, sensors
+from jaxslam.core.types import Scan, Status
 from jaxslam.filters import FastSlam, Localization, ParticleLocalization
 from jaxslam.filters.particles import pose_particles
 from jaxslam.sensors import Part, Suite
-from jaxslam.types import Scan, Status
 
 KEY = jax.random.key(5)
 WORLD = worlds.ring(100)

@@ -7,7 +7,7 @@ import pytest
 from PIL import Image
 
 from jaxslam import grids, plot
-from jaxslam.types import Beams
+from jaxslam.core.types import Beams
 
 GRID = grids.Grid(
     np.array([[2.0, -2.0, 0.0], [2.0, 2.0, -1.0]]), np.array([1.0, 2.0, np.pi / 2]), np.float64(0.5)

@@ -8,9 +8,9 @@ import numpy as np
 import pytest
 
 from jaxslam import plot
+from jaxslam.core.types import Trace
 from jaxslam.results.plot.campaigns.scale import BEYOND
 from jaxslam.results.plot.style import curves_of
-from jaxslam.types import Trace
 
 
 @pytest.mark.parametrize("n_sigma", [1.0, 3.0])

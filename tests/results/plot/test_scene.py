@@ -11,6 +11,7 @@ import worlds
 
 import jaxslam
 from jaxslam import catalog, filters, plot
+from jaxslam.core.types import Info, Log, Scan, Status, Trace
 from jaxslam.filters.delayed.state import TableLayout, empty_state
 from jaxslam.filters.information.eif_slam import CanonicalState
 from jaxslam.filters.information.sparse_state import empty_map
@@ -19,7 +20,6 @@ from jaxslam.results.plot.scene import layers
 from jaxslam.results.plot.scene.history import MOST, history_of
 from jaxslam.results.plot.scene.probe import Cloud, Hypotheses, Links
 from jaxslam.results.plot.style import panels_of
-from jaxslam.types import Info, Log, Scan, Status, Trace
 
 STEPS = 3
 # Landmark 2 is new in the last step; a measurement of landmark 1 fails the gate there.

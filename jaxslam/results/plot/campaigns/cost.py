@@ -5,8 +5,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxslam.consistency import DOF, Average
+from jaxslam.consistency.campaign import Campaign
 from jaxslam.consistency.measures import REGISTRY
-from jaxslam.monte_carlo import Campaign
+from jaxslam.core.validation import check_record
 from jaxslam.results.plot.campaigns.layout import TOGETHER, head, kinds_of, numbers_of, runs_of
 from jaxslam.results.plot.campaigns.scale import power, set_positive
 from jaxslam.results.plot.style import (
@@ -19,7 +20,6 @@ from jaxslam.results.plot.style import (
     panels_of,
     plain,
 )
-from jaxslam.validation import check_record
 
 _ERROR, _NEES = "rmse_position", "nees_pose"
 

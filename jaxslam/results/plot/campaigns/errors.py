@@ -4,7 +4,9 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from jaxslam.monte_carlo import Campaign
+from jaxslam.consistency.campaign import Campaign
+from jaxslam.core.types import Estimate, Truth
+from jaxslam.core.validation import check_record
 from jaxslam.results.plot.campaigns.scale import common_top, mark_beyond, scale_setters
 from jaxslam.results.plot.style import (
     COLORS,
@@ -18,8 +20,6 @@ from jaxslam.results.plot.style import (
     step_limits,
     titled,
 )
-from jaxslam.types import Estimate, Truth
-from jaxslam.validation import check_record
 
 _SHORT = ("x [m]", "y [m]", "θ [°]")
 """The quantities in a narrow figure."""

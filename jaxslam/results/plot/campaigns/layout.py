@@ -7,7 +7,8 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxslam.catalog import KINDS
-from jaxslam.monte_carlo import Campaign
+from jaxslam.consistency.campaign import Campaign
+from jaxslam.core.validation import check_record
 from jaxslam.results.plot.style import (
     PAGE,
     TEXT,
@@ -18,7 +19,6 @@ from jaxslam.results.plot.style import (
     plain,
     titled,
 )
-from jaxslam.validation import check_record
 
 TOGETHER = 5
 """largest number of curves in a panel"""

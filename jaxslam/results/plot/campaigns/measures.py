@@ -7,13 +7,13 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxslam.consistency import DOF, LEVELS
+from jaxslam.consistency.campaign import Campaign
 from jaxslam.consistency.measures import REGISTRY, in_figure
 from jaxslam.consistency.measures.errors import bound_curve
-from jaxslam.monte_carlo import Campaign
+from jaxslam.core.validation import check_record
 from jaxslam.results.plot.campaigns.layout import add_legends, head, runs_of, sheet
 from jaxslam.results.plot.campaigns.scale import common_top, mark_beyond, nees_scale, scale_setters
 from jaxslam.results.plot.style import INK, PAGE, RULE, band, curve, plain, step_limits
-from jaxslam.validation import check_record
 
 _NOTHING = 1e-6
 """Information on a heading that counts as none, σ being 1000 rad [1/rad²]."""

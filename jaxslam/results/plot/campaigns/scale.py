@@ -5,7 +5,7 @@ from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, NullLocator
 
 from jaxslam.consistency import DOF
-from jaxslam.monte_carlo import Campaign
+from jaxslam.consistency.campaign import Campaign
 from jaxslam.results.plot.style import INK, curves_of
 
 _FAR = 3.0

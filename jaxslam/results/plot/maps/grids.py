@@ -8,7 +8,8 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import ArrayLike
 
-from jaxslam.grids import Field, Grid
+from jaxslam.core.types import Beams
+from jaxslam.laser.grids import Field, Grid
 from jaxslam.results.plot.style import (
     COLORS,
     FAINT,
@@ -20,7 +21,6 @@ from jaxslam.results.plot.style import (
     every_handle,
     panels_of,
 )
-from jaxslam.types import Beams
 
 _UNKNOWN = "#c9d3dd"
 """Colour of unknown cells, which no shade of grey has."""

@@ -9,7 +9,9 @@ from matplotlib.markers import MarkerStyle
 from matplotlib.path import Path
 from matplotlib.transforms import Affine2D
 
-from jaxslam.monte_carlo import Campaign
+from jaxslam.consistency.campaign import Campaign
+from jaxslam.core.types import Estimate, Truth
+from jaxslam.core.validation import check_record
 from jaxslam.results.plot.maps.geometry import ellipses, extent, square_limits
 from jaxslam.results.plot.style import (
     COLORS,
@@ -25,8 +27,6 @@ from jaxslam.results.plot.style import (
     plain,
     titled,
 )
-from jaxslam.types import Estimate, Truth
-from jaxslam.validation import check_record
 
 _ARROW = Path([(1.2, 0.0), (-0.6, 0.6), (-0.25, 0.0), (-0.6, -0.6), (1.2, 0.0)])
 

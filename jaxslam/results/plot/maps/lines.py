@@ -5,9 +5,9 @@ from matplotlib.collections import LineCollection, PolyCollection
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
+from jaxslam.core.types import Estimate
 from jaxslam.results.plot.style import COLORS, INK, PAGE, caption, every_handle, panels_of
 from jaxslam.simulation.walls import Walls, wall_lines
-from jaxslam.types import Estimate
 
 
 def walls_figure(

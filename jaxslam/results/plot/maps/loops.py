@@ -6,8 +6,8 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 from numpy.typing import ArrayLike
 
-from jaxslam.laser_slam import LoopOutcome, Solved
-from jaxslam.metrics import ate, carried
+from jaxslam.consistency.metrics import ate, carried
+from jaxslam.laser.laser_slam import LoopOutcome, Solved
 from jaxslam.results.plot.style import (
     COLORS,
     FAINT,

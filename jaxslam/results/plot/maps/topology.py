@@ -6,10 +6,10 @@ from matplotlib.figure import Figure
 from matplotlib.patches import Patch
 from numpy.typing import ArrayLike
 
+from jaxslam.laser.topology import Route, TopologicalMap
+from jaxslam.laser.topology.places import cell_centers
 from jaxslam.results.plot.maps.grids import world_of
 from jaxslam.results.plot.style import COLORS, INK, PAGE, Look, caption, every_handle, panels_of
-from jaxslam.topology import Route, TopologicalMap
-from jaxslam.topology.places import cell_centers
 
 _PALE = ("#cfe3f1", "#f8dcc8", "#cdebdf", "#f2dde9", "#f9e6c0", "#d9edf8", "#e3dccb", "#dcdcdc")
 

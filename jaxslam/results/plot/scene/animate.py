@@ -7,16 +7,16 @@ import numpy as np
 from jax.typing import DTypeLike
 from numpy.typing import ArrayLike
 
-from jaxslam.monte_carlo.candidates import method_of, rounded
-from jaxslam.protocols import Candidate, Filter
+from jaxslam.consistency.campaign.candidates import method_of, rounded
+from jaxslam.core.protocols import Candidate, Filter
+from jaxslam.core.types import Log, Trace, Truth
+from jaxslam.core.validation import check_record
 from jaxslam.results.plot.scene.film import Film
 from jaxslam.results.plot.scene.history import MOST, history_of
 from jaxslam.results.plot.scene.probe import probe
 from jaxslam.results.plot.scene.run_scene import run_scene
 from jaxslam.run import run
 from jaxslam.simulation.worlds import World, run_keys, with_positions, world_of_run
-from jaxslam.types import Log, Trace, Truth
-from jaxslam.validation import check_record
 
 
 def animate(

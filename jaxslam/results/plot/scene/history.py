@@ -7,9 +7,9 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from jaxslam.core.numbers import check_count
+from jaxslam.core.types import Estimate, Log, Status, Trace
+from jaxslam.core.validation import check_record
 from jaxslam.results.plot.scene.probe import Cloud, Hypotheses, Links
-from jaxslam.types import Estimate, Log, Status, Trace
-from jaxslam.validation import check_record
 
 MOST = 100
 """default of the largest number of frames"""

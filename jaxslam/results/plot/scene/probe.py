@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, PyTree
 
+from jaxslam.core.types import Estimate
 from jaxslam.filters.delayed.state import DelayedState, covariance_blocks
 from jaxslam.filters.information.eif_slam import CanonicalState
 from jaxslam.filters.information.marginals import local_information
@@ -15,7 +16,6 @@ from jaxslam.filters.particles.slam_particles import SlamParticles
 from jaxslam.results.plot.scene.film import Layer
 from jaxslam.results.plot.scene.layers import cloud, lines_between, marks, rings, weighted_segments
 from jaxslam.results.plot.style import COLORS, INK, Look
-from jaxslam.types import Estimate
 
 _ROBOT_LINK, _LINK = COLORS[5], COLORS[3]
 

@@ -1,0 +1,8 @@
+"""Monte-Carlo campaigns: many filters on identical draws, over blocks, devices and hosts."""
+
+from jaxslam.consistency.campaign.harness import monte_carlo
+from jaxslam.consistency.campaign.kept import Keep
+from jaxslam.consistency.campaign.pieces import missing
+from jaxslam.consistency.campaign.record import Campaign, Interrupted
+
+__all__ = ["Campaign", "Interrupted", "Keep", "missing", "monte_carlo"]

@@ -1,0 +1,232 @@
+"""The campaign: blocks of runs over devices, kept as they finish, then summed up.
+
+A run is a number: its key and its place in a block. For one size of blocks and one number of
+devices its world and its filters' results are the same to the bit, whatever workers and parts there
+are and whatever was interrupted; otherwise to rounding. Only scores are kept of a block, so
+memory is that of the blocks in flight however many runs there are.
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Literal
+
+import jax
+import numpy as np
+from jax.typing import DTypeLike
+
+from jaxslam.consistency import Summary, Tally, summarize
+from jaxslam.consistency.campaign.block import BOUND, CampaignPlan
+from jaxslam.consistency.campaign.candidates import (
+    check_dtype,
+    check_fits,
+    check_noise,
+    fitting_block,
+    without_noise,
+)
+from jaxslam.consistency.campaign.identity import identity
+from jaxslam.consistency.campaign.kept import Keep, add_kept
+from jaxslam.consistency.campaign.pieces import check_part, cores, in_part, missing
+from jaxslam.consistency.campaign.record import Campaign, Interrupted
+from jaxslam.consistency.campaign.work import Work, shown_progress
+from jaxslam.core.numbers import check_count, check_key
+from jaxslam.core.protocols import Candidate
+from jaxslam.core.validation import check_record
+from jaxslam.simulation.worlds import World, with_positions
+
+
+def monte_carlo(
+    scenario: World,
+    filters: Mapping[str, Candidate],
+    runs: int,
+    key: jax.Array,
+    *,
+    block: int | None = None,
+    devices: Sequence[jax.Device] | None = None,
+    workers: int | None = None,
+    bound: bool = False,
+    dtype: DTypeLike | None = None,
+    keep: Keep | None = None,
+    part: tuple[int, int] | None = None,
+    progress: Callable[[int, int], None] | Literal[False] | None = None,
+) -> Campaign:
+    """Run every filter over the same `runs` worlds of a scenario and sum up its consistency.
+
+    Args:
+        scenario: what to draw; see `scenarios`.
+        filters: by name. A function instead of a filter is called with each run's `Truth`.
+        runs: how many worlds; run i has key fold_in(key, i).
+        key: a PRNG key.
+        block: runs vmapped together on a device, which sets memory; default 16 on a CPU, and
+            by its memory on an accelerator. Where memory does not suffice, half of it is tried,
+            with a warning.
+        devices: default all of `jax.local_devices()`.
+        workers: blocks in flight at once; default as many as keep every core of a CPU busy (1 on an
+            accelerator).
+        bound: also take the conditional Cramér-Rao bound of every run (`conditional_bound`), at
+            the price of one more EKF.
+        dtype: float32 or float64, of the worlds and so of the filters. With `jax_enable_x64` worlds
+            are drawn in float64 and then rounded: both see the same. Default what JAX is set to.
+        keep: blocks are saved there as they finish, and those found there are not run again. It
+            holds one campaign: what must agree (key, scenario, models, filters, precision,
+            versions) is its `identity`. More runs than it has extend it.
+        part: (i, n) with 1 <= i <= n: only the blocks i - 1, i - 1 + n, … are computed, and the
+            campaign returned is of them. So n jobs that know nothing of each other compute a
+            campaign, each with a `keep` from `store.join` on one folder, with the same block and
+            number of devices; without `part` the blocks are summed up, and those that are missing
+            computed.
+        progress: called with (runs done, runs) after each block. Default a bar with
+            rate and remaining time, on a terminal and in a notebook alone; False: none.
+    Returns:
+        Campaign.
+    Raises:
+        ValueError: on runs, block or workers below 1, more runs than are recorded, no PRNG key, no
+            devices, no filters, a filter that does not fit the scenario, or a noise that is no
+            covariance, before anything is traced; where `keep` holds another campaign, by every
+            difference, or runs beyond those asked for; on a part without a block.
+        MemoryError: if one run a device is too much.
+        Interrupted: on Ctrl-C, with the campaign so far.
+    """
+    _check(scenario, filters, runs, key, block, workers, devices, keep, part, progress)
+    began, runs = time.perf_counter(), int(runs)
+    devices = jax.local_devices() if devices is None else list(devices)
+    dtype = check_dtype(dtype)
+    if workers is None:
+        workers = -(-cores() // len(devices)) if devices[0].platform == "cpu" else 1
+    names = (*filters, BOUND)
+    tallies = {name: Tally() for name in names}
+    size = int(block or fitting_block(scenario, filters, devices[0]))
+    plan = CampaignPlan(scenario, filters, key, devices, size, bound, dtype)
+    if part is not None and (part[0] - 1) * plan.wide >= runs:
+        raise ValueError(
+            f"monte_carlo: part: expected one of the {-(-runs // plan.wide)} blocks of {plan.wide} "
+            f"runs that {runs} runs are, got part {part[0]} of {part[1]}"
+        )
+    done: list[tuple[int, int]] = []
+    if keep is not None:
+        keep.claim(identity(scenario, filters, key, devices[0].platform, bound, dtype))
+        done = add_kept(tallies, keep, runs, lambda first: in_part(first, plan.wide, part))
+    pieces = missing(done, runs, plan.wide)
+    todo = [piece for piece in pieces if in_part(piece[0], plan.wide, part)]
+    work = Work(workers, keep, progress or None, {name: Tally() for name in names})
+    try:
+        with shown_progress(work, plan, progress is None):
+            work.in_blocks_that_fit(plan, todo)
+        interrupted = False
+    except KeyboardInterrupt:
+        interrupted = True
+    for name, tally in work.own.items():
+        tallies[name].merge(tally)
+    campaign = None
+    if tallies[BOUND].pieces():
+        campaign = _summed_up(plan, tallies, work, time.perf_counter() - began)
+    if interrupted or campaign is None:
+        raise Interrupted(campaign, runs)
+    return campaign
+
+
+def _check(
+    scenario: World,
+    filters: Mapping[str, Candidate],
+    runs: int,
+    key: jax.Array,
+    block: int | None,
+    workers: int | None,
+    devices: Sequence[jax.Device] | None,
+    keep: Keep | None,
+    part: object,
+    progress: object,
+) -> None:
+    """Raise ValueError on arguments that `monte_carlo` does not take."""
+    for name, value in (("runs", runs), ("block", block), ("workers", workers)):
+        if value is not None:
+            check_count(f"monte_carlo: {name}", value)
+    if part is not None:
+        check_part("monte_carlo: part", part)
+    check_record("monte_carlo", "scenario", scenario, World)
+    if (most := scenario.recorded_runs) is not None and runs > most:
+        raise ValueError(
+            f"monte_carlo: runs: expected at most {most}, the recorded runs of {scenario.name}, "
+            f"got {runs}"
+        )
+    check_key("monte_carlo", key)
+    if not isinstance(filters, Mapping) or not filters:
+        raise ValueError("monte_carlo: expected filters as {name: filter}, at least one")
+    for name, candidate in filters.items():
+        check_fits(name, candidate, scenario)
+    check_noise(scenario)
+    if devices is not None and not isinstance(devices, Sequence):
+        raise ValueError(
+            f"monte_carlo: expected devices as from jax.local_devices(), got {devices!r}"
+        )
+    if devices is not None and not devices:
+        raise ValueError("monte_carlo: expected at least one device, got none")
+    if keep is not None and not all(
+        callable(getattr(keep, name, None)) for name in ("claim", "save", "blocks")
+    ):
+        raise ValueError(
+            "monte_carlo: expected keep as from jaxslam.store.create(folder) or .resume(folder), "
+            f"got {keep!r}"
+        )
+    if not (progress is None or progress is False or callable(progress)):
+        raise ValueError(
+            "monte_carlo: expected progress as a function of (runs done, runs), or False for none, "
+            f"got {progress!r}"
+        )
+
+
+def summaries_of(tallies: dict[str, Tally]) -> tuple[int, np.ndarray, dict[str, Summary]]:
+    """How many runs there are, the divergence limit, and the summary of each filter."""
+    done = sum(count for _, count in tallies[BOUND].pieces())
+    bound = {name: total / done for name, total in tallies[BOUND].sums.items()} or None
+    found = {name: summarize(one, bound) for name, one in tallies.items() if name != BOUND}
+    return done, tallies[BOUND].first("limit"), found
+
+
+def _summed_up(
+    plan: CampaignPlan, tallies: dict[str, Tally], work: Work, seconds: float
+) -> Campaign:
+    """The campaign of the runs in the tallies."""
+    scenario = plan.scenario
+    done, limit, summaries = summaries_of(tallies)
+    steps = max(scenario.steps, 1)
+    return Campaign(
+        scenario=scenario.name,
+        source=scenario.source,
+        published={name: dict(told) for name, told in scenario.published.items()},
+        steps=scenario.steps,
+        runs=done,
+        dtype=str(limit.dtype),
+        divergence_limit=float(limit),
+        filters=_qualified(summaries, scenario),
+        seconds=seconds,
+        compile_seconds=work.compile_seconds,
+        step_seconds={name: seconds / steps for name, seconds in work.run_seconds.items()},
+        first={
+            name: (jax.device_get(with_positions(scenario.sensor, truth)), estimate)
+            for name, (truth, estimate) in work.first.items()
+        },
+        run_numbers=tallies[BOUND].numbers(),
+    )
+
+
+def _qualified(found: dict[str, Summary], scenario: World) -> dict[str, Summary]:
+    """The summaries, with a doubt on those that an exact sensor left without a covariance."""
+    dropped = {name: one.counts.get("singular", 0) for name, one in found.items()}
+    exact = without_noise(scenario) if any(dropped.values()) else ""
+    if not exact:
+        return found
+    return {
+        name: replace(
+            one,
+            doubts=(
+                *one.doubts,
+                f"the sensor has {exact} without noise, so innovation covariances were singular: "
+                f"{dropped[name]:,} measurements were dropped and others weighted by rounding "
+                "errors; give the sensor a small noise",
+            ),
+        )
+        if dropped[name]
+        else one
+        for name, one in found.items()
+    }

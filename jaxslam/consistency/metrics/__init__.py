@@ -1,0 +1,52 @@
+"""Errors of paths and maps against a reference, one set of measures for every data set and
+estimator: absolute and relative errors of a path, errors of relations, alignment, map entropy and
+correlation. On the host, by NumPy in float64.
+"""
+
+from jaxslam.consistency.metrics.paths import (
+    PathErrors,
+    align_map,
+    alignment,
+    ate,
+    carried,
+    map_entropy,
+)
+from jaxslam.consistency.metrics.relative import (
+    Errors,
+    MeanAndStd,
+    Relations,
+    Statistics,
+    benchmark_figures,
+    given,
+    joined,
+    relation_errors,
+    relations,
+    revisits,
+    rpe,
+    statistics,
+    summary,
+)
+from jaxslam.laser.grids import correlation
+
+__all__ = [
+    "Errors",
+    "MeanAndStd",
+    "PathErrors",
+    "Relations",
+    "Statistics",
+    "align_map",
+    "alignment",
+    "ate",
+    "benchmark_figures",
+    "carried",
+    "correlation",
+    "given",
+    "joined",
+    "map_entropy",
+    "relation_errors",
+    "relations",
+    "revisits",
+    "rpe",
+    "statistics",
+    "summary",
+]

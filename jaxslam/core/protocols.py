@@ -1,0 +1,571 @@
+"""The records of pure functions that make up a SLAM method.
+
+Every method, and field that is a function, is pure and traceable and acts on *one* pose, landmark
+or scan; the caller vmaps. The numbers of a motion model or a sensor are the leaves of a record.
+
+Shapes: pose (3,); u (U,) control; w (W,) process noise; z (Z,) measurement; l (L,) landmark
+parameters; s (K,) landmark parameters that z does not determine (K = 0 if none).
+"""
+
+import inspect
+import re
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass
+from typing import Any, ClassVar, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int, PyTree
+
+from jaxslam.core.noise import hold_noise
+from jaxslam.core.numbers import check_mount, held_array
+from jaxslam.core.record import record, set_field
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Estimate, Info, JaxOrNumPy, Log, Scan, Trace
+from jaxslam.math import se2
+from jaxslam.math.angles import wrap
+from jaxslam.math.arrays import (
+    Control,
+    Landmark,
+    Measurement,
+    Point,
+    Pose,
+    ProcessNoise,
+    Unmeasured,
+)
+
+Array = jax.Array
+
+
+def unfit_signature(function: Callable[..., object], count: int) -> str | None:
+    """The parameters of a function that does not take `count` arguments; None of one that does."""
+    try:
+        signature = inspect.signature(function)
+    except (TypeError, ValueError):  # a builtin has none
+        return None
+    try:
+        signature.bind(*[None] * count)
+    except TypeError:
+        return f"({', '.join(signature.parameters)})"
+    return None
+
+
+def _lower(cls: type) -> str:
+    """The name of a class in lower case, words divided by underscores."""
+    return re.sub(r"(?<=[a-z0-9])(?=[A-Z])", "_", cls.__name__).lower()
+
+
+class Component:
+    """What models, rules and filters share: a name, and a check of what a subclass defines."""
+
+    name: str
+    """lower case, for tables, files and messages; by default that of the class"""
+    __dataclass_fields__: ClassVar[dict[str, Any]]
+
+    def __init_subclass__(cls) -> None:
+        super().__init_subclass__()
+        if "name" not in cls.__dict__ and not isinstance(getattr(cls, "name", None), property):
+            cls.name = _lower(cls)
+
+    def __init__(self, *_: object, **__: object) -> None:  # a record has its own
+        raise ValueError(f"{type(self).__name__}: expected @record above the class, of core.record")
+
+    def _check(self, base: type, methods: Mapping[str, str]) -> None:
+        """Check that a subclass of `base` is a record and defines methods of these parameters.
+
+        methods: the parameters of each by its name, "" where `verify` reports other ones.
+        """
+        what = type(self).__name__
+        if "__dataclass_fields__" not in type(self).__dict__:
+            Component.__init__(self)
+        for name, taken in methods.items():
+            if getattr(type(self), name) is getattr(base, name):
+                raise ValueError(f"{what}: expected a method {name}")
+            got = unfit_signature(getattr(self, name), taken.count(",") + 1) if taken else None
+            if got is not None:
+                raise ValueError(f"{what}: expected {name} to take ({taken}), got {got}")
+
+    def _check_names(self, *fields: str) -> None:
+        """Check that these are tuples of names."""
+        for name in fields:
+            value = getattr(self, name, None)
+            if not isinstance(value, tuple) or not all(isinstance(one, str) for one in value):
+                raise ValueError(
+                    f'{type(self).__name__}: expected {name} to be a tuple of names as ("x [m]",), '
+                    f"got {value!r}"
+                )
+
+
+class Model(Component):
+    """What motion models and sensors share: noise."""
+
+    def _check_model(self, base: type, methods: tuple[str, ...], names: tuple[str, ...]) -> None:
+        """Check a subclass of `base`, and make its noise_cov what can be called; the last of the
+        names is of what has noise."""
+        self._check(base, dict.fromkeys(methods, ""))
+        self._check_names(*names)
+        if not hasattr(self, "noise_cov"):
+            raise ValueError(f"{type(self).__name__}: expected a field or a method noise_cov")
+        if "noise_cov" in self.__dict__:
+            hold_noise(self, len(getattr(self, names[-1])))
+
+
+class Motion(Model):
+    """A motion model, one class for simulator and filters; w = 0 is the nominal motion.
+
+    A subclass is a record (`core.record`) that declares controls and noises, has a field noise_cov,
+    or a method of that name, and defines `step`. Raises ValueError, at construction, on a
+    covariance that is none, names that are no tuple of strings, or a missing method.
+    """
+
+    controls: tuple[str, ...]
+    """What u holds, with units; its length is U."""
+    noises: tuple[str, ...]
+    """What w holds, with units; its length is W."""
+    noise_cov: Any
+    """(pose, u) -> (W, W). Given as a covariance, a record with `__call__`, or a function."""
+    perturb: Any = None
+    """(u, w) -> u with step(pose, u, w) = step(pose, perturb(u, w), 0), where noise is of that
+    kind; needed by worlds that add noise to the odometry instead of the robot's motion."""
+    jacobians: Any = None
+    """(pose, u, w) -> by pose (3, 3), by u (3, U), by w (3, W); hand-derived, to verify against."""
+
+    def __post_init__(self) -> None:
+        self._check_model(Motion, ("step",), ("controls", "noises"))
+
+    def step(self, pose: Pose, u: Control, w: ProcessNoise) -> Pose:
+        """The pose after a control, θ wrapped."""
+        raise NotImplementedError
+
+
+class Free(NamedTuple):
+    """The Gaussian prior of the unmeasured landmark parameters (Solà 39)."""
+
+    mean: Float[JaxOrNumPy, "K"]
+    cov: Float[JaxOrNumPy, "K K"]
+
+
+NOTHING_FREE = Free(np.zeros(0), np.zeros((0, 0)))
+"""of a measurement that determines its landmark"""
+
+
+class Reduced(NamedTuple):
+    """A permanent reduction of a landmark's L parameters to its position (x, y)."""
+
+    sensor: PyTree
+    """a Sensor with the same z, whose landmarks are points"""
+    ready: Callable[[Array, Array, Array], Array]
+    """(pose, l, cov (L, L)) -> () bool"""
+
+
+class Sensor(Model):
+    """A measurement model of one landmark, or with L = 0 of the robot itself (an absolute sensor).
+
+    A subclass is a record (`core.record`) that declares measurements, has a field noise_cov, or a
+    method of that name, and defines `observe` and `invert`; the rest has a default. It may have a
+    field `mount`, and then observes from `frame(pose)`. Raises ValueError, at construction, on a
+    covariance or a mount that is none, names that are no tuple of strings, or a missing method.
+
+    An absolute sensor (a compass, a satellite receiver) has no landmark: l is (0,), invert and
+    embed return (0,), position unused zeros, and K = 0. Each of its measurements
+    corrects the robot, whatever the tag.
+    """
+
+    measurements: tuple[str, ...]
+    """What z holds, with units; its length is Z."""
+    landmark: tuple[str, ...] = ("x [m]", "y [m]")
+    """What l holds, with units; its length is L, 0 for an absolute sensor."""
+    noise_cov: Any
+    """(z) -> (Z, Z). Given as a covariance, a record with `__call__`, or a function."""
+    mount: Any = None
+    """(3,) pose of the sensor on the robot, Solà's S; None where it is the robot's."""
+    free: Free = NOTHING_FREE
+    """the prior of s. Default that of a full measurement."""
+    carry: Any = None
+    """(frame (3,), l) -> l of a landmark given in a frame, in the coordinates that the frame's pose
+    is in. Default, of a landmark whose first two numbers are a place (x, y): the place moves,
+    entries in [rad] turn, and the others stay."""
+    observe_jacobians: Any = None
+    """(pose, l) -> by pose (Z, 3), by l (Z, L); hand-derived, to verify against."""
+    invert_jacobians: Any = None
+    """(pose, z, s) -> by pose (L, 3), by z (L, Z), by s (L, K); hand-derived."""
+    reduced: Reduced | None = None
+    """the points that landmarks may turn into; None where they never do"""
+
+    def __post_init__(self) -> None:
+        self._check_model(Sensor, ("observe", "invert"), ("landmark", "measurements"))
+        free = self.__dict__.get("free", type(self).free)
+        if not isinstance(free, Free | property):
+            what = f"{type(self).__name__}: expected free to be a Free(mean, cov)"
+            raise ValueError(f"{what}, got {type(free).__name__}")
+        if self.mount is not None and "mount" in self.__dict__:
+            check_mount(type(self).__name__, self.mount)
+            set_field(self, "mount", held_array(self.mount))
+
+    def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
+        """The measurement z of a landmark."""
+        raise NotImplementedError
+
+    def invert(self, pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
+        """The landmark with observe(pose, invert(pose, z, s)) = z; a range is not negative."""
+        raise NotImplementedError
+
+    def residual(self, z: Measurement, z_hat: Measurement) -> Measurement:
+        """z ⊖ z_hat, entries in [rad] wrapped; residual(z, 0) is z with its angles wrapped."""
+        turns = np.array([name.endswith("[rad]") for name in self.measurements])
+        return jnp.where(turns, wrap(z - z_hat), z - z_hat)
+
+    def position(self, landmark: Landmark) -> Point:
+        """(2,) position of a landmark. By default its first two numbers."""
+        return landmark[:2]
+
+    def embed(self, pose: Pose, point: Point) -> Landmark:
+        """The landmark at a point, measured first from pose. By default zeros beside the point."""
+        rest = max(len(self.landmark) - 2, 0)
+        return jnp.concatenate([point, jnp.zeros(rest, point.dtype)]) if rest else point
+
+    def frame(self, pose: Pose) -> Pose:
+        """The pose of the sensor, pose ∘ mount."""
+        return pose if self.mount is None else se2.compose(pose, self._mount(pose))
+
+    def frame_jacobian(self, pose: Pose) -> Float[Array, "3 3"]:
+        """The derivative of `frame` by the pose."""
+        if self.mount is None:
+            return jnp.eye(3, dtype=pose.dtype)
+        return se2.compose_jacobians(pose, self._mount(pose))[0]
+
+    def _mount(self, pose: Pose) -> Pose:
+        return jnp.asarray(self.mount, pose.dtype)
+
+    @property
+    def of_points(self) -> bool:
+        """Whether a landmark is a point (x, y), as some methods need."""
+        return len(self.landmark) == 2 and self.carry is None
+
+    def carried(self, frame: Pose, landmark: Landmark) -> Landmark:
+        """A landmark given in a frame, in the coordinates that the frame's pose is in."""
+        if self.carry is not None:
+            carried: Array = self.carry(frame, landmark)
+            return carried
+        if len(self.landmark) < 2:
+            return landmark
+        turns = np.array([name.endswith("[rad]") for name in self.landmark[2:]], bool)
+        rest = jnp.where(turns, wrap(landmark[2:] + frame[2]), landmark[2:])
+        return jnp.concatenate([se2.from_frame(frame, landmark[:2]), rest])
+
+
+class Basis(NamedTuple):
+    """The derivative of a chart's `retract` at zero, block lower triangular."""
+
+    pose: Float[Array, "3 3"]
+    """∂pose/∂dx."""
+    cross: Float[Array, "L 3"]
+    """∂l/∂dx."""
+    landmark: Array | None
+    """(L, L) ∂l/∂dl; None says identity, without products."""
+
+
+class Chart(Component):
+    """Error coordinates of the covariance, on a pair of the pose and one landmark.
+
+    A subclass is a record (`core.record`) that defines `retract` and `local`. The pose's retraction
+    must not depend on a landmark, nor one landmark's on another.
+    """
+
+    basis: Any = None
+    """(pose, l) -> the derivative of retract at zero; None says identity, without products."""
+    landmark_size: int | None = None
+    """numbers L of the landmarks it acts on; None where any."""
+
+    def __post_init__(self) -> None:
+        self._check(Chart, {"retract": "pose, l, dx, dl", "local": "pose0, l0, pose, l"})
+
+    def retract(
+        self, pose: Pose, landmark: Landmark, dx: Pose, dl: Landmark
+    ) -> tuple[Pose, Landmark]:
+        """Pose and landmark moved by errors dx (3,) and dl (L,)."""
+        raise NotImplementedError
+
+    def local(
+        self, pose0: Pose, landmark0: Landmark, pose: Pose, landmark: Landmark
+    ) -> tuple[Pose, Landmark]:
+        """The errors (dx, dl) with retract(pose0, l0, dx, dl) = (pose, l)."""
+        raise NotImplementedError
+
+
+class Here(NamedTuple):
+    """The state at which a model is linearized, the input of a linearizer."""
+
+    joint: Joint
+    """the filter's state, `joint.lin` being the linearizer's own memory"""
+    chart: Chart
+    pose: Float[Array, "3"]
+    """estimate of the robot"""
+    cov: Array
+    """P in the chart: of the robot (3, 3), or for `observe` of robot and landmark (3+L, 3+L)"""
+    slot: PyTree = None
+    """() of the landmark, for `observe`"""
+    landmark: PyTree = None
+    """(L,) its estimate, for `observe`"""
+
+
+class Linearizer(Component):
+    """An affine approximation, with added noise, of the models near a Gaussian.
+
+    A subclass is a record (`core.record`) that defines `motion`, `observe` and `invert`.
+    First-order linearizers evaluate Jacobians at a point; statistical ones fit over the covariance.
+    Each may keep a memory inside the filter's state, `joint.lin`. Derivatives are by the
+    *coordinates* of pose and landmark, whatever the chart.
+    """
+
+    euclidean: bool = False
+    """whether it is meant for the Euclidean chart and landmarks that are points (x, y) alone."""
+    iterates: bool = True
+    """whether a correction may linearize again at its result; a fit to a covariance may not."""
+    own_landmarks: bool = False
+    """whether it linearizes at landmarks other than the estimates; not for known maps then."""
+
+    def __post_init__(self) -> None:
+        self._check(
+            Linearizer,
+            {"motion": "motion, u, here", "observe": "sensor, here", "invert": "s, z, tag, here"},
+        )
+
+    def init(self, pose: Pose, landmarks: Float[Array, "N L"]) -> PyTree:
+        """The first memory, of a start with landmarks (N, L) zeros: arrays of fixed shape."""
+        return ()
+
+    def motion(self, motion: Motion, u: Control, here: Here) -> tuple[Array, Array, Array, PyTree]:
+        """The new pose, its derivative by the old one (3, 3), the covariance that the noise adds to
+        it (3, 3), and the memory."""
+        raise NotImplementedError
+
+    def observe(self, sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
+        """The predicted z, its derivatives by pose (Z, 3) and by l (Z, L), and a covariance (Z, Z)
+        to add to that of the measurement noise."""
+        raise NotImplementedError
+
+    def invert(
+        self, sensor: Sensor, z: Measurement, tag: Int[Array, ""], here: Here
+    ) -> tuple[Array, Array, Array]:
+        """The new l, its derivative by the pose (L, 3), its covariance for a known pose (L, L)."""
+        raise NotImplementedError
+
+    def born(self, joint: Joint, born: Bool[Array, "N"]) -> PyTree:
+        """The memory after the landmarks of the slots `born` entered the map."""
+        return joint.lin
+
+
+class Pairs(NamedTuple):
+    """The innovations of all pairs of M measurements and N slots."""
+
+    innovation: Float[Array, "M N Z"]
+    """ν_ij = z_i ⊖ ẑ_j."""
+    cov: Float[Array, "M N Z Z"]
+    """S_ij = H_j P H_jᵀ + R_i."""
+    distance: Float[Array, "M N"]
+    """ν_ijᵀ S_ij⁻¹ ν_ij."""
+    log_det: Float[Array, "M N"]
+    """log |S_ij|."""
+    possible: Bool[Array, "M N"]
+    """measurement and landmark are there, and S_ij is positive definite."""
+
+
+@dataclass(frozen=True, eq=False)
+class Prediction:
+    """The input of association: predicted measurements of the map before the scan's corrections.
+
+    The functions compute what they return when they are called, within the trace.
+    """
+
+    tag: Int[Array, "N"]
+    """tags of the slots, -1 where dead."""
+    alive: Bool[Array, "N"]
+    pairs: Callable[[Scan], Pairs]
+    """(scan) -> every measurement against every slot."""
+    cross: Callable[[], Array]
+    """() -> (N, Z, N, Z): H_i P H_jᵀ, the cross-covariances of predicted measurements."""
+
+
+class Association(NamedTuple):
+    """The landmark slot of each measurement of a scan."""
+
+    slot: Int[Array, "M"]
+    """-1 where none; no slot twice."""
+    is_new: Bool[Array, "M"]
+    """starts a landmark. A valid measurement that is neither is ignored, and counted."""
+    exhausted: Array | bool = False
+    """() bool: a search ended at its budget, with the best it had found."""
+
+
+Associate = Callable[[Prediction, Scan], Association]
+"""Association methods, records with `__call__` or functions. They are not differentiated: what they
+return are integers."""
+
+
+Resample = Callable[[Array, Array], Array]
+"""(log-weights (P,) of any scale, key) -> the ancestor (P,) int of each of the P particles that go
+on; the expected number of copies of j is P w_j. Not differentiated."""
+
+Differentiable = Callable[[Array, Array], tuple[Array, Array]]
+"""As `Resample`, with the log-weight (P,) of each as well, Σ exp = 1, through which gradients reach
+the weights before. Do not normalize it again: the gradient of its sum may be part of the method."""
+
+
+class Life(Component):
+    """A rule that decides after each scan which landmarks stay in the map, an argument of filters.
+
+    A subclass is a record (`core.record`) that defines `init` and `after`.
+    """
+
+    make_room: Any = None
+    """(joint, needed () int, measured (N,) bool) -> slots (N,) bool to remove before new landmarks
+    enter a map that lacks so many slots, none of those this scan measured; None if nothing is
+    removed from a full map."""
+
+    def __post_init__(self) -> None:
+        self._check(Life, {"init": "pose, landmarks", "after": "joint, info, estimate"})
+
+    def init(self, pose: Pose, landmarks: Float[Array, "N L"]) -> PyTree:
+        """The first memory, of a start with landmarks (N, L) zeros: arrays of fixed shape."""
+        raise NotImplementedError
+
+    def after(
+        self, joint: Joint, info: Info, estimate: Callable[[], Estimate]
+    ) -> tuple[PyTree, Bool[Array, "N"]]:
+        """The memory after a scan, and the slots to remove.
+
+        joint.life is the memory so far, estimate() the moments in map coordinates.
+        """
+        raise NotImplementedError
+
+
+class Filter(Component):
+    """A recursive estimator, as `run` and `monte_carlo` take it.
+
+    A subclass is a record (`core.record`) that defines `init`, `predict`, `update` and `estimate`,
+    whose state is a pytree of arrays of fixed shapes, and has a field motion and a field sensor, or
+    declares controls and measurements.
+
+    Raises ValueError, at construction, on a missing method, or one of other arguments.
+    """
+
+    chart: Chart
+    """the error coordinates of its covariance"""
+    square_root: bool = False
+    """whether its state is a `slots.Joint` with a root of the covariance."""
+    landmark: tuple[str, ...] = ()
+    """what a landmark of its `slots.Joint` holds, with units, as `Sensor.landmark`; () where its
+    state is none."""
+    linearized: Any = None
+    """the `LinearizedSteps` of a filter whose steps return the linear system they use."""
+
+    def __post_init__(self) -> None:
+        self._check(
+            Filter,
+            {
+                "init": "pose, pose_cov",
+                "predict": "state, u, key",
+                "update": "state, scan, key",
+                "estimate": "state",
+            },
+        )
+        self._check_names("controls", "measurements")
+
+    @property
+    def controls(self) -> tuple[str, ...]:
+        """What u holds, with units."""
+        motion: Motion = self.motion  # type: ignore[attr-defined]
+        return motion.controls
+
+    @property
+    def measurements(self) -> tuple[str, ...]:
+        """What z holds, with units."""
+        sensor: Sensor = self.sensor  # type: ignore[attr-defined]
+        return sensor.measurements
+
+    @property
+    def places(self) -> tuple[int, ...]:
+        """The measurement slots of each sensor of a suite, in order; () of a single sensor."""
+        return getattr(getattr(self, "sensor", None), "places", ())
+
+    def init(self, pose: Pose, pose_cov: Float[Array, "3 3"]) -> PyTree:
+        """The state at the start."""
+        raise NotImplementedError
+
+    def predict(self, state: PyTree, u: Control, key: Array) -> PyTree:
+        """The state after a control."""
+        raise NotImplementedError
+
+    def update(self, state: PyTree, scan: Scan, key: Array) -> tuple[PyTree, Info]:
+        """The state after a scan, and what became of its measurements."""
+        raise NotImplementedError
+
+    def estimate(self, state: PyTree) -> Estimate:
+        """The moments of a state in map coordinates."""
+        raise NotImplementedError
+
+
+@record
+class Wrapper(Filter):
+    """A filter that holds another, and does as that one does unless it defines a method itself."""
+
+    filter: Filter
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.filter, Filter):
+            made = isinstance(self.filter, type)
+            got = (
+                f"the class {self.filter.__name__}: call it" if made else type(self.filter).__name__
+            )
+            raise ValueError(f"{type(self).__name__}: expected a filter, got {got}")
+        super().__post_init__()
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        return f"{_lower(type(self))} {self.filter.name}"
+
+    @property
+    def controls(self) -> tuple[str, ...]:
+        return self.filter.controls
+
+    @property
+    def measurements(self) -> tuple[str, ...]:
+        return self.filter.measurements
+
+    @property
+    def places(self) -> tuple[int, ...]:
+        return self.filter.places
+
+    @property
+    def chart(self) -> Chart:  # type: ignore[override]
+        return self.filter.chart
+
+    @property
+    def square_root(self) -> bool:  # type: ignore[override]
+        return self.filter.square_root
+
+    @property
+    def landmark(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self.filter.landmark
+
+    def init(self, pose: Pose, pose_cov: Float[Array, "3 3"]) -> PyTree:
+        return self.filter.init(pose, pose_cov)
+
+    def predict(self, state: PyTree, u: Control, key: Array) -> PyTree:
+        return self.filter.predict(state, u, key)
+
+    def update(self, state: PyTree, scan: Scan, key: Array) -> tuple[PyTree, Info]:
+        return self.filter.update(state, scan, key)
+
+    def estimate(self, state: PyTree) -> Estimate:
+        return self.filter.estimate(state)
+
+
+Estimator = Callable[[Log, Array], Trace]
+"""(log, key) -> trace: `partial(run, filter, …)`, or a batch method."""
+
+Candidate = Filter | Callable[..., Any]
+"""An entry of a campaign: a filter, a smoother, or a function of the run's truth that returns a
+filter or an estimator."""

@@ -1,0 +1,283 @@
+"""The records exchanged by simulators, filters and campaigns, with their shapes.
+
+All are NamedTuples, hence pytrees; leading axes are added by `vmap` (runs) and `scan` (time).
+T steps, M measurement slots a step, N landmark slots, Z measurement size, L landmark size.
+Masks and status codes, never NaN, mark absent data.
+"""
+
+from collections.abc import Sequence
+from enum import IntEnum
+from typing import NamedTuple, TypeAlias
+
+import jax
+import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float, Int, PyTree
+from numpy.typing import ArrayLike
+
+from jaxslam.core.logs import streams, tables
+
+JaxOrNumPy: TypeAlias = Array | np.ndarray
+"""The array of a record that is made in either: a compiled function takes both, and an operation
+of NumPy compiles nothing."""
+
+
+class Status(IntEnum):
+    """The outcome of a measurement; `Info.status` holds one a measurement slot.
+
+    `filters.reporting.status_of` has the decision table.
+    """
+
+    EMPTY = 0
+    """No measurement there (padding)."""
+    FUSED = 1
+    """Corrected the map."""
+    BORN = 2
+    """Started a new landmark."""
+    REJECTED = 3
+    """Failed the gate, or not finite; dropped."""
+    OVERFLOW = 4
+    """A new landmark, but the map is full; dropped."""
+    DEFERRED = 5
+    """A new landmark beyond `births`, the limit of new landmarks a scan; dropped in this scan."""
+    REPEATED = 6
+    """Its new tag occurs earlier in the same scan; dropped."""
+    SINGULAR = 7
+    """Its innovation covariance is not positive definite, so that it cannot be gated; dropped."""
+    UNMATCHED = 8
+    """Association found it neither of a landmark nor new (between two gates, ambiguous, or of
+    unknown identity where a tag is required), a robot it concerns has no pose in the map yet, or it
+    is a beam that entered no weight (`grids.GridLocalization`); dropped."""
+    SIGHTED = 9
+    """Of no landmark yet; kept as a stored measurement (`filters.DelayedSlam`)."""
+
+
+class Scan(NamedTuple):
+    """The measurements of one step, padded to M slots."""
+
+    z: Float[Array, "M Z"]
+    """measurements; any finite number where not valid."""
+    tag: Int[Array, "M"]
+    """landmark identity, -1 = unknown."""
+    valid: Bool[Array, "M"]
+
+
+class Log(NamedTuple):
+    """The data of a robot. Row t: the control that led *to* pose t, and the scan taken there."""
+
+    control: Float[Array, "T U"]
+    """the interval Δt, where a model needs one, is part of it."""
+    scan: Scan
+    """with leading T."""
+
+    @classmethod
+    def from_streams(
+        cls,
+        odometry: tuple[ArrayLike, ArrayLike],
+        measurements: tuple[ArrayLike, ArrayLike, ArrayLike],
+        rule: streams.Rule,
+        rows: ArrayLike | None = None,
+    ) -> "Log":
+        """The log of odometry (times, values) and measurements (times, tags, values), in NumPy;
+        `logs.streams.align_streams` says what they, the rule and the rows are."""
+        return cls.from_rows(streams.align_streams(odometry, measurements, rule, rows))
+
+    @classmethod
+    def from_rows(cls, rows: streams.Rows) -> "Log":
+        """The log of aligned rows; arrays are NumPy's."""
+        held: PyTree = rows  # the fields are declared as JAX arrays
+        return cls(held.control, Scan(held.z, held.tag, held.valid))
+
+    @classmethod
+    def from_records(
+        cls,
+        odometry: tables.Tabular,
+        measurements: tables.Tabular | Sequence[tables.Tabular],
+        motion: PyTree,
+        sensor: PyTree,
+    ) -> "Recording":
+        """The log of lines of odometry and measurements, each with times of its own.
+
+            log, time, tags, dropped = Log.from_records(odometry, measurements, motion, sensor)
+
+        odometry has columns t and the motion's controls without Δt; measurements has t, tag and
+        what the sensor measures (no tag for a sensor of no landmark, as a compass). Either is a
+        sequence of rows in this order (lists, a NumPy array), or has columns with names: a mapping,
+        a structured array, a data frame. A name may have a unit, as "bearing [deg]"; else it is the
+        model's. With `PoseIncrement` columns named t, x, y, theta may be a path of poses. Of a
+        `sensors.Suite` measurements are one such table a part, in order: (of_laser, of_compass).
+
+        There is a row at every time of either. A velocity holds until the next; poses are
+        interpolated; other controls stand as they are, and measurements must be at their times.
+        Tags are whole numbers or text, in any order; None, "", NaN and -1 are unknown. Measurements
+        before the first or after the last line of odometry are dropped and counted; the last
+        velocity holds for the longest interval.
+
+        Args:
+            motion, sensor: the models.
+        Raises:
+            ValueError: with row and column, on a missing column, a value that is no finite number,
+                times that go back (of odometry: or repeat), a tag twice at a time, or more
+                measurements at a time than the suite has slots.
+        """
+        name, controls = "Log.from_records", motion.controls
+        moved = tables.columns_of(
+            f"{name}: odometry",
+            odometry,
+            lambda given: (tables.TIME, *tables.odometry_columns(controls, given)),
+        )
+        parts = getattr(sensor, "parts", None)  # of a suite
+        given: list[tuple[str, PyTree, PyTree, int | None]] = []
+        if parts is None:
+            given = [(f"{name}: measurements", sensor, measurements, None)]
+        else:
+            if not isinstance(measurements, Sequence) or len(measurements) != len(parts):
+                each = ", ".join(part.sensor.name for part in parts)
+                raise ValueError(
+                    f"{name}: measurements: expected a table for each of the {len(parts)} sensors "
+                    f"of the suite, ({each}), got {type(measurements).__name__}"
+                )
+            if any(part.sees == "robots" for part in parts):
+                raise ValueError(
+                    f"{name}: expected sensors of landmarks; of a team make the log of each robot "
+                    "by Log.from_streams, with the rows of all, and put them side by side"
+                )
+            given = [
+                (
+                    f"{name}: measurements[{i}] of {part.sensor.name}",
+                    part.sensor,
+                    table,
+                    part.places,
+                )
+                for i, (part, table) in enumerate(zip(parts, measurements, strict=True))
+            ]
+        seen = []
+        for what, model, table, places in given:
+            columns = tables.measurement_columns(model.measurements, model.landmark)
+            made = tables.columns_of(what, table, lambda _, own=columns: own)  # type: ignore[misc]
+            seen.append(tables.Seen(made, model.measurements, places))
+        rows, tags, dropped = tables.align_tables(moved, seen, controls)
+        return Recording(cls.from_rows(rows), rows.time, tags, dropped)
+
+
+class Recording(NamedTuple):
+    """The result of `Log.from_records`."""
+
+    log: Log
+    time: PyTree
+    """(T,) the time of each row"""
+    tags: tuple[int | str, ...]
+    """the names of the landmarks with tags 0, 1, …, N-1, sorted"""
+    dropped: dict[str, int]
+    """number of measurements that are not in the log, by reason"""
+
+
+class Truth(NamedTuple):
+    """The true states of a simulation."""
+
+    pose: Float[JaxOrNumPy, "T 3"]
+    """true pose at each scan [m, m, rad]."""
+    landmarks: Float[JaxOrNumPy, "N L"]
+    """true landmarks, in the order of their tags."""
+    missed: Int[JaxOrNumPy, "T"]
+    """landmarks in view for which the scan had no free slot."""
+    start: Float[JaxOrNumPy, "3"]
+    """true pose before the first control."""
+    origin: Int[JaxOrNumPy, "T M"] | None = None
+    """the tag of the landmark each measurement is truly of, -1 of none; None but in a world with
+    `spurious` data."""
+
+
+class Estimate(NamedTuple):
+    """Means and marginal covariances in map coordinates, whatever the filter's chart."""
+
+    pose: Float[JaxOrNumPy, "3"]
+    """x [m], y [m], θ [rad] in (-π, π]."""
+    pose_cov: Float[JaxOrNumPy, "3 3"]
+    points: Float[JaxOrNumPy, "N 2"]
+    """landmark positions [m]; 0 where not alive."""
+    point_covs: Float[JaxOrNumPy, "N 2 2"]
+    alive: Bool[JaxOrNumPy, "N"]
+    tag: Int[JaxOrNumPy, "N"]
+    """-1 where not alive."""
+
+
+class Info(NamedTuple):
+    """The results of one update for each measurement slot."""
+
+    nis: Float[Array, "M"]
+    """normalized innovation squared of fused and rejected measurements, else 0. Within a joint
+    update: of a measurement given those before it, so that the sum is the joint NIS."""
+    dof: Int[Array, "M"]
+    """Z where fused, else 0."""
+    innovation: Float[Array, "M Z"]
+    """z ⊖ ẑ of measurements matched to a landmark (fused, rejected or singular), else 0."""
+    innovation_cov: Float[Array, "M Z Z"]
+    """S of the same measurements, else 0."""
+    slot: Int[Array, "M"]
+    """the landmark slot corrected or initialized, -1 if none."""
+    status: Int[Array, "M"]
+    """see `Status`."""
+    log_likelihood: Float[Array, ""]
+    """Σ log N(innovation; 0, S) over fused measurements."""
+    exhausted: Bool[Array, ""] | None = None
+    """the search for the best association ended at its budget; None where there is no search"""
+    extra: dict[str, PyTree] | None = None
+    """records of one family or wrapper of filters alone, by name, as
+    "particles" for a `filters.ParticleInfo`."""
+
+    @property
+    def overflow(self) -> jax.Array:
+        """Whether at least one measurement was dropped because the map was full, () bool."""
+        return (self.status == Status.OVERFLOW).any(-1)
+
+    def tally(self, status: Status) -> jax.Array:
+        """The number of measurements with that status: () of a step, (T,) of a whole trace."""
+        return (self.status == status).sum(-1)
+
+
+class Trace(NamedTuple):
+    """The result of `run`: the log of a run's estimates, and what the filter says of each step."""
+
+    estimate: Estimate
+    """with leading T, after each update."""
+    info: Info
+    """with leading T."""
+    final: PyTree
+    """the filter's own state at the end."""
+    probe: PyTree
+    """results of the caller's probe after each update, leading T; None without one."""
+
+
+class Beams(NamedTuple):
+    """A scan of a laser: B beams, in the frame of its mount.
+
+    What a range says, everywhere in the package (`returns`):
+
+    | range [m] | meaning |
+    |---|---|
+    | above 0, below the maximum range | an obstacle at this distance |
+    | the maximum range (less a millionth) or more, ∞ | no obstacle up to the maximum range |
+    | 0, below 0, NaN, -∞; any, where `valid` is false or the angle is not finite | nothing |
+    """
+
+    range: Float[JaxOrNumPy, "B"]
+    """[m]"""
+    angle: Float[JaxOrNumPy, "B"]
+    """direction of each beam [rad], counter-clockwise from the x axis"""
+    valid: Bool[JaxOrNumPy, "B"]
+    """false for a beam that says nothing: a dropout or padding. A beam that met nothing has the
+    laser's maximum range, and is valid."""
+
+    def returns(
+        self, max_range: float | JaxOrNumPy = np.inf, *, min_range: float | JaxOrNumPy = 0.0
+    ) -> tuple[Bool[JaxOrNumPy, "*n"], Bool[JaxOrNumPy, "*n"]]:
+        """Which beams met an obstacle nearer than max_range [m], and which met none up to there.
+
+        The others say nothing, as does a range of min_range or less. See the table of `Beams`.
+        """
+        with np.errstate(invalid="ignore"):  # comparisons with NaN, which are false
+            says = (self.range > min_range) & (self.valid != 0)
+            says = says & (self.angle > -np.inf) & (self.angle < np.inf)
+            met = self.range < max_range * (1 - 1e-6)  # less the rounding of float32
+        return says & met, says & ~met

@@ -1,0 +1,1 @@
+"""Laser scans: grids and rays, matching, laser SLAM, segments, topological maps."""

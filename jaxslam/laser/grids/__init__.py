@@ -1,0 +1,60 @@
+"""Occupancy grids: maps, files, distances, rays, beam models, mapping, localization."""
+
+from jaxslam.laser.grids.beam_models import (
+    BeamModel,
+    LikelihoodField,
+    Mixture,
+    RayCast,
+    fit,
+    log_likelihood,
+)
+from jaxslam.laser.grids.distance import distance_field, gradient
+from jaxslam.laser.grids.grid import (
+    Field,
+    Grid,
+    centers,
+    check_grid,
+    interpolate,
+    read_map,
+    to_cells,
+    write_map,
+)
+from jaxslam.laser.grids.localization import GridLocalization, beam_log
+from jaxslam.laser.grids.mapping import Counts, count, entropy, occupancy, reflection
+from jaxslam.laser.grids.pose_clusters import Clusters, clusters
+from jaxslam.laser.grids.rays import RayMap, cast, ray_map
+from jaxslam.laser.grids.resampling import correlation, crop, resample
+
+__all__ = [
+    "BeamModel",
+    "Clusters",
+    "Counts",
+    "Field",
+    "Grid",
+    "GridLocalization",
+    "LikelihoodField",
+    "Mixture",
+    "RayCast",
+    "RayMap",
+    "beam_log",
+    "cast",
+    "centers",
+    "check_grid",
+    "clusters",
+    "correlation",
+    "count",
+    "crop",
+    "distance_field",
+    "entropy",
+    "fit",
+    "gradient",
+    "interpolate",
+    "log_likelihood",
+    "occupancy",
+    "ray_map",
+    "read_map",
+    "reflection",
+    "resample",
+    "to_cells",
+    "write_map",
+]

@@ -1,0 +1,151 @@
+"""The range of a beam against the one that the map predicts: a mixture of four components."""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import ndtr
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, PyTree
+
+from jaxslam.core.numbers import check_positive, is_concrete
+from jaxslam.core.record import record, static
+from jaxslam.core.types import Beams
+from jaxslam.laser.grids.beam_models.beam_model import BeamModel, hold_mount
+from jaxslam.laser.grids.grid import Grid
+from jaxslam.laser.grids.rays import RayMap, cast, check_method, ray_map
+from jaxslam.math.arrays import Number
+
+
+class Mixture(NamedTuple):
+    """The parameters of `RayCast`."""
+
+    hit: Number
+    """share of beams that end at the obstacle of the map, with Gaussian noise"""
+    short: ArrayLike
+    """share that ends earlier, at what the map does not have"""
+    maximum: Number
+    """share that returns nothing, and so max_range"""
+    random: Number
+    """share of any range"""
+    sigma: Number
+    """standard deviation of a hit [m]"""
+    rate: ArrayLike
+    """rate λ of the exponential density of short ones [1/m]"""
+
+
+_USUAL = Mixture(0.75, 0.1, 0.05, 0.1, 0.1, 0.5)
+"""Parameters of a laser in a building whose map is good."""
+
+
+def mixture_log_density(
+    mixture: Mixture, z: Float[Array, "*n"], expected: Float[Array, "*n"], max_range: Number
+) -> Float[Array, "*n"]:
+    """The log-density of ranges z given those expected: a density below max_range, a mass there.
+
+    Below max_range: hit · N(z; z*, σ²)/Φ + short · λ exp(-λ z)/(1 - exp(-λ z*)) [z <= z*]
+    + random/max_range, Φ the mass of the normal within [0, max_range]. At max_range: maximum, and
+    with it the hit where max_range is expected, since there is nothing to hit. Integral and mass
+    sum to 1.
+
+    Thrun, Burgard & Fox 2005, "Probabilistic robotics", (6.4) to (6.12).
+    """
+    hit, short, maximum, random, sigma, rate = (jnp.asarray(value) for value in mixture)
+    nothing = expected >= max_range
+    star = jnp.where(nothing, 0.5 * max_range, expected)
+    mass = ndtr((max_range - star) / sigma) - ndtr(-star / sigma)
+    normal = jnp.exp(-0.5 * ((z - star) / sigma) ** 2) / (sigma * math.sqrt(2 * math.pi) * mass)
+    # Where max_range is expected, short ones are spread over all of it.
+    end = jnp.where(nothing, max_range, jnp.maximum(expected, 1e-6))
+    early = jnp.where(z <= end, rate * jnp.exp(-rate * z) / -jnp.expm1(-rate * end), 0.0)
+    near = jnp.where(nothing, 0.0, hit * normal) + short * early + random / max_range
+    far = maximum + jnp.where(nothing, hit, 0.0)
+    least = jnp.finfo(jnp.result_type(z, float)).tiny
+    return jnp.log(jnp.maximum(jnp.where(z >= max_range, far, near), least))
+
+
+def _density_slope(
+    mixture: Mixture, z: Float[Array, "*n"], expected: Float[Array, "*n"], max_range: Number
+) -> Float[Array, "*n"]:
+    """The derivative of `mixture_log_density` by the expected range z*, by hand.
+
+    With N the hit, Φ its mass and φ the normal density: ∂(N/Φ) = (N/Φ) ((z - z*)/σ² - ∂Φ/Φ),
+    ∂Φ = (φ(-z*/σ) - φ((z_max - z*)/σ))/σ; the short ones E = λ exp(-λ z)/(1 - exp(-λ z*)) have
+    ∂E = -E λ exp(-λ z*)/(1 - exp(-λ z*)). 0 at max_range, and where max_range is expected.
+    """
+    hit, short, _, random, sigma, rate = (jnp.asarray(value) for value in mixture)
+    star = jnp.minimum(jnp.maximum(expected, 1e-6), max_range)
+    low, high = -star / sigma, (max_range - star) / sigma
+    mass = ndtr(high) - ndtr(low)
+    by_mass = (jnp.exp(-0.5 * low**2) - jnp.exp(-0.5 * high**2)) / (sigma * math.sqrt(2 * math.pi))
+    normal = jnp.exp(-0.5 * ((z - star) / sigma) ** 2) / (sigma * math.sqrt(2 * math.pi) * mass)
+    rest = -jnp.expm1(-rate * star)
+    early = jnp.where(z <= star, rate * jnp.exp(-rate * z) / rest, 0.0)
+    near = hit * normal + short * early + random / max_range
+    rise = hit * normal * ((z - star) / sigma**2 - by_mass / mass)
+    rise = rise - short * early * rate * jnp.exp(-rate * star) / rest
+    known = (z < max_range) & (expected < max_range) & (near > 0)
+    return jnp.where(known, rise / jnp.where(near > 0, near, 1.0), 0.0)
+
+
+@record
+class RayCast(BeamModel):
+    """The ray-cast model: `mixture_log_density` of each range given that of `grids.cast`.
+
+    Differentiable by the parameters, and by the pose in the sense of `cast`, with either method.
+
+    Raises ValueError on numbers out of range, an unknown method, a mount that is no pose.
+    """
+
+    mixture: Mixture = _USUAL
+    """parameters, which `fit` learns from data; the four shares have sum 1"""
+    _: dataclasses.KW_ONLY
+    max_range: Number
+    """[m]"""
+    method: str | None = static(default=None)
+    """of `ray_map`; None chooses by the map"""
+    mount: ArrayLike | None = None
+    """(3,) pose of the laser on the robot"""
+
+    def __post_init__(self) -> None:
+        name, mixture = type(self).__name__, self.mixture
+        check_positive(name, max_range=self.max_range, sigma=mixture.sigma, rate=mixture.rate)
+        if self.method is not None:
+            check_method(name, self.method)
+        hold_mount(self)
+        check_weights(name, dict(zip(Mixture._fields[:4], mixture[:4], strict=True)))
+        super().__post_init__()
+
+    def prepare(self, grid: Grid) -> RayMap:
+        return ray_map(grid, method=self.method)
+
+    def each(self, prepared: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
+        expected = self._expected(prepared, pose, beams)
+        far = jnp.asarray(self.max_range, expected.dtype)
+        z = jnp.where(beams.returns(far)[1], far, beams.range)
+        return mixture_log_density(self.mixture, z, expected, far)
+
+    def jacobian(self, prepared: PyTree, pose: Array, beams: Beams) -> Float[Array, "B 3"]:
+        """The derivative by z*, times that of z*, for which `cast` has its own rule."""
+        expected = self._expected(prepared, pose, beams)
+        by_pose = jax.jacfwd(lambda pose: self._expected(prepared, pose, beams))(pose)
+        far = jnp.asarray(self.max_range, expected.dtype)
+        z = jnp.where(beams.returns(far)[1], far, beams.range)
+        by_range: Array = _density_slope(self.mixture, z, expected, far)
+        return by_range[:, None] * jnp.asarray(by_pose)
+
+    def _expected(self, rays: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
+        return cast(rays, self.frame(pose), beams.angle, self.max_range)
+
+
+def check_weights(name: str, weights: dict[str, ArrayLike]) -> None:
+    """Raise ValueError unless the shares of a mixture are >= 0 and have sum 1."""
+    if not is_concrete(weights):
+        return
+    values = np.array([float(np.asarray(value)) for value in weights.values()])
+    if np.any(values < 0) or not abs(values.sum() - 1) < 1e-6:
+        told = ", ".join(f"{key} {value:g}" for key, value in zip(weights, values, strict=True))
+        raise ValueError(f"{name}: expected shares >= 0 of sum 1, got {told}")

@@ -1,0 +1,17 @@
+"""Covariances of a match, each of the published ways, to be held against the truth."""
+
+from jaxslam.laser.matching.covariance.implicit import AlongNormals, Hessian, Implicit
+from jaxslam.laser.matching.covariance.record import MatchCovariance, MatchedScans, covariance
+from jaxslam.laser.matching.covariance.sampling import Lattice, Sampling, Unscented
+
+__all__ = [
+    "AlongNormals",
+    "Hessian",
+    "Implicit",
+    "Lattice",
+    "MatchCovariance",
+    "MatchedScans",
+    "Sampling",
+    "Unscented",
+    "covariance",
+]

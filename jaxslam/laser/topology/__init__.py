@@ -1,0 +1,25 @@
+"""Topological maps: places and doors from a grid, routes, and the place of a particle set."""
+
+from jaxslam.laser.topology.places import (
+    Door,
+    PathPlaces,
+    TopologicalMap,
+    path_places,
+    topological_map,
+)
+from jaxslam.laser.topology.planning import Route, place_of, place_weights, route
+from jaxslam.laser.topology.voronoi import Skeleton, skeleton
+
+__all__ = [
+    "Door",
+    "PathPlaces",
+    "Route",
+    "Skeleton",
+    "TopologicalMap",
+    "path_places",
+    "place_of",
+    "place_weights",
+    "route",
+    "skeleton",
+    "topological_map",
+]

@@ -1,0 +1,194 @@
+"""A campaign is known by its data and code: whatever changes a result changes its identity."""
+
+import dataclasses
+import json
+import os
+import subprocess
+import sys
+
+import jax
+import numpy as np
+import pytest
+import worlds
+
+from jaxslam import filters, sensors, store
+from jaxslam.consistency.campaign import identity as module
+from jaxslam.consistency.campaign import monte_carlo
+from jaxslam.consistency.campaign.identity import digest, identity
+from jaxslam.core.record import record
+
+
+def world(steps=12, sigma=0.05, **changes):
+    sensor = sensors.RangeBearing(np.diag([sigma, 0.02]) ** 2, mount=(0.1, -0.05, 0.3))
+    return dataclasses.replace(worlds.ring(steps), sensor=sensor, **changes)
+
+
+def blind(scenario):
+    return filters.DeadReckoning(scenario.motion, scenario.sensor)
+
+
+def campaign(scenario=None, name="blind", make=blind, key=0):
+    scenario = scenario or world()
+    return {"scenario": scenario, "filters": {name: make(scenario)}, "key": jax.random.key(key)}
+
+
+@record
+class Drifting(filters.Wrapper):
+    name = "dead_reckoning"
+
+    def predict(self, state, u, key):
+        return self.filter.predict(state, 1.0001 * u, key)
+
+
+def drifting(scenario):
+    """The same filter by another line of code."""
+    return Drifting(blind(scenario))
+
+
+ELSEWHERE = np.asarray(worlds.ring(12).landmarks) + [1e-15, 0.0]
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory):
+    kept = store.create(tmp_path_factory.mktemp("claimed"))
+    kept.claim(identity(**campaign(), platform="cpu"))
+    return kept.folder
+
+
+@pytest.mark.parametrize(
+    ("changed", "named"),
+    [
+        ({"key": 1}, {"key"}),
+        ({"scenario": world(sigma=0.06)}, {"sensor", "filter blind"}),
+        ({"scenario": world(steps=13)}, {"steps", "controls"}),
+        ({"scenario": world(landmarks=ELSEWHERE)}, {"landmarks"}),
+        ({"scenario": world(name="circus")}, {"scenario"}),
+        (
+            {"scenario": world(visible=lambda pose, landmark: landmark[0] > pose[0])},
+            {"world's visible"},
+        ),
+        ({"name": "deaf"}, {"filters", "filter blind", "filter deaf"}),
+        ({"make": drifting}, {"filter blind"}),
+        ({"make": worlds.ekf}, {"filter blind"}),
+    ],
+)
+def test_a_changed_campaign_is_refused_by_what_changed(folder, changed, named):
+    changed = campaign(**changed)
+    with pytest.raises(ValueError, match="holds another campaign: ") as caught:
+        monte_carlo(runs=2, keep=store.resume(folder), **changed)
+    differences = str(caught.value).split("another campaign: ")[1].split("; ")
+    assert differences.pop().startswith("choose another folder")
+    assert {difference.split(": ")[0] for difference in differences} == named
+    for each in differences:
+        assert each.endswith((" here", " has other numbers or other code than in the stored runs"))
+
+
+def test_another_precision_platform_version_or_bound_is_another_campaign(folder, monkeypatch):
+    there = store.resume(folder).campaign
+    asked = campaign()
+
+    def changed(platform="cpu", **options):
+        found = identity(**asked, platform=platform, **options)
+        assert found.keys() == there.keys()
+        return {name for name in found if found[name] != there[name]}
+
+    assert changed() == set()
+    assert changed(platform="gpu") == {"platform"}
+    assert changed(bound=True) == {"bound"}
+    with jax.enable_x64(False):
+        assert "dtype" in changed()
+    monkeypatch.setattr(module, "version", lambda name: {"jax": "0.1"}.get(name, there[name]))
+    assert changed() == {"jax"}
+
+
+def test_fewer_runs_than_are_kept_are_refused(tmp_path):
+    kept = store.create(tmp_path)
+    kept.claim(identity(**campaign(), platform="cpu"))
+    kept.save(0, {"0/x": np.zeros(2)}, 2)
+    kept.save(2, {"0/x": np.zeros(2)}, 2)
+    with pytest.raises(ValueError, match=r"keep holds 4 runs: expected at least as many, got 3"):
+        monte_carlo(runs=3, keep=store.resume(tmp_path), **campaign())
+
+
+def test_a_gate_that_a_filter_closes_over_is_seen():
+    scenario = world()
+    ekfs = [
+        identity(
+            scenario, {"it": worlds.ekf(scenario, gate=gate)}, jax.random.key(0), platform="cpu"
+        )["filter it"]
+        for gate in (9.0, 9.0, 9.0 + 1e-12)
+    ]
+    assert ekfs[0] == ekfs[1] != ekfs[2]
+
+
+ALONE = """
+import json, jax, test_identity as t
+jax.config.update("jax_enable_x64", True)
+found = t.identity(**t.campaign(make=t.worlds.ekf), platform="cpu")
+print(json.dumps(found))
+"""
+
+
+def test_the_same_campaign_in_another_process_has_the_same_identity():
+    done = subprocess.run(
+        [sys.executable, "-c", ALONE],
+        env=os.environ | {"PYTHONPATH": os.pathsep.join(sys.path), "PYTHONHASHSEED": "7"},
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    assert json.loads(done.stdout) == identity(**campaign(make=worlds.ekf), platform="cpu")
+
+
+def made_by(scale, table):
+    return lambda x: helped(x) * scale + table
+
+
+def helped(x):
+    return x + 1.0
+
+
+def test_a_digest_of_a_function_is_of_its_code_and_of_what_it_refers_to(monkeypatch):
+    table = np.arange(3.0)
+    one = digest(made_by(2.0, table))
+    assert one == digest(made_by(2.0, table.copy()))
+    others = [
+        digest(made_by(np.nextafter(2.0, 3.0), table)),
+        digest(made_by(2.0, np.nextafter(table, 9))),
+        digest(lambda x: x),
+    ]
+    monkeypatch.setitem(globals(), "helped", lambda x: x + 2.0)
+    assert len({one, *others, digest(made_by(2.0, table))}) == 5
+    assert digest(np.sin) != digest(np.cos)
+
+
+def test_a_digest_of_a_class_is_of_its_methods():
+    def made(by):
+        @record
+        class Faster(filters.Wrapper):
+            def predict(self, state, u, key):
+                return self.filter.predict(state, by * u, key)
+
+        return Faster
+
+    assert digest(made(1.0)) == digest(made(1.0)) != digest(made(2.0))
+
+
+def test_a_digest_of_a_class_is_of_its_constants_and_of_sets_in_its_code():
+    def made(scale, among):
+        @record
+        class Scaled(filters.Wrapper):
+            factor = scale
+
+            @staticmethod
+            def known(tag):
+                return tag in among
+
+            def predict(self, state, u, key):
+                return self.filter.predict(state, self.factor * u, key)
+
+        return Scaled
+
+    one, two = frozenset({1, 2}), frozenset({2, 3})
+    assert digest(made(1.0, one)) == digest(made(1.0, frozenset({2, 1})))
+    assert len({digest(made(*each)) for each in ((1.0, one), (2.0, one), (1.0, two))}) == 3

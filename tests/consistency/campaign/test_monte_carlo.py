@@ -1,0 +1,456 @@
+"""Campaigns: blocks, workers and loops agree; draws are shared; wrong filters are found out."""
+
+import dataclasses
+import re
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+import worlds
+from own_models import changed
+
+from jaxslam import Scenario, catalog, filters, grids, motion, run, sensors, simulate, store
+from jaxslam.consistency.campaign import Interrupted, missing, monte_carlo, work
+from jaxslam.consistency.campaign.candidates import fitting_block, without_noise
+from jaxslam.core.record import record
+from jaxslam.core.types import Status, Truth
+from jaxslam.filters import reporting
+from jaxslam.laser.grids.localization import info_of_beams
+from jaxslam.simulation.laser import scan_world
+from jaxslam.simulation.scenarios import square
+
+WORLD = worlds.ring()
+BESIDE = dataclasses.replace(WORLD, sensor=sensors.RelativePosition(np.eye(2)))
+EKF = worlds.ekf(WORLD)
+LARGE = 100
+"""A block as large as those of `lineup`, whose programs it shares; the others are of four runs."""
+
+
+@pytest.fixture(scope="module")
+def in_fours():
+    """Runs 0 to 3, 4 to 7, 8 and 9; one device, one worker."""
+    return campaign_of({"ekf": EKF, "again": worlds.ekf(WORLD)}, workers=1)
+
+
+def campaign_of(candidates=None, *, devices=1, block=4, bound=True, **options):
+    candidates = candidates or {"ekf": EKF}
+    options |= {"devices": jax.devices()[:devices], "block": block, "bound": bound}
+    return monte_carlo(WORLD, candidates, 10, worlds.key(), **options)
+
+
+def same(a, b, rtol=1e-9):
+    assert a.counts == b.counts
+    for name in a.measures.keys() & b.measures.keys():  # a bound is taken in some
+        np.testing.assert_allclose(a.measures[name], b.measures[name], rtol=rtol)
+    for name in a.curves.keys() & b.curves.keys():
+        np.testing.assert_allclose(a.curves[name], b.curves[name], rtol=rtol)
+
+
+def test_blocks_follow_the_memory_of_an_accelerator():
+    def fits(platform, memory):
+        stats = None if memory is None else {"bytes_limit": memory}
+        device = SimpleNamespace(platform=platform, memory_stats=lambda: stats)
+        return fitting_block(WORLD, {"ekf": worlds.ekf(WORLD)}, device)
+
+    assert fits("cpu", None) == 16
+    assert fits("gpu", None) == 1024
+    assert fits("gpu", 10**6) == 32
+    assert 32 < fits("gpu", 10**8) < 4096
+    assert fits("gpu", 2 * 10**8) == 2 * fits("gpu", 10**8)
+    assert fits("gpu", 10**11) == 4096
+
+
+@pytest.mark.parametrize(("devices", "workers"), [(1, 2), (2, 3)])
+def test_workers_do_not_change_a_bit_and_devices_what_rounding_does(in_fours, devices, workers):
+    heard = []
+    campaign = campaign_of(
+        devices=devices,
+        workers=workers,
+        progress=lambda done, total: heard.append((done, total)),
+    )
+    agree = worlds.assert_identical if devices == 1 else same
+    agree(campaign.filters["ekf"], in_fours.filters["ekf"])
+    assert [total for _, total in heard] == [10] * -(-10 // (4 * devices))
+    assert sorted(done for done, _ in heard)[-1] == 10
+
+
+@pytest.mark.parametrize("block", [3, LARGE])
+def test_other_blocks_change_what_rounding_does(in_fours, block):
+    same(campaign_of(block=block).filters["ekf"], in_fours.filters["ekf"])
+
+
+def test_pieces_lie_within_the_blocks_of_their_numbers():
+    assert missing([], 10, 4) == [(0, 4), (4, 4), (8, 2)]
+    assert missing([(0, 3), (6, 1)], 10, 4) == [(3, 1), (4, 2), (7, 1), (8, 2)]
+    assert missing([(0, 20)], 10, 4) == []
+    assert missing([(0, 10)], 13, 8) == [(10, 3)]
+
+
+class Spy:
+    """A keep that writes down what is saved, and may fail."""
+
+    def __init__(self, store, fails=()):
+        self.store, self.saved, self.fails = store, [], list(fails)
+
+    def claim(self, identity):
+        self.store.claim(identity)
+
+    def save(self, first, arrays, runs):
+        if self.fails and self.fails.pop(0):
+            raise OSError(28, "no space left")
+        self.saved.append((first, runs))
+        return self.store.save(first, arrays, runs)
+
+    def blocks(self):
+        return self.store.blocks()
+
+
+def test_a_stopped_campaign_goes_on_and_no_run_comes_twice(tmp_path, in_fours):
+    kept = store.create(tmp_path, {"seed": 0})
+    first = Spy(kept)
+
+    def stop(done, total):
+        if done >= 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(Interrupted, match="of 10 runs done") as stopped:
+        campaign_of(workers=1, keep=first, progress=stop)
+    so_far = stopped.value.campaign
+    assert so_far.runs == sum(runs for _, runs in first.saved) < 10
+    assert so_far.filters["ekf"].counts["runs"] == so_far.runs
+
+    second = Spy(store.resume(tmp_path), fails=[True])
+    with pytest.raises(OSError, match="no space"):
+        campaign_of(workers=1, keep=second)
+
+    third = Spy(store.resume(tmp_path))
+    campaign = campaign_of(devices=2, keep=third)
+    same(campaign.filters["ekf"], in_fours.filters["ekf"])
+    pieces = sorted(first.saved + second.saved + third.saved)
+    assert [run for at, runs in pieces for run in range(at, at + runs)] == list(range(10))
+
+    finished = Spy(store.resume(tmp_path))
+    began = campaign_of(keep=finished)
+    assert finished.saved == []
+    assert began.compile_seconds == 0
+    assert began.divergence_limit == in_fours.divergence_limit
+    worlds.assert_identical(began.filters["ekf"], campaign.filters["ekf"])
+
+
+def test_an_interrupt_before_any_block_has_no_campaign(monkeypatch):
+    def interrupted(*arguments):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(work, "BlockRunner", interrupted)
+    with pytest.raises(Interrupted, match="0 of 10") as stopped:
+        campaign_of()
+    assert stopped.value.campaign is None
+
+
+def test_out_of_memory_tries_smaller_blocks(monkeypatch, in_fours):
+    tried = []
+    runner = work.BlockRunner
+
+    def little_memory(plan):
+        tried.append(plan.wide)
+        if plan.wide > 4:
+            raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 1 byte")
+        return runner(plan)
+
+    monkeypatch.setattr(work, "BlockRunner", little_memory)
+    with pytest.warns(UserWarning, match="continuing with block=") as warned:
+        campaign = campaign_of(block=18)
+    assert (tried, len(warned)) == ([18, 9, 4], 2)
+    same(campaign.filters["ekf"], in_fours.filters["ekf"])
+
+
+def test_out_of_memory_for_one_run_says_so(monkeypatch):
+    def no_memory(*arguments):
+        raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")
+
+    monkeypatch.setattr(work, "BlockRunner", no_memory)
+    with pytest.raises(MemoryError, match="block=1"):
+        campaign_of(block=1)
+
+
+def test_other_errors_of_the_runtime_are_not_taken_for_memory(monkeypatch):
+    def broken(*arguments):
+        raise jax.errors.JaxRuntimeError("INTERNAL: something else")
+
+    monkeypatch.setattr(work, "BlockRunner", broken)
+    with pytest.raises(jax.errors.JaxRuntimeError, match="something else"):
+        campaign_of()
+
+
+def test_a_model_that_cannot_be_traced_stops_the_campaign_whatever_waits_for_it():
+    def broken(truth):
+        raise ValueError("no filter for this truth")
+
+    with pytest.raises(ValueError, match="no filter for this truth"):
+        campaign_of({"ekf": EKF, "broken": broken}, workers=2)
+
+
+@pytest.mark.parametrize(
+    ("candidate", "message"),
+    [
+        (filters.EkfSlam, "expected it to be a filter, got the class EkfSlam: call it"),
+        (lambda truth: 3, "function of the truth to return a filter or an estimator, got int"),
+    ],
+)
+def test_what_is_no_filter_is_refused(candidate, message):
+    with pytest.raises(ValueError, match=f"monte_carlo: expected .*{message}|{message}"):
+        campaign_of({"it": candidate})
+
+
+def test_every_filter_gets_the_same_draws(in_fours):
+    same(in_fours.filters["ekf"], in_fours.filters["again"], rtol=0)
+
+
+def test_a_campaign_is_the_loop_over_its_runs(in_fours):
+    square, nees = [], []
+    for i in range(10):
+        key_world, key_filter = jax.random.split(jax.random.fold_in(worlds.key(), i))
+        truth, log = simulate(WORLD, key_world)
+        trace = run(EKF, log, WORLD.pose, WORLD.pose_cov, key_filter)
+        error = np.asarray(truth.pose) - np.asarray(trace.estimate.pose)
+        error[:, 2] = np.angle(np.exp(1j * error[:, 2]))
+        square.append((error[:, :2] ** 2).sum(1).mean())
+        cov = np.asarray(trace.estimate.pose_cov)[1:]  # after one step P is singular
+        nees.append(
+            np.mean([e @ np.linalg.solve(p, e) for e, p in zip(error[1:], cov, strict=True)])
+        )
+    measures = in_fours.filters["ekf"].measures
+    np.testing.assert_allclose(measures["rmse_position"].value, np.sqrt(np.mean(square)), rtol=1e-9)
+    np.testing.assert_allclose(measures["nees_pose"].value, np.mean(nees), rtol=1e-6)
+
+
+def test_another_seed_is_another_campaign(in_fours):
+    options = {"block": 4, "bound": True, "devices": jax.devices()[:1]}
+    other = monte_carlo(WORLD, {"ekf": EKF}, 10, worlds.key(1), **options)
+    ours = in_fours.filters["ekf"].measures["rmse_position"].value
+    assert abs(other.filters["ekf"].measures["rmse_position"].value / ours - 1) > 1e-3
+
+
+def test_another_key_noise_map_or_more_runs_compile_nothing():
+    def campaign(there, runs, seed):
+        tried = {"ekf": worlds.ekf(there), "ideal": catalog.ideal(there)}
+        more = {"block": 4, "bound": True, "devices": jax.devices()[:1]}
+        return monte_carlo(there, tried, runs, jax.random.key(seed), **more)
+
+    same, other = worlds.scaled(1.0, WORLD.steps), worlds.scaled(1.07, WORLD.steps)
+    first = campaign(same, 3, 0)
+    with worlds.compilations() as count:
+        for there, runs, seed in ((same, 3, 1), (same, 9, 0), (other, 3, 0)):
+            found = campaign(there, runs, seed)
+            assert found.runs == runs
+            assert found.filters["ekf"].measures != first.filters["ekf"].measures
+        assert count() == 0
+
+
+def test_functions_of_the_truth_and_estimators_run_too(in_fours):
+    def estimator(truth):
+        return lambda log, key: run(EKF, log, WORLD.pose, WORLD.pose_cov, key)
+
+    candidates = {"ideal": catalog.ideal(WORLD), "estimator": estimator}
+    campaign = campaign_of(candidates)
+    same(campaign.filters["estimator"], in_fours.filters["ekf"])
+    assert campaign.filters["ideal"].measures["nees_pose"].value > 0
+
+
+def test_blocks_share_one_trace():
+    traces = []
+
+    def counted(pose, u, w):
+        traces.append(1)
+        return WORLD.motion.step(pose, u, w)
+
+    watched = changed(WORLD.motion, step=counted)
+    ekf = filters.EkfSlam(watched, WORLD.sensor, 6)
+    counts = []
+    for runs in (4, 10):
+        options = {"block": 4, "bound": True, "devices": jax.devices()[:1]}
+        monte_carlo(WORLD, {"ekf": ekf}, runs, worlds.key(), **options)
+        counts.append(len(traces))
+    assert counts[0] == counts[1] > 0  # the second campaign traces nothing
+
+
+def test_float32_sees_the_worlds_of_float64(in_fours):
+    campaign = campaign_of({"ekf": EKF}, dtype=jnp.float32, bound=False)
+    assert (campaign.dtype, in_fours.dtype) == ("float32", "float64")
+    single, double = campaign.filters["ekf"].per_run, in_fours.filters["ekf"].per_run
+    np.testing.assert_allclose(single["square_position"], double["square_position"], rtol=0.02)
+    with pytest.raises(ValueError, match="float16"):
+        campaign_of(dtype=jnp.float16)
+
+
+def test_drops_and_losses_are_counted_and_leave_the_others_valid(in_fours):
+    reckoning = filters.DeadReckoning(WORLD.motion, WORLD.sensor)
+
+    @record
+    class Poisoned(filters.Wrapper):
+        def update(self, joint, scan, key):
+            joint, info = self.filter.update(joint, scan, key)
+            # A scan that starts with a long range in about half of the runs.
+            bad = scan.z[0, 0] > 3.68
+            return joint._replace(pose=jnp.where(bad, jnp.nan, joint.pose)), info
+
+    @record
+    class Lost(filters.Wrapper):
+        def predict(self, joint, u, key):
+            return joint._replace(pose=joint.pose * jnp.nan)
+
+    candidates = {
+        "ekf": EKF,
+        "poisoned": Poisoned(reckoning),
+        "small": filters.EkfSlam(WORLD.motion, WORLD.sensor, 4),
+        "always lost": Lost(reckoning),
+    }
+    campaign = campaign_of(candidates)
+    same(campaign.filters["ekf"], in_fours.filters["ekf"])
+    poisoned = campaign.filters["poisoned"]
+    assert poisoned.counts["runs"] + poisoned.counts["not_finite"] == 10
+    assert 0 < poisoned.counts["not_finite"] < 10
+    assert all(np.isfinite(m.value) for m in poisoned.measures.values())
+    assert campaign.filters["small"].counts["overflow"] == 10 * WORLD.steps * 2
+    lost = campaign.filters["always lost"]
+    assert lost.verdict == "diverged"
+    assert lost.counts["not_finite"] == 10
+
+
+def test_a_filter_of_beams_without_innovations_runs_in_a_world_that_draws_a_log_of_beams():
+    """Dead reckoning that says of beams what `grids.GridLocalization` does: there is nothing to whiten."""
+    room = square(beams=3)
+
+    @record
+    class OfBeams(Scenario):
+        def draw(self, key):
+            log = scan_world(room, key)
+            nothing = jnp.zeros(len(log.pose), jnp.int32)
+            start = jnp.asarray(room.pose, log.pose.dtype)
+            truth = Truth(log.pose, jnp.zeros((1, 2)), nothing, start)
+            return truth, grids.beam_log(log.control, log.beams)
+
+    world = OfBeams("beams", room.motion, WORLD.sensor, np.zeros((1, 2)), room.controls, room.pose)
+    reckoning = filters.DeadReckoning(room.motion, WORLD.sensor)
+
+    @record
+    class Silent(filters.Wrapper):
+        def update(self, joint, scan, key):
+            return joint, info_of_beams(scan, 1, jnp.zeros(()), jnp.asarray(True))
+
+    found = worlds.campaign(world, {"silent": Silent(reckoning)}, 3).filters["silent"]
+    assert found.counts["fused"] > 0 and found.counts["not_finite"] == 0
+    assert all(np.isfinite(m.value) for m in found.measures.values())
+
+
+def test_a_world_without_noise_does_not_diverge():
+    still = dataclasses.replace(
+        WORLD,
+        motion=motion.Increment(np.zeros((2, 2))),
+    )
+    campaign = worlds.campaign(still, {"ekf": worlds.ekf(still)}, 3)
+    assert campaign.filters["ekf"].verdict == "undecided"
+    assert campaign.filters["ekf"].counts["divergent"] == 0
+
+
+def test_a_sensor_without_noise_is_told_where_it_left_nothing_to_judge():
+    """Nothing is wrong with it in dead reckoning, which takes no measurements."""
+    exact = sensors.RangeBearing(np.diag([0.1, 0.0]), mount=(0.1, -0.05, 0.3))
+    still = dataclasses.replace(WORLD, sensor=exact)  # drawn by the program of WORLD
+    reckoning = filters.DeadReckoning(still.motion, exact)
+
+    @record
+    class Singular(filters.Wrapper):
+        def update(self, joint, scan, key):
+            info = reporting.nothing_of(scan)
+            return joint, info._replace(status=jnp.full_like(info.status, Status.SINGULAR))
+
+    candidates = {"a": reckoning, "b": Singular(reckoning)}
+    found = worlds.campaign(still, candidates, 2)
+    a, b = (found.filters[name].doubts for name in candidates)
+    assert not any("without noise" in doubt for doubt in a)
+    assert "bearing [rad] of range_bearing without noise" in b[-1]
+    assert f"{2 * still.steps * len(still.landmarks):,} measurements were dropped and" in b[-1]
+
+
+@pytest.mark.parametrize(
+    ("noise", "told"),
+    [
+        (np.diag([0.1, 1e-9]), ""),
+        (np.zeros((2, 2)), "range [m], bearing [rad] of range_bearing"),
+        (np.full((2, 2), 0.1), "a combination of range [m], bearing [rad] of range_bearing"),
+        (lambda z: jnp.diag(jnp.stack([z[0], 1.0])) ** 2, ""),  # grows with the range
+        (lambda z: jnp.diag(z * jnp.array([1.0, 0.0])), "bearing [rad] of range_bearing"),
+    ],
+)
+def test_measurements_without_noise_are_named(noise, told):
+    there = dataclasses.replace(WORLD, sensor=sensors.RangeBearing(noise))
+    assert without_noise(there) == told
+    eyes = sensors.Suite(((sensors.Compass(np.eye(1)), 1), (there.sensor, 6)))
+    assert without_noise(dataclasses.replace(WORLD, sensor=eyes)) == told
+
+
+@pytest.fixture(scope="module")
+def lineup():
+    candidates = {
+        "ekf": EKF,
+        "right_invariant": catalog.FILTERS["right_invariant"](WORLD),
+        "ideal": catalog.ideal(WORLD),
+    } | {name: make(WORLD) for name, make in worlds.WRONG.items()}
+    options = {"block": LARGE, "devices": jax.devices()[:1], "bound": True}
+    return monte_carlo(WORLD, candidates, LARGE, worlds.key(), **options).filters
+
+
+@pytest.mark.parametrize("name", ["ekf", "right_invariant", "ideal"])
+def test_honest_filters_are_found_consistent(lineup, name):
+    assert lineup[name].verdict == "consistent"
+    low, high = lineup[name].nis_band
+    assert low < lineup[name].measures["nis_per_dof"].value < high
+
+
+@pytest.mark.parametrize("name", worlds.WRONG)
+def test_wrong_filters_are_found_out(lineup, name):
+    assert lineup[name].verdict in ("optimistic", "diverged")
+    assert lineup[name].measures["nees_pose"].low > 3
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"runs": 0}, "runs"),
+        ({"runs": 2.5}, "runs"),
+        ({"block": 0}, "block"),
+        ({"workers": 0}, "workers"),
+        ({"devices": []}, "device"),
+        ({"key": 0}, "monte_carlo: expected a PRNG key, as jax.random.key(0), got 0"),
+        ({"filters": {}}, "at least one"),
+        ({"filters": {"x": 3}}, "expected x to be a Filter"),
+        ({"filters": {"x": lambda log, key: None}}, "lambda truth"),
+        (
+            {"filters": {"x": filters.EkfSlam}},
+            "expected x to be a filter, got the class EkfSlam: call it",
+        ),
+        ({"filters": {"x": filters.DeadReckoning}}, "got the class DeadReckoning: call it"),
+        ({"filters": catalog.FILTERS}, "'ekf' is a factory: call it, ekf(scenario, …)"),
+        ({"filters": {"fej": catalog.FILTERS["fej"]}}, "call it, fej(world, …)"),
+        (
+            {"filters": {"x": filters.EkfSlam(motion.Unicycle(np.eye(2)), WORLD.sensor, 2)}},
+            "takes controls (v [m/s], omega [rad/s], dt [s]), the scenario ring gives (forward [m], ",
+        ),
+        ({"filters": {"x": lambda a, b, key: None}}, "'x' is a factory: call it, x(a, b, key)"),
+        (
+            {"filters": {"x": worlds.ekf(BESIDE)}},
+            "filter x takes measurements (ahead [m], left [m]), the scenario ring gives (range [m], ",
+        ),
+        (
+            {"filters": {"x": lambda truth: worlds.ekf(BESIDE)}},
+            "filter ekf_slam takes measurements (ahead [m]",
+        ),
+    ],
+)
+def test_bad_arguments_are_refused(change, message):
+    arguments = {"filters": {"ekf": worlds.ekf(WORLD)}, "runs": 2, "key": worlds.key()} | change
+    with pytest.raises(ValueError, match=re.escape(message)):
+        monte_carlo(WORLD, **arguments)

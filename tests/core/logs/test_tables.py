@@ -1,0 +1,186 @@
+"""`Log.from_records` and the alignment of streams below it: by hand, every kind of table, bad input."""
+
+from types import SimpleNamespace
+
+import jax
+import numpy as np
+import pytest
+
+from jaxslam import run
+from jaxslam.core.logs import streams
+from jaxslam.core.types import Log, Status
+from jaxslam.filters import EkfSlam
+from jaxslam.motion import PoseIncrement, Unicycle
+from jaxslam.sensors import Compass, Part, RangeBearing, Suite
+
+DRIVE, EYE = Unicycle(np.eye(2)), RangeBearing(np.eye(2))
+ODOMETRY = [[1.0, 0.5, 0.1], [2.0, 1.0, 0.0], [3.0, 0.0, 0.0]]
+SEEN = [
+    (0.5, 7, 1.0, 0.0),
+    (1.5, 7, 2.0, 0.25),
+    (1.5, 3, 3.0, -0.5),
+    (3.0, -1, 4.0, 0.5),
+    (9.0, 7, 1.0, 0),
+]
+
+
+def columns(rows, *names):
+    return {name: [row[i] for row in rows] for i, name in enumerate(names)}
+
+
+def frame(rows, *names):
+    """What a data frame shows: columns, and each by its name."""
+    table = columns(rows, *names)
+
+    class Frame:
+        def __init__(self):
+            self.columns = list(table)
+
+        def __getitem__(self, name):
+            return np.array(table[name])
+
+    return Frame()
+
+
+STRUCTURED = np.array(ODOMETRY, float).view([("t", float), ("v", float), ("omega", float)])[:, 0]
+
+
+@pytest.mark.parametrize(
+    ("odometry", "seen"),
+    [
+        (ODOMETRY, SEEN),
+        (np.array(ODOMETRY), np.array(SEEN, float)),
+        (STRUCTURED, columns(SEEN, "t", "tag", "range", "bearing")),
+        (
+            frame(ODOMETRY, "t [s]", "v [m/s]", "omega [rad/s]"),
+            frame(SEEN, "t", "tag", "range [m]", "bearing"),
+        ),
+        (
+            columns([(w, x, v, 1e3 * t) for (t, v, w), x in zip(ODOMETRY, "abc", strict=True)],
+                    "omega", "left out", "v", "t [ms]"),
+            columns([(t, k, r, np.rad2deg(b)) for t, k, r, b in SEEN], "t", "tag", "range", "bearing [deg]"),
+        ),
+    ],
+    ids=["lists", "arrays", "columns", "frames", "units"],
+)  # fmt: skip
+def test_a_log_from_records_by_hand(odometry, seen):
+    log, time, tags, dropped = Log.from_records(odometry, seen, DRIVE, EYE)
+    np.testing.assert_allclose(time, [1.0, 1.5, 2.0, 3.0], rtol=1e-15)
+    np.testing.assert_allclose(
+        log.control, [[0, 0, 0], [0.5, 0.1, 0.5], [0.5, 0.1, 0.5], [1, 0, 1]], atol=1e-15
+    )
+    assert tags == (3, 7)
+    np.testing.assert_array_equal(log.scan.tag, [[-1, -1], [1, 0], [-1, -1], [-1, -1]])
+    np.testing.assert_array_equal(log.scan.valid, [[0, 0], [1, 1], [0, 0], [1, 0]])
+    np.testing.assert_allclose(log.scan.z[1], [[2, 0.25], [3, -0.5]], rtol=1e-15)
+    assert dropped == {"measurements outside the odometry": 2}
+
+
+def test_tags_may_be_text_and_unknown():
+    seen = [(1.0, "tree", 1, 0), (1.0, 12, 1, 0), (2.0, "", 1, 0), (2.0, None, 1, 0)]
+    log, _, tags, _ = Log.from_records(ODOMETRY, seen, DRIVE, EYE)
+    assert tags == (12, "tree")
+    np.testing.assert_array_equal(log.scan.tag, [[1, 0], [-1, -1], [-1, -1]])
+    assert log.scan.valid.sum() == 4
+
+
+def test_a_path_of_poses_becomes_increments():
+    """Composed again they give the path; between two poses it is straight."""
+    path = [(0.0, 1.0, 1.0, np.pi / 2), (1.0, 1.0, 3.0, np.pi), (2.0, 0.0, 3.0, -np.pi / 2)]
+    poses = columns(path, "t", "x", "y", "theta")
+    log, time, *_ = Log.from_records(poses, [(0.5, 1, 1, 0)], PoseIncrement(np.eye(3)), EYE)
+    np.testing.assert_array_equal(time, [0, 0.5, 1, 2])
+    np.testing.assert_allclose(log.control[[0, 1, 3]], [[0, 0, 0], [1, 0, np.pi / 4], [1, 0, np.pi / 2]], atol=1e-15)  # fmt: skip
+    at = np.array(path[0][1:])
+    for u in log.control:
+        c, s = np.cos(at[2]), np.sin(at[2])
+        at = at + [c * u[0] - s * u[1], s * u[0] + c * u[1], u[2]]
+    np.testing.assert_allclose(at, [0, 3, 1.5 * np.pi], atol=1e-14)
+
+
+def test_a_sensor_of_no_landmark_needs_no_tag():
+    log, _, tags, _ = Log.from_records(ODOMETRY, [(2.0, 0.5)], DRIVE, Compass(np.eye(1)))
+    assert tags == ()
+    np.testing.assert_array_equal(log.scan.valid[:, 0], [False, True, False])
+
+
+EYES = Suite(((EYE, 3), (Compass(np.eye(1)), 1)))
+NORTH = [(1.5, 0.3), (2.5, 0.2)]
+
+
+def test_sensors_with_rates_of_their_own_are_one_log():
+    """Rows at the times of any; slots by sensor, as the suite has them (Solà 2.4)."""
+    log, time, tags, dropped = Log.from_records(ODOMETRY, (SEEN, NORTH), DRIVE, EYES)
+    np.testing.assert_allclose(time, [1.0, 1.5, 2.0, 2.5, 3.0])
+    np.testing.assert_allclose(log.control[3:], [[1, 0, 0.5], [1, 0, 0.5]])
+    assert (tags, dropped) == ((3, 7), {"measurements outside the odometry": 2})
+    valid = [[0, 0, 0, 0], [1, 1, 0, 1], [0, 0, 0, 0], [0, 0, 0, 1], [1, 0, 0, 0]]
+    np.testing.assert_array_equal(log.scan.valid, valid)
+    np.testing.assert_array_equal(log.scan.tag[1], [1, 0, -1, -1])
+    np.testing.assert_allclose(log.scan.z[1], [[2, 0.25], [3, -0.5], [0, 0], [0.3, 0]])
+    start = np.zeros(3), np.eye(3)
+    trace = run(EkfSlam(DRIVE, EYES, 2), log, *start, jax.random.key(0))
+    assert int(trace.info.tally(Status.FUSED)[3]) == 1
+
+
+def test_tables_that_are_not_those_of_the_suite_are_refused():
+    for seen, message in (
+        (
+            SEEN,
+            r"a table for each of the 2 sensors of the suite, \(range_bearing, compass\), got list",
+        ),
+        (
+            (SEEN, [(1.5, 0.3)] * 2),
+            r"measurements\[1\] of compass, row 1, .*at most 1 measurement at a",
+        ),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Log.from_records(ODOMETRY, seen, DRIVE, EYES)
+    team = Suite((Part(EYE, 1, sees="robots"),))
+    with pytest.raises(
+        ValueError, match=r"of a team make the log of each robot by Log.from_streams"
+    ):
+        Log.from_records(ODOMETRY, (SEEN,), DRIVE, team)
+
+
+BAD = {
+    "a short row": (ODOMETRY, [(1, 7, 1)], r"measurements, row 0: expected 4 values"),
+    "no column": (columns(ODOMETRY, "t", "v", "w"), SEEN, r"odometry: expected a column 'omega \["),
+    "a unit": (columns(ODOMETRY, "t", "v", "omega [rpm]"), SEEN, r"column 'omega \[rad/s\]', got 'o"),
+    "nan": ([*ODOMETRY, (4.0, np.nan, 0.0)], SEEN, r"odometry, row 3, column v: expected a finite"),
+    "text": (ODOMETRY, [(1.0, 7, "1.0", 0)], r"column range: expected a finite number, got '1.0'"),
+    "back": (ODOMETRY[::-1], SEEN, r"row 1, column t: expected a time above 3.0, got 2"),
+    "repeats": (ODOMETRY[:1] * 2, SEEN, r"odometry, row 1, column t: expected a time above 1.0, got 1"),
+    "seen back": (ODOMETRY, SEEN[::-1], r"measurements, row 1, column t: expected a time of at leas"),
+    "a tag": (ODOMETRY, [(1.0, 7.5, 1, 0)], r"column tag: expected a whole number or text, got 7.5"),
+    "a negative tag": (ODOMETRY, [(1.0, -2, 1, 0)], r"row 0, column tag: expected a number >= 0"),
+    "twice": (ODOMETRY, [(1.0, 7, 1, 0)] * 2, r"row 1, column tag: expected a tag once at a time"),
+    "nothing": (ODOMETRY, [], r"measurements: expected at least one row, got none"),
+    "lengths": ({"t": [1], "v": [], "omega": [1]}, SEEN, r"expected columns of one length"),
+    "no table": (3, SEEN, r"odometry: expected rows or columns, got int"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize(("odometry", "seen", "message"), BAD.values(), ids=BAD)
+def test_bad_records_say_where(odometry, seen, message):
+    with pytest.raises(ValueError, match=r"Log.from_records: .*" + message):
+        Log.from_records(odometry, seen, DRIVE, EYE)
+
+
+def test_increments_cannot_be_divided():
+    motion = SimpleNamespace(controls=("forward [m]", "turn [rad]"))
+    seen = [(1.5, 7, 1, 0)]
+    with pytest.raises(ValueError, match=r"row 0, column t: expected a time of the odometry"):
+        Log.from_records(ODOMETRY, seen, motion, EYE)
+    log, *_ = Log.from_records(ODOMETRY, [(2.0, 7, 1, 0)], motion, EYE)
+    np.testing.assert_array_equal(log.control, np.array(ODOMETRY)[:, 1:])
+
+
+def test_streams_need_a_row_for_each_measurement():
+    stream = np.arange(2.0), np.zeros((2, 1))
+    with pytest.raises(
+        ValueError, match="align: expected measurements at times of rows, got one a"
+    ):
+        streams.align_streams(stream, ([0.5], [0], np.ones((1, 2))), streams.as_recorded, [0, 1])
+    with pytest.raises(ValueError, match="expected a row at each time of the odometry"):
+        streams.align_streams(stream, ([0.5], [0], np.ones((1, 2))), streams.as_recorded)
