@@ -1,8 +1,9 @@
 """Sphinx extension: writes the pages of the API reference from the package.
 
 A name is public if a package lists it in `__all__`, or if its module stands directly below
-`jaxslam` or is one of `INTRODUCED` or `OPEN`; and if neither it nor its module begins with an underscore. It is
-shown under the shortest path that reaches it: the package that lists it, else its own module.
+`jaxslam` or is one of `INTRODUCED` or `OPEN`; and if neither it nor its module begins with an
+underscore. It is shown under the shortest path that reaches it: the package that lists it, else its
+own module.
 """
 
 import ast

@@ -7,8 +7,8 @@ from types import SimpleNamespace
 import jax
 import numpy as np
 import pytest
-from laser_slam.ring_of_rooms import FAR, ranges_of
 from matplotlib.animation import FFMpegWriter
+from ring_of_rooms import FAR, ranges_of
 
 from jaxslam import cli, grids
 from jaxslam.cli.laser.mapping import TOGETHER

@@ -26,7 +26,6 @@ from jaxslam.consistency.metrics.relative import (
     statistics,
     summary,
 )
-from jaxslam.laser.grids import correlation
 
 __all__ = [
     "Errors",
@@ -39,7 +38,6 @@ __all__ = [
     "ate",
     "benchmark_figures",
     "carried",
-    "correlation",
     "given",
     "joined",
     "map_entropy",
