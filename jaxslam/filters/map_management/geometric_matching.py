@@ -160,18 +160,16 @@ class _SearchLimits(NamedTuple):
     candidates: int
 
 
-def search_limits(
-    caller: str, size: int, probability: float, pairs: int, candidates: int
-) -> _SearchLimits:
-    """The limits of a search over M = size cluster points.
-
-    Raises ValueError, which names the caller, on a probability not between 0 and 1, or pairs or
-    candidates below 1.
-    """
+def check_search(caller: str, probability: float, pairs: int, candidates: int) -> None:
+    """Raise ValueError on a probability not between 0 and 1, or pairs or candidates below 1."""
     if not 0 < probability < 1:
         raise ValueError(f"{caller}: expected a probability between 0 and 1, got {probability}")
     check_count(f"{caller}: pairs", pairs)
     check_count(f"{caller}: candidates", candidates)
+
+
+def search_limits(size: int, probability: float, pairs: int, candidates: int) -> _SearchLimits:
+    """The limits of a search over M = size cluster points."""
     joint = [chi2_quantile(probability, max(2 * n - 3, 1)) for n in range(size + 1)]
     single = chi2_quantile(probability, 1), chi2_quantile(probability, 2)
     return _SearchLimits(single, np.asarray(joint), pairs, candidates)

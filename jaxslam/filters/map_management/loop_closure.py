@@ -17,6 +17,7 @@ from jaxslam.core.slots import Joint
 from jaxslam.filters.ekf.map_coordinates import cov_of_coordinates
 from jaxslam.filters.map_management.geometric_matching import (
     GeometricMatch,
+    check_search,
     match_points,
     search_limits,
     with_unit_blocks,
@@ -132,7 +133,7 @@ class LoopSettings:
         check_policy("LoopSettings", self.least, self.margin)
         if not 0 < self.drift < 1:
             raise ValueError(f"LoopSettings: expected a drift between 0 and 1, got {self.drift}")
-        search_limits("LoopSettings", self.cluster, self.probability, self.pairs, self.candidates)
+        check_search("LoopSettings", self.probability, self.pairs, self.candidates)
 
 
 def check_recency(caller: str, joint: Joint, chart: Chart) -> None:
@@ -213,7 +214,7 @@ def _old_slots(
         [0.0, *(chi2_quantile(settings.drift, 2 * n) for n in range(1, settings.cluster + 1))]
     )
     limits = search_limits(
-        "close_loop", settings.cluster, settings.probability, settings.pairs, settings.candidates
+        settings.cluster, settings.probability, settings.pairs, settings.candidates
     )
     cov = cov_of_coordinates(joint, chart)[3:, 3:].reshape(capacity, 2, capacity, 2)
     own, shared = cov[recent][:, :, recent], cov[recent]

@@ -18,6 +18,7 @@ from jaxslam.filters.ekf.map_coordinates import (
 from jaxslam.filters.map_management.geometric_matching import (
     GeometricMatch,
     align_points,
+    check_search,
     match_points,
     search_limits,
 )
@@ -113,7 +114,8 @@ def relocalize(
         if np.shape(value) != shape:
             raise ValueError(f"relocalize: expected shape {shape}, got {np.shape(value)}")
     check_policy("relocalize", least, margin)
-    limits = search_limits("relocalize", m, probability, pairs, candidates)
+    check_search("relocalize", probability, pairs, candidates)
+    limits = search_limits(m, probability, pairs, candidates)
     if n < 2 or m < 2:
         return _judged(_nothing(m, jnp.result_type(points)), least, margin)
     own = jnp.zeros((m, 2, m, 2), seen.dtype)
