@@ -24,8 +24,9 @@ class Constant:
     def __call__(self, *arguments: jax.Array) -> jax.Array:
         if np.ndim(self.cov) > 2:
             raise ValueError(
-                f"noise_cov: expected a covariance (n, n), got {np.shape(self.cov)}: run a stack "
-                "of filters as jax.vmap(run, in_axes=(0, None, None, None, None))(stack, …)"
+                f"noise_cov: expected a covariance (n, n), got {np.shape(self.cov)}: a stack of "
+                "filters or worlds goes through jax.vmap, as "
+                "jax.vmap(run, in_axes=(0, None, None, None, None))(stack, …)"
             )
         return jnp.asarray(self.cov, arguments[0].dtype)
 

@@ -64,7 +64,7 @@ def check_real(name: str, **values: Any) -> None:
         except (TypeError, ValueError):  # a key; rows of unlike lengths
             dtype = np.dtype(object)
         if not any(jnp.issubdtype(dtype, kind) for kind in (np.integer, np.floating, np.bool_)):
-            got = value if isinstance(value, str) else shape_told(value)
+            got = value if isinstance(value, str | tuple | list) else shape_told(value)
             raise ValueError(f"{name}: expected real numbers as {what}, got {got!s}")
 
 
@@ -81,6 +81,7 @@ def check_mount(name: str, mount: ArrayLike) -> None:
     got = shape_told(mount if is_concrete(mount) else jnp.asarray(mount))
     if got != "(3,)":
         raise ValueError(f"{name}: expected a mounting pose of shape (3,), got {got}")
+    check_real(name, mount=mount)
     if is_concrete(mount) and not np.all(np.isfinite(np.asarray(mount))):
         raise ValueError(f"{name}: the mounting pose is not finite")
 
@@ -116,7 +117,10 @@ def check_key(name: str, key: object) -> None:
 
 def check_gate(name: str, gate: ArrayLike | None) -> None:
     """Raise ValueError unless the gate is None, a tracer, or above 0."""
-    if gate is not None and is_concrete(gate) and not np.asarray(gate) > 0:
+    if gate is None or not is_concrete(gate):
+        return
+    check_real(name, gate=gate)
+    if np.shape(gate) != () or not np.asarray(gate) > 0:
         raise ValueError(f"{name}: expected a gate above 0, got {gate}")
 
 

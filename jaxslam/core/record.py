@@ -36,8 +36,15 @@ def record(cls: type[_T]) -> type[_T]:
     given = cls.__dict__.get("__post_init__") or getattr(cls, "__post_init__", None)
 
     def __post_init__(self: Any) -> None:
-        if given is not None:
-            given(self)
+        for field in dataclasses.fields(self):
+            if field.metadata.get("static") and _is_array(value := getattr(self, field.name)):
+                _check_static(f"{type(self).__name__}: {field.name}", value)
+        try:
+            if given is not None:
+                given(self)
+        except TypeError:  # arithmetic with text, say: a field of another kind says more
+            _check_kinds(self)
+            raise
         _check_kinds(self)
 
     cls.__post_init__ = __post_init__  # type: ignore[attr-defined]
@@ -137,7 +144,7 @@ def _check_static(where: str, value: Any) -> None:
     if isinstance(value, tuple | frozenset):
         for each in value:
             _check_static(where, each)
-    elif isinstance(value, np.ndarray | jax.Array):
+    elif _is_array(value):
         raise ValueError(f"{where}: expected a value that is compared by ==, got an array")
     elif is_record(value) and jax.tree.leaves(value):
         got = f"the record {type(value).__name__}, whose numbers belong in a field of data"
@@ -162,6 +169,10 @@ def _check_child(where: str, value: Any) -> None:
 
 
 _WANTED = "a number, an array or a record (a choice or a function is a static() field)"
+
+
+def _is_array(value: Any) -> bool:
+    return isinstance(value, np.ndarray | jax.Array)
 
 
 def _is_number(value: Any) -> bool:

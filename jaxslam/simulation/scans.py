@@ -38,6 +38,11 @@ def sensor_scans(
     places = min(places, count)
     by_time = None if targets.ndim == 2 else 0
     seen = jax.vmap(jax.vmap(visible, (None, 0)), (0, by_time))(poses, targets)
+    if seen.shape != (len(poses), count) or seen.dtype != bool:
+        raise ValueError(
+            f"visible: expected a bool for each pose and landmark, got {seen.dtype} of shape "
+            f"{seen.shape[2:]}"
+        )
     if on is not None:
         seen = seen & on[:, None]
     if places < count:

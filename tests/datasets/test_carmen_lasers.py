@@ -60,7 +60,9 @@ def test_a_maximum_range_that_is_none_is_told(read, far):
         read(line("ROBOTLASER1", ROBOT[0], far="far"))
 
 
-@pytest.mark.parametrize(("kind", "mount"), [("ROBOTLASER1", MOUNT), ("RLASER", (0, 0, np.pi))])
+@pytest.mark.parametrize(
+    ("kind", "mount"), [("ROBOTLASER1", MOUNT), ("FLASER", MOUNT), ("RLASER", (-0.1, 0, np.pi))]
+)
 def test_the_mount_is_that_of_the_lines(read, kind, mount):
     log = read(*(line(kind, robot, mount, t) for t, robot in enumerate(ROBOT)))
     np.testing.assert_allclose(poses.between(log.mount, np.array(mount)), 0, atol=1e-5)
@@ -69,9 +71,21 @@ def test_the_mount_is_that_of_the_lines(read, kind, mount):
     np.testing.assert_allclose(log.time, [0, 1, 2])
 
 
-def test_the_mount_of_flaser_is_zero_or_given(read):
+@pytest.mark.parametrize(("kind", "mount"), [("FLASER", (0, 0, 0)), ("RLASER", (0, 0, np.pi))])
+def test_two_poses_that_differ_by_no_constant_are_a_correction(read, kind, mount):
+    drift = [(0.1 * t, 0.02 * t, 0.03 * t) for t in range(len(ROBOT))]
+    log = read(
+        *(
+            line(kind, robot, off, t)
+            for t, (robot, off) in enumerate(zip(ROBOT, drift, strict=True))
+        )
+    )
+    np.testing.assert_array_equal(log.mount, mount)
+    assert any("differ by no constant mount" in what for what in log.corrections)
+
+
+def test_a_mount_that_is_given_takes_the_place_of_that_of_the_lines(read):
     lines = [line("FLASER", robot, MOUNT, t) for t, robot in enumerate(ROBOT)]
-    np.testing.assert_array_equal(read(*lines).mount, np.zeros(3))
     log = read(*lines, mount=MOUNT)
     np.testing.assert_array_equal(log.mount, MOUNT)
     np.testing.assert_allclose(log.corrected, ROBOT, atol=1e-5)
@@ -128,7 +142,7 @@ def office(count, largest=12.0, seed=0):
 
 def test_the_sign_that_a_beam_met_nothing_is_found_in_the_ranges():
     walls = office(5000)
-    signs = 32.76 + np.random.default_rng(1).uniform(-0.005, 0.005, 300)
+    signs = np.random.default_rng(1).choice([32.763, 32.767], 300)
     code = _code_of_no_return(np.concatenate([walls, signs]))
     assert walls.max() < code < signs.min() and code > 32.0
     # A few walls as far as that change nothing, if signs are many more.
@@ -143,6 +157,9 @@ def test_a_far_wall_that_is_seen_often_is_no_sign():
     wall = 30.0 / np.cos(bearing)
     noise = np.random.default_rng(2).normal(scale=0.01, size=len(wall))
     assert _code_of_no_return(np.concatenate([office(4000), wall + noise])) is None
+    # The end of a corridor, through a door, as a log to a centimetre has it.
+    end = np.random.default_rng(4).normal(10.0, 0.01, 300).round(2)
+    assert _code_of_no_return(np.concatenate([office(10_000, 6.0), end])) is None
     # And one that is seen while the robot drives up to it.
     distance = np.random.default_rng(3).uniform(5.0, 30.0, 4000)
     assert _code_of_no_return(np.concatenate([office(4000), distance])) is None
@@ -164,7 +181,7 @@ def test_a_log_with_the_sign_says_so_and_its_beams_met_nothing(read):
     for k in range(12):
         ranges = office(100, seed=k)
         none = random.random(100) < 0.1
-        ranges[none] = 32.76 + random.uniform(-0.005, 0.005, none.sum())
+        ranges[none] = random.choice([32.763, 32.767], none.sum())
         told = " ".join(f"{value:.3f}" for value in ranges)
         lines.append(f"FLASER 100 {told} 0 0 0 0 0 0 {k} host {k}")
     log = read(*lines)

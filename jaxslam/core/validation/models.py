@@ -192,6 +192,11 @@ def _check_size(
         raise ValueError(f"{name}: expected {call} to return shape {_told(shape)}, got {what}")
     if not jnp.issubdtype(getattr(found, "dtype", np.dtype(object)), jnp.floating):
         raise ValueError(f"{name}: expected {call} to return real numbers, got {found.dtype}")
+    given = next(iter(arguments.values())).dtype
+    if field != "noise_cov" and found.dtype != given:
+        raise ValueError(
+            f"{name}: expected {call} to return {given}, as its arguments are, got {found.dtype}"
+        )
 
 
 def _told(shape: _Shape) -> str:

@@ -105,8 +105,9 @@ def carmen(
     from -90° on; of 400 and 401 ¼°, from -50° on (the laser's field of 100°; CARMEN itself begins
     at -90° there).
 
-    **Mount**: the laser's pose on the robot, from the two poses of ROBOTLASER; (0, 0, π) for
-    RLASER, zero for FLASER and RAWLASER. The robot's corrected pose of these, and where the
+    **Mount**: the laser's pose on the robot, from the two poses of a line. Where those of FLASER or
+    RLASER are the same, or differ by no constant, it is zero, or (0, 0, π) for RLASER; zero for
+    RAWLASER. The robot's corrected pose of these, and where the
     mount is given, is the laser's without the mount; where a line has one pose twice, that pose.
 
     Args:
@@ -153,7 +154,7 @@ def carmen(
     corrections: list[str] = []
     clock = clock_of(scans, corrections)
     time = np.array([scan.times[clock] for scan in scans])
-    frame = mount_of(file, kind, scans) if given is None else given
+    frame = mount_of(file, kind, scans, corrections) if given is None else given
     corrected, robot = robot_poses(kind, scans, frame, given is not None)
     if odometry is not None:
         found, time, told = of_file(odometry, time, str(file.path))

@@ -3,11 +3,11 @@
 from collections import Counter
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 from numpy.typing import ArrayLike
 
 from jaxslam.core.types import Beams
-from jaxslam.datasets.carmen.lines import Scan
+from jaxslam.datasets.carmen.lines import Scan, has_poses
 from jaxslam.datasets.lines import TextFile
 from jaxslam.math import numpy_poses as poses
 
@@ -69,15 +69,19 @@ def _code_of_no_return(ranges: Float[np.ndarray, "n"]) -> float | None:
     """The range from which on beams met nothing [m], of a laser that says so by its largest range;
     None where ranges do not show that.
 
-    They do if the last hundredth of the largest range has more than one beam in 500, and ten times
-    as many as the tenth below it: walls are not found at one distance alone.
+    They do if the last hundredth of the largest range has more than one beam in 500, ten times as
+    many as the tenth below it, and two values are 93 % of them: a wall that is seen from one place
+    alone is measured with noise, but a code is one number, or in a pair of units two.
     """
     if len(ranges) < 1000:
         return None
     code = 0.99 * float(ranges.max())
-    last = int((ranges >= code).sum())
+    last = ranges[ranges >= code]
     below = int(((ranges < code) & (ranges >= 0.9 * code)).sum())
-    return code if last > max(len(ranges) / 500, 10 * below) else None
+    if len(last) <= max(len(ranges) / 500, 10 * below):
+        return None
+    _, count = np.unique(last, return_counts=True)
+    return code if np.sort(count)[-2:].sum() > 0.93 * len(last) else None
 
 
 def checked_mount(mount: ArrayLike) -> Float[np.ndarray, "3"]:
@@ -92,18 +96,33 @@ def checked_mount(mount: ArrayLike) -> Float[np.ndarray, "3"]:
     return frame
 
 
-def mount_of(file: TextFile, kind: str, scans: list[Scan]) -> Float[np.ndarray, "3"]:
-    """The laser's pose on the robot: of ROBOTLASER robot⁻¹ ∘ laser, as constant as it is printed.
+def mount_of(
+    file: TextFile, kind: str, scans: list[Scan], corrections: list[str]
+) -> Float[np.ndarray, "3"]:
+    """The laser's pose on the robot, robot⁻¹ ∘ laser, as constant as it is printed.
 
-    Raises ValueError, with file and line, where it differs between lines.
+    FLASER and RLASER may have a corrected pose in place of the laser's: where the two poses are the
+    same, or differ by no constant, the laser looks ahead, that of RLASER back.
+
+    Raises ValueError, with file and line, where it differs between lines of ROBOTLASER.
     """
-    if not kind.startswith("ROBOTLASER"):
-        return _REAR.copy() if kind == "RLASER" else np.zeros(3)
+    default = _REAR.copy() if kind == "RLASER" else np.zeros(3)
+    if not has_poses(kind):
+        return default
     laser, robot = (np.array([getattr(scan, of) for scan in scans]) for of in ("laser", "robot"))
     mounts = poses.between(robot, laser)
     off = poses.between(mounts[0], mounts)
-    far = (np.hypot(off[:, 0], off[:, 1]) > LOOSE[0]) | (np.abs(off[:, 2]) > LOOSE[1])
-    if far.any():
+    far = _beyond(off)
+    if not kind.startswith("ROBOTLASER"):
+        if far.any():
+            corrections.append(
+                f"the two poses of {kind} differ by no constant mount: the first is taken for the "
+                "robot's corrected pose"
+            )
+        if far.any() or not _beyond(mounts[:1]).any():
+            return default
+        corrections.append(f"the mount is that of the two poses of {kind}: {told(mounts[0])}")
+    elif far.any():
         k = int(far.argmax())
         raise file.error(
             scans[k].line,
@@ -112,6 +131,11 @@ def mount_of(file: TextFile, kind: str, scans: list[Scan]) -> Float[np.ndarray, 
         )
     # The median of what is left is free of the rounding of a single line.
     return poses.compose(mounts[0], np.median(off, axis=0))
+
+
+def _beyond(off: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+    """Which poses differ from zero by more than printing and rounding do."""
+    return (np.hypot(off[:, 0], off[:, 1]) > LOOSE[0]) | (np.abs(off[:, 2]) > LOOSE[1])
 
 
 def told(pose: Float[np.ndarray, "3"]) -> str:
