@@ -19,6 +19,7 @@ from typing import Any
 import jax
 
 from benchmarks import (
+    accelerator,
     baselines,
     bearing,
     campaigns,
@@ -90,6 +91,7 @@ def parts(quick: bool) -> dict[str, Callable[[], list[Metric]]]:
         "commands": command_seconds,
         "compile": compile.measure,
         "speed": lambda: gated(measure_speed(quick)),
+        "accelerator": accelerator.measure,
         "gradient": lambda: gradient.measure() + gradient.measure("sequential"),
         "film": film.measure,
         "verdict": lambda: verdict.measure(1000 if quick else 4000),

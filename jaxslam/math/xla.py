@@ -53,7 +53,7 @@ def one_kernel(function: Callable[..., _T], *arguments: PyTree) -> _T:
     call a library (LAPACK, FFT): XLA cannot compile that in one kernel, and may abort the process.
     """
     if jax.default_backend() != "cpu":
-        return function(*arguments)
+        return function(*jax.tree.map(jnp.asarray, arguments))
 
     @functools.wraps(function)
     def whole(*arguments: PyTree) -> _T:

@@ -69,7 +69,7 @@ def test_a_loop_in_one_kernel_is_the_loop(given):
     }[given]
     program = jax.jit(f).lower(table, x).compile()
     np.testing.assert_array_equal(np.ravel(program(table, x)), [1, 4, 7])
-    if given == "argument":
+    if given == "argument" and jax.default_backend() == "cpu":
         assert re.search(r"call\(.*xla_cpu_small_call=\"true\"", program.as_text())
 
 

@@ -61,7 +61,7 @@ def monte_carlo(
             by its memory on an accelerator. Where memory does not suffice, half of it is tried,
             with a warning.
         devices: default all of `jax.local_devices()`.
-        workers: blocks in flight at once; default as many as keep every core of a CPU busy (1 on an
+        workers: blocks in flight at once; default as many as keep every core of a CPU busy (2 on an
             accelerator).
         bound: also take the conditional Cramér-Rao bound of every run (`conditional_bound`), at
             the price of one more EKF.
@@ -92,7 +92,9 @@ def monte_carlo(
     devices = jax.local_devices() if devices is None else list(devices)
     dtype = check_dtype(dtype)
     if workers is None:
-        workers = -(-cores() // len(devices)) if devices[0].platform == "cpu" else 1
+        # An accelerator computes a block while the host scores the one before: 1.4 times the runs a
+        # second of one block at a time on an H100, and no more with three.
+        workers = -(-cores() // len(devices)) if devices[0].platform == "cpu" else 2
     names = (*filters, BOUND)
     tallies = {name: Tally() for name in names}
     size = int(block or fitting_block(scenario, filters, devices[0]))
