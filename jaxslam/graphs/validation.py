@@ -207,12 +207,12 @@ def _check_gauge(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None
     members = np.flatnonzero(parts.part == loose[0])
     told = ", ".join(label(graph, int(variable)) for variable in members[:3])
     told += f", … ({len(members):,} variables)" if len(members) > 3 else ""
-    count = int(parts.free.sum())
-    if count == 1:
+    if parts.free.sum() == 1 and not parts.anchored.any():
         raise ValueError(
             f"{name}: the graph has no gauge: fix a pose (`graphs.with_gauge` fixes the first) or "
             "give one a prior"
         )
+    count = int((parts.free | parts.anchored).sum())
     raise ValueError(
         f"{name}: the graph is disconnected: no measurement with information joins {told} to a "
         f"fixed pose or one with a prior; {count} parts, {len(loose)} of them loose"

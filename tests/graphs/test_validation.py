@@ -147,6 +147,23 @@ def test_a_part_that_is_fixed_needs_no_gauge():
     graphs.check_graph("optimize", graphs.with_gauge(free), graphs.REGISTRY)
 
 
+def test_a_fixed_pose_that_nothing_joins_to_the_other_is_no_missing_gauge():
+    graph = small_graphs.only(small_graphs.drawn(), "relative_pose")
+    zero = graph.tables["relative_pose"]
+    zero = zero._replace(information=np.zeros_like(zero.information))
+    two = graph._replace(
+        poses=graph.poses[:2],
+        fixed_pose=np.array([True, False]),
+        pose_id=graph.pose_id[:2],
+        points=np.zeros((0, 2)),
+        fixed_point=np.zeros(0, bool),
+        point_id=np.zeros(0, int),
+        tables={"relative_pose": type(zero)(*(part[:1] for part in zero))},
+    )
+    with pytest.raises(ValueError, match=r"disconnected: .* joins pose 11 .*; 2 parts, 1 of"):
+        graphs.check_graph("optimize", two, graphs.REGISTRY)
+
+
 def test_another_kind_of_number_is_refused():
     graph = small_graphs.drawn()
     table = graph.tables["prior"]

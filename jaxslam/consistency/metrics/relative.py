@@ -67,9 +67,13 @@ def relations(
     at = travelled(path) if seconds is None else np.asarray(time, np.float64)
     if rows is not None:
         at = np.arange(len(path), dtype=np.float64)
-    if at.shape != (len(path),) or not (np.diff(at) >= 0).all():
+    if at.shape != (len(path),):
+        raise ValueError(f"relations: expected stamps of shape ({len(path)},), got {at.shape}")
+    if not (rises := np.diff(at) >= 0).all():
+        row = int(rises.argmin())
         raise ValueError(
-            f"relations: expected stamps ({len(path)},) that do not go back, got {at.shape}"
+            f"relations: expected stamps that do not go back, got {at[row + 1]} in row {row + 1} "
+            f"after {at[row]}"
         )
     given = next(spacing for spacing in (rows, seconds, metres) if spacing is not None)
     spacings = np.atleast_1d(np.asarray(given, np.float64))
@@ -211,9 +215,12 @@ def travelled(path: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K"]:
 
 def _stamps_of(caller: str, given: ArrayLike, count: int) -> Float[np.ndarray, "R"]:
     stamps = np.asarray(given, np.float64)
-    if stamps.shape != (count,) or not np.isfinite(stamps).all():
+    if stamps.shape != (count,):
+        raise ValueError(f"{caller}: expected {count} stamps of relations, got {stamps.shape}")
+    if not (finite := np.isfinite(stamps)).all():
+        row = int(finite.argmin())
         raise ValueError(
-            f"{caller}: expected {count} finite stamps of relations, got {stamps.shape}"
+            f"{caller}: expected finite stamps of relations, got {stamps[row]} in row {row}"
         )
     return stamps
 

@@ -121,19 +121,24 @@ def align_tables(
     """
     clock = odometry.columns[TIME]
     check_times(odometry, strict=True)
-    named = {name for seen in sensors for name in seen.table.tags or ()}
-    tag_of = {name: tag for tag, name in enumerate(ordered({*names, *named}))}
-    tags = [_tags_in_scans(seen, tag_of) for seen in sensors]
     columns = odometry_columns(controls, tuple(odometry.columns))
     last = clock[-1]
     rule: streams.Rule = streams.relative_poses if columns == POSE else streams.as_recorded
     if columns != POSE and INTERVAL in controls and controls[:3] != _INCREMENT:
         rule = streams.hold
         last += np.max(np.diff(clock), initial=0.0)
+    within = [(t >= clock[0]) & (t <= last) for t in (seen.table.columns[TIME] for seen in sensors)]
+    named = {
+        name
+        for seen, inside in zip(sensors, within, strict=True)
+        for name, kept in zip(seen.table.tags or (), inside, strict=False)
+        if kept
+    }
+    tag_of = {name: tag for tag, name in enumerate(ordered({*names, *named}))}
+    tags = [_tags_in_scans(seen, tag_of) for seen in sensors]
     kept, outside = [], 0
-    for seen, tag in zip(sensors, tags, strict=True):
+    for seen, tag, inside in zip(sensors, tags, within, strict=True):
         when = seen.table.columns[TIME]
-        inside = (when >= clock[0]) & (when <= last)
         lost = np.flatnonzero(inside & ~np.isin(when, clock))
         if lost.size and rule is streams.as_recorded:
             raise ValueError(
@@ -158,7 +163,7 @@ def _tags_in_scans(seen: Seen[_Name], tag_of: dict[_Name, int]) -> Int[np.ndarra
     table, when = seen.table, seen.table.columns[TIME]
     check_times(table, strict=False)
     named = table.tags or [None] * len(when)
-    tags = [-1 if name is None else tag_of[name] for name in named]
+    tags = [-1 if name is None else tag_of.get(name, -1) for name in named]
     scan: set[tuple[float, int]] = set()
     for row, pair in enumerate(zip(when.tolist(), tags, strict=True)):
         if pair[1] >= 0 and pair in scan:

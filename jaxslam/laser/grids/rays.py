@@ -127,7 +127,8 @@ def cast(
     """The range [m] of each beam from each pose: to the nearest obstacle, at most max_range.
 
     A beam leaves the pose (x, y, θ) in direction θ + angle. Unknown cells do not stop it. A beam
-    that leaves the map, or starts off it, has max_range; one that starts in an obstacle has 0.
+    that leaves the map has max_range, and within a trace one that starts off it; one that starts in
+    an obstacle has 0.
 
     Two methods, by `ray_map`, and both are differentiable; a plain grid is cast by the one that
     `ray_map` takes by default:

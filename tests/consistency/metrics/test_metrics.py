@@ -221,7 +221,7 @@ def test_the_entropy_of_a_map_is_that_of_its_known_cells():
         ),
         (
             lambda: metrics.given([0, 1], [0], [np.nan], SQUARE[:1], tolerance=1),
-            "given: expected 1 finite stamps",
+            "given: expected finite stamps of relations, got nan in row 0",
         ),
         (
             lambda: metrics.given([0, np.inf], [0], [1], SQUARE[:1], tolerance=1),

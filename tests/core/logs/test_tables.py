@@ -76,6 +76,13 @@ def test_a_log_from_records_by_hand(odometry, seen):
     assert dropped == {"measurements outside the odometry": 2}
 
 
+def test_a_landmark_whose_measurements_are_all_outside_the_odometry_has_no_tag():
+    seen = [(-1.0, 5, 1, 0), (1.0, 7, 1, 0), (9.0, 5, 1, 0)]
+    log, _, tags, dropped = Log.from_records(ODOMETRY, seen, DRIVE, EYE)
+    assert tags == (7,) and log.scan.tag.max() == 0
+    assert dropped == {"measurements outside the odometry": 2}
+
+
 def test_tags_may_be_text_and_unknown():
     seen = [(1.0, "tree", 1, 0), (1.0, 12, 1, 0), (2.0, "", 1, 0), (2.0, None, 1, 0)]
     log, _, tags, _ = Log.from_records(ODOMETRY, seen, DRIVE, EYE)
