@@ -34,7 +34,7 @@ POINTS = np.array([[3.0, 1.0], [-1.0, 4.0], [-3.0, -1.0], [2.0, -3.0]])
 
 
 def simulated(runs: int = 8, steps: int = 200, seed: int = 0) -> Callable[[jax.Array], Info]:
-    """The EKF's innovations in runs round four landmarks with true noise TRUE, as a function of σ."""
+    """The EKF's innovations in runs round four landmarks with noise TRUE, as a function of σ."""
 
     def models(sigma: Any) -> tuple[Any, Any]:
         noise = jnp.asarray(sigma) ** 2

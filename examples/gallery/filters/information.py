@@ -1,4 +1,4 @@
-"""Information: covariance and information of one filter, normalized; and SEIF, which removes links."""
+"""Information: covariance and information of one filter, normalized; and SEIF, which cuts links."""
 
 import jax
 import numpy as np
