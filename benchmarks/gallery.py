@@ -38,33 +38,33 @@ COLOURS, DOTS = 64, 110
 
 HEAD = """# Gallery
 
-Every scenario, family of filters and data set, and a method of the sources, with one picture and
-the lines that made it. Each script is a file of `examples/gallery/`, and runs alone: the picture is
-its `figure`, which `figure.savefig("picture.png")` writes. `python -m benchmarks.gallery` makes all
-pictures and this page again, `python -m benchmarks.gallery circle` one picture. Those of data sets
-need the [files](guide/real_data.md).
+Every scenario, family of filters and data set, and a method of the sources, with one figure and
+its code. Each script is a file of `examples/gallery/` and runs alone: it binds `figure`, which
+`figure.savefig("picture.png")` writes. `python -m benchmarks.gallery` makes all figures and this
+page again, `python -m benchmarks.gallery circle` one figure. The data sets need their
+[files](guide/real_data.md).
 """
 
 PARTS = {
     "scenarios": """## Scenarios
 
-{py:mod}`jaxslam.simulation.scenarios` has them by name. Steps are fewer here than in the published
-experiments.
+{py:mod}`jaxslam.simulation.scenarios` has them by name. The figures have fewer steps than the
+published experiments.
 """,
     "filters": """## Families of filters
 
-[Choosing a filter](guide/choosing_a_filter.md) says which is for what. {py:mod}`jaxslam.catalog`
+[Choosing a filter](guide/choosing_a_filter.md) compares them. {py:mod}`jaxslam.catalog`
 has the families that run in every scenario.
 """,
     "methods": """## Methods
 
-[Bearings and ranges](methods/bearings_and_ranges.md#delayed-initialization) says what the library
-does in place of this.
+[Bearings and ranges](methods/bearings_and_ranges.md#delayed-initialization) describes the method of
+the library.
 """,
     "datasets": """## Data sets
 
-{py:mod}`jaxslam.datasets` has the readers. [Real data](guide/real_data.md) says where the files
-are, [Your own data](guide/own_data.md) how to write your own.
+{py:mod}`jaxslam.datasets` has the readers. [Real data](guide/real_data.md) lists the sources of the
+files; [Your own data](guide/own_data.md) describes how to write your own.
 """,
 }
 """What the page says of each folder of scripts."""

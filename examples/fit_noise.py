@@ -1,10 +1,10 @@
-"""Fit motion and sensor noise by maximum likelihood, on simulated runs or on a robot's own log.
+"""Fit motion and sensor noise by maximum likelihood, on simulated runs or on a recorded log.
 
     python examples/fit_noise.py
     python examples/fit_noise.py --mrclam FOLDER --robot 1 --steps 10000
 
-The likelihood is the filter's own, Σ log N(innovation; 0, S) over the run, and
-`calibration.fit_noise` climbs it from starts a factor 5 off, by exact gradients through every step.
+The likelihood is that of the filter, Σ log N(innovation; 0, S) over the run.
+`calibration.fit_noise` maximizes it from starts a factor 5 off, with exact gradients.
 """
 
 import argparse
@@ -25,7 +25,7 @@ from jaxslam.datasets import mrclam
 from jaxslam.datasets.mrclam.robot import ODOMETRY_DENSITY, white_noise
 
 OFF = np.array([5.0, 0.2, 0.2, 5.0])
-"""How far from the truth, or the reader's defaults, the four parameters start."""
+"""Factors from the truth, or from the reader's defaults, to the starts of the four parameters."""
 
 
 TRUE = np.array([0.02, 0.01, 0.05, np.deg2rad(1.0)])
@@ -34,7 +34,7 @@ POINTS = np.array([[3.0, 1.0], [-1.0, 4.0], [-3.0, -1.0], [2.0, -3.0]])
 
 
 def simulated(runs: int = 8, steps: int = 200, seed: int = 0) -> Callable[[jax.Array], Info]:
-    """The EKF's innovations in runs round four landmarks, whose true noise is TRUE, by σ (4,)."""
+    """The EKF's innovations in runs round four landmarks with noise TRUE, as a function of σ."""
 
     def models(sigma: Any) -> tuple[Any, Any]:
         noise = jnp.asarray(sigma) ** 2
@@ -62,7 +62,7 @@ RECORDED = ("travel [m/√s]", "heading [rad/√s]", "range [m]", "bearing [rad]
 
 
 def recorded(data: Any, steps: int) -> Callable[[jax.Array], Info]:
-    """The EKF's innovations in the first rows of a log of `datasets.mrclam`, by σ (4,)."""
+    """The EKF's innovations in the first rows of a log of `datasets.mrclam`, as a function of σ."""
     log = jax.tree.map(lambda a: jnp.asarray(a[:steps]), data.log)
 
     def info(sigma: jax.Array) -> Info:

@@ -1,7 +1,7 @@
-"""The Notes' velocity motion and its Jacobian as they stand: `jaxslam verify` finds what is wrong.
+"""The velocity motion of the Notes and its printed Jacobian, whose mistakes `jaxslam verify` finds.
 
-Row 2 has a sign wrong, and the matrix after "I +" has a 1 at (3, 3) where a 0 belongs. The motion
-itself divides by ω, so it has no value at ω = 0; `jaxslam.motion.Velocity` has.
+Row 2 has a wrong sign, and the matrix after "I +" has a 1 at (3, 3) instead of a 0. The motion
+itself divides by ω, so it is undefined at ω = 0; `jaxslam.motion.Velocity` is not.
 """
 
 import jax.numpy as jnp
@@ -11,7 +11,7 @@ move_outputs = ("x [m]", "y [m]", "theta [rad]")
 
 
 def move(pose, u):
-    """Along the arc of radius v/ω."""
+    """The pose after an arc of radius v/ω."""
     (x, y, theta), (v, omega, dt) = pose, u
     turned = theta + omega * dt
     return jnp.stack(

@@ -1,4 +1,4 @@
-"""Williams' observation Jacobian H_x as it stands in the slides: `jaxslam verify` finds the slip.
+"""Williams' observation Jacobian H_x as printed, whose mistake `jaxslam verify` finds.
 
 Row 1 has the signs of ∂r/∂landmark, not of ∂r/∂robot (Δ points from the robot to the landmark).
 """
@@ -15,7 +15,7 @@ def observe(pose, landmark):
 
 
 def observe_jacobian(pose, landmark):
-    """By the pose; no claim is made about the landmark."""
+    """The Jacobian by the pose; there is no claim by the landmark."""
     dx, dy = landmark - pose[:2]
     r2 = dx**2 + dy**2
     r = jnp.sqrt(r2)

@@ -196,7 +196,7 @@ def _in_a_window(
         scenario.sensor,
         capacity,
         (scenario.places or capacity) + false,
-        window=WINDOW,
+        window=_WINDOW,
         first_estimates=first_estimates,
         **_options(scenario, options, *_OF_MAPS),
     )
@@ -210,7 +210,7 @@ def _in_one_batch(scenario: World, **options: Unpack[EkfOptions]) -> BatchMap:
     return BatchMap(scenario.motion, scenario.sensor, _capacity(scenario), *start, **mine)
 
 
-WINDOW = 5
+_WINDOW = 5
 """motions and scans in the window of the fixed-lag smoother in the catalog"""
 
 _SLAM_PARTICLES = 50
@@ -237,7 +237,7 @@ def _sparse_in_canonical_form(scenario: World, **options: Unpack[EkfOptions]) ->
     (`InPieces`).
     """
     count = _capacity(scenario)
-    active = min(max(min(LARGEST_AREA, count // 2), LEAST_AREA), count)
+    active = min(max(min(_LARGEST_AREA, count // 2), _LEAST_AREA), count)
     filter = Seif(
         scenario.motion,
         scenario.sensor,
@@ -254,7 +254,7 @@ def _capacity(scenario: World) -> int:
     return int(np.shape(scenario.landmarks)[0])
 
 
-LEAST_AREA, LARGEST_AREA = 8, 20
+_LEAST_AREA, _LARGEST_AREA = 8, 20
 """active landmarks of the sparse information filter in the catalog"""
 
 

@@ -19,7 +19,8 @@ from jaxslam.consistency.score import run_statistics
 from jaxslam.core.protocols import Filter, Motion, Sensor
 from jaxslam.results.plot.style import INK, PAGE, Figure, caption, curve, panels_of
 from jaxslam.run import run
-from jaxslam.simulation.scenarios import loop, loop_landmarks
+from jaxslam.simulation.scenarios import loop
+from jaxslam.simulation.scenarios.loop import loop_landmarks
 from jaxslam.simulation.worlds import simulate
 
 _Model = TypeVar("_Model", Motion, Sensor)

@@ -17,6 +17,9 @@ from jaxslam import (
 )
 from jaxslam.core.types import Log, Scan
 from jaxslam.laser.laser_slam import ScanLog, Settings, covariances
+from jaxslam.laser.laser_slam.odometry import raw
+from jaxslam.laser.laser_slam.odometry.pieces import laser_odometry
+from jaxslam.laser.laser_slam.scans import scans_of
 from jaxslam.math import numpy_poses as poses
 from jaxslam.simulation.laser import scan_world
 
@@ -94,9 +97,9 @@ def measure(runs: int) -> list[Metric]:
     for true, log in logs(runs):
         for name, reference in (("scan to scan", 1), ("scan to submap", SETTINGS.reference)):
             settings = dataclasses.replace(SETTINGS, reference=reference)
-            scans = laser_slam.scans_of(log, settings)
-            steps = laser_slam.steps_of(log.raw, settings)
-            odometry = laser_slam.laser_odometry(scans, steps, settings, log.raw[0])
+            scans = scans_of(log, settings)
+            steps = raw.steps_of(log.raw, settings)
+            odometry = laser_odometry(scans, steps, settings, log.raw[0])
             found.setdefault(f"{name}: a match", []).append(steps_of(odometry, true))
             found.setdefault(f"{name}: the path", []).append(path_of(odometry, true))
             pair = laser_slam.match_controls(odometry), true[odometry.keyframe]

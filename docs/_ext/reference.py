@@ -1,9 +1,8 @@
 """Sphinx extension: writes the pages of the API reference from the package.
 
-A name is public if a package lists it in `__all__`, or if its module stands directly below
-`jaxslam` or is one of `INTRODUCED` or `OPEN`; and if neither it nor its module begins with an
-underscore. It is shown under the shortest path that reaches it: the package that lists it, else its
-own module.
+The public names of a module are those that `OPEN` lists, else its `__all__`, else, directly below
+`jaxslam` and in `INTRODUCED`, all that it defines without an underscore. A name is shown under its
+shortest path: the package that lists it, else the module that defines it.
 """
 
 import ast
@@ -58,30 +57,77 @@ INTRODUCED = {
 
 
 OPEN = {
-    "jaxslam.consistency.nees",
-    "jaxslam.core.numbers",
-    "jaxslam.core.record",
-    "jaxslam.datasets.evaluation",
-    "jaxslam.filters.information.canonical",
-    "jaxslam.filters.map_management.relocalization",
-    "jaxslam.filters.reporting",
-    "jaxslam.linearize.first_order",
-    "jaxslam.core.logs.streams",
-    "jaxslam.core.logs.tables",
-    "jaxslam.math.angles",
-    "jaxslam.math.gaussians",
-    "jaxslam.math.se2",
-    "jaxslam.math.stats",
-    "jaxslam.math.uncertain_poses",
-    "jaxslam.results.plot.style",
-    "jaxslam.results.report",
-    "jaxslam.results.store",
-    "jaxslam.simulation.laser",
-    "jaxslam.simulation.scenarios.lines",
-    "jaxslam.simulation.walls",
-    "jaxslam.simulation.worlds",
+    "jaxslam.charts": "Euclidean LeftInvariant RightInvariant",
+    "jaxslam.catalog": "ALL FILTERS ideal variant",
+    "jaxslam.consistency": (
+        "Average LocalizationScores LocalizationSummary Measure RunStatistics Score "
+        "Summary Verdict conditional_bound covering_level credibility judge "
+        "judge_localization posterior_bound register score summarize_localization"
+    ),
+    "jaxslam.consistency.campaign": "Keep",
+    "jaxslam.consistency.metrics": (
+        "Errors MeanAndStd PathErrors Relations Statistics align_map alignment ate "
+        "benchmark_figures given map_entropy relation_errors relations revisits rpe "
+        "statistics summary"
+    ),
+    "jaxslam.core.logs.streams": "Rows Rule divide hold relative",
+    "jaxslam.core.logs.tables": "Aligned",
+    "jaxslam.core.noise": "Constant NoiseCov",
+    "jaxslam.core.numbers": "check_array check_positive",
+    "jaxslam.core.protocols": (
+        "Associate Association Basis Candidate Chart Estimator Free Here Life Linearizer "
+        "Model Motion Pairs Prediction Reduced Resample Sensor"
+    ),
+    "jaxslam.core.record": "record set_field static",
+    "jaxslam.core.slots": "Joint allocate empty find remove scatter",
+    "jaxslam.core.types": "Beams Estimate Info Log Scan Status Trace Truth",
+    "jaxslam.core.validation": "check_count check_covariance check_gate check_record is_concrete",
+    "jaxslam.datasets": (
+        "MRCLAM_CALIBRATION Dataset DatasetFit LaserLog OwnCalibration RobotCalibration "
+        "StampedRelations bonn carmen fit mrclam mrclam_calibration mrclam_team plaza "
+        "relation_file table victoria_park white_noise"
+    ),
+    "jaxslam.datasets.evaluation": "Evaluation MapTest evaluate",
+    "jaxslam.filters.map_management.relocalization": (
+        "lost points_of_map relocalize relocated seen_points"
+    ),
+    "jaxslam.filters.multi_robot.team": "Robot pose_cross_cov poses",
+    "jaxslam.filters.reporting": "Mask Pruned info_of status_of with_extra",
+    "jaxslam.linearize.first_order": "invert_jacobians motion_jacobians observe_jacobians",
+    "jaxslam.math.angles": "sinc wrap",
+    "jaxslam.math.gaussians": "GaussianTerms gaussian_terms",
+    "jaxslam.math.linalg": "cholesky inverse root_psd solve_lower solve_psd symmetrize",
+    "jaxslam.math.se2": (
+        "adjoint align between boxminus boxplus compose exp from_frame "
+        "from_frame_jacobians inverse log polar polar_in_frame polar_jacobians "
+        "rectangular rectangular_jacobians rotation to_frame to_frame_jacobians"
+    ),
+    "jaxslam.math.stats": "chi2_band chi2_quantile sigma_gate",
+    "jaxslam.math.uncertain_poses": (
+        "Frame bhattacharyya compound mahalanobis_squared merge reverse"
+    ),
+    "jaxslam.results.page": "",
+    "jaxslam.results.plot": (
+        "COLORS COLUMN PAGE Figure Film Layer Panel Scene animate animate_world "
+        "cost_figure coverage_figure ellipse errors_figure gained_figure graph_figure "
+        "grid_figure loops_figure map_figure maps_before_after nees_figure probe "
+        "rmse_figure topology_figure walls_figure whiteness_figure"
+    ),
+    "jaxslam.results.plot.style": (
+        "FAINT INK SHADE TEXT band caption curve every_handle panels_of titled"
+    ),
+    "jaxslam.results.report": "map_csv trajectory_csv trajectory_tum",
+    "jaxslam.results.store": "create join resume",
+    "jaxslam.run": "",
+    "jaxslam.simulation.laser": (
+        "Laser LaserHistory LaserWorld Observability scan scan_information scan_world true_ranges"
+    ),
+    "jaxslam.simulation.scenarios.lines": "from_start",
+    "jaxslam.simulation.walls": "Walls rasterize walls",
+    "jaxslam.simulation.worlds": "World",
+    "jaxslam.verify": "Check Finding Report",
 }
-"""Modules within packages whose names a user's own filter, sensor, world or figure may call."""
+"""Names, of modules whose other names only the package uses, that user code may call."""
 
 
 class Name(NamedTuple):
@@ -107,16 +153,18 @@ def modules() -> list[ModuleType]:
 
 def public_names() -> dict[str, list[Name]]:
     """The public names of each module that has some; a name stands once."""
-    walked = [m for m in modules() if hasattr(m, "__all__") or is_open(m.__name__)]
+    walked = [m for m in modules() if listed_names(m) is not None or is_open(m.__name__)]
     listed: dict[tuple[int, str], Name] = {}
     pages: dict[str, list[Name]] = {module.__name__: [] for module in walked}
     for module in walked:
-        for name in getattr(module, "__all__", []):
+        for name in listed_names(module) or []:
             value = getattr(module, name)
             if not inspect.ismodule(value) and (key := key_of(name, value)) not in listed:
                 listed[key] = Name(module.__name__, name, kind_of(value))
                 pages[module.__name__].append(listed[key])
     for module in walked:
+        if listed_names(module) is not None:
+            continue
         constants = assigned(module)
         for name, value in vars(module).items():
             if name.startswith("_") or inspect.ismodule(value) or key_of(name, value) in listed:
@@ -129,9 +177,16 @@ def public_names() -> dict[str, list[Name]]:
     return pages
 
 
+def listed_names(module: ModuleType) -> list[str] | None:
+    """The names of a module by `OPEN` or `__all__`; None without either."""
+    if module.__name__ in OPEN:
+        return OPEN[module.__name__].split()
+    return getattr(module, "__all__", None)
+
+
 def is_open(module: str) -> bool:
-    """Whether the names of a module are public that no package lists."""
-    return module.count(".") < 2 or module in INTRODUCED or module in OPEN
+    """Whether all names of a module without an underscore are public."""
+    return module.count(".") < 2 or module in INTRODUCED
 
 
 def key_of(name: str, value: Any) -> tuple[int, str]:

@@ -17,7 +17,7 @@ from jaxslam.core.numbers import check_count
 from jaxslam.core.record import as_record
 from jaxslam.core.types import Info, Log, Status
 
-BOUND = 1.35
+_BOUND = 1.35
 """By how much log L falls at the 95 % upper limit of a parameter whose estimate is 0: half the 0.90
 quantile of χ² with one degree of freedom, since half of the estimates are 0 where the truth is."""
 
@@ -65,13 +65,13 @@ def _observed_information(
 def _upper_limit(
     at: Callable[[np.ndarray], _LikelihoodPoint], here: _LikelihoodPoint, i: int
 ) -> float:
-    """The deviation, above that of parameter i, at which log L is lower by `BOUND`; to 2 %."""
+    """The deviation, above that of parameter i, at which log L is lower by `_BOUND`; to 2 %."""
     unit, low, high = np.eye(len(here.q))[i], 0.0, np.log(2.0)
-    while at(here.q + high * unit).value > here.value - BOUND and high < 20:
+    while at(here.q + high * unit).value > here.value - _BOUND and high < 20:
         low, high = high, high + np.log(2.0)
     for _ in range(5):
         middle = (low + high) / 2
-        inside = at(here.q + middle * unit).value > here.value - BOUND
+        inside = at(here.q + middle * unit).value > here.value - _BOUND
         low, high = (middle, high) if inside else (low, middle)
     return float(np.exp(here.q[i] + (low + high) / 2))
 
@@ -101,7 +101,7 @@ def _standard_errors(
     return cov, robust, [list(np.flatnonzero(row)) for row in related]
 
 
-LOOSE = 1.0
+_LOOSE = 1.0
 """Standard error of log σ above which a log does not determine σ: a factor e either way."""
 
 
@@ -232,9 +232,9 @@ def fit_noise(
     cov, robust, related = _standard_errors(observed, here.spread)
     deviations = np.where(logged, np.exp(here.q), 1.0)
     error = np.sqrt(np.diag(cov))
-    wide = ~np.isfinite(error) | (logged & (error > LOOSE))
+    wide = ~np.isfinite(error) | (logged & (error > _LOOSE))
     # Near 0 log L is linear in σ²: slope and curvature by log σ are twice and four times the gain.
-    falling = wide & logged & (here.gradient < 0) & (np.abs(np.diag(observed)) < 4 * BOUND)
+    falling = wide & logged & (here.gradient < 0) & (np.abs(np.diag(observed)) < 4 * _BOUND)
     return NoiseFit(
         names=told,
         start=first,

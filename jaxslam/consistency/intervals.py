@@ -10,7 +10,7 @@ from jaxslam.math.stats import t_quantile
 LEVEL = 0.95
 """of every band and interval."""
 
-SKEW = 1.5
+_SKEW = 1.5
 """The factor by which the skewness of a run's average NEES reduces degrees of freedom."""
 
 
@@ -46,8 +46,8 @@ class Spread(NamedTuple):
     hence μ between m/(1 + q u - u²/2) and m/(1 - q u - u²/2): never negative, longer above than
     below, as the average of a skewed quantity is. u²/2 centres the statistic where the skewness is
     three times s/m, which that of a run's average NEES is about (the χ² of the common factor of its
-    steps has 2, a sum of a constant and such a χ² more). f = `SKEW` accounts for the spread of s of
-    skewed numbers, and 1 is for numbers whose spread is small. Calibrated by simulation:
+    steps has 2, a sum of a constant and such a χ² more). f = `_SKEW` accounts for the spread of s
+    for skewed numbers, and 1 is for numbers whose spread is small. Calibrated by simulation:
     `python -m benchmarks --record --only verdict`.
     """
 
@@ -83,7 +83,7 @@ def spread(
 ) -> Spread | None:
     """The mean of positive numbers, one an independent run, NaN left out; None without any.
 
-    skewed: f = `SKEW`, else 1; see `Spread`.
+    skewed: f = `_SKEW`, else 1; see `Spread`.
     """
     there = _numbers(values)
     if there.size == 0:
@@ -92,7 +92,7 @@ def spread(
     if there.size < 2:
         return Spread(mean, np.inf, np.inf)
     error = float(there.std(ddof=1) / mean / np.sqrt(there.size)) if mean > 0 else 0.0
-    dof = (there.size - 1) / (SKEW if skewed else 1.0)
+    dof = (there.size - 1) / (_SKEW if skewed else 1.0)
     return Spread(mean, error, t_quantile(0.5 + level / 2, dof) * error)
 
 

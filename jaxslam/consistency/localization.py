@@ -22,13 +22,13 @@ from jaxslam.resampling.weights import at_points, weights_of
 from jaxslam.run import run
 from jaxslam.simulation.laser import LaserWorld, check_world, scan_world
 
-DRAWS = 199
+_DRAWS = 199
 """Draws from the particles that represent them in a step; with the truth they are 200."""
 
 NEAR = 0.5, np.deg2rad(30.0)
 """Distance [m] and turn [rad] from the mean within which 95 % of the weight must lie for a NEES."""
 
-KERNEL = 0.5
+_KERNEL = 0.5
 """Width of the kernel of `covering_level` in standard deviations."""
 
 
@@ -170,7 +170,7 @@ def score_localization(
     def each(row: tuple[Array, ...]) -> tuple[Array, Array, Array]:
         true, mean, poses, log_weights, key = row
         weights = weights_of(log_weights)
-        draws = poses[at_points(weights, jax.random.uniform(key, (DRAWS,), weights.dtype))]
+        draws = poses[at_points(weights, jax.random.uniform(key, (_DRAWS,), weights.dtype))]
         off = jnp.hypot(*(poses[:, :2] - mean[None, :2]).T)
         near = (off < NEAR[0]) & (jnp.abs(wrap(poses[:, 2] - mean[2])) < NEAR[1])
         together = (weights * near).sum() >= 0.95
@@ -184,7 +184,7 @@ def covering_level(draws: Float[Array, "S 3"], truth: Float[Array, "3"]) -> Floa
     """The level of the smallest set of a sample of poses that covers the truth, in (0, 1].
 
     Of an honest filter the truth is one more draw. So all S + 1 poses are ranked by a density that
-    treats them alike, the mean of Gaussian kernels at the others, of `KERNEL` standard deviations
+    treats them alike, the mean of Gaussian kernels at the others, of `_KERNEL` standard deviations
     of all S + 1 in x, y and θ: the level is the share of them that are as dense as the truth or
     denser. It is uniform on 1/(S+1), …, 1 if the truth is distributed as the draws, whatever that
     distribution and the kernel. The 95 % set covers the truth where the level is at most 0.95.
@@ -198,7 +198,7 @@ def covering_level(draws: Float[Array, "S 3"], truth: Float[Array, "3"]) -> Floa
     scale = jnp.where(variance > 0, variance, 1.0)[None, None]
     scaled = (d * d / scale).sum(axis=-1)
     other = scaled > 0
-    kernels = jnp.where(other, jnp.exp(-0.5 * scaled / KERNEL**2), 0.0).sum(axis=1)
+    kernels = jnp.where(other, jnp.exp(-0.5 * scaled / _KERNEL**2), 0.0).sum(axis=1)
     density = kernels / jnp.maximum(other.sum(axis=1), 1)
     # Rounding must not break a tie, as of a sample of one point.
     return (density >= density[0] * (1 - 1e-6)).sum() / count

@@ -34,7 +34,7 @@ LAGS = 10
 _UNROLLED = 4
 """Measurement slots that are looked at in one piece of compiled code."""
 
-SNAPSHOTS = 25
+_SNAPSHOTS = 25
 """Steps of each run at which error and covariance are kept as they are."""
 
 
@@ -53,7 +53,7 @@ class Score(NamedTuple):
 
 def snapshot_steps(steps: int) -> np.ndarray:
     """The steps (K,) of the snapshots, the last among them."""
-    return np.unique(np.round(np.linspace(0, steps - 1, SNAPSHOTS)).astype(int))
+    return np.unique(np.round(np.linspace(0, steps - 1, _SNAPSHOTS)).astype(int))
 
 
 def score(

@@ -20,7 +20,7 @@ from jaxslam.math.stats import normal_quantile, truncated_chi2_mean
 TESTS = {"nees_pose": "pose NEES", "nis_per_dof": "NIS / dof"}
 """The measures that are tested, and their names in messages."""
 
-TOLERANCE = 0.01
+_TOLERANCE = 0.01
 """An interval that lies wholly so near the honest value, relative to it, rejects nothing."""
 
 POWER = 0.9
@@ -61,7 +61,7 @@ def judge(
     rejects, but over half of the measurements that arrived were dropped. diverged: over half of the
     runs are not finite or divergent.
 
-    An interval that lies within 1 % (`TOLERANCE`) of the honest value rejects nothing: a nonlinear
+    An interval that lies within 1 % (`_TOLERANCE`) of the honest value rejects nothing: a nonlinear
     filter is never exactly honest, and enough runs would reject any. It changes nothing where the
     interval is wider than that, as the NIS's is below some 400,000 degrees of freedom.
 
@@ -110,9 +110,9 @@ def power_of(noticed: Mapping[str, tuple[float, float]]) -> str:
 
 def _side(found: Spread, low: float, high: float) -> int:
     """The sign of a rejection: 1 for an interval above what is honest, -1 for one below, else 0."""
-    if found.low > high and found.high > high * (1 + TOLERANCE):
+    if found.low > high and found.high > high * (1 + _TOLERANCE):
         return 1
-    return -1 if found.high < low and found.low < low / (1 + TOLERANCE) else 0
+    return -1 if found.high < low and found.low < low / (1 + _TOLERANCE) else 0
 
 
 def _noticed(found: Spread, low: float, high: float) -> tuple[float, float]:
@@ -122,7 +122,7 @@ def _noticed(found: Spread, low: float, high: float) -> tuple[float, float]:
     lies beyond that is z standard errors farther.
     """
     margin = normal_quantile(POWER) * found.error
-    least, most = low * found.below, high * max(found.above, 1 + TOLERANCE)
+    least, most = low * found.below, high * max(found.above, 1 + _TOLERANCE)
     return least / (1 + margin), most / (1 - margin) if margin < 1 else np.inf
 
 

@@ -8,7 +8,6 @@ from jaxslam.filters.ekf.ekf_slam import EkfSlam
 from jaxslam.filters.ekf.linear_system import LinearizedSteps
 from jaxslam.filters.ekf.observability import Monitored
 from jaxslam.filters.information.eif_slam import EifSlam
-from jaxslam.filters.information.innovation import InformationFilter
 from jaxslam.filters.information.seif import Seif
 from jaxslam.filters.information.sparse_state import ApproximationCounts
 from jaxslam.filters.known.dead_reckoning import DeadReckoning
@@ -20,7 +19,6 @@ from jaxslam.filters.map_management.merging import Merging
 from jaxslam.filters.multi_robot.team_slam import TeamSlam
 from jaxslam.filters.particles.fastslam import FastSlam
 from jaxslam.filters.particles.particle_localization import ParticleLocalization
-from jaxslam.filters.particles.pose_steps import MonteCarloFilter
 from jaxslam.filters.particles.slam_particles import ParticleInfo
 
 __all__ = [
@@ -34,14 +32,12 @@ __all__ = [
     "FastSlam",
     "Filter",
     "Hypotheses",
-    "InformationFilter",
     "LinearizedSteps",
     "Localization",
     "LoopSettings",
     "Mapping",
     "Merging",
     "Monitored",
-    "MonteCarloFilter",
     "ParticleInfo",
     "ParticleLocalization",
     "Promotion",

@@ -25,7 +25,6 @@ REGISTRY: dict[str, Callable[..., Motion]] = {
 }
 
 __all__ = [
-    "REGISTRY",
     "Ackermann",
     "Increment",
     "Odometry",

@@ -22,7 +22,6 @@ REGISTRY: dict[str, Resample] = {
 }
 
 __all__ = [
-    "REGISTRY",
     "Soft",
     "StopGradient",
     "kld_bound",

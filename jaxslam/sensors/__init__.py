@@ -27,7 +27,6 @@ REGISTRY: dict[str, Callable[..., Sensor]] = {
 }
 
 __all__ = [
-    "REGISTRY",
     "Absolute",
     "BearingInverseDepth",
     "BearingOnly",

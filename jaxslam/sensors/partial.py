@@ -98,7 +98,7 @@ class _PolarCoordinate(Sensor):
         )
 
 
-TEN_METRES = ((10.0,), ((25.0,),))
+_TEN_METRES = ((10.0,), ((25.0,),))
 """Range 10 m, σ 5 m: a placeholder for the actual prior knowledge."""
 
 
@@ -122,13 +122,13 @@ class BearingOnly(_PolarCoordinate):
     """(1, 1) covariance of the bearing, or a function of z."""
     mount: ArrayLike | None = None
     """(3,) pose of the sensor on the robot, Solà's S"""
-    free: FreeLike = TEN_METRES  # type: ignore[assignment]
+    free: FreeLike = _TEN_METRES  # type: ignore[assignment]
     """mean (1,) and covariance (1, 1) of the range [m], Solà (39)"""
     measurements = ("bearing [rad]",)
     _own, _other = slice(1, 2), slice(0, 1)
 
 
-ANY_DIRECTION = ((0.0,), ((np.pi**2 / 3,),))
+_ANY_DIRECTION = ((0.0,), ((np.pi**2 / 3,),))
 """The Gaussian with the mean and the variance of a direction uniform on (-π, π]."""
 
 
@@ -151,7 +151,7 @@ class RangeOnly(_PolarCoordinate):
     """(1, 1) covariance of the range, or a function of z."""
     mount: ArrayLike | None = None
     """(3,) pose of the sensor on the robot, Solà's S"""
-    free: FreeLike = ANY_DIRECTION  # type: ignore[assignment]
+    free: FreeLike = _ANY_DIRECTION  # type: ignore[assignment]
     """mean (1,) and covariance (1, 1) of the bearing [rad], Solà (39)"""
     measurements = ("range [m]",)
     _own, _other = slice(0, 1), slice(1, 2)

@@ -24,7 +24,7 @@ from jaxslam.verify.inputs.functions import (
 from jaxslam.verify.inputs.samples import Samples
 from jaxslam.verify.record import Report
 
-MOUNT = (0.4, -0.3, 0.9)
+_MOUNT = (0.4, -0.3, 0.9)
 """The mount of a sensor made by `build`: off the robot's centre, so that all terms contribute."""
 
 TOLERANCE = 1e-12
@@ -158,7 +158,7 @@ def build(
     returns none of these.
     """
     parameters = inspect.signature(factory).parameters
-    mounted = {"mount": MOUNT} if "mount" in parameters else {}
+    mounted = {"mount": _MOUNT} if "mount" in parameters else {}
     if "max_range" in parameters:
         made = factory(max_range=FAR, **mounted)
         if isinstance(made, BeamModel):

@@ -23,7 +23,7 @@ MADE = {
     "relative_pose_log": graphs.RelativePoseLog(),
     "from_sensor": graphs.FromSensor(SEEN),
     "from_motion": graphs.FromMotion(DRIVEN),
-    "nominal_motion": graphs.NominalMotion(motion.Unicycle(np.eye(2))),
+    "nominal_motion": graphs.factor.NominalMotion(motion.Unicycle(np.eye(2))),
 }
 PARTS = {"from_sensor": SEEN, "from_motion": DRIVEN, "nominal_motion": motion.Unicycle(np.eye(2))}
 

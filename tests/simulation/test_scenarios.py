@@ -11,9 +11,9 @@ from jaxslam.simulation.scenarios import (
     explore,
     loop,
     loop_bearing,
-    loop_landmarks,
     stationary,
 )
+from jaxslam.simulation.scenarios.loop import loop_landmarks
 from jaxslam.simulation.worlds import simulate
 
 

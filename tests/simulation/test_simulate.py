@@ -23,8 +23,8 @@ from jaxslam.simulation.scenarios import (
     BetweenRanges,
     circle,
     cloister,
-    cloister_landmarks,
 )
+from jaxslam.simulation.scenarios.cloister import cloister_landmarks
 from jaxslam.simulation.worlds import Scenario, simulate
 
 Q = np.array([[0.002, 0.0005], [0.0005, 0.001]])

@@ -1,4 +1,4 @@
-"""MRCLAM, three robots that see each other: the map of the first, and the others' paths."""
+"""MRCLAM, three robots that measure each other: map and path of the first, paths of the others."""
 
 import sys
 from functools import partial

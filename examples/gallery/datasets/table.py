@@ -1,4 +1,4 @@
-"""Table: CSV files of one's own; here of a simulated robot."""
+"""Table: your own CSV files; here from a simulated robot."""
 
 import tempfile
 from functools import partial

@@ -1,4 +1,4 @@
-"""Victoria Park: a truck among trees, as it comes with GTSAM."""
+"""Victoria Park: a truck among trees; the file is part of GTSAM."""
 
 import gtsam
 import jax

@@ -1,4 +1,4 @@
-"""Consistent Jacobians: FEJ and OC learn nothing about a turn of the whole frame."""
+"""Consistent Jacobians: FEJ and OC gain no information on a rotation of the frame."""
 
 import jax
 

@@ -1,4 +1,4 @@
-"""Delayed: ranges alone; a beacon enters the map when two intersections are told apart."""
+"""Delayed: ranges only; a beacon enters the map when one of two intersections is rejected."""
 
 import jax
 import numpy as np

@@ -1,4 +1,4 @@
-"""Map management: one false measurement a scan, and what is not seen again is removed."""
+"""Map management: one false measurement a scan; landmarks not measured again are removed."""
 
 import dataclasses
 

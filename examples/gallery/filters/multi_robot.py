@@ -1,4 +1,4 @@
-"""Several robots: two that see each other share one map."""
+"""Several robots: two robots that measure each other share one map."""
 
 import jax
 import numpy as np

@@ -1,4 +1,4 @@
-"""Smoothing: a window of poses learns a heading it cannot know, unless Jacobians stay put."""
+"""Smoothing: a window of poses gains information on the heading, unless Jacobians stay fixed."""
 
 import jax
 

@@ -17,7 +17,7 @@ robots = [
 
 
 def sighting(robot, error):
-    """The landmark in the robot's frame, by a bearing and a vague range; its heading is free."""
+    """The landmark in the robot's frame, from a bearing and a vague range; its heading is free."""
     r, phi = se2.polar_in_frame(robot.pose, landmark) + np.array([0.0, error])
     turn, cov = np.asarray(se2.rotation(phi)), np.diag([0.0, 0.0, 1e6])
     cov[:2, :2] = turn @ np.diag([0.4 * r, sigma * r]) ** 2 @ turn.T
@@ -25,7 +25,7 @@ def sighting(robot, error):
 
 
 def show(axes, frame, color, text="", place=0, look="-"):
-    """Draw the 2 σ ellipse of a frame's position, and write what it is at one of its points."""
+    """Draw the 2 σ ellipse of a frame's position, with a label at one of its points."""
     contour = jaxslam.plot.ellipse(frame.pose[:2], frame.cov[:2, :2], 2.0)
     axes.plot(*contour.T, look, color=color, lw=1.3)
     where = contour[place] + 0.4 * np.array([np.cos(place / 10.2), np.sin(place / 10.2)])
@@ -33,7 +33,7 @@ def show(axes, frame, color, text="", place=0, look="-"):
 
 
 def wedge(axes):
-    """The density of a landmark that is seen at π/3 from the origin, over its largest value."""
+    """The density of a landmark with bearing π/3 from the origin, over its largest value."""
     x, y = np.meshgrid(np.linspace(-4, 5, 181), np.linspace(-1, 8, 181))
     density = np.exp(-0.5 * ((np.arctan2(y, x) - np.pi / 3) / sigma) ** 2)
     axes.contourf(
@@ -45,7 +45,7 @@ def wedge(axes):
 
 
 def stage(axes, title, seen, shown):
-    """The robots, their bearings, and what is known of the landmark."""
+    """The robots, their bearings, and estimates of the landmark."""
     for robot, of in seen:
         ray = compound(robot, of._replace(pose=of.pose * np.array([2.2, 2.2, 1.0]))).pose[:2]
         axes.plot(*np.stack([robot.pose[:2], ray]).T, color=FAINT, lw=0.8, ls=(0, (4, 2)))

@@ -1,4 +1,4 @@
-"""A robot drives ahead and never comes back: its errors grow, and so does its covariance."""
+"""A robot drives ahead and never returns: its errors grow, and so does its covariance."""
 
 import jax
 

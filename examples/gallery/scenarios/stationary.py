@@ -1,4 +1,4 @@
-"""A robot stands still and measures one landmark: whoever learns its heading is mistaken."""
+"""A robot at rest measures one landmark: a filter that becomes certain of its heading is wrong."""
 
 import jax
 

@@ -60,4 +60,4 @@ def measures_of(names: Iterable[str]) -> list[Measure]:
     return [*REGISTRY.values(), *(Measure(name, name) for name in names if name not in known)]
 
 
-__all__ = ["BUILT_IN", "REGISTRY", "Measure", "in_figure", "measures_of", "register"]
+__all__ = ["Measure", "register"]

@@ -38,7 +38,7 @@ class Rmse(Measure):
         return {self.key: self.scale * np.sqrt(ratio(sums[self.column], np.asarray(runs)))}
 
 
-POSITION = Rmse(
+_POSITION = Rmse(
     "rmse_position",
     "position RMSE",
     unit="m",
@@ -60,7 +60,7 @@ HEADING = Rmse(
 _BOUND = "conditional bound", "the Cramér-Rao bound of an RMSE, given the true path"
 
 MEASURES = (
-    POSITION,
+    _POSITION,
     Measure("bound_ratio_position", "  over conditional bound", honest=1, note=_BOUND),
     HEADING,
     Measure("bound_ratio_heading", "  over conditional bound", honest=1),
@@ -76,7 +76,7 @@ def over_bound(
     bound: position [m²] and heading [rad²], (T,) each.
     """
     ratios, curves = {}, {}
-    for name, measure in (("position", POSITION), ("heading", HEADING)):
+    for name, measure in (("position", _POSITION), ("heading", HEADING)):
         if measure.key in averages and bound[name].mean() > 0:
             least = measure.scale * np.sqrt(bound[name].mean())
             ratios[f"bound_ratio_{name}"] = Average(*(x / least for x in averages[measure.key]))

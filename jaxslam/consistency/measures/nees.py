@@ -19,7 +19,7 @@ from jaxslam.math.stats import chi2_quantiles
 DOF = {"pose": 3, "position": 2, "heading": 1}
 """Blocks of the pose error whose NEES is taken, and the mean of an honest one."""
 
-ROUNDING = 32
+_ROUNDING = 32
 """A claimed deviation of at most so many ulp of its coordinate is taken for zero."""
 
 
@@ -102,7 +102,7 @@ def block_nees(
     There is none where the claimed covariance is singular, i.e. some direction is known exactly:
     1/tr P⁻¹, at most its least eigenvalue and at least a third of it, is at most 100 n·eps where P
     is scaled to a diagonal of at most 1, x and y by one unit. And none
-    where a claimed deviation is what rounding makes of zero: at most `ROUNDING` ulp of the
+    where a claimed deviation is what rounding makes of zero: at most `_ROUNDING` ulp of the
     coordinate, that is of π for the heading and of max(|x|, |y|) for the position. So particles
     that are copies of one, whose sample covariance is zero but for rounding, have no NEES, instead
     of one of 1e27.
@@ -157,7 +157,7 @@ def _unit(pose: np.ndarray, cov: np.ndarray, eps: float) -> list[np.ndarray]:
     reach = np.abs(pose[..., :2]).max(axis=-1)
 
     def unit(variance: np.ndarray, size: np.ndarray | float) -> np.ndarray:
-        there = variance > (ROUNDING * eps * size) ** 2
+        there = variance > (_ROUNDING * eps * size) ** 2
         return np.where(there, 1.0 / np.sqrt(np.where(there, variance, 1.0)), 0.0)
 
     metres = unit(np.maximum(x, y), reach)

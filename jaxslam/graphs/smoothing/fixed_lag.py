@@ -32,7 +32,7 @@ from jaxslam.math import linalg
 from jaxslam.math.arrays import Number
 from jaxslam.sensors.suite import Suite
 
-POINT = ("x [m]", "y [m]")
+_POINT = ("x [m]", "y [m]")
 
 
 class _WindowState(NamedTuple):
@@ -107,7 +107,7 @@ class FixedLag(Filter):
                 f"{name}: expected one sensor whose measurement determines its landmark by as many "
                 f"numbers as it has, got {sensor.name}"
             )
-        if self.first_estimates and sensor.landmark != POINT:
+        if self.first_estimates and sensor.landmark != _POINT:
             raise ValueError(
                 f"{name}: expected landmarks (x, y) for first_estimates, got {sensor.landmark}"
             )

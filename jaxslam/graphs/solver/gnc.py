@@ -19,13 +19,13 @@ from jaxslam.graphs.solver.model import Model
 from jaxslam.graphs.solver.plans import Plan
 from jaxslam.graphs.solver.search import Ending, Solution, minimize
 
-ROUNDS = 100
+_ROUNDS = 100
 """at most"""
 _GROWTH = 1.4
 """of μ in each round"""
 _SHARP = 1e6
 """a μ with which nearly all weights are zeros or ones"""
-LOOSE = 1e-6
+_LOOSE = 1e-6
 """tolerance of the rounds before the last"""
 
 
@@ -91,7 +91,7 @@ def graduated(
         return 1.0 / jnp.maximum(2 * worst - 1.0, 1.0 / _SHARP)
 
     def again(state: _Round) -> Array:
-        return ~state.settled.all() & (state.rounds < ROUNDS)
+        return ~state.settled.all() & (state.rounds < _ROUNDS)
 
     def work(state: _Round) -> _Round:
         """The optimum with the weights, then the weights there."""
@@ -116,7 +116,7 @@ def graduated(
 
     batch = graph.poses.shape[-1:]
     zero, none = jnp.zeros(batch, graph.poses.dtype), jnp.zeros(batch, jnp.int32)
-    loose = jnp.maximum(tolerance, jnp.asarray(LOOSE, tolerance.dtype))
+    loose = jnp.maximum(tolerance, jnp.asarray(_LOOSE, tolerance.dtype))
     every = row_weights(plain, plan.who, variables_of(graph), data)
     start = Solution(graph, zero, none, none, none - 1, zero, zero, zero, every)
     ratio = ratios(start)

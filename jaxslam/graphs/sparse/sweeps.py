@@ -26,7 +26,7 @@ TARGETS = 8
 _TERMS = 2
 """K, products of a target that are computed together"""
 
-PART = 1 << 12
+_PART = 1 << 12
 """Chunks whose tables are made at once: a large graph has some hundred thousand of them."""
 
 Ints = Int[np.ndarray, "_"]
@@ -151,8 +151,8 @@ def sweep(sums: Sums, left: Ints, right: Ints, end: Ints, room: int = 0) -> Swee
     finished = padded_table_size(len(end_base), 4 * room)
     tables = [np.full((width, TARGETS, _TERMS), at[-1], np.int32) for at in (left, right)]
     flips = None if sums.flip is None else np.zeros((width, TARGETS, _TERMS), bool)
-    for part in range(0, len(bases), PART):
-        some = slice(part, min(part + PART, len(bases)))
+    for part in range(0, len(bases), _PART):
+        some = slice(part, min(part + _PART, len(bases)))
         place = bases[some, None] + np.arange(TARGETS)
         there = np.minimum(place, size - 1)[..., None]
         term = shifts[some, None, None] + np.arange(_TERMS)

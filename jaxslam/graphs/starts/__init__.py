@@ -28,4 +28,4 @@ STARTS: dict[str, Callable[..., Graph]] = {
 }
 """The starts by name, for the command line."""
 
-__all__ = ["STARTS", "chordal", "given", "odometry", "robust", "spanning_tree"]
+__all__ = ["chordal", "given", "odometry", "robust", "spanning_tree"]

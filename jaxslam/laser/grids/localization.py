@@ -45,14 +45,14 @@ _BEAM = ("range [m]", "angle [rad]")
 _BEAM = ("range [m]", "angle [rad]")
 """The measurements of such a log."""
 
-NOTHING = 1e6
+_NOTHING = 1e6
 """Range [m] in a log of a beam that met nothing and is infinite in the scan: a log is finite."""
 
 
 def beam_log(control: ArrayLike, beams: Beams) -> Log:
     """The log of T controls and T scans of B beams: measurements (range, angle), without tags.
 
-    A beam that says nothing (`Beams`) is not valid in the log. An infinite range becomes `NOTHING`.
+    A beam without information (`Beams`) is not valid. An infinite range becomes `_NOTHING`.
     Arrays are NumPy's, within a trace JAX's.
 
     Args:
@@ -85,7 +85,7 @@ def beam_log(control: ArrayLike, beams: Beams) -> Log:
             raise ValueError(f"beam_log: scan {step}: the angle of a valid beam is not finite")
         if not usable.any():
             raise ValueError(f"beam_log: none of {steps} scans has a valid beam")
-    z = xp.stack([xp.minimum(ranges, NOTHING), angle], axis=-1)
+    z = xp.stack([xp.minimum(ranges, _NOTHING), angle], axis=-1)
     scan = Scan(
         z=xp.where(usable[..., None], z, 0.0).astype(moved.dtype),
         tag=xp.full(shapes[0], -1, np.int32),

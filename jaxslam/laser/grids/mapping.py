@@ -18,7 +18,7 @@ from jaxslam.math import se2
 from jaxslam.math.arrays import Number
 from jaxslam.math.xla import hot_jit
 
-FARTHEST = 2.0**29
+_FARTHEST = 2.0**29
 """An end of a beam farther off [cells] counts as this far, lest the number of cells overflow."""
 
 
@@ -184,7 +184,7 @@ def _cross(
     delta = ends - start
     forward = jnp.where(delta >= 0, 1, -1)
     first = jnp.floor(start).astype(jnp.int32)
-    last = jnp.floor(jnp.clip(ends, -FARTHEST, FARTHEST)).astype(jnp.int32)
+    last = jnp.floor(jnp.clip(ends, -_FARTHEST, _FARTHEST)).astype(jnp.int32)
     steps = jnp.where(live, jnp.abs(last - first).sum(axis=1), 0)
     slope = jnp.where(delta != 0, 1.0 / jnp.where(delta != 0, delta, 1.0), 0.0)
 

@@ -1,10 +1,8 @@
 """Laser SLAM: from the raw odometry and scans of a log to a path, a pose graph and a map."""
 
-from jaxslam.laser.laser_slam.odometry.pieces import MatchMotion, laser_odometry, match_controls
-from jaxslam.laser.laser_slam.odometry.raw import Steps, steps_of
+from jaxslam.laser.laser_slam.odometry.pieces import MatchMotion, match_controls
 from jaxslam.laser.laser_slam.odometry.tracking import Odometry
 from jaxslam.laser.laser_slam.records import LoopOutcome, Loops, ScanLog, Settings, Solved
-from jaxslam.laser.laser_slam.scans import Scans, scans_of
 from jaxslam.laser.laser_slam.score import ClosureScore, closure_score, relation_covs, relation_nees
 from jaxslam.laser.laser_slam.solver import solve
 
@@ -15,16 +13,11 @@ __all__ = [
     "MatchMotion",
     "Odometry",
     "ScanLog",
-    "Scans",
     "Settings",
     "Solved",
-    "Steps",
     "closure_score",
-    "laser_odometry",
     "match_controls",
     "relation_covs",
     "relation_nees",
-    "scans_of",
     "solve",
-    "steps_of",
 ]

@@ -9,7 +9,7 @@ from jaxslam.graphs.graph import LOOPS
 from jaxslam.laser.laser_slam import covariances
 from jaxslam.math import numpy_poses as poses
 
-PART = 2048
+_PART = 2048
 """Pairs whose covariances are computed at once."""
 ROOM = 4096
 """Poses of a graph: smaller graphs are filled up to it, so that all logs share their programs."""
@@ -60,7 +60,7 @@ def relative_covs(
     From the joint marginals of both, by the Jacobians of x_i⁻¹ ∘ x_j.
     """
     # Each pair fills the factor, so that time and memory grow with the pairs of a part.
-    parts = [pairs[begin : begin + PART] for begin in range(0, len(pairs), PART)]
+    parts = [pairs[begin : begin + _PART] for begin in range(0, len(pairs), _PART)]
     found = [np.asarray(graphs.marginals(solution, pairs=of, room=ROOM).pairs) for of in parts]
     joint = np.concatenate(found).astype(np.float64)
     at = np.asarray(solution.graph.poses, np.float64)

@@ -15,7 +15,7 @@ from jaxslam.math import numpy_poses as poses
 
 _LARGEST = 4_000
 """cells along a side of the map; a larger world has larger cells"""
-FILM = 400
+_FILM = 400
 """cells along a side of a map in a film"""
 WINDOW = 1024
 """Cells along a side of the window in which scans are counted: one program for all maps, but for
@@ -145,7 +145,7 @@ def growing_maps(
 ) -> tuple[list[Grid], Int[np.ndarray, "F"]]:
     """Maps of the first scans, more of them in each, for a film; and how many scans each has.
 
-    Cells are as large as `FILM` of them along a side need.
+    Cells are as large as `_FILM` of them along a side need.
 
     Args:
         frames: number of maps at most.
@@ -153,7 +153,7 @@ def growing_maps(
     """
     paths = [path, *others]
     shape, _, resolution = frame_of(log, paths, settings)
-    coarse = max(resolution, max(shape) * resolution / FILM)
+    coarse = max(resolution, max(shape) * resolution / _FILM)
     shape, origin, resolution = frame_of(log, paths, replace(settings, resolution=coarse))
     laser = poses.compose(path, np.asarray(log.mount, float))
     together = -(-len(path) // min(frames, len(path)))

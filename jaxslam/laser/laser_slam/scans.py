@@ -20,7 +20,7 @@ _MAX_NEIGHBOURS = 8
 WIDTH, ROWS = 384, 64
 """Beams and scans of one call that fits lines: logs are cut and filled up to these, so that all
 share one program."""
-CHANGED, SHARE = 0.1, 0.2
+_CHANGED, SHARE = 0.1, 0.2
 """A scan differs from the one before if more than this share of its beams do, by this much [m]."""
 
 
@@ -155,7 +155,7 @@ def _spacing(angles: np.ndarray, there: np.ndarray) -> float:
 
 def _changed(ranges: Float[np.ndarray, "K B"], met: Bool[np.ndarray, "K B"]) -> np.ndarray:
     """Whether each scan differs from the one before; the first does."""
-    differs = (np.abs(np.diff(ranges, axis=0)) > CHANGED) | (met[1:] != met[:-1])
+    differs = (np.abs(np.diff(ranges, axis=0)) > _CHANGED) | (met[1:] != met[:-1])
     either = met[1:] | met[:-1]
     share = (differs & either).sum(axis=1) / np.maximum(either.sum(axis=1), 1)
     return np.concatenate([[True], share > SHARE])

@@ -3,12 +3,11 @@
 from jaxslam.laser.matching import covariance
 from jaxslam.laser.matching.correlative import Correlative
 from jaxslam.laser.matching.field import FieldMatcher
-from jaxslam.laser.matching.icp import Icp, IcpSettings, PointToLine, PointToPoint
+from jaxslam.laser.matching.icp import IcpSettings, PointToLine, PointToPoint
 from jaxslam.laser.matching.matcher import Match, Matcher, MatchStatus, match
 from jaxslam.laser.matching.point_sets import (
     Points,
     Prior,
-    moved_along_rays,
     points,
     raster,
     transformed,
@@ -17,7 +16,6 @@ from jaxslam.laser.matching.point_sets import (
 __all__ = [
     "Correlative",
     "FieldMatcher",
-    "Icp",
     "IcpSettings",
     "Match",
     "MatchStatus",
@@ -28,7 +26,6 @@ __all__ = [
     "Prior",
     "covariance",
     "match",
-    "moved_along_rays",
     "points",
     "raster",
     "transformed",

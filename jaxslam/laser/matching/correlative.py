@@ -135,13 +135,13 @@ class Scores(NamedTuple):
     """What a point scores by its cell, with `block` cells of 0 around the map."""
 
     table: Float[Array, "L H W"]
-    """first exp(-d²/2σ²), d the distance to the nearest occupied cell, 0 beyond `REACH` σ; then, at
+    """first exp(-d²/2σ²), d the distance to the nearest occupied cell, 0 beyond `_REACH` σ; at
     level l, the largest of the 2^l × 2^l cells of which this is the lower left one"""
     field: Field
-    """d [m], of the map alone, up to `REACH` σ"""
+    """d [m], of the map alone, up to `_REACH` σ"""
 
 
-REACH = 4.0
+_REACH = 4.0
 """Distance in σ beyond which a point scores 0, where exp(-d²/2σ²) is below 3.4e-4."""
 
 
@@ -215,7 +215,7 @@ class Correlative(Matcher):
 
     def prepare(self, reference: Grid) -> Scores:
         sigma, block = self.sigma, self.block
-        reach = int(np.ceil(REACH * sigma / self.cell))
+        reach = int(np.ceil(_REACH * sigma / self.cell))
         squared = near_distances(reference.log_odds > 0, reach)
         dtype = reference.log_odds.dtype
         d = jnp.asarray(reference.resolution, dtype) * jnp.sqrt(squared.astype(dtype))

@@ -85,7 +85,7 @@ def surface(
     variance = least / jnp.maximum(n - 2, 1)
     usual = jax.lax.stop_gradient(_median(variance, ~round_))
     return Surface(
-        position=jnp.where(valid[:, None], p, FAR),
+        position=jnp.where(valid[:, None], p, _FAR),
         middle=jnp.where(round_[:, None], p, middle),
         normal=jnp.stack([-jnp.sin(direction), jnp.cos(direction)], axis=-1),
         tilt=variance / jnp.where(round_, 1.0, largest),
@@ -119,7 +119,7 @@ def _median(values: Float[Array, "M"], there: Bool[Array, "M"]) -> Float[Array, 
     return jnp.where(there.any(), middle, 0.0)
 
 
-FAR = 1e6
+_FAR = 1e6
 """Coordinate [m] of a reference point that is not there, so that others are nearer."""
 
 

@@ -3,10 +3,10 @@
 from collections.abc import Callable
 
 from jaxslam.simulation.scenarios.circle import circle
-from jaxslam.simulation.scenarios.cloister import cloister, cloister_landmarks, cloister_noisy
+from jaxslam.simulation.scenarios.cloister import cloister, cloister_noisy
 from jaxslam.simulation.scenarios.explore import explore
 from jaxslam.simulation.scenarios.lines import office_lines, square_lines
-from jaxslam.simulation.scenarios.loop import loop, loop_bearing, loop_landmarks
+from jaxslam.simulation.scenarios.loop import loop, loop_bearing
 from jaxslam.simulation.scenarios.rooms import ROOMS, circular_room, corridor, office, square
 from jaxslam.simulation.scenarios.stationary import stationary
 from jaxslam.simulation.scenarios.view import BetweenRanges
@@ -34,13 +34,11 @@ __all__ = [
     "circle",
     "circular_room",
     "cloister",
-    "cloister_landmarks",
     "cloister_noisy",
     "corridor",
     "explore",
     "loop",
     "loop_bearing",
-    "loop_landmarks",
     "office",
     "office_lines",
     "square",

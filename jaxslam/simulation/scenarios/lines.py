@@ -13,8 +13,8 @@ from jaxslam.simulation.scenarios.rooms import office, square
 from jaxslam.simulation.walls import Walls, exact_ranges, wall_lines
 from jaxslam.simulation.worlds import Scenario
 
-BEAMS, HITS, SLANT = 120, 5, np.sin(np.deg2rad(10.0))
-"""A wall is measured where at least `HITS` of so many beams all around meet it within the laser's
+BEAMS, _HITS, _SLANT = 120, 5, np.sin(np.deg2rad(10.0))
+"""A wall is measured where at least `_HITS` of so many beams all around meet it within the laser's
 range, at 10° or more to its surface."""
 
 NOISE = np.diag([0.02, np.deg2rad(0.5)]) ** 2
@@ -82,5 +82,5 @@ class _MetByBeams:
         e = jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=-1)
         normal = jnp.stack([jnp.cos(landmark[1]), jnp.sin(landmark[1])])
         off = (pose[None, :2] + ranges[:, None] * e) @ normal - landmark[0]
-        met = (ranges < self.max_range) & (jnp.abs(off) < 1e-3) & (e @ normal > SLANT)
-        return jnp.asarray(met.sum() >= HITS)
+        met = (ranges < self.max_range) & (jnp.abs(off) < 1e-3) & (e @ normal > _SLANT)
+        return jnp.asarray(met.sum() >= _HITS)

@@ -12,8 +12,8 @@ from jaxslam.sensors.relative_position import RelativePosition
 from jaxslam.simulation.scenarios.view import BetweenRanges
 from jaxslam.simulation.worlds import Scenario
 
-SPEED, TURN = 0.25, 0.025
-SOURCE = (
+_SPEED, TURN = 0.25, 0.025
+_SOURCE = (
     "Huang, Mourikis, Roumeliotis, Observability-based rules for designing consistent EKF SLAM "
     "estimators, IJRR 29(5), 2010"
 )
@@ -49,9 +49,9 @@ def loop_landmarks(map_seed: int) -> np.ndarray:
     """The landmarks (20, 2) of a map [m]."""
     draw = np.random.default_rng(map_seed)
     side = np.where(draw.random(20) < 0.5, -1.0, 1.0)
-    radius = SPEED / TURN + side * draw.uniform(0.5, 5.0, 20)
+    radius = _SPEED / TURN + side * draw.uniform(0.5, 5.0, 20)
     around = draw.uniform(0, 2 * np.pi, 20)
-    centre = np.array([0.0, SPEED / TURN])
+    centre = np.array([0.0, _SPEED / TURN])
     return np.asarray(centre + radius[:, None] * np.stack([np.cos(around), np.sin(around)], axis=1))
 
 
@@ -60,20 +60,20 @@ def _loop(name: str, sensor: Sensor, steps: int, map_seed: int) -> Scenario:
     landmarks = loop_landmarks(map_seed)
     # The true path does not depend on the draw of the noise, so the fullest scan can be counted.
     heading = TURN * np.arange(steps)
-    path = np.cumsum(SPEED * np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)
+    path = np.cumsum(_SPEED * np.stack([np.cos(heading), np.sin(heading)], axis=1), axis=0)
     distance = np.linalg.norm(path[:, None] - landmarks[None], axis=2)
     fullest = int(((distance > 0.5) & (distance < 5)).sum(axis=1).max())
-    sigma = 0.05 * SPEED
+    sigma = 0.05 * _SPEED
     return Scenario(
         name=name,
         motion=Unicycle(np.diag([sigma / np.sqrt(2), 2 * np.sqrt(2) * sigma]) ** 2),
         sensor=sensor,
         landmarks=landmarks,
-        controls=np.tile([SPEED, TURN, 1.0], (steps, 1)),
+        controls=np.tile([_SPEED, TURN, 1.0], (steps, 1)),
         pose_cov=1e-8 * np.eye(3),
         noise_on="odometry",
         visible=BetweenRanges(0.5, 5.0),
         places=max(fullest, 1),
         filter_options={"correction": "joint"},
-        source=SOURCE,
+        source=_SOURCE,
     )

@@ -8,7 +8,7 @@ from jaxslam.motion.unicycle import Unicycle
 from jaxslam.simulation.laser import Laser, LaserWorld
 from jaxslam.simulation.walls import Walls, walls
 
-SPEED, TURN, STEP = 0.5, np.deg2rad(45.0), 0.25
+_SPEED, TURN, _STEP = 0.5, np.deg2rad(45.0), 0.25
 """Speed [m/s], rate of turn [rad/s] and interval [s] of the robot in these worlds."""
 
 
@@ -97,10 +97,10 @@ def _between(stops: Sequence[tuple[float, float]]) -> tuple[np.ndarray, np.ndarr
     for leg, towards in zip(legs, headings, strict=True):
         turn = (towards - heading + np.pi) % (2 * np.pi) - np.pi
         heading = towards
-        for size, speed, row in ((turn, TURN, 1), (np.hypot(*leg), SPEED, 0)):
-            count = int(np.ceil(abs(size) / (speed * STEP) - 1e-9))
+        for size, speed, row in ((turn, TURN, 1), (np.hypot(*leg), _SPEED, 0)):
+            count = int(np.ceil(abs(size) / (speed * _STEP) - 1e-9))
             control = np.zeros((count, 3))
             if count:
-                control[:, row], control[:, 2] = size / (count * STEP), STEP
+                control[:, row], control[:, 2] = size / (count * _STEP), _STEP
             rows.append(control)
     return pose, np.concatenate(rows)

@@ -70,13 +70,13 @@ def split_claim(
 
 
 POSE = ("x [m]", "y [m]", "theta [rad]")
-POINT = ("x [m]", "y [m]")
+_POINT = ("x [m]", "y [m]")
 _GLOSSARY = {
     "pose": POSE,
     "frame": POSE,
-    "landmark": POINT,
-    "l": POINT,
-    "point": POINT,
+    "landmark": _POINT,
+    "l": _POINT,
+    "point": _POINT,
 }
 """Default entries of an argument by its name."""
 
@@ -174,7 +174,7 @@ def factor_function(factor: Factor) -> Function:
 
     A point has two coordinates.
     """
-    known = {"pose": POSE, "point": POINT}
+    known = {"pose": POSE, "point": _POINT}
     counts = {kind: factor.variables.count(kind) for kind in known}
     arguments = [
         Argument(kind if counts[kind] == 1 else f"{kind} {k + 1}", known[kind])

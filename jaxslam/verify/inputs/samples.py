@@ -18,7 +18,7 @@ FAR = 1e5
 """Distance from the origin, as of survey coordinates [m]."""
 _OUT_OF_SIGHT = 16.0
 """Distance from the robot to a far landmark, along each axis [m]."""
-NEAR = 2.0**-10
+_NEAR = 2.0**-10
 """Distance from the robot to a close landmark [m]; a power of two is exact in float32, too."""
 NOMINAL = ("random", "given")
 """Labels of the states that are not chosen to be difficult."""
@@ -66,7 +66,7 @@ def argument_samples(arguments: tuple[Argument, ...], count: int, seed: int) -> 
         shift = np.zeros((2, 2)) + [[FAR, -FAR], [-FAR, FAR]]
         groups.append((LARGE, tuple(_shifted(base, places, shift))))
     for k in places[1:]:
-        for distance in (NEAR, 2.0**-4):
+        for distance in (_NEAR, 2.0**-4):
             close = base[k][:2].copy()
             close[:, :2] = base[places[0]][:2, :2] + distance * np.array([[1, 0.5], [-0.25, 1]])
             groups.append((f"{arguments[k].name} close", _replaced(base, k, close, 2)))
@@ -119,7 +119,7 @@ def sensor_samples(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samp
     few = slice(0, 4)
     if sensor.landmark:
         turn = np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])], axis=1)
-        close = first[few, :2] + NEAR * np.sign(offset[few])
+        close = first[few, :2] + _NEAR * np.sign(offset[few])
         ahead = pose[few, :2] - 5 * turn[few]
         groups += [
             ("landmark close to the robot", (first[few], at(first[few], close))),
@@ -127,7 +127,10 @@ def sensor_samples(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samp
             ("landmark at the robot", (pose[few], at(pose[few], pose[few, :2]))),
             ("landmark far", (pose[few], at(pose[few], pose[few, :2] + _OUT_OF_SIGHT))),
         ]
-        for label, scale in (("landmark close to the sensor", NEAR), ("landmark at the sensor", 0)):
+        for label, scale in (
+            ("landmark close to the sensor", _NEAR),
+            ("landmark at the sensor", 0),
+        ):
             seen = np.where(metres, z[few] * scale, z[few])
             near = np.asarray(place(pose[few], seen, s[few] * scale), np.float64)
             if np.isfinite(near).all():  # else `invert` fails, which another check reports

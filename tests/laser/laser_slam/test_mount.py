@@ -5,9 +5,10 @@ import pytest
 from ring_of_rooms import SETTINGS, driven, errors, walls
 
 from jaxslam import laser_slam
-from jaxslam.laser.laser_slam import laser_odometry, scans_of, steps_of
 from jaxslam.laser.laser_slam.mapping import map_of
-from jaxslam.laser.laser_slam.scans import check_laser_log
+from jaxslam.laser.laser_slam.odometry.pieces import laser_odometry
+from jaxslam.laser.laser_slam.odometry.raw import steps_of
+from jaxslam.laser.laser_slam.scans import check_laser_log, scans_of
 from jaxslam.math import numpy_poses as poses
 
 MOUNTS = [(0.3, -0.1, np.pi / 2), (0.0, 0.0, np.pi)]

@@ -8,8 +8,10 @@ import pytest
 from ring_of_rooms import SETTINGS, driven, errors
 
 from jaxslam import laser_slam
-from jaxslam.laser.laser_slam import laser_odometry, scans_of, steps_of
 from jaxslam.laser.laser_slam.odometry import pieces, tracking
+from jaxslam.laser.laser_slam.odometry.pieces import laser_odometry
+from jaxslam.laser.laser_slam.odometry.raw import steps_of
+from jaxslam.laser.laser_slam.scans import scans_of
 from jaxslam.math import numpy_poses as poses
 
 COUNT = 40

@@ -11,8 +11,11 @@ from ring_of_rooms import FAR, SETTINGS, driven, errors
 from jaxslam import filters, laser_slam, metrics, run, sensors
 from jaxslam.cli import main
 from jaxslam.core.types import Beams, Log, Scan
-from jaxslam.laser.laser_slam import LoopOutcome, covariances, laser_odometry, scans_of, steps_of
+from jaxslam.laser.laser_slam import LoopOutcome, covariances
 from jaxslam.laser.laser_slam.mapping import growing_maps
+from jaxslam.laser.laser_slam.odometry.pieces import laser_odometry
+from jaxslam.laser.laser_slam.odometry.raw import steps_of
+from jaxslam.laser.laser_slam.scans import scans_of
 from jaxslam.math import numpy_poses as poses
 from jaxslam.results import laser_slam as results
 from jaxslam.results.files import write_files
@@ -51,7 +54,7 @@ def test_a_filter_is_driven_by_the_matches(drive):
     """It follows laser odometry, and its covariance is that of the chain of matches."""
     _, log, found = drive
     of = scans_of(log, SETTINGS), steps_of(log.raw, SETTINGS)
-    odometry = laser_slam.laser_odometry(*of, SETTINGS, log.raw[0])
+    odometry = laser_odometry(*of, SETTINGS, log.raw[0])
     keys = odometry.keyframe
     control = laser_slam.match_controls(odometry)
     np.testing.assert_allclose(laser_slam.match_controls(found), control, rtol=1e-6, atol=1e-12)

@@ -6,8 +6,7 @@ import numpy as np
 import pytest
 from ring_of_rooms import SETTINGS, driven
 
-from jaxslam.laser.laser_slam import steps_of
-from jaxslam.laser.laser_slam.odometry.raw import FARTHEST
+from jaxslam.laser.laser_slam.odometry.raw import FARTHEST, steps_of
 from jaxslam.math import numpy_poses as poses
 
 COUNT = 60

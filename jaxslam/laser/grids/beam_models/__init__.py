@@ -12,7 +12,6 @@ REGISTRY: dict[str, type[BeamModel]] = {
 """By name; each takes max_range and the mount of the laser."""
 
 __all__ = [
-    "REGISTRY",
     "BeamModel",
     "LikelihoodField",
     "Mixture",

@@ -14,7 +14,7 @@ from jaxslam.laser.grids.beam_models.ray_cast import Mixture, check_weights, mix
 
 START = Mixture(0.6, 0.15, 0.1, 0.15, 0.2, 0.5)
 """Where the search begins."""
-LEAST = 1e-6
+_LEAST = 1e-6
 """The least σ [m], where ranges are as expected, and length 1/λ."""
 
 
@@ -76,7 +76,7 @@ def fit(
 
 
 def _mixture(x: Float[Array, "6"]) -> Mixture:
-    shares, scales = jax.nn.softmax(x[:4]), LEAST + jnp.exp(x[4:])
+    shares, scales = jax.nn.softmax(x[:4]), _LEAST + jnp.exp(x[4:])
     return Mixture(shares[0], shares[1], shares[2], shares[3], scales[0], scales[1])
 
 
@@ -109,5 +109,5 @@ def _em_step(mixture: Mixture, z: np.ndarray, stars: np.ndarray, max_range: floa
     variance = (at * (z - stars) ** 2).sum() / max(at.sum(), 1e-12)
     weights = share.mean(axis=1) / max(share.mean(axis=1).sum(), 1e-12)
     length = (share[1] * z).sum() / max(share[1].sum(), 1e-12)
-    scales = max(np.sqrt(variance), LEAST), 1 / max(length, LEAST)
+    scales = max(np.sqrt(variance), _LEAST), 1 / max(length, _LEAST)
     return Mixture(*(float(value) for value in (*weights, *scales)))

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from jaxslam.laser.laser_slam.records import Settings
 from jaxslam.math import numpy_poses as poses
 
-RINGS, SECTORS = 12, 60
+_RINGS, SECTORS = 12, 60
 
 
 def descriptors(
@@ -25,9 +25,9 @@ def descriptors(
     """
     far = np.hypot(points[..., 0], points[..., 1])
     turn = np.arctan2(points[..., 1], points[..., 0]) / (2 * np.pi) % 1.0
-    ring = np.minimum((RINGS * np.sqrt(far / reach)).astype(int), RINGS - 1)
+    ring = np.minimum((_RINGS * np.sqrt(far / reach)).astype(int), _RINGS - 1)
     sector = np.minimum((SECTORS * turn).astype(int), SECTORS - 1)
-    table = np.zeros((len(points), RINGS, SECTORS))
+    table = np.zeros((len(points), _RINGS, SECTORS))
     which = np.broadcast_to(np.arange(len(points))[:, None], valid.shape)
     np.add.at(table, (which[valid], ring[valid], sector[valid]), 1.0)
     sizes = np.abs(np.fft.rfft(np.sqrt(table), axis=2))[:, :, : SECTORS // 4]
@@ -48,7 +48,7 @@ REACH = 3.0
 """Distance [m] between two places that share walls."""
 _PROBABILITY = 0.999
 """Of the ellipse in which a place is sought."""
-SAME = 15
+_SAME = 15
 """Keyframes between submaps that are taken to be of one place."""
 
 
@@ -94,14 +94,14 @@ def near(
         far = np.hypot(*(path[rest, :2] - path[keyframe, :2]).T)
         rest, far = rest[far < reach], far[far < reach]
         for place in places:
-            apart = np.abs(rest - place) >= SAME
+            apart = np.abs(rest - place) >= _SAME
             rest, far = rest[apart], far[apart]
         for _ in range(len(places), most):
             if not len(rest):
                 break
             nearest = rest[far.argmin()]
             pairs.append((nearest, keyframe))
-            apart = np.abs(rest - nearest) >= SAME
+            apart = np.abs(rest - nearest) >= _SAME
             rest, far = rest[apart], far[apart]
     return np.array(pairs, int).reshape(-1, 2)
 

@@ -57,10 +57,10 @@ def give_back() -> None:
             trim(ctypes.c_size_t(0))
 
 
-NARROW, WIDE = (0.8, float(np.deg2rad(14.0))), (4.0, float(np.deg2rad(40.0)))
+_NARROW, _WIDE = (0.8, float(np.deg2rad(14.0))), (4.0, float(np.deg2rad(40.0)))
 """Windows of the search, [m] and [rad] to either side."""
-_SEARCHES = [search(*window, np.deg2rad(2.0)) for window in (NARROW, WIDE)]
-WINDOW = np.diag(1 / np.square([WIDE[0], *WIDE]))
+_SEARCHES = [search(*window, np.deg2rad(2.0)) for window in (_NARROW, _WIDE)]
+_WINDOW = np.diag(1 / np.square([_WIDE[0], *_WIDE]))
 """Information of the window, which bounds what the walls do not tell."""
 
 _CONSISTENCY = 0.999
@@ -102,7 +102,7 @@ def matched(
                 taken(scans.points, keyframe[candidates.second[row]]),
                 candidates.z[row],
                 None,
-                WINDOW,
+                _WINDOW,
                 settings,
             )
             z[row], cov[row], score[row] = fit.pose, fit.cov, fit.inliers
@@ -136,7 +136,7 @@ def _submap(
     return reference_of(scans, keyframe[around], path[around], path[middle], size)
 
 
-KERNEL = {LOOPS: graphs.Cauchy()}
+_KERNEL = {LOOPS: graphs.Cauchy()}
 """One object, so that the optimum is traced once."""
 
 
@@ -191,14 +191,14 @@ def closed(
         # By the graph few places, since each pair of which the covariance is computed fills its
         # factor; after a first optimum the nearest ones fit a window.
         most = PLACES if turn == 0 else CANDIDATES
-        reach = REACH + WIDE[0]
+        reach = REACH + _WIDE[0]
         pairs = near(path, middle, usable, ends, most, reach, settings.loop_gap)
         cov = (
             covariances.relative_cov(total, at, pairs[:, 0], pairs[:, 1])
             if solution is None or not len(pairs)
             else relative_covs(solution, pairs)
         )
-        new = by_place(path, pairs, cov, done, settings, NARROW, WIDE)
+        new = by_place(path, pairs, cov, done, settings, _NARROW, _WIDE)
         if turn == 0:
             new = _with(new, by_appearance(looks, middle, usable, settings))
         new, out = thinned(new)
@@ -221,7 +221,7 @@ def closed(
         ends |= set(zip(loops.first[kept].tolist(), loops.second[kept].tolist(), strict=True))
         edges = table_of(loops.first[kept], loops.second[kept], loops.z[kept], loops.cov[kept])
         graph = graph_of(path, keyframe, chain, edges)
-        kernel = KERNEL if kept.any() else None
+        kernel = _KERNEL if kept.any() else None
         solution = graphs.optimize(graph, kernel=kernel, room=ROOM)
         graph = _host(solution.graph)
         give_back()

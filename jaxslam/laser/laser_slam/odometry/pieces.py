@@ -31,7 +31,7 @@ from jaxslam.math import numpy_poses as poses
 from jaxslam.math import se2
 from jaxslam.math.arrays import Control, Pose, ProcessNoise, ProcessNoiseCov
 
-ENDS = ("x [m]", "y [m]", "θ [rad]")
+_ENDS = ("x [m]", "y [m]", "θ [rad]")
 _ROOTS = ("Lxx [m]", "Lyx [m]", "Lyy [m]", "Lθx [rad]", "Lθy [rad]", "Lθθ [rad]")
 
 
@@ -44,8 +44,8 @@ class MatchMotion(Motion):
     robot after z. `match_controls` makes u of the matches of laser odometry.
     """
 
-    controls = (*ENDS, *_ROOTS)
-    noises = ENDS
+    controls = (*_ENDS, *_ROOTS)
+    noises = _ENDS
 
     def step(self, pose: Pose, u: Control, w: ProcessNoise) -> Pose:
         return se2.compose(se2.compose(pose, u[:3]), w)
@@ -86,7 +86,7 @@ def match_controls(of: Odometry | Solved) -> Float[np.ndarray, "N 9"]:
 
 PIECE = 400
 """Scans of a piece of a log, at least."""
-AROUND = 5
+_AROUND = 5
 """Scans to either side of the first of a piece in which raw odometry is right."""
 
 
@@ -168,7 +168,7 @@ def _borders(scans: Scans, steps: Steps) -> Int[np.ndarray, "n"]:
     """
     count = len(scans.usable)
     odd = ~scans.usable | steps.unknown | steps.lags | steps.gap
-    odd = np.convolve(odd, np.ones(2 * AROUND + 1), "same") > 0
+    odd = np.convolve(odd, np.ones(2 * _AROUND + 1), "same") > 0
     borders = [0]
     for wanted in np.linspace(0, count, max(count // PIECE, 1) + 1)[1:-1].astype(int):
         near = np.arange(wanted - PIECE // 4, wanted + PIECE // 4)

@@ -16,9 +16,9 @@ _BASE = (0.03, 0.02)
 """Standard deviation of a step of raw odometry, [m] and [rad]"""
 _SHARE = (0.10, 0.15, 0.05)
 """and more of it: position by distance, heading by turn, heading by distance [rad/m]."""
-ENOUGH = 20
+_ENOUGH = 20
 """steps in which the robot moves, for a largest speed to be known"""
-MOVES = (0.02, 0.02)
+_MOVES = (0.02, 0.02)
 """[m], [rad] of a step in which it moves"""
 _AS_BEFORE = 0.6
 """of the reach, by which a step that is not known differs from the one before"""
@@ -107,10 +107,10 @@ def _by_speeds(
     reach = np.broadcast_to(FARTHEST, size.shape).copy()
     lags = np.zeros(len(size), bool)
     timed = duration > 0
-    for column, (least, much) in enumerate(zip(MOVES, _MUCH, strict=True)):
+    for column, (least, much) in enumerate(zip(_MOVES, _MUCH, strict=True)):
         way = size[:, column]
         moves = timed & ~useless & (way > least)
-        if moves.sum() < ENOUGH:
+        if moves.sum() < _ENOUGH:
             continue
         fastest = _FASTER * np.quantile(way[moves] / duration[moves], 0.95)
         can = fastest * duration

@@ -38,7 +38,7 @@ HALF = 16.0
 _PEAK = 0.9
 """A pose elsewhere of this share of the best score makes a match ambiguous."""
 
-SECTORS = 180
+_SECTORS = 180
 """of a turn, in which beams are compared with the reference"""
 _CLEAR = 0.4
 """[m] by which a point lies before what a beam met, at least, to be passed through"""
@@ -96,7 +96,7 @@ _OF_WALLS = IcpSettings(kernel=Cauchy(), scale=0.05, lone=0.5, iterations=10, le
 WALLS = PointToLine(replace(_OF_WALLS, reach=0.5))
 _NEAR_WALLS = PointToLine(replace(_OF_WALLS, reach=0.15))
 """From where `WALLS` ends: its pairs are the points that lie on walls."""
-ANY = search(1.0, 0.5, 0.1)
+_ANY = search(1.0, 0.5, 0.1)
 """Whose table serves all searches, since they differ by their windows alone."""
 
 
@@ -168,7 +168,7 @@ def _gathered(points: Points, surface: Surface, at: Float[Array, "n 3"]) -> Refe
     """The points (n, B) of n scans in the frame in which their poses are, as n · B of one."""
     there = jax.vmap(transformed)(points, at), jax.vmap(surface_at)(surface, at)
     gathered, lines = jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), there)
-    return Reference(gathered, lines, ANY.prepare(raster(gathered, CELL, HALF)))
+    return Reference(gathered, lines, _ANY.prepare(raster(gathered, CELL, HALF)))
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -206,12 +206,12 @@ def _seen_through(reference: Points, scan: Points, pose: Array) -> Array:
 
     def sector(at: Array) -> Array:
         turn = jnp.arctan2(at[:, 1], at[:, 0]) / (2 * jnp.pi) + 0.5
-        return jnp.minimum((SECTORS * turn).astype(jnp.int32), SECTORS - 1)
+        return jnp.minimum((_SECTORS * turn).astype(jnp.int32), _SECTORS - 1)
 
     far = jnp.sqrt((scan.position**2).sum(axis=1))
-    where = jnp.where(scan.valid, sector(scan.position), SECTORS)
-    nearest = jnp.full(SECTORS + 1, jnp.inf, far.dtype).at[where].min(far)[:SECTORS]
-    farthest = jnp.zeros(SECTORS + 1, far.dtype).at[where].max(far)[:SECTORS]
+    where = jnp.where(scan.valid, sector(scan.position), _SECTORS)
+    nearest = jnp.full(_SECTORS + 1, jnp.inf, far.dtype).at[where].min(far)[:_SECTORS]
+    farthest = jnp.zeros(_SECTORS + 1, far.dtype).at[where].max(far)[:_SECTORS]
     own = (reference.position - pose[None, :2]) @ se2.rotation(pose[2])
     r, at = jnp.sqrt((own**2).sum(axis=1)), sector(own)
     met = reference.valid & jnp.isfinite(nearest[at])

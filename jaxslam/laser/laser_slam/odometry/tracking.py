@@ -42,9 +42,9 @@ _MAX_THROUGH = 0.15
 _MAX_THROUGH_LIKELY = 0.4
 """The same about raw odometry, and where that is frozen: a pose without a match would be farther
 off than most wrong matches, so these are taken, and are in doubt."""
-GATE = 30.66
+_GATE = 30.66
 """χ² of three degrees of freedom at 1 - 1e-6: a match farther from raw odometry is in doubt."""
-WRONG = 0.1
+_WRONG = 0.1
 """Probability that a match in doubt is of another place."""
 LOST = 6
 """Scans in a row without a match after which the next one is a keyframe without one."""
@@ -134,7 +134,7 @@ def tracked(
             result.matched[scan] = True
             z, cov = found.pose, found.cov
             off = poses.between(guess, z)
-            contradicted = off @ np.linalg.solve(found.prior, off) > GATE
+            contradicted = off @ np.linalg.solve(found.prior, off) > _GATE
             doubted = bool(contradicted or not found.sure)
             if steps.frozen[scan]:
                 other = (begin, begin_cov) if other is None else other
@@ -316,4 +316,4 @@ def _doubt(prior: np.ndarray, off: np.ndarray) -> np.ndarray:
     """
     at_match = covariances.propagated(covariances.turns(off[2]), prior)
     far = off[0] ** 2 + off[1] ** 2
-    return np.asarray(WRONG * (at_match + np.diag([far, far, off[2] ** 2])))
+    return np.asarray(_WRONG * (at_match + np.diag([far, far, off[2] ** 2])))
