@@ -42,6 +42,23 @@ def corrected_log(stamp, whole=True):
     return lines, wheels[3::3]
 
 
+def test_a_scan_that_is_written_before_the_line_of_its_pose_sets_nothing(tmp_path):
+    """Half of the motion of a raw log leads to such lines: it is motion."""
+    path = np.cumsum(np.full((21, 3), [1.0, 0.0, 0.0]), axis=0)
+    lines = [odom(path[0], 0)]
+    for k in range(1, 20, 2):
+        lines += [
+            odom(path[k], k),
+            flaser(path[k + 1], path[k + 1], k + 1),
+            odom(path[k + 1], k + 1),
+        ]
+    file = tmp_path / "a.log"
+    file.write_text("\n".join(lines) + "\n")
+    log = datasets.carmen(file)
+    np.testing.assert_allclose(log.raw, path[1:20:2], atol=1e-6)
+    assert not log.corrections
+
+
 @pytest.mark.parametrize(
     ("stamp", "whole"), [(lambda t: 0, True), (lambda t: t, True), (lambda t: 0, False)]
 )
@@ -135,6 +152,7 @@ def test_as_many_lines_as_scans_join_in_order_where_no_stamp_does(tmp_path):
             r" stamps from 1\.0+ s to 7\.0+ s join 1 of the 3 scans of .*a\.log, ",
         ),
         ("2 0 0 0\n1 0 0 0\n7 0 0 0\n", ".* join 2 of the 3 scans"),
+        ("103 0 0 0\n102 0 0 0\n101 0 0 0\n", ".* join 0 of the 3 scans"),
         ("1 0 0 0\n2 0 0\n", r"2: expected 4 fields \(t x y theta\), got 3"),
         ("1 0 0 0\n2 0 0 up\n", "2: theta is not a finite number"),
         ("# nothing\n", "1: expected lines t x y theta, got none"),

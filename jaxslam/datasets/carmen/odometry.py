@@ -14,6 +14,12 @@ _JOINED = 1e-3
 """[s] within which a stamp of a file of odometry is that of a scan."""
 
 
+_MOTION = 0.2
+"""The share of the way ahead from which on the steps to lines that may set the odometry are motion.
+In the logs of `docs/guide/real_data.md` with odometry at every scan corrections have up to 0.03; in
+a raw log whose scans are written before the line of their pose it is 1/n with n lines a scan."""
+
+
 class RawOdometry(NamedTuple):
     """T lines of raw odometry, and what they say at K scans."""
 
@@ -64,7 +70,8 @@ def setting_lines(
     Such a line repeats the pose of the scan before, and so differs from the ODOM line before that
     scan. A line of a raw log may repeat it by chance, or since the logger wrote the two in this
     order. So a line stamped after the one before it counts only where at least half of the lines
-    that follow a scan are such, and other lines remain.
+    that follow a scan are such, other lines remain, and either another such line goes back in time,
+    or the steps to these lines are no share of the motion: corrections lead nowhere on average.
 
     Args:
         row: of each scan of any laser, the last ODOM line before it, -1 if none.
@@ -82,7 +89,10 @@ def setting_lines(
     found = at_scan & ~as_before
     rest = len(path) - 1 - max(int(row[0]), 0) - int(found.sum())
     common = 2 * found.sum() >= (follows & ~(at_scan & as_before)).sum() and rest > 0
-    setting = found & (common | (np.diff(time, prepend=time[0]) < 0))
+    back = np.diff(time, prepend=time[0]) < 0
+    ahead = poses.between(path[:-1], path[1:])[:, 0]
+    motion = abs(ahead[found[1:]].sum()) > _MOTION * abs(ahead.sum())
+    setting = found & (back | (common and ((found & back).any() or not motion)))
     return np.asarray(setting)
 
 
@@ -140,10 +150,11 @@ def of_file(
     row = np.take_along_axis(pair, np.abs(stamps[pair] - time).argmin(axis=0)[None], axis=0)[0]
     joins = np.abs(stamps[row] - time) <= _JOINED
     told = f"raw odometry is of {file.path}: {len(rows):,} lines, "
+    in_time = np.sum(np.diff(stamps) < 0) <= len(stamps) / 2  # else the file runs backwards
     if joins.all():
         used = len(np.unique(row))
         told += f"{used:,} of them joined to the {scans:,} scans by stamp"
-    elif len(rows) == scans and (row[joins] == np.flatnonzero(joins)).all():
+    elif len(rows) == scans and (row[joins] == np.flatnonzero(joins)).all() and in_time:
         row, time = np.arange(scans), stamps
         told += "joined to as many scans in order, which take their stamps"
     else:
