@@ -211,12 +211,12 @@ def _block_row(
     before = (jnp.arange(m) < i) & (at.chosen >= 0)
     shared = problem.cross[jnp.maximum(at.chosen, 0), :, slot]
     shared = jnp.where(before[:, None, None], shared, 0.0).reshape(m * size_z, size_z)
-    there = jnp.repeat(before, size_z)
-    inverse = jnp.where(there[:, None], at.inverse, 0.0)
-    whitened = jnp.where(there, at.whitened, 0.0)
+    joined = jnp.repeat(before, size_z)
+    inverse = jnp.where(joined[:, None], at.inverse, 0.0)
+    whitened = jnp.where(joined, at.whitened, 0.0)
     w = inverse @ shared
     factor, regular = linalg.cholesky(problem.cov[i, which] - w.T @ w)
-    own = jnp.arange(m * size_z)[None, :] == i * size_z + jnp.arange(size_z)[:, None]
-    rows = linalg.solve_lower(factor, own.astype(w.dtype) - w.T @ inverse)
+    diagonal = jnp.arange(m * size_z)[None, :] == i * size_z + jnp.arange(size_z)[:, None]
+    rows = linalg.solve_lower(factor, diagonal.astype(w.dtype) - w.T @ inverse)
     white = linalg.solve_lower(factor, problem.innovation[i, which] - w.T @ whitened)
     return rows, white, (white**2).sum(), regular

@@ -137,12 +137,12 @@ def _step(
             )
         fused = found.status == Status.FUSED
         count, size = fused.size, found.innovation.shape[-1]
-        there = fused.reshape(count)
+        used = fused.reshape(count)
         cov = jax.lax.stop_gradient(found.innovation_cov).reshape(count, size, size)
         # Masked before and after the factor: an empty slot then has no effect on derivatives.
-        cov = jnp.where(there[:, None, None], cov, jnp.eye(size, dtype=cov.dtype))
+        cov = jnp.where(used[:, None, None], cov, jnp.eye(size, dtype=cov.dtype))
         factor = jax.vmap(lambda s: linalg.cholesky(s)[0])(cov)
-        residual = jnp.where(there[:, None], found.innovation.reshape(count, size), 0.0)
+        residual = jnp.where(used[:, None], found.innovation.reshape(count, size), 0.0)
         w = jax.vmap(linalg.solve_lower)(factor, residual).reshape(-1)
         return w, (w, jnp.where(fused, found.dof, 0).sum())
 

@@ -213,19 +213,19 @@ def final_covariance(
                 by_pose, by_landmark = seen.by_pose[t, i], seen.by_landmark[t, i]
                 noise = seen.noise_cov[t, i] + (1e-9 * reach) ** 2 * np.eye(len(by_pose))
                 begin = 3 + int(seen.tag[t, i]) * size
-                own = slice(begin, begin + by_landmark.shape[1])
+                block = slice(begin, begin + by_landmark.shape[1])
                 if by_landmark.shape[1] and not known[seen.tag[t, i]]:
                     known[seen.tag[t, i]] = True
                     if by_landmark.shape == (size, size) and np.linalg.cond(by_landmark) < 1e6:
                         by = np.linalg.inv(by_landmark)
-                        cov[own] = -by @ by_pose @ cov[:3]
-                        cov[:, own] = cov[own].T
-                        cov[own, own] = by @ (by_pose @ cov[:3, :3] @ by_pose.T + noise) @ by.T
+                        cov[block] = -by @ by_pose @ cov[:3]
+                        cov[:, block] = cov[block].T
+                        cov[block, block] = by @ (by_pose @ cov[:3, :3] @ by_pose.T + noise) @ by.T
                         continue
                     whole = slice(begin, begin + size)
                     cov[whole, whole] = (100 * reach) ** 2 * np.eye(size)
-                cross = by_pose @ cov[:3] + by_landmark @ cov[own]
-                innovation = cross[:, :3] @ by_pose.T + cross[:, own] @ by_landmark.T + noise
+                cross = by_pose @ cov[:3] + by_landmark @ cov[block]
+                innovation = cross[:, :3] @ by_pose.T + cross[:, block] @ by_landmark.T + noise
                 cov -= cross.T @ np.linalg.solve(innovation, cross)
         cov = (cov + cov.T) / 2
     return cov[:3, :3]
@@ -260,15 +260,15 @@ def _by_parameters(
 
 def _whitened(sensor: SensorJacobians) -> list[np.ndarray]:
     """The whitened Jacobians R^{-1/2} H by pose and landmark; zero where nothing was measured."""
-    there = sensor.valid[:, :, None, None]
-    noise = np.where(there, sensor.noise_cov, np.eye(sensor.noise_cov.shape[2]))
+    valid = sensor.valid[:, :, None, None]
+    noise = np.where(valid, sensor.noise_cov, np.eye(sensor.noise_cov.shape[2]))
     try:
         factor = np.linalg.cholesky(noise)
     except np.linalg.LinAlgError:
         raise ValueError(
             "posterior_bound: a covariance of measurement noise is not positive definite"
         ) from None
-    return [np.where(there, np.linalg.solve(factor, by), 0.0) for by in sensor[:2]]
+    return [np.where(valid, np.linalg.solve(factor, by), 0.0) for by in sensor[:2]]
 
 
 def _inverted(
@@ -278,7 +278,7 @@ def _inverted(
     size = np.sqrt(np.diagonal(information))
     unit = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
     values, vectors = np.linalg.eigh(information * unit[:, None] * unit)
-    there = values > len(values) * np.finfo(float).eps * values[-1]
-    root = (jacobian * unit) @ vectors[:, there] / np.sqrt(values[there])
+    positive = values > len(values) * np.finfo(float).eps * values[-1]
+    root = (jacobian * unit) @ vectors[:, positive] / np.sqrt(values[positive])
     bound: np.ndarray = root @ root.T
     return bound

@@ -138,15 +138,15 @@ def run_statistics(
         nees, regular = _planar_nees(off, jnp.asarray(estimate.point_covs))
         counts = regular & (held >= 0)
         white = _white(estimate, info)
-        *w, energy, there = sums.recent
-        *w_now, energy_now, there_now = white
+        *w, energy, valid = sums.recent
+        *w_now, energy_now, valid_now = white
         products = [
             linalg.total(old * new[None] for old, new in zip(w, w_now, strict=True))
             if size
             else jnp.zeros_like(energy),
-            energy * there_now[None],
-            there * energy_now[None],
-            there * there_now[None],
+            energy * valid_now[None],
+            valid * energy_now[None],
+            valid * valid_now[None],
         ]
         sums = _Sums(
             poison=sums.poison + 0 * _numbers((estimate, info)),
@@ -210,10 +210,10 @@ def _planar_nees(
     a²/p₁ + (b - a p₁₂/p₁)²/(p₂(1 - ρ²)); 0 where P is not regular or e not finite.
     """
     p1, p12, p2 = cov[:, 0, 0], cov[:, 1, 0], cov[:, 1, 1]
-    there = (p1 > 0) & (p2 > 0) & jnp.isfinite(error).all(axis=1)
-    p1, p2 = (jnp.where(there, p, 1.0) for p in (p1, p2))
+    valid = (p1 > 0) & (p2 > 0) & jnp.isfinite(error).all(axis=1)
+    p1, p2 = (jnp.where(valid, p, 1.0) for p in (p1, p2))
     left = 1 - (p12 / p1) * (p12 / p2)
-    regular = there & (left > 200 * float(jnp.finfo(cov.dtype).eps))
+    regular = valid & (left > 200 * float(jnp.finfo(cov.dtype).eps))
     a = error[:, 0]
     b = error[:, 1] - a * (p12 / p1)
     nees = a**2 / p1 + b**2 / (p2 * jnp.where(regular, left, 1.0))

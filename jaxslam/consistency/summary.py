@@ -73,8 +73,8 @@ class Summary:
     """nis_per_dof from here on up to 1 is honest: below 1 where a gate dropped measurements"""
 
     def __repr__(self) -> str:
-        there = (name for name in _IN_REPR if name in self.measures)
-        shown = (f"{name}={self.measures[name].value:.4g}" for name in there)
+        present = (name for name in _IN_REPR if name in self.measures)
+        shown = (f"{name}={self.measures[name].value:.4g}" for name in present)
         return f"Summary({', '.join([self.verdict, *shown, *self.doubts])})"
 
 

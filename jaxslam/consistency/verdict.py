@@ -76,12 +76,12 @@ def judge(
     lost = counts["not_finite"] + counts["divergent"]
     if lost > 0.5 * (counts["runs"] + counts["not_finite"]):
         return Verdict("diverged", (), {}, doubts, honest_nis)
-    there = {name: per_run[name] for name in TESTS if np.isfinite(per_run.get(name, ())).sum() > 1}
-    level = LEVEL ** (1 / max(len(there), 1))
+    tested = {name: per_run[name] for name in TESTS if np.isfinite(per_run.get(name, ())).sum() > 1}
+    level = LEVEL ** (1 / max(len(tested), 1))
     signs: dict[str, int] = {}
     noticed: dict[str, tuple[float, float]] = {}
     wide = True
-    for name, values in there.items():
+    for name, values in tested.items():
         of_nees = name == "nees_pose"
         found = spread(values, level, skewed=of_nees)
         assert found is not None

@@ -41,12 +41,12 @@ def check_array(
 ) -> None:
     """Raise ValueError unless an array has this shape, in which a letter stands for any number."""
     got = shape_told(value)
-    there = np.shape(value) if got.startswith("(") else ()
-    if len(there) != len(shape) or any(
-        isinstance(n, int) and n != m for n, m in zip(shape, there, strict=True)
+    shape_of = np.shape(value) if got.startswith("(") else ()
+    if len(shape_of) != len(shape) or any(
+        isinstance(n, int) and n != m for n, m in zip(shape, shape_of, strict=True)
     ):
-        told = ", ".join(map(str, shape)) + "," * (len(shape) == 1)
-        raise ValueError(f"{name}: expected shape ({told}), got {got}")
+        expected = ", ".join(map(str, shape)) + "," * (len(shape) == 1)
+        raise ValueError(f"{name}: expected shape ({expected}), got {got}")
     if not hasattr(value, "dtype"):
         raise ValueError(f"{name}: expected an array, got a {type(value).__name__}")
     dtype = jnp.result_type(value)

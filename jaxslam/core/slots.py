@@ -119,8 +119,8 @@ def local_cov(joint: Joint, slot: Int[Array, ""], square_root: bool = False) -> 
 
 def _local_block(rows: Float[Array, "k D"], slot: Int[Array, ""], size: int) -> Float[Array, "k K"]:
     """The columns of the robot and of the landmark (size L) of a slot (), of rows (k, D)."""
-    own = jax.lax.dynamic_slice_in_dim(rows, 3 + slot * size, size, axis=1)
-    return jnp.concatenate([rows[:, :3], own], axis=1)
+    landmark = jax.lax.dynamic_slice_in_dim(rows, 3 + slot * size, size, axis=1)
+    return jnp.concatenate([rows[:, :3], landmark], axis=1)
 
 
 def scatter(
@@ -158,12 +158,12 @@ def scatter(
         return jnp.where(mask, values[place], jnp.zeros_like(values[:1]))
 
     gain = of_slots(by_pose).reshape(capacity * size, 3)
-    own = of_slots(symmetrize(own_cov))
+    diagonal = of_slots(symmetrize(own_cov))
     # Padding's unit variance goes first, to an exact zero: a small covariance plus 1 would lose it.
     filled = jnp.concatenate([jnp.zeros(3, bool), jnp.repeat(born, size)])
     cov = jnp.where(filled[:, None], 0.0, joint.cov)
     if square_root:
-        root = jax.vmap(lambda cov: cholesky(cov)[0])(own)
+        root = jax.vmap(lambda cov: cholesky(cov)[0])(diagonal)
         cov = cov.at[3:].add(total(gain[:, k, None] * joint.cov[None, k] for k in range(3)))
         cov = _add_blocks(cov, root)
     else:
@@ -173,7 +173,7 @@ def scatter(
         cross = total(gain[:, k, None] * half[k, None, :] for k in range(3))
         cross = materialize(jnp.pad(cross, [(3, 0), (0, 0)]))
         cov = cov + (cross + cross.T)
-        cov = _add_blocks(cov, own)
+        cov = _add_blocks(cov, diagonal)
     return joint._replace(
         landmarks=joint.landmarks + of_slots(landmarks),
         cov=cov,

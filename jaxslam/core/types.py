@@ -154,7 +154,7 @@ class Log(NamedTuple):
         seen = []
         for what, model, table, places in given:
             columns = tables.measurement_columns(model.measurements, model.landmark)
-            made = tables.columns_of(what, table, lambda _, own=columns: own)  # type: ignore[misc]
+            made = tables.columns_of(what, table, lambda _, columns=columns: columns)  # type: ignore[misc]
             seen.append(tables.Seen(made, model.measurements, places))
         rows, tags, dropped = tables.align_tables(moved, seen, controls)
         return Recording(cls.from_rows(rows), rows.time, tags, dropped)

@@ -124,12 +124,12 @@ def _inverted(model: Model, plan: Plan, graph: Graph) -> Marginals:
     system = linearize(model, plan, variables, data)
     factored = factorize(plan.cholesky, system.blocks)
     blocks = selected_inverse(plan.inverse, factored)
-    own = blocks[plan.inverse.diagonal[plan.column]]  # by variable
-    own = _masked(own, *[data.free[plan.column]] * 2)
+    diagonal = blocks[plan.inverse.diagonal[plan.column]]  # by variable
+    diagonal = _masked(diagonal, *[data.free[plan.column]] * 2)
     poses, size = len(graph.poses), graph.points.shape[1]
     width = data.free.shape[1]
     turn = _turns(graph, width)
-    own = by_transposed(by(turn, own), turn)
+    diagonal = by_transposed(by(turn, diagonal), turn)
     first, second = plan.pairs[:, 0], plan.pairs[:, 1]
     cross = blocks[plan.inverse.pairs]
     turned = plan.inverse.turned[:, None, None, None]
@@ -138,16 +138,16 @@ def _inverted(model: Model, plan: Plan, graph: Graph) -> Marginals:
     cross = by_transposed(by(turn[first], cross), turn[second])
     joint = jnp.stack(
         [
-            jnp.stack([own[first], cross], axis=1),
-            jnp.stack([jnp.swapaxes(cross, 1, 2), own[second]], axis=1),
+            jnp.stack([diagonal[first], cross], axis=1),
+            jnp.stack([jnp.swapaxes(cross, 1, 2), diagonal[second]], axis=1),
         ],
         axis=1,
     )
     regular = factored.regular
     culprit = plan.order[jnp.argmin(regular, axis=0)].astype(jnp.int32)
     return Marginals(
-        poses=own[:poses, :3, :3],
-        points=own[poses:, :size, :size],
+        poses=diagonal[:poses, :3, :3],
+        points=diagonal[poses:, :size, :size],
         pairs=joint,
         singular=jnp.where(regular.all(axis=0), -1, culprit).astype(jnp.int32),
     )

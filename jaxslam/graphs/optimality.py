@@ -115,8 +115,8 @@ def dual(
             for i in range(size)
         )
         blocks.append(product.reshape(rows * k * k, 4, 4, batch))
-    own = summed(plan.gradient, jnp.concatenate(gradients))[plan.column]
-    multipliers = (own[:poses, 2:] * z[:poses, 2:]).sum(axis=1)
+    by_variable = summed(plan.gradient, jnp.concatenate(gradients))[plan.column]
+    multipliers = (by_variable[:poses, 2:] * z[:poses, 2:]).sum(axis=1)
     every = jnp.concatenate([multipliers, jnp.zeros((count - poses, batch), dtype)])
     unit = jnp.eye(4, dtype=dtype)[None, ..., None]
     turn = unit * jnp.array([0.0, 0.0, 1.0, 1.0], dtype)[None, None, :, None]

@@ -93,8 +93,8 @@ def followed(model: Model, plan: Plan, graph: Graph, found: Solution) -> Solutio
     still = jax.lax.stop_gradient((found.graph.poses, found.graph.points))
     poses = jnp.where(graph.fixed_pose[:, None], graph.poses, still[0])
     points = jnp.where(graph.fixed_point[:, None], graph.points, still[1])
-    there = with_batch(graph._replace(poses=poses, points=points))
-    variables, data = variables_of(there), data_of(there, plan.column)
+    trial = with_batch(graph._replace(poses=poses, points=points))
+    variables, data = variables_of(trial), data_of(trial, plan.column)
     blocks = half_hessian(*jax.lax.stop_gradient((model, plan, variables, data)))
     gradient = linearize(model, plan, variables, data).gradient
     step = _solve_by_factor(plan, blocks[..., 0], gradient[..., 0])
@@ -174,16 +174,16 @@ def optimize(
         )
     model = model_of(caller, graph, factors, kernel)
     check_graph(caller, graph, model.factors)
-    own, fill = graph, plan is None and is_concrete(graph)
+    original, fill = graph, plan is None and is_concrete(graph)
     graph = padded_graph(graph, room) if fill else graph
     plan = plan_for(caller, graph, model.factors, plan, room=room)
     found: Solution = _optimize(model, graph, plan, iterations, tolerance)
     if not fill:
         return found
-    singular = own_number(found.singular, own, graph)
-    rows = {name: table.valid for name, table in own.tables.items()}
+    singular = own_number(found.singular, original, graph)
+    rows = {name: table.valid for name, table in original.tables.items()}
     return found._replace(
-        graph=cut(found.graph, own), singular=singular, weights=cut(found.weights, rows)
+        graph=cut(found.graph, original), singular=singular, weights=cut(found.weights, rows)
     )
 
 

@@ -129,8 +129,8 @@ def _check_kind(what: str, **values: tuple[JaxOrNumPy, type]) -> None:
         if not hasattr(value, "dtype"):
             raise ValueError(f"{what}: expected {field} to be an array, got {type(value).__name__}")
         if np.size(value) and not jnp.issubdtype(value.dtype, kind):
-            told = "bool" if kind is np.bool_ else "integers"
-            raise ValueError(f"{what}: expected {field} of {told}, got {value.dtype}")
+            expected = "bool" if kind is np.bool_ else "integers"
+            raise ValueError(f"{what}: expected {field} of {expected}, got {value.dtype}")
 
 
 def _check_shapes(name: str, graph: Graph) -> None:
@@ -205,8 +205,8 @@ def _check_gauge(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None
     if not len(loose):
         return
     members = np.flatnonzero(parts.part == loose[0])
-    told = ", ".join(label(graph, int(variable)) for variable in members[:3])
-    told += f", … ({len(members):,} variables)" if len(members) > 3 else ""
+    labels = ", ".join(label(graph, int(variable)) for variable in members[:3])
+    labels += f", … ({len(members):,} variables)" if len(members) > 3 else ""
     count = int(parts.free.sum())
     if count == 1:
         raise ValueError(
@@ -214,7 +214,7 @@ def _check_gauge(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None
             "give one a prior"
         )
     raise ValueError(
-        f"{name}: the graph is disconnected: no measurement with information joins {told} to a "
+        f"{name}: the graph is disconnected: no measurement with information joins {labels} to a "
         f"fixed pose or one with a prior; {count} parts, {len(loose)} of them loose"
     )
 

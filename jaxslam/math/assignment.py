@@ -109,9 +109,9 @@ def _augmented(matching: _Matching, path: _Path, row: Array) -> tuple[Array, Arr
         column, column_of, row_of = state
         owner = path.before[column]
         before = column_of[owner]
-        done = owner == row
+        matched = owner == row
         return (
-            jnp.where(done, -1, before),
+            jnp.where(matched, -1, before),
             column_of.at[owner].set(column),
             row_of.at[column].set(owner),
         )

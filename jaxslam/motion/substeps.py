@@ -69,8 +69,8 @@ class Substeps(Motion):
             return self.motion.step(pose, u_k, none), self.motion.noise_cov(pose, u_k)
 
         _, blocks = jax.lax.scan(one, pose, self._rows(u, jnp.zeros(size, pose.dtype)))
-        own = jnp.eye(self.count, dtype=blocks.dtype)[:, None, :, None]
-        return (own * blocks[:, :, None, :]).reshape(size, size)
+        identity = jnp.eye(self.count, dtype=blocks.dtype)[:, None, :, None]
+        return (identity * blocks[:, :, None, :]).reshape(size, size)
 
     @property
     def perturb(self) -> Callable[[Array, Array], Array] | None:
@@ -91,8 +91,8 @@ class Substeps(Motion):
         def forward(pose: Pose, row: _Rows) -> tuple[Array, _Jacobians]:
             return self.motion.step(pose, *row), self.motion.jacobians(pose, *row)
 
-        def backward(after: Array, own: _Jacobians) -> tuple[Array, _Rows]:
-            by_pose, by_u, by_w = own
+        def backward(after: Array, step: _Jacobians) -> tuple[Array, _Rows]:
+            by_pose, by_u, by_w = step
             return after @ by_pose, (after @ by_u, after @ by_w)  # after is F_n ⋯ F_{k+1}
 
         _, along = jax.lax.scan(forward, pose, self._rows(u, w))

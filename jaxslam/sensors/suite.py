@@ -231,15 +231,15 @@ class _OnGround(Wrapped):
 
     @property
     def landmark(self) -> tuple[str, ...]:  # type: ignore[override]
-        own = self.sensor.landmark
-        return (*own, *("-",) * (self.size - len(own)))
+        entries = self.sensor.landmark
+        return (*entries, *("-",) * (self.size - len(entries)))
 
     @property
     def free(self) -> Free:  # type: ignore[override]
-        own, spare = self.sensor.free, self.size - len(self.sensor.landmark)
-        mean = jnp.asarray(own.mean)
+        prior, spare = self.sensor.free, self.size - len(self.sensor.landmark)
+        mean = jnp.asarray(prior.mean)
         kept = mean.shape[0]
-        cov = jnp.eye(kept + spare, dtype=mean.dtype).at[:kept, :kept].set(own.cov)
+        cov = jnp.eye(kept + spare, dtype=mean.dtype).at[:kept, :kept].set(prior.cov)
         return Free(jnp.concatenate([mean, jnp.zeros(spare, mean.dtype)]), cov)
 
     def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
@@ -253,8 +253,8 @@ class _OnGround(Wrapped):
         return self.sensor.position(self._own(landmark))
 
     def embed(self, pose: Pose, point: Point) -> Landmark:
-        own = self.sensor.embed(pose, point)
-        return jnp.concatenate([own, jnp.zeros(self.size - len(own), pose.dtype)])
+        landmark = self.sensor.embed(pose, point)
+        return jnp.concatenate([landmark, jnp.zeros(self.size - len(landmark), pose.dtype)])
 
     def _own(self, landmark: Landmark) -> Array:
         return landmark[: len(self.sensor.landmark)]

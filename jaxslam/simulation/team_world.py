@@ -99,8 +99,10 @@ class TeamWorld(World):
             if robot.start is not None:
                 mean, cov = robot.start
                 start = se2.compose(first, drawn_near(jnp.asarray(mean, dtype), cov, own_key))
-            own = controls[:, ends[b] - len(robot.motion.controls) : ends[b]]
-            path, log = drive(robot.motion, start, own, jax.random.fold_in(key_motion, b))
+            robot_controls = controls[:, ends[b] - len(robot.motion.controls) : ends[b]]
+            path, log = drive(
+                robot.motion, start, robot_controls, jax.random.fold_in(key_motion, b)
+            )
             starts.append(start)
             poses.append(path)
             logged.append(log)

@@ -87,8 +87,8 @@ def _compare(evaluation: Jacobians, tolerance: float, float32_tolerance: float) 
     if evaluation.quotient is not None:
         value, error, kink = evaluation.quotient
         away = np.abs(np.stack(list(evaluation.methods.values())) - value).max(axis=0)
-        own = np.abs(value).max(axis=2, keepdims=True, initial=0.0)
-        trusted = ((error <= _CONVERGED * own) | (error <= _NOTHING)) & ~kink
+        magnitude = np.abs(value).max(axis=2, keepdims=True, initial=0.0)
+        trusted = ((error <= _CONVERGED * magnitude) | (error <= _NOTHING)) & ~kink
         away = np.where(trusted, np.where(np.isfinite(away), away, np.inf), 0.0)
         excess_away = _relative(away, _DIFFERENCES_TOLERANCE * scale + 10 * error)
         # At a kink any value between the one-sided derivatives is accepted. Elsewhere, if the

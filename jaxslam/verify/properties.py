@@ -66,8 +66,8 @@ def motion_checks(motion: Motion, samples: Samples) -> Iterator[Check]:
 
     def perturb_error() -> str:
         def gap(pose: jax.Array, u: jax.Array, w: jax.Array) -> jax.Array:
-            there = motion.step(pose, perturb(u, w), jnp.zeros_like(w))
-            return there - motion.step(pose, u, w)
+            perturbed = motion.step(pose, perturb(u, w), jnp.zeros_like(w))
+            return perturbed - motion.step(pose, u, w)
 
         return _deviation(
             quick_jit(jax.vmap(gap))(pose, u, w), np.array([np.inf, np.inf, 2 * np.pi])

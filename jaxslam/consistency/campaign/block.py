@@ -178,9 +178,9 @@ class BlockRunner:
         found = jax.device_get(
             self._statistics(self._world.sensor, drawn, results.estimate, results.info)
         )
-        own = np.swapaxes(jax.device_get(results.own_error), 0, 1)
+        chart_error = np.swapaxes(jax.device_get(results.own_error), 0, 1)
         trace = _on_host(results)
-        return score(*jax.tree.map(lambda leaf: leaf[mine], (trace, truth, found, own)))
+        return score(*jax.tree.map(lambda leaf: leaf[mine], (trace, truth, found, chart_error)))
 
     def run_seconds(self) -> dict[str, float]:
         """What one run took on one device, by filter: the median over blocks so far."""

@@ -149,8 +149,8 @@ def _check_stated(name: str, size: int, model: Motion | Sensor, *at: PyTree) -> 
     try:
         check_covariance(name, _noise_cov(model, *at), size)
     except ValueError as error:
-        said = str(error).removeprefix(f"{name}: ")
-        raise ValueError(f"monte_carlo: noise_cov of {name}: {said}") from None
+        message = str(error).removeprefix(f"{name}: ")
+        raise ValueError(f"monte_carlo: noise_cov of {name}: {message}") from None
 
 
 def check_fits(name: str, candidate: Candidate, scenario: World) -> None:

@@ -102,11 +102,11 @@ def monte_carlo(
             f"monte_carlo: part: expected one of the {-(-runs // plan.wide)} blocks of {plan.wide} "
             f"runs that {runs} runs are, got part {part[0]} of {part[1]}"
         )
-    done: list[tuple[int, int]] = []
+    finished: list[tuple[int, int]] = []
     if keep is not None:
         keep.claim(identity(scenario, filters, key, devices[0].platform, bound, dtype))
-        done = add_kept(tallies, keep, runs, lambda first: in_part(first, plan.wide, part))
-    pieces = missing(done, runs, plan.wide)
+        finished = add_kept(tallies, keep, runs, lambda first: in_part(first, plan.wide, part))
+    pieces = missing(finished, runs, plan.wide)
     todo = [piece for piece in pieces if in_part(piece[0], plan.wide, part)]
     work = Work(workers, keep, progress or None, {name: Tally() for name in names})
     try:
@@ -115,7 +115,7 @@ def monte_carlo(
         interrupted = False
     except KeyboardInterrupt:
         interrupted = True
-    for name, tally in work.own.items():
+    for name, tally in work.tallies.items():
         tallies[name].merge(tally)
     campaign = None
     if tallies[BOUND].pieces():
@@ -177,10 +177,10 @@ def _check(
 
 def summaries_of(tallies: dict[str, Tally]) -> tuple[int, np.ndarray, dict[str, Summary]]:
     """How many runs there are, the divergence limit, and the summary of each filter."""
-    done = sum(count for _, count in tallies[BOUND].pieces())
-    bound = {name: total / done for name, total in tallies[BOUND].sums.items()} or None
+    finished = sum(count for _, count in tallies[BOUND].pieces())
+    bound = {name: total / finished for name, total in tallies[BOUND].sums.items()} or None
     found = {name: summarize(one, bound) for name, one in tallies.items() if name != BOUND}
-    return done, tallies[BOUND].first("limit"), found
+    return finished, tallies[BOUND].first("limit"), found
 
 
 def _summed_up(
@@ -188,14 +188,14 @@ def _summed_up(
 ) -> Campaign:
     """The campaign of the runs in the tallies."""
     scenario = plan.scenario
-    done, limit, summaries = summaries_of(tallies)
+    finished, limit, summaries = summaries_of(tallies)
     steps = max(scenario.steps, 1)
     return Campaign(
         scenario=scenario.name,
         source=scenario.source,
-        published={name: dict(told) for name, told in scenario.published.items()},
+        published={name: dict(values) for name, values in scenario.published.items()},
         steps=scenario.steps,
-        runs=done,
+        runs=finished,
         dtype=str(limit.dtype),
         divergence_limit=float(limit),
         filters=_qualified(summaries, scenario),

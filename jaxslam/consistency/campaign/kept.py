@@ -28,20 +28,20 @@ def add_kept(
 
     Raises ValueError where there are runs beyond those asked for.
     """
-    done: list[tuple[int, int]] = []
+    finished: list[tuple[int, int]] = []
     most = 0
     for first, count, arrays in keep.blocks():
         most = max(most, first + count)
         if most > runs:  # sums over a block cannot be taken apart; look how many runs there are
             continue
-        done.append((first, count))
+        finished.append((first, count))
         if wanted(first):
             add_block(tallies, first, count, by_filter(arrays, tallies))
     if most > runs:
         raise ValueError(
             f"monte_carlo: keep holds {most} runs: expected at least as many, got {runs}"
         )
-    return done
+    return finished
 
 
 def add_block(

@@ -25,8 +25,8 @@ class Work:
     workers: int
     keep: Keep | None
     progress: Callable[[int, int], None] | None
-    own: dict[str, Tally]
-    """what was computed here, by filter"""
+    tallies: dict[str, Tally]
+    """the results of this process, by filter"""
     compile_seconds: float = 0.0
     run_seconds: dict[str, float] = field(default_factory=dict)
     first: dict[str, tuple[Truth, Estimate]] = field(default_factory=dict)
@@ -56,7 +56,7 @@ class Work:
         """Add those of the pieces that are not yet there to the tallies."""
         if not todo:
             return
-        before = self.own[BOUND].pieces()
+        before = self.tallies[BOUND].pieces()
         queue = [
             piece
             for first, count in todo
@@ -64,7 +64,7 @@ class Work:
         ][::-1]
         runner = BlockRunner(plan)
         self.compile_seconds += runner.compile_seconds
-        done = sum(count for _, count in before)
+        finished = sum(count for _, count in before)
         total = sum(count for _, count in todo)
         flight: dict[Future[dict[str, dict[str, np.ndarray]]], tuple[int, int]] = {}
         stop: BaseException | None = None
@@ -81,11 +81,11 @@ class Work:
                             continue
                         found = future.result()
                         if self.keep is not None:
-                            self.keep.save(first, flat(found, self.own), count)
-                        add_block(self.own, first, count, found)
-                        done += count
+                            self.keep.save(first, flat(found, self.tallies), count)
+                        add_block(self.tallies, first, count, found)
+                        finished += count
                         if self.progress is not None:
-                            self.progress(done, total)
+                            self.progress(finished, total)
                 except BaseException as error:
                     if stop is not None:
                         raise

@@ -117,8 +117,8 @@ def credibility(
             continue
         claimed = np.einsum("ri,ri->r", e, np.linalg.solve(covs[runs, step], e[:, :, None])[..., 0])
         fair = np.einsum("ri,ri->r", e, np.linalg.solve(actual, e.T).T)
-        there = (claimed > 0) & (fair > 0) & np.isfinite(claimed) & np.isfinite(fair)
-        runs, decibels = runs[there], 10 * np.log10(claimed[there] / fair[there])
+        valid = (claimed > 0) & (fair > 0) & np.isfinite(claimed) & np.isfinite(fair)
+        runs, decibels = runs[valid], 10 * np.log10(claimed[valid] / fair[valid])
         total[:, runs] += [np.abs(decibels), decibels]
         count[runs] += 1
     if not count.any():

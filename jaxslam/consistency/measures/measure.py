@@ -118,12 +118,12 @@ class Measure:
             return None
         if isinstance(found, tuple):
             return RunScores(np.asarray(found[0]), np.asarray(found[1]))
-        there = np.isfinite(found)
-        values = np.where(there, found, 0.0).astype(np.float64)
+        finite = np.isfinite(found)
+        values = np.where(finite, found, 0.0).astype(np.float64)
         if values.ndim == 1:
-            return RunScores(values, there)
-        sums = {self.key: values, f"runs_{self.key}": there.astype(np.float64)}
-        return RunScores(values.sum(axis=1), there.sum(axis=1), sums)
+            return RunScores(values, finite)
+        sums = {self.key: values, f"runs_{self.key}": finite.astype(np.float64)}
+        return RunScores(values.sum(axis=1), finite.sum(axis=1), sums)
 
     def of_snapshots(
         self,

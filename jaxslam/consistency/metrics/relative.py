@@ -269,8 +269,8 @@ def summary(errors: Errors | PathErrors) -> dict[str, float]:
     ):
         figures = statistics(values)
         for figure in ("mean", "std", "rmse", "median", "max"):
-            told = "RMSE" if figure == "rmse" else figure
-            found[f"{name} {told} [{unit}]"] = float(getattr(figures, figure))
+            title = "RMSE" if figure == "rmse" else figure
+            found[f"{name} {title} [{unit}]"] = float(getattr(figures, figure))
     return found
 
 

@@ -87,9 +87,9 @@ def unit_divisor(unit: str | None, wanted: str) -> float | None:
 
 def odometry_columns(controls: tuple[str, ...], given: Sequence[str]) -> tuple[str, ...]:
     """The columns beside the time from which a model's controls come, out of those given."""
-    own = tuple(name for name in controls if name != INTERVAL)
+    measured = tuple(name for name in controls if name != INTERVAL)
     poses = {split_unit(name)[0] for name in POSE} <= {split_unit(name)[0] for name in given}
-    return POSE if poses and own == _INCREMENT else own
+    return POSE if poses and measured == _INCREMENT else measured
 
 
 def measurement_columns(measured: tuple[str, ...], landmark: tuple[str, ...]) -> tuple[str, ...]:
@@ -252,16 +252,16 @@ def columns_of(
         divisors = dict.fromkeys(needed, 1.0)
     else:
         assert not isinstance(given, Sequence)  # which has no names
-        own = {split_unit(name)[0]: name for name in names}
+        header = {split_unit(name)[0]: name for name in names}
         found, divisors = {}, {}
         for name in needed:
             bare = split_unit(name)[0]
-            if bare not in own:
+            if bare not in header:
                 raise ValueError(f"{what}: expected a column {name!r}, got {', '.join(names)}")
-            divisor = unit_divisor(split_unit(own[bare])[1], name)
+            divisor = unit_divisor(split_unit(header[bare])[1], name)
             if divisor is None:
-                raise ValueError(f"{what}: expected the column {name!r}, got {own[bare]!r}")
-            found[name], divisors[name] = list(given[own[bare]]), divisor
+                raise ValueError(f"{what}: expected the column {name!r}, got {header[bare]!r}")
+            found[name], divisors[name] = list(given[header[bare]]), divisor
         lengths = {name: len(column) for name, column in found.items()}
         if len(set(lengths.values())) > 1:
             raise ValueError(f"{what}: expected columns of one length, got {lengths}")

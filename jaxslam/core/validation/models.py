@@ -179,8 +179,8 @@ def _check_size(
     if (got := unfit_signature(function, len(arguments))) is not None:
         wanted = f"{model.name}.{field} to take ({', '.join(arguments)})"
         raise ValueError(f"{name}: expected {wanted}, got {got}")
-    told = ", ".join(f"{key} {_told(value.shape)}" for key, value in arguments.items())
-    call = f"{model.name}.{field}({told})"
+    sizes = ", ".join(f"{key} {_told(value.shape)}" for key, value in arguments.items())
+    call = f"{model.name}.{field}({sizes})"
     try:
         found = jax.eval_shape(function, *arguments.values())
     except Exception as error:
@@ -216,8 +216,8 @@ def same_state(name: str, before: _S, after: PyTree) -> _S:
     """
     old: PyTree = jax.tree.structure(before)
     if old != jax.tree.structure(after):
-        told = f"expected a state as before, {_kind(before)}, got {_kind(after)}"
-        raise ValueError(f"{name}: {told}")
+        message = f"expected a state as before, {_kind(before)}, got {_kind(after)}"
+        raise ValueError(f"{name}: {message}")
     pairs = zip(jax.tree.leaves_with_path(before), jax.tree.leaves(after), strict=True)
     unlike = [
         f"state{jax.tree_util.keystr(path)}: expected {_array(old)}, got {_array(new)}"

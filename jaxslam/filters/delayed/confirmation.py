@@ -127,18 +127,18 @@ def correct_hypotheses(
 
     and robot, landmarks and stored measurements keep theirs.
     """
-    count, own = layout.hypotheses, layout.hypothesis_rows
+    count, own_rows = layout.hypotheses, layout.hypothesis_rows
     rows = SIZE * count
     every = jnp.arange(count)
-    own_hp = constraints.hp[:, own].reshape(count, count, SIZE)[every, every]
+    own_hp = constraints.hp[:, own_rows].reshape(count, count, SIZE)[every, every]
     variance = jnp.diagonal(constraints.cov)
     which = which & (variance > 0)
     gain = jnp.where(which[:, None], own_hp / jnp.where(which, variance, 1.0)[:, None], 0.0)
     k_hp = (gain[:, :, None] * constraints.hp[:, None, :]).reshape(rows, -1)
     k_s_k = gain[:, :, None, None] * constraints.cov[:, None, :, None] * gain[None, None]
-    half = -k_hp.at[:, own].add(-0.5 * k_s_k.reshape(rows, rows))
+    half = -k_hp.at[:, own_rows].add(-0.5 * k_s_k.reshape(rows, rows))
     half = materialize(half)
     return joint._replace(
         landmarks=joint.landmarks.at[layout.of_hypotheses].add(-gain * constraints.value[:, None]),
-        cov=joint.cov.at[own].add(half).at[:, own].add(half.T),
+        cov=joint.cov.at[own_rows].add(half).at[:, own_rows].add(half.T),
     )

@@ -73,11 +73,11 @@ class UncertainPoints(NamedTuple):
 def relative_to_robot(joint: Joint, layout: TableLayout) -> UncertainPoints:
     """The positions of the hypotheses (C,) relative to the robot's position."""
     first, count = layout.landmarks, layout.hypotheses
-    own = covariance_blocks(joint)[first : first + count][:, :2]
-    own = own[jnp.arange(count), :, first + jnp.arange(count), :2]
+    blocks = covariance_blocks(joint)[first : first + count][:, :2]
+    blocks = blocks[jnp.arange(count), :, first + jnp.arange(count), :2]
     cross = joint.cov[:2, 3:].reshape(2, layout.slots, SIZE)[:, first : first + count, :2]
     cross = cross.transpose(1, 0, 2)
-    cov = own + joint.cov[None, :2, :2] - cross - cross.transpose(0, 2, 1)
+    cov = blocks + joint.cov[None, :2, :2] - cross - cross.transpose(0, 2, 1)
     return UncertainPoints(joint.landmarks[layout.of_hypotheses, :2] - joint.pose[None, :2], cov)
 
 

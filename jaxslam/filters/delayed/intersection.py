@@ -237,17 +237,17 @@ def add_hypotheses(
     own_cov = own_cov + jnp.einsum("cinj,nkj->cink", columns[:, :, parents[:, 1]], by_b)
     own_cov = jnp.pad(own_cov, [(0, 0), (0, 1), (0, 0), (0, 1)]).reshape(SIZE * count, SIZE * count)
     half = jnp.pad(jp, [(0, 0), (0, 1), (0, 0)]).reshape(SIZE * count, -1)
-    own = layout.hypothesis_rows
-    half = materialize(half.at[:, own].add(0.5 * own_cov))
+    hypothesis_rows = layout.hypothesis_rows
+    half = materialize(half.at[:, hypothesis_rows].add(0.5 * own_cov))
     # Padding's unit variance goes first, to an exact zero; the third parameter keeps it.
     unit = (formed[:, None] & (jnp.arange(SIZE) < 2)[None]).reshape(-1).astype(joint.cov.dtype)
-    at = jnp.arange(own.start, own.stop)
+    at = jnp.arange(hypothesis_rows.start, hypothesis_rows.stop)
     cov = joint.cov.at[at, at].add(-unit)
     here = layout.of_hypotheses
     placed = jnp.where(formed[:, None], jnp.pad(points, [(0, 0), (0, 1)]), 0.0)
     return joint._replace(
         landmarks=joint.landmarks.at[here].add(placed),
-        cov=cov.at[own].add(half).at[:, own].add(half.T),
+        cov=cov.at[hypothesis_rows].add(half).at[:, hypothesis_rows].add(half.T),
         alive=joint.alive.at[here].set(joint.alive[here] | formed),
         tag=joint.tag.at[here].set(jnp.where(formed, tag, joint.tag[here]).astype(jnp.int32)),
     )

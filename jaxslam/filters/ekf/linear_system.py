@@ -105,6 +105,8 @@ def basis_of_each(
         return None
     (m, size), still = landmarks.shape, jnp.eye(landmarks.shape[1], dtype=pose.dtype)
     basis = jax.vmap(chart.basis, in_axes=(None, 0))(pose, landmarks)
-    own = jnp.broadcast_to(still, (m, size, size)) if basis.landmark is None else basis.landmark
+    landmark = (
+        jnp.broadcast_to(still, (m, size, size)) if basis.landmark is None else basis.landmark
+    )
     top = jnp.concatenate([basis.pose, jnp.zeros((m, 3, size), pose.dtype)], axis=2)
-    return jnp.concatenate([top, jnp.concatenate([basis.cross, own], axis=2)], axis=1)
+    return jnp.concatenate([top, jnp.concatenate([basis.cross, landmark], axis=2)], axis=1)

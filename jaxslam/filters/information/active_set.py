@@ -151,12 +151,12 @@ def deactivate(
     else:
         pairs = jnp.repeat(order, count), jnp.tile(every, len(order)), entered.reshape(-1)
         state, _ = jax.lax.scan(enter_pair, state, pairs)
-    own = state.diagonal.at[state.active].get(mode="fill", fill_value=0)
+    diagonal = state.diagonal.at[state.active].get(mode="fill", fill_value=0)
     unit = jnp.eye(2, dtype=omega.dtype)
     empty = leaving | (state.active >= n)
-    blocks = blocks.at[every, every].set(own)
+    blocks = blocks.at[every, every].set(diagonal)
     blocks = jnp.where((leaving[:, None] | leaving[None, :])[:, :, None, None], 0.0, blocks)
-    blocks = blocks.at[every, every].set(jnp.where(empty[:, None, None], unit, own))
+    blocks = blocks.at[every, every].set(jnp.where(empty[:, None, None], unit, diagonal))
     return state._replace(
         omega=with_landmark_blocks(omega, blocks),
         active=jnp.where(leaving, n, state.active).astype(jnp.int32),
@@ -182,11 +182,11 @@ def activate(
     rows, links = materialize((rows, links))
     match = (rows[:, :, None] == active[None, None, :]) & (active < n)[None, None, :]
     found = jnp.einsum("akij,akb->abij", links, match.astype(links.dtype))
-    own = state.diagonal.at[jnp.where(entered, active, n)].get(mode="fill", fill_value=0)
+    diagonal = state.diagonal.at[jnp.where(entered, active, n)].get(mode="fill", fill_value=0)
     blocks = landmark_blocks(state.omega) + found
     every = jnp.arange(count)
     before = blocks[every, every]
-    blocks = blocks.at[every, every].set(jnp.where(entered[:, None, None], own, before))
+    blocks = blocks.at[every, every].set(jnp.where(entered[:, None, None], diagonal, before))
     moved = match.any(axis=2)
     left = jnp.where(moved[:, :, None, None], 0.0, links)
     return state._replace(

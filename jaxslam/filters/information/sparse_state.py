@@ -94,14 +94,14 @@ def active_means(state: SparseState) -> Float[Array, "A 2"]:
 
 def active_residual(state: SparseState) -> Float[Array, "D"]:
     """The information residual ρ of the robot and the active landmarks."""
-    own = state.landmark_residual.at[state.active].get(mode="fill", fill_value=0)
-    return jnp.concatenate([state.pose_residual, own.reshape(-1)])
+    landmarks = state.landmark_residual.at[state.active].get(mode="fill", fill_value=0)
+    return jnp.concatenate([state.pose_residual, landmarks.reshape(-1)])
 
 
 def with_active_residual(state: SparseState, residual: Float[Array, "D"]) -> SparseState:
     """The state with ρ of the robot and the active landmarks."""
-    own = residual[3:].reshape(-1, 2)
-    after = state.landmark_residual.at[state.active].set(own, mode="drop")
+    landmarks = residual[3:].reshape(-1, 2)
+    after = state.landmark_residual.at[state.active].set(landmarks, mode="drop")
     return state._replace(pose_residual=residual[:3], landmark_residual=after)
 
 

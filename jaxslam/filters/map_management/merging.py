@@ -191,8 +191,8 @@ def closest_pair(
     own_errors = jnp.einsum("nij,njmk,mlk->nmil", by_landmark, blocks, by_landmark)
     cov = own_errors + with_robot + with_robot.transpose(1, 0, 3, 2)
     cov = cov + jnp.einsum("nij,jk,mlk->nmil", by_robot, robot, by_robot)
-    own = cov[jnp.arange(capacity), jnp.arange(capacity)]
-    delta_covs = own[:, None] + own[None, :] - cov - cov.transpose(1, 0, 2, 3)
+    diagonal = cov[jnp.arange(capacity), jnp.arange(capacity)]
+    delta_covs = diagonal[:, None] + diagonal[None, :] - cov - cov.transpose(1, 0, 2, 3)
     pairs = joint.alive[:, None] & joint.alive[None, :]
     pairs = pairs & (jnp.arange(capacity)[:, None] < jnp.arange(capacity)[None, :])
     pairs = pairs & ((delta**2).sum(axis=2) <= reach**2)
@@ -222,9 +222,9 @@ def merge_landmarks(
     size = joint.landmarks.shape[1]
     by_robot, by_landmark = (part[jnp.stack([i, j])] for part in _derivatives(joint, chart))
     rows = joint.cov @ joint.cov.T if square_root else joint.cov
-    own = [jax.lax.dynamic_slice_in_dim(rows, 3 + slot * size, size) for slot in (i, j)]
+    rows_of = [jax.lax.dynamic_slice_in_dim(rows, 3 + slot * size, size) for slot in (i, j)]
     with_all = (by_robot[0] - by_robot[1]) @ rows[:3]
-    with_all = with_all + by_landmark[0] @ own[0] - by_landmark[1] @ own[1]
+    with_all = with_all + by_landmark[0] @ rows_of[0] - by_landmark[1] @ rows_of[1]
     mine = [jax.lax.dynamic_slice_in_dim(with_all, 3 + s * size, size, axis=1) for s in (i, j)]
     s = with_all[:, :3] @ (by_robot[0] - by_robot[1]).T
     s = s + mine[0] @ by_landmark[0].T - mine[1] @ by_landmark[1].T

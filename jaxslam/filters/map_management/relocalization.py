@@ -63,9 +63,9 @@ def seen_points(sensor: Sensor, scan: Scan) -> tuple[Float[Array, "M 2"], Float[
 
     jacobian = jax.vmap(jax.jacfwd(point))(z)
     covs = jacobian @ jax.vmap(sensor.noise_cov)(z) @ jacobian.transpose(0, 2, 1)
-    there = scan.valid[:, None, None]
+    valid = scan.valid[:, None, None]
     points = jnp.where(scan.valid[:, None], jax.vmap(point)(z), 0.0)
-    return points, jnp.where(there, covs, jnp.eye(2, dtype=z.dtype)[None])
+    return points, jnp.where(valid, covs, jnp.eye(2, dtype=z.dtype)[None])
 
 
 def relocalize(
@@ -118,11 +118,11 @@ def relocalize(
     limits = search_limits(m, probability, pairs, candidates)
     if n < 2 or m < 2:
         return _judged(_nothing(m, jnp.result_type(points)), least, margin)
-    own = jnp.zeros((m, 2, m, 2), seen.dtype)
-    own = own.at[jnp.arange(m), :, jnp.arange(m)].set(seen_covs)
+    seen_cov = jnp.zeros((m, 2, m, 2), seen.dtype)
+    seen_cov = seen_cov.at[jnp.arange(m), :, jnp.arange(m)].set(seen_covs)
     shared = jnp.zeros((m, 2, n, 2), seen.dtype)
     parts = PointSets(
-        seen, points, own, cov.reshape(n, 2, n, 2), shared, valid[:, None] & alive[None]
+        seen, points, seen_cov, cov.reshape(n, 2, n, 2), shared, valid[:, None] & alive[None]
     )
     return _judged(match_points(parts, limits), least, margin)
 
@@ -215,15 +215,15 @@ def relocated(
             f"got {np.shape(seen)} and {np.shape(seen_covs)}"
         )
     cov = cov_of_coordinates(joint, chart, square_root=square_root)
-    own = jnp.zeros((m, 2, m, 2), cov.dtype)
-    own = own.at[jnp.arange(m), :, jnp.arange(m)].set(seen_covs)
+    seen_cov = jnp.zeros((m, 2, m, 2), cov.dtype)
+    seen_cov = seen_cov.at[jnp.arange(m), :, jnp.arange(m)].set(seen_covs)
     among = cov[3:, 3:].reshape(capacity, 2, capacity, 2)
     shared = jnp.zeros((m, 2, capacity, 2), cov.dtype)
     allowed = (slot >= 0)[:, None] & joint.alive[None]
     slot = jnp.where((slot >= 0) & joint.alive[jnp.maximum(slot, 0)], slot, -1)
-    found = align_points(PointSets(seen, joint.landmarks, own, among, shared, allowed), slot)
-    there = (slot >= 0)[:, None]
-    rows = jnp.where(there[:, :, None], among[jnp.maximum(slot, 0)].reshape(m, 2, -1), 0.0)
+    found = align_points(PointSets(seen, joint.landmarks, seen_cov, among, shared, allowed), slot)
+    paired = (slot >= 0)[:, None]
+    rows = jnp.where(paired[:, :, None], among[jnp.maximum(slot, 0)].reshape(m, 2, -1), 0.0)
     rows = linalg.solve_lower(found.factor, rows.reshape(2 * m, -1))
     by = linalg.solve_lower(found.factor, found.jacobian)
     white = linalg.solve_lower(found.factor, found.residual)

@@ -140,8 +140,8 @@ def propose_pose(
     slot, zero = association.slot, jnp.zeros((), particle.pose.dtype)
     rows = scan.z, particle.landmarks[slot], particle.covs[slot], association.matched, scan.valid
     start = particle.pose, particle.pose_cov, zero, zero
-    done, innovations = jax.lax.scan(correct_by, start, rows)
-    return PoseProposal(*done), innovations
+    corrected, innovations = jax.lax.scan(correct_by, start, rows)
+    return PoseProposal(*corrected), innovations
 
 
 def _predict_measurements(particle: SlamParticles, sensor: Sensor) -> Prediction:
@@ -152,20 +152,20 @@ def _predict_measurements(particle: SlamParticles, sensor: Sensor) -> Prediction
 
         def one(landmark: Array, cov: Array) -> tuple[Array, Array, Array]:
             by_pose, by_landmark = first_order.observe_jacobians(sensor, particle.pose, landmark)
-            own = linalg.matmul(linalg.matmul(by_landmark, cov), by_landmark.T)
-            return sensor.observe(particle.pose, landmark), by_pose, own
+            landmark_cov = linalg.matmul(linalg.matmul(by_landmark, cov), by_landmark.T)
+            return sensor.observe(particle.pose, landmark), by_pose, landmark_cov
 
         return jax.vmap(one)(particle.landmarks, particle.covs)
 
     def measurements() -> tuple[Float[Array, "N Z"], Float[Array, "N Z Z"]]:
-        expected, by_pose, own = linearized()
+        expected, by_pose, landmark_cov = linearized()
         robot = jax.vmap(lambda h: linalg.matmul(linalg.matmul(h, particle.pose_cov), h.T))(by_pose)
-        return expected, linalg.symmetrize(robot + own)
+        return expected, linalg.symmetrize(robot + landmark_cov)
 
     def cross() -> Float[Array, "N Z N Z"]:
-        _, by_pose, own = linearized()
+        _, by_pose, landmark_cov = linearized()
         shared = jnp.einsum("izx,xy,jwy->izjw", by_pose, particle.pose_cov, by_pose)
         every = jnp.arange(particle.alive.shape[0])
-        return shared.at[every, :, every, :].add(own)
+        return shared.at[every, :, every, :].add(landmark_cov)
 
     return predicted(sensor, particle.tag, particle.alive, measurements, cross)

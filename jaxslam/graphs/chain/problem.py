@@ -179,9 +179,9 @@ def optimize_chain(
         may = (search.taken < iterations) & ~converged
         after, value, lower = _line_search(motion, sensor, problem, search, policy)
         moved = may & lower
-        there = after, _linearize_at(motion, sensor, problem, after), value
+        trial = after, _linearize_at(motion, sensor, problem, after), value
         here = search.at, search.chain, search.cost
-        at, chain, value = jax.tree.map(lambda a, b: jnp.where(moved, a, b), there, here)
+        at, chain, value = jax.tree.map(lambda a, b: jnp.where(moved, a, b), trial, here)
         ending = jnp.where(converged, Ending.CONVERGED, Ending.EXHAUSTED)
         ending = jnp.where(may & ~lower, Ending.STALLED, ending)
         late = jnp.arange(iterations) >= search.taken

@@ -130,8 +130,8 @@ def factorize(tables: CholeskyTables, blocks: Float[Array, "padded d d B"]) -> F
     column irregular; its inverse is then taken as zero, so that all numbers stay finite.
     """
     size, width = len(tables.diagonal), blocks.shape[1]
-    own = jnp.diagonal(blocks[tables.diagonal], axis1=1, axis2=2)  # (n, B, d)
-    least = 32 * float(jnp.finfo(blocks.dtype).eps) * jnp.moveaxis(own, 2, 1)
+    entries = jnp.diagonal(blocks[tables.diagonal], axis1=1, axis2=2)  # (n, B, d)
+    least = 32 * float(jnp.finfo(blocks.dtype).eps) * jnp.moveaxis(entries, 2, 1)
     least = jnp.pad(least, [(0, TARGETS), (0, 0), (0, 0)])
     one = jnp.broadcast_to(jnp.eye(width, dtype=blocks.dtype)[..., None], blocks.shape[1:])
     inverses = padded(jnp.zeros((size, *blocks.shape[1:]), blocks.dtype)).at[-1].set(one)
@@ -199,8 +199,8 @@ def substitute(
             x = subtract_products(tables_of, i, x, factored.blocks, None, on)  # noqa: B023
             return finish(tables_of, i, x, factored.inverses, lambda x, a: on(a, x))  # noqa: B023
 
-        done = jax.lax.fori_loop(0, tables_of.levels, level, padded(x[order]))
-        x = jnp.zeros_like(rhs).at[order].set(done[: len(order)], unique_indices=True)
+        solved = jax.lax.fori_loop(0, tables_of.levels, level, padded(x[order]))
+        x = jnp.zeros_like(rhs).at[order].set(solved[: len(order)], unique_indices=True)
     return x
 
 
@@ -242,10 +242,10 @@ def _sums(pattern: Pattern) -> Sums:
     rows, columns = pattern.rows, pattern.columns
     target, left, right, flip = [], [], [], []
     for column, blocks in pattern.below():
-        own = rows[blocks]  # (C, m)
+        involved = rows[blocks]  # (C, m)
         # The rows of a column, its own included, by the rows below its diagonal.
-        every = np.concatenate([column[:, None], own], axis=1)
-        one, other = np.broadcast_arrays(every[:, :, None], own[:, None, :])
+        every = np.concatenate([column[:, None], involved], axis=1)
+        one, other = np.broadcast_arrays(every[:, :, None], involved[:, None, :])
         at = np.concatenate([pattern.first[column][:, None], blocks], axis=1, dtype=np.int32)
         target.append(np.broadcast_to(at[:, :, None], one.shape).ravel())
         left.append(pattern.find(np.maximum(one, other).ravel(), np.minimum(one, other).ravel()))
@@ -267,8 +267,10 @@ def selected_inverse(tables: InverseTables, factored: Factored) -> Float[Array, 
     """
     size = len(tables.diagonal)
     count = len(factored.blocks)
-    own = jnp.swapaxes(factored.inverses[:size], 1, 2)
-    start = jnp.zeros((count, *own.shape[1:]), own.dtype).at[tables.diagonal].set(own)
+    inverses = jnp.swapaxes(factored.inverses[:size], 1, 2)
+    start = (
+        jnp.zeros((count, *inverses.shape[1:]), inverses.dtype).at[tables.diagonal].set(inverses)
+    )
 
     def level(i: jax.Array, blocks: jax.Array) -> jax.Array:
         blocks = subtract_products(tables.sweep, i, blocks, None, factored.blocks, by)

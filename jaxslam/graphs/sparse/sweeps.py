@@ -154,10 +154,10 @@ def sweep(sums: Sums, left: Ints, right: Ints, end: Ints, room: int = 0) -> Swee
     for part in range(0, len(bases), _PART):
         some = slice(part, min(part + _PART, len(bases)))
         place = bases[some, None] + np.arange(TARGETS)
-        there = np.minimum(place, size - 1)[..., None]
+        clipped = np.minimum(place, size - 1)[..., None]
         term = shifts[some, None, None] + np.arange(_TERMS)
-        real = (place < stops[some, None])[..., None] & (term < count[there])
-        product = by_target[np.where(real, begin[there] + term, 0)]
+        real = (place < stops[some, None])[..., None] & (term < count[clipped])
+        product = by_target[np.where(real, begin[clipped] + term, 0)]
         for table, factor, at in zip(tables, (sums.left, sums.right), (left, right), strict=True):
             table[some] = at[np.where(real, factor[product], -1)]
         if flips is not None and sums.flip is not None:
@@ -245,10 +245,10 @@ def stages(target: Int[np.ndarray, "rows"], size: int, room: int = 0) -> Stages:
         sums = np.full((groups.sum(), _SUMMED), absent, np.int32)
         rank = np.arange(len(owner)) - begin[owner]
         sums[group_begin[owner] + rank // _SUMMED, rank % _SUMMED] = numbers
-        done = last and len(out) + 1 >= (4 if room else _LEAST_STAGES)
-        rows = len(sums) if done else padded_size(max(len(sums), room))
+        last_stage = last and len(out) + 1 >= (4 if room else _LEAST_STAGES)
+        rows = len(sums) if last_stage else padded_size(max(len(sums), room))
         out.append(index_table(sums, rows, absent))
-        if done:
+        if last_stage:
             return tuple(out)
         owner = np.repeat(np.arange(size), groups)
         numbers, absent = np.arange(len(owner)), rows

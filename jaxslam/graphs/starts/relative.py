@@ -140,7 +140,7 @@ def with_points(
     """
     points = np.array(graph.points, np.float64)
     known = factors_of("graphs.starts", graph, factors)
-    done = np.asarray(graph.fixed_point) | (False if placed is None else placed)
+    placed_already = np.asarray(graph.fixed_point) | (False if placed is None else placed)
     for key, table in graph.tables.items():
         factor = known[key]
         if factor.variables != ("pose", "point") or factor.predict is None:
@@ -149,11 +149,11 @@ def with_points(
         rows = _by_id(graph, who[:, :1], z)
         who, z = who[rows], z[rows]
         found, at = np.unique(who[:, 1], return_index=True)
-        at = at[~done[found]]
+        at = at[~placed_already[found]]
         if len(at):
             poses = np.asarray(graph.poses)[who[at, 0]]
             points[who[at, 1]] = _predicted(factor, poses, z[at])
-            done[who[at, 1]] = True
+            placed_already[who[at, 1]] = True
     return graph._replace(points=as_before(graph.points, points))
 
 

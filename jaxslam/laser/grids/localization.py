@@ -66,8 +66,10 @@ def beam_log(control: ArrayLike, beams: Beams) -> Log:
         raise ValueError(f"beam_log: expected Beams, got {type(beams).__name__}")
     shapes = [np.shape(part) for part in beams]
     if len(shapes[0]) != 2 or len(set(shapes)) != 1:
-        told = ", ".join(map(str, shapes))
-        raise ValueError(f"beam_log: expected as many ranges, angles and masks (T, B), got {told}")
+        listed = ", ".join(map(str, shapes))
+        raise ValueError(
+            f"beam_log: expected as many ranges, angles and masks (T, B), got {listed}"
+        )
     steps = shapes[0][0]
     if np.ndim(control) != 2 or np.shape(control)[0] != steps:
         raise ValueError(
@@ -96,8 +98,8 @@ def beam_log(control: ArrayLike, beams: Beams) -> Log:
 
 def beams_of(scan: Scan, every: int) -> Beams:
     """Each n-th beam of a scan of such a log; those not valid are of range 0."""
-    z, there = scan.z[::every], scan.valid[::every]
-    used = there & (z[:, 0] > 0)
+    z, valid = scan.z[::every], scan.valid[::every]
+    used = valid & (z[:, 0] > 0)
     clean = jnp.where(used[:, None], z, 0.0)
     return Beams(clean[:, 0], clean[:, 1], used)
 

@@ -82,10 +82,10 @@ def clusters(
 @jax.jit
 def _moments(pose: Array, log_weight: Array, mine: Array) -> tuple[Array, Array]:
     """Mean and covariance of the particles that are marked."""
-    own = jnp.where(mine, log_weight, -jnp.inf)
-    top = own.max()
-    own = own - (top + jnp.log(jnp.exp(own - top).sum()))
-    return weighted_pose_moments(pose, own, jnp.argmax(own))
+    log_weight_in = jnp.where(mine, log_weight, -jnp.inf)
+    top = log_weight_in.max()
+    log_weight_in = log_weight_in - (top + jnp.log(jnp.exp(log_weight_in - top).sum()))
+    return weighted_pose_moments(pose, log_weight_in, jnp.argmax(log_weight_in))
 
 
 def _connected(cells: Int[np.ndarray, "C 3"], turns: int) -> Int[np.ndarray, "C"]:

@@ -111,10 +111,12 @@ def _count(
     )
     height, width = counts.shape[1:]
     low, high = np.maximum(first, 0), np.minimum(first + size, [width, height])
-    here = (slice(low[1], high[1]), slice(low[0], high[0]))
-    there = tuple(slice(s.start - f, s.stop - f) for s, f in zip(here, first[::-1], strict=True))
-    for total, found_there in zip(counts, (found.hits, found.misses), strict=True):
-        total[here] += np.asarray(found_there)[there]
+    in_total = (slice(low[1], high[1]), slice(low[0], high[0]))
+    in_part = tuple(
+        slice(s.start - f, s.stop - f) for s, f in zip(in_total, first[::-1], strict=True)
+    )
+    for total, counted in zip(counts, (found.hits, found.misses), strict=True):
+        total[in_total] += np.asarray(counted)[in_part]
 
 
 def _occupancy(

@@ -84,8 +84,8 @@ def scans_of(log: LogOfScans, settings: Settings) -> Scans:
     count, beams = np.shape(log.beams.range)
     stride = -(-beams // WIDTH)
     some = slice(None, None, -(-count // ROWS))
-    angles, there = np.asarray(log.beams.angle)[some], np.asarray(log.beams.valid)[some] > 0
-    spacing = max(_spacing(angles[:, ::stride], there[:, ::stride]), 1e-3)
+    angles, valid = np.asarray(log.beams.angle)[some], np.asarray(log.beams.valid)[some] > 0
+    spacing = max(_spacing(angles[:, ::stride], valid[:, ::stride]), 1e-3)
     span = np.int32(np.clip(round(SPAN / spacing), 2, _MAX_NEIGHBOURS))
     every, kept = -(-len(range(0, beams, stride)) // settings.beams), settings.beams
     changed = []
@@ -147,9 +147,9 @@ def _surfaces(points: Points, span: Int[Array, ""]) -> Surface:
     return found
 
 
-def _spacing(angles: np.ndarray, there: np.ndarray) -> float:
+def _spacing(angles: np.ndarray, valid: np.ndarray) -> float:
     """The angle between beams [rad]."""
-    steps = np.abs(np.diff(angles, axis=1))[there[:, 1:] & there[:, :-1]]
+    steps = np.abs(np.diff(angles, axis=1))[valid[:, 1:] & valid[:, :-1]]
     return float(np.median(steps)) if steps.size else 0.02
 
 

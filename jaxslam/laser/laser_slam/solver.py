@@ -53,7 +53,7 @@ def solve(
         give_back()
 
     def telling(stage: str) -> Callable[[int, int], object] | None:
-        return None if progress is None else lambda done, of: progress(stage, done, of)
+        return None if progress is None else lambda finished, of: progress(stage, finished, of)
 
     raw = np.asarray(log.raw, np.float64)
     scans = scans_of(log, settings)

@@ -125,11 +125,11 @@ class FieldMatcher(Matcher):
             curvature, slope = fused(damped, at.slope, prior_terms(prior, pose), onto, length)
             move, _ = linalg.solve_psd(curvature, -slope)
             tried = moved(pose, move)
-            there = matcher._at(prepared, points, tried, prior)
-            better = there.cost < at.cost
+            trial = matcher._at(prepared, points, tried, prior)
+            better = trial.cost < at.cost
             small = jnp.hypot(move[0], move[1]) + length * jnp.abs(move[2]) <= matcher.tolerance
             pose = jnp.where(better, tried, pose)
-            at = jax.tree.map(lambda new, old: jnp.where(better, new, old), there, at)
+            at = jax.tree.map(lambda new, old: jnp.where(better, new, old), trial, at)
             damping = jnp.clip(jnp.where(better, 0.1 * damping, 10 * damping), low, high)
             return k + 1, pose, at, damping, small
 
@@ -175,8 +175,8 @@ class FieldMatcher(Matcher):
 
     def _at(self, of: Field, points: Points, pose: Array, prior: Prior | None) -> _At:
         residual, jacobian = field_residuals(of, points, pose)
-        there = points.valid & _on_map(of, points, pose) & (residual < self.reach)
-        weight = weights(residual, there, self.kernel, self.scale)
+        used = points.valid & _on_map(of, points, pose) & (residual < self.reach)
+        weight = weights(residual, used, self.kernel, self.scale)
         curvature, slope = information_of(jacobian, weight), (weight * residual) @ jacobian
         cost = self._robust_cost(residual, points) + 2 * prior_cost(prior, pose)
         return _At(cost, residual, weight, curvature, slope)

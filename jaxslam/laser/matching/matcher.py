@@ -230,8 +230,8 @@ def _check_points(name: str, of: object, batch: tuple[int, ...] = ()) -> None:
         or shape[:-1] != batch
         or any(np.shape(part) != (*shape, 2) for part in of[:2])
     ):
-        told = ", ".join(shape_told(part) for part in of)
+        shapes = ", ".join(shape_told(part) for part in of)
         whole = " x ".join(str(size) for size in (*batch, "N"))
-        raise ValueError(f"{name}: expected {whole} positions, rays and masks, got {told}")
+        raise ValueError(f"{name}: expected {whole} positions, rays and masks, got {shapes}")
     if is_concrete(of) and not all(np.all(np.isfinite(np.asarray(part))) for part in of[:2]):
         raise ValueError(f"{name}: expected finite points; those that are not valid, too")

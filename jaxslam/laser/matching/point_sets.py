@@ -44,8 +44,10 @@ def points(
     """
     shapes = [np.shape(part) for part in beams]
     if len(set(shapes)) > 1 or len(shapes[0]) != 1:
-        told = ", ".join(map(str, shapes))
-        raise ValueError(f"points: expected ranges, angles and masks (B,) of one scan, got {told}")
+        listed = ", ".join(map(str, shapes))
+        raise ValueError(
+            f"points: expected ranges, angles and masks (B,) of one scan, got {listed}"
+        )
     check_positive("points", max_range=max_range)
     r = jnp.asarray(beams.range)
     valid, _ = beams._replace(range=r).returns(

@@ -112,11 +112,11 @@ def surface_information(
     return information_along(of.normal @ turn, of.tilt, arm, jnp.where(of.straight, weight, 0.0))
 
 
-def _median(values: Float[Array, "M"], there: Bool[Array, "M"]) -> Float[Array, ""]:
+def _median(values: Float[Array, "M"], valid: Bool[Array, "M"]) -> Float[Array, ""]:
     """The median of the values that are there; 0 of none."""
-    ordered = jnp.sort(jnp.where(there, values, jnp.inf))
-    middle = ordered[jnp.maximum(there.sum() - 1, 0) // 2]
-    return jnp.where(there.any(), middle, 0.0)
+    ordered = jnp.sort(jnp.where(valid, values, jnp.inf))
+    middle = ordered[jnp.maximum(valid.sum() - 1, 0) // 2]
+    return jnp.where(valid.any(), middle, 0.0)
 
 
 _FAR = 1e6

@@ -168,10 +168,10 @@ def neighbours(cells: Bool[np.ndarray, "H W"]) -> "scipy.sparse.csr_matrix":
     rows, columns, weights = [], [], []
     for i, j in _HALF:
         here = index[: height - i, max(0, -j) : width - max(0, j)]
-        there = index[i:, max(0, j) : width - max(0, -j)]
-        both = cells.reshape(-1)[here] & cells.reshape(-1)[there]
+        shifted = index[i:, max(0, j) : width - max(0, -j)]
+        both = cells.reshape(-1)[here] & cells.reshape(-1)[shifted]
         rows.append(here[both])
-        columns.append(there[both])
+        columns.append(shifted[both])
         weights.append(np.full(int(both.sum()), np.hypot(i, j)))
     pairs = np.concatenate(rows), np.concatenate(columns)
     return scipy.sparse.csr_matrix((np.concatenate(weights), pairs), shape=(height * width,) * 2)

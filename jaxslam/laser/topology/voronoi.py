@@ -75,21 +75,21 @@ def _thin(
     candidates = np.flatnonzero(cells & ~kept)
     candidates = candidates[np.argsort(away.reshape(-1)[candidates], kind="stable")]
     left = candidates.tolist()
-    there = bytearray(flat.astype(np.uint8).tobytes())
+    present = bytearray(flat.astype(np.uint8).tobytes())
     while True:
         still = []
         for at in left:
             code = 0
             for k, step in enumerate(steps):
-                code |= there[at + step] << k
+                code |= present[at + step] << k
             if table[code]:
-                there[at] = 0
+                present[at] = 0
             else:
                 still.append(at)
         if len(still) == len(left):
             break
         left = still
-    flat[:] = np.frombuffer(bytes(there), np.uint8) > 0
+    flat[:] = np.frombuffer(bytes(present), np.uint8) > 0
 
 
 def _removable(ends: bool) -> list[bool]:

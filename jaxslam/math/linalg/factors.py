@@ -167,8 +167,8 @@ def root_psd(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
         pivot = rest[j, j]
         good = pivot > floor[j]
         root = jnp.sqrt(jnp.where(good, pivot, 1.0))
-        own = jnp.where(good & (jnp.arange(n) >= j), rest[:, j] / root, 0.0)
-        return rest - own[:, None] * own[None, :], own
+        values = jnp.where(good & (jnp.arange(n) >= j), rest[:, j] / root, 0.0)
+        return rest - values[:, None] * values[None, :], values
 
     return jax.lax.scan(column, matrix, jnp.arange(n))[1].T
 
@@ -184,13 +184,13 @@ def triangular_root(wide: Float[Array, "n m"]) -> Float[Array, "n n"]:
     def reflect(rest: jax.Array, i: jax.Array) -> tuple[jax.Array, None]:
         ahead = jnp.where(jnp.arange(m) >= i, rest[i], 0.0)
         square = jnp.sum(ahead**2)
-        there = square > 0
-        length = jnp.sqrt(jnp.where(there, square, 1.0))
+        nonzero = square > 0
+        length = jnp.sqrt(jnp.where(nonzero, square, 1.0))
         # To -sign(a_i)·length, away from where a_i - length would cancel; then the sign is turned.
         sign = jnp.where(ahead[i] >= 0, 1.0, -1.0).astype(rest.dtype)
         axis = ahead.at[i].add(sign * length)
-        scale = jnp.where(there, 1.0 / (length * (length + jnp.abs(ahead[i]))), 0.0)
+        scale = jnp.where(nonzero, 1.0 / (length * (length + jnp.abs(ahead[i]))), 0.0)
         rest = rest - (rest @ axis * scale)[:, None] * axis[None, :]
-        return rest.at[:, i].multiply(jnp.where(there, -sign, 1.0)), None
+        return rest.at[:, i].multiply(jnp.where(nonzero, -sign, 1.0)), None
 
     return jnp.tril(jax.lax.scan(reflect, wide, jnp.arange(n))[0][:, :n])

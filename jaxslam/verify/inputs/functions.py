@@ -145,11 +145,11 @@ def told_signatures(model: Motion | Sensor) -> Motion | Sensor:
 
         return refuse
 
-    told = copy.copy(model)
+    renamed = copy.copy(model)
     for field, taken in names.items():
         if (got := unfit_signature(getattr(model, field), taken.count(",") + 1)) is not None:
-            set_field(told, field, refusing(f"{field} takes ({taken}), got a function of {got}"))
-    return told
+            set_field(renamed, field, refusing(f"{field} takes ({taken}), got a function of {got}"))
+    return renamed
 
 
 def sensor_functions(sensor: Sensor) -> tuple[Function, Function]:

@@ -80,11 +80,11 @@ def coincident(
     state = [table[0].copy() for table in samples.values]
     places = [k for k, argument in enumerate(arguments) if _is_place(argument)]
     for k in places:
-        there = [entry.copy() for entry in state]
+        moved = [entry.copy() for entry in state]
         alone = k == places[0]
-        there[k][:2] = 0.0 if alone else state[places[0]][:2]
+        moved[k][:2] = 0.0 if alone else state[places[0]][:2]
         where = "the origin" if alone else f"the {arguments[places[0]].name}"
-        yield f"{arguments[k].name} at {where}", tuple(there)
+        yield f"{arguments[k].name} at {where}", tuple(moved)
 
 
 def sensor_samples(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samples]:
@@ -135,9 +135,9 @@ def sensor_samples(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samp
             near = np.asarray(place(pose[few], seen, s[few] * scale), np.float64)
             if np.isfinite(near).all():  # else `invert` fails, which another check reports
                 groups.append((label, (pose[few], near)))
-    there = np.array([[FAR, -FAR], [-FAR, FAR]])
+    corners = np.array([[FAR, -FAR], [-FAR, FAR]])
     away = pose[:2].copy()
-    away[:, :2] += there
+    away[:, :2] += corners
     groups.append((LARGE, (away, at(away, away[:, :2] + offset[:2]))))
     observed = _concatenated(groups)
 

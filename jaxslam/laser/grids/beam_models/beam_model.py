@@ -107,8 +107,8 @@ def _check_beams(name: str, beams: object) -> None:
         raise ValueError(f"{name}: expected Beams, got {type(beams).__name__}")
     shapes = [np.shape(part) for part in beams]
     if len(shapes[0]) != 1 or len(set(shapes)) != 1:
-        told = ", ".join(shape_told(part) for part in beams)
-        raise ValueError(f"{name}: expected as many ranges, angles and masks, got {told}")
+        listed = ", ".join(shape_told(part) for part in beams)
+        raise ValueError(f"{name}: expected as many ranges, angles and masks, got {listed}")
     if not is_concrete(beams):
         return
     valid = np.asarray(beams.valid) & (np.asarray(beams.range) > 0)

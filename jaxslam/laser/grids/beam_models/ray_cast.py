@@ -147,5 +147,5 @@ def check_weights(name: str, weights: dict[str, ArrayLike]) -> None:
         return
     values = np.array([float(np.asarray(value)) for value in weights.values()])
     if np.any(values < 0) or not abs(values.sum() - 1) < 1e-6:
-        told = ", ".join(f"{key} {value:g}" for key, value in zip(weights, values, strict=True))
-        raise ValueError(f"{name}: expected shares >= 0 of sum 1, got {told}")
+        listed = ", ".join(f"{key} {value:g}" for key, value in zip(weights, values, strict=True))
+        raise ValueError(f"{name}: expected shares >= 0 of sum 1, got {listed}")

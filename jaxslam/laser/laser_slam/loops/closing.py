@@ -117,8 +117,8 @@ def matched(
         progress()
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         try:
-            for done in pool.map(of_submap, submaps[1:]):
-                for _ in range(done):
+            for results in pool.map(of_submap, submaps[1:]):
+                for _ in range(results):
                     progress()
         except BaseException:
             pool.shutdown(cancel_futures=True)
@@ -175,14 +175,14 @@ def closed(
     total = covariances.along(at, covs)
     middle = index[:: settings.submap_every]
     usable = scans.usable[keyframe] & ~odometry.doubted[keyframe]
-    ends_at, there = np.asarray(scans.points.position), np.asarray(scans.points.valid)
+    ends_at, valid = np.asarray(scans.points.position), np.asarray(scans.points.valid)
     parts = np.split(keyframe, range(ROWS, len(keyframe), ROWS))
-    looks = np.concatenate([descriptors(ends_at[some], there[some]) for some in parts])
+    looks = np.concatenate([descriptors(ends_at[some], valid[some]) for some in parts])
     graph = graph_of(at, keyframe, chain)
     solution: graphs.Solution | None = None
     tried: list[Candidates] = []
     found: list[Matches] = []
-    done: set[tuple[int, int, bool]] = set()
+    pairs_tried: set[tuple[int, int, bool]] = set()
     ends: set[tuple[int, int]] = set()
     loops, kept = _agreeing(tried, found, at, total, settings)
     left_out = max(int(usable.sum()) - MOST, 0)
@@ -198,12 +198,14 @@ def closed(
             if solution is None or not len(pairs)
             else relative_covs(solution, pairs)
         )
-        new = by_place(path, pairs, cov, done, settings, _NARROW, _WIDE)
+        new = by_place(path, pairs, cov, pairs_tried, settings, _NARROW, _WIDE)
         if turn == 0:
             new = _with(new, by_appearance(looks, middle, usable, settings))
         new, out = thinned(new)
         left_out += out
-        done |= set(zip(new.first.tolist(), new.second.tolist(), new.wide.tolist(), strict=True))
+        pairs_tried |= set(
+            zip(new.first.tolist(), new.second.tolist(), new.wide.tolist(), strict=True)
+        )
         if not len(new.first):
             break
         count = 0

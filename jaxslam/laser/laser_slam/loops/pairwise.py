@@ -51,8 +51,8 @@ def consistent(
     out = np.zeros((count, count), bool)
     end = poses.compose(path[first], z)
     moved = poses.compose(end, poses.inverse(path[second]))
-    own = covariances.propagated(poses.adjoint(end), cov)
-    parts = path[second], end, moved, own, total[first], total[second], first, second
+    loop_cov = covariances.propagated(poses.adjoint(end), cov)
+    parts = path[second], end, moved, loop_cov, total[first], total[second], first, second
     with float64():
         tiles = [
             _Loop(*(jnp.asarray(_filled(part[begin : begin + _TILE])) for part in parts))
@@ -77,7 +77,7 @@ class _Loop(NamedTuple):
     """x_i ∘ z"""
     moved: Array
     """g"""
-    own: Array
+    cov: Array
     """A"""
     total_first: Array
     """S_i"""
@@ -104,7 +104,7 @@ def _of_pair(a: _Loop, b: _Loop) -> Float[Array, ""]:
     backward = jnp.where(a.second <= b.second, 1.0, -1.0)
     first = forward * (b.total_first - a.total_first)
     second = backward * (b.total_second - a.total_second)
-    cov = a.own + b.own + first + ad @ second @ ad.T
+    cov = a.cov + b.cov + first + ad @ second @ ad.T
     # By cofactors: XLA's solver takes the matrices one by one.
     x, y, t = error
     xx, xy, xt, yy, yt, tt = (cov[i, j] for i, j in zip(*np.triu_indices(3), strict=True))

@@ -132,7 +132,7 @@ def laser_odometry(
     count = len(scans.usable)
     borders = _borders(scans, steps)
     _compile(scans, settings)
-    done, lock = itertools.count(2), threading.Lock()
+    progress_count, lock = itertools.count(2), threading.Lock()
     stopped = threading.Event()
 
     def advance() -> None:
@@ -140,7 +140,7 @@ def laser_odometry(
             raise InterruptedError
         if progress is not None:
             with lock:
-                progress(next(done), count)
+                progress(next(progress_count), count)
 
     def piece(begin: int, end: int) -> Odometry:
         rows = slice(begin, end)

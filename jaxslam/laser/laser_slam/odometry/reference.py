@@ -113,8 +113,8 @@ def reference_of(
     points = taken(scans.points, take)
     # The last scan is repeated without its points: a reference always has as many scans.
     points = points._replace(valid=points.valid & (np.arange(size) < len(rows))[:, None])
-    there = poses.between(origin, at).astype(np.float32)
-    gathered: Reference = _gathered(points, taken(scans.surface, take), there)
+    relative = poses.between(origin, at).astype(np.float32)
+    gathered: Reference = _gathered(points, taken(scans.surface, take), relative)
     return gathered
 
 
@@ -166,8 +166,8 @@ def match(
 @jax.jit
 def _gathered(points: Points, surface: Surface, at: Float[Array, "n 3"]) -> Reference:
     """The points (n, B) of n scans in the frame in which their poses are, as n · B of one."""
-    there = jax.vmap(transformed)(points, at), jax.vmap(surface_at)(surface, at)
-    gathered, lines = jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), there)
+    moved = jax.vmap(transformed)(points, at), jax.vmap(surface_at)(surface, at)
+    gathered, lines = jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), moved)
     return Reference(gathered, lines, _ANY.prepare(raster(gathered, CELL, HALF)))
 
 
@@ -212,8 +212,8 @@ def _seen_through(reference: Points, scan: Points, pose: Array) -> Array:
     where = jnp.where(scan.valid, sector(scan.position), _SECTORS)
     nearest = jnp.full(_SECTORS + 1, jnp.inf, far.dtype).at[where].min(far)[:_SECTORS]
     farthest = jnp.zeros(_SECTORS + 1, far.dtype).at[where].max(far)[:_SECTORS]
-    own = (reference.position - pose[None, :2]) @ se2.rotation(pose[2])
-    r, at = jnp.sqrt((own**2).sum(axis=1)), sector(own)
+    in_frame = (reference.position - pose[None, :2]) @ se2.rotation(pose[2])
+    r, at = jnp.sqrt((in_frame**2).sum(axis=1)), sector(in_frame)
     met = reference.valid & jnp.isfinite(nearest[at])
     before = met & (r < nearest[at] - _CLEAR - 0.02 * r)
     in_view = met & (r < farthest[at] + 0.2)

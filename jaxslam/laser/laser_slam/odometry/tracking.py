@@ -123,11 +123,13 @@ def tracked(
             )
             found = _matched(reference, points, guess, prior, steps.reach[scan], how, settings)
             if other is not None and not steps.unknown[scan]:
-                there = poses.compose(other[0], step)
+                prediction = poses.compose(other[0], step)
                 wide = covariances.composed_cov(other[1], step, step_cov)
-                back = _matched(reference, points, there, wide, steps.reach[scan], how, settings)
+                back = _matched(
+                    reference, points, prediction, wide, steps.reach[scan], how, settings
+                )
                 if back.accepted and back.quality > found.quality:
-                    found, guess, prior = back, there, wide
+                    found, guess, prior = back, prediction, wide
             result.inliers[scan] = found.inliers
             result.residual[scan] = found.residual
         if found is not None and found.accepted:

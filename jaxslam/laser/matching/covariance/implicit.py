@@ -55,11 +55,13 @@ class Implicit(MatchCovariance):
 
         def slope(of_reference: Array, of_scan: Array) -> Array:
             changed = with_ranges(reference, of_reference)
-            there = matcher.prepare(changed) if isinstance(reference, Points) else prepared
-            moved = moved_along_rays(points, of_scan)
-            by_pose: Array = jax.grad(lambda pose: matcher.cost(there, moved, pose, found))(
-                found.pose
+            changed_prepared = (
+                matcher.prepare(changed) if isinstance(reference, Points) else prepared
             )
+            moved = moved_along_rays(points, of_scan)
+            by_pose: Array = jax.grad(
+                lambda pose: matcher.cost(changed_prepared, moved, pose, found)
+            )(found.pose)
             return by_pose
 
         dtype = points.position.dtype
