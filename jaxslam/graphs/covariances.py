@@ -32,7 +32,7 @@ from jaxslam.graphs.validation import check_graph, label
 
 
 class Marginals(NamedTuple):
-    """Covariances of a graph's variables, zero for what is fixed; leading axes by `vmap`."""
+    """Covariances of a graph's variables, zero for fixed ones; leading axes by `vmap`."""
 
     poses: Float[Array, "N 3 3"]
     """of (x, y, θ), in world coordinates as the poses themselves"""

@@ -200,7 +200,7 @@ def _graph_of(
     else:
         of_motion = jax.vmap(_local, (0, 0, 0, None))(path[1:], by_noise, of_motion, slack)
     of_sensor = jax.vmap(jax.vmap(sensor.noise_cov))(z)
-    # The prior's error is turned into the frame of its mean, in which the factor has it.
+    # The prior's error is rotated into the frame of its mean, as the factor needs it.
     turned = jnp.eye(3, dtype=kind).at[:2, :2].set(se2.rotation(pose[2]))
     q, q_regular = jax.vmap(_information)(of_motion)
     r, r_regular = jax.vmap(jax.vmap(_information))(of_sensor)
@@ -244,7 +244,7 @@ def _local(
 
 
 def _moving(by_noise: Float[Array, "T 3 3"]) -> Bool[Array, "T"]:
-    """Whether matrices are regular, whatever the lengths of their columns."""
+    """Whether matrices are regular, for any lengths of their columns."""
     length = jnp.linalg.norm(by_noise, axis=1, keepdims=True)
     a, b, c = jnp.moveaxis(by_noise / jnp.where(length > 0, length, 1.0), 2, 0)
     return jnp.abs((a * jnp.cross(b, c)).sum(axis=1)) > _STILL

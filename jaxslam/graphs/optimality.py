@@ -1,6 +1,6 @@
 """A certificate of global optimality: a lower bound of the chordal cost of a pose graph.
 
-It is of the dual matrix of that cost, whose least eigenvalue is found by the solver of graphs.
+It uses the dual matrix of that cost, whose least eigenvalue the solver of graphs computes.
 """
 
 from collections.abc import Mapping
@@ -138,18 +138,18 @@ _POWERS = 100
 
 
 class Certificate(NamedTuple):
-    """What is proved of a pose graph's optimum; leading axes by `vmap`.
+    """The certificate of a pose graph's optimum; leading axes by `vmap`.
 
-    The proof is of the chordal cost with isotropic weights, Σ τ |t_j - t_i - R_i t|² + κ |R_j - R_i
-    R|²/2. Of the graph's own cost nothing is proved: `position` and `heading` say how far the two
-    optima are apart. Where they are close, and the surrogate's is global, another minimum of the
-    graph's own cost that is lower would have to have a higher chordal cost.
+    The proof is for the chordal cost with isotropic weights, Σ τ |t_j - t_i - R_i t|² + κ |R_j -
+    R_i R|²/2. It proves nothing about the cost of the graph: `position` and `heading` are the
+    distances of the two optima. If they are close, and the surrogate's is global, a lower minimum
+    of the graph's cost would have a higher chordal cost.
     """
 
     certified: Bool[Array, ""]
     """the optimum of the surrogate that was found is its global one, up to `gap`"""
     gap: Float[Array, ""]
-    """what is proved: no poses have a chordal cost below `chi2 - gap`"""
+    """proved: no poses have a chordal cost below `chi2 - gap`"""
     smallest: Float[Array, ""]
     """the smallest eigenvalue of the dual matrix, about 0 where certified: the optimum itself is
     its eigenvector"""

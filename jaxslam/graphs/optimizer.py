@@ -1,6 +1,6 @@
 """The optimum of a graph, by Levenberg-Marquardt on sparse blocks, and its squared residuals.
 
-Derivatives of the optimum by what it depends on are those of implicit differentiation.
+Derivatives of the optimum are by implicit differentiation.
 """
 
 from collections.abc import Mapping
@@ -157,12 +157,12 @@ def optimize(
             factor "name".
         kernel: robust kernels, one for all tables or by table. With `Truncated` the iterations are
             rounds of graduated non-convexity (`gnc`), and `iterations` is the limit of each.
-        iterations: steps at most; with 0 the solution is of the graph as it is.
+        iterations: largest number of steps; with 0 the solution is the graph itself.
         tolerance: done when a step lowers χ² by less than this share of it, as the quadratic model
             predicts, and at least by rounding.
         plan: of `plan`; needed under `jit` and `vmap`, where `who` is traced. Without one, graphs
             of about the same size share a compiled program (`solver.padding`).
-        room: without a plan, all graphs of at most about so many variables share one.
+        room: without a plan, graphs of up to about this number of variables share one.
     Raises:
         ValueError: on what `check_graph` refuses, and on unknown tables.
     """

@@ -36,7 +36,7 @@ def check_graph(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None:
 
     Refused are tables without a factor or of other sizes than their factor's, arrays of another
     kind than `Graph` and `Table` say, numbers that are not
-    finite, an id twice, a measurement of a variable that is nowhere or of one variable twice, an
+    finite, an id twice, a measurement of a variable out of range or of one variable twice, an
     information that is not symmetric or not positive semidefinite, no measurement at all, and parts
     that neither a fixed variable nor a measurement of one pose holds in place: a disconnected
     graph, or no gauge. A measurement of zero information joins nothing. Within a trace only what
@@ -175,8 +175,8 @@ def _check_rows(name: str, graph: Graph, key: str, table: Table, factor: Factor)
         if lost.any():
             row = int(lost.argmax())
             raise ValueError(
-                f"{name}: {key}, row {row}: {kind} number {who[row, k]} is nowhere, "
-                f"the graph has {count}"
+                f"{name}: {key}, row {row}: {kind} index {who[row, k]} is out of "
+                f"range: the graph has {count} {kind}s"
             )
     of = variables_in(graph, table, factor)
     twice = np.zeros(len(valid), bool)

@@ -66,7 +66,7 @@ def fit_line(
     for _ in range(_ITERATIONS):
         n = np.array([np.cos(line[1]), np.sin(line[1])])
         toward, across = e @ n, e @ np.array([-n[1], n[0]])
-        toward = np.maximum(toward, 1e-3)  # a beam along the wall says nothing of it
+        toward = np.maximum(toward, 1e-3)  # a beam along the wall has no information on it
         met = line[0] / toward
         if np.ptp(met * across) <= 1e-9 * max(sigma, np.abs(distance).max()):
             raise ValueError("fit_line: expected beams whose ends are not in line with the laser")
@@ -131,7 +131,7 @@ class Segments(NamedTuple):
     chi2: Float[np.ndarray, "K"]
     """squared residuals over σ², of size - 2 degrees of freedom where the wall is straight"""
     left: int
-    """usable beams that are of no segment"""
+    """usable beams outside of all segments"""
 
 
 def segments(
@@ -167,7 +167,7 @@ def segments(
         beams: of one scan, (B,) each, angles increasing. Where the last is within half a step of a
             full turn from the first, both are one beam.
         sigma: standard deviation of a range [m]. sigma_angle: of a beam's direction [rad].
-        max_range: [m]; what a range says: `Beams`.
+        max_range: [m]; `Beams` defines the meaning of a range.
         least: number of beams of a segment, at least 3.
         trim: beams given up at each end.
         probability: of a straight wall to pass each test.
@@ -222,7 +222,7 @@ def segments(
         return _misfit_of_parabola(angle[run], distance[run], *noise)
 
     def arc(k: int) -> bool:
-        """Whether a piece and the next one are of one arc."""
+        """Whether a piece and the next one belong to one arc."""
         other = (k + 1) % len(pieces)
         if other == k or not _adjacent(pieces[k][-1], pieces[other][0], angle):
             return False

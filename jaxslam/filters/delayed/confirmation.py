@@ -32,12 +32,12 @@ def confirm_hypotheses(
 ) -> tuple[DelayedState, Bool[Array, "M"], Int[Array, "C"]]:
     """The state with hypotheses confirmed and corrected, or deleted.
 
-    Each hypothesis is compared with the stored measurements of its tag; the one of least g²/var(g)
+    Each hypothesis is compared with the stored measurements of its tag; the least g²/var(g)
     confirms it, if that is within the gate.
 
     Args:
         slot: of the measurements in the table.
-        stored: which of them are there.
+        stored: mask of the measurements in the table.
     Returns:
         The state; which measurements are within the gate of a hypothesis; and which measurement
         confirmed each hypothesis, -1 where none did.
@@ -116,9 +116,9 @@ def constraints_of(
 def correct_hypotheses(
     joint: Joint, layout: TableLayout, constraints: _Constraints, which: Bool[Array, "C"]
 ) -> Joint:
-    """The joint with each hypothesis corrected by its own constraint, and nothing else changed.
+    """The joint with each hypothesis corrected by its constraint, and nothing else changed.
 
-    g = 0 is a measurement without noise of its own (that of the stored measurement is in P). A
+    g = 0 is a measurement without noise (the noise of the stored measurement is in P). A
     hypothesis may be false, so of the optimal gain K = P Hᵀ/S only the rows of the hypothesis are
     kept (Schmidt 1966, "Application of state-space methods to navigation problems": variables that
     are considered, not estimated). Of any gain, P ← (I - KH) P (I - KH)ᵀ is the error's covariance:

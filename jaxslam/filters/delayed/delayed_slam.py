@@ -89,7 +89,7 @@ def _store_measurements(
 
 @record
 class DelayedSlam(Filter):
-    """EKF-SLAM with bearings or ranges alone, and delayed initialization of landmarks.
+    """EKF-SLAM with bearings only or ranges only, and delayed initialization of landmarks.
 
     After Costa, Kantor & Choset, "Bearing-only landmark initialization with unknown data
     association", ICRA 2004, as summarized in Tacher §2, with the correlations that they neglect.
@@ -243,7 +243,7 @@ def _associated(
 ) -> tuple[Association, Bool[Array, "M"]]:
     """The landmark slot of each measurement, and which measurements have one.
 
-    Hypotheses and stored measurements are no landmarks.
+    Hypotheses and stored measurements are not landmarks.
     """
     joint = state.joint
     landmarks = joint.alive & (jnp.arange(settings.layout.slots) < settings.layout.landmarks)

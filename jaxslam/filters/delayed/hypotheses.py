@@ -26,7 +26,7 @@ class _PointResiduals(NamedTuple):
     """The residuals g(s, x) of p points x against q stored measurements s, and their moments."""
 
     value: Float[Array, "p q"]
-    """g at the estimate, truly 0 where both are of one landmark [rad or m]"""
+    """g at the estimate; its true value is 0 for the same landmark [rad or m]"""
     variance: Float[Array, "p q"]
     """of g, with the correlation of the two"""
     by_point: Float[Array, "p q 2"]
@@ -97,7 +97,7 @@ def closer_than(
 ) -> Bool[Array, "p q"]:
     """Whether the distance of each of p points from each of q others is below a limit.
 
-    By `mahalanobis_squared` (as of independent ones) or `bhattacharyya` of `uncertain_poses`; never
+    By `mahalanobis_squared` (of independent points) or `bhattacharyya` of `uncertain_poses`; never
     where a covariance is singular.
     """
     measure = _DISTANCES[distance]

@@ -85,7 +85,7 @@ def _sharpest(
     allowed = allowed & (new.tag[:, None] == joint.tag[None, layout.of_stored])
     sharp = found.ok & allowed[:, :, None] & (found.spread <= settings.hypotheses.spread)
     spread = jnp.where(sharp, found.spread, jnp.inf)
-    if settings.by_tag:  # the best partner alone
+    if settings.by_tag:  # only the best partner
         partner = jnp.argmin(spread.min(axis=2), axis=1)
         sharp = sharp & (partner[:, None] == jnp.arange(layout.stored)[None, :])[:, :, None]
         spread = jnp.where(sharp, spread, jnp.inf)
@@ -110,7 +110,7 @@ def _sharpest(
 def _form_hypotheses(
     settings: DelayedSettings, state: DelayedState, found: _Sharpest
 ) -> DelayedState:
-    """The state with hypotheses at intersections that are no duplicates, while slots are free."""
+    """The state with hypotheses at new intersections, while slots are free."""
     layout, joint = settings.layout, state.joint
     wanted = found.ok & ~_duplicates(settings, joint, found)
     place, granted = slots.allocate(joint.alive[layout.of_hypotheses], wanted)
@@ -132,7 +132,7 @@ def _form_hypotheses(
 def _duplicates(settings: DelayedSettings, joint: Joint, found: _Sharpest) -> Bool[Array, "k"]:
     """Which intersections duplicate one of less spread, or an earlier hypothesis.
 
-    Mirrored points of one pair are no duplicates of each other.
+    Mirrored points of one pair are not duplicates of each other.
     """
     layout, count = settings.layout, len(found.pair)
     old = relative_to_robot(joint, layout)
@@ -167,7 +167,7 @@ def _intersections_of(
 ) -> _Intersections:
     """The intersections of the measurements in these slots; J P Jᵀ with the P of each two.
 
-    Relative to the sensor's position, so that the uncertainty of the robot's own pose in the map
+    Relative to the sensor's position, so that the uncertainty of the robot's pose in the map
     does not affect the spread of an intersection.
     """
     intersect = triangulation.intersect

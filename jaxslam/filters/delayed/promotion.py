@@ -172,7 +172,7 @@ def _measurements_of(
     same_tag = joint.alive[layout.of_stored]
     same_tag = same_tag & (joint.tag[layout.of_stored] == joint.tag[hypothesis])
     found = point_residuals(joint, settings.triangulation, hypothesis[None], layout.stored_slots)
-    # After the correction by its own measurements g has almost no variance: that of the noise is
+    # After the correction by its measurements g has almost no variance: that of the noise is
     # added, for rounding and curvature.
     variance = found.variance[0] + state.noise_var
     return same_tag, same_tag & (found.value[0] ** 2 <= settings.gate * variance)

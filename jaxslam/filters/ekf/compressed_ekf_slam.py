@@ -18,7 +18,7 @@ from jaxslam.math import linalg
 from jaxslam.math.xla import where_any
 from jaxslam.sensors.suite import Suite
 
-# The tag of slots that are no landmark: not -1, which is the tag of a measurement without one.
+# The tag of slots without a landmark: not -1, the tag of a measurement of unknown identity.
 _NONE = -2
 
 
@@ -137,7 +137,7 @@ class CompressedEkfSlam(Wrapper):
 
     @property
     def _local(self) -> EkfSlam:
-        """The filter of the area, with slots for what is postponed."""
+        """The filter of the area, with slots for the postponed update."""
         area = min(self.area, self.filter.capacity)
         more = _more(area, len(self.filter.sensor.landmark))
         return dataclasses.replace(self.filter, capacity=area + more)
@@ -267,7 +267,7 @@ def _chosen(joint: Joint, area: int, sensor: Sensor, seen: jax.Array, new: jax.A
     """The slots (own,) of a new area, ascending: those seen, free ones, the nearest to the pose."""
     points = jax.vmap(sensor.position)(joint.landmarks)
     distance = ((points - joint.pose[None, :2]) ** 2).sum(axis=1)
-    # A quarter of the area is reserved for new landmarks: each would else need another area.
+    # A quarter of the area is reserved for new landmarks, each of which would need a new area.
     spare = jnp.cumsum(~joint.alive) <= jnp.maximum(new, area // 4)
     rank = jnp.select([seen, ~joint.alive & spare, joint.alive], [0, 1, 2], 3)
     distance = jnp.where(joint.alive, distance, 0.0)

@@ -61,9 +61,9 @@ class EkfSlam(Filter):
     linearize: Linearizer = AtEstimate()
     """where Jacobians are taken"""
     associate: Associate = Known()
-    """which landmark a measurement is of"""
+    """the landmark of each measurement"""
     correction: CorrectionOrder = static(default="sequential")
-    """"sequential" corrects by one measurement after the other, linearizing anew each time, as the
+    """"sequential" corrects by one measurement after the other, relinearizing each time, as the
     guide does; "joint" corrects by the whole scan at once"""
     gate: Number | None = None
     """reject a measurement whose squared Mahalanobis distance exceeds this; None: none. The guide's
@@ -75,7 +75,7 @@ class EkfSlam(Filter):
     "square_root", a root X of P = X Xᵀ instead of P, as accurate in float32 as P is in float64, at
     a higher cost (the prediction is O(N³))"""
     births: int | None = static(default=None)
-    """at most so many new landmarks a scan, the first ones in its order (that of tags in simulated
+    """largest number of new landmarks a scan, the first in its order (that of tags in simulated
     scans), the rest `Status.DEFERRED`. The guide starts one, picked at random. None: no limit"""
     life: Life | None = None
     """a rule that removes landmarks after each scan, and may make room in a full map. Its memory is

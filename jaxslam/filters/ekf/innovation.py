@@ -39,7 +39,7 @@ class Correction(NamedTuple):
     jacobian: Float[Array, "m Z 3+L"]
     """H by coordinates, against the prior"""
     basis: Float[Array, "m 3+L 3+L"] | None
-    """the coordinates by the errors in the chart; None says identity"""
+    """the coordinates by the errors in the chart; None is the identity"""
 
 
 class _View(NamedTuple):
@@ -91,7 +91,7 @@ class _Linearized(NamedTuple):
 
 
 class _Gated(NamedTuple):
-    """The gate of each measurement on its own, against the prior."""
+    """The gate of each measurement separately, against the prior."""
 
     innovation: Float[Array, "m Z"]
     cov: Float[Array, "m Z Z"]
@@ -256,7 +256,7 @@ def _report(
     jacobian: Float[Array, "m Z W"],
     basis: Float[Array, "m W W"] | None,
 ) -> Correction:
-    """The `Correction`: NIS of fused measurements from their joint S, of the others each alone."""
+    """The `Correction`: NIS of fused measurements from their joint S, of others from theirs."""
     m, size_z = gated.innovation.shape
     positive = gated.positive & factored.regular
     log_det = log_det_of_pivots(factored.pivots)

@@ -74,7 +74,7 @@ def moved_cov(
         robot = materialize(jnp.concatenate([robot_cov, robot[:, 3:]], axis=1))
         return jnp.asarray(cov).at[:3].set(robot).at[:, :3].set(robot.T)
     if moved.landmark is not None:
-        # Stored before it is transposed: each entry would else be computed twice.
+        # Stored before it is transposed; otherwise each entry would be computed twice.
         cov = materialize(moved.turn(moved.turn(cov).T))
     cov = linalg.symmetrize(cov)
     # A = I + b e_Rᵀ, so with T = P_R + P_RR bᵀ/2 the change of P is b T + (b T)ᵀ.

@@ -14,14 +14,14 @@ from jaxslam.math.xla import materialize
 
 
 def prediction_of(joint: Joint, settings: EkfSettings) -> Prediction:
-    """The `Prediction` of a map; what the association does not call is not computed."""
+    """The `Prediction` of a map; only the parts that the association calls are computed."""
     sensor, chart, square_root = settings.sensor, settings.chart, settings.square_root
     capacity, size = joint.landmarks.shape
 
     def jacobians() -> tuple[
         Float[Array, "N Z"], Float[Array, "N Z 3"], Float[Array, "N Z L"], Float[Array, "N Z Z"]
     ]:
-        """The predicted ẑ, H by errors of pose and landmark, and H P Hᵀ, of each landmark alone."""
+        """The predicted ẑ, H by errors of pose and landmark, and H P Hᵀ, for each landmark."""
         every = jnp.arange(capacity)
         robot, cross, landmarks = materialize(_blocks(joint, square_root))
         top = jnp.concatenate([jnp.broadcast_to(robot, (capacity, 3, 3)), cross], axis=2)

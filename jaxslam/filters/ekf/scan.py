@@ -76,7 +76,7 @@ class SensorTurn(NamedTuple):
     """The measurement slots and settings of one sensor in a scan."""
 
     places: int | None
-    """measurement slots of the scan that are its own; None where all are"""
+    """the measurement slots of this sensor in the scan; None for all"""
     settings: EkfSettings | None
     """None where its measurements are ignored: `Status.UNMATCHED`"""
 
@@ -303,9 +303,9 @@ def _report_scan(
 
 
 def without_landmarks(joint: Joint, dead: Bool[Array, "N"], *, square_root: bool = False) -> Joint:
-    """The map without the landmarks of the slots `dead`, exactly as before where there are none.
+    """The map without the landmarks of the slots `dead`; without such a slot unchanged to the bit.
 
-    A root is made triangular again; a run without a removal keeps exactly its own.
+    A root is made triangular again; a run without a removal keeps its root to the bit.
     """
     remove = partial(slots.remove, dead=dead, square_root=square_root)
     return change_where(dead.any(), remove, joint)

@@ -156,7 +156,7 @@ def correct_in_turn(
 def _one_by_one(
     joint: Joint, measurements: Measurements, settings: EkfSettings
 ) -> tuple[Joint, Correction]:
-    """`correct_in_turn` by `correct` of each measurement alone."""
+    """`correct_in_turn` by `correct` of one measurement at a time."""
 
     def work(joint: Joint, one: Measurements) -> tuple[Joint, Correction]:
         return correct(joint, *one, settings)

@@ -53,7 +53,7 @@ def whiten(
     hp: Float[Array, "K D"],
     nu: Float[Array, "m Z"],
 ) -> tuple[Float[Array, "K D"], Float[Array, "K"]]:
-    """The whitened rows V = L⁻¹ H P and innovations L⁻¹ ν, zero for what is not fused."""
+    """The whitened rows V = L⁻¹ H P and innovations L⁻¹ ν, zero if not fused."""
     if len(fuse) == 1:
         inverse = jnp.where((fuse & factored.regular)[:, None, None], factored.inverse, 0.0)
         return no_inline(_multiplied, inverse, hp, nu)

@@ -45,7 +45,7 @@ def enter_link(
         at = jnp.argmin(weight)
         return at, row[at], links[at], weight[at]
 
-    # Read before any write: XLA would else copy all N lists to read them later.
+    # Read before any write; otherwise XLA copies all N lists to read them later.
     found = materialize((weakest(i), weakest(j)))
     (at_i, p, link_p, least_i), (at_j, q, link_q, least_j) = found
     keep = on & (size > least_i) & (size > least_j)
@@ -93,7 +93,7 @@ def _enter_links(
 
 
 def active_matches(state: SparseState, association: TagAssociation) -> Bool[Array, "M A"]:
-    """Which measurements are of the landmark at each index of the active set."""
+    """Mask of the measurements of the landmark at each index of the active set."""
     same = association.slot[:, None] == state.active[None, :]
     return association.has_slot[:, None] & same
 

@@ -174,7 +174,7 @@ def whole_information(state: SparseState) -> "scipy.sparse.csc_array":
     dense = np.asarray(landmark_blocks(state.omega))[index][:, index]
     one, two = (m.ravel() for m in np.meshgrid(slot, slot, indexing="ij"))
     add(one, two, dense.reshape(-1, 2, 2))
-    # The robot's rows and columns: its own block, and its links to the active landmarks.
+    # The robot's rows and columns: its block, and its links to the active landmarks.
     own_rows, linked = (3 + (2 * k[:, None] + np.arange(2)).ravel() for k in (slot, index))
     i, j = (
         m.ravel()

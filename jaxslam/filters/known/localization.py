@@ -180,7 +180,7 @@ class _OnMap(Linearizer):
 
 @record
 class _OfRobot(Wrapped):
-    """A sensor as one of the robot alone: the landmark that it measures is known."""
+    """A sensor of a known landmark, as a sensor of the robot alone."""
 
     sensor: Sensor
     known: PyTree = None

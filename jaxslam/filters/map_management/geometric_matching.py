@@ -26,7 +26,7 @@ from jaxslam.math.stats import chi2_quantile
 
 
 class _Alignment(NamedTuple):
-    """A weighted alignment of M cluster points, of which some have a map point."""
+    """A weighted alignment of M cluster points, some of them paired with map points."""
 
     pose: Float[Array, "3"]
     """T with map = T ∘ cluster"""
@@ -41,7 +41,7 @@ class _Alignment(NamedTuple):
     jacobian: Float[Array, "2*M 3"]
     """∂r/∂T"""
     factor: Float[Array, "2*M 2*M"]
-    """Cholesky factor of Σ; the identity where there is no pair"""
+    """Cholesky factor of Σ; the identity without a pair"""
 
 
 class _Residuals(NamedTuple):

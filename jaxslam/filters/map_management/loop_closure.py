@@ -90,7 +90,7 @@ class LoopReport(NamedTuple):
     runner_up: Int[Array, ""]
     """the same under any other hypothesis"""
     likely: Bool[Array, ""]
-    """the filter's own covariance, drift included, allows the best hypothesis"""
+    """the covariance of the filter, drift included, allows the best hypothesis"""
     merged: Int[Array, ""]
     """pairs of landmarks merged by the search, 0 or explained"""
     exhausted: Bool[Array, ""]
@@ -208,7 +208,7 @@ def _old_slots(
     candidates: Bool[Array, "M N"],
     settings: LoopSettings,
 ) -> tuple[Int[Array, "M"], LoopReport]:
-    """The old slot of each recent landmark, -1 where none is to be merged, and the report."""
+    """The old slot of each recent landmark, -1 without a merge, and the report."""
     capacity, m = joint.landmarks.shape[0], recent.shape[0]
     levels = jnp.asarray(
         [0.0, *(chi2_quantile(settings.drift, 2 * n) for n in range(1, settings.cluster + 1))]

@@ -98,7 +98,7 @@ class Merging(Managed):
     filter: Filter
     """whose state is a `slots.Joint`"""
     reach: Number
-    """[m] no two true landmarks are as near to one another. The test alone cannot separate two
+    """[m] below the distance of any two true landmarks. The test alone cannot separate two
     landmarks from one where their difference is less certain than that."""
     probability: float = static(default=0.95)
     """of the test, that two estimates of one landmark are merged"""
@@ -212,7 +212,7 @@ def squared_distance(error: Float[Array, "n"], cov: Float[Array, "n n"]) -> Floa
 def merge_landmarks(
     joint: Joint, chart: Chart, i: Array, j: Array, *, square_root: bool = False
 ) -> Joint:
-    """The map conditioned on equal landmarks in slots i and j, of which slot i is kept.
+    """The map conditioned on equal landmarks in slots i and j; slot i is kept.
 
     The constraint l_i = l_j is a measurement of δ = l_i - l_j = 0 without noise: with
     S = cov(δ) = L Lᵀ and V = L⁻¹ cov(δ, ·), x ← x ⊞ -Vᵀ L⁻¹ δ and P ← P - Vᵀ V, for points exact.
@@ -254,7 +254,7 @@ def merge_landmarks(
 
 
 def _derivatives(joint: Joint, chart: Chart) -> tuple[Float[Array, "N L 3"], Float[Array, "N L L"]]:
-    """The derivatives of each landmark's coordinates by errors of the pose and its own."""
+    """The derivatives of each landmark's coordinates by errors of the pose and of the landmark."""
     capacity, size = joint.landmarks.shape
     still = jnp.broadcast_to(jnp.eye(size, dtype=joint.cov.dtype), (capacity, size, size))
     if chart.basis is None:

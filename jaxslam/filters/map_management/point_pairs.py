@@ -73,7 +73,7 @@ def equal_lengths(
     test = (s - r) ** 2 / jnp.maximum(variance, jnp.finfo(s.dtype).tiny)
     possible = points.allowed[a][:, None] & points.allowed[b][None, :]
     possible = possible & (every[:, None] != every[None, :]) & (a != b)
-    # The direction of a pair shorter than its own uncertainty is undetermined.
+    # The direction of a pair shorter than its uncertainty is undetermined.
     directed = (s**2 > 9 * u @ cluster_cov @ u) & (s > 0)
     return test, possible & directed & (variance > 0) & (test <= gate)
 

@@ -49,7 +49,7 @@ def seen_points(sensor: Sensor, scan: Scan) -> tuple[Float[Array, "M 2"], Float[
     """A scan as points in the robot's frame, and their covariances.
 
     p = position(invert(0, z)), P = J R Jᵀ with J = ∂p/∂z; zeros and identity where not valid.
-    Raises ValueError for a sensor without landmarks, of landmarks that are no places (lines), or
+    Raises ValueError for a sensor without landmarks, of landmarks without a position (lines), or
     one whose measurement leaves the position open (K > 0).
     """
     no_place = len(sensor.landmark) == 0 or sensor.carry is not None
@@ -173,7 +173,7 @@ def lost(joint: Joint, chart: Chart, pose_cov: ArrayLike, *, square_root: bool =
     In coordinates P_RR ← pose_cov, P_RM ← 0, P_MM as it is: the pose is marginalized out and given
     an independent prior, at the estimate there was.
 
-    Raises ValueError on landmarks that are no points, a linearizer with a memory, or a pose_cov
+    Raises ValueError on landmarks other than points, a linearizer with a memory, or a pose_cov
     that is none.
     """
     check_point_map("lost", joint, chart)
@@ -193,7 +193,7 @@ def relocated(
     *,
     square_root: bool = False,
 ) -> Joint:
-    """The state with the robot's pose replaced by the one that aligns its scan with the map.
+    """The state with the robot's pose replaced by the pose that aligns its scan with the map.
 
     With r = T z - m over the pairs, J = ∂r/∂T, Σ = cov(r) = R Z Rᵀ + P_mm, N = (Jᵀ Σ⁻¹ J)⁻¹ and
     A = Σ⁻¹ - Σ⁻¹ J N Jᵀ Σ⁻¹, T the generalized least squares: P_TT = N, P_TM = N Jᵀ Σ⁻¹ P_mM,

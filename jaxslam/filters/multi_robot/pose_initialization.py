@@ -2,8 +2,8 @@
 
 Its pose x_b is a function g(y, q) of variables y of the map and of measurements q, so its
 covariances are P_bM = G_y P_yM and P_bb = G_y P_yy G_yᵀ + G_q C G_qᵀ (as Solà (32)-(38) for a
-landmark): correlated with the whole joint state. Every measurement is taken as a point in the frame
-of the robot that made it, whatever the sensor.
+landmark): correlated with the whole joint state. Every measurement is converted to a point in the
+frame of its robot, for any sensor.
 """
 
 from typing import NamedTuple
@@ -32,14 +32,14 @@ from jaxslam.sensors.suite import Suite, split_scan
 
 
 class _ObservedPoints(NamedTuple):
-    """The measurements of a robot as points in its own frame."""
+    """The measurements of a robot as points in its frame."""
 
     point: Float[Array, "M 2"]
     """[m]"""
     cov: Float[Array, "M 2 2"]
     tag: Int[Array, "M"]
     valid: Bool[Array, "M"]
-    """there is a measurement, of a known identity, which determines the point"""
+    """mask of measurements of known identity that determine the point"""
 
 
 Candidate = tuple[InitialPose, list[Bool[Array, "M"]]]
@@ -118,7 +118,7 @@ def _none_of(observed: list[_ObservedPoints]) -> list[Array]:
 
 
 def _first(observed: _ObservedPoints, tag: int) -> tuple[Int[Array, ""], Bool[Array, ""]]:
-    """The first measurement with a tag, and whether there is one."""
+    """The first measurement with a tag, and whether it exists."""
     match = observed.valid & (observed.tag == tag)
     return jnp.argmax(match), match.any()
 
@@ -167,7 +167,7 @@ def by_mutual_sight(
     atan2(-v) - atan2(w); then x_b = x_a ∘ that pose.
 
     Args:
-        other, rows, cov: x_a, its covariance with all errors and its own.
+        other, rows, cov: x_a, its covariance with all errors, and its covariance.
         seen, back: v and w, each with its covariance.
     """
     (v, cov_v), (w, cov_w) = seen, back
@@ -199,7 +199,7 @@ def by_two_landmarks(
     directions of l_2 - l_1 and q_2 - q_1 agree, and so do the midpoints.
 
     Args:
-        points, rows, cov: l, its covariance with all errors and its own.
+        points, rows, cov: l, its covariance with all errors, and its covariance.
         seen, seen_cov: q and its covariances.
     """
 

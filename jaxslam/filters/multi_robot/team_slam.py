@@ -83,7 +83,7 @@ class TeamSlam(Filter):
     tags: tuple[int, ...] | None = static(default=None)
     """R that mean robots; default N, N + 1, …"""
     report: int = static(default=0)
-    """which robot `estimate` is of; `team.poses` has all"""
+    """the robot of `estimate`; `team.poses` has all"""
     associate: Associate = Known()
     correction: CorrectionOrder = static(default="sequential")
     gate: Number | None = None

@@ -73,7 +73,7 @@ def _correct_landmarks(
     scan: Scan,
     settings: ParticleMapSettings,
 ) -> SlamParticles:
-    """The landmarks of a particle, each corrected by its own EKF at a known pose.
+    """The landmarks of a particle, each corrected by a separate EKF at a known pose.
 
     With S = H_l C H_lᵀ + R: l ← l + C H_lᵀ S⁻¹ ν, C ← C - C H_lᵀ S⁻¹ H_l C.
     """

@@ -122,7 +122,7 @@ def _sensor_likelihood(
 def _ignored_likelihood(
     pose: Float[Array, "3"], scan: Scan, settings: KnownMapSensor
 ) -> ScanLikelihood:
-    """The likelihood of ignored measurements, as of other robots: zero terms."""
+    """The likelihood of ignored measurements, such as those of other robots: zero terms."""
     m, size = scan.z.shape
     zero, none, no = (jnp.zeros(m, kind) for kind in (pose.dtype, jnp.int32, bool))
     return ScanLikelihood(

@@ -145,7 +145,7 @@ class ParticleEvents(NamedTuple):
 
 
 class PoseParticles(NamedTuple):
-    """P particles, of which the first `active` are in use; the others have weight zero."""
+    """P particles; the first `active` are in use, the others have weight zero."""
 
     pose: Float[Array, "P 3"]
     """finite also where not in use"""

@@ -145,7 +145,7 @@ def propose_pose(
 
 
 def _predict_measurements(particle: SlamParticles, sensor: Sensor) -> Prediction:
-    """The `Prediction` of one particle's map, with landmarks correlated by the pose alone."""
+    """The `Prediction` of one particle's map, with landmarks correlated only through the pose."""
 
     def linearized() -> tuple[Float[Array, "N Z"], Float[Array, "N Z 3"], Float[Array, "N Z Z"]]:
         """The prediction ẑ, H_x and H_l C H_lᵀ of each landmark."""

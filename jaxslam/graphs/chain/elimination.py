@@ -11,7 +11,7 @@ smoothing problem for linear dynamic systems", Automatica 4(2); Fraser & Potter 
 
 No covariance of a motion, of the start or of a pose is inverted, so all may be singular; no prior
 of a landmark is needed, so it does not matter when one is initialized; and covariances are
-sums of squares. O(T N²) time, and O(T N) memory besides a few matrices of N².
+sums of squares. O(T N²) time, and O(T N) memory plus a few matrices of N².
 """
 
 from typing import NamedTuple

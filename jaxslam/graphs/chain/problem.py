@@ -1,8 +1,8 @@
 """The nonlinear least-squares problem of a path and a map, and Gauss-Newton with line search on it.
 
-The unknowns are the noises of the start and of the motions, in units of their own standard
+The unknowns are the noises of the start and of the motions, in units of their standard
 deviations, and the map; the path follows from the noises by the motion models. So the models hold
-exactly at every iterate, and singular process noise is no special case.
+exactly at every iterate, and singular process noise is not a special case.
 """
 
 from typing import NamedTuple
@@ -130,7 +130,7 @@ def roll_out(
 
 
 _SHARES = (1.0, 0.5, 0.25, 0.1, 0.03, 0.01, 0.001)
-"""of the Gauss-Newton step that are tried, all at once; the first that lowers the cost is taken."""
+"""of the Gauss-Newton step, tried all at once; the first that lowers the cost is used."""
 
 _ARMIJO = 1e-4
 """least share of the decrease predicted by the gradient (Armijo)."""

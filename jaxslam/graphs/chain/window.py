@@ -34,7 +34,7 @@ class WindowPrior(NamedTuple):
     """The Gaussian of the oldest pose and of the landmarks measured before it."""
 
     joint: Joint
-    """mean and covariance; `alive`: the landmarks that it is of"""
+    """mean and covariance; `alive`: its landmarks"""
     points: tuple[Float[Array, "3"], Float[Array, "N L"]]
     """the oldest pose and these landmarks, where first-estimates Jacobians are taken"""
 
@@ -87,7 +87,8 @@ def linearize_window(
     everything else at the iterate (Dong-Si & Mourikis 2011, "Motion tracking with fixed-lag
     smoothing: algorithm and consistency analysis", ICRA): prior and new terms then share three
     unobservable directions.
-    By the oldest pose F = [I, J(p_1 - p_0); 0, 1] with p_0 at its first estimate, J = [0, -1; 1, 0].
+    By the oldest pose F = [I, J(p_1 - p_0); 0, 1] with p_0 at its first estimate,
+    J = [0, -1; 1, 0].
     """
     landmark_points = at.landmarks
     if first:

@@ -65,7 +65,7 @@ class FixedLag(Filter):
     log marginalizes nothing: then the newest pose and the map are those of `BatchMap`.
 
     A measurement with a singular R is dropped as `Status.SINGULAR`. Where the numbers of the window
-    are not finite (it is optimized without step control), it begins anew from the EKF-SLAM's state,
+    are not finite (it is optimized without step control), it restarts from the state of EKF-SLAM,
     and `exhausted` is set. O(W N²) for the window, and
     O(N³) for the prior, an iteration.
 
@@ -194,7 +194,7 @@ def _is_finite(state: _WindowState) -> Bool[Array, ""]:
 
 
 def _finite_or(state: _WindowState, other: _WindowState) -> _WindowState:
-    """The state if all its numbers are finite, else the other one."""
+    """The state if all its numbers are finite, else the other state."""
     finite = _is_finite(state)
     chosen: _WindowState = jax.tree.map(lambda a, b: jnp.where(finite, a, b), state, other)
     return chosen

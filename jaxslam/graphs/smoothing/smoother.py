@@ -147,7 +147,7 @@ class Smoothed(NamedTuple):
     joint: Joint
     """the last pose and the map, a possible initial state of a filter"""
     regular: Bool[Array, ""]
-    """the information on the map is positive definite; else covariances are invalid"""
+    """the information on the map is positive definite; otherwise covariances are invalid"""
     filtered: Estimate
     """with leading T, of the filter"""
 

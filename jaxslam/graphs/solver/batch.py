@@ -27,10 +27,10 @@ LEAST = 16
 def padded_graph(graph: Graph, room: int = 0) -> Graph:
     """The graph with more poses and points, which are fixed, and rows, which are not valid.
 
-    With room for so many variables there are as many poses, and two rows a pose.
+    With room for n variables there are n poses, and two rows a pose.
 
-    For concrete graphs: its arrays are NumPy's. The rows are of variable -1, which is nowhere, so
-    that a plan leaves them out.
+    For concrete graphs: its arrays are NumPy's. The rows have variable -1, which is out of range,
+    so that a plan leaves them out.
     """
 
     def more(x: PyTree, value: float = 0, least: int = 0) -> np.ndarray:
@@ -103,9 +103,9 @@ def over_batch(name: str, function: Callable[..., _T]) -> Callable[[PyTree, PyTr
     """The function of one graph, called with (shared, graph), from a function of graphs with a last
     axis B.
 
-    `function(*shared, graphs)` computes all graphs at once, so that its loops run over tables that the
-    graphs share. Under `vmap`, nested or not, the batch becomes larger. Raises ValueError, which
-    begins with a caller's name, if a shared argument has a batch axis.
+    `function(*shared, graphs)` computes all graphs at once, so that its loops run over tables that
+    the graphs share. Under `vmap`, nested or not, the batch becomes larger. Raises ValueError,
+    which begins with a caller's name, if a shared argument has a batch axis.
     """
 
     @jax.custom_batching.custom_vmap

@@ -31,7 +31,7 @@ class Variables(NamedTuple):
 
 
 class Data(NamedTuple):
-    """What is measured, and what is held; numbers of rows that are not valid are zero."""
+    """Measurements and fixed variables; numbers of rows that are not valid are zero."""
 
     z: dict[str, Float[Array, "_ _ B"]]
     information: dict[str, Float[Array, "_ _ _ B"]]
@@ -47,7 +47,7 @@ class System(NamedTuple):
     gradient: Float[Array, "n d B"]
     """Σ Jᵀ ρ' Ω e, by column: half the derivative of χ² by the increments"""
     blocks: Float[Array, "M d d B"]
-    """Σ Jᵀ ρ' Ω J; one on the diagonal of what is not estimated"""
+    """Σ Jᵀ ρ' Ω J; one on the diagonal of fixed variables"""
 
 
 def retract(variables: Variables, increments: Float[Array, "n d B"], plan: Plan) -> Variables:
@@ -187,7 +187,7 @@ def half_hessian(
 
 
 def variable_numbers(factor: Factor, who: Array, poses: int) -> Array:
-    """The variables of rows, points counted on from so many poses."""
+    """The variables of rows; points are numbered after the poses."""
     shift = np.array([[poses * (kind == "point") for kind in factor.variables]], np.int32)
     return who + shift
 
@@ -204,7 +204,7 @@ def _moved(
 
 @jax.custom_jvp
 def _barrier(values: PyTree) -> PyTree:
-    """`optimization_barrier`, whose own derivative JAX cannot transpose where some of the values
+    """`optimization_barrier`, whose derivative JAX cannot transpose where some of the values
     have none."""
     return jax.lax.optimization_barrier(values)
 

@@ -1,4 +1,4 @@
-"""The iterations of an optimization: a trial step, its χ², and what follows from it."""
+"""The iterations of an optimization: a trial step, its χ², and the decision."""
 
 from enum import IntEnum
 from typing import NamedTuple
@@ -23,7 +23,7 @@ from jaxslam.graphs.sparse.cholesky import factorize, substitute
 
 
 class _Step(NamedTuple):
-    """An increment, and what the quadratic model of χ² says of it."""
+    """An increment, and its prediction by the quadratic model of χ²."""
 
     increments: Float[Array, "n d B"]
     predicted: Float[Array, "B"]
@@ -45,7 +45,7 @@ def _marquardt(plan: Plan, system: System, damping: Float[Array, "B"]) -> _Step:
     """
     width = system.blocks.shape[1]
     unit = jnp.eye(width, dtype=bool)[None, ..., None] & plan.on_diagonal[:, None, None, None]
-    # What no measurement sees has a diagonal of zero, and stays where it is.
+    # A variable without measurements has a diagonal of zero, and does not move.
     scale = jnp.where(system.blocks == 0, 1.0, system.blocks)
     blocks = system.blocks + jnp.where(unit, damping, 0.0) * scale
     factored = factorize(plan.cholesky, blocks)
@@ -164,7 +164,7 @@ def minimize(
         return proposed(search), first_chi2, first_gradient
 
     def judged(search: _Search) -> _Search:
-        """The search after its trial is taken or refused."""
+        """The search after its trial is accepted or refused."""
         trial = linearize(model, plan, search.trial, data)
         finite, began = jnp.isfinite(trial.chi2), search.taken < 0
         gain = search.system.chi2 - trial.chi2
@@ -223,13 +223,13 @@ def minimize(
         chi2 = search.system.chi2
         least = jnp.maximum(tolerance * chi2, 32 * eps * (chi2 + 1))
         small = step.predicted <= least
-        # What is regular at the end is determined there, whatever it was on the way.
+        # Only regularity at the end matters, not on the way.
         singular = jnp.where(plain & regular & small, -1, singular)
         known = singular >= 0
         stuck = search.refused | (step.predicted <= 0)
         converged = small & (plain | (known & search.judged) | stuck)
         ending = jnp.where(known, Ending.SINGULAR, Ending.CONVERGED)
-        # A gradient of exactly zero is no reason to stall.
+        # A gradient of exactly zero is not a stall.
         stalled = ~plain | (stuck & (step.predicted != 0))
         ending = jnp.where(~known & stalled, Ending.STALLED, ending)
         # Without a step: an undamped factor that failed, or that has to confirm convergence.

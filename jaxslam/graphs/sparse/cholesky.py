@@ -60,7 +60,7 @@ class Factored(NamedTuple):
 
 
 def cholesky_tables(pattern: Pattern, room: int = 0) -> tuple[CholeskyTables, Ints]:
-    """The tables of a pattern, with room for so many variables, and the place of each of its
+    """The tables of a pattern, with room for more variables, and the place of each of its
     blocks, and of none, in `Factored.blocks`."""
     size, heights, columns, rows = (
         len(pattern.order),
@@ -100,7 +100,7 @@ def cholesky_tables(pattern: Pattern, room: int = 0) -> tuple[CholeskyTables, In
 
 
 def block_count(pattern: Pattern, room: int) -> int:
-    """The size of the array of a pattern's blocks, with room for so many variables."""
+    """The size of the array of a pattern's blocks, with room for more variables."""
     return padded_size(max(len(pattern.columns), 8 * room))
 
 
@@ -126,7 +126,7 @@ def _transposed_on_vector(a: jax.Array, x: jax.Array) -> jax.Array:
 def factorize(tables: CholeskyTables, blocks: Float[Array, "padded d d B"]) -> Factored:
     """The factor of a matrix, from its blocks at their places (lower triangle).
 
-    A pivot that rounding may have left of zero, beside the matrix's own diagonal entry, makes its
+    A pivot that may be rounding of zero, compared with the diagonal entry of the matrix, makes its
     column irregular; its inverse is then taken as zero, so that all numbers stay finite.
     """
     size, width = len(tables.diagonal), blocks.shape[1]
@@ -213,7 +213,7 @@ class InverseTables(NamedTuple):
     pairs: Int[Array, "Q"]
     """the place of the block of each pair of variables"""
     turned: Bool[Array, "Q"]
-    """whether that block is of the second variable's rows and the first one's columns"""
+    """whether that block has the second variable's rows and the first one's columns"""
 
 
 def inverse_tables(
@@ -238,12 +238,12 @@ def inverse_tables(
 
 
 def _sums(pattern: Pattern) -> Sums:
-    """The products of the selected inversion, of which a large graph has millions."""
+    """The products of the selected inversion; a large graph has millions."""
     rows, columns = pattern.rows, pattern.columns
     target, left, right, flip = [], [], [], []
     for column, blocks in pattern.below():
         involved = rows[blocks]  # (C, m)
-        # The rows of a column, its own included, by the rows below its diagonal.
+        # The rows of a column, with the diagonal, by the rows below its diagonal.
         every = np.concatenate([column[:, None], involved], axis=1)
         one, other = np.broadcast_arrays(every[:, :, None], involved[:, None, :])
         at = np.concatenate([pattern.first[column][:, None], blocks], axis=1, dtype=np.int32)
@@ -252,7 +252,7 @@ def _sums(pattern: Pattern) -> Sums:
         flip.append((one < other).ravel())
         right.append(np.broadcast_to(blocks[:, None, :], one.shape).ravel())
     depth = pattern.heights[-1] - pattern.heights
-    # The diagonal block of a column comes after those below it, of which it is a sum.
+    # The diagonal block of a column comes after the blocks below it, which it sums.
     level = 2 * depth[columns] + (rows == columns)
     return Sums(level, *map(np.concatenate, (target, left, right, flip)))
 

@@ -126,7 +126,7 @@ def with_poses(graph: Graph, poses: Float[np.ndarray, "N 3"]) -> Graph:
 
 
 def as_before(before: JaxOrNumPy, values: np.ndarray) -> np.ndarray:
-    """The values in the type of those before, unless that is of whole numbers."""
+    """The values in the dtype of the previous ones, unless that is an integer dtype."""
     dtype = np.asarray(before).dtype
     return values.astype(dtype) if np.issubdtype(dtype, np.floating) else values
 

@@ -97,7 +97,7 @@ def beam_log(control: ArrayLike, beams: Beams) -> Log:
 
 
 def beams_of(scan: Scan, every: int) -> Beams:
-    """Each n-th beam of a scan of such a log; those not valid are of range 0."""
+    """Each n-th beam of a scan of such a log; beams that are not valid have range 0."""
     z, valid = scan.z[::every], scan.valid[::every]
     used = valid & (z[:, 0] > 0)
     clean = jnp.where(used[:, None], z, 0.0)
@@ -134,7 +134,7 @@ class _FreeSpace(Region):
 def _free_space(name: str, grid: Grid, box: Float[np.ndarray, "2 2"] | None) -> _FreeSpace:
     """The free cells of a map whose centres lie in a box, None for all.
 
-    Raises ValueError, which begins with a caller's name, where there is none.
+    Raises ValueError, which begins with a caller's name, if there is no such cell.
     """
     free = np.asarray(grid.log_odds) < 0
     if not free.any():
@@ -169,13 +169,13 @@ class GridLocalization(MonteCarloFilter):
 
     Recovery (table 8.3) compares the geometric mean of p(z_k) over the beams of a scan, averaged
     over the particles, with its long-term average, so the number of beams does not matter. It draws
-    particles from the free cells of the map (in the box, if there is one) with any heading; so does
+    particles from the free cells of the map (in the box, if given) with any heading; so does
     a uniform start.
 
     The estimate is a single mean and covariance, also where the particles form several groups:
     `clusters` of `final.pose` and `final.log_weight` finds these. A particle off the map or in an
     occupied cell has weight zero; `blocked` of `info.extra["particles"]`, a `ParticleInfo`, counts
-    those in use. A scan without a usable beam tells no more than that. The status of a beam is
+    those in use. A scan without a usable beam gives no more information. The status of a beam is
     FUSED if it entered the weights, UNMATCHED if `every` left it out or the scan left no particle a
     weight (`underflow`), as where all are off the map. log_likelihood is
     log Σ w p(z | x)^exponent.
@@ -198,7 +198,7 @@ class GridLocalization(MonteCarloFilter):
     every: int = static(default=1)
     """use each n-th beam, at least 1"""
     prepared: PyTree = dataclasses.field(init=False, repr=False)
-    """what the model needs of the map"""
+    """the map as prepared for the model"""
     region: _FreeSpace = dataclasses.field(init=False, repr=False)
     """where the robot may be: the free cells of the map (in the box)"""
     measurements = _BEAM

@@ -30,9 +30,9 @@ class Counts(NamedTuple):
     origin: Float[JaxOrNumPy, "3"]
     resolution: Float[JaxOrNumPy, ""]
     outside: Int[JaxOrNumPy, ""]
-    """usable beams that say nothing: their origin is off the map"""
+    """usable beams without effect: their origin is off the map"""
     unusable: Int[JaxOrNumPy, ""]
-    """beams that say nothing: not valid, or of a range of 0, below 0 or NaN (`Beams`)"""
+    """beams without information: not valid, or of a range of 0, below 0 or NaN (`Beams`)"""
 
 
 def count(
@@ -234,7 +234,7 @@ def reflection(counts: Counts, *, prior: ArrayLike = 1.0) -> Grid:
     """The counting model: p = (hits + prior)/(hits + misses + 2 prior), how often a cell reflects.
 
     The mean of a Beta(prior, prior) distribution updated by the counts. A cell of no beam has a
-    log-odds of exactly 0; the counts, not the grid, say how sure p is.
+    log-odds of exactly 0; the counts, not the grid, show how certain p is.
 
     Raises ValueError unless prior is above 0.
     """

@@ -34,7 +34,7 @@ class RayMap(NamedTuple):
 
 
 def ray_map(grid: Grid, *, method: str | None = None, skip: bool = True) -> RayMap:
-    """A grid prepared for `cast` by one of two methods, of which only `cast` knows the difference.
+    """A grid prepared for `cast` by one of two methods, which only `cast` distinguishes.
 
     Args:
         method: "surface" or "cells", see `cast`. None chooses by the map: "surface" where each cell
@@ -60,7 +60,8 @@ def _default_method(grid: Grid) -> str:
     solid.
 
     It is not with three log-odds or fewer, which have no grades, nor where cells are unknown, which
-    a map made from scans has: its p says how sure a cell is. There "surface" goes too far (`cast`).
+    a map made from scans has: its p is the certainty of a cell. There "surface" goes too far
+    (`cast`).
     """
     if not is_concrete(grid.log_odds):
         return "cells"
@@ -73,7 +74,7 @@ def _default_method(grid: Grid) -> str:
 
 
 def check_method(name: str, method: str) -> None:
-    """Raise ValueError unless there is such a method."""
+    """Raise ValueError on an unknown method."""
     if method not in METHODS:
         raise ValueError(f"{name}: expected a method of {', '.join(METHODS)}, got {method!r}")
 
@@ -156,7 +157,7 @@ def cast(
     beam passes an edge or hits it is a jump, which no derivative knows.
 
     Args:
-        grid: a `Grid`, or a `RayMap` of it, which is faster for many rays.
+        grid: a `Grid`, or its `RayMap`, which is faster for many rays.
         pose: (3,) or with leading axes.
         angles: (B,) of beams in the frame of the pose [rad].
         max_range: [m].

@@ -51,7 +51,7 @@ def map_of(
     frame: tuple[tuple[int, int], Float[np.ndarray, "3"], float],
     settings: Settings,
 ) -> Grid:
-    """The occupancy grid of usable scans; beams that met nothing say nothing."""
+    """The occupancy grid of usable scans; beams that met nothing have no effect."""
     shape, origin, resolution = frame
     counts = np.zeros((2, *shape), np.int32)
     laser = poses.compose(path, np.asarray(log.mount, float))
@@ -171,7 +171,7 @@ def growing_maps(
 
 
 def _used(log: LogOfScans, settings: Settings, usable: np.ndarray, rows: slice) -> Beams:
-    """The beams of some scans as maps take them: what a scan that is not usable met is nothing."""
+    """The beams of some scans for a map; beams of scans that are not usable met nothing."""
     some = Beams(*(np.asarray(part)[rows] for part in log.beams))
     ranges, angles, met = (np.asarray(part) for part in met_something(some, log.max_range))
     seen = met & usable[rows, None]

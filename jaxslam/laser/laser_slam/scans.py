@@ -21,7 +21,7 @@ WIDTH, ROWS = 384, 64
 """Beams and scans of one call that fits lines: logs are cut and filled up to these, so that all
 share one program."""
 _CHANGED, SHARE = 0.1, 0.2
-"""A scan differs from the one before if more than this share of its beams do, by this much [m]."""
+"""A scan differs from the previous one if more than this share of its beams do, by this [m]."""
 
 
 class Scans(NamedTuple):
@@ -34,7 +34,7 @@ class Scans(NamedTuple):
     usable: Bool[np.ndarray, "K"]
     """enough points to match"""
     changed: Bool[np.ndarray, "K"]
-    """whether a scan differs from the one before, as that of a robot at rest does not"""
+    """whether a scan differs from the previous one; a scan of a robot at rest does not"""
 
 
 def check_laser_log(name: str, log: LogOfScans) -> None:
@@ -154,7 +154,7 @@ def _spacing(angles: np.ndarray, valid: np.ndarray) -> float:
 
 
 def _changed(ranges: Float[np.ndarray, "K B"], met: Bool[np.ndarray, "K B"]) -> np.ndarray:
-    """Whether each scan differs from the one before; the first does."""
+    """Whether each scan differs from the previous one; the first does."""
     differs = (np.abs(np.diff(ranges, axis=0)) > _CHANGED) | (met[1:] != met[:-1])
     either = met[1:] | met[:-1]
     share = (differs & either).sum(axis=1) / np.maximum(either.sum(axis=1), 1)

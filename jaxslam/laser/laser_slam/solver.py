@@ -28,11 +28,11 @@ def solve(
     *,
     progress: Callable[[str, int, int], object] | None = None,
 ) -> Solved:
-    """The path, graph, loops and map of a laser log, from its raw odometry and scans alone.
+    """The path, graph, loops and map of a laser log, from its raw odometry and scans.
 
     Laser odometry places each scan among the keyframes before it; loops between keyframes are
-    sought by place and by looks, and those that agree are edges of the graph; the map is of all
-    scans at the optimum. What was left out is counted, and the run goes on: scans with too few
+    found by position and by appearance, and those that agree are edges of the graph; the map is of
+    all scans at the optimum. Unused data are counted, and the run continues: scans with too few
     points have raw odometry, steps of raw odometry that cannot be are taken to be unknown.
 
     Args:

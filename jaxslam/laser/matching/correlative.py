@@ -63,7 +63,7 @@ def _best_shift(
 ) -> _Best:
     """The best shift of all blocks, by depth first search with the best bound ahead.
 
-    A block whose bound is not above the best value so far is left out; others are divided into four
+    A block whose bound is not above the best value so far is skipped; others are divided into four
     (Hess et al. 2016, "Real-time loop closure in 2D LIDAR SLAM", ICRA).
 
     Args:
@@ -136,7 +136,7 @@ class Scores(NamedTuple):
 
     table: Float[Array, "L H W"]
     """first exp(-d²/2σ²), d the distance to the nearest occupied cell, 0 beyond `_REACH` σ; at
-    level l, the largest of the 2^l × 2^l cells of which this is the lower left one"""
+    level l, the largest of the 2^l × 2^l cells with this cell at the lower left"""
     field: Field
     """d [m], of the map alone, up to `_REACH` σ"""
 

@@ -54,7 +54,7 @@ class FieldMatcher(Matcher):
     d [m] is truncated at reach, and interpolated between centres of cells, so that the cost is
     continuous and no pairs are chosen; a point of d >= reach has a constant cost, and no part.
     Levenberg's method: (A + μ diag A) δ = -Σ w d J, A = Σ w J Jᵀ, J = (∇d, ∇d·∂(R p)/∂θ);
-    a step that does not reduce the cost is not taken, and μ grows tenfold, else it falls tenfold.
+    a step that does not reduce the cost is refused and μ grows tenfold; else μ falls tenfold.
     The reference is a `Grid`; `raster` makes one of points.
 
     The slope of a field of cells feigns information along a wall, so the status and
@@ -135,7 +135,7 @@ class FieldMatcher(Matcher):
 
         begin = start
         if prior is not None:
-            # Along what the scan does not determine it begins where the prior has it: a step that
+            # Along directions that the scan does not determine it begins at the prior: a step that
             # the roughness of a field of cells might refuse.
             onto = onto_of(start, matcher._at(prepared, points, start, prior))
             free = jnp.eye(3, dtype=start.dtype) - onto
@@ -182,7 +182,7 @@ class FieldMatcher(Matcher):
         return _At(cost, residual, weight, curvature, slope)
 
     def _robust_cost(self, residual: Array, points: Points) -> Float[Array, ""]:
-        """The sum of ρ over the valid points, also beyond reach, so that leaving is no gain."""
+        """The sum of ρ over the valid points, also beyond reach, so that leaving has no gain."""
         square = residual**2
         if self.kernel is not None:
             square = self.scale**2 * self.kernel.cost(square / self.scale**2)

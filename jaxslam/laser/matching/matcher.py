@@ -59,7 +59,7 @@ class Match(NamedTuple):
     condition: Float[Array, ""]
     """its eigenvalue over the largest, lengths in RMS ranges"""
     determined: Float[Array, "3 3"]
-    """projection of a motion (dx, dy, dθ) onto what the scans determine: the identity, unless the
+    """projection of a motion (dx, dy, dθ) onto the determined directions: the identity, unless the
     match is DEGENERATE"""
     pair: Int[Array, "N"]
     """the partner of each point in the reference, -1 without; in a grid 0 where it took part"""
@@ -94,7 +94,7 @@ class Matcher(Component):
         start: Float[Array, "3"],
         prior: Prior | None = None,
     ) -> Match:
-        """The match of a scan. By while loops: forward derivatives alone."""
+        """The match of a scan, by while loops, which have only forward derivatives."""
         raise NotImplementedError
 
     def cost(
@@ -120,7 +120,7 @@ def match(
         reference: `Points`, or a `Grid` where `matcher.of_grid`; with a leading axis on all of its
             arrays for many pairs at once, as `points` and `start` then have.
         start: (3,) where the search begins.
-        prior: what is known of the pose; without one only the start is.
+        prior: of the pose; without a prior only the start is known.
 
     It is computed in the higher precision of reference and points.
 

@@ -66,7 +66,7 @@ def topological_map(
     to the place whose skeleton is nearest on a way through free cells.
 
     Args:
-        clearance: radius of the robot [m]; what is narrower connects nothing.
+        clearance: radius of the robot [m]; narrower passages do not connect.
         max_width: [m] widest narrowing that counts as a door.
         prominence: [m] by how much half of a door's width is less than that of either side.
     Raises:
@@ -181,7 +181,7 @@ class PathPlaces(NamedTuple):
     """Places that cover the poses of a path."""
 
     center: Int[np.ndarray, "P"]
-    """the pose that stands for each place"""
+    """the pose that represents each place"""
     place: Int[np.ndarray, "N"]
     """of each pose: that of the nearest center"""
     adjacent: Bool[np.ndarray, "P P"]

@@ -31,7 +31,7 @@ def skeleton(grid: Grid, *, clearance: float = 0.2) -> Skeleton:
 
     Cells are removed in the order of their distance to the walls, as long as that changes neither
     connections nor holes (8-connected, by Yokoi's number), except ridges of the distance field:
-    so what is left of rooms and corridors is the Voronoi line between their walls, without the
+    so rooms and corridors are reduced to the Voronoi line between their walls, without the
     branches into right-angled corners. A second round makes it one cell wide. Unknown cells count
     as walls. A loop in Python over the free cells: about 1 s for 10⁵.
 

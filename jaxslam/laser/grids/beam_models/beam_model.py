@@ -61,14 +61,14 @@ def log_likelihood(
 ) -> Float[Array, ""]:
     """The log-likelihood of a scan at a pose (3,): exponent · Σ log p(z_k) over its valid beams.
 
-    Beams that say nothing (`Beams`) add nothing. The beams of a scan are
-    taken to be independent given the pose, which they are not: what the map lacks, or a pose
+    Beams without information (`Beams`) add nothing. The beams of a scan are
+    assumed independent given the pose, which they are not: what the map lacks, or a pose
     between two cells, spoils many of them in the same way. `every` takes each n-th beam alone, and
     an exponent below 1 tempers the likelihood; both make it wider. Differentiable by pose and
     exponent; `jax.vmap` it over poses.
 
     Raises ValueError on beams that `_check_beams` refuses, a pose that is not (3,), every below 1,
-    an exponent below 0, and a grid in place of what `model.prepare` makes of it.
+    an exponent below 0, and a grid in place of the result of `model.prepare`.
     """
     _check_beams("log_likelihood", beams)
     if np.shape(pose) != (3,):
@@ -92,7 +92,7 @@ def log_likelihood(
 
 
 def usable_beams(beams: Beams) -> Bool[JaxOrNumPy, "*n"]:
-    """Which beams say something, by `Beams.returns`."""
+    """Mask of the beams with information, by `Beams.returns`."""
     met, free = beams.returns()
     return met | free
 

@@ -1,4 +1,4 @@
-"""Candidates of loops: places that the graph says may be the same, and scans that look alike.
+"""Candidates of loops: places that may be the same by the graph, and scans that look alike.
 
 Scans are compared by a descriptor that does not change when the robot turns on the spot.
 """

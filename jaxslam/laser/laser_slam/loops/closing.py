@@ -61,7 +61,7 @@ _NARROW, _WIDE = (0.8, float(np.deg2rad(14.0))), (4.0, float(np.deg2rad(40.0)))
 """Windows of the search, [m] and [rad] to either side."""
 _SEARCHES = [search(*window, np.deg2rad(2.0)) for window in (_NARROW, _WIDE)]
 _WINDOW = np.diag(1 / np.square([_WIDE[0], *_WIDE]))
-"""Information of the window, which bounds what the walls do not tell."""
+"""Information of the window, which bounds directions that the walls do not determine."""
 
 _CONSISTENCY = 0.999
 """Probability below which two loops agree."""
@@ -188,7 +188,7 @@ def closed(
     left_out = max(int(usable.sum()) - MOST, 0)
     for turn in range(settings.rounds if len(keyframe) > settings.loop_gap else 0):
         path = np.asarray(graph.poses, np.float64)
-        # By the graph few places, since each pair of which the covariance is computed fills its
+        # By the graph few places, since each pair whose covariance is computed fills its
         # factor; after a first optimum the nearest ones fit a window.
         most = PLACES if turn == 0 else CANDIDATES
         reach = REACH + _WIDE[0]
@@ -258,7 +258,7 @@ def _final(
 
 
 def _with(place: Candidates, pairs: np.ndarray) -> Candidates:
-    """Candidates by looks beside those by place: at the same pose, with the wide window."""
+    """Candidates by appearance and by position: at the same pose, with the wide window."""
     known = set(zip(place.first.tolist(), place.second.tolist(), strict=True))
     new = np.array([tuple(pair) not in known for pair in pairs.tolist()], bool)
     pairs = pairs[new]

@@ -69,7 +69,7 @@ def consistent(
 
 
 class _Loop(NamedTuple):
-    """What the agreement of loops needs of each, in the world's frame; see `consistent`."""
+    """The data of loops for their agreement, in the world's frame; see `consistent`."""
 
     at: Array
     """x_j, by odometry"""

@@ -21,13 +21,13 @@ _ENOUGH = 20
 _MOVES = (0.02, 0.02)
 """[m], [rad] of a step in which it moves"""
 _AS_BEFORE = 0.6
-"""of the reach, by which a step that is not known differs from the one before"""
+"""of the reach, by which an unknown step differs from the previous step"""
 _MUCH = (0.3, 0.35)
 """[m], [rad]: shorter steps are not timed well enough to be called too fast"""
 
 
 class Steps(NamedTuple):
-    """The steps of raw odometry to each scan from the one before; the first is none."""
+    """The steps of raw odometry to each scan from the previous one; the first is zero."""
 
     step: Float[np.ndarray, "K 3"]
     cov: Float[np.ndarray, "K 3 3"]
@@ -45,7 +45,7 @@ class Steps(NamedTuple):
 
     @property
     def unknown(self) -> Bool[np.ndarray, "K"]:
-        """Steps of which raw odometry says nothing."""
+        """Mask of the steps without raw odometry."""
         return np.asarray(self.jump | self.frozen)
 
 
@@ -59,13 +59,13 @@ def steps_of(
     """The steps of raw odometry; σ of position and heading grow with distance and turn.
 
     The largest speed of the robot is the 95 % quantile of the speeds in the log, and 1.5 times it
-    is faster than can be. A step that is a jump, or lags, has σ of half of what the robot can have
-    gone in that time, since raw odometry may err by all of it; one that is frozen 0.6 of that,
+    is faster than possible. A step that is a jump, or lags, has σ of half of what the robot can
+    have gone in that time, since raw odometry may err by all of it; one that is frozen 0.6 of that,
     about a step like the one before. The step after one that lags is right only together with it.
 
     Args:
         time: [s] of the scans; None: no speed is known.
-        changed: whether each scan differs from the one before; None: none does.
+        changed: whether each scan differs from the previous one; None: none does.
         known: whether odometry was logged since the scan before; None: always.
     """
     step = np.zeros((len(raw), 3))
@@ -95,7 +95,7 @@ def steps_of(
 
 
 def reach_cov(reach: Float[np.ndarray, "... 2"]) -> Float[np.ndarray, "... 3 3"]:
-    """The covariance of a step of which only how far it can lead is known: σ is half of that."""
+    """The covariance of a step with only a known reach: σ is half of the reach."""
     sigma = 0.5 * np.asarray(reach)[..., [0, 0, 1]]
     return np.asarray(sigma[..., None] ** 2 * np.eye(3))
 

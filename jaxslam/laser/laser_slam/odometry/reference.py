@@ -41,7 +41,7 @@ _PEAK = 0.9
 _SECTORS = 180
 """of a turn, in which beams are compared with the reference"""
 _CLEAR = 0.4
-"""[m] by which a point lies before what a beam met, at least, to be passed through"""
+"""[m] least distance of a passed point in front of the end of a beam"""
 
 
 class Reference(NamedTuple):
@@ -91,7 +91,7 @@ def search(
 _CORRELATION = 2.0
 """Beams that err together: the information of a match is divided by it."""
 _FLOOR = (0.005, 0.005, 0.002)
-"""Standard deviations of x, y [m], θ [rad] added to each match, for what the lines miss."""
+"""Standard deviations of x, y [m], θ [rad] added to each match, for errors of the lines."""
 _OF_WALLS = IcpSettings(kernel=Cauchy(), scale=0.05, lone=0.5, iterations=10, least_condition=None)
 WALLS = PointToLine(replace(_OF_WALLS, reach=0.5))
 _NEAR_WALLS = PointToLine(replace(_OF_WALLS, reach=0.15))
@@ -131,7 +131,7 @@ def match(
 
     Args:
         guess: pose in the frame of the reference. prior_cov: of the end of it; None: only a start.
-        floor: information added to that of the walls where there is no prior.
+        floor: information added to that of the walls without a prior.
     """
     known = floor
     prior = np.zeros((3, 3))
@@ -183,7 +183,7 @@ def _match(
     """Pose, information, share of inliers, residual, whether it is ambiguous, and share of points
     that beams pass through, in one array, since each transfer from the device takes time.
 
-    information: of the prior, beside points of variance 1.
+    information: of the prior, relative to points of variance 1.
     """
     coarse = Prior(guess, _BLUR**2 * information)
     found = matcher.match(reference.table, _thinned(scan), guess, coarse)
@@ -197,9 +197,9 @@ def _match(
 
 
 def _seen_through(reference: Points, scan: Points, pose: Array) -> Array:
-    """The share of the reference's points in view that lie before what the scan meets there.
+    """The share of the reference's points in view that lie in front of the scan's points.
 
-    At the right pose the beams of a scan pass through no wall of the reference, but for what has
+    At the right pose the beams of a scan pass through no wall of the reference, except for what has
     moved; at a wrong one that has as many points on walls they do. By sectors of two degrees:
     points in sectors without a beam, and those behind what it met, are not in view.
     """

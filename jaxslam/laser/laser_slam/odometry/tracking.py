@@ -24,7 +24,7 @@ from jaxslam.math import numpy_poses as poses
 NEAR = search(0.6, np.deg2rad(22.0), np.deg2rad(2.0), ambiguous=None)
 """About raw odometry."""
 FAR = search(*FARTHEST, np.deg2rad(2.5))
-"""Where that finds little, or raw odometry is no guess."""
+"""The wider search, if the first finds little, or raw odometry is unusable."""
 _INFLATION = 16.0
 """Of raw odometry's covariance in the wider search."""
 _KEY_TURN = 0.35
@@ -56,7 +56,7 @@ class Odometry(NamedTuple):
 
     poses: Float[np.ndarray, "K 3"]
     base: Int[np.ndarray, "K"]
-    """the keyframe before each scan; of a keyframe, the one before it"""
+    """the keyframe before each scan; for a keyframe, the previous one"""
     z: Float[np.ndarray, "K 3"]
     """the scan's pose in the frame of its base"""
     cov: Float[np.ndarray, "K 3 3"]
@@ -65,11 +65,11 @@ class Odometry(NamedTuple):
     """the same as if no match were in doubt"""
     keyframe: Int[np.ndarray, "N"]
     matched: Bool[np.ndarray, "K"]
-    """false where z is raw odometry alone"""
+    """false where z is raw odometry"""
     doubted: Bool[np.ndarray, "K"]
     """matched, but far from raw odometry, or with few points on walls"""
     inliers: Float[np.ndarray, "K"]
-    """share of the points on walls, 0 where none were matched"""
+    """share of the points on walls, 0 without a match"""
     residual: Float[np.ndarray, "K"]
     """[m] root mean square of their distances from these"""
 
@@ -93,7 +93,7 @@ def tracked(
     )
     keys, since = [0], 0  # since: the keyframe from which on scans are matched with
     reference = _reference_of_last(scans, keys, result.poses, settings)
-    # Of the last scan, relative to the last keyframe; doubt is what is added to its covariance.
+    # Of the last scan, relative to the last keyframe; doubt is added to its covariance.
     z, cov, doubt = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
     missed, blind, last = 0, False, np.zeros(3)
     # Pose and covariance by raw odometry from before a step that lags, for the step after it.
@@ -188,7 +188,7 @@ class _Found(NamedTuple):
     residual: float
     accepted: bool
     sure: bool
-    """else it is in doubt"""
+    """otherwise it is in doubt"""
     quality: float
 
 
@@ -198,7 +198,7 @@ class _How(NamedTuple):
     gap: bool
     """it is long after the scan before"""
     unknown: bool
-    """it is no guess"""
+    """it is unusable as a guess"""
     frozen: bool
     """so are most likely those after it"""
 
@@ -250,7 +250,7 @@ def _reached(
     prior: Float[np.ndarray, "3 3"],
     reach: Float[np.ndarray, "2"],
 ) -> bool:
-    """Whether raw odometry is off by no more than the robot can have gone, and 2 σ of its own."""
+    """Whether raw odometry is off by no more than the robot's reach plus 2 σ of raw odometry."""
     off, sigma = poses.between(guess, fit.pose), np.sqrt(prior.diagonal())
     near = np.hypot(off[0], off[1]) <= reach[0] + 2 * sigma[:2].max()
     return bool(near and abs(off[2]) <= reach[1] + 2 * sigma[2])
@@ -273,7 +273,7 @@ def _reference_of_last(
 def place_unmatched(result: Odometry, scans: Scans, steps: Steps, settings: Settings) -> None:
     """Match the scans without a match with the keyframes around them, in place.
 
-    They are taken to lie in the middle of their neighbours, up to half of the way between these.
+    They are assumed midway between their neighbours, up to half the distance between these.
     The poses of the others do not change.
     """
     keys = result.keyframe
