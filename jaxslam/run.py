@@ -53,7 +53,7 @@ def run(
         pose: (3,) where the robot is before the first control.
         pose_cov: (3, 3) its covariance; zero is allowed.
         key: a PRNG key, split into two a step; a filter without randomness ignores them.
-        probe: called with the filter's own state after each update; what it returns is stacked.
+        probe: called with the filter's state after each update; its results are stacked.
     Returns:
         Trace with estimates and infos of leading axis T, and the final state.
     Raises:

@@ -1,4 +1,4 @@
-"""Systematic errors: parameters found from a filter's own innovations, and what they add.
+"""Systematic errors: parameters from a filter's innovations, and their effect on the covariance.
 
 What is added is to the covariance of a result, by the uncertainty of the parameters.
 """
@@ -57,7 +57,7 @@ def calibrate(
     with `association.Nearest` and `life.Recency(patience=…)` keeps a local map, in which landmarks
     seen close in time are associated whatever the drift, and no loop is closed.
 
-    Each measurement of a scan is whitened by its own S; the correlation between those of one joint
+    Each measurement of a scan is whitened by its S; the correlation between those of one joint
     update is ignored, which costs a little precision.
 
     Args:
@@ -68,7 +68,7 @@ def calibrate(
             of a record with `__call__` once for all its numbers.
         start: (P,), or a number.
         iterations: steps at most.
-        tolerance: done when no parameter moves by more than so many of its standard deviations.
+        tolerance: stop when no parameter moves by more than this many of its standard deviations.
     Returns:
         `Calibration`; look at `converged`.
     Raises:

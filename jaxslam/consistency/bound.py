@@ -57,14 +57,14 @@ def posterior_bound(
 
     The posterior (van Trees) bound: information is averaged over the worlds and then inverted. The
     recursion over states needs Q⁻¹, which the noise of a robot seldom has; so the bound is taken
-    over what is random, p = (ξ, ω_1 … ω_t, landmarks) with ξ, ω ~ N(0, 1), x_0 = pose + √P0 ξ and
-    x_t = f(x_{t-1}, u_t, √Q ω_t):
+    over the random variables p = (ξ, ω_1 … ω_t, landmarks) with ξ, ω ~ N(0, 1), x_0 = pose + √P0 ξ
+    and x_t = f(x_{t-1}, u_t, √Q ω_t):
 
         J_t = diag(1, …, 1, 0, …, 0) + E Σ_{s<=t} (∂h_s/∂p)ᵀ R⁻¹ (∂h_s/∂p),
         E (x̂_t - x_t)(x̂_t - x_t)ᵀ >= A J_t⁻¹ Aᵀ,     A = E ∂x_t/∂p,
 
     E over the worlds given, whose number should be large enough for an average. The landmarks are
-    the same unknowns in every run, without a prior: the bound is for estimators that do not know
+    the same unknowns in every run, without a prior: the bound holds for estimators that do not know
     the map beforehand and are unbiased in it (a hybrid bound: Rockah & Schultheiss, IEEE Trans.
     ASSP 35(3), 1987; van Trees, "Detection, Estimation, and Modulation Theory I", 1968, 2.4.3).
     Jacobians by the noise are taken at ω = 0, and Q and R are what the models state at the truth
@@ -116,8 +116,8 @@ def van_trees(
     Args:
         target_jacobians: ∂g/∂p of each draw. jacobians: ∂h/∂p.
         noise_covs: R (M, M), or (draws, M, M).
-        prior: information on p: P0⁻¹ of a normal prior, 0 of what has none. A direction that
-            nothing tells is left out, and must not matter to g.
+        prior: information on p: P0⁻¹ of a normal prior, 0 without a prior. A direction that
+            nothing determines is left out, and must not matter to g.
     """
     scaled = np.linalg.solve(noise_covs, jacobians)
     gained = (np.swapaxes(jacobians, 1, 2) @ scaled).mean(axis=0)

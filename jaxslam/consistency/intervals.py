@@ -99,7 +99,7 @@ def spread(
 def positive_interval(
     values: np.ndarray | Sequence[float], level: float = LEVEL, skewed: bool = True
 ) -> Average | None:
-    """The mean of positive numbers with the interval of `Spread`; None where there are none.
+    """The mean of positive numbers with the interval of `Spread`; None without numbers.
 
     Of a single number the interval is all that is positive, (0, ∞).
     """

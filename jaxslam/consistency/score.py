@@ -1,4 +1,4 @@
-"""The scores of runs: what each run says of a filter, the numbers a campaign adds up or keeps.
+"""The scores of runs: the numbers of each run that a campaign adds up or keeps.
 
 `run_statistics` takes sums over one run's maps and innovations, in JAX; `monte_carlo.programs`
 compiles it. `score` takes them, and the poses and infos of many runs, to the measures of each run;
@@ -29,7 +29,7 @@ from jaxslam.core.types import Estimate, Info, Status, Trace, Truth
 from jaxslam.math import linalg
 
 LAGS = 10
-"""The autocorrelation of innovations is taken up to so many steps."""
+"""Largest lag of the autocorrelation of innovations, in steps."""
 
 _UNROLLED = 4
 """Measurement slots that are looked at in one piece of compiled code."""
@@ -44,11 +44,11 @@ class Score(NamedTuple):
     finite: Bool[np.ndarray, "R"]
     """every number of the run is finite."""
     measures: dict[str, tuple[np.ndarray, np.ndarray]]
-    """each run's own averages: what is averaged, and over how much; there is none over 0."""
+    """averages of each run: the numbers, and their counts; none over 0."""
     snapshots: tuple[np.ndarray, np.ndarray, np.ndarray]
     """pose error (R, K, 3), its covariance (R, K, 3, 3), whether that is regular (R, K)."""
     sums: dict[str, np.ndarray]
-    """what is added up over runs: counts (R,), and (R, …) of measures."""
+    """sums over runs: counts (R,), and (R, …) of measures."""
 
 
 def snapshot_steps(steps: int) -> np.ndarray:
@@ -69,7 +69,7 @@ def score(
             its observability monitor (`monitor_of`), and where it has one, of `probe` the
             information of that after each step (R, T, 3, 3).
         found: `run_statistics` of each run.
-        own_error: the pose errors in the filter's own coordinates (see `own_error_of`), by default
+        own_error: the pose errors in the coordinates of the filter (see `own_error_of`), by default
             those in (x, y, θ).
     """
     pose, cov = map(np.asarray, trace.estimate[:2])
@@ -106,9 +106,9 @@ def score(
 
 class _Sums(NamedTuple):
     poison: Array
-    """() 0 times every number so far: NaN once one was not finite"""
+    """() 0 times every earlier number: NaN once one was not finite"""
     recent: list[Array]
-    """(LAGS, N) each, the latest steps first: the numbers of w, |w|² and whether there is one"""
+    """(LAGS, N) each, the latest steps first: the numbers of w, |w|² and a mask of the values"""
     pairs: list[Array]
     """(LAGS, N) each: Σ wᵀw', |w|²|there'|, |there||w'|², |there||there'|"""
 
@@ -223,7 +223,7 @@ def _planar_nees(
 def _white(estimate: Estimate, info: Info) -> list[Array]:
     """The numbers of the whitened innovation w, |w|², and 1 where there is one, else 0; (N,) each.
 
-    By landmark, of the first measurement fused with it; by measurement slot where there is no map.
+    By landmark, of the first measurement fused with it; by measurement slot without a map.
     """
     fused = info.status == Status.FUSED
 

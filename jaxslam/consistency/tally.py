@@ -1,4 +1,4 @@
-"""`condense` returns what is kept of a block of scores, and a `Tally` adds such blocks up.
+"""`condense` reduces a block of scores to its sums, and a `Tally` adds such blocks up.
 
 Called by `monte_carlo`: `block` condenses, `campaign` adds in any order and keeps the tallies, and
 `summary.summarize` takes them.

@@ -39,7 +39,7 @@ def shape_told(value: ArrayLike) -> str:
 def check_array(
     name: str, value: ArrayLike, shape: tuple[int | str, ...], kind: type = np.generic
 ) -> None:
-    """Raise ValueError unless an array has this shape, in which a letter stands for any number."""
+    """Raise ValueError unless an array has this shape, in which a letter is any number."""
     got = shape_told(value)
     shape_of = np.shape(value) if got.startswith("(") else ()
     if len(shape_of) != len(shape) or any(
@@ -77,7 +77,7 @@ def check_positive(name: str, **values: ArrayLike) -> None:
 
 
 def check_mount(name: str, mount: ArrayLike) -> None:
-    """Raise ValueError unless mount is a finite (3,); a tracer is checked for its shape alone."""
+    """Raise ValueError unless mount is a finite (3,); only the shape of a tracer is checked."""
     got = shape_told(mount if is_concrete(mount) else jnp.asarray(mount))
     if got != "(3,)":
         raise ValueError(f"{name}: expected a mounting pose of shape (3,), got {got}")
@@ -87,7 +87,7 @@ def check_mount(name: str, mount: ArrayLike) -> None:
 
 
 def held_array(values: ArrayLike) -> ArrayLike:
-    """An array as given; numbers in lists or tuples as one, in float64 whatever JAX's default."""
+    """An array unchanged; numbers in lists or tuples as an array in float64."""
     if hasattr(values, "dtype"):
         return values
     if not is_concrete(values):

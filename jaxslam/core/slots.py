@@ -64,7 +64,7 @@ def empty(
 def find(
     tag: Int[Array, "N"], alive: Bool[Array, "N"], wanted: Int[Array, "M"]
 ) -> tuple[Int[Array, "M"], Bool[Array, "M"]]:
-    """The slot (M,) of each wanted tag (M,), 0 where none, and whether there is one (M,)."""
+    """The slot (M,) of each wanted tag (M,), 0 without one, and a mask of the slots found (M,)."""
     return where_set((wanted[:, None] == tag[None, :]) & alive[None, :])
 
 
@@ -82,8 +82,8 @@ def allocate(
 
 
 def where_set(match: Bool[Array, "M N"]) -> tuple[Int[Array, "M"], Bool[Array, "M"]]:
-    """The last column in which each row (M, N) bool is set, 0 where none, (M,) int32; and whether
-    there is one (M,). One pass, instead of two by `argmax` and `any`.
+    """The last column (M,) int32 in which each row (M, N) bool is set, 0 without one, and a mask of
+    the rows with one (M,). One pass, instead of two by `argmax` and `any`.
     """
     # Over the leading axis XLA takes maxima of whole rows.
     at = jnp.where(match.T, jnp.arange(match.shape[1], dtype=jnp.int32)[:, None], -1)
@@ -192,7 +192,7 @@ def _add_blocks(cov: Float[Array, "D D"], blocks: Float[Array, "N L L"]) -> Floa
 def remove(joint: Joint, dead: Array, *, square_root: bool = False) -> Joint:
     """The joint with the landmarks of the slots dead (N,) bool marginalized out and the slots free.
 
-    In covariance form the marginal is what is left when rows and columns are dropped (Solà Table 1,
+    In covariance form the marginal is P without the rows and columns (Solà Table 1,
     state reduction); here they are overwritten with padding. Removing a dead slot changes nothing.
     square_root: the state holds a root of P, as of a filter with covariance="square_root".
 

@@ -1,7 +1,7 @@
 """Jacobians at the current estimate, and at other linearization points: the standard EKF.
 
 They are taken by forward-mode automatic differentiation. The hand-derived Jacobians of models are
-for verification; filters do not use them, so a user's own model needs none.
+for verification; filters do not use them, so a user's model needs none.
 """
 
 import jax

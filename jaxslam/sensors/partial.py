@@ -1,4 +1,4 @@
-"""Sensors of one polar coordinate of a point landmark: bearing or range alone.
+"""Sensors of one polar coordinate of a point landmark: bearing only or range only.
 
 The other one is unmeasured, with a prior: Solà's s ~ N(s̄, S).
 """
@@ -48,7 +48,7 @@ def free_parameters(name: str, free: FreeLike, size: int) -> Free:
 
 
 def _held(values: ArrayLike) -> JaxOrNumPy:
-    """The array on the host in float64, whatever the default width of JAX."""
+    """The array on the host in float64, for any default width of JAX."""
     if not is_concrete(values):
         return jnp.asarray(values)
     array = np.asarray(values)

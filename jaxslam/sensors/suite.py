@@ -1,4 +1,4 @@
-"""Several sensors on one robot, each with its own model, mount, rate and measurement slots.
+"""Several sensors on one robot, each with a model, mount, rate and measurement slots.
 
 And the base class of sensors that change some methods of another.
 """
@@ -67,9 +67,9 @@ class Part:
     places: int = static()
     """its measurement slots in a scan; 1 of an absolute sensor"""
     every: int = static(default=1)
-    """in a simulation it measures every so many steps,"""
+    """interval of its measurements in a simulation, in steps,"""
     start: int = static(default=0)
-    """beginning with this one; a filter uses `Scan.valid` alone"""
+    """and first step; a filter uses only `Scan.valid`"""
     visible: Callable[[Array, Array], Array] | None = None
     """(pose, l) -> (): its field of view in a simulation; None for that of the scenario"""
     sees: Literal["landmarks", "robots"] = static(default="landmarks")

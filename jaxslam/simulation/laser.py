@@ -1,4 +1,4 @@
-"""A laser scanner in a world of exact walls, and what its scan can say of the pose."""
+"""A laser scanner in a world of exact walls, and the information of its scan on the pose."""
 
 from functools import partial
 from typing import NamedTuple
@@ -104,7 +104,7 @@ def scan(laser: Laser, walls: Walls, pose: Float[Array, "3"], key: Array) -> Bea
     """A random scan: exact ranges with N(0, σ²) on those below max_range, less the dropouts.
 
     A noisy range lies within [0, max_range]. Where walls are of glass, each beam passes each such
-    segment with the probability that `Walls.glass` says, and meets what is behind it.
+    segment with the probability in `Walls.glass`, and meets the wall behind it.
     """
     if walls.glass is None:
         key_noise, key_drop = jax.random.split(key)
@@ -149,7 +149,7 @@ def _scan_world(world: LaserWorld, key: Array) -> LaserHistory:
 
 
 class Observability(NamedTuple):
-    """What one scan can say of the pose (x, y, θ)."""
+    """The information of one scan on the pose (x, y, θ)."""
 
     information: Float[np.ndarray, "3 3"]
     """J, Fisher's information in units of 1/m², 1/m and 1/rad²"""

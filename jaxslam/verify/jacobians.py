@@ -1,4 +1,4 @@
-"""The Jacobians of a function computed in four ways: forward, reverse, by hand, by differences."""
+"""The Jacobians of a function by four methods: forward, reverse, by hand, by differences."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -120,7 +120,7 @@ class _Evaluator:
         return True
 
     def _outputs(self) -> tuple[str, ...] | None:
-        """The names of the outputs; None, with a failed check, if they are no vector."""
+        """The names of the outputs; None, with a failed check, if they are not a vector."""
         name, named = self.function.name, self.function.outputs
         first = [jnp.asarray(a[0]) for a in self.arguments]
         call = self.function.call

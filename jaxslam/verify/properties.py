@@ -1,4 +1,4 @@
-"""Checks beside Jacobians: round trips, residuals, noise, purity, finite values, dtypes."""
+"""Checks other than Jacobians: round trips, residuals, noise, purity, finite values, dtypes."""
 
 from collections.abc import Callable, Iterator
 from typing import TypeAlias

@@ -1,4 +1,4 @@
-"""Checks of what a campaign is given to run, and how many runs fit a device."""
+"""Checks of the filters of a campaign, and the number of runs that fit a device."""
 
 import inspect
 from collections.abc import Callable, Mapping
@@ -72,11 +72,11 @@ def rounded(tree: _T, dtype: DTypeLike | None) -> _T:
 
 
 def check_noise(scenario: World) -> None:
-    """Raise ValueError where a model of the scenario states a noise that is no covariance.
+    """Raise ValueError if the noise of a model of the scenario is not a covariance.
 
     A `noise_cov` that is a function can only be looked at where it is called. That of the motion is
     called for the start and the first control, that of a sensor, or of each part of a suite, for
-    z = 0 and, where it is no covariance there, for the first landmark as seen from the start.
+    z = 0 and, if it is not a covariance there, for the first landmark as measured from the start.
     """
     if not is_concrete(scenario.controls, scenario.pose, scenario.landmarks):
         return
@@ -92,7 +92,7 @@ def check_noise(scenario: World) -> None:
 
 
 def without_noise(scenario: World) -> str:
-    """In words, what the scenario's sensors measure without noise; "" where there is none.
+    """The names of the scenario's measurements without noise; "" without such a measurement.
 
     Looked at where `check_noise` looks; a noise that grows from 0 with z is one.
     """
@@ -110,7 +110,7 @@ def without_noise(scenario: World) -> str:
 
 
 def _exact(sensor: Sensor, cov: np.ndarray) -> str:
-    """The measurements of variance 0; a combination of them where it is none of them alone."""
+    """The measurements of variance 0; a combination of them if no single one has variance 0."""
     sigma = np.sqrt(np.diagonal(cov))
     if (sigma == 0).any():
         return ", ".join(n for n, one in zip(sensor.measurements, sigma, strict=True) if one == 0)
@@ -154,7 +154,7 @@ def _check_stated(name: str, size: int, model: Motion | Sensor, *at: PyTree) -> 
 
 
 def check_fits(name: str, candidate: Candidate, scenario: World) -> None:
-    """Raise ValueError unless a candidate takes what the scenario's log has."""
+    """Raise ValueError unless a candidate fits the scenario's log."""
     if isinstance(candidate, LogEstimator):
         return
     if isinstance(candidate, type):
@@ -209,7 +209,7 @@ def check_called(name: str, candidate: Callable[..., object]) -> None:
 
 
 def method_of(candidate: Candidate, truth: Truth) -> Filter | Estimator:
-    """A filter or an estimator: a candidate, or what it makes of the truth.
+    """A filter or an estimator: a candidate, or its result for the truth.
 
     Raises ValueError where it fails on the truth, as a function of the world.
     """

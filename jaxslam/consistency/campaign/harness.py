@@ -1,8 +1,8 @@
 """The campaign: blocks of runs over devices, kept as they finish, then summed up.
 
 A run is a number: its key and its place in a block. For one size of blocks and one number of
-devices its world and its filters' results are the same to the bit, whatever workers and parts there
-are and whatever was interrupted; otherwise to rounding. Only scores are kept of a block, so
+devices its world and its filters' results are the same to the bit, for any workers, parts and
+interruptions; otherwise to rounding. Only scores are kept of a block, so
 memory is that of the blocks in flight however many runs there are.
 """
 
@@ -71,19 +71,19 @@ def monte_carlo(
             holds one campaign: what must agree (key, scenario, models, filters, precision,
             versions) is its `identity`. More runs than it has extend it.
         part: (i, n) with 1 <= i <= n: only the blocks i - 1, i - 1 + n, … are computed, and the
-            campaign returned is of them. So n jobs that know nothing of each other compute a
+            returned campaign covers them. So n independent jobs compute a
             campaign, each with a `keep` from `store.join` on one folder, with the same block and
             number of devices; without `part` the blocks are summed up, and those that are missing
             computed.
         progress: called with (runs done, runs) after each block. Default a bar with
-            rate and remaining time, on a terminal and in a notebook alone; False: none.
+            rate and remaining time, only on a terminal and in a notebook; False: none.
     Returns:
         Campaign.
     Raises:
         ValueError: on runs, block or workers below 1, more runs than are recorded, no PRNG key, no
             devices, no filters, a filter that does not fit the scenario, or a noise that is no
             covariance, before anything is traced; where `keep` holds another campaign, by every
-            difference, or runs beyond those asked for; on a part without a block.
+            difference, or runs beyond the requested ones; on a part without a block.
         MemoryError: if one run a device is too much.
         Interrupted: on Ctrl-C, with the campaign so far.
     """

@@ -26,7 +26,7 @@ def add_kept(
 ) -> list[tuple[int, int]]:
     """Add the blocks kept whose first run is wanted; (first, runs) of all of them.
 
-    Raises ValueError where there are runs beyond those asked for.
+    Raises ValueError on stored runs beyond the requested ones.
     """
     finished: list[tuple[int, int]] = []
     most = 0

@@ -34,7 +34,7 @@ def check_part(name: str, part: object) -> None:
 def in_part(first: int, block: int, part: tuple[int, int] | None) -> bool:
     """Whether the block of run `first` is one of part (i, n): blocks i - 1, i - 1 + n, … from 0 on.
 
-    So the parts of a campaign depend neither on what is done nor on how many runs it has.
+    So the parts of a campaign depend neither on finished runs nor on the number of runs.
     """
     return part is None or first // block % part[1] == part[0] - 1
 

@@ -55,7 +55,7 @@ class FilterResults(NamedTuple):
     info: Info
     """(T, B, …)"""
     own_error: Float[Array, "T B 3"]
-    """the pose error in the filter's own coordinates"""
+    """the pose error in the coordinates of the filter"""
     monitor: Monitor | None
     """(B, …) its observability monitor at the end, where it has one"""
     information: Float[Array, "T B 3 3"] | None

@@ -1,4 +1,4 @@
-"""A progress bar, drawn on a terminal or in a notebook, and nowhere else."""
+"""A progress bar, drawn only on a terminal or in a notebook."""
 
 import os
 import sys
@@ -55,7 +55,7 @@ class Progress:
         self._draw("")
 
     def _draw(self, line: str) -> None:
-        """Show a line in place of the last one."""
+        """Replace the last line."""
         if self._terminal:
             print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
         elif self._cell is not None:

@@ -68,7 +68,7 @@ class Work:
         total = sum(count for _, count in todo)
         flight: dict[Future[dict[str, dict[str, np.ndarray]]], tuple[int, int]] = {}
         stop: BaseException | None = None
-        # XLA uses the cores; threads of the BLAS below its LAPACK would only spin beside it.
+        # XLA uses the cores; additional threads of the BLAS below its LAPACK would only spin.
         with threadpool_limits(1, "blas"), ThreadPoolExecutor(self.workers) as pool:
             while flight or (queue and stop is None):
                 try:
@@ -89,7 +89,7 @@ class Work:
                 except BaseException as error:
                     if stop is not None:
                         raise
-                    stop = error  # what is at work is finished, and kept
+                    stop = error  # blocks in flight are finished and kept
                     for future in flight:
                         future.cancel()
         self.run_seconds = runner.run_seconds()
@@ -100,7 +100,7 @@ class Work:
 
 @contextlib.contextmanager
 def shown_progress(work: Work, plan: CampaignPlan, wanted: bool) -> Iterator[None]:
-    """A block in which, if wanted, a bar of progress tells of the work where it can be seen."""
+    """A context with an optional progress bar on a terminal or in a notebook."""
     count = len(plan.filters)
     bar = Progress(f"{plan.scenario.name}, {count} filter{'s' * (count > 1)}") if wanted else None
     if bar is None or not bar.shown:

@@ -1,5 +1,5 @@
 """NEES: eᵀ P⁻¹ e of a pose and of its blocks, e = truth - estimate, in (x, y, θ) and in the
-filter's own error coordinates; on the host, by NumPy in float64. And of landmarks.
+error coordinates of the filter, and of landmarks; on the host, by NumPy in float64.
 """
 
 from collections.abc import Mapping
@@ -17,10 +17,10 @@ from jaxslam.core.types import Trace, Truth
 from jaxslam.math.stats import chi2_quantiles
 
 DOF = {"pose": 3, "position": 2, "heading": 1}
-"""Blocks of the pose error whose NEES is taken, and the mean of an honest one."""
+"""Blocks of the pose error with a NEES, and its honest mean."""
 
 _ROUNDING = 32
-"""A claimed deviation of at most so many ulp of its coordinate is taken for zero."""
+"""Largest claimed deviation, in ulp of its coordinate, that counts as zero."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +97,7 @@ def block_nees(
     chart_error: Float[np.ndarray, "*steps 3"],
     cov: Float[np.ndarray, "*steps 3 3"],
 ) -> dict[str, Nees]:
-    """The NEES of each block of `DOF`, and of the error in the filter's own coordinates ("own").
+    """The NEES of each block of `DOF`, and of the error in the coordinates of the filter ("own").
 
     There is none where the claimed covariance is singular, i.e. some direction is known exactly:
     1/tr P⁻¹, at most its least eigenvalue and at least a third of it, is at most 100 n·eps where P

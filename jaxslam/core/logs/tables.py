@@ -72,13 +72,13 @@ class Aligned(NamedTuple, Generic[_Name]):
 
 
 def split_unit(name: str) -> tuple[str, str | None]:
-    """Name and unit of a column, ("v", "m/s") of "v [m/s]"; None where there is no unit."""
+    """Name and unit of a column, ("v", "m/s") of "v [m/s]"; None without a unit."""
     bare, bracket, unit = name.strip().partition("[")
     return bare.strip(), unit.rstrip("] ").strip() if bracket else None
 
 
 def unit_divisor(unit: str | None, wanted: str) -> float | None:
-    """The divisor that brings a column in a unit to the wanted unit; None where there is none."""
+    """The divisor that converts a column to the wanted unit; None if the units do not fit."""
     target = split_unit(wanted)[1] or ""
     if unit is None or unit == target:
         return 1.0
@@ -86,14 +86,14 @@ def unit_divisor(unit: str | None, wanted: str) -> float | None:
 
 
 def odometry_columns(controls: tuple[str, ...], given: Sequence[str]) -> tuple[str, ...]:
-    """The columns beside the time from which a model's controls come, out of those given."""
+    """The columns for a model's controls, without the time, among the given ones."""
     measured = tuple(name for name in controls if name != INTERVAL)
     poses = {split_unit(name)[0] for name in POSE} <= {split_unit(name)[0] for name in given}
     return POSE if poses and measured == _INCREMENT else measured
 
 
 def measurement_columns(measured: tuple[str, ...], landmark: tuple[str, ...]) -> tuple[str, ...]:
-    """The columns of measurements: with a tag, unless the sensor's are of no landmark."""
+    """The columns of measurements: with a tag, unless the sensor has no landmark."""
     return (TIME, *((TAG,) if landmark else ()), *measured)
 
 
@@ -103,13 +103,13 @@ def align_tables(
     controls: tuple[str, ...],
     names: Sequence[_Name] = (),
 ) -> Aligned[_Name]:
-    """The rows of odometry and of sensors with rates of their own (Solà 2.4): a row at every time
+    """The rows of odometry and of sensors with different rates (Solà 2.4): a row at every time
     of odometry, and of measurements within it.
 
     Velocities (controls with an interval) hold until the next line; poses are interpolated; other
-    controls stand as they are, and measurements must then be at their times. Measurements before
+    controls are unchanged, and measurements must then be at their times. Measurements before
     the first or after the last odometry are dropped and counted; the last velocity holds as long as
-    the longest interval between lines. In a scan the slots of the sensors stand in their order.
+    the longest interval between lines. A scan has the slots of the sensors in their order.
 
     Args:
         controls: the names of the motion model, with units.
@@ -287,7 +287,7 @@ def _names(given: Tabular) -> tuple[str, ...] | None:
 def _numbers(
     at: Callable[[int, str], str], name: str, column: Sequence[object]
 ) -> Float[np.ndarray, "K"]:
-    """The column as float64 (K,); raises ValueError on anything else than finite numbers."""
+    """The column as float64 (K,); raises ValueError on anything but finite numbers."""
     for row, value in enumerate(column):
         if (
             not isinstance(value, int | float | np.integer | np.floating)

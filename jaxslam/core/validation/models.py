@@ -1,4 +1,4 @@
-"""Checks of models before tracing, and of what a user's filter returns, during it.
+"""Checks of models before tracing, and of the results of a user's filter, during it.
 
 Types of records, arguments of functions, sizes of results. Each error is one line that states what
 was expected.
@@ -57,7 +57,7 @@ def check_models(name: str, motion: object, sensor: object) -> None:
     """Raise ValueError, which begins with a caller's name, unless these are a Motion and a Sensor.
 
     Their functions are evaluated on shapes alone (`jax.eval_shape`): they must take the arguments
-    that `protocols` says and return arrays of the sizes that their names say.
+    of `protocols` and return arrays of the sizes of their names.
     """
     if isinstance(motion, Sensor) and isinstance(sensor, Motion):
         raise ValueError(

@@ -1,4 +1,4 @@
-"""The Cholesky factor of a small matrix, unrolled, and what is solved with it; other square roots.
+"""The Cholesky factor of a small matrix, unrolled, its solutions, and other square roots.
 
 A landmark update factors a 2×2 to 6×6 matrix, millions of times, under `vmap`. The library call
 behind `jnp.linalg.cholesky` costs more there than the arithmetic, and hides a non-positive pivot

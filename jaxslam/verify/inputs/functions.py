@@ -37,7 +37,7 @@ def as_claim(claim: PyTree) -> PyTree:
 def split_claim(
     claim: PyTree, rows: int, names: Sequence[str], sizes: Sequence[int]
 ) -> list[PyTree]:
-    """A claimed Jacobian split by argument, None where there is no claim.
+    """A claimed Jacobian split by argument, None without a claim.
 
     Args:
         claim: as from `as_claim`: arrays, or their shapes, with any number of leading axes.
@@ -132,7 +132,7 @@ def motion_functions(motion: Motion) -> tuple[Function]:
 
 
 def told_signatures(model: Motion | Sensor) -> Motion | Sensor:
-    """The model, with methods that cannot take their arguments replaced by ones that say so."""
+    """The model, with methods of a wrong signature replaced by methods that raise its error."""
     names = (
         {"step": "pose, u, w"}
         if isinstance(model, Motion)

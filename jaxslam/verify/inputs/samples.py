@@ -15,7 +15,7 @@ Values: TypeAlias = Float[np.ndarray, "_ _"]
 """States (S, n) of one argument."""
 
 FAR = 1e5
-"""Distance from the origin, as of survey coordinates [m]."""
+"""Distance from the origin of survey coordinates [m]."""
 _OUT_OF_SIGHT = 16.0
 """Distance from the robot to a far landmark, along each axis [m]."""
 _NEAR = 2.0**-10
