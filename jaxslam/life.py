@@ -59,8 +59,8 @@ class Recency(Life):
         known: Times = joint.life
         now = known.now + 1
         count = len(joint.alive)
-        born = slots.concerned(info.slot, info.status == Status.BORN, count)
-        hit = born | slots.concerned(info.slot, info.status == Status.FUSED, count)
+        born = slots.slot_mask(info.slot, info.status == Status.BORN, count)
+        hit = born | slots.slot_mask(info.slot, info.status == Status.FUSED, count)
         zero = jnp.zeros_like(known.last)
         memory = Times(
             now,
@@ -157,8 +157,8 @@ class Existence(Life):
         self, joint: Joint, info: Info, estimate: Callable[[], Estimate]
     ) -> tuple[Evidence, Bool[Array, "N"]]:
         count = len(joint.alive)
-        born = slots.concerned(info.slot, info.status == Status.BORN, count)
-        hit = born | slots.concerned(info.slot, info.status == Status.FUSED, count)
+        born = slots.slot_mask(info.slot, info.status == Status.BORN, count)
+        hit = born | slots.slot_mask(info.slot, info.status == Status.FUSED, count)
         known: Evidence = joint.life
         old = jax.tree.map(lambda x: jnp.where(born | ~joint.alive, jnp.zeros_like(x), x), known)
         view = jax.vmap(self.visible, (None, 0))(joint.pose, joint.landmarks)

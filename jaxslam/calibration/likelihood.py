@@ -181,7 +181,9 @@ def fit_noise(
         ValueError: on parameters that are not finite, or deviations not above 0; where a run fuses
             nothing or its likelihood is not finite; where other measurements are fused at other p.
     """
-    first, begin, logged, labels = _checked(start, guess, names, deviation, iterations, tolerance)
+    first, begin, logged, labels = _check_start(
+        start, guess, names, deviation, iterations, tolerance
+    )
 
     of_run = as_record(info)
 
@@ -294,7 +296,7 @@ def _coordinates(p: np.ndarray, logged: np.ndarray) -> np.ndarray:
     return np.where(logged, np.log(np.where(logged, p, 1.0)), p)
 
 
-def _checked(
+def _check_start(
     start: ArrayLike,
     guess: ArrayLike | None,
     names: Sequence[str] | None,

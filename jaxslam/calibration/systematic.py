@@ -195,7 +195,7 @@ def consider_cov(
         )
     c = _covariance(cov, p.size)
 
-    found = jax.device_get(_differentiated(as_record(result), p))
+    found = jax.device_get(_differentiate(as_record(result), p))
     jacobian, value = (np.asarray(each, np.float64) for each in found)
     if not (np.isfinite(jacobian).all() and np.isfinite(value).all()):
         raise ValueError(f"consider_cov: the result or its derivatives at {p} are not finite")
@@ -203,7 +203,7 @@ def consider_cov(
 
 
 @partial(jax.jit, inline=True)
-def _differentiated(
+def _differentiate(
     result: Callable[[Float[Array, "P"]], Float[Array, "*shape n"]], p: Float[Array, "P"]
 ) -> tuple[Float[Array, "*shape n P"], Float[Array, "*shape n"]]:
     """The derivative of a result, and the result."""

@@ -100,7 +100,7 @@ def posterior_bound(
         information = information + np.stack([gained for _, gained in rows]) / count
     random = 3 + total * runs.by_noise.shape[3]
     prior = np.diag((np.arange(information.shape[1]) < random).astype(float))
-    return at, np.stack([_inverted(a, prior + j) for a, j in zip(by_p, information, strict=True)])
+    return at, np.stack([_invert(a, prior + j) for a, j in zip(by_p, information, strict=True)])
 
 
 def van_trees(
@@ -121,7 +121,7 @@ def van_trees(
     """
     scaled = np.linalg.solve(noise_covs, jacobians)
     gained = (np.swapaxes(jacobians, 1, 2) @ scaled).mean(axis=0)
-    return _inverted(np.mean(target_jacobians, axis=0), prior + gained)
+    return _invert(np.mean(target_jacobians, axis=0), prior + gained)
 
 
 class SensorJacobians(NamedTuple):
@@ -242,7 +242,7 @@ def _by_parameters(
     by_p[:, :3] = start
     information = np.zeros((by_p.shape[1],) * 2)
     kept = {}
-    white = [_whitened(sensor) for sensor in run.sensors]
+    white = [_whiten(sensor) for sensor in run.sensors]
     for t in range(steps):
         by_p = np.asarray(run.by_pose[t]) @ by_p
         by_p[:, 3 + t * width : 3 + (t + 1) * width] = run.by_noise[t]
@@ -258,7 +258,7 @@ def _by_parameters(
     return iter([kept[t] for t in at])
 
 
-def _whitened(sensor: SensorJacobians) -> list[np.ndarray]:
+def _whiten(sensor: SensorJacobians) -> list[np.ndarray]:
     """The whitened Jacobians R^{-1/2} H by pose and landmark; zero where nothing was measured."""
     valid = sensor.valid[:, :, None, None]
     noise = np.where(valid, sensor.noise_cov, np.eye(sensor.noise_cov.shape[2]))
@@ -271,7 +271,7 @@ def _whitened(sensor: SensorJacobians) -> list[np.ndarray]:
     return [np.where(valid, np.linalg.solve(factor, by), 0.0) for by in sensor[:2]]
 
 
-def _inverted(
+def _invert(
     jacobian: Float[np.ndarray, "K P"], information: Float[np.ndarray, "P P"]
 ) -> Float[np.ndarray, "K K"]:
     """A J⁺ Aᵀ, J scaled to a unit diagonal, a direction of no information left out."""

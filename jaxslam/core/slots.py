@@ -65,7 +65,7 @@ def find(
     tag: Int[Array, "N"], alive: Bool[Array, "N"], wanted: Int[Array, "M"]
 ) -> tuple[Int[Array, "M"], Bool[Array, "M"]]:
     """The slot (M,) of each wanted tag (M,), 0 without one, and a mask of the slots found (M,)."""
-    return where_set((wanted[:, None] == tag[None, :]) & alive[None, :])
+    return last_true_column((wanted[:, None] == tag[None, :]) & alive[None, :])
 
 
 def allocate(
@@ -78,10 +78,10 @@ def allocate(
     free = ~alive
     rank_of_slot = jnp.where(free, jnp.cumsum(free), 0)
     rank_of_wish = jnp.where(wanted, jnp.cumsum(wanted), -1)
-    return where_set(rank_of_wish[:, None] == rank_of_slot[None, :])
+    return last_true_column(rank_of_wish[:, None] == rank_of_slot[None, :])
 
 
-def where_set(match: Bool[Array, "M N"]) -> tuple[Int[Array, "M"], Bool[Array, "M"]]:
+def last_true_column(match: Bool[Array, "M N"]) -> tuple[Int[Array, "M"], Bool[Array, "M"]]:
     """The last column (M,) int32 in which each row (M, N) bool is set, 0 without one, and a mask of
     the rows with one (M,). One pass, instead of two by `argmax` and `any`.
     """
@@ -91,7 +91,7 @@ def where_set(match: Bool[Array, "M N"]) -> tuple[Int[Array, "M"], Bool[Array, "
     return jnp.maximum(at, 0), at >= 0
 
 
-def concerned(slot: Int[Array, "M"], on: Bool[Array, "M"], count: int) -> Bool[Array, "N"]:
+def slot_mask(slot: Int[Array, "M"], on: Bool[Array, "M"], count: int) -> Bool[Array, "N"]:
     """Mask (count,) of the slots that occur in slot (M,) where on (M,)."""
     return jnp.zeros(count, bool).at[jnp.where(on, slot, count)].set(True, mode="drop")
 
@@ -151,7 +151,9 @@ def scatter(
     if m == 0:
         return joint
     # By slot: the index it is filled from. Whole passes over P are cheaper than scattered writes.
-    place, born = where_set(granted[None, :] & (slot[None, :] == jnp.arange(capacity)[:, None]))
+    place, born = last_true_column(
+        granted[None, :] & (slot[None, :] == jnp.arange(capacity)[:, None])
+    )
 
     def of_slots(values: jax.Array) -> jax.Array:
         mask = born.reshape(-1, *(1,) * (values.ndim - 1))

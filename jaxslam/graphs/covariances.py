@@ -80,7 +80,7 @@ def marginals(
         )
     model = model_of(caller, solution.graph, factors)
     check_graph(caller, solution.graph, model.factors)
-    graph = _weighted(solution)
+    graph = _weighted_tables(solution)
     wanted = checked_pairs(caller, pairs, len(graph.poses) + len(graph.points))
     if plan is None and is_concrete(graph):
         more = padded_graph(graph, room)
@@ -100,7 +100,7 @@ def marginals(
     return found
 
 
-def _weighted(solution: Solution) -> Graph:
+def _weighted_tables(solution: Solution) -> Graph:
     """The graph of a solution, each information multiplied by the weight of its row."""
     array = np.asarray if is_concrete(solution) else jnp.asarray  # no program for each shape
     tables = {
@@ -114,10 +114,10 @@ def _weighted(solution: Solution) -> Graph:
 
 @partial(jax.jit, inline=True)
 def _marginals(model: Model, graph: Graph, plan: Plan) -> Marginals:
-    return over_batch("graphs.marginals", _inverted)((model, plan), graph_in_one_dtype(graph))
+    return over_batch("graphs.marginals", _invert)((model, plan), graph_in_one_dtype(graph))
 
 
-def _inverted(model: Model, plan: Plan, graph: Graph) -> Marginals:
+def _invert(model: Model, plan: Plan, graph: Graph) -> Marginals:
     """Of graphs with a last axis B."""
     assert plan.inverse is not None
     data, variables = data_of(graph, plan.column), variables_of(graph)
@@ -125,7 +125,7 @@ def _inverted(model: Model, plan: Plan, graph: Graph) -> Marginals:
     factored = factorize(plan.cholesky, system.blocks)
     blocks = selected_inverse(plan.inverse, factored)
     diagonal = blocks[plan.inverse.diagonal[plan.column]]  # by variable
-    diagonal = _masked(diagonal, *[data.free[plan.column]] * 2)
+    diagonal = _mask(diagonal, *[data.free[plan.column]] * 2)
     poses, size = len(graph.poses), graph.points.shape[1]
     width = data.free.shape[1]
     turn = _turns(graph, width)
@@ -134,7 +134,7 @@ def _inverted(model: Model, plan: Plan, graph: Graph) -> Marginals:
     cross = blocks[plan.inverse.pairs]
     turned = plan.inverse.turned[:, None, None, None]
     cross = jnp.where(turned, jnp.swapaxes(cross, 1, 2), cross)
-    cross = _masked(cross, data.free[plan.column[first]], data.free[plan.column[second]])
+    cross = _mask(cross, data.free[plan.column[first]], data.free[plan.column[second]])
     cross = by_transposed(by(turn[first], cross), turn[second])
     joint = jnp.stack(
         [
@@ -153,7 +153,7 @@ def _inverted(model: Model, plan: Plan, graph: Graph) -> Marginals:
     )
 
 
-def _masked(
+def _mask(
     blocks: Float[Array, "k d d B"], rows: Bool[Array, "k d B"], columns: Bool[Array, "k d B"]
 ) -> Float[Array, "k d d B"]:
     return jnp.where(rows[:, :, None] & columns[:, None], blocks, 0.0)

@@ -205,7 +205,7 @@ def _graph_of(
     q, q_regular = jax.vmap(_information)(of_motion)
     r, r_regular = jax.vmap(jax.vmap(_information))(of_sensor)
     p, p_regular = _information(turned.T @ pose_cov.astype(kind) @ turned)
-    points, seen = _placed(sensor, path[1:], z, index, valid, ids.shape[0])
+    points, seen = _place_poses(sensor, path[1:], z, index, valid, ids.shape[0])
 
     count = jnp.arange(path.shape[0], dtype=jnp.int32)
     rows = jnp.repeat(count[1:], valid.shape[1])
@@ -256,7 +256,7 @@ def _information(cov: Float[Array, "R R"]) -> tuple[Float[Array, "R R"], Bool[Ar
     return linalg.symmetrize(inverse), regular
 
 
-def _placed(
+def _place_poses(
     sensor: Sensor,
     path: Float[Array, "T 3"],
     z: Float[Array, "T M Z"],

@@ -216,7 +216,7 @@ def certificate(
     return proved
 
 
-def _held(model: Model, plan: Plan, graph: Graph) -> Bool[Array, "N *B"]:
+def _hold(model: Model, plan: Plan, graph: Graph) -> Bool[Array, "N *B"]:
     """The poses that are fixed or have a prior."""
     held = jnp.asarray(graph.fixed_pose)
     for name, factor in model.factors.items():
@@ -227,13 +227,13 @@ def _held(model: Model, plan: Plan, graph: Graph) -> Bool[Array, "N *B"]:
 
 @partial(jax.jit, inline=True)
 def _certificate(model: Model, graph: Graph, plan: Plan) -> Certificate:
-    return over_batch("graphs.certificate", _proved)((model, plan), graph_in_one_dtype(graph))
+    return over_batch("graphs.certificate", _prove)((model, plan), graph_in_one_dtype(graph))
 
 
-def _proved(model: Model, plan: Plan, graph: Graph) -> Certificate:
+def _prove(model: Model, plan: Plan, graph: Graph) -> Certificate:
     """Of graphs with a last axis B."""
     poses, dtype = len(graph.poses), graph.poses.dtype
-    held = _held(model, plan, graph)
+    held = _hold(model, plan, graph)
     tables = {}
     for name, factor in model.factors.items():
         table = graph.tables[name]

@@ -49,7 +49,7 @@ def squared_residuals(
     degrees of freedom. factors, room: as for `optimize`.
     """
     factors = factors_of("graphs.squared_residuals", graph, factors)
-    found = _squared(factors, padded_graph(graph, room) if is_concrete(graph) else graph)
+    found = _squared_of(factors, padded_graph(graph, room) if is_concrete(graph) else graph)
     return {key: cut(square, graph.tables[key].valid) for key, square in found.items()}
 
 
@@ -64,7 +64,7 @@ def degrees_of_freedom(graph: Graph, factors: Mapping[str, Factor] | None = None
 
 
 @partial(jax.jit, inline=True)
-def _squared(factors: dict[str, Factor], graph: Graph) -> dict[str, Float[Array, "E"]]:
+def _squared_of(factors: dict[str, Factor], graph: Graph) -> dict[str, Float[Array, "E"]]:
     found = {}
     for key, factor in factors.items():
         table = graph.tables[key]

@@ -208,13 +208,13 @@ def segments(
     pieces = [
         piece
         for run in _runs(angle, distance, sigma)
-        for piece in _divided(run, angle, distance, noise)
+        for piece in _divide(run, angle, distance, noise)
         if len(piece) >= 3
     ]
-    pieces = _merged(pieces, angle, distance, noise, trim)
+    pieces = _merge(pieces, angle, distance, noise, trim)
     # Without the short ones between them, pieces of one wall may be neighbours.
     long = [piece for piece in pieces if len(piece) >= least]
-    pieces = _merged(long, angle, distance, noise, trim)
+    pieces = _merge(long, angle, distance, noise, trim)
     misfit = [line_of(piece)[2] for piece in pieces]
     more = chi2_quantile(probability, 1)
 
@@ -275,7 +275,7 @@ def _runs(angle: np.ndarray, distance: np.ndarray, sigma: float) -> list[Int[np.
     return np.split(order, np.flatnonzero(breaks[order])[:-1] + 1)
 
 
-def _divided(
+def _divide(
     run: Int[np.ndarray, "n"], angle: np.ndarray, distance: np.ndarray, noise: tuple[float, float]
 ) -> list[Int[np.ndarray, "n"]]:
     """The straight pieces of a run: divided at the point furthest from the chord, in σ."""
@@ -296,12 +296,12 @@ def _divided(
         return [run]
     before, behind = run[: at + 1], run[at:]
     return [
-        *_divided(before, angle, distance, noise),
-        *_divided(behind[1:], angle, distance, noise),
+        *_divide(before, angle, distance, noise),
+        *_divide(behind[1:], angle, distance, noise),
     ]
 
 
-def _merged(
+def _merge(
     pieces: list[Int[np.ndarray, "n"]],
     angle: np.ndarray,
     distance: np.ndarray,

@@ -49,11 +49,11 @@ class Substeps(Motion):
 
     @property
     def controls(self) -> tuple[str, ...]:  # type: ignore[override]
-        return _numbered(self.motion.controls, self.count)
+        return _number_names(self.motion.controls, self.count)
 
     @property
     def noises(self) -> tuple[str, ...]:  # type: ignore[override]
-        return _numbered(self.motion.noises, self.count)
+        return _number_names(self.motion.noises, self.count)
 
     def step(self, pose: Pose, u: Control, w: ProcessNoise) -> Pose:
         def one(pose: Pose, row: _Rows) -> tuple[Array, None]:
@@ -101,7 +101,7 @@ class Substeps(Motion):
         return by_pose, jnp.concatenate(by_u, axis=1), jnp.concatenate(by_w, axis=1)
 
 
-def _numbered(names: tuple[str, ...], count: int) -> tuple[str, ...]:
+def _number_names(names: tuple[str, ...], count: int) -> tuple[str, ...]:
     """Numbered names: ("v [m/s]",) twice is ("v 1 [m/s]", "v 2 [m/s]"), units last for `verify`."""
     parts = [name.partition(" [") for name in names]
     return tuple(f"{a} {k + 1}{space}{unit}" for k in range(count) for a, space, unit in parts)

@@ -81,7 +81,7 @@ def spoil(
         z=jnp.concatenate(
             [jnp.where(valid[:, None], z, 0.0), jnp.where(occurs[:, None], false[m:], 0.0)]
         ),
-        tag=jnp.concatenate([jnp.where(valid, _permuted(scan.tag, mislabelled), -1), no_tag]),
+        tag=jnp.concatenate([jnp.where(valid, _permute(scan.tag, mislabelled), -1), no_tag]),
         valid=jnp.concatenate([valid, occurs]),
     )
     return spoilt, jnp.concatenate([origin, no_tag])
@@ -105,7 +105,7 @@ def _false_measurements(
     return jax.vmap(one)(points, normals)
 
 
-def _permuted(tag: Int[Array, "M"], wrong: Bool[Array, "M"]) -> Int[Array, "M"]:
+def _permute(tag: Int[Array, "M"], wrong: Bool[Array, "M"]) -> Int[Array, "M"]:
     """The tags, each wrong one replaced by that of the next wrong slot."""
     slots = jnp.argsort(~wrong, stable=True)  # the wrong ones first
     following = jnp.cumsum(wrong) % jnp.maximum(wrong.sum(), 1)

@@ -19,7 +19,7 @@ from jaxslam.verify.inputs.functions import (
     factor_function,
     makes_a_model,
     plain_function,
-    told_signatures,
+    with_signature_errors,
 )
 from jaxslam.verify.inputs.samples import Samples
 from jaxslam.verify.record import Report
@@ -120,7 +120,7 @@ def verify_jacobians(
         )
     if isinstance(model, Motion | Sensor):
         kind, name = "motion" if isinstance(model, Motion) else "sensor", model.name
-        model = told_signatures(model)
+        model = with_signature_errors(model)
         functions = functions_of(model)
     elif isinstance(model, Factor):
         kind, name, functions = "factor", model.name, (factor_function(model),)

@@ -88,7 +88,7 @@ def check_noise(scenario: World) -> None:
         try:
             _check_stated(model.name, size, model, nothing)
         except ValueError:
-            _check_stated(model.name, size, model, _seen_first(model, scenario))
+            _check_stated(model.name, size, model, _first_measurement(model, scenario))
 
 
 def without_noise(scenario: World) -> str:
@@ -100,7 +100,7 @@ def without_noise(scenario: World) -> str:
         return ""
     found = []
     for model in _sensors(scenario):
-        for z in (_number(np.zeros(len(model.measurements))), _seen_first(model, scenario)):
+        for z in (_number(np.zeros(len(model.measurements))), _first_measurement(model, scenario)):
             exact = _exact(model, np.asarray(_noise_cov(model, z), np.float64))
             if not exact:
                 break
@@ -123,7 +123,7 @@ def _sensors(scenario: World) -> list[Sensor]:
     return [part.sensor for part in sensor.parts] if isinstance(sensor, Suite) else [sensor]
 
 
-def _seen_first(sensor: Sensor, scenario: World) -> jax.Array:
+def _first_measurement(sensor: Sensor, scenario: World) -> jax.Array:
     """The first landmark as measured from the start, (Z,)."""
     landmark = _number(scenario.landmarks)[0, : len(sensor.landmark)]
     z: jax.Array = _observe(sensor, _number(scenario.pose), landmark)

@@ -198,7 +198,7 @@ def _summed_up(
         runs=finished,
         dtype=str(limit.dtype),
         divergence_limit=float(limit),
-        filters=_qualified(summaries, scenario),
+        filters=_qualify(summaries, scenario),
         seconds=seconds,
         compile_seconds=work.compile_seconds,
         step_seconds={name: seconds / steps for name, seconds in work.run_seconds.items()},
@@ -210,7 +210,7 @@ def _summed_up(
     )
 
 
-def _qualified(found: dict[str, Summary], scenario: World) -> dict[str, Summary]:
+def _qualify(found: dict[str, Summary], scenario: World) -> dict[str, Summary]:
     """The summaries, with a doubt on those that an exact sensor left without a covariance."""
     dropped = {name: one.counts.get("singular", 0) for name, one in found.items()}
     exact = without_noise(scenario) if any(dropped.values()) else ""

@@ -121,7 +121,7 @@ def block_nees(
         factor, pivots = _cholesky(scaled, eps)
         found = {}
         for name, e in (("pose", error), ("own", chart_error)):
-            squares, known = _whitened(factor, e, unit)
+            squares, known = _whiten(factor, e, unit)
             for block, k in (("position", 2), ("pose", 3)):
                 if name == "pose" or block == "pose":
                     regular = (_least_eigenvalue(factor, pivots, k) > 100 * k * eps) & _every(
@@ -185,7 +185,7 @@ def _cholesky(
     return factor, pivots
 
 
-def _whitened(
+def _whiten(
     factor: dict[tuple[int, int], np.ndarray], error: np.ndarray, unit: list[np.ndarray]
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """The squares of L⁻¹e by coordinate, and whether the error is finite there."""

@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
-from jaxslam.core.numbers import check_array, shape_told
+from jaxslam.core.numbers import check_array, shape_text
 from jaxslam.core.protocols import Chart, Life, Linearizer, Motion, Sensor, unfit_signature
 from jaxslam.core.types import Estimate, Info, Scan
 
@@ -179,7 +179,7 @@ def _check_size(
     if (got := unfit_signature(function, len(arguments))) is not None:
         wanted = f"{model.name}.{field} to take ({', '.join(arguments)})"
         raise ValueError(f"{name}: expected {wanted}, got {got}")
-    sizes = ", ".join(f"{key} {_told(value.shape)}" for key, value in arguments.items())
+    sizes = ", ".join(f"{key} {_shape_text(value.shape)}" for key, value in arguments.items())
     call = f"{model.name}.{field}({sizes})"
     try:
         found = jax.eval_shape(function, *arguments.values())
@@ -188,8 +188,10 @@ def _check_size(
         raise ValueError(f"{name}: {call} fails: {type(error).__name__}: {why}") from error
     got = getattr(found, "shape", None)
     if got != shape:
-        what = f"a {type(found).__name__}" if got is None else f"shape {_told(got)}"
-        raise ValueError(f"{name}: expected {call} to return shape {_told(shape)}, got {what}")
+        what = f"a {type(found).__name__}" if got is None else f"shape {_shape_text(got)}"
+        raise ValueError(
+            f"{name}: expected {call} to return shape {_shape_text(shape)}, got {what}"
+        )
     if not jnp.issubdtype(getattr(found, "dtype", np.dtype(object)), jnp.floating):
         raise ValueError(f"{name}: expected {call} to return real numbers, got {found.dtype}")
     given = next(iter(arguments.values())).dtype
@@ -199,7 +201,7 @@ def _check_size(
         )
 
 
-def _told(shape: _Shape) -> str:
+def _shape_text(shape: _Shape) -> str:
     return "(" + ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "") + ")"
 
 
@@ -237,7 +239,7 @@ def _kind(state: PyTree) -> str:
 
 
 def _array(leaf: ArrayLike) -> str:
-    return f"{jnp.result_type(leaf)} {shape_told(leaf)}"
+    return f"{jnp.result_type(leaf)} {shape_text(leaf)}"
 
 
 def state_and_info(name: str, state: _S, scan: Scan, found: object) -> tuple[_S, Info]:

@@ -181,8 +181,8 @@ class DelayedSlam(Filter):
         # Padding may hold any number, and is multiplied by zero below.
         scan = scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
         state = state._replace(clock=state.clock + 1)
-        found, matched = _associated(settings, state, scan)
-        state, correction = _corrected(settings, state, scan, found, matched)
+        found, matched = _associate(settings, state, scan)
+        state, correction = _correct(settings, state, scan, found, matched)
         new = _new_measurements(settings, scan, found)
 
         def initialize(state: DelayedState) -> tuple[DelayedState, _Outcome]:
@@ -197,7 +197,7 @@ class DelayedSlam(Filter):
 
         steps = initialize if len(scan.tag) > 0 else leave
         state, outcome = where_any(new.wanted.any(), steps, leave, state)
-        return state, _reported(scan, found, matched, correction, new, outcome)
+        return state, _report(scan, found, matched, correction, new, outcome)
 
     def estimate(self, state: DelayedState) -> Estimate:
         joint, capacity, size = state.joint, self.capacity, 3 + SIZE * self.capacity
@@ -238,7 +238,7 @@ def _ekf_settings(settings: DelayedSettings) -> EkfSettings:
     return EkfSettings(sensor=settings.sensor, associate=settings.associate, gate=settings.gate)
 
 
-def _associated(
+def _associate(
     settings: DelayedSettings, state: DelayedState, scan: Scan
 ) -> tuple[Association, Bool[Array, "M"]]:
     """The landmark slot of each measurement, and which measurements have one.
@@ -250,7 +250,7 @@ def _associated(
     return associate_scan(joint._replace(alive=landmarks), scan, _ekf_settings(settings))
 
 
-def _corrected(
+def _correct(
     settings: DelayedSettings,
     state: DelayedState,
     scan: Scan,
@@ -272,7 +272,7 @@ def _new_measurements(settings: DelayedSettings, scan: Scan, found: Association)
     return NewMeasurements(scan.z, unknown, scan.tag, is_new, jnp.zeros_like(is_new))
 
 
-def _reported(
+def _report(
     scan: Scan,
     found: Association,
     matched: Bool[Array, "M"],

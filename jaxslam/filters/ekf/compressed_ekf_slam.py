@@ -153,7 +153,7 @@ def up_to_date(state: _Compressed) -> Joint:
     joint = state.whole
     at = _rows(state.slot, joint.landmarks.shape[1])
     before = joint.cov[at]
-    phi, psi, _ = _postponed(state)
+    phi, psi, _ = _postponed_update(state)
     cov = joint.cov - linalg.symmetrize(before.T @ (psi @ before))
     now = (phi @ before).at[:, at].set(state.area.cov[: len(at), : len(at)])
     return joint._replace(
@@ -201,7 +201,7 @@ def _with_updated_area(state: _Compressed, area: Joint) -> _Compressed:
 def _moved_map(state: _Compressed) -> jax.Array:
     """The current landmarks (N, L)."""
     landmarks, area = state.whole.landmarks, state.slot.shape[0]
-    theta = _postponed(state)[2]
+    theta = _postponed_update(state)[2]
     moved = (theta @ state.whole.cov[_rows(state.slot, landmarks.shape[1])])[3:]
     return (
         (landmarks + moved.reshape(landmarks.shape)).at[state.slot].set(state.area.landmarks[:area])
@@ -220,7 +220,7 @@ def _marginals(state: _Compressed) -> tuple[jax.Array, jax.Array]:
         every = jnp.arange(count)
         return cov[3:, 3:].reshape(count, size, count, size)[every, :, every]
 
-    phi, psi, _ = _postponed(state)
+    phi, psi, _ = _postponed_update(state)
     before, inside = state.whole.cov[at], state.area.cov[: len(at), : len(at)]
     lost = jnp.einsum("nal,nak->nlk", by_landmark(before), by_landmark(psi @ before))
     alone = with_itself(state.whole.cov, capacity) - lost
@@ -231,7 +231,7 @@ def _marginals(state: _Compressed) -> tuple[jax.Array, jax.Array]:
     )
 
 
-def _postponed(state: _Compressed) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _postponed_update(state: _Compressed) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The postponed update Φ, Ψ (W, W) and θ (W,), W = 3 + K·L."""
     area, count = state.area, state.slot.shape[0]
     width = 3 + count * area.landmarks.shape[1]

@@ -16,7 +16,7 @@ from jaxslam.filters.ekf import map_coordinates
 from jaxslam.filters.ekf.linear_system import LinearizedSteps, LinearSystem
 from jaxslam.filters.ekf.map_coordinates import estimate_of
 from jaxslam.filters.ekf.predict import propagate
-from jaxslam.filters.ekf.scan import turns_of, update_by_scan, without_landmarks
+from jaxslam.filters.ekf.scan import stages_of, update_by_scan, without_landmarks
 from jaxslam.filters.ekf.settings import (
     CorrectionOrder,
     Covariance,
@@ -149,7 +149,7 @@ class EkfSlam(Filter):
         return joint, (moved,)
 
     def _update(self, joint: Joint, scan: Scan, key: Array) -> tuple[Joint, Info, LinearSystem]:
-        turns = turns_of(self.sensor, self._settings)
+        turns = stages_of(self.sensor, self._settings)
         joint, info, evicted, system = update_by_scan(joint, scan, turns)
         if self.sensor.reduced is not None:
             joint, which, reduced = map_coordinates.reduced_where_ready(

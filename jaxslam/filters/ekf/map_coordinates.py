@@ -33,7 +33,7 @@ class ToPoints(NamedTuple):
         return {"reduced": self.reduced}
 
 
-def _seen_as(sensor: Sensor, reduced: Bool[Array, ""] | None) -> Sensor:
+def _measured_points(sensor: Sensor, reduced: Bool[Array, ""] | None) -> Sensor:
     """The sensor for a landmark that may be a point (x, y, padding); None: no landmark is one."""
     if sensor.reduced is None or reduced is None:
         return sensor
@@ -58,7 +58,7 @@ class _MaybePoint(Wrapped):
 
 def at_slot(sensor: Sensor, joint: Joint, slot: Int[Array, ""]) -> Sensor:
     """The sensor for the landmark of a slot () of the map."""
-    return sensor if joint.reduced is None else _seen_as(sensor, joint.reduced[slot])
+    return sensor if joint.reduced is None else _measured_points(sensor, joint.reduced[slot])
 
 
 def reduced_where_ready(
@@ -139,7 +139,7 @@ def estimate_of(
         by_robot: Float[Array, "L 3"],
         reduced: PyTree,
     ) -> tuple[Float[Array, "2"], Float[Array, "2 2"]]:
-        position = _seen_as(sensor, reduced).position
+        position = _measured_points(sensor, reduced).position
         by_landmark = jax.jacfwd(position)(landmark)
         if chart.basis is not None:
             basis = chart.basis(joint.pose, landmark)

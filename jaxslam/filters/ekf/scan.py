@@ -72,7 +72,7 @@ def augment(
     return joint._replace(lin=settings.linearize.born(joint, new)), by_pose
 
 
-class SensorTurn(NamedTuple):
+class SensorStage(NamedTuple):
     """The measurement slots and settings of one sensor in a scan."""
 
     places: int | None
@@ -104,46 +104,46 @@ class _ScanUpdate(NamedTuple):
     system: LinearSystem
 
 
-def turns_of(sensor: Sensor, settings: EkfSettings) -> list[SensorTurn]:
-    """The turns of the sensors of a suite, in order; a single one for a sensor that is no suite.
+def stages_of(sensor: Sensor, settings: EkfSettings) -> list[SensorStage]:
+    """The stages of the sensors of a suite, in order; a single stage for another sensor.
 
     Measurements of robots are ignored.
     """
     if not isinstance(sensor, Suite):
-        return [SensorTurn(None, dataclasses.replace(settings, absolute=not sensor.landmark))]
+        return [SensorStage(None, dataclasses.replace(settings, absolute=not sensor.landmark))]
     return [
-        SensorTurn(part.places, None)
+        SensorStage(part.places, None)
         if part.sees == "robots"
-        else turn_of(part, len(sensor.landmark), settings)
+        else stage_of(part, len(sensor.landmark), settings)
         for part in sensor.parts
     ]
 
 
-def turn_of(part: Part, size: int, settings: EkfSettings) -> SensorTurn:
+def stage_of(part: Part, size: int, settings: EkfSettings) -> SensorStage:
     """The part of a scan's update that is one sensor's, for landmarks of `size` numbers."""
     sensor = on_ground(part.sensor, size)
-    return SensorTurn(
+    return SensorStage(
         part.places, dataclasses.replace(settings, sensor=sensor, absolute=part.absolute)
     )
 
 
-def update_by_scan(joint: Joint, scan: Scan, turns: Sequence[SensorTurn]) -> _ScanUpdate:
+def update_by_scan(joint: Joint, scan: Scan, stages: Sequence[SensorStage]) -> _ScanUpdate:
     """The update by each sensor in turn.
 
     Raises ValueError if the scan does not have their measurement slots.
     """
-    first = turns[0]
+    first = stages[0]
     if first.places is None and first.settings is not None:
         return _update_by_sensor(joint, scan, first.settings)
     system: LinearSystem = ()
     infos, evicted = [], jnp.zeros_like(joint.alive)
-    counts = [turn.places or 0 for turn in turns]
-    for part, turn in zip(split_scan(scan, counts), turns, strict=True):
-        if turn.settings is None:
+    counts = [stage.places or 0 for stage in stages]
+    for part, stage in zip(split_scan(scan, counts), stages, strict=True):
+        if stage.settings is None:
             infos.append(nothing_of(part))
             continue
-        part = part._replace(z=part.z[:, : len(turn.settings.sensor.measurements)])
-        joint, info, gone, more = _update_by_sensor(joint, part, turn.settings)
+        part = part._replace(z=part.z[:, : len(stage.settings.sensor.measurements)])
+        joint, info, gone, more = _update_by_sensor(joint, part, stage.settings)
         infos.append(info)
         evicted, system = evicted | gone, (*system, *more)
     return _ScanUpdate(joint, joined_info(infos, scan.z.shape[1]), evicted, system)
@@ -221,7 +221,7 @@ def initialize_landmarks(
         wanted = wanted & ~deferred
         used = matched & correction.inside & correction.positive
         joint, evicted = _with_room(joint, wanted, found.slot, used, settings)
-        joint, slot, granted, by_pose = _started(joint, scan, wanted, rank, settings)
+        joint, slot, granted, by_pose = _new_landmarks(joint, scan, wanted, rank, settings)
         return joint, _NewLandmarks(slot, granted, deferred, repeated, evicted, by_pose)
 
     return where_any(is_new.any(), start, lambda joint: (joint, nothing), joint)
@@ -238,12 +238,12 @@ def _with_room(
     if settings.life is None or settings.life.make_room is None:
         return joint, jnp.zeros_like(joint.alive)
     needed = wanted.sum() - (~joint.alive).sum()
-    measured = slots.concerned(slot, used, len(joint.alive))
+    measured = slots.slot_mask(slot, used, len(joint.alive))
     evicted = settings.life.make_room(joint, needed, measured)
     return without_landmarks(joint, evicted, square_root=settings.square_root), evicted
 
 
-def _started(
+def _new_landmarks(
     joint: Joint,
     scan: Scan,
     wanted: Bool[Array, "M"],
@@ -261,8 +261,8 @@ def _started(
         joint, by_pose = augment(joint, scan.z, scan.tag, slot, granted, settings)
         return joint, slot, granted, by_pose
     # No more than may be granted are computed.
-    turn = wanted[None, :] & (rank[None, :] == 1 + jnp.arange(births)[:, None])
-    at, has_slot = slots.where_set(turn)
+    is_kth = wanted[None, :] & (rank[None, :] == 1 + jnp.arange(births)[:, None])
+    at, has_slot = slots.last_true_column(is_kth)
     slot, granted = slots.allocate(taken, has_slot)
     joint, by_pose = augment(joint, scan.z[at], scan.tag[at], slot, granted, settings)
     mine = jnp.clip(rank - 1, 0, births - 1)

@@ -112,7 +112,7 @@ def assign_indices(
     by_order = jnp.argsort(order, stable=True)
     entered = by_order[jnp.clip(rank, 0, len(by_order) - 1)]
     index = jnp.where(enters, entered, jnp.argmax(matches, axis=1))
-    return index, slots.concerned(index, enters, len(by_order))
+    return index, slots.slot_mask(index, enters, len(by_order))
 
 
 def deactivate(

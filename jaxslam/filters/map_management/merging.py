@@ -50,7 +50,7 @@ class Managed(Wrapper):
         return joint
 
     def update(self, state: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
-        return self._managed(state, scan, self.filter.update(state, scan, key))
+        return self._manage(state, scan, self.filter.update(state, scan, key))
 
     @property
     def linearized(self) -> LinearizedSteps | None:
@@ -60,11 +60,11 @@ class Managed(Wrapper):
 
         def update(joint: Joint, scan: Scan, key: Array) -> tuple[Joint, Info, LinearSystem]:
             after, info, system = steps.update(joint, scan, key)
-            return *self._managed(joint, scan, (after, info)), system
+            return *self._manage(joint, scan, (after, info)), system
 
         return LinearizedSteps(steps.predict, update)
 
-    def _managed(self, joint: Joint, scan: Scan, found: PyTree) -> tuple[Joint, Info]:
+    def _manage(self, joint: Joint, scan: Scan, found: PyTree) -> tuple[Joint, Info]:
         name = f"{type(self).__name__}: {self.filter.name}"
         found = validation.state_and_info(name, joint, scan, found)
         return self.manage(found[0], scan, found[1])
@@ -150,7 +150,7 @@ def co_observed(joint: Joint, info: Info, places: tuple[int, ...] = ()) -> Bool[
     end = 0
     for count in places or info.status.shape:
         begin, end = end, end + count
-        here = slots.concerned(info.slot[begin:end], measured[begin:end], capacity)
+        here = slots.slot_mask(info.slot[begin:end], measured[begin:end], capacity)
         pairs = pairs | (here[:, None] & here[None, :])
     return pairs
 

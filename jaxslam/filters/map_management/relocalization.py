@@ -117,14 +117,14 @@ def relocalize(
     check_search("relocalize", probability, pairs, candidates)
     limits = search_limits(m, probability, pairs, candidates)
     if n < 2 or m < 2:
-        return _judged(_nothing(m, jnp.result_type(points)), least, margin)
+        return _judge(_nothing(m, jnp.result_type(points)), least, margin)
     seen_cov = jnp.zeros((m, 2, m, 2), seen.dtype)
     seen_cov = seen_cov.at[jnp.arange(m), :, jnp.arange(m)].set(seen_covs)
     shared = jnp.zeros((m, 2, n, 2), seen.dtype)
     parts = PointSets(
         seen, points, seen_cov, cov.reshape(n, 2, n, 2), shared, valid[:, None] & alive[None]
     )
-    return _judged(match_points(parts, limits), least, margin)
+    return _judge(match_points(parts, limits), least, margin)
 
 
 def check_policy(caller: str, least: int, margin: int) -> None:
@@ -135,7 +135,7 @@ def check_policy(caller: str, least: int, margin: int) -> None:
         raise ValueError(f"{caller}: expected least >= 3, got {least}")
 
 
-def _judged(found: GeometricMatch, least: int, margin: int) -> _Relocalization:
+def _judge(found: GeometricMatch, least: int, margin: int) -> _Relocalization:
     ok = (found.explained >= least) & (found.explained - found.runner_up >= margin)
     return _Relocalization(
         pose=found.pose,

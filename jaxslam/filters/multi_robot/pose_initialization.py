@@ -183,7 +183,7 @@ def by_mutual_sight(
     by_other, by_v, by_w = jax.jacfwd(pose, argnums=(0, 1, 2))(other, v, w)
     noise = by_v @ cov_v @ by_v.T + by_w @ cov_w @ by_w.T
     noise = symmetrize(by_other @ cov @ by_other.T + noise)
-    return _wrapped(pose(other, v, w)), by_other @ rows, noise
+    return _wrap_heading(pose(other, v, w)), by_other @ rows, noise
 
 
 def by_two_landmarks(
@@ -210,7 +210,7 @@ def by_two_landmarks(
     by_points = by_points.reshape(3, 4)
     noise = jnp.einsum("ikl,klm,jkm->ij", by_seen, seen_cov, by_seen)
     noise = symmetrize(by_points @ cov @ by_points.T + noise)
-    return _wrapped(pose(points, seen)), by_points @ rows, noise
+    return _wrap_heading(pose(points, seen)), by_points @ rows, noise
 
 
 def _farthest_pair(
@@ -233,5 +233,5 @@ def _distance_variance(point: Float[Array, "2"], cov: Float[Array, "2 2"]) -> Fl
     return jnp.where(along > 0, along, jnp.finfo(point.dtype).tiny)
 
 
-def _wrapped(pose: Float[Array, "3"]) -> Float[Array, "3"]:
+def _wrap_heading(pose: Float[Array, "3"]) -> Float[Array, "3"]:
     return jnp.concatenate([pose[:2], wrap(pose[2:])])

@@ -16,7 +16,7 @@ from jaxslam.core.record import hold_function, record, set_field, static
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan, Status
 from jaxslam.filters.ekf.predict import propagate
-from jaxslam.filters.ekf.scan import SensorTurn, turn_of, update_by_scan
+from jaxslam.filters.ekf.scan import SensorStage, stage_of, update_by_scan
 from jaxslam.filters.ekf.settings import (
     CorrectionOrder,
     Covariance,
@@ -188,15 +188,15 @@ class TeamSlam(Filter):
             births=self.births,
             reserved=np.arange(capacity + len(robots) - 1) >= capacity,
         )
-        turns = tuple([_turn_of(part, ekf) for part in robot.sensors.parts] for robot in robots)
+        stages = tuple([_stage_of(part, ekf) for part in robot.sensors.parts] for robot in robots)
         tags = self.tags or tuple(range(capacity, capacity + len(robots)))
-        return TeamSettings(robots, capacity, tags, ekf, turns)
+        return TeamSettings(robots, capacity, tags, ekf, stages)
 
 
-def _turn_of(part: Part, ekf: EkfSettings) -> SensorTurn:
-    """The turn of one sensor in a scan; sensors of robots start no landmarks."""
+def _stage_of(part: Part, ekf: EkfSettings) -> SensorStage:
+    """The stage of one sensor in a scan; sensors of robots initialize no landmarks."""
     births = 0 if part.sees == "robots" else ekf.births
-    return turn_of(part, SIZE, dataclasses.replace(ekf, births=births))
+    return stage_of(part, SIZE, dataclasses.replace(ekf, births=births))
 
 
 @record
@@ -274,7 +274,7 @@ def corrected(joint: Joint, robot: int, scan: Scan, settings: TeamSettings) -> t
     unknown = (of_robot & ~others[None, :]).any(axis=1) | ~in_map[robot]
     part_scan = scan._replace(valid=scan.valid & ~unknown)
     after, info = update_by_scan(
-        seen_from(joint, robot, settings), part_scan, settings.turns[robot]
+        seen_from(joint, robot, settings), part_scan, settings.stages[robot]
     )[:2]
     status = jnp.where(scan.valid & unknown, Status.UNMATCHED, info.status)
     info = info._replace(status=status.astype(jnp.int32))

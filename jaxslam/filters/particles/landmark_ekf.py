@@ -106,7 +106,7 @@ def _evict_for_new(
     if life is None or life.make_room is None:
         return particle, jnp.zeros_like(alive)
     needed = association.is_new.sum() - (~alive).sum()
-    measured = slots.concerned(association.slot, used, len(alive))
+    measured = slots.slot_mask(association.slot, used, len(alive))
     evicted = life.make_room(_as_joint(particle), needed, measured)
     return _without_landmarks(particle, evicted), evicted
 

@@ -175,7 +175,7 @@ def optimize_chain(
         policy = eliminate(search.chain, alive)
         converged = jnp.asarray(False)
         if tolerance is not None:
-            converged = _converged(search, policy, tolerance)
+            converged = _has_converged(search, policy, tolerance)
         may = (search.taken < iterations) & ~converged
         after, value, lower = _line_search(motion, sensor, problem, search, policy)
         moved = may & lower
@@ -196,7 +196,7 @@ def optimize_chain(
         )
         return found, moved
 
-    begin = _unstarted(start, chain, alive, iterations)
+    begin = _initial_noise(start, chain, alive, iterations)
     # One iteration more than steps: the last solves the chain at the final iterate.
     if tolerance is None:
         fixed: Iterations = jax.lax.fori_loop(
@@ -209,7 +209,7 @@ def optimize_chain(
     return out[0]
 
 
-def _unstarted(
+def _initial_noise(
     start: Iterate, chain: Chain, alive: Bool[Array, "N"], iterations: int
 ) -> Iterations:
     """The search before the first step: no chain solved, and infinite cost."""
@@ -222,7 +222,7 @@ def _unstarted(
     return Iterations(start, chain, unsolved, far, costs, none, none + Ending.EXHAUSTED)
 
 
-def _converged(search: Iterations, policy: Policy, tolerance: float) -> Bool[Array, ""]:
+def _has_converged(search: Iterations, policy: Policy, tolerance: float) -> Bool[Array, ""]:
     """Whether the next step is shorter than the tolerance, in posterior standard deviations.
 
     A step of √eps is rounding of the gradient; so is one whose decrease of the cost is below

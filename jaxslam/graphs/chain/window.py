@@ -130,7 +130,7 @@ def solve_window(
     """
     joint, (capacity, size) = prior.joint, at.landmarks.shape
     cost, gains, _ = eliminate_steps(system, capacity)
-    information, y = _joined(cost)
+    information, y = _join(cost)
     known = jnp.concatenate([jnp.ones(3, bool), jnp.repeat(joint.alive, size)])
     new = jnp.concatenate([jnp.zeros(3, bool), jnp.repeat(alive & ~joint.alive, size)])
     off = jnp.where(joint.alive[:, None], at.landmarks - joint.landmarks, 0.0)
@@ -147,7 +147,7 @@ def solve_window(
     return _WindowSolution(delta[:3], landmarks, gains, linalg.symmetrize(of_delta))
 
 
-def _joined(cost: CostToGo) -> tuple[Float[Array, "D D"], Float[Array, "D"]]:
+def _join(cost: CostToGo) -> tuple[Float[Array, "D D"], Float[Array, "D"]]:
     information = jnp.block([[cost.pose, cost.cross], [cost.cross.T, cost.map]])
     return linalg.symmetrize(information), jnp.concatenate([cost.pose_y, cost.map_y])
 

@@ -125,7 +125,7 @@ class BatchMap(LogEstimator):
             iterations=self.iterations,
             tolerance=self.tolerance,
         )
-        estimate, solved = _solved(sensor, search, passed)
+        estimate, solved = _solve(sensor, search, passed)
         info = with_singular(passed.trace.info, problem.used)
         info = info if self.tolerance is None else _with_exhausted(info, search.ending)
         return Trace(estimate, info, solved, None)
@@ -154,7 +154,7 @@ def _problem_of(
     return problem, Iterate(chain.start.noise, chain.steps.noise, path, landmarks), chain
 
 
-def _solved(
+def _solve(
     sensor: Sensor, search: Iterations, passed: ForwardPass
 ) -> tuple[Estimate, BatchSolution]:
     """The estimates at the end of a search."""

@@ -147,11 +147,11 @@ def linearize(model: Model, plan: Plan, variables: Variables, data: Data) -> Sys
     return System(
         total(chi2),
         summed(plan.gradient, jnp.concatenate(gradients)),
-        _assembled(plan, blocks, data),
+        _assemble(plan, blocks, data),
     )
 
 
-def _assembled(plan: Plan, blocks: list[Array], data: Data) -> Float[Array, "M d d B"]:
+def _assemble(plan: Plan, blocks: list[Array], data: Data) -> Float[Array, "M d d B"]:
     """The blocks of the matrix from those of the rows of each table, (E K K, d, d, B)."""
     out = summed(plan.information, jnp.concatenate(blocks))
     held = plan.on_diagonal[:, None, None] & ~data.free[plan.block_column]
@@ -169,7 +169,7 @@ def half_hessian(
         kernel, count = model.kernels.get(name), len(factor.variables)
 
         def half(steps: Array, involved: tuple[Array, ...], z: Array, info: Array) -> Array:
-            e = factor.residual(_moved(factor, steps, involved), z)  # noqa: B023
+            e = factor.residual(_move(factor, steps, involved), z)  # noqa: B023
             s = e @ info @ e
             return 0.5 * (s if kernel is None else kernel.cost(s))  # noqa: B023
 
@@ -183,7 +183,7 @@ def half_hessian(
         keep = keep & data.valid[name][:, None, None, None, None]
         second = jnp.moveaxis(jnp.where(keep, second, 0.0), 3, 2)
         blocks.append(second.reshape(-1, *second.shape[3:]))
-    return _assembled(plan, blocks, data)
+    return _assemble(plan, blocks, data)
 
 
 def variable_numbers(factor: Factor, who: Array, poses: int) -> Array:
@@ -192,7 +192,7 @@ def variable_numbers(factor: Factor, who: Array, poses: int) -> Array:
     return who + shift
 
 
-def _moved(
+def _move(
     factor: Factor, steps: Float[Array, "K d"], involved: tuple[Array, ...]
 ) -> tuple[Array, ...]:
     """The variables of a row moved by increments."""

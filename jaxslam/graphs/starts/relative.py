@@ -45,7 +45,7 @@ def measured_relative_poses(graph: Graph, factors: Factors | None) -> Relative:
             np.asarray(part)[valid] for part in (table.who, table.z, table.information)
         )
         if not isinstance(factor, BetweenPoses):
-            z, by_error = map(np.asarray, _measured(factor, z))
+            z, by_error = map(np.asarray, _measured_poses(factor, z))
             information = np.einsum("eri,ers,esj->eij", by_error, information, by_error)
         found.append(
             Relative(who[:, 0], who[:, 1], np.asarray(z, float), np.asarray(information, float))
@@ -67,7 +67,7 @@ def _by_id(graph: Graph, who: Int[np.ndarray, "E K"], z: Float[np.ndarray, "E Z"
 
 
 @partial(jax.jit, inline=True)
-def _measured(factor: Factor, z: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _measured_poses(factor: Factor, z: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The relative poses of rows, and the derivatives of the residual by an error of them."""
 
     def one(z: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -152,13 +152,13 @@ def with_points(
         at = at[~placed_already[found]]
         if len(at):
             poses = np.asarray(graph.poses)[who[at, 0]]
-            points[who[at, 1]] = _predicted(factor, poses, z[at])
+            points[who[at, 1]] = _predicted_poses(factor, poses, z[at])
             placed_already[who[at, 1]] = True
     return graph._replace(points=as_before(graph.points, points))
 
 
 @partial(jax.jit, inline=True)
-def _predicted(factor: Factor, poses: jax.Array, z: jax.Array) -> jax.Array:
+def _predicted_poses(factor: Factor, poses: jax.Array, z: jax.Array) -> jax.Array:
     """The second variables that rows measure."""
     assert factor.predict is not None
     second: jax.Array = jax.vmap(factor.predict)(poses, z)

@@ -12,7 +12,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from jaxslam.core.numbers import check_real, is_concrete, shape_told
+from jaxslam.core.numbers import check_real, is_concrete, shape_text
 from jaxslam.core.types import JaxOrNumPy
 from jaxslam.math import se2
 
@@ -83,7 +83,7 @@ def check_grid(name: str, grid: object) -> None:
     if np.ndim(grid.log_odds) != 2 or 0 in np.shape(grid.log_odds):
         raise ValueError(
             f"{name}: expected log-odds of shape (at least 1, at least 1), "
-            f"got {shape_told(grid.log_odds)}"
+            f"got {shape_text(grid.log_odds)}"
         )
     check_frame(name, grid.origin, grid.resolution)
     if is_concrete(grid.log_odds) and not np.all(np.isfinite(grid.log_odds)):
@@ -95,10 +95,10 @@ def check_frame(name: str, origin: ArrayLike, resolution: ArrayLike) -> None:
     check_real(name, origin=origin, resolution=resolution)
     if np.shape(origin) != (3,):
         raise ValueError(
-            f"{name}: expected an origin that is a pose (x, y, θ), got {shape_told(origin)}"
+            f"{name}: expected an origin that is a pose (x, y, θ), got {shape_text(origin)}"
         )
     if np.shape(resolution) != ():
-        raise ValueError(f"{name}: expected one resolution, got {shape_told(resolution)}")
+        raise ValueError(f"{name}: expected one resolution, got {shape_text(resolution)}")
     if not is_concrete(origin, resolution):
         return
     if not np.all(np.isfinite(origin)):

@@ -229,7 +229,7 @@ class GridLocalization(MonteCarloFilter):
 
         # Else XLA computes it again in each of its consumers.
         fit = no_inline(fit_of, state.pose, in_dtype(self.prepared, state.pose.dtype), beams)
-        blocked = _blocked(self.grid, state.pose)
+        blocked = _is_blocked(self.grid, state.pose)
         fit = jnp.where(blocked, jnp.inf, fit)
         misfit = jnp.where(blocked, jnp.inf, jnp.asarray(self.exponent, fit.dtype) * fit)
         evidence = normalized(state.log_weight - misfit)[1]
@@ -244,7 +244,7 @@ class GridLocalization(MonteCarloFilter):
         return self.pose_estimate(state, none, jnp.zeros(0, jnp.int32))
 
 
-def _blocked(grid: Grid, pose: Float[Array, "P 3"]) -> Bool[Array, "P"]:
+def _is_blocked(grid: Grid, pose: Float[Array, "P 3"]) -> Bool[Array, "P"]:
     """Which poses are off the map or in an occupied cell."""
     height, width = grid.log_odds.shape
     at = jnp.floor(to_cells(jnp.asarray(grid.origin), grid.resolution, pose[:, :2]))

@@ -9,7 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree, UInt8
 
-from jaxslam.core.numbers import check_real, is_concrete, shape_told
+from jaxslam.core.numbers import check_real, is_concrete, shape_text
 from jaxslam.laser.grids.distance import squared_distances
 from jaxslam.laser.grids.grid import Grid, check_grid, interpolated, to_cells
 from jaxslam.laser.grids.traversal import MOST, OFF, STOP, march
@@ -87,14 +87,14 @@ def _ray_map(grid: Grid, method: str, skip: bool) -> RayMap:
     if skip:
         # Beyond the border it is as if all were occupied: no step leads off the map. The distance
         # of two squares is that of the centre of one from those around the other.
-        around = _dilated(jnp.pad(stops, 1, constant_values=True))
+        around = _dilate(jnp.pad(stops, 1, constant_values=True))
         away = jnp.sqrt(squared_distances(around))[1:-1, 1:-1]
         ahead = jnp.minimum(jnp.floor(4.0 * away), MOST).astype(jnp.uint8)
     ahead = jnp.pad(jnp.where(stops, jnp.uint8(STOP), ahead), 1, constant_values=OFF)
     return RayMap(solid, ahead, jnp.asarray(grid.origin), jnp.asarray(grid.resolution, solid.dtype))
 
 
-def _dilated(stops: Bool[Array, "H W"]) -> Array:
+def _dilate(stops: Bool[Array, "H W"]) -> Array:
     """Whether a square or one of the eight around it stops."""
     wide = jnp.pad(stops, 1)
     rows = wide[2:] | wide[1:-1] | wide[:-2]
@@ -178,9 +178,9 @@ def cast(
 
 def _check_rays(pose: Array, angles: Array, max_range: ArrayLike) -> None:
     if pose.ndim < 1 or pose.shape[-1] != 3:
-        raise ValueError(f"cast: expected poses (x, y, θ), got shape {shape_told(pose)}")
+        raise ValueError(f"cast: expected poses (x, y, θ), got shape {shape_text(pose)}")
     if angles.ndim != 1 or angles.size == 0:
-        raise ValueError(f"cast: expected angles of shape (at least 1,), got {shape_told(angles)}")
+        raise ValueError(f"cast: expected angles of shape (at least 1,), got {shape_text(angles)}")
     if is_concrete(angles) and not np.all(np.isfinite(angles)):
         raise ValueError("cast: expected finite angles")
     if is_concrete(max_range) and not (

@@ -95,15 +95,15 @@ def scans_of(log: LogOfScans, settings: Settings) -> Scans:
         near = met_something(
             Beams(*(np.asarray(part)[last : begin + ROWS] for part in log.beams)), log.max_range
         )
-        differs = _changed(np.asarray(near.range), np.asarray(near.valid))
+        differs = _has_changed(np.asarray(near.range), np.asarray(near.valid))
         changed.append(differs if begin == 0 else differs[1:])
         rows = Beams(*(np.asarray(part)[begin - last :, ::stride] for part in near))
         points = _points(rows, np.asarray(log.mount), settings.max_range)
-        filled = _filled(points)
+        filled = _fill(points)
         lines = jax.tree.map(np.asarray, _surfaces(filled, span))
         # Beams that fill a scan up come last: they are cut off, or stay without a point.
         size = len(rows.range)
-        found = jax.tree.map(lambda part, n=size: _thinned(part[:n], every, kept), (filled, lines))
+        found = jax.tree.map(lambda part, n=size: _thin(part[:n], every, kept), (filled, lines))
         if not begin:  # all at once: parts and their concatenation would take twice the memory
             scans = jax.tree.map(lambda of: np.empty((count, *of.shape[1:]), of.dtype), found)
         for whole, part in zip(jax.tree.leaves(scans), jax.tree.leaves(found), strict=True):
@@ -124,13 +124,13 @@ def _points(beams: Beams, mount: Float[np.ndarray, "3"], max_range: float) -> Po
     return Points(*parts)
 
 
-def _thinned(part: np.ndarray, every: int, width: int) -> np.ndarray:
+def _thin(part: np.ndarray, every: int, width: int) -> np.ndarray:
     """Each n-th of the beams, cut or filled up to a width."""
     found = part[:, ::every][:, :width]
     return np.pad(found, [(0, 0), (0, width - found.shape[1])] + [(0, 0)] * (part.ndim - 2))
 
 
-def _filled(points: Points) -> Points:
+def _fill(points: Points) -> Points:
     """Some scans, filled up to `ROWS` of `WIDTH` beams by points that are not valid."""
 
     def one(part: np.ndarray) -> np.ndarray:
@@ -153,7 +153,7 @@ def _spacing(angles: np.ndarray, valid: np.ndarray) -> float:
     return float(np.median(steps)) if steps.size else 0.02
 
 
-def _changed(ranges: Float[np.ndarray, "K B"], met: Bool[np.ndarray, "K B"]) -> np.ndarray:
+def _has_changed(ranges: Float[np.ndarray, "K B"], met: Bool[np.ndarray, "K B"]) -> np.ndarray:
     """Whether each scan differs from the previous one; the first does."""
     differs = (np.abs(np.diff(ranges, axis=0)) > _CHANGED) | (met[1:] != met[:-1])
     either = met[1:] | met[:-1]

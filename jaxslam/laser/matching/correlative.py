@@ -18,7 +18,7 @@ from jaxslam.laser.grids.distance import near_distances
 from jaxslam.laser.grids.grid import Field, Grid, interpolate, to_cells
 from jaxslam.laser.matching.field import field_cost
 from jaxslam.laser.matching.matcher import Match, Matcher
-from jaxslam.laser.matching.outcome import Limits, concluded, length_of
+from jaxslam.laser.matching.outcome import Limits, length_of, make_match
 from jaxslam.laser.matching.point_sets import Points, Prior, prior_cost
 from jaxslam.laser.matching.surfaces import surface, surface_information
 from jaxslam.math import se2
@@ -306,7 +306,7 @@ class Correlative(Matcher):
         residual = interpolate(prepared.field, moved)
         weight = (points.valid & (residual < 3 * sigma)).astype(residual.dtype)
         only = _Nodes(jnp.zeros(1, jnp.int32), best.turn[None], best.shift[None])
-        return concluded(
+        return make_match(
             start,
             pose,
             points,

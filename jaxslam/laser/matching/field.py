@@ -15,11 +15,11 @@ from jaxslam.laser.grids.grid import Field, Grid, interpolate, to_cells
 from jaxslam.laser.matching.matcher import Match, Matcher
 from jaxslam.laser.matching.outcome import (
     Limits,
-    concluded,
     determined,
     fused,
     information_of,
     length_of,
+    make_match,
 )
 from jaxslam.laser.matching.point_sets import Points, Prior, prior_cost, prior_terms
 from jaxslam.laser.matching.surfaces import surface, surface_information, weights
@@ -153,7 +153,7 @@ class FieldMatcher(Matcher):
             jnp.zeros((), bool),
         )
         k, pose, at, _, small = jax.lax.while_loop(unfinished, step, first)
-        return concluded(
+        return make_match(
             start,
             pose,
             points,

@@ -24,11 +24,11 @@ from jaxslam.laser.matching.closed_form import (
 from jaxslam.laser.matching.matcher import Match, Matcher
 from jaxslam.laser.matching.outcome import (
     Limits,
-    concluded,
     determined,
     fused,
     information_along,
     length_of,
+    make_match,
 )
 from jaxslam.laser.matching.point_sets import Points, Prior, prior_cost, prior_terms
 from jaxslam.laser.matching.surfaces import GAP, SPAN, Surface, nearest_points, surface, weights
@@ -178,7 +178,7 @@ class Icp(Matcher):
         first = jnp.zeros((), jnp.int32), start, far, jnp.asarray(jnp.inf, start.dtype)
         k, pose, _, change = jax.lax.while_loop(unfinished, step, first)
         at = icp._pairs(prepared, points, pose)
-        return concluded(
+        return make_match(
             start,
             pose,
             points,

@@ -24,7 +24,7 @@ class Limits(NamedTuple):
     """of `Match.condition`; None: no match is DEGENERATE"""
 
 
-def concluded(
+def make_match(
     start: Float[Array, "3"],
     pose: Float[Array, "3"],
     points: Points,

@@ -110,10 +110,10 @@ def topological_map(
         for part in parts:
             parent[root(at)] = part if away[part] >= away[root(at)] else root(at)
             parent[part] = root(at)
-    return _labelled(grid, found, {c: root(c) for c in parent}, gates)
+    return _label(grid, found, {c: root(c) for c in parent}, gates)
 
 
-def _labelled(
+def _label(
     grid: Grid, found: Skeleton, part: dict[int, int], gates: list[tuple[int, int, int]]
 ) -> TopologicalMap:
     """The map from the part of each cell of the skeleton, named by one of its cells."""

@@ -123,14 +123,14 @@ def solve_lower(
     solution: jax.Array = jax.lax.custom_linear_solve(
         lower,
         rhs,
-        lambda _, b: _substituted(factor, b),
-        transpose_solve=lambda _, b: _substituted(factor[::-1, ::-1].T, b[::-1])[::-1],
+        lambda _, b: _substitute(factor, b),
+        transpose_solve=lambda _, b: _substitute(factor[::-1, ::-1].T, b[::-1])[::-1],
     )
     return solution
 
 
 @traced_once
-def _substituted(
+def _substitute(
     factor: Float[Array, "n n"], rhs: Float[Array, "n *rest"]
 ) -> Float[Array, "n *rest"]:
     """L⁻¹ B by forward substitution, unrolled."""

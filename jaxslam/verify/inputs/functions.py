@@ -131,7 +131,7 @@ def motion_functions(motion: Motion) -> tuple[Function]:
     return (Function("step", motion.step, arguments, POSE, motion.jacobians),)
 
 
-def told_signatures(model: Motion | Sensor) -> Motion | Sensor:
+def with_signature_errors(model: Motion | Sensor) -> Motion | Sensor:
     """The model, with methods of a wrong signature replaced by methods that raise its error."""
     names = (
         {"step": "pose, u, w"}
@@ -231,7 +231,7 @@ def plain_function(
     shapes = [np.shape(table) for table in (() if states is None else states)]
     if len(shapes) == len(parameters) and all(len(shape) == 2 for shape in shapes):
         pairs = zip(parameters, shapes, strict=True)
-        named |= {p: _numbered(p, shape[1]) for p, shape in pairs if named[p] is None}
+        named |= {p: _number_names(p, shape[1]) for p, shape in pairs if named[p] is None}
     known = {p: entries for p, entries in named.items() if entries is not None}
     if missing := [p for p in named if p not in known]:
         raise ValueError(
@@ -260,13 +260,13 @@ def _entries(
     if entries is None:
         return None
     if isinstance(entries, int):
-        return _numbered(parameter, entries)
+        return _number_names(parameter, entries)
     if isinstance(entries, str) or not all(isinstance(entry, str) for entry in entries):
         raise ValueError(f"{name}: {parameter}: expected a tuple of names, got {entries!r}")
     return tuple(entries)
 
 
-def _numbered(parameter: str, count: int) -> tuple[str, ...]:
+def _number_names(parameter: str, count: int) -> tuple[str, ...]:
     return tuple(f"{parameter}[{k}]" for k in range(count))
 
 

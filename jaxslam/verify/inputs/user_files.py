@@ -125,7 +125,7 @@ def verify_file(target: str, verify_one: Callable[..., Report]) -> list[Report]:
     reports, unusable = [], []
     for one in targets:
         try:
-            reports.append(_verified(one, verify_one))
+            reports.append(_verify(one, verify_one))
         except ValueError as error:
             unusable.append(str(error))
             check = Check("can be verified", False, str(error))
@@ -135,7 +135,7 @@ def verify_file(target: str, verify_one: Callable[..., Report]) -> list[Report]:
     return [dataclasses.replace(reports[0], notes=(*notes, *reports[0].notes)), *reports[1:]]
 
 
-def _verified(target: _Target, verify_one: Callable[..., Report]) -> Report:
+def _verify(target: _Target, verify_one: Callable[..., Report]) -> Report:
     """The report on a target, with a check that it prints nothing, since it must be pure."""
     with _recorded_prints() as printed:
         report = verify_one(

@@ -7,7 +7,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxslam.core.numbers import check_count, check_mount, held_array, is_concrete, shape_told
+from jaxslam.core.numbers import check_count, check_mount, held_array, is_concrete, shape_text
 from jaxslam.core.protocols import Component
 from jaxslam.core.record import set_field
 from jaxslam.core.types import Beams, JaxOrNumPy
@@ -72,7 +72,7 @@ def log_likelihood(
     """
     _check_beams("log_likelihood", beams)
     if np.shape(pose) != (3,):
-        raise ValueError(f"log_likelihood: expected a pose (x, y, θ), got {shape_told(pose)}")
+        raise ValueError(f"log_likelihood: expected a pose (x, y, θ), got {shape_text(pose)}")
     if is_concrete(pose) and not np.all(np.isfinite(np.asarray(pose))):
         raise ValueError(f"log_likelihood: expected a finite pose, got {pose!r}")
     if is_concrete(exponent) and not np.all(np.asarray(exponent) >= 0):
@@ -107,7 +107,7 @@ def _check_beams(name: str, beams: object) -> None:
         raise ValueError(f"{name}: expected Beams, got {type(beams).__name__}")
     shapes = [np.shape(part) for part in beams]
     if len(shapes[0]) != 1 or len(set(shapes)) != 1:
-        listed = ", ".join(shape_told(part) for part in beams)
+        listed = ", ".join(shape_text(part) for part in beams)
         raise ValueError(f"{name}: expected as many ranges, angles and masks, got {listed}")
     if not is_concrete(beams):
         return

@@ -123,21 +123,21 @@ class RayCast(BeamModel):
         return ray_map(grid, method=self.method)
 
     def each(self, prepared: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
-        expected = self._expected(prepared, pose, beams)
+        expected = self._expected_range(prepared, pose, beams)
         far = jnp.asarray(self.max_range, expected.dtype)
         z = jnp.where(beams.returns(far)[1], far, beams.range)
         return mixture_log_density(self.mixture, z, expected, far)
 
     def jacobian(self, prepared: PyTree, pose: Array, beams: Beams) -> Float[Array, "B 3"]:
         """The derivative by z*, times that of z*, for which `cast` has a custom rule."""
-        expected = self._expected(prepared, pose, beams)
-        by_pose = jax.jacfwd(lambda pose: self._expected(prepared, pose, beams))(pose)
+        expected = self._expected_range(prepared, pose, beams)
+        by_pose = jax.jacfwd(lambda pose: self._expected_range(prepared, pose, beams))(pose)
         far = jnp.asarray(self.max_range, expected.dtype)
         z = jnp.where(beams.returns(far)[1], far, beams.range)
         by_range: Array = _density_slope(self.mixture, z, expected, far)
         return by_range[:, None] * jnp.asarray(by_pose)
 
-    def _expected(self, rays: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
+    def _expected_range(self, rays: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
         return cast(rays, self.frame(pose), beams.angle, self.max_range)
 
 

@@ -55,13 +55,13 @@ def consistent(
     parts = path[second], end, moved, loop_cov, total[first], total[second], first, second
     with float64():
         tiles = [
-            _Loop(*(jnp.asarray(_filled(part[begin : begin + _TILE])) for part in parts))
+            _Loop(*(jnp.asarray(_fill(part[begin : begin + _TILE])) for part in parts))
             for begin in range(0, count, _TILE)
         ]
         for i, a in enumerate(tiles):
             for j, b in enumerate(tiles[i:], i):
                 rows, columns = (slice(k * _TILE, min((k + 1) * _TILE, count)) for k in (i, j))
-                square = np.asarray(_squared(a, b))
+                square = np.asarray(_squared_distances(a, b))
                 square = square[: rows.stop - rows.start, : columns.stop - columns.start]
                 out[rows, columns] = square < limit
     earlier = np.triu(out, 1)
@@ -86,13 +86,13 @@ class _Loop(NamedTuple):
     second: Array
 
 
-def _filled(part: np.ndarray) -> np.ndarray:
+def _fill(part: np.ndarray) -> np.ndarray:
     """A part of the loops, its last one repeated up to the size of a tile."""
     return np.concatenate([part, np.repeat(part[-1:], _TILE - len(part), axis=0)])
 
 
 @jax.jit
-def _squared(a: _Loop, b: _Loop) -> Float[Array, "tile tile"]:
+def _squared_distances(a: _Loop, b: _Loop) -> Float[Array, "tile tile"]:
     """eᵀ Σ⁻¹ e of each loop of one tile with each of another, the first of them the earlier."""
     return jax.vmap(lambda one: jax.vmap(lambda other: _of_pair(one, other))(b))(a)
 

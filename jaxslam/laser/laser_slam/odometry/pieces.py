@@ -22,8 +22,8 @@ from jaxslam.laser.laser_slam.odometry.tracking import (
     NEAR,
     NO_FLOOR,
     Odometry,
+    match_to_keyframes,
     place_unmatched,
-    tracked,
 )
 from jaxslam.laser.laser_slam.records import Settings, Solved
 from jaxslam.laser.laser_slam.scans import Scans
@@ -145,7 +145,7 @@ def laser_odometry(
 
     def piece(begin: int, end: int) -> Odometry:
         rows = slice(begin, end)
-        return tracked(taken(scans, rows), taken(steps, rows), settings, advance)
+        return match_to_keyframes(taken(scans, rows), taken(steps, rows), settings, advance)
 
     # The last scan of a piece is the first of the next.
     ends = [*(borders[1:-1] + 1).tolist(), count]

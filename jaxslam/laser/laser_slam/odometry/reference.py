@@ -114,7 +114,7 @@ def reference_of(
     # The last scan is repeated without its points: a reference always has as many scans.
     points = points._replace(valid=points.valid & (np.arange(size) < len(rows))[:, None])
     relative = poses.between(origin, at).astype(np.float32)
-    gathered: Reference = _gathered(points, taken(scans.surface, take), relative)
+    gathered: Reference = _gather(points, taken(scans.surface, take), relative)
     return gathered
 
 
@@ -164,7 +164,7 @@ def match(
 
 
 @jax.jit
-def _gathered(points: Points, surface: Surface, at: Float[Array, "n 3"]) -> Reference:
+def _gather(points: Points, surface: Surface, at: Float[Array, "n 3"]) -> Reference:
     """The points (n, B) of n scans in the frame in which their poses are, as n · B of one."""
     moved = jax.vmap(transformed)(points, at), jax.vmap(surface_at)(surface, at)
     gathered, lines = jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), moved)
@@ -186,7 +186,7 @@ def _match(
     information: of the prior, relative to points of variance 1.
     """
     coarse = Prior(guess, _BLUR**2 * information)
-    found = matcher.match(reference.table, _thinned(scan), guess, coarse)
+    found = matcher.match(reference.table, _thin(scan), guess, coarse)
     fine = Prior(guess, sigma**2 * information)
     near: Match = WALLS.match(reference.surface, scan, found.pose, fine)
     near = _NEAR_WALLS.match(reference.surface, scan, near.pose, fine)
@@ -220,7 +220,7 @@ def _seen_through(reference: Points, scan: Points, pose: Array) -> Array:
     return (before.sum() / jnp.maximum(in_view.sum(), 1)).astype(far.dtype)
 
 
-def _thinned(of: Points) -> Points:
+def _thin(of: Points) -> Points:
     """Every second point."""
     return Points(*(part[::2] for part in of))
 

@@ -74,7 +74,7 @@ class Odometry(NamedTuple):
     """[m] root mean square of their distances from these"""
 
 
-def tracked(
+def match_to_keyframes(
     scans: Scans, steps: Steps, settings: Settings, advance: Callable[[], object]
 ) -> Odometry:
     """The odometry of a piece of a log, from the pose zero, as `laser_odometry` describes it."""
@@ -177,7 +177,7 @@ def tracked(
     return result._replace(keyframe=np.array(keys))
 
 
-class _Found(NamedTuple):
+class _Search(NamedTuple):
     """A match with raw odometry as its prior."""
 
     pose: Float[np.ndarray, "3"]
@@ -211,7 +211,7 @@ def _matched(
     reach: Float[np.ndarray, "2"],
     how: _How,
     settings: Settings,
-) -> _Found:
+) -> _Search:
     """The match of a scan about raw odometry, or over all that the robot can have reached."""
 
     def by(matcher: Matcher, prior: np.ndarray) -> ScanMatch:
@@ -229,13 +229,13 @@ def _matched(
             bound = reach_cov(reach)
             wide = by(FAR, _INFLATION * prior + bound)
             better = _sure(wide, settings) and _quality(wide) > _quality(fit) + _MIN_GAIN
-            if better and _reached(wide, guess, prior, reach):
+            if better and _within_reach(wide, guess, prior, reach):
                 fit = wide
                 prior = prior + bound if how.gap else prior
         accepted = fit.inliers >= least and fit.through <= _MAX_THROUGH_LIKELY
         sure = fit.inliers >= _MIN_INLIERS
     parts = fit.pose, fit.cov, prior, fit.inliers, fit.residual
-    return _Found(*parts, accepted, sure, _quality(fit))
+    return _Search(*parts, accepted, sure, _quality(fit))
 
 
 def _sure(fit: ScanMatch, settings: Settings) -> bool:
@@ -244,7 +244,7 @@ def _sure(fit: ScanMatch, settings: Settings) -> bool:
     return good and not fit.ambiguous
 
 
-def _reached(
+def _within_reach(
     fit: ScanMatch,
     guess: Float[np.ndarray, "3"],
     prior: Float[np.ndarray, "3 3"],
