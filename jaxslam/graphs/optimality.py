@@ -127,11 +127,11 @@ def dual(
     return out - turns * every[plan.order][plan.block_column][:, None, None], multipliers, turns
 
 
-_SHARE = 1e-6
-"""The gap that is tried first, relative to χ² + 1."""
+_FIRST_GAP = 1e-6
+"""The first gap, relative to χ² + 1."""
 
-_ENOUGH = 1e-5
-"""The gap that counts as none."""
+_NEGLIGIBLE_GAP = 1e-5
+"""The gap that counts as zero."""
 
 _POWERS = 100
 """iterations for the smallest eigenvalue"""
@@ -250,7 +250,7 @@ def _prove(model: Model, plan: Plan, graph: Graph) -> Certificate:
     value = found.chi2
     bound = multipliers.sum(axis=0)
     margin = jnp.maximum(
-        _SHARE * (value + 1.0) / poses, 16 * jnp.finfo(dtype).eps * blocks.max((0, 1, 2))
+        _FIRST_GAP * (value + 1.0) / poses, 16 * jnp.finfo(dtype).eps * blocks.max((0, 1, 2))
     )
 
     def shifted(shift: Array) -> Array:
@@ -290,7 +290,7 @@ def _prove(model: Model, plan: Plan, graph: Graph) -> Certificate:
     away = found.graph.poses - graph.poses
     turned = jnp.arctan2(jnp.sin(away[:, 2]), jnp.cos(away[:, 2]))
     return Certificate(
-        certified=good & (gap <= _ENOUGH * (value + 1.0)),
+        certified=good & (gap <= _NEGLIGIBLE_GAP * (value + 1.0)),
         gap=jnp.where(good, gap, jnp.inf),
         smallest=smallest,
         chi2=value,

@@ -13,14 +13,14 @@ from jaxslam.laser.laser_slam.records import LogOfScans, Settings
 from jaxslam.laser.laser_slam.scans import ROWS, WIDTH, met_something
 from jaxslam.math import numpy_poses as poses
 
-_LARGEST = 4_000
+_MAX_CELLS = 4_000
 """cells along a side of the map; a larger world has larger cells"""
-_FILM = 400
+_FILM_CELLS = 400
 """cells along a side of a map in a film"""
 WINDOW = 1024
 """Cells along a side of the window in which scans are counted: one program for all maps, but for
 scans that are larger."""
-_ASIDE = np.array([0.37, 0.29])
+_CORNER_OFFSET = np.array([0.37, 0.29])
 """Cells from the origin of `raw` to a corner of a cell: a robot that starts there, or drives along
 an axis, has no beams along the borders of cells, where rounding decides what they cross."""
 
@@ -37,8 +37,8 @@ def frame_of(
             rows = slice(begin, begin + ROWS)
             first, last = _boxes(laser[rows], _used(log, settings, every, rows))
             low, high = np.minimum(low, first.min(axis=0)), np.maximum(high, last.max(axis=0))
-    resolution = max(settings.resolution, float((high - low).max()) / _LARGEST)
-    low = (np.floor(low / resolution - 4) + _ASIDE) * resolution
+    resolution = max(settings.resolution, float((high - low).max()) / _MAX_CELLS)
+    low = (np.floor(low / resolution - 4) + _CORNER_OFFSET) * resolution
     width, height = (int(n) for n in np.ceil((high - low) / resolution) + 4)
     # Whole pieces of 64 cells: maps of nearly the same size share a program.
     return (-(-height // 64) * 64, -(-width // 64) * 64), np.array([*low, 0.0]), resolution
@@ -147,7 +147,7 @@ def growing_maps(
 ) -> tuple[list[Grid], Int[np.ndarray, "F"]]:
     """Maps of the first scans, more of them in each, for a film; and how many scans each has.
 
-    Cells are as large as `_FILM` of them along a side need.
+    Cells are as large as `_FILM_CELLS` of them along a side need.
 
     Args:
         frames: number of maps at most.
@@ -155,7 +155,7 @@ def growing_maps(
     """
     paths = [path, *others]
     shape, _, resolution = frame_of(log, paths, settings)
-    coarse = max(resolution, max(shape) * resolution / _FILM)
+    coarse = max(resolution, max(shape) * resolution / _FILM_CELLS)
     shape, origin, resolution = frame_of(log, paths, replace(settings, resolution=coarse))
     laser = poses.compose(path, np.asarray(log.mount, float))
     together = -(-len(path) // min(frames, len(path)))

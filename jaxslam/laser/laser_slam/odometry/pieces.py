@@ -86,7 +86,7 @@ def match_controls(of: Odometry | Solved) -> Float[np.ndarray, "N 9"]:
 
 PIECE = 400
 """Scans of a piece of a log, at least."""
-_AROUND = 5
+_MARGIN = 5
 """Scans to either side of the first of a piece in which raw odometry is right."""
 
 
@@ -169,7 +169,7 @@ def _borders(scans: Scans, steps: Steps) -> Int[np.ndarray, "n"]:
     """
     count = len(scans.usable)
     odd = ~scans.usable | steps.unknown | steps.lags | steps.gap
-    odd = np.convolve(odd, np.ones(2 * _AROUND + 1), "same") > 0
+    odd = np.convolve(odd, np.ones(2 * _MARGIN + 1), "same") > 0
     borders = [0]
     for wanted in np.linspace(0, count, max(count // PIECE, 1) + 1)[1:-1].astype(int):
         near = np.arange(wanted - PIECE // 4, wanted + PIECE // 4)

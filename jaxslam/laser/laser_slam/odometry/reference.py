@@ -35,12 +35,12 @@ _BLUR = 0.1
 """[m] standard deviation of the score of a point by its distance from the reference"""
 HALF = 16.0
 """[m] from the middle of a reference to the border of its grid"""
-_PEAK = 0.9
-"""A pose elsewhere of this share of the best score makes a match ambiguous."""
+_AMBIGUOUS_SHARE = 0.9
+"""Share of the best score at which another pose makes a match ambiguous."""
 
 _SECTORS = 180
 """of a turn, in which beams are compared with the reference"""
-_CLEAR = 0.4
+_MIN_CLEARANCE = 0.4
 """[m] least distance of a passed point in front of the end of a beam"""
 
 
@@ -71,7 +71,7 @@ class ScanMatch(NamedTuple):
 
 
 def search(
-    distance: float, angle: float, turn: float, *, ambiguous: float | None = _PEAK
+    distance: float, angle: float, turn: float, *, ambiguous: float | None = _AMBIGUOUS_SHARE
 ) -> Matcher:
     """The search over a window of the reference's grid, [m] and [rad] to either side."""
     return Correlative(
@@ -96,8 +96,8 @@ _OF_WALLS = IcpSettings(kernel=Cauchy(), scale=0.05, lone=0.5, iterations=10, le
 WALLS = PointToLine(replace(_OF_WALLS, reach=0.5))
 _NEAR_WALLS = PointToLine(replace(_OF_WALLS, reach=0.15))
 """From where `WALLS` ends: its pairs are the points that lie on walls."""
-_ANY = search(1.0, 0.5, 0.1)
-"""Whose table serves all searches, since they differ by their windows alone."""
+_TABLE_SEARCH = search(1.0, 0.5, 0.1)
+"""Its table serves all searches, which differ only in their windows."""
 
 
 def reference_of(
@@ -168,7 +168,7 @@ def _gather(points: Points, surface: Surface, at: Float[Array, "n 3"]) -> Refere
     """The points (n, B) of n scans in the frame in which their poses are, as n · B of one."""
     moved = jax.vmap(transformed)(points, at), jax.vmap(surface_at)(surface, at)
     gathered, lines = jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), moved)
-    return Reference(gathered, lines, _ANY.prepare(raster(gathered, CELL, HALF)))
+    return Reference(gathered, lines, _TABLE_SEARCH.prepare(raster(gathered, CELL, HALF)))
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -215,7 +215,7 @@ def _seen_through(reference: Points, scan: Points, pose: Array) -> Array:
     in_frame = (reference.position - pose[None, :2]) @ se2.rotation(pose[2])
     r, at = jnp.sqrt((in_frame**2).sum(axis=1)), sector(in_frame)
     met = reference.valid & jnp.isfinite(nearest[at])
-    before = met & (r < nearest[at] - _CLEAR - 0.02 * r)
+    before = met & (r < nearest[at] - _MIN_CLEARANCE - 0.02 * r)
     in_view = met & (r < farthest[at] + 0.2)
     return (before.sum() / jnp.maximum(in_view.sum(), 1)).astype(far.dtype)
 

@@ -42,9 +42,9 @@ _MAX_THROUGH = 0.15
 _MAX_THROUGH_LIKELY = 0.4
 """The same about raw odometry, and where that is frozen: a pose without a match would be farther
 off than most wrong matches, so these are taken, and are in doubt."""
-_GATE = 30.66
+_DOUBT_GATE = 30.66
 """χ² of three degrees of freedom at 1 - 1e-6: a match farther from raw odometry is in doubt."""
-_WRONG = 0.1
+_DOUBT_PROBABILITY = 0.1
 """Probability that a match in doubt is of another place."""
 LOST = 6
 """Scans in a row without a match after which the next one is a keyframe without one."""
@@ -136,7 +136,7 @@ def match_to_keyframes(
             result.matched[scan] = True
             z, cov = found.pose, found.cov
             off = poses.between(guess, z)
-            contradicted = off @ np.linalg.solve(found.prior, off) > _GATE
+            contradicted = off @ np.linalg.solve(found.prior, off) > _DOUBT_GATE
             doubted = bool(contradicted or not found.sure)
             if steps.frozen[scan]:
                 other = (begin, begin_cov) if other is None else other
@@ -318,4 +318,4 @@ def _doubt(prior: np.ndarray, off: np.ndarray) -> np.ndarray:
     """
     at_match = covariances.propagated(covariances.turns(off[2]), prior)
     far = off[0] ** 2 + off[1] ** 2
-    return np.asarray(_WRONG * (at_match + np.diag([far, far, off[2] ** 2])))
+    return np.asarray(_DOUBT_PROBABILITY * (at_match + np.diag([far, far, off[2] ** 2])))
