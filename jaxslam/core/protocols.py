@@ -116,7 +116,7 @@ class Motion(Model):
 
     A subclass is a record (`core.record`) that declares controls and noises, has a field noise_cov,
     or a method of that name, and defines `step`. Raises ValueError, at construction, on a
-    covariance that is none, names that are no tuple of strings, or a missing method.
+    bad covariance, names other than a tuple of strings, or a missing method.
     """
 
     controls: tuple[str, ...]
@@ -165,7 +165,7 @@ class Sensor(Model):
     A subclass is a record (`core.record`) that declares measurements, has a field noise_cov, or a
     method of that name, and defines `observe` and `invert`; the rest has a default. It may have a
     field `mount`, and then observes from `frame(pose)`. Raises ValueError, at construction, on a
-    covariance or a mount that is none, names that are no tuple of strings, or a missing method.
+    bad covariance or mount, names other than a tuple of strings, or a missing method.
 
     An absolute sensor (a compass, a satellite receiver) has no landmark: l is (0,), invert and
     embed return (0,), position unused zeros, and K = 0. Each of its measurements

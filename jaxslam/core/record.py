@@ -29,7 +29,7 @@ def record(cls: type[_T]) -> type[_T]:
 
     Fields are checked where a record is made by its class: values in a method `__post_init__`,
     where the class has one, and then kinds here. JAX rebuilds records without any check, since it
-    fills them with whatever a transformation needs: tracers, stacks, derivatives.
+    fills them with the values of a transformation: tracers, stacks, derivatives.
 
     Raises ValueError, at construction, on a field of another kind.
     """

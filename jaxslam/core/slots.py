@@ -196,7 +196,7 @@ def remove(joint: Joint, dead: Array, *, square_root: bool = False) -> Joint:
 
     In covariance form the marginal is P without the rows and columns (Solà Table 1,
     state reduction); here they are overwritten with padding. Removing a dead slot changes nothing.
-    square_root: the state holds a root of P, as of a filter with covariance="square_root".
+    square_root: the state holds a root of P, as in a filter with covariance="square_root".
 
     Raises ValueError unless dead is bool, one for each slot.
     """

@@ -274,7 +274,7 @@ class FromMotion(_OfMotion):
     where step is affine in w; its optimum is another elsewhere. w is found by Newton's method from
     w = 0: ten steps without derivatives, then two with them, whose error is of the fourth order in
     a change of the poses, so derivatives up to the third are those of w. Where ∂step/∂w is
-    singular (a robot that stands still, with `Odometry`) a step is not taken.
+    singular (a robot at rest, with `Odometry`) no step is made.
 
     Raises ValueError unless the noise has three components, which the two poses determine; see
     `NominalMotion`.

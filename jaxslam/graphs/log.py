@@ -70,7 +70,7 @@ def of_log(
     Raises:
         ValueError: on models, a log or a covariance that do not fit, and at the row where a motion
             or a measurement has a singular noise, or a noise does not move the pose in all
-            directions (a robot that stands still, with `Odometry`).
+            directions (a robot at rest, with `Odometry`).
     """
     name = "graphs.of_log"
     validation.check_models(name, motion, sensor)

@@ -160,7 +160,7 @@ def segments(
     the second test. At `probability` 0.999 that shows h = 11 σ/√n in one of two segments, and 17
     σ/√n in 95 %: 4 and 6 σ for 8 beams. What is flatter is found by its neighbours. In a round room
     of radius 3 m (σ = 2 cm, 90 to 720 beams) at most 0.04 segments a scan remain. A flat arc that
-    is seen alone may pass. Two walls are lost as well whose corner is too low to be told from an
+    is seen alone may pass. Two walls are also lost if their corner is too low to be told from an
     arc: one in two where it is 46 σ/√n above their common chord, n beams on both.
 
     Args:

@@ -91,7 +91,7 @@ def recorded_world(
         poses: (R, T, 3) true pose at each row [m, m, rad].
         landmarks: (N, L) true landmarks, of all runs, or (R, N, L); the tag of one is its row.
         pose, pose_cov: (3,) and (3, 3), the filter's prior of the pose before the first control,
-            of every run: move records that begin elsewhere there.
+            of every run: transform records that begin elsewhere.
         starts: (R, 3) true pose before the first control; default `pose`.
         origin: (R, T, M) tag of the landmark that each measurement is truly of, -1 of none, where
             associations are to be scored.

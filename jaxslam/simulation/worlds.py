@@ -47,9 +47,9 @@ class World(Component):
     controls: ArrayLike
     """(T, U) nominal controls."""
     pose: ArrayLike
-    """(3,) what a filter is told of the pose before the first control."""
+    """(3,) mean of the filter's prior of the pose before the first control."""
     pose_cov: ArrayLike
-    """(3, 3) how far from there, by a Gaussian draw, the robot truly starts."""
+    """(3, 3) covariance of the true start about `pose`, and of that prior."""
     places: int | None = None
     """M measurement slots of a scan; None for as many as there are landmarks."""
     spurious: Spurious | None = None
@@ -112,9 +112,9 @@ class Scenario(World):
     controls: ArrayLike = field()
     """(T, U) nominal controls."""
     pose: ArrayLike = (0.0, 0.0, 0.0)
-    """(3,) what a filter is told of the pose before the first control."""
+    """(3,) mean of the filter's prior of the pose before the first control."""
     pose_cov: ArrayLike = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    """(3, 3) how far from there, by a Gaussian draw, the robot truly starts."""
+    """(3, 3) covariance of the true start about `pose`, and of that prior."""
     noise_on: Literal["robot", "odometry"] = static(default="robot")
     """"robot": the noise moves the true robot, and the log holds the nominal control. "odometry":
     the true robot follows the nominal control, and the noise is on the control in the log."""

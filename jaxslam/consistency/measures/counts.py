@@ -34,7 +34,7 @@ MEANINGS = {
     "merged": "pairs of landmarks made one",
     "reduced": "landmarks converted to points",
     "exhausted": "scans whose search for an association ended at its limit",
-    "resampled": "scans after which particles were drawn anew by their weights",
+    "resampled": "scans after which particles were resampled by their weights",
     "underflow": "scans that left no particle a weight",
     "invalid": "particles whose pose was not finite",
     "injected": "particles drawn anywhere, to find a lost robot",

@@ -128,7 +128,7 @@ def given(
         tolerance: [s].
     Raises:
         ValueError: on shapes that do not fit, stamps of the path that are not finite, a tolerance
-            that is no number of at least 0; and where no relation is kept, with both time ranges.
+            that is not a number of at least 0; and if no relation is kept, with both time ranges.
     """
     stamps, of = np.asarray(time, np.float64), poses_of("given", pose)
     if stamps.ndim != 1 or not len(stamps) or not np.isfinite(stamps).all():

@@ -229,7 +229,7 @@ def columns_of(
         wanted: (names given) -> the columns needed, with units.
     Raises:
         ValueError: on a column that is missing, in another unit, of another length, or with a value
-            that is no finite number.
+            that is not a finite number.
     """
     names = _names(given)
     needed = list(wanted(names or ()))

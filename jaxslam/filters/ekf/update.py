@@ -250,7 +250,7 @@ def _correct_local(
 
 
 def _nothing(joint: Joint, unused: Measurements, chart: Chart) -> Correction:
-    """The `Correction` of m unused measurements, all zero; the map is not composed anew."""
+    """The `Correction` of m unused measurements, all zero; the map is unchanged."""
     z = unused[0]
     (m, size), width = z.shape, 3 + joint.landmarks.shape[1]
     dtype = jnp.result_type(z, joint.pose, joint.cov)

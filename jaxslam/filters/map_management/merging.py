@@ -28,7 +28,7 @@ from jaxslam.math.xla import change_where
 class Managed(Wrapper):
     """A filter on a `slots.Joint`, each of whose updates is followed by `manage`.
 
-    It returns its linear system (`Monitored`) if the filter does; what `manage` does is no part
+    It returns its linear system (`Monitored`) if the filter does; the change by `manage` is not part
     of it. A subclass defines `manage`, and may extend `init`.
     """
 

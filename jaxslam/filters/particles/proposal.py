@@ -94,7 +94,7 @@ def propose_pose(
         S = H_x P H_xᵀ + H_l C H_lᵀ + R    x ← x + P H_xᵀ S⁻¹ ν    P ← P - P H_xᵀ S⁻¹ H_x P
         log w += log N(ν; 0, S)
 
-    the product of which is the density of the scan given the path. P = 0 (a pose that is drawn
+    whose product is the density of the scan given the path. P = 0 (a pose that is drawn
     already) is not changed, and gives the weights of FastSLAM 1.0. P is not inverted, so it may be
     singular. A measurement outside the gate gets the d² of the gate, and one without a landmark
     d² = `unmatched_distance` of a landmark known exactly, log N = -(d² + log |2πR|)/2, so that a

@@ -72,7 +72,7 @@ def centers(grid: Grid | Field) -> Float[Array, "H W 2"]:
 def check_grid(name: str, grid: object) -> None:
     """Raise ValueError, which begins with a caller's name, unless the grid is one.
 
-    Refused are log-odds that are no finite array of floats of at least one cell, an origin that is
+    Refused are log-odds other than a finite array of floats of at least one cell, an origin that is
     no pose, and a resolution that is not above 0. Within a trace only shapes are checked.
     """
     if not isinstance(grid, Grid):
