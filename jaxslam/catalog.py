@@ -57,7 +57,7 @@ class Named(dict[str, _V]):
 
 
 def meant(name: object, known: Iterable[str]) -> str:
-    """The closest of the known names, as a question in brackets; else nothing."""
+    """The closest known name, as a question in brackets, or ""."""
     alike = difflib.get_close_matches(str(name), known, 1)
     return "".join(f" (did you mean {each}?)" for each in alike)
 
@@ -131,7 +131,7 @@ def _options(scenario: World, more: EkfOptions, *names: str) -> dict[str, Any]:
 
 
 _OF_MAPS = "gate", "associate", "births"
-"""The options of filters that start landmarks, beside those of `EkfSlam` alone."""
+"""The options of filters that initialize landmarks, without those only of `EkfSlam`."""
 
 
 def _in_a_known_map(scenario: World, **options: Unpack[EkfOptions]) -> Callable[[Truth], Filter]:

@@ -24,7 +24,7 @@ class Times(NamedTuple):
     """Times of the first and last measurement of each landmark, in scans; zero where dead."""
 
     now: Int[Array, ""]
-    """the scans so far"""
+    """number of processed scans"""
     born: Int[Array, "N"]
     """when it was initialized"""
     last: Int[Array, "N"]
@@ -41,8 +41,8 @@ class Recency(Life):
     """
 
     patience: int | None = static(default=None)
-    """a landmark not measured for so many scans, empty ones too, is removed, so that a local map is
-    left. None removes no landmark."""
+    """a landmark not measured for this many scans, empty ones too, is removed, which leaves a local
+    map. None removes no landmark."""
 
     def __post_init__(self) -> None:
         if self.patience is not None:
@@ -59,8 +59,8 @@ class Recency(Life):
         known: Times = joint.life
         now = known.now + 1
         count = len(joint.alive)
-        born = slots.concerned(info.slot, info.status == Status.BORN, count)
-        hit = born | slots.concerned(info.slot, info.status == Status.FUSED, count)
+        born = slots.slot_mask(info.slot, info.status == Status.BORN, count)
+        hit = born | slots.slot_mask(info.slot, info.status == Status.FUSED, count)
         zero = jnp.zeros_like(known.last)
         memory = Times(
             now,
@@ -121,7 +121,7 @@ class Existence(Life):
     remove: Number = 0.05
     """probability"""
     patience: int | None = static(default=None)
-    """a provisional landmark not measured for so many scans is removed"""
+    """a provisional landmark not measured for this many scans is removed"""
     spread: Number | None = None
     """[m] a landmark with a larger standard deviation, √(tr P/2), is removed"""
     replace: bool = static(default=False)
@@ -157,8 +157,8 @@ class Existence(Life):
         self, joint: Joint, info: Info, estimate: Callable[[], Estimate]
     ) -> tuple[Evidence, Bool[Array, "N"]]:
         count = len(joint.alive)
-        born = slots.concerned(info.slot, info.status == Status.BORN, count)
-        hit = born | slots.concerned(info.slot, info.status == Status.FUSED, count)
+        born = slots.slot_mask(info.slot, info.status == Status.BORN, count)
+        hit = born | slots.slot_mask(info.slot, info.status == Status.FUSED, count)
         known: Evidence = joint.life
         old = jax.tree.map(lambda x: jnp.where(born | ~joint.alive, jnp.zeros_like(x), x), known)
         view = jax.vmap(self.visible, (None, 0))(joint.pose, joint.landmarks)

@@ -14,7 +14,7 @@ from jaxslam.core.numbers import (
     check_key,
     is_concrete,
     largest,
-    shape_told,
+    shape_text,
 )
 from jaxslam.core.protocols import Filter
 from jaxslam.core.types import Log, Scan, Status, Trace
@@ -53,7 +53,7 @@ def run(
         pose: (3,) where the robot is before the first control.
         pose_cov: (3, 3) its covariance; zero is allowed.
         key: a PRNG key, split into two a step; a filter without randomness ignores them.
-        probe: called with the filter's own state after each update; what it returns is stacked.
+        probe: called with the filter's state after each update; its results are stacked.
     Returns:
         Trace with estimates and infos of leading axis T, and the final state.
     Raises:
@@ -78,7 +78,7 @@ def check_run(name: str, filter: Filter, log: Log, pose: ArrayLike, pose_cov: Ar
         measurement_size=len(filter.measurements),
         parts=filter.places,
     )
-    if (got := shape_told(pose)) != "(3,)":
+    if (got := shape_text(pose)) != "(3,)":
         raise ValueError(f"{name}: expected a pose (x, y, θ) of shape (3,), got {got}")
     if is_concrete(pose):
         values = np.asarray(pose)

@@ -42,10 +42,10 @@ class JointCompatibility:
     new_gate: Number | None = None
     """of squared distance, for new landmarks"""
     budget: int = static(default=2000, kw_only=True)
-    """nodes of the search. Where they do not suffice, the best so far is returned, and
+    """largest number of nodes of the search. At this limit the best result is returned, and
     `Association.exhausted` is set"""
     candidates: int = static(default=8, kw_only=True)
-    """compatible landmarks a measurement is tried with, the nearest; where there are more,
+    """number of nearest compatible landmarks tried for a measurement; if there are more,
     `exhausted` is set"""
 
     def __post_init__(self) -> None:
@@ -130,7 +130,7 @@ class _Search(NamedTuple):
     distance: Float[Array, "M+1"]
     """D² of the first k"""
     inverse: Float[Array, "M*Z M*Z"]
-    """L⁻¹, rows of zeros where there is no pair"""
+    """L⁻¹, rows of zeros without a pair"""
     whitened: Float[Array, "M*Z"]
     """L⁻¹ ν"""
     best: Int[Array, "M"]
@@ -211,12 +211,12 @@ def _block_row(
     before = (jnp.arange(m) < i) & (at.chosen >= 0)
     shared = problem.cross[jnp.maximum(at.chosen, 0), :, slot]
     shared = jnp.where(before[:, None, None], shared, 0.0).reshape(m * size_z, size_z)
-    there = jnp.repeat(before, size_z)
-    inverse = jnp.where(there[:, None], at.inverse, 0.0)
-    whitened = jnp.where(there, at.whitened, 0.0)
+    joined = jnp.repeat(before, size_z)
+    inverse = jnp.where(joined[:, None], at.inverse, 0.0)
+    whitened = jnp.where(joined, at.whitened, 0.0)
     w = inverse @ shared
     factor, regular = linalg.cholesky(problem.cov[i, which] - w.T @ w)
-    own = jnp.arange(m * size_z)[None, :] == i * size_z + jnp.arange(size_z)[:, None]
-    rows = linalg.solve_lower(factor, own.astype(w.dtype) - w.T @ inverse)
+    diagonal = jnp.arange(m * size_z)[None, :] == i * size_z + jnp.arange(size_z)[:, None]
+    rows = linalg.solve_lower(factor, diagonal.astype(w.dtype) - w.T @ inverse)
     white = linalg.solve_lower(factor, problem.innovation[i, which] - w.T @ whitened)
     return rows, white, (white**2).sum(), regular

@@ -31,15 +31,15 @@ def predicted(
     """
 
     def pairs(scan: Scan) -> Pairs:
-        expected, own = measurements()
+        expected, landmark_cov = measurements()
         noise = jax.vmap(sensor.noise_cov)(scan.z)
         over_slots = jax.vmap(sensor.residual, in_axes=(None, 0))
         innovation = jax.vmap(over_slots, in_axes=(0, None))(scan.z, expected)
-        if own is None:
+        if landmark_cov is None:
             cov = jnp.broadcast_to(noise[:, None], (*innovation.shape, innovation.shape[2]))
             terms = jax.vmap(jax.vmap(gaussian_terms, in_axes=(0, None)))(innovation, noise)
         else:
-            cov = own[None] + noise[:, None]
+            cov = landmark_cov[None] + noise[:, None]
             terms = jax.vmap(jax.vmap(gaussian_terms))(innovation, cov)
         possible = scan.valid[:, None] & alive[None, :] & terms.positive
         return Pairs(innovation, cov, terms.distance, terms.log_det, possible)

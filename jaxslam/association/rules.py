@@ -53,7 +53,7 @@ def mutual(score: Float[Array, "M N"], allowed: Bool[Array, "M N"]) -> Int[Array
 
 @record
 class Known:
-    """Association by tags: each measurement is of the landmark of its tag; a new tag starts one.
+    """Association by tags: a measurement has the landmark of its tag; a new tag starts one.
 
     A measurement of unknown identity (tag -1) is neither, and becomes `Status.UNMATCHED`.
     """
@@ -155,7 +155,7 @@ class GlobalNearest:
         within = jnp.where(compatible, pairs.distance, 0.0)
         alone = jnp.minimum(self.gate, 1 + within.sum())
         cost = jnp.where(compatible, pairs.distance, 2 * alone + 1)
-        # One more column for each measurement, which stands for no landmark.
+        # One more column for each measurement, for no landmark.
         cost = jnp.concatenate([cost, jnp.broadcast_to(alone, (m, m))], axis=1)
         column = assign(cost)
         slot = jnp.where(column < n, column, -1)

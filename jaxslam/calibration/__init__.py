@@ -1,4 +1,4 @@
-"""Calibration from a filter's own innovations: systematic errors, and noises by their likelihood.
+"""Calibration from a filter's innovations: systematic errors, and noises by their likelihood.
 
 `calibrate` finds parameters of which the noise covariances do not depend, by Gauss-Newton on the
 whitened innovations, also where associations change; `fit_noise` maximizes the likelihood, for

@@ -181,7 +181,9 @@ def fit_noise(
         ValueError: on parameters that are not finite, or deviations not above 0; where a run fuses
             nothing or its likelihood is not finite; where other measurements are fused at other p.
     """
-    first, begin, logged, told = _checked(start, guess, names, deviation, iterations, tolerance)
+    first, begin, logged, labels = _check_start(
+        start, guess, names, deviation, iterations, tolerance
+    )
 
     of_run = as_record(info)
 
@@ -203,11 +205,11 @@ def fit_noise(
     from scipy.optimize import minimize  # slow to load
 
     def objective(q: np.ndarray) -> tuple[float, np.ndarray]:
-        there = tried(q)
-        if not np.isfinite([there.value, *there.gradient]).all():  # a step too far
+        trial = tried(q)
+        if not np.isfinite([trial.value, *trial.gradient]).all():  # a step too far
             return 10.0 - 10 * scale * here.value, 0.0 * q
-        _check_same(before, there, logged)
-        return -scale * there.value, -scale * there.gradient
+        _check_same(before, trial, logged)
+        return -scale * trial.value, -scale * trial.gradient
 
     found = minimize(
         objective,
@@ -223,10 +225,10 @@ def fit_noise(
         step, gain = _newton_step(observed, here.gradient)
         if gain <= tolerance:
             break
-        there = at(here.q + step)
-        if not there.value > here.value:
+        at_trial = at(here.q + step)
+        if not at_trial.value > here.value:
             break
-        here = there
+        here = at_trial
         path.append(here.q)
         observed = _observed_information(at, here, logged)
     cov, robust, related = _standard_errors(observed, here.spread)
@@ -236,7 +238,7 @@ def fit_noise(
     # Near 0 log L is linear in σ²: slope and curvature by log σ are twice and four times the gain.
     falling = wide & logged & (here.gradient < 0) & (np.abs(np.diag(observed)) < 4 * _BOUND)
     return NoiseFit(
-        names=told,
+        names=labels,
         start=first,
         parameters=np.where(logged, deviations, here.q),
         error=deviations * error,
@@ -247,9 +249,9 @@ def fit_noise(
         dof=here.dof,
         path=np.where(logged, np.exp(np.where(logged, path, 0.0)), path),
         converged=_newton_step(observed, here.gradient)[1] <= tolerance,
-        upper={told[i]: _upper_limit(at, here, int(i)) for i in np.flatnonzero(falling)},
+        upper={labels[i]: _upper_limit(at, here, int(i)) for i in np.flatnonzero(falling)},
         loose={
-            told[i]: tuple(told[j] for j in related[i]) for i in np.flatnonzero(wide & ~falling)
+            labels[i]: tuple(labels[j] for j in related[i]) for i in np.flatnonzero(wide & ~falling)
         },
     )
 
@@ -294,7 +296,7 @@ def _coordinates(p: np.ndarray, logged: np.ndarray) -> np.ndarray:
     return np.where(logged, np.log(np.where(logged, p, 1.0)), p)
 
 
-def _checked(
+def _check_start(
     start: ArrayLike,
     guess: ArrayLike | None,
     names: Sequence[str] | None,
@@ -306,18 +308,18 @@ def _checked(
     first = np.atleast_1d(np.asarray(start, np.float64))
     begin = first if guess is None else np.atleast_1d(np.asarray(guess, np.float64))
     logged = np.ones(first.shape, bool) if deviation is None else np.asarray(deviation, bool)
-    told = tuple(names or (f"p{i}" for i in range(first.size)))
+    labels = tuple(names or (f"p{i}" for i in range(first.size)))
     for what, p in (("start", first), ("guess", begin)):
         if p.ndim != 1 or not p.size or not np.isfinite(p).all() or p.shape != first.shape:
             raise ValueError(f"fit_noise: expected a {what} of shape (P,), finite, got {p}")
-        if logged.shape != p.shape or len(told) != p.size:
+        if logged.shape != p.shape or len(labels) != p.size:
             raise ValueError(f"fit_noise: expected {p.size} names and deviations, as the start")
         if (p[logged] <= 0).any():
             raise ValueError(f"fit_noise: expected standard deviations above 0, got {p}")
     check_count("fit_noise: iterations", iterations)
     if not tolerance > 0:
         raise ValueError(f"fit_noise: expected a tolerance above 0, got {tolerance}")
-    return first, begin, logged, told
+    return first, begin, logged, labels
 
 
 def _check_point(point: _LikelihoodPoint, logged: np.ndarray) -> None:

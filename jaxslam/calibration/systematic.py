@@ -1,4 +1,4 @@
-"""Systematic errors: parameters found from a filter's own innovations, and what they add.
+"""Systematic errors: parameters from a filter's innovations, and their effect on the covariance.
 
 What is added is to the covariance of a result, by the uncertainty of the parameters.
 """
@@ -57,7 +57,7 @@ def calibrate(
     with `association.Nearest` and `life.Recency(patience=…)` keeps a local map, in which landmarks
     seen close in time are associated whatever the drift, and no loop is closed.
 
-    Each measurement of a scan is whitened by its own S; the correlation between those of one joint
+    Each measurement of a scan is whitened by its S; the correlation between those of one joint
     update is ignored, which costs a little precision.
 
     Args:
@@ -68,7 +68,7 @@ def calibrate(
             of a record with `__call__` once for all its numbers.
         start: (P,), or a number.
         iterations: steps at most.
-        tolerance: done when no parameter moves by more than so many of its standard deviations.
+        tolerance: stop when no parameter moves by more than this many of its standard deviations.
     Returns:
         `Calibration`; look at `converged`.
     Raises:
@@ -137,12 +137,12 @@ def _step(
             )
         fused = found.status == Status.FUSED
         count, size = fused.size, found.innovation.shape[-1]
-        there = fused.reshape(count)
+        used = fused.reshape(count)
         cov = jax.lax.stop_gradient(found.innovation_cov).reshape(count, size, size)
         # Masked before and after the factor: an empty slot then has no effect on derivatives.
-        cov = jnp.where(there[:, None, None], cov, jnp.eye(size, dtype=cov.dtype))
+        cov = jnp.where(used[:, None, None], cov, jnp.eye(size, dtype=cov.dtype))
         factor = jax.vmap(lambda s: linalg.cholesky(s)[0])(cov)
-        residual = jnp.where(there[:, None], found.innovation.reshape(count, size), 0.0)
+        residual = jnp.where(used[:, None], found.innovation.reshape(count, size), 0.0)
         w = jax.vmap(linalg.solve_lower)(factor, residual).reshape(-1)
         return w, (w, jnp.where(fused, found.dof, 0).sum())
 
@@ -195,7 +195,7 @@ def consider_cov(
         )
     c = _covariance(cov, p.size)
 
-    found = jax.device_get(_differentiated(as_record(result), p))
+    found = jax.device_get(_differentiate(as_record(result), p))
     jacobian, value = (np.asarray(each, np.float64) for each in found)
     if not (np.isfinite(jacobian).all() and np.isfinite(value).all()):
         raise ValueError(f"consider_cov: the result or its derivatives at {p} are not finite")
@@ -203,7 +203,7 @@ def consider_cov(
 
 
 @partial(jax.jit, inline=True)
-def _differentiated(
+def _differentiate(
     result: Callable[[Float[Array, "P"]], Float[Array, "*shape n"]], p: Float[Array, "P"]
 ) -> tuple[Float[Array, "*shape n P"], Float[Array, "*shape n"]]:
     """The derivative of a result, and the result."""

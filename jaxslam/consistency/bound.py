@@ -57,14 +57,14 @@ def posterior_bound(
 
     The posterior (van Trees) bound: information is averaged over the worlds and then inverted. The
     recursion over states needs Q⁻¹, which the noise of a robot seldom has; so the bound is taken
-    over what is random, p = (ξ, ω_1 … ω_t, landmarks) with ξ, ω ~ N(0, 1), x_0 = pose + √P0 ξ and
-    x_t = f(x_{t-1}, u_t, √Q ω_t):
+    over the random variables p = (ξ, ω_1 … ω_t, landmarks) with ξ, ω ~ N(0, 1), x_0 = pose + √P0 ξ
+    and x_t = f(x_{t-1}, u_t, √Q ω_t):
 
         J_t = diag(1, …, 1, 0, …, 0) + E Σ_{s<=t} (∂h_s/∂p)ᵀ R⁻¹ (∂h_s/∂p),
         E (x̂_t - x_t)(x̂_t - x_t)ᵀ >= A J_t⁻¹ Aᵀ,     A = E ∂x_t/∂p,
 
     E over the worlds given, whose number should be large enough for an average. The landmarks are
-    the same unknowns in every run, without a prior: the bound is for estimators that do not know
+    the same unknowns in every run, without a prior: the bound holds for estimators that do not know
     the map beforehand and are unbiased in it (a hybrid bound: Rockah & Schultheiss, IEEE Trans.
     ASSP 35(3), 1987; van Trees, "Detection, Estimation, and Modulation Theory I", 1968, 2.4.3).
     Jacobians by the noise are taken at ω = 0, and Q and R are what the models state at the truth
@@ -100,7 +100,7 @@ def posterior_bound(
         information = information + np.stack([gained for _, gained in rows]) / count
     random = 3 + total * runs.by_noise.shape[3]
     prior = np.diag((np.arange(information.shape[1]) < random).astype(float))
-    return at, np.stack([_inverted(a, prior + j) for a, j in zip(by_p, information, strict=True)])
+    return at, np.stack([_invert(a, prior + j) for a, j in zip(by_p, information, strict=True)])
 
 
 def van_trees(
@@ -116,12 +116,12 @@ def van_trees(
     Args:
         target_jacobians: ∂g/∂p of each draw. jacobians: ∂h/∂p.
         noise_covs: R (M, M), or (draws, M, M).
-        prior: information on p: P0⁻¹ of a normal prior, 0 of what has none. A direction that
-            nothing tells is left out, and must not matter to g.
+        prior: information on p: P0⁻¹ of a normal prior, 0 without a prior. A direction that
+            nothing determines is left out, and must not matter to g.
     """
     scaled = np.linalg.solve(noise_covs, jacobians)
     gained = (np.swapaxes(jacobians, 1, 2) @ scaled).mean(axis=0)
-    return _inverted(np.mean(target_jacobians, axis=0), prior + gained)
+    return _invert(np.mean(target_jacobians, axis=0), prior + gained)
 
 
 class SensorJacobians(NamedTuple):
@@ -213,19 +213,19 @@ def final_covariance(
                 by_pose, by_landmark = seen.by_pose[t, i], seen.by_landmark[t, i]
                 noise = seen.noise_cov[t, i] + (1e-9 * reach) ** 2 * np.eye(len(by_pose))
                 begin = 3 + int(seen.tag[t, i]) * size
-                own = slice(begin, begin + by_landmark.shape[1])
+                block = slice(begin, begin + by_landmark.shape[1])
                 if by_landmark.shape[1] and not known[seen.tag[t, i]]:
                     known[seen.tag[t, i]] = True
                     if by_landmark.shape == (size, size) and np.linalg.cond(by_landmark) < 1e6:
                         by = np.linalg.inv(by_landmark)
-                        cov[own] = -by @ by_pose @ cov[:3]
-                        cov[:, own] = cov[own].T
-                        cov[own, own] = by @ (by_pose @ cov[:3, :3] @ by_pose.T + noise) @ by.T
+                        cov[block] = -by @ by_pose @ cov[:3]
+                        cov[:, block] = cov[block].T
+                        cov[block, block] = by @ (by_pose @ cov[:3, :3] @ by_pose.T + noise) @ by.T
                         continue
                     whole = slice(begin, begin + size)
                     cov[whole, whole] = (100 * reach) ** 2 * np.eye(size)
-                cross = by_pose @ cov[:3] + by_landmark @ cov[own]
-                innovation = cross[:, :3] @ by_pose.T + cross[:, own] @ by_landmark.T + noise
+                cross = by_pose @ cov[:3] + by_landmark @ cov[block]
+                innovation = cross[:, :3] @ by_pose.T + cross[:, block] @ by_landmark.T + noise
                 cov -= cross.T @ np.linalg.solve(innovation, cross)
         cov = (cov + cov.T) / 2
     return cov[:3, :3]
@@ -242,7 +242,7 @@ def _by_parameters(
     by_p[:, :3] = start
     information = np.zeros((by_p.shape[1],) * 2)
     kept = {}
-    white = [_whitened(sensor) for sensor in run.sensors]
+    white = [_whiten(sensor) for sensor in run.sensors]
     for t in range(steps):
         by_p = np.asarray(run.by_pose[t]) @ by_p
         by_p[:, 3 + t * width : 3 + (t + 1) * width] = run.by_noise[t]
@@ -258,27 +258,27 @@ def _by_parameters(
     return iter([kept[t] for t in at])
 
 
-def _whitened(sensor: SensorJacobians) -> list[np.ndarray]:
+def _whiten(sensor: SensorJacobians) -> list[np.ndarray]:
     """The whitened Jacobians R^{-1/2} H by pose and landmark; zero where nothing was measured."""
-    there = sensor.valid[:, :, None, None]
-    noise = np.where(there, sensor.noise_cov, np.eye(sensor.noise_cov.shape[2]))
+    valid = sensor.valid[:, :, None, None]
+    noise = np.where(valid, sensor.noise_cov, np.eye(sensor.noise_cov.shape[2]))
     try:
         factor = np.linalg.cholesky(noise)
     except np.linalg.LinAlgError:
         raise ValueError(
             "posterior_bound: a covariance of measurement noise is not positive definite"
         ) from None
-    return [np.where(there, np.linalg.solve(factor, by), 0.0) for by in sensor[:2]]
+    return [np.where(valid, np.linalg.solve(factor, by), 0.0) for by in sensor[:2]]
 
 
-def _inverted(
+def _invert(
     jacobian: Float[np.ndarray, "K P"], information: Float[np.ndarray, "P P"]
 ) -> Float[np.ndarray, "K K"]:
     """A J⁺ Aᵀ, J scaled to a unit diagonal, a direction of no information left out."""
     size = np.sqrt(np.diagonal(information))
     unit = np.divide(1.0, size, out=np.zeros_like(size), where=size > 0)
     values, vectors = np.linalg.eigh(information * unit[:, None] * unit)
-    there = values > len(values) * np.finfo(float).eps * values[-1]
-    root = (jacobian * unit) @ vectors[:, there] / np.sqrt(values[there])
+    positive = values > len(values) * np.finfo(float).eps * values[-1]
+    root = (jacobian * unit) @ vectors[:, positive] / np.sqrt(values[positive])
     bound: np.ndarray = root @ root.T
     return bound

@@ -85,21 +85,21 @@ def spread(
 
     skewed: f = `_SKEW`, else 1; see `Spread`.
     """
-    there = _numbers(values)
-    if there.size == 0:
+    finite = _numbers(values)
+    if finite.size == 0:
         return None
-    mean = float(there.mean())
-    if there.size < 2:
+    mean = float(finite.mean())
+    if finite.size < 2:
         return Spread(mean, np.inf, np.inf)
-    error = float(there.std(ddof=1) / mean / np.sqrt(there.size)) if mean > 0 else 0.0
-    dof = (there.size - 1) / (_SKEW if skewed else 1.0)
+    error = float(finite.std(ddof=1) / mean / np.sqrt(finite.size)) if mean > 0 else 0.0
+    dof = (finite.size - 1) / (_SKEW if skewed else 1.0)
     return Spread(mean, error, t_quantile(0.5 + level / 2, dof) * error)
 
 
 def positive_interval(
     values: np.ndarray | Sequence[float], level: float = LEVEL, skewed: bool = True
 ) -> Average | None:
-    """The mean of positive numbers with the interval of `Spread`; None where there are none.
+    """The mean of positive numbers with the interval of `Spread`; None without numbers.
 
     Of a single number the interval is all that is positive, (0, ∞).
     """
@@ -116,16 +116,16 @@ def interval(values: np.ndarray | Sequence[float]) -> Average | None:
 
     For what may be of either sign; what cannot be negative has `positive_interval`.
     """
-    there = _numbers(values)
-    if there.size == 0:
+    finite = _numbers(values)
+    if finite.size == 0:
         return None
-    mean = float(there.mean())
-    if there.size < 2:
+    mean = float(finite.mean())
+    if finite.size < 2:
         return Average(mean, -np.inf, np.inf)
-    half = t_quantile(0.5 + LEVEL / 2, there.size - 1) * there.std(ddof=1) / np.sqrt(there.size)
+    half = t_quantile(0.5 + LEVEL / 2, finite.size - 1) * finite.std(ddof=1) / np.sqrt(finite.size)
     return Average(mean, mean - float(half), mean + float(half))
 
 
 def _numbers(values: np.ndarray | Sequence[float]) -> np.ndarray:
-    there = np.asarray(values, np.float64)
-    return there[np.isfinite(there)]
+    numbers = np.asarray(values, np.float64)
+    return numbers[np.isfinite(numbers)]

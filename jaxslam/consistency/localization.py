@@ -33,7 +33,7 @@ _KERNEL = 0.5
 
 
 class LocalizationScores(NamedTuple):
-    """What a filter says in each of R runs at T steps, beside the truth."""
+    """The estimates of a filter in each of R runs at T steps, and the truth."""
 
     truth: Float[JaxOrNumPy, "R T 3"]
     pose: Float[JaxOrNumPy, "R T 3"]
@@ -82,13 +82,13 @@ def judge_localization(
 ) -> LocalizationScores:
     """The scores of a filter over many draws of a laser world; the same key gives the same draws.
 
-    The filter is told a pose drawn from N(true start, start_cov), with that covariance. Runs go one
-    after the other in one program.
+    The filter starts at a pose drawn from N(true start, start_cov), with that covariance. Runs go
+    one after the other in one program.
 
     Args:
         filter: of `grids.GridLocalization`.
         start_cov: (3, 3), which may be zero.
-        same_log: one history for all runs, which differ in the filter's own draws alone.
+        same_log: one history for all runs, which differ only in the draws of the filter.
         every: scores are computed at each n-th step, from the n-th on.
     Raises:
         ValueError: a world, a filter, a key, a covariance or a number that is none.
@@ -188,7 +188,7 @@ def covering_level(draws: Float[Array, "S 3"], truth: Float[Array, "3"]) -> Floa
     of all S + 1 in x, y and θ: the level is the share of them that are as dense as the truth or
     denser. It is uniform on 1/(S+1), …, 1 if the truth is distributed as the draws, whatever that
     distribution and the kernel. The 95 % set covers the truth where the level is at most 0.95.
-    Copies of a draw, of which resampling makes many, are left out of its own mean.
+    Copies of a draw, from resampling, are left out of its mean.
     """
     points = jnp.concatenate([truth[None], draws])
     count = len(points)
@@ -200,7 +200,7 @@ def covering_level(draws: Float[Array, "S 3"], truth: Float[Array, "3"]) -> Floa
     other = scaled > 0
     kernels = jnp.where(other, jnp.exp(-0.5 * scaled / _KERNEL**2), 0.0).sum(axis=1)
     density = kernels / jnp.maximum(other.sum(axis=1), 1)
-    # Rounding must not break a tie, as of a sample of one point.
+    # Rounding must not break a tie, as in a sample of one point.
     return (density >= density[0] * (1 - 1e-6)).sum() / count
 
 
@@ -262,10 +262,10 @@ def summarize_localization(
 
 
 def seed_spread(scores: LocalizationScores) -> Float[np.ndarray, "T"]:
-    """How far runs on one log differ beside what they claim: the mean over x, y and θ of the
+    """The spread of runs on one log relative to the claimed one: the mean over x, y and θ of the
     variance of the estimate between the runs over the mean claimed variance.
 
-    0 where the filter's own draws do not matter. From `judge_localization(…, same_log=True)`.
+    0 for a filter without draws. From `judge_localization(…, same_log=True)`.
     """
     pose, cov = np.asarray(scores.pose), np.asarray(scores.pose_cov)
     middle = np.broadcast_to(pose[:1], pose.shape)

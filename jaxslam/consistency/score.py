@@ -1,4 +1,4 @@
-"""The scores of runs: what each run says of a filter, the numbers a campaign adds up or keeps.
+"""The scores of runs: the numbers of each run that a campaign adds up or keeps.
 
 `run_statistics` takes sums over one run's maps and innovations, in JAX; `monte_carlo.programs`
 compiles it. `score` takes them, and the poses and infos of many runs, to the measures of each run;
@@ -29,7 +29,7 @@ from jaxslam.core.types import Estimate, Info, Status, Trace, Truth
 from jaxslam.math import linalg
 
 LAGS = 10
-"""The autocorrelation of innovations is taken up to so many steps."""
+"""Largest lag of the autocorrelation of innovations, in steps."""
 
 _UNROLLED = 4
 """Measurement slots that are looked at in one piece of compiled code."""
@@ -44,11 +44,11 @@ class Score(NamedTuple):
     finite: Bool[np.ndarray, "R"]
     """every number of the run is finite."""
     measures: dict[str, tuple[np.ndarray, np.ndarray]]
-    """each run's own averages: what is averaged, and over how much; there is none over 0."""
+    """averages of each run: the numbers, and their counts; none over 0."""
     snapshots: tuple[np.ndarray, np.ndarray, np.ndarray]
     """pose error (R, K, 3), its covariance (R, K, 3, 3), whether that is regular (R, K)."""
     sums: dict[str, np.ndarray]
-    """what is added up over runs: counts (R,), and (R, …) of measures."""
+    """sums over runs: counts (R,), and (R, …) of measures."""
 
 
 def snapshot_steps(steps: int) -> np.ndarray:
@@ -69,7 +69,7 @@ def score(
             its observability monitor (`monitor_of`), and where it has one, of `probe` the
             information of that after each step (R, T, 3, 3).
         found: `run_statistics` of each run.
-        own_error: the pose errors in the filter's own coordinates (see `own_error_of`), by default
+        own_error: the pose errors in the coordinates of the filter (see `own_error_of`), by default
             those in (x, y, θ).
     """
     pose, cov = map(np.asarray, trace.estimate[:2])
@@ -106,9 +106,9 @@ def score(
 
 class _Sums(NamedTuple):
     poison: Array
-    """() 0 times every number so far: NaN once one was not finite"""
+    """() 0 times every earlier number: NaN once one was not finite"""
     recent: list[Array]
-    """(LAGS, N) each, the latest steps first: the numbers of w, |w|² and whether there is one"""
+    """(LAGS, N) each, the latest steps first: the numbers of w, |w|² and a mask of the values"""
     pairs: list[Array]
     """(LAGS, N) each: Σ wᵀw', |w|²|there'|, |there||w'|², |there||there'|"""
 
@@ -138,15 +138,15 @@ def run_statistics(
         nees, regular = _planar_nees(off, jnp.asarray(estimate.point_covs))
         counts = regular & (held >= 0)
         white = _white(estimate, info)
-        *w, energy, there = sums.recent
-        *w_now, energy_now, there_now = white
+        *w, energy, valid = sums.recent
+        *w_now, energy_now, valid_now = white
         products = [
             linalg.total(old * new[None] for old, new in zip(w, w_now, strict=True))
             if size
             else jnp.zeros_like(energy),
-            energy * there_now[None],
-            there * energy_now[None],
-            there * there_now[None],
+            energy * valid_now[None],
+            valid * energy_now[None],
+            valid * valid_now[None],
         ]
         sums = _Sums(
             poison=sums.poison + 0 * _numbers((estimate, info)),
@@ -210,10 +210,10 @@ def _planar_nees(
     a²/p₁ + (b - a p₁₂/p₁)²/(p₂(1 - ρ²)); 0 where P is not regular or e not finite.
     """
     p1, p12, p2 = cov[:, 0, 0], cov[:, 1, 0], cov[:, 1, 1]
-    there = (p1 > 0) & (p2 > 0) & jnp.isfinite(error).all(axis=1)
-    p1, p2 = (jnp.where(there, p, 1.0) for p in (p1, p2))
+    valid = (p1 > 0) & (p2 > 0) & jnp.isfinite(error).all(axis=1)
+    p1, p2 = (jnp.where(valid, p, 1.0) for p in (p1, p2))
     left = 1 - (p12 / p1) * (p12 / p2)
-    regular = there & (left > 200 * float(jnp.finfo(cov.dtype).eps))
+    regular = valid & (left > 200 * float(jnp.finfo(cov.dtype).eps))
     a = error[:, 0]
     b = error[:, 1] - a * (p12 / p1)
     nees = a**2 / p1 + b**2 / (p2 * jnp.where(regular, left, 1.0))
@@ -223,7 +223,7 @@ def _planar_nees(
 def _white(estimate: Estimate, info: Info) -> list[Array]:
     """The numbers of the whitened innovation w, |w|², and 1 where there is one, else 0; (N,) each.
 
-    By landmark, of the first measurement fused with it; by measurement slot where there is no map.
+    By landmark, of the first measurement fused with it; by measurement slot without a map.
     """
     fused = info.status == Status.FUSED
 

@@ -30,16 +30,16 @@ class Summary:
     """Each with its interval over the runs; names without a number (nothing to average) are absent.
 
     NEES, none divided by its dof: nees_pose (3), nees_position (2), nees_heading (1) in (x, y, θ),
-    nees_own (3) of the pose in the filter's own error coordinates, nees_landmarks (2) averaged over
-    landmarks and steps. nis_per_dof (1). coverage_95_pose, _position, _heading: share of steps with
-    the truth in the 95 % ellipsoid. noncredibility and inclination [dB] (0). autocorrelation of
-    innovations at lag 1 (0). rmse_position [m], rmse_heading_deg [°], rmse_landmarks [m] (final
+    nees_own (3) of the pose in the error coordinates of the filter, nees_landmarks (2) averaged
+    over landmarks and steps. nis_per_dof (1). coverage_95_pose, _position, _heading: share of steps
+    with the truth in the 95 % ellipsoid. noncredibility and inclination [dB] (0). autocorrelation
+    of innovations at lag 1 (0). rmse_position [m], rmse_heading_deg [°], rmse_landmarks [m] (final
     map, unaligned; none of a known map); bound_ratio_position and _heading: those over the
     conditional Cramér-Rao bound (about 1 at best; see `conditional_bound`). unobservable (3) and
     rotation_information [1/rad²] (0): the dimension of the filter's unobservable subspace, and what
     it has learnt of a turn of the whole frame. log_likelihood (mean a run; none without an
-    innovation). In a world with spurious data: precision and
-    recall of associations, and false_landmarks; see `associations`.
+    innovation). In a world with spurious data: precision and recall of associations, and
+    false_landmarks; see `associations`.
     """
     nis_band: tuple[float, float] | None
     """95 % band of nis_per_dof from the summed degrees of freedom; None without a measurement."""
@@ -59,7 +59,7 @@ class Summary:
     """runs (finite), not_finite, divergent, singular_steps, dropped measurements by reason, and,
     of filters that have them, landmarks removed, merged and reduced, and searches exhausted."""
     per_run: dict[str, np.ndarray]
-    """(runs,) each run's own average of each measure, NaN where it has none: squares, radians."""
+    """(runs,) the average of each measure in each run, NaN without one: squares, radians."""
     not_finite_runs: list[int]
     """the numbers of the runs that are not finite; run i has key fold_in(key, i)."""
     by: tuple[str, ...] = ()
@@ -73,8 +73,8 @@ class Summary:
     """nis_per_dof from here on up to 1 is honest: below 1 where a gate dropped measurements"""
 
     def __repr__(self) -> str:
-        there = (name for name in _IN_REPR if name in self.measures)
-        shown = (f"{name}={self.measures[name].value:.4g}" for name in there)
+        present = (name for name in _IN_REPR if name in self.measures)
+        shown = (f"{name}={self.measures[name].value:.4g}" for name in present)
         return f"Summary({', '.join([self.verdict, *shown, *self.doubts])})"
 
 
@@ -99,7 +99,7 @@ def summarize(tally: Tally, bound: Mapping[str, np.ndarray] | None = None) -> Su
             if average is not None:
                 measures[measure.key] = average
         curves |= measure.curves(sums, runs)
-    # The bound is averaged over all runs, so it is no yardstick where some were lost.
+    # The bound is averaged over all runs, so it does not apply if some were lost.
     if bound is not None and finite.all():
         ratios, bounds = over_bound(measures, bound)
         measures, curves = measures | ratios, curves | bounds

@@ -1,4 +1,4 @@
-"""`condense` returns what is kept of a block of scores, and a `Tally` adds such blocks up.
+"""`condense` reduces a block of scores to its sums, and a `Tally` adds such blocks up.
 
 Called by `monte_carlo`: `block` condenses, `campaign` adds in any order and keeps the tallies, and
 `summary.summarize` takes them.
@@ -30,8 +30,8 @@ def plus(a: Sum, b: Sum) -> Sum:
     """The sum a + b, to about 2⁻¹⁰⁴ of |a| + |b|."""
     high, rest = _two_sum(a.high, b.high)
     low, last = _two_sum(a.low, b.low)
-    high, rest = _renormalized(high, rest + low)
-    return Sum(*_renormalized(high, rest + last))
+    high, rest = _renormalize(high, rest + low)
+    return Sum(*_renormalize(high, rest + last))
 
 
 def sum_rows(rows: np.ndarray) -> Sum:
@@ -195,7 +195,7 @@ def _two_sum(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return high, (a - (high - of_b)) + (b - of_b)
 
 
-def _renormalized(high: np.ndarray, low: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def _renormalize(high: np.ndarray, low: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The sum high + low rounded, and the exact error of that rounding, for |high| >= |low|."""
     out = high + low
     return out, low - (out - high)

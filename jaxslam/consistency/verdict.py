@@ -1,6 +1,6 @@
 """The verdict on a filter: two tests over the runs of a campaign, and their power.
 
-Pose NEES and NIS say different things. The NEES holds the claimed covariance of the pose against
+Pose NEES and NIS test different things. The NEES compares the claimed covariance of the pose with
 its error, and answers to everything; but within a run it is correlated in time, so that a run is
 worth a few numbers. The NIS holds innovations against S, is nearly white, so that a run is worth as
 many numbers as it has measurements, and is by far the sharper test of R.
@@ -28,7 +28,7 @@ POWER = 0.9
 
 
 class Verdict(NamedTuple):
-    """The verdict on a filter, what it rests on, and what it could not have noticed."""
+    """The verdict on a filter, its reasons, and the deviations that it could not detect."""
 
     word: str
     """consistent, optimistic, pessimistic, diverged, incomplete or undecided"""
@@ -46,7 +46,7 @@ class Verdict(NamedTuple):
 def judge(
     per_run: Mapping[str, np.ndarray], counts: Mapping[str, int], nis_dof: float = 0.0
 ) -> Verdict:
-    """The verdict on a filter from each run's own averages and the counts of the campaign.
+    """The verdict on a filter from the averages of each run and the counts of the campaign.
 
     Each run gives one average of the pose NEES over time and one of NIS/dof, and runs are
     independent. Each average over the runs has an interval (`Spread`) of such a level, √0.95 with
@@ -55,11 +55,11 @@ def judge(
     innovations, so if a share ρ failed it, all from `truncated_chi2_mean`(ρ) to 1 is honest.
 
     optimistic: an interval lies above, covariances are claimed too small; pessimistic: below. If
-    the tests disagree, the NEES decides. consistent: neither rejects, which is no proof: `noticed`
-    says what would have been. undecided: under two runs have a NEES, or neither rejects, but an
-    average NEES of twice the honest one would not have been rejected either. incomplete: neither
-    rejects, but over half of the measurements that arrived were dropped. diverged: over half of the
-    runs are not finite or divergent.
+    the tests disagree, the NEES decides. consistent: neither rejects, which proves nothing:
+    `noticed` has the detectable averages. undecided: under two runs have a NEES, or neither
+    rejects, but an average NEES of twice the honest one would not have been rejected either.
+    incomplete: neither rejects, but over half of the measurements that arrived were dropped.
+    diverged: over half of the runs are not finite or divergent.
 
     An interval that lies within 1 % (`_TOLERANCE`) of the honest value rejects nothing: a nonlinear
     filter is never exactly honest, and enough runs would reject any. It changes nothing where the
@@ -68,20 +68,20 @@ def judge(
     Args:
         per_run: (runs,) nees_pose, nis_per_dof and unobservable, those that there are; NaN for a
             run without.
-        counts: runs, not_finite, divergent, and measurements by what became of them, as in
-            `Summary.counts`; what is absent counts as 0.
+        counts: runs, not_finite, divergent, and measurements by status, as in
+            `Summary.counts`; an absent count is 0.
         nis_dof: the degrees of freedom of all NIS together.
     """
     doubts, honest_nis = _doubts(per_run, counts), _after_gate(counts, nis_dof)
     lost = counts["not_finite"] + counts["divergent"]
     if lost > 0.5 * (counts["runs"] + counts["not_finite"]):
         return Verdict("diverged", (), {}, doubts, honest_nis)
-    there = {name: per_run[name] for name in TESTS if np.isfinite(per_run.get(name, ())).sum() > 1}
-    level = LEVEL ** (1 / max(len(there), 1))
+    tested = {name: per_run[name] for name in TESTS if np.isfinite(per_run.get(name, ())).sum() > 1}
+    level = LEVEL ** (1 / max(len(tested), 1))
     signs: dict[str, int] = {}
     noticed: dict[str, tuple[float, float]] = {}
     wide = True
-    for name, values in there.items():
+    for name, values in tested.items():
         of_nees = name == "nees_pose"
         found = spread(values, level, skewed=of_nees)
         assert found is not None
@@ -99,7 +99,7 @@ def judge(
 
 
 def power_of(noticed: Mapping[str, tuple[float, float]]) -> str:
-    """A phrase on what the campaign rejects with probability `POWER`; "" where nothing."""
+    """A phrase on the averages that the campaign rejects with probability `POWER`, or ""."""
     parts = []
     for name, (low, high) in noticed.items():
         beyond = [f"above {high:.3g}"] * bool(high < np.inf) + [f"below {low:.3g}"] * bool(low > 0)
@@ -109,7 +109,7 @@ def power_of(noticed: Mapping[str, tuple[float, float]]) -> str:
 
 
 def _side(found: Spread, low: float, high: float) -> int:
-    """The sign of a rejection: 1 for an interval above what is honest, -1 for one below, else 0."""
+    """The sign of a rejection: 1 for an interval above the honest value, -1 for below, else 0."""
     if found.low > high and found.high > high * (1 + _TOLERANCE):
         return 1
     return -1 if found.high < low and found.low < low / (1 + _TOLERANCE) else 0

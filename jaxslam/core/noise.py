@@ -33,7 +33,7 @@ class Constant:
 
 @record
 class Function:
-    """A plain function that returns a covariance; its numbers are no leaves."""
+    """A plain function that returns a covariance; its numbers are not leaves."""
 
     function: Callable[..., jax.Array] = static()
     owner: str = static()

@@ -24,7 +24,7 @@ def largest(*values: ArrayLike) -> float:
     return float(float(jnp.finfo(dtype).max) ** 0.2)
 
 
-def shape_told(value: ArrayLike) -> str:
+def shape_text(value: ArrayLike) -> str:
     """The shape of an array, or the type of anything else, for an error message."""
     try:
         shape = np.shape(value)
@@ -39,14 +39,14 @@ def shape_told(value: ArrayLike) -> str:
 def check_array(
     name: str, value: ArrayLike, shape: tuple[int | str, ...], kind: type = np.generic
 ) -> None:
-    """Raise ValueError unless an array has this shape, in which a letter stands for any number."""
-    got = shape_told(value)
-    there = np.shape(value) if got.startswith("(") else ()
-    if len(there) != len(shape) or any(
-        isinstance(n, int) and n != m for n, m in zip(shape, there, strict=True)
+    """Raise ValueError unless an array has this shape, in which a letter is any number."""
+    got = shape_text(value)
+    shape_of = np.shape(value) if got.startswith("(") else ()
+    if len(shape_of) != len(shape) or any(
+        isinstance(n, int) and n != m for n, m in zip(shape, shape_of, strict=True)
     ):
-        told = ", ".join(map(str, shape)) + "," * (len(shape) == 1)
-        raise ValueError(f"{name}: expected shape ({told}), got {got}")
+        expected = ", ".join(map(str, shape)) + "," * (len(shape) == 1)
+        raise ValueError(f"{name}: expected shape ({expected}), got {got}")
     if not hasattr(value, "dtype"):
         raise ValueError(f"{name}: expected an array, got a {type(value).__name__}")
     dtype = jnp.result_type(value)
@@ -64,7 +64,7 @@ def check_real(name: str, **values: Any) -> None:
         except (TypeError, ValueError):  # a key; rows of unlike lengths
             dtype = np.dtype(object)
         if not any(jnp.issubdtype(dtype, kind) for kind in (np.integer, np.floating, np.bool_)):
-            got = value if isinstance(value, str | tuple | list) else shape_told(value)
+            got = value if isinstance(value, str | tuple | list) else shape_text(value)
             raise ValueError(f"{name}: expected real numbers as {what}, got {got!s}")
 
 
@@ -77,8 +77,8 @@ def check_positive(name: str, **values: ArrayLike) -> None:
 
 
 def check_mount(name: str, mount: ArrayLike) -> None:
-    """Raise ValueError unless mount is a finite (3,); a tracer is checked for its shape alone."""
-    got = shape_told(mount if is_concrete(mount) else jnp.asarray(mount))
+    """Raise ValueError unless mount is a finite (3,); only the shape of a tracer is checked."""
+    got = shape_text(mount if is_concrete(mount) else jnp.asarray(mount))
     if got != "(3,)":
         raise ValueError(f"{name}: expected a mounting pose of shape (3,), got {got}")
     check_real(name, mount=mount)
@@ -87,7 +87,7 @@ def check_mount(name: str, mount: ArrayLike) -> None:
 
 
 def held_array(values: ArrayLike) -> ArrayLike:
-    """An array as given; numbers in lists or tuples as one, in float64 whatever JAX's default."""
+    """An array unchanged; numbers in lists or tuples as an array in float64."""
     if hasattr(values, "dtype"):
         return values
     if not is_concrete(values):
@@ -129,7 +129,7 @@ def check_covariance(name: str, cov: ArrayLike, size: int) -> None:
 
     Values are checked only where they are concrete; a tracer is checked for its shape alone.
     """
-    got = shape_told(cov)
+    got = shape_text(cov)
     if got != str((size, size)):
         raise ValueError(f"{name}: expected a covariance of shape ({size}, {size}), got {got}")
     if not is_concrete(cov):

@@ -57,7 +57,7 @@ def _lower(cls: type) -> str:
 
 
 class Component:
-    """What models, rules and filters share: a name, and a check of what a subclass defines."""
+    """The base of models, rules and filters: a name, and a check of a subclass's methods."""
 
     name: str
     """lower case, for tables, files and messages; by default that of the class"""
@@ -116,7 +116,7 @@ class Motion(Model):
 
     A subclass is a record (`core.record`) that declares controls and noises, has a field noise_cov,
     or a method of that name, and defines `step`. Raises ValueError, at construction, on a
-    covariance that is none, names that are no tuple of strings, or a missing method.
+    bad covariance, names other than a tuple of strings, or a missing method.
     """
 
     controls: tuple[str, ...]
@@ -165,7 +165,7 @@ class Sensor(Model):
     A subclass is a record (`core.record`) that declares measurements, has a field noise_cov, or a
     method of that name, and defines `observe` and `invert`; the rest has a default. It may have a
     field `mount`, and then observes from `frame(pose)`. Raises ValueError, at construction, on a
-    covariance or a mount that is none, names that are no tuple of strings, or a missing method.
+    bad covariance or mount, names other than a tuple of strings, or a missing method.
 
     An absolute sensor (a compass, a satellite receiver) has no landmark: l is (0,), invert and
     embed return (0,), position unused zeros, and K = 0. Each of its measurements
@@ -221,7 +221,7 @@ class Sensor(Model):
         return landmark[:2]
 
     def embed(self, pose: Pose, point: Point) -> Landmark:
-        """The landmark at a point, measured first from pose. By default zeros beside the point."""
+        """The landmark at a point, measured first from pose. By default zeros follow the point."""
         rest = max(len(self.landmark) - 2, 0)
         return jnp.concatenate([point, jnp.zeros(rest, point.dtype)]) if rest else point
 
@@ -263,7 +263,7 @@ class Basis(NamedTuple):
     cross: Float[Array, "L 3"]
     """∂l/∂dx."""
     landmark: Array | None
-    """(L, L) ∂l/∂dl; None says identity, without products."""
+    """(L, L) ∂l/∂dl; None is the identity, without products."""
 
 
 class Chart(Component):
@@ -274,7 +274,7 @@ class Chart(Component):
     """
 
     basis: Any = None
-    """(pose, l) -> the derivative of retract at zero; None says identity, without products."""
+    """(pose, l) -> the derivative of retract at zero; None is the identity, without products."""
     landmark_size: int | None = None
     """numbers L of the landmarks it acts on; None where any."""
 
@@ -298,7 +298,7 @@ class Here(NamedTuple):
     """The state at which a model is linearized, the input of a linearizer."""
 
     joint: Joint
-    """the filter's state, `joint.lin` being the linearizer's own memory"""
+    """the filter's state; `joint.lin` is the memory of the linearizer"""
     chart: Chart
     pose: Float[Array, "3"]
     """estimate of the robot"""
@@ -320,7 +320,7 @@ class Linearizer(Component):
     """
 
     euclidean: bool = False
-    """whether it is meant for the Euclidean chart and landmarks that are points (x, y) alone."""
+    """whether it works only in the Euclidean chart with landmarks that are points (x, y)."""
     iterates: bool = True
     """whether a correction may linearize again at its result; a fit to a covariance may not."""
     own_landmarks: bool = False
@@ -369,7 +369,7 @@ class Pairs(NamedTuple):
     log_det: Float[Array, "M N"]
     """log |S_ij|."""
     possible: Bool[Array, "M N"]
-    """measurement and landmark are there, and S_ij is positive definite."""
+    """measurement and landmark exist, and S_ij is positive definite."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -392,7 +392,7 @@ class Association(NamedTuple):
     """The landmark slot of each measurement of a scan."""
 
     slot: Int[Array, "M"]
-    """-1 where none; no slot twice."""
+    """-1 without a landmark; no slot twice."""
     is_new: Bool[Array, "M"]
     """starts a landmark. A valid measurement that is neither is ignored, and counted."""
     exhausted: Array | bool = False
@@ -456,8 +456,8 @@ class Filter(Component):
     square_root: bool = False
     """whether its state is a `slots.Joint` with a root of the covariance."""
     landmark: tuple[str, ...] = ()
-    """what a landmark of its `slots.Joint` holds, with units, as `Sensor.landmark`; () where its
-    state is none."""
+    """the entries of a landmark of its `slots.Joint`, with units, as `Sensor.landmark`; () for
+    another state."""
     linearized: Any = None
     """the `LinearizedSteps` of a filter whose steps return the linear system they use."""
 

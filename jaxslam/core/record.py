@@ -29,7 +29,7 @@ def record(cls: type[_T]) -> type[_T]:
 
     Fields are checked where a record is made by its class: values in a method `__post_init__`,
     where the class has one, and then kinds here. JAX rebuilds records without any check, since it
-    fills them with whatever a transformation needs: tracers, stacks, derivatives.
+    fills them with the values of a transformation: tracers, stacks, derivatives.
 
     Raises ValueError, at construction, on a field of another kind.
     """
@@ -48,7 +48,7 @@ def record(cls: type[_T]) -> type[_T]:
         _check_kinds(self)
 
     cls.__post_init__ = __post_init__  # type: ignore[attr-defined]
-    # A repr of its own is kept by subclasses; that of the fields is made anew.
+    # A custom repr is kept by subclasses; that of the fields is made for each class.
     of_fields = cls.__repr__ in (object.__repr__, getattr(cls, "_repr_of_fields", None))
     made = dataclasses.dataclass(frozen=True, eq=False, repr=of_fields)(cls)
     if of_fields:
@@ -113,7 +113,7 @@ class Function:
 
 
 def as_record(value: Any) -> Any:
-    """The value where it is a record, else the `Function` that it is."""
+    """The value if it is a record, else its `Function`."""
     return value if is_record(value) else Function(value)
 
 
@@ -140,7 +140,7 @@ def _check_kinds(of: Any) -> None:
 
 
 def _check_static(where: str, value: Any) -> None:
-    """Check that a value cannot change and holds no numbers of its own to differentiate by."""
+    """Check that a value cannot change and holds no numbers to differentiate by."""
     if isinstance(value, tuple | frozenset):
         for each in value:
             _check_static(where, each)

@@ -64,8 +64,8 @@ def empty(
 def find(
     tag: Int[Array, "N"], alive: Bool[Array, "N"], wanted: Int[Array, "M"]
 ) -> tuple[Int[Array, "M"], Bool[Array, "M"]]:
-    """The slot (M,) of each wanted tag (M,), 0 where none, and whether there is one (M,)."""
-    return where_set((wanted[:, None] == tag[None, :]) & alive[None, :])
+    """The slot (M,) of each wanted tag (M,), 0 without one, and a mask of the slots found (M,)."""
+    return last_true_column((wanted[:, None] == tag[None, :]) & alive[None, :])
 
 
 def allocate(
@@ -78,12 +78,12 @@ def allocate(
     free = ~alive
     rank_of_slot = jnp.where(free, jnp.cumsum(free), 0)
     rank_of_wish = jnp.where(wanted, jnp.cumsum(wanted), -1)
-    return where_set(rank_of_wish[:, None] == rank_of_slot[None, :])
+    return last_true_column(rank_of_wish[:, None] == rank_of_slot[None, :])
 
 
-def where_set(match: Bool[Array, "M N"]) -> tuple[Int[Array, "M"], Bool[Array, "M"]]:
-    """The last column in which each row (M, N) bool is set, 0 where none, (M,) int32; and whether
-    there is one (M,). One pass, instead of two by `argmax` and `any`.
+def last_true_column(match: Bool[Array, "M N"]) -> tuple[Int[Array, "M"], Bool[Array, "M"]]:
+    """The last column (M,) int32 in which each row (M, N) bool is set, 0 without one, and a mask of
+    the rows with one (M,). One pass, instead of two by `argmax` and `any`.
     """
     # Over the leading axis XLA takes maxima of whole rows.
     at = jnp.where(match.T, jnp.arange(match.shape[1], dtype=jnp.int32)[:, None], -1)
@@ -91,7 +91,7 @@ def where_set(match: Bool[Array, "M N"]) -> tuple[Int[Array, "M"], Bool[Array, "
     return jnp.maximum(at, 0), at >= 0
 
 
-def concerned(slot: Int[Array, "M"], on: Bool[Array, "M"], count: int) -> Bool[Array, "N"]:
+def slot_mask(slot: Int[Array, "M"], on: Bool[Array, "M"], count: int) -> Bool[Array, "N"]:
     """Mask (count,) of the slots that occur in slot (M,) where on (M,)."""
     return jnp.zeros(count, bool).at[jnp.where(on, slot, count)].set(True, mode="drop")
 
@@ -119,8 +119,8 @@ def local_cov(joint: Joint, slot: Int[Array, ""], square_root: bool = False) -> 
 
 def _local_block(rows: Float[Array, "k D"], slot: Int[Array, ""], size: int) -> Float[Array, "k K"]:
     """The columns of the robot and of the landmark (size L) of a slot (), of rows (k, D)."""
-    own = jax.lax.dynamic_slice_in_dim(rows, 3 + slot * size, size, axis=1)
-    return jnp.concatenate([rows[:, :3], own], axis=1)
+    landmark = jax.lax.dynamic_slice_in_dim(rows, 3 + slot * size, size, axis=1)
+    return jnp.concatenate([rows[:, :3], landmark], axis=1)
 
 
 def scatter(
@@ -151,19 +151,21 @@ def scatter(
     if m == 0:
         return joint
     # By slot: the index it is filled from. Whole passes over P are cheaper than scattered writes.
-    place, born = where_set(granted[None, :] & (slot[None, :] == jnp.arange(capacity)[:, None]))
+    place, born = last_true_column(
+        granted[None, :] & (slot[None, :] == jnp.arange(capacity)[:, None])
+    )
 
     def of_slots(values: jax.Array) -> jax.Array:
         mask = born.reshape(-1, *(1,) * (values.ndim - 1))
         return jnp.where(mask, values[place], jnp.zeros_like(values[:1]))
 
     gain = of_slots(by_pose).reshape(capacity * size, 3)
-    own = of_slots(symmetrize(own_cov))
+    diagonal = of_slots(symmetrize(own_cov))
     # Padding's unit variance goes first, to an exact zero: a small covariance plus 1 would lose it.
     filled = jnp.concatenate([jnp.zeros(3, bool), jnp.repeat(born, size)])
     cov = jnp.where(filled[:, None], 0.0, joint.cov)
     if square_root:
-        root = jax.vmap(lambda cov: cholesky(cov)[0])(own)
+        root = jax.vmap(lambda cov: cholesky(cov)[0])(diagonal)
         cov = cov.at[3:].add(total(gain[:, k, None] * joint.cov[None, k] for k in range(3)))
         cov = _add_blocks(cov, root)
     else:
@@ -173,7 +175,7 @@ def scatter(
         cross = total(gain[:, k, None] * half[k, None, :] for k in range(3))
         cross = materialize(jnp.pad(cross, [(3, 0), (0, 0)]))
         cov = cov + (cross + cross.T)
-        cov = _add_blocks(cov, own)
+        cov = _add_blocks(cov, diagonal)
     return joint._replace(
         landmarks=joint.landmarks + of_slots(landmarks),
         cov=cov,
@@ -192,9 +194,9 @@ def _add_blocks(cov: Float[Array, "D D"], blocks: Float[Array, "N L L"]) -> Floa
 def remove(joint: Joint, dead: Array, *, square_root: bool = False) -> Joint:
     """The joint with the landmarks of the slots dead (N,) bool marginalized out and the slots free.
 
-    In covariance form the marginal is what is left when rows and columns are dropped (Solà Table 1,
+    In covariance form the marginal is P without the rows and columns (Solà Table 1,
     state reduction); here they are overwritten with padding. Removing a dead slot changes nothing.
-    square_root: the state holds a root of P, as of a filter with covariance="square_root".
+    square_root: the state holds a root of P, as in a filter with covariance="square_root".
 
     Raises ValueError unless dead is bool, one for each slot.
     """

@@ -96,7 +96,7 @@ class Log(NamedTuple):
         motion: PyTree,
         sensor: PyTree,
     ) -> "Recording":
-        """The log of lines of odometry and measurements, each with times of its own.
+        """The log of lines of odometry and measurements, each with its times.
 
             log, time, tags, dropped = Log.from_records(odometry, measurements, motion, sensor)
 
@@ -116,7 +116,7 @@ class Log(NamedTuple):
         Args:
             motion, sensor: the models.
         Raises:
-            ValueError: with row and column, on a missing column, a value that is no finite number,
+            ValueError: with row and column, on a missing column, a value that is not a finite number,
                 times that go back (of odometry: or repeat), a tag twice at a time, or more
                 measurements at a time than the suite has slots.
         """
@@ -154,7 +154,7 @@ class Log(NamedTuple):
         seen = []
         for what, model, table, places in given:
             columns = tables.measurement_columns(model.measurements, model.landmark)
-            made = tables.columns_of(what, table, lambda _, own=columns: own)  # type: ignore[misc]
+            made = tables.columns_of(what, table, lambda _, columns=columns: columns)  # type: ignore[misc]
             seen.append(tables.Seen(made, model.measurements, places))
         rows, tags, dropped = tables.align_tables(moved, seen, controls)
         return Recording(cls.from_rows(rows), rows.time, tags, dropped)
@@ -189,7 +189,7 @@ class Truth(NamedTuple):
 
 
 class Estimate(NamedTuple):
-    """Means and marginal covariances in map coordinates, whatever the filter's chart."""
+    """Means and marginal covariances in map coordinates, for any chart of the filter."""
 
     pose: Float[JaxOrNumPy, "3"]
     """x [m], y [m], θ [rad] in (-π, π]."""
@@ -221,9 +221,9 @@ class Info(NamedTuple):
     log_likelihood: Float[Array, ""]
     """Σ log N(innovation; 0, S) over fused measurements."""
     exhausted: Bool[Array, ""] | None = None
-    """the search for the best association ended at its budget; None where there is no search"""
+    """the search for the best association ended at its budget; None without a search"""
     extra: dict[str, PyTree] | None = None
-    """records of one family or wrapper of filters alone, by name, as
+    """records of a family or wrapper of filters, by name, as
     "particles" for a `filters.ParticleInfo`."""
 
     @property
@@ -237,14 +237,14 @@ class Info(NamedTuple):
 
 
 class Trace(NamedTuple):
-    """The result of `run`: the log of a run's estimates, and what the filter says of each step."""
+    """The result of `run`: the estimates of a run, and the report of each step."""
 
     estimate: Estimate
     """with leading T, after each update."""
     info: Info
     """with leading T."""
     final: PyTree
-    """the filter's own state at the end."""
+    """the filter's state at the end."""
     probe: PyTree
     """results of the caller's probe after each update, leading T; None without one."""
 
@@ -252,7 +252,7 @@ class Trace(NamedTuple):
 class Beams(NamedTuple):
     """A scan of a laser: B beams, in the frame of its mount.
 
-    What a range says, everywhere in the package (`returns`):
+    The meaning of a range, everywhere in the package (`returns`):
 
     | range [m] | meaning |
     |---|---|
@@ -266,7 +266,7 @@ class Beams(NamedTuple):
     angle: Float[JaxOrNumPy, "B"]
     """direction of each beam [rad], counter-clockwise from the x axis"""
     valid: Bool[JaxOrNumPy, "B"]
-    """false for a beam that says nothing: a dropout or padding. A beam that met nothing has the
+    """false for a beam without information: a dropout or padding. A beam that met nothing has the
     laser's maximum range, and is valid."""
 
     def returns(
@@ -274,7 +274,8 @@ class Beams(NamedTuple):
     ) -> tuple[Bool[JaxOrNumPy, "*n"], Bool[JaxOrNumPy, "*n"]]:
         """Which beams met an obstacle nearer than max_range [m], and which met none up to there.
 
-        The others say nothing, as does a range of min_range or less. See the table of `Beams`.
+        The others have no information, nor has a range of min_range or less. See the table of
+        `Beams`.
         """
         with np.errstate(invalid="ignore"):  # comparisons with NaN, which are false
             says = (self.range > min_range) & (self.valid != 0)

@@ -47,7 +47,7 @@ def status_of(
     sees it, and one that concerns a robot without a pose in the map is UNMATCHED (`TeamSlam`).
 
     Args:
-        valid: there is a measurement.
+        valid: mask of the measurements of the scan.
         matched: association found its landmark (or it is of an absolute sensor); wins over new.
         positive: S is positive definite, alone and with those of the scan that are fused with it,
             and so is whatever the filter needs to compute S.
@@ -173,8 +173,8 @@ def seen_before(tag: jax.Array, among: jax.Array) -> jax.Array:
 def with_extra(info: Info, name: str, record: PyTree) -> Info:
     """The `Info` with a named record of one filter family or wrapper.
 
-    A campaign counts what the record's method `counts` returns, if it has one: arrays by name, the
-    sums of which over the steps are the counts.
+    A campaign counts what the record's method `counts` returns, if it has one: arrays by name,
+    whose sums over the steps are the counts.
     """
     return info._replace(extra={**(info.extra or {}), name: record})
 

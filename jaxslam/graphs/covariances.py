@@ -32,7 +32,7 @@ from jaxslam.graphs.validation import check_graph, label
 
 
 class Marginals(NamedTuple):
-    """Covariances of a graph's variables, zero for what is fixed; leading axes by `vmap`."""
+    """Covariances of a graph's variables, zero for fixed ones; leading axes by `vmap`."""
 
     poses: Float[Array, "N 3 3"]
     """of (x, y, θ), in world coordinates as the poses themselves"""
@@ -80,7 +80,7 @@ def marginals(
         )
     model = model_of(caller, solution.graph, factors)
     check_graph(caller, solution.graph, model.factors)
-    graph = _weighted(solution)
+    graph = _weighted_tables(solution)
     wanted = checked_pairs(caller, pairs, len(graph.poses) + len(graph.points))
     if plan is None and is_concrete(graph):
         more = padded_graph(graph, room)
@@ -100,7 +100,7 @@ def marginals(
     return found
 
 
-def _weighted(solution: Solution) -> Graph:
+def _weighted_tables(solution: Solution) -> Graph:
     """The graph of a solution, each information multiplied by the weight of its row."""
     array = np.asarray if is_concrete(solution) else jnp.asarray  # no program for each shape
     tables = {
@@ -114,46 +114,46 @@ def _weighted(solution: Solution) -> Graph:
 
 @partial(jax.jit, inline=True)
 def _marginals(model: Model, graph: Graph, plan: Plan) -> Marginals:
-    return over_batch("graphs.marginals", _inverted)((model, plan), graph_in_one_dtype(graph))
+    return over_batch("graphs.marginals", _invert)((model, plan), graph_in_one_dtype(graph))
 
 
-def _inverted(model: Model, plan: Plan, graph: Graph) -> Marginals:
+def _invert(model: Model, plan: Plan, graph: Graph) -> Marginals:
     """Of graphs with a last axis B."""
     assert plan.inverse is not None
     data, variables = data_of(graph, plan.column), variables_of(graph)
     system = linearize(model, plan, variables, data)
     factored = factorize(plan.cholesky, system.blocks)
     blocks = selected_inverse(plan.inverse, factored)
-    own = blocks[plan.inverse.diagonal[plan.column]]  # by variable
-    own = _masked(own, *[data.free[plan.column]] * 2)
+    diagonal = blocks[plan.inverse.diagonal[plan.column]]  # by variable
+    diagonal = _mask(diagonal, *[data.free[plan.column]] * 2)
     poses, size = len(graph.poses), graph.points.shape[1]
     width = data.free.shape[1]
     turn = _turns(graph, width)
-    own = by_transposed(by(turn, own), turn)
+    diagonal = by_transposed(by(turn, diagonal), turn)
     first, second = plan.pairs[:, 0], plan.pairs[:, 1]
     cross = blocks[plan.inverse.pairs]
     turned = plan.inverse.turned[:, None, None, None]
     cross = jnp.where(turned, jnp.swapaxes(cross, 1, 2), cross)
-    cross = _masked(cross, data.free[plan.column[first]], data.free[plan.column[second]])
+    cross = _mask(cross, data.free[plan.column[first]], data.free[plan.column[second]])
     cross = by_transposed(by(turn[first], cross), turn[second])
     joint = jnp.stack(
         [
-            jnp.stack([own[first], cross], axis=1),
-            jnp.stack([jnp.swapaxes(cross, 1, 2), own[second]], axis=1),
+            jnp.stack([diagonal[first], cross], axis=1),
+            jnp.stack([jnp.swapaxes(cross, 1, 2), diagonal[second]], axis=1),
         ],
         axis=1,
     )
     regular = factored.regular
     culprit = plan.order[jnp.argmin(regular, axis=0)].astype(jnp.int32)
     return Marginals(
-        poses=own[:poses, :3, :3],
-        points=own[poses:, :size, :size],
+        poses=diagonal[:poses, :3, :3],
+        points=diagonal[poses:, :size, :size],
         pairs=joint,
         singular=jnp.where(regular.all(axis=0), -1, culprit).astype(jnp.int32),
     )
 
 
-def _masked(
+def _mask(
     blocks: Float[Array, "k d d B"], rows: Bool[Array, "k d B"], columns: Bool[Array, "k d B"]
 ) -> Float[Array, "k d d B"]:
     return jnp.where(rows[:, :, None] & columns[:, None], blocks, 0.0)

@@ -68,7 +68,7 @@ class Factor(Component):
 
     A subclass is a record (`core.record`) that declares variables, measurements and errors, and
     defines `residual`. Raises ValueError, at construction, where one of these is missing, on names
-    that are no tuple of strings, and on a kind of variable that graphs do not have.
+    other than a tuple of strings, and on an unknown kind of variable.
     """
 
     variables: tuple[str, ...]
@@ -76,7 +76,7 @@ class Factor(Component):
     measurements: tuple[str, ...]
     """what z holds, with units; its length is Z"""
     errors: tuple[str, ...]
-    """what the residual holds, with units; its length is R"""
+    """the entries of the residual, with units; its length is R"""
     jacobians: Any = None
     """(variables, z) -> by the coordinates of each variable, (R, 3) or (R, L); hand-derived, to
     verify against"""
@@ -269,12 +269,12 @@ class FromMotion(_OfMotion):
 
         e = w with step(x, u, w) = x', z = u
 
-    The cost wᵀ Q⁻¹ w is the one of `smoothing.BatchMap`. The pose error of the nominal motion with
+    The cost wᵀ Q⁻¹ w is that of `smoothing.BatchMap`. The pose error of the nominal motion with
     the covariance G Q Gᵀ, G = ∂step/∂w at w = 0, is the same to first order in w, and exactly
     where step is affine in w; its optimum is another elsewhere. w is found by Newton's method from
     w = 0: ten steps without derivatives, then two with them, whose error is of the fourth order in
     a change of the poses, so derivatives up to the third are those of w. Where ∂step/∂w is
-    singular (a robot that stands still, with `Odometry`) a step is not taken.
+    singular (a robot at rest, with `Odometry`) no step is made.
 
     Raises ValueError unless the noise has three components, which the two poses determine; see
     `NominalMotion`.

@@ -14,7 +14,7 @@ from jaxtyping import Bool, Float, Int
 from jaxslam.core.types import JaxOrNumPy
 
 LOOPS = "relative_pose/loops"
-"""Loop edges in a table of their own, so that they can have a robust kernel."""
+"""The key of a separate table of loop edges, which can have a robust kernel."""
 
 TRUSTED = ("relative_pose", "prior")
 """Tables without a robust kernel where loops are doubted: odometry and priors."""
@@ -26,7 +26,7 @@ class Table(NamedTuple):
     who: Int[JaxOrNumPy, "E K"]
     """the variables of a row: indices of poses or points, as the factor's `variables` says"""
     z: Float[JaxOrNumPy, "E Z"]
-    """what was measured"""
+    """the measurement"""
     information: Float[JaxOrNumPy, "E R R"]
     """Ω, the inverse of the residual's covariance; symmetric, positive semidefinite"""
     valid: Bool[JaxOrNumPy, "E"]
@@ -36,12 +36,12 @@ class Table(NamedTuple):
 class Graph(NamedTuple):
     """A graph of N poses and P points (or landmarks of L numbers); leading axes by `vmap`.
 
-    The factor of a table stands in a dictionary of the same keys beside the graph, since data hold
+    The factor of a table is in a separate dictionary with the same keys, because data hold
     no functions: `graphs.REGISTRY` has those of files.
     """
 
     poses: Float[JaxOrNumPy, "N 3"]
-    """(x, y, θ); θ is wrapped where it was computed, and as it stands in a file"""
+    """(x, y, θ); a computed θ is wrapped, and one from a file is unchanged"""
     points: Float[JaxOrNumPy, "P L"]
     tables: dict[str, Table]
     fixed_pose: Bool[JaxOrNumPy, "N"]
@@ -54,7 +54,7 @@ class Graph(NamedTuple):
 
 
 def ranks(graph: Graph) -> Int[np.ndarray, "N"]:
-    """The place of each pose in the order of the ids, whatever the order of the poses is."""
+    """The place of each pose in the order of the ids."""
     return np.argsort(np.argsort(np.asarray(graph.pose_id), kind="stable"))
 
 
@@ -107,7 +107,7 @@ def read(path: str | Path) -> Graph:
     `VERTEX_ELLIPSE`) and offsets of sensors (`PARAMS_SE2OFFSET`, to which no edge that is read
     refers) are skipped; `datasets.g2o.load` counts them. In a file without vertices, poses
     and points have the order of their ids and are placed along the edges, `starts.odometry`. The
-    cost of what is read is χ² = Σ eᵀ Ω e, with e as `graphs.REGISTRY` has it and no factor ½.
+    cost of the graph is χ² = Σ eᵀ Ω e, with e from `graphs.REGISTRY` and without a factor ½.
 
     Kümmerle et al. 2011, "g2o: A general framework for graph optimization", ICRA; Grisetti et al.
     2007, "A tree parameterization for efficiently computing maximum likelihood maps using gradient
@@ -115,7 +115,7 @@ def read(path: str | Path) -> Graph:
 
     Raises:
         ValueError: `path:line: reason` for an unknown or malformed line, a vertex that occurs
-            twice, an edge to a vertex that is nowhere or from one to itself, and an information
+            twice, an edge to a missing vertex or from one to itself, and an information
             that is not positive semidefinite.
     """
     from jaxslam.datasets import g2o
@@ -127,13 +127,13 @@ def write(path: str | Path, graph: Graph) -> None:
     """Write a graph as a file that `read` reads as the same graph, number by number.
 
     The format is g2o; in a file that ends in .toro or .graph it is TORO, which has lines for poses
-    and relative poses alone. A file that ends in .gz, after that, is packed by gzip.
+    and relative poses. A file that ends in .gz, after that, is packed by gzip.
 
     Poses, points, the tables in their order, then `FIX`, at which GTSAM's reader stops. Rows that
     are not valid are left out. A table "name/part" is written as the table "name", and read as
     part of it.
 
-    Raises ValueError, before anything is written, on what the format has no line for: in TORO
+    Raises ValueError, before anything is written, on data without a line in the format: in TORO
     points, fixed poses, and tables other than relative poses; in g2o tables that `read` does not
     name and points of other than two numbers. In both on an id of both a pose and a point, and on
     what `read` refuses: ids twice or below zero, numbers that are not finite, and informations that

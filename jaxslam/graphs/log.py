@@ -70,7 +70,7 @@ def of_log(
     Raises:
         ValueError: on models, a log or a covariance that do not fit, and at the row where a motion
             or a measurement has a singular noise, or a noise does not move the pose in all
-            directions (a robot that stands still, with `Odometry`).
+            directions (a robot at rest, with `Odometry`).
     """
     name = "graphs.of_log"
     validation.check_models(name, motion, sensor)
@@ -126,39 +126,43 @@ def _points_of(
 ) -> tuple[JaxOrNumPy, JaxOrNumPy, Int[np.ndarray, "P"]]:
     """The point of each measurement, whether it is used, and the tags of the points."""
     given = log.scan.tag if tags is None else tags
-    asked: JaxOrNumPy = given if isinstance(given, Array) else np.asarray(given)
+    requested: JaxOrNumPy = given if isinstance(given, Array) else np.asarray(given)
     valid = log.scan.valid
     if not sensor.landmark:
         return log.scan.tag * 0, valid, np.zeros(0, np.int32)
-    if np.shape(asked) != np.shape(valid):
-        raise ValueError(f"{name}: expected tags of shape {np.shape(valid)}, got {np.shape(asked)}")
-    if not jnp.issubdtype(asked.dtype, np.integer):
-        raise ValueError(f"{name}: expected tags to be integers, got {asked.dtype}")
-    if is_concrete(asked) and is_concrete(valid):
-        unknown = np.asarray(valid) & (np.asarray(asked) < 0)
+    if np.shape(requested) != np.shape(valid):
+        raise ValueError(
+            f"{name}: expected tags of shape {np.shape(valid)}, got {np.shape(requested)}"
+        )
+    if not jnp.issubdtype(requested.dtype, np.integer):
+        raise ValueError(f"{name}: expected tags to be integers, got {requested.dtype}")
+    if is_concrete(requested) and is_concrete(valid):
+        unknown = np.asarray(valid) & (np.asarray(requested) < 0)
         if tags is None and unknown.any():
             row, place = np.argwhere(unknown)[0]
             raise ValueError(
                 f"{name}: the measurement of row {row}, slot {place} has no identity: give tags= "
                 "of an association"
             )
-        high = np.asarray(valid) & (np.asarray(asked) >= (2**31 if capacity is None else capacity))
+        high = np.asarray(valid) & (
+            np.asarray(requested) >= (2**31 if capacity is None else capacity)
+        )
         if high.any():
             raise ValueError(
                 f"{name}: expected tags below {capacity}, the capacity, got "
-                f"{np.asarray(asked)[high][0]}"
+                f"{np.asarray(requested)[high][0]}"
             )
     elif capacity is None:
         raise ValueError(f"{name}: expected capacity, the number of points, of a traced log")
     if capacity is not None:
         validation.check_count(f"{name}: capacity", capacity)
-        used = valid & (asked >= 0)
-        return asked * used, used, np.arange(capacity, dtype=np.int32)
-    here = np.asarray(valid) & (np.asarray(asked) >= 0)
-    ids = np.unique(np.asarray(asked)[here]).astype(np.int32)
+        used = valid & (requested >= 0)
+        return requested * used, used, np.arange(capacity, dtype=np.int32)
+    here = np.asarray(valid) & (np.asarray(requested) >= 0)
+    ids = np.unique(np.asarray(requested)[here]).astype(np.int32)
     if not len(ids):
         raise ValueError(f"{name}: the log has no measurement of a landmark")
-    return np.where(here, np.searchsorted(ids, asked), 0).astype(np.int32), here, ids
+    return np.where(here, np.searchsorted(ids, requested), 0).astype(np.int32), here, ids
 
 
 @partial(jax.jit, static_argnames="known", inline=True)
@@ -196,12 +200,12 @@ def _graph_of(
     else:
         of_motion = jax.vmap(_local, (0, 0, 0, None))(path[1:], by_noise, of_motion, slack)
     of_sensor = jax.vmap(jax.vmap(sensor.noise_cov))(z)
-    # The prior's error is turned into the frame of its mean, in which the factor has it.
+    # The prior's error is rotated into the frame of its mean, as the factor needs it.
     turned = jnp.eye(3, dtype=kind).at[:2, :2].set(se2.rotation(pose[2]))
     q, q_regular = jax.vmap(_information)(of_motion)
     r, r_regular = jax.vmap(jax.vmap(_information))(of_sensor)
     p, p_regular = _information(turned.T @ pose_cov.astype(kind) @ turned)
-    points, seen = _placed(sensor, path[1:], z, index, valid, ids.shape[0])
+    points, seen = _place_poses(sensor, path[1:], z, index, valid, ids.shape[0])
 
     count = jnp.arange(path.shape[0], dtype=jnp.int32)
     rows = jnp.repeat(count[1:], valid.shape[1])
@@ -240,7 +244,7 @@ def _local(
 
 
 def _moving(by_noise: Float[Array, "T 3 3"]) -> Bool[Array, "T"]:
-    """Whether matrices are regular, whatever the lengths of their columns."""
+    """Whether matrices are regular, for any lengths of their columns."""
     length = jnp.linalg.norm(by_noise, axis=1, keepdims=True)
     a, b, c = jnp.moveaxis(by_noise / jnp.where(length > 0, length, 1.0), 2, 0)
     return jnp.abs((a * jnp.cross(b, c)).sum(axis=1)) > _STILL
@@ -252,7 +256,7 @@ def _information(cov: Float[Array, "R R"]) -> tuple[Float[Array, "R R"], Bool[Ar
     return linalg.symmetrize(inverse), regular
 
 
-def _placed(
+def _place_poses(
     sensor: Sensor,
     path: Float[Array, "T 3"],
     z: Float[Array, "T M Z"],

@@ -1,6 +1,6 @@
 """A certificate of global optimality: a lower bound of the chordal cost of a pose graph.
 
-It is of the dual matrix of that cost, whose least eigenvalue is found by the solver of graphs.
+It uses the dual matrix of that cost, whose least eigenvalue the solver of graphs computes.
 """
 
 from collections.abc import Mapping
@@ -115,8 +115,8 @@ def dual(
             for i in range(size)
         )
         blocks.append(product.reshape(rows * k * k, 4, 4, batch))
-    own = summed(plan.gradient, jnp.concatenate(gradients))[plan.column]
-    multipliers = (own[:poses, 2:] * z[:poses, 2:]).sum(axis=1)
+    by_variable = summed(plan.gradient, jnp.concatenate(gradients))[plan.column]
+    multipliers = (by_variable[:poses, 2:] * z[:poses, 2:]).sum(axis=1)
     every = jnp.concatenate([multipliers, jnp.zeros((count - poses, batch), dtype)])
     unit = jnp.eye(4, dtype=dtype)[None, ..., None]
     turn = unit * jnp.array([0.0, 0.0, 1.0, 1.0], dtype)[None, None, :, None]
@@ -127,29 +127,29 @@ def dual(
     return out - turns * every[plan.order][plan.block_column][:, None, None], multipliers, turns
 
 
-_SHARE = 1e-6
-"""The gap that is tried first, relative to χ² + 1."""
+_FIRST_GAP = 1e-6
+"""The first gap, relative to χ² + 1."""
 
-_ENOUGH = 1e-5
-"""The gap that counts as none."""
+_NEGLIGIBLE_GAP = 1e-5
+"""The gap that counts as zero."""
 
 _POWERS = 100
 """iterations for the smallest eigenvalue"""
 
 
 class Certificate(NamedTuple):
-    """What is proved of a pose graph's optimum; leading axes by `vmap`.
+    """The certificate of a pose graph's optimum; leading axes by `vmap`.
 
-    The proof is of the chordal cost with isotropic weights, Σ τ |t_j - t_i - R_i t|² + κ |R_j - R_i
-    R|²/2. Of the graph's own cost nothing is proved: `position` and `heading` say how far the two
-    optima are apart. Where they are close, and the surrogate's is global, another minimum of the
-    graph's own cost that is lower would have to have a higher chordal cost.
+    The proof is for the chordal cost with isotropic weights, Σ τ |t_j - t_i - R_i t|² + κ |R_j -
+    R_i R|²/2. It proves nothing about the cost of the graph: `position` and `heading` are the
+    distances of the two optima. If they are close, and the surrogate's is global, a lower minimum
+    of the graph's cost would have a higher chordal cost.
     """
 
     certified: Bool[Array, ""]
     """the optimum of the surrogate that was found is its global one, up to `gap`"""
     gap: Float[Array, ""]
-    """what is proved: no poses have a chordal cost below `chi2 - gap`"""
+    """proved: no poses have a chordal cost below `chi2 - gap`"""
     smallest: Float[Array, ""]
     """the smallest eigenvalue of the dual matrix, about 0 where certified: the optimum itself is
     its eigenvector"""
@@ -216,7 +216,7 @@ def certificate(
     return proved
 
 
-def _held(model: Model, plan: Plan, graph: Graph) -> Bool[Array, "N *B"]:
+def _hold(model: Model, plan: Plan, graph: Graph) -> Bool[Array, "N *B"]:
     """The poses that are fixed or have a prior."""
     held = jnp.asarray(graph.fixed_pose)
     for name, factor in model.factors.items():
@@ -227,13 +227,13 @@ def _held(model: Model, plan: Plan, graph: Graph) -> Bool[Array, "N *B"]:
 
 @partial(jax.jit, inline=True)
 def _certificate(model: Model, graph: Graph, plan: Plan) -> Certificate:
-    return over_batch("graphs.certificate", _proved)((model, plan), graph_in_one_dtype(graph))
+    return over_batch("graphs.certificate", _prove)((model, plan), graph_in_one_dtype(graph))
 
 
-def _proved(model: Model, plan: Plan, graph: Graph) -> Certificate:
+def _prove(model: Model, plan: Plan, graph: Graph) -> Certificate:
     """Of graphs with a last axis B."""
     poses, dtype = len(graph.poses), graph.poses.dtype
-    held = _held(model, plan, graph)
+    held = _hold(model, plan, graph)
     tables = {}
     for name, factor in model.factors.items():
         table = graph.tables[name]
@@ -250,7 +250,7 @@ def _proved(model: Model, plan: Plan, graph: Graph) -> Certificate:
     value = found.chi2
     bound = multipliers.sum(axis=0)
     margin = jnp.maximum(
-        _SHARE * (value + 1.0) / poses, 16 * jnp.finfo(dtype).eps * blocks.max((0, 1, 2))
+        _FIRST_GAP * (value + 1.0) / poses, 16 * jnp.finfo(dtype).eps * blocks.max((0, 1, 2))
     )
 
     def shifted(shift: Array) -> Array:
@@ -290,7 +290,7 @@ def _proved(model: Model, plan: Plan, graph: Graph) -> Certificate:
     away = found.graph.poses - graph.poses
     turned = jnp.arctan2(jnp.sin(away[:, 2]), jnp.cos(away[:, 2]))
     return Certificate(
-        certified=good & (gap <= _ENOUGH * (value + 1.0)),
+        certified=good & (gap <= _NEGLIGIBLE_GAP * (value + 1.0)),
         gap=jnp.where(good, gap, jnp.inf),
         smallest=smallest,
         chi2=value,

@@ -1,6 +1,6 @@
 """The optimum of a graph, by Levenberg-Marquardt on sparse blocks, and its squared residuals.
 
-Derivatives of the optimum by what it depends on are those of implicit differentiation.
+Derivatives of the optimum are by implicit differentiation.
 """
 
 from collections.abc import Mapping
@@ -49,7 +49,7 @@ def squared_residuals(
     degrees of freedom. factors, room: as for `optimize`.
     """
     factors = factors_of("graphs.squared_residuals", graph, factors)
-    found = _squared(factors, padded_graph(graph, room) if is_concrete(graph) else graph)
+    found = _squared_of(factors, padded_graph(graph, room) if is_concrete(graph) else graph)
     return {key: cut(square, graph.tables[key].valid) for key, square in found.items()}
 
 
@@ -64,7 +64,7 @@ def degrees_of_freedom(graph: Graph, factors: Mapping[str, Factor] | None = None
 
 
 @partial(jax.jit, inline=True)
-def _squared(factors: dict[str, Factor], graph: Graph) -> dict[str, Float[Array, "E"]]:
+def _squared_of(factors: dict[str, Factor], graph: Graph) -> dict[str, Float[Array, "E"]]:
     found = {}
     for key, factor in factors.items():
         table = graph.tables[key]
@@ -93,8 +93,8 @@ def followed(model: Model, plan: Plan, graph: Graph, found: Solution) -> Solutio
     still = jax.lax.stop_gradient((found.graph.poses, found.graph.points))
     poses = jnp.where(graph.fixed_pose[:, None], graph.poses, still[0])
     points = jnp.where(graph.fixed_point[:, None], graph.points, still[1])
-    there = with_batch(graph._replace(poses=poses, points=points))
-    variables, data = variables_of(there), data_of(there, plan.column)
+    trial = with_batch(graph._replace(poses=poses, points=points))
+    variables, data = variables_of(trial), data_of(trial, plan.column)
     blocks = half_hessian(*jax.lax.stop_gradient((model, plan, variables, data)))
     gradient = linearize(model, plan, variables, data).gradient
     step = _solve_by_factor(plan, blocks[..., 0], gradient[..., 0])
@@ -157,12 +157,12 @@ def optimize(
             factor "name".
         kernel: robust kernels, one for all tables or by table. With `Truncated` the iterations are
             rounds of graduated non-convexity (`gnc`), and `iterations` is the limit of each.
-        iterations: steps at most; with 0 the solution is of the graph as it is.
+        iterations: largest number of steps; with 0 the solution is the graph itself.
         tolerance: done when a step lowers χ² by less than this share of it, as the quadratic model
             predicts, and at least by rounding.
         plan: of `plan`; needed under `jit` and `vmap`, where `who` is traced. Without one, graphs
             of about the same size share a compiled program (`solver.padding`).
-        room: without a plan, all graphs of at most about so many variables share one.
+        room: without a plan, graphs of up to about this number of variables share one.
     Raises:
         ValueError: on what `check_graph` refuses, and on unknown tables.
     """
@@ -174,16 +174,16 @@ def optimize(
         )
     model = model_of(caller, graph, factors, kernel)
     check_graph(caller, graph, model.factors)
-    own, fill = graph, plan is None and is_concrete(graph)
+    original, fill = graph, plan is None and is_concrete(graph)
     graph = padded_graph(graph, room) if fill else graph
     plan = plan_for(caller, graph, model.factors, plan, room=room)
     found: Solution = _optimize(model, graph, plan, iterations, tolerance)
     if not fill:
         return found
-    singular = own_number(found.singular, own, graph)
-    rows = {name: table.valid for name, table in own.tables.items()}
+    singular = own_number(found.singular, original, graph)
+    rows = {name: table.valid for name, table in original.tables.items()}
     return found._replace(
-        graph=cut(found.graph, own), singular=singular, weights=cut(found.weights, rows)
+        graph=cut(found.graph, original), singular=singular, weights=cut(found.weights, rows)
     )
 
 

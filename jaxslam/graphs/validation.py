@@ -36,7 +36,7 @@ def check_graph(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None:
 
     Refused are tables without a factor or of other sizes than their factor's, arrays of another
     kind than `Graph` and `Table` say, numbers that are not
-    finite, an id twice, a measurement of a variable that is nowhere or of one variable twice, an
+    finite, an id twice, a measurement of a variable out of range or of one variable twice, an
     information that is not symmetric or not positive semidefinite, no measurement at all, and parts
     that neither a fixed variable nor a measurement of one pose holds in place: a disconnected
     graph, or no gauge. A measurement of zero information joins nothing. Within a trace only what
@@ -129,8 +129,8 @@ def _check_kind(what: str, **values: tuple[JaxOrNumPy, type]) -> None:
         if not hasattr(value, "dtype"):
             raise ValueError(f"{what}: expected {field} to be an array, got {type(value).__name__}")
         if np.size(value) and not jnp.issubdtype(value.dtype, kind):
-            told = "bool" if kind is np.bool_ else "integers"
-            raise ValueError(f"{what}: expected {field} of {told}, got {value.dtype}")
+            expected = "bool" if kind is np.bool_ else "integers"
+            raise ValueError(f"{what}: expected {field} of {expected}, got {value.dtype}")
 
 
 def _check_shapes(name: str, graph: Graph) -> None:
@@ -175,8 +175,8 @@ def _check_rows(name: str, graph: Graph, key: str, table: Table, factor: Factor)
         if lost.any():
             row = int(lost.argmax())
             raise ValueError(
-                f"{name}: {key}, row {row}: {kind} number {who[row, k]} is nowhere, "
-                f"the graph has {count}"
+                f"{name}: {key}, row {row}: {kind} index {who[row, k]} is out of "
+                f"range: the graph has {count} {kind}s"
             )
     of = variables_in(graph, table, factor)
     twice = np.zeros(len(valid), bool)
@@ -205,8 +205,8 @@ def _check_gauge(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None
     if not len(loose):
         return
     members = np.flatnonzero(parts.part == loose[0])
-    told = ", ".join(label(graph, int(variable)) for variable in members[:3])
-    told += f", … ({len(members):,} variables)" if len(members) > 3 else ""
+    labels = ", ".join(label(graph, int(variable)) for variable in members[:3])
+    labels += f", … ({len(members):,} variables)" if len(members) > 3 else ""
     if parts.free.sum() == 1 and not parts.anchored.any():
         raise ValueError(
             f"{name}: the graph has no gauge: fix a pose (`graphs.with_gauge` fixes the first) or "
@@ -214,7 +214,7 @@ def _check_gauge(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None
         )
     count = int((parts.free | parts.anchored).sum())
     raise ValueError(
-        f"{name}: the graph is disconnected: no measurement with information joins {told} to a "
+        f"{name}: the graph is disconnected: no measurement with information joins {labels} to a "
         f"fixed pose or one with a prior; {count} parts, {len(loose)} of them loose"
     )
 

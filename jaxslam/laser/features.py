@@ -66,7 +66,7 @@ def fit_line(
     for _ in range(_ITERATIONS):
         n = np.array([np.cos(line[1]), np.sin(line[1])])
         toward, across = e @ n, e @ np.array([-n[1], n[0]])
-        toward = np.maximum(toward, 1e-3)  # a beam along the wall says nothing of it
+        toward = np.maximum(toward, 1e-3)  # a beam along the wall has no information on it
         met = line[0] / toward
         if np.ptp(met * across) <= 1e-9 * max(sigma, np.abs(distance).max()):
             raise ValueError("fit_line: expected beams whose ends are not in line with the laser")
@@ -131,7 +131,7 @@ class Segments(NamedTuple):
     chi2: Float[np.ndarray, "K"]
     """squared residuals over σ², of size - 2 degrees of freedom where the wall is straight"""
     left: int
-    """usable beams that are of no segment"""
+    """usable beams outside of all segments"""
 
 
 def segments(
@@ -160,14 +160,14 @@ def segments(
     the second test. At `probability` 0.999 that shows h = 11 σ/√n in one of two segments, and 17
     σ/√n in 95 %: 4 and 6 σ for 8 beams. What is flatter is found by its neighbours. In a round room
     of radius 3 m (σ = 2 cm, 90 to 720 beams) at most 0.04 segments a scan remain. A flat arc that
-    is seen alone may pass. Two walls are lost as well whose corner is too low to be told from an
+    is seen alone may pass. Two walls are also lost if their corner is too low to be told from an
     arc: one in two where it is 46 σ/√n above their common chord, n beams on both.
 
     Args:
         beams: of one scan, (B,) each, angles increasing. Where the last is within half a step of a
             full turn from the first, both are one beam.
         sigma: standard deviation of a range [m]. sigma_angle: of a beam's direction [rad].
-        max_range: [m]; what a range says: `Beams`.
+        max_range: [m]; `Beams` defines the meaning of a range.
         least: number of beams of a segment, at least 3.
         trim: beams given up at each end.
         probability: of a straight wall to pass each test.
@@ -208,13 +208,13 @@ def segments(
     pieces = [
         piece
         for run in _runs(angle, distance, sigma)
-        for piece in _divided(run, angle, distance, noise)
+        for piece in _divide(run, angle, distance, noise)
         if len(piece) >= 3
     ]
-    pieces = _merged(pieces, angle, distance, noise, trim)
+    pieces = _merge(pieces, angle, distance, noise, trim)
     # Without the short ones between them, pieces of one wall may be neighbours.
     long = [piece for piece in pieces if len(piece) >= least]
-    pieces = _merged(long, angle, distance, noise, trim)
+    pieces = _merge(long, angle, distance, noise, trim)
     misfit = [line_of(piece)[2] for piece in pieces]
     more = chi2_quantile(probability, 1)
 
@@ -222,7 +222,7 @@ def segments(
         return _misfit_of_parabola(angle[run], distance[run], *noise)
 
     def arc(k: int) -> bool:
-        """Whether a piece and the next one are of one arc."""
+        """Whether a piece and the next one belong to one arc."""
         other = (k + 1) % len(pieces)
         if other == k or not _adjacent(pieces[k][-1], pieces[other][0], angle):
             return False
@@ -275,7 +275,7 @@ def _runs(angle: np.ndarray, distance: np.ndarray, sigma: float) -> list[Int[np.
     return np.split(order, np.flatnonzero(breaks[order])[:-1] + 1)
 
 
-def _divided(
+def _divide(
     run: Int[np.ndarray, "n"], angle: np.ndarray, distance: np.ndarray, noise: tuple[float, float]
 ) -> list[Int[np.ndarray, "n"]]:
     """The straight pieces of a run: divided at the point furthest from the chord, in σ."""
@@ -296,12 +296,12 @@ def _divided(
         return [run]
     before, behind = run[: at + 1], run[at:]
     return [
-        *_divided(before, angle, distance, noise),
-        *_divided(behind[1:], angle, distance, noise),
+        *_divide(before, angle, distance, noise),
+        *_divide(behind[1:], angle, distance, noise),
     ]
 
 
-def _merged(
+def _merge(
     pieces: list[Int[np.ndarray, "n"]],
     angle: np.ndarray,
     distance: np.ndarray,

@@ -1,7 +1,7 @@
 """Jacobians at the current estimate, and at other linearization points: the standard EKF.
 
 They are taken by forward-mode automatic differentiation. The hand-derived Jacobians of models are
-for verification; filters do not use them, so a user's own model needs none.
+for verification; filters do not use them, so a user's model needs none.
 """
 
 import jax
@@ -74,8 +74,8 @@ def invert_at(
     """
     mean, cov_s = (jnp.asarray(part, z.dtype) for part in sensor.free)
     by_pose, by_z, by_s = invert_jacobians(sensor, at_pose, at_z, mean)
-    own = by_z @ sensor.noise_cov(z) @ by_z.T + by_s @ cov_s @ by_s.T
-    return sensor.invert(pose, z, mean), by_pose, own
+    cov = by_z @ sensor.noise_cov(z) @ by_z.T + by_s @ cov_s @ by_s.T
+    return sensor.invert(pose, z, mean), by_pose, cov
 
 
 def with_lever_arm(by_pose: Float[Array, "L 3"], offset: Float[Array, "2"]) -> Float[Array, "L 3"]:

@@ -109,8 +109,8 @@ class FirstEstimate(Linearizer):
     def invert(
         self, sensor: Sensor, z: Array, tag: Array, here: Here
     ) -> tuple[Array, Array, Array]:
-        landmark, by_pose, own = first_order.invert_at(sensor, here.pose, z, here.pose, z)
-        return landmark, with_lever_arm(by_pose, here.pose[:2] - here.joint.lin.pose[:2]), own
+        landmark, by_pose, cov = first_order.invert_at(sensor, here.pose, z, here.pose, z)
+        return landmark, with_lever_arm(by_pose, here.pose[:2] - here.joint.lin.pose[:2]), cov
 
     def born(self, joint: Joint, born: Array) -> First:
         landmarks = jnp.where(born[:, None], joint.landmarks, joint.lin.landmarks)
@@ -165,9 +165,9 @@ class Observability(Linearizer):
         return moved, with_lever_arm(by_pose, -shift), noise, old._replace(pose=moved, robot=robot)
 
     def observe(self, sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
-        own = here.joint.lin
-        at_landmark = own.pose[:2] + own.landmarks[here.slot] - own.robot
-        return first_order.observe_at(sensor, here, own.pose, at_landmark)
+        points = here.joint.lin
+        at_landmark = points.pose[:2] + points.landmarks[here.slot] - points.robot
+        return first_order.observe_at(sensor, here, points.pose, at_landmark)
 
     def invert(
         self, sensor: Sensor, z: Array, tag: Array, here: Here

@@ -110,13 +110,13 @@ class Unscented(Linearizer):
 
         by = self._fit(g, jax.scipy.linalg.block_diag(root, *own_roots))
         by_pose = by_variables(by.slope[:, :3], root)
-        own = linalg.matmul(by.slope[:, 3:], by.slope[:, 3:].T) + by.rest
+        cov = linalg.matmul(by.slope[:, 3:], by.slope[:, 3:].T) + by.rest
         if chart.basis is not None:
             basis = chart.basis(pose, centre)
             if basis.landmark is not None:
-                by_pose, own = basis.landmark @ by_pose, basis.landmark @ own @ basis.landmark.T
+                by_pose, cov = basis.landmark @ by_pose, basis.landmark @ cov @ basis.landmark.T
             by_pose = (basis.cross + by_pose) @ linalg.inverse(basis.pose)
-        return centre, by_pose, own
+        return centre, by_pose, cov
 
     def _fit(self, f: Callable[[Array], Array], root: Array) -> _Regression:
         alpha = _spread(root) if self.alpha is None else jnp.asarray(self.alpha, root.dtype)

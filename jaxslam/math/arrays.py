@@ -48,8 +48,8 @@ def in_dtype(tree: _T, dtype: DTypeLike) -> _T:
     """The tree with its real numbers in one precision; arrays of it stay as they are."""
 
     def one(leaf: PyTree) -> PyTree:
-        own = jnp.result_type(leaf)
-        other = jnp.issubdtype(own, jnp.floating) and own != dtype
+        kind = jnp.result_type(leaf)
+        other = jnp.issubdtype(kind, jnp.floating) and kind != dtype
         return jnp.asarray(leaf, dtype) if other else leaf
 
     return cast(_T, jax.tree.map(one, tree))

@@ -46,7 +46,7 @@ def assign(cost: Array) -> Array:
         by_row = matching.by_row + jnp.where(in_tree, path.least - at_column, 0.0)
         by_row = by_row.at[row].add(path.least)
         shorter = jnp.where(path.columns, path.least - path.length, 0.0)
-        column_of, row_of = _augmented(matching, path, row)
+        column_of, row_of = _augment(matching, path, row)
         return _Matching(by_row, matching.by_column - shorter, column_of, row_of), None
 
     start = _Matching(jnp.zeros(m, cost.dtype), jnp.zeros(n, cost.dtype), nobody[:m], nobody)
@@ -102,16 +102,16 @@ def _shortest_path(cost: Array, matching: _Matching, row: Array) -> _Path:
     return jax.lax.while_loop(lambda path: path.free < 0, grow, start)
 
 
-def _augmented(matching: _Matching, path: _Path, row: Array) -> tuple[Array, Array]:
+def _augment(matching: _Matching, path: _Path, row: Array) -> tuple[Array, Array]:
     """The matching updated along the augmenting path, from its free column back to the row."""
 
     def step(state: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         column, column_of, row_of = state
         owner = path.before[column]
         before = column_of[owner]
-        done = owner == row
+        matched = owner == row
         return (
-            jnp.where(done, -1, before),
+            jnp.where(matched, -1, before),
             column_of.at[owner].set(column),
             row_of.at[column].set(owner),
         )

@@ -8,7 +8,7 @@ Poses = Float[np.ndarray, "... 3"]
 
 
 def wrapped(angle: ArrayLike) -> Float[np.ndarray, "..."]:
-    """Angles [rad] in (-π, π]; those that are there already stay as they are."""
+    """Angles [rad] in (-π, π]; an angle in this interval is unchanged."""
     a = np.asarray(angle, np.float64)
     return np.asarray(a - 2 * np.pi * np.ceil((a - np.pi) / (2 * np.pi)))
 

@@ -211,7 +211,7 @@ def align(source: Float[Array, "N 2"], target: Float[Array, "N 2"]) -> Pose:
 def _away_from_origin(point: Point) -> tuple[Scalar, Scalar, Bool[Array, ""]]:
     """The point, replaced by (1, 0) at the origin, where sqrt and arctan2 have no derivative.
 
-    The range is taken to be zero where x² + y² underflows, hence the test on the squares.
+    The range is set to zero where x² + y² underflows, hence the test on the squares.
     """
     away = point[0] * point[0] + point[1] * point[1] > 0
     return jnp.where(away, point[0], 1.0), jnp.where(away, point[1], 0.0), away

@@ -118,7 +118,7 @@ def materialize(values: _T) -> _T:
 def anywhere(flag: jax.Array) -> jax.Array:
     """Whether the flag () is set in any run of the batch under `vmap`; not batched itself.
 
-    Under `vmap` a `lax.cond` with a predicate of its own for each run becomes a `select`, and both
+    Under `vmap` a `lax.cond` with a separate predicate for each run becomes a `select`, and both
     branches are computed. One predicate for the whole batch stays a branch.
     """
     return flag
@@ -134,13 +134,13 @@ def where_any(
 ) -> _U:
     """The result of work(state) if the flag is set in any run of a batch, else otherwise(state).
 
-    Of a run whose own flag is not set, both must give the same numbers.
+    For a run whose flag is not set, both must give the same numbers.
     """
     return cast(_U, jax.lax.cond(anywhere(flag), work, otherwise, state))
 
 
 def change_where(flag: jax.Array, change: Callable[[_T], _T], state: _T) -> _T:
-    """The state changed by change(state) in a run whose flag () is set, else exactly the state.
+    """The state changed by change(state) in a run whose flag () is set, else the same state.
 
     Computed only where the flag is set in any run of the batch.
     """
@@ -156,7 +156,7 @@ def hot_jit(
 ) -> Callable[..., _T]:
     """The jitted function, for long passes over arrays called from the host; see `hot_options`.
 
-    JAX takes options for a whole program alone, so within a trace it is a plain jitted function.
+    JAX takes options only for a whole program, so within a trace it is a plain jitted function.
     """
     within = jax.jit(function, static_argnames=static_argnames, inline=True)
 

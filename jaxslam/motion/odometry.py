@@ -93,7 +93,7 @@ def odometry_control(before: Array, after: Array) -> Array:
     undefined: u is (0, 0, wrap(θ' - θ)) with finite derivatives.
 
     Args:
-        before, after: poses (3,) in one frame, the odometry's own for instance.
+        before, after: poses (3,) in one frame, for instance that of the odometry.
     """
     trans, bearing = se2.polar(se2.to_frame(before, after[:2]))
     rot1 = wrap(bearing)  # arctan2 of (-0, x < 0) is -π, which no wrapped angle is
@@ -101,7 +101,7 @@ def odometry_control(before: Array, after: Array) -> Array:
 
 
 def odometry_controls(path: ArrayLike) -> Float[np.ndarray, "T 3"]:
-    """The controls (T, 3) of `Odometry` along a path of poses (T, 3), in NumPy; row 0 is no motion.
+    """The controls (T, 3) of `Odometry` along a path of poses (T, 3), in NumPy; row 0 is zero.
 
     As `odometry_control` from pose to pose, but a robot that moves backward, with the translation
     in the half plane behind it, gets a negative trans in place of two turns by π, which

@@ -49,11 +49,11 @@ class Substeps(Motion):
 
     @property
     def controls(self) -> tuple[str, ...]:  # type: ignore[override]
-        return _numbered(self.motion.controls, self.count)
+        return _number_names(self.motion.controls, self.count)
 
     @property
     def noises(self) -> tuple[str, ...]:  # type: ignore[override]
-        return _numbered(self.motion.noises, self.count)
+        return _number_names(self.motion.noises, self.count)
 
     def step(self, pose: Pose, u: Control, w: ProcessNoise) -> Pose:
         def one(pose: Pose, row: _Rows) -> tuple[Array, None]:
@@ -69,8 +69,8 @@ class Substeps(Motion):
             return self.motion.step(pose, u_k, none), self.motion.noise_cov(pose, u_k)
 
         _, blocks = jax.lax.scan(one, pose, self._rows(u, jnp.zeros(size, pose.dtype)))
-        own = jnp.eye(self.count, dtype=blocks.dtype)[:, None, :, None]
-        return (own * blocks[:, :, None, :]).reshape(size, size)
+        identity = jnp.eye(self.count, dtype=blocks.dtype)[:, None, :, None]
+        return (identity * blocks[:, :, None, :]).reshape(size, size)
 
     @property
     def perturb(self) -> Callable[[Array, Array], Array] | None:
@@ -91,8 +91,8 @@ class Substeps(Motion):
         def forward(pose: Pose, row: _Rows) -> tuple[Array, _Jacobians]:
             return self.motion.step(pose, *row), self.motion.jacobians(pose, *row)
 
-        def backward(after: Array, own: _Jacobians) -> tuple[Array, _Rows]:
-            by_pose, by_u, by_w = own
+        def backward(after: Array, step: _Jacobians) -> tuple[Array, _Rows]:
+            by_pose, by_u, by_w = step
             return after @ by_pose, (after @ by_u, after @ by_w)  # after is F_n ⋯ F_{k+1}
 
         _, along = jax.lax.scan(forward, pose, self._rows(u, w))
@@ -101,7 +101,7 @@ class Substeps(Motion):
         return by_pose, jnp.concatenate(by_u, axis=1), jnp.concatenate(by_w, axis=1)
 
 
-def _numbered(names: tuple[str, ...], count: int) -> tuple[str, ...]:
+def _number_names(names: tuple[str, ...], count: int) -> tuple[str, ...]:
     """Numbered names: ("v [m/s]",) twice is ("v 1 [m/s]", "v 2 [m/s]"), units last for `verify`."""
     parts = [name.partition(" [") for name in names]
     return tuple(f"{a} {k + 1}{space}{unit}" for k in range(count) for a, space, unit in parts)

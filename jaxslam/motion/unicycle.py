@@ -16,7 +16,8 @@ class Unicycle(Motion):
     u = (v [m/s], ω [rad/s], Δt [s]), with noise added to the velocities.
 
     pose ← (x + (v+w_v)Δt cos θ, y + (v+w_v)Δt sin θ, wrap(θ + (ω+w_ω)Δt)). The robot of Huang et
-    al. 2010 and of UKF-M's 2-D SLAM example (Brossard et al. 2020); Δt = 0 is no motion, no noise.
+    al. 2010 and of UKF-M's 2-D SLAM example (Brossard et al. 2020); Δt = 0 gives no motion and no
+    noise.
     """
 
     noise_cov: NoiseCov

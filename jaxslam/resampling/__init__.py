@@ -1,6 +1,7 @@
 """Resampling methods of particle filters. Their tests run over `REGISTRY`.
 
-`Soft` and `StopGradient` make a method differentiable; `kld` says how many particles suffice.
+`Soft` and `StopGradient` make a method differentiable; `kld` bounds the necessary number of
+particles.
 """
 
 from jaxslam.core.protocols import Resample

@@ -131,9 +131,9 @@ class Soft:
         log_q = jnp.log(jnp.where(drawn, q, 1.0))
         ancestor = self.resample(jax.lax.stop_gradient(jnp.where(drawn, log_q, -jnp.inf)), key)
         # A ratio of logarithms where there is a weight: double where, for the gradient.
-        there = w > 0
-        ratio = jnp.where(there, log_w, 0.0) - jnp.where(there, log_q, 0.0)
-        ratio = jnp.where(there, ratio, -jnp.inf)[ancestor]
+        positive = w > 0
+        ratio = jnp.where(positive, log_w, 0.0) - jnp.where(positive, log_q, 0.0)
+        ratio = jnp.where(positive, ratio, -jnp.inf)[ancestor]
         _, log_sum, some = normalized(jax.lax.stop_gradient(ratio))
         return ancestor, jnp.where(some, ratio - log_sum, even(log_weights))
 

@@ -27,13 +27,13 @@ def normalized(
         raise ValueError(
             f"normalized: expected log-weights of shape (P,), got {jnp.shape(log_weights)}"
         )
-    there = jnp.isfinite(log_weights)
-    some = there.any()
-    highest = jnp.where(some, jnp.max(jnp.where(there, log_weights, -jnp.inf)), 0.0)
-    safe = jnp.where(there, log_weights - highest, 0.0)
-    total = jnp.where(there, jnp.exp(safe), 0.0).sum()
+    finite = jnp.isfinite(log_weights)
+    some = finite.any()
+    highest = jnp.where(some, jnp.max(jnp.where(finite, log_weights, -jnp.inf)), 0.0)
+    safe = jnp.where(finite, log_weights - highest, 0.0)
+    total = jnp.where(finite, jnp.exp(safe), 0.0).sum()
     log_total = jnp.where(some, jnp.log(jnp.where(some, total, 1.0)), 0.0)
-    out = jnp.where(there, safe - log_total, -jnp.inf)
+    out = jnp.where(finite, safe - log_total, -jnp.inf)
     return jnp.where(some, out, even(log_weights)), highest + log_total, some
 
 

@@ -1,4 +1,4 @@
-"""Sensors of the robot's own state in the map, without a landmark."""
+"""Sensors of the robot's state in the map, without a landmark."""
 
 import jax.numpy as jnp
 from numpy.typing import ArrayLike

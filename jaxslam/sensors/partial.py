@@ -1,4 +1,4 @@
-"""Sensors of one polar coordinate of a point landmark: bearing or range alone.
+"""Sensors of one polar coordinate of a point landmark: bearing only or range only.
 
 The other one is unmeasured, with a prior: Solà's s ~ N(s̄, S).
 """
@@ -36,7 +36,7 @@ def free_parameters(name: str, free: FreeLike, size: int) -> Free:
         mean, cov = free
     except (TypeError, ValueError):
         raise ValueError(f"{name}: expected free = (mean, covariance), got {free!r}") from None
-    mean, cov = _held(mean), _held(cov)
+    mean, cov = _host_array(mean), _host_array(cov)
     if mean.shape != (size,):
         raise ValueError(f"{name}: expected a prior mean of shape ({size},), got {mean.shape}")
     if is_concrete(mean) and not (_is_real(mean) and np.all(np.isfinite(mean))):
@@ -47,8 +47,8 @@ def free_parameters(name: str, free: FreeLike, size: int) -> Free:
     return Free(mean, cov)
 
 
-def _held(values: ArrayLike) -> JaxOrNumPy:
-    """The array on the host in float64, whatever the default width of JAX."""
+def _host_array(values: ArrayLike) -> JaxOrNumPy:
+    """The array on the host in float64, for any default width of JAX."""
     if not is_concrete(values):
         return jnp.asarray(values)
     array = np.asarray(values)

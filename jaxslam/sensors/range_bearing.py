@@ -1,4 +1,4 @@
-"""Range and bearing of a point landmark, as of a laser scanner or a sonar."""
+"""Range and bearing of a point landmark, from a laser scanner or a sonar."""
 
 import jax.numpy as jnp
 from numpy.typing import ArrayLike

@@ -1,4 +1,4 @@
-"""Several sensors on one robot, each with its own model, mount, rate and measurement slots.
+"""Several sensors on one robot, each with a model, mount, rate and measurement slots.
 
 And the base class of sensors that change some methods of another.
 """
@@ -67,9 +67,9 @@ class Part:
     places: int = static()
     """its measurement slots in a scan; 1 of an absolute sensor"""
     every: int = static(default=1)
-    """in a simulation it measures every so many steps,"""
+    """interval of its measurements in a simulation, in steps,"""
     start: int = static(default=0)
-    """beginning with this one; a filter uses `Scan.valid` alone"""
+    """and first step; a filter uses only `Scan.valid`"""
     visible: Callable[[Array, Array], Array] | None = None
     """(pose, l) -> (): its field of view in a simulation; None for that of the scenario"""
     sees: Literal["landmarks", "robots"] = static(default="landmarks")
@@ -231,15 +231,15 @@ class _OnGround(Wrapped):
 
     @property
     def landmark(self) -> tuple[str, ...]:  # type: ignore[override]
-        own = self.sensor.landmark
-        return (*own, *("-",) * (self.size - len(own)))
+        entries = self.sensor.landmark
+        return (*entries, *("-",) * (self.size - len(entries)))
 
     @property
     def free(self) -> Free:  # type: ignore[override]
-        own, spare = self.sensor.free, self.size - len(self.sensor.landmark)
-        mean = jnp.asarray(own.mean)
+        prior, spare = self.sensor.free, self.size - len(self.sensor.landmark)
+        mean = jnp.asarray(prior.mean)
         kept = mean.shape[0]
-        cov = jnp.eye(kept + spare, dtype=mean.dtype).at[:kept, :kept].set(own.cov)
+        cov = jnp.eye(kept + spare, dtype=mean.dtype).at[:kept, :kept].set(prior.cov)
         return Free(jnp.concatenate([mean, jnp.zeros(spare, mean.dtype)]), cov)
 
     def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
@@ -253,8 +253,8 @@ class _OnGround(Wrapped):
         return self.sensor.position(self._own(landmark))
 
     def embed(self, pose: Pose, point: Point) -> Landmark:
-        own = self.sensor.embed(pose, point)
-        return jnp.concatenate([own, jnp.zeros(self.size - len(own), pose.dtype)])
+        landmark = self.sensor.embed(pose, point)
+        return jnp.concatenate([landmark, jnp.zeros(self.size - len(landmark), pose.dtype)])
 
     def _own(self, landmark: Landmark) -> Array:
         return landmark[: len(self.sensor.landmark)]

@@ -1,4 +1,4 @@
-"""A laser scanner in a world of exact walls, and what its scan can say of the pose."""
+"""A laser scanner in a world of exact walls, and the information of its scan on the pose."""
 
 from functools import partial
 from typing import NamedTuple
@@ -104,7 +104,7 @@ def scan(laser: Laser, walls: Walls, pose: Float[Array, "3"], key: Array) -> Bea
     """A random scan: exact ranges with N(0, σ²) on those below max_range, less the dropouts.
 
     A noisy range lies within [0, max_range]. Where walls are of glass, each beam passes each such
-    segment with the probability that `Walls.glass` says, and meets what is behind it.
+    segment with the probability in `Walls.glass`, and meets the wall behind it.
     """
     if walls.glass is None:
         key_noise, key_drop = jax.random.split(key)
@@ -149,7 +149,7 @@ def _scan_world(world: LaserWorld, key: Array) -> LaserHistory:
 
 
 class Observability(NamedTuple):
-    """What one scan can say of the pose (x, y, θ)."""
+    """The information of one scan on the pose (x, y, θ)."""
 
     information: Float[np.ndarray, "3 3"]
     """J, Fisher's information in units of 1/m², 1/m and 1/rad²"""
@@ -206,7 +206,7 @@ def scan_information(
     bound = scaled * inverse @ scaled.T
     free = scaled[:, ~seen].T
     free = free / np.linalg.norm(free, axis=1, keepdims=True)
-    return Observability(information, bound, free, tuple(_named(d, place, unit[2]) for d in free))
+    return Observability(information, bound, free, tuple(_name(d, place, unit[2]) for d in free))
 
 
 @partial(jax.jit, inline=True)
@@ -219,7 +219,7 @@ def _ranges_and_slopes(laser: Laser, walls: Walls, pose: Array) -> tuple[Array, 
     return ranges(pose), jax.jacfwd(ranges)(pose)
 
 
-def _named(
+def _name(
     direction: Float[np.ndarray, "3"], pose: Float[np.ndarray, "3"], per_length: float
 ) -> str:
     """A motion in words: with turn ω it is a rotation about t + (-dy, dx)/ω."""

@@ -80,9 +80,9 @@ def recorded_world(
 ) -> RecordedWorld:
     """A world of R runs with known truth, in which run i of a campaign is record i.
 
-    So logs of another simulator, of robots under motion capture, or of a front end that is no pure
-    function (laser odometry) are judged as draws are. `simulate` takes one of the records by its
-    key. A campaign of more than R runs is refused.
+    So logs of another simulator, of robots under motion capture, or of a front end that is not a
+    pure function (laser odometry) are judged as draws are. `simulate` takes one of the records by
+    its key. A campaign of more than R runs is refused.
 
     Args:
         motion, sensor: the models that filters and the bound assume of the logs.
@@ -90,8 +90,8 @@ def recorded_world(
             valid.
         poses: (R, T, 3) true pose at each row [m, m, rad].
         landmarks: (N, L) true landmarks, of all runs, or (R, N, L); the tag of one is its row.
-        pose, pose_cov: (3,) and (3, 3) what a filter is told of the pose before the first control,
-            of every run: move records that begin elsewhere there.
+        pose, pose_cov: (3,) and (3, 3), the filter's prior of the pose before the first control,
+            of every run: transform records that begin elsewhere.
         starts: (R, 3) true pose before the first control; default `pose`.
         origin: (R, T, M) tag of the landmark that each measurement is truly of, -1 of none, where
             associations are to be scored.

@@ -75,14 +75,14 @@ def spoil(
     z = jnp.where(outlier[:, None], false[:m], scan.z)
     origin = jnp.where(valid & ~outlier, scan.tag, -1)
     share = spurious.clutter / max(spurious.places, 1)
-    there = jax.random.bernoulli(key_clutter, share, (spurious.places,))
+    occurs = jax.random.bernoulli(key_clutter, share, (spurious.places,))
     no_tag = jnp.full(spurious.places, -1, scan.tag.dtype)
     spoilt = Scan(
         z=jnp.concatenate(
-            [jnp.where(valid[:, None], z, 0.0), jnp.where(there[:, None], false[m:], 0.0)]
+            [jnp.where(valid[:, None], z, 0.0), jnp.where(occurs[:, None], false[m:], 0.0)]
         ),
-        tag=jnp.concatenate([jnp.where(valid, _permuted(scan.tag, mislabelled), -1), no_tag]),
-        valid=jnp.concatenate([valid, there]),
+        tag=jnp.concatenate([jnp.where(valid, _permute(scan.tag, mislabelled), -1), no_tag]),
+        valid=jnp.concatenate([valid, occurs]),
     )
     return spoilt, jnp.concatenate([origin, no_tag])
 
@@ -105,7 +105,7 @@ def _false_measurements(
     return jax.vmap(one)(points, normals)
 
 
-def _permuted(tag: Int[Array, "M"], wrong: Bool[Array, "M"]) -> Int[Array, "M"]:
+def _permute(tag: Int[Array, "M"], wrong: Bool[Array, "M"]) -> Int[Array, "M"]:
     """The tags, each wrong one replaced by that of the next wrong slot."""
     slots = jnp.argsort(~wrong, stable=True)  # the wrong ones first
     following = jnp.cumsum(wrong) % jnp.maximum(wrong.sum(), 1)

@@ -27,7 +27,7 @@ class TeamWorld(World):
     for which it is unknown is made from `dataclasses.replace(robot, start=None)`.
 
     The truth is that of one robot, so campaigns judge the filter whose `report` is the same; the
-    draws are the same whatever is reported. Divergence limit and bound of a campaign are those of
+    draws are the same for any report. Divergence limit and bound of a campaign are those of
     that robot alone, started as robot 0 is.
 
     Raises ValueError on no robots, tags that clash, a robot without start, one that is not there to
@@ -44,10 +44,10 @@ class TeamWorld(World):
     tags: tuple[int, ...] | None = static(default=None)
     """(R,) of the robots; default N, N + 1, …"""
     report: int = static(default=0)
-    """which robot the truth is of"""
+    """the robot of the truth"""
     name: str = static(default="team")
     pose: ArrayLike = (0.0, 0.0, 0.0)
-    """(3,) what is known of robot 0 before the first control, and"""
+    """(3,) mean of the prior of robot 0 before the first control, and"""
     pose_cov: ArrayLike = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
     """(3, 3) its covariance"""
     visible: Visible = everywhere
@@ -99,8 +99,10 @@ class TeamWorld(World):
             if robot.start is not None:
                 mean, cov = robot.start
                 start = se2.compose(first, drawn_near(jnp.asarray(mean, dtype), cov, own_key))
-            own = controls[:, ends[b] - len(robot.motion.controls) : ends[b]]
-            path, log = drive(robot.motion, start, own, jax.random.fold_in(key_motion, b))
+            robot_controls = controls[:, ends[b] - len(robot.motion.controls) : ends[b]]
+            path, log = drive(
+                robot.motion, start, robot_controls, jax.random.fold_in(key_motion, b)
+            )
             starts.append(start)
             poses.append(path)
             logged.append(log)

@@ -1,4 +1,4 @@
-"""Rooms whose walls a laser sees exactly: segments and circles, without a grid."""
+"""Rooms with exact walls for a laser: segments and circles, without a grid."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -24,7 +24,7 @@ class Walls(NamedTuple):
     circles: Float[JaxOrNumPy, "C 3"]
     """centre (x, y) and radius of each [m]"""
     glass: Float[JaxOrNumPy, "K"] | None = None
-    """the share of beams that pass each segment, in [0, 1]; None where none is of glass"""
+    """the share of beams that pass each segment, in [0, 1]; None without glass"""
 
 
 def walls(
@@ -39,7 +39,7 @@ def walls(
             next.
     Raises:
         ValueError: a chain that is not at least three finite corners, a circle that is not
-            (x, y, radius) with radius above 0, no wall at all, glass that is of no side, or a share
+            (x, y, radius) with radius above 0, no wall at all, glass on a missing side, or a share
             outside [0, 1].
     """
     segments = [np.zeros((0, 2, 2))]
@@ -103,7 +103,7 @@ def wall_ranges(
     max_range: float | Array,
     passes: Bool[Array, "B K"] | None = None,
 ) -> Float[Array, "B N"]:
-    """The range [m] of each beam to each wall as if it were alone, max_range where it is not met.
+    """The range [m] of each beam to each wall alone, max_range if the beam misses it.
 
     N = K + 2 C + 1: the K segments, each circle twice, and max_range. As `exact_ranges`.
     """

@@ -47,9 +47,9 @@ class World(Component):
     controls: ArrayLike
     """(T, U) nominal controls."""
     pose: ArrayLike
-    """(3,) what a filter is told of the pose before the first control."""
+    """(3,) mean of the filter's prior of the pose before the first control."""
     pose_cov: ArrayLike
-    """(3, 3) how far from there, by a Gaussian draw, the robot truly starts."""
+    """(3, 3) covariance of the true start about `pose`, and of that prior."""
     places: int | None = None
     """M measurement slots of a scan; None for as many as there are landmarks."""
     spurious: Spurious | None = None
@@ -112,9 +112,9 @@ class Scenario(World):
     controls: ArrayLike = field()
     """(T, U) nominal controls."""
     pose: ArrayLike = (0.0, 0.0, 0.0)
-    """(3,) what a filter is told of the pose before the first control."""
+    """(3,) mean of the filter's prior of the pose before the first control."""
     pose_cov: ArrayLike = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    """(3, 3) how far from there, by a Gaussian draw, the robot truly starts."""
+    """(3, 3) covariance of the true start about `pose`, and of that prior."""
     noise_on: Literal["robot", "odometry"] = static(default="robot")
     """"robot": the noise moves the true robot, and the log holds the nominal control. "odometry":
     the true robot follows the nominal control, and the noise is on the control in the log."""
@@ -152,11 +152,11 @@ class Scenario(World):
             )
 
     def draw(self, key: Array) -> tuple[Truth, Log]:
-        """Draw the start, the path, the scans, and what is spurious in them."""
+        """Draw the start, the path, the scans, and their spurious measurements."""
         dtype = jnp.result_type(float)
         controls = jnp.asarray(self.controls, dtype)
         landmarks = jnp.asarray(self.landmarks, dtype)
-        # Three keys where nothing is spurious: faults do not change what is drawn without them.
+        # Three keys without spurious measurements: faults do not change the other draws.
         keys = jax.random.split(key, 3 if self.spurious is None else 4)
         key_motion, key_scan, key_start = keys[:3]
         start = drawn_near(jnp.asarray(self.pose, dtype), self.pose_cov, key_start)
@@ -182,7 +182,7 @@ class Scenario(World):
         landmarks: Float[Array, "N L"],
         key: Array,
     ) -> tuple[Scan, Int[Array, "T"]]:
-        """The scans of all sensors of a lone robot, side by side; it sees no other robot."""
+        """The scans of all sensors of a single robot, side by side; it measures no other robot."""
         tags = jnp.arange(landmarks.shape[0])
         targets = {"landmarks": (landmarks, tags), "robots": (landmarks[:0], tags[:0])}
         keys = jax.random.split(key, len(sensors.parts))
@@ -213,7 +213,7 @@ def _draw(scenario: World, key: Array) -> tuple[Truth, Log]:
 
 
 def drawn(scenario: World, key: Array) -> tuple[Truth, Log]:
-    """What a world draws; ValueError where that is no truth and log."""
+    """The truth and log that a world draws; raises ValueError on anything else."""
     name = f"{scenario.name}: draw"
     found = call_traced(name, scenario.draw, key)
     kinds = tuple(map(type, found)) if isinstance(found, tuple) else (type(found),)
@@ -248,7 +248,7 @@ def run_keys(key: Array, number: int | Array) -> Array:
 
 
 def with_positions(sensor: Sensor, truth: Truth) -> Truth:
-    """The truth with positions (N, 2) for landmarks that are no points, as figures need them."""
+    """The truth with positions (N, 2) for landmarks other than points, as figures need them."""
     if sensor.of_points or not sensor.landmark:
         return truth
     return truth._replace(landmarks=jax.vmap(sensor.position)(jnp.asarray(truth.landmarks)))

@@ -1,4 +1,4 @@
-"""Comparison of Jacobians computed in several ways: which entries are wrong, by which method."""
+"""Comparison of Jacobians by several methods: the wrong entries, and the wrong method."""
 
 from typing import NamedTuple, TypeAlias
 
@@ -87,8 +87,8 @@ def _compare(evaluation: Jacobians, tolerance: float, float32_tolerance: float) 
     if evaluation.quotient is not None:
         value, error, kink = evaluation.quotient
         away = np.abs(np.stack(list(evaluation.methods.values())) - value).max(axis=0)
-        own = np.abs(value).max(axis=2, keepdims=True, initial=0.0)
-        trusted = ((error <= _CONVERGED * own) | (error <= _NOTHING)) & ~kink
+        magnitude = np.abs(value).max(axis=2, keepdims=True, initial=0.0)
+        trusted = ((error <= _CONVERGED * magnitude) | (error <= _NOTHING)) & ~kink
         away = np.where(trusted, np.where(np.isfinite(away), away, np.inf), 0.0)
         excess_away = _relative(away, _DIFFERENCES_TOLERANCE * scale + 10 * error)
         # At a kink any value between the one-sided derivatives is accepted. Elsewhere, if the
@@ -103,9 +103,9 @@ def _compare(evaluation: Jacobians, tolerance: float, float32_tolerance: float) 
             if g.size:
                 g[kink | (odd & _modes_differ(methods, size, limit))] = 0.0
         if gap.size and lost == len(gap):
-            excess_away = np.full_like(gap, np.inf)  # nothing was compared, which is no pass
+            excess_away = np.full_like(gap, np.inf)  # nothing was compared, so nothing passes
     relative, relative32 = _relative(gap, scale), _relative(gap32, scale32)
-    # What cancels is rounded by more than its size says: in float64 by 2⁻²⁹ of float32's error.
+    # Cancellation rounds by more than the size suggests: in float64 by 2⁻²⁹ of float32's error.
     rounded = gap <= 2.0**-28 * evaluation.single_error
     in_double = np.where(rounded, np.minimum(relative / tolerance, 1.0), relative / tolerance)
     in_double = np.maximum(in_double, excess_away)
@@ -164,7 +164,7 @@ def _finding(
         entries.append(entry(int(np.argmax(excess)), int(i), int(j)))
     entries.sort(key=lambda e: -e.states)
     has_quotient = evaluation.quotient is not None
-    # Where no method has a finite derivative, their differences say nothing.
+    # Without a finite derivative by any method, their differences mean nothing.
     lost = bool(wrong[~np.isfinite(list(evaluation.methods.values())).any(axis=0)].any())
     return Finding(
         function=function.name,
@@ -211,7 +211,7 @@ def _largest_gap(
 ) -> tuple[Float[np.ndarray, "S m n"], Float[np.ndarray, "S m _"]]:
     """The largest difference between two methods, and the size of each row.
 
-    The size is the row's largest entry, since rows have units of their own, but at least a
+    The size is the row's largest entry, since rows have different units, but at least a
     thousandth of its median over the states.
     """
     if not methods:

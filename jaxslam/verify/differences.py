@@ -17,7 +17,7 @@ _ORDERS = 6
 _FINE = 20
 """the halving at which the one-sided quotients are compared: h = 2.4e-7"""
 _KINK = 0.05
-"""relative difference of the one-sided quotients above which there is no derivative"""
+"""relative difference of the one-sided quotients above which no derivative exists"""
 
 
 class Quotient(NamedTuple):
@@ -40,11 +40,11 @@ def quotients(
     """The derivative ∂f/∂argument at S states: central differences with Richardson's extrapolation.
 
     Steps h = ¼, ⅛, … are extrapolated to h → 0 (orders 2, 4, …, as in Ridders 1982); of all entries
-    of the tableau the one with the least estimated error is kept. The estimate is the change from
+    the tableau entry with the least estimated error is kept. The estimate is the change from
     its neighbours plus the rounding error of f and of the argument over h.
 
-    Where the one-sided derivatives differ there is no derivative, though the central quotients may
-    converge: `kink` says so. Of an output on a circle, steps that change it by more than half a
+    If the one-sided derivatives differ, no derivative exists, though the central quotients may
+    converge: `kink` marks this. For an output on a circle, steps that change it by more than half a
     period are ignored.
 
     Args:

@@ -45,7 +45,7 @@ def finite_check(evaluated: Evaluated) -> Check:
 def singular_notes(evaluated: Evaluated) -> Iterator[str]:
     """What is not finite with a place at the origin, or two places at one: a note for each.
 
-    A claim need not be defined there, so it is no failure; but a gradient through it is NaN.
+    A claim need not be defined there, so this is not a failure; but a gradient through it is NaN.
     """
     function = evaluated.function
     if evaluated.values is None or any("jacfwd" not in x.methods for x in evaluated.by_argument):

@@ -1,4 +1,4 @@
-"""The Jacobians of a function computed in four ways: forward, reverse, by hand, by differences."""
+"""The Jacobians of a function by four methods: forward, reverse, by hand, by differences."""
 
 from collections.abc import Callable
 from dataclasses import replace
@@ -120,7 +120,7 @@ class _Evaluator:
         return True
 
     def _outputs(self) -> tuple[str, ...] | None:
-        """The names of the outputs; None, with a failed check, if they are no vector."""
+        """The names of the outputs; None, with a failed check, if they are not a vector."""
         name, named = self.function.name, self.function.outputs
         first = [jnp.asarray(a[0]) for a in self.arguments]
         call = self.function.call
@@ -153,7 +153,7 @@ class _Evaluator:
         """The function of batches of arguments -> values (B, m)."""
         if self.traceable:
             return _in_chunks(quick_jit(jax.vmap(self.function.call)))
-        return _looped(self.function.call)
+        return _loop(self.function.call)
 
     @cached_property
     def both_modes(self) -> Callable[..., PyTree]:
@@ -198,7 +198,7 @@ class _Evaluator:
                 batch: Callable[..., PyTree] = quick_jit(jax.vmap(hand))
             except (jax.errors.JAXTypeError, TypeError) as error:
                 shaped = self._split(hand(*first))  # raises again unless tracing was the fault
-                batch = _looped(hand)
+                batch = _loop(hand)
                 self.checks.append(
                     Check(f"{name} is called state by state", True, describe_error(error))
                 )
@@ -265,7 +265,7 @@ def _worst_gap(methods: dict[str, Values], reference: dict[str, Values]) -> np.n
     return np.where(np.isfinite(worst), worst, 0.0)
 
 
-def _looped(call: Callable[..., PyTree]) -> Callable[..., PyTree]:
+def _loop(call: Callable[..., PyTree]) -> Callable[..., PyTree]:
     """The function applied state by state, if it cannot be traced; keeps None in tuples."""
 
     def batch(*arguments: States) -> PyTree:

@@ -97,8 +97,8 @@ def linearity_index(
     by_hessian = jnp.where(smooth, by_hessian, jnp.inf)
 
     axes, random = jnp.eye(len(zero), dtype=point.dtype), _random_directions(len(zero), point.dtype)
-    own = jnp.swapaxes(jax.lax.stop_gradient(vectors), 1, 2).reshape(-1, len(zero))
-    directions = jnp.concatenate([axes, random, own])
+    eigenvectors = jnp.swapaxes(jax.lax.stop_gradient(vectors), 1, 2).reshape(-1, len(zero))
+    directions = jnp.concatenate([axes, random, eigenvectors])
     tries = jnp.concatenate([sign * r * directions for r in _RADII for sign in (1, -1)]) * sigmas
     centre, difference = g(zero), residual or jnp.subtract
     away = jax.vmap(lambda xi: difference(g(xi), centre) - slope @ xi)(tries)
@@ -153,8 +153,8 @@ def sensor_linearity(
     with_noise: whether departures are relative to the sensor's noise, too (R in the index).
     """
     at = _vector("sensor_linearity: pose", pose, 3)
-    own = _vector("sensor_linearity: landmark", landmark, len(sensor.landmark))
-    x = jnp.concatenate([at, own.astype(at.dtype)])
+    point = _vector("sensor_linearity: landmark", landmark, len(sensor.landmark))
+    x = jnp.concatenate([at, point.astype(at.dtype)])
     noise = sensor.noise_cov(sensor.observe(x[:3], x[3:])) if with_noise else None
     return linearity_index(
         lambda x: sensor.observe(x[:3], x[3:]),

@@ -1,4 +1,4 @@
-"""Checks beside Jacobians: round trips, residuals, noise, purity, finite values, dtypes."""
+"""Checks other than Jacobians: round trips, residuals, noise, purity, finite values, dtypes."""
 
 from collections.abc import Callable, Iterator
 from typing import TypeAlias
@@ -35,14 +35,14 @@ def function_checks(evaluated: Evaluated) -> Iterator[Check]:
     function = evaluated.function
     yield finite_check(evaluated)
     if any(evaluation.methods for evaluation in evaluated.by_argument):
-        yield from _guarded(f"{function.name} is pure", lambda: _pure(function, evaluated))
+        yield from _guard(f"{function.name} is pure", lambda: _pure(function, evaluated))
 
 
 def dtype_checks(evaluated: Evaluated) -> Iterator[Check]:
     """The check of a model's function that its result has the dtype of its arguments."""
     if any(evaluation.methods for evaluation in evaluated.by_argument):
         function = evaluated.function
-        yield from _guarded(
+        yield from _guard(
             f"{function.name} keeps the dtype", lambda: _dtypes(function, evaluated.samples)
         )
 
@@ -50,7 +50,7 @@ def dtype_checks(evaluated: Evaluated) -> Iterator[Check]:
 def motion_checks(motion: Motion, samples: Samples) -> Iterator[Check]:
     """Checks of a motion model: its noise, its heading, and `perturb`."""
     pose, u, w = samples.values
-    yield from _guarded(
+    yield from _guard(
         "noise covariance", lambda: _covariances(motion.noise_cov, (pose, u), w.shape[-1])
     )
 
@@ -59,51 +59,49 @@ def motion_checks(motion: Motion, samples: Samples) -> Iterator[Check]:
         worst = float(np.max(np.abs(heading)))
         return "" if worst <= np.pi else f"it returns a heading of {worst:.6g} rad"
 
-    yield from _guarded("the heading is wrapped to (-π, π]", heading_error)
+    yield from _guard("the heading is wrapped to (-π, π]", heading_error)
     perturb = motion.perturb
     if perturb is None:
         return
 
     def perturb_error() -> str:
         def gap(pose: jax.Array, u: jax.Array, w: jax.Array) -> jax.Array:
-            there = motion.step(pose, perturb(u, w), jnp.zeros_like(w))
-            return there - motion.step(pose, u, w)
+            perturbed = motion.step(pose, perturb(u, w), jnp.zeros_like(w))
+            return perturbed - motion.step(pose, u, w)
 
         return _deviation(
             quick_jit(jax.vmap(gap))(pose, u, w), np.array([np.inf, np.inf, 2 * np.pi])
         )
 
-    yield from _guarded("step(pose, u, w) = step(pose, perturb(u, w), 0)", perturb_error)
+    yield from _guard("step(pose, u, w) = step(pose, perturb(u, w), 0)", perturb_error)
 
 
 def sensor_checks(sensor: Sensor, seen: Samples, inverse: Samples) -> Iterator[Check]:
     """Checks of a sensor: noise, residual, and that `invert` is the inverse of `observe`."""
     circle = periods(sensor.measurements)
     z = np.asarray(quick_jit(jax.vmap(sensor.observe))(*seen.values), np.float64)
-    yield from _guarded(
-        "noise covariance", lambda: _covariances(sensor.noise_cov, (z,), z.shape[-1])
-    )
+    yield from _guard("noise covariance", lambda: _covariances(sensor.noise_cov, (z,), z.shape[-1]))
     residual = quick_jit(jax.vmap(sensor.residual))
 
     def residual_size() -> str:
         got = jax.eval_shape(residual, z, z).shape[1:]
         return "" if got == z.shape[1:] else f"it returns shape {got}, expected {z.shape[1:]}"
 
-    size = list(_guarded("the residual has the size of z", residual_size))
+    size = list(_guard("the residual has the size of z", residual_size))
     if not all(check.passed for check in size):
         yield from size
         return
     other = z[::-1] + np.random.default_rng(0).uniform(-1, 1, z.shape)
-    yield from _guarded(
+    yield from _guard(
         "the residual is zero at equality",
         lambda: _exactly(residual(z, z)),
     )
-    yield from _guarded(
+    yield from _guard(
         "the residual is antisymmetric",
         lambda: _deviation(residual(z, other) + residual(other, z), circle),
     )
     wrapped = ", wrapped on the circle" if np.isfinite(circle).any() else ""
-    yield from _guarded(
+    yield from _guard(
         f"the residual is a difference{wrapped}",
         lambda: _residual_error(residual, z, other, circle),
     )
@@ -130,8 +128,8 @@ def sensor_checks(sensor: Sensor, seen: Samples, inverse: Samples) -> Iterator[C
             trouble = "off by 2π (an angle's name ends in [rad])"
         return f"{sensor.measurements[entry]} is {trouble}, at {at}"
 
-    yield from _guarded("observe undoes invert, whatever is free", observation_error)
-    yield from _guarded(
+    yield from _guard("observe undoes invert, whatever is free", observation_error)
+    yield from _guard(
         "invert undoes observe, within what is free", lambda: _inversion_error(sensor, seen)
     )
 
@@ -261,7 +259,7 @@ def _dtypes(function: Function, samples: Samples) -> str:
     return ""
 
 
-def _guarded(name: str, run: Callable[[], str]) -> Iterator[Check]:
+def _guard(name: str, run: Callable[[], str]) -> Iterator[Check]:
     """A check by name, passed if run returns ""; else it reports the result or the exception."""
     try:
         trouble = run()

@@ -35,7 +35,7 @@ class WrongEntry:
     dissent: tuple[str, ...]
     """the methods that disagree with the others at that state"""
     far_alone: bool = False
-    """it is wrong at large coordinates alone, as what subtracts them loses digits"""
+    """it is wrong only at large coordinates, as if a subtraction lost digits"""
 
     def lines(self, samples: int) -> Iterator[str]:
         """The entry as lines of text."""
@@ -52,7 +52,7 @@ class WrongEntry:
 
 
 class WorstState(TypedDict, total=False):
-    """The state with the largest difference over its tolerance; empty where there is no state."""
+    """The state with the largest difference over its tolerance; empty without a state."""
 
     label: str
     """name of the kind of state"""
@@ -148,7 +148,7 @@ class Report:
     """of a model, the median of `linearity_index` over the random states, for standard deviations
     of 0.1 (0.05 of [rad] and [1/m])"""
     notes: tuple[str, ...] = field(default=())
-    """what the user should know although it is no failure"""
+    """remarks that are not failures"""
 
     @property
     def passed(self) -> bool:
@@ -190,7 +190,7 @@ class Report:
 
     def as_dict(self) -> dict[str, object]:
         """The report as a dictionary for JSON; numbers that are not finite are None."""
-        told = {
+        out = {
             "model": self.model,
             "kind": self.kind,
             "passed": self.passed,
@@ -199,7 +199,7 @@ class Report:
             "linearity_index": self.linearity,
             "notes": self.notes,
         }
-        return {key: _json_value(part) for key, part in told.items()}
+        return {key: _json_value(part) for key, part in out.items()}
 
 
 def report_table(reports: Sequence[Report]) -> str:

@@ -19,7 +19,7 @@ from jaxslam.verify.inputs.functions import (
     factor_function,
     makes_a_model,
     plain_function,
-    told_signatures,
+    with_signature_errors,
 )
 from jaxslam.verify.inputs.samples import Samples
 from jaxslam.verify.record import Report
@@ -44,7 +44,7 @@ def verify_jacobians(
     tolerance: float = TOLERANCE,
     float32_tolerance: float = FLOAT32_TOLERANCE,
 ) -> Report:
-    """Compare the Jacobians of a model, by every argument, computed in four ways.
+    """Compare the Jacobians of a model by every argument, computed by four methods.
 
     At each sampled state these are `jax.jacfwd`, `jax.jacrev`, the hand-derived Jacobian if there
     is one, and difference quotients in float64 (Ridders' extrapolation with its error estimate; the
@@ -58,7 +58,7 @@ def verify_jacobians(
     themselves under jit and vmap, and keep the dtype; noise covariances are covariances; of a
     sensor the residual, and that `invert` and `observe` are inverse to each other.
 
-    The computation is in float64 whatever JAX is set to, and leaves that setting as it was. No
+    The computation is in float64 for any setting of JAX, and restores that setting. No
     fault of the model raises: a model that cannot be traced, raises or returns the wrong shape is
     reported with the line in its file, and the remaining checks are run.
 
@@ -68,14 +68,14 @@ def verify_jacobians(
             function of vectors.
         jacobian: of a function, its hand-derived Jacobian. Called with the function's arguments it
             returns a tuple of one (m, n_k) array an argument (None: no claim), or one array: by the
-            first argument, or by all of them side by side. Models bring their own.
+            first argument, or by all of them side by side. Models have their claims.
         arguments: of a function, the names of the entries of its arguments with units, as in
             {"pose": ("x [m]", "y [m]", "theta [rad]")}, or only their number. Parameters called
             pose, frame, landmark, l or point need not be given, nor others where `states` are.
         outputs: of a function, the names of its outputs with units; [rad] is modulo 2π.
         states: your own states, one array (S, n_k) an argument, instead of the sampled ones. For a
             sensor those of `observe`; `invert` is tried at the measurements of these.
-        name: of a function, its name in the report; default: its own.
+        name: name of a function in the report; default: its `__name__`.
         count: number of random states.
         seed: seed of the random states.
         tolerance, float32_tolerance: largest relative difference between autodiff and hand.
@@ -120,7 +120,7 @@ def verify_jacobians(
         )
     if isinstance(model, Motion | Sensor):
         kind, name = "motion" if isinstance(model, Motion) else "sensor", model.name
-        model = told_signatures(model)
+        model = with_signature_errors(model)
         functions = functions_of(model)
     elif isinstance(model, Factor):
         kind, name, functions = "factor", model.name, (factor_function(model),)
@@ -175,7 +175,7 @@ def build(
 
 
 def _given_samples(function: Function, states: Sequence[ArrayLike]) -> Samples:
-    """The caller's own states; raises ValueError on a wrong shape."""
+    """The states of the caller; raises ValueError on a wrong shape."""
     tables = [np.asarray(table, np.float64) for table in states]
     wanted = [len(argument.entries) for argument in function.arguments]
     shapes = [table.shape for table in tables]

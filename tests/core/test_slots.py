@@ -187,9 +187,9 @@ def test_removing_a_dead_slot_is_the_identity():
 
 def test_concerned_slots_are_those_that_a_place_names():
     slot, on = np.array([2, 0, -1, 2, 4]), np.array([True, False, False, True, True])
-    found = jax.jit(slots.concerned, static_argnums=2)(slot, on, 6)
+    found = jax.jit(slots.slot_mask, static_argnums=2)(slot, on, 6)
     np.testing.assert_array_equal(found, [False, False, True, False, True, False])
-    assert not slots.concerned(slot[:0], on[:0], 6).any()
+    assert not slots.slot_mask(slot[:0], on[:0], 6).any()
 
 
 def test_allocate_grants_the_lowest_free_slots_in_order_until_the_map_is_full():

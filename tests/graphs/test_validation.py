@@ -59,9 +59,9 @@ SPOILS = {
         lambda g: spoiled(g, "relative_position", "information", (0, 0, 1), 99.0),
         r"row 0 \(pose 10, point 0\): the information is not symmetric",
     ),
-    "nowhere": (
+    "out_of_range": (
         lambda g: spoiled(g, "relative_position", "who", (2, 1), 3),
-        "relative_position, row 2: point number 3 is nowhere, the graph has 3",
+        "relative_position, row 2: point index 3 is out of range: the graph has 3 points",
     ),
     "itself": (
         lambda g: spoiled(g, "relative_pose", "who", (2, 1), 2),

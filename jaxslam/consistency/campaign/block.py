@@ -47,7 +47,7 @@ class CampaignPlan:
     block: int
     """runs a device"""
     bound: bool = False
-    """whether the conditional Cramér-Rao bound of every run is taken"""
+    """whether to compute the conditional Cramér-Rao bound of every run"""
     dtype: np.dtype | None = None
     """of the worlds; None for that of JAX"""
 
@@ -83,7 +83,7 @@ class BlockRunner:
         self.first: dict[str, tuple[Truth, Estimate]] = {}
         """run 0 of each filter, once its block has run"""
         self._spent: dict[str, list[float]] = {name: [] for name in plan.filters}
-        """wall seconds of each block so far"""
+        """wall seconds of each finished block"""
         began = time.perf_counter()
         self._compile()
         self.compile_seconds = time.perf_counter() - began
@@ -147,7 +147,7 @@ class BlockRunner:
     def block(self, first: int, runs: int) -> dict[str, dict[str, np.ndarray]]:
         """The condensed scores of runs first … first + runs - 1 by filter, all within a block."""
         plan, made = self.plan, self.programs
-        # A run has its place in the block by its number, in whatever piece: the same bits.
+        # The number of a run sets its place in a block, in any piece: the same bits.
         base = first // plan.wide * plan.wide
         mine = slice(first - base, first - base + runs)
         which = self._numbers(base)
@@ -178,12 +178,12 @@ class BlockRunner:
         found = jax.device_get(
             self._statistics(self._world.sensor, drawn, results.estimate, results.info)
         )
-        own = np.swapaxes(jax.device_get(results.own_error), 0, 1)
+        chart_error = np.swapaxes(jax.device_get(results.own_error), 0, 1)
         trace = _on_host(results)
-        return score(*jax.tree.map(lambda leaf: leaf[mine], (trace, truth, found, own)))
+        return score(*jax.tree.map(lambda leaf: leaf[mine], (trace, truth, found, chart_error)))
 
     def run_seconds(self) -> dict[str, float]:
-        """What one run took on one device, by filter: the median over blocks so far."""
+        """The time of one run on one device, by filter: the median over finished blocks."""
         return {
             name: float(np.median(times)) / self.plan.block
             for name, times in self._spent.items()

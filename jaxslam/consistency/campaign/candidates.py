@@ -1,4 +1,4 @@
-"""Checks of what a campaign is given to run, and how many runs fit a device."""
+"""Checks of the filters of a campaign, and the number of runs that fit a device."""
 
 import inspect
 from collections.abc import Callable, Mapping
@@ -72,11 +72,11 @@ def rounded(tree: _T, dtype: DTypeLike | None) -> _T:
 
 
 def check_noise(scenario: World) -> None:
-    """Raise ValueError where a model of the scenario states a noise that is no covariance.
+    """Raise ValueError if the noise of a model of the scenario is not a covariance.
 
     A `noise_cov` that is a function can only be looked at where it is called. That of the motion is
     called for the start and the first control, that of a sensor, or of each part of a suite, for
-    z = 0 and, where it is no covariance there, for the first landmark as seen from the start.
+    z = 0 and, if it is not a covariance there, for the first landmark as measured from the start.
     """
     if not is_concrete(scenario.controls, scenario.pose, scenario.landmarks):
         return
@@ -88,11 +88,11 @@ def check_noise(scenario: World) -> None:
         try:
             _check_stated(model.name, size, model, nothing)
         except ValueError:
-            _check_stated(model.name, size, model, _seen_first(model, scenario))
+            _check_stated(model.name, size, model, _first_measurement(model, scenario))
 
 
 def without_noise(scenario: World) -> str:
-    """In words, what the scenario's sensors measure without noise; "" where there is none.
+    """The names of the scenario's measurements without noise; "" without such a measurement.
 
     Looked at where `check_noise` looks; a noise that grows from 0 with z is one.
     """
@@ -100,7 +100,7 @@ def without_noise(scenario: World) -> str:
         return ""
     found = []
     for model in _sensors(scenario):
-        for z in (_number(np.zeros(len(model.measurements))), _seen_first(model, scenario)):
+        for z in (_number(np.zeros(len(model.measurements))), _first_measurement(model, scenario)):
             exact = _exact(model, np.asarray(_noise_cov(model, z), np.float64))
             if not exact:
                 break
@@ -110,7 +110,7 @@ def without_noise(scenario: World) -> str:
 
 
 def _exact(sensor: Sensor, cov: np.ndarray) -> str:
-    """The measurements of variance 0; a combination of them where it is none of them alone."""
+    """The measurements of variance 0; a combination of them if no single one has variance 0."""
     sigma = np.sqrt(np.diagonal(cov))
     if (sigma == 0).any():
         return ", ".join(n for n, one in zip(sensor.measurements, sigma, strict=True) if one == 0)
@@ -123,7 +123,7 @@ def _sensors(scenario: World) -> list[Sensor]:
     return [part.sensor for part in sensor.parts] if isinstance(sensor, Suite) else [sensor]
 
 
-def _seen_first(sensor: Sensor, scenario: World) -> jax.Array:
+def _first_measurement(sensor: Sensor, scenario: World) -> jax.Array:
     """The first landmark as measured from the start, (Z,)."""
     landmark = _number(scenario.landmarks)[0, : len(sensor.landmark)]
     z: jax.Array = _observe(sensor, _number(scenario.pose), landmark)
@@ -149,12 +149,12 @@ def _check_stated(name: str, size: int, model: Motion | Sensor, *at: PyTree) -> 
     try:
         check_covariance(name, _noise_cov(model, *at), size)
     except ValueError as error:
-        said = str(error).removeprefix(f"{name}: ")
-        raise ValueError(f"monte_carlo: noise_cov of {name}: {said}") from None
+        message = str(error).removeprefix(f"{name}: ")
+        raise ValueError(f"monte_carlo: noise_cov of {name}: {message}") from None
 
 
 def check_fits(name: str, candidate: Candidate, scenario: World) -> None:
-    """Raise ValueError unless a candidate takes what the scenario's log has."""
+    """Raise ValueError unless a candidate fits the scenario's log."""
     if isinstance(candidate, LogEstimator):
         return
     if isinstance(candidate, type):
@@ -209,7 +209,7 @@ def check_called(name: str, candidate: Callable[..., object]) -> None:
 
 
 def method_of(candidate: Candidate, truth: Truth) -> Filter | Estimator:
-    """A filter or an estimator: a candidate, or what it makes of the truth.
+    """A filter or an estimator: a candidate, or its result for the truth.
 
     Raises ValueError where it fails on the truth, as a function of the world.
     """

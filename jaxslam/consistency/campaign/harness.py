@@ -1,8 +1,8 @@
 """The campaign: blocks of runs over devices, kept as they finish, then summed up.
 
 A run is a number: its key and its place in a block. For one size of blocks and one number of
-devices its world and its filters' results are the same to the bit, whatever workers and parts there
-are and whatever was interrupted; otherwise to rounding. Only scores are kept of a block, so
+devices its world and its filters' results are the same to the bit, for any workers, parts and
+interruptions; otherwise to rounding. Only scores are kept of a block, so
 memory is that of the blocks in flight however many runs there are.
 """
 
@@ -71,19 +71,19 @@ def monte_carlo(
             holds one campaign: what must agree (key, scenario, models, filters, precision,
             versions) is its `identity`. More runs than it has extend it.
         part: (i, n) with 1 <= i <= n: only the blocks i - 1, i - 1 + n, … are computed, and the
-            campaign returned is of them. So n jobs that know nothing of each other compute a
+            returned campaign covers them. So n independent jobs compute a
             campaign, each with a `keep` from `store.join` on one folder, with the same block and
             number of devices; without `part` the blocks are summed up, and those that are missing
             computed.
         progress: called with (runs done, runs) after each block. Default a bar with
-            rate and remaining time, on a terminal and in a notebook alone; False: none.
+            rate and remaining time, only on a terminal and in a notebook; False: none.
     Returns:
         Campaign.
     Raises:
         ValueError: on runs, block or workers below 1, more runs than are recorded, no PRNG key, no
             devices, no filters, a filter that does not fit the scenario, or a noise that is no
             covariance, before anything is traced; where `keep` holds another campaign, by every
-            difference, or runs beyond those asked for; on a part without a block.
+            difference, or runs beyond the requested ones; on a part without a block.
         MemoryError: if one run a device is too much.
         Interrupted: on Ctrl-C, with the campaign so far.
     """
@@ -104,11 +104,11 @@ def monte_carlo(
             f"monte_carlo: part: expected one of the {-(-runs // plan.wide)} blocks of {plan.wide} "
             f"runs that {runs} runs are, got part {part[0]} of {part[1]}"
         )
-    done: list[tuple[int, int]] = []
+    finished: list[tuple[int, int]] = []
     if keep is not None:
         keep.claim(identity(scenario, filters, key, devices[0].platform, bound, dtype))
-        done = add_kept(tallies, keep, runs, lambda first: in_part(first, plan.wide, part))
-    pieces = missing(done, runs, plan.wide)
+        finished = add_kept(tallies, keep, runs, lambda first: in_part(first, plan.wide, part))
+    pieces = missing(finished, runs, plan.wide)
     todo = [piece for piece in pieces if in_part(piece[0], plan.wide, part)]
     work = Work(workers, keep, progress or None, {name: Tally() for name in names})
     try:
@@ -117,7 +117,7 @@ def monte_carlo(
         interrupted = False
     except KeyboardInterrupt:
         interrupted = True
-    for name, tally in work.own.items():
+    for name, tally in work.tallies.items():
         tallies[name].merge(tally)
     campaign = None
     if tallies[BOUND].pieces():
@@ -179,10 +179,10 @@ def _check(
 
 def summaries_of(tallies: dict[str, Tally]) -> tuple[int, np.ndarray, dict[str, Summary]]:
     """How many runs there are, the divergence limit, and the summary of each filter."""
-    done = sum(count for _, count in tallies[BOUND].pieces())
-    bound = {name: total / done for name, total in tallies[BOUND].sums.items()} or None
+    finished = sum(count for _, count in tallies[BOUND].pieces())
+    bound = {name: total / finished for name, total in tallies[BOUND].sums.items()} or None
     found = {name: summarize(one, bound) for name, one in tallies.items() if name != BOUND}
-    return done, tallies[BOUND].first("limit"), found
+    return finished, tallies[BOUND].first("limit"), found
 
 
 def _summed_up(
@@ -190,17 +190,17 @@ def _summed_up(
 ) -> Campaign:
     """The campaign of the runs in the tallies."""
     scenario = plan.scenario
-    done, limit, summaries = summaries_of(tallies)
+    finished, limit, summaries = summaries_of(tallies)
     steps = max(scenario.steps, 1)
     return Campaign(
         scenario=scenario.name,
         source=scenario.source,
-        published={name: dict(told) for name, told in scenario.published.items()},
+        published={name: dict(values) for name, values in scenario.published.items()},
         steps=scenario.steps,
-        runs=done,
+        runs=finished,
         dtype=str(limit.dtype),
         divergence_limit=float(limit),
-        filters=_qualified(summaries, scenario),
+        filters=_qualify(summaries, scenario),
         seconds=seconds,
         compile_seconds=work.compile_seconds,
         step_seconds={name: seconds / steps for name, seconds in work.run_seconds.items()},
@@ -212,7 +212,7 @@ def _summed_up(
     )
 
 
-def _qualified(found: dict[str, Summary], scenario: World) -> dict[str, Summary]:
+def _qualify(found: dict[str, Summary], scenario: World) -> dict[str, Summary]:
     """The summaries, with a doubt on those that an exact sensor left without a covariance."""
     dropped = {name: one.counts.get("singular", 0) for name, one in found.items()}
     exact = without_noise(scenario) if any(dropped.values()) else ""

@@ -32,7 +32,7 @@ _OF_WORLD = ("landmarks", "controls", "pose", "pose_cov", "motion", "sensor")
 """Parts of a world that are named where they differ."""
 
 _NO_PART_OF_DRAWS = frozenset({"name", "published", "source", "filter_options"})
-"""Fields of a world that do not change what is drawn."""
+"""Fields of a world that do not change its draws."""
 
 _BY_DATACLASS = frozenset({"__init__", "__repr__", "__setattr__", "__delattr__", "__replace__"})
 """Methods that are made of the fields."""
@@ -51,7 +51,7 @@ def identity(
 ) -> dict[str, str]:
     """A short text by the name of each thing that must agree.
 
-    The number of runs is no part of it: run i has a key of its own. platform: of the devices that
+    The number of runs is not part of it: run i has its key. platform: of the devices that
     compute, as "cpu"; rounding differs between platforms.
     """
     parts = {name: digest(getattr(scenario, name)) for name in _OF_WORLD}

@@ -26,22 +26,22 @@ def add_kept(
 ) -> list[tuple[int, int]]:
     """Add the blocks kept whose first run is wanted; (first, runs) of all of them.
 
-    Raises ValueError where there are runs beyond those asked for.
+    Raises ValueError on stored runs beyond the requested ones.
     """
-    done: list[tuple[int, int]] = []
+    finished: list[tuple[int, int]] = []
     most = 0
     for first, count, arrays in keep.blocks():
         most = max(most, first + count)
         if most > runs:  # sums over a block cannot be taken apart; look how many runs there are
             continue
-        done.append((first, count))
+        finished.append((first, count))
         if wanted(first):
             add_block(tallies, first, count, by_filter(arrays, tallies))
     if most > runs:
         raise ValueError(
             f"monte_carlo: keep holds {most} runs: expected at least as many, got {runs}"
         )
-    return done
+    return finished
 
 
 def add_block(

@@ -4,7 +4,7 @@ import os
 from collections.abc import Iterable
 
 
-def missing(done: Iterable[tuple[int, int]], runs: int, block: int) -> list[tuple[int, int]]:
+def missing(finished: Iterable[tuple[int, int]], runs: int, block: int) -> list[tuple[int, int]]:
     """The pieces (first, runs) of runs 0 … runs-1 that are not done, in order; each of them lies
     within runs n block … (n + 1) block - 1 for some n.
 
@@ -13,7 +13,7 @@ def missing(done: Iterable[tuple[int, int]], runs: int, block: int) -> list[tupl
     if block < 1:
         raise ValueError(f"block: expected an integer >= 1, got {block}")
     gaps, at = [], 0
-    for first, count in [*sorted(done), (runs, 0)]:
+    for first, count in [*sorted(finished), (runs, 0)]:
         gaps.append((at, min(first, runs)))
         at = max(at, first + count)
     return [
@@ -34,7 +34,7 @@ def check_part(name: str, part: object) -> None:
 def in_part(first: int, block: int, part: tuple[int, int] | None) -> bool:
     """Whether the block of run `first` is one of part (i, n): blocks i - 1, i - 1 + n, … from 0 on.
 
-    So the parts of a campaign depend neither on what is done nor on how many runs it has.
+    So the parts of a campaign depend neither on finished runs nor on the number of runs.
     """
     return part is None or first // block % part[1] == part[0] - 1
 

@@ -55,7 +55,7 @@ class FilterResults(NamedTuple):
     info: Info
     """(T, B, …)"""
     own_error: Float[Array, "T B 3"]
-    """the pose error in the filter's own coordinates"""
+    """the pose error in the coordinates of the filter"""
     monitor: Monitor | None
     """(B, …) its observability monitor at the end, where it has one"""
     information: Float[Array, "T B 3 3"] | None
@@ -159,10 +159,10 @@ def drive_filter(
     def one(i: Array, truth: Truth, log: Log) -> FilterResults:
         method, chart = estimator_of(candidate, truth, scenario)
         trace = method(log, run_keys(key, i)[1])
-        own = own_error_of(chart, scenario.sensor, trace, truth)
+        chart_error = own_error_of(chart, scenario.sensor, trace, truth)
         monitor = monitor_of(trace.final)
         information = None if monitor is None else trace.probe
-        return FilterResults(trace.estimate, trace.info, own, monitor, information)
+        return FilterResults(trace.estimate, trace.info, chart_error, monitor, information)
 
     results: FilterResults = jax.vmap(one, out_axes=RUN_AXES)(which, *draws)
     return results

@@ -1,4 +1,4 @@
-"""A progress bar, drawn on a terminal or in a notebook, and nowhere else."""
+"""A progress bar, drawn only on a terminal or in a notebook."""
 
 import os
 import sys
@@ -35,27 +35,27 @@ class Progress:
         """Show a word on the current stage of the work."""
         self._draw(f"{self._what}: {what}")
 
-    def __call__(self, done: int, total: int) -> None:
+    def __call__(self, finished: int, total: int) -> None:
         """Show how much is done and, from the second call on, the rate and the remaining time.
 
         The rate is measured from the first call, so it excludes compilation.
         """
         now = time.perf_counter()
-        filled = round(30 * done / total)
+        filled = round(30 * finished / total)
         bar = "█" * filled + "░" * (30 - filled)
-        line = f"{self._what}: {bar} {done:,}/{total:,} {self._unit}, {now - self._began:.0f} s"
+        line = f"{self._what}: {bar} {finished:,}/{total:,} {self._unit}, {now - self._began:.0f} s"
         if self._first is None:
-            self._first = now, done
-        elif done > self._first[1] and now > self._first[0]:
-            rate = (done - self._first[1]) / (now - self._first[0])
-            line += f", {_rate(rate)} a second, {_duration((total - done) / rate)} left"
+            self._first = now, finished
+        elif finished > self._first[1] and now > self._first[0]:
+            rate = (finished - self._first[1]) / (now - self._first[0])
+            line += f", {_rate(rate)} a second, {_duration((total - finished) / rate)} left"
         self._draw(line)
 
     def __exit__(self, *_: object) -> None:
         self._draw("")
 
     def _draw(self, line: str) -> None:
-        """Show a line in place of the last one."""
+        """Replace the last line."""
         if self._terminal:
             print(f"\r\x1b[K{line}", end="", file=sys.stderr, flush=True)
         elif self._cell is not None:

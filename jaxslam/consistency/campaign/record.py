@@ -15,7 +15,7 @@ from jaxslam.core.types import Estimate, Truth
 
 @dataclass(frozen=True, repr=False)
 class Campaign:
-    """The result of a campaign: what was run, and a `Summary` for each filter by name.
+    """The result of a campaign: its settings, and a `Summary` for each filter by name.
 
     `print(campaign)` is the table of verdicts and measures that the command prints, and a notebook
     shows verdicts and figures. `save` writes the whole report, `to_dataframe` has the runs.
@@ -41,8 +41,8 @@ class Campaign:
     process computed while nothing was being compiled (where there are none, over all), several of
     which are at work at once; without filters of which it was none."""
     first: dict[str, tuple[Truth, Estimate]] = field(default_factory=dict)
-    """Run 0 by filter, host arrays; of those that this process did not run there is none. For
-    landmarks that are no points, the truth has their positions."""
+    """Run 0 by filter, host arrays; absent for filters that this process did not run. For
+    landmarks other than points, the truth has their positions."""
     run_numbers: np.ndarray = field(default_factory=lambda: np.arange(0))
     """(runs,) the number of each run, in the order of `Summary.per_run`; run i has key
     fold_in(key, i)"""
@@ -135,7 +135,7 @@ class Campaign:
 
 
 class Interrupted(KeyboardInterrupt):
-    """Ctrl-C, once the blocks at work are finished; `campaign` is of the runs done, if any."""
+    """Ctrl-C, raised after the blocks in flight; `campaign` covers the finished runs, if any."""
 
     def __init__(self, campaign: Campaign | None, runs: int) -> None:
         super().__init__(f"{campaign.runs if campaign else 0} of {runs} runs done")

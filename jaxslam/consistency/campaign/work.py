@@ -25,8 +25,8 @@ class Work:
     workers: int
     keep: Keep | None
     progress: Callable[[int, int], None] | None
-    own: dict[str, Tally]
-    """what was computed here, by filter"""
+    tallies: dict[str, Tally]
+    """the results of this process, by filter"""
     compile_seconds: float = 0.0
     run_seconds: dict[str, float] = field(default_factory=dict)
     first: dict[str, tuple[Truth, Estimate]] = field(default_factory=dict)
@@ -56,7 +56,7 @@ class Work:
         """Add those of the pieces that are not yet there to the tallies."""
         if not todo:
             return
-        before = self.own[BOUND].pieces()
+        before = self.tallies[BOUND].pieces()
         queue = [
             piece
             for first, count in todo
@@ -64,11 +64,11 @@ class Work:
         ][::-1]
         runner = BlockRunner(plan)
         self.compile_seconds += runner.compile_seconds
-        done = sum(count for _, count in before)
+        finished = sum(count for _, count in before)
         total = sum(count for _, count in todo)
         flight: dict[Future[dict[str, dict[str, np.ndarray]]], tuple[int, int]] = {}
         stop: BaseException | None = None
-        # XLA uses the cores; threads of the BLAS below its LAPACK would only spin beside it.
+        # XLA uses the cores; additional threads of the BLAS below its LAPACK would only spin.
         with threadpool_limits(1, "blas"), ThreadPoolExecutor(self.workers) as pool:
             while flight or (queue and stop is None):
                 try:
@@ -81,15 +81,15 @@ class Work:
                             continue
                         found = future.result()
                         if self.keep is not None:
-                            self.keep.save(first, flat(found, self.own), count)
-                        add_block(self.own, first, count, found)
-                        done += count
+                            self.keep.save(first, flat(found, self.tallies), count)
+                        add_block(self.tallies, first, count, found)
+                        finished += count
                         if self.progress is not None:
-                            self.progress(done, total)
+                            self.progress(finished, total)
                 except BaseException as error:
                     if stop is not None:
                         raise
-                    stop = error  # what is at work is finished, and kept
+                    stop = error  # blocks in flight are finished and kept
                     for future in flight:
                         future.cancel()
         self.run_seconds = runner.run_seconds()
@@ -100,7 +100,7 @@ class Work:
 
 @contextlib.contextmanager
 def shown_progress(work: Work, plan: CampaignPlan, wanted: bool) -> Iterator[None]:
-    """A block in which, if wanted, a bar of progress tells of the work where it can be seen."""
+    """A context with an optional progress bar on a terminal or in a notebook."""
     count = len(plan.filters)
     bar = Progress(f"{plan.scenario.name}, {count} filter{'s' * (count > 1)}") if wanted else None
     if bar is None or not bar.shown:

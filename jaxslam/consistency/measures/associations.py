@@ -40,7 +40,7 @@ def associations(
 
     precision: corrections by a measurement of that landmark, over all corrections. recall: the same
     over the measurements of landmarks that were in the map before the step. false_landmarks: those
-    of the final map that are of no true landmark, or of one that an earlier slot holds. held: the
+    of the final map without a true landmark, or with that of an earlier slot. held: the
     `identities` of the run.
     """
     info = trace.info

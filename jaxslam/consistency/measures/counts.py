@@ -34,7 +34,7 @@ MEANINGS = {
     "merged": "pairs of landmarks made one",
     "reduced": "landmarks converted to points",
     "exhausted": "scans whose search for an association ended at its limit",
-    "resampled": "scans after which particles were drawn anew by their weights",
+    "resampled": "scans after which particles were resampled by their weights",
     "underflow": "scans that left no particle a weight",
     "invalid": "particles whose pose was not finite",
     "injected": "particles drawn anywhere, to find a lost robot",
@@ -49,10 +49,10 @@ def count_label(name: str) -> str:
 
 
 def counted(info: Info) -> dict[str, Int[np.ndarray, "R"]]:
-    """How many measurements of R runs became what, and what the filter counts itself.
+    """The counts of measurements of R runs by status, and those of the filter.
 
-    A filter counts what a record of `Info.extra` returns by its method `counts`: arrays (R, T, …),
-    by name.
+    The counts of a filter come from the method `counts` of records of `Info.extra`: arrays (R, T,
+    …), by name.
     """
     runs = len(info.status)
     at = np.asarray(info.status).reshape(runs, -1) + np.arange(runs)[:, None] * len(Status)

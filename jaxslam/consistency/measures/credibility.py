@@ -41,7 +41,7 @@ class Coverage(Measure):
         """The steps within the ellipsoid, of those with a regular covariance."""
         nees = runs.nees[self.block]
         count = nees.regular.sum(axis=1)
-        covered = _covered(nees, DOF[self.block])
+        covered = _coverage(nees, DOF[self.block])
         sums = {f"coverage_{self.block}": covered / np.maximum(count, 1)[:, None]}
         return RunScores(covered[:, LEVELS.index(0.95)], count, sums)
 
@@ -117,8 +117,8 @@ def credibility(
             continue
         claimed = np.einsum("ri,ri->r", e, np.linalg.solve(covs[runs, step], e[:, :, None])[..., 0])
         fair = np.einsum("ri,ri->r", e, np.linalg.solve(actual, e.T).T)
-        there = (claimed > 0) & (fair > 0) & np.isfinite(claimed) & np.isfinite(fair)
-        runs, decibels = runs[there], 10 * np.log10(claimed[there] / fair[there])
+        valid = (claimed > 0) & (fair > 0) & np.isfinite(claimed) & np.isfinite(fair)
+        runs, decibels = runs[valid], 10 * np.log10(claimed[valid] / fair[valid])
         total[:, runs] += [np.abs(decibels), decibels]
         count[runs] += 1
     if not count.any():
@@ -135,7 +135,7 @@ def coverage_curves(sums: Sums, per_run: Mapping[str, np.ndarray]) -> dict[str, 
     }
 
 
-def _covered(nees: Nees, dof: int) -> Int[np.ndarray, "R LEVELS"]:
+def _coverage(nees: Nees, dof: int) -> Int[np.ndarray, "R LEVELS"]:
     """At how many steps the truth lies in the ellipsoid of each of the probabilities `LEVELS`."""
     runs, bins = len(nees.value), len(LEVELS) + 1
     radii = [chi2_quantile(p, dof) for p in LEVELS]

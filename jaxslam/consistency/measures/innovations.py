@@ -48,7 +48,7 @@ class Autocorrelation(Measure):
 
 @dataclass(frozen=True, eq=False)
 class LogLikelihood(Measure):
-    """The log-likelihood of a run's innovations; there is none without an innovation."""
+    """The log-likelihood of a run's innovations, if it has any."""
 
     def of_runs(self, runs: Runs) -> RunScores:
         """The sum over the steps."""
@@ -74,7 +74,7 @@ LOG_LIKELIHOOD = LogLikelihood("log_likelihood", "log-likelihood")
 
 
 def nis_band(total_dof: float) -> tuple[float, float] | None:
-    """The 95 % band of NIS / dof of so many degrees of freedom; None without any."""
+    """The 95 % band of NIS / dof for these degrees of freedom; None for zero."""
     if not total_dof > 0:
         return None
     tail = (1 - LEVEL) / 2

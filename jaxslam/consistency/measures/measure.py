@@ -1,6 +1,6 @@
 """What a measure of consistency is: a number or a curve of each run, averaged over the runs.
 
-A measure says what it is called, what an honest filter has, how it is computed and where it is
+A measure has a name, an honest value, a computation and the places where it is
 shown. Its class is `Measure` where a function of JAX computes it, and a subclass in a file of this
 package where it is made of what all measures share (`Runs`).
 """
@@ -24,9 +24,9 @@ class Nees(NamedTuple):
     """The NEES of one block of the pose error, at each step."""
 
     value: Float[np.ndarray, "..."]
-    """0 where there is none."""
+    """0 without a value."""
     regular: Bool[np.ndarray, "..."]
-    """whether there is one"""
+    """mask of the values"""
 
 
 class RunStatistics(NamedTuple):
@@ -68,11 +68,11 @@ class RunScores(NamedTuple):
     """A measure of each of R runs."""
 
     total: np.ndarray
-    """(R,) what is averaged within the run"""
+    """(R,) the average within each run"""
     weight: np.ndarray | int
     """(R,) over how much; a run of weight 0 has no number"""
     sums: Sums = MappingProxyType({})
-    """(R, …) what is added up over the runs, for `Measure.curves`, by name"""
+    """(R, …) summed over the runs, for `Measure.curves`, by name"""
 
 
 @dataclass(frozen=True, eq=False)
@@ -92,7 +92,7 @@ class Measure:
     positive: bool = False
     """it is never negative: the interval is `positive_interval`, else `interval`"""
     note: tuple[str, str] | None = None
-    """a term and a sentence below the table, where the label does not say all"""
+    """a term and a sentence below the table, if the label is not enough"""
     row: bool = True
     """whether tables show it"""
     figure: str = ""
@@ -108,7 +108,7 @@ class Measure:
 
     @property
     def title(self) -> str:
-        """Label and unit, as of a row."""
+        """Label and unit of a row."""
         return f"{self.label} [{self.unit}]" if self.unit else self.label
 
     def of_runs(self, runs: Runs) -> RunScores | None:
@@ -118,12 +118,12 @@ class Measure:
             return None
         if isinstance(found, tuple):
             return RunScores(np.asarray(found[0]), np.asarray(found[1]))
-        there = np.isfinite(found)
-        values = np.where(there, found, 0.0).astype(np.float64)
+        finite = np.isfinite(found)
+        values = np.where(finite, found, 0.0).astype(np.float64)
         if values.ndim == 1:
-            return RunScores(values, there)
-        sums = {self.key: values, f"runs_{self.key}": there.astype(np.float64)}
-        return RunScores(values.sum(axis=1), there.sum(axis=1), sums)
+            return RunScores(values, finite)
+        sums = {self.key: values, f"runs_{self.key}": finite.astype(np.float64)}
+        return RunScores(values.sum(axis=1), finite.sum(axis=1), sums)
 
     def of_snapshots(
         self,

@@ -1,5 +1,5 @@
 """NEES: eᵀ P⁻¹ e of a pose and of its blocks, e = truth - estimate, in (x, y, θ) and in the
-filter's own error coordinates; on the host, by NumPy in float64. And of landmarks.
+error coordinates of the filter, and of landmarks; on the host, by NumPy in float64.
 """
 
 from collections.abc import Mapping
@@ -17,10 +17,10 @@ from jaxslam.core.types import Trace, Truth
 from jaxslam.math.stats import chi2_quantiles
 
 DOF = {"pose": 3, "position": 2, "heading": 1}
-"""Blocks of the pose error whose NEES is taken, and the mean of an honest one."""
+"""Blocks of the pose error with a NEES, and its honest mean."""
 
 _ROUNDING = 32
-"""A claimed deviation of at most so many ulp of its coordinate is taken for zero."""
+"""Largest claimed deviation, in ulp of its coordinate, that counts as zero."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,10 +94,10 @@ def pose_error(
 def block_nees(
     pose: Float[np.ndarray, "*steps 3"],
     error: Float[np.ndarray, "*steps 3"],
-    own: Float[np.ndarray, "*steps 3"],
+    chart_error: Float[np.ndarray, "*steps 3"],
     cov: Float[np.ndarray, "*steps 3 3"],
 ) -> dict[str, Nees]:
-    """The NEES of each block of `DOF`, and of the error in the filter's own coordinates ("own").
+    """The NEES of each block of `DOF`, and of the error in the coordinates of the filter ("own").
 
     There is none where the claimed covariance is singular, i.e. some direction is known exactly:
     1/tr P⁻¹, at most its least eigenvalue and at least a third of it, is at most 100 n·eps where P
@@ -120,8 +120,8 @@ def block_nees(
         }
         factor, pivots = _cholesky(scaled, eps)
         found = {}
-        for name, e in (("pose", error), ("own", own)):
-            squares, known = _whitened(factor, e, unit)
+        for name, e in (("pose", error), ("own", chart_error)):
+            squares, known = _whiten(factor, e, unit)
             for block, k in (("position", 2), ("pose", 3)):
                 if name == "pose" or block == "pose":
                     regular = (_least_eigenvalue(factor, pivots, k) > 100 * k * eps) & _every(
@@ -157,8 +157,8 @@ def _unit(pose: np.ndarray, cov: np.ndarray, eps: float) -> list[np.ndarray]:
     reach = np.abs(pose[..., :2]).max(axis=-1)
 
     def unit(variance: np.ndarray, size: np.ndarray | float) -> np.ndarray:
-        there = variance > (_ROUNDING * eps * size) ** 2
-        return np.where(there, 1.0 / np.sqrt(np.where(there, variance, 1.0)), 0.0)
+        certain = variance > (_ROUNDING * eps * size) ** 2
+        return np.where(certain, 1.0 / np.sqrt(np.where(certain, variance, 1.0)), 0.0)
 
     metres = unit(np.maximum(x, y), reach)
     return [metres, metres, unit(heading, np.pi)]
@@ -185,7 +185,7 @@ def _cholesky(
     return factor, pivots
 
 
-def _whitened(
+def _whiten(
     factor: dict[tuple[int, int], np.ndarray], error: np.ndarray, unit: list[np.ndarray]
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """The squares of L⁻¹e by coordinate, and whether the error is finite there."""
@@ -194,8 +194,8 @@ def _whitened(
     for i in range(3):
         rest = np.where(known[i], error[..., i], 0.0) * unit[i]
         rest = rest - sum(factor[i, k] * rows[k] for k in range(i))
-        there = factor[i, i] > 0
-        rows.append(np.where(there, rest / np.where(there, factor[i, i], 1.0), 0.0))
+        regular = factor[i, i] > 0
+        rows.append(np.where(regular, rest / np.where(regular, factor[i, i], 1.0), 0.0))
     return [row**2 for row in rows], known
 
 
@@ -207,10 +207,10 @@ def _least_eigenvalue(
     positive = _every([pivot > 0 for pivot in pivots[:size]])
     rows: dict[tuple[int, int], np.ndarray] = {}
     for i in range(size):
-        own = 1.0 / np.where(factor[i, i] > 0, factor[i, i], 1.0)
-        rows[i, i] = own
+        inverse = 1.0 / np.where(factor[i, i] > 0, factor[i, i], 1.0)
+        rows[i, i] = inverse
         for j in range(i):
-            rows[i, j] = -own * sum(factor[i, k] * rows[k, j] for k in range(j, i))
+            rows[i, j] = -inverse * sum(factor[i, k] * rows[k, j] for k in range(j, i))
     out: np.ndarray = np.where(positive, 1.0 / sum(row**2 for row in rows.values()), 0.0)
     return out
 

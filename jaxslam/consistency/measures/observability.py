@@ -1,4 +1,4 @@
-"""Measures of a monitored filter: what its own linearized system leaves unobservable."""
+"""Measures of a monitored filter: the unobservable directions of its linearized system."""
 
 from dataclasses import dataclass
 
@@ -69,7 +69,7 @@ def monitor_of(state: PyTree) -> Monitor | None:
 def unobservable_directions(monitor: Monitor) -> Int[np.ndarray, "R"]:
     """The dimension of the unobservable subspace of the filter's linearized system.
 
-    A direction is unobservable if what was gained along it is below 1e-9 of the same sum of squares
+    A direction is unobservable if the information along it is below 1e-9 of the same sum of squares
     with absolute values, in float32 eps^(3/4): rounding leaves 1e-32 of it, the higher moments that
     sigma points do not see 1e-10, an EKF's changing Jacobians 1e-5 after a hundred steps.
     """

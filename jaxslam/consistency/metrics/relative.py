@@ -49,10 +49,10 @@ def relations(
 
     Args:
         reference: (K, 3) poses, in the order of time.
-        rows: exactly so many rows after.
+        rows: distance of the two poses in rows.
         seconds: at least so long after, by the stamps `time` (K,) [s]. Of several spacings, the
             relations of each, one after the other.
-        metres: at least so far after, along the reference path; as `seconds`.
+        metres: least distance along the reference path; as `seconds`.
     Raises:
         ValueError: unless exactly one spacing is given, and above 0; on poses that are none, and
             on stamps that are missing or go back.
@@ -122,7 +122,7 @@ def given(
     """Relations that a file gives by their stamps, by the rows of a path, and how many are dropped.
 
     Each stamp takes the row nearest in time, the first of several with the same stamp; a relation
-    of which one is further than `tolerance` away is dropped.
+    with one further than `tolerance` away is dropped.
 
     Args:
         time: (K,) stamps of the path [s], in any order: logs have scans stamped before their
@@ -132,7 +132,7 @@ def given(
         tolerance: [s].
     Raises:
         ValueError: on shapes that do not fit, stamps of the path that are not finite, a tolerance
-            that is no number of at least 0; and where no relation is kept, with both time ranges.
+            that is not a number of at least 0; and if no relation is kept, with both time ranges.
     """
     stamps, of = np.asarray(time, np.float64), poses_of("given", pose)
     if stamps.ndim != 1 or not len(stamps) or not np.isfinite(stamps).all():
@@ -276,8 +276,8 @@ def summary(errors: Errors | PathErrors) -> dict[str, float]:
     ):
         figures = statistics(values)
         for figure in ("mean", "std", "rmse", "median", "max"):
-            told = "RMSE" if figure == "rmse" else figure
-            found[f"{name} {told} [{unit}]"] = float(getattr(figures, figure))
+            title = "RMSE" if figure == "rmse" else figure
+            found[f"{name} {title} [{unit}]"] = float(getattr(figures, figure))
     return found
 
 

@@ -1,1 +1,1 @@
-"""Logs from tables of odometry and measurements, whose streams have times of their own."""
+"""Logs from tables of odometry and measurements, whose streams have separate times."""

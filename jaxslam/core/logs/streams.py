@@ -44,7 +44,7 @@ def align_streams(
         rule: `hold`, `divide`, `relative_poses` or `as_recorded`.
         rows: (T,) the times of the rows, rising; default every time of either stream.
     Raises:
-        ValueError: on a measurement at a time that is no row.
+        ValueError: on a measurement at a time without a row.
     """
     clock, moved = (np.asarray(part, np.float64) for part in odometry)
     seen, tag, z = measurements[0], np.asarray(measurements[1]), np.asarray(measurements[2])

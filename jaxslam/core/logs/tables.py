@@ -72,13 +72,13 @@ class Aligned(NamedTuple, Generic[_Name]):
 
 
 def split_unit(name: str) -> tuple[str, str | None]:
-    """Name and unit of a column, ("v", "m/s") of "v [m/s]"; None where there is no unit."""
+    """Name and unit of a column, ("v", "m/s") of "v [m/s]"; None without a unit."""
     bare, bracket, unit = name.strip().partition("[")
     return bare.strip(), unit.rstrip("] ").strip() if bracket else None
 
 
 def unit_divisor(unit: str | None, wanted: str) -> float | None:
-    """The divisor that brings a column in a unit to the wanted unit; None where there is none."""
+    """The divisor that converts a column to the wanted unit; None if the units do not fit."""
     target = split_unit(wanted)[1] or ""
     if unit is None or unit == target:
         return 1.0
@@ -86,14 +86,14 @@ def unit_divisor(unit: str | None, wanted: str) -> float | None:
 
 
 def odometry_columns(controls: tuple[str, ...], given: Sequence[str]) -> tuple[str, ...]:
-    """The columns beside the time from which a model's controls come, out of those given."""
-    own = tuple(name for name in controls if name != INTERVAL)
+    """The columns for a model's controls, without the time, among the given ones."""
+    measured = tuple(name for name in controls if name != INTERVAL)
     poses = {split_unit(name)[0] for name in POSE} <= {split_unit(name)[0] for name in given}
-    return POSE if poses and own == _INCREMENT else own
+    return POSE if poses and measured == _INCREMENT else measured
 
 
 def measurement_columns(measured: tuple[str, ...], landmark: tuple[str, ...]) -> tuple[str, ...]:
-    """The columns of measurements: with a tag, unless the sensor's are of no landmark."""
+    """The columns of measurements: with a tag, unless the sensor has no landmark."""
     return (TIME, *((TAG,) if landmark else ()), *measured)
 
 
@@ -103,13 +103,13 @@ def align_tables(
     controls: tuple[str, ...],
     names: Sequence[_Name] = (),
 ) -> Aligned[_Name]:
-    """The rows of odometry and of sensors with rates of their own (Solà 2.4): a row at every time
+    """The rows of odometry and of sensors with different rates (Solà 2.4): a row at every time
     of odometry, and of measurements within it.
 
     Velocities (controls with an interval) hold until the next line; poses are interpolated; other
-    controls stand as they are, and measurements must then be at their times. Measurements before
+    controls are unchanged, and measurements must then be at their times. Measurements before
     the first or after the last odometry are dropped and counted; the last velocity holds as long as
-    the longest interval between lines. In a scan the slots of the sensors stand in their order.
+    the longest interval between lines. A scan has the slots of the sensors in their order.
 
     Args:
         controls: the names of the motion model, with units.
@@ -234,7 +234,7 @@ def columns_of(
         wanted: (names given) -> the columns needed, with units.
     Raises:
         ValueError: on a column that is missing, in another unit, of another length, or with a value
-            that is no finite number.
+            that is not a finite number.
     """
     names = _names(given)
     needed = list(wanted(names or ()))
@@ -257,16 +257,16 @@ def columns_of(
         divisors = dict.fromkeys(needed, 1.0)
     else:
         assert not isinstance(given, Sequence)  # which has no names
-        own = {split_unit(name)[0]: name for name in names}
+        header = {split_unit(name)[0]: name for name in names}
         found, divisors = {}, {}
         for name in needed:
             bare = split_unit(name)[0]
-            if bare not in own:
+            if bare not in header:
                 raise ValueError(f"{what}: expected a column {name!r}, got {', '.join(names)}")
-            divisor = unit_divisor(split_unit(own[bare])[1], name)
+            divisor = unit_divisor(split_unit(header[bare])[1], name)
             if divisor is None:
-                raise ValueError(f"{what}: expected the column {name!r}, got {own[bare]!r}")
-            found[name], divisors[name] = list(given[own[bare]]), divisor
+                raise ValueError(f"{what}: expected the column {name!r}, got {header[bare]!r}")
+            found[name], divisors[name] = list(given[header[bare]]), divisor
         lengths = {name: len(column) for name, column in found.items()}
         if len(set(lengths.values())) > 1:
             raise ValueError(f"{what}: expected columns of one length, got {lengths}")
@@ -292,7 +292,7 @@ def _names(given: Tabular) -> tuple[str, ...] | None:
 def _numbers(
     at: Callable[[int, str], str], name: str, column: Sequence[object]
 ) -> Float[np.ndarray, "K"]:
-    """The column as float64 (K,); raises ValueError on anything else than finite numbers."""
+    """The column as float64 (K,); raises ValueError on anything but finite numbers."""
     for row, value in enumerate(column):
         if (
             not isinstance(value, int | float | np.integer | np.floating)

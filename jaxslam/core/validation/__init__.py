@@ -7,7 +7,7 @@ from jaxslam.core.numbers import (
     check_gate,
     check_key,
     is_concrete,
-    shape_told,
+    shape_text,
 )
 from jaxslam.core.validation.logs import check_log
 from jaxslam.core.validation.models import (
@@ -40,6 +40,6 @@ __all__ = [
     "checked_estimate",
     "is_concrete",
     "same_state",
-    "shape_told",
+    "shape_text",
     "state_and_info",
 ]

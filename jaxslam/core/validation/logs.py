@@ -43,18 +43,18 @@ def check_log(
         )
     if not is_concrete(log):
         return
-    there, tags = np.asarray(valid), np.asarray(tag)
+    mask, tags = np.asarray(valid), np.asarray(tag)
     most = largest(control, z)
     for what, values, used, then in (
         ("log.control", control, np.ones(steps, bool), "correct or leave out this row"),
-        ("log.scan.z: a valid measurement", z, there, "set log.scan.valid to False there"),
+        ("log.scan.z: a valid measurement", z, mask, "set log.scan.valid to False there"),
     ):
         size = np.abs(np.asarray(values, np.float64)).max(axis=-1, initial=0.0)
         _refuse(name, used & ~np.isfinite(size), f"{what} is not finite", then)
         _refuse(name, used & (size > most), f"{what} is beyond ±{most:.2g}", then)
-    _refuse(name, there & (tags < -1), "log.scan.tag: a tag is below -1")
-    _refuse(name, there & (tags > np.iinfo(np.int32).max), "log.scan.tag: a tag is beyond int32")
-    named = np.where(there & (tags >= 0), tags, -1 - np.arange(places))
+    _refuse(name, mask & (tags < -1), "log.scan.tag: a tag is below -1")
+    _refuse(name, mask & (tags > np.iinfo(np.int32).max), "log.scan.tag: a tag is beyond int32")
+    named = np.where(mask & (tags >= 0), tags, -1 - np.arange(places))
     for part in np.split(named, np.cumsum(parts)[:-1].astype(int), axis=1) if parts else (named,):
         ordered = np.sort(part, axis=1)
         repeats = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)

@@ -1,4 +1,4 @@
-"""Checks of models before tracing, and of what a user's filter returns, during it.
+"""Checks of models before tracing, and of the results of a user's filter, during it.
 
 Types of records, arguments of functions, sizes of results. Each error is one line that states what
 was expected.
@@ -17,7 +17,7 @@ import numpy as np
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
-from jaxslam.core.numbers import check_array, shape_told
+from jaxslam.core.numbers import check_array, shape_text
 from jaxslam.core.protocols import Chart, Life, Linearizer, Motion, Sensor, unfit_signature
 from jaxslam.core.types import Estimate, Info, Scan
 
@@ -57,7 +57,7 @@ def check_models(name: str, motion: object, sensor: object) -> None:
     """Raise ValueError, which begins with a caller's name, unless these are a Motion and a Sensor.
 
     Their functions are evaluated on shapes alone (`jax.eval_shape`): they must take the arguments
-    that `protocols` says and return arrays of the sizes that their names say.
+    of `protocols` and return arrays of the sizes of their names.
     """
     if isinstance(motion, Sensor) and isinstance(sensor, Motion):
         raise ValueError(
@@ -179,8 +179,8 @@ def _check_size(
     if (got := unfit_signature(function, len(arguments))) is not None:
         wanted = f"{model.name}.{field} to take ({', '.join(arguments)})"
         raise ValueError(f"{name}: expected {wanted}, got {got}")
-    told = ", ".join(f"{key} {_told(value.shape)}" for key, value in arguments.items())
-    call = f"{model.name}.{field}({told})"
+    sizes = ", ".join(f"{key} {_shape_text(value.shape)}" for key, value in arguments.items())
+    call = f"{model.name}.{field}({sizes})"
     try:
         found = jax.eval_shape(function, *arguments.values())
     except Exception as error:
@@ -188,8 +188,10 @@ def _check_size(
         raise ValueError(f"{name}: {call} fails: {type(error).__name__}: {why}") from error
     got = getattr(found, "shape", None)
     if got != shape:
-        what = f"a {type(found).__name__}" if got is None else f"shape {_told(got)}"
-        raise ValueError(f"{name}: expected {call} to return shape {_told(shape)}, got {what}")
+        what = f"a {type(found).__name__}" if got is None else f"shape {_shape_text(got)}"
+        raise ValueError(
+            f"{name}: expected {call} to return shape {_shape_text(shape)}, got {what}"
+        )
     if not jnp.issubdtype(getattr(found, "dtype", np.dtype(object)), jnp.floating):
         raise ValueError(f"{name}: expected {call} to return real numbers, got {found.dtype}")
     given = next(iter(arguments.values())).dtype
@@ -199,7 +201,7 @@ def _check_size(
         )
 
 
-def _told(shape: _Shape) -> str:
+def _shape_text(shape: _Shape) -> str:
     return "(" + ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "") + ")"
 
 
@@ -216,8 +218,8 @@ def same_state(name: str, before: _S, after: PyTree) -> _S:
     """
     old: PyTree = jax.tree.structure(before)
     if old != jax.tree.structure(after):
-        told = f"expected a state as before, {_kind(before)}, got {_kind(after)}"
-        raise ValueError(f"{name}: {told}")
+        message = f"expected a state as before, {_kind(before)}, got {_kind(after)}"
+        raise ValueError(f"{name}: {message}")
     pairs = zip(jax.tree.leaves_with_path(before), jax.tree.leaves(after), strict=True)
     unlike = [
         f"state{jax.tree_util.keystr(path)}: expected {_array(old)}, got {_array(new)}"
@@ -237,7 +239,7 @@ def _kind(state: PyTree) -> str:
 
 
 def _array(leaf: ArrayLike) -> str:
-    return f"{jnp.result_type(leaf)} {shape_told(leaf)}"
+    return f"{jnp.result_type(leaf)} {shape_text(leaf)}"
 
 
 def state_and_info(name: str, state: _S, scan: Scan, found: object) -> tuple[_S, Info]:

@@ -32,12 +32,12 @@ def confirm_hypotheses(
 ) -> tuple[DelayedState, Bool[Array, "M"], Int[Array, "C"]]:
     """The state with hypotheses confirmed and corrected, or deleted.
 
-    Each hypothesis is compared with the stored measurements of its tag; the one of least g²/var(g)
+    Each hypothesis is compared with the stored measurements of its tag; the least g²/var(g)
     confirms it, if that is within the gate.
 
     Args:
         slot: of the measurements in the table.
-        stored: which of them are there.
+        stored: mask of the measurements in the table.
     Returns:
         The state; which measurements are within the gate of a hypothesis; and which measurement
         confirmed each hypothesis, -1 where none did.
@@ -116,9 +116,9 @@ def constraints_of(
 def correct_hypotheses(
     joint: Joint, layout: TableLayout, constraints: _Constraints, which: Bool[Array, "C"]
 ) -> Joint:
-    """The joint with each hypothesis corrected by its own constraint, and nothing else changed.
+    """The joint with each hypothesis corrected by its constraint, and nothing else changed.
 
-    g = 0 is a measurement without noise of its own (that of the stored measurement is in P). A
+    g = 0 is a measurement without noise (the noise of the stored measurement is in P). A
     hypothesis may be false, so of the optimal gain K = P Hᵀ/S only the rows of the hypothesis are
     kept (Schmidt 1966, "Application of state-space methods to navigation problems": variables that
     are considered, not estimated). Of any gain, P ← (I - KH) P (I - KH)ᵀ is the error's covariance:
@@ -127,18 +127,18 @@ def correct_hypotheses(
 
     and robot, landmarks and stored measurements keep theirs.
     """
-    count, own = layout.hypotheses, layout.hypothesis_rows
+    count, own_rows = layout.hypotheses, layout.hypothesis_rows
     rows = SIZE * count
     every = jnp.arange(count)
-    own_hp = constraints.hp[:, own].reshape(count, count, SIZE)[every, every]
+    own_hp = constraints.hp[:, own_rows].reshape(count, count, SIZE)[every, every]
     variance = jnp.diagonal(constraints.cov)
     which = which & (variance > 0)
     gain = jnp.where(which[:, None], own_hp / jnp.where(which, variance, 1.0)[:, None], 0.0)
     k_hp = (gain[:, :, None] * constraints.hp[:, None, :]).reshape(rows, -1)
     k_s_k = gain[:, :, None, None] * constraints.cov[:, None, :, None] * gain[None, None]
-    half = -k_hp.at[:, own].add(-0.5 * k_s_k.reshape(rows, rows))
+    half = -k_hp.at[:, own_rows].add(-0.5 * k_s_k.reshape(rows, rows))
     half = materialize(half)
     return joint._replace(
         landmarks=joint.landmarks.at[layout.of_hypotheses].add(-gain * constraints.value[:, None]),
-        cov=joint.cov.at[own].add(half).at[:, own].add(half.T),
+        cov=joint.cov.at[own_rows].add(half).at[:, own_rows].add(half.T),
     )

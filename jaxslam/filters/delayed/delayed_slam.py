@@ -89,7 +89,7 @@ def _store_measurements(
 
 @record
 class DelayedSlam(Filter):
-    """EKF-SLAM with bearings or ranges alone, and delayed initialization of landmarks.
+    """EKF-SLAM with bearings only or ranges only, and delayed initialization of landmarks.
 
     After Costa, Kantor & Choset, "Bearing-only landmark initialization with unknown data
     association", ICRA 2004, as summarized in Tacher §2, with the correlations that they neglect.
@@ -181,8 +181,8 @@ class DelayedSlam(Filter):
         # Padding may hold any number, and is multiplied by zero below.
         scan = scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
         state = state._replace(clock=state.clock + 1)
-        found, matched = _associated(settings, state, scan)
-        state, correction = _corrected(settings, state, scan, found, matched)
+        found, matched = _associate(settings, state, scan)
+        state, correction = _correct(settings, state, scan, found, matched)
         new = _new_measurements(settings, scan, found)
 
         def initialize(state: DelayedState) -> tuple[DelayedState, _Outcome]:
@@ -197,7 +197,7 @@ class DelayedSlam(Filter):
 
         steps = initialize if len(scan.tag) > 0 else leave
         state, outcome = where_any(new.wanted.any(), steps, leave, state)
-        return state, _reported(scan, found, matched, correction, new, outcome)
+        return state, _report(scan, found, matched, correction, new, outcome)
 
     def estimate(self, state: DelayedState) -> Estimate:
         joint, capacity, size = state.joint, self.capacity, 3 + SIZE * self.capacity
@@ -238,19 +238,19 @@ def _ekf_settings(settings: DelayedSettings) -> EkfSettings:
     return EkfSettings(sensor=settings.sensor, associate=settings.associate, gate=settings.gate)
 
 
-def _associated(
+def _associate(
     settings: DelayedSettings, state: DelayedState, scan: Scan
 ) -> tuple[Association, Bool[Array, "M"]]:
     """The landmark slot of each measurement, and which measurements have one.
 
-    Hypotheses and stored measurements are no landmarks.
+    Hypotheses and stored measurements are not landmarks.
     """
     joint = state.joint
     landmarks = joint.alive & (jnp.arange(settings.layout.slots) < settings.layout.landmarks)
     return associate_scan(joint._replace(alive=landmarks), scan, _ekf_settings(settings))
 
 
-def _corrected(
+def _correct(
     settings: DelayedSettings,
     state: DelayedState,
     scan: Scan,
@@ -272,7 +272,7 @@ def _new_measurements(settings: DelayedSettings, scan: Scan, found: Association)
     return NewMeasurements(scan.z, unknown, scan.tag, is_new, jnp.zeros_like(is_new))
 
 
-def _reported(
+def _report(
     scan: Scan,
     found: Association,
     matched: Bool[Array, "M"],

@@ -26,7 +26,7 @@ class _PointResiduals(NamedTuple):
     """The residuals g(s, x) of p points x against q stored measurements s, and their moments."""
 
     value: Float[Array, "p q"]
-    """g at the estimate, truly 0 where both are of one landmark [rad or m]"""
+    """g at the estimate; its true value is 0 for the same landmark [rad or m]"""
     variance: Float[Array, "p q"]
     """of g, with the correlation of the two"""
     by_point: Float[Array, "p q 2"]
@@ -73,11 +73,11 @@ class UncertainPoints(NamedTuple):
 def relative_to_robot(joint: Joint, layout: TableLayout) -> UncertainPoints:
     """The positions of the hypotheses (C,) relative to the robot's position."""
     first, count = layout.landmarks, layout.hypotheses
-    own = covariance_blocks(joint)[first : first + count][:, :2]
-    own = own[jnp.arange(count), :, first + jnp.arange(count), :2]
+    blocks = covariance_blocks(joint)[first : first + count][:, :2]
+    blocks = blocks[jnp.arange(count), :, first + jnp.arange(count), :2]
     cross = joint.cov[:2, 3:].reshape(2, layout.slots, SIZE)[:, first : first + count, :2]
     cross = cross.transpose(1, 0, 2)
-    cov = own + joint.cov[None, :2, :2] - cross - cross.transpose(0, 2, 1)
+    cov = blocks + joint.cov[None, :2, :2] - cross - cross.transpose(0, 2, 1)
     return UncertainPoints(joint.landmarks[layout.of_hypotheses, :2] - joint.pose[None, :2], cov)
 
 
@@ -97,7 +97,7 @@ def closer_than(
 ) -> Bool[Array, "p q"]:
     """Whether the distance of each of p points from each of q others is below a limit.
 
-    By `mahalanobis_squared` (as of independent ones) or `bhattacharyya` of `uncertain_poses`; never
+    By `mahalanobis_squared` (of independent points) or `bhattacharyya` of `uncertain_poses`; never
     where a covariance is singular.
     """
     measure = _DISTANCES[distance]

@@ -110,8 +110,8 @@ def initial_estimate(
     # The covariance of the point relative to the position of the first measurement.
     with_first = transform @ jnp.einsum("mi,mij->mj", by_stored, blocks[:, :, 0, :2])
     cross = minus_r_inv @ with_first[:2]
-    own = minus_r_inv @ minus_r_inv.T
-    relative = linalg.symmetrize(own - cross - cross.T + blocks[0, :2, 0, :2])
+    landmark_cov = minus_r_inv @ minus_r_inv.T
+    relative = linalg.symmetrize(landmark_cov - cross - cross.T + blocks[0, :2, 0, :2])
     return InitialEstimate(
         point=point,
         by_stored=by_stored,
@@ -136,8 +136,8 @@ def add_landmark(
     rows = covariance_rows(joint)[stored]
     hp = materialize(estimate.transform @ jnp.einsum("mi,mid->md", estimate.by_stored, rows))
     mine = 3 + SIZE * slot + jnp.arange(2)
-    own = 0.5 * estimate.minus_r_inv @ estimate.minus_r_inv.T
-    half = (estimate.minus_r_inv @ hp[:2]).at[:, mine].add(own)
+    half_cov = 0.5 * estimate.minus_r_inv @ estimate.minus_r_inv.T
+    half = (estimate.minus_r_inv @ hp[:2]).at[:, mine].add(half_cov)
     # Padding's unit variance goes first, to an exact zero.
     cov = joint.cov.at[mine, mine].add(-1.0)
     cov = cov.at[mine].add(half).at[:, mine].add(half.T)

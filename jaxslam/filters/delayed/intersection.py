@@ -85,7 +85,7 @@ def _sharpest(
     allowed = allowed & (new.tag[:, None] == joint.tag[None, layout.of_stored])
     sharp = found.ok & allowed[:, :, None] & (found.spread <= settings.hypotheses.spread)
     spread = jnp.where(sharp, found.spread, jnp.inf)
-    if settings.by_tag:  # the best partner alone
+    if settings.by_tag:  # only the best partner
         partner = jnp.argmin(spread.min(axis=2), axis=1)
         sharp = sharp & (partner[:, None] == jnp.arange(layout.stored)[None, :])[:, :, None]
         spread = jnp.where(sharp, spread, jnp.inf)
@@ -110,7 +110,7 @@ def _sharpest(
 def _form_hypotheses(
     settings: DelayedSettings, state: DelayedState, found: _Sharpest
 ) -> DelayedState:
-    """The state with hypotheses at intersections that are no duplicates, while slots are free."""
+    """The state with hypotheses at new intersections, while slots are free."""
     layout, joint = settings.layout, state.joint
     wanted = found.ok & ~_duplicates(settings, joint, found)
     place, granted = slots.allocate(joint.alive[layout.of_hypotheses], wanted)
@@ -132,7 +132,7 @@ def _form_hypotheses(
 def _duplicates(settings: DelayedSettings, joint: Joint, found: _Sharpest) -> Bool[Array, "k"]:
     """Which intersections duplicate one of less spread, or an earlier hypothesis.
 
-    Mirrored points of one pair are no duplicates of each other.
+    Mirrored points of one pair are not duplicates of each other.
     """
     layout, count = settings.layout, len(found.pair)
     old = relative_to_robot(joint, layout)
@@ -167,7 +167,7 @@ def _intersections_of(
 ) -> _Intersections:
     """The intersections of the measurements in these slots; J P Jᵀ with the P of each two.
 
-    Relative to the sensor's position, so that the uncertainty of the robot's own pose in the map
+    Relative to the sensor's position, so that the uncertainty of the robot's pose in the map
     does not affect the spread of an intersection.
     """
     intersect = triangulation.intersect
@@ -237,17 +237,17 @@ def add_hypotheses(
     own_cov = own_cov + jnp.einsum("cinj,nkj->cink", columns[:, :, parents[:, 1]], by_b)
     own_cov = jnp.pad(own_cov, [(0, 0), (0, 1), (0, 0), (0, 1)]).reshape(SIZE * count, SIZE * count)
     half = jnp.pad(jp, [(0, 0), (0, 1), (0, 0)]).reshape(SIZE * count, -1)
-    own = layout.hypothesis_rows
-    half = materialize(half.at[:, own].add(0.5 * own_cov))
+    hypothesis_rows = layout.hypothesis_rows
+    half = materialize(half.at[:, hypothesis_rows].add(0.5 * own_cov))
     # Padding's unit variance goes first, to an exact zero; the third parameter keeps it.
     unit = (formed[:, None] & (jnp.arange(SIZE) < 2)[None]).reshape(-1).astype(joint.cov.dtype)
-    at = jnp.arange(own.start, own.stop)
+    at = jnp.arange(hypothesis_rows.start, hypothesis_rows.stop)
     cov = joint.cov.at[at, at].add(-unit)
     here = layout.of_hypotheses
     placed = jnp.where(formed[:, None], jnp.pad(points, [(0, 0), (0, 1)]), 0.0)
     return joint._replace(
         landmarks=joint.landmarks.at[here].add(placed),
-        cov=cov.at[own].add(half).at[:, own].add(half.T),
+        cov=cov.at[hypothesis_rows].add(half).at[:, hypothesis_rows].add(half.T),
         alive=joint.alive.at[here].set(joint.alive[here] | formed),
         tag=joint.tag.at[here].set(jnp.where(formed, tag, joint.tag[here]).astype(jnp.int32)),
     )

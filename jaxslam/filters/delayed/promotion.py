@@ -85,7 +85,7 @@ def promote_hypotheses(
     measurements = jnp.arange(len(new.tag))
 
     def once(carry: PyTree, _: None) -> tuple[PyTree, None]:
-        state, confirmed_by, done = carry
+        state, confirmed_by, finished = carry
         ready, chosen = _candidate(settings, state, confirmed_by)
         free = ~state.joint.alive[settings.layout.of_landmarks]
         room, slot = free.any(), jnp.argmax(free)
@@ -100,15 +100,15 @@ def promote_hypotheses(
         gone = ~state.joint.alive[settings.layout.of_hypotheses]
         here = measurements == by
         succeeded = go & (state.counts.promoted > before)
-        done = Promoted(
-            jnp.where(here & succeeded, slot, done.slot).astype(jnp.int32),
-            done.refused | (here & ~room),
+        finished = Promoted(
+            jnp.where(here & succeeded, slot, finished.slot).astype(jnp.int32),
+            finished.refused | (here & ~room),
         )
-        return (state, jnp.where(considered | gone, -1, confirmed_by), done), None
+        return (state, jnp.where(considered | gone, -1, confirmed_by), finished), None
 
     start = state, confirmed_by, Promoted.none(new)
-    (state, _, done), _ = jax.lax.scan(once, start, None, length=settings.promotion.per_scan)
-    return state, done._replace(refused=done.refused & (done.slot < 0))
+    (state, _, promoted), _ = jax.lax.scan(once, start, None, length=settings.promotion.per_scan)
+    return state, promoted._replace(refused=promoted.refused & (promoted.slot < 0))
 
 
 def _candidate(
@@ -138,8 +138,8 @@ def _promote(
     slot, name: of the landmark that it may become.
     """
     layout, joint = settings.layout, state.joint
-    same_tag, own = _measurements_of(settings, state, chosen)
-    used, use = _outermost(settings, state, own)
+    same_tag, stored = _measurements_of(settings, state, chosen)
+    used, use = _outermost(settings, state, stored)
     estimate, decision = _locate(settings, state, chosen, used, use)
     # In a batch, the runs without a promotion stay exactly as they are.
     accepted, undecided = materialize(_Decision(decision.accepted & go, decision.undecided | ~go))
@@ -150,7 +150,7 @@ def _promote(
     joint = joint._replace(tag=jnp.where(here, name, joint.tag).astype(jnp.int32))
     state = state._replace(joint=joint)
 
-    used_up = accepted & (same_tag if settings.by_tag else own)
+    used_up = accepted & (same_tag if settings.by_tag else stored)
     itself = jnp.arange(layout.hypotheses) == chosen
     rivals = _rivals(settings, state, chosen, slots_where(layout, stored=used_up))
     rivals = rivals & joint.alive[layout.of_hypotheses] & ~itself & accepted
@@ -172,23 +172,23 @@ def _measurements_of(
     same_tag = joint.alive[layout.of_stored]
     same_tag = same_tag & (joint.tag[layout.of_stored] == joint.tag[hypothesis])
     found = point_residuals(joint, settings.triangulation, hypothesis[None], layout.stored_slots)
-    # After the correction by its own measurements g has almost no variance: that of the noise is
+    # After the correction by its measurements g has almost no variance: that of the noise is
     # added, for rounding and curvature.
     variance = found.variance[0] + state.noise_var
     return same_tag, same_tag & (found.value[0] ** 2 <= settings.gate * variance)
 
 
 def _outermost(
-    settings: DelayedSettings, state: DelayedState, own: Bool[Array, "W"]
+    settings: DelayedSettings, state: DelayedState, stored: Bool[Array, "W"]
 ) -> tuple[Int[Array, "m"], Bool[Array, "m"]]:
     """The slots of the oldest and the newest of these stored measurements, and which of them exist.
 
     They were taken from the positions farthest apart.
     """
-    rank = (own[None, :] & ~is_newer(state.taken_at)).sum(axis=1)
-    outer = jnp.where(own, jnp.maximum(rank, own.sum() + 1 - rank), 0)
+    rank = (stored[None, :] & ~is_newer(state.taken_at)).sum(axis=1)
+    outer = jnp.where(stored, jnp.maximum(rank, stored.sum() + 1 - rank), 0)
     best = jax.lax.top_k(outer, min(_USED, settings.layout.stored))[1]
-    return settings.layout.stored_slots[best], own[best]
+    return settings.layout.stored_slots[best], stored[best]
 
 
 def _locate(

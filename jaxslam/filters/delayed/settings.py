@@ -25,7 +25,7 @@ class StoredMeasurements:
     capacity: int = static(default=32)
     """W: where all slots are taken, the oldest stored measurement is marginalized out"""
     spacing: Number = 0.2
-    """[m] measurements of one identity are stored only from positions at least so far apart;
+    """[m] least distance between the positions of stored measurements of one identity;
     one from nearer is `Status.DEFERRED`"""
 
     def __post_init__(self) -> None:
@@ -95,7 +95,7 @@ class Promotion:
     """[1] the largest standard deviation of its position relative to the sensor, over its range,
     with which it may become a landmark"""
     per_scan: int = static(default=2)
-    """at most so many promotions a scan"""
+    """largest number of promotions a scan"""
 
     def __post_init__(self) -> None:
         check_count("Promotion: per_scan", self.per_scan)

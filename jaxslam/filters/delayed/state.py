@@ -113,9 +113,9 @@ class DelayedState(NamedTuple):
     joint: Joint
     """robot, landmarks, hypotheses and stored measurements, as in the diagram above"""
     clock: Int[Array, ""]
-    """scans so far"""
+    """number of processed scans"""
     taken_at: Int[Array, "W"]
-    """the scan that each stored measurement is of"""
+    """the scan of each stored measurement"""
     noise_var: Float[Array, "W"]
     """the variance of each stored q [rad² or m²]"""
     persistence: Float[Array, "C"]

@@ -63,7 +63,7 @@ class Rays(Triangulation):
     intersection lies in front of both sensors, where the rays cross at an angle of at least
     `parallax`.
 
-    The sensor's mounting is computed from its `invert`, whatever the prior of the range.
+    The sensor's mounting is computed from its `invert`, for any prior of the range.
 
     Raises ValueError on a parallax out of range.
     """

@@ -18,7 +18,7 @@ from jaxslam.math import linalg
 from jaxslam.math.xla import where_any
 from jaxslam.sensors.suite import Suite
 
-# The tag of slots that are no landmark: not -1, which is the tag of a measurement without one.
+# The tag of slots without a landmark: not -1, the tag of a measurement of unknown identity.
 _NONE = -2
 
 
@@ -119,8 +119,8 @@ class CompressedEkfSlam(Wrapper):
 
     def estimate(self, state: _Compressed) -> Estimate:
         def one(*of_landmark: jax.Array) -> Estimate:
-            landmark, alive, tag, own, with_robot = of_landmark
-            cov = jnp.block([[robot, with_robot], [with_robot.T, own]])
+            landmark, alive, tag, landmark_cov, with_robot = of_landmark
+            cov = jnp.block([[robot, with_robot], [with_robot.T, landmark_cov]])
             place = state.area.pose, landmark[None], cov, alive[None], tag[None]
             return self.filter.estimate(Joint(*place, ()))
 
@@ -137,10 +137,10 @@ class CompressedEkfSlam(Wrapper):
 
     @property
     def _local(self) -> EkfSlam:
-        """The filter of the area, with slots for what is postponed."""
-        own = min(self.area, self.filter.capacity)
-        more = _more(own, len(self.filter.sensor.landmark))
-        return dataclasses.replace(self.filter, capacity=own + more)
+        """The filter of the area, with slots for the postponed update."""
+        area = min(self.area, self.filter.capacity)
+        more = _more(area, len(self.filter.sensor.landmark))
+        return dataclasses.replace(self.filter, capacity=area + more)
 
 
 def opened(joint: Joint, area: int) -> _Compressed:
@@ -153,7 +153,7 @@ def up_to_date(state: _Compressed) -> Joint:
     joint = state.whole
     at = _rows(state.slot, joint.landmarks.shape[1])
     before = joint.cov[at]
-    phi, psi, _ = _postponed(state)
+    phi, psi, _ = _postponed_update(state)
     cov = joint.cov - linalg.symmetrize(before.T @ (psi @ before))
     now = (phi @ before).at[:, at].set(state.area.cov[: len(at), : len(at)])
     return joint._replace(
@@ -168,7 +168,7 @@ def _with_area_of(scan: Scan, state: _Compressed, sensor: Sensor, most: int | No
 
     most: new landmarks a scan.
     """
-    joint, own = state.whole, state.slot.shape[0]
+    joint, area = state.whole, state.slot.shape[0]
     tagged = scan.valid & (scan.tag >= 0)
     slot, found = slots.find(joint.tag, joint.alive, scan.tag)
     seen = jnp.zeros(joint.alive.shape, bool).at[slot].max(tagged & found)
@@ -180,7 +180,7 @@ def _with_area_of(scan: Scan, state: _Compressed, sensor: Sensor, most: int | No
     def anew(state: _Compressed) -> _Compressed:
         joint = up_to_date(state)
         # The result of a run must not depend on other runs of the batch.
-        other = _opened_at(joint, _chosen(joint, own, sensor, seen, new))
+        other = _opened_at(joint, _chosen(joint, area, sensor, seen, new))
         both: _Compressed = jax.tree.map(lambda a, b: jnp.where(leave, a, b), other, state)
         return both
 
@@ -190,28 +190,28 @@ def _with_area_of(scan: Scan, state: _Compressed, sensor: Sensor, most: int | No
 
 def _with_updated_area(state: _Compressed, area: Joint) -> _Compressed:
     """The state with its area updated, and tags and alive slots of the map as in the area."""
-    joint, own = state.whole, state.slot.shape[0]
+    joint, count = state.whole, state.slot.shape[0]
     joint = joint._replace(
-        alive=joint.alive.at[state.slot].set(area.alive[:own]),
-        tag=joint.tag.at[state.slot].set(area.tag[:own]),
+        alive=joint.alive.at[state.slot].set(area.alive[:count]),
+        tag=joint.tag.at[state.slot].set(area.tag[:count]),
     )
     return state._replace(whole=joint, area=area)
 
 
 def _moved_map(state: _Compressed) -> jax.Array:
     """The current landmarks (N, L)."""
-    landmarks, own = state.whole.landmarks, state.slot.shape[0]
-    theta = _postponed(state)[2]
+    landmarks, area = state.whole.landmarks, state.slot.shape[0]
+    theta = _postponed_update(state)[2]
     moved = (theta @ state.whole.cov[_rows(state.slot, landmarks.shape[1])])[3:]
     return (
-        (landmarks + moved.reshape(landmarks.shape)).at[state.slot].set(state.area.landmarks[:own])
+        (landmarks + moved.reshape(landmarks.shape)).at[state.slot].set(state.area.landmarks[:area])
     )
 
 
 def _marginals(state: _Compressed) -> tuple[jax.Array, jax.Array]:
     """The current P of each landmark with itself (N, L, L) and with the robot (N, 3, L)."""
     capacity, size = state.whole.landmarks.shape
-    own, at = state.slot.shape[0], _rows(state.slot, size)
+    area, at = state.slot.shape[0], _rows(state.slot, size)
 
     def by_landmark(rows: jax.Array) -> jax.Array:
         return rows[:, 3:].reshape(len(rows), -1, size).transpose(1, 0, 2)
@@ -220,22 +220,22 @@ def _marginals(state: _Compressed) -> tuple[jax.Array, jax.Array]:
         every = jnp.arange(count)
         return cov[3:, 3:].reshape(count, size, count, size)[every, :, every]
 
-    phi, psi, _ = _postponed(state)
+    phi, psi, _ = _postponed_update(state)
     before, inside = state.whole.cov[at], state.area.cov[: len(at), : len(at)]
     lost = jnp.einsum("nal,nak->nlk", by_landmark(before), by_landmark(psi @ before))
     alone = with_itself(state.whole.cov, capacity) - lost
     with_robot = by_landmark(phi[:3] @ before)
     return (
-        alone.at[state.slot].set(with_itself(inside, own)),
+        alone.at[state.slot].set(with_itself(inside, area)),
         with_robot.at[state.slot].set(by_landmark(inside[:3])),
     )
 
 
-def _postponed(state: _Compressed) -> tuple[jax.Array, jax.Array, jax.Array]:
+def _postponed_update(state: _Compressed) -> tuple[jax.Array, jax.Array, jax.Array]:
     """The postponed update Φ, Ψ (W, W) and θ (W,), W = 3 + K·L."""
-    area, own = state.area, state.slot.shape[0]
-    width = 3 + own * area.landmarks.shape[1]
-    theta = area.landmarks[own:].reshape(-1)[:width]
+    area, count = state.area, state.slot.shape[0]
+    width = 3 + count * area.landmarks.shape[1]
+    theta = area.landmarks[count:].reshape(-1)[:width]
     return (
         area.cov[:width, width : 2 * width],
         -area.cov[width : 2 * width, width : 2 * width],
@@ -245,8 +245,8 @@ def _postponed(state: _Compressed) -> tuple[jax.Array, jax.Array, jax.Array]:
 
 def _opened_at(joint: Joint, slot: jax.Array) -> _Compressed:
     """The state with nothing postponed and the landmarks of slots (K,) as its area."""
-    own, size = slot.shape[0], joint.landmarks.shape[1]
-    at, more = _rows(slot, size), _more(own, size)
+    count, size = slot.shape[0], joint.landmarks.shape[1]
+    at, more = _rows(slot, size), _more(count, size)
     inside = joint.cov[at][:, at]
     living = jnp.concatenate([jnp.ones(3, bool), jnp.repeat(joint.alive[slot], size)])
     phi = jnp.diag(living.astype(inside.dtype))
@@ -263,15 +263,15 @@ def _opened_at(joint: Joint, slot: jax.Array) -> _Compressed:
     return _Compressed(joint, area, slot)
 
 
-def _chosen(joint: Joint, own: int, sensor: Sensor, seen: jax.Array, new: jax.Array) -> jax.Array:
+def _chosen(joint: Joint, area: int, sensor: Sensor, seen: jax.Array, new: jax.Array) -> jax.Array:
     """The slots (own,) of a new area, ascending: those seen, free ones, the nearest to the pose."""
     points = jax.vmap(sensor.position)(joint.landmarks)
     distance = ((points - joint.pose[None, :2]) ** 2).sum(axis=1)
-    # A quarter of the area is reserved for new landmarks: each would else need another area.
-    spare = jnp.cumsum(~joint.alive) <= jnp.maximum(new, own // 4)
+    # A quarter of the area is reserved for new landmarks, each of which would need a new area.
+    spare = jnp.cumsum(~joint.alive) <= jnp.maximum(new, area // 4)
     rank = jnp.select([seen, ~joint.alive & spare, joint.alive], [0, 1, 2], 3)
     distance = jnp.where(joint.alive, distance, 0.0)
-    return jnp.sort(jnp.lexsort((distance, rank))[:own]).astype(jnp.int32)
+    return jnp.sort(jnp.lexsort((distance, rank))[:area]).astype(jnp.int32)
 
 
 def _rows(slot: jax.Array, size: int) -> jax.Array:
@@ -280,6 +280,6 @@ def _rows(slot: jax.Array, size: int) -> jax.Array:
     return jnp.concatenate([jnp.arange(3), of_landmarks.reshape(-1)])
 
 
-def _more(own: int, size: int) -> int:
+def _more(area: int, size: int) -> int:
     """The number of landmark slots that hold 3 + own·size variables."""
-    return -(-(3 + own * size) // size)
+    return -(-(3 + area * size) // size)

@@ -16,7 +16,7 @@ from jaxslam.filters.ekf import map_coordinates
 from jaxslam.filters.ekf.linear_system import LinearizedSteps, LinearSystem
 from jaxslam.filters.ekf.map_coordinates import estimate_of
 from jaxslam.filters.ekf.predict import propagate
-from jaxslam.filters.ekf.scan import turns_of, update_by_scan, without_landmarks
+from jaxslam.filters.ekf.scan import stages_of, update_by_scan, without_landmarks
 from jaxslam.filters.ekf.settings import (
     CorrectionOrder,
     Covariance,
@@ -61,9 +61,9 @@ class EkfSlam(Filter):
     linearize: Linearizer = AtEstimate()
     """where Jacobians are taken"""
     associate: Associate = Known()
-    """which landmark a measurement is of"""
+    """the landmark of each measurement"""
     correction: CorrectionOrder = static(default="sequential")
-    """"sequential" corrects by one measurement after the other, linearizing anew each time, as the
+    """"sequential" corrects by one measurement after the other, relinearizing each time, as the
     guide does; "joint" corrects by the whole scan at once"""
     gate: Number | None = None
     """reject a measurement whose squared Mahalanobis distance exceeds this; None: none. The guide's
@@ -75,7 +75,7 @@ class EkfSlam(Filter):
     "square_root", a root X of P = X Xᵀ instead of P, as accurate in float32 as P is in float64, at
     a higher cost (the prediction is O(N³))"""
     births: int | None = static(default=None)
-    """at most so many new landmarks a scan, the first ones in its order (that of tags in simulated
+    """largest number of new landmarks a scan, the first in its order (that of tags in simulated
     scans), the rest `Status.DEFERRED`. The guide starts one, picked at random. None: no limit"""
     life: Life | None = None
     """a rule that removes landmarks after each scan, and may make room in a full map. Its memory is
@@ -149,7 +149,7 @@ class EkfSlam(Filter):
         return joint, (moved,)
 
     def _update(self, joint: Joint, scan: Scan, key: Array) -> tuple[Joint, Info, LinearSystem]:
-        turns = turns_of(self.sensor, self._settings)
+        turns = stages_of(self.sensor, self._settings)
         joint, info, evicted, system = update_by_scan(joint, scan, turns)
         if self.sensor.reduced is not None:
             joint, which, reduced = map_coordinates.reduced_where_ready(

@@ -39,7 +39,7 @@ class Correction(NamedTuple):
     jacobian: Float[Array, "m Z 3+L"]
     """H by coordinates, against the prior"""
     basis: Float[Array, "m 3+L 3+L"] | None
-    """the coordinates by the errors in the chart; None says identity"""
+    """the coordinates by the errors in the chart; None is the identity"""
 
 
 class _View(NamedTuple):
@@ -47,7 +47,7 @@ class _View(NamedTuple):
 
     robot: Float[Array, "3 D"]
     """rows of the robot"""
-    own: Float[Array, "m L D"]
+    landmark: Float[Array, "m L D"]
     """rows of the landmarks seen"""
     local: Float[Array, "m 3+L 3+L"]
     """P of the robot and the landmark"""
@@ -91,7 +91,7 @@ class _Linearized(NamedTuple):
 
 
 class _Gated(NamedTuple):
-    """The gate of each measurement on its own, against the prior."""
+    """The gate of each measurement separately, against the prior."""
 
     innovation: Float[Array, "m Z"]
     cov: Float[Array, "m Z Z"]
@@ -104,9 +104,9 @@ class _Gated(NamedTuple):
 
 def view_of(joint: Joint, slot: Int[Array, "m"], square_root: bool = False) -> _View:
     """The view of measurements of the landmarks in slot (m,)."""
-    own = jax.vmap(slots.gather, in_axes=(None, 0))(joint, slot)[1]
+    landmark_rows = jax.vmap(slots.gather, in_axes=(None, 0))(joint, slot)[1]
     local = jax.vmap(partial(slots.local_cov, joint, square_root=square_root))(slot)
-    return _View(joint.cov[:3], own, local)
+    return _View(joint.cov[:3], landmark_rows, local)
 
 
 def innovate(
@@ -227,7 +227,7 @@ def _project(
     rows: Float[Array, "m Z C"], view: _View, joint: Joint, settings: EkfSettings
 ) -> tuple[Float[Array, "m Z D"], Float[Array, "m Z D"]]:
     """The products H X and H P of a square-root filter; else H P twice."""
-    hp = hx = no_inline(_seen_rows, rows, view.robot, view.own)
+    hp = hx = no_inline(_seen_rows, rows, view.robot, view.landmark)
     if settings.square_root:
         m, size_z = rows.shape[:2]
         hp = materialize((hx.reshape(m * size_z, -1) @ joint.cov.T).reshape(hx.shape))
@@ -256,7 +256,7 @@ def _report(
     jacobian: Float[Array, "m Z W"],
     basis: Float[Array, "m W W"] | None,
 ) -> Correction:
-    """The `Correction`: NIS of fused measurements from their joint S, of the others each alone."""
+    """The `Correction`: NIS of fused measurements from their joint S, of others from theirs."""
     m, size_z = gated.innovation.shape
     positive = gated.positive & factored.regular
     log_det = log_det_of_pivots(factored.pivots)
@@ -277,9 +277,11 @@ def _report(
 
 @linalg.kept_whole
 def _seen_rows(
-    rows: Float[Array, "m Z C"], robot: Float[Array, "3 D"], own: Float[Array, "m L D"]
+    rows: Float[Array, "m Z C"], robot: Float[Array, "3 D"], landmark_rows: Float[Array, "m L D"]
 ) -> Float[Array, "m Z D"]:
     """The product H P from the blocks of H, by rows, and P of the robot and the landmarks seen."""
     terms = [rows[:, :, k, None] * robot[None, None, k] for k in range(3)]
-    terms += [rows[:, :, 3 + k, None] * own[:, None, k] for k in range(own.shape[1])]
+    terms += [
+        rows[:, :, 3 + k, None] * landmark_rows[:, None, k] for k in range(landmark_rows.shape[1])
+    ]
     return linalg.total(terms)

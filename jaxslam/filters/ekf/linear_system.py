@@ -1,6 +1,6 @@
 """The linearized error system of a filter's steps, in the order in which a step applies it.
 
-A step of a filter returns it beside its result, as a tuple of the records below, and `monitored`
+A step of a filter returns it with its result, as a tuple of the records below, and `monitored`
 takes it. Under `jit` what nobody takes costs nothing.
 """
 
@@ -18,7 +18,7 @@ from jaxslam.math import linalg
 
 
 class Transition(NamedTuple):
-    """The error model: [dx; dl_i] ← [A dx + own noise; a_i dx + B_i dl_i + noise through dx]."""
+    """The error model: [dx; dl_i] ← [A dx + noise; a_i dx + B_i dl_i + noise through dx]."""
 
     robot: Float[Array, "3 3"]
     """A"""
@@ -65,7 +65,7 @@ class LinearMeasurements(NamedTuple):
     jacobian: Float[Array, "m Z K"]
     """H, by the coordinates of pose and landmark"""
     basis: Float[Array, "m K K"] | None
-    """E, the coordinates by the errors; None says identity"""
+    """E, the coordinates by the errors; None is the identity"""
     noise: Float[Array, "m Z Z"]
     """the covariance R of v"""
     slot: Int[Array, "m"]
@@ -75,7 +75,7 @@ class LinearMeasurements(NamedTuple):
 
 
 class LinearLandmarks(NamedTuple):
-    """New landmarks, dl = G dx + noise of their own."""
+    """New landmarks, dl = G dx + noise."""
 
     slot: Int[Array, "m"]
     granted: Bool[Array, "m"]
@@ -105,6 +105,8 @@ def basis_of_each(
         return None
     (m, size), still = landmarks.shape, jnp.eye(landmarks.shape[1], dtype=pose.dtype)
     basis = jax.vmap(chart.basis, in_axes=(None, 0))(pose, landmarks)
-    own = jnp.broadcast_to(still, (m, size, size)) if basis.landmark is None else basis.landmark
+    landmark = (
+        jnp.broadcast_to(still, (m, size, size)) if basis.landmark is None else basis.landmark
+    )
     top = jnp.concatenate([basis.pose, jnp.zeros((m, 3, size), pose.dtype)], axis=2)
-    return jnp.concatenate([top, jnp.concatenate([basis.cross, own], axis=2)], axis=1)
+    return jnp.concatenate([top, jnp.concatenate([basis.cross, landmark], axis=2)], axis=1)

@@ -33,7 +33,7 @@ class ToPoints(NamedTuple):
         return {"reduced": self.reduced}
 
 
-def _seen_as(sensor: Sensor, reduced: Bool[Array, ""] | None) -> Sensor:
+def _measured_points(sensor: Sensor, reduced: Bool[Array, ""] | None) -> Sensor:
     """The sensor for a landmark that may be a point (x, y, padding); None: no landmark is one."""
     if sensor.reduced is None or reduced is None:
         return sensor
@@ -58,7 +58,7 @@ class _MaybePoint(Wrapped):
 
 def at_slot(sensor: Sensor, joint: Joint, slot: Int[Array, ""]) -> Sensor:
     """The sensor for the landmark of a slot () of the map."""
-    return sensor if joint.reduced is None else _seen_as(sensor, joint.reduced[slot])
+    return sensor if joint.reduced is None else _measured_points(sensor, joint.reduced[slot])
 
 
 def reduced_where_ready(
@@ -135,20 +135,23 @@ def estimate_of(
 
     def point(
         landmark: Float[Array, "L"],
-        own: Float[Array, "L L"],
+        landmark_cov: Float[Array, "L L"],
         by_robot: Float[Array, "L 3"],
         reduced: PyTree,
     ) -> tuple[Float[Array, "2"], Float[Array, "2 2"]]:
-        position = _seen_as(sensor, reduced).position
+        position = _measured_points(sensor, reduced).position
         by_landmark = jax.jacfwd(position)(landmark)
         if chart.basis is not None:
             basis = chart.basis(joint.pose, landmark)
             if basis.landmark is not None:
-                own, by_robot = basis.landmark @ own @ basis.landmark.T, basis.landmark @ by_robot
+                landmark_cov, by_robot = (
+                    basis.landmark @ landmark_cov @ basis.landmark.T,
+                    basis.landmark @ by_robot,
+                )
             cross = basis.cross @ by_robot.T
-            own = own + cross + cross.T
-            own = own + basis.cross @ pose_cov @ basis.cross.T
-        return position(landmark), by_landmark @ own @ by_landmark.T
+            landmark_cov = landmark_cov + cross + cross.T
+            landmark_cov = landmark_cov + basis.cross @ pose_cov @ basis.cross.T
+        return position(landmark), by_landmark @ landmark_cov @ by_landmark.T
 
     points, point_covs = jax.vmap(point)(joint.landmarks, own_covs, with_pose, joint.reduced)
     if chart.basis is not None:

@@ -48,7 +48,7 @@ class MonitoredState(NamedTuple):
 
 @record
 class Monitored(Wrapper):
-    """The filter with an observability monitor of its own linearized system, for campaigns.
+    """The filter with an observability monitor of its linearized system, for campaigns.
 
     The state is a `MonitoredState`; estimates and infos are the filter's. A landmark merged into
     another is not a measurement here.

@@ -54,10 +54,10 @@ def _in_charts(
     cross_noise = -times(after.cross, undo)
     landmark = None
     if before.landmark is not None and after.landmark is not None:
-        own = jax.vmap(linalg.inverse)(after.landmark)
-        still = jnp.eye(own.shape[-1], dtype=own.dtype)
-        landmark = jnp.where(alive[:, None, None], each(own, before.landmark), still)
-        cross, cross_noise = each(own, cross), each(own, cross_noise)
+        by_landmark = jax.vmap(linalg.inverse)(after.landmark)
+        still = jnp.eye(by_landmark.shape[-1], dtype=by_landmark.dtype)
+        landmark = jnp.where(alive[:, None, None], each(by_landmark, before.landmark), still)
+        cross, cross_noise = each(by_landmark, cross), each(by_landmark, cross_noise)
     cross, cross_noise = (jnp.where(alive[:, None, None], m, 0.0) for m in (cross, cross_noise))
     return materialize(Transition(robot, cross, landmark, undo, cross_noise))
 
@@ -68,13 +68,13 @@ def moved_cov(
     """The predicted covariance A P Aᵀ + G N Gᵀ, each entry of P written once or twice."""
     if moved.cross is None:
         robot = linalg.matmul(moved.robot, cov[:3])
-        own = linalg.matmul(robot[:, :3], moved.robot.T)
-        own = linalg.symmetrize(own if noise is None else own + noise)
+        robot_cov = linalg.matmul(robot[:, :3], moved.robot.T)
+        robot_cov = linalg.symmetrize(robot_cov if noise is None else robot_cov + noise)
         # Stored separately from P, from which it is computed, so that P is written in place.
-        robot = materialize(jnp.concatenate([own, robot[:, 3:]], axis=1))
+        robot = materialize(jnp.concatenate([robot_cov, robot[:, 3:]], axis=1))
         return jnp.asarray(cov).at[:3].set(robot).at[:, :3].set(robot.T)
     if moved.landmark is not None:
-        # Stored before it is transposed: each entry would else be computed twice.
+        # Stored before it is transposed; otherwise each entry would be computed twice.
         cov = materialize(moved.turn(moved.turn(cov).T))
     cov = linalg.symmetrize(cov)
     # A = I + b e_Rᵀ, so with T = P_R + P_RR bᵀ/2 the change of P is b T + (b T)ᵀ.

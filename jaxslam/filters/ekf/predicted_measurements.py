@@ -14,18 +14,18 @@ from jaxslam.math.xla import materialize
 
 
 def prediction_of(joint: Joint, settings: EkfSettings) -> Prediction:
-    """The `Prediction` of a map; what the association does not call is not computed."""
+    """The `Prediction` of a map; only the parts that the association calls are computed."""
     sensor, chart, square_root = settings.sensor, settings.chart, settings.square_root
     capacity, size = joint.landmarks.shape
 
     def jacobians() -> tuple[
         Float[Array, "N Z"], Float[Array, "N Z 3"], Float[Array, "N Z L"], Float[Array, "N Z Z"]
     ]:
-        """The predicted ẑ, H by errors of pose and landmark, and H P Hᵀ, of each landmark alone."""
+        """The predicted ẑ, H by errors of pose and landmark, and H P Hᵀ, for each landmark."""
         every = jnp.arange(capacity)
-        robot, cross, own = materialize(_blocks(joint, square_root))
+        robot, cross, landmarks = materialize(_blocks(joint, square_root))
         top = jnp.concatenate([jnp.broadcast_to(robot, (capacity, 3, 3)), cross], axis=2)
-        bottom = jnp.concatenate([cross.transpose(0, 2, 1), own], axis=2)
+        bottom = jnp.concatenate([cross.transpose(0, 2, 1), landmarks], axis=2)
         local = jnp.concatenate([top, bottom], axis=1)
         expected, by_pose, by_landmark, rest = jax.vmap(
             lambda slot, landmark, cov: settings.linearize.observe(
@@ -45,8 +45,8 @@ def prediction_of(joint: Joint, settings: EkfSettings) -> Prediction:
         return expected, by_pose, by_landmark, materialize(alone + rest)
 
     def measurements() -> tuple[Float[Array, "N Z"], Float[Array, "N Z Z"]]:
-        expected, _, _, own = jacobians()
-        return expected, own
+        expected, _, _, landmark = jacobians()
+        return expected, landmark
 
     def cross() -> Float[Array, "N Z N Z"]:
         _, by_pose, by_landmark, _ = jacobians()
@@ -70,9 +70,9 @@ def _blocks(
         cross = jnp.einsum("ik,nlk->nil", robot, rows)
         return robot @ robot.T, cross, jnp.einsum("nlk,nmk->nlm", rows, rows)
     every = jnp.arange(capacity)
-    own = joint.cov[3:, 3:].reshape(capacity, size, capacity, size)[every, :, every]
+    landmark = joint.cov[3:, 3:].reshape(capacity, size, capacity, size)[every, :, every]
     cross = joint.cov[:3, 3:].reshape(3, capacity, size).transpose(1, 0, 2)
-    return joint.cov[:3, :3], cross, own
+    return joint.cov[:3, :3], cross, landmark
 
 
 def in_chart(
@@ -106,11 +106,13 @@ def projected_cov(
 ) -> Float[Array, "m Z m Z"]:
     """The covariance H P Hᵀ of predicted measurements, from the columns of H P that H meets."""
     m, size_z, size_l = by_landmark.shape
-    own = linalg.total(hp[:, :, k, None, None] * by_pose[None, None, :, :, k] for k in range(3))
+    by_robot = linalg.total(
+        hp[:, :, k, None, None] * by_pose[None, None, :, :, k] for k in range(3)
+    )
     if size_l == 0:
-        return own
+        return by_robot
     by_slot = hp[:, :, 3 : 3 + capacity * size_l].reshape(m, size_z, capacity, size_l)
     at_landmark = by_slot[:, :, slot]
-    return own + linalg.total(
+    return by_robot + linalg.total(
         at_landmark[..., k, None] * by_landmark[None, None, :, :, k] for k in range(size_l)
     )

@@ -53,28 +53,30 @@ def augment(
     def one(
         z_i: Float[Array, "Z"], tag_i: Int[Array, ""]
     ) -> tuple[Float[Array, "L"], Float[Array, "L 3"], Float[Array, "L L"]]:
-        landmark, by_pose, own = settings.linearize.invert(settings.sensor, z_i, tag_i, here)
+        landmark, by_pose, landmark_cov = settings.linearize.invert(
+            settings.sensor, z_i, tag_i, here
+        )
         if chart.basis is not None:
             basis = chart.basis(joint.pose, landmark)
             by_pose = by_pose @ basis.pose - basis.cross
             if basis.landmark is not None:
                 undo = linalg.inverse(basis.landmark)
-                by_pose, own = undo @ by_pose, undo @ own @ undo.T
-        return landmark, by_pose, own
+                by_pose, landmark_cov = undo @ by_pose, undo @ landmark_cov @ undo.T
+        return landmark, by_pose, landmark_cov
 
-    landmark, by_pose, own = materialize(jax.vmap(one)(z, tag))
+    landmark, by_pose, landmark_covs = materialize(jax.vmap(one)(z, tag))
     joint = slots.scatter(
-        joint, slot, granted, landmark, by_pose, own, tag, square_root=square_root
+        joint, slot, granted, landmark, by_pose, landmark_covs, tag, square_root=square_root
     )
     new = jnp.zeros_like(joint.alive).at[slot].max(granted)
     return joint._replace(lin=settings.linearize.born(joint, new)), by_pose
 
 
-class SensorTurn(NamedTuple):
+class SensorStage(NamedTuple):
     """The measurement slots and settings of one sensor in a scan."""
 
     places: int | None
-    """measurement slots of the scan that are its own; None where all are"""
+    """the measurement slots of this sensor in the scan; None for all"""
     settings: EkfSettings | None
     """None where its measurements are ignored: `Status.UNMATCHED`"""
 
@@ -102,46 +104,46 @@ class _ScanUpdate(NamedTuple):
     system: LinearSystem
 
 
-def turns_of(sensor: Sensor, settings: EkfSettings) -> list[SensorTurn]:
-    """The turns of the sensors of a suite, in order; a single one for a sensor that is no suite.
+def stages_of(sensor: Sensor, settings: EkfSettings) -> list[SensorStage]:
+    """The stages of the sensors of a suite, in order; a single stage for another sensor.
 
     Measurements of robots are ignored.
     """
     if not isinstance(sensor, Suite):
-        return [SensorTurn(None, dataclasses.replace(settings, absolute=not sensor.landmark))]
+        return [SensorStage(None, dataclasses.replace(settings, absolute=not sensor.landmark))]
     return [
-        SensorTurn(part.places, None)
+        SensorStage(part.places, None)
         if part.sees == "robots"
-        else turn_of(part, len(sensor.landmark), settings)
+        else stage_of(part, len(sensor.landmark), settings)
         for part in sensor.parts
     ]
 
 
-def turn_of(part: Part, size: int, settings: EkfSettings) -> SensorTurn:
+def stage_of(part: Part, size: int, settings: EkfSettings) -> SensorStage:
     """The part of a scan's update that is one sensor's, for landmarks of `size` numbers."""
     sensor = on_ground(part.sensor, size)
-    return SensorTurn(
+    return SensorStage(
         part.places, dataclasses.replace(settings, sensor=sensor, absolute=part.absolute)
     )
 
 
-def update_by_scan(joint: Joint, scan: Scan, turns: Sequence[SensorTurn]) -> _ScanUpdate:
+def update_by_scan(joint: Joint, scan: Scan, stages: Sequence[SensorStage]) -> _ScanUpdate:
     """The update by each sensor in turn.
 
     Raises ValueError if the scan does not have their measurement slots.
     """
-    first = turns[0]
+    first = stages[0]
     if first.places is None and first.settings is not None:
         return _update_by_sensor(joint, scan, first.settings)
     system: LinearSystem = ()
     infos, evicted = [], jnp.zeros_like(joint.alive)
-    counts = [turn.places or 0 for turn in turns]
-    for own, turn in zip(split_scan(scan, counts), turns, strict=True):
-        if turn.settings is None:
-            infos.append(nothing_of(own))
+    counts = [stage.places or 0 for stage in stages]
+    for part, stage in zip(split_scan(scan, counts), stages, strict=True):
+        if stage.settings is None:
+            infos.append(nothing_of(part))
             continue
-        own = own._replace(z=own.z[:, : len(turn.settings.sensor.measurements)])
-        joint, info, gone, more = _update_by_sensor(joint, own, turn.settings)
+        part = part._replace(z=part.z[:, : len(stage.settings.sensor.measurements)])
+        joint, info, gone, more = _update_by_sensor(joint, part, stage.settings)
         infos.append(info)
         evicted, system = evicted | gone, (*system, *more)
     return _ScanUpdate(joint, joined_info(infos, scan.z.shape[1]), evicted, system)
@@ -155,15 +157,15 @@ def _update_by_sensor(joint: Joint, scan: Scan, settings: EkfSettings) -> _ScanU
     at_once = settings.correction == "joint" and len(scan.tag) > 0
     by_scan = correct if at_once else correct_in_turn
     slot = jnp.maximum(found.slot, 0)
-    joint, done = by_scan(joint, scan.z, slot, matched, settings)
-    joint, new = initialize_landmarks(joint, scan, found, matched, done, settings)
-    info = _report_scan(scan, found, matched, done, new, settings)
+    joint, correction = by_scan(joint, scan.z, slot, matched, settings)
+    joint, new = initialize_landmarks(joint, scan, found, matched, correction, settings)
+    info = _report_scan(scan, found, matched, correction, new, settings)
     seen = LinearMeasurements(
-        jacobian=done.jacobian,
-        basis=done.basis,
+        jacobian=correction.jacobian,
+        basis=correction.basis,
         noise=jax.vmap(settings.sensor.noise_cov)(scan.z),
         slot=slot,
-        fused=matched & done.inside & done.positive,
+        fused=matched & correction.inside & correction.positive,
     )
     born = LinearLandmarks(new.slot, new.granted, new.by_pose)
     return _ScanUpdate(joint, info, new.evicted, (seen, born))
@@ -189,7 +191,7 @@ def initialize_landmarks(
     scan: Scan,
     found: Association,
     matched: Bool[Array, "M"],
-    done: Correction,
+    correction: Correction,
     settings: EkfSettings,
 ) -> tuple[Joint, _NewLandmarks]:
     """The map with the new landmarks of a scan, up to `births` and the free slots.
@@ -217,9 +219,9 @@ def initialize_landmarks(
         if settings.births is not None:
             deferred = wanted & (rank > settings.births)
         wanted = wanted & ~deferred
-        used = matched & done.inside & done.positive
+        used = matched & correction.inside & correction.positive
         joint, evicted = _with_room(joint, wanted, found.slot, used, settings)
-        joint, slot, granted, by_pose = _started(joint, scan, wanted, rank, settings)
+        joint, slot, granted, by_pose = _new_landmarks(joint, scan, wanted, rank, settings)
         return joint, _NewLandmarks(slot, granted, deferred, repeated, evicted, by_pose)
 
     return where_any(is_new.any(), start, lambda joint: (joint, nothing), joint)
@@ -236,12 +238,12 @@ def _with_room(
     if settings.life is None or settings.life.make_room is None:
         return joint, jnp.zeros_like(joint.alive)
     needed = wanted.sum() - (~joint.alive).sum()
-    measured = slots.concerned(slot, used, len(joint.alive))
+    measured = slots.slot_mask(slot, used, len(joint.alive))
     evicted = settings.life.make_room(joint, needed, measured)
     return without_landmarks(joint, evicted, square_root=settings.square_root), evicted
 
 
-def _started(
+def _new_landmarks(
     joint: Joint,
     scan: Scan,
     wanted: Bool[Array, "M"],
@@ -259,9 +261,9 @@ def _started(
         joint, by_pose = augment(joint, scan.z, scan.tag, slot, granted, settings)
         return joint, slot, granted, by_pose
     # No more than may be granted are computed.
-    turn = wanted[None, :] & (rank[None, :] == 1 + jnp.arange(births)[:, None])
-    at, there = slots.where_set(turn)
-    slot, granted = slots.allocate(taken, there)
+    is_kth = wanted[None, :] & (rank[None, :] == 1 + jnp.arange(births)[:, None])
+    at, has_slot = slots.last_true_column(is_kth)
+    slot, granted = slots.allocate(taken, has_slot)
     joint, by_pose = augment(joint, scan.z[at], scan.tag[at], slot, granted, settings)
     mine = jnp.clip(rank - 1, 0, births - 1)
     return joint, slot[mine], wanted & granted[mine], by_pose[mine]
@@ -271,7 +273,7 @@ def _report_scan(
     scan: Scan,
     found: Association,
     matched: Bool[Array, "M"],
-    done: Correction,
+    correction: Correction,
     new: _NewLandmarks,
     settings: EkfSettings,
 ) -> Info:
@@ -279,8 +281,8 @@ def _report_scan(
     status = status_of(
         scan.valid,
         matched=matched,
-        positive=done.positive,
-        inside=done.inside,
+        positive=correction.positive,
+        inside=correction.inside,
         new=found.is_new,
         repeated=new.repeated,
         granted=new.granted,
@@ -292,18 +294,18 @@ def _report_scan(
         size=len(settings.sensor.measurements),
         slot=found.slot,
         born=new.slot,
-        nis=done.nis,
-        innovation=done.innovation,
-        innovation_cov=done.innovation_cov,
-        log_likelihood=done.log_likelihood.sum(),
+        nis=correction.nis,
+        innovation=correction.innovation,
+        innovation_cov=correction.innovation_cov,
+        log_likelihood=correction.log_likelihood.sum(),
         exhausted=jnp.asarray(found.exhausted),
     )
 
 
 def without_landmarks(joint: Joint, dead: Bool[Array, "N"], *, square_root: bool = False) -> Joint:
-    """The map without the landmarks of the slots `dead`, exactly as before where there are none.
+    """The map without the landmarks of the slots `dead`; without such a slot unchanged to the bit.
 
-    A root is made triangular again; a run without a removal keeps exactly its own.
+    A root is made triangular again; a run without a removal keeps its root to the bit.
     """
     remove = partial(slots.remove, dead=dead, square_root=square_root)
     return change_where(dead.any(), remove, joint)

@@ -56,7 +56,7 @@ class EkfSettings:
     life: Life | None = None
     """which landmarks make room for new ones"""
     absolute: bool = False
-    """every valid measurement corrects the robot, whatever its tag"""
+    """every valid measurement corrects the robot, for any tag"""
     reserved: PyTree = None
     """(N,) bool: slots that no new landmark may take; None for no such slots"""
 

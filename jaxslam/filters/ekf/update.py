@@ -143,20 +143,20 @@ def correct_in_turn(
     group = max(1, min(_GROUP if cached else _GROUP_BEYOND, z.shape[0]))
     if cached:
         joint = joint._replace(cov=jnp.pad(joint.cov, ((0, 0), (0, -size % _LANES))))
-    joint, done = _in_groups(
+    joint, corrections = _in_groups(
         lambda joint, part: _correct_group(joint, part, settings),
         joint,
         measurements,
         group,
         partial(_nothing, joint, chart=settings.chart),
     )
-    return joint._replace(cov=joint.cov[:, :size]), done
+    return joint._replace(cov=joint.cov[:, :size]), corrections
 
 
 def _one_by_one(
     joint: Joint, measurements: Measurements, settings: EkfSettings
 ) -> tuple[Joint, Correction]:
-    """`correct_in_turn` by `correct` of each measurement alone."""
+    """`correct_in_turn` by `correct` of one measurement at a time."""
 
     def work(joint: Joint, one: Measurements) -> tuple[Joint, Correction]:
         return correct(joint, *one, settings)
@@ -187,9 +187,9 @@ def _in_groups(
         unused = nothing(part)
         return where_any(part[2].any(), lambda s: work(s, part), lambda s: (s, unused), state)
 
-    state, done = jax.lax.scan(of_group, state, jax.tree.map(padded, measurements))
+    state, corrections = jax.lax.scan(of_group, state, jax.tree.map(padded, measurements))
     shape = (groups * group,)
-    return state, jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[2:])[:m], done)
+    return state, jax.tree.map(lambda leaf: leaf.reshape(*shape, *leaf.shape[2:])[:m], corrections)
 
 
 def _correct_group(
@@ -218,7 +218,7 @@ def _correct_group(
         return _correct_local(local, measurement, joint, settings)
 
     # A gradient stores the input of each step, and recomputes the rest.
-    local, (reach, whitened, done) = jax.lax.scan(
+    local, (reach, whitened, corrections) = jax.lax.scan(
         jax.checkpoint(one, prevent_cse=False),
         local,
         (jnp.arange(len(slot)), part),
@@ -226,7 +226,7 @@ def _correct_group(
     v = no_inline(linalg.matmul, reach.reshape(-1, len(at)), rows)
     landmarks = _moved_map(joint, v[:, :size], whitened, chart)
     cov = joint.cov - linalg.gram(v[:, :size], v)
-    return joint._replace(pose=local.pose, landmarks=landmarks, cov=cov), done
+    return joint._replace(pose=local.pose, landmarks=landmarks, cov=cov), corrections
 
 
 def _correct_local(
@@ -245,12 +245,12 @@ def _correct_local(
     v, reach = found.v[:, :width], found.v[:, width:]
     moved = _retract_means(local, found.xi[:width], settings.chart)
     moved = moved._replace(cov=local.cov - linalg.gram(v, found.v))
-    done = jax.tree.map(lambda leaf: leaf[0], found.correction)
-    return moved, (reach, found.whitened, done)
+    correction = jax.tree.map(lambda leaf: leaf[0], found.correction)
+    return moved, (reach, found.whitened, correction)
 
 
 def _nothing(joint: Joint, unused: Measurements, chart: Chart) -> Correction:
-    """The `Correction` of m unused measurements, all zero; the map is not composed anew."""
+    """The `Correction` of m unused measurements, all zero; the map is unchanged."""
     z = unused[0]
     (m, size), width = z.shape, 3 + joint.landmarks.shape[1]
     dtype = jnp.result_type(z, joint.pose, joint.cov)

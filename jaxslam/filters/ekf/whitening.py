@@ -53,16 +53,16 @@ def whiten(
     hp: Float[Array, "K D"],
     nu: Float[Array, "m Z"],
 ) -> tuple[Float[Array, "K D"], Float[Array, "K"]]:
-    """The whitened rows V = L⁻¹ H P and innovations L⁻¹ ν, zero for what is not fused."""
+    """The whitened rows V = L⁻¹ H P and innovations L⁻¹ ν, zero if not fused."""
     if len(fuse) == 1:
         inverse = jnp.where((fuse & factored.regular)[:, None, None], factored.inverse, 0.0)
-        return no_inline(_multiplied, inverse, hp, nu)
+        return no_inline(_multiply, inverse, hp, nu)
     # As a vector, the factor has one layout: LAPACK wants columns, and XLA (jaxlib 0.12) may pass
     # rows to a computation that was compiled for columns.
-    return no_inline(_solved, factored.factor.reshape(-1), hp, nu.reshape(-1))
+    return no_inline(_solve, factored.factor.reshape(-1), hp, nu.reshape(-1))
 
 
-def _solved(
+def _solve(
     factor: Float[Array, "KK"], hp: Float[Array, "K D"], nu: Float[Array, "K"]
 ) -> tuple[Float[Array, "K D"], Float[Array, "K"]]:
     """The whitened L⁻¹ H P and L⁻¹ ν by substitution."""
@@ -71,7 +71,7 @@ def _solved(
     return both[:, :-1], both[:, -1]
 
 
-def _multiplied(
+def _multiply(
     inverse: Float[Array, "1 Z Z"], hp: Float[Array, "Z D"], nu: Float[Array, "1 Z"]
 ) -> tuple[Float[Array, "Z D"], Float[Array, "Z"]]:
     """The whitened L⁻¹ H P and L⁻¹ ν of one measurement, by L⁻¹."""

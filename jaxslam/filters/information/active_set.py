@@ -45,7 +45,7 @@ def enter_link(
         at = jnp.argmin(weight)
         return at, row[at], links[at], weight[at]
 
-    # Read before any write: XLA would else copy all N lists to read them later.
+    # Read before any write; otherwise XLA copies all N lists to read them later.
     found = materialize((weakest(i), weakest(j)))
     (at_i, p, link_p, least_i), (at_j, q, link_q, least_j) = found
     keep = on & (size > least_i) & (size > least_j)
@@ -93,7 +93,7 @@ def _enter_links(
 
 
 def active_matches(state: SparseState, association: TagAssociation) -> Bool[Array, "M A"]:
-    """Which measurements are of the landmark at each index of the active set."""
+    """Mask of the measurements of the landmark at each index of the active set."""
     same = association.slot[:, None] == state.active[None, :]
     return association.has_slot[:, None] & same
 
@@ -112,7 +112,7 @@ def assign_indices(
     by_order = jnp.argsort(order, stable=True)
     entered = by_order[jnp.clip(rank, 0, len(by_order) - 1)]
     index = jnp.where(enters, entered, jnp.argmax(matches, axis=1))
-    return index, slots.concerned(index, enters, len(by_order))
+    return index, slots.slot_mask(index, enters, len(by_order))
 
 
 def deactivate(
@@ -151,12 +151,12 @@ def deactivate(
     else:
         pairs = jnp.repeat(order, count), jnp.tile(every, len(order)), entered.reshape(-1)
         state, _ = jax.lax.scan(enter_pair, state, pairs)
-    own = state.diagonal.at[state.active].get(mode="fill", fill_value=0)
+    diagonal = state.diagonal.at[state.active].get(mode="fill", fill_value=0)
     unit = jnp.eye(2, dtype=omega.dtype)
     empty = leaving | (state.active >= n)
-    blocks = blocks.at[every, every].set(own)
+    blocks = blocks.at[every, every].set(diagonal)
     blocks = jnp.where((leaving[:, None] | leaving[None, :])[:, :, None, None], 0.0, blocks)
-    blocks = blocks.at[every, every].set(jnp.where(empty[:, None, None], unit, own))
+    blocks = blocks.at[every, every].set(jnp.where(empty[:, None, None], unit, diagonal))
     return state._replace(
         omega=with_landmark_blocks(omega, blocks),
         active=jnp.where(leaving, n, state.active).astype(jnp.int32),
@@ -182,11 +182,11 @@ def activate(
     rows, links = materialize((rows, links))
     match = (rows[:, :, None] == active[None, None, :]) & (active < n)[None, None, :]
     found = jnp.einsum("akij,akb->abij", links, match.astype(links.dtype))
-    own = state.diagonal.at[jnp.where(entered, active, n)].get(mode="fill", fill_value=0)
+    diagonal = state.diagonal.at[jnp.where(entered, active, n)].get(mode="fill", fill_value=0)
     blocks = landmark_blocks(state.omega) + found
     every = jnp.arange(count)
     before = blocks[every, every]
-    blocks = blocks.at[every, every].set(jnp.where(entered[:, None, None], own, before))
+    blocks = blocks.at[every, every].set(jnp.where(entered[:, None, None], diagonal, before))
     moved = match.any(axis=2)
     left = jnp.where(moved[:, :, None, None], 0.0, links)
     return state._replace(

@@ -75,7 +75,7 @@ class TagAssociation(NamedTuple):
     has_slot: Bool[Array, "M"]
     """the landmark has a slot, or a slot is free for a new landmark"""
     slot: Int[Array, "M"]
-    """this slot; any number where there is none"""
+    """this slot; any number without a landmark"""
 
 
 def associate_by_table(tag: Int[Array, "N"], alive: Bool[Array, "N"], scan: Scan) -> TagAssociation:
@@ -122,9 +122,9 @@ class CanonicalInnovations(NamedTuple):
     innovation: Float[Array, "M Z"]
     """ν"""
     innovation_cov: Float[Array, "M Z Z"]
-    """S of each alone"""
+    """S of each measurement"""
     nis: Float[Array, "M"]
-    """of fused measurements given those before, of the others alone"""
+    """of fused measurements given the earlier ones, of the others without them"""
     log_likelihood: Float[Array, "M"]
     """0 where not fused"""
     omega_positive: Bool[Array, ""]
@@ -146,7 +146,7 @@ def innovations(
     are all where Ω is not.
 
     Args:
-        index: which of the landmarks each measurement is of, where known.
+        index: the landmark of each measurement, where known.
     """
     sensor, gate = settings.sensor, settings.gate
     m, size = scan.z.shape

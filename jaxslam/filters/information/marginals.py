@@ -174,11 +174,11 @@ def whole_information(state: SparseState) -> "scipy.sparse.csc_array":
     dense = np.asarray(landmark_blocks(state.omega))[index][:, index]
     one, two = (m.ravel() for m in np.meshgrid(slot, slot, indexing="ij"))
     add(one, two, dense.reshape(-1, 2, 2))
-    # The robot's rows and columns: its own block, and its links to the active landmarks.
-    own, linked = (3 + (2 * k[:, None] + np.arange(2)).ravel() for k in (slot, index))
+    # The robot's rows and columns: its block, and its links to the active landmarks.
+    own_rows, linked = (3 + (2 * k[:, None] + np.arange(2)).ravel() for k in (slot, index))
     i, j = (
         m.ravel()
-        for m in np.meshgrid(np.arange(3), np.concatenate([np.arange(3), own]), indexing="ij")
+        for m in np.meshgrid(np.arange(3), np.concatenate([np.arange(3), own_rows]), indexing="ij")
     )
     top = np.asarray(state.omega)[:3][:, np.concatenate([np.arange(3), linked])].ravel()
     beside = j >= 3

@@ -44,7 +44,7 @@ class Seif(InformationFilter):
     """Sparse extended information filter (Thrun et al. 2004; the Notes, corrected by the errata).
 
     The robot is linked to at most `active` landmarks, the most recent ones, each landmark to at
-    most `links` others. Four steps, none of which touches the rest of the map:
+    most `links` others. The four steps do not touch the rest of the map:
 
     1. motion update (`canonical.motion_update`), of the robot and the active landmarks;
     2. sparsification (`sparsification.sparsify`): the least recently measured active landmarks
@@ -57,7 +57,7 @@ class Seif(InformationFilter):
     measurement, and only makes the room that the scan needs, so that a scan without another
     landmark drops nothing.
 
-    With active = capacity it is `EifSlam`. `sparsification` documents what is dropped, and
+    With active = capacity it is `EifSlam`. `sparsification` documents the approximation, and
     `SparseState.counts` counts it. NIS, gate and, unless `whole`, `estimate` use covariances of
     Markov blankets (`marginals`), which hold all other landmarks at their means: less than the true
     ones, by much in a map that has drifted as a whole. Sparsification is overconfident
@@ -78,7 +78,7 @@ class Seif(InformationFilter):
     links: int = static()
     """most links K of a landmark to others while one of both is passive"""
     passive: int = static(default=10)
-    """landmarks whose means are recovered in rotation each scan, beside the active ones"""
+    """landmarks whose means are recovered in rotation each scan, in addition to the active ones"""
     sweeps: int = static(default=1)
     """rounds of mean recovery a scan: passive landmarks, then the active block"""
     conservative: bool = static(default=False)

@@ -1,8 +1,8 @@
 """The sparse canonical form of `filters.Seif`: a dense active block of Ω, and lists of links.
 
 Ω of the robot and the A active landmarks is one dense block. A passive landmark has no link to the
-robot; its links to other landmarks are in its list of at most K. A pair of which both are active is
-in the dense block alone, every other pair in the lists of both. So a motion or a scan changes the
+robot; its links to other landmarks are in its list of at most K. A pair of active landmarks is
+only in the dense block, every other pair in both lists. So a motion or a scan changes the
 dense block, and only a few rows of arrays of N landmarks are read or written.
 """
 
@@ -45,7 +45,7 @@ class SparseState(NamedTuple):
     last_measured: Int[Array, "A"]
     """the scan in which each was last measured"""
     omega: Float[Array, "D D"]
-    """Ω of the robot and the active landmarks, D = 3 + 2A; unit diagonal where there is none"""
+    """Ω of the robot and the active landmarks, D = 3 + 2A; unit diagonal at unused indices"""
     diagonal: Float[Array, "N 2 2"]
     """diagonal blocks of Ω; of an active landmark the block in `omega` counts instead"""
     neighbours: Int[Array, "N K"]
@@ -87,21 +87,21 @@ def empty_map(
 
 
 def active_means(state: SparseState) -> Float[Array, "A 2"]:
-    """The means of the active landmarks, 0 where there is none."""
+    """The means of the active landmarks, 0 at unused indices."""
     means: Array = state.landmarks.at[state.active].get(mode="fill", fill_value=0)
     return means
 
 
 def active_residual(state: SparseState) -> Float[Array, "D"]:
     """The information residual ρ of the robot and the active landmarks."""
-    own = state.landmark_residual.at[state.active].get(mode="fill", fill_value=0)
-    return jnp.concatenate([state.pose_residual, own.reshape(-1)])
+    landmarks = state.landmark_residual.at[state.active].get(mode="fill", fill_value=0)
+    return jnp.concatenate([state.pose_residual, landmarks.reshape(-1)])
 
 
 def with_active_residual(state: SparseState, residual: Float[Array, "D"]) -> SparseState:
     """The state with ρ of the robot and the active landmarks."""
-    own = residual[3:].reshape(-1, 2)
-    after = state.landmark_residual.at[state.active].set(own, mode="drop")
+    landmarks = residual[3:].reshape(-1, 2)
+    after = state.landmark_residual.at[state.active].set(landmarks, mode="drop")
     return state._replace(pose_residual=residual[:3], landmark_residual=after)
 
 

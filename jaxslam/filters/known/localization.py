@@ -31,7 +31,7 @@ from jaxslam.core.record import hold_function, record, set_field, static
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.filters.ekf.predict import propagate
-from jaxslam.filters.ekf.scan import SensorTurn, update_by_scan
+from jaxslam.filters.ekf.scan import SensorStage, update_by_scan
 from jaxslam.filters.ekf.settings import (
     CorrectionOrder,
     Covariance,
@@ -112,15 +112,15 @@ class Localization(Filter):
         return propagate(state, u, self.motion, self._settings(self.sensor))[0]
 
     def update(self, state: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
-        turns = [SensorTurn(None, self._settings(self.sensor))]
+        stages = [SensorStage(None, self._settings(self.sensor))]
         if isinstance(self.sensor, Suite):
-            turns = [
-                SensorTurn(
+            stages = [
+                SensorStage(
                     part.places, None if part.sees == "robots" else self._settings(part.sensor)
                 )
                 for part in self.sensor.parts
             ]
-        return update_by_scan(state, scan, turns)[:2]
+        return update_by_scan(state, scan, stages)[:2]
 
     def estimate(self, state: Joint) -> Estimate:
         cov, chart = state.cov, _OfPose(self.chart)
@@ -180,7 +180,7 @@ class _OnMap(Linearizer):
 
 @record
 class _OfRobot(Wrapped):
-    """A sensor as one of the robot alone: the landmark that it measures is known."""
+    """A sensor of a known landmark, as a sensor of the robot alone."""
 
     sensor: Sensor
     known: PyTree = None

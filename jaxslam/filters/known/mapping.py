@@ -32,9 +32,9 @@ from jaxslam.math.arrays import Number
 
 @record
 class Mapping(Filter):
-    """A filter of the map alone, for known poses (Williams): the control *is* the pose.
+    """A filter of the map for known poses (Williams): the control *is* the pose.
 
-    Given the path, landmarks are independent: each has an EKF of its own, l ← l + C Hᵀ S⁻¹ ν with
+    Given the path, landmarks are independent: each has a separate EKF, l ← l + C Hᵀ S⁻¹ ν with
     S = H C Hᵀ + R, and a measurement costs O(1) for any size of the map. This is the map update of
     one particle of `FastSlam`, without a joint covariance.
 
@@ -93,7 +93,7 @@ class StartingAt(Wrapper):
 
     filter: Filter
     state: PyTree
-    """whatever `init` is called with"""
+    """independent of the arguments of `init`"""
 
     @property
     def name(self) -> str:  # type: ignore[override]

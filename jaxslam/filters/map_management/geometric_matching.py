@@ -26,7 +26,7 @@ from jaxslam.math.stats import chi2_quantile
 
 
 class _Alignment(NamedTuple):
-    """A weighted alignment of M cluster points, of which some have a map point."""
+    """A weighted alignment of M cluster points, some of them paired with map points."""
 
     pose: Float[Array, "3"]
     """T with map = T ∘ cluster"""
@@ -41,7 +41,7 @@ class _Alignment(NamedTuple):
     jacobian: Float[Array, "2*M 3"]
     """∂r/∂T"""
     factor: Float[Array, "2*M 2*M"]
-    """Cholesky factor of Σ; the identity where there is no pair"""
+    """Cholesky factor of Σ; the identity without a pair"""
 
 
 class _Residuals(NamedTuple):
@@ -64,8 +64,8 @@ def align_points(points: PointSets, slot: Int[Array, "M"]) -> _Alignment:
     and not (R z)⊥, which differ by the residual: then a rotation of the whole map rotates the pose
     with it, and the residuals do not depend on it.
     """
-    there, target = slot >= 0, points.map[jnp.maximum(slot, 0)]
-    weight = jnp.where(there, 1.0, 0.0).astype(target.dtype)
+    paired, target = slot >= 0, points.map[jnp.maximum(slot, 0)]
+    weight = jnp.where(paired, 1.0, 0.0).astype(target.dtype)
     total = jnp.maximum(weight.sum(), 1.0)
     centroid = (weight[:, None] * points.cluster).sum(axis=0) / total
     map_centroid = (weight[:, None] * target).sum(axis=0) / total
@@ -84,11 +84,11 @@ def align_points(points: PointSets, slot: Int[Array, "M"]) -> _Alignment:
     centred = start - step
     shift = map_centroid + centred[:2] - se2.rotation(centred[2]) @ centroid
     heading = jnp.arctan2(jnp.sin(centred[2:]), jnp.cos(centred[2:]))
-    by_turn = jnp.where(there[:, None], quarter_turned(target - shift[None, :]), 0.0)
+    by_turn = jnp.where(paired[:, None], quarter_turned(target - shift[None, :]), 0.0)
     return _Alignment(
         pose=jnp.concatenate([shift, heading]),
         distance=((whitened - by_pose @ step) ** 2).sum(),
-        each=jnp.where(there, each, 0.0),
+        each=jnp.where(paired, each, 0.0),
         regular=r.positive & solvable,
         residual=left,
         jacobian=r.jacobian.at[:, 2].set(by_turn.reshape(-1)),
@@ -104,27 +104,27 @@ def _residuals(
     pose: Float[Array, "3"],
 ) -> _Residuals:
     """The residuals of points z and goals about their centroids; 0 and identity without a pair."""
-    m, there, at = slot.shape[0], slot >= 0, jnp.maximum(slot, 0)
+    m, paired, at = slot.shape[0], slot >= 0, jnp.maximum(slot, 0)
     rotation = se2.rotation(pose[2])
     mixed = jnp.einsum("xy,iyjw->ixjw", rotation, points.cross_cov[:, :, at])
     cov = jnp.einsum("xy,iyjw,vw->ixjv", rotation, points.cluster_cov, rotation)
     cov = cov + points.map_cov[at][:, :, at] - mixed - mixed.transpose(2, 3, 0, 1)
-    cov = with_unit_blocks(cov, there)
+    cov = with_unit_blocks(cov, paired)
     factor, positive = linalg.cholesky(linalg.symmetrize(cov.reshape(2 * m, 2 * m)))
-    error = jnp.where(there[:, None], z @ rotation.T + pose[None, :2] - goal, 0.0)
+    error = jnp.where(paired[:, None], z @ rotation.T + pose[None, :2] - goal, 0.0)
     eye = jnp.broadcast_to(jnp.eye(2, dtype=z.dtype), (m, 2, 2))
     by_turn = quarter_turned(goal - pose[None, :2])[:, :, None]
-    jacobian = jnp.where(there[:, None, None], jnp.concatenate([eye, by_turn], 2), 0.0)
-    own = cov[jnp.arange(m), :, jnp.arange(m)]
-    return _Residuals(error.reshape(-1), jacobian.reshape(2 * m, 3), own, factor, positive)
+    jacobian = jnp.where(paired[:, None, None], jnp.concatenate([eye, by_turn], 2), 0.0)
+    blocks = cov[jnp.arange(m), :, jnp.arange(m)]
+    return _Residuals(error.reshape(-1), jacobian.reshape(2 * m, 3), blocks, factor, positive)
 
 
 def with_unit_blocks(
-    cov: Float[Array, "M 2 M 2"], there: Bool[Array, "M"]
+    cov: Float[Array, "M 2 M 2"], used: Bool[Array, "M"]
 ) -> Float[Array, "M 2 M 2"]:
     """The covariance with the identity in the rows and columns of absent points."""
-    m = there.shape[0]
-    both = jnp.broadcast_to(there[:, None, None, None] & there[None, None, :, None], cov.shape)
+    m = used.shape[0]
+    both = jnp.broadcast_to(used[:, None, None, None] & used[None, None, :, None], cov.shape)
     return jnp.where(both, cov, jnp.eye(2 * m, dtype=cov.dtype).reshape(m, 2, m, 2))
 
 

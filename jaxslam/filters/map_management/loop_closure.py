@@ -67,9 +67,9 @@ def successive_duplicate(
     def search(joint: Joint) -> tuple[Array, Array, Array]:
         cov = cov_of_coordinates(joint, chart)[3:, 3:].reshape(capacity, 2, capacity, 2)
         every = jnp.arange(capacity)
-        own = jnp.trace(cov[every, :, every], axis1=1, axis2=2)
+        traces = jnp.trace(cov[every, :, every], axis1=1, axis2=2)
         mixed = cov[:, 0, :, 0] + cov[:, 1, :, 1]
-        variance = own[:, None] + own[None, :] - 2 * mixed
+        variance = traces[:, None] + traces[None, :] - 2 * mixed
         i, j, distance = closest_pair(joint, chart, reach, pairs & (variance <= 2 * spread**2))
         first = known.born[i] <= known.born[j]
         i, j = jnp.where(first, i, j), jnp.where(first, j, i)
@@ -90,7 +90,7 @@ class LoopReport(NamedTuple):
     runner_up: Int[Array, ""]
     """the same under any other hypothesis"""
     likely: Bool[Array, ""]
-    """the filter's own covariance, drift included, allows the best hypothesis"""
+    """the covariance of the filter, drift included, allows the best hypothesis"""
     merged: Int[Array, ""]
     """pairs of landmarks merged by the search, 0 or explained"""
     exhausted: Bool[Array, ""]
@@ -208,7 +208,7 @@ def _old_slots(
     candidates: Bool[Array, "M N"],
     settings: LoopSettings,
 ) -> tuple[Int[Array, "M"], LoopReport]:
-    """The old slot of each recent landmark, -1 where none is to be merged, and the report."""
+    """The old slot of each recent landmark, -1 without a merge, and the report."""
     capacity, m = joint.landmarks.shape[0], recent.shape[0]
     levels = jnp.asarray(
         [0.0, *(chi2_quantile(settings.drift, 2 * n) for n in range(1, settings.cluster + 1))]
@@ -217,15 +217,15 @@ def _old_slots(
         settings.cluster, settings.probability, settings.pairs, settings.candidates
     )
     cov = cov_of_coordinates(joint, chart)[3:, 3:].reshape(capacity, 2, capacity, 2)
-    own, shared = cov[recent][:, :, recent], cov[recent]
+    within, shared = cov[recent][:, :, recent], cov[recent]
     every, each = jnp.arange(capacity), jnp.arange(m)
     delta = joint.landmarks[recent][:, None] - joint.landmarks[None]
     delta_covs = difference_covs(
-        own[each, :, each], cov[every, :, every], shared.transpose(0, 2, 1, 3)
+        within[each, :, each], cov[every, :, every], shared.transpose(0, 2, 1, 3)
     )
     distance = jax.vmap(jax.vmap(squared_distance))(delta, delta_covs)
     allowed = candidates & (distance <= levels[1])
-    points = PointSets(joint.landmarks[recent], joint.landmarks, own, cov, shared, allowed)
+    points = PointSets(joint.landmarks[recent], joint.landmarks, within, cov, shared, allowed)
 
     def compare(_: PyTree) -> tuple[Array, LoopReport]:
         found = match_points(points, limits)
@@ -261,9 +261,9 @@ def _joint_distance(
     delta: Float[Array, "M N 2"], points: PointSets, found: GeometricMatch
 ) -> Float[Array, ""]:
     """The joint distance δᵀ cov(δ)⁻¹ δ of all pairs, including the drift."""
-    m, there, at = found.slot.shape[0], found.slot >= 0, jnp.maximum(found.slot, 0)
+    m, paired, at = found.slot.shape[0], found.slot >= 0, jnp.maximum(found.slot, 0)
     crossed = points.cross_cov[:, :, at]
     cov = points.cluster_cov + points.map_cov[at][:, :, at]
-    cov = with_unit_blocks(cov - crossed - crossed.transpose(2, 3, 0, 1), there)
-    error = jnp.where(there[:, None], delta[jnp.arange(m), at], 0.0).reshape(2 * m)
+    cov = with_unit_blocks(cov - crossed - crossed.transpose(2, 3, 0, 1), paired)
+    error = jnp.where(paired[:, None], delta[jnp.arange(m), at], 0.0).reshape(2 * m)
     return squared_distance(error, linalg.symmetrize(cov.reshape(2 * m, 2 * m)))

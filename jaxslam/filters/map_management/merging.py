@@ -28,7 +28,7 @@ from jaxslam.math.xla import change_where
 class Managed(Wrapper):
     """A filter on a `slots.Joint`, each of whose updates is followed by `manage`.
 
-    It returns its linear system (`Monitored`) if the filter does; what `manage` does is no part
+    It returns its linear system (`Monitored`) if the filter does; the change by `manage` is not part
     of it. A subclass defines `manage`, and may extend `init`.
     """
 
@@ -50,7 +50,7 @@ class Managed(Wrapper):
         return joint
 
     def update(self, state: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
-        return self._managed(state, scan, self.filter.update(state, scan, key))
+        return self._manage(state, scan, self.filter.update(state, scan, key))
 
     @property
     def linearized(self) -> LinearizedSteps | None:
@@ -60,11 +60,11 @@ class Managed(Wrapper):
 
         def update(joint: Joint, scan: Scan, key: Array) -> tuple[Joint, Info, LinearSystem]:
             after, info, system = steps.update(joint, scan, key)
-            return *self._managed(joint, scan, (after, info)), system
+            return *self._manage(joint, scan, (after, info)), system
 
         return LinearizedSteps(steps.predict, update)
 
-    def _managed(self, joint: Joint, scan: Scan, found: PyTree) -> tuple[Joint, Info]:
+    def _manage(self, joint: Joint, scan: Scan, found: PyTree) -> tuple[Joint, Info]:
         name = f"{type(self).__name__}: {self.filter.name}"
         found = validation.state_and_info(name, joint, scan, found)
         return self.manage(found[0], scan, found[1])
@@ -98,7 +98,7 @@ class Merging(Managed):
     filter: Filter
     """whose state is a `slots.Joint`"""
     reach: Number
-    """[m] no two true landmarks are as near to one another. The test alone cannot separate two
+    """[m] below the distance of any two true landmarks. The test alone cannot separate two
     landmarks from one where their difference is less certain than that."""
     probability: float = static(default=0.95)
     """of the test, that two estimates of one landmark are merged"""
@@ -150,7 +150,7 @@ def co_observed(joint: Joint, info: Info, places: tuple[int, ...] = ()) -> Bool[
     end = 0
     for count in places or info.status.shape:
         begin, end = end, end + count
-        here = slots.concerned(info.slot[begin:end], measured[begin:end], capacity)
+        here = slots.slot_mask(info.slot[begin:end], measured[begin:end], capacity)
         pairs = pairs | (here[:, None] & here[None, :])
     return pairs
 
@@ -191,8 +191,8 @@ def closest_pair(
     own_errors = jnp.einsum("nij,njmk,mlk->nmil", by_landmark, blocks, by_landmark)
     cov = own_errors + with_robot + with_robot.transpose(1, 0, 3, 2)
     cov = cov + jnp.einsum("nij,jk,mlk->nmil", by_robot, robot, by_robot)
-    own = cov[jnp.arange(capacity), jnp.arange(capacity)]
-    delta_covs = own[:, None] + own[None, :] - cov - cov.transpose(1, 0, 2, 3)
+    diagonal = cov[jnp.arange(capacity), jnp.arange(capacity)]
+    delta_covs = diagonal[:, None] + diagonal[None, :] - cov - cov.transpose(1, 0, 2, 3)
     pairs = joint.alive[:, None] & joint.alive[None, :]
     pairs = pairs & (jnp.arange(capacity)[:, None] < jnp.arange(capacity)[None, :])
     pairs = pairs & ((delta**2).sum(axis=2) <= reach**2)
@@ -212,7 +212,7 @@ def squared_distance(error: Float[Array, "n"], cov: Float[Array, "n n"]) -> Floa
 def merge_landmarks(
     joint: Joint, chart: Chart, i: Array, j: Array, *, square_root: bool = False
 ) -> Joint:
-    """The map conditioned on equal landmarks in slots i and j, of which slot i is kept.
+    """The map conditioned on equal landmarks in slots i and j; slot i is kept.
 
     The constraint l_i = l_j is a measurement of δ = l_i - l_j = 0 without noise: with
     S = cov(δ) = L Lᵀ and V = L⁻¹ cov(δ, ·), x ← x ⊞ -Vᵀ L⁻¹ δ and P ← P - Vᵀ V, for points exact.
@@ -222,9 +222,9 @@ def merge_landmarks(
     size = joint.landmarks.shape[1]
     by_robot, by_landmark = (part[jnp.stack([i, j])] for part in _derivatives(joint, chart))
     rows = joint.cov @ joint.cov.T if square_root else joint.cov
-    own = [jax.lax.dynamic_slice_in_dim(rows, 3 + slot * size, size) for slot in (i, j)]
+    rows_of = [jax.lax.dynamic_slice_in_dim(rows, 3 + slot * size, size) for slot in (i, j)]
     with_all = (by_robot[0] - by_robot[1]) @ rows[:3]
-    with_all = with_all + by_landmark[0] @ own[0] - by_landmark[1] @ own[1]
+    with_all = with_all + by_landmark[0] @ rows_of[0] - by_landmark[1] @ rows_of[1]
     mine = [jax.lax.dynamic_slice_in_dim(with_all, 3 + s * size, size, axis=1) for s in (i, j)]
     s = with_all[:, :3] @ (by_robot[0] - by_robot[1]).T
     s = s + mine[0] @ by_landmark[0].T - mine[1] @ by_landmark[1].T
@@ -254,7 +254,7 @@ def merge_landmarks(
 
 
 def _derivatives(joint: Joint, chart: Chart) -> tuple[Float[Array, "N L 3"], Float[Array, "N L L"]]:
-    """The derivatives of each landmark's coordinates by errors of the pose and its own."""
+    """The derivatives of each landmark's coordinates by errors of the pose and of the landmark."""
     capacity, size = joint.landmarks.shape
     still = jnp.broadcast_to(jnp.eye(size, dtype=joint.cov.dtype), (capacity, size, size))
     if chart.basis is None:

@@ -29,10 +29,10 @@ def longest_pairs(points: PointSets, count: int) -> tuple[Int[Array, "P"], Int[A
     the length of its further pairs.
     """
     m = points.cluster.shape[0]
-    there = points.allowed.any(axis=1)
+    allowed = points.allowed.any(axis=1)
     delta = points.cluster[:, None] - points.cluster[None, :]
     length = jnp.sqrt((delta**2).sum(axis=2) + jnp.finfo(delta.dtype).tiny)
-    usable = there[:, None] & there[None, :] & (jnp.arange(m)[:, None] < jnp.arange(m)[None, :])
+    usable = allowed[:, None] & allowed[None, :] & (jnp.arange(m)[:, None] < jnp.arange(m)[None, :])
     length = jnp.where(usable, length, 0.0)
 
     def take(used: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
@@ -60,8 +60,8 @@ def equal_lengths(
     every, ends = jnp.arange(n), jnp.stack([a, b])
     s, u = _length_and_direction(points.cluster[b] - points.cluster[a])
     r, v = _length_and_direction(points.map[None, :] - points.map[:, None])
-    own = points.map_cov[every, :, every]
-    map_covs = difference_covs(own, own, points.map_cov.transpose(0, 2, 1, 3))
+    diagonal = points.map_cov[every, :, every]
+    map_covs = difference_covs(diagonal, diagonal, points.map_cov.transpose(0, 2, 1, 3))
     variance = jnp.einsum("jlx,jlxy,jly->jl", v, map_covs, v)
     blocks = points.cluster_cov[ends][:, :, ends]
     cluster_cov = blocks[0, :, 0] + blocks[1, :, 1] - blocks[0, :, 1] - blocks[1, :, 0]
@@ -73,7 +73,7 @@ def equal_lengths(
     test = (s - r) ** 2 / jnp.maximum(variance, jnp.finfo(s.dtype).tiny)
     possible = points.allowed[a][:, None] & points.allowed[b][None, :]
     possible = possible & (every[:, None] != every[None, :]) & (a != b)
-    # The direction of a pair shorter than its own uncertainty is undetermined.
+    # The direction of a pair shorter than its uncertainty is undetermined.
     directed = (s**2 > 9 * u @ cluster_cov @ u) & (s > 0)
     return test, possible & directed & (variance > 0) & (test <= gate)
 
@@ -153,18 +153,18 @@ def _moved_covs(
 ) -> tuple[Float[Array, "M 2 2"], Float[Array, "M N 2 2"]]:
     """Covariances of T z_i, and with the map: errors are G of z_a, z_b, m_j, m_k, and R of z_i."""
     (m, n), g, rotation = points.allowed.shape, frame.jacobians, frame.rotation
-    own, cross, of_map = points.cluster_cov, points.cross_cov, points.map_cov
+    cluster, cross, of_map = points.cluster_cov, points.cross_cov, points.map_cov
     # Of the four points that fix T: with one another (8, 8), with each z_i, with the map.
     mixed = cross[ends][:, :, slots].reshape(4, 4)
-    top = jnp.concatenate([own[ends][:, :, ends].reshape(4, 4), mixed], axis=1)
+    top = jnp.concatenate([cluster[ends][:, :, ends].reshape(4, 4), mixed], axis=1)
     low = jnp.concatenate([mixed.T, of_map[slots][:, :, slots].reshape(4, 4)], axis=1)
     base = jnp.concatenate([top, low])
     base_own = jnp.concatenate(
-        [own[ends].reshape(4, m, 2), cross[:, :, slots].reshape(m, 2, 4).transpose(2, 0, 1)]
+        [cluster[ends].reshape(4, m, 2), cross[:, :, slots].reshape(m, 2, 4).transpose(2, 0, 1)]
     )
     base_map = jnp.concatenate([cross[ends].reshape(4, n * 2), of_map[slots].reshape(4, -1)])
     every = jnp.arange(m)
-    alone = rotation @ own[every, :, every] @ rotation.T
+    alone = rotation @ cluster[every, :, every] @ rotation.T
     crossed = g @ base_own.transpose(1, 0, 2) @ rotation.T
     covs = g @ base @ g.transpose(0, 2, 1) + alone + crossed + crossed.transpose(0, 2, 1)
     with_map = (g.reshape(2 * m, 8) @ base_map).reshape(m, 2, n, 2)

@@ -49,7 +49,7 @@ def seen_points(sensor: Sensor, scan: Scan) -> tuple[Float[Array, "M 2"], Float[
     """A scan as points in the robot's frame, and their covariances.
 
     p = position(invert(0, z)), P = J R Jᵀ with J = ∂p/∂z; zeros and identity where not valid.
-    Raises ValueError for a sensor without landmarks, of landmarks that are no places (lines), or
+    Raises ValueError for a sensor without landmarks, of landmarks without a position (lines), or
     one whose measurement leaves the position open (K > 0).
     """
     no_place = len(sensor.landmark) == 0 or sensor.carry is not None
@@ -63,9 +63,9 @@ def seen_points(sensor: Sensor, scan: Scan) -> tuple[Float[Array, "M 2"], Float[
 
     jacobian = jax.vmap(jax.jacfwd(point))(z)
     covs = jacobian @ jax.vmap(sensor.noise_cov)(z) @ jacobian.transpose(0, 2, 1)
-    there = scan.valid[:, None, None]
+    valid = scan.valid[:, None, None]
     points = jnp.where(scan.valid[:, None], jax.vmap(point)(z), 0.0)
-    return points, jnp.where(there, covs, jnp.eye(2, dtype=z.dtype)[None])
+    return points, jnp.where(valid, covs, jnp.eye(2, dtype=z.dtype)[None])
 
 
 def relocalize(
@@ -117,14 +117,14 @@ def relocalize(
     check_search("relocalize", probability, pairs, candidates)
     limits = search_limits(m, probability, pairs, candidates)
     if n < 2 or m < 2:
-        return _judged(_nothing(m, jnp.result_type(points)), least, margin)
-    own = jnp.zeros((m, 2, m, 2), seen.dtype)
-    own = own.at[jnp.arange(m), :, jnp.arange(m)].set(seen_covs)
+        return _judge(_nothing(m, jnp.result_type(points)), least, margin)
+    seen_cov = jnp.zeros((m, 2, m, 2), seen.dtype)
+    seen_cov = seen_cov.at[jnp.arange(m), :, jnp.arange(m)].set(seen_covs)
     shared = jnp.zeros((m, 2, n, 2), seen.dtype)
     parts = PointSets(
-        seen, points, own, cov.reshape(n, 2, n, 2), shared, valid[:, None] & alive[None]
+        seen, points, seen_cov, cov.reshape(n, 2, n, 2), shared, valid[:, None] & alive[None]
     )
-    return _judged(match_points(parts, limits), least, margin)
+    return _judge(match_points(parts, limits), least, margin)
 
 
 def check_policy(caller: str, least: int, margin: int) -> None:
@@ -135,7 +135,7 @@ def check_policy(caller: str, least: int, margin: int) -> None:
         raise ValueError(f"{caller}: expected least >= 3, got {least}")
 
 
-def _judged(found: GeometricMatch, least: int, margin: int) -> _Relocalization:
+def _judge(found: GeometricMatch, least: int, margin: int) -> _Relocalization:
     ok = (found.explained >= least) & (found.explained - found.runner_up >= margin)
     return _Relocalization(
         pose=found.pose,
@@ -173,7 +173,7 @@ def lost(joint: Joint, chart: Chart, pose_cov: ArrayLike, *, square_root: bool =
     In coordinates P_RR ← pose_cov, P_RM ← 0, P_MM as it is: the pose is marginalized out and given
     an independent prior, at the estimate there was.
 
-    Raises ValueError on landmarks that are no points, a linearizer with a memory, or a pose_cov
+    Raises ValueError on landmarks other than points, a linearizer with a memory, or a pose_cov
     that is none.
     """
     check_point_map("lost", joint, chart)
@@ -193,7 +193,7 @@ def relocated(
     *,
     square_root: bool = False,
 ) -> Joint:
-    """The state with the robot's pose replaced by the one that aligns its scan with the map.
+    """The state with the robot's pose replaced by the pose that aligns its scan with the map.
 
     With r = T z - m over the pairs, J = ∂r/∂T, Σ = cov(r) = R Z Rᵀ + P_mm, N = (Jᵀ Σ⁻¹ J)⁻¹ and
     A = Σ⁻¹ - Σ⁻¹ J N Jᵀ Σ⁻¹, T the generalized least squares: P_TT = N, P_TM = N Jᵀ Σ⁻¹ P_mM,
@@ -215,15 +215,15 @@ def relocated(
             f"got {np.shape(seen)} and {np.shape(seen_covs)}"
         )
     cov = cov_of_coordinates(joint, chart, square_root=square_root)
-    own = jnp.zeros((m, 2, m, 2), cov.dtype)
-    own = own.at[jnp.arange(m), :, jnp.arange(m)].set(seen_covs)
+    seen_cov = jnp.zeros((m, 2, m, 2), cov.dtype)
+    seen_cov = seen_cov.at[jnp.arange(m), :, jnp.arange(m)].set(seen_covs)
     among = cov[3:, 3:].reshape(capacity, 2, capacity, 2)
     shared = jnp.zeros((m, 2, capacity, 2), cov.dtype)
     allowed = (slot >= 0)[:, None] & joint.alive[None]
     slot = jnp.where((slot >= 0) & joint.alive[jnp.maximum(slot, 0)], slot, -1)
-    found = align_points(PointSets(seen, joint.landmarks, own, among, shared, allowed), slot)
-    there = (slot >= 0)[:, None]
-    rows = jnp.where(there[:, :, None], among[jnp.maximum(slot, 0)].reshape(m, 2, -1), 0.0)
+    found = align_points(PointSets(seen, joint.landmarks, seen_cov, among, shared, allowed), slot)
+    paired = (slot >= 0)[:, None]
+    rows = jnp.where(paired[:, :, None], among[jnp.maximum(slot, 0)].reshape(m, 2, -1), 0.0)
     rows = linalg.solve_lower(found.factor, rows.reshape(2 * m, -1))
     by = linalg.solve_lower(found.factor, found.jacobian)
     white = linalg.solve_lower(found.factor, found.residual)

@@ -2,8 +2,8 @@
 
 Its pose x_b is a function g(y, q) of variables y of the map and of measurements q, so its
 covariances are P_bM = G_y P_yM and P_bb = G_y P_yy G_yᵀ + G_q C G_qᵀ (as Solà (32)-(38) for a
-landmark): correlated with the whole joint state. Every measurement is taken as a point in the frame
-of the robot that made it, whatever the sensor.
+landmark): correlated with the whole joint state. Every measurement is converted to a point in the
+frame of its robot, for any sensor.
 """
 
 from typing import NamedTuple
@@ -32,14 +32,14 @@ from jaxslam.sensors.suite import Suite, split_scan
 
 
 class _ObservedPoints(NamedTuple):
-    """The measurements of a robot as points in its own frame."""
+    """The measurements of a robot as points in its frame."""
 
     point: Float[Array, "M 2"]
     """[m]"""
     cov: Float[Array, "M 2 2"]
     tag: Int[Array, "M"]
     valid: Bool[Array, "M"]
-    """there is a measurement, of a known identity, which determines the point"""
+    """mask of measurements of known identity that determine the point"""
 
 
 Candidate = tuple[InitialPose, list[Bool[Array, "M"]]]
@@ -50,7 +50,7 @@ def best_initialization(
     joint: Joint,
     robot: int,
     observed: list[_ObservedPoints],
-    there: Bool[Array, "R"],
+    in_map: Bool[Array, "R"],
     settings: TeamSettings,
 ) -> Candidate:
     """The candidate pose of a robot whose heading has the least variance.
@@ -58,7 +58,7 @@ def best_initialization(
     observed: by each robot. there: which robots are in the map.
     """
     candidates = [
-        _mutual_candidate(joint, robot, other, observed, there[other], settings)
+        _mutual_candidate(joint, robot, other, observed, in_map[other], settings)
         for other in range(len(observed))
         if other != robot
     ]
@@ -75,7 +75,7 @@ def _mutual_candidate(
     robot: int,
     other: int,
     observed: list[_ObservedPoints],
-    there: Bool[Array, ""],
+    in_map: Bool[Array, ""],
     settings: TeamSettings,
 ) -> Candidate:
     """The pose from another robot in the map, if the two measure each other."""
@@ -92,7 +92,7 @@ def _mutual_candidate(
     used = _none_of(observed)
     used[other] = jnp.arange(len(used[other])) == i
     used[robot] = jnp.arange(len(used[robot])) == j
-    return InitialPose(*found, there & sees & sees_back), used
+    return InitialPose(*found, in_map & sees & sees_back), used
 
 
 def _landmark_candidate(
@@ -118,7 +118,7 @@ def _none_of(observed: list[_ObservedPoints]) -> list[Array]:
 
 
 def _first(observed: _ObservedPoints, tag: int) -> tuple[Int[Array, ""], Bool[Array, ""]]:
-    """The first measurement with a tag, and whether there is one."""
+    """The first measurement with a tag, and whether it exists."""
     match = observed.valid & (observed.tag == tag)
     return jnp.argmax(match), match.any()
 
@@ -126,14 +126,16 @@ def _first(observed: _ObservedPoints, tag: int) -> tuple[Int[Array, ""], Bool[Ar
 def observed_points(sensors: Suite, scan: Scan) -> _ObservedPoints:
     """A robot's scan as points; valid if a measurement has a tag and determines a point."""
     found = []
-    for part, own in zip(sensors.parts, split_scan(scan, sensors.places), strict=True):
+    for part, part_scan in zip(sensors.parts, split_scan(scan, sensors.places), strict=True):
         if measures_points(part.sensor):
-            points, covs = _points_of(part.sensor, own)
-            found.append(_ObservedPoints(points, covs, own.tag, own.valid & (own.tag >= 0)))
+            points, covs = _points_of(part.sensor, part_scan)
+            found.append(
+                _ObservedPoints(points, covs, part_scan.tag, part_scan.valid & (part_scan.tag >= 0))
+            )
         else:
             m, dtype = part.places, scan.z.dtype
             nothing = jnp.zeros((m, 2), dtype), jnp.zeros((m, 2, 2), dtype)
-            found.append(_ObservedPoints(*nothing, own.tag, jnp.zeros(m, bool)))
+            found.append(_ObservedPoints(*nothing, part_scan.tag, jnp.zeros(m, bool)))
     return _ObservedPoints(*(jnp.concatenate(leaves) for leaves in zip(*found, strict=True)))
 
 
@@ -165,7 +167,7 @@ def by_mutual_sight(
     atan2(-v) - atan2(w); then x_b = x_a ∘ that pose.
 
     Args:
-        other, rows, cov: x_a, its covariance with all errors and its own.
+        other, rows, cov: x_a, its covariance with all errors, and its covariance.
         seen, back: v and w, each with its covariance.
     """
     (v, cov_v), (w, cov_w) = seen, back
@@ -174,14 +176,14 @@ def by_mutual_sight(
 
     def pose(other: Array, v: Array, w: Array) -> Array:
         (far, at_v), (back, at_w) = se2.polar(v), se2.polar(w)
-        there = se2.rectangular(jnp.stack([share * far + (1 - share) * back, at_v]))
+        position = se2.rectangular(jnp.stack([share * far + (1 - share) * back, at_v]))
         turn = at_v + jnp.pi - at_w
-        return se2.compose(other, jnp.stack([there[0], there[1], turn]))
+        return se2.compose(other, jnp.stack([position[0], position[1], turn]))
 
     by_other, by_v, by_w = jax.jacfwd(pose, argnums=(0, 1, 2))(other, v, w)
-    own = by_v @ cov_v @ by_v.T + by_w @ cov_w @ by_w.T
-    own = symmetrize(by_other @ cov @ by_other.T + own)
-    return _wrapped(pose(other, v, w)), by_other @ rows, own
+    noise = by_v @ cov_v @ by_v.T + by_w @ cov_w @ by_w.T
+    noise = symmetrize(by_other @ cov @ by_other.T + noise)
+    return _wrap_heading(pose(other, v, w)), by_other @ rows, noise
 
 
 def by_two_landmarks(
@@ -197,7 +199,7 @@ def by_two_landmarks(
     directions of l_2 - l_1 and q_2 - q_1 agree, and so do the midpoints.
 
     Args:
-        points, rows, cov: l, its covariance with all errors and its own.
+        points, rows, cov: l, its covariance with all errors, and its covariance.
         seen, seen_cov: q and its covariances.
     """
 
@@ -206,9 +208,9 @@ def by_two_landmarks(
 
     by_points, by_seen = jax.jacfwd(pose, argnums=(0, 1))(points, seen)
     by_points = by_points.reshape(3, 4)
-    own = jnp.einsum("ikl,klm,jkm->ij", by_seen, seen_cov, by_seen)
-    own = symmetrize(by_points @ cov @ by_points.T + own)
-    return _wrapped(pose(points, seen)), by_points @ rows, own
+    noise = jnp.einsum("ikl,klm,jkm->ij", by_seen, seen_cov, by_seen)
+    noise = symmetrize(by_points @ cov @ by_points.T + noise)
+    return _wrap_heading(pose(points, seen)), by_points @ rows, noise
 
 
 def _farthest_pair(
@@ -226,10 +228,10 @@ def _farthest_pair(
 def _distance_variance(point: Float[Array, "2"], cov: Float[Array, "2 2"]) -> Float[Array, ""]:
     """The variance of the distance of a point with that covariance; positive."""
     square = (point**2).sum()
-    there = square > 0
-    along = point @ cov @ point / jnp.where(there, square, 1.0)
+    positive = square > 0
+    along = point @ cov @ point / jnp.where(positive, square, 1.0)
     return jnp.where(along > 0, along, jnp.finfo(point.dtype).tiny)
 
 
-def _wrapped(pose: Float[Array, "3"]) -> Float[Array, "3"]:
+def _wrap_heading(pose: Float[Array, "3"]) -> Float[Array, "3"]:
     return jnp.concatenate([pose[:2], wrap(pose[2:])])

@@ -20,7 +20,7 @@ from jaxslam.sensors.suite import Part, Suite
 
 @record
 class Robot:
-    """One robot of a team. Raises ValueError on sensors that are no suite, or an invalid start."""
+    """One robot of a team. Raises ValueError on sensors without a suite, or an invalid start."""
 
     motion: Motion
     sensors: Suite

@@ -16,7 +16,7 @@ from jaxslam.core.record import hold_function, record, set_field, static
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan, Status
 from jaxslam.filters.ekf.predict import propagate
-from jaxslam.filters.ekf.scan import SensorTurn, turn_of, update_by_scan
+from jaxslam.filters.ekf.scan import SensorStage, stage_of, update_by_scan
 from jaxslam.filters.ekf.settings import (
     CorrectionOrder,
     Covariance,
@@ -83,7 +83,7 @@ class TeamSlam(Filter):
     tags: tuple[int, ...] | None = static(default=None)
     """R that mean robots; default N, N + 1, …"""
     report: int = static(default=0)
-    """which robot `estimate` is of; `team.poses` has all"""
+    """the robot of `estimate`; `team.poses` has all"""
     associate: Associate = Known()
     correction: CorrectionOrder = static(default="sequential")
     gate: Number | None = None
@@ -133,8 +133,8 @@ class TeamSlam(Filter):
         return _initial_team_state(pose, pose_cov, self._settings)
 
     def predict(self, state: Joint, u: Float[Array, "U"], key: Array) -> Joint:
-        for b, own in enumerate(jnp.split(u, sizes(self.robots)[0][:-1])):
-            state = _predicted_robot(state, b, own, self._settings)
+        for b, control in enumerate(jnp.split(u, sizes(self.robots)[0][:-1])):
+            state = _predicted_robot(state, b, control, self._settings)
         return state
 
     def update(self, state: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
@@ -151,8 +151,8 @@ class TeamSlam(Filter):
             if b in settings.unstarted:
                 state, used[b] = initialized(state, b, scans, settings)
                 scans = [
-                    own._replace(valid=own.valid & ~mask)
-                    for own, mask in zip(scans, used[b], strict=True)
+                    robot_scan._replace(valid=robot_scan.valid & ~mask)
+                    for robot_scan, mask in zip(scans, used[b], strict=True)
                 ]
             state, infos[b] = corrected(state, b, scans[b], settings)
         for b, masks in used.items():
@@ -188,15 +188,15 @@ class TeamSlam(Filter):
             births=self.births,
             reserved=np.arange(capacity + len(robots) - 1) >= capacity,
         )
-        turns = tuple([_turn_of(part, ekf) for part in robot.sensors.parts] for robot in robots)
+        stages = tuple([_stage_of(part, ekf) for part in robot.sensors.parts] for robot in robots)
         tags = self.tags or tuple(range(capacity, capacity + len(robots)))
-        return TeamSettings(robots, capacity, tags, ekf, turns)
+        return TeamSettings(robots, capacity, tags, ekf, stages)
 
 
-def _turn_of(part: Part, ekf: EkfSettings) -> SensorTurn:
-    """The turn of one sensor in a scan; sensors of robots start no landmarks."""
+def _stage_of(part: Part, ekf: EkfSettings) -> SensorStage:
+    """The stage of one sensor in a scan; sensors of robots initialize no landmarks."""
     births = 0 if part.sees == "robots" else ekf.births
-    return turn_of(part, SIZE, dataclasses.replace(ekf, births=births))
+    return stage_of(part, SIZE, dataclasses.replace(ekf, births=births))
 
 
 @record
@@ -217,9 +217,9 @@ def _initial_team_state(
     for b, robot in enumerate(settings.robots):
         if robot.start is None:
             continue
-        mean, own = (jnp.asarray(part, pose.dtype) for part in robot.start)
+        mean, robot_cov = (jnp.asarray(part, pose.dtype) for part in robot.start)
         by_first, by_start = jax.jacfwd(se2.compose, argnums=(0, 1))(pose, mean)
-        cov = by_first @ pose_cov @ by_first.T + by_start @ own @ by_start.T
+        cov = by_first @ pose_cov @ by_first.T + by_start @ robot_cov @ by_start.T
         rows = by_first @ joint.cov[:3]
         new = InitialPose(se2.compose(pose, mean), rows, cov, jnp.asarray(True))
         joint = with_robot(joint, b, new, settings)
@@ -236,8 +236,8 @@ def _predicted_robot(
     after = seen_from_first(after, robot, joint, settings)
     if robot in settings.started:
         return after
-    there = joint.alive[settings.slot_of(robot)]
-    same: Joint = jax.tree.map(lambda new, old: jnp.where(there, new, old), after, joint)
+    in_map = joint.alive[settings.slot_of(robot)]
+    same: Joint = jax.tree.map(lambda new, old: jnp.where(in_map, new, old), after, joint)
     return same
 
 
@@ -250,30 +250,32 @@ def initialized(
 
     def initialize(joint: Joint) -> tuple[Joint, list[Array]]:
         observed = [
-            observed_points(one.sensors, own)
-            for one, own in zip(settings.robots, scans, strict=True)
+            observed_points(one.sensors, robot_scan)
+            for one, robot_scan in zip(settings.robots, scans, strict=True)
         ]
-        there = robots_in_map(joint, settings)
-        new, used = best_initialization(joint, robot, observed, there, settings)
+        in_map = robots_in_map(joint, settings)
+        new, used = best_initialization(joint, robot, observed, in_map, settings)
         ok = new.possible & absent
         after = with_robot(joint, robot, new, settings)
         after = jax.tree.map(lambda x, y: jnp.where(ok, x, y), after, joint)
         return after, [mask & ok for mask in used]
 
     def leave(joint: Joint) -> tuple[Joint, list[Array]]:
-        return joint, [jnp.zeros_like(own.valid) for own in scans]
+        return joint, [jnp.zeros_like(robot_scan.valid) for robot_scan in scans]
 
     return where_any(absent, initialize, leave, joint)
 
 
 def corrected(joint: Joint, robot: int, scan: Scan, settings: TeamSettings) -> tuple[Joint, Info]:
     """The state corrected by one robot's scan, by measurements whose robots are all in the map."""
-    there = robots_in_map(joint, settings)
+    in_map = robots_in_map(joint, settings)
     of_robot = scan.tag[:, None] == jnp.asarray(settings.tags, jnp.int32)[None, :]
-    others = jnp.where(jnp.arange(len(there)) == robot, False, there)
-    unknown = (of_robot & ~others[None, :]).any(axis=1) | ~there[robot]
-    own = scan._replace(valid=scan.valid & ~unknown)
-    after, info = update_by_scan(seen_from(joint, robot, settings), own, settings.turns[robot])[:2]
+    others = jnp.where(jnp.arange(len(in_map)) == robot, False, in_map)
+    unknown = (of_robot & ~others[None, :]).any(axis=1) | ~in_map[robot]
+    part_scan = scan._replace(valid=scan.valid & ~unknown)
+    after, info = update_by_scan(
+        seen_from(joint, robot, settings), part_scan, settings.stages[robot]
+    )[:2]
     status = jnp.where(scan.valid & unknown, Status.UNMATCHED, info.status)
     info = info._replace(status=status.astype(jnp.int32))
     return seen_from_first(after, robot, joint, settings), info

@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxslam.core.protocols import Sensor
 from jaxslam.core.slots import Joint
-from jaxslam.filters.ekf.scan import SensorTurn
+from jaxslam.filters.ekf.scan import SensorStage
 from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.multi_robot.team import Robot
 
@@ -33,8 +33,8 @@ class TeamSettings:
     """(R,) that mean robots"""
     ekf: EkfSettings
     """settings of the prediction and the correction of each robot"""
-    turns: tuple[list[SensorTurn], ...]
-    """turns of the sensors of each robot in a scan"""
+    stages: tuple[list[SensorStage], ...]
+    """stages of the sensors of each robot in a scan"""
 
     @property
     def started(self) -> list[int]:
@@ -123,7 +123,7 @@ def seen_from(joint: Joint, robot: int, settings: TeamSettings) -> Joint:
     if robot == 0:
         return joint
     slot = settings.slot_of(robot)
-    return _exchanged(joint, robot, settings)._replace(
+    return _exchange(joint, robot, settings)._replace(
         alive=joint.alive.at[slot].set(True),
         tag=joint.tag.at[slot].set(settings.tags[0]),
     )
@@ -134,13 +134,13 @@ def seen_from_first(joint: Joint, robot: int, before: Joint, settings: TeamSetti
     if robot == 0:
         return joint
     slot = settings.slot_of(robot)
-    return _exchanged(joint, robot, settings)._replace(
+    return _exchange(joint, robot, settings)._replace(
         alive=joint.alive.at[slot].set(before.alive[slot]),
         tag=joint.tag.at[slot].set(before.tag[slot]),
     )
 
 
-def _exchanged(joint: Joint, robot: int, settings: TeamSettings) -> Joint:
+def _exchange(joint: Joint, robot: int, settings: TeamSettings) -> Joint:
     """The joint with robot 0 and another exchanged; its own inverse except for `alive`."""
     slot, first, other = settings.slot_of(robot), slice(0, 3), rows_of(robot, settings)
     cov = joint.cov

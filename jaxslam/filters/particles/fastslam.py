@@ -66,7 +66,7 @@ class FastSlam(Filter):
     Resampling happens in steps with ESS = 1/Σ w² below threshold·P. Where all weights underflow,
     all become 1/P and `ParticleInfo.underflow` is set; the log-likelihood, -∞, is then given as 0,
     so `underflow` must be checked in a sum of log-likelihoods. A particle that a motion or a scan
-    leaves without a finite pose keeps the one before, with weight zero (`ParticleInfo.invalid`).
+    leaves without a finite pose keeps its previous pose, with weight zero (`ParticleInfo.invalid`).
 
     The measurements in an `Info` are those of the most likely particle (by its weight before
     resampling), whose slots are those of the estimate; its innovations are given its path, with the
@@ -78,7 +78,7 @@ class FastSlam(Filter):
     Estimates: `slam_estimate`.
 
     Raises ValueError on a capacity, particles or births below 1, a threshold outside [0, 1], a gate
-    not above 0, an unknown proposal, a life that is none, a resample that is no function, or a
+    not above 0, an unknown proposal, an invalid life or resample, or a
     sensor that is a suite, absolute, or whose landmarks turn into points.
     """
 
@@ -104,7 +104,7 @@ class FastSlam(Filter):
     gate: Number | None = None
     """reject a measurement whose squared Mahalanobis distance exceeds this"""
     births: int | None = static(default=None)
-    """at most so many new landmarks a scan and particle, the rest `Status.DEFERRED`"""
+    """largest number of new landmarks a scan and particle, the rest `Status.DEFERRED`"""
     life: Life | None = None
     """rule that removes landmarks from each particle's map (`jaxslam.life`), e.g. by negative
     evidence: `life.Existence` keeps log-odds (P, N) in `SlamParticles.life`"""
@@ -177,7 +177,7 @@ def _report_best(
     log_likelihood: Float[Array, ""],
     exhausted: Bool[Array, "P"],
 ) -> Info:
-    """The `Info` of the best particle of all `infos`, with the numbers that are of all of them."""
+    """The `Info` of the best particle of `infos`, with the numbers of all particles."""
     info: Info = jax.tree.map(lambda of_all: of_all[best], infos)
     return info._replace(
         nis=jnp.where(has_distance(info.status), nis, 0.0),

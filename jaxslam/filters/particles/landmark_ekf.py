@@ -73,7 +73,7 @@ def _correct_landmarks(
     scan: Scan,
     settings: ParticleMapSettings,
 ) -> SlamParticles:
-    """The landmarks of a particle, each corrected by its own EKF at a known pose.
+    """The landmarks of a particle, each corrected by a separate EKF at a known pose.
 
     With S = H_l C H_lᵀ + R: l ← l + C H_lᵀ S⁻¹ ν, C ← C - C H_lᵀ S⁻¹ H_l C.
     """
@@ -106,7 +106,7 @@ def _evict_for_new(
     if life is None or life.make_room is None:
         return particle, jnp.zeros_like(alive)
     needed = association.is_new.sum() - (~alive).sum()
-    measured = slots.concerned(association.slot, used, len(alive))
+    measured = slots.slot_mask(association.slot, used, len(alive))
     evicted = life.make_room(_as_joint(particle), needed, measured)
     return _without_landmarks(particle, evicted), evicted
 
@@ -130,11 +130,11 @@ def _initialize_particle_landmarks(
     kind, m = particle.landmarks.dtype, is_new.shape[0]
     capacity, size = particle.landmarks.shape
 
-    def initialize(own: SlamParticles) -> tuple[_AllocatedSlots, Array, Array]:
-        allocated = _allocate_slots(is_new, scan.tag, own.alive, settings.quota)
-        return allocated, *_invert_scan(own.pose, scan.z, settings.sensor)
+    def initialize(particle: SlamParticles) -> tuple[_AllocatedSlots, Array, Array]:
+        allocated = _allocate_slots(is_new, scan.tag, particle.alive, settings.quota)
+        return allocated, *_invert_scan(particle.pose, scan.z, settings.sensor)
 
-    def nothing_new(own: SlamParticles) -> tuple[_AllocatedSlots, Array, Array]:
+    def nothing_new(particle: SlamParticles) -> tuple[_AllocatedSlots, Array, Array]:
         no = jnp.zeros_like(is_new)
         allocated = _AllocatedSlots(jnp.zeros(m, jnp.int32), no, no, no)
         return allocated, jnp.zeros((m, size), kind), jnp.zeros((m, size, size), kind)
@@ -159,8 +159,8 @@ def _invert_scan(
     """
 
     def one(z: Float[Array, "Z"]) -> tuple[Float[Array, "L"], Float[Array, "L L"]]:
-        landmark, _, own = first_order.invert_at(sensor, pose, z, pose, z)
-        return landmark, linalg.symmetrize(own)
+        landmark, _, landmark_cov = first_order.invert_at(sensor, pose, z, pose, z)
+        return landmark, linalg.symmetrize(landmark_cov)
 
     return jax.vmap(one)(z)
 
@@ -194,8 +194,10 @@ def _remove_landmarks(
 
 def _as_joint(particle: SlamParticles) -> Joint:
     """The particle as a `Joint` for `Life`, with landmark covariances (N, L, L) as its cov."""
-    own = particle
-    return Joint(own.pose, own.landmarks, own.covs, own.alive, own.tag, lin=(), life=own.life)
+    joint = particle
+    return Joint(
+        joint.pose, joint.landmarks, joint.covs, joint.alive, joint.tag, lin=(), life=joint.life
+    )
 
 
 def _without_landmarks(particle: SlamParticles, dead: Bool[Array, "N"]) -> SlamParticles:

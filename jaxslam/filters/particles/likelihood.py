@@ -62,10 +62,10 @@ def scan_likelihood(
     m, widest = scan.z.shape
     counts = [m if each.measured is None else each.measured for each in sensors]
     found = []
-    for each, own in zip(sensors, split_scan(scan, counts), strict=True):
+    for each, part in zip(sensors, split_scan(scan, counts), strict=True):
         size = len(each.sensor.measurements)
         of_sensor = _ignored_likelihood if each.ignored else _sensor_likelihood
-        one, spare = of_sensor(pose, own._replace(z=own.z[:, :size]), each), widest - size
+        one, spare = of_sensor(pose, part._replace(z=part.z[:, :size]), each), widest - size
         innovation = jnp.pad(one.innovation, [(0, 0), (0, spare)])
         cov = jnp.pad(one.innovation_cov, [(0, 0), (0, spare), (0, spare)])
         one = one._replace(innovation=innovation, innovation_cov=cov)
@@ -122,7 +122,7 @@ def _sensor_likelihood(
 def _ignored_likelihood(
     pose: Float[Array, "3"], scan: Scan, settings: KnownMapSensor
 ) -> ScanLikelihood:
-    """The likelihood of ignored measurements, as of other robots: zero terms."""
+    """The likelihood of ignored measurements, such as those of other robots: zero terms."""
     m, size = scan.z.shape
     zero, none, no = (jnp.zeros(m, kind) for kind in (pose.dtype, jnp.int32, bool))
     return ScanLikelihood(

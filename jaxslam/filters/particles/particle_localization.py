@@ -122,15 +122,20 @@ def _info_of_scan(
 ) -> Info:
     """The `Info` of the most likely particle, with the weighted mean NIS."""
     best = jnp.argmax(log_weight)
-    own: ScanLikelihood = jax.tree.map(lambda of_all: of_all[best], likelihood)
+    best_particle: ScanLikelihood = jax.tree.map(lambda of_all: of_all[best], likelihood)
     return info_of(
-        status_of(scan.valid, matched=own.matched, positive=own.positive, inside=own.inside),
-        own.matched,
-        size=own.dof,
-        slot=own.slot,
+        status_of(
+            scan.valid,
+            matched=best_particle.matched,
+            positive=best_particle.positive,
+            inside=best_particle.inside,
+        ),
+        best_particle.matched,
+        size=best_particle.dof,
+        slot=best_particle.slot,
         nis=weighted_nis(likelihood.nis, likelihood.matched, log_weight),
-        innovation=own.innovation,
-        innovation_cov=own.innovation_cov,
+        innovation=best_particle.innovation,
+        innovation_cov=best_particle.innovation_cov,
         log_likelihood=log_likelihood,
         exhausted=likelihood.exhausted.any(),
     )

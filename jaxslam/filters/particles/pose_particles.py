@@ -54,9 +54,9 @@ def weighted_pose_moments(
     # Headings that cancel have no mean; then the heading of the most likely particle is used.
     sine, cosine = (w * jnp.sin(pose[:, 2])).sum(), (w * jnp.cos(pose[:, 2])).sum()
     cancel = sine**2 + cosine**2 < jnp.finfo(w.dtype).eps ** 2
-    own = pose[best, 2]
+    heading = pose[best, 2]
     theta = jnp.where(
-        cancel, own, jnp.arctan2(jnp.where(cancel, 0.0, sine), jnp.where(cancel, 1.0, cosine))
+        cancel, heading, jnp.arctan2(jnp.where(cancel, 0.0, sine), jnp.where(cancel, 1.0, cosine))
     )
     theta = theta + (w * wrap(pose[:, 2] - theta)).sum()
     mean = jnp.concatenate([xy, wrap(theta)[None]])
@@ -145,7 +145,7 @@ class ParticleEvents(NamedTuple):
 
 
 class PoseParticles(NamedTuple):
-    """P particles, of which the first `active` are in use; the others have weight zero."""
+    """P particles; the first `active` are in use, the others have weight zero."""
 
     pose: Float[Array, "P 3"]
     """finite also where not in use"""

@@ -66,14 +66,14 @@ class MonteCarloFilter(_Particles):
     _: dataclasses.KW_ONLY
     start: Literal["gaussian", "uniform"] = static(default="gaussian")
     """"gaussian", the pose and covariance given to `run` (the latter may be zero), or "uniform",
-    anywhere with any heading, whatever is given (global localization)"""
+    anywhere with any heading, for any initial pose (global localization)"""
     box: ArrayLike | None = None
     """(2, 2) the lowest and the highest (x, y) [m] where the robot may be"""
     resample: Resample | Differentiable = systematic
     """one of `jaxslam.resampling`; also `Soft` or `StopGradient` of one"""
     threshold: Number = 1.0
     """of ESS, as a share; 1 resamples (and chooses the number) in every step with unequal weights,
-    0 only to inject. Where odometry is precise beside the scans, copies stay together, and a lower
+    0 only to inject. If odometry is more precise than the scans, copies stay together, and a lower
     threshold gives a more consistent covariance"""
     least: int | None = static(default=None)
     """never fewer particles; default 50, or the capacity if that is less. As many as the capacity:
@@ -152,7 +152,7 @@ class MonteCarloFilter(_Particles):
         fit: Float[Array, "P"],
         measured: Int[Array, ""],
     ) -> tuple[PoseParticles, ParticleInfo]:
-        """The particles weighted by exp(-misfit), with what is decided for the next motion.
+        """The particles weighted by exp(-misfit), with the decisions for the next motion.
 
         Args:
             misfit: the negative log-likelihood of the scan at each particle, up to a constant.

@@ -94,7 +94,7 @@ def propose_pose(
         S = H_x P H_xᵀ + H_l C H_lᵀ + R    x ← x + P H_xᵀ S⁻¹ ν    P ← P - P H_xᵀ S⁻¹ H_x P
         log w += log N(ν; 0, S)
 
-    the product of which is the density of the scan given the path. P = 0 (a pose that is drawn
+    whose product is the density of the scan given the path. P = 0 (a pose that is drawn
     already) is not changed, and gives the weights of FastSLAM 1.0. P is not inverted, so it may be
     singular. A measurement outside the gate gets the d² of the gate, and one without a landmark
     d² = `unmatched_distance` of a landmark known exactly, log N = -(d² + log |2πR|)/2, so that a
@@ -140,32 +140,32 @@ def propose_pose(
     slot, zero = association.slot, jnp.zeros((), particle.pose.dtype)
     rows = scan.z, particle.landmarks[slot], particle.covs[slot], association.matched, scan.valid
     start = particle.pose, particle.pose_cov, zero, zero
-    done, innovations = jax.lax.scan(correct_by, start, rows)
-    return PoseProposal(*done), innovations
+    corrected, innovations = jax.lax.scan(correct_by, start, rows)
+    return PoseProposal(*corrected), innovations
 
 
 def _predict_measurements(particle: SlamParticles, sensor: Sensor) -> Prediction:
-    """The `Prediction` of one particle's map, with landmarks correlated by the pose alone."""
+    """The `Prediction` of one particle's map, with landmarks correlated only through the pose."""
 
     def linearized() -> tuple[Float[Array, "N Z"], Float[Array, "N Z 3"], Float[Array, "N Z Z"]]:
         """The prediction ẑ, H_x and H_l C H_lᵀ of each landmark."""
 
         def one(landmark: Array, cov: Array) -> tuple[Array, Array, Array]:
             by_pose, by_landmark = first_order.observe_jacobians(sensor, particle.pose, landmark)
-            own = linalg.matmul(linalg.matmul(by_landmark, cov), by_landmark.T)
-            return sensor.observe(particle.pose, landmark), by_pose, own
+            landmark_cov = linalg.matmul(linalg.matmul(by_landmark, cov), by_landmark.T)
+            return sensor.observe(particle.pose, landmark), by_pose, landmark_cov
 
         return jax.vmap(one)(particle.landmarks, particle.covs)
 
     def measurements() -> tuple[Float[Array, "N Z"], Float[Array, "N Z Z"]]:
-        expected, by_pose, own = linearized()
+        expected, by_pose, landmark_cov = linearized()
         robot = jax.vmap(lambda h: linalg.matmul(linalg.matmul(h, particle.pose_cov), h.T))(by_pose)
-        return expected, linalg.symmetrize(robot + own)
+        return expected, linalg.symmetrize(robot + landmark_cov)
 
     def cross() -> Float[Array, "N Z N Z"]:
-        _, by_pose, own = linearized()
+        _, by_pose, landmark_cov = linearized()
         shared = jnp.einsum("izx,xy,jwy->izjw", by_pose, particle.pose_cov, by_pose)
         every = jnp.arange(particle.alive.shape[0])
-        return shared.at[every, :, every, :].add(own)
+        return shared.at[every, :, every, :].add(landmark_cov)
 
     return predicted(sensor, particle.tag, particle.alive, measurements, cross)

@@ -25,7 +25,7 @@ def update_averages(
 ) -> PoseParticles:
     """The state with updated likelihood averages and the injection probability.
 
-    While no scan has left a particle a weight, there is no average, and all are drawn anew.
+    While no particle has had a weight, there is no average, and all particles are drawn again.
 
     Args:
         misfit: of each particle: Σ d²/2, or the negative log-likelihood of the scan; a constant
@@ -75,7 +75,7 @@ def resample_and_inject(
     particles = len(state.pose)
     key_resample, key_order, key_which, key_anywhere = jax.random.split(key, 4)
     ancestor, log_weight = survivors(resample, state.log_weight, key_resample)
-    # Ancestors ascend, and only the first so many may be used.
+    # Ancestors ascend, and only the first ones may be used.
     order = jax.random.permutation(key_order, particles)
     pose, log_weight = state.pose[ancestor[order]], log_weight[order]
     if region is None:

@@ -15,7 +15,7 @@ class ParticleAssociation(NamedTuple):
     """The association of M measurements with the map of one particle."""
 
     slot: Int[Array, "*P M"]
-    """of the landmark measured, 0 where none"""
+    """of the measured landmark, 0 without one"""
     matched: Bool[Array, "*P M"]
     is_new: Bool[Array, "*P M"]
     exhausted: Bool[Array, "*P"]

@@ -14,7 +14,7 @@ from jaxslam.math.arrays import Number
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.sensors.suite import Suite
 
-# The probability that a measurement of a landmark lies within d², where there is no gate.
+# The probability that a measurement of a landmark lies within d², without a gate.
 _NEAR = 0.99
 
 
@@ -52,7 +52,7 @@ class KnownMapSensor(_AssociationSettings):
     tags: Array
     """(N,) int32"""
     measured: int | None
-    """measurement slots M of a scan that are its own; None for all"""
+    """measurement slots M of the sensor in a scan; None for all"""
     ignored: bool
     """it measures other robots, and is ignored"""
 

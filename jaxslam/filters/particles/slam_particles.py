@@ -147,11 +147,11 @@ def slam_estimate(state: SlamParticles, sensor: Sensor) -> Estimate:
     best = state.best
     assert best is not None
     named = (state.tag == state.tag[best][None]) & (state.tag[best] >= 0)[None]
-    own = (jnp.arange(state.pose.shape[0]) == best)[:, None]
-    same = state.alive & state.alive[best][None] & (named | own)
+    is_best = (jnp.arange(state.pose.shape[0]) == best)[:, None]
+    same = state.alive & state.alive[best][None] & (named | is_best)
     # A most likely particle of weight zero would cause a division by zero.
     w = jnp.where(same, jnp.exp(state.log_weight)[:, None], 0.0)
-    w = jnp.where((w.sum(axis=0) > 0)[None], w, own.astype(w.dtype))
+    w = jnp.where((w.sum(axis=0) > 0)[None], w, is_best.astype(w.dtype))
     w = w / w.sum(axis=0)[None]
 
     def point(

@@ -11,7 +11,7 @@ smoothing problem for linear dynamic systems", Automatica 4(2); Fraser & Potter 
 
 No covariance of a motion, of the start or of a pose is inverted, so all may be singular; no prior
 of a landmark is needed, so it does not matter when one is initialized; and covariances are
-sums of squares. O(T N²) time, and O(T N) memory besides a few matrices of N².
+sums of squares. O(T N²) time, and O(T N) memory plus a few matrices of N².
 """
 
 from typing import NamedTuple
@@ -206,11 +206,11 @@ def _add_measurements(to_go: CostToGo, step: LinearizedStep, capacity: int) -> C
 
     cross = by_slot(jnp.einsum("mzi,mzl->mil", a, b)).transpose(1, 0, 2).reshape(3, -1)
     rows = jnp.arange(capacity)[:, None] * size + jnp.arange(size)[None, :]
-    own = by_slot(jnp.einsum("mzk,mzl->mkl", b, b))
+    diagonal = by_slot(jnp.einsum("mzk,mzl->mkl", b, b))
     return CostToGo(
         pose=to_go.pose + jnp.einsum("mzi,mzj->ij", a, a),
         cross=to_go.cross + cross,
-        map=to_go.map.at[rows[:, :, None], rows[:, None, :]].add(own),
+        map=to_go.map.at[rows[:, :, None], rows[:, None, :]].add(diagonal),
         pose_y=to_go.pose_y + jnp.einsum("mzi,mz->i", a, r),
         map_y=to_go.map_y + by_slot(jnp.einsum("mzl,mz->ml", b, r)).reshape(-1),
     )
@@ -272,14 +272,14 @@ def chain_marginals(chain: Chain, policy: Policy) -> _ChainMarginals:
     def forward(
         before: tuple[Array, Array, Array], row: tuple[LinearizedStep, Gain]
     ) -> tuple[tuple[Array, Array, Array], tuple[Array, Array, Array]]:
-        deviation, own, by_map = before
+        deviation, pose_cov, by_map = before
         step, gain = row
         ahead = step.by_pose @ deviation + step.drift
         noise = gain.constant - gain.by_pose @ ahead - gain.by_map @ delta
         closed = step.by_pose - step.by_noise @ (gain.by_pose @ step.by_pose)
         after = (
             ahead + step.by_noise @ noise,
-            linalg.symmetrize(closed @ own @ closed.T + own_cov(step.by_noise, gain)),
+            linalg.symmetrize(closed @ pose_cov @ closed.T + own_cov(step.by_noise, gain)),
             linalg.matmul(closed, by_map) - linalg.matmul(step.by_noise, gain.by_map),
         )
         return after, after
@@ -291,16 +291,16 @@ def chain_marginals(chain: Chain, policy: Policy) -> _ChainMarginals:
         -linalg.matmul(root, gain.by_map),
     )
     _, rest = jax.lax.scan(forward, start, (chain.steps, policy.steps))
-    path, own, by_map = (
+    path, pose_covs, by_map = (
         jnp.concatenate([one[None], more]) for one, more in zip(start, rest, strict=True)
     )
     if wide == 0:
-        return _ChainMarginals(path, own, own[-1])
+        return _ChainMarginals(path, pose_covs, pose_covs[-1])
     poses = path.shape[0]
     spread = linalg.solve_lower(policy.map_factor, by_map.reshape(poses * 3, wide).T)
     spread = spread.reshape(wide, poses, 3)
-    covs = own + jnp.einsum("nti,ntj->tij", spread, spread)
-    unit = linalg.solve_lower(policy.map_factor, jnp.eye(wide, dtype=own.dtype))
+    covs = pose_covs + jnp.einsum("nti,ntj->tij", spread, spread)
+    unit = linalg.solve_lower(policy.map_factor, jnp.eye(wide, dtype=pose_covs.dtype))
     of_map = unit.T @ unit
     cross = by_map[-1] @ of_map
     cov = jnp.block([[covs[-1], cross], [cross.T, of_map]])

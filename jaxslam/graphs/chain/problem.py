@@ -1,8 +1,8 @@
 """The nonlinear least-squares problem of a path and a map, and Gauss-Newton with line search on it.
 
-The unknowns are the noises of the start and of the motions, in units of their own standard
+The unknowns are the noises of the start and of the motions, in units of their standard
 deviations, and the map; the path follows from the noises by the motion models. So the models hold
-exactly at every iterate, and singular process noise is no special case.
+exactly at every iterate, and singular process noise is not a special case.
 """
 
 from typing import NamedTuple
@@ -130,7 +130,7 @@ def roll_out(
 
 
 _SHARES = (1.0, 0.5, 0.25, 0.1, 0.03, 0.01, 0.001)
-"""of the Gauss-Newton step that are tried, all at once; the first that lowers the cost is taken."""
+"""of the Gauss-Newton step, tried all at once; the first that lowers the cost is used."""
 
 _ARMIJO = 1e-4
 """least share of the decrease predicted by the gradient (Armijo)."""
@@ -175,13 +175,13 @@ def optimize_chain(
         policy = eliminate(search.chain, alive)
         converged = jnp.asarray(False)
         if tolerance is not None:
-            converged = _converged(search, policy, tolerance)
+            converged = _has_converged(search, policy, tolerance)
         may = (search.taken < iterations) & ~converged
         after, value, lower = _line_search(motion, sensor, problem, search, policy)
         moved = may & lower
-        there = after, _linearize_at(motion, sensor, problem, after), value
+        trial = after, _linearize_at(motion, sensor, problem, after), value
         here = search.at, search.chain, search.cost
-        at, chain, value = jax.tree.map(lambda a, b: jnp.where(moved, a, b), there, here)
+        at, chain, value = jax.tree.map(lambda a, b: jnp.where(moved, a, b), trial, here)
         ending = jnp.where(converged, Ending.CONVERGED, Ending.EXHAUSTED)
         ending = jnp.where(may & ~lower, Ending.STALLED, ending)
         late = jnp.arange(iterations) >= search.taken
@@ -196,7 +196,7 @@ def optimize_chain(
         )
         return found, moved
 
-    begin = _unstarted(start, chain, alive, iterations)
+    begin = _initial_noise(start, chain, alive, iterations)
     # One iteration more than steps: the last solves the chain at the final iterate.
     if tolerance is None:
         fixed: Iterations = jax.lax.fori_loop(
@@ -209,7 +209,7 @@ def optimize_chain(
     return out[0]
 
 
-def _unstarted(
+def _initial_noise(
     start: Iterate, chain: Chain, alive: Bool[Array, "N"], iterations: int
 ) -> Iterations:
     """The search before the first step: no chain solved, and infinite cost."""
@@ -222,7 +222,7 @@ def _unstarted(
     return Iterations(start, chain, unsolved, far, costs, none, none + Ending.EXHAUSTED)
 
 
-def _converged(search: Iterations, policy: Policy, tolerance: float) -> Bool[Array, ""]:
+def _has_converged(search: Iterations, policy: Policy, tolerance: float) -> Bool[Array, ""]:
     """Whether the next step is shorter than the tolerance, in posterior standard deviations.
 
     A step of √eps is rounding of the gradient; so is one whose decrease of the cost is below

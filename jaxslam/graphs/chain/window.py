@@ -34,15 +34,15 @@ class WindowPrior(NamedTuple):
     """The Gaussian of the oldest pose and of the landmarks measured before it."""
 
     joint: Joint
-    """mean and covariance; `alive`: the landmarks that it is of"""
+    """mean and covariance; `alive`: its landmarks"""
     points: tuple[Float[Array, "3"], Float[Array, "N L"]]
     """the oldest pose and these landmarks, where first-estimates Jacobians are taken"""
 
 
 class WindowSteps(NamedTuple):
-    """The motions and scans of a window, with leading W; the first ones not there at the start."""
+    """The motions and scans of a window, with leading W; the first ones absent at the start."""
 
-    there: Bool[Array, "W"]
+    present: Bool[Array, "W"]
     control: Float[Array, "W U"]
     root: Float[Array, "W Q Q"]
     """of the covariances of the motions' noises"""
@@ -87,7 +87,8 @@ def linearize_window(
     everything else at the iterate (Dong-Si & Mourikis 2011, "Motion tracking with fixed-lag
     smoothing: algorithm and consistency analysis", ICRA): prior and new terms then share three
     unobservable directions.
-    By the oldest pose F = [I, J(p_1 - p_0); 0, 1] with p_0 there, J = [0, -1; 1, 0].
+    By the oldest pose F = [I, J(p_1 - p_0); 0, 1] with p_0 at its first estimate,
+    J = [0, -1; 1, 0].
     """
     landmark_points = at.landmarks
     if first:
@@ -95,11 +96,11 @@ def linearize_window(
         landmark_points = jnp.where(known, prior.points[1], at.landmarks)
 
     def moved(
-        pose: Array, u: Array, root: Array, noise: Array, there: Array
+        pose: Array, u: Array, root: Array, noise: Array, present: Array
     ) -> tuple[Array, Array]:
         by_pose, by_noise = jax.jacfwd(motion.step, argnums=(0, 2))(pose, u, root @ noise)
-        by_pose = jnp.where(there, by_pose, jnp.eye(3, dtype=pose.dtype))
-        return by_pose, jnp.where(there, by_noise @ root, 0.0)
+        by_pose = jnp.where(present, by_pose, jnp.eye(3, dtype=pose.dtype))
+        return by_pose, jnp.where(present, by_noise @ root, 0.0)
 
     def measured(z: Array, slot: Array, used: Array, pose: Array) -> tuple[Array, Array, Array]:
         a, b, r, _ = whitened_rows(sensor, z, pose, at.landmarks[slot])
@@ -107,10 +108,10 @@ def linearize_window(
             a, b, _, _ = whitened_rows(sensor, z, pose, landmark_points[slot])
         return tuple(jnp.where(used, row, 0.0) for row in (a, b, r))  # type: ignore[return-value]
 
-    data = steps.control, steps.root, at.noise, steps.there
+    data = steps.control, steps.root, at.noise, steps.present
     by_pose, by_noise = jax.vmap(moved)(at.path[:-1], *data)
     if first:
-        offset = jnp.where(steps.there[0], at.path[0, :2] - prior.points[0][:2], 0.0)
+        offset = jnp.where(steps.present[0], at.path[0, :2] - prior.points[0][:2], 0.0)
         by_pose = by_pose.at[0].set(with_lever_arm(by_pose[0], offset))
     over_slots = jax.vmap(measured, (0, 0, 0, None))
     a, b, r = jax.vmap(over_slots)(steps.z, steps.slot, steps.used, at.path[1:])
@@ -129,7 +130,7 @@ def solve_window(
     """
     joint, (capacity, size) = prior.joint, at.landmarks.shape
     cost, gains, _ = eliminate_steps(system, capacity)
-    information, y = _joined(cost)
+    information, y = _join(cost)
     known = jnp.concatenate([jnp.ones(3, bool), jnp.repeat(joint.alive, size)])
     new = jnp.concatenate([jnp.zeros(3, bool), jnp.repeat(alive & ~joint.alive, size)])
     off = jnp.where(joint.alive[:, None], at.landmarks - joint.landmarks, 0.0)
@@ -146,7 +147,7 @@ def solve_window(
     return _WindowSolution(delta[:3], landmarks, gains, linalg.symmetrize(of_delta))
 
 
-def _joined(cost: CostToGo) -> tuple[Float[Array, "D D"], Float[Array, "D"]]:
+def _join(cost: CostToGo) -> tuple[Float[Array, "D D"], Float[Array, "D"]]:
     information = jnp.block([[cost.pose, cost.cross], [cost.cross.T, cost.map]])
     return linalg.symmetrize(information), jnp.concatenate([cost.pose_y, cost.map_y])
 
@@ -160,14 +161,14 @@ def moved_by(
     start = start.at[2].set(wrap(start[2]))
 
     def forward(pose: Array, row: tuple[Array, ...]) -> tuple[Array, tuple[Array, Array]]:
-        there, u, root, noise, reference, constant, by_pose, by_map = row
+        present, u, root, noise, reference, constant, by_pose, by_map = row
         ahead = pose_difference(motion.step(pose, u, root @ noise), reference)
         noise = noise + constant - by_pose @ ahead - by_map @ delta
-        noise = jnp.where(there, noise, 0.0)
-        pose = jnp.where(there, motion.step(pose, u, root @ noise), pose)
+        noise = jnp.where(present, noise, 0.0)
+        pose = jnp.where(present, motion.step(pose, u, root @ noise), pose)
         return pose, (pose, noise)
 
-    data = steps.there, steps.control, steps.root, at.noise, at.path[1:]
+    data = steps.present, steps.control, steps.root, at.noise, at.path[1:]
     rows = *data, gains.constant, gains.by_pose, gains.by_map
     _, (path, noise) = jax.lax.scan(forward, start, rows)
     return WindowIterate(
@@ -186,19 +187,19 @@ def newest_cov(system: LinearizedStep, solved: _WindowSolution) -> Float[Array, 
     def forward(
         before: tuple[Array, Array, Array], row: tuple[LinearizedStep, Gain]
     ) -> tuple[tuple[Array, Array, Array], None]:
-        by_start, by_map, own = before
+        by_start, by_map, pose_cov = before
         step, gain = row
         closed = step.by_pose - step.by_noise @ (gain.by_pose @ step.by_pose)
         spread = linalg.solve_lower(gain.factor, step.by_noise.T)
         by_map = closed @ by_map - step.by_noise @ gain.by_map
-        own = linalg.symmetrize(closed @ own @ closed.T + spread.T @ spread)
-        return (closed @ by_start, by_map, own), None
+        pose_cov = linalg.symmetrize(closed @ pose_cov @ closed.T + spread.T @ spread)
+        return (closed @ by_start, by_map, pose_cov), None
 
     kind = solved.cov.dtype
     start = jnp.eye(3, dtype=kind), jnp.zeros((3, wide), kind), jnp.zeros((3, 3), kind)
-    (by_start, by_map, own), _ = jax.lax.scan(forward, start, (system, solved.gains))
+    (by_start, by_map, last_cov), _ = jax.lax.scan(forward, start, (system, solved.gains))
     rows = jnp.concatenate([by_start, by_map], axis=1) @ solved.cov
-    pose = rows[:, :3] @ by_start.T + rows[:, 3:] @ by_map.T + own
+    pose = rows[:, :3] @ by_start.T + rows[:, 3:] @ by_map.T + last_cov
     cross = rows[:, 3:]
     return jnp.block([[linalg.symmetrize(pose), cross], [cross.T, solved.cov[3:, 3:]]])
 
@@ -214,10 +215,10 @@ def marginalize_oldest(
 
     The Kalman filter of the linearized step about the iterate: prediction, correction by the whole
     scan, and new landmarks l = l̂ + B⁻¹ (b - A (x_1 - x̂_1) - v). They and x_1 get their points
-    here. tag: of the map's slots. The prior itself where there is no first step.
+    here. tag: of the map's slots. The prior itself if there is no first step.
     """
     one = jax.tree.map(lambda leaf: leaf[0], (system, steps))
-    step, (there, _, _, _, slot, used) = one
+    step, (present, _, _, _, slot, used) = one
     joint, (capacity, size) = prior.joint, at.landmarks.shape
     # Prediction: x_1 = x̂_1 + F (x_0 - x̂_0) + G (η - η̄).
     mean = step.by_pose @ pose_difference(joint.pose, at.path[0]) - step.by_noise @ step.noise
@@ -251,8 +252,8 @@ def marginalize_oldest(
     )
     # New landmarks.
     new = used & ~joint.alive[slot]
-    own = jnp.where(new[:, None, None], step.landmark_rows, jnp.eye(size, dtype=r.dtype))
-    undo = jnp.linalg.inv(own)
+    landmark_rows = jnp.where(new[:, None, None], step.landmark_rows, jnp.eye(size, dtype=r.dtype))
+    undo = jnp.linalg.inv(landmark_rows)
     start = at.landmarks[slot] + jnp.einsum(
         "mlz,mz->ml", undo, step.residual - step.pose_rows @ deviation[:3]
     )
@@ -267,5 +268,7 @@ def marginalize_oldest(
     )
     points = at.path[1], jnp.where(joint.alive[:, None], prior.points[1], at.landmarks)
     moved = WindowPrior(after, points)
-    chosen: WindowPrior = jax.tree.map(lambda then, now: jnp.where(there, then, now), moved, prior)
+    chosen: WindowPrior = jax.tree.map(
+        lambda then, now: jnp.where(present, then, now), moved, prior
+    )
     return chosen

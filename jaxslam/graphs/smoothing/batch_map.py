@@ -40,7 +40,7 @@ class BatchSolution(NamedTuple):
     joint: Joint
     """the last pose and the map, a possible initial state of a filter"""
     regular: Bool[Array, ""]
-    """the information on the map is positive definite; else covariances are invalid"""
+    """the information on the map is positive definite; otherwise covariances are invalid"""
     filtered: Estimate
     """with leading T, of the filter that gave the initial path"""
     start_noise: Float[Array, "3"]
@@ -83,7 +83,7 @@ class BatchMap(LogEstimator):
 
     It is the graph of the log (`graphs.of_log`) with another solution: where the noises of a motion
     are three and not singular, `graphs.optimize` has the same optimum. Here (`graphs.chain`) a
-    motion is a constraint, and the run itself says which landmark each measurement is of; the
+    motion is a constraint, and the run itself associates the measurements; the
     sparse plan of `graphs.optimize` has to know that on the host.
 
     Raises ValueError as `LogEstimator`; on a sensor with K > 0, iterations below 1, or a tolerance
@@ -92,9 +92,9 @@ class BatchMap(LogEstimator):
 
     _: dataclasses.KW_ONLY
     iterations: int = static(default=30)
-    """at most so many steps"""
+    """largest number of steps"""
     tolerance: float | None = static(default=1e-6)
-    """end when the next step is shorter than so many posterior standard deviations (the Newton
+    """end when the next step is below this many posterior standard deviations (the Newton
     decrement), or than √eps of the dtype, 3e-4 in float32, or where steps do not get shorter
     because of rounding. None runs all iterations in a loop of fixed length, which supports
     reverse-mode derivatives; they are those of the optimum if the search has converged"""
@@ -125,7 +125,7 @@ class BatchMap(LogEstimator):
             iterations=self.iterations,
             tolerance=self.tolerance,
         )
-        estimate, solved = _solved(sensor, search, passed)
+        estimate, solved = _solve(sensor, search, passed)
         info = with_singular(passed.trace.info, problem.used)
         info = info if self.tolerance is None else _with_exhausted(info, search.ending)
         return Trace(estimate, info, solved, None)
@@ -154,7 +154,7 @@ def _problem_of(
     return problem, Iterate(chain.start.noise, chain.steps.noise, path, landmarks), chain
 
 
-def _solved(
+def _solve(
     sensor: Sensor, search: Iterations, passed: ForwardPass
 ) -> tuple[Estimate, BatchSolution]:
     """The estimates at the end of a search."""

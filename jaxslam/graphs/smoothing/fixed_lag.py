@@ -65,7 +65,7 @@ class FixedLag(Filter):
     log marginalizes nothing: then the newest pose and the map are those of `BatchMap`.
 
     A measurement with a singular R is dropped as `Status.SINGULAR`. Where the numbers of the window
-    are not finite (it is optimized without step control), it begins anew from the EKF-SLAM's state,
+    are not finite (it is optimized without step control), it restarts from the state of EKF-SLAM,
     and `exhausted` is set. O(W N²) for the window, and
     O(N³) for the prior, an iteration.
 
@@ -176,7 +176,7 @@ def _empty_window(joint: Joint, sizes: tuple[int, int], shape: tuple[int, int]) 
     """The state before the first step. sizes: of a control and its noise; shape: W and M."""
     (control, noise), (window, places), kind = sizes, shape, joint.pose.dtype
     steps = WindowSteps(
-        there=jnp.zeros(window, bool),
+        present=jnp.zeros(window, bool),
         control=jnp.zeros((window, control), kind),
         root=jnp.zeros((window, noise, noise), kind),
         z=jnp.zeros((window, places, joint.landmarks.shape[1]), kind),
@@ -194,7 +194,7 @@ def _is_finite(state: _WindowState) -> Bool[Array, ""]:
 
 
 def _finite_or(state: _WindowState, other: _WindowState) -> _WindowState:
-    """The state if all its numbers are finite, else the other one."""
+    """The state if all its numbers are finite, else the other state."""
     finite = _is_finite(state)
     chosen: _WindowState = jax.tree.map(lambda a, b: jnp.where(finite, a, b), state, other)
     return chosen
@@ -213,7 +213,7 @@ def shift(
         return jnp.roll(rows, -1, axis=0).at[-1].set(new)
 
     after = WindowSteps(
-        there=append(steps.there, True),
+        present=append(steps.present, True),
         control=append(steps.control, u),
         root=append(steps.root, root),
         z=append(steps.z, 0.0),
@@ -237,8 +237,8 @@ def _with_scan(steps: WindowSteps, scan: Scan, info: Info) -> WindowSteps:
 
 def _with_newest(joint: Joint, at: WindowIterate, cov: Float[Array, "D D"]) -> Joint:
     """The joint with the newest pose and the map of a window; unit variance at dead slots."""
-    there = jnp.repeat(joint.alive, joint.landmarks.shape[1])
-    there = jnp.concatenate([jnp.ones(3, bool), there])
-    padded = jnp.where(there[:, None] & there[None], cov, jnp.eye(len(there), dtype=cov.dtype))
+    alive = jnp.repeat(joint.alive, joint.landmarks.shape[1])
+    alive = jnp.concatenate([jnp.ones(3, bool), alive])
+    padded = jnp.where(alive[:, None] & alive[None], cov, jnp.eye(len(alive), dtype=cov.dtype))
     landmarks = jnp.where(joint.alive[:, None], at.landmarks, 0.0)
     return joint._replace(pose=at.path[-1], landmarks=landmarks, cov=padded)

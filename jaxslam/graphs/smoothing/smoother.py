@@ -131,8 +131,8 @@ def _new_landmark_rows(sensor: Sensor, z: Float[Array, "Z"], pose: Float[Array, 
     size = len(sensor.landmark)
     mean, cov_s = (jnp.asarray(part, z.dtype) for part in sensor.free)
     by_pose, by_z, by_s = first_order.invert_jacobians(sensor, pose, z, mean)
-    own = by_z @ sensor.noise_cov(z) @ by_z.T + by_s @ cov_s @ by_s.T
-    factor, positive = linalg.cholesky(own)
+    noise = by_z @ sensor.noise_cov(z) @ by_z.T + by_s @ cov_s @ by_s.T
+    factor, positive = linalg.cholesky(noise)
     a = linalg.solve_lower(factor, -by_pose)
     b = linalg.solve_lower(factor, jnp.eye(size, dtype=z.dtype))
     return a, b, jnp.zeros(size, z.dtype), positive
@@ -147,7 +147,7 @@ class Smoothed(NamedTuple):
     joint: Joint
     """the last pose and the map, a possible initial state of a filter"""
     regular: Bool[Array, ""]
-    """the information on the map is positive definite; else covariances are invalid"""
+    """the information on the map is positive definite; otherwise covariances are invalid"""
     filtered: Estimate
     """with leading T, of the filter"""
 

@@ -27,10 +27,10 @@ LEAST = 16
 def padded_graph(graph: Graph, room: int = 0) -> Graph:
     """The graph with more poses and points, which are fixed, and rows, which are not valid.
 
-    With room for so many variables there are as many poses, and two rows a pose.
+    With room for n variables there are n poses, and two rows a pose.
 
-    For concrete graphs: its arrays are NumPy's. The rows are of variable -1, which is nowhere, so
-    that a plan leaves them out.
+    For concrete graphs: its arrays are NumPy's. The rows have variable -1, which is out of range,
+    so that a plan leaves them out.
     """
 
     def more(x: PyTree, value: float = 0, least: int = 0) -> np.ndarray:
@@ -100,19 +100,20 @@ def with_batch(tree: _T) -> _T:
 
 
 def over_batch(name: str, function: Callable[..., _T]) -> Callable[[PyTree, PyTree], _T]:
-    """The function of one graph (shared, own), from one of graphs with a last axis B.
+    """The function of one graph, called with (shared, graph), from a function of graphs with a last
+    axis B.
 
-    `function(*shared, own)` computes all graphs at once, so that its loops run over tables that the
-    graphs share. Under `vmap`, nested or not, the batch becomes larger. Raises ValueError, which
-    begins with a caller's name, where what is shared has a batch of its own.
+    `function(*shared, graphs)` computes all graphs at once, so that its loops run over tables that
+    the graphs share. Under `vmap`, nested or not, the batch becomes larger. Raises ValueError,
+    which begins with a caller's name, if a shared argument has a batch axis.
     """
 
     @jax.custom_batching.custom_vmap
-    def whole(shared: PyTree, own: PyTree) -> _T:
-        return function(*shared, own)
+    def whole(shared: PyTree, graphs: PyTree) -> _T:
+        return function(*shared, graphs)
 
     @whole.def_vmap
-    def rule(size: int, batched: PyTree, shared: PyTree, own: PyTree) -> tuple[_T, PyTree]:
+    def rule(size: int, batched: PyTree, shared: PyTree, graphs: PyTree) -> tuple[_T, PyTree]:
         if any(jax.tree.leaves(batched[0])):
             raise ValueError(
                 f"{name}: expected the same factors, kernels, plan and limits for all graphs "
@@ -127,8 +128,8 @@ def over_batch(name: str, function: Callable[..., _T]) -> Callable[[PyTree, PyTr
                 x = x if one else jnp.broadcast_to(x[None], (size, *x.shape))
                 return x[rows].reshape(groups, _GROUP, *x.shape[1:])
 
-            together = jax.vmap(lambda own: whole(shared, own))
-            out = jax.lax.map(together, jax.tree.map(parted, own, batched[1]))
+            together = jax.vmap(lambda group: whole(shared, group))
+            out = jax.lax.map(together, jax.tree.map(parted, graphs, batched[1]))
             out = jax.tree.map(lambda x: x.reshape(groups * _GROUP, *x.shape[2:])[:size], out)
             return out, jax.tree.map(lambda _: True, out)
 
@@ -140,11 +141,11 @@ def over_batch(name: str, function: Callable[..., _T]) -> Callable[[PyTree, PyTr
         def unfold(x: Array) -> Array:
             return jnp.moveaxis(x.reshape(*x.shape[:-1], size, x.shape[-1] // size), -2, 0)
 
-        out = jax.tree.map(unfold, whole(shared, jax.tree.map(fold, own, batched[1])))
+        out = jax.tree.map(unfold, whole(shared, jax.tree.map(fold, graphs, batched[1])))
         return out, jax.tree.map(lambda _: True, out)
 
-    def single(shared: PyTree, own: PyTree) -> _T:
-        return cast(_T, jax.tree.map(lambda x: x[..., 0], whole(shared, with_batch(own))))
+    def single(shared: PyTree, graphs: PyTree) -> _T:
+        return cast(_T, jax.tree.map(lambda x: x[..., 0], whole(shared, with_batch(graphs))))
 
     return single
 

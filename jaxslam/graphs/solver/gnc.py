@@ -19,13 +19,13 @@ from jaxslam.graphs.solver.model import Model
 from jaxslam.graphs.solver.plans import Plan
 from jaxslam.graphs.solver.search import Ending, Solution, minimize
 
-_ROUNDS = 100
+_MAX_ROUNDS = 100
 """at most"""
 _GROWTH = 1.4
 """of μ in each round"""
-_SHARP = 1e6
-"""a μ with which nearly all weights are zeros or ones"""
-_LOOSE = 1e-6
+_LAST_MU = 1e6
+"""μ at which nearly all weights are zeros or ones"""
+_LOOSE_TOLERANCE = 1e-6
 """tolerance of the rounds before the last"""
 
 
@@ -88,10 +88,10 @@ def graduated(
     def convex(ratio: dict[str, Array]) -> Float[Array, "B"]:
         """The μ up to which the surrogate is convex over all rows, from s/c²."""
         worst = jnp.stack([r.max(axis=0, initial=0.0) for r in ratio.values()]).max(axis=0)
-        return 1.0 / jnp.maximum(2 * worst - 1.0, 1.0 / _SHARP)
+        return 1.0 / jnp.maximum(2 * worst - 1.0, 1.0 / _LAST_MU)
 
     def again(state: _Round) -> Array:
-        return ~state.settled.all() & (state.rounds < _ROUNDS)
+        return ~state.settled.all() & (state.rounds < _MAX_ROUNDS)
 
     def work(state: _Round) -> _Round:
         """The optimum with the weights, then the weights there."""
@@ -116,14 +116,14 @@ def graduated(
 
     batch = graph.poses.shape[-1:]
     zero, none = jnp.zeros(batch, graph.poses.dtype), jnp.zeros(batch, jnp.int32)
-    loose = jnp.maximum(tolerance, jnp.asarray(_LOOSE, tolerance.dtype))
+    loose = jnp.maximum(tolerance, jnp.asarray(_LOOSE_TOLERANCE, tolerance.dtype))
     every = row_weights(plain, plan.who, variables_of(graph), data)
     start = Solution(graph, zero, none, none, none - 1, zero, zero, zero, every)
     ratio = ratios(start)
     rows = jnp.concatenate([data.valid[name] for name in ratio])
     fitting = rows & (jnp.concatenate(list(ratio.values())) <= 1.0)
     good = 2 * fitting.sum(axis=0) >= rows.sum(axis=0)
-    control = jnp.where(good, _SHARP, convex(ratio))
+    control = jnp.where(good, _LAST_MU, convex(ratio))
     weights = {name: _weight(r, control[None]) for name, r in ratio.items()}
     state = _Round(start, weights, control, jnp.zeros(batch, bool), jnp.zeros((), jnp.int32))
     end = jax.lax.while_loop(again, work, state)

@@ -1,4 +1,4 @@
-"""Robust kernels: what a measurement costs, by its squared residual s = eᵀ Ω e."""
+"""Robust kernels: the cost of a measurement, by its squared residual s = eᵀ Ω e."""
 
 import jax
 import jax.numpy as jnp
@@ -21,7 +21,7 @@ class Kernel(Component):
         self._check(Kernel, {"cost": "s", "weight": "s"})
 
     def cost(self, s: Array) -> Array:
-        """ρ(s), what stands in χ² in place of s."""
+        """ρ(s), which replaces s in χ²."""
         raise NotImplementedError
 
     def weight(self, s: Array) -> Array:
@@ -120,7 +120,7 @@ class Truncated(_OfWidth):
         return (s <= square).astype(s.dtype)
 
     def ratio(self, s: Array) -> Array:
-        """s/c², above 1 for what is left out."""
+        """s/c², above 1 for rejected measurements."""
         _, square = self._widths(s)
         return s / square
 

@@ -31,7 +31,7 @@ class Variables(NamedTuple):
 
 
 class Data(NamedTuple):
-    """What is measured, and what is held; numbers of rows that are not valid are zero."""
+    """Measurements and fixed variables; numbers of rows that are not valid are zero."""
 
     z: dict[str, Float[Array, "_ _ B"]]
     information: dict[str, Float[Array, "_ _ _ B"]]
@@ -47,7 +47,7 @@ class System(NamedTuple):
     gradient: Float[Array, "n d B"]
     """Σ Jᵀ ρ' Ω e, by column: half the derivative of χ² by the increments"""
     blocks: Float[Array, "M d d B"]
-    """Σ Jᵀ ρ' Ω J; one on the diagonal of what is not estimated"""
+    """Σ Jᵀ ρ' Ω J; one on the diagonal of fixed variables"""
 
 
 def retract(variables: Variables, increments: Float[Array, "n d B"], plan: Plan) -> Variables:
@@ -147,11 +147,11 @@ def linearize(model: Model, plan: Plan, variables: Variables, data: Data) -> Sys
     return System(
         total(chi2),
         summed(plan.gradient, jnp.concatenate(gradients)),
-        _assembled(plan, blocks, data),
+        _assemble(plan, blocks, data),
     )
 
 
-def _assembled(plan: Plan, blocks: list[Array], data: Data) -> Float[Array, "M d d B"]:
+def _assemble(plan: Plan, blocks: list[Array], data: Data) -> Float[Array, "M d d B"]:
     """The blocks of the matrix from those of the rows of each table, (E K K, d, d, B)."""
     out = summed(plan.information, jnp.concatenate(blocks))
     held = plan.on_diagonal[:, None, None] & ~data.free[plan.block_column]
@@ -168,41 +168,43 @@ def half_hessian(
     for name, factor in model.factors.items():
         kernel, count = model.kernels.get(name), len(factor.variables)
 
-        def half(steps: Array, own: tuple[Array, ...], z: Array, info: Array) -> Array:
-            e = factor.residual(_moved(factor, steps, own), z)  # noqa: B023
+        def half(steps: Array, involved: tuple[Array, ...], z: Array, info: Array) -> Array:
+            e = factor.residual(_move(factor, steps, involved), z)  # noqa: B023
             s = e @ info @ e
             return 0.5 * (s if kernel is None else kernel.cost(s))  # noqa: B023
 
-        own = _taken(factor, plan.who[name], variables)
+        values = _taken(factor, plan.who[name], variables)
         still = jnp.zeros((count, width), variables.poses.dtype)
         second: Array = jax.vmap(
             jax.vmap(jax.jacfwd(jax.grad(half)), (None, -1, -1, -1), -1), (None, 0, 0, 0)
-        )(still, own, data.z[name], data.information[name])  # (E, K, d, K, d, B)
+        )(still, values, data.z[name], data.information[name])  # (E, K, d, K, d, B)
         free = data.free[plan.column[variable_numbers(factor, plan.who[name], poses)]]
         keep = free[:, :, :, None, None] & free[:, None, None]
         keep = keep & data.valid[name][:, None, None, None, None]
         second = jnp.moveaxis(jnp.where(keep, second, 0.0), 3, 2)
         blocks.append(second.reshape(-1, *second.shape[3:]))
-    return _assembled(plan, blocks, data)
+    return _assemble(plan, blocks, data)
 
 
 def variable_numbers(factor: Factor, who: Array, poses: int) -> Array:
-    """The variables of rows, points counted on from so many poses."""
+    """The variables of rows; points are numbered after the poses."""
     shift = np.array([[poses * (kind == "point") for kind in factor.variables]], np.int32)
     return who + shift
 
 
-def _moved(factor: Factor, steps: Float[Array, "K d"], own: tuple[Array, ...]) -> tuple[Array, ...]:
+def _move(
+    factor: Factor, steps: Float[Array, "K d"], involved: tuple[Array, ...]
+) -> tuple[Array, ...]:
     """The variables of a row moved by increments."""
     return tuple(
         se2.boxplus(x, step[:3]) if kind == "pose" else x + step[: len(x)]
-        for kind, x, step in zip(factor.variables, own, steps, strict=True)
+        for kind, x, step in zip(factor.variables, involved, steps, strict=True)
     )
 
 
 @jax.custom_jvp
 def _barrier(values: PyTree) -> PyTree:
-    """`optimization_barrier`, whose own derivative JAX cannot transpose where some of the values
+    """`optimization_barrier`, whose derivative JAX cannot transpose where some of the values
     have none."""
     return jax.lax.optimization_barrier(values)
 
@@ -221,24 +223,24 @@ def _jacobians(
     themselves they take two to five times as long. What the derivatives have in common is computed
     once: without the barrier XLA would compute it again for each of their entries.
     """
-    own = _taken(factor, who, variables)
-    e, slope = jax.linearize(lambda *own: _over_rows(factor.residual, own, z), *own)
-    slope, common = jax.closure_convert(slope, *own)
+    involved = _taken(factor, who, variables)
+    e, slope = jax.linearize(lambda *involved: _over_rows(factor.residual, involved, z), *involved)
+    slope, common = jax.closure_convert(slope, *involved)
     e, common = _barrier((e, common))
 
     def by_coordinate(k: int) -> Array:
         """(size, E, R, B)"""
-        still = [jnp.zeros_like(x) for x in own]
+        still = [jnp.zeros_like(x) for x in involved]
 
         def along(unit: Array) -> Array:
-            still[k] = jnp.broadcast_to(unit[:, None], own[k].shape)
+            still[k] = jnp.broadcast_to(unit[:, None], involved[k].shape)
             out: Array = slope(*still, *common)
             return out
 
-        return jax.vmap(along)(jnp.eye(own[k].shape[1], dtype=e.dtype))
+        return jax.vmap(along)(jnp.eye(involved[k].shape[1], dtype=e.dtype))
 
     out = []
-    for k, (kind, x) in enumerate(zip(factor.variables, own, strict=True)):
+    for k, (kind, x) in enumerate(zip(factor.variables, involved, strict=True)):
         part = by_coordinate(k)
         if kind == "pose":
             sin, cos = (y[:, None] for y in sin_cos(x[:, 2]))
@@ -260,9 +262,9 @@ def data_of(graph: Graph, column: Array) -> Data:
     size = graph.points.shape[1] if len(graph.points) else 0
     width = max(3, size)
     fixed = jnp.concatenate([graph.fixed_pose, graph.fixed_point])
-    own = np.array([3] * len(graph.poses) + [size] * len(graph.points))
-    there = np.arange(width) < own[:, None]
-    free = there[..., None] & ~fixed[:, None]
+    sizes = np.array([3] * len(graph.poses) + [size] * len(graph.points))
+    used = np.arange(width) < sizes[:, None]
+    free = used[..., None] & ~fixed[:, None]
     tables = graph.tables.items()
     return Data(
         {name: jnp.where(rows.valid[:, None], rows.z, 0.0) for name, rows in tables},

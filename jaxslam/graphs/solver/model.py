@@ -1,4 +1,4 @@
-"""The functions of a graph: a factor for each table, and a robust kernel where there is one."""
+"""The functions of a graph: a factor for each table, and optional robust kernels."""
 
 from collections.abc import Mapping
 from functools import partial
@@ -88,11 +88,11 @@ def _check_made(name: str, value: object, kind: type, example: str) -> None:
 
 
 def _residual_shape(factor: Factor, point_size: int) -> object:
-    """The shape of what a factor's residual returns; the type's name if that is no array."""
+    """The shape of a factor's residual, or the name of its type if it is not an array."""
     sizes, number = {"pose": 3, "point": point_size}, jnp.result_type(float)
-    own = tuple(jax.ShapeDtypeStruct((sizes[kind],), number) for kind in factor.variables)
+    involved = tuple(jax.ShapeDtypeStruct((sizes[kind],), number) for kind in factor.variables)
     z = jax.ShapeDtypeStruct((len(factor.measurements),), number)
-    found = jax.eval_shape(_residual, factor, own, z)
+    found = jax.eval_shape(_residual, factor, involved, z)
     return getattr(found, "shape", type(found).__name__)
 
 

@@ -64,10 +64,10 @@ def plan(
         jax.vmap(lambda g: graphs.optimize(g, plan=plan))(many)
 
     Rows that are not valid are in the pattern all the same, since which are may differ from graph
-    to graph; but rows of a variable that is nowhere, as -1, are not.
+    to graph; but rows of a variable out of range, as -1, are not.
 
     Args:
-        graph: of which only `who` and the numbers of poses and points are read.
+        graph: only its `who` and the numbers of poses and points are read.
         factors: as in `optimize`.
         marginals: whether to plan `marginals` as well.
         pairs: (Q, 2), two variables each, points counted on from the poses, of which `marginals`
@@ -94,8 +94,8 @@ def plan(
         bad = lost & np.asarray(its.valid) if is_concrete(its.valid) else lost
         if bad.any():
             raise ValueError(
-                f"graphs.plan: row {bad.argmax()} of the table {name!r} is of a variable that is "
-                f"nowhere: {np.asarray(its.who)[bad.argmax()].tolist()}"
+                f"graphs.plan: row {bad.argmax()} of the table {name!r} has a variable out of "
+                f"range: {np.asarray(its.who)[bad.argmax()].tolist()}"
             )
         who[name] = np.where(lost[:, None], 0, who[name])
         shift = np.array([poses * (kind == "point") for kind in factors[name].variables])
@@ -141,7 +141,7 @@ def plan(
 
 def checked_pairs(name: str, pairs: ArrayLike, size: int) -> Int[np.ndarray, "Q 2"]:
     """Pairs of variables, (Q, 2); raises ValueError, which begins with a caller's name, on another
-    shape, on numbers that are not whole, and if one is not among so many."""
+    shape, on numbers that are not whole, and on one out of range."""
     given = np.asarray(pairs)
     if given.size == 0:
         return np.zeros((0, 2), int)

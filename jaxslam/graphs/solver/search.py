@@ -1,4 +1,4 @@
-"""The iterations of an optimization: a trial step, its χ², and what follows from it."""
+"""The iterations of an optimization: a trial step, its χ², and the decision."""
 
 from enum import IntEnum
 from typing import NamedTuple
@@ -23,7 +23,7 @@ from jaxslam.graphs.sparse.cholesky import factorize, substitute
 
 
 class _Step(NamedTuple):
-    """An increment, and what the quadratic model of χ² says of it."""
+    """An increment, and its prediction by the quadratic model of χ²."""
 
     increments: Float[Array, "n d B"]
     predicted: Float[Array, "B"]
@@ -45,7 +45,7 @@ def _marquardt(plan: Plan, system: System, damping: Float[Array, "B"]) -> _Step:
     """
     width = system.blocks.shape[1]
     unit = jnp.eye(width, dtype=bool)[None, ..., None] & plan.on_diagonal[:, None, None, None]
-    # What no measurement sees has a diagonal of zero, and stays where it is.
+    # A variable without measurements has a diagonal of zero, and does not move.
     scale = jnp.where(system.blocks == 0, 1.0, system.blocks)
     blocks = system.blocks + jnp.where(unit, damping, 0.0) * scale
     factored = factorize(plan.cholesky, blocks)
@@ -164,10 +164,10 @@ def minimize(
         return proposed(search), first_chi2, first_gradient
 
     def judged(search: _Search) -> _Search:
-        """The search after its trial is taken or refused."""
-        there = linearize(model, plan, search.trial, data)
-        finite, began = jnp.isfinite(there.chi2), search.taken < 0
-        gain = search.system.chi2 - there.chi2
+        """The search after its trial is accepted or refused."""
+        trial = linearize(model, plan, search.trial, data)
+        finite, began = jnp.isfinite(trial.chi2), search.taken < 0
+        gain = search.system.chi2 - trial.chi2
         ratio = gain / jnp.where(search.predicted > 0, search.predicted, 1.0)
         # A step hardly damped may go uphill, as far as the iterate before: it crosses curved
         # valleys along which damped steps crawl (Grippo, Lampariello and Lucidi 1986, "A
@@ -175,23 +175,27 @@ def minimize(
         above = jnp.maximum(search.former - search.system.chi2, 0.0)
         slack = jnp.where(search.damping <= _FIRST_DAMPING, above, 0.0)
         good = finite & (began | (gain + slack > 1e-3 * search.predicted))
-        asked = search.going & search.stepped
-        take = asked & good
-        refused = jnp.where(take, False, search.refused | (asked & ~good & (search.damping == 0)))
+        evaluated = search.going & search.stepped
+        take = evaluated & good
+        refused = jnp.where(
+            take, False, search.refused | (evaluated & ~good & (search.damping == 0))
+        )
 
         def chosen(new: Array, old: Array) -> Array:
             return jnp.where(take.reshape((1,) * (new.ndim - 1) + batch), new, old)
 
-        lost = asked & ~finite & began
+        lost = evaluated & ~finite & began
         return search._replace(
             variables=jax.tree.map(chosen, search.trial, search.variables),
-            system=jax.tree.map(chosen, there, search.system),
-            damping=jnp.where(asked & ~began, damping_after(search, good, ratio), search.damping),
+            system=jax.tree.map(chosen, trial, search.system),
+            damping=jnp.where(
+                evaluated & ~began, damping_after(search, good, ratio), search.damping
+            ),
             going=search.going & ~lost,
             ending=jnp.where(lost, Ending.DIVERGED, search.ending).astype(jnp.int32),
-            taken=search.taken + asked,
+            taken=search.taken + evaluated,
             refused=refused,
-            careful=jnp.where(asked, ~good, search.careful),
+            careful=jnp.where(evaluated, ~good, search.careful),
             former=jnp.where(take & ~began, search.system.chi2, search.former),
             judged=search.judged & ~take,
         )
@@ -219,29 +223,29 @@ def minimize(
         chi2 = search.system.chi2
         least = jnp.maximum(tolerance * chi2, 32 * eps * (chi2 + 1))
         small = step.predicted <= least
-        # What is regular at the end is determined there, whatever it was on the way.
+        # Only regularity at the end matters, not on the way.
         singular = jnp.where(plain & regular & small, -1, singular)
         known = singular >= 0
         stuck = search.refused | (step.predicted <= 0)
-        done = small & (plain | (known & search.judged) | stuck)
+        converged = small & (plain | (known & search.judged) | stuck)
         ending = jnp.where(known, Ending.SINGULAR, Ending.CONVERGED)
-        # A gradient of exactly zero is no reason to stall.
+        # A gradient of exactly zero is not a stall.
         stalled = ~plain | (stuck & (step.predicted != 0))
         ending = jnp.where(~known & stalled, Ending.STALLED, ending)
         # Without a step: an undamped factor that failed, or that has to confirm convergence.
         more = jnp.maximum(10 * search.damping, _FIRST_DAMPING)
         damping = jnp.where(regular, search.damping, more)
-        again = regular & small & ~plain & ~done
+        again = regular & small & ~plain & ~converged
         damping = jnp.where(again, 0.0, damping)
-        stuck = ~done & (damping > 1e10)
-        done, ending = done | stuck, jnp.where(stuck, Ending.STALLED, ending)
-        ends = search.going & done
+        stuck = ~converged & (damping > 1e10)
+        converged, ending = converged | stuck, jnp.where(stuck, Ending.STALLED, ending)
+        ends = search.going & converged
         return search._replace(
             trial=retract(search.variables, step.increments, plan),
             predicted=step.predicted,
             stepped=regular & (~small | plain),
             damping=jnp.where(search.going, damping, search.damping),
-            going=search.going & ~done & (search.taken < iterations),
+            going=search.going & ~converged & (search.taken < iterations),
             ending=jnp.where(ends, ending, search.ending).astype(jnp.int32),
             singular=jnp.where(search.going, singular, search.singular),
             judged=search.judged | (again & known),

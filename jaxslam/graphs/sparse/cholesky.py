@@ -60,7 +60,7 @@ class Factored(NamedTuple):
 
 
 def cholesky_tables(pattern: Pattern, room: int = 0) -> tuple[CholeskyTables, Ints]:
-    """The tables of a pattern, with room for so many variables, and the place of each of its
+    """The tables of a pattern, with room for more variables, and the place of each of its
     blocks, and of none, in `Factored.blocks`."""
     size, heights, columns, rows = (
         len(pattern.order),
@@ -100,7 +100,7 @@ def cholesky_tables(pattern: Pattern, room: int = 0) -> tuple[CholeskyTables, In
 
 
 def block_count(pattern: Pattern, room: int) -> int:
-    """The size of the array of a pattern's blocks, with room for so many variables."""
+    """The size of the array of a pattern's blocks, with room for more variables."""
     return padded_size(max(len(pattern.columns), 8 * room))
 
 
@@ -126,12 +126,12 @@ def _transposed_on_vector(a: jax.Array, x: jax.Array) -> jax.Array:
 def factorize(tables: CholeskyTables, blocks: Float[Array, "padded d d B"]) -> Factored:
     """The factor of a matrix, from its blocks at their places (lower triangle).
 
-    A pivot that rounding may have left of zero, beside the matrix's own diagonal entry, makes its
+    A pivot that may be rounding of zero, compared with the diagonal entry of the matrix, makes its
     column irregular; its inverse is then taken as zero, so that all numbers stay finite.
     """
     size, width = len(tables.diagonal), blocks.shape[1]
-    own = jnp.diagonal(blocks[tables.diagonal], axis1=1, axis2=2)  # (n, B, d)
-    least = 32 * float(jnp.finfo(blocks.dtype).eps) * jnp.moveaxis(own, 2, 1)
+    entries = jnp.diagonal(blocks[tables.diagonal], axis1=1, axis2=2)  # (n, B, d)
+    least = 32 * float(jnp.finfo(blocks.dtype).eps) * jnp.moveaxis(entries, 2, 1)
     least = jnp.pad(least, [(0, TARGETS), (0, 0), (0, 0)])
     one = jnp.broadcast_to(jnp.eye(width, dtype=blocks.dtype)[..., None], blocks.shape[1:])
     inverses = padded(jnp.zeros((size, *blocks.shape[1:]), blocks.dtype)).at[-1].set(one)
@@ -199,8 +199,8 @@ def substitute(
             x = subtract_products(tables_of, i, x, factored.blocks, None, on)  # noqa: B023
             return finish(tables_of, i, x, factored.inverses, lambda x, a: on(a, x))  # noqa: B023
 
-        done = jax.lax.fori_loop(0, tables_of.levels, level, padded(x[order]))
-        x = jnp.zeros_like(rhs).at[order].set(done[: len(order)], unique_indices=True)
+        solved = jax.lax.fori_loop(0, tables_of.levels, level, padded(x[order]))
+        x = jnp.zeros_like(rhs).at[order].set(solved[: len(order)], unique_indices=True)
     return x
 
 
@@ -213,7 +213,7 @@ class InverseTables(NamedTuple):
     pairs: Int[Array, "Q"]
     """the place of the block of each pair of variables"""
     turned: Bool[Array, "Q"]
-    """whether that block is of the second variable's rows and the first one's columns"""
+    """whether that block has the second variable's rows and the first one's columns"""
 
 
 def inverse_tables(
@@ -238,21 +238,21 @@ def inverse_tables(
 
 
 def _sums(pattern: Pattern) -> Sums:
-    """The products of the selected inversion, of which a large graph has millions."""
+    """The products of the selected inversion; a large graph has millions."""
     rows, columns = pattern.rows, pattern.columns
     target, left, right, flip = [], [], [], []
     for column, blocks in pattern.below():
-        own = rows[blocks]  # (C, m)
-        # The rows of a column, its own included, by the rows below its diagonal.
-        every = np.concatenate([column[:, None], own], axis=1)
-        one, other = np.broadcast_arrays(every[:, :, None], own[:, None, :])
+        involved = rows[blocks]  # (C, m)
+        # The rows of a column, with the diagonal, by the rows below its diagonal.
+        every = np.concatenate([column[:, None], involved], axis=1)
+        one, other = np.broadcast_arrays(every[:, :, None], involved[:, None, :])
         at = np.concatenate([pattern.first[column][:, None], blocks], axis=1, dtype=np.int32)
         target.append(np.broadcast_to(at[:, :, None], one.shape).ravel())
         left.append(pattern.find(np.maximum(one, other).ravel(), np.minimum(one, other).ravel()))
         flip.append((one < other).ravel())
         right.append(np.broadcast_to(blocks[:, None, :], one.shape).ravel())
     depth = pattern.heights[-1] - pattern.heights
-    # The diagonal block of a column comes after those below it, of which it is a sum.
+    # The diagonal block of a column comes after the blocks below it, which it sums.
     level = 2 * depth[columns] + (rows == columns)
     return Sums(level, *map(np.concatenate, (target, left, right, flip)))
 
@@ -267,8 +267,10 @@ def selected_inverse(tables: InverseTables, factored: Factored) -> Float[Array, 
     """
     size = len(tables.diagonal)
     count = len(factored.blocks)
-    own = jnp.swapaxes(factored.inverses[:size], 1, 2)
-    start = jnp.zeros((count, *own.shape[1:]), own.dtype).at[tables.diagonal].set(own)
+    inverses = jnp.swapaxes(factored.inverses[:size], 1, 2)
+    start = (
+        jnp.zeros((count, *inverses.shape[1:]), inverses.dtype).at[tables.diagonal].set(inverses)
+    )
 
     def level(i: jax.Array, blocks: jax.Array) -> jax.Array:
         blocks = subtract_products(tables.sweep, i, blocks, None, factored.blocks, by)

@@ -61,7 +61,7 @@ class Sweep(NamedTuple):
     """the first chunk of finished targets of each level, and the end of the last"""
     end_base: Int[Array, "F"]
     end: Int[Array, "F T"]
-    """what a target is finished with"""
+    """the operation that finishes a target"""
     flip: Bool[Array, "C T K"] | None
     """whether the left factor is transposed"""
 
@@ -76,12 +76,12 @@ def padded_size(size: int, least: int = 64, parts: int = 8) -> int:
 
 
 def padded_table_size(size: int, room: int = 0) -> int:
-    """The padded size of a table, whose rows beyond its size cost memory alone; `room` at least."""
+    """The padded size of a table, at least `room`; rows beyond its size cost only memory."""
     return padded_size(max(size, room), parts=2)
 
 
 def index_table(numbers: np.ndarray, size: int | None = None, fill: int = 0) -> Array:
-    """A table of integers or flags, on the device; filled up to so many rows."""
+    """A table of integers or flags on the device, padded to a number of rows."""
     kept = numbers if numbers.dtype == bool else numbers.astype(np.int32, copy=False)
     if size is not None:
         more = [(0, size - len(kept))] + [(0, 0)] * (kept.ndim - 1)
@@ -90,7 +90,7 @@ def index_table(numbers: np.ndarray, size: int | None = None, fill: int = 0) -> 
 
 
 def level_table(ends: Sequence[int], room: int = 0) -> Array:
-    """The end of each level, from 0, as a table with room for so many variables."""
+    """The end of each level, from 0, as a table with room for more variables."""
     return index_table(np.array(ends), padded_table_size(len(ends), room // 4))
 
 
@@ -108,7 +108,7 @@ def places(sums: Sums, size: int) -> tuple[Ints, Ints]:
 
 
 def nothing(size: int) -> int:
-    """The place of an array of so many targets that is always zero (or the identity)."""
+    """The place in an array of targets that is always zero (or the identity)."""
     return size + TARGETS
 
 
@@ -118,7 +118,7 @@ def padded(array: jax.Array) -> jax.Array:
 
 
 def sweep(sums: Sums, left: Ints, right: Ints, end: Ints, room: int = 0) -> Sweep:
-    """The tables of a sweep, with room for those of so many variables.
+    """The tables of a sweep, with room for more variables.
 
     left, right: the place of each factor, and of none, by its number. end: what each target is
     finished with, and what leaves a target as it is.
@@ -154,10 +154,10 @@ def sweep(sums: Sums, left: Ints, right: Ints, end: Ints, room: int = 0) -> Swee
     for part in range(0, len(bases), _PART):
         some = slice(part, min(part + _PART, len(bases)))
         place = bases[some, None] + np.arange(TARGETS)
-        there = np.minimum(place, size - 1)[..., None]
+        clipped = np.minimum(place, size - 1)[..., None]
         term = shifts[some, None, None] + np.arange(_TERMS)
-        real = (place < stops[some, None])[..., None] & (term < count[there])
-        product = by_target[np.where(real, begin[there] + term, 0)]
+        real = (place < stops[some, None])[..., None] & (term < count[clipped])
+        product = by_target[np.where(real, begin[clipped] + term, 0)]
         for table, factor, at in zip(tables, (sums.left, sums.right), (left, right), strict=True):
             table[some] = at[np.where(real, factor[product], -1)]
         if flips is not None and sums.flip is not None:
@@ -245,10 +245,10 @@ def stages(target: Int[np.ndarray, "rows"], size: int, room: int = 0) -> Stages:
         sums = np.full((groups.sum(), _SUMMED), absent, np.int32)
         rank = np.arange(len(owner)) - begin[owner]
         sums[group_begin[owner] + rank // _SUMMED, rank % _SUMMED] = numbers
-        done = last and len(out) + 1 >= (4 if room else _LEAST_STAGES)
-        rows = len(sums) if done else padded_size(max(len(sums), room))
+        last_stage = last and len(out) + 1 >= (4 if room else _LEAST_STAGES)
+        rows = len(sums) if last_stage else padded_size(max(len(sums), room))
         out.append(index_table(sums, rows, absent))
-        if done:
+        if last_stage:
             return tuple(out)
         owner = np.repeat(np.arange(size), groups)
         numbers, absent = np.arange(len(owner)), rows

@@ -65,7 +65,7 @@ class Pattern:
         return out
 
     def find(self, rows: Ints, columns: Ints) -> Ints:
-        """The blocks at these places, each of which must exist."""
+        """The blocks at these places, which must exist."""
         size = len(self.order)
         keys = self.columns * size + self.rows
         wanted = columns * size + rows

@@ -2,8 +2,8 @@
 
 They are computed on the host, for concrete graphs. Fixed variables stay where
 they are. A part of the graph without a fixed pose is held at the pose of its first prior (a table
-"prior"), or else at the pose of its lowest id. The start decides which minimum is found; it has no
-other influence on the optimum.
+"prior"), or else at the pose of its lowest id. The start decides which minimum is reached; it has
+no other influence on the optimum.
 """
 
 from collections.abc import Callable

@@ -45,7 +45,7 @@ def measured_relative_poses(graph: Graph, factors: Factors | None) -> Relative:
             np.asarray(part)[valid] for part in (table.who, table.z, table.information)
         )
         if not isinstance(factor, BetweenPoses):
-            z, by_error = map(np.asarray, _measured(factor, z))
+            z, by_error = map(np.asarray, _measured_poses(factor, z))
             information = np.einsum("eri,ers,esj->eij", by_error, information, by_error)
         found.append(
             Relative(who[:, 0], who[:, 1], np.asarray(z, float), np.asarray(information, float))
@@ -67,7 +67,7 @@ def _by_id(graph: Graph, who: Int[np.ndarray, "E K"], z: Float[np.ndarray, "E Z"
 
 
 @partial(jax.jit, inline=True)
-def _measured(factor: Factor, z: jax.Array) -> tuple[jax.Array, jax.Array]:
+def _measured_poses(factor: Factor, z: jax.Array) -> tuple[jax.Array, jax.Array]:
     """The relative poses of rows, and the derivatives of the residual by an error of them."""
 
     def one(z: jax.Array) -> tuple[jax.Array, jax.Array]:
@@ -126,7 +126,7 @@ def with_poses(graph: Graph, poses: Float[np.ndarray, "N 3"]) -> Graph:
 
 
 def as_before(before: JaxOrNumPy, values: np.ndarray) -> np.ndarray:
-    """The values in the type of those before, unless that is of whole numbers."""
+    """The values in the dtype of the previous ones, unless that is an integer dtype."""
     dtype = np.asarray(before).dtype
     return values.astype(dtype) if np.issubdtype(dtype, np.floating) else values
 
@@ -140,7 +140,7 @@ def with_points(
     """
     points = np.array(graph.points, np.float64)
     known = factors_of("graphs.starts", graph, factors)
-    done = np.asarray(graph.fixed_point) | (False if placed is None else placed)
+    placed_already = np.asarray(graph.fixed_point) | (False if placed is None else placed)
     for key, table in graph.tables.items():
         factor = known[key]
         if factor.variables != ("pose", "point") or factor.predict is None:
@@ -149,16 +149,16 @@ def with_points(
         rows = _by_id(graph, who[:, :1], z)
         who, z = who[rows], z[rows]
         found, at = np.unique(who[:, 1], return_index=True)
-        at = at[~done[found]]
+        at = at[~placed_already[found]]
         if len(at):
             poses = np.asarray(graph.poses)[who[at, 0]]
-            points[who[at, 1]] = _predicted(factor, poses, z[at])
-            done[who[at, 1]] = True
+            points[who[at, 1]] = _predicted_poses(factor, poses, z[at])
+            placed_already[who[at, 1]] = True
     return graph._replace(points=as_before(graph.points, points))
 
 
 @partial(jax.jit, inline=True)
-def _predicted(factor: Factor, poses: jax.Array, z: jax.Array) -> jax.Array:
+def _predicted_poses(factor: Factor, poses: jax.Array, z: jax.Array) -> jax.Array:
     """The second variables that rows measure."""
     assert factor.predict is not None
     second: jax.Array = jax.vmap(factor.predict)(poses, z)

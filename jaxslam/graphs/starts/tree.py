@@ -28,7 +28,7 @@ def odometry(graph: Graph, factors: Factors | None = None) -> Graph:
     The tree that is followed prefers the edges between poses of the nearest ids: it is the minimum
     spanning tree by |i - j|, i and j being places in the order of the ids. Of several edges between
     two poses the shortest is followed. Points are placed by a measurement of each from the first
-    pose that tells where it is. The order of poses and rows has no influence.
+    pose that locates it. The order of poses and rows has no influence.
 
     Args:
         factors: as for `optimize`; by default those of the tables of files.

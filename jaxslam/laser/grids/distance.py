@@ -73,13 +73,13 @@ def squared_distances(occupied: Bool[JaxOrNumPy, "H W"]) -> Int[Array, "H W"]:
     transforms of sampled functions", Theory of Computing 8). Where parabola q goes below parabola p
     is (h_q - h_p)/(2 (q - p)) with h_k = k² + d(i, k)²; the first cell from there on is found in
     integers, exactly in float32 too. All rows are treated together, each with a
-    stack of its own; a step of the loop adds a parabola to a row or removes one, so that there are
+    separate stack; a step of the loop adds a parabola to a row or removes one, so that there are
     at most 2 W steps however unlike the rows are. H² + W² where nothing is occupied.
     """
     height, width = occupied.shape
     nothing = height**2 + width**2
     i = jnp.arange(height, dtype=jnp.int32)[:, None]
-    # So far that no such column is ever nearest, if there is another.
+    # So far away that no such column is ever nearest, if another exists.
     far = height + width
     above = i - jax.lax.cummax(jnp.where(occupied, i, -far), axis=0)
     below = jax.lax.cummin(jnp.where(occupied, i, height + far), axis=0, reverse=True) - i
@@ -158,7 +158,7 @@ def _envelope(column: Int[Array, "W H"]) -> Int[Array, "W H"]:
         begins[:rows],
     )
     _, top, parabola, begins, *_ = jax.lax.while_loop(unfinished, step, start)
-    # Parabolas stand in the order of their columns, so the last that began is the lowest.
+    # Parabolas are in the order of their columns, so the last that began is the lowest.
     depth = jnp.arange(width, dtype=jnp.int32)[:, None]
     first = jnp.where(depth <= top[None, :], begins.reshape(width, rows), width)
     first = jnp.clip(first, 0, width)
@@ -169,7 +169,7 @@ def _envelope(column: Int[Array, "W H"]) -> Int[Array, "W H"]:
 
 @_envelope.def_vmap
 def _of_all(size: int, _: object, columns: Int[Array, "P W H"]) -> tuple[Array, bool]:
-    """The rows of all tables of a batch together: a loop of each table's own would copy all."""
+    """The rows of all tables of a batch together: a separate loop for each would copy all."""
     _, width, rows = columns.shape
     found = _envelope(jnp.swapaxes(columns, 0, 1).reshape(width, size * rows))
     return jnp.swapaxes(found.reshape(width, size, rows), 0, 1), True

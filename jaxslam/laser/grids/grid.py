@@ -12,7 +12,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
-from jaxslam.core.numbers import check_real, is_concrete, shape_told
+from jaxslam.core.numbers import check_real, is_concrete, shape_text
 from jaxslam.core.types import JaxOrNumPy
 from jaxslam.math import se2
 
@@ -22,7 +22,7 @@ class Grid(NamedTuple):
 
     A log-odds of exactly 0 is *unknown*: no evidence for occupied or free. What sums evidence keeps
     it exactly 0 where nothing was measured. Evidence that cancels exactly is unknown as well, since
-    it says nothing of the cell; who must tell the two apart keeps counts (`grids.Counts`).
+    it has no information on the cell; counts (`grids.Counts`) distinguish the two.
     """
 
     log_odds: Float[JaxOrNumPy, "H W"]
@@ -39,7 +39,7 @@ class Grid(NamedTuple):
 
     @property
     def known(self) -> Bool[JaxOrNumPy, "H W"]:
-        """Whether there is evidence for a cell: its log-odds are not 0."""
+        """Mask of the cells with evidence: their log-odds are not 0."""
         return self.log_odds != 0
 
 
@@ -72,7 +72,7 @@ def centers(grid: Grid | Field) -> Float[Array, "H W 2"]:
 def check_grid(name: str, grid: object) -> None:
     """Raise ValueError, which begins with a caller's name, unless the grid is one.
 
-    Refused are log-odds that are no finite array of floats of at least one cell, an origin that is
+    Refused are log-odds other than a finite array of floats of at least one cell, an origin that is
     no pose, and a resolution that is not above 0. Within a trace only shapes are checked.
     """
     if not isinstance(grid, Grid):
@@ -83,7 +83,7 @@ def check_grid(name: str, grid: object) -> None:
     if np.ndim(grid.log_odds) != 2 or 0 in np.shape(grid.log_odds):
         raise ValueError(
             f"{name}: expected log-odds of shape (at least 1, at least 1), "
-            f"got {shape_told(grid.log_odds)}"
+            f"got {shape_text(grid.log_odds)}"
         )
     check_frame(name, grid.origin, grid.resolution)
     if is_concrete(grid.log_odds) and not np.all(np.isfinite(grid.log_odds)):
@@ -95,10 +95,10 @@ def check_frame(name: str, origin: ArrayLike, resolution: ArrayLike) -> None:
     check_real(name, origin=origin, resolution=resolution)
     if np.shape(origin) != (3,):
         raise ValueError(
-            f"{name}: expected an origin that is a pose (x, y, θ), got {shape_told(origin)}"
+            f"{name}: expected an origin that is a pose (x, y, θ), got {shape_text(origin)}"
         )
     if np.shape(resolution) != ():
-        raise ValueError(f"{name}: expected one resolution, got {shape_told(resolution)}")
+        raise ValueError(f"{name}: expected one resolution, got {shape_text(resolution)}")
     if not is_concrete(origin, resolution):
         return
     if not np.all(np.isfinite(origin)):
@@ -114,7 +114,7 @@ def interpolate(field: Field, points: ArrayLike) -> Float[Array, "*n"]:
     rectangle of centres: continuous everywhere, and the gradient by a point is finite everywhere;
     across the border it is zero. At a line between four centres the gradient is of one side.
 
-    Raises ValueError on what is no field, and on points of a shape other than (..., 2).
+    Raises ValueError on other types than fields, and on points of a shape other than (..., 2).
     """
     if not isinstance(field, Field):
         raise ValueError(f"interpolate: expected a Field, got a {type(field).__name__}")
@@ -188,7 +188,7 @@ def read_map(path: str | Path) -> Grid:
 
     Raises:
         ValueError: `path:line: reason` for what is not YAML, a key that is missing or occurs twice,
-            a resolution that is not above 0, an origin that is no pose, thresholds out of order, a
+            a resolution that is not above 0, an invalid origin, thresholds out of order, a
             mode `raw`, and an image that is missing, transparent, of another format, or damaged.
     """
     from jaxslam.datasets import ros_map
@@ -197,7 +197,7 @@ def read_map(path: str | Path) -> Grid:
 
 
 def write_map(path: str | Path, grid: Grid, *, mode: str = "trinary") -> list[Path]:
-    """Write a grid as a map of ROS, `NAME.yaml` and `NAME.pgm` beside it; returns their paths.
+    """Write a grid as a ROS map, `NAME.yaml` and `NAME.pgm`; returns their paths.
 
     Mode `trinary` has black, white and grey 205 for log-odds above, below and equal to 0: what was
     read from a trinary map is read again as the same numbers. Mode `scale` has the probability in

@@ -66,8 +66,10 @@ def beam_log(control: ArrayLike, beams: Beams) -> Log:
         raise ValueError(f"beam_log: expected Beams, got {type(beams).__name__}")
     shapes = [np.shape(part) for part in beams]
     if len(shapes[0]) != 2 or len(set(shapes)) != 1:
-        told = ", ".join(map(str, shapes))
-        raise ValueError(f"beam_log: expected as many ranges, angles and masks (T, B), got {told}")
+        listed = ", ".join(map(str, shapes))
+        raise ValueError(
+            f"beam_log: expected as many ranges, angles and masks (T, B), got {listed}"
+        )
     steps = shapes[0][0]
     if np.ndim(control) != 2 or np.shape(control)[0] != steps:
         raise ValueError(
@@ -95,9 +97,9 @@ def beam_log(control: ArrayLike, beams: Beams) -> Log:
 
 
 def beams_of(scan: Scan, every: int) -> Beams:
-    """Each n-th beam of a scan of such a log; those not valid are of range 0."""
-    z, there = scan.z[::every], scan.valid[::every]
-    used = there & (z[:, 0] > 0)
+    """Each n-th beam of a scan of such a log; beams that are not valid have range 0."""
+    z, valid = scan.z[::every], scan.valid[::every]
+    used = valid & (z[:, 0] > 0)
     clean = jnp.where(used[:, None], z, 0.0)
     return Beams(clean[:, 0], clean[:, 1], used)
 
@@ -132,7 +134,7 @@ class _FreeSpace(Region):
 def _free_space(name: str, grid: Grid, box: Float[np.ndarray, "2 2"] | None) -> _FreeSpace:
     """The free cells of a map whose centres lie in a box, None for all.
 
-    Raises ValueError, which begins with a caller's name, where there is none.
+    Raises ValueError, which begins with a caller's name, if there is no such cell.
     """
     free = np.asarray(grid.log_odds) < 0
     if not free.any():
@@ -167,13 +169,13 @@ class GridLocalization(MonteCarloFilter):
 
     Recovery (table 8.3) compares the geometric mean of p(z_k) over the beams of a scan, averaged
     over the particles, with its long-term average, so the number of beams does not matter. It draws
-    particles from the free cells of the map (in the box, if there is one) with any heading; so does
+    particles from the free cells of the map (in the box, if given) with any heading; so does
     a uniform start.
 
     The estimate is a single mean and covariance, also where the particles form several groups:
     `clusters` of `final.pose` and `final.log_weight` finds these. A particle off the map or in an
     occupied cell has weight zero; `blocked` of `info.extra["particles"]`, a `ParticleInfo`, counts
-    those in use. A scan without a usable beam tells no more than that. The status of a beam is
+    those in use. A scan without a usable beam gives no more information. The status of a beam is
     FUSED if it entered the weights, UNMATCHED if `every` left it out or the scan left no particle a
     weight (`underflow`), as where all are off the map. log_likelihood is
     log Σ w p(z | x)^exponent.
@@ -196,7 +198,7 @@ class GridLocalization(MonteCarloFilter):
     every: int = static(default=1)
     """use each n-th beam, at least 1"""
     prepared: PyTree = dataclasses.field(init=False, repr=False)
-    """what the model needs of the map"""
+    """the map as prepared for the model"""
     region: _FreeSpace = dataclasses.field(init=False, repr=False)
     """where the robot may be: the free cells of the map (in the box)"""
     measurements = _BEAM
@@ -227,7 +229,7 @@ class GridLocalization(MonteCarloFilter):
 
         # Else XLA computes it again in each of its consumers.
         fit = no_inline(fit_of, state.pose, in_dtype(self.prepared, state.pose.dtype), beams)
-        blocked = _blocked(self.grid, state.pose)
+        blocked = _is_blocked(self.grid, state.pose)
         fit = jnp.where(blocked, jnp.inf, fit)
         misfit = jnp.where(blocked, jnp.inf, jnp.asarray(self.exponent, fit.dtype) * fit)
         evidence = normalized(state.log_weight - misfit)[1]
@@ -242,7 +244,7 @@ class GridLocalization(MonteCarloFilter):
         return self.pose_estimate(state, none, jnp.zeros(0, jnp.int32))
 
 
-def _blocked(grid: Grid, pose: Float[Array, "P 3"]) -> Bool[Array, "P"]:
+def _is_blocked(grid: Grid, pose: Float[Array, "P 3"]) -> Bool[Array, "P"]:
     """Which poses are off the map or in an occupied cell."""
     height, width = grid.log_odds.shape
     at = jnp.floor(to_cells(jnp.asarray(grid.origin), grid.resolution, pose[:, :2]))

@@ -30,9 +30,9 @@ class Counts(NamedTuple):
     origin: Float[JaxOrNumPy, "3"]
     resolution: Float[JaxOrNumPy, ""]
     outside: Int[JaxOrNumPy, ""]
-    """usable beams that say nothing: their origin is off the map"""
+    """usable beams without effect: their origin is off the map"""
     unusable: Int[JaxOrNumPy, ""]
-    """beams that say nothing: not valid, or of a range of 0, below 0 or NaN (`Beams`)"""
+    """beams without information: not valid, or of a range of 0, below 0 or NaN (`Beams`)"""
 
 
 def count(
@@ -89,8 +89,8 @@ def _check_scans(poses: JaxOrNumPy, beams: Beams, max_range: float) -> None:
     if not isinstance(beams, Beams):
         raise ValueError(f"count: expected Beams, got {type(beams).__name__}")
     if not all(hasattr(part, "dtype") for part in beams):
-        told = ", ".join(type(part).__name__ for part in beams)
-        raise ValueError(f"count: expected ranges, angles and masks in arrays, got {told}")
+        kinds = ", ".join(type(part).__name__ for part in beams)
+        raise ValueError(f"count: expected ranges, angles and masks in arrays, got {kinds}")
     shapes = [np.shape(part) for part in beams]
     if len(set(shapes)) != 1 or len(shapes[0]) != 2:
         raise ValueError(f"count: expected as many ranges, angles and masks (T, B), got {shapes}")
@@ -192,8 +192,8 @@ def _cross(
         return (state[2] < steps).any()
 
     def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
-        misses, cell, done = state
-        going = done < steps
+        misses, cell, arrived = state
+        going = arrived < steps
         inside = (cell >= 0).all(axis=1) & (cell[:, 0] < width) & (cell[:, 1] < height)
         at = jnp.where(going & inside, cell[:, 1] * width + cell[:, 0], nowhere)
         misses = misses.at[at].add(1, mode="drop")
@@ -202,8 +202,8 @@ def _cross(
         crossing = jnp.where(cell == last, jnp.inf, crossing)
         across = crossing[:, 0] < crossing[:, 1]
         move = jnp.stack([across, ~across], axis=1) * forward
-        done = jnp.where(inside, done + going, steps)
-        return misses, jnp.where(going[:, None], cell + move, cell), done
+        arrived = jnp.where(inside, arrived + going, steps)
+        return misses, jnp.where(going[:, None], cell + move, cell), arrived
 
     begin: tuple[Array, ...] = (misses, first, jnp.zeros_like(steps))
     misses, *_ = jax.lax.while_loop(unfinished, step, begin)
@@ -234,7 +234,7 @@ def reflection(counts: Counts, *, prior: ArrayLike = 1.0) -> Grid:
     """The counting model: p = (hits + prior)/(hits + misses + 2 prior), how often a cell reflects.
 
     The mean of a Beta(prior, prior) distribution updated by the counts. A cell of no beam has a
-    log-odds of exactly 0; the counts, not the grid, say how sure p is.
+    log-odds of exactly 0; the counts, not the grid, show how certain p is.
 
     Raises ValueError unless prior is above 0.
     """

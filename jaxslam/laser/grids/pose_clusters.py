@@ -64,7 +64,7 @@ def clusters(
     heading = np.floor((poses[used, 2] / (2 * math.pi) % 1.0) * turns) % turns
     at = np.column_stack([np.floor(poses[used, :2] / bins[:2]), heading]).astype(np.int64)
     cells, which = np.unique(at, axis=0, return_inverse=True)
-    group = _connected(cells, turns)[which.reshape(-1)]
+    group = _connect(cells, turns)[which.reshape(-1)]
     total = np.bincount(group, weights=w)
     order = np.argsort(-total, kind="stable")
     order = order[total[order] >= least]
@@ -82,13 +82,13 @@ def clusters(
 @jax.jit
 def _moments(pose: Array, log_weight: Array, mine: Array) -> tuple[Array, Array]:
     """Mean and covariance of the particles that are marked."""
-    own = jnp.where(mine, log_weight, -jnp.inf)
-    top = own.max()
-    own = own - (top + jnp.log(jnp.exp(own - top).sum()))
-    return weighted_pose_moments(pose, own, jnp.argmax(own))
+    log_weight_in = jnp.where(mine, log_weight, -jnp.inf)
+    top = log_weight_in.max()
+    log_weight_in = log_weight_in - (top + jnp.log(jnp.exp(log_weight_in - top).sum()))
+    return weighted_pose_moments(pose, log_weight_in, jnp.argmax(log_weight_in))
 
 
-def _connected(cells: Int[np.ndarray, "C 3"], turns: int) -> Int[np.ndarray, "C"]:
+def _connect(cells: Int[np.ndarray, "C 3"], turns: int) -> Int[np.ndarray, "C"]:
     """The group of each of C different bins, two being neighbours if no index differs by more
     than 1; the last is on a circle."""
     index = {tuple(cell): k for k, cell in enumerate(cells.tolist())}

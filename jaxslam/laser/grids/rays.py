@@ -9,7 +9,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree, UInt8
 
-from jaxslam.core.numbers import check_real, is_concrete, shape_told
+from jaxslam.core.numbers import check_real, is_concrete, shape_text
 from jaxslam.laser.grids.distance import squared_distances
 from jaxslam.laser.grids.grid import Grid, check_grid, interpolated, to_cells
 from jaxslam.laser.grids.traversal import MOST, OFF, STOP, march
@@ -34,7 +34,7 @@ class RayMap(NamedTuple):
 
 
 def ray_map(grid: Grid, *, method: str | None = None, skip: bool = True) -> RayMap:
-    """A grid prepared for `cast` by one of two methods, of which only `cast` knows the difference.
+    """A grid prepared for `cast` by one of two methods, which only `cast` distinguishes.
 
     Args:
         method: "surface" or "cells", see `cast`. None chooses by the map: "surface" where each cell
@@ -60,7 +60,8 @@ def _default_method(grid: Grid) -> str:
     solid.
 
     It is not with three log-odds or fewer, which have no grades, nor where cells are unknown, which
-    a map made from scans has: its p says how sure a cell is. There "surface" goes too far (`cast`).
+    a map made from scans has: its p is the certainty of a cell. There "surface" goes too far
+    (`cast`).
     """
     if not is_concrete(grid.log_odds):
         return "cells"
@@ -73,7 +74,7 @@ def _default_method(grid: Grid) -> str:
 
 
 def check_method(name: str, method: str) -> None:
-    """Raise ValueError unless there is such a method."""
+    """Raise ValueError on an unknown method."""
     if method not in METHODS:
         raise ValueError(f"{name}: expected a method of {', '.join(METHODS)}, got {method!r}")
 
@@ -86,14 +87,14 @@ def _ray_map(grid: Grid, method: str, skip: bool) -> RayMap:
     if skip:
         # Beyond the border it is as if all were occupied: no step leads off the map. The distance
         # of two squares is that of the centre of one from those around the other.
-        around = _dilated(jnp.pad(stops, 1, constant_values=True))
+        around = _dilate(jnp.pad(stops, 1, constant_values=True))
         away = jnp.sqrt(squared_distances(around))[1:-1, 1:-1]
         ahead = jnp.minimum(jnp.floor(4.0 * away), MOST).astype(jnp.uint8)
     ahead = jnp.pad(jnp.where(stops, jnp.uint8(STOP), ahead), 1, constant_values=OFF)
     return RayMap(solid, ahead, jnp.asarray(grid.origin), jnp.asarray(grid.resolution, solid.dtype))
 
 
-def _dilated(stops: Bool[Array, "H W"]) -> Array:
+def _dilate(stops: Bool[Array, "H W"]) -> Array:
     """Whether a square or one of the eight around it stops."""
     wide = jnp.pad(stops, 1)
     rows = wide[2:] | wide[1:-1] | wide[:-2]
@@ -143,7 +144,7 @@ def cast(
         the wall to a fraction of a cell: the range of a beam less than 63° from the normal, and one
         and a half cells from edges and corners, is wrong by less than half a cell, in the median by
         less than a tenth (`python -m benchmarks.grids`). These are rounded: beside an edge a beam
-        may hit or miss wrongly. Where p is no share, it goes too far. In a trinary map the corners
+        may hit or miss wrongly. If p is not a share, it goes too far. In a trinary map the corners
         of cells are cut, by half a cell from a pillar or an end of a wall, and beams behind them go
         on to the next wall. In a map of log-odds it passes walls that are weakly occupied beside
         cells that are surely free: between two such cells that touch by a corner p is below ½
@@ -157,7 +158,7 @@ def cast(
     beam passes an edge or hits it is a jump, which no derivative knows.
 
     Args:
-        grid: a `Grid`, or a `RayMap` of it, which is faster for many rays.
+        grid: a `Grid`, or its `RayMap`, which is faster for many rays.
         pose: (3,) or with leading axes.
         angles: (B,) of beams in the frame of the pose [rad].
         max_range: [m].
@@ -178,9 +179,9 @@ def cast(
 
 def _check_rays(pose: Array, angles: Array, max_range: ArrayLike) -> None:
     if pose.ndim < 1 or pose.shape[-1] != 3:
-        raise ValueError(f"cast: expected poses (x, y, θ), got shape {shape_told(pose)}")
+        raise ValueError(f"cast: expected poses (x, y, θ), got shape {shape_text(pose)}")
     if angles.ndim != 1 or angles.size == 0:
-        raise ValueError(f"cast: expected angles of shape (at least 1,), got {shape_told(angles)}")
+        raise ValueError(f"cast: expected angles of shape (at least 1,), got {shape_text(angles)}")
     if is_concrete(angles) and not np.all(np.isfinite(angles)):
         raise ValueError("cast: expected finite angles")
     if is_concrete(max_range) and not (

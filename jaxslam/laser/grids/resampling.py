@@ -13,9 +13,10 @@ from jaxslam.math import se2
 def resample(grid: Grid, resolution: float) -> Grid:
     """The map in cells of another size [m], with the same origin.
 
-    A new cell has the mean log-odds of what it covers, weighted by area; beyond the map is unknown,
+    A new cell has the mean log-odds of the covered cells, weighted by area; beyond the map is
+    unknown,
     0. So a cell over unknown cells alone is unknown, and the integral of the log-odds over the map
-    stays what it is. A wall thinner than a new cell fades: the mean is no maximum.
+    is unchanged. A wall thinner than a new cell fades: the mean is not the maximum.
 
     Raises ValueError on a grid that is none, a resolution that is not above 0, or one within a
     trace, since it sets the shape.

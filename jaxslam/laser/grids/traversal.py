@@ -108,7 +108,7 @@ def _together(
 ) -> tuple[Array, Array]:
     height, width = ahead.shape
     x, y = start[:, 0] + 1, start[:, 1] + 1
-    # Squares of corners reach half a square beyond the map: what is hit there is off it.
+    # Squares of corners reach half a square beyond the map: a hit there is off the map.
     edge = 1.0 if corners is None else 1.5 - _ROUNDING
 
     def on_map(x: Array, y: Array) -> Array:
@@ -184,7 +184,7 @@ def _crossings(rays: _Rays, at: _Square) -> tuple[Array, Array]:
 
 
 def _next(rays: _Rays, at: _Square, crosses: tuple[Array, Array], ahead: Array) -> _Square:
-    """Where a step leads: as far as is free, where that is beyond the square, else out of it."""
+    """The end of a step: that of the free distance if beyond the square, else out of the square."""
     exit_x, exit_y = crosses
     leaves, jump = jnp.minimum(exit_x, exit_y), at.length + ahead
     far, first = (ahead > 0) & (jump > leaves), exit_x < exit_y

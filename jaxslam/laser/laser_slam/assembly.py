@@ -37,7 +37,7 @@ def graph_of(
     odometry: Table,
     loops: Table | None = None,
 ) -> Graph:
-    """The graph of keyframes, the first of which is fixed."""
+    """The graph of keyframes; the first is fixed."""
     tables = {"relative_pose": odometry}
     if loops is not None and len(loops.z):
         tables[LOOPS] = loops

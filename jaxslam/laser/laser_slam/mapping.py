@@ -13,14 +13,14 @@ from jaxslam.laser.laser_slam.records import LogOfScans, Settings
 from jaxslam.laser.laser_slam.scans import ROWS, WIDTH, met_something
 from jaxslam.math import numpy_poses as poses
 
-_LARGEST = 4_000
+_MAX_CELLS = 4_000
 """cells along a side of the map; a larger world has larger cells"""
-_FILM = 400
+_FILM_CELLS = 400
 """cells along a side of a map in a film"""
 WINDOW = 1024
 """Cells along a side of the window in which scans are counted: one program for all maps, but for
 scans that are larger."""
-_ASIDE = np.array([0.37, 0.29])
+_CORNER_OFFSET = np.array([0.37, 0.29])
 """Cells from the origin of `raw` to a corner of a cell: a robot that starts there, or drives along
 an axis, has no beams along the borders of cells, where rounding decides what they cross."""
 
@@ -37,8 +37,8 @@ def frame_of(
             rows = slice(begin, begin + ROWS)
             first, last = _boxes(laser[rows], _used(log, settings, every, rows))
             low, high = np.minimum(low, first.min(axis=0)), np.maximum(high, last.max(axis=0))
-    resolution = max(settings.resolution, float((high - low).max()) / _LARGEST)
-    low = (np.floor(low / resolution - 4) + _ASIDE) * resolution
+    resolution = max(settings.resolution, float((high - low).max()) / _MAX_CELLS)
+    low = (np.floor(low / resolution - 4) + _CORNER_OFFSET) * resolution
     width, height = (int(n) for n in np.ceil((high - low) / resolution) + 4)
     # Whole pieces of 64 cells: maps of nearly the same size share a program.
     return (-(-height // 64) * 64, -(-width // 64) * 64), np.array([*low, 0.0]), resolution
@@ -51,7 +51,7 @@ def map_of(
     frame: tuple[tuple[int, int], Float[np.ndarray, "3"], float],
     settings: Settings,
 ) -> Grid:
-    """The occupancy grid of usable scans; beams that met nothing say nothing."""
+    """The occupancy grid of usable scans; beams that met nothing have no effect."""
     shape, origin, resolution = frame
     counts = np.zeros((2, *shape), np.int32)
     laser = poses.compose(path, np.asarray(log.mount, float))
@@ -111,10 +111,12 @@ def _count(
     )
     height, width = counts.shape[1:]
     low, high = np.maximum(first, 0), np.minimum(first + size, [width, height])
-    here = (slice(low[1], high[1]), slice(low[0], high[0]))
-    there = tuple(slice(s.start - f, s.stop - f) for s, f in zip(here, first[::-1], strict=True))
-    for total, found_there in zip(counts, (found.hits, found.misses), strict=True):
-        total[here] += np.asarray(found_there)[there]
+    in_total = (slice(low[1], high[1]), slice(low[0], high[0]))
+    in_part = tuple(
+        slice(s.start - f, s.stop - f) for s, f in zip(in_total, first[::-1], strict=True)
+    )
+    for total, counted in zip(counts, (found.hits, found.misses), strict=True):
+        total[in_total] += np.asarray(counted)[in_part]
 
 
 def _occupancy(
@@ -145,7 +147,7 @@ def growing_maps(
 ) -> tuple[list[Grid], Int[np.ndarray, "F"]]:
     """Maps of the first scans, more of them in each, for a film; and how many scans each has.
 
-    Cells are as large as `_FILM` of them along a side need.
+    Cells are as large as `_FILM_CELLS` of them along a side need.
 
     Args:
         frames: number of maps at most.
@@ -153,7 +155,7 @@ def growing_maps(
     """
     paths = [path, *others]
     shape, _, resolution = frame_of(log, paths, settings)
-    coarse = max(resolution, max(shape) * resolution / _FILM)
+    coarse = max(resolution, max(shape) * resolution / _FILM_CELLS)
     shape, origin, resolution = frame_of(log, paths, replace(settings, resolution=coarse))
     laser = poses.compose(path, np.asarray(log.mount, float))
     together = -(-len(path) // min(frames, len(path)))
@@ -169,7 +171,7 @@ def growing_maps(
 
 
 def _used(log: LogOfScans, settings: Settings, usable: np.ndarray, rows: slice) -> Beams:
-    """The beams of some scans as maps take them: what a scan that is not usable met is nothing."""
+    """The beams of some scans for a map; beams of scans that are not usable met nothing."""
     some = Beams(*(np.asarray(part)[rows] for part in log.beams))
     ranges, angles, met = (np.asarray(part) for part in met_something(some, log.max_range))
     seen = met & usable[rows, None]

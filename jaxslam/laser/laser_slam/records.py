@@ -31,7 +31,7 @@ class Settings:
     sigma: float = 0.02
     """least standard deviation of a point's distance from a wall"""
     jump: float = 3.0
-    """a step of raw odometry longer than this is taken to be an error"""
+    """a longer step of raw odometry is assumed to be an error"""
     reference: int = 8
     """keyframes that a scan is matched with; 1 is scan to scan"""
     key_distance: float = 0.4
@@ -157,7 +157,7 @@ class Solved(NamedTuple):
     keyframe: Int[np.ndarray, "N"]
     """scans that are poses of the graph"""
     base: Int[np.ndarray, "K"]
-    """row in the graph of the keyframe that each scan is relative to; of a keyframe, its own"""
+    """row in the graph of each scan's keyframe; for a keyframe, its own row"""
     z: Float[np.ndarray, "K 3"]
     """pose of each scan in the frame of that keyframe; zero for keyframes"""
     z_cov: Float[np.ndarray, "K 3 3"]
@@ -171,7 +171,7 @@ class Solved(NamedTuple):
     map_before: Grid
     """of the poses of laser odometry"""
     counts: dict[str, int]
-    """what was used and what was left out"""
+    """counts of used and unused data"""
     chi2: float
     """of the graph, without a kernel"""
     dof: int

@@ -21,7 +21,7 @@ WIDTH, ROWS = 384, 64
 """Beams and scans of one call that fits lines: logs are cut and filled up to these, so that all
 share one program."""
 _CHANGED, SHARE = 0.1, 0.2
-"""A scan differs from the one before if more than this share of its beams do, by this much [m]."""
+"""A scan differs from the previous one if more than this share of its beams do, by this [m]."""
 
 
 class Scans(NamedTuple):
@@ -34,7 +34,7 @@ class Scans(NamedTuple):
     usable: Bool[np.ndarray, "K"]
     """enough points to match"""
     changed: Bool[np.ndarray, "K"]
-    """whether a scan differs from the one before, as that of a robot at rest does not"""
+    """whether a scan differs from the previous one; a scan of a robot at rest does not"""
 
 
 def check_laser_log(name: str, log: LogOfScans) -> None:
@@ -84,8 +84,8 @@ def scans_of(log: LogOfScans, settings: Settings) -> Scans:
     count, beams = np.shape(log.beams.range)
     stride = -(-beams // WIDTH)
     some = slice(None, None, -(-count // ROWS))
-    angles, there = np.asarray(log.beams.angle)[some], np.asarray(log.beams.valid)[some] > 0
-    spacing = max(_spacing(angles[:, ::stride], there[:, ::stride]), 1e-3)
+    angles, valid = np.asarray(log.beams.angle)[some], np.asarray(log.beams.valid)[some] > 0
+    spacing = max(_spacing(angles[:, ::stride], valid[:, ::stride]), 1e-3)
     span = np.int32(np.clip(round(SPAN / spacing), 2, _MAX_NEIGHBOURS))
     every, kept = -(-len(range(0, beams, stride)) // settings.beams), settings.beams
     changed = []
@@ -95,15 +95,15 @@ def scans_of(log: LogOfScans, settings: Settings) -> Scans:
         near = met_something(
             Beams(*(np.asarray(part)[last : begin + ROWS] for part in log.beams)), log.max_range
         )
-        differs = _changed(np.asarray(near.range), np.asarray(near.valid))
+        differs = _has_changed(np.asarray(near.range), np.asarray(near.valid))
         changed.append(differs if begin == 0 else differs[1:])
         rows = Beams(*(np.asarray(part)[begin - last :, ::stride] for part in near))
         points = _points(rows, np.asarray(log.mount), settings.max_range)
-        filled = _filled(points)
+        filled = _fill(points)
         lines = jax.tree.map(np.asarray, _surfaces(filled, span))
         # Beams that fill a scan up come last: they are cut off, or stay without a point.
         size = len(rows.range)
-        found = jax.tree.map(lambda part, n=size: _thinned(part[:n], every, kept), (filled, lines))
+        found = jax.tree.map(lambda part, n=size: _thin(part[:n], every, kept), (filled, lines))
         if not begin:  # all at once: parts and their concatenation would take twice the memory
             scans = jax.tree.map(lambda of: np.empty((count, *of.shape[1:]), of.dtype), found)
         for whole, part in zip(jax.tree.leaves(scans), jax.tree.leaves(found), strict=True):
@@ -124,13 +124,13 @@ def _points(beams: Beams, mount: Float[np.ndarray, "3"], max_range: float) -> Po
     return Points(*parts)
 
 
-def _thinned(part: np.ndarray, every: int, width: int) -> np.ndarray:
+def _thin(part: np.ndarray, every: int, width: int) -> np.ndarray:
     """Each n-th of the beams, cut or filled up to a width."""
     found = part[:, ::every][:, :width]
     return np.pad(found, [(0, 0), (0, width - found.shape[1])] + [(0, 0)] * (part.ndim - 2))
 
 
-def _filled(points: Points) -> Points:
+def _fill(points: Points) -> Points:
     """Some scans, filled up to `ROWS` of `WIDTH` beams by points that are not valid."""
 
     def one(part: np.ndarray) -> np.ndarray:
@@ -147,14 +147,14 @@ def _surfaces(points: Points, span: Int[Array, ""]) -> Surface:
     return found
 
 
-def _spacing(angles: np.ndarray, there: np.ndarray) -> float:
+def _spacing(angles: np.ndarray, valid: np.ndarray) -> float:
     """The angle between beams [rad]."""
-    steps = np.abs(np.diff(angles, axis=1))[there[:, 1:] & there[:, :-1]]
+    steps = np.abs(np.diff(angles, axis=1))[valid[:, 1:] & valid[:, :-1]]
     return float(np.median(steps)) if steps.size else 0.02
 
 
-def _changed(ranges: Float[np.ndarray, "K B"], met: Bool[np.ndarray, "K B"]) -> np.ndarray:
-    """Whether each scan differs from the one before; the first does."""
+def _has_changed(ranges: Float[np.ndarray, "K B"], met: Bool[np.ndarray, "K B"]) -> np.ndarray:
+    """Whether each scan differs from the previous one; the first does."""
     differs = (np.abs(np.diff(ranges, axis=0)) > _CHANGED) | (met[1:] != met[:-1])
     either = met[1:] | met[:-1]
     share = (differs & either).sum(axis=1) / np.maximum(either.sum(axis=1), 1)

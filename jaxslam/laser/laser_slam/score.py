@@ -101,7 +101,7 @@ class ClosureScore(NamedTuple):
     kept: int
     correct: int
     revisits: int
-    """keyframes near an earlier one, as the reference has it"""
+    """keyframes near an earlier one by the reference path"""
 
 
 def closure_score(

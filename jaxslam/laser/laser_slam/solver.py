@@ -28,11 +28,11 @@ def solve(
     *,
     progress: Callable[[str, int, int], object] | None = None,
 ) -> Solved:
-    """The path, graph, loops and map of a laser log, from its raw odometry and scans alone.
+    """The path, graph, loops and map of a laser log, from its raw odometry and scans.
 
     Laser odometry places each scan among the keyframes before it; loops between keyframes are
-    sought by place and by looks, and those that agree are edges of the graph; the map is of all
-    scans at the optimum. What was left out is counted, and the run goes on: scans with too few
+    found by position and by appearance, and those that agree are edges of the graph; the map is of
+    all scans at the optimum. Unused data are counted, and the run continues: scans with too few
     points have raw odometry, steps of raw odometry that cannot be are taken to be unknown.
 
     Args:
@@ -53,7 +53,7 @@ def solve(
         give_back()
 
     def telling(stage: str) -> Callable[[int, int], object] | None:
-        return None if progress is None else lambda done, of: progress(stage, done, of)
+        return None if progress is None else lambda finished, of: progress(stage, finished, of)
 
     raw = np.asarray(log.raw, np.float64)
     scans = scans_of(log, settings)

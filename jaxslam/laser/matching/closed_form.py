@@ -87,14 +87,14 @@ def of_prior(prior: Prior, pose: Float[Array, "3"], middle: Float[Array, "2"]) -
     by_turn = jnp.stack(
         [jnp.stack([arm[0], -arm[1]]), jnp.stack([arm[1], arm[0]]), jnp.stack([off, one])]
     )
-    there = jnp.concatenate([prior.pose[:2] - middle, zero[None]])
+    offset = jnp.concatenate([prior.pose[:2] - middle, zero[None]])
     weighted = prior.information @ by_turn
     return Quadratic(
         shift=prior.information[:2, :2],
         cross=weighted[:2],
         turn=by_turn.T @ weighted,
-        shift_slope=prior.information[:2] @ there,
-        turn_slope=there @ weighted,
+        shift_slope=prior.information[:2] @ offset,
+        turn_slope=offset @ weighted,
     )
 
 

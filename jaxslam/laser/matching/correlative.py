@@ -18,7 +18,7 @@ from jaxslam.laser.grids.distance import near_distances
 from jaxslam.laser.grids.grid import Field, Grid, interpolate, to_cells
 from jaxslam.laser.matching.field import field_cost
 from jaxslam.laser.matching.matcher import Match, Matcher
-from jaxslam.laser.matching.outcome import Limits, concluded, length_of
+from jaxslam.laser.matching.outcome import Limits, length_of, make_match
 from jaxslam.laser.matching.point_sets import Points, Prior, prior_cost
 from jaxslam.laser.matching.surfaces import surface, surface_information
 from jaxslam.math import se2
@@ -63,7 +63,7 @@ def _best_shift(
 ) -> _Best:
     """The best shift of all blocks, by depth first search with the best bound ahead.
 
-    A block whose bound is not above the best value so far is left out; others are divided into four
+    A block whose bound is not above the best value so far is skipped; others are divided into four
     (Hess et al. 2016, "Real-time loop closure in 2D LIDAR SLAM", ICRA).
 
     Args:
@@ -136,7 +136,7 @@ class Scores(NamedTuple):
 
     table: Float[Array, "L H W"]
     """first exp(-d²/2σ²), d the distance to the nearest occupied cell, 0 beyond `_REACH` σ; at
-    level l, the largest of the 2^l × 2^l cells of which this is the lower left one"""
+    level l, the largest of the 2^l × 2^l cells with this cell at the lower left"""
     field: Field
     """d [m], of the map alone, up to `_REACH` σ"""
 
@@ -306,7 +306,7 @@ class Correlative(Matcher):
         residual = interpolate(prepared.field, moved)
         weight = (points.valid & (residual < 3 * sigma)).astype(residual.dtype)
         only = _Nodes(jnp.zeros(1, jnp.int32), best.turn[None], best.shift[None])
-        return concluded(
+        return make_match(
             start,
             pose,
             points,

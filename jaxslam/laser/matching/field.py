@@ -15,11 +15,11 @@ from jaxslam.laser.grids.grid import Field, Grid, interpolate, to_cells
 from jaxslam.laser.matching.matcher import Match, Matcher
 from jaxslam.laser.matching.outcome import (
     Limits,
-    concluded,
     determined,
     fused,
     information_of,
     length_of,
+    make_match,
 )
 from jaxslam.laser.matching.point_sets import Points, Prior, prior_cost, prior_terms
 from jaxslam.laser.matching.surfaces import surface, surface_information, weights
@@ -54,7 +54,7 @@ class FieldMatcher(Matcher):
     d [m] is truncated at reach, and interpolated between centres of cells, so that the cost is
     continuous and no pairs are chosen; a point of d >= reach has a constant cost, and no part.
     Levenberg's method: (A + μ diag A) δ = -Σ w d J, A = Σ w J Jᵀ, J = (∇d, ∇d·∂(R p)/∂θ);
-    a step that does not reduce the cost is not taken, and μ grows tenfold, else it falls tenfold.
+    a step that does not reduce the cost is refused and μ grows tenfold; else μ falls tenfold.
     The reference is a `Grid`; `raster` makes one of points.
 
     The slope of a field of cells feigns information along a wall, so the status and
@@ -125,17 +125,17 @@ class FieldMatcher(Matcher):
             curvature, slope = fused(damped, at.slope, prior_terms(prior, pose), onto, length)
             move, _ = linalg.solve_psd(curvature, -slope)
             tried = moved(pose, move)
-            there = matcher._at(prepared, points, tried, prior)
-            better = there.cost < at.cost
+            trial = matcher._at(prepared, points, tried, prior)
+            better = trial.cost < at.cost
             small = jnp.hypot(move[0], move[1]) + length * jnp.abs(move[2]) <= matcher.tolerance
             pose = jnp.where(better, tried, pose)
-            at = jax.tree.map(lambda new, old: jnp.where(better, new, old), there, at)
+            at = jax.tree.map(lambda new, old: jnp.where(better, new, old), trial, at)
             damping = jnp.clip(jnp.where(better, 0.1 * damping, 10 * damping), low, high)
             return k + 1, pose, at, damping, small
 
         begin = start
         if prior is not None:
-            # Along what the scan does not determine it begins where the prior has it: a step that
+            # Along directions that the scan does not determine it begins at the prior: a step that
             # the roughness of a field of cells might refuse.
             onto = onto_of(start, matcher._at(prepared, points, start, prior))
             free = jnp.eye(3, dtype=start.dtype) - onto
@@ -153,7 +153,7 @@ class FieldMatcher(Matcher):
             jnp.zeros((), bool),
         )
         k, pose, at, _, small = jax.lax.while_loop(unfinished, step, first)
-        return concluded(
+        return make_match(
             start,
             pose,
             points,
@@ -175,14 +175,14 @@ class FieldMatcher(Matcher):
 
     def _at(self, of: Field, points: Points, pose: Array, prior: Prior | None) -> _At:
         residual, jacobian = field_residuals(of, points, pose)
-        there = points.valid & _on_map(of, points, pose) & (residual < self.reach)
-        weight = weights(residual, there, self.kernel, self.scale)
+        used = points.valid & _on_map(of, points, pose) & (residual < self.reach)
+        weight = weights(residual, used, self.kernel, self.scale)
         curvature, slope = information_of(jacobian, weight), (weight * residual) @ jacobian
         cost = self._robust_cost(residual, points) + 2 * prior_cost(prior, pose)
         return _At(cost, residual, weight, curvature, slope)
 
     def _robust_cost(self, residual: Array, points: Points) -> Float[Array, ""]:
-        """The sum of ρ over the valid points, also beyond reach, so that leaving is no gain."""
+        """The sum of ρ over the valid points, also beyond reach, so that leaving has no gain."""
         square = residual**2
         if self.kernel is not None:
             square = self.scale**2 * self.kernel.cost(square / self.scale**2)

@@ -24,11 +24,11 @@ from jaxslam.laser.matching.closed_form import (
 from jaxslam.laser.matching.matcher import Match, Matcher
 from jaxslam.laser.matching.outcome import (
     Limits,
-    concluded,
     determined,
     fused,
     information_along,
     length_of,
+    make_match,
 )
 from jaxslam.laser.matching.point_sets import Points, Prior, prior_cost, prior_terms
 from jaxslam.laser.matching.surfaces import GAP, SPAN, Surface, nearest_points, surface, weights
@@ -178,7 +178,7 @@ class Icp(Matcher):
         first = jnp.zeros((), jnp.int32), start, far, jnp.asarray(jnp.inf, start.dtype)
         k, pose, _, change = jax.lax.while_loop(unfinished, step, first)
         at = icp._pairs(prepared, points, pose)
-        return concluded(
+        return make_match(
             start,
             pose,
             points,
@@ -243,7 +243,7 @@ class PointToPoint(Icp):
 
     Each step is the exact minimum for its pairs (`closed_form.least`); its error falls by a
     constant factor a step. Besl & McKay 1992, "A method for registration of 3-D shapes", IEEE
-    PAMI 14; Lu & Milios 1997. Lines serve the status alone.
+    PAMI 14; Lu & Milios 1997. Lines serve only the status.
     """
 
     settings: IcpSettings = IcpSettings()
@@ -277,7 +277,7 @@ class PointToLine(Icp):
     The line (m_j, n_j) is fitted to point j of the reference and its neighbours (`Surface`); each
     step is the exact minimum for its pairs (`closed_form.least`), so that it converges
     quadratically. Censi 2008, "An ICP variant using a point-to-line metric", ICRA, where the line
-    joins the two nearest points. Where there is no line, the residual is `lone` |T ∘ p_i - q_j|.
+    joins the two nearest points. Without a line, the residual is `lone` |T ∘ p_i - q_j|.
     """
 
     settings: IcpSettings = IcpSettings()

@@ -10,7 +10,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, PyTree
 
-from jaxslam.core.numbers import is_concrete, shape_told
+from jaxslam.core.numbers import is_concrete, shape_text
 from jaxslam.core.protocols import Component
 from jaxslam.laser.grids.grid import Grid, check_grid
 from jaxslam.laser.matching.point_sets import Points, Prior
@@ -59,7 +59,7 @@ class Match(NamedTuple):
     condition: Float[Array, ""]
     """its eigenvalue over the largest, lengths in RMS ranges"""
     determined: Float[Array, "3 3"]
-    """projection of a motion (dx, dy, dθ) onto what the scans determine: the identity, unless the
+    """projection of a motion (dx, dy, dθ) onto the determined directions: the identity, unless the
     match is DEGENERATE"""
     pair: Int[Array, "N"]
     """the partner of each point in the reference, -1 without; in a grid 0 where it took part"""
@@ -94,7 +94,7 @@ class Matcher(Component):
         start: Float[Array, "3"],
         prior: Prior | None = None,
     ) -> Match:
-        """The match of a scan. By while loops: forward derivatives alone."""
+        """The match of a scan, by while loops, which have only forward derivatives."""
         raise NotImplementedError
 
     def cost(
@@ -120,7 +120,7 @@ def match(
         reference: `Points`, or a `Grid` where `matcher.of_grid`; with a leading axis on all of its
             arrays for many pairs at once, as `points` and `start` then have.
         start: (3,) where the search begins.
-        prior: what is known of the pose; without one only the start is.
+        prior: of the pose; without a prior only the start is known.
 
     It is computed in the higher precision of reference and points.
 
@@ -180,7 +180,7 @@ def _checked(
         )
     batch: tuple[int, ...] = np.shape(start)[:-1]
     if len(batch) > 1 or np.shape(start)[-1:] != (3,):
-        raise ValueError(f"match: expected a start of poses (x, y, θ), got {shape_told(start)}")
+        raise ValueError(f"match: expected a start of poses (x, y, θ), got {shape_text(start)}")
     _check_points("match: points", points, batch)
     if isinstance(reference, Points):
         _check_points("match: reference", reference, batch)
@@ -190,7 +190,7 @@ def _checked(
         check_grid("match", reference)
     elif np.ndim(reference.log_odds) != 3 or len(reference.log_odds) != batch[0]:
         raise ValueError(
-            f"match: expected {batch[0]} grids, got log-odds of {shape_told(reference.log_odds)}"
+            f"match: expected {batch[0]} grids, got log-odds of {shape_text(reference.log_odds)}"
         )
     if is_concrete(start) and not np.all(np.isfinite(np.asarray(start))):
         raise ValueError(f"match: expected a finite start, got {np.asarray(start)}")
@@ -204,7 +204,7 @@ def _check_prior(prior: object, batch: tuple[int, ...]) -> None:
         whole = " x ".join(str(size) for size in (*batch, 3))
         raise ValueError(
             f"match: expected a prior of a pose {whole} and an information {whole} x 3, got "
-            f"{shape_told(prior.pose)} and {shape_told(prior.information)}"
+            f"{shape_text(prior.pose)} and {shape_text(prior.information)}"
         )
     if is_concrete(prior):
         information = np.asarray(prior.information)
@@ -230,8 +230,8 @@ def _check_points(name: str, of: object, batch: tuple[int, ...] = ()) -> None:
         or shape[:-1] != batch
         or any(np.shape(part) != (*shape, 2) for part in of[:2])
     ):
-        told = ", ".join(shape_told(part) for part in of)
+        shapes = ", ".join(shape_text(part) for part in of)
         whole = " x ".join(str(size) for size in (*batch, "N"))
-        raise ValueError(f"{name}: expected {whole} positions, rays and masks, got {told}")
+        raise ValueError(f"{name}: expected {whole} positions, rays and masks, got {shapes}")
     if is_concrete(of) and not all(np.all(np.isfinite(np.asarray(part))) for part in of[:2]):
         raise ValueError(f"{name}: expected finite points; those that are not valid, too")

@@ -1,4 +1,4 @@
-"""What all matchers say of a result: the weakest direction, the score, the status."""
+"""Common results of all matchers: the weakest direction, the score, the status."""
 
 from typing import NamedTuple
 
@@ -24,7 +24,7 @@ class Limits(NamedTuple):
     """of `Match.condition`; None: no match is DEGENERATE"""
 
 
-def concluded(
+def make_match(
     start: Float[Array, "3"],
     pose: Float[Array, "3"],
     points: Points,
@@ -84,7 +84,7 @@ def concluded(
 def length_of(points: Points) -> Float[Array, ""]:
     """The root mean square distance of the points from the origin of their frame [m]; 1 of none.
 
-    What an angle is multiplied by where it stands beside lengths.
+    The factor of an angle beside lengths.
     """
     square = jnp.where(points.valid, (points.position**2).sum(axis=1), 0.0).sum()
     mean = square / jnp.maximum(points.valid.sum(), 1)
@@ -136,7 +136,7 @@ def _weakest_direction(
 def determined(
     information: Float[Array, "3 3"], length: Float[Array, ""], least: Number | None
 ) -> Float[Array, "3 3"]:
-    """The projection D of a motion onto what the scans determine; the identity where that is all,
+    """The projection D of a motion onto the determined directions; the identity for all directions,
     or `least` is None.
 
     With lengths in RMS ranges, the directions of the eigenvectors whose eigenvalue is at least

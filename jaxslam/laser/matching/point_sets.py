@@ -1,4 +1,4 @@
-"""The points of scans, and what is known of a pose before its scan is matched."""
+"""The points of scans, and the prior of a pose before its scan is matched."""
 
 from typing import NamedTuple
 
@@ -22,7 +22,7 @@ class Points(NamedTuple):
     ray: Float[Array, "N 2"]
     """unit direction of the beam, the derivative of the position by the range: noise is along it"""
     valid: Bool[Array, "N"]
-    """whether there is a point"""
+    """mask of the points"""
 
 
 def points(
@@ -34,8 +34,8 @@ def points(
 ) -> Points:
     """The ends of the beams in the robot's frame, in the order of the beams.
 
-    A beam that says nothing or met nothing up to max_range [m] gives no point (`Beams`), nor does a
-    range of min_range or less.
+    A beam without information, or without a hit up to max_range [m], gives no point (`Beams`), nor
+    does a range of min_range or less.
 
     Args:
         mount: (3,) pose of the laser on the robot.
@@ -44,8 +44,10 @@ def points(
     """
     shapes = [np.shape(part) for part in beams]
     if len(set(shapes)) > 1 or len(shapes[0]) != 1:
-        told = ", ".join(map(str, shapes))
-        raise ValueError(f"points: expected ranges, angles and masks (B,) of one scan, got {told}")
+        listed = ", ".join(map(str, shapes))
+        raise ValueError(
+            f"points: expected ranges, angles and masks (B,) of one scan, got {listed}"
+        )
     check_positive("points", max_range=max_range)
     r = jnp.asarray(beams.range)
     valid, _ = beams._replace(range=r).returns(
@@ -60,13 +62,13 @@ def points(
 
 
 def transformed(of: Points, pose: Float[Array, "3"]) -> Points:
-    """The same points, given in the frame of a pose, in the coordinates of the pose's own frame."""
+    """The points of the frame of a pose, in the coordinates of the frame of that pose."""
     turn = se2.rotation(pose[2]).T
     return Points(of.position @ turn + pose[None, :2], of.ray @ turn, of.valid)
 
 
 def moved_along_rays(of: Points, by: Float[Array, "N"]) -> Points:
-    """The points with their ranges changed by so many metres."""
+    """The points with their ranges changed by d [m]."""
     return of._replace(position=of.position + by[:, None] * of.ray)
 
 

@@ -25,14 +25,14 @@ _BENT = 4.0
 """A line whose points scatter by more than this times the median variance goes round a corner."""
 
 _FLAT = 1e-3
-"""[m] Points that scatter less than this are of a line."""
+"""[m] Points that scatter less than this form a line."""
 
 
 class Surface(NamedTuple):
     """Points of a reference, each with the line fitted to it and its neighbours."""
 
     position: Float[Array, "M 2"]
-    """[m]; far away where there is no point"""
+    """[m]; far away without a point"""
     middle: Float[Array, "M 2"]
     """a point of the line: the mean of the neighbours"""
     normal: Float[Array, "M 2"]
@@ -106,21 +106,21 @@ def surface_at(of: Surface, pose: Float[Array, "3"]) -> Surface:
 def surface_information(
     of: Surface, pose: Float[Array, "3"], weight: Float[Array, "M"]
 ) -> Float[Array, "3 3"]:
-    """The information Σ w J Jᵀ of a scan at a pose, by the lines through its own points."""
+    """The information Σ w J Jᵀ of a scan at a pose, by the lines through its points."""
     turn = se2.rotation(pose[2]).T
     arm = jnp.where((weight > 0)[:, None], of.position @ turn, 0.0)
     return information_along(of.normal @ turn, of.tilt, arm, jnp.where(of.straight, weight, 0.0))
 
 
-def _median(values: Float[Array, "M"], there: Bool[Array, "M"]) -> Float[Array, ""]:
-    """The median of the values that are there; 0 of none."""
-    ordered = jnp.sort(jnp.where(there, values, jnp.inf))
-    middle = ordered[jnp.maximum(there.sum() - 1, 0) // 2]
-    return jnp.where(there.any(), middle, 0.0)
+def _median(values: Float[Array, "M"], valid: Bool[Array, "M"]) -> Float[Array, ""]:
+    """The median of the valid values; 0 without a valid value."""
+    ordered = jnp.sort(jnp.where(valid, values, jnp.inf))
+    middle = ordered[jnp.maximum(valid.sum() - 1, 0) // 2]
+    return jnp.where(valid.any(), middle, 0.0)
 
 
 _FAR = 1e6
-"""Coordinate [m] of a reference point that is not there, so that others are nearer."""
+"""Coordinate [m] of a missing reference point, so that others are nearer."""
 
 
 def nearest_points(reference: Float[Array, "M 2"], query: Float[Array, "N 2"]) -> Int[Array, "N"]:

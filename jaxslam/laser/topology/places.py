@@ -66,7 +66,7 @@ def topological_map(
     to the place whose skeleton is nearest on a way through free cells.
 
     Args:
-        clearance: radius of the robot [m]; what is narrower connects nothing.
+        clearance: radius of the robot [m]; narrower passages do not connect.
         max_width: [m] widest narrowing that counts as a door.
         prominence: [m] by how much half of a door's width is less than that of either side.
     Raises:
@@ -110,10 +110,10 @@ def topological_map(
         for part in parts:
             parent[root(at)] = part if away[part] >= away[root(at)] else root(at)
             parent[part] = root(at)
-    return _labelled(grid, found, {c: root(c) for c in parent}, gates)
+    return _label(grid, found, {c: root(c) for c in parent}, gates)
 
 
-def _labelled(
+def _label(
     grid: Grid, found: Skeleton, part: dict[int, int], gates: list[tuple[int, int, int]]
 ) -> TopologicalMap:
     """The map from the part of each cell of the skeleton, named by one of its cells."""
@@ -168,10 +168,10 @@ def neighbours(cells: Bool[np.ndarray, "H W"]) -> "scipy.sparse.csr_matrix":
     rows, columns, weights = [], [], []
     for i, j in _HALF:
         here = index[: height - i, max(0, -j) : width - max(0, j)]
-        there = index[i:, max(0, j) : width - max(0, -j)]
-        both = cells.reshape(-1)[here] & cells.reshape(-1)[there]
+        shifted = index[i:, max(0, j) : width - max(0, -j)]
+        both = cells.reshape(-1)[here] & cells.reshape(-1)[shifted]
         rows.append(here[both])
-        columns.append(there[both])
+        columns.append(shifted[both])
         weights.append(np.full(int(both.sum()), np.hypot(i, j)))
     pairs = np.concatenate(rows), np.concatenate(columns)
     return scipy.sparse.csr_matrix((np.concatenate(weights), pairs), shape=(height * width,) * 2)
@@ -181,7 +181,7 @@ class PathPlaces(NamedTuple):
     """Places that cover the poses of a path."""
 
     center: Int[np.ndarray, "P"]
-    """the pose that stands for each place"""
+    """the pose that represents each place"""
     place: Int[np.ndarray, "N"]
     """of each pose: that of the nearest center"""
     adjacent: Bool[np.ndarray, "P P"]

@@ -45,8 +45,8 @@ def route(places: TopologicalMap, start: ArrayLike, goal: ArrayLike) -> Route:
     where = cell_centers(places.grid)
     at = []
     for end, label in zip(ends, labels, strict=True):
-        own = np.flatnonzero(cells & (places.label.reshape(-1) == label))
-        at.append(int(own[np.argmin(((where[own] - end) ** 2).sum(axis=1))]))
+        cells_of_place = np.flatnonzero(cells & (places.label.reshape(-1) == label))
+        at.append(int(cells_of_place[np.argmin(((where[cells_of_place] - end) ** 2).sum(axis=1))]))
     graph = neighbours(places.skeleton.cells)
     distance, before = scipy.sparse.csgraph.dijkstra(
         graph, directed=False, indices=at[0], return_predecessors=True

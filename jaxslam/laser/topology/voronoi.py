@@ -31,7 +31,7 @@ def skeleton(grid: Grid, *, clearance: float = 0.2) -> Skeleton:
 
     Cells are removed in the order of their distance to the walls, as long as that changes neither
     connections nor holes (8-connected, by Yokoi's number), except ridges of the distance field:
-    so what is left of rooms and corridors is the Voronoi line between their walls, without the
+    so rooms and corridors are reduced to the Voronoi line between their walls, without the
     branches into right-angled corners. A second round makes it one cell wide. Unknown cells count
     as walls. A loop in Python over the free cells: about 1 s for 10⁵.
 
@@ -75,21 +75,21 @@ def _thin(
     candidates = np.flatnonzero(cells & ~kept)
     candidates = candidates[np.argsort(away.reshape(-1)[candidates], kind="stable")]
     left = candidates.tolist()
-    there = bytearray(flat.astype(np.uint8).tobytes())
+    present = bytearray(flat.astype(np.uint8).tobytes())
     while True:
         still = []
         for at in left:
             code = 0
             for k, step in enumerate(steps):
-                code |= there[at + step] << k
+                code |= present[at + step] << k
             if table[code]:
-                there[at] = 0
+                present[at] = 0
             else:
                 still.append(at)
         if len(still) == len(left):
             break
         left = still
-    flat[:] = np.frombuffer(bytes(there), np.uint8) > 0
+    flat[:] = np.frombuffer(bytes(present), np.uint8) > 0
 
 
 def _removable(ends: bool) -> list[bool]:

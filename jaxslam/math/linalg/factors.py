@@ -1,4 +1,4 @@
-"""The Cholesky factor of a small matrix, unrolled, and what is solved with it; other square roots.
+"""The Cholesky factor of a small matrix, unrolled, its solutions, and other square roots.
 
 A landmark update factors a 2×2 to 6×6 matrix, millions of times, under `vmap`. The library call
 behind `jnp.linalg.cholesky` costs more there than the arithmetic, and hides a non-positive pivot
@@ -123,14 +123,14 @@ def solve_lower(
     solution: jax.Array = jax.lax.custom_linear_solve(
         lower,
         rhs,
-        lambda _, b: _substituted(factor, b),
-        transpose_solve=lambda _, b: _substituted(factor[::-1, ::-1].T, b[::-1])[::-1],
+        lambda _, b: _substitute(factor, b),
+        transpose_solve=lambda _, b: _substitute(factor[::-1, ::-1].T, b[::-1])[::-1],
     )
     return solution
 
 
 @traced_once
-def _substituted(
+def _substitute(
     factor: Float[Array, "n n"], rhs: Float[Array, "n *rest"]
 ) -> Float[Array, "n *rest"]:
     """L⁻¹ B by forward substitution, unrolled."""
@@ -167,8 +167,8 @@ def root_psd(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
         pivot = rest[j, j]
         good = pivot > floor[j]
         root = jnp.sqrt(jnp.where(good, pivot, 1.0))
-        own = jnp.where(good & (jnp.arange(n) >= j), rest[:, j] / root, 0.0)
-        return rest - own[:, None] * own[None, :], own
+        values = jnp.where(good & (jnp.arange(n) >= j), rest[:, j] / root, 0.0)
+        return rest - values[:, None] * values[None, :], values
 
     return jax.lax.scan(column, matrix, jnp.arange(n))[1].T
 
@@ -184,13 +184,13 @@ def triangular_root(wide: Float[Array, "n m"]) -> Float[Array, "n n"]:
     def reflect(rest: jax.Array, i: jax.Array) -> tuple[jax.Array, None]:
         ahead = jnp.where(jnp.arange(m) >= i, rest[i], 0.0)
         square = jnp.sum(ahead**2)
-        there = square > 0
-        length = jnp.sqrt(jnp.where(there, square, 1.0))
+        nonzero = square > 0
+        length = jnp.sqrt(jnp.where(nonzero, square, 1.0))
         # To -sign(a_i)·length, away from where a_i - length would cancel; then the sign is turned.
         sign = jnp.where(ahead[i] >= 0, 1.0, -1.0).astype(rest.dtype)
         axis = ahead.at[i].add(sign * length)
-        scale = jnp.where(there, 1.0 / (length * (length + jnp.abs(ahead[i]))), 0.0)
+        scale = jnp.where(nonzero, 1.0 / (length * (length + jnp.abs(ahead[i]))), 0.0)
         rest = rest - (rest @ axis * scale)[:, None] * axis[None, :]
-        return rest.at[:, i].multiply(jnp.where(there, -sign, 1.0)), None
+        return rest.at[:, i].multiply(jnp.where(nonzero, -sign, 1.0)), None
 
     return jnp.tril(jax.lax.scan(reflect, wide, jnp.arange(n))[0][:, :n])

@@ -71,11 +71,11 @@ def whitener_by_rows(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], 
         pivot = rest[j, j]
         good = pivot > tolerance * jnp.abs(matrix[j, j])
         scale = jnp.where(good, jax.lax.rsqrt(jnp.where(good, pivot, 1.0)), 0.0)
-        below, own = jnp.where(every > j, rest[:, j] * scale, 0.0), ahead[j] * scale
+        below, scaled = jnp.where(every > j, rest[:, j] * scale, 0.0), ahead[j] * scale
         return (
             rest - below[:, None] * below[None, :],
-            ahead - below[:, None] * own[None, :],
-        ), (own, good)
+            ahead - below[:, None] * scaled[None, :],
+        ), (scaled, good)
 
     rows, good = jax.lax.scan(row, (matrix, jnp.eye(n, dtype=matrix.dtype)), every)[1]
     return rows, good.all()

@@ -43,7 +43,7 @@ def office(beams: int = 180, glass: float = 0.0) -> LaserWorld:
 def corridor(beams: int = 180) -> LaserWorld:
     """A corridor, 40 m × 2 m, whose ends are beyond the laser's 8 m for most of the way.
 
-    There no scan says where along it the robot is.
+    There no scan determines the position along it.
     """
     return _world("corridor", walls(_box(0, -1, 40, 1)), [(10.0, 0.2), (30.0, 0.2)], beams, 8.0)
 
@@ -55,7 +55,7 @@ def square(beams: int = 180) -> LaserWorld:
 
 
 def circular_room(beams: int = 180) -> LaserWorld:
-    """A round room of radius 3 m: no scan says how the robot is turned about its centre."""
+    """A round room of radius 3 m: no scan determines the rotation about its centre."""
     stops = [(-1.5, -1.0), (1.5, -1.0), (1.5, 1.0), (-1.5, 1.0)]
     return _world("circular_room", walls(circles=[[0.0, 0.0, 3.0]]), stops, beams, 10.0)
 

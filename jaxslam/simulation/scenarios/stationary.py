@@ -9,10 +9,10 @@ from jaxslam.simulation.worlds import Scenario
 
 
 def stationary(steps: int = 300) -> Scenario:
-    """A robot stands still and measures one landmark, 10 m away, again and again.
+    """A robot at rest measures one landmark, 10 m away, at every step.
 
     It knows its pose to (0.5 m, 0.5 m, 5°), ranges and bearings to (0.5 m, 5°), and has no process
-    noise. Nothing tells it more about the pose, so its covariance must stay what it was; a filter
+    noise. The robot gets no information on the pose, so its covariance must not change; a filter
     that linearizes at each new estimate shrinks it. After Julier & Uhlmann, "A counter example to
     the theory of simultaneous localization and map building", ICRA 2001; the figures are ours.
     """

@@ -31,7 +31,7 @@ _LANDMARKS = (
 
 
 def webmap(steps: int | None = None, loops: int = 2) -> Scenario:
-    """A steered car drives loops of 340 m among 36 landmarks, of which it sees those ahead.
+    """A steered car drives loops of 340 m among 36 landmarks, and sees those ahead.
 
     After Bailey, Nieto, Guivant, Stevens, Nebot, "Consistency of the EKF-SLAM Algorithm", IROS
     2006, and Bailey's simulator: 3 m/s, wheelbase 4 m, steering within ±30° and 20 °/s; a control
@@ -97,7 +97,7 @@ def _drive(steps: int | None, loops: int) -> tuple[np.ndarray, np.ndarray]:
     """The steering (n,) and the poses (n+1, 3) of whole scans: `steps`, or all that `loops` take.
 
     From the first waypoint, along the chord of its neighbours, the car steers for the next one, and
-    for the one after it when within 1 m. A loop ends within 1 m of the first waypoint.
+    for the next one when within 1 m. A loop ends within 1 m of the first waypoint.
     """
     (x, y), before, after = _WAYPOINTS[0], _WAYPOINTS[-1], _WAYPOINTS[1]
     theta = math.atan2(after[1] - before[1], after[0] - before[0])

@@ -21,11 +21,11 @@ _CELL, _ORIGIN = 0.5, (-17.03, -14.11, 0.2)
 _WIDTH = 6.0
 _HEADINGS = (0.0, 1e-9, -1e-9, np.pi, np.pi - 1e-9, 1e-9 - np.pi, np.pi / 2)
 _CORNER = 2.0
-"""Beams of the trial end at least so far from a corner [m], and so near another wall's line."""
+"""Least distance of a trial beam's end from a corner [m], and from another wall's line."""
 
 
 def beam_function(model: BeamModel) -> Function:
-    """The log-densities of eight beams by the pose and the ranges, with the model's own Jacobian.
+    """The log-densities of eight beams by the pose and the ranges, with the Jacobian of the model.
 
     In a room of four slanted walls, near which the share of a cell that is solid falls off
     linearly, over cells: there bilinear interpolation has no error, so that a right derivative and

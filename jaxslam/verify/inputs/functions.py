@@ -37,7 +37,7 @@ def as_claim(claim: PyTree) -> PyTree:
 def split_claim(
     claim: PyTree, rows: int, names: Sequence[str], sizes: Sequence[int]
 ) -> list[PyTree]:
-    """A claimed Jacobian split by argument, None where there is no claim.
+    """A claimed Jacobian split by argument, None without a claim.
 
     Args:
         claim: as from `as_claim`: arrays, or their shapes, with any number of leading axes.
@@ -131,8 +131,8 @@ def motion_functions(motion: Motion) -> tuple[Function]:
     return (Function("step", motion.step, arguments, POSE, motion.jacobians),)
 
 
-def told_signatures(model: Motion | Sensor) -> Motion | Sensor:
-    """The model, with methods that cannot take their arguments replaced by ones that say so."""
+def with_signature_errors(model: Motion | Sensor) -> Motion | Sensor:
+    """The model, with methods of a wrong signature replaced by methods that raise its error."""
     names = (
         {"step": "pose, u, w"}
         if isinstance(model, Motion)
@@ -145,11 +145,11 @@ def told_signatures(model: Motion | Sensor) -> Motion | Sensor:
 
         return refuse
 
-    told = copy.copy(model)
+    renamed = copy.copy(model)
     for field, taken in names.items():
         if (got := unfit_signature(getattr(model, field), taken.count(",") + 1)) is not None:
-            set_field(told, field, refusing(f"{field} takes ({taken}), got a function of {got}"))
-    return told
+            set_field(renamed, field, refusing(f"{field} takes ({taken}), got a function of {got}"))
+    return renamed
 
 
 def sensor_functions(sensor: Sensor) -> tuple[Function, Function]:
@@ -231,7 +231,7 @@ def plain_function(
     shapes = [np.shape(table) for table in (() if states is None else states)]
     if len(shapes) == len(parameters) and all(len(shape) == 2 for shape in shapes):
         pairs = zip(parameters, shapes, strict=True)
-        named |= {p: _numbered(p, shape[1]) for p, shape in pairs if named[p] is None}
+        named |= {p: _number_names(p, shape[1]) for p, shape in pairs if named[p] is None}
     known = {p: entries for p, entries in named.items() if entries is not None}
     if missing := [p for p in named if p not in known]:
         raise ValueError(
@@ -260,13 +260,13 @@ def _entries(
     if entries is None:
         return None
     if isinstance(entries, int):
-        return _numbered(parameter, entries)
+        return _number_names(parameter, entries)
     if isinstance(entries, str) or not all(isinstance(entry, str) for entry in entries):
         raise ValueError(f"{name}: {parameter}: expected a tuple of names, got {entries!r}")
     return tuple(entries)
 
 
-def _numbered(parameter: str, count: int) -> tuple[str, ...]:
+def _number_names(parameter: str, count: int) -> tuple[str, ...]:
     return tuple(f"{parameter}[{k}]" for k in range(count))
 
 

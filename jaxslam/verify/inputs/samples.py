@@ -15,7 +15,7 @@ Values: TypeAlias = Float[np.ndarray, "_ _"]
 """States (S, n) of one argument."""
 
 FAR = 1e5
-"""Distance from the origin, as of survey coordinates [m]."""
+"""Distance from the origin of survey coordinates [m]."""
 _OUT_OF_SIGHT = 16.0
 """Distance from the robot to a far landmark, along each axis [m]."""
 _NEAR = 2.0**-10
@@ -56,7 +56,7 @@ def argument_samples(arguments: tuple[Argument, ...], count: int, seed: int) -> 
     for k, argument in enumerate(arguments):
         groups += list(_one_at_a_time(base, k, argument))
         if not _is_place(argument):
-            groups.append((f"zero {argument.name}", _replaced(base, k, 0.0 * base[k][:4], 4)))
+            groups.append((f"zero {argument.name}", _replace(base, k, 0.0 * base[k][:4], 4)))
     others = [k for k, argument in enumerate(arguments) if not _is_place(argument)]
     if len(others) > 1:
         still = tuple(a[:2] * (k not in others) for k, a in enumerate(base))
@@ -64,13 +64,13 @@ def argument_samples(arguments: tuple[Argument, ...], count: int, seed: int) -> 
     places = [k for k, argument in enumerate(arguments) if _is_place(argument)]
     if places:
         shift = np.zeros((2, 2)) + [[FAR, -FAR], [-FAR, FAR]]
-        groups.append((LARGE, tuple(_shifted(base, places, shift))))
+        groups.append((LARGE, tuple(_shift(base, places, shift))))
     for k in places[1:]:
         for distance in (_NEAR, 2.0**-4):
             close = base[k][:2].copy()
             close[:, :2] = base[places[0]][:2, :2] + distance * np.array([[1, 0.5], [-0.25, 1]])
-            groups.append((f"{arguments[k].name} close", _replaced(base, k, close, 2)))
-    return _concatenated(groups)
+            groups.append((f"{arguments[k].name} close", _replace(base, k, close, 2)))
+    return _concatenate(groups)
 
 
 def coincident(
@@ -80,11 +80,11 @@ def coincident(
     state = [table[0].copy() for table in samples.values]
     places = [k for k, argument in enumerate(arguments) if _is_place(argument)]
     for k in places:
-        there = [entry.copy() for entry in state]
+        moved = [entry.copy() for entry in state]
         alone = k == places[0]
-        there[k][:2] = 0.0 if alone else state[places[0]][:2]
+        moved[k][:2] = 0.0 if alone else state[places[0]][:2]
         where = "the origin" if alone else f"the {arguments[places[0]].name}"
-        yield f"{arguments[k].name} at {where}", tuple(there)
+        yield f"{arguments[k].name} at {where}", tuple(moved)
 
 
 def sensor_samples(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samples]:
@@ -135,17 +135,17 @@ def sensor_samples(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samp
             near = np.asarray(place(pose[few], seen, s[few] * scale), np.float64)
             if np.isfinite(near).all():  # else `invert` fails, which another check reports
                 groups.append((label, (pose[few], near)))
-    there = np.array([[FAR, -FAR], [-FAR, FAR]])
+    corners = np.array([[FAR, -FAR], [-FAR, FAR]])
     away = pose[:2].copy()
-    away[:, :2] += there
+    away[:, :2] += corners
     groups.append((LARGE, (away, at(away, away[:, :2] + offset[:2]))))
-    observed = _concatenated(groups)
+    observed = _concatenate(groups)
 
     back: list[_Group] = [("random", (pose, z, s))]
     back += list(_one_at_a_time((pose, z, s), 0, Argument("pose", POSE)))
     angular = np.isfinite(periods(sensor.measurements))
     seen = np.asarray(quick_jit(jax.vmap(sensor.observe))(*observed.values), np.float64)
-    reached = _reached(seen, periods(sensor.measurements))
+    reached = _reach(seen, periods(sensor.measurements))
     difficult = _one_at_a_time((pose, z, s), 1, Argument("measurement", sensor.measurements))
     back += [(label, part) for label, part in difficult if reached(part[1]).all()]
     zero = np.where(angular & ~reached(0 * z[few]), z[few], 0.0)
@@ -153,7 +153,7 @@ def sensor_samples(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samp
     if len(mean):
         back.append(("free coordinates zero", (pose[few], z[few], 0 * s[few])))
     back.append((LARGE, (away, z[:2], s[:2])))
-    return observed, _concatenated(back)
+    return observed, _concatenate(back)
 
 
 def given_inverse(sensor: Sensor, given: Samples, drawn: Samples) -> Samples:
@@ -166,7 +166,7 @@ def given_inverse(sensor: Sensor, given: Samples, drawn: Samples) -> Samples:
     return Samples((given.values[0], z, s), given.labels)
 
 
-def _reached(seen: Values, circle: Float[np.ndarray, "m"]) -> Callable[[Values], np.ndarray]:
+def _reach(seen: Values, circle: Float[np.ndarray, "m"]) -> Callable[[Values], np.ndarray]:
     """The function of measurements (B, m) -> whether each entry is one that the sensor can return.
 
     An angle is, if it is between the smallest and the largest observed one, or if these cover
@@ -222,15 +222,15 @@ def _one_at_a_time(base: tuple[Values, ...], which: int, argument: Argument) -> 
             for i, value in enumerate(hard):
                 here = tuple(a[rows[i : i + 1]] for a in base)
                 label = f"{argument.name} {name.split(' ')[0]} = {value:.4g}"
-                yield label, _replaced(here, which, moved[i : i + 1], 1)
+                yield label, _replace(here, which, moved[i : i + 1], 1)
 
 
-def _replaced(base: tuple[Values, ...], which: int, new: Values, count: int) -> tuple[Values, ...]:
+def _replace(base: tuple[Values, ...], which: int, new: Values, count: int) -> tuple[Values, ...]:
     """The first states, with another value of one argument."""
     return tuple(new[:count] if k == which else a[:count] for k, a in enumerate(base))
 
 
-def _shifted(base: tuple[Values, ...], places: list[int], shift: Values) -> Iterable[Values]:
+def _shift(base: tuple[Values, ...], places: list[int], shift: Values) -> Iterable[Values]:
     """The first states, with all poses and points shifted."""
     for k, a in enumerate(base):
         rows = a[: len(shift)].copy()
@@ -239,7 +239,7 @@ def _shifted(base: tuple[Values, ...], places: list[int], shift: Values) -> Iter
         yield rows
 
 
-def _concatenated(groups: list[_Group]) -> Samples:
+def _concatenate(groups: list[_Group]) -> Samples:
     labels = tuple(label for label, parts in groups for _ in range(len(parts[0])))
     parts = zip(*(parts for _, parts in groups), strict=True)
     return Samples(tuple(np.concatenate(part) for part in parts), labels)

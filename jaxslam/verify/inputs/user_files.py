@@ -1,4 +1,4 @@
-"""A user's own Python file: the models and hand-derived Jacobians that it defines."""
+"""A user's Python file: the models and hand-derived Jacobians that it defines."""
 
 import contextlib
 import dataclasses
@@ -125,7 +125,7 @@ def verify_file(target: str, verify_one: Callable[..., Report]) -> list[Report]:
     reports, unusable = [], []
     for one in targets:
         try:
-            reports.append(_verified(one, verify_one))
+            reports.append(_verify(one, verify_one))
         except ValueError as error:
             unusable.append(str(error))
             check = Check("can be verified", False, str(error))
@@ -135,7 +135,7 @@ def verify_file(target: str, verify_one: Callable[..., Report]) -> list[Report]:
     return [dataclasses.replace(reports[0], notes=(*notes, *reports[0].notes)), *reports[1:]]
 
 
-def _verified(target: _Target, verify_one: Callable[..., Report]) -> Report:
+def _verify(target: _Target, verify_one: Callable[..., Report]) -> Report:
     """The report on a target, with a check that it prints nothing, since it must be pure."""
     with _recorded_prints() as printed:
         report = verify_one(
@@ -159,7 +159,7 @@ def _verified(target: _Target, verify_one: Callable[..., Report]) -> Report:
 def split_target(target: str) -> tuple[Path, str]:
     """The file and the name, or "", of FILE.py or FILE.py:NAME.
 
-    Raises UnusableFile where that is no Python file, and where it is not there.
+    Raises UnusableFile on a missing file, or one that is not Python.
     """
     file, colon, name = target.rpartition(":")
     if not colon or not file.endswith(".py"):
@@ -180,7 +180,7 @@ def import_file(path: Path) -> ModuleType:
     assert spec.loader is not None
     module = importlib.util.module_from_spec(spec)
     sys.modules[name] = module
-    sys.path.insert(0, str(path.resolve().parent))  # it may import modules beside it
+    sys.path.insert(0, str(path.resolve().parent))  # it may import neighbouring modules
     try:
         spec.loader.exec_module(module)
     except SyntaxError as error:
@@ -211,7 +211,7 @@ def names_in(module: ModuleType) -> str:
 
 
 def _target(module: ModuleType, name: str) -> _Target | None:
-    """What a name of the module stands for, or None where there is nothing to verify."""
+    """The object to verify under a name of the module, or None."""
     value = getattr(module, name)
     if isinstance(value, Motion | Sensor | Factor | BeamModel):
         return _Target(name, value)

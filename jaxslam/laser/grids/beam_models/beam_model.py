@@ -7,7 +7,7 @@ import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree
 
-from jaxslam.core.numbers import check_count, check_mount, held_array, is_concrete, shape_told
+from jaxslam.core.numbers import check_count, check_mount, held_array, is_concrete, shape_text
 from jaxslam.core.protocols import Component
 from jaxslam.core.record import set_field
 from jaxslam.core.types import Beams, JaxOrNumPy
@@ -61,18 +61,18 @@ def log_likelihood(
 ) -> Float[Array, ""]:
     """The log-likelihood of a scan at a pose (3,): exponent · Σ log p(z_k) over its valid beams.
 
-    Beams that say nothing (`Beams`) add nothing. The beams of a scan are
-    taken to be independent given the pose, which they are not: what the map lacks, or a pose
+    Beams without information (`Beams`) add nothing. The beams of a scan are
+    assumed independent given the pose, which they are not: what the map lacks, or a pose
     between two cells, spoils many of them in the same way. `every` takes each n-th beam alone, and
     an exponent below 1 tempers the likelihood; both make it wider. Differentiable by pose and
     exponent; `jax.vmap` it over poses.
 
     Raises ValueError on beams that `_check_beams` refuses, a pose that is not (3,), every below 1,
-    an exponent below 0, and a grid in place of what `model.prepare` makes of it.
+    an exponent below 0, and a grid in place of the result of `model.prepare`.
     """
     _check_beams("log_likelihood", beams)
     if np.shape(pose) != (3,):
-        raise ValueError(f"log_likelihood: expected a pose (x, y, θ), got {shape_told(pose)}")
+        raise ValueError(f"log_likelihood: expected a pose (x, y, θ), got {shape_text(pose)}")
     if is_concrete(pose) and not np.all(np.isfinite(np.asarray(pose))):
         raise ValueError(f"log_likelihood: expected a finite pose, got {pose!r}")
     if is_concrete(exponent) and not np.all(np.asarray(exponent) >= 0):
@@ -92,7 +92,7 @@ def log_likelihood(
 
 
 def usable_beams(beams: Beams) -> Bool[JaxOrNumPy, "*n"]:
-    """Which beams say something, by `Beams.returns`."""
+    """Mask of the beams with information, by `Beams.returns`."""
     met, free = beams.returns()
     return met | free
 
@@ -107,8 +107,8 @@ def _check_beams(name: str, beams: object) -> None:
         raise ValueError(f"{name}: expected Beams, got {type(beams).__name__}")
     shapes = [np.shape(part) for part in beams]
     if len(shapes[0]) != 1 or len(set(shapes)) != 1:
-        told = ", ".join(shape_told(part) for part in beams)
-        raise ValueError(f"{name}: expected as many ranges, angles and masks, got {told}")
+        listed = ", ".join(shape_text(part) for part in beams)
+        raise ValueError(f"{name}: expected as many ranges, angles and masks, got {listed}")
     if not is_concrete(beams):
         return
     valid = np.asarray(beams.valid) & (np.asarray(beams.range) > 0)

@@ -35,10 +35,10 @@ def fit(
         neglects the limits [0, max_range] and [0, z*] of the two densities: Thrun, Burgard & Fox
         2005, "Probabilistic robotics", table 6.2. So λ is too large where obstacles are near.
 
-    Ranges that say nothing are left out (`Beams`).
+    Ranges without information are left out (`Beams`).
 
     Raises ValueError on lengths that differ, expected ranges that are not finite or below 0, no
-    range that says anything, a start that is no mixture, and a max_range that is not above 0.
+    range with information, an invalid start, and a max_range that is not above 0.
     """
     ranges, stars = np.asarray(z, np.float64), np.asarray(expected, np.float64)
     if ranges.ndim != 1 or ranges.shape != stars.shape or len(ranges) == 0:

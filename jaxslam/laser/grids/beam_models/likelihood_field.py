@@ -22,14 +22,14 @@ class LikelihoodField(BeamModel):
     """The beam end-point model: log(hit · N(d; 0, σ²) + random/max_range), or log of maximum.
 
     d [m] is the distance from the end of the beam to the nearest obstacle, interpolated between
-    centres of cells. A beam of max_range or more has maximum alone; where that is 0, nothing is
-    said of it (log 1). No ray is cast, so a beam through a wall costs nothing, and the density does
+    centres of cells. A beam of max_range or more has maximum alone; where that is 0, it has no
+    density (log 1). No ray is cast, so a beam through a wall costs nothing, and the density does
     not integrate to 1 over the range. Differentiable by pose, σ and weights; off the map the
     distance is that at the border.
 
     Thrun, Burgard & Fox 2005, "Probabilistic robotics", section 6.4.
 
-    Raises ValueError on numbers out of range, or a mount that is no pose.
+    Raises ValueError on numbers out of range, or an invalid mount.
     """
 
     sigma: Number = 0.1

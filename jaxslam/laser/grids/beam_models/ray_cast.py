@@ -26,7 +26,7 @@ class Mixture(NamedTuple):
     hit: Number
     """share of beams that end at the obstacle of the map, with Gaussian noise"""
     short: ArrayLike
-    """share that ends earlier, at what the map does not have"""
+    """share that ends earlier, at objects that the map does not have"""
     maximum: Number
     """share that returns nothing, and so max_range"""
     random: Number
@@ -48,7 +48,7 @@ def mixture_log_density(
 
     Below max_range: hit · N(z; z*, σ²)/Φ + short · λ exp(-λ z)/(1 - exp(-λ z*)) [z <= z*]
     + random/max_range, Φ the mass of the normal within [0, max_range]. At max_range: maximum, and
-    with it the hit where max_range is expected, since there is nothing to hit. Integral and mass
+    with it the hit where max_range is expected, because nothing can be hit. Integral and mass
     sum to 1.
 
     Thrun, Burgard & Fox 2005, "Probabilistic robotics", (6.4) to (6.12).
@@ -97,7 +97,7 @@ class RayCast(BeamModel):
 
     Differentiable by the parameters, and by the pose in the sense of `cast`, with either method.
 
-    Raises ValueError on numbers out of range, an unknown method, a mount that is no pose.
+    Raises ValueError on numbers out of range, an unknown method, an invalid mount.
     """
 
     mixture: Mixture = _USUAL
@@ -123,21 +123,21 @@ class RayCast(BeamModel):
         return ray_map(grid, method=self.method)
 
     def each(self, prepared: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
-        expected = self._expected(prepared, pose, beams)
+        expected = self._expected_range(prepared, pose, beams)
         far = jnp.asarray(self.max_range, expected.dtype)
         z = jnp.where(beams.returns(far)[1], far, beams.range)
         return mixture_log_density(self.mixture, z, expected, far)
 
     def jacobian(self, prepared: PyTree, pose: Array, beams: Beams) -> Float[Array, "B 3"]:
-        """The derivative by z*, times that of z*, for which `cast` has its own rule."""
-        expected = self._expected(prepared, pose, beams)
-        by_pose = jax.jacfwd(lambda pose: self._expected(prepared, pose, beams))(pose)
+        """The derivative by z*, times that of z*, for which `cast` has a custom rule."""
+        expected = self._expected_range(prepared, pose, beams)
+        by_pose = jax.jacfwd(lambda pose: self._expected_range(prepared, pose, beams))(pose)
         far = jnp.asarray(self.max_range, expected.dtype)
         z = jnp.where(beams.returns(far)[1], far, beams.range)
         by_range: Array = _density_slope(self.mixture, z, expected, far)
         return by_range[:, None] * jnp.asarray(by_pose)
 
-    def _expected(self, rays: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
+    def _expected_range(self, rays: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
         return cast(rays, self.frame(pose), beams.angle, self.max_range)
 
 
@@ -147,5 +147,5 @@ def check_weights(name: str, weights: dict[str, ArrayLike]) -> None:
         return
     values = np.array([float(np.asarray(value)) for value in weights.values()])
     if np.any(values < 0) or not abs(values.sum() - 1) < 1e-6:
-        told = ", ".join(f"{key} {value:g}" for key, value in zip(weights, values, strict=True))
-        raise ValueError(f"{name}: expected shares >= 0 of sum 1, got {told}")
+        listed = ", ".join(f"{key} {value:g}" for key, value in zip(weights, values, strict=True))
+        raise ValueError(f"{name}: expected shares >= 0 of sum 1, got {listed}")

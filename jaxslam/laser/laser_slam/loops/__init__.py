@@ -1,1 +1,1 @@
-"""Loop closing: candidates by place and by looks, their matches, and which of them agree."""
+"""Loop closing: candidates by position and by appearance, their matches, and their agreement."""

@@ -1,4 +1,4 @@
-"""Candidates of loops: places that the graph says may be the same, and scans that look alike.
+"""Candidates of loops: places that may be the same by the graph, and scans that look alike.
 
 Scans are compared by a descriptor that does not change when the robot turns on the spot.
 """
@@ -47,9 +47,9 @@ CANDIDATES = 3
 REACH = 3.0
 """Distance [m] between two places that share walls."""
 _PROBABILITY = 0.999
-"""Of the ellipse in which a place is sought."""
-_SAME = 15
-"""Keyframes between submaps that are taken to be of one place."""
+"""Of the search ellipse of a place."""
+_MIN_SEPARATION = 15
+"""Keyframes between submaps that count as one place."""
 
 
 class Candidates(NamedTuple):
@@ -94,14 +94,14 @@ def near(
         far = np.hypot(*(path[rest, :2] - path[keyframe, :2]).T)
         rest, far = rest[far < reach], far[far < reach]
         for place in places:
-            apart = np.abs(rest - place) >= _SAME
+            apart = np.abs(rest - place) >= _MIN_SEPARATION
             rest, far = rest[apart], far[apart]
         for _ in range(len(places), most):
             if not len(rest):
                 break
             nearest = rest[far.argmin()]
             pairs.append((nearest, keyframe))
-            apart = np.abs(rest - nearest) >= _SAME
+            apart = np.abs(rest - nearest) >= _MIN_SEPARATION
             rest, far = rest[apart], far[apart]
     return np.array(pairs, int).reshape(-1, 2)
 

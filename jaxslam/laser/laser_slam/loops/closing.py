@@ -61,7 +61,7 @@ _NARROW, _WIDE = (0.8, float(np.deg2rad(14.0))), (4.0, float(np.deg2rad(40.0)))
 """Windows of the search, [m] and [rad] to either side."""
 _SEARCHES = [search(*window, np.deg2rad(2.0)) for window in (_NARROW, _WIDE)]
 _WINDOW = np.diag(1 / np.square([_WIDE[0], *_WIDE]))
-"""Information of the window, which bounds what the walls do not tell."""
+"""Information of the window, which bounds directions that the walls do not determine."""
 
 _CONSISTENCY = 0.999
 """Probability below which two loops agree."""
@@ -117,8 +117,8 @@ def matched(
         progress()
     with ThreadPoolExecutor(os.cpu_count()) as pool:
         try:
-            for done in pool.map(of_submap, submaps[1:]):
-                for _ in range(done):
+            for results in pool.map(of_submap, submaps[1:]):
+                for _ in range(results):
                     progress()
         except BaseException:
             pool.shutdown(cancel_futures=True)
@@ -175,20 +175,20 @@ def closed(
     total = covariances.along(at, covs)
     middle = index[:: settings.submap_every]
     usable = scans.usable[keyframe] & ~odometry.doubted[keyframe]
-    ends_at, there = np.asarray(scans.points.position), np.asarray(scans.points.valid)
+    ends_at, valid = np.asarray(scans.points.position), np.asarray(scans.points.valid)
     parts = np.split(keyframe, range(ROWS, len(keyframe), ROWS))
-    looks = np.concatenate([descriptors(ends_at[some], there[some]) for some in parts])
+    looks = np.concatenate([descriptors(ends_at[some], valid[some]) for some in parts])
     graph = graph_of(at, keyframe, chain)
     solution: graphs.Solution | None = None
     tried: list[Candidates] = []
     found: list[Matches] = []
-    done: set[tuple[int, int, bool]] = set()
+    pairs_tried: set[tuple[int, int, bool]] = set()
     ends: set[tuple[int, int]] = set()
     loops, kept = _agreeing(tried, found, at, total, settings)
     left_out = max(int(usable.sum()) - MOST, 0)
     for turn in range(settings.rounds if len(keyframe) > settings.loop_gap else 0):
         path = np.asarray(graph.poses, np.float64)
-        # By the graph few places, since each pair of which the covariance is computed fills its
+        # By the graph few places, since each pair whose covariance is computed fills its
         # factor; after a first optimum the nearest ones fit a window.
         most = PLACES if turn == 0 else CANDIDATES
         reach = REACH + _WIDE[0]
@@ -198,12 +198,14 @@ def closed(
             if solution is None or not len(pairs)
             else relative_covs(solution, pairs)
         )
-        new = by_place(path, pairs, cov, done, settings, _NARROW, _WIDE)
+        new = by_place(path, pairs, cov, pairs_tried, settings, _NARROW, _WIDE)
         if turn == 0:
             new = _with(new, by_appearance(looks, middle, usable, settings))
         new, out = thinned(new)
         left_out += out
-        done |= set(zip(new.first.tolist(), new.second.tolist(), new.wide.tolist(), strict=True))
+        pairs_tried |= set(
+            zip(new.first.tolist(), new.second.tolist(), new.wide.tolist(), strict=True)
+        )
         if not len(new.first):
             break
         count = 0
@@ -256,7 +258,7 @@ def _final(
 
 
 def _with(place: Candidates, pairs: np.ndarray) -> Candidates:
-    """Candidates by looks beside those by place: at the same pose, with the wide window."""
+    """Candidates by appearance and by position: at the same pose, with the wide window."""
     known = set(zip(place.first.tolist(), place.second.tolist(), strict=True))
     new = np.array([tuple(pair) not in known for pair in pairs.tolist()], bool)
     pairs = pairs[new]

@@ -51,17 +51,17 @@ def consistent(
     out = np.zeros((count, count), bool)
     end = poses.compose(path[first], z)
     moved = poses.compose(end, poses.inverse(path[second]))
-    own = covariances.propagated(poses.adjoint(end), cov)
-    parts = path[second], end, moved, own, total[first], total[second], first, second
+    loop_cov = covariances.propagated(poses.adjoint(end), cov)
+    parts = path[second], end, moved, loop_cov, total[first], total[second], first, second
     with float64():
         tiles = [
-            _Loop(*(jnp.asarray(_filled(part[begin : begin + _TILE])) for part in parts))
+            _Loop(*(jnp.asarray(_fill(part[begin : begin + _TILE])) for part in parts))
             for begin in range(0, count, _TILE)
         ]
         for i, a in enumerate(tiles):
             for j, b in enumerate(tiles[i:], i):
                 rows, columns = (slice(k * _TILE, min((k + 1) * _TILE, count)) for k in (i, j))
-                square = np.asarray(_squared(a, b))
+                square = np.asarray(_squared_distances(a, b))
                 square = square[: rows.stop - rows.start, : columns.stop - columns.start]
                 out[rows, columns] = square < limit
     earlier = np.triu(out, 1)
@@ -69,7 +69,7 @@ def consistent(
 
 
 class _Loop(NamedTuple):
-    """What the agreement of loops needs of each, in the world's frame; see `consistent`."""
+    """The data of loops for their agreement, in the world's frame; see `consistent`."""
 
     at: Array
     """x_j, by odometry"""
@@ -77,7 +77,7 @@ class _Loop(NamedTuple):
     """x_i ∘ z"""
     moved: Array
     """g"""
-    own: Array
+    cov: Array
     """A"""
     total_first: Array
     """S_i"""
@@ -86,13 +86,13 @@ class _Loop(NamedTuple):
     second: Array
 
 
-def _filled(part: np.ndarray) -> np.ndarray:
+def _fill(part: np.ndarray) -> np.ndarray:
     """A part of the loops, its last one repeated up to the size of a tile."""
     return np.concatenate([part, np.repeat(part[-1:], _TILE - len(part), axis=0)])
 
 
 @jax.jit
-def _squared(a: _Loop, b: _Loop) -> Float[Array, "tile tile"]:
+def _squared_distances(a: _Loop, b: _Loop) -> Float[Array, "tile tile"]:
     """eᵀ Σ⁻¹ e of each loop of one tile with each of another, the first of them the earlier."""
     return jax.vmap(lambda one: jax.vmap(lambda other: _of_pair(one, other))(b))(a)
 
@@ -104,7 +104,7 @@ def _of_pair(a: _Loop, b: _Loop) -> Float[Array, ""]:
     backward = jnp.where(a.second <= b.second, 1.0, -1.0)
     first = forward * (b.total_first - a.total_first)
     second = backward * (b.total_second - a.total_second)
-    cov = a.own + b.own + first + ad @ second @ ad.T
+    cov = a.cov + b.cov + first + ad @ second @ ad.T
     # By cofactors: XLA's solver takes the matrices one by one.
     x, y, t = error
     xx, xy, xt, yy, yt, tt = (cov[i, j] for i, j in zip(*np.triu_indices(3), strict=True))

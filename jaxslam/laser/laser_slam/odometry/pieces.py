@@ -1,6 +1,6 @@
 """Laser odometry of a log, tracked in pieces side by side; and as the input of a filter.
 
-The input is the pose of each keyframe relative to the one before.
+The input is the pose of each keyframe relative to the previous one.
 """
 
 import itertools
@@ -22,8 +22,8 @@ from jaxslam.laser.laser_slam.odometry.tracking import (
     NEAR,
     NO_FLOOR,
     Odometry,
+    match_to_keyframes,
     place_unmatched,
-    tracked,
 )
 from jaxslam.laser.laser_slam.records import Settings, Solved
 from jaxslam.laser.laser_slam.scans import Scans
@@ -61,7 +61,7 @@ class MatchMotion(Motion):
 def match_controls(of: Odometry | Solved) -> Float[np.ndarray, "N 9"]:
     """The controls (N, 9) of `MatchMotion` along the N keyframes of laser odometry, in NumPy.
 
-    Row n led to keyframe n, and row 0 is no motion: with the scans of `of.keyframe` they make a
+    Row n leads to keyframe n, and row 0 has no motion: with the scans of `of.keyframe` they make a
     `Log`. Loops take no part. The filter takes noises of successive rows to be independent; matches
     that share scans are not.
 
@@ -86,7 +86,7 @@ def match_controls(of: Odometry | Solved) -> Float[np.ndarray, "N 9"]:
 
 PIECE = 400
 """Scans of a piece of a log, at least."""
-_AROUND = 5
+_MARGIN = 5
 """Scans to either side of the first of a piece in which raw odometry is right."""
 
 
@@ -104,7 +104,7 @@ def laser_odometry(
     covariances; its covariance is (H/σ² + P⁻¹)⁻¹ + floor², H the information of the lines divided
     by 2, for beams that err together.
 
-    Where fewer than 0.6 of the points meet a wall, and where raw odometry is no guess (a jump, a
+    If fewer than 0.6 of the points meet a wall, or raw odometry is unusable (a jump, a
     frozen step, one that lags), all poses are searched that the robot can have reached in that time
     (`Steps.reach`). Such a match counts if it is as good as that of a loop, no other pose is nearly
     as good, and few beams pass through the reference; about raw odometry also if it is better by
@@ -114,25 +114,26 @@ def laser_odometry(
     not: the scan is matched from the match before and from raw odometry before, and the better of
     both counts.
 
-    A scan without a match has the pose of raw odometry, is no keyframe, and is matched once more at
+    A scan without a match has the pose of raw odometry, is not a keyframe, and is matched again at
     the end, with the keyframes before and after it, from the path between its neighbours. After
     `LOST` such scans in a row the next one is a keyframe, and only keyframes since then are matched
     with; so is the first where raw odometry is frozen, but there matches that are less good count,
     too, and are in doubt.
 
     A match is in doubt that has few points on walls, or that raw odometry contradicts: it may be of
-    another place that looks the same. It stays, and is taken to be wrong with probability p = 0.1:
+    another place that looks the same. It stays, and is assumed wrong with probability p = 0.1:
     its covariance is about that of the mixture with raw odometry, C + p (P + diag(d², d², t²)),
     where d is the distance and t the turn from one to the other. So are those of the scans after
     it until the next keyframe.
 
     A log of twice `PIECE` scans or more is tracked in pieces, side by side on every core. The first
-    scan of a piece is a keyframe, and the scans of a piece see no keyframes of the one before.
+    scan of a piece is a keyframe, and its scans are not matched with keyframes of the previous
+    piece.
     """
     count = len(scans.usable)
     borders = _borders(scans, steps)
     _compile(scans, settings)
-    done, lock = itertools.count(2), threading.Lock()
+    progress_count, lock = itertools.count(2), threading.Lock()
     stopped = threading.Event()
 
     def advance() -> None:
@@ -140,11 +141,11 @@ def laser_odometry(
             raise InterruptedError
         if progress is not None:
             with lock:
-                progress(next(done), count)
+                progress(next(progress_count), count)
 
     def piece(begin: int, end: int) -> Odometry:
         rows = slice(begin, end)
-        return tracked(taken(scans, rows), taken(steps, rows), settings, advance)
+        return match_to_keyframes(taken(scans, rows), taken(steps, rows), settings, advance)
 
     # The last scan of a piece is the first of the next.
     ends = [*(borders[1:-1] + 1).tolist(), count]
@@ -164,11 +165,11 @@ def laser_odometry(
 def _borders(scans: Scans, steps: Steps) -> Int[np.ndarray, "n"]:
     """The first scan of each piece, and the number of scans.
 
-    A piece begins where raw odometry is right for some scans, as far as it tells.
+    A piece begins where raw odometry seems right for some scans.
     """
     count = len(scans.usable)
     odd = ~scans.usable | steps.unknown | steps.lags | steps.gap
-    odd = np.convolve(odd, np.ones(2 * _AROUND + 1), "same") > 0
+    odd = np.convolve(odd, np.ones(2 * _MARGIN + 1), "same") > 0
     borders = [0]
     for wanted in np.linspace(0, count, max(count // PIECE, 1) + 1)[1:-1].astype(int):
         near = np.arange(wanted - PIECE // 4, wanted + PIECE // 4)
@@ -181,7 +182,7 @@ def _borders(scans: Scans, steps: Steps) -> Int[np.ndarray, "n"]:
 def _joined(
     pieces: list[Odometry], borders: Int[np.ndarray, "n"], first: Float[np.ndarray, "3"]
 ) -> Odometry:
-    """The odometry of all scans from pieces, each of which ends where the next begins."""
+    """The odometry of all scans from pieces; each piece ends where the next begins."""
     parts = []
     for piece, begin in zip(pieces, borders[:-1].tolist(), strict=True):
         path = poses.compose(first, piece.poses)
@@ -195,7 +196,7 @@ def _joined(
 
 
 def _compile(scans: Scans, settings: Settings) -> None:
-    """Compile what the pieces share; the wider search beside them, which they may need."""
+    """Compile the programs of the pieces, and in parallel the wider search."""
     row, start = np.zeros(1, int), np.zeros((1, 3))
     reference = reference_of(scans, row, start, start[0], settings.scans_of_reference)
     rest = reference, taken(scans.points, 0), start[0], np.eye(3), NO_FLOOR, settings

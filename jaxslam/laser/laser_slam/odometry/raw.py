@@ -9,25 +9,25 @@ from jaxslam.laser.laser_slam.records import Settings
 from jaxslam.math import numpy_poses as poses
 
 FARTHEST = (3.0, float(np.deg2rad(100.0)))
-"""The longest step [m] and turn [rad] between two scans that is searched."""
-_FASTER = 1.5
-"""times the usual largest speed is faster than the robot can be"""
-_BASE = (0.03, 0.02)
+"""Largest step [m] and turn [rad] between two scans in a search."""
+_SPEED_MARGIN = 1.5
+"""Factor on the usual largest speed that the robot cannot exceed"""
+_BASE_SIGMA = (0.03, 0.02)
 """Standard deviation of a step of raw odometry, [m] and [rad]"""
-_SHARE = (0.10, 0.15, 0.05)
+_SIGMA_SHARES = (0.10, 0.15, 0.05)
 """and more of it: position by distance, heading by turn, heading by distance [rad/m]."""
-_ENOUGH = 20
-"""steps in which the robot moves, for a largest speed to be known"""
-_MOVES = (0.02, 0.02)
-"""[m], [rad] of a step in which it moves"""
-_AS_BEFORE = 0.6
-"""of the reach, by which a step that is not known differs from the one before"""
-_MUCH = (0.3, 0.35)
-"""[m], [rad]: shorter steps are not timed well enough to be called too fast"""
+_MIN_MOVING_STEPS = 20
+"""Steps with motion that determine a largest speed"""
+_MIN_MOTION = (0.02, 0.02)
+"""Least motion of such a step, [m] and [rad]"""
+_STEP_CHANGE = 0.6
+"""Change of an unknown step from the previous step, as a share of the reach"""
+_MIN_TIMED_STEP = (0.3, 0.35)
+"""[m], [rad]: the timing of shorter steps is too coarse to call them too fast"""
 
 
 class Steps(NamedTuple):
-    """The steps of raw odometry to each scan from the one before; the first is none."""
+    """The steps of raw odometry to each scan from the previous one; the first is zero."""
 
     step: Float[np.ndarray, "K 3"]
     cov: Float[np.ndarray, "K 3 3"]
@@ -45,7 +45,7 @@ class Steps(NamedTuple):
 
     @property
     def unknown(self) -> Bool[np.ndarray, "K"]:
-        """Steps of which raw odometry says nothing."""
+        """Mask of the steps without raw odometry."""
         return np.asarray(self.jump | self.frozen)
 
 
@@ -59,13 +59,13 @@ def steps_of(
     """The steps of raw odometry; σ of position and heading grow with distance and turn.
 
     The largest speed of the robot is the 95 % quantile of the speeds in the log, and 1.5 times it
-    is faster than can be. A step that is a jump, or lags, has σ of half of what the robot can have
-    gone in that time, since raw odometry may err by all of it; one that is frozen 0.6 of that,
+    is faster than possible. A step that is a jump, or lags, has σ of half of what the robot can
+    have gone in that time, since raw odometry may err by all of it; one that is frozen 0.6 of that,
     about a step like the one before. The step after one that lags is right only together with it.
 
     Args:
         time: [s] of the scans; None: no speed is known.
-        changed: whether each scan differs from the one before; None: none does.
+        changed: whether each scan differs from the previous one; None: none does.
         known: whether odometry was logged since the scan before; None: always.
     """
     step = np.zeros((len(raw), 3))
@@ -82,20 +82,20 @@ def steps_of(
     size = np.stack([np.hypot(step[:, 0], step[:, 1]), np.abs(step[:, 2])], axis=1)
     reach, lags = _by_speeds(size, duration, jump | frozen)
     usual = float(np.median(duration[duration > 0])) if (duration > 0).any() else np.inf
-    by_far, by_turn, turn_by_far = _SHARE
-    position = _BASE[0] + by_far * size[:, 0]
-    heading = _BASE[1] + by_turn * size[:, 1] + turn_by_far * size[:, 0]
+    by_far, by_turn, turn_by_far = _SIGMA_SHARES
+    position = _BASE_SIGMA[0] + by_far * size[:, 0]
+    heading = _BASE_SIGMA[1] + by_turn * size[:, 1] + turn_by_far * size[:, 0]
     cov = np.stack([position, position, heading], axis=1)[:, :, None] ** 2 * np.eye(3)
     cov[0] = 0.0
     steps = Steps(step, cov, reach, jump, frozen, lags, duration > 2.5 * usual)
     doubtful = jump | lags
     cov[doubtful] += reach_cov(reach[doubtful])
-    cov[frozen] += reach_cov(_AS_BEFORE * reach[frozen])
+    cov[frozen] += reach_cov(_STEP_CHANGE * reach[frozen])
     return steps
 
 
 def reach_cov(reach: Float[np.ndarray, "... 2"]) -> Float[np.ndarray, "... 3 3"]:
-    """The covariance of a step of which only how far it can lead is known: σ is half of that."""
+    """The covariance of a step with only a known reach: σ is half of the reach."""
     sigma = 0.5 * np.asarray(reach)[..., [0, 0, 1]]
     return np.asarray(sigma[..., None] ** 2 * np.eye(3))
 
@@ -107,12 +107,12 @@ def _by_speeds(
     reach = np.broadcast_to(FARTHEST, size.shape).copy()
     lags = np.zeros(len(size), bool)
     timed = duration > 0
-    for column, (least, much) in enumerate(zip(_MOVES, _MUCH, strict=True)):
+    for column, (least, much) in enumerate(zip(_MIN_MOTION, _MIN_TIMED_STEP, strict=True)):
         way = size[:, column]
         moves = timed & ~useless & (way > least)
-        if moves.sum() < _ENOUGH:
+        if moves.sum() < _MIN_MOVING_STEPS:
             continue
-        fastest = _FASTER * np.quantile(way[moves] / duration[moves], 0.95)
+        fastest = _SPEED_MARGIN * np.quantile(way[moves] / duration[moves], 0.95)
         can = fastest * duration
         reach[timed, column] = np.minimum(FARTHEST[column], can[timed])
         # Two steps, the first too slow and the second too fast, together of usual speed.

@@ -35,13 +35,13 @@ _BLUR = 0.1
 """[m] standard deviation of the score of a point by its distance from the reference"""
 HALF = 16.0
 """[m] from the middle of a reference to the border of its grid"""
-_PEAK = 0.9
-"""A pose elsewhere of this share of the best score makes a match ambiguous."""
+_AMBIGUOUS_SHARE = 0.9
+"""Share of the best score at which another pose makes a match ambiguous."""
 
 _SECTORS = 180
 """of a turn, in which beams are compared with the reference"""
-_CLEAR = 0.4
-"""[m] by which a point lies before what a beam met, at least, to be passed through"""
+_MIN_CLEARANCE = 0.4
+"""[m] least distance of a passed point in front of the end of a beam"""
 
 
 class Reference(NamedTuple):
@@ -71,7 +71,7 @@ class ScanMatch(NamedTuple):
 
 
 def search(
-    distance: float, angle: float, turn: float, *, ambiguous: float | None = _PEAK
+    distance: float, angle: float, turn: float, *, ambiguous: float | None = _AMBIGUOUS_SHARE
 ) -> Matcher:
     """The search over a window of the reference's grid, [m] and [rad] to either side."""
     return Correlative(
@@ -91,13 +91,13 @@ def search(
 _CORRELATION = 2.0
 """Beams that err together: the information of a match is divided by it."""
 _FLOOR = (0.005, 0.005, 0.002)
-"""Standard deviations of x, y [m], θ [rad] added to each match, for what the lines miss."""
+"""Standard deviations of x, y [m], θ [rad] added to each match, for errors of the lines."""
 _OF_WALLS = IcpSettings(kernel=Cauchy(), scale=0.05, lone=0.5, iterations=10, least_condition=None)
 WALLS = PointToLine(replace(_OF_WALLS, reach=0.5))
 _NEAR_WALLS = PointToLine(replace(_OF_WALLS, reach=0.15))
 """From where `WALLS` ends: its pairs are the points that lie on walls."""
-_ANY = search(1.0, 0.5, 0.1)
-"""Whose table serves all searches, since they differ by their windows alone."""
+_TABLE_SEARCH = search(1.0, 0.5, 0.1)
+"""Its table serves all searches, which differ only in their windows."""
 
 
 def reference_of(
@@ -113,8 +113,8 @@ def reference_of(
     points = taken(scans.points, take)
     # The last scan is repeated without its points: a reference always has as many scans.
     points = points._replace(valid=points.valid & (np.arange(size) < len(rows))[:, None])
-    there = poses.between(origin, at).astype(np.float32)
-    gathered: Reference = _gathered(points, taken(scans.surface, take), there)
+    relative = poses.between(origin, at).astype(np.float32)
+    gathered: Reference = _gather(points, taken(scans.surface, take), relative)
     return gathered
 
 
@@ -131,7 +131,7 @@ def match(
 
     Args:
         guess: pose in the frame of the reference. prior_cov: of the end of it; None: only a start.
-        floor: information added to that of the walls where there is no prior.
+        floor: information added to that of the walls without a prior.
     """
     known = floor
     prior = np.zeros((3, 3))
@@ -164,11 +164,11 @@ def match(
 
 
 @jax.jit
-def _gathered(points: Points, surface: Surface, at: Float[Array, "n 3"]) -> Reference:
+def _gather(points: Points, surface: Surface, at: Float[Array, "n 3"]) -> Reference:
     """The points (n, B) of n scans in the frame in which their poses are, as n · B of one."""
-    there = jax.vmap(transformed)(points, at), jax.vmap(surface_at)(surface, at)
-    gathered, lines = jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), there)
-    return Reference(gathered, lines, _ANY.prepare(raster(gathered, CELL, HALF)))
+    moved = jax.vmap(transformed)(points, at), jax.vmap(surface_at)(surface, at)
+    gathered, lines = jax.tree.map(lambda part: part.reshape(-1, *part.shape[2:]), moved)
+    return Reference(gathered, lines, _TABLE_SEARCH.prepare(raster(gathered, CELL, HALF)))
 
 
 @functools.partial(jax.jit, static_argnums=0)
@@ -183,10 +183,10 @@ def _match(
     """Pose, information, share of inliers, residual, whether it is ambiguous, and share of points
     that beams pass through, in one array, since each transfer from the device takes time.
 
-    information: of the prior, beside points of variance 1.
+    information: of the prior, relative to points of variance 1.
     """
     coarse = Prior(guess, _BLUR**2 * information)
-    found = matcher.match(reference.table, _thinned(scan), guess, coarse)
+    found = matcher.match(reference.table, _thin(scan), guess, coarse)
     fine = Prior(guess, sigma**2 * information)
     near: Match = WALLS.match(reference.surface, scan, found.pose, fine)
     near = _NEAR_WALLS.match(reference.surface, scan, near.pose, fine)
@@ -197,9 +197,9 @@ def _match(
 
 
 def _seen_through(reference: Points, scan: Points, pose: Array) -> Array:
-    """The share of the reference's points in view that lie before what the scan meets there.
+    """The share of the reference's points in view that lie in front of the scan's points.
 
-    At the right pose the beams of a scan pass through no wall of the reference, but for what has
+    At the right pose the beams of a scan pass through no wall of the reference, except for what has
     moved; at a wrong one that has as many points on walls they do. By sectors of two degrees:
     points in sectors without a beam, and those behind what it met, are not in view.
     """
@@ -212,15 +212,15 @@ def _seen_through(reference: Points, scan: Points, pose: Array) -> Array:
     where = jnp.where(scan.valid, sector(scan.position), _SECTORS)
     nearest = jnp.full(_SECTORS + 1, jnp.inf, far.dtype).at[where].min(far)[:_SECTORS]
     farthest = jnp.zeros(_SECTORS + 1, far.dtype).at[where].max(far)[:_SECTORS]
-    own = (reference.position - pose[None, :2]) @ se2.rotation(pose[2])
-    r, at = jnp.sqrt((own**2).sum(axis=1)), sector(own)
+    in_frame = (reference.position - pose[None, :2]) @ se2.rotation(pose[2])
+    r, at = jnp.sqrt((in_frame**2).sum(axis=1)), sector(in_frame)
     met = reference.valid & jnp.isfinite(nearest[at])
-    before = met & (r < nearest[at] - _CLEAR - 0.02 * r)
+    before = met & (r < nearest[at] - _MIN_CLEARANCE - 0.02 * r)
     in_view = met & (r < farthest[at] + 0.2)
     return (before.sum() / jnp.maximum(in_view.sum(), 1)).astype(far.dtype)
 
 
-def _thinned(of: Points) -> Points:
+def _thin(of: Points) -> Points:
     """Every second point."""
     return Points(*(part[::2] for part in of))
 

@@ -24,7 +24,7 @@ from jaxslam.math import numpy_poses as poses
 NEAR = search(0.6, np.deg2rad(22.0), np.deg2rad(2.0), ambiguous=None)
 """About raw odometry."""
 FAR = search(*FARTHEST, np.deg2rad(2.5))
-"""Where that finds little, or raw odometry is no guess."""
+"""The wider search, if the first finds little, or raw odometry is unusable."""
 _INFLATION = 16.0
 """Of raw odometry's covariance in the wider search."""
 _KEY_TURN = 0.35
@@ -42,9 +42,9 @@ _MAX_THROUGH = 0.15
 _MAX_THROUGH_LIKELY = 0.4
 """The same about raw odometry, and where that is frozen: a pose without a match would be farther
 off than most wrong matches, so these are taken, and are in doubt."""
-_GATE = 30.66
+_DOUBT_GATE = 30.66
 """χ² of three degrees of freedom at 1 - 1e-6: a match farther from raw odometry is in doubt."""
-_WRONG = 0.1
+_DOUBT_PROBABILITY = 0.1
 """Probability that a match in doubt is of another place."""
 LOST = 6
 """Scans in a row without a match after which the next one is a keyframe without one."""
@@ -56,7 +56,7 @@ class Odometry(NamedTuple):
 
     poses: Float[np.ndarray, "K 3"]
     base: Int[np.ndarray, "K"]
-    """the keyframe before each scan; of a keyframe, the one before it"""
+    """the keyframe before each scan; for a keyframe, the previous one"""
     z: Float[np.ndarray, "K 3"]
     """the scan's pose in the frame of its base"""
     cov: Float[np.ndarray, "K 3 3"]
@@ -65,16 +65,16 @@ class Odometry(NamedTuple):
     """the same as if no match were in doubt"""
     keyframe: Int[np.ndarray, "N"]
     matched: Bool[np.ndarray, "K"]
-    """false where z is raw odometry alone"""
+    """false where z is raw odometry"""
     doubted: Bool[np.ndarray, "K"]
     """matched, but far from raw odometry, or with few points on walls"""
     inliers: Float[np.ndarray, "K"]
-    """share of the points on walls, 0 where none were matched"""
+    """share of the points on walls, 0 without a match"""
     residual: Float[np.ndarray, "K"]
     """[m] root mean square of their distances from these"""
 
 
-def tracked(
+def match_to_keyframes(
     scans: Scans, steps: Steps, settings: Settings, advance: Callable[[], object]
 ) -> Odometry:
     """The odometry of a piece of a log, from the pose zero, as `laser_odometry` describes it."""
@@ -93,7 +93,7 @@ def tracked(
     )
     keys, since = [0], 0  # since: the keyframe from which on scans are matched with
     reference = _reference_of_last(scans, keys, result.poses, settings)
-    # Of the last scan, relative to the last keyframe; doubt is what is added to its covariance.
+    # Of the last scan, relative to the last keyframe; doubt is added to its covariance.
     z, cov, doubt = np.zeros(3), np.zeros((3, 3)), np.zeros((3, 3))
     missed, blind, last = 0, False, np.zeros(3)
     # Pose and covariance by raw odometry from before a step that lags, for the step after it.
@@ -123,18 +123,20 @@ def tracked(
             )
             found = _matched(reference, points, guess, prior, steps.reach[scan], how, settings)
             if other is not None and not steps.unknown[scan]:
-                there = poses.compose(other[0], step)
+                prediction = poses.compose(other[0], step)
                 wide = covariances.composed_cov(other[1], step, step_cov)
-                back = _matched(reference, points, there, wide, steps.reach[scan], how, settings)
+                back = _matched(
+                    reference, points, prediction, wide, steps.reach[scan], how, settings
+                )
                 if back.accepted and back.quality > found.quality:
-                    found, guess, prior = back, there, wide
+                    found, guess, prior = back, prediction, wide
             result.inliers[scan] = found.inliers
             result.residual[scan] = found.residual
         if found is not None and found.accepted:
             result.matched[scan] = True
             z, cov = found.pose, found.cov
             off = poses.between(guess, z)
-            contradicted = off @ np.linalg.solve(found.prior, off) > _GATE
+            contradicted = off @ np.linalg.solve(found.prior, off) > _DOUBT_GATE
             doubted = bool(contradicted or not found.sure)
             if steps.frozen[scan]:
                 other = (begin, begin_cov) if other is None else other
@@ -175,7 +177,7 @@ def tracked(
     return result._replace(keyframe=np.array(keys))
 
 
-class _Found(NamedTuple):
+class _Search(NamedTuple):
     """A match with raw odometry as its prior."""
 
     pose: Float[np.ndarray, "3"]
@@ -186,7 +188,7 @@ class _Found(NamedTuple):
     residual: float
     accepted: bool
     sure: bool
-    """else it is in doubt"""
+    """otherwise it is in doubt"""
     quality: float
 
 
@@ -196,7 +198,7 @@ class _How(NamedTuple):
     gap: bool
     """it is long after the scan before"""
     unknown: bool
-    """it is no guess"""
+    """it is unusable as a guess"""
     frozen: bool
     """so are most likely those after it"""
 
@@ -209,7 +211,7 @@ def _matched(
     reach: Float[np.ndarray, "2"],
     how: _How,
     settings: Settings,
-) -> _Found:
+) -> _Search:
     """The match of a scan about raw odometry, or over all that the robot can have reached."""
 
     def by(matcher: Matcher, prior: np.ndarray) -> ScanMatch:
@@ -227,13 +229,13 @@ def _matched(
             bound = reach_cov(reach)
             wide = by(FAR, _INFLATION * prior + bound)
             better = _sure(wide, settings) and _quality(wide) > _quality(fit) + _MIN_GAIN
-            if better and _reached(wide, guess, prior, reach):
+            if better and _within_reach(wide, guess, prior, reach):
                 fit = wide
                 prior = prior + bound if how.gap else prior
         accepted = fit.inliers >= least and fit.through <= _MAX_THROUGH_LIKELY
         sure = fit.inliers >= _MIN_INLIERS
     parts = fit.pose, fit.cov, prior, fit.inliers, fit.residual
-    return _Found(*parts, accepted, sure, _quality(fit))
+    return _Search(*parts, accepted, sure, _quality(fit))
 
 
 def _sure(fit: ScanMatch, settings: Settings) -> bool:
@@ -242,13 +244,13 @@ def _sure(fit: ScanMatch, settings: Settings) -> bool:
     return good and not fit.ambiguous
 
 
-def _reached(
+def _within_reach(
     fit: ScanMatch,
     guess: Float[np.ndarray, "3"],
     prior: Float[np.ndarray, "3 3"],
     reach: Float[np.ndarray, "2"],
 ) -> bool:
-    """Whether raw odometry is off by no more than the robot can have gone, and 2 σ of its own."""
+    """Whether raw odometry is off by no more than the robot's reach plus 2 σ of raw odometry."""
     off, sigma = poses.between(guess, fit.pose), np.sqrt(prior.diagonal())
     near = np.hypot(off[0], off[1]) <= reach[0] + 2 * sigma[:2].max()
     return bool(near and abs(off[2]) <= reach[1] + 2 * sigma[2])
@@ -271,7 +273,7 @@ def _reference_of_last(
 def place_unmatched(result: Odometry, scans: Scans, steps: Steps, settings: Settings) -> None:
     """Match the scans without a match with the keyframes around them, in place.
 
-    They are taken to lie in the middle of their neighbours, up to half of the way between these.
+    They are assumed midway between their neighbours, up to half the distance between these.
     The poses of the others do not change.
     """
     keys = result.keyframe
@@ -316,4 +318,4 @@ def _doubt(prior: np.ndarray, off: np.ndarray) -> np.ndarray:
     """
     at_match = covariances.propagated(covariances.turns(off[2]), prior)
     far = off[0] ** 2 + off[1] ** 2
-    return np.asarray(_WRONG * (at_match + np.diag([far, far, off[2] ** 2])))
+    return np.asarray(_DOUBT_PROBABILITY * (at_match + np.diag([far, far, off[2] ** 2])))

@@ -1,4 +1,4 @@
-"""Covariances of a match, each of the published ways, to be held against the truth."""
+"""Covariances of a match, by the published methods."""
 
 from jaxslam.laser.matching.covariance.implicit import AlongNormals, Hessian, Implicit
 from jaxslam.laser.matching.covariance.record import MatchCovariance, MatchedScans, covariance

@@ -55,11 +55,13 @@ class Implicit(MatchCovariance):
 
         def slope(of_reference: Array, of_scan: Array) -> Array:
             changed = with_ranges(reference, of_reference)
-            there = matcher.prepare(changed) if isinstance(reference, Points) else prepared
-            moved = moved_along_rays(points, of_scan)
-            by_pose: Array = jax.grad(lambda pose: matcher.cost(there, moved, pose, found))(
-                found.pose
+            changed_prepared = (
+                matcher.prepare(changed) if isinstance(reference, Points) else prepared
             )
+            moved = moved_along_rays(points, of_scan)
+            by_pose: Array = jax.grad(
+                lambda pose: matcher.cost(changed_prepared, moved, pose, found)
+            )(found.pose)
             return by_pose
 
         dtype = points.position.dtype
@@ -93,7 +95,7 @@ class AlongNormals(MatchCovariance):
     """The covariance A⁻¹ B A⁻¹, A = Σ w J Jᵀ, J = (n, n·∂(R p)/∂θ), B the noise of Σ w J e.
 
     A scan that slides along a wall finds other partners, so that the part of a residual along the
-    wall says nothing: the second derivative of point-to-point with its pairs kept counts it as
+    wall has no information: the second derivative of point-to-point with fixed pairs counts it as
     information, whatever the noise. Across the wall a change of partner matters to second order
     only (Bonnabel, Barczyk & Goulette 2016, "On the covariance of ICP-based scan-matching
     techniques", ACC). Hence n alone, for both ICPs. A range of the scan moves its residual by n·Ru,

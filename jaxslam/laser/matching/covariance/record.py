@@ -16,10 +16,10 @@ from jaxslam.math import linalg
 
 
 class MatchedScans(NamedTuple):
-    """A match with what it was made of."""
+    """A match with its inputs."""
 
     reference: Reference
-    """the one that `matcher.prepare` takes"""
+    """the argument of `matcher.prepare`"""
     points: Points
     found: Match
     start: Float[Array, "3"]
@@ -43,7 +43,7 @@ class MatchCovariance(Component):
         raise NotImplementedError
 
     def of(self, matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
-        """The covariance of a match; of one that failed it says what the prior alone does.
+        """The covariance of a match; after a failure, that of the prior alone.
 
         That is σ² Λ⁻¹ with the σ of a residual, if that is known; what no prior tells, or all
         without one, is known to a kilometre or a thousand radians. A match failed if its status is
@@ -72,8 +72,8 @@ def covariance(
     """The covariance (3, 3) of a match.
 
     With a leading axis on the start, and so on all arrays but the key, (B, 3, 3). Of a match
-    that is UNLIKE or TOO_FEW it says what the prior does, and else (1 km)² and (1000 rad)². Along
-    `found.weakest` of a DEGENERATE match add what is known of the start.
+    that is UNLIKE or TOO_FEW it is that of the prior, and otherwise (1 km)² and (1000 rad)². Along
+    `found.weakest` of a DEGENERATE match add the variance of the start.
     """
     begin = jnp.asarray(start)
     many = begin.ndim == 2
@@ -133,7 +133,7 @@ def beside_prior(found: Match, of_scans: Float[Array, "3 3"]) -> Float[Array, "3
     without a prior.
 
     D leaves what the scans determine (`Match.determined`), as the match does: along a corridor the
-    noise of normals feigns information, beside which a realistic prior is nothing.
+    noise of normals adds spurious information, which exceeds a realistic prior.
     """
     if found.prior is None:
         return of_scans
@@ -142,7 +142,7 @@ def beside_prior(found: Match, of_scans: Float[Array, "3 3"]) -> Float[Array, "3
 
 
 def with_ranges(reference: Reference, by: Float[Array, "M"]) -> Reference:
-    """The reference with its ranges changed [m], where it is of points; a grid stays."""
+    """The reference with its ranges changed [m], if it is of points; a grid is unchanged."""
     return moved_along_rays(reference, by) if isinstance(reference, Points) else reference
 
 

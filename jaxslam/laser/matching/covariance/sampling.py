@@ -49,7 +49,7 @@ class Lattice(MatchCovariance):
     window: Number = 0.3
     """[m] and"""
     turn_window: Number = 0.3
-    """[rad]: standard deviations of a prior, beside that of the match"""
+    """[rad]: standard deviations of a prior, in addition to that of the match"""
     steps: int = static(default=13)
     """along each axis"""
 
@@ -92,8 +92,8 @@ class Unscented(MatchCovariance):
     """The covariance of what six starts lead to, plus `Implicit` of the noise of the ranges.
 
     The starts are start ± √3 L_k, L Lᵀ = start_cov, with weights 1/6 each: Σ (x_k - x̂)(x_k - x̂)ᵀ/6.
-    It sees wrong minima and directions that the scans do not determine, where a match stays as far
-    off as it began. Brossard, Bonnabel & Barrau 2020, "A new approach to 3D ICP covariance
+    It includes wrong minima and directions that the scans do not determine, where a match stays as
+    far off as it began. Brossard, Bonnabel & Barrau 2020, "A new approach to 3D ICP covariance
     estimation", IEEE Robotics and Automation Letters 5, which adds the bias of the sensor.
     """
 
