@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-import pytest
+from refusals import refused
 
 import jaxslam
 from jaxslam import association, filters, motion, sensors
@@ -108,23 +108,20 @@ def nothing(p, x):
     return of(x, p[0] ** 2 + 0 * x, fused=False)
 
 
-@pytest.mark.parametrize(
-    ("info", "start", "options", "reason"),
-    [
-        (gated, [0.5], {}, "expected the same measurements at all parameters, got "),
-        (nothing, [0.5], {}, "expected fused measurements, got none at parameters"),
-        (scatter, [np.nan, 1], {}, "expected a start of shape"),
-        (scatter, [0.0, 1], {}, r"expected standard deviations above 0"),
-        (scatter, [1.0, 1], {"guess": [1.0]}, "expected a guess of shape"),
-        (scatter, [1.0, 1], {"names": ["a"]}, "expected 2 names and deviations"),
-        (scatter, [1.0, 1], {"iterations": 0}, "iterations: expected an integer >= 1"),
-        (scatter, [1.0, 1], {"tolerance": 0}, "expected a tolerance above 0"),
-        (scatter, [1e-200, 1], {}, "the likelihood or its gradient is not finite"),
-    ],
+@refused(
+    (gated, [0.5], {}, "expected the same measurements at all parameters, got "),
+    (nothing, [0.5], {}, "expected fused measurements, got none at parameters"),
+    (scatter, [np.nan, 1], {}, "expected a start of shape"),
+    (scatter, [0.0, 1], {}, r"expected standard deviations above 0"),
+    (scatter, [1.0, 1], {"guess": [1.0]}, "expected a guess of shape"),
+    (scatter, [1.0, 1], {"names": ["a"]}, "expected 2 names and deviations"),
+    (scatter, [1.0, 1], {"iterations": 0}, "iterations: expected an integer >= 1"),
+    (scatter, [1.0, 1], {"tolerance": 0}, "expected a tolerance above 0"),
+    (scatter, [1e-200, 1], {}, "the likelihood or its gradient is not finite"),
+    told="fit_noise: .*",
 )
-def test_bad_input_is_named(info, start, options, reason):
-    with pytest.raises(ValueError, match=f"fit_noise: .*{reason}"):
-        fit_noise(info, start, X, **options)
+def test_bad_input_is_named(info, start, options):
+    fit_noise(info, start, X, **options)
 
 
 TRUE = np.array([0.02, 0.01, 0.05, 0.02])

@@ -10,6 +10,7 @@ import scipy.optimize
 import worlds
 from reference import ekf_slam
 from reference import graph as plain
+from refusals import refused
 
 from jaxslam import graphs, motion, sensors, simulate
 from jaxslam.core.types import Log, Scan
@@ -251,33 +252,25 @@ def _log(**change):
     return Log(change.pop("control", log.control), log.scan._replace(**change))
 
 
-@pytest.mark.parametrize(
-    ("change", "options", "message"),
-    [
-        ({"control": np.ones((STEPS, 2))}, {"motion": motion.Increment(np.eye(2))}, "give slack"),
-        ({}, {"slack": -1.0}, "expected slack to be a finite number >= 0, got -1.0"),
-        ({}, {"motion": motion.Odometry(np.diag([1.0, 0, 1]))}, "odometry is singular at row 0"),
-        ({"control": np.tile([0.1, 0, 0.1], (STEPS, 1))}, {}, "all directions at row 0"),
-        ({}, {"sensor": sensors.RangeBearing(np.diag([1.0, 0]))}, "range_bearing is singular"),
-        ({}, {"pose_cov": np.diag([1.0, 0, 1])}, "pose_cov is singular; expected zero"),
-        ({}, {"pose": np.zeros(2)}, r"expected a pose of shape \(3,\), got \(2,\)"),
-        ({}, {"capacity": 3}, "expected tags below 3, the capacity, got 3"),
-        ({}, {"pose": np.full(3, np.nan)}, "the pose is not finite"),
-        ({}, {"tags": np.zeros((STEPS, 6))}, "expected tags to be integers, got float64"),
-        ({}, {"tags": np.zeros((2, 2), int)}, r"expected tags of shape \(8, 6\)"),
-        ({"tag": np.full((STEPS, 6), -1)}, {}, "has no identity: give tags="),
-        ({"valid": np.zeros((STEPS, 6), bool)}, {}, "no measurement of a landmark"),
-        (
-            {},
-            {"sensor": sensors.Suite(((sensors.RangeBearing(np.eye(2)), 6),))},
-            "expected one sensor",
-        ),
-    ],
+@refused(
+    ({"control": np.ones((STEPS, 2))}, {"motion": motion.Increment(np.eye(2))}, "give slack"),
+    ({}, {"slack": -1.0}, "expected slack to be a finite number >= 0, got -1.0"),
+    ({}, {"motion": motion.Odometry(np.diag([1.0, 0, 1]))}, "odometry is singular at row 0"),
+    ({"control": np.tile([0.1, 0, 0.1], (STEPS, 1))}, {}, "all directions at row 0"),
+    ({}, {"sensor": sensors.RangeBearing(np.diag([1.0, 0]))}, "range_bearing is singular"),
+    ({}, {"pose_cov": np.diag([1.0, 0, 1])}, "pose_cov is singular; expected zero"),
+    ({}, {"pose": np.zeros(2)}, r"expected a pose of shape \(3,\), got \(2,\)"),
+    ({}, {"capacity": 3}, "expected tags below 3, the capacity, got 3"),
+    ({}, {"pose": np.full(3, np.nan)}, "the pose is not finite"),
+    ({}, {"tags": np.zeros((STEPS, 6))}, "expected tags to be integers, got float64"),
+    ({}, {"tags": np.zeros((2, 2), int)}, r"expected tags of shape \(8, 6\)"),
+    ({"tag": np.full((STEPS, 6), -1)}, {}, "has no identity: give tags="),
+    ({"valid": np.zeros((STEPS, 6), bool)}, {}, "no measurement of a landmark"),
+    ({}, {"sensor": sensors.Suite(((sensors.RangeBearing(np.eye(2)), 6),))}, "expected one sensor"),
 )
-def test_bad_input_is_refused(change, options, message):
+def test_bad_input_is_refused(change, options):
     here = world()
     given = {"motion": here.motion, "sensor": here.sensor, "pose": START, "pose_cov": START_COV}
     given |= options
     models = [given.pop(key) for key in ("motion", "sensor", "pose", "pose_cov")]
-    with pytest.raises(ValueError, match=message):
-        graphs.of_log(_log(**change), *models, **given)
+    graphs.of_log(_log(**change), *models, **given)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from refusals import refused
 from worlds import narrow
 
 from jaxslam import life, motion, run, sensors, slots
@@ -236,17 +237,13 @@ def test_what_is_no_manager_is_refused():
         EkfSlam(MOTION, SENSOR, 3, life=life.Existence)
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"detected": 1.0}, "detected"),
-        ({"detected": 0.1, "false": 0.2}, "detected"),
-        ({"confirm": 0.4}, "confirm"),
-        ({"remove": 0.0}, "remove"),
-        ({"patience": 0}, "patience"),
-        ({"spread": 0.0}, "spread"),
-    ],
+@refused(
+    ({"detected": 1.0}, "detected"),
+    ({"detected": 0.1, "false": 0.2}, "detected"),
+    ({"confirm": 0.4}, "confirm"),
+    ({"remove": 0.0}, "remove"),
+    ({"patience": 0}, "patience"),
+    ({"spread": 0.0}, "spread"),
 )
-def test_refusals(options, message):
-    with pytest.raises(ValueError, match=message):
-        life.Existence(always, **options)
+def test_refusals(options):
+    life.Existence(always, **options)

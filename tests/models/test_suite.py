@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from own_models import changed
+from refusals import refused
 from worlds import draw, ring
 
 import jaxslam
@@ -233,37 +234,33 @@ def signature():
     return sensors.RangeBearingSignature(np.diag([0.1, 0.1, 0.1]) ** 2)
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: Suite(()), "at least one sensor"),
-        (lambda: Suite((EYES,)), "expected a Part or"),
-        (lambda: Suite(((EYES, 0),)), "places of range_bearing"),
-        (lambda: Suite((Part(EYES, 1, every=0),)), "every of range_bearing"),
-        (lambda: Suite((Part(EYES, 1, start=-1),)), "a start of at least 0"),
-        (lambda: Suite((Part(EYES, 1, sees="birds"),)), 'sees "landmarks"'),
-        (lambda: Suite(((COMPASS, 2),)), "expected places=1 of the absolute sensor compass, got 2"),
-        (lambda: Suite(((Suite(((EYES, 1),)), 1),)), "Part: expected one Sensor, got Suite"),
-        (lambda: Suite(((EYES, 1), (signature(), 1))), "expected sensors that share landmarks"),
-        (lambda: world(places=3), "each Part has its own places"),
-        (lambda: world(spurious=Spurious()), "each Part has its own places"),
-        (
-            lambda: EkfSlam(ring().motion, world().sensor, 6, linearize=linearize.Observability()),
-            "needs a suite without absolute sensors, not .*: choose linearize.AtEstimate",
-        ),
-        (
-            lambda: filters.CompressedEkfSlam(EkfSlam(ring().motion, world().sensor, 6), area=3),
-            "a suite is not supported",
-        ),
-        (
-            lambda: Suite(((EYES, 1),)).observe(jnp.zeros(3), jnp.zeros(2)),
-            "a suite has no model of its own",
-        ),
-    ],
+@refused(
+    (lambda: Suite(()), "at least one sensor"),
+    (lambda: Suite((EYES,)), "expected a Part or"),
+    (lambda: Suite(((EYES, 0),)), "places of range_bearing"),
+    (lambda: Suite((Part(EYES, 1, every=0),)), "every of range_bearing"),
+    (lambda: Suite((Part(EYES, 1, start=-1),)), "a start of at least 0"),
+    (lambda: Suite((Part(EYES, 1, sees="birds"),)), 'sees "landmarks"'),
+    (lambda: Suite(((COMPASS, 2),)), "expected places=1 of the absolute sensor compass, got 2"),
+    (lambda: Suite(((Suite(((EYES, 1),)), 1),)), "Part: expected one Sensor, got Suite"),
+    (lambda: Suite(((EYES, 1), (signature(), 1))), "expected sensors that share landmarks"),
+    (lambda: world(places=3), "each Part has its own places"),
+    (lambda: world(spurious=Spurious()), "each Part has its own places"),
+    (
+        lambda: EkfSlam(ring().motion, world().sensor, 6, linearize=linearize.Observability()),
+        "needs a suite without absolute sensors, not .*: choose linearize.AtEstimate",
+    ),
+    (
+        lambda: filters.CompressedEkfSlam(EkfSlam(ring().motion, world().sensor, 6), area=3),
+        "a suite is not supported",
+    ),
+    (
+        lambda: Suite(((EYES, 1),)).observe(jnp.zeros(3), jnp.zeros(2)),
+        "a suite has no model of its own",
+    ),
 )
-def test_bad_input(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
+def test_bad_input(make):
+    make()
 
 
 def test_absolute_sensors_alone_in_both_precisions():

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
+from refusals import refused
 
 from jaxslam import association, life, monte_carlo, run, sensors, simulate
 from jaxslam.consistency.measures.associations import associations, identities
@@ -79,21 +80,17 @@ def test_nothing_wrong_leaves_the_scan_alone():
     assert log.scan.valid.all()
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"missed": 1.5}, "missed"),
-        ({"mislabelled": -0.1}, "mislabelled"),
-        ({"clutter": -1.0, "reach": 1.0}, "clutter"),
-        ({"clutter": 1.0}, "reach"),
-        ({"outliers": 0.1}, "reach"),
-        ({"reach": np.nan}, "reach"),
-        ({"clutter": 1.0, "reach": np.inf}, "reach"),
-    ],
+@refused(
+    ({"missed": 1.5}, "missed"),
+    ({"mislabelled": -0.1}, "mislabelled"),
+    ({"clutter": -1.0, "reach": 1.0}, "clutter"),
+    ({"clutter": 1.0}, "reach"),
+    ({"outliers": 0.1}, "reach"),
+    ({"reach": np.nan}, "reach"),
+    ({"clutter": 1.0, "reach": np.inf}, "reach"),
 )
-def test_refusals(options, message):
-    with pytest.raises(ValueError, match=message):
-        Spurious(**options)
+def test_refusals(options):
+    Spurious(**options)
 
 
 def test_associations_are_counted_by_what_a_slot_was_born_of():

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from reference.team import Team
+from refusals import refused
 from worlds import draw, judged, narrow, nees, ring
 
 import jaxslam
@@ -380,34 +381,30 @@ def signs():
     return team.Robot(motion.Increment(Q), Suite(((sensor, 1),)))
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: TeamSlam([], 3), "at least one robot"),
-        (lambda: TeamSlam([ring()], 3), "expected a team.Robot"),
-        (lambda: TeamSlam(crew(2)[::-1], 3), "expected no start of robot 0"),
-        (lambda: TeamSlam(crew(2), 3, tags=(7, 7)), "2 different tags"),
-        (lambda: TeamSlam(crew(2), 3, tags=(7,)), "2 different tags"),
-        (lambda: TeamSlam(crew(2), 3, tags=(7, -1)), "integers >= 0"),
-        (lambda: TeamSlam(crew(2), 0), "capacity"),
-        (lambda: TeamSlam(crew(2), 3, report=2), "expected report from 0 to"),
-        (lambda: TeamSlam(crew(2), 3, gate=0.0), "gate above 0"),
-        (lambda: TeamSlam(crew(2), 3, correction="at once"), "expected correction"),
-        (lambda: TeamSlam([signs()], 3), "expected landmarks \\(x, y\\)"),
-        (lambda: TeamSlam([crew(1)[0], compass_only()], 3), "robot 1 needs a start"),
-        (
-            lambda: team.Robot(motion.Increment(Q), ring().sensor),
-            "a motion and a Suite, got Increment and RangeBearing",
-        ),
-        (lambda: dataclasses.replace(crew(1)[0], start=((0, 0), NOTHING)), "shape"),
-        (lambda: world(crew(2), tags=(3, 9)), "expected tags of robots from"),
-        (lambda: world(unknown(crew(2))), "expected a start of every robot"),
-        (lambda: world(crew(2), report=2), "expected report from 0 to"),
-    ],
+@refused(
+    (lambda: TeamSlam([], 3), "at least one robot"),
+    (lambda: TeamSlam([ring()], 3), "expected a team.Robot"),
+    (lambda: TeamSlam(crew(2)[::-1], 3), "expected no start of robot 0"),
+    (lambda: TeamSlam(crew(2), 3, tags=(7, 7)), "2 different tags"),
+    (lambda: TeamSlam(crew(2), 3, tags=(7,)), "2 different tags"),
+    (lambda: TeamSlam(crew(2), 3, tags=(7, -1)), "integers >= 0"),
+    (lambda: TeamSlam(crew(2), 0), "capacity"),
+    (lambda: TeamSlam(crew(2), 3, report=2), "expected report from 0 to"),
+    (lambda: TeamSlam(crew(2), 3, gate=0.0), "gate above 0"),
+    (lambda: TeamSlam(crew(2), 3, correction="at once"), "expected correction"),
+    (lambda: TeamSlam([signs()], 3), "expected landmarks \\(x, y\\)"),
+    (lambda: TeamSlam([crew(1)[0], compass_only()], 3), "robot 1 needs a start"),
+    (
+        lambda: team.Robot(motion.Increment(Q), ring().sensor),
+        "a motion and a Suite, got Increment and RangeBearing",
+    ),
+    (lambda: dataclasses.replace(crew(1)[0], start=((0, 0), NOTHING)), "shape"),
+    (lambda: world(crew(2), tags=(3, 9)), "expected tags of robots from"),
+    (lambda: world(unknown(crew(2))), "expected a start of every robot"),
+    (lambda: world(crew(2), report=2), "expected report from 0 to"),
 )
-def test_bad_input(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
+def test_bad_input(make):
+    make()
 
 
 def test_a_scan_with_other_places_is_refused():

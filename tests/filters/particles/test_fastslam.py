@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
+from refusals import refused
 
 from jaxslam import association, life, motion, resampling, sensors
 from jaxslam.consistency.measures.counts import counted
@@ -447,27 +448,23 @@ def test_gradients_are_finite_where_the_pose_is_known_exactly(proposal):
     np.testing.assert_array_equal(info.status[:3], [Status.FUSED] * 2 + [Status.BORN])
 
 
-@pytest.mark.parametrize(
-    ("change", "why"),
-    [
-        ({"particles": 0}, "particles: expected an integer"),
-        ({"particles": 2.5}, "particles: expected an integer"),
-        ({"capacity": 0}, "capacity: expected an integer"),
-        ({"births": 0}, "births: expected an integer"),
-        ({"proposal": "optimal"}, 'expected proposal "motion" or "measurement"'),
-        ({"threshold": 1.5}, "threshold from 0 to 1"),
-        ({"threshold": np.nan}, "threshold from 0 to 1"),
-        ({"gate": 0.0}, "gate above 0"),
-        ({"resample": "systematic"}, "resample to be a function"),
-        ({"life": "existence"}, "life to be a Life"),
-        ({"sensor": sensors.Compass(np.eye(1))}, "not a suite"),
-        (
-            {"sensor": sensors.BearingInverseDepth(np.eye(1), min_distance=1.0, to_point=0.1)},
-            "converted to points",
-        ),
-    ],
+@refused(
+    ({"particles": 0}, "particles: expected an integer"),
+    ({"particles": 2.5}, "particles: expected an integer"),
+    ({"capacity": 0}, "capacity: expected an integer"),
+    ({"births": 0}, "births: expected an integer"),
+    ({"proposal": "optimal"}, 'expected proposal "motion" or "measurement"'),
+    ({"threshold": 1.5}, "threshold from 0 to 1"),
+    ({"threshold": np.nan}, "threshold from 0 to 1"),
+    ({"gate": 0.0}, "gate above 0"),
+    ({"resample": "systematic"}, "resample to be a function"),
+    ({"life": "existence"}, "life to be a Life"),
+    ({"sensor": sensors.Compass(np.eye(1))}, "not a suite"),
+    (
+        {"sensor": sensors.BearingInverseDepth(np.eye(1), min_distance=1.0, to_point=0.1)},
+        "converted to points",
+    ),
 )
-def test_bad_input_is_refused(change, why):
+def test_bad_input_is_refused(change):
     arguments = {"motion": RING.motion, "sensor": RING.sensor, "capacity": 6, "particles": 5}
-    with pytest.raises(ValueError, match=why):
-        FastSlam(**(arguments | change))
+    FastSlam(**(arguments | change))

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
+from refusals import refused
 from test_smoothing import KEY, P0, START, arguments, linear_log, linear_world
 
 from jaxslam import motion, run, sensors, simulate
@@ -106,25 +107,21 @@ def test_float32_and_gradients(short):
     np.testing.assert_allclose(found, double, atol=2e-4)
 
 
-@pytest.mark.parametrize(
-    ("options", "why"),
-    [
-        ({"window": 0}, "window"),
-        ({"iterations": 0}, "iterations"),
-        ({"slots": 0}, "slots"),
-        ({"sensor": sensors.BearingOnly(np.eye(1))}, "as many numbers"),
-        ({"sensor": sensors.Compass(np.eye(1))}, "as many numbers"),
-        (
-            {"sensor": sensors.RangeBearingSignature(np.eye(3)), "first_estimates": True},
-            r"landmarks \(x, y\)",
-        ),
-    ],
+@refused(
+    ({"window": 0}, "window"),
+    ({"iterations": 0}, "iterations"),
+    ({"slots": 0}, "slots"),
+    ({"sensor": sensors.BearingOnly(np.eye(1))}, "as many numbers"),
+    ({"sensor": sensors.Compass(np.eye(1))}, "as many numbers"),
+    (
+        {"sensor": sensors.RangeBearingSignature(np.eye(3)), "first_estimates": True},
+        r"landmarks \(x, y\)",
+    ),
 )
-def test_what_does_not_fit_is_refused(options, why):
+def test_what_does_not_fit_is_refused(options):
     given = {"motion": worlds.ring().motion, "sensor": worlds.ring().sensor}
     given |= {"capacity": 3, "slots": 3} | options
-    with pytest.raises(ValueError, match=why):
-        FixedLag(**given)
+    FixedLag(**given)
 
 
 def test_a_scan_that_is_too_large_is_refused(short):

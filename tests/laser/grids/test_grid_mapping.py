@@ -6,6 +6,7 @@ import chex
 import jax
 import numpy as np
 import pytest
+from refusals import refused
 
 from jaxslam import grids
 from jaxslam.core.types import Beams
@@ -126,26 +127,19 @@ def test_a_map_of_a_square_room_is_that_room():
     assert said.sum() > 150
 
 
-@pytest.mark.parametrize(
-    ("change", "reason"),
-    [
-        (lambda p, b: (p[:3], b), "count: expected a pose .* for each of 20 scans"),
-        (
-            lambda p, b: (p, b._replace(angle=b.angle[:, :4])),
-            "count: expected as many ranges, angles",
-        ),
-        (lambda p, b: (p, None), "count: expected Beams, got NoneType"),
-        (
-            lambda p, b: (p, b._replace(range=b.range.tolist())),
-            "count: expected ranges, angles and masks in arrays, got list, ndarray, ndarray",
-        ),
-        (lambda p, b: (p, b._replace(valid=b.valid & False)), "count: no scan has a valid beam"),
-        (lambda p, b: (p * np.nan, b), "count: expected finite poses"),
-    ],
+@refused(
+    (lambda p, b: (p[:3], b), "count: expected a pose .* for each of 20 scans"),
+    (lambda p, b: (p, b._replace(angle=b.angle[:, :4])), "count: expected as many ranges, angles"),
+    (lambda p, b: (p, None), "count: expected Beams, got NoneType"),
+    (
+        lambda p, b: (p, b._replace(range=b.range.tolist())),
+        "count: expected ranges, angles and masks in arrays, got list, ndarray, ndarray",
+    ),
+    (lambda p, b: (p, b._replace(valid=b.valid & False)), "count: no scan has a valid beam"),
+    (lambda p, b: (p * np.nan, b), "count: expected finite poses"),
 )
-def test_bad_scans_are_refused(change, reason):
-    with pytest.raises(ValueError, match=reason):
-        counted(*change(*scans()))
+def test_bad_scans_are_refused(change):
+    counted(*change(*scans()))
 
 
 def test_a_beam_of_no_angle_is_unusable():

@@ -7,6 +7,7 @@ import jax
 import numpy as np
 import pytest
 from ring_of_rooms import FAR, SETTINGS, driven, errors
+from worlds import compilations
 
 from jaxslam import filters, laser_slam, metrics, run, sensors
 from jaxslam.cli import main
@@ -331,3 +332,23 @@ def test_relations_that_do_not_join_are_refused_before_the_work(
     assert "ring.relations: none of 2 relations, from 7.500000 s to 60.000000 s, " in told
     assert told.endswith("from 0.000000 s to 39.000000 s, within 0.0001 s at both ends")
     assert not out.exists()
+
+
+# --- A log of another size is solved by the programs of the first ---------------------------------
+
+
+def test_a_second_log_of_another_size_compiles_nothing():
+    """Other scans, beams, walls and map; the first has a step of odometry that is not known, whose
+    search a log may need or not."""
+    true, log = driven()
+    known = np.arange(len(true)) != 9
+    with compilations() as count:
+        first = laser_slam.solve(log._replace(odometry_known=known), SETTINGS)
+        before = count()
+        true, log = driven(scans=47, beams=90, seed=1, scale=1.6)
+        second = laser_slam.solve(log, SETTINGS)
+        assert count() == before
+    assert second.map.log_odds.shape != first.map.log_odds.shape
+    assert len(second.graph.poses) != len(first.graph.poses)
+    assert len(second.loops.outcome) != len(first.loops.outcome) > 0
+    assert errors(second.poses, true)[0].max() < 0.15

@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from refusals import refused
 from scanned_rooms import BEAMS, moved, pairs
 
 from jaxslam import matching, verify_jacobians
@@ -198,15 +199,11 @@ def test_the_jacobian_of_the_field_is_that_of_autodiff():
     assert report.passed, str(report)
 
 
-@pytest.mark.parametrize(
-    ("call", "reason"),
-    [
-        (lambda: covariance.Implicit(0.0), "Implicit: expected sigma above 0"),
-        (lambda: covariance.Lattice(0.1, steps=1), "Lattice: steps: expected an integer >= 3"),
-        (lambda: covariance.Unscented(0.1, np.eye(2)), "Unscented: expected a covariance"),
-        (lambda: covariance.Sampling(0.1, np.eye(3), 0), "Sampling: samples: expected"),
-    ],
+@refused(
+    (lambda: covariance.Implicit(0.0), "Implicit: expected sigma above 0"),
+    (lambda: covariance.Lattice(0.1, steps=1), "Lattice: steps: expected an integer >= 3"),
+    (lambda: covariance.Unscented(0.1, np.eye(2)), "Unscented: expected a covariance"),
+    (lambda: covariance.Sampling(0.1, np.eye(3), 0), "Sampling: samples: expected"),
 )
-def test_bad_input_is_refused(call, reason):
-    with pytest.raises(ValueError, match=reason):
-        call()
+def test_bad_input_is_refused(call):
+    call()
