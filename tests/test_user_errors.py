@@ -1,7 +1,5 @@
 """What a user gets wrong is one line that says what was expected, before anything is traced."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -28,7 +26,6 @@ from jaxslam.core.types import Log, Scan
 from jaxslam.core.validation import check_models, checked_estimate, state_and_info
 from jaxslam.filters import reporting
 from jaxslam.filters.map_management.closing import Closing
-from jaxslam.filters.map_management.loop_closure import LoopSettings
 
 MOVE = motion.PoseIncrement(np.diag([1e-4, 1e-4, 1e-6]))
 SEES = sensors.RangeBearing(np.diag([1e-2, 1e-4]))
@@ -48,12 +45,6 @@ KINDS = {
     "BatchMap": lambda m, s, **o: smoothing.BatchMap(m, s, 3, np.zeros(3), np.eye(3), **o),
     "FixedLag": lambda m, s, **o: smoothing.FixedLag(m, s, 3, 3, **o),
 }
-
-
-def one_line(caught):
-    message = str(caught.value)
-    assert "\n" not in message and len(message) < 300
-    return message
 
 
 @pytest.mark.parametrize("name", KINDS)
@@ -104,9 +95,8 @@ def test_an_association_that_was_not_called_or_is_none_is_told(name):
         (lambda prediction: None, "too many positional arguments"),
         ("known", "got str"),
     ):
-        with pytest.raises(ValueError, match=f"^{name}: expected associate to be.*{told}") as e:
+        with pytest.raises(ValueError, match=f"^{name}: expected associate to be.*{told}"):
             KINDS[name](MOVE, sensor, associate=wrong)
-        one_line(e)
 
 
 def own_sensor(**other):
@@ -162,15 +152,6 @@ def test_what_has_been_found_sound_is_not_looked_at_again():
     check_models("mine", MOVE, sensor)
     check_models("mine", MOVE, sensor)
     assert len(asked) == 1
-
-
-def test_fields_and_methods_that_are_missing_or_none_are_named():
-    with pytest.raises(ValueError, match=r"^RangeBearing: noise_cov: expected a covar.*None"):
-        dataclasses.replace(SEES, noise_cov=None)
-    with pytest.raises(ValueError, match=r"^Own: expected a method observe"):
-        sensor_of(noise_cov=lambda z: jnp.eye(2), measurements=("x [m]",))
-    with pytest.raises(ValueError, match=r"^Own: expected a field or a method noise_cov"):
-        motion_of(step=lambda pose, u, w: pose, controls=(), noises=())
 
 
 def test_names_are_tuples_of_strings():
@@ -266,34 +247,6 @@ def test_what_a_filter_of_ones_own_returns_is_told():
             checked_estimate("run: mine", wrong, real)
 
 
-def test_localization_is_named_by_its_own_name():
-    for wrong in ({"gate": 0.0}, {"iterations": 0}, {"correction": "at once"}):
-        with pytest.raises(ValueError, match=r"^Localization: "):
-            filters.Localization(MOVE, SEES, POINTS, **wrong)
-
-
-def test_a_compressed_filter_refuses_to_merge():
-    with pytest.raises(ValueError, match=r"^CompressedEkfSlam: a life is not supported"):
-        filters.CompressedEkfSlam(filters.EkfSlam(MOVE, SEES, 3, life=life.Recency()), area=2)
-    with pytest.raises(ValueError, match=r"^Merging: landmarks of compressed_ekf_slam"):
-        filters.Merging(filters.CompressedEkfSlam(filters.EkfSlam(MOVE, SEES, 3), area=2), 1.0)
-
-
-def test_closing_checks_its_options_when_it_is_made():
-    ekf = filters.EkfSlam(MOVE, SEES, 3)
-    with pytest.raises(ValueError, match=r"^Closing: expected settings to be a LoopSettings"):
-        Closing(ekf, settings={"least": 3})
-    with pytest.raises(ValueError, match=r"^LoopSettings: .*least"):
-        LoopSettings(least=2)
-    with pytest.raises(ValueError, match=r"^LoopSettings: .*drift"):
-        LoopSettings(drift=1.0)
-    assert LoopSettings().least == 5
-
-
-def test_calibration_is_reached_from_the_package():
-    assert "calibration" in jaxslam.__all__ and callable(jaxslam.calibration.calibrate)
-
-
 KEY = jax.random.key(0)
 WORLD = jaxslam.scenarios.circle(steps=3)
 EKF = filters.EkfSlam(WORLD.motion, WORLD.sensor, 2)
@@ -356,3 +309,26 @@ def run_from(pose, pose_cov=WORLD.pose_cov):
 )
 def test_what_drives_a_filter_says_what_it_expected(call):
     call()
+
+
+def compressed(**options):
+    return filters.CompressedEkfSlam(filters.EkfSlam(MOVE, SEES, 3, **options), area=2)
+
+
+@refused(
+    (lambda: filters.Localization(MOVE, SEES, POINTS, gate=0.0), "^Localization: "),
+    (lambda: filters.Localization(MOVE, SEES, POINTS, iterations=0), "^Localization: "),
+    (lambda: filters.Localization(MOVE, SEES, POINTS, correction="at once"), "^Localization: "),
+    (lambda: compressed(life=life.Recency()), "^CompressedEkfSlam: a life is not supported"),
+    (lambda: filters.Merging(compressed(), 1.0), "^Merging: landmarks of compressed_ekf_slam"),
+    (
+        lambda: Closing(filters.EkfSlam(MOVE, SEES, 3), settings={"least": 3}),
+        "^Closing: expected settings to be a LoopSettings",
+    ),
+    (
+        lambda: motion_of(step=lambda pose, u, w: pose, controls=(), noises=()),
+        "^Own: expected a field or a method noise_cov",
+    ),
+)
+def test_options_are_refused_by_the_class_that_got_them(make):
+    make()

@@ -384,40 +384,6 @@ def test_capacity_8_is_a_larger_one(logs, single):
     np.testing.assert_array_equal(roomy.final.cov[19:], np.eye(3 + 2 * capacity)[19:])
 
 
-class TestOneStep(chex.TestCase):
-    """Prediction and estimate; op by op, an update compiles for 20 s and has no branch to test."""
-
-    @chex.variants(with_jit=True, without_jit=True, with_device=True, without_device=True)
-    def test_compiled_or_not_of_host_or_device_arrays(self):
-        joint, filter = some_joint((True, False)), EkfSlam(MOTION, SENSOR, 2)
-
-        def step(joint, u):
-            joint = filter.predict(joint, u, KEY)
-            return joint, filter.estimate(joint)
-
-        u = np.array([0.1, 0.2])
-        assert_same(self.variant(step)(joint, u), jax.jit(step)(joint, u), atol=1e-13)
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        {"correction": "joint", "gate": 9.0, "births": 1},
-        {"chart": "right_invariant", "iterations": 2, "covariance": "joseph"},
-        {"chart": "right_invariant", "correction": "joint"},
-    ],
-)
-def test_float32_logs_give_float32_outputs_although_float64_is_on(logs, options):
-    chart = charts.REGISTRY[options.get("chart", "euclidean")]()
-    single = narrow(take(logs[1], 0))
-    out = jax.eval_shape(runner(5, **(options | {"chart": chart})), single)
-    kinds = {
-        leaf.dtype for leaf in jax.tree.leaves(out) if jnp.issubdtype(leaf.dtype, jnp.floating)
-    }
-    assert kinds == {np.dtype("f4")}
-
-
 # --- linearization at the truth -----------------------------------------------------------------
 
 

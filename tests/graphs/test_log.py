@@ -11,6 +11,7 @@ import worlds
 from reference import ekf_slam
 from reference import graph as plain
 from refusals import refused
+from sweeps import swept
 
 from jaxslam import graphs, motion, sensors, simulate
 from jaxslam.core.types import Log, Scan
@@ -87,7 +88,7 @@ def optimum(log, points, step, sigma_w, start, root=None):
     return found.cost, np.array(path(found.x)), found.x[ends[1] :].reshape(-1, 2)
 
 
-@pytest.mark.parametrize("known", [False, True])
+@pytest.mark.parametrize("known", swept([False, True], False))
 def test_it_has_the_optimum_of_scipy(known):
     _, log, graph, _, solution = solved(known)
     assert solution.status == Ending.CONVERGED
@@ -103,7 +104,7 @@ def test_it_has_the_optimum_of_scipy(known):
         np.testing.assert_array_equal(solution.graph.poses[0], START)
 
 
-@pytest.mark.parametrize("known", [False, True])
+@pytest.mark.parametrize("known", swept([False, True], False))
 def test_it_has_the_optimum_of_batch_map(known):
     here, log, graph, _, solution = solved(known)
     cov = np.zeros((3, 3)) if known else START_COV
@@ -119,6 +120,7 @@ def test_it_has_the_optimum_of_batch_map(known):
     np.testing.assert_allclose(batch.joint.landmarks, solution.graph.points[order], atol=1e-8)
 
 
+@pytest.mark.sweep
 def test_derivatives_of_the_optimum_by_the_noises_are_differences():
     """By Q and R, in factories that the differentiated function calls."""
     _, log, graph, factors, _ = solved()
@@ -149,6 +151,7 @@ def test_derivatives_of_the_optimum_by_the_noises_are_differences():
         np.testing.assert_allclose(slope, (ends[0] - ends[1]) / 2e-4, rtol=1e-6)
 
 
+@pytest.mark.sweep
 def test_a_motion_of_two_noises_is_a_soft_constraint():
     """The optimum comes to that of the constraint by the square of the slack."""
     here = dataclasses.replace(worlds.ring(STEPS), sensor=world().sensor)
@@ -220,6 +223,7 @@ def test_logs_are_batched_with_a_capacity():
     assert np.abs(points[1][:6] - points[0][:6]).max() > 0.01
 
 
+@pytest.mark.sweep
 def test_points_of_a_capacity_that_no_scan_saw_are_no_hindrance():
     here, log, _, _, solution = solved()
     made = graphs.of_log(log, here.motion, here.sensor, START, START_COV, capacity=9)

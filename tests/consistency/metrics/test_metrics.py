@@ -1,4 +1,4 @@
-"""Errors of paths and maps, against values by hand and against evo where it is installed."""
+"""Errors of paths and maps, against values by hand and homogeneous matrices."""
 
 import numpy as np
 import pytest
@@ -236,34 +236,3 @@ def test_the_entropy_of_a_map_is_that_of_its_known_cells():
 )
 def test_bad_input_is_refused_by_name(call):
     call()
-
-
-# --- evo ----------------------------------------------------------------------------------------
-
-
-def test_the_errors_are_those_of_evo():
-    pytest.importorskip("evo", reason="evo is not installed")
-    from evo.core import metrics as theirs
-    from evo.core.trajectory import PosePath3D
-
-    path, moved = random_paths(2)
-    true, found = (PosePath3D(poses_se3=list(matrices(each))) for each in (path, moved))
-    relation = theirs.PoseRelation
-    for kind, field in (
-        (relation.translation_part, "translation"),
-        (relation.rotation_angle_rad, "rotation"),
-    ):
-        step = theirs.RPE(kind, delta=3, delta_unit=theirs.Unit.frames, all_pairs=True)
-        step.process_data((true, found))
-        ours = getattr(metrics.rpe(path, moved, rows=3), field)
-        np.testing.assert_allclose(ours, step.error, atol=1e-8)
-    aligned = PosePath3D(poses_se3=list(matrices(moved)))
-    aligned.align(true)
-    whole = theirs.APE(relation.translation_part)
-    whole.process_data((true, aligned))
-    ours = metrics.ate(path, moved)
-    np.testing.assert_allclose(ours.translation, whole.error, atol=1e-9)
-    figures = metrics.statistics(ours.translation)
-    for name in ("rmse", "mean", "median", "std", "min", "max"):
-        expected = whole.get_statistic(theirs.StatisticsType(name))
-        np.testing.assert_allclose(getattr(figures, name), expected, atol=1e-9)

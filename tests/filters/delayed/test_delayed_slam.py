@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from refusals import refused
+from sweeps import swept
 from worlds import draw, judged, nameless, narrow
 
 import jaxslam
@@ -332,7 +333,7 @@ def driven(filter, log):
 RUNS = 40
 
 
-@pytest.fixture(scope="module", params=list(KINDS))
+@pytest.fixture(scope="module", params=swept(KINDS, "rays"))
 def many(request):
     """Of one kind, truths, logs and traces of all runs: one program for all tests."""
     scenario = world(request.param)
@@ -475,6 +476,7 @@ def test_float32_stays_float32(poor):
         assert leaf.dtype == np.float32 or not jnp.issubdtype(leaf.dtype, jnp.floating)
 
 
+@pytest.mark.sweep
 def test_derivatives_reach_the_noise_and_are_finite():
     """Of the whole filter forward; in reverse it compiles for minutes, and its parts are below."""
     scenario, _ = small("circles")
@@ -509,6 +511,7 @@ def test_in_reverse_intersections_and_residuals_are_as_forward(kind):
     assert all(np.any(leaf) for leaf in jax.tree.leaves(reverse))
 
 
+@pytest.mark.sweep
 def test_in_reverse_what_makes_a_landmark_is_as_forward():
     """A hypothesis formed and confirmed, a point fitted and entered, by means and covariances."""
     kind = "rays"
@@ -544,6 +547,7 @@ def test_in_reverse_what_makes_a_landmark_is_as_forward():
     np.testing.assert_allclose(reverse, forward, rtol=1e-8)
 
 
+@pytest.mark.sweep
 def test_without_names_intersections_find_the_landmarks():
     """Every bearing may be of any landmark; the names in the log are not looked at."""
     scenario = world("rays")

@@ -112,6 +112,7 @@ def gated():
     )
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize("case", ["full scans", "every third scan empty", "no measurement at all"])
 def test_gradients_are_finite_in_float32_with_gate_overflow_and_empty_scans(gated, log, case):
     """Also with P0 = 0, which is where the cloister starts."""
@@ -140,6 +141,7 @@ FORMS = {
 }
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize("name", FORMS)
 def test_in_reverse_through_a_motion_and_corrections_in_turn(name):
     """By both noises, from a pose that is known exactly. Corrected at once, and with births:

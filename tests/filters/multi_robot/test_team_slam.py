@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 from reference.team import Team
 from refusals import refused
+from sweeps import swept
 from worlds import draw, judged, narrow, nees, ring
 
 import jaxslam
@@ -132,7 +133,8 @@ def started(count):
 
 
 @pytest.mark.parametrize(
-    ("count", "way"), [(2, "known"), (2, "landmarks"), (2, "mutual"), (3, "mutual")]
+    ("count", "way"),
+    swept([(2, "known"), (2, "landmarks"), (2, "mutual"), (3, "mutual")], (2, "mutual")),
 )
 def test_a_team_is_its_plain_reference(count, way):
     """Means, covariances and cross-covariances of everything, step by step, to 1e-9."""
@@ -174,6 +176,7 @@ def test_a_team_is_its_plain_reference(count, way):
     assert plain.entered == [way] * (count - 1) * (way != "known")
 
 
+@pytest.mark.sweep
 def test_padding_stays_inert():
     """Eight landmarks in a table of twelve."""
     scenario, log_of = started(3)
@@ -191,6 +194,7 @@ def relabelled(log, first, to):
     return log._replace(scan=log.scan._replace(tag=np.where(tag >= first, tag - first + to, tag)))
 
 
+@pytest.mark.sweep
 def test_sightings_of_each_other_help():
     """Without landmarks a sighting is all that ties the robots; all covariances shrink."""
     scenario, log_of = drawn(2)
@@ -294,6 +298,7 @@ def many():
     return jax.jit(jax.vmap(go))
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize(("report", "first"), [(0, 0), (1, 10)])
 def test_every_robot_is_honest(report, first):
     """The pose NEES of each of two robots over 100 runs, started from unknown places.
@@ -350,6 +355,7 @@ def driven_by(theta, log):
     return jaxslam.run(filter, log, np.zeros(3), NOTHING, jax.random.key(0))
 
 
+@pytest.mark.sweep
 def test_gradients_are_finite_and_float32_is_near():
     """Through births, corrections and the way in by two landmarks."""
     eyes = sensors.RangeBearing(R1, mount=MOUNT)

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 import worlds
 from refusals import refused
+from sweeps import swept
 
 from jaxslam import association, life, motion, resampling, sensors
 from jaxslam.consistency.measures.counts import counted
@@ -59,7 +60,7 @@ def updated(filter, state, scan):
     return filter.update(state, scan, KEY)
 
 
-PROPOSALS = pytest.mark.parametrize("proposal", ["motion", "measurement"])
+PROPOSALS = pytest.mark.parametrize("proposal", swept(["motion", "measurement"], "measurement"))
 
 
 # --- against plain NumPy ------------------------------------------------------------------------
