@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
+from reference import plane
 from refusals import refused
 
 from jaxslam import association, motion, run, sensors
@@ -125,10 +126,8 @@ def drive(seed, steps=160, drift=0.02, turn=0.1):
         u = np.array([0.3, 0.0, 0.08 * np.sin(2 * np.pi * t / 80)])
         w = rng.normal(size=3) * np.sqrt(np.diag(NOISE))
         true = u + w + [0, 0, drift * u[0] + turn * u[2]]
-        c, s = np.cos(pose[2]), np.sin(pose[2])
-        pose = pose + [c * true[0] - s * true[1], s * true[0] + c * true[1], true[2]]
-        c, s = np.cos(pose[2]), np.sin(pose[2])
-        seen = (trees - pose[:2]) @ np.array([[c, -s], [s, c]])
+        pose = plane.compose(pose, true)
+        seen = plane.to_frame(pose, trees)
         near = seen[(seen[:, 0] > 0) & (np.hypot(*seen.T) < 5.0)][:PLACES]
         z = np.zeros((PLACES, 2))
         z[: len(near)] = near + rng.normal(size=near.shape) * 0.1

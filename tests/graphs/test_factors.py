@@ -10,8 +10,9 @@ import pytest
 import small_graphs
 import worlds
 from own_models import made
-from pose_rings import SIZE, between, dense, ring
+from pose_rings import SIZE, dense, ring
 from reference import graph as plain
+from reference.plane import between
 
 from jaxslam import graphs, motion, sensors
 from jaxslam.core.record import record
@@ -251,7 +252,7 @@ def test_one_model_for_a_batch():
 
 
 def test_numbers_in_float64_leave_a_graph_in_float32():
-    numbers = jax.tree.map(lambda x: x.astype(np.float32) if x.dtype == float else x, GRAPH)
+    numbers = worlds.narrow(GRAPH)
     for name in ("cauchy", "truncated"):
         kernel = dataclasses.replace(graphs.KERNELS[name](), width=np.float64(3.0))
         plan = graphs.plan(GRAPH)

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 import scipy.optimize
 import worlds
-from reference import ekf_slam
-from reference import graph as plain
+from reference import ekf_slam, plane
 from refusals import refused
 from sweeps import swept
 
@@ -79,7 +78,7 @@ def optimum(log, points, step, sigma_w, start, root=None):
             for z, tag, there in zip(*scan, strict=True):
                 if there:
                     off = z - ekf_slam.range_bearing(pose, points[tag])[0]
-                    out.append(np.array([off[0], plain.wrap(off[1])]) / SIGMA_Z)
+                    out.append(np.array([off[0], plane.wrap(off[1])]) / SIGMA_Z)
         return np.concatenate(out)
 
     begun = np.concatenate([np.zeros(ends[1]), points.ravel()])
@@ -99,7 +98,7 @@ def test_it_has_the_optimum_of_scipy(known):
     np.testing.assert_allclose(solution.graph.points, points, atol=1e-6)
     off = solution.graph.poses - poses
     np.testing.assert_allclose(off[:, :2], 0, atol=1e-6)
-    np.testing.assert_allclose(plain.wrap(off[:, 2]), 0, atol=1e-6)
+    np.testing.assert_allclose(plane.wrap(off[:, 2]), 0, atol=1e-6)
     if known:
         np.testing.assert_array_equal(solution.graph.poses[0], START)
 
@@ -113,7 +112,7 @@ def test_it_has_the_optimum_of_batch_map(known):
     assert batch.ending == Ending.CONVERGED
     np.testing.assert_allclose(solution.chi2, 2 * batch.cost, rtol=1e-8)
     off = np.asarray(solution.graph.poses) - [batch.start, *trace.estimate.pose]
-    off[:, 2] = plain.wrap(off[:, 2])
+    off[:, 2] = plane.wrap(off[:, 2])
     np.testing.assert_allclose(off, 0, atol=1e-8)
     assert set(batch.joint.tag.tolist()) == set(graph.point_id.tolist())
     order = np.searchsorted(graph.point_id, batch.joint.tag)
@@ -165,7 +164,7 @@ def test_a_motion_of_two_noises_is_a_soft_constraint():
             step = lambda pose, u: ekf_slam.increment(pose, u)[0]  # noqa: E731
             poses = optimum(log, np.asarray(graph.points), step, [0.01, 0.01], np.zeros(3))[1]
         apart = solution.graph.poses - poses
-        off.append(max(np.abs(apart[:, :2]).max(), np.abs(plain.wrap(apart[:, 2])).max()))
+        off.append(max(np.abs(apart[:, :2]).max(), np.abs(plane.wrap(apart[:, 2])).max()))
     assert off[0] < 1e-3
     assert 0.5 < off[0] / off[1] / 100 < 1.5
 

@@ -7,7 +7,7 @@ import jax
 import numpy as np
 import pytest
 import scipy.stats
-from reference.plane import wrap
+from reference.plane import turn, wrap
 
 from jaxslam import charts, linearize, motion, sensors
 from jaxslam.core.types import Log, Scan, Status
@@ -31,18 +31,17 @@ CONTROLS[30:40, 1] = 0.03  # slowly where the compass is near its seam
 
 
 def move(x, u):
-    d, turn = u
+    d, turned = u
     c, s = np.cos(x[2]), np.sin(x[2])
     by_pose = np.array([[1, 0, -d * s], [0, 1, d * c], [0, 0, 1]])
     by_noise = np.array([[c, 0], [s, 0], [0, 1]])
-    return np.array([x[0] + d * c, x[1] + d * s, wrap(x[2] + turn)]), by_pose, by_noise
+    return np.array([x[0] + d * c, x[1] + d * s, wrap(x[2] + turned)]), by_pose, by_noise
 
 
 def see(name, x, mount):
     if name == "compass":
         return np.array([x[2] + mount[2]]), np.array([[0.0, 0.0, 1.0]])
-    c, s = np.cos(x[2]), np.sin(x[2])
-    lever = np.array([c * mount[0] - s * mount[1], s * mount[0] + c * mount[1]])
+    lever = turn(x[2]) @ mount[:2]
     return x[:2] + lever, np.array([[1, 0, -lever[1]], [0, 1, lever[0]]])
 
 

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from reference.plane import mounted, wrap
+from reference.plane import from_frame, mounted, to_frame, wrap
 from refusals import refused
 
 import jaxslam
@@ -375,20 +375,14 @@ def points_of(line, at):
     return r * normal + np.asarray(at)[:, None] * np.array([-normal[1], normal[0]])
 
 
-def carried(frame, points):
-    c, s = np.cos(frame[2]), np.sin(frame[2])
-    return points @ np.array([[c, s], [-s, c]]) + frame[:2]
-
-
 @pytest.mark.parametrize("line", [(2.0, 0.4), (-1.5, 3.0), (0.0, -2.0)])
 def test_a_measured_line_is_that_of_the_points_in_the_robots_frame(line):
     sensor, pose = sensors.Line(NOISE), np.array([0.7, -1.2, 2.8])
     z = np.asarray(sensor.observe(pose, np.array(line)))
     there = points_of(line, [-3.0, 0.0, 5.0])
-    np.testing.assert_allclose(carried(pose, points_of(z, [-3, 0, 5])), there, atol=4.0)
+    np.testing.assert_allclose(from_frame(pose, points_of(z, [-3, 0, 5])), there, atol=4.0)
     # Those points satisfy n·p = r of the measured line, in the robot's frame.
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    local = (there - pose[:2]) @ np.array([[c, -s], [s, c]])
+    local = to_frame(pose, there)
     np.testing.assert_allclose(local @ [np.cos(z[1]), np.sin(z[1])], z[0], atol=1e-12)
     np.testing.assert_allclose(sensor.position(np.array(line)), points_of(line, [0])[0], atol=1e-15)
 
@@ -396,7 +390,7 @@ def test_a_measured_line_is_that_of_the_points_in_the_robots_frame(line):
 def test_a_carried_line_goes_through_the_carried_points():
     sensor, line, frame = sensors.Line(NOISE), np.array([1.3, -2.9]), np.array([4.0, -2.0, 1.1])
     r, alpha = np.asarray(sensor.carried(frame, line))
-    points = carried(frame, points_of(line, [-2.0, 0.0, 2.0]))
+    points = from_frame(frame, points_of(line, [-2.0, 0.0, 2.0]))
     np.testing.assert_allclose(points @ [np.cos(alpha), np.sin(alpha)], r, atol=1e-12)
     # The side is kept: the normal turns with the frame.
     assert abs(np.angle(np.exp(1j * (alpha - line[1] - frame[2])))) < 1e-12

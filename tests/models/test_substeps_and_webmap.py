@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from own_models import changed
+from reference.plane import to_frame
 
 from jaxslam import motion, run
 from jaxslam.filters import EkfSlam
@@ -140,13 +141,6 @@ def fine_controls(scenario):
     return np.asarray(scenario.controls).reshape(-1, 3)
 
 
-def offsets(path, landmarks):
-    """(T, N, 2): ahead and to the left of each pose."""
-    dx = landmarks - path[:, None, :2]
-    c, s = np.cos(path[:, 2])[:, None], np.sin(path[:, 2])[:, None]
-    return np.stack([c * dx[..., 0] + s * dx[..., 1], -s * dx[..., 0] + c * dx[..., 1]], axis=-1)
-
-
 def test_controls_keep_the_cars_limits(scenario):
     speed, steering, interval = fine_controls(scenario).T
     assert len(speed) == 8 * scenario.steps
@@ -183,7 +177,9 @@ def test_odometry_and_measurements_have_the_published_noise(scenario, drawn):
     speed, steering, interval = (log.control - scenario.controls).reshape(-1, 3).T
     np.testing.assert_array_equal(interval, 0)
     ahead = np.take_along_axis(
-        offsets(truth.pose, np.asarray(scenario.landmarks)), log.scan.tag[..., None], axis=1
+        to_frame(truth.pose[:, None], np.asarray(scenario.landmarks)),
+        log.scan.tag[..., None],
+        axis=1,
     )
     expected = np.stack([np.hypot(*ahead.T).T, np.arctan2(ahead[..., 1], ahead[..., 0])], axis=-1)
     distance, bearing = (log.scan.z - expected)[log.scan.valid].T
@@ -216,7 +212,7 @@ def test_every_loop_ends_where_it_began(scenario, drawn):
 def test_scans_hold_all_that_is_near_and_ahead_and_nothing_else(scenario, drawn):
     truth, log = drawn
     assert not truth.missed.any()
-    ahead = offsets(truth.pose, np.asarray(scenario.landmarks))
+    ahead = to_frame(truth.pose[:, None], np.asarray(scenario.landmarks))
     expected = (np.hypot(*ahead.T).T < 30) & (ahead[..., 0] > 0)
     seen = np.zeros_like(expected)
     rows, places = np.nonzero(log.scan.valid)

@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 from own_models import changed
 from refusals import refused
-from worlds import draw, ring
+from worlds import draw, narrow, ring
 
 import jaxslam
 from jaxslam import charts, filters, linearize, motion, sensors
@@ -277,18 +277,14 @@ def test_absolute_sensors_alone_in_both_precisions():
     trace = driven(ekf, scenario, log)
     assert (trace.info.status == Status.FUSED).all()
     assert np.abs(trace.estimate.pose - truth.pose).max() < 0.2
-    single = driven(ekf, scenario, in_float32(log))
+    single = driven(ekf, scenario, narrow(log))
     np.testing.assert_allclose(single.estimate.pose, trace.estimate.pose, atol=1e-4)
-
-
-def in_float32(log):
-    return jax.tree.map(lambda x: x.astype("f4") if x.dtype == float else x, log)
 
 
 def test_float32_stays():
     """Of sensors of unlike widths; the numbers are held to float64 in the test above."""
     scenario, ekf = estimated()
-    log = in_float32(drawn()[1])
+    log = narrow(drawn()[1])
     start = np.zeros(3), np.zeros((3, 3)), jax.random.key(0)
     trace = jax.eval_shape(lambda log: jaxslam.run(ekf, log, *start), log)
     kinds = {leaf.dtype for leaf in jax.tree.leaves(trace)}

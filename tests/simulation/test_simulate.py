@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 import scipy.stats
 from own_models import changed
-from reference.plane import mounted, wrap
+from reference.plane import mounted, to_frame, wrap
 from refusals import refused
 
 from jaxslam import motion, sensors
@@ -354,11 +354,7 @@ def test_circle_is_the_published_benchmark():
     w = (log.control - scenario.controls)[:, :2]
     assert_standard_normal(w / (0.05 * 0.25 * np.array([1 / np.sqrt(2), 2 * np.sqrt(2)])))
     np.testing.assert_array_equal(log.control[:, 2], 1)
-    c, s = np.cos(truth.pose[:, 2])[:, None], np.sin(truth.pose[:, 2])[:, None]
-    offset = landmarks[log.scan.tag] - truth.pose[:, None, :2]
-    ahead = np.stack(
-        [c * offset[..., 0] + s * offset[..., 1], -s * offset[..., 0] + c * offset[..., 1]], axis=-1
-    )
+    ahead = to_frame(truth.pose[:, None], landmarks[log.scan.tag])
     assert_standard_normal((log.scan.z - ahead)[log.scan.valid] / 0.1)
     assert not np.any(scenario.pose)
     assert not np.any(scenario.pose_cov)

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reference.plane import from_frame
 from refusals import refused
 from sweeps import swept
 from worlds import draw, judged, nameless, narrow
@@ -104,8 +105,7 @@ def test_a_measurement_is_stored_where_the_sensor_is_mounted(kind):
     factory = sensors.BearingOnly if kind == "rays" else sensors.RangeOnly
     sensor = factory([[1e-4]], mount=mount)
     pose, point = np.array([1.0, 2.0, 2.5]), np.array([-3.0, 4.0])
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    place = pose[:2] + np.array([[c, -s], [s, c]]) @ mount[:2]
+    place = from_frame(pose, mount[:2])
     seen = KINDS[kind].store(sensor, jnp.asarray(pose), sensor.observe(pose, point))
     assert type(triangulation_of(sensor)) is type(KINDS[kind])
     np.testing.assert_allclose(seen, seen_by(kind, place[None], point)[0], atol=1e-12)

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reference import plane
 
 from jaxslam import association, charts, motion, sensors, slots
 from jaxslam.core.protocols import Pairs, Prediction
@@ -181,10 +182,8 @@ def test_a_whole_run_ends_with_each_landmark_once():
     for step in range(140):
         u = np.array([0.5, 0.0, 2 * np.pi / 120])
         w = u + rng.normal(size=3) * [0.05, 0.05, 0.008]
-        c, s = np.cos(pose[2]), np.sin(pose[2])
-        pose = pose + [c * w[0] - s * w[1], s * w[0] + c * w[1], w[2]]
-        c, s = np.cos(pose[2]), np.sin(pose[2])
-        z = (points - pose[:2]) @ np.array([[c, -s], [s, c]]) + 0.05 * rng.normal(size=(8, 2))
+        pose = plane.compose(pose, w)
+        z = plane.to_frame(pose, points) + 0.05 * rng.normal(size=(8, 2))
         valid = np.full(8, step < 5 or step >= 118)
         scan = Scan(z, np.full(8, -1), valid)
         state = predict(state, u, key)

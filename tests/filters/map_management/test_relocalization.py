@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reference import plane
 
 from jaxslam import charts, motion, se2, sensors
 from jaxslam.core.slots import Joint
@@ -48,8 +49,7 @@ def world(seed, count, reach=10.0, spread=0.05):
 
 def seen_from(rng, pose, points, noise=0.05):
     """A scan's points in the robot's frame with independent noise."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    exact = (points - np.asarray(pose)[:2]) @ np.array([[c, -s], [s, c]])
+    exact = plane.to_frame(pose, points)
     covs = np.tile(noise**2 * np.eye(2), (len(points), 1, 1))
     return exact + noise * rng.normal(size=exact.shape), covs
 
@@ -95,9 +95,8 @@ def test_without_noise_the_pose_is_exact(seed):
 def generalized_least_squares(seen, covs, points, cov, start):
     """min rᵀ Σ⁻¹ r over the pose, to first order about a start, with dense algebra."""
     pose, n = np.array(start), len(seen)
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    turn = np.array([[c, -s], [s, c]])
-    r = (seen @ turn.T + pose[:2] - points).ravel()
+    turn = plane.turn(pose[2])
+    r = (plane.from_frame(pose, seen) - points).ravel()
     lever = points - pose[:2]
     slope = np.zeros((2 * n, 3))
     slope[0::2, 0] = slope[1::2, 1] = 1
@@ -122,26 +121,14 @@ def exhaustive(points, cov, seen, covs, probability=0.99):
             continue
         z, m = seen[choice >= 0], points[pick]
         start = np.asarray(ALIGN(z, m))
-        if (
-            np.abs(
-                z
-                @ np.array(
-                    [[np.cos(start[2]), np.sin(start[2])], [-np.sin(start[2]), np.cos(start[2])]]
-                )
-                + start[:2]
-                - m
-            ).max()
-            > 3
-        ):
+        if np.abs(plane.from_frame(start, z) - m).max() > 3:
             continue
         at = (2 * pick[:, None] + np.arange(2)).ravel()
         pose, distance = generalized_least_squares(
             z, covs[choice >= 0], m, cov[np.ix_(at, at)], start
         )
-        if distance <= chi2_quantile(probability, 2 * n - 3) and (-n, distance) < (
-            -best[0],
-            best[1],
-        ):
+        better = (-n, distance) < (-best[0], best[1])
+        if better and distance <= chi2_quantile(probability, 2 * n - 3):
             best = (n, distance, choice, pose)
     return best
 

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reference.plane import to_frame
 from reference.team import Team
 from refusals import refused
 from sweeps import swept
@@ -241,18 +242,14 @@ def test_nothing_of_an_absent_robot_is_lost():
 def test_a_way_in_is_exact_without_noise(way):
     a, b = np.array([1.0, 2.0, 0.7]), np.array([-1.0, 3.0, -2.5])
 
-    def to(pose, point):
-        c, s = np.cos(pose[2]), np.sin(pose[2])
-        return np.array([[c, s], [-s, c]]) @ (point - pose[:2])
-
     cov = np.eye(2) * 1e-4
     if way == "mutual":
         found = jax.jit(pose_initialization.by_mutual_sight)(
-            a, np.eye(3, 9), np.eye(3), (to(a, b[:2]), cov), (to(b, a[:2]), cov)
+            a, np.eye(3, 9), np.eye(3), (to_frame(a, b[:2]), cov), (to_frame(b, a[:2]), cov)
         )
     else:
         points = np.array([[0.0, 0.5], [3.0, -1.0]])
-        seen = np.stack([to(b, point) for point in points])
+        seen = to_frame(b, points)
         found = jax.jit(pose_initialization.by_two_landmarks)(
             points, np.eye(4, 9), np.eye(4), seen, np.stack([cov, cov])
         )

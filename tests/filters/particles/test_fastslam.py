@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
+from reference.plane import from_frame
 from refusals import refused
 from sweeps import swept
 
@@ -70,8 +71,7 @@ def mapped_by_hand(poses, log):
     """Per-landmark EKFs from a known path, range and bearing: {tag: (mean, cov)}, log-likelihood."""
     maps, log_likelihood = {}, 0.0
     for pose, z, tags, valid in zip(poses, *map(np.asarray, log.scan), strict=True):
-        c, s = np.cos(pose[2]), np.sin(pose[2])
-        eye = pose[:2] + np.array([[c, -s], [s, c]]) @ MOUNT[:2]
+        eye = from_frame(pose, MOUNT[:2])
         heading = pose[2] + MOUNT[2]
         for (r, b), tag, there in zip(z, tags, valid, strict=True):
             if not there:

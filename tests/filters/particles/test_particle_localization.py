@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 import worlds
 from own_models import changed
+from reference.plane import from_frame
 from refusals import refused
 
 from jaxslam import association, motion, resampling, run, sensors
@@ -73,8 +74,7 @@ def test_many_particles_are_the_posterior_of_the_ekf():
 
 def by_hand(pose, scan, gate=math.inf, edge=9.21034037197618):
     """Σ of what counts of d² for one pose: range and bearing to the landmarks of their tags."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    eye = pose[:2] + np.array([[c, -s], [s, c]]) @ MOUNT[:2]
+    eye = from_frame(pose, MOUNT[:2])
     total = 0.0
     for (r, b), tag, there in zip(*map(np.asarray, scan), strict=True):
         if not there:

@@ -10,6 +10,7 @@ import pytest
 import scipy.optimize
 from own_models import motion_of, sensor_of
 from reference import ekf_slam as plain
+from reference.plane import compose
 from worlds import ring
 
 from jaxslam import filters, motion, run, sensors, simulate
@@ -320,12 +321,6 @@ def step_ring(steps=10):
     )
 
 
-def composed(pose, u):
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    x, y = pose[0] + c * u[0] - s * u[1], pose[1] + s * u[0] + c * u[1]
-    return np.array([x, y, plain.wrap(pose[2] + u[2])])
-
-
 def residuals(unknowns, log, world):
     """All whitened residuals in the noises and the map, in NumPy; and the path they make."""
     steps, count = len(log.control), len(world.landmarks)
@@ -333,7 +328,7 @@ def residuals(unknowns, log, world):
     landmarks = unknowns[3 * steps :].reshape(count, 2)
     pose, path, out = np.asarray(world.pose, float), [], [noise.ravel()]
     for t in range(steps):
-        pose = composed(pose, log.control[t] + SIGMA_W * noise[t])
+        pose = compose(pose, log.control[t] + SIGMA_W * noise[t])
         path.append(pose)
         for z, tag, there in zip(log.scan.z[t], log.scan.tag[t], log.scan.valid[t], strict=True):
             if there:

@@ -6,9 +6,10 @@ import own_models
 import pytest
 import small_graphs
 import worlds
-from pose_rings import SIZE, between, dense, ring, wrap
+from pose_rings import SIZE, dense, ring
 from recordings import DATA
 from reference import graph as plain
+from reference.plane import between, wrap
 from worlds import compilations
 
 from jaxslam import graphs

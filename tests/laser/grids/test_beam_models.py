@@ -5,6 +5,7 @@ import itertools
 import jax
 import numpy as np
 import pytest
+from reference.plane import from_frame
 from scipy import integrate, stats
 
 from jaxslam import grids
@@ -80,8 +81,7 @@ def test_the_ray_cast_model_of_a_laser_off_the_centre_by_hand():
     model = RayCast(MIXTURE, max_range=FAR, mount=(0.3, -0.2, 0.7))
     prepared, pose = model.prepare(empty), np.array([2.0, 1.2, 0.4])
     angles = np.delete(np.linspace(-3, 3, 12), 8)  # the ninth ends in a corner, which is rounded
-    c, s = np.cos(0.4), np.sin(0.4)
-    eye = pose[:2] + [0.3 * c + 0.2 * s, 0.3 * s - 0.2 * c]
+    eye = from_frame(pose, [0.3, -0.2])
     e = np.stack([np.cos(0.4 + 0.7 + angles), np.sin(0.4 + 0.7 + angles)], axis=1)
     star = ((np.where(e > 0, [5.0, 3.0], 0.0) - eye) / e).min(axis=1)
     z = star + np.array([0.1, -0.2, -0.05, 0.3, -0.9, 0.05, -1.5, 0.6, -0.1, 0.2, 5.0])

@@ -5,6 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import recordings
+from reference.plane import from_frame
 from refusals import refused
 
 from jaxslam import grids
@@ -61,8 +62,7 @@ def blocks():
     at = free[rng.choice(len(free), 12, replace=False)][:, ::-1] + rng.uniform(0.05, 0.95, (12, 2))
     heading = rng.uniform(-3, 3, 12)
     origin = np.array([3.0, -1.0, 0.6])
-    c, s = np.cos(0.6), np.sin(0.6)
-    position = origin[:2] + 0.1 * at @ np.array([[c, s], [-s, c]])
+    position = from_frame(origin, 0.1 * at)
     return grid_of(log_odds, origin), at, heading, np.column_stack([position, heading + 0.6])
 
 
@@ -274,9 +274,8 @@ def test_gradients_are_finite_at_walls_in_obstacles_and_off_the_map(blocks, meth
     grid, at, _, pose = blocks
     rays = grids.ray_map(grid, method=method)
     blocked = np.argwhere(grid.log_odds > 0)[:4, ::-1]
-    c, s = np.cos(0.6), np.sin(0.6)
     hard = np.concatenate([blocked + 0.5, blocked, [[0, 0], [31, 23], [-5, 90], [31, 5.5]]])
-    world = grid.origin[:2] + 0.1 * hard @ np.array([[c, s], [-s, c]])
+    world = from_frame(grid.origin, 0.1 * hard)
     poses = np.concatenate([pose, np.column_stack([world, np.full(len(world), 0.6)])])
     angles = np.concatenate([ANGLES[::6], [0.0, np.pi / 2, np.pi, np.pi / 4]])
     slope = jax.jit(jax.vmap(jax.grad(lambda p: grids.cast(rays, p, angles, 1.5).sum())))(poses)

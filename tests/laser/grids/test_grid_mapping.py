@@ -6,6 +6,7 @@ import chex
 import jax
 import numpy as np
 import pytest
+from reference.plane import from_frame, to_frame
 from refusals import refused
 
 from jaxslam import grids
@@ -21,10 +22,7 @@ def scans(seed=0, steps=20, beams=11):
     rng = np.random.default_rng(seed)
     local = np.column_stack([rng.uniform(-0.3, 4.3, steps), rng.uniform(0, 3, steps)])
     local[0] = [-0.2, 1.0]  # off the map
-    c, s = np.cos(0.3), np.sin(0.3)
-    poses = np.column_stack(
-        [ORIGIN[:2] + local @ np.array([[c, s], [-s, c]]), rng.uniform(-3, 3, steps)]
-    )
+    poses = np.column_stack([from_frame(ORIGIN, local), rng.uniform(-3, 3, steps)])
     ranges = rng.uniform(0.1, 4, (steps, beams))
     ranges[1, :3] = [np.nan, np.inf, -1.0]
     angles = np.tile(np.linspace(-2, 2, beams), (steps, 1))
@@ -34,12 +32,9 @@ def scans(seed=0, steps=20, beams=11):
 def reference_counts(poses, beams, max_range, free, mount):
     """Each beam cut at every line of the table that it crosses; the middle of a piece is in its cell."""
     hits, misses = np.zeros(SHAPE, int), np.zeros(SHAPE, int)
-    c, s = np.cos(0.3), np.sin(0.3)
     outside = unusable = 0
     for pose, ranges, angles, valid in zip(poses, *beams, strict=True):
-        ct, st = np.cos(pose[2]), np.sin(pose[2])
-        eye = pose[:2] + [ct * mount[0] - st * mount[1], st * mount[0] + ct * mount[1]]
-        a = np.array([[c, s], [-s, c]]) @ (eye - ORIGIN[:2]) / CELL
+        a = to_frame(ORIGIN, from_frame(pose, mount[:2])) / CELL
         for r, angle, there in zip(ranges, angles, valid, strict=True):
             if not (there and r >= 0):
                 unusable += 1

@@ -3,7 +3,8 @@
 import jax
 import numpy as np
 import pytest
-from scanned_rooms import moved, pairs, points_at, stacked
+from reference.plane import from_frame
+from scanned_rooms import pairs, points_at, stacked
 
 from jaxslam import matching
 from jaxslam.laser.matching import MatchStatus
@@ -43,7 +44,7 @@ def test_the_maximum_is_that_of_all_poses(found):
         best, where = -1.0, None
         for turn in turns:
             pose = np.array([*STARTS[k, :2], STARTS[k, 2] + turn])
-            cells = np.floor((moved(SCANS.position[k], pose) - grids.origin[k, :2]) / CELL)
+            cells = np.floor((from_frame(pose, SCANS.position[k]) - grids.origin[k, :2]) / CELL)
             for x in shifts:
                 for y in shifts:
                     at = (cells + [x, y]).astype(int)

@@ -5,8 +5,10 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reference.plane import from_frame
 from refusals import refused
-from scanned_rooms import BEAMS, by_polynomial, line_cost, moved, pairs, points_at, stacked
+from scanned_rooms import BEAMS, by_polynomial, line_cost, pairs, points_at, stacked
+from worlds import narrow
 
 from jaxslam import matching
 from jaxslam.core.types import Beams
@@ -80,14 +82,14 @@ def lines(p):
 
 def partners(k):
     """The scan of a pair at its start, its nearest reference points, and which are within reach."""
-    there = moved(SCANS.position[k], STARTS[k])
+    there = from_frame(STARTS[k], SCANS.position[k])
     apart = np.linalg.norm(there[:, None] - REFERENCES.position[k][None], axis=2)
     j = apart.argmin(axis=1)
     return there, j, apart[np.arange(BEAMS), j] < REACH
 
 
 def composed(step, pose):
-    c = moved(pose[None, :2], step)[0]
+    c = from_frame(step, pose[None, :2])[0]
     return np.array([*c, pose[2] + step[2]])
 
 
@@ -234,10 +236,7 @@ def test_trimming_and_a_kernel_bear_outliers_and_forward_derivatives_are_finite(
         )
     )(jnp.ones(BEAMS))  # fmt: skip
     assert np.all(np.isfinite(slope))
-    single = jax.tree.map(
-        lambda a: a.astype(np.float32) if a.dtype == np.float64 else a, (of, scan, STARTS[0])
-    )
-    end = matching.match(matcher, *single)
+    end = matching.match(matcher, *narrow((of, scan, STARTS[0])))
     assert end.pose.dtype == np.float32
     np.testing.assert_allclose(end.pose, pose, atol=1e-3)
 

@@ -4,8 +4,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from reference.plane import from_frame
 from refusals import refused
-from scanned_rooms import BEAMS, moved, pairs
+from scanned_rooms import BEAMS, pairs
 
 from jaxslam import matching, verify_jacobians
 from jaxslam.core.record import record
@@ -102,8 +103,7 @@ def least(reference, scan, pair, used):
     normal = np.linalg.eigh(moments)[1][:, :, 0]
     pose = np.zeros(3)
     for _ in range(20):
-        c, s = np.cos(pose[2]), np.sin(pose[2])
-        arm = scan[used] @ np.array([[c, s], [-s, c]])
+        arm = from_frame([0, 0, pose[2]], scan[used])
         e = (normal * (arm + pose[:2] - middle)).sum(axis=1)
         jacobian = np.column_stack([normal, normal[:, 1] * arm[:, 0] - normal[:, 0] * arm[:, 1]])
         pose = pose - np.linalg.solve(jacobian.T @ jacobian, jacobian.T @ e)
@@ -174,7 +174,7 @@ def test_the_lattice_of_a_quadratic_cost_is_its_inverse(by_lines):
     prior = np.eye(3) * 0.3**-2
     k = whole_run(found)
     used = found.weight[k] > 0
-    arm = moved(SCANS.position[k], found.pose[k])[used] - found.pose[k, :2]
+    arm = from_frame(found.pose[k], SCANS.position[k])[used] - found.pose[k, :2]
     own = REFERENCES.position[k][found_neighbours[found.pair[k][used]]]
     apart = own - own.mean(axis=1, keepdims=True)
     n = np.linalg.eigh(np.einsum("nka,nkb->nab", apart, apart))[1][:, :, 0]
