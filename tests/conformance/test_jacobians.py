@@ -5,6 +5,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 from own_models import changed
+from sweeps import swept
 
 from jaxslam import motion, sensors
 from jaxslam.core.protocols import Motion
@@ -16,7 +17,10 @@ from jaxslam.verify.verifier import FLOAT32_TOLERANCE, TOLERANCE
 MODELS = motion.REGISTRY | sensors.REGISTRY
 
 
-@pytest.fixture(scope="module", params=MODELS)
+@pytest.fixture(
+    scope="module",
+    params=swept(MODELS, "unicycle", "velocity", "range_bearing", "bearing_inverse_depth", "line"),
+)
 def made(request):
     """A registered model, all that was computed about it, and what that was judged to be."""
     model = build(MODELS[request.param])

@@ -13,6 +13,7 @@ import worlds
 from layouts import kept_programs, wrong_layouts
 from own_models import motion_of, sensor_of
 from refusals import refused
+from sweeps import swept
 
 import jaxslam
 from jaxslam import catalog, filters, motion, resampling, run, sensors, simulate, smoothing
@@ -166,7 +167,9 @@ LOG, START = standing(), (np.zeros(3), np.diag([0.1, 0.1, 0.01]) ** 2, jax.rando
 
 def toy_filter(noise=1.0):
     model = Counted(noise * np.diag([0.01, 0.01]) ** 2)
-    return filters.EkfSlam(model, sensors.RangeBearing(R, MOUNT), 6, gate=50.0 * noise)
+    return filters.EkfSlam(
+        model, sensors.RangeBearing(R, MOUNT), 6, gate=50.0 * noise, correction="joint"
+    )
 
 
 def driven(filter):
@@ -399,7 +402,9 @@ def test_a_world_without_draw_is_refused():
 # --- programs ---------------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize("smooths", [False, True], ids=["square root, in turn", "smoother"])
+@pytest.mark.parametrize(
+    "smooths", swept([False, True], False), ids=["square root, in turn", "smoother"]
+)
 def test_other_numbers_run_what_is_there(smooths):
     """As test_catalog has it of all that the catalog has, corrected jointly."""
 

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from refusals import refused
+from sweeps import swept
 from worlds import draw
 
 from jaxslam import charts, linearize, sensors
@@ -73,7 +74,7 @@ def assert_same(a, b, rtol=1e-9):
         np.testing.assert_allclose(left, right, rtol=0, atol=rtol * scale)
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", swept(CASES, "in turn"))
 def test_the_same_as_the_ordinary_filter(case):
     """Also where the map is full."""
     (plain, joint), (compressed, whole) = driven(case)
@@ -115,6 +116,7 @@ def test_from_a_map_at_hand():
     assert_same(final, go_on(joint))
 
 
+@pytest.mark.sweep
 def test_gradients_pass_through_a_change_of_area():
     world, logs = tour()
     log = jax.tree.map(lambda x: x[0, :40], logs)

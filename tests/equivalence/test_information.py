@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from refusals import refused
+from sweeps import swept
 from worlds import draw
 
 from jaxslam import filters, sensors
@@ -68,7 +69,7 @@ def assert_same(a, b):
     assert int(final.refused) == 0
 
 
-@pytest.mark.parametrize("gate", [UNGATED, 6.0])
+@pytest.mark.parametrize("gate", swept([UNGATED, 6.0], 6.0))
 def test_eif_is_the_ekf(gate):
     """Without a gate: `test_other_models_full_maps_unknown_tags_and_empty_scans`."""
     a, b = (driven(filter, world(), drawn()) for filter in pair(gate))
@@ -76,7 +77,7 @@ def test_eif_is_the_ekf(gate):
     assert ((a.info.status == Status.REJECTED).sum() > 0) == (gate == 6.0)
 
 
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.float64])
+@pytest.mark.parametrize("dtype", swept([jnp.float32, jnp.float64], jnp.float64))
 def test_a_certain_start_gets_the_floor(dtype):
     """P0 = 0 has no inverse: the filter is the EKF that starts with floor² I."""
     ekf, eif = pair(UNGATED)
@@ -133,6 +134,7 @@ def test_a_lost_definiteness_is_refused_counted_and_recovered():
     assert (np.asarray(info.status) == Status.FUSED).any()
 
 
+@pytest.mark.sweep
 def test_gradients_and_batches():
     """Of six steps, which are as in the run of all, alone."""
     log = jax.tree.map(lambda leaf: leaf[:6], drawn())

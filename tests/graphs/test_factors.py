@@ -200,6 +200,7 @@ def test_other_numbers_of_factor_and_kernel_cost_no_trace_and_no_program():
     assert not np.allclose(first.graph.poses, second.graph.poses)
 
 
+@pytest.mark.sweep
 def test_derivatives_by_mount_and_width_are_differences():
     """Of a graph that is no tracer itself, so that it is planned and padded as outside a trace."""
 

@@ -103,7 +103,8 @@ def test_it_has_the_optimum_of_scipy(known):
         np.testing.assert_array_equal(solution.graph.poses[0], START)
 
 
-@pytest.mark.parametrize("known", swept([False, True], False))
+@pytest.mark.sweep
+@pytest.mark.parametrize("known", [False, True])
 def test_it_has_the_optimum_of_batch_map(known):
     here, log, graph, _, solution = solved(known)
     cov = np.zeros((3, 3)) if known else START_COV

@@ -158,6 +158,7 @@ def test_a_full_map_of_confirmed_landmarks_refuses_in_any_case():
     assert not removed_in(trace).any()
 
 
+@pytest.mark.sweep
 def test_gradients_pass_through_births_and_deaths():
     log = log_of(seen_by_turns({0: 1, 5: 2}, steps=8))
 

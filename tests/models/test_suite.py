@@ -173,6 +173,7 @@ def test_info_is_of_all_places():
     np.testing.assert_array_equal(fused[:, 10], log.scan.valid[:, 10])
 
 
+@pytest.mark.sweep
 def test_campaigns_judge_a_suite():
     """An honest filter of all three, and one that believes its compass too much is found out."""
     scenario, honest = estimated()
@@ -192,6 +193,7 @@ def test_more_sensors_know_more():
     assert np.trace(both) < np.trace(one)
 
 
+@pytest.mark.sweep
 def test_gradients_reach_every_part():
     """Of one scan of a map that is known, by every number of every sensor."""
     scenario, _ = estimated()
@@ -263,6 +265,7 @@ def test_bad_input(make):
     make()
 
 
+@pytest.mark.sweep
 def test_absolute_sensors_alone_in_both_precisions():
     """A compass and a position fix on a robot without a map."""
     scenario = Scenario(

@@ -80,6 +80,7 @@ def gradient(compiled, log):
     return np.asarray(compiled(AT, log)[1])
 
 
+@pytest.mark.sweep
 def test_the_gradient_of_200_steps_is_that_of_central_differences(log, compiled, gradient):
     value = jax.jit(lambda p: log_likelihood(p, log)[0])
     (total, status), _ = compiled(AT, log)
@@ -97,6 +98,7 @@ def test_the_gradient_of_200_steps_is_that_of_central_differences(log, compiled,
         assert abs(gradient[i]) > 1.0, name  # every parameter is reached
 
 
+@pytest.mark.sweep
 def test_reverse_mode_keeps_one_state_a_step(compiled):
     state = 8 * (3 + 2 * 36) ** 2
     assert compiled.memory_analysis().temp_size_in_bytes < 1.5 * 200 * state

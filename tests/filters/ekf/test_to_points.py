@@ -227,6 +227,7 @@ def test_dead_and_reduced_slots_are_not_ready():
     assert not gone.reduced.any()
 
 
+@pytest.mark.sweep
 def test_gradients_and_float32():
     log = a_log(12, dtype=np.float32)
 

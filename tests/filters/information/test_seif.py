@@ -378,6 +378,7 @@ def test_lost_definiteness_is_refused_and_counted():
     assert np.all(status == Status.SINGULAR)
 
 
+@pytest.mark.sweep
 def test_float32_keeps_its_type_and_its_definiteness():
     scene, log = world()
     f, predict, update = made()
@@ -391,6 +392,7 @@ def test_float32_keeps_its_type_and_its_definiteness():
     np.testing.assert_allclose(state.pose, wide.pose, atol=1e-2)
 
 
+@pytest.mark.sweep
 def test_gradients_and_batches():
     """Of one step, which is that of one run alone."""
     row = list(rows(12))[-1]

@@ -226,6 +226,7 @@ def test_far_landmarks_and_none_are_left_alone():
     assert np.isfinite(trace.final.cov).all()
 
 
+@pytest.mark.sweep
 def test_merging_in_float32_and_its_gradient():
     log = seen_twice(dtype=np.float32)
     _, go = driver(dtype=np.float32)

@@ -148,6 +148,7 @@ def test_exhaustive_search_finds_no_better(seed):
     np.testing.assert_allclose(found.pose, pose, atol=1e-2)
 
 
+@pytest.mark.sweep
 @pytest.mark.usefixtures("full_optimization")
 def test_clutter_is_left_alone_and_the_right_place_found_at_full_size():
     """200 landmarks, 6 of a scan's 9 measurements of them: never sure of a wrong place."""
@@ -213,6 +214,7 @@ def test_dead_landmarks_are_not_matched_and_vmap_is_a_loop():
     np.testing.assert_allclose(many.pose[1], found.pose, atol=1e-9)
 
 
+@pytest.mark.sweep
 def test_float32():
     rng, points, cov = world(3, 40, reach=40.0)
     of = np.argsort(((points - points[0]) ** 2).sum(axis=1))[:7]

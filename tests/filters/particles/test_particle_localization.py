@@ -13,6 +13,7 @@ import worlds
 from own_models import changed
 from reference.plane import from_frame
 from refusals import refused
+from sweeps import swept
 
 from jaxslam import association, motion, resampling, run, sensors
 from jaxslam.core.types import Scan, Status
@@ -248,7 +249,7 @@ def breaking(level):
     return changed(WORLD.motion, step=step)
 
 
-@pytest.mark.parametrize("kind", ["localization", "fastslam"])
+@pytest.mark.parametrize("kind", swept(["localization", "fastslam"], "localization"))
 def test_poses_that_are_not_finite_weigh_nothing_and_are_counted(kind):
     _, log = history(3)
 
@@ -331,6 +332,7 @@ def test_runs_of_a_batch_know_nothing_of_each_other_and_float32_stays_float32():
         assert leaf.dtype != np.float64
 
 
+@pytest.mark.sweep
 def test_gradients_are_finite_from_a_start_that_is_known_exactly():
     _, log = history(3)
 

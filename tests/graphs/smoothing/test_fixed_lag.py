@@ -35,6 +35,7 @@ def lag(world, **options):
     return FixedLag(world.motion, world.sensor, count, count, **options)
 
 
+@pytest.mark.sweep
 def test_a_window_as_long_as_the_log_is_the_batch(short):
     world, log = short
     filter = lag(world, window=4, iterations=5)
@@ -46,6 +47,7 @@ def test_a_window_as_long_as_the_log_is_the_batch(short):
     np.testing.assert_allclose(trace.final.at.path[0], batch.final.start, atol=1e-8)
 
 
+@pytest.mark.sweep
 def test_a_window_without_finite_numbers_begins_anew_and_says_so(short):
     world, log = short
     world = dataclasses.replace(world, landmarks=world.landmarks[:2])
@@ -83,6 +85,7 @@ def regular(log):
     return log._replace(scan=log.scan._replace(valid=log.scan.valid & ~exact))
 
 
+@pytest.mark.sweep
 def test_float32_and_gradients(short):
     world, log = short
     world = dataclasses.replace(world, landmarks=world.landmarks[:2])
