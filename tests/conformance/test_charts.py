@@ -1,7 +1,4 @@
-"""What every chart owes: run over `charts.REGISTRY`, so a new chart inherits it all.
-
-That `retract` and `local` undo each other whatever the numbers is a law of test_properties, too.
-"""
+"""What every chart owes: run over `charts.REGISTRY`, so a new chart inherits it all."""
 
 from types import SimpleNamespace
 

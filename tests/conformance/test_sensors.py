@@ -1,8 +1,8 @@
 """What every sensor owes: run over `sensors.REGISTRY`, so a new sensor inherits it all.
 
 Jacobians of `observe` and `invert`, their round trips, dtypes and hard states, the residual and the
-noise are what `verify` checks: see test_jacobians. That the map may have any frame, and that the
-residual takes back what was added, are laws of test_properties.
+noise are what `verify` checks: see test_jacobians. That the map may have any frame is a law of
+test_properties.
 """
 
 from types import SimpleNamespace

@@ -1,6 +1,6 @@
 """se2 against 3×3 homogeneous matrices, hand Jacobians against autodiff and differences.
 
-The laws of the group, and that functions undo each other, are in conformance/test_properties.
+That exp and log, ⊞ and ⊖ undo each other are laws of conformance/test_properties.
 """
 
 import inspect

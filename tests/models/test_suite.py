@@ -282,13 +282,3 @@ def test_absolute_sensors_alone_in_both_precisions():
     assert np.abs(trace.estimate.pose - truth.pose).max() < 0.2
     single = driven(ekf, scenario, narrow(log))
     np.testing.assert_allclose(single.estimate.pose, trace.estimate.pose, atol=1e-4)
-
-
-def test_float32_stays():
-    """Of sensors of unlike widths; the numbers are held to float64 in the test above."""
-    scenario, ekf = estimated()
-    log = narrow(drawn()[1])
-    start = np.zeros(3), np.zeros((3, 3)), jax.random.key(0)
-    trace = jax.eval_shape(lambda log: jaxslam.run(ekf, log, *start), log)
-    kinds = {leaf.dtype for leaf in jax.tree.leaves(trace)}
-    assert {kind for kind in kinds if kind.kind == "f"} == {np.dtype("f4")}

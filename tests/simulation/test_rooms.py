@@ -196,9 +196,8 @@ def test_a_laser_and_its_world_hold_numbers_alone():
     first, key = scan_world(world, jax.random.key(0)), jax.random.key(0)
     laser = dataclasses.replace(world.laser, sigma=0.1, mount=np.array([-0.3, 0.1, 0.2]))
     other = dataclasses.replace(world, laser=laser)
-    with worlds.compilations() as compiled:
+    with worlds.nothing_compiled():
         second = scan_world(other, key)
-        assert compiled() == 0
     np.testing.assert_array_equal(first.pose, second.pose)
     assert np.all(first.beams.range != second.beams.range)
     at, along = jnp.array([3.0, 3.0, 0.0]), Laser([0.0], mount=np.array([0.2, 0.1, 0.0]))

@@ -322,27 +322,18 @@ def test_a_wrong_entry_of_a_factor_is_named():
     assert "entry (y [m], x [m]): hand disagrees" in str(report)
 
 
-def test_factors_of_a_file_are_found(tmp_path):
+@pytest.mark.parametrize(
+    ("text", "name", "factor"),
+    [
+        ("mine = graphs.Prior()\n", "mine", "prior"),
+        ("def mine() -> graphs.Factor:\n    return graphs.Prior()\n", "mine", "prior"),
+        ("@record\nclass Mine(graphs.Prior):\n    pass\n", "Mine", "mine"),
+    ],
+)
+def test_a_file_has_factors_by_themselves_by_factories_and_classes(tmp_path, text, name, factor):
     path = tmp_path / "mine.py"
-    path.write_text("from jaxslam import graphs\nmine = graphs.Prior()\n")
-    assert [(t.name, t.model.name) for t in user_files.load(str(path))] == [("mine", "prior")]
-
-
-def test_a_factory_of_a_factor_is_one(tmp_path):
-    path = tmp_path / "mine.py"
-    path.write_text(
-        "from jaxslam import graphs\n\n\ndef mine() -> graphs.Factor:\n    return graphs.Prior()\n"
-    )
-    assert [(t.name, t.model.name) for t in user_files.load(str(path))] == [("mine", "prior")]
-
-
-def test_a_class_of_a_factor_without_fields_is_one(tmp_path):
-    path = tmp_path / "mine.py"
-    path.write_text(
-        "from jaxslam import graphs\nfrom jaxslam.core.record import record\n\n\n"
-        "@record\nclass Mine(graphs.Prior):\n    pass\n"
-    )
-    assert [(t.name, t.model.name) for t in user_files.load(str(path))] == [("Mine", "mine")]
+    path.write_text(f"from jaxslam import graphs\nfrom jaxslam.core.record import record\n{text}")
+    assert [(t.name, t.model.name) for t in user_files.load(str(path))] == [(name, factor)]
 
 
 def test_a_class_in_the_place_of_a_factor_is_to_be_called():

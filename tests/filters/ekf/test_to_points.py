@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from own_models import changed
+from refusals import refused
 
 from jaxslam import charts, motion, run, sensors, slots
 from jaxslam.charts import RightInvariant
@@ -242,17 +243,24 @@ def test_gradients_and_float32():
     assert trace.info.extra["points"].reduced.any()
 
 
-def test_refusals():
-    with pytest.raises(ValueError, match="to_point above 0"):
-        camera(to_point=0.0)
-    turning = changed(
-        RightInvariant(rays=True), basis=lambda x, y: Basis(jnp.eye(3), y[:, None], jnp.eye(4))
-    )
-    with pytest.raises(ValueError, match="turn with the robot"):
-        EkfSlam(MOTION, camera(to_point=0.1), 4, chart=turning)
-    with pytest.raises(ValueError, match="does not act on the 4-parameter"):
-        EkfSlam(MOTION, camera(), 4, chart=RightInvariant())
-    with pytest.raises(ValueError, match="does not act on the 2-parameter"):
-        EkfSlam(MOTION, sensors.RangeBearing(np.eye(2)), 4, chart=RightInvariant(rays=True))
-    with pytest.raises(ValueError, match="converted to points"):
-        CompressedEkfSlam(EkfSlam(MOTION, camera(to_point=0.1), 8), area=4)
+TURNING = changed(
+    RightInvariant(rays=True), basis=lambda x, y: Basis(jnp.eye(3), y[:, None], jnp.eye(4))
+)
+POINT_SENSOR = sensors.RangeBearing(np.eye(2))
+
+
+@refused(
+    (lambda: camera(to_point=0.0), "to_point above 0"),
+    (lambda: EkfSlam(MOTION, SENSOR, 4, chart=TURNING), "turn with the robot"),
+    (
+        lambda: EkfSlam(MOTION, camera(), 4, chart=RightInvariant()),
+        "does not act on the 4-parameter",
+    ),
+    (
+        lambda: EkfSlam(MOTION, POINT_SENSOR, 4, chart=RightInvariant(rays=True)),
+        "does not act on the 2-parameter",
+    ),
+    (lambda: CompressedEkfSlam(EkfSlam(MOTION, SENSOR, 8), area=4), "converted to points"),
+)
+def test_refusals(make):
+    make()

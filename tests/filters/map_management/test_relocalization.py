@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from reference import plane
+from refusals import refused
 
 from jaxslam import charts, motion, se2, sensors
 from jaxslam.core.slots import Joint
@@ -238,10 +239,6 @@ def test_a_scan_as_points():
         slope = np.array([[np.cos(phi), -r * np.sin(phi)], [np.sin(phi), r * np.cos(phi)]])
         np.testing.assert_allclose(covs[i], slope @ SENSOR.noise_cov(z[i]) @ slope.T, atol=1e-12)
     np.testing.assert_array_equal(points[2], 0.0)
-    with pytest.raises(
-        ValueError, match="expected a sensor that measures points, got bearing_only"
-    ):
-        seen_points(sensors.BearingOnly(0.1 * np.eye(1)), scan)
 
 
 def some_joint(seed=0, count=6):
@@ -411,33 +408,40 @@ def test_a_kidnapped_robot_finds_itself_and_goes_on():
     assert np.hypot(*error[:2]) < 0.5
 
 
-def test_refusals():
-    rng, points, cov = world(0, 5)
+def relocalized(cov=slice(None), **options):
+    rng, points, whole = world(0, 5)
     seen, covs = seen_from(rng, [0.0, 0.0, 0.0], points)
     yes = np.ones(5, bool)
-    for change, message in (
-        ({"least": 2}, "least"),
-        ({"margin": 0}, "margin"),
-        ({"probability": 1.0}, "probability"),
-        ({"pairs": 0}, "pairs"),
-        ({"candidates": 0}, "candidates"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            relocalize(points, cov, yes, seen, covs, yes, **change)
-    with pytest.raises(ValueError, match="shape"):
-        relocalize(points, cov[:4], yes, seen, covs, yes)
-    joint = some_joint()
-    with pytest.raises(ValueError, match="covariance"):
-        lost(joint, charts.Euclidean(), -np.eye(3))
-    with pytest.raises(ValueError, match="keeps former estimates"):
-        lost(
-            joint._replace(lin=FirstEstimate().init(joint.pose, joint.landmarks)),
-            charts.Euclidean(),
-            np.eye(3),
-        )
-    with pytest.raises(ValueError, match="landmarks"):
-        points_of_map(joint._replace(landmarks=jnp.zeros((4, 3))), charts.Euclidean())
-    with pytest.raises(ValueError, match="scans"):
-        relocated(
-            joint, charts.Euclidean(), jnp.array([0, 1]), jnp.zeros((3, 2)), jnp.zeros((3, 2, 2))
-        )
+    relocalize(points, whole[cov], yes, seen, covs, yes, **options)
+
+
+def former(joint):
+    return joint._replace(lin=FirstEstimate().init(joint.pose, joint.landmarks))
+
+
+@refused(
+    (lambda: relocalized(least=2), "least"),
+    (lambda: relocalized(margin=0), "margin"),
+    (lambda: relocalized(probability=1.0), "probability"),
+    (lambda: relocalized(pairs=0), "pairs"),
+    (lambda: relocalized(candidates=0), "candidates"),
+    (lambda: relocalized(slice(4)), "shape"),
+    (lambda: lost(some_joint(), charts.Euclidean(), -np.eye(3)), "covariance"),
+    (lambda: lost(former(some_joint()), charts.Euclidean(), np.eye(3)), "keeps former estimates"),
+    (
+        lambda: MAP_OF(some_joint()._replace(landmarks=np.zeros((4, 3))), charts.Euclidean()),
+        "landm",
+    ),
+    (
+        lambda: RELOCATED(
+            some_joint(), charts.Euclidean(), np.arange(2), np.zeros((3, 2)), np.zeros((3, 2, 2))
+        ),
+        "scans",
+    ),
+    (
+        lambda: seen_points(sensors.BearingOnly(0.1 * np.eye(1)), None),
+        "expected a sensor that measures points, got bearing_only",
+    ),
+)
+def test_refusals(call):
+    call()

@@ -160,24 +160,23 @@ def test_a_beam_ends_where_it_leaves_the_map():
     assert far.hits.sum() == near.hits.sum() == 0 and far.misses.sum() > 100
 
 
-def test_bad_numbers_are_refused():
-    poses, beams = scans()
-    for max_range in (0.0, np.inf, np.nan):
-        with pytest.raises(ValueError, match="count: expected max_range above 0"):
-            grids.count(SHAPE, ORIGIN, CELL, poses, beams, max_range=max_range)
-    for shape in ((0, 5), (5.0, 5), (5,)):
-        with pytest.raises(ValueError, match=r"count: expected a shape \(H, W\)"):
-            grids.count(shape, ORIGIN, 0.1, poses, beams, max_range=1.0)
-    with pytest.raises(ValueError, match="count: expected a mounting pose"):
-        counted(poses, beams, mount=(0.0, 0.0))
-    with pytest.raises(ValueError, match="count: expected a resolution above 0"):
-        grids.count(SHAPE, ORIGIN, 0.0, poses, beams, max_range=1.0)
-    with pytest.raises(ValueError, match="count: expected an origin"):
-        grids.count(SHAPE, ORIGIN[:2], 0.1, poses, beams, max_range=1.0)
-    with pytest.raises(ValueError, match=r"count: expected no_return from 0 to 2\.5"):
-        counted(poses, beams, free=3.0)
-    found = counted(poses, beams)
-    with pytest.raises(ValueError, match="occupancy: expected 0 < miss"):
-        grids.occupancy(found, hit=0.4)
-    with pytest.raises(ValueError, match="reflection: expected a prior"):
-        grids.reflection(found, prior=0.0)
+def of_window(shape=SHAPE, origin=ORIGIN, cell=CELL, max_range=1.0):
+    return grids.count(shape, origin, cell, *scans(), max_range=max_range)
+
+
+@refused(
+    (lambda: of_window(max_range=0.0), "count: expected max_range above 0"),
+    (lambda: of_window(max_range=np.inf), "count: expected max_range above 0"),
+    (lambda: of_window(max_range=np.nan), "count: expected max_range above 0"),
+    (lambda: of_window((0, 5)), r"count: expected a shape \(H, W\)"),
+    (lambda: of_window((5.0, 5)), r"count: expected a shape \(H, W\)"),
+    (lambda: of_window((5,)), r"count: expected a shape \(H, W\)"),
+    (lambda: counted(*scans(), mount=(0.0, 0.0)), "count: expected a mounting pose"),
+    (lambda: of_window(cell=0.0), "count: expected a resolution above 0"),
+    (lambda: of_window(origin=ORIGIN[:2]), "count: expected an origin"),
+    (lambda: counted(*scans(), free=3.0), r"count: expected no_return from 0 to 2\.5"),
+    (lambda: grids.occupancy(counted(*scans()), hit=0.4), "occupancy: expected 0 < miss"),
+    (lambda: grids.reflection(counted(*scans()), prior=0.0), "reflection: expected a prior"),
+)
+def test_bad_numbers_are_refused(call):
+    call()
