@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import refused
 from own_models import changed, motion_of, sensor_of
-from refusals import refused
 
 import jaxslam
 from jaxslam import (

@@ -13,8 +13,8 @@ import jax
 import numpy as np
 import pytest
 import worlds
+from cases import swept
 from hypothesis import given, settings
-from sweeps import swept
 
 from jaxslam import catalog, run
 from jaxslam.core.numbers import largest

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
+from cases import refused
 from reference import plane
-from refusals import refused
 
 from jaxslam import association, motion, run, sensors
 from jaxslam.calibration import calibrate, consider_cov
@@ -139,6 +139,7 @@ def drive(seed, steps=160, drift=0.02, turn=0.1):
 PLACES, NOISE = 3, np.diag([0.01, 0.01, 0.002]) ** 2
 
 
+@pytest.mark.sweep
 def test_odometry_is_calibrated_without_identities():
     logs = [drive(seed) for seed in range(4)]
     together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *logs)

@@ -8,9 +8,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
+from cases import refused, swept
 from layouts import kept_programs, wrong_layouts
-from refusals import refused
-from sweeps import swept
 
 from jaxslam import catalog, charts, linearize, motion, sensors
 from jaxslam.core.protocols import Filter, Here
@@ -152,7 +151,8 @@ def test_with_points_close_together_it_is_the_ekf_of_the_same_chart(chart):
     assert np.abs(fitted.estimate.pose - first.estimate.pose).max() > 1e-9
 
 
-@pytest.mark.parametrize("dtype", swept([np.float32, np.float64], np.float64))
+@pytest.mark.sweep
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
 def test_sigma_points_take_a_pose_known_exactly_in_both_precisions(dtype):
     world, truth, log = around(noise=0.01)
     world = dataclasses.replace(world, pose_cov=np.zeros((3, 3)))

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import scipy.stats
 import worlds
-from refusals import refused
+from cases import refused
 from test_consistency import STEPS, plain_nees, scored, summed, synthetic
 
 from jaxslam import charts, consistency, motion, sensors

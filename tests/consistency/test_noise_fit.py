@@ -3,7 +3,8 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from refusals import refused
+import pytest
+from cases import refused
 
 import jaxslam
 from jaxslam import association, filters, motion, sensors
@@ -145,6 +146,7 @@ def followed(p, log):
     return jaxslam.run(ekf, log, np.zeros(3), np.zeros((3, 3)), KEY).info
 
 
+@pytest.mark.sweep
 def test_the_noises_of_simulated_logs_are_found_and_errors_are_their_spread():
     """From starts a factor 3 off: over 24 logs the z of each noise are standard normal numbers, by
     bands that honest ones leave once in a thousand, and NIS/dof is 1, since P grows with all noises."""

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
-from refusals import refused
+from cases import refused
 
 import jaxslam
 from jaxslam import plot, report, store

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import refused
 from reference.plane import compose
-from refusals import refused
 from worlds import narrow
 
 from jaxslam import graphs, run

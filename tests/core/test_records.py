@@ -10,10 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
+from cases import refused, swept
 from layouts import kept_programs, wrong_layouts
 from own_models import motion_of, sensor_of
-from refusals import refused
-from sweeps import swept
 
 import jaxslam
 from jaxslam import catalog, filters, motion, run, sensors, simulate, smoothing
@@ -102,6 +101,11 @@ class Later(sensors.RangeBearing):
     """A class of a record that is none."""
 
 
+@record
+class Still(World):
+    """A world that draws nothing."""
+
+
 @refused(
     (lambda: Pair("near"), "Pair: first: expected a number, an array or a record .* got 'near'"),
     (lambda: Pair([1.0, 2.0]), "Pair: first: expected an array, as of numpy.asarray, got a list"),
@@ -120,6 +124,7 @@ class Later(sensors.RangeBearing):
     (lambda: sensors.Suite([sensors.RangeBearing(R)]), "Suite: expected a Part or .* got RangeB"),
     (Bare, "Bare: expected @record above the class"),
     (lambda: Later(R), "Later: expected @record above the class"),
+    (Still, "Still: expected a method draw"),
     told="^",
 )  # fmt: skip
 def test_bad_input_is_one_line_that_names_the_class(make):
@@ -180,6 +185,7 @@ def likelihood(filter):
     return driven(filter).info.log_likelihood.sum()
 
 
+@pytest.mark.sweep
 def test_the_gradient_of_a_filter_is_one():
     filter = toy_filter()
     slope = jax.jit(jax.grad(likelihood))(filter)
@@ -363,16 +369,6 @@ def test_what_cannot_be_traced_is_told_by_method_and_line():
     with pytest.raises(ValueError, match=r"ring: draw: test_records.py:\d+ needs the value"):
         simulate(Counted(**fields), KEY)
     assert "\n" not in repr(Drawn(**fields))
-
-
-def test_a_world_without_draw_is_refused():
-    @record
-    class Still(World):
-        motion: object
-        sensor: object
-
-    with pytest.raises(ValueError, match="Still: expected a method draw"):
-        Still(worlds.ring(3).motion, worlds.ring(3).sensor)
 
 
 # --- programs ---------------------------------------------------------------------------------------

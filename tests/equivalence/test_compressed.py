@@ -7,8 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from refusals import refused
-from sweeps import swept
+from cases import refused, swept
 from worlds import draw
 
 from jaxslam import charts, linearize, sensors
@@ -98,6 +97,7 @@ def test_a_run_does_not_depend_on_the_runs_beside_it():
     assert_same(beside, alone, rtol=1e-12)
 
 
+@pytest.mark.sweep
 def test_from_a_map_at_hand():
     world, logs = tour()
     rest = jax.tree.map(lambda x: x[0, STEPS - 20 :], logs)

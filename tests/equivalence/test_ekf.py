@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import swept
 from own_models import changed
-from sweeps import swept
 from worlds import narrow
 
 from jaxslam import charts, linearize, motion, sensors
@@ -272,6 +272,7 @@ def test_initial_covariance_is_given_in_map_coordinates(name):
     assert not estimate.alive.any()
 
 
+@pytest.mark.sweep
 def test_iterated_correction_finds_the_most_probable_state_and_counts_the_data_once():
     """Its fixed point is the minimum of ξᵀP⁻¹ξ + νᵀR⁻¹ν, its covariance that of one measurement."""
     joint = some_joint(size=0.25)
@@ -373,6 +374,7 @@ def test_vmap_is_a_loop_and_one_trace_serves_all_logs(logs, single):
         assert_same(take(mapped, i), single(take(logs[1], i)), atol=1e-11)
 
 
+@pytest.mark.sweep
 def test_capacity_8_is_a_larger_one(logs, single):
     capacity = 70  # P is passed over in another way beyond 128 rows
     roomy = jax.device_get(jax.jit(runner(capacity))(take(logs[1], 0)))

@@ -8,8 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from refusals import refused
-from sweeps import swept
+from cases import refused, swept
 from worlds import draw
 
 from jaxslam import filters, sensors
@@ -90,6 +89,7 @@ def test_a_certain_start_gets_the_floor(dtype):
     assert int(b.final.refused) == 0
 
 
+@pytest.mark.sweep
 def test_other_models_full_maps_unknown_tags_and_empty_scans():
     """Landmarks of three parameters, in the canonical form as in the other, in too small a map."""
     sensor = sensors.RangeBearingSignature(np.diag([0.1, 0.02, 0.1]) ** 2)

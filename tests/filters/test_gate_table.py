@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import swept
 from own_models import changed
-from sweeps import swept
 
 from jaxslam import filters, motion, sensors
 from jaxslam.core.types import Scan, Status

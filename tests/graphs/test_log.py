@@ -8,9 +8,8 @@ import numpy as np
 import pytest
 import scipy.optimize
 import worlds
+from cases import refused, swept
 from reference import ekf_slam, plane
-from refusals import refused
-from sweeps import swept
 
 from jaxslam import graphs, motion, sensors, simulate
 from jaxslam.core.types import Log, Scan

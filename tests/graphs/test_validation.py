@@ -3,8 +3,8 @@
 import numpy as np
 import pytest
 import small_graphs
+from cases import refused
 from own_models import made
-from refusals import refused
 
 from jaxslam import graphs
 

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from refusals import refused
+from cases import refused, swept
 
 from jaxslam.core import validation
 from jaxslam.math import gaussians, linalg
@@ -67,7 +67,7 @@ def over_rows(function):
     return padded
 
 
-@pytest.mark.parametrize("n", UNROLLED + LAPACK)
+@pytest.mark.parametrize("n", swept(UNROLLED + LAPACK, 3, 9))
 def test_factor_and_solves_equal_numpy(n):
     a = random_covariances(n)
     b = np.random.default_rng(1).normal(size=(len(a), n, 2))
@@ -111,7 +111,7 @@ def test_a_vector_or_a_matrix_the_lower_triangle_alone_and_the_slope_of_the_log_
     np.testing.assert_allclose(slope * unit, np.linalg.inv(a) * unit, rtol=1e-7)
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 6, 9, 20])
+@pytest.mark.parametrize("n", swept([1, 2, 3, 6, 9, 20], 3, 9))
 def test_semi_definite_matrices_are_flagged_and_nothing_is_nan(n):
     a = semi_definite(n)
     factor, positive, half, solution, solvable = used(n)(a, np.ones((len(a), n, 2)))
@@ -128,7 +128,7 @@ def test_semi_definite_matrices_are_flagged_and_nothing_is_nan(n):
         np.testing.assert_allclose(rebuilt, a, rtol=1e-14)
 
 
-@pytest.mark.parametrize("n", [2, 3, 9])
+@pytest.mark.parametrize("n", swept([2, 3, 9], 3))
 def test_gradients_through_semi_definite_matrices_are_finite(n):
     def total(a, b):
         solution, _ = linalg.solve_psd(a, b)
@@ -142,7 +142,7 @@ def test_gradients_through_semi_definite_matrices_are_finite(n):
     assert any(np.any(slope) for slope in slopes) == (n < 9)  # 9: all masked
 
 
-@pytest.mark.parametrize("n", [1, 2, 3, 6])
+@pytest.mark.parametrize("n", swept([1, 2, 3, 6], 3))
 def test_whitener_is_the_inverse_of_the_factor(n):
     a = random_covariances(n)
     whiten, flags = whitened(n)(a)
@@ -162,7 +162,7 @@ def test_whitener_as_a_loop_is_the_same_matrix():
     np.testing.assert_allclose(rows[:-1], whiten[:-1], rtol=1e-9, atol=1e-9)
 
 
-@pytest.mark.parametrize("n", [2, 3, 6])
+@pytest.mark.parametrize("n", swept([2, 3, 6], 3))
 def test_whitener_of_a_semi_definite_matrix_leaves_out_what_the_factor_leaves_out(n):
     a = semi_definite(n)
     whiten, flags = whitened(n)(a)

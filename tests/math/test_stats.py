@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 import scipy.stats
-from refusals import refused
+from cases import refused
 
 from jaxslam import stats
 

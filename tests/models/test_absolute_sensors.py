@@ -7,9 +7,10 @@ import jax
 import numpy as np
 import pytest
 import scipy.stats
+from cases import swept
 from reference.plane import turn, wrap
 
-from jaxslam import charts, linearize, motion, sensors
+from jaxslam import charts, motion, sensors
 from jaxslam.core.types import Log, Scan, Status
 from jaxslam.core.validation import check_log
 from jaxslam.filters import EkfSlam
@@ -110,7 +111,7 @@ def assert_same(a, b):
     np.testing.assert_allclose(a.estimate.pose_cov, b.estimate.pose_cov, atol=1e-9)
 
 
-@pytest.mark.parametrize("update", ["sequential", "joint"])
+@pytest.mark.parametrize("update", swept(["sequential", "joint"], "joint"))
 @pytest.mark.parametrize("name", R)
 def test_the_ekf_is_the_plain_one_of_the_pose(name, update):
     log = drive(name, MOUNT)
@@ -139,6 +140,7 @@ def test_the_ekf_is_the_plain_one_of_the_pose(name, update):
     assert np.isfinite(trace.estimate.point_covs).all()
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize("name", R)
 def test_joint_is_sequential_where_the_measurement_is_linear(name):
     """Without a lever arm a position fix is linear in the pose, as a compass always is."""
@@ -151,6 +153,7 @@ def test_joint_is_sequential_where_the_measurement_is_linear(name):
     np.testing.assert_allclose(total, together.info.log_likelihood, atol=1e-9)
 
 
+@pytest.mark.sweep
 def test_iterations_and_josephs_form_change_nothing_where_the_measurement_is_linear():
     log = drive("position_fix", np.zeros(3))
     once = filtered("position_fix", log, mount=np.zeros(3))
@@ -213,6 +216,7 @@ def padded(log):
     return log._replace(scan=scan)
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize("name", R)
 def test_simulated_runs_have_an_honest_nees(name):
     keys = jax.random.split(jax.random.key(5), RUNS)
@@ -259,16 +263,3 @@ def test_a_chart_of_landmarks_and_an_empty_capacity_are_refused(name):
         EkfSlam(motion.Increment(Q), sensor, 1, chart=charts.RightInvariant())
     with pytest.raises(ValueError, match="EkfSlam: capacity"):
         EkfSlam(motion.Increment(Q), sensor, 0)
-
-
-@pytest.mark.parametrize("name", R)
-def test_the_ideal_ekf_takes_them_too(name):
-    scenario = world(name)
-
-    def ideal(key):
-        truth, log = simulate(scenario, key)
-        at_truth = linearize.AtTruth(truth)
-        filter = EkfSlam(scenario.motion, scenario.sensor, 1, linearize=at_truth)
-        return run(filter, log, START, SPREAD, key).estimate
-
-    assert jax.eval_shape(ideal, KEY).pose.shape == (STEPS, 3)

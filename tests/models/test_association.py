@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
-from refusals import refused
+from cases import refused, swept
 from worlds import narrow
 
 from jaxslam import association
@@ -227,7 +227,7 @@ COUNT = 20
 """Random problems of a batch; in two more no landmark is alive, or nothing was measured."""
 
 
-@pytest.fixture(scope="module", params=METHODS)
+@pytest.fixture(scope="module", params=swept(METHODS, "nearest", "joint"))
 def batch(request):
     """A method, problems of it, and what it finds of them all at once."""
     method, rng = METHODS[request.param](), np.random.default_rng(5)

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from refusals import refused
+from cases import refused
 from worlds import narrow
 
 from jaxslam import life, motion, run, sensors, slots
@@ -177,6 +177,7 @@ def test_gradients_pass_through_births_and_deaths():
     np.testing.assert_allclose(slope, rise / 2e-6, rtol=1e-5)
 
 
+@pytest.mark.sweep
 def test_batches_and_float32():
     each = [log_of(seen_by_turns(second)) for second in ({0: 1}, {range(3, 12): 2})]
     logs = jax.tree.map(lambda *x: np.stack(x), *each)
@@ -189,6 +190,7 @@ def test_batches_and_float32():
         np.testing.assert_array_equal(batch.estimate.tag[i], alone.estimate.tag)
 
 
+@pytest.mark.sweep
 def test_a_root_does_not_change_because_another_run_loses_a_landmark():
     one, other = log_of(seen_by_turns({0: 1})), log_of(seen_by_turns({}))
     go = jax.vmap(driver(covariance="square_root"), (0, None, None))

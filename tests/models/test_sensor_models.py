@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import refused
 from reference.plane import from_frame, mounted, to_frame, wrap
-from refusals import refused
 
 import jaxslam
 from jaxslam import charts, filters, linearize, motion, sensors

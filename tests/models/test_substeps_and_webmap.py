@@ -97,15 +97,6 @@ def test_names_are_numbered_and_keep_their_units(case):
     )
 
 
-def test_float32_stays(case):
-    _, whole, pose, u, w = case
-    pose, u, w = (a.astype(np.float32) for a in (pose, u.ravel(), w.ravel()))
-    calls = [(whole.step, (pose, u, w)), (whole.noise_cov, (pose, u))]
-    calls += [(whole.jacobians, (pose, u, w)), (whole.perturb, (u, w))]
-    out = [jax.eval_shape(function, *given) for function, given in calls if function is not None]
-    assert {array.dtype for array in jax.tree.leaves(out)} == {np.dtype(np.float32)}
-
-
 def test_gradients_reach_the_models_parameters():
     def end(wheelbase):
         model = Substeps(motion.Ackermann(Q, wheelbase=wheelbase), COUNT)

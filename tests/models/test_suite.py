@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import refused
 from own_models import changed
-from refusals import refused
 from worlds import draw, narrow, ring
 
 import jaxslam
@@ -86,6 +86,7 @@ def places(scan, first, count, size=2):
     return own._replace(z=own.z[:, :size])
 
 
+@pytest.mark.sweep
 def test_a_suite_of_one_is_the_sensor():
     scenario, _ = estimated()
     pair = [EkfSlam(scenario.motion, s, 6) for s in (EYES, Suite(((EYES, 4),)))]

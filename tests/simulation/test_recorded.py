@@ -6,7 +6,7 @@ import chex
 import jax
 import numpy as np
 import pytest
-from refusals import refused
+from cases import refused
 
 from jaxslam import Scenario, catalog, monte_carlo, motion, recorded_world, sensors, simulate, store
 from jaxslam.core.types import Log, Scan

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
-from refusals import refused
+from cases import refused, swept
 
 from jaxslam import catalog, run
 from jaxslam.simulation.laser import Laser, scan, scan_information, scan_world, true_ranges
@@ -64,7 +64,7 @@ def test_exact_ranges_are_intersections_with_every_wall(differences):
     assert np.all(np.isfinite(slopes))
 
 
-@pytest.mark.parametrize("name", ROOMS)
+@pytest.mark.parametrize("name", swept(ROOMS, "office"))
 def test_the_robot_drives_in_free_space_and_its_scans_are_the_lasers(name):
     world = ROOMS[name](beams=24)
     log = scan_world(world, jax.random.key(0))
@@ -118,6 +118,7 @@ def test_the_directions_that_a_scan_does_not_see_are_named():
         assert scan_information(world.laser, world.walls, pose).names == ()
 
 
+@pytest.mark.sweep
 def test_maximum_likelihood_estimates_reach_the_cramer_rao_bound():
     """400 draws, three steps of Gauss and Newton each: the mean NEES under the bound is 3."""
     world = square(beams=60)
@@ -266,7 +267,7 @@ def test_rooms_without_segments_or_with_walls_of_no_thickness_are_refused():
         wall_lines(flat)
 
 
-@pytest.mark.parametrize("make", [office_lines, square_lines])
+@pytest.mark.parametrize("make", swept([office_lines, square_lines], square_lines))
 def test_a_scan_has_the_walls_in_view_and_no_other(make):
     world = make()
     truth, log = simulate(world, jax.random.key(0))
@@ -281,6 +282,7 @@ def test_a_scan_has_the_walls_in_view_and_no_other(make):
         make(world.steps + 1)
 
 
+@pytest.mark.sweep
 def test_the_ekf_of_lines_is_honest_over_a_few_steps():
     """100 runs of 12 steps; where the drive is short, the EKF's linearization costs nothing."""
     world = square_lines(12)

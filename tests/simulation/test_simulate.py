@@ -13,9 +13,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
+from cases import refused
 from own_models import changed
 from reference.plane import mounted, to_frame, wrap
-from refusals import refused
 
 from jaxslam import motion, sensors
 from jaxslam.core.validation import check_log

@@ -8,8 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
-from refusals import refused
-from sweeps import swept
+from cases import refused, swept
 
 from jaxslam import association, life, monte_carlo, run, sensors, simulate
 from jaxslam.consistency.measures.associations import associations, identities

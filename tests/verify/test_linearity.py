@@ -5,7 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from refusals import refused
+from cases import refused
 
 import jaxslam
 from jaxslam import motion, sensors

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import refused
 from own_models import changed
-from refusals import refused
 from verified import by_name, failed
 
 from jaxslam import sensors

@@ -8,9 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import refused, swept
 from reference.plane import from_frame
-from refusals import refused
-from sweeps import swept
 from worlds import draw, judged, nameless, narrow
 
 import jaxslam
@@ -424,6 +423,7 @@ def poor():
     return scenario, filter, logs, truth, [jax.device_get(go(filter, each)) for each in logs]
 
 
+@pytest.mark.sweep
 def test_a_full_map_refuses_and_says_so_in_float32_too(poor):
     truth, (trace, *_) = poor[-2:]
     chex.assert_tree_all_finite(trace)
@@ -438,6 +438,7 @@ def test_a_full_map_refuses_and_says_so_in_float32_too(poor):
     assert trace.info.tally(Status.OVERFLOW).sum() > 0
 
 
+@pytest.mark.sweep
 def test_spurious_bearings_move_no_robot_and_empty_scans_neither(poor):
     """Random bearings make no landmark, so all is as without them."""
     scenario, filter, (_, _, empty, _), _, (_, *traces) = poor
@@ -456,6 +457,7 @@ def test_spurious_bearings_move_no_robot_and_empty_scans_neither(poor):
     assert (trace.estimate.pose.shape, trace.info.status.shape) == ((60, 3), (60, 0))
 
 
+@pytest.mark.sweep
 def test_float32_stays_float32(poor):
     """Of bearings by runs of a full map, of ranges by their shapes alone."""
     scenario, filter = small("circles")

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
-from refusals import refused
+from cases import refused
 
 from jaxslam import catalog, charts, filters, life, linearize, sensors
 from jaxslam.core.record import record

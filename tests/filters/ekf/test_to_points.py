@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import refused, swept
 from own_models import changed
-from refusals import refused
 
 from jaxslam import charts, motion, run, sensors, slots
 from jaxslam.charts import RightInvariant
@@ -57,7 +57,8 @@ CHARTS = {"euclidean": charts.Euclidean, "right_invariant": lambda: RightInvaria
 
 
 FORMS = pytest.mark.parametrize(
-    ("name", "square_root"), [("euclidean", False), ("right_invariant", True)]
+    ("name", "square_root"),
+    swept([("euclidean", False), ("right_invariant", True)], ("euclidean", False)),
 )
 
 
@@ -125,7 +126,9 @@ def test_nothing_to_reduce_changes_nothing(name, square_root):
     chex.assert_trees_all_equal(same, joint)
 
 
-@pytest.mark.parametrize("options", [{}, {"linearize": Unscented(), "correction": "joint"}])
+@pytest.mark.parametrize(
+    "options", swept([{}, {"linearize": Unscented(), "correction": "joint"}], {})
+)
 def test_a_reduced_map_is_filtered_as_one_of_points(options):
     """From the moment of conversion on, the filter on 4-vectors is that on points (x, y)."""
     log = a_log()

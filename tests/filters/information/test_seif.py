@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from refusals import refused
+from cases import refused
 from worlds import draw, narrow
 
 from jaxslam import catalog, filters, scenarios, sensors
@@ -211,6 +211,7 @@ def test_every_step_is_the_dense_formula():
     assert float(state.counts.cut_nats) > 0
 
 
+@pytest.mark.sweep
 def test_mean_recovery_converges_to_the_whole_mean():
     state = driven(**FEW)
     residual = np.concatenate([state.pose_residual, np.ravel(state.landmark_residual)])

@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from refusals import refused
+from cases import refused, swept
 from worlds import draw, judged, nameless, narrow, ring
 
 from jaxslam import association, charts, linearize, run, sensors, simulate
@@ -94,7 +94,7 @@ def test_it_is_slam_in_a_map_without_error(chart, options, compass):
     assert not compass or (trace.info.status == Status.FUSED).all()
 
 
-@pytest.mark.parametrize("method", ["nearest", "joint"])
+@pytest.mark.parametrize("method", swept(["nearest", "joint"], "nearest"))
 def test_it_finds_its_landmarks_without_tags(method):
     scenario, (_, log) = world()
     make = {"nearest": association.Nearest, "joint": association.JointCompatibility}[method]
@@ -125,6 +125,7 @@ def test_sigma_points_are_close_to_jacobians():
     assert not np.array_equal(sigma.estimate.pose, plain.estimate.pose)
 
 
+@pytest.mark.sweep
 def test_it_is_honest_and_dead_reckoning_is_what_it_says():
     """The pose NEES of 200 runs in its interval, with a start that is not known either."""
     scenario, _ = world()

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import refused, swept
 from own_models import changed
-from refusals import refused
 from worlds import draw, nameless, ring
 
 from jaxslam import association, charts, linearize, motion, run, sensors, simulate
@@ -32,7 +32,7 @@ def on_poses(filter, truth, log):
     return jax.device_get(run(filter, log._replace(control=truth.pose), *start))
 
 
-@pytest.mark.parametrize("options", [{}, {"gate": 4.0, "births": 1}])
+@pytest.mark.parametrize("options", swept([{}, {"gate": 4.0, "births": 1}], {}))
 def test_it_is_slam_of_a_robot_that_knows_where_it_is(options):
     scenario, truth, log = world()
     capacity = 8
@@ -48,6 +48,7 @@ def test_it_is_slam_of_a_robot_that_knows_where_it_is(options):
     np.testing.assert_array_equal(trace.estimate.pose_cov, 0)
 
 
+@pytest.mark.sweep
 def test_it_is_honest():
     """NEES of the landmarks over 200 worlds in the chi-square band of so many."""
     scenario, _, _ = world()
@@ -91,6 +92,7 @@ def test_a_prior_for_slam():
     assert np.trace(after.cov) < np.trace(joint.cov)
 
 
+@pytest.mark.sweep
 def test_without_tags():
     scenario, truth, log = world()
     method = association.JointCompatibility(0.999, chi2_quantile(0.99999, 2))

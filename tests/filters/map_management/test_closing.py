@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import refused
 from reference import plane
-from refusals import refused
 
 from jaxslam import association, charts, motion, sensors, slots
 from jaxslam.core.protocols import Pairs, Prediction

@@ -8,8 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import refused, swept
 from reference import plane
-from refusals import refused
 
 from jaxslam import charts, motion, se2, sensors
 from jaxslam.core.slots import Joint
@@ -201,6 +201,7 @@ def test_too_few_points_and_nothing_that_agrees():
     np.testing.assert_array_equal(far.slot, -1)
 
 
+@pytest.mark.sweep
 def test_dead_landmarks_are_not_matched_and_vmap_is_a_loop():
     rng, points, cov = world(2, 12)
     seen, covs = seen_from(rng, [1.0, 2.0, 0.5], points[:6])
@@ -258,8 +259,10 @@ def some_joint(seed=0, count=6):
     return Joint(*parts, ())
 
 
-@pytest.mark.parametrize("name", ["euclidean", "right_invariant", "left_invariant"])
-@pytest.mark.parametrize("square_root", [False, True])
+@pytest.mark.parametrize(
+    "name", swept(["euclidean", "right_invariant", "left_invariant"], "right_invariant")
+)
+@pytest.mark.parametrize("square_root", swept([False, True], True))
 def test_lost_forgets_the_pose_and_nothing_else(name, square_root):
     chart = charts.REGISTRY[name]()
     joint = some_joint()
@@ -286,7 +289,7 @@ def test_lost_forgets_the_pose_and_nothing_else(name, square_root):
     np.testing.assert_allclose(whole[:3, 3:], 0, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["euclidean", "right_invariant"])
+@pytest.mark.parametrize("name", swept(["euclidean", "right_invariant"], "euclidean"))
 def test_relocated_is_the_limit_of_an_update_from_a_large_covariance(name):
     chart = charts.REGISTRY[name]()
     sensor = sensors.RelativePosition(0.1**2 * np.eye(2))

@@ -8,10 +8,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import refused, swept
 from reference.plane import to_frame
 from reference.team import Team
-from refusals import refused
-from sweeps import swept
 from worlds import draw, judged, narrow, nees, ring
 
 import jaxslam
@@ -319,6 +318,7 @@ def nees_at_worst(truth, estimate):
     return np.nanmax(nees(off[..., :2], np.asarray(estimate.pose_cov)[..., :2, :2]))
 
 
+@pytest.mark.sweep
 def test_a_team_in_a_campaign():
     """With the cheapest of filters: campaigns draw, bound and score worlds of teams."""
     scenario = hundred(1, 10)[1]

@@ -9,9 +9,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
+from cases import refused, swept
 from reference.plane import from_frame
-from refusals import refused
-from sweeps import swept
 
 from jaxslam import association, life, motion, resampling, sensors
 from jaxslam.consistency.measures.counts import counted
@@ -240,6 +239,7 @@ def test_the_start_is_reported_before_anything_is_drawn():
 # --- association of each particle ----------------------------------------------------------------
 
 
+@pytest.mark.sweep
 def test_unknown_identities_of_landmarks_far_apart_give_the_same_filter():
     known, _, log = driven()
     unknown = jax.device_get(
@@ -325,6 +325,7 @@ def test_a_gate_drops_an_outlier_and_births_have_a_quota_and_a_tag_is_born_once(
     np.testing.assert_array_equal(after.tag, [[0, 1, 3, -1]] * 4)
 
 
+@pytest.mark.sweep
 def test_negative_evidence_removes_a_landmark_from_every_map():
     """One that is measured once and then never again, though in view."""
     world = worlds.ring(6)
@@ -390,6 +391,7 @@ def test_any_method_resamples_whole_particles(name):
 # --- the house ----------------------------------------------------------------------------------
 
 
+@pytest.mark.sweep
 def test_a_batch_is_a_loop_and_keys_matter():
     logs = [worlds.draw(RING, seed)[1] for seed in range(2)]
     together = jax.random.split(jax.random.key(3), 2)
@@ -407,6 +409,7 @@ def test_a_batch_is_a_loop_and_keys_matter():
     assert np.all(alone[0].final.pose != other.final.pose)
 
 
+@pytest.mark.sweep
 @PROPOSALS
 def test_float32_stays_float32_and_near(proposal):
     double, _, log = driven("still")
@@ -422,6 +425,7 @@ def test_float32_stays_float32_and_near(proposal):
     assert all(leaf.dtype != np.float64 for leaf in jax.tree.leaves(trace))
 
 
+@pytest.mark.sweep
 @PROPOSALS
 def test_gradients_are_finite_where_the_pose_is_known_exactly(proposal):
     """By both noises, in reverse through a motion, corrections, a birth and resampling, P0 = 0."""

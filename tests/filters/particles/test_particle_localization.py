@@ -10,10 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
+from cases import refused, swept
 from own_models import changed
 from reference.plane import from_frame
-from refusals import refused
-from sweeps import swept
 
 from jaxslam import association, motion, resampling, run, sensors
 from jaxslam.core.types import Scan, Status
@@ -115,7 +114,7 @@ def assert_weighs(after, info, off):
     np.testing.assert_allclose(info.extra["particles"].ess, w.sum() ** 2 / (w**2).sum(), rtol=1e-9)
 
 
-@pytest.mark.parametrize("gate", [math.inf, 16.0])
+@pytest.mark.parametrize("gate", swept([math.inf, 16.0], 16.0))
 def test_weights_are_the_scans_densities(gate):
     scan = jax.tree.map(np.array, one_scan())
     scan.tag[2], scan.valid[5] = -1, False
@@ -136,6 +135,7 @@ def test_weights_are_the_scans_densities(gate):
     np.testing.assert_allclose(after.slow, after.fast)
 
 
+@pytest.mark.sweep
 def test_landmarks_far_apart_are_known_without_tags_by_each_particle():
     truth, log = history(8)
     likeliest = association.MaximumLikelihood(1e6)
@@ -146,6 +146,7 @@ def test_landmarks_far_apart_are_known_without_tags_by_each_particle():
     assert np.linalg.norm(trace.estimate.pose[-1, :2] - truth.pose[-1, :2]) < 0.3
 
 
+@pytest.mark.sweep
 def test_absolute_sensors_of_a_suite_weigh_too():
     eyes = Suite(((BLUNT, 6), Part(sensors.Compass(np.array([[0.04]])), 1)))
     scan, filter = one_scan(), of(20, eyes)
@@ -215,6 +216,7 @@ def test_the_number_of_particles_follows_the_uncertainty(carried):
     assert np.isfinite(poses).all()
 
 
+@pytest.mark.sweep
 def test_what_is_not_in_use_is_inert():
     _, log = history(2)
     filter = of(40, BLUNT, threshold=0.0)
@@ -286,7 +288,7 @@ def test_where_all_weights_underflow_the_filter_goes_on_and_counts():
     chex.assert_tree_all_finite((info, jax.jit(filter.estimate)(after)))
 
 
-@pytest.mark.parametrize("count", [1, 7])
+@pytest.mark.parametrize("count", swept([1, 7], 7))
 def test_without_any_noise_or_with_one_particle_it_is_dead_reckoning(count):
     """A proposal without spread, from a start without any: all particles are one."""
     _, log = history(5)
@@ -318,6 +320,7 @@ def test_the_start_is_reported_before_anything_is_drawn():
     np.testing.assert_allclose(np.cov(draws.T), out.pose_cov, atol=0.15)
 
 
+@pytest.mark.sweep
 def test_runs_of_a_batch_know_nothing_of_each_other_and_float32_stays_float32():
     _, log = history(4)
     filter = of(30, BLUNT, box=BOX)

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
-from refusals import refused
+from cases import refused
 from test_smoothing import KEY, P0, START, arguments, linear_log, linear_world
 
 from jaxslam import motion, run, sensors, simulate

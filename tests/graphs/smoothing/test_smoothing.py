@@ -8,10 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
+from cases import swept
 from own_models import motion_of, sensor_of
 from reference import ekf_slam as plain
 from reference.plane import compose
-from sweeps import swept
 from worlds import ring
 
 from jaxslam import filters, motion, run, sensors, simulate

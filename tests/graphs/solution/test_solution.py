@@ -6,6 +6,7 @@ import jax
 import numpy as np
 import pytest
 import small_graphs
+from cases import refused
 from pose_rings import SIZE, dense, ring
 from reference import graph as plain
 from small_graphs import POINTS, POSES
@@ -89,39 +90,34 @@ def test_a_prior_is_a_gauge_and_two_are_refused():
         graphs.certificate(free._replace(fixed_pose=graph.fixed_pose))
 
 
-def test_a_factor_without_a_chordal_cost_is_refused():
+def with_point(name, size):
+    """The graph of a ring with a point, measured once."""
     graph = isotropic()
-    seen = graphs.Table(
-        np.zeros((1, 2), np.int32), np.zeros((1, 1)), np.ones((1, 1, 1)), np.ones(1, bool)
-    )
-    with pytest.raises(ValueError, match="'bearing' has no chordal cost"):
-        graphs.certificate(
-            graph._replace(
-                tables={**graph.tables, "bearing": seen},
-                points=np.ones((1, 2)),
-                fixed_point=np.ones(1, bool),
-                point_id=np.zeros(1, int),
-            )
-        )
+    row = np.zeros((1, 2), np.int32), np.zeros((1, size)), np.eye(size)[None], np.ones(1, bool)
+    point = {
+        "points": np.ones((1, 2)),
+        "fixed_point": np.ones(1, bool),
+        "point_id": np.zeros(1, int),
+    }
+    return graph._replace(tables={**graph.tables, name: graphs.Table(*row)}, **point)
 
 
-def test_a_sensor_of_the_same_name_on_a_mount_is_refused():
-    """Its residual is another one than that of a relative position from the robot's own place."""
-    graph = isotropic()
-    seen = graphs.Table(
-        np.zeros((1, 2), np.int32), np.zeros((1, 2)), np.eye(2)[None], np.ones(1, bool)
-    )
-    mounted = graphs.FromSensor(sensors.RelativePosition(np.eye(2), mount=[1.0, 0.0, 0.5]))
-    with pytest.raises(ValueError, match="'seen' has no chordal cost: its factor is relative_pos"):
-        graphs.certificate(
-            graph._replace(
-                tables={**graph.tables, "seen": seen},
-                points=np.ones((1, 2)),
-                fixed_point=np.ones(1, bool),
-                point_id=np.zeros(1, int),
-            ),
-            {"relative_pose": graphs.RelativePose(), "seen": mounted},
-        )
+@refused(
+    (lambda: graphs.certificate(with_point("bearing", 1)), "'bearing' has no chordal cost"),
+    (
+        lambda: graphs.certificate(
+            with_point("seen", 2),
+            {
+                "relative_pose": graphs.RelativePose(),
+                "seen": graphs.FromSensor(sensors.RelativePosition(np.eye(2), mount=[1, 0, 0.5])),
+            },
+        ),
+        "'seen' has no chordal cost: its factor is relative_pos",
+    ),
+)
+def test_a_factor_without_a_chordal_cost_is_refused(call):
+    """Nor has a sensor on a mount, though its name is that of a factor which has one."""
+    call()
 
 
 # --- Marginal covariances, against the dense inverse ----------------------------------------------

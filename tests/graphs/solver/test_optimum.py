@@ -5,11 +5,11 @@ import numpy as np
 import own_models
 import pytest
 import small_graphs
+from cases import swept
 from pose_rings import SIZE, dense, ring
 from recordings import DATA
 from reference import graph as plain
 from reference.plane import between, wrap
-from sweeps import swept
 from worlds import nothing_compiled
 
 from jaxslam import graphs
@@ -301,6 +301,7 @@ def larger(graph, more=12):
     )
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize("kernel", swept([None, KERNEL], KERNEL))
 def test_the_numbers_are_those_without_room(kernel):
     graph = with_loops(ring(spread=3.0))
@@ -346,6 +347,7 @@ def test_graphs_of_other_sizes_share_a_program():
     )
 
 
+@pytest.mark.sweep
 def test_a_plan_with_room_is_shared_too():
     """One plan a graph, given, as it must be where the graph is traced."""
     graph = with_loops(ring())
@@ -362,6 +364,7 @@ def test_a_graph_that_is_larger_than_the_room_is_solved_all_the_same():
     np.testing.assert_allclose(found.graph.poses, alone.graph.poses, rtol=0, atol=1e-8)
 
 
+@pytest.mark.sweep
 def test_what_is_not_determined_is_told_of_the_graph_that_was_given():
     graph = with_loops(ring())
     tables = dict(graph.tables)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from refusals import refused
+from cases import refused
 
 from jaxslam.core.types import Beams
 from jaxslam.laser.features import fit_line, segments

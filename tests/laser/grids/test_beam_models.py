@@ -5,8 +5,8 @@ import itertools
 import jax
 import numpy as np
 import pytest
+from cases import refused
 from reference.plane import from_frame
-from refusals import refused
 from scipy import integrate, stats
 
 from jaxslam import grids

@@ -5,8 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import recordings
+from cases import refused, swept
 from reference.plane import from_frame
-from refusals import refused
 
 from jaxslam import grids
 from jaxslam.simulation.walls import exact_ranges, is_free, rasterize, walls
@@ -78,7 +78,7 @@ def test_a_ray_ends_where_it_enters_the_first_occupied_cell(blocks):
     assert 0.2 < np.mean(np.asarray(found) < 1.5) < 0.99
 
 
-@pytest.mark.parametrize("method", ["cells", "surface"])
+@pytest.mark.parametrize("method", swept(["cells", "surface"], "surface"))
 def test_long_steps_through_free_space_change_no_range(blocks, method):
     grid, _, _, pose = blocks
     step_by_step, skipping = (
@@ -88,6 +88,7 @@ def test_long_steps_through_free_space_change_no_range(blocks, method):
     np.testing.assert_allclose(skipping, step_by_step, rtol=0, atol=1e-12)
 
 
+@pytest.mark.sweep
 def test_rays_end_in_single_precision_too():
     """Rounding may leave a ray in a square whose end it has passed; it takes many to meet one."""
     rng = np.random.default_rng(0)
@@ -194,7 +195,7 @@ def test_ranges_are_those_of_exact_geometry_to_a_tenth_of_a_cell():
     assert np.all(sides.any(axis=2) & ~sides.all(axis=2) | (found >= 5))
 
 
-@pytest.mark.parametrize("method", ["cells", "surface"])
+@pytest.mark.parametrize("method", swept(["cells", "surface"], "surface"))
 def test_the_derivative_by_the_pose_is_that_of_a_wall(method):
     world, cell = rooms(), 0.05
     rays = grids.ray_map(rasterize(world, cell, yaw=0.3), method=method)
@@ -255,6 +256,7 @@ def test_the_method_is_chosen_by_the_map():
     assert same_rays(grid, "cells", model.prepare)
 
 
+@pytest.mark.sweep
 def test_the_second_derivative_is_that_of_a_wall_too():
     """Its trace once went on without end, through the loop of the rays."""
     log_odds = np.full((20, 30), -2.0)
@@ -269,7 +271,7 @@ def test_the_second_derivative_is_that_of_a_wall_too():
     np.testing.assert_allclose(second, expected, atol=1e-9)
 
 
-@pytest.mark.parametrize("method", ["cells", "surface"])
+@pytest.mark.parametrize("method", swept(["cells", "surface"], "surface"))
 def test_gradients_are_finite_at_walls_in_obstacles_and_off_the_map(blocks, method):
     grid, at, _, pose = blocks
     rays = grids.ray_map(grid, method=method)
@@ -322,6 +324,7 @@ def test_bad_input_is_refused(call):
     call(grid_of(np.full((5, 6), -1.0)))
 
 
+@pytest.mark.sweep
 def test_rays_in_float32(blocks):
     grid, _, _, pose = blocks
     single = jax.tree.map(np.float32, grid)

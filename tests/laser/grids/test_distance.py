@@ -3,7 +3,7 @@
 import jax
 import numpy as np
 import pytest
-from refusals import refused
+from cases import refused
 from scipy import ndimage
 
 from jaxslam import grids, se2

@@ -5,7 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
-from refusals import refused
+from cases import refused
 
 from jaxslam import consistency, grids, motion, run
 from jaxslam.core.types import Beams, Scan, Status
@@ -149,6 +149,7 @@ def test_particles_of_no_weight_from_the_start_are_drawn_anew_until_one_has_some
     assert int(found.injected) == 16 and not found.underflow and float(state.injection) == 0.0
 
 
+@pytest.mark.sweep
 def test_the_ray_cast_model_keeps_the_robot_on_the_draws_that_both_models_get():
     """From a pose known roughly, 20 steps: same truths for both, and both stay within 0.15 m."""
     world = dataclasses.replace(WORLD, controls=CONTROLS[:20])

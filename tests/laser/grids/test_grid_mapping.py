@@ -6,8 +6,8 @@ import chex
 import jax
 import numpy as np
 import pytest
+from cases import refused
 from reference.plane import from_frame, to_frame
-from refusals import refused
 
 from jaxslam import grids
 from jaxslam.core.types import Beams

@@ -6,7 +6,7 @@ import json
 import jax
 import numpy as np
 import pytest
-from refusals import refused
+from cases import refused
 from ring_of_rooms import FAR, SETTINGS, driven, errors
 from worlds import nothing_compiled
 

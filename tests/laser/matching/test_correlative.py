@@ -3,6 +3,7 @@
 import jax
 import numpy as np
 import pytest
+from cases import swept
 from reference.plane import from_frame
 from scanned_rooms import pairs, points_at, stacked
 
@@ -83,7 +84,7 @@ def round_room(pose, beams):
     return scan._replace(position=ranges[:, None] * scan.ray)
 
 
-@pytest.mark.parametrize("name", ["field", "correlative"])
+@pytest.mark.parametrize("name", swept(["field", "correlative"], "correlative"))
 def test_what_a_scan_does_not_determine_is_named(name):
     """A corridor beyond the range, and a round room, which any turn about its middle fits."""
     at = np.array([0.8, 0.5, 0.0])

@@ -5,8 +5,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import refused, swept
 from reference.plane import from_frame
-from refusals import refused
 from scanned_rooms import BEAMS, by_polynomial, line_cost, pairs, points_at, stacked
 from worlds import narrow
 
@@ -153,9 +153,12 @@ def test_a_corridor_is_degenerate_along_itself(found):
 
 
 @pytest.mark.parametrize(
-    "make", [matching.PointToLine, matching.PointToPoint, matching.FieldMatcher]
+    "make",
+    swept(
+        [matching.PointToLine, matching.PointToPoint, matching.FieldMatcher], matching.PointToLine
+    ),
 )
-@pytest.mark.parametrize("sigma", [0.0, 0.02])
+@pytest.mark.parametrize("sigma", swept([0.0, 0.02], 0.02))
 def test_in_a_corridor_the_prior_decides_whatever_it_is_worth(make, sigma):
     """Walls at y = ±1, both scans from one place: the scans do not depend on x.
 
@@ -186,7 +189,9 @@ def test_in_a_corridor_the_prior_decides_whatever_it_is_worth(make, sigma):
     np.testing.assert_allclose((alone.pose[:, :2] * along).sum(axis=1), 0, atol=2e-3)
 
 
-@pytest.mark.parametrize("make", [matching.PointToPoint, matching.PointToLine])
+@pytest.mark.parametrize(
+    "make", swept([matching.PointToPoint, matching.PointToLine], matching.PointToLine)
+)
 def test_a_prior_holds_what_the_scans_do_not_determine(make):
     """At the end the slope of the cost is zero; in the corridor x is that of the prior."""
     matcher = make(IcpSettings(**OPTIONS, tolerance=1e-9, kernel=Huber(), scale=0.05))

@@ -4,8 +4,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import refused
 from reference.plane import from_frame
-from refusals import refused
 from scanned_rooms import BEAMS, pairs
 
 from jaxslam import matching, verify_jacobians
@@ -63,6 +63,7 @@ def test_the_noise_through_lines_is_honest_and_others_are_not(by_lines):
         assert np.all(np.linalg.eigvalsh(cov) > 0)
 
 
+@pytest.mark.sweep
 def test_a_prior_tells_what_a_corridor_does_not():
     """What two walls do not tell is known by the prior, and the covariance says so.
 
@@ -87,6 +88,7 @@ def test_a_prior_tells_what_a_corridor_does_not():
     np.testing.assert_allclose(along, 0.1, rtol=0.01)
 
 
+@pytest.mark.sweep
 def test_points_with_their_partners_kept_feign_information():
     found, covs = all_of(POINTS, ("implicit", "along_normals"))
     assert nees(found, covs["implicit"]) > 30

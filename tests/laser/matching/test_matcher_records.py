@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
-from refusals import refused
+from cases import refused
 from scanned_rooms import pairs
 
 from jaxslam import matching

@@ -4,7 +4,7 @@ import functools
 
 import numpy as np
 import pytest
-from refusals import refused
+from cases import refused
 
 from jaxslam import grids, topology
 from jaxslam.laser.topology.places import cell_centers

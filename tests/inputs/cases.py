@@ -1,16 +1,17 @@
-"""What is refused: a table of bad arguments, each with a pattern of its message, as a test."""
+"""Cases of tests: which of them `make test` leaves out, and tables of what is refused."""
 
 import functools
 import inspect
+import re
 
 import pytest
 
 
-def refused(*cases, told="", error=ValueError):
+def refused(*cases, told="", error=ValueError, escaped=False):
     """Makes a test of a call, which must fail in every case, with one line.
 
     A case is the call's first arguments and a pattern of the message, before which `told` stands.
-    The call's other arguments are fixtures.
+    The call's other arguments are fixtures. escaped: the pattern is plain text.
     """
 
     def test_of(call):
@@ -20,7 +21,8 @@ def refused(*cases, told="", error=ValueError):
         @pytest.mark.parametrize((*given, "reason"), cases)
         @functools.wraps(call)
         def test(*, reason, **values):
-            with pytest.raises(error, match=told + reason) as caught:
+            pattern = told + (re.escape(reason) if escaped else reason)
+            with pytest.raises(error, match=pattern) as caught:
                 call(**values)
             assert "\n" not in str(caught.value)
 
@@ -30,3 +32,15 @@ def refused(*cases, told="", error=ValueError):
         return test
 
     return test_of
+
+
+def swept(cases, *kept):
+    """The cases of a parametrization; those that are not kept belong to the sweep."""
+    return [
+        case if case in kept else pytest.param(*_parts(case), marks=pytest.mark.sweep)
+        for case in cases
+    ]
+
+
+def _parts(case):
+    return case if isinstance(case, tuple) else (case,)
