@@ -50,6 +50,7 @@ def test_it_is_generalized_least_squares_where_all_is_linear():
     np.testing.assert_array_equal(found.dof, 2 * (steps - 1))
 
 
+@pytest.mark.sweep
 def test_a_pose_covariance_with_what_parameters_add_is_that_of_the_joint_estimate():
     """Of a robot that never turns, whose odometry has a scale p to be found from the same log."""
     rng, steps, start = np.random.default_rng(1), 9, 0.2**2

@@ -136,7 +136,8 @@ def test_other_numbers_run_what_is_there(name):
         assert_shapes_of_particles(second, still()[0], 80)
 
 
-@pytest.mark.parametrize("chart", swept(charts.REGISTRY, "euclidean"))
+@pytest.mark.sweep
+@pytest.mark.parametrize("chart", list(charts.REGISTRY))
 def test_with_points_close_together_it_is_the_ekf_of_the_same_chart(chart):
     """Slopes are then derivatives; what stays is the mean's second order, which is of size P."""
     calm = around(noise=0.01)

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
+from cases import swept
 
 from jaxslam.resampling import REGISTRY, Soft, StopGradient, kld, kld_bound, systematic
 from jaxslam.resampling.weights import at_points, effective_size, normalized, survivors, weights_of
@@ -94,7 +95,7 @@ def test_where_all_underflow_all_weigh_the_same_and_what_is_not_finite_is_not_ch
     assert np.all(found[3] == [0, 5, 0, 0, 0])
 
 
-@pytest.mark.parametrize("dtype", ["f4", "f8"])
+@pytest.mark.parametrize("dtype", swept(["f4", "f8"], "f8"))
 def test_both_precisions_many_particles(named, dtype):
     _, method = named
     log_weights = np.random.default_rng(0).normal(size=5000).astype(dtype)

@@ -103,6 +103,7 @@ def test_a_suite_of_one_is_the_sensor():
         chex.assert_trees_all_close(a, b, rtol=0, atol=1e-12)
 
 
+@pytest.mark.sweep
 def test_sensors_in_turn_are_filters_in_turn():
     """Each part by hand: the state of one filter handed to another, of its own sensor. In the chart
     whose basis turns the map; the others have a simpler one."""

@@ -328,6 +328,7 @@ def test_a_team_in_a_campaign():
     assert campaign.filters["still"].counts["runs"] == 2
 
 
+@pytest.mark.sweep
 def test_a_world_is_the_same_whatever_is_reported():
     robots = crew(3)
     scenarios = [world(robots, 5, report=b) for b in (0, 2)]

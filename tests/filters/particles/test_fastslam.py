@@ -350,6 +350,7 @@ def test_negative_evidence_removes_a_landmark_from_every_map():
 # --- resampling within the filter ----------------------------------------------------------------
 
 
+@pytest.mark.sweep
 def test_it_resamples_where_the_threshold_says_and_it_is_counted():
     # ESS is at least 1, so this is never; 0 itself would be another program.
     never, often = (driven(proposal="motion", threshold=t)[0] for t in (1e-9, 0.5))

@@ -158,6 +158,7 @@ def test_derivatives_of_the_optimum_are_differences():
     np.testing.assert_allclose(slope, (high - low) / 2e-5, rtol=1e-6)
 
 
+@pytest.mark.sweep
 def test_priors_alone_and_what_is_not_determined():
     """A graph without a measurement of two variables; a singular start with a regular end."""
     prior = graphs.Table(np.zeros((1, 1), int), np.ones((1, 3)), np.eye(3)[None], np.ones(1, bool))

@@ -189,6 +189,7 @@ def test_in_a_corridor_the_prior_decides_whatever_it_is_worth(make, sigma):
     np.testing.assert_allclose((alone.pose[:, :2] * along).sum(axis=1), 0, atol=2e-3)
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize(
     "make", swept([matching.PointToPoint, matching.PointToLine], matching.PointToLine)
 )
@@ -213,6 +214,7 @@ def test_a_prior_holds_what_the_scans_do_not_determine(make):
     assert np.linalg.matrix_rank(found.determined[7], tol=1e-6) == 2
 
 
+@pytest.mark.sweep
 def test_trimming_and_a_kernel_bear_outliers_and_forward_derivatives_are_finite():
     """Every sixth beam is 30 cm short; in float32 the same to 1 mm."""
     position = np.array(SCANS.position[:GOOD])
