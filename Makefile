@@ -19,15 +19,17 @@ unexport PYTHONDONTWRITEBYTECODE
 JEMALLOC := $(firstword $(wildcard /usr/lib/*/libjemalloc.so.2 /usr/lib64/libjemalloc.so.2))
 
 .DELETE_ON_ERROR:
-.PHONY: consistency test check bench docs api links clean
+.PHONY: consistency test test-all check bench docs api links clean
 
 ## The main job: is EKF-SLAM honest? 100 simulated runs; results in out/.
 consistency: $(VENV)/.run
 	$(BIN)/jaxslam consistency $(if $(filter --resume% --overwrite,$(ARGS)),,--again) $(ARGS)
 
-## The test suite, on every core: heavy files first, compiled programs kept in .cache/ for the next run.
-test: $(VENV)/.dev
-	LD_PRELOAD=$(JEMALLOC) $(BIN)/python -m pytest -n auto --dist loadscope --no-loadscope-reorder $(ARGS)
+## The tests, on every core: heavy files first, compiled programs kept in .cache/ for the next run. Of each kind
+## of case one is tested; `test-all` takes every variant, scenario and precision.
+test: SELECTED := -m "not sweep"
+test test-all: $(VENV)/.dev
+	LD_PRELOAD=$(JEMALLOC) $(BIN)/python -m pytest -n auto --dist loadscope --no-loadscope-reorder $(SELECTED) $(ARGS)
 
 ## Format, lint and types.
 check: $(VENV)/.dev

@@ -1,7 +1,4 @@
-"""What every chart owes: run over `charts.REGISTRY`, so a new chart inherits it all.
-
-That `retract` and `local` undo each other whatever the numbers is a law of test_properties, too.
-"""
+"""What every chart owes: run over `charts.REGISTRY`, so a new chart inherits it all."""
 
 from types import SimpleNamespace
 
@@ -10,13 +7,14 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import swept
 from owed import DTYPES, of_rows
 from reference.plane import assert_same_poses, turn
 
 from jaxslam.charts import REGISTRY
 
 
-@pytest.fixture(scope="module", params=REGISTRY)
+@pytest.fixture(scope="module", params=swept(REGISTRY, "right_invariant"))
 def made(request, hard_angles):
     """A chart of the registry, cases (pose, l, dx, dl) with leading C, and one compiled call."""
     chart = REGISTRY[request.param]()

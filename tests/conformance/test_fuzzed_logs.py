@@ -13,6 +13,7 @@ import jax
 import numpy as np
 import pytest
 import worlds
+from cases import swept
 from hypothesis import given, settings
 
 from jaxslam import catalog, run
@@ -104,7 +105,7 @@ TOGETHER = {"right_invariant": {"covariance": "square_root"}}
 """Options of one filter that stand for another filter of the catalogue, too: `square_root`."""
 
 
-@pytest.mark.parametrize("name", catalog.ALL if WIDE > 1 else SUITE)
+@pytest.mark.parametrize("name", catalog.ALL if WIDE > 1 else swept(SUITE, "ekf", "fastslam2"))
 def test_what_becomes_of_every_measurement_is_said(name):
     go = jax.jit(jax.vmap(drive(made(name))))
     rng = np.random.default_rng(zlib.crc32(name.encode()))

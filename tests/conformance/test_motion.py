@@ -11,6 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import swept
 from owed import DTYPES, bad_covariances, of_rows, random_covariance
 
 from jaxslam.motion import REGISTRY
@@ -36,7 +37,7 @@ def cases_of(model, hard_angles):
     return pose, u, w
 
 
-@pytest.fixture(scope="module", params=REGISTRY)
+@pytest.fixture(scope="module", params=swept(REGISTRY, "unicycle", "velocity"))
 def made(request, hard_angles):
     """A model of the registry with a random noise covariance, its cases, and one compiled call."""
     factory = REGISTRY[request.param]

@@ -5,6 +5,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
+from cases import refused
+from reference import plane
 
 from jaxslam import association, motion, run, sensors
 from jaxslam.calibration import calibrate, consider_cov
@@ -48,6 +50,7 @@ def test_it_is_generalized_least_squares_where_all_is_linear():
     np.testing.assert_array_equal(found.dof, 2 * (steps - 1))
 
 
+@pytest.mark.sweep
 def test_a_pose_covariance_with_what_parameters_add_is_that_of_the_joint_estimate():
     """Of a robot that never turns, whose odometry has a scale p to be found from the same log."""
     rng, steps, start = np.random.default_rng(1), 9, 0.2**2
@@ -82,29 +85,26 @@ def test_a_pose_covariance_with_what_parameters_add_is_that_of_the_joint_estimat
         assert added[-1, axis, axis] > 0.1 * joint[steps, steps]
 
 
-@pytest.mark.parametrize(
-    ("result", "parameters", "cov", "why"),
-    [
-        (lambda p: p, [np.nan], 1.0, "finite"),
-        (lambda p: p, [], np.eye(0), "finite"),
-        (lambda p: p, [[1.0]], 1.0, "shape"),
-        (lambda p: p, [1.0, 2.0], np.eye(3), r"shape \(2, 2\)"),
-        (lambda p: p, [1.0, 2.0], [[1.0, 0.5], [0.0, 1.0]], "symmetric"),
-        (lambda p: p, [1.0, 2.0], -np.eye(2), "negative eigenvalue"),
-        (lambda p: p, [1.0, 2.0], np.diag([1.0, -1e-9]), "negative eigenvalue"),
-        (lambda p: p, [1.0, 2.0], [[1.0, 1e-9], [1e-9, 0.0]], "negative eigenvalue"),
-        (lambda p: p, [1.0, 2.0], [[1.0, np.nan], [np.nan, 1.0]], "not finite"),
-        (3.0, [1.0], 1.0, "a function of p, got float"),
-        (lambda p: jnp.where(p > 0, jnp.nan, p), [1.0], 1.0, "not finite"),
-        (lambda p: p.sum(), [1.0, 2.0], np.eye(2), "array"),
-        (lambda p: (p, p), [1.0], 1.0, "array"),
-        (lambda p: p > 0, [1.0], 1.0, "real numbers"),
-        (lambda p: jnp.sqrt(p), [0.0], 1.0, "derivatives"),
-    ],
+@refused(
+    (lambda p: p, [np.nan], 1.0, "finite"),
+    (lambda p: p, [], np.eye(0), "finite"),
+    (lambda p: p, [[1.0]], 1.0, "shape"),
+    (lambda p: p, [1.0, 2.0], np.eye(3), r"shape \(2, 2\)"),
+    (lambda p: p, [1.0, 2.0], [[1.0, 0.5], [0.0, 1.0]], "symmetric"),
+    (lambda p: p, [1.0, 2.0], -np.eye(2), "negative eigenvalue"),
+    (lambda p: p, [1.0, 2.0], np.diag([1.0, -1e-9]), "negative eigenvalue"),
+    (lambda p: p, [1.0, 2.0], [[1.0, 1e-9], [1e-9, 0.0]], "negative eigenvalue"),
+    (lambda p: p, [1.0, 2.0], [[1.0, np.nan], [np.nan, 1.0]], "not finite"),
+    (3.0, [1.0], 1.0, "a function of p, got float"),
+    (lambda p: jnp.where(p > 0, jnp.nan, p), [1.0], 1.0, "not finite"),
+    (lambda p: p.sum(), [1.0, 2.0], np.eye(2), "array"),
+    (lambda p: (p, p), [1.0], 1.0, "array"),
+    (lambda p: p > 0, [1.0], 1.0, "real numbers"),
+    (lambda p: jnp.sqrt(p), [0.0], 1.0, "derivatives"),
+    told="consider_cov: .*",
 )
-def test_what_adds_no_covariance_is_refused(result, parameters, cov, why):
-    with pytest.raises(ValueError, match=f"consider_cov: .*{why}"):
-        consider_cov(result, parameters, cov)
+def test_what_adds_no_covariance_is_refused(result, parameters, cov):
+    consider_cov(result, parameters, cov)
 
 
 def test_uncertain_parameters_are_not_considered_within_a_trace():
@@ -127,10 +127,8 @@ def drive(seed, steps=160, drift=0.02, turn=0.1):
         u = np.array([0.3, 0.0, 0.08 * np.sin(2 * np.pi * t / 80)])
         w = rng.normal(size=3) * np.sqrt(np.diag(NOISE))
         true = u + w + [0, 0, drift * u[0] + turn * u[2]]
-        c, s = np.cos(pose[2]), np.sin(pose[2])
-        pose = pose + [c * true[0] - s * true[1], s * true[0] + c * true[1], true[2]]
-        c, s = np.cos(pose[2]), np.sin(pose[2])
-        seen = (trees - pose[:2]) @ np.array([[c, -s], [s, c]])
+        pose = plane.compose(pose, true)
+        seen = plane.to_frame(pose, trees)
         near = seen[(seen[:, 0] > 0) & (np.hypot(*seen.T) < 5.0)][:PLACES]
         z = np.zeros((PLACES, 2))
         z[: len(near)] = near + rng.normal(size=near.shape) * 0.1
@@ -142,6 +140,7 @@ def drive(seed, steps=160, drift=0.02, turn=0.1):
 PLACES, NOISE = 3, np.diag([0.01, 0.01, 0.002]) ** 2
 
 
+@pytest.mark.sweep
 def test_odometry_is_calibrated_without_identities():
     logs = [drive(seed) for seed in range(4)]
     together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *logs)
@@ -210,11 +209,8 @@ def test_other_numbers_of_a_record_cost_no_trace_and_no_program():
         return found.parameters[0], added[0, 0]
 
     both(3.0)
-    TRACED.clear()
-    with worlds.compilations() as compiled:
+    with worlds.nothing_compiled(TRACED):
         root, added = both(2.0)
-        assert compiled() == 0
-    assert not TRACED
     np.testing.assert_allclose(root, np.sqrt(2), rtol=1e-4)
     np.testing.assert_allclose(added, 8.0, rtol=1e-3)
 
@@ -240,20 +236,16 @@ def test_what_is_empty_does_not_count_and_a_number_will_do():
     np.testing.assert_allclose(again.parameters, found.parameters, rtol=1e-12)
 
 
-@pytest.mark.parametrize(
-    ("info", "start", "options", "message"),
-    [
-        (plain, [[1.0]], {}, "start"),
-        (plain, [np.nan], {}, "start"),
-        (plain, [], {}, "start"),
-        (plain, 1.0, {"iterations": 0}, "iterations"),
-        (plain, 1.0, {"tolerance": 0.0}, "tolerance"),
-        (lambda p: plain(p[0], status=3), 1.0, {}, "expected fused measurements"),
-        (lambda p: plain(jnp.log(p[0])), -1.0, {}, "not finite"),
-        (lambda p: plain(p[0] + p[1]), [1.0, 2.0], {}, "does not determine"),
-        (lambda p: plain(p[0] * 0), 1.0, {}, "does not determine"),
-    ],
+@refused(
+    (plain, [[1.0]], {}, "start"),
+    (plain, [np.nan], {}, "start"),
+    (plain, [], {}, "start"),
+    (plain, 1.0, {"iterations": 0}, "iterations"),
+    (plain, 1.0, {"tolerance": 0.0}, "tolerance"),
+    (lambda p: plain(p[0], status=3), 1.0, {}, "expected fused measurements"),
+    (lambda p: plain(jnp.log(p[0])), -1.0, {}, "not finite"),
+    (lambda p: plain(p[0] + p[1]), [1.0, 2.0], {}, "does not determine"),
+    (lambda p: plain(p[0] * 0), 1.0, {}, "does not determine"),
 )
-def test_refusals(info, start, options, message):
-    with pytest.raises(ValueError, match=message):
-        calibrate(info, start, **options)
+def test_refusals(info, start, options):
+    calibrate(info, start, **options)

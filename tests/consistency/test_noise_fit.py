@@ -4,6 +4,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import refused
 
 import jaxslam
 from jaxslam import association, filters, motion, sensors
@@ -108,23 +109,20 @@ def nothing(p, x):
     return of(x, p[0] ** 2 + 0 * x, fused=False)
 
 
-@pytest.mark.parametrize(
-    ("info", "start", "options", "reason"),
-    [
-        (gated, [0.5], {}, "expected the same measurements at all parameters, got "),
-        (nothing, [0.5], {}, "expected fused measurements, got none at parameters"),
-        (scatter, [np.nan, 1], {}, "expected a start of shape"),
-        (scatter, [0.0, 1], {}, r"expected standard deviations above 0"),
-        (scatter, [1.0, 1], {"guess": [1.0]}, "expected a guess of shape"),
-        (scatter, [1.0, 1], {"names": ["a"]}, "expected 2 names and deviations"),
-        (scatter, [1.0, 1], {"iterations": 0}, "iterations: expected an integer >= 1"),
-        (scatter, [1.0, 1], {"tolerance": 0}, "expected a tolerance above 0"),
-        (scatter, [1e-200, 1], {}, "the likelihood or its gradient is not finite"),
-    ],
+@refused(
+    (gated, [0.5], {}, "expected the same measurements at all parameters, got "),
+    (nothing, [0.5], {}, "expected fused measurements, got none at parameters"),
+    (scatter, [np.nan, 1], {}, "expected a start of shape"),
+    (scatter, [0.0, 1], {}, r"expected standard deviations above 0"),
+    (scatter, [1.0, 1], {"guess": [1.0]}, "expected a guess of shape"),
+    (scatter, [1.0, 1], {"names": ["a"]}, "expected 2 names and deviations"),
+    (scatter, [1.0, 1], {"iterations": 0}, "iterations: expected an integer >= 1"),
+    (scatter, [1.0, 1], {"tolerance": 0}, "expected a tolerance above 0"),
+    (scatter, [1e-200, 1], {}, "the likelihood or its gradient is not finite"),
+    told="fit_noise: .*",
 )
-def test_bad_input_is_named(info, start, options, reason):
-    with pytest.raises(ValueError, match=f"fit_noise: .*{reason}"):
-        fit_noise(info, start, X, **options)
+def test_bad_input_is_named(info, start, options):
+    fit_noise(info, start, X, **options)
 
 
 TRUE = np.array([0.02, 0.01, 0.05, 0.02])
@@ -148,6 +146,7 @@ def followed(p, log):
     return jaxslam.run(ekf, log, np.zeros(3), np.zeros((3, 3)), KEY).info
 
 
+@pytest.mark.sweep
 def test_the_noises_of_simulated_logs_are_found_and_errors_are_their_spread():
     """From starts a factor 3 off: over 24 logs the z of each noise are standard normal numbers, by
     bands that honest ones leave once in a thousand, and NIS/dof is 1, since P grows with all noises."""

@@ -219,21 +219,6 @@ def test_gather_returns_a_landmark_and_its_rows():
     np.testing.assert_array_equal(rows, joint.cov[7:9])
 
 
-def test_operations_keep_float32():
-    joint = start()
-    joint = joint._replace(
-        **{k: getattr(joint, k).astype("f4") for k in ("pose", "landmarks", "cov")}
-    )
-    slot, born, landmarks, by_pose, own, tag = births(np.random.default_rng(8), [True] * 4)
-    part = (slot, born, landmarks.astype("f4"), by_pose.astype("f4"), own.astype("f4"), tag)
-    for out in (
-        jax.eval_shape(slots.scatter, joint, *part),
-        jax.eval_shape(slots.remove, joint, born),
-    ):
-        assert {out.pose.dtype, out.landmarks.dtype, out.cov.dtype} == {np.dtype("f4")}
-        assert out.tag.dtype == np.int32
-
-
 def test_a_mask_of_another_kind_or_shape_is_refused():
     joint = scatter(start(), *births(np.random.default_rng(5), [True, False, True, False]))
     with pytest.raises(ValueError, match="bool"):

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import swept
 from own_models import changed
 from worlds import narrow
 
@@ -171,7 +172,7 @@ SLOPING = sloping()
 STEP_OF_ROWS = over_rows(SLOPING.step)
 
 
-@pytest.mark.parametrize("name", CHARTS)
+@pytest.mark.parametrize("name", swept(CHARTS, "right_invariant"))
 def test_prediction_is_a_p_at_plus_b_q_bt(name):
     joint, u = some_joint(), np.array([0.3, 0.4])
     dense = Dense(joint, name)
@@ -197,7 +198,7 @@ def test_prediction_is_a_p_at_plus_b_q_bt(name):
 PASSES = {"correction": "joint", "iterations": 2}
 
 
-@pytest.mark.parametrize("name", CHARTS)
+@pytest.mark.parametrize("name", swept(CHARTS, "right_invariant"))
 def test_joint_correction_is_the_textbook_update_in_chart_coordinates(name):
     """Two passes: the innovations reported are those of the first."""
     joint = some_joint()
@@ -214,7 +215,7 @@ def test_joint_correction_is_the_textbook_update_in_chart_coordinates(name):
     np.testing.assert_allclose(info.innovation_cov[1], s[2:, 2:], atol=1e-8)
 
 
-@pytest.mark.parametrize("name", CHARTS)
+@pytest.mark.parametrize("name", swept(CHARTS, "right_invariant"))
 def test_augmentation_and_estimate_are_first_order_propagation(name):
     joint = some_joint((True, False, False, True))
     dense = Dense(joint, name)
@@ -261,7 +262,7 @@ def test_augmentation_and_estimate_are_first_order_propagation(name):
     np.testing.assert_array_equal(estimate.points, out.landmarks)
 
 
-@pytest.mark.parametrize("name", CHARTS)
+@pytest.mark.parametrize("name", swept(CHARTS, "right_invariant"))
 def test_initial_covariance_is_given_in_map_coordinates(name):
     root = np.random.default_rng(5).normal(size=(3, 3))
     filter = EkfSlam(MOTION, SENSOR, CAPACITY, chart=charts.REGISTRY[name]())
@@ -271,6 +272,7 @@ def test_initial_covariance_is_given_in_map_coordinates(name):
     assert not estimate.alive.any()
 
 
+@pytest.mark.sweep
 def test_iterated_correction_finds_the_most_probable_state_and_counts_the_data_once():
     """Its fixed point is the minimum of ξᵀP⁻¹ξ + νᵀR⁻¹ν, its covariance that of one measurement."""
     joint = some_joint(size=0.25)
@@ -372,6 +374,7 @@ def test_vmap_is_a_loop_and_one_trace_serves_all_logs(logs, single):
         assert_same(take(mapped, i), single(take(logs[1], i)), atol=1e-11)
 
 
+@pytest.mark.sweep
 def test_capacity_8_is_a_larger_one(logs, single):
     capacity = 70  # P is passed over in another way beyond 128 rows
     roomy = jax.device_get(jax.jit(runner(capacity))(take(logs[1], 0)))
@@ -382,40 +385,6 @@ def test_capacity_8_is_a_larger_one(logs, single):
     assert_same(roomy.info, tight.info, atol=1e-11)
     assert_same(roomy.probe.cov[:, :19, :19], tight.probe.cov, atol=1e-12)
     np.testing.assert_array_equal(roomy.final.cov[19:], np.eye(3 + 2 * capacity)[19:])
-
-
-class TestOneStep(chex.TestCase):
-    """Prediction and estimate; op by op, an update compiles for 20 s and has no branch to test."""
-
-    @chex.variants(with_jit=True, without_jit=True, with_device=True, without_device=True)
-    def test_compiled_or_not_of_host_or_device_arrays(self):
-        joint, filter = some_joint((True, False)), EkfSlam(MOTION, SENSOR, 2)
-
-        def step(joint, u):
-            joint = filter.predict(joint, u, KEY)
-            return joint, filter.estimate(joint)
-
-        u = np.array([0.1, 0.2])
-        assert_same(self.variant(step)(joint, u), jax.jit(step)(joint, u), atol=1e-13)
-
-
-@pytest.mark.parametrize(
-    "options",
-    [
-        {},
-        {"correction": "joint", "gate": 9.0, "births": 1},
-        {"chart": "right_invariant", "iterations": 2, "covariance": "joseph"},
-        {"chart": "right_invariant", "correction": "joint"},
-    ],
-)
-def test_float32_logs_give_float32_outputs_although_float64_is_on(logs, options):
-    chart = charts.REGISTRY[options.get("chart", "euclidean")]()
-    single = narrow(take(logs[1], 0))
-    out = jax.eval_shape(runner(5, **(options | {"chart": chart})), single)
-    kinds = {
-        leaf.dtype for leaf in jax.tree.leaves(out) if jnp.issubdtype(leaf.dtype, jnp.floating)
-    }
-    assert kinds == {np.dtype("f4")}
 
 
 # --- linearization at the truth -----------------------------------------------------------------

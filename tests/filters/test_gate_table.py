@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import swept
 from own_models import changed
 
 from jaxslam import filters, motion, sensors
@@ -169,7 +170,9 @@ def after_two_scans(family, tags):
     return jax.device_get(step(state, second)[1])
 
 
-@pytest.mark.parametrize("family", [*FAMILIES, *SPARSE])
+@pytest.mark.parametrize(
+    "family", swept([*FAMILIES, *SPARSE], "ekf_slam", "fastslam", "localization")
+)
 def test_every_family_reports_a_scan_by_the_table(family):
     tags = [tag for tag, *_ in SCAN.values()]
     wanted = [status for *_, status in SCAN.values()]
@@ -192,7 +195,7 @@ def test_every_family_reports_a_scan_by_the_table(family):
 
 @pytest.mark.parametrize(
     "family",
-    ["compressed_ekf_slam", "ekf_slam", "ekf_slam, at once", "eif_slam", "seif"],
+    swept(["compressed_ekf_slam", "ekf_slam", "ekf_slam, at once", "eif_slam", "seif"], "ekf_slam"),
 )
 def test_scans_without_places_and_measurements_beyond_all_numbers(family):
     """A scan of none is none; a d² that overflows is outside any gate, and moves nothing."""
@@ -228,6 +231,7 @@ def test_scans_without_places_and_measurements_beyond_all_numbers(family):
     chex.assert_trees_all_close(far, after, rtol=0, atol=1e-12)
 
 
+@pytest.mark.sweep
 def test_a_delayed_filter_reports_bearings_by_the_table():
     def noise(z):
         return jnp.where(jnp.abs(z[0]) > 3.0, -1e4, 1e-4)[None, None]

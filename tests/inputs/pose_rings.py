@@ -1,27 +1,11 @@
 """A ring of poses, and its optimum by a dense Gauss-Newton: plain NumPy, from the equations."""
 
 import numpy as np
+from reference.plane import between, compose, wrap
 
 from jaxslam.graphs import Graph, Table
 
 SIZE = 20
-
-
-def compose(a, b):
-    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
-    x = a[..., 0] + c * b[..., 0] - s * b[..., 1]
-    y = a[..., 1] + s * b[..., 0] + c * b[..., 1]
-    return np.stack([x, y, wrap(a[..., 2] + b[..., 2])], -1)
-
-
-def between(a, b):
-    c, s = np.cos(a[..., 2]), np.sin(a[..., 2])
-    dx, dy = b[..., 0] - a[..., 0], b[..., 1] - a[..., 1]
-    return np.stack([c * dx + s * dy, -s * dx + c * dy, wrap(b[..., 2] - a[..., 2])], -1)
-
-
-def wrap(angle):
-    return np.pi - (np.pi - angle) % (2 * np.pi)
 
 
 def ring(seed=0, spread=1.0):

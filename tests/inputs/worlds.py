@@ -1,7 +1,9 @@
 """Small worlds and deliberately wrong filters that several tests share."""
 
 import contextlib
+import copy
 import dataclasses
+import pickle
 
 import jax
 import jax.numpy as jnp
@@ -73,6 +75,15 @@ def compilations():
     jax.monitoring.register_event_duration_secs_listener(listen)
     yield lambda: count[0]
     jax.monitoring.unregister_event_duration_listener(listen)
+
+
+@contextlib.contextmanager
+def nothing_compiled(traced=()):
+    """Within it no program may be compiled, or read from the disk, and nothing put into a list."""
+    before = len(traced)
+    with compilations() as count:
+        yield
+        assert (count(), len(traced)) == (0, before)
 
 
 def ekf(scenario, **options):
@@ -233,3 +244,11 @@ def assert_same_bits(a, b):
     )
     for name, summary in a.filters.items():
         assert_identical(summary, b.filters[name])
+
+
+def assert_record(made, numbers):
+    """Its leaves are these numbers, in order; a copy and a pickle are of the same class and numbers."""
+    for one in (made, copy.deepcopy(made), pickle.loads(pickle.dumps(made))):
+        assert type(one) is type(made) and jax.tree.structure(one) == jax.tree.structure(made)
+        for leaf, number in zip(jax.tree.leaves(one), numbers, strict=True):
+            np.testing.assert_array_equal(leaf, number)

@@ -3,6 +3,7 @@
 import numpy as np
 import pytest
 import scipy.stats
+from cases import refused
 
 from jaxslam import stats
 
@@ -53,22 +54,18 @@ def test_t_quantile():
         np.testing.assert_allclose(stats.t_quantile(p, dof), value, atol=5e-4)
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: stats.chi2_quantile(0.0, 2), "probability"),
-        (lambda: stats.chi2_quantile(1.0, 2), "probability"),
-        (lambda: stats.chi2_quantile(float("nan"), 2), "probability"),
-        (lambda: stats.chi2_quantile(0.5, 0), "dof above 0"),
-        (lambda: stats.chi2_quantile(0.5, float("nan")), "dof above 0"),
-        (lambda: stats.sigma_gate(0), "n_sigma above 0"),
-        (lambda: stats.sigma_gate(-3), "n_sigma above 0"),
-        (lambda: stats.chi2_band(2, 0), "run"),
-        (lambda: stats.chi2_band(2, 10, 1.0), "probability"),
-        (lambda: stats.chi2_band(2, 10, 1.5), "probability"),
-        (lambda: stats.chi2_band(-2, 10), "dof above 0"),
-    ],
+@refused(
+    (lambda: stats.chi2_quantile(0.0, 2), "probability"),
+    (lambda: stats.chi2_quantile(1.0, 2), "probability"),
+    (lambda: stats.chi2_quantile(float("nan"), 2), "probability"),
+    (lambda: stats.chi2_quantile(0.5, 0), "dof above 0"),
+    (lambda: stats.chi2_quantile(0.5, float("nan")), "dof above 0"),
+    (lambda: stats.sigma_gate(0), "n_sigma above 0"),
+    (lambda: stats.sigma_gate(-3), "n_sigma above 0"),
+    (lambda: stats.chi2_band(2, 0), "run"),
+    (lambda: stats.chi2_band(2, 10, 1.0), "probability"),
+    (lambda: stats.chi2_band(2, 10, 1.5), "probability"),
+    (lambda: stats.chi2_band(-2, 10), "dof above 0"),
 )
-def test_arguments_out_of_range_are_refused(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()
+def test_arguments_out_of_range_are_refused(call):
+    call()

@@ -7,9 +7,10 @@ import jax
 import numpy as np
 import pytest
 import scipy.stats
-from reference.plane import wrap
+from cases import swept
+from reference.plane import turn, wrap
 
-from jaxslam import charts, linearize, motion, sensors
+from jaxslam import charts, motion, sensors
 from jaxslam.core.types import Log, Scan, Status
 from jaxslam.core.validation import check_log
 from jaxslam.filters import EkfSlam
@@ -31,18 +32,17 @@ CONTROLS[30:40, 1] = 0.03  # slowly where the compass is near its seam
 
 
 def move(x, u):
-    d, turn = u
+    d, turned = u
     c, s = np.cos(x[2]), np.sin(x[2])
     by_pose = np.array([[1, 0, -d * s], [0, 1, d * c], [0, 0, 1]])
     by_noise = np.array([[c, 0], [s, 0], [0, 1]])
-    return np.array([x[0] + d * c, x[1] + d * s, wrap(x[2] + turn)]), by_pose, by_noise
+    return np.array([x[0] + d * c, x[1] + d * s, wrap(x[2] + turned)]), by_pose, by_noise
 
 
 def see(name, x, mount):
     if name == "compass":
         return np.array([x[2] + mount[2]]), np.array([[0.0, 0.0, 1.0]])
-    c, s = np.cos(x[2]), np.sin(x[2])
-    lever = np.array([c * mount[0] - s * mount[1], s * mount[0] + c * mount[1]])
+    lever = turn(x[2]) @ mount[:2]
     return x[:2] + lever, np.array([[1, 0, -lever[1]], [0, 1, lever[0]]])
 
 
@@ -111,7 +111,7 @@ def assert_same(a, b):
     np.testing.assert_allclose(a.estimate.pose_cov, b.estimate.pose_cov, atol=1e-9)
 
 
-@pytest.mark.parametrize("update", ["sequential", "joint"])
+@pytest.mark.parametrize("update", swept(["sequential", "joint"], "joint"))
 @pytest.mark.parametrize("name", R)
 def test_the_ekf_is_the_plain_one_of_the_pose(name, update):
     log = drive(name, MOUNT)
@@ -140,6 +140,7 @@ def test_the_ekf_is_the_plain_one_of_the_pose(name, update):
     assert np.isfinite(trace.estimate.point_covs).all()
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize("name", R)
 def test_joint_is_sequential_where_the_measurement_is_linear(name):
     """Without a lever arm a position fix is linear in the pose, as a compass always is."""
@@ -152,6 +153,7 @@ def test_joint_is_sequential_where_the_measurement_is_linear(name):
     np.testing.assert_allclose(total, together.info.log_likelihood, atol=1e-9)
 
 
+@pytest.mark.sweep
 def test_iterations_and_josephs_form_change_nothing_where_the_measurement_is_linear():
     log = drive("position_fix", np.zeros(3))
     once = filtered("position_fix", log, mount=np.zeros(3))
@@ -214,6 +216,7 @@ def padded(log):
     return log._replace(scan=scan)
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize("name", R)
 def test_simulated_runs_have_an_honest_nees(name):
     keys = jax.random.split(jax.random.key(5), RUNS)
@@ -260,16 +263,3 @@ def test_a_chart_of_landmarks_and_an_empty_capacity_are_refused(name):
         EkfSlam(motion.Increment(Q), sensor, 1, chart=charts.RightInvariant())
     with pytest.raises(ValueError, match="EkfSlam: capacity"):
         EkfSlam(motion.Increment(Q), sensor, 0)
-
-
-@pytest.mark.parametrize("name", R)
-def test_the_ideal_ekf_takes_them_too(name):
-    scenario = world(name)
-
-    def ideal(key):
-        truth, log = simulate(scenario, key)
-        at_truth = linearize.AtTruth(truth)
-        filter = EkfSlam(scenario.motion, scenario.sensor, 1, linearize=at_truth)
-        return run(filter, log, START, SPREAD, key).estimate
-
-    assert jax.eval_shape(ideal, KEY).pose.shape == (STEPS, 3)

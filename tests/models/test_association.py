@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
+from cases import refused, swept
 from worlds import narrow
 
 from jaxslam import association
@@ -226,7 +227,7 @@ COUNT = 20
 """Random problems of a batch; in two more no landmark is alive, or nothing was measured."""
 
 
-@pytest.fixture(scope="module", params=METHODS)
+@pytest.fixture(scope="module", params=swept(METHODS, "nearest", "joint"))
 def batch(request):
     """A method, problems of it, and what it finds of them all at once."""
     method, rng = METHODS[request.param](), np.random.default_rng(5)
@@ -289,27 +290,23 @@ def test_joint_probabilities_of_nothing_and_of_everything():
     assert (np.asarray(everything.slot) >= 0).all()
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: association.Nearest(-1.0), "at least 0"),
-        (lambda: association.Nearest(np.nan), "at least 0"),
-        (lambda: association.Nearest("9"), "Nearest: .*gate.* got str$"),
-        (
-            lambda: plainly(association.Nearest, *posed(*problem(np.random.default_rng(1), 3, 5))),
-            r"expected a number .*: as associate, give Nearest\(gate\), not Nearest$",
-        ),
-        (lambda: association.MaximumLikelihood(9.0, 4.0), "new_gate >= gate"),
-        (lambda: association.GlobalNearest(9.0, 4.0), "new_gate >= gate"),
-        (lambda: association.Nearest(9.0, ambiguous="guess"), "guess"),
-        (lambda: association.JointCompatibility(1.5), "probability"),
-        (lambda: association.JointCompatibility(budget=0), "budget"),
-        (lambda: association.JointCompatibility(candidates=0), "candidates"),
-    ],
+@refused(
+    (lambda: association.Nearest(-1.0), "at least 0"),
+    (lambda: association.Nearest(np.nan), "at least 0"),
+    (lambda: association.Nearest("9"), "Nearest: .*gate.* got str$"),
+    (
+        lambda: plainly(association.Nearest, *posed(*problem(np.random.default_rng(1), 3, 5))),
+        r"expected a number .*: as associate, give Nearest\(gate\), not Nearest$",
+    ),
+    (lambda: association.MaximumLikelihood(9.0, 4.0), "new_gate >= gate"),
+    (lambda: association.GlobalNearest(9.0, 4.0), "new_gate >= gate"),
+    (lambda: association.Nearest(9.0, ambiguous="guess"), "guess"),
+    (lambda: association.JointCompatibility(1.5), "probability"),
+    (lambda: association.JointCompatibility(budget=0), "budget"),
+    (lambda: association.JointCompatibility(candidates=0), "candidates"),
 )
-def test_refusals(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
+def test_refusals(make):
+    make()
 
 
 def test_joint_refuses_a_gate_for_new_ones_below_its_own():

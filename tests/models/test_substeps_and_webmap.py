@@ -6,6 +6,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from own_models import changed
+from reference.plane import to_frame
 
 from jaxslam import motion, run
 from jaxslam.filters import EkfSlam
@@ -96,15 +97,6 @@ def test_names_are_numbered_and_keep_their_units(case):
     )
 
 
-def test_float32_stays(case):
-    _, whole, pose, u, w = case
-    pose, u, w = (a.astype(np.float32) for a in (pose, u.ravel(), w.ravel()))
-    calls = [(whole.step, (pose, u, w)), (whole.noise_cov, (pose, u))]
-    calls += [(whole.jacobians, (pose, u, w)), (whole.perturb, (u, w))]
-    out = [jax.eval_shape(function, *given) for function, given in calls if function is not None]
-    assert {array.dtype for array in jax.tree.leaves(out)} == {np.dtype(np.float32)}
-
-
 def test_gradients_reach_the_models_parameters():
     def end(wheelbase):
         model = Substeps(motion.Ackermann(Q, wheelbase=wheelbase), COUNT)
@@ -138,13 +130,6 @@ def drawn(scenario):
 def fine_controls(scenario):
     """(8T, 3): speed, steering, interval."""
     return np.asarray(scenario.controls).reshape(-1, 3)
-
-
-def offsets(path, landmarks):
-    """(T, N, 2): ahead and to the left of each pose."""
-    dx = landmarks - path[:, None, :2]
-    c, s = np.cos(path[:, 2])[:, None], np.sin(path[:, 2])[:, None]
-    return np.stack([c * dx[..., 0] + s * dx[..., 1], -s * dx[..., 0] + c * dx[..., 1]], axis=-1)
 
 
 def test_controls_keep_the_cars_limits(scenario):
@@ -183,7 +168,9 @@ def test_odometry_and_measurements_have_the_published_noise(scenario, drawn):
     speed, steering, interval = (log.control - scenario.controls).reshape(-1, 3).T
     np.testing.assert_array_equal(interval, 0)
     ahead = np.take_along_axis(
-        offsets(truth.pose, np.asarray(scenario.landmarks)), log.scan.tag[..., None], axis=1
+        to_frame(truth.pose[:, None], np.asarray(scenario.landmarks)),
+        log.scan.tag[..., None],
+        axis=1,
     )
     expected = np.stack([np.hypot(*ahead.T).T, np.arctan2(ahead[..., 1], ahead[..., 0])], axis=-1)
     distance, bearing = (log.scan.z - expected)[log.scan.valid].T
@@ -216,7 +203,7 @@ def test_every_loop_ends_where_it_began(scenario, drawn):
 def test_scans_hold_all_that_is_near_and_ahead_and_nothing_else(scenario, drawn):
     truth, log = drawn
     assert not truth.missed.any()
-    ahead = offsets(truth.pose, np.asarray(scenario.landmarks))
+    ahead = to_frame(truth.pose[:, None], np.asarray(scenario.landmarks))
     expected = (np.hypot(*ahead.T).T < 30) & (ahead[..., 0] > 0)
     seen = np.zeros_like(expected)
     rows, places = np.nonzero(log.scan.valid)

@@ -1,4 +1,4 @@
-"""A pytest plugin: what each test file costs, heavy files first, and memory given back after each.
+"""A pytest plugin: what each test file costs, large files first, and memory given back after each.
 
 At the end of a run it prints the worst files. Under pytest-xdist every worker counts its own and
 sends the counts to the controller.
@@ -21,36 +21,6 @@ WORST = 10
 ROOM = 0.8, 1.3
 """Resident memory [GB] of a worker above which compiled programs are dropped: after a file, and
 after a test."""
-
-HEAVY = tuple(
-    f"tests/{folder}/test_{name}.py"
-    for folder, names in (
-        ("consistency", "catalog"),
-        ("consistency/campaign", "monte_carlo"),
-        ("filters/multi_robot", "team_slam"),
-        ("filters/particles", "fastslam"),
-        ("filters/delayed", "delayed_slam"),
-        ("filters/ekf", "gradients"),
-        ("laser/laser_slam", "solve"),
-        ("graphs", "log"),
-        ("conformance", "fuzzed_logs"),
-        ("graphs/smoothing", "smoothing fixed_lag"),
-        ("equivalence", "information ekf"),
-        ("core", "programs records"),
-        ("filters/particles", "particle_localization"),
-        ("filters", "gate_table"),
-        ("filters/information", "seif"),
-        ("conformance", "jacobians"),
-        ("equivalence", "compressed"),
-        ("models", "suite"),
-        ("filters/map_management", "relocalization merging"),
-        ("simulation", "spurious"),
-        ("cli", "cli"),
-        ("filters/ekf", "to_points wild"),
-    )
-    for name in names.split()
-)
-"""Files in the order in which they start; what is not here comes afterwards, as collected."""
 
 COLUMNS = ("compiled", "from cache", "compile s", "cpu s", "wall s")
 
@@ -94,8 +64,8 @@ class Spending:
 
     @pytest.hookimpl(tryfirst=True)
     def pytest_collection_modifyitems(self, items):
-        place = {name: i for i, name in enumerate(HEAVY)}
-        items.sort(key=lambda item: place.get(item.location[0], len(place)))
+        size = {item.path: item.path.stat().st_size for item in items}
+        items.sort(key=lambda item: (-size[item.path], item.location[0]))
 
     @pytest.hookimpl(trylast=True)
     def pytest_sessionfinish(self):

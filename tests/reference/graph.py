@@ -3,22 +3,7 @@
 import numpy as np
 import scipy.optimize
 
-
-def wrap(angle):
-    return np.pi - np.mod(np.pi - angle, 2 * np.pi)
-
-
-def between(a, b):
-    """The pose b in the frame of a."""
-    c, s = np.cos(a[2]), np.sin(a[2])
-    x, y = b[0] - a[0], b[1] - a[1]
-    return np.array([c * x + s * y, -s * x + c * y, wrap(b[2] - a[2])])
-
-
-def composed(a, b):
-    """The pose b of the frame a in the world."""
-    c, s = np.cos(a[2]), np.sin(a[2])
-    return np.array([a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], wrap(a[2] + b[2])])
+from reference.plane import between, wrap
 
 
 def error(kind, variables, z):

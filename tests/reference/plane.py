@@ -17,7 +17,26 @@ def turn(theta):
 
 def from_frame(pose, point):
     """The points (…, 2) of the frames `pose` (…, 3), in the map."""
+    pose = np.asarray(pose, float)
     return pose[..., :2] + np.einsum("...ij,...j->...i", turn(pose[..., 2]), point)
+
+
+def to_frame(pose, point):
+    """The points (…, 2) of the map, in the frames `pose` (…, 3)."""
+    pose = np.asarray(pose, float)
+    return np.einsum("...ji,...j->...i", turn(pose[..., 2]), point - pose[..., :2])
+
+
+def compose(a, b):
+    """The pose b (…, 3) of the frame a, in the map."""
+    a, b = np.asarray(a, float), np.asarray(b, float)
+    return np.concatenate([from_frame(a, b[..., :2]), wrap(a[..., 2:] + b[..., 2:])], axis=-1)
+
+
+def between(a, b):
+    """The pose b (…, 3) of the map, in the frame of a."""
+    a, b = np.asarray(a, float), np.asarray(b, float)
+    return np.concatenate([to_frame(a, b[..., :2]), wrap(b[..., 2:] - a[..., 2:])], axis=-1)
 
 
 def mounted(pose, mount):

@@ -6,6 +6,7 @@ import chex
 import jax
 import numpy as np
 import pytest
+from cases import refused
 
 from jaxslam import Scenario, catalog, monte_carlo, motion, recorded_world, sensors, simulate, store
 from jaxslam.core.types import Log, Scan
@@ -81,27 +82,23 @@ def unlike(**fields):
     return [logs[0], Log(logs[1].control, scan), *logs[2:]]
 
 
-@pytest.mark.parametrize(
-    ("changed", "message"),
-    [
-        ({"logs": []}, "logs as a list of Log, one a run, got an empty list"),
-        ({"logs": Log(np.zeros((2, 3)), Scan(*[np.zeros((2, 1))] * 3))}, "logs as a list"),
-        ({"logs": [None]}, r"expected logs\[0\] to be a Log, got NoneType"),
-        ({"logs": ragged()}, r"got \(6, 2\) in run 0 and \(5, 2\) in run 4"),
-        ({"logs": unlike(z=np.full((6, 2, 2), np.nan))}, "run 1: .* is not finite"),
-        ({"logs": unlike(tag=np.tile([0, 2], (6, 1)))}, r"below 2, .* got 2 \(run 1, row 0\)"),
-        ({"poses": np.zeros((5, 4, 3))}, r"poses: expected shape \(5, 6, 3\)"),
-        ({"poses": np.full((5, 6, 3), np.inf)}, "true pose of run 0: expected finite"),
-        ({"landmarks": np.zeros((4, 2, 2))}, r"landmarks: expected shape \(5, N, 2\)"),
-        ({"landmarks": np.zeros((0, 2))}, "tags below 0, the number of landmarks"),
-        ({"starts": np.zeros(3)}, r"starts: expected shape \(5, 3\), got \(3,\)"),
-        ({"pose": (0.0, 0.0)}, r"pose: expected shape \(3,\)"),
-        ({"origin": np.zeros((5, 6, 2))}, "origin: expected integer"),
-    ],
+@refused(
+    ({"logs": []}, "logs as a list of Log, one a run, got an empty list"),
+    ({"logs": Log(np.zeros((2, 3)), Scan(*[np.zeros((2, 1))] * 3))}, "logs as a list"),
+    ({"logs": [None]}, r"expected logs\[0\] to be a Log, got NoneType"),
+    ({"logs": ragged()}, r"got \(6, 2\) in run 0 and \(5, 2\) in run 4"),
+    ({"logs": unlike(z=np.full((6, 2, 2), np.nan))}, "run 1: .* is not finite"),
+    ({"logs": unlike(tag=np.tile([0, 2], (6, 1)))}, r"below 2, .* got 2 \(run 1, row 0\)"),
+    ({"poses": np.zeros((5, 4, 3))}, r"poses: expected shape \(5, 6, 3\)"),
+    ({"poses": np.full((5, 6, 3), np.inf)}, "true pose of run 0: expected finite"),
+    ({"landmarks": np.zeros((4, 2, 2))}, r"landmarks: expected shape \(5, N, 2\)"),
+    ({"landmarks": np.zeros((0, 2))}, "tags below 0, the number of landmarks"),
+    ({"starts": np.zeros(3)}, r"starts: expected shape \(5, 3\), got \(3,\)"),
+    ({"pose": (0.0, 0.0)}, r"pose: expected shape \(3,\)"),
+    ({"origin": np.zeros((5, 6, 2))}, "origin: expected integer"),
 )
-def test_what_is_no_record_is_refused(changed, message):
-    with pytest.raises(ValueError, match=message):
-        recorded(**changed)
+def test_what_is_no_record_is_refused(changed):
+    recorded(**changed)
 
 
 def test_a_campaign_of_more_runs_than_there_are_is_refused():

@@ -5,6 +5,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import refused, swept
 
 import jaxslam
 from jaxslam import motion, sensors
@@ -168,7 +169,7 @@ def test_whole_numbers_are_as_good_as_any():
     chex.assert_trees_all_equal(both(np.array([1, 2, 0])), both(np.array([1.0, 2.0, 0.0])))
 
 
-@pytest.mark.parametrize("dtype", DTYPES)
+@pytest.mark.parametrize("dtype", swept(DTYPES, np.float64))
 def test_jit_vmap_dtype_and_gradient(dtype):
     states = np.array([X, [1.0, 2.0], [0.0, 0.0]], dtype)
     cov = COV.astype(dtype)
@@ -271,25 +272,21 @@ def test_inverse_depth_is_near_linear_where_range_is_not(share):
 # --- bad input ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("change", "why"),
-    [
-        ({"x": np.eye(2)}, "state: expected shape"),
-        ({"cov": np.eye(3)}, r"shape \(2, 2\)"),
-        ({"cov": -np.eye(2)}, "negative variance"),
-        ({"cov": np.diag([1.0, np.nan])}, "NaN"),
-        ({"sigmas": 0.0}, "above 0"),
-        ({"x": np.array([np.nan, 1])}, "not finite"),
-        ({"f": lambda x: x[0]}, r"return \(m,\)"),
-        ({"noise_cov": np.eye(2)}, r"shape \(3, 3\)"),
-    ],
+@refused(
+    ({"x": np.eye(2)}, "state: expected shape"),
+    ({"cov": np.eye(3)}, r"shape \(2, 2\)"),
+    ({"cov": -np.eye(2)}, "negative variance"),
+    ({"cov": np.diag([1.0, np.nan])}, "NaN"),
+    ({"sigmas": 0.0}, "above 0"),
+    ({"x": np.array([np.nan, 1])}, "not finite"),
+    ({"f": lambda x: x[0]}, r"return \(m,\)"),
+    ({"noise_cov": np.eye(2)}, r"shape \(3, 3\)"),
 )
-def test_bad_input_is_refused(change, why):
+def test_bad_input_is_refused(change):
     arguments = {"f": curved, "x": X, "cov": COV} | change
-    with pytest.raises(ValueError, match=why):
-        if "noise_cov" in change:  # by its shape alone
-            jax.eval_shape(lambda: jaxslam.linearity_index(**arguments))
-        jaxslam.linearity_index(**arguments)
+    if "noise_cov" in change:  # by its shape alone
+        jax.eval_shape(lambda: jaxslam.linearity_index(**arguments))
+    jaxslam.linearity_index(**arguments)
 
 
 @pytest.mark.parametrize(

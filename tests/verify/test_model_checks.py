@@ -1,6 +1,7 @@
 """`verify_jacobians` of models: faults of sensors, motion models and noise are found by name."""
 
 import dataclasses
+from functools import partial
 
 import jax.numpy as jnp
 import numpy as np
@@ -8,13 +9,16 @@ import pytest
 from own_models import changed, sensor_of
 from verified import failed
 
-from jaxslam import motion, sensors
+from jaxslam import cli, graphs, motion, sensors
 from jaxslam.core.protocols import Sensor
+from jaxslam.core.record import record
+from jaxslam.laser.grids import beam_models
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
 from jaxslam.verify import Check, Report, build, properties, verify_jacobians
-from jaxslam.verify.inputs import samples
+from jaxslam.verify.inputs import samples, user_files
 from jaxslam.verify.inputs.functions import motion_functions
+from jaxslam.verify.inputs.user_files import UnusableFile, load, verify_file
 
 LASER = build(sensors.RangeBearing)
 CAMERA = build(sensors.BearingOnly)
@@ -256,3 +260,82 @@ def test_a_round_trip_off_by_a_turn_says_that_the_unit_is_missing():
         "bearing is off by 2π (an angle's name ends in [rad])"
     )
     assert "the residual is a difference" in checks
+
+
+# --- Beam models under `verify`: both pass, a wrong derivative does not, and a file may define on--
+
+
+@pytest.mark.parametrize("make", beam_models.REGISTRY.values(), ids=beam_models.REGISTRY)
+def test_beam_models_are_verified(make):
+    report = verify_jacobians(build(make), count=4)
+    assert report.passed, str(report)
+    assert report.kind == "beam model"
+
+
+def test_a_wrong_derivative_by_the_heading_is_found():
+    @record
+    class Wrong(beam_models.LikelihoodField):
+        def jacobian(self, prepared, pose, beams):
+            return super().jacobian(prepared, pose, beams) * jnp.array([[1.0, 1.0, -1.0]])
+
+    report = verify_jacobians(build(Wrong), count=4)
+    assert not report.passed
+    assert "theta" in str(report) and "hand disagrees" in str(report), str(report)
+
+
+def test_a_file_may_define_a_beam_model_whose_jacobian_is_held(tmp_path):
+    path = tmp_path / "mine.py"
+    path.write_text(
+        "import dataclasses\nfrom jaxslam.core.record import record\n"
+        "from jaxslam.laser.grids import LikelihoodField\n"
+        "@record\nclass Wrong(LikelihoodField):\n"
+        "    def jacobian(self, *at):\n        return -super(Wrong, self).jacobian(*at)\n"
+        "mine = LikelihoodField(0.2, max_range=40.0)\nwrong = Wrong(0.2, max_range=40.0)\n",
+        encoding="utf-8",
+    )
+    right, wrong = verify_file(str(path), partial(verify_jacobians, count=4))
+    assert (right.model, right.kind, right.passed) == ("mine", "beam model", True), str(right)
+    assert not wrong.passed
+    assert "hand disagrees" in str(wrong)
+    with pytest.raises(UnusableFile, match=r"expected dataclasses to be .* a BeamModel, or"):
+        load(f"{path}:dataclasses")
+    (target,) = (a for a in cli._parser()._actions if isinstance(a.choices, dict))
+    assert "grids.BeamModel" in target.choices["verify"].format_help()
+
+
+# --- A factor of a graph is verified as models are ------------------------------------------------
+
+
+def test_a_wrong_entry_of_a_factor_is_named():
+    right = graphs.RelativePose()
+
+    def jacobians(variables, z):
+        by_first, by_second = right.jacobians(variables, z)
+        return by_first, by_second.at[1, 0].multiply(-1.0)
+
+    report = verify_jacobians(changed(right, jacobians=jacobians), count=4)
+    assert report.kind == "factor"
+    assert failed(report) == ["residual by pose 2"]
+    assert [f.name for f in report.findings] == [
+        f"residual by {name}" for name in ("pose 1", "pose 2", "measurement")
+    ]
+    assert "entry (y [m], x [m]): hand disagrees" in str(report)
+
+
+@pytest.mark.parametrize(
+    ("text", "name", "factor"),
+    [
+        ("mine = graphs.Prior()\n", "mine", "prior"),
+        ("def mine() -> graphs.Factor:\n    return graphs.Prior()\n", "mine", "prior"),
+        ("@record\nclass Mine(graphs.Prior):\n    pass\n", "Mine", "mine"),
+    ],
+)
+def test_a_file_has_factors_by_themselves_by_factories_and_classes(tmp_path, text, name, factor):
+    path = tmp_path / "mine.py"
+    path.write_text(f"from jaxslam import graphs\nfrom jaxslam.core.record import record\n{text}")
+    assert [(t.name, t.model.name) for t in user_files.load(str(path))] == [(name, factor)]
+
+
+def test_a_class_in_the_place_of_a_factor_is_to_be_called():
+    with pytest.raises(ValueError, match=r"got the class Prior of one: call it, as in Prior\(\)"):
+        verify_jacobians(graphs.Prior)

@@ -1,7 +1,8 @@
-"""Errors of paths and maps, against values by hand and against evo where it is installed."""
+"""Errors of paths and maps, against values by hand and homogeneous matrices."""
 
 import numpy as np
 import pytest
+from cases import refused
 
 from jaxslam import grids, metrics
 from jaxslam.core.types import Estimate
@@ -188,60 +189,53 @@ def test_the_entropy_of_a_map_is_that_of_its_known_cells():
 # --- bad input ----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: metrics.ate(SQUARE, SQUARE[:3]), "ate: .* same length, got 5 and 3"),
-        (lambda: metrics.ate(SQUARE[:, :2], SQUARE[:, :2]), r"ate: .* got shape \(5, 2\)"),
-        (lambda: metrics.ate(SQUARE, SQUARE * np.nan), "ate: expected finite .* row 0 is not"),
-        (lambda: metrics.ate(np.zeros((0, 3)), np.zeros((0, 3))), "ate: expected at least one"),
-        (lambda: metrics.ate([["a", 1, 2]], SQUARE[:1]), "ate: expected a table"),
-        (lambda: metrics.relations(SQUARE), "relations: expected exactly one"),
-        (lambda: metrics.relations(SQUARE, rows=1, metres=1.0), "relations: expected exactly one"),
-        (lambda: metrics.relations(SQUARE, seconds=1.0), "relations: expected the stamps"),
-        (
-            lambda: metrics.relations(SQUARE, metres=0.0),
-            "relations: expected finite spacings above 0",
-        ),
-        (lambda: metrics.relations(SQUARE, rows=1.5), "relations: expected a whole number"),
-        (
-            lambda: metrics.relations(SQUARE, seconds=1.0, time=[0, 1, 0.5, 2, 3]),
-            "relations: expected stamps",
-        ),
-        (lambda: metrics.revisits(SQUARE, radius=0, apart=1), "revisits: expected numbers"),
-        (
-            lambda: metrics.relation_errors(metrics.relations(SQUARE, rows=4), SQUARE[:3]),
-            "relation_errors: the relations are of rows up to 4, and the path has 3",
-        ),
-        (lambda: metrics.given([0, 1], [0], [1, 2], SQUARE[:1], tolerance=1), "given: expected 1"),
-        (
-            lambda: metrics.given([3, 0, 1], [7, 0], [8, 9], SQUARE[:2], tolerance=0.5),
-            r"given: none of 2 relations, from 0\.0+ s to 9\.0+ s, joins the path, from 0\.0+ s to "
-            r"3\.0+ s, within 0\.5 s",
-        ),
-        (
-            lambda: metrics.given([0, 1], [0], [np.nan], SQUARE[:1], tolerance=1),
-            "given: expected finite stamps of relations, got nan in row 0",
-        ),
-        (
-            lambda: metrics.given([0, np.inf], [0], [1], SQUARE[:1], tolerance=1),
-            "given: expected finite stamps",
-        ),
-        (
-            lambda: metrics.given([0, 1], [0], [1], SQUARE[:1], tolerance=-1),
-            "given: expected a tolerance",
-        ),
-        (lambda: metrics.joined(), "joined: expected at least one"),
-        (lambda: metrics.statistics([]), "statistics: expected finite"),
-        (
-            lambda: metrics.benchmark_figures(metrics.Errors(np.zeros(0), np.zeros(0))),
-            "statistics: expected finite errors",
-        ),
-    ],
+@refused(
+    (lambda: metrics.ate(SQUARE, SQUARE[:3]), "ate: .* same length, got 5 and 3"),
+    (lambda: metrics.ate(SQUARE[:, :2], SQUARE[:, :2]), r"ate: .* got shape \(5, 2\)"),
+    (lambda: metrics.ate(SQUARE, SQUARE * np.nan), "ate: expected finite .* row 0 is not"),
+    (lambda: metrics.ate(np.zeros((0, 3)), np.zeros((0, 3))), "ate: expected at least one"),
+    (lambda: metrics.ate([["a", 1, 2]], SQUARE[:1]), "ate: expected a table"),
+    (lambda: metrics.relations(SQUARE), "relations: expected exactly one"),
+    (lambda: metrics.relations(SQUARE, rows=1, metres=1.0), "relations: expected exactly one"),
+    (lambda: metrics.relations(SQUARE, seconds=1.0), "relations: expected the stamps"),
+    (lambda: metrics.relations(SQUARE, metres=0.0), "relations: expected finite spacings above 0"),
+    (lambda: metrics.relations(SQUARE, rows=1.5), "relations: expected a whole number"),
+    (
+        lambda: metrics.relations(SQUARE, seconds=1.0, time=[0, 1, 0.5, 2, 3]),
+        "relations: expected stamps",
+    ),
+    (lambda: metrics.revisits(SQUARE, radius=0, apart=1), "revisits: expected numbers"),
+    (
+        lambda: metrics.relation_errors(metrics.relations(SQUARE, rows=4), SQUARE[:3]),
+        "relation_errors: the relations are of rows up to 4, and the path has 3",
+    ),
+    (lambda: metrics.given([0, 1], [0], [1, 2], SQUARE[:1], tolerance=1), "given: expected 1"),
+    (
+        lambda: metrics.given([3, 0, 1], [7, 0], [8, 9], SQUARE[:2], tolerance=0.5),
+        r"given: none of 2 relations, from 0\.0+ s to 9\.0+ s, joins the path, from 0\.0+ s to "
+        r"3\.0+ s, within 0\.5 s",
+    ),
+    (
+        lambda: metrics.given([0, 1], [0], [np.nan], SQUARE[:1], tolerance=1),
+        "given: expected finite stamps of relations, got nan in row 0",
+    ),
+    (
+        lambda: metrics.given([0, np.inf], [0], [1], SQUARE[:1], tolerance=1),
+        "given: expected finite stamps",
+    ),
+    (
+        lambda: metrics.given([0, 1], [0], [1], SQUARE[:1], tolerance=-1),
+        "given: expected a tolerance",
+    ),
+    (lambda: metrics.joined(), "joined: expected at least one"),
+    (lambda: metrics.statistics([]), "statistics: expected finite"),
+    (
+        lambda: metrics.benchmark_figures(metrics.Errors(np.zeros(0), np.zeros(0))),
+        "statistics: expected finite errors",
+    ),
 )
-def test_bad_input_is_refused_by_name(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()
+def test_bad_input_is_refused_by_name(call):
+    call()
 
 
 # --- evo ----------------------------------------------------------------------------------------

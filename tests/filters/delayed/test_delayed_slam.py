@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import refused, swept
+from reference.plane import from_frame
 from worlds import draw, judged, nameless, narrow
 
 import jaxslam
@@ -102,23 +104,10 @@ def test_a_measurement_is_stored_where_the_sensor_is_mounted(kind):
     factory = sensors.BearingOnly if kind == "rays" else sensors.RangeOnly
     sensor = factory([[1e-4]], mount=mount)
     pose, point = np.array([1.0, 2.0, 2.5]), np.array([-3.0, 4.0])
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    place = pose[:2] + np.array([[c, -s], [s, c]]) @ mount[:2]
+    place = from_frame(pose, mount[:2])
     seen = KINDS[kind].store(sensor, jnp.asarray(pose), sensor.observe(pose, point))
     assert type(triangulation_of(sensor)) is type(KINDS[kind])
     np.testing.assert_allclose(seen, seen_by(kind, place[None], point)[0], atol=1e-12)
-
-
-def test_bad_triangulations_are_refused():
-    move = motion.Increment(np.eye(2))
-    with pytest.raises(ValueError, match="one bearing"):
-        DelayedSlam(move, BEACON, 3, triangulation=Rays())
-    with pytest.raises(ValueError, match="one range"):
-        DelayedSlam(move, CAMERA, 3, triangulation=Circles())
-    with pytest.raises(ValueError, match=r"^Rays: expected parallax in"):
-        Rays(parallax=2.0)
-    with pytest.raises(ValueError, match=r"^Circles: expected angle in"):
-        Circles(angle=0.0)
 
 
 # --- hypotheses in the table --------------------------------------------------------------------
@@ -331,7 +320,7 @@ def driven(filter, log):
 RUNS = 40
 
 
-@pytest.fixture(scope="module", params=list(KINDS))
+@pytest.fixture(scope="module", params=swept(KINDS, "rays"))
 def many(request):
     """Of one kind, truths, logs and traces of all runs: one program for all tests."""
     scenario = world(request.param)
@@ -434,6 +423,7 @@ def poor():
     return scenario, filter, logs, truth, [jax.device_get(go(filter, each)) for each in logs]
 
 
+@pytest.mark.sweep
 def test_a_full_map_refuses_and_says_so_in_float32_too(poor):
     truth, (trace, *_) = poor[-2:]
     chex.assert_tree_all_finite(trace)
@@ -448,6 +438,7 @@ def test_a_full_map_refuses_and_says_so_in_float32_too(poor):
     assert trace.info.tally(Status.OVERFLOW).sum() > 0
 
 
+@pytest.mark.sweep
 def test_spurious_bearings_move_no_robot_and_empty_scans_neither(poor):
     """Random bearings make no landmark, so all is as without them."""
     scenario, filter, (_, _, empty, _), _, (_, *traces) = poor
@@ -466,6 +457,7 @@ def test_spurious_bearings_move_no_robot_and_empty_scans_neither(poor):
     assert (trace.estimate.pose.shape, trace.info.status.shape) == ((60, 3), (60, 0))
 
 
+@pytest.mark.sweep
 def test_float32_stays_float32(poor):
     """Of bearings by runs of a full map, of ranges by their shapes alone."""
     scenario, filter = small("circles")
@@ -474,6 +466,7 @@ def test_float32_stays_float32(poor):
         assert leaf.dtype == np.float32 or not jnp.issubdtype(leaf.dtype, jnp.floating)
 
 
+@pytest.mark.sweep
 def test_derivatives_reach_the_noise_and_are_finite():
     """Of the whole filter forward; in reverse it compiles for minutes, and its parts are below."""
     scenario, _ = small("circles")
@@ -508,6 +501,7 @@ def test_in_reverse_intersections_and_residuals_are_as_forward(kind):
     assert all(np.any(leaf) for leaf in jax.tree.leaves(reverse))
 
 
+@pytest.mark.sweep
 def test_in_reverse_what_makes_a_landmark_is_as_forward():
     """A hypothesis formed and confirmed, a point fitted and entered, by means and covariances."""
     kind = "rays"
@@ -543,6 +537,7 @@ def test_in_reverse_what_makes_a_landmark_is_as_forward():
     np.testing.assert_allclose(reverse, forward, rtol=1e-8)
 
 
+@pytest.mark.sweep
 def test_without_names_intersections_find_the_landmarks():
     """Every bearing may be of any landmark; the names in the log are not looked at."""
     scenario = world("rays")
@@ -564,41 +559,37 @@ def test_without_names_intersections_find_the_landmarks():
     assert final.alive.sum() <= 6
 
 
-@pytest.mark.parametrize(
-    ("options", "message"),
-    [
-        ({"sensor": sensors.RangeBearing(np.eye(2))}, "one bearing or one range"),
-        ({"capacity": 0}, "DelayedSlam: capacity"),
-        ({"gate": 0}, "DelayedSlam: expected a gate above 0"),
-        ({"triangulation": 3}, "DelayedSlam: expected triangulation to be a Triangulation"),
-        ({"triangulation": Rays}, "got the class Rays: call it"),
-        ({"stored": 32}, "DelayedSlam: expected stored to be a StoredMeasurements, got int"),
-        ({"hypotheses": 16}, "DelayedSlam: expected hypotheses to be a Hypotheses, got int"),
-        ({"promotion": 2}, "DelayedSlam: expected promotion to be a Promotion, got int"),
-    ],
+@refused(
+    (lambda: slam(sensors.RangeBearing(np.eye(2))), "one bearing or one range"),
+    (lambda: slam(capacity=0), "DelayedSlam: capacity"),
+    (lambda: slam(gate=0), "DelayedSlam: expected a gate above 0"),
+    (lambda: slam(triangulation=3), "DelayedSlam: expected triangulation to be a Triangulation"),
+    (lambda: slam(triangulation=Rays), "got the class Rays: call it"),
+    (lambda: slam(stored=32), "DelayedSlam: expected stored to be a StoredMeasurements, got int"),
+    (lambda: slam(hypotheses=16), "DelayedSlam: expected hypotheses to be a Hypotheses, got int"),
+    (lambda: slam(promotion=2), "DelayedSlam: expected promotion to be a Promotion, got int"),
+    (lambda: slam(BEACON, triangulation=Rays()), "one bearing"),
+    (lambda: slam(triangulation=Circles()), "one range"),
+    (lambda: Rays(parallax=2.0), "^Rays: expected parallax in"),
+    (lambda: Circles(angle=0.0), "^Circles: expected angle in"),
+    (lambda: StoredMeasurements(capacity=0), "^StoredMeasurements: capacity"),
+    (
+        lambda: StoredMeasurements(spacing=-0.1),
+        "^StoredMeasurements: expected spacing of at least 0",
+    ),
+    (lambda: Hypotheses(capacity=0), "^Hypotheses: capacity"),
+    (lambda: Hypotheses(patience=0.5), "^Hypotheses: patience"),
+    (lambda: Hypotheses(decay=-1), "^Hypotheses: expected decay of at least 0"),
+    (lambda: Hypotheses(spread=np.nan), "^Hypotheses: expected spread above 0"),
+    (lambda: Hypotheses(same=0), "^Hypotheses: expected same above 0"),
+    (lambda: Hypotheses(distance="euclid"), "^Hypotheses: expected distance .*, got 'euclid'"),
+    (lambda: Promotion(per_scan=1.5), "^Promotion: per_scan"),
+    (lambda: Promotion(persistence=0), "^Promotion: expected persistence above 0"),
+    (lambda: Promotion(lead=-1), "^Promotion: expected lead of at least 0"),
 )
-def test_bad_arguments_are_refused(options, message):
-    options = {"sensor": CAMERA, "capacity": 3} | options
-    with pytest.raises(ValueError, match=message):
-        DelayedSlam(motion.Increment(np.eye(2)), **options)
+def test_bad_arguments_are_refused(make):
+    make()
 
 
-@pytest.mark.parametrize(
-    ("record", "options", "message"),
-    [
-        (StoredMeasurements, {"capacity": 0}, "capacity"),
-        (StoredMeasurements, {"spacing": -0.1}, "expected spacing of at least 0"),
-        (Hypotheses, {"capacity": 0}, "capacity"),
-        (Hypotheses, {"patience": 0.5}, "patience"),
-        (Hypotheses, {"decay": -1}, "expected decay of at least 0"),
-        (Hypotheses, {"spread": np.nan}, "expected spread above 0"),
-        (Hypotheses, {"same": 0}, "expected same above 0"),
-        (Hypotheses, {"distance": "euclid"}, "expected distance .*, got 'euclid'"),
-        (Promotion, {"per_scan": 1.5}, "per_scan"),
-        (Promotion, {"persistence": 0}, "expected persistence above 0"),
-        (Promotion, {"lead": -1}, "expected lead of at least 0"),
-    ],
-)
-def test_bad_settings_are_refused_where_they_are_made(record, options, message):
-    with pytest.raises(ValueError, match=f"^{record.__name__}: {message}"):
-        record(**options)
+def slam(sensor=CAMERA, capacity=3, **options):
+    return DelayedSlam(motion.Increment(np.eye(2)), sensor, capacity, **options)

@@ -8,6 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
+from cases import refused
 
 from jaxslam import motion, sensors, slots
 from jaxslam.core.types import Log, Scan, Status
@@ -319,24 +320,21 @@ def test_gradients_are_finite_with_a_landmark_exactly_at_the_robot(likelihood, c
 
 # --- refusals -----------------------------------------------------------------------------------
 
-BAD_OPTIONS = {
-    "capacity 0": ({"capacity": 0}, "capacity"),
-    "capacity 2.5": ({"capacity": 2.5}, "capacity"),
-    "iterations 0": ({"iterations": 0}, "iterations"),
-    "iterations -1": ({"iterations": -1}, "iterations"),
-    "births 0": ({"births": 0}, "births"),
-    "correction": ({"correction": "x"}, "correction"),
-    "gate 0": ({"gate": 0.0}, "gate"),
-    "gate -1": ({"gate": -1}, "gate"),
-    "gate nan": ({"gate": float("nan")}, "gate"),
-}
 
-
-@pytest.mark.parametrize("case", BAD_OPTIONS)
-def test_bad_options_are_refused(case):
-    options, message = BAD_OPTIONS[case]
-    with pytest.raises(ValueError, match=f"EkfSlam: .*{message}"):
-        EkfSlam(MOTION, SENSOR, **({"capacity": 3} | options))
+@refused(
+    ({"capacity": 0}, "capacity"),
+    ({"capacity": 2.5}, "capacity"),
+    ({"iterations": 0}, "iterations"),
+    ({"iterations": -1}, "iterations"),
+    ({"births": 0}, "births"),
+    ({"correction": "x"}, "correction"),
+    ({"gate": 0.0}, "gate"),
+    ({"gate": -1}, "gate"),
+    ({"gate": float("nan")}, "gate"),
+    told="EkfSlam: .*",
+)
+def test_bad_options_are_refused(options):
+    EkfSlam(MOTION, SENSOR, **({"capacity": 3} | options))
 
 
 def good_log(steps=3):
@@ -395,18 +393,3 @@ def test_what_is_not_finite_and_escapes_the_check_under_jit_is_dropped(good_trac
     chex.assert_tree_all_finite(trace.estimate)
     chex.assert_trees_all_equal(expected.estimate, trace.estimate)
     np.testing.assert_array_equal(expected.info.log_likelihood, trace.info.log_likelihood)
-
-
-def test_a_log_without_rows_is_a_log():
-    """Without places: tests/equivalence/test_information.py."""
-    steps, places = 0, 2
-    scan = Scan(
-        np.zeros((steps, places, 2)),
-        np.full((steps, places), -1, np.int32),
-        np.zeros((steps, places), bool),
-    )
-    filter = EkfSlam(MOTION, sensors.RangeBearing(R), 1, correction="joint")
-    trace = run(filter, Log(np.zeros((steps, 2)), scan), np.zeros(3), np.zeros((3, 3)), KEY)
-    assert trace.estimate.pose.shape == (steps, 3)
-    assert not trace.info.log_likelihood.any()
-    assert not trace.final.alive.any()

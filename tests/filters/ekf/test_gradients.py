@@ -1,12 +1,14 @@
-"""The gradient of a whole run: by every parameter of robot and sensor, and of every kind of filter."""
+"""Whole runs: the gradient by every parameter and of every kind of filter; single precision."""
 
 import dataclasses
+from functools import cache
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
+from worlds import draw, narrow
 
 from jaxslam import charts, linearize, motion, sensors
 from jaxslam.core.slots import Joint
@@ -17,7 +19,7 @@ from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.update import correct_in_turn
 from jaxslam.math.stats import sigma_gate
 from jaxslam.run import run
-from jaxslam.simulation.scenarios import cloister
+from jaxslam.simulation.scenarios import circle, cloister
 from jaxslam.simulation.worlds import simulate
 
 KEY = jax.random.key(0)
@@ -78,6 +80,7 @@ def gradient(compiled, log):
     return np.asarray(compiled(AT, log)[1])
 
 
+@pytest.mark.sweep
 def test_the_gradient_of_200_steps_is_that_of_central_differences(log, compiled, gradient):
     value = jax.jit(lambda p: log_likelihood(p, log)[0])
     (total, status), _ = compiled(AT, log)
@@ -95,6 +98,7 @@ def test_the_gradient_of_200_steps_is_that_of_central_differences(log, compiled,
         assert abs(gradient[i]) > 1.0, name  # every parameter is reached
 
 
+@pytest.mark.sweep
 def test_reverse_mode_keeps_one_state_a_step(compiled):
     state = 8 * (3 + 2 * 36) ** 2
     assert compiled.memory_analysis().temp_size_in_bytes < 1.5 * 200 * state
@@ -110,6 +114,7 @@ def gated():
     )
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize("case", ["full scans", "every third scan empty", "no measurement at all"])
 def test_gradients_are_finite_in_float32_with_gate_overflow_and_empty_scans(gated, log, case):
     """Also with P0 = 0, which is where the cloister starts."""
@@ -138,6 +143,7 @@ FORMS = {
 }
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize("name", FORMS)
 def test_in_reverse_through_a_motion_and_corrections_in_turn(name):
     """By both noises, from a pose that is known exactly. Corrected at once, and with births:
@@ -165,3 +171,47 @@ def test_in_reverse_through_a_motion_and_corrections_in_turn(name):
     ]
     np.testing.assert_allclose(slope, rise, rtol=5e-5, atol=1e-3)
     assert np.all(slope != 0)
+
+
+# --- Single precision over the long benchmark: the covariance stays positive definite, the pose c--
+
+
+@cache
+def traces():
+    """The EKF over 2500 steps of the circle in float32 and in float64, on the same log."""
+    scenario = circle(2500)
+    filter = EkfSlam(scenario.motion, scenario.sensor, 20, **scenario.filter_options)
+    single = narrow(draw(scenario, 11)[1])
+    # Rounding the log to float32 and back leaves one log for both.
+    double = jax.tree.map(lambda a: a.astype("f8") if a.dtype == np.float32 else a, single)
+
+    def definite(state):
+        return [jnp.isfinite(jnp.linalg.cholesky(p)).all() for p in (state.cov[3:, 3:], state.cov)]
+
+    start = scenario.pose, scenario.pose_cov, jax.random.key(0)
+    return [jax.device_get(run(filter, log, *start, probe=definite)) for log in (single, double)]
+
+
+def test_the_joint_covariance_is_positive_definite_at_every_step():
+    """From the second step on: two noises cannot fill three dimensions of P0 = 0 in one."""
+    for trace in traces():
+        landmarks, everything = trace.probe
+        assert landmarks.all()
+        assert trace.estimate.pose_cov[0, 1, 1] == 0
+        assert everything[1:].all(), f"first at step {1 + np.argmin(everything[1:])}"
+
+
+def test_everything_is_float32_and_agrees_with_float64_far_within_its_sigma():
+    single, double = traces()
+    kinds = {a.dtype for a in jax.tree.leaves(single) if np.issubdtype(a.dtype, np.floating)}
+    assert kinds == {np.dtype("f4")}
+    cov = single.final.cov
+    np.testing.assert_allclose(cov, cov.T, atol=4 * np.finfo("f4").eps * np.abs(cov).max())
+    assert single.estimate.alive[-1].all()
+    np.testing.assert_array_equal(single.info.status, double.info.status)
+    error = single.estimate.pose.astype(float) - double.estimate.pose
+    error[:, 2] = np.angle(np.exp(1j * error[:, 2]))
+    variance = np.einsum("tii->ti", double.estimate.pose_cov)[2:]  # zero in y before
+    assert np.abs(error[2:] / np.sqrt(variance)).max() < 0.01
+    ratio = np.einsum("tii->ti", single.estimate.pose_cov)[2:] / variance
+    assert np.abs(ratio - 1).max() < 2e-3

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import refused, swept
 from own_models import changed
 
 from jaxslam import charts, motion, run, sensors, slots
@@ -56,7 +57,8 @@ CHARTS = {"euclidean": charts.Euclidean, "right_invariant": lambda: RightInvaria
 
 
 FORMS = pytest.mark.parametrize(
-    ("name", "square_root"), [("euclidean", False), ("right_invariant", True)]
+    ("name", "square_root"),
+    swept([("euclidean", False), ("right_invariant", True)], ("euclidean", False)),
 )
 
 
@@ -124,7 +126,9 @@ def test_nothing_to_reduce_changes_nothing(name, square_root):
     chex.assert_trees_all_equal(same, joint)
 
 
-@pytest.mark.parametrize("options", [{}, {"linearize": Unscented(), "correction": "joint"}])
+@pytest.mark.parametrize(
+    "options", swept([{}, {"linearize": Unscented(), "correction": "joint"}], {})
+)
 def test_a_reduced_map_is_filtered_as_one_of_points(options):
     """From the moment of conversion on, the filter on 4-vectors is that on points (x, y)."""
     log = a_log()
@@ -227,6 +231,7 @@ def test_dead_and_reduced_slots_are_not_ready():
     assert not gone.reduced.any()
 
 
+@pytest.mark.sweep
 def test_gradients_and_float32():
     log = a_log(12, dtype=np.float32)
 
@@ -241,17 +246,24 @@ def test_gradients_and_float32():
     assert trace.info.extra["points"].reduced.any()
 
 
-def test_refusals():
-    with pytest.raises(ValueError, match="to_point above 0"):
-        camera(to_point=0.0)
-    turning = changed(
-        RightInvariant(rays=True), basis=lambda x, y: Basis(jnp.eye(3), y[:, None], jnp.eye(4))
-    )
-    with pytest.raises(ValueError, match="turn with the robot"):
-        EkfSlam(MOTION, camera(to_point=0.1), 4, chart=turning)
-    with pytest.raises(ValueError, match="does not act on the 4-parameter"):
-        EkfSlam(MOTION, camera(), 4, chart=RightInvariant())
-    with pytest.raises(ValueError, match="does not act on the 2-parameter"):
-        EkfSlam(MOTION, sensors.RangeBearing(np.eye(2)), 4, chart=RightInvariant(rays=True))
-    with pytest.raises(ValueError, match="converted to points"):
-        CompressedEkfSlam(EkfSlam(MOTION, camera(to_point=0.1), 8), area=4)
+TURNING = changed(
+    RightInvariant(rays=True), basis=lambda x, y: Basis(jnp.eye(3), y[:, None], jnp.eye(4))
+)
+POINT_SENSOR = sensors.RangeBearing(np.eye(2))
+
+
+@refused(
+    (lambda: camera(to_point=0.0), "to_point above 0"),
+    (lambda: EkfSlam(MOTION, SENSOR, 4, chart=TURNING), "turn with the robot"),
+    (
+        lambda: EkfSlam(MOTION, camera(), 4, chart=RightInvariant()),
+        "does not act on the 4-parameter",
+    ),
+    (
+        lambda: EkfSlam(MOTION, POINT_SENSOR, 4, chart=RightInvariant(rays=True)),
+        "does not act on the 2-parameter",
+    ),
+    (lambda: CompressedEkfSlam(EkfSlam(MOTION, SENSOR, 8), area=4), "converted to points"),
+)
+def test_refusals(make):
+    make()

@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import swept
 
 from jaxslam import association, life, motion, run, sensors
-from jaxslam.core.protocols import Association
 from jaxslam.core.types import Log, Scan, Status
 from jaxslam.filters import EkfSlam
 from jaxslam.filters.map_management.merging import Merging
@@ -30,23 +30,19 @@ METHODS = {name: (name, GATE, NEW) for name in MAKERS} | {
     "gates of ∞": ("nearest", np.inf, np.inf),
 }
 CASES = [(method, 6) for method in METHODS] + [("joint", 1)]
+OF_NEAREST = [case for case in CASES if METHODS[case[0]][0] == "nearest"]
 
 
 @cache
-def program(capacity, names):
-    """A run as a program of the log, the number of the method and the gates: one for all methods."""
+def program(capacity, name):
+    """A run as a program of the log and the gates."""
     manager = life.Existence(
         lambda pose, point: ((point - pose[:2]) ** 2).sum() < 25, patience=5, replace=True
     )
 
-    def one(log, which, *gates):
-        methods = [MAKERS[name](*gates) for name in names]
-
-        def chosen(prediction, scan):
-            branches = [lambda m=m: Association(*m(prediction, scan)) for m in methods]
-            return jax.lax.switch(which, branches)
-
-        plain = EkfSlam(MOTION, SENSOR, capacity, associate=chosen, life=manager)
+    def one(log, *gates):
+        associate = MAKERS[name](*gates)
+        plain = EkfSlam(MOTION, SENSOR, capacity, associate=associate, life=manager)
         filter = Merging(plain, 0.3)
         return run(filter, log, jnp.zeros(3), jnp.zeros((3, 3)), jax.random.key(0))
 
@@ -55,9 +51,8 @@ def program(capacity, names):
 
 @cache
 def go(method, capacity, world):
-    maker, *gates = METHODS[method]
-    names = tuple(MAKERS) if capacity > 1 else (maker,)
-    return jax.device_get(program(capacity, names)(WORLDS[world], names.index(maker), *gates))
+    name, *gates = METHODS[method]
+    return jax.device_get(program(capacity, name)(WORLDS[world], *gates))
 
 
 def log_of(z, valid):
@@ -99,7 +94,7 @@ def worlds():
 WORLDS = worlds()
 
 
-@pytest.mark.parametrize(("method", "capacity"), CASES)
+@pytest.mark.parametrize(("method", "capacity"), swept(CASES, *OF_NEAREST))
 def test_everything_stays_finite_and_nothing_is_lost_uncounted(method, capacity):
     for name, log in WORLDS.items():
         trace = go(method, capacity, name)
@@ -117,7 +112,7 @@ def test_everything_stays_finite_and_nothing_is_lost_uncounted(method, capacity)
         np.testing.assert_allclose(cov, cov.T, atol=1e-12, err_msg=name)
 
 
-@pytest.mark.parametrize("method", ["nearest", "joint", "maximum_likelihood", "global_nearest"])
+@pytest.mark.parametrize("method", swept(MAKERS, "nearest"))
 def test_what_the_worlds_hold_is_found(method):
     clean = go(method, 6, "four landmarks")
     assert np.asarray(clean.final.alive).sum() == 4
@@ -127,6 +122,7 @@ def test_what_the_worlds_hold_is_found(method):
     assert (np.asarray(nothing.estimate.pose_cov)[-1, :2, :2].trace()) > 0
 
 
+@pytest.mark.sweep
 def test_clutter_alone_confirms_nothing_for_long():
     trace = go("joint", 6, "nothing but clutter")
     removed = trace.info.extra["pruning"].removed.sum()

@@ -7,21 +7,92 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from dense_form import COUNT, canonical, close, dense, dtypes, initialized, measured, picks
+from cases import refused
 from worlds import draw, narrow
 
-from jaxslam import filters, sensors
-from jaxslam.core.types import Status
+from jaxslam import catalog, filters, scenarios, sensors
+from jaxslam.charts import Euclidean
+from jaxslam.core.protocols import Filter
+from jaxslam.core.record import record
+from jaxslam.core.types import Scan, Status
 from jaxslam.filters.information import active_set, sparse_state, sparsification
+from jaxslam.filters.information.eif_slam import InPieces
 from jaxslam.filters.information.marginals import (
     blanket_cov,
     blanket_marginals,
+    local_information,
     recover_passive_means,
     whole_information,
 )
+from jaxslam.filters.reporting import nothing_of
 from jaxslam.run import run
 from jaxslam.simulation.scenarios import cloister
 from jaxslam.simulation.scenarios.view import BetweenRanges
+
+COUNT = 36
+"""landmarks of the cloister"""
+
+dense = jax.jit(lambda state: local_information(state, jnp.arange(state.alive.shape[0])))
+
+
+def canonical(state):
+    """Ω, ξ and μ of all."""
+    omega, state = np.array(dense(state)), jax.device_get(state)
+    mean = np.concatenate([state.pose, np.ravel(state.landmarks)])
+    residual = np.concatenate([state.pose_residual, np.ravel(state.landmark_residual)])
+    return omega, omega @ mean + residual, mean
+
+
+def at(slots, robot=True):
+    """Rows of robot and landmarks in Ω."""
+    rows = ([0, 1, 2] if robot else []) + [3 + 2 * s + k for s in slots for k in (0, 1)]
+    return np.array(rows, int)
+
+
+def picks(slots, robot=False):
+    """F, (D, n): the columns of the unit matrix of robot and landmarks."""
+    return np.eye(3 + 2 * COUNT)[:, at(slots, robot)]
+
+
+def h_of(pose, point, slot):
+    """(2, D) of range and bearing, and what is expected."""
+    dx, dy = point - pose[:2]
+    q = dx * dx + dy * dy
+    r = np.sqrt(q)
+    h = np.zeros((2, 3 + 2 * COUNT))
+    h[:, at([slot])] = [
+        [-dx / r, -dy / r, 0, dx / r, dy / r],
+        [dy / q, -dx / q, -1, -dy / q, dx / q],
+    ]
+    return h, np.array([r, np.arctan2(dy, dx) - pose[2]])
+
+
+def measured(omega, xi, mean, scan, i, noise):
+    """Ω and ξ after measurement i of a scan, the models at a mean; and its H."""
+    slot = int(scan.tag[i])
+    h, expected = h_of(mean[:3], mean[at([slot], robot=False)], slot)
+    nu = np.asarray(scan.z[i]) - expected
+    nu[1] = np.angle(np.exp(1j * nu[1]))
+    gain = h.T @ np.linalg.inv(noise)
+    return omega + gain @ h, xi + gain @ (nu + h @ mean), h
+
+
+def initialized(omega, xi, mean, slot, noise):
+    """Ω and ξ after a landmark is new at the mean: H and its noise say the same as g and its own."""
+    h, _ = h_of(mean[:3], mean[at([slot], robot=False)], slot)
+    more = h.T @ np.linalg.inv(noise) @ h
+    padding = picks([slot])
+    return omega + more - padding @ padding.T, xi + more @ mean
+
+
+def close(a, b, tolerance=1e-8):
+    """The same to a share of the largest entry."""
+    np.testing.assert_allclose(a, b, rtol=0, atol=tolerance * np.abs(b).max())
+
+
+def dtypes(tree):
+    return {str(leaf.dtype) for leaf in jax.tree.leaves(tree)}
+
 
 KEY = jax.random.key(0)
 P0 = np.diag([0.1, 0.1, 0.05]) ** 2
@@ -140,6 +211,7 @@ def test_every_step_is_the_dense_formula():
     assert float(state.counts.cut_nats) > 0
 
 
+@pytest.mark.sweep
 def test_mean_recovery_converges_to_the_whole_mean():
     state = driven(**FEW)
     residual = np.concatenate([state.pose_residual, np.ravel(state.landmark_residual)])
@@ -307,6 +379,7 @@ def test_lost_definiteness_is_refused_and_counted():
     assert np.all(status == Status.SINGULAR)
 
 
+@pytest.mark.sweep
 def test_float32_keeps_its_type_and_its_definiteness():
     scene, log = world()
     f, predict, update = made()
@@ -320,6 +393,7 @@ def test_float32_keeps_its_type_and_its_definiteness():
     np.testing.assert_allclose(state.pose, wide.pose, atol=1e-2)
 
 
+@pytest.mark.sweep
 def test_gradients_and_batches():
     """Of one step, which is that of one run alone."""
     row = list(rows(12))[-1]
@@ -336,23 +410,19 @@ def test_gradients_and_batches():
     np.testing.assert_allclose(several[0], driven(upto=12).pose.sum(), rtol=1e-8)
 
 
-@pytest.mark.parametrize(
-    ("changes", "message"),
-    [
-        ({"active": 0}, "active"),
-        ({"links": 0}, "links"),
-        ({"passive": 0}, "passive"),
-        ({"sweeps": 0}, "sweeps"),
-        ({"capacity": 0}, "capacity"),
-        ({"floor": -1.0}, "floor"),
-        ({"sensor": sensors.RangeBearingSignature(0.01 * np.eye(3))}, r"landmarks \(x, y\)"),
-    ],
+@refused(
+    ({"active": 0}, "active"),
+    ({"links": 0}, "links"),
+    ({"passive": 0}, "passive"),
+    ({"sweeps": 0}, "sweeps"),
+    ({"capacity": 0}, "capacity"),
+    ({"floor": -1.0}, "floor"),
+    ({"sensor": sensors.RangeBearingSignature(0.01 * np.eye(3))}, r"landmarks \(x, y\)"),
 )
-def test_refusals(changes, message):
+def test_refusals(changes):
     scene, _ = world()
     options = {"motion": scene.motion, "sensor": scene.sensor, "capacity": COUNT}
-    with pytest.raises(ValueError, match=message):
-        filters.Seif(**(options | {"active": 10, "links": 10} | changes))
+    filters.Seif(**(options | {"active": 10, "links": 10} | changes))
 
 
 def test_an_area_smaller_than_a_scan_is_refused():
@@ -362,3 +432,54 @@ def test_an_area_smaller_than_a_scan_is_refused():
         ValueError, match="expected active >= 8, the measurement slots of a scan, got 7"
     ):
         run(f, log, scene.pose, P0, KEY)
+
+
+# --- SEIF of the catalog is sparse wherever there is a map to speak of ----------------------------
+
+
+@pytest.mark.parametrize(("scenario", "active"), [("cloister", 18), ("circle", 10)])
+def test_fewer_landmarks_are_active_than_the_map_has(scenario, active):
+    world = scenarios.SCENARIOS[scenario](20)
+    count = len(world.landmarks)
+    filter = catalog.CANONICAL["seif"](world)
+    pose, cov = jnp.zeros(3), jnp.eye(3)
+    state = jax.eval_shape(filter.init, pose, cov)
+    assert state.active.shape == (active,) and active < count
+    places = world.places or count
+    scan = Scan(jnp.zeros((places, 2)), jnp.arange(places), jnp.ones(places, bool))
+    _, info = jax.eval_shape(filter.update, state, scan, jax.random.key(0))
+    assert info.status.shape == (places,) and info.innovation_cov.shape == (places, 2, 2)
+
+
+@record
+class Toy(Filter):
+    """A filter that adds up what it measures, three measurements at once."""
+
+    controls = ("a", "b", "c")
+    measurements = ("x [m]", "y [m]")
+    chart = Euclidean()
+
+    def init(self, pose, pose_cov):
+        return pose[0]
+
+    def predict(self, state, u, key):
+        return state
+
+    def update(self, state, scan, key):
+        assert scan.tag.shape == (3,)
+        info = nothing_of(scan)._replace(slot=scan.tag, log_likelihood=scan.z.sum())
+        return state + jnp.where(scan.valid, scan.z[:, 0], 0.0).sum(), info
+
+    def estimate(self, state):
+        return state
+
+
+def test_a_scan_in_pieces_loses_and_moves_nothing():
+    seen = InPieces(Toy(), 3)
+    tag = jnp.asarray([7, 3, 9, 1, 4, 8, 0])
+    scan = Scan(jnp.stack([tag, -tag], axis=1) * 1.0 + 1.0, tag, tag != 9)
+    state, info = jax.jit(seen.update)(jnp.zeros(()), scan, jax.random.key(0))
+    np.testing.assert_array_equal(info.slot, tag)
+    np.testing.assert_array_equal(info.status != 0, tag != 9)
+    assert state == np.asarray(tag)[np.asarray(tag) != 9].sum() + 6
+    assert info.log_likelihood == 14 and info.nis.shape == (7,) and info.exhausted.shape == ()

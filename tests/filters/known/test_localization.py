@@ -7,10 +7,11 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import refused, swept
 from worlds import draw, judged, nameless, narrow, ring
 
 from jaxslam import association, charts, linearize, run, sensors, simulate
-from jaxslam.core.types import Log, Status
+from jaxslam.core.types import Scan, Status
 from jaxslam.filters import DeadReckoning, EkfSlam, Localization, StartingAt
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.sensors import Part, Suite
@@ -24,6 +25,17 @@ GATE, NEW = chi2_quantile(0.999, 2), chi2_quantile(0.99999, 2)
 def world():
     scenario = replace(ring(40), pose=START, pose_cov=SPREAD)
     return scenario, draw(scenario, 3)
+
+
+def with_compass():
+    """The world whose robot has a compass as well, and its log."""
+    scenario, (truth, log) = world()
+    angles = truth.pose[:, 2] + 0.1 * np.random.default_rng(4).normal(size=scenario.steps)
+    z = np.stack([angles, 0 * angles], axis=1)[:, None]
+    row = Scan(z, np.full((len(z), 1), -1, np.int32), np.ones((len(z), 1), bool))
+    scan = Scan(*(np.concatenate(pair, axis=1) for pair in zip(log.scan, row, strict=True)))
+    sensor = Suite(((scenario.sensor, 6), Part(sensors.Compass(np.array([[0.01]])), 1)))
+    return replace(scenario, sensor=sensor), log._replace(scan=scan)
 
 
 def here(**options):
@@ -62,85 +74,27 @@ def slam_in_a_known_map(scenario, log, chart_name, options):
 
 
 @pytest.mark.parametrize(
-    ("chart", "options"),
+    ("chart", "options", "compass"),
     [
-        ("euclidean", {"iterations": 3, "covariance": "joseph", "gate": 4.0}),
-        ("right_invariant", {}),
-        ("left_invariant", {"correction": "joint"}),
+        ("euclidean", {"iterations": 3, "covariance": "joseph", "gate": 4.0}, False),
+        ("euclidean", {}, True),
+        pytest.param("right_invariant", {}, False, marks=pytest.mark.sweep),
+        pytest.param("left_invariant", {"correction": "joint"}, False, marks=pytest.mark.sweep),
     ],
 )
-def test_it_is_slam_in_a_map_without_error(chart, options):
-    scenario, (_, log) = world()
+def test_it_is_slam_in_a_map_without_error(chart, options, compass):
+    """With a compass beside the landmarks, too."""
+    scenario, log = with_compass() if compass else (world()[0], world()[1][1])
     expected = slam_in_a_known_map(scenario, log, chart, options)
-    trace = driven(here(chart=charts.REGISTRY[chart](), **options), log)
+    options = options | {"chart": charts.REGISTRY[chart]()}
+    filter = Localization(scenario.motion, scenario.sensor, scenario.landmarks, **options)
+    trace = driven(filter, log)
     np.testing.assert_allclose(trace.estimate.pose, expected.pose, atol=1e-9)
     np.testing.assert_allclose(trace.estimate.pose_cov, expected.pose_cov, rtol=1e-7, atol=1e-12)
+    assert not compass or (trace.info.status == Status.FUSED).all()
 
 
-def by_hand(scenario, log, angles):
-    """A plain EKF of the pose with a range and a bearing of each landmark, then a compass."""
-    x, p, out = START.copy(), SPREAD.copy(), []
-    q, points = np.diag([0.01, 0.01]) ** 2, np.asarray(scenario.landmarks)
-    mount = np.array([0.1, -0.05, 0.3])
-
-    def wrap(angle):
-        return np.pi - np.mod(np.pi - angle, 2 * np.pi)
-
-    def fuse(x, p, nu, h, r):
-        gain = p @ h.T @ np.linalg.inv(h @ p @ h.T + r)
-        x = x + gain @ nu
-        return np.array([*x[:2], wrap(x[2])]), p - gain @ h @ p
-
-    for t, (d, turn) in enumerate(np.asarray(log.control)):
-        c, s = np.cos(x[2]), np.sin(x[2])
-        f = np.array([[1, 0, -d * s], [0, 1, d * c], [0, 0, 1]])
-        w = np.array([[c, 0], [s, 0], [0, 1]])
-        x = np.array([x[0] + d * c, x[1] + d * s, wrap(x[2] + turn)])
-        p = f @ p @ f.T + w @ q @ w.T
-        for z, point in zip(np.asarray(log.scan.z[t])[: len(points)], points, strict=True):
-            c, s = np.cos(x[2]), np.sin(x[2])
-            lever = np.array([c * mount[0] - s * mount[1], s * mount[0] + c * mount[1]])
-            off = point - x[:2] - lever
-            r = np.hypot(*off)
-            nu = np.array([z[0] - r, wrap(z[1] - np.arctan2(off[1], off[0]) + x[2] + mount[2])])
-            by_lever = np.array([-off / r, np.array([off[1], -off[0]]) / r**2])
-            turned = by_lever @ np.array([-lever[1], lever[0]])
-            h = np.column_stack([by_lever, turned + [0, -1]])
-            x, p = fuse(x, p, nu, h, np.diag([0.05, 0.02]) ** 2)
-        if angles is not None:
-            nu = np.array([wrap(angles[t] - x[2])])
-            x, p = fuse(x, p, nu, np.array([[0.0, 0.0, 1.0]]), np.array([[0.01]]))
-        out.append((x, p))
-    return [np.array(part) for part in zip(*out, strict=True)]
-
-
-@pytest.mark.parametrize("with_compass", [False, True])
-def test_it_is_the_textbooks_filter_with_absolute_sensors_too(with_compass):
-    scenario, (truth, log) = world()
-    angles, sensor = None, scenario.sensor
-    if with_compass:
-        rng = np.random.default_rng(4)
-        angles = np.asarray(truth.pose[:, 2]) + 0.1 * rng.normal(size=scenario.steps)
-        sensor = Suite(((scenario.sensor, 6), Part(sensors.Compass(np.array([[0.01]])), 1)))
-        z, tag, valid = (np.asarray(part) for part in log.scan)
-        extra = np.stack([angles, 0 * angles], axis=1)[:, None]
-        log = Log(
-            log.control,
-            log.scan._replace(
-                z=np.concatenate([z, extra], axis=1),
-                tag=np.concatenate([tag, np.full((len(tag), 1), -1, tag.dtype)], axis=1),
-                valid=np.concatenate([valid, np.ones((len(tag), 1), bool)], axis=1),
-            ),
-        )
-    poses, covs = by_hand(scenario, log, angles)
-    filter = Localization(scenario.motion, sensor, scenario.landmarks)
-    trace = driven(filter, jax.tree.map(jnp.asarray, log))
-    np.testing.assert_allclose(trace.estimate.pose, poses, atol=1e-9)
-    np.testing.assert_allclose(trace.estimate.pose_cov, covs, rtol=1e-7, atol=1e-12)
-    assert (trace.info.status == Status.FUSED).all()
-
-
-@pytest.mark.parametrize("method", ["nearest", "joint"])
+@pytest.mark.parametrize("method", swept(["nearest", "joint"], "nearest"))
 def test_it_finds_its_landmarks_without_tags(method):
     scenario, (_, log) = world()
     make = {"nearest": association.Nearest, "joint": association.JointCompatibility}[method]
@@ -171,6 +125,7 @@ def test_sigma_points_are_close_to_jacobians():
     assert not np.array_equal(sigma.estimate.pose, plain.estimate.pose)
 
 
+@pytest.mark.sweep
 def test_it_is_honest_and_dead_reckoning_is_what_it_says():
     """The pose NEES of 200 runs in its interval, with a start that is not known either."""
     scenario, _ = world()
@@ -216,22 +171,16 @@ def test_gradient_and_float32():
     np.testing.assert_allclose(trace.estimate.pose, driven(here(), log).estimate.pose, atol=1e-3)
 
 
-BAD = {
-    "shape": ({"landmarks": np.zeros((3, 3))}, r"landmarks of shape \(at least 1, 2\)"),
-    "none": ({"landmarks": np.zeros((0, 2))}, "at least 1"),
-    "nan": ({"landmarks": np.full((2, 2), np.nan)}, "not finite"),
-    "tags": ({"tags": [0, 0, 1, 2, 3, 4]}, "different tags"),
-    "negative tag": ({"tags": [-1, 0, 1, 2, 3, 4]}, "different tags"),
-    "linearizer": ({"linearize": linearize.FirstEstimate()}, "is for estimated maps"),
-    "iterated": ({"linearize": linearize.Unscented(), "iterations": 2}, "does not iterate"),
-    "correction": ({"correction": "whole"}, "sequential"),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_refusals(case):
-    options, message = BAD[case]
+@refused(
+    ({"landmarks": np.zeros((3, 3))}, r"landmarks of shape \(at least 1, 2\)"),
+    ({"landmarks": np.zeros((0, 2))}, "at least 1"),
+    ({"landmarks": np.full((2, 2), np.nan)}, "not finite"),
+    ({"tags": [0, 0, 1, 2, 3, 4]}, "different tags"),
+    ({"tags": [-1, 0, 1, 2, 3, 4]}, "different tags"),
+    ({"linearize": linearize.FirstEstimate()}, "is for estimated maps"),
+    ({"linearize": linearize.Unscented(), "iterations": 2}, "does not iterate"),
+    ({"correction": "whole"}, "sequential"),
+)
+def test_refusals(options):
     scenario, _ = world()
-    options = {"landmarks": scenario.landmarks} | options
-    with pytest.raises(ValueError, match=message):
-        Localization(scenario.motion, scenario.sensor, options.pop("landmarks"), **options)
+    Localization(scenario.motion, scenario.sensor, **({"landmarks": scenario.landmarks} | options))

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import refused, swept
 from own_models import changed
 from worlds import draw, nameless, ring
 
@@ -31,7 +32,7 @@ def on_poses(filter, truth, log):
     return jax.device_get(run(filter, log._replace(control=truth.pose), *start))
 
 
-@pytest.mark.parametrize("options", [{}, {"gate": 4.0, "births": 1}])
+@pytest.mark.parametrize("options", swept([{}, {"gate": 4.0, "births": 1}], {}))
 def test_it_is_slam_of_a_robot_that_knows_where_it_is(options):
     scenario, truth, log = world()
     capacity = 8
@@ -47,6 +48,7 @@ def test_it_is_slam_of_a_robot_that_knows_where_it_is(options):
     np.testing.assert_array_equal(trace.estimate.pose_cov, 0)
 
 
+@pytest.mark.sweep
 def test_it_is_honest():
     """NEES of the landmarks over 200 worlds in the chi-square band of so many."""
     scenario, _, _ = world()
@@ -90,6 +92,7 @@ def test_a_prior_for_slam():
     assert np.trace(after.cov) < np.trace(joint.cov)
 
 
+@pytest.mark.sweep
 def test_without_tags():
     scenario, truth, log = world()
     method = association.JointCompatibility(0.999, chi2_quantile(0.99999, 2))
@@ -106,27 +109,25 @@ def test_a_full_map_refuses():
     assert trace.final.lost == 40 * 5
 
 
-def test_refusals():
-    sensor = ring(3).sensor
-    for options, message in (({"capacity": 0}, "capacity"), ({"gate": 0.0}, "gate above 0")):
-        with pytest.raises(ValueError, match=f"Mapping: .*{message}"):
-            Mapping(sensor, **({"capacity": 3} | options))
-    with pytest.raises(ValueError, match="absolute"):
-        Mapping(sensors.Compass(np.eye(1)), 3)
-    final = jax.eval_shape(Mapping(sensor, 2).init, np.zeros(3), np.eye(3))
+FINAL = Mapping(ring(3).sensor, 2)
 
-    def prior(slam, pose):
-        return jax.eval_shape(lambda final: as_prior(final, slam, pose, np.eye(3)), final)
 
-    assert prior(EkfSlam(ring(3).motion, sensor, 2), np.zeros(3)).cov.shape == (7, 7)
-    with pytest.raises(ValueError, match=r"pose \(3,\)"):
-        prior(EkfSlam(ring(3).motion, sensor, 2), np.zeros(2))
-    for options, message in (
-        ({"capacity": 3}, "a filter of 2 landmarks"),
-        ({"chart": charts.RightInvariant()}, "Euclidean"),
-        ({"covariance": "square_root"}, "covariance"),
-        ({"linearize": linearize.FirstEstimate()}, "Jacobians"),
-    ):
-        other = EkfSlam(ring(3).motion, sensor, **({"capacity": 2} | options))
-        with pytest.raises(ValueError, match=message):
-            prior(other, np.zeros(3))
+def prior(pose=(0.0, 0.0, 0.0), **options):
+    slam = EkfSlam(ring(3).motion, ring(3).sensor, **({"capacity": 2} | options))
+    final = jax.eval_shape(FINAL.init, np.zeros(3), np.eye(3))
+    return jax.eval_shape(lambda final: as_prior(final, slam, np.array(pose), np.eye(3)), final)
+
+
+@refused(
+    (lambda: Mapping(ring(3).sensor, 0), "Mapping: .*capacity"),
+    (lambda: Mapping(ring(3).sensor, 3, gate=0.0), "Mapping: .*gate above 0"),
+    (lambda: Mapping(sensors.Compass(np.eye(1)), 3), "absolute"),
+    (lambda: prior((0.0, 0.0)), r"pose \(3,\)"),
+    (lambda: prior(capacity=3), "a filter of 2 landmarks"),
+    (lambda: prior(chart=charts.RightInvariant()), "Euclidean"),
+    (lambda: prior(covariance="square_root"), "covariance"),
+    (lambda: prior(linearize=linearize.FirstEstimate()), "Jacobians"),
+)
+def test_refusals(make):
+    assert prior().cov.shape == (7, 7)
+    make()

@@ -1,5 +1,6 @@
 """Merging two landmarks that are one: the joint test, the constraint, and what it equals."""
 
+import itertools
 from functools import cache
 
 import chex
@@ -7,13 +8,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import refused, swept
 
 from jaxslam import charts, motion, run, sensors, slots
 from jaxslam.core.record import record
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Log, Scan
 from jaxslam.filters import EkfSlam
+from jaxslam.filters.map_management.closing import Closing
 from jaxslam.filters.map_management.merging import Merging, closest_pair, merge_landmarks
+from jaxslam.life import Existence, Recency
 
 EUCLIDEAN = charts.Euclidean()
 MOTION = motion.PoseIncrement(np.diag([0.1, 0.1, 0.05]) ** 2)
@@ -54,7 +58,9 @@ def test_the_constraint_is_a_conditional_gaussian():
     np.testing.assert_array_equal(merged.cov[9:11], np.eye(2, 11, 9))
 
 
-@pytest.mark.parametrize("chart", ["euclidean", "right_invariant", "left_invariant"])
+@pytest.mark.parametrize(
+    "chart", swept(["euclidean", "right_invariant", "left_invariant"], "right_invariant")
+)
 def test_the_pair_is_found_by_its_own_covariance(chart):
     """d² of every pair by dense algebra in coordinates."""
     chart = charts.REGISTRY[chart]()
@@ -78,12 +84,6 @@ def test_the_pair_is_found_by_its_own_covariance(chart):
     np.testing.assert_allclose(distance, best[0])
 
 
-def test_refusals():
-    for reach, allowed, message in ((-1.0, None, "reach"), (1.0, jnp.asarray(True), "allowed")):
-        with pytest.raises(ValueError, match=message):
-            closest_pair(some_joint(), EUCLIDEAN, reach, allowed)
-
-
 def test_no_pair_within_reach():
     joint = some_joint()
     assert np.isinf(CLOSEST(joint, EUCLIDEAN, 1e-6)[2])
@@ -95,7 +95,7 @@ def test_no_pair_within_reach():
     chex.assert_trees_all_equal(same, joint)
 
 
-@pytest.mark.parametrize("chart", ["euclidean", "right_invariant"])
+@pytest.mark.parametrize("chart", swept(["euclidean", "right_invariant"], "euclidean"))
 def test_two_sightings_merged_are_one_landmark_seen_twice(chart):
     """With a linear sensor and no turn, starting anew and merging is the same as matching."""
     chart = charts.REGISTRY[chart]()
@@ -168,7 +168,7 @@ def pairs_in(trace):
 
 @pytest.mark.parametrize(
     "options",
-    [{}, {"chart": "right_invariant"}, {"covariance": "square_root"}],
+    swept([{}, {"chart": "right_invariant"}, {"covariance": "square_root"}], {}),
 )
 def test_a_filter_merges_what_it_holds_twice(options):
     log = seen_twice()
@@ -223,6 +223,7 @@ def test_far_landmarks_and_none_are_left_alone():
     assert np.isfinite(trace.final.cov).all()
 
 
+@pytest.mark.sweep
 def test_merging_in_float32_and_its_gradient():
     log = seen_twice(dtype=np.float32)
     _, go = driver(dtype=np.float32)
@@ -237,20 +238,27 @@ def test_merging_in_float32_and_its_gradient():
     assert np.isfinite(along).all()
 
 
-def test_refusals_of_merging():
-    plain = EkfSlam(MOTION, SENSOR, 3)
-    for bad in ({"reach": 0.0}, {"reach": 1.0, "probability": 1.0}):
-        with pytest.raises(ValueError, match=r"^Merging: expected"):
-            Merging(plain, **bad)
-    rays = sensors.BearingInverseDepth(np.eye(1))
-    for sensor in (rays, sensors.Compass(np.eye(1))):
-        with pytest.raises(ValueError, match="cannot be merged"):
-            Merging(EkfSlam(MOTION, sensor, 3), 0.5)
-    other = Poses(MOTION, SENSOR, 3)
-    with pytest.raises(
-        ValueError, match=r"^Merging: expected a filter whose state is a slots.Joint"
-    ):
-        Merging(other, 0.5).init(np.zeros(3), np.eye(3))
+@refused(
+    (lambda: Merging(PLAIN, 0.0), "^Merging: expected"),
+    (lambda: Merging(PLAIN, 1.0, probability=1.0), "^Merging: expected"),
+    (lambda: Merging(of_sensor(sensors.BearingInverseDepth(np.eye(1))), 0.5), "cannot be merged"),
+    (lambda: Merging(of_sensor(sensors.Compass(np.eye(1))), 0.5), "cannot be merged"),
+    (
+        lambda: Merging(Poses(MOTION, SENSOR, 3), 0.5).init(np.zeros(3), np.eye(3)),
+        "^Merging: expected a filter whose state is a slots.Joint",
+    ),
+    (lambda: closest_pair(some_joint(), EUCLIDEAN, -1.0), "reach"),
+    (lambda: closest_pair(some_joint(), EUCLIDEAN, 1.0, jnp.asarray(True)), "allowed"),
+)
+def test_refusals(make):
+    make()
+
+
+def of_sensor(sensor):
+    return EkfSlam(MOTION, sensor, 3)
+
+
+PLAIN = of_sensor(SENSOR)
 
 
 def test_landmarks_that_differ_stay_two():
@@ -283,3 +291,51 @@ class Poses(EkfSlam):
 
     def init(self, pose, pose_cov):
         return pose
+
+
+# --- Map managers around one filter, in any order -------------------------------------------------
+
+
+MANAGERS = {
+    "merging": lambda filter: Merging(filter, 0.5),
+    "closing": lambda filter: Closing(filter, reach=1.0),
+}
+ORDERS = [
+    (life, order)
+    for life in (None, Recency())
+    for count in range(3)
+    for order in itertools.permutations(MANAGERS, count)
+    if life is not None or "closing" not in order
+]
+MODELS = motion.PoseIncrement(np.eye(3)), sensors.RelativePosition(np.eye(2))
+
+
+@pytest.mark.parametrize(("life", "order"), swept(ORDERS, ORDERS[-1]))
+def test_managers_compose_in_any_order(life, order):
+    """Each keeps the state's structure, reports under its own name, and leaves the rest alone."""
+    plain = filter = EkfSlam(*MODELS, 4, chart=charts.RightInvariant(), life=life)
+    for name in order:
+        filter = MANAGERS[name](filter)
+    assert filter.name == " ".join((*order[::-1], "ekf_slam"))
+    assert (filter.chart, filter.landmark) == (plain.chart, plain.landmark)
+    state = filter.init(np.zeros(3), np.eye(3))
+    assert (state.life is not None) == (life is not None)
+    assert (state.co_observed is not None) == ("merging" in order)
+    scan = Scan(np.zeros((2, 2)), np.full(2, -1), np.ones(2, bool))
+    after, info = jax.eval_shape(filter.update, state, scan, jax.random.key(0))
+    chex.assert_trees_all_equal_shapes_and_dtypes(after, state)
+    assert set(info.extra or {}) == set(order) | ({"pruning"} if life is not None else set())
+
+
+def test_closing_takes_times():
+    for life in (None, Existence(lambda pose, landmark: True)):
+        with pytest.raises(ValueError, match=r"^Closing: expected a filter that keeps times"):
+            Closing(EkfSlam(*MODELS, 4, life=life)).init(np.zeros(3), np.eye(3))
+
+
+@pytest.mark.parametrize("name", MANAGERS)
+def test_a_class_is_no_filter(name):
+    with pytest.raises(
+        ValueError, match=rf"^{name.title()}: expected a filter, got the class EkfSlam: call it"
+    ):
+        MANAGERS[name](EkfSlam)

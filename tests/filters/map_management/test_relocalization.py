@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import refused, swept
+from reference import plane
 
 from jaxslam import charts, motion, se2, sensors
 from jaxslam.core.slots import Joint
@@ -48,8 +50,7 @@ def world(seed, count, reach=10.0, spread=0.05):
 
 def seen_from(rng, pose, points, noise=0.05):
     """A scan's points in the robot's frame with independent noise."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    exact = (points - np.asarray(pose)[:2]) @ np.array([[c, -s], [s, c]])
+    exact = plane.to_frame(pose, points)
     covs = np.tile(noise**2 * np.eye(2), (len(points), 1, 1))
     return exact + noise * rng.normal(size=exact.shape), covs
 
@@ -95,9 +96,8 @@ def test_without_noise_the_pose_is_exact(seed):
 def generalized_least_squares(seen, covs, points, cov, start):
     """min rᵀ Σ⁻¹ r over the pose, to first order about a start, with dense algebra."""
     pose, n = np.array(start), len(seen)
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    turn = np.array([[c, -s], [s, c]])
-    r = (seen @ turn.T + pose[:2] - points).ravel()
+    turn = plane.turn(pose[2])
+    r = (plane.from_frame(pose, seen) - points).ravel()
     lever = points - pose[:2]
     slope = np.zeros((2 * n, 3))
     slope[0::2, 0] = slope[1::2, 1] = 1
@@ -122,26 +122,14 @@ def exhaustive(points, cov, seen, covs, probability=0.99):
             continue
         z, m = seen[choice >= 0], points[pick]
         start = np.asarray(ALIGN(z, m))
-        if (
-            np.abs(
-                z
-                @ np.array(
-                    [[np.cos(start[2]), np.sin(start[2])], [-np.sin(start[2]), np.cos(start[2])]]
-                )
-                + start[:2]
-                - m
-            ).max()
-            > 3
-        ):
+        if np.abs(plane.from_frame(start, z) - m).max() > 3:
             continue
         at = (2 * pick[:, None] + np.arange(2)).ravel()
         pose, distance = generalized_least_squares(
             z, covs[choice >= 0], m, cov[np.ix_(at, at)], start
         )
-        if distance <= chi2_quantile(probability, 2 * n - 3) and (-n, distance) < (
-            -best[0],
-            best[1],
-        ):
+        better = (-n, distance) < (-best[0], best[1])
+        if better and distance <= chi2_quantile(probability, 2 * n - 3):
             best = (n, distance, choice, pose)
     return best
 
@@ -161,6 +149,7 @@ def test_exhaustive_search_finds_no_better(seed):
     np.testing.assert_allclose(found.pose, pose, atol=1e-2)
 
 
+@pytest.mark.sweep
 @pytest.mark.usefixtures("full_optimization")
 def test_clutter_is_left_alone_and_the_right_place_found_at_full_size():
     """200 landmarks, 6 of a scan's 9 measurements of them: never sure of a wrong place."""
@@ -212,6 +201,7 @@ def test_too_few_points_and_nothing_that_agrees():
     np.testing.assert_array_equal(far.slot, -1)
 
 
+@pytest.mark.sweep
 def test_dead_landmarks_are_not_matched_and_vmap_is_a_loop():
     rng, points, cov = world(2, 12)
     seen, covs = seen_from(rng, [1.0, 2.0, 0.5], points[:6])
@@ -226,6 +216,7 @@ def test_dead_landmarks_are_not_matched_and_vmap_is_a_loop():
     np.testing.assert_allclose(many.pose[1], found.pose, atol=1e-9)
 
 
+@pytest.mark.sweep
 def test_float32():
     rng, points, cov = world(3, 40, reach=40.0)
     of = np.argsort(((points - points[0]) ** 2).sum(axis=1))[:7]
@@ -249,10 +240,6 @@ def test_a_scan_as_points():
         slope = np.array([[np.cos(phi), -r * np.sin(phi)], [np.sin(phi), r * np.cos(phi)]])
         np.testing.assert_allclose(covs[i], slope @ SENSOR.noise_cov(z[i]) @ slope.T, atol=1e-12)
     np.testing.assert_array_equal(points[2], 0.0)
-    with pytest.raises(
-        ValueError, match="expected a sensor that measures points, got bearing_only"
-    ):
-        seen_points(sensors.BearingOnly(0.1 * np.eye(1)), scan)
 
 
 def some_joint(seed=0, count=6):
@@ -272,8 +259,10 @@ def some_joint(seed=0, count=6):
     return Joint(*parts, ())
 
 
-@pytest.mark.parametrize("name", ["euclidean", "right_invariant", "left_invariant"])
-@pytest.mark.parametrize("square_root", [False, True])
+@pytest.mark.parametrize(
+    "name", swept(["euclidean", "right_invariant", "left_invariant"], "right_invariant")
+)
+@pytest.mark.parametrize("square_root", swept([False, True], True))
 def test_lost_forgets_the_pose_and_nothing_else(name, square_root):
     chart = charts.REGISTRY[name]()
     joint = some_joint()
@@ -300,7 +289,7 @@ def test_lost_forgets_the_pose_and_nothing_else(name, square_root):
     np.testing.assert_allclose(whole[:3, 3:], 0, atol=1e-9)
 
 
-@pytest.mark.parametrize("name", ["euclidean", "right_invariant"])
+@pytest.mark.parametrize("name", swept(["euclidean", "right_invariant"], "euclidean"))
 def test_relocated_is_the_limit_of_an_update_from_a_large_covariance(name):
     chart = charts.REGISTRY[name]()
     sensor = sensors.RelativePosition(0.1**2 * np.eye(2))
@@ -422,33 +411,40 @@ def test_a_kidnapped_robot_finds_itself_and_goes_on():
     assert np.hypot(*error[:2]) < 0.5
 
 
-def test_refusals():
-    rng, points, cov = world(0, 5)
+def relocalized(cov=slice(None), **options):
+    rng, points, whole = world(0, 5)
     seen, covs = seen_from(rng, [0.0, 0.0, 0.0], points)
     yes = np.ones(5, bool)
-    for change, message in (
-        ({"least": 2}, "least"),
-        ({"margin": 0}, "margin"),
-        ({"probability": 1.0}, "probability"),
-        ({"pairs": 0}, "pairs"),
-        ({"candidates": 0}, "candidates"),
-    ):
-        with pytest.raises(ValueError, match=message):
-            relocalize(points, cov, yes, seen, covs, yes, **change)
-    with pytest.raises(ValueError, match="shape"):
-        relocalize(points, cov[:4], yes, seen, covs, yes)
-    joint = some_joint()
-    with pytest.raises(ValueError, match="covariance"):
-        lost(joint, charts.Euclidean(), -np.eye(3))
-    with pytest.raises(ValueError, match="keeps former estimates"):
-        lost(
-            joint._replace(lin=FirstEstimate().init(joint.pose, joint.landmarks)),
-            charts.Euclidean(),
-            np.eye(3),
-        )
-    with pytest.raises(ValueError, match="landmarks"):
-        points_of_map(joint._replace(landmarks=jnp.zeros((4, 3))), charts.Euclidean())
-    with pytest.raises(ValueError, match="scans"):
-        relocated(
-            joint, charts.Euclidean(), jnp.array([0, 1]), jnp.zeros((3, 2)), jnp.zeros((3, 2, 2))
-        )
+    relocalize(points, whole[cov], yes, seen, covs, yes, **options)
+
+
+def former(joint):
+    return joint._replace(lin=FirstEstimate().init(joint.pose, joint.landmarks))
+
+
+@refused(
+    (lambda: relocalized(least=2), "least"),
+    (lambda: relocalized(margin=0), "margin"),
+    (lambda: relocalized(probability=1.0), "probability"),
+    (lambda: relocalized(pairs=0), "pairs"),
+    (lambda: relocalized(candidates=0), "candidates"),
+    (lambda: relocalized(slice(4)), "shape"),
+    (lambda: lost(some_joint(), charts.Euclidean(), -np.eye(3)), "covariance"),
+    (lambda: lost(former(some_joint()), charts.Euclidean(), np.eye(3)), "keeps former estimates"),
+    (
+        lambda: MAP_OF(some_joint()._replace(landmarks=np.zeros((4, 3))), charts.Euclidean()),
+        "landm",
+    ),
+    (
+        lambda: RELOCATED(
+            some_joint(), charts.Euclidean(), np.arange(2), np.zeros((3, 2)), np.zeros((3, 2, 2))
+        ),
+        "scans",
+    ),
+    (
+        lambda: seen_points(sensors.BearingOnly(0.1 * np.eye(1)), None),
+        "expected a sensor that measures points, got bearing_only",
+    ),
+)
+def test_refusals(call):
+    call()

@@ -8,6 +8,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import refused, swept
+from reference.plane import to_frame
 from reference.team import Team
 from worlds import draw, judged, narrow, nees, ring
 
@@ -131,7 +133,8 @@ def started(count):
 
 
 @pytest.mark.parametrize(
-    ("count", "way"), [(2, "known"), (2, "landmarks"), (2, "mutual"), (3, "mutual")]
+    ("count", "way"),
+    swept([(2, "known"), (2, "landmarks"), (2, "mutual"), (3, "mutual")], (2, "mutual")),
 )
 def test_a_team_is_its_plain_reference(count, way):
     """Means, covariances and cross-covariances of everything, step by step, to 1e-9."""
@@ -173,6 +176,7 @@ def test_a_team_is_its_plain_reference(count, way):
     assert plain.entered == [way] * (count - 1) * (way != "known")
 
 
+@pytest.mark.sweep
 def test_padding_stays_inert():
     """Eight landmarks in a table of twelve."""
     scenario, log_of = started(3)
@@ -190,6 +194,7 @@ def relabelled(log, first, to):
     return log._replace(scan=log.scan._replace(tag=np.where(tag >= first, tag - first + to, tag)))
 
 
+@pytest.mark.sweep
 def test_sightings_of_each_other_help():
     """Without landmarks a sighting is all that ties the robots; all covariances shrink."""
     scenario, log_of = drawn(2)
@@ -236,18 +241,14 @@ def test_nothing_of_an_absent_robot_is_lost():
 def test_a_way_in_is_exact_without_noise(way):
     a, b = np.array([1.0, 2.0, 0.7]), np.array([-1.0, 3.0, -2.5])
 
-    def to(pose, point):
-        c, s = np.cos(pose[2]), np.sin(pose[2])
-        return np.array([[c, s], [-s, c]]) @ (point - pose[:2])
-
     cov = np.eye(2) * 1e-4
     if way == "mutual":
         found = jax.jit(pose_initialization.by_mutual_sight)(
-            a, np.eye(3, 9), np.eye(3), (to(a, b[:2]), cov), (to(b, a[:2]), cov)
+            a, np.eye(3, 9), np.eye(3), (to_frame(a, b[:2]), cov), (to_frame(b, a[:2]), cov)
         )
     else:
         points = np.array([[0.0, 0.5], [3.0, -1.0]])
-        seen = np.stack([to(b, point) for point in points])
+        seen = to_frame(b, points)
         found = jax.jit(pose_initialization.by_two_landmarks)(
             points, np.eye(4, 9), np.eye(4), seen, np.stack([cov, cov])
         )
@@ -293,6 +294,7 @@ def many():
     return jax.jit(jax.vmap(go))
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize(("report", "first"), [(0, 0), (1, 10)])
 def test_every_robot_is_honest(report, first):
     """The pose NEES of each of two robots over 100 runs, started from unknown places.
@@ -316,6 +318,7 @@ def nees_at_worst(truth, estimate):
     return np.nanmax(nees(off[..., :2], np.asarray(estimate.pose_cov)[..., :2, :2]))
 
 
+@pytest.mark.sweep
 def test_a_team_in_a_campaign():
     """With the cheapest of filters: campaigns draw, bound and score worlds of teams."""
     scenario = hundred(1, 10)[1]
@@ -325,6 +328,7 @@ def test_a_team_in_a_campaign():
     assert campaign.filters["still"].counts["runs"] == 2
 
 
+@pytest.mark.sweep
 def test_a_world_is_the_same_whatever_is_reported():
     robots = crew(3)
     scenarios = [world(robots, 5, report=b) for b in (0, 2)]
@@ -349,6 +353,7 @@ def driven_by(theta, log):
     return jaxslam.run(filter, log, np.zeros(3), NOTHING, jax.random.key(0))
 
 
+@pytest.mark.sweep
 def test_gradients_are_finite_and_float32_is_near():
     """Through births, corrections and the way in by two landmarks."""
     eyes = sensors.RangeBearing(R1, mount=MOUNT)
@@ -380,34 +385,30 @@ def signs():
     return team.Robot(motion.Increment(Q), Suite(((sensor, 1),)))
 
 
-@pytest.mark.parametrize(
-    ("make", "message"),
-    [
-        (lambda: TeamSlam([], 3), "at least one robot"),
-        (lambda: TeamSlam([ring()], 3), "expected a team.Robot"),
-        (lambda: TeamSlam(crew(2)[::-1], 3), "expected no start of robot 0"),
-        (lambda: TeamSlam(crew(2), 3, tags=(7, 7)), "2 different tags"),
-        (lambda: TeamSlam(crew(2), 3, tags=(7,)), "2 different tags"),
-        (lambda: TeamSlam(crew(2), 3, tags=(7, -1)), "integers >= 0"),
-        (lambda: TeamSlam(crew(2), 0), "capacity"),
-        (lambda: TeamSlam(crew(2), 3, report=2), "expected report from 0 to"),
-        (lambda: TeamSlam(crew(2), 3, gate=0.0), "gate above 0"),
-        (lambda: TeamSlam(crew(2), 3, correction="at once"), "expected correction"),
-        (lambda: TeamSlam([signs()], 3), "expected landmarks \\(x, y\\)"),
-        (lambda: TeamSlam([crew(1)[0], compass_only()], 3), "robot 1 needs a start"),
-        (
-            lambda: team.Robot(motion.Increment(Q), ring().sensor),
-            "a motion and a Suite, got Increment and RangeBearing",
-        ),
-        (lambda: dataclasses.replace(crew(1)[0], start=((0, 0), NOTHING)), "shape"),
-        (lambda: world(crew(2), tags=(3, 9)), "expected tags of robots from"),
-        (lambda: world(unknown(crew(2))), "expected a start of every robot"),
-        (lambda: world(crew(2), report=2), "expected report from 0 to"),
-    ],
+@refused(
+    (lambda: TeamSlam([], 3), "at least one robot"),
+    (lambda: TeamSlam([ring()], 3), "expected a team.Robot"),
+    (lambda: TeamSlam(crew(2)[::-1], 3), "expected no start of robot 0"),
+    (lambda: TeamSlam(crew(2), 3, tags=(7, 7)), "2 different tags"),
+    (lambda: TeamSlam(crew(2), 3, tags=(7,)), "2 different tags"),
+    (lambda: TeamSlam(crew(2), 3, tags=(7, -1)), "integers >= 0"),
+    (lambda: TeamSlam(crew(2), 0), "capacity"),
+    (lambda: TeamSlam(crew(2), 3, report=2), "expected report from 0 to"),
+    (lambda: TeamSlam(crew(2), 3, gate=0.0), "gate above 0"),
+    (lambda: TeamSlam(crew(2), 3, correction="at once"), "expected correction"),
+    (lambda: TeamSlam([signs()], 3), "expected landmarks \\(x, y\\)"),
+    (lambda: TeamSlam([crew(1)[0], compass_only()], 3), "robot 1 needs a start"),
+    (
+        lambda: team.Robot(motion.Increment(Q), ring().sensor),
+        "a motion and a Suite, got Increment and RangeBearing",
+    ),
+    (lambda: dataclasses.replace(crew(1)[0], start=((0, 0), NOTHING)), "shape"),
+    (lambda: world(crew(2), tags=(3, 9)), "expected tags of robots from"),
+    (lambda: world(unknown(crew(2))), "expected a start of every robot"),
+    (lambda: world(crew(2), report=2), "expected report from 0 to"),
 )
-def test_bad_input(make, message):
-    with pytest.raises(ValueError, match=message):
-        make()
+def test_bad_input(make):
+    make()
 
 
 def test_a_scan_with_other_places_is_refused():

@@ -10,7 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
+from cases import refused, swept
 from own_models import changed
+from reference.plane import from_frame
 
 from jaxslam import association, motion, resampling, run, sensors
 from jaxslam.core.types import Scan, Status
@@ -72,8 +74,7 @@ def test_many_particles_are_the_posterior_of_the_ekf():
 
 def by_hand(pose, scan, gate=math.inf, edge=9.21034037197618):
     """Σ of what counts of d² for one pose: range and bearing to the landmarks of their tags."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    eye = pose[:2] + np.array([[c, -s], [s, c]]) @ MOUNT[:2]
+    eye = from_frame(pose, MOUNT[:2])
     total = 0.0
     for (r, b), tag, there in zip(*map(np.asarray, scan), strict=True):
         if not there:
@@ -113,7 +114,7 @@ def assert_weighs(after, info, off):
     np.testing.assert_allclose(info.extra["particles"].ess, w.sum() ** 2 / (w**2).sum(), rtol=1e-9)
 
 
-@pytest.mark.parametrize("gate", [math.inf, 16.0])
+@pytest.mark.parametrize("gate", swept([math.inf, 16.0], 16.0))
 def test_weights_are_the_scans_densities(gate):
     scan = jax.tree.map(np.array, one_scan())
     scan.tag[2], scan.valid[5] = -1, False
@@ -134,6 +135,7 @@ def test_weights_are_the_scans_densities(gate):
     np.testing.assert_allclose(after.slow, after.fast)
 
 
+@pytest.mark.sweep
 def test_landmarks_far_apart_are_known_without_tags_by_each_particle():
     truth, log = history(8)
     likeliest = association.MaximumLikelihood(1e6)
@@ -144,6 +146,7 @@ def test_landmarks_far_apart_are_known_without_tags_by_each_particle():
     assert np.linalg.norm(trace.estimate.pose[-1, :2] - truth.pose[-1, :2]) < 0.3
 
 
+@pytest.mark.sweep
 def test_absolute_sensors_of_a_suite_weigh_too():
     eyes = Suite(((BLUNT, 6), Part(sensors.Compass(np.array([[0.04]])), 1)))
     scan, filter = one_scan(), of(20, eyes)
@@ -213,6 +216,7 @@ def test_the_number_of_particles_follows_the_uncertainty(carried):
     assert np.isfinite(poses).all()
 
 
+@pytest.mark.sweep
 def test_what_is_not_in_use_is_inert():
     _, log = history(2)
     filter = of(40, BLUNT, threshold=0.0)
@@ -247,7 +251,7 @@ def breaking(level):
     return changed(WORLD.motion, step=step)
 
 
-@pytest.mark.parametrize("kind", ["localization", "fastslam"])
+@pytest.mark.parametrize("kind", swept(["localization", "fastslam"], "localization"))
 def test_poses_that_are_not_finite_weigh_nothing_and_are_counted(kind):
     _, log = history(3)
 
@@ -284,7 +288,7 @@ def test_where_all_weights_underflow_the_filter_goes_on_and_counts():
     chex.assert_tree_all_finite((info, jax.jit(filter.estimate)(after)))
 
 
-@pytest.mark.parametrize("count", [1, 7])
+@pytest.mark.parametrize("count", swept([1, 7], 7))
 def test_without_any_noise_or_with_one_particle_it_is_dead_reckoning(count):
     """A proposal without spread, from a start without any: all particles are one."""
     _, log = history(5)
@@ -316,6 +320,7 @@ def test_the_start_is_reported_before_anything_is_drawn():
     np.testing.assert_allclose(np.cov(draws.T), out.pose_cov, atol=0.15)
 
 
+@pytest.mark.sweep
 def test_runs_of_a_batch_know_nothing_of_each_other_and_float32_stays_float32():
     _, log = history(4)
     filter = of(30, BLUNT, box=BOX)
@@ -330,6 +335,7 @@ def test_runs_of_a_batch_know_nothing_of_each_other_and_float32_stays_float32():
         assert leaf.dtype != np.float64
 
 
+@pytest.mark.sweep
 def test_gradients_are_finite_from_a_start_that_is_known_exactly():
     _, log = history(3)
 
@@ -345,33 +351,22 @@ def test_gradients_are_finite_from_a_start_that_is_known_exactly():
     assert np.all(slope != 0)
 
 
-BAD = {
-    "none": ({"particles": 0}, "particles: expected an integer"),
-    "half": ({"particles": 2.5}, "particles: expected an integer"),
-    "least": ({"least": 0}, "least: expected an integer"),
-    "more": ({"least": 6}, "least <= particles = 5"),
-    "map": ({"landmarks": np.zeros((3, 3))}, "ParticleLocalization: expected landmarks of shape"),
-    "tags": ({"tags": [0, 0, 1, 2, 3, 4]}, "different tags"),
-    "start": ({"start": "anywhere"}, 'start "gaussian" or "uniform"'),
-    "no box": ({"start": "uniform"}, "expected a box"),
-    "box": ({"box": [[0, 0, 0], [1, 1, 1]]}, r"a box of shape \(2, 2\)"),
-    "inside out": ({"box": [[1, 1], [0, 2]]}, "a box of"),
-    "threshold": ({"threshold": 1.5}, "threshold from 0 to 1"),
-    "gate": ({"gate": 0.0}, "gate above 0"),
-    "forget": ({"forget": (0.2, 0.1)}, "0 < slow <= fast <= 1"),
-    "resample": ({"resample": "systematic"}, "resample to be a function"),
-}
-
-
-@pytest.mark.parametrize("case", BAD)
-def test_bad_input_is_refused(case):
-    change, why = BAD[case]
-    options = {"landmarks": WORLD.landmarks, "particles": 5} | change
-    with pytest.raises(ValueError, match=why):
-        ParticleLocalization(
-            WORLD.motion,
-            WORLD.sensor,
-            options.pop("landmarks"),
-            options.pop("particles"),
-            **options,
-        )
+@refused(
+    ({"particles": 0}, "particles: expected an integer"),
+    ({"particles": 2.5}, "particles: expected an integer"),
+    ({"least": 0}, "least: expected an integer"),
+    ({"least": 6}, "least <= particles = 5"),
+    ({"landmarks": np.zeros((3, 3))}, "ParticleLocalization: expected landmarks of shape"),
+    ({"tags": [0, 0, 1, 2, 3, 4]}, "different tags"),
+    ({"start": "anywhere"}, 'start "gaussian" or "uniform"'),
+    ({"start": "uniform"}, "expected a box"),
+    ({"box": [[0, 0, 0], [1, 1, 1]]}, r"a box of shape \(2, 2\)"),
+    ({"box": [[1, 1], [0, 2]]}, "a box of"),
+    ({"threshold": 1.5}, "threshold from 0 to 1"),
+    ({"gate": 0.0}, "gate above 0"),
+    ({"forget": (0.2, 0.1)}, "0 < slow <= fast <= 1"),
+    ({"resample": "systematic"}, "resample to be a function"),
+)
+def test_bad_input_is_refused(change):
+    given = {"landmarks": WORLD.landmarks, "particles": 5} | change
+    ParticleLocalization(WORLD.motion, WORLD.sensor, **given)

@@ -12,6 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
+from cases import refused
 from test_smoothing import KEY, P0, START, arguments, linear_log, linear_world
 
 from jaxslam import motion, run, sensors, simulate
@@ -34,6 +35,7 @@ def lag(world, **options):
     return FixedLag(world.motion, world.sensor, count, count, **options)
 
 
+@pytest.mark.sweep
 def test_a_window_as_long_as_the_log_is_the_batch(short):
     world, log = short
     filter = lag(world, window=4, iterations=5)
@@ -45,6 +47,7 @@ def test_a_window_as_long_as_the_log_is_the_batch(short):
     np.testing.assert_allclose(trace.final.at.path[0], batch.final.start, atol=1e-8)
 
 
+@pytest.mark.sweep
 def test_a_window_without_finite_numbers_begins_anew_and_says_so(short):
     world, log = short
     world = dataclasses.replace(world, landmarks=world.landmarks[:2])
@@ -82,6 +85,7 @@ def regular(log):
     return log._replace(scan=log.scan._replace(valid=log.scan.valid & ~exact))
 
 
+@pytest.mark.sweep
 def test_float32_and_gradients(short):
     world, log = short
     world = dataclasses.replace(world, landmarks=world.landmarks[:2])
@@ -106,25 +110,21 @@ def test_float32_and_gradients(short):
     np.testing.assert_allclose(found, double, atol=2e-4)
 
 
-@pytest.mark.parametrize(
-    ("options", "why"),
-    [
-        ({"window": 0}, "window"),
-        ({"iterations": 0}, "iterations"),
-        ({"slots": 0}, "slots"),
-        ({"sensor": sensors.BearingOnly(np.eye(1))}, "as many numbers"),
-        ({"sensor": sensors.Compass(np.eye(1))}, "as many numbers"),
-        (
-            {"sensor": sensors.RangeBearingSignature(np.eye(3)), "first_estimates": True},
-            r"landmarks \(x, y\)",
-        ),
-    ],
+@refused(
+    ({"window": 0}, "window"),
+    ({"iterations": 0}, "iterations"),
+    ({"slots": 0}, "slots"),
+    ({"sensor": sensors.BearingOnly(np.eye(1))}, "as many numbers"),
+    ({"sensor": sensors.Compass(np.eye(1))}, "as many numbers"),
+    (
+        {"sensor": sensors.RangeBearingSignature(np.eye(3)), "first_estimates": True},
+        r"landmarks \(x, y\)",
+    ),
 )
-def test_what_does_not_fit_is_refused(options, why):
+def test_what_does_not_fit_is_refused(options):
     given = {"motion": worlds.ring().motion, "sensor": worlds.ring().sensor}
     given |= {"capacity": 3, "slots": 3} | options
-    with pytest.raises(ValueError, match=why):
-        FixedLag(**given)
+    FixedLag(**given)
 
 
 def test_a_scan_that_is_too_large_is_refused(short):

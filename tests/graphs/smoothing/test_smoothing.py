@@ -8,8 +8,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.optimize
+from cases import swept
 from own_models import motion_of, sensor_of
 from reference import ekf_slam as plain
+from reference.plane import compose
 from worlds import ring
 
 from jaxslam import filters, motion, run, sensors, simulate
@@ -120,28 +122,25 @@ def dense_linear(log, pose):
 
 @cache
 def solve_linear(kind):
-    """The batch solution of the linear log in a dtype. In float64 with a loop of fixed length, and
-    what the mean of the start moves the last x by, in reverse through it all."""
+    """The linear log in a dtype, and its batch solution; in float64 with a loop of fixed length."""
     log = jax.tree.map(lambda a: a.astype(kind) if a.dtype == float else a, linear_log())
-    options = {"iterations": 2, "tolerance": None} if kind == np.float64 else {}
+    return log, jax.device_get(jax.jit(lambda pose: solution(log, pose))(jnp.asarray(START, kind)))
 
-    def solve(pose):
-        trace = BatchMap(*linear_world(), 4, pose, P0, **options)(log, KEY)
-        return trace.estimate.pose[-1, 0], trace
 
-    if kind == np.float64:
-        solve = jax.value_and_grad(solve, has_aux=True)
-    found = jax.device_get(jax.jit(solve)(jnp.asarray(START, kind)))
-    return (log, *found) if kind == np.float32 else (log, found[1], found[0][1])
+def solution(log, pose):
+    options = {"iterations": 2, "tolerance": None} if pose.dtype == np.float64 else {}
+    return BatchMap(*linear_world(), 4, pose, P0, **options)(log, KEY)
 
 
 START = (0.3, -0.2, 0.1)
 
 
-@pytest.mark.parametrize(("kind", "close"), [(np.float64, 1e-9), (np.float32, 3e-4)])
+@pytest.mark.parametrize(
+    ("kind", "close"), swept([(np.float64, 1e-9), (np.float32, 3e-4)], (np.float64, 1e-9))
+)
 def test_a_linear_log_is_dense_least_squares(kind, close):
     path, covs, landmarks, map_cov, cost = dense_linear(linear_log(), START)
-    trace = solve_linear(kind)[2]
+    trace = solve_linear(kind)[1]
     found, order = by_tag(trace, 3)
     for actual, wanted in (
         (trace.estimate.pose, path[1:]),
@@ -165,7 +164,7 @@ def test_a_linear_log_is_dense_least_squares(kind, close):
 
 
 def test_measurements_of_singular_noise_are_left_out_and_counted():
-    log, _, trace = solve_linear(np.float64)
+    log, trace = solve_linear(np.float64)
     status = trace.info.status
     np.testing.assert_array_equal(np.argwhere(status == Status.SINGULAR), [[6, 0]])
     used = (status == Status.FUSED) | (status == Status.BORN)
@@ -175,9 +174,12 @@ def test_measurements_of_singular_noise_are_left_out_and_counted():
     assert trace.info.nis[6, 0] == 0
 
 
+@pytest.mark.sweep
 def test_it_can_be_differentiated():
     """By the mean of the start, in reverse, through a loop of fixed length."""
-    log, slope, _ = solve_linear(np.float64)
+    log = linear_log()
+    last = jax.grad(lambda pose: solution(log, pose).estimate.pose[-1, 0])
+    slope = jax.jit(last)(jnp.asarray(START))
     wanted = slopes(lambda pose: dense_linear(log, pose)[0][-1, 0][None], np.asarray(START))[0]
     np.testing.assert_allclose(slope, wanted, rtol=0, atol=1e-7)
 
@@ -275,7 +277,8 @@ def fixed_ring(steps=14):
 
 
 @pytest.mark.parametrize(
-    ("make", "options"), [(camera_ring, {"gate": 1.0, "births": 1}), (fixed_ring, {})]
+    ("make", "options"),
+    swept([(camera_ring, {"gate": 1.0, "births": 1}), (fixed_ring, {})], (fixed_ring, {})),
 )
 def test_it_ends_where_the_filter_ends(make, options):
     """The last pose and the map, with all covariances: births, gates and priors as the filter has
@@ -320,12 +323,6 @@ def step_ring(steps=10):
     )
 
 
-def composed(pose, u):
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    x, y = pose[0] + c * u[0] - s * u[1], pose[1] + s * u[0] + c * u[1]
-    return np.array([x, y, plain.wrap(pose[2] + u[2])])
-
-
 def residuals(unknowns, log, world):
     """All whitened residuals in the noises and the map, in NumPy; and the path they make."""
     steps, count = len(log.control), len(world.landmarks)
@@ -333,7 +330,7 @@ def residuals(unknowns, log, world):
     landmarks = unknowns[3 * steps :].reshape(count, 2)
     pose, path, out = np.asarray(world.pose, float), [], [noise.ravel()]
     for t in range(steps):
-        pose = composed(pose, log.control[t] + SIGMA_W * noise[t])
+        pose = compose(pose, log.control[t] + SIGMA_W * noise[t])
         path.append(pose)
         for z, tag, there in zip(log.scan.z[t], log.scan.tag[t], log.scan.valid[t], strict=True):
             if there:
@@ -443,7 +440,7 @@ def test_smoothed_is_better_than_filtered():
 
 
 @pytest.mark.parametrize("name", ["smooth", "batch"])
-@pytest.mark.parametrize("step", [2, STEPS // 2, STEPS - 1])
+@pytest.mark.parametrize("step", swept([2, STEPS // 2, STEPS - 1], STEPS // 2))
 def test_smoothed_is_honest(name, step):
     truth, _, traces = many()
     error = pose_errors(truth, traces[name].estimate)[:, step]

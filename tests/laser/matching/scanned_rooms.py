@@ -3,6 +3,7 @@ best step to lines, by the roots of a polynomial."""
 
 import numpy as np
 from numpy.polynomial import Polynomial
+from reference.plane import from_frame
 
 from jaxslam.laser.matching import Points
 
@@ -29,12 +30,6 @@ def points_at(pose, rng, sigma=SIGMA, half=(HALF, HALF), beams=BEAMS):
     return Points(ranges[:, None] * ray, ray, np.ones(beams, bool))
 
 
-def moved(points, pose):
-    """Points of a frame in the frame that the pose is given in."""
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    return points @ np.array([[c, s], [-s, c]]) + pose[:2]
-
-
 def stacked(parts):
     return type(parts[0])(*(np.stack(column) for column in zip(*parts, strict=True)))
 
@@ -46,7 +41,7 @@ def pairs(count, seed=0, sigma=SIGMA, half=(HALF, HALF), off=(0.05, 0.05, 0.03),
     for _ in range(count):
         first = rng.uniform(-1, 1, 3) * [0.8, 0.8, np.pi]
         step = rng.uniform(-1, 1, 3) * [0.2, 0.1, 0.1]
-        second = np.append(moved(step[None, :2], first)[0], first[2] + step[2])
+        second = np.append(from_frame(first, step[:2]), first[2] + step[2])
         references.append(points_at(first, rng, sigma, half, beams))
         scans.append(points_at(second, rng, sigma, half))
         truth.append(step)
@@ -87,6 +82,4 @@ def by_polynomial(source, target, normal, weight):
 
 
 def line_cost(pose, source, target, normal, weight):
-    c, s = np.cos(pose[2]), np.sin(pose[2])
-    moved = source @ np.array([[c, s], [-s, c]]) + pose[:2]
-    return (weight * (normal * (moved - target)).sum(axis=1) ** 2).sum()
+    return (weight * (normal * (from_frame(pose, source) - target)).sum(axis=1) ** 2).sum()

@@ -3,7 +3,9 @@
 import jax
 import numpy as np
 import pytest
-from scanned_rooms import moved, pairs, points_at, stacked
+from cases import swept
+from reference.plane import from_frame
+from scanned_rooms import pairs, points_at, stacked
 
 from jaxslam import matching
 from jaxslam.laser.matching import MatchStatus
@@ -43,7 +45,7 @@ def test_the_maximum_is_that_of_all_poses(found):
         best, where = -1.0, None
         for turn in turns:
             pose = np.array([*STARTS[k, :2], STARTS[k, 2] + turn])
-            cells = np.floor((moved(SCANS.position[k], pose) - grids.origin[k, :2]) / CELL)
+            cells = np.floor((from_frame(pose, SCANS.position[k]) - grids.origin[k, :2]) / CELL)
             for x in shifts:
                 for y in shifts:
                     at = (cells + [x, y]).astype(int)
@@ -82,7 +84,7 @@ def round_room(pose, beams):
     return scan._replace(position=ranges[:, None] * scan.ray)
 
 
-@pytest.mark.parametrize("name", ["field", "correlative"])
+@pytest.mark.parametrize("name", swept(["field", "correlative"], "correlative"))
 def test_what_a_scan_does_not_determine_is_named(name):
     """A corridor beyond the range, and a round room, which any turn about its middle fits."""
     at = np.array([0.8, 0.5, 0.0])

@@ -5,12 +5,16 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from scanned_rooms import BEAMS, by_polynomial, moved, pairs, points_at, stacked
+from cases import refused, swept
+from reference.plane import from_frame
+from scanned_rooms import BEAMS, by_polynomial, line_cost, pairs, points_at, stacked
+from worlds import narrow
 
 from jaxslam import matching
 from jaxslam.core.types import Beams
 from jaxslam.graphs import Huber
 from jaxslam.laser.matching import IcpSettings, MatchStatus, Points, Prior
+from jaxslam.laser.matching.closed_form import added, least, of_lines, of_points, of_prior
 
 COUNT, GOOD = 8, 4
 SPAN, GAP, REACH = 2, 0.8, 0.5
@@ -78,14 +82,14 @@ def lines(p):
 
 def partners(k):
     """The scan of a pair at its start, its nearest reference points, and which are within reach."""
-    there = moved(SCANS.position[k], STARTS[k])
+    there = from_frame(STARTS[k], SCANS.position[k])
     apart = np.linalg.norm(there[:, None] - REFERENCES.position[k][None], axis=2)
     j = apart.argmin(axis=1)
     return there, j, apart[np.arange(BEAMS), j] < REACH
 
 
 def composed(step, pose):
-    c = moved(pose[None, :2], step)[0]
+    c = from_frame(step, pose[None, :2])[0]
     return np.array([*c, pose[2] + step[2]])
 
 
@@ -149,9 +153,12 @@ def test_a_corridor_is_degenerate_along_itself(found):
 
 
 @pytest.mark.parametrize(
-    "make", [matching.PointToLine, matching.PointToPoint, matching.FieldMatcher]
+    "make",
+    swept(
+        [matching.PointToLine, matching.PointToPoint, matching.FieldMatcher], matching.PointToLine
+    ),
 )
-@pytest.mark.parametrize("sigma", [0.0, 0.02])
+@pytest.mark.parametrize("sigma", swept([0.0, 0.02], 0.02))
 def test_in_a_corridor_the_prior_decides_whatever_it_is_worth(make, sigma):
     """Walls at y = ±1, both scans from one place: the scans do not depend on x.
 
@@ -182,7 +189,10 @@ def test_in_a_corridor_the_prior_decides_whatever_it_is_worth(make, sigma):
     np.testing.assert_allclose((alone.pose[:, :2] * along).sum(axis=1), 0, atol=2e-3)
 
 
-@pytest.mark.parametrize("make", [matching.PointToPoint, matching.PointToLine])
+@pytest.mark.sweep
+@pytest.mark.parametrize(
+    "make", swept([matching.PointToPoint, matching.PointToLine], matching.PointToLine)
+)
 def test_a_prior_holds_what_the_scans_do_not_determine(make):
     """At the end the slope of the cost is zero; in the corridor x is that of the prior."""
     matcher = make(IcpSettings(**OPTIONS, tolerance=1e-9, kernel=Huber(), scale=0.05))
@@ -204,6 +214,7 @@ def test_a_prior_holds_what_the_scans_do_not_determine(make):
     assert np.linalg.matrix_rank(found.determined[7], tol=1e-6) == 2
 
 
+@pytest.mark.sweep
 def test_trimming_and_a_kernel_bear_outliers_and_forward_derivatives_are_finite():
     """Every sixth beam is 30 cm short; in float32 the same to 1 mm."""
     position = np.array(SCANS.position[:GOOD])
@@ -232,45 +243,124 @@ def test_trimming_and_a_kernel_bear_outliers_and_forward_derivatives_are_finite(
         )
     )(jnp.ones(BEAMS))  # fmt: skip
     assert np.all(np.isfinite(slope))
-    single = jax.tree.map(
-        lambda a: a.astype(np.float32) if a.dtype == np.float64 else a, (of, scan, STARTS[0])
-    )
-    end = matching.match(matcher, *single)
+    end = matching.match(matcher, *narrow((of, scan, STARTS[0])))
     assert end.pose.dtype == np.float32
     np.testing.assert_allclose(end.pose, pose, atol=1e-3)
 
 
-@pytest.mark.parametrize(
-    ("call", "reason"),
-    [
-        (lambda m, p: matching.match("icp", p, p, np.zeros(3)), "expected a Matcher"),
-        (lambda m, p: matching.match(m, "map", p, np.zeros(3)), "takes a reference of Points"),
-        (lambda m, p: matching.match(m, p, p, np.zeros(2)), "expected a start of poses"),
-        (lambda m, p: matching.match(m, p, p, np.full(3, np.nan)), "expected a finite start"),
-        (lambda m, p: matching.match(m, p, p._replace(valid=np.ones(3, bool)), np.zeros(3)),
-         "expected N positions, rays and masks"),
-        (lambda m, p: matching.match(m, p._replace(position=np.nan * p.position), p, np.zeros(3)),
-         "expected finite points"),
-        (lambda m, p: matching.match(m, Points(*(part[:0] for part in p)), p, np.zeros(3)),
-         "reference of at least one point"),
-        (lambda m, p: matching.match(m, p, p, np.zeros(3), np.eye(3)), "expected a Prior"),
-        (lambda m, p: matching.points(Beams(np.ones(4), np.ones(3), np.ones(4, bool)), 5.0),
-         r"of one scan, got \(4,\), \(3,\), \(4,\)"),
-        (lambda m, p: matching.points(Beams(*np.ones((3, 4))), np.nan), "points: expected max_range"),
-        (lambda m, p: matching.match(m, p, p, np.zeros(3), Prior(np.zeros(2), np.eye(3))),
-         "expected a prior of a pose 3"),
-        (lambda m, p: matching.match(m, p, p, np.zeros(3), Prior(np.zeros(3), -np.eye(3))),
-         "positive semi-definite"),
-        (lambda m, p: matching.match(m, p, p, np.zeros(3), Prior(np.full(3, np.nan), np.eye(3))),
-         "expected a finite prior"),
-        (lambda m, p: IcpSettings(reach=0), "IcpSettings: expected reach"),
-        (lambda m, p: IcpSettings(span=0), "IcpSettings: span: expected an integer >= 1, got 0"),
-        (lambda m, p: matching.FieldMatcher(scale=-1), "FieldMatcher: expected scale above 0, got -1"),
-        (lambda m, p: matching.Correlative(block=0), "Correlative: expected block"),
-        (lambda m, p: matching.raster(p, 0.0, 1.0), "raster: expected resolution"),
-    ],
+@refused(
+    (lambda m, p: matching.match("icp", p, p, np.zeros(3)), "expected a Matcher"),
+    (lambda m, p: matching.match(m, "map", p, np.zeros(3)), "takes a reference of Points"),
+    (lambda m, p: matching.match(m, p, p, np.zeros(2)), "expected a start of poses"),
+    (lambda m, p: matching.match(m, p, p, np.full(3, np.nan)), "expected a finite start"),
+    (lambda m, p: matching.match(m, p, p._replace(valid=np.ones(3, bool)), np.zeros(3)),
+     "expected N positions, rays and masks"),
+    (lambda m, p: matching.match(m, p._replace(position=np.nan * p.position), p, np.zeros(3)),
+     "expected finite points"),
+    (lambda m, p: matching.match(m, Points(*(part[:0] for part in p)), p, np.zeros(3)),
+     "reference of at least one point"),
+    (lambda m, p: matching.match(m, p, p, np.zeros(3), np.eye(3)), "expected a Prior"),
+    (lambda m, p: matching.points(Beams(np.ones(4), np.ones(3), np.ones(4, bool)), 5.0),
+     r"of one scan, got \(4,\), \(3,\), \(4,\)"),
+    (lambda m, p: matching.points(Beams(*np.ones((3, 4))), np.nan), "points: expected max_range"),
+    (lambda m, p: matching.match(m, p, p, np.zeros(3), Prior(np.zeros(2), np.eye(3))),
+     "expected a prior of a pose 3"),
+    (lambda m, p: matching.match(m, p, p, np.zeros(3), Prior(np.zeros(3), -np.eye(3))),
+     "positive semi-definite"),
+    (lambda m, p: matching.match(m, p, p, np.zeros(3), Prior(np.full(3, np.nan), np.eye(3))),
+     "expected a finite prior"),
+    (lambda m, p: IcpSettings(reach=0), "IcpSettings: expected reach"),
+    (lambda m, p: IcpSettings(span=0), "IcpSettings: span: expected an integer >= 1, got 0"),
+    (lambda m, p: matching.FieldMatcher(scale=-1), "FieldMatcher: expected scale above 0, got -1"),
+    (lambda m, p: matching.Correlative(block=0), "Correlative: expected block"),
+    (lambda m, p: matching.raster(p, 0.0, 1.0), "raster: expected resolution"),
 )  # fmt: skip
-def test_bad_input_is_refused(call, reason):
+def test_bad_input_is_refused(call):
     p = points_at(np.zeros(3), np.random.default_rng(0))
-    with pytest.raises(ValueError, match=reason):
-        call(matching.PointToLine(), p)
+    call(matching.PointToLine(), p)
+
+
+# --- The steps of the ICPs against NumPy: the roots of Censi's polynomial, and a fit by SVD -------
+
+
+DRAWS = np.random.default_rng(4)
+POINTS, CASES = 12, 6
+
+
+def clouds():
+    source = DRAWS.uniform(-3, 3, (CASES, POINTS, 2))
+    target = source + DRAWS.normal(0, 0.3, source.shape)
+    normal = DRAWS.normal(size=source.shape)
+    normal /= np.linalg.norm(normal, axis=2, keepdims=True)
+    weight = DRAWS.uniform(0, 1, (CASES, POINTS))
+    weight[:, :3] = 0
+    return source, target, normal, weight
+
+
+def align_to_lines(*given):
+    return least(of_lines(*given))
+
+
+def align_points(*given):
+    return least(of_points(*given))
+
+
+def test_a_prior_is_a_term_of_the_cost():
+    """Of all motions, by the shift that is best for each of 2,000 headings, in NumPy."""
+    source, target, normal, weight = (part[0] for part in clouds())
+    pose, middle = np.array([0.4, -0.2, 0.3]), np.array([0.1, 0.5])
+    root = DRAWS.normal(size=(3, 3))
+    prior = Prior(pose + [0.3, 0.2, -0.1], root @ root.T)
+
+    @jax.jit
+    def found(prior):
+        both = added(of_lines(source, target, normal, weight), of_prior(prior, pose, middle))
+        return least(both)
+
+    arm = pose[:2] - middle
+    best = np.inf, None
+    for angle in np.linspace(-np.pi, np.pi, 2001):
+        c, s = np.cos(angle), np.sin(angle)
+        turn = np.array([[c, -s], [s, c]])
+        # Residuals of a shift t: rows of n t + b, weighted.
+        rows = np.concatenate([np.sqrt(weight)[:, None] * normal, root.T[:, :2]])
+        off = np.array([*(turn @ arm + middle - prior.pose[:2]), 0.1 * c + s])
+        rest = np.sqrt(weight) * (normal * (source @ turn.T - target)).sum(axis=1)
+        rest = np.concatenate([rest, root.T @ off])
+        shift = -np.linalg.lstsq(rows, rest, rcond=None)[0]
+        value = ((rows @ shift + rest) ** 2).sum()
+        best = min(best, (value, (*shift, angle)))
+    np.testing.assert_allclose(found(prior), best[1], atol=4e-3)
+
+
+def test_the_step_to_lines_is_the_least_root_of_the_polynomial():
+    source, target, normal, weight = clouds()
+    found = np.asarray(jax.jit(jax.vmap(align_to_lines))(source, target, normal, weight))
+    for k in range(CASES):
+        value, pose = by_polynomial(source[k], target[k], normal[k], weight[k])
+        np.testing.assert_allclose(found[k], pose, atol=1e-8)
+        assert line_cost(found[k], source[k], target[k], normal[k], weight[k]) <= value + 1e-9
+
+
+def test_what_lines_do_not_determine_stays():
+    """All normals along y: x stays at 0, whatever the partners."""
+    source, target, _, weight = (part[0] for part in clouds())
+    normal = np.tile([0.0, 1.0], (POINTS, 1))
+    pose = np.asarray(jax.jit(align_to_lines)(source, target, normal, weight))
+    assert abs(pose[0]) < 1e-6 and np.all(np.isfinite(pose))
+    nothing = jax.jit(align_to_lines)(source, target, normal, 0 * weight)
+    np.testing.assert_allclose(nothing, 0, atol=1e-12)
+
+
+def test_the_step_to_points_is_the_weighted_fit():
+    source, target, _, weight = clouds()
+    found = np.asarray(jax.jit(jax.vmap(align_points))(source, target, weight))
+    for k in range(CASES):
+        w = weight[k] / weight[k].sum()
+        s0, t0 = w @ source[k], w @ target[k]
+        u, _, v = np.linalg.svd(((source[k] - s0) * w[:, None]).T @ (target[k] - t0))
+        turn = v.T @ np.diag([1, np.linalg.det(v.T @ u.T)]) @ u.T
+        shift = t0 - turn @ s0
+        np.testing.assert_allclose(
+            found[k], [*shift, np.arctan2(turn[1, 0], turn[0, 0])], atol=1e-10
+        )

@@ -4,6 +4,7 @@ import functools
 
 import numpy as np
 import pytest
+from cases import refused
 
 from jaxslam import grids, topology
 from jaxslam.laser.topology.places import cell_centers
@@ -129,22 +130,15 @@ def test_places_of_a_path_cover_it_and_a_loop_connects_its_ends():
     assert (closed.adjacent.sum(axis=1) == 2).all()
 
 
-@pytest.mark.parametrize(
-    ("call", "message"),
-    [
-        (lambda: topology.skeleton(drawn("###")), "skeleton: no free cell"),
-        (lambda: topology.skeleton(drawn("..."), clearance=0), "skeleton: expected a clearance"),
-        (lambda: topology.topological_map(drawn("..."), max_width=0), "topological_map: expected"),
-        (lambda: topology.route(places(), [-9, 0], ROOMS[0]), "route: the start .* is in no place"),
-        (lambda: topology.place_weights(places(), np.zeros((2, 3)), [0.0]), "place_weights: exp"),
-        (
-            lambda: topology.place_weights(places(), np.zeros((1, 3)), [-np.inf]),
-            "of weight above 0",
-        ),
-        (lambda: topology.path_places([[0, 0]], [[0, 1]], radius=1), "path_places: expected pairs"),
-        (lambda: topology.path_places([[0, 0]], [], radius=0), "path_places: expected poses"),
-    ],
+@refused(
+    (lambda: topology.skeleton(drawn("###")), "skeleton: no free cell"),
+    (lambda: topology.skeleton(drawn("..."), clearance=0), "skeleton: expected a clearance"),
+    (lambda: topology.topological_map(drawn("..."), max_width=0), "topological_map: expected"),
+    (lambda: topology.route(places(), [-9, 0], ROOMS[0]), "route: the start .* is in no place"),
+    (lambda: topology.place_weights(places(), np.zeros((2, 3)), [0.0]), "place_weights: exp"),
+    (lambda: topology.place_weights(places(), np.zeros((1, 3)), [-np.inf]), "of weight above 0"),
+    (lambda: topology.path_places([[0, 0]], [[0, 1]], radius=1), "path_places: expected pairs"),
+    (lambda: topology.path_places([[0, 0]], [], radius=0), "path_places: expected poses"),
 )
-def test_bad_input_is_refused(call, message):
-    with pytest.raises(ValueError, match=message):
-        call()
+def test_bad_input_is_refused(call):
+    call()

@@ -1,0 +1,334 @@
+"""Logs: what `check_log` refuses, and naming the row; `Log.from_records`; the counts of `Info`."""
+
+import pydoc
+from types import SimpleNamespace
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from cases import refused
+from reference.plane import compose
+from worlds import narrow
+
+from jaxslam import graphs, run
+from jaxslam.core.logs import streams
+from jaxslam.core.types import Info, Log, Scan, Status, Truth
+from jaxslam.core.validation import check_log
+from jaxslam.filters import EkfSlam
+from jaxslam.motion import PoseIncrement, Unicycle
+from jaxslam.sensors import Compass, Part, RangeBearing, Suite
+
+
+def good_log(steps=4, places=3):
+    tag = np.tile([0, 1, -1], (steps, 1))
+    valid = np.ones((steps, places), bool)
+    scan = Scan(z=np.ones((steps, places, 2)), tag=tag, valid=valid)
+    return Log(control=np.zeros((steps, 3)), scan=scan)
+
+
+def check(log):
+    return check_log("drive", log, control_size=3, measurement_size=2)
+
+
+def changed(field, row, value):
+    """The good log with one row of one field replaced."""
+    log = good_log()
+    table = getattr(log if field == "control" else log.scan, field).copy()
+    table[row] = value
+    return replaced(**{field: table})
+
+
+def replaced(**fields):
+    """The good log with other fields, of its own or of its scan."""
+    log, own = (
+        good_log(),
+        {name: fields.pop(name) for name in ("control", "scan") if name in fields},
+    )
+    return log._replace(scan=log.scan._replace(**fields))._replace(**own)
+
+
+def test_a_good_log_passes():
+    check(good_log())
+    check(jax.tree.map(jnp.asarray, good_log()))
+    check(narrow(good_log()))
+
+
+NO_Z = "log.scan.z: a valid measurement is"
+BAD_VALUES = {
+    "control nan": (
+        changed("control", (2, 1), np.nan),
+        r"log.control is not finite \(row 2\): correct or leave out",
+    ),
+    "control inf": (changed("control", (3, 0), np.inf), r"log.control is not finite \(row 3\)"),
+    "z nan": (changed("z", (1, 2, 0), np.nan), rf"{NO_Z} not finite \(row 1, slot 2\)"),
+    "z inf": (changed("z", (0, 0, 1), -np.inf), rf"{NO_Z} not finite \(row 0, slot 0\)"),
+    "control beyond": (changed("control", (2, 0), -5e61), r"control is beyond ±4.5e\+61 \(row 2\)"),
+    "z beyond": (changed("z", (1, 2, 0), 1e70), rf"{NO_Z} beyond ±4.5e\+61 \(row 1, slot 2\)"),
+    "tag -2": (changed("tag", (3, 1), -2), r"log.scan.tag: a tag is below -1 \(row 3, slot 1\)"),
+    "tag 2**32": (
+        replaced(tag=good_log().scan.tag.astype(np.int64) + 2**32),
+        r"log.scan.tag: a tag is beyond int32 \(row 0, slot 0\)",
+    ),
+    "repeated": (
+        changed("tag", 2, [5, 6, 5]),
+        r"log.scan.tag: a tag repeats within the scan \(row 2\)",
+    ),
+}
+
+
+@pytest.mark.parametrize("case", BAD_VALUES)
+def test_bad_values_are_refused_with_their_row(case):
+    log, message = BAD_VALUES[case]
+    with pytest.raises(ValueError, match=f"^drive: .*{message}"):
+        check(log)
+
+
+@pytest.mark.parametrize("case", BAD_VALUES)
+def test_values_are_not_looked_at_where_they_are_traced(case):
+    def traced(log):
+        check(log)
+        return log
+
+    jax.eval_shape(traced, BAD_VALUES[case][0])
+
+
+def test_padding_may_hold_anything_and_unknown_tags_may_repeat():
+    for field, row, value in (("z", (1, 2, 0), np.nan), ("tag", (1, 2), -7), ("tag", (1, 2), 0)):
+        log = changed(field, row, value)
+        valid = log.scan.valid.copy()
+        valid[1, 2] = False
+        check(log._replace(scan=log.scan._replace(valid=valid)))
+    check(changed("tag", 1, [-1, -1, -1]))
+
+
+BAD_SHAPES = {
+    "control size": ({"control": np.zeros((4, 2))}, r"control: expected shape \(T, 3\), got \(4, 2\)"),
+    "control rank": ({"control": np.zeros(3)}, r"control: expected shape \(T, 3\), got \(3,\)"),
+    "control kind": ({"control": np.zeros((4, 3), int)}, "control: expected floating values, got int64"),
+    "z size": ({"z": np.ones((4, 3, 1))}, r"scan.z: expected shape \(4, 3, 2\), got \(4, 3, 1\)"),
+    "z kind": ({"z": np.ones((4, 3, 2), bool)}, "scan.z: expected floating values, got bool"),
+    "steps": ({"scan": good_log(5).scan}, r"scan.z: expected shape \(4, 3, 2\), got \(5, 3, 2\)"),
+    "tag rank": ({"tag": np.zeros(4, int)}, r"scan.tag: expected shape \(4, M\), got \(4,\)"),
+    "no scan": ({"scan": None}, r"expected a Scan\(z, tag, valid\), got NoneType"),
+    "no array": ({"valid": None}, r"scan.valid: expected shape \(4, 3\), got None"),
+    "tag kind": ({"tag": np.zeros((4, 3))}, "scan.tag: expected integer values, got float64"),
+    "valid kind": ({"valid": np.ones((4, 3), int)}, "scan.valid: expected bool.* values, got int64"),
+    "valid places": ({"valid": np.ones((4, 2), bool)}, r"valid: expected shape \(4, 3\), got \(4, 2\)"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("traced", [False, True], ids=["concrete", "traced"])
+@pytest.mark.parametrize("case", BAD_SHAPES)
+def test_bad_shapes_and_kinds_are_refused_traced_or_not(case, traced):
+    fields, message = BAD_SHAPES[case]
+    log = replaced(**fields)
+    with pytest.raises(ValueError, match=f"^drive: .*{message}"):
+        if traced:
+            jax.eval_shape(check, log)
+        else:
+            check(log)
+
+
+def test_info_counts_statuses_of_a_step_and_of_a_trace():
+    codes = np.array([[Status.EMPTY, Status.FUSED, Status.FUSED], [Status.OVERFLOW] * 3])
+    nothing = np.zeros(0)
+    info = Info(nothing, nothing, nothing, nothing, nothing, jnp.asarray(codes), nothing)
+    np.testing.assert_array_equal(info.tally(Status.FUSED), [2, 0])
+    np.testing.assert_array_equal(info.tally(Status.OVERFLOW), [0, 3])
+    np.testing.assert_array_equal(info.overflow, [False, True])
+    step = info._replace(status=jnp.asarray(codes[1]))
+    assert step.overflow
+    assert step.tally(Status.OVERFLOW) == 3
+
+
+def test_status_codes_are_distinct_and_empty_is_zero():
+    assert Status.EMPTY == 0
+    assert len({int(s) for s in Status}) == len(Status)
+
+
+def test_help_shows_the_docstrings_of_fields():
+    """Of named tuples, whose fields Python calls "Alias for field number 0"."""
+    text = pydoc.plain(pydoc.render_doc(graphs.Marginals))
+    assert "of (x, y, θ), in world coordinates as the poses themselves" in text
+    assert "a variable does not have are zero" in text and "Alias for field" not in text
+    assert Truth.origin.__doc__.startswith("the tag of the landmark each measurement is")
+
+
+# --- `Log.from_records` and the alignment of streams below it: by hand, every kind of table, bad --
+
+
+DRIVE, EYE = Unicycle(np.eye(2)), RangeBearing(np.eye(2))
+ODOMETRY = [[1.0, 0.5, 0.1], [2.0, 1.0, 0.0], [3.0, 0.0, 0.0]]
+SEEN = [
+    (0.5, 7, 1.0, 0.0),
+    (1.5, 7, 2.0, 0.25),
+    (1.5, 3, 3.0, -0.5),
+    (3.0, -1, 4.0, 0.5),
+    (9.0, 7, 1.0, 0),
+]
+
+
+def columns(rows, *names):
+    return {name: [row[i] for row in rows] for i, name in enumerate(names)}
+
+
+def frame(rows, *names):
+    """What a data frame shows: columns, and each by its name."""
+    table = columns(rows, *names)
+
+    class Frame:
+        def __init__(self):
+            self.columns = list(table)
+
+        def __getitem__(self, name):
+            return np.array(table[name])
+
+    return Frame()
+
+
+STRUCTURED = np.array(ODOMETRY, float).view([("t", float), ("v", float), ("omega", float)])[:, 0]
+
+
+@pytest.mark.parametrize(
+    ("odometry", "seen"),
+    [
+        (ODOMETRY, SEEN),
+        (np.array(ODOMETRY), np.array(SEEN, float)),
+        (STRUCTURED, columns(SEEN, "t", "tag", "range", "bearing")),
+        (
+            frame(ODOMETRY, "t [s]", "v [m/s]", "omega [rad/s]"),
+            frame(SEEN, "t", "tag", "range [m]", "bearing"),
+        ),
+        (
+            columns([(w, x, v, 1e3 * t) for (t, v, w), x in zip(ODOMETRY, "abc", strict=True)],
+                    "omega", "left out", "v", "t [ms]"),
+            columns([(t, k, r, np.rad2deg(b)) for t, k, r, b in SEEN], "t", "tag", "range", "bearing [deg]"),
+        ),
+    ],
+    ids=["lists", "arrays", "columns", "frames", "units"],
+)  # fmt: skip
+def test_a_log_from_records_by_hand(odometry, seen):
+    log, time, tags, dropped = Log.from_records(odometry, seen, DRIVE, EYE)
+    np.testing.assert_allclose(time, [1.0, 1.5, 2.0, 3.0], rtol=1e-15)
+    np.testing.assert_allclose(
+        log.control, [[0, 0, 0], [0.5, 0.1, 0.5], [0.5, 0.1, 0.5], [1, 0, 1]], atol=1e-15
+    )
+    assert tags == (3, 7)
+    np.testing.assert_array_equal(log.scan.tag, [[-1, -1], [1, 0], [-1, -1], [-1, -1]])
+    np.testing.assert_array_equal(log.scan.valid, [[0, 0], [1, 1], [0, 0], [1, 0]])
+    np.testing.assert_allclose(log.scan.z[1], [[2, 0.25], [3, -0.5]], rtol=1e-15)
+    assert dropped == {"measurements outside the odometry": 2}
+
+
+def test_a_landmark_whose_measurements_are_all_outside_the_odometry_has_no_tag():
+    seen = [(-1.0, 5, 1, 0), (1.0, 7, 1, 0), (9.0, 5, 1, 0)]
+    log, _, tags, dropped = Log.from_records(ODOMETRY, seen, DRIVE, EYE)
+    assert tags == (7,) and log.scan.tag.max() == 0
+    assert dropped == {"measurements outside the odometry": 2}
+
+
+def test_tags_may_be_text_and_unknown():
+    seen = [(1.0, "tree", 1, 0), (1.0, 12, 1, 0), (2.0, "", 1, 0), (2.0, None, 1, 0)]
+    log, _, tags, _ = Log.from_records(ODOMETRY, seen, DRIVE, EYE)
+    assert tags == (12, "tree")
+    np.testing.assert_array_equal(log.scan.tag, [[1, 0], [-1, -1], [-1, -1]])
+    assert log.scan.valid.sum() == 4
+
+
+def test_a_path_of_poses_becomes_increments():
+    """Composed again they give the path; between two poses it is straight."""
+    path = [(0.0, 1.0, 1.0, np.pi / 2), (1.0, 1.0, 3.0, np.pi), (2.0, 0.0, 3.0, -np.pi / 2)]
+    poses = columns(path, "t", "x", "y", "theta")
+    log, time, *_ = Log.from_records(poses, [(0.5, 1, 1, 0)], PoseIncrement(np.eye(3)), EYE)
+    np.testing.assert_array_equal(time, [0, 0.5, 1, 2])
+    np.testing.assert_allclose(log.control[[0, 1, 3]], [[0, 0, 0], [1, 0, np.pi / 4], [1, 0, np.pi / 2]], atol=1e-15)  # fmt: skip
+    at = np.array(path[0][1:])
+    for u in log.control:
+        at = compose(at, u)
+    np.testing.assert_allclose(at, [0, 3, -0.5 * np.pi], atol=1e-14)
+
+
+def test_a_sensor_of_no_landmark_needs_no_tag():
+    log, _, tags, _ = Log.from_records(ODOMETRY, [(2.0, 0.5)], DRIVE, Compass(np.eye(1)))
+    assert tags == ()
+    np.testing.assert_array_equal(log.scan.valid[:, 0], [False, True, False])
+
+
+EYES = Suite(((EYE, 3), (Compass(np.eye(1)), 1)))
+NORTH = [(1.5, 0.3), (2.5, 0.2)]
+
+
+def test_sensors_with_rates_of_their_own_are_one_log():
+    """Rows at the times of any; slots by sensor, as the suite has them (Solà 2.4)."""
+    log, time, tags, dropped = Log.from_records(ODOMETRY, (SEEN, NORTH), DRIVE, EYES)
+    np.testing.assert_allclose(time, [1.0, 1.5, 2.0, 2.5, 3.0])
+    np.testing.assert_allclose(log.control[3:], [[1, 0, 0.5], [1, 0, 0.5]])
+    assert (tags, dropped) == ((3, 7), {"measurements outside the odometry": 2})
+    valid = [[0, 0, 0, 0], [1, 1, 0, 1], [0, 0, 0, 0], [0, 0, 0, 1], [1, 0, 0, 0]]
+    np.testing.assert_array_equal(log.scan.valid, valid)
+    np.testing.assert_array_equal(log.scan.tag[1], [1, 0, -1, -1])
+    np.testing.assert_allclose(log.scan.z[1], [[2, 0.25], [3, -0.5], [0, 0], [0.3, 0]])
+    start = np.zeros(3), np.eye(3)
+    trace = run(EkfSlam(DRIVE, EYES, 2), log, *start, jax.random.key(0))
+    assert int(trace.info.tally(Status.FUSED)[3]) == 1
+
+
+def test_tables_that_are_not_those_of_the_suite_are_refused():
+    for seen, message in (
+        (
+            SEEN,
+            r"a table for each of the 2 sensors of the suite, \(range_bearing, compass\), got list",
+        ),
+        (
+            (SEEN, [(1.5, 0.3)] * 2),
+            r"measurements\[1\] of compass, row 1, .*at most 1 measurement at a",
+        ),
+    ):
+        with pytest.raises(ValueError, match=message):
+            Log.from_records(ODOMETRY, seen, DRIVE, EYES)
+    team = Suite((Part(EYE, 1, sees="robots"),))
+    with pytest.raises(
+        ValueError, match=r"of a team make the log of each robot by Log.from_streams"
+    ):
+        Log.from_records(ODOMETRY, (SEEN,), DRIVE, team)
+
+
+@refused(
+    (ODOMETRY, [(1, 7, 1)], r"measurements, row 0: expected 4 values"),
+    (columns(ODOMETRY, "t", "v", "w"), SEEN, r"odometry: expected a column 'omega \["),
+    (columns(ODOMETRY, "t", "v", "omega [rpm]"), SEEN, r"column 'omega \[rad/s\]', got 'o"),
+    ([*ODOMETRY, (4.0, np.nan, 0.0)], SEEN, r"odometry, row 3, column v: expected a finite"),
+    (ODOMETRY, [(1.0, 7, "1.0", 0)], r"column range: expected a finite number, got '1.0'"),
+    (ODOMETRY[::-1], SEEN, r"row 1, column t: expected a time above 3.0, got 2"),
+    (ODOMETRY[:1] * 2, SEEN, r"odometry, row 1, column t: expected a time above 1.0, got 1"),
+    (ODOMETRY, SEEN[::-1], r"measurements, row 1, column t: expected a time of at leas"),
+    (ODOMETRY, [(1.0, 7.5, 1, 0)], r"column tag: expected a whole number or text, got 7.5"),
+    (ODOMETRY, [(1.0, -2, 1, 0)], r"row 0, column tag: expected a number >= 0"),
+    (ODOMETRY, [(1.0, 7, 1, 0)] * 2, r"row 1, column tag: expected a tag once at a time"),
+    (ODOMETRY, [], r"measurements: expected at least one row, got none"),
+    ({"t": [1], "v": [], "omega": [1]}, SEEN, r"expected columns of one length"),
+    (3, SEEN, r"odometry: expected rows or columns, got int"),
+    told="Log.from_records: .*",
+)  # fmt: skip
+def test_bad_records_say_where(odometry, seen):
+    Log.from_records(odometry, seen, DRIVE, EYE)
+
+
+def test_increments_cannot_be_divided():
+    motion = SimpleNamespace(controls=("forward [m]", "turn [rad]"))
+    seen = [(1.5, 7, 1, 0)]
+    with pytest.raises(ValueError, match=r"row 0, column t: expected a time of the odometry"):
+        Log.from_records(ODOMETRY, seen, motion, EYE)
+    log, *_ = Log.from_records(ODOMETRY, [(2.0, 7, 1, 0)], motion, EYE)
+    np.testing.assert_array_equal(log.control, np.array(ODOMETRY)[:, 1:])
+
+
+def test_streams_need_a_row_for_each_measurement():
+    stream = np.arange(2.0), np.zeros((2, 1))
+    with pytest.raises(
+        ValueError, match="align: expected measurements at times of rows, got one a"
+    ):
+        streams.align_streams(stream, ([0.5], [0], np.ones((1, 2))), streams.as_recorded, [0, 1])
+    with pytest.raises(ValueError, match="expected a row at each time of the odometry"):
+        streams.align_streams(stream, ([0.5], [0], np.ones((1, 2))), streams.as_recorded)
