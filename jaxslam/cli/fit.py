@@ -1,17 +1,18 @@
 """The command `jaxslam fit`: the noises of one's own data by maximum likelihood."""
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from jaxslam.cli import cache
 from jaxslam.cli.common import add_out
-from jaxslam.cli.runtime import cache
 from jaxslam.core.logs.tables import POSE
 from jaxslam.datasets import Dataset, DatasetFit, fit, table
-from jaxslam.datasets.table.settings_text import changed, toml_lines
+from jaxslam.datasets.table_settings import changed, toml_lines
 from jaxslam.results.files import (
+    Files,
     Json,
     check_writable,
     json_number,
@@ -52,7 +53,7 @@ def fit_folder(options: argparse.Namespace, command: str) -> int:
     settings = Path(options.path) / "dataset.toml"
     good = result.found.converged and result.settled
     text = changed(settings, changes) if options.write and good else None
-    files: dict[str, str | Callable[[Path], object]] = {
+    files: Files = {
         "fit.json": json_text(
             _summary(data, result) | {"command": command, "versions": versions()}
         ),

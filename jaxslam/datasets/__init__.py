@@ -9,21 +9,19 @@ from functools import partial
 from pathlib import Path
 
 from jaxslam.datasets.bonn_reader import bonn
-from jaxslam.datasets.carmen.reader import LaserLog, carmen
+from jaxslam.datasets.carmen_reader import LaserLog, StampedRelations, carmen, relation_file
 from jaxslam.datasets.dataset import Dataset
-from jaxslam.datasets.mrclam.calibration import MRCLAM_CALIBRATION, RobotCalibration
-from jaxslam.datasets.mrclam.reader import (
+from jaxslam.datasets.mrclam_reader import (
     MRCLAM_FITTED,
     OwnCalibration,
     mrclam,
     mrclam_calibration,
+    mrclam_team,
 )
-from jaxslam.datasets.mrclam.robot import white_noise
-from jaxslam.datasets.mrclam.team import mrclam_team
+from jaxslam.datasets.mrclam_robot import MRCLAM_CALIBRATION, RobotCalibration, white_noise
 from jaxslam.datasets.noise_fit import DatasetFit, fit
 from jaxslam.datasets.plaza_reader import plaza
-from jaxslam.datasets.relation_reader import StampedRelations, relation_file
-from jaxslam.datasets.table.reader import table
+from jaxslam.datasets.table_reader import table
 from jaxslam.datasets.victoria_park_reader import victoria_park
 
 Reader = Callable[[str | Path, int | None], Dataset]

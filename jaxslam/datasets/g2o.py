@@ -262,10 +262,8 @@ def save(path: str | Path, graph: Graph) -> None:
     text = text_of(graph, _ENDINGS.get(ending, _G2O))
     _check_readable(graph)
 
-    def pack(target: Path) -> None:
-        target.write_bytes(gzip.compress(text.encode("utf-8"), mtime=0))
-
-    write_files(path.parent, {path.name: pack if packed else text})
+    content = gzip.compress(text.encode("utf-8"), mtime=0) if packed else text
+    write_files(path.parent, {path.name: content})
 
 
 def text_of(graph: Graph, form: Format = _G2O) -> str:

@@ -6,7 +6,6 @@ Grey images are PGM, P5 (binary) and P2 (text), read here; PNG and BMP are read 
 import io
 import math
 import warnings
-from collections.abc import Callable
 from pathlib import Path
 from typing import TypeVar
 
@@ -16,7 +15,7 @@ from numpy.typing import NDArray
 
 from jaxslam.datasets.lines import TextFile, read_bytes
 from jaxslam.laser.grids.grid import Grid, check_grid
-from jaxslam.results.files import write_files
+from jaxslam.results.files import Files, write_files
 
 _BY_MATPLOTLIB = {b"\x89PNG": "png", b"BM": "bmp"}
 
@@ -100,12 +99,6 @@ def _fields(path: Path, data: bytes, at: int, count: int) -> tuple[list[int], in
     return [int(word) for word in words], at
 
 
-def _pgm_bytes(image: NDArray[np.int64], top: int) -> bytes:
-    """A binary PGM file (P5) of shades (rows, columns), 0 to top <= 255, the first row on top."""
-    height, width = image.shape
-    return f"P5\n{width} {height}\n{top}\n".encode() + image.astype(np.uint8).tobytes()
-
-
 CERTAIN = math.log(509.0)
 """Log-odds of an occupied cell: p = 1 - ε with ε half a level of grey, 0.5/255."""
 
@@ -149,9 +142,7 @@ def save(path: str | Path, grid: Grid, mode: str) -> list[Path]:
     return write_files(path.parent, map_files(path.stem, grid, mode))
 
 
-def map_files(
-    stem: str, grid: Grid, mode: str = "trinary"
-) -> dict[str, str | Callable[[Path], object]]:
+def map_files(stem: str, grid: Grid, mode: str = "trinary") -> Files:
     """The map file STEM.yaml and its image STEM.pgm, as `write_files` takes them."""
     check_grid("write_map", grid)
     if mode not in _MODES:
@@ -169,8 +160,9 @@ def map_files(
         f"image: {_scalar(f'{stem}.pgm')}\nmode: {mode}\nresolution: {float(grid.resolution)!r}\n"
         f"origin: [{numbers}]\nnegate: 0\noccupied_thresh: {occupied}\nfree_thresh: {free}\n"
     )
-    data = _pgm_bytes(image, levels)
-    return {f"{stem}.yaml": text, f"{stem}.pgm": lambda target: target.write_bytes(data)}
+    height, width = image.shape  # the first row is on top
+    pgm = f"P5\n{width} {height}\n{levels}\n".encode() + image.astype(np.uint8).tobytes()
+    return {f"{stem}.yaml": text, f"{stem}.pgm": pgm}
 
 
 def _log_odds(p: NDArray[np.float64]) -> NDArray[np.float64]:

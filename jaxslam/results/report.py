@@ -1,10 +1,8 @@
-"""Results as text: a campaign's table, JSON and CSV, the table of its runs, CSV of one run."""
+"""Results as text: a campaign's table, JSON and CSV; CSV of one run."""
 
-import json
 import math
 import textwrap
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 
 import numpy as np
 
@@ -13,18 +11,12 @@ from jaxslam.consistency.campaign import Campaign
 from jaxslam.consistency.verdict import POWER, TESTS
 from jaxslam.core.types import Estimate
 from jaxslam.results.files import (
-    check_formats,
-    check_writable,
     csv_text,
     json_number,
     json_text,
     versions,
-    write_files,
 )
 from jaxslam.results.table import VERDICTS, Cell, lost_runs, notes_on, rows_of
-
-RUN_FORMATS = ("csv", "json")
-"""Of `save_runs`."""
 
 _COLUMNS = 5
 
@@ -185,35 +177,6 @@ def run_columns(campaign: Campaign) -> dict[str, np.ndarray]:
     for name in names:
         found[name] = np.concatenate([s.per_run.get(name, none) for s in filters.values()])
     return found
-
-
-def save_runs(campaign: Campaign, path: str | Path) -> Path:
-    """Write the table to a file of the format that its name ends in, whole or not at all.
-
-    In CSV what is not finite is an empty cell, in JSON (a list a column) null.
-
-    Raises ValueError on another format.
-    """
-    path = Path(path)
-    (kind,) = check_formats("Campaign.save_runs", path.suffix.removeprefix("."), RUN_FORMATS)
-    check_writable(path.parent)
-    found = run_columns(campaign)
-    if kind == "json":
-        made = json.dumps({name: _plain(column) for name, column in found.items()}) + "\n"
-    else:
-        cells = [
-            ["" if value is None else str(value) for value in _plain(column)]
-            for column in found.values()
-        ]
-        made = csv_text(list(found), [list(row) for row in zip(*cells, strict=True)])
-    return write_files(path.parent, {path.name: made})[0]
-
-
-def _plain(column: np.ndarray) -> list[object]:
-    """The values as Python's own, None where not finite."""
-    if column.dtype.kind != "f":
-        return list(column.tolist())
-    return [value if np.isfinite(value) else None for value in column.tolist()]
 
 
 def trajectory_csv(time: np.ndarray, estimate: Estimate) -> str:

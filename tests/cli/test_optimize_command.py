@@ -10,7 +10,7 @@ import small_graphs
 from reference import graph as plain
 
 from jaxslam import cli, graphs
-from jaxslam.cli.optimize import command
+from jaxslam.cli import optimize
 from jaxslam.results import plot
 
 
@@ -160,7 +160,7 @@ def test_gtsam_reads_what_is_written(tmp_path, undrawn, fixed):
 def test_an_optimum_without_a_proof_says_what_to_try(monkeypatch):
     proof = SimpleNamespace(certified=False, chi2=2.0, gap=1.0, position=0.1, heading=0.1)
     monkeypatch.setattr(graphs, "certificate", lambda graph: proof)
-    told = command._certificate(small(), converged=True, plain=True)
+    told = optimize._certificate(small(), converged=True, plain=True)
     assert told["certificate"].startswith("not certified: ") and "--start" in told["certificate"]
 
 
