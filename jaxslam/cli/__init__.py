@@ -54,7 +54,7 @@ COMMANDS = {
         "fit the noises of your own data to its log",
         "Find the standard deviations of motion and sensor by maximum likelihood, with standard "
         "errors, from a folder as of `jaxslam run --dataset table`. Prints a table and writes "
-        "fit.json and fit.toml, lines for dataset.toml.",
+        "fit.json, and fit.toml, which stands in for the noises of dataset.toml.",
     ),
     "slam": (
         slam,

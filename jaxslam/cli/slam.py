@@ -2,7 +2,7 @@
 
 import argparse
 from collections.abc import Mapping
-from typing import TYPE_CHECKING, NamedTuple
+from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
@@ -64,9 +64,21 @@ def run_slam(log: LaserLog, options: argparse.Namespace) -> laser.Job:
     summary = result_summary(solved) | laser.scored(log, lambda: _scores(log, solved))
     if given is None:
         return laser.Job(summary, files)
-    scores = scores_of(given, solved)
-    entries: Json = {"relations": score_entries(given, scores)}
-    return laser.Job(summary, files, score_text(given, scores), entries)
+    relations, dropped = given
+    joined, scores = len(relations.first), relation_scores(relations, log, solved)
+    text = (
+        f"relations of {options.relations}: {joined:,} of {joined + dropped:,} join the scans, "
+        f"within {TOLERANCE:g} s; errors, mean ± standard deviation:\n{_score_text(scores)}"
+    )
+    entry: Json = {
+        "file": options.relations,
+        "relations in the file": joined + dropped,
+        "joined": joined,
+        "not joined": dropped,
+        "tolerance [s]": TOLERANCE,
+        **scores,
+    }
+    return laser.Job(summary, files, text, {"relations": entry})
 
 
 def _solved(log: LaserLog, settings: Settings) -> Solved:
@@ -222,125 +234,68 @@ def _scores(log: LaserLog, solved: laser_slam.Solved) -> dict[str, object]:
     return out
 
 
-class GivenRelations(NamedTuple):
-    """The relations of a file between the scans of a log."""
-
-    joined: metrics.Relations
-    """R relations by the rows of the log"""
-    apart: Float[np.ndarray, "R"]
-    """[s] between the scans of each"""
-    dropped: int
-    """relations of the file without a scan at one of their stamps"""
-    source: str
-    """the file"""
-
-
-class Score(NamedTuple):
-    """What some of the relations say of a result."""
-
-    size: int
-    figures: dict[str, dict[str, metrics.MeanAndStd]]
-    """by path and quantity; empty without relations"""
-    inside: int
-    """relations in the ellipse of the graph's covariance"""
-    unknown: int
-    """relations without a covariance: of a scan and itself"""
-
-    @property
-    def share(self) -> float | None:
-        """Of those with a covariance, in the ellipse."""
-        known = self.size - self.unknown
-        return self.inside / known if known else None
-
-
-def given_relations(path: str, log: LaserLog) -> GivenRelations:
-    """The relations of a file between the scans of a log.
+def given_relations(path: str, log: LaserLog) -> tuple[metrics.Relations, int]:
+    """The relations of a file by the rows of the log, and how many have no scan at a stamp.
 
     Raises ValueError, with the file, on what `relation_file` refuses, and where none joins.
     """
     told = relation_file(path)
     try:
-        joined, dropped = metrics.given(
-            log.time, told.first, told.second, told.pose, tolerance=TOLERANCE
-        )
+        return metrics.given(log.time, told.first, told.second, told.pose, tolerance=TOLERANCE)
     except ValueError as problem:
         reason = str(problem).removeprefix("given: ")
         raise ValueError(f"--relations: {told.source}: {reason}") from problem
-    apart = np.abs(log.time[joined.second] - log.time[joined.first])
-    return GivenRelations(joined, apart, dropped, told.source)
 
 
-def scores_of(given: GivenRelations, solved: Solved) -> dict[str, Score]:
-    """The scores of all relations, and of those whose scans are far apart."""
-    nees = laser_slam.relation_nees(solved, *given.joined)
+def relation_scores(relations: metrics.Relations, log: LaserLog, solved: Solved) -> dict[str, Json]:
+    """Entries of all relations, and of those whose scans are far apart."""
+    nees = laser_slam.relation_nees(solved, *relations)
+    apart = np.abs(log.time[relations.second] - log.time[relations.first])
     paths = {
         "laser SLAM": solved.poses,
         "laser odometry": solved.odometry,
         "raw odometry": solved.raw,
     }
-    out = {}
-    far = given.apart > APART
-    for name, chosen in (("all", np.ones_like(far)), (f"over {APART:g} s apart", far)):
-        some = metrics.Relations(*(field[chosen] for field in given.joined))
-        count, found = len(some.first), nees[chosen]
+    out: dict[str, Json] = {}
+    for name, chosen in (("all", apart >= 0), (f"over {APART:g} s apart", apart > APART)):
+        some = metrics.Relations(*(field[chosen] for field in relations))
+        count, unknown = len(some.first), int(np.isnan(nees[chosen]).sum())
+        inside = int((nees[chosen] <= chi2_quantile(SHARE, 3)).sum())
         errors = {path: metrics.relation_errors(some, at) for path, at in paths.items()}
-        out[name] = Score(
-            count,
-            {path: metrics.benchmark_figures(of) for path, of in errors.items()} if count else {},
-            int((found <= chi2_quantile(SHARE, 3)).sum()),
-            int(np.isnan(found).sum()),
-        )
-    return out
-
-
-def score_entries(given: GivenRelations, scores: Mapping[str, Score]) -> Json:
-    """The entry of `summary.json`."""
-    joined = len(given.apart)
-    out: Json = {
-        "file": given.source,
-        "relations in the file": joined + given.dropped,
-        "joined": joined,
-        "not joined": given.dropped,
-        "tolerance [s]": TOLERANCE,
-    }
-    for name, score in scores.items():
-        by_path = {
-            path: {quantity: of._asdict() for quantity, of in figures.items()}
-            for path, figures in score.figures.items()
+        figures = {
+            path: {what: of._asdict() for what, of in metrics.benchmark_figures(of).items()}
+            for path, of in errors.items()
+            if count
         }
         out[name] = {
-            "relations": score.size,
-            **by_path,
-            "in the 95 % ellipse": score.inside,
-            "without a covariance": score.unknown,
-            "share in the 95 % ellipse": score.share,
+            "relations": count,
+            **figures,
+            "in the 95 % ellipse": inside,
+            "without a covariance": unknown,  # of a scan and itself
+            "share in the 95 % ellipse": inside / (count - unknown) if count > unknown else None,
         }
     return out
 
 
-def score_text(given: GivenRelations, scores: Mapping[str, Score]) -> str:
+def _score_text(scores: Mapping[str, Json]) -> str:
     """The scores as they are printed: a row for each path, a column for each quantity."""
     columns: dict[str, dict[str, object]] = {}
     lines = []
     for name, score in scores.items():
-        for path, figures in score.figures.items():
-            for quantity, (mean, std) in figures.items():
-                cell = f"{_shown(mean)} ± {_shown(std)}"
+        for path, figures in score.items():
+            for quantity, of in figures.items() if isinstance(figures, dict) else ():
+                cell = f"{_shown(of['mean'])} ± {_shown(of['std'])}"
                 columns.setdefault(quantity, {})[f"{name}, {path}"] = cell
-        if score.share is None:
-            lines.append(f"{name}: {score.size:,} relations")
-        else:
-            without = f", {score.unknown:,} without a covariance" if score.unknown else ""
-            lines.append(
-                f"{name}: {score.size:,} relations, {100 * score.share:.1f} % in the 95 % ellipse "
-                f"of the graph's covariance{without}"
-            )
-    joined = len(given.apart)
-    head = (
-        f"relations of {given.source}: {joined:,} of {joined + given.dropped:,} join the scans, "
-        f"within {TOLERANCE:g} s; errors, mean ± standard deviation:"
-    )
-    return "\n".join([head, summary_table(columns), *lines])
+        line, share = (
+            f"{name}: {score['relations']:,} relations",
+            score["share in the 95 % ellipse"],
+        )
+        if isinstance(share, float):
+            line += f", {100 * share:.1f} % in the 95 % ellipse of the graph's covariance"
+            if unknown := score["without a covariance"]:
+                line += f", {unknown:,} without a covariance"
+        lines.append(line)
+    return "\n".join([summary_table(columns), *lines])
 
 
 def _shown(value: float) -> str:

@@ -5,7 +5,7 @@ import re
 import tomllib
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
-from typing import Generic, NamedTuple, NoReturn, TypeVar
+from typing import Any, Generic, NamedTuple, NoReturn, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -132,94 +132,36 @@ def is_number(value: object) -> bool:
     )
 
 
-_Changes = Mapping[str, Mapping[str, Sequence[float]]]
-"""numbers by section and key"""
+FITTED = "fit.toml"
+"""The file of fitted numbers: beside `dataset.toml` they are taken in place of its own."""
 
 
-def toml_lines(changes: _Changes, comments: Mapping[str, str] | None = None) -> str:
-    """The changes as TOML, ready to paste. comments: by "section.key"."""
-    told = comments or {}
+def fitted_text(
+    numbers: Mapping[str, Mapping[str, Sequence[float]]], comments: Mapping[str, str]
+) -> str:
+    """The text of `FITTED` with numbers by section and key, and comments by "section.key"."""
     parts = []
-    for section, keys in changes.items():
+    for section, keys in numbers.items():
         lines = [
-            f"{key} = {_list(numbers)}"
-            + (f"  # {told[f'{section}.{key}']}" if f"{section}.{key}" in told else "")
-            for key, numbers in keys.items()
+            f"{key} = [{', '.join(f'{value:.4g}' for value in values)}]"
+            f"  # {comments[f'{section}.{key}']}\n"
+            for key, values in keys.items()
         ]
-        parts.append("\n".join([f"[{section}]", *lines]) + "\n")
+        parts.append(f"[{section}]\n" + "".join(lines))
     return "\n".join(parts)
 
 
-def changed(path: Path, changes: _Changes) -> str:
-    """The text of a file of settings with these numbers, else as it is; of no file, the fragment.
-
-    A list of numbers that stands on one line is replaced, its comment stays; others are inserted
-    below the head of their section, or at the end.
-
-    Raises ValueError where the result would not read as asked.
-    """
-    try:
-        text = path.read_text(encoding="utf-8")
-    except FileNotFoundError:
-        return toml_lines(changes)
-    before = tomllib.loads(text)
-    lines = text.split("\n")
-    for section, keys in changes.items():
-        head = _head(lines, section)
-        if head is None:
-            lines = [*"\n".join(lines).rstrip("\n").split("\n"), ""]
-            lines += toml_lines({section: keys}).split("\n")
-            continue
-        for key, numbers in keys.items():
-            at = _find(lines, rf"\s*{key}\s*=", head + 1, _end(lines, head))
-            if at is None:
-                lines.insert(head + 1, f"{key} = {_list(numbers)}")
-            else:
-                lines[at] = re.sub(r"\[[^\]#]*\]", _list(numbers), lines[at], count=1)
-    wanted = {name: dict(part) if isinstance(part, dict) else part for name, part in before.items()}
-    for section, keys in changes.items():
-        wanted[section] = (
-            wanted.get(section, {}) | tomllib.loads(toml_lines({section: keys}))[section]
-        )
-    result = "\n".join(lines)
-    try:
-        good = tomllib.loads(result) == wanted
-    except tomllib.TOMLDecodeError:
-        good = False
-    if not good:
-        raise ValueError(f"{path}: cannot be changed line by line: paste fit.toml by hand")
-    return result
-
-
-def line_number(text: str, section: str, key: str) -> int | None:
+def _line_number(text: str, section: str, key: str) -> int | None:
     """The line, from 1, of a key in a section ("": at the top), or of the section, or None."""
-    lines = text.split("\n")
-    head = _head(lines, section) if section else -1
-    if head is None:
-        return None
-    at = _find(lines, rf"\s*{re.escape(key)}\s*=", head + 1, _end(lines, head))
-    if at is None and not section:  # a section that stands where none is known
-        at = _head(lines, key)
-    return None if at is None and head < 0 else (head if at is None else at) + 1
-
-
-def _head(lines: Sequence[str], section: str) -> int | None:
-    return _find(lines, rf"\s*\[\s*{re.escape(section)}\s*\]", 0, len(lines))
-
-
-def _end(lines: Sequence[str], head: int) -> int:
-    """The line after a section."""
-    after = _find(lines, r"\s*\[", head + 1, len(lines))
-    return len(lines) if after is None else after
-
-
-def _list(numbers: Sequence[float]) -> str:
-    return f"[{', '.join(f'{number:.4g}' for number in numbers)}]"
-
-
-def _find(lines: Sequence[str], pattern: str, first: int, end: int) -> int | None:
-    """The first line from `first` to `end` that begins with a pattern."""
-    return next((i for i in range(first, end) if re.match(pattern, lines[i])), None)
+    current, head = "", None
+    for number, line in enumerate(text.split("\n"), 1):
+        if heading := re.match(r"\s*\[\s*(\w+)\s*\]", line):
+            current = heading[1]
+            if head is None and current == (section or key):
+                head = number
+        elif current == section and re.match(rf"\s*{re.escape(key)}\s*=", line):
+            return number
+    return head
 
 
 _Value = TypeVar("_Value")
@@ -276,6 +218,17 @@ class _WithInterval(Motion):
         return self.motion.step(pose, u[:-1], w)
 
 
+def _read(path: Path) -> tuple[str, dict[str, Any]]:
+    """The text and the content of a file of settings; empty where there is none."""
+    try:
+        text = path.read_text(encoding="utf-8")
+        return text, tomllib.loads(text)
+    except FileNotFoundError:
+        return "", {}
+    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as problem:
+        raise ValueError(f"{path}: cannot be read: {problem}") from problem
+
+
 class TableSettings:
     """The settings of a folder; `assumed` lists the defaults taken so far.
 
@@ -285,14 +238,13 @@ class TableSettings:
     def __init__(self, path: Path) -> None:
         self.path = path
         self.assumed: list[str] = []
-        try:
-            self._text = path.read_text(encoding="utf-8")
-            self.content = tomllib.loads(self._text)
-        except FileNotFoundError:
-            self._text, self.content = "", {}
+        self._text, self.content = _read(path)
+        if not path.exists():
             self.assumed.append(f"no {path.name}")
-        except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as problem:
-            raise ValueError(f"{path}: cannot be read: {problem}") from problem
+        fitted = _read(path.with_name(FITTED))[1]
+        for section in fitted.keys() & {"motion", "sensor"}:
+            self.content[section] = self.content.get(section, {}) | fitted[section]
+            self.assumed.append(f"[{section}] {', '.join(fitted[section])} of {FITTED}")
         known = ("name", "source", "motion", "sensor", "filter")
         self._check_keys("", self.content, known)
         for name in known:
@@ -481,6 +433,6 @@ class TableSettings:
 
     def _at(self, section: str, key: str) -> str:
         """The place of a key, with which a message begins."""
-        line = line_number(self._text, section, key)
+        line = _line_number(self._text, section, key)
         where = f"{self.path}:" + (f"{line}: " if line else " ")
         return where + (f"[{section}] " if section else "") + key

@@ -11,13 +11,12 @@ from itertools import groupby
 
 import numpy as np
 
-from jaxslam.consistency import LEVEL, Average, Summary, lopsided
-from jaxslam.consistency import percentage as plain_percentage
+from jaxslam.consistency import LEVEL, Average, Summary, percentage
 from jaxslam.consistency.campaign import Campaign
 from jaxslam.consistency.verdict import TESTS
 from jaxslam.results import report, table
 from jaxslam.results.plot import Figure, describe, png
-from jaxslam.results.table import VERDICTS
+from jaxslam.results.table import VERDICTS, cell_text, short
 
 
 def _text(name: str) -> str:
@@ -42,8 +41,6 @@ FRAGMENT_CSS = f"""
 figure {{ margin: 1rem 0; }} }}"""
 """Rules nested below one class, with light colours alone: figures are light, too."""
 
-
-__all__ = ["VERDICTS", "fragment", "page"]
 
 _UPRIGHT = 5
 """With more filters, the table is printed on a landscape page of its own."""
@@ -134,25 +131,32 @@ def _setup(campaign: Campaign) -> str:
 
 
 def _figures(figures: Mapping[str, tuple[str, Figure]], draw: Callable[[Figure], bytes]) -> str:
-    """The figures as HTML, numbered."""
-    return "\n".join(
-        embedded_figure(i, caption, figure, draw(figure))
-        for i, (caption, figure) in enumerate(figures.values(), 1)
-    )
+    """The figures as HTML, numbered, with the PNG files embedded."""
+    out = []
+    for i, (caption, figure) in enumerate(figures.values(), 1):
+        width, height = (round(96 * inches) for inches in figure.get_size_inches())
+        data = base64.b64encode(draw(figure)).decode("ascii")
+        out.append(
+            f'<figure><img width="{width}" height="{height}" alt="{escape(describe(figure))}" '
+            f'src="data:image/png;base64,{data}">'
+            f"<figcaption><strong>Figure {i}.</strong> {escape(caption)}</figcaption></figure>"
+        )
+    return "\n".join(out)
 
 
 def _conventions(campaign: Campaign) -> str:
     """The definitions of measures and verdicts as HTML."""
+    level, rest = (_unbroken(percentage(share)) for share in (LEVEL, 1 - LEVEL))
     meanings = "\n".join(
         f"<dt>{badge(verdict)}</dt><dd>{escape(meaning)}.</dd>"
         for verdict, (_, meaning) in VERDICTS.items()
     )
     return f"""<p><strong>NEES</strong> = eᵀP⁻¹e is <em>not</em> divided by its degrees of freedom,
-which are the honest value. <strong>±</strong> is half the {percentage(LEVEL)} interval of the mean
+which are the honest value. <strong>±</strong> is half the {level} interval of the mean
 over independent runs. A run is <strong>divergent</strong> when its final position error exceeds
 {campaign.divergence_limit:.3g} m, 5 σ of the EKF with Jacobians at the truth.</p>
 <p>The <strong>verdict</strong> goes by the pose NEES and by NIS / dof, averaged over time, with
-intervals so wide that an honest filter of a linear problem is rejected in {percentage(1 - LEVEL)}
+intervals so wide that an honest filter of a linear problem is rejected in {rest}
 of campaigns. An asterisk marks a verdict with a reservation:</p>
 <dl class="meanings">
 {meanings}
@@ -184,8 +188,8 @@ def verdict_list(campaign: Campaign) -> str:
     """Name, badge and tested measures of each filter as HTML, and what qualifies the verdicts."""
     items = []
     for name, summary in campaign.filters.items():
-        there = [key for key in TESTS if key in summary.measures]
-        said = [f"{TESTS[key]} {_average(summary.measures[key])}" for key in there]
+        tested = [key for key in TESTS if key in summary.measures]
+        said = [f"{TESTS[key]} {cell_text(summary.measures[key])}" for key in tested]
         lines = "".join(f'<span class="why">{line}</span>' for line in said or ["no pose NEES"])
         label = f'<span class="name">{breakable(name)}</span>'
         items.append(f"<li>{label}{badge(summary.verdict, summary)}{lines}</li>")
@@ -236,29 +240,16 @@ def _row(row: table.Row) -> str:
 
 
 def _cell(cell: table.Cell, published: float | None) -> str:
-    """A cell of the table as HTML, with the number by which the script sorts filters."""
-    value: float | None = None
-    title, text = "", "–"
+    """A cell of the table as HTML; the pointer on a measure shows its interval."""
+    title, text = "", escape(_unbroken(cell_text(cell)))
     if isinstance(cell, Summary):
-        ranks = list(VERDICTS)
-        value = ranks.index(cell.verdict) if cell.verdict in ranks else None
         text = badge(cell.verdict, cell)
-    elif isinstance(cell, Average):
-        value, title, text = cell.value, _interval(cell), _average(cell)
-    elif cell is not None:
-        value, text = cell.value, escape(_unbroken(cell.text))
-    key = "" if value is None or not np.isfinite(value) else f' data-v="{value:.6g}"'
-    note = "" if published is None else f"published {number(published, 4)}"
-    return (
-        f"<td{key}{title}>{text}" + f'<span class="published">{note}</span>' * bool(note) + "</td>"
-    )
-
-
-def _interval(measure: Average) -> str:
-    """The HTML attribute that shows a measure's interval under the pointer."""
-    if not np.isfinite(measure.high):
-        return ""
-    return f' title="{percentage(LEVEL)} interval {measure.low:.5g} to {measure.high:.5g}"'
+    elif isinstance(cell, Average) and np.isfinite(cell.high):
+        ends = f"{cell.low:.5g} to {cell.high:.5g}"
+        title = f' title="{_unbroken(percentage(LEVEL))} interval {ends}"'
+    if published is not None:
+        text += f'<span class="published">published {short(published)}</span>'
+    return f"<td{title}>{text}</td>"
 
 
 def _unbroken(text: str) -> str:
@@ -272,49 +263,6 @@ def measure_notes(campaign: Campaign) -> str:
         f'<p class="note"><strong>{escape(term)}</strong>: {escape(said)}.</p>'
         for term, said in table.notes_on(campaign)
     )
-
-
-def embedded_figure(number: int, caption: str, figure: Figure, drawn: bytes) -> str:
-    """A figure with its caption as HTML, the PNG file embedded."""
-    width, height = (round(96 * inches) for inches in figure.get_size_inches())
-    data = base64.b64encode(drawn).decode("ascii")
-    return (
-        f'<figure><img width="{width}" height="{height}" '
-        f'alt="{escape(describe(figure))}" '
-        f'src="data:image/png;base64,{data}">'
-        f"<figcaption><strong>Figure {number}.</strong> {escape(caption)}</figcaption></figure>"
-    )
-
-
-def _average(measure: Average) -> str:
-    """A measure as value ± half-width to two digits, or with [low, high] if that is asymmetric."""
-    half = (measure.high - measure.low) / 2
-    if not np.isfinite(measure.high) and measure.low <= 0:
-        return number(measure.value, 4)
-    if lopsided(measure):
-        ends = (number(end, 3) if np.isfinite(end) else "∞" for end in measure[1:])
-        return f"{number(measure.value, 4)} [{', '.join(ends)}]"
-    if half == 0:
-        return f"{number(measure.value, 4)} ± 0"
-    size = max(abs(measure.value), half)
-    power = 0 if 1e-3 <= size < 1e6 else int(np.floor(np.log10(size)))
-    value, half = measure.value / 10.0**power, half / 10.0**power
-    digits = min(max(1 - int(np.floor(np.log10(half))), 0), 6)
-    text = f"{value:,.{digits}f} ± {half:,.{digits}f}"
-    return (f"({text})·10<sup>{power}</sup>" if power else text).replace("-", "−")
-
-
-def number(value: float, digits: int) -> str:
-    """A number with some significant digits; small and large ones with a power of ten."""
-    if value == 0 or 1e-3 <= abs(value) < 1e6:
-        return f"{value:.{digits}g}".replace("-", "−")
-    mantissa, power = f"{value:.{digits - 1}e}".split("e")
-    return f"{mantissa}·10<sup>{int(power)}</sup>".replace("-", "−")
-
-
-def percentage(share: float, digits: int = 0) -> str:
-    """A share as a percentage, with a no-break space."""
-    return _unbroken(plain_percentage(share, digits))
 
 
 def with_noun(number: int, noun: str) -> str:

@@ -6,7 +6,7 @@ from collections.abc import Iterable, Sequence
 
 import numpy as np
 
-from jaxslam.consistency import LEVEL, LEVELS, Average, Summary, lopsided, percentage
+from jaxslam.consistency import LEVEL, LEVELS, Average, Summary, percentage
 from jaxslam.consistency.campaign import Campaign
 from jaxslam.consistency.verdict import POWER, TESTS
 from jaxslam.core.types import Estimate
@@ -16,7 +16,7 @@ from jaxslam.results.files import (
     json_text,
     versions,
 )
-from jaxslam.results.table import VERDICTS, Cell, lost_runs, notes_on, rows_of
+from jaxslam.results.table import VERDICTS, Cell, cell_text, lost_runs, notes_on, rows_of, short
 
 _COLUMNS = 5
 
@@ -221,9 +221,9 @@ def _columns(campaign: Campaign, names: list[str]) -> str:
     """The table of some filters."""
     lines = [["", "honest", *names]]
     for row in rows_of(campaign, names):
-        lines.append([row.label, row.honest, *map(_cell, row.cells)])
+        lines.append([row.label, row.honest, *map(cell_text, row.cells)])
         if row.published:
-            told = ("" if value is None else f"{value:.4g}" for value in row.published)
+            told = ("" if value is None else short(value) for value in row.published)
             lines.append(["  published", "", *told])
     widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
     text = [
@@ -235,30 +235,6 @@ def _columns(campaign: Campaign, names: list[str]) -> str:
     ]
     text.insert(1, "-" * len(text[0]))
     return "\n".join(text)
-
-
-def _verdict(summary: Summary) -> str:
-    """The verdict, the tests that rejected, and an asterisk if there are doubts."""
-    rejected = ", ".join(
-        TESTS[name].removeprefix("pose ").removesuffix(" / dof") for name in summary.by
-    )
-    return summary.verdict + f" ({rejected})" * bool(rejected) + "*" * bool(summary.doubts)
-
-
-def _cell(cell: Cell) -> str:
-    """A cell of the table as text."""
-    if cell is None:
-        return "-"
-    if isinstance(cell, Summary):
-        return _verdict(cell)
-    if not isinstance(cell, Average):
-        return cell.text
-    value, low, high = cell
-    if not (np.isfinite(low) or np.isfinite(high)) or (low, high) == (0.0, np.inf):
-        return f"{value:.4g}"
-    if lopsided(cell):
-        return f"{value:.4g} [{low:.3g}, {high:.3g}]".replace("inf", "∞")
-    return f"{value:.4g} ± {(high - low) / 2:.2g}"
 
 
 def _finite_or_none(values: Iterable[float]) -> list[float | None]:
