@@ -1,5 +1,7 @@
 """Figures of run 0: the errors of filters with their claimed bounds."""
 
+import textwrap
+
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
@@ -14,9 +16,9 @@ from jaxslam.results.plot.style import (
     INK,
     PAGE,
     caption,
-    in_lines,
     ordinate,
     panels_of,
+    plain,
     step_limits,
     titled,
 )
@@ -34,23 +36,21 @@ _SMALL = 0.1
 
 
 def errors_figure(
-    estimate: Estimate, truth: Truth, *, n_sigma: float = 3.0, title: str = "", width: float = PAGE
+    estimate: Estimate, truth: Truth, *, title: str = "", width: float = PAGE
 ) -> Figure:
-    """Errors of x, y and heading over the steps, with ±n σ of the filter's own covariance."""
+    """Errors of x, y and heading over the steps, with ±3 σ of the filter's own covariance."""
     check_record("errors_figure", "the first argument", estimate, Estimate)
-    error, bound = _errors(estimate, truth, n_sigma)
+    error, bound = _errors(estimate, truth)
     figure, panels = panels_of(width, 0.55 * width + 1.4, 3)
     for i, (axes, name) in enumerate(zip(panels, _QUANTITIES, strict=True)):
-        _draw(axes, error[:, i], bound[:, i], n_sigma)
+        _draw(axes, error[:, i], bound[:, i])
         ordinate(axes, name, 0.18 * width + 0.3)
     caption(figure, title)
     panels[-1].set_xlabel("step")
     return figure
 
 
-def run_errors_figure(
-    campaign: Campaign, *, n_sigma: float = 3.0, title: str = "", width: float = PAGE
-) -> Figure:
+def run_errors_figure(campaign: Campaign, *, title: str = "", width: float = PAGE) -> Figure:
     """Errors of run 0 of every filter of `Campaign.first`, a row each, as `errors_figure`.
 
     The scales are the same, but for panels that would fill less than a tenth of theirs: these have
@@ -62,10 +62,8 @@ def run_errors_figure(
         raise ValueError("run_errors_figure: the campaign holds no run 0 (Campaign.first is empty)")
     if len(campaign.first) == 1:
         ((truth, estimate),) = campaign.first.values()
-        return errors_figure(estimate, truth, n_sigma=n_sigma, title=title, width=width)
-    found = {
-        n: _errors(estimate, truth, n_sigma) for n, (truth, estimate) in campaign.first.items()
-    }
+        return errors_figure(estimate, truth, title=title, width=width)
+    found = {n: _errors(estimate, truth) for n, (truth, estimate) in campaign.first.items()}
     setters = scale_setters(campaign)
     peaks = {
         name: np.nanmax([np.abs(error).max(axis=0), bound.max(axis=0)], axis=0)
@@ -85,28 +83,31 @@ def run_errors_figure(
             axes.set_ylim(-1.05 * top or -1.0, 1.05 * top or 1.0)
             if top != common:
                 axes.set_yticks([-top, 0.0, top], [f"−{top:.2g}", "0", f"{top:.2g}"], weight="bold")
-            _draw(axes, error[:, i], bound[:, i], n_sigma)
+            _draw(axes, error[:, i], bound[:, i])
             mark_beyond(axes)
-        panels[3 * j].set_ylabel(in_lines(name), rotation=0, ha="right", va="center")
+        words = plain(name).replace("_", "_ ")
+        wrapped = textwrap.wrap(words, 12, break_long_words=False)
+        lines = [line.replace("_ ", "_") for line in wrapped]
+        panels[3 * j].set_ylabel("\n".join(lines), rotation=0, ha="right", va="center")
     for axes in panels[-3:]:
         axes.set_xlabel("step")
     caption(figure, title)
     return figure
 
 
-def _errors(estimate: Estimate, truth: Truth, n_sigma: float) -> tuple[np.ndarray, np.ndarray]:
-    """The errors (T, 3), truth minus estimate, and n σ, in metres and degrees."""
+def _errors(estimate: Estimate, truth: Truth) -> tuple[np.ndarray, np.ndarray]:
+    """The errors (T, 3), truth minus estimate, and 3 σ, in metres and degrees."""
     error = np.asarray(truth.pose) - np.asarray(estimate.pose)
     error[:, 2] = np.mod(error[:, 2] + np.pi, 2 * np.pi) - np.pi
     variance = np.diagonal(np.asarray(estimate.pose_cov), axis1=1, axis2=2)
     scale = np.array([1.0, 1.0, np.rad2deg(1.0)])
-    return scale * error, n_sigma * scale * np.sqrt(np.maximum(variance, 0.0))
+    return scale * error, 3 * scale * np.sqrt(np.maximum(variance, 0.0))
 
 
-def _draw(axes: Axes, error: np.ndarray, bound: np.ndarray, n_sigma: float) -> None:
+def _draw(axes: Axes, error: np.ndarray, bound: np.ndarray) -> None:
     """Draw errors over the steps within their bounds."""
     step = np.arange(1, len(error) + 1)
-    label = f"±{n_sigma:g} σ claimed"
+    label = "±3 σ claimed"
     axes.fill_between(step, -bound, bound, color=COLORS[0], alpha=0.18, lw=0, label=label)
     axes.plot(step, bound, step, -bound, color=COLORS[0], lw=0.5)
     label = "truth - estimate"

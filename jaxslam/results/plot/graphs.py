@@ -4,6 +4,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from jax.typing import ArrayLike
+from jaxtyping import Float
 from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
@@ -24,6 +25,13 @@ from jaxslam.results.plot.style import (
     panels_of,
     titled,
 )
+
+_EDGES: dict[str, Look] = {
+    "measurements of points": {"color": SHADE, "lw": 0.4, "zorder": 1.5},
+    "loop edges": {"color": FAINT, "lw": 0.5, "zorder": 2.0},
+    "path": {"color": COLORS[0], "lw": 0.9, "zorder": 3.0},
+}
+"""How edges look: the path is between poses of successive ids."""
 
 
 def graph_figure(
@@ -50,10 +58,18 @@ def graph_figure(
         subtitles: of the panels. width: [in].
     """
     factors = factors_of("graph_figure", after, factors)
+    ratios = [
+        (float(value) / len(factors[key].errors), key, row)
+        for key in _drawn(after, factors)
+        for row, value in enumerate(np.asarray(squared[key]))
+    ]
+    largest = sorted((each for each in ratios if each[0] > 0), key=lambda each: -each[0])[:worst]
     figure, panels = panels_of(width, 0.52 * width, 1, 2, share=(False, False))
-    marked = _worst(after, squared, factors, worst)
     for axes, graph, text in zip(panels, (before, after), subtitles, strict=True):
-        _draw(axes, graph, factors, marked)
+        _draw(axes, graph, factors)
+        if largest:
+            ends = [_ends(graph, factors[key], key)[row] for _, key, row in largest]
+            _mark(axes, np.array(ends))
         titled(axes, text)
         axes.set_xlabel("x [m]")
     panels[0].set_ylabel("y [m]")
@@ -61,79 +77,54 @@ def graph_figure(
     return figure
 
 
-def _worst(
-    graph: Graph, squared: Mapping[str, ArrayLike], factors: Mapping[str, Factor], count: int
-) -> dict[str, np.ndarray]:
-    """The rows of each table that are marked: the largest, by residual and size of it."""
-    found: dict[str, np.ndarray] = {key: np.zeros(0, int) for key in graph.tables}
-    drawn = [key for key in graph.tables if len(factors[key].variables) == 2]
-    ratio = [np.asarray(squared[key]) / len(factors[key].errors) for key in drawn]
-    table = np.repeat(np.arange(len(drawn)), [len(each) for each in ratio])
-    row = np.concatenate([np.zeros(0, int), *(np.arange(len(each)) for each in ratio)])
-    every = np.concatenate([np.zeros(0), *ratio])
-    largest = np.argsort(-every, kind="stable")[:count]
-    largest = largest[every[largest] > 0]
-    for i, key in enumerate(drawn):
-        found[key] = row[largest[table[largest] == i]]
-    return found
+def _drawn(graph: Graph, factors: Mapping[str, Factor]) -> list[str]:
+    """The tables that are drawn: those of edges between two variables."""
+    return [key for key in graph.tables if len(factors[key].variables) == 2]
 
 
-def _draw(
-    axes: Axes, graph: Graph, factors: Mapping[str, Factor], marked: Mapping[str, np.ndarray]
-) -> None:
-    """Draw path, loop edges, points and what is marked."""
-    poses, points = np.asarray(graph.poses)[:, :2], np.asarray(graph.points)
-    bad = []
-    for key, table in graph.tables.items():
-        if len(factors[key].variables) != 2:
-            continue
-        who, valid = np.asarray(table.who), np.asarray(table.valid)
-        between = factors[key].variables == ("pose", "pose")
-        ends = np.stack([poses[who[:, 0]], (poses if between else points)[who[:, 1], :2]], axis=1)
-        if between:
-            steps = successive(graph, who)
-            _lines(axes, ends[valid & ~steps], "loop edges", FAINT, 0.4, 2.0, alpha=0.5)
-            _lines(axes, ends[valid & steps], "path", COLORS[0], 0.8, 3.0)
+def _ends(graph: Graph, factor: Factor, key: str) -> Float[np.ndarray, "E 2 2"]:
+    """The positions that the edges of a table join."""
+    poses, who = np.asarray(graph.poses)[:, :2], np.asarray(graph.tables[key].who)
+    other = poses if factor.variables == ("pose", "pose") else np.asarray(graph.points)[:, :2]
+    return np.stack([poses[who[:, 0]], other[who[:, 1]]], axis=1)
+
+
+def _edges(graph: Graph, factors: Mapping[str, Factor]) -> dict[str, Float[np.ndarray, "E 2 2"]]:
+    """The ends of all edges, by the names of `_EDGES`."""
+    found = {name: [np.zeros((0, 2, 2))] for name in _EDGES}
+    for key in _drawn(graph, factors):
+        table, ends = graph.tables[key], _ends(graph, factors[key], key)
+        valid = np.asarray(table.valid)
+        if factors[key].variables == ("pose", "pose"):
+            along = successive(graph, np.asarray(table.who))
+            found["path"].append(ends[valid & along])
+            found["loop edges"].append(ends[valid & ~along])
         else:
-            _lines(axes, ends[valid], "measurements of points", SHADE, 0.3, 1.5, alpha=0.6)
-        bad.append(ends[marked[key]])
-    if len(points):
-        axes.plot(*points[:, :2].T, ".", color=COLORS[2], ms=3, label="points", zorder=4)
-    worst = np.concatenate([np.zeros((0, 2, 2)), *bad])
-    if len(worst):
-        axes.add_collection(LineCollection(list(worst), colors=COLORS[1], linewidths=1.4, zorder=5))
-        ring: Look = {
-            "ls": "none",
-            "mfc": "none",
-            "mec": COLORS[1],
-            "mew": 0.9,
-            "ms": 5,
-            "zorder": 5,
-        }
-        label = f"{len(worst)} largest residuals"
-        axes.plot(*worst.mean(axis=1).T, marker="o", label=label, **ring)
-    start: Look = {
-        "ls": "none",
-        "color": INK,
-        "mfc": "white",
-        "mew": 1.2,
-        "ms": 5,
-        "zorder": 6,
-    }
-    axes.plot(*poses[0], marker="o", label="first pose", **start)
+            found["measurements of points"].append(ends[valid])
+    return {name: np.concatenate(each) for name, each in found.items()}
+
+
+def _draw(axes: Axes, graph: Graph, factors: Mapping[str, Factor]) -> None:
+    """Draw path, loop edges and points."""
+    for name, ends in _edges(graph, factors).items():
+        if len(ends):
+            axes.add_collection(LineCollection(list(ends), alpha=0.8, label=name, **_EDGES[name]))
+            axes.update_datalim(ends.reshape(-1, 2))
+    if len(graph.points):
+        points = np.asarray(graph.points)[:, :2]
+        axes.plot(*points.T, ".", color=COLORS[2], ms=3, label="points", zorder=4)
+    start: Look = {"ls": "none", "color": INK, "mfc": "white", "mew": 1.2, "ms": 5, "zorder": 6}
+    axes.plot(*np.asarray(graph.poses)[0, :2], marker="o", label="first pose", **start)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.04)
 
 
-def _lines(
-    axes: Axes, ends: np.ndarray, label: str, color: str, width: float, order: float, **more: float
-) -> None:
-    if len(ends):
-        lines = LineCollection(
-            list(ends), colors=color, linewidths=width, label=label, zorder=order, **more
-        )
-        axes.add_collection(lines)
-        axes.update_datalim(ends.reshape(-1, 2))
+def _mark(axes: Axes, ends: Float[np.ndarray, "E 2 2"]) -> None:
+    """Mark edges with large residuals."""
+    axes.add_collection(LineCollection(list(ends), colors=COLORS[1], linewidths=1.4, zorder=5))
+    ring: Look = {"ls": "none", "mfc": "none", "mec": COLORS[1], "mew": 0.9, "ms": 5, "zorder": 5}
+    label = f"{len(ends)} largest residuals"
+    axes.plot(*ends.mean(axis=1).T, marker="o", label=label, **ring)
 
 
 def graph_scene(
@@ -166,55 +157,27 @@ def graph_scene(
     factors = factors_of("graph_scene", iterates[0], factors)
     poses = np.stack([np.asarray(graph.poses)[:, :2] for graph in iterates])
     points = np.stack([np.asarray(graph.points)[:, :2] for graph in iterates])
-    found: dict[str, list[np.ndarray]] = {"path": [], "loop edges": [], "measurements": []}
-    for key, table in iterates[0].tables.items():
-        if len(factors[key].variables) != 2:
-            continue
-        who = np.asarray(table.who)[np.asarray(table.valid)]
-        between = factors[key].variables == ("pose", "pose")
-        other = (poses if between else points)[:, who[:, 1]]
-        ends = np.stack([poses[:, who[:, 0]], other], axis=2)
-        if not between:
-            found["measurements"].append(ends)
-            continue
-        along = successive(iterates[0], who)
-        found["path"].append(ends[:, along])
-        found["loop edges"].append(ends[:, ~along])
-    edges = {name: np.concatenate(each, axis=1) for name, each in found.items() if each}
+    every = [_edges(graph, factors) for graph in iterates]
     layers: list[Layer] = [still(poses[-1], color=SHADE, lw=2.5, label="path at the end", zorder=1)]
-    for name, color, width, order in (
-        ("measurements", SHADE, 0.4, 1.5),
-        ("loop edges", FAINT, 0.5, 2.0),
-        ("path", COLORS[0], 0.9, 3.0),
-    ):
-        if name in edges and edges[name].shape[1]:
-            layers.append(
-                lines_between(list(edges[name]), color=color, lw=width, label=name, zorder=order)
-            )
+    for name, look in _EDGES.items():
+        if len(every[0][name]):
+            layers.append(lines_between([edges[name] for edges in every], label=name, **look))
     if points.shape[1]:
-        shown = np.ones(points.shape[:2], bool)
-        layers.append(
-            marks(points, shown, marker=".", ms=3, color=COLORS[2], label="points", zorder=4)
-        )
-    first = np.ones((len(poses), 1), bool)
-    layers.append(
-        marks(poses[:, :1], first, marker="o", ms=5, mec=INK, mfc="white", label="first pose")
-    )
-    xlim, ylim = _limits(np.concatenate([poses, points], axis=1))
+        dots: Look = {"marker": ".", "ms": 3, "color": COLORS[2], "label": "points", "zorder": 4}
+        layers.append(marks(points, np.ones(points.shape[:2], bool), **dots))
+    first: Look = {"marker": "o", "ms": 5, "mec": INK, "mfc": "white", "label": "first pose"}
+    layers.append(marks(poses[:, :1], np.ones((len(poses), 1), bool), **first))
 
     def said(k: int) -> str:
         step = k if steps is None else steps[k]
         when = f"iteration {step}" if step else "start"
         return f"{when}, χ² = {chi2[k]:.6g}"
 
-    return Scene(len(iterates), Panel(layers, xlim, ylim), None, said, title, note)
-
-
-def _limits(places: np.ndarray) -> tuple[tuple[float, float], tuple[float, float]]:
-    """Limits of x and y that hold the first and the last iterate, and of the others the bulk."""
-    ends = places[[0, -1]].reshape(-1, 2)
-    least = np.minimum(ends.min(axis=0), np.quantile(places.reshape(-1, 2), 0.01, axis=0))
-    most = np.maximum(ends.max(axis=0), np.quantile(places.reshape(-1, 2), 0.99, axis=0))
+    # The limits hold the first and the last iterate, and of the others the bulk.
+    places = np.concatenate([poses, points], axis=1)
+    ends, rest = places[[0, -1]].reshape(-1, 2), places.reshape(-1, 2)
+    least = np.minimum(ends.min(axis=0), np.quantile(rest, 0.01, axis=0))
+    most = np.maximum(ends.max(axis=0), np.quantile(rest, 0.99, axis=0))
     margin = 0.04 * max(float((most - least).max()), 1.0)
-    (x0, y0), (x1, y1) = least - margin, most + margin
-    return (float(x0), float(x1)), (float(y0), float(y1))
+    x, y = ((float(a - margin), float(b + margin)) for a, b in zip(least, most, strict=True))
+    return Scene(len(iterates), Panel(layers, x, y), None, said, title, note)

@@ -126,11 +126,10 @@ def map_figure(
     dead_reckoning: np.ndarray | None = None,
     others: Mapping[str, Estimate] | None = None,
     names: Sequence[object] | None = None,
-    n_sigma: float = 3.0,
     title: str = "",
     width: float = 6.0,
 ) -> Figure:
-    """The estimated path and final map with n-σ ellipses, and the truth if it is known.
+    """The estimated path and final map with 3 σ ellipses, and the truth if it is known.
 
     Args:
         estimate: with leading T, as in `Trace.estimate`.
@@ -143,7 +142,7 @@ def map_figure(
         names: of the landmarks, by tag. A panel below shows the distance of each landmark of the
             map from its point in true_points, with what its covariance claims in that direction,
             and lines join the two.
-        n_sigma: size of ellipses and claims. width: [in].
+        width: [in].
 
     Raises ValueError if names are given without true_points.
     """
@@ -156,7 +155,7 @@ def map_figure(
     figure, panels = panels_of(width, tall, len(heights), share=(False, False), heights=heights)
     axes = panels[0]
     shown = _draw_truth(axes, true_path, true_points, "true" if names is None else "surveyed")
-    shown += _draw_estimate(axes, estimate, n_sigma)
+    shown += _draw_estimate(axes, estimate)
     if dead_reckoning is not None:
         path = np.asarray(dead_reckoning)[:, :2]
         axes.plot(*path.T, color=FAINT, lw=1.0, ls=(0, (1, 1.2)), label="dead reckoning", zorder=2)
@@ -169,15 +168,13 @@ def map_figure(
         axes.plot(*points.T, ".", color=color, ms=3, zorder=5.2)
     _limit(axes, shown)
     if names is not None:
-        _draw_residuals(axes, panels[1], estimate, np.asarray(true_points), names, n_sigma)
+        _draw_residuals(axes, panels[1], estimate, np.asarray(true_points), names)
         figure.align_ylabels()
     caption(figure, title, every_handle(panels))
     return figure
 
 
-def run_map_figure(
-    campaign: Campaign, *, n_sigma: float = 3.0, title: str = "", width: float = PAGE
-) -> Figure:
+def run_map_figure(campaign: Campaign, *, title: str = "", width: float = PAGE) -> Figure:
     """Path and final map of run 0 of every filter of `Campaign.first`, with the truth.
 
     The panels show the true map and its surroundings; estimates may leave them. Raises ValueError
@@ -188,7 +185,7 @@ def run_map_figure(
         raise ValueError("run_map_figure: the campaign holds no run 0 (Campaign.first is empty)")
     if len(campaign.first) == 1:
         ((truth, estimate),) = campaign.first.values()
-        return map_figure(estimate, truth=truth, n_sigma=n_sigma, title=title, width=width)
+        return map_figure(estimate, truth=truth, title=title, width=width)
     columns = min(len(campaign.first), 3 if len(campaign.first) <= 9 else 4)
     if width < 5:
         columns = 2
@@ -198,7 +195,7 @@ def run_map_figure(
     figure, panels = panels_of(width, tall, rows, columns, share=(True, True))
     for axes, (name, (truth, estimate)) in zip(panels, campaign.first.items(), strict=False):
         shown = _draw_truth(axes, np.asarray(truth.pose), np.asarray(truth.landmarks)[:, :2])
-        _draw_estimate(axes, estimate, n_sigma)
+        _draw_estimate(axes, estimate)
         _limit(axes, shown)
         titled(axes, plain(name))
     for axes in panels[len(campaign.first) :]:
@@ -229,7 +226,7 @@ def _draw_truth(
     return shown
 
 
-def _draw_estimate(axes: Axes, estimate: Estimate, n_sigma: float) -> list[np.ndarray]:
+def _draw_estimate(axes: Axes, estimate: Estimate) -> list[np.ndarray]:
     """Draw the estimated path with its ends, and the final map; returns what was drawn.
 
     Covariances that have no ellipse are counted above the panel.
@@ -240,14 +237,14 @@ def _draw_estimate(axes: Axes, estimate: Estimate, n_sigma: float) -> list[np.nd
     covs = np.asarray(estimate.point_covs[-1])[alive]
     axes.plot(*pose[:, :2].T, color=COLORS[0], lw=1.3, label="estimated path", zorder=3)
     axes.plot(*points.T, ".", color=COLORS[1], ms=4.5, label="estimated landmarks", zorder=5)
-    label = f"{n_sigma:g} σ ellipses"
+    label = "3 σ ellipses"
     here, here_cov = pose[-1:, :2], np.asarray(estimate.pose_cov[-1:])[:, :2, :2]
     refused = 0
     for means, around, color, named in (
-        (here, here_cov, COLORS[0], f"{n_sigma:g} σ ellipse, pose"),
+        (here, here_cov, COLORS[0], "3 σ ellipse, pose"),
         (points, covs, COLORS[1], label),
     ):
-        contours = ellipses(means, around, n_sigma)
+        contours = ellipses(means, around)
         good = ~np.isnan(contours).all(axis=(1, 2))
         refused += int((~good).sum())
         for contour in contours[good]:
@@ -268,7 +265,6 @@ def _draw_residuals(
     estimate: Estimate,
     survey: np.ndarray,
     names: Sequence[object],
-    n_sigma: float,
 ) -> None:
     """Draw what parts each landmark from its surveyed point: lines over the map, and lengths."""
     tag = np.asarray(estimate.tag[-1])
@@ -282,9 +278,9 @@ def _draw_residuals(
     far = np.hypot(*error.T)
     along = error / np.where(far > 0, far, 1.0)[:, None]
     covs = np.asarray(estimate.point_covs[-1])[mine]
-    claim = n_sigma * np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", along, covs, along), 0.0))
+    claim = 3 * np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", along, covs, along), 0.0))
     at = np.arange(len(mine))
-    claimed = f"{n_sigma:g} σ claimed in its direction"
+    claimed = "3 σ claimed in its direction"
     axes.bar(at, claim, 0.7, color=SHADE, label=claimed)
     axes.plot(at, far, "D", color=COLORS[2], ms=4.5, mec="white", mew=0.4, label=label)
     axes.set_xticks(at, [str(names[tag[i]]) for i in mine])
@@ -306,14 +302,13 @@ def walls_figure(
     walls: Walls,
     *,
     path: ArrayLike | None = None,
-    n_sigma: float = 3.0,
     title: str = "",
     width: float = PAGE,
 ) -> Figure:
     """The map of an EKF of `sensors.Line`: each true wall where its estimated line has it.
 
     A segment of the walls is projected onto the line with its tag, and drawn with the band of the
-    line's n_sigma across it. Walls that were not measured are the true ones alone.
+    line's 3 σ across it. Walls that were not measured are the true ones alone.
 
     Args:
         estimate: (T, …); the map is the last one. Tags are those of `simulation.walls.wall_lines`.
@@ -339,7 +334,7 @@ def walls_figure(
             across = r * normal[None] + at[:, None] * along[None]
             # The line is off by dr - at dα there, and the foot by (dr, r dα) in the line's frame.
             slope = normal[None] - (at / r)[:, None] * along[None]
-            sigma = n_sigma * np.sqrt(np.einsum("ki,ij,kj->k", slope, cov, slope))
+            sigma = 3 * np.sqrt(np.einsum("ki,ij,kj->k", slope, cov, slope))
             off = sigma[:, None] * normal[None]
             ends.append(across)
             bands.append(np.concatenate([across + off, (across - off)[::-1]]))
@@ -352,7 +347,7 @@ def walls_figure(
     axes.add_collection(
         LineCollection(list(segments), color=INK, lw=2.2, alpha=0.45, label="walls")
     )
-    band = f"{n_sigma:g} σ of a line"
+    band = "3 σ of a line"
     axes.add_collection(PolyCollection(bands, color=COLORS[1], alpha=0.25, lw=0, label=band))
     axes.add_collection(
         LineCollection(ends, color=COLORS[1], lw=0.9, label="estimated lines", zorder=3)
