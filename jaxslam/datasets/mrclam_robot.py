@@ -2,7 +2,7 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import NamedTuple, TypedDict, TypeVar
+from typing import Any, NamedTuple, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -30,7 +30,11 @@ def read_landmarks(
     """The subject of each barcode, the landmarks' subjects, positions, and corrections of these."""
     subject_of, names = _read_barcodes(TextFile(folder / "Barcodes.dat", "#"))
     points = _read_survey(TextFile(folder / "Landmark_Groundtruth.dat", "#"), names)
-    corrections = _correct(points) if errata else ()
+    corrections: tuple[str, ...] = ()
+    if errata and all(points.get(subject) == at for subject, at in EXCHANGED.items()):
+        one, other = EXCHANGED
+        points[one], points[other] = points[other], points[one]
+        corrections = (f"the surveyed positions of subjects {one} and {other} were exchanged",)
     return subject_of, names, np.array([points[name] for name in names]), corrections
 
 
@@ -105,15 +109,6 @@ def _read_survey(file: TextFile, names: tuple[int, ...]) -> dict[int, list[float
     if missing:
         raise file.end_error(f"no position of subject {missing[0]} in the file")
     return points
-
-
-def _correct(points: dict[int, list[float]]) -> tuple[str, ...]:
-    """Undo the exchange in the survey of data set 1; returns descriptions of what was done."""
-    if any(points.get(subject) != position for subject, position in EXCHANGED.items()):
-        return ()
-    one, other = EXCHANGED
-    points[one], points[other] = points[other], points[one]
-    return (f"the surveyed positions of subjects {one} and {other} were exchanged",)
 
 
 Numbers = TypeVar("Numbers", np.ndarray, jax.Array)
@@ -271,17 +266,6 @@ def per_interval(density: jax.Array, dt: jax.Array) -> jax.Array:
     return jnp.diag(density) * jnp.where(moving, 1 / jnp.where(moving, dt, 1.0), 0.0)
 
 
-def recorded(
-    odometry: Float[np.ndarray, "K 3"],
-    seen: Float[np.ndarray, "J 4"],
-    calibration: RobotCalibration | None,
-) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "J 4"]]:
-    """The lines of a robot as they are, or corrected."""
-    if calibration is None:
-        return odometry, seen
-    return calibration.odometry(odometry), calibration.measurements(seen)
-
-
 GAP = 0.2
 """Time between lines of the truth beyond which it is unknown between them [s]."""
 START_COV = np.diag([0.01, 0.01, 0.03]) ** 2
@@ -336,18 +320,6 @@ class Recorded(NamedTuple):
     corrections: tuple[str, ...]
 
 
-class TrueFields(TypedDict, total=False):
-    """The fields of a data set about true paths, and the start."""
-
-    true_path: Float[np.ndarray, "T 3"]
-    true_at: Bool[np.ndarray, "T"]
-    true_paths: Float[np.ndarray, "R T 3"]
-    true_paths_at: Bool[np.ndarray, "R T"]
-    pose: Float[np.ndarray, "3"]
-    pose_cov: Float[np.ndarray, "3 3"]
-    one_frame: bool
-
-
 def read_lines(folder: Path, robot: int, calibration: RobotCalibration | None) -> Recorded:
     """The lines of a robot, corrected, with its true path and what was changed, in words."""
     odometry, seen = read_robot(folder, robot)
@@ -358,7 +330,8 @@ def read_lines(folder: Path, robot: int, calibration: RobotCalibration | None) -
             corrections.append(
                 f"{cut:,} odometry lines (0, 0) of robot {robot} after its true path were left out"
             )
-    odometry, seen = recorded(odometry, seen, calibration)
+    if calibration is not None:
+        odometry, seen = calibration.odometry(odometry), calibration.measurements(seen)
     return Recorded(odometry, seen, truth, tuple(corrections))
 
 
@@ -370,12 +343,12 @@ def models_of(calibration: RobotCalibration | None) -> tuple[Unicycle, RangeBear
     return Unicycle(calibration.odometry_cov()), sensor
 
 
-def true_fields(files: Sequence[Recorded], time: Float[np.ndarray, "T"]) -> TrueFields:
-    """The true paths, and the start; nothing where no path is known."""
+def true_fields(files: Sequence[Recorded], time: Float[np.ndarray, "T"]) -> dict[str, Any]:
+    """The fields of a `Dataset` about true paths, and the start; none where no path is known."""
     if files[0].truth is None:
         return {}
     paths, known = true_poses(files[0].truth, time)
-    found: TrueFields = {"true_path": paths, "true_at": known}
+    found: dict[str, Any] = {"true_path": paths, "true_at": known}
     if len(files) > 1 and all(own.truth is not None for own in files):
         each = [true_poses(own.truth, time) for own in files if own.truth is not None]
         found["true_paths"] = np.stack([path for path, _ in each])
