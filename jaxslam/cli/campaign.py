@@ -121,6 +121,7 @@ def _campaign(
         )
     # Blocks of another size would round differently.
     block = kept.settings.get("block") if options.block is None else options.block
+    assert isinstance(block, int | None)
     return CampaignOptions(**(stored | {"runs": kept.runs} | given)), kept.settings, block
 
 

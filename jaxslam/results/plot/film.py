@@ -266,24 +266,24 @@ def still(points: Float[np.ndarray, "N 2"], **look: Any) -> Layer:
     return layer
 
 
-def track(path: Float[np.ndarray, "T C"], until: Int[np.ndarray, "F"], **look: Any) -> Layer:
-    """The layer of a path that grows: in frame k its points up to until[k]; NaN interrupts it."""
+def line_of(points: Callable[[int], Float[np.ndarray, "N 2"]], **look: Any) -> Layer:
+    """The layer of a line through points(k) in frame k; NaN interrupts it."""
 
     def layer(axes: Axes) -> Draw:
         (line,) = axes.plot([], [], **look)
-        return lambda k: line.set_data(*path[: until[k] + 1, :2].T)
+        return lambda k: line.set_data(*points(k).T)
 
     return layer
+
+
+def track(path: Float[np.ndarray, "T C"], until: Int[np.ndarray, "F"], **look: Any) -> Layer:
+    """The layer of a path that grows: in frame k its points up to until[k]."""
+    return line_of(lambda k: path[: until[k] + 1, :2], **look)
 
 
 def marks(points: Float[np.ndarray, "F N 2"], shown: Bool[np.ndarray, "F N"], **look: Any) -> Layer:
     """The layer of points that are others in each frame."""
-
-    def layer(axes: Axes) -> Draw:
-        (line,) = axes.plot([], [], ls="none", **look)
-        return lambda k: line.set_data(*points[k][shown[k]].T)
-
-    return layer
+    return line_of(lambda k: points[k][shown[k]], ls="none", **look)
 
 
 def triangle(poses: Float[np.ndarray, "F 3"], size: float, **look: Any) -> Layer:
@@ -312,27 +312,14 @@ def rings(
     **look: Any,
 ) -> Layer:
     """The layer of 3 σ ellipses that grow and shrink; a covariance that has none is left out."""
-
-    def layer(axes: Axes) -> Draw:
-        (line,) = axes.plot([], [], **look)
-
-        def draw(k: int) -> None:
-            contours = ellipses(means[k][shown[k]], covs[k][shown[k]], points=48)
-            line.set_data(*_apart(contours).T)
-
-        return draw
-
-    return layer
+    return line_of(
+        lambda k: _apart(ellipses(means[k][shown[k]], covs[k][shown[k]], points=48)), **look
+    )
 
 
 def lines_between(ends: Sequence[Float[np.ndarray, "E 2 2"]], **look: Any) -> Layer:
     """The layer of lines between two points each, others in every frame."""
-
-    def layer(axes: Axes) -> Draw:
-        (line,) = axes.plot([], [], **look)
-        return lambda k: line.set_data(*_apart(ends[k]).T)
-
-    return layer
+    return line_of(lambda k: _apart(ends[k]), **look)
 
 
 def weighted_segments(

@@ -17,7 +17,7 @@ from jaxslam.laser.grids import Field, Grid
 from jaxslam.laser.laser_slam import LoopOutcome, Solved
 from jaxslam.laser.topology import Route, TopologicalMap
 from jaxslam.laser.topology.places import cell_centers
-from jaxslam.results.plot.film import Draw, Layer, Panel, Scene, triangle
+from jaxslam.results.plot.film import Draw, Layer, Panel, Scene, line_of, triangle
 from jaxslam.results.plot.style import (
     COLORS,
     FAINT,
@@ -61,9 +61,7 @@ def grid_figure(
     if beams is not None and (path is None or path.shape[1] != 3):
         raise ValueError("grid_figure: beams are from the last of poses (x, y, θ)")
     values = np.asarray(grid[0])
-    frame = np.asarray(grid.origin, float), float(np.asarray(grid.resolution))
-    rows, columns = (np.arange(n + 1) for n in values.shape)
-    x, y = world_of(*frame, columns[None, :] + 0.0 * rows[:, None], rows[:, None] + 0.0 * columns)
+    x, y = _corners(grid, *(np.arange(n + 1) for n in values.shape))
     inner = width - (0.6 if isinstance(grid, Grid) else 1.3)
     height = inner * np.ptp(y) / np.ptp(x) + 0.8
     figure, (axes,) = panels_of(width, min(height, 9.0), 1)
@@ -124,10 +122,12 @@ def shown_occupancy(log_odds: np.ndarray) -> np.ma.MaskedArray:
     return np.ma.masked_array(0.5 * (1 + np.tanh(log_odds / 2)), mask=log_odds == 0)
 
 
-def world_of(
-    origin: np.ndarray, resolution: float, x: np.ndarray, y: np.ndarray
+def _corners(
+    grid: Grid | Field, rows: np.ndarray, columns: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The world coordinates [m] of coordinates in cells."""
+    """The world coordinates [m] of the corners of cells, as `pcolormesh` takes them."""
+    x, y = np.meshgrid(columns, rows)
+    origin, resolution = np.asarray(grid.origin, float), float(np.asarray(grid.resolution))
     c, s = np.cos(origin[2]), np.sin(origin[2])
     return origin[0] + resolution * (c * x - s * y), origin[1] + resolution * (s * x + c * y)
 
@@ -153,12 +153,10 @@ def topology_figure(
     """
     grid = places.grid
     label = places.label
-    frame = np.asarray(grid.origin, float), float(np.asarray(grid.resolution))
     occupied = np.asarray(grid.log_odds) > 0
     there = np.nonzero((label >= 0) | occupied)  # the rest of the map is not shown
     part = tuple(slice(k.min(), k.max() + 1) for k in there)
-    rows, columns = (np.arange(k.start, k.stop + 1) for k in part)
-    x, y = world_of(*frame, columns[None, :] + 0.0 * rows[:, None], rows[:, None] + 0.0 * columns)
+    x, y = _corners(grid, *(np.arange(k.start, k.stop + 1) for k in part))
     height = (width - 0.6) * np.ptp(y) / np.ptp(x) + 0.9
     figure, (axes,) = panels_of(width, min(height, 9.0), 1)
     axes.grid(visible=False)
@@ -321,7 +319,8 @@ def map_scene(
     ends = np.stack([path[-1] for path in paths])
     size = 0.03 * max(x[1] - x[0], y[1] - y[0])
     robot = triangle(ends, size, fc=COLORS[0], ec="white", lw=0.6, zorder=5)
-    layers = [_image(log_odds, (*x, *y)), _path(paths), robot]
+    path = line_of(lambda k: paths[k][:, :2], color=COLORS[0], lw=1.0, label="path", zorder=3)
+    layers = [_image(log_odds, (*x, *y)), path, robot]
     return Scene(count, Panel(layers, x, y), None, lambda k: said[k], title)
 
 
@@ -341,15 +340,5 @@ def _image(
             vmax=1,
         )
         return lambda k: image.set_data(shown_occupancy(log_odds[k]))
-
-    return layer
-
-
-def _path(paths: Sequence[Float[np.ndarray, "n 3"]]) -> Layer:
-    """The path of each frame: one that grows, or another one."""
-
-    def layer(axes: Axes) -> Draw:
-        (line,) = axes.plot([], [], color=COLORS[0], lw=1.0, label="path", zorder=3)
-        return lambda k: line.set_data(*paths[k][:, :2].T)
 
     return layer
