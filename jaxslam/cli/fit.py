@@ -17,6 +17,7 @@ from jaxslam.results.files import (
     check_writable,
     json_number,
     json_text,
+    text_table,
     versions,
     write_files,
 )
@@ -145,14 +146,7 @@ def _table(data: Dataset, result: DatasetFit) -> str:
     lag, band = result.autocorrelation
     if np.isfinite(lag):
         lines.append(["autocorrelation", "", f"{lag:.3f}", f"(± {band:.2g})", ""])
-    widths = [max(len(line[i]) for line in lines) for i in range(5)]
-    text = [
-        "  ".join(
-            c.rjust(w) if i else c.ljust(w)
-            for i, (c, w) in enumerate(zip(line, widths, strict=True))
-        )
-        for line in lines
-    ]
+    text = text_table(lines)
     out = ", ".join(f"{count:,} {name}" for name, count in result.left_out.items())
     text.insert(
         0,

@@ -2,6 +2,7 @@
 
 import argparse
 import dataclasses
+import inspect
 import time
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -80,7 +81,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run_dataset(options: argparse.Namespace, command: str) -> int:
     """Run filters over the data set, print and write their results; returns the exit status."""
     formats = check_figure_formats("--figures", options.figures.split(","))
-    data = pick("dataset", options.dataset, READERS)(options.path, options.robot)
+    reader = pick("dataset", options.dataset, READERS)
+    if options.robot is not None and "robot" not in inspect.signature(reader).parameters:
+        raise ValueError(
+            f"--robot: expected none, since this data set has one robot, got {options.robot}"
+        )
+    data = reader(options.path, *([] if options.robot is None else [options.robot]))
     data = with_options(data, options)
     filters = chosen_filters(data, options.filters)
     check_out(options.out, "run")

@@ -43,6 +43,15 @@ def csv_text(header: list[str], rows: list[list[str]]) -> str:
     return out.getvalue()
 
 
+def text_table(lines: Sequence[Sequence[str]]) -> list[str]:
+    """The lines of a table as text: the first column is flush left, the others right."""
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return [
+        "  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])])
+        for line in lines
+    ]
+
+
 def versions() -> dict[str, str]:
     """The versions of Python, JAX and NumPy."""
     return {"python": platform.python_version()} | {

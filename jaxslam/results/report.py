@@ -14,6 +14,7 @@ from jaxslam.results.files import (
     csv_text,
     json_number,
     json_text,
+    text_table,
     versions,
 )
 from jaxslam.results.table import VERDICTS, Cell, cell_text, lost_runs, notes_on, rows_of, short
@@ -225,14 +226,7 @@ def _columns(campaign: Campaign, names: list[str]) -> str:
         if row.published:
             told = ("" if value is None else short(value) for value in row.published)
             lines.append(["  published", "", *told])
-    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
-    text = [
-        "  ".join(
-            c.ljust(w) if i == 0 else c.rjust(w)
-            for i, (c, w) in enumerate(zip(line, widths, strict=True))
-        )
-        for line in lines
-    ]
+    text = text_table(lines)
     text.insert(1, "-" * len(text[0]))
     return "\n".join(text)
 

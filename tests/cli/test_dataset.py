@@ -86,6 +86,7 @@ def test_run_writes_films_and_says_what_is_missing(tmp_path, capsys, monkeypatch
         (["moon"], "", "unknown dataset 'moon'"),
         (["bonn"], "SENSOR 1 oops 0", "sensor_data.dat:10: "),
         (["victoria_park"], "", "victoria_park"),
+        (["bonn", "--robot", "2"], "", "--robot: expected none, since this data set has one"),
     ],
 )
 def test_bad_input_exits_with_2_and_writes_nothing(tmp_path, refused, asked, spoil, message):

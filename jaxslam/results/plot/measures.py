@@ -15,16 +15,15 @@ from jaxslam.results.plot.panels import (
     TOGETHER,
     add_legends,
     common_top,
-    head,
     kinds_of,
     mark_beyond,
     nees_scale,
     numbers_of,
     power,
-    runs_of,
     scale_setters,
     set_positive,
     sheet,
+    title_of,
 )
 from jaxslam.results.plot.style import (
     INK,
@@ -75,7 +74,7 @@ def nees_figure(
                 curve(axes, i, step, summary.curves[f"nees_{block}"], label, absent="no NEES")
             axes.set_xlim(step_limits(campaign.steps))
             mark_beyond(axes)
-    add_legends(figure, rows, f"{head(campaign)}: NEES, average over {runs_of(campaign)}", "step")
+    add_legends(figure, rows, title_of(campaign, "NEES, average over"), "step")
     return figure
 
 
@@ -111,7 +110,7 @@ def rmse_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
                     step, bound, color=INK, lw=2.0, label=label, zorder=2.5, marker=_lone(bound)
                 )
             mark_beyond(axes)
-    add_legends(figure, rows, f"{head(campaign)}: error, average over {runs_of(campaign)}", "step")
+    add_legends(figure, rows, title_of(campaign, "error, average over"), "step")
     return figure
 
 
@@ -141,7 +140,7 @@ def coverage_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     add_legends(
         figure,
         rows,
-        f"{head(campaign)}: share of the truth within an ellipsoid, {runs_of(campaign)}",
+        title_of(campaign, "share of the truth within an ellipsoid,"),
         "probability p" if width > 5 else "p",
     )
     return figure
@@ -174,7 +173,7 @@ def whiteness_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
             aside = _ASIDE * (place - (len(drawn) - 1) / 2)
             curve(axes, i, lags + aside, values, name, absent="no innovations")
         axes.set(xticks=lags, ylim=(-1.1 * extreme, 1.1 * extreme))
-    title = f"{head(campaign)}: whiteness of innovations, {runs_of(campaign)}"
+    title = title_of(campaign, "whiteness of innovations,")
     add_legends(figure, rows, title, "lag [steps]")
     return figure
 
@@ -209,9 +208,7 @@ def gained_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     if not curves:
         said = "no filter has an observability monitor (filters.Monitored)"
         axes.text(0.5, 0.6, said, transform=axes.transAxes, ha="center", fontsize=8)
-    title = (
-        f"{head(campaign)}: information gained on a turn of the whole frame, {runs_of(campaign)}"
-    )
+    title = title_of(campaign, "information gained on a turn of the whole frame,")
     title += f". Not monitored: {', '.join(map(plain, others))}" * bool(others and curves)
     add_legends(figure, rows, title, "step")
     return figure
@@ -306,8 +303,8 @@ def cost_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     for axes, text in zip(panels, said, strict=True):
         axes.set_xlabel(text if width >= PAGE else text.replace(" [", "\n[").replace(" (", "\n("))
     honest = panels[2].axvline(DOF["pose"], color=INK, lw=0.8, zorder=1.5, label="honest")
-    what = "error and NEES, with 95 % intervals, and the time of a step"
-    caption(figure, f"{head(campaign)}: {what}, {runs_of(campaign)}", [honest])
+    what = "error and NEES, with 95 % intervals, and the time of a step,"
+    caption(figure, title_of(campaign, what), [honest])
     return figure
 
 

@@ -144,14 +144,10 @@ def add_legends(figure: Figure, rows: Sequence[Row], title: str, across: str) ->
     caption(figure, title, [handle for handle in everything if handle not in own])
 
 
-def head(campaign: Campaign) -> str:
-    """The name of a campaign's scenario, for a title."""
-    return plain(campaign.scenario)
-
-
-def runs_of(campaign: Campaign) -> str:
-    """The number of runs of a campaign in words."""
-    return f"{campaign.runs:,} run{'s' if campaign.runs != 1 else ''}"
+def title_of(campaign: Campaign, what: str) -> str:
+    """The title of a figure: the scenario, what is shown, and the number of runs."""
+    runs = f"{campaign.runs:,} run{'s' if campaign.runs != 1 else ''}"
+    return f"{plain(campaign.scenario)}: {what} {runs}"
 
 
 _FAR = 3.0
