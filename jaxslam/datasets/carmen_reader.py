@@ -130,7 +130,7 @@ def carmen(
             are as many as scans, and then their stamps are the scans'.
         mount: (3,) [m, m, rad] in place of that of the lines.
     Raises:
-        ValueError: with file and line: where a line ends early or has a field that is no number; on
+        ValueError: with file and line: where a line ends early or a field is not a number; on
             a file without scans (of the laser) or without beams; where the mount differs between
             two lines by more than 1 cm or ½°; on odometry that does not join. Further on a
             max_range that is not above 0, and a mount that is not three finite numbers.

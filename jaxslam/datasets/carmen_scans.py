@@ -117,7 +117,7 @@ def _expect(file: TextFile, line: int, fields: list[str], count: int) -> None:
 def _ranges(
     file: TextFile, line: int, fields: list[str], name: str = "range"
 ) -> Float[np.ndarray, "n"]:
-    """Ranges [m], 0 for NaN. Raises ValueError on what is no number."""
+    """Ranges [m], 0 for NaN. Raises ValueError on what is not a number."""
     bad = None
     try:
         values = np.array(fields, float)
@@ -127,7 +127,7 @@ def _ranges(
         bad = next((k for k, field in enumerate(fields) if not _is_number(field)), None)
     if bad is not None:
         which = f"{name} {bad + 1}" if name == "range" else name
-        raise file.error(line, f"{which} is no number: {fields[bad]!r}")
+        raise file.error(line, f"{which} is not a number: {fields[bad]!r}")
     known: np.ndarray = np.nan_to_num(values, nan=0.0, posinf=np.finfo(float).max, neginf=0.0)
     return known
 

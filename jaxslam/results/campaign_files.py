@@ -92,10 +92,7 @@ def save_campaign(
     for name, (_, figure) in drawn.items():
         files |= {f"{name}.{kind}": encode(figure, kind) for kind in formats}
     stale = () if _holds(folder / RESULT, files[RESULT]) else file_names(FORMATS)
-    paths = write_files(folder, files)
-    for name in {*stale} - {*files}:
-        (folder / name).unlink(missing_ok=True)
-    return paths
+    return write_files(folder, files, replaces=stale)
 
 
 def load(folder: str | Path) -> Campaign:

@@ -317,9 +317,6 @@ def test_many_filters_are_listed_by_cost(every):
         assert all(left < each.get_xdata()[0] < right for each in points)
     assert nees.get_xlim()[1] < 1e3
     assert r"$3\cdot 10^{27}$" in [text.get_text() for text in nees.texts]
-    untimed = plot.cost_figure(dataclasses.replace(every, step_seconds={}))
-    assert untimed.axes[0].get_xlabel() == "no filter was timed"
-    untimed.canvas.draw()
 
 
 def test_information_gained_is_drawn_for_watched_filters_and_zeros_below_the_axis():
