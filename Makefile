@@ -23,7 +23,7 @@ JEMALLOC := $(firstword $(wildcard /usr/lib/*/libjemalloc.so.2 /usr/lib64/libjem
 
 ## The main job: is EKF-SLAM honest? 100 simulated runs; results in out/.
 consistency: $(VENV)/.run
-	$(BIN)/jaxslam consistency $(if $(filter --resume% --overwrite,$(ARGS)),,--again) $(ARGS)
+	$(BIN)/jaxslam consistency $(ARGS)
 
 ## The tests, on every core: heavy files first, compiled programs kept in .cache/ for the next run. Of each kind
 ## of case one is tested; `test-all` takes every variant, scenario and precision.

@@ -20,7 +20,7 @@ from benchmarks.gate import Metric, alone
 from benchmarks.graphs.worlds import with_false_loops
 from benchmarks.real_data import DATA
 from jaxslam import graphs
-from jaxslam.cli.optimize.command import SEVERAL
+from jaxslam.cli.optimize import SEVERAL
 from jaxslam.graphs import starts
 from jaxslam.graphs.graph import LOOPS
 from jaxslam.math import stats

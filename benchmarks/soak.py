@@ -55,7 +55,7 @@ def share(runs: int, stop_at: int, folder: str) -> None:
     world = scenarios.cloister(steps=50)
     filters = {name: catalog.FILTERS[name](world) for name in ("ekf", "right_invariant")}
     page = os.sysconf("SC_PAGE_SIZE")
-    keep = store.join(folder, runs=runs)
+    keep = store.open(folder, runs=runs)
     before = keep.done()
     marks: list[tuple[float, int, int]] = []
 

@@ -22,7 +22,7 @@ import jaxslam
 from jaxslam.calibration import NoiseFit, fit_noise
 from jaxslam.core.types import Info
 from jaxslam.datasets import mrclam
-from jaxslam.datasets.mrclam.robot import ODOMETRY_DENSITY, white_noise
+from jaxslam.datasets.mrclam_robot import ODOMETRY_DENSITY, white_noise
 
 OFF = np.array([5.0, 0.2, 0.2, 5.0])
 """Factors from the truth, or from the reader's defaults, to the starts of the four parameters."""

@@ -273,7 +273,7 @@ def run_from(pose, pose_cov=WORLD.pose_cov):
     ),
     (
         lambda: jaxslam.monte_carlo(WORLD, {"ekf": EKF}, 2, KEY, keep="kk"),
-        r"^monte_carlo: expected keep as from jaxslam.store.create\(folder\).*got 'kk'",
+        r"^monte_carlo: expected keep as from jaxslam.store.open\(folder\).*got 'kk'",
     ),
     (
         lambda: jaxslam.verify_jacobians(3),

@@ -41,11 +41,14 @@ RECORD = ROOT / ".cache" / "commands.json"
 LIMIT = 900
 """seconds that a block may take"""
 BEGINS = {
-    "consistency": "jaxslam.cli.consistency.options:",
+    "consistency": "jaxslam.cli.consistency:",
     "fit": "jaxslam.cli.fit:",
-    "optimize": "jaxslam.cli.optimize.options:",
-    "run": "jaxslam.cli.run.options:",
-    "verify": "jaxslam.cli.models:",
+    "localize": "jaxslam.cli.localization:",
+    "map": "jaxslam.cli.mapping:",
+    "optimize": "jaxslam.cli.optimize:",
+    "run": "jaxslam.cli.run:",
+    "slam": "jaxslam.cli.slam:",
+    "verify": "jaxslam.cli.verify:",
 }
 """where the code of a subcommand begins"""
 KEYS = {"exit": "0", "argument": "", "first": ""}
@@ -113,7 +116,7 @@ def digest(group: list[Block]) -> str:
     code = [*cells(script).values(), *(path.read_text(encoding="utf-8") for path in files)]
     names = frozenset().union(*(executed.named(ast.parse(text)) for text in code))
     if commands := re.findall(r"\bjaxslam (\w+)", script):
-        names |= {BEGINS[command] for command in commands} | {"jaxslam.cli.runtime.cache:"}
+        names |= {BEGINS[command] for command in commands} | {"jaxslam.cli.cache:"}
         files |= {executed.home("jaxslam.cli:main")}
     return executed.hashed(files | executed.reached(names), "".join([script, *code]))
 

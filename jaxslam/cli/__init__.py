@@ -3,6 +3,7 @@
 import argparse
 import os
 import platform
+import re
 import shlex
 import sys
 from collections.abc import Sequence
@@ -13,20 +14,83 @@ import jax
 from threadpoolctl import threadpool_limits
 
 from jaxslam.catalog import meant
-from jaxslam.cli import fit, models
+from jaxslam.cli import (
+    cache,
+    consistency,
+    fit,
+    localization,
+    mapping,
+    optimize,
+    run,
+    slam,
+    verify,
+)
 from jaxslam.cli.common import INTERRUPTED, as_folders
-from jaxslam.cli.consistency import options as consistency_options
-from jaxslam.cli.laser import options as laser_options
-from jaxslam.cli.optimize import options as optimize_options
-from jaxslam.cli.optimize.command import COST, ERRORS
-from jaxslam.cli.run import options as run_options
-from jaxslam.cli.runtime import cache, devices
-from jaxslam.cli.runtime.compile_clock import CompileClock
+from jaxslam.cli.runtime import CompileClock, set_device_count
 
 __all__ = ["main"]
 
 USAGE_ERROR = 2
 PIPE_CLOSED = 141  # 128 + SIGPIPE, as a shell reports it
+
+_POSITIONAL = re.compile(r"-[\d.]")
+"""What begins like a negative number is a value, as in `--start -6,-10,90`, and no option."""
+
+COMMANDS = {
+    "consistency": (
+        consistency,
+        "test filters for consistency in a Monte-Carlo campaign",
+        "Run filters over the same simulated worlds and compare their errors with the covariances "
+        "they claim. Prints a table and writes JSON, CSV and figures.",
+    ),
+    "run": (
+        run,
+        "run filters on a recorded data set",
+        "Run filters on recorded data. Prints a summary and writes trajectory, map, summary and a "
+        "figure.",
+    ),
+    "fit": (
+        fit,
+        "fit the noises of your own data to its log",
+        "Find the standard deviations of motion and sensor by maximum likelihood, with standard "
+        "errors, from a folder as of `jaxslam run --dataset table`. Prints a table and writes "
+        "fit.json, and fit.toml, which stands in for the noises of dataset.toml.",
+    ),
+    "slam": (
+        slam,
+        "make a path and a map of a laser log",
+        "Laser SLAM from raw odometry and scans. Prints a summary and writes trajectory, graph, "
+        "loops, map and figures.",
+    ),
+    "map": (
+        mapping,
+        "make a map of a laser log from the poses in the file",
+        "Make a map from the poses that stand in a laser log beside the scans. Prints a summary "
+        "and writes the map, as ROS reads it, and a figure.",
+    ),
+    "localize": (
+        localization,
+        "localize the robot of a laser log in a map",
+        "Localize the robot in a map of ROS from raw odometry and scans, by particles. Prints a "
+        "summary and writes trajectory and a figure.",
+    ),
+    "optimize": (
+        optimize,
+        "optimize a pose or landmark graph in a file",
+        "Optimize a graph in a file of g2o or TORO. Prints a table and writes the poses, the "
+        "optimized graph in g2o, a summary and a figure. The cost is "
+        f"{optimize.COST} {optimize.ERRORS['pose'][1]}. The exit status is 1 if the optimization "
+        "did not converge, 2 if the file cannot be used.",
+    ),
+    "verify": (
+        verify,
+        "verify the Jacobians of every model, or of your own file",
+        "Compare hand-derived Jacobians with forward and reverse autodiff and with difference "
+        "quotients. Prints a table, or a report on your file, and writes JSON. The exit status is "
+        "1 if anything fails, 2 if the file cannot be used.",
+    ),
+}
+"""Of each command the module, which has its options, its help and its description."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -37,7 +101,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
-        options = _parser().parse_args(laser_options.with_signed_values(arguments))
+        options = _parser().parse_args(arguments)
     except SystemExit as stop:
         return int(stop.code or 0)
     try:
@@ -45,7 +109,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         # By default a GPU rounds the factors of a float32 matrix product to 11 bits (TF32).
         jax.config.update("jax_default_matmul_precision", "highest")
         if hasattr(options, "devices"):
-            devices.prepare(options)
+            set_device_count(options.devices)
         else:
             jax.config.update("jax_enable_x64", options.dtype == "float64")
         with CompileClock() as clock, cache.from_options(options), threadpool_limits(1, "blas"):
@@ -70,6 +134,7 @@ class _Parser(argparse.ArgumentParser):
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **{"allow_abbrev": False, **options})
+        self._negative_number_matcher = _POSITIONAL
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
         """As that of argparse; what is not known is an error, here where the command is known."""
@@ -92,57 +157,11 @@ def _parser() -> argparse.ArgumentParser:
         description="2-D SLAM in JAX: landmark filters and their consistency, graphs, laser maps.",
         epilog="jaxslam COMMAND --help describes the options of a command.",
     )
-    parser.add_argument("--version", action="version", version=_versions())
+    versions = f"jax {jax.__version__}, Python {platform.python_version()}"
+    parser.add_argument(
+        "--version", action="version", version=f"jaxslam {version('jaxslam')} ({versions})"
+    )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    consistency_options.add_options(
-        commands.add_parser(
-            "consistency",
-            help="test filters for consistency in a Monte-Carlo campaign",
-            description="Run filters over the same simulated worlds and compare their errors with "
-            "the covariances they claim. Prints a table and writes JSON, CSV and figures.",
-        )
-    )
-    run_options.add_options(
-        commands.add_parser(
-            "run",
-            help="run filters on a recorded data set",
-            description="Run filters on recorded data. Prints a summary and writes trajectory, "
-            "map, summary and a figure.",
-        )
-    )
-    fit.add_options(
-        commands.add_parser(
-            "fit",
-            help="fit the noises of your own data to its log",
-            description="Find the standard deviations of motion and sensor by maximum likelihood, "
-            "with standard errors, from a folder as of `jaxslam run --dataset table`. Prints a "
-            "table and writes fit.json and fit.toml, lines for dataset.toml.",
-        )
-    )
-    optimize_options.add_options(
-        commands.add_parser(
-            "optimize",
-            help="optimize a pose or landmark graph in a file",
-            description="Optimize a graph in a file of g2o or TORO. Prints a table and writes the "
-            "poses, the optimized graph in g2o, a summary and a figure. The cost is "
-            f"{COST} {ERRORS['pose'][1]}. The exit status is 1 if the "
-            "optimization did not converge, 2 if the file cannot be used.",
-        )
-    )
-    models.add_options(
-        commands.add_parser(
-            "verify",
-            help="verify the Jacobians of every model, or of your own file",
-            description="Compare hand-derived Jacobians with forward and reverse autodiff and "
-            "with difference quotients. Prints a table, or a report on your file, and writes JSON. "
-            "The exit status is 1 if anything fails, 2 if the file cannot be used.",
-        )
-    )
+    for name, (module, told, description) in COMMANDS.items():
+        module.add_options(commands.add_parser(name, help=told, description=description))
     return parser
-
-
-def _versions() -> str:
-    """The versions of jaxslam, JAX and Python."""
-    return (
-        f"jaxslam {version('jaxslam')} (jax {jax.__version__}, Python {platform.python_version()})"
-    )

@@ -1,15 +1,19 @@
-"""Helpers of all commands: look-up by name, options of several, summaries as text."""
+"""Helpers of all commands: look-up by name, options of several, summaries as text, films."""
 
 import argparse
 import json
-from collections.abc import Collection, Mapping
+from collections.abc import Callable, Collection, Mapping
 from pathlib import Path
-from typing import TypeVar
+from typing import TYPE_CHECKING, TypeVar
 
 from jaxslam.catalog import meant
+from jaxslam.consistency.campaign.progress import Progress
 from jaxslam.consistency.measures.counts import count_label
 from jaxslam.results.campaign_files import RESULT
-from jaxslam.results.files import check_writable
+from jaxslam.results.files import Files, check_writable
+
+if TYPE_CHECKING:  # Matplotlib is slow to load
+    from jaxslam.results.plot import Film
 
 _T = TypeVar("_T")
 
@@ -21,6 +25,9 @@ SUMMARY = "summary.json"
 
 COUNT = "measurements "
 """Begins the rows of a summary that count what became of measurements."""
+
+FILMS = ("film.gif", "film.mp4", "film.html", "film-*.gif", "film-*.mp4", "film-*.html")
+"""Patterns of the names of films: those of an earlier command do not stay beside its results."""
 
 OUT = Path("out")
 """Default folder of results."""
@@ -131,3 +138,45 @@ def _shown(value: object) -> str:
         lines = all(isinstance(part, str) for part in value)
         return ("\n" if lines else "; ").join(_shown(part) for part in value) or "-"
     return f"{value:.6g}" if isinstance(value, float) else str(value) or "-"
+
+
+def film_files(films: Mapping[str, "Film"], *, suffixed: bool) -> Files:
+    """The functions that write each film as MP4, or else GIF, and as a page; by file name.
+
+    Prints in a line how many steps are shown, and why there is no MP4.
+
+    Args:
+        films: by the name of the filter, which the file has where suffixed.
+    """
+    from jaxslam.results import plot  # matplotlib is slow to load
+
+    notes = dict.fromkeys(film.scene.note for film in films.values() if film.scene.note)
+    kind = "mp4" if plot.has_ffmpeg() else "gif"
+    said = [*notes, *(["ffmpeg is not installed: GIF instead of MP4"] if kind == "gif" else [])]
+    if said:
+        print("\nfilm: " + "; ".join(said))
+    files: Files = {}
+    for name, film in films.items():
+        stem = f"film-{name}" if suffixed else "film"
+        files |= {f"{stem}.{kind}": _with_progress(film, name), f"{stem}.html": film.save}
+    return files
+
+
+def _with_progress(film: "Film", name: str) -> Callable[[Path], object]:
+    """The function that saves a film and shows how many frames are drawn."""
+
+    def save(path: Path) -> None:
+        with Progress(f"{name}: film", "frames") as progress:
+            film.save(path, progress_callback=lambda k, of: progress(k + 1, of))
+
+    return save
+
+
+def add_animate(parser: argparse.ArgumentParser, of: str) -> None:
+    """Add the option of films."""
+    parser.add_argument(
+        "--animate",
+        action="store_true",
+        help=f"also write a film {of}: film.html to step and play, and film.mp4, or film.gif where "
+        "ffmpeg is missing",
+    )

@@ -1,21 +1,23 @@
 """The command `jaxslam fit`: the noises of one's own data by maximum likelihood."""
 
 import argparse
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
+from jaxslam.cli import cache
 from jaxslam.cli.common import add_out
-from jaxslam.cli.runtime import cache
 from jaxslam.core.logs.tables import POSE
 from jaxslam.datasets import Dataset, DatasetFit, fit, table
-from jaxslam.datasets.table.settings_text import changed, toml_lines
+from jaxslam.datasets.table_settings import FITTED, fitted_text
 from jaxslam.results.files import (
+    Files,
     Json,
     check_writable,
     json_number,
     json_text,
+    text_table,
     versions,
     write_files,
 )
@@ -34,7 +36,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help='parameters to hold, comma-separated, as "motion v,mount y"',
     )
     parser.add_argument(
-        "--write", action="store_true", help="also change dataset.toml in the folder"
+        "--write",
+        action="store_true",
+        help="also write fit.toml into the folder, where it stands in for what dataset.toml says",
     )
     cache.add_options(parser)
     add_out(parser)
@@ -48,24 +52,22 @@ def fit_folder(options: argparse.Namespace, command: str) -> int:
     fixed = [name.strip() for name in options.fix.split(",") if name.strip()]
     result = fit(data, mount=options.mount, fixed=fixed)
     print(_table(data, result))
-    changes, comments = _settings(data, result, options.mount)
-    settings = Path(options.path) / "dataset.toml"
-    good = result.found.converged and result.settled
-    text = changed(settings, changes) if options.write and good else None
-    files: dict[str, str | Callable[[Path], object]] = {
+    fitted = fitted_text(*_settings(data, result, options.mount))
+    files: Files = {
         "fit.json": json_text(
             _summary(data, result) | {"command": command, "versions": versions()}
         ),
-        "fit.toml": toml_lines(changes, comments),
+        FITTED: fitted,
     }
     written = write_files(options.out, files)
-    if text is not None:
-        written += write_files(settings.parent, {settings.name: text})
+    good = result.found.converged and result.settled
+    if options.write and good:
+        written += write_files(Path(options.path), {FITTED: fitted})
     print("\nwrote " + ", ".join(map(str, written)))
     if options.write and not good:
-        print(f"{settings} was not changed, since the fit did not come to an end")
-    elif text is None:
-        print(f"paste fit.toml into {settings}, or use --write")
+        print(f"{FITTED} was not written into {options.path}: the fit did not come to an end")
+    elif not options.write:
+        print(f"{FITTED} in {options.path} stands in for what its dataset.toml says: use --write")
     return 0
 
 
@@ -144,14 +146,7 @@ def _table(data: Dataset, result: DatasetFit) -> str:
     lag, band = result.autocorrelation
     if np.isfinite(lag):
         lines.append(["autocorrelation", "", f"{lag:.3f}", f"(± {band:.2g})", ""])
-    widths = [max(len(line[i]) for line in lines) for i in range(5)]
-    text = [
-        "  ".join(
-            c.rjust(w) if i else c.ljust(w)
-            for i, (c, w) in enumerate(zip(line, widths, strict=True))
-        )
-        for line in lines
-    ]
+    text = text_table(lines)
     out = ", ".join(f"{count:,} {name}" for name, count in result.left_out.items())
     text.insert(
         0,

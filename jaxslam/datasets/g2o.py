@@ -90,27 +90,32 @@ class Loaded(NamedTuple):
     """poses and points without a line of their own, placed along the edges"""
 
 
-class _Rows(NamedTuple):
-    """The lines of one table."""
+class _Row(NamedTuple):
+    """The line of an edge."""
 
-    ids: list[list[int]]
-    numbers: list[list[float]]
-    lines: list[int]
-    kinds: list[_Edge]
+    line: int
+    edge: _Edge
+    ids: list[int]
+    numbers: list[float]
 
 
 def load(path: str | Path) -> Loaded:
     """The graph in a file; see `graphs.read`, which says what is read and what is refused."""
     file = TextFile(path)
     vertices: dict[str, dict[int, list[float]]] = {"pose": {}, "point": {}}
-    rows: dict[str, _Rows] = {}
+    rows: dict[str, list[_Row]] = {}
     fixed: list[tuple[int, int]] = []
     skipped: dict[str, int] = {}
     for line, (kind, *fields) in file:
         if kind in EDGES:
-            _read_edge(file, line, EDGES[kind], fields, rows)
+            rows.setdefault(EDGES[kind].table, []).append(_row(file, line, EDGES[kind], fields))
         elif kind in _VERTICES:
-            _read_vertex(file, line, *_VERTICES[kind], fields, vertices)
+            variable, names = _VERTICES[kind]
+            file.expect(line, fields, ("id", *names))
+            vertex = _identity(file, line, fields[0], "id")
+            if any(vertex in known for known in vertices.values()):
+                raise file.error(line, f"vertex {vertex} occurs twice")
+            vertices[variable][vertex] = file.numbers(line, fields[1:], names)
         elif kind == "FIX":
             if not fields:
                 raise file.error(line, "expected at least 1 field (id), got 0")
@@ -123,10 +128,17 @@ def load(path: str | Path) -> Loaded:
             raise file.error(line, f"unknown kind {kind!r}; known: {known}")
     if not rows:
         raise file.end_error("no edge in the file")
-    unplaced = not vertices["pose"] and not vertices["point"]
+    unplaced = not any(vertices.values())
     if unplaced:
         vertices = _named_by_edges(file, rows)
-    return _assembled(file, vertices, rows, fixed, skipped, unplaced)
+    graph = _assembled(file, vertices, rows, fixed)
+    if not unplaced:
+        return Loaded(graph, skipped, 0)
+    try:
+        return Loaded(odometry(graph), skipped, len(graph.poses) + len(graph.points))
+    except ValueError as problem:
+        why = str(problem).removeprefix("odometry: ")
+        raise file.end_error(f"no vertices in the file to start from, and {why}") from problem
 
 
 def _identity(file: TextFile, line: int, field: str, name: str) -> int:
@@ -136,122 +148,82 @@ def _identity(file: TextFile, line: int, field: str, name: str) -> int:
     return found
 
 
-def _read_vertex(
-    file: TextFile,
-    line: int,
-    kind: str,
-    names: tuple[str, ...],
-    fields: list[str],
-    vertices: dict[str, dict[int, list[float]]],
-) -> None:
-    """Add a vertex; raises ValueError on a malformed line and on an id that occurred before."""
-    file.expect(line, fields, ("id", *names))
-    vertex = _identity(file, line, fields[0], "id")
-    if any(vertex in known for known in vertices.values()):
-        raise file.error(line, f"vertex {vertex} occurs twice")
-    vertices[kind][vertex] = file.numbers(line, fields[1:], names)
-
-
-def _read_edge(
-    file: TextFile, line: int, edge: _Edge, fields: list[str], rows: dict[str, _Rows]
-) -> None:
-    """Add an edge to its table; raises ValueError on a malformed line."""
+def _row(file: TextFile, line: int, edge: _Edge, fields: list[str]) -> _Row:
+    """The line of an edge; raises ValueError on a malformed one."""
     names = (*"ij"[: len(edge.who)], *edge.measured, *(f"I{i + 1}{j + 1}" for i, j in edge.entries))
     file.expect(line, fields, names)
     count = len(edge.who)
     ids = [_identity(file, line, field, n) for field, n in zip(fields[:count], names, strict=False)]
     if len(set(ids)) < count:
         raise file.error(line, f"an edge from vertex {ids[0]} to itself")
-    table = rows.setdefault(edge.table, _Rows([], [], [], []))
-    table.ids.append(ids)
-    table.numbers.append(file.numbers(line, fields[count:], names[count:]))
-    table.lines.append(line)
-    table.kinds.append(edge)
+    return _Row(line, edge, ids, file.numbers(line, fields[count:], names[count:]))
 
 
-def _named_by_edges(file: TextFile, rows: dict[str, _Rows]) -> dict[str, dict[int, list[float]]]:
+def _named_by_edges(
+    file: TextFile, rows: dict[str, list[_Row]]
+) -> dict[str, dict[int, list[float]]]:
     """The vertices that edges name, at the origin, in the order of their ids."""
-    found: dict[str, set[int]] = {"pose": set(), "point": set()}
-    for table in rows.values():
-        for ids, edge, line in zip(table.ids, table.kinds, table.lines, strict=True):
-            for vertex, kind in zip(ids, edge.who, strict=True):
-                found[kind].add(vertex)
-                if vertex in found["point" if kind == "pose" else "pose"]:
-                    raise file.error(
-                        line, f"vertex {vertex} is a pose in one edge, a point in another"
-                    )
+    kinds: dict[int, str] = {}
+    for row in (row for table in rows.values() for row in table):
+        for vertex, kind in zip(row.ids, row.edge.who, strict=True):
+            if kinds.setdefault(vertex, kind) != kind:
+                raise file.error(
+                    row.line, f"vertex {vertex} is a pose in one edge, a point in another"
+                )
     return {
-        kind: {vertex: [0.0] * (3 if kind == "pose" else 2) for vertex in sorted(ids)}
-        for kind, ids in found.items()
+        kind: {vertex: [0.0] * size for vertex in sorted(kinds) if kinds[vertex] == kind}
+        for kind, size in (("pose", 3), ("point", 2))
     }
 
 
 def _assembled(
     file: TextFile,
     vertices: dict[str, dict[int, list[float]]],
-    rows: dict[str, _Rows],
+    rows: dict[str, list[_Row]],
     fixed: list[tuple[int, int]],
-    skipped: dict[str, int],
-    unplaced: bool,
-) -> Loaded:
+) -> Graph:
     """The graph of the lines of a file; raises ValueError where they do not fit together."""
     index = {
         kind: {vertex: at for at, vertex in enumerate(named)} for kind, named in vertices.items()
     }
     held = {kind: np.zeros(len(named), bool) for kind, named in vertices.items()}
     for line, vertex in fixed:
-        for kind, known in index.items():
-            if vertex in known:
-                held[kind][known[vertex]] = True
-        if not any(vertex in known for known in index.values()):
+        kinds = [kind for kind, known in index.items() if vertex in known]
+        if not kinds:
             raise file.error(line, f"vertex {vertex} is nowhere in the file")
-    values = {
-        kind: np.array(list(named.values())).reshape(-1, 3 if kind == "pose" else 2)
-        for kind, named in vertices.items()
-    }
-    ids = {kind: np.array(list(named), np.int32) for kind, named in vertices.items()}
-    graph = Graph(
-        poses=values["pose"],
-        points=values["point"],
+        held[kinds[0]][index[kinds[0]][vertex]] = True
+    return Graph(
+        poses=np.array(list(vertices["pose"].values())).reshape(-1, 3),
+        points=np.array(list(vertices["point"].values())).reshape(-1, 2),
         tables={key: _table(file, table, index) for key, table in rows.items()},
         fixed_pose=held["pose"],
         fixed_point=held["point"],
-        pose_id=ids["pose"],
-        point_id=ids["point"],
+        pose_id=np.array(list(vertices["pose"]), np.int32),
+        point_id=np.array(list(vertices["point"]), np.int32),
     )
-    if not unplaced:
-        return Loaded(graph, skipped, 0)
-    try:
-        return Loaded(odometry(graph), skipped, len(ids["pose"]) + len(ids["point"]))
-    except ValueError as problem:
-        why = str(problem).removeprefix("odometry: ")
-        raise file.end_error(f"no vertices in the file to start from, and {why}") from problem
 
 
-def _table(file: TextFile, rows: _Rows, index: dict[str, dict[int, int]]) -> Table:
+def _table(file: TextFile, rows: list[_Row], index: dict[str, dict[int, int]]) -> Table:
     """A table; raises ValueError on a vertex that is nowhere and an indefinite information."""
-    who = []
-    for line, ids, edge in zip(rows.lines, rows.ids, rows.kinds, strict=True):
-        for vertex, kind in zip(ids, edge.who, strict=True):
+    who, size = [], len(rows[0].edge.measured)
+    information = np.zeros((len(rows), size, size))
+    for row, own in zip(rows, information, strict=True):
+        for vertex, kind in zip(row.ids, row.edge.who, strict=True):
             if vertex not in index[kind]:
                 elsewhere = any(vertex in known for known in index.values())
                 why = f"is no {kind}" if elsewhere else "is nowhere in the file"
-                raise file.error(line, f"vertex {vertex} {why}")
-        who.append([index[kind][vertex] for vertex, kind in zip(ids, edge.who, strict=True)])
-    numbers, size = np.array(rows.numbers), len(rows.kinds[0].measured)
-    information = np.zeros((len(who), size, size))
-    for edge in set(rows.kinds):
-        mine = np.array([kind is edge for kind in rows.kinds])
-        for (i, j), column in zip(edge.entries, numbers[:, size:].T, strict=True):
-            information[mine, i, j] = information[mine, j, i] = column[mine]
+                raise file.error(row.line, f"vertex {vertex} {why}")
+        who.append([index[kind][v] for v, kind in zip(row.ids, row.edge.who, strict=True)])
+        for (i, j), entry in zip(row.edge.entries, row.numbers[size:], strict=True):
+            own[i, j] = own[j, i] = entry
     bad = indefinite(information)
     if bad.any():
-        row = int(bad.argmax())
         why = "the information is not positive semidefinite"
         if size == 3:
             why += "; EDGE2 has the order I11 I12 I22 I33 I13 I23, EDGE_SE2 that of the rows"
-        raise file.error(rows.lines[row], why)
-    return Table(np.array(who, np.int32), numbers[:, :size], information, np.ones(len(who), bool))
+        raise file.error(rows[int(bad.argmax())].line, why)
+    z = np.array([row.numbers[:size] for row in rows])
+    return Table(np.array(who, np.int32), z, information, np.ones(len(rows), bool))
 
 
 def save(path: str | Path, graph: Graph) -> None:
@@ -262,10 +234,8 @@ def save(path: str | Path, graph: Graph) -> None:
     text = text_of(graph, _ENDINGS.get(ending, _G2O))
     _check_readable(graph)
 
-    def pack(target: Path) -> None:
-        target.write_bytes(gzip.compress(text.encode("utf-8"), mtime=0))
-
-    write_files(path.parent, {path.name: pack if packed else text})
+    content = gzip.compress(text.encode("utf-8"), mtime=0) if packed else text
+    write_files(path.parent, {path.name: content})
 
 
 def text_of(graph: Graph, form: Format = _G2O) -> str:

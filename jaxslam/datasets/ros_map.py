@@ -5,8 +5,9 @@ Grey images are PGM, P5 (binary) and P2 (text), read here; PNG and BMP are read 
 
 import io
 import math
+import re
 import warnings
-from collections.abc import Callable
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeVar
 
@@ -16,7 +17,10 @@ from numpy.typing import NDArray
 
 from jaxslam.datasets.lines import TextFile, read_bytes
 from jaxslam.laser.grids.grid import Grid, check_grid
-from jaxslam.results.files import write_files
+from jaxslam.results.files import Files, write_files
+
+_PGM = re.compile(rb"(P[25])" + 3 * rb"(?:\s|#[^\n]*\n)+([^\s#]+)" + rb"\s")
+"""The head of a PGM file: kind, width, height and largest shade, with comments between."""
 
 _BY_MATPLOTLIB = {b"\x89PNG": "png", b"BM": "bmp"}
 
@@ -33,22 +37,23 @@ def _read_shades(path: Path) -> NDArray[np.float64]:
     for begin, form in _BY_MATPLOTLIB.items():
         if data.startswith(begin):
             return _by_matplotlib(path, data, form)
-    kind = data[:2]
-    if kind not in (b"P5", b"P2") or not data[2:3].isspace():
+    head = _PGM.match(data)
+    if head is None:
         raise ValueError(f"{path}: expected an image in PGM (P5 or P2), PNG or BMP")
-    header, at = _fields(path, data, 2, 3)
-    width, height, top = header
+    width, height, top = _whole(path, head.groups()[1:])
     if width < 1 or height < 1 or not 1 <= top <= 65535:
         raise ValueError(
             f"{path}: expected an image of at least 1 × 1 with a largest shade of 1 to 65535, "
             f"got {width} × {height} with {top}"
         )
-    count = width * height
-    if kind == b"P2":
-        found = np.array(_fields(path, data, at, count)[0])
+    count, body = width * height, data[head.end() :]
+    if head[1] == b"P2":
+        words = re.sub(rb"#[^\n]*", b"", body).split()[:count]
+        if len(words) < count:
+            raise ValueError(f"{path}: the image ends after {len(words)} of {count} numbers")
+        found = np.array(_whole(path, words))
     else:
         shades = np.dtype(np.uint8 if top < 256 else ">u2")
-        body = data[at + 1 :]
         size = count * shades.itemsize
         if len(body) < size:
             raise ValueError(f"{path}: the image ends after {len(body)} of {size} bytes")
@@ -56,6 +61,14 @@ def _read_shades(path: Path) -> NDArray[np.float64]:
     if found.max() > top:
         raise ValueError(f"{path}: a shade of {found.max()} is above the largest, {top}")
     return np.asarray(found.reshape(height, width) / top, np.float64)
+
+
+def _whole(path: Path, words: Sequence[bytes]) -> list[int]:
+    """Words as whole numbers; raises ValueError on one that is none."""
+    for word in words:
+        if not word.isdigit():
+            raise ValueError(f"{path}: expected a whole number, got {word.decode('latin-1')!r}")
+    return [int(word) for word in words]
 
 
 def _by_matplotlib(path: Path, data: bytes, form: str) -> NDArray[np.float64]:
@@ -72,38 +85,6 @@ def _by_matplotlib(path: Path, data: bytes, form: str) -> NDArray[np.float64]:
     if np.any(image[..., colours:] < 1):
         raise ValueError(f"{path}: expected an image that is opaque everywhere")
     return np.asarray(image[..., :colours].mean(axis=2))
-
-
-def _fields(path: Path, data: bytes, at: int, count: int) -> tuple[list[int], int]:
-    """The `count` whole numbers of a text from a place on, without comments, and where they end."""
-    if count > 3:  # a body of text: quicker, and it has no end to find
-        lines = [line.partition(b"#")[0] for line in data[at:].split(b"\n")]
-        words = b" ".join(lines).split()[:count]
-    else:
-        words = []
-        while len(words) < count and at < len(data):
-            if data[at : at + 1].isspace():
-                at += 1
-            elif data[at : at + 1] == b"#":
-                at = (data.find(b"\n", at) + 1) or len(data)
-            else:
-                end = at
-                while end < len(data) and not data[end : end + 1].isspace():
-                    end += 1
-                words.append(data[at:end])
-                at = end
-    if len(words) < count:
-        raise ValueError(f"{path}: the image ends after {len(words)} of {count} numbers")
-    for word in words:
-        if not word.isdigit():
-            raise ValueError(f"{path}: expected a whole number, got {word.decode('latin-1')!r}")
-    return [int(word) for word in words], at
-
-
-def _pgm_bytes(image: NDArray[np.int64], top: int) -> bytes:
-    """A binary PGM file (P5) of shades (rows, columns), 0 to top <= 255, the first row on top."""
-    height, width = image.shape
-    return f"P5\n{width} {height}\n{top}\n".encode() + image.astype(np.uint8).tobytes()
 
 
 CERTAIN = math.log(509.0)
@@ -149,9 +130,7 @@ def save(path: str | Path, grid: Grid, mode: str) -> list[Path]:
     return write_files(path.parent, map_files(path.stem, grid, mode))
 
 
-def map_files(
-    stem: str, grid: Grid, mode: str = "trinary"
-) -> dict[str, str | Callable[[Path], object]]:
+def map_files(stem: str, grid: Grid, mode: str = "trinary") -> Files:
     """The map file STEM.yaml and its image STEM.pgm, as `write_files` takes them."""
     check_grid("write_map", grid)
     if mode not in _MODES:
@@ -169,8 +148,9 @@ def map_files(
         f"image: {_scalar(f'{stem}.pgm')}\nmode: {mode}\nresolution: {float(grid.resolution)!r}\n"
         f"origin: [{numbers}]\nnegate: 0\noccupied_thresh: {occupied}\nfree_thresh: {free}\n"
     )
-    data = _pgm_bytes(image, levels)
-    return {f"{stem}.yaml": text, f"{stem}.pgm": lambda target: target.write_bytes(data)}
+    height, width = image.shape  # the first row is on top
+    pgm = f"P5\n{width} {height}\n{levels}\n".encode() + image.astype(np.uint8).tobytes()
+    return {f"{stem}.yaml": text, f"{stem}.pgm": pgm}
 
 
 def _log_odds(p: NDArray[np.float64]) -> NDArray[np.float64]:

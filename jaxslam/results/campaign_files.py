@@ -14,7 +14,7 @@ from jaxslam.consistency.campaign.block import BOUND
 from jaxslam.consistency.campaign.harness import summaries_of
 from jaxslam.consistency.campaign.kept import add_kept
 from jaxslam.results import report, store
-from jaxslam.results.files import check_formats, check_writable, versions, write_files
+from jaxslam.results.files import Files, check_formats, check_writable, versions, write_files
 
 if TYPE_CHECKING:  # Matplotlib is slow to load
     from jaxslam.results.plot import Figure
@@ -24,6 +24,9 @@ PAGE, RESULT, CURVES = "report.html", "consistency.json", "consistency.csv"
 
 TABLE = "measures.csv"
 """The table of the page."""
+
+TIMES = ("seconds", "compile_seconds", "step_seconds")
+"""Entries of `RESULT` that another computation of the same runs changes."""
 
 BLOCKS = "blocks"
 """The folder of a campaign's finished blocks, beside its results."""
@@ -48,12 +51,6 @@ def check_figure_formats(caller: str, given: str | Iterable[str]) -> tuple[str, 
     return check_formats(caller, given, FORMATS)
 
 
-def filter_of_run_zero(campaign: Campaign) -> str:
-    """The filter whose run 0 is shown where none is kept: the first with a map, else the first."""
-    mapping = [n for n, found in campaign.filters.items() if "rmse_landmarks" in found.measures]
-    return next(iter(mapping or campaign.filters))
-
-
 def save_campaign(
     campaign: Campaign,
     folder: str | Path,
@@ -74,40 +71,28 @@ def save_campaign(
     folder = Path(folder)
     check_writable(folder)
     drawings = _drawings(campaign, seed)
-    there = [name for name in file_names(formats, drawings) if (folder / name).exists()]
-    if there and not overwrite:
+    existing = [name for name in file_names(formats, drawings) if (folder / name).exists()]
+    if existing and not overwrite:
         raise ValueError(
-            f"Campaign.save: {folder / there[0]} exists: overwrite=True replaces it, or choose "
+            f"Campaign.save: {folder / existing[0]} exists: overwrite=True replaces it, or choose "
             "another folder"
         )
     from jaxslam.results import page, plot  # matplotlib is slow to load
 
     drawn = {name: (caption, make()) for name, (caption, make) in drawings.items()}
-    encode = cache(plot.encode)
-
-    def saved(figure: "Figure", kind: str) -> Callable[[Path], object]:
-        return lambda path: path.write_bytes(encode(figure, kind))
-
-    files: dict[str, str | Callable[[Path], object]] = {
+    encode = cache(plot.encode)  # the page and a file have the same picture
+    files: Files = {
         PAGE: page.page(
-            campaign,
-            command,
-            seed,
-            versions(),
-            drawn,
-            lambda figure: encode(figure, "png"),
+            campaign, command, seed, versions(), drawn, lambda figure: encode(figure, "png")
         ),
         RESULT: report.as_json(campaign, command, seed),
         CURVES: report.as_csv(campaign),
         TABLE: report.table_csv(campaign),
     }
     for name, (_, figure) in drawn.items():
-        files |= {f"{name}.{kind}": saved(figure, kind) for kind in formats}
+        files |= {f"{name}.{kind}": encode(figure, kind) for kind in formats}
     stale = () if _holds(folder / RESULT, files[RESULT]) else file_names(FORMATS)
-    paths = write_files(folder, files)
-    for name in {*stale} - {*files}:
-        (folder / name).unlink(missing_ok=True)
-    return paths
+    return write_files(folder, files, replaces=stale)
 
 
 def load(folder: str | Path) -> Campaign:
@@ -139,9 +124,8 @@ def load(folder: str | Path) -> Campaign:
         )
     _, limit, summaries = summaries_of(tallies)
     told = ("scenario", "source", "published", "steps", "dtype")
-    times = ("seconds", "compile_seconds", "step_seconds")
     return Campaign(
-        **{name: found[name] for name in (*told, *times)},
+        **{name: found[name] for name in (*told, *TIMES)},
         runs=runs,
         divergence_limit=float(limit),
         filters={

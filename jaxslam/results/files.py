@@ -16,8 +16,11 @@ from typing import SupportsFloat, TypeAlias
 Json: TypeAlias = dict[str, object]
 """What JSON can hold, by name."""
 
-Files: TypeAlias = dict[str, str | Callable[[Path], object]]
-"""By name, a text, or a function that writes the file at a path: as `write_files` takes them."""
+Content: TypeAlias = str | bytes | Callable[[Path], object]
+"""Of a file: a text, bytes, or a function that writes the file at a path."""
+
+Files: TypeAlias = dict[str, Content]
+"""By name, as `write_files` takes them."""
 
 
 def json_text(content: Mapping[str, object]) -> str:
@@ -38,6 +41,15 @@ def csv_text(header: list[str], rows: list[list[str]]) -> str:
     writer.writerow(header)
     writer.writerows(rows)
     return out.getvalue()
+
+
+def text_table(lines: Sequence[Sequence[str]]) -> list[str]:
+    """The lines of a table as text: the first column is flush left, the others right."""
+    widths = [max(map(len, column)) for column in zip(*lines, strict=True)]
+    return [
+        "  ".join([line[0].ljust(widths[0]), *map(str.rjust, line[1:], widths[1:])])
+        for line in lines
+    ]
 
 
 def versions() -> dict[str, str]:
@@ -81,7 +93,7 @@ def check_writable(folder: Path) -> None:
 
 def write_files(
     folder: Path,
-    files: Mapping[str, str | Callable[[Path], object]],
+    files: Mapping[str, Content],
     *,
     replaces: Sequence[str] = (),
 ) -> list[Path]:
@@ -92,7 +104,7 @@ def write_files(
 
     Args:
         folder: the target, which is created if needed.
-        files: by name, the text, or a function that writes the file at a path.
+        files: by name.
         replaces: patterns of names of an earlier result; files of such names that are not written
             now are removed in the end.
     """
@@ -107,6 +119,8 @@ def write_files(
                 target = Path(hidden) / name
                 if callable(content):
                     content(target)
+                elif isinstance(content, bytes):
+                    target.write_bytes(content)
                 else:
                     target.write_text(content, encoding="utf-8")
             for name in files:

@@ -1,30 +1,23 @@
-"""Results as text: a campaign's table, JSON and CSV, the table of its runs, CSV of one run."""
+"""Results as text: a campaign's table, JSON and CSV; CSV of one run."""
 
-import json
 import math
 import textwrap
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 
 import numpy as np
 
-from jaxslam.consistency import LEVEL, LEVELS, Average, Summary, lopsided, percentage
+from jaxslam.consistency import LEVEL, LEVELS, Average, Summary, percentage
 from jaxslam.consistency.campaign import Campaign
 from jaxslam.consistency.verdict import POWER, TESTS
 from jaxslam.core.types import Estimate
 from jaxslam.results.files import (
-    check_formats,
-    check_writable,
     csv_text,
     json_number,
     json_text,
+    text_table,
     versions,
-    write_files,
 )
-from jaxslam.results.table import VERDICTS, Cell, lost_runs, notes_on, rows_of
-
-RUN_FORMATS = ("csv", "json")
-"""Of `save_runs`."""
+from jaxslam.results.table import VERDICTS, Cell, cell_text, lost_runs, notes_on, rows_of, short
 
 _COLUMNS = 5
 
@@ -187,35 +180,6 @@ def run_columns(campaign: Campaign) -> dict[str, np.ndarray]:
     return found
 
 
-def save_runs(campaign: Campaign, path: str | Path) -> Path:
-    """Write the table to a file of the format that its name ends in, whole or not at all.
-
-    In CSV what is not finite is an empty cell, in JSON (a list a column) null.
-
-    Raises ValueError on another format.
-    """
-    path = Path(path)
-    (kind,) = check_formats("Campaign.save_runs", path.suffix.removeprefix("."), RUN_FORMATS)
-    check_writable(path.parent)
-    found = run_columns(campaign)
-    if kind == "json":
-        made = json.dumps({name: _plain(column) for name, column in found.items()}) + "\n"
-    else:
-        cells = [
-            ["" if value is None else str(value) for value in _plain(column)]
-            for column in found.values()
-        ]
-        made = csv_text(list(found), [list(row) for row in zip(*cells, strict=True)])
-    return write_files(path.parent, {path.name: made})[0]
-
-
-def _plain(column: np.ndarray) -> list[object]:
-    """The values as Python's own, None where not finite."""
-    if column.dtype.kind != "f":
-        return list(column.tolist())
-    return [value if np.isfinite(value) else None for value in column.tolist()]
-
-
 def trajectory_csv(time: np.ndarray, estimate: Estimate) -> str:
     """A path as CSV: a row a step with time, pose and the upper triangle of the pose covariance."""
     header = ["time", "x", "y", "theta", "c_xx", "c_xy", "c_xt", "c_yy", "c_yt", "c_tt"]
@@ -258,44 +222,13 @@ def _columns(campaign: Campaign, names: list[str]) -> str:
     """The table of some filters."""
     lines = [["", "honest", *names]]
     for row in rows_of(campaign, names):
-        lines.append([row.label, row.honest, *map(_cell, row.cells)])
+        lines.append([row.label, row.honest, *map(cell_text, row.cells)])
         if row.published:
-            told = ("" if value is None else f"{value:.4g}" for value in row.published)
+            told = ("" if value is None else short(value) for value in row.published)
             lines.append(["  published", "", *told])
-    widths = [max(len(line[i]) for line in lines) for i in range(len(lines[0]))]
-    text = [
-        "  ".join(
-            c.ljust(w) if i == 0 else c.rjust(w)
-            for i, (c, w) in enumerate(zip(line, widths, strict=True))
-        )
-        for line in lines
-    ]
+    text = text_table(lines)
     text.insert(1, "-" * len(text[0]))
     return "\n".join(text)
-
-
-def _verdict(summary: Summary) -> str:
-    """The verdict, the tests that rejected, and an asterisk if there are doubts."""
-    rejected = ", ".join(
-        TESTS[name].removeprefix("pose ").removesuffix(" / dof") for name in summary.by
-    )
-    return summary.verdict + f" ({rejected})" * bool(rejected) + "*" * bool(summary.doubts)
-
-
-def _cell(cell: Cell) -> str:
-    """A cell of the table as text."""
-    if cell is None:
-        return "-"
-    if isinstance(cell, Summary):
-        return _verdict(cell)
-    if not isinstance(cell, Average):
-        return cell.text
-    value, low, high = cell
-    if not (np.isfinite(low) or np.isfinite(high)) or (low, high) == (0.0, np.inf):
-        return f"{value:.4g}"
-    if lopsided(cell):
-        return f"{value:.4g} [{low:.3g}, {high:.3g}]".replace("inf", "∞")
-    return f"{value:.4g} ± {(high - low) / 2:.2g}"
 
 
 def _finite_or_none(values: Iterable[float]) -> list[float | None]:

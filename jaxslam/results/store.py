@@ -1,52 +1,272 @@
 """The folder of a campaign's finished blocks of runs, from which a campaign can be resumed.
 
-A block is an npz file (`campaign_folder`) that appears only when it is complete, so an interrupted
+A block is an npz file that appears only when it is complete, so an interrupted
 program loses no other block than the current one. A file that is damaged or belongs to another
 campaign is renamed and not counted. A manifest holds the caller's settings and the identity of
 the campaign.
 """
 
 import contextlib
+import errno
+import hashlib
+import io
+import json
+import operator
 import os
+import re
+import secrets
+import zipfile
 from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, field, replace
 from pathlib import Path
+from typing import NamedTuple
 
 import numpy as np
 
 from jaxslam.consistency.campaign.pieces import missing
-from jaxslam.results.campaign_folder import (
-    FORMAT,
-    MANIFEST,
-    Block,
-    as_stored,
-    block_order,
-    differences_of,
-    digest_of,
-    is_unfinished,
-    read_block,
-    read_manifest,
-    runs_of_name,
-    write_block,
-    write_manifest,
-)
+from jaxslam.results.files import Json
 
-__all__ = [
-    "FORMAT",
-    "MANIFEST",
-    "Block",
-    "Store",
-    "create",
-    "is_unfinished",
-    "join",
-    "read_manifest",
-    "resume",
-]
+FORMAT = 3
+"""Format of the folder, written in its manifest; others are refused."""
+
+MANIFEST = "manifest.json"
+"""File with the format, the settings, the identity, their digest, and the number of runs."""
+
+_DIGEST = re.compile("[0-9a-f]{16}")
+"""Digest of a part of an identity; its digits tell a user nothing."""
+
+_ABOUT = "_block"  # the entry of the npz that describes the block
+_NAME = re.compile(r"block-(\d{8,})-(\d{8,})\.npz", re.ASCII)
+_KINDS = "biufcSU"  # of dtypes that npz keeps without pickle
+
+
+class Block(NamedTuple):
+    """The results of runs first … first + runs - 1."""
+
+    first: int
+    runs: int
+    arrays: dict[str, np.ndarray]
+
+
+def write_block(
+    folder: Path, first: int, arrays: Mapping[str, np.ndarray], runs: int, campaign: str
+) -> Path:
+    """Write runs first … first + runs - 1 to a file in a folder, and return its path.
+
+    Raises ValueError on names and dtypes that npz cannot keep, and OSError, with the path and the
+    size, where the disk fails; after any error, an interrupt too, the folder is as it was before.
+
+    Args:
+        folder, first, arrays, runs: what to write, and where.
+        campaign: the digest of the campaign.
+    """
+    first, runs = operator.index(first), operator.index(runs)
+    if first < 0 or runs < 1:
+        raise ValueError(f"block: expected runs >= 1 and first >= 0, got {runs} and {first}")
+    entries = {name: np.asarray(array) for name, array in arrays.items()}
+    for name, array in entries.items():
+        if not name.isprintable() or name in ("", _ABOUT) or re.search(r"\\|\.npy$", name):
+            raise ValueError(f"{name!r} cannot be the name of an array in a block")
+        if array.dtype.kind not in _KINDS:
+            raise ValueError(f"array {name!r}: dtype {array.dtype} cannot be kept in a block")
+    about = {"first": first, "runs": runs, "settings": campaign}
+    about["sha256"] = _checksum(about, entries)
+    entries[_ABOUT] = np.frombuffer(canonical_json(about).encode(), np.uint8)
+    path = folder / f"block-{first:08d}-{first + runs:08d}.npz"
+    write_atomically(path, _npz(entries))
+    return path
+
+
+def read_block(path: Path, campaign: str) -> Block:
+    """The block in a file; raises ValueError with the file and what is wrong with it.
+
+    campaign: the digest of the campaign that the block must belong to.
+    """
+    content = path.read_bytes()
+    try:
+        with np.load(io.BytesIO(content), allow_pickle=False) as npz:
+            # All entries are tested first: a damaged header may ask for any amount of memory.
+            if broken := npz.zip.testzip():
+                raise ValueError(f"entry {broken} is damaged")
+            arrays = {name: np.asarray(npz[name]) for name in npz.files}
+    except MemoryError:
+        raise
+    except Exception as error:  # NumPy and zipfile raise many types
+        raise ValueError(f"{path}: truncated or not an npz ({error})") from error
+    try:
+        about = json.loads(arrays.pop(_ABOUT).tobytes())
+        first, runs, checksum = about["first"], about["runs"], about.pop("sha256")
+        settings = about["settings"]
+    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        raise ValueError(f"{path}: an npz, but not a block of a campaign") from error
+    if checksum != _checksum(about, arrays):
+        raise ValueError(f"{path}: its content does not match its checksum")
+    if settings != campaign:
+        raise ValueError(f"{path}: belongs to another campaign, or to other settings")
+    if (named := runs_of_name(path)) != (first, first + runs):
+        names = f"names runs {named[0]} to {named[1]}" if named else "names no runs"
+        raise ValueError(f"{path}: {names}, holds {first} to {first + runs}")
+    return Block(first, runs, arrays)
+
+
+def runs_of_name(path: Path) -> tuple[int, int] | None:
+    """(first run, one past the last) by the name of a file; None if it is no name of a block."""
+    match = _NAME.fullmatch(path.name)
+    return (int(match[1]), int(match[2])) if match else None
+
+
+def block_order(path: Path) -> tuple[int, int, str]:
+    """Sorting key of block files: by the first run, longer blocks first."""
+    first, end = runs_of_name(path) or (-1, 0)
+    return first, -end, path.name
+
+
+def write_atomically(path: Path, content: bytes, new: bool = False) -> None:
+    """Write a file completely or not at all, through a hidden file of this process beside it.
+
+    new: raise FileExistsError where the path exists. Of several processes one then writes it; on a
+    file system without hard links, of those that do not begin within microseconds.
+    """
+    hidden = path.with_name(f".{path.name}-{os.getpid()}-{secrets.token_hex(4)}.tmp")
+    try:
+        with hidden.open("wb") as file:
+            file.write(content)
+            file.flush()
+            os.fsync(file.fileno())
+        if new:
+            _link(hidden, path)
+        else:
+            os.replace(hidden, path)
+    except OSError as error:
+        reason = f"cannot write {len(content):,} bytes, {error.strerror or error}"
+        raise OSError(error.errno, reason, str(path)) from error
+    finally:
+        with contextlib.suppress(OSError):
+            hidden.unlink()
+
+
+def is_unfinished(path: Path) -> bool:
+    """Whether a file is one that a process writes, or was killed while it wrote."""
+    return path.name.startswith(".") and path.name.endswith(".tmp")
+
+
+def _link(hidden: Path, path: Path) -> None:
+    """Give a file a second name; raises FileExistsError where there is a file of that name."""
+    try:
+        os.link(hidden, path)
+    except FileExistsError:
+        raise
+    except OSError:  # the file system has no hard links
+        if path.exists():
+            raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST)) from None
+        os.replace(hidden, path)
+
+
+def canonical_json(value: object) -> str:
+    """JSON with sorted keys, the same for equal values; raises ValueError on NaN and infinity."""
+    return json.dumps(value, sort_keys=True, allow_nan=False)
+
+
+def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
+    """The bytes that `np.savez` writes, for any names, without pickle and without dates."""
+    out = io.BytesIO()
+    with zipfile.ZipFile(out, "w") as npz:
+        for name, array in arrays.items():
+            with npz.open(f"{name}.npy", "w", force_zip64=True) as entry:
+                np.lib.format.write_array(entry, array, allow_pickle=False)
+    return out.getvalue()
+
+
+def _checksum(about: Mapping[str, object], arrays: Mapping[str, np.ndarray]) -> str:
+    """SHA-256 of the description and of the names, dtypes, shapes and bytes of the arrays."""
+    total = hashlib.sha256(canonical_json(about).encode())
+    for name, array in sorted(arrays.items()):
+        total.update(canonical_json([name, array.dtype.str, array.shape]).encode())
+        total.update(array.tobytes())
+    return total.hexdigest()
+
+
+def read_manifest(folder: Path) -> Json:
+    """The content of the manifest of a campaign's folder, in any format.
+
+    Raises ValueError if there is none, or if the file is no manifest.
+    """
+    path = folder / MANIFEST
+    try:
+        manifest = json.loads(path.read_text(encoding="utf-8"))
+    except FileNotFoundError as error:
+        raise ValueError(
+            f"no campaign to resume: there is no {path}: give the folder of an interrupted "
+            "campaign, or begin a new one"
+        ) from error
+    except json.JSONDecodeError as error:
+        raise ValueError(f"{path}, line {error.lineno}: {error.msg}") from error
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"{path}: not JSON ({error})") from error
+    if not isinstance(manifest, dict) or "format" not in manifest:
+        raise ValueError(f"{path}: not the manifest of a campaign")
+    return manifest
+
+
+def write_manifest(
+    folder: Path,
+    settings: Mapping[str, object],
+    campaign: Mapping[str, str],
+    runs: int | None,
+    new: bool = False,
+) -> None:
+    """Write the manifest of a folder; new: raises FileExistsError where there is one."""
+    own = {"settings": settings, "campaign": campaign}
+    manifest = {"format": FORMAT, "digest": digest_of(own), "runs": runs, **own}
+    text = json.dumps(manifest, indent=2, ensure_ascii=False) + "\n"
+    write_atomically(folder / MANIFEST, text.encode(), new)
+
+
+def as_stored(settings: Mapping[str, object]) -> Json:
+    """Settings as the manifest returns them: tuples become lists, keys strings."""
+    plain: Json = json.loads(json.dumps(dict(settings), allow_nan=False))
+    return plain
+
+
+def digest_of(settings: Mapping[str, object]) -> str:
+    """SHA-256 of settings."""
+    return hashlib.sha256(canonical_json(settings).encode()).hexdigest()
+
+
+def differences_of(
+    there: Mapping[str, object], here: Mapping[str, object], above: str = ""
+) -> list[str]:
+    """A sentence for each setting that differs, in nested settings, too."""
+    found = []
+    for key in {**there, **here}:
+        values = [side[key] for side in (there, here) if key in side]
+        inner = [value for value in values if isinstance(value, dict)]
+        if len(inner) == 2:
+            found += differences_of(inner[0], inner[1], f"{above}{key}.")
+        elif len(values) < 2 or canonical_json(values[0]) != canonical_json(values[1]):
+            plain = all(isinstance(value, str) for value in values)
+            unknown = plain and all(_DIGEST.fullmatch(str(value)) for value in values)
+            old, new = (
+                "absent"
+                if key not in side
+                else "present"
+                if unknown
+                else str(side[key])
+                if plain
+                else json.dumps(side[key], ensure_ascii=False)
+                for side in (there, here)
+            )
+            if len(values) == 2 and unknown:
+                how = "has other numbers or other code than in the stored runs"
+            else:
+                how = f"{old} there, {new} here"
+            found.append(f"{above}{key}: {how}")
+    return found
 
 
 @dataclass(frozen=True)
 class Store:
-    """Finished blocks of a campaign in a folder; make one with `create`, `resume` or `join`.
+    """Finished blocks of a campaign in a folder; make one with `open` or `resume`.
 
     Several processes may save into one folder. Killed processes leave hidden files `.block-….tmp`,
     which are never read.
@@ -68,7 +288,7 @@ class Store:
         names every difference of identities, as "key: … there, … here", and what to do then.
         """
         mine = {str(name): str(value) for name, value in identity.items()}
-        if not (self.folder / MANIFEST).exists():  # of `join`
+        if not (self.folder / MANIFEST).exists():
             with contextlib.suppress(FileExistsError):
                 write_manifest(self.folder, self.settings, mine, self.runs, new=True)
         there = resume(self.folder, self.settings)  # another process may have claimed it since
@@ -140,80 +360,47 @@ class Store:
         self.set_aside.append(f"{reason}; not used, renamed to {name}")
 
 
-def create(
+def open(
     folder: str | os.PathLike[str],
     settings: Mapping[str, object] | None = None,
     runs: int | None = None,
 ) -> Store:
-    """The store of a new campaign in a folder, which is created if needed.
+    """The store of the campaign in a folder: of that which it holds, or of a new one.
 
-    `monte_carlo(keep=…)` notes the identity of the campaign in it.
-
-    Args:
-        folder: the folder.
-        settings: further settings that must agree when the campaign is resumed, of JSON's types.
-        runs: number of runs that the campaign is to have, noted for `resume`.
-    Raises:
-        ValueError: if the folder holds a campaign.
-    """
-    folder, own = _folder(folder), as_stored(settings or {})
-    folder.mkdir(parents=True, exist_ok=True)
-    try:
-        write_manifest(folder, own, {}, runs, new=True)
-    except FileExistsError:
-        raise ValueError(
-            f"store.create: {folder} holds a campaign with {Store(folder, {}).done()} runs done: "
-            "store.resume continues it; or choose another folder"
-        ) from None
-    return Store(folder, own, runs)
-
-
-def join(
-    folder: str | os.PathLike[str],
-    settings: Mapping[str, object] | None = None,
-    runs: int | None = None,
-) -> Store:
-    """The store of a campaign that independent processes compute, each a part of it.
-
-    The first to claim it makes the manifest, with the identity; the others must have the same
-    settings and the same identity.
+    `monte_carlo(keep=…)` notes the identity of the campaign in it, and refuses another one.
+    Independent processes may open one folder, and compute a part of the campaign each.
 
     Args:
-        folder: the folder, which is created if needed; all of them see it.
-        settings: as of `create`.
-        runs: number of runs that the campaign is to have; a larger number than before extends it.
+        folder: the folder, which is created if needed.
+        settings: further settings that must agree when the campaign is opened again, of JSON's
+            types.
+        runs: number of runs that the campaign is to have; a larger number than before extends it
+            from the next `claim` on.
     Raises:
-        ValueError: on any difference of settings, naming all, and where the campaign is to have
-            more runs.
+        ValueError: where the campaign is to have more runs, and as `resume` on what is there.
     """
     folder, own = _folder(folder), as_stored(settings or {})
-    folder.mkdir(parents=True, exist_ok=True)
     if not (folder / MANIFEST).exists():
+        folder.mkdir(parents=True, exist_ok=True)
         return Store(folder, own, runs)
-    there = resume(folder, own)
-    if runs is not None and there.runs is not None and runs < there.runs:
+    kept = resume(folder, own)
+    if runs is not None and runs < (kept.runs or 0):
         raise ValueError(
-            f"{folder}: the campaign is to have {there.runs} runs: expected at least as many, got "
+            f"{folder}: the campaign is to have {kept.runs} runs: expected at least as many, got "
             f"{runs}"
         )
-    return replace(there, runs=there.runs if runs is None else runs)
+    return kept if runs is None else replace(kept, runs=runs)
 
 
-def resume(
-    folder: str | os.PathLike[str],
-    settings: Mapping[str, object] | None = None,
-    runs: int | None = None,
-) -> Store:
+def resume(folder: str | os.PathLike[str], settings: Mapping[str, object] | None = None) -> Store:
     """The store of the campaign that a folder holds.
 
     Args:
         folder: the folder.
         settings: if given, they must equal those of the manifest.
-        runs: if given, the number of runs that the campaign is to have from the next `claim` on;
-            a larger number than before extends it.
     Raises:
-        ValueError: if there is no campaign, if its manifest cannot be read, if it has more runs
-            than `runs`, and on any difference of settings, naming all.
+        ValueError: if there is no campaign, if its manifest cannot be read, and on any difference
+            of settings, naming all.
     """
     folder = _folder(folder)
     manifest, path = read_manifest(folder), folder / MANIFEST
@@ -221,12 +408,11 @@ def resume(
         raise ValueError(
             f"{path}: expected format {FORMAT}, got {manifest['format']}: begin a new campaign"
         )
-    own, campaign = manifest.get("settings"), manifest.get("campaign")
-    total = manifest.get("runs")
+    own, campaign, runs = (manifest.get(key) for key in ("settings", "campaign", "runs"))
     if (
         not isinstance(own, dict)
         or not isinstance(campaign, dict)
-        or not isinstance(total, int | None)
+        or not isinstance(runs, int | None)
         or manifest.get("digest") != digest_of({"settings": own, "campaign": campaign})
     ):
         raise ValueError(
@@ -235,12 +421,7 @@ def resume(
         )
     if settings is not None and (found := differences_of(own, as_stored(settings))):
         raise ValueError(f"{folder} holds another campaign: {'; '.join(found)}")
-    kept = Store(folder, own, total, campaign)
-    if runs is None:
-        return kept
-    if (end := max((first + count for first, count in kept.spans()), default=0)) > runs:
-        raise ValueError(f"{folder} holds {end} runs: expected at least as many, got {runs}")
-    return replace(kept, runs=runs)
+    return Store(folder, own, runs, campaign)
 
 
 def _folder(folder: str | os.PathLike[str]) -> Path:

@@ -5,10 +5,11 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from jaxslam.consistency import DOF, LEVEL, Average, Summary, percentage
+from jaxslam.consistency import DOF, LEVEL, Average, Summary, lopsided, percentage
 from jaxslam.consistency.campaign import Campaign
 from jaxslam.consistency.measures import Measure, measures_of
 from jaxslam.consistency.measures.counts import MEANINGS, count_label
+from jaxslam.consistency.verdict import TESTS
 
 VERDICTS = {
     "consistent": ("✓", "neither test rejects, which is no proof"),
@@ -41,7 +42,7 @@ class Figure(NamedTuple):
 
     text: str
     value: float | None = None
-    """what filters are sorted by, and what CSV has"""
+    """what CSV has"""
 
 
 Cell: TypeAlias = Summary | Average | Figure | None
@@ -60,6 +61,29 @@ class Row(NamedTuple):
     """of each filter, where any has one"""
     group: str = ""
     """heading above the rows, on a page"""
+
+
+def cell_text(cell: Cell) -> str:
+    """A cell as text: a verdict with the tests that rejected, and an asterisk if in doubt."""
+    if cell is None:
+        return "-"
+    if isinstance(cell, Summary):
+        tests = [TESTS[name].removeprefix("pose ").removesuffix(" / dof") for name in cell.by]
+        rejected = f" ({', '.join(tests)})" * bool(tests)
+        return cell.verdict + rejected + "*" * bool(cell.doubts)
+    if not isinstance(cell, Average):
+        return cell.text
+    value, low, high = cell
+    if not (np.isfinite(low) or np.isfinite(high)) or (low, high) == (0.0, np.inf):
+        return short(value)
+    if lopsided(cell):
+        return f"{short(value)} [{short(low, 3)}, {short(high, 3)}]".replace("inf", "∞")
+    return f"{short(value)} ± {short((high - low) / 2, 2)}"
+
+
+def short(value: float, digits: int = 4) -> str:
+    """A number with some significant digits; large ones with all of the digits before the point."""
+    return f"{value:,.0f}" if 10**digits <= abs(value) < 1e6 else f"{value:.{digits}g}"
 
 
 def rows_of(campaign: Campaign, names: Sequence[str]) -> list[Row]:

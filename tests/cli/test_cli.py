@@ -5,14 +5,13 @@ import os
 import re
 import subprocess
 import sys
-from types import SimpleNamespace
 
 import jax
 import pytest
 from worlds import three_parameters
 
 from jaxslam import catalog, cli, scenarios
-from jaxslam.cli.runtime import devices
+from jaxslam.cli import runtime
 from jaxslam.consistency.campaign import Interrupted
 from jaxslam.results import campaign_files, files
 
@@ -21,7 +20,7 @@ QUICK = ["consistency", "--scenario", "circle", "--steps", "8", "--runs", "3"]
 
 def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys, monkeypatch, undrawn):
     out, filmed = tmp_path / "results", []
-    monkeypatch.setattr(cli.consistency.command, "write_films", lambda *a: filmed.append(a))
+    monkeypatch.setattr(cli.consistency, "_write_films", lambda *a: filmed.append(a))
     asked = ["--filters", "dead_reckoning,localization", "--no-bound", "--seed", "4", "--animate"]
     shape = ["--block", "1", "--devices", "1"]
     assert cli.main([*QUICK, *asked, *shape, "--out", str(out)]) == 0
@@ -94,8 +93,8 @@ def test_bad_input_exits_with_2_and_writes_nothing(tmp_path, refused, change, me
 def test_no_more_devices_are_made_than_there_are_cores(monkeypatch):
     told = {}
     monkeypatch.setattr(jax.config, "update", told.__setitem__)
-    for asked, made in (("99", devices.cores()), ("1", 1), ("all", devices.cores())):
-        devices.prepare(SimpleNamespace(devices=asked))
+    for asked, made in (("99", runtime.cores()), ("1", 1), ("all", runtime.cores())):
+        runtime.set_device_count(asked)
         assert told == {"jax_num_cpu_devices": made}
 
 
@@ -107,14 +106,14 @@ def test_particles_are_named_as_any_filter_and_all_spans_them(tmp_path, monkeypa
         seen.extend(filters)
         raise Interrupted(None, 3)
 
-    monkeypatch.setattr(cli.consistency.command, "monte_carlo", begun)
+    monkeypatch.setattr(cli.consistency, "monte_carlo", begun)
     assert cli.main([*QUICK, "--filters", asked, "--out", str(tmp_path / "out")]) == 130
     assert seen == (list(catalog.ALL) if asked == "all" else list(catalog.PARTICLES))
 
 
 def test_a_filter_that_cannot_run_a_scenario_is_refused_by_name(tmp_path, refused, monkeypatch):
     monkeypatch.setattr(
-        cli.consistency.command, "monte_carlo", lambda *a, **k: pytest.fail("work was begun")
+        cli.consistency, "monte_carlo", lambda *a, **k: pytest.fail("work was begun")
     )
     monkeypatch.setitem(scenarios.SCENARIOS, "signs", lambda steps: three_parameters())
     asked = ["consistency", "--scenario", "signs", "--steps", "5", "--filters", "ekf,fej"]
@@ -129,7 +128,7 @@ def test_a_filter_that_cannot_run_a_scenario_is_refused_by_name(tmp_path, refuse
 
 def test_an_unwritable_folder_exits_with_2_before_any_work(tmp_path, refused, monkeypatch):
     monkeypatch.setattr(
-        cli.consistency.command, "monte_carlo", lambda *a, **k: pytest.fail("work was begun")
+        cli.consistency, "monte_carlo", lambda *a, **k: pytest.fail("work was begun")
     )
     (tmp_path / "file").write_text("")
     out = tmp_path / "file" / "deeper" / "out"
@@ -198,6 +197,6 @@ def test_a_closed_pipe_ends_the_command_silently(tmp_path, monkeypatch, capfd):
     os.close(read)
     with os.fdopen(write, "w") as closed, monkeypatch.context() as patch:
         patch.setattr(sys, "stdout", closed)
-        patch.setattr(cli.models, "verify_models", lambda *a: print("report") or 0)
+        patch.setattr(cli.verify, "verify_models", lambda *a: print("report") or 0)
         assert cli.main(["verify", "--out", str(tmp_path)]) == 141
     assert capfd.readouterr().err == ""

@@ -9,8 +9,7 @@ import pytest
 from matplotlib.animation import FFMpegWriter
 
 from jaxslam import cli
-from jaxslam.cli.run.command import positive_definite
-from jaxslam.cli.run.filters import NAMES
+from jaxslam.cli.run import NAMES, positive_definite
 from jaxslam.results import plot
 
 
@@ -30,12 +29,12 @@ def test_run_filters_a_data_set_and_writes_its_results(tmp_path, capsys, monkeyp
         plot, "map_figure", lambda *a, **more: drawn.update(more) or draw(*a, **more)
     )
     data = write_bonn(tmp_path / "bonn")
-    run = ["run", "--dataset", "bonn", str(data), "--check-every", "2", "--out", str(out)]
+    run = ["run", "--dataset", "bonn", str(data), "--out", str(out)]
     assert cli.main(run) == 0
     assert jax.config.jax_enable_x64
     printed = capsys.readouterr().out
     assert "fused 4, initialized 2, rejected 0" in printed
-    assert "at 2 of 2 checked steps" in printed
+    assert "at 3 of 3 checked steps" in printed
     assert {path.name for path in out.iterdir()} == {
         "trajectory.csv",
         "trajectory.tum",
@@ -63,7 +62,7 @@ def test_run_writes_films_and_says_what_is_missing(tmp_path, capsys, monkeypatch
     scenes, film = [], plot.Film
     monkeypatch.setattr(plot, "Film", lambda scene: scenes.append(scene) or film(scene))
     data, out = write_bonn(tmp_path / "bonn"), tmp_path / "out"
-    filters = ["--filters", "ekf,dead_reckoning", "--check-every", "0"]
+    filters = ["--filters", "ekf,dead_reckoning"]
     run = ["run", "--dataset", "bonn", str(data), *filters, "--animate", "--out", str(out)]
     assert cli.main(run) == 0
     printed = capsys.readouterr().out
@@ -87,7 +86,7 @@ def test_run_writes_films_and_says_what_is_missing(tmp_path, capsys, monkeypatch
         (["moon"], "", "unknown dataset 'moon'"),
         (["bonn"], "SENSOR 1 oops 0", "sensor_data.dat:10: "),
         (["victoria_park"], "", "victoria_park"),
-        (["bonn", "--check-every", "-1"], "", "--check-every: expected at least 0"),
+        (["bonn", "--robot", "2"], "", "--robot: expected none, since this data set has one"),
     ],
 )
 def test_bad_input_exits_with_2_and_writes_nothing(tmp_path, refused, asked, spoil, message):

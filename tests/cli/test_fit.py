@@ -80,11 +80,14 @@ def test_the_noises_of_a_folder_are_fitted_and_written(tmp_path, capsys):
         abs(said["innovation autocorrelation"]) < 2 * said["innovation autocorrelation, 95 % band"]
     )
     assert said["converged"] and said["associations settled"]
-    written = (tmp_path / "dataset.toml").read_text()
-    assert 'model = "velocity"' in written and "# by hand" in written
-    after = datasets.table(tmp_path).adjustable.deviations
+    assert (out / "fit.toml").read_text() == (tmp_path / "fit.toml").read_text()
+    fitted = datasets.table(tmp_path)
+    assert fitted.motion.name == "velocity" and "[sensor] noise of fit.toml" in fitted.assumed
+    after = fitted.adjustable.deviations
     np.testing.assert_allclose(after[3], said["parameters"]["sensor range [m]"]["after"], rtol=1e-3)
     assert (out / "fit.toml").read_text().startswith("[motion]\nnoise = [")
+    comment = "  # v [m/s], omega [rad/s], gamma [rad/s]\n\n[sensor]\nnoise = ["
+    assert comment in (out / "fit.toml").read_text()
 
 
 @pytest.mark.parametrize(

@@ -1,4 +1,4 @@
-"""`jaxslam run` on a laser log: a map that ROS reads, a row for every scan, bad input."""
+"""The commands on a laser log: a map that ROS reads, a row for every scan, bad input."""
 
 import dataclasses
 import json
@@ -11,8 +11,8 @@ from matplotlib.animation import FFMpegWriter
 from ring_of_rooms import FAR, ranges_of
 
 from jaxslam import cli, grids
-from jaxslam.cli.laser.mapping import TOGETHER
-from jaxslam.cli.laser.options import read_log
+from jaxslam.cli.laser import read_log
+from jaxslam.cli.mapping import TOGETHER
 from jaxslam.math import numpy_poses as poses
 from jaxslam.results import plot
 from jaxslam.simulation.laser import scan_world
@@ -52,15 +52,13 @@ def log_file(tmp_path_factory):
     return SimpleNamespace(path=path, pose=log.pose[:STEPS], walls=world.walls, lost=lost)
 
 
-def run(path, out, *options):
-    return cli.main(["run", "--dataset", "carmen", str(path), "--out", str(out), *options])
+def run(command, path, out, *options):
+    return cli.main([command, str(path), "--out", str(out), *options])
 
 
 def test_a_map_at_known_poses_is_one_that_ros_reads(log_file, tmp_path, capsys):
     out = tmp_path / "out"
-    assert (
-        run(log_file.path, out, "--map", "known", "--resolution", "0.1", "--max-range", "10") == 0
-    )
+    assert run("map", log_file.path, out, "--resolution", "0.1", "--max-range", "10") == 0
     assert "without a valid beam 1" in capsys.readouterr().out
     assert {path.name for path in out.iterdir()} == {
         *("map.yaml", "map.pgm", "map.png", "trajectory.csv", "trajectory.tum", "summary.json")
@@ -87,8 +85,8 @@ def test_a_map_at_known_poses_is_one_that_ros_reads(log_file, tmp_path, capsys):
 
 def test_scans_are_chosen_and_those_left_out_are_counted(log_file, tmp_path):
     out = tmp_path / "out"
-    chosen = ["--map", "known", "--resolution", "0.1", "--scans", "10:31", "--every", "2"]
-    assert run(log_file.path, out, *chosen) == 0
+    chosen = ["--resolution", "0.1", "--scans", "10:31", "--every", "2"]
+    assert run("map", log_file.path, out, *chosen) == 0
     rows = np.loadtxt(out / "trajectory.csv", delimiter=",", skiprows=1)
     np.testing.assert_allclose(rows[:, 0], 100 + 0.25 * np.arange(10, 31, 2))
     left_out = json.loads((out / "summary.json").read_text())["scans left out"]
@@ -102,64 +100,43 @@ def test_scans_are_chosen_and_those_left_out_are_counted(log_file, tmp_path):
 @pytest.mark.parametrize(
     ("options", "message"),
     [
-        (["--map", "known", "--filters", "seif"], "--filters: a laser log does not have this"),
-        (["--map", "known", "--animate"], "--animate: a laser log has a film of laser SLAM alone"),
-        (["--map", "known", "--relations", "a"], "--relations: relations score laser SLAM alone"),
-        (
-            ["--localize", "m.yaml", "--relations", "a"],
-            "--relations: relations score laser SLAM alone",
-        ),
-        (["--relations", "no.txt"], "no.txt: cannot be read: No such file"),
-        (
-            ["--map", "known", "--start", "global"],
-            "--start: expected --localize MAP.yaml beside it",
-        ),
-        (
-            ["--localize", "m.yaml", "--resolution", "1"],
-            "--resolution: --localize reads a map, which has its own",
-        ),
-        (["--map", "known", "--resolution", "0"], "--resolution: expected a number above 0"),
-        (["--map", "known", "--resolution", "1e-4"], "--resolution: cells of 0.0001 m make a map"),
-        (["--map", "known", "--max-range", "-1"], "--max-range: expected a number above 0"),
-        (["--map", "known", "--every", "0"], "--every: expected a number above 0"),
-        (
-            ["--map", "known", "--mount", "-1,0"],
-            "--mount: expected X,Y,HEADING [m, m, deg], got '-1",
-        ),
-        (["--map", "known", "--mount", "0,nan,0"], "--mount: expected X,Y,HEADING [m, m, deg]"),
-        (
-            ["--map", "known", "--laser", "RLASER"],
-            "room.log:141: expected scans of the laser RLASER",
-        ),
-        (["--map", "known", "--odometry", "no.txt"], "no.txt: cannot be read: No such file"),
-        (["--map", "known", "--scans", "a:b"], "--scans: expected A:B"),
-        (["--map", "known", "--scans", "900:"], "--scans: 900: has none of the 70 scans"),
-        (["--map", "known", "--scans", "3:4"], "room.log: none of 1 scans has a valid beam"),
-        (["--map", "known", "--figures", "gif"], "--figures: expected formats"),
-        (
-            ["--map", "known", "--max-range", "0.01"],
-            "room.log: no beam returns within 0.01 m (--max-range)",
-        ),
-        (["--localize", "map.yaml", "--scans", "-3:3"], "--scans: -3:3 has none of the 70 scans"),
+        (["slam", "--filters", "seif"], "unrecognized arguments: --filters"),
+        (["map", "--animate"], "unrecognized arguments: --animate"),
+        (["slam", "--relations", "no.txt"], "no.txt: cannot be read: No such file"),
+        (["map", "--resolution", "0"], "--resolution: expected a number above 0"),
+        (["map", "--resolution", "1e-4"], "--resolution: cells of 0.0001 m make a map"),
+        (["map", "--max-range", "-1"], "--max-range: expected a number above 0"),
+        (["map", "--every", "0"], "--every: expected a number above 0"),
+        (["map", "--mount", "-1,0"], "--mount: expected X,Y,HEADING [m, m, deg], got '-1"),
+        (["map", "--mount", "0,nan,0"], "--mount: expected X,Y,HEADING [m, m, deg]"),
+        (["map", "--laser", "RLASER"], "room.log:141: expected scans of the laser RLASER"),
+        (["map", "--odometry", "no.txt"], "no.txt: cannot be read: No such file"),
+        (["map", "--scans", "a:b"], "--scans: expected A:B"),
+        (["map", "--scans", "900:"], "--scans: 900: has none of the 70 scans"),
+        (["map", "--scans", "3:4"], "room.log: none of 1 scans has a valid beam"),
+        (["map", "--figures", "gif"], "--figures: expected formats"),
+        (["map", "--max-range", "0.01"], "room.log: no beam returns within 0.01 m (--max-range)"),
+        (["localize", "m.yaml", "--scans", "-3:3"], "--scans: -3:3 has none of the 70 scans"),
     ],
 )
 def test_options_that_do_not_fit_are_refused(log_file, tmp_path, refused, options, message):
     out = tmp_path / "out"
-    refused(["run", "--dataset", "carmen", log_file.path, "--out", out, *options], message)
+    refused([*options, log_file.path, "--out", out], message)
     assert not out.exists()
 
 
 def test_a_log_that_ends_in_a_line_is_refused_with_the_line(log_file, tmp_path, refused):
     short, out = tmp_path / "short.log", tmp_path / "out"
     short.write_text(log_file.path.read_text()[:-40])
-    run = ["run", "--dataset", "carmen", short, "--out", out, "--map", "known"]
-    refused(run, f"short.log:{2 * STEPS + 1}: expected {BEAMS + 11} fields")
+    refused(
+        ["map", short, "--out", out], f"short.log:{2 * STEPS + 1}: expected {BEAMS + 11} fields"
+    )
     assert not out.exists()
 
 
 def test_a_path_too_short_to_be_scored_is_told(log_file, tmp_path, undrawn):
     out = tmp_path / "out"
-    assert run(log_file.path, out, "--scans", ":2", "--max-range", "10") == 0
+    assert run("slam", log_file.path, out, "--scans", ":2", "--max-range", "10") == 0
     score = json.loads((out / "summary.json").read_text())["score"]
     assert score == "none: the path is shorter than 1 m"
 
@@ -171,7 +148,7 @@ def test_laser_slam_writes_a_film_of_the_map_growing(
     scenes, film = [], plot.Film
     monkeypatch.setattr(plot, "Film", lambda scene: scenes.append(scene) or film(scene))
     out = tmp_path / "out"
-    assert run(log_file.path, out, "--scans", ":2", "--max-range", "10", "--animate") == 0
+    assert run("slam", log_file.path, out, "--scans", ":2", "--max-range", "10", "--animate") == 0
     assert "\nfilm: ffmpeg is not installed: GIF instead of MP4\n" in capsys.readouterr().out
     assert (out / "film.gif").read_bytes().startswith(b"GIF")
     assert "data:image/png;base64," in (out / "film.html").read_text()
@@ -184,12 +161,6 @@ def test_laser_slam_writes_a_film_of_the_map_growing(
     ]
 
 
-def test_options_of_laser_logs_are_of_no_other_data_set(tmp_path, refused):
-    run = ["run", "--dataset", "bonn", tmp_path, "--map", "known"]
-    refused(run, "--map: expected a laser log, --dataset carmen")
-    refused(["run", "--dataset", "moon", tmp_path], "unknown dataset 'moon'; known: ", ", carmen")
-
-
 @pytest.fixture(scope="module")
 def room_map(log_file, tmp_path_factory):
     """A map of the room, as another program would have made it."""
@@ -200,8 +171,8 @@ def room_map(log_file, tmp_path_factory):
 
 def test_a_robot_is_localized_in_a_map_by_odometry_and_scans(log_file, room_map, tmp_path, capsys):
     out = tmp_path / "out"
-    options = ["--max-range", "10", "--particles", "500", "--localize", str(room_map)]
-    assert run(log_file.path, out, *options) == 0
+    options = [str(log_file.path), "--max-range", "10", "--particles", "500"]
+    assert run("localize", room_map, out, *options) == 0
     capsys.readouterr()
     assert {path.name for path in out.iterdir()} == {
         *("localization.png", "trajectory.csv", "trajectory.tum", "summary.json")
@@ -218,7 +189,7 @@ def test_a_robot_is_localized_in_a_map_by_odometry_and_scans(log_file, room_map,
     assert summary["particles agree at the end"] is (summary["weight of the heaviest"] > 0.5)
     assert summary[FIT] > 0.9
     assert summary["localized at the end"] == "yes"
-    assert run(log_file.path, tmp_path / "lost", *options, "--start", "5,5,90") == 0
+    assert run("localize", room_map, tmp_path / "lost", *options, "--start", "5,5,90") == 0
     summary = json.loads((tmp_path / "lost" / "summary.json").read_text())
     assert summary["particles agree at the end"] and summary[FIT] < 0.6
     assert summary["localized at the end"] == "no: less than 75% of the beams fit the map"
@@ -248,8 +219,8 @@ def mounted(request, log_file, tmp_path_factory):
 
 def test_a_map_by_a_laser_on_a_mount(log_file, mounted, tmp_path):
     out = tmp_path / "out"
-    options = ["--map", "known", "--resolution", "0.1"]
-    assert run(mounted.path, out, *options) == 0
+    options = ["--resolution", "0.1"]
+    assert run("map", mounted.path, out, *options) == 0
     grid = grids.read_map(out / "map.yaml")
     free = np.asarray(grid.log_odds) < 0
     assert free.sum() > 1000
@@ -260,14 +231,14 @@ def test_a_map_by_a_laser_on_a_mount(log_file, mounted, tmp_path):
     x, y, heading = summary["mount of the laser [m, m, deg]"]
     np.testing.assert_allclose([x, y, np.deg2rad(heading)], mounted.mount, atol=1e-6)
     given = [f"{mounted.mount[0]}", f"{mounted.mount[1]}", f"{np.rad2deg(mounted.mount[2])}"]
-    assert run(mounted.path, tmp_path / "given", *options, "--mount", ",".join(given)) == 0
+    assert run("map", mounted.path, tmp_path / "given", *options, "--mount", ",".join(given)) == 0
     again = grids.read_map(tmp_path / "given" / "map.yaml")
     assert (again.log_odds == grid.log_odds).mean() > 0.99
 
 
 def test_a_robot_is_localized_by_a_laser_on_a_mount(mounted, room_map, tmp_path):
     out = tmp_path / "out"
-    assert run(mounted.path, out, "--particles", "500", "--localize", str(room_map)) == 0
+    assert run("localize", room_map, out, str(mounted.path), "--particles", "500") == 0
     rows = np.loadtxt(out / "trajectory.csv", delimiter=",", skiprows=1)
     error = np.hypot(*(rows[:, 1:3] - mounted.pose[:, :2]).T)
     assert np.median(error) < 0.3 and error[-1] < 0.3
@@ -278,7 +249,7 @@ def test_a_robot_is_localized_by_a_laser_on_a_mount(mounted, room_map, tmp_path)
 def test_odometry_of_a_file_takes_the_place_of_the_logs(log_file, tmp_path):
     text = "".join(f"{100 + 0.25 * k} {k / 10} 0 0\n" for k in range(STEPS))
     (tmp_path / "odometry.txt").write_text(text)
-    asked = {"dataset": "carmen", "path": log_file.path, "odometry": tmp_path / "odometry.txt"}
+    asked = {"path": log_file.path, "odometry": tmp_path / "odometry.txt"}
     rest = {"max_range": 10.0, "laser": None, "mount": None, "scans": ":", "every": 2}
     log, _ = read_log(SimpleNamespace(**asked, **rest))
     np.testing.assert_allclose(log.raw[:, 0], np.arange(0, STEPS, 2) / 10)
@@ -291,13 +262,11 @@ def test_odometry_of_a_file_takes_the_place_of_the_logs(log_file, tmp_path):
         (("", ""), ["--start", "9,9,0"], "--start: the pose (9 m, 9 m, 0°) is off the map"),
         (("", ""), ["--start", "here"], "--start: expected file, global or X,Y,HEADING"),
         (("image: room.pgm", "image: no.pgm"), [], "room.yaml:1: no image"),
-        (("resolution: 0.1", "resolution: 0"), [], "room.yaml:3: expected a resolution above 0"),
         (
             ("", ""),
             ["--start", "-60,-.5,90"],
             "--start: the pose (-60 m, -0.5 m, 90°) is off the map",
         ),
-        (("origin: [-0.5, ", "origin: ["), [], "room.yaml:4: expected origin: [x, y, yaw]"),
         (("negate: 0", "negate: 1"), [], "room.yaml: the map has no free cell"),
     ],
 )
@@ -311,15 +280,6 @@ def test_a_map_or_a_start_that_is_none_is_refused(
     full = "negate: 1" in change  # then white is occupied
     image = b"P5\n2 1\n255\n\xff\xff" if full else room_map.with_suffix(".pgm").read_bytes()
     (tmp_path / "room.pgm").write_bytes(image)
-    run = ["run", "--dataset", "carmen", log_file.path, "--out", out, "--localize", here]
+    run = ["localize", here, log_file.path, "--out", out]
     refused([*run, *options], message)
-    assert not out.exists()
-
-
-def test_an_image_of_another_format_is_refused(log_file, room_map, tmp_path, refused):
-    here, out = tmp_path / "room.yaml", tmp_path / "out"
-    here.write_text(room_map.read_text())
-    (tmp_path / "room.pgm").write_bytes(b"\x89PNG\r\n")
-    run = ["run", "--dataset", "carmen", log_file.path, "--out", out, "--localize", here]
-    refused(run, "room.pgm: expected a PNG image: ")
     assert not out.exists()

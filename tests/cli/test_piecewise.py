@@ -4,10 +4,10 @@ import itertools
 
 import jax.numpy as jnp
 import numpy as np
-import pytest
 
 from jaxslam import charts
-from jaxslam.cli.run.piecewise import run_in_pieces
+from jaxslam.cli import piecewise
+from jaxslam.cli.piecewise import run_in_pieces
 from jaxslam.core.protocols import Filter
 from jaxslam.core.record import record
 from jaxslam.core.types import Estimate, Log, Scan
@@ -55,18 +55,16 @@ def log_of(steps=STEPS):
     return Log(control, scan)
 
 
-@pytest.mark.parametrize(
-    ("every", "looked"),
-    [(4, [4, 8, 11]), (None, list(range(1, 12))), (0, []), (20, [11]), (11, [11])],
-)
-def test_a_log_in_pieces_is_the_whole_log(every, looked):
+def test_a_log_in_pieces_is_the_whole_log(monkeypatch):
+    monkeypatch.setattr(piecewise, "LONGEST", 4)
+    monkeypatch.setattr(piecewise, "PIECES", 2)
+    looked = [4, 8, 11]
     traced, shown, seen = [], [], []
     done = run_in_pieces(
         toy(traced),
         log_of(),
         np.ones(3),
         np.zeros((3, 3)),
-        every=every,
         check=lambda pose: seen.append(np.asarray(pose)) or float(pose[0]) > 20,
         progress=lambda done, total: shown.append((done, total)),
     )
@@ -86,28 +84,18 @@ def test_a_log_in_pieces_is_the_whole_log(every, looked):
     assert len(traced) <= 2  # its shapes and its program, however many pieces there are
 
 
-@pytest.mark.parametrize("every", [4, 0])
-def test_what_a_film_shows_is_kept_of_the_steps_to_watch_alone(every):
+def test_what_a_film_shows_is_kept_of_the_steps_to_watch_alone(monkeypatch):
+    monkeypatch.setattr(piecewise, "PIECES", 3)
     at = np.array([0, 3, 4, 4, 10])
-    options = {"every": every, "check": lambda pose: True, "progress": lambda done, total: None}
     start = np.ones(3), np.zeros((3, 3))
     done = run_in_pieces(
-        toy([]), log_of(), *start, **options, at=at, watch=lambda pose: {"twice": 2 * pose}
+        toy([]),
+        log_of(),
+        *start,
+        progress=lambda done, total: None,
+        at=at,
+        watch=lambda pose: {"twice": 2 * pose},
     )
     np.testing.assert_array_equal(done.estimates.pose, done.path.pose[at])
     np.testing.assert_array_equal(done.watched["twice"], 2 * done.path.pose[at])
     assert done.estimates.points.shape == (5, 1, 2) and done.slot.shape == (STEPS, 2)
-
-
-def test_a_long_log_is_shown_every_500_steps_at_least():
-    shown = []
-    run_in_pieces(
-        toy([]),
-        log_of(1200),
-        np.ones(3),
-        np.zeros((3, 3)),
-        every=0,
-        check=lambda pose: True,
-        progress=lambda done, total: shown.append(done),
-    )
-    assert shown == [500, 1000, 1200]

@@ -118,7 +118,6 @@ def test_a_scenario_of_a_file_may_be_a_function_of_its_steps(mine):
             "; or FILE.py:NAME, one of your own",
         ),
         (["--figures", "gif"], "--figures: expected formats of png, pdf, svg, got 'gif'"),
-        (["--table", "xls"], "--table: expected formats of csv, json, got 'xls'"),
         (["--figures", ""], "--figures: expected formats of png, pdf, svg, got ''"),
     ],
 )
@@ -165,9 +164,8 @@ def test_a_campaign_of_a_file_is_resumed_while_the_file_computes_the_same(
     assert cli.main([*again, "--figures", "svg"]) == 0
     assert "finished: nothing was run and nothing written" in capsys.readouterr().out
     # Of a finished campaign.
-    assert cli.main([*again, "--figures", "pdf,png", "--table", "csv,json"]) == 0
+    assert cli.main([*again, "--figures", "pdf,png"]) == 0
     assert {path.suffix for path in out.glob("map.*")} == {".svg", ".pdf", ".png"}
-    assert {path.name for path in out.glob("runs.*")} == {"runs.csv", "runs.json"}
     mine.write_text(MINE.replace("factor = 2.0", "factor = 3.0"))
     message = refused(
         [*again, "--runs", "4"],

@@ -39,7 +39,7 @@ def registered():
 
 
 def test_a_measure_of_ones_own_is_everywhere(registered, tmp_path):
-    keep = store.create(tmp_path / "blocks")
+    keep = store.open(tmp_path / "blocks")
     options = {"block": 4, "bound": True, "keep": keep}
     campaign = jaxslam.monte_carlo(WORLD, {"ekf": worlds.ekf(WORLD)}, 6, worlds.key(), **options)
     summary = campaign.filters["ekf"]
@@ -63,7 +63,7 @@ def test_a_measure_of_ones_own_is_everywhere(registered, tmp_path):
     assert float(rows["claimed σ [m]"]["ekf low"]) == pytest.approx(average.low, rel=1e-8)
     assert rows["farthest"]["honest"] == "0.25" and rows["verdict"]["ekf"] == summary.verdict
     assert "claimed" in _rows(report.as_csv(campaign))[0]
-    assert "claimed" in _rows(campaign.save_runs(tmp_path / "runs.csv").read_text())[0]
+    assert "claimed" in report.run_columns(campaign)
     assert json.loads(report.as_json(campaign))["filters"]["ekf"]["measures"]["claimed"]
     assert plot.rmse_figure(campaign).axes[-1].get_ylabel() == "claimed σ [m]"
 

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxslam import datasets
-from jaxslam.datasets.carmen.scans import _code_of_no_return
+from jaxslam.datasets.carmen_scans import _code_of_no_return
 from jaxslam.math import numpy_poses as poses
 
 MOUNT = np.array([0.2, -0.1, np.pi])
@@ -56,7 +56,7 @@ def test_a_maximum_range_that_is_none_is_told(read, far):
     assert log.max_range == 50.0
     np.testing.assert_allclose(log.beams.range, [[5.6, 2.0, 8.183]])
     assert any(what.endswith("take the one asked for: 1") for what in log.corrections)
-    with pytest.raises(ValueError, match=r"a\.log:1: the maximum range is no number: 'far'"):
+    with pytest.raises(ValueError, match=r"a\.log:1: the maximum range is not a number: 'far'"):
         read(line("ROBOTLASER1", ROBOT[0], far="far"))
 
 

@@ -58,14 +58,11 @@ def test_readers_by_name(tmp_path):
     first = {name.replace("2", "1"): text for name, text in MRCLAM.items()}
     both = write(tmp_path, VICTORIA | BONN | MRCLAM | first)
     file = both / "victoria_park.txt"
-    assert datasets.READERS["victoria_park"](file, None).name == "victoria_park"
-    assert datasets.READERS["bonn"](str(both), None).name == "bonn"
-    assert datasets.READERS["mrclam"](both, None).name == "mrclam robot 1"
-    assert datasets.READERS["mrclam"](both, 2).name == "mrclam robot 2"
-    for name, path in (("victoria_park", file), ("bonn", both)):
-        with pytest.raises(ValueError, match="robot: expected none"):
-            datasets.READERS[name](path, 1)
-    for name, path in (("victoria_park", file), ("bonn", both), ("mrclam", both)):
-        data = datasets.READERS[name](path, None)
-        assert data.source
-        assert datasets.Dataset is type(data)
+    for name, arguments, named in (
+        ("victoria_park", [file], "victoria_park"),
+        ("bonn", [str(both)], "bonn"),
+        ("mrclam", [both], "mrclam robot 1"),
+        ("mrclam", [both, 2], "mrclam robot 2"),
+    ):
+        data = datasets.READERS[name](*arguments)
+        assert data.name == named and data.source and type(data) is datasets.Dataset

@@ -6,7 +6,7 @@ import scipy.io
 
 import jaxslam
 from jaxslam import datasets, se2
-from jaxslam.datasets import READERS, plaza
+from jaxslam.datasets import plaza
 
 GOOD = {
     "DR": [[1.0, 1.0, 0.0], [2.0, 1.0, np.pi / 2], [3.0, 1.0, 0.0]],
@@ -96,7 +96,7 @@ def test_what_is_no_such_file_is_refused(tmp_path):
 @pytest.fixture(scope="module")
 def plaza1():
     gtsam = pytest.importorskip("gtsam", reason="the file comes with the gtsam wheel")
-    return READERS["plaza"](gtsam.findExampleDataFile("Plaza1_.mat"), None)
+    return plaza(gtsam.findExampleDataFile("Plaza1_.mat"))
 
 
 def test_the_odometry_leads_along_the_ground_truth(plaza1):
@@ -120,6 +120,4 @@ def test_the_odometry_leads_along_the_ground_truth(plaza1):
     off = plaza1.log.scan.z[rows, places, 0] - distance
     assert abs(off.mean()) < 0.05
     assert 0.4 < off.std() < 0.6
-    with pytest.raises(ValueError, match="robot: expected none"):
-        READERS["plaza"]("nowhere", 2)
     assert jaxslam.datasets.plaza is datasets.plaza

@@ -121,7 +121,7 @@ def test_what_is_run_again_after_a_change_of_the_code(commands):
 
     assert changed("simulation/scenarios/circle.py") == [True, False]
     assert changed("verify/examination.py") == [False, True]
-    assert changed("cli/laser/slam.py") == [False, False]
+    assert changed("cli/slam.py") == [False, False]
 
 
 def test_each_block_is_a_directive_or_is_run(commands):

@@ -6,4 +6,6 @@ from jaxslam import store
 
 @pytest.fixture
 def made(tmp_path):
-    return store.create(tmp_path / "a" / "campaign", SETTINGS)
+    made = store.open(tmp_path / "a" / "campaign", SETTINGS)
+    made.claim({})
+    return made

@@ -5,6 +5,7 @@ import errno
 import itertools
 import os
 import zipfile
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -83,7 +84,7 @@ def test_a_failed_save_leaves_the_earlier_blocks_alone(made, monkeypatch, call, 
 
 @pytest.mark.skipif(not os.path.exists("/dev/full"), reason="needs /dev/full")
 def test_a_full_disk_names_the_file_and_the_size(made, monkeypatch):
-    monkeypatch.setattr("builtins.open", lambda _, mode, plain=open: plain("/dev/full", mode))
+    monkeypatch.setattr(Path, "open", lambda _, mode, plain=open: plain("/dev/full", mode))
     with pytest.raises(
         OSError, match=r"cannot write 80\d,\d{3} bytes, No space .*block-00000000"
     ) as e:

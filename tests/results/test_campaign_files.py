@@ -194,15 +194,3 @@ def test_without_pandas_a_line_says_so(found, monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
     with pytest.raises(ImportError, match="to_dataframe needs pandas, which is not inst"):
         found.to_dataframe()
-
-
-def test_runs_are_written_as_csv_and_json(found, tmp_path):
-    text = found.save_runs(tmp_path / "new" / "runs.csv").read_text().splitlines()
-    assert text[0] == "filter,run,finite,nees_pose,square_position"
-    assert text[1] == "good,0,True,0.0,1.0" and text[5] == "other,4,False,,"
-    read = json.loads(found.save_runs(tmp_path / "runs.json").read_text())
-    assert list(read) == text[0].split(",")
-    assert read["nees_pose"] == [0, 1, 2, 5, None, 7] and read["run"] == [0, 4, 5] * 2
-    found.save_runs(tmp_path / "runs.json")  # replaced
-    with pytest.raises(ValueError, match="save_runs: expected formats of csv, json, got 'xls'"):
-        found.save_runs(tmp_path / "runs.xls")

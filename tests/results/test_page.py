@@ -11,7 +11,8 @@ from jaxslam import plot
 from jaxslam.consistency import DOF, LEVELS, Average, Summary
 from jaxslam.consistency.campaign import Campaign
 from jaxslam.consistency.measures import BUILT_IN
-from jaxslam.results.page import VERDICTS, page
+from jaxslam.results.page import page
+from jaxslam.results.table import VERDICTS
 
 STEPS, RUNS = 7, 30
 EVIL = "<script>alert(1)</script>&\"'"
@@ -150,12 +151,12 @@ def test_names_are_escaped(text, read):
 def test_filters_verdicts_and_measures_stand_in_the_table(read):
     assert read.rows[0] == ["measure", "honest", "good", EVIL, "lost"]
     assert row(read, "verdict")[1:] == ["consistent", "✓ consistent", "▲ optimistic", "✕ diverged"]
-    assert row(read, "pose NEES (x, y, θ)")[1:] == ["3", "3.041 ± 0.050", "9.0 ± 1.0", "–"]
-    assert row(read, "position RMSE [m]")[2] == "1.20 ± 0.10published 1.25"
+    assert row(read, "pose NEES (x, y, θ)")[1:] == ["3", "3.041 ± 0.05", "9 ± 1", "-"]
+    assert row(read, "position RMSE [m]")[2] == "1.2 ± 0.1published 1.25"
     assert row(read, "over conditional bound")[1:3] == ["1", "1"]
     assert row(read, "unobservable directions")[2] == "3 ± 0"
-    assert row(read, "rotation information [1/rad²]")[2] == "(3.0 ± 1.0)·10−26"
-    assert row(read, "log-likelihood")[2] == "−12,346 ± 100"
+    assert row(read, "rotation information [1/rad²]")[2] == "3e-26 ± 1e-26"
+    assert row(read, "log-likelihood")[2] == "-12,346 ± 100"
     assert row(read, "not finite")[2:] == ["0", "2", "0"]
     assert row(read, "finite runs")[2:] == ["30", "28", "30"]
     assert row(read, "steps in pose band")[2] == "75.0\N{NO-BREAK SPACE}%"
@@ -210,13 +211,6 @@ def test_figures_are_embedded_with_captions_and_alternative_text(read):
         if (tag, name) == ("img", "src"):
             png = base64.b64decode(value.split(",")[1], validate=True)
             assert png.startswith(b"\x89PNG\r\n")
-
-
-def test_cells_hold_the_number_they_are_sorted_by(read):
-    assert [v for tag, name, v in read.attributes if (tag, name) == ("td", "data-v")][:5] == [
-        *("0", "1", "3"),  # verdicts, in the order of VERDICTS
-        *("3.0412", "9"),
-    ]
 
 
 def test_a_narrow_screen_has_rules_of_its_own(text):

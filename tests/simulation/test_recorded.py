@@ -49,7 +49,7 @@ def test_a_campaign_of_records_is_that_of_the_draws(tmp_path):
     campaign = partial(monte_carlo, filters=filters, block=4, progress=False)
     expected = campaign(DRAWN, runs=5, key=KEY).filters["ekf"]
     world = recorded()
-    for key, keep in ((KEY, None), (jax.random.key(8), store.create(tmp_path / "kept"))):
+    for key, keep in ((KEY, None), (jax.random.key(8), store.open(tmp_path / "kept"))):
         found = campaign(world, runs=5, key=key, keep=keep).filters["ekf"]
         chex.assert_trees_all_close(found.per_run, expected.per_run, rtol=1e-9)
     again = campaign(recorded(), runs=5, key=key, keep=store.resume(tmp_path / "kept"))

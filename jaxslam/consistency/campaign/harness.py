@@ -72,7 +72,7 @@ def monte_carlo(
             versions) is its `identity`. More runs than it has extend it.
         part: (i, n) with 1 <= i <= n: only the blocks i - 1, i - 1 + n, … are computed, and the
             returned campaign covers them. So n independent jobs compute a
-            campaign, each with a `keep` from `store.join` on one folder, with the same block and
+            campaign, each with a `keep` from `store.open` on one folder, with the same block and
             number of devices; without `part` the blocks are summed up, and those that are missing
             computed.
         progress: called with (runs done, runs) after each block. Default a bar with
@@ -167,7 +167,7 @@ def _check(
         callable(getattr(keep, name, None)) for name in ("claim", "save", "blocks")
     ):
         raise ValueError(
-            "monte_carlo: expected keep as from jaxslam.store.create(folder) or .resume(folder), "
+            "monte_carlo: expected keep as from jaxslam.store.open(folder) or .resume(folder), "
             f"got {keep!r}"
         )
     if not (progress is None or progress is False or callable(progress)):

@@ -120,19 +120,6 @@ class Campaign:
 
         return pandas.DataFrame(report.run_columns(self))
 
-    def save_runs(self, path: str | Path) -> Path:
-        """Write the table of `to_dataframe` to a file, and return its path; it is replaced.
-
-        Args:
-            path: ends in .csv or .json (a list a column), which sets the format.
-        Raises:
-            ValueError: on another ending.
-            OSError: if the folder cannot be written.
-        """
-        from jaxslam.results import report
-
-        return report.save_runs(self, path)
-
 
 class Interrupted(KeyboardInterrupt):
     """Ctrl-C, raised after the blocks in flight; `campaign` covers the finished runs, if any."""

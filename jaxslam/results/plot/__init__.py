@@ -5,29 +5,33 @@ Only this package draws. Figures are made without pyplot, so there is no global 
 column of a paper, with letters of the same size.
 """
 
-from jaxslam.results.plot.campaigns.cost import cost_figure
-from jaxslam.results.plot.campaigns.errors import errors_figure, run_errors_figure
-from jaxslam.results.plot.campaigns.measures import (
+from jaxslam.results.plot.errors import errors_figure, run_errors_figure
+from jaxslam.results.plot.film import Film, Layer, Panel, Scene, has_ffmpeg
+from jaxslam.results.plot.graphs import graph_figure, graph_scene
+from jaxslam.results.plot.grids import (
+    grid_figure,
+    loops_figure,
+    map_scene,
+    maps_before_after,
+    topology_figure,
+)
+from jaxslam.results.plot.landmarks import ellipse, map_figure, run_map_figure, walls_figure
+from jaxslam.results.plot.measures import (
+    cost_figure,
     coverage_figure,
     gained_figure,
     nees_figure,
     rmse_figure,
     whiteness_figure,
 )
-from jaxslam.results.plot.maps.geometry import ellipse
-from jaxslam.results.plot.maps.graph import graph_figure
-from jaxslam.results.plot.maps.grids import grid_figure
-from jaxslam.results.plot.maps.landmarks import map_figure, run_map_figure
-from jaxslam.results.plot.maps.lines import walls_figure
-from jaxslam.results.plot.maps.loops import loops_figure, maps_before_after
-from jaxslam.results.plot.maps.topology import topology_figure
-from jaxslam.results.plot.scene.animate import animate, animate_world
-from jaxslam.results.plot.scene.film import Film, Layer, Panel, Scene, has_ffmpeg
-from jaxslam.results.plot.scene.graph_scene import graph_scene
-from jaxslam.results.plot.scene.history import History, frame_steps
-from jaxslam.results.plot.scene.map_scene import map_scene
-from jaxslam.results.plot.scene.probe import probe
-from jaxslam.results.plot.scene.run_scene import run_scene
+from jaxslam.results.plot.run_film import (
+    History,
+    animate,
+    animate_world,
+    frame_steps,
+    probe,
+    run_scene,
+)
 from jaxslam.results.plot.style import COLORS, COLUMN, PAGE, Figure, describe, encode, png
 
 __all__ = [

@@ -58,22 +58,18 @@ def look(i: int) -> Look:
     }
 
 
-def png(figure: Figure, dpi: float = 200) -> bytes:
-    """The figure as a PNG file with dpi dots an inch."""
-    out = io.BytesIO()
-    figure.savefig(out, format="png", dpi=dpi)
-    return out.getvalue()
-
-
-def encode(figure: Figure, kind: str) -> bytes:
+def encode(figure: Figure, kind: str, dpi: float = 200) -> bytes:
     """The figure as a file of a kind, png, pdf or svg; the same bytes every time."""
-    if kind == "png":
-        return png(figure)
     out = io.BytesIO()
     # TrueType fonts in PDF, as publishers ask; the same names of parts in every SVG file.
     with matplotlib.rc_context({"pdf.fonttype": 42, "svg.hashsalt": "jaxslam"}):
-        figure.savefig(out, format=kind, metadata=_NO_DATE[kind])
+        figure.savefig(out, format=kind, dpi=dpi, metadata=_NO_DATE.get(kind))
     return out.getvalue()
+
+
+def png(figure: Figure, dpi: float = 200) -> bytes:
+    """The figure as a PNG file with dpi dots an inch."""
+    return encode(figure, "png", dpi)
 
 
 def describe(figure: Figure) -> str:
@@ -199,14 +195,6 @@ def plain(name: str) -> str:
     """A name escaped for Matplotlib: without formulas, and not hidden from the legend."""
     name = name.replace("$", r"\$")
     return f" {name}" if name.startswith("_") else name
-
-
-def in_lines(name: str) -> str:
-    """A long name in several lines, broken at underscores."""
-    words = plain(name).replace("_", "_ ")
-    return "\n".join(
-        line.replace("_ ", "_") for line in textwrap.wrap(words, 12, break_long_words=False)
-    )
 
 
 def caption(figure: Figure, title: str, handles: Sequence[Artist] | None = None) -> None:

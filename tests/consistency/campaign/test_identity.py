@@ -50,7 +50,7 @@ ELSEWHERE = np.asarray(worlds.ring(12).landmarks) + [1e-15, 0.0]
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    kept = store.create(tmp_path_factory.mktemp("claimed"))
+    kept = store.open(tmp_path_factory.mktemp("claimed"))
     kept.claim(identity(**campaign(), platform="cpu"))
     return kept.folder
 
@@ -102,7 +102,7 @@ def test_another_precision_platform_version_or_bound_is_another_campaign(folder,
 
 
 def test_fewer_runs_than_are_kept_are_refused(tmp_path):
-    kept = store.create(tmp_path)
+    kept = store.open(tmp_path)
     kept.claim(identity(**campaign(), platform="cpu"))
     kept.save(0, {"0/x": np.zeros(2)}, 2)
     kept.save(2, {"0/x": np.zeros(2)}, 2)

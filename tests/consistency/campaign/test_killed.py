@@ -52,7 +52,7 @@ def _begin(folder, programs, full_after):
     try:
         if limited:
             fill()
-        campaign(keep=store.join(folder, runs=RUNS), progress=fill if limited else False)
+        campaign(keep=store.open(folder, runs=RUNS), progress=fill if limited else False)
     except OSError as error:
         full = error.errno == errno.EFBIG and "cannot write" in str(error)
         os._exit(FULL if full else 1)

@@ -106,7 +106,7 @@ class Spy:
 
 
 def test_a_stopped_campaign_goes_on_and_no_run_comes_twice(tmp_path, in_fours):
-    kept = store.create(tmp_path, {"seed": 0})
+    kept = store.open(tmp_path, {"seed": 0})
     first = Spy(kept)
 
     def stop(done, total):

@@ -12,7 +12,7 @@ import worlds
 
 from jaxslam import cli, filters, store
 from jaxslam.consistency.campaign import monte_carlo
-from jaxslam.results import campaign_files, campaign_folder
+from jaxslam.results import campaign_files
 
 WORLD = worlds.ring(20)
 RECKONING = filters.DeadReckoning(WORLD.motion, WORLD.sensor)
@@ -36,7 +36,7 @@ def blocks(folder):
 
 def test_parts_missing_doubled_and_rerun_sum_up_to_one_go(tmp_path, whole):
     def part(i, runs=22):
-        return campaign_of(runs, keep=store.join(tmp_path, runs=runs), part=(i, 3))
+        return campaign_of(runs, keep=store.open(tmp_path, runs=runs), part=(i, 3))
 
     last = part(3)
     assert blocks(tmp_path) == [2, 5]
@@ -51,19 +51,19 @@ def test_parts_missing_doubled_and_rerun_sum_up_to_one_go(tmp_path, whole):
     assert heard[-1] == (8, 8)  # part 2 alone
     worlds.assert_same_bits(found, whole)
     # Two of the same part at once: neither knows of the other's blocks.
-    doubled = [store.join(tmp_path / "b", runs=22) for _ in range(2)]
+    doubled = [store.open(tmp_path / "b", runs=22) for _ in range(2)]
     worlds.assert_same_bits(*(campaign_of(22, keep=keep, part=(2, 3)) for keep in doubled))
 
 
 def test_parts_extend_a_campaign_and_do_not_shorten_it(tmp_path, whole):
     for i in (1, 2):
-        campaign_of(10, keep=store.join(tmp_path, runs=10), part=(i, 2))
+        campaign_of(10, keep=store.open(tmp_path, runs=10), part=(i, 2))
     for i in (2, 1):
-        campaign_of(22, keep=store.join(tmp_path, runs=22), part=(i, 2))
+        campaign_of(22, keep=store.open(tmp_path, runs=22), part=(i, 2))
     assert store.resume(tmp_path).runs == 22
     worlds.assert_same_bits(campaign_of(22, keep=store.resume(tmp_path)), whole)
     with pytest.raises(ValueError, match="is to have 22 runs: expected at least as many, got 10"):
-        store.join(tmp_path, runs=10)
+        store.open(tmp_path, runs=10)
 
 
 @pytest.mark.parametrize("part", [(0, 2), (3, 2), (1.0, 2), "1/2", (1, 2, 3), (True, 2)])
@@ -92,7 +92,7 @@ def test_of_processes_that_begin_at_once_one_makes_the_manifest(tmp_path, links,
 
         def begin(i, folder=folder, ready=ready, fates=fates):
             ready.wait()
-            kept = store.join(folder, {"seed": 0}, 10)
+            kept = store.open(folder, {"seed": 0}, 10)
             if not links and i:
                 ready.wait()
             try:
@@ -115,17 +115,7 @@ def test_of_processes_that_begin_at_once_one_makes_the_manifest(tmp_path, links,
         assert store.resume(folder).campaign == {"jax": f"0.{winner}"}
         assert [path.name for path in folder.iterdir()] == ["manifest.json"]
         with pytest.raises(ValueError, match="seed: 0 there, 1 here"):
-            store.join(folder, {"seed": 1})
-
-
-def test_of_two_that_create_a_campaign_one_is_refused(tmp_path, monkeypatch):
-    def created_meanwhile(*arguments, original=campaign_folder.os.link):
-        original(*arguments)
-        return original(*arguments)
-
-    monkeypatch.setattr(campaign_folder.os, "link", created_meanwhile)
-    with pytest.raises(ValueError, match=r"holds a campaign with 0 runs done"):
-        store.create(tmp_path)
+            store.open(folder, {"seed": 1})
 
 
 ASKED = ["--scenario", "circle", "--filters", "dead_reckoning", "--steps", "12", "--block", "2"]
@@ -167,10 +157,13 @@ def test_the_command_computes_a_part(tmp_path, capsys, in_one_go):
     assert command(out, "--devices", "1", "--part", "9/9") == 0
     assert "part 9 of 9 has no block of the 13 runs" in capsys.readouterr().out
     for options, told in (
-        (["--devices", "1", "--seed", "3"], "--seed is 0 there, 3 here: give all parts the same"),
+        (["--devices", "1", "--seed", "3"], "--seed is 0 there, 3 here: choose another folder"),
         (["--devices", "2"], "--devices is 1 there, 2 here"),
         (["--devices", "1", "--block", "4"], "--block is 2 there, 4 here"),
-        (["--devices", "1", "--runs", "12"], "to have 13 runs: expected at least as many, got 12"),
+        (
+            ["--devices", "1", "--runs", "12"],
+            "is to have 13 runs: expected at least as many, got 12",
+        ),
         (["--devices", "1", "--overwrite"], "--part: expected no --overwrite"),
     ):
         assert command(out, "--part", "1/3", *options) == 2
@@ -183,8 +176,10 @@ def test_the_command_computes_a_part(tmp_path, capsys, in_one_go):
     assert cli.main(["consistency", "--resume", str(out), "--part", "1/9"]) == 0
     assert cli.main(["consistency", "--resume", str(out)]) == 0  # with the devices of the parts
     assert results(out) == results(in_one_go)
-    assert command(in_one_go, "--part", "1/2") == 2
-    assert "devices: absent there" in capsys.readouterr().err
+    assert command(in_one_go, "--devices", "1", "--part", "1/2") == 2
+    assert (
+        "--devices is not given there, 1 here: give all parts the same" in capsys.readouterr().err
+    )
 
 
 def test_the_job_array_of_the_documentation(tmp_path, in_one_go):

@@ -12,6 +12,7 @@ from worlds import nothing_compiled
 
 from jaxslam import filters, laser_slam, metrics, run, sensors
 from jaxslam.cli import main
+from jaxslam.cli import slam as results
 from jaxslam.core.types import Beams, Log, Scan
 from jaxslam.laser.laser_slam import LoopOutcome, covariances
 from jaxslam.laser.laser_slam.mapping import growing_maps
@@ -19,7 +20,6 @@ from jaxslam.laser.laser_slam.odometry.pieces import laser_odometry
 from jaxslam.laser.laser_slam.odometry.raw import steps_of
 from jaxslam.laser.laser_slam.scans import scans_of
 from jaxslam.math import numpy_poses as poses
-from jaxslam.results import laser_slam as results
 from jaxslam.results.files import write_files
 
 ONCE = dataclasses.replace(SETTINGS, rounds=1)  # and so fewer programs
@@ -263,13 +263,13 @@ def carmen_lines(true, log):
 
 
 def test_the_command_scores_it_by_the_poses_in_the_file(drive, monkeypatch, tmp_path):
-    """`jaxslam run --dataset carmen FILE`, with the result of above in place of a second one."""
+    """`jaxslam slam FILE`, with the result of above in place of a second one."""
     true, log, found = drive
     monkeypatch.setattr(laser_slam, "solve", lambda log, settings, progress: found)
     lines = carmen_lines(true, log)
     (tmp_path / "ring.log").write_text("\n".join(lines))
     out = tmp_path / "out"
-    command = ["run", "--dataset", "carmen", str(tmp_path / "ring.log"), "--out", str(out)]
+    command = ["slam", str(tmp_path / "ring.log"), "--out", str(out)]
     assert main([*command, "--figures", "svg"]) == 0
     summary = json.loads((out / "summary.json").read_text())
     assert summary["mean relation error to 10 m [m]"] < 0.1
@@ -304,7 +304,7 @@ def test_the_command_scores_it_by_relations(drive, monkeypatch, tmp_path, capsys
     text = relation_text(made, time) + "5 6 0 0 0 0 0 0\n"
     (tmp_path / "ring.relations").write_text(text)
     out = tmp_path / "out"
-    command = ["run", "--dataset", "carmen", str(tmp_path / "ring.log"), "--out", str(out)]
+    command = ["slam", str(tmp_path / "ring.log"), "--out", str(out)]
     asked = ["--relations", str(tmp_path / "ring.relations"), "--figures", "svg"]
     assert main([*command, *asked]) == 0
     told = json.loads((out / "summary.json").read_text())["relations"]
@@ -338,7 +338,7 @@ def test_relations_that_do_not_join_are_refused_before_the_work(
     (tmp_path / "ring.log").write_text("\n".join(carmen_lines(true, log)))
     (tmp_path / "ring.relations").write_text("7.5 8.5 0 0 0 0 0 0\n50 60 0 0 0 0 0 0\n")
     out = tmp_path / "out"
-    command = ["run", "--dataset", "carmen", str(tmp_path / "ring.log"), "--out", str(out)]
+    command = ["slam", str(tmp_path / "ring.log"), "--out", str(out)]
     assert main([*command, "--relations", str(tmp_path / "ring.relations")]) == 2
     (told,) = capsys.readouterr().err.splitlines()
     assert "ring.relations: none of 2 relations, from 7.500000 s to 60.000000 s, " in told

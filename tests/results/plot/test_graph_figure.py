@@ -36,7 +36,7 @@ def test_path_loops_and_points_are_drawn_in_both_panels(drawn):
         found = lines(axes)
         assert found["path"].shape == (7, 2, 2)
         assert found["loop edges"].shape == (3, 2, 2)
-        assert found["measurements of points"].shape == (5, 2, 2)  # of the table drawn last
+        assert found["measurements of points"].shape == (21, 2, 2)  # of both tables
         np.testing.assert_allclose(found["path"][0], graph.poses[:2, :2] + shift)
         (points,) = [line for line in axes.lines if line.get_label() == "points"]
         np.testing.assert_allclose(points.get_xydata(), graph.points)

@@ -9,7 +9,7 @@ import pytest
 
 from jaxslam import plot
 from jaxslam.core.types import Trace
-from jaxslam.results.plot.campaigns.scale import BEYOND
+from jaxslam.results.plot.panels import BEYOND
 from jaxslam.results.plot.style import curves_of
 
 

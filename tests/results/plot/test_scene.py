@@ -16,9 +16,8 @@ from jaxslam.filters.delayed.state import TableLayout, empty_state
 from jaxslam.filters.information.eif_slam import CanonicalState
 from jaxslam.filters.information.sparse_state import empty_map
 from jaxslam.filters.particles.slam_particles import initial_slam_particles
-from jaxslam.results.plot.scene import layers
-from jaxslam.results.plot.scene.history import MOST, history_of
-from jaxslam.results.plot.scene.probe import Cloud, Hypotheses, Links
+from jaxslam.results.plot.film import still
+from jaxslam.results.plot.run_film import MOST, Cloud, Hypotheses, Links, history_of
 from jaxslam.results.plot.style import panels_of
 
 STEPS = 3
@@ -261,9 +260,7 @@ def test_another_film_is_another_layer():
         image = axes.imshow(images[0], cmap="gray", vmin=0, vmax=1, extent=(0, 1, 0, 1))
         return lambda k: image.set_data(images[k])
 
-    panel = plot.Panel(
-        [growing, layers.still(np.array([[0.5, 0.5]]), color="white")], (0, 1), (0, 1)
-    )
+    panel = plot.Panel([growing, still(np.array([[0.5, 0.5]]), color="white")], (0, 1), (0, 1))
     film = plot.Film(plot.Scene(3, panel), width=4.0, fps=4)
     middle = [picture[110, 100, 0] for picture in pictures(film)]
     assert [film.scene.said(k) for k in range(3)] == ["frame 1", "frame 2", "frame 3"]

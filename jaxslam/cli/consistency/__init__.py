@@ -1,1 +1,0 @@
-"""The command `jaxslam consistency`: options, campaign, folder, films."""

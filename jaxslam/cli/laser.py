@@ -1,0 +1,216 @@
+"""What the commands on a laser log share: its options, the scans they ask for, and the results."""
+
+import argparse
+import dataclasses
+import math
+import time
+from collections.abc import Callable
+from functools import partial
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxslam import datasets
+from jaxslam.cli import cache
+from jaxslam.cli.common import (
+    FILMS,
+    SUMMARY,
+    add_dtype,
+    add_figures,
+    add_out,
+    check_out,
+    summary_table,
+)
+from jaxslam.datasets import LaserLog
+from jaxslam.laser.grids import Grid
+from jaxslam.results.campaign_files import FORMATS, check_figure_formats
+from jaxslam.results.files import Files, Json, json_text, versions, write_files
+
+
+class Job(NamedTuple):
+    """The result of a command, for the screen and the folder of results."""
+
+    summary: Json
+    """entries of the summary"""
+    files: Files
+    text: str = ""
+    """what is printed below the summary"""
+    details: Json | None = None
+    """entries of `summary.json` that are printed in `text`"""
+
+
+Work = Callable[[LaserLog, argparse.Namespace], Job]
+"""What a command makes of a log; `options.figures` are the formats of its figures."""
+
+
+def add_options(parser: argparse.ArgumentParser, work: Work, *, map_is_made: bool = True) -> None:
+    """Add the options of a command on a laser log; map_is_made: of which cells, is an option."""
+    parser.add_argument("path", metavar="FILE", help="the log, in the format of CARMEN")
+    if map_is_made:
+        parser.add_argument(
+            "--resolution",
+            type=float,
+            metavar="M",
+            default=0.05,
+            help="side of a cell of the map that is made [m] (default: 0.05)",
+        )
+    parser.add_argument(
+        "--max-range",
+        type=float,
+        metavar="M",
+        default=50.0,
+        help="a range from here on, or from the maximum that the log states, met nothing [m] "
+        "(default: 50)",
+    )
+    parser.add_argument(
+        "--every", type=int, metavar="N", default=1, help="use each n-th scan (default: 1)"
+    )
+    parser.add_argument(
+        "--scans",
+        metavar="A:B",
+        default=":",
+        help="use the scans from number A on and before B; :455 is the first 455 (default: all)",
+    )
+    parser.add_argument(
+        "--laser",
+        metavar="KIND",
+        help="lines of the laser to read: FLASER, RLASER, ROBOTLASER1, RAWLASER1, … (default: of "
+        "those with poses the one with most scans)",
+    )
+    parser.add_argument(
+        "--odometry",
+        metavar="FILE",
+        help="raw odometry, lines t x y heading [s, m, m, rad], in place of the log's",
+    )
+    parser.add_argument(
+        "--mount",
+        metavar="X,Y,HEADING",
+        help="pose of the laser on the robot [m, m, deg] (default: that of the log)",
+    )
+    add_figures(parser, FORMATS)
+    cache.add_options(parser)
+    add_dtype(parser)
+    add_out(parser)
+    parser.set_defaults(command=partial(run_job, work))
+
+
+def run_job(work: Work, options: argparse.Namespace, command: str) -> int:
+    """Read the log, print and write what a command makes of it; returns the exit status."""
+    began = time.perf_counter()
+    for name in ("resolution", "max_range", "every", "particles"):
+        value = getattr(options, name, 1)
+        if not 0 < value < math.inf:
+            raise ValueError(f"--{name.replace('_', '-')}: expected a number above 0, got {value}")
+    options.figures = check_figure_formats("--figures", options.figures.split(","))
+    log, left_out = read_log(options)
+    check_out(options.out, command.split()[1])
+    job = work(log, options)
+    x, y, heading = map(float, log.mount)
+    mount = {"mount of the laser [m, m, deg]": [x, y, float(np.rad2deg(heading))]}
+    summary: Json = {
+        "dataset": log.name,
+        "source": log.source,
+        "command": command,
+        "dtype": options.dtype,
+        "scans": len(log.time),
+        "scans left out": left_out,
+        "dropped by the reader": dict(log.dropped),
+        "corrections to the data": list(log.corrections),
+        **(mount if log.mount.any() else {}),
+        **job.summary,
+        "seconds": round(time.perf_counter() - began, 2),
+    }
+    print(summary_table({"": summary}))
+    if job.text:
+        print("\n" + job.text)
+    told = json_text(summary | (job.details or {}) | {"versions": versions()})
+    written = write_files(options.out, job.files | {SUMMARY: told}, replaces=FILMS)
+    print("\nwrote " + ", ".join(str(path) for path in written))
+    return 0
+
+
+def read_log(options: argparse.Namespace) -> tuple[LaserLog, dict[str, int]]:
+    """The scans that the options ask for, and how many are left out, by reason.
+
+    Raises ValueError, with the file, where no scan is left or none has a valid beam.
+    """
+    log = datasets.carmen(
+        options.path,
+        max_range=options.max_range,
+        laser=options.laser,
+        odometry=options.odometry,
+        mount=None if options.mount is None else pose_of("--mount", options.mount),
+    )
+    total = len(log.time)
+    first, last = _interval(options.scans, total)
+    keep = np.arange(first, last)[:: options.every]
+    if not len(keep):
+        raise ValueError(f"--scans: {options.scans} has none of the {total} scans of {log.source}")
+    # Raw odometry is known where it tells of any of the steps between two scans that are kept.
+    known = np.diff(np.cumsum(log.odometry_known)[keep], prepend=-1) > 0
+    log = dataclasses.replace(
+        log,
+        **{name: getattr(log, name)[keep] for name in ("time", "corrected", "raw", "row")},
+        odometry_known=known,
+        beams=type(log.beams)(*(part[keep] for part in log.beams)),
+    )
+    blind = int((~np.asarray(log.beams.valid).any(axis=1)).sum())
+    if blind == len(keep):
+        raise ValueError(f"{log.source}: none of {blind} scans has a valid beam")
+    return log, {
+        "outside --scans": total - (last - first),
+        "skipped by --every": last - first - len(keep),
+        "without a valid beam": blind,
+    }
+
+
+def _interval(text: str, total: int) -> tuple[int, int]:
+    """The first scan and the one after the last of A:B, as slices of Python have it."""
+    ends = text.split(":")
+    try:
+        if len(ends) != 2:
+            raise ValueError
+        first, last = (int(end) if end.strip() else None for end in ends)
+    except ValueError:
+        raise ValueError(f"--scans: expected A:B, two numbers of scans, got {text!r}") from None
+    start, stop, _ = slice(first, last).indices(total)
+    return start, max(start, stop)
+
+
+def check_poses(log: LaserLog) -> None:
+    """Raise ValueError where the scans of a log have no poses."""
+    if not log.placed:
+        raise ValueError(f"{log.source}: expected poses beside the scans, and {log.laser} has none")
+
+
+def pose_of(option: str, text: str, others: str = "") -> Float[np.ndarray, "3"]:
+    """The pose (3,) of X,Y,HEADING [m, m, deg]."""
+    try:
+        pose = np.array([float(field) for field in text.split(",")])
+    except ValueError:
+        pose = np.zeros(0)
+    if pose.shape != (3,) or not np.all(np.isfinite(pose)):
+        raise ValueError(f"{option}: expected {others}X,Y,HEADING [m, m, deg], got {text!r}")
+    pose[2] = np.angle(np.exp(1j * np.deg2rad(pose[2])))
+    return pose
+
+
+def scored(log: LaserLog, score: Callable[[], Json]) -> Json:
+    """The score by the poses in the file, or why there is none: no poses, or they were the odometry
+    as well."""
+    if not log.placed:
+        return {"score": "none: the file has no poses"}
+    if np.allclose(log.raw, log.corrected, rtol=0, atol=1e-6):
+        return {"score": "none: the odometry is equal to the poses that would score it"}
+    return score()
+
+
+def map_size(grid: Grid) -> dict[str, object]:
+    """The size of a map: entries of the summary."""
+    height, width = grid.log_odds.shape
+    return {
+        "map, cells wide": width,
+        "map, cells high": height,
+        "resolution [m]": float(grid.resolution),
+    }

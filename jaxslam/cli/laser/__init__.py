@@ -1,1 +1,0 @@
-"""`jaxslam run` on a laser log: options, mapping from known poses, localization in a map."""

@@ -1,0 +1,231 @@
+"""The command `jaxslam localize`: Monte-Carlo localization from raw odometry and scans."""
+
+import argparse
+from typing import TypedDict
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, PyTree
+
+from jaxslam import motion
+from jaxslam.cli import laser
+from jaxslam.cli.piecewise import run_in_pieces
+from jaxslam.consistency.campaign.progress import Progress
+from jaxslam.core.types import Info
+from jaxslam.datasets import LaserLog
+from jaxslam.laser import grids
+from jaxslam.laser.grids import Grid
+from jaxslam.math.numpy_poses import compose
+from jaxslam.results import report
+from jaxslam.results.files import Files, Json
+
+START_DEVIATION = np.array([0.2, 0.2, np.deg2rad(10.0)])
+"""Standard deviations of the pose at the start [m, m, rad]."""
+
+ODOMETRY_NOISE = (0.05, 0.03, 0.02, 0.01)
+"""α of `motion.OdometryNoise`: for a straight step of 0.7 m 10 cm ahead and 7° of each turn. Raw
+odometry of intel, freiburg-101 and edmonton differs from the corrected poses by 4 cm, 5 cm and 1.7°
+to 3.5° (RMS) a step of 0.5 m to 1 m; the rest is for robots with worse wheels."""
+
+
+class _Weighing(TypedDict):
+    """Options of `grids.GridLocalization`."""
+
+    exponent: float
+    """of the likelihood"""
+    forget: tuple[float, float] | None
+    """recovery"""
+
+
+TRACKING: _Weighing = {"exponent": 0.2, "forget": None}
+"""Exponent of the likelihood and recovery, of a robot that starts at a pose: none, since it takes
+scans that the map does not explain for a robot that is lost."""
+
+ANYWHERE: _Weighing = {"exponent": 0.1, "forget": (0.05, 0.5)}
+"""The same of a robot that may be anywhere, few particles being near the truth."""
+
+SIGMA = {"pose": 0.1, "anywhere": 0.2}
+"""Width of the likelihood field [m]."""
+
+BEAMS = 60
+"""About as many beams of a scan enter the weights."""
+
+NEAR = 0.5
+"""Distance from the reference within which the robot counts as found [m]."""
+
+
+LAST, REACH, FIT = 10, 0.3, 0.75
+"""The robot is said to be localized where of the beams of the last scans, so many, at least this
+share has the range that the map predicts, within REACH [m]: `benchmarks/NOTES.md` has the runs that
+it was chosen on."""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `jaxslam localize`."""
+    parser.add_argument("map", metavar="MAP.yaml", help="a map of ROS")
+    laser.add_options(parser, run_localization, map_is_made=False)
+    parser.add_argument(
+        "--start",
+        metavar="POSE",
+        default="file",
+        help="where the robot starts: file (the pose beside the first scan), global (anywhere that "
+        "is free), or X,Y,HEADING [m, m, deg] (default: file)",
+    )
+    parser.add_argument(
+        "--particles",
+        type=int,
+        metavar="N",
+        default=2000,
+        help="largest number of particles (default: 2000)",
+    )
+    parser.add_argument(
+        "--seed",
+        type=int,
+        metavar="N",
+        default=0,
+        help="seed of the particles' random numbers (default: 0)",
+    )
+
+
+def run_localization(log: LaserLog, options: argparse.Namespace) -> laser.Job:
+    """Localize the robot in the map, from raw odometry and scans: likelihood field, KLD, and from
+    anywhere recovery.
+
+    Particles and the path are the robot's poses. The poses in the file score the result, and serve
+    nothing else but the start `file`.
+    """
+    from jaxslam.results import plot  # matplotlib is slow to load
+
+    grid = grids.read_map(options.map)
+    if not np.any(np.asarray(grid.log_odds) < 0):
+        raise ValueError(f"{options.map}: the map has no free cell")
+    pose = _start(options.start, log)
+    if pose is not None and not _on(grid, pose):
+        x, y, heading = pose
+        raise ValueError(
+            f"--start: the pose ({x:g} m, {y:g} m, {np.rad2deg(heading):g}°) is off the map "
+            f"{options.map}"
+        )
+    options_of = ANYWHERE if pose is None else TRACKING
+    sigma = SIGMA["anywhere" if pose is None else "pose"]
+    filter = grids.GridLocalization(
+        grid,
+        grids.LikelihoodField(sigma, max_range=log.max_range, mount=log.mount),
+        motion.Odometry(motion.OdometryNoise(ODOMETRY_NOISE)),
+        options.particles,
+        start="uniform" if pose is None else "gaussian",
+        **options_of,
+        every=max(1, np.shape(log.beams.range)[1] // BEAMS),
+    )
+    rows = grids.beam_log(motion.odometry_controls(log.raw), log.beams)
+    last = len(log.time) - 1
+    with Progress(f"{log.name}, localization", "scans") as progress:
+        found = run_in_pieces(
+            filter,
+            jax.tree.map(jnp.asarray, rows),
+            np.zeros(3) if pose is None else pose,
+            np.diag(START_DEVIATION**2),
+            progress=progress,
+            seed=options.seed,
+            at=np.array([last]),
+            watch=lambda state: (state.pose, state.log_weight),
+            keep=_particle_info,
+        )
+    path = found.path
+    cloud, weight = (np.asarray(part)[-1] for part in found.watched)
+    groups = grids.clusters(cloud, weight)
+    info = found.kept
+    agree = bool(groups.weight[0] > 0.5)
+    fit = share_as_predicted(grid, np.asarray(path.pose)[-LAST:], log)
+    summary = {
+        "job": "localization",
+        "map": str(options.map),
+        "start": options.start,
+        "particles": options.particles,
+        "particles in use, mean": float(np.mean(info.active)),
+        "particles drawn anywhere, to recover": int(np.sum(info.injected)),
+        "scans that left no particle a weight": int(np.sum(info.underflow)),
+        "particles off the map or in a wall, largest share": float(
+            np.max(info.blocked / info.active)
+        ),
+        "hypotheses at the end": len(groups.weight),
+        "weight of the heaviest": float(groups.weight[0]),
+        "particles agree at the end": agree,
+        f"beams of the last {LAST} scans within {REACH:g} m of the map's range, share": fit,
+        "localized at the end": (
+            "no: hypotheses disagree"
+            if not agree
+            else "yes"
+            if fit >= FIT
+            else f"no: less than {FIT:.0%} of the beams fit the map"
+        ),
+        "final pose [m, m, rad]": [float(value) for value in path.pose[-1]],
+    } | laser.scored(log, lambda: scores(np.asarray(path.pose), log.corrected))
+
+    figure = plot.grid_figure(
+        grid,
+        poses=path.pose,
+        width=plot.PAGE,
+        others={"poses in the file": log.corrected},
+        title=f"{log.name}: localization",
+    )
+    files: Files = {
+        "trajectory.csv": report.trajectory_csv(log.time, path),
+        "trajectory.tum": report.trajectory_tum(log.time, path),
+        **{f"localization.{kind}": plot.encode(figure, kind) for kind in options.figures},
+    }
+    return laser.Job(summary, files)
+
+
+def _start(text: str, log: LaserLog) -> np.ndarray | None:
+    """The pose (3,) at which localization starts; None for anywhere."""
+    if text == "global":
+        return None
+    if text == "file":
+        laser.check_poses(log)
+        return np.asarray(log.corrected[0])
+    return laser.pose_of("--start", text, "file, global or ")
+
+
+def share_as_predicted(grid: Grid, poses: Float[np.ndarray, "n 3"], log: LaserLog) -> float:
+    """Of the beams of the last n scans that met something, the share whose range is within REACH of
+    that of the map at the robot's pose of its scan; 0 without such beams."""
+    scans = jax.tree.map(lambda part: part[-len(poses) :], log.beams)
+    rays = grids.ray_map(grid, method="cells")
+    cast = jax.jit(jax.vmap(lambda pose, angles: grids.cast(rays, pose, angles, log.max_range)))
+    off = np.abs(np.asarray(cast(compose(poses, log.mount), scans.angle)) - scans.range)
+    met, _ = scans.returns(log.max_range)
+    return float((met & (off < REACH)).sum() / max(met.sum(), 1))
+
+
+def _particle_info(info: Info) -> PyTree:
+    assert info.extra is not None
+    return info.extra["particles"]
+
+
+def _on(grid: Grid, pose: Float[np.ndarray, "3"]) -> bool:
+    """Whether a pose is on the map."""
+    at = np.asarray(
+        grids.to_cells(jnp.asarray(grid.origin), grid.resolution, jnp.asarray(pose[:2]))
+    )
+    height, width = grid.log_odds.shape
+    return bool(np.all((at >= 0) & (at <= [width, height])))
+
+
+def scores(pose: Float[np.ndarray, "K 3"], reference: Float[np.ndarray, "K 3"]) -> Json:
+    """Distances from the poses in the file, a reference in the frame of the map or of nothing."""
+    apart = np.hypot(*(pose[:, :2] - reference[:, :2]).T)
+    turned = np.rad2deg(np.abs(np.angle(np.exp(1j * (pose[:, 2] - reference[:, 2])))))
+    near = apart < NEAR
+    late = np.flatnonzero(~near)
+    found = 0 if not len(late) else int(late[-1]) + 1
+    return {
+        "from the poses in the file, median [m]": float(np.median(apart)),
+        "from the poses in the file, median [deg]": float(np.median(turned)),
+        "from the poses in the file, largest of the second half [m]": float(
+            apart[len(apart) // 2 :].max()
+        ),
+        f"share of scans within {NEAR:g} m": float(near.mean()),
+        f"within {NEAR:g} m from scan … on": found if found < len(apart) else None,
+    }

@@ -1,1 +1,0 @@
-"""The command `jaxslam optimize`: options, optimization, figure and film."""

@@ -1,0 +1,145 @@
+"""A filter run over a long log piece by piece, with checks of its state in between."""
+
+from collections.abc import Callable
+from typing import NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int, PyTree
+
+from jaxslam.core.protocols import Filter
+from jaxslam.core.types import Estimate, Info, JaxOrNumPy, Log
+
+State: TypeAlias = PyTree
+"""A filter's own state, a pytree."""
+
+Rows: TypeAlias = tuple[tuple[PyTree, ...], PyTree]
+"""What is kept of each step, and of the steps to watch: arrays with leading T."""
+
+PIECES, LONGEST = 20, 500
+"""A log is run in so many pieces, or in more of at most so many steps."""
+
+
+class PiecewiseRun(NamedTuple):
+    """The results of a filter over a log of T steps, as NumPy arrays."""
+
+    path: Estimate
+    """pose (T, 3) and pose_cov (T, 3, 3); the fields of the map are ()"""
+    status: Int[np.ndarray, "T M"]
+    slot: Int[np.ndarray, "T M"]
+    nis: Float[np.ndarray, "T M"]
+    dof: Int[np.ndarray, "T M"]
+    log_likelihood: Float[np.ndarray, "T"]
+    last: Estimate
+    """the estimate after the last step"""
+    final: State
+    """the filter's own state there"""
+    checked: list[int]
+    """the steps, from 1, after which the state was checked"""
+    passed: list[bool]
+    """the results of these checks"""
+    estimates: Estimate | None = None
+    """the whole estimates (F, …) after the steps to watch, where there are such, and"""
+    watched: PyTree = None
+    """what `watch` returned of the states there"""
+    kept: PyTree = None
+    """what `keep` returned of the info of each step, leading T"""
+
+
+def run_in_pieces(
+    filter: Filter,
+    log: Log,
+    pose: np.ndarray,
+    pose_cov: np.ndarray,
+    *,
+    progress: Callable[[int, int], object],
+    check: Callable[[State], bool] | None = None,
+    seed: int = 0,
+    at: Int[np.ndarray, "F"] | None = None,
+    watch: Callable[[State], PyTree] = lambda state: None,
+    keep: Callable[[Info], PyTree] = lambda info: None,
+) -> PiecewiseRun:
+    """Predict and update row by row, as `run` does, for a log whose values have been checked.
+
+    One compiled program processes the log piece by piece; the last piece is padded.
+
+    Args:
+        log: T rows of arrays in the dtype of the arithmetic.
+        progress: called after each piece with the steps done and their total.
+        check: called after each piece with the filter's own state.
+        seed: of the random numbers of a particle filter.
+        at: the steps to watch, from 0, in order: the whole estimate after each is kept, and what
+            `watch` makes of the filter's own state. Default none.
+        keep: called with the info of each step.
+    """
+    total = log.control.shape[0]
+    size = min(-(-total // PIECES), LONGEST)
+    key = jax.random.key(seed)
+
+    def step(state: State, row: Log, number: jax.Array) -> tuple[State, Rows]:
+        to_predict, to_update = jax.random.split(jax.random.fold_in(key, number))
+        state = filter.predict(state, row.control, to_predict)
+        state, info = filter.update(state, row.scan, to_update)
+        now = filter.estimate(state)
+        kept = info.status, info.slot, info.nis, info.dof, info.log_likelihood, keep(info)
+        return state, ((now.pose, now.pose_cov, *kept), None if at is None else (now, watch(state)))
+
+    @jax.jit
+    def piece(
+        state: State, rows: Log, count: jax.Array, before: jax.Array
+    ) -> tuple[State, Rows, Estimate]:
+        def one(i: jax.Array, carry: tuple[State, Rows]) -> tuple[State, Rows]:
+            state, kept = carry
+            state, new = step(state, jax.tree.map(lambda leaf: leaf[i], rows), before + i)
+            return state, jax.tree.map(lambda all, one: all.at[i].set(one), kept, new)
+
+        first = jax.tree.map(lambda leaf: leaf[0], rows)
+        shapes = jax.eval_shape(step, state, first, before)[1]
+        kept = jax.tree.map(lambda leaf: jnp.zeros((size, *leaf.shape), leaf.dtype), shapes)
+        state, kept = jax.lax.fori_loop(0, count, one, (state, kept))
+        return state, kept, filter.estimate(state)
+
+    kind = log.control.dtype
+    state = jax.jit(filter.init)(pose.astype(kind), pose_cov.astype(kind))
+    pieces, films, checked, passed = [], [], [], []
+    for begin in range(0, total, size):
+        end = min(begin + size, total)
+        rows = jax.tree.map(lambda leaf, a=begin, b=end: padded_rows(leaf[a:b], size), log)
+        state, kept, last = piece(state, rows, jnp.asarray(end - begin), jnp.asarray(begin))
+        pieces.append(jax.tree.map(lambda leaf, n=end - begin: np.asarray(leaf)[:n], kept[0]))
+        if at is not None:
+            mine = at[(at >= begin) & (at < end)] - begin
+            films.append(jax.tree.map(lambda leaf, a=mine: np.asarray(leaf)[a], kept[1]))
+        progress(end, total)
+        if check is not None:
+            checked.append(end)
+            passed.append(check(state))
+    pose, cov, status, slot, nis, dof, log_likelihood, told = jax.tree.map(
+        lambda *parts: np.concatenate(parts), *pieces
+    )
+    path = last._replace(pose=pose, pose_cov=cov, points=(), point_covs=(), alive=(), tag=())
+    estimates, watched = (
+        jax.tree.map(lambda *parts: np.concatenate(parts), *films) if films else (None, None)
+    )
+    return PiecewiseRun(
+        path=path,
+        status=status,
+        slot=slot,
+        nis=nis,
+        dof=dof,
+        log_likelihood=log_likelihood,
+        last=jax.tree.map(np.asarray, last),
+        final=state,
+        checked=checked,
+        passed=passed,
+        estimates=estimates,
+        watched=watched,
+        kept=told,
+    )
+
+
+def padded_rows(rows: JaxOrNumPy, size: int) -> np.ndarray:
+    """The rows with zeros appended up to `size` of them."""
+    rows = np.asarray(rows)
+    return np.pad(rows, [(0, size - len(rows)), *[(0, 0)] * (rows.ndim - 1)])

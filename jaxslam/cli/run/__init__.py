@@ -1,1 +1,0 @@
-"""The command `jaxslam run`: options, filters, pieces, films."""

@@ -1,1 +1,0 @@
-"""What a command runs on: devices, kept programs, the time compilation takes."""

@@ -1,0 +1,292 @@
+"""The lines of CARMEN that hold a scan; stamps, beams, mount and poses of all of a log."""
+
+import re
+from collections import Counter
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float
+from numpy.typing import ArrayLike
+
+from jaxslam.core.types import Beams
+from jaxslam.datasets.lines import TextFile
+from jaxslam.math import numpy_poses as poses
+
+POSE = ("x", "y", "theta")
+_TIMES = ("timestamp", "logger time")
+_BEFORE = 9
+"""Fields of ROBOTLASER and RAWLASER before the ranges."""
+
+
+class Scan(NamedTuple):
+    """A line with a scan."""
+
+    line: int
+    ranges: Float[np.ndarray, "n"]
+    """[m] 0 where the file has NaN"""
+    angles: Float[np.ndarray, "n"]
+    laser: list[float]
+    """the laser's pose, NaN where the line has none"""
+    robot: list[float]
+    """the robot's"""
+    times: list[float]
+    """[s] of the scan, of the logger"""
+    limit: float
+    """[m] the maximum range that the line states, infinite if it states none"""
+    bad_limit: bool
+    """it states one that is not finite and above 0"""
+    row: int
+    """of the last line ODOM before it, -1 if none"""
+
+
+def has_poses(kind: str) -> bool:
+    """Whether lines of a kind state where laser and robot are."""
+    return not kind.startswith("RAWLASER")
+
+
+def is_scan(kind: str) -> bool:
+    """Whether lines of a kind hold a scan: FLASER, RLASER, ROBOTLASER1 …, RAWLASER1 …."""
+    return re.fullmatch("[FR]LASER|(ROBOT|RAW)LASER[0-9]+", kind) is not None
+
+
+def scan_of(file: TextFile, line: int, fields: list[str], row: int) -> Scan:
+    """The scan of a line; raises ValueError, with file and line, on what is none."""
+    read = _flaser if fields[0] in ("FLASER", "RLASER") else _configured_laser
+    return read(file, line, fields, row)
+
+
+def _flaser(file: TextFile, line: int, fields: list[str], row: int) -> Scan:
+    """Of FLASER and RLASER: `n r… x y θ x y θ time host t`."""
+    count = _count(file, line, fields, 1)
+    _expect(file, line, fields, count + 11)
+    ranges = _ranges(file, line, fields[2 : 2 + count])
+    laser = file.numbers(line, fields[2 + count : 5 + count], POSE)
+    robot = file.numbers(line, fields[5 + count : 8 + count], POSE)
+    times = file.numbers(line, [fields[-3], fields[-1]], _TIMES)
+    return Scan(line, ranges, _angles_of(count), laser, robot, times, np.inf, False, row)
+
+
+def _angles_of(count: int) -> Float[np.ndarray, "n"]:
+    """The angles of n beams of FLASER [rad], which has none: those of a SICK LMS, as in CARMEN.
+
+    1° apart for 180, ½° for 360, from -90° on: there the last beam is left out. ¼° apart for 400
+    and 401, from -50° on, the laser's field of 100° looking ahead. Else over 180°, from -90° on.
+    """
+    if count in (400, 401):
+        return np.asarray(np.deg2rad(-50.0 + 0.25 * np.arange(count)))
+    step = np.pi / (count if count in (180, 360) else max(count - 1, 1))
+    return -np.pi / 2 + step * np.arange(count)
+
+
+def _configured_laser(file: TextFile, line: int, fields: list[str], row: int) -> Scan:
+    """Of ROBOTLASER and RAWLASER: `type start field-of-view resolution maximum-range accuracy
+    remission-mode n r… m remission… time host t`, before the time of ROBOTLASER two poses and five
+    more fields."""
+    after = 14 if has_poses(fields[0]) else 3
+    count = _count(file, line, fields, _BEFORE - 1)
+    remissions = _count(file, line, fields, _BEFORE + count)
+    _expect(file, line, fields, _BEFORE + count + 1 + remissions + after)
+    first, step = file.numbers(line, [fields[2], fields[4]], ("start angle", "resolution"))
+    ranges = _ranges(file, line, fields[_BEFORE : _BEFORE + count])
+    stated = _ranges(file, line, [fields[5]], "the maximum range")[0]
+    good = 0 < stated < np.finfo(float).max
+    limit = float(stated) if good else np.inf
+    laser = robot = [np.nan] * 3
+    if has_poses(fields[0]):
+        laser = file.numbers(line, fields[-after : 3 - after], POSE)
+        robot = file.numbers(line, fields[3 - after : 6 - after], POSE)
+    times = file.numbers(line, [fields[-3], fields[-1]], _TIMES)
+    angles = first + step * np.arange(count)
+    return Scan(line, ranges, angles, laser, robot, times, limit, not good, row)
+
+
+def _count(file: TextFile, line: int, fields: list[str], at: int) -> int:
+    """The number of values that a field announces."""
+    if len(fields) <= at:
+        raise file.error(line, f"{fields[0]} ends after {len(fields)} fields")
+    return file.identity(line, fields[at], "the number of values")
+
+
+def _expect(file: TextFile, line: int, fields: list[str], count: int) -> None:
+    if len(fields) != count:
+        raise file.error(
+            line, f"expected {count} fields in this line {fields[0]}, got {len(fields)}"
+        )
+
+
+def _ranges(
+    file: TextFile, line: int, fields: list[str], name: str = "range"
+) -> Float[np.ndarray, "n"]:
+    """Ranges [m], 0 for NaN. Raises ValueError on what is not a number."""
+    bad = None
+    try:
+        values = np.array(fields, float)
+    except ValueError:
+        bad = next(k for k, field in enumerate(fields) if not _is_number(field))
+    if "_" in file.lines[line - 1]:  # float() also accepts 1_000
+        bad = next((k for k, field in enumerate(fields) if not _is_number(field)), None)
+    if bad is not None:
+        which = f"{name} {bad + 1}" if name == "range" else name
+        raise file.error(line, f"{which} is not a number: {fields[bad]!r}")
+    known: np.ndarray = np.nan_to_num(values, nan=0.0, posinf=np.finfo(float).max, neginf=0.0)
+    return known
+
+
+def _is_number(field: str) -> bool:
+    try:
+        float(field)
+    except ValueError:
+        return False
+    return "_" not in field
+
+
+LOOSE = 0.01, np.deg2rad(0.5)
+"""[m], [rad] by which the mount may differ between lines."""
+
+_REAR = np.array([0.0, 0.0, np.pi])
+
+
+def clock_of(scans: list[Scan], corrections: list[str]) -> int:
+    """Which of the two times of a line counts: 0 of the measurement, 1 of the logger, where those
+    of the measurements are all the same."""
+    taken, logged = np.array([scan.times for scan in scans]).T
+    if len(scans) == 1 or np.ptp(taken) > 0:
+        return 0
+    if np.ptp(logged) > 0:
+        corrections.append("all scans have the same timestamp: times are the logger's")
+        return 1
+    corrections.append("all scans have the same time, by the logger as well")
+    return 0
+
+
+def beams_of(
+    scans: list[Scan], max_range: float, dropped: Counter[str], corrections: list[str]
+) -> tuple[Beams, float]:
+    """The beams (K, B), and the range [m] to which those are set that met nothing."""
+    width = max(len(scan.ranges) for scan in scans)
+    ranges, angles = np.zeros((2, len(scans), width))
+    there = np.zeros((len(scans), width), bool)
+    for k, scan in enumerate(scans):
+        count = len(scan.ranges)
+        ranges[k, :count], angles[k, :count], there[k, :count] = scan.ranges, scan.angles, True
+    valid = there & (ranges > 0)
+    if lost := int((there & ~valid).sum()):
+        dropped["beams without a range"] = lost
+    limits = np.minimum([scan.limit for scan in scans], max_range)
+    if (code := _code_of_no_return(ranges[valid & (ranges < limits[:, None])])) is not None:
+        corrections.append(
+            f"ranges from {code:.2f} m on, where the log has many and just below hardly any, are "
+            "taken for the laser's sign that a beam met nothing"
+        )
+        limits = np.minimum(limits, code)
+    if unstated := sum(scan.bad_limit for scan in scans):
+        corrections.append(
+            "scans whose line states no maximum range above 0, which take the one asked for: "
+            f"{unstated}"
+        )
+    limit = float(limits.max())
+    if (limits < limit).any():
+        corrections.append(
+            f"maximum ranges differ, from {limits.min():g} m on: a beam beyond that of its scan "
+            f"met nothing and is set to {limit:g} m"
+        )
+    ranges = np.where(ranges >= limits[:, None], limit, ranges)
+    return Beams(np.where(valid, ranges, 0.0), angles, valid), limit
+
+
+def _code_of_no_return(ranges: Float[np.ndarray, "n"]) -> float | None:
+    """The range from which on beams met nothing [m], of a laser that says so by its largest range;
+    None where ranges do not show that.
+
+    They do if the last hundredth of the largest range has more than one beam in 500, ten times as
+    many as the tenth below it, and two values are 93 % of them: a wall that is seen from one place
+    alone is measured with noise, but a code is one number, or in a pair of units two.
+    """
+    if len(ranges) < 1000:
+        return None
+    code = 0.99 * float(ranges.max())
+    last = ranges[ranges >= code]
+    below = int(((ranges < code) & (ranges >= 0.9 * code)).sum())
+    if len(last) <= max(len(ranges) / 500, 10 * below):
+        return None
+    _, count = np.unique(last, return_counts=True)
+    return code if np.sort(count)[-2:].sum() > 0.93 * len(last) else None
+
+
+def checked_mount(mount: ArrayLike) -> Float[np.ndarray, "3"]:
+    """A mount that was given; raises ValueError unless it is three finite numbers."""
+    try:
+        frame = np.asarray(mount, float)
+    except (TypeError, ValueError):
+        frame = np.zeros(0)
+    if frame.shape != (3,) or not np.isfinite(frame).all():
+        told = " ".join(str(mount).split())
+        raise ValueError(f"carmen: expected a mount of three finite numbers, got {told}")
+    return frame
+
+
+def mount_of(
+    file: TextFile, kind: str, scans: list[Scan], corrections: list[str]
+) -> Float[np.ndarray, "3"]:
+    """The laser's pose on the robot, robot⁻¹ ∘ laser, as constant as it is printed.
+
+    FLASER and RLASER may have a corrected pose in place of the laser's: where the two poses are the
+    same, or differ by no constant, the laser looks ahead, that of RLASER back.
+
+    Raises ValueError, with file and line, where it differs between lines of ROBOTLASER.
+    """
+    default = _REAR.copy() if kind == "RLASER" else np.zeros(3)
+    if not has_poses(kind):
+        return default
+    laser, robot = (np.array([getattr(scan, of) for scan in scans]) for of in ("laser", "robot"))
+    mounts = poses.between(robot, laser)
+    off = poses.between(mounts[0], mounts)
+    far = _beyond(off)
+    if not kind.startswith("ROBOTLASER"):
+        if far.any():
+            corrections.append(
+                f"the two poses of {kind} differ by no constant mount: the first is taken for the "
+                "robot's corrected pose"
+            )
+        if far.any() or not _beyond(mounts[:1]).any():
+            return default
+        corrections.append(f"the mount is that of the two poses of {kind}: {told(mounts[0])}")
+    elif far.any():
+        k = int(far.argmax())
+        raise file.error(
+            scans[k].line,
+            f"the laser is at {told(mounts[k])} on the robot, in line {scans[0].line} at "
+            f"{told(mounts[0])}: expected one mount [m, m, deg], or one that is given",
+        )
+    # The median of what is left is free of the rounding of a single line.
+    return poses.compose(mounts[0], np.median(off, axis=0))
+
+
+def _beyond(off: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+    """Which poses differ from zero by more than printing and rounding do."""
+    return (np.hypot(off[:, 0], off[:, 1]) > LOOSE[0]) | (np.abs(off[:, 2]) > LOOSE[1])
+
+
+def told(pose: Float[np.ndarray, "3"]) -> str:
+    """A pose in words, metres and degrees."""
+    x, y, heading = pose
+    return f"({x:.4g}, {y:.4g}, {np.rad2deg(heading):.4g}°)"
+
+
+def robot_poses(
+    kind: str, scans: list[Scan], mount: Float[np.ndarray, "3"], given: bool
+) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "K 3"]]:
+    """The robot's corrected poses, and the robot's poses as they stand in the lines.
+
+    given: the mount is not that of the lines.
+    """
+    laser, robot = (np.array([getattr(scan, of) for scan in scans]) for of in ("laser", "robot"))
+    if kind.startswith("ROBOTLASER") and not given:
+        return robot, robot
+    if kind.startswith("RAWLASER"):
+        return np.zeros_like(robot), robot
+    # Programs that correct a log write one pose twice, which then is the robot's.
+    twice = (laser == robot).all(axis=1, keepdims=True)
+    if not mount.any() or twice.all():
+        return laser, robot
+    return np.where(twice, robot, poses.compose(laser, poses.inverse(mount))), robot

@@ -1,1 +1,0 @@
-"""The UTIAS multi-robot data sets (MRCLAM): files, calibration, truth, reader."""

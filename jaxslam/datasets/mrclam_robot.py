@@ -1,0 +1,409 @@
+"""One robot of MRCLAM: its files as tables, its systematic errors, its models and its true path."""
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxslam.core.logs.streams import hold, interpolate_poses
+from jaxslam.core.noise import NoiseCov
+from jaxslam.core.types import Log
+from jaxslam.datasets.lines import TextFile, stored
+from jaxslam.motion import Unicycle
+from jaxslam.sensors import RangeBearing
+
+ROBOTS = range(1, 6)
+"""Subjects 1 to 5 are the robots; they carry barcodes like the landmarks, 6 to 20."""
+EXCHANGED = {11: [3.15071999, 2.38294871], 17: [0.03596156, -2.84396626]}
+"""Positions of two subjects that are exchanged in the survey of data set 1, as in the file: their
+distances from landmarks of the same scan differ by metres from the survey, and by centimetres after
+the exchange."""
+
+
+def read_landmarks(
+    folder: Path, errata: bool
+) -> tuple[dict[int, int], tuple[int, ...], Float[np.ndarray, "N 2"], tuple[str, ...]]:
+    """The subject of each barcode, the landmarks' subjects, positions, and corrections of these."""
+    subject_of, names = _read_barcodes(TextFile(folder / "Barcodes.dat", "#"))
+    points = _read_survey(TextFile(folder / "Landmark_Groundtruth.dat", "#"), names)
+    corrections: tuple[str, ...] = ()
+    if errata and all(points.get(subject) == at for subject, at in EXCHANGED.items()):
+        one, other = EXCHANGED
+        points[one], points[other] = points[other], points[one]
+        corrections = (f"the surveyed positions of subjects {one} and {other} were exchanged",)
+    return subject_of, names, np.array([points[name] for name in names]), corrections
+
+
+def read_robot(
+    folder: Path, robot: int
+) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "J 4"]]:
+    """Odometry (t, v, ω) and measurements (t, barcode, range, bearing) of one robot."""
+    odometry = _read_in_time(
+        TextFile(folder / f"Robot{robot}_Odometry.dat", "#"), ("time", "v", "omega")
+    )
+    seen = _read_in_time(
+        TextFile(folder / f"Robot{robot}_Measurement.dat", "#"),
+        ("time", "barcode", "range", "bearing"),
+    )
+    return odometry, seen
+
+
+def read_truth(folder: Path, robot: int) -> Float[np.ndarray, "K 4"] | None:
+    """The true poses (t, x, y, θ) of one robot; None where there is no such file."""
+    path = folder / f"Robot{robot}_Groundtruth.dat"
+    if stored(path) is None:
+        return None
+    return _read_in_time(TextFile(path, "#"), ("time", "x", "y", "theta"))
+
+
+def _read_in_time(file: TextFile, names: tuple[str, ...]) -> Float[np.ndarray, "_ _"]:
+    """A table whose first column does not decrease; raises ValueError otherwise."""
+    table: list[list[float]] = []
+    for line, fields in file:
+        values = file.numbers(line, fields, names)
+        if table and values[0] < table[-1][0]:
+            raise file.error(line, f"time goes back from {table[-1][0]} to {values[0]}")
+        if names[1] == "barcode":
+            file.identity(line, fields[1], "barcode")
+            if values[2] < 0:
+                raise file.error(line, f"the range {values[2]} is negative")
+        table.append(values)
+    if not table:
+        raise file.end_error("no data in the file")
+    return np.array(table)
+
+
+def _read_barcodes(file: TextFile) -> tuple[dict[int, int], tuple[int, ...]]:
+    """The subject of each barcode, and the landmarks' subjects in rising order."""
+    subject_of: dict[int, int] = {}
+    for line, fields in file:
+        file.expect(line, fields, ("subject", "barcode"))
+        subject = file.identity(line, fields[0], "subject")
+        barcode = file.identity(line, fields[1], "barcode")
+        if barcode in subject_of or subject in subject_of.values():
+            raise file.error(line, f"subject {subject} or barcode {barcode} occurs twice")
+        subject_of[barcode] = subject
+    names = tuple(sorted(set(subject_of.values()) - set(ROBOTS)))
+    if not names:
+        raise file.end_error("no landmark in the file")
+    return subject_of, names
+
+
+def _read_survey(file: TextFile, names: tuple[int, ...]) -> dict[int, list[float]]:
+    """The surveyed position of every landmark."""
+    points: dict[int, list[float]] = {}
+    for line, fields in file:
+        columns = ("subject", "x", "y", "sigma_x", "sigma_y")
+        _, x, y, _, _ = file.numbers(line, fields, columns)
+        subject = file.identity(line, fields[0], "subject")
+        if subject not in names:
+            raise file.error(line, f"subject {subject} is no landmark in Barcodes.dat")
+        if subject in points:
+            raise file.error(line, f"subject {subject} occurs twice")
+        points[subject] = [x, y]
+    missing = [name for name in names if name not in points]
+    if missing:
+        raise file.end_error(f"no position of subject {missing[0]} in the file")
+    return points
+
+
+Numbers = TypeVar("Numbers", np.ndarray, jax.Array)
+
+
+class RobotCalibration(NamedTuple):
+    """The systematic errors of a robot's odometry and camera, and the noise that remains.
+
+    A recorded velocity (v, ω) at time t moves the robot at time t + delay, by
+
+        v' = forward v - outer |ω|,    ω' = turn ω + curvature v
+
+    since v is rather the speed of the outer wheel, half a track `outer` from the centre, and since
+    wheels of unequal size bend the path of a robot that is told to go straight (Borenstein & Feng
+    1996). The camera is at (ahead, 0, yaw) on the robot. Its range r is `depth` times the depth
+    along the optical axis, as the height of a barcode in the image gives it. That axis has the
+    bearing `axis`, so that with the recorded bearing φ the range is
+
+        r' = r / (depth cos(φ - axis))
+
+    Arrays and fields may be NumPy's or traced.
+
+    White noise per second has the variance forward_noise² of travel and turn_noise² +
+    (turn_share ω')² of heading. The range has the standard deviation range_share r', the bearing
+    bearing_noise.
+    """
+
+    delay: float
+    """[s], of odometry after measurements"""
+    forward: float
+    outer: float
+    """[m]"""
+    turn: float
+    curvature: float
+    """[rad/m]"""
+    depth: float
+    ahead: float
+    """[m]"""
+    yaw: float
+    """[rad]"""
+    axis: float
+    """[rad]"""
+    forward_noise: float
+    """[m/√s]"""
+    turn_noise: float
+    """[rad/√s]"""
+    turn_share: float
+    """[√s]"""
+    range_share: float
+    bearing_noise: float
+    """[rad]"""
+
+    def odometry(self, recorded: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K 3"]:
+        """The lines (t, v, ω) corrected, at the times when the robot moves."""
+        t, v, omega = recorded.T
+        return np.column_stack([t + self.delay, *self.velocities(v, omega)])
+
+    def velocities(self, v: Numbers, omega: Numbers) -> tuple[Numbers, Numbers]:
+        """The calibrated velocities (v', ω') of recorded ones."""
+        return self.forward * v - self.outer * abs(omega), self.turn * omega + self.curvature * v
+
+    def range(self, recorded: Numbers, bearing: Numbers) -> Numbers:
+        """The calibrated range r' of a recorded range and bearing."""
+        cos = jnp.cos if isinstance(bearing, jax.Array) else np.cos
+        return recorded / (self.depth * cos(bearing - self.axis))
+
+    def measurements(self, recorded: Float[np.ndarray, "J 4"]) -> Float[np.ndarray, "J 4"]:
+        """The lines (t, barcode, range, bearing) with ranges corrected.
+
+        Raises ValueError on a bearing beyond a right angle, behind the image plane.
+        """
+        beyond = np.abs(recorded[:, 3] - self.axis) >= np.pi / 2
+        if beyond.any():
+            bearing = recorded[beyond, 3][0]
+            raise ValueError(f"Calibration: expected bearings below π/2, got {bearing}")
+        corrected = recorded.copy()
+        corrected[:, 2] = self.range(recorded[:, 2], recorded[:, 3])
+        return corrected
+
+    @property
+    def mount(self) -> Float[np.ndarray, "3"]:
+        """The pose of the camera on the robot."""
+        return np.array([self.ahead, 0.0, self.yaw])
+
+    def odometry_cov(self) -> NoiseCov:
+        """The covariance (2, 2) of (v', ω') over an interval Δt, a function of (pose, u)."""
+
+        def noise_cov(pose: jax.Array, u: jax.Array) -> jax.Array:
+            by_turn = (self.turn_share * u[1]) ** 2
+            forward = self.forward_noise**2 + 0 * by_turn
+            return per_interval(jnp.stack([forward, self.turn_noise**2 + by_turn]), u[2])
+
+        return noise_cov
+
+    def measurement_cov(self) -> NoiseCov:
+        """The covariance (2, 2) of (r', φ), a function of z."""
+
+        def noise_cov(z: jax.Array) -> jax.Array:
+            share = self.range_share * z[0]
+            return jnp.diag(jnp.stack([share, self.bearing_noise + 0 * share]) ** 2)
+
+        return noise_cov
+
+
+MRCLAM_CALIBRATION = RobotCalibration(
+    delay=0.265,
+    forward=1.049,
+    outer=0.098,
+    turn=0.956,
+    curvature=-0.039,
+    depth=1.017,
+    ahead=-0.034,
+    yaw=0.0,
+    axis=0.0,
+    forward_noise=0.0091,
+    turn_noise=0.0219,
+    turn_share=0.186,
+    range_share=0.0098,
+    bearing_noise=0.0183,
+)
+"""Fitted on the true path of robot 1 of data set 6 (`python -m benchmarks.mrclam --fit`).
+
+The yaw and the axis of the camera are left at zero, since they differ from robot to robot;
+`mrclam_calibration` finds them in a robot's own log.
+
+The ranges of that robot deviate from the survey by 0.12 m as recorded, by a function of the
+bearing, and by 1 % of the range once corrected. Errors that last are counted in full: the noise of
+the odometry is that of windows of 8 s, that of the camera of single measurements and the truth."""
+
+
+def check_calibration(name: str, calibration: object) -> None:
+    """Raise ValueError, which begins with the caller's name, unless it is a RobotCalibration of
+    finite numbers, its depth above 0, its noise not negative."""
+    if not isinstance(calibration, RobotCalibration):
+        raise ValueError(f"{name}: expected a RobotCalibration, got {type(calibration).__name__}")
+    for field, value in calibration._asdict().items():
+        try:
+            number = float(value)
+        except (TypeError, ValueError):
+            number = np.nan
+        good, wanted = np.isfinite(number), "a finite number"
+        if field == "depth":
+            good, wanted = good and number > 0, f"{wanted} above 0"
+        elif field.endswith(("_noise", "_share")):
+            good, wanted = good and number >= 0, f"{wanted} >= 0"
+        if not good:
+            raise ValueError(
+                f"{name}: expected the {field} of a calibration to be {wanted}, got {value!r}"
+            )
+
+
+def per_interval(density: jax.Array, dt: jax.Array) -> jax.Array:
+    """The diagonal covariance density/Δt of velocities over Δt, zero where Δt = 0."""
+    moving = dt > 0
+    return jnp.diag(density) * jnp.where(moving, 1 / jnp.where(moving, dt, 1.0), 0.0)
+
+
+GAP = 0.2
+"""Time between lines of the truth beyond which it is unknown between them [s]."""
+START_COV = np.diag([0.01, 0.01, 0.03]) ** 2
+"""Covariance of a true pose. Of robot 1 of data set 6, headings that two landmarks give agree with
+the recorded ones to 0.03 rad, with errors that last for tens of seconds."""
+
+
+def cut_after(
+    odometry: Float[np.ndarray, "K 3"], end: float
+) -> tuple[Float[np.ndarray, "J 3"], int]:
+    """Odometry without the (0, 0) lines at its end that are later than `end`, and their number.
+
+    A recorder that goes on after the robot has stopped writes such lines. The first of them stays,
+    so that the robot stands still from there on.
+    """
+    moving = np.flatnonzero(odometry[:, 1:].any(axis=1) | (odometry[:, 0] <= end))
+    keep = min(int(moving[-1]) + 2 if moving.size else 1, len(odometry))
+    return odometry[:keep], len(odometry) - keep
+
+
+def true_poses(
+    truth: Float[np.ndarray, "K 4"], time: Float[np.ndarray, "T"]
+) -> tuple[Float[np.ndarray, "T 3"], Bool[np.ndarray, "T"]]:
+    """True poses at some times, linear between lines of the truth, and where they are known.
+
+    They are unknown before the first line, after the last, and between lines more than `GAP` apart.
+    """
+    clock = truth[:, 0]
+    after = np.clip(np.searchsorted(clock, time), 1, max(len(clock) - 1, 1))
+    last = np.minimum(after, len(clock) - 1)
+    near = clock[last] - clock[after - 1] <= GAP
+    known = (time >= clock[0]) & (time <= clock[-1]) & (near | np.isin(time, clock))
+    return interpolate_poses(clock, truth[:, 1:], time), known
+
+
+SOURCE = (
+    "K. Y. K. Leung, Y. Halpern, T. D. Barfoot, H. H. T. Liu, The UTIAS multi-robot cooperative "
+    "localization and mapping dataset, International Journal of Robotics Research 30(8), 2011"
+)
+ODOMETRY_DENSITY = (0.01**2, 0.05**2)
+"""Variance of travel [m²/s] and heading [rad²/s] per second."""
+MEASUREMENT_COV = np.diag([0.15, 0.01]) ** 2
+DROPS = ("robot sightings", "unknown barcodes", "repeated in a scan")
+
+
+class Recorded(NamedTuple):
+    """What a robot's files hold, corrected where a calibration is given."""
+
+    odometry: Float[np.ndarray, "K 3"]
+    seen: Float[np.ndarray, "J 4"]
+    truth: Float[np.ndarray, "G 4"] | None
+    corrections: tuple[str, ...]
+
+
+def read_lines(folder: Path, robot: int, calibration: RobotCalibration | None) -> Recorded:
+    """The lines of a robot, corrected, with its true path and what was changed, in words."""
+    odometry, seen = read_robot(folder, robot)
+    truth, corrections = read_truth(folder, robot), []
+    if truth is not None:
+        odometry, cut = cut_after(odometry, truth[-1, 0])
+        if cut:
+            corrections.append(
+                f"{cut:,} odometry lines (0, 0) of robot {robot} after its true path were left out"
+            )
+    if calibration is not None:
+        odometry, seen = calibration.odometry(odometry), calibration.measurements(seen)
+    return Recorded(odometry, seen, truth, tuple(corrections))
+
+
+def models_of(calibration: RobotCalibration | None) -> tuple[Unicycle, RangeBearing]:
+    """The motion model and the sensor of a robot, calibrated or as recorded."""
+    if calibration is None:
+        return Unicycle(white_noise(*ODOMETRY_DENSITY)), RangeBearing(MEASUREMENT_COV)
+    sensor = RangeBearing(calibration.measurement_cov(), mount=calibration.mount)
+    return Unicycle(calibration.odometry_cov()), sensor
+
+
+def true_fields(files: Sequence[Recorded], time: Float[np.ndarray, "T"]) -> dict[str, Any]:
+    """The fields of a `Dataset` about true paths, and the start; none where no path is known."""
+    if files[0].truth is None:
+        return {}
+    paths, known = true_poses(files[0].truth, time)
+    found: dict[str, Any] = {"true_path": paths, "true_at": known}
+    if len(files) > 1 and all(own.truth is not None for own in files):
+        each = [true_poses(own.truth, time) for own in files if own.truth is not None]
+        found["true_paths"] = np.stack([path for path, _ in each])
+        found["true_paths_at"] = np.stack([at for _, at in each])
+    if known[0]:
+        found |= {"pose": paths[0], "pose_cov": START_COV, "one_frame": True}
+    return found
+
+
+def white_noise(v: float, omega: float) -> NoiseCov:
+    """White noise of (v, ω) with covariance density/Δt, so that time steps can be divided.
+
+    v [m²/s], omega [rad²/s]: the variance of travel and heading per second. Where Δt = 0 it is 0.
+    """
+
+    def noise_cov(pose: jax.Array, u: jax.Array) -> jax.Array:
+        density = jnp.stack([jnp.asarray(v, u.dtype), jnp.asarray(omega, u.dtype)])
+        return per_interval(density, u[2])
+
+    return noise_cov
+
+
+def log_of(
+    odometry: Float[np.ndarray, "K 3"],
+    time: Float[np.ndarray, "T"],
+    row: Int[np.ndarray, "J"] | list[int],
+    tag: Int[np.ndarray, "J"] | list[int],
+    z: Float[np.ndarray, "J Z"],
+) -> Log:
+    """The log of odometry (t, v, ω) and of measurements in some rows."""
+    return Log.from_streams((odometry[:, 0], odometry[:, 1:]), (time[row], tag, z), hold, time)
+
+
+def associated(
+    seen: Float[np.ndarray, "J 4"],
+    time: Float[np.ndarray, "T"],
+    subject_of: dict[int, int],
+    names: tuple[int, ...],
+) -> tuple[list[int], list[int], list[int], dict[str, int]]:
+    """Row, tag and index of the measurements kept, and the number of dropped ones by reason.
+
+    names: the subjects, landmarks first; their tags are their indices in the list.
+    """
+    tag_of = {name: tag for tag, name in enumerate(names)}
+    dropped = dict.fromkeys(DROPS, 0)
+    kept: dict[tuple[int, int], int] = {}
+    row = np.searchsorted(time, seen[:, 0])
+    for k, barcode in enumerate(seen[:, 1]):
+        subject = subject_of.get(int(barcode))
+        if subject is None:
+            dropped["unknown barcodes"] += 1
+        elif subject not in tag_of:
+            dropped["robot sightings"] += 1
+        elif (int(row[k]), tag_of[subject]) in kept:
+            dropped["repeated in a scan"] += 1
+        else:
+            kept[int(row[k]), tag_of[subject]] = k
+    return [r for r, _ in kept], [t for _, t in kept], list(kept.values()), dropped

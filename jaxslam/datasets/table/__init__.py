@@ -1,1 +1,0 @@
-"""Your own data as CSV files: reader and settings."""

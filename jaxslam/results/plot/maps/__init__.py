@@ -1,1 +1,0 @@
-"""Figures of maps: landmarks, grids, graphs, walls, places, the loops of laser SLAM."""
