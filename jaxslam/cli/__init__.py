@@ -101,7 +101,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     try:
-        options = _parser().parse_args(arguments)
+        options = _parser().parse_args(_laser_command(arguments))
     except SystemExit as stop:
         return int(stop.code or 0)
     try:
@@ -127,6 +127,23 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except KeyboardInterrupt:
         print("\njaxslam: interrupted; nothing was written", file=sys.stderr)
         return INTERRUPTED
+
+
+def _laser_command(arguments: list[str]) -> list[str]:
+    """`run --dataset carmen …` as the command on a laser log that it stands for: `localize MAP`
+    with `--localize MAP`, `map` with `--map known`, else `slam`."""
+    of = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    of.add_argument("--dataset")
+    of.add_argument("--localize", metavar="MAP")
+    of.add_argument("--map", choices=("known",))
+    if arguments[:1] != ["run"] or "carmen" not in " ".join(arguments).replace("=", " ").split():
+        return arguments
+    chosen, others = of.parse_known_args(arguments[1:])
+    if chosen.dataset != "carmen":
+        return arguments
+    if chosen.localize is not None:
+        return ["localize", chosen.localize, *others]
+    return ["map" if chosen.map else "slam", *others]
 
 
 class _Parser(argparse.ArgumentParser):

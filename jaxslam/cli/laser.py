@@ -201,9 +201,14 @@ def scored(log: LaserLog, score: Callable[[], Json]) -> Json:
     as well."""
     if not log.placed:
         return {"score": "none: the file has no poses"}
-    if np.allclose(log.raw, log.corrected, rtol=0, atol=1e-6):
+    if odometry_is_poses(log):
         return {"score": "none: the odometry is equal to the poses that would score it"}
     return score()
+
+
+def odometry_is_poses(log: LaserLog) -> bool:
+    """Whether raw odometry equals the poses beside the scans, as in a file without lines ODOM."""
+    return log.placed and bool(np.allclose(log.raw, log.corrected, rtol=0, atol=1e-6))
 
 
 def map_size(grid: Grid) -> dict[str, object]:

@@ -227,5 +227,5 @@ def scores(pose: Float[np.ndarray, "K 3"], reference: Float[np.ndarray, "K 3"]) 
             apart[len(apart) // 2 :].max()
         ),
         f"share of scans within {NEAR:g} m": float(near.mean()),
-        f"within {NEAR:g} m from scan … on": found if found < len(apart) else None,
+        f"within {NEAR:g} m from scan … on": found if found < len(apart) else "none",
     }

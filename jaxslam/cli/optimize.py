@@ -252,8 +252,8 @@ def _robust(
         left_out[key] = int(valid.sum()) - kept[key]
     return {
         "robust cost": json_number(solution.chi2),
-        "kept": kept,
-        "left out": left_out,
+        "of weight above 1/2": kept,
+        "of weight 1/2 or less": left_out,
         **{f"robust cost from {name}": json_number(cost) for name, cost in tried.items()},
         **{f"robust cost from {name}": f"none: {reason}" for name, reason in impossible.items()},
     }

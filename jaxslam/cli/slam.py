@@ -58,10 +58,13 @@ def run_slam(log: LaserLog, options: argparse.Namespace) -> laser.Job:
     given = None if options.relations is None else given_relations(options.relations, log)
     settings = Settings(resolution=options.resolution)
     solved = _solved(log, settings)
+    coarser = float(solved.map.resolution) > 1.001 * settings.resolution
     files = result_files(solved) | figures(solved, options.figures, log.corrected)
     if options.animate:
         files |= film_files({"slam": film(log, solved, settings)}, suffixed=False)
     summary = result_summary(solved) | laser.scored(log, lambda: _scores(log, solved))
+    if coarser:
+        summary["resolution asked for, of too many cells [m]"] = settings.resolution
     if given is None:
         return laser.Job(summary, files)
     relations, dropped = given
@@ -70,6 +73,11 @@ def run_slam(log: LaserLog, options: argparse.Namespace) -> laser.Job:
         f"relations of {options.relations}: {joined:,} of {joined + dropped:,} join the scans, "
         f"within {TOLERANCE:g} s; errors, mean ± standard deviation:\n{_score_text(scores)}"
     )
+    if laser.odometry_is_poses(log):
+        text += (
+            "\nraw odometry is that of the poses in the file: if these are corrected, the errors "
+            "are none of laser SLAM; --odometry FILE gives the odometry of the wheels"
+        )
     entry: Json = {
         "file": options.relations,
         "relations in the file": joined + dropped,

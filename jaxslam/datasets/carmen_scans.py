@@ -175,8 +175,8 @@ def beams_of(
     limits = np.minimum([scan.limit for scan in scans], max_range)
     if (code := _code_of_no_return(ranges[valid & (ranges < limits[:, None])])) is not None:
         corrections.append(
-            f"ranges from {code:.2f} m on, where the log has many and just below hardly any, are "
-            "taken for the laser's sign that a beam met nothing"
+            f"ranges of {code:.2f} m or more are read as no return: the log has many of one value "
+            "there, and hardly any just below"
         )
         limits = np.minimum(limits, code)
     if unstated := sum(scan.bad_limit for scan in scans):

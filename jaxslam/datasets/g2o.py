@@ -190,7 +190,7 @@ def _assembled(
     for line, vertex in fixed:
         kinds = [kind for kind, known in index.items() if vertex in known]
         if not kinds:
-            raise file.error(line, f"vertex {vertex} is nowhere in the file")
+            raise file.error(line, f"vertex {vertex} is not defined in the file")
         held[kinds[0]][index[kinds[0]][vertex]] = True
     return Graph(
         poses=np.array(list(vertices["pose"].values())).reshape(-1, 3),
@@ -211,7 +211,7 @@ def _table(file: TextFile, rows: list[_Row], index: dict[str, dict[int, int]]) -
         for vertex, kind in zip(row.ids, row.edge.who, strict=True):
             if vertex not in index[kind]:
                 elsewhere = any(vertex in known for known in index.values())
-                why = f"is no {kind}" if elsewhere else "is nowhere in the file"
+                why = f"is no {kind}" if elsewhere else "is not defined in the file"
                 raise file.error(row.line, f"vertex {vertex} {why}")
         who.append([index[kind][v] for v, kind in zip(row.ids, row.edge.who, strict=True)])
         for (i, j), entry in zip(row.edge.entries, row.numbers[size:], strict=True):

@@ -186,9 +186,8 @@ class _Header:
             root = yaml.compose(text, yaml.SafeLoader)
         except yaml.MarkedYAMLError as problem:
             mark = problem.context_mark or problem.problem_mark  # where it begins
-            raise self.file.error(
-                mark.line + 1, f"expected YAML, but {problem.problem}"
-            ) from problem
+            what = str(problem.problem).removeprefix("but ")
+            raise self.file.error(mark.line + 1, f"expected YAML, but {what}") from problem
         except yaml.reader.ReaderError as problem:
             line = text.count("\n", 0, problem.position) + 1
             raise self.file.error(line, f"expected YAML, but {problem.reason}") from problem

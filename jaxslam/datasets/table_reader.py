@@ -43,15 +43,20 @@ class CsvTable:
             _, _, text = text.partition("\n")
             above += 1
         reader = csv.reader(io.StringIO(text, newline=""))
-        lines = [(above + reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
+        lines, begins = [], above + 1  # a cell in quotes may go over several lines of the file
+        for cells in reader:
+            lines.append((begins, [cell.strip() for cell in cells]))
+            begins = above + reader.line_num + 1
         lines = [(number, cells) for number, cells in lines if any(cells)]
         if not lines:
             raise ValueError(f"{self.path}:1: expected a header, as 't [s],v [m/s]', got no text")
         self.head_line, self.header = lines[0]
         self.lines = [number for number, _ in lines[1:]]
         self.cells = [cells for _, cells in lines[1:]]
-        if len(self.header) == 1 and ";" in self.header[0]:
-            raise self._error(self.head_line, "expected cells separated by commas, got ';'")
+        for separator in ";\t":
+            if len(self.header) == 1 and separator in self.header[0]:
+                told = f"expected cells separated by commas, got {separator!r}"
+                raise self._error(self.head_line, told)
         if all(math.isfinite(_number(cell)) for cell in self.header):
             raise self._error(
                 self.head_line, f"expected a header, as 't [s],v [m/s]', got {self.header[0]!r}"
@@ -65,7 +70,9 @@ class CsvTable:
         for number, cells in zip(self.lines, self.cells, strict=True):
             if len(cells) != len(self.header):
                 wanted, hint = len(self.header), ""
-                if len(cells) > wanted:
+                if "\n" in "".join(cells):
+                    hint = "; a quotation mark stays open over lines"
+                elif len(cells) > wanted:
                     hint = "; a number has a point, no comma: 0.5"
                 raise self._error(
                     number,

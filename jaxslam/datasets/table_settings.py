@@ -225,7 +225,12 @@ def _read(path: Path) -> tuple[str, dict[str, Any]]:
         return text, tomllib.loads(text)
     except FileNotFoundError:
         return "", {}
-    except (OSError, UnicodeDecodeError, tomllib.TOMLDecodeError) as problem:
+    except tomllib.TOMLDecodeError as problem:
+        what, line = str(problem), text.count("\n") + 1
+        if at := re.search(r" \(at line (\d+), column \d+\)$", what):
+            what, line = what[: at.start()], int(at[1])
+        raise ValueError(f"{path}:{line}: expected TOML: {what}") from problem
+    except (OSError, UnicodeDecodeError) as problem:
         raise ValueError(f"{path}: cannot be read: {problem}") from problem
 
 

@@ -190,7 +190,10 @@ def test_a_kernel_doubts_loops_and_points_but_not_the_path(file, tmp_path, monke
     assert summary["robust cost"] == min(costs)
     np.testing.assert_allclose(min(costs), summary["chi2 without the kernel"])  # no row is doubted
     loops, points = "relative_pose/loops", "relative_position"
-    assert summary["kept"] == {loops: 3, points: 16} and sum(summary["left out"].values()) == 0
+    assert (
+        summary["of weight above 1/2"] == {loops: 3, points: 16}
+        and sum(summary["of weight 1/2 or less"].values()) == 0
+    )
     assert summary["certificate"].startswith("none: of a robust cost")
     assert len(graphs.read(tmp_path / "optimized.g2o").tables["relative_pose"].z) == 10
     apart = graphs.with_loops_apart(small())

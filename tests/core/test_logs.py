@@ -228,6 +228,13 @@ def test_a_landmark_whose_measurements_are_all_outside_the_odometry_has_no_tag()
     assert dropped == {"measurements outside the odometry": 2}
 
 
+def test_a_measurement_with_a_range_below_0_is_dropped_and_counted():
+    seen = [(1.0, 7, -1.0, 0.5), (1.0, 5, 2.0, 0.5), (2.0, 5, 0.0, 0.5)]
+    log, _, tags, dropped = Log.from_records(ODOMETRY, seen, DRIVE, EYE)
+    assert log.scan.valid.sum() == 2 and (log.scan.z >= 0).all()
+    assert dropped["measurements with a range below 0"] == 1 and tags == (5, 7)
+
+
 def test_tags_may_be_text_and_unknown():
     seen = [(1.0, "tree", 1, 0), (1.0, 12, 1, 0), (2.0, "", 1, 0), (2.0, None, 1, 0)]
     log, _, tags, _ = Log.from_records(ODOMETRY, seen, DRIVE, EYE)

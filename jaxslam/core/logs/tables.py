@@ -136,7 +136,7 @@ def align_tables(
     }
     tag_of = {name: tag for tag, name in enumerate(ordered({*names, *named}))}
     tags = [_tags_in_scans(seen, tag_of) for seen in sensors]
-    kept, outside = [], 0
+    kept, outside, negative = [], 0, 0
     for seen, tag, inside in zip(sensors, tags, within, strict=True):
         when = seen.table.columns[TIME]
         lost = np.flatnonzero(inside & ~np.isin(when, clock))
@@ -146,8 +146,13 @@ def align_tables(
                 f"{', '.join(columns)} cannot be divided, got {when[lost[0]]:.12g}; poses can: "
                 f"{TIME}, {', '.join(POSE)}"
             )
-        kept.append((when[inside], tag[inside], seen.table.values(seen.measured)[inside]))
+        values = seen.table.values(seen.measured)
+        ranges = [k for k, name in enumerate(seen.measured) if split_unit(name)[0] == "range"]
+        no_echo = inside & (values[:, ranges] < 0).any(axis=1)
+        taken = inside & ~no_echo
+        kept.append((when[taken], tag[taken], values[taken]))
         outside += int((~inside).sum())
+        negative += int(no_echo.sum())
     times = np.unique(np.concatenate([clock, *(when for when, *_ in kept)]))
     moved = clock, odometry.values(columns)
     places = [seen.places for seen in sensors]
@@ -155,7 +160,10 @@ def align_tables(
     if INTERVAL in controls and rule is not streams.hold:
         interval = np.diff(rows.time, prepend=rows.time[:1])
         rows = rows._replace(control=np.column_stack([rows.control, interval]))
-    return Aligned(rows, tuple(tag_of), {"measurements outside the odometry": outside})
+    dropped = {"measurements outside the odometry": outside}
+    if negative:
+        dropped["measurements with a range below 0"] = negative
+    return Aligned(rows, tuple(tag_of), dropped)
 
 
 def _tags_in_scans(seen: Seen[_Name], tag_of: dict[_Name, int]) -> Int[np.ndarray, "J"]:

@@ -38,8 +38,8 @@ def descriptors(
 
 
 MOST = 2_500
-"""Candidates that are matched in a round, and keyframes that are tried, at most: in a log with more
-of them loops abound."""
+"""Candidates that are matched in a round, and keyframes that are tried, at most: a log with more
+of them has more loops than its graph needs."""
 PLACES = 12
 """Submaps near a keyframe whose relative pose is examined by odometry, which costs little."""
 CANDIDATES = 3
