@@ -116,8 +116,8 @@ class Log(NamedTuple):
         Args:
             motion, sensor: the models.
         Raises:
-            ValueError: with row and column, on a missing column, a value that is not a finite
-                number, times that go back (of odometry: or repeat), a tag twice at a time, or more
+            ValueError: with row and column, on a missing column, a value that is not finite,
+                times that go back (of odometry: or repeat), a tag twice at a time, or more
                 measurements at a time than the suite has slots.
         """
         name, controls = "Log.from_records", motion.controls

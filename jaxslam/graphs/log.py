@@ -126,43 +126,39 @@ def _points_of(
 ) -> tuple[JaxOrNumPy, JaxOrNumPy, Int[np.ndarray, "P"]]:
     """The point of each measurement, whether it is used, and the tags of the points."""
     given = log.scan.tag if tags is None else tags
-    requested: JaxOrNumPy = given if isinstance(given, Array) else np.asarray(given)
+    array: JaxOrNumPy = given if isinstance(given, Array) else np.asarray(given)
     valid = log.scan.valid
     if not sensor.landmark:
         return log.scan.tag * 0, valid, np.zeros(0, np.int32)
-    if np.shape(requested) != np.shape(valid):
-        raise ValueError(
-            f"{name}: expected tags of shape {np.shape(valid)}, got {np.shape(requested)}"
-        )
-    if not jnp.issubdtype(requested.dtype, np.integer):
-        raise ValueError(f"{name}: expected tags to be integers, got {requested.dtype}")
-    if is_concrete(requested) and is_concrete(valid):
-        unknown = np.asarray(valid) & (np.asarray(requested) < 0)
+    if np.shape(array) != np.shape(valid):
+        raise ValueError(f"{name}: expected tags of shape {np.shape(valid)}, got {np.shape(array)}")
+    if not jnp.issubdtype(array.dtype, np.integer):
+        raise ValueError(f"{name}: expected tags to be integers, got {array.dtype}")
+    if is_concrete(array) and is_concrete(valid):
+        unknown = np.asarray(valid) & (np.asarray(array) < 0)
         if tags is None and unknown.any():
             row, place = np.argwhere(unknown)[0]
             raise ValueError(
                 f"{name}: the measurement of row {row}, slot {place} has no identity: give tags= "
                 "of an association"
             )
-        high = np.asarray(valid) & (
-            np.asarray(requested) >= (2**31 if capacity is None else capacity)
-        )
+        high = np.asarray(valid) & (np.asarray(array) >= (2**31 if capacity is None else capacity))
         if high.any():
             raise ValueError(
                 f"{name}: expected tags below {capacity}, the capacity, got "
-                f"{np.asarray(requested)[high][0]}"
+                f"{np.asarray(array)[high][0]}"
             )
     elif capacity is None:
         raise ValueError(f"{name}: expected capacity, the number of points, of a traced log")
     if capacity is not None:
         validation.check_count(f"{name}: capacity", capacity)
-        used = valid & (requested >= 0)
-        return requested * used, used, np.arange(capacity, dtype=np.int32)
-    here = np.asarray(valid) & (np.asarray(requested) >= 0)
-    ids = np.unique(np.asarray(requested)[here]).astype(np.int32)
+        used = valid & (array >= 0)
+        return array * used, used, np.arange(capacity, dtype=np.int32)
+    here = np.asarray(valid) & (np.asarray(array) >= 0)
+    ids = np.unique(np.asarray(array)[here]).astype(np.int32)
     if not len(ids):
         raise ValueError(f"{name}: the log has no measurement of a landmark")
-    return np.where(here, np.searchsorted(ids, requested), 0).astype(np.int32), here, ids
+    return np.where(here, np.searchsorted(ids, array), 0).astype(np.int32), here, ids
 
 
 @partial(jax.jit, static_argnames="known", inline=True)

@@ -135,7 +135,7 @@ def estimate_of(
 
     def point(
         landmark: Float[Array, "L"],
-        landmark_cov: Float[Array, "L L"],
+        cov: Float[Array, "L L"],
         by_robot: Float[Array, "L 3"],
         reduced: PyTree,
     ) -> tuple[Float[Array, "2"], Float[Array, "2 2"]]:
@@ -144,14 +144,11 @@ def estimate_of(
         if chart.basis is not None:
             basis = chart.basis(joint.pose, landmark)
             if basis.landmark is not None:
-                landmark_cov, by_robot = (
-                    basis.landmark @ landmark_cov @ basis.landmark.T,
-                    basis.landmark @ by_robot,
-                )
+                cov, by_robot = basis.landmark @ cov @ basis.landmark.T, basis.landmark @ by_robot
             cross = basis.cross @ by_robot.T
-            landmark_cov = landmark_cov + cross + cross.T
-            landmark_cov = landmark_cov + basis.cross @ pose_cov @ basis.cross.T
-        return position(landmark), by_landmark @ landmark_cov @ by_landmark.T
+            cov = cov + cross + cross.T
+            cov = cov + basis.cross @ pose_cov @ basis.cross.T
+        return position(landmark), by_landmark @ cov @ by_landmark.T
 
     points, point_covs = jax.vmap(point)(joint.landmarks, own_covs, with_pose, joint.reduced)
     if chart.basis is not None:

@@ -28,8 +28,8 @@ from jaxslam.math.xla import change_where
 class Managed(Wrapper):
     """A filter on a `slots.Joint`, each of whose updates is followed by `manage`.
 
-    It returns its linear system (`Monitored`) if the filter does; the change by `manage` is not
-    part of it. A subclass defines `manage`, and may extend `init`.
+    It returns its linear system (`Monitored`) if the filter does, without the change
+    by `manage`. A subclass defines `manage`, and may extend `init`.
     """
 
     def __post_init__(self) -> None:

@@ -122,20 +122,15 @@ def _info_of_scan(
 ) -> Info:
     """The `Info` of the most likely particle, with the weighted mean NIS."""
     best = jnp.argmax(log_weight)
-    best_particle: ScanLikelihood = jax.tree.map(lambda of_all: of_all[best], likelihood)
+    one: ScanLikelihood = jax.tree.map(lambda of_all: of_all[best], likelihood)
     return info_of(
-        status_of(
-            scan.valid,
-            matched=best_particle.matched,
-            positive=best_particle.positive,
-            inside=best_particle.inside,
-        ),
-        best_particle.matched,
-        size=best_particle.dof,
-        slot=best_particle.slot,
+        status_of(scan.valid, matched=one.matched, positive=one.positive, inside=one.inside),
+        one.matched,
+        size=one.dof,
+        slot=one.slot,
         nis=weighted_nis(likelihood.nis, likelihood.matched, log_weight),
-        innovation=best_particle.innovation,
-        innovation_cov=best_particle.innovation_cov,
+        innovation=one.innovation,
+        innovation_cov=one.innovation_cov,
         log_likelihood=log_likelihood,
         exhausted=likelihood.exhausted.any(),
     )

@@ -175,27 +175,23 @@ def minimize(
         above = jnp.maximum(search.former - search.system.chi2, 0.0)
         slack = jnp.where(search.damping <= _FIRST_DAMPING, above, 0.0)
         good = finite & (began | (gain + slack > 1e-3 * search.predicted))
-        evaluated = search.going & search.stepped
-        take = evaluated & good
-        refused = jnp.where(
-            take, False, search.refused | (evaluated & ~good & (search.damping == 0))
-        )
+        active = search.going & search.stepped
+        take = active & good
+        refused = jnp.where(take, False, search.refused | (active & ~good & (search.damping == 0)))
 
         def chosen(new: Array, old: Array) -> Array:
             return jnp.where(take.reshape((1,) * (new.ndim - 1) + batch), new, old)
 
-        lost = evaluated & ~finite & began
+        lost = active & ~finite & began
         return search._replace(
             variables=jax.tree.map(chosen, search.trial, search.variables),
             system=jax.tree.map(chosen, trial, search.system),
-            damping=jnp.where(
-                evaluated & ~began, damping_after(search, good, ratio), search.damping
-            ),
+            damping=jnp.where(active & ~began, damping_after(search, good, ratio), search.damping),
             going=search.going & ~lost,
             ending=jnp.where(lost, Ending.DIVERGED, search.ending).astype(jnp.int32),
-            taken=search.taken + evaluated,
+            taken=search.taken + active,
             refused=refused,
-            careful=jnp.where(evaluated, ~good, search.careful),
+            careful=jnp.where(active, ~good, search.careful),
             former=jnp.where(take & ~began, search.system.chi2, search.former),
             judged=search.judged & ~take,
         )

@@ -127,10 +127,7 @@ def sensor_samples(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samp
             ("landmark at the robot", (pose[few], at(pose[few], pose[few, :2]))),
             ("landmark far", (pose[few], at(pose[few], pose[few, :2] + _OUT_OF_SIGHT))),
         ]
-        for label, scale in (
-            ("landmark close to the sensor", _NEAR),
-            ("landmark at the sensor", 0),
-        ):
+        for label, scale in ("landmark close to the sensor", _NEAR), ("landmark at the sensor", 0):
             seen = np.where(metres, z[few] * scale, z[few])
             near = np.asarray(place(pose[few], seen, s[few] * scale), np.float64)
             if np.isfinite(near).all():  # else `invert` fails, which another check reports
