@@ -25,7 +25,7 @@ JEMALLOC := $(firstword $(wildcard /usr/lib/*/libjemalloc.so.2 /usr/lib64/libjem
 consistency: $(VENV)/.run
 	$(BIN)/jaxslam consistency $(ARGS)
 
-## The tests, on every core: heavy files first, compiled programs kept in .cache/ for the next run. Of each kind
+## The tests, on every core: large files first, compiled programs kept in .cache/ for the next run. Of each kind
 ## of case one is tested; `test-all` takes every variant, scenario and precision.
 test: SELECTED := -m "not sweep"
 test test-all: $(VENV)/.dev

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 import small_graphs
 import worlds
+from cases import swept
 from own_models import made
 from pose_rings import SIZE, dense, ring
 from reference import graph as plain
@@ -71,7 +72,7 @@ def test_what_is_predicted_has_no_residual():
     assert graphs.FromSensor(sensors.Compass([[1.0]])).variables == ("pose",)
 
 
-@pytest.mark.parametrize("make", [motion.Odometry, motion.Velocity])
+@pytest.mark.parametrize("make", swept([motion.Odometry, motion.Velocity], motion.Odometry))
 def test_the_residual_of_a_motion_is_its_noise(make):
     """And its derivatives are those of w where step(x, u, w) = x'."""
     model, random = make(np.eye(3)), np.random.default_rng(2)
@@ -217,6 +218,7 @@ def test_a_gradient_by_a_factor_is_a_factor():
     np.testing.assert_allclose(found.width, 2 * 3 - 2 * 2)  # of 2 k √s - k²
 
 
+@pytest.mark.sweep
 def test_a_graph_within_a_trace_is_solved_as_outside():
     graph = ring()
     outside = graphs.optimize(graph)
@@ -276,7 +278,7 @@ def falsified(graph, false=((2, 12), (6, 15))):
     ), graph._replace(poses=graph.poses)
 
 
-@pytest.mark.parametrize("name", ["dcs", "truncated"])
+@pytest.mark.parametrize("name", swept(["dcs", "truncated"], "truncated"))
 def test_a_redescending_kernel_leaves_false_loop_closures_out(name):
     graph, clean = falsified(ring())
     poses, _, information, _ = dense(clean)
@@ -310,7 +312,9 @@ def test_the_robust_start_is_good_and_is_kept():
     assert found.iterations < 10  # weights of zero and one at once, without rounds
 
 
-@pytest.mark.parametrize(("name", "share"), [("huber", 0.5), ("cauchy", 0.1)])
+@pytest.mark.parametrize(
+    ("name", "share"), swept([("huber", 0.5), ("cauchy", 0.1)], ("huber", 0.5))
+)
 def test_other_kernels_reduce_the_pull_of_false_loop_closures(name, share):
     """The optimum lies nearer to that without false ones than least squares does, in NumPy."""
     graph, clean = falsified(ring())
