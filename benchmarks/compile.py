@@ -1,10 +1,11 @@
-"""What a first run waits for: `python -m benchmarks.compile [--only NAMES] [--quick]`.
+"""What a first run waits for.
 
 Seconds of tracing, lowering and XLA's compilation of one run of every filter of the catalogue, of
 `DelayedSlam`, `TeamSlam`, an EKF with life and merging, the smoother and the batch solution,
 and of gradients through runs of an EKF; how many programs XLA compiled when the same was run again
 with every noise, gate and map value changed (asked: none); and what a second call of `run` costs
-beyond its program. Compilation does not depend on the number of steps. Idle machine, please.
+beyond its program. Compilation does not depend on the number of steps. Idle machine, please. Quick
+runs nothing a second time.
 """
 
 import dataclasses
@@ -18,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.delayed import named
-from benchmarks.gate import Metric, alone
+from benchmarks.gate import Metric
 from jaxslam import catalog, life, motion, sensors, smoothing, team
 from jaxslam.consistency.campaign.candidates import estimator_of
 from jaxslam.core.protocols import Filter
@@ -117,9 +118,7 @@ def seconds(program: Any, *arguments: Any) -> tuple[float, float, float]:
     return at - began, then - at, time.perf_counter() - then
 
 
-def measure(only: str = "", quick: bool = False) -> list[Metric]:
-    wanted = [name for name in only.split(",") if name]
-    chosen = {name: make for name, make in cases().items() if not wanted or name in wanted}
+def measure(quick: bool = False) -> list[Metric]:
     count = [0]
 
     def listen(event: str, *_: Any, **__: Any) -> None:
@@ -129,7 +128,7 @@ def measure(only: str = "", quick: bool = False) -> list[Metric]:
     metrics = []
     key = jax.random.key(0)
     print(f"{'':24} {'trace':>7} {'lower':>7} {'XLA':>7} {'sum [s]':>8}")
-    for name, make in chosen.items():
+    for name, make in cases().items():
         there, method = make(1.0)
         truth, log = simulate(there, key)
         taken = seconds(drive, method, there, truth, log, key)
@@ -145,10 +144,8 @@ def measure(only: str = "", quick: bool = False) -> list[Metric]:
         jax.block_until_ready(drive(method, there, truth, log, key))
         metrics.append(Metric(f"{name}: compiled for other numbers", count[0] - before, high=0.0))
         jax.clear_caches()
-    if not wanted:
-        metrics += gradients(key) + overhead(key)
     jax.monitoring.unregister_event_duration_listener(listen)
-    return metrics
+    return metrics + gradients(key) + overhead(key)
 
 
 def gradients(key: jax.Array) -> list[Metric]:
@@ -209,14 +206,3 @@ def overhead(key: jax.Array) -> list[Metric]:
         Metric("run of a rebuilt filter, beyond [ms]", beyond_rebuilt, high=OVERHEAD_MS),
         Metric("simulate again [ms]", draw, high=OVERHEAD_MS),
     ]
-
-
-if __name__ == "__main__":
-    raise SystemExit(
-        alone(
-            "compile",
-            measure,
-            only={"default": "", "help": "comma-separated names; default all, and gradients"},
-            quick={"action": "store_true", "help": "without running anything a second time"},
-        )
-    )

@@ -1,4 +1,4 @@
-"""Campaigns that are killed, `python -m benchmarks.kill [--kills 100] [--seed 0]`.
+"""Campaigns that are killed.
 
 `jaxslam consistency` with small blocks is killed by `kill -9` at random times, and each time
 resumed. Then the same on a full disk, with truncated blocks, with a clock that was set back, and by
@@ -19,7 +19,7 @@ from pathlib import Path
 
 import numpy as np
 
-from benchmarks.gate import Metric, alone
+from benchmarks.gate import Metric
 
 BLOCK = 2
 MANIFEST, RESULT, CURVES = "blocks/manifest.json", "consistency.json", "consistency.csv"
@@ -144,8 +144,8 @@ def on_a_full_disk(undisturbed: Campaign, folder: Path) -> tuple[str, int]:
         return how, differing(campaign, undisturbed.content())
 
 
-def measure(kills: int = 100, seed: int = 0) -> list[Metric]:
-    rng = np.random.default_rng(seed)
+def measure(quick: bool = False) -> list[Metric]:
+    kills, rng = 10 if quick else 100, np.random.default_rng(0)
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
         runs = BLOCK * (60 + 4 * kills)
@@ -201,14 +201,3 @@ def measure(kills: int = 100, seed: int = 0) -> list[Metric]:
         campaign.finish(count=2)
         also("two processes at once", differing(campaign, expected))
         return metrics
-
-
-if __name__ == "__main__":
-    raise SystemExit(
-        alone(
-            "kill",
-            measure,
-            kills={"type": int, "default": 100},
-            seed={"type": int, "default": 0},
-        )
-    )
