@@ -90,9 +90,10 @@ def page() -> str:
         made = ", ".join((record["date"], record["processor"], versions))
         parts.append(f"## {path.stem}\n\n{made}\n")
         rows = [[m["name"], f"{m['value']:.4g}", gate(**m), m["note"]] for m in record["metrics"]]
-        heads = ["metric", "value", "gate", "note"]
-        if not any(m["note"] for m in record["metrics"]):
-            rows, heads = [row[:3] for row in rows], heads[:3]
+        for row in rows:  # cells left empty at the end of a row need no border
+            while not row[-1]:
+                row.pop()
+        heads = ["metric", "value", "gate", "note"][: max(map(len, rows))]
         parts.append(table(heads, rows).strip() + "\n")
     return "\n".join(parts)
 

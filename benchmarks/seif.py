@@ -157,7 +157,7 @@ def park(quick: bool = False) -> list[Metric]:
         drive = jax.jit(lambda log, f=filter, s=start: jax.lax.scan(partial(step, f), s, log))
         state, path = drive(jax.tree.map(jnp.asarray, data.log))
         found[name] = Solution(np.asarray(path), np.asarray(estimated_map(state)[0]))
-    batch = run_batch(data, found["EKF"]).solution
+    batch = run_batch(data, found["EKF"])
     for name, solution in found.items():
         from_batch = compare(solution, batch)["map RMSE [m]"]
         rows[name] = {"map RMSE from batch [m]": from_batch} | compare(solution, found["EKF"])

@@ -11,8 +11,6 @@ first ended, with the records of the processes that are done.
 import json
 import signal
 import tempfile
-from collections.abc import Callable
-from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -108,17 +106,11 @@ def finite(campaign: object) -> dict[str, int]:
     return {"nan": nan, "not finite": lost, "held": held}
 
 
-def process(cache: Path, runs: int, stop_at: int, folder: Path) -> Record:
-    """The record of a process that goes on until so many runs are done."""
-    record: Record = child("-c", SHARE, cache, runs, stop_at, folder)
-    return record
-
-
-def recorded(file: Path, make: Callable[[], Record]) -> Record:
-    """The record in a file, which is made where there is none."""
+def recorded(file: Path, *arguments: object) -> Record:
+    """The record of a process (`share`) in a file, which is made where there is none."""
     if not file.exists():
         new = file.with_suffix(".new")
-        new.write_text(json.dumps(make()), encoding="utf-8")
+        new.write_text(json.dumps(child("-c", SHARE, *arguments)), encoding="utf-8")
         new.replace(file)
     record: Record = json.loads(file.read_text(encoding="utf-8"))
     return record
@@ -155,10 +147,8 @@ def campaigns(runs: int, folder: Path) -> list[Metric]:
     for name, parts in (("one go", 1), ("interrupted", PROCESSES)):
         for number in range(1, parts + 1):
             stop_at = runs * number // parts
-            record = recorded(
-                folder / f"{name} {number}.json",
-                partial(process, folder / "cache", runs, stop_at, folder / name),
-            )
+            file = folder / f"{name} {number}.json"
+            record = recorded(file, folder / "cache", runs, stop_at, folder / name)
             grown, rate, peak = growth(record["marks"])
             label = name if parts == 1 else f"{name}, process {number}"
             cells = f"{record['done']:>12,}{rate:>8.0f}{peak / 1e6:>11.0f}{grown:>16.0f}"

@@ -28,7 +28,7 @@ from benchmarks.scan_matching.honesty import (
 def measure(quick: bool = False) -> list[Metric]:
     compiled, runs = programs(MATCHERS), 30 if quick else 300
     rows, errors = judged(compiled, tuple(MATCHERS), runs, 0)
-    other = judged(compiled, RECOMMENDED[:1], runs, 1000)
+    other, _ = judged(compiled, RECOMMENDED[:1], runs, 1000)
     print(f"\n{error_table(errors)}\n\n{nees_table(rows)}\n")
     curves = numbers.convergence()
     if not quick:
@@ -36,7 +36,7 @@ def measure(quick: bool = False) -> list[Metric]:
         save(draw.convergence(curves), "scan_matching_convergence")
     return [
         *honest(rows, ""),
-        *honest(other.rows, ", other draws"),
+        *honest(other, ", other draws"),
         *numbers.orders(curves),
         *numbers.accuracy(50 if quick else 300),
         *numbers.speed(),

@@ -95,13 +95,6 @@ class Error(NamedTuple):
     statuses: dict[str, int]
 
 
-class Judged(NamedTuple):
-    """All that is known of some matchers on some draws."""
-
-    rows: list[Row]
-    errors: list[Error]
-
-
 def programs(names):
     """By matcher: (reference, scan, start, key) of many runs -> Match, covariances by name."""
 
@@ -124,7 +117,7 @@ def programs(names):
     return {name: of(name, MATCHERS[name]) for name in names}
 
 
-def judged(compiled, names: tuple[str, ...], runs: int, seed: int) -> Judged:
+def judged(compiled, names: tuple[str, ...], runs: int, seed: int) -> tuple[list[Row], list[Error]]:
     """These matchers on the draws of a seed, in every world."""
     rows, errors = [], []
     for world in WORLDS:
@@ -140,7 +133,7 @@ def judged(compiled, names: tuple[str, ...], runs: int, seed: int) -> Judged:
                 scored(world, name, way, error[usable], cov[usable], told, usable)
                 for way, cov in covs.items()
             ]
-    return Judged(rows, errors)
+    return rows, errors
 
 
 def error_of(found: matching.Match, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
