@@ -1,19 +1,16 @@
-"""Campaigns of `cloister` on a GPU and on all cores of the CPU beside it: `python -m
-benchmarks.accelerator [--runs 12288]`; left out where JAX finds no GPU.
+"""Campaigns of `cloister` on a GPU and on all cores of the CPU beside it; left out without a GPU.
 
 Runs a second after the first block, which compiles, and those of the filter without draws and
 scores, in float64 and float32; and how far the pose NEES differ between the two, run by run.
 """
 
-import json
 import os
 import subprocess
 import sys
 
 import numpy as np
 
-from benchmarks.consistency.markdown import table
-from benchmarks.gate import Metric, alone
+from benchmarks.gate import Metric, child, table
 
 MEASURE = """
 import json, os, sys, time
@@ -38,6 +35,7 @@ nees = np.asarray(campaign.filters[name].per_run["nees_pose"]).tolist()
 first = blocks[0][0] - marks[0][0]
 print(json.dumps([rate, alone, first, jax.devices()[0].device_kind, nees]))
 """
+RUNS = 12288
 SHARES = {"ekf": 1, "right_invariant": 1, "fastslam2": 4}
 """The filters, and by what their number of runs is divided; the cores do a quarter of the GPU's."""
 
@@ -45,37 +43,30 @@ SHARES = {"ekf": 1, "right_invariant": 1, "fastslam2": 4}
 def campaign(platform, dtype, name, runs):
     """Runs a second, those of the filter alone, seconds until the first block, device, pose NEES of
     each run."""
-    command = [sys.executable, "-c", MEASURE, platform, dtype, name, str(runs)]
-    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True, timeout=120)
-    return json.loads(done.stdout.splitlines()[-1])
+    return child("-c", MEASURE, platform, dtype, name, runs)
 
 
-def measure(runs=12288):
+def measure(quick: bool = False) -> list[Metric]:
     """Rates by filter, precision and device."""
-    if subprocess.run([sys.executable, "-c", "import jax; jax.devices('cuda')"],
-                      stderr=subprocess.DEVNULL).returncode:  # fmt: skip
+    gpu = [sys.executable, "-c", "import jax; jax.devices('cuda')"]
+    if subprocess.run(gpu, stderr=subprocess.DEVNULL).returncode:
         print("no GPU", file=sys.stderr)
         return []
     metrics, rows, kind = [], [], ""
     for dtype in ("float64", "float32"):
         for name, share in SHARES.items():
-            *gpu, kind, nees = campaign("cuda", dtype, name, runs // share)
-            *cpu, _, nees_cpu = campaign("cpu", dtype, name, max(runs // share // 4, 256))
+            *gpu, kind, nees = campaign("cuda", dtype, name, RUNS // share)
+            *cpu, _, nees_cpu = campaign("cpu", dtype, name, max(RUNS // share // 4, 256))
             nees, nees_cpu = np.array(nees[: len(nees_cpu)]), np.array(nees_cpu)
             pairs = [*zip(gpu, cpu, strict=True), (nees.mean(), nees_cpu.mean())]
             rows.append([name, dtype, *(f"{a:.4g}, {b:.4g}" for a, b in pairs)])
-            print(rows[-1], file=sys.stderr, flush=True)
             metrics.append(Metric(f"{name}, {dtype}, GPU / all cores", gpu[0] / cpu[0]))
             off = np.abs(nees / nees_cpu - 1)
-            told = f"median; at most {off.max():.2g}"
+            note = f"median; at most {off.max():.2g}"
             what = f"{name}, {dtype}, NEES of a run, GPU / CPU - 1"
-            metrics.append(Metric(what, float(np.median(off)), note=told))
-    print(f"\n{kind}, {len(os.sched_getaffinity(0))} cores beside it; {runs} runs of `cloister`\n")
+            metrics.append(Metric(what, float(np.median(off)), note=note))
+    print(f"\n{kind}, {len(os.sched_getaffinity(0))} cores beside it; {RUNS} runs of `cloister`\n")
     print("In a cell: the GPU, the cores.\n")
-    print(table(["filter", "precision", "runs/s", "filter alone [runs/s]", "first block [s]",
-                 "mean pose NEES"], rows))  # fmt: skip
+    header = ["filter", "precision", "runs/s", "filter alone [runs/s]", "first block [s]"]
+    print(table([*header, "mean pose NEES"], rows))
     return metrics
-
-
-if __name__ == "__main__":
-    raise SystemExit(alone("accelerator", measure, runs={"type": int, "default": 12288}))

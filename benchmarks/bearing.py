@@ -1,7 +1,5 @@
 """Bearings alone: a prior on the range, or on its inverse (Solà 2.3.5, 2.3.6).
 
-    python -m benchmarks.bearing [--runs 100]
-
 `cloister` and `circle` with a camera instead of their sensors: the same worlds, one bearing of 1° a
 landmark. Filters on the same draws:
 
@@ -17,21 +15,29 @@ landmark. Filters on the same draws:
 The yardstick is 3, the pose NEES of an honest filter; the contract is its 95 % band over so many
 runs and 30 % more, for the customary prior. (Jacobians at the truth make no ideal filter of the
 naive one: its estimate starts metres off, where they are not those of its own innovations.)
+
+`linearity` draws why: a landmark is seen first from the origin, straight ahead, with a Gaussian on
+the guide's interval of inverse distance, 0 to 1/d_min (Solà (47)): 1/(2 d_min) ± 1/(4 d_min), or
+the same as a range, to first order. How far does the second bearing, from a robot that went a
+baseline sideways, bend within 3 σ of that prior?
 """
 
 import dataclasses
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.gate import Metric, alone
+from benchmarks.gate import Metric, save
 from jaxslam import monte_carlo, sensors
 from jaxslam.charts import RightInvariant
 from jaxslam.filters import EkfSlam
 from jaxslam.linearize import Unscented
 from jaxslam.math.stats import chi2_band
+from jaxslam.results.plot.style import COLUMN, INK, TEXT, caption, look, panels_of
 from jaxslam.simulation.scenarios import circle, cloister
+from jaxslam.verify.linearity import sensor_linearity
 
 SIGMA = np.deg2rad(1.0)
 # The range 5 m ± 2.5 m, and the inverse distance from d_min = 1 m: both hold all distances that
@@ -40,7 +46,7 @@ RANGE = (np.array([5.0]), np.array([[2.5**2]]))
 MIN_DISTANCE = 1.0
 MATCHED = ((0.25,), ((0.25**2,),))
 TO_POINT = 0.1
-ROWS = ("nees_pose", "nees_heading", "nis_per_dof", "rmse_position", "rmse_landmarks")
+RHO, RHO_SIGMA = 0.5 / MIN_DISTANCE, 0.25 / MIN_DISTANCE
 
 
 def worlds():
@@ -57,33 +63,20 @@ def worlds():
             EkfSlam, scenario.motion, capacity=len(scenario.landmarks), correction="joint"
         )
         better = {"chart": RightInvariant(rays=True), "linearize": Unscented()}
-        yield (
-            scenario,
-            {
-                "naive": ekf(camera),
-                "inverse_depth": ekf(rays),
-                "rays_invariant": ekf(to_points, **better),
-                "rays_matched": ekf(matched, **better),
-            },
-        )
+        filters = {
+            "naive": ekf(camera),
+            "inverse_depth": ekf(rays),
+            "rays_invariant": ekf(to_points, **better),
+            "rays_matched": ekf(matched, **better),
+        }
+        yield scenario, filters
 
 
-def measure(runs=100):
-    metrics = []
+def measure(quick: bool = False) -> list[Metric]:
+    metrics, runs = [], 20 if quick else 100
     for scenario, filters in worlds():
         campaign = monte_carlo(scenario, filters, runs, jax.random.key(0))
-        print(f"\n{scenario.name}: {campaign.runs} runs × {campaign.steps} steps")
-        print(f"{'':18}" + "".join(f"{name:>24}" for name in filters))
-        print(f"{'verdict':18}" + "".join(f"{s.verdict:>24}" for s in campaign.filters.values()))
-        for row in ROWS:
-            cells = []
-            for summary in campaign.filters.values():
-                m = summary.measures.get(row)
-                cells.append("-" if m is None else f"{m.value:.4g} [{m.low:.3g}, {m.high:.3g}]")
-            print(f"{row:18}" + "".join(f"{cell:>24}" for cell in cells))
-        for row in ("divergent", "not_finite", "singular"):
-            counts = (str(s.counts.get(row, 0)) for s in campaign.filters.values())
-            print(f"{row:18}" + "".join(f"{cell:>24}" for cell in counts))
+        print(campaign, flush=True)
         nees = campaign.filters["rays_invariant"].measures["nees_pose"].value
         lost = campaign.filters["naive"].counts["divergent"] / runs
         high = 1.3 * chi2_band(3, runs)[1]
@@ -92,5 +85,38 @@ def measure(runs=100):
     return metrics
 
 
-if __name__ == "__main__":
-    raise SystemExit(alone("bearing", measure, runs={"type": int, "default": 100}))
+def indices(sensor, landmark, column: int, sigma: float, baselines):
+    """By the Hessian and by sampling, (B,) each, with one uncertain coordinate of the landmark."""
+    cov = np.zeros((3 + len(landmark), 3 + len(landmark)))
+    cov[3 + column, 3 + column] = sigma**2
+
+    def one(baseline):
+        pose = jnp.stack([0.0, baseline, 0.0])
+        return sensor_linearity(sensor, pose, landmark, cov)
+
+    out = jax.jit(jax.vmap(one))(baselines)
+    return np.asarray(out.hessian), np.asarray(out.sampled)
+
+
+def linearity(quick: bool = False) -> list[Metric]:
+    """Draw the linearity index; no metrics."""
+    shares = np.geomspace(0.01, 3, 60)
+    by_range = sensors.BearingOnly([[1e-4]])
+    rays = sensors.BearingInverseDepth([[1e-4]], min_distance=MIN_DISTANCE)
+    ask = partial(indices, baselines=shares * MIN_DISTANCE)
+    curves = {
+        "range d": ask(by_range, np.array([1 / RHO, 0.0]), 0, RHO_SIGMA / RHO**2),
+        "inverse depth ρ": ask(rays, np.array([0.0, 0.0, 0.0, RHO]), 3, RHO_SIGMA),
+    }
+    figure, (axes,) = panels_of(COLUMN, 2.6, 1)
+    for i, (name, (hessian, sampled)) in enumerate(curves.items()):
+        line = look(i)
+        axes.loglog(shares, hessian, color=line["color"], ls=line["ls"], label=f"{name}, Hessian")
+        line["ls"] = "none"
+        axes.loglog(shares[::4], sampled[::4], ms=3.6, label=f"{name}, sampled", **line)
+    axes.axhline(1.0, color=INK, lw=0.8)
+    axes.text(shares[0], 0.8, "above: bends farther than it rises", fontsize=TEXT, va="top")
+    axes.set_xlabel("baseline / nearest distance")
+    caption(figure, "Linearity index of the bearing (3 σ)")
+    save(figure, "linearity")
+    return []

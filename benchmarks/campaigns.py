@@ -1,4 +1,4 @@
-"""The campaigns that README and the pages quote: `python -m benchmarks.campaigns [--runs 100]`.
+"""The campaigns that README and the pages quote.
 
 Each is `jaxslam consistency` with the scenario, the filters and the seed that are printed above its
 table.
@@ -6,7 +6,7 @@ table.
 
 import jax
 
-from benchmarks.gate import Metric, alone
+from benchmarks.gate import Metric
 from jaxslam import catalog, monte_carlo
 from jaxslam.simulation.scenarios import SCENARIOS
 
@@ -19,9 +19,9 @@ CAMPAIGNS = (
 """Scenario, filters by their names in the catalog, seed"""
 
 
-def measure(runs: int = 100) -> list[Metric]:
+def measure(quick: bool = False) -> list[Metric]:
     """Prints the table of each campaign; the pose NEES of its filters."""
-    metrics = []
+    metrics, runs = [], 10 if quick else 100
     for scenario, names, seed in CAMPAIGNS:
         world = SCENARIOS[scenario]()
         filters = {name: catalog.ALL[name](world, watch=True) for name in names}
@@ -33,7 +33,3 @@ def measure(runs: int = 100) -> list[Metric]:
             for name, summary in campaign.filters.items()
         ]
     return metrics
-
-
-if __name__ == "__main__":
-    raise SystemExit(alone("campaigns", measure, runs={"type": int, "default": 100}))

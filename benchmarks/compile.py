@@ -1,10 +1,11 @@
-"""What a first run waits for: `python -m benchmarks.compile [--only NAMES] [--quick]`.
+"""What a first run waits for.
 
 Seconds of tracing, lowering and XLA's compilation of one run of every filter of the catalogue, of
 `DelayedSlam`, `TeamSlam`, an EKF with life and merging, the smoother and the batch solution,
 and of gradients through runs of an EKF; how many programs XLA compiled when the same was run again
 with every noise, gate and map value changed (asked: none); and what a second call of `run` costs
-beyond its program. Compilation does not depend on the number of steps. Idle machine, please.
+beyond its program. Compilation does not depend on the number of steps. Idle machine, please. Quick
+runs nothing a second time.
 """
 
 import dataclasses
@@ -18,7 +19,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.delayed import named
-from benchmarks.gate import Metric, alone
+from benchmarks.gate import Metric
 from jaxslam import catalog, life, motion, sensors, smoothing, team
 from jaxslam.consistency.campaign.candidates import estimator_of
 from jaxslam.core.protocols import Filter
@@ -60,43 +61,27 @@ def crew(scale: float) -> tuple[World, Filter]:
     return TeamWorld(robots, points, controls), TeamSlam(robots, 8)
 
 
-def cases() -> dict[str, Callable[[float], tuple[World, Any]]]:
-    """By name: (scale) -> a world and a filter, or an estimator, with every number scaled."""
+NAMES = (*catalog.ALL, "delayed_slam", "team_slam", "life and merging", "smooth", "batch_map")
 
-    def of_family(name: str) -> Callable[[float], tuple[World, Any]]:
-        def make(scale: float) -> tuple[World, Any]:
-            there = world(scale)
-            return there, catalog.ALL[name](there, gate=9.21 * scale)
 
-        return make
-
-    def delayed(scale: float) -> tuple[World, Any]:
+def case(name: str, scale: float) -> tuple[World, Any]:
+    """A world and a filter, or an estimator, with every number scaled."""
+    if name == "delayed_slam":
         there, filters = named(6)
         controls = np.asarray(there.controls)[:STEPS] * scale
         return dataclasses.replace(there, controls=controls), filters["delayed"]
-
-    def managed(scale: float) -> tuple[World, Any]:
-        there = world(scale)
+    if name == "team_slam":
+        return crew(scale)
+    there = world(scale)
+    parts = there.motion, there.sensor, len(there.landmarks)
+    if name == "life and merging":
         keeps = life.Existence(there.visible, detected=0.9 * scale, patience=50)
-        count = len(there.landmarks)
-        plain = EkfSlam(there.motion, there.sensor, count, correction="joint", life=keeps)
-        return there, Merging(plain, 0.5 * scale)
-
-    def smoother(make: Callable[..., Any]) -> Callable[[float], tuple[World, Any]]:
-        def of(scale: float) -> tuple[World, Any]:
-            there = world(scale)
-            count = len(there.landmarks)
-            return there, make(there.motion, there.sensor, count, there.pose, there.pose_cov)
-
-        return of
-
-    return {name: of_family(name) for name in catalog.ALL} | {
-        "delayed_slam": delayed,
-        "team_slam": crew,
-        "life and merging": managed,
-        "smooth": smoother(smoothing.Smoother),
-        "batch_map": smoother(smoothing.BatchMap),
-    }
+        return there, Merging(EkfSlam(*parts, correction="joint", life=keeps), 0.5 * scale)
+    if name == "smooth":
+        return there, smoothing.Smoother(*parts, there.pose, there.pose_cov)
+    if name == "batch_map":
+        return there, smoothing.BatchMap(*parts, there.pose, there.pose_cov)
+    return there, catalog.ALL[name](there, gate=9.21 * scale)
 
 
 @jax.jit
@@ -106,20 +91,21 @@ def drive(method: Any, there: World, truth: Truth, log: Log, key: jax.Array) -> 
     return estimate(log, key)
 
 
-def seconds(program: Any, *arguments: Any) -> tuple[float, float, float]:
-    """Of tracing, lowering and compiling a jitted function."""
+def first_run(name: str, program: Any, *arguments: Any) -> Metric:
+    """Seconds of tracing, lowering and compiling a jitted function, which are printed."""
     began = time.perf_counter()
     traced = program.trace(*arguments)
     at = time.perf_counter()
     lowered = traced.lower()
     then = time.perf_counter()
     lowered.compile()
-    return at - began, then - at, time.perf_counter() - then
+    taken = at - began, then - at, time.perf_counter() - then
+    print(f"{name:24} " + " ".join(f"{x:7.2f}" for x in taken) + f" {sum(taken):8.2f}", flush=True)
+    high = DELAYED_GATE if name == "delayed_slam" else GATE
+    return Metric(f"{name}: first run [s]", sum(taken), high=high)
 
 
-def measure(only: str = "", quick: bool = False) -> list[Metric]:
-    wanted = [name for name in only.split(",") if name]
-    chosen = {name: make for name, make in cases().items() if not wanted or name in wanted}
+def measure(quick: bool = False) -> list[Metric]:
     count = [0]
 
     def listen(event: str, *_: Any, **__: Any) -> None:
@@ -129,26 +115,21 @@ def measure(only: str = "", quick: bool = False) -> list[Metric]:
     metrics = []
     key = jax.random.key(0)
     print(f"{'':24} {'trace':>7} {'lower':>7} {'XLA':>7} {'sum [s]':>8}")
-    for name, make in chosen.items():
-        there, method = make(1.0)
+    for name in NAMES:
+        there, method = case(name, 1.0)
         truth, log = simulate(there, key)
-        taken = seconds(drive, method, there, truth, log, key)
-        print(f"{name:24} " + " ".join(f"{x:7.2f}" for x in taken) + f" {sum(taken):8.2f}")
-        high = DELAYED_GATE if name == "delayed_slam" else GATE
-        metrics.append(Metric(f"{name}: first run [s]", sum(taken), high=high))
+        metrics.append(first_run(name, drive, method, there, truth, log, key))
         if quick:
             continue
         jax.block_until_ready(drive(method, there, truth, log, key))
-        there, method = make(1.07)
+        there, method = case(name, 1.07)
         truth, log = simulate(there, key)
         before = count[0]
         jax.block_until_ready(drive(method, there, truth, log, key))
         metrics.append(Metric(f"{name}: compiled for other numbers", count[0] - before, high=0.0))
         jax.clear_caches()
-    if not wanted:
-        metrics += gradients(key) + overhead(key)
     jax.monitoring.unregister_event_duration_listener(listen)
-    return metrics
+    return metrics + gradients(key) + overhead(key)
 
 
 def gradients(key: jax.Array) -> list[Metric]:
@@ -165,10 +146,8 @@ def gradients(key: jax.Array) -> list[Metric]:
             trace = run(ekf, log, there.pose, there.pose_cov, key)
             return trace.info.log_likelihood.sum()
 
-        taken = seconds(jax.jit(jax.value_and_grad(cost)), at, log)
-        name = f"gradient, {correction}"
-        print(f"{name:24} " + " ".join(f"{x:7.2f}" for x in taken) + f" {sum(taken):8.2f}")
-        metrics.append(Metric(f"{name}: first run [s]", sum(taken), high=GATE))
+        program = jax.jit(jax.value_and_grad(cost))
+        metrics.append(first_run(f"gradient, {correction}", program, at, log))
     return metrics
 
 
@@ -209,14 +188,3 @@ def overhead(key: jax.Array) -> list[Metric]:
         Metric("run of a rebuilt filter, beyond [ms]", beyond_rebuilt, high=OVERHEAD_MS),
         Metric("simulate again [ms]", draw, high=OVERHEAD_MS),
     ]
-
-
-if __name__ == "__main__":
-    raise SystemExit(
-        alone(
-            "compile",
-            measure,
-            only={"default": "", "help": "comma-separated names; default all, and gradients"},
-            quick={"action": "store_true", "help": "without running anything a second time"},
-        )
-    )

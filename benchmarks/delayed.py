@@ -1,7 +1,5 @@
 """Bearing-only landmarks: initialized late, or at once in inverse depth; the same draws.
 
-    python -m benchmarks.delayed [--runs 100] [--every 3]
-
 `cloister` with a camera, as in `benchmarks.bearing`: one bearing of 1° a landmark and step, the
 start known, identities known. Every third column stands, so that 100 runs with a table of stored
 measurements take minutes. `delayed` promotes an intersection that was confirmed three times,
@@ -24,7 +22,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxslam
-from benchmarks.gate import Metric, alone
+from benchmarks.gate import Metric, show
 from jaxslam import motion, sensors
 from jaxslam.association import Nearest
 from jaxslam.filters import DelayedSlam, EkfSlam
@@ -37,11 +35,10 @@ from jaxslam.simulation.worlds import Scenario
 
 SIGMA = np.deg2rad(1.0)
 FALSE = 1.0
-BLOCK = 20
-HEADER = ("pose NEES", "median", "position [m]", "landmarks [m]", "wait", "found", "false")
+BLOCK, EVERY = 20, 3
 
 
-def named(every):
+def named(every=EVERY):
     world = cloister()
     columns = world.landmarks[::every]
     camera = sensors.BearingOnly([[SIGMA**2]], free=([5.0], [[2.5**2]]))
@@ -135,54 +132,40 @@ def scores(scenario, filter, runs, names=True, spoil=None):
     return {name: np.concatenate([part[name] for part in parts])[:runs] for name in parts[0]}
 
 
-def line(name, found, count):
+def row(found):
     nees = found["nees"]
-    cells = (
-        f"{nees.mean():.3g} ± {2 * nees.std() / len(nees) ** 0.5:.2g}",
-        f"{np.median(nees):.3g}",
-        f"{np.sqrt(found['position'].mean()):.3f}",
-        f"{np.sqrt(found['landmarks'].mean()):.3f}",
-        f"{found['wait'].mean():.1f}",
-        f"{found['found'].mean():.2f}/{count}",
-        f"{found['false'].mean():.2f}",
-    )
-    print(f"{name:16}" + "".join(f"{cell:>15}" for cell in cells), flush=True)
+    return {
+        "pose NEES": f"{nees.mean():.3g} ± {2 * nees.std() / len(nees) ** 0.5:.2g}",
+        "median": np.median(nees),
+        "position [m]": np.sqrt(found["position"].mean()),
+        "landmarks [m]": np.sqrt(found["landmarks"].mean()),
+        "wait": found["wait"].mean(),
+        "found": found["found"].mean(),
+        "false": found["false"].mean(),
+    }
 
 
-def measure(runs=100, every=3):
-    scenario, filters = named(every)
-    count = len(scenario.landmarks)
-    metrics = []
-    print(f"\n{scenario.name}, {count} columns: {runs} runs × {scenario.steps} steps")
-    print(f"{'':16}" + "".join(f"{name:>15}" for name in HEADER))
-    for name, filter in filters.items():
-        found = scores(scenario, filter, runs)
-        line(name, found, count)
-        if name == "delayed":
-            median = float(np.median(found["nees"]))
-            metrics.append(Metric("delayed, cloister: median pose NEES", median, high=6.0))
-            wrong = float(found["false"].mean())
-            metrics.append(Metric("delayed, cloister: false landmarks", wrong, high=0.5))
+def measure(quick: bool = False) -> list[Metric]:
+    runs = 20 if quick else 100
+    scenario, filters = named()
+    rows = {name: row(scores(scenario, filter, runs)) for name, filter in filters.items()}
+    show(f"{scenario.name}, {len(scenario.landmarks)} columns: {runs} runs", rows)
+    delayed = rows["delayed"]
+    metrics = [
+        Metric("delayed, cloister: median pose NEES", delayed["median"], high=6.0),
+        Metric("delayed, cloister: false landmarks", delayed["false"], high=0.5),
+    ]
     scenario, filter = nameless()
     count = len(scenario.landmarks)
-    print(f"\n{scenario.name}: {runs} runs × {scenario.steps} steps")
-    print(f"{'':16}" + "".join(f"{name:>15}" for name in HEADER))
-    for name, spoil in (("still", None), ("clutter", clutter)):
-        found = scores(scenario, filter, runs, names=False, spoil=spoil)
-        line(name, found, count)
-        here = float(found["found"].mean())
-        metrics.append(Metric(f"delayed, {name}: found of {count}", here, low=0.8 * count))
-        wrong = float(found["false"].mean())
-        metrics.append(Metric(f"delayed, {name}: false landmarks", wrong, high=0.5))
+    rows = {
+        name: row(scores(scenario, filter, runs, names=False, spoil=spoil))
+        for name, spoil in (("still", None), ("clutter", clutter))
+    }
+    show(f"{scenario.name}: {runs} runs × {scenario.steps} steps", rows)
+    for name, found in rows.items():
+        what = f"delayed, {name}: found of {count}"
+        metrics += [
+            Metric(what, found["found"], low=0.8 * count),
+            Metric(f"delayed, {name}: false landmarks", found["false"], high=0.5),
+        ]
     return metrics
-
-
-if __name__ == "__main__":
-    raise SystemExit(
-        alone(
-            "delayed",
-            measure,
-            runs={"type": int, "default": 100},
-            every={"type": int, "default": 3},
-        )
-    )

@@ -1,15 +1,28 @@
-"""A benchmark's result and its gate: a measured number and the range it must lie in."""
+"""The result of a benchmark and its gate, and how benchmarks print tables and save figures."""
 
-import argparse
-from collections.abc import Callable
+import json
+import subprocess
+import sys
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
+from pathlib import Path
 from typing import Any
 
-import jax
+from matplotlib.figure import Figure
+
+from jaxslam.results.plot.style import png
+
+FIGURES = Path(__file__).parent / "figures"
 
 
 @dataclass(frozen=True)
 class Metric:
+    """A measured number and the range it must lie in.
+
+    A metric of which more is better has the gate `low`, one of which less is better `high`, one
+    with a known value both: the limit is what was asked, less a tolerance where a machine decides.
+    """
+
     name: str
     value: float
     low: float = float("-inf")
@@ -34,16 +47,33 @@ def report(metrics: list[Metric]) -> int:
     return 1 if missed else 0
 
 
-def alone(name: str, measure: Callable[..., list[Metric]], **options: dict[str, Any]) -> int:
-    """The command `python -m benchmarks.NAME`: measure with its options, report; exit status.
+def table(header: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A Markdown table."""
+    lines = ["| " + " | ".join(row) + " |" for row in (header, *rows)]
+    return "\n".join([lines[0], "|" + "---|" * len(header), *lines[1:]])
 
-    options: arguments of measure, each with what `add_argument` is told of it.
-    """
-    parser = argparse.ArgumentParser(prog=f"python -m benchmarks.{name}")
-    for option, told in options.items():
-        parser.add_argument(f"--{option}", **told)
-    asked = vars(parser.parse_args())
-    jax.config.update("jax_enable_x64", True)
-    metrics = measure(**asked)
-    print()
-    return report(metrics) if metrics else 0
+
+def show(title: str, rows: Mapping[Any, Mapping[str, float | str]]) -> None:
+    """Print a table of {row: {column: value}}."""
+    columns = list(dict.fromkeys(column for row in rows.values() for column in row))
+    cells = [["", *columns]]
+    for name, row in rows.items():
+        values = (row.get(column, "-") for column in columns)
+        cells.append([str(name), *(v if isinstance(v, str) else f"{v:.4g}" for v in values)])
+    first, *widths = (max(map(len, column)) for column in zip(*cells, strict=True))
+    print(f"\n{title}")
+    for name, *row in cells:
+        aligned = (f"  {cell:>{width}}" for cell, width in zip(row, widths, strict=True))
+        print(f"{name:{first}}" + "".join(aligned), flush=True)
+
+
+def child(*arguments: object) -> Any:
+    """What a Python process with these arguments prints as JSON, in its last line."""
+    command = [sys.executable, *map(str, arguments)]
+    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+    return json.loads(done.stdout.splitlines()[-1])
+
+
+def save(figure: Figure, name: str) -> None:
+    """Write figures/NAME.png."""
+    (FIGURES / f"{name}.png").write_bytes(png(figure))

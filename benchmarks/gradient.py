@@ -1,4 +1,4 @@
-"""What a gradient through a whole run costs: `python -m benchmarks.gradient`.
+"""What a gradient through a whole run costs.
 
 The log-likelihood of 200 steps of `cloister`, driven by a steered car, by the noise, the mounting
 pose and the wheelbase (8 parameters): time of `jax.value_and_grad` over that of the forward run,
@@ -6,14 +6,13 @@ both compiled, and the memory it holds; with joint and with sequential correctio
 """
 
 import dataclasses
-import statistics
-import time
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.gate import Metric, report
+from benchmarks.gate import Metric
+from benchmarks.speed.timing import together
 from jaxslam.filters.ekf.ekf_slam import EkfSlam
 from jaxslam.motion.ackermann import Ackermann
 from jaxslam.run import run
@@ -31,7 +30,11 @@ def models(p):
     return car, RangeBearing(jnp.diag(p[2:4]) ** 2, mount=p[4:7])
 
 
-def measure(correction: str = "joint") -> list[Metric]:
+def measure(quick: bool = False) -> list[Metric]:
+    return cost_of("joint") + cost_of("sequential")
+
+
+def cost_of(correction: str) -> list[Metric]:
     car, sensor = models(AT)
     steering = np.arctan(0.05 * WHEELBASE / (SPEED * DT))
     controls = np.tile([SPEED, steering, DT], (200, 1))
@@ -45,30 +48,17 @@ def measure(correction: str = "joint") -> list[Metric]:
         trace = run(ekf, log, world.pose, world.pose_cov, key)
         return trace.info.log_likelihood.sum()
 
-    programs = [
-        jax.jit(function).lower(AT, log).compile()
-        for function in (log_likelihood, jax.value_and_grad(log_likelihood))
-    ]
-    forward, both = _seconds(programs, log)
-    held = programs[1].memory_analysis().temp_size_in_bytes / 1e6
+    functions = {"forward": log_likelihood, "gradient": jax.value_and_grad(log_likelihood)}
+    programs = {name: jax.jit(f).lower(AT, log).compile() for name, f in functions.items()}
+    actions = {
+        name: lambda program=program: jax.block_until_ready(program(AT, log))
+        for name, program in programs.items()
+    }
+    seconds = together(actions, ROUNDS)
+    forward, both = seconds["forward"], seconds["gradient"]
+    held = programs["gradient"].memory_analysis().temp_size_in_bytes / 1e6
     name, gate = f"cloister, {correction}, ", 6.0 if correction == "joint" else float("inf")
     return [
         Metric(name + "forward run [s]", forward),
         Metric(name + "gradient / forward", both / forward, high=gate, note=f"{held:.1f} MB"),
     ]
-
-
-def _seconds(programs, log) -> list[float]:
-    """The median of what each takes, all in turns, for the machine's own speed drifts."""
-    seconds: list[list[float]] = [[] for _ in programs]
-    for _ in range(ROUNDS + 1):
-        for taken, program in zip(seconds, programs, strict=True):
-            began = time.perf_counter()
-            jax.block_until_ready(program(AT, log))
-            taken.append(time.perf_counter() - began)
-    return [statistics.median(taken[1:]) for taken in seconds]
-
-
-if __name__ == "__main__":
-    jax.config.update("jax_enable_x64", True)
-    raise SystemExit(report(measure() + measure("sequential")))

@@ -1,7 +1,5 @@
 """Walls from a laser's scans: segments, and EKF-SLAM with the lines and each one's covariance.
 
-    python -m benchmarks.lines [--runs 100] [--rooms square,office]
-
 In exact rooms (180 beams, σ = 2 cm, 2 % dropouts) every n-th scan is divided into segments; each
 line enters the EKF with the covariance of its own fit. Which wall a line is of is told by the true
 pose (the world's wall ids); lines that are of no wall are counted and left out. NEES of the lines
@@ -14,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.gate import Metric, alone
+from benchmarks.gate import Metric
 from jaxslam import features, filters, scenarios, sensors
 from jaxslam.consistency.measures.nees import block_nees, pose_error
 from jaxslam.core.types import Beams, Scan
@@ -42,11 +40,7 @@ def lines_of(world, lines, pose, beams: Beams):
     rows = np.flatnonzero(mine)[:PLACES]
     z, cov = np.zeros((PLACES, 2)), np.tile(np.eye(2), (PLACES, 1, 1))
     tags, valid = np.full(PLACES, -1), np.arange(PLACES) < len(rows)
-    z[: len(rows)], cov[: len(rows)], tags[: len(rows)] = (
-        found.line[rows],
-        found.cov[rows],
-        tag[rows],
-    )
+    z[valid], cov[valid], tags[valid] = found.line[rows], found.cov[rows], tag[rows]
     nees = np.einsum("ki,kij,kj->k", gap[rows], np.linalg.inv(found.cov[rows]), gap[rows])
     return (z, cov, tags, valid), nees, len(tag) - len(rows)
 
@@ -80,27 +74,19 @@ def judge(name: str, runs: int, every: int) -> tuple[float, float, float]:
     lines, _ = walls.wall_lines(world.walls)
     keys = jax.random.split(jax.random.key(0), runs)
     logs = jax.device_get(jax.jit(jax.vmap(lambda key: laser.scan_world(world, key)))(keys))
-    nothing = (
-        np.zeros((PLACES, 2)),
-        np.tile(np.eye(2), (PLACES, 1, 1)),
-        np.full(PLACES, -1),
-        np.zeros(PLACES, bool),
-    )
     steps, nees, none = logs.pose.shape[1], [], 0
-    table = []
-    for run in range(runs):
-        rows = []
-        for t in range(steps):
-            if t % every:
-                rows.append(nothing)
-                continue
-            beams = Beams(*(part[run, t] for part in logs.beams))
-            row, each, spurious = lines_of(world, lines, logs.pose[run, t], beams)
-            rows.append(row)
-            nees.append(each)
-            none += spurious
-        table.append([np.stack(part) for part in zip(*rows, strict=True)])
-    scans = tuple(np.stack(part) for part in zip(*table, strict=True))
+    shape = (runs, steps, PLACES)
+    cov, tag = np.tile(np.eye(2), (*shape, 1, 1)), np.full(shape, -1)
+    scans = np.zeros((*shape, 2)), cov, tag, np.zeros(shape, bool)
+    for run, t in np.ndindex(runs, -(-steps // every)):
+        at = run, t * every
+        row, each, spurious = lines_of(
+            world, lines, logs.pose[at], Beams(*(part[at] for part in logs.beams))
+        )
+        for whole, part in zip(scans, row, strict=True):
+            whole[at] = part
+        nees.append(each)
+        none += spurious
     go = jax.jit(jax.vmap(lambda control, scans: drive(world, len(lines), control, scans)))
     pose, cov, nis, dof = (np.asarray(part) for part in go(logs.control, scans))
     measured = slice(every, None)  # P0 = 0 at first
@@ -131,28 +117,16 @@ def round_walls(beams: int) -> float:
     return float(np.mean([len(features.segments(Beams(*scan), **options).line) for scan in scans]))
 
 
-def measure(runs: int = 100, rooms: str = "square,office") -> list[Metric]:
+def measure(quick: bool = False) -> list[Metric]:
     metrics = [
         Metric(f"circular_room, {beams} beams: lines a scan", round_walls(beams), high=0.1)
         for beams in (90, 180, 360, 720)
     ]
-    for name in rooms.split(","):
-        line, pose, ratio = judge(name, runs, every=4 if name == "square" else 8)
+    for name, every in (("square", 4), ("office", 8)):
+        line, pose, ratio = judge(name, 10 if quick else 100, every)
         metrics += [
             Metric(f"{name}: NEES of a line", line, low=1.6, high=2.8, note="honest: 2"),
             Metric(f"{name}: pose NEES", pose, high=6.0, note="honest: 3"),
             Metric(f"{name}: NIS/dof", ratio, low=0.85, high=1.3, note="honest: 1"),
         ]
     return metrics
-
-
-if __name__ == "__main__":
-    jax.config.update("jax_enable_x64", True)
-    raise SystemExit(
-        alone(
-            "lines",
-            measure,
-            runs={"type": int, "default": 100},
-            rooms={"default": "square,office"},
-        )
-    )

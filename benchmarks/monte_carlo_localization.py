@@ -1,7 +1,5 @@
 """A robot that may be anywhere, then is carried away: particles against the EKF in a known map.
 
-    python -m benchmarks.monte_carlo_localization [--runs 20] [--particles 5000]
-
 `circle`, its map known: landmarks by tag, seen between 1 and 5 m. As far as the filters know the
 robot starts anywhere; it drives 150 s, is put down at the other side of the ring without being
 told, and drives 150 s more. Monte-Carlo localization with at most so many particles, and with five
@@ -16,24 +14,22 @@ part. The EKF without a gate has none: as tags are known, what it measures may p
 
 import dataclasses
 from functools import partial
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.gate import Metric, alone
+from benchmarks.gate import Metric, show
 from jaxslam import run, sensors, simulate
 from jaxslam.filters import Localization, ParticleLocalization
 from jaxslam.filters.particles import pose_particles
 from jaxslam.math.stats import chi2_quantile
-from jaxslam.results.plot.style import HUES, INK, PAGE, TEXT, caption, curve, panels_of, png
 from jaxslam.simulation.scenarios import circle
 
-FIGURE = Path(__file__).parent / "figures" / "monte_carlo_localization.png"
 BOX = np.array([[-14.0, -4.0], [14.0, 23.0]])
 HALF = 150  # steps of 1 s
 FOUND = 0.5  # [m]
+PARTICLES = 5000
 
 
 def carried(world, key):
@@ -47,7 +43,7 @@ def carried(world, key):
     return jnp.concatenate(poses), jax.tree.map(lambda a, b: jnp.concatenate([a, b]), *logs)
 
 
-def filters_of(world, particles):
+def filters_of(world):
     """Filter, and what it is told of the start, by name."""
     blunt = sensors.RelativePosition(0.5**2 * np.eye(2))
     anywhere = pose_particles.uniform_pose_moments(jnp.asarray(BOX))
@@ -57,13 +53,7 @@ def filters_of(world, particles):
     return {
         "particles": (
             ParticleLocalization(
-                world.motion,
-                blunt,
-                world.landmarks,
-                particles,
-                box=BOX,
-                start="uniform",
-                gate=25.0,
+                world.motion, blunt, world.landmarks, PARTICLES, box=BOX, start="uniform", gate=25.0
             ),
             *anywhere,
         ),
@@ -72,13 +62,13 @@ def filters_of(world, particles):
     }
 
 
-def histories(runs, particles):
+def histories(runs):
     """By filter: position error [m] (runs, 2·HALF), and its `Info`."""
     world = circle(HALF)
     keys = jax.random.split(jax.random.key(0), runs)
     poses, logs = jax.jit(jax.vmap(partial(carried, world)))(keys)
     out = {}
-    for name, (filter, pose, cov) in filters_of(world, particles).items():
+    for name, (filter, pose, cov) in filters_of(world).items():
 
         def one(row, filter=filter, pose=pose, cov=cov):
             log, key = row
@@ -98,74 +88,31 @@ def seconds_to_find(error):
     return np.where(last < error.shape[1], last, np.inf)
 
 
-def measure(runs=20, particles=5000, out=None):
-    """The gates, with a table printed, and the figure where asked for."""
-    traces = histories(runs, particles)
-    metrics = []
-    title = f"{'':22}{'part':>12}{'found':>8}{'after [s]':>11}{'error at its end [m]':>22}"
-    print(f"\ncircle: {runs} runs of 2 × {HALF} s\n{title}")
+def measure(quick: bool = False) -> list[Metric]:
+    runs = 4 if quick else 12
+    traces, rows, metrics = histories(runs), {}, []
     for name, (error, _) in traces.items():
         for part, at in (("anywhere", slice(0, HALF)), ("carried away", slice(HALF, None))):
-            own = error[:, at]
-            after = seconds_to_find(own)
+            after = seconds_to_find(error[:, at])
             found = np.isfinite(after)
-            when = f"{np.median(after[found]):.0f}" if found.any() else "-"
-            print(f"{name:22}{part:>12}{found.mean():8.0%}{when:>11}{np.median(own[:, -1]):22.3g}")
-            gate = {}
-            if name == "particles":
-                gate = {"low": 0.9}
-            elif part == "carried away" and name == "EKF, start, gate":
+            rows[f"{name}, {part}"] = {
+                "found": found.mean(),
+                "after [s]": np.median(after[found]) if found.any() else np.inf,
+                "error at its end [m]": np.median(error[:, at][:, -1]),
+            }
+            gate = {"low": 0.9} if name == "particles" else {}
+            if part == "carried away" and name == "EKF, start, gate":
                 gate = {"high": 0.1}
             metrics.append(Metric(f"{name}, {part}: share found", found.mean(), **gate))
+    show(f"circle: {runs} runs of 2 × {HALF} s", rows)
     found = traces["particles"][1].extra["particles"]
-    active = np.median(np.asarray(found.active), axis=0)
+    active, injected = np.median(np.asarray(found.active), axis=0), np.asarray(found.injected)
     for part, at in (("anywhere", HALF - 1), ("carried away", 2 * HALF - 1)):
-        metrics.append(Metric(f"particles in use, end of {part}", active[at], high=0.2 * particles))
-    injected = np.asarray(found.injected)
-    metrics.append(Metric("injected a run, before it is carried", injected[:, :HALF].sum(1).mean()))
-    metrics.append(Metric("injected a run, after", injected[:, HALF:].sum(1).mean()))
-    metrics.append(Metric("steps in which no weight was left", float(found.underflow.sum())))
-    metrics.append(Metric("steps at the capacity, a run", float(found.capped.sum(1).mean())))
-    if out is not None:
-        draw(traces, out)
-    return metrics
-
-
-def draw(traces, out):
-    """Error and particles in use against time: medians over the runs, and 10 % to 90 % of them."""
-    figure, (above, below) = panels_of(PAGE, 3.8, 2, heights=(3, 2))
-    seconds = np.arange(1, 2 * HALF + 1)
-
-    def spread(axes, values, i, label):
-        low, mid, high = np.quantile(values, [0.1, 0.5, 0.9], axis=0)
-        axes.fill_between(seconds, low, high, color=HUES[i], alpha=0.2, lw=0)
-        curve(axes, i, seconds, mid, label)
-
-    for i, (name, (error, _)) in enumerate(traces.items()):
-        spread(above, np.maximum(error, 1e-3), i, name)
-    found = traces["particles"][1].extra["particles"]
-    spread(below, np.asarray(found.active), 0, "particles in use")
-    above.set_ylabel("position error [m]")
-    below.set_ylabel("particles in use")
-    below.set_xlabel("time [s]")
-    for axes in (above, below):
-        axes.set_yscale("log")
-        axes.axvline(HALF, color=INK, lw=0.8)
-    above.text(HALF + 2, above.get_ylim()[1], "carried away", va="top", size=TEXT)
-    runs = len(traces["particles"][0])
-    what = "medians, shaded 10 % to 90 % of the runs"
-    caption(figure, f"circle, map known: anywhere, then carried away; {runs} runs, {what}")
-    out.parent.mkdir(exist_ok=True)
-    out.write_bytes(png(figure))
-
-
-if __name__ == "__main__":
-    raise SystemExit(
-        alone(
-            "monte_carlo_localization",
-            measure,
-            runs={"type": int, "default": 20},
-            particles={"type": int, "default": 5000},
-            out={"type": Path, "default": FIGURE},
-        )
-    )
+        metrics.append(Metric(f"particles in use, end of {part}", active[at], high=0.2 * PARTICLES))
+    return [
+        *metrics,
+        Metric("injected a run, before it is carried", injected[:, :HALF].sum(1).mean()),
+        Metric("injected a run, after", injected[:, HALF:].sum(1).mean()),
+        Metric("steps in which no weight was left", float(found.underflow.sum())),
+        Metric("steps at the capacity, a run", float(found.capped.sum(1).mean())),
+    ]

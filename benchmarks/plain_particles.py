@@ -1,7 +1,5 @@
 """A plain particle filter over path and map against FastSLAM.
 
-    python -m benchmarks.plain_particles [--runs 20] [--particles 500]
-
 Williams's reason for Rao-Blackwellization: the number of particles that a posterior needs grows
 exponentially with its dimension, 3 + 2N for the joint state (x, y, θ, l_1 … l_N). What is measured
 here is less: at a fixed number of particles the error grows with N. How the number needed grows is
@@ -13,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.gate import Metric, alone
+from benchmarks.gate import Metric, show
 from jaxslam import filters, motion, run, sensors
 from jaxslam.math import gaussians, linalg
 from jaxslam.resampling import systematic
@@ -23,6 +21,7 @@ MOTION = motion.Increment(np.diag([0.01, 0.01]) ** 2)
 SENSOR = sensors.RangeBearing(np.diag([0.1, 0.03]) ** 2)
 LANDMARKS = (1, 2, 5, 10, 20)
 STEPS = 100
+PARTICLES = 500
 
 
 def world(count: int) -> Scenario:
@@ -36,7 +35,7 @@ def world(count: int) -> Scenario:
     )
 
 
-def plain(log, key, count: int, particles: int):
+def plain(log, key, count: int):
     """Bootstrap filter of pose and map: the map (N, 2) at the end, and the mean ESS over the steps.
 
     The landmarks of the first scan are drawn from what it says; all are seen in every scan.
@@ -55,14 +54,14 @@ def plain(log, key, count: int, particles: int):
         return MOTION.step(pose, u, linalg.root_psd(MOTION.noise_cov(pose, u)) @ noise)
 
     key, first = jax.random.split(key)
-    noise = jax.random.normal(first, (particles, count, 2))
-    poses = jnp.zeros((particles, 3))
+    noise = jax.random.normal(first, (PARTICLES, count, 2))
+    poses = jnp.zeros((PARTICLES, 3))
 
     def step(carry, row):
         poses, maps, key, born = carry
         key, drive, again = jax.random.split(key, 3)
         poses = jax.vmap(moved, (0, None, 0))(
-            poses, row.control, jax.random.normal(drive, (particles, 2))
+            poses, row.control, jax.random.normal(drive, (PARTICLES, 2))
         )
         z = row.scan.z[jnp.argsort(row.scan.tag)]
         seen = jax.vmap(jax.vmap(place), (None, 0))(z, noise)
@@ -77,22 +76,20 @@ def plain(log, key, count: int, particles: int):
         chosen = systematic(weight, again)
         return (poses[chosen], maps[chosen], key, jnp.asarray(True)), ess
 
-    maps = jnp.zeros((particles, count, 2))
+    maps = jnp.zeros((PARTICLES, count, 2))
     (_, maps, _, _), ess = jax.lax.scan(step, (poses, maps, key, jnp.asarray(False)), log)
     return maps.mean(axis=0), ess[1:].mean()
 
 
-def measure(runs: int = 20, particles: int = 500) -> list[Metric]:
-    print(f"{runs} runs, {particles} particles, {STEPS} steps")
-    print("landmarks   map RMSE [m]: plain   FastSLAM   effective particles: plain   share")
-    ratios = []
+def measure(quick: bool = False) -> list[Metric]:
+    runs, rows = 8 if quick else 20, {}
     for count in LANDMARKS:
         scene = world(count)
-        filter = filters.FastSlam(scene.motion, scene.sensor, count, particles)
+        filter = filters.FastSlam(scene.motion, scene.sensor, count, PARTICLES)
 
         def one(key, scene=scene, filter=filter, count=count):
             truth, log = simulate(scene, key)
-            points, ess = plain(log, key, count, particles)
+            points, ess = plain(log, key, count)
             start = jnp.zeros(3), jnp.zeros((3, 3)), key
             estimate = jax.tree.map(lambda x: x[-1], run(filter, log, *start).estimate)
             off = estimate.points - truth.landmarks[estimate.tag]
@@ -101,21 +98,12 @@ def measure(runs: int = 20, particles: int = 500) -> list[Metric]:
 
         keys = jax.random.split(jax.random.key(3), runs)
         square, rao, ess = jax.jit(lambda keys, one=one: jax.lax.map(one, keys))(keys)
-        row = float(np.sqrt(square.mean())), float(np.sqrt(rao.mean())), float(ess.mean())
-        ratios.append(row[0] / row[1])
-        print(f"{count:9d}{row[0]:23.4f}{row[1]:11.4f}{row[2]:28.1f}{row[2] / particles:8.1%}")
-    return [
-        Metric("plain particles: map RMSE over FastSLAM's, 1 landmark", ratios[0]),
-        Metric("plain particles: map RMSE over FastSLAM's, 20 landmarks", ratios[-1], low=1.5),
-    ]
-
-
-if __name__ == "__main__":
-    raise SystemExit(
-        alone(
-            "plain_particles",
-            measure,
-            runs={"type": int, "default": 20},
-            particles={"type": int, "default": 500},
-        )
-    )
+        rows[scene.name] = {
+            "map RMSE [m]": float(np.sqrt(square.mean())),
+            "of FastSLAM [m]": float(np.sqrt(rao.mean())),
+            "effective particles": float(ess.mean()),
+        }
+    show(f"{runs} runs, {PARTICLES} particles, {STEPS} steps", rows)
+    first, *_, last = (row["map RMSE [m]"] / row["of FastSLAM [m]"] for row in rows.values())
+    what = "plain particles: map RMSE over FastSLAM's"
+    return [Metric(f"{what}, 1 landmark", first), Metric(f"{what}, 20 landmarks", last, low=1.5)]

@@ -1,4 +1,4 @@
-"""Range-only SLAM on recorded data, beacons unknown: `python -m benchmarks.plaza [--figure]`.
+"""Range-only SLAM on recorded data, beacons unknown.
 
 Plaza1 (Djugash, Hamner & Roth 2009, as with GTSAM): a lawn mower drives 1.9 km in half an hour and
 measures its distance from four radio beacons, one at a time. `DelayedSlam` gets odometry and
@@ -12,22 +12,19 @@ of its ground truth, so dead reckoning is good already, and stands beside it. Gr
 in this file; the last row replaces one range in ten by anything from 0 to 80 m.
 """
 
-from pathlib import Path
-
 import gtsam
 import jax
 import jax.numpy as jnp
 import numpy as np
 
 import jaxslam
-from benchmarks.gate import Metric, alone
+from benchmarks.gate import Metric, save, show
 from jaxslam import datasets, metrics
 from jaxslam.core.types import Status
 from jaxslam.filters import DelayedSlam
 from jaxslam.filters.delayed.settings import StoredMeasurements
-from jaxslam.results.plot.style import COLORS, FAINT, INK, PAGE, SHADE, caption, panels_of, png
+from jaxslam.results.plot.style import COLORS, FAINT, INK, PAGE, SHADE, caption, panels_of
 
-FIGURE = Path(__file__).parent / "figures" / "plaza1.png"
 STORED = StoredMeasurements(capacity=40, spacing=2.0)
 SPOILED, FARTHEST = 0.1, 80.0
 
@@ -61,15 +58,14 @@ def aligned(path, data):
 
 
 def beacons(motion, estimate, data):
-    """Where the beacons of the map are in the survey's frame (K, 2), their tags (K,) and errors."""
+    """Where the beacons of the map are in the survey's frame (K, 2), and their errors, by tag."""
     alive = np.asarray(estimate.alive)
     points = metrics.carried(motion, estimate.points[alive])
     tags = np.asarray(estimate.tag)[alive]
-    off = np.linalg.norm(points - data.landmarks[tags], axis=1)
-    return points, tags, off
+    return points, np.linalg.norm(points - data.landmarks[tags], axis=1)[np.argsort(tags)]
 
 
-def measure(figure=False):
+def measure(quick: bool = False) -> list[Metric]:
     data, raw = read(), read(range_bias=(0.0, 0.0))
     slam = DelayedSlam(data.motion, data.sensor, data.capacity, stored=STORED)
 
@@ -77,43 +73,35 @@ def measure(figure=False):
     def go(log):
         return jaxslam.run(slam, log, data.pose, data.pose_cov, jax.random.key(0))
 
-    reckoned = dead_reckoning(data)
-    print(f"Plaza1: {data.steps:,} rows, {data.measurements:,} ranges, {data.capacity} beacons")
-    print(f"{'':26}{'path RMSE [m]':>15}{'beacons found':>15}{'errors [m]':>28}{'rejected':>10}")
-    print(f"{'odometry alone':26}{aligned(reckoned, data)[2]:15.2f}")
-    found = {}
-    cases = {
+    logs = {
         "delayed_slam": data.log,
         "ranges as they are": raw.log,
         "10 % spoiled": spoil(data.log),
     }
-    for name, log in cases.items():
+    _, reckoned, rmse = aligned(dead_reckoning(data), data)
+    rows = {"odometry alone": {"path RMSE [m]": f"{rmse:.2f}"}}
+    found = []
+    for name, log in logs.items():
         trace = go(log)
         motion, path, rmse = aligned(trace.estimate.pose, data)
-        last = jax.tree.map(lambda x: x[-1], trace.estimate)
-        points, tags, off = beacons(motion, last, data)
-        errors = " ".join(f"{e:.2f}" for e in off[np.argsort(tags)])
-        rejected = int(trace.info.tally(Status.REJECTED).sum())
-        print(f"{name:26}{rmse:15.2f}{len(tags):>15}{errors:>28}{rejected:>10}", flush=True)
-        found[name] = rmse, off, len(tags)
-        if name == "delayed_slam":
-            rows = np.asarray(trace.estimate.alive).argmax(axis=0)
-            when = ", ".join(f"{data.time[r] - data.time[0]:.0f}" for r in np.sort(rows))
-            print(f"{'':26}beacons exist from {when} s on; σ of each", end=" ")
-            covs = np.asarray(last.point_covs)
-            print(" ".join(f"{s:.2f}" for s in np.sqrt(np.trace(covs, axis1=1, axis2=2))), "m")
-            if figure:
-                draw(data, path, aligned(reckoned, data)[1], points)
-    metrics = []
-    for name in ("delayed_slam", "10 % spoiled"):
-        rmse, off, count = found[name]
-        metrics.append(Metric(f"Plaza1, {name}: path RMSE [m]", rmse, high=1.5))
-        worst = off.max() if count == data.capacity else np.inf
-        metrics.append(Metric(f"Plaza1, {name}: worst beacon [m]", worst, high=1.0))
-    return metrics
+        points, off = beacons(motion, jax.tree.map(lambda x: x[-1], trace.estimate), data)
+        rows[name] = {
+            "path RMSE [m]": f"{rmse:.2f}",
+            "beacons found": len(off),
+            "errors [m]": " ".join(f"{e:.2f}" for e in off),
+            "rejected": int(trace.info.tally(Status.REJECTED).sum()),
+        }
+        if log is not raw.log:
+            worst = off.max() if len(off) == data.capacity else np.inf
+            found.append(Metric(f"Plaza1, {name}: path RMSE [m]", rmse, high=1.5))
+            found.append(Metric(f"Plaza1, {name}: worst beacon [m]", worst, high=1.0))
+        if log is data.log and not quick:
+            save(figure(data, path, reckoned, points), "plaza1")
+    show(f"Plaza1: {data.steps:,} rows, {data.measurements:,} ranges", rows)
+    return found
 
 
-def draw(data, path, reckoned, points):
+def figure(data, path, reckoned, points):
     figure, (axes,) = panels_of(PAGE, 6.0, 1)
     blue, red, *_ = COLORS
     axes.plot(*data.true_path[:, :2].T, color=SHADE, lw=2.5, label="ground truth")
@@ -124,11 +112,4 @@ def draw(data, path, reckoned, points):
     axes.set(xlabel="x [m]", ylabel="y [m]", aspect="equal")
     axes.margins(0.06)
     caption(figure, "Plaza1: SLAM by ranges alone, beacons unknown")
-    FIGURE.parent.mkdir(exist_ok=True)
-    FIGURE.write_bytes(png(figure))
-
-
-if __name__ == "__main__":
-    raise SystemExit(
-        alone("plaza", measure, figure={"action": "store_true", "help": f"draw {FIGURE.name}"})
-    )
+    return figure

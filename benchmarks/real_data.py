@@ -1,4 +1,4 @@
-"""Recorded data through the EKF, scored against the survey: `python -m benchmarks.real_data`.
+"""Recorded data through the EKF, scored against the survey.
 
 Bonn and MRCLAM are looked for in the folder JAXSLAM_DATA, by default ../shared/data beside the
 checkout, and left out where absent; Victoria Park comes with GTSAM. The map is brought onto the
@@ -15,7 +15,7 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxslam
-from benchmarks.gate import Metric, alone
+from benchmarks.gate import Metric, show
 from jaxslam import datasets
 from jaxslam.consistency.metrics import align_map
 from jaxslam.core.types import Status
@@ -25,7 +25,6 @@ from jaxslam.filters import EkfSlam
 DATA = Path(os.environ.get("JAXSLAM_DATA", Path(__file__).parents[2] / "shared" / "data"))
 GATES = {"bonn": 0.2, "mrclam robot 1": 0.5, "mrclam robot 2": 0.5, "mrclam robot 3": 0.5}
 """Map RMSE [m]."""
-HEADER = "data T N measured fused rejected dropped NIS/dof RMSE[m] read[s] run[s]"
 
 
 def readers() -> list[Callable[[], Dataset]]:
@@ -39,9 +38,8 @@ def readers() -> list[Callable[[], Dataset]]:
     return found
 
 
-def measure() -> list[Metric]:
-    metrics = []
-    print("".join(f"{name:>{16 if i == 0 else 10}}" for i, name in enumerate(HEADER.split())))
+def measure(quick: bool = False) -> list[Metric]:
+    metrics, rows = [], {}
     for reader in readers():
         begin = time.perf_counter()
         data = reader()
@@ -60,15 +58,20 @@ def measure() -> list[Metric]:
         seconds = time.perf_counter() - begin
         rmse = np.nan if data.landmarks is None else align_map(final, data.landmarks)[1]
         fused, rejected = (int((status == s).sum()) for s in (Status.FUSED, Status.REJECTED))
-        counts = (data.steps, data.capacity, data.measurements, fused, rejected)
-        cells = [*(f"{n:,}" for n in (*counts, sum(data.dropped.values()))), f"{nis:.3f}"]
-        cells += ["-" if np.isnan(rmse) else f"{rmse:.4f}", f"{read:.2f}", f"{seconds:.2f}"]
-        print(f"{data.name:>16}" + "".join(f"{cell:>10}" for cell in cells), flush=True)
+        rows[data.name] = {
+            "T": f"{data.steps:,}",
+            "N": data.capacity,
+            "measured": f"{data.measurements:,}",
+            "fused": f"{fused:,}",
+            "rejected": f"{rejected:,}",
+            "dropped": f"{sum(data.dropped.values()):,}",
+            "NIS/dof": f"{nis:.3f}",
+            "RMSE [m]": rmse,
+            "read [s]": f"{read:.2f}",
+            "run [s]": f"{seconds:.2f}",
+        }
         if data.name in GATES:
             metrics.append(Metric(f"map RMSE of {data.name} [m]", rmse, high=GATES[data.name]))
         metrics.append(Metric(f"NIS/dof of {data.name}", float(nis), low=0.7, high=1.3))
+    show("EKF-SLAM of recorded data", rows)
     return metrics
-
-
-if __name__ == "__main__":
-    raise SystemExit(alone("real_data", measure))

@@ -7,13 +7,13 @@ import json
 import math
 import os
 import platform
+import re
 import sys
-from collections.abc import Callable, Iterator
+from collections.abc import Callable
 from importlib.metadata import version
 from pathlib import Path
 
-from benchmarks.consistency.markdown import table
-from benchmarks.gate import Metric
+from benchmarks.gate import Metric, table
 
 FILE, RECORDS = Path(__file__).with_name("RESULTS.md"), Path(__file__).with_name("records")
 LIBRARIES = ("jax", "numpy")
@@ -34,38 +34,25 @@ class Screen(io.StringIO):
         return super().write(text)
 
 
-@contextlib.contextmanager
-def screen() -> Iterator[Screen]:
-    """What is printed within, kept."""
-    with contextlib.redirect_stdout(Screen()) as kept:
-        yield kept
-
-
 def processor() -> str:
-    """The processor's name, its cores, and which vectors it has."""
-    try:
-        text = Path("/proc/cpuinfo").read_text(encoding="utf-8")
-    except OSError:
-        return platform.processor() or platform.machine()
-    known = {
-        key.strip(): value.strip()
-        for key, _, value in (line.partition(":") for line in text.splitlines())
-    }
-    flags = known.get("flags", "").split()
-    widest = next((name for name in ("avx512f", "avx2", "avx") if name in flags), "")
-    cores = f"{os.cpu_count()} cores"
-    return ", ".join(filter(None, (known.get("model name", platform.machine()), cores, widest)))
+    """The processor's name, its cores, and which vectors it has, as Linux tells."""
+    file = Path("/proc/cpuinfo")
+    text = file.read_text(encoding="utf-8") if file.exists() else ""
+    model = re.search(r"model name\s*: (.*)", text)
+    widest = [name for name in ("avx512f", "avx2", "avx") if name in text][:1]
+    name = model[1] if model else platform.machine()
+    return ", ".join([name, f"{os.cpu_count()} cores", *widest])
 
 
-def measured(name: str, measure: Callable[[], list[Metric]], command: str) -> list[Metric]:
+def measured(name: str, measure: Callable[[bool], list[Metric]], quick: bool) -> list[Metric]:
     """The metrics of a benchmark; they and what it printed become its record."""
-    with screen() as kept:
-        metrics = measure()
+    with contextlib.redirect_stdout(Screen()) as kept:
+        metrics = measure(quick)
     versions = ", ".join(
         [f"Python {platform.python_version()}", *(f"{each} {version(each)}" for each in LIBRARIES)]
     )
     record = {
-        "command": command,
+        "command": f"python -m benchmarks --record {'--quick ' * quick}--only {name}",
         "date": datetime.date.today().isoformat(),
         "processor": processor(),
         "versions": versions,
@@ -87,6 +74,13 @@ def measured(name: str, measure: Callable[[], list[Metric]], command: str) -> li
     return metrics
 
 
+def recorded(name: str) -> dict[str, float]:
+    """The values of a record by the names of its metrics; none where there is no record."""
+    path = RECORDS / f"{name}.json"
+    record = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {"metrics": []}
+    return {metric["name"]: metric["value"] for metric in record["metrics"]}
+
+
 def page() -> str:
     """RESULTS.md: of each record its metrics with their gates."""
     parts = [HEAD]
@@ -96,9 +90,10 @@ def page() -> str:
         made = ", ".join((record["date"], record["processor"], versions))
         parts.append(f"## {path.stem}\n\n{made}\n")
         rows = [[m["name"], f"{m['value']:.4g}", gate(**m), m["note"]] for m in record["metrics"]]
-        heads = ["metric", "value", "gate", "note"]
-        if not any(m["note"] for m in record["metrics"]):
-            rows, heads = [row[:3] for row in rows], heads[:3]
+        for row in rows:  # cells left empty at the end of a row need no border
+            while not row[-1]:
+                row.pop()
+        heads = ["metric", "value", "gate", "note"][: max(map(len, rows))]
         parts.append(table(heads, rows).strip() + "\n")
     return "\n".join(parts)
 

@@ -1,4 +1,4 @@
-"""What a step costs as the map grows, 10 landmarks of it in view: `python -m benchmarks.scaling`.
+"""What a step costs as the map grows, 10 landmarks of it in view.
 
 Claims of the sources, as measured exponents: a step of EKF-SLAM is O(N²) (Solà 2.3.3; Tacher 1 has
 O(N^ω), of a dense product), of localization O(M) in the measurements of a scan (Tacher 1 has O(N),
@@ -8,22 +8,19 @@ resampling, O(P·N).
 
 A robot drives along a ring of landmarks 1 m apart that all are in its map. Prediction and update
 are timed in a scan whose carry is donated, without estimates, which are O(N) by themselves. Each
-time is the least of some. Draws `figures/scaling.png`.
+time is the least of some.
 """
 
 import time
-from pathlib import Path
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.gate import Metric, alone
+from benchmarks.gate import Metric
 from jaxslam import filters, motion, sensors
 from jaxslam.core.types import Log, Scan
-from jaxslam.results.plot.style import PAGE, caption, curve, panels_of, png
 
-FIGURE = Path(__file__).parent / "figures" / "scaling.png"
 KEY = jax.random.key(0)
 SEEN, PARTICLES = 10, 100
 SPACING, OFFSET = 1.0, 2.0
@@ -107,11 +104,13 @@ def localization(points):
 
 
 METHODS = {
-    "EKF-SLAM": (ekf, 3000),  # at 10,000 P alone has 3.2 GB
-    "SEIF": (seif, 10000),
-    f"FastSLAM 2.0, {PARTICLES} particles": (fastslam, 10000),
-    "localization": (localization, 10000),
+    "EKF-SLAM": (ekf, 300, 3000, 1.6, 2.2),  # at 10,000 P alone has 3.2 GB
+    "SEIF": (seif, 100, 10000, -0.1, 0.1),
+    f"FastSLAM 2.0, {PARTICLES} particles": (fastslam, 1000, 10000, -0.1, 1.2),
+    "localization": (localization, 100, 10000, -0.1, 0.5),
 }
+"""Filter and map, the sizes between which the power of N is taken, and its gate. Localization looks
+its tags up among N, a few microseconds that grow."""
 
 
 def seconds_a_step(make, count: int, steps: int, repeats: int = 3) -> float:
@@ -137,52 +136,14 @@ def seconds_a_step(make, count: int, steps: int, repeats: int = 3) -> float:
     return min(times[1:]) / steps
 
 
-def measure(out: Path | None = None) -> list[Metric]:
-    found = {}
-    for name, (make, most) in METHODS.items():
-        sizes = [size for size in SIZES if size <= most]
-        found[name] = {n: seconds_a_step(make, n, 100 if n <= 300 else 30) for n in sizes}
-        print(f"{name:28}" + "  ".join(f"{n}: {1e3 * s:.3f} ms" for n, s in found[name].items()))
-
-    def slope(name, low, high):
-        rows = [(n, s) for n, s in found[name].items() if low <= n <= high]
-        return float(np.polyfit(*np.log(np.array(rows)).T, 1)[0])
-
-    names = list(METHODS)
-    slopes = {
-        names[0]: (300, 3000),
-        names[1]: (100, 10000),
-        names[2]: (1000, 10000),
-        names[3]: (100, 10000),
-    }
-    powers = {name: slope(name, *ends) for name, ends in slopes.items()}
-    if out is not None:
-        draw(found, {name: (power, slopes[name]) for name, power in powers.items()}, out)
-    flat = (-0.1, 0.1)
-    # Localization looks its tags up among N, a few microseconds that grow.
-    gates = dict(zip(names, ((1.6, 2.2), flat, (-0.1, 1.2), (-0.1, 0.5)), strict=True))
-    return [
-        Metric(
-            f"{name}: step as a power of N, {ends[0]} to {ends[1]:,}", powers[name], *gates[name]
-        )
-        for name, ends in slopes.items()
-    ]
-
-
-def draw(found, powers, out):
-    figure, (axes,) = panels_of(PAGE, 3.0, 1)
-    for i, (name, times) in enumerate(found.items()):
-        power, (low, high) = powers[name]
-        label = f"{name}: N to the power {power:.2f} from {low} to {high:,}"
-        milliseconds = 1e3 * np.array(list(times.values()))
-        curve(axes, i, np.array(list(times)), milliseconds, label)
-    axes.set(xscale="log", yscale="log")
-    axes.set_xlabel("landmarks N in the map")
-    axes.set_ylabel("time of a step [ms]")
-    caption(figure, f"One robot, {SEEN} landmarks in view, CPU with two cores, float64")
-    out.parent.mkdir(exist_ok=True)
-    out.write_bytes(png(figure))
-
-
-if __name__ == "__main__":
-    raise SystemExit(alone("scaling", measure, out={"type": Path, "default": FIGURE}))
+def measure(quick: bool = False) -> list[Metric]:
+    metrics = []
+    for name, (make, low, high, *gate) in METHODS.items():
+        sizes = [size for size in SIZES if size <= high]
+        times = {n: seconds_a_step(make, n, 100 if n <= 300 else 30) for n in sizes}
+        print(f"{name:28}" + "  ".join(f"{n}: {1e3 * s:.3f} ms" for n, s in times.items()))
+        rows = np.log([(n, s) for n, s in times.items() if n >= low])
+        power = float(np.polyfit(*rows.T, 1)[0])
+        what = f"{name}: step as a power of N, {low} to {high:,}"
+        metrics.append(Metric(what, power, *gate))
+    return metrics

@@ -1,27 +1,22 @@
-"""A long campaign, `python -m benchmarks.soak [--runs 1000000] [--resumptions 4] [--folder DIR]`.
+"""A long campaign.
 
 EKF and invariant EKF over 50 steps of `cloister`. The runs are computed in one go, and again by
 several processes, each of which is interrupted (the last is not) and resumed by the next. Measured:
 whether any number is NaN that is not of a run counted as not finite; whether both give the same
 bits; and by how much resident memory grows a run, over what the result holds of each. A million
-runs are a campaign of hours: give a folder, so that a second call of the same code goes on where
-the first ended, with the records of the processes that are done.
+runs are a campaign of hours, in a folder, so that a second call of the same code goes on where the
+first ended, with the records of the processes that are done.
 """
 
 import json
 import signal
-import subprocess
-import sys
 import tempfile
-from collections.abc import Callable
-from contextlib import ExitStack
-from functools import partial
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from benchmarks.gate import Metric, alone
+from benchmarks.gate import Metric, child
 from jaxslam.consistency.tally import SHOTS
 
 SHARE = """
@@ -34,6 +29,10 @@ runs, stop_at, folder = int(sys.argv[2]), int(sys.argv[3]), sys.argv[4]
 soak.share(runs, stop_at, folder)
 """
 Record = dict[str, Any]
+PROCESSES = 5
+"""of the campaign that is interrupted"""
+KEPT = Path(__file__).parents[1] / ".cache" / "soak"
+"""where the long campaign goes on from, if it was interrupted"""
 FROM_SHOTS = ("noncredibility", "inclination")
 STEADY = 4096
 """runs from which memory is measured: before, programs are compiled, and snapshots kept of runs"""
@@ -107,19 +106,11 @@ def finite(campaign: object) -> dict[str, int]:
     return {"nan": nan, "not finite": lost, "held": held}
 
 
-def process(cache: Path, runs: int, stop_at: int, folder: Path) -> Record:
-    """The record of a process that goes on until so many runs are done."""
-    command = [sys.executable, "-c", SHARE, str(cache), str(runs), str(stop_at), str(folder)]
-    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
-    record: Record = json.loads(done.stdout.splitlines()[-1])
-    return record
-
-
-def recorded(file: Path, make: Callable[[], Record]) -> Record:
-    """The record in a file, which is made where there is none."""
+def recorded(file: Path, *arguments: object) -> Record:
+    """The record of a process (`share`) in a file, which is made where there is none."""
     if not file.exists():
         new = file.with_suffix(".new")
-        new.write_text(json.dumps(make()), encoding="utf-8")
+        new.write_text(json.dumps(child("-c", SHARE, *arguments)), encoding="utf-8")
         new.replace(file)
     record: Record = json.loads(file.read_text(encoding="utf-8"))
     return record
@@ -139,25 +130,30 @@ def growth(marks: list[tuple[float, int, int]]) -> tuple[float, float, float]:
     return float(grown), float(rate), peak
 
 
-def measure(runs: int = 1_000_000, resumptions: int = 4, folder: str = "") -> list[Metric]:
-    with ExitStack() as stack:
-        place = Path(folder or stack.enter_context(tempfile.TemporaryDirectory()))
-        place.mkdir(parents=True, exist_ok=True)
-        print(f"cloister, 50 steps, EKF and invariant EKF: {runs:,} runs")
-        print(f"{'':24}{'runs done':>12}{'runs/s':>8}{'peak [MB]':>11}{'growth [B/run]':>16}")
-        records = {}
-        for name, parts in (("one go", 1), ("interrupted", resumptions + 1)):
-            for number in range(1, parts + 1):
-                stop_at = runs * number // parts
-                record = recorded(
-                    place / f"{name} {number}.json",
-                    partial(process, place / "cache", runs, stop_at, place / name),
-                )
-                grown, rate, peak = growth(record["marks"])
-                label = name if parts == 1 else f"{name}, process {number}"
-                cells = f"{record['done']:>12,}{rate:>8.0f}{peak / 1e6:>11.0f}{grown:>16.0f}"
-                print(f"{label:24}{cells}", flush=True)
-                records[name] = record | ({"growth": grown} if parts == 1 else {})
+def measure(quick: bool = False) -> list[Metric]:
+    with tempfile.TemporaryDirectory() as folder:
+        return campaigns(6_000 if quick else 20_000, Path(folder))
+
+
+def million(quick: bool = False) -> list[Metric]:
+    KEPT.mkdir(parents=True, exist_ok=True)
+    return campaigns(1_000_000, KEPT)
+
+
+def campaigns(runs: int, folder: Path) -> list[Metric]:
+    print(f"cloister, 50 steps, EKF and invariant EKF: {runs:,} runs")
+    print(f"{'':24}{'runs done':>12}{'runs/s':>8}{'peak [MB]':>11}{'growth [B/run]':>16}")
+    records = {}
+    for name, parts in (("one go", 1), ("interrupted", PROCESSES)):
+        for number in range(1, parts + 1):
+            stop_at = runs * number // parts
+            file = folder / f"{name} {number}.json"
+            record = recorded(file, folder / "cache", runs, stop_at, folder / name)
+            grown, rate, peak = growth(record["marks"])
+            label = name if parts == 1 else f"{name}, process {number}"
+            cells = f"{record['done']:>12,}{rate:>8.0f}{peak / 1e6:>11.0f}{grown:>16.0f}"
+            print(f"{label:24}{cells}", flush=True)
+            records[name] = record | ({"growth": grown} if parts == 1 else {})
     whole, resumed = records["one go"], records["interrupted"]
     held = whole["held"] / runs
     print(f"the result holds {held:.0f} B a run; {whole['not finite']} runs are not finite")
@@ -170,15 +166,3 @@ def measure(runs: int = 1_000_000, resumptions: int = 4, folder: str = "") -> li
         over = whole["growth"] / held
         metrics.append(Metric("memory growth over what the result holds", over, high=2.0))
     return metrics
-
-
-if __name__ == "__main__":
-    raise SystemExit(
-        alone(
-            "soak",
-            measure,
-            runs={"type": int, "default": 1_000_000},
-            resumptions={"type": int, "default": 4},
-            folder={"default": "", "help": "where blocks are kept, to go on with later"},
-        )
-    )

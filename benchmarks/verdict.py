@@ -1,4 +1,4 @@
-"""Size and power of the verdict, `python -m benchmarks.verdict [--campaigns 4000] [--steps 30]`.
+"""Size and power of the verdict.
 
 An exactly linear SLAM problem: the errors of a planar robot (x, y, θ) and of landmarks about a
 known path, whose motion and relative-position measurements are linear in them, with or without a
@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.gate import Metric, alone
+from benchmarks.gate import Metric
 from jaxslam.consistency import Verdict, judge
 
 SIZES = (8, 20, 100)
@@ -105,12 +105,12 @@ def rejected(found: list[Verdict], by: str = "") -> float:
     return float(np.mean([by in v.by if by else bool(v.by) for v in found]))
 
 
-def measure(campaigns: int = 4000, steps: int = 30) -> list[Metric]:
-    """Size and power, with their gates; `campaigns` of each kind.
+def measure(quick: bool = False) -> list[Metric]:
+    """Size and power, with their gates.
 
     False alarms are to be 5 ± 1 %, and two standard errors of a share among so many are granted.
     """
-    metrics = []
+    metrics, campaigns = [], 1000 if quick else 4000
     slack = 2 * np.sqrt(0.05 * 0.95 / campaigns)
     print(f"{'':44}{'runs':>6}{'rejected':>10}{'NEES':>8}{'NIS':>8}  noticed from NEES, NIS")
 
@@ -127,22 +127,17 @@ def measure(campaigns: int = 4000, steps: int = 30) -> list[Metric]:
         return shares[0]
 
     for compass in (False, True):
-        world = problem(compass, steps)
+        world = problem(compass)
         said = f"{'with' if compass else 'without'} a compass"
         honest = averages(world, campaigns * max(SIZES), 1)
         for runs in SIZES:
             some = [each[: campaigns * runs] for each in honest]
             found = verdicts(*some, runs)
-            for name, alarms in (
-                (f"{said}, {runs} runs", row(f"honest, {said}", runs, found)),
-                (
-                    f"{said}, {runs} runs, NEES alone",
-                    row(f"honest, {said}, NEES alone", runs, verdicts(some[0], None, runs)),
-                ),
-            ):
-                metrics.append(
-                    Metric(f"false alarms, {name}", alarms, 0.04 - slack, 0.06 + slack, "5 ± 1 %")
-                )
+            ends = 0.04 - slack, 0.06 + slack, "5 ± 1 %"
+            for tests, each in (("", found), (", NEES alone", verdicts(some[0], None, runs))):
+                alarms = row(f"honest, {said}{tests}", runs, each)
+                name = f"false alarms, {said}, {runs} runs{tests}"
+                metrics.append(Metric(name, alarms, *ends))
             most = float(np.median([v.noticed["nees_pose"][1] for v in found]))
             if np.isfinite(most):
                 share = rejected(verdicts(most / 3 * some[0], None, runs))
@@ -158,7 +153,7 @@ def measure(campaigns: int = 4000, steps: int = 30) -> list[Metric]:
             power = row(f"{name}, {said}", 20, found)
             if r == 0.8:
                 metrics.append(Metric(f"{name}, {said}, 20 runs, noticed", power, 0.9))
-    world = problem(False, steps, landmarks=1)
+    world = problem(False, landmarks=1)
     found = verdicts(*averages(world, campaigns * 20 // 4, 3, 1.0, 0.8), 20)
     power = row("R understated by 20 %, one landmark", 20, found)
     metrics.append(Metric("R understated by 20 %, one landmark, noticed", power, 0.9))
@@ -173,14 +168,3 @@ def _rotation(angle: float) -> np.ndarray:
 def _squares(error: np.ndarray, cov: np.ndarray) -> np.ndarray:
     """(runs,) eᵀ P⁻¹ e."""
     return ((error @ np.linalg.inv(np.linalg.cholesky(cov)).T) ** 2).sum(axis=1)
-
-
-if __name__ == "__main__":
-    raise SystemExit(
-        alone(
-            "verdict",
-            measure,
-            campaigns={"type": int, "default": 4000, "help": "of each kind"},
-            steps={"type": int, "default": 30, "help": "of a run"},
-        )
-    )

@@ -18,6 +18,7 @@ from jaxslam.filters import EkfSlam
 from jaxslam.filters.map_management.closing import Closing
 from jaxslam.filters.map_management.loop_closure import LoopSettings
 from jaxslam.life import Recency
+from jaxslam.math.angles import wrap
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.results.plot.style import COLORS, INK, PAGE, SHADE, caption, panels_of, titled
 from jaxslam.simulation.scenarios import BetweenRanges
@@ -29,16 +30,6 @@ RADIUS, COUNT, CAPACITY = 30.0, 72, 120
 ROUND, MORE, STEP = 240, 80, 2 * np.pi * RADIUS / 240
 GATE = chi2_quantile(0.99, 2)
 SEARCH = LoopSettings(window=30, cluster=10, sightings=2, least=5, candidates=32)
-COLUMNS = (
-    "re-found [%]",
-    "wrong [%]",
-    "runs with wrong",
-    "RMSE [m]",
-    "median NEES",
-    "mean NEES",
-    "drift [m]",
-    "closings",
-)
 SHOWN = 5
 """the run of the figure"""
 
@@ -53,7 +44,6 @@ def world(seed=0):
         if all(np.hypot(*(point - other)) > 2.0 for other in points):
             points.append(point)
     points = np.asarray(points)
-    view = BetweenRanges(0.5, 9.0)
     heading = 2 * np.pi * np.arange(ROUND) / ROUND
     path = RADIUS * np.stack([np.sin(heading), 1 - np.cos(heading)], axis=1)
     places = int((np.hypot(*(path[:, None] - points).transpose(2, 0, 1)) < 9.5).sum(axis=1).max())
@@ -63,7 +53,7 @@ def world(seed=0):
         sensor=sensors.RelativePosition(0.1**2 * np.eye(2)),
         landmarks=points,
         controls=np.tile([STEP, 2 * np.pi / ROUND], (ROUND + MORE, 1)),
-        visible=view,
+        visible=BetweenRanges(0.5, 9.0),
         places=places,
         spurious=Spurious(),
     )
@@ -112,8 +102,8 @@ def one(scenario, filter, key):
     early = (held[ROUND // 3][:, None] == tags[None]) & slots
     right = (again & (fused & (mine == truth.origin))[..., None]).any(axis=(0, 1))
     found = first & (slots.sum(axis=0) == 1) & early.any(axis=0) & right
-    error = filter.estimate(trace.final).pose - truth.pose[-1]
-    error = error.at[2].set(jnp.arctan2(jnp.sin(error[2]), jnp.cos(error[2])))
+    error = trace.estimate.pose[-1] - truth.pose[-1]
+    error = error.at[2].set(wrap(error[2]))
     nees = error @ jnp.linalg.solve(trace.estimate.pose_cov[-1], error)
     drift = trace.estimate.pose[ROUND - 1, :2] - truth.pose[ROUND - 1, :2]
     out = {
@@ -128,23 +118,16 @@ def one(scenario, filter, key):
         "drift": (drift**2).sum(),
     }
     picture = trace.estimate.pose[:, :2], truth.pose[:, :2], trace.estimate.points[-1]
-    closings = (info.extra or {}).get("closing")
-    counts = jnp.zeros(3, int)
-    if closings is not None:
-        kinds = (closings.merged > 0, closings.merged, closings.duplicates)
-        counts = jnp.stack([each.sum() for each in kinds])
-    return out, (*picture, trace.estimate.alive[-1], counts)
+    return out, (*picture, trace.estimate.alive[-1])
 
 
-def measure(runs=RUNS, names=None):
+def measure():
     """{method: figures}, and what the runs looked like."""
     scenario, table, pictures = world(), {}, {}
-    keys = jax.random.split(jax.random.key(0), runs)
+    keys = jax.random.split(jax.random.key(0), RUNS)
     for name, filter in methods(scenario).items():
-        if names and name not in names:
-            continue
         go = jax.jit(jax.vmap(partial(one, scenario, filter)))
-        parts = [jax.device_get(go(keys[i : i + BLOCK])) for i in range(0, runs, BLOCK)]
+        parts = [jax.device_get(go(keys[i : i + BLOCK])) for i in range(0, RUNS, BLOCK)]
         each, pictures[name] = jax.tree.map(lambda *leaves: np.concatenate(leaves), *parts)
         total = {key: value.sum() for key, value in each.items()}
         table[name] = {
@@ -155,20 +138,16 @@ def measure(runs=RUNS, names=None):
             "median NEES": float(np.median(each["nees"])),
             "mean NEES": float(each["nees"].mean()),
             "drift [m]": np.sqrt(each["drift"].mean()),
-            "closings": float(pictures[name][4][:, 0].mean()),
-            "merged": float(pictures[name][4][:, 1].mean()),
-            "duplicates": float(pictures[name][4][:, 2].mean()),
-            "worst [m]": np.sqrt(each["error"].max()),
         }
     return table, pictures
 
 
-def draw(pictures, run=0):
+def draw(pictures, run):
     """One run, a panel a method: the true path, the estimated one, and the final map."""
     figure, panels = panels_of(PAGE, 2.5, 1, len(pictures), share=(True, True))
     blue, red, *_ = COLORS
     true_map = world().landmarks
-    for axes, (name, (path, true, points, alive, _)) in zip(panels, pictures.items(), strict=True):
+    for axes, (name, (path, true, points, alive)) in zip(panels, pictures.items(), strict=True):
         axes.plot(*true[run].T, color=SHADE, lw=2.2, label="true path")
         axes.plot(*true_map.T, "x", color=INK, ms=2.5, mew=0.6, label="true landmarks")
         axes.plot(*path[run].T, color=blue, lw=0.9, label="estimated path, as it was driven")

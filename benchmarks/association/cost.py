@@ -53,7 +53,7 @@ def problem(sensor, seed):
 
 def measure():
     """Seconds of one scan: the correction, and each method."""
-    sensor = dataclasses.replace(cloister().sensor)
+    sensor = cloister().sensor
     joint, scan = jax.tree.map(
         lambda *leaves: jnp.stack(leaves), *(problem(sensor, seed) for seed in range(RUNS))
     )

@@ -35,7 +35,7 @@ METHODS = {
 
 
 def decide(method, sigma, key):
-    """Shares of a scan's measurements associated rightly and wrongly; whether it was exhausted."""
+    """Shares of a scan's measurements associated rightly and wrongly."""
     keys = jax.random.split(key, 4)
     angle = jax.random.uniform(keys[3], (COUNT,), minval=-jnp.pi, maxval=jnp.pi)
     radius = jax.random.uniform(keys[0], (COUNT,), minval=2.0, maxval=8.0)
@@ -59,23 +59,23 @@ def decide(method, sigma, key):
     scan = Scan(z, jnp.full(SEEN, -1), jnp.ones(SEEN, bool))
     found = method(prediction_of(joint, EkfSettings(SENSOR)), scan)
     right = found.slot == jnp.arange(SEEN)
-    return right.mean(), (~right & (found.slot >= 0)).mean(), jnp.asarray(found.exhausted)
+    return right.mean(), (~right & (found.slot >= 0)).mean()
 
 
 def measure():
-    """By method: (right, wrong, exhausted), (S,) each over SIGMAS."""
+    """By method: (right, wrong), (S,) each over SIGMAS."""
     keys = jax.random.split(jax.random.key(0), DRAWS)
     out = {}
     for name, method in METHODS.items():
         over = jax.jit(jax.vmap(partial(decide, method), (None, 0)))
         each = [over(jnp.deg2rad(sigma), keys) for sigma in SIGMAS]
-        out[name] = tuple(np.array([float(e[i].mean()) for e in each]) for i in range(3))
+        out[name] = tuple(np.array([float(e[i].mean()) for e in each]) for i in range(2))
     return out
 
 
 def draw(found):
     figure, panels = panels_of(PAGE, 2.6, 1, 2)
-    for i, (name, (right, wrong, _)) in enumerate(found.items()):
+    for i, (name, (right, wrong)) in enumerate(found.items()):
         for axes, share in zip(panels, (right, wrong), strict=True):
             curve(axes, i, np.array(SIGMAS), 100 * share, name)
     for axes, what in zip(panels, ("rightly", "wrongly"), strict=True):

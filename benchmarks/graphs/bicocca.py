@@ -14,14 +14,16 @@ own Levenberg-Marquardt.
 
 import time
 
-import gtsam
 import jax
 import numpy as np
 
+from benchmarks.gate import Metric, show
+from benchmarks.graphs import peer
 from benchmarks.graphs.worlds import with_false_closures
 from benchmarks.real_data import DATA
 from jaxslam import graphs, metrics
-from jaxslam.math import se2, stats
+from jaxslam.graphs.graph import LOOPS
+from jaxslam.math import numpy_poses
 
 GRAPH = DATA / "graphs" / "B25b_0.500.g2o"
 TRUTH = DATA / "graphs" / "Bicocca_2009-02-25b-GT-extended.csv"
@@ -29,20 +31,33 @@ GAP = 1.0
 """[s]"""
 NEAR = np.array([3.0, 3.0, 0.5])
 """what a loop may differ from the true path in [m, m, rad]"""
-TRUSTED = "relative_pose"
 FACTORS = {"relative_pose": graphs.RelativePoseLog()}
+
+
+def measure(quick: bool = False) -> list[Metric]:
+    """Nothing where the graph is absent, or quick."""
+    metrics = []
+    for share in (0.0, 0.5) if GRAPH.exists() and not quick else ():
+        found = compare(share)
+        name = f"Bicocca 25b, {share:.0%} false"
+        show(name, found)
+        ours, theirs = found["truncated"], found["GTSAM's GNC"]
+        gap = ours["position RMSE [m]"] / theirs["position RMSE [m]"]
+        metrics.append(Metric(f"{name}: position RMSE, truncated / GTSAM's GNC", gap, high=1.05))
+        if share:
+            metrics.append(Metric(f"{name}: false loops kept", ours["false loops kept"]))
+    return metrics
 
 
 def compare(share: float) -> dict[str, dict[str, float]]:
     """Figures of merit by kernel, without one first, then GTSAM's, and the odometry last; a share
     of the loops is added and false."""
     graph = graphs.starts.odometry(graphs.with_gauge(graphs.read(GRAPH)))
-    apart, loops, added = with_false_closures(graph, share)
-    truth, seen = _true_poses(len(graph.poses))
-    table = apart.tables[loops]
-    first, second = truth[np.asarray(table.who).T]
-    off = np.asarray(jax.jit(jax.vmap(se2.between))(first, second)) - np.asarray(table.z)
-    off[:, 2] = np.angle(np.exp(1j * off[:, 2]))
+    apart, added = with_false_closures(graph, share)
+    truth, seen = true_poses(len(graph.poses))
+    table = apart.tables[LOOPS]
+    off = numpy_poses.between(*truth[np.asarray(table.who).T]) - np.asarray(table.z)
+    off[:, 2] = numpy_poses.wrapped(off[:, 2])
     judged = ~added & seen[np.asarray(table.who)].all(axis=1)
     false = added | (judged & (np.abs(off) > NEAR).any(axis=1))
     true = judged & ~false
@@ -53,47 +68,39 @@ def compare(share: float) -> dict[str, dict[str, float]]:
     )
     plan, found = graphs.plan(apart, FACTORS), {}
 
-    def merits(poses, kept, chi2, seconds):
+    def merits(poses, kept, seconds, converged=np.nan):
+        square = graphs.squared_residuals(apart._replace(poses=poses), FACTORS)
+        chi2 = square["relative_pose"].sum() + np.asarray(square[LOOPS])[kept].sum()
         error = metrics.ate(truth[seen], np.asarray(poses)[seen])
         return {
             "position RMSE [m]": float(np.sqrt(np.mean(error.translation**2))),
             "greatest error [m]": float(np.max(error.translation)),
             "false loops kept": kept[false].mean() if false.any() else np.nan,
             "true loops kept": kept[true].mean(),
-            "χ² of odometry and kept loops": chi2,
+            "χ² of odometry and kept loops": float(chi2),
             "seconds": seconds,
+            "converged": converged,
         }
 
     for name in ("none", *graphs.KERNELS):
-        kernel = None if name == "none" else {loops: graphs.KERNELS[name]()}
+        kernel = None if name == "none" else {LOOPS: graphs.KERNELS[name]()}
         options = {"kernel": kernel, "plan": plan, "iterations": 1000, "tolerance": 1e-9}
         graphs.optimize(apart, FACTORS, **options)
         began = time.process_time()
         solution = jax.block_until_ready(graphs.optimize(apart, FACTORS, **options))
         seconds = time.process_time() - began
-        square = {k: np.asarray(v) for k, v in _squares(solution.graph).items()}
         kept = np.ones(len(false), bool)
         if kernel:
-            kept = np.asarray(kernel[loops].weight(square[loops])) > 0.5
-        chi2 = square[TRUSTED].sum() + square[loops][kept].sum()
-        found[name] = merits(solution.graph.poses, kept, chi2, seconds)
-        found[name]["converged"] = float(solution.status == graphs.Ending.CONVERGED)
-    poses, kept, seconds = _gtsam(apart, loops)
-    square = _squares(apart._replace(poses=poses))
-    chi2 = square[TRUSTED].sum() + np.asarray(square[loops])[kept].sum()
-    found["GTSAM's GNC"] = {**merits(poses, kept, float(chi2), seconds), "converged": np.nan}
-    found["odometry"] = {
-        **merits(graph.poses, np.zeros(len(false), bool), 0.0, np.nan),
-        "converged": np.nan,
-    }
+            square = graphs.squared_residuals(solution.graph, FACTORS)[LOOPS]
+            kept = np.asarray(kernel[LOOPS].weight(square)) > 0.5
+        converged = float(solution.status == graphs.Ending.CONVERGED)
+        found[name] = merits(solution.graph.poses, kept, seconds, converged)
+    found["GTSAM's GNC"] = merits(*peer.graduated(apart))
+    found["odometry"] = merits(graph.poses, np.zeros(len(false), bool), np.nan)
     return found
 
 
-def _squares(graph):
-    return graphs.squared_residuals(graph, FACTORS)
-
-
-def _true_poses(count: int):
+def true_poses(count: int):
     """The true pose of each of so many, (count, 3), and whether the true path has it."""
     rows = np.loadtxt(TRUTH, delimiter=",")
     at = np.linspace(rows[0, 0], rows[-1, 0], count)
@@ -101,29 +108,3 @@ def _true_poses(count: int):
     truth = np.stack([np.interp(at, rows[:, 0], column) for column in columns], axis=1)
     after = np.clip(np.searchsorted(rows[:, 0], at), 1, len(rows) - 1)
     return truth, rows[after, 0] - rows[after - 1, 0] < GAP
-
-
-def _gtsam(apart, loops):
-    """Poses, which loops are kept, and processor seconds of GTSAM's graduated non-convexity."""
-    factors, start, trusted = gtsam.NonlinearFactorGraph(), gtsam.Values(), 0
-    for name in (TRUSTED, loops):
-        table = apart.tables[name]
-        for (i, j), z, information in zip(table.who, table.z, table.information, strict=True):
-            noise = gtsam.noiseModel.Gaussian.Information(np.asarray(information))
-            factors.add(gtsam.BetweenFactorPose2(int(i), int(j), gtsam.Pose2(*z), noise))
-        trusted = trusted or factors.size()
-    for k, pose in enumerate(apart.poses):
-        start.insert(k, gtsam.Pose2(*pose))
-    held = gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)
-    factors.add(gtsam.PriorFactorPose2(0, gtsam.Pose2(*apart.poses[0]), held))
-    parameters = gtsam.GncLMParams()
-    parameters.setLossType(gtsam.GncLossType.TLS)
-    parameters.setKnownInliers([*range(trusted), factors.size() - 1])
-    solver = gtsam.GncLMOptimizer(factors, start, parameters)
-    solver.setInlierCostThresholds(0.5 * float(stats.chi2_quantile(0.99, 3)))
-    began = time.process_time()
-    found = solver.optimize()
-    seconds = time.process_time() - began
-    poses = [found.atPose2(k) for k in range(len(apart.poses))]
-    poses = np.array([[pose.x(), pose.y(), pose.theta()] for pose in poses])
-    return poses, np.asarray(solver.getWeights())[trusted:-1] > 0.5, seconds

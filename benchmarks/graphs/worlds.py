@@ -1,8 +1,5 @@
 """Graphs with true poses, their noisy measurements, and false loop closures."""
 
-from pathlib import Path
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -13,24 +10,19 @@ from jaxslam.graphs import Graph, Table
 from jaxslam.graphs.graph import LOOPS
 from jaxslam.math import se2
 
-MANHATTAN = Path(DATA) / "graphs" / "manhattanOlson3500.g2o"
-TRUTH = Path(DATA) / "graphs" / "manhattanOlson3500_nodes_groundTruth.dat"
+MANHATTAN = DATA / "graphs" / "manhattanOlson3500.g2o"
+TRUTH = DATA / "graphs" / "manhattanOlson3500_nodes_groundTruth.dat"
 
 
-def manhattan(poses=None):
-    """The Manhattan world at its true poses: the first `poses` of them, and what joins these."""
+def manhattan():
+    """The Manhattan world at its true poses."""
     graph = graphs.read(MANHATTAN)
-    truth = np.loadtxt(TRUTH)[: len(graph.poses)]
-    count = len(truth) if poses is None else poses
-    (name, table), *_ = graph.tables.items()
-    inside = (np.asarray(table.who) < count).all(axis=1)
-    cut = Table(*(np.asarray(leaf)[inside] for leaf in table))
-    return at(truth[:count], {name: cut})
+    return at(np.loadtxt(TRUTH)[: len(graph.poses)], jax.tree.map(np.asarray, graph.tables))
 
 
-def ring(poses=100, closures=20, seed=0):
+def ring(poses=100, closures=20):
     """A robot drives round a square of `poses` poses twice; the second round closes loops."""
-    rng = np.random.default_rng(seed)
+    rng = np.random.default_rng(0)
     per_round = poses // 2
     side = max(per_round // 4, 1)
     truth = np.zeros((poses, 3))
@@ -72,23 +64,13 @@ def measured(graph, key, scale=1.0):
     return graph._replace(tables=graph.tables | {name: drawn})
 
 
-class Mixed(NamedTuple):
-    """A graph in two tables, odometry and loops, some of which are false."""
-
-    graph: Graph
-    loops: str
-    """the table of loops"""
-    false: np.ndarray
-    """(E,) which of them are"""
-
-
-def with_false_closures(graph, share, seed=0):
-    """The graph with false loops, a `share` of all loops (`with_false_loops`)."""
+def with_false_closures(graph, share):
+    """The graph with its loops apart and false ones among them, a `share` of all, and which (E,)
+    these are (`with_false_loops`)."""
     apart = graphs.with_loops_apart(graph)
     count = len(apart.tables[LOOPS].who)
     wanted = int(share / (1 - share) * count)
-    mixed = with_false_loops(apart, wanted, seed)
-    return Mixed(mixed, LOOPS, np.arange(count + wanted) >= count)
+    return with_false_loops(apart, wanted), np.arange(count + wanted) >= count
 
 
 def with_false_loops(apart, wanted, seed=0):

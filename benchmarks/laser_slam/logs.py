@@ -2,19 +2,17 @@
 
 import time
 from collections.abc import Callable
-from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from benchmarks.gate import Metric
+from benchmarks.gate import FIGURES, Metric
 from benchmarks.real_data import DATA
 from jaxslam import datasets, laser_slam, metrics
 from jaxslam.laser.laser_slam import LoopOutcome
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.results import plot
 
-FIGURES = Path(__file__).parents[1] / "figures"
 METRES = (1.0, 2.0, 5.0, 10.0)
 """Lengths of path of the relations to the file's poses, of each as many as there are scans."""
 DRAWN = ("intel", "csail", "fhw", "orebro")
@@ -36,7 +34,7 @@ class PublicLog(NamedTuple):
     seconds: float = np.inf
 
 
-def _carmen(name: str, odometry: str | None = None) -> Callable[[], datasets.LaserLog]:
+def carmen_log(name: str, odometry: str | None = None) -> Callable[[], datasets.LaserLog]:
     def read() -> datasets.LaserLog:
         raw = None if odometry is None else DATA / "relations" / odometry
         return datasets.carmen(DATA / "carmen" / f"{name}-corrected.log", odometry=raw)
@@ -44,7 +42,7 @@ def _carmen(name: str, odometry: str | None = None) -> Callable[[], datasets.Las
     return read
 
 
-def _csail() -> datasets.LaserLog:
+def csail() -> datasets.LaserLog:
     return datasets.carmen(
         DATA / "laser_graphs" / "mit-cscail.log",
         odometry=DATA / "relations" / "csail_raw_odometry.txt",
@@ -52,21 +50,21 @@ def _csail() -> datasets.LaserLog:
 
 
 LOGS = {  # the first compiles what the others run
-    "freiburg-101": PublicLog(_carmen("freiburg-101"), high=0.042),
-    "intel": PublicLog(_carmen("intel"), high=0.05, seconds=20.0),
+    "freiburg-101": PublicLog(carmen_log("freiburg-101"), high=0.042),
+    "intel": PublicLog(carmen_log("intel"), high=0.05, seconds=20.0),
     "intel, raw log's stamps": PublicLog(
-        _carmen("intel", "intel_raw_odometry.txt"), "intel.relations", high=0.0229
+        carmen_log("intel", "intel_raw_odometry.txt"), "intel.relations", high=0.0229
     ),
-    "csail": PublicLog(_csail, "mit-csail.relations", scored=False, high=0.0319),
-    "edmonton": PublicLog(_carmen("edmonton"), high=0.059),
-    "fhw": PublicLog(_carmen("fhw")),
-    "orebro": PublicLog(_carmen("orebro")),
+    "csail": PublicLog(csail, "mit-csail.relations", scored=False, high=0.0319),
+    "edmonton": PublicLog(carmen_log("edmonton"), high=0.059),
+    "fhw": PublicLog(carmen_log("fhw")),
+    "orebro": PublicLog(carmen_log("orebro")),
 }
 
 
-def measure(names: tuple[str, ...] = tuple(LOGS), draw: bool = True) -> list[Metric]:
+def measure(quick: bool = False) -> list[Metric]:
     found: list[Metric] = []
-    for name in names:
+    for name in ("intel",) if quick else LOGS:
         try:
             log = LOGS[name].read()
         except ValueError as problem:
@@ -89,20 +87,19 @@ def measure(names: tuple[str, ...] = tuple(LOGS), draw: bool = True) -> list[Met
             Metric(f"{name}, processor seconds, all cores", busy),
         ]
         if LOGS[name].relations is not None:
-            found += _by_relations(name, log, solved)
+            found += by_relations(name, log, solved)
         if LOGS[name].scored:
-            found += _by_file(name, log, solved)
-        if draw and name in DRAWN:
-            figure = plot.maps_before_after(solved)
-            figure.savefig(FIGURES / f"laser_slam_{name}.png")
+            found += by_file(name, log, solved)
+        if name in DRAWN and not quick:
+            plot.maps_before_after(solved).savefig(FIGURES / f"laser_slam_{name}.png")
     return found
 
 
-def _by_file(name: str, log: datasets.LaserLog, solved: laser_slam.Solved) -> list[Metric]:
+def by_file(name: str, log: datasets.LaserLog, solved: laser_slam.Solved) -> list[Metric]:
     """Errors to the poses in the file, and loops that agree with them."""
     means = {}
     print("path             relation error [m]  heading [deg]   of 1 m   2 m    5 m   10 m")
-    for what, path in _paths(solved).items():
+    for what, path in paths(solved).items():
         errors = [metrics.rpe(log.corrected, path, metres=m) for m in METRES]
         every = np.concatenate([each.translation for each in errors])
         turn = np.degrees(np.concatenate([each.rotation for each in errors]).mean())
@@ -122,7 +119,7 @@ def _by_file(name: str, log: datasets.LaserLog, solved: laser_slam.Solved) -> li
     ]
 
 
-def _by_relations(name: str, log: datasets.LaserLog, solved: laser_slam.Solved) -> list[Metric]:
+def by_relations(name: str, log: datasets.LaserLog, solved: laser_slam.Solved) -> list[Metric]:
     """Errors of relations that were checked by hand, as their benchmark has them."""
     read = datasets.relation_file(DATA / "relations" / str(LOGS[name].relations))
     of, lost = metrics.given(log.time, read.first, read.second, read.pose, tolerance=TOLERANCE)
@@ -131,31 +128,26 @@ def _by_relations(name: str, log: datasets.LaserLog, solved: laser_slam.Solved) 
     print(f"{len(of.pose)} relations of {len(of.pose) + lost} join, {far.sum()} over {LONG:g} s")
     print("path             relations     translation [m]       squared [m²]      rotation [deg]")
     found = []
-    for what, path in _paths(solved).items():
+    for what, path in paths(solved).items():
         errors = metrics.relation_errors(of, path)
         for which, rows in (("all", np.ones(len(far), bool)), (f"over {LONG:g} s", far)):
             t, r = errors.translation[rows], np.degrees(errors.rotation[rows])
-            told = (f"{x.mean():.4f} ± {x.std():.4f}" for x in (t, t**2, r))
-            print(f"{what:15}  {which:9}  " + "  ".join(f"{one:>18}" for one in told))
-            if what == "laser SLAM":
-                found += [
-                    Metric(
-                        f"{name}, {which} relations [m]",
-                        t.mean(),
-                        high=LOGS[name].high if which == "all" else np.inf,
-                        note=f"± {t.std():.4f}, of {len(t)}",
-                    ),
-                    Metric(f"{name}, {which} relations [deg]", r.mean(), note=f"± {r.std():.3f}"),
-                    Metric(
-                        f"{name}, {which} relations in the 95 % ellipse",
-                        inside[rows].mean(),
-                        note="errors of the relations themselves are not in it",
-                    ),
-                ]
+            cells = (f"{x.mean():.4f} ± {x.std():.4f}" for x in (t, t**2, r))
+            print(f"{what:15}  {which:9}  " + "  ".join(f"{cell:>18}" for cell in cells))
+            if what != "laser SLAM":
+                continue
+            of_name, high = f"{name}, {which} relations", LOGS[name].high
+            high, note = high if which == "all" else np.inf, f"± {t.std():.4f}, of {len(t)}"
+            apart = "errors of the relations themselves are not in it"
+            found += [
+                Metric(f"{of_name} [m]", t.mean(), high=high, note=note),
+                Metric(f"{of_name} [deg]", r.mean(), note=f"± {r.std():.3f}"),
+                Metric(f"{of_name} in the 95 % ellipse", inside[rows].mean(), note=apart),
+            ]
     return found
 
 
-def _paths(solved: laser_slam.Solved) -> dict[str, np.ndarray]:
+def paths(solved: laser_slam.Solved) -> dict[str, np.ndarray]:
     return {
         "raw odometry": solved.raw,
         "laser odometry": solved.odometry,

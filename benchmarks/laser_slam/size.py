@@ -4,13 +4,10 @@ Between two drives raw odometry jumps, so that the robot is lost and found there
 """
 
 import dataclasses
-import json
-import subprocess
-import sys
 
 import numpy as np
 
-from benchmarks.gate import Metric
+from benchmarks.gate import Metric, child
 from benchmarks.laser_slam.logs import LOGS
 
 RUN = """
@@ -48,9 +45,7 @@ def repeated(scans: int):
 def measure() -> list[Metric]:
     found = []
     for scans, start, high in ((4_791, "warm", 60.0), (20_000, "cold", np.inf)):
-        command = [sys.executable, "-c", RUN, str(scans), start]
-        done = subprocess.run(command, capture_output=True, text=True, check=True)
-        told = json.loads(done.stdout.splitlines()[-1])
+        told = child("-c", RUN, scans, start)
         stages = ", ".join(f"{stage} {value:.1f}" for stage, value in told["stages"].items())
         print(f"{scans:,} scans, {start}: {told['seconds']:.1f} s ({stages})")
         print(", ".join(f"{count:,} {what}" for what, count in told["counts"].items() if count))

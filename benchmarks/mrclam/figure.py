@@ -1,7 +1,5 @@
 """The figure of `benchmarks.mrclam`: errors of one robot in their bounds, NEES of all."""
 
-from pathlib import Path
-
 import numpy as np
 
 from jaxslam.math.stats import chi2_quantile
@@ -15,7 +13,6 @@ from jaxslam.results.plot.style import (
     caption,
     every_handle,
     panels_of,
-    png,
     titled,
 )
 
@@ -25,7 +22,7 @@ UNITS = (("x [m]", 1.0), ("y [m]", 1.0), ("heading [deg]", 180 / np.pi))
 FILTER, SMOOTHER = COLORS[0], COLORS[1]
 
 
-def draw(filtered, smoothed, out: Path) -> None:
+def errors_and_nees(filtered, smoothed):
     """Robot -> path of the filter, and of the smoother."""
     figure, panels = panels_of(PAGE, 6.4, 3 + len(filtered))
     axes = panels[:3]
@@ -62,5 +59,4 @@ def draw(filtered, smoothed, out: Path) -> None:
     axes[-1].set_xlabel("time [s]")
     title = "MRCLAM 6: right-invariant EKF, and batch_map, which knows later measurements, too"
     caption(figure, title, every_handle((panels[0], axes[0])))
-    out.parent.mkdir(exist_ok=True)
-    out.write_bytes(png(figure))
+    return figure

@@ -47,7 +47,6 @@ class Course(NamedTuple):
     """What is the same in all simulated runs of a robot."""
 
     truth: Truth
-    start_cov: np.ndarray
     control: jax.Array
     """(T, 6) true increments, and the standard deviations of theirs"""
     scan: Scan
@@ -68,10 +67,24 @@ class Replayed(NamedTuple):
     """root of the mean of the ideal EKF's position variance [m]"""
 
 
+def cut(log, row):
+    """The log from a row on, which is the start: nothing moves before it."""
+    log = jax.tree.map(lambda leaf: leaf[row:], log)
+    return log._replace(control=jnp.asarray(log.control).at[0].set(0.0))
+
+
+def from_first_scan(data, own=None):
+    """The row of the first scan with a landmark at which the truth is known, and the log from it.
+
+    own: the measurement slots of the robot that starts there; default all.
+    """
+    seen = data.log.scan.valid[:, :own].any(axis=1) & data.true_at
+    row = int(np.argmax(seen))
+    return row, cut(data.log, row)
+
+
 def course(folder: Path, robot: int) -> Course:
     """The true path of a robot, and whom it saw when, with noise fitted on its truth."""
-    from benchmarks.mrclam.__main__ import from_first_scan
-
     own = fitting.fit(folder, robot, turned=True, window=WHITE)
     data = datasets.mrclam(folder, robot, calibration=own)
     row, log = from_first_scan(data)
@@ -93,17 +106,15 @@ def course(folder: Path, robot: int) -> Course:
     sensor = RangeBearing(own.measurement_cov(), mount=own.mount)
     landmarks = jnp.asarray(data.landmarks)
     at = landmarks[jnp.maximum(scan.tag, 0)]
-    z = jax.vmap(jax.vmap(sensor.observe, (None, 0)))(path, at)
+    scan = scan._replace(z=jax.vmap(jax.vmap(sensor.observe, (None, 0)))(path, at))
     truth = Truth(path, landmarks, np.zeros(len(path), np.int32), path[0])
-    scan = scan._replace(z=z)
-    options = dict(data.filter_options)
-    return Course(truth, START, control, scan, motion, sensor, options)
+    return Course(truth, control, scan, motion, sensor, dict(data.filter_options))
 
 
-def replay(folder: Path, robot: int, runs: int = RUNS) -> Replayed:
+def replay(folder: Path, robot: int) -> Replayed:
     """Errors of the right-invariant EKF that knows all constants and the noise exactly."""
     at = course(folder, robot)
-    capacity = len(at.truth.landmarks)
+    capacity, chart = len(at.truth.landmarks), charts.RightInvariant()
 
     def run(key: jax.Array, ideal: bool) -> tuple[jax.Array, jax.Array]:
         moved, seen, first, rest = jax.random.split(key, 4)
@@ -111,30 +122,21 @@ def replay(folder: Path, robot: int, runs: int = RUNS) -> Replayed:
         control = at.control.at[:, :3].add(noise)
         deviation = jax.vmap(jax.vmap(lambda z: jnp.sqrt(jnp.diag(at.sensor.noise_cov(z)))))
         z = at.scan.z + deviation(at.scan.z) * jax.random.normal(seen, at.scan.z.shape)
-        start = jax.random.multivariate_normal(first, at.truth.start, at.start_cov)
-        kind = (
-            {"linearize": linearize.AtTruth(at.truth)}
-            if ideal
-            else {"chart": charts.RightInvariant()}
-        )
+        start = jax.random.multivariate_normal(first, at.truth.start, START)
+        kind = {"linearize": linearize.AtTruth(at.truth)} if ideal else {"chart": chart}
         filter = EkfSlam(at.motion, at.sensor, capacity, **at.options, **kind)
         log = Log(control, at.scan._replace(z=z))
-        estimate = jaxslam.run(filter, log, start, at.start_cov, rest).estimate
+        estimate = jaxslam.run(filter, log, start, START, rest).estimate
         return estimate.pose, estimate.pose_cov
 
     def several(keys: jax.Array, ideal: bool) -> tuple[np.ndarray, np.ndarray]:
-        found = jax.jit(jax.vmap(partial(run, ideal=ideal)))(keys)
-        poses, covs = jax.device_get(found)
-        return poses, covs
+        return jax.device_get(jax.jit(jax.vmap(partial(run, ideal=ideal)))(keys))
 
-    true = np.asarray(at.truth.pose)
-    poses, covs = several(jax.random.split(jax.random.key(robot), runs), False)
-    ate, nees = np.empty(runs), np.empty(runs)
-    for k in range(runs):
-        error = pose_error(true, poses[k])
-        ate[k] = np.sqrt((error[:, :2] ** 2).sum(axis=1).mean())
-        each, regular = block_nees(poses[k], error, error, covs[k])["pose"]
-        nees[k] = np.median(each[regular])
+    poses, covs = several(jax.random.split(jax.random.key(robot), RUNS), False)
+    error = pose_error(np.asarray(at.truth.pose), poses)
+    ate = np.sqrt((error[..., :2] ** 2).sum(axis=2).mean(axis=1))
+    each, regular = block_nees(poses, error, error, covs)["pose"]
+    nees = np.nanmedian(np.where(regular, each, np.nan), axis=1)
     _, (cov,) = several(jax.random.split(jax.random.key(robot), 1), True)
     bound = float(np.sqrt((cov[:, 0, 0] + cov[:, 1, 1]).mean()))
     return Replayed(ate, nees, bound)

@@ -1,7 +1,6 @@
 """The figures: NEES of matchers and covariances by world; errors over iterations."""
 
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 from matplotlib.figure import Figure
@@ -17,7 +16,6 @@ from jaxslam.results.plot.style import (
     curve,
     look,
     panels_of,
-    png,
     titled,
 )
 
@@ -79,7 +77,3 @@ def convergence(errors: dict[str, np.ndarray]) -> Figure:
     axes.set_ylabel("distance from the limit [m]")
     caption(figure, "")
     return figure
-
-
-def save(figure: Figure, name: str) -> None:
-    (Path(__file__).parents[1] / "figures" / f"{name}.png").write_bytes(png(figure))

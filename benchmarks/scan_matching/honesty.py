@@ -1,6 +1,5 @@
 """NEES of every matcher with every covariance, in four exact worlds."""
 
-import sys
 from typing import NamedTuple
 
 import jax
@@ -9,6 +8,7 @@ from jaxtyping import PyTree
 
 from benchmarks.scan_matching.pairs import START, Known, drawn, known
 from jaxslam import matching
+from jaxslam.consistency.measures.nees import pose_error
 from jaxslam.core.record import record
 from jaxslam.graphs import Cauchy
 from jaxslam.laser.matching import MatchStatus
@@ -82,12 +82,6 @@ class Row(NamedTuple):
     free: float
     """mean squared error over variance along what the scans do not determine; NaN where they do"""
 
-    @property
-    def verdict(self) -> str:
-        if self.nees > self.high:
-            return "optimistic"
-        return "pessimistic" if self.nees < self.low else "honest"
-
 
 class Error(NamedTuple):
     """A matcher in a world."""
@@ -99,14 +93,6 @@ class Error(NamedTuple):
     over_bound: float
     """mean squared error over the Cramér-Rao bound, by its degrees of freedom"""
     statuses: dict[str, int]
-    usable: int
-
-
-class Judged(NamedTuple):
-    """All that is known of some matchers on some draws."""
-
-    rows: list[Row]
-    errors: list[Error]
 
 
 def programs(names):
@@ -131,13 +117,8 @@ def programs(names):
     return {name: of(name, MATCHERS[name]) for name in names}
 
 
-def judged(runs: int, seeds: dict[int, tuple[str, ...]]) -> dict[int, Judged]:
-    """By seed of the draws: the matchers that are named for it, in every world."""
-    compiled = programs({name for names in seeds.values() for name in names})
-    return {seed: of_draws(compiled, names, runs, seed) for seed, names in seeds.items()}
-
-
-def of_draws(compiled, names: tuple[str, ...], runs: int, seed: int) -> Judged:
+def judged(compiled, names: tuple[str, ...], runs: int, seed: int) -> tuple[list[Row], list[Error]]:
+    """These matchers on the draws of a seed, in every world."""
     rows, errors = [], []
     for world in WORLDS:
         pairs = drawn(world, runs, sigma=SIGMA, seed=seed)
@@ -152,15 +133,12 @@ def of_draws(compiled, names: tuple[str, ...], runs: int, seed: int) -> Judged:
                 scored(world, name, way, error[usable], cov[usable], told, usable)
                 for way, cov in covs.items()
             ]
-            print(f"{world}, {name}: {errors[-1].statuses}", file=sys.stderr, flush=True)
-    return Judged(rows, errors)
+    return rows, errors
 
 
 def error_of(found: matching.Match, truth: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Error of the pose, and which of the runs have a usable one."""
-    error = found.pose - truth
-    error[:, 2] = np.angle(np.exp(1j * error[:, 2]))
-    return error, found.status <= MatchStatus.DEGENERATE
+    return pose_error(found.pose, truth), found.status <= MatchStatus.DEGENERATE
 
 
 def scored(world, matcher, way, error, cov, told: Known, usable) -> Row:
@@ -186,7 +164,7 @@ def summary(world, matcher, found, error, usable, told: Known) -> Error:
     }
     over = squares(error[usable], told.bound[usable], told.seen[usable]).mean()
     deviation = np.sqrt((error[usable] ** 2).mean(axis=0))
-    return Error(world, matcher, deviation, over / told.seen.shape[2], names, int(usable.sum()))
+    return Error(world, matcher, deviation, over / told.seen.shape[2], names)
 
 
 def squares(error, cov, functionals) -> np.ndarray:

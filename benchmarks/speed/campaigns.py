@@ -1,11 +1,12 @@
 """Whole campaigns through the command: throughput and memory, and two processes against one."""
 
-import json
 import os
 import subprocess
 import sys
 import tempfile
 from pathlib import Path
+
+from benchmarks.gate import child
 
 MEASURE = """
 import json, resource, sys
@@ -34,9 +35,7 @@ print(json.dumps([rate, memory, alone]))
 def campaign(runs: int, where: str = "free") -> tuple[float, float, float]:
     """Runs a second once compiled, peak memory [MB] of the process; and on one core ("pinned") also
     the runs a second of its filter alone."""
-    command = [sys.executable, "-c", MEASURE, str(runs), where]
-    done = subprocess.run(command, check=True, capture_output=True, text=True)
-    rate, memory, alone = json.loads(done.stdout.splitlines()[-1])
+    rate, memory, alone = child("-c", MEASURE, runs, where)
     return rate, memory, alone
 
 

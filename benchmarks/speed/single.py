@@ -11,21 +11,23 @@ import time
 from functools import partial
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.speed import roofline
-from benchmarks.speed.area import compressed
 from benchmarks.speed.dense import dense_ekf
-from benchmarks.speed.peers import Mrpt, dynamax_ekf
 from jaxslam.catalog import FILTERS
-from jaxslam.filters.ekf.ekf_slam import EkfSlam
+from jaxslam.core.slots import Joint
+from jaxslam.filters import CompressedEkfSlam, EkfSlam
+from jaxslam.filters.ekf.compressed_ekf_slam import opened
 from jaxslam.math.xla import hot_options
 from jaxslam.run import run
 from jaxslam.simulation.scenarios import cloister
 from jaxslam.simulation.worlds import simulate
 
-RUNS, PEERS_RUNS = 32, 4
+RUNS = 32
 VISIBLE = 20
+AREA = 40
+"""landmarks that the compressed filter works on"""
 SIZES = (36, 100, 300, 1000)
 
 
@@ -84,26 +86,18 @@ def throughput(dtype):
     limit = Limit(dtype)
     if limit.there:
         actions["limit"] = lambda: limit.run(RUNS)
-    few = jax.tree.map(lambda leaf: leaf[:PEERS_RUNS], logs)
-    peer = dynamax_ekf(scenario, few)
-    if peer is not None:
-        actions["dynamax"] = peer
-    mrpt, mrpt_seconds = Mrpt(), []
-    if mrpt.there:
-        actions["MRPT"] = lambda: mrpt_seconds.append(mrpt.run(PEERS_RUNS))
     seconds = together(actions)
     each = seconds["batch"] / RUNS
     numpy_seconds = best(lambda: dense_ekf(numpy_log, scenario.pose, noise_u, noise_z), 1)
-    peak, stream = roofline.ceilings(np.dtype(dtype))
-    count, flops, reads = roofline.corrections(36, 200)
+    peak, stream = ceilings(np.dtype(dtype))
+    count, flops, reads = corrections(36, 200)
     reads *= np.dtype(dtype).itemsize
+    temporary = program.memory_analysis().temp_size_in_bytes
     out = {
         "trace and compile [s]": build,
         "first call / steady": first / seconds["batch"],
         "runs/s per core": 1 / each,
-        "peak temporary memory a run [MB]": program.memory_analysis().temp_size_in_bytes
-        / RUNS
-        / 1e6,
+        "peak temporary memory a run [MB]": temporary / RUNS / 1e6,
         "largest difference from NumPy": float(np.abs(ours - plain).max()),
         "NumPy / ours, a run": numpy_seconds / each,
         "corrections a run": count,
@@ -120,11 +114,44 @@ def throughput(dtype):
             "limit / ours, one trajectory": fair / seconds["single"],
             "limit [s a run]": fair,
         }
-    if peer is not None:
-        out["dynamax / ours, a run"] = seconds["dynamax"] / PEERS_RUNS / each
-    if mrpt.there:
-        out["MRPT / ours, a run"] = min(mrpt_seconds) / each
     return out
+
+
+def ceilings(dtype) -> tuple[float, float]:
+    """Peak multiply-adds in flop/s, and bytes/s to and from memory, of what XLA makes for one core.
+
+    Peak: x ← a x + b over a vector that stays in the first cache, eight times a pass.
+    """
+    small, large = jnp.ones(1024, dtype), jnp.ones(2**24, dtype)
+
+    @jax.jit
+    def chew(x):
+        def body(_, parts):
+            for _ in range(8):
+                parts = [part * 0.999 + 0.001 for part in parts]
+            return parts
+
+        return jax.lax.fori_loop(0, 4000, body, [x, x + 1, x + 2, x + 3])
+
+    @jax.jit
+    def stream(x, y):
+        return 0.5 * x + y
+
+    jax.block_until_ready((chew(small), stream(large, large)))
+    peak = 4000 * 8 * 4 * 2 * small.size / best(lambda: jax.block_until_ready(chew(small)))
+    seconds = best(lambda: jax.block_until_ready(stream(large, large)))
+    return peak, 3 * large.nbytes / seconds
+
+
+def corrections(landmarks: int, steps: int, group: int = 3) -> tuple[int, float, float]:
+    """Of `cloister` a run: rank-2 corrections, their flops, and bytes of P read and written.
+
+    One landmark enters a step and all of the map are measured, so step t corrects min(t, N).
+    """
+    size = 3 + 2 * landmarks
+    seen = [min(step, landmarks) for step in range(steps)]
+    passes = sum(-(-count // group) for count in seen)
+    return sum(seen), sum(seen) * 4.0 * size**2, passes * 2.0 * size**2
 
 
 def exponent(sizes, seconds):
@@ -133,28 +160,21 @@ def exponent(sizes, seconds):
 
 
 def scaling():
-    """Exponents in landmarks, visible landmarks, steps and runs; and what padding costs."""
+    """Exponents in landmarks, visible landmarks and steps; and what padding costs."""
     scenario = cloister(40)
     _, logs = logs_of(scenario, 1)
     log = jax.tree.map(lambda leaf: leaf[0], logs)
 
     def program(capacity, visible, places=None, steps=40):
-        def cut(leaf):
-            return leaf[:steps, :visible]
-
-        scan = jax.tree.map(cut, log.scan)
+        scan = jax.tree.map(lambda leaf: leaf[:steps, :visible], log.scan)
         spare = (places or visible) - visible
         scan = scan._replace(
             z=np.pad(scan.z, [(0, 0), (0, spare), (0, 0)]),
             tag=np.pad(scan.tag, [(0, 0), (0, spare)], constant_values=-1),
             valid=np.pad(scan.valid, [(0, 0), (0, spare)]),
         )
-        filter = EkfSlam(
-            scenario.motion,
-            scenario.sensor,
-            capacity,
-            **(scenario.filter_options | {"births": None}),
-        )
+        options = scenario.filter_options | {"births": None}
+        filter = EkfSlam(scenario.motion, scenario.sensor, capacity, **options)
         part = log._replace(control=log.control[:steps], scan=scan)
         return compiled(final_pose(filter, scenario), part, jax.random.key(0))[0]
 
@@ -167,7 +187,7 @@ def scaling():
     by_steps = [seconds(100, VISIBLE, steps=n) for n in (10, 20, 40)]
     padding = together({n: program(100, VISIBLE, places=n) for n in (VISIBLE, 100)}, 15)
     scan = jax.tree.map(lambda leaf: leaf[:40, :VISIBLE], log.scan)
-    local, ordinary = compressed(scenario, log._replace(control=log.control[:40], scan=scan), SIZES)
+    local, ordinary = compressed(scenario, log._replace(scan=scan))
     return {
         "exponent in landmarks, 36 to 1000, 20 visible": exponent(SIZES, by_landmarks),
         "exponent in landmarks, 300 to 1000": exponent(SIZES[-2:], by_landmarks[-2:]),
@@ -179,6 +199,52 @@ def scaling():
         "ordinary / compressed, a step, 1000 landmarks": ordinary / local[-1],
         "ms a step, 1000 landmarks": 1e3 * by_landmarks[-1] / 40,
     }
+
+
+def map_of(count, scenario):
+    """A robot in a map of N landmarks, all correlated: the scenario's, and others further off."""
+    rng = np.random.default_rng(0)
+    landmarks = np.concatenate([scenario.landmarks, rng.uniform(10, 100, size=(1000, 2))])
+    landmarks = landmarks[:count] + 0.01 * rng.normal(size=(count, 2))
+    root = 0.1 * rng.normal(size=(3, 3 + 2 * count))
+    return Joint(
+        pose=jnp.asarray(scenario.pose, float),
+        landmarks=jnp.asarray(landmarks),
+        cov=jnp.asarray(root.T @ root + 0.01 * np.eye(3 + 2 * count)),
+        alive=jnp.ones(count, bool),
+        tag=jnp.arange(count, dtype=jnp.int32),
+        lin=(),
+    )
+
+
+def seconds_a_step(filter, state, log):
+    """Of predict and update along the log, from a state at hand."""
+    key = jax.random.key(0)
+
+    @jax.jit
+    def go(state, log):
+        def step(state, row):
+            state = filter.predict(state, row.control, key)
+            state, info = filter.update(state, row.scan, key)
+            return state, (filter.estimate(state).pose, info.nis)
+
+        return jax.lax.scan(step, state, log)[1]
+
+    jax.block_until_ready(go(state, log))
+    return best(lambda: jax.block_until_ready(go(state, log)), 3) / len(log.control)
+
+
+def compressed(scenario, log):
+    """Seconds a step of the compressed filter by N, on a trajectory that stays within one part of
+    the map, and of the ordinary one at the largest N."""
+    options = scenario.filter_options | {"births": None}
+    by_landmarks = []
+    for count in SIZES:
+        joint = map_of(count, scenario)
+        plain = EkfSlam(scenario.motion, scenario.sensor, count, **options)
+        filter = CompressedEkfSlam(plain, area=AREA)
+        by_landmarks.append(seconds_a_step(filter, opened(joint, AREA), log))
+    return by_landmarks, seconds_a_step(plain, joint, log)
 
 
 def main():

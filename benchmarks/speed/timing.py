@@ -49,6 +49,6 @@ class Limit:
             command = ["g++", *flags, str(SOURCE), "-o", str(self.program)]
             subprocess.run(command, check=True)
 
-    def run(self, runs: int, steps: int = 200, side: int = 7) -> None:
-        command = [str(self.program), str(runs), str(steps), str(side)]
+    def run(self, runs: int) -> None:
+        command = [str(self.program), str(runs), "200", "7"]  # steps; columns a side
         subprocess.run(command, check=True, stdout=subprocess.DEVNULL)

@@ -229,7 +229,7 @@ MRCLAM_CALIBRATION = RobotCalibration(
     range_share=0.0098,
     bearing_noise=0.0183,
 )
-"""Fitted on the true path of robot 1 of data set 6 (`python -m benchmarks.mrclam --fit`).
+"""Fitted on the true path of robot 1 of data set 6 (`python -m benchmarks --only mrclam_fit`).
 
 The yaw and the axis of the camera are left at zero, since they differ from robot to robot;
 `mrclam_calibration` finds them in a robot's own log.

@@ -15,7 +15,7 @@ from jaxslam import datasets, grids
 from jaxslam.datasets import g2o, ros_map
 
 WIDE = int(os.environ.get("JAXSLAM_FUZZ", "1"))
-"""How many times as many examples are tried, as by `python -m benchmarks.fuzz`."""
+"""How many times as many examples are tried, as by `python -m benchmarks --only fuzz`."""
 fuzz = settings(
     max_examples=60 * WIDE,
     deadline=None,

@@ -1,10 +1,10 @@
-"""Robust kernels with false loops in public graphs: `python -m benchmarks.false_loops`.
+"""Robust kernels with false loops in public graphs.
 
 To the loops of a graph false ones are added, a share of their number: between poses at random, at
 the relative pose of a true loop. A run is right if its positions are those of the optimum without
 them, to 0.1 m root mean square. Rows "several" are what `jaxslam optimize --kernel NAME` does: the
 lowest robust cost of its starts. GTSAM's graduated non-convexity has the same threshold and trusts
-the odometry as well; without GTSAM its rows are left out.
+the odometry as well.
 
 The files are looked for in the folder JAXSLAM_DATA, by default ../shared/data beside the checkout,
 and left out where absent. A kernel and start that were wrong in all draws of the two shares before
@@ -12,18 +12,17 @@ are not run at a larger one, and count as wrong.
 """
 
 from collections import defaultdict
-from importlib.metadata import PackageNotFoundError, version
 
 import numpy as np
 
-from benchmarks.gate import Metric, alone
+from benchmarks.gate import Metric, show
+from benchmarks.graphs import peer
 from benchmarks.graphs.worlds import with_false_loops
 from benchmarks.real_data import DATA
 from jaxslam import graphs
 from jaxslam.cli.optimize import SEVERAL
 from jaxslam.graphs import starts
 from jaxslam.graphs.graph import LOOPS
-from jaxslam.math import stats
 
 FILES = {
     "intel": ("intel.g2o", 1),
@@ -49,15 +48,15 @@ def measure(quick: bool = False) -> list[Metric]:
         if not path.exists() or (quick and name != "MIT"):
             continue
         clean = graphs.with_loops_apart(graphs.with_gauge(graphs.read(path)))
-        best, best_of_log = (_optimum(clean, factors) for factors in (None, LOG))
+        best, best_of_log = (optimum(clean, factors) for factors in (None, LOG))
         for share in SHARES:
             count = 1 if quick or share == 0 else draws
             merits = defaultdict(list)
             for seed in range(count):
                 wanted = int(np.ceil(share * len(clean.tables[LOOPS].z)))
                 mixed = with_false_loops(clean, wanted, seed)
-                tried = {row for row, of in right.items() if _hopeful(of, name, share)}
-                for row, poses in _solved(mixed, tried if share else None).items():
+                tried = {row for row, of in right.items() if hopeful(of, name, share)}
+                for row, poses in solved(mixed, tried if share else None).items():
                     off = (poses - (best_of_log if row[0] == "GTSAM" else best))[:, :2]
                     merits[row].append(float((off**2).sum(axis=1).mean()) < NEAR**2)
             for row in merits | dict.fromkeys(right):
@@ -65,47 +64,45 @@ def measure(quick: bool = False) -> list[Metric]:
             print(f"{name}, {share:.0%}: {count} draws", flush=True)
     if not right:
         return []
-    print(f"\nshare of runs right to {NEAR} m; {_versions()}")
-    names = list(dict.fromkeys(name for name, _ in right[DEFAULT]))
-    shares = [f"{share:.0%}" for share in SHARES]
-    print("".join(f"{head:>10}" for head in ("kernel", "start", *names, *shares, "all")))
-    total = {row: np.mean(list(of.values())) for row, of in right.items()}
-    for (kernel, start), of in right.items():
-        cells = [np.mean([v for (file, _), v in of.items() if file == name]) for name in names]
-        cells += [np.mean([v for (_, s), v in of.items() if s == share]) for share in SHARES]
-        cells = "".join(f"{cell:>10.2f}" for cell in (*cells, total[kernel, start]))
-        print(f"{kernel:>10}{start:>14}"[:24].rjust(20) + cells)
+    total = {row: float(np.mean(list(of.values()))) for row, of in right.items()}
+    rows = {
+        f"{kernel}, {start}": average_by(0, of)
+        | {f"{share:.0%}": value for share, value in average_by(1, of).items()}
+        | {"all": total[kernel, start]}
+        for (kernel, start), of in right.items()
+    }
+    show(f"share of runs right to {NEAR} m", rows)
     rest = max(value for row, value in total.items() if row != DEFAULT)
     return [
         Metric("right by default", total[DEFAULT], low=rest, note="the gate is the best other row"),
     ]
 
 
-def _optimum(clean: graphs.Graph, factors: dict | None) -> np.ndarray:
+def average_by(part: int, of: dict[tuple[str, float], float]) -> dict:
+    """Averages over the files and shares of a row, by the file (part 0) or by the share (1)."""
+    kinds = dict.fromkeys(key[part] for key in of)
+    return {kind: np.mean([v for key, v in of.items() if key[part] == kind]) for kind in kinds}
+
+
+def optimum(clean: graphs.Graph, factors: dict | None) -> np.ndarray:
     """The poses of the lowest χ² from some starts."""
     found = [graphs.optimize(starts.STARTS[start](clean), factors) for start in SEVERAL]
     return np.asarray(min(found, key=lambda each: float(each.chi2)).graph.poses)
 
 
-def _hopeful(of: dict[tuple[str, float], float], name: str, share: float) -> bool:
+def hopeful(of: dict[tuple[str, float], float], name: str, share: float) -> bool:
     """Whether a row was right in some draw of the two shares before."""
     before = [of[name, each] for each in SHARES if each < share][-2:]
     return len(before) < 2 or any(before)
 
 
-def _solved(mixed: graphs.Graph, tried: set | None) -> dict[tuple[str, str], np.ndarray]:
-    """Poses by kernel and start, of the rows to try."""
-    found, begins = {}, {}
-
-    def asked(*row: str) -> bool:
-        return tried is None or row in tried
-
-    for start, place in starts.STARTS.items():
-        begins[start] = place(mixed)
+def solved(mixed: graphs.Graph, tried: set | None) -> dict[tuple[str, str], np.ndarray]:
+    """Poses by kernel and start, of the rows to try; None: of all."""
+    found, begins = {}, {start: place(mixed) for start, place in starts.STARTS.items()}
     for name, kernel in KERNELS.items():
         costs = {}
         for start, begin in begins.items():
-            if not asked(name, start):
+            if tried is not None and (name, start) not in tried:
                 continue
             same = [e for e in costs if np.allclose(begins[e].poses, begin.poses, atol=1e-9)]
             if same:  # in some files the given poses are the odometry
@@ -116,49 +113,7 @@ def _solved(mixed: graphs.Graph, tried: set | None) -> dict[tuple[str, str], np.
             found[name, start] = np.asarray(solution.graph.poses)
         if several := [start for start in SEVERAL if start in costs]:
             found[name, "several"] = found[name, min(several, key=costs.__getitem__)]
-    if _gtsam_version():
-        for start in GTSAM_STARTS:
-            if asked("GTSAM", start):
-                found["GTSAM", start] = _gtsam(begins[start])
+    for start in GTSAM_STARTS:
+        if tried is None or ("GTSAM", start) in tried:
+            found["GTSAM", start], *_ = peer.graduated(begins[start])
     return found
-
-
-def _gtsam_version() -> str:
-    try:
-        return version("gtsam")
-    except PackageNotFoundError:
-        return ""
-
-
-def _versions() -> str:
-    return f"GTSAM {_gtsam_version()}" if _gtsam_version() else "GTSAM is not installed"
-
-
-def _gtsam(mixed: graphs.Graph) -> np.ndarray:
-    """Poses by GTSAM's graduated non-convexity from those of a graph, its odometry trusted."""
-    import gtsam
-
-    factors, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    for name in ("relative_pose", LOOPS):
-        table = mixed.tables[name]
-        for (i, j), z, information in zip(table.who, table.z, table.information, strict=True):
-            noise = gtsam.noiseModel.Gaussian.Information(np.asarray(information))
-            factors.add(gtsam.BetweenFactorPose2(int(i), int(j), gtsam.Pose2(*z), noise))
-    for k, pose in enumerate(np.asarray(mixed.poses)):
-        start.insert(k, gtsam.Pose2(*pose))
-    held = gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)
-    fixed = int(np.asarray(mixed.fixed_pose).argmax())
-    factors.add(gtsam.PriorFactorPose2(fixed, gtsam.Pose2(*mixed.poses[fixed]), held))
-    parameters = gtsam.GncLMParams()
-    parameters.setLossType(gtsam.GncLossType.TLS)
-    trusted = len(mixed.tables["relative_pose"].z)
-    parameters.setKnownInliers([*range(trusted), factors.size() - 1])
-    solver = gtsam.GncLMOptimizer(factors, start, parameters)
-    solver.setInlierCostThresholds(0.5 * float(stats.chi2_quantile(0.99, 3)))
-    found = solver.optimize()
-    poses = [found.atPose2(k) for k in range(len(mixed.poses))]
-    return np.array([[pose.x(), pose.y(), pose.theta()] for pose in poses])
-
-
-if __name__ == "__main__":
-    raise SystemExit(alone("false_loops", measure, quick={"action": "store_true"}))

@@ -1,22 +1,16 @@
-"""Grids: `python -m benchmarks.grids`.
-
-Rays a second on one core beside a traversal in C++ (`rays.py`), the error of ranges against exact
-walls, and the distance field of 4 million cells beside SciPy's.
+"""Rays a second on one core beside a traversal in C++ (`rays.py`), the error of ranges against
+exact walls, and the distance field of 4 million cells beside SciPy's.
 """
-
-import json
-import subprocess
-import sys
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from scipy import ndimage
 
-from benchmarks.gate import Metric, alone
-from benchmarks.real_data import DATA
+from benchmarks.gate import Metric, child
+from benchmarks.grid_localization import counts_of, read
 from benchmarks.speed.timing import together
-from jaxslam import datasets, grids
+from jaxslam import grids
 from jaxslam.simulation.scenarios import ROOMS
 from jaxslam.simulation.walls import exact_ranges, rasterize
 
@@ -70,9 +64,8 @@ def accuracy() -> list[Metric]:
         steady = (np.maximum(abs(left - middle), abs(right - middle)) < 3 * CELL) & (middle < far)
         unit = np.stack([np.cos(heading), np.sin(heading)], axis=-1)
         ends = pose[:, None, :2] + middle[..., None] * unit
-        corners = world.walls.segments[:, 0]
         apart = np.full(middle.shape, np.inf)
-        for corner in corners:
+        for corner in world.walls.segments[:, 0]:
             apart = np.minimum(apart, np.linalg.norm(ends - corner, axis=-1))
         plain = steady & (apart > 1.5 * CELL)
         for method in ("surface", "cells"):
@@ -96,23 +89,11 @@ def accuracy() -> list[Metric]:
 
 def passed_walls() -> list[Metric]:
     """The share of the beams of a log that a map of all its scans predicts over 0.5 m too far."""
-    far, cell = 20.0, 0.05
-    try:
-        log = datasets.carmen(DATA / "carmen" / "freiburg-101-corrected.log", max_range=far)
-    except ValueError as problem:
-        print(f"beams that pass walls: left out: {problem}")
+    far = 20.0
+    log = read("freiburg-101", far)
+    if log is None:
         return []
-    low, high = log.corrected[:, :2].min(0) - far - 1, log.corrected[:, :2].max(0) + far + 1
-    rows, columns = np.ceil((high - low) / cell)[::-1].astype(int).tolist()
-    counts = grids.count(
-        (rows, columns),
-        np.array([*low, 0.0]),
-        cell,
-        log.corrected,
-        log.beams,
-        max_range=far,
-        no_return=0.0,
-    )
+    counts = counts_of(log, slice(None), far, margin=far + 1)
     every = slice(None, None, 6)
     ranges, angles, valid = (np.asarray(part)[every] for part in log.beams)
     hit, metrics = valid & (ranges < far), []
@@ -131,11 +112,9 @@ def passed_walls() -> list[Metric]:
     return metrics
 
 
-def measure() -> list[Metric]:
-    command = [sys.executable, "-m", "benchmarks.grids.rays"]
-    done = subprocess.run(command, check=True, stdout=subprocess.PIPE, text=True)
+def measure(quick: bool = False) -> list[Metric]:
     metrics = []
-    for name, value in json.loads(done.stdout.splitlines()[-1]).items():
+    for name, value in child("-m", "benchmarks.grids.rays").items():
         low, high = -np.inf, np.inf
         if name.startswith(("cells, skipping", "surface")):
             low = 6.0  # of CDDT: Walsh & Karaman 2018, "CDDT: fast approximate 2D ray casting"
@@ -145,7 +124,3 @@ def measure() -> list[Metric]:
             low, high = -1e-3, 1e-3
         metrics.append(Metric(name, value, low, high))
     return metrics + accuracy() + passed_walls() + distance()
-
-
-if __name__ == "__main__":
-    raise SystemExit(alone("grids", measure))

@@ -1,4 +1,4 @@
-"""Time of an optimization beside GTSAM's, and by poses: `python -m benchmarks.graph_speed`.
+"""Time of an optimization beside GTSAM's, and by poses.
 
 `input_M3500_g2o` and `city10000`, one graph at a time, from the file's own start, by
 Levenberg-Marquardt; and 256 graphs of the pattern of `ring` in one batch, its measurements drawn
@@ -26,10 +26,12 @@ import gtsam
 import jax
 import numpy as np
 
-from benchmarks.gate import Metric, alone
+from benchmarks.gate import Metric
+from benchmarks.graphs import peer
+from benchmarks.graphs.worlds import at
 from benchmarks.real_data import DATA
 from jaxslam import graphs
-from jaxslam.math import se2
+from jaxslam.math import numpy_poses
 
 FACTORS = {"relative_pose": graphs.RelativePoseLog()}
 TOLERANCE = 5e-7
@@ -43,22 +45,10 @@ def processor_seconds(work) -> tuple[float, object]:
     return time.process_time() - began, out
 
 
-def of_gtsam(graph, method=gtsam.LevenbergMarquardtOptimizer):
-    """A function that solves the graph by GTSAM, and returns (χ², iterations)."""
-    factors, start = gtsam.NonlinearFactorGraph(), gtsam.Values()
-    table = graph.tables["relative_pose"]
-    for (i, j), z, information in zip(table.who, table.z, table.information, strict=True):
-        noise = gtsam.noiseModel.Gaussian.Information(information)
-        factors.add(gtsam.BetweenFactorPose2(int(i), int(j), gtsam.Pose2(*z), noise))
-    for k, pose in enumerate(graph.poses):
-        start.insert(k, gtsam.Pose2(*pose))
-    held = int(np.argmax(graph.fixed_pose))
-    exact = gtsam.noiseModel.Constrained.All(3)
-    factors.add(gtsam.PriorFactorPose2(held, gtsam.Pose2(*graph.poses[held]), exact))
-    parameters = {
-        gtsam.LevenbergMarquardtOptimizer: gtsam.LevenbergMarquardtParams,
-        gtsam.GaussNewtonOptimizer: gtsam.GaussNewtonParams,
-    }[method]
+def of_gtsam(graph, kind="GaussNewton"):
+    """A function that solves the graph by GTSAM: processor seconds, χ², iterations."""
+    factors, start = peer.problem(graph, held=gtsam.noiseModel.Constrained.All(3))
+    method, parameters = (getattr(gtsam, f"{kind}{part}") for part in ("Optimizer", "Params"))
 
     def solve():
         solver = method(factors, start, parameters())
@@ -77,10 +67,7 @@ def one_graph(name: str, high: float, repeats: int) -> list[Metric]:
         return graphs.optimize(graph, FACTORS, plan=plan, tolerance=TOLERANCE)
 
     first, _ = processor_seconds(ours)
-    theirs = {
-        "LM": of_gtsam(graph),
-        "GN": of_gtsam(graph, gtsam.GaussNewtonOptimizer),
-    }
+    theirs = {"LM": of_gtsam(graph, "LevenbergMarquardt"), "GN": of_gtsam(graph)}
     rows = [
         (processor_seconds(ours), {key: solve() for key, solve in theirs.items()})
         for _ in range(repeats)
@@ -88,10 +75,8 @@ def one_graph(name: str, high: float, repeats: int) -> list[Metric]:
     own = np.median([mine[0] for mine, _ in rows])
     found = rows[-1][0][1]
     print(f"{name}: plan {planning:.2f} s, first call {first:.2f} s")
-    told = (
-        f"  jaxslam {1e3 * own:8.1f} ms, {int(found.iterations)} steps, χ² {float(found.chi2):.6f}"
-    )
-    print(told)
+    steps, chi2 = int(found.iterations), float(found.chi2)
+    print(f"  jaxslam {1e3 * own:8.1f} ms, {steps} steps, χ² {chi2:.6f}")
     metrics = []
     for key in theirs:
         seconds = np.median([other[key][0] for _, other in rows])
@@ -124,7 +109,7 @@ def many_graphs(repeats: int) -> list[Metric]:
     batch = jax.device_put(batch)
     first, found = processor_seconds(lambda: ours(batch))
     single = [graph._replace(tables={"relative_pose": table._replace(z=rows)}) for rows in z]
-    theirs = [of_gtsam(one, gtsam.GaussNewtonOptimizer) for one in single]
+    theirs = [of_gtsam(one) for one in single]
     own, other, off = [], [], []
     for _ in range(repeats):
         own.append(processor_seconds(lambda: ours(batch))[0])
@@ -170,12 +155,10 @@ def lanes(size: int, length: int = 20):
     second = np.concatenate([np.arange(1, size), np.flatnonzero(there)])
     sigma = np.array([0.02, 0.02, 0.01])
     noise = sigma * np.random.default_rng(0).normal(size=(len(first), 3))
-    z = np.asarray(jax.jit(jax.vmap(se2.between))(truth[first], truth[second])) + noise
+    z = numpy_poses.between(truth[first], truth[second]) + noise
     information = np.tile(np.diag(sigma**-2), (len(z), 1, 1))
     table = graphs.Table(np.stack([first, second], axis=1), z, information, np.ones(len(z), bool))
-    no_points = np.zeros((0, 2)), {"relative_pose": table}, np.arange(size) == 0
-    ids = np.zeros(0, bool), np.arange(size), np.arange(0)
-    return graphs.starts.odometry(graphs.Graph(truth, *no_points, *ids))
+    return graphs.starts.odometry(at(truth, {"relative_pose": table}))
 
 
 def growth(name: str, of_size, repeats: int, high: float = np.inf) -> Metric:
@@ -195,8 +178,9 @@ def growth(name: str, of_size, repeats: int, high: float = np.inf) -> Metric:
     return Metric(f"{name}: a step as a power of the poses", power, high=high)
 
 
-def measure(repeats: int = 5) -> list[Metric]:
+def measure(quick: bool = False) -> list[Metric]:
     """Nothing where the files are absent."""
+    repeats = 3 if quick else 9
     if not (DATA / "graphs").is_dir():
         print(f"{DATA / 'graphs'} is not there")
         return []
@@ -210,7 +194,3 @@ def measure(repeats: int = 5) -> list[Metric]:
     metrics.append(growth("city10000", partial(first_poses, whole), repeats))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     return [*metrics, Metric("peak memory of the process [GB]", peak)]
-
-
-if __name__ == "__main__":
-    raise SystemExit(alone("graph_speed", measure, repeats={"type": int, "default": 5}))

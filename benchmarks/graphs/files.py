@@ -1,4 +1,4 @@
-"""Optima of public pose graphs from four starts: `python -m benchmarks.graph_files`.
+"""Optima of public pose graphs from four starts.
 
 The files are looked for in the folder JAXSLAM_DATA, by default ../shared/data beside the checkout,
 and left out where absent. χ² has two forms: e = Z⁻¹ ∘ Xᵢ⁻¹ ∘ Xⱼ as (x, y, θ), which g2o has, and
@@ -10,7 +10,7 @@ are known, whether its covariances are honest.
 
 import numpy as np
 
-from benchmarks.gate import Metric, alone
+from benchmarks.gate import Metric
 from benchmarks.real_data import DATA
 from jaxslam import graphs
 from jaxslam.consistency.measures.nees import pose_error
@@ -44,7 +44,7 @@ ERRORS = {"log": graphs.RelativePoseLog(), "pose": graphs.RelativePose()}
 ITERATIONS = 1000
 
 
-def measure() -> list[Metric]:
+def measure(quick: bool = False) -> list[Metric]:
     metrics, best = [], {}
     print(
         "file               e     start           χ² at the start  χ² at the end    steps  "
@@ -124,7 +124,3 @@ def judge(optima: dict[str, Solution]) -> list[Metric]:
             Metric(f"{name}: mean pose NEES, covariances × χ² / dof", nees / ratio),
         ]
     return metrics
-
-
-if __name__ == "__main__":
-    raise SystemExit(alone("graph_files", measure))

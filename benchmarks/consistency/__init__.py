@@ -1,1 +1,0 @@
-"""Published consistency experiments, reproduced: `python -m benchmarks.consistency`."""
