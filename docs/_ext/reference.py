@@ -117,7 +117,7 @@ OPEN = {
         "FAINT INK SHADE TEXT band caption curve every_handle panels_of titled"
     ),
     "jaxslam.results.report": "map_csv trajectory_csv trajectory_tum",
-    "jaxslam.results.store": "create join resume",
+    "jaxslam.results.store": "open resume",
     "jaxslam.run": "",
     "jaxslam.simulation.laser": (
         "Laser LaserHistory LaserWorld Observability scan scan_information scan_world true_ranges"

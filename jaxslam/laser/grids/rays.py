@@ -143,12 +143,13 @@ def cast(
         share of a cell that is solid (`simulation.walls.rasterize` makes such grids), this line is
         the wall to a fraction of a cell: the range of a beam less than 63° from the normal, and one
         and a half cells from edges and corners, is wrong by less than half a cell, in the median by
-        less than a tenth (`python -m benchmarks --only grids`). These are rounded: beside an edge a beam
-        may hit or miss wrongly. If p is not a share, it goes too far. In a trinary map the corners
-        of cells are cut, by half a cell from a pillar or an end of a wall, and beams behind them go
-        on to the next wall. In a map of log-odds it passes walls that are weakly occupied beside
-        cells that are surely free: between two such cells that touch by a corner p is below ½
-        (`python -m benchmarks --only grids` has the share of beams that pass walls of a real map).
+        less than a tenth (`python -m benchmarks --only grids`). These are rounded: beside an edge a
+        beam may hit or miss wrongly. If p is not a share, it goes too far. In a trinary map the
+        corners of cells are cut, by half a cell from a pillar or an end of a wall, and beams behind
+        them go on to the next wall. In a map of log-odds it passes walls that are weakly occupied
+        beside cells that are surely free: between two such cells that touch by a corner p is below
+        ½ (`python -m benchmarks --only grids` has the share of beams that pass walls of a real
+        map).
 
     The derivative by the pose is that of the range to a straight wall through the hit,
     dr = -n·(dt + r dφ e⊥)/(n·e), with e the direction, φ its angle, dt the shift of the origin, and
