@@ -18,7 +18,7 @@ MODELS = motion.REGISTRY | sensors.REGISTRY
 
 @pytest.fixture(
     scope="module",
-    params=swept(MODELS, "unicycle", "velocity", "range_bearing", "bearing_inverse_depth", "line"),
+    params=swept(MODELS, "unicycle", "range_bearing", "line"),
 )
 def made(request):
     """A registered model, all that was computed about it, and what that was judged to be."""

@@ -165,6 +165,7 @@ def test_the_noises_of_simulated_logs_are_found_and_errors_are_their_spread():
     assert (np.abs(z.mean(axis=0)) < 3.3 / np.sqrt(count)).all(), z.mean(axis=0)
 
 
+@pytest.mark.sweep
 def test_decisions_are_held_in_the_log():
     """Unknown tags and a gate, then known tags and none: the same run, and the rest is not valid."""
     place = world(40)

@@ -398,6 +398,7 @@ def test_other_numbers_run_what_is_there(smooths):
     assert not np.allclose(first.estimate.pose, second.estimate.pose)
 
 
+@pytest.mark.sweep
 def test_a_program_gives_what_the_function_does():
     """The numbers of records are arguments: the same trace as with constants, to rounding."""
     there = worlds.scaled(1.0)

@@ -86,6 +86,7 @@ def test_the_same_as_the_ordinary_filter(case):
     assert (plain.info.status == Status.OVERFLOW).any()
 
 
+@pytest.mark.sweep
 def test_a_run_does_not_depend_on_the_runs_beside_it():
     log = jax.tree.map(lambda leaf: leaf[::-1].copy(), tour()[1])
     log.scan.valid[0] = False  # beside it nothing is seen

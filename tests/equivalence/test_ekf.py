@@ -368,6 +368,7 @@ def single():
     return lambda log: jax.device_get(compiled(log))
 
 
+@pytest.mark.sweep
 def test_vmap_is_a_loop_and_one_trace_serves_all_logs(logs, single):
     mapped = jax.device_get(jax.jit(jax.vmap(runner(8)))(logs[1]))
     for i in range(3):

@@ -182,6 +182,7 @@ def test_the_command_computes_a_part(tmp_path, capsys, in_one_go):
     )
 
 
+@pytest.mark.sweep
 def test_the_job_array_of_the_documentation(tmp_path, in_one_go):
     """Its script, by processes at once in place of SLURM's jobs; one of three never comes."""
     (tmp_path / "jaxslam").write_text(f'#!/bin/sh\nexec {sys.executable} -m jaxslam "$@"\n')

@@ -192,6 +192,7 @@ def traces():
     return [jax.device_get(run(filter, log, *start, probe=definite)) for log in (single, double)]
 
 
+@pytest.mark.sweep
 def test_the_joint_covariance_is_positive_definite_at_every_step():
     """From the second step on: two noises cannot fill three dimensions of P0 = 0 in one."""
     for trace in traces():
@@ -201,6 +202,7 @@ def test_the_joint_covariance_is_positive_definite_at_every_step():
         assert everything[1:].all(), f"first at step {1 + np.argmin(everything[1:])}"
 
 
+@pytest.mark.sweep
 def test_everything_is_float32_and_agrees_with_float64_far_within_its_sigma():
     single, double = traces()
     kinds = {a.dtype for a in jax.tree.leaves(single) if np.issubdtype(a.dtype, np.floating)}

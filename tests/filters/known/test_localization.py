@@ -155,6 +155,7 @@ def test_dead_reckoning_is_the_motion_alone():
     assert not trace.estimate.alive.any()
 
 
+@pytest.mark.sweep
 def test_gradient_and_float32():
     scenario, (_, log) = world()
     short = jax.tree.map(lambda leaf: leaf[:5], log)

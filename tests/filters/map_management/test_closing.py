@@ -7,7 +7,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import refused
+from cases import refused, swept
 from reference import plane
 
 from jaxslam import association, charts, motion, sensors, slots
@@ -63,7 +63,7 @@ def look(joint, **options):
 MERGE = jax.jit(lambda joint, k, m: merge_landmarks(joint, EUCLIDEAN, k, m))
 
 
-@pytest.mark.parametrize("seed", range(3))
+@pytest.mark.parametrize("seed", swept(range(3), 0))
 def test_the_cluster_is_found_and_merged_exactly(seed):
     """The same as merging the true pairs one by one."""
     joint, of = two_visits(seed)
@@ -158,6 +158,7 @@ def test_certain_hides_what_cannot_be_foretold():
     assert int(hidden.slot[0]) == -1 and bool(hidden.is_new[0])
 
 
+@pytest.mark.sweep
 def test_a_whole_run_ends_with_each_landmark_once():
     """Eight landmarks seen, a long way blind, and the same eight again: one loop, closed once."""
     rng = np.random.default_rng(2)

@@ -357,6 +357,7 @@ def test_two_pairs_are_enough_and_fewer_change_nothing():
         chex.assert_trees_all_equal(same, joint)
 
 
+@pytest.mark.sweep
 def test_a_kidnapped_robot_finds_itself_and_goes_on():
     """Put elsewhere without a word: scans no longer fit, it is lost, it is found, it is honest."""
     chart = charts.RightInvariant()

@@ -367,6 +367,7 @@ def solved():
     return world, log, trace["batch"], unknowns, order
 
 
+@pytest.mark.sweep
 def test_the_batch_is_scipys_optimum():
     world, log, trace, unknowns, _ = solved()
     start = np.concatenate([np.zeros(30), np.asarray(world.landmarks).ravel()])
@@ -450,6 +451,7 @@ def test_smoothed_is_honest(name, step):
     assert low < nees < high
 
 
+@pytest.mark.sweep
 def test_a_batch_of_runs_ends_where_each_does():
     *_, traces = many()
     filtered = traces["smooth"].final.filtered

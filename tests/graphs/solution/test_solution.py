@@ -76,6 +76,7 @@ def test_it_tells_the_global_optimum_from_another(wrong):
         assert found.chi2 - found.gap <= best.chi2
 
 
+@pytest.mark.sweep
 def test_a_prior_is_a_gauge_and_two_are_refused():
     graph = isotropic()
     prior = graphs.Table(

@@ -163,6 +163,7 @@ def dense(found, i, j):
     return by @ cov @ by.T
 
 
+@pytest.mark.sweep
 def test_the_covariances_are_those_of_the_dense_inverse(drive, monkeypatch):
     _, found = drive
     count = len(found.poses)

@@ -5,6 +5,7 @@ import dataclasses
 import jax
 import numpy as np
 import pytest
+from cases import swept
 from ring_of_rooms import SETTINGS, driven, errors, ranges_of
 
 from jaxslam import laser_slam
@@ -65,6 +66,7 @@ def check_late(drive, k, share):
     return steps
 
 
+@pytest.mark.sweep
 def test_a_log_in_pieces_has_the_path_of_one(drive, monkeypatch):
     true, _, _ = drive
     _, whole = solved(drive)
@@ -95,27 +97,27 @@ def test_an_interrupt_ends_all_pieces(drive, monkeypatch):
     assert len(calls) < 10
 
 
-@pytest.mark.parametrize("k", [3, 10, 21, 29, 38])
+@pytest.mark.parametrize("k", swept([3, 10, 21, 29, 38], 10))
 def test_a_message_that_comes_late_moves_no_scan(drive, k):
     steps = check_late(drive, k, 0.05)
     np.testing.assert_array_equal(np.flatnonzero(steps.lags), [k])
 
 
-@pytest.mark.parametrize("k", [3, 10, 21, 29, 38])
+@pytest.mark.parametrize("k", swept([3, 10, 21, 29, 38], 10))
 def test_a_message_that_is_missing_and_comes_with_the_next_moves_no_scan(drive, k):
     """Odometry repeats a pose while the scan changes, and makes up for it: it is not lost."""
     steps = check_late(drive, k, 0.0)
     np.testing.assert_array_equal(np.flatnonzero(steps.frozen), [k])
 
 
-@pytest.mark.parametrize("share", [0.05, 0.0])
+@pytest.mark.parametrize("share", swept([0.05, 0.0], 0.05))
 @pytest.mark.parametrize("k", CORNERS)
 def test_a_turn_that_comes_late_bends_nothing(drive, k, share):
     """By its speed it cannot be told: the robot turns as fast at every corner."""
     check_late(drive, k, share)
 
 
-@pytest.mark.parametrize("k", [3, 15, 27])
+@pytest.mark.parametrize("k", swept([3, 15, 27], 15))
 @pytest.mark.parametrize("wrong", [(1.8, 0.0, 0.0), (0.0, 1.5, 0.0), (0.0, 0.0, 1.2)])
 def test_a_single_wrong_pose_of_raw_odometry_moves_no_other_scan(drive, k, wrong):
     """The scan itself may match a place that looks alike, in doubt."""
@@ -129,7 +131,7 @@ def test_a_single_wrong_pose_of_raw_odometry_moves_no_other_scan(drive, k, wrong
     assert nees(found, true, k) < 20
 
 
-@pytest.mark.parametrize("first", [4, 15, 23, 33])
+@pytest.mark.parametrize("first", swept([4, 15, 23, 33], 15))
 def test_odometry_that_is_frozen_for_some_steps_is_found_by_the_scans(drive, first):
     """What the robot drove meanwhile is lost to raw odometry for good."""
     true, log, _ = drive
@@ -159,6 +161,7 @@ def test_odometry_that_is_frozen_on_the_whole_drive(drive):
     assert found.doubted[1:].sum() >= 4 and (found.cov[1:].diagonal(axis1=1, axis2=2) > 0).all()
 
 
+@pytest.mark.sweep
 def test_frozen_and_late_steps_are_counted(drive):
     true, log, _ = drive
     step = poses.between(log.raw[:-1], log.raw[1:])
@@ -171,7 +174,7 @@ def test_frozen_and_late_steps_are_counted(drive):
     assert counts["jumps of raw odometry"] == counts["scans by raw odometry alone"] == 0
 
 
-@pytest.mark.parametrize("k", [2, 14, 22, 30])
+@pytest.mark.parametrize("k", swept([2, 14, 22, 30], 14))
 def test_a_scan_without_points_stays_where_raw_odometry_leads(drive, k):
     true, log, every = drive
     scans = jax.tree.map(np.array, every)
@@ -185,7 +188,7 @@ def test_a_scan_without_points_stays_where_raw_odometry_leads(drive, k):
     assert nees(found, true, k) < 20
 
 
-@pytest.mark.parametrize("k", [5, 16, 25])
+@pytest.mark.parametrize("k", swept([5, 16, 25], 16))
 def test_a_scan_that_matches_nothing_before_is_placed_by_what_comes_after(drive, monkeypatch, k):
     """Raw odometry is wrong at it alone. The others are as if it had no points."""
     true, log, every = drive

@@ -93,7 +93,7 @@ def composed(step, pose):
     return np.array([*c, pose[2] + step[2]])
 
 
-@pytest.mark.parametrize("k", range(2))
+@pytest.mark.parametrize("k", swept(range(2), 0))
 def test_one_step_is_that_of_numpy(found, k):
     there, j, near = partners(k)
     q = REFERENCES.position[k][j]
@@ -152,6 +152,7 @@ def test_a_corridor_is_degenerate_along_itself(found):
     assert abs(found["lines", None].pose[7, 1]) < 0.01
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize(
     "make",
     swept(
