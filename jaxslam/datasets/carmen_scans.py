@@ -264,7 +264,8 @@ def mount_of(
 
 def _beyond(off: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
     """Which poses differ from zero by more than printing and rounding do."""
-    return (np.hypot(off[:, 0], off[:, 1]) > LOOSE[0]) | (np.abs(off[:, 2]) > LOOSE[1])
+    far = (np.hypot(off[:, 0], off[:, 1]) > LOOSE[0]) | (np.abs(off[:, 2]) > LOOSE[1])
+    return np.asarray(far)
 
 
 def told(pose: Float[np.ndarray, "3"]) -> str:
