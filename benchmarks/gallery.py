@@ -1,4 +1,4 @@
-"""docs/gallery.md and its pictures: `python -m benchmarks.gallery [NAME …]`.
+"""The pictures of docs/gallery.md: `python -m benchmarks.gallery [NAME …]`.
 
 A picture is made by a script of its name in `examples/gallery/`, which binds `figure`. Those of
 data sets take a folder as their argument; where it is absent, their pictures are left as they are
@@ -6,7 +6,6 @@ data sets take a folder as their argument; where it is absent, their pictures ar
 """
 
 import argparse
-import ast
 import io
 import runpy
 import sys
@@ -19,7 +18,6 @@ from benchmarks.real_data import DATA
 
 ROOT = Path(__file__).parents[1]
 SCRIPTS, PICTURES = ROOT / "examples" / "gallery", ROOT / "benchmarks" / "figures" / "gallery"
-PAGE = ROOT / "docs" / "gallery.md"
 FOLDERS = {
     "bonn": "bonn",
     "carmen": "carmen",
@@ -29,66 +27,15 @@ FOLDERS = {
 }
 """The folder of recorded data that a script takes, by its name."""
 
-TITLED = ("filters", "methods")
-"""Folders of scripts whose names are words, not names of code."""
+PARTS = ("scenarios", "filters", "methods", "datasets")
+"""Folders of scripts, in the order of the page."""
 
 COLOURS, DOTS = 64, 110
 """Colours of a picture, and dots an inch."""
 
 
-HEAD = """# Gallery
-
-Every scenario, family of filters and data set, and a method of the sources, with one figure and
-its code. Each script is a file of `examples/gallery/` and runs alone: it binds `figure`, which
-`figure.savefig("picture.png")` writes. `python -m benchmarks.gallery` makes all figures and this
-page again, `python -m benchmarks.gallery circle` one figure. The data sets need their
-[files](guide/real_data.md).
-"""
-
-PARTS = {
-    "scenarios": """## Scenarios
-
-{py:mod}`jaxslam.simulation.scenarios` has them by name. The figures have fewer steps than the
-published experiments.
-""",
-    "filters": """## Families of filters
-
-[Choosing a filter](guide/choosing_a_filter.md) compares them. {py:mod}`jaxslam.catalog`
-has the families that run in every scenario.
-""",
-    "methods": """## Methods
-
-[Bearings and ranges](methods/bearings_and_ranges.md#delayed-initialization) describes the method of
-the library.
-""",
-    "datasets": """## Data sets
-
-{py:mod}`jaxslam.datasets` has the readers. [Real data](guide/real_data.md) lists the sources of the
-files; [Your own data](guide/own_data.md) describes how to write your own.
-""",
-}
-"""What the page says of each folder of scripts."""
-
-
-def page() -> str:
-    """The text of docs/gallery.md: each script with its picture."""
-    parts = [HEAD]
-    for kind, said in PARTS.items():
-        parts.append(said)
-        for path in sorted((SCRIPTS / kind).glob("*.py")):
-            name = path.stem
-            title = name.replace("_", " ").capitalize() if kind in TITLED else f"`{name}`"
-            about = ast.get_docstring(ast.parse(path.read_text(encoding="utf-8")))
-            argument = f"<!-- run: argument=data/{FOLDERS[name]} -->\n" if name in FOLDERS else ""
-            parts.append(
-                f"### {title}\n\n![{about}](../benchmarks/figures/gallery/{name}.png)\n\n"
-                f"{argument}```{{literalinclude}} ../examples/gallery/{kind}/{name}.py\n```\n"
-            )
-    return "\n".join(parts)
-
-
 def scripts() -> dict[str, Path]:
-    """Every script by its name: scenarios, families of filters, data sets."""
+    """Every script by its name."""
     return {path.stem: path for kind in PARTS for path in sorted((SCRIPTS / kind).glob("*.py"))}
 
 
@@ -118,7 +65,6 @@ def main() -> None:
     for name in names:
         if name not in known:
             parser.error(f"NAME: expected one of {', '.join(known)}, got {name}")
-    PAGE.write_text(page(), encoding="utf-8")
     for name in names:
         began = time.process_time()
         path = draw(name, known[name])

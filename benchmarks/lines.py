@@ -12,7 +12,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.gate import Metric
+from benchmarks.gate import Metric, show
 from jaxslam import features, filters, scenarios, sensors
 from jaxslam.consistency.measures.nees import block_nees, pose_error
 from jaxslam.core.types import Beams, Scan
@@ -96,15 +96,17 @@ def judge(name: str, runs: int, every: int) -> tuple[float, float, float]:
     of_pose = of_pose.compressed()
     ratio = nis.sum(axis=1) / dof.sum(axis=1)
     error = np.sqrt(((logs.pose - pose)[:, -1, :2] ** 2).sum(axis=1).mean())
-    print(f"{name}: {runs} runs × {steps} steps, a scan every {every}")
-    shown = {"NEES of a line (2)": of_lines, "pose NEES (3)": of_pose, "NIS/dof (1)": ratio}
-    for what, values in shown.items():
+    found = {"NEES of a line (2)": of_lines, "pose NEES (3)": of_pose, "NIS/dof (1)": ratio}
+    rows = {}
+    for what, values in found.items():
         half = t_quantile(0.975, len(values) - 1) * values.std(ddof=1) / np.sqrt(len(values))
-        print(f"  {what:20}{values.mean():8.3f} ± {half:.3f}  median {np.median(values):.3f}")
+        mean, median = f"{values.mean():.3f} ± {half:.3f}", f"{np.median(values):.3f}"
+        rows[what] = {"mean": mean, "median": median}
+    show(f"{name}: {runs} runs × {steps} steps, a scan every {every}", rows)
     share = none / (none + len(of_lines))
-    print(f"  {len(of_lines):,} lines, {share:.1%} more of no wall or in pieces, left out")
-    print(f"  final position RMSE {error:.3f} m")
-    return float(np.mean(of_lines)), float(np.mean(of_pose)), float(np.mean(ratio))
+    print(f"{len(of_lines):,} lines, {share:.1%} more of no wall or in pieces, left out")
+    print(f"final position RMSE {error:.3f} m", flush=True)
+    return tuple(float(values.mean()) for values in found.values())
 
 
 def round_walls(beams: int) -> float:

@@ -5,7 +5,8 @@ import dataclasses
 import jax
 import numpy as np
 
-from jaxslam import association, motion
+from benchmarks.association import rules
+from jaxslam import motion
 from jaxslam.consistency.campaign import monte_carlo
 from jaxslam.filters import EkfSlam
 from jaxslam.life import Existence
@@ -17,12 +18,7 @@ RUNS = 32
 REACH = 4.0
 CAPACITY = 60
 GATES = chi2_quantile(0.99, 2), chi2_quantile(0.9999, 2)
-METHODS = {
-    "nearest": association.Nearest(*GATES),
-    "maximum_likelihood": association.MaximumLikelihood(*GATES),
-    "global_nearest": association.GlobalNearest(*GATES),
-    "joint": association.JointCompatibility(0.99, GATES[1], budget=500),
-}
+METHODS = rules(*GATES, budget=500)
 ROWS = ("precision", "recall", "false_landmarks", "nees_pose", "rmse_position")
 
 

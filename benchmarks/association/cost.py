@@ -11,8 +11,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from benchmarks.association import rules
 from benchmarks.speed.timing import together
-from jaxslam import association, life, run
+from jaxslam import life, run
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Log, Scan
 from jaxslam.filters import EkfSlam
@@ -23,13 +24,7 @@ from jaxslam.filters.map_management.merging import Merging
 from jaxslam.simulation.scenarios import cloister
 
 COUNT, SEEN, RUNS = 200, 20, 16
-GATE = 9.21
-METHODS = {
-    "nearest": association.Nearest(GATE),
-    "maximum_likelihood": association.MaximumLikelihood(GATE),
-    "global_nearest": association.GlobalNearest(GATE),
-    "joint": association.JointCompatibility(0.99),
-}
+METHODS = rules(9.21)
 
 
 def problem(sensor, seed):

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from jaxslam import association
+from benchmarks.association import rules
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Scan
 from jaxslam.filters.ekf.predicted_measurements import prediction_of
@@ -25,13 +25,7 @@ from jaxslam.sensors import RangeBearing
 COUNT, SEEN, DRAWS = 14, 8, 500
 SIGMAS = np.array([0.5, 2, 4, 6, 8, 10, 12, 15, 20, 25, 30, 35, 40, 45])
 SENSOR = RangeBearing(np.diag([0.1, np.deg2rad(1.0)]) ** 2)
-GATE = chi2_quantile(0.99, 2)
-METHODS = {
-    "nearest": association.Nearest(GATE),
-    "maximum_likelihood": association.MaximumLikelihood(GATE),
-    "global_nearest": association.GlobalNearest(GATE),
-    "joint": association.JointCompatibility(0.99, budget=20_000, candidates=COUNT),
-}
+METHODS = rules(chi2_quantile(0.99, 2), budget=20_000, candidates=COUNT)
 
 
 def decide(method, sigma, key):

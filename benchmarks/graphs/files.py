@@ -10,7 +10,7 @@ are known, whether its covariances are honest.
 
 import numpy as np
 
-from benchmarks.gate import Metric
+from benchmarks.gate import Metric, show
 from benchmarks.real_data import DATA
 from jaxslam import graphs
 from jaxslam.consistency.measures.nees import pose_error
@@ -45,11 +45,7 @@ ITERATIONS = 1000
 
 
 def measure(quick: bool = False) -> list[Metric]:
-    metrics, best = [], {}
-    print(
-        "file               e     start           χ² at the start  χ² at the end    steps  "
-        "gradient / start's  status"
-    )
+    metrics, best, rows = [], {}, {}
     for name, known in KNOWN.items():
         path = FOLDER / f"{name}.g2o"
         if not path.exists():
@@ -62,13 +58,13 @@ def measure(quick: bool = False) -> list[Metric]:
                     place(read), {"relative_pose": factor}, iterations=ITERATIONS
                 )
                 solutions[start] = found
-                status = Ending(int(found.status)).name.lower()
-                slope = float(found.gradient / found.gradient_start)
-                print(
-                    f"{name:18} {error:5} {start:14} {float(found.chi2_start):16.7g} "
-                    f"{float(found.chi2):16.9g} {int(found.iterations):7}  {slope:18.1e}  {status}",
-                    flush=True,
-                )
+                rows[f"{name}, {error}, {start}"] = {
+                    "χ² at the start": f"{float(found.chi2_start):.7g}",
+                    "χ² at the end": f"{float(found.chi2):.9g}",
+                    "steps": int(found.iterations),
+                    "gradient / start's": f"{float(found.gradient / found.gradient_start):.1e}",
+                    "status": Ending(int(found.status)).name.lower(),
+                }
                 gated = error == "log" and start in ("given", "chordal") and np.isfinite(known)
                 if gated and (name, start) not in NOT_FROM:
                     off = abs(float(found.chi2) / known - 1)
@@ -78,26 +74,26 @@ def measure(quick: bool = False) -> list[Metric]:
             what = f"gradient of {name}, {error}, over that of the file"
             metrics.append(Metric(what, slope, high=1e-6))
     optima = {name: found for (name, error), found in best.items() if error == "pose"}
-    certify(optima)
+    show("every start", rows)
+    show("lowest optimum: is the chordal one next to it global?", certificates(optima))
     return metrics + judge({name: optima[name] for name in TRUE if name in optima})
 
 
-def certify(optima: dict[str, Solution]) -> None:
-    """Print what is proved of the optima, as `jaxslam optimize` does."""
-    print(
-        "\nthe lowest optimum of each file, e = pose: is the chordal optimum next to it global?\n"
-        "file                poses            χ²       chordal χ²  lower by at most  "
-        "apart [m]  apart [rad]  certified"
-    )
+def certificates(optima: dict[str, Solution]) -> dict[str, dict[str, float | str]]:
+    """What is proved of the optima, e = pose, as by `jaxslam optimize`."""
+    rows = {}
     for name, found in optima.items():
         proof = graphs.certificate(found.graph)
-        print(
-            f"{name:18} {len(found.graph.poses):6} {float(found.chi2):13.9g}    "
-            f"{float(proof.chi2):13.9g}  "
-            f"{float(proof.gap):16.2g}  {float(proof.position):9.2g}  "
-            f"{float(proof.heading):11.2g}  {'yes' if proof.certified else 'no'}",
-            flush=True,
-        )
+        rows[name] = {
+            "poses": len(found.graph.poses),
+            "χ²": f"{float(found.chi2):.9g}",
+            "chordal χ²": f"{float(proof.chi2):.9g}",
+            "lower by at most": f"{float(proof.gap):.2g}",
+            "apart [m]": f"{float(proof.position):.2g}",
+            "apart [rad]": f"{float(proof.heading):.2g}",
+            "certified": "yes" if proof.certified else "no",
+        }
+    return rows
 
 
 def judge(optima: dict[str, Solution]) -> list[Metric]:

@@ -26,7 +26,7 @@ import gtsam
 import jax
 import numpy as np
 
-from benchmarks.gate import Metric
+from benchmarks.gate import Metric, show
 from benchmarks.graphs import peer
 from benchmarks.graphs.worlds import at
 from benchmarks.real_data import DATA
@@ -61,30 +61,35 @@ def of_gtsam(graph, kind="GaussNewton"):
 
 def one_graph(name: str, high: float, repeats: int) -> list[Metric]:
     graph = graphs.with_gauge(graphs.read(DATA / "graphs" / f"{name}.g2o"))
-    planning, plan = processor_seconds(lambda: graphs.plan(graph, FACTORS))
+    plan = graphs.plan(graph, FACTORS)
 
     def ours():
-        return graphs.optimize(graph, FACTORS, plan=plan, tolerance=TOLERANCE)
+        seconds, found = processor_seconds(
+            lambda: graphs.optimize(graph, FACTORS, plan=plan, tolerance=TOLERANCE)
+        )
+        return seconds, float(found.chi2), int(found.iterations)
 
-    first, _ = processor_seconds(ours)
-    theirs = {"LM": of_gtsam(graph, "LevenbergMarquardt"), "GN": of_gtsam(graph)}
-    rows = [
-        (processor_seconds(ours), {key: solve() for key, solve in theirs.items()})
-        for _ in range(repeats)
-    ]
-    own = np.median([mine[0] for mine, _ in rows])
-    found = rows[-1][0][1]
-    print(f"{name}: plan {planning:.2f} s, first call {first:.2f} s")
-    steps, chi2 = int(found.iterations), float(found.chi2)
-    print(f"  jaxslam {1e3 * own:8.1f} ms, {steps} steps, χ² {chi2:.6f}")
-    metrics = []
-    for key in theirs:
-        seconds = np.median([other[key][0] for _, other in rows])
-        _, chi2, steps = rows[-1][1][key]
-        print(f"  GTSAM {key} {1e3 * seconds:6.1f} ms, {steps} steps, χ² {chi2:.6f}")
-        metrics.append(Metric(f"{name}: time / GTSAM's {key}", own / seconds, high=high))
-        off = float(found.chi2) / chi2 - 1
-        metrics.append(Metric(f"{name}: χ² / GTSAM's {key} - 1", off, high=1e-6))
+    ours()  # compiles
+    solvers = {
+        "jaxslam": ours,
+        "GTSAM's LM": of_gtsam(graph, "LevenbergMarquardt"),
+        "GTSAM's GN": of_gtsam(graph),
+    }
+    turns = [{who: solve() for who, solve in solvers.items()} for _ in range(repeats)]
+    rows = {
+        who: {
+            "ms": 1e3 * np.median([turn[who][0] for turn in turns]),
+            "χ²": turns[-1][who][1],
+            "steps": turns[-1][who][2],
+        }
+        for who in solvers
+    }
+    show(name, rows)
+    own, metrics = rows.pop("jaxslam"), []
+    for who, row in rows.items():
+        off = own["χ²"] / row["χ²"] - 1
+        metrics.append(Metric(f"{name}: time / {who}", own["ms"] / row["ms"], high=high))
+        metrics.append(Metric(f"{name}: χ² / {who} - 1", off, high=1e-6))
     return metrics
 
 
@@ -107,7 +112,7 @@ def many_graphs(repeats: int) -> list[Metric]:
         )(batch)
 
     batch = jax.device_put(batch)
-    first, found = processor_seconds(lambda: ours(batch))
+    found = jax.block_until_ready(ours(batch))
     single = [graph._replace(tables={"relative_pose": table._replace(z=rows)}) for rows in z]
     theirs = [of_gtsam(one) for one in single]
     own, other, off = [], [], []
@@ -116,9 +121,8 @@ def many_graphs(repeats: int) -> list[Metric]:
         solved = [solve() for solve in theirs]
         other.append(sum(row[0] for row in solved))
         off.append(np.max(np.asarray(found.chi2) / [row[1] for row in solved] - 1))
-    print(f"ring: {MANY} graphs, first call {first:.2f} s, statuses {np.bincount(found.status)}")
-    print(f"  jaxslam {MANY / np.median(own):8.0f} graphs a second and core")
-    print(f"  GTSAM GN {MANY / np.median(other):7.0f} graphs a second and core")
+    rates = f"{MANY / np.median(own):.0f}, GTSAM {MANY / np.median(other):.0f}"
+    print(f"ring: graphs a second and core: {rates}; statuses {np.bincount(found.status)}")
     gained = np.median(np.array(other) / own)
     return [
         Metric("ring: graphs a second and core / GTSAM's", gained, low=2.5),

@@ -5,8 +5,9 @@ import dataclasses
 import jax
 import numpy as np
 
-from benchmarks.gate import Metric
+from benchmarks.gate import Metric, show
 from jaxslam import Campaign, filters, laser_slam, monte_carlo, recorded_world, scenarios, sensors
+from jaxslam.consistency.measures.nees import pose_error
 from jaxslam.core.types import Log, Scan
 from jaxslam.laser.laser_slam import ScanLog, Settings, covariances
 from jaxslam.laser.laser_slam.odometry import raw
@@ -20,9 +21,9 @@ EVERY = 4
 SETTINGS = Settings(beams=90, max_range=8.0, key_distance=0.3, loop_gap=15, submap_every=2)
 
 
-def logs(runs: int, beams: int = 90):
+def logs(runs: int):
     """Pairs (true poses, log)."""
-    world = scenarios.office(beams=beams)
+    world = scenarios.office(beams=90)
     for seed in range(runs):
         history = jax.tree.map(np.asarray, scan_world(world, jax.random.key(seed)))
         speed, turn, interval = history.control.T
@@ -66,6 +67,10 @@ def nees(error: np.ndarray, cov: np.ndarray) -> np.ndarray:
     return np.einsum("ki,kij,kj->k", error, np.linalg.inv(cov), error)
 
 
+def rmse_of(path: np.ndarray, true: np.ndarray) -> float:
+    return float(np.sqrt(((path - true)[:, :2] ** 2).sum(axis=1).mean()))
+
+
 def steps_of(odometry, true):
     """NEES of each match relative to its keyframe."""
     rows = np.flatnonzero(odometry.matched)
@@ -96,28 +101,27 @@ def measure(runs: int) -> list[Metric]:
             found.setdefault(f"{name}: the path", []).append(path_of(odometry, true))
             pair = laser_slam.match_controls(odometry), true[odometry.keyframe]
             records.setdefault(name, []).append(pair)
-            off = np.hypot(*(odometry.poses - true)[:, :2].T)
-            position.setdefault(name, []).append(np.sqrt((off**2).mean()))
+            position.setdefault(name, []).append(rmse_of(odometry.poses, true))
         solved = laser_slam.solve(log, SETTINGS)
         # The marginals are of coordinates; the first pose is certain.
         keys = solved.keyframe[1:]
-        error = solved.poses[keys] - true[keys]
-        error[:, 2] = poses.wrapped(error[:, 2])
+        error = pose_error(solved.poses[keys], true[keys])
         found.setdefault("graph with loops: the path", []).append(nees(error, solved.cov[keys]))
-        off = np.hypot(*(solved.poses - true)[:, :2].T)
-        position.setdefault("graph with loops", []).append(np.sqrt((off**2).mean()))
+        position.setdefault("graph with loops", []).append(rmse_of(solved.poses, true))
         chi2.append(solved.chi2 / max(solved.dof, 1))
         closures.append(laser_slam.closure_score(solved, true, gap=SETTINGS.loop_gap))
-    print("office, NEES (3 is honest)    mean of runs      median of all    RMSE of position [m]")
-    metrics = []
+    metrics, rows = [], {}
     for name, runs_of in found.items():
         means = np.array([each.mean() for each in runs_of])
         half = 1.96 * means.std(ddof=1) / np.sqrt(len(means)) if len(means) > 1 else np.nan
-        middle = np.median(np.concatenate(runs_of))
-        where = name.split(":")[0]
-        rmse = "" if name.endswith("match") else f"{np.mean(position[where]):.3f}"
-        print(f"{name:28}  {means.mean():7.2f} ± {half:5.2f}  {middle:12.2f}    {rmse:>12}")
+        rmse = "" if name.endswith("match") else f"{np.mean(position[name.split(':')[0]]):.3f}"
+        rows[name] = {
+            "mean of runs": f"{means.mean():.2f} ± {half:.2f}",
+            "median of all": f"{np.median(np.concatenate(runs_of)):.2f}",
+            "RMSE of position [m]": rmse,
+        }
         metrics.append(Metric(f"office, NEES, {name}", means.mean(), note="3 is honest"))
+    show("office, NEES (3 is honest)", rows)
     for name, of in records.items():
         ekf = campaign(of).filters["ekf"]
         pose, position = (ekf.measures[what] for what in ("nees_pose", "rmse_position"))

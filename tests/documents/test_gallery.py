@@ -41,11 +41,15 @@ def test_every_scenario_family_and_data_set_has_a_script():
 
 
 def test_the_page_shows_every_script_with_its_picture():
-    text = gallery.page()
-    assert gallery.PAGE.read_text(encoding="utf-8") == text
+    """In the order of the folders, the docstring of a script as the picture's description."""
+    text = (ROOT / "docs" / "gallery.md").read_text(encoding="utf-8")
     included = re.findall(r"\{literalinclude\} \.\./examples/gallery/\w+/(\w+)\.py", text)
-    shown = re.findall(r"\]\(\.\./benchmarks/figures/gallery/(\w+)\.png\)", text)
-    assert included == shown == list(SCRIPTS)
+    shown = re.findall(r"!\[(.*)\]\(\.\./benchmarks/figures/gallery/(\w+)\.png\)", text)
+    said = [ast.get_docstring(ast.parse(path.read_text())) for path in SCRIPTS.values()]
+    assert shown == list(zip(said, SCRIPTS, strict=True))
+    assert included == list(SCRIPTS)
+    given = re.findall(r"argument=data/(\w+) -->\n.*/(\w+)\.py", text)
+    assert [(gallery.FOLDERS[name], name) for name in SCRIPTS if name in gallery.FOLDERS] == given
 
 
 @pytest.mark.parametrize("name", SCRIPTS)
