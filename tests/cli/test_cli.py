@@ -200,3 +200,18 @@ def test_a_closed_pipe_ends_the_command_silently(tmp_path, monkeypatch, capfd):
         patch.setattr(cli.verify, "verify_models", lambda *a: print("report") or 0)
         assert cli.main(["verify", "--out", str(tmp_path)]) == 141
     assert capfd.readouterr().err == ""
+
+
+@pytest.mark.parametrize(
+    ("given", "called"),
+    [
+        ("run --dataset carmen a.log --mount -1,0,90", "slam a.log --mount -1,0,90"),
+        ("run a.log --relations r --dataset=carmen", "slam a.log --relations r"),
+        ("run --dataset carmen a.log --map known --every 2", "map a.log --every 2"),
+        ("run --dataset carmen a.log --localize m.yaml", "localize m.yaml a.log"),
+        ("run --dataset table carmen", "run --dataset table carmen"),
+        ("slam carmen", "slam carmen"),
+    ],
+)
+def test_run_of_a_laser_log_is_a_command_of_its_own(given, called):
+    assert cli._laser_command(given.split()) == called.split()
