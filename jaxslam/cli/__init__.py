@@ -108,6 +108,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
         as_folders(options)
         # By default a GPU rounds the factors of a float32 matrix product to 11 bits (TF32).
         jax.config.update("jax_default_matmul_precision", "highest")
+        # Lowering without the Python frames of each operation takes a fifth less time.
+        jax.config.update("jax_traceback_in_locations_limit", 0)
         if hasattr(options, "devices"):
             set_device_count(options.devices)
         else:
