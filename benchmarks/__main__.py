@@ -56,7 +56,7 @@ BENCHMARKS = {
     "lines": "lines",
     "scaling": "scaling",
     "seif": "seif",
-    "comparison": "comparison",
+    "comparison": "campaigns:comparison",
     "soak": "soak",
     "kill": "kill",
     "fuzz": "commands:fuzz",

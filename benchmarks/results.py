@@ -86,9 +86,8 @@ def page() -> str:
     parts = [HEAD]
     for path in sorted(RECORDS.glob("*.json")):
         record = json.loads(path.read_text(encoding="utf-8"))
-        versions = record["versions"].split(", numpy")[0]
-        made = ", ".join((record["date"], record["processor"], versions))
-        parts.append(f"## {path.stem}\n\n{made}\n")
+        _, jax, _ = record["versions"].split(", ")
+        parts.append(f"## {path.stem}\n\n{record['date']}, {record['processor']}, {jax}\n")
         rows = [[m["name"], f"{m['value']:.4g}", gate(**m), m["note"]] for m in record["metrics"]]
         for row in rows:  # cells left empty at the end of a row need no border
             while not row[-1]:

@@ -20,6 +20,7 @@ import numpy as np
 from benchmarks.gate import Metric
 from jaxslam import filters, motion, sensors
 from jaxslam.core.types import Log, Scan
+from jaxslam.math.numpy_poses import wrapped
 
 KEY = jax.random.key(0)
 SEEN, PARTICLES = 10, 100
@@ -40,8 +41,7 @@ def ring(count: int, steps: int) -> tuple[np.ndarray, Log]:
         pose = pose + [forward * np.cos(pose[2]), forward * np.sin(pose[2]), turn]
         away = points - pose[:2]
         tag = np.sort(np.argsort(np.hypot(*away.T))[:SEEN])
-        bearing = np.arctan2(away[tag, 1], away[tag, 0]) - pose[2]
-        bearing = (bearing + np.pi) % (2 * np.pi) - np.pi
+        bearing = wrapped(np.arctan2(away[tag, 1], away[tag, 0]) - pose[2])
         z.append(np.stack([np.hypot(*away[tag].T), bearing], axis=1))
         tags.append(tag)
     valid = np.ones((steps, SEEN), bool)

@@ -55,7 +55,7 @@ def measure(quick: bool = False) -> list[Metric]:
         ("three, blind", team, apart, 3),
         ("three", team, log, 3),
     ):
-        (final, info, (_, covs, there)), seconds = through(filter, data, given, robots)
+        (final, info, (_, covs, *there)), seconds = through(filter, data, given, robots)
         fused = info.status == Status.FUSED
         met = fused & ~own
         nis = float(np.where(fused, info.nis, 0.0).sum() / info.dof.sum())
@@ -81,7 +81,7 @@ def measure(quick: bool = False) -> list[Metric]:
     print(f"sightings are off by {mean[0]:.3f} ± {spread[0]:.3f} m", end=", ")
     print(f"{mean[1]:.4f} ± {spread[1]:.4f} rad")
     for b in (1, 2):
-        row = int(np.argmax(there[:, b]))
+        row = int(np.argmax(there[0][:, b]))
         began = data.time[row] - data.time[0]
         print(f"robot {b + 1} is in the map from row {row}, {began:.2f} s on")
     return metrics

@@ -6,12 +6,11 @@ turns; the fastest pass of each counts.
 
 # ruff: noqa: E402
 import json
-import shutil
 import subprocess
 import tempfile
 from pathlib import Path
 
-from benchmarks.speed.timing import pin, together
+from benchmarks.speed.timing import compiled_cpp, pin, together
 
 pin()
 
@@ -61,39 +60,30 @@ def measure(name, grid, max_range):
         rays = grids.ray_map(single, method=kind, skip=skip)
         actions[method] = lambda r=rays: grids.cast(r, pose, beams, max_range).block_until_ready()
         means[method] = float(jnp.mean(actions[method]()))
+    inside = []
     with tempfile.TemporaryDirectory() as folder:
-        paths = [str(Path(folder) / part) for part in ("limit", "map", "rays")]
-        if shutil.which("g++"):
-            source = Path(__file__).with_name("limit.cpp")
-            flags = ["-O3", "-march=native", "-ffast-math"]
-            subprocess.run(["g++", *flags, str(source), "-o", paths[0]], check=True)
-            (np.asarray(grid.log_odds) > 0).astype(np.uint8).tofile(paths[1])
-            each = np.column_stack(
-                [np.repeat(cells, BEAMS, axis=0), (heading[:, None] + angles).ravel()]
-            )
-            each.tofile(paths[2])
-            height, width = grid.log_odds.shape
-            limit = max_range / float(grid.resolution)
-            numbers = [str(n) for n in (width, height)], [str(n) for n in (len(each), limit, 1)]
-            inside = []
+        program = compiled_cpp(Path(__file__).with_name("limit.cpp"), folder)
+        occupied, given = (str(Path(folder) / part) for part in ("map", "rays"))
+        (np.asarray(grid.log_odds) > 0).astype(np.uint8).tofile(occupied)
+        each = np.repeat(cells, BEAMS, axis=0), (heading[:, None] + angles).ravel()
+        np.column_stack(each).tofile(given)
+        height, width = grid.log_odds.shape
+        size, limit = POSES * BEAMS, max_range / float(grid.resolution)
+        command = [program, occupied, str(width), str(height), given, str(size), str(limit), "1"]
 
-            def cpp():
-                command = [paths[0], paths[1], *numbers[0], paths[2], *numbers[1]]
-                out = subprocess.run(command, check=True, capture_output=True, text=True).stdout
-                inside.append([float(word) for word in out.split()])
+        def cpp():
+            out = subprocess.run(command, check=True, capture_output=True, text=True).stdout
+            inside.append([float(word) for word in out.split()])
 
-            actions["C++"] = cpp
-        seconds = together(actions)
+        seconds = together(actions | {"C++": cpp})
     found = {
         f"{method}, {name} [million rays/s]": POSES * BEAMS / 1e6 / seconds[method]
         for method in METHODS
     }
-    if "C++" in actions:
-        best, mean = min(row[0] for row in inside), float(grid.resolution) * inside[0][1]
-        found[f"C++, {name} [million rays/s]"] = POSES * BEAMS / 1e6 / best
-        for method in METHODS:
-            found[f"C++ / {method}, time, {name}"] = best / seconds[method]
-        found[f"mean range by C++ - cells, {name} [m]"] = mean - means["cells"]
+    best, mean = min(row[0] for row in inside), float(grid.resolution) * inside[0][1]
+    found[f"C++, {name} [million rays/s]"] = POSES * BEAMS / 1e6 / best
+    found |= {f"C++ / {method}, time, {name}": best / seconds[method] for method in METHODS}
+    found[f"mean range by C++ - cells, {name} [m]"] = mean - means["cells"]
     return found
 
 

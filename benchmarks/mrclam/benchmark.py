@@ -207,7 +207,7 @@ def measure(quick: bool = False) -> list[Metric]:
     scale = float(np.std([each.robot.forward for each in own.values()], ddof=1))
     print(f"\nscale: standard deviation {scale:.4f}, that of `forward` over the own logs")
     print("\n| " + " | ".join(COLUMNS) + " |\n|" + " --- |" * len(COLUMNS))
-    kinds = {"EKF": None, "invariant EKF": charts.RightInvariant()}
+    kinds = {"EKF": charts.Euclidean(), "invariant EKF": charts.RightInvariant()}
     estimators = {
         "invariant EKF": partial(ekf, chart=kinds["invariant EKF"]),
         "smoother": smoother,

@@ -1,13 +1,10 @@
-"""Timing on one core: what a compiled function costs, and a C++ program beside it."""
+"""Timing on one core, and C++ programs to time beside."""
 
 import os
-import shutil
 import subprocess
-import tempfile
 import time
 from pathlib import Path
 
-SOURCE = Path(__file__).with_name("ekf_limit.cpp")
 REPEATS = 5
 
 
@@ -36,19 +33,9 @@ def together(actions: dict, repeats: int = REPEATS) -> dict[str, float]:
     return {name: min(each) for name, each in times.items()}
 
 
-class Limit:
-    """The hand-written program, compiled here for one precision; None where there is no g++."""
-
-    def __init__(self, dtype: str) -> None:
-        self.folder = tempfile.TemporaryDirectory()
-        self.program = Path(self.folder.name) / "limit"
-        flags = ["-O3", "-march=native", "-ffast-math"]
-        flags += ["-DREAL=float"] if dtype == "float32" else []
-        self.there = shutil.which("g++") is not None
-        if self.there:
-            command = ["g++", *flags, str(SOURCE), "-o", str(self.program)]
-            subprocess.run(command, check=True)
-
-    def run(self, runs: int) -> None:
-        command = [str(self.program), str(runs), "200", "7"]  # steps; columns a side
-        subprocess.run(command, check=True, stdout=subprocess.DEVNULL)
+def compiled_cpp(source: Path, folder: str, *flags: str) -> str:
+    """The program of a C++ file, made in a folder."""
+    program = str(Path(folder) / source.stem)
+    options = ["-O3", "-march=native", "-ffast-math", *flags]
+    subprocess.run(["c++", *options, str(source), "-o", program], check=True)
+    return program
