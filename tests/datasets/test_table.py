@@ -279,7 +279,7 @@ def test_a_file_that_is_missing_or_no_text_is_named(tmp_path, name):
         ("[robot]\nmass = 1", ":1: robot: expected one of name, source, motion, sensor, filter"),
         ("filter = 3", ":1: filter: expected a section [filter]"),
         ("# mine\n[sensor]\n[motion]\nnoise = [1]", ":4: [motion] noise: expected 2 numbers"),
-        ("[motion\n", "cannot be read: Expected ']'"),
+        ("[motion\n", "expected TOML: Expected ']'"),
     ],
 )  # fmt: skip
 def test_bad_settings_are_named(tmp_path, toml, reason):
