@@ -4,6 +4,8 @@ A run is a number: its key and its place in a block. For one size of blocks and 
 devices its world and its filters' results are the same to the bit, for any workers, parts and
 interruptions; otherwise to rounding. Only scores are kept of a block, so
 memory is that of the blocks in flight however many runs there are.
+
+On a GPU particle filters agree to rounding alone (`docs/guide/campaigns.md`).
 """
 
 import time
