@@ -22,6 +22,7 @@ BENCHMARKS = {
     "compile": "compile",
     "speed": "speed.benchmark",
     "accelerator": "accelerator",
+    "engines": "engines",
     "gradient": "gradient",
     "film": "film",
     "verdict": "verdict",

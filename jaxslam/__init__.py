@@ -24,7 +24,7 @@ from jaxslam import (
     sensors,
 )
 from jaxslam.consistency import metrics
-from jaxslam.consistency.campaign import Campaign, Interrupted, monte_carlo
+from jaxslam.consistency.campaign import Campaign, Incomplete, Interrupted, monte_carlo
 from jaxslam.core import protocols, slots, types
 from jaxslam.core._field_docs import attach_field_docs
 from jaxslam.filters.multi_robot import team
@@ -41,6 +41,7 @@ from jaxslam.verify.linearity import linearity_index
 
 __all__ = [
     "Campaign",
+    "Incomplete",
     "Interrupted",
     "Scenario",
     "TeamWorld",

@@ -4,4 +4,5 @@ import sys
 
 from jaxslam.cli import main
 
-sys.exit(main())
+if __name__ == "__main__":  # the workers of mpi4py.futures import this module under another name
+    sys.exit(main())

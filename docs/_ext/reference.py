@@ -64,7 +64,7 @@ OPEN = {
         "Summary Verdict conditional_bound covering_level credibility judge "
         "judge_localization posterior_bound register score summarize_localization"
     ),
-    "jaxslam.consistency.campaign": "Keep",
+    "jaxslam.consistency.campaign": "Keep Processes",
     "jaxslam.consistency.metrics": (
         "Errors MeanAndStd PathErrors Relations Statistics align_map alignment ate "
         "benchmark_figures given map_entropy relation_errors relations revisits rpe "

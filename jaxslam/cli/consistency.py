@@ -20,9 +20,10 @@ from jaxslam.cli.campaign import (
     open_store,
     spec_of,
 )
-from jaxslam.cli.common import INTERRUPTED, OUT, add_animate, add_figures, film_files
+from jaxslam.cli.common import FAILED, INTERRUPTED, OUT, add_animate, add_figures, film_files
+from jaxslam.cli.engines import engine
 from jaxslam.cli.user_objects import UserObjects
-from jaxslam.consistency.campaign import Campaign, Interrupted, monte_carlo
+from jaxslam.consistency.campaign import Campaign, Incomplete, Interrupted, monte_carlo
 from jaxslam.consistency.campaign.candidates import estimator_of, fitting_block, rounded
 from jaxslam.core.protocols import Candidate
 from jaxslam.results import campaign_files
@@ -93,6 +94,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="compute only part I of N of the runs, as 3/16, in a folder that independent jobs "
         "share; --resume then sums up, and computes what is missing",
     )
+    parser.add_argument(
+        "--executor",
+        metavar="ENGINE",
+        help="compute the blocks elsewhere: processes:N, here; dask://HOST:PORT, on the workers of "
+        "a Dask scheduler; mpi, on the ranks of mpiexec (mpi4py.futures)",
+    )
     parser.set_defaults(command=consistency)
 
 
@@ -100,6 +107,8 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     """Run a campaign, print its table and write its files; returns the exit status."""
     # Worlds are drawn in float64 whatever the filters compute in, so both precisions see the same.
     jax.config.update("jax_enable_x64", True)
+    if options.executor is not None and options.devices != "all":
+        raise ValueError("--executor: each worker has one device: expected no --devices with it")
     spec = spec_of(options)
     asked, part, user = spec.campaign, spec.part, UserObjects()
     scenario = user.scenario(asked.scenario, asked.steps)
@@ -113,29 +122,34 @@ def consistency(options: argparse.Namespace, command: str) -> int:
     keep = open_store(spec)
     earlier = None if part else earlier_results(spec.out, keep)
     try:
-        with user.located_errors():
+        with user.located_errors(), engine(options.executor) as (executor, workers):
             campaign = monte_carlo(
                 scenario,
                 filters,
                 asked.runs,
                 jax.random.key(asked.seed),
                 block=spec.block,
-                devices=spec.devices,
+                devices=None if executor else spec.devices,
+                workers=workers,
                 bound=asked.bound,
                 dtype=asked.dtype,
                 keep=keep,
                 part=part,
+                executor=executor,
             )
     except BaseException as stop:
         if part is None and not keep.spans():  # other jobs may save some
             shutil.rmtree(keep.folder, ignore_errors=True)
             with contextlib.suppress(OSError):  # it has other files, as results
                 spec.out.rmdir()
-        if not isinstance(stop, Interrupted) or stop.campaign is None:
+        if isinstance(stop, Incomplete) and stop.campaign is None:
+            raise ValueError(stop) from stop
+        if not isinstance(stop, Interrupted | Incomplete) or stop.campaign is None:
             raise
         print(stop.campaign)
-        print(f"\njaxslam: interrupted, {stop}; --resume {spec.out} continues it", file=sys.stderr)
-        return INTERRUPTED
+        what = "interrupted, " if isinstance(stop, Interrupted) else ""
+        print(f"\njaxslam: {what}{stop}; --resume {spec.out} continues it", file=sys.stderr)
+        return INTERRUPTED if what else FAILED
     for sentence in keep.set_aside:
         print(f"jaxslam: {sentence}", file=sys.stderr)
     if part is not None:

@@ -9,13 +9,11 @@ from functools import partial
 
 from jaxslam import motion, sensors, verify
 from jaxslam.cli import cache
-from jaxslam.cli.common import add_out
+from jaxslam.cli.common import FAILED, add_out
 from jaxslam.consistency.campaign.progress import Progress
 from jaxslam.laser.grids import beam_models
 from jaxslam.results.files import check_writable, json_text, versions, write_files
 from jaxslam.verify.inputs import user_files
-
-FAILED = 1
 
 
 def verify_models(options: argparse.Namespace, command: str) -> int:

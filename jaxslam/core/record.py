@@ -53,7 +53,23 @@ def record(cls: type[_T]) -> type[_T]:
     made = dataclasses.dataclass(frozen=True, eq=False, repr=of_fields)(cls)
     if of_fields:
         made._repr_of_fields = made.__repr__  # type: ignore[attr-defined]
-    fields = dataclasses.fields(made)  # type: ignore[arg-type]
+    made.__reduce__ = lambda self: (_unpickled, (type(self), self.__dict__))  # type: ignore[method-assign]
+    _register(made)
+    return made
+
+
+def _unpickled(cls: type, values: dict[str, Any]) -> Any:
+    """The record of a class, which a pickle by value, as cloudpickle's, has made anew."""
+    made: Any = object.__new__(cls)
+    made.__dict__.update(values)
+    if jax.tree_util.all_leaves([made]):
+        _register(cls)
+    return made
+
+
+def _register(made: type) -> None:
+    """Make a class of records known to JAX."""
+    fields = dataclasses.fields(made)
     leaves = tuple(field.name for field in fields if not field.metadata.get("static"))
     statics = tuple(field.name for field in fields if field.metadata.get("static"))
     keys = tuple(jax.tree_util.GetAttrKey(name) for name in leaves)
@@ -67,13 +83,12 @@ def record(cls: type[_T]) -> type[_T]:
         return zip(keys, children, strict=True), structure
 
     def unflatten(structure: tuple[Any, ...], children: Iterable[Any]) -> Any:
-        rebuilt = object.__new__(made)
+        rebuilt: Any = object.__new__(made)
         rebuilt.__dict__.update(zip(leaves, children, strict=True))
         rebuilt.__dict__.update(zip(statics, structure, strict=True))
         return rebuilt
 
     jax.tree_util.register_pytree_with_keys(made, flatten_with_keys, unflatten, flatten)
-    return made
 
 
 def is_record(value: object) -> bool:

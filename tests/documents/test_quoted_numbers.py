@@ -21,6 +21,7 @@ CITED = r"--record --only (\w+)"
 GIVEN = {
     "docs/background/limits.md": {"3.11", "0.10"},  # versions of Python and jaxlib
     "docs/guide/animation.md": {"100"},  # frames
+    "docs/guide/beyond_one_machine.md": {"3.13", "2026.8", "4.1", "22.05"},  # versions
     "docs/guide/campaigns.md": {"200"},  # steps
     "docs/guide/consistency.md": {"0.95"},  # a coverage
     "docs/guide/differentiating.md": {"200"},  # steps

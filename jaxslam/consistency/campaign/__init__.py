@@ -3,6 +3,7 @@
 from jaxslam.consistency.campaign.harness import monte_carlo
 from jaxslam.consistency.campaign.kept import Keep
 from jaxslam.consistency.campaign.pieces import missing
-from jaxslam.consistency.campaign.record import Campaign, Interrupted
+from jaxslam.consistency.campaign.record import Campaign, Incomplete, Interrupted
+from jaxslam.consistency.campaign.remote import Processes
 
-__all__ = ["Campaign", "Interrupted", "Keep", "missing", "monte_carlo"]
+__all__ = ["Campaign", "Incomplete", "Interrupted", "Keep", "Processes", "missing", "monte_carlo"]

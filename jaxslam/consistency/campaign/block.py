@@ -4,6 +4,7 @@ import time
 from collections.abc import Hashable, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -65,6 +66,19 @@ class CampaignPlan:
         return self.bound or own_draw or world.spurious is not None
 
 
+class BlockResult(NamedTuple):
+    """What a block of runs gives."""
+
+    scores: dict[str, dict[str, np.ndarray]]
+    """condensed scores by filter"""
+    first: dict[str, tuple[Truth, Estimate]]
+    """run 0 by filter, of the block that has it"""
+    seconds: dict[str, float]
+    """wall time of a run of each filter on a device [s]"""
+    compile_seconds: float
+    """wall time in which the programs were compiled, for this and other blocks [s]"""
+
+
 class BlockRunner:
     """Compiles the programs of a plan where it is made, and computes its blocks."""
 
@@ -80,10 +94,6 @@ class BlockRunner:
         self._filters: dict[str, Candidate] = {
             name: jax.device_put(as_record(one), everywhere) for name, one in plan.filters.items()
         }
-        self.first: dict[str, tuple[Truth, Estimate]] = {}
-        """run 0 of each filter, once its block has run"""
-        self._spent: dict[str, list[float]] = {name: [] for name in plan.filters}
-        """wall seconds of each finished block"""
         began = time.perf_counter()
         self._compile()
         self.compile_seconds = time.perf_counter() - began
@@ -144,8 +154,8 @@ class BlockRunner:
         rounding = 1000 * float(jnp.finfo(dtype).eps) * reach
         return np.asarray(max(5 * max(variance, 0.0) ** 0.5, rounding), dtype)
 
-    def block(self, first: int, runs: int) -> dict[str, dict[str, np.ndarray]]:
-        """The condensed scores of runs first … first + runs - 1 by filter, all within a block."""
+    def block(self, first: int, runs: int) -> BlockResult:
+        """The result of runs first … first + runs - 1, all within a block."""
         plan, made = self.plan, self.programs
         # The number of a run sets its place in a block, in any piece: the same bits.
         base = first // plan.wide * plan.wide
@@ -153,15 +163,16 @@ class BlockRunner:
         which = self._numbers(base)
         draws: Draws = jax.block_until_ready(made.draw(self._world, self._key, which))
         truth = jax.device_get(draws[0])
-        out = {}
+        out: dict[str, dict[str, np.ndarray]] = {}
+        run_0, seconds = {}, {}
         for name, one in self._filters.items():
             began = time.perf_counter()
             results: FilterResults = jax.block_until_ready(
                 made.drive(self._world, one, self._key, which, draws)
             )
-            self._spent[name].append(time.perf_counter() - began)
+            seconds[name] = (time.perf_counter() - began) / plan.block
             if first == 0:
-                self.first[name] = (
+                run_0[name] = (
                     jax.tree.map(lambda leaf: leaf[0], truth),
                     jax.tree.map(lambda leaf: first_run(leaf, 1), results.estimate),
                 )
@@ -171,7 +182,7 @@ class BlockRunner:
         if plan.bound:
             bound = jax.device_get(made.bound(self._world, self._key, which, draws))
             out[BOUND] |= condensed_sums({name: rows[mine] for name, rows in bound.items()})
-        return out
+        return BlockResult(out, run_0, seconds, self.compile_seconds)
 
     def _score(self, results: FilterResults, drawn: Truth, truth: Truth, mine: slice) -> Score:
         """The scores of the runs mine. drawn: the truth on the devices, truth: on the host."""
@@ -181,14 +192,6 @@ class BlockRunner:
         chart_error = np.swapaxes(jax.device_get(results.own_error), 0, 1)
         trace = _on_host(results)
         return score(*jax.tree.map(lambda leaf: leaf[mine], (trace, truth, found, chart_error)))
-
-    def run_seconds(self) -> dict[str, float]:
-        """The time of one run on one device, by filter: the median over finished blocks."""
-        return {
-            name: float(np.median(times)) / self.plan.block
-            for name, times in self._spent.items()
-            if times
-        }
 
 
 def first_run(leaf: jax.Array, axis: int = 0) -> np.ndarray:

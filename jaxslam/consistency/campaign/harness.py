@@ -29,7 +29,8 @@ from jaxslam.consistency.campaign.candidates import (
 from jaxslam.consistency.campaign.identity import identity
 from jaxslam.consistency.campaign.kept import Keep, add_kept
 from jaxslam.consistency.campaign.pieces import check_part, cores, in_part, missing
-from jaxslam.consistency.campaign.record import Campaign, Interrupted
+from jaxslam.consistency.campaign.record import Campaign, Incomplete, Interrupted
+from jaxslam.consistency.campaign.remote import Executor
 from jaxslam.consistency.campaign.work import Work, shown_progress
 from jaxslam.core.numbers import check_count, check_key
 from jaxslam.core.protocols import Candidate
@@ -51,6 +52,7 @@ def monte_carlo(
     keep: Keep | None = None,
     part: tuple[int, int] | None = None,
     progress: Callable[[int, int], None] | Literal[False] | None = None,
+    executor: Executor | None = None,
 ) -> Campaign:
     """Run every filter over the same `runs` worlds of a scenario and sum up its consistency.
 
@@ -64,7 +66,7 @@ def monte_carlo(
             with a warning.
         devices: default all of `jax.local_devices()`.
         workers: blocks in flight at once; default as many as keep every core of a CPU busy (2 on an
-            accelerator).
+            accelerator), and 64 with an executor.
         bound: also take the conditional Cramér-Rao bound of every run (`conditional_bound`), at
             the price of one more EKF.
         dtype: float32 or float64, of the worlds and so of the filters. With `jax_enable_x64` worlds
@@ -79,6 +81,10 @@ def monte_carlo(
             computed.
         progress: called with (runs done, runs) after each block. Default a bar with
             rate and remaining time, only on a terminal and in a notebook; False: none.
+        executor: where the blocks are computed, in place of this process: any object with the
+            `submit` of `concurrent.futures`, as `ProcessPoolExecutor`, Dask's, mpi4py's. Each
+            worker compiles the programs once and has one device, so results are the bits of
+            `devices` of one. A block whose worker dies, fails or is late is computed again.
     Returns:
         Campaign.
     Raises:
@@ -88,11 +94,16 @@ def monte_carlo(
             difference, or runs beyond the requested ones; on a part without a block.
         MemoryError: if one run a device is too much.
         Interrupted: on Ctrl-C, with the campaign so far.
+        Incomplete: where an executor computes no more, with the campaign so far.
     """
-    _check(scenario, filters, runs, key, block, workers, devices, keep, part, progress)
+    _check(scenario, filters, runs, key, block, workers, devices, keep, part, progress, executor)
     began, runs = time.perf_counter(), int(runs)
     devices = jax.local_devices() if devices is None else list(devices)
+    if executor is not None:
+        devices = devices[:1]  # as every worker
     dtype = check_dtype(dtype)
+    if workers is None and executor is not None:
+        workers = 64
     if workers is None:
         # An accelerator computes a block while the host scores the one before: 1.4 times the runs a
         # second of one block at a time on an H100, and no more with three.
@@ -112,19 +123,22 @@ def monte_carlo(
         finished = add_kept(tallies, keep, runs, lambda first: in_part(first, plan.wide, part))
     pieces = missing(finished, runs, plan.wide)
     todo = [piece for piece in pieces if in_part(piece[0], plan.wide, part)]
-    work = Work(workers, keep, progress or None, {name: Tally() for name in names})
+    work = Work(workers, keep, progress or None, {name: Tally() for name in names}, executor)
+    stop: KeyboardInterrupt | Incomplete | None = None
     try:
         with shown_progress(work, plan, progress is None):
             work.in_blocks_that_fit(plan, todo)
-        interrupted = False
-    except KeyboardInterrupt:
-        interrupted = True
+    except (KeyboardInterrupt, Incomplete) as error:
+        stop = error
     for name, tally in work.tallies.items():
         tallies[name].merge(tally)
     campaign = None
     if tallies[BOUND].pieces():
         campaign = _summed_up(plan, tallies, work, time.perf_counter() - began)
-    if interrupted or campaign is None:
+    if isinstance(stop, Incomplete):
+        done = f"{campaign.runs if campaign else 0} of {runs} runs done"
+        raise Incomplete(f"monte_carlo: executor: {stop}; {done}", campaign) from stop.__cause__
+    if stop is not None or campaign is None:
         raise Interrupted(campaign, runs)
     return campaign
 
@@ -140,6 +154,7 @@ def _check(
     keep: Keep | None,
     part: object,
     progress: object,
+    executor: object,
 ) -> None:
     """Raise ValueError on arguments that `monte_carlo` does not take."""
     for name, value in (("runs", runs), ("block", block), ("workers", workers)):
@@ -162,6 +177,15 @@ def _check(
     if devices is not None and not isinstance(devices, Sequence):
         raise ValueError(
             f"monte_carlo: expected devices as from jax.local_devices(), got {devices!r}"
+        )
+    if executor is not None and not callable(getattr(executor, "submit", None)):
+        raise ValueError(
+            "monte_carlo: expected executor as of concurrent.futures, with a method submit, got "
+            f"{executor!r:.60}"
+        )
+    if executor is not None and devices is not None:
+        raise ValueError(
+            "monte_carlo: devices: each worker of an executor uses its first device: expected none"
         )
     if devices is not None and not devices:
         raise ValueError("monte_carlo: expected at least one device, got none")
@@ -205,7 +229,7 @@ def _summed_up(
         filters=_qualify(summaries, scenario),
         seconds=seconds,
         compile_seconds=work.compile_seconds,
-        step_seconds={name: seconds / steps for name, seconds in work.run_seconds.items()},
+        step_seconds={name: seconds / steps for name, seconds in work.run_seconds().items()},
         first={
             name: (jax.device_get(with_positions(scenario.sensor, truth)), estimate)
             for name, (truth, estimate) in work.first.items()

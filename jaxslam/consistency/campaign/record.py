@@ -127,3 +127,11 @@ class Interrupted(KeyboardInterrupt):
     def __init__(self, campaign: Campaign | None, runs: int) -> None:
         super().__init__(f"{campaign.runs if campaign else 0} of {runs} runs done")
         self.campaign = campaign
+
+
+class Incomplete(RuntimeError):
+    """The workers of an executor failed; `campaign` covers the finished runs, if any."""
+
+    def __init__(self, message: str, campaign: Campaign | None = None) -> None:
+        super().__init__(message)
+        self.campaign = campaign

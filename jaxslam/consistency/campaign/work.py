@@ -2,8 +2,9 @@
 
 import contextlib
 import warnings
+from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_COMPLETED, Future, ThreadPoolExecutor, wait
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import jax
@@ -12,9 +13,12 @@ from threadpoolctl import threadpool_limits
 
 from jaxslam.consistency import Tally
 from jaxslam.consistency.campaign.block import BOUND, BlockRunner, CampaignPlan
+from jaxslam.consistency.campaign.flight import TRIES, WRONG, Flight, out_of_memory
 from jaxslam.consistency.campaign.kept import Keep, add_block, flat
 from jaxslam.consistency.campaign.pieces import missing
 from jaxslam.consistency.campaign.progress import Progress
+from jaxslam.consistency.campaign.record import Incomplete
+from jaxslam.consistency.campaign.remote import Executor, compute_block, packed
 from jaxslam.core.types import Estimate, Truth
 
 
@@ -23,13 +27,20 @@ class Work:
     """Computes the missing blocks of a campaign, and keeps count."""
 
     workers: int
+    """blocks in flight at once, beside one that waits"""
     keep: Keep | None
     progress: Callable[[int, int], None] | None
     tallies: dict[str, Tally]
     """the results of this process, by filter"""
+    executor: Executor | None = None
     compile_seconds: float = 0.0
-    run_seconds: dict[str, float] = field(default_factory=dict)
     first: dict[str, tuple[Truth, Estimate]] = field(default_factory=dict)
+    spent: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    """wall time of a run in each finished block, by filter [s]"""
+
+    def run_seconds(self) -> dict[str, float]:
+        """The time of one run on one device, by filter: the median over finished blocks."""
+        return {name: float(np.median(times)) for name, times in self.spent.items()}
 
     def in_blocks_that_fit(self, plan: CampaignPlan, todo: Sequence[tuple[int, int]]) -> None:
         """Compute the pieces, in blocks of half the size each time that memory does not suffice."""
@@ -37,7 +48,7 @@ class Work:
             try:
                 return self.go(plan, todo)
             except (jax.errors.JaxRuntimeError, MemoryError) as error:
-                if not (isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in str(error)):
+                if not out_of_memory(error):
                     raise
                 if plan.block == 1:
                     raise MemoryError(
@@ -62,38 +73,56 @@ class Work:
             for first, count in todo
             for piece in missing([(0, first), *before], first + count, plan.wide)
         ][::-1]
+        if self.executor is not None:
+            send, content = self.executor.submit, packed(plan)
+            flight = Flight(lambda first, runs: send(compute_block, content, first, runs), TRIES)
+            try:
+                self._compute(flight, queue, todo)
+            except Exception as error:
+                if isinstance(error, WRONG) or out_of_memory(error):
+                    raise
+                raise Incomplete(f"{type(error).__name__}: {error}") from error
+            return
         runner = BlockRunner(plan)
-        self.compile_seconds += runner.compile_seconds
-        finished = sum(count for _, count in before)
-        total = sum(count for _, count in todo)
-        flight: dict[Future[dict[str, dict[str, np.ndarray]]], tuple[int, int]] = {}
-        stop: BaseException | None = None
         # XLA uses the cores; additional threads of the BLAS below its LAPACK would only spin.
         with threadpool_limits(1, "blas"), ThreadPoolExecutor(self.workers) as pool:
-            while flight or (queue and stop is None):
-                try:
-                    while queue and stop is None and len(flight) <= self.workers:
-                        first, count = queue.pop()
-                        flight[pool.submit(runner.block, first, count)] = first, count
-                    for future in wait(flight, return_when=FIRST_COMPLETED).done:
-                        first, count = flight.pop(future)
-                        if stop is not None and (future.cancelled() or future.exception()):
-                            continue
-                        found = future.result()
-                        if self.keep is not None:
-                            self.keep.save(first, flat(found, self.tallies), count)
-                        add_block(self.tallies, first, count, found)
-                        finished += count
-                        if self.progress is not None:
-                            self.progress(finished, total)
-                except BaseException as error:
-                    if stop is not None:
-                        raise
-                    stop = error  # blocks in flight are finished and kept
-                    for future in flight:
-                        future.cancel()
-        self.run_seconds = runner.run_seconds()
-        self.first |= runner.first
+            flight = Flight(lambda first, runs: pool.submit(runner.block, first, runs))
+            self._compute(flight, queue, todo)
+
+    def _compute(
+        self, flight: Flight, queue: list[tuple[int, int]], todo: Sequence[tuple[int, int]]
+    ) -> None:
+        """Compute the pieces of a queue, last first, and add them to the tallies.
+
+        After an error, or Ctrl-C, blocks in flight are finished and kept.
+        """
+        finished = sum(count for _, count in self.tallies[BOUND].pieces())
+        total = sum(count for _, count in todo)
+        stop: BaseException | None = None
+        while flight or (queue and stop is None):
+            try:
+                while queue and stop is None and len(flight) <= self.workers:
+                    flight.start(queue.pop())
+                for (first, count), result in flight.finished():
+                    if stop is not None and isinstance(result, BaseException):
+                        continue
+                    if isinstance(result, BaseException):
+                        raise result
+                    if self.keep is not None:
+                        self.keep.save(first, flat(result.scores, self.tallies), count)
+                    add_block(self.tallies, first, count, result.scores)
+                    self.first |= result.first
+                    for name, seconds in result.seconds.items():
+                        self.spent[name].append(seconds)
+                    self.compile_seconds = max(self.compile_seconds, result.compile_seconds)
+                    finished += count
+                    if self.progress is not None:
+                        self.progress(finished, total)
+            except BaseException as error:
+                if stop is not None:
+                    raise
+                stop = error
+                flight.cancel()
         if stop is not None:
             raise stop
 
