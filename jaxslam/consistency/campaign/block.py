@@ -12,8 +12,7 @@ from jax.sharding import NamedSharding
 from jaxtyping import Float, PyTree
 
 from jaxslam.consistency import Score, condense, final_covariance, score
-from jaxslam.consistency.campaign.pieces import cores
-from jaxslam.consistency.campaign.programs import (
+from jaxslam.consistency.campaign.block_programs import (
     RUN_AXES,
     Draws,
     FilterResults,
@@ -23,6 +22,7 @@ from jaxslam.consistency.campaign.programs import (
     statistics_program,
     structs,
 )
+from jaxslam.consistency.campaign.pieces import cores
 from jaxslam.consistency.measures import REGISTRY
 from jaxslam.consistency.tally import condensed_sums
 from jaxslam.core.protocols import Candidate

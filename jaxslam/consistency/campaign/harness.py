@@ -26,7 +26,7 @@ from jaxslam.consistency.campaign.candidates import (
     fitting_block,
     without_noise,
 )
-from jaxslam.consistency.campaign.identity import identity
+from jaxslam.consistency.campaign.digests import identity
 from jaxslam.consistency.campaign.kept import Keep, add_kept
 from jaxslam.consistency.campaign.pieces import check_part, cores, in_part, missing
 from jaxslam.consistency.campaign.record import Campaign, Interrupted
