@@ -82,7 +82,7 @@ def save_campaign(
     drawn = {name: (caption, make()) for name, (caption, make) in drawings.items()}
     encode = cache(plot.encode)  # the page and a file have the same picture
     files: Files = {
-        PAGE: page.page(
+        PAGE: page.campaign_page(
             campaign, command, seed, versions(), drawn, lambda figure: encode(figure, "png")
         ),
         RESULT: report.as_json(campaign, command, seed),

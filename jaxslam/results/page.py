@@ -46,7 +46,7 @@ _UPRIGHT = 5
 """With more filters, the table is printed on a landscape page of its own."""
 
 
-def page(
+def campaign_page(
     campaign: Campaign,
     command: str,
     seed: int | None,

@@ -15,6 +15,7 @@ from jaxslam.core.numbers import check_count
 from jaxslam.core.protocols import Candidate, Filter
 from jaxslam.core.types import Estimate, Log, Status, Trace, Truth
 from jaxslam.core.validation import check_record
+from jaxslam.driver import run
 from jaxslam.filters.delayed.state import DelayedState, covariance_blocks
 from jaxslam.filters.information.eif_slam import CanonicalState
 from jaxslam.filters.information.marginals import local_information
@@ -37,7 +38,6 @@ from jaxslam.results.plot.film import (
 )
 from jaxslam.results.plot.landmarks import Limits, ellipses, extent, square_limits
 from jaxslam.results.plot.style import COLORS, FAINT, INK, Look
-from jaxslam.run import run
 from jaxslam.simulation.worlds import World, run_keys, with_positions, world_of_run
 
 _ROBOT_LINK, _LINK = COLORS[5], COLORS[3]

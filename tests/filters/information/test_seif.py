@@ -15,6 +15,7 @@ from jaxslam.charts import Euclidean
 from jaxslam.core.protocols import Filter
 from jaxslam.core.record import record
 from jaxslam.core.types import Scan, Status
+from jaxslam.driver import run
 from jaxslam.filters.information import active_set, sparse_state, sparsification
 from jaxslam.filters.information.eif_slam import InPieces
 from jaxslam.filters.information.marginals import (
@@ -25,9 +26,7 @@ from jaxslam.filters.information.marginals import (
     whole_information,
 )
 from jaxslam.filters.reporting import nothing_of
-from jaxslam.run import run
-from jaxslam.simulation.scenarios import cloister
-from jaxslam.simulation.scenarios.view import BetweenRanges
+from jaxslam.simulation.scenarios import BetweenRanges, cloister
 
 COUNT = 36
 """landmarks of the cloister"""

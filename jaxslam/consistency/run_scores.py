@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxslam.consistency.measures import REGISTRY
-from jaxslam.consistency.measures.associations import associations, identities
+from jaxslam.consistency.measures.associations import association_scores, identities
 from jaxslam.consistency.measures.counts import counted
 from jaxslam.consistency.measures.measure import Measure, Nees, Runs, RunStatistics
 from jaxslam.consistency.measures.nees import block_nees, pose_error
@@ -127,7 +127,7 @@ def run_statistics(
     if truth.origin is not None:
         origin = jnp.asarray(truth.origin)
         held = identities(trace, origin)
-        values |= associations(trace, origin, held)
+        values |= association_scores(trace, origin, held)
     points = jax.vmap(sensor.position)(jnp.asarray(truth.landmarks))
     size, count = info.innovation.shape[2], estimate.alive.shape[1] or info.slot.shape[1]
     dtype = estimate.pose.dtype
