@@ -21,9 +21,9 @@ from jaxslam.core.protocols import Candidate, Estimator, Filter
 from jaxslam.core.record import record, static
 from jaxslam.core.types import Truth
 from jaxslam.driver import run
+from jaxslam.filters.ekf.ekf_settings import EkfOptions
 from jaxslam.filters.ekf.ekf_slam import EkfSlam
-from jaxslam.filters.ekf.observability import Monitored
-from jaxslam.filters.ekf.settings import EkfOptions
+from jaxslam.filters.ekf.monitor import Monitored
 from jaxslam.filters.information.eif_slam import EifSlam, InPieces
 from jaxslam.filters.information.seif import Seif
 from jaxslam.filters.known.dead_reckoning import DeadReckoning

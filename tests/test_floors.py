@@ -34,7 +34,7 @@ FLOOR[""] = len(FLOORS)  # jaxslam/__init__.py sees everything, and nothing sees
 WITHIN_CALLS = {
     "graphs.graph": "datasets",
     "laser.grids.grid": "datasets",
-    "consistency.campaign.record": "results",
+    "consistency.campaign.result": "results",
 }
 
 # What only these modules may touch.
@@ -199,7 +199,7 @@ def test_shapes_in_signatures_are_checked_in_the_package():
 
 # --- the checker is no rubber stamp -------------------------------------------------------------
 
-RECORD = "consistency.campaign.record"
+RECORD = "consistency.campaign.result"
 HOUSE = {
     "": "from jaxslam.driver import run",
     "math": "",
@@ -218,7 +218,7 @@ HOUSE = {
 def test_a_sound_house_passes_and_only_methods_of_a_record_look_up():
     assert violations(HOUSE) == []
     within = "class Campaign:\n    def save(self):\n        from jaxslam.results import report"
-    house = HOUSE | {"results.report": "from jaxslam.consistency.campaign.record import Campaign"}
+    house = HOUSE | {"results.report": "from jaxslam.consistency.campaign.result import Campaign"}
     house |= {"consistency.campaign": ""}
     assert violations(house | {RECORD: within}) == []
     for source in ("from jaxslam.results import report", within.replace("results", "cli")):

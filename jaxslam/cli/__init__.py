@@ -20,8 +20,8 @@ from jaxslam.cli import (
     cache,
     consistency,
     fit,
-    localization,
-    mapping,
+    localize,
+    make_map,
     optimize,
     run,
     slam,
@@ -65,13 +65,13 @@ COMMANDS = {
         "loops, map and figures.",
     ),
     "map": (
-        mapping,
+        make_map,
         "make a map of a laser log from the poses in the file",
         "Make a map from the poses that stand in a laser log beside the scans. Prints a summary "
         "and writes the map, as ROS reads it, and a figure.",
     ),
     "localize": (
-        localization,
+        localize,
         "localize the robot of a laser log in a map",
         "Localize the robot in a map of ROS from raw odometry and scans, by particles. Prints a "
         "summary and writes trajectory and a figure.",

@@ -28,11 +28,11 @@ from jaxslam.core.numbers import check_count
 from jaxslam.core.types import JaxOrNumPy
 from jaxslam.datasets import g2o
 from jaxslam.graphs import Ending, Graph, starts
+from jaxslam.graphs.checks import label, variables_in
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import TRUSTED
 from jaxslam.graphs.solver.kernels import REGISTRY as KERNELS
 from jaxslam.graphs.starts import STARTS
-from jaxslam.graphs.validation import label, variables_in
 from jaxslam.results.files import Files, csv_text, json_number, json_text, versions, write_files
 
 ERRORS = {

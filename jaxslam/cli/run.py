@@ -37,7 +37,7 @@ from jaxslam.core.types import Estimate, Log, Status, Truth
 from jaxslam.datasets import READERS, Dataset
 from jaxslam.datasets.evaluation import Evaluation, evaluate, joint_map_cov
 from jaxslam.datasets.table_settings import METHODS, association_options
-from jaxslam.filters.ekf.settings import EkfOptions
+from jaxslam.filters.ekf.ekf_settings import EkfOptions
 from jaxslam.results import report
 from jaxslam.results.campaign_files import FORMATS, check_figure_formats
 from jaxslam.results.files import Files, Json, json_text, versions, write_files

@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.cli import laser
+from jaxslam.cli import laser_log
 from jaxslam.cli.common import add_animate, film_files, summary_table
 from jaxslam.consistency import metrics
 from jaxslam.consistency.campaign.progress import Progress
@@ -15,7 +15,7 @@ from jaxslam.core.types import Estimate
 from jaxslam.datasets import LaserLog, g2o, relation_file, ros_map
 from jaxslam.laser import laser_slam
 from jaxslam.laser.laser_slam import LoopOutcome, Settings, Solved
-from jaxslam.laser.laser_slam.mapping import growing_maps
+from jaxslam.laser.laser_slam.log_map import growing_maps
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.results import report
 from jaxslam.results.files import Files, Json, csv_text
@@ -42,7 +42,7 @@ SHARE = 0.95
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `jaxslam slam`."""
-    laser.add_options(parser, run_slam)
+    laser_log.add_options(parser, run_slam)
     add_animate(parser, "of the map growing")
     parser.add_argument(
         "--relations",
@@ -52,7 +52,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run_slam(log: LaserLog, options: argparse.Namespace) -> laser.Job:
+def run_slam(log: LaserLog, options: argparse.Namespace) -> laser_log.Job:
     """Path, graph, loops and map from raw odometry and scans; the poses in the file score them,
     and the relations of another file."""
     given = None if options.relations is None else given_relations(options.relations, log)
@@ -62,18 +62,18 @@ def run_slam(log: LaserLog, options: argparse.Namespace) -> laser.Job:
     files = result_files(solved) | figures(solved, options.figures, log.corrected)
     if options.animate:
         files |= film_files({"slam": film(log, solved, settings)}, suffixed=False)
-    summary = result_summary(solved) | laser.scored(log, lambda: _scores(log, solved))
+    summary = result_summary(solved) | laser_log.scored(log, lambda: _scores(log, solved))
     if coarser:
         summary["resolution asked for, of too many cells [m]"] = settings.resolution
     if given is None:
-        return laser.Job(summary, files)
+        return laser_log.Job(summary, files)
     relations, dropped = given
     joined, scores = len(relations.first), relation_scores(relations, log, solved)
     text = (
         f"relations of {options.relations}: {joined:,} of {joined + dropped:,} join the scans, "
         f"within {TOLERANCE:g} s; errors, mean ± standard deviation:\n{_score_text(scores)}"
     )
-    if laser.odometry_is_poses(log):
+    if laser_log.odometry_is_poses(log):
         text += (
             "\nraw odometry is that of the poses in the file: if these are corrected, the errors "
             "are none of laser SLAM; --odometry FILE gives the odometry of the wheels"
@@ -86,7 +86,7 @@ def run_slam(log: LaserLog, options: argparse.Namespace) -> laser.Job:
         "tolerance [s]": TOLERANCE,
         **scores,
     }
-    return laser.Job(summary, files, text, {"relations": entry})
+    return laser_log.Job(summary, files, text, {"relations": entry})
 
 
 def _solved(log: LaserLog, settings: Settings) -> Solved:
@@ -184,7 +184,7 @@ def result_summary(solved: Solved) -> dict[str, object]:
         "degrees of freedom": solved.dof,
         "chi2 / degrees of freedom": solved.chi2 / solved.dof if solved.dof > 0 else None,
         "covariances": _verdict(solved),
-        **laser.map_size(solved.map),
+        **laser_log.map_size(solved.map),
         **{f"seconds, {stage}": round(value, 2) for stage, value in solved.seconds.items()},
     }
 

@@ -18,8 +18,8 @@ from jaxslam.consistency.campaign.candidates import check_fits, check_noise
 from jaxslam.core.protocols import Candidate, Filter
 from jaxslam.simulation.scenarios import SCENARIOS
 from jaxslam.simulation.worlds import World
-from jaxslam.verify.errors import describe_error
 from jaxslam.verify.inputs.user_files import import_file, names_in, split_target
+from jaxslam.verify.user_errors import describe_error
 
 _OWN = "; or FILE.py:NAME, one of your own"
 

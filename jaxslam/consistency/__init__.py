@@ -16,7 +16,7 @@ from jaxslam.consistency.intervals import (
     percentage,
     positive_interval,
 )
-from jaxslam.consistency.localization import (
+from jaxslam.consistency.localization_scores import (
     LocalizationScores,
     LocalizationSummary,
     covering_level,

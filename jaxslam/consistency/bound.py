@@ -13,8 +13,8 @@ from jaxslam.consistency.run_scores import snapshot_steps
 from jaxslam.core.protocols import Sensor
 from jaxslam.core.types import Estimate, Log, Truth
 from jaxslam.driver import run
+from jaxslam.filters.ekf.ekf_settings import EkfOptions
 from jaxslam.filters.ekf.ekf_slam import EkfSlam
-from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.linearize import first_order
 from jaxslam.linearize.first_order import with_lever_arm
 from jaxslam.linearize.other_points import AtTruth

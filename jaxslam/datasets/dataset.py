@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import JaxOrNumPy, Log
 from jaxslam.core.validation.logs import check_log
-from jaxslam.filters.ekf.settings import EkfOptions
+from jaxslam.filters.ekf.ekf_settings import EkfOptions
 from jaxslam.filters.multi_robot.team import Robot
 from jaxslam.sensors.suite import Suite
 

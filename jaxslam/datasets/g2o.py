@@ -8,10 +8,10 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxslam.datasets.lines import TextFile
+from jaxslam.graphs.checks import check_numbers, indefinite
 from jaxslam.graphs.factor import REGISTRY
 from jaxslam.graphs.graph import Graph, Table
 from jaxslam.graphs.starts import odometry
-from jaxslam.graphs.validation import check_numbers, indefinite
 from jaxslam.results.files import write_files
 
 

@@ -35,8 +35,8 @@ from jaxslam.datasets.mrclam_robot import (
     true_fields,
 )
 from jaxslam.driver import run
+from jaxslam.filters.ekf.ekf_settings import EkfOptions
 from jaxslam.filters.ekf.ekf_slam import EkfSlam
-from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.filters.multi_robot.team import Robot, TeamMotion, sensors_of
 from jaxslam.math.stats import sigma_gate
 from jaxslam.motion import Unicycle

@@ -15,8 +15,8 @@ from jaxslam.core.protocols import Filter
 from jaxslam.core.types import Info, JaxOrNumPy, Log, Status
 from jaxslam.datasets.dataset import Adjustable, Dataset
 from jaxslam.driver import run
+from jaxslam.filters.ekf.ekf_settings import EkfOptions
 from jaxslam.filters.ekf.ekf_slam import EkfSlam
-from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.math.stats import normal_quantile
 
 

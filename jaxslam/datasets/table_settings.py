@@ -24,7 +24,7 @@ from jaxslam.core.logs.tables import INTERVAL, POSE, odometry_columns, split_uni
 from jaxslam.core.protocols import Associate, Motion, Sensor
 from jaxslam.core.record import record, static
 from jaxslam.core.types import JaxOrNumPy
-from jaxslam.filters.ekf.settings import EkfOptions
+from jaxslam.filters.ekf.ekf_settings import EkfOptions
 from jaxslam.math import stats
 
 _Model = TypeVar("_Model", bound=Motion | Sensor)

@@ -11,8 +11,8 @@ from matplotlib.animation import FFMpegWriter
 from ring_of_rooms import FAR, ranges_of
 
 from jaxslam import cli, grids
-from jaxslam.cli.laser import read_log
-from jaxslam.cli.mapping import TOGETHER
+from jaxslam.cli.laser_log import read_log
+from jaxslam.cli.make_map import TOGETHER
 from jaxslam.math import numpy_poses as poses
 from jaxslam.results import plot
 from jaxslam.simulation.laser import scan_world

@@ -3,6 +3,6 @@
 from jaxslam.consistency.campaign.harness import monte_carlo
 from jaxslam.consistency.campaign.kept import Keep
 from jaxslam.consistency.campaign.pieces import missing
-from jaxslam.consistency.campaign.record import Campaign, Interrupted
+from jaxslam.consistency.campaign.result import Campaign, Interrupted
 
 __all__ = ["Campaign", "Interrupted", "Keep", "missing", "monte_carlo"]

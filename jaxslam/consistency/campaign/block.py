@@ -28,7 +28,7 @@ from jaxslam.consistency.tally import condensed_sums
 from jaxslam.core.protocols import Candidate
 from jaxslam.core.record import as_record
 from jaxslam.core.types import Estimate, Info, Trace, Truth
-from jaxslam.filters.ekf.observability import MonitoredState
+from jaxslam.filters.ekf.monitor import MonitoredState
 from jaxslam.simulation.worlds import Scenario, World
 
 BOUND = "bound"

@@ -10,13 +10,13 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.core import slots
-from jaxslam.filters.information.innovation import TagAssociation
 from jaxslam.filters.information.sparse_state import (
     SparseState,
     landmark_blocks,
     with_landmark_blocks,
 )
 from jaxslam.filters.information.sparsification import drop_link
+from jaxslam.filters.information.tag_innovation import TagAssociation
 from jaxslam.math.xla import materialize
 
 

@@ -9,18 +9,12 @@ from jaxtyping import Bool, Float, Int
 from jaxslam.core.numbers import check_count
 from jaxslam.core.record import record, static
 from jaxslam.core.types import Estimate, Info, Scan
-from jaxslam.filters.information import canonical, innovation
+from jaxslam.filters.information import canonical, tag_innovation
 from jaxslam.filters.information.active_set import (
     activate,
     active_matches,
     assign_indices,
     deactivate,
-)
-from jaxslam.filters.information.innovation import (
-    CanonicalInnovations,
-    InformationFilter,
-    TagAssociation,
-    associate_by_index,
 )
 from jaxslam.filters.information.marginals import (
     blanket_marginals,
@@ -37,6 +31,12 @@ from jaxslam.filters.information.sparse_state import (
     with_active_residual,
 )
 from jaxslam.filters.information.sparsification import cut_robot_links
+from jaxslam.filters.information.tag_innovation import (
+    CanonicalInnovations,
+    InformationFilter,
+    TagAssociation,
+    associate_by_index,
+)
 
 
 @record
@@ -182,12 +182,12 @@ def _correct_active(
 ) -> tuple[SparseState, Float[Array, "D D"], CanonicalInnovations, Bool[Array, ""]]:
     """The state with its mean corrected by measurements of active landmarks, Ω after them, their
     innovations, and whether the mean could be solved for."""
-    found = innovation.innovations(
+    found = tag_innovation.innovations(
         filter, state.omega, state.pose, active_means(state), scan, index, known
     )
     omega, residual = canonical.measurement_update(state.omega, active_residual(state), found)
     state, solved = recover_active_means(state, omega, residual, found.omega_positive)
-    return state, omega, innovation.refuse_unless(solved, found), solved
+    return state, omega, tag_innovation.refuse_unless(solved, found), solved
 
 
 def _initialize_active(

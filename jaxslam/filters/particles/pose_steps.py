@@ -16,6 +16,7 @@ from jaxslam.core.numbers import is_concrete
 from jaxslam.core.protocols import Differentiable, Filter, Motion, Resample
 from jaxslam.core.record import record, static
 from jaxslam.core.types import Estimate
+from jaxslam.filters.particles.particle_settings import check_resampling
 from jaxslam.filters.particles.pose_particles import (
     ParticleEvents,
     PoseParticles,
@@ -29,11 +30,10 @@ from jaxslam.filters.particles.pose_particles import (
 )
 from jaxslam.filters.particles.proposal import sample_motion
 from jaxslam.filters.particles.recovery import resample_and_inject, update_averages
-from jaxslam.filters.particles.settings import check_resampling
 from jaxslam.filters.particles.slam_particles import ParticleInfo
 from jaxslam.math.arrays import Number
 from jaxslam.resampling.kld import bins_of, enough
-from jaxslam.resampling.rules import systematic
+from jaxslam.resampling.methods import systematic
 from jaxslam.resampling.weights import effective_size, normalized
 
 # The default least number of particles.

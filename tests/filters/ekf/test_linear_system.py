@@ -16,8 +16,8 @@ from jaxslam.core.slots import Joint
 from jaxslam.core.types import Scan
 from jaxslam.driver import run
 from jaxslam.filters import Closing, EkfSlam, Filter, Monitored, Wrapper
+from jaxslam.filters.ekf.ekf_settings import EkfSettings
 from jaxslam.filters.ekf.predicted_measurements import prediction_of
-from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.update import correct
 from jaxslam.linearize import FirstEstimate
 

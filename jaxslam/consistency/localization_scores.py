@@ -16,7 +16,7 @@ from jaxslam.core.protocols import Filter
 from jaxslam.core.types import JaxOrNumPy, Log
 from jaxslam.driver import run
 from jaxslam.filters.particles.pose_particles import PoseParticles
-from jaxslam.laser.grids.localization import beam_log
+from jaxslam.laser.grids.grid_localization import beam_log
 from jaxslam.math.angles import wrap
 from jaxslam.math.linalg import root_psd
 from jaxslam.resampling.weights import at_points, weights_of

@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, PyTree
 
 from jaxslam import motion
-from jaxslam.cli import laser
+from jaxslam.cli import laser_log
 from jaxslam.cli.piecewise import run_in_pieces
 from jaxslam.consistency.campaign.progress import Progress
 from jaxslam.core.types import Info
@@ -64,7 +64,7 @@ it was chosen on."""
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `jaxslam localize`."""
     parser.add_argument("map", metavar="MAP.yaml", help="a map of ROS")
-    laser.add_options(parser, run_localization, map_is_made=False)
+    laser_log.add_options(parser, run_localization, map_is_made=False)
     parser.add_argument(
         "--start",
         metavar="POSE",
@@ -88,7 +88,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run_localization(log: LaserLog, options: argparse.Namespace) -> laser.Job:
+def run_localization(log: LaserLog, options: argparse.Namespace) -> laser_log.Job:
     """Localize the robot in the map, from raw odometry and scans: likelihood field, KLD, and from
     anywhere recovery.
 
@@ -161,7 +161,7 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> laser.Job:
             else f"no: less than {FIT:.0%} of the beams fit the map"
         ),
         "final pose [m, m, rad]": [float(value) for value in path.pose[-1]],
-    } | laser.scored(log, lambda: scores(np.asarray(path.pose), log.corrected))
+    } | laser_log.scored(log, lambda: scores(np.asarray(path.pose), log.corrected))
 
     figure = plot.grid_figure(
         grid,
@@ -175,7 +175,7 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> laser.Job:
         "trajectory.tum": report.trajectory_tum(log.time, path),
         **{f"localization.{kind}": plot.encode(figure, kind) for kind in options.figures},
     }
-    return laser.Job(summary, files)
+    return laser_log.Job(summary, files)
 
 
 def _start(text: str, log: LaserLog) -> np.ndarray | None:
@@ -183,9 +183,9 @@ def _start(text: str, log: LaserLog) -> np.ndarray | None:
     if text == "global":
         return None
     if text == "file":
-        laser.check_poses(log)
+        laser_log.check_poses(log)
         return np.asarray(log.corrected[0])
-    return laser.pose_of("--start", text, "file, global or ")
+    return laser_log.pose_of("--start", text, "file, global or ")
 
 
 def share_as_predicted(grid: Grid, poses: Float[np.ndarray, "n 3"], log: LaserLog) -> float:
