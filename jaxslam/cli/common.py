@@ -1,4 +1,4 @@
-"""Helpers of all commands: look-up by name, options of several, summaries as text, films."""
+"""Helpers of the commands: lookup by name, shared options, summaries as text, films."""
 
 import argparse
 import json
@@ -21,20 +21,20 @@ INTERRUPTED = 130
 """Exit status after Ctrl-C."""
 
 SUMMARY = "summary.json"
-"""The file in which `run` and `optimize` say what they did."""
+"""The file with the summary of a command."""
 
 COUNT = "measurements "
-"""Begins the rows of a summary that count what became of measurements."""
+"""Prefix of the rows of a summary that count measurements by status."""
 
 FILMS = ("film.gif", "film.mp4", "film.html", "film-*.gif", "film-*.mp4", "film-*.html")
-"""Patterns of the names of films: those of an earlier command do not stay beside its results."""
+"""Names of films; those of an earlier command are deleted."""
 
 OUT = Path("out")
 """Default folder of results."""
 
 
 def pick(option: str, name: str, known: Mapping[str, _T], more: str = "") -> _T:
-    """The entry of `known` with a name that an option gives, as `filters`.
+    """The entry of `known` under a name given by an option, as `filters`.
 
     Raises ValueError with the known names and `more`.
     """
@@ -45,9 +45,9 @@ def pick(option: str, name: str, known: Mapping[str, _T], more: str = "") -> _T:
 
 
 def as_folders(options: argparse.Namespace) -> None:
-    """Convert the options that name folders to paths; raises ValueError on an empty name.
+    """Convert the options that name folders to paths.
 
-    `Path("")` would be the current folder.
+    Raises ValueError on an empty name, which `Path` takes for the current folder.
     """
     for name in ("out", "resume", "cache"):
         text = getattr(options, name, None)
@@ -68,22 +68,22 @@ def add_out(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def check_out(folder: Path, own: str) -> None:
-    """Raise before hours of work if the results of a command, as "run", cannot go to a folder.
+def check_out(folder: Path, name: str) -> None:
+    """Check before any work that a command, as "run", can write its results to a folder.
 
-    OSError where no file can be written to it; ValueError where it holds the results of another
-    command, some of whose files have the same names.
+    Raises OSError if no file can be written, ValueError if the folder holds the results of another
+    command, since some files have the same names.
     """
     check_writable(folder)
-    for name in (RESULT, SUMMARY):
+    for file in (RESULT, SUMMARY):
         try:
-            command = str(json.loads((folder / name).read_text(encoding="utf-8"))["command"])
+            command = str(json.loads((folder / file).read_text(encoding="utf-8"))["command"])
         except (OSError, ValueError, LookupError, TypeError):
             continue
-        if (other := " ".join(command.split()[:2])) not in ("", f"jaxslam {own}"):
+        if (other := " ".join(command.split()[:2])) not in ("", f"jaxslam {name}"):
             raise ValueError(
                 f"--out: {folder} holds the results of {other}: choose another folder for those of "
-                f"jaxslam {own}"
+                f"jaxslam {name}"
             )
 
 
@@ -98,7 +98,7 @@ def add_dtype(parser: argparse.ArgumentParser, of: str = "") -> None:
 
 
 def add_figures(parser: argparse.ArgumentParser, formats: Collection[str], more: str = "") -> None:
-    """Add the option of the formats of figures; `more` is said after the default."""
+    """Add the option of the formats of figures; `more` follows the default in the help."""
     parser.add_argument(
         "--figures",
         metavar="FORMATS",
@@ -108,7 +108,7 @@ def add_figures(parser: argparse.ArgumentParser, formats: Collection[str], more:
 
 
 def summary_table(columns: Mapping[str, Mapping[str, object]]) -> str:
-    """Summaries side by side, a row an entry; names above them where there are several."""
+    """Summaries side by side, one row per entry; several have their names above them."""
     rows = list(dict.fromkeys(key for column in columns.values() for key in column))
     head = [["", *columns]] if len(columns) > 1 else []
     lines = head + [
@@ -141,20 +141,22 @@ def _shown(value: object) -> str:
 
 
 def film_files(films: Mapping[str, "Film"], *, suffixed: bool) -> Files:
-    """The functions that write each film as MP4, or else GIF, and as a page; by file name.
+    """The functions that write each film as MP4, or GIF without ffmpeg, and as a page, by name.
 
-    Prints in a line how many steps are shown, and why there is no MP4.
+    Prints one line: how many steps are shown, and a missing ffmpeg.
 
     Args:
-        films: by the name of the filter, which the file has where suffixed.
+        films: by the name of the filter.
+        suffixed: whether file names contain the name of the filter.
     """
     from jaxslam.results import plot  # matplotlib is slow to load
 
     notes = dict.fromkeys(film.scene.note for film in films.values() if film.scene.note)
     kind = "mp4" if plot.has_ffmpeg() else "gif"
-    said = [*notes, *(["ffmpeg is not installed: GIF instead of MP4"] if kind == "gif" else [])]
-    if said:
-        print("\nfilm: " + "; ".join(said))
+    if kind == "gif":
+        notes["ffmpeg is not installed: GIF instead of MP4"] = None
+    if notes:
+        print("\nfilm: " + "; ".join(notes))
     files: Files = {}
     for name, film in films.items():
         stem = f"film-{name}" if suffixed else "film"
@@ -163,7 +165,7 @@ def film_files(films: Mapping[str, "Film"], *, suffixed: bool) -> Files:
 
 
 def _with_progress(film: "Film", name: str) -> Callable[[Path], object]:
-    """The function that saves a film and shows how many frames are drawn."""
+    """The function that saves a film with a progress bar over its frames."""
 
     def save(path: Path) -> None:
         with Progress(f"{name}: film", "frames") as progress:

@@ -1,4 +1,4 @@
-"""The devices that compute, and the time that compilation takes."""
+"""Devices to compute on, and the time of compilation."""
 
 import contextlib
 import threading
@@ -9,42 +9,41 @@ import jax
 from jaxslam.consistency.campaign.pieces import cores
 
 
-def set_device_count(asked: str) -> None:
-    """Set the number of CPU devices, before JAX first uses them; by default one a core.
+def set_device_count(devices: str) -> None:
+    """Set the number of CPU devices, before JAX first uses them; by default one per core.
 
-    Never more than there are cores, since JAX would create them; `chosen_devices` refuses
-    such a request.
+    At most the number of cores; `chosen_devices` then refuses a larger request.
     """
-    count = cores() if asked in ("all", "cpu") else int(asked) if asked.isdecimal() else None
+    count = cores() if devices in ("all", "cpu") else int(devices) if devices.isdecimal() else None
     if count is not None and count < 1:
-        raise ValueError(f"--devices: expected at least 1, got {asked}")
+        raise ValueError(f"--devices: expected at least 1, got {devices}")
     if count is not None:
         with contextlib.suppress(RuntimeError):  # JAX is already in use, as in a notebook
             jax.config.update("jax_num_cpu_devices", min(count, cores()))
 
 
-def chosen_devices(asked: str, most: int | None = None) -> list[jax.Device]:
-    """This process's devices by what was asked for: all, their number, or a platform's name.
+def chosen_devices(devices: str, most: int | None = None) -> list[jax.Device]:
+    """The devices of this process for the option `--devices`: all, a number, or a platform.
 
-    most: how many are all.
+    most: largest number for "all".
     """
-    if asked == "all":
+    if devices == "all":
         return list(jax.local_devices()[:most])
-    if asked.isdecimal():
-        there = jax.local_devices()
-        if int(asked) > len(there):
-            of = "each a core of the CPU" if there[0].platform == "cpu" else there[0].platform
+    if devices.isdecimal():
+        local = jax.local_devices()
+        if int(devices) > len(local):
+            kind = "CPU cores" if local[0].platform == "cpu" else local[0].platform
             raise ValueError(
-                f"--devices: expected at most {len(there)}, as many as there are here ({of}), "
-                f"got {asked}"
+                f"--devices: expected at most {len(local)}, the number of devices here ({kind}), "
+                f"got {devices}"
             )
-        return list(there[: int(asked)])
+        return list(local[: int(devices)])
     try:
-        return list(jax.local_devices(backend=asked))
+        return list(jax.local_devices(backend=devices))
     except RuntimeError as error:
         known = sorted({device.platform for device in jax.local_devices()} | {"cpu"})
         raise ValueError(
-            f"--devices: expected all, a number, or one of {', '.join(known)}, got {asked!r}"
+            f"--devices: expected all, a number, or one of {', '.join(known)}, got {devices!r}"
         ) from error
 
 

@@ -1,7 +1,7 @@
-"""Readers of public data sets and of your own (`table`), one in each file; they return a `Dataset`.
+"""Readers of public data sets, and of your data in CSV files (`table`); they return a `Dataset`.
 
-`READERS` has them by name, for the command line; each takes a path, and the number of a robot where
-a data set has several.
+`READERS` has them by name, for the command line; each takes a path, and, for a data set of several
+robots, the number of one.
 """
 
 from collections.abc import Callable
@@ -11,7 +11,7 @@ from jaxslam.datasets.carmen_reader import LaserLog, StampedRelations, carmen, r
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.mrclam_reader import (
     MRCLAM_FITTED,
-    OwnCalibration,
+    FittedCalibration,
     mrclam,
     mrclam_calibration,
     mrclam_team,
@@ -36,8 +36,8 @@ __all__ = [
     "READERS",
     "Dataset",
     "DatasetFit",
+    "FittedCalibration",
     "LaserLog",
-    "OwnCalibration",
     "RobotCalibration",
     "StampedRelations",
     "bonn",

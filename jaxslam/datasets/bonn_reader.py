@@ -27,8 +27,8 @@ def bonn(folder: str | Path) -> Dataset:
     range negative; such a measurement has no direction, and is dropped and counted.
 
     The default noise maximizes the likelihood of the innovations of an EKF, rounded: 0.1 m and
-    0.05 rad for the sensor; of the odometry the likelihood only says that σ is about 0.001 a step
-    (m or rad). NIS/dof is then 0.95.
+    0.05 rad for the sensor; for the odometry it only shows that σ is about 0.001 per step (m or
+    rad). NIS/dof is then 0.95.
 
     Source: course data by C. Stachniss, University of Freiburg and University of Bonn.
 

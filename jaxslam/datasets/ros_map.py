@@ -1,4 +1,4 @@
-"""Reader and writer of occupancy grids as ROS has them: a YAML file and an image.
+"""Reader and writer of occupancy grids in the format of ROS: a YAML file and an image.
 
 Grey images are PGM, P5 (binary) and P2 (text), read here; PNG and BMP are read by Matplotlib.
 """
@@ -30,8 +30,8 @@ def _read_shades(path: Path) -> NDArray[np.float64]:
 
     A colour counts as the mean of its three channels, as in `map_server`.
 
-    Raises ValueError, `path: reason`, on a file of another format, one that is damaged, and an
-    image that is transparent somewhere.
+    Raises ValueError, `path: reason`, on a file that is damaged or of another format, and on an
+    image with transparent pixels.
     """
     path, data = read_bytes(path)
     for begin, form in _BY_MATPLOTLIB.items():
@@ -64,7 +64,7 @@ def _read_shades(path: Path) -> NDArray[np.float64]:
 
 
 def _whole(path: Path, words: Sequence[bytes]) -> list[int]:
-    """Words as whole numbers; raises ValueError on one that is none."""
+    """Words as whole numbers; ValueError on any other."""
     for word in words:
         if not word.isdigit():
             raise ValueError(f"{path}: expected a whole number, got {word.decode('latin-1')!r}")
@@ -72,7 +72,7 @@ def _whole(path: Path, words: Sequence[bytes]) -> list[int]:
 
 
 def _by_matplotlib(path: Path, data: bytes, form: str) -> NDArray[np.float64]:
-    import matplotlib.image  # late, since most commands read no image
+    import matplotlib.image  # slow to load, and most commands read no image
 
     try:
         image = np.asarray(matplotlib.image.imread(io.BytesIO(data), format=form))
@@ -98,7 +98,7 @@ _UNKNOWN = 205
 
 
 def load(path: str | Path) -> Grid:
-    """The grid in a map file; `grids.read_map` says what is read."""
+    """The grid in a map file; see `grids.read_map`."""
     head = _Header(path)
     resolution = head.number("resolution")
     if not resolution > 0:
@@ -123,7 +123,7 @@ def load(path: str | Path) -> Grid:
 
 
 def save(path: str | Path, grid: Grid, mode: str) -> list[Path]:
-    """Write a map file and its image; `grids.write_map` says how."""
+    """Write a map file and its image; see `grids.write_map`."""
     path = Path(path)
     if path.suffix != ".yaml" or path.stem == "":
         raise ValueError(f"write_map: expected a path NAME.yaml, got {path}")
@@ -131,7 +131,7 @@ def save(path: str | Path, grid: Grid, mode: str) -> list[Path]:
 
 
 def map_files(stem: str, grid: Grid, mode: str = "trinary") -> Files:
-    """The map file STEM.yaml and its image STEM.pgm, as `write_files` takes them."""
+    """The map file STEM.yaml and its image STEM.pgm, for `write_files`."""
     check_grid("write_map", grid)
     if mode not in _MODES:
         raise ValueError(f'write_map: expected mode "trinary" or "scale", got {mode!r}')

@@ -32,10 +32,11 @@ def victoria_park(path: str | Path) -> Dataset:
     triangle of its covariance; poses and landmarks share one numbering. Odometry must be one chain,
     and the covariance the same on every line of a kind: it is the noise of the models by default.
     The correction is joint, since a scan has at most two landmarks. Tags follow the landmarks'
-    numbers; there is no ground truth. `gtsam.findExampleDataFile("victoria_park.txt")` is the file.
+    numbers. The data have no ground truth. The file is
+    `gtsam.findExampleDataFile("victoria_park.txt")`.
 
-    A scan at the first pose gets a row of its own, with zero control; then a control of exactly
-    zero has no noise.
+    A scan at the first pose gets a separate row with zero control; then a control of exactly zero
+    has no noise.
 
     Source: Guivant & Nebot, IEEE Trans. Robotics and Automation 17(3), 2001, as with GTSAM.
 
@@ -101,7 +102,7 @@ def victoria_park(path: str | Path) -> Dataset:
 
 
 class _Constant:
-    """A covariance that every line repeats as its upper triangle."""
+    """A covariance that each line repeats as its upper triangle."""
 
     def __init__(self, file: TextFile, size: int) -> None:
         self.file = file

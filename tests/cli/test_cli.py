@@ -77,7 +77,10 @@ def test_the_version_is_told(capsys):
         (["--seed", "-1"], "seed"),
         (["--dtype", "float16"], "invalid choice"),
         (["--devices", "0"], "--devices: expected at least 1"),
-        (["--devices", "99"], "--devices: expected at most 4, as many as there are here (each a"),
+        (
+            ["--devices", "99"],
+            "--devices: expected at most 4, the number of devices here (CPU cores)",
+        ),
         (["--filters", ""], "--filters: expected names of filters, or FILE.py:NAME, with commas"),
         (["--filters", "ekf,"], "or all, got 'ekf,'"),
         (["--cache", ""], "--cache: expected a folder, got ''"),

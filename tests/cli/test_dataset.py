@@ -73,7 +73,7 @@ def test_run_writes_films_and_says_what_is_missing(tmp_path, capsys, monkeypatch
         assert (out / f"film-{name}.gif").read_bytes().startswith(b"GIF")
         assert "data:image/png;base64," in (out / f"film-{name}.html").read_text()
     assert [scene.title for scene in scenes] == ["bonn: ekf", "bonn: dead_reckoning"]
-    assert [scenes[0].said(k).split(": ")[1] for k in range(3)] == [
+    assert [scenes[0].caption(k).split(": ")[1] for k in range(3)] == [
         "0 fused, 2 new, 0 dropped",
         "2 fused, 0 new, 0 dropped",
         "2 fused, 0 new, 0 dropped",

@@ -154,7 +154,7 @@ def test_laser_slam_writes_a_film_of_the_map_growing(
     assert "data:image/png;base64," in (out / "film.html").read_text()
     (scene,) = scenes
     assert scene.title == "room"
-    assert [scene.said(k) for k in range(3)] == [
+    assert [scene.caption(k) for k in range(3)] == [
         "laser odometry, scan 1 of 2",
         "laser odometry, scan 2 of 2",
         "after closing by 0 loops",

@@ -92,8 +92,8 @@ def test_it_writes_the_optimum(file, tmp_path, capsys, monkeypatch):
     # The film's last iterate is the optimum.
     (scene,) = [film.scene for film in films]
     assert scene.frames == 1 + summary["iterations"]
-    assert scene.said(0) == f"start, χ² = {summary['chi2 at the start']:.6g}"
-    assert scene.said(summary["iterations"]).endswith(f"χ² = {summary['chi2']:.6g}")
+    assert scene.caption(0) == f"start, χ² = {summary['chi2 at the start']:.6g}"
+    assert scene.caption(summary["iterations"]).endswith(f"χ² = {summary['chi2']:.6g}")
 
     for part in (
         "χ² = Σ eᵀ Ω e, without a factor ½; of relative poses e = Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ) as (x, y, θ)",

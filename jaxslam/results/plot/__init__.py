@@ -1,6 +1,6 @@
 """Figures of maps, errors and campaigns, all in one style (`plot.style`).
 
-Only this package draws. Figures are made without pyplot, so there is no global state and no window;
+Only this package draws. Figures are made without pyplot, without global state and windows;
 `figure.savefig(path)` saves one. They are as wide as a page; `width=plot.COLUMN` makes one for a
 column of a paper, with letters of the same size.
 """

@@ -87,12 +87,12 @@ class Scene:
     frames: int
     main: Panel
     beside: Panel | None = None
-    """in the upper right corner; below it is the legend"""
-    said: Callable[[int], str] = lambda k: f"frame {k + 1}"
+    """in the upper right corner, above the legend"""
+    caption: Callable[[int], str] = lambda k: f"frame {k + 1}"
     """the text above frame k"""
     title: str = ""
     note: str = ""
-    """which steps of a longer run are shown; "" where all are"""
+    """which steps of a longer run are shown; "" for all"""
 
 
 class Film(FuncAnimation):
@@ -102,7 +102,7 @@ class Film(FuncAnimation):
         film.save("slam.gif")
 
     Args:
-        fps: frames a second; default so many that the film lasts 10 s, at most 25.
+        fps: frames per second; by default the film lasts 10 s, with at most 25 a second.
         width: of the figure [in], with letters of 8 pt.
     Raises:
         ValueError: on a scene without frames, an fps or a width that is not above 0.
@@ -129,7 +129,7 @@ class Film(FuncAnimation):
         super().__init__(figure, draw, scene.frames, interval=1000 / fps, **options)
 
     def __del__(self) -> None:
-        """Say nothing of a film that was never drawn, as Matplotlib would."""
+        """No warning about a film that was never drawn, unlike Matplotlib."""
 
     def save(
         self, filename: str | Path, writer: Any = None, *arguments: Any, **options: Any
@@ -138,10 +138,10 @@ class Film(FuncAnimation):
 
         Args:
             filename: name of the file.
-            writer: one of Matplotlib's in place of those; then the name may end otherwise.
+            writer: another writer of Matplotlib, for any ending.
             arguments, options: of Matplotlib's `Animation.save`.
         Raises:
-            ValueError: on another ending, or .mp4 where ffmpeg is not installed.
+            ValueError: on another ending, or .mp4 without ffmpeg.
         """
         if writer is None and Path(filename).suffix == ".html":
             Path(filename).write_text(self.to_jshtml(), encoding="utf-8")
@@ -149,7 +149,7 @@ class Film(FuncAnimation):
             super().save(filename, writer or _writer_of(filename), *arguments, **options)
 
     def to_jshtml(self, *arguments: Any, **options: Any) -> str:
-        """The player in HTML, which loads nothing; arguments are those of Matplotlib's method."""
+        """The player in HTML, which loads nothing; arguments as for Matplotlib's method."""
         with matplotlib.rc_context({"animation.embed_limit": _EMBEDDED}):
             return super().to_jshtml(*arguments, **options).replace(_ICON_FONT, _ICONS)
 
@@ -163,7 +163,7 @@ def has_ffmpeg() -> bool:
 
 
 def _writer_of(filename: str | Path) -> str:
-    """The name of Matplotlib's writer of a file; ValueError where there is none."""
+    """The name of Matplotlib's writer for a file; ValueError without one."""
     kind = Path(filename).suffix
     if kind not in (".gif", ".mp4"):
         raise ValueError(f"Film.save: expected a name in .gif, .html, .mp4, got {filename}")
@@ -173,7 +173,7 @@ def _writer_of(filename: str | Path) -> str:
 
 
 class _Stage:
-    """The figure of a scene; what its layers have not made is drawn once, for speed."""
+    """The figure of a scene; artists that no layer changes are drawn once, for speed."""
 
     def __init__(self, scene: Scene, width: float) -> None:
         height, widths = 0.645 * width, (2.15, 1.0)
@@ -186,7 +186,7 @@ class _Stage:
         self.size = across / _DPI, tall / _DPI
         figure, (main, beside) = panels_of(*self.size, 1, 2, share=(False, False), widths=widths)
         figure.set_dpi(_DPI)
-        self._canvas, self._said = FigureCanvasAgg(figure), scene.said
+        self._canvas, self._caption = FigureCanvasAgg(figure), scene.caption
         engine = figure.get_layout_engine()
         assert isinstance(engine, ConstrainedLayoutEngine)
         engine.set(rect=(0.0, 0.0, 1.0, 1.0 - _HEAD / self.size[1]))
@@ -210,7 +210,7 @@ class _Stage:
         """Frame k as an array (height, width, 3) of bytes."""
         for draw in self._draws:
             draw(k)
-        self._text.set_text(self._said(k))
+        self._text.set_text(self._caption(k))
         self._canvas.restore_region(self._still)
         for artist in (*self._moving, self._text):
             self._canvas.figure.draw_artist(artist)
@@ -353,16 +353,16 @@ def weighted_segments(
 def cloud(
     points: Float[np.ndarray, "F P 2"], weight: Float[np.ndarray, "F P"], **look: Any
 ) -> Layer:
-    """The layer of particles, with areas by their weights; one of weight zero is left out."""
+    """The layer of particles, with areas by their weights; without those of weight 0."""
     areas = 4.0 * weight * weight.shape[1]
 
     def layer(axes: Axes) -> Draw:
         dots = axes.scatter([], [], **look)
 
         def draw(k: int) -> None:
-            there = weight[k] > 0
-            dots.set_offsets(points[k][there])
-            dots.set_sizes(np.clip(areas[k][there], 0.5, 60.0))
+            shown = weight[k] > 0
+            dots.set_offsets(points[k][shown])
+            dots.set_sizes(np.clip(areas[k][shown], 0.5, 60.0))
 
         return draw
 

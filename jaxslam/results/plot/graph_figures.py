@@ -168,7 +168,7 @@ def graph_scene(
     first: Look = {"marker": "o", "ms": 5, "mec": INK, "mfc": "white", "label": "first pose"}
     layers.append(marks(poses[:, :1], np.ones((len(poses), 1), bool), **first))
 
-    def said(k: int) -> str:
+    def caption(k: int) -> str:
         step = k if steps is None else steps[k]
         when = f"iteration {step}" if step else "start"
         return f"{when}, χ² = {chi2[k]:.6g}"
@@ -180,4 +180,4 @@ def graph_scene(
     most = np.maximum(ends.max(axis=0), np.quantile(rest, 0.99, axis=0))
     margin = 0.04 * max(float((most - least).max()), 1.0)
     x, y = ((float(a - margin), float(b + margin)) for a, b in zip(least, most, strict=True))
-    return Scene(len(iterates), Panel(layers, x, y), None, said, title, note)
+    return Scene(len(iterates), Panel(layers, x, y), None, caption, title, note)

@@ -98,7 +98,7 @@ def square_limits(clouds: Sequence[np.ndarray]) -> Limits:
 
 
 def _finite(clouds: Sequence[np.ndarray]) -> np.ndarray:
-    """The finite ones of some points, the origin if there is none."""
+    """The finite points of some, or else the origin."""
     every = np.concatenate(clouds)
     every = every[np.isfinite(every).all(axis=1)]
     return every if len(every) else np.zeros((1, 2))

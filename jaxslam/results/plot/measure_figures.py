@@ -183,7 +183,7 @@ def gained_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
 
     It is shown of filters with an observability monitor; the others are named in the title. Values
     below 1e-6 / rad² (σ of 1000 rad), zeros and rounding errors alike, are drawn in a strip below
-    the logarithmic axis, each filter at a height of its own. More than five filters are drawn by
+    the logarithmic axis, each filter at a different height. More than five filters are drawn by
     kind. width [in].
     """
     check_record("gained_figure", "the first argument", campaign, Campaign)
@@ -206,8 +206,8 @@ def gained_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
         axes.set(yscale="log", xlim=step_limits(campaign.steps), ylim=(_NOTHING * 10**-strip, top))
         _label_powers(axes, strip, decades)
     if not curves:
-        said = "no filter has an observability monitor (filters.Monitored)"
-        axes.text(0.5, 0.6, said, transform=axes.transAxes, ha="center", fontsize=8)
+        text = "no filter has an observability monitor (filters.Monitored)"
+        axes.text(0.5, 0.6, text, transform=axes.transAxes, ha="center", fontsize=8)
     title = title_of(campaign, "information gained on a turn of the whole frame,")
     title += f". Not monitored: {', '.join(map(plain, others))}" * bool(others and curves)
     add_legends(figure, rows, title, "step")
@@ -299,8 +299,8 @@ def cost_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
         kinds.tick_params(labelsize=TEXT, length=0, pad=8)
         kinds.spines["right"].set_visible(False)
     timed = np.isfinite(list(times.values())).any()
-    said = ("time of a step [µs]" if timed else "no filter was timed", *_LABELS.values())
-    for axes, text in zip(panels, said, strict=True):
+    titles = ("time of a step [µs]" if timed else "no filter was timed", *_LABELS.values())
+    for axes, text in zip(panels, titles, strict=True):
         axes.set_xlabel(text if width >= PAGE else text.replace(" [", "\n[").replace(" (", "\n("))
     honest = panels[2].axvline(DOF["pose"], color=INK, lw=0.8, zorder=1.5, label="honest")
     what = "error and NEES, with 95 % intervals, and the time of a step,"
@@ -361,6 +361,6 @@ def _values(campaign: Campaign, key: str) -> np.ndarray:
 
 def _scale(axes: Axes, values: np.ndarray) -> None:
     """Set the abscissa for some values, none of them on the frame."""
-    there = values[np.isfinite(values) & (values > 0)]
-    if there.size:
-        set_positive(axes, there.min(), there.max(), "x", margin=0.12, linear=3.0)
+    shown = values[np.isfinite(values) & (values > 0)]
+    if shown.size:
+        set_positive(axes, shown.min(), shown.max(), "x", margin=0.12, linear=3.0)

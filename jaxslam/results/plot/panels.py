@@ -54,8 +54,8 @@ def kinds_of(names: Sequence[str]) -> list[tuple[str, list[str]]]:
 def numbers_of(names: Sequence[str]) -> dict[str, int]:
     """The number of each filter of a campaign, which gives its look (`look`) in every figure.
 
-    It is the place among the filters, by kind where there are more than five; so those of a panel
-    have successive numbers.
+    It is the position among the filters, sorted by kind if they are more than five; so the filters
+    of a panel have successive numbers.
     """
     if len(names) > TOGETHER:
         names = [name for _, members in kinds_of(names) for name in members]
@@ -109,10 +109,10 @@ def sheet(
     )
     rows = []
     for i, (kind, members) in enumerate(groups):
-        *own, beside = panels[i * (count + 1) : (i + 1) * (count + 1)]
+        *measured, beside = panels[i * (count + 1) : (i + 1) * (count + 1)]
         beside.set_axis_off()
-        own[0].set_ylabel(kind.replace(" ", "\n"))
-        rows.append(Row(kind, {name: numbers[name] for name in members}, own))
+        measured[0].set_ylabel(kind.replace(" ", "\n"))
+        rows.append(Row(kind, {name: numbers[name] for name in members}, measured))
     for axes, quantity in zip(rows[0].panels, quantities, strict=True):
         titled(axes, quantity)
     return figure, rows
@@ -139,9 +139,9 @@ def add_legends(figure: Figure, rows: Sequence[Row], title: str, across: str) ->
             borderpad=0,
             handlelength=2.6,
         )
-    own = curves_of(rows[0].panels[0])
+    curves = curves_of(rows[0].panels[0])
     everything = rows[0].panels[0].get_legend_handles_labels()[0]
-    caption(figure, title, [handle for handle in everything if handle not in own])
+    caption(figure, title, [handle for handle in everything if handle not in curves])
 
 
 def title_of(campaign: Campaign, what: str) -> str:
@@ -175,7 +175,7 @@ _PLACES = 12
 def scale_setters(campaign: Campaign) -> list[str]:
     """The filters that set the scale of errors: those that fused measurements and do not diverge.
 
-    All filters where there are none such.
+    All filters if there are none.
     """
     names = [
         name
@@ -190,12 +190,12 @@ def common_top(peaks: dict[str, float], setters: list[str]) -> float:
 
     0 without a finite peak.
     """
-    there = {name: peak for name, peak in peaks.items() if np.isfinite(peak)}
-    mine = sorted(peak for name, peak in there.items() if name in setters) or sorted(there.values())
-    if not mine:
+    finite = {name: peak for name, peak in peaks.items() if np.isfinite(peak)}
+    chosen = [peak for name, peak in finite.items() if name in setters] or list(finite.values())
+    if not chosen:
         return 0.0
-    limit = _FAR * mine[len(mine) // 2]
-    return max(peak for peak in there.values() if peak <= limit)
+    limit = _FAR * sorted(chosen)[len(chosen) // 2]
+    return max(peak for peak in finite.values() if peak <= limit)
 
 
 def nees_scale(axes: Axes, campaign: Campaign, block: str) -> None:
@@ -231,7 +231,7 @@ def set_positive(
     """Set an axis (x or y) for numbers from low to high, with a margin as a share of the length.
 
     It is logarithmic if the largest is over `linear` times the smallest, with labels at 1, 2 and 5
-    of each decade, or 1 and 3, or 1 alone, as there is room.
+    of each decade, or 1 and 3, or 1 alone, by the room.
     """
     axis = axes.yaxis if which == "y" else axes.xaxis
     set_limits = axes.set_ylim if which == "y" else axes.set_xlim
@@ -270,8 +270,9 @@ def power(x: float) -> str:
 def mark_beyond(axes: Axes) -> None:
     """Mark what lies beyond the ends of the ordinate, with the marks of the curves at the edges.
 
-    Each filter has its own places; a curve without marks has arrows. The greatest value is written
-    above the panel, the least one only if the axis goes below 0. Call it when the limits are set.
+    Marks of different filters are at different places; a curve without marks has arrows. The
+    greatest value is written above the panel, the least one only if the axis goes below 0. Call it
+    when the limits are set.
     """
     low, high = axes.get_ylim()
     left, right = axes.get_xlim()
@@ -287,7 +288,7 @@ def mark_beyond(axes: Axes) -> None:
             offset = (i + 0.5) / max(len(curves), 1)
             places = np.interp((np.arange(_PLACES) + offset) / _PLACES, [0, 1], [left, right])
         near = np.abs(x[:, None] - places).argmin(axis=0)
-        own = str(line.get_marker())
+        marker = str(line.get_marker())
         for out, edge, arrow in ((y > high, 1.0, "$\u2191$"), (y < low, 0.0, "$\u2193$")):
             if not out.any():
                 continue
@@ -296,7 +297,7 @@ def mark_beyond(axes: Axes) -> None:
             axes.plot(
                 x[at],
                 np.full(len(at), edge),
-                marker=arrow if own in _NO_MARK else own,
+                marker=arrow if marker in _NO_MARK else marker,
                 linestyle="none",
                 transform=axes.get_xaxis_transform(),
                 color=line.get_color(),
@@ -309,7 +310,7 @@ def mark_beyond(axes: Axes) -> None:
             )
         largest = max(largest, y.max())
         least = min(least, y.min())
-    said = [f"↑ to {power(largest)}"] if largest > high else []
-    said += [f"↓ to −{power(-least)}"] if least < low < 0 else []
-    if said:
-        axes.set_title(", ".join(said), loc="right", fontsize=7, color=INK)
+    texts = [f"↑ to {power(largest)}"] if largest > high else []
+    texts += [f"↓ to −{power(-least)}"] if least < low < 0 else []
+    if texts:
+        axes.set_title(", ".join(texts), loc="right", fontsize=7, color=INK)
