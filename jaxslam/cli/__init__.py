@@ -27,8 +27,7 @@ from jaxslam.cli import (
     slam,
     verify,
 )
-from jaxslam.cli.common import INTERRUPTED, as_folders
-from jaxslam.cli.runtime import CompileClock, set_device_count
+from jaxslam.cli.common import INTERRUPTED, CompileClock, as_folders, set_device_count
 
 __all__ = ["main"]
 

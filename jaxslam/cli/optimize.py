@@ -14,6 +14,7 @@ from jaxslam.cli import cache
 from jaxslam.cli.common import (
     FILMS,
     SUMMARY,
+    CompileClock,
     add_animate,
     add_dtype,
     add_out,
@@ -22,7 +23,6 @@ from jaxslam.cli.common import (
     pick,
     summary_table,
 )
-from jaxslam.cli.runtime import CompileClock
 from jaxslam.consistency.campaign.progress import Progress
 from jaxslam.core.numbers import check_count
 from jaxslam.core.types import JaxOrNumPy

@@ -6,9 +6,9 @@ robots, the number of one.
 
 from collections.abc import Callable
 
-from jaxslam.datasets.bonn_reader import bonn
 from jaxslam.datasets.carmen_reader import LaserLog, StampedRelations, carmen, relation_file
 from jaxslam.datasets.dataset import Dataset
+from jaxslam.datasets.line_readers import bonn, victoria_park
 from jaxslam.datasets.mrclam_reader import (
     MRCLAM_FITTED,
     FittedCalibration,
@@ -20,7 +20,6 @@ from jaxslam.datasets.mrclam_robot import MRCLAM_CALIBRATION, RobotCalibration, 
 from jaxslam.datasets.noise_fit import DatasetFit, fit
 from jaxslam.datasets.plaza_reader import plaza
 from jaxslam.datasets.table_reader import table
-from jaxslam.datasets.victoria_park_reader import victoria_park
 
 READERS: dict[str, Callable[..., Dataset]] = {
     "bonn": bonn,

@@ -146,16 +146,14 @@ def mrclam_calibration(
     robot: int = 1,
     *,
     known: RobotCalibration = MRCLAM_CALIBRATION,
-    gate: float = 5.0,
     errata: bool = True,
 ) -> FittedCalibration:
     """The systematic errors of a robot that minimize the innovations of its log.
 
-    `calibration.calibrate` on the innovations of the right-invariant EKF: wheels (`forward`,
-    `outer`, `turn`, `curvature`), place and yaw of the camera (`ahead`, `yaw`), and its optical
-    axis (`axis`).
-    Neither the true path nor the survey is used (but `mrclam` cuts lines (0, 0) after the end of a
-    true path). Delay, noise and `depth` are those of `known`:
+    `calibration.calibrate` on the innovations of the right-invariant EKF with a gate at 5 σ: wheels
+    (`forward`, `outer`, `turn`, `curvature`), place and yaw of the camera (`ahead`, `yaw`), and its
+    optical axis (`axis`). Neither the true path nor the survey is used, though `mrclam` cuts lines
+    (0, 0) after the end of a true path. Delay, noise and `depth` are those of `known`:
     proportionally larger ranges and odometry give the same log of a larger world, so `depth` sets
     the scale of the map.
 
@@ -165,7 +163,6 @@ def mrclam_calibration(
     Args:
         folder, robot, errata: as for `mrclam`.
         known: the start of the search, and the constants that are held.
-        gate: [σ] of innovations.
     Raises:
         ValueError: as `mrclam` and `calibrate` do.
     """
@@ -207,7 +204,7 @@ def mrclam_calibration(
 
     def info(p: jax.Array) -> Info:
         log, motion, sensor = at(p)
-        more: EkfOptions = {"gate": sigma_gate(gate), "chart": RightInvariant()}
+        more: EkfOptions = {"gate": sigma_gate(5.0), "chart": RightInvariant()}
         options = data.filter_options | more
         filter = EkfSlam(motion, sensor, data.capacity, **options)
         return run(filter, log, jnp.zeros(3), jnp.zeros((3, 3)), jax.random.key(0)).info

@@ -10,7 +10,6 @@ import numpy as np
 from jaxslam.association.rules import Known
 from jaxslam.calibration import NoiseFit, as_associated, fit_noise
 from jaxslam.core.logs.tables import POSE, split_unit
-from jaxslam.core.numbers import check_count
 from jaxslam.core.protocols import Filter
 from jaxslam.core.types import Info, JaxOrNumPy, Log, Status
 from jaxslam.datasets.dataset import Adjustable, Dataset
@@ -42,16 +41,19 @@ class DatasetFit(NamedTuple):
     0; NaN if none is seen twice. Outside of it errors persist, and standard errors are too small"""
 
 
-def fit(
-    data: Dataset, *, mount: bool = False, fixed: Iterable[str] = (), rounds: int = 5
-) -> DatasetFit:
+_ROUNDS = 5
+"""Largest number of rounds of association and fit."""
+
+
+def fit(data: Dataset, *, mount: bool = False, fixed: Iterable[str] = ()) -> DatasetFit:
     """The standard deviations of the noises of a data set that maximize the likelihood of its log.
 
     EKF-SLAM with the options of the data set runs over the log to associate and gate its
     measurements. With these decisions fixed, `calibration.fit_noise` maximizes the likelihood of
-    the used measurements. Both are repeated until the decisions do not change; with known tags and
-    without a gate that is after one round. A gate also cuts the tail of good measurements, so the
-    noises come out a little too small: use a gate of 0.999 or more, or none.
+    the used measurements. Both are repeated, up to 5 times, until the decisions do not
+    change; with known tags and without a gate that is after one round. A gate also cuts the tail of
+    good measurements, so the noises come out a little too small: use a gate of 0.999 or more, or
+    none.
 
     Truth and survey are not used, except for the pose at the start. A deviation of 0 is held.
 
@@ -59,7 +61,6 @@ def fit(
         data: with `Dataset.adjustable`, as from `table`.
         mount: whether the pose of the sensor on the robot is fitted, too.
         fixed: names of parameters to hold, as "motion v" or "mount y".
-        rounds: largest number of rounds.
     Raises:
         ValueError: on a data set with fixed noises, a sensor without a mount, an unknown name,
             nothing to fit, and as `fit_noise` does.
@@ -67,7 +68,6 @@ def fit(
     models = data.adjustable
     if models is None:
         raise ValueError(f"fit: expected a data set with adjustable noises, got {data.name}")
-    check_count("fit: rounds", rounds)
     names, values, free = _parameters(models, mount, tuple(fixed))
     count, key = len(models.deviations), jax.random.key(0)
     decided = data.filter_options | {"gate": None, "associate": Known()}
@@ -90,7 +90,7 @@ def fit(
     whole, logged = np.array(values), np.arange(len(values)) < count
     info_of_log = decide(whole)
     settled, taken = False, 0
-    while taken < rounds and not settled:
+    while taken < _ROUNDS and not settled:
         taken += 1
         log = as_associated(data.log, info_of_log)
         found = fit_noise(

@@ -199,7 +199,7 @@ def test_several_filters_side_by_side(tmp_path, capsys):
         (["--filters", "batch_map"], "--filters: batch_map takes a whole log at once"),
         (["--filters", "seif"], "--filters: seif needs the tag of every measurement"),
         (["--gate", "9.2", "--associate", "joint"], "--gate: expected a probability"),
-        (["--gate", "0.9"], "--gate: expected --associate beside it"),
+        (["--gate", "0.9"], "--gate: expected --associate, too"),
         (["--associate", "best"], "--associate: expected one of nearest"),
         (["--figures", "gif"], "--figures: expected formats of png, pdf, svg, got 'gif'"),
     ],

@@ -194,7 +194,7 @@ def test_a_kernel_doubts_loops_and_points_but_not_the_path(file, tmp_path, monke
         summary["of weight above 1/2"] == {loops: 3, points: 16}
         and sum(summary["of weight 1/2 or less"].values()) == 0
     )
-    assert summary["certificate"].startswith("none: of a robust cost")
+    assert summary["certificate"].startswith("none: not for a robust cost")
     assert len(graphs.read(tmp_path / "optimized.g2o").tables["relative_pose"].z) == 10
     apart = graphs.with_loops_apart(small())
     assert apart.tables["relative_pose/loops"].who.tolist() == [[7, 0], [2, 6], [5, 1]]

@@ -305,7 +305,7 @@ def test_a_run_that_is_not_finite_is_drawn_as_far_as_it_goes_and_says_so():
     pose[2], covs[1, 0] = np.nan, -np.eye(2)
     broken = trace._replace(estimate=trace.estimate._replace(pose=pose, point_covs=covs))
     film = plot.animate(broken, log, truth)
-    said = film.scene.said
+    said = film.scene.caption
     assert said(1).endswith("1 without ellipse") and said(2).endswith("pose not finite")
     assert len(pictures(film)) == 3
 
