@@ -27,10 +27,10 @@ from jaxslam.filters.information.sparse_state import (
     SparseState,
     active_means,
     active_residual,
+    cut_robot_links,
     empty_map,
     with_active_residual,
 )
-from jaxslam.filters.information.sparsification import cut_robot_links
 from jaxslam.filters.information.tag_innovation import (
     CanonicalInnovations,
     InformationFilter,
@@ -47,7 +47,7 @@ class Seif(InformationFilter):
     most `links` others. The four steps do not touch the rest of the map:
 
     1. motion update (`canonical.motion_update`), of the robot and the active landmarks;
-    2. sparsification (`sparsification.sparsify`): the least recently measured active landmarks
+    2. sparsification (`sparse_state.sparsify`): the least recently measured active landmarks
        lose their links to the robot, as many as the scan needs indices for;
     3. measurement update and new landmarks (`canonical`);
     4. mean recovery (`marginals`), one block at a time: the block of robot and active
@@ -82,7 +82,7 @@ class Seif(InformationFilter):
     sweeps: int = static(default=1)
     """rounds of mean recovery a scan: passive landmarks, then the active block"""
     conservative: bool = static(default=False)
-    """how a full list drops its weakest link, `sparsification.drop_link`. False: overconfidently, Ω
+    """how a full list drops its weakest link, `sparse_state.drop_link`. False: overconfidently, Ω
     stays positive definite. True: with loss of information; where a map needs many more links than
     it may have, Ω does not stay positive definite"""
     whole: bool = static(default=False)
