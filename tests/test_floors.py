@@ -163,6 +163,11 @@ def test_no_module_shares_its_functions_name():
     ]
 
 
+def test_no_two_modules_share_a_name():
+    stems = [path.stem for path in PACKAGE.rglob("*.py") if not path.stem.startswith("__")]
+    assert sorted(stems) == sorted(set(stems))
+
+
 def test_public_names_have_docstrings():
     assert undocumented(read(PACKAGE)) == []
 

@@ -46,7 +46,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--no-cache",
         action="store_true",
         default=argparse.SUPPRESS,
-        help="neither keep compiled programs nor use those that are kept",
+        help="neither keep compiled programs nor use kept ones",
     )
 
 

@@ -111,8 +111,8 @@ def run_in_pieces(
         state, kept, last = piece(state, rows, jnp.asarray(end - begin), jnp.asarray(begin))
         pieces.append(jax.tree.map(lambda leaf, n=end - begin: np.asarray(leaf)[:n], kept[0]))
         if at is not None:
-            mine = at[(at >= begin) & (at < end)] - begin
-            films.append(jax.tree.map(lambda leaf, a=mine: np.asarray(leaf)[a], kept[1]))
+            chosen = at[(at >= begin) & (at < end)] - begin
+            films.append(jax.tree.map(lambda leaf, a=chosen: np.asarray(leaf)[a], kept[1]))
         progress(end, total)
         if check is not None:
             checked.append(end)

@@ -76,7 +76,7 @@ def run_slam(log: LaserLog, options: argparse.Namespace) -> laser_log.Job:
     if laser_log.odometry_is_poses(log):
         text += (
             "\nraw odometry is that of the poses in the file: if these are corrected, the errors "
-            "are none of laser SLAM; --odometry FILE gives the odometry of the wheels"
+            "are not those of laser SLAM; --odometry FILE gives the odometry of the wheels"
         )
     entry: Json = {
         "file": options.relations,

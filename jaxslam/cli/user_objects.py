@@ -99,7 +99,7 @@ class UserObjects:
         if not name:
             raise ValueError(f"{option}: expected FILE.py:NAME, got {entry}{names_in(module)}")
         if not hasattr(module, name):
-            raise ValueError(f"{option}: there is no {name!r} in {path.name}{names_in(module)}")
+            raise ValueError(f"{option}: {path.name} has no {name!r}{names_in(module)}")
         return name, getattr(module, name)
 
     def _from_file(self, entry: str, scenario: World) -> tuple[str, Candidate]:

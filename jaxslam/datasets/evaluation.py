@@ -100,9 +100,9 @@ def judge_map(
     if size <= 0:
         return None
     joint = joint_cov is not None
-    whole = np.zeros((count, 2, count, 2))
-    whole[np.arange(count), :, np.arange(count)] = covs
-    cov = np.asarray(whole if joint_cov is None else joint_cov, np.float64)
+    separate = np.zeros((count, 2, count, 2))
+    separate[np.arange(count), :, np.arange(count)] = covs
+    cov = np.asarray(separate if joint_cov is None else joint_cov, np.float64)
     cov = cov.reshape(2 * count, 2 * count)
     values, vectors = np.linalg.eigh((cov + cov.T) / 2)
     if not values[0] > 1e-12 * values[-1]:

@@ -283,10 +283,10 @@ def mrclam_team(
         controls.append(hold(lines.odometry[:, 0], lines.odometry[:, 1:], time))
         parts = []
         for robots_seen in (False, True):
-            mine = (tags >= len(names)) == robots_seen
-            if mine.any():
-                z = lines.seen[kept, 2:][mine]
-                scan = log_of(lines.odometry, time, rows[mine], tags[mine], z).scan
+            chosen = (tags >= len(names)) == robots_seen
+            if chosen.any():
+                z = lines.seen[kept, 2:][chosen]
+                scan = log_of(lines.odometry, time, rows[chosen], tags[chosen], z).scan
                 sees: Literal["landmarks", "robots"] = "robots" if robots_seen else "landmarks"
                 sensor = sight if robots_seen else eye
                 parts.append(Part(sensor, scan.tag.shape[1], sees=sees))

@@ -31,7 +31,7 @@ class DatasetFit(NamedTuple):
     used: int
     """measurements fused or born, over which the likelihood is"""
     left_out: dict[str, int]
-    """others, by what became of them with the noises found"""
+    """others, by status with the fitted noises"""
     rounds: int
     """how often the filter decided what to use"""
     settled: bool
@@ -72,23 +72,23 @@ def fit(data: Dataset, *, mount: bool = False, fixed: Iterable[str] = ()) -> Dat
     count, key = len(models.deviations), jax.random.key(0)
     decided = data.filter_options | {"gate": None, "associate": Known()}
 
-    def filter(whole: JaxOrNumPy, options: EkfOptions) -> Filter:
+    def filter(parameters: JaxOrNumPy, options: EkfOptions) -> Filter:
         fitted = mount and models.mount is not None
-        place = whole[count:] if fitted else models.mount
-        motion, sensor = models.models(whole[:count], place)
+        place = parameters[count:] if fitted else models.mount
+        motion, sensor = models.models(parameters[:count], place)
         return EkfSlam(motion, sensor, data.capacity, **options)
 
     def info(p: jax.Array, log: Log) -> Info:
-        whole = jnp.asarray(values, p.dtype).at[free].set(p)
-        return run(filter(whole, decided), log, data.pose, data.pose_cov, key).info
+        parameters = jnp.asarray(values, p.dtype).at[free].set(p)
+        return run(filter(parameters, decided), log, data.pose, data.pose_cov, key).info
 
-    def decide(whole: np.ndarray) -> Info:
-        method = filter(whole, data.filter_options)
+    def decide(parameters: np.ndarray) -> Info:
+        method = filter(parameters, data.filter_options)
         found: Info = jax.device_get(run(method, data.log, data.pose, data.pose_cov, key).info)
         return found
 
-    whole, logged = np.array(values), np.arange(len(values)) < count
-    info_of_log = decide(whole)
+    parameters, logged = np.array(values), np.arange(len(values)) < count
+    info_of_log = decide(parameters)
     settled, taken = False, 0
     while taken < _ROUNDS and not settled:
         taken += 1
@@ -99,17 +99,17 @@ def fit(data: Dataset, *, mount: bool = False, fixed: Iterable[str] = ()) -> Dat
             log,
             names=[names[i] for i in free],
             deviation=logged[free].tolist(),
-            guess=whole[free],
+            guess=parameters[free],
         )
-        whole[free] = found.parameters
-        info_of_log = decide(whole)
+        parameters[free] = found.parameters
+        info_of_log = decide(parameters)
         settled = _same(log, as_associated(data.log, info_of_log))
     outcome = {s.name.lower(): int((np.asarray(info_of_log.status) == s).sum()) for s in Status}
     kept = ("empty", "fused", "born")
     return DatasetFit(
         found=found,
-        deviations=tuple(whole[:count].tolist()),
-        mount=tuple(whole[count:].tolist()) if mount else models.mount,
+        deviations=tuple(parameters[:count].tolist()),
+        mount=tuple(parameters[count:].tolist()) if mount else models.mount,
         held={
             names[i]: float(values[i])
             for i in np.flatnonzero(~np.isin(np.arange(len(values)), free))

@@ -214,7 +214,7 @@ class _Header:
         return self.file.error(self.found[key].start_mark.line + 1, reason)
 
     def text(self, key: str) -> str:
-        """The value of a key as it stands in the file, without quotes."""
+        """The value of a key as written in the file, without quotes."""
         value = self.found[key].value
         if not isinstance(value, str) or not value:
             raise self.error(key, f"expected one value of {key}")
@@ -226,7 +226,7 @@ class _Header:
         return self.file.numbers(line, [self.text(key)], [key])[0]
 
     def numbers(self, key: str, names: tuple[str, ...]) -> list[float]:
-        """The value of a key as a list of finite numbers, one a name."""
+        """The value of a key as a list of finite numbers, one per name."""
         node = self.found[key]
         items = node.value if isinstance(node, yaml.SequenceNode) else [node]
         fields = [item.value if isinstance(item, yaml.ScalarNode) else "" for item in items]
@@ -239,7 +239,7 @@ class _Header:
             raise self.error(key, f"{wanted}: {reason}") from problem
 
     def choice(self, key: str, choices: dict[str, _Value], default: str | None = None) -> _Value:
-        """What the value of a key stands for."""
+        """The meaning of the value of a key."""
         if key not in self.found and default is not None:
             return choices[default]
         value = self.text(key).lower()

@@ -61,7 +61,7 @@ def campaign_page(
         command, seed: those of the campaign; None without a seed.
         versions: of the software, by name.
         figures: in order, by name, each with its caption.
-        draw: makes a PNG file of a figure; with a cache where the files are needed elsewhere, too.
+        draw: returns a figure as a PNG file; a cached function if the files are needed elsewhere.
     """
     heading = f"{campaign.scenario}: consistency of {with_noun(len(campaign.filters), 'filter')}"
     sections = {
@@ -107,9 +107,9 @@ def fragment(
     figures: Mapping[str, tuple[str, Figure]],
     draw: Callable[[Figure], bytes] = png,
 ) -> str:
-    """The HTML that a notebook shows of a campaign: verdicts, these figures, the measures folded.
+    """The campaign as HTML for a notebook: verdicts, these figures, and the measures folded.
 
-    The arguments are those of `page`. Its style applies to nothing else on the page.
+    Arguments as for `campaign_page`. Its style does not apply to the rest of the page.
     """
     return f"""<div class="jaxslam">
 <style>{FRAGMENT_CSS}</style>

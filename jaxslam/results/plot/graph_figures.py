@@ -54,7 +54,7 @@ def graph_figure(
         before, after: the same graph with different values.
         squared: eᵀ Ω e of each row after, of `graphs.squared_residuals`.
         factors: of the tables; by default those of files.
-        worst: so many rows are marked in both panels: those of the largest eᵀ Ω e for its size.
+        worst: number of rows marked in both panels: those with the largest eᵀ Ω e for its size.
         subtitles: of the panels. width: [in].
     """
     factors = factors_of("graph_figure", after, factors)
@@ -78,7 +78,7 @@ def graph_figure(
 
 
 def _drawn(graph: Graph, factors: Mapping[str, Factor]) -> list[str]:
-    """The tables that are drawn: those of edges between two variables."""
+    """The tables of edges between two variables, which are drawn."""
     return [key for key in graph.tables if len(factors[key].variables) == 2]
 
 
@@ -136,7 +136,7 @@ def graph_scene(
     title: str = "",
     note: str = "",
 ) -> Scene:
-    """The scene of one graph at each of F iterates: path, loop edges, points, and χ² in words.
+    """The scene of one graph at each of F iterates: path, loop edges, points, and χ² as text.
 
     The last iterate stays in the background. Edges between poses of successive ids are the
     path, others are loop edges.

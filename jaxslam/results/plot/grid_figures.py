@@ -32,7 +32,7 @@ from jaxslam.results.plot.style import (
 )
 
 _UNKNOWN = "#c9d3dd"
-"""Colour of unknown cells, which no shade of grey has."""
+"""Colour of unknown cells, not a shade of grey."""
 
 
 def grid_figure(
@@ -118,14 +118,14 @@ def shades_of_occupancy() -> Colormap:
 
 
 def shown_occupancy(log_odds: np.ndarray) -> np.ma.MaskedArray:
-    """The probability of each cell, masked where it is unknown."""
+    """The probability of each cell; unknown cells are masked."""
     return np.ma.masked_array(0.5 * (1 + np.tanh(log_odds / 2)), mask=log_odds == 0)
 
 
 def _corners(
     grid: Grid | Field, rows: np.ndarray, columns: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The world coordinates [m] of the corners of cells, as `pcolormesh` takes them."""
+    """The world coordinates [m] of the corners of cells, for `pcolormesh`."""
     x, y = np.meshgrid(columns, rows)
     origin, resolution = np.asarray(grid.origin, float), float(np.asarray(grid.resolution))
     c, s = np.cos(origin[2]), np.sin(origin[2])
@@ -303,7 +303,7 @@ def map_scene(
         origin: of the maps, without yaw. resolution: [m].
         paths: of each map, in the same order. captions: the text of each.
     Raises:
-        ValueError: without maps, other numbers of paths or texts, or a frame that is turned.
+        ValueError: without maps, other numbers of paths or captions, or a rotated frame.
     """
     count = len(log_odds)
     if not count or {count} != {len(paths), len(captions)}:

@@ -1,6 +1,6 @@
 """Panels of a campaign's filters, all in one or a row for each kind, and their scales.
 
-One extreme filter does not set a scale; what lies beyond it is marked.
+One extreme filter does not set a scale; values beyond it are marked.
 """
 
 from collections.abc import Container, Sequence
@@ -46,8 +46,8 @@ def kinds_of(names: Sequence[str]) -> list[tuple[str, list[str]]]:
     known = {name: kind for kind, members in KINDS.items() for name in members}
     found = []
     for kind in [*KINDS, "others"]:
-        mine = [name for name in names if known.get(name, "others") == kind]
-        found += [(kind, mine[at : at + TOGETHER]) for at in range(0, len(mine), TOGETHER)]
+        chosen = [name for name in names if known.get(name, "others") == kind]
+        found += [(kind, chosen[at : at + TOGETHER]) for at in range(0, len(chosen), TOGETHER)]
     return found
 
 
@@ -97,8 +97,8 @@ def sheet(
                 titled(axes, quantity)
             else:
                 ordinate(axes, quantity, height)
-        mine = {name: i for name, i in numbers.items() if only is None or name in only}
-        return figure, [Row("", mine, panels)]
+        chosen = {name: i for name, i in numbers.items() if only is None or name in only}
+        return figure, [Row("", chosen, panels)]
     figure, panels = panels_of(
         max(width, PAGE),
         1.05 * len(groups) + 0.7,
@@ -151,7 +151,7 @@ def title_of(campaign: Campaign, what: str) -> str:
 
 
 _FAR = 3.0
-"""A filter whose curve rises above so many times the median does not set a scale."""
+"""A filter whose curve exceeds this multiple of the median does not set a scale."""
 
 _NEES = (1 / 10, 10.0, 100.0)
 """lowest end of a scale of NEES, and least and greatest upper end, in multiples of dof"""
@@ -160,13 +160,13 @@ _BAND = 0.06
 """share of the height of a panel that the 95 % band fills at least, where the scale allows it"""
 
 _POWERS = 6
-"""a logarithmic axis has a label at every power of ten if they are at most so many"""
+"""largest number of powers of ten for which a logarithmic axis labels all of them"""
 
 BEYOND = "beyond"
-"""`gid` of the marks of what lies beyond an axis."""
+"""`gid` of the marks of values beyond an axis."""
 
 _NO_MARK = "", " ", "None", "none"
-"""what Matplotlib calls the mark of a line without marks"""
+"""Matplotlib's names for a line without markers"""
 
 _PLACES = 12
 """number of marks along an edge"""
@@ -268,11 +268,11 @@ def power(x: float) -> str:
 
 
 def mark_beyond(axes: Axes) -> None:
-    """Mark what lies beyond the ends of the ordinate, with the marks of the curves at the edges.
+    """Mark values beyond the ends of the ordinate with the markers of their curves, at the edges.
 
     Marks of different filters are at different places; a curve without marks has arrows. The
     greatest value is written above the panel, the least one only if the axis goes below 0. Call it
-    when the limits are set.
+    after the limits are set.
     """
     low, high = axes.get_ylim()
     left, right = axes.get_xlim()

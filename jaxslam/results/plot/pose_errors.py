@@ -51,11 +51,11 @@ def errors_figure(
 
 
 def run_errors_figure(campaign: Campaign, *, title: str = "", width: float = PAGE) -> Figure:
-    """Errors of run 0 of every filter of `Campaign.first`, a row each, as `errors_figure`.
+    """Errors of run 0 of every filter of `Campaign.first`, one row each, as in `errors_figure`.
 
-    The scales are the same, but for panels that would fill less than a tenth of theirs: these have
-    their own, in bold figures. Filters that would set them alone (`rmse_figure`) leave the panels
-    at an arrow. Raises ValueError if the campaign has no run 0.
+    The scales are equal, except for panels that would use less than a tenth of theirs: these have a
+    separate one, with bold numbers. Filters that do not set a scale (`rmse_figure`) leave the
+    panels at an arrow. Raises ValueError if the campaign has no run 0.
     """
     check_record("run_errors_figure", "the first argument", campaign, Campaign)
     if not campaign.first:

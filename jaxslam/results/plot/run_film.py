@@ -141,7 +141,7 @@ def hypothesis_layers(seen: object) -> list[Layer]:
 
 
 def link_layers(seen: object, estimate: Estimate) -> list[Layer]:
-    """The layers of the links of an information matrix, as wide as strong; lately cut ones dotted.
+    """The layers of the links of an information matrix, as wide as strong; recent cuts dotted.
 
     None where `seen` is not `Links`. estimate: with leading F, as the links.
     """
@@ -156,7 +156,7 @@ def link_layers(seen: object, estimate: Estimate) -> list[Layer]:
     for k, step in enumerate(strength):
         nodes = np.concatenate([estimate.pose[k, None, :2], estimate.points[k]])
         linked = np.triu(step > 0)
-        lately = np.triu(strength[max(0, k - _CUT_FOR) : k + 1].max(axis=0) > 0)
+        recent = np.triu(strength[max(0, k - _CUT_FOR) : k + 1].max(axis=0) > 0)
         i, j = np.nonzero(linked)
         ends, weight = nodes[np.stack([i, j], axis=1)], np.minimum(step[i, j], 1.0)
         between.append(ends[i > 0])
@@ -164,7 +164,7 @@ def link_layers(seen: object, estimate: Estimate) -> list[Layer]:
         weights["between"].append(weight[i > 0])
         weights["robot"].append(np.maximum(weight[i == 0], _SEEN))
         alive = np.append(True, estimate.alive[k])
-        gone = lately & ~linked & alive[:, None] & alive[None, :]
+        gone = recent & ~linked & alive[:, None] & alive[None, :]
         cut.append(nodes[np.stack(np.nonzero(gone), axis=1)])
     look: Look = {"capstyle": "round", "zorder": 2.6}
     dots: Look = {"color": INK, "lw": 1.0, "ls": (0, (1, 1.2)), "zorder": 2.8}
@@ -365,7 +365,7 @@ def run_scene(
 
 
 def _limits(history: History, points: np.ndarray | None, path: np.ndarray | None) -> Limits:
-    """The limits of the map: of the truth, else the estimate; and of what is near of the rest."""
+    """The limits of the map: those of the truth, or else the estimate, extended by near points."""
     alive = history.estimate.alive
     mapped = np.asarray(history.estimate.points)[alive]
     covs = np.asarray(history.estimate.point_covs)[alive]
@@ -406,7 +406,7 @@ def _beams(found: Measured) -> list[Layer]:
 
 
 def _map(history: History) -> list[Layer]:
-    """The layers of the map's landmarks with their ellipses; none of a filter without a map."""
+    """The layers of the landmarks with their ellipses; none for a filter without a map."""
     _, _, points, covs, alive, _ = map(np.asarray, history.estimate)
     if not np.any(alive):
         return []

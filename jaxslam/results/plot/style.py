@@ -39,7 +39,7 @@ CURVE = "curve"
 """`gid` of the lines of filters."""
 
 _FEW = 12
-"""A curve of so many values has a mark at each."""
+"""Largest number of values of a curve with a mark at each."""
 
 _NO_DATE = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
 
@@ -155,7 +155,7 @@ def titled(axes: Axes, text: str) -> None:
 def curve(
     axes: Axes, i: int, x: np.ndarray, y: np.ndarray, label: str, *, absent: str = "no values"
 ) -> None:
-    """Draw the curve of filter number i with marks, in other places than those of its neighbours.
+    """Draw the curve of filter number i with marks, shifted against those of its neighbours.
 
     absent: the entry in the legend of a curve without a finite value.
     """
@@ -186,7 +186,7 @@ def curves_of(axes: Axes) -> list[Line2D]:
 
 
 def band(axes: Axes, x: np.ndarray, low: np.ndarray, high: np.ndarray, label: str) -> None:
-    """Shade what lies between two curves: light, so that curves stand out, within thin edges."""
+    """Shade the area between two curves, light and with thin edges, so that curves stand out."""
     look: Look = {"fc": (SHADE, 0.35), "ec": FAINT, "lw": 0.4}
     axes.fill_between(x, low, high, label=label, zorder=1, **look)
 
