@@ -22,7 +22,7 @@ from jaxslam.math.gaussians import gaussian_terms
 
 
 def check_gates(name: str, gate: Number, new_gate: Number | None) -> None:
-    """Raise ValueError on a gate below 0 or that is no number, or a new_gate below it."""
+    """Raise ValueError on a gate that is not a number >= 0, and on a new_gate below it."""
     for each in (gate, new_gate):
         if each is not None and not isinstance(each, Real | np.ndarray | jax.Array):
             called = isinstance(each, Prediction | Scan)

@@ -40,11 +40,11 @@ class _Weighing(TypedDict):
 
 
 TRACKING: _Weighing = {"exponent": 0.2, "forget": None}
-"""Of a robot that starts at a known pose: without recovery, which takes scans that the map does not
+"""Options for a start at a known pose: without recovery, which takes scans that the map does not
 explain for a lost robot."""
 
 ANYWHERE: _Weighing = {"exponent": 0.1, "forget": (0.05, 0.5)}
-"""Of a robot that starts anywhere: few particles are near the truth."""
+"""Options for a start anywhere, with few particles near the truth."""
 
 SIGMA = {"pose": 0.1, "anywhere": 0.2}
 """Width of the likelihood field [m]."""

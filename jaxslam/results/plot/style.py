@@ -231,7 +231,7 @@ def caption(figure: Figure, title: str, handles: Sequence[Artist] | None = None)
 
 
 def every_handle(panels: Sequence[Axes]) -> list[Artist]:
-    """What the legend of some panels shows: the last of those with the same label."""
+    """The handles for the legend of some panels, the last one of each label."""
     found = [handle for axes in panels for handle in axes.get_legend_handles_labels()[0]]
     return list({handle.get_label(): handle for handle in found}.values())
 
