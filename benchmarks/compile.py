@@ -24,9 +24,9 @@ from jaxslam import catalog, life, motion, sensors, smoothing, team
 from jaxslam.consistency.campaign.candidates import estimator_of
 from jaxslam.core.protocols import Filter
 from jaxslam.core.types import Log, Trace, Truth
+from jaxslam.driver import run
 from jaxslam.filters import EkfSlam, TeamSlam
 from jaxslam.filters.map_management.merging import Merging
-from jaxslam.run import run
 from jaxslam.sensors import Part, Suite
 from jaxslam.simulation.scenarios import circle
 from jaxslam.simulation.team_world import TeamWorld

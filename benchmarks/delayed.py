@@ -26,7 +26,7 @@ from benchmarks.gate import Metric, show
 from jaxslam import motion, sensors
 from jaxslam.association import Nearest
 from jaxslam.filters import DelayedSlam, EkfSlam
-from jaxslam.filters.delayed.settings import Hypotheses, Promotion, StoredMeasurements
+from jaxslam.filters.delayed.delayed_settings import Hypotheses, Promotion, StoredMeasurements
 from jaxslam.math.angles import wrap
 from jaxslam.math.gaussians import mahalanobis_squared
 from jaxslam.math.stats import chi2_quantile

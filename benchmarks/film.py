@@ -15,7 +15,7 @@ import jax
 
 from benchmarks.gate import Metric
 from jaxslam import catalog, filters, plot, scenarios
-from jaxslam.run import run
+from jaxslam.driver import run
 from jaxslam.simulation.worlds import simulate
 
 MOST = 30.0

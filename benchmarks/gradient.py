@@ -13,9 +13,9 @@ import numpy as np
 
 from benchmarks.gate import Metric
 from benchmarks.speed.timing import together
+from jaxslam.driver import run
 from jaxslam.filters.ekf.ekf_slam import EkfSlam
 from jaxslam.motion.ackermann import Ackermann
-from jaxslam.run import run
 from jaxslam.sensors.range_bearing import RangeBearing
 from jaxslam.simulation.scenarios import cloister
 from jaxslam.simulation.worlds import simulate

@@ -17,7 +17,7 @@ from jaxslam.catalog import FILTERS
 from jaxslam.consistency.campaign import monte_carlo
 from jaxslam.core.record import record, static
 from jaxslam.simulation.scenarios import loop
-from jaxslam.simulation.scenarios.loop import loop_landmarks
+from jaxslam.simulation.scenarios.published import loop_landmarks
 from jaxslam.simulation.worlds import Scenario, drawn
 
 NAMES = ("ekf", "ideal", "fej", "oc", "right_invariant")

@@ -22,7 +22,7 @@ from benchmarks.gate import Metric, save, show
 from jaxslam import datasets, metrics
 from jaxslam.core.types import Status
 from jaxslam.filters import DelayedSlam
-from jaxslam.filters.delayed.settings import StoredMeasurements
+from jaxslam.filters.delayed.delayed_settings import StoredMeasurements
 from jaxslam.results.plot.style import COLORS, FAINT, INK, PAGE, SHADE, caption, panels_of
 
 STORED = StoredMeasurements(capacity=40, spacing=2.0)

@@ -23,8 +23,7 @@ from jaxslam import datasets, filters
 from jaxslam.filters.information.marginals import blanket_marginals, whole_marginals
 from jaxslam.math.angles import wrap
 from jaxslam.math.gaussians import mahalanobis_squared
-from jaxslam.simulation.scenarios import circle, cloister
-from jaxslam.simulation.scenarios.view import BetweenRanges
+from jaxslam.simulation.scenarios import BetweenRanges, circle, cloister
 from jaxslam.simulation.worlds import simulate
 
 KEY = jax.random.key(0)

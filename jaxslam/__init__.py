@@ -27,11 +27,11 @@ from jaxslam.consistency import metrics
 from jaxslam.consistency.campaign import Campaign, Incomplete, Interrupted, monte_carlo
 from jaxslam.core import protocols, slots, types
 from jaxslam.core._field_docs import attach_field_docs
+from jaxslam.driver import run
 from jaxslam.filters.multi_robot import team
 from jaxslam.graphs import smoothing
 from jaxslam.laser import features, grids, laser_slam, matching, topology
 from jaxslam.math import se2, stats, uncertain_poses
-from jaxslam.run import run
 from jaxslam.simulation import scenarios, spurious
 from jaxslam.simulation.recorded import recorded_world
 from jaxslam.simulation.team_world import TeamWorld

@@ -20,9 +20,10 @@ from jaxslam.charts import LeftInvariant, RightInvariant
 from jaxslam.core.protocols import Candidate, Estimator, Filter
 from jaxslam.core.record import record, static
 from jaxslam.core.types import Truth
+from jaxslam.driver import run
+from jaxslam.filters.ekf.ekf_settings import EkfOptions
 from jaxslam.filters.ekf.ekf_slam import EkfSlam
-from jaxslam.filters.ekf.observability import Monitored
-from jaxslam.filters.ekf.settings import EkfOptions
+from jaxslam.filters.ekf.monitor import Monitored
 from jaxslam.filters.information.eif_slam import EifSlam, InPieces
 from jaxslam.filters.information.seif import Seif
 from jaxslam.filters.known.dead_reckoning import DeadReckoning
@@ -34,7 +35,6 @@ from jaxslam.graphs.smoothing.batch_map import BatchMap
 from jaxslam.graphs.smoothing.fixed_lag import FixedLag
 from jaxslam.linearize.other_points import AtTruth, FirstEstimate, Observability
 from jaxslam.linearize.unscented import Unscented
-from jaxslam.run import run
 from jaxslam.simulation.worlds import World
 
 _V = TypeVar("_V")

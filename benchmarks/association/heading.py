@@ -14,8 +14,8 @@ import numpy as np
 from benchmarks.association import rules
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Scan
+from jaxslam.filters.ekf.ekf_settings import EkfSettings
 from jaxslam.filters.ekf.predicted_measurements import prediction_of
-from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.math.angles import wrap
 from jaxslam.math.linalg import root_psd
 from jaxslam.math.stats import chi2_quantile

@@ -9,10 +9,10 @@ from benchmarks.gate import Metric, show
 from jaxslam import Campaign, filters, laser_slam, monte_carlo, recorded_world, scenarios, sensors
 from jaxslam.consistency.measures.nees import pose_error
 from jaxslam.core.types import Log, Scan
-from jaxslam.laser.laser_slam import ScanLog, Settings, covariances
+from jaxslam.laser.laser_slam import ScanLog, Settings, end_covariances
 from jaxslam.laser.laser_slam.odometry import raw
-from jaxslam.laser.laser_slam.odometry.pieces import laser_odometry
-from jaxslam.laser.laser_slam.scans import scans_of
+from jaxslam.laser.laser_slam.odometry.log_odometry import laser_odometry
+from jaxslam.laser.laser_slam.scan_points import scans_of
 from jaxslam.math import numpy_poses as poses
 from jaxslam.simulation.laser import scan_world
 
@@ -81,9 +81,9 @@ def steps_of(odometry, true):
 def path_of(odometry, true):
     """NEES of the keyframes by the chain of matches."""
     keys = odometry.keyframe
-    total = covariances.along(odometry.poses[keys], odometry.cov[keys[1:]])
+    total = end_covariances.along(odometry.poses[keys], odometry.cov[keys[1:]])
     zero = np.zeros(len(keys) - 1, int)
-    cov = covariances.relative_cov(total, odometry.poses[keys], zero, np.arange(1, len(keys)))
+    cov = end_covariances.relative_cov(total, odometry.poses[keys], zero, np.arange(1, len(keys)))
     return nees(poses.between(odometry.poses[keys[1:]], true[keys[1:]]), cov)
 
 

@@ -11,7 +11,7 @@ from benchmarks.gate import Metric, child
 from benchmarks.scan_matching.pairs import drawn
 from jaxslam import matching
 from jaxslam.simulation import laser
-from jaxslam.simulation.walls import walls
+from jaxslam.simulation.walls import make_walls
 
 BATCH = 64
 
@@ -48,7 +48,7 @@ def accuracy(runs: int) -> list[Metric]:
 
 def convergence(steps: int = 30) -> dict[str, np.ndarray]:
     """Distance [m] of each iterate from the last, without noise, in a round room with pillars."""
-    room = walls(circles=[[0, 0, 4.0], [1.5, 1.2, 0.4], [-1.8, 0.6, 0.5], [0.3, -2.2, 0.6]])
+    room = make_walls(circles=[[0, 0, 4.0], [1.5, 1.2, 0.4], [-1.8, 0.6, 0.5], [0.3, -2.2, 0.6]])
     beams = 1440
     angles = 2 * np.pi * np.arange(beams) / beams
     exact = laser.Laser(angles, sigma=0.01, max_range=20.0)

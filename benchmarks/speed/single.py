@@ -20,10 +20,10 @@ import numpy as np
 from benchmarks.speed.dense import dense_ekf
 from jaxslam.catalog import FILTERS
 from jaxslam.core.slots import Joint
+from jaxslam.driver import run
 from jaxslam.filters import CompressedEkfSlam, EkfSlam
 from jaxslam.filters.ekf.compressed_ekf_slam import opened
 from jaxslam.math.xla import hot_options
-from jaxslam.run import run
 from jaxslam.simulation.scenarios import cloister
 from jaxslam.simulation.worlds import simulate
 

@@ -43,8 +43,8 @@ LIMIT = 900
 BEGINS = {
     "consistency": "jaxslam.cli.consistency:",
     "fit": "jaxslam.cli.fit:",
-    "localize": "jaxslam.cli.localization:",
-    "map": "jaxslam.cli.mapping:",
+    "localize": "jaxslam.cli.localize:",
+    "map": "jaxslam.cli.make_map:",
     "optimize": "jaxslam.cli.optimize:",
     "run": "jaxslam.cli.run:",
     "slam": "jaxslam.cli.slam:",

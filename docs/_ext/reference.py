@@ -83,7 +83,7 @@ OPEN = {
     "jaxslam.core.types": "Beams Estimate Info Log Scan Status Trace Truth",
     "jaxslam.core.validation": "check_count check_covariance check_gate check_record is_concrete",
     "jaxslam.datasets": (
-        "MRCLAM_CALIBRATION Dataset DatasetFit LaserLog OwnCalibration RobotCalibration "
+        "MRCLAM_CALIBRATION Dataset DatasetFit FittedCalibration LaserLog RobotCalibration "
         "StampedRelations bonn carmen fit mrclam mrclam_calibration mrclam_team plaza "
         "relation_file table victoria_park white_noise"
     ),
@@ -118,12 +118,12 @@ OPEN = {
     ),
     "jaxslam.results.report": "map_csv trajectory_csv trajectory_tum",
     "jaxslam.results.store": "open resume",
-    "jaxslam.run": "",
+    "jaxslam.driver": "",
     "jaxslam.simulation.laser": (
         "Laser LaserHistory LaserWorld Observability scan scan_information scan_world true_ranges"
     ),
-    "jaxslam.simulation.scenarios.lines": "from_start",
-    "jaxslam.simulation.walls": "Walls rasterize walls",
+    "jaxslam.simulation.scenarios.rooms": "from_start",
+    "jaxslam.simulation.walls": "Walls make_walls rasterize",
     "jaxslam.simulation.worlds": "World",
     "jaxslam.verify": "Check Finding Report",
 }
@@ -248,8 +248,7 @@ def write_pages(app: Any = None) -> None:
 def section(module: str, names: list[Name], top: bool) -> str:
     """The text of one module: its docstring, then its names in order."""
     lines = [] if top else [module, "-" * len(module), ""]
-    lines += [f".. automodule:: {module}", "   :no-members:"]
-    lines += ["   :no-index:", ""] if hidden(module) else [""]
+    lines += [f".. automodule:: {module}", "   :no-members:", ""]
     for name in names:
         lines += [f".. auto{name.kind}:: {name.module}::{name.name}"]
         if name.kind == "data":
@@ -258,12 +257,6 @@ def section(module: str, names: list[Name], top: bool) -> str:
             lines += [f"   :{shape}"]
         lines += [""]
     return "\n".join(lines)
-
-
-def hidden(module: str) -> bool:
-    """Whether the package has a function of the module's name, as `jaxslam.run` is."""
-    package, _, name = module.rpartition(".")
-    return bool(package) and not inspect.ismodule(getattr(importlib.import_module(package), name))
 
 
 def as_markup(app: Any, what: str, name: str, obj: Any, options: Any, lines: list[str]) -> None:

@@ -1,6 +1,7 @@
-"""Association by tags, by nearest neighbours and by likelihood, and the gates these share."""
+"""Association by tags, nearest neighbours or likelihood: the pairs, the rules and their gates."""
 
 import dataclasses
+from collections.abc import Callable
 from numbers import Real
 from typing import Literal
 
@@ -12,15 +13,16 @@ from jaxtyping import Bool, Float, Int
 
 from jaxslam.core import slots
 from jaxslam.core.numbers import check_positive, is_concrete
-from jaxslam.core.protocols import Associate, Association, Pairs, Prediction
+from jaxslam.core.protocols import Associate, Association, Pairs, Prediction, Sensor
 from jaxslam.core.record import hold_function, record, static
 from jaxslam.core.types import Scan
 from jaxslam.math.arrays import Number
 from jaxslam.math.assignment import assign
+from jaxslam.math.gaussians import gaussian_terms
 
 
 def check_gates(name: str, gate: Number, new_gate: Number | None) -> None:
-    """Raise ValueError on a gate below 0 or that is no number, or a new_gate below it."""
+    """Raise ValueError on a gate that is not a number >= 0, and on a new_gate below it."""
     for each in (gate, new_gate):
         if each is not None and not isinstance(each, Real | np.ndarray | jax.Array):
             called = isinstance(each, Prediction | Scan)
@@ -190,3 +192,38 @@ class Certain:
             return found._replace(possible=found.possible & (variance <= self.spread**2))
 
         return Association(*self.associate(dataclasses.replace(prediction, pairs=pairs), scan))
+
+
+def predicted(
+    sensor: Sensor,
+    tag: Int[Array, "N"],
+    alive: Bool[Array, "N"],
+    measurements: Callable[[], tuple[Float[Array, "N Z"], Float[Array, "N Z Z"] | None]],
+    cross: Callable[[], Float[Array, "N Z N Z"]],
+) -> Prediction:
+    """The `Prediction` of N landmarks, from predicted measurements and their covariances.
+
+    ν_ij = z_i ⊖ ẑ_j, S_ij = H_j P H_jᵀ + R_i. What a method does not call is not computed.
+
+    Args:
+        tag, alive: of the slots.
+        measurements: () -> ẑ and H_j P H_jᵀ; None instead of the latter where pose and map have no
+            error: then S_ij = R_i, which is factored once a measurement.
+        cross: () -> H_i P H_jᵀ.
+    """
+
+    def pairs(scan: Scan) -> Pairs:
+        expected, landmark_cov = measurements()
+        noise = jax.vmap(sensor.noise_cov)(scan.z)
+        over_slots = jax.vmap(sensor.residual, in_axes=(None, 0))
+        innovation = jax.vmap(over_slots, in_axes=(0, None))(scan.z, expected)
+        if landmark_cov is None:
+            cov = jnp.broadcast_to(noise[:, None], (*innovation.shape, innovation.shape[2]))
+            terms = jax.vmap(jax.vmap(gaussian_terms, in_axes=(0, None)))(innovation, noise)
+        else:
+            cov = landmark_cov[None] + noise[:, None]
+            terms = jax.vmap(jax.vmap(gaussian_terms))(innovation, cov)
+        possible = scan.valid[:, None] & alive[None, :] & terms.positive
+        return Pairs(innovation, cov, terms.distance, terms.log_det, possible)
+
+    return Prediction(tag, alive, pairs, cross)

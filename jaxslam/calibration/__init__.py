@@ -6,7 +6,7 @@ standard deviations and what else is in it, with the associations held; `conside
 uncertainty of parameters adds to the covariance of a result.
 """
 
-from jaxslam.calibration.likelihood import NoiseFit, as_associated, fit_noise
+from jaxslam.calibration.maximum_likelihood import NoiseFit, as_associated, fit_noise
 from jaxslam.calibration.systematic import Calibration, calibrate, consider_cov
 
 __all__ = ["Calibration", "NoiseFit", "as_associated", "calibrate", "consider_cov", "fit_noise"]

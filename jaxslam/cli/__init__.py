@@ -20,15 +20,14 @@ from jaxslam.cli import (
     cache,
     consistency,
     fit,
-    localization,
-    mapping,
+    localize,
+    make_map,
     optimize,
     run,
     slam,
     verify,
 )
-from jaxslam.cli.common import INTERRUPTED, as_folders
-from jaxslam.cli.runtime import CompileClock, set_device_count
+from jaxslam.cli.common import INTERRUPTED, CompileClock, as_folders, set_device_count
 
 __all__ = ["main"]
 
@@ -36,7 +35,7 @@ USAGE_ERROR = 2
 PIPE_CLOSED = 141  # 128 + SIGPIPE, as a shell reports it
 
 _POSITIONAL = re.compile(r"-[\d.]")
-"""What begins like a negative number is a value, as in `--start -6,-10,90`, and no option."""
+"""A value that begins like a negative number, as in `--start -6,-10,90`, is not an option."""
 
 COMMANDS = {
     "consistency": (
@@ -53,10 +52,10 @@ COMMANDS = {
     ),
     "fit": (
         fit,
-        "fit the noises of your own data to its log",
+        "fit the noises of your data by maximum likelihood",
         "Find the standard deviations of motion and sensor by maximum likelihood, with standard "
         "errors, from a folder as of `jaxslam run --dataset table`. Prints a table and writes "
-        "fit.json, and fit.toml, which stands in for the noises of dataset.toml.",
+        "fit.json, and fit.toml, which replaces the noises of dataset.toml.",
     ),
     "slam": (
         slam,
@@ -65,13 +64,13 @@ COMMANDS = {
         "loops, map and figures.",
     ),
     "map": (
-        mapping,
+        make_map,
         "make a map of a laser log from the poses in the file",
-        "Make a map from the poses that stand in a laser log beside the scans. Prints a summary "
-        "and writes the map, as ROS reads it, and a figure.",
+        "Make a map of a laser log at the poses in the file. Prints a summary and writes the map, "
+        "as ROS reads it, and a figure.",
     ),
     "localize": (
-        localization,
+        localize,
         "localize the robot of a laser log in a map",
         "Localize the robot in a map of ROS from raw odometry and scans, by particles. Prints a "
         "summary and writes trajectory and a figure.",
@@ -86,20 +85,20 @@ COMMANDS = {
     ),
     "verify": (
         verify,
-        "verify the Jacobians of every model, or of your own file",
+        "verify the Jacobians of every model, or of your file",
         "Compare hand-derived Jacobians with forward and reverse autodiff and with difference "
         "quotients. Prints a table, or a report on your file, and writes JSON. The exit status is "
         "1 if anything fails, 2 if the file cannot be used.",
     ),
 }
-"""Of each command the module, which has its options, its help and its description."""
+"""By command: its module, its line of help and its description."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status.
 
     0 on success, 1 for a wrong model or an optimization that did not converge, 2 on bad input, 130
-    if interrupted, 141 if the reader of its output has gone.
+    if interrupted, 141 if the reader of the output has closed the pipe.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     # Python's last collection would visit every object of JAX, which takes over half a second.
@@ -137,8 +136,8 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _laser_command(arguments: list[str]) -> list[str]:
-    """`run --dataset carmen …` as the command on a laser log that it stands for: `localize MAP`
-    with `--localize MAP`, `map` with `--map known`, else `slam`."""
+    """Replace `run --dataset carmen …` by the command on a laser log: `localize MAP` with
+    `--localize MAP`, `map` with `--map known`, else `slam`."""
     of = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     of.add_argument("--dataset")
     of.add_argument("--localize", metavar="MAP")
@@ -154,24 +153,24 @@ def _laser_command(arguments: list[str]) -> list[str]:
 
 
 class _Parser(argparse.ArgumentParser):
-    """A parser that tells an error in one line, and takes no part of an option's name for it."""
+    """A parser with errors of one line, which does not complete abbreviated options."""
 
     def __init__(self, *args: Any, **options: Any) -> None:
         super().__init__(*args, **{"allow_abbrev": False, **options})
         self._negative_number_matcher = _POSITIONAL
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """As that of argparse; what is not known is an error, here where the command is known."""
+        """As in argparse; unknown arguments are an error, reported with the name of the command."""
         found, unknown = super().parse_known_args(args, namespace)
         if unknown:
-            asked = meant(unknown[0], self._option_string_actions)
-            self.error(f"unrecognized arguments: {' '.join(unknown)}{asked}")
+            hint = meant(unknown[0], self._option_string_actions)
+            self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
         return found, unknown
 
     def error(self, message: str) -> NoReturn:
-        """Exit with what is wrong and where the options are described."""
-        told = f"{self.prog} --help describes the options"
-        self.exit(USAGE_ERROR, f"{self.prog}: {message}; {told}\n")
+        """Exit with the error and a reference to the help."""
+        hint = f"{self.prog} --help describes the options"
+        self.exit(USAGE_ERROR, f"{self.prog}: {message}; {hint}\n")
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -186,6 +185,6 @@ def _parser() -> argparse.ArgumentParser:
         "--version", action="version", version=f"jaxslam {version('jaxslam')} ({versions})"
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
-    for name, (module, told, description) in COMMANDS.items():
-        module.add_options(commands.add_parser(name, help=told, description=description))
+    for name, (module, line, description) in COMMANDS.items():
+        module.add_options(commands.add_parser(name, help=line, description=description))
     return parser

@@ -39,21 +39,21 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--cache",
         metavar="DIR",
         default=argparse.SUPPRESS,  # a formatter that adds defaults would print None
-        help="folder in which compiled programs are kept for the next time "
+        help="folder in which compiled programs are kept for later commands "
         "(default: the user's cache folder, as ~/.cache/jaxslam)",
     )
     where.add_argument(
         "--no-cache",
         action="store_true",
         default=argparse.SUPPRESS,
-        help="neither keep compiled programs nor use those that are kept",
+        help="neither keep compiled programs nor use kept ones",
     )
 
 
 def user_folder() -> Path:
     """The cache folder of this user on this system, for jaxslam.
 
-    Raises RuntimeError where the user has no home.
+    Raises RuntimeError if the user has no home.
     """
     home = Path.home()
     if sys.platform == "darwin":
@@ -61,24 +61,24 @@ def user_folder() -> Path:
     elif sys.platform == "win32":
         base = Path(os.environ.get("LOCALAPPDATA") or home / "AppData" / "Local")
     else:
-        asked = os.environ.get("XDG_CACHE_HOME", "")
-        base = Path(asked) if os.path.isabs(asked) else home / ".cache"
+        configured = os.environ.get("XDG_CACHE_HOME", "")
+        base = Path(configured) if os.path.isabs(configured) else home / ".cache"
     return base / "jaxslam"
 
 
 def from_options(options: argparse.Namespace) -> contextlib.AbstractContextManager[None]:
-    """The `program_cache` that the options of a command ask for."""
+    """The `program_cache` for the options of a command."""
     return program_cache(getattr(options, "cache", None), getattr(options, "no_cache", False))
 
 
 @contextlib.contextmanager
-def program_cache(asked: Path | None, none: bool = False, bound: int = BOUND) -> Iterator[None]:
+def program_cache(given: Path | None, none: bool = False, bound: int = BOUND) -> Iterator[None]:
     """A block in which JAX writes compiled programs to a folder and reads them from it.
 
     The configuration of JAX is restored at the end.
 
     Args:
-        asked: the folder; None for the one that JAX is configured with, as by the environment
+        given: the folder; None for the one that JAX is configured with, as by the environment
             variable JAX_COMPILATION_CACHE_DIR, or else `user_folder`.
         none: keep and read no programs.
         bound: largest size of the folder after the block [bytes].
@@ -87,19 +87,19 @@ def program_cache(asked: Path | None, none: bool = False, bound: int = BOUND) ->
         with jax_settings(jax_compilation_cache_dir=None):
             yield
         return
-    if asked is None and (configured := jax.config.jax_compilation_cache_dir):
+    if given is None and (configured := jax.config.jax_compilation_cache_dir):
         with _one_warning(Path(configured), ours=False):
             yield
         return
-    whole = asked
+    root = given
     try:
-        whole = whole or user_folder()
-        folder = whole / processor_kind()
+        root = root or user_folder()
+        folder = root / processor_kind()
         folder.mkdir(parents=True, exist_ok=True)
         with tempfile.TemporaryFile(dir=folder):
             pass
     except (OSError, RuntimeError) as error:
-        where = whole or "the user's cache folder"
+        where = root or "the user's cache folder"
         warn(f"compiled programs cannot be kept in {where} ({_reason(error)}); continuing without")
         with jax_settings(jax_compilation_cache_dir=None):
             yield
@@ -115,18 +115,18 @@ def program_cache(asked: Path | None, none: bool = False, bound: int = BOUND) ->
         ):
             yield
     finally:
-        prune(whole, bound)
+        prune(root, bound)
 
 
 def prune(folder: Path, bound: int) -> None:
     """Delete the least recently used files of a cache folder until its size is within the bound."""
-    found = []
+    files = []
     for path in folder.glob("*/*-cache"):
         with contextlib.suppress(OSError):  # another process deleted it
             state = path.stat()
-            found.append((max(state.st_atime, state.st_mtime), state.st_size, path))
-    total = sum(size for _, size, _ in found)
-    for _, size, path in sorted(found):
+            files.append((max(state.st_atime, state.st_mtime), state.st_size, path))
+    total = sum(size for _, size, _ in files)
+    for _, size, path in sorted(files):
         if total <= bound:
             break
         with contextlib.suppress(OSError):
@@ -149,7 +149,7 @@ def processor_kind() -> str:
 
 @contextlib.contextmanager
 def jax_settings(**values: str | float | None) -> Iterator[None]:
-    """A block in which JAX has other settings. JAX opens its cache once, hence `reset_cache`."""
+    """A block with other settings of JAX; `reset_cache`, since JAX opens its cache only once."""
     before = {name: getattr(jax.config, name) for name in values}
     try:
         for name, value in values.items():

@@ -11,8 +11,7 @@ from typing import NamedTuple
 
 import jax
 
-from jaxslam.cli.common import OUT, check_out
-from jaxslam.cli.runtime import chosen_devices
+from jaxslam.cli.common import OUT, check_out, chosen_devices
 from jaxslam.consistency.campaign import missing
 from jaxslam.core.numbers import check_count
 from jaxslam.results import campaign_files, store

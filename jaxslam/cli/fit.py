@@ -1,4 +1,4 @@
-"""The command `jaxslam fit`: the noises of one's own data by maximum likelihood."""
+"""The command `jaxslam fit`: the noises of a user's data by maximum likelihood."""
 
 import argparse
 from collections.abc import Sequence
@@ -38,7 +38,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--write",
         action="store_true",
-        help="also write fit.toml into the folder, where it stands in for what dataset.toml says",
+        help="also write fit.toml into the folder, where it replaces the noises of dataset.toml",
     )
     cache.add_options(parser)
     add_out(parser)
@@ -65,16 +65,18 @@ def fit_folder(options: argparse.Namespace, command: str) -> int:
         written += write_files(Path(options.path), {FITTED: fitted})
     print("\nwrote " + ", ".join(map(str, written)))
     if options.write and not good:
-        print(f"{FITTED} was not written into {options.path}: the fit did not come to an end")
+        print(f"{FITTED} was not written into {options.path}: the fit did not converge")
     elif not options.write:
-        print(f"{FITTED} in {options.path} stands in for what its dataset.toml says: use --write")
+        print(
+            f"use --write to write {FITTED} into {options.path}, too, where it replaces the noises"
+        )
     return 0
 
 
 def _settings(
     data: Dataset, result: DatasetFit, mount: bool
 ) -> tuple[dict[str, dict[str, Sequence[float]]], dict[str, str]]:
-    """The sections of `dataset.toml` with what was found, and a comment for each key."""
+    """The sections of `dataset.toml` with the fitted numbers, and a comment for each key."""
     count = len(data.motion.noises)
     changes: dict[str, dict[str, Sequence[float]]] = {
         "motion": {"noise": result.deviations[:count]},
@@ -91,7 +93,7 @@ def _settings(
 
 
 def _summary(data: Dataset, result: DatasetFit) -> Json:
-    """What `fit.json` says; what is infinite is null."""
+    """The content of `fit.json`; infinite numbers are null."""
     found = result.found
     rows = zip(
         found.names, found.start, found.parameters, found.error, found.robust_error, strict=True
@@ -129,7 +131,7 @@ def _summary(data: Dataset, result: DatasetFit) -> Json:
 
 
 def _table(data: Dataset, result: DatasetFit) -> str:
-    """The parameters before and after with their errors, the likelihood, and what to mind."""
+    """The parameters before and after with their errors, the likelihood, and notes."""
     found = result.found
     lines = [["", "before", "after", "std. error", "robust"]]
     for i, name in enumerate(found.names):
@@ -173,8 +175,8 @@ def _notes(result: DatasetFit) -> list[str]:
     notes += [f"{name} = {value:g} was held" for name, value in result.held.items()]
     for name, limit in found.upper.items():
         notes.append(
-            f"{name}: the log does not tell it from 0; above {limit:.2g} it is unlikely (95 %, the "
-            "others held)"
+            f"{name}: this log does not distinguish it from 0; above {limit:.2g} it is unlikely "
+            "(95 %, the others held)"
         )
     for name, others in found.loose.items():
         reason = (

@@ -14,6 +14,7 @@ from jaxslam.cli import cache
 from jaxslam.cli.common import (
     FILMS,
     SUMMARY,
+    CompileClock,
     add_animate,
     add_dtype,
     add_out,
@@ -22,17 +23,16 @@ from jaxslam.cli.common import (
     pick,
     summary_table,
 )
-from jaxslam.cli.runtime import CompileClock
 from jaxslam.consistency.campaign.progress import Progress
 from jaxslam.core.numbers import check_count
 from jaxslam.core.types import JaxOrNumPy
 from jaxslam.datasets import g2o
 from jaxslam.graphs import Ending, Graph, starts
+from jaxslam.graphs.checks import label, variables_in
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import TRUSTED
 from jaxslam.graphs.solver.kernels import REGISTRY as KERNELS
 from jaxslam.graphs.starts import STARTS
-from jaxslam.graphs.validation import label, variables_in
 from jaxslam.results.files import Files, csv_text, json_number, json_text, versions, write_files
 
 ERRORS = {
@@ -44,7 +44,7 @@ ERRORS = {
 COST = "χ² = Σ eᵀ Ω e, without a factor ½; of relative poses"
 
 SEVERAL = ("given", "chordal", "robust")
-"""Starts that are tried with a robust kernel: which one is right differs from graph to graph."""
+"""Starts tried with a robust kernel: the best one differs from graph to graph."""
 
 NOT_CONVERGED = 1
 
@@ -52,7 +52,7 @@ WORST = 10
 """Number of rows with the largest residuals in the summary and the figure."""
 
 FRAMES = 60
-"""Number of iterations that a film shows at most."""
+"""Largest number of iterations in a film."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -85,7 +85,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--certificate",
         action="store_true",
-        help="also prove, where it can be, that no poses have a lower chordal cost",
+        help="also try to prove that no poses have a lower chordal cost",
     )
     add_animate(parser, "of the iterations")
     cache.add_options(parser)
@@ -225,7 +225,7 @@ def _sum(squared: Mapping[str, np.ndarray]) -> float:
 def _begins(
     name: str | None, robust: bool, given: Graph, factors: Mapping[str, Factor]
 ) -> tuple[dict[str, Graph], dict[str, str]]:
-    """The graph at each start to try; and the starts that cannot be, with the reason."""
+    """The graph at each start to try, and the starts that are not possible, with the reason."""
     if name is not None or not robust:
         name = name or "given"
         return {name: starts.STARTS[name](given, factors)}, {}
@@ -244,7 +244,7 @@ def _robust(
     tried: Mapping[str, float],
     impossible: Mapping[str, str],
 ) -> dict[str, object]:
-    """What a robust kernel made of the graph: entries of the summary."""
+    """Entries of the summary on a robust kernel: costs, and the number of rows kept."""
     kept, left_out = {}, {}
     for key in doubted:
         valid, weight = np.asarray(solution.graph.tables[key].valid), solution.weights[key]
@@ -260,7 +260,7 @@ def _robust(
 
 
 def _advice(status: int, tried: Collection[str]) -> str:
-    """What to try after an optimization without a minimum; nothing where the status says enough."""
+    """What to try if no minimum was reached; empty for a singular graph, whose status is enough."""
     if status == Ending.SINGULAR:
         return ""
     others = ", ".join(name for name in starts.STARTS if name not in tried)
@@ -277,8 +277,8 @@ def _gauge(read: Graph, given: Graph) -> str:
     if given is not read:
         held = given.pose_id[given.fixed_pose.argmax()]
         return f"pose {int(held)} is fixed, since the file fixes none"
-    told = [f"{poses} poses"] * (poses > 0) + [f"{points} points"] * (points > 0)
-    return " and ".join(told) + " fixed by the file" if told else "by priors"
+    fixed = [f"{poses} poses"] * (poses > 0) + [f"{points} points"] * (points > 0)
+    return " and ".join(fixed) + " fixed by the file" if fixed else "by priors"
 
 
 def _status(solution: graphs.Solution, found: Graph) -> str:
@@ -292,7 +292,7 @@ def _status(solution: graphs.Solution, found: Graph) -> str:
 def _certificate(found: Graph, converged: bool, plain: bool) -> dict[str, object]:
     """The certificate of the optimum: entries of the summary."""
     if not converged or not plain:
-        why = "of a robust cost nothing is proved" if converged else "there is no optimum"
+        why = "not for a robust cost" if converged else "no optimum was reached"
         return {"certificate": f"none: {why}"}
     began = time.perf_counter()
     try:
@@ -355,8 +355,8 @@ def _film(
 ) -> Files:
     """The film of the iterations, by file name.
 
-    Iterate k is where the same optimization stops after k steps; the limit is no part of the
-    compiled program.
+    Iterate k is the result of the same optimization with a limit of k steps; the limit is an
+    argument of the compiled program.
     """
     from jaxslam.results import plot  # matplotlib is slow to load
 
@@ -382,7 +382,7 @@ def _film(
 
 
 def as_text(value: object) -> str:
-    """A value as it is printed; numbers with nine digits, so that optima can be compared."""
+    """A value as text; numbers with nine digits, so that optima can be compared."""
     if isinstance(value, dict):
         return ", ".join(f"{key} {count:,}" for key, count in value.items()) or "none"
     if value is None:

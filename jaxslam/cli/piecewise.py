@@ -1,4 +1,4 @@
-"""A filter run over a long log piece by piece, with checks of its state in between."""
+"""Runs a filter over a long log piece by piece, and checks its state between pieces."""
 
 from collections.abc import Callable
 from typing import NamedTuple, TypeAlias
@@ -12,13 +12,15 @@ from jaxslam.core.protocols import Filter
 from jaxslam.core.types import Estimate, Info, JaxOrNumPy, Log
 
 State: TypeAlias = PyTree
-"""A filter's own state, a pytree."""
+"""The state of a filter, a pytree."""
 
 Rows: TypeAlias = tuple[tuple[PyTree, ...], PyTree]
-"""What is kept of each step, and of the steps to watch: arrays with leading T."""
+"""Results of each step, and of the watched steps: arrays with leading T."""
 
-PIECES, LONGEST = 20, 500
-"""A log is run in so many pieces, or in more of at most so many steps."""
+PIECES = 20
+"""Number of pieces of a log, unless they exceed `LONGEST`."""
+LONGEST = 500
+"""Largest number of steps of a piece."""
 
 
 class PiecewiseRun(NamedTuple):
@@ -34,17 +36,17 @@ class PiecewiseRun(NamedTuple):
     last: Estimate
     """the estimate after the last step"""
     final: State
-    """the filter's own state there"""
+    """the state of the filter after it"""
     checked: list[int]
     """the steps, from 1, after which the state was checked"""
     passed: list[bool]
     """the results of these checks"""
     estimates: Estimate | None = None
-    """the whole estimates (F, …) after the steps to watch, where there are such, and"""
+    """the whole estimates (F, …) after the watched steps, if any"""
     watched: PyTree = None
-    """what `watch` returned of the states there"""
+    """the results of `watch` after the same steps"""
     kept: PyTree = None
-    """what `keep` returned of the info of each step, leading T"""
+    """the results of `keep`, leading T"""
 
 
 def run_in_pieces(
@@ -67,10 +69,10 @@ def run_in_pieces(
     Args:
         log: T rows of arrays in the dtype of the arithmetic.
         progress: called after each piece with the steps done and their total.
-        check: called after each piece with the filter's own state.
+        check: called after each piece with the state of the filter.
         seed: of the random numbers of a particle filter.
-        at: the steps to watch, from 0, in order: the whole estimate after each is kept, and what
-            `watch` makes of the filter's own state. Default none.
+        at: the watched steps, counted from 0, in order: the whole estimate after each is kept, and
+            `watch` of the state. Default none.
         keep: called with the info of each step.
     """
     total = log.control.shape[0]
@@ -109,13 +111,13 @@ def run_in_pieces(
         state, kept, last = piece(state, rows, jnp.asarray(end - begin), jnp.asarray(begin))
         pieces.append(jax.tree.map(lambda leaf, n=end - begin: np.asarray(leaf)[:n], kept[0]))
         if at is not None:
-            mine = at[(at >= begin) & (at < end)] - begin
-            films.append(jax.tree.map(lambda leaf, a=mine: np.asarray(leaf)[a], kept[1]))
+            chosen = at[(at >= begin) & (at < end)] - begin
+            films.append(jax.tree.map(lambda leaf, a=chosen: np.asarray(leaf)[a], kept[1]))
         progress(end, total)
         if check is not None:
             checked.append(end)
             passed.append(check(state))
-    pose, cov, status, slot, nis, dof, log_likelihood, told = jax.tree.map(
+    pose, cov, status, slot, nis, dof, log_likelihood, info = jax.tree.map(
         lambda *parts: np.concatenate(parts), *pieces
     )
     path = last._replace(pose=pose, pose_cov=cov, points=(), point_covs=(), alive=(), tag=())
@@ -135,7 +137,7 @@ def run_in_pieces(
         passed=passed,
         estimates=estimates,
         watched=watched,
-        kept=told,
+        kept=info,
     )
 
 

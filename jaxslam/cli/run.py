@@ -37,7 +37,7 @@ from jaxslam.core.types import Estimate, Log, Status, Truth
 from jaxslam.datasets import READERS, Dataset
 from jaxslam.datasets.evaluation import Evaluation, evaluate, joint_map_cov
 from jaxslam.datasets.table_settings import METHODS, association_options
-from jaxslam.filters.ekf.settings import EkfOptions
+from jaxslam.filters.ekf.ekf_settings import EkfOptions
 from jaxslam.results import report
 from jaxslam.results.campaign_files import FORMATS, check_figure_formats
 from jaxslam.results.files import Files, Json, json_text, versions, write_files
@@ -51,7 +51,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--robot",
         type=int,
-        help="number of the robot, where there are several (default: the first)",
+        help="number of the robot, of several (default: the first)",
     )
     parser.add_argument(
         "--filters",
@@ -62,13 +62,13 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--gate",
         type=float,
         metavar="P",
-        help="probability that a correct measurement passes the gate, as 0.999 (default: as the "
-        "reader says, mostly none)",
+        help="probability that a correct measurement passes the gate, as 0.999 (default: that of "
+        "the reader, mostly none)",
     )
     parser.add_argument(
         "--associate",
         metavar="METHOD",
-        help=f"one of: {', '.join(METHODS)} (default: as the reader says, mostly known)",
+        help=f"one of: {', '.join(METHODS)} (default: that of the reader, mostly known)",
     )
     add_figures(parser, FORMATS)
     add_animate(parser, "of each filter")
@@ -93,7 +93,7 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
     from jaxslam.results import plot  # matplotlib is slow to load
 
     at = plot.frame_steps(data.steps, time=data.time) if options.animate else None
-    runs = {name: _run(name, filter, data, at) for name, filter in filters.items()}
+    runs = {name: run_filter(name, filter, data, at) for name, filter in filters.items()}
     last = next(iter(runs.values())).result.last
     summary: Json = {
         "dataset": data.name,
@@ -129,25 +129,24 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
     return 0
 
 
-class _Run(NamedTuple):
-    """A filter's results on a data set."""
+class FilterRun(NamedTuple):
+    """The results of a filter on a data set."""
 
     result: PiecewiseRun
     found: Evaluation
     summary: Json
 
 
-def _run(
+def run_filter(
     name: str,
     filter: Filter,
     data: Dataset,
     at: Int[np.ndarray, "F"] | None,
-) -> _Run:
-    """Run one filter over a data set; its covariance is checked where the state holds P.
+) -> FilterRun:
+    """Run one filter over a data set; the covariance is checked if the state has P.
 
-    at: the steps that a film shows, None without one.
+    at: the steps of a film; None without one.
     """
-
     from jaxslam.results import plot  # matplotlib is slow to load
 
     def check(state: Joint) -> bool:
@@ -174,7 +173,7 @@ def _run(
     last = result.last
     nis = np.where(result.status == Status.FUSED, result.nis, 0.0).sum()
     dof = int(result.dof.sum())
-    innovations = {  # of a filter that has some
+    innovations = {  # of filters that have innovations
         "NIS / dof": float(nis / max(dof, 1)),
         "log-likelihood": float(result.log_likelihood.sum()),
     }
@@ -191,11 +190,11 @@ def _run(
         "seconds": round(seconds, 2),
     }
     tested = {} if found.map_test is None else found.map_test.rows()
-    return _Run(result, found, summary | found.errors | tested)
+    return FilterRun(result, found, summary | found.errors | tested)
 
 
-def _figure(data: Dataset, runs: dict[str, _Run], formats: tuple[str, ...]) -> Files:
-    """The map: the first filter with ellipses and truth, others without."""
+def _figure(data: Dataset, runs: dict[str, FilterRun], formats: tuple[str, ...]) -> Files:
+    """The figure of the map: the first filter with ellipses and truth, others without."""
     from jaxslam.results import plot  # matplotlib is slow to load
 
     (name, first), *rest = runs.items()
@@ -212,7 +211,7 @@ def _figure(data: Dataset, runs: dict[str, _Run], formats: tuple[str, ...]) -> F
     return {f"map.{kind}": plot.encode(figure, kind) for kind in formats}
 
 
-def _films(data: Dataset, runs: Mapping[str, _Run], at: Int[np.ndarray, "F"]) -> Files:
+def _films(data: Dataset, runs: Mapping[str, FilterRun], at: Int[np.ndarray, "F"]) -> Files:
     """The film of each filter, by file name; see `film_files`."""
     from jaxslam.results import plot  # matplotlib is slow to load
 
@@ -244,7 +243,7 @@ def _films(data: Dataset, runs: Mapping[str, _Run], at: Int[np.ndarray, "F"]) ->
 
 
 def _whole(result: PiecewiseRun) -> Estimate:
-    """The estimated path with the map of its end."""
+    """The estimated path with the final map."""
     last = result.last
     at_end = {name: getattr(last, name)[None] for name in ("points", "point_covs", "alive", "tag")}
     return result.path._replace(**at_end)
@@ -271,7 +270,7 @@ def _dead_reckoning(data: Dataset) -> Float[np.ndarray, "T 3"]:
 
 
 def _definiteness(result: PiecewiseRun) -> str:
-    """A phrase: at how many of the checked steps P was positive definite, and where not."""
+    """The number of checked steps with positive definite P, and the first without, as text."""
     if not result.checked:
         return "not checked"
     failed = [step for step, good in zip(result.checked, result.passed, strict=True) if not good]
@@ -283,7 +282,7 @@ def _definiteness(result: PiecewiseRun) -> str:
 
 
 def _flat(summary: Json) -> Json:
-    """The summary as rows of one value: a row a status that occurs, a row a coordinate."""
+    """The summary as rows of one value: one per status that occurs, one per coordinate."""
     status, final = summary["status"], summary["final pose"]
     assert isinstance(status, dict)
     assert isinstance(final, list)
@@ -295,38 +294,38 @@ def _flat(summary: Json) -> Json:
 
 
 NAMES = tuple(name for name in ALL if name not in ("ideal", "batch_map"))
-"""Those that run on a data set: no truth is needed, and no whole log at once."""
+"""Filters for a data set: those that need neither the truth nor the whole log at once."""
 
 
 def with_options(data: Dataset, options: argparse.Namespace) -> Dataset:
-    """The data set with the gate and the association that the command asks for."""
+    """The data set with the gate and the association of the command."""
     if options.gate is None and options.associate is None:
         return data
     if options.associate is None and data.filter_options.get("associate") is not None:
-        raise ValueError("--gate: expected --associate beside it, since the tags are not used")
+        raise ValueError("--gate: expected --associate, too, since the tags are not used")
     try:
         size = len(data.sensor.measurements)
-        own = association_options(options.associate or "known", options.gate, size)
+        chosen = association_options(options.associate or "known", options.gate, size)
     except ValueError as problem:
         raise ValueError(f"--{problem}") from problem
-    asked = [name for name in ("gate", "associate") if getattr(options, name) is not None]
+    given = [name for name in ("gate", "associate") if getattr(options, name) is not None]
     assumed = (
-        line for line in data.assumed if not line.startswith(tuple(f"[filter] {n}" for n in asked))
+        line for line in data.assumed if not line.startswith(tuple(f"[filter] {n}" for n in given))
     )
     plain: EkfOptions = {"gate": None, "associate": Known()}
-    mine = data.filter_options | plain | own
-    return dataclasses.replace(data, filter_options=mine, assumed=tuple(assumed))
+    changed = data.filter_options | plain | chosen
+    return dataclasses.replace(data, filter_options=changed, assumed=tuple(assumed))
 
 
-def chosen_filters(data: Dataset, asked: str) -> dict[str, Filter]:
+def chosen_filters(data: Dataset, text: str) -> dict[str, Filter]:
     """The filters of a comma-separated list of names.
 
-    Raises ValueError on names that are unknown or occur twice, and on a filter that needs what the
-    data set does not have: the truth at every step, a map in the frame of the start, or tags.
+    Raises ValueError on unknown or repeated names, and on a filter that needs what the data set
+    does not have: the truth at every step, a map in the frame of the start, or tags.
     """
-    names = [name.strip() for name in asked.split(",")]
+    names = [name.strip() for name in text.split(",")]
     if not all(names) or len(set(names)) < len(names):
-        raise ValueError(f"--filters: expected different names with commas between, got {asked!r}")
+        raise ValueError(f"--filters: expected different names with commas between, got {text!r}")
     slots = np.zeros((data.capacity, len(data.sensor.landmark)))
     world = Scenario(
         name=data.name,
@@ -337,9 +336,9 @@ def chosen_filters(data: Dataset, asked: str) -> dict[str, Filter]:
         places=data.log.scan.tag.shape[1],
         filter_options=data.filter_options,
     )
-    if own := next((name for name in names if ".py" in name), None):
+    if user := next((name for name in names if ".py" in name), None):
         raise ValueError(
-            f"--filters: {own}: `jaxslam run` takes filters of the catalog; give your own to "
+            f"--filters: {user}: `jaxslam run` takes filters of the catalog; give your own to "
             "`jaxslam.run` in Python"
         )
     known = {name: ALL[name] for name in ALL if name in NAMES or name in names}
@@ -348,8 +347,10 @@ def chosen_filters(data: Dataset, asked: str) -> dict[str, Filter]:
 
 
 def on_true_poses(data: Dataset) -> tuple[Log, int]:
-    """The log with true poses as controls, for mapping; and how many measurements it leaves out,
-    made where the pose is not known. The control there is the last known pose."""
+    """The log with true poses as controls, for mapping, and the number of measurements left out.
+
+    Without a true pose, the measurements are left out and the control is the last known pose.
+    """
     assert data.true_path is not None
     known = np.ones(data.steps, bool) if data.true_at is None else data.true_at
     scan = data.log.scan
@@ -370,7 +371,7 @@ def _filter(name: str, candidate: Candidate, data: Dataset) -> Filter:
         return candidate
     if name in SMOOTHERS:
         raise ValueError(
-            f"--filters: {name} takes a whole log at once, which `jaxslam run` does not: call "
+            f"--filters: {name} takes a whole log at once: call "
             f"jaxslam.graphs.smoothing.{name} from Python"
         )
     if name == "ideal" or not data.one_frame or data.landmarks is None:

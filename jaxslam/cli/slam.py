@@ -1,4 +1,4 @@
-"""The command `jaxslam slam`: laser SLAM, its files, and its score by poses or relations."""
+"""The command `jaxslam slam`: laser SLAM, its files, and scores by poses or relations."""
 
 import argparse
 from collections.abc import Mapping
@@ -7,7 +7,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.cli import laser
+from jaxslam.cli import laser_log
 from jaxslam.cli.common import add_animate, film_files, summary_table
 from jaxslam.consistency import metrics
 from jaxslam.consistency.campaign.progress import Progress
@@ -15,7 +15,7 @@ from jaxslam.core.types import Estimate
 from jaxslam.datasets import LaserLog, g2o, relation_file, ros_map
 from jaxslam.laser import laser_slam
 from jaxslam.laser.laser_slam import LoopOutcome, Settings, Solved
-from jaxslam.laser.laser_slam.mapping import growing_maps
+from jaxslam.laser.laser_slam.log_map import growing_maps
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.results import report
 from jaxslam.results.files import Files, Json, csv_text
@@ -27,22 +27,22 @@ METRES = (1.0, 2.0, 5.0, 10.0)
 """Lengths of path of the relations that score the result."""
 
 HELD = 12
-"""Frames of a film that show the map after closing."""
+"""Number of frames of a film with the map after closing."""
 
 TOLERANCE = 1e-4
-"""[s] within which a stamp of a relation is that of a scan: public files print five decimals, and
-times since 1970 have 2e-7 s in float64."""
+"""Largest difference between the stamps of a relation and of its scan [s]: public files print five
+decimals, and times since 1970 have 2e-7 s in float64."""
 
 APART = 60.0
-"""[s] beyond which the scans of a relation are far apart."""
+"""Time between the scans of a relation beyond which they are far apart [s]."""
 
 SHARE = 0.95
-"""Of the relations in the ellipse of the covariance, if it is right and the relations exact."""
+"""Expected share of relations in the ellipse, if the covariance is right and relations exact."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `jaxslam slam`."""
-    laser.add_options(parser, run_slam)
+    laser_log.add_options(parser, run_slam)
     add_animate(parser, "of the map growing")
     parser.add_argument(
         "--relations",
@@ -52,9 +52,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run_slam(log: LaserLog, options: argparse.Namespace) -> laser.Job:
-    """Path, graph, loops and map from raw odometry and scans; the poses in the file score them,
-    and the relations of another file."""
+def run_slam(log: LaserLog, options: argparse.Namespace) -> laser_log.Job:
+    """Path, graph, loops and map from raw odometry and scans, scored by the poses in the file and
+    the relations of another file."""
     given = None if options.relations is None else given_relations(options.relations, log)
     settings = Settings(resolution=options.resolution)
     solved = _solved(log, settings)
@@ -62,21 +62,21 @@ def run_slam(log: LaserLog, options: argparse.Namespace) -> laser.Job:
     files = result_files(solved) | figures(solved, options.figures, log.corrected)
     if options.animate:
         files |= film_files({"slam": film(log, solved, settings)}, suffixed=False)
-    summary = result_summary(solved) | laser.scored(log, lambda: _scores(log, solved))
+    summary = result_summary(solved) | laser_log.scored(log, lambda: _scores(log, solved))
     if coarser:
-        summary["resolution asked for, of too many cells [m]"] = settings.resolution
+        summary["requested resolution, of too many cells [m]"] = settings.resolution
     if given is None:
-        return laser.Job(summary, files)
+        return laser_log.Job(summary, files)
     relations, dropped = given
     joined, scores = len(relations.first), relation_scores(relations, log, solved)
     text = (
         f"relations of {options.relations}: {joined:,} of {joined + dropped:,} join the scans, "
         f"within {TOLERANCE:g} s; errors, mean ± standard deviation:\n{_score_text(scores)}"
     )
-    if laser.odometry_is_poses(log):
+    if laser_log.odometry_is_poses(log):
         text += (
             "\nraw odometry is that of the poses in the file: if these are corrected, the errors "
-            "are none of laser SLAM; --odometry FILE gives the odometry of the wheels"
+            "are not those of laser SLAM; --odometry FILE gives the odometry of the wheels"
         )
     entry: Json = {
         "file": options.relations,
@@ -86,7 +86,7 @@ def run_slam(log: LaserLog, options: argparse.Namespace) -> laser.Job:
         "tolerance [s]": TOLERANCE,
         **scores,
     }
-    return laser.Job(summary, files, text, {"relations": entry})
+    return laser_log.Job(summary, files, text, {"relations": entry})
 
 
 def _solved(log: LaserLog, settings: Settings) -> Solved:
@@ -94,23 +94,23 @@ def _solved(log: LaserLog, settings: Settings) -> Solved:
     with Progress(f"{log.name}, reading", "scans") as first:
         bars = {"": first}
 
-        def tell(stage: str, done: int, of: int) -> None:
+        def report_stage(stage: str, done: int, of: int) -> None:
             if stage not in bars:
                 unit = "candidates" if stage == "loop closing" else "scans"
                 bars[stage] = Progress(f"{log.name}, {stage}", unit)
             bars[stage](done, of)
 
-        return laser_slam.solve(log, settings, progress=tell)
+        return laser_slam.solve(log, settings, progress=report_stage)
 
 
 def result_files(solved: Solved) -> Files:
-    """What `results.files.write_files` writes of a result, by name; without figures.
+    """The files of a result by name, without figures.
 
     | file | content |
     |---|---|
     | `trajectory.csv`, `trajectory.tum` | the pose of every scan, the first with its covariance |
     | `graph.g2o` | the optimized graph of keyframes |
-    | `loops.csv` | every loop that was tried, with its outcome |
+    | `loops.csv` | every candidate of a loop, with its outcome |
     | `map.yaml`, `map.pgm` | the map, as ROS has it |
     """
     count = len(solved.time)
@@ -163,14 +163,14 @@ def film(log: LaserLog, solved: Solved, settings: Settings) -> "Film":
     kept = int((solved.loops.outcome == LoopOutcome.KEPT).sum())
     last = [closed[-1]] * HELD
     paths = [solved.odometry[:end] for end in until] + [solved.poses] * HELD
-    said = [f"laser odometry, scan {end:,} of {until[-1]:,}" for end in until]
-    said += [f"after closing by {kept:,} loops"] * HELD
+    captions = [f"laser odometry, scan {end:,} of {until[-1]:,}" for end in until]
+    captions += [f"after closing by {kept:,} loops"] * HELD
     scene = plot.map_scene(
         [np.asarray(one.log_odds) for one in (*maps, *last)],
         np.asarray(maps[0].origin),
         float(maps[0].resolution),
         paths,
-        said,
+        captions,
         title=log.name,
     )
     return plot.Film(scene)
@@ -184,13 +184,13 @@ def result_summary(solved: Solved) -> dict[str, object]:
         "degrees of freedom": solved.dof,
         "chi2 / degrees of freedom": solved.chi2 / solved.dof if solved.dof > 0 else None,
         "covariances": _verdict(solved),
-        **laser.map_size(solved.map),
+        **laser_log.map_size(solved.map),
         **{f"seconds, {stage}": round(value, 2) for stage, value in solved.seconds.items()},
     }
 
 
 def _verdict(solved: Solved) -> str:
-    """What χ² says of the covariances of matches."""
+    """The verdict of χ² on the covariances of matches."""
     if solved.dof <= 0:
         return "no loop tests them"
     ratio = solved.chi2 / solved.dof
@@ -202,7 +202,7 @@ def _verdict(solved: Solved) -> str:
 
 
 def _loops_csv(solved: Solved) -> str:
-    """The loops that were tried, a row each."""
+    """The candidates of loops, one per row."""
     loops = solved.loops
     rows = [
         [
@@ -220,7 +220,7 @@ def _loops_csv(solved: Solved) -> str:
 
 
 def _scores(log: LaserLog, solved: laser_slam.Solved) -> dict[str, object]:
-    """Errors of relations, ATE, and which loops are right, by the poses in the file."""
+    """Errors of relations, ATE, and the number of correct loops, by the poses in the file."""
     paths = {"raw odometry": solved.raw, "laser odometry": solved.odometry, "": solved.poses}
     out: dict[str, object] = {}
     try:
@@ -243,20 +243,20 @@ def _scores(log: LaserLog, solved: laser_slam.Solved) -> dict[str, object]:
 
 
 def given_relations(path: str, log: LaserLog) -> tuple[metrics.Relations, int]:
-    """The relations of a file by the rows of the log, and how many have no scan at a stamp.
+    """The relations of a file by rows of the log, and the number without a scan at a stamp.
 
-    Raises ValueError, with the file, on what `relation_file` refuses, and where none joins.
+    Raises ValueError, with the file, if `relation_file` does or if no relation has its scans.
     """
-    told = relation_file(path)
+    file = relation_file(path)
     try:
-        return metrics.given(log.time, told.first, told.second, told.pose, tolerance=TOLERANCE)
+        return metrics.given(log.time, file.first, file.second, file.pose, tolerance=TOLERANCE)
     except ValueError as problem:
         reason = str(problem).removeprefix("given: ")
-        raise ValueError(f"--relations: {told.source}: {reason}") from problem
+        raise ValueError(f"--relations: {file.source}: {reason}") from problem
 
 
 def relation_scores(relations: metrics.Relations, log: LaserLog, solved: Solved) -> dict[str, Json]:
-    """Entries of all relations, and of those whose scans are far apart."""
+    """Scores of all relations, and of those whose scans are far apart."""
     nees = laser_slam.relation_nees(solved, *relations)
     apart = np.abs(log.time[relations.second] - log.time[relations.first])
     paths = {
@@ -286,7 +286,7 @@ def relation_scores(relations: metrics.Relations, log: LaserLog, solved: Solved)
 
 
 def _score_text(scores: Mapping[str, Json]) -> str:
-    """The scores as they are printed: a row for each path, a column for each quantity."""
+    """The scores as text: a row for each path, a column for each quantity."""
     columns: dict[str, dict[str, object]] = {}
     lines = []
     for name, score in scores.items():

@@ -1,4 +1,4 @@
-"""The scenario and the filters of a campaign: by name, or from a user's own file.
+"""The scenario and the filters of a campaign: by name, or from a Python file of the user.
 
 In place of a name, FILE.py:NAME takes NAME from a Python file: a `Scenario` or a function that
 returns one, a `Filter` or a function of the scenario that returns one.
@@ -18,10 +18,10 @@ from jaxslam.consistency.campaign.candidates import check_fits, check_noise
 from jaxslam.core.protocols import Candidate, Filter
 from jaxslam.simulation.scenarios import SCENARIOS
 from jaxslam.simulation.worlds import World
-from jaxslam.verify.errors import describe_error
 from jaxslam.verify.inputs.user_files import import_file, names_in, split_target
+from jaxslam.verify.user_errors import describe_error
 
-_OWN = "; or FILE.py:NAME, one of your own"
+_FROM_FILE = "; or FILE.py:NAME, one of your own"
 
 
 class UserObjects:
@@ -30,47 +30,49 @@ class UserObjects:
     def __init__(self) -> None:
         self._modules: dict[Path, ModuleType] = {}
 
-    def scenario(self, asked: str, steps: int | None) -> World:
-        """A scenario, by name or from a file; steps: None for its own number of them.
+    def scenario(self, entry: str, steps: int | None) -> World:
+        """A scenario, by name or from a file; steps: None for its default.
 
-        Raises ValueError where there is none, and where a `Scenario` is to have other steps.
+        Raises ValueError on an unknown one, and on a number of steps for a `Scenario`.
         """
         arguments = () if steps is None else (steps,)
-        if not _in_file(asked):
-            return pick("scenario", asked, SCENARIOS, _OWN)(*arguments)
-        _, own = self._find("--scenario", asked)
-        made = own
+        if not _in_file(entry):
+            return pick("scenario", entry, SCENARIOS, _FROM_FILE)(*arguments)
+        _, value = self._find("--scenario", entry)
+        made = value
         if isinstance(made, World) and steps is not None:
             raise ValueError(
-                f"--steps: {asked} is a Scenario, which has {made.steps}; "
+                f"--steps: {entry} is a Scenario, which has {made.steps}; "
                 "expected a function of the number of steps"
             )
         if not isinstance(made, World) and callable(made):
-            told = "the number of steps" if arguments else "nothing"
-            made = self._call(asked, told, made, *arguments)
+            given = "the number of steps" if arguments else "nothing"
+            made = self._call(entry, given, made, *arguments)
         if not isinstance(made, World):
             raise ValueError(
-                f"{asked}: expected a Scenario, or a function that returns one, {_got(own, made)}"
+                f"{entry}: expected a Scenario, or a function that returns one, {_got(value, made)}"
             )
         check_noise(made)
         return made
 
-    def filters(self, asked: str, scenario: World) -> dict[str, Candidate]:
+    def filters(self, names: str, scenario: World) -> dict[str, Candidate]:
         """The filters of a comma-separated list, or all of the catalog, by name.
 
-        Raises ValueError where there is none, and with its name if one cannot run the scenario.
+        Raises ValueError on an unknown one, and on one that cannot run the scenario.
         """
-        entries = [entry.strip() for entry in asked.split(",")]
+        entries = [entry.strip() for entry in names.split(",")]
         if entries == ["all"]:
             entries = list(ALL)
         if "" in entries:
             raise ValueError(
                 "--filters: expected names of filters, or FILE.py:NAME, with commas between them, "
-                f"or all, got {asked!r}"
+                f"or all, got {names!r}"
             )
         found: dict[str, Candidate] = {}
         for entry in entries:
-            name, candidate = (self._own if _in_file(entry) else _of_catalog)(entry, scenario)
+            name, candidate = (self._from_file if _in_file(entry) else _from_catalog)(
+                entry, scenario
+            )
             if name in found:
                 raise ValueError(f"--filters: expected each name once, got {name} twice")
             found[name] = candidate
@@ -78,7 +80,7 @@ class UserObjects:
 
     @contextlib.contextmanager
     def located_errors(self) -> Iterator[None]:
-        """A block whose errors in a user's file become a ValueError that begins with the line."""
+        """A block that turns an error in a user's file into a ValueError with file and line."""
         try:
             yield
         except Exception as error:
@@ -87,32 +89,32 @@ class UserObjects:
                 raise
             raise ValueError(describe_error(error)) from error
 
-    def _find(self, option: str, asked: str) -> tuple[str, object]:
+    def _find(self, option: str, entry: str) -> tuple[str, object]:
         """The name and the object of FILE.py:NAME."""
-        path, name = split_target(asked)
+        path, name = split_target(entry)
         path = path.resolve()
         if path not in self._modules:
             self._modules[path] = import_file(path)
         module = self._modules[path]
         if not name:
-            raise ValueError(f"{option}: expected FILE.py:NAME, got {asked}{names_in(module)}")
+            raise ValueError(f"{option}: expected FILE.py:NAME, got {entry}{names_in(module)}")
         if not hasattr(module, name):
-            raise ValueError(f"{option}: there is no {name!r} in {path.name}{names_in(module)}")
+            raise ValueError(f"{option}: {path.name} has no {name!r}{names_in(module)}")
         return name, getattr(module, name)
 
-    def _own(self, asked: str, scenario: World) -> tuple[str, Candidate]:
+    def _from_file(self, entry: str, scenario: World) -> tuple[str, Candidate]:
         """The name of a user's filter, and the filter for the scenario.
 
-        It is the filter's own, or NAME for one that still has that of a filter of the library.
+        The name is that of the filter, or NAME if the filter has the name of one of the library.
         """
-        name, own = self._find("--filters", asked)
-        made = own
+        name, value = self._find("--filters", entry)
+        made = value
         if not isinstance(made, Filter) and callable(made):
-            made = self._call(asked, "the scenario", made, scenario)
+            made = self._call(entry, "the scenario", made, scenario)
         if not isinstance(made, Filter) and not callable(made):
             raise ValueError(
-                f"{asked}: expected a Filter, or a function of the scenario that returns one, "
-                f"{_got(own, made)}"
+                f"{entry}: expected a Filter, or a function of the scenario that returns one, "
+                f"{_got(value, made)}"
             )
         if isinstance(made, Filter) and not (made.name in ALL or hasattr(filters, made.name)):
             name = made.name
@@ -120,35 +122,35 @@ class UserObjects:
         return name, made
 
     def _call(
-        self, asked: str, told: str, function: Callable[..., object], *arguments: object
+        self, entry: str, given: str, function: Callable[..., object], *arguments: object
     ) -> object:
-        """What a user's function returns; `told` says what it is called with."""
-        given = "one argument" if arguments else "no argument"
+        """The result of a user's function; given: its argument in words."""
+        count = "one argument" if arguments else "no argument"
         try:
             inspect.signature(function).bind(*arguments)
         except TypeError as error:
-            raise ValueError(f"{asked} is called with {given}: {error}") from error
+            raise ValueError(f"{entry} is called with {count}: {error}") from error
         try:
             return function(*arguments)
         except Exception as error:
             raise ValueError(
-                f"{asked}: called with {told}, it fails: {describe_error(error)}"
+                f"{entry}: called with {given}, it fails: {describe_error(error)}"
             ) from error
 
 
-def _got(own: object, made: object) -> str:
-    """What stands in a file in place of what was expected, or what its function returned."""
-    return f"got {made!r:.60}" if made is own else f"got a function that returned {made!r:.60}"
+def _got(value: object, made: object) -> str:
+    """The object in the file that is not as expected, or the result of its function."""
+    return f"got {made!r:.60}" if made is value else f"got a function that returned {made!r:.60}"
 
 
-def _in_file(asked: str) -> bool:
-    """Whether an object is asked for by its file."""
-    return ":" in asked or asked.endswith(".py")
+def _in_file(entry: str) -> bool:
+    """Whether an entry names a file."""
+    return ":" in entry or entry.endswith(".py")
 
 
-def _of_catalog(name: str, scenario: World) -> tuple[str, Candidate]:
-    """The name and a filter of the catalog; raises ValueError if it cannot run the scenario."""
-    make = pick("filters", name, ALL, _OWN)
+def _from_catalog(name: str, scenario: World) -> tuple[str, Candidate]:
+    """The name and a filter of the catalog; ValueError if it cannot run the scenario."""
+    make = pick("filters", name, ALL, _FROM_FILE)
     try:
         return name, make(scenario, watch=True)
     except ValueError as error:

@@ -1,4 +1,4 @@
-"""The command `jaxslam verify`: the Jacobians of every model, or of the user's own file."""
+"""The command `jaxslam verify`: the Jacobians of every model, or of a user's file."""
 
 import argparse
 import os
@@ -59,7 +59,7 @@ def _verify_all(verify_one: Callable[..., verify.Report]) -> list[verify.Report]
             for task in tasks:
                 reports.append(task.result())
                 progress(len(reports), len(models))
-        except BaseException:  # on an interrupt, models that wait are dropped
+        except BaseException:  # on an interrupt, models not yet started are dropped
             pool.shutdown(wait=False, cancel_futures=True)
             raise
     return reports

@@ -16,7 +16,7 @@ from jaxslam.consistency.intervals import (
     percentage,
     positive_interval,
 )
-from jaxslam.consistency.localization import (
+from jaxslam.consistency.localization_scores import (
     LocalizationScores,
     LocalizationSummary,
     covering_level,
@@ -27,11 +27,11 @@ from jaxslam.consistency.localization import (
     summarize_localization,
 )
 from jaxslam.consistency.measures import Measure, register
-from jaxslam.consistency.measures.credibility import LEVELS, credibility
+from jaxslam.consistency.measures.coverage import LEVELS, credibility
 from jaxslam.consistency.measures.measure import RunStatistics
 from jaxslam.consistency.measures.nees import DOF, own_error_of
 from jaxslam.consistency.measures.observability import monitor_of
-from jaxslam.consistency.score import LAGS, Score, run_statistics, score
+from jaxslam.consistency.run_scores import LAGS, Score, run_statistics, score
 from jaxslam.consistency.summary import Summary, summarize
 from jaxslam.consistency.tally import Tally, condense
 from jaxslam.consistency.verdict import Verdict, judge, power_of

@@ -9,16 +9,16 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.consistency.score import snapshot_steps
+from jaxslam.consistency.run_scores import snapshot_steps
 from jaxslam.core.protocols import Sensor
 from jaxslam.core.types import Estimate, Log, Truth
+from jaxslam.driver import run
+from jaxslam.filters.ekf.ekf_settings import EkfOptions
 from jaxslam.filters.ekf.ekf_slam import EkfSlam
-from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.linearize import first_order
 from jaxslam.linearize.first_order import with_lever_arm
 from jaxslam.linearize.other_points import AtTruth
 from jaxslam.math.linalg import root_psd
-from jaxslam.run import run
 from jaxslam.sensors.suite import Suite
 from jaxslam.simulation.recorded import RecordedWorld
 from jaxslam.simulation.worlds import Scenario, World

@@ -10,7 +10,7 @@ import numpy as np
 
 from jaxslam.consistency.intervals import Average
 from jaxslam.consistency.measures import measures_of
-from jaxslam.consistency.measures.credibility import coverage_curves
+from jaxslam.consistency.measures.coverage import coverage_curves
 from jaxslam.consistency.measures.errors import over_bound
 from jaxslam.consistency.measures.innovations import autocorrelation_of, nis_band
 from jaxslam.consistency.measures.nees import inside_bands

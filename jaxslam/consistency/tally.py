@@ -13,7 +13,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxslam.consistency.score import Score
+from jaxslam.consistency.run_scores import Score
 
 SHOTS = 2048
 """Snapshots are kept of runs with numbers below this."""

@@ -1,17 +1,17 @@
-"""Readers of public data sets and of your own (`table`), one in each file; they return a `Dataset`.
+"""Readers of public data sets, and of your data in CSV files (`table`); they return a `Dataset`.
 
-`READERS` has them by name, for the command line; each takes a path, and the number of a robot where
-a data set has several.
+`READERS` has them by name, for the command line; each takes a path, and, for a data set of several
+robots, the number of one.
 """
 
 from collections.abc import Callable
 
-from jaxslam.datasets.bonn_reader import bonn
 from jaxslam.datasets.carmen_reader import LaserLog, StampedRelations, carmen, relation_file
 from jaxslam.datasets.dataset import Dataset
+from jaxslam.datasets.line_readers import bonn, victoria_park
 from jaxslam.datasets.mrclam_reader import (
     MRCLAM_FITTED,
-    OwnCalibration,
+    FittedCalibration,
     mrclam,
     mrclam_calibration,
     mrclam_team,
@@ -20,7 +20,6 @@ from jaxslam.datasets.mrclam_robot import MRCLAM_CALIBRATION, RobotCalibration, 
 from jaxslam.datasets.noise_fit import DatasetFit, fit
 from jaxslam.datasets.plaza_reader import plaza
 from jaxslam.datasets.table_reader import table
-from jaxslam.datasets.victoria_park_reader import victoria_park
 
 READERS: dict[str, Callable[..., Dataset]] = {
     "bonn": bonn,
@@ -36,8 +35,8 @@ __all__ = [
     "READERS",
     "Dataset",
     "DatasetFit",
+    "FittedCalibration",
     "LaserLog",
-    "OwnCalibration",
     "RobotCalibration",
     "StampedRelations",
     "bonn",

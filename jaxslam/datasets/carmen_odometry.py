@@ -1,4 +1,4 @@
-"""Raw odometry of a log: lines ODOM chained over those that set the odometry, or of a file."""
+"""Raw odometry of a log: from ODOM lines, without those that set it, or from a file."""
 
 from itertools import pairwise
 from pathlib import Path
@@ -11,39 +11,39 @@ from jaxslam.datasets.lines import TextFile
 from jaxslam.math import numpy_poses as poses
 
 _JOINED = 1e-3
-"""[s] within which a stamp of a file of odometry is that of a scan."""
+"""Largest difference between the stamps of a line of odometry and its scan [s]."""
 
 
 _MOTION = 0.2
-"""The share of the way ahead from which on the steps to lines that may set the odometry are motion.
-In the logs of `docs/guide/real_data.md` with odometry at every scan corrections have up to 0.03; in
-a raw log whose scans are written before the line of their pose it is 1/n with n lines a scan."""
+"""Share of the way ahead above which the steps to lines that may set the odometry are motion.
+
+Corrections have up to 0.03 in the logs of `docs/guide/real_data.md` with odometry at every scan; a
+raw log whose scans are written before the line of their pose has 1/n with n lines per scan."""
 
 
 class RawOdometry(NamedTuple):
-    """T lines of raw odometry, and what they say at K scans."""
+    """T lines of raw odometry, and the odometry at K scans."""
 
     poses: Float[np.ndarray, "T 3"]
     time: Float[np.ndarray, "T"]
     row: Int[np.ndarray, "K"]
-    """the last line before each scan; -1 where there is none"""
+    """the last line before each scan; -1 if none"""
     raw: Float[np.ndarray, "K 3"]
     known: Bool[np.ndarray, "K"]
-    """whether a line tells of the step from the scan before; True for the first"""
+    """whether the step from the previous scan is known; True for the first"""
     setting: int
-    """lines that set the odometry"""
+    """number of lines that set the odometry"""
 
 
-def chained(
+def odometry_of_lines(
     path: Float[np.ndarray, "T 3"],
     time: Float[np.ndarray, "T"],
     setting: Bool[np.ndarray, "T"],
     row: Int[np.ndarray, "K"],
 ) -> RawOdometry:
-    """The odometry of T >= 1 lines ODOM, of which some set it, at K scans.
+    """The odometry at K scans from T >= 1 ODOM lines, some of which set it.
 
-    No motion lies between a line that sets the odometry and the line before it: there the path goes
-    on from where it was.
+    A line that sets the odometry is not motion: the path continues from its last pose.
 
     Args:
         row: of each scan, the last ODOM line before it, -1 if none.
@@ -65,21 +65,21 @@ def setting_lines(
     row: Int[np.ndarray, "S"],
     robot: Float[np.ndarray, "S 3"],
 ) -> Bool[np.ndarray, "T"]:
-    """Which ODOM lines set the odometry, as a program that corrects a log writes them.
+    """Which ODOM lines set the odometry; programs that correct a log write such lines.
 
-    Such a line repeats the pose of the scan before, and so differs from the ODOM line before that
-    scan. A line of a raw log may repeat it by chance, or since the logger wrote the two in this
-    order. So a line stamped after the one before it counts only where at least half of the lines
-    that follow a scan are such, other lines remain, and either another such line goes back in time,
-    or the steps to these lines are no share of the motion: corrections lead nowhere on average.
+    They repeat the pose of the previous scan, and so differ from the ODOM line before that scan. In
+    a raw log a line may repeat it by chance, or since the logger writes the two in this order. So a
+    line with a later stamp than the previous one sets the odometry only if at least half of the
+    lines after a scan are such, other lines remain, and either another such line goes back in time,
+    or the steps to these lines are not a part of the motion: corrections have mean zero.
 
     Args:
         row: of each scan of any laser, the last ODOM line before it, -1 if none.
-        robot: the pose of the robot in the line of the scan, NaN where there is none.
+        robot: the pose of the robot in the line of the scan, NaN if it has none.
     """
     near = _printed(path, robot)
     line = row + 1
-    # The first line tells where odometry begins.
+    # The first line gives the start of the odometry.
     scans = np.flatnonzero((line > 0) & (line < len(path)) & np.isfinite(robot).all(axis=1))
     follows, at_scan = np.zeros((2, len(path)), bool)
     follows[line[scans]] = True
@@ -97,7 +97,7 @@ def setting_lines(
 
 
 def _printed(path: Float[np.ndarray, "T 3"], robot: Float[np.ndarray, "K 3"]) -> np.ndarray:
-    """(3,) half of the last digit that both kinds of lines print, at most half a millimetre."""
+    """(3,) half of the last digit that both kinds of lines have, at most half a millimetre."""
 
     def digits(values: np.ndarray) -> int:
         for count in range(3, 7):
@@ -112,31 +112,31 @@ def _printed(path: Float[np.ndarray, "T 3"], robot: Float[np.ndarray, "K 3"]) ->
 def _equal(
     a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"], near: np.ndarray
 ) -> Bool[np.ndarray, "n"]:
-    """Whether poses are the same; False where one is NaN."""
+    """Whether poses are equal; False for NaN."""
     off = np.abs(a - b)
     off[:, 2] = np.abs(poses.wrapped(off[:, 2]))
     return np.asarray((off <= near).all(axis=1))
 
 
-def without_lines(robot: Float[np.ndarray, "K 3"]) -> RawOdometry:
-    """The odometry of a log without ODOM lines: the robot's poses, zero where there are none."""
-    there = np.isfinite(robot).all(axis=1)
-    known = there.copy()
+def odometry_of_poses(robot: Float[np.ndarray, "K 3"]) -> RawOdometry:
+    """The odometry of a log without ODOM lines: the poses of the robot, zero if unknown."""
+    finite = np.isfinite(robot).all(axis=1)
+    known = finite.copy()
     known[0] = True
-    raw = np.where(there[:, None], robot, 0.0)
+    raw = np.where(finite[:, None], robot, 0.0)
     row = np.full(len(robot), -1)
     return RawOdometry(np.zeros((0, 3)), np.zeros(0), row, raw, known, 0)
 
 
-def of_file(
+def odometry_of_file(
     path: str | Path, time: Float[np.ndarray, "K"], source: str
 ) -> tuple[RawOdometry, Float[np.ndarray, "K"], str]:
-    """The odometry of a file, lines `t x y θ`, at each scan, the scans' times, and how they join.
+    """The odometry at each scan from a file of lines `t x y θ`, the times of the scans, and a note.
 
-    Each scan takes the line whose stamp is nearest, within `_JOINED`. Where there are as many lines
-    as scans and no stamp contradicts that, they join in order, and the lines' stamps are the times.
+    Each scan takes the line with the nearest stamp, within `_JOINED`. As many lines as scans, whose
+    stamps do not contradict their order, join in order and give the scans their stamps.
 
-    Raises ValueError, with file and line, on lines that are none; on stamps that do not join.
+    Raises ValueError, with file and line, on malformed lines, and on stamps that do not join.
     """
     file = TextFile(path, comment="#")
     rows = [file.numbers(line, fields, ("t", "x", "y", "theta")) for line, fields in file]
@@ -149,14 +149,14 @@ def of_file(
     pair = order[np.minimum(np.stack([after - 1, after]), len(rows) - 1)]
     row = np.take_along_axis(pair, np.abs(stamps[pair] - time).argmin(axis=0)[None], axis=0)[0]
     joins = np.abs(stamps[row] - time) <= _JOINED
-    told = f"raw odometry is of {file.path}: {len(rows):,} lines, "
+    note = f"raw odometry is from {file.path}: {len(rows):,} lines, "
     in_time = np.sum(np.diff(stamps) < 0) <= len(stamps) / 2  # else the file runs backwards
     if joins.all():
         used = len(np.unique(row))
-        told += f"{used:,} of them joined to the {scans:,} scans by stamp"
+        note += f"{used:,} of them joined to the {scans:,} scans by stamp"
     elif len(rows) == scans and (row[joins] == np.flatnonzero(joins)).all() and in_time:
         row, time = np.arange(scans), stamps
-        told += "joined to as many scans in order, which take their stamps"
+        note += "joined to as many scans in order, which take their stamps"
     else:
         raise ValueError(
             f"{file.path}: stamps from {stamps.min():.6f} s to {stamps.max():.6f} s join "
@@ -165,4 +165,4 @@ def of_file(
         )
     path_of = table[:, 1:]
     everywhere = np.ones(scans, bool)
-    return RawOdometry(path_of, stamps, row, path_of[row], everywhere, 0), time, told
+    return RawOdometry(path_of, stamps, row, path_of[row], everywhere, 0), time, note

@@ -1,5 +1,5 @@
-"""Laser logs of CARMEN: odometry and scans, with corrected poses where the file has them; and the
-relative poses that score laser SLAM.
+"""Laser logs of CARMEN: odometry and scans, and corrected poses if the file has them; and relative
+poses that score laser SLAM.
 
 Source of the public logs: Radish, the robotics data set repository (Howard & Roy 2003); corrected
 by the particle filter of GMapping (Grisetti, Stachniss & Burgard 2007).
@@ -18,10 +18,10 @@ from numpy.typing import ArrayLike
 from jaxslam.core.types import Beams
 from jaxslam.datasets.carmen_odometry import (
     RawOdometry,
-    chained,
-    of_file,
+    odometry_of_file,
+    odometry_of_lines,
+    odometry_of_poses,
     setting_lines,
-    without_lines,
 )
 from jaxslam.datasets.carmen_scans import (
     POSE,
@@ -42,45 +42,42 @@ from jaxslam.math.numpy_poses import wrapped
 
 @dataclass(frozen=True, eq=False)
 class LaserLog:
-    """A laser log: K scans of at most B beams, T lines of raw odometry; poses are the robot's."""
+    """A laser log: K scans of at most B beams, T lines of raw odometry; poses are of the robot."""
 
     name: str
     source: str
     laser: str
-    """the kind of the lines that hold the scans, as FLASER"""
+    """the kind of the lines of the scans, as FLASER"""
     placed: bool
-    """whether these have poses: else `corrected` is zero"""
+    """whether these lines have poses; else `corrected` is zero"""
     time: Float[np.ndarray, "K"]
-    """[s] at which each scan was taken; may repeat where the file has few digits"""
+    """of each scan [s]; may repeat if the file has few digits"""
     beams: Beams
-    """with leading K, in the frame of the laser; shorter scans are padded by beams that are not
-    valid"""
+    """with leading K, in the frame of the laser; shorter scans are padded by invalid beams"""
     corrected: Float[np.ndarray, "K 3"]
-    """the robot's pose that stands in the line of the scan: a reference, not the truth"""
+    """pose of the robot in the line of the scan: a reference, not the truth"""
     raw: Float[np.ndarray, "K 3"]
     """raw odometry at each scan"""
     odometry_known: Bool[np.ndarray, "K"]
-    """whether raw odometry tells of the step from the scan before; where not, it stands still. True
-    for the first"""
+    """whether the odometry from the previous scan is known, else zero; True for the first"""
     row: Int[np.ndarray, "K"]
-    """the last line of raw odometry before each scan, as an index of `odometry`; -1 where there is
-    none before"""
+    """the last line of raw odometry before each scan, as an index of `odometry`; -1 if none"""
     odometry: Float[np.ndarray, "T 3"]
     odometry_time: Float[np.ndarray, "T"]
-    """[s] as logged: 0 or anything in a line that sets the odometry"""
+    """as logged [s]; arbitrary in a line that sets the odometry"""
     max_range: float
-    """[m]: ranges from here on are of beams that met nothing, and are set to it"""
+    """the range of beams without a return [m]"""
     mount: Float[np.ndarray, "3"]
-    """the laser's pose on the robot"""
+    """pose of the laser on the robot"""
     dropped: Mapping[str, int]
-    """what the reader left out, by kind"""
+    """number of lines, scans or beams left out, by kind"""
     corrections: tuple[str, ...]
-    """what it changed, in words"""
+    """descriptions of the changes that the reader made"""
 
 
 ODOMETRY = (*POSE, "v", "omega", "acceleration", "time", "host", "logger time")
 _PREFERRED = ("FLASER", "ROBOTLASER1", "RAWLASER1", "RLASER")
-"""Kinds of scans in the order in which they are taken where there are as many of each."""
+"""Kinds of scans, the preferred ones first if several are equally frequent."""
 
 
 def carmen(
@@ -95,46 +92,46 @@ def carmen(
 
     | line | read as |
     |---|---|
-    | `ODOM x y θ v ω a t host T` | raw odometry, or what sets it |
+    | `ODOM x y θ v ω a t host T` | raw odometry, or a line that sets it |
     | `FLASER n r… x y θ x y θ t host T` | a scan of n beams, poses of laser and robot |
-    | `RLASER` | the same of a laser that looks back |
+    | `RLASER` | the same, of a laser that looks back |
     | `ROBOTLASER1 …`, and other numbers | a scan with angles, a maximum range, both poses |
-    | `RAWLASER1 …` | the same without poses |
+    | `RAWLASER1 …` | the same, without poses |
 
     One laser is read. Scans of others, beams whose range is NaN or not above 0, and all other lines
-    are counted in `dropped`. Times are those of the measurements (t); where all scans have the same
-    t, the logger's (T).
+    are counted in `dropped`. Times are those of the measurements (t), or of the logger (T) if all
+    scans have the same t.
 
     **Raw odometry** at a scan is that of the last ODOM line before it, by the order of lines, since
     stamps may be rounded. An ODOM line that repeats the pose of the scan before it, and differs
     from the one before that scan, was written by a program that corrects logs. It sets the
-    odometry and is no motion: raw odometry is the chain of the increments between such lines, and
-    `corrections` says how far it parts from the scans' poses. A file without ODOM lines has the
-    robot's pose of each scan as raw odometry.
+    odometry and is not motion: raw odometry is the chain of the increments between such lines, and
+    `corrections` has its largest distance from the poses of the scans. Without ODOM lines, raw
+    odometry is the pose of the robot of each scan.
 
-    **Angles** of FLASER: as CARMEN has them, 1° apart for 180 beams, ½° for 360, else 180°/(n - 1),
-    from -90° on; of 400 and 401 ¼°, from -50° on (the laser's field of 100°; CARMEN itself begins
-    at -90° there).
+    **Angles** of FLASER: as in CARMEN, from -90°, 1° apart for 180 beams, ½° for 360, else
+    180°/(n - 1); for 400 and 401 beams ¼° apart from -50°, the field of 100° of the laser (CARMEN
+    begins at -90°).
 
-    **Mount**: the laser's pose on the robot, from the two poses of a line. Where those of FLASER or
-    RLASER are the same, or differ by no constant, it is zero, or (0, 0, π) for RLASER; zero for
-    RAWLASER. The robot's corrected pose of these, and where the
-    mount is given, is the laser's without the mount; where a line has one pose twice, that pose.
+    **Mount**: the pose of the laser on the robot, from the two poses of a line. If those of FLASER
+    or RLASER are equal, or do not differ by a constant, it is zero, or (0, 0, π) for RLASER; it is
+    zero for RAWLASER. The corrected pose of the robot in these cases, or with a given mount, is
+    that of the laser without the mount, or the pose itself if the line has it twice.
 
     Args:
         path: NAME, or NAME.gz beside it.
-        max_range: [m] a range from here on, or from the maximum that its line states, met nothing;
-            `LaserLog.max_range` is the largest limit of a scan.
-        laser: kind of the lines to read; default: of those with poses the one with most scans.
+        max_range: ranges from this one [m], or from the maximum in their line, are without a
+            return; `LaserLog.max_range` is the largest limit of a scan.
+        laser: kind of the lines to read; default: the one with poses and most scans.
         odometry: a file of lines `t x y θ` in place of the log's odometry (`#` begins a comment).
-            They join the scans by stamp, to a millisecond; if no stamp joins, in order, where there
-            are as many as scans, and then their stamps are the scans'.
+            They join the scans by stamp, to a millisecond; else as many lines as scans join in
+            order, and give the scans their stamps.
         mount: (3,) [m, m, rad] in place of that of the lines.
     Raises:
-        ValueError: with file and line: where a line ends early or a field is not a number; on
-            a file without scans (of the laser) or without beams; where the mount differs between
-            two lines by more than 1 cm or ½°; on odometry that does not join. Further on a
-            max_range that is not above 0, and a mount that is not three finite numbers.
+        ValueError: with file and line: on a line that ends early, a field that is not a number, a
+            file without scans (of the laser) or without beams, a mount that differs between two
+            lines by more than 1 cm or ½°, and odometry that does not join. Also on a max_range
+            that is not above 0, and a mount that is not three finite numbers.
     """
     if not max_range > 0:
         raise ValueError(f"carmen: expected a max_range above 0, got {max_range}")
@@ -168,19 +165,19 @@ def carmen(
     frame = mount_of(file, kind, scans, corrections) if given is None else given
     corrected, robot = robot_poses(kind, scans, frame, given is not None)
     if odometry is not None:
-        found, time, told = of_file(odometry, time, str(file.path))
-        corrections.append(told)
+        found, time, note = odometry_of_file(odometry, time, str(file.path))
+        corrections.append(note)
         if logged:
             dropped["lines ODOM"] = len(logged)
     elif logged:
         table, every = np.array(logged), np.array(scan_poses)
         moved, stamp = table[:, :3], table[:, 3 + clock]
         setting = setting_lines(moved, stamp, every[:, 0].astype(int), every[:, 1:])
-        found = chained(moved, stamp, setting, np.array([scan.row for scan in scans]))
+        found = odometry_of_lines(moved, stamp, setting, np.array([scan.row for scan in scans]))
     else:
-        found = without_lines(robot)
+        found = odometry_of_poses(robot)
     beams, limit = beams_of(scans, max_range, dropped, corrections)
-    corrections += _odd(kind, time, found, corrected)
+    corrections += _irregularities(kind, time, found, corrected)
     if file.lines[-1].strip():
         corrections.append(
             f"the last line, {len(file.lines)}, has no newline: its last number may be cut off"
@@ -205,59 +202,58 @@ def carmen(
     )
 
 
-def _kind(file: TextFile, counts: Counter[str], asked: str | None) -> str:
-    """The kind of lines to read: the one asked for, or of those with poses that with most scans."""
+def _kind(file: TextFile, counts: Counter[str], given: str | None) -> str:
+    """The kind of lines to read: the given one, or that with poses and most scans."""
     if not counts:
         raise file.end_error(
             "expected a line FLASER, RLASER, ROBOTLASER1 or RAWLASER1, and so on, got none"
         )
-    if asked is None:
+    if given is None:
         first = {kind: rank for rank, kind in enumerate(_PREFERRED)}
         rank = [
             (not has_poses(kind), -count, first.get(kind, len(first)), kind)
             for kind, count in counts.items()
         ]
         return min(rank)[-1]
-    if asked not in counts:
-        there = ", ".join(f"{count} {kind}" for kind, count in sorted(counts.items()))
-        raise file.end_error(f"expected scans of the laser {asked}, got {there}")
-    return asked
+    if given not in counts:
+        kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(counts.items()))
+        raise file.end_error(f"expected scans of the laser {given}, got {kinds}")
+    return given
 
 
-def _odd(
+def _irregularities(
     kind: str,
     time: Float[np.ndarray, "K"],
     found: RawOdometry,
     corrected: Float[np.ndarray, "K 3"],
 ) -> list[str]:
-    """What is odd about a log, in words."""
-    told = []
+    """Descriptions of the irregularities of a log."""
+    notes = []
     if len(found.poses) and (early := int((found.row < 0).sum())):
-        told.append(f"scans before the first ODOM line, which take its pose: {early}")
+        notes.append(f"scans before the first ODOM line, which take its pose: {early}")
     if not has_poses(kind):
-        told.append(f"lines {kind} have no poses: there are none to compare with")
+        notes.append(f"lines {kind} have no poses to compare with")
     if not len(found.poses):
-        told.append(
+        notes.append(
             "no ODOM lines: raw odometry is the robot's pose of each scan"
             if has_poses(kind)
-            else "no ODOM lines and no poses: nothing is known of raw odometry, and it is zero"
+            else "no ODOM lines and no poses: raw odometry is unknown, and zero"
         )
     elif has_poses(kind) and found.setting:
         apart = poses.between(found.raw[0], found.raw)[:, :2]
         apart = np.hypot(*(apart - poses.between(corrected[0], corrected)[:, :2]).T)
-        told.append(
+        notes.append(
             f"ODOM lines that set the odometry to the pose of the scan before: {found.setting}; "
-            "raw odometry is the chain of the increments between them, and parts from the scans' "
+            "raw odometry is the chain of the increments between them, and differs from the scans' "
             f"poses by up to {apart.max():.2f} m, {apart[-1]:.2f} m at the end"
         )
     if len(found.poses) and (still := int((~found.known).sum())):
-        told.append(
-            "scans without an ODOM line since the scan before, where raw odometry stands still: "
-            f"{still}"
+        notes.append(
+            f"scans without an ODOM line since the previous scan, with a zero step: {still}"
         )
     if backward := int((np.diff(time) < 0).sum()):
-        told.append(f"scans stamped before their predecessor, kept in order: {backward}")
-    return told
+        notes.append(f"scans stamped before their predecessor, kept in order: {backward}")
+    return notes
 
 
 def _wrapped(path: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
@@ -267,7 +263,7 @@ def _wrapped(path: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
 
 _FIELDS = "t1", "t2", "x", "y", "z", "roll", "pitch", "yaw"
 _FLAT = 1e-6
-"""What z [m], roll and pitch [rad] of a pose of the plane may differ from 0."""
+"""Largest z [m], roll and pitch [rad] of a pose in the plane."""
 
 
 class StampedRelations(NamedTuple):
@@ -292,8 +288,8 @@ def relation_file(path: str | Path) -> StampedRelations:
     Source: Kümmerle, Steder, Dornhege, Ruhnke, Grisetti, Stachniss & Kleiner 2009, "On measuring
     the accuracy of SLAM algorithms", Autonomous Robots 27.
 
-    Raises ValueError, `path:line: reason`, on a line that is malformed, a pose that is not of the
-    plane (z, roll or pitch above 1e-6), and a file without relations.
+    Raises ValueError, `path:line: reason`, on a malformed line, a pose that is not in the plane
+    (z, roll or pitch above 1e-6), and a file without relations.
     """
     file = TextFile(path, comment="#")
     rows = []
@@ -301,7 +297,7 @@ def relation_file(path: str | Path) -> StampedRelations:
         row = file.numbers(line, fields, _FIELDS)
         for name, value in zip(_FIELDS[4:7], row[4:7], strict=True):
             if abs(value) > _FLAT:
-                raise file.error(line, f"expected a pose of the plane, with {name} 0, got {value}")
+                raise file.error(line, f"expected a pose in the plane, with {name} 0, got {value}")
         rows.append(row)
     if not rows:
         raise file.end_error(f"expected lines {' '.join(_FIELDS)}, got none")

@@ -1,4 +1,4 @@
-"""The lines of CARMEN that hold a scan; stamps, beams, mount and poses of all of a log."""
+"""Scans of a CARMEN log: parsing of lines; stamps, beams, mount and poses of all scans."""
 
 import re
 from collections import Counter
@@ -23,40 +23,40 @@ class Scan(NamedTuple):
 
     line: int
     ranges: Float[np.ndarray, "n"]
-    """[m] 0 where the file has NaN"""
+    """[m], 0 for NaN in the file"""
     angles: Float[np.ndarray, "n"]
     laser: list[float]
-    """the laser's pose, NaN where the line has none"""
+    """pose of the laser, NaN if the line has none"""
     robot: list[float]
-    """the robot's"""
+    """pose of the robot, likewise"""
     times: list[float]
-    """[s] of the scan, of the logger"""
+    """of the scan and of the logger [s]"""
     limit: float
-    """[m] the maximum range that the line states, infinite if it states none"""
+    """maximum range in the line [m], infinite if it has none"""
     bad_limit: bool
-    """it states one that is not finite and above 0"""
+    """whether the line has a maximum range that is not finite and above 0"""
     row: int
-    """of the last line ODOM before it, -1 if none"""
+    """index of the last ODOM line before it, -1 if none"""
 
 
 def has_poses(kind: str) -> bool:
-    """Whether lines of a kind state where laser and robot are."""
+    """Whether lines of a kind have the poses of laser and robot."""
     return not kind.startswith("RAWLASER")
 
 
 def is_scan(kind: str) -> bool:
-    """Whether lines of a kind hold a scan: FLASER, RLASER, ROBOTLASER1 …, RAWLASER1 …."""
+    """Whether a kind of line is a scan: FLASER, RLASER, ROBOTLASER1 …, RAWLASER1 …."""
     return re.fullmatch("[FR]LASER|(ROBOT|RAW)LASER[0-9]+", kind) is not None
 
 
 def scan_of(file: TextFile, line: int, fields: list[str], row: int) -> Scan:
-    """The scan of a line; raises ValueError, with file and line, on what is none."""
+    """The scan of a line; ValueError, with file and line, on a malformed one."""
     read = _flaser if fields[0] in ("FLASER", "RLASER") else _configured_laser
     return read(file, line, fields, row)
 
 
 def _flaser(file: TextFile, line: int, fields: list[str], row: int) -> Scan:
-    """Of FLASER and RLASER: `n r… x y θ x y θ time host t`."""
+    """A line FLASER or RLASER: `n r… x y θ x y θ time host t`."""
     count = _count(file, line, fields, 1)
     _expect(file, line, fields, count + 11)
     ranges = _ranges(file, line, fields[2 : 2 + count])
@@ -67,10 +67,10 @@ def _flaser(file: TextFile, line: int, fields: list[str], row: int) -> Scan:
 
 
 def _angles_of(count: int) -> Float[np.ndarray, "n"]:
-    """The angles of n beams of FLASER [rad], which has none: those of a SICK LMS, as in CARMEN.
+    """The angles of the n beams of a FLASER line [rad]: those of a SICK LMS, as in CARMEN.
 
-    1° apart for 180, ½° for 360, from -90° on: there the last beam is left out. ¼° apart for 400
-    and 401, from -50° on, the laser's field of 100° looking ahead. Else over 180°, from -90° on.
+    From -90°, 1° apart for 180 beams and ½° for 360, without the last beam; from -50°, ¼° apart
+    for 400 and 401, the field of 100° of the laser; else over 180°, from -90°.
     """
     if count in (400, 401):
         return np.asarray(np.deg2rad(-50.0 + 0.25 * np.arange(count)))
@@ -79,9 +79,9 @@ def _angles_of(count: int) -> Float[np.ndarray, "n"]:
 
 
 def _configured_laser(file: TextFile, line: int, fields: list[str], row: int) -> Scan:
-    """Of ROBOTLASER and RAWLASER: `type start field-of-view resolution maximum-range accuracy
-    remission-mode n r… m remission… time host t`, before the time of ROBOTLASER two poses and five
-    more fields."""
+    """A line ROBOTLASER or RAWLASER: `type start field-of-view resolution maximum-range accuracy
+    remission-mode n r… m remission… time host t`, with two poses and five more fields before the
+    time of ROBOTLASER."""
     after = 14 if has_poses(fields[0]) else 3
     count = _count(file, line, fields, _BEFORE - 1)
     remissions = _count(file, line, fields, _BEFORE + count)
@@ -117,7 +117,7 @@ def _expect(file: TextFile, line: int, fields: list[str], count: int) -> None:
 def _ranges(
     file: TextFile, line: int, fields: list[str], name: str = "range"
 ) -> Float[np.ndarray, "n"]:
-    """Ranges [m], 0 for NaN. Raises ValueError on what is not a number."""
+    """Ranges [m], 0 for NaN; ValueError on a field that is not a number."""
     bad = None
     try:
         values = np.array(fields, float)
@@ -141,14 +141,14 @@ def _is_number(field: str) -> bool:
 
 
 LOOSE = 0.01, np.deg2rad(0.5)
-"""[m], [rad] by which the mount may differ between lines."""
+"""Largest difference of the mount between lines [m], [rad]."""
 
 _REAR = np.array([0.0, 0.0, np.pi])
 
 
 def clock_of(scans: list[Scan], corrections: list[str]) -> int:
-    """Which of the two times of a line counts: 0 of the measurement, 1 of the logger, where those
-    of the measurements are all the same."""
+    """Which of the two times of a line to use: 0 for that of the measurement, 1 for that of the
+    logger, if all measurements have the same time."""
     taken, logged = np.array([scan.times for scan in scans]).T
     if len(scans) == 1 or np.ptp(taken) > 0:
         return 0
@@ -162,45 +162,43 @@ def clock_of(scans: list[Scan], corrections: list[str]) -> int:
 def beams_of(
     scans: list[Scan], max_range: float, dropped: Counter[str], corrections: list[str]
 ) -> tuple[Beams, float]:
-    """The beams (K, B), and the range [m] to which those are set that met nothing."""
+    """The beams (K, B), and the range of beams without a return [m]."""
     width = max(len(scan.ranges) for scan in scans)
     ranges, angles = np.zeros((2, len(scans), width))
-    there = np.zeros((len(scans), width), bool)
+    present = np.zeros((len(scans), width), bool)
     for k, scan in enumerate(scans):
         count = len(scan.ranges)
-        ranges[k, :count], angles[k, :count], there[k, :count] = scan.ranges, scan.angles, True
-    valid = there & (ranges > 0)
-    if lost := int((there & ~valid).sum()):
+        ranges[k, :count], angles[k, :count], present[k, :count] = scan.ranges, scan.angles, True
+    valid = present & (ranges > 0)
+    if lost := int((present & ~valid).sum()):
         dropped["beams without a range"] = lost
     limits = np.minimum([scan.limit for scan in scans], max_range)
     if (code := _code_of_no_return(ranges[valid & (ranges < limits[:, None])])) is not None:
         corrections.append(
-            f"ranges of {code:.2f} m or more are read as no return: the log has many of one value "
-            "there, and hardly any just below"
+            f"ranges of {code:.2f} m or more are read as no return: the log has many of one value, "
+            "and hardly any just below it"
         )
         limits = np.minimum(limits, code)
     if unstated := sum(scan.bad_limit for scan in scans):
         corrections.append(
-            "scans whose line states no maximum range above 0, which take the one asked for: "
-            f"{unstated}"
+            f"scans without a maximum range above 0 in their line, which take max_range: {unstated}"
         )
     limit = float(limits.max())
     if (limits < limit).any():
         corrections.append(
-            f"maximum ranges differ, from {limits.min():g} m on: a beam beyond that of its scan "
-            f"met nothing and is set to {limit:g} m"
+            f"maximum ranges differ, the smallest is {limits.min():g} m: a beam beyond that of its "
+            f"scan has no return and is set to {limit:g} m"
         )
     ranges = np.where(ranges >= limits[:, None], limit, ranges)
     return Beams(np.where(valid, ranges, 0.0), angles, valid), limit
 
 
 def _code_of_no_return(ranges: Float[np.ndarray, "n"]) -> float | None:
-    """The range from which on beams met nothing [m], of a laser that says so by its largest range;
-    None where ranges do not show that.
+    """The range that codes "no return" [m], of a laser that reports it as its largest range.
 
-    They do if the last hundredth of the largest range has more than one beam in 500, ten times as
-    many as the tenth below it, and two values are 93 % of them: a wall that is seen from one place
-    alone is measured with noise, but a code is one number, or in a pair of units two.
+    None unless the last hundredth of the largest range has more than one beam in 500, ten times as
+    many as the tenth below it, and two values are 93 % of them: ranges of a wall have noise, but a
+    code is one number, or two after a conversion of units.
     """
     if len(ranges) < 1000:
         return None
@@ -214,26 +212,26 @@ def _code_of_no_return(ranges: Float[np.ndarray, "n"]) -> float | None:
 
 
 def checked_mount(mount: ArrayLike) -> Float[np.ndarray, "3"]:
-    """A mount that was given; raises ValueError unless it is three finite numbers."""
+    """The given mount; ValueError unless it is three finite numbers."""
     try:
         frame = np.asarray(mount, float)
     except (TypeError, ValueError):
         frame = np.zeros(0)
     if frame.shape != (3,) or not np.isfinite(frame).all():
-        told = " ".join(str(mount).split())
-        raise ValueError(f"carmen: expected a mount of three finite numbers, got {told}")
+        text = " ".join(str(mount).split())
+        raise ValueError(f"carmen: expected a mount of three finite numbers, got {text}")
     return frame
 
 
 def mount_of(
     file: TextFile, kind: str, scans: list[Scan], corrections: list[str]
 ) -> Float[np.ndarray, "3"]:
-    """The laser's pose on the robot, robot⁻¹ ∘ laser, as constant as it is printed.
+    """The pose of the laser on the robot, robot⁻¹ ∘ laser.
 
-    FLASER and RLASER may have a corrected pose in place of the laser's: where the two poses are the
-    same, or differ by no constant, the laser looks ahead, that of RLASER back.
+    FLASER and RLASER may have a corrected pose in place of the laser's: if the two poses are equal,
+    or do not differ by a constant, the laser looks ahead, that of RLASER back.
 
-    Raises ValueError, with file and line, where it differs between lines of ROBOTLASER.
+    Raises ValueError, with file and line, if it differs between lines of ROBOTLASER.
     """
     default = _REAR.copy() if kind == "RLASER" else np.zeros(3)
     if not has_poses(kind):
@@ -245,31 +243,31 @@ def mount_of(
     if not kind.startswith("ROBOTLASER"):
         if far.any():
             corrections.append(
-                f"the two poses of {kind} differ by no constant mount: the first is taken for the "
-                "robot's corrected pose"
+                f"the two poses of {kind} do not differ by a constant mount: the first is taken "
+                "for the corrected pose of the robot"
             )
         if far.any() or not _beyond(mounts[:1]).any():
             return default
-        corrections.append(f"the mount is that of the two poses of {kind}: {told(mounts[0])}")
+        corrections.append(f"the mount is that of the two poses of {kind}: {pose_text(mounts[0])}")
     elif far.any():
         k = int(far.argmax())
         raise file.error(
             scans[k].line,
-            f"the laser is at {told(mounts[k])} on the robot, in line {scans[0].line} at "
-            f"{told(mounts[0])}: expected one mount [m, m, deg], or one that is given",
+            f"the laser is at {pose_text(mounts[k])} on the robot, in line {scans[0].line} at "
+            f"{pose_text(mounts[0])}: expected one mount [m, m, deg], or one that is given",
         )
-    # The median of what is left is free of the rounding of a single line.
+    # The median is free of the rounding of a single line.
     return poses.compose(mounts[0], np.median(off, axis=0))
 
 
 def _beyond(off: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
-    """Which poses differ from zero by more than printing and rounding do."""
+    """Which poses differ from zero by more than by rounding."""
     far = (np.hypot(off[:, 0], off[:, 1]) > LOOSE[0]) | (np.abs(off[:, 2]) > LOOSE[1])
     return np.asarray(far)
 
 
-def told(pose: Float[np.ndarray, "3"]) -> str:
-    """A pose in words, metres and degrees."""
+def pose_text(pose: Float[np.ndarray, "3"]) -> str:
+    """A pose as text, in metres and degrees."""
     x, y, heading = pose
     return f"({x:.4g}, {y:.4g}, {np.rad2deg(heading):.4g}°)"
 
@@ -277,16 +275,16 @@ def told(pose: Float[np.ndarray, "3"]) -> str:
 def robot_poses(
     kind: str, scans: list[Scan], mount: Float[np.ndarray, "3"], given: bool
 ) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "K 3"]]:
-    """The robot's corrected poses, and the robot's poses as they stand in the lines.
+    """The corrected poses of the robot, and its poses in the lines.
 
-    given: the mount is not that of the lines.
+    given: whether the mount is given, not from the lines.
     """
     laser, robot = (np.array([getattr(scan, of) for scan in scans]) for of in ("laser", "robot"))
     if kind.startswith("ROBOTLASER") and not given:
         return robot, robot
     if kind.startswith("RAWLASER"):
         return np.zeros_like(robot), robot
-    # Programs that correct a log write one pose twice, which then is the robot's.
+    # Programs that correct a log write the pose of the robot twice.
     twice = (laser == robot).all(axis=1, keepdims=True)
     if not mount.any() or twice.all():
         return laser, robot

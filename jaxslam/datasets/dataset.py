@@ -1,4 +1,4 @@
-"""The record that readers return: a log with models, noise and options of a filter for it."""
+"""The result of a reader: a log with models, noises and options of a filter for it."""
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import JaxOrNumPy, Log
 from jaxslam.core.validation.logs import check_log
-from jaxslam.filters.ekf.settings import EkfOptions
+from jaxslam.filters.ekf.ekf_settings import EkfOptions
 from jaxslam.filters.multi_robot.team import Robot
 from jaxslam.sensors.suite import Suite
 
@@ -22,9 +22,9 @@ class Adjustable(NamedTuple):
     names: tuple[str, ...]
     """of the deviations: "motion v [m/s]", …, then "sensor range [m]", …"""
     deviations: tuple[float, ...]
-    """those that the data set has"""
+    """those of the data set"""
     mount: tuple[float, ...] | None
-    """(x [m], y [m], θ [rad]) of the sensor on the robot; None where it has none"""
+    """(x [m], y [m], θ [rad]) of the sensor on the robot; None without a mount"""
     models: Callable[[JaxOrNumPy, ArrayLike | None], tuple[Motion, Sensor]]
     """(deviations (P,) an array, mount (3,) or None) -> motion and sensor"""
 
@@ -37,48 +37,47 @@ class Dataset:
         ekf = EkfSlam(data.motion, data.sensor, data.capacity, **data.filter_options)
         trace = jaxslam.run(ekf, data.log, data.pose, data.pose_cov, key)
 
-    Arrays are NumPy's, in float64. Raises ValueError where their shapes do not fit together.
+    Arrays are NumPy's, in float64. Raises ValueError if their shapes do not fit together.
     """
 
     name: str
     log: Log
     """row t: the control that led to pose t, and the scan at pose t; tags are indices of `tags`"""
     time: Float[np.ndarray, "T"]
-    """[s], or the number of the odometry line where the file has no times"""
+    """[s], or the number of the odometry line if the file has no times"""
     motion: Motion
     sensor: Sensor
     tags: tuple[int, ...]
-    """the file's own names of the landmarks with tags 0, 1, …, N-1"""
+    """the names in the file of the landmarks with tags 0, 1, …, N-1"""
     pose: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
-    """the robot's pose before the first control, which is the map's frame"""
+    """pose of the robot before the first control, the frame of the map"""
     pose_cov: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.zeros((3, 3)))
     """zero, since the first pose defines the frame"""
     filter_options: EkfOptions = field(default_factory=EkfOptions)
     """keyword arguments of `filters.EkfSlam` for this data set (update, gate)"""
     landmarks: Float[np.ndarray, "N 2"] | None = None
-    """surveyed positions [m] in the order of tags, in a frame of their own; None if unknown"""
+    """surveyed positions [m] by tag, in their frame (see `one_frame`); None if unknown"""
     true_path: Float[np.ndarray, "T 3"] | None = None
     """true pose at each row [m, m, rad], in the frame of `landmarks`; None if unknown"""
     true_at: Bool[np.ndarray, "T"] | None = None
     """in which rows the true pose is known; None if in all"""
     true_paths: Float[np.ndarray, "R T 3"] | None = None
-    """true poses of all robots of a log of several, where they are known; `true_path` is the first
-    robot's"""
+    """true poses of all robots of a log of several, if known; `true_path` is that of the first"""
     true_paths_at: Bool[np.ndarray, "R T"] | None = None
     """in which rows those are known; None if in all"""
     one_frame: bool = False
     """whether `pose`, `landmarks` and `true_path` are in one frame; if not, compare after an
     alignment"""
     slots: int | None = None
-    """landmark slots of the filter; None for one a tag"""
+    """landmark slots of the filter; None for one per tag"""
     adjustable: Adjustable | None = None
-    """the models with other noises and mount, for `datasets.fit`; None where they are fixed"""
+    """the models as functions of noises and mount, for `datasets.fit`; None if they are fixed"""
     dropped: dict[str, int] = field(default_factory=dict)
-    """number of measurements of the file that are not in the log, by reason"""
+    """number of measurements in the file that are not in the log, by reason"""
     corrections: tuple[str, ...] = ()
-    """descriptions of what the reader changed"""
+    """descriptions of the changes that the reader made"""
     assumed: tuple[str, ...] = ()
-    """defaults that the reader took where the files do not say"""
+    """defaults that the reader took for settings missing in the files"""
     source: str = ""
     """the publication of the data"""
     robots: tuple[Robot, ...] = ()

@@ -1,4 +1,4 @@
-"""A filter's path and map against the truth and the survey of a data set.
+"""Errors of the path and the map of a filter, by the truth and the survey of a data set.
 
 The map is tested by the joint NEES of its landmarks, with a verdict.
 """
@@ -29,12 +29,12 @@ class MapTest(NamedTuple):
     """The NEES of a map, the band of an honest one, and the verdict."""
 
     nees: float
-    """of all landmarks together, or the largest of one"""
+    """of all landmarks together, or the largest of a single one"""
     dof: int
     band: tuple[float, float]
-    """where it is in 95 % of honest maps; (0, high) of the largest"""
+    """the interval of 95 % of honest maps; (0, high) for the largest"""
     joint: bool
-    """whether the covariances between landmarks were there"""
+    """whether the covariances between landmarks are known"""
 
     @property
     def verdict(self) -> str:
@@ -59,7 +59,7 @@ class MapTest(NamedTuple):
 def joint_map_cov(filter: Filter, state: PyTree) -> Float[np.ndarray, "N 2 N 2"] | None:
     """The covariance of all landmark positions together, by slots, in map coordinates.
 
-    None of a filter whose state is no `slots.Joint` of point landmarks.
+    None unless the state of the filter is a `slots.Joint` of point landmarks.
     """
     if not isinstance(state, Joint) or filter.landmark != _POINT:
         return None
@@ -78,32 +78,31 @@ def judge_map(
     """The test of n landmarks at one time against their surveyed positions.
 
     With e = points - survey and the joint covariance P, eᵀ P⁻¹ e of an honest map is χ² with 2n
-    degrees of freedom, whatever the correlations, which P has. In another frame the survey is moved
-    by the rigid motion that makes it smallest (least squares weighted by P⁻¹), which takes 3 of
-    them.
+    degrees of freedom. In another frame the survey is first moved by the rigid motion that
+    minimizes it (least squares weighted by P⁻¹), which takes 3 of them.
 
-    Without P the landmarks' errors are correlated in a way that is not known. Then the largest
-    eᵢᵀ Pᵢ⁻¹ eᵢ is held against its bound at level 0.95 by Bonferroni's inequality, which holds for
-    any correlation, and can only reject an optimistic map. With a motion of the frame, which makes
-    errors smaller on the whole, it rejects more seldom still.
+    Without P the correlation of the landmarks' errors is unknown. Then the largest eᵢᵀ Pᵢ⁻¹ eᵢ is
+    compared with its bound at level 0.95 by Bonferroni's inequality, which holds for any
+    correlation and can only reject an optimistic map. A motion of the frame reduces the errors, so
+    the test then rejects even less often.
 
-    It assumes Gaussian errors, models that are linear over them, and a survey without error. One
-    map is one number: a filter that passes may be inconsistent all the same.
+    It assumes Gaussian errors, models that are linear over them, and an exact survey. One map gives
+    one number: an inconsistent filter may pass.
 
     Args:
-        points, covs: of the filter, covs each landmark's own.
+        points, covs: of the filter; covs without correlations between landmarks.
         one_frame: whether the survey is in the filter's frame.
     Returns:
-        None where the covariance is singular, or there are too few landmarks for the frame.
+        None if the covariance is singular, or the landmarks are too few to find the frame.
     """
     count = len(points)
     size = 2 * count - (0 if one_frame else 3)
     if size <= 0:
         return None
     joint = joint_cov is not None
-    whole = np.zeros((count, 2, count, 2))
-    whole[np.arange(count), :, np.arange(count)] = covs
-    cov = np.asarray(whole if joint_cov is None else joint_cov, np.float64)
+    separate = np.zeros((count, 2, count, 2))
+    separate[np.arange(count), :, np.arange(count)] = covs
+    cov = np.asarray(separate if joint_cov is None else joint_cov, np.float64)
     cov = cov.reshape(2 * count, 2 * count)
     values, vectors = np.linalg.eigh((cov + cov.T) / 2)
     if not values[0] > 1e-12 * values[-1]:
@@ -120,7 +119,7 @@ def judge_map(
 def _best_frame(points: np.ndarray, survey: np.ndarray, white: np.ndarray) -> np.ndarray:
     """The pose (3,) of the survey's frame that makes ‖L⁻¹ (points - moved survey)‖ smallest.
 
-    Gauss-Newton from the plain alignment; points far from the origin are no worse.
+    Gauss-Newton from the unweighted alignment; points may be far from the origin.
     """
     pose = alignment(survey, points)
     for _ in range(_ITERATIONS):
@@ -150,9 +149,9 @@ class Evaluation(NamedTuple):
     points: Float[np.ndarray, "N 2"] | None
     """surveyed landmarks [m]"""
     path: Float[np.ndarray, "K 3"] | None
-    """true poses, of the rows in which they are known"""
+    """true poses, of the rows with a known one"""
     map_test: MapTest | None
-    """the map against the survey; None without one, or a regular covariance"""
+    """the test of the map by the survey; None without a survey or a regular covariance"""
 
 
 def evaluate(
@@ -161,13 +160,13 @@ def evaluate(
     last: Estimate,
     map_cov: Float[np.ndarray, "N 2 N 2"] | None = None,
 ) -> Evaluation:
-    """The errors of a path and of its last map, as far as the data set has a truth.
+    """The errors of a path and its last map, as far as the data set has the truth.
 
     In one frame: ATE (RMSE of the positions), RMSE of the heading, RPE (RMSE of the translation
     from each row to the first at least `SPAN` later, in the frame of the former), mean and median
     NEES of the pose where its covariance is regular; RMSE and mean NEES of the landmarks with a
-    tag, each landmark by its own covariance. In frames of their own path and map are compared after
-    the rigid motion that fits each best, and the pose has no NEES. `map_test` has the verdict on
+    tag, each landmark by its covariance alone. In different frames path and map are each compared
+    after the rigid motion that fits best, and the pose has no NEES. `map_test` has the verdict on
     the map.
 
     Args:

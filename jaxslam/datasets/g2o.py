@@ -8,22 +8,22 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxslam.datasets.lines import TextFile
+from jaxslam.graphs.checks import check_numbers, indefinite
 from jaxslam.graphs.factor import REGISTRY
 from jaxslam.graphs.graph import Graph, Table
 from jaxslam.graphs.starts import odometry
-from jaxslam.graphs.validation import check_numbers, indefinite
 from jaxslam.results.files import write_files
 
 
 class _Edge(NamedTuple):
-    """What a line of one kind holds."""
+    """The fields of one kind of edge."""
 
     table: str
     who: tuple[str, ...]
     """kinds of the variables, "pose" or "point" """
     measured: tuple[str, ...]
     entries: tuple[tuple[int, int], ...]
-    """where in Ω each number stands"""
+    """row and column in Ω of each number"""
 
 
 _BY_ROWS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
@@ -51,11 +51,11 @@ _SKIPPED = {
     "VERTEX_TAG": "notes",
     "VERTEX_ELLIPSE": "notes",
 }
-"""Lines that are no part of the graph, and what they are counted as."""
+"""Lines that are not part of the graph, and the name under which they are counted."""
 
 
 class Format(NamedTuple):
-    """The kinds of lines that a graph is written in."""
+    """The kinds of lines of a file format."""
 
     name: str
     vertices: dict[str, str]
@@ -63,7 +63,7 @@ class Format(NamedTuple):
     edges: dict[str, str]
     """by table"""
     fix: bool
-    """whether a variable can be held"""
+    """whether a variable can be fixed"""
 
 
 _G2O = Format(
@@ -74,20 +74,20 @@ _G2O = Format(
 )
 TORO = Format("TORO", {"pose": "VERTEX2"}, {"relative_pose": "EDGE2"}, fix=False)
 _ENDINGS = {".toro": TORO, ".graph": TORO}
-"""How the names of files end that are not written as g2o."""
+"""Endings of file names that are not written as g2o."""
 
 
 _LARGEST = 2**31 - 1
 
 
 class Loaded(NamedTuple):
-    """A graph as a file has it, and what was done to it."""
+    """The graph in a file, and the changes made to it."""
 
     graph: Graph
     skipped: dict[str, int]
-    """lines that are not in the graph, by what they are"""
+    """number of lines that are not in the graph, by kind"""
     placed: int
-    """poses and points without a line of their own, placed along the edges"""
+    """number of poses and points without a line, placed along the edges"""
 
 
 class _Row(NamedTuple):
@@ -100,7 +100,7 @@ class _Row(NamedTuple):
 
 
 def load(path: str | Path) -> Loaded:
-    """The graph in a file; see `graphs.read`, which says what is read and what is refused."""
+    """The graph in a file; see `graphs.read`."""
     file = TextFile(path)
     vertices: dict[str, dict[int, list[float]]] = {"pose": {}, "point": {}}
     rows: dict[str, list[_Row]] = {}
@@ -182,7 +182,7 @@ def _assembled(
     rows: dict[str, list[_Row]],
     fixed: list[tuple[int, int]],
 ) -> Graph:
-    """The graph of the lines of a file; raises ValueError where they do not fit together."""
+    """The graph of the lines of a file; ValueError if they do not fit together."""
     index = {
         kind: {vertex: at for at, vertex in enumerate(named)} for kind, named in vertices.items()
     }
@@ -204,18 +204,18 @@ def _assembled(
 
 
 def _table(file: TextFile, rows: list[_Row], index: dict[str, dict[int, int]]) -> Table:
-    """A table; raises ValueError on a vertex that is nowhere and an indefinite information."""
+    """A table; ValueError on an undefined vertex, and on an indefinite information."""
     who, size = [], len(rows[0].edge.measured)
     information = np.zeros((len(rows), size, size))
-    for row, own in zip(rows, information, strict=True):
+    for row, matrix in zip(rows, information, strict=True):
         for vertex, kind in zip(row.ids, row.edge.who, strict=True):
             if vertex not in index[kind]:
                 elsewhere = any(vertex in known for known in index.values())
-                why = f"is no {kind}" if elsewhere else "is not defined in the file"
+                why = f"is not a {kind}" if elsewhere else "is not defined in the file"
                 raise file.error(row.line, f"vertex {vertex} {why}")
         who.append([index[kind][v] for v, kind in zip(row.ids, row.edge.who, strict=True)])
         for (i, j), entry in zip(row.edge.entries, row.numbers[size:], strict=True):
-            own[i, j] = own[j, i] = entry
+            matrix[i, j] = matrix[j, i] = entry
     bad = indefinite(information)
     if bad.any():
         why = "the information is not positive semidefinite"
@@ -265,7 +265,7 @@ def text_of(graph: Graph, form: Format = _G2O) -> str:
 
 
 def _check_readable(graph: Graph) -> None:
-    """Raise ValueError on what `read` refuses."""
+    """Raise ValueError on a graph that `read` refuses."""
     ids = np.concatenate([np.asarray(graph.pose_id), np.asarray(graph.point_id)])
     if (ids < 0).any():
         raise ValueError(f"graphs.write: expected ids >= 0, got {ids.min()}")
@@ -274,7 +274,7 @@ def _check_readable(graph: Graph) -> None:
 
 
 def _check_writable(graph: Graph, form: Format) -> None:
-    """Raise ValueError on what a format has no line for."""
+    """Raise ValueError on a graph that the format cannot represent."""
     if len(both := np.intersect1d(graph.pose_id, graph.point_id)):
         raise ValueError(
             f"graphs.write: {both[0]} is the id of a pose and of a point, which {form.name} does "

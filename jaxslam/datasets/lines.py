@@ -14,10 +14,10 @@ def stored(path: str | Path) -> Path | None:
 
 
 def read_bytes(path: str | Path) -> tuple[Path, bytes]:
-    """The file that is read, NAME or else NAME.gz, and its bytes, unpacked where it ends in .gz.
+    """The path of NAME or else NAME.gz, and its bytes, unpacked if it ends in .gz.
 
-    Raises ValueError, `path: cannot be read: reason`, where neither can be read, and where a packed
-    file is damaged or ends early.
+    Raises ValueError, `path: cannot be read: reason`, if neither can be read, or a packed file is
+    damaged or ends early.
     """
     found = stored(path) or Path(path)
     try:
@@ -32,7 +32,7 @@ class TextFile:
     """The lines of a small table in a text file, NAME or NAME.gz.
 
     Iteration yields (line number from 1, fields split at white space), without blank lines and
-    lines that start with `comment`. Raises ValueError where the file cannot be read.
+    lines that start with `comment`. Raises ValueError if the file cannot be read.
     """
 
     def __init__(self, path: str | Path, comment: str | None = None) -> None:
@@ -59,7 +59,7 @@ class TextFile:
         return self.error(max(len(self.lines) - (self.lines[-1] == ""), 1), reason)
 
     def numbers(self, line: int, fields: Sequence[str], names: Sequence[str]) -> list[float]:
-        """The fields of a line as finite numbers, one a name; raises ValueError otherwise."""
+        """The fields of a line as finite numbers, one per name; ValueError otherwise."""
         self.expect(line, fields, names)
         try:
             values = [float(field) for field in fields]

@@ -1,5 +1,5 @@
-"""Readers of MRCLAM, the UTIAS multi-robot data: of one robot, of several in one log,
-and of the systematic errors of a robot by its own log.
+"""Readers of MRCLAM, the UTIAS multi-robot data: of one robot, of several in one log, and the
+systematic errors of a robot from its log.
 """
 
 from collections.abc import Callable, Mapping
@@ -34,12 +34,12 @@ from jaxslam.datasets.mrclam_robot import (
     read_lines,
     true_fields,
 )
+from jaxslam.driver import run
+from jaxslam.filters.ekf.ekf_settings import EkfOptions
 from jaxslam.filters.ekf.ekf_slam import EkfSlam
-from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.filters.multi_robot.team import Robot, TeamMotion, sensors_of
 from jaxslam.math.stats import sigma_gate
 from jaxslam.motion import Unicycle
-from jaxslam.run import run
 from jaxslam.sensors import Part, RangeBearing, Suite
 
 
@@ -53,8 +53,8 @@ def mrclam(
     """The data of one robot in the files of a folder, each `NAME.dat` or `NAME.dat.gz`.
 
     These are `Robot{n}_Odometry.dat` (t v ω), `Robot{n}_Measurement.dat` (t barcode range bearing),
-    `Barcodes.dat` (the subject of each barcode), `Landmark_Groundtruth.dat` (the survey) and, where
-    it is there, `Robot{n}_Groundtruth.dat` (t x y θ).
+    `Barcodes.dat` (the subject of each barcode), `Landmark_Groundtruth.dat` (the survey) and,
+    optionally, `Robot{n}_Groundtruth.dat` (t x y θ).
 
     The log has a row at every time that occurs in either of the first two. Its control is
     (v, ω, Δt): the velocity of the latest odometry line at or before the row before, and the time
@@ -63,8 +63,8 @@ def mrclam(
     Measurements of robots and of unknown barcodes, and repetitions within a scan, are dropped and
     counted. Tags follow the subject numbers.
 
-    With a true path, odometry lines (0, 0) at the end of the file and after it are left out, but
-    for the first (`Dataset.corrections` says how many). If the true pose is known in the first row,
+    With a true path, odometry lines (0, 0) after its end, at the end of the file, are left out but
+    for the first (counted in `Dataset.corrections`). If the true pose is known in the first row,
     the robot starts there, with the covariance `mrclam_robot.START_COV`, and path, survey and map
     are in one frame.
 
@@ -73,8 +73,8 @@ def mrclam(
     0.19 m, with errors that persist for seconds, so that innovations show 0.11 m; 0.15 is between.
     With odometry noise of 0.01 m/√s and 0.05 rad/√s, NIS/dof is then 0.78, 1.22 and 0.92. Since the
     errors of ranges persist, the map's covariance is too small for any choice. A `calibration`
-    removes what causes them, see `MRCLAM_CALIBRATION` and `mrclam_calibration`. There is no gate; a
-    gate at 5 σ changes the maps by millimetres.
+    removes their causes, see `MRCLAM_CALIBRATION` and `mrclam_calibration`. The default is without
+    a gate; a gate at 5 σ changes the maps by millimetres.
 
     Source: Leung, Halpern, Barfoot, Liu, International Journal of Robotics Research 30(8), 2011.
 
@@ -83,24 +83,24 @@ def mrclam(
         robot: number of the robot, 1 to 5.
         calibration: corrects odometry and ranges, and gives the noise. Default: as recorded.
         errata: exchange the positions of subjects 11 and 17 if they are those of data set 1, see
-            `mrclam_robot.EXCHANGED`; `Dataset.corrections` then says so.
+            `mrclam_robot.EXCHANGED`; noted in `Dataset.corrections`.
     Raises:
         ValueError: `path:line: reason` on a malformed line, a time that decreases, a negative
-            range, or a subject without survey; on a robot other than 1 to 5, and a calibration
-            that is none.
+            range, or a subject without survey; on a robot other than 1 to 5, and on a calibration
+            of another kind.
     """
     if type(robot) is not int or robot not in ROBOTS:
         raise ValueError(f"mrclam: expected a robot from 1 to 5, got {robot!r}")
     if calibration is not None:
         check_calibration("mrclam", calibration)
     subject_of, names, points, corrections = read_landmarks(Path(folder), errata)
-    own = read_lines(Path(folder), robot, calibration)
-    time = np.unique(np.concatenate([own.odometry[:, 0], own.seen[:, 0]]))
-    row, tag, kept, dropped = associated(own.seen, time, subject_of, names)
+    lines = read_lines(Path(folder), robot, calibration)
+    time = np.unique(np.concatenate([lines.odometry[:, 0], lines.seen[:, 0]]))
+    row, tag, kept, dropped = associated(lines.seen, time, subject_of, names)
     motion, sensor = models_of(calibration)
     return Dataset(
         name=f"mrclam robot {robot}",
-        log=log_of(own.odometry, time, row, tag, own.seen[kept, 2:]),
+        log=log_of(lines.odometry, time, row, tag, lines.seen[kept, 2:]),
         time=time,
         motion=motion,
         sensor=sensor,
@@ -108,30 +108,30 @@ def mrclam(
         filter_options={"correction": "sequential"},
         landmarks=points,
         dropped=dropped,
-        corrections=(*corrections, *own.corrections),
+        corrections=(*corrections, *lines.corrections),
         source=SOURCE,
-        **true_fields([own], time),
+        **true_fields([lines], time),
     )
 
 
 MRCLAM_FITTED = ("forward", "outer", "turn", "curvature", "ahead", "yaw", "axis")
-"""What a log tells of a `RobotCalibration`; it does not tell `depth` beside `forward`."""
+"""The fields of a `RobotCalibration` that a log determines; `depth` only in ratio to `forward`."""
 
 
-class OwnCalibration(NamedTuple):
-    """The calibration of a robot by its own log, and how it was found.
+class FittedCalibration(NamedTuple):
+    """The calibration of a robot from its log, and the fit.
 
     `at(p, scale=1.0)` returns the log and the models (`Log`, `Motion`, `Sensor`) with other
-    constants p (7,), in the order of `MRCLAM_FITTED`; ranges and travel, which no log tells apart,
-    are both larger by a scale. p and the scale may be traced:
+    constants p (7,), in the order of `MRCLAM_FITTED`; ranges and travel, whose common scale no
+    log determines, are multiplied by a scale. p and the scale may be traced:
 
         def poses(p):
-            log, motion, sensor = own.at(p[:-1], scale=1 + p[-1])
+            log, motion, sensor = fitted.at(p[:-1], scale=1 + p[-1])
             filter = EkfSlam(motion, sensor, data.capacity, **data.filter_options)
             return run(filter, log, data.pose, data.pose_cov, key).estimate.pose
 
-        p = [*own.found.parameters, 0.0]
-        added = calibration.consider_cov(poses, p, block_diag(own.found.cov, 0.02**2))
+        p = [*fitted.found.parameters, 0.0]
+        added = calibration.consider_cov(poses, p, block_diag(fitted.found.cov, 0.02**2))
     """
 
     robot: RobotCalibration
@@ -146,26 +146,23 @@ def mrclam_calibration(
     robot: int = 1,
     *,
     known: RobotCalibration = MRCLAM_CALIBRATION,
-    gate: float = 5.0,
     errata: bool = True,
-) -> OwnCalibration:
-    """The systematic errors of one robot that make its innovations least, by its own log.
+) -> FittedCalibration:
+    """The systematic errors of a robot that minimize the innovations of its log.
 
-    `calibration.calibrate` on the innovations of the right-invariant EKF: wheels (`forward`,
-    `outer`, `turn`, `curvature`), place and yaw of the camera (`ahead`, `yaw`), and its optical
-    axis (`axis`).
-    Neither the true path nor the survey is used (where there is a true path, `mrclam` cuts lines
-    (0, 0) after its end). Delay, noise and `depth` are those of `known`:
-    ranges and odometry in proportion larger are the same log of a larger world, so the scale of the
-    map is that of `depth`.
+    `calibration.calibrate` on the innovations of the right-invariant EKF with a gate at 5 σ: wheels
+    (`forward`, `outer`, `turn`, `curvature`), place and yaw of the camera (`ahead`, `yaw`), and its
+    optical axis (`axis`). Neither the true path nor the survey is used, though `mrclam` cuts lines
+    (0, 0) after the end of a true path. Delay, noise and `depth` are those of `known`:
+    proportionally larger ranges and odometry give the same log of a larger world, so `depth` sets
+    the scale of the map.
 
-        own = mrclam_calibration(folder, 5)
-        data = mrclam(folder, 5, calibration=own.robot)
+        fitted = mrclam_calibration(folder, 5)
+        data = mrclam(folder, 5, calibration=fitted.robot)
 
     Args:
         folder, robot, errata: as for `mrclam`.
-        known: what is held, and where the search starts.
-        gate: [σ] of innovations.
+        known: the start of the search, and the constants that are held.
     Raises:
         ValueError: as `mrclam` and `calibrate` do.
     """
@@ -184,33 +181,37 @@ def mrclam_calibration(
     def at(p: jax.Array, scale: jax.Array | float = 1.0) -> tuple[Log, Motion, Sensor]:
         if np.shape(p) != (len(MRCLAM_FITTED),) or (is_concrete(scale) and not float(scale) > 0):
             raise ValueError(
-                f"OwnCalibration.at: expected constants of shape {(len(MRCLAM_FITTED),)} and a "
+                f"FittedCalibration.at: expected constants of shape {(len(MRCLAM_FITTED),)} and a "
                 f"scale above 0, got {np.shape(p)} and {scale}"
             )
         traced = cast("dict[str, float]", dict(zip(MRCLAM_FITTED, p, strict=True)))
-        own = known._replace(**traced)
+        errors = known._replace(**traced)
         v, omega, dt = jnp.asarray(data.log.control).T
-        forward, turn = own.velocities(v, omega)
+        forward, turn = errors.velocities(v, omega)
         phi = jnp.asarray(bearing)
-        z = jnp.stack([scale * own.range(jnp.asarray(depth), phi), phi], axis=-1)
+        z = jnp.stack([scale * errors.range(jnp.asarray(depth), phi), phi], axis=-1)
         log = data.log._replace(
             control=jnp.stack([scale * forward, turn, dt], axis=-1),
             scan=data.log.scan._replace(z=z),
         )
-        ahead = scale * own.ahead
-        mount = jnp.stack([ahead, 0.0 * ahead, own.yaw])
-        return log, Unicycle(own.odometry_cov()), RangeBearing(own.measurement_cov(), mount=mount)
+        ahead = scale * errors.ahead
+        mount = jnp.stack([ahead, 0.0 * ahead, errors.yaw])
+        return (
+            log,
+            Unicycle(errors.odometry_cov()),
+            RangeBearing(errors.measurement_cov(), mount=mount),
+        )
 
     def info(p: jax.Array) -> Info:
         log, motion, sensor = at(p)
-        more: EkfOptions = {"gate": sigma_gate(gate), "chart": RightInvariant()}
+        more: EkfOptions = {"gate": sigma_gate(5.0), "chart": RightInvariant()}
         options = data.filter_options | more
         filter = EkfSlam(motion, sensor, data.capacity, **options)
         return run(filter, log, jnp.zeros(3), jnp.zeros((3, 3)), jax.random.key(0)).info
 
     found = calibrate(info, [getattr(known, name) for name in MRCLAM_FITTED])
     values = dict(zip(MRCLAM_FITTED, found.parameters.tolist(), strict=True))
-    return OwnCalibration(known._replace(**values), found, at)
+    return FittedCalibration(known._replace(**values), found, at)
 
 
 def mrclam_team(
@@ -226,73 +227,73 @@ def mrclam_team(
     The log has a row at every time that occurs in a file of any of the robots, with a control
     (v, ω, Δt) for each robot as in `mrclam`. Measurement slots of a scan are ordered by robot,
     those for landmarks before those for robots; tags N, N + 1, … are the robots in the given order.
-    The first robot's start is the map's frame, from its true path where that is known. The others'
-    starts are left to the filter. Measurements of robots are less accurate than those of landmarks:
-    of robots 1 to 3 of data set 1, their innovations have standard deviations of 0.18 m and
-    0.048 rad (NIS/dof 2.5 with the noise of landmarks; `python -m benchmarks --record --only
-    team`), so a `sighting_cov` of their own is advisable. Measurements of other robots are dropped
-    and counted; all else is as in `mrclam`.
+    The frame of the map is the start of the first robot, from its true path if known. The filter
+    finds the starts of the others. Measurements of robots are less accurate than those of
+    landmarks: of robots 1 to 3 of data set 1, their innovations have standard deviations of 0.18 m
+    and 0.048 rad (NIS/dof 2.5 with the noise of landmarks; `python -m benchmarks --record --only
+    team`), so set `sighting_cov`. Measurements of other robots are dropped and counted; all else is
+    as in `mrclam`.
 
         data = mrclam_team(folder)
         filter = TeamSlam(data.robots, data.capacity)
 
     Args:
         folder: where the files of one data set are.
-        robots: their numbers, each from 1 to 5, none twice.
-        calibration: as for `mrclam`; or one for each robot, by its number.
+        robots: their numbers, different ones from 1 to 5.
+        calibration: as for `mrclam`, or a mapping from the number of each robot.
         errata: as for `mrclam`.
         sighting_cov: (2, 2) covariance of (range, bearing) of another robot, or a function of z;
             default that of a landmark.
     Raises:
-        ValueError: as `mrclam`, on a robot that measured nothing, on one without calibration where
-            others have one, and unless robots are different numbers from 1 to 5.
+        ValueError: as `mrclam`, on a robot without measurements or missing in a mapping of
+            calibrations, and unless robots are different numbers from 1 to 5.
     """
-    asked = tuple(robots)
-    good = all(type(robot) is int and robot in ROBOTS for robot in asked)
-    if not asked or not good or len(set(asked)) != len(asked):
+    numbers = tuple(robots)
+    good = all(type(robot) is int and robot in ROBOTS for robot in numbers)
+    if not numbers or not good or len(set(numbers)) != len(numbers):
         raise ValueError(f"mrclam_team: expected different robots from 1 to 5, got {robots!r}")
     subject_of, names, points, corrections = read_landmarks(Path(folder), errata)
-    each: list[RobotCalibration | None] = [None] * len(asked)
+    each: list[RobotCalibration | None] = [None] * len(numbers)
     if isinstance(calibration, Mapping):
-        if missing := [robot for robot in asked if robot not in calibration]:
+        if missing := [robot for robot in numbers if robot not in calibration]:
             raise ValueError(f"mrclam_team: robot {missing[0]} has no calibration")
-        each = [calibration[robot] for robot in asked]
+        each = [calibration[robot] for robot in numbers]
     elif calibration is not None:
-        each = [calibration] * len(asked)
+        each = [calibration] * len(numbers)
     for constants in each:
         if constants is not None:
             check_calibration("mrclam_team", constants)
-    files = [read_lines(Path(folder), *one) for one in zip(asked, each, strict=True)]
-    time = np.unique(np.concatenate([t[:, 0] for own in files for t in (own.odometry, own.seen)]))
+    files = [read_lines(Path(folder), *one) for one in zip(numbers, each, strict=True)]
+    time = np.unique(np.concatenate([t[:, 0] for one in files for t in (one.odometry, one.seen)]))
     team, scans, controls, dropped = [], [], [], dict.fromkeys(DROPS, 0)
     models = {one: models_of(one) for one in set(each)}
     sights = {one: eye for one, (_, eye) in models.items()}
     if sighting_cov is not None:
         sights = {one: replace(eye, noise_cov=sighting_cov) for one, eye in sights.items()}
-    for robot, own, constants in zip(asked, files, each, strict=True):
+    for robot, lines, constants in zip(numbers, files, each, strict=True):
         (model, eye), sight = models[constants], sights[constants]
-        row, tag, kept, lost = associated(own.seen, time, subject_of, names + asked)
+        row, tag, kept, lost = associated(lines.seen, time, subject_of, names + numbers)
         dropped = {why: dropped[why] + lost[why] for why in dropped}
         if not tag:
             seen = Path(folder) / f"Robot{robot}_Measurement.dat"
             raise ValueError(
-                f"{stored(seen)}:1: no measurement of a landmark, or of a robot in {asked}"
+                f"{stored(seen)}:1: no measurement of a landmark, or of a robot in {numbers}"
             )
         tags, rows = np.array(tag), np.array(row)
-        controls.append(hold(own.odometry[:, 0], own.odometry[:, 1:], time))
+        controls.append(hold(lines.odometry[:, 0], lines.odometry[:, 1:], time))
         parts = []
         for robots_seen in (False, True):
-            mine = (tags >= len(names)) == robots_seen
-            if mine.any():
-                z = own.seen[kept, 2:][mine]
-                scan = log_of(own.odometry, time, rows[mine], tags[mine], z).scan
+            chosen = (tags >= len(names)) == robots_seen
+            if chosen.any():
+                z = lines.seen[kept, 2:][chosen]
+                scan = log_of(lines.odometry, time, rows[chosen], tags[chosen], z).scan
                 sees: Literal["landmarks", "robots"] = "robots" if robots_seen else "landmarks"
                 sensor = sight if robots_seen else eye
                 parts.append(Part(sensor, scan.tag.shape[1], sees=sees))
                 scans.append(scan)
         team.append(Robot(model, Suite((*parts,))))
     return Dataset(
-        name=f"mrclam robots {', '.join(map(str, asked))}",
+        name=f"mrclam robots {', '.join(map(str, numbers))}",
         log=Log.from_rows(
             Rows(
                 time,
@@ -307,7 +308,7 @@ def mrclam_team(
         filter_options={"correction": "sequential"},
         landmarks=points,
         dropped=dropped,
-        corrections=(*corrections, *(line for own in files for line in own.corrections)),
+        corrections=(*corrections, *(note for lines in files for note in lines.corrections)),
         source=SOURCE,
         robots=tuple(team),
         **true_fields(files, time),

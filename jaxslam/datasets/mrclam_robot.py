@@ -53,7 +53,7 @@ def read_robot(
 
 
 def read_truth(folder: Path, robot: int) -> Float[np.ndarray, "K 4"] | None:
-    """The true poses (t, x, y, θ) of one robot; None where there is no such file."""
+    """The true poses (t, x, y, θ) of one robot; None without a file."""
     path = folder / f"Robot{robot}_Groundtruth.dat"
     if stored(path) is None:
         return None
@@ -101,7 +101,7 @@ def _read_survey(file: TextFile, names: tuple[int, ...]) -> dict[int, list[float
         _, x, y, _, _ = file.numbers(line, fields, columns)
         subject = file.identity(line, fields[0], "subject")
         if subject not in names:
-            raise file.error(line, f"subject {subject} is no landmark in Barcodes.dat")
+            raise file.error(line, f"subject {subject} is not a landmark in Barcodes.dat")
         if subject in points:
             raise file.error(line, f"subject {subject} occurs twice")
         points[subject] = [x, y]
@@ -121,8 +121,8 @@ class RobotCalibration(NamedTuple):
 
         v' = forward v - outer |ω|,    ω' = turn ω + curvature v
 
-    since v is rather the speed of the outer wheel, half a track `outer` from the centre, and since
-    wheels of unequal size bend the path of a robot that is told to go straight (Borenstein & Feng
+    since v is close to the speed of the outer wheel, half a track `outer` from the centre, and
+    wheels of unequal size bend the path of a robot that drives straight ahead (Borenstein & Feng
     1996). The camera is at (ahead, 0, yaw) on the robot. Its range r is `depth` times the depth
     along the optical axis, as the height of a barcode in the image gives it. That axis has the
     bearing `axis`, so that with the recorded bearing φ the range is
@@ -232,10 +232,10 @@ MRCLAM_CALIBRATION = RobotCalibration(
 """Fitted on the true path of robot 1 of data set 6 (`python -m benchmarks --only mrclam_fit`).
 
 The yaw and the axis of the camera are left at zero, since they differ from robot to robot;
-`mrclam_calibration` finds them in a robot's own log.
+`mrclam_calibration` finds them from the log of a robot.
 
 The ranges of that robot deviate from the survey by 0.12 m as recorded, by a function of the
-bearing, and by 1 % of the range once corrected. Errors that last are counted in full: the noise of
+bearing, and by 1 % of the range once corrected. Persistent errors are included: the noise of
 the odometry is that of windows of 8 s, that of the camera of single measurements and the truth."""
 
 
@@ -267,10 +267,10 @@ def per_interval(density: jax.Array, dt: jax.Array) -> jax.Array:
 
 
 GAP = 0.2
-"""Time between lines of the truth beyond which it is unknown between them [s]."""
+"""Largest time between lines of the truth over which it is interpolated [s]."""
 START_COV = np.diag([0.01, 0.01, 0.03]) ** 2
 """Covariance of a true pose. Of robot 1 of data set 6, headings that two landmarks give agree with
-the recorded ones to 0.03 rad, with errors that last for tens of seconds."""
+the recorded ones to 0.03 rad, with errors that persist for tens of seconds."""
 
 
 def cut_after(
@@ -278,8 +278,8 @@ def cut_after(
 ) -> tuple[Float[np.ndarray, "J 3"], int]:
     """Odometry without the (0, 0) lines at its end that are later than `end`, and their number.
 
-    A recorder that goes on after the robot has stopped writes such lines. The first of them stays,
-    so that the robot stands still from there on.
+    A recorder that runs on after the robot has stopped writes such lines. The first one stays, so
+    that the velocity is zero from then on.
     """
     moving = np.flatnonzero(odometry[:, 1:].any(axis=1) | (odometry[:, 0] <= end))
     keep = min(int(moving[-1]) + 2 if moving.size else 1, len(odometry))
@@ -312,7 +312,7 @@ DROPS = ("robot sightings", "unknown barcodes", "repeated in a scan")
 
 
 class Recorded(NamedTuple):
-    """What a robot's files hold, corrected where a calibration is given."""
+    """The content of the files of a robot, corrected if a calibration is given."""
 
     odometry: Float[np.ndarray, "K 3"]
     seen: Float[np.ndarray, "J 4"]
@@ -321,7 +321,7 @@ class Recorded(NamedTuple):
 
 
 def read_lines(folder: Path, robot: int, calibration: RobotCalibration | None) -> Recorded:
-    """The lines of a robot, corrected, with its true path and what was changed, in words."""
+    """The lines of a robot, corrected, with its true path and descriptions of the corrections."""
     odometry, seen = read_robot(folder, robot)
     truth, corrections = read_truth(folder, robot), []
     if truth is not None:
@@ -344,13 +344,13 @@ def models_of(calibration: RobotCalibration | None) -> tuple[Unicycle, RangeBear
 
 
 def true_fields(files: Sequence[Recorded], time: Float[np.ndarray, "T"]) -> dict[str, Any]:
-    """The fields of a `Dataset` about true paths, and the start; none where no path is known."""
+    """The fields of a `Dataset` about true paths and the start; none without a true path."""
     if files[0].truth is None:
         return {}
     paths, known = true_poses(files[0].truth, time)
     found: dict[str, Any] = {"true_path": paths, "true_at": known}
-    if len(files) > 1 and all(own.truth is not None for own in files):
-        each = [true_poses(own.truth, time) for own in files if own.truth is not None]
+    if len(files) > 1 and all(lines.truth is not None for lines in files):
+        each = [true_poses(lines.truth, time) for lines in files if lines.truth is not None]
         found["true_paths"] = np.stack([path for path, _ in each])
         found["true_paths_at"] = np.stack([at for _, at in each])
     if known[0]:

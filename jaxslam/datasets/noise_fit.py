@@ -1,4 +1,4 @@
-"""The noises of a data set by maximum likelihood, from its own log."""
+"""The noises of a data set by maximum likelihood, from its log."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -10,14 +10,13 @@ import numpy as np
 from jaxslam.association.rules import Known
 from jaxslam.calibration import NoiseFit, as_associated, fit_noise
 from jaxslam.core.logs.tables import POSE, split_unit
-from jaxslam.core.numbers import check_count
 from jaxslam.core.protocols import Filter
 from jaxslam.core.types import Info, JaxOrNumPy, Log, Status
 from jaxslam.datasets.dataset import Adjustable, Dataset
+from jaxslam.driver import run
+from jaxslam.filters.ekf.ekf_settings import EkfOptions
 from jaxslam.filters.ekf.ekf_slam import EkfSlam
-from jaxslam.filters.ekf.settings import EkfOptions
 from jaxslam.math.stats import normal_quantile
-from jaxslam.run import run
 
 
 class DatasetFit(NamedTuple):
@@ -32,84 +31,85 @@ class DatasetFit(NamedTuple):
     used: int
     """measurements fused or born, over which the likelihood is"""
     left_out: dict[str, int]
-    """others, by what became of them with the noises found"""
+    """others, by status with the fitted noises"""
     rounds: int
     """how often the filter decided what to use"""
     settled: bool
     """whether it decides with the noises found as it did before"""
     autocorrelation: tuple[float, float]
     """of successive whitened innovations of a landmark, and the half width of its 95 % band about
-    0; NaN where none is seen twice. Outside of it errors last, and standard errors are too small"""
+    0; NaN if none is seen twice. Outside of it errors persist, and standard errors are too small"""
 
 
-def fit(
-    data: Dataset, *, mount: bool = False, fixed: Iterable[str] = (), rounds: int = 5
-) -> DatasetFit:
-    """The standard deviations of a data set's noises that are most likely for its log.
+_ROUNDS = 5
+"""Largest number of rounds of association and fit."""
 
-    EKF-SLAM with the options of the data set runs over the log, and says which measurement is of
-    which landmark, and which failed its gate. With these decisions held, `calibration.fit_noise`
-    maximizes the likelihood of the others. Both are repeated until the decisions stay; with known
-    tags and no gate they do at once. A gate cuts the tail of good measurements too, and so makes
-    noises a little too small: one of 0.999 or more is advisable, or none.
 
-    Truth and survey are not used, but for the pose at the start. A deviation of 0 is held.
+def fit(data: Dataset, *, mount: bool = False, fixed: Iterable[str] = ()) -> DatasetFit:
+    """The standard deviations of the noises of a data set that maximize the likelihood of its log.
+
+    EKF-SLAM with the options of the data set runs over the log to associate and gate its
+    measurements. With these decisions fixed, `calibration.fit_noise` maximizes the likelihood of
+    the used measurements. Both are repeated, up to 5 times, until the decisions do not
+    change; with known tags and without a gate that is after one round. A gate also cuts the tail of
+    good measurements, so the noises come out a little too small: use a gate of 0.999 or more, or
+    none.
+
+    Truth and survey are not used, except for the pose at the start. A deviation of 0 is held.
 
     Args:
         data: with `Dataset.adjustable`, as from `table`.
         mount: whether the pose of the sensor on the robot is fitted, too.
         fixed: names of parameters to hold, as "motion v" or "mount y".
-        rounds: how often decisions are made at most.
     Raises:
-        ValueError: on a data set whose noises are fixed, a mount that the sensor does not have, a
-            name that is none, nothing to fit, and what `fit_noise` raises.
+        ValueError: on a data set with fixed noises, a sensor without a mount, an unknown name,
+            nothing to fit, and as `fit_noise` does.
     """
     models = data.adjustable
     if models is None:
         raise ValueError(f"fit: expected a data set with adjustable noises, got {data.name}")
-    check_count("fit: rounds", rounds)
     names, values, free = _parameters(models, mount, tuple(fixed))
     count, key = len(models.deviations), jax.random.key(0)
     decided = data.filter_options | {"gate": None, "associate": Known()}
 
-    def filter(whole: JaxOrNumPy, options: EkfOptions) -> Filter:
+    def filter(parameters: JaxOrNumPy, options: EkfOptions) -> Filter:
         fitted = mount and models.mount is not None
-        place = whole[count:] if fitted else models.mount
-        motion, sensor = models.models(whole[:count], place)
+        place = parameters[count:] if fitted else models.mount
+        motion, sensor = models.models(parameters[:count], place)
         return EkfSlam(motion, sensor, data.capacity, **options)
 
     def info(p: jax.Array, log: Log) -> Info:
-        whole = jnp.asarray(values, p.dtype).at[free].set(p)
-        return run(filter(whole, decided), log, data.pose, data.pose_cov, key).info
+        parameters = jnp.asarray(values, p.dtype).at[free].set(p)
+        return run(filter(parameters, decided), log, data.pose, data.pose_cov, key).info
 
-    def decide(whole: np.ndarray) -> Info:
-        mine = filter(whole, data.filter_options)
-        found: Info = jax.device_get(run(mine, data.log, data.pose, data.pose_cov, key).info)
+    def decide(parameters: np.ndarray) -> Info:
+        method = filter(parameters, data.filter_options)
+        found: Info = jax.device_get(run(method, data.log, data.pose, data.pose_cov, key).info)
         return found
 
-    whole, logged = np.array(values), np.arange(len(values)) < count
-    said = decide(whole)
+    parameters, logged = np.array(values), np.arange(len(values)) < count
+    info_of_log = decide(parameters)
     settled, taken = False, 0
-    while taken < rounds and not settled:
+    while taken < _ROUNDS and not settled:
         taken += 1
-        log = as_associated(data.log, said)
+        log = as_associated(data.log, info_of_log)
         found = fit_noise(
             info,
             values[free],
             log,
             names=[names[i] for i in free],
             deviation=logged[free].tolist(),
-            guess=whole[free],
+            guess=parameters[free],
         )
-        whole[free] = found.parameters
-        said = decide(whole)
-        settled = _same(log, as_associated(data.log, said))
-    outcome = {s.name.lower(): int((np.asarray(said.status) == s).sum()) for s in Status}
+        parameters[free] = found.parameters
+        info_of_log = decide(parameters)
+        settled = _same(log, as_associated(data.log, info_of_log))
+    outcome = {s.name.lower(): int((np.asarray(info_of_log.status) == s).sum()) for s in Status}
     kept = ("empty", "fused", "born")
     return DatasetFit(
         found=found,
-        deviations=tuple(whole[:count].tolist()),
-        mount=tuple(whole[count:].tolist()) if mount else models.mount,
+        deviations=tuple(parameters[:count].tolist()),
+        mount=tuple(parameters[count:].tolist()) if mount else models.mount,
         held={
             names[i]: float(values[i])
             for i in np.flatnonzero(~np.isin(np.arange(len(values)), free))
@@ -118,7 +118,7 @@ def fit(
         left_out={name: n for name, n in outcome.items() if n and name not in kept},
         rounds=taken,
         settled=settled,
-        autocorrelation=autocorrelation(said),
+        autocorrelation=autocorrelation(info_of_log),
     )
 
 
@@ -131,8 +131,8 @@ def autocorrelation(info: Info) -> tuple[float, float]:
     nu, cov = np.asarray(info.innovation)[fused], np.asarray(info.innovation_cov)[fused]
     slot = np.asarray(info.slot)[fused]
     # A part of a suite may have fewer numbers than another.
-    bare = np.diagonal(cov, axis1=1, axis2=2) == 0
-    cov = cov + bare[:, None, :] * np.eye(nu.shape[1])
+    unused = np.diagonal(cov, axis1=1, axis2=2) == 0
+    cov = cov + unused[:, None, :] * np.eye(nu.shape[1])
     white = np.linalg.solve(np.linalg.cholesky(cov), nu[..., None])[..., 0]
     order = np.argsort(slot, kind="stable")  # by landmark, in order of time
     pair = slot[order][1:] == slot[order][:-1]
@@ -153,13 +153,13 @@ def _parameters(
             raise ValueError("fit: expected a sensor with a mount, got one without")
         names += tuple(f"mount {name}" for name in POSE)
         values += models.mount
-    bare = [split_unit(name)[0] for name in names]
+    plain = [split_unit(name)[0] for name in names]
     held = {split_unit(name)[0] for name in fixed}
-    for name in held - set(bare):
-        raise ValueError(f"fit: expected fixed parameters of {', '.join(bare)}, got {name!r}")
+    for name in held - set(plain):
+        raise ValueError(f"fit: expected fixed parameters of {', '.join(plain)}, got {name!r}")
     free = [
         i
-        for i, name in enumerate(bare)
+        for i, name in enumerate(plain)
         if name not in held and (i >= len(models.deviations) or values[i] > 0)
     ]
     if not free:

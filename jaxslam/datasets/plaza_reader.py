@@ -1,7 +1,7 @@
 """Reader of the Plaza data sets: a lawn mower with range measurements to four radio beacons.
 
-Their files are MAT-files of level 5. SciPy's own reader can end the process on a damaged file, so
-this one reads matrices of numbers, as MATLAB and SciPy write them. Format: MathWorks, "MAT-File
+Their files are MAT-files of level 5. SciPy's reader can end the process on a damaged file, so this
+one reads matrices of numbers, as MATLAB and SciPy write them. Format: MathWorks, "MAT-File
 Format" (2024), chapter 1: a header of 128 bytes, then elements, each a tag (type, bytes) and its
 data, padded to 8 bytes; a compressed element holds one more element; a matrix holds elements with
 its flags, dimensions, name and numbers, by column.
@@ -38,8 +38,7 @@ _COMPLEX = 0x0800
 def read_matrices(path: Path) -> dict[str, np.ndarray]:
     """The real matrices of numbers in a file, by name; other variables are left out.
 
-    Raises ValueError, which begins with the path and says at which byte, on anything else than such
-    a file, and where it cannot be read.
+    Raises ValueError, with the path and the byte, on an unreadable file or another format.
     """
     path, content = read_bytes(path)
     mark = content[_HEADER - 2 : _HEADER]
@@ -78,7 +77,7 @@ def _element(content: bytes, at: int, order: str) -> tuple[int, bytes, int]:
 
 
 def _matrix(data: bytes, order: str) -> tuple[str, np.ndarray] | None:
-    """Name and values of a matrix; None where they are not real numbers."""
+    """Name and values of a matrix; None if they are not real numbers."""
     parts: list[tuple[int, bytes]] = []
     at = 0
     while at < len(data) and len(parts) < 4:
@@ -103,12 +102,12 @@ SOURCE = (
 )
 _TABLES = {"DR": 3, "TD": 4, "TL": 3, "GT": 4}
 MOST = 1e30
-"""No number of a table is larger: sums of them are what a filter takes."""
+"""Largest number of a table, so that sums in a filter stay finite."""
 _COLUMNS = "DR: t, distance, turn; TD: t, sender, receiver, range; TL: id, x, y; GT: t, x, y, θ"
 _RANGE_BIAS = (0.03, 0.069)
 """Offset [m] and scale by which the ranges of both files exceed the distances: the least-squares
 line through all ranges against the distances between survey and ground truth. It stands for a radio
-calibrated beforehand; no estimator here finds it."""
+calibrated beforehand; it is not estimated here."""
 _RANGE_COV = ((0.5**2,),)
 """Variance of the ranges after that correction [m²]; successive ranges of a beacon are white."""
 _TRAVEL_DENSITY = (0.03**2, 0.03**2, 0.003**2)
@@ -125,7 +124,7 @@ def plaza(
     The file's tables are DR (t, distance, turn), TD (t, sender, receiver, range), TL (id, x, y of a
     beacon) and GT (t, x, y, θ). The log has a row at the time of every range: its control is the
     pose increment (dx, dy, dθ) of the odometry since the row before, with a proportional part of
-    the odometry row that this time divides. Ranges of one time share a row. Dropped and counted are
+    an odometry row that this time divides. Ranges of one time share a row. Dropped and counted are
     ranges before the first ground truth or after the last odometry, and all but the first range of
     a beacon at one time. A range z is corrected to (z - offset)/(1 + scale) by `range_bias`.
 
@@ -137,9 +136,9 @@ def plaza(
 
     Args:
         path: the file.
-        range_bias: (offset [m], scale) of the ranges; (0, 0) leaves them as they are.
+        range_bias: (offset [m], scale) of the ranges; (0, 0) does not change them.
     Raises:
-        ValueError: `path: reason` where the file cannot be read, lacks a table, has a table of
+        ValueError: `path: reason` if the file cannot be read, lacks a table, has a table of
             another shape or not finite, times of odometry or ground truth that do not increase, a
             range that is not positive or of a beacon without a survey.
     """

@@ -1,4 +1,4 @@
-"""Reader and writer of occupancy grids as ROS has them: a YAML file and an image.
+"""Reader and writer of occupancy grids in the format of ROS: a YAML file and an image.
 
 Grey images are PGM, P5 (binary) and P2 (text), read here; PNG and BMP are read by Matplotlib.
 """
@@ -30,8 +30,8 @@ def _read_shades(path: Path) -> NDArray[np.float64]:
 
     A colour counts as the mean of its three channels, as in `map_server`.
 
-    Raises ValueError, `path: reason`, on a file of another format, one that is damaged, and an
-    image that is transparent somewhere.
+    Raises ValueError, `path: reason`, on a file that is damaged or of another format, and on an
+    image with transparent pixels.
     """
     path, data = read_bytes(path)
     for begin, form in _BY_MATPLOTLIB.items():
@@ -64,7 +64,7 @@ def _read_shades(path: Path) -> NDArray[np.float64]:
 
 
 def _whole(path: Path, words: Sequence[bytes]) -> list[int]:
-    """Words as whole numbers; raises ValueError on one that is none."""
+    """Words as whole numbers; ValueError on any other."""
     for word in words:
         if not word.isdigit():
             raise ValueError(f"{path}: expected a whole number, got {word.decode('latin-1')!r}")
@@ -72,7 +72,7 @@ def _whole(path: Path, words: Sequence[bytes]) -> list[int]:
 
 
 def _by_matplotlib(path: Path, data: bytes, form: str) -> NDArray[np.float64]:
-    import matplotlib.image  # late, since most commands read no image
+    import matplotlib.image  # slow to load, and most commands read no image
 
     try:
         image = np.asarray(matplotlib.image.imread(io.BytesIO(data), format=form))
@@ -98,7 +98,7 @@ _UNKNOWN = 205
 
 
 def load(path: str | Path) -> Grid:
-    """The grid in a map file; `grids.read_map` says what is read."""
+    """The grid in a map file; see `grids.read_map`."""
     head = _Header(path)
     resolution = head.number("resolution")
     if not resolution > 0:
@@ -123,7 +123,7 @@ def load(path: str | Path) -> Grid:
 
 
 def save(path: str | Path, grid: Grid, mode: str) -> list[Path]:
-    """Write a map file and its image; `grids.write_map` says how."""
+    """Write a map file and its image; see `grids.write_map`."""
     path = Path(path)
     if path.suffix != ".yaml" or path.stem == "":
         raise ValueError(f"write_map: expected a path NAME.yaml, got {path}")
@@ -131,7 +131,7 @@ def save(path: str | Path, grid: Grid, mode: str) -> list[Path]:
 
 
 def map_files(stem: str, grid: Grid, mode: str = "trinary") -> Files:
-    """The map file STEM.yaml and its image STEM.pgm, as `write_files` takes them."""
+    """The map file STEM.yaml and its image STEM.pgm, for `write_files`."""
     check_grid("write_map", grid)
     if mode not in _MODES:
         raise ValueError(f'write_map: expected mode "trinary" or "scale", got {mode!r}')
@@ -214,7 +214,7 @@ class _Header:
         return self.file.error(self.found[key].start_mark.line + 1, reason)
 
     def text(self, key: str) -> str:
-        """The value of a key as it stands in the file, without quotes."""
+        """The value of a key as written in the file, without quotes."""
         value = self.found[key].value
         if not isinstance(value, str) or not value:
             raise self.error(key, f"expected one value of {key}")
@@ -226,7 +226,7 @@ class _Header:
         return self.file.numbers(line, [self.text(key)], [key])[0]
 
     def numbers(self, key: str, names: tuple[str, ...]) -> list[float]:
-        """The value of a key as a list of finite numbers, one a name."""
+        """The value of a key as a list of finite numbers, one per name."""
         node = self.found[key]
         items = node.value if isinstance(node, yaml.SequenceNode) else [node]
         fields = [item.value if isinstance(item, yaml.ScalarNode) else "" for item in items]
@@ -239,7 +239,7 @@ class _Header:
             raise self.error(key, f"{wanted}: {reason}") from problem
 
     def choice(self, key: str, choices: dict[str, _Value], default: str | None = None) -> _Value:
-        """What the value of a key stands for."""
+        """The meaning of the value of a key."""
         if key not in self.found and default is not None:
             return choices[default]
         value = self.text(key).lower()

@@ -1,4 +1,4 @@
-"""Reader of your own data: CSV files with units in the header, and a file of settings."""
+"""Reader of your data: CSV files with units in the header, and a file of settings."""
 
 import csv
 import io
@@ -23,7 +23,7 @@ class CsvTable:
 
     It is NAME or NAME.gz. Every column but `tag` has its unit in the header, as in `v [m/s]`. Lines
     above the header that begin with # are comments.
-    Raises ValueError where the file cannot be read, has no line below its header, or a line with
+    Raises ValueError if the file cannot be read, has no line below its header, or a line with
     another number of cells.
     """
 
@@ -55,8 +55,8 @@ class CsvTable:
         self.cells = [cells for _, cells in lines[1:]]
         for separator in ";\t":
             if len(self.header) == 1 and separator in self.header[0]:
-                told = f"expected cells separated by commas, got {separator!r}"
-                raise self._error(self.head_line, told)
+                reason = f"expected cells separated by commas, got {separator!r}"
+                raise self._error(self.head_line, reason)
         if all(math.isfinite(_number(cell)) for cell in self.header):
             raise self._error(
                 self.head_line, f"expected a header, as 't [s],v [m/s]', got {self.header[0]!r}"
@@ -71,9 +71,9 @@ class CsvTable:
             if len(cells) != len(self.header):
                 wanted, hint = len(self.header), ""
                 if "\n" in "".join(cells):
-                    hint = "; a quotation mark stays open over lines"
+                    hint = "; a quotation mark is not closed on its line"
                 elif len(cells) > wanted:
-                    hint = "; a number has a point, no comma: 0.5"
+                    hint = "; write a number with a point: 0.5"
                 raise self._error(
                     number,
                     f"expected {wanted} cells, as in line {self.head_line}, got {len(cells)}{hint}",
@@ -82,11 +82,11 @@ class CsvTable:
     def table(self, wanted: Sequence[str], why: str) -> Columns[int]:
         """The wanted columns ("v [m/s]"), in their units.
 
-        Raises ValueError on a column that is missing, without unit or in another one, a cell that
-        is no finite number, and a tag that is no whole number >= 0 (or empty, for unknown).
+        Raises ValueError on a column that is missing, or without a known unit, a cell that is not a
+        finite number, and a tag that is not a whole number >= 0 (or empty, for unknown).
 
         Args:
-            why: what wants them, for messages.
+            why: what needs them, for messages.
         """
         places = {name: self._place(name, why) for name in wanted}
 
@@ -97,7 +97,7 @@ class CsvTable:
         return Columns(columns, self._tags(places[TAG]) if TAG in places else None, at)
 
     def unused(self, wanted: Sequence[str]) -> list[str]:
-        """The columns of the file that are not among those wanted."""
+        """The columns of the file that are not wanted."""
         bare = {split_unit(name)[0] for name in wanted}
         return [
             whole for whole, name in zip(self.header, self.names, strict=True) if name not in bare
@@ -152,7 +152,7 @@ class CsvTable:
 
 
 def _number(cell: str) -> float:
-    """The number in a cell; NaN where there is none. float() alone accepts 1_000."""
+    """The number in a cell, or NaN. float() alone accepts 1_000."""
     try:
         return math.nan if "_" in cell else float(cell)
     except ValueError:
@@ -162,7 +162,7 @@ def _number(cell: str) -> float:
 ODOMETRY, MEASUREMENTS = "odometry.csv", "measurements.csv"
 
 _GAP = 10
-"""An interval of odometry above so many medians is noted."""
+"""Intervals of odometry above this multiple of the median are noted."""
 
 
 def table(folder: str | Path) -> Dataset:
@@ -170,7 +170,7 @@ def table(folder: str | Path) -> Dataset:
 
     `odometry.csv` has the columns `t [s]` and the controls of a motion model without Δt, as
     `v [m/s],omega [rad/s]`, or a path of poses, `x [m],y [m],theta [rad]`. `measurements.csv` has
-    `t [s]`, `tag` (empty where the landmark is unknown) and what a sensor measures, as
+    `t [s]`, `tag` (empty if the landmark is unknown) and the measurements of a sensor, as
     `range [m],bearing [rad]`. Optional are `truth.csv` (t, x, y, theta), `landmarks.csv` (tag, x, y
     of every tag) and `dataset.toml`:
 
@@ -189,23 +189,23 @@ def table(folder: str | Path) -> Dataset:
         associate = "nearest"
         update = "sequential"
 
-    What is left out has a default, listed in `Dataset.assumed`. The log is `Log.from_records`. The
+    Missing settings have defaults, listed in `Dataset.assumed`. The log is `Log.from_records`. The
     noise of the motion is that of a line of odometry; a row that is shorter or longer has white
-    noise of the same density. The start is that of the truth, where this covers the first row; then
-    all is in one frame. Other columns are not used, and listed. A CSV file may be packed by gzip,
-    as `truth.csv.gz`; where both are there the plain one is read.
+    noise of the same density. The start is that of the truth if it covers the first row; then all
+    is in one frame. Other columns are not used, and listed. A CSV file may be packed by gzip, as
+    `truth.csv.gz`; of both the plain one is read.
 
     Args:
-        folder: where the files are.
+        folder: the folder of the files.
     Raises:
         ValueError: `path:line: column: what was expected` on a header without a column or a unit, a
-            cell that is no finite number, a tag that is no whole number, times that go back (or
-            repeat, but for measurements), a line with another number of cells, no lines; `path:
+            cell that is not a finite number, a tag that is not a whole number, times that go back
+            (or repeat, but for measurements), a line with another number of cells, no lines; `path:
             [section] key: …` on settings; and on a measured tag that `landmarks.csv` lacks.
     """
     folder = Path(folder)
     if not folder.is_dir():
-        found = "is a file" if folder.exists() else "is not there"
+        found = "is a file" if folder.exists() else "does not exist"
         raise ValueError(f"{folder} {found}: expected a folder with {ODOMETRY} and {MEASUREMENTS}")
     for name, columns in ((ODOMETRY, "controls of the motion"), (MEASUREMENTS, "measurements")):
         if not any((folder / file).is_file() for file in (name, f"{name}.gz")):
@@ -234,7 +234,7 @@ def table(folder: str | Path) -> Dataset:
         k = int(np.argmax(gaps))
         notes.append(
             f"{odometry.at(k + 1, TIME)}: {gaps[k]:.6g} s since the line before, the median is "
-            f"{np.median(gaps):.6g} s; the odometry is taken to hold for so long"
+            f"{np.median(gaps):.6g} s; the odometry is taken to hold over it"
         )
     survey = _survey(folder / "landmarks.csv")
     rows, tags, dropped = tables.align_tables(
@@ -276,7 +276,7 @@ def table(folder: str | Path) -> Dataset:
 
 
 def _adjustable(motion: Parametric[Motion], sensor: Parametric[Sensor]) -> Adjustable:
-    """Both models by the deviations of both, one after the other."""
+    """Both models as functions of the deviations of both, one after the other."""
     count = len(motion.names)
     return Adjustable(
         names=tuple(f"motion {n}" for n in motion.names)
@@ -291,7 +291,7 @@ def _adjustable(motion: Parametric[Motion], sensor: Parametric[Sensor]) -> Adjus
 
 
 def _survey(path: Path) -> dict[int, tuple[float, float]] | None:
-    """The position of each tag; None where there is no file."""
+    """The position of each tag; None without a file."""
     if stored(path) is None:
         return None
     found = CsvTable(path).table((TAG, *POSE[:2]), "of landmarks")
@@ -299,13 +299,15 @@ def _survey(path: Path) -> dict[int, tuple[float, float]] | None:
     for row, tag in enumerate(found.tags or ()):
         if tag is None or tag in survey:
             got = "nothing" if tag is None else f"{tag} again"
-            raise ValueError(f"{found.at(row, TAG)}: expected a tag of its own, got {got}")
+            raise ValueError(
+                f"{found.at(row, TAG)}: expected a tag that no other line has, got {got}"
+            )
         survey[tag] = tuple(found.values(POSE[:2])[row])
     return survey
 
 
 def _truth(path: Path, time: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """The true pose at each row (T, 3), and in which rows it is known (T,); None without a file."""
+    """The true pose at each row (T, 3), and whether it is known (T,); None without a file."""
     if stored(path) is None:
         return None, None
     found = CsvTable(path).table((TIME, *POSE), "of a true path")

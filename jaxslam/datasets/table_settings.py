@@ -1,4 +1,4 @@
-"""The file `dataset.toml` of a table: models, noises, gate and start, each with a default."""
+"""The file `dataset.toml` of a table: models, noises, gate and start, with defaults."""
 
 import inspect
 import re
@@ -24,27 +24,27 @@ from jaxslam.core.logs.tables import INTERVAL, POSE, odometry_columns, split_uni
 from jaxslam.core.protocols import Associate, Motion, Sensor
 from jaxslam.core.record import record, static
 from jaxslam.core.types import JaxOrNumPy
-from jaxslam.filters.ekf.settings import EkfOptions
+from jaxslam.filters.ekf.ekf_settings import EkfOptions
 from jaxslam.math import stats
 
 _Model = TypeVar("_Model", bound=Motion | Sensor)
 
 _FIRST = ("unicycle", "pose_increment", "range_bearing")
-"""Of models with the same columns, those taken by default."""
+"""The default among models with the same columns."""
 
 
 class Parametric(NamedTuple, Generic[_Model]):
-    """A model by the standard deviations of its noise and its mount, and what the file says."""
+    """A model as a function of its noise deviations and its mount, with those of the file."""
 
     names: tuple[str, ...]
     deviations: tuple[float, ...]
     mount: tuple[float, ...] | None
-    """None where the model has none"""
+    """None for a model without one"""
     make: Callable[[JaxOrNumPy, ArrayLike | None], _Model]
     """(deviations (W,) an array, mount (3,) or None) -> model"""
 
     def made(self) -> _Model:
-        """The model that the file describes."""
+        """The model with the numbers of the file."""
         return self.make(np.array(self.deviations), self.mount)
 
 
@@ -54,7 +54,7 @@ def fitting_model(
     given: Sequence[str],
     path: Path,
 ) -> str:
-    """The model whose columns are given; of several the one with most, then of `_FIRST`."""
+    """The model whose columns are given; of several the one with most columns, then of `_FIRST`."""
     bare = {split_unit(name)[0] for name in given}
     fitting, known = [], []
     for name, factory in registry.items():
@@ -70,22 +70,22 @@ def fitting_model(
     if not fitting:
         raise ValueError(
             f"{path}: [{section}] model: expected one, since no model has the columns "
-            f"{', '.join(given)}; there are {'; '.join(known)}"
+            f"{', '.join(given)}; known: {'; '.join(known)}"
         )
     most = max(fitting)[:2]
     return next(name for *rank, name in fitting if tuple(rank) == most)
 
 
 def of_no_noise(*_: object) -> NoReturn:
-    """The noise of a model that is made for its names alone, and is never evaluated."""
-    raise AssertionError("a model that was made for its names was evaluated")
+    """The noise of a model that serves only for its names, and is never evaluated."""
+    raise AssertionError("a model that serves only for its names was evaluated")
 
 
 GATE = 0.99
 """Default probability of the gate of an association."""
 
 NEW_GATE = 0.9999
-"""Probability beyond which a measurement is of a new landmark."""
+"""Probability of the gate beyond which a measurement is of a new landmark."""
 
 METHODS: dict[str, Callable[..., Associate]] = {
     "nearest": Nearest,
@@ -99,8 +99,8 @@ METHODS: dict[str, Callable[..., Associate]] = {
 def association_options(method: object, gate: object, size: int) -> EkfOptions:
     """Options of `EkfSlam` for a method by name and a gate by probability.
 
-    Raises ValueError, "associate: …" or "gate: …", on a name that is none and a gate that is no
-    probability. Known identities need no gate (None); other methods take `GATE`.
+    Raises ValueError, "associate: …" or "gate: …", on an unknown name and a gate that is not a
+    probability. By default known identities have no gate, other methods `GATE`.
 
     Args:
         method: one of `METHODS`.
@@ -119,7 +119,7 @@ def association_options(method: object, gate: object, size: int) -> EkfOptions:
 
 
 def _probability(gate: object) -> float:
-    """The probability that a gate is given by; ValueError where it is none."""
+    """The gate as a probability; ValueError if it is not one."""
     if not isinstance(gate, int | float) or isinstance(gate, bool) or not 0 < gate < 1:
         raise ValueError(f"gate: expected a probability between 0 and 1, got {gate!r}")
     return gate
@@ -133,7 +133,7 @@ def is_number(value: object) -> bool:
 
 
 FITTED = "fit.toml"
-"""The file of fitted numbers: beside `dataset.toml` they are taken in place of its own."""
+"""The file of fitted numbers, which replace those of `dataset.toml`."""
 
 
 def fitted_text(
@@ -197,7 +197,7 @@ class _TableNoise:
 
 @record
 class _WithInterval(Motion):
-    """A motion model with Δt as a last control, of which its noise alone depends."""
+    """A motion model with Δt as a last control, which only its noise depends on."""
 
     motion: Motion
     noise_cov: _TableNoise
@@ -219,7 +219,7 @@ class _WithInterval(Motion):
 
 
 def _read(path: Path) -> tuple[str, dict[str, Any]]:
-    """The text and the content of a file of settings; empty where there is none."""
+    """The text and the content of a file of settings; empty without a file."""
     try:
         text = path.read_text(encoding="utf-8")
         return text, tomllib.loads(text)
@@ -237,7 +237,7 @@ def _read(path: Path) -> tuple[str, dict[str, Any]]:
 class TableSettings:
     """The settings of a folder; `assumed` lists the defaults taken so far.
 
-    Raises ValueError on a file that is no TOML, and on a section or a key that does not exist.
+    Raises ValueError on a file that is not TOML, and on an unknown section or key.
     """
 
     def __init__(self, path: Path) -> None:
@@ -263,7 +263,7 @@ class TableSettings:
         return str(self.content.get(name, default))
 
     def motion(self, given: Sequence[str], interval: float) -> Parametric[Motion]:
-        """The motion model; its noise is that of a line of odometry, whatever rows divide it.
+        """The motion model; its noise is that of a line of odometry, however rows divide it.
 
         Velocities have the covariance σ² interval/Δt over Δt, white noise. Poses give increments
         with covariance σ² Δt/interval, and Δt as a last control. Other increments have σ².
@@ -299,7 +299,7 @@ class TableSettings:
             mount = self._default("sensor", "mount", [0.0, 0.0, 0.0])
 
         def model(deviations: JaxOrNumPy, mount: ArrayLike | None) -> Sensor:
-            # In NumPy where they are numbers, so that nothing is compiled.
+            # NumPy for plain numbers, so that nothing is compiled.
             cov = deviations[:, None] ** 2 * np.eye(len(names))
             more = options if mount is None else options | {"mount": mount}
             return self._built("sensor", factory, more, cov)
@@ -330,29 +330,29 @@ class TableSettings:
         return options
 
     def capacity(self, tags: int, unknown: bool) -> int:
-        """The number of landmark slots. tags: how many landmarks have a name."""
-        asked = self._filter().get("capacity")
-        if asked is None:
+        """The number of landmark slots. tags: number of landmarks with a name."""
+        given = self._filter().get("capacity")
+        if given is None:
             return int(self._default("filter", "capacity", max(tags, 1) + ROOM * unknown))
-        if type(asked) is not int or asked < max(tags, 1):
+        if type(given) is not int or given < max(tags, 1):
             raise ValueError(
                 f"{self._at('filter', 'capacity')}: expected a whole number of at least "
-                f"{max(tags, 1)}, the number of tags, got {asked!r}"
+                f"{max(tags, 1)}, the number of tags, got {given!r}"
             )
-        return asked
+        return given
 
     def start(self) -> np.ndarray | None:
-        """The pose before the first row (3,); None where the file does not say."""
+        """The pose (3,) before the first row; None if the file has none."""
         return self._three("start")
 
     def start_noise(self) -> np.ndarray:
-        """Its standard deviations (3,)."""
-        asked = self._three("start_noise")
-        if asked is None:
+        """The standard deviations (3,) of that pose."""
+        given = self._three("start_noise")
+        if given is None:
             return np.array(self._default("filter", "start_noise", [0.0, 0.0, 0.0]))
-        if (asked < 0).any():
+        if (given < 0).any():
             raise ValueError(f"{self._at('filter', 'start_noise')}: expected numbers of at least 0")
-        return asked
+        return given
 
     def _filter(self) -> dict[str, object]:
         section: dict[str, object] = self.content.get("filter", {})
@@ -360,15 +360,15 @@ class TableSettings:
         return section
 
     def _three(self, key: str) -> np.ndarray | None:
-        asked = self._filter().get(key)
-        if asked is None:
+        given = self._filter().get(key)
+        if given is None:
             return None
-        return np.array(self._numbers("filter", key, asked, POSE))
+        return np.array(self._numbers("filter", key, given, POSE))
 
     def _model(
         self, section: str, registry: Mapping[str, Callable[..., _Model]], given: Sequence[str]
     ) -> tuple[Callable[..., _Model], dict[str, object]]:
-        """The factory that a section names, or the columns fit, and its options."""
+        """The factory named by a section, or else by the columns, and its options."""
         options: dict[str, object] = dict(self.content.get(section, {}))
         name = options.pop("model", None)
         if name is None:
@@ -387,30 +387,30 @@ class TableSettings:
     def _noise(
         self, section: str, names: tuple[str, ...], defaults: Mapping[str, float]
     ) -> list[float]:
-        """The standard deviations of a model's noise, in its order."""
-        asked = self.content.get(section, {}).get("noise")
-        if asked is None:
+        """The standard deviations of the noise of a model, in its order."""
+        given = self.content.get(section, {}).get("noise")
+        if given is None:
             usual = [defaults.get(split_unit(name)[1] or "", 0.1) for name in names]
             self.assumed.append(f"[{section}] noise = {usual} ({', '.join(names)})")
             return usual
-        found = self._numbers(section, "noise", asked, names)
+        found = self._numbers(section, "noise", given, names)
         if min(found) < 0:
             raise ValueError(
-                f"{self._at(section, 'noise')}: expected standard deviations >= 0, got {asked}"
+                f"{self._at(section, 'noise')}: expected standard deviations >= 0, got {given}"
             )
         return found
 
-    def _numbers(self, section: str, key: str, asked: object, names: Sequence[str]) -> list[float]:
+    def _numbers(self, section: str, key: str, given: object, names: Sequence[str]) -> list[float]:
         if (
-            not isinstance(asked, list)
-            or len(asked) != len(names)
-            or not all(map(is_number, asked))
+            not isinstance(given, list)
+            or len(given) != len(names)
+            or not all(map(is_number, given))
         ):
             raise ValueError(
                 f"{self._at(section, key)}: expected {len(names)} numbers "
-                f"({', '.join(names)}), got {asked!r}"
+                f"({', '.join(names)}), got {given!r}"
             )
-        return [float(value) for value in asked]
+        return [float(value) for value in given]
 
     def _built(
         self,
@@ -437,7 +437,7 @@ class TableSettings:
                 raise ValueError(f"{self._at(section, key)}: expected one of {', '.join(known)}")
 
     def _at(self, section: str, key: str) -> str:
-        """The place of a key, with which a message begins."""
+        """The place of a key, at the beginning of a message."""
         line = _line_number(self._text, section, key)
         where = f"{self.path}:" + (f"{line}: " if line else " ")
         return where + (f"[{section}] " if section else "") + key

@@ -1,12 +1,12 @@
 """Filters: recursive estimators, all of type `Filter`."""
 
 from jaxslam.core.protocols import Filter, Wrapper
+from jaxslam.filters.delayed.delayed_settings import Hypotheses, Promotion, StoredMeasurements
 from jaxslam.filters.delayed.delayed_slam import DelayedSlam
-from jaxslam.filters.delayed.settings import Hypotheses, Promotion, StoredMeasurements
 from jaxslam.filters.ekf.compressed_ekf_slam import CompressedEkfSlam
 from jaxslam.filters.ekf.ekf_slam import EkfSlam
 from jaxslam.filters.ekf.linear_system import LinearizedSteps
-from jaxslam.filters.ekf.observability import Monitored
+from jaxslam.filters.ekf.monitor import Monitored
 from jaxslam.filters.information.eif_slam import EifSlam
 from jaxslam.filters.information.seif import Seif
 from jaxslam.filters.information.sparse_state import ApproximationCounts

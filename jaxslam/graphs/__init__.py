@@ -5,6 +5,7 @@ relative pose e = Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ) as (x, y, θ wrapped), without
 """
 
 from jaxslam.graphs import starts
+from jaxslam.graphs.checks import check_graph, with_gauge
 from jaxslam.graphs.covariances import Marginals, marginals
 from jaxslam.graphs.factor import (
     REGISTRY,
@@ -31,7 +32,6 @@ from jaxslam.graphs.solver.kernels import (
 )
 from jaxslam.graphs.solver.plans import Plan, plan
 from jaxslam.graphs.solver.search import Ending, Solution
-from jaxslam.graphs.validation import check_graph, with_gauge
 
 __all__ = [
     "KERNELS",

@@ -11,6 +11,7 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam.core.numbers import is_concrete
+from jaxslam.graphs.checks import check_graph, label
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.solver.batch import (
@@ -28,7 +29,6 @@ from jaxslam.graphs.solver.plans import Plan, checked_pairs, plan_for
 from jaxslam.graphs.solver.search import Solution
 from jaxslam.graphs.sparse.cholesky import by, by_transposed, factorize, selected_inverse
 from jaxslam.graphs.sparse.sweeps import padded_size
-from jaxslam.graphs.validation import check_graph, label
 
 
 class Marginals(NamedTuple):

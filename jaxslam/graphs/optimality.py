@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 from jaxslam.core.numbers import is_concrete
 from jaxslam.core.record import record
 from jaxslam.core.types import JaxOrNumPy
+from jaxslam.graphs.checks import check_graph
 from jaxslam.graphs.factor import PRIOR, Chordal, Factor
 from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.solver.batch import graph_in_one_dtype, over_batch
@@ -30,7 +31,6 @@ from jaxslam.graphs.solver.plans import Plan, plan_for
 from jaxslam.graphs.solver.search import minimize
 from jaxslam.graphs.sparse.cholesky import factorize, substitute
 from jaxslam.graphs.sparse.sweeps import summed
-from jaxslam.graphs.validation import check_graph
 from jaxslam.math.linalg import total
 
 

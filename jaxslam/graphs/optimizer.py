@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 
 from jaxslam.core.numbers import check_count, is_concrete
+from jaxslam.graphs.checks import check_graph
 from jaxslam.graphs.factor import Factor
 from jaxslam.graphs.graph import Graph
 from jaxslam.graphs.solver.batch import (
@@ -37,7 +38,6 @@ from jaxslam.graphs.solver.model import Model, factors_of, model_of
 from jaxslam.graphs.solver.plans import Plan, plan_for
 from jaxslam.graphs.solver.search import Solution, minimize
 from jaxslam.graphs.sparse.cholesky import factorize, substitute
-from jaxslam.graphs.validation import check_graph
 
 
 def squared_residuals(

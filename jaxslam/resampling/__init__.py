@@ -6,7 +6,7 @@ particles.
 
 from jaxslam.core.protocols import Resample
 from jaxslam.resampling.kld import kld_bound
-from jaxslam.resampling.rules import (
+from jaxslam.resampling.methods import (
     Soft,
     StopGradient,
     multinomial,

@@ -1,4 +1,4 @@
-"""The report of a campaign: its files, written whole or not at all, and its part of a notebook."""
+"""The report of a campaign: its files, written all or none, and a fragment for notebooks."""
 
 import json
 import os
@@ -26,7 +26,7 @@ TABLE = "measures.csv"
 """The table of the page."""
 
 TIMES = ("seconds", "compile_seconds", "step_seconds")
-"""Entries of `RESULT` that another computation of the same runs changes."""
+"""Entries of `RESULT` that differ between computations of the same runs."""
 
 BLOCKS = "blocks"
 """The folder of a campaign's finished blocks, beside its results."""
@@ -47,7 +47,7 @@ def file_names(formats: Iterable[str], figures: Iterable[str] = FIGURES) -> list
 
 
 def check_figure_formats(caller: str, given: str | Iterable[str]) -> tuple[str, ...]:
-    """The formats of figures, each once; raises ValueError that names another one."""
+    """The formats of figures, each once; ValueError on an unknown one."""
     return check_formats(caller, given, FORMATS)
 
 
@@ -62,8 +62,7 @@ def save_campaign(
     """Write the files of a campaign's report, and return their paths; see `Campaign.save`.
 
     Args:
-        command, seed: those of the campaign, for the page and the JSON; "" and None where it has
-            none.
+        command, seed: those of the campaign, for the page and the JSON; "" and None if unknown.
     """
     formats = check_figure_formats("Campaign.save", figures)
     if not isinstance(folder, str | os.PathLike) or not str(folder).strip():
@@ -82,7 +81,7 @@ def save_campaign(
     drawn = {name: (caption, make()) for name, (caption, make) in drawings.items()}
     encode = cache(plot.encode)  # the page and a file have the same picture
     files: Files = {
-        PAGE: page.page(
+        PAGE: page.campaign_page(
             campaign, command, seed, versions(), drawn, lambda figure: encode(figure, "png")
         ),
         RESULT: report.as_json(campaign, command, seed),
@@ -96,7 +95,7 @@ def save_campaign(
 
 
 def load(folder: str | Path) -> Campaign:
-    """The finished campaign that `jaxslam consistency` left in a folder, as it was computed.
+    """The finished campaign in a folder written by `jaxslam consistency`.
 
         campaign = jaxslam.load("out")
         jaxslam.plot.nees_figure(campaign, width=3.5).savefig("nees.pdf")
@@ -123,9 +122,9 @@ def load(folder: str | Path) -> Campaign:
             f"{folder}: the campaign is not finished: jaxslam consistency --resume {folder}"
         )
     _, limit, summaries = summaries_of(tallies)
-    told = ("scenario", "source", "published", "steps", "dtype")
+    entries = ("scenario", "source", "published", "steps", "dtype")
     return Campaign(
-        **{name: found[name] for name in (*told, *TIMES)},
+        **{name: found[name] for name in (*entries, *TIMES)},
         runs=runs,
         divergence_limit=float(limit),
         filters={

@@ -1,4 +1,4 @@
-"""Files of results: JSON and CSV as text, and files that are written whole or not at all."""
+"""Files of results: JSON and CSV as text, and writing of all files or none."""
 
 import contextlib
 import csv
@@ -14,13 +14,13 @@ from pathlib import Path
 from typing import SupportsFloat, TypeAlias
 
 Json: TypeAlias = dict[str, object]
-"""What JSON can hold, by name."""
+"""An object of JSON."""
 
 Content: TypeAlias = str | bytes | Callable[[Path], object]
-"""Of a file: a text, bytes, or a function that writes the file at a path."""
+"""The content of a file: text, bytes, or a function that writes it to a path."""
 
 Files: TypeAlias = dict[str, Content]
-"""By name, as `write_files` takes them."""
+"""Contents by file name, for `write_files`."""
 
 
 def json_text(content: Mapping[str, object]) -> str:
@@ -29,7 +29,7 @@ def json_text(content: Mapping[str, object]) -> str:
 
 
 def json_number(value: SupportsFloat) -> float | None:
-    """The number, or None (null) where it is not finite, which JSON does not have."""
+    """The number, or None (null) if it is not finite, which JSON does not have."""
     number = float(value)
     return number if math.isfinite(number) else None
 
@@ -60,7 +60,7 @@ def versions() -> dict[str, str]:
 
 
 def check_formats(caller: str, given: str | Iterable[str], known: Sequence[str]) -> tuple[str, ...]:
-    """The formats given, each once; raises ValueError that names one that is not known."""
+    """The given formats, each once; ValueError on an unknown one."""
     expected = f"{caller}: expected formats of {', '.join(known)}"
     try:
         kinds = tuple(dict.fromkeys([given] if isinstance(given, str) else given))
@@ -73,10 +73,9 @@ def check_formats(caller: str, given: str | Iterable[str], known: Sequence[str])
 
 
 def check_writable(folder: Path) -> None:
-    """Raise OSError if files could not be written to a folder, before hours of work.
+    """Raise OSError, before any work, if files cannot be written to a folder.
 
-    The folder is not created; its nearest existing parent is tried. The error names the folder as
-    it was given.
+    The folder is not created; its nearest existing parent is tried.
     """
     try:
         existing = folder.absolute()
@@ -99,14 +98,14 @@ def write_files(
 ) -> list[Path]:
     """Write all files or, after any error or interrupt, none; returns their paths.
 
-    They are written to a hidden folder in the target and moved into place when all are complete. A
-    folder that was created for nothing is removed again.
+    They are written to a hidden folder in the target and moved into place when all are complete.
+    After an error, folders created for them are removed.
 
     Args:
         folder: the target, which is created if needed.
         files: by name.
-        replaces: patterns of names of an earlier result; files of such names that are not written
-            now are removed in the end.
+        replaces: patterns of names of earlier results; matching files that are not written now
+            are deleted at the end.
     """
     created = [each for each in (folder, *folder.parents) if not each.exists()]
     for name in files:

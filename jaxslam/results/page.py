@@ -1,6 +1,6 @@
 """The report of a campaign as one self-contained HTML5 file; and as a fragment for a notebook.
 
-Figures are embedded; there are no scripts, and the page forbids the browser to load anything else.
+Figures are embedded. The page has no scripts, and forbids the browser to load anything else.
 """
 
 import base64
@@ -43,10 +43,10 @@ figure {{ margin: 1rem 0; }} }}"""
 
 
 _UPRIGHT = 5
-"""With more filters, the table is printed on a landscape page of its own."""
+"""With more filters, the table is printed on a separate landscape page."""
 
 
-def page(
+def campaign_page(
     campaign: Campaign,
     command: str,
     seed: int | None,
@@ -58,10 +58,10 @@ def page(
 
     Args:
         campaign: the campaign.
-        command, seed: those of the campaign; None where there was no seed.
+        command, seed: those of the campaign; None without a seed.
         versions: of the software, by name.
         figures: in order, by name, each with its caption.
-        draw: makes a PNG file of a figure; with a cache where the files are needed elsewhere, too.
+        draw: returns a figure as a PNG file; a cached function if the files are needed elsewhere.
     """
     heading = f"{campaign.scenario}: consistency of {with_noun(len(campaign.filters), 'filter')}"
     sections = {
@@ -107,9 +107,9 @@ def fragment(
     figures: Mapping[str, tuple[str, Figure]],
     draw: Callable[[Figure], bytes] = png,
 ) -> str:
-    """The HTML that a notebook shows of a campaign: verdicts, these figures, the measures folded.
+    """The campaign as HTML for a notebook: verdicts, these figures, and the measures folded.
 
-    The arguments are those of `page`. Its style applies to nothing else on the page.
+    Arguments as for `campaign_page`. Its style does not apply to the rest of the page.
     """
     return f"""<div class="jaxslam">
 <style>{FRAGMENT_CSS}</style>
@@ -125,7 +125,7 @@ def fragment(
 
 
 def _setup(campaign: Campaign) -> str:
-    """How many runs there are, of how many steps, in which number format; as HTML."""
+    """The numbers of runs and steps and the number format, as HTML."""
     runs, steps = with_noun(campaign.runs, "Monte-Carlo run"), with_noun(campaign.steps, "step")
     return escape(f"{runs} of {steps} each, in {campaign.dtype}")
 
@@ -185,15 +185,15 @@ def _parameters(
 
 
 def verdict_list(campaign: Campaign) -> str:
-    """Name, badge and tested measures of each filter as HTML, and what qualifies the verdicts."""
+    """Name, badge and tested measures of each filter, and notes on the verdicts, as HTML."""
     items = []
     for name, summary in campaign.filters.items():
         tested = [key for key in TESTS if key in summary.measures]
-        said = [f"{TESTS[key]} {cell_text(summary.measures[key])}" for key in tested]
-        lines = "".join(f'<span class="why">{line}</span>' for line in said or ["no pose NEES"])
+        values = [f"{TESTS[key]} {cell_text(summary.measures[key])}" for key in tested]
+        lines = "".join(f'<span class="why">{line}</span>' for line in values or ["no pose NEES"])
         label = f'<span class="name">{breakable(name)}</span>'
         items.append(f"<li>{label}{badge(summary.verdict, summary)}{lines}</li>")
-    lost = (f"{name} {said}" for name, said in table.lost_runs(campaign))
+    lost = (f"{name} {phrase}" for name, phrase in table.lost_runs(campaign))
     sentences = [*report.qualified(campaign), *lost]
     notes = (f'<p class="note">{escape(sentence)}.</p>' for sentence in sentences)
     return "\n".join(['<ul class="verdicts">', *items, "</ul>", *notes])
@@ -212,7 +212,7 @@ def badge(verdict: str, summary: Summary | None = None) -> str:
 
 
 def measures_table(campaign: Campaign) -> str:
-    """The table of measures × filters as HTML; published values below our own."""
+    """The table of measures × filters as HTML; published values below them."""
     names = list(campaign.filters)
     head = "".join(f'<th scope="col">{breakable(name)}</th>' for name in names)
     parts = []
@@ -258,10 +258,10 @@ def _unbroken(text: str) -> str:
 
 
 def measure_notes(campaign: Campaign) -> str:
-    """What must be known of the measures, as HTML."""
+    """The notes on the measures, as HTML."""
     return "\n".join(
-        f'<p class="note"><strong>{escape(term)}</strong>: {escape(said)}.</p>'
-        for term, said in table.notes_on(campaign)
+        f'<p class="note"><strong>{escape(term)}</strong>: {escape(sentence)}.</p>'
+        for term, sentence in table.notes_on(campaign)
     )
 
 

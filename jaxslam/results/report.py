@@ -26,10 +26,7 @@ _WIDTH = 88
 
 
 def campaign_table(campaign: Campaign) -> str:
-    """The campaign as a text table: a column a filter, a row a measure, and notes below.
-
-    Each five filters have a table of their own.
-    """
+    """The campaign as text tables of at most five filters, one column each, with notes below."""
     names = list(campaign.filters)
     parts = [names[i : i + _COLUMNS] for i in range(0, len(names), _COLUMNS)]
     text = "\n\n".join(_columns(campaign, part) for part in parts)
@@ -44,9 +41,9 @@ def campaign_table(campaign: Campaign) -> str:
         f"divergent: final position error over {campaign.divergence_limit:.3g} m, 5 σ of the ideal "
         "EKF.",
     ]
-    notes += [f"{term}: {said}." for term, said in notes_on(campaign)]
+    notes += [f"{term}: {sentence}." for term, sentence in notes_on(campaign)]
     notes += qualified(campaign)
-    notes += [f"{name} {said}" for name, said in lost_runs(campaign)]
+    notes += [f"{name} {phrase}" for name, phrase in lost_runs(campaign)]
     if campaign.dtype == "float32":
         notes.append(
             "The filters ran in float32: for float64, set jax_enable_x64 in Python, or leave out "
@@ -59,16 +56,15 @@ def campaign_table(campaign: Campaign) -> str:
 
 
 def _explained(campaign: Campaign) -> list[str]:
-    """The meanings of the verdicts that this campaign has."""
+    """The meanings of the verdicts in this campaign."""
     found = {summary.verdict for summary in campaign.filters.values()}
     return [f"{word}: {meaning}." for word, (_, meaning) in VERDICTS.items() if word in found]
 
 
 def qualified(campaign: Campaign) -> list[str]:
-    """Sentences on the power of the tests of the filters not rejected, and on verdicts' doubts.
+    """Sentences on the power of the tests of filters that are not rejected, and on doubts.
 
-    Filters of which the same is said share a sentence. Verdicts with doubts have an asterisk in the
-    table.
+    Filters with the same sentence share it. A verdict in doubt has an asterisk in the table.
     """
     powers: dict[str, list[str]] = {}
     doubts: dict[str, list[str]] = {}
@@ -82,13 +78,13 @@ def qualified(campaign: Campaign) -> list[str]:
             doubts.setdefault(doubt, []).append(name)
     power = f"not rejected, with {percentage(POWER)} power to reject"
     return [
-        *(f"{power} {tests} outside: {'; '.join(told)}" for tests, told in powers.items()),
+        *(f"{power} {tests} outside: {'; '.join(limits)}" for tests, limits in powers.items()),
         *(f"{', '.join(names)}*: {doubt}" for doubt, names in doubts.items()),
     ]
 
 
 def as_json(campaign: Campaign, command: str = "", seed: int | None = None) -> str:
-    """The campaign without its curves as JSON, with versions, seed and command; NaN is null."""
+    """The campaign without curves as JSON, with versions, seed and command; NaN is null."""
     filters = {
         name: {
             "verdict": s.verdict,
@@ -132,9 +128,9 @@ def as_json(campaign: Campaign, command: str = "", seed: int | None = None) -> s
 
 
 def table_csv(campaign: Campaign) -> str:
-    """The table as CSV: a row a measure; of each filter the value and the ends of its interval.
+    """The table as CSV: a row per measure; for each filter the value and the ends of its interval.
 
-    A verdict is a word, a band a text; cells without a number are empty.
+    Verdicts and bands are text; cells without a number are empty.
     """
     names = list(campaign.filters)
     ends = [f"{name}{end}" for name in names for end in ("", " low", " high")]
@@ -146,7 +142,7 @@ def table_csv(campaign: Campaign) -> str:
 
 
 def _three(cell: Cell) -> list[str]:
-    """A cell as three of CSV: the value, and the ends of its interval."""
+    """A cell as three columns of CSV: the value and the ends of its interval."""
     if isinstance(cell, Average):
         return [_blank(value) for value in cell]
     if cell is None or isinstance(cell, Summary):
@@ -166,7 +162,7 @@ def as_csv(campaign: Campaign) -> str:
 
 
 def run_columns(campaign: Campaign) -> dict[str, np.ndarray]:
-    """The columns of a table with a row for each run of each filter; `Campaign.to_dataframe`."""
+    """The columns of `Campaign.to_dataframe`, which has a row for each run of each filter."""
     numbers, filters = campaign.run_numbers, campaign.filters
     none = np.full(len(numbers), np.nan)
     names = dict.fromkeys(name for s in filters.values() for name in s.per_run)
@@ -181,7 +177,7 @@ def run_columns(campaign: Campaign) -> dict[str, np.ndarray]:
 
 
 def trajectory_csv(time: np.ndarray, estimate: Estimate) -> str:
-    """A path as CSV: a row a step with time, pose and the upper triangle of the pose covariance."""
+    """A path as CSV: per step time, pose and the upper triangle of its covariance."""
     header = ["time", "x", "y", "theta", "c_xx", "c_xy", "c_xt", "c_yy", "c_yt", "c_tt"]
     rows, columns = np.triu_indices(3)
     triangle = np.asarray(estimate.pose_cov)[:, rows, columns]
@@ -195,7 +191,7 @@ def trajectory_csv(time: np.ndarray, estimate: Estimate) -> str:
 
 
 def trajectory_tum(time: np.ndarray, estimate: Estimate) -> str:
-    """A path in the format of the TUM RGB-D benchmark: lines `t x y z qx qy qz qw`, without a head.
+    """A path in the format of the TUM RGB-D benchmark: lines `t x y z qx qy qz qw`, no header.
 
     z = 0, and the quaternion (0, 0, sin θ/2, cos θ/2) turns about z.
     """
@@ -207,7 +203,7 @@ def trajectory_tum(time: np.ndarray, estimate: Estimate) -> str:
 
 
 def map_csv(estimate: Estimate, names: Sequence[int]) -> str:
-    """A map as CSV: a row a landmark with its name in the data set, position and covariance."""
+    """A map as CSV: per landmark its name in the data set, position and covariance."""
     rows = []
     for i in np.flatnonzero(np.asarray(estimate.alive)):
         cov = np.asarray(estimate.point_covs[i])
@@ -224,8 +220,8 @@ def _columns(campaign: Campaign, names: list[str]) -> str:
     for row in rows_of(campaign, names):
         lines.append([row.label, row.honest, *map(cell_text, row.cells)])
         if row.published:
-            told = ("" if value is None else short(value) for value in row.published)
-            lines.append(["  published", "", *told])
+            values = ("" if value is None else short(value) for value in row.published)
+            lines.append(["  published", "", *values])
     text = text_table(lines)
     text.insert(1, "-" * len(text[0]))
     return "\n".join(text)

@@ -1,4 +1,4 @@
-"""The table of a campaign as rows, made once for text, HTML and CSV; and what its words mean."""
+"""The rows of the table of a campaign, shared by text, HTML and CSV, and notes on its terms."""
 
 from collections.abc import Sequence
 from typing import NamedTuple, TypeAlias
@@ -12,7 +12,7 @@ from jaxslam.consistency.measures.counts import MEANINGS, count_label
 from jaxslam.consistency.verdict import TESTS
 
 VERDICTS = {
-    "consistent": ("✓", "neither test rejects, which is no proof"),
+    "consistent": ("✓", "neither test rejects, which is not a proof"),
     "optimistic": (
         "▲",
         "the interval of pose NEES or of NIS / dof lies above the honest value: covariances are "
@@ -34,7 +34,7 @@ VERDICTS = {
 """Verdicts, each with its sign and its meaning."""
 
 _ALWAYS = ("runs", "not_finite", "divergent")
-"""Counts that are shown though they are 0."""
+"""Counts that are shown even if they are 0."""
 
 
 class Figure(NamedTuple):
@@ -42,23 +42,23 @@ class Figure(NamedTuple):
 
     text: str
     value: float | None = None
-    """what CSV has"""
+    """in CSV"""
 
 
 Cell: TypeAlias = Summary | Average | Figure | None
-"""A summary stands for its verdict."""
+"""A summary shows its verdict."""
 
 
 class Row(NamedTuple):
-    """A row of the table: something of each filter."""
+    """A row of the table, with a cell per filter."""
 
     label: str
     """one that starts with a space belongs to the row above"""
     honest: str
-    """what a consistent filter has, where that is known"""
+    """the value of a consistent filter, if known"""
     cells: Sequence[Cell]
     published: Sequence[float | None] = ()
-    """of each filter, where any has one"""
+    """of each filter, if any has one"""
     group: str = ""
     """heading above the rows, on a page"""
 
@@ -87,7 +87,7 @@ def short(value: float, digits: int = 4) -> str:
 
 
 def rows_of(campaign: Campaign, names: Sequence[str]) -> list[Row]:
-    """The rows of the table of some filters. Measures that none of them has are left out."""
+    """The rows of the table of some filters, without measures that none of them has."""
     summaries = [campaign.filters[name] for name in names]
     rows = [Row("verdict", "consistent", summaries)]
     for measure in _shown(summaries):
@@ -106,7 +106,7 @@ def _shown(summaries: Sequence[Summary]) -> list[Measure]:
 
 
 def _bands(summaries: Sequence[Summary]) -> list[Row]:
-    """The rows of bands of honest filters, and of how often an average lies in one."""
+    """The rows of the bands of honest filters, and of the share of steps within them."""
     nis = [s.nis_band and Figure("[{:.4f}, {:.4f}]".format(*s.nis_band)) for s in summaries]
     half = [s.autocorrelation_band[0] for s in summaries]
     white = [Figure(f"± {width:.4f}") if np.isfinite(width) else None for width in half]
@@ -138,7 +138,7 @@ def _counts(campaign: Campaign, names: Sequence[str]) -> list[Row]:
 
 
 def notes_on(campaign: Campaign) -> list[tuple[str, str]]:
-    """What a reader of the measures must know of this campaign: terms, each with a sentence."""
+    """Notes on the measures of this campaign: terms, each with a sentence."""
     summaries = campaign.filters
     known = {key for summary in summaries.values() for key in summary.measures}
     out = [one.note for one in measures_of(known) if one.note and one.key in known]
@@ -147,12 +147,12 @@ def notes_on(campaign: Campaign) -> list[tuple[str, str]]:
         if summary.honest_nis < 1:
             lowest.setdefault(f"{summary.honest_nis:.3f}", []).append(name)
     if lowest:
-        told = [f"{least} ({', '.join(names)})" for least, names in lowest.items()]
+        limits = [f"{least} ({', '.join(names)})" for least, names in lowest.items()]
         out.append(
             (
                 "gate",
                 "a gate drops the largest innovations, so that NIS / dof is honest from "
-                f"{', '.join(told)} to 1, as the verdict has it; the band is without a gate",
+                f"{', '.join(limits)} to 1, the range of the verdict; the band is without a gate",
             )
         )
     likely = [s for s in summaries.values() if "log_likelihood" in s.measures]
@@ -164,18 +164,19 @@ def notes_on(campaign: Campaign) -> list[tuple[str, str]]:
                 "differ here",
             )
         )
-    there = {name for s in summaries.values() for name, count in s.counts.items() if count}
-    told = [f"{count_label(name)}, {what}" for name, what in MEANINGS.items() if name in there]
-    return out + [("counts, over all runs", "; ".join(told))] * bool(told)
+    counted = {name for s in summaries.values() for name, count in s.counts.items() if count}
+    terms = [f"{count_label(name)}, {what}" for name, what in MEANINGS.items() if name in counted]
+    return out + [("counts, over all runs", "; ".join(terms))] * bool(terms)
 
 
 def lost_runs(campaign: Campaign) -> list[tuple[str, str]]:
-    """The filters that were not finite in some runs, each with a phrase that numbers them."""
+    """The filters that were not finite in some runs, each with a phrase that lists the runs."""
     out = []
     for name, summary in campaign.filters.items():
         lost = summary.not_finite_runs
         if lost:
             numbers = ", ".join(map(str, lost[:20])) + (", …" if len(lost) > 20 else "")
-            of = f"{len(lost):,} of {campaign.runs:,} runs"
-            out.append((name, f"was not finite in {of}, which its measures leave out: {numbers}"))
+            share = f"{len(lost):,} of {campaign.runs:,} runs"
+            phrase = f"was not finite in {share}, which its measures leave out: {numbers}"
+            out.append((name, phrase))
     return out

@@ -14,7 +14,7 @@ from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.record import FrozenDict, record, static
 from jaxslam.core.types import Log, Truth
 from jaxslam.core.validation import check_log, check_record
-from jaxslam.filters.ekf.settings import EkfOptions
+from jaxslam.filters.ekf.ekf_settings import EkfOptions
 from jaxslam.sensors.suite import Suite
 from jaxslam.simulation.worlds import World
 

@@ -1,13 +1,17 @@
-"""The scans that sensors take along a path, drawn with their noise."""
+"""Simulated scans: fields of view, and noisy measurements along a path."""
 
 from collections.abc import Callable
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxslam.core.numbers import is_concrete
 from jaxslam.core.protocols import Sensor
+from jaxslam.core.record import record
 from jaxslam.core.types import Scan
+from jaxslam.math.arrays import Landmark, Number, Pose
 from jaxslam.math.linalg import root_psd
 from jaxslam.sensors.suite import Part
 
@@ -18,6 +22,31 @@ Visible = Callable[[jax.Array, jax.Array], jax.Array]
 def everywhere(pose: Float[Array, "3"], landmark: Float[Array, "L"]) -> Bool[Array, ""]:
     """The field of view in which every landmark is seen from every pose."""
     return jnp.asarray(True)
+
+
+@record
+class BetweenRanges:
+    """A field of view all around, from nearest to farthest metres (both excluded).
+
+    Raises ValueError unless 0 <= nearest < farthest.
+    """
+
+    nearest: Number
+    farthest: Number
+
+    def __post_init__(self) -> None:
+        if is_concrete(self.nearest, self.farthest) and not np.all(
+            (np.asarray(self.nearest) >= 0) & (self.nearest < np.asarray(self.farthest))
+        ):
+            raise ValueError(
+                f"BetweenRanges: expected 0 <= nearest < farthest, got {self.nearest} and "
+                f"{self.farthest}"
+            )
+
+    def __call__(self, pose: Pose, landmark: Landmark) -> jax.Array:
+        squared = jnp.sum((landmark[:2] - pose[:2]) ** 2)
+        nearest, farthest = (jnp.asarray(x, pose.dtype) for x in (self.nearest, self.farthest))
+        return (squared > nearest**2) & (squared < farthest**2)
 
 
 def sensor_scans(

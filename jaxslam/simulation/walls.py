@@ -27,7 +27,7 @@ class Walls(NamedTuple):
     """the share of beams that pass each segment, in [0, 1]; None without glass"""
 
 
-def walls(
+def make_walls(
     *chains: ArrayLike,
     circles: ArrayLike = (),
     glass: Mapping[tuple[int, int], float] | None = None,
@@ -47,7 +47,8 @@ def walls(
         corners = np.asarray(chain, np.float64)
         if corners.ndim != 2 or corners.shape[1] != 2 or len(corners) < 3:
             raise ValueError(
-                f"walls: expected chain {k} of at least three corners (x, y), got {corners.shape}"
+                f"make_walls: expected chain {k} of at least three corners (x, y), got "
+                f"{corners.shape}"
             )
         segments.append(np.stack([corners, np.roll(corners, -1, axis=0)], axis=1))
     rounds = (
@@ -55,9 +56,9 @@ def walls(
     )
     made = Walls(np.concatenate(segments), rounds)
     if not all(np.all(np.isfinite(part)) for part in made[:2]) or np.any(rounds[:, 2] <= 0):
-        raise ValueError("walls: expected finite numbers and radii above 0")
+        raise ValueError("make_walls: expected finite numbers and radii above 0")
     if len(made.segments) + len(rounds) == 0:
-        raise ValueError("walls: expected at least one wall")
+        raise ValueError("make_walls: expected at least one wall")
     shares = _shares(segments[1:], glass) if glass else None
     return Walls(made.segments, made.circles, shares)
 
@@ -69,9 +70,9 @@ def _shares(
     shares = [np.zeros(len(chain)) for chain in chains]
     for (chain, side), share in glass.items():
         if not (0 <= chain < len(chains) and 0 <= side < len(chains[chain])):
-            raise ValueError(f"walls: glass: chain {chain} has no side {side}")
+            raise ValueError(f"make_walls: glass: chain {chain} has no side {side}")
         if not 0 <= share <= 1:
-            raise ValueError(f"walls: glass: expected a share in [0, 1], got {share}")
+            raise ValueError(f"make_walls: glass: expected a share in [0, 1], got {share}")
         shares[chain][side] = share
     return np.concatenate(shares)
 

@@ -17,7 +17,7 @@ from jaxslam.core.protocols import Component, Motion, Sensor
 from jaxslam.core.record import FrozenDict, hold_function, record, set_field, static
 from jaxslam.core.types import Log, Scan, Truth
 from jaxslam.core.validation import call_traced, check_record
-from jaxslam.filters.ekf.settings import EkfOptions
+from jaxslam.filters.ekf.ekf_settings import EkfOptions
 from jaxslam.math.angles import wrap
 from jaxslam.sensors.suite import Suite
 from jaxslam.simulation.scans import (

@@ -6,9 +6,9 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxslam.verify.findings import Finding, WorstState, WrongEntry
 from jaxslam.verify.inputs.samples import LARGE, NOMINAL, Samples
 from jaxslam.verify.jacobians import Evaluated, Jacobians
-from jaxslam.verify.record import Finding, WorstState, WrongEntry
 
 Values: TypeAlias = Float[np.ndarray, "_ _ _"]
 """Jacobians (S, m, n)."""

@@ -13,7 +13,7 @@ from jaxslam.laser.grids.beam_models import BeamModel
 from jaxslam.math.arrays import float64
 from jaxslam.math.xla import quick_jit
 from jaxslam.verify import properties
-from jaxslam.verify.errors import describe_error
+from jaxslam.verify.findings import Check
 from jaxslam.verify.finite import singular_notes
 from jaxslam.verify.inputs import samples
 from jaxslam.verify.inputs.functions import (
@@ -24,7 +24,7 @@ from jaxslam.verify.inputs.functions import (
 from jaxslam.verify.inputs.samples import Samples
 from jaxslam.verify.jacobians import Evaluated, evaluate_jacobians
 from jaxslam.verify.linearity import motion_linearity, sensor_linearity
-from jaxslam.verify.record import Check
+from jaxslam.verify.user_errors import describe_error
 
 Model: TypeAlias = Motion | Sensor | Factor | BeamModel | Callable[..., jax.Array]
 

@@ -9,11 +9,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.math.xla import quick_jit
-from jaxslam.verify.errors import place_of_error
+from jaxslam.verify.findings import Check
 from jaxslam.verify.inputs.functions import Function, at_state
 from jaxslam.verify.inputs.samples import coincident
 from jaxslam.verify.jacobians import Evaluated
-from jaxslam.verify.record import Check
+from jaxslam.verify.user_errors import place_of_error
 
 State = Sequence[np.ndarray]
 

@@ -12,10 +12,10 @@ from jaxtyping import Float, PyTree
 
 from jaxslam.math.xla import quick_jit
 from jaxslam.verify.differences import Batch, Quotient, complex_step, quotients
-from jaxslam.verify.errors import describe_error
+from jaxslam.verify.findings import Check
 from jaxslam.verify.inputs.functions import Function, as_claim, periods, split_claim
 from jaxslam.verify.inputs.samples import Samples
-from jaxslam.verify.record import Check
+from jaxslam.verify.user_errors import describe_error
 
 Values: TypeAlias = Float[np.ndarray, "_ _ _"]
 """Jacobians (S, m, n)."""

@@ -13,12 +13,12 @@ from jaxslam.core.numbers import check_covariance
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.math.xla import quick_jit
 from jaxslam.verify.differences import modulo_periods
-from jaxslam.verify.errors import describe_error
+from jaxslam.verify.findings import Check
 from jaxslam.verify.finite import finite_check
 from jaxslam.verify.inputs.functions import Function, at_state, periods, sensor_functions
 from jaxslam.verify.inputs.samples import NOMINAL, Samples
 from jaxslam.verify.jacobians import Evaluated
-from jaxslam.verify.record import Check
+from jaxslam.verify.user_errors import describe_error
 
 Values: TypeAlias = np.ndarray
 

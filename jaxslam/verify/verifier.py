@@ -12,7 +12,8 @@ from jaxslam.laser.grids.beam_models import BeamModel
 from jaxslam.math.arrays import float64
 from jaxslam.verify.comparison import compare_methods
 from jaxslam.verify.examination import Model, examine, functions_of, typical_linearity
-from jaxslam.verify.inputs.beam_models import FAR, beam_function, beam_samples
+from jaxslam.verify.findings import Report
+from jaxslam.verify.inputs.beams import FAR, beam_function, beam_samples
 from jaxslam.verify.inputs.functions import (
     Claim,
     Function,
@@ -22,7 +23,6 @@ from jaxslam.verify.inputs.functions import (
     with_signature_errors,
 )
 from jaxslam.verify.inputs.samples import Samples
-from jaxslam.verify.record import Report
 
 _MOUNT = (0.4, -0.3, 0.9)
 """The mount of a sensor made by `build`: off the robot's centre, so that all terms contribute."""

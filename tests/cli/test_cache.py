@@ -10,7 +10,7 @@ import pytest
 
 from jaxslam import cli
 from jaxslam.cli import cache
-from jaxslam.cli.runtime import CompileClock
+from jaxslam.cli.common import CompileClock
 
 OURS = {
     "jax_compilation_cache_dir",

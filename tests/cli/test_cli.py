@@ -11,7 +11,7 @@ import pytest
 from worlds import three_parameters
 
 from jaxslam import catalog, cli, scenarios
-from jaxslam.cli import runtime
+from jaxslam.cli import common
 from jaxslam.consistency.campaign import Interrupted
 from jaxslam.results import campaign_files, files
 
@@ -77,7 +77,10 @@ def test_the_version_is_told(capsys):
         (["--seed", "-1"], "seed"),
         (["--dtype", "float16"], "invalid choice"),
         (["--devices", "0"], "--devices: expected at least 1"),
-        (["--devices", "99"], "--devices: expected at most 4, as many as there are here (each a"),
+        (
+            ["--devices", "99"],
+            "--devices: expected at most 4, the number of devices here (CPU cores)",
+        ),
         (["--filters", ""], "--filters: expected names of filters, or FILE.py:NAME, with commas"),
         (["--filters", "ekf,"], "or all, got 'ekf,'"),
         (["--cache", ""], "--cache: expected a folder, got ''"),
@@ -93,8 +96,8 @@ def test_bad_input_exits_with_2_and_writes_nothing(tmp_path, refused, change, me
 def test_no_more_devices_are_made_than_there_are_cores(monkeypatch):
     told = {}
     monkeypatch.setattr(jax.config, "update", told.__setitem__)
-    for asked, made in (("99", runtime.cores()), ("1", 1), ("all", runtime.cores())):
-        runtime.set_device_count(asked)
+    for asked, made in (("99", common.cores()), ("1", 1), ("all", common.cores())):
+        common.set_device_count(asked)
         assert told == {"jax_num_cpu_devices": made}
 
 

@@ -73,7 +73,7 @@ def test_run_writes_films_and_says_what_is_missing(tmp_path, capsys, monkeypatch
         assert (out / f"film-{name}.gif").read_bytes().startswith(b"GIF")
         assert "data:image/png;base64," in (out / f"film-{name}.html").read_text()
     assert [scene.title for scene in scenes] == ["bonn: ekf", "bonn: dead_reckoning"]
-    assert [scenes[0].said(k).split(": ")[1] for k in range(3)] == [
+    assert [scenes[0].caption(k).split(": ")[1] for k in range(3)] == [
         "0 fused, 2 new, 0 dropped",
         "2 fused, 0 new, 0 dropped",
         "2 fused, 0 new, 0 dropped",
@@ -199,7 +199,7 @@ def test_several_filters_side_by_side(tmp_path, capsys):
         (["--filters", "batch_map"], "--filters: batch_map takes a whole log at once"),
         (["--filters", "seif"], "--filters: seif needs the tag of every measurement"),
         (["--gate", "9.2", "--associate", "joint"], "--gate: expected a probability"),
-        (["--gate", "0.9"], "--gate: expected --associate beside it"),
+        (["--gate", "0.9"], "--gate: expected --associate, too"),
         (["--associate", "best"], "--associate: expected one of nearest"),
         (["--figures", "gif"], "--figures: expected formats of png, pdf, svg, got 'gif'"),
     ],

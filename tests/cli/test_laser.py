@@ -11,13 +11,13 @@ from matplotlib.animation import FFMpegWriter
 from ring_of_rooms import FAR, ranges_of
 
 from jaxslam import cli, grids
-from jaxslam.cli.laser import read_log
-from jaxslam.cli.mapping import TOGETHER
+from jaxslam.cli.laser_log import read_log
+from jaxslam.cli.make_map import TOGETHER
 from jaxslam.math import numpy_poses as poses
 from jaxslam.results import plot
 from jaxslam.simulation.laser import scan_world
 from jaxslam.simulation.scenarios import square
-from jaxslam.simulation.walls import is_free, rasterize, walls
+from jaxslam.simulation.walls import is_free, make_walls, rasterize
 
 BEAMS, STEPS = 25, TOGETHER + 6
 FIT = "beams of the last 10 scans within 0.3 m of the map's range, share"
@@ -37,7 +37,7 @@ def line(ranges, pose, raw, t):
 def log_file(tmp_path_factory):
     """A robot in a room with a niche: 70 scans of the beams ahead; scan 3 has no valid one, 4 a NaN."""
     niche = [[0, 0], [6, 0], [6, 4], [7.5, 4], [7.5, 6], [0, 6]]
-    room = walls(niche, [[2.6, 2.6], [3.4, 2.6], [3.4, 2.9]])
+    room = make_walls(niche, [[2.6, 2.6], [3.4, 2.6], [3.4, 2.9]])
     world = dataclasses.replace(square(beams=2 * (BEAMS - 1)), walls=room)
     log = jax.device_get(scan_world(world, jax.random.key(0)))
     ahead = slice(BEAMS // 2, BEAMS // 2 + BEAMS)  # from -90° to 90°, 7.5° apart
@@ -154,7 +154,7 @@ def test_laser_slam_writes_a_film_of_the_map_growing(
     assert "data:image/png;base64," in (out / "film.html").read_text()
     (scene,) = scenes
     assert scene.title == "room"
-    assert [scene.said(k) for k in range(3)] == [
+    assert [scene.caption(k) for k in range(3)] == [
         "laser odometry, scan 1 of 2",
         "laser odometry, scan 2 of 2",
         "after closing by 0 loops",

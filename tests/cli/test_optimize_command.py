@@ -92,8 +92,8 @@ def test_it_writes_the_optimum(file, tmp_path, capsys, monkeypatch):
     # The film's last iterate is the optimum.
     (scene,) = [film.scene for film in films]
     assert scene.frames == 1 + summary["iterations"]
-    assert scene.said(0) == f"start, χ² = {summary['chi2 at the start']:.6g}"
-    assert scene.said(summary["iterations"]).endswith(f"χ² = {summary['chi2']:.6g}")
+    assert scene.caption(0) == f"start, χ² = {summary['chi2 at the start']:.6g}"
+    assert scene.caption(summary["iterations"]).endswith(f"χ² = {summary['chi2']:.6g}")
 
     for part in (
         "χ² = Σ eᵀ Ω e, without a factor ½; of relative poses e = Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ) as (x, y, θ)",
@@ -194,7 +194,7 @@ def test_a_kernel_doubts_loops_and_points_but_not_the_path(file, tmp_path, monke
         summary["of weight above 1/2"] == {loops: 3, points: 16}
         and sum(summary["of weight 1/2 or less"].values()) == 0
     )
-    assert summary["certificate"].startswith("none: of a robust cost")
+    assert summary["certificate"].startswith("none: not for a robust cost")
     assert len(graphs.read(tmp_path / "optimized.g2o").tables["relative_pose"].z) == 10
     apart = graphs.with_loops_apart(small())
     assert apart.tables["relative_pose/loops"].who.tolist() == [[7, 0], [2, 6], [5, 1]]

@@ -92,7 +92,7 @@ def test_a_scenario_of_a_file_may_be_a_function_of_its_steps(mine):
         (["--filters", "mine.txt:blind"], "expected a Python file"),
         (
             ["--filters", "mine.py:nobody"],
-            "--filters: there is no 'nobody' in mine.py; it defines: world",
+            "--filters: mine.py has no 'nobody'; it defines: world",
         ),
         (
             ["--filters", "mine.py:number"],

@@ -14,9 +14,9 @@ from layouts import kept_programs, wrong_layouts
 from jaxslam import catalog, charts, linearize, motion, sensors
 from jaxslam.core.protocols import Filter, Here
 from jaxslam.core.types import Status
+from jaxslam.driver import run
 from jaxslam.filters import EkfSlam
 from jaxslam.graphs.smoothing.forward_pass import LogEstimator
-from jaxslam.run import run
 from jaxslam.simulation.scenarios import SCENARIOS, loop, stationary
 from jaxslam.simulation.worlds import simulate
 

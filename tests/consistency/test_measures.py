@@ -18,7 +18,7 @@ from jaxslam.consistency.measures.nees import block_nees
 from jaxslam.consistency.measures.observability import unobservable_directions
 from jaxslam.core.types import Estimate, Info, Log, Scan, Status, Trace, Truth
 from jaxslam.filters.ekf.map_coordinates import ToPoints
-from jaxslam.filters.ekf.observability import Monitor
+from jaxslam.filters.ekf.monitor import Monitor
 from jaxslam.filters.map_management.merging import Merged
 from jaxslam.filters.particles.pose_particles import weighted_pose_moments
 from jaxslam.filters.particles.slam_particles import ParticleInfo

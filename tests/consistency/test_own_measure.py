@@ -15,7 +15,7 @@ import jaxslam
 from jaxslam import plot, report, store
 from jaxslam.consistency import Measure, register
 from jaxslam.consistency.measures import REGISTRY
-from jaxslam.results.page import page
+from jaxslam.results.page import campaign_page
 
 WORLD = worlds.ring()
 
@@ -54,7 +54,7 @@ def test_a_measure_of_ones_own_is_everywhere(registered, tmp_path):
     np.testing.assert_allclose([average.value, np.nanmean(claimed)], per_run["claimed"].mean())
     assert average.low > 0
 
-    text, html = str(campaign), page(campaign, "", None, {}, {})
+    text, html = str(campaign), campaign_page(campaign, "", None, {}, {})
     assert re.search(rf"claimed σ \[m\] +{average.value:.4g} ", text)
     assert re.search(r"farthest +0.25 ", text) and "far: largest error." in text
     assert "claimed σ [m]" in html and "<strong>far</strong>: largest error." in html

@@ -113,7 +113,7 @@ def test_scans_without_a_line_of_odometry_are_told(tmp_path):
     np.testing.assert_array_equal(log.odometry_known, [True] + [False] * 7)
     np.testing.assert_allclose(log.raw, np.broadcast_to(log.raw[0], (8, 3)), atol=1e-12)
     assert log.corrections[-1] == (
-        "scans without an ODOM line since the scan before, where raw odometry stands still: 7"
+        "scans without an ODOM line since the previous scan, with a zero step: 7"
     )
 
 

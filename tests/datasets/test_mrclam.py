@@ -80,7 +80,7 @@ def test_white_noise_does_not_depend_on_how_time_is_cut():
         ("Barcodes.dat", "8 \t 70", "1 70", 3, "subject 1 or barcode 70 occurs twice"),
         ("Barcodes.dat", None, "1 5\n", 1, "no landmark in the file"),
         ("Landmark_Groundtruth.dat", "6 0 3", "6 0 y", 3, "y is not a finite number"),
-        ("Landmark_Groundtruth.dat", "6 0 3", "7 0 3", 3, "subject 7 is no landmark"),
+        ("Landmark_Groundtruth.dat", "6 0 3", "7 0 3", 3, "subject 7 is not a landmark"),
         ("Landmark_Groundtruth.dat", "6 0 3", "8 0 3", 3, "subject 8 occurs twice"),
         ("Landmark_Groundtruth.dat", " 6 0 3 1e-4 1e-4\n", "", 2, "no position of subject 6"),
         ("Landmark_Groundtruth.dat", "6 0 3 1e-4", "6 0 3", 3, "got 4"),

@@ -100,7 +100,7 @@ def test_the_constants_of_a_simulated_robot_are_found(tmp_path):
     np.testing.assert_allclose(log.control, data.log.control, rtol=1e-12)
     np.testing.assert_allclose(log.scan.z, data.log.scan.z, rtol=1e-12)
     for p, scale in ((own.found.parameters[:-1], 1.0), (own.found.parameters, 0.0)):
-        with pytest.raises(ValueError, match=r"OwnCalibration\.at: expected constants of shape"):
+        with pytest.raises(ValueError, match=r"FittedCalibration\.at: expected constants of shape"):
             own.at(p, scale)
     larger, _, farther = own.at(own.found.parameters, scale=2.0)
     np.testing.assert_allclose(larger.scan.z, np.asarray(log.scan.z) * [2.0, 1.0], rtol=1e-12)

@@ -30,8 +30,8 @@ def test_relations_are_read_packed_or_not(tmp_path, name):
         ("1 2 0 0 0 0 0\n", r"1: expected 8 fields \(t1 t2 x y z roll pitch yaw\), got 7"),
         ("# one\n1 2 0 0 0 0 0 x\n", "2: yaw is not a finite number: 'x'"),
         ("nan 2 0 0 0 0 0 0\n", "1: t1 is not a finite number: 'nan'"),
-        ("1 2 0 0 0.1 0 0 0\n", "1: expected a pose of the plane, with z 0, got 0.1"),
-        ("1 2 0 0 0 0 -0.1 0\n", "1: expected a pose of the plane, with pitch 0, got -0.1"),
+        ("1 2 0 0 0.1 0 0 0\n", "1: expected a pose in the plane, with z 0, got 0.1"),
+        ("1 2 0 0 0 0 -0.1 0\n", "1: expected a pose in the plane, with pitch 0, got -0.1"),
         ("# none\n", "1: expected lines t1 t2 x y z roll pitch yaw, got none"),
     ],
 )

@@ -200,7 +200,7 @@ BAD = [
     (ODOMETRY, "1.2,1.0", "1.2,", ":3: column 2 (v [m/s]): expected a finite number, got ''"),
     (ODOMETRY, "1.2,1.0", "1.2,1_0", ":3: column 2 (v [m/s]): expected a finite number, got '1_0'"),
     (ODOMETRY, "1.2,1.0", '1.2,"1,0"', ":3: column 2 (v [m/s]): expected a finite number, got '1,0' (w"),
-    (ODOMETRY, "1.2,1.0", "1,2,1,0", ":3: expected 3 cells, as in line 1, got 5; a number has a point, no comma"),
+    (ODOMETRY, "1.2,1.0", "1,2,1,0", ":3: expected 3 cells, as in line 1, got 5; write a number with a point"),
     (ODOMETRY, "1.2,1.0,0", "1.2,1.0", ":3: expected 3 cells, as in line 1, got 2"),
     (ODOMETRY, None, "", ":1: expected a header"),
     (ODOMETRY, "t [s]", "# by robot\n1,2,3\n# t [s]", ":2: expected a header, as 't [s],v [m/s]', got '1'"),
@@ -214,8 +214,8 @@ BAD = [
     (SEEN, "tag,", "id,", ":1: expected a column 'tag' (of the sensor range_bearing), got 't [s]'"),
     ("truth.csv", "1.3,", "0.8,", ":3: column 1 (t [s]): expected a time above 0.9, got 0.8"),
     ("truth.csv", None, "t [s],x [m],y [m],theta [rad]\n5,0,0,0\n", ": expected times within those"),
-    ("landmarks.csv", "9,0,0", "7,0,0", ":3: column 1 (tag): expected a tag of its own, got 7 again"),
-    ("landmarks.csv", "9,0,0\n3,1,5", "\v9,0,0\n7,1,5", ":4: column 1 (tag): expected a tag of its own"),
+    ("landmarks.csv", "9,0,0", "7,0,0", ":3: column 1 (tag): expected a tag that no other line has, got 7 again"),
+    ("landmarks.csv", "9,0,0\n3,1,5", "\v9,0,0\n7,1,5", ":4: column 1 (tag): expected a tag that no other line has"),
 ]  # fmt: skip
 
 
@@ -252,7 +252,7 @@ def test_a_file_that_is_missing_or_no_text_is_named(tmp_path, name):
     (tmp_path / name).unlink()
     with pytest.raises(ValueError, match=f"expected a file {name}, with columns 't"):
         datasets.table(tmp_path)
-    for wrong, found in ((tmp_path / name, "is not there"), (Path(__file__), "is a file")):
+    for wrong, found in ((tmp_path / name, "does not exist"), (Path(__file__), "is a file")):
         with pytest.raises(
             ValueError, match=rf"{wrong.name} {found}: expected a folder with odome"
         ):

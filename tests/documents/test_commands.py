@@ -119,7 +119,7 @@ def test_what_is_run_again_after_a_change_of_the_code(commands):
             after = commands.digest(script), commands.digest(verify[-1:])
         return [one != other for one, other in zip(before, after, strict=True)]
 
-    assert changed("simulation/scenarios/circle.py") == [True, False]
+    assert changed("simulation/scenarios/published.py") == [True, False]
     assert changed("verify/examination.py") == [False, True]
     assert changed("cli/slam.py") == [False, False]
 

@@ -14,8 +14,8 @@ from worlds import narrow
 from jaxslam import charts, linearize, motion, sensors
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Scan, Status
+from jaxslam.driver import run
 from jaxslam.filters import EkfSlam
-from jaxslam.run import run
 from jaxslam.simulation.worlds import Scenario, simulate
 
 Q, R = np.diag([0.05, 0.03]) ** 2, np.array([[0.01, 0.001], [0.001, 0.0025]])

@@ -13,9 +13,8 @@ from worlds import draw
 
 from jaxslam import filters, sensors
 from jaxslam.core.types import Status
-from jaxslam.run import run
-from jaxslam.simulation.scenarios import cloister
-from jaxslam.simulation.scenarios.view import BetweenRanges
+from jaxslam.driver import run
+from jaxslam.simulation.scenarios import BetweenRanges, cloister
 
 KEY = jax.random.key(0)
 P0 = np.diag([0.1, 0.1, 0.05]) ** 2

@@ -10,8 +10,8 @@ from reference import ekf_slam as plain
 from worlds import draw
 
 from jaxslam.core.types import Status
+from jaxslam.driver import run
 from jaxslam.filters import EkfSlam
-from jaxslam.run import run
 from jaxslam.simulation.scenarios import circle, cloister
 
 MODELS = {

@@ -232,7 +232,7 @@ def test_a_file_without_vertices_is_placed_along_its_edges(tmp_path):
         ("VERTEX_XY 9", "VERTEX_XY 3000000000", 4, "id is above 2147483647"),
         ("0.1\n", "nan\n", 2, "theta is not a finite number: 'nan'"),
         ("EDGE_SE2 7 3", "EDGE_SE2 7 8", 6, "vertex 8 is not defined in the file"),
-        ("EDGE_SE2 7 3", "EDGE_SE2 7 9", 6, "vertex 9 is no pose"),
+        ("EDGE_SE2 7 3", "EDGE_SE2 7 9", 6, "vertex 9 is not a pose"),
         ("EDGE_SE2 7 3", "EDGE_SE2 7 7", 6, "an edge from vertex 7 to itself"),
         ("EDGE_SE2 7 3", "EDGE_SE2 -1 3", 6, "i is not a whole number >= 0: '-1'"),
         ("4 1 0.5 5 0.25 6", "4 1 0.5 5 0.25", 6, "expected 11 fields (i j x y theta I11 I12 I13"),

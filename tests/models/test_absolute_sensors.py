@@ -13,8 +13,8 @@ from reference.plane import turn, wrap
 from jaxslam import charts, motion, sensors
 from jaxslam.core.types import Log, Scan, Status
 from jaxslam.core.validation import check_log
+from jaxslam.driver import run
 from jaxslam.filters import EkfSlam
-from jaxslam.run import run
 from jaxslam.simulation.worlds import Scenario, simulate
 
 KEY = jax.random.key(0)

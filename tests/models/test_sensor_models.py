@@ -10,9 +10,9 @@ from reference.plane import from_frame, mounted, to_frame, wrap
 import jaxslam
 from jaxslam import charts, filters, linearize, motion, sensors
 from jaxslam.core.types import Scan
+from jaxslam.driver import run
 from jaxslam.filters import EkfSlam
 from jaxslam.filters.map_management.relocalization import seen_points
-from jaxslam.run import run
 from jaxslam.sensors.line import facing
 from jaxslam.simulation.worlds import Scenario, simulate
 

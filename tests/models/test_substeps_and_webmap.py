@@ -11,7 +11,7 @@ from reference.plane import to_frame
 from jaxslam import motion, run
 from jaxslam.filters import EkfSlam
 from jaxslam.motion.substeps import Substeps
-from jaxslam.simulation.scenarios.webmap import webmap
+from jaxslam.simulation.scenarios.drives import webmap
 from jaxslam.simulation.worlds import simulate
 
 Q = np.array([[0.04, 0.003], [0.003, 0.01]])

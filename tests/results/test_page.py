@@ -11,7 +11,7 @@ from jaxslam import plot
 from jaxslam.consistency import DOF, LEVELS, Average, Summary
 from jaxslam.consistency.campaign import Campaign
 from jaxslam.consistency.measures import BUILT_IN
-from jaxslam.results.page import page
+from jaxslam.results.page import campaign_page
 from jaxslam.results.table import VERDICTS
 
 STEPS, RUNS = 7, 30
@@ -104,7 +104,7 @@ def text():
         **{EVIL: summary("optimistic", {"nees_pose": Average(9.0, 8.0, 10.0)}, lost=(4, 17))},
         lost=summary("diverged", {}),
     )
-    return page(
+    return campaign_page(
         world,
         f"jaxslam consistency {EVIL}",
         1234,
@@ -169,7 +169,7 @@ def test_filters_verdicts_and_measures_stand_in_the_table(read):
 
 def test_every_label_of_the_table_is_shown_where_it_is_measured():
     every = {one.key: Average(1.0, 0.5, 1.5) for one in BUILT_IN}
-    reader = Reader(page(campaign(a=summary("undecided", every)), "", None, {}, {}))
+    reader = Reader(campaign_page(campaign(a=summary("undecided", every)), "", None, {}, {}))
     labels = [cells[0] for cells in reader.rows]
     for one in BUILT_IN:
         assert (one.title.strip() in labels) == one.row
@@ -180,7 +180,7 @@ def test_every_label_of_the_table_is_shown_where_it_is_measured():
 def test_notes_of_the_measures_stand_below_them():
     of = dataclasses.replace(summary("consistent", GOOD), honest_nis=0.95)
     of.counts.update(born=3, fused=9, rejected=2)
-    reader = Reader(page(campaign(a=of), "", None, {}, {}))
+    reader = Reader(campaign_page(campaign(a=of), "", None, {}, {}))
     words = " ".join("".join(reader.words).split())
     assert "so that NIS / dof is honest from 0.950 (a) to 1" in words
     assert "initialized, measurements that started a landmark" in words

@@ -21,7 +21,7 @@ from jaxslam.simulation.scenarios import (
     square,
     square_lines,
 )
-from jaxslam.simulation.walls import exact_ranges, is_free, rasterize, wall_lines, walls
+from jaxslam.simulation.walls import exact_ranges, is_free, make_walls, rasterize, wall_lines
 from jaxslam.simulation.worlds import simulate
 
 
@@ -44,7 +44,7 @@ def reference_range(world, x, y, angle, limit):
 def test_exact_ranges_are_intersections_with_every_wall(differences):
     turn = 2 * np.pi * np.arange(5) / 5
     star = np.stack([np.cos(turn), np.sin(turn)], axis=1) * [[5], [4], [5], [6], [4]]
-    world = walls(star, [[1, 1], [2, 1], [1.4, 2]], circles=[[-2, 0, 0.7]])
+    world = make_walls(star, [[1, 1], [2, 1], [1.4, 2]], circles=[[-2, 0, 0.7]])
     rng = np.random.default_rng(0)
     pose = np.column_stack([rng.uniform(-1, 1, (20, 2)), rng.uniform(-3, 3, 20)])
     angles = np.linspace(-3, 3, 25)
@@ -88,7 +88,9 @@ def test_the_robot_drives_in_free_space_and_its_scans_are_the_lasers(name):
 
 
 def test_free_space_is_what_an_odd_number_of_walls_encloses():
-    world = walls([[0, 0], [4, 0], [4, 4], [0, 4]], [[1, 1], [2, 1], [2, 2]], circles=[[3, 3, 0.5]])
+    world = make_walls(
+        [[0, 0], [4, 0], [4, 4], [0, 4]], [[1, 1], [2, 1], [2, 2]], circles=[[3, 3, 0.5]]
+    )
     points = [[0.5, 2], [1.9, 1.5], [1.1, 1.9], [3, 3], [3, 2], [5, 1]]
     np.testing.assert_array_equal(is_free(world, points), [True, False, True, False, True, False])
 
@@ -172,7 +174,7 @@ def test_the_information_of_a_scan_through_glass_is_that_of_both_walls_by_their_
     room, pillar = [[0, 0], [6, 0], [6, 3], [0, 3]], [[3, 1], [3.1, 1], [3.1, 2.5]]
 
     def seen(*chains, **more):
-        return scan_information(laser, walls(*chains, **more), pose).information
+        return scan_information(laser, make_walls(*chains, **more), pose).information
 
     def through(*shares):
         return seen(room, pillar, glass={(1, side): share for side, share in enumerate(shares)})
@@ -209,11 +211,17 @@ def test_a_laser_and_its_world_hold_numbers_alone():
 
 
 @refused(
-    (lambda: walls([[0, 0], [1, 0], [0, 1]], glass={(0, 3): 0.5}), "chain 0 has no side 3"),
-    (lambda: walls([[0, 0], [1, 0], [0, 1]], glass={(0, 1): 1.5}), "share in"),
-    (lambda: walls(), "walls: expected at least one wall"),
-    (lambda: walls([[0, 0], [1, 1]]), "walls: expected chain 0 of at least three corners"),
-    (lambda: walls(circles=[[0, 0, 0]]), "walls: expected finite numbers and radii above 0"),
+    (lambda: make_walls([[0, 0], [1, 0], [0, 1]], glass={(0, 3): 0.5}), "chain 0 has no side 3"),
+    (lambda: make_walls([[0, 0], [1, 0], [0, 1]], glass={(0, 1): 1.5}), "share in"),
+    (lambda: make_walls(), "make_walls: expected at least one wall"),
+    (
+        lambda: make_walls([[0, 0], [1, 1]]),
+        "make_walls: expected chain 0 of at least three corners",
+    ),
+    (
+        lambda: make_walls(circles=[[0, 0, 0]]),
+        "make_walls: expected finite numbers and radii above 0",
+    ),
     (lambda: Laser([]), "Laser: expected finite angles"),
     (lambda: Laser([0.0], sigma=0.0), "Laser: expected sigma above 0"),
     (lambda: Laser([0.0], max_range=np.inf), "Laser: expected max_range above 0, got inf"),
@@ -237,7 +245,7 @@ def test_bad_input_is_refused(call):
 
 
 def test_the_lines_of_a_box_and_of_a_thin_wall():
-    box = walls([(0, 0), (4, 0), (4, 3), (0, 3)], [(1, 1), (3, 1), (3, 1.2), (1, 1.2)])
+    box = make_walls([(0, 0), (4, 0), (4, 3), (0, 3)], [(1, 1), (3, 1), (3, 1.2), (1, 1.2)])
     lines, index = wall_lines(box)
     np.testing.assert_array_equal(index, np.arange(8))
     quarter = np.pi / 2
@@ -261,8 +269,8 @@ def test_segments_on_one_line_share_it():
 
 def test_rooms_without_segments_or_with_walls_of_no_thickness_are_refused():
     with pytest.raises(ValueError, match="wall_lines: expected at least one segment"):
-        wall_lines(walls(circles=[[0, 0, 1]]))
-    flat = walls([(0, 0), (4, 0), (2, 0)])
+        wall_lines(make_walls(circles=[[0, 0, 1]]))
+    flat = make_walls([(0, 0), (4, 0), (2, 0)])
     with pytest.raises(ValueError, match="wall_lines: segment 0 has no free side"):
         wall_lines(flat)
 

@@ -13,7 +13,7 @@ from jaxslam.simulation.scenarios import (
     loop_bearing,
     stationary,
 )
-from jaxslam.simulation.scenarios.loop import loop_landmarks
+from jaxslam.simulation.scenarios.published import loop_landmarks
 from jaxslam.simulation.worlds import simulate
 
 

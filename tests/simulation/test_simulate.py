@@ -25,7 +25,7 @@ from jaxslam.simulation.scenarios import (
     circle,
     cloister,
 )
-from jaxslam.simulation.scenarios.cloister import cloister_landmarks
+from jaxslam.simulation.scenarios.published import cloister_landmarks
 from jaxslam.simulation.worlds import Scenario, simulate
 
 Q = np.array([[0.002, 0.0005], [0.0005, 0.001]])

@@ -11,7 +11,7 @@ import worlds
 from cases import refused, swept
 
 from jaxslam import association, life, monte_carlo, run, sensors, simulate
-from jaxslam.consistency.measures.associations import associations, identities
+from jaxslam.consistency.measures.associations import association_scores, identities
 from jaxslam.core.types import Estimate, Info, Scan, Status, Trace
 from jaxslam.filters import EkfSlam
 from jaxslam.simulation.spurious import Spurious, spoil
@@ -105,7 +105,7 @@ def test_associations_are_counted_by_what_a_slot_was_born_of():
     trace = Trace(estimate, info, None, None)
     held = jax.jit(identities)(trace, origin)
     np.testing.assert_array_equal(held, [[4, -1]] * 3)
-    found = jax.jit(associations)(trace, origin, held)
+    found = jax.jit(association_scores)(trace, origin, held)
     assert [float(x) for x in found["precision"]] == [1, 3]
     assert [float(x) for x in found["recall"]] == [1, 3]
     assert float(found["false_landmarks"][0]) == 1
@@ -145,7 +145,7 @@ def test_where_landmarks_are_far_apart_every_method_finds_them_without_tags(name
         held = identities(trace, truth.origin)
         own = truth.landmarks[jnp.maximum(held[-1], 0)]
         error = jnp.where(trace.estimate.alive[-1, :, None], trace.estimate.points[-1] - own, 0.0)
-        return associations(trace, truth.origin, held), error
+        return association_scores(trace, truth.origin, held), error
 
     found, error = jax.jit(jax.vmap(one))(jax.random.split(jax.random.key(0), 4))
     share = {name: total.sum() / weight.sum() for name, (total, weight) in found.items()}

@@ -5,7 +5,7 @@ import jax
 
 import jaxslam
 from jaxslam.datasets.evaluation import evaluate
-from jaxslam.filters.delayed.settings import StoredMeasurements
+from jaxslam.filters.delayed.delayed_settings import StoredMeasurements
 
 jax.config.update("jax_enable_x64", True)
 data = jaxslam.datasets.plaza(gtsam.findExampleDataFile("Plaza1_.mat"))

@@ -13,8 +13,7 @@ from jax.sharding import NamedSharding
 from jaxtyping import Float, PyTree
 
 from jaxslam.consistency import Score, condense, final_covariance, score
-from jaxslam.consistency.campaign.pieces import cores
-from jaxslam.consistency.campaign.programs import (
+from jaxslam.consistency.campaign.block_programs import (
     RUN_AXES,
     Draws,
     FilterResults,
@@ -24,12 +23,13 @@ from jaxslam.consistency.campaign.programs import (
     statistics_program,
     structs,
 )
+from jaxslam.consistency.campaign.pieces import cores
 from jaxslam.consistency.measures import REGISTRY
 from jaxslam.consistency.tally import condensed_sums
 from jaxslam.core.protocols import Candidate
 from jaxslam.core.record import as_record
 from jaxslam.core.types import Estimate, Info, Trace, Truth
-from jaxslam.filters.ekf.observability import MonitoredState
+from jaxslam.filters.ekf.monitor import MonitoredState
 from jaxslam.simulation.worlds import Scenario, World
 
 BOUND = "bound"

@@ -17,8 +17,8 @@ from jaxslam.core.logs.tables import split_unit
 from jaxslam.core.numbers import check_covariance, is_concrete
 from jaxslam.core.protocols import Candidate, Chart, Estimator, Filter, Motion, Sensor
 from jaxslam.core.types import Log, Trace, Truth
+from jaxslam.driver import run
 from jaxslam.graphs.smoothing.forward_pass import LogEstimator
-from jaxslam.run import run
 from jaxslam.sensors.suite import Suite
 from jaxslam.simulation.worlds import World
 

@@ -26,11 +26,11 @@ from jaxslam.consistency.campaign.candidates import (
     fitting_block,
     without_noise,
 )
-from jaxslam.consistency.campaign.identity import identity
+from jaxslam.consistency.campaign.digests import identity
 from jaxslam.consistency.campaign.kept import Keep, add_kept
 from jaxslam.consistency.campaign.pieces import check_part, cores, in_part, missing
-from jaxslam.consistency.campaign.record import Campaign, Incomplete, Interrupted
 from jaxslam.consistency.campaign.remote import Executor
+from jaxslam.consistency.campaign.result import Campaign, Incomplete, Interrupted
 from jaxslam.consistency.campaign.work import Work, shown_progress
 from jaxslam.core.numbers import check_count, check_key
 from jaxslam.core.protocols import Candidate

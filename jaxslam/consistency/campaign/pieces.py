@@ -1,14 +1,14 @@
-"""The runs that are still to do, in pieces of blocks; and the cores that there are."""
+"""Remaining runs, split at block borders; number of usable cores."""
 
 import os
 from collections.abc import Iterable
 
 
 def missing(finished: Iterable[tuple[int, int]], runs: int, block: int) -> list[tuple[int, int]]:
-    """The pieces (first, runs) of runs 0 … runs-1 that are not done, in order; each of them lies
-    within runs n block … (n + 1) block - 1 for some n.
+    """The unfinished pieces (first, runs) of runs 0 … runs-1, in order, split at block borders:
+    each is within runs n block … (n + 1) block - 1 for some n.
 
-    done: (first, runs) of what is, in any order; may overlap and reach beyond.
+    finished: (first, runs) of finished pieces, in any order; may overlap and exceed runs.
     """
     if block < 1:
         raise ValueError(f"block: expected an integer >= 1, got {block}")
@@ -34,7 +34,7 @@ def check_part(name: str, part: object) -> None:
 def in_part(first: int, block: int, part: tuple[int, int] | None) -> bool:
     """Whether the block of run `first` is one of part (i, n): blocks i - 1, i - 1 + n, … from 0 on.
 
-    So the parts of a campaign depend neither on finished runs nor on the number of runs.
+    Thus the parts of a campaign depend neither on finished runs nor on the number of runs.
     """
     return part is None or first // block % part[1] == part[0] - 1
 

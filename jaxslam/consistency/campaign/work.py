@@ -17,8 +17,8 @@ from jaxslam.consistency.campaign.flight import TRIES, WRONG, Flight, out_of_mem
 from jaxslam.consistency.campaign.kept import Keep, add_block, flat
 from jaxslam.consistency.campaign.pieces import missing
 from jaxslam.consistency.campaign.progress import Progress
-from jaxslam.consistency.campaign.record import Incomplete
 from jaxslam.consistency.campaign.remote import Executor, compute_block, packed
+from jaxslam.consistency.campaign.result import Incomplete
 from jaxslam.core.types import Estimate, Truth
 
 

@@ -7,7 +7,7 @@ from collections.abc import Iterable
 
 from jaxslam.consistency.measures import (
     associations,
-    credibility,
+    coverage,
     errors,
     innovations,
     nees,
@@ -20,8 +20,8 @@ BUILT_IN: tuple[Measure, ...] = (
     *nees.MEASURES,
     innovations.NIS,
     innovations.AUTOCORRELATION,
-    *credibility.COVERAGE,
-    *credibility.CREDIBILITY,
+    *coverage.COVERAGE,
+    *coverage.CREDIBILITY,
     *errors.MEASURES,
     *associations.MEASURES,
     *observability.MEASURES,

@@ -33,7 +33,7 @@ def identities(trace: Trace, origin: Int[Array, "T M"]) -> Int[Array, "T N"]:
     return jnp.where(trace.estimate.alive, held, -1)
 
 
-def associations(
+def association_scores(
     trace: Trace, origin: Int[Array, "T M"], held: Int[Array, "T N"]
 ) -> dict[str, tuple[Array, Array]]:
     """Precision, recall and false landmarks of one run, each as a sum and its weight.

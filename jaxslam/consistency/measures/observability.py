@@ -6,7 +6,7 @@ import numpy as np
 from jaxtyping import Float, Int, PyTree
 
 from jaxslam.consistency.measures.measure import Measure, Runs, RunScores
-from jaxslam.filters.ekf.observability import Monitor, MonitoredState
+from jaxslam.filters.ekf.monitor import Monitor, MonitoredState
 
 
 @dataclass(frozen=True, eq=False)

@@ -11,7 +11,7 @@ from jaxslam.consistency.metrics.paths import (
     carried,
     map_entropy,
 )
-from jaxslam.consistency.metrics.relative import (
+from jaxslam.consistency.metrics.relative_poses import (
     Errors,
     MeanAndStd,
     Relations,

@@ -7,8 +7,8 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.core.slots import Joint
+from jaxslam.filters.delayed.delayed_settings import DelayedSettings
 from jaxslam.filters.delayed.hypotheses import point_residuals
-from jaxslam.filters.delayed.settings import DelayedSettings
 from jaxslam.filters.delayed.state import (
     SIZE,
     DelayedState,

@@ -16,14 +16,14 @@ from jaxslam.core.protocols import Associate, Association, Filter, Motion, Senso
 from jaxslam.core.record import hold_function, record, set_field, static
 from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.filters.delayed.confirmation import confirm_hypotheses
-from jaxslam.filters.delayed.intersection import intersect_measurements
-from jaxslam.filters.delayed.promotion import Promoted, promote_hypotheses
-from jaxslam.filters.delayed.settings import (
+from jaxslam.filters.delayed.delayed_settings import (
     DelayedSettings,
     Hypotheses,
     Promotion,
     StoredMeasurements,
 )
+from jaxslam.filters.delayed.intersection import intersect_measurements
+from jaxslam.filters.delayed.promotion import Promoted, promote_hypotheses
 from jaxslam.filters.delayed.state import (
     SIZE,
     DelayedState,
@@ -36,11 +36,11 @@ from jaxslam.filters.delayed.state import (
     slots_where,
 )
 from jaxslam.filters.delayed.triangulation import Triangulation, triangulation_of
+from jaxslam.filters.ekf.ekf_settings import EkfSettings
 from jaxslam.filters.ekf.innovation import Correction
 from jaxslam.filters.ekf.map_coordinates import estimate_of
 from jaxslam.filters.ekf.predict import propagate
 from jaxslam.filters.ekf.scan import associate_scan
-from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.update import correct_in_turn
 from jaxslam.filters.reporting import info_of, seen_before, status_of
 from jaxslam.math.arrays import Number

@@ -8,7 +8,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.core.slots import Joint
-from jaxslam.filters.delayed.settings import Distance
+from jaxslam.filters.delayed.delayed_settings import Distance
 from jaxslam.filters.delayed.state import SIZE, TableLayout, covariance_blocks
 from jaxslam.filters.delayed.triangulation import Triangulation
 from jaxslam.math import uncertain_poses

@@ -9,13 +9,13 @@ from jaxtyping import Bool, Float, Int
 
 from jaxslam.core import slots
 from jaxslam.core.slots import Joint
+from jaxslam.filters.delayed.delayed_settings import DelayedSettings
 from jaxslam.filters.delayed.hypotheses import (
     UncertainPoints,
     closer_than,
     relative_spread,
     relative_to_robot,
 )
-from jaxslam.filters.delayed.settings import DelayedSettings
 from jaxslam.filters.delayed.state import (
     SIZE,
     DelayedState,

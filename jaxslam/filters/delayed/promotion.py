@@ -16,6 +16,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Int, PyTree
 
+from jaxslam.filters.delayed.delayed_settings import DelayedSettings
 from jaxslam.filters.delayed.hypotheses import (
     closer_than,
     point_residuals,
@@ -23,7 +24,6 @@ from jaxslam.filters.delayed.hypotheses import (
     relative_to_robot,
 )
 from jaxslam.filters.delayed.initialization import InitialEstimate, add_landmark, initial_estimate
-from jaxslam.filters.delayed.settings import DelayedSettings
 from jaxslam.filters.delayed.state import (
     DelayedState,
     NewMeasurements,

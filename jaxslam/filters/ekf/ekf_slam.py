@@ -13,17 +13,17 @@ from jaxslam.core.record import hold_function, record, static
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.filters.ekf import map_coordinates
-from jaxslam.filters.ekf.linear_system import LinearizedSteps, LinearSystem
-from jaxslam.filters.ekf.map_coordinates import estimate_of
-from jaxslam.filters.ekf.predict import propagate
-from jaxslam.filters.ekf.scan import stages_of, update_by_scan, without_landmarks
-from jaxslam.filters.ekf.settings import (
+from jaxslam.filters.ekf.ekf_settings import (
     CorrectionOrder,
     Covariance,
     EkfSettings,
     check_ekf_options,
     check_settings,
 )
+from jaxslam.filters.ekf.linear_system import LinearizedSteps, LinearSystem
+from jaxslam.filters.ekf.map_coordinates import estimate_of
+from jaxslam.filters.ekf.predict import propagate
+from jaxslam.filters.ekf.scan import stages_of, update_by_scan, without_landmarks
 from jaxslam.filters.reporting import with_extra, with_removed
 from jaxslam.linearize.first_order import AtEstimate
 from jaxslam.math import linalg

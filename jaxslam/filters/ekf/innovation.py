@@ -14,10 +14,10 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 from jaxslam.core import slots
 from jaxslam.core.protocols import Here
 from jaxslam.core.slots import Joint
+from jaxslam.filters.ekf.ekf_settings import EkfSettings
 from jaxslam.filters.ekf.linear_system import basis_of_each
 from jaxslam.filters.ekf.map_coordinates import at_slot
 from jaxslam.filters.ekf.predicted_measurements import in_chart, projected_cov
-from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.whitening import InnovationFactor, factor_of, whiten, whitened_by
 from jaxslam.math import linalg
 from jaxslam.math.gaussians import log_density, log_det_of_pivots

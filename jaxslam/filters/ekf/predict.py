@@ -7,8 +7,8 @@ from jaxtyping import Array, Bool, Float
 from jaxslam.core import slots
 from jaxslam.core.protocols import Basis, Here, Motion
 from jaxslam.core.slots import Joint
+from jaxslam.filters.ekf.ekf_settings import EkfSettings
 from jaxslam.filters.ekf.linear_system import Transition
-from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.math import linalg
 from jaxslam.math.xla import materialize
 

@@ -4,11 +4,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from jaxslam.association.prediction import predicted
+from jaxslam.association.rules import predicted
 from jaxslam.core.protocols import Basis, Chart, Here, Prediction
 from jaxslam.core.slots import Joint
+from jaxslam.filters.ekf.ekf_settings import EkfSettings
 from jaxslam.filters.ekf.map_coordinates import at_slot
-from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.math import linalg
 from jaxslam.math.xla import materialize
 

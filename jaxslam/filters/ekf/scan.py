@@ -18,6 +18,7 @@ from jaxslam.core import slots
 from jaxslam.core.protocols import Association, Here, Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Info, Scan
+from jaxslam.filters.ekf.ekf_settings import EkfSettings
 from jaxslam.filters.ekf.innovation import Correction
 from jaxslam.filters.ekf.linear_system import (
     LinearLandmarks,
@@ -25,7 +26,6 @@ from jaxslam.filters.ekf.linear_system import (
     LinearSystem,
 )
 from jaxslam.filters.ekf.predicted_measurements import prediction_of
-from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.update import correct, correct_in_turn
 from jaxslam.filters.reporting import info_of, joined_info, nothing_of, seen_before, status_of
 from jaxslam.math import linalg

@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam.core.protocols import Chart
 from jaxslam.core.slots import Joint
+from jaxslam.filters.ekf.ekf_settings import Covariance, EkfSettings
 from jaxslam.filters.ekf.innovation import (
     Correction,
     Innovation,
@@ -22,7 +23,6 @@ from jaxslam.filters.ekf.innovation import (
     view_of,
 )
 from jaxslam.filters.ekf.map_coordinates import retracted
-from jaxslam.filters.ekf.settings import Covariance, EkfSettings
 from jaxslam.math import linalg
 from jaxslam.math.xla import materialize, no_inline, where_any
 

@@ -1,6 +1,6 @@
 """The active set of a `SparseState`: its landmarks, links, activation and deactivation.
 
-A landmark leaves only without a link to the robot, which `sparsification.sparsify` cuts. A list of
+A landmark leaves only without a link to the robot, which `sparse_state.sparsify` cuts. A list of
 links that is full drops its weakest one for a new one.
 """
 
@@ -10,13 +10,13 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.core import slots
-from jaxslam.filters.information.innovation import TagAssociation
 from jaxslam.filters.information.sparse_state import (
     SparseState,
+    drop_link,
     landmark_blocks,
     with_landmark_blocks,
 )
-from jaxslam.filters.information.sparsification import drop_link
+from jaxslam.filters.information.tag_innovation import TagAssociation
 from jaxslam.math.xla import materialize
 
 
@@ -31,7 +31,7 @@ def enter_link(
     """The state with the link Ω_ij in the lists of landmarks i and j, where on and it is not 0.
 
     A full list drops its weakest link (least |Ω_ij|), or the new one is not entered if that is the
-    weakest: `sparsification.drop_link`. `diagonal` must be current for both landmarks.
+    weakest: `sparse_state.drop_link`. `diagonal` must be current for both landmarks.
     """
     n = state.alive.shape[0]
     size = (link**2).sum()

@@ -20,7 +20,7 @@ from jaxtyping import Bool, Float, Int
 
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import Info, Scan
-from jaxslam.filters.information.innovation import (
+from jaxslam.filters.information.tag_innovation import (
     CanonicalInnovations,
     TagAssociation,
     stack_jacobians,

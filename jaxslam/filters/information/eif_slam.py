@@ -15,8 +15,8 @@ from jaxslam.core.record import record, static
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.filters.ekf.map_coordinates import estimate_of
-from jaxslam.filters.information import canonical, innovation
-from jaxslam.filters.information.innovation import InformationFilter, associate_by_table
+from jaxslam.filters.information import canonical, tag_innovation
+from jaxslam.filters.information.tag_innovation import InformationFilter, associate_by_table
 from jaxslam.math import linalg
 
 
@@ -77,7 +77,7 @@ class EifSlam(InformationFilter):
 
     def update(self, state: CanonicalState, scan: Scan, key: Array) -> tuple[CanonicalState, Info]:
         measured = associate_by_table(state.tag, state.alive, scan)
-        innovations = innovation.innovations(
+        innovations = tag_innovation.innovations(
             self, state.omega, state.pose, state.landmarks, scan, measured.slot, measured.known
         )
         omega, residual = canonical.measurement_update(state.omega, state.residual, innovations)
@@ -101,7 +101,7 @@ class EifSlam(InformationFilter):
             tag=state.tag.at[into].set(scan.tag.astype(jnp.int32), mode="drop"),
             refused=state.refused + (scan.valid.any() & ~solved),
         )
-        innovations = innovation.refuse_unless(solved, innovations)
+        innovations = tag_innovation.refuse_unless(solved, innovations)
         return after, canonical.report(scan, measured, innovations, initialized)
 
     def estimate(self, state: CanonicalState) -> Estimate:

@@ -9,18 +9,12 @@ from jaxtyping import Bool, Float, Int
 from jaxslam.core.numbers import check_count
 from jaxslam.core.record import record, static
 from jaxslam.core.types import Estimate, Info, Scan
-from jaxslam.filters.information import canonical, innovation
+from jaxslam.filters.information import canonical, tag_innovation
 from jaxslam.filters.information.active_set import (
     activate,
     active_matches,
     assign_indices,
     deactivate,
-)
-from jaxslam.filters.information.innovation import (
-    CanonicalInnovations,
-    InformationFilter,
-    TagAssociation,
-    associate_by_index,
 )
 from jaxslam.filters.information.marginals import (
     blanket_marginals,
@@ -33,10 +27,16 @@ from jaxslam.filters.information.sparse_state import (
     SparseState,
     active_means,
     active_residual,
+    cut_robot_links,
     empty_map,
     with_active_residual,
 )
-from jaxslam.filters.information.sparsification import cut_robot_links
+from jaxslam.filters.information.tag_innovation import (
+    CanonicalInnovations,
+    InformationFilter,
+    TagAssociation,
+    associate_by_index,
+)
 
 
 @record
@@ -47,7 +47,7 @@ class Seif(InformationFilter):
     most `links` others. The four steps do not touch the rest of the map:
 
     1. motion update (`canonical.motion_update`), of the robot and the active landmarks;
-    2. sparsification (`sparsification.sparsify`): the least recently measured active landmarks
+    2. sparsification (`sparse_state.sparsify`): the least recently measured active landmarks
        lose their links to the robot, as many as the scan needs indices for;
     3. measurement update and new landmarks (`canonical`);
     4. mean recovery (`marginals`), one block at a time: the block of robot and active
@@ -82,7 +82,7 @@ class Seif(InformationFilter):
     sweeps: int = static(default=1)
     """rounds of mean recovery a scan: passive landmarks, then the active block"""
     conservative: bool = static(default=False)
-    """how a full list drops its weakest link, `sparsification.drop_link`. False: overconfidently, Ω
+    """how a full list drops its weakest link, `sparse_state.drop_link`. False: overconfidently, Ω
     stays positive definite. True: with loss of information; where a map needs many more links than
     it may have, Ω does not stay positive definite"""
     whole: bool = static(default=False)
@@ -182,12 +182,12 @@ def _correct_active(
 ) -> tuple[SparseState, Float[Array, "D D"], CanonicalInnovations, Bool[Array, ""]]:
     """The state with its mean corrected by measurements of active landmarks, Ω after them, their
     innovations, and whether the mean could be solved for."""
-    found = innovation.innovations(
+    found = tag_innovation.innovations(
         filter, state.omega, state.pose, active_means(state), scan, index, known
     )
     omega, residual = canonical.measurement_update(state.omega, active_residual(state), found)
     state, solved = recover_active_means(state, omega, residual, found.omega_positive)
-    return state, omega, innovation.refuse_unless(solved, found), solved
+    return state, omega, tag_innovation.refuse_unless(solved, found), solved
 
 
 def _initialize_active(

@@ -10,10 +10,10 @@ from jaxslam.core.protocols import Chart, Filter, Linearizer, Motion, Sensor
 from jaxslam.core.record import record
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan
+from jaxslam.filters.ekf.ekf_settings import EkfSettings, check_settings
 from jaxslam.filters.ekf.ekf_slam import initial_state
 from jaxslam.filters.ekf.map_coordinates import estimate_of
 from jaxslam.filters.ekf.predict import propagate
-from jaxslam.filters.ekf.settings import EkfSettings, check_settings
 from jaxslam.filters.reporting import nothing_of
 from jaxslam.linearize.first_order import AtEstimate
 

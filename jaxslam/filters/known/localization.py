@@ -30,9 +30,7 @@ from jaxslam.core.protocols import (
 from jaxslam.core.record import hold_function, record, set_field, static
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan
-from jaxslam.filters.ekf.predict import propagate
-from jaxslam.filters.ekf.scan import SensorStage, update_by_scan
-from jaxslam.filters.ekf.settings import (
+from jaxslam.filters.ekf.ekf_settings import (
     CorrectionOrder,
     Covariance,
     EkfSettings,
@@ -40,6 +38,8 @@ from jaxslam.filters.ekf.settings import (
     check_ekf_options,
     check_iterations,
 )
+from jaxslam.filters.ekf.predict import propagate
+from jaxslam.filters.ekf.scan import SensorStage, update_by_scan
 from jaxslam.linearize.first_order import AtEstimate
 from jaxslam.math import linalg
 from jaxslam.math.arrays import Number

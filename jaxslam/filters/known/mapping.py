@@ -17,9 +17,9 @@ from jaxslam.core.record import record, static
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.filters.particles.landmark_ekf import update_map
+from jaxslam.filters.particles.particle_settings import check_particle_map, particle_map_settings
 from jaxslam.filters.particles.proposal import associate_particle, propose_pose
 from jaxslam.filters.particles.scan_association import zero_padding
-from jaxslam.filters.particles.settings import check_particle_map, particle_map_settings
 from jaxslam.filters.particles.slam_particles import (
     SlamParticles,
     as_only_particle,

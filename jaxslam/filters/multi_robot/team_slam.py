@@ -15,15 +15,15 @@ from jaxslam.core.protocols import Associate, Filter
 from jaxslam.core.record import hold_function, record, set_field, static
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan, Status
-from jaxslam.filters.ekf.predict import propagate
-from jaxslam.filters.ekf.scan import SensorStage, stage_of, update_by_scan
-from jaxslam.filters.ekf.settings import (
+from jaxslam.filters.ekf.ekf_settings import (
     CorrectionOrder,
     Covariance,
     EkfSettings,
     check_covariance_form,
     check_ekf_options,
 )
+from jaxslam.filters.ekf.predict import propagate
+from jaxslam.filters.ekf.scan import SensorStage, stage_of, update_by_scan
 from jaxslam.filters.multi_robot.pose_initialization import best_initialization, observed_points
 from jaxslam.filters.multi_robot.team import Robot, check_team, poses, sizes
 from jaxslam.filters.multi_robot.team_state import (

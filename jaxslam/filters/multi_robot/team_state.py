@@ -14,8 +14,8 @@ from jaxtyping import Array, Bool, Float
 
 from jaxslam.core.protocols import Sensor
 from jaxslam.core.slots import Joint
+from jaxslam.filters.ekf.ekf_settings import EkfSettings
 from jaxslam.filters.ekf.scan import SensorStage
-from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.multi_robot.team import Robot
 
 SIZE = 3

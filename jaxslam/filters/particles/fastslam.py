@@ -17,6 +17,12 @@ from jaxslam.core.protocols import Associate, Differentiable, Filter, Life, Moti
 from jaxslam.core.record import record, static
 from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.filters.particles.landmark_ekf import update_map
+from jaxslam.filters.particles.particle_settings import (
+    ParticleMapSettings,
+    check_particle_map,
+    check_resampling,
+    particle_map_settings,
+)
 from jaxslam.filters.particles.pose_particles import weighted_nis
 from jaxslam.filters.particles.proposal import (
     PoseProposal,
@@ -26,12 +32,6 @@ from jaxslam.filters.particles.proposal import (
     sample_motion,
 )
 from jaxslam.filters.particles.scan_association import zero_padding
-from jaxslam.filters.particles.settings import (
-    ParticleMapSettings,
-    check_particle_map,
-    check_resampling,
-    particle_map_settings,
-)
 from jaxslam.filters.particles.slam_particles import (
     ParticleInfo,
     SlamParticles,
@@ -42,7 +42,7 @@ from jaxslam.filters.particles.slam_particles import (
 )
 from jaxslam.filters.reporting import has_distance, with_extra
 from jaxslam.math.arrays import Number
-from jaxslam.resampling.rules import systematic
+from jaxslam.resampling.methods import systematic
 from jaxslam.resampling.weights import normalized, resampled_where
 
 _T = TypeVar("_T")

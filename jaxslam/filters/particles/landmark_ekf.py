@@ -14,9 +14,9 @@ from jaxslam.core import slots
 from jaxslam.core.protocols import Life, Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan, Status
+from jaxslam.filters.particles.particle_settings import ParticleMapSettings
 from jaxslam.filters.particles.proposal import ParticleInnovations
 from jaxslam.filters.particles.scan_association import ParticleAssociation
-from jaxslam.filters.particles.settings import ParticleMapSettings
 from jaxslam.filters.particles.slam_particles import SlamParticles, as_only_particle, slam_estimate
 from jaxslam.filters.reporting import info_of, seen_before, status_of, with_removed
 from jaxslam.linearize import first_order

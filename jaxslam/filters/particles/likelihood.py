@@ -11,15 +11,15 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.association.prediction import predicted
+from jaxslam.association.rules import predicted
 from jaxslam.core.protocols import Prediction
 from jaxslam.core.types import Scan
+from jaxslam.filters.particles.particle_settings import KnownMapSensor
 from jaxslam.filters.particles.scan_association import (
     ParticleAssociation,
     gate_distance,
     particle_association,
 )
-from jaxslam.filters.particles.settings import KnownMapSensor
 from jaxslam.math.gaussians import GaussianTerms, gaussian_terms, log_density
 from jaxslam.sensors.suite import split_scan
 

@@ -16,10 +16,10 @@ from jaxslam.core.record import hold_function, record, static
 from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.filters.known.localization import hold_map, map_tags
 from jaxslam.filters.particles.likelihood import ScanLikelihood, scan_likelihood
+from jaxslam.filters.particles.particle_settings import known_map_sensors
 from jaxslam.filters.particles.pose_particles import Box, PoseParticles, draw_start, weighted_nis
 from jaxslam.filters.particles.pose_steps import MonteCarloFilter
 from jaxslam.filters.particles.scan_association import zero_padding
-from jaxslam.filters.particles.settings import known_map_sensors
 from jaxslam.filters.reporting import info_of, status_of, with_extra
 from jaxslam.math.arrays import Number
 from jaxslam.resampling.weights import normalized

@@ -10,15 +10,15 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
 
-from jaxslam.association.prediction import predicted
+from jaxslam.association.rules import predicted
 from jaxslam.core.protocols import Motion, Prediction, Sensor
 from jaxslam.core.types import Scan
+from jaxslam.filters.particles.particle_settings import ParticleMapSettings
 from jaxslam.filters.particles.scan_association import (
     ParticleAssociation,
     gate_distance,
     particle_association,
 )
-from jaxslam.filters.particles.settings import ParticleMapSettings
 from jaxslam.filters.particles.slam_particles import SlamParticles
 from jaxslam.linearize import first_order
 from jaxslam.math import linalg

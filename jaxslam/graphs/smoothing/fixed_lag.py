@@ -15,8 +15,8 @@ from jaxslam.core.protocols import Associate, Filter, Motion, Sensor
 from jaxslam.core.record import hold_function, record, static
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan, Status
+from jaxslam.filters.ekf.ekf_settings import check_ekf_options
 from jaxslam.filters.ekf.ekf_slam import EkfSlam
-from jaxslam.filters.ekf.settings import check_ekf_options
 from jaxslam.graphs.chain.window import (
     WindowIterate,
     WindowPrior,

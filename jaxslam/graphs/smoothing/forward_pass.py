@@ -15,11 +15,11 @@ from jaxslam.core.protocols import Associate, Component, Filter, Motion, Sensor,
 from jaxslam.core.record import hold_function, record, set_field, static
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Log, Scan, Trace
+from jaxslam.driver import check_run, run
+from jaxslam.filters.ekf.ekf_settings import check_ekf_options
 from jaxslam.filters.ekf.ekf_slam import EkfSlam
-from jaxslam.filters.ekf.settings import check_ekf_options
 from jaxslam.math.arrays import Number
 from jaxslam.math.xla import hot_jit
-from jaxslam.run import check_run, run
 from jaxslam.sensors.suite import Suite
 
 

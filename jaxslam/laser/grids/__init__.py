@@ -8,6 +8,7 @@ from jaxslam.laser.grids.beam_models import (
     fit,
     log_likelihood,
 )
+from jaxslam.laser.grids.cell_counts import Counts, count, entropy, occupancy, reflection
 from jaxslam.laser.grids.distance import distance_field, gradient
 from jaxslam.laser.grids.grid import (
     Field,
@@ -18,11 +19,10 @@ from jaxslam.laser.grids.grid import (
     to_cells,
     write_map,
 )
-from jaxslam.laser.grids.localization import GridLocalization, beam_log
-from jaxslam.laser.grids.mapping import Counts, count, entropy, occupancy, reflection
+from jaxslam.laser.grids.grid_localization import GridLocalization, beam_log
 from jaxslam.laser.grids.pose_clusters import Clusters, clusters
 from jaxslam.laser.grids.rays import RayMap, cast, ray_map
-from jaxslam.laser.grids.resampling import correlation, crop, resample
+from jaxslam.laser.grids.resolution import correlation, crop, resample
 
 __all__ = [
     "BeamModel",

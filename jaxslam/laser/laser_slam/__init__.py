@@ -1,6 +1,6 @@
 """Laser SLAM: from the raw odometry and scans of a log to a path, a pose graph and a map."""
 
-from jaxslam.laser.laser_slam.odometry.pieces import MatchMotion, match_controls
+from jaxslam.laser.laser_slam.odometry.log_odometry import MatchMotion, match_controls
 from jaxslam.laser.laser_slam.odometry.tracking import Odometry
 from jaxslam.laser.laser_slam.records import LoopOutcome, Loops, ScanLog, Settings, Solved
 from jaxslam.laser.laser_slam.score import ClosureScore, closure_score, relation_covs, relation_nees

@@ -6,7 +6,7 @@ from jaxtyping import Float, Int
 from jaxslam import graphs
 from jaxslam.graphs import Graph, Table
 from jaxslam.graphs.graph import LOOPS
-from jaxslam.laser.laser_slam import covariances
+from jaxslam.laser.laser_slam import end_covariances
 from jaxslam.math import numpy_poses as poses
 
 _PART = 2048
@@ -66,8 +66,8 @@ def relative_covs(
     at = np.asarray(solution.graph.poses, np.float64)
     i, j = at[pairs[:, 0]], at[pairs[:, 1]]
     # x_i + δ_i is x_i ∘ R(θ_i)ᵀ δ_i to first order, which moves the end by -Ad(z)⁻¹ of it.
-    by_i = -poses.adjoint(poses.between(j, i)) @ covariances.turns(-i[:, 2])
-    by_j = covariances.turns(-j[:, 2])
+    by_i = -poses.adjoint(poses.between(j, i)) @ end_covariances.turns(-i[:, 2])
+    by_j = end_covariances.turns(-j[:, 2])
     both = np.concatenate([by_i, by_j], axis=2)
     whole = np.swapaxes(joint, 2, 3).reshape(-1, 6, 6)
-    return covariances.propagated(both, whole)
+    return end_covariances.propagated(both, whole)

@@ -10,7 +10,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from jaxslam import graphs
-from jaxslam.laser.laser_slam import covariances
+from jaxslam.laser.laser_slam import end_covariances
 from jaxslam.laser.laser_slam.assembly import ROOM, relative_covs
 from jaxslam.laser.laser_slam.records import LoopOutcome, Loops, Solved
 from jaxslam.math import numpy_poses as poses
@@ -62,8 +62,8 @@ def relation_covs(
         parts = [relative_covs(optimum, pairs[k : k + TOGETHER]) for k in starts]
         between[apart] = np.concatenate(parts)[row.reshape(-1)]
     z = poses.between(solved.poses[i], solved.poses[j])
-    at_start = covariances.moved(solved.z_cov[i], z)
-    cov = at_start + covariances.composed_cov(between, solved.z[j], solved.z_cov[j])
+    at_start = end_covariances.moved(solved.z_cov[i], z)
+    cov = at_start + end_covariances.composed_cov(between, solved.z[j], solved.z_cov[j])
     cov[i == j] = 0.0
     return np.asarray(0.5 * (cov + np.swapaxes(cov, 1, 2)))
 

@@ -7,15 +7,15 @@ from concurrent.futures import ThreadPoolExecutor
 import numpy as np
 
 from jaxslam import graphs
-from jaxslam.laser.laser_slam import covariances
+from jaxslam.laser.laser_slam import end_covariances
 from jaxslam.laser.laser_slam.assembly import ROOM
-from jaxslam.laser.laser_slam.loops.closing import closed, give_back
-from jaxslam.laser.laser_slam.mapping import frame_of, map_of
-from jaxslam.laser.laser_slam.odometry.pieces import laser_odometry
+from jaxslam.laser.laser_slam.log_map import frame_of, map_of
+from jaxslam.laser.laser_slam.loops.rounds import closed, give_back
+from jaxslam.laser.laser_slam.odometry.log_odometry import laser_odometry
 from jaxslam.laser.laser_slam.odometry.raw import Steps, steps_of
 from jaxslam.laser.laser_slam.odometry.tracking import Odometry
 from jaxslam.laser.laser_slam.records import LogOfScans, LoopOutcome, Loops, Settings, Solved
-from jaxslam.laser.laser_slam.scans import check_laser_log, scans_of
+from jaxslam.laser.laser_slam.scan_points import check_laser_log, scans_of
 from jaxslam.math import numpy_poses as poses
 from jaxslam.math.arrays import float64
 
@@ -117,9 +117,9 @@ def _of_scans(
     else:
         optimum = graphs.optimize(graph, room=ROOM, iterations=0)
         marginal = np.asarray(graphs.marginals(optimum, room=ROOM).poses, np.float64)
-    at_key = covariances.turns(-at[row, 2]) @ marginal[row] @ covariances.turns(at[row, 2])
+    at_key = end_covariances.turns(-at[row, 2]) @ marginal[row] @ end_covariances.turns(at[row, 2])
     step = np.where(is_key[:, None, None], 0.0, odometry.cov)
-    cov = covariances.of_coordinates(covariances.composed_cov(at_key, z, step), path)
+    cov = end_covariances.of_coordinates(end_covariances.composed_cov(at_key, z, step), path)
     return path, cov, (row, z, step)
 
 

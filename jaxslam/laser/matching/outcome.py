@@ -14,7 +14,7 @@ from jaxslam.math.arrays import Number
 
 
 class Limits(NamedTuple):
-    """Below which a match gets a status."""
+    """Thresholds below which a match is flagged."""
 
     fewest: int = 10
     """points with a partner"""

@@ -1,14 +1,13 @@
 """Figures of maps, errors and campaigns, all in one style (`plot.style`).
 
-Only this package draws. Figures are made without pyplot, so there is no global state and no window;
+Only this package draws. Figures are made without pyplot, without global state and windows;
 `figure.savefig(path)` saves one. They are as wide as a page; `width=plot.COLUMN` makes one for a
 column of a paper, with letters of the same size.
 """
 
-from jaxslam.results.plot.errors import errors_figure, run_errors_figure
 from jaxslam.results.plot.film import Film, Layer, Panel, Scene, has_ffmpeg
-from jaxslam.results.plot.graphs import graph_figure, graph_scene
-from jaxslam.results.plot.grids import (
+from jaxslam.results.plot.graph_figures import graph_figure, graph_scene
+from jaxslam.results.plot.grid_figures import (
     grid_figure,
     loops_figure,
     map_scene,
@@ -16,7 +15,7 @@ from jaxslam.results.plot.grids import (
     topology_figure,
 )
 from jaxslam.results.plot.landmarks import ellipse, map_figure, run_map_figure, walls_figure
-from jaxslam.results.plot.measures import (
+from jaxslam.results.plot.measure_figures import (
     cost_figure,
     coverage_figure,
     gained_figure,
@@ -24,6 +23,7 @@ from jaxslam.results.plot.measures import (
     rmse_figure,
     whiteness_figure,
 )
+from jaxslam.results.plot.pose_errors import errors_figure, run_errors_figure
 from jaxslam.results.plot.run_film import (
     History,
     animate,

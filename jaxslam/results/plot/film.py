@@ -1,7 +1,7 @@
-"""A scene, as panels of layers, and its film: an animation of Matplotlib's.
+"""A scene of panels of layers, and its film, an animation of Matplotlib.
 
-A layer is a function of the axes: it draws what stays, makes what changes, and returns a function
-that sets it to frame k. Another kind of film is another layer:
+A layer is a function of the axes: it draws the fixed artists, makes the moving ones, and returns a
+function that sets those to frame k. Another kind of film is another layer:
 
     def growing(maps):  # (F, H, W)
         def layer(axes):
@@ -35,10 +35,10 @@ from jaxslam.results.plot.landmarks import ellipses
 from jaxslam.results.plot.style import INK, PAGE, TEXT, TITLE, panels_of, titled
 
 Draw: TypeAlias = Callable[[int], object]
-"""Sets what a layer has made to frame k."""
+"""Sets the moving artists of a layer to frame k."""
 
 Layer: TypeAlias = Callable[[Axes], Draw]
-"""Draws on the axes what is the same in all frames, and returns what draws frame k."""
+"""Draws the fixed artists on the axes, and returns the function that draws frame k."""
 
 _DPI = 110
 """dots an inch: a film as wide as a page has 788 pixels"""
@@ -50,10 +50,10 @@ _SECONDS, _FASTEST, _SLOWEST = 10.0, 25.0, 2.0
 """A film lasts 10 s, unless it would have more than 25 or fewer than 2 frames a second."""
 
 _EMBEDDED = 100.0
-"""largest size of the player [MB]; Matplotlib leaves frames out above"""
+"""largest size of the player [MB], beyond which Matplotlib leaves out frames"""
 
 _LEVELS = (17 * np.rint(np.arange(256) / 17)).astype(np.uint8)
-"""The 16 levels of a colour that frames have: it is hardly seen, and halves their PNG files."""
+"""The 16 levels of a colour in frames: hardly visible, and PNG files are half as large."""
 
 _ICON_FONT = """<link rel="stylesheet"
 href="https://maxcdn.bootstrapcdn.com/font-awesome/4.4.0/css/font-awesome.min.css">"""
@@ -87,22 +87,22 @@ class Scene:
     frames: int
     main: Panel
     beside: Panel | None = None
-    """in the upper right corner; below it is the legend"""
-    said: Callable[[int], str] = lambda k: f"frame {k + 1}"
+    """in the upper right corner, above the legend"""
+    caption: Callable[[int], str] = lambda k: f"frame {k + 1}"
     """the text above frame k"""
     title: str = ""
     note: str = ""
-    """which steps of a longer run are shown; "" where all are"""
+    """which steps of a longer run are shown; "" for all"""
 
 
 class Film(FuncAnimation):
-    """The film of a scene, an animation of Matplotlib's. A notebook shows its player.
+    """The film of a scene, an animation of Matplotlib. A notebook shows its player.
 
         film = jaxslam.plot.animate(trace, log, truth)
         film.save("slam.gif")
 
     Args:
-        fps: frames a second; default so many that the film lasts 10 s, at most 25.
+        fps: frames per second; by default the film lasts 10 s, with at most 25 a second.
         width: of the figure [in], with letters of 8 pt.
     Raises:
         ValueError: on a scene without frames, an fps or a width that is not above 0.
@@ -129,19 +129,19 @@ class Film(FuncAnimation):
         super().__init__(figure, draw, scene.frames, interval=1000 / fps, **options)
 
     def __del__(self) -> None:
-        """Say nothing of a film that was never drawn, as Matplotlib would."""
+        """No warning about a film that was never drawn, unlike Matplotlib."""
 
     def save(
         self, filename: str | Path, writer: Any = None, *arguments: Any, **options: Any
     ) -> None:
-        """Write GIF (by Pillow), HTML (a player), or MP4 (by ffmpeg), as the name ends.
+        """Write GIF (by Pillow), HTML (a player), or MP4 (by ffmpeg), by the ending of the name.
 
         Args:
             filename: name of the file.
-            writer: one of Matplotlib's in place of those; then the name may end otherwise.
+            writer: another writer of Matplotlib, for any ending.
             arguments, options: of Matplotlib's `Animation.save`.
         Raises:
-            ValueError: on another ending, or .mp4 where ffmpeg is not installed.
+            ValueError: on another ending, or .mp4 without ffmpeg.
         """
         if writer is None and Path(filename).suffix == ".html":
             Path(filename).write_text(self.to_jshtml(), encoding="utf-8")
@@ -149,7 +149,7 @@ class Film(FuncAnimation):
             super().save(filename, writer or _writer_of(filename), *arguments, **options)
 
     def to_jshtml(self, *arguments: Any, **options: Any) -> str:
-        """The player in HTML, which loads nothing; arguments are those of Matplotlib's method."""
+        """The player in HTML, which loads nothing; arguments as for Matplotlib's method."""
         with matplotlib.rc_context({"animation.embed_limit": _EMBEDDED}):
             return super().to_jshtml(*arguments, **options).replace(_ICON_FONT, _ICONS)
 
@@ -163,7 +163,7 @@ def has_ffmpeg() -> bool:
 
 
 def _writer_of(filename: str | Path) -> str:
-    """The name of Matplotlib's writer of a file; ValueError where there is none."""
+    """The name of Matplotlib's writer for a file; ValueError without one."""
     kind = Path(filename).suffix
     if kind not in (".gif", ".mp4"):
         raise ValueError(f"Film.save: expected a name in .gif, .html, .mp4, got {filename}")
@@ -173,7 +173,7 @@ def _writer_of(filename: str | Path) -> str:
 
 
 class _Stage:
-    """The figure of a scene; what its layers have not made is drawn once, for speed."""
+    """The figure of a scene; artists that no layer changes are drawn once, for speed."""
 
     def __init__(self, scene: Scene, width: float) -> None:
         height, widths = 0.645 * width, (2.15, 1.0)
@@ -186,7 +186,7 @@ class _Stage:
         self.size = across / _DPI, tall / _DPI
         figure, (main, beside) = panels_of(*self.size, 1, 2, share=(False, False), widths=widths)
         figure.set_dpi(_DPI)
-        self._canvas, self._said = FigureCanvasAgg(figure), scene.said
+        self._canvas, self._caption = FigureCanvasAgg(figure), scene.caption
         engine = figure.get_layout_engine()
         assert isinstance(engine, ConstrainedLayoutEngine)
         engine.set(rect=(0.0, 0.0, 1.0, 1.0 - _HEAD / self.size[1]))
@@ -210,7 +210,7 @@ class _Stage:
         """Frame k as an array (height, width, 3) of bytes."""
         for draw in self._draws:
             draw(k)
-        self._text.set_text(self._said(k))
+        self._text.set_text(self._caption(k))
         self._canvas.restore_region(self._still)
         for artist in (*self._moving, self._text):
             self._canvas.figure.draw_artist(artist)
@@ -218,7 +218,7 @@ class _Stage:
 
 
 def _furnish(axes: Axes, panel: Panel) -> tuple[list[Draw], list[Artist]]:
-    """Set up the axes of a panel; returns what draws a frame, and what the layers made."""
+    """Set up the axes of a panel; returns its functions of the frame, and its moving artists."""
     axes.set(xlim=panel.xlim, ylim=panel.ylim, xlabel=panel.xlabel, ylabel=panel.ylabel)
     axes.set(aspect="equal", autoscale_on=False)
     if panel.title:
@@ -233,7 +233,7 @@ def _furnish(axes: Axes, panel: Panel) -> tuple[list[Draw], list[Artist]]:
 
 
 def _legend(main: Axes, beside: Axes) -> None:
-    """The legend of both panels, each label once, below the one beside."""
+    """The legend of both panels, each label once, below the smaller panel."""
     handles: dict[object, Artist] = {}
     for axes in (main, beside):
         for handle in axes.get_legend_handles_labels()[0]:
@@ -267,7 +267,7 @@ def still(points: Float[np.ndarray, "N 2"], **look: Any) -> Layer:
 
 
 def line_of(points: Callable[[int], Float[np.ndarray, "N 2"]], **look: Any) -> Layer:
-    """The layer of a line through points(k) in frame k; NaN interrupts it."""
+    """The layer of a line through points(k) in frame k, interrupted at NaN."""
 
     def layer(axes: Axes) -> Draw:
         (line,) = axes.plot([], [], **look)
@@ -282,7 +282,7 @@ def track(path: Float[np.ndarray, "T C"], until: Int[np.ndarray, "F"], **look: A
 
 
 def marks(points: Float[np.ndarray, "F N 2"], shown: Bool[np.ndarray, "F N"], **look: Any) -> Layer:
-    """The layer of points that are others in each frame."""
+    """The layer of points that differ from frame to frame."""
     return line_of(lambda k: points[k][shown[k]], ls="none", **look)
 
 
@@ -311,14 +311,14 @@ def rings(
     shown: Bool[np.ndarray, "F N"],
     **look: Any,
 ) -> Layer:
-    """The layer of 3 σ ellipses that grow and shrink; a covariance that has none is left out."""
+    """The layer of 3 σ ellipses in each frame; indefinite covariances are left out."""
     return line_of(
         lambda k: _apart(ellipses(means[k][shown[k]], covs[k][shown[k]], points=48)), **look
     )
 
 
 def lines_between(ends: Sequence[Float[np.ndarray, "E 2 2"]], **look: Any) -> Layer:
-    """The layer of lines between two points each, others in every frame."""
+    """The layer of lines between pairs of points that differ from frame to frame."""
     return line_of(lambda k: _apart(ends[k]), **look)
 
 
@@ -353,16 +353,16 @@ def weighted_segments(
 def cloud(
     points: Float[np.ndarray, "F P 2"], weight: Float[np.ndarray, "F P"], **look: Any
 ) -> Layer:
-    """The layer of particles, with areas by their weights; one of weight zero is left out."""
+    """The layer of particles, with areas by their weights; without those of weight 0."""
     areas = 4.0 * weight * weight.shape[1]
 
     def layer(axes: Axes) -> Draw:
         dots = axes.scatter([], [], **look)
 
         def draw(k: int) -> None:
-            there = weight[k] > 0
-            dots.set_offsets(points[k][there])
-            dots.set_sizes(np.clip(areas[k][there], 0.5, 60.0))
+            shown = weight[k] > 0
+            dots.set_offsets(points[k][shown])
+            dots.set_sizes(np.clip(areas[k][shown], 0.5, 60.0))
 
         return draw
 
@@ -370,6 +370,6 @@ def cloud(
 
 
 def _apart(lines: Float[np.ndarray, "E C 2"]) -> Float[np.ndarray, "D 2"]:
-    """Lines one after the other, with NaN between them: as one line they are drawn at once."""
+    """Lines joined into one with NaN between them, so that they are drawn at once."""
     gap = np.full((len(lines), 1, 2), np.nan)
     return np.concatenate([lines, gap], axis=1).reshape(-1, 2)

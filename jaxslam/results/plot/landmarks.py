@@ -98,7 +98,7 @@ def square_limits(clouds: Sequence[np.ndarray]) -> Limits:
 
 
 def _finite(clouds: Sequence[np.ndarray]) -> np.ndarray:
-    """The finite ones of some points, the origin if there is none."""
+    """The finite points of some, or else the origin."""
     every = np.concatenate(clouds)
     every = every[np.isfinite(every).all(axis=1)]
     return every if len(every) else np.zeros((1, 2))
@@ -114,7 +114,7 @@ _DASHES = ((0, (4, 5)), (0, (1.5, 3)), (0, (6, 3, 1.5, 3)))
 """Looks of the paths of other filters over the first one's: twelve, with gaps to see it."""
 
 _UPRIGHT = 15
-"""largest number of landmarks whose names stand side by side"""
+"""largest number of landmarks whose names are written horizontally"""
 
 
 def map_figure(
@@ -133,15 +133,15 @@ def map_figure(
 
     Args:
         estimate: with leading T, as in `Trace.estimate`.
-        truth: of a simulated world whose landmarks begin with a place (of lines: of
+        truth: of a simulated world whose landmarks begin with a position (for lines use
             `worlds.with_positions`); or, drawn without alignment,
-        true_points: (N, 2) landmarks [m], in the order of tags where names is given, and
+        true_points: (N, 2) landmarks [m], in the order of tags if names are given, and
         true_path: (T, 2 or 3) poses.
-        dead_reckoning: (T, 2 or 3) poses; what is far from the rest of the map is not shown.
+        dead_reckoning: (T, 2 or 3) poses; parts far from the rest of the map are not shown.
         others: estimates of other filters by name; their paths and landmarks are drawn.
         names: of the landmarks, by tag. A panel below shows the distance of each landmark of the
-            map from its point in true_points, with what its covariance claims in that direction,
-            and lines join the two.
+            map from its point in true_points, with the deviation that its covariance claims
+            in that direction, and lines join the two.
         width: [in].
 
     Raises ValueError if names are given without true_points.
@@ -214,7 +214,7 @@ def run_map_figure(campaign: Campaign, *, title: str = "", width: float = PAGE) 
 def _draw_truth(
     axes: Axes, path: np.ndarray | None, points: np.ndarray | None, kind: str = "true"
 ) -> list[np.ndarray]:
-    """Draw the true path and landmarks; returns what was drawn."""
+    """Draw the true path and landmarks; returns their points."""
     shown = []
     if path is not None:
         shown.append(np.asarray(path)[:, :2])
@@ -227,9 +227,9 @@ def _draw_truth(
 
 
 def _draw_estimate(axes: Axes, estimate: Estimate) -> list[np.ndarray]:
-    """Draw the estimated path with its ends, and the final map; returns what was drawn.
+    """Draw the estimated path with its ends, and the final map; returns their points.
 
-    Covariances that have no ellipse are counted above the panel.
+    Indefinite covariances are counted above the panel.
     """
     pose = np.asarray(estimate.pose)
     alive = np.asarray(estimate.alive[-1])
@@ -266,25 +266,25 @@ def _draw_residuals(
     survey: np.ndarray,
     names: Sequence[object],
 ) -> None:
-    """Draw what parts each landmark from its surveyed point: lines over the map, and lengths."""
+    """Draw the distance of each landmark from its surveyed point, on the map and as lengths."""
     tag = np.asarray(estimate.tag[-1])
-    mine = np.flatnonzero(np.asarray(estimate.alive[-1]) & (tag >= 0))
-    mine = mine[np.argsort(tag[mine])]
-    points, targets = np.asarray(estimate.points[-1])[mine], survey[tag[mine]]
+    tagged = np.flatnonzero(np.asarray(estimate.alive[-1]) & (tag >= 0))
+    tagged = tagged[np.argsort(tag[tagged])]
+    points, targets = np.asarray(estimate.points[-1])[tagged], survey[tag[tagged]]
     label = "residual"
     for ends in zip(points, targets, strict=True):
         over.plot(*np.array(ends).T, color=COLORS[2], lw=1.2, label=label, zorder=4.5)
     error = points - targets
     far = np.hypot(*error.T)
     along = error / np.where(far > 0, far, 1.0)[:, None]
-    covs = np.asarray(estimate.point_covs[-1])[mine]
+    covs = np.asarray(estimate.point_covs[-1])[tagged]
     claim = 3 * np.sqrt(np.maximum(np.einsum("ni,nij,nj->n", along, covs, along), 0.0))
-    at = np.arange(len(mine))
+    at = np.arange(len(tagged))
     claimed = "3 σ claimed in its direction"
     axes.bar(at, claim, 0.7, color=SHADE, label=claimed)
     axes.plot(at, far, "D", color=COLORS[2], ms=4.5, mec="white", mew=0.4, label=label)
-    axes.set_xticks(at, [str(names[tag[i]]) for i in mine])
-    if len(mine) > _UPRIGHT:
+    axes.set_xticks(at, [str(names[tag[i]]) for i in tagged])
+    if len(tagged) > _UPRIGHT:
         axes.tick_params(axis="x", rotation=90)
     axes.grid(axis="x", visible=False)
     axes.set(xlabel="landmark", ylabel="residual [m]")
@@ -305,17 +305,17 @@ def walls_figure(
     title: str = "",
     width: float = PAGE,
 ) -> Figure:
-    """The map of an EKF of `sensors.Line`: each true wall where its estimated line has it.
+    """The map of an EKF of `sensors.Line`: each true wall, projected onto its estimated line.
 
-    A segment of the walls is projected onto the line with its tag, and drawn with the band of the
-    line's 3 σ across it. Walls that were not measured are the true ones alone.
+    A segment of the walls is projected onto the line with its tag, and drawn with a band of 3 σ of
+    the line. Of walls that were not measured only the true ones are drawn.
 
     Args:
         estimate: (T, …); the map is the last one. Tags are those of `simulation.walls.wall_lines`.
         walls: true ones, in the frame of the map.
         path: (T, 2 or 3) true one.
     Raises:
-        ValueError: if the walls have no segments, or a tag is none of theirs.
+        ValueError: if the walls have no segments, or a tag is not one of them.
     """
     of = wall_lines(walls)[1]
     alive = np.asarray(estimate.alive[-1])

@@ -1,6 +1,6 @@
 """Panels of a campaign's filters, all in one or a row for each kind, and their scales.
 
-One extreme filter does not set a scale; what lies beyond it is marked.
+One extreme filter does not set a scale; values beyond it are marked.
 """
 
 from collections.abc import Container, Sequence
@@ -46,16 +46,16 @@ def kinds_of(names: Sequence[str]) -> list[tuple[str, list[str]]]:
     known = {name: kind for kind, members in KINDS.items() for name in members}
     found = []
     for kind in [*KINDS, "others"]:
-        mine = [name for name in names if known.get(name, "others") == kind]
-        found += [(kind, mine[at : at + TOGETHER]) for at in range(0, len(mine), TOGETHER)]
+        chosen = [name for name in names if known.get(name, "others") == kind]
+        found += [(kind, chosen[at : at + TOGETHER]) for at in range(0, len(chosen), TOGETHER)]
     return found
 
 
 def numbers_of(names: Sequence[str]) -> dict[str, int]:
     """The number of each filter of a campaign, which gives its look (`look`) in every figure.
 
-    It is the place among the filters, by kind where there are more than five; so those of a panel
-    have successive numbers.
+    It is the position among the filters, sorted by kind if they are more than five; so the filters
+    of a panel have successive numbers.
     """
     if len(names) > TOGETHER:
         names = [name for _, members in kinds_of(names) for name in members]
@@ -97,8 +97,8 @@ def sheet(
                 titled(axes, quantity)
             else:
                 ordinate(axes, quantity, height)
-        mine = {name: i for name, i in numbers.items() if only is None or name in only}
-        return figure, [Row("", mine, panels)]
+        chosen = {name: i for name, i in numbers.items() if only is None or name in only}
+        return figure, [Row("", chosen, panels)]
     figure, panels = panels_of(
         max(width, PAGE),
         1.05 * len(groups) + 0.7,
@@ -109,10 +109,10 @@ def sheet(
     )
     rows = []
     for i, (kind, members) in enumerate(groups):
-        *own, beside = panels[i * (count + 1) : (i + 1) * (count + 1)]
+        *measured, beside = panels[i * (count + 1) : (i + 1) * (count + 1)]
         beside.set_axis_off()
-        own[0].set_ylabel(kind.replace(" ", "\n"))
-        rows.append(Row(kind, {name: numbers[name] for name in members}, own))
+        measured[0].set_ylabel(kind.replace(" ", "\n"))
+        rows.append(Row(kind, {name: numbers[name] for name in members}, measured))
     for axes, quantity in zip(rows[0].panels, quantities, strict=True):
         titled(axes, quantity)
     return figure, rows
@@ -139,9 +139,9 @@ def add_legends(figure: Figure, rows: Sequence[Row], title: str, across: str) ->
             borderpad=0,
             handlelength=2.6,
         )
-    own = curves_of(rows[0].panels[0])
+    curves = curves_of(rows[0].panels[0])
     everything = rows[0].panels[0].get_legend_handles_labels()[0]
-    caption(figure, title, [handle for handle in everything if handle not in own])
+    caption(figure, title, [handle for handle in everything if handle not in curves])
 
 
 def title_of(campaign: Campaign, what: str) -> str:
@@ -151,7 +151,7 @@ def title_of(campaign: Campaign, what: str) -> str:
 
 
 _FAR = 3.0
-"""A filter whose curve rises above so many times the median does not set a scale."""
+"""A filter whose curve exceeds this multiple of the median does not set a scale."""
 
 _NEES = (1 / 10, 10.0, 100.0)
 """lowest end of a scale of NEES, and least and greatest upper end, in multiples of dof"""
@@ -160,13 +160,13 @@ _BAND = 0.06
 """share of the height of a panel that the 95 % band fills at least, where the scale allows it"""
 
 _POWERS = 6
-"""a logarithmic axis has a label at every power of ten if they are at most so many"""
+"""largest number of powers of ten for which a logarithmic axis labels all of them"""
 
 BEYOND = "beyond"
-"""`gid` of the marks of what lies beyond an axis."""
+"""`gid` of the marks of values beyond an axis."""
 
 _NO_MARK = "", " ", "None", "none"
-"""what Matplotlib calls the mark of a line without marks"""
+"""Matplotlib's names for a line without markers"""
 
 _PLACES = 12
 """number of marks along an edge"""
@@ -175,7 +175,7 @@ _PLACES = 12
 def scale_setters(campaign: Campaign) -> list[str]:
     """The filters that set the scale of errors: those that fused measurements and do not diverge.
 
-    All filters where there are none such.
+    All filters if there are none.
     """
     names = [
         name
@@ -190,12 +190,12 @@ def common_top(peaks: dict[str, float], setters: list[str]) -> float:
 
     0 without a finite peak.
     """
-    there = {name: peak for name, peak in peaks.items() if np.isfinite(peak)}
-    mine = sorted(peak for name, peak in there.items() if name in setters) or sorted(there.values())
-    if not mine:
+    finite = {name: peak for name, peak in peaks.items() if np.isfinite(peak)}
+    chosen = [peak for name, peak in finite.items() if name in setters] or list(finite.values())
+    if not chosen:
         return 0.0
-    limit = _FAR * mine[len(mine) // 2]
-    return max(peak for peak in there.values() if peak <= limit)
+    limit = _FAR * sorted(chosen)[len(chosen) // 2]
+    return max(peak for peak in finite.values() if peak <= limit)
 
 
 def nees_scale(axes: Axes, campaign: Campaign, block: str) -> None:
@@ -231,7 +231,7 @@ def set_positive(
     """Set an axis (x or y) for numbers from low to high, with a margin as a share of the length.
 
     It is logarithmic if the largest is over `linear` times the smallest, with labels at 1, 2 and 5
-    of each decade, or 1 and 3, or 1 alone, as there is room.
+    of each decade, or 1 and 3, or 1 alone, by the room.
     """
     axis = axes.yaxis if which == "y" else axes.xaxis
     set_limits = axes.set_ylim if which == "y" else axes.set_xlim
@@ -268,10 +268,11 @@ def power(x: float) -> str:
 
 
 def mark_beyond(axes: Axes) -> None:
-    """Mark what lies beyond the ends of the ordinate, with the marks of the curves at the edges.
+    """Mark values beyond the ends of the ordinate with the markers of their curves, at the edges.
 
-    Each filter has its own places; a curve without marks has arrows. The greatest value is written
-    above the panel, the least one only if the axis goes below 0. Call it when the limits are set.
+    Marks of different filters are at different places; a curve without marks has arrows. The
+    greatest value is written above the panel, the least one only if the axis goes below 0. Call it
+    after the limits are set.
     """
     low, high = axes.get_ylim()
     left, right = axes.get_xlim()
@@ -287,7 +288,7 @@ def mark_beyond(axes: Axes) -> None:
             offset = (i + 0.5) / max(len(curves), 1)
             places = np.interp((np.arange(_PLACES) + offset) / _PLACES, [0, 1], [left, right])
         near = np.abs(x[:, None] - places).argmin(axis=0)
-        own = str(line.get_marker())
+        marker = str(line.get_marker())
         for out, edge, arrow in ((y > high, 1.0, "$\u2191$"), (y < low, 0.0, "$\u2193$")):
             if not out.any():
                 continue
@@ -296,7 +297,7 @@ def mark_beyond(axes: Axes) -> None:
             axes.plot(
                 x[at],
                 np.full(len(at), edge),
-                marker=arrow if own in _NO_MARK else own,
+                marker=arrow if marker in _NO_MARK else marker,
                 linestyle="none",
                 transform=axes.get_xaxis_transform(),
                 color=line.get_color(),
@@ -309,7 +310,7 @@ def mark_beyond(axes: Axes) -> None:
             )
         largest = max(largest, y.max())
         least = min(least, y.min())
-    said = [f"↑ to {power(largest)}"] if largest > high else []
-    said += [f"↓ to −{power(-least)}"] if least < low < 0 else []
-    if said:
-        axes.set_title(", ".join(said), loc="right", fontsize=7, color=INK)
+    texts = [f"↑ to {power(largest)}"] if largest > high else []
+    texts += [f"↓ to −{power(-least)}"] if least < low < 0 else []
+    if texts:
+        axes.set_title(", ".join(texts), loc="right", fontsize=7, color=INK)

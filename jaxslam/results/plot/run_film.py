@@ -15,6 +15,7 @@ from jaxslam.core.numbers import check_count
 from jaxslam.core.protocols import Candidate, Filter
 from jaxslam.core.types import Estimate, Log, Status, Trace, Truth
 from jaxslam.core.validation import check_record
+from jaxslam.driver import run
 from jaxslam.filters.delayed.state import DelayedState, covariance_blocks
 from jaxslam.filters.information.eif_slam import CanonicalState
 from jaxslam.filters.information.marginals import local_information
@@ -37,7 +38,6 @@ from jaxslam.results.plot.film import (
 )
 from jaxslam.results.plot.landmarks import Limits, ellipses, extent, square_limits
 from jaxslam.results.plot.style import COLORS, FAINT, INK, Look
-from jaxslam.run import run
 from jaxslam.simulation.worlds import World, run_keys, with_positions, world_of_run
 
 _ROBOT_LINK, _LINK = COLORS[5], COLORS[3]
@@ -77,11 +77,11 @@ class Hypotheses(NamedTuple):
 
 
 def probe(state: PyTree) -> Cloud | Links | Hypotheses | None:
-    """What `animate` shows of the state of a particle filter, information filter or `DelayedSlam`.
+    """The part of the state that `animate` shows: particles, links or hypotheses.
 
         trace = jaxslam.run(filter, log, pose, pose_cov, key, probe=jaxslam.plot.probe)
 
-    None of other filters, whose films need no probe; `mapping`, of one particle, is among them.
+    Of a particle filter, an information filter or `DelayedSlam`; None of others, as of `Mapping`.
     """
     if isinstance(state, SlamParticles | PoseParticles) and state.log_weight.ndim:
         return Cloud(state.pose, jnp.exp(state.log_weight))
@@ -112,9 +112,11 @@ def _links(omega: Float[Array, "D D"], size: int) -> Links:
     rows = np.concatenate([np.arange(2)[None], landmarks])
     blocks = omega[rows[:, None, :, None], rows[None, :, None, :]]
     norm = jnp.sqrt((blocks**2).sum(axis=(2, 3)))
-    own = jnp.sqrt(jnp.diagonal(norm))
+    diagonal = jnp.sqrt(jnp.diagonal(norm))
     apart = ~np.eye(len(rows), dtype=bool)
-    return Links(jnp.where(apart, norm / (own[:, None] * own[None, :]), 0.0).astype(jnp.float32))
+    return Links(
+        jnp.where(apart, norm / (diagonal[:, None] * diagonal[None, :]), 0.0).astype(jnp.float32)
+    )
 
 
 def particle_layer(seen: Cloud, origin: np.ndarray, label: str) -> Layer:
@@ -139,7 +141,7 @@ def hypothesis_layers(seen: object) -> list[Layer]:
 
 
 def link_layers(seen: object, estimate: Estimate) -> list[Layer]:
-    """The layers of the links of an information matrix, as wide as strong; lately cut ones dotted.
+    """The layers of the links of an information matrix, as wide as strong; recent cuts dotted.
 
     None where `seen` is not `Links`. estimate: with leading F, as the links.
     """
@@ -153,16 +155,16 @@ def link_layers(seen: object, estimate: Estimate) -> list[Layer]:
     weights: dict[str, list[np.ndarray]] = {"between": [], "robot": []}
     for k, step in enumerate(strength):
         nodes = np.concatenate([estimate.pose[k, None, :2], estimate.points[k]])
-        there = np.triu(step > 0)
-        lately = np.triu(strength[max(0, k - _CUT_FOR) : k + 1].max(axis=0) > 0)
-        i, j = np.nonzero(there)
+        linked = np.triu(step > 0)
+        recent = np.triu(strength[max(0, k - _CUT_FOR) : k + 1].max(axis=0) > 0)
+        i, j = np.nonzero(linked)
         ends, weight = nodes[np.stack([i, j], axis=1)], np.minimum(step[i, j], 1.0)
         between.append(ends[i > 0])
         robot.append(ends[i == 0])
         weights["between"].append(weight[i > 0])
         weights["robot"].append(np.maximum(weight[i == 0], _SEEN))
         alive = np.append(True, estimate.alive[k])
-        gone = lately & ~there & alive[:, None] & alive[None, :]
+        gone = recent & ~linked & alive[:, None] & alive[None, :]
         cut.append(nodes[np.stack(np.nonzero(gone), axis=1)])
     look: Look = {"capstyle": "round", "zorder": 2.6}
     dots: Look = {"color": INK, "lw": 1.0, "ls": (0, (1, 1.2)), "zorder": 2.8}
@@ -205,7 +207,7 @@ def frame_steps(
 
 
 class History(NamedTuple):
-    """A run of T steps, of which F are frames; NumPy arrays."""
+    """A run of T steps with F frames, as NumPy arrays."""
 
     path: Float[np.ndarray, "T 3"]
     """the estimated pose of every step"""
@@ -248,12 +250,12 @@ def history_of(trace: Trace, log: Log, frames: int = MOST) -> History:
 
 
 class Measured(NamedTuple):
-    """The measurements of the steps since the frame before, of each of F frames."""
+    """The measurements since the previous frame, for each of F frames."""
 
     beams: dict[str, list[Float[np.ndarray, "E 2 2"]]]
-    """by what became of them: from the robot to the landmark, of those that have one in the map"""
+    """by outcome: from the robot to the landmark, if that is in the map"""
     counts: dict[str, Int[np.ndarray, "F"]]
-    """how many there are, by the same"""
+    """number of measurements, by outcome"""
 
 
 _OUTCOMES = {
@@ -268,7 +270,7 @@ def measured(history: History) -> Measured:
     """The beams and counts of a history.
 
     A beam begins where the robot was estimated in that step, and ends at the landmark's estimate in
-    the frame. A dropped measurement has the landmark of its tag, where that is in the map.
+    the frame. A dropped measurement has the landmark of its tag, if that is in the map.
     """
     beams: dict[str, list[np.ndarray]] = {name: [] for name in _OUTCOMES}
     counts: dict[str, list[int]] = {name: [] for name in _OUTCOMES}
@@ -282,19 +284,19 @@ def measured(history: History) -> Measured:
         match = (tag[..., None] == history.estimate.tag[k]) & named
         by_tag = np.where(match.any(axis=-1), match.argmax(axis=-1), -1) if named.size else -1
         target = np.where(slot >= 0, slot, by_tag)
-        there = (target >= 0) & (target < len(alive))
-        there &= np.append(alive, False)[np.where(there, target, -1)]
+        in_map = (target >= 0) & (target < len(alive))
+        in_map &= np.append(alive, False)[np.where(in_map, target, -1)]
         for name, outcomes in _OUTCOMES.items():
-            mine = np.isin(status, outcomes)
-            counts[name].append(int(mine.sum()))
-            row, at = np.nonzero(mine & there)
+            chosen = np.isin(status, outcomes)
+            counts[name].append(int(chosen.sum()))
+            row, at = np.nonzero(chosen & in_map)
             ends = [history.path[rows][row, :2], np.asarray(points)[target[row, at]]]
             beams[name].append(np.stack(ends, axis=1))
     return Measured(beams, {name: np.array(found) for name, found in counts.items()})
 
 
 _NEAR = 1.5
-"""What the estimate adds to the limits of the truth: at most this factor."""
+"""Largest factor by which the estimate extends the limits of the truth."""
 
 _ROBOT = 0.035
 """length of the robot from its position to its tip, as a share of the map's side"""
@@ -308,7 +310,7 @@ _BEAMS: dict[str, Look] = {
     "stored": {"color": COLORS[5], "lw": 0.9, "ls": (0, (6, 1.3, 1.4, 1.3))},
     "dropped": {"color": INK, "lw": 0.9, "ls": (0, (1, 1.5))},
 }
-"""Beams by what became of the measurement: another dash each, for readers without colour."""
+"""Beams by outcome of the measurement; dashes differ, for readers without colour."""
 
 
 def run_scene(
@@ -322,7 +324,7 @@ def run_scene(
 
     A history with particles, links or hypotheses shows these, too. Beside the map is the error of
     the robot's position within its ellipse, on a fixed scale. The limits are those of the truth, or
-    of the estimate where there is none.
+    else of the estimate.
 
     Args:
         true_points: (N, 2) landmarks [m], in the frame of the map.
@@ -363,7 +365,7 @@ def run_scene(
 
 
 def _limits(history: History, points: np.ndarray | None, path: np.ndarray | None) -> Limits:
-    """The limits of the map: of the truth, else the estimate; and of what is near of the rest."""
+    """The limits of the map: those of the truth, or else the estimate, extended by near points."""
     alive = history.estimate.alive
     mapped = np.asarray(history.estimate.points)[alive]
     covs = np.asarray(history.estimate.point_covs)[alive]
@@ -404,7 +406,7 @@ def _beams(found: Measured) -> list[Layer]:
 
 
 def _map(history: History) -> list[Layer]:
-    """The layers of the map's landmarks with their ellipses; none of a filter without a map."""
+    """The layers of the landmarks with their ellipses; none for a filter without a map."""
     _, _, points, covs, alive, _ = map(np.asarray, history.estimate)
     if not np.any(alive):
         return []
@@ -473,14 +475,14 @@ def _nearby(history: History, path: np.ndarray | None) -> Panel:
 
 
 def _text(history: History, found: Measured) -> Callable[[int], str]:
-    """The line above frame k: its step, and what became of the measurements since the last."""
+    """The line above frame k: its step, and the outcomes of the measurements since the last."""
     total = len(history.path)
     lost = []
     for covs, alive in zip(history.estimate.point_covs, history.estimate.alive, strict=True):
         contours = ellipses(np.zeros((alive.sum(), 2)), covs[alive], points=1)
         lost.append(int(np.isnan(contours).all(axis=(1, 2)).sum()))
 
-    def said(k: int) -> str:
+    def caption(k: int) -> str:
         counts = {name: int(of[k]) for name, of in found.counts.items()}
         shown = [f"{count} {name}" for name, count in counts.items() if count or name != "stored"]
         parts = [f"step {history.step[k] + 1:,} of {total:,}"]
@@ -493,7 +495,7 @@ def _text(history: History, found: Measured) -> Callable[[int], str]:
         parts += [] if np.isfinite(history.estimate.pose[k]).all() else ["pose not finite"]
         return " · ".join(parts)
 
-    return said
+    return caption
 
 
 def animate(
@@ -514,8 +516,8 @@ def animate(
 
     With a trace of `run(…, probe=jaxslam.plot.probe)` it shows the particles of a particle filter,
     the links of an information filter, and the hypotheses of `DelayedSlam`. Of more than `frames`
-    steps so many are shown, evenly in time; a frame has the beams of the steps since the one
-    before. `film.scene.note` says so.
+    steps, `frames` are shown, evenly in time, each with the beams since the previous one, and
+    `film.scene.note` says so.
 
     Args:
         trace, log: of `run`, T steps.
@@ -548,7 +550,7 @@ def animate_world(
     dtype: DTypeLike | None = None,
     **options: Any,
 ) -> Film:
-    """The film of a filter in a simulated world, with what `probe` has of its state.
+    """The film of a filter in a simulated world, with the `probe` of its state.
 
         world = jaxslam.scenarios.cloister()
         jaxslam.plot.animate_world(world, jaxslam.catalog.variant(world), jax.random.key(0))

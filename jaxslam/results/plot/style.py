@@ -27,7 +27,7 @@ COLORS = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#00
 """A palette for colour-blind readers (Okabe & Ito)."""
 
 INK, FAINT, SHADE, RULE = "#333333", "#777777", "#bdbdbd", "#dddddd"
-"""Colours of what is no filter's: lines and text, dead reckoning, bands, the grid."""
+"""Colours of everything but filters: lines and text, dead reckoning, bands, the grid."""
 
 HUES = (*COLORS[:4], "#c98500", "#7d5f1f")
 """Colours of filters; yellow and brown can be seen on a grey band."""
@@ -39,7 +39,7 @@ CURVE = "curve"
 """`gid` of the lines of filters."""
 
 _FEW = 12
-"""A curve of so many values has a mark at each."""
+"""Largest number of values of a curve with a mark at each."""
 
 _NO_DATE = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
 
@@ -61,7 +61,7 @@ def look(i: int) -> Look:
 def encode(figure: Figure, kind: str, dpi: float = 200) -> bytes:
     """The figure as a file of a kind, png, pdf or svg; the same bytes every time."""
     out = io.BytesIO()
-    # TrueType fonts in PDF, as publishers ask; the same names of parts in every SVG file.
+    # TrueType fonts in PDF, which publishers require; reproducible names of parts in SVG.
     with matplotlib.rc_context({"pdf.fonttype": 42, "svg.hashsalt": "jaxslam"}):
         figure.savefig(out, format=kind, dpi=dpi, metadata=_NO_DATE.get(kind))
     return out.getvalue()
@@ -81,8 +81,8 @@ def describe(figure: Figure) -> str:
     across = next(filter(None, (a.get_xlabel() for a in figure.axes)), "")
     legends = [*figure.legends, *filter(None, (a.get_legend() for a in figure.axes))]
     named = [text.get_text() for legend in legends for text in legend.get_texts()]
-    said = f"{'; '.join(filter(None, panels))} against {across}".replace("\n", " ")
-    return (f"{said}. Drawn: {', '.join(named)}." if named else f"{said}.").replace(r"\$", "$")
+    text = f"{'; '.join(filter(None, panels))} against {across}".replace("\n", " ")
+    return (f"{text}. Drawn: {', '.join(named)}." if named else f"{text}.").replace(r"\$", "$")
 
 
 class _ShownFigure(Figure):
@@ -115,7 +115,7 @@ def panels_of(
 ) -> tuple[Figure, list[Axes]]:
     """An empty figure, width by height inches, and its panels row by row.
 
-    share: whether panels share abscissae and ordinates, as Matplotlib says it. widths, heights:
+    share: whether panels share abscissae and ordinates, as in Matplotlib. widths, heights:
     ratios of columns and rows.
     """
     figure = _ShownFigure(figsize=(width, height), dpi=150, layout="constrained")
@@ -155,9 +155,9 @@ def titled(axes: Axes, text: str) -> None:
 def curve(
     axes: Axes, i: int, x: np.ndarray, y: np.ndarray, label: str, *, absent: str = "no values"
 ) -> None:
-    """Draw the curve of filter number i with marks, in other places than those of its neighbours.
+    """Draw the curve of filter number i with marks, shifted against those of its neighbours.
 
-    A curve without a finite value has an entry in the legend that says so: absent.
+    absent: the entry in the legend of a curve without a finite value.
     """
     label, finite = plain(label), np.isfinite(x) & np.isfinite(y)
     if not finite.any():
@@ -186,7 +186,7 @@ def curves_of(axes: Axes) -> list[Line2D]:
 
 
 def band(axes: Axes, x: np.ndarray, low: np.ndarray, high: np.ndarray, label: str) -> None:
-    """Shade what lies between two curves: light, so that curves stand out, within thin edges."""
+    """Shade the area between two curves, light and with thin edges, so that curves stand out."""
     look: Look = {"fc": (SHADE, 0.35), "ec": FAINT, "lw": 0.4}
     axes.fill_between(x, low, high, label=label, zorder=1, **look)
 
@@ -231,7 +231,7 @@ def caption(figure: Figure, title: str, handles: Sequence[Artist] | None = None)
 
 
 def every_handle(panels: Sequence[Axes]) -> list[Artist]:
-    """What the legend of some panels shows: the last of those with the same label."""
+    """The handles for the legend of some panels, the last one of each label."""
     found = [handle for axes in panels for handle in axes.get_legend_handles_labels()[0]]
     return list({handle.get_label(): handle for handle in found}.values())
 

@@ -1,16 +1,26 @@
-"""Named, published experiments with their parameters and figures, one a file."""
+"""Named, published experiments with their parameters and figures."""
 
 from collections.abc import Callable
 
-from jaxslam.simulation.scenarios.circle import circle
-from jaxslam.simulation.scenarios.cloister import cloister, cloister_noisy
-from jaxslam.simulation.scenarios.explore import explore
-from jaxslam.simulation.scenarios.lines import office_lines, square_lines
-from jaxslam.simulation.scenarios.loop import loop, loop_bearing
-from jaxslam.simulation.scenarios.rooms import ROOMS, circular_room, corridor, office, square
-from jaxslam.simulation.scenarios.stationary import stationary
-from jaxslam.simulation.scenarios.view import BetweenRanges
-from jaxslam.simulation.scenarios.webmap import webmap
+from jaxslam.simulation.scans import BetweenRanges
+from jaxslam.simulation.scenarios.drives import explore, webmap
+from jaxslam.simulation.scenarios.published import (
+    circle,
+    cloister,
+    cloister_noisy,
+    loop,
+    loop_bearing,
+    stationary,
+)
+from jaxslam.simulation.scenarios.rooms import (
+    ROOMS,
+    circular_room,
+    corridor,
+    office,
+    office_lines,
+    square,
+    square_lines,
+)
 from jaxslam.simulation.worlds import Scenario
 
 SCENARIOS: dict[str, Callable[..., Scenario]] = {
@@ -25,7 +35,7 @@ SCENARIOS: dict[str, Callable[..., Scenario]] = {
     "stationary": stationary,
     "webmap": webmap,
 }
-"""By name; each takes the number of steps, and has the published one as default."""
+"""By name; each takes the number of steps, by default that of the publication."""
 
 __all__ = [
     "ROOMS",

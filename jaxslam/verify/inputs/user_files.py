@@ -16,9 +16,9 @@ from jaxslam.graphs import Factor
 from jaxslam.laser.grids.beam_models import BeamModel
 from jaxslam.simulation.worlds import World
 from jaxslam.verify import Check, Report, build
-from jaxslam.verify.errors import describe_error, is_user_file, place_of_error
 from jaxslam.verify.examination import Model
 from jaxslam.verify.inputs.functions import Claim, makes_a_model
+from jaxslam.verify.user_errors import describe_error, is_user_file, place_of_error
 
 _CLAIMS = ("_jacobian", "_jacobians")
 """Endings of names: f_jacobian is the hand-derived Jacobian of f."""

@@ -16,7 +16,7 @@ from jaxslam.consistency.campaign.candidates import fitting_block, without_noise
 from jaxslam.core.record import record
 from jaxslam.core.types import Status, Truth
 from jaxslam.filters import reporting
-from jaxslam.laser.grids.localization import info_of_beams
+from jaxslam.laser.grids.grid_localization import info_of_beams
 from jaxslam.simulation.laser import scan_world
 from jaxslam.simulation.scenarios import square
 

@@ -18,10 +18,10 @@ from jaxslam.association import Nearest
 from jaxslam.core.types import Status
 from jaxslam.filters import DeadReckoning, DelayedSlam
 from jaxslam.filters.delayed.confirmation import constraints_of, correct_hypotheses
+from jaxslam.filters.delayed.delayed_settings import Hypotheses, Promotion, StoredMeasurements
 from jaxslam.filters.delayed.hypotheses import UncertainPoints, closer_than, point_residuals
 from jaxslam.filters.delayed.initialization import add_landmark, initial_estimate
 from jaxslam.filters.delayed.intersection import add_hypotheses
-from jaxslam.filters.delayed.settings import Hypotheses, Promotion, StoredMeasurements
 from jaxslam.filters.delayed.state import TableLayout
 from jaxslam.filters.delayed.triangulation import Circles, Rays, triangulation_of
 from jaxslam.math.stats import chi2_quantile

@@ -12,8 +12,8 @@ from cases import refused
 
 from jaxslam import motion, sensors, slots
 from jaxslam.core.types import Log, Scan, Status
+from jaxslam.driver import run
 from jaxslam.filters import EkfSlam
-from jaxslam.run import run
 from jaxslam.simulation.scenarios import cloister
 from jaxslam.simulation.worlds import simulate
 

@@ -13,12 +13,12 @@ from worlds import draw, narrow
 from jaxslam import charts, linearize, motion, sensors
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Status
+from jaxslam.driver import run
 from jaxslam.filters import EkfSlam
+from jaxslam.filters.ekf.ekf_settings import EkfSettings
 from jaxslam.filters.ekf.predict import propagate
-from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.update import correct_in_turn
 from jaxslam.math.stats import sigma_gate
-from jaxslam.run import run
 from jaxslam.simulation.scenarios import circle, cloister
 from jaxslam.simulation.worlds import simulate
 

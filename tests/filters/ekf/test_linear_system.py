@@ -14,12 +14,12 @@ from jaxslam import catalog, charts, filters, life, linearize, sensors
 from jaxslam.core.record import record
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Scan
+from jaxslam.driver import run
 from jaxslam.filters import Closing, EkfSlam, Filter, Monitored, Wrapper
+from jaxslam.filters.ekf.ekf_settings import EkfSettings
 from jaxslam.filters.ekf.predicted_measurements import prediction_of
-from jaxslam.filters.ekf.settings import EkfSettings
 from jaxslam.filters.ekf.update import correct
 from jaxslam.linearize import FirstEstimate
-from jaxslam.run import run
 
 SENSOR = sensors.RangeBearing(np.diag([0.1, 0.02]) ** 2, mount=(0.2, -0.1, 0.4))
 COUNT = 4

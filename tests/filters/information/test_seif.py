@@ -15,7 +15,8 @@ from jaxslam.charts import Euclidean
 from jaxslam.core.protocols import Filter
 from jaxslam.core.record import record
 from jaxslam.core.types import Scan, Status
-from jaxslam.filters.information import active_set, sparse_state, sparsification
+from jaxslam.driver import run
+from jaxslam.filters.information import active_set, sparse_state
 from jaxslam.filters.information.eif_slam import InPieces
 from jaxslam.filters.information.marginals import (
     blanket_cov,
@@ -25,9 +26,7 @@ from jaxslam.filters.information.marginals import (
     whole_information,
 )
 from jaxslam.filters.reporting import nothing_of
-from jaxslam.run import run
-from jaxslam.simulation.scenarios import cloister
-from jaxslam.simulation.scenarios.view import BetweenRanges
+from jaxslam.simulation.scenarios import BetweenRanges, cloister
 
 COUNT = 36
 """landmarks of the cloister"""
@@ -258,7 +257,7 @@ def test_sparsification_is_overconfident():
     root = rng.normal(size=(9, 9))
     omega = root @ root.T + 0.1 * np.eye(9)
     gone = np.array([False, False, True])
-    sparsify = jax.jit(sparsification.sparsify)
+    sparsify = jax.jit(sparse_state.sparsify)
     after, nats = sparsify(omega, gone)
     after = np.asarray(after)
     assert np.linalg.eigvalsh(after)[0] > 0
@@ -296,13 +295,13 @@ def test_sparsification_of_some_is_overconfident_about_the_rest():
 def test_the_least_psd_completion_of_a_link():
     rng = np.random.default_rng(0)
     links = [*rng.normal(size=(20, 2, 2)), np.zeros((2, 2)), np.outer([1.0, 2.0], [3.0, 1.0])]
-    completion = jax.jit(sparsification.psd_completion)
+    completion = jax.jit(sparse_state.psd_completion)
     for link in links:
         u, v = (np.asarray(part) for part in completion(link))
         np.testing.assert_allclose(u @ u, link @ link.T, atol=1e-12)
         np.testing.assert_allclose(v @ v, link.T @ link, atol=1e-12)
         assert np.linalg.eigvalsh(np.block([[u, link], [link.T, v]]))[0] > -1e-12
-    slope = jax.jit(jax.grad(lambda b: sparsification.psd_completion(b)[0].sum()))(np.zeros((2, 2)))
+    slope = jax.jit(jax.grad(lambda b: sparse_state.psd_completion(b)[0].sum()))(np.zeros((2, 2)))
     assert np.isfinite(slope).all()
 
 

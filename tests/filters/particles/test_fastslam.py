@@ -15,10 +15,10 @@ from reference.plane import from_frame
 from jaxslam import association, life, motion, resampling, sensors
 from jaxslam.consistency.measures.counts import counted
 from jaxslam.core.types import Scan, Status
+from jaxslam.driver import run
 from jaxslam.filters import FastSlam
 from jaxslam.filters.particles import slam_particles
 from jaxslam.filters.particles.slam_particles import SlamParticles
-from jaxslam.run import run
 
 KEY = jax.random.key(5)
 MOUNT = np.array([0.1, -0.05, 0.3])  # of worlds.ring

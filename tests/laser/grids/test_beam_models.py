@@ -19,7 +19,7 @@ from jaxslam.laser.grids.beam_models import (
     log_likelihood,
     mixture_log_density,
 )
-from jaxslam.simulation.walls import rasterize, walls
+from jaxslam.simulation.walls import make_walls, rasterize
 
 MIXTURE = Mixture(0.6, 0.2, 0.05, 0.15, 0.15, 0.8)
 FAR = 4.0
@@ -28,7 +28,7 @@ log_density = jax.jit(lambda mixture, z, star: mixture_log_density(mixture, z, s
 
 @pytest.fixture(scope="module")
 def room():
-    return rasterize(walls([[0, 0], [5, 0], [5, 3], [0, 3]]), 0.05)
+    return rasterize(make_walls([[0, 0], [5, 0], [5, 3], [0, 3]]), 0.05)
 
 
 def beams(count=24, seed=0):

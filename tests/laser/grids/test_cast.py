@@ -9,7 +9,7 @@ from cases import refused, swept
 from reference.plane import from_frame
 
 from jaxslam import grids
-from jaxslam.simulation.walls import exact_ranges, is_free, rasterize, walls
+from jaxslam.simulation.walls import exact_ranges, is_free, make_walls, rasterize
 
 ANGLES = np.linspace(-np.pi, np.pi, 37)[:-1] + 0.05
 
@@ -154,7 +154,7 @@ def rooms():
     outer = [[0, 0], [6, 0.7], [7, 4], [3.1, 5.3], [-0.8, 3.6]]
     turn = 2 * np.pi * np.arange(8) / 8 + 0.2
     pillar = np.array([4.6, 2.4]) + 0.5 * np.stack([np.cos(turn), np.sin(turn)], axis=1)
-    return walls(outer, pillar, circles=[[1.7, 2.9, 0.45]])
+    return make_walls(outer, pillar, circles=[[1.7, 2.9, 0.45]])
 
 
 def test_ranges_are_those_of_exact_geometry_to_a_tenth_of_a_cell():

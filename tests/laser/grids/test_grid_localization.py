@@ -11,10 +11,10 @@ from jaxslam import consistency, grids, motion, run
 from jaxslam.core.types import Beams, Scan, Status
 from jaxslam.resampling import kld_bound
 from jaxslam.simulation.laser import Laser, LaserWorld, scan_world
-from jaxslam.simulation.walls import rasterize, walls
+from jaxslam.simulation.walls import make_walls, rasterize
 
 KEY = jax.random.key(3)
-ROOM = walls([[0, 0], [5, 0], [5, 2], [3, 2], [3, 3], [0, 3]])  # no two poses look alike
+ROOM = make_walls([[0, 0], [5, 0], [5, 2], [3, 2], [3, 3], [0, 3]])  # no two poses look alike
 GRID = rasterize(ROOM, 0.1)
 FAR = 8.0
 MODEL = grids.LikelihoodField(0.1, max_range=FAR)

@@ -7,10 +7,10 @@ import pytest
 from ring_of_rooms import SETTINGS, driven
 
 from jaxslam import graphs, laser_slam, metrics
-from jaxslam.laser.laser_slam import covariances
+from jaxslam.laser.laser_slam import end_covariances
 from jaxslam.laser.laser_slam import score as module
 from jaxslam.laser.laser_slam.assembly import ROOM, graph_of, relative_covs, table_of
-from jaxslam.laser.laser_slam.loops.candidates import SECTORS, descriptors
+from jaxslam.laser.laser_slam.loops.loop_candidates import SECTORS, descriptors
 from jaxslam.laser.laser_slam.loops.pairwise import clique, consistent
 from jaxslam.math import numpy_poses as poses
 
@@ -23,22 +23,22 @@ def chain():
     root = 0.05 * random.normal(size=(11, 3, 3))
     covs = root @ np.swapaxes(root, 1, 2) + 1e-4 * np.eye(3)
     path = poses.chain(np.array([1.0, -2.0, 0.7]), steps)
-    return path, steps, covs, covariances.along(path, covs)
+    return path, steps, covs, end_covariances.along(path, covs)
 
 
 def test_covariance_along_a_chain_step_by_step(chain):
     path, steps, covs, total = chain
     cov = np.zeros((3, 3))
     for k in range(4, 9):
-        cov = covariances.composed_cov(cov, steps[k], covs[k])
+        cov = end_covariances.composed_cov(cov, steps[k], covs[k])
     np.testing.assert_allclose(
-        covariances.relative_cov(total, path, np.array(4), np.array(9)), cov, rtol=1e-9
+        end_covariances.relative_cov(total, path, np.array(4), np.array(9)), cov, rtol=1e-9
     )
     z = poses.between(path[4], path[9])
-    back = covariances.relative_cov(total, path, np.array(9), np.array(4))
-    np.testing.assert_allclose(covariances.moved(cov, poses.inverse(z)), back, rtol=1e-9)
+    back = end_covariances.relative_cov(total, path, np.array(9), np.array(4))
+    np.testing.assert_allclose(end_covariances.moved(cov, poses.inverse(z)), back, rtol=1e-9)
     np.testing.assert_allclose(
-        covariances.at_end(covariances.of_coordinates(cov, z), z), cov, rtol=1e-9
+        end_covariances.at_end(end_covariances.of_coordinates(cov, z), z), cov, rtol=1e-9
     )
 
 
@@ -49,7 +49,9 @@ def test_covariance_along_a_chain_is_that_of_the_graph(chain):
     found = graphs.optimize(graph, room=ROOM, iterations=0)
     pairs = np.array([[2, 7], [0, 11]])
     np.testing.assert_allclose(
-        relative_covs(found, pairs), covariances.relative_cov(total, path, *pairs.T), rtol=1e-6
+        relative_covs(found, pairs),
+        end_covariances.relative_cov(total, path, *pairs.T),
+        rtol=1e-6,
     )
 
 
@@ -78,7 +80,7 @@ def test_true_loops_agree_as_often_as_their_probability_says(chain):
         error = (root @ random.normal(size=(11, 3, 1)))[..., 0]
         drawn = poses.chain(path[0], poses.compose(steps, error))
         z = poses.compose(true, 1e-3 * random.normal(size=(2, 3)))
-        total = covariances.along(drawn, 1e-3 * covs)
+        total = end_covariances.along(drawn, 1e-3 * covs)
         agreed += consistent(drawn, total, first, second, z, cov, 0.9)[0, 1]
     assert abs(agreed / 300 - 0.9) < 3 * np.sqrt(0.9 * 0.1 / 300)
 
@@ -170,7 +172,7 @@ def test_the_covariances_are_those_of_the_dense_inverse(drive, monkeypatch):
     between = np.setdiff1d(np.arange(count), found.keyframe)
     assert len(found.keyframe) > 8 and len(between) > 8 and found.base[3] == 1
     scans = np.arange(1, count)
-    of_path = covariances.of_coordinates(
+    of_path = end_covariances.of_coordinates(
         laser_slam.relation_covs(found, 0 * scans, scans), found.poses[1:]
     )
     np.testing.assert_allclose(of_path, found.cov[1:], rtol=1e-6, atol=1e-12)

@@ -9,11 +9,11 @@ from ring_of_rooms import SETTINGS, driven, errors, walls
 
 from jaxslam import grids, laser_slam
 from jaxslam.core.types import Beams
-from jaxslam.laser.laser_slam import ScanLog, mapping
-from jaxslam.laser.laser_slam.mapping import map_of
-from jaxslam.laser.laser_slam.odometry.pieces import laser_odometry
+from jaxslam.laser.laser_slam import ScanLog, log_map
+from jaxslam.laser.laser_slam.log_map import map_of
+from jaxslam.laser.laser_slam.odometry.log_odometry import laser_odometry
 from jaxslam.laser.laser_slam.odometry.raw import steps_of
-from jaxslam.laser.laser_slam.scans import check_laser_log, scans_of
+from jaxslam.laser.laser_slam.scan_points import check_laser_log, scans_of
 from jaxslam.math import numpy_poses as poses
 
 RESOLUTION = 0.1
@@ -34,9 +34,9 @@ def wandering(scans, beams, far, seed=0):
 
 def both(log, monkeypatch, window, settings=SETTINGS):
     """(hits, misses), counted in windows and at once; and the shapes of the windows."""
-    monkeypatch.setattr(mapping, "WINDOW", window)
-    shape, origin, resolution = mapping.frame_of(log, [log.raw], settings)
-    beams = mapping._used(log, settings, np.ones(len(log.time), bool), slice(None))
+    monkeypatch.setattr(log_map, "WINDOW", window)
+    shape, origin, resolution = log_map.frame_of(log, [log.raw], settings)
+    beams = log_map._used(log, settings, np.ones(len(log.time), bool), slice(None))
     laser = poses.compose(log.raw, np.array(log.mount))
     whole = grids.count(shape, origin, resolution, laser, beams, max_range=settings.max_range)
     calls = []
@@ -48,7 +48,7 @@ def both(log, monkeypatch, window, settings=SETTINGS):
 
     monkeypatch.setattr(grids, "count", counting)
     found = np.zeros((2, *shape), np.int32)
-    mapping._count(found, origin, resolution, laser, beams, settings)
+    log_map._count(found, origin, resolution, laser, beams, settings)
     return found, np.stack([whole.hits, whole.misses]), calls
 
 
@@ -74,14 +74,14 @@ def test_a_scan_that_is_larger_than_a_window_has_a_larger_one(monkeypatch, far, 
     log = wandering(3, 40, far)
     found, whole, windows = both(log, monkeypatch, 64)
     assert max(windows) == (side, side)
-    assert mapping.frame_of(log, [log.raw], SETTINGS)[2] == RESOLUTION
+    assert log_map.frame_of(log, [log.raw], SETTINGS)[2] == RESOLUTION
     np.testing.assert_array_equal(found, whole)
 
 
 def test_beams_along_the_axes_from_the_origin_are_counted_alike_in_every_window(monkeypatch):
     """Without care they lie on the borders of cells, and rounding decides."""
     _, log = driven()
-    monkeypatch.setattr(mapping, "ROWS", 8)
+    monkeypatch.setattr(log_map, "ROWS", 8)
     found, whole, windows = both(log, monkeypatch, 128)
     assert len(windows) == 5 and not log.raw[0].any()
     np.testing.assert_array_equal(found, whole)
@@ -90,8 +90,8 @@ def test_beams_along_the_axes_from_the_origin_are_counted_alike_in_every_window(
 def test_a_log_that_met_nothing_is_an_empty_map(monkeypatch):
     log = wandering(3, 40, 2.5)
     nothing = log._replace(beams=log.beams._replace(valid=np.zeros((3, 40), bool)))
-    frame = mapping.frame_of(log, [log.raw], SETTINGS)
-    grid = mapping.map_of(nothing, log.raw, np.ones(3, bool), frame, SETTINGS)
+    frame = log_map.frame_of(log, [log.raw], SETTINGS)
+    grid = log_map.map_of(nothing, log.raw, np.ones(3, bool), frame, SETTINGS)
     assert not grid.log_odds.any()
 
 
@@ -99,14 +99,14 @@ def test_a_log_that_met_nothing_is_an_empty_map(monkeypatch):
 def test_scans_that_are_not_usable_say_nothing(usable):
     log, usable = wandering(3, 40, 2.5), np.array(usable)
     settings = dataclasses.replace(SETTINGS, resolution=2 * RESOLUTION)
-    frame = mapping.frame_of(log, [log.raw], settings)
+    frame = log_map.frame_of(log, [log.raw], settings)
     some = log._replace(
         time=log.time[usable], raw=log.raw[usable], beams=Beams(*(b[usable] for b in log.beams))
     )
     every = np.ones(usable.sum(), bool)
     np.testing.assert_array_equal(
-        mapping.map_of(log, log.raw, usable, frame, settings).log_odds,
-        mapping.map_of(some, some.raw, every, frame, settings).log_odds,
+        log_map.map_of(log, log.raw, usable, frame, settings).log_odds,
+        log_map.map_of(some, some.raw, every, frame, settings).log_odds,
     )
 
 

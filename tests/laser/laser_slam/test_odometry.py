@@ -9,11 +9,11 @@ from cases import swept
 from ring_of_rooms import SETTINGS, driven, errors, ranges_of
 
 from jaxslam import laser_slam
-from jaxslam.laser.laser_slam.odometry import pieces, tracking
-from jaxslam.laser.laser_slam.odometry.pieces import laser_odometry
+from jaxslam.laser.laser_slam.odometry import log_odometry, tracking
+from jaxslam.laser.laser_slam.odometry.log_odometry import laser_odometry
 from jaxslam.laser.laser_slam.odometry.raw import FARTHEST, steps_of
 from jaxslam.laser.laser_slam.odometry.reference import _seen_through
-from jaxslam.laser.laser_slam.scans import scans_of
+from jaxslam.laser.laser_slam.scan_points import scans_of
 from jaxslam.laser.matching import Points
 from jaxslam.math import numpy_poses as poses
 
@@ -70,7 +70,7 @@ def check_late(drive, k, share):
 def test_a_log_in_pieces_has_the_path_of_one(drive, monkeypatch):
     true, _, _ = drive
     _, whole = solved(drive)
-    monkeypatch.setattr(pieces, "PIECE", 13)
+    monkeypatch.setattr(log_odometry, "PIECE", 13)
     _, found = solved(drive)
     inner = sorted({13, 26} & set(found.keyframe.tolist()))
     assert inner == [13, 26], "the first scan of a piece is a keyframe"
@@ -84,7 +84,7 @@ def test_a_log_in_pieces_has_the_path_of_one(drive, monkeypatch):
 
 def test_an_interrupt_ends_all_pieces(drive, monkeypatch):
     _, log, scans = drive
-    monkeypatch.setattr(pieces, "PIECE", 10)
+    monkeypatch.setattr(log_odometry, "PIECE", 10)
     steps, calls = steps_of(log.raw, SETTINGS), []
 
     def progress(done, of):
@@ -210,7 +210,7 @@ def test_a_scan_that_matches_nothing_before_is_placed_by_what_comes_after(drive,
     assert np.hypot(*relative_error(found, true, k)[:2]) < 0.1
     assert nees(found, true, k) < 20
     # With nothing but the scans before it, it stays where raw odometry leads.
-    monkeypatch.setattr(pieces, "place_unmatched", lambda *_: None)
+    monkeypatch.setattr(log_odometry, "place_unmatched", lambda *_: None)
     _, alone = solved(drive, raw)
     assert k not in alone.keyframe and not alone.matched[k]
     others = np.arange(COUNT) != k

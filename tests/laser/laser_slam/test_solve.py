@@ -14,11 +14,11 @@ from jaxslam import filters, laser_slam, metrics, run, sensors
 from jaxslam.cli import main
 from jaxslam.cli import slam as results
 from jaxslam.core.types import Beams, Log, Scan
-from jaxslam.laser.laser_slam import LoopOutcome, covariances
-from jaxslam.laser.laser_slam.mapping import growing_maps
-from jaxslam.laser.laser_slam.odometry.pieces import laser_odometry
+from jaxslam.laser.laser_slam import LoopOutcome, end_covariances
+from jaxslam.laser.laser_slam.log_map import growing_maps
+from jaxslam.laser.laser_slam.odometry.log_odometry import laser_odometry
 from jaxslam.laser.laser_slam.odometry.raw import steps_of
-from jaxslam.laser.laser_slam.scans import scans_of
+from jaxslam.laser.laser_slam.scan_points import scans_of
 from jaxslam.math import numpy_poses as poses
 from jaxslam.results.files import write_files
 
@@ -68,8 +68,8 @@ def test_a_filter_is_driven_by_the_matches(drive):
     np.testing.assert_allclose(path.pose, odometry.poses[keys], atol=1e-9)
     cov = np.zeros((3, 3))
     for row, key in enumerate(keys[1:], 1):
-        cov = covariances.composed_cov(cov, odometry.z[key], odometry.cov[key])
-        expected = covariances.of_coordinates(cov, odometry.poses[key])
+        cov = end_covariances.composed_cov(cov, odometry.z[key], odometry.cov[key])
+        expected = end_covariances.of_coordinates(cov, odometry.poses[key])
         np.testing.assert_allclose(path.pose_cov[row], expected, rtol=1e-9, atol=1e-15)
     with pytest.raises(ValueError, match="match_controls: expected Odometry or Solved, got int"):
         laser_slam.match_controls(1)

@@ -11,7 +11,7 @@ from matplotlib.colors import to_rgb
 from jaxslam import plot
 from jaxslam.catalog import ALL, KINDS
 from jaxslam.consistency import DOF, LAGS, LEVELS, Average
-from jaxslam.results.plot.measures import INTERVAL
+from jaxslam.results.plot.measure_figures import INTERVAL
 from jaxslam.results.plot.panels import BEYOND, kinds_of, numbers_of, set_positive
 from jaxslam.results.plot.style import HUES, SHADE, TEXT, curves_of, look, panels_of
 

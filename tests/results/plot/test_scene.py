@@ -118,7 +118,7 @@ def test_beams_go_to_the_landmarks_measured_in_the_step():
             to = kinds.get(outcome, [])
             np.testing.assert_array_equal(ends[:, 0], np.tile(estimate.pose[k, :2], (len(to), 1)))
             np.testing.assert_array_equal(ends[:, 1], estimate.points[k][to])
-    assert [scene.said(k) for k in range(STEPS)] == [
+    assert [scene.caption(k) for k in range(STEPS)] == [
         "step 1 of 3 · 2 measurements: 0 fused, 2 new, 0 dropped",
         "step 2 of 3 · 1 measurement: 1 fused, 0 new, 0 dropped",
         "step 3 of 3 · 2 measurements: 0 fused, 1 new, 1 dropped",
@@ -141,7 +141,7 @@ def test_a_frame_of_many_steps_has_all_their_beams():
     np.testing.assert_array_equal(beams(axes, "new")[:, 0], estimate.pose[[3, 3], :2])
     np.testing.assert_array_equal(beams(axes, "new")[:, 1], estimate.points[4][:2])
     np.testing.assert_array_equal(beams(axes, "fused")[:, 0], estimate.pose[[1, 4], :2])
-    assert scene.said(1) == "step 5 of 9 · 6 measurements: 2 fused, 3 new, 1 dropped"
+    assert scene.caption(1) == "step 5 of 9 · 6 measurements: 2 fused, 3 new, 1 dropped"
     every = scene_of(9)[0]
     assert every.note == "" and every.frames == 9
 
@@ -226,7 +226,7 @@ def test_hypotheses_are_drawn_until_they_are_landmarks():
         rings = line(axes, "hypothesis, 3 σ").reshape(len(shown), 50, 2)[:, :-1]
         away = np.linalg.norm(rings - points[k, shown][:, None], axis=2)
         np.testing.assert_allclose(away, 0.6)
-    counts = [scene.said(k).rpartition(" · ")[2] for k in range(STEPS)]
+    counts = [scene.caption(k).rpartition(" · ")[2] for k in range(STEPS)]
     assert counts == ["0 hypotheses", "2 hypotheses", "1 hypothesis"]
 
 
@@ -263,7 +263,7 @@ def test_another_film_is_another_layer():
     panel = plot.Panel([growing, still(np.array([[0.5, 0.5]]), color="white")], (0, 1), (0, 1))
     film = plot.Film(plot.Scene(3, panel), width=4.0, fps=4)
     middle = [picture[110, 100, 0] for picture in pictures(film)]
-    assert [film.scene.said(k) for k in range(3)] == ["frame 1", "frame 2", "frame 3"]
+    assert [film.scene.caption(k) for k in range(3)] == ["frame 1", "frame 2", "frame 3"]
     np.testing.assert_allclose(middle, [0, 128, 255], atol=20)
 
 
@@ -305,7 +305,7 @@ def test_a_run_that_is_not_finite_is_drawn_as_far_as_it_goes_and_says_so():
     pose[2], covs[1, 0] = np.nan, -np.eye(2)
     broken = trace._replace(estimate=trace.estimate._replace(pose=pose, point_covs=covs))
     film = plot.animate(broken, log, truth)
-    said = film.scene.said
+    said = film.scene.caption
     assert said(1).endswith("1 without ellipse") and said(2).endswith("pose not finite")
     assert len(pictures(film)) == 3
 
@@ -375,7 +375,7 @@ def test_a_filter_is_filmed_in_a_world_by_itself():
     film = plot.animate_world(world, catalog.BASELINES["dead_reckoning"](world), jax.random.key(0))
     assert len({picture.tobytes() for picture in pictures(film)}) == 4
     assert film.scene.title == "ring"
-    assert film.scene.said(0) == "step 1 of 4 · 6 measurements: 0 fused, 0 new, 6 dropped"
+    assert film.scene.caption(0) == "step 1 of 4 · 6 measurements: 0 fused, 0 new, 6 dropped"
 
 
 def test_mapping_from_a_known_path_is_filmed():
@@ -386,8 +386,8 @@ def test_mapping_from_a_known_path_is_filmed():
     mapping = filters.Mapping(world.sensor, 6)
     trace = jaxslam.run(mapping, log, *start, jax.random.key(1), probe=plot.probe)
     film = plot.animate(trace, log, truth)
-    assert film.scene.said(0) == "step 1 of 4 · 6 measurements: 0 fused, 6 new, 0 dropped"
-    assert film.scene.said(3) == "step 4 of 4 · 6 measurements: 6 fused, 0 new, 0 dropped"
+    assert film.scene.caption(0) == "step 1 of 4 · 6 measurements: 0 fused, 6 new, 0 dropped"
+    assert film.scene.caption(3) == "step 4 of 4 · 6 measurements: 6 fused, 0 new, 0 dropped"
     assert len({picture.tobytes() for picture in pictures(film)}) == 4
 
 
@@ -395,7 +395,7 @@ def test_a_map_scene_has_as_many_paths_as_maps():
     origin, path = np.zeros(3), np.zeros((2, 3))
     maps = [np.zeros((2, 3)), np.ones((2, 3))]
     scene = plot.map_scene(maps, origin, 0.5, [path, path], ["one", "two"])
-    assert scene.frames == 2 and scene.said(1) == "two"
+    assert scene.frames == 2 and scene.caption(1) == "two"
     assert scene.main.xlim == (0.0, 1.5) and scene.main.ylim == (0.0, 1.0)
     for wrong, message in (
         ((maps, origin, 0.5, [path], ["one", "two"]), "as many paths"),

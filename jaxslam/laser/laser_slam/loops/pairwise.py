@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from jaxslam.laser.laser_slam import covariances
+from jaxslam.laser.laser_slam import end_covariances
 from jaxslam.math import numpy_poses as poses
 from jaxslam.math import se2
 from jaxslam.math.arrays import float64
@@ -43,7 +43,7 @@ def consistent(
     multi-robot map merging", ICRA).
 
     Args:
-        path: by odometry. total: `covariances.along` of it.
+        path: by odometry. total: `end_covariances.along` of it.
         first, second, z, cov: of the loops; the covariance of the end of z.
     """
     limit = chi2_quantile(probability, 3)
@@ -51,7 +51,7 @@ def consistent(
     out = np.zeros((count, count), bool)
     end = poses.compose(path[first], z)
     moved = poses.compose(end, poses.inverse(path[second]))
-    loop_cov = covariances.propagated(poses.adjoint(end), cov)
+    loop_cov = end_covariances.propagated(poses.adjoint(end), cov)
     parts = path[second], end, moved, loop_cov, total[first], total[second], first, second
     with float64():
         tiles = [

@@ -10,9 +10,9 @@ import numpy as np
 from jaxtyping import Array, Float, Int, PyTree
 
 from jaxslam.graphs import Cauchy
-from jaxslam.laser.laser_slam import covariances
+from jaxslam.laser.laser_slam import end_covariances
 from jaxslam.laser.laser_slam.records import Settings
-from jaxslam.laser.laser_slam.scans import Scans
+from jaxslam.laser.laser_slam.scan_points import Scans
 from jaxslam.laser.matching import (
     Correlative,
     IcpSettings,
@@ -136,7 +136,7 @@ def match(
     known = floor
     prior = np.zeros((3, 3))
     if prior_cov is not None:
-        known = np.linalg.inv(covariances.of_coordinates(prior_cov, guess))
+        known = np.linalg.inv(end_covariances.of_coordinates(prior_cov, guess))
         prior = _CORRELATION * known
     found = np.asarray(
         _match(
@@ -152,10 +152,10 @@ def match(
     pose, information = found[:3], found[3:12].reshape(3, 3)
     inliers, residual, ambiguous, through = found[12:]
     sigma = max(settings.sigma, residual) ** 2 * _CORRELATION
-    cov = np.linalg.inv(covariances.semidefinite(information) / sigma + known)
+    cov = np.linalg.inv(end_covariances.semidefinite(information) / sigma + known)
     return ScanMatch(
         pose,
-        covariances.at_end(cov, pose) + np.diag(np.square(_FLOOR)),
+        end_covariances.at_end(cov, pose) + np.diag(np.square(_FLOOR)),
         float(inliers),
         float(residual),
         bool(ambiguous),

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.laser.laser_slam import covariances
+from jaxslam.laser.laser_slam import end_covariances
 from jaxslam.laser.laser_slam.odometry.raw import FARTHEST, Steps, reach_cov
 from jaxslam.laser.laser_slam.odometry.reference import (
     Reference,
@@ -17,7 +17,7 @@ from jaxslam.laser.laser_slam.odometry.reference import (
     taken,
 )
 from jaxslam.laser.laser_slam.records import Settings
-from jaxslam.laser.laser_slam.scans import Scans
+from jaxslam.laser.laser_slam.scan_points import Scans
 from jaxslam.laser.matching import Matcher, Points
 from jaxslam.math import numpy_poses as poses
 
@@ -107,11 +107,11 @@ def match_to_keyframes(
             step = last  # the robot most likely goes on as it did
         begin, begin_cov = (z, cov) if late is None else late
         guess = poses.compose(begin, step)
-        prior = covariances.composed_cov(begin_cov, step, step_cov)
+        prior = end_covariances.composed_cov(begin_cov, step, step_cov)
         late = None
         if steps.lags[scan]:
             usual = step_cov - reach_cov(steps.reach[scan])
-            late = guess, covariances.composed_cov(begin_cov, step, usual)
+            late = guess, end_covariances.composed_cov(begin_cov, step, usual)
         blind = bool(blind or steps.unknown[scan])
         before, z, cov = z, guess, prior
         doubted = False
@@ -124,7 +124,7 @@ def match_to_keyframes(
             found = _matched(reference, points, guess, prior, steps.reach[scan], how, settings)
             if other is not None and not steps.unknown[scan]:
                 prediction = poses.compose(other[0], step)
-                wide = covariances.composed_cov(other[1], step, step_cov)
+                wide = end_covariances.composed_cov(other[1], step, step_cov)
                 back = _matched(
                     reference, points, prediction, wide, steps.reach[scan], how, settings
                 )
@@ -150,7 +150,7 @@ def match_to_keyframes(
             if steps.gap[scan]:
                 cov = cov + reach_cov(steps.reach[scan])
         last = poses.between(before, z)
-        doubt = covariances.moved(doubt, last)
+        doubt = end_covariances.moved(doubt, last)
         if doubted and found is not None:
             doubt = _doubt(found.prior, poses.between(z, guess))
         result.doubted[scan] = doubted
@@ -316,6 +316,6 @@ def _doubt(prior: np.ndarray, off: np.ndarray) -> np.ndarray:
 
     off: e, the mean of raw odometry seen from the match.
     """
-    at_match = covariances.propagated(covariances.turns(off[2]), prior)
+    at_match = end_covariances.propagated(end_covariances.turns(off[2]), prior)
     far = off[0] ** 2 + off[1] ** 2
     return np.asarray(_DOUBT_PROBABILITY * (at_match + np.diag([far, far, off[2] ** 2])))

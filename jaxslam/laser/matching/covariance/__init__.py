@@ -1,7 +1,11 @@
 """Covariances of a match, by the published methods."""
 
 from jaxslam.laser.matching.covariance.implicit import AlongNormals, Hessian, Implicit
-from jaxslam.laser.matching.covariance.record import MatchCovariance, MatchedScans, covariance
+from jaxslam.laser.matching.covariance.match_covariance import (
+    MatchCovariance,
+    MatchedScans,
+    covariance,
+)
 from jaxslam.laser.matching.covariance.sampling import Lattice, Sampling, Unscented
 
 __all__ = [

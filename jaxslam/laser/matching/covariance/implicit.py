@@ -14,7 +14,7 @@ from jaxtyping import Array, Float
 
 from jaxslam.core.numbers import check_count, check_positive
 from jaxslam.core.record import record, static
-from jaxslam.laser.matching.covariance.record import (
+from jaxslam.laser.matching.covariance.match_covariance import (
     MatchCovariance,
     MatchedScans,
     beside_prior,

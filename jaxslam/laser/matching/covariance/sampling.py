@@ -15,7 +15,7 @@ from jaxtyping import Array, Float
 from jaxslam.core.numbers import check_count, check_covariance, check_positive, held_array
 from jaxslam.core.record import record, set_field, static
 from jaxslam.laser.matching.covariance.implicit import Implicit
-from jaxslam.laser.matching.covariance.record import (
+from jaxslam.laser.matching.covariance.match_covariance import (
     MatchCovariance,
     MatchedScans,
     beside_prior,

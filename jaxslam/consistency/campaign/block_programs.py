@@ -40,7 +40,7 @@ from jaxslam.consistency import (
 from jaxslam.consistency.campaign.candidates import estimator_of, rounded
 from jaxslam.core.protocols import Candidate, Sensor
 from jaxslam.core.types import Estimate, Info, Log, Trace, Truth
-from jaxslam.filters.ekf.observability import Monitor
+from jaxslam.filters.ekf.monitor import Monitor
 from jaxslam.math.xla import hot_options, quick_options
 from jaxslam.simulation.worlds import World, run_keys
 

@@ -41,7 +41,7 @@ from jaxslam.results.plot.style import (
 )
 
 _NOTHING = 1e-6
-"""Information on a heading that counts as none, σ being 1000 rad [1/rad²]."""
+"""Information on a heading below which it counts as zero: σ of 1000 rad [1/rad²]."""
 
 _STRIP = 0.2
 """Share of the height of a panel in which values below `_NOTHING` are drawn."""
@@ -57,8 +57,8 @@ def nees_figure(
 
     The band is that of the filter with the most finite runs, the narrowest. More than five filters
     are drawn in a row of panels for each kind of filter (`catalog.KINDS`). The scale ends at 100
-    times dof, or sooner where the band would be too narrow to be seen; marks at the edge are of
-    larger values, and the largest is written above. width [in]: `COLUMN` is that of a paper.
+    times dof, or lower if the band would be too narrow to be seen; marks at the edge are of
+    larger values, and the largest is written above. width [in]: `COLUMN` for a paper.
     """
     titles = [REGISTRY[f"nees_{block}"].axis for block in blocks]
     figure, rows = sheet(campaign, titles, width=width)
@@ -81,11 +81,11 @@ def nees_figure(
 def rmse_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     """RMSE of position and heading over the steps, with the conditional Cramér-Rao bound if known.
 
-    So is every other measure whose figure is "rmse".
+    Other measures with the figure "rmse" have a panel, too.
 
     More than five filters are drawn by kind. Filters that fuse no measurement, that diverge, or
-    whose error is over three times the median of the others do not set the scale: marks at the
-    edge mark what lies beyond, and the largest value is written above. width [in].
+    whose error is over three times the median of the others do not set the scale: larger
+    values have marks at the edge, and the largest one is written above. width [in].
     """
     every = list(campaign.filters.values())
     shown = [one for one in in_figure("rmse") if any(one.key in s.curves for s in every)]
@@ -150,8 +150,8 @@ def whiteness_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     """Autocorrelation of normalized innovations against the lag; that of a consistent filter is 0.
 
     The band is that of white innovations, the widest of the filters. A filter without innovations
-    is named, without a curve. Each curve is moved a little to the side, so that none hides
-    another. More than five filters are drawn by kind. width [in].
+    is named, without a curve. Curves are shifted a little sideways, so that none hides another.
+    More than five filters are drawn by kind. width [in].
     """
     figure, rows = sheet(campaign, ["autocorrelation"], width=width, height=2.4)
     every = campaign.filters.values()
@@ -181,9 +181,9 @@ def whiteness_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
 def gained_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     """Spurious information on the rotation of the whole frame over the steps; 0 is consistent.
 
-    It is shown of filters with an observability monitor; the others are named in the title. Values
+    Only filters with an observability monitor have it; the others are named in the title. Values
     below 1e-6 / rad² (σ of 1000 rad), zeros and rounding errors alike, are drawn in a strip below
-    the logarithmic axis, each filter at a height of its own. More than five filters are drawn by
+    the logarithmic axis, each filter at a different height. More than five filters are drawn by
     kind. width [in].
     """
     check_record("gained_figure", "the first argument", campaign, Campaign)
@@ -206,8 +206,8 @@ def gained_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
         axes.set(yscale="log", xlim=step_limits(campaign.steps), ylim=(_NOTHING * 10**-strip, top))
         _label_powers(axes, strip, decades)
     if not curves:
-        said = "no filter has an observability monitor (filters.Monitored)"
-        axes.text(0.5, 0.6, said, transform=axes.transAxes, ha="center", fontsize=8)
+        text = "no filter has an observability monitor (filters.Monitored)"
+        axes.text(0.5, 0.6, text, transform=axes.transAxes, ha="center", fontsize=8)
     title = title_of(campaign, "information gained on a turn of the whole frame,")
     title += f". Not monitored: {', '.join(map(plain, others))}" * bool(others and curves)
     add_legends(figure, rows, title, "step")
@@ -223,7 +223,7 @@ def _draw_band(axes: Axes, campaign: Campaign, block: str) -> None:
 
 
 def _label_powers(axes: Axes, strip: float, decades: float) -> None:
-    """Write powers of ten at the ordinate, three or four of them, and what the strip is."""
+    """Label the ordinate with three or four powers of ten, and the strip."""
     apart = max(2, int(np.ceil((decades - 1) / 4)))
     powers = np.arange(-6 + apart, -6 + decades, apart)
     axes.set_yticks(
@@ -239,7 +239,7 @@ def _peak(values: np.ndarray) -> float:
 
 
 def _lone(values: np.ndarray) -> str:
-    """The marker of a line: one only where a single value is finite."""
+    """The marker of a line, if a single value is finite; else none."""
     return "o" if np.isfinite(values).sum() == 1 else ""
 
 
@@ -250,10 +250,10 @@ _LABELS = {key: REGISTRY[key].axis for key in (_ERROR, _NEES)}
 _NONE = Average(np.nan, np.nan, np.nan)
 
 _CAP = 100.0
-"""The scale of the NEES ends at so many times dof."""
+"""End of the scale of the NEES, in multiples of dof."""
 
 _WIDE = 10.0
-"""Ends of intervals set a scale up to so many times the largest value, and down to as little."""
+"""Largest factor by which ends of intervals extend a scale beyond the values."""
 
 INTERVAL = "interval"
 """`gid` of the lines of intervals, and of the arrows where they leave the scale."""
@@ -263,8 +263,8 @@ def cost_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     """Time of a step, position error and pose NEES of every filter: a row each, by kind.
 
     Error and NEES have their 95 % intervals, with an arrow where one leaves the scale. A NEES over
-    100 times dof is marked at the edge. Filters that were not timed have no point. width [in]; of
-    more than five filters that of a page at least.
+    100 times dof is marked at the edge. Filters that were not timed have no point. width [in]; at
+    least that of a page for more than five filters.
     """
     check_record("cost_figure", "the first argument", campaign, Campaign)
     times = {name: 1e6 * campaign.step_seconds.get(name, np.nan) for name in campaign.filters}
@@ -299,8 +299,8 @@ def cost_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
         kinds.tick_params(labelsize=TEXT, length=0, pad=8)
         kinds.spines["right"].set_visible(False)
     timed = np.isfinite(list(times.values())).any()
-    said = ("time of a step [µs]" if timed else "no filter was timed", *_LABELS.values())
-    for axes, text in zip(panels, said, strict=True):
+    titles = ("time of a step [µs]" if timed else "no filter was timed", *_LABELS.values())
+    for axes, text in zip(panels, titles, strict=True):
         axes.set_xlabel(text if width >= PAGE else text.replace(" [", "\n[").replace(" (", "\n("))
     honest = panels[2].axvline(DOF["pose"], color=INK, lw=0.8, zorder=1.5, label="honest")
     what = "error and NEES, with 95 % intervals, and the time of a step,"
@@ -348,7 +348,7 @@ def _interval(axes: Axes, at: float, measure: Average, color: str) -> None:
 
 
 def _values(campaign: Campaign, key: str) -> np.ndarray:
-    """What sets the scale of a measure: values and ends of intervals, not the extreme ones."""
+    """The numbers that set the scale of a measure: values, and ends of intervals."""
     found = np.array([s.measures.get(key, _NONE) for s in campaign.filters.values()])
     if key == _NEES:
         found = np.minimum([*found, [DOF["pose"]] * 3], _CAP * DOF["pose"])
@@ -361,6 +361,6 @@ def _values(campaign: Campaign, key: str) -> np.ndarray:
 
 def _scale(axes: Axes, values: np.ndarray) -> None:
     """Set the abscissa for some values, none of them on the frame."""
-    there = values[np.isfinite(values) & (values > 0)]
-    if there.size:
-        set_positive(axes, there.min(), there.max(), "x", margin=0.12, linear=3.0)
+    shown = values[np.isfinite(values) & (values > 0)]
+    if shown.size:
+        set_positive(axes, shown.min(), shown.max(), "x", margin=0.12, linear=3.0)

@@ -1,4 +1,4 @@
-"""What the commands on a laser log share: its options, the scans they ask for, and the results."""
+"""Shared by the commands on a laser log: options, selection of scans, writing of results."""
 
 import argparse
 import dataclasses
@@ -29,23 +29,26 @@ from jaxslam.results.files import Files, Json, json_text, versions, write_files
 
 
 class Job(NamedTuple):
-    """The result of a command, for the screen and the folder of results."""
+    """The result of a command, to print and to write."""
 
     summary: Json
     """entries of the summary"""
     files: Files
     text: str = ""
-    """what is printed below the summary"""
+    """printed below the summary"""
     details: Json | None = None
-    """entries of `summary.json` that are printed in `text`"""
+    """further entries of `summary.json`, which `text` already shows"""
 
 
 Work = Callable[[LaserLog, argparse.Namespace], Job]
-"""What a command makes of a log; `options.figures` are the formats of its figures."""
+"""Computes the result of a command; `options.figures` are the formats of figures."""
 
 
 def add_options(parser: argparse.ArgumentParser, work: Work, *, map_is_made: bool = True) -> None:
-    """Add the options of a command on a laser log; map_is_made: of which cells, is an option."""
+    """Add the options of a command on a laser log.
+
+    map_is_made: add `--resolution`, of the map that the command makes.
+    """
     parser.add_argument("path", metavar="FILE", help="the log, in the format of CARMEN")
     if map_is_made:
         parser.add_argument(
@@ -60,7 +63,7 @@ def add_options(parser: argparse.ArgumentParser, work: Work, *, map_is_made: boo
         type=float,
         metavar="M",
         default=50.0,
-        help="a range from here on, or from the maximum that the log states, met nothing [m] "
+        help="ranges from this one, or from the maximum in the log, are without a return [m] "
         "(default: 50)",
     )
     parser.add_argument(
@@ -70,13 +73,13 @@ def add_options(parser: argparse.ArgumentParser, work: Work, *, map_is_made: boo
         "--scans",
         metavar="A:B",
         default=":",
-        help="use the scans from number A on and before B; :455 is the first 455 (default: all)",
+        help="use scans A to B - 1, counted from 0; :455 is the first 455 (default: all)",
     )
     parser.add_argument(
         "--laser",
         metavar="KIND",
-        help="lines of the laser to read: FLASER, RLASER, ROBOTLASER1, RAWLASER1, … (default: of "
-        "those with poses the one with most scans)",
+        help="lines of the laser to read: FLASER, RLASER, ROBOTLASER1, RAWLASER1, … (default: the "
+        "one with poses and most scans)",
     )
     parser.add_argument(
         "--odometry",
@@ -96,7 +99,7 @@ def add_options(parser: argparse.ArgumentParser, work: Work, *, map_is_made: boo
 
 
 def run_job(work: Work, options: argparse.Namespace, command: str) -> int:
-    """Read the log, print and write what a command makes of it; returns the exit status."""
+    """Read the log, print and write the result of a command; returns the exit status."""
     began = time.perf_counter()
     for name in ("resolution", "max_range", "every", "particles"):
         value = getattr(options, name, 1)
@@ -124,16 +127,16 @@ def run_job(work: Work, options: argparse.Namespace, command: str) -> int:
     print(summary_table({"": summary}))
     if job.text:
         print("\n" + job.text)
-    told = json_text(summary | (job.details or {}) | {"versions": versions()})
-    written = write_files(options.out, job.files | {SUMMARY: told}, replaces=FILMS)
+    text = json_text(summary | (job.details or {}) | {"versions": versions()})
+    written = write_files(options.out, job.files | {SUMMARY: text}, replaces=FILMS)
     print("\nwrote " + ", ".join(str(path) for path in written))
     return 0
 
 
 def read_log(options: argparse.Namespace) -> tuple[LaserLog, dict[str, int]]:
-    """The scans that the options ask for, and how many are left out, by reason.
+    """The scans that the options select, and the number left out by reason.
 
-    Raises ValueError, with the file, where no scan is left or none has a valid beam.
+    Raises ValueError, with the file, if no scan is left or none has a valid beam.
     """
     log = datasets.carmen(
         options.path,
@@ -147,7 +150,7 @@ def read_log(options: argparse.Namespace) -> tuple[LaserLog, dict[str, int]]:
     keep = np.arange(first, last)[:: options.every]
     if not len(keep):
         raise ValueError(f"--scans: {options.scans} has none of the {total} scans of {log.source}")
-    # Raw odometry is known where it tells of any of the steps between two scans that are kept.
+    # Odometry between two selected scans is known if that of any step between them is.
     known = np.diff(np.cumsum(log.odometry_known)[keep], prepend=-1) > 0
     log = dataclasses.replace(
         log,
@@ -166,7 +169,7 @@ def read_log(options: argparse.Namespace) -> tuple[LaserLog, dict[str, int]]:
 
 
 def _interval(text: str, total: int) -> tuple[int, int]:
-    """The first scan and the one after the last of A:B, as slices of Python have it."""
+    """The range of scans A:B, as a slice in Python."""
     ends = text.split(":")
     try:
         if len(ends) != 2:
@@ -179,9 +182,9 @@ def _interval(text: str, total: int) -> tuple[int, int]:
 
 
 def check_poses(log: LaserLog) -> None:
-    """Raise ValueError where the scans of a log have no poses."""
+    """Raise ValueError if the scans of a log have no poses."""
     if not log.placed:
-        raise ValueError(f"{log.source}: expected poses beside the scans, and {log.laser} has none")
+        raise ValueError(f"{log.source}: expected scans with poses, and {log.laser} has none")
 
 
 def pose_of(option: str, text: str, others: str = "") -> Float[np.ndarray, "3"]:
@@ -197,8 +200,7 @@ def pose_of(option: str, text: str, others: str = "") -> Float[np.ndarray, "3"]:
 
 
 def scored(log: LaserLog, score: Callable[[], Json]) -> Json:
-    """The score by the poses in the file, or why there is none: no poses, or they were the odometry
-    as well."""
+    """The score by the poses in the file; without poses, or equal ones, the reason for none."""
     if not log.placed:
         return {"score": "none: the file has no poses"}
     if odometry_is_poses(log):
@@ -207,7 +209,7 @@ def scored(log: LaserLog, score: Callable[[], Json]) -> Json:
 
 
 def odometry_is_poses(log: LaserLog) -> bool:
-    """Whether raw odometry equals the poses beside the scans, as in a file without lines ODOM."""
+    """Whether raw odometry equals the poses of the scans, as in a file without ODOM lines."""
     return log.placed and bool(np.allclose(log.raw, log.corrected, rtol=0, atol=1e-6))
 
 

@@ -54,7 +54,7 @@ def graph_figure(
         before, after: the same graph with different values.
         squared: eᵀ Ω e of each row after, of `graphs.squared_residuals`.
         factors: of the tables; by default those of files.
-        worst: so many rows are marked in both panels: those of the largest eᵀ Ω e for its size.
+        worst: number of rows marked in both panels: those with the largest eᵀ Ω e for its size.
         subtitles: of the panels. width: [in].
     """
     factors = factors_of("graph_figure", after, factors)
@@ -78,7 +78,7 @@ def graph_figure(
 
 
 def _drawn(graph: Graph, factors: Mapping[str, Factor]) -> list[str]:
-    """The tables that are drawn: those of edges between two variables."""
+    """The tables of edges between two variables, which are drawn."""
     return [key for key in graph.tables if len(factors[key].variables) == 2]
 
 
@@ -136,7 +136,7 @@ def graph_scene(
     title: str = "",
     note: str = "",
 ) -> Scene:
-    """The scene of one graph at each of F iterates: path, loop edges, points, and χ² in words.
+    """The scene of one graph at each of F iterates: path, loop edges, points, and χ² as text.
 
     The last iterate stays in the background. Edges between poses of successive ids are the
     path, others are loop edges.
@@ -168,7 +168,7 @@ def graph_scene(
     first: Look = {"marker": "o", "ms": 5, "mec": INK, "mfc": "white", "label": "first pose"}
     layers.append(marks(poses[:, :1], np.ones((len(poses), 1), bool), **first))
 
-    def said(k: int) -> str:
+    def caption(k: int) -> str:
         step = k if steps is None else steps[k]
         when = f"iteration {step}" if step else "start"
         return f"{when}, χ² = {chi2[k]:.6g}"
@@ -180,4 +180,4 @@ def graph_scene(
     most = np.maximum(ends.max(axis=0), np.quantile(rest, 0.99, axis=0))
     margin = 0.04 * max(float((most - least).max()), 1.0)
     x, y = ((float(a - margin), float(b + margin)) for a, b in zip(least, most, strict=True))
-    return Scene(len(iterates), Panel(layers, x, y), None, said, title, note)
+    return Scene(len(iterates), Panel(layers, x, y), None, caption, title, note)

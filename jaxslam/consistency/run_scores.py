@@ -1,6 +1,6 @@
 """The scores of runs: the numbers of each run that a campaign adds up or keeps.
 
-`run_statistics` takes sums over one run's maps and innovations, in JAX; `monte_carlo.programs`
+`run_statistics` takes sums over one run's maps and innovations, in JAX; `campaign.block_programs`
 compiles it. `score` takes them, and the poses and infos of many runs, to the measures of each run;
 `tally.condense` takes what that returns.
 
@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxslam.consistency.measures import REGISTRY
-from jaxslam.consistency.measures.associations import associations, identities
+from jaxslam.consistency.measures.associations import association_scores, identities
 from jaxslam.consistency.measures.counts import counted
 from jaxslam.consistency.measures.measure import Measure, Nees, Runs, RunStatistics
 from jaxslam.consistency.measures.nees import block_nees, pose_error
@@ -127,7 +127,7 @@ def run_statistics(
     if truth.origin is not None:
         origin = jnp.asarray(truth.origin)
         held = identities(trace, origin)
-        values |= associations(trace, origin, held)
+        values |= association_scores(trace, origin, held)
     points = jax.vmap(sensor.position)(jnp.asarray(truth.landmarks))
     size, count = info.innovation.shape[2], estimate.alive.shape[1] or info.slot.shape[1]
     dtype = estimate.pose.dtype

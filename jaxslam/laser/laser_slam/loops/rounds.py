@@ -17,9 +17,9 @@ from jaxtyping import Float, Int
 from jaxslam import graphs
 from jaxslam.graphs import Graph, Table
 from jaxslam.graphs.graph import LOOPS
-from jaxslam.laser.laser_slam import covariances
+from jaxslam.laser.laser_slam import end_covariances
 from jaxslam.laser.laser_slam.assembly import ROOM, graph_of, relative_covs, table_of
-from jaxslam.laser.laser_slam.loops.candidates import (
+from jaxslam.laser.laser_slam.loops.loop_candidates import (
     CANDIDATES,
     MOST,
     PLACES,
@@ -41,7 +41,7 @@ from jaxslam.laser.laser_slam.odometry.reference import (
 )
 from jaxslam.laser.laser_slam.odometry.tracking import LOOP_INLIERS, Odometry
 from jaxslam.laser.laser_slam.records import LoopOutcome, Loops, Settings
-from jaxslam.laser.laser_slam.scans import ROWS, Scans
+from jaxslam.laser.laser_slam.scan_points import ROWS, Scans
 from jaxslam.math.stats import chi2_quantile
 
 
@@ -172,7 +172,7 @@ def closed(
     steps, covs = odometry.z[keyframe[1:]], odometry.cov_if_right[keyframe[1:]]
     index = np.arange(len(keyframe))
     chain = table_of(index[:-1], index[1:], steps, covs)
-    total = covariances.along(at, covs)
+    total = end_covariances.along(at, covs)
     middle = index[:: settings.submap_every]
     usable = scans.usable[keyframe] & ~odometry.doubted[keyframe]
     ends_at, valid = np.asarray(scans.points.position), np.asarray(scans.points.valid)
@@ -194,7 +194,7 @@ def closed(
         reach = REACH + _WIDE[0]
         pairs = near(path, middle, usable, ends, most, reach, settings.loop_gap)
         cov = (
-            covariances.relative_cov(total, at, pairs[:, 0], pairs[:, 1])
+            end_covariances.relative_cov(total, at, pairs[:, 0], pairs[:, 1])
             if solution is None or not len(pairs)
             else relative_covs(solution, pairs)
         )

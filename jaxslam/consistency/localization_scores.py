@@ -14,12 +14,12 @@ from jaxslam.consistency.measures.nees import block_nees, pose_error
 from jaxslam.core.numbers import check_count, check_covariance, check_key
 from jaxslam.core.protocols import Filter
 from jaxslam.core.types import JaxOrNumPy, Log
+from jaxslam.driver import run
 from jaxslam.filters.particles.pose_particles import PoseParticles
-from jaxslam.laser.grids.localization import beam_log
+from jaxslam.laser.grids.grid_localization import beam_log
 from jaxslam.math.angles import wrap
 from jaxslam.math.linalg import root_psd
 from jaxslam.resampling.weights import at_points, weights_of
-from jaxslam.run import run
 from jaxslam.simulation.laser import LaserWorld, check_world, scan_world
 
 _DRAWS = 199

@@ -32,7 +32,7 @@ from jaxslam.results.plot.style import (
 )
 
 _UNKNOWN = "#c9d3dd"
-"""Colour of unknown cells, which no shade of grey has."""
+"""Colour of unknown cells, not a shade of grey."""
 
 
 def grid_figure(
@@ -45,7 +45,7 @@ def grid_figure(
     title: str = "",
     width: float = PAGE / 2,
 ) -> Figure:
-    """The map: occupied cells black, free ones white, unknown ones in a colour of their own.
+    """The map: occupied cells black, free ones white, unknown ones in a third colour.
 
     Args:
         grid: a map; or a `Field`, as a distance field, whose values are shown in colours.
@@ -118,14 +118,14 @@ def shades_of_occupancy() -> Colormap:
 
 
 def shown_occupancy(log_odds: np.ndarray) -> np.ma.MaskedArray:
-    """The probability of each cell, masked where it is unknown."""
+    """The probability of each cell; unknown cells are masked."""
     return np.ma.masked_array(0.5 * (1 + np.tanh(log_odds / 2)), mask=log_odds == 0)
 
 
 def _corners(
     grid: Grid | Field, rows: np.ndarray, columns: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray]:
-    """The world coordinates [m] of the corners of cells, as `pcolormesh` takes them."""
+    """The world coordinates [m] of the corners of cells, for `pcolormesh`."""
     x, y = np.meshgrid(columns, rows)
     origin, resolution = np.asarray(grid.origin, float), float(np.asarray(grid.resolution))
     c, s = np.cos(origin[2]), np.sin(origin[2])
@@ -154,8 +154,8 @@ def topology_figure(
     grid = places.grid
     label = places.label
     occupied = np.asarray(grid.log_odds) > 0
-    there = np.nonzero((label >= 0) | occupied)  # the rest of the map is not shown
-    part = tuple(slice(k.min(), k.max() + 1) for k in there)
+    drawn = np.nonzero((label >= 0) | occupied)  # the rest of the map is left out
+    part = tuple(slice(k.min(), k.max() + 1) for k in drawn)
     x, y = _corners(grid, *(np.arange(k.start, k.stop + 1) for k in part))
     height = (width - 0.6) * np.ptp(y) / np.ptp(x) + 0.9
     figure, (axes,) = panels_of(width, min(height, 9.0), 1)
@@ -192,7 +192,7 @@ def topology_figure(
 
 
 def _coloured(places: TopologicalMap) -> np.ndarray:
-    """A colour for each place, another one than its neighbours', where there are enough."""
+    """A colour for each place, different from its neighbours' if there are enough."""
     adjacent, colour = places.adjacent, np.full(len(places.center) + 1, -1)
     for k in np.argsort(-adjacent.sum(axis=1), kind="stable"):
         taken = set(colour[:-1][adjacent[k]])
@@ -292,7 +292,7 @@ def map_scene(
     origin: Float[np.ndarray, "3"],
     resolution: float,
     paths: Sequence[Float[np.ndarray, "n 3"]],
-    said: Sequence[str],
+    captions: Sequence[str],
     *,
     title: str = "",
 ) -> Scene:
@@ -301,15 +301,15 @@ def map_scene(
     Args:
         log_odds: of each map; 0 is unknown.
         origin: of the maps, without yaw. resolution: [m].
-        paths: of each map, in the same order. said: the text of each.
+        paths: of each map, in the same order. captions: the text of each.
     Raises:
-        ValueError: without maps, other numbers of paths or texts, or a frame that is turned.
+        ValueError: without maps, other numbers of paths or captions, or a rotated frame.
     """
     count = len(log_odds)
-    if not count or {count} != {len(paths), len(said)}:
+    if not count or {count} != {len(paths), len(captions)}:
         raise ValueError(
             f"map_scene: expected as many paths and texts as maps, at least 1, got {count} maps, "
-            f"{len(paths)} paths and {len(said)} texts"
+            f"{len(paths)} paths and {len(captions)} captions"
         )
     if origin[2] != 0:
         raise ValueError(f"map_scene: expected an origin without yaw, got {origin[2]} rad")
@@ -321,7 +321,7 @@ def map_scene(
     robot = triangle(ends, size, fc=COLORS[0], ec="white", lw=0.6, zorder=5)
     path = line_of(lambda k: paths[k][:, :2], color=COLORS[0], lw=1.0, label="path", zorder=3)
     layers = [_image(log_odds, (*x, *y)), path, robot]
-    return Scene(count, Panel(layers, x, y), None, lambda k: said[k], title)
+    return Scene(count, Panel(layers, x, y), None, lambda k: captions[k], title)
 
 
 def _image(

@@ -26,7 +26,7 @@ from jaxslam.laser.laser_slam.odometry.tracking import (
     place_unmatched,
 )
 from jaxslam.laser.laser_slam.records import Settings, Solved
-from jaxslam.laser.laser_slam.scans import Scans
+from jaxslam.laser.laser_slam.scan_points import Scans
 from jaxslam.math import numpy_poses as poses
 from jaxslam.math import se2
 from jaxslam.math.arrays import Control, Pose, ProcessNoise, ProcessNoiseCov

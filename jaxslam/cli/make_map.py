@@ -1,4 +1,4 @@
-"""The command `jaxslam map`: a map from the poses that stand beside the scans."""
+"""The command `jaxslam map`: a map of a laser log at the poses in the file."""
 
 import argparse
 from collections.abc import Callable
@@ -7,7 +7,7 @@ import jax
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.cli import laser
+from jaxslam.cli import laser_log
 from jaxslam.cli.piecewise import padded_rows
 from jaxslam.consistency.campaign.progress import Progress
 from jaxslam.core.types import Beams, Estimate
@@ -30,17 +30,17 @@ MOST = 10**8
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `jaxslam map`."""
-    laser.add_options(parser, run_mapping)
+    laser_log.add_options(parser, run_mapping)
 
 
-def run_mapping(log: LaserLog, options: argparse.Namespace) -> laser.Job:
+def run_mapping(log: LaserLog, options: argparse.Namespace) -> laser_log.Job:
     """The map of the scans at the poses in the file: counts of hits and misses, as log-odds.
 
-    A beam without a return says nothing. The path that is written is the robot's.
+    A beam without a return is not used. The written path is that of the robot.
     """
     from jaxslam.results import plot  # matplotlib is slow to load
 
-    laser.check_poses(log)
+    laser_log.check_poses(log)
     shape, origin = map_frame(log, options.resolution)
     with Progress(f"{log.name}, map", "scans") as progress:
         counts = counted(log, shape, origin, options.resolution, progress)
@@ -68,19 +68,19 @@ def run_mapping(log: LaserLog, options: argparse.Namespace) -> laser.Job:
             "met nothing": int(log.beams.returns(log.max_range)[1].sum()),
             "without a range, or padding": int(counts.unusable),
         },
-        **laser.map_size(grid),
+        **laser_log.map_size(grid),
         "cells known": int(known.sum()),
         "cells occupied": int((np.asarray(grid.log_odds) > 0).sum()),
         "mean entropy of a known cell [bit]": float(bits.mean()),
         "entropy of the map [bit]": float(bits.sum() + (~known).sum()),
     }
-    return laser.Job(summary, files)
+    return laser_log.Job(summary, files)
 
 
 def map_frame(log: LaserLog, resolution: float) -> tuple[tuple[int, int], Float[np.ndarray, "3"]]:
-    """The shape (H, W) and the origin of a map that holds all poses and hits.
+    """The shape (H, W) and the origin of a map that covers all poses and hits.
 
-    Raises ValueError where no beam returns, and on more than `MOST` cells.
+    Raises ValueError if no beam returns, and on more than `MOST` cells.
     """
     ranges, angles = np.asarray(log.beams.range), np.asarray(log.beams.angle)
     pose = poses.compose(log.corrected, log.mount)  # of the laser
@@ -110,9 +110,9 @@ def counted(
     resolution: float,
     progress: Callable[[int, int], object],
 ) -> Counts:
-    """The counts of all scans at the poses in the file; scans of which no beam is valid are passed.
+    """The counts of all scans at the poses in the file; scans without a valid beam are skipped.
 
-    Some at a time, padded by scans without a valid beam.
+    `TOGETHER` scans at a time, padded by scans without a valid beam.
     """
     total, width = np.shape(log.beams.range)
     hits, misses = np.zeros((2, *shape), np.int32)

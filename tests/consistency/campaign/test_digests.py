@@ -12,9 +12,8 @@ import pytest
 import worlds
 
 from jaxslam import filters, sensors, store
-from jaxslam.consistency.campaign import identity as module
-from jaxslam.consistency.campaign import monte_carlo
-from jaxslam.consistency.campaign.identity import digest, identity
+from jaxslam.consistency.campaign import digests, monte_carlo
+from jaxslam.consistency.campaign.digests import digest, identity
 from jaxslam.core.record import record
 
 
@@ -97,7 +96,7 @@ def test_another_precision_platform_version_or_bound_is_another_campaign(folder,
     assert changed(bound=True) == {"bound"}
     with jax.enable_x64(False):
         assert "dtype" in changed()
-    monkeypatch.setattr(module, "version", lambda name: {"jax": "0.1"}.get(name, there[name]))
+    monkeypatch.setattr(digests, "version", lambda name: {"jax": "0.1"}.get(name, there[name]))
     assert changed() == {"jax"}
 
 
@@ -122,7 +121,7 @@ def test_a_gate_that_a_filter_closes_over_is_seen():
 
 
 ALONE = """
-import json, jax, test_identity as t
+import json, jax, test_digests as t
 jax.config.update("jax_enable_x64", True)
 found = t.identity(**t.campaign(make=t.worlds.ekf), platform="cpu")
 print(json.dumps(found))

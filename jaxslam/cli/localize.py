@@ -9,7 +9,7 @@ import numpy as np
 from jaxtyping import Float, PyTree
 
 from jaxslam import motion
-from jaxslam.cli import laser
+from jaxslam.cli import laser_log
 from jaxslam.cli.piecewise import run_in_pieces
 from jaxslam.consistency.campaign.progress import Progress
 from jaxslam.core.types import Info
@@ -24,47 +24,46 @@ START_DEVIATION = np.array([0.2, 0.2, np.deg2rad(10.0)])
 """Standard deviations of the pose at the start [m, m, rad]."""
 
 ODOMETRY_NOISE = (0.05, 0.03, 0.02, 0.01)
-"""α of `motion.OdometryNoise`: for a straight step of 0.7 m 10 cm ahead and 7° of each turn. Raw
-odometry of intel, freiburg-101 and edmonton differs from the corrected poses by 4 cm, 5 cm and 1.7°
-to 3.5° (RMS) a step of 0.5 m to 1 m; the rest is for robots with worse wheels."""
+"""α of `motion.OdometryNoise`: a straight step of 0.7 m has σ = 10 cm ahead and 7° in each turn.
+
+Raw odometry of intel, freiburg-101 and edmonton differs from the corrected poses by 4 cm, 5 cm and
+1.7° to 3.5° (RMS) per step of 0.5 m to 1 m; the margin is for robots with worse odometry."""
 
 
 class _Weighing(TypedDict):
     """Options of `grids.GridLocalization`."""
 
     exponent: float
-    """of the likelihood"""
+    """exponent of the likelihood"""
     forget: tuple[float, float] | None
-    """recovery"""
+    """rates of the recovery from a wrong pose"""
 
 
 TRACKING: _Weighing = {"exponent": 0.2, "forget": None}
-"""Exponent of the likelihood and recovery, of a robot that starts at a pose: none, since it takes
-scans that the map does not explain for a robot that is lost."""
+"""Options for a start at a known pose: without recovery, which takes scans that the map does not
+explain for a lost robot."""
 
 ANYWHERE: _Weighing = {"exponent": 0.1, "forget": (0.05, 0.5)}
-"""The same of a robot that may be anywhere, few particles being near the truth."""
+"""Options for a start anywhere, with few particles near the truth."""
 
 SIGMA = {"pose": 0.1, "anywhere": 0.2}
 """Width of the likelihood field [m]."""
 
 BEAMS = 60
-"""About as many beams of a scan enter the weights."""
+"""Approximate number of beams of a scan that enter the weights."""
 
 NEAR = 0.5
-"""Distance from the reference within which the robot counts as found [m]."""
-
+"""Distance from the reference within which a pose counts as correct [m]."""
 
 LAST, REACH, FIT = 10, 0.3, 0.75
-"""The robot is said to be localized where of the beams of the last scans, so many, at least this
-share has the range that the map predicts, within REACH [m]: `benchmarks/NOTES.md` has the runs that
-it was chosen on."""
+"""The robot is localized if at least the share `FIT` of the beams of the `LAST` scans has the range
+that the map predicts, within `REACH` [m]. Chosen on the runs in `benchmarks/NOTES.md`."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `jaxslam localize`."""
     parser.add_argument("map", metavar="MAP.yaml", help="a map of ROS")
-    laser.add_options(parser, run_localization, map_is_made=False)
+    laser_log.add_options(parser, run_localization, map_is_made=False)
     parser.add_argument(
         "--start",
         metavar="POSE",
@@ -88,12 +87,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def run_localization(log: LaserLog, options: argparse.Namespace) -> laser.Job:
-    """Localize the robot in the map, from raw odometry and scans: likelihood field, KLD, and from
-    anywhere recovery.
+def run_localization(log: LaserLog, options: argparse.Namespace) -> laser_log.Job:
+    """Localize the robot in the map, from raw odometry and scans.
 
-    Particles and the path are the robot's poses. The poses in the file score the result, and serve
-    nothing else but the start `file`.
+    By the likelihood field and KLD resampling; a robot that starts anywhere has recovery, too.
+    The poses in the file score the result, and are otherwise used only by the start `file`.
     """
     from jaxslam.results import plot  # matplotlib is slow to load
 
@@ -161,7 +159,7 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> laser.Job:
             else f"no: less than {FIT:.0%} of the beams fit the map"
         ),
         "final pose [m, m, rad]": [float(value) for value in path.pose[-1]],
-    } | laser.scored(log, lambda: scores(np.asarray(path.pose), log.corrected))
+    } | laser_log.scored(log, lambda: scores(np.asarray(path.pose), log.corrected))
 
     figure = plot.grid_figure(
         grid,
@@ -175,22 +173,24 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> laser.Job:
         "trajectory.tum": report.trajectory_tum(log.time, path),
         **{f"localization.{kind}": plot.encode(figure, kind) for kind in options.figures},
     }
-    return laser.Job(summary, files)
+    return laser_log.Job(summary, files)
 
 
 def _start(text: str, log: LaserLog) -> np.ndarray | None:
-    """The pose (3,) at which localization starts; None for anywhere."""
+    """The pose (3,) at the start; None for anywhere."""
     if text == "global":
         return None
     if text == "file":
-        laser.check_poses(log)
+        laser_log.check_poses(log)
         return np.asarray(log.corrected[0])
-    return laser.pose_of("--start", text, "file, global or ")
+    return laser_log.pose_of("--start", text, "file, global or ")
 
 
 def share_as_predicted(grid: Grid, poses: Float[np.ndarray, "n 3"], log: LaserLog) -> float:
-    """Of the beams of the last n scans that met something, the share whose range is within REACH of
-    that of the map at the robot's pose of its scan; 0 without such beams."""
+    """The share of beams whose range is within `REACH` of that predicted by the map.
+
+    Of the returned beams of the last n scans, at the estimated poses; 0 without such beams.
+    """
     scans = jax.tree.map(lambda part: part[-len(poses) :], log.beams)
     rays = grids.ray_map(grid, method="cells")
     cast = jax.jit(jax.vmap(lambda pose, angles: grids.cast(rays, pose, angles, log.max_range)))
@@ -214,7 +214,7 @@ def _on(grid: Grid, pose: Float[np.ndarray, "3"]) -> bool:
 
 
 def scores(pose: Float[np.ndarray, "K 3"], reference: Float[np.ndarray, "K 3"]) -> Json:
-    """Distances from the poses in the file, a reference in the frame of the map or of nothing."""
+    """Distances from the poses in the file; they mean something only in the frame of the map."""
     apart = np.hypot(*(pose[:, :2] - reference[:, :2]).T)
     turned = np.rad2deg(np.abs(np.angle(np.exp(1j * (pose[:, 2] - reference[:, 2])))))
     near = apart < NEAR

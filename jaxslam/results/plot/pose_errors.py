@@ -32,13 +32,13 @@ _QUANTITIES = ("x error [m]", "y error [m]", "heading error [°]")
 
 
 _SMALL = 0.1
-"""Errors and bounds below this share of a common scale have a scale of their own."""
+"""Errors and bounds below this share of a common scale have a separate scale."""
 
 
 def errors_figure(
     estimate: Estimate, truth: Truth, *, title: str = "", width: float = PAGE
 ) -> Figure:
-    """Errors of x, y and heading over the steps, with ±3 σ of the filter's own covariance."""
+    """Errors of x, y and heading over the steps, with ±3 σ of the filter's covariance."""
     check_record("errors_figure", "the first argument", estimate, Estimate)
     error, bound = _errors(estimate, truth)
     figure, panels = panels_of(width, 0.55 * width + 1.4, 3)
@@ -51,11 +51,11 @@ def errors_figure(
 
 
 def run_errors_figure(campaign: Campaign, *, title: str = "", width: float = PAGE) -> Figure:
-    """Errors of run 0 of every filter of `Campaign.first`, a row each, as `errors_figure`.
+    """Errors of run 0 of every filter of `Campaign.first`, one row each, as in `errors_figure`.
 
-    The scales are the same, but for panels that would fill less than a tenth of theirs: these have
-    their own, in bold figures. Filters that would set them alone (`rmse_figure`) leave the panels
-    at an arrow. Raises ValueError if the campaign has no run 0.
+    The scales are equal, except for panels that would use less than a tenth of theirs: these have a
+    separate one, with bold numbers. Filters that do not set a scale (`rmse_figure`) leave the
+    panels at an arrow. Raises ValueError if the campaign has no run 0.
     """
     check_record("run_errors_figure", "the first argument", campaign, Campaign)
     if not campaign.first:
@@ -78,8 +78,8 @@ def run_errors_figure(campaign: Campaign, *, title: str = "", width: float = PAG
             axes.locator_params(axis="x", nbins=2, min_n_ticks=1)
     for j, (name, (error, bound)) in enumerate(found.items()):
         for i, axes in enumerate(panels[3 * j : 3 * j + 3]):
-            own, common = peaks[name][i], tops[i]
-            top = own if 0 < own < _SMALL * common else common
+            peak, common = peaks[name][i], tops[i]
+            top = peak if 0 < peak < _SMALL * common else common
             axes.set_ylim(-1.05 * top or -1.0, 1.05 * top or 1.0)
             if top != common:
                 axes.set_yticks([-top, 0.0, top], [f"−{top:.2g}", "0", f"{top:.2g}"], weight="bold")

@@ -10,7 +10,7 @@ from jaxslam.core.types import Beams
 from jaxslam.laser import grids
 from jaxslam.laser.grids import Counts, Grid
 from jaxslam.laser.laser_slam.records import LogOfScans, Settings
-from jaxslam.laser.laser_slam.scans import ROWS, WIDTH, met_something
+from jaxslam.laser.laser_slam.scan_points import ROWS, WIDTH, met_something
 from jaxslam.math import numpy_poses as poses
 
 _MAX_CELLS = 4_000

@@ -28,18 +28,18 @@ class Campaign:
     runs: int
     dtype: str
     divergence_limit: float
-    """[m] a run is divergent when its final position error exceeds it: 5 σ of the ideal spread,
-    σ² = tr P of the position at the end of an EKF with Jacobians at the truth, in run 0."""
+    """final position error beyond which a run is divergent [m]: 5 σ, with σ² = tr P of the position
+    at the end of an EKF with Jacobians at the truth, in run 0"""
     filters: dict[str, Summary]
     seconds: float
     """wall time, compilation included."""
     compile_seconds: float
-    """wall time until the last program was traced, and compiled or found compiled; blocks begun
-    meanwhile ran beside. 0 where nothing was left to run."""
+    """wall time until the last program was traced, and compiled or loaded, while earlier blocks may
+    already run; 0 if no run was left"""
     step_seconds: dict[str, float]
-    """Wall time of a step of one run on one device, by filter: the median over the blocks that this
-    process computed while nothing was being compiled (where there are none, over all), several of
-    which are at work at once; without filters of which it was none."""
+    """Wall time of a step of one run on one device, by filter: the median over the blocks of this
+    process, if possible those without compilation beside them. Blocks may overlap. Filters that
+    this process did not time are absent."""
     first: dict[str, tuple[Truth, Estimate]] = field(default_factory=dict)
     """Run 0 by filter, host arrays; absent for filters that this process did not run. For
     landmarks other than points, the truth has their positions."""
@@ -66,7 +66,7 @@ class Campaign:
         return report.campaign_table(self)
 
     def _repr_html_(self) -> str:
-        """Verdicts, two figures and all measures as HTML, which a notebook shows."""
+        """Verdicts, two figures and all measures as HTML, for a notebook."""
         from jaxslam.results import campaign_files
 
         return campaign_files.notebook(self)
