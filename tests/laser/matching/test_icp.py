@@ -96,17 +96,20 @@ def test_one_step_is_that_of_numpy(k):
     u, _, v = np.linalg.svd((there[near] - s0).T @ (q[near] - t0))
     turn = v.T @ u.T
     step = np.array([*(t0 - turn @ s0), np.arctan2(turn[1, 0], turn[0, 0])])
-    np.testing.assert_allclose(found("points", iterations=1).pose[k], composed(step, STARTS[k]), atol=1e-9)
+    np.testing.assert_allclose(
+        found("points", iterations=1).pose[k], composed(step, STARTS[k]), atol=1e-9
+    )
     middle, normal, straight = lines(REFERENCES.position[k])
     near = near & straight[j]
     _, step = by_polynomial(there, middle[j], normal[j], near.astype(float))
-    np.testing.assert_allclose(found("lines", iterations=1).pose[k], composed(step, STARTS[k]), atol=1e-6)
+    np.testing.assert_allclose(
+        found("lines", iterations=1).pose[k], composed(step, STARTS[k]), atol=1e-6
+    )
 
 
 def test_the_ends_are_near_the_truth_and_lines_nearer():
     error = {
-        name: np.abs(found(name).pose - TRUTH)[:GOOD].max(axis=0)
-        for name in ("points", "lines")
+        name: np.abs(found(name).pose - TRUTH)[:GOOD].max(axis=0) for name in ("points", "lines")
     }
     # Of 60 beams, 30 a direction: 14 mm/√30 = 2.6 mm, over 1.7 m: four times that.
     assert np.all(error["lines"] < [0.0104, 0.0104, 0.006])
@@ -115,6 +118,7 @@ def test_the_ends_are_near_the_truth_and_lines_nearer():
     assert np.all(found("lines").residual[:GOOD] < 0.03)
 
 
+@pytest.mark.sweep
 def test_numbers_of_other_types_are_those_of_the_scans():
     """A start of integers or of float32, and a prior of float32, beside scans in float64."""
     one = jax.tree.map(lambda part: part[0], (REFERENCES, SCANS))
