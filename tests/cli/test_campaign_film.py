@@ -1,6 +1,7 @@
 """Films of run 0 of a campaign, as the command line writes them."""
 
 import jax
+import pytest
 import worlds
 from matplotlib.animation import FFMpegWriter
 from PIL import Image, ImageChops
@@ -9,6 +10,7 @@ from jaxslam import catalog, plot
 from jaxslam.cli.consistency import _write_films as write_films
 
 
+@pytest.mark.sweep
 def test_every_filter_is_filmed_in_run_0(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(FFMpegWriter, "isAvailable", lambda: False)
     world = worlds.ring(3)

@@ -37,6 +37,7 @@ def test_the_true_noise_is_recovered_from_a_factor_five_off(example):
     assert all(name in text for name in example.SIMULATED)
 
 
+@pytest.mark.sweep
 @pytest.mark.skipif(not MRCLAM.is_dir(), reason="no ../shared/data/mrclam1")
 def test_a_robots_own_noise_is_fitted(example):
     """On the first rows of a real log: uphill, to an optimum, and to a likelier noise."""

@@ -105,6 +105,7 @@ def test_it_writes_the_optimum(file, tmp_path, capsys, monkeypatch):
         assert part in printed
 
 
+@pytest.mark.sweep
 def test_a_file_of_toro_is_optimized_and_written_as_g2o(tmp_path, capsys, undrawn):
     graph = small_graphs.only(small(), "relative_pose")
     none = np.zeros(0, int)
@@ -131,6 +132,7 @@ EDGE_SE2 0 2 2.1 0 0 5 0 0 5 0 5
 """
 
 
+@pytest.mark.sweep
 @pytest.mark.parametrize("fixed", ["", "FIX 0\n"])
 def test_gtsam_reads_what_is_written(tmp_path, undrawn, fixed):
     """Poses, relative poses and informations; FIX stands only where the file has it."""
@@ -173,6 +175,7 @@ def test_too_few_steps_are_no_success(file, tmp_path, capsys):
     assert json.loads((tmp_path / "summary.json").read_text())["status"] == "exhausted"
 
 
+@pytest.mark.sweep
 def test_a_kernel_doubts_loops_and_points_but_not_the_path(file, tmp_path, monkeypatch):
     asked, solve = {}, graphs.optimize
 

@@ -147,6 +147,7 @@ def test_a_filter_of_another_size_and_a_world_without_covariance_are_refused(min
         UserObjects().scenario(f"{mine}:noisy", None)
 
 
+@pytest.mark.sweep
 def test_a_campaign_of_a_file_is_resumed_while_the_file_computes_the_same(
     mine, tmp_path, capsys, refused, undrawn
 ):

@@ -6,6 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import swept
 from recordings import EPOCH, MRCLAM, assert_log, assert_spoiled, folder, mapped, mrclam, write
 
 from jaxslam import datasets
@@ -175,7 +176,10 @@ def test_mrclam_survey_of_data_set_1_has_two_subjects_exchanged():
     assert np.median(off["of the others"]) < 0.15
 
 
-@pytest.mark.parametrize(("robot", "rmse", "nis"), [(1, 0.0731, 0.775), (3, 0.1124, 0.921)])
+@pytest.mark.parametrize(
+    ("robot", "rmse", "nis"),
+    swept([(1, 0.0731, 0.775), (3, 0.1124, 0.921)], (1, 0.0731, 0.775)),
+)
 def test_ekf_maps_mrclam(robot, rmse, nis):
     """Within 5 % of what was measured when the noise was chosen; 0.5 m was asked for."""
     found = mapped(mrclam(robot))

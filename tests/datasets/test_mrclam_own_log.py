@@ -83,6 +83,7 @@ def test_what_is_no_calibration_is_refused(tmp_path):
     )
 
 
+@pytest.mark.sweep
 def test_the_constants_of_a_simulated_robot_are_found(tmp_path):
     own = datasets.mrclam_calibration(write(tmp_path, recorded()), 1, known=KNOWN)
     assert own.found.converged

@@ -111,6 +111,7 @@ def test_victoria_file(victoria_file):
     np.testing.assert_allclose(np.sqrt(np.diagonal(cov)), [0.01, 0.002, 0.002], rtol=1e-12)
 
 
+@pytest.mark.sweep
 def test_ekf_maps_victoria_park(victoria_file):
     """All of it: finite, and the joint covariance positive definite after every step."""
     data = datasets.victoria_park(victoria_file)

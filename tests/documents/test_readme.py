@@ -15,6 +15,7 @@ def test_the_readme_is_a_page():
     assert len(README.encode()) <= 8192
 
 
+@pytest.mark.sweep
 @pytest.mark.filterwarnings("default")
 def test_the_readme_runs(capsys):
     blocks = re.findall(r"```python\n(.*?)```", README, re.DOTALL)

@@ -6,6 +6,7 @@ import functools
 import jax
 import numpy as np
 import pytest
+from cases import swept
 from reference import ekf_slam as plain
 from worlds import draw
 
@@ -96,7 +97,7 @@ def reference(case, log, steps=None, **changes):
     )
 
 
-@pytest.mark.parametrize("case", CASES)
+@pytest.mark.parametrize("case", swept(CASES, "circle", "cloister joint with gate"))
 def test_filter_equals_the_reference_at_every_step(case):
     log, trace = filtered(case)
     assert_equal_at_every_step(trace.probe, list(reference(case, log)))

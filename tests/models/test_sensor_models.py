@@ -317,6 +317,7 @@ def test_bad_least_distances_are_refused(distance):
 # --- in a filter --------------------------------------------------------------------------------
 
 
+@pytest.mark.sweep
 def test_inverse_depth_in_the_ekf_starts_from_the_prior_and_finds_the_distance():
     """Driving past landmarks 3 to 30 m away; one of five slots stays empty."""
     points = np.array([[3.0, 3.0], [6.0, -4.0], [10.0, 10.0], [4.0, 30.0]])

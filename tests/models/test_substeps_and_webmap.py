@@ -237,6 +237,7 @@ def test_steps_may_be_given():
             webmap(loops=bad)
 
 
+@pytest.mark.sweep
 def test_ekf_slam_runs_on_it():
     scenario = webmap(20)
     landmarks = np.asarray(scenario.landmarks)

@@ -156,6 +156,7 @@ def test_no_slope_to_compare_with_is_inf_not_nan():
     )  # 0.2 - 3 * 0.2 < 0
 
 
+@pytest.mark.sweep
 def test_whole_numbers_are_as_good_as_any():
     """A pose of integers does not round the control, the landmark or the noise."""
     robot, u, cov = motion.Velocity(np.diag([0.1, 0.05, 0.05]) ** 2), [1.5, 0.3, 0.5], np.eye(3) / 9
@@ -252,7 +253,7 @@ def from_the_side(baseline):
     return by_inverse, sensor_linearity(sensors.BearingOnly([[1e-4]]), pose, point, cov)
 
 
-@pytest.mark.parametrize("share", [0.02, 0.1, 0.25])
+@pytest.mark.parametrize("share", swept([0.02, 0.1, 0.25], 0.1))
 def test_inverse_depth_is_near_linear_where_range_is_not(share):
     """f(ρ) = -atan(ρ b) has |f''/f'| = 2ρb²/(1 + ρ²b²), f(d) = -atan(b/d) has 2d/(d² + b²)."""
     prior = sensors.BearingInverseDepth([[1e-4]], min_distance=NEAREST).free

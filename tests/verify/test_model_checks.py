@@ -6,7 +6,6 @@ from functools import partial
 import jax.numpy as jnp
 import numpy as np
 import pytest
-from cases import swept
 from own_models import changed, sensor_of
 from verified import failed
 
@@ -137,6 +136,7 @@ def test_a_claim_that_loses_digits_far_from_the_origin_is_told_apart():
     assert wrong.far_alone and "right at all other states" in str(report)
 
 
+@pytest.mark.sweep
 def test_a_squared_range_is_tried_only_where_it_can_be_measured():
     """A sensor whose `invert` takes a root: no measurement is invented that it could not have made."""
 
@@ -159,6 +159,7 @@ def test_a_squared_range_is_tried_only_where_it_can_be_measured():
     assert report.passed, str(report)
 
 
+@pytest.mark.sweep
 def test_a_sensor_whose_embed_fails_is_still_looked_at():
     def embed(pose, point):
         raise NotImplementedError("later")
@@ -266,7 +267,8 @@ def test_a_round_trip_off_by_a_turn_says_that_the_unit_is_missing():
 # --- Beam models under `verify`: both pass, a wrong derivative does not, and a file may define on--
 
 
-@pytest.mark.parametrize("name", swept(beam_models.REGISTRY, "likelihood_field"))
+@pytest.mark.sweep
+@pytest.mark.parametrize("name", beam_models.REGISTRY)
 def test_beam_models_are_verified(name):
     report = verify_jacobians(build(beam_models.REGISTRY[name]), count=4)
     assert report.passed, str(report)

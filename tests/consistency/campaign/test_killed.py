@@ -153,6 +153,7 @@ def test_ten_kills_anywhere_change_no_bit(tmp_path, programs, undisturbed):
     worlds.assert_same_bits(summed_up(tmp_path), undisturbed)
 
 
+@pytest.mark.sweep
 def test_a_full_disk_damage_a_wrong_clock_and_company_change_no_bit(
     tmp_path, programs, undisturbed
 ):

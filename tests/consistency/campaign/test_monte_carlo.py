@@ -254,6 +254,7 @@ def test_float32_sees_the_worlds_of_float64(in_fours):
         campaign_of(dtype=jnp.float16)
 
 
+@pytest.mark.sweep
 def test_drops_and_losses_are_counted_and_leave_the_others_valid(in_fours):
     reckoning = filters.DeadReckoning(WORLD.motion, WORLD.sensor)
 

@@ -145,6 +145,7 @@ def in_one_go(tmp_path_factory):
     return out
 
 
+@pytest.mark.sweep
 def test_the_command_computes_a_part(tmp_path, capsys, in_one_go):
     out = tmp_path / "out"
     # A process was killed as it made the manifest.

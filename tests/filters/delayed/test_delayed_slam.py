@@ -29,6 +29,7 @@ from jaxslam.math.stats import chi2_quantile
 CAMERA = sensors.BearingOnly([[0.01**2]])
 BEACON = sensors.RangeOnly([[0.05**2]])
 KINDS = {"rays": Rays(), "circles": Circles()}
+EACH_KIND = pytest.mark.parametrize("kind", swept(KINDS, "rays"))
 RESIDUAL = {kind: jax.jit(jax.vmap(model.residual)) for kind, model in KINDS.items()}
 
 
@@ -42,7 +43,7 @@ def seen_by(kind, places, point):
     return np.column_stack([places, seen])
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@EACH_KIND
 def test_perfect_measurements_intersect_at_the_point(kind):
     rng = np.random.default_rng(0)
     places, points = rng.uniform(-5, 5, (200, 2, 2)), rng.uniform(-5, 5, (200, 2))
@@ -98,7 +99,7 @@ def test_what_does_not_intersect_is_not_ok_and_finite(kind, a, b):
     chex.assert_tree_all_finite((points, jacobians))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@EACH_KIND
 def test_a_measurement_is_stored_where_the_sensor_is_mounted(kind):
     mount = (0.3, -0.2, 0.7)
     factory = sensors.BearingOnly if kind == "rays" else sensors.RangeOnly
@@ -160,7 +161,7 @@ def formed(kind, joint, which):
     return ADD_HYPOTHESES(joint, LAYOUT, KINDS[kind], new, parents, which, jnp.zeros(2, int))
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@EACH_KIND
 def test_the_covariance_of_an_intersection_is_that_of_draws(kind):
     joint = table(kind, scale=0.002)
     at = closest_point(kind, joint.landmarks[4:6])
@@ -206,7 +207,7 @@ def jacobian_rows(kind, joint, point, stored, differences):
     return residual(seen, points), rows, by_point
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@EACH_KIND
 def test_a_confirmed_hypothesis_moves_and_nothing_else(kind, differences):
     joint = table(kind)
     joint = formed(kind, joint, closest_point(kind, joint.landmarks[4:6]))
@@ -235,7 +236,7 @@ def test_a_confirmed_hypothesis_moves_and_nothing_else(kind, differences):
     np.testing.assert_array_equal(new.landmarks[4:], joint.landmarks[4:])
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@EACH_KIND
 def test_a_landmark_of_all_its_measurements_is_the_constrained_least_squares(kind, differences):
     """Against the solution of minimize δᵀP⁻¹δ subject to the four constraints, by one inverse."""
     joint = table(kind)
@@ -484,7 +485,7 @@ def test_derivatives_reach_the_noise_and_are_finite():
     np.testing.assert_allclose(both(at)[1], by_differences, rtol=1e-4)
 
 
-@pytest.mark.parametrize("kind", KINDS)
+@EACH_KIND
 def test_in_reverse_intersections_and_residuals_are_as_forward(kind):
     model = KINDS[kind]
 

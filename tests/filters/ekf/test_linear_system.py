@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 import worlds
-from cases import refused
+from cases import refused, swept
 
 from jaxslam import catalog, charts, filters, life, linearize, sensors
 from jaxslam.core.record import record
@@ -62,11 +62,10 @@ def dense(name):
 
 @pytest.mark.parametrize(
     ("name", "square_root"),
-    [
-        ("euclidean", True),
+    swept(
+        [("euclidean", True), ("right_invariant", False), ("left_invariant", True)],
         ("right_invariant", False),
-        ("left_invariant", True),
-    ],
+    ),
 )
 def test_pairs_and_cross_covariances_are_those_of_dense_algebra(name, square_root):
     chart, joint = charts.REGISTRY[name](), some_joint()
@@ -139,6 +138,7 @@ class Corrected(EkfSlam):
         return super().update(state, scan, key)
 
 
+@pytest.mark.sweep
 def test_landmarks_that_leave_the_map_and_come_back_tell_nothing_of_a_turn():
     """First estimates keep the turn unobservable; a slot begins anew with each landmark."""
     filter = Monitored(managed(life.Existence(lambda pose, point: point[0] < 100.0)))

@@ -126,9 +126,8 @@ def test_nothing_to_reduce_changes_nothing(name, square_root):
     chex.assert_trees_all_equal(same, joint)
 
 
-@pytest.mark.parametrize(
-    "options", swept([{}, {"linearize": Unscented(), "correction": "joint"}], {})
-)
+@pytest.mark.sweep
+@pytest.mark.parametrize("options", [{}, {"linearize": Unscented(), "correction": "joint"}])
 def test_a_reduced_map_is_filtered_as_one_of_points(options):
     """From the moment of conversion on, the filter on 4-vectors is that on points (x, y)."""
     log = a_log()

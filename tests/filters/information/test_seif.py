@@ -341,6 +341,7 @@ def test_a_full_list_drops_its_weakest_link(conservative):
     assert int(weak.counts.anchored) == (1 if conservative else 3)
 
 
+@pytest.mark.sweep
 def test_few_links_stay_definite_and_are_counted():
     state = driven(**FEW)
     assert int(state.counts.dropped) > 0

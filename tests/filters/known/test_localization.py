@@ -75,12 +75,15 @@ def slam_in_a_known_map(scenario, log, chart_name, options):
 
 @pytest.mark.parametrize(
     ("chart", "options", "compass"),
-    [
-        ("euclidean", {"iterations": 3, "covariance": "joseph", "gate": 4.0}, False),
+    swept(
+        [
+            ("euclidean", {"iterations": 3, "covariance": "joseph", "gate": 4.0}, False),
+            ("euclidean", {}, True),
+            ("right_invariant", {}, False),
+            ("left_invariant", {"correction": "joint"}, False),
+        ],
         ("euclidean", {}, True),
-        pytest.param("right_invariant", {}, False, marks=pytest.mark.sweep),
-        pytest.param("left_invariant", {"correction": "joint"}, False, marks=pytest.mark.sweep),
-    ],
+    ),
 )
 def test_it_is_slam_in_a_map_without_error(chart, options, compass):
     """With a compass beside the landmarks, too."""
@@ -118,6 +121,7 @@ def test_what_is_not_in_the_map_is_counted_and_not_started():
     np.testing.assert_array_equal(trace.final.tag, [5, 1, 2, 3])
 
 
+@pytest.mark.sweep
 def test_sigma_points_are_close_to_jacobians():
     _, (_, log) = world()
     plain, sigma = (driven(here(**o), log) for o in ({}, {"linearize": linearize.Unscented()}))

@@ -95,6 +95,7 @@ def test_a_hypothesis_the_covariance_excludes_is_refused():
     assert look(joint._replace(landmarks=far))[1].merged == 0
 
 
+@pytest.mark.sweep
 def test_a_symmetric_old_map_is_ambiguous():
     """A square may be entered by any of its sides, if the drift allows a quarter turn."""
     joint, _ = two_visits(symmetric=True, drift=8.0, shape=0.02)

@@ -95,7 +95,8 @@ def test_no_pair_within_reach():
     chex.assert_trees_all_equal(same, joint)
 
 
-@pytest.mark.parametrize("chart", swept(["euclidean", "right_invariant"], "euclidean"))
+@pytest.mark.sweep
+@pytest.mark.parametrize("chart", ["euclidean", "right_invariant"])
 def test_two_sightings_merged_are_one_landmark_seen_twice(chart):
     """With a linear sensor and no turn, starting anew and merging is the same as matching."""
     chart = charts.REGISTRY[chart]()
@@ -261,6 +262,7 @@ def of_sensor(sensor):
 PLAIN = of_sensor(SENSOR)
 
 
+@pytest.mark.sweep
 def test_landmarks_that_differ_stay_two():
     """0.45 m apart, known to centimetres, and seen by turns: only their distance tells them apart.
 

@@ -115,6 +115,7 @@ def reference_of(robots, tags, scenario):
     return Team(plain, tags, scenario.pose, scenario.pose_cov)
 
 
+@pytest.mark.sweep
 def test_a_team_of_one_is_ekf_slam():
     alone = ring(60)
     log = draw(alone, 0)[1]

@@ -251,7 +251,8 @@ def breaking(level):
     return changed(WORLD.motion, step=step)
 
 
-@pytest.mark.parametrize("kind", swept(["localization", "fastslam"], "localization"))
+@pytest.mark.sweep
+@pytest.mark.parametrize("kind", ["localization", "fastslam"])
 def test_poses_that_are_not_finite_weigh_nothing_and_are_counted(kind):
     _, log = history(3)
 
@@ -288,7 +289,8 @@ def test_where_all_weights_underflow_the_filter_goes_on_and_counts():
     chex.assert_tree_all_finite((info, jax.jit(filter.estimate)(after)))
 
 
-@pytest.mark.parametrize("count", swept([1, 7], 7))
+@pytest.mark.sweep
+@pytest.mark.parametrize("count", [1, 7])
 def test_without_any_noise_or_with_one_particle_it_is_dead_reckoning(count):
     """A proposal without spread, from a start without any: all particles are one."""
     _, log = history(5)

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from cases import refused
+from cases import refused, swept
 
 from jaxslam.core.types import Beams
 from jaxslam.laser.features import fit_line, segments
@@ -132,7 +132,7 @@ def test_a_round_room_has_next_to_no_segment(beams, scans):
     assert count <= 0.04 * scans + 4 * np.sqrt(0.04 * scans)
 
 
-@pytest.mark.parametrize("beams", [8, 30])
+@pytest.mark.parametrize("beams", swept([8, 30], 8))
 def test_a_bent_wall_is_found_as_often_as_the_docstring_says_and_a_straight_one_kept(beams):
     """One segment at 20 m, an arc whose sagitta is so many σ; no neighbour helps."""
     rng = np.random.default_rng(0)

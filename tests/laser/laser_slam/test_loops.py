@@ -68,6 +68,7 @@ def test_a_false_loop_agrees_with_no_true_one(chain):
     np.testing.assert_array_equal(clique(agree, np.ones(5)), [1, 1, 1, 1, 0])
 
 
+@pytest.mark.sweep
 def test_true_loops_agree_as_often_as_their_probability_says(chain):
     """Loops and odometry drawn from their covariances; independent, as the test assumes."""
     path, steps, covs, _ = chain

@@ -82,6 +82,7 @@ def test_a_log_in_pieces_has_the_path_of_one(drive, monkeypatch):
     np.testing.assert_allclose(chained, found.poses[1:], atol=1e-9)
 
 
+@pytest.mark.sweep
 def test_an_interrupt_ends_all_pieces(drive, monkeypatch):
     _, log, scans = drive
     monkeypatch.setattr(log_odometry, "PIECE", 10)
@@ -111,14 +112,16 @@ def test_a_message_that_is_missing_and_comes_with_the_next_moves_no_scan(drive, 
 
 
 @pytest.mark.parametrize("share", swept([0.05, 0.0], 0.05))
-@pytest.mark.parametrize("k", CORNERS)
+@pytest.mark.parametrize("k", swept(CORNERS, 12))
 def test_a_turn_that_comes_late_bends_nothing(drive, k, share):
     """By its speed it cannot be told: the robot turns as fast at every corner."""
     check_late(drive, k, share)
 
 
 @pytest.mark.parametrize("k", swept([3, 15, 27], 15))
-@pytest.mark.parametrize("wrong", [(1.8, 0.0, 0.0), (0.0, 1.5, 0.0), (0.0, 0.0, 1.2)])
+@pytest.mark.parametrize(
+    "wrong", swept([[1.8, 0.0, 0.0], [0.0, 1.5, 0.0], [0.0, 0.0, 1.2]], [0.0, 0.0, 1.2])
+)
 def test_a_single_wrong_pose_of_raw_odometry_moves_no_other_scan(drive, k, wrong):
     """The scan itself may match a place that looks alike, in doubt."""
     true, log, _ = drive

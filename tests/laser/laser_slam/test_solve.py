@@ -122,6 +122,7 @@ def test_what_is_wrong_is_counted_and_the_run_goes_on(drive):
     assert sum(counts[f"loops {o.name.lower()}"] for o in LoopOutcome) == counts["loops matched"]
 
 
+@pytest.mark.sweep
 def test_after_a_jump_a_match_is_right_or_refused(drive):
     """At each scan of the drive: the step from the one before is unknown, a metre and up to 90°."""
     true, log, _ = drive
@@ -160,6 +161,7 @@ def test_a_match_with_another_place_is_in_doubt(drive):
     assert matched > 25 and matched - doubted < 5 and wrong < 3
 
 
+@pytest.mark.sweep
 def test_a_scan_of_another_place_does_not_move_the_path(drive):
     """Its pose is wrong, by its covariance; the other poses and the loops are right."""
     true, log, _ = drive
@@ -349,6 +351,7 @@ def test_relations_that_do_not_join_are_refused_before_the_work(
 # --- A log of another size is solved by the programs of the first ---------------------------------
 
 
+@pytest.mark.sweep
 def test_a_second_log_of_another_size_compiles_nothing():
     """Other scans, beams, walls and map; the first has a step of odometry that is not known, whose
     search a log may need or not."""

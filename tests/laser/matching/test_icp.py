@@ -1,5 +1,7 @@
 """The iterative closest point methods: one step in NumPy, accuracy, outliers, bad scans."""
 
+from functools import cache
+
 import chex
 import jax
 import jax.numpy as jnp
@@ -43,19 +45,11 @@ def batch():
 REFERENCES, SCANS, TRUTH, STARTS = batch()
 
 
-@pytest.fixture(scope="module")
-def found():
-    makers = {"points": matching.PointToPoint, "lines": matching.PointToLine}
-    return {
-        (name, steps): jax.device_get(
-            matching.match(
-                make(IcpSettings(**OPTIONS, **({"iterations": 1} if steps == 1 else {}))),
-                REFERENCES, SCANS, STARTS,
-            )
-        )
-        for name, make in makers.items()
-        for steps in (1, None)
-    }  # fmt: skip
+@cache
+def found(name, **options):
+    make = {"points": matching.PointToPoint, "lines": matching.PointToLine}[name]
+    matcher = make(IcpSettings(**OPTIONS, **options))
+    return jax.device_get(matching.match(matcher, REFERENCES, SCANS, STARTS))
 
 
 def lines(p):
@@ -93,34 +87,39 @@ def composed(step, pose):
     return np.array([*c, pose[2] + step[2]])
 
 
-@pytest.mark.parametrize("k", swept(range(2), 0))
-def test_one_step_is_that_of_numpy(found, k):
+@pytest.mark.sweep
+@pytest.mark.parametrize("k", range(2))
+def test_one_step_is_that_of_numpy(k):
     there, j, near = partners(k)
     q = REFERENCES.position[k][j]
     s0, t0 = there[near].mean(axis=0), q[near].mean(axis=0)
     u, _, v = np.linalg.svd((there[near] - s0).T @ (q[near] - t0))
     turn = v.T @ u.T
     step = np.array([*(t0 - turn @ s0), np.arctan2(turn[1, 0], turn[0, 0])])
-    np.testing.assert_allclose(found["points", 1].pose[k], composed(step, STARTS[k]), atol=1e-9)
+    np.testing.assert_allclose(
+        found("points", iterations=1).pose[k], composed(step, STARTS[k]), atol=1e-9
+    )
     middle, normal, straight = lines(REFERENCES.position[k])
     near = near & straight[j]
     _, step = by_polynomial(there, middle[j], normal[j], near.astype(float))
-    np.testing.assert_allclose(found["lines", 1].pose[k], composed(step, STARTS[k]), atol=1e-6)
+    np.testing.assert_allclose(
+        found("lines", iterations=1).pose[k], composed(step, STARTS[k]), atol=1e-6
+    )
 
 
-def test_the_ends_are_near_the_truth_and_lines_nearer(found):
+def test_the_ends_are_near_the_truth_and_lines_nearer():
     error = {
-        name: np.abs(found[name, None].pose - TRUTH)[:GOOD].max(axis=0)
-        for name in ("points", "lines")
+        name: np.abs(found(name).pose - TRUTH)[:GOOD].max(axis=0) for name in ("points", "lines")
     }
     # Of 60 beams, 30 a direction: 14 mm/√30 = 2.6 mm, over 1.7 m: four times that.
     assert np.all(error["lines"] < [0.0104, 0.0104, 0.006])
     assert np.all(error["points"] < 0.1) and error["points"].sum() > error["lines"].sum()
-    assert np.all(found["lines", None].status[:GOOD] == MatchStatus.CONVERGED)
-    assert np.all(found["lines", None].residual[:GOOD] < 0.03)
+    assert np.all(found("lines").status[:GOOD] == MatchStatus.CONVERGED)
+    assert np.all(found("lines").residual[:GOOD] < 0.03)
 
 
-def test_numbers_of_other_types_are_those_of_the_scans(found):
+@pytest.mark.sweep
+def test_numbers_of_other_types_are_those_of_the_scans():
     """A start of integers or of float32, and a prior of float32, beside scans in float64."""
     one = jax.tree.map(lambda part: part[0], (REFERENCES, SCANS))
     whole = matching.Prior(np.zeros(3, np.float32), np.zeros((3, 3), np.float32))
@@ -133,9 +132,9 @@ def test_numbers_of_other_types_are_those_of_the_scans(found):
     np.testing.assert_array_equal(*ends)
 
 
-def test_bad_scans_have_a_status(found):
+def test_bad_scans_have_a_status():
     for name in ("points", "lines"):
-        end = found[name, None]
+        end = found(name)
         assert list(end.status[4:6]) == [MatchStatus.TOO_FEW] * 2
         assert end.status[6] == MatchStatus.UNLIKE
         chex.assert_tree_all_finite(end)
@@ -143,13 +142,13 @@ def test_bad_scans_have_a_status(found):
         assert np.all(end.pair[4:6] == -1) and np.all(end.inliers[4:6] == 0)
 
 
-def test_a_corridor_is_degenerate_along_itself(found):
+def test_a_corridor_is_degenerate_along_itself():
     for name in ("points", "lines"):
-        end = found[name, None]
+        end = found(name)
         assert end.status[7] == MatchStatus.DEGENERATE
         direction = end.weakest[7] / np.linalg.norm(end.weakest[7])
         assert abs(direction[0]) > 0.999
-    assert abs(found["lines", None].pose[7, 1]) < 0.01
+    assert abs(found("lines").pose[7, 1]) < 0.01
 
 
 @pytest.mark.sweep

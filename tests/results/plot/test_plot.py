@@ -6,6 +6,7 @@ from itertools import pairwise
 import drawn
 import numpy as np
 import pytest
+from cases import swept
 from matplotlib.colors import to_rgb
 
 from jaxslam import plot
@@ -102,7 +103,7 @@ def drawn_looks(figure):
     return {(name, each.get_color(), each.get_marker()) for name, each in found if name in TWELVE}
 
 
-@pytest.mark.parametrize("names", [FIVE, TWELVE])
+@pytest.mark.parametrize("names", swept([FIVE, [*TWELVE]], FIVE))
 def test_a_filter_has_one_look_in_all_figures(names):
     found = drawn.campaign(names)
     numbers = numbers_of(names)
@@ -142,7 +143,10 @@ def test_kinds_keep_their_order_and_others_come_last_in_fives():
     ]
 
 
-@pytest.mark.parametrize(("draw", "columns"), list(zip(OVER_STEPS, (3, 2, 3, 1, 1), strict=True)))
+@pytest.mark.parametrize(
+    ("draw", "columns"),
+    swept(zip(OVER_STEPS, (3, 2, 3, 1, 1), strict=True), (plot.nees_figure, 3)),
+)
 def test_twenty_filters_are_drawn_by_kind(every, draw, columns):
     rows = kinds(draw(every), columns)
     there = {kind: list(names) for kind, names in KINDS.items()}
@@ -170,7 +174,7 @@ def test_nees_is_drawn_with_its_band_and_verdicts(five):
     assert axes.get_ylabel() == "heading NEES (dof 1)"
 
 
-@pytest.mark.parametrize("names", [FIVE, tuple(ALL)])
+@pytest.mark.parametrize("names", swept([FIVE, [*ALL]], FIVE))
 def test_the_band_is_seen_whatever_a_degenerate_covariance_gives(names):
     figure = plot.nees_figure(drawn.campaign(names))
     shown = panels(figure)
@@ -278,7 +282,7 @@ def test_points_of_cost_stay_off_the_frame(five):
     untimed.canvas.draw()
 
 
-@pytest.mark.parametrize("names", [FIVE[:3], TWELVE])
+@pytest.mark.parametrize("names", swept([FIVE[:3], [*TWELVE]], FIVE[:3]))
 def test_intervals_of_cost_set_the_scale_and_have_an_arrow_where_they_leave_it(names):
     found = drawn.campaign(names)
     measures = {
@@ -342,7 +346,7 @@ def test_information_gained_is_drawn_for_watched_filters_and_zeros_below_the_axi
     ]
 
 
-@pytest.mark.parametrize("names", [("ekf", "fej"), tuple(ALL)])
+@pytest.mark.parametrize("names", swept([["ekf", "fej"], [*ALL]], ["ekf", "fej"]))
 def test_labels_of_information_gained_do_not_crowd(names):
     figure = plot.gained_figure(drawn.campaign(names))
     figure.draw_without_rendering()
@@ -357,7 +361,7 @@ def test_labels_of_information_gained_do_not_crowd(names):
 
 
 @pytest.mark.parametrize("draw", FIGURES)
-@pytest.mark.parametrize("width", [plot.PAGE, plot.COLUMN])
+@pytest.mark.parametrize("width", swept([plot.PAGE, plot.COLUMN], plot.COLUMN))
 def test_five_filters_fit_a_page_and_a_column_in_letters_of_one_size(five, draw, width):
     figure = draw(five, width=width)
     figure.draw_without_rendering()
@@ -374,7 +378,7 @@ def test_five_filters_fit_a_page_and_a_column_in_letters_of_one_size(five, draw,
     _apart(shown)
 
 
-@pytest.mark.parametrize("draw", FIGURES)
+@pytest.mark.parametrize("draw", swept(FIGURES, plot.nees_figure))
 def test_twenty_filters_can_be_read_and_nothing_overlaps(every, draw):
     rows = draw is plot.run_errors_figure  # three panels a filter: slow to lay out, and all alike
     figure = draw(drawn.campaign(list(ALL)[:7]) if rows else every)
@@ -398,7 +402,7 @@ def _apart(shown):
 
 
 @pytest.mark.parametrize("draw", [*OVER_STEPS, plot.cost_figure])
-@pytest.mark.parametrize("count", [1, 6])
+@pytest.mark.parametrize("count", swept([1, 6], 1))
 def test_filters_without_a_number_and_single_steps_can_be_drawn(draw, count):
     there = drawn.summary("ekf")
     lost = dataclasses.replace(

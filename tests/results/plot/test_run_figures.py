@@ -6,6 +6,7 @@ import dataclasses
 import drawn
 import numpy as np
 import pytest
+from cases import swept
 
 from jaxslam import plot
 from jaxslam.core.types import Trace
@@ -85,7 +86,7 @@ def test_paths_that_coincide_can_all_be_seen_in_a_map():
     assert len(looks) == 12 and first.get_color() not in {color for color, _ in looks}
 
 
-@pytest.mark.parametrize("count", [3, 5, 7, 11])
+@pytest.mark.parametrize("count", swept([3, 5, 7, 11], 5))
 def test_the_lowest_map_of_each_column_has_the_abscissa(count):
     figure = plot.run_map_figure(drawn.campaign([f"filter{i}" for i in range(count)]))
     figure.draw_without_rendering()
