@@ -64,8 +64,10 @@ def setting_lines(
     time: Float[np.ndarray, "T"],
     row: Int[np.ndarray, "S"],
     robot: Float[np.ndarray, "S 3"],
-) -> Bool[np.ndarray, "T"]:
-    """Which ODOM lines set the odometry; programs that correct a log write such lines.
+) -> tuple[Bool[np.ndarray, "T"], str]:
+    """Which ODOM lines set the odometry, and a note where that is judged by the motion.
+
+    Programs that correct a log write such lines.
 
     They repeat the pose of the previous scan, and so differ from the ODOM line before that scan. In
     a raw log a line may repeat it by chance, or since the logger writes the two in this order. So a
@@ -91,9 +93,15 @@ def setting_lines(
     common = 2 * found.sum() >= (follows & ~(at_scan & as_before)).sum() and rest > 0
     back = np.diff(time, prepend=time[0]) < 0
     ahead = poses.between(path[:-1], path[1:])[:, 0]
-    motion = abs(ahead[found[1:]].sum()) > _MOTION * abs(ahead.sum())
-    setting = found & (back | (common and ((found & back).any() or not motion)))
-    return np.asarray(setting)
+    share = abs(ahead[found[1:]].sum()) / max(abs(ahead.sum()), 1e-9)
+    judged = bool(common and found.any() and not (found & back).any())
+    setting = found & (back | (common and not (judged and share > _MOTION)))
+    taken = "set the odometry" if share <= _MOTION else "are motion"
+    note = (
+        f"{found.sum():,} lines ODOM repeat the pose of the scan before them, with later stamps: "
+        f"they {taken}, since the steps to them are {100 * share:.0f} % of the way ahead"
+    )
+    return np.asarray(setting), note if judged else ""
 
 
 def _printed(path: Float[np.ndarray, "T 3"], robot: Float[np.ndarray, "K 3"]) -> np.ndarray:

@@ -172,7 +172,8 @@ def carmen(
     elif logged:
         table, every = np.array(logged), np.array(scan_poses)
         moved, stamp = table[:, :3], table[:, 3 + clock]
-        setting = setting_lines(moved, stamp, every[:, 0].astype(int), every[:, 1:])
+        setting, note = setting_lines(moved, stamp, every[:, 0].astype(int), every[:, 1:])
+        corrections += [note] * bool(note)
         found = odometry_of_lines(moved, stamp, setting, np.array([scan.row for scan in scans]))
     else:
         found = odometry_of_poses(robot)
