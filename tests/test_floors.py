@@ -41,10 +41,11 @@ WITHIN_CALLS = {
 KEPT = {
     "matplotlib": ("results.plot", "datasets.ros_map"),
     "argparse": ("cli",),
-    "jax.config": ("cli", "__main__", "verify"),  # verify: float64 within a block, then as before
+    # verify: float64 within a block, then as before; remote: in a worker, as where it is called
+    "jax.config": ("cli", "__main__", "verify", "consistency.campaign.remote"),
 }
-# Left as they are: the decorator that pages import, and a command.
-SHADOWED = ["cli.consistency.consistency", "core.record.record"]
+# Left as it is: the decorator that pages import.
+SHADOWED = ["core.record.record"]
 
 CONFIG = {"jax.config", "jax.enable_x64", "jax.experimental.enable_x64"}
 

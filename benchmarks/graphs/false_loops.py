@@ -20,7 +20,7 @@ from benchmarks.graphs import peer
 from benchmarks.graphs.worlds import with_false_loops
 from benchmarks.real_data import DATA
 from jaxslam import graphs
-from jaxslam.cli.optimize import SEVERAL
+from jaxslam.cli.optimize import ROBUST_STARTS
 from jaxslam.graphs import starts
 from jaxslam.graphs.graph import LOOPS
 
@@ -86,7 +86,7 @@ def average_by(part: int, of: dict[tuple[str, float], float]) -> dict:
 
 def optimum(clean: graphs.Graph, factors: dict | None) -> np.ndarray:
     """The poses of the lowest χ² from some starts."""
-    found = [graphs.optimize(starts.STARTS[start](clean), factors) for start in SEVERAL]
+    found = [graphs.optimize(starts.STARTS[start](clean), factors) for start in ROBUST_STARTS]
     return np.asarray(min(found, key=lambda each: float(each.chi2)).graph.poses)
 
 
@@ -111,7 +111,7 @@ def solved(mixed: graphs.Graph, tried: set | None) -> dict[tuple[str, str], np.n
             solution = graphs.optimize(begin, kernel=kernel)
             costs[start] = float(np.nan_to_num(solution.chi2, nan=np.inf))
             found[name, start] = np.asarray(solution.graph.poses)
-        if several := [start for start in SEVERAL if start in costs]:
+        if several := [start for start in ROBUST_STARTS if start in costs]:
             found[name, "several"] = found[name, min(several, key=costs.__getitem__)]
     for start in GTSAM_STARTS:
         if tried is None or ("GTSAM", start) in tried:

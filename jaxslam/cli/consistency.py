@@ -100,10 +100,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         help="compute the blocks elsewhere: processes:N, here; dask://HOST:PORT, on the workers of "
         "a Dask scheduler; mpi, on the ranks of mpiexec (mpi4py.futures)",
     )
-    parser.set_defaults(command=consistency)
+    parser.set_defaults(command=run_campaign)
 
 
-def consistency(options: argparse.Namespace, command: str) -> int:
+def run_campaign(options: argparse.Namespace, command: str) -> int:
     """Run a campaign, print its table and write its files; returns the exit status."""
     # Worlds are drawn in float64 whatever the filters compute in, so both precisions see the same.
     jax.config.update("jax_enable_x64", True)

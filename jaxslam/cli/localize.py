@@ -52,12 +52,12 @@ SIGMA = {"pose": 0.1, "anywhere": 0.2}
 BEAMS = 60
 """Approximate number of beams of a scan that enter the weights."""
 
-NEAR = 0.5
+MAX_POSE_ERROR = 0.5
 """Distance from the reference within which a pose counts as correct [m]."""
 
-LAST, REACH, FIT = 10, 0.3, 0.75
-"""The robot is localized if at least the share `FIT` of the beams of the `LAST` scans has the range
-that the map predicts, within `REACH` [m]. Chosen on the runs in `benchmarks/NOTES.md`."""
+LAST_SCANS, MAX_RANGE_ERROR, MIN_SHARE = 10, 0.3, 0.75
+"""The robot is localized if at least `MIN_SHARE` of the beams of the last scans have the range that
+the map predicts, within `MAX_RANGE_ERROR` [m]. Chosen on the runs in `benchmarks/NOTES.md`."""
 
 
 def add_options(parser: argparse.ArgumentParser) -> None:
@@ -105,7 +105,7 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> laser_log.Jo
             f"--start: the pose ({x:g} m, {y:g} m, {np.rad2deg(heading):g}°) is off the map "
             f"{options.map}"
         )
-    options_of = ANYWHERE if pose is None else TRACKING
+    weighing = ANYWHERE if pose is None else TRACKING
     sigma = SIGMA["anywhere" if pose is None else "pose"]
     filter = grids.GridLocalization(
         grid,
@@ -113,7 +113,7 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> laser_log.Jo
         motion.Odometry(motion.OdometryNoise(ODOMETRY_NOISE)),
         options.particles,
         start="uniform" if pose is None else "gaussian",
-        **options_of,
+        **weighing,
         every=max(1, np.shape(log.beams.range)[1] // BEAMS),
     )
     rows = grids.beam_log(motion.odometry_controls(log.raw), log.beams)
@@ -135,7 +135,7 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> laser_log.Jo
     groups = grids.clusters(cloud, weight)
     info = found.kept
     agree = bool(groups.weight[0] > 0.5)
-    fit = share_as_predicted(grid, np.asarray(path.pose)[-LAST:], log)
+    fit = share_as_predicted(grid, np.asarray(path.pose)[-LAST_SCANS:], log)
     summary = {
         "job": "localization",
         "map": str(options.map),
@@ -150,13 +150,14 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> laser_log.Jo
         "hypotheses at the end": len(groups.weight),
         "weight of the heaviest": float(groups.weight[0]),
         "particles agree at the end": agree,
-        f"beams of the last {LAST} scans within {REACH:g} m of the map's range, share": fit,
+        f"beams of the last {LAST_SCANS} scans within {MAX_RANGE_ERROR:g} m of the map's range, "
+        "share": fit,
         "localized at the end": (
             "no: hypotheses disagree"
             if not agree
             else "yes"
-            if fit >= FIT
-            else f"no: less than {FIT:.0%} of the beams fit the map"
+            if fit >= MIN_SHARE
+            else f"no: less than {MIN_SHARE:.0%} of the beams fit the map"
         ),
         "final pose [m, m, rad]": [float(value) for value in path.pose[-1]],
     } | laser_log.scored(log, lambda: scores(np.asarray(path.pose), log.corrected))
@@ -187,7 +188,7 @@ def _start(text: str, log: LaserLog) -> np.ndarray | None:
 
 
 def share_as_predicted(grid: Grid, poses: Float[np.ndarray, "n 3"], log: LaserLog) -> float:
-    """The share of beams whose range is within `REACH` of that predicted by the map.
+    """The share of beams whose range is within `MAX_RANGE_ERROR` of that predicted by the map.
 
     Of the returned beams of the last n scans, at the estimated poses; 0 without such beams.
     """
@@ -196,7 +197,7 @@ def share_as_predicted(grid: Grid, poses: Float[np.ndarray, "n 3"], log: LaserLo
     cast = jax.jit(jax.vmap(lambda pose, angles: grids.cast(rays, pose, angles, log.max_range)))
     off = np.abs(np.asarray(cast(compose(poses, log.mount), scans.angle)) - scans.range)
     met, _ = scans.returns(log.max_range)
-    return float((met & (off < REACH)).sum() / max(met.sum(), 1))
+    return float((met & (off < MAX_RANGE_ERROR)).sum() / max(met.sum(), 1))
 
 
 def _particle_info(info: Info) -> PyTree:
@@ -217,7 +218,7 @@ def scores(pose: Float[np.ndarray, "K 3"], reference: Float[np.ndarray, "K 3"]) 
     """Distances from the poses in the file; they mean something only in the frame of the map."""
     apart = np.hypot(*(pose[:, :2] - reference[:, :2]).T)
     turned = np.rad2deg(np.abs(np.angle(np.exp(1j * (pose[:, 2] - reference[:, 2])))))
-    near = apart < NEAR
+    near = apart < MAX_POSE_ERROR
     late = np.flatnonzero(~near)
     found = 0 if not len(late) else int(late[-1]) + 1
     return {
@@ -226,6 +227,6 @@ def scores(pose: Float[np.ndarray, "K 3"], reference: Float[np.ndarray, "K 3"]) 
         "from the poses in the file, largest of the second half [m]": float(
             apart[len(apart) // 2 :].max()
         ),
-        f"share of scans within {NEAR:g} m": float(near.mean()),
-        f"within {NEAR:g} m from scan … on": found if found < len(apart) else "none",
+        f"share of scans within {MAX_POSE_ERROR:g} m": float(near.mean()),
+        f"within {MAX_POSE_ERROR:g} m from scan … on": found if found < len(apart) else "none",
     }

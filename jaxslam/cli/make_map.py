@@ -18,13 +18,13 @@ from jaxslam.math import numpy_poses as poses
 from jaxslam.results import report
 from jaxslam.results.files import Files
 
-TOGETHER = 64
+SCANS_AT_ONCE = 64
 """Scans between two updates of the progress."""
 
 MARGIN = 1.0
 """Distance from the outermost hit to the border of the map [m]."""
 
-MOST = 10**8
+MAX_CELLS = 10**8
 """Largest number of cells of a map."""
 
 
@@ -80,7 +80,7 @@ def run_mapping(log: LaserLog, options: argparse.Namespace) -> laser_log.Job:
 def map_frame(log: LaserLog, resolution: float) -> tuple[tuple[int, int], Float[np.ndarray, "3"]]:
     """The shape (H, W) and the origin of a map that covers all poses and hits.
 
-    Raises ValueError if no beam returns, and on more than `MOST` cells.
+    Raises ValueError if no beam returns, and on more than `MAX_CELLS` cells.
     """
     ranges, angles = np.asarray(log.beams.range), np.asarray(log.beams.angle)
     pose = poses.compose(log.corrected, log.mount)  # of the laser
@@ -95,10 +95,10 @@ def map_frame(log: LaserLog, resolution: float) -> tuple[tuple[int, int], Float[
     places = np.concatenate([log.corrected[:, :2], pose[:, :2], ends[met]])
     low = resolution * np.floor((places.min(axis=0) - MARGIN) / resolution)
     size = np.ceil((places.max(axis=0) + MARGIN - low) / resolution)
-    if not size.prod() <= MOST:
+    if not size.prod() <= MAX_CELLS:
         raise ValueError(
             f"--resolution: cells of {resolution:g} m make a map of {size[0]:,.0f} × {size[1]:,.0f}"
-            f" cells; at most {MOST:,}"
+            f" cells; at most {MAX_CELLS:,}"
         )
     return (int(size[1]), int(size[0])), np.array([*low, 0.0])
 
@@ -112,21 +112,23 @@ def counted(
 ) -> Counts:
     """The counts of all scans at the poses in the file; scans without a valid beam are skipped.
 
-    `TOGETHER` scans at a time, padded by scans without a valid beam.
+    `SCANS_AT_ONCE` scans at a time, padded by scans without a valid beam.
     """
     total, width = np.shape(log.beams.range)
     hits, misses = np.zeros((2, *shape), np.int32)
     outside = unusable = 0
-    for begin in range(0, total, TOGETHER):
-        rows = slice(begin, begin + TOGETHER)
-        beams = Beams(*(padded_rows(part[rows], TOGETHER) for part in log.beams))
-        unusable += int((~np.asarray(beams.valid)).sum()) - width * (TOGETHER - len(log.time[rows]))
+    for begin in range(0, total, SCANS_AT_ONCE):
+        rows = slice(begin, begin + SCANS_AT_ONCE)
+        beams = Beams(*(padded_rows(part[rows], SCANS_AT_ONCE) for part in log.beams))
+        unusable += int((~np.asarray(beams.valid)).sum()) - width * (
+            SCANS_AT_ONCE - len(log.time[rows])
+        )
         if beams.valid.any():
             found = grids.count(
                 shape,
                 origin,
                 resolution,
-                padded_rows(log.corrected[rows], TOGETHER),
+                padded_rows(log.corrected[rows], SCANS_AT_ONCE),
                 beams,
                 max_range=log.max_range,
                 no_return=0.0,
@@ -135,6 +137,6 @@ def counted(
             hits += np.asarray(found.hits)
             misses += np.asarray(found.misses)
             outside += int(found.outside)
-        progress(min(begin + TOGETHER, total), total)
+        progress(min(begin + SCANS_AT_ONCE, total), total)
     sums = np.array(outside), np.array(unusable)
     return Counts(hits, misses, origin, np.array(resolution), *sums)

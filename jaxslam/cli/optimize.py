@@ -43,15 +43,15 @@ ERRORS = {
 
 COST = "χ² = Σ eᵀ Ω e, without a factor ½; of relative poses"
 
-SEVERAL = ("given", "chordal", "robust")
+ROBUST_STARTS = ("given", "chordal", "robust")
 """Starts tried with a robust kernel: the best one differs from graph to graph."""
 
 NOT_CONVERGED = 1
 
-WORST = 10
+WORST_ROWS = 10
 """Number of rows with the largest residuals in the summary and the figure."""
 
-FRAMES = 60
+MAX_FRAMES = 60
 """Largest number of iterations in a film."""
 
 
@@ -69,7 +69,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
         "--start",
         metavar="NAME",
         help=f"where to start, one of: {', '.join(STARTS)} (default: given; with a kernel each of "
-        f"{', '.join(SEVERAL)}, and the lowest robust cost is kept)",
+        f"{', '.join(ROBUST_STARTS)}, and the lowest robust cost is kept)",
     )
     parser.add_argument(
         "--kernel",
@@ -114,37 +114,40 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
     graphs.check_graph(str(options.path), held, factors)
     given = held if kernel is None else graphs.with_loops_apart(held)
     factors = {key: known[key.split("/")[0]] for key in given.tables}
-    doubted = {key: kernel for key in given.tables if key not in TRUSTED} if kernel else None
-    begins, impossible = _begins(options.start, doubted is not None, given, factors)
+    kernels = {key: kernel for key in given.tables if key not in TRUSTED} if kernel else None
+    start_graphs, impossible = _start_graphs(options.start, kernels is not None, given, factors)
     solutions = {}
     with Progress(Path(options.path).name, "starts") as progress:
         progress.say("compiling and solving …")
         with CompileClock() as clock:
-            for name, begun in begins.items():
+            for name, start_graph in start_graphs.items():
                 solutions[name] = jax.block_until_ready(
                     graphs.optimize(
-                        begun,
+                        start_graph,
                         factors,
-                        kernel=doubted,
+                        kernel=kernels,
                         iterations=options.iterations,
                     )
                 )
             seconds, compiling = clock.seconds, clock.compiling
     tried = {name: float(np.nan_to_num(each.chi2, nan=np.inf)) for name, each in solutions.items()}
     start = min(tried, key=tried.__getitem__)
-    begun, solution = begins[start], solutions[start]
+    start_graph, solution = start_graphs[start], solutions[start]
     found = jax.tree.map(np.asarray, solution.graph)
     squared = _squared(found, factors)
     converged = int(solution.status) == Ending.CONVERGED
     costs = (
-        json_number(_sum(_squared(begun, factors))),
+        json_number(_sum(_squared(start_graph, factors))),
         json_number(_sum(squared)),
     )
     status = _status(solution, found)
     shown = costs
-    if doubted:
-        shown = json_number(graphs.chi2(begun, factors, kernel=doubted)), json_number(solution.chi2)
-    cost = "robust cost" if doubted else "χ²"
+    if kernels:
+        shown = (
+            json_number(graphs.chi2(start_graph, factors, kernel=kernels)),
+            json_number(solution.chi2),
+        )
+    cost = "robust cost" if kernels else "χ²"
     subtitles = (
         f"start ({start}): {cost} = {as_text(shown[0])}",
         f"{status.split(':')[0]}: {cost} = {as_text(shown[1])}",
@@ -162,9 +165,9 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
         "gauge": _gauge(loaded.graph, held),
         "start": start,
         "kernel": options.kernel or "none",
-        **(_robust(solution, doubted, tried, impossible) if doubted else {}),
+        **(_robust(solution, kernels, tried, impossible) if kernels else {}),
         f"chi2 of the file{plain}": costs[0]
-        if begun is given
+        if start_graph is given
         else json_number(_sum(_squared(given, factors))),
         f"chi2 at the start{plain}": costs[0],
         f"chi2{plain}": costs[1],
@@ -184,10 +187,10 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
 
     edges = sum(int(table.valid.sum()) for table in found.tables.values())
     figure = plot.graph_figure(
-        begun,
+        start_graph,
         found,
         squared,
-        worst=WORST,
+        worst=WORST_ROWS,
         subtitles=subtitles,
         title=f"{Path(options.path).name}: {len(found.poses):,} poses, {edges:,} edges",
     )
@@ -202,7 +205,7 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
         "graph.png": plot.png(figure),
     }
     if options.animate:
-        files |= _film(options, begun, factors, doubted, solution)
+        files |= _film(options, start_graph, factors, kernels, solution)
     if len(found.points):
         files["points.csv"] = _csv(("x", "y"), found.point_id, found.points, found.fixed_point)
     written = write_files(options.out, files, replaces=(*FILMS, "points.csv"))
@@ -222,31 +225,31 @@ def _sum(squared: Mapping[str, np.ndarray]) -> float:
     return float(sum(s.sum() for s in squared.values()))
 
 
-def _begins(
+def _start_graphs(
     name: str | None, robust: bool, given: Graph, factors: Mapping[str, Factor]
 ) -> tuple[dict[str, Graph], dict[str, str]]:
     """The graph at each start to try, and the starts that are not possible, with the reason."""
     if name is not None or not robust:
         name = name or "given"
         return {name: starts.STARTS[name](given, factors)}, {}
-    begins, impossible = {}, {}
-    for each in SEVERAL:
+    start_graphs, impossible = {}, {}
+    for each in ROBUST_STARTS:
         try:
-            begins[each] = starts.STARTS[each](given, factors)
+            start_graphs[each] = starts.STARTS[each](given, factors)
         except ValueError as error:
             impossible[each] = str(error)
-    return begins, impossible
+    return start_graphs, impossible
 
 
 def _robust(
     solution: graphs.Solution,
-    doubted: Mapping[str, graphs.Kernel],
+    kernels: Mapping[str, graphs.Kernel],
     tried: Mapping[str, float],
     impossible: Mapping[str, str],
 ) -> dict[str, object]:
     """Entries of the summary on a robust kernel: costs, and the number of rows kept."""
     kept, left_out = {}, {}
-    for key in doubted:
+    for key in kernels:
         valid, weight = np.asarray(solution.graph.tables[key].valid), solution.weights[key]
         kept[key] = int((np.asarray(weight)[valid] > 0.5).sum())
         left_out[key] = int(valid.sum()) - kept[key]
@@ -321,7 +324,7 @@ def _worst(
         for row, value in enumerate(values)
     ]
     found = []
-    for _, key, row in sorted(rows, key=lambda entry: -entry[0])[:WORST]:
+    for _, key, row in sorted(rows, key=lambda entry: -entry[0])[:WORST_ROWS]:
         one = graph.tables[key]._replace(valid=np.arange(len(squared[key])) == row)
         between = variables_in(graph, one, factors[key])[0]
         found.append(
@@ -348,7 +351,7 @@ def _csv(names: tuple[str, ...], ids: JaxOrNumPy, values: JaxOrNumPy, fixed: Jax
 
 def _film(
     options: argparse.Namespace,
-    begun: Graph,
+    start_graph: Graph,
     factors: Mapping[str, Factor],
     kernel: Mapping[str, graphs.Kernel] | None,
     solution: graphs.Solution,
@@ -361,11 +364,11 @@ def _film(
     from jaxslam.results import plot  # matplotlib is slow to load
 
     taken = int(solution.iterations)
-    shown = np.unique(np.linspace(1, taken, min(taken, FRAMES)).round().astype(int)).tolist()
-    iterates, costs = [begun], [float(solution.chi2_start)]
+    shown = np.unique(np.linspace(1, taken, min(taken, MAX_FRAMES)).round().astype(int)).tolist()
+    iterates, costs = [start_graph], [float(solution.chi2_start)]
     with Progress(f"{Path(options.path).name}: film", "iterations") as progress:
         for done, steps in enumerate(shown):
-            at = graphs.optimize(begun, factors, kernel=kernel, iterations=steps)
+            at = graphs.optimize(start_graph, factors, kernel=kernel, iterations=steps)
             iterates.append(jax.tree.map(np.asarray, at.graph))
             costs.append(float(at.chi2))
             progress(done + 1, len(shown))

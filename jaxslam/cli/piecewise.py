@@ -18,8 +18,8 @@ Rows: TypeAlias = tuple[tuple[PyTree, ...], PyTree]
 """Results of each step, and of the watched steps: arrays with leading T."""
 
 PIECES = 20
-"""Number of pieces of a log, unless they exceed `LONGEST`."""
-LONGEST = 500
+"""Number of pieces of a log, unless they exceed `MAX_STEPS`."""
+MAX_STEPS = 500
 """Largest number of steps of a piece."""
 
 
@@ -76,7 +76,7 @@ def run_in_pieces(
         keep: called with the info of each step.
     """
     total = log.control.shape[0]
-    size = min(-(-total // PIECES), LONGEST)
+    size = min(-(-total // PIECES), MAX_STEPS)
     key = jax.random.key(seed)
 
     def step(state: State, row: Log, number: jax.Array) -> tuple[State, Rows]:

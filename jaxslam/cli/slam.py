@@ -26,17 +26,17 @@ if TYPE_CHECKING:  # Matplotlib is slow to load
 METRES = (1.0, 2.0, 5.0, 10.0)
 """Lengths of path of the relations that score the result."""
 
-HELD = 12
+FINAL_FRAMES = 12
 """Number of frames of a film with the map after closing."""
 
 TOLERANCE = 1e-4
 """Largest difference between the stamps of a relation and of its scan [s]: public files print five
 decimals, and times since 1970 have 2e-7 s in float64."""
 
-APART = 60.0
+FAR_APART = 60.0
 """Time between the scans of a relation beyond which they are far apart [s]."""
 
-SHARE = 0.95
+ELLIPSE_SHARE = 0.95
 """Expected share of relations in the ellipse, if the covariance is right and relations exact."""
 
 
@@ -161,10 +161,10 @@ def film(log: LaserLog, solved: Solved, settings: Settings) -> "Film":
     maps, until = growing_maps(log, solved.odometry, settings, others=[solved.poses])
     closed, _ = growing_maps(log, solved.poses, settings, others=[solved.odometry])
     kept = int((solved.loops.outcome == LoopOutcome.KEPT).sum())
-    last = [closed[-1]] * HELD
-    paths = [solved.odometry[:end] for end in until] + [solved.poses] * HELD
+    last = [closed[-1]] * FINAL_FRAMES
+    paths = [solved.odometry[:end] for end in until] + [solved.poses] * FINAL_FRAMES
     captions = [f"laser odometry, scan {end:,} of {until[-1]:,}" for end in until]
-    captions += [f"after closing by {kept:,} loops"] * HELD
+    captions += [f"after closing by {kept:,} loops"] * FINAL_FRAMES
     scene = plot.map_scene(
         [np.asarray(one.log_odds) for one in (*maps, *last)],
         np.asarray(maps[0].origin),
@@ -265,10 +265,10 @@ def relation_scores(relations: metrics.Relations, log: LaserLog, solved: Solved)
         "raw odometry": solved.raw,
     }
     out: dict[str, Json] = {}
-    for name, chosen in (("all", apart >= 0), (f"over {APART:g} s apart", apart > APART)):
+    for name, chosen in (("all", apart >= 0), (f"over {FAR_APART:g} s apart", apart > FAR_APART)):
         some = metrics.Relations(*(field[chosen] for field in relations))
         count, unknown = len(some.first), int(np.isnan(nees[chosen]).sum())
-        inside = int((nees[chosen] <= chi2_quantile(SHARE, 3)).sum())
+        inside = int((nees[chosen] <= chi2_quantile(ELLIPSE_SHARE, 3)).sum())
         errors = {path: metrics.relation_errors(some, at) for path, at in paths.items()}
         figures = {
             path: {what: of._asdict() for what, of in metrics.benchmark_figures(of).items()}

@@ -10,11 +10,11 @@ from jaxtyping import Bool, Float, Int
 from jaxslam.datasets.lines import TextFile
 from jaxslam.math import numpy_poses as poses
 
-_JOINED = 1e-3
+_STAMP_TOLERANCE = 1e-3
 """Largest difference between the stamps of a line of odometry and its scan [s]."""
 
 
-_MOTION = 0.2
+_MIN_MOTION = 0.2
 """Share of the way ahead above which the steps to lines that may set the odometry are motion.
 
 Corrections have up to 0.03 in the logs of `docs/guide/real_data.md` with odometry at every scan; a
@@ -95,8 +95,8 @@ def setting_lines(
     ahead = poses.between(path[:-1], path[1:])[:, 0]
     share = abs(ahead[found[1:]].sum()) / max(abs(ahead.sum()), 1e-9)
     judged = bool(common and found.any() and not (found & back).any())
-    setting = found & (back | (common and not (judged and share > _MOTION)))
-    taken = "set the odometry" if share <= _MOTION else "are motion"
+    setting = found & (back | (common and not (judged and share > _MIN_MOTION)))
+    taken = "set the odometry" if share <= _MIN_MOTION else "are motion"
     note = (
         f"{found.sum():,} lines ODOM repeat the pose of the scan before them, with later stamps: "
         f"they {taken}, since the steps to them are {100 * share:.0f} % of the way ahead"
@@ -141,8 +141,9 @@ def odometry_of_file(
 ) -> tuple[RawOdometry, Float[np.ndarray, "K"], str]:
     """The odometry at each scan from a file of lines `t x y θ`, the times of the scans, and a note.
 
-    Each scan takes the line with the nearest stamp, within `_JOINED`. As many lines as scans, whose
-    stamps do not contradict their order, join in order and give the scans their stamps.
+    Each scan takes the line with the nearest stamp, within `_STAMP_TOLERANCE`. As many lines as
+    scans, whose stamps do not contradict their order, join in order and give the scans their
+    stamps.
 
     Raises ValueError, with file and line, on malformed lines, and on stamps that do not join.
     """
@@ -156,7 +157,7 @@ def odometry_of_file(
     after = np.clip(np.searchsorted(stamps[order], time), 1, max(len(rows) - 1, 1))
     pair = order[np.minimum(np.stack([after - 1, after]), len(rows) - 1)]
     row = np.take_along_axis(pair, np.abs(stamps[pair] - time).argmin(axis=0)[None], axis=0)[0]
-    joins = np.abs(stamps[row] - time) <= _JOINED
+    joins = np.abs(stamps[row] - time) <= _STAMP_TOLERANCE
     note = f"raw odometry is from {file.path}: {len(rows):,} lines, "
     in_time = np.sum(np.diff(stamps) < 0) <= len(stamps) / 2  # else the file runs backwards
     if joins.all():
@@ -169,7 +170,8 @@ def odometry_of_file(
         raise ValueError(
             f"{file.path}: stamps from {stamps.min():.6f} s to {stamps.max():.6f} s join "
             f"{int(joins.sum())} of the {scans} scans of {source}, from {time.min():.6f} s to "
-            f"{time.max():.6f} s, within {_JOINED:g} s; expected all, or a line for each scan"
+            f"{time.max():.6f} s, within {_STAMP_TOLERANCE:g} s; expected all, or a line for each "
+            "scan"
         )
     path_of = table[:, 1:]
     everywhere = np.ones(scans, bool)

@@ -140,7 +140,7 @@ def _is_number(field: str) -> bool:
     return "_" not in field
 
 
-LOOSE = 0.01, np.deg2rad(0.5)
+MOUNT_TOLERANCE = 0.01, np.deg2rad(0.5)
 """Largest difference of the mount between lines [m], [rad]."""
 
 _REAR = np.array([0.0, 0.0, np.pi])
@@ -262,7 +262,9 @@ def mount_of(
 
 def _beyond(off: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
     """Which poses differ from zero by more than by rounding."""
-    far = (np.hypot(off[:, 0], off[:, 1]) > LOOSE[0]) | (np.abs(off[:, 2]) > LOOSE[1])
+    far = (np.hypot(off[:, 0], off[:, 1]) > MOUNT_TOLERANCE[0]) | (
+        np.abs(off[:, 2]) > MOUNT_TOLERANCE[1]
+    )
     return np.asarray(far)
 
 

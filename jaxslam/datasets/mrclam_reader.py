@@ -21,7 +21,7 @@ from jaxslam.core.types import Info, Log
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.lines import stored
 from jaxslam.datasets.mrclam_robot import (
-    DROPS,
+    DROP_REASONS,
     MRCLAM_CALIBRATION,
     ROBOTS,
     SOURCE,
@@ -265,7 +265,7 @@ def mrclam_team(
             check_calibration("mrclam_team", constants)
     files = [read_lines(Path(folder), *one) for one in zip(numbers, each, strict=True)]
     time = np.unique(np.concatenate([t[:, 0] for one in files for t in (one.odometry, one.seen)]))
-    team, scans, controls, dropped = [], [], [], dict.fromkeys(DROPS, 0)
+    team, scans, controls, dropped = [], [], [], dict.fromkeys(DROP_REASONS, 0)
     models = {one: models_of(one) for one in set(each)}
     sights = {one: eye for one, (_, eye) in models.items()}
     if sighting_cov is not None:

@@ -266,7 +266,7 @@ def per_interval(density: jax.Array, dt: jax.Array) -> jax.Array:
     return jnp.diag(density) * jnp.where(moving, 1 / jnp.where(moving, dt, 1.0), 0.0)
 
 
-GAP = 0.2
+MAX_TRUTH_GAP = 0.2
 """Largest time between lines of the truth over which it is interpolated [s]."""
 START_COV = np.diag([0.01, 0.01, 0.03]) ** 2
 """Covariance of a true pose. Of robot 1 of data set 6, headings that two landmarks give agree with
@@ -291,12 +291,13 @@ def true_poses(
 ) -> tuple[Float[np.ndarray, "T 3"], Bool[np.ndarray, "T"]]:
     """True poses at some times, linear between lines of the truth, and where they are known.
 
-    They are unknown before the first line, after the last, and between lines more than `GAP` apart.
+    They are unknown before the first line, after the last, and between lines more than
+    `MAX_TRUTH_GAP` apart.
     """
     clock = truth[:, 0]
     after = np.clip(np.searchsorted(clock, time), 1, max(len(clock) - 1, 1))
     last = np.minimum(after, len(clock) - 1)
-    near = clock[last] - clock[after - 1] <= GAP
+    near = clock[last] - clock[after - 1] <= MAX_TRUTH_GAP
     known = (time >= clock[0]) & (time <= clock[-1]) & (near | np.isin(time, clock))
     return interpolate_poses(clock, truth[:, 1:], time), known
 
@@ -308,7 +309,7 @@ SOURCE = (
 ODOMETRY_DENSITY = (0.01**2, 0.05**2)
 """Variance of travel [m²/s] and heading [rad²/s] per second."""
 MEASUREMENT_COV = np.diag([0.15, 0.01]) ** 2
-DROPS = ("robot sightings", "unknown barcodes", "repeated in a scan")
+DROP_REASONS = ("robot sightings", "unknown barcodes", "repeated in a scan")
 
 
 class Recorded(NamedTuple):
@@ -393,7 +394,7 @@ def associated(
     names: the subjects, landmarks first; their tags are their indices in the list.
     """
     tag_of = {name: tag for tag, name in enumerate(names)}
-    dropped = dict.fromkeys(DROPS, 0)
+    dropped = dict.fromkeys(DROP_REASONS, 0)
     kept: dict[tuple[int, int], int] = {}
     row = np.searchsorted(time, seen[:, 0])
     for k, barcode in enumerate(seen[:, 1]):

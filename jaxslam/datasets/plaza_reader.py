@@ -101,7 +101,7 @@ SOURCE = (
     "truth, Journal of Field Robotics 26(9), 2009; Plaza1_.mat and Plaza2_.mat as with GTSAM"
 )
 _TABLES = {"DR": 3, "TD": 4, "TL": 3, "GT": 4}
-MOST = 1e30
+MAX_NUMBER = 1e30
 """Largest number of a table, so that sums in a filter stay finite."""
 _COLUMNS = "DR: t, distance, turn; TD: t, sender, receiver, range; TL: id, x, y; GT: t, x, y, θ"
 _RANGE_BIAS = (0.03, 0.069)
@@ -214,8 +214,8 @@ def _read(path: Path) -> dict[str, Float[np.ndarray, "_ _"]]:
             )
         if not np.all(np.isfinite(table)):
             raise ValueError(f"{path}: {name} has something other than finite numbers")
-        if np.any(np.abs(table) > MOST):
-            raise ValueError(f"{path}: {name} has a number beyond ±{MOST:g}")
+        if np.any(np.abs(table) > MAX_NUMBER):
+            raise ValueError(f"{path}: {name} has a number beyond ±{MAX_NUMBER:g}")
         tables[name] = table.astype(np.float64)
     return tables
 

@@ -161,7 +161,7 @@ def _number(cell: str) -> float:
 
 ODOMETRY, MEASUREMENTS = "odometry.csv", "measurements.csv"
 
-_GAP = 10
+_GAP_FACTOR = 10
 """Intervals of odometry above this multiple of the median are noted."""
 
 
@@ -230,7 +230,7 @@ def table(folder: str | Path) -> Dataset:
         for file, wanted in ((odometry_file, moved), (seen_file, measured))
         for column in file.unused(wanted)
     ]
-    if len(clock) > 2 and (gaps := np.diff(clock)).max() > _GAP * np.median(gaps):
+    if len(clock) > 2 and (gaps := np.diff(clock)).max() > _GAP_FACTOR * np.median(gaps):
         k = int(np.argmax(gaps))
         notes.append(
             f"{odometry.at(k + 1, TIME)}: {gaps[k]:.6g} s since the line before, the median is "

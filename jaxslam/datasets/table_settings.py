@@ -29,7 +29,7 @@ from jaxslam.math import stats
 
 _Model = TypeVar("_Model", bound=Motion | Sensor)
 
-_FIRST = ("unicycle", "pose_increment", "range_bearing")
+_DEFAULT_MODELS = ("unicycle", "pose_increment", "range_bearing")
 """The default among models with the same columns."""
 
 
@@ -54,7 +54,7 @@ def fitting_model(
     given: Sequence[str],
     path: Path,
 ) -> str:
-    """The model whose columns are given; of several the one with most columns, then of `_FIRST`."""
+    """The model whose columns are given, by most columns and then by `_DEFAULT_MODELS`."""
     bare = {split_unit(name)[0] for name in given}
     fitting, known = [], []
     for name, factory in registry.items():
@@ -66,7 +66,7 @@ def fitting_model(
         )
         known.append(f"{name} ({', '.join(names)})")
         if {split_unit(one)[0] for one in names} <= bare:
-            fitting.append((len(names), name in _FIRST, name))
+            fitting.append((len(names), name in _DEFAULT_MODELS, name))
     if not fitting:
         raise ValueError(
             f"{path}: [{section}] model: expected one, since no model has the columns "

@@ -12,14 +12,14 @@ from ring_of_rooms import FAR, ranges_of
 
 from jaxslam import cli, grids
 from jaxslam.cli.laser_log import read_log
-from jaxslam.cli.make_map import TOGETHER
+from jaxslam.cli.make_map import SCANS_AT_ONCE
 from jaxslam.math import numpy_poses as poses
 from jaxslam.results import plot
 from jaxslam.simulation.laser import scan_world
 from jaxslam.simulation.scenarios import square
 from jaxslam.simulation.walls import is_free, make_walls, rasterize
 
-BEAMS, STEPS = 25, TOGETHER + 6
+BEAMS, STEPS = 25, SCANS_AT_ONCE + 6
 FIT = "beams of the last 10 scans within 0.3 m of the map's range, share"
 
 

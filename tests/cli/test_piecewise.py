@@ -56,7 +56,7 @@ def log_of(steps=STEPS):
 
 
 def test_a_log_in_pieces_is_the_whole_log(monkeypatch):
-    monkeypatch.setattr(piecewise, "LONGEST", 4)
+    monkeypatch.setattr(piecewise, "MAX_STEPS", 4)
     monkeypatch.setattr(piecewise, "PIECES", 2)
     looked = [4, 8, 11]
     traced, shown, seen = [], [], []
