@@ -6,8 +6,9 @@ robots, the number of one.
 
 from collections.abc import Callable
 
-from jaxslam.datasets.carmen_reader import LaserLog, StampedRelations, carmen, relation_file
+from jaxslam.datasets.carmen_reader import StampedRelations, carmen, relation_file
 from jaxslam.datasets.dataset import Dataset
+from jaxslam.datasets.laser_record import LaserLog
 from jaxslam.datasets.line_readers import bonn, victoria_park
 from jaxslam.datasets.mrclam_reader import (
     MRCLAM_FITTED,
