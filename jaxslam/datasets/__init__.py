@@ -20,6 +20,7 @@ from jaxslam.datasets.mrclam_reader import (
 from jaxslam.datasets.mrclam_robot import MRCLAM_CALIBRATION, RobotCalibration, white_noise
 from jaxslam.datasets.noise_fit import DatasetFit, fit
 from jaxslam.datasets.plaza_reader import plaza
+from jaxslam.datasets.rosbag_reader import BagContents, rosbag, rosbag_contents
 from jaxslam.datasets.table_reader import table
 
 READERS: dict[str, Callable[..., Dataset]] = {
@@ -34,6 +35,7 @@ __all__ = [
     "MRCLAM_CALIBRATION",
     "MRCLAM_FITTED",
     "READERS",
+    "BagContents",
     "Dataset",
     "DatasetFit",
     "FittedCalibration",
@@ -48,6 +50,8 @@ __all__ = [
     "mrclam_team",
     "plaza",
     "relation_file",
+    "rosbag",
+    "rosbag_contents",
     "table",
     "victoria_park",
     "white_noise",

@@ -247,7 +247,14 @@ def test_odometry_of_a_file_takes_the_place_of_the_logs(log_file, tmp_path):
     text = "".join(f"{100 + 0.25 * k} {k / 10} 0 0\n" for k in range(STEPS))
     (tmp_path / "odometry.txt").write_text(text)
     asked = {"path": log_file.path, "odometry": tmp_path / "odometry.txt"}
-    rest = {"max_range": 10.0, "laser": None, "mount": None, "scans": ":", "every": 2}
+    rest = {
+        "max_range": 10.0,
+        "laser": None,
+        "mount": None,
+        "dataset": None,
+        "scans": ":",
+        "every": 2,
+    }
     log, _ = read_log(SimpleNamespace(**asked, **rest))
     np.testing.assert_allclose(log.raw[:, 0], np.arange(0, STEPS, 2) / 10)
     assert log.odometry_known.shape == (STEPS // 2,)
