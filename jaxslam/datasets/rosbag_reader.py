@@ -299,7 +299,8 @@ def _scan_of(
 ) -> _ScanMessage:
     """The scan of a message."""
     first, step = float(message.angle_min), float(message.angle_increment)
-    ranges = np.asarray(message.ranges, np.float64)
+    with np.errstate(invalid="ignore"):  # a signalling NaN
+        ranges = np.asarray(message.ranges, np.float64)
     if not (np.isfinite(first) and np.isfinite(step)) or (step == 0 and len(ranges) > 1):
         raise bag.error(
             f"{topic}: scan {number}: expected a finite angle_min and angle_increment, which is "
