@@ -8,15 +8,18 @@ import bags
 import jax
 import numpy as np
 import pytest
+import yaml
 from matplotlib.animation import FFMpegWriter
+from PIL import Image
 from ring_of_rooms import FAR, ranges_of
 
 from jaxslam import cli, datasets, grids
 from jaxslam.cli import localize
 from jaxslam.cli.laser_log import read_log
 from jaxslam.cli.make_map import TOGETHER
+from jaxslam.core.types import Estimate
 from jaxslam.math import numpy_poses as poses
-from jaxslam.results import plot
+from jaxslam.results import plot, report
 from jaxslam.simulation.laser import scan_world
 from jaxslam.simulation.scenarios import square
 from jaxslam.simulation.walls import is_free, make_walls, rasterize
@@ -289,6 +292,35 @@ def test_the_contents_of_a_bag_are_listed(bag, log_file, capsys, refused):
     refused(["map", bag], "expected scans with poses, and /scan has none")
 
 
+def check_as_ros_reads_it(path):
+    """Occupied, free and unknown cells by the rule of map_server, with a reader of its own."""
+    of = yaml.safe_load(path.read_text())
+    assert set(of) == {
+        *("image", "mode", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
+    }
+    assert (of["mode"], of["negate"], of["origin"][2]) == ("trinary", 0, 0.0)
+    shade = np.asarray(Image.open(path.parent / of["image"]))[::-1]  # the first row is on top
+    p = (255 - shade) / 255.0
+    occupied, free = p > of["occupied_thresh"], p < of["free_thresh"]
+    grid = grids.read_map(path)
+    np.testing.assert_array_equal(occupied, np.asarray(grid.log_odds) > 0)
+    np.testing.assert_array_equal(free, np.asarray(grid.log_odds) < 0)
+    assert occupied.any() and free.any() and not (occupied | free).all()
+    np.testing.assert_allclose(grid.origin, of["origin"])
+    assert float(grid.resolution) == of["resolution"]
+
+
+def test_evo_reads_the_path(tmp_path):
+    file_interface = pytest.importorskip("evo.tools.file_interface", reason="evo is not installed")
+    pose = np.array([[1.0, 2.0, 0.5], [1.5, 2.5, -3.0]])
+    path = Estimate(pose, np.zeros((2, 3, 3)), *[np.zeros(0)] * 4)
+    (tmp_path / "a.tum").write_text(report.trajectory_tum(np.array([1.7e9, 1.7e9 + 0.25]), path))
+    found = file_interface.read_tum_trajectory_file(tmp_path / "a.tum")
+    np.testing.assert_allclose(found.timestamps, [1.7e9, 1.7e9 + 0.25])
+    np.testing.assert_allclose(found.positions_xyz[:, :2], pose[:, :2])
+    np.testing.assert_allclose(found.get_orientations_euler()[:, 2], pose[:, 2])
+
+
 def test_a_bag_gives_the_files_that_its_log_gives(bag, log_file, tmp_path, undrawn, capsys):
     chosen = ["--scans", ":2", "--max-range", "10", "--out"]
     assert command("run", "--dataset", "rosbag", bag, *chosen, tmp_path / "bag") == 0
@@ -301,6 +333,7 @@ def test_a_bag_gives_the_files_that_its_log_gives(bag, log_file, tmp_path, undra
         for of in ("bag", "log")
     )
     np.testing.assert_allclose(found[:, :4], expected[:, :4], atol=1e-5)
+    check_as_ros_reads_it(tmp_path / "bag" / "map.yaml")
     summary = json.loads((tmp_path / "bag" / "summary.json").read_text())
     assert summary["score"] == "none: the file has no poses"
 
