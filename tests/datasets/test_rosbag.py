@@ -402,7 +402,7 @@ def test_csail_as_a_bag_is_the_log_of_carmen(tmp_path, scans):
 
 
 @pytest.mark.sweep
-def test_csail_as_a_bag_has_the_path_of_carmen(tmp_path):
+def test_csail_as_a_bag_has_the_path_of_carmen(tmp_path, full_optimization):
     log = csail(1051)
     expected = laser_slam.solve(log).poses
     found = laser_slam.solve(datasets.rosbag(bags.write(tmp_path, bags.of_log(log), "mcap")))
