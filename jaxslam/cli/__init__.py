@@ -20,6 +20,7 @@ from jaxslam.cli import (
     cache,
     consistency,
     fit,
+    laser_log,
     localize,
     make_map,
     optimize,
@@ -136,17 +137,19 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _laser_command(arguments: list[str]) -> list[str]:
-    """Replace `run --dataset carmen …` by the command on a laser log: `localize MAP` with
-    `--localize MAP`, `map` with `--map known`, else `slam`."""
+    """Replace `run --dataset carmen …`, or `rosbag`, by the command on a laser log: `localize MAP`
+    with `--localize MAP`, `map` with `--map known`, else `slam`."""
     of = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     of.add_argument("--dataset")
     of.add_argument("--localize", metavar="MAP")
     of.add_argument("--map", choices=("known",))
-    if arguments[:1] != ["run"] or "carmen" not in " ".join(arguments).replace("=", " ").split():
+    words = set(" ".join(arguments).replace("=", " ").split())
+    if arguments[:1] != ["run"] or not words & set(laser_log.READERS):
         return arguments
     chosen, others = of.parse_known_args(arguments[1:])
-    if chosen.dataset != "carmen":
+    if chosen.dataset not in laser_log.READERS:
         return arguments
+    others += ["--dataset", chosen.dataset]
     if chosen.localize is not None:
         return ["localize", chosen.localize, *others]
     return ["map" if chosen.map else "slam", *others]

@@ -23,6 +23,7 @@ from jaxslam.cli.common import (
     summary_table,
 )
 from jaxslam.datasets import LaserLog
+from jaxslam.datasets.bag_messages import is_bag
 from jaxslam.laser.grids import Grid
 from jaxslam.results.campaign_files import FORMATS, check_figure_formats
 from jaxslam.results.files import Files, Json, json_text, versions, write_files
@@ -40,6 +41,12 @@ class Job(NamedTuple):
     """further entries of `summary.json`, which `text` already shows"""
 
 
+READERS: dict[str, Callable[..., LaserLog]] = {
+    "carmen": lambda path, laser, **options: datasets.carmen(path, laser=laser, **options),
+    "rosbag": lambda path, laser, **options: datasets.rosbag(path, laser, **options),
+}
+"""Readers of laser logs by `--dataset`, of the path and the laser, with the same options."""
+
 Work = Callable[[LaserLog, argparse.Namespace], Job]
 """Computes the result of a command; `options.figures` are the formats of figures."""
 
@@ -49,7 +56,21 @@ def add_options(parser: argparse.ArgumentParser, work: Work, *, map_is_made: boo
 
     map_is_made: add `--resolution`, of the map that the command makes.
     """
-    parser.add_argument("path", metavar="FILE", help="the log, in the format of CARMEN")
+    parser.add_argument(
+        "path",
+        metavar="FILE",
+        help="the log: a file of CARMEN, or a ROS bag (.bag, .mcap, .db3, or the folder of ROS 2)",
+    )
+    parser.add_argument(
+        "--dataset",
+        choices=tuple(READERS),
+        help="format of the log (default: rosbag for a folder and for .bag, .mcap and .db3)",
+    )
+    parser.add_argument(
+        "--list",
+        action="store_true",
+        help="print the topics of a ROS bag, its time and the mounts of its lasers, and stop",
+    )
     if map_is_made:
         parser.add_argument(
             "--resolution",
@@ -79,12 +100,13 @@ def add_options(parser: argparse.ArgumentParser, work: Work, *, map_is_made: boo
         "--laser",
         metavar="KIND",
         help="lines of the laser to read: FLASER, RLASER, ROBOTLASER1, RAWLASER1, … (default: the "
-        "one with poses and most scans)",
+        "one with poses and most scans); of a bag the topic (default: the only one)",
     )
     parser.add_argument(
         "--odometry",
         metavar="FILE",
-        help="raw odometry, lines t x y heading [s, m, m, rad], in place of the log's",
+        help="raw odometry, lines t x y heading [s, m, m, rad], in place of the log's; of a bag "
+        "the topic, or two frames odom:base_link (default: the only one)",
     )
     parser.add_argument(
         "--mount",
@@ -106,6 +128,9 @@ def run_job(work: Work, options: argparse.Namespace, command: str) -> int:
         if not 0 < value < math.inf:
             raise ValueError(f"--{name.replace('_', '-')}: expected a number above 0, got {value}")
     options.figures = check_figure_formats("--figures", options.figures.split(","))
+    if options.list:
+        print(bag_text(options.path))
+        return 0
     log, left_out = read_log(options)
     check_out(options.out, command.split()[1])
     job = work(log, options)
@@ -138,12 +163,13 @@ def read_log(options: argparse.Namespace) -> tuple[LaserLog, dict[str, int]]:
 
     Raises ValueError, with the file, if no scan is left or none has a valid beam.
     """
-    log = datasets.carmen(
+    mount = None if options.mount is None else pose_of("--mount", options.mount)
+    log = READERS[options.dataset or ("rosbag" if is_bag(options.path) else "carmen")](
         options.path,
-        max_range=options.max_range,
-        laser=options.laser,
+        options.laser,
         odometry=options.odometry,
-        mount=None if options.mount is None else pose_of("--mount", options.mount),
+        max_range=options.max_range,
+        mount=mount,
     )
     total = len(log.time)
     first, last = _interval(options.scans, total)
@@ -166,6 +192,24 @@ def read_log(options: argparse.Namespace) -> tuple[LaserLog, dict[str, int]]:
         "skipped by --every": last - first - len(keep),
         "without a valid beam": blind,
     }
+
+
+def bag_text(path: str) -> str:
+    """The contents of a ROS bag: topics, time of the recording, mounts."""
+    found = datasets.rosbag_contents(path)
+    rows = {topic.name: {"type": topic.type, "messages": topic.count} for topic in found.topics}
+    columns = {
+        what: {name: row[what] for name, row in rows.items()} for what in ("type", "messages")
+    }
+    lines = [summary_table(columns)]
+    if found.start < found.end:
+        lines.append(
+            f"recorded from {found.start:.3f} s to {found.end:.3f} s: "
+            f"{found.end - found.start:.3f} s"
+        )
+    lines += [f"mount of {topic}: {mount}" for topic, mount in found.lasers.items()]
+    lines += [f"odometry {pair}: {count:,} transforms" for pair, count in found.odometry.items()]
+    return "\n".join(lines)
 
 
 def _interval(text: str, total: int) -> tuple[int, int]:

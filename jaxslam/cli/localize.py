@@ -14,7 +14,7 @@ from jaxslam.cli.piecewise import run_in_pieces
 from jaxslam.consistency.campaign.progress import Progress
 from jaxslam.core.types import Info
 from jaxslam.datasets import LaserLog
-from jaxslam.laser import grids
+from jaxslam.laser import grids, laser_slam
 from jaxslam.laser.grids import Grid
 from jaxslam.math.numpy_poses import compose
 from jaxslam.results import report
@@ -67,9 +67,8 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--start",
         metavar="POSE",
-        default="file",
         help="where the robot starts: file (the pose beside the first scan), global (anywhere that "
-        "is free), or X,Y,HEADING [m, m, deg] (default: file)",
+        "is free), or X,Y,HEADING [m, m, deg] (default: file, or global if the file has no poses)",
     )
     parser.add_argument(
         "--particles",
@@ -98,7 +97,8 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> laser_log.Jo
     grid = grids.read_map(options.map)
     if not np.any(np.asarray(grid.log_odds) < 0):
         raise ValueError(f"{options.map}: the map has no free cell")
-    pose = _start(options.start, log)
+    start = options.start or ("file" if log.placed else "global")
+    pose = _start(start, log)
     if pose is not None and not _on(grid, pose):
         x, y, heading = pose
         raise ValueError(
@@ -116,7 +116,9 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> laser_log.Jo
         **weighing,
         every=max(1, np.shape(log.beams.range)[1] // BEAMS),
     )
-    rows = grids.beam_log(motion.odometry_controls(log.raw), log.beams)
+    logged = len(log.time) == 1 or bool(log.odometry_known[1:].any())
+    raw = log.raw if logged else laser_slam.solve(log).odometry
+    rows = grids.beam_log(motion.odometry_controls(raw), log.beams)
     last = len(log.time) - 1
     with Progress(f"{log.name}, localization", "scans") as progress:
         found = run_in_pieces(
@@ -139,7 +141,8 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> laser_log.Jo
     summary = {
         "job": "localization",
         "map": str(options.map),
-        "start": options.start,
+        "start": start,
+        "odometry": "of the log" if logged else "laser odometry, since the log has none",
         "particles": options.particles,
         "particles in use, mean": float(np.mean(info.active)),
         "particles drawn anywhere, to recover": int(np.sum(info.injected)),
@@ -166,7 +169,7 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> laser_log.Jo
         grid,
         poses=path.pose,
         width=plot.PAGE,
-        others={"poses in the file": log.corrected},
+        others={"poses in the file": log.corrected} if log.placed else {},
         title=f"{log.name}: localization",
     )
     files: Files = {

@@ -46,7 +46,11 @@ from jaxslam.simulation.worlds import Scenario
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `jaxslam run`."""
-    parser.add_argument("--dataset", required=True, help=f"one of: {', '.join(READERS)}")
+    parser.add_argument(
+        "--dataset",
+        required=True,
+        help=f"one of: {', '.join(READERS)}; or a laser log: carmen, rosbag",
+    )
     parser.add_argument("path", metavar="PATH", help="the file, or the folder, of the data set")
     parser.add_argument(
         "--robot",

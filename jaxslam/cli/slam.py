@@ -59,7 +59,8 @@ def run_slam(log: LaserLog, options: argparse.Namespace) -> laser_log.Job:
     settings = Settings(resolution=options.resolution)
     solved = _solved(log, settings)
     coarser = float(solved.map.resolution) > 1.001 * settings.resolution
-    files = result_files(solved) | figures(solved, options.figures, log.corrected)
+    reference = log.corrected if log.placed else None
+    files = result_files(solved) | figures(solved, options.figures, reference)
     if options.animate:
         files |= film_files({"slam": film(log, solved, settings)}, suffixed=False)
     summary = result_summary(solved) | laser_log.scored(log, lambda: _scores(log, solved))
@@ -131,10 +132,12 @@ def result_files(solved: Solved) -> Files:
     }
 
 
-def figures(solved: Solved, formats: tuple[str, ...], corrected: Float[np.ndarray, "K 3"]) -> Files:
+def figures(
+    solved: Solved, formats: tuple[str, ...], corrected: Float[np.ndarray, "K 3"] | None
+) -> Files:
     """`map_before`, `map_after` (maps of laser odometry alone, and of the optimum) and `graph`.
 
-    corrected: poses of reference, drawn beside both paths in `graph`.
+    corrected: poses of reference, if there are some, drawn beside both paths in `graph`.
     """
     from jaxslam.results import plot  # matplotlib is slow to load
 

@@ -6,8 +6,9 @@ robots, the number of one.
 
 from collections.abc import Callable
 
-from jaxslam.datasets.carmen_reader import LaserLog, StampedRelations, carmen, relation_file
+from jaxslam.datasets.carmen_reader import StampedRelations, carmen, relation_file
 from jaxslam.datasets.dataset import Dataset
+from jaxslam.datasets.laser_record import LaserLog
 from jaxslam.datasets.line_readers import bonn, victoria_park
 from jaxslam.datasets.mrclam_reader import (
     MRCLAM_FITTED,
@@ -19,6 +20,7 @@ from jaxslam.datasets.mrclam_reader import (
 from jaxslam.datasets.mrclam_robot import MRCLAM_CALIBRATION, RobotCalibration, white_noise
 from jaxslam.datasets.noise_fit import DatasetFit, fit
 from jaxslam.datasets.plaza_reader import plaza
+from jaxslam.datasets.rosbag_reader import BagContents, rosbag, rosbag_contents
 from jaxslam.datasets.table_reader import table
 
 READERS: dict[str, Callable[..., Dataset]] = {
@@ -33,6 +35,7 @@ __all__ = [
     "MRCLAM_CALIBRATION",
     "MRCLAM_FITTED",
     "READERS",
+    "BagContents",
     "Dataset",
     "DatasetFit",
     "FittedCalibration",
@@ -47,6 +50,8 @@ __all__ = [
     "mrclam_team",
     "plaza",
     "relation_file",
+    "rosbag",
+    "rosbag_contents",
     "table",
     "victoria_park",
     "white_noise",

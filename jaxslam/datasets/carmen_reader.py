@@ -6,16 +6,13 @@ by the particle filter of GMapping (Grisetti, Stachniss & Burgard 2007).
 """
 
 from collections import Counter
-from collections.abc import Mapping
-from dataclasses import dataclass
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from jaxslam.core.types import Beams
 from jaxslam.datasets.carmen_odometry import (
     RawOdometry,
     odometry_of_file,
@@ -26,8 +23,6 @@ from jaxslam.datasets.carmen_odometry import (
 from jaxslam.datasets.carmen_scans import (
     POSE,
     Scan,
-    beams_of,
-    checked_mount,
     clock_of,
     has_poses,
     is_scan,
@@ -35,45 +30,11 @@ from jaxslam.datasets.carmen_scans import (
     robot_poses,
     scan_of,
 )
+from jaxslam.datasets.laser_beams import beams_of
+from jaxslam.datasets.laser_record import LaserLog, checked_mount, wrapped_path
 from jaxslam.datasets.lines import TextFile
 from jaxslam.math import numpy_poses as poses
 from jaxslam.math.numpy_poses import wrapped
-
-
-@dataclass(frozen=True, eq=False)
-class LaserLog:
-    """A laser log: K scans of at most B beams, T lines of raw odometry; poses are of the robot."""
-
-    name: str
-    source: str
-    laser: str
-    """the kind of the lines of the scans, as FLASER"""
-    placed: bool
-    """whether these lines have poses; else `corrected` is zero"""
-    time: Float[np.ndarray, "K"]
-    """of each scan [s]; may repeat if the file has few digits"""
-    beams: Beams
-    """with leading K, in the frame of the laser; shorter scans are padded by invalid beams"""
-    corrected: Float[np.ndarray, "K 3"]
-    """pose of the robot in the line of the scan: a reference, not the truth"""
-    raw: Float[np.ndarray, "K 3"]
-    """raw odometry at each scan"""
-    odometry_known: Bool[np.ndarray, "K"]
-    """whether the odometry from the previous scan is known, else zero; True for the first"""
-    row: Int[np.ndarray, "K"]
-    """the last line of raw odometry before each scan, as an index of `odometry`; -1 if none"""
-    odometry: Float[np.ndarray, "T 3"]
-    odometry_time: Float[np.ndarray, "T"]
-    """as logged [s]; arbitrary in a line that sets the odometry"""
-    max_range: float
-    """the range of beams without a return [m]"""
-    mount: Float[np.ndarray, "3"]
-    """pose of the laser on the robot"""
-    dropped: Mapping[str, int]
-    """number of lines, scans or beams left out, by kind"""
-    corrections: tuple[str, ...]
-    """descriptions of the changes that the reader made"""
-
 
 ODOMETRY = (*POSE, "v", "omega", "acceleration", "time", "host", "logger time")
 _PREFERRED = ("FLASER", "ROBOTLASER1", "RAWLASER1", "RLASER")
@@ -135,7 +96,7 @@ def carmen(
     """
     if not max_range > 0:
         raise ValueError(f"carmen: expected a max_range above 0, got {max_range}")
-    given = None if mount is None else checked_mount(mount)
+    given = None if mount is None else checked_mount("carmen", mount)
     file = TextFile(path)
     lines = list(file)
     kind = _kind(file, Counter(fields[0] for _, fields in lines if is_scan(fields[0])), laser)
@@ -190,11 +151,11 @@ def carmen(
         placed=has_poses(kind),
         time=time,
         beams=beams,
-        corrected=_wrapped(corrected),
-        raw=_wrapped(found.raw),
+        corrected=wrapped_path(corrected),
+        raw=wrapped_path(found.raw),
         odometry_known=found.known,
         row=found.row,
-        odometry=_wrapped(found.poses),
+        odometry=wrapped_path(found.poses),
         odometry_time=found.time,
         max_range=limit,
         mount=frame,
@@ -255,11 +216,6 @@ def _irregularities(
     if backward := int((np.diff(time) < 0).sum()):
         notes.append(f"scans stamped before their predecessor, kept in order: {backward}")
     return notes
-
-
-def _wrapped(path: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 3"]:
-    """The poses with θ in (-π, π]."""
-    return np.column_stack([path[:, :2], np.angle(np.exp(1j * path[:, 2]))])
 
 
 _FIELDS = "t1", "t2", "x", "y", "z", "roll", "pitch", "yaw"

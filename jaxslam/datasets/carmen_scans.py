@@ -1,14 +1,12 @@
-"""Scans of a CARMEN log: parsing of lines; stamps, beams, mount and poses of all scans."""
+"""Scans of a CARMEN log: parsing of lines; stamps, mount and poses of all scans."""
 
 import re
-from collections import Counter
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
-from numpy.typing import ArrayLike
+from jaxtyping import Float
 
-from jaxslam.core.types import Beams
+from jaxslam.datasets.laser_record import beyond, pose_text
 from jaxslam.datasets.lines import TextFile
 from jaxslam.math import numpy_poses as poses
 
@@ -140,9 +138,6 @@ def _is_number(field: str) -> bool:
     return "_" not in field
 
 
-MOUNT_TOLERANCE = 0.01, np.deg2rad(0.5)
-"""Largest difference of the mount between lines [m], [rad]."""
-
 _REAR = np.array([0.0, 0.0, np.pi])
 
 
@@ -157,70 +152,6 @@ def clock_of(scans: list[Scan], corrections: list[str]) -> int:
         return 1
     corrections.append("all scans have the same time, by the logger as well")
     return 0
-
-
-def beams_of(
-    scans: list[Scan], max_range: float, dropped: Counter[str], corrections: list[str]
-) -> tuple[Beams, float]:
-    """The beams (K, B), and the range of beams without a return [m]."""
-    width = max(len(scan.ranges) for scan in scans)
-    ranges, angles = np.zeros((2, len(scans), width))
-    present = np.zeros((len(scans), width), bool)
-    for k, scan in enumerate(scans):
-        count = len(scan.ranges)
-        ranges[k, :count], angles[k, :count], present[k, :count] = scan.ranges, scan.angles, True
-    valid = present & (ranges > 0)
-    if lost := int((present & ~valid).sum()):
-        dropped["beams without a range"] = lost
-    limits = np.minimum([scan.limit for scan in scans], max_range)
-    if (code := _code_of_no_return(ranges[valid & (ranges < limits[:, None])])) is not None:
-        corrections.append(
-            f"ranges of {code:.2f} m or more are read as no return: the log has many of one value, "
-            "and hardly any just below it"
-        )
-        limits = np.minimum(limits, code)
-    if unstated := sum(scan.bad_limit for scan in scans):
-        corrections.append(
-            f"scans without a maximum range above 0 in their line, which take max_range: {unstated}"
-        )
-    limit = float(limits.max())
-    if (limits < limit).any():
-        corrections.append(
-            f"maximum ranges differ, the smallest is {limits.min():g} m: a beam beyond that of its "
-            f"scan has no return and is set to {limit:g} m"
-        )
-    ranges = np.where(ranges >= limits[:, None], limit, ranges)
-    return Beams(np.where(valid, ranges, 0.0), angles, valid), limit
-
-
-def _code_of_no_return(ranges: Float[np.ndarray, "n"]) -> float | None:
-    """The range that codes "no return" [m], of a laser that reports it as its largest range.
-
-    None unless the last hundredth of the largest range has more than one beam in 500, ten times as
-    many as the tenth below it, and two values are 93 % of them: ranges of a wall have noise, but a
-    code is one number, or two after a conversion of units.
-    """
-    if len(ranges) < 1000:
-        return None
-    code = 0.99 * float(ranges.max())
-    last = ranges[ranges >= code]
-    below = int(((ranges < code) & (ranges >= 0.9 * code)).sum())
-    if len(last) <= max(len(ranges) / 500, 10 * below):
-        return None
-    _, count = np.unique(last, return_counts=True)
-    return code if np.sort(count)[-2:].sum() > 0.93 * len(last) else None
-
-
-def checked_mount(mount: ArrayLike) -> Float[np.ndarray, "3"]:
-    """The given mount; ValueError unless it is three finite numbers."""
-    try:
-        frame = np.asarray(mount, float)
-    except (TypeError, ValueError):
-        frame = np.zeros(0)
-    if frame.shape != (3,) or not np.isfinite(frame).all():
-        text = " ".join(str(mount).split())
-        raise ValueError(f"carmen: expected a mount of three finite numbers, got {text}")
-    return frame
 
 
 def mount_of(
@@ -239,14 +170,14 @@ def mount_of(
     laser, robot = (np.array([getattr(scan, of) for scan in scans]) for of in ("laser", "robot"))
     mounts = poses.between(robot, laser)
     off = poses.between(mounts[0], mounts)
-    far = _beyond(off)
+    far = beyond(off)
     if not kind.startswith("ROBOTLASER"):
         if far.any():
             corrections.append(
                 f"the two poses of {kind} do not differ by a constant mount: the first is taken "
                 "for the corrected pose of the robot"
             )
-        if far.any() or not _beyond(mounts[:1]).any():
+        if far.any() or not beyond(mounts[:1]).any():
             return default
         corrections.append(f"the mount is that of the two poses of {kind}: {pose_text(mounts[0])}")
     elif far.any():
@@ -258,20 +189,6 @@ def mount_of(
         )
     # The median is free of the rounding of a single line.
     return poses.compose(mounts[0], np.median(off, axis=0))
-
-
-def _beyond(off: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
-    """Which poses differ from zero by more than by rounding."""
-    far = (np.hypot(off[:, 0], off[:, 1]) > MOUNT_TOLERANCE[0]) | (
-        np.abs(off[:, 2]) > MOUNT_TOLERANCE[1]
-    )
-    return np.asarray(far)
-
-
-def pose_text(pose: Float[np.ndarray, "3"]) -> str:
-    """A pose as text, in metres and degrees."""
-    x, y, heading = pose
-    return f"({x:.4g}, {y:.4g}, {np.rad2deg(heading):.4g}°)"
 
 
 def robot_poses(

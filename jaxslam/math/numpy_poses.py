@@ -44,6 +44,15 @@ def chain(first: Poses, steps: Poses) -> Poses:
     return out
 
 
+def part(step: Poses, share: Float[np.ndarray, "..."]) -> Poses:
+    """The share s of each step at constant velocity on SE(2): exp(s log(step))."""
+    half = step[..., 2] / 2
+    # (exp(iθs) - 1) / (exp(iθ) - 1), without its zeros
+    ratio = share * np.sinc(share * half / np.pi) / np.sinc(half / np.pi)
+    moved = (step[..., 0] + 1j * step[..., 1]) * ratio * np.exp(1j * (share - 1) * half)
+    return np.stack([moved.real, moved.imag, share * step[..., 2]], axis=-1)
+
+
 def adjoint(pose: Poses) -> Float[np.ndarray, "... 3 3"]:
     """The adjoint of each pose: pose ∘ e = (Ad e) ∘ pose to first order in a small pose e."""
     c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])

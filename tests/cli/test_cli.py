@@ -208,10 +208,17 @@ def test_a_closed_pipe_ends_the_command_silently(tmp_path, monkeypatch, capfd):
 @pytest.mark.parametrize(
     ("given", "called"),
     [
-        ("run --dataset carmen a.log --mount -1,0,90", "slam a.log --mount -1,0,90"),
-        ("run a.log --relations r --dataset=carmen", "slam a.log --relations r"),
-        ("run --dataset carmen a.log --map known --every 2", "map a.log --every 2"),
-        ("run --dataset carmen a.log --localize m.yaml", "localize m.yaml a.log"),
+        (
+            "run --dataset carmen a.log --mount -1,0,90",
+            "slam a.log --mount -1,0,90 --dataset carmen",
+        ),
+        ("run a.log --relations r --dataset=carmen", "slam a.log --relations r --dataset carmen"),
+        (
+            "run --dataset carmen a.log --map known --every 2",
+            "map a.log --every 2 --dataset carmen",
+        ),
+        ("run --dataset carmen a.log --localize m.yaml", "localize m.yaml a.log --dataset carmen"),
+        ("run --dataset rosbag a.bag --list", "slam a.bag --list --dataset rosbag"),
         ("run --dataset table carmen", "run --dataset table carmen"),
         ("slam carmen", "slam carmen"),
     ],

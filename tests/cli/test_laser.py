@@ -4,17 +4,22 @@ import dataclasses
 import json
 from types import SimpleNamespace
 
+import bags
 import jax
 import numpy as np
 import pytest
+import yaml
 from matplotlib.animation import FFMpegWriter
+from PIL import Image
 from ring_of_rooms import FAR, ranges_of
 
-from jaxslam import cli, grids
+from jaxslam import cli, datasets, grids
+from jaxslam.cli import localize
 from jaxslam.cli.laser_log import read_log
 from jaxslam.cli.make_map import SCANS_AT_ONCE
+from jaxslam.core.types import Estimate
 from jaxslam.math import numpy_poses as poses
-from jaxslam.results import plot
+from jaxslam.results import plot, report
 from jaxslam.simulation.laser import scan_world
 from jaxslam.simulation.scenarios import square
 from jaxslam.simulation.walls import is_free, make_walls, rasterize
@@ -247,10 +252,113 @@ def test_odometry_of_a_file_takes_the_place_of_the_logs(log_file, tmp_path):
     text = "".join(f"{100 + 0.25 * k} {k / 10} 0 0\n" for k in range(STEPS))
     (tmp_path / "odometry.txt").write_text(text)
     asked = {"path": log_file.path, "odometry": tmp_path / "odometry.txt"}
-    rest = {"max_range": 10.0, "laser": None, "mount": None, "scans": ":", "every": 2}
+    rest = {
+        "max_range": 10.0,
+        "laser": None,
+        "mount": None,
+        "dataset": None,
+        "scans": ":",
+        "every": 2,
+    }
     log, _ = read_log(SimpleNamespace(**asked, **rest))
     np.testing.assert_allclose(log.raw[:, 0], np.arange(0, STEPS, 2) / 10)
     assert log.odometry_known.shape == (STEPS // 2,)
+
+
+@pytest.fixture(scope="module")
+def bag(log_file, tmp_path_factory):
+    """The log of CARMEN as a bag of ROS 2."""
+    log = bags.first(datasets.carmen(log_file.path, max_range=10.0), STEPS)
+    return bags.write(tmp_path_factory.mktemp("bag"), bags.of_log(log), "mcap", name="room")
+
+
+def command(*words):
+    return cli.main(list(map(str, words)))
+
+
+def test_the_contents_of_a_bag_are_listed(bag, log_file, capsys, refused):
+    assert command("run", "--dataset", "rosbag", bag, "--list") == 0
+    lines = capsys.readouterr().out.splitlines()
+    assert [line.split() for line in lines[:4]] == [
+        ["type", "messages"],
+        ["/odom", "nav_msgs/Odometry", f"{STEPS}"],
+        ["/scan", "sensor_msgs/LaserScan", f"{STEPS}"],
+        ["/tf_static", "tf2_msgs/TFMessage", "1"],
+    ]
+    assert lines[4] == f"recorded from 100.000 s to {100 + 0.25 * (STEPS - 1):.3f} s: 17.250 s"
+    assert lines[5] == "mount of /scan: (0, 0, 0°) on base_link"
+    refused(["slam", log_file.path, "--list"], "room.log: cannot be read as a ROS bag")
+    refused(["run", "--dataset", "rosbag", log_file.path], "cannot be read as a ROS bag")
+    refused(["map", bag], "expected scans with poses, and /scan has none")
+
+
+def check_as_ros_reads_it(path):
+    """Occupied, free and unknown cells by the rule of map_server, with a reader of its own."""
+    of = yaml.safe_load(path.read_text())
+    assert set(of) == {
+        *("image", "mode", "resolution", "origin", "negate", "occupied_thresh", "free_thresh")
+    }
+    assert (of["mode"], of["negate"], of["origin"][2]) == ("trinary", 0, 0.0)
+    shade = np.asarray(Image.open(path.parent / of["image"]))[::-1]  # the first row is on top
+    p = (255 - shade) / 255.0
+    occupied, free = p > of["occupied_thresh"], p < of["free_thresh"]
+    grid = grids.read_map(path)
+    np.testing.assert_array_equal(occupied, np.asarray(grid.log_odds) > 0)
+    np.testing.assert_array_equal(free, np.asarray(grid.log_odds) < 0)
+    assert occupied.any() and free.any() and not (occupied | free).all()
+    np.testing.assert_allclose(grid.origin, of["origin"])
+    assert float(grid.resolution) == of["resolution"]
+
+
+def test_evo_reads_the_path(tmp_path):
+    file_interface = pytest.importorskip("evo.tools.file_interface", reason="evo is not installed")
+    pose = np.array([[1.0, 2.0, 0.5], [1.5, 2.5, -3.0]])
+    path = Estimate(pose, np.zeros((2, 3, 3)), *[np.zeros(0)] * 4)
+    (tmp_path / "a.tum").write_text(report.trajectory_tum(np.array([1.7e9, 1.7e9 + 0.25]), path))
+    found = file_interface.read_tum_trajectory_file(tmp_path / "a.tum")
+    np.testing.assert_allclose(found.timestamps, [1.7e9, 1.7e9 + 0.25])
+    np.testing.assert_allclose(found.positions_xyz[:, :2], pose[:, :2])
+    np.testing.assert_allclose(found.get_orientations_euler()[:, 2], pose[:, 2])
+
+
+def test_a_bag_gives_the_files_that_its_log_gives(bag, log_file, tmp_path, undrawn, capsys):
+    chosen = ["--scans", ":2", "--max-range", "10", "--out"]
+    assert command("run", "--dataset", "rosbag", bag, *chosen, tmp_path / "bag") == 0
+    assert command("run", "--dataset", "carmen", log_file.path, *chosen, tmp_path / "log") == 0
+    names = {path.name for path in (tmp_path / "log").iterdir()}
+    assert {path.name for path in (tmp_path / "bag").iterdir()} == names
+    assert {"trajectory.tum", "graph.g2o", "loops.csv", "map.yaml", "map.pgm"} < names
+    found, expected = (
+        np.loadtxt(tmp_path / of / "trajectory.csv", delimiter=",", skiprows=1)
+        for of in ("bag", "log")
+    )
+    np.testing.assert_allclose(found[:, :4], expected[:, :4], atol=1e-5)
+    check_as_ros_reads_it(tmp_path / "bag" / "map.yaml")
+    summary = json.loads((tmp_path / "bag" / "summary.json").read_text())
+    assert summary["score"] == "none: the file has no poses"
+
+
+@pytest.mark.parametrize("odometry", [True, False])
+def test_the_robot_of_a_bag_is_localized(
+    bag, log_file, room_map, tmp_path, undrawn, monkeypatch, odometry
+):
+    given, out = bag, tmp_path / "out"
+    if not odometry:
+        log = bags.first(datasets.carmen(log_file.path, max_range=10.0), STEPS)
+        given = bags.write(tmp_path, [m for m in bags.of_log(log) if m.topic != "/odom"])
+        solved = SimpleNamespace(odometry=log.raw)  # 25 beams are too few for laser odometry
+        monkeypatch.setattr(localize.laser_slam, "solve", lambda log: solved)
+    x, y, heading = log_file.pose[0]
+    start = f"{x},{y},{np.rad2deg(heading)}"
+    options = ["--max-range", "10", "--particles", "500", "--start", start, "--out", out]
+    assert command("run", "--dataset", "rosbag", given, "--localize", room_map, *options) == 0
+    rows = np.loadtxt(out / "trajectory.csv", delimiter=",", skiprows=1)
+    error = np.hypot(*(rows[:, 1:3] - log_file.pose[:, :2]).T)
+    assert np.median(error) < 0.3 and error[-1] < 0.3
+    summary = json.loads((out / "summary.json").read_text())
+    assert summary["localized at the end"] == "yes"
+    assert summary["odometry"].startswith("of the log" if odometry else "laser odometry")
+    assert summary["score"] == "none: the file has no poses"
 
 
 @pytest.mark.parametrize(

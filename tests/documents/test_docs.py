@@ -44,7 +44,7 @@ def test_a_command_that_a_page_shows_is_understood(page, line):
     said, status = io.StringIO(), 0
     with contextlib.redirect_stderr(said), contextlib.redirect_stdout(said):
         try:
-            cli._parser().parse_args(arguments)
+            cli._parser().parse_args(cli._laser_command(arguments))
         except SystemExit as stop:
             status = stop.code
     assert not status, said.getvalue()

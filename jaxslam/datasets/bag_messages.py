@@ -1,0 +1,105 @@
+"""Messages of a ROS bag by the library `rosbags`: only here is it imported."""
+
+import math
+from collections.abc import Collection, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+TRANSFORMS = ("tf2_msgs/TFMessage", "tf/tfMessage")
+
+INSTALL = "pip install 'jaxslam[ros]'"
+
+
+@dataclass(frozen=True)
+class Topic:
+    """A topic of a bag."""
+
+    name: str
+    type: str
+    """as `sensor_msgs/LaserScan`; `several types` if its publishers differ"""
+    count: int
+    """number of messages"""
+
+
+class Bag:
+    """An open bag: its topics, and the messages of some of them."""
+
+    def __init__(self, path: Path, reader: Any) -> None:
+        self.path = path
+        self._reader = reader
+        self.topics = tuple(
+            Topic(name, (of.msgtype or "several types").replace("/msg/", "/"), of.msgcount)
+            for name, of in sorted(reader.topics.items())
+        )
+        """by name"""
+        some = any(topic.count for topic in self.topics)
+        self.start = reader.start_time * 1e-9 if some else math.nan
+        """of the recording [s]"""
+        self.end = reader.end_time * 1e-9 if some else math.nan
+
+    def messages(self, names: Collection[str]) -> Iterator[tuple[str, int, Any]]:
+        """(topic, time of the recording [ns], message) of the named topics, in that order of time.
+
+        Raises ValueError, with the file, if one cannot be read.
+        """
+        connections = [each for each in self._reader.connections if each.topic in names]
+        if not connections:
+            return
+        found = self._reader.messages(connections)
+        count = 0
+        while True:
+            try:
+                connection, recorded, data = next(found)
+                message = self._reader.deserialize(data, connection.msgtype)
+            except StopIteration:
+                return
+            except Exception as problem:  # of SQLite, zstd, struct, … where a bag is damaged
+                raise _unreadable(
+                    self.path, problem, f" after {count:,} messages of {', '.join(sorted(names))}"
+                ) from problem
+            count += 1
+            yield connection.topic, recorded, message
+
+    def error(self, reason: str) -> ValueError:
+        """A ValueError about the bag, for the caller to raise."""
+        return ValueError(f"{self.path}: {reason}")
+
+
+@contextmanager
+def opened(path: str | Path) -> Iterator[Bag]:
+    """The bag in a file (ROS 1 `.bag`, ROS 2 `.mcap` or `.db3`) or in a folder of ROS 2.
+
+    Raises ValueError if `rosbags` is not installed, and, with the file, if the bag cannot be read.
+    """
+    try:
+        from rosbags.highlevel import AnyReader
+        from rosbags.typesys import Stores, get_typestore
+    except ImportError as problem:
+        raise ValueError(f"rosbag: the library rosbags reads bags: {INSTALL}") from problem
+    path = Path(path)
+    try:
+        # Bags of ROS 2 before Iron have no definitions; those of these types are equal in all.
+        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        reader.open()
+    except Exception as problem:  # of SQLite, zstd, struct, … where a bag is damaged
+        raise _unreadable(path, problem) from problem
+    try:
+        yield Bag(path, reader)
+    finally:
+        reader.close()
+
+
+def is_bag(path: str | Path) -> bool:
+    """Whether a path is that of a bag: a folder, or a file .bag, .mcap or .db3."""
+    return Path(path).is_dir() or Path(path).suffix in (".bag", ".mcap", ".db3")
+
+
+def _unreadable(path: Path, problem: Exception, where: str = "") -> ValueError:
+    """The error on a bag that is damaged or none."""
+    if isinstance(problem, FileNotFoundError):
+        what = "metadata.yaml" if path.is_dir() else "file"
+        return ValueError(f"{path}: cannot be read: no such {what}")
+    reason = " ".join(str(problem).split()) or type(problem).__name__
+    return ValueError(f"{path}: cannot be read as a ROS bag{where}: {reason}")

@@ -1,0 +1,82 @@
+"""The beams of a laser log from the ranges and angles of its scans."""
+
+from collections import Counter
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxslam.core.types import Beams
+
+
+class RangeScan(Protocol):
+    """What is read of a scan of n beams."""
+
+    @property
+    def ranges(self) -> Float[np.ndarray, "n"]:
+        """[m], 0 where the beam has none."""
+
+    @property
+    def angles(self) -> Float[np.ndarray, "n"]:
+        """[rad] in the frame of the laser."""
+
+    @property
+    def limit(self) -> float:
+        """Maximum range in the file [m], infinite if it has none."""
+
+    @property
+    def bad_limit(self) -> bool:
+        """Whether the file has a maximum range that is not finite and above 0."""
+
+
+def beams_of(
+    scans: Sequence[RangeScan], max_range: float, dropped: Counter[str], corrections: list[str]
+) -> tuple[Beams, float]:
+    """The beams (K, B), and the range of beams without a return [m]."""
+    width = max(len(scan.ranges) for scan in scans)
+    ranges, angles = np.zeros((2, len(scans), width))
+    present = np.zeros((len(scans), width), bool)
+    for k, scan in enumerate(scans):
+        count = len(scan.ranges)
+        ranges[k, :count], angles[k, :count], present[k, :count] = scan.ranges, scan.angles, True
+    valid = present & (ranges > 0)
+    if lost := int((present & ~valid).sum()):
+        dropped["beams without a range"] = lost
+    limits = np.minimum([scan.limit for scan in scans], max_range)
+    if (code := _code_of_no_return(ranges[valid & (ranges < limits[:, None])])) is not None:
+        corrections.append(
+            f"ranges of {code:.2f} m or more are read as no return: the log has many of one value, "
+            "and hardly any just below it"
+        )
+        limits = np.minimum(limits, code)
+    if unstated := sum(scan.bad_limit for scan in scans):
+        corrections.append(
+            f"scans without a maximum range above 0, which take max_range: {unstated}"
+        )
+    limit = float(limits.max())
+    if (limits < limit).any():
+        corrections.append(
+            f"maximum ranges differ, the smallest is {limits.min():g} m: a beam beyond that of its "
+            f"scan has no return and is set to {limit:g} m"
+        )
+    ranges = np.where(ranges >= limits[:, None], limit, ranges)
+    return Beams(np.where(valid, ranges, 0.0), angles, valid), limit
+
+
+def _code_of_no_return(ranges: Float[np.ndarray, "n"]) -> float | None:
+    """The range that codes "no return" [m], of a laser that reports it as its largest range.
+
+    None unless the last hundredth of the largest range has more than one beam in 500, ten times as
+    many as the tenth below it, and two values are 93 % of them: ranges of a wall have noise, but a
+    code is one number, or two after a conversion of units.
+    """
+    if len(ranges) < 1000:
+        return None
+    code = 0.99 * float(ranges.max())
+    last = ranges[ranges >= code]
+    below = int(((ranges < code) & (ranges >= 0.9 * code)).sum())
+    if len(last) <= max(len(ranges) / 500, 10 * below):
+        return None
+    _, count = np.unique(last, return_counts=True)
+    return code if np.sort(count)[-2:].sum() > 0.93 * len(last) else None
