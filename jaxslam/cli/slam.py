@@ -126,7 +126,10 @@ def result_files(solved: Solved) -> Files:
     return {
         "trajectory.csv": report.trajectory_csv(solved.time, path),
         "trajectory.tum": report.trajectory_tum(solved.time, path),
-        "graph.g2o": g2o.text_of(solved.graph),
+        # Without its gauge, pose 0: GTSAM's readG2o does not read the line FIX.
+        "graph.g2o": g2o.text_of(
+            solved.graph._replace(fixed_pose=np.zeros_like(solved.graph.fixed_pose))
+        ),
         "loops.csv": _loops_csv(solved),
         **ros_map.map_files("map", solved.map),
     }

@@ -328,6 +328,7 @@ def test_a_bag_gives_the_files_that_its_log_gives(bag, log_file, tmp_path, undra
     names = {path.name for path in (tmp_path / "log").iterdir()}
     assert {path.name for path in (tmp_path / "bag").iterdir()} == names
     assert {"trajectory.tum", "graph.g2o", "loops.csv", "map.yaml", "map.pgm"} < names
+    assert "FIX" not in (tmp_path / "bag" / "graph.g2o").read_text()
     found, expected = (
         np.loadtxt(tmp_path / of / "trajectory.csv", delimiter=",", skiprows=1)
         for of in ("bag", "log")
