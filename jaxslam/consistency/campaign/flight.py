@@ -1,5 +1,6 @@
 """The blocks of a campaign that are being computed, in threads or on the workers of an executor."""
 
+import contextlib
 import time
 import warnings
 from collections.abc import Callable, Iterator
@@ -65,7 +66,8 @@ class Flight:
         self._ends = True
         for block in self._blocks.values():
             for future, _ in block.futures:
-                future.cancel()
+                with contextlib.suppress(AttributeError):  # not every engine has it
+                    future.cancel()
 
     def finished(self) -> Iterator[tuple[Piece, BlockResult | BaseException]]:
         """The results of the blocks that have ended since, or the error of one that failed.

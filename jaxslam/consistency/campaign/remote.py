@@ -29,7 +29,7 @@ _SETTINGS = (
 class Executor(Protocol):
     """What computes blocks elsewhere: any object with the `submit` of `concurrent.futures`.
 
-    What `submit` returns needs `done` and `result`.
+    What `submit` returns needs `done`, `exception` and `result`.
     """
 
     def submit(self, fn: Any, /, *args: Any) -> Any:
