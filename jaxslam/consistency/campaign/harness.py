@@ -178,7 +178,8 @@ def _check(
         raise ValueError(
             f"monte_carlo: expected devices as from jax.local_devices(), got {devices!r}"
         )
-    if executor is not None and not callable(getattr(executor, "submit", None)):
+    submits = callable(getattr(executor, "submit", None)) and not isinstance(executor, type)
+    if executor is not None and not submits:
         raise ValueError(
             "monte_carlo: expected executor as of concurrent.futures, with a method submit, got "
             f"{executor!r:.60}"

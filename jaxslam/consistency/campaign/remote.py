@@ -3,6 +3,7 @@
 import functools
 import importlib
 import pickle
+import signal
 import threading
 from concurrent.futures import Future, ProcessPoolExecutor
 from concurrent.futures.process import BrokenProcessPool
@@ -94,8 +95,11 @@ class Processes:
         self._pool = self._new()
 
     def _new(self) -> ProcessPoolExecutor:
-        # JAX has threads, and a forked copy of a process with threads may hang.
-        return ProcessPoolExecutor(self._count, get_context("spawn"))
+        # JAX has threads, and a forked copy of a process with threads may hang. A terminal sends
+        # Ctrl-C to the processes, too: they finish their blocks, which are kept.
+        return ProcessPoolExecutor(
+            self._count, get_context("spawn"), signal.signal, (signal.SIGINT, signal.SIG_IGN)
+        )
 
     def submit(self, fn: Any, /, *args: Any) -> Future[Any]:
         """The future of fn(*args), which a process computes."""

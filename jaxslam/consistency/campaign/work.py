@@ -4,7 +4,7 @@ import contextlib
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import jax
@@ -81,7 +81,11 @@ class Work:
             except Exception as error:
                 if isinstance(error, WRONG) or out_of_memory(error):
                     raise
-                raise Incomplete(f"{type(error).__name__}: {error}") from error
+                began = self.tallies[BOUND].pieces() or not isinstance(error, BrokenExecutor)
+                hint = (
+                    "" if began else "; does the script begin under `if __name__ == '__main__':`?"
+                )
+                raise Incomplete(f"{type(error).__name__}: {error}{hint}") from error
             return
         runner = BlockRunner(plan)
         # XLA uses the cores; additional threads of the BLAS below its LAPACK would only spin.

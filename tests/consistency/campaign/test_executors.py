@@ -9,7 +9,7 @@ import subprocess
 import sys
 import time
 import warnings
-from concurrent.futures import Future, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor, ThreadPoolExecutor
 from multiprocessing import get_context
 
 import jax
@@ -121,6 +121,16 @@ def test_a_campaign_that_cannot_be_finished_says_what_it_has(whole, tmp_path):
     worlds.assert_same_bits(campaign_of(executor=Unreliable(), keep=store.resume(tmp_path)), whole)
 
 
+def test_a_pool_that_breaks_at_once_asks_for_the_guard_of_a_script():
+    broken = Unreliable(*[BrokenExecutor("terminated abruptly")] * 50)
+    with (
+        warnings.catch_warnings(),
+        pytest.raises(Incomplete, match=r"under `if __name__ == '__main__':`.*0 of 22 runs"),
+    ):
+        warnings.simplefilter("ignore")
+        campaign_of(executor=broken)
+
+
 def test_an_error_of_the_code_is_not_tried_again():
     executor = Unreliable(ValueError("wrong on every worker"))
     with pytest.raises(ValueError, match="wrong on every worker"):
@@ -132,6 +142,7 @@ def test_an_error_of_the_code_is_not_tried_again():
     ("options", "told"),
     [
         ({"executor": 4}, "expected executor as of concurrent.futures"),
+        ({"executor": lambda: Unreliable}, "expected executor as of concurrent.futures"),
         ({"executor": Unreliable(), "devices": jax.devices}, "each worker of an executor uses"),
     ],
 )
