@@ -97,8 +97,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--executor",
         metavar="ENGINE",
-        help="compute the blocks elsewhere: processes:N, here; dask://HOST:PORT, on the workers of "
-        "a Dask scheduler; mpi, on the ranks of mpiexec (mpi4py.futures)",
+        help="compute the blocks in other processes: processes:N, on this machine; "
+        "dask://HOST:PORT, the workers of a Dask scheduler; mpi, the ranks of mpiexec "
+        "(mpi4py.futures)",
     )
     parser.set_defaults(command=run_campaign)
 

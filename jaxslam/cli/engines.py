@@ -15,29 +15,29 @@ _TIMEOUT = 10
 
 
 @contextlib.contextmanager
-def engine(asked: str | None) -> Iterator[tuple[Executor | None, int | None]]:
-    """A block with the executor of an option's value, and the number of blocks in flight.
+def engine(value: str | None) -> Iterator[tuple[Executor | None, int | None]]:
+    """A context with the executor that an option names, and the number of blocks in flight.
 
     Raises ValueError on another value, on a library that is not installed, and where no worker
     answers.
     """
-    if asked is None:
+    if value is None:
         yield None, None
-    elif found := re.fullmatch(r"processes:([1-9]\d*)", asked, re.ASCII):
+    elif found := re.fullmatch(r"processes:([1-9]\d*)", value, re.ASCII):
         pool = Processes(int(found[1]))
         try:
             yield pool, 2 * int(found[1])
         finally:
             pool.shutdown()
-    elif asked == "mpi":
+    elif value == "mpi":
         with _of_mpi() as pool:
             yield pool, 2 * pool.num_workers
-    elif found := re.fullmatch(r"dask://(.+:\d+)", asked, re.ASCII):
+    elif found := re.fullmatch(r"dask://(.+:\d+)", value, re.ASCII):
         with _client(found[1]) as client:
             yield client.get_executor(pure=False), 2 * sum(client.nthreads().values())
     else:
         raise ValueError(
-            f"--executor: expected processes:N, dask://HOST:PORT or mpi, got {asked!r}"
+            f"--executor: expected processes:N, dask://HOST:PORT or mpi, got {value!r}"
         )
 
 

@@ -4,13 +4,14 @@ import contextlib
 import time
 import warnings
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_COMPLETED, CancelledError, Future, wait
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
 from dataclasses import dataclass, field
 from typing import Any
 
 import jax
 
 from jaxslam.consistency.campaign.block import BlockResult
+from jaxslam.consistency.campaign.result import Incomplete
 
 Piece = tuple[int, int]
 """(first, runs) of a block"""
@@ -21,14 +22,16 @@ TRIES = 3
 _LATE = 60.0
 """A block is late after this time [s], and after ten times the longest of those before it."""
 
-WRONG = (ValueError, TypeError, ImportError)
-"""Errors of the code that is run, which it would raise on every worker."""
-
 
 def out_of_memory(error: BaseException) -> bool:
     """Whether an error says that a block needs more memory than there is."""
     whole = isinstance(error, jax.errors.JaxRuntimeError) and "RESOURCE_EXHAUSTED" in str(error)
     return whole or isinstance(error, MemoryError)
+
+
+def _is_of_the_code(error: BaseException) -> bool:
+    """Whether the code that is run would raise an error on every worker."""
+    return isinstance(error, ValueError | TypeError | ImportError) or out_of_memory(error)
 
 
 @dataclass
@@ -55,8 +58,14 @@ class Flight:
         return len(self._blocks)
 
     def start(self, piece: Piece) -> None:
-        """Begin a block, or begin it once more."""
-        future = self.submit(*piece)
+        """Begin a block, or begin it once more.
+
+        Raises Incomplete if the executor takes no more.
+        """
+        try:
+            future = self.submit(*piece)
+        except Exception as error:
+            raise self._given_up(error) from error
         block = self._blocks.setdefault(piece, _Block())
         block.futures.append((future, time.monotonic()))
         block.tries += 1
@@ -81,7 +90,17 @@ class Flight:
                 found = None
             if found is not None:
                 del self._blocks[piece]
-                yield piece, found
+                yield piece, self._given_up(found) if isinstance(found, BaseException) else found
+
+    def _given_up(self, error: BaseException) -> BaseException:
+        """The error of a block that is not computed again: of an executor an `Incomplete`."""
+        if self.tries == 1 or not isinstance(error, Exception) or _is_of_the_code(error):
+            return error
+        broken = isinstance(error, BrokenExecutor) and self._longest == 0
+        hint = "; does the script begin under `if __name__ == '__main__':`?" * broken
+        incomplete = Incomplete(f"{type(error).__name__}: {error}{hint}")
+        incomplete.__cause__ = error
+        return incomplete
 
     def _wait(self) -> None:
         futures = [future for block in self._blocks.values() for future, _ in block.futures]
@@ -114,8 +133,8 @@ class Flight:
 
     def _once_more(self, piece: Piece, block: _Block, error: BaseException) -> bool:
         """Begin a block once more, and warn, unless that is in vain; whether it was begun."""
-        in_vain = isinstance(error, WRONG) or out_of_memory(error)
-        if self._ends or in_vain or block.tries >= self.tries or not isinstance(error, Exception):
+        in_vain = self._ends or block.tries >= self.tries
+        if in_vain or not isinstance(error, Exception) or _is_of_the_code(error):
             return False
         try:
             self.start(piece)

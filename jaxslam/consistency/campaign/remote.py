@@ -67,7 +67,9 @@ def compute_block(plan: bytes, first: int, runs: int) -> BlockResult:
     """
     with _COMPILING:
         runner = _runner(plan)
-    return runner.block(first, runs)
+    # XLA uses the cores; additional threads of the BLAS below its LAPACK would only spin.
+    with threadpool_limits(1, "blas"):
+        return runner.block(first, runs)
 
 
 _COMPILING = threading.Lock()
@@ -80,7 +82,6 @@ def _runner(plan: bytes) -> BlockRunner:
     for name, value in settings.items():
         if getattr(jax.config, name) != value:
             jax.config.update(name, value)
-    threadpool_limits(1, "blas")  # of LAPACK below XLA, whose threads would only spin
     return BlockRunner(replace(sent, devices=jax.local_devices(backend=sent.devices[0])[:1]))
 
 

@@ -4,7 +4,7 @@ import contextlib
 import warnings
 from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import BrokenExecutor, ThreadPoolExecutor
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 
 import jax
@@ -13,12 +13,11 @@ from threadpoolctl import threadpool_limits
 
 from jaxslam.consistency import Tally
 from jaxslam.consistency.campaign.block import BOUND, BlockRunner, CampaignPlan
-from jaxslam.consistency.campaign.flight import TRIES, WRONG, Flight, out_of_memory
+from jaxslam.consistency.campaign.flight import TRIES, Flight, out_of_memory
 from jaxslam.consistency.campaign.kept import Keep, add_block, flat
 from jaxslam.consistency.campaign.pieces import missing
 from jaxslam.consistency.campaign.progress import Progress
 from jaxslam.consistency.campaign.remote import Executor, compute_block, packed
-from jaxslam.consistency.campaign.result import Incomplete
 from jaxslam.core.types import Estimate, Truth
 
 
@@ -76,16 +75,7 @@ class Work:
         if self.executor is not None:
             send, content = self.executor.submit, packed(plan)
             flight = Flight(lambda first, runs: send(compute_block, content, first, runs), TRIES)
-            try:
-                self._compute(flight, queue, todo)
-            except Exception as error:
-                if isinstance(error, WRONG) or out_of_memory(error):
-                    raise
-                began = self.tallies[BOUND].pieces() or not isinstance(error, BrokenExecutor)
-                hint = (
-                    "" if began else "; does the script begin under `if __name__ == '__main__':`?"
-                )
-                raise Incomplete(f"{type(error).__name__}: {error}{hint}") from error
+            self._compute(flight, queue, todo)
             return
         runner = BlockRunner(plan)
         # XLA uses the cores; additional threads of the BLAS below its LAPACK would only spin.

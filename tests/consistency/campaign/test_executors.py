@@ -131,6 +131,16 @@ def test_a_pool_that_breaks_at_once_asks_for_the_guard_of_a_script():
         campaign_of(executor=broken)
 
 
+def test_an_error_of_the_store_is_not_taken_for_one_of_the_executor(tmp_path, monkeypatch):
+    def full(*_):
+        raise OSError("no space left")
+
+    keep = store.open(tmp_path)
+    monkeypatch.setattr(type(keep), "save", full)
+    with pytest.raises(OSError, match="no space left"):
+        campaign_of(executor=Unreliable(), workers=1, keep=keep)
+
+
 def test_an_error_of_the_code_is_not_tried_again():
     executor = Unreliable(ValueError("wrong on every worker"))
     with pytest.raises(ValueError, match="wrong on every worker"):
