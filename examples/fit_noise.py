@@ -22,7 +22,7 @@ import jaxslam
 from jaxslam.calibration import NoiseFit, fit_noise
 from jaxslam.core.types import Info
 from jaxslam.datasets import mrclam
-from jaxslam.datasets.mrclam_robot import ODOMETRY_DENSITY, white_noise
+from jaxslam.datasets.mrclam_robot import ODOMETRY_NOISE
 
 OFF = np.array([5.0, 0.2, 0.2, 5.0])
 """Factors from the truth, or from the reader's defaults, to the starts of the four parameters."""
@@ -66,7 +66,7 @@ def recorded(data: Any, steps: int) -> Callable[[jax.Array], Info]:
     log = jax.tree.map(lambda a: jnp.asarray(a[:steps]), data.log)
 
     def info(sigma: jax.Array) -> Info:
-        motion = jaxslam.motion.Unicycle(white_noise(sigma[0] ** 2, sigma[1] ** 2))
+        motion = jaxslam.motion.Unicycle(jaxslam.motion.WhiteNoise(sigma[0], sigma[1]))
         sensor = jaxslam.sensors.RangeBearing(jnp.diag(sigma[2:] ** 2))
         ekf = jaxslam.filters.EkfSlam(motion, sensor, data.capacity, **data.filter_options)
         return jaxslam.run(ekf, log, data.pose, data.pose_cov, jax.random.key(0)).info
@@ -107,7 +107,9 @@ def main() -> int:
             )
         else:
             data = mrclam(options.mrclam, options.robot)
-            known = np.sqrt([*ODOMETRY_DENSITY, *np.diag(data.sensor.noise_cov(jnp.zeros(2)))])
+            known = np.array(
+                [*ODOMETRY_NOISE, *np.sqrt(np.diag(data.sensor.noise_cov(jnp.zeros(2))))]
+            )
             info, called, names = recorded(data, options.steps or 10_000), "default", RECORDED
         print(table(fit_noise(info, known * OFF, names=names), known, called))
     except (ValueError, OSError) as error:

@@ -2,7 +2,7 @@
 
 EKF-SLAM and the right-invariant EKF of each robot alone: with the default noise of the reader; with
 `MRCLAM_CALIBRATION`, which is fitted on robot 1; with the constants that each robot's own log tells
-(`datasets.mrclam_calibration`, no truth), without and with what the uncertainty of
+(`datasets.fit`, no truth), without and with what the uncertainty of
 these constants and of the scale adds to the covariance (`calibration.consider_cov`); and, for
 reference, with constants and noise fitted on each robot's own truth. The smoother `batch_map`,
 whose path follows from the whole log, with the constants of the own log, without and with their
@@ -16,6 +16,7 @@ after the SE(2) motion that fits the path best; σ [m] is what the filter claims
 checkout.
 """
 
+from dataclasses import replace
 from functools import partial
 from typing import NamedTuple
 
@@ -34,7 +35,7 @@ from jaxslam import charts, datasets, metrics, smoothing
 from jaxslam.calibration import consider_cov
 from jaxslam.consistency.measures.nees import block_nees, pose_error
 from jaxslam.core.types import Status
-from jaxslam.datasets import MRCLAM_FITTED
+from jaxslam.datasets import MRCLAM_CALIBRATION, RobotCalibration
 from jaxslam.filters import EkfSlam, TeamSlam
 from jaxslam.filters.multi_robot.team import poses
 from jaxslam.math.stats import sigma_gate
@@ -56,6 +57,9 @@ COLUMNS = ("robot", "filter", "noise", "ATE [m]", "aligned [m]", "heading [deg]"
 COLUMNS += ("σ [m]", "NEES median", "NEES mean", "NIS/dof", "rejected", "unseen [s]")
 NOISES = "default", "fitted on robot 1", "own log", "own truth"
 CONSIDERED = "own log, considered"
+GROUPS = ("scale", "wheels", "mount", "axis")
+"""What the log of a robot tells of its constants; `depth` only in ratio to `forward`."""
+FITTED = ("forward", "outer", "turn", "curvature", "ahead", "yaw", "axis")
 
 
 class Scored(NamedTuple):
@@ -106,8 +110,14 @@ def of_trace(data, row, trace, added=0.0):
     return scored(*truth, estimate.pose, estimate.pose_cov + added, trace.info, True, seen)
 
 
+def sigma_of(own):
+    """The standard errors of the fitted constants."""
+    at = [own.robot._fields.index(name) for name in FITTED]
+    return np.sqrt(np.diag(own.cov))[at]
+
+
 def constants_row(robot, source, constants, sigma):
-    values = [getattr(constants, name) for name in MRCLAM_FITTED]
+    values = [getattr(constants, name) for name in FITTED]
     cells = [f"{value:.4f}" for value in values]
     if sigma is not None:
         cells = [f"{cell} ± {s:.4f}" for cell, s in zip(cells, sigma, strict=True)]
@@ -139,6 +149,32 @@ def smoother(data, row):
     return go
 
 
+class Own(NamedTuple):
+    """The constants of a robot by its own log."""
+
+    robot: RobotCalibration
+    cov: np.ndarray
+    """of all fields, 0 of those that are held"""
+
+
+def own_log(folder, robot):
+    data = datasets.mrclam(folder, robot, calibration=MRCLAM_CALIBRATION)
+    # The log alone: no pose of the truth, in no frame but the robot's.
+    data = replace(data, pose=np.zeros(3), pose_cov=np.zeros((3, 3)))
+    found = datasets.fit(data, calibrate=GROUPS, fixed=("noise",), options={"gate": GATE})
+    assert found.found.converged
+    assert found.settled
+    return Own(RobotCalibration(*found.values.tolist()), found.cov)
+
+
+def scaled(own, scale):
+    """The covariance with an unknown scale of the world, of a relative standard deviation."""
+    larger = own.robot._replace(**dict.fromkeys(own.robot._fields, 0.0))
+    grow = {name: getattr(own.robot, name) for name in ("forward", "outer", "ahead")}
+    direction = np.array(larger._replace(**grow, depth=-own.robot.depth))
+    return own.cov + scale**2 * np.outer(direction, direction)
+
+
 def own_constants(folder, robot, own, scale, estimator):
     """The path with the constants of the own log, and with what these and the scale add to its
     covariance.
@@ -148,16 +184,16 @@ def own_constants(folder, robot, own, scale, estimator):
     data = datasets.mrclam(folder, robot, calibration=own.robot)
     row, _ = from_first_scan(data)
     go = estimator(data, row)
+    cov, p = scaled(own, scale), np.array(own.robot)
+    uncertain = np.flatnonzero(np.diag(cov))
 
-    def trace(p):
-        log, motion, sensor = own.at(p[:-1], 1.0 + p[-1])
+    def trace(changed):
+        log, motion, sensor = data.adjustable.at(jnp.asarray(p).at[uncertain].set(changed))
         return go(cut(log, row), motion, sensor)
 
-    p = np.append(own.found.parameters, 0.0)
-    cov = np.zeros((len(p), len(p)))
-    cov[:-1, :-1], cov[-1, -1] = own.found.cov, scale**2
-    added = consider_cov(lambda p: trace(p).estimate.pose, p, cov)
-    found = jax.device_get(trace(jnp.asarray(p)))
+    cov = cov[np.ix_(uncertain, uncertain)]
+    added = consider_cov(lambda changed: trace(changed).estimate.pose, p[uncertain], cov)
+    found = jax.device_get(trace(jnp.asarray(p[uncertain])))
     if found.info.exhausted is not None and found.info.exhausted.any():
         print(f"robot {robot}: the smoother did not converge in {STEPS} steps")
     return of_trace(data, row, found), of_trace(data, row, found, added)
@@ -198,11 +234,11 @@ def measure(quick: bool = False) -> list[Metric]:
     gates, folder = fitting.measure(), DATA / "mrclam6"
     if not gates:
         return []
-    own = {robot: datasets.mrclam_calibration(folder, robot) for robot in ROBOTS}
+    own = {robot: own_log(folder, robot) for robot in ROBOTS}
     true = {robot: fitting.fit(folder, robot, turned=True) for robot in ROBOTS}
-    print("\n| robot | source | " + " | ".join(MRCLAM_FITTED) + " | depth |\n|" + " --- |" * 10)
+    print("\n| robot | source | " + " | ".join(FITTED) + " | depth |\n|" + " --- |" * 10)
     for robot, each in own.items():
-        print(constants_row(robot, "own log", each.robot, np.sqrt(np.diag(each.found.cov))))
+        print(constants_row(robot, "own log", each.robot, sigma_of(each)))
         print(constants_row(robot, "own truth", true[robot], None), flush=True)
     scale = float(np.std([each.robot.forward for each in own.values()], ddof=1))
     print(f"\nscale: standard deviation {scale:.4f}, that of `forward` over the own logs")

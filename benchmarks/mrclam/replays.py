@@ -18,7 +18,6 @@ from jaxslam.core.types import Log, Scan, Truth
 from jaxslam.filters import EkfSlam
 from jaxslam.math import se2
 from jaxslam.motion import PoseIncrement
-from jaxslam.sensors import RangeBearing
 
 RUNS = 300
 WHITE = 2.0
@@ -103,7 +102,7 @@ def course(folder: Path, robot: int) -> Course:
     density = np.stack([np.full(len(dt), own.forward_noise), 0 * turn, turn], axis=1)
     control = jnp.concatenate([increment, np.sqrt(dt)[:, None] * density], axis=1)
     motion = PoseIncrementWithDeviations()
-    sensor = RangeBearing(own.measurement_cov(), mount=own.mount)
+    sensor = own.sensor
     landmarks = jnp.asarray(data.landmarks)
     at = landmarks[jnp.maximum(scan.tag, 0)]
     scan = scan._replace(z=jax.vmap(jax.vmap(sensor.observe, (None, 0)))(path, at))

@@ -33,16 +33,18 @@ class _LikelihoodPoint(NamedTuple):
     gradient: np.ndarray
     spread: np.ndarray
     """Σ g gᵀ over the rows"""
+    expected: np.ndarray
+    """the expected information"""
     nis: float
     dof: int
 
 
-def _newton_step(observed: np.ndarray, gradient: np.ndarray) -> tuple[np.ndarray, float]:
+def _newton_step(information: np.ndarray, gradient: np.ndarray) -> tuple[np.ndarray, float]:
     """Newton's step, in each direction at most 1, and the gain of log L that it promises.
 
     Where log L is convex the step goes uphill by as much as it would where it is concave.
     """
-    values, vectors = np.linalg.eigh(observed)
+    values, vectors = np.linalg.eigh(information)
     along = vectors.T @ gradient
     step = np.clip(along / np.maximum(np.abs(values), 1e-300), -1.0, 1.0)
     return vectors @ step, float(np.abs(along * step).sum() / 2)
@@ -106,6 +108,8 @@ _LOOSE = 1.0
 
 
 _POLISH = 5
+"""Newton's steps with the observed information at most."""
+_HALVINGS = 8
 
 
 class NoiseFit(NamedTuple):
@@ -153,11 +157,13 @@ def fit_noise(
 
         log L(p) = Σ log N(ν; 0, S) over fused measurements = Σ_t `Info.log_likelihood`
 
-    BFGS in the coordinates q = log p of standard deviations and q = p of others, then Newton's
-    steps. The gradient is exact, from one run in forward mode. The observed information
-    H = -∂²log L/∂q² comes from central differences of the gradient. Maximum likelihood by the
-    prediction-error decomposition: Schweppe, IEEE Trans. Information Theory 11(1), 1965; robust
-    errors: White, Econometrica 50(1), 1982.
+    Fisher scoring in the coordinates q = log p of standard deviations and q = p of others, then
+    Newton's steps. The gradient is exact, from one run in forward mode, which also gives the
+    expected information Σ ∂νᵀS⁻¹∂ν + ½ tr(S⁻¹∂S S⁻¹∂S), that of a scan being the sum over its
+    measurements. The observed information H = -∂²log L/∂q² comes from central differences of the
+    gradient. Maximum likelihood by the prediction-error decomposition: Schweppe, IEEE Trans.
+    Information Theory 11(1), 1965; scoring: Harvey, "Forecasting, structural time series models
+    and the Kalman filter", 1989, section 3.4; robust errors: White, Econometrica 50(1), 1982.
 
     The same measurements must be fused whatever p, or likelihoods are not of the same data: take a
     filter without a gate and with known identities, where a landmark is born at its first
@@ -189,8 +195,8 @@ def fit_noise(
 
     def tried(q: np.ndarray) -> _LikelihoodPoint:
         found = jax.device_get(_evaluate(of_run, q, logged, data))
-        value, gradient, spread, nis, dof = (np.asarray(part, np.float64) for part in found)
-        return _LikelihoodPoint(q, float(value), gradient, spread, float(nis), int(dof))
+        value, gradient, spread, expected, nis, dof = (np.asarray(x, np.float64) for x in found)
+        return _LikelihoodPoint(q, float(value), gradient, spread, expected, float(nis), int(dof))
 
     def at(q: np.ndarray) -> _LikelihoodPoint:
         point = tried(q)
@@ -200,43 +206,47 @@ def fit_noise(
     before = at(_coordinates(first, logged))
     here = before if guess is None else at(_coordinates(begin, logged))
     _check_same(before, here, logged)
-    scale, path = 1.0 / max(abs(here.value), 1.0), [here.q]
+    path = [here.q]
 
-    from scipy.optimize import minimize  # slow to load
+    def better(step: np.ndarray) -> _LikelihoodPoint | None:
+        """The first point above the present one on a step halved up to `_HALVINGS` times."""
+        for halving in range(_HALVINGS + 1):
+            trial = tried(here.q + step / 2**halving)
+            if np.isfinite([trial.value, *trial.gradient]).all():  # else a step too far
+                _check_same(before, trial, logged)
+                if trial.value > here.value:
+                    return trial
+        return None
 
-    def objective(q: np.ndarray) -> tuple[float, np.ndarray]:
-        trial = tried(q)
-        if not np.isfinite([trial.value, *trial.gradient]).all():  # a step too far
-            return 10.0 - 10 * scale * here.value, 0.0 * q
-        _check_same(before, trial, logged)
-        return -scale * trial.value, -scale * trial.gradient
-
-    found = minimize(
-        objective,
-        here.q,
-        jac=True,
-        method="BFGS",
-        callback=lambda q: path.append(np.array(q)),
-        options={"gtol": scale * tolerance, "maxiter": iterations},
-    )
-    here = at(np.asarray(found.x))
+    for _ in range(iterations):
+        step, gain = _newton_step(here.expected, here.gradient)
+        higher = better(step)
+        if higher is None:
+            break
+        here = higher
+        path.append(here.q)
+        if gain <= tolerance:
+            break
     observed = _observed_information(at, here, logged)
     for _ in range(_POLISH):
         step, gain = _newton_step(observed, here.gradient)
         if gain <= tolerance:
             break
-        at_trial = at(here.q + step)
-        if not at_trial.value > here.value:
+        higher = better(step)
+        if higher is None:
             break
-        here = at_trial
+        here = higher
         path.append(here.q)
         observed = _observed_information(at, here, logged)
-    cov, robust, related = _standard_errors(observed, here.spread)
+    # A deviation at 0, of which little is known and less the smaller it is, has no error, and the
+    # others have that which they have without it.
+    falling = logged & (here.gradient < 0) & (np.diag(observed) < 1 / _LOOSE**2)
+    kept = np.where(falling | falling[:, None], 0.0, observed)
+    cov, robust, related = _standard_errors(kept, here.spread)
     deviations = np.where(logged, np.exp(here.q), 1.0)
     error = np.sqrt(np.diag(cov))
     wide = ~np.isfinite(error) | (logged & (error > _LOOSE))
-    # Near 0 log L is linear in σ²: slope and curvature by log σ are twice and four times the gain.
-    falling = wide & logged & (here.gradient < 0) & (np.abs(np.diag(observed)) < 4 * _BOUND)
+    loose = set(np.flatnonzero(wide & ~falling).tolist())
     return NoiseFit(
         names=labels,
         start=first,
@@ -251,7 +261,9 @@ def fit_noise(
         converged=_newton_step(observed, here.gradient)[1] <= tolerance,
         upper={labels[i]: _upper_limit(at, here, int(i)) for i in np.flatnonzero(falling)},
         loose={
-            labels[i]: tuple(labels[j] for j in related[i]) for i in np.flatnonzero(wide & ~falling)
+            labels[i]: tuple(labels[j] for j in related[i])
+            for i in range(len(labels))
+            if {i, *related[i]} & loose and not falling[i]
         },
     )
 
@@ -278,18 +290,32 @@ def _evaluate(
     logged: Bool[Array, "P"],
     data: tuple[PyTree, ...],
 ) -> tuple[Array, ...]:
-    """The log-likelihood log L, its gradient, Σ g gᵀ over the rows, NIS and dof."""
+    """log L, its gradient, Σ g gᵀ over the rows, the expected information, NIS and dof."""
 
     def rows(q: Float[Array, "P"]) -> PyTree:
         found = info(jnp.where(logged, jnp.exp(jnp.where(logged, q, 0.0)), q), *data)
         fused = found.status == Status.FUSED
         nis = jnp.where(fused, found.nis, 0.0).sum()
         dof = jnp.where(fused, found.dof, 0).sum()
-        return found.log_likelihood, (found.log_likelihood.sum(), nis, dof)
+        size = found.innovation.shape[-1]
+        innovation = jnp.where(fused[..., None], found.innovation, 0.0).reshape(-1, size)
+        cov = jnp.where(fused[..., None, None], found.innovation_cov, 0.0).reshape(-1, size, size)
+        differentiated = found.log_likelihood, innovation, cov
+        return differentiated, (found.log_likelihood.sum(), cov, nis, dof)
 
-    by_row, (value, nis, dof) = jax.jacfwd(rows, has_aux=True)(q)
+    (by_row, by_mean, by_cov), (value, cov, nis, dof) = jax.jacfwd(rows, has_aux=True)(q)
     by_row = by_row.reshape(-1, q.shape[0])
-    return value, by_row.sum(axis=0), by_row.T @ by_row, nis, dof
+
+    def expected(cov: Array, by_mean: Array, by_cov: Array) -> Array:
+        # The identity where nothing is fused, and in the unused rows of a smaller part of a suite.
+        cov = cov + jnp.diag((jnp.diag(cov) == 0).astype(cov.dtype))
+        relative = jnp.linalg.solve(cov, by_cov.reshape(cov.shape[0], -1)).reshape(by_cov.shape)
+        shape = jnp.einsum("ijp,jiq->pq", relative, relative) / 2
+        found: Array = by_mean.T @ jnp.linalg.solve(cov, by_mean) + shape
+        return found
+
+    information = jax.vmap(expected)(cov, by_mean, by_cov).sum(axis=0)
+    return value, by_row.sum(axis=0), by_row.T @ by_row, information, nis, dof
 
 
 def _coordinates(p: np.ndarray, logged: np.ndarray) -> np.ndarray:

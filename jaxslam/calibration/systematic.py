@@ -10,7 +10,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float, Int, PyTree
 from numpy.typing import ArrayLike
 
 from jaxslam.core.numbers import check_count, is_concrete
@@ -151,10 +151,10 @@ def _step(
 
 
 def consider_cov(
-    result: Callable[[Float[Array, "P"]], Float[Array, "*shape n"]],
+    result: Callable[[Float[Array, "P"]], PyTree[Float[Array, "*shape n"]]],
     parameters: ArrayLike,
     cov: ArrayLike,
-) -> Float[np.ndarray, "*shape n n"]:
+) -> PyTree[Float[np.ndarray, "*shape n n"]]:
     """The covariance that uncertain parameters add to each row of a result.
 
         J C Jᵀ,    J = ∂ result / ∂ p
@@ -173,8 +173,8 @@ def consider_cov(
     covariance of the joint estimate of state and constants, and in general too large before.
 
     Args:
-        result: p (P,) -> an array (*shape, n), as poses (T, 3). Traced once; of a record with
-            `__call__` once for all its numbers.
+        result: p (P,) -> an array (*shape, n), as poses (T, 3), or a tree of such arrays. Traced
+            once; of a record with `__call__` once for all its numbers.
         parameters: where J is taken; a number counts as (1,).
         cov: (P, P) C, or a number for one parameter.
     Raises:
@@ -195,31 +195,36 @@ def consider_cov(
         )
     c = _covariance(cov, p.size)
 
-    found = jax.device_get(_differentiate(as_record(result), p))
-    jacobian, value = (np.asarray(each, np.float64) for each in found)
-    if not (np.isfinite(jacobian).all() and np.isfinite(value).all()):
+    jacobians, values = jax.device_get(_differentiate(as_record(result), p))
+    if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((jacobians, values))):
         raise ValueError(f"consider_cov: the result or its derivatives at {p} are not finite")
-    return np.asarray(jacobian @ c @ np.swapaxes(jacobian, -1, -2))
+
+    def added(jacobian: np.ndarray) -> np.ndarray:
+        jacobian = np.asarray(jacobian, np.float64)
+        return np.asarray(jacobian @ c @ np.swapaxes(jacobian, -1, -2))
+
+    return jax.tree.map(added, jacobians)
 
 
 @partial(jax.jit, inline=True)
 def _differentiate(
-    result: Callable[[Float[Array, "P"]], Float[Array, "*shape n"]], p: Float[Array, "P"]
-) -> tuple[Float[Array, "*shape n P"], Float[Array, "*shape n"]]:
+    result: Callable[[Float[Array, "P"]], PyTree], p: Float[Array, "P"]
+) -> tuple[PyTree, PyTree]:
     """The derivative of a result, and the result."""
 
-    def both(p: Float[Array, "P"]) -> tuple[Array, Array]:
+    def both(p: Float[Array, "P"]) -> tuple[PyTree, PyTree]:
         value = result(p)
-        array = isinstance(value, jax.Array)
-        if not array or not value.shape or not jnp.issubdtype(value.dtype, jnp.floating):
-            what = f"{value.shape} {value.dtype}" if array else type(value).__name__
-            raise ValueError(
-                "consider_cov: expected result to return an array (*shape, n) of real numbers, as "
-                f"trace.estimate.pose, got {what}"
-            )
+        for leaf in jax.tree.leaves(value) or [None]:
+            array = isinstance(leaf, jax.Array)
+            if not array or not leaf.shape or not jnp.issubdtype(leaf.dtype, jnp.floating):
+                what = f"{leaf.shape} {leaf.dtype}" if array else type(leaf).__name__
+                raise ValueError(
+                    "consider_cov: expected result to return an array (*shape, n) of real numbers, "
+                    f"as trace.estimate.pose, got {what}"
+                )
         return value, value
 
-    found: tuple[Array, Array] = jax.jacfwd(both, has_aux=True)(p)
+    found: tuple[PyTree, PyTree] = jax.jacfwd(both, has_aux=True)(p)
     return found
 
 

@@ -1,14 +1,12 @@
-"""The command `jaxslam fit`: the noises of a user's data by maximum likelihood."""
+"""The command `jaxslam fit`: noises and systematic errors of a user's data."""
 
 import argparse
-from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
 from jaxslam.cli import cache
 from jaxslam.cli.common import add_out
-from jaxslam.core.logs.tables import POSE
 from jaxslam.datasets import Dataset, DatasetFit, fit, table
 from jaxslam.datasets.table_settings import FITTED, fitted_text
 from jaxslam.results.files import (
@@ -27,18 +25,22 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     """Add the options of `jaxslam fit`."""
     parser.add_argument("path", metavar="FOLDER", help="the folder of the CSV files")
     parser.add_argument(
-        "--mount", action="store_true", help="fit the pose of the sensor on the robot, too"
+        "--calibrate",
+        metavar="GROUPS",
+        default="",
+        help="systematic errors to fit, too, some of: mount, scale, wheels, heading, range, axis, "
+        "delay; with commas between them",
     )
     parser.add_argument(
         "--fix",
         metavar="NAMES",
         default="",
-        help='parameters to hold, comma-separated, as "motion v,mount y"',
+        help='parameters or groups to hold, comma-separated, as "motion v,mount y" or noise',
     )
     parser.add_argument(
         "--write",
         action="store_true",
-        help="also write fit.toml into the folder, where it replaces the noises of dataset.toml",
+        help="also write fit.toml into the folder, where it replaces numbers of dataset.toml",
     )
     cache.add_options(parser)
     add_out(parser)
@@ -47,12 +49,17 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 def fit_folder(options: argparse.Namespace, command: str) -> int:
     """Fit the noises of a folder, print and write them; returns the exit status."""
-    data = table(options.path)
+    data = table(options.path, fitted=False)
     check_writable(options.out)
-    fixed = [name.strip() for name in options.fix.split(",") if name.strip()]
-    result = fit(data, mount=options.mount, fixed=fixed)
+    fixed, calibrated = (
+        [name.strip() for name in text.split(",") if name.strip()]
+        for text in (options.fix, options.calibrate)
+    )
+    result = fit(data, calibrate=calibrated, fixed=fixed)
     print(_table(data, result))
-    fitted = fitted_text(*_settings(data, result, options.mount))
+    groups = [parameter.group for parameter in result.parameters]
+    kept = np.flatnonzero([group in ("noise", *calibrated) for group in groups])
+    fitted = fitted_text([result.parameters[i] for i in kept], result.cov[np.ix_(kept, kept)])
     files: Files = {
         "fit.json": json_text(
             _summary(data, result) | {"command": command, "versions": versions()}
@@ -68,28 +75,10 @@ def fit_folder(options: argparse.Namespace, command: str) -> int:
         print(f"{FITTED} was not written into {options.path}: the fit did not converge")
     elif not options.write:
         print(
-            f"use --write to write {FITTED} into {options.path}, too, where it replaces the noises"
+            f"use --write to write {FITTED} into {options.path}, too, where it replaces numbers of "
+            "dataset.toml"
         )
     return 0
-
-
-def _settings(
-    data: Dataset, result: DatasetFit, mount: bool
-) -> tuple[dict[str, dict[str, Sequence[float]]], dict[str, str]]:
-    """The sections of `dataset.toml` with the fitted numbers, and a comment for each key."""
-    count = len(data.motion.noises)
-    changes: dict[str, dict[str, Sequence[float]]] = {
-        "motion": {"noise": result.deviations[:count]},
-        "sensor": {"noise": result.deviations[count:]},
-    }
-    comments = {
-        "motion.noise": ", ".join(data.motion.noises),
-        "sensor.noise": ", ".join(data.sensor.measurements),
-    }
-    if mount and result.mount is not None:
-        changes["sensor"]["mount"] = result.mount
-        comments["sensor.mount"] = ", ".join(POSE)
-    return changes, comments
 
 
 def _summary(data: Dataset, result: DatasetFit) -> Json:

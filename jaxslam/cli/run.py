@@ -31,10 +31,11 @@ from jaxslam.cli.common import (
 from jaxslam.cli.piecewise import PiecewiseRun, run_in_pieces
 from jaxslam.consistency.campaign.progress import Progress
 from jaxslam.consistency.measures.counts import count_label
-from jaxslam.core.protocols import Candidate, Filter
+from jaxslam.core.protocols import Candidate, Filter, Motion, Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Log, Status, Truth
 from jaxslam.datasets import READERS, Dataset
+from jaxslam.datasets.considered import considered
 from jaxslam.datasets.evaluation import Evaluation, evaluate, joint_map_cov
 from jaxslam.datasets.table_settings import METHODS, association_options
 from jaxslam.filters.ekf.ekf_settings import EkfOptions
@@ -181,7 +182,21 @@ def run_filter(
         "NIS / dof": float(nis / max(dof, 1)),
         "log-likelihood": float(result.log_likelihood.sum()),
     }
-    found = evaluate(data, result.path, last, joint_map_cov(filter, result.final))
+    map_cov, added = joint_map_cov(filter, result.final), None
+    if has_covariance:
+        added = considered(data, lambda *models: chosen_filters(data, name, models)[name])
+    if added is not None:
+        covs = np.moveaxis(np.diagonal(added.points, axis1=0, axis2=2), -1, 0)
+        result = result._replace(
+            path=result.path._replace(pose_cov=result.path.pose_cov + added.pose),
+            last=last._replace(
+                pose_cov=last.pose_cov + added.pose[-1], point_covs=last.point_covs + covs
+            ),
+        )
+        last = result.last
+        map_cov = None if map_cov is None else map_cov + added.points
+    uncertain = data.adjustable is not None and data.adjustable.cov is not None
+    found = evaluate(data, result.path, last, map_cov)
     summary = {
         "landmarks": int(last.alive.sum()),
         "status": {
@@ -190,6 +205,7 @@ def run_filter(
         **({"measurements without a true pose, left out": unplaced} if unplaced else {}),
         **(innovations if dof else {}),
         "P positive definite": _definiteness(result),
+        **({"uncertainty of constants": "added" if added else "left out"} if uncertain else {}),
         "final pose": [float(value) for value in last.pose],
         "seconds": round(seconds, 2),
     }
@@ -321,8 +337,10 @@ def with_options(data: Dataset, options: argparse.Namespace) -> Dataset:
     return dataclasses.replace(data, filter_options=changed, assumed=tuple(assumed))
 
 
-def chosen_filters(data: Dataset, text: str) -> dict[str, Filter]:
-    """The filters of a comma-separated list of names.
+def chosen_filters(
+    data: Dataset, text: str, models: tuple[Motion, Sensor] | None = None
+) -> dict[str, Filter]:
+    """The filters of a comma-separated list of names, with the models of the data set or others.
 
     Raises ValueError on unknown or repeated names, and on a filter that needs what the data set
     does not have: the truth at every step, a map in the frame of the start, or tags.
@@ -331,10 +349,11 @@ def chosen_filters(data: Dataset, text: str) -> dict[str, Filter]:
     if not all(names) or len(set(names)) < len(names):
         raise ValueError(f"--filters: expected different names with commas between, got {text!r}")
     slots = np.zeros((data.capacity, len(data.sensor.landmark)))
+    motion, sensor = models or (data.motion, data.sensor)
     world = Scenario(
         name=data.name,
-        motion=data.motion,
-        sensor=data.sensor,
+        motion=motion,
+        sensor=sensor,
         landmarks=slots,
         controls=data.log.control,
         places=data.log.scan.tag.shape[1],

@@ -7,17 +7,12 @@ robots, the number of one.
 from collections.abc import Callable
 
 from jaxslam.datasets.carmen_reader import StampedRelations, carmen, relation_file
-from jaxslam.datasets.dataset import Dataset
+from jaxslam.datasets.considered import Added, considered
+from jaxslam.datasets.dataset import Adjustable, Dataset, Parameter
 from jaxslam.datasets.laser_record import LaserLog
 from jaxslam.datasets.line_readers import bonn, victoria_park
-from jaxslam.datasets.mrclam_reader import (
-    MRCLAM_FITTED,
-    FittedCalibration,
-    mrclam,
-    mrclam_calibration,
-    mrclam_team,
-)
-from jaxslam.datasets.mrclam_robot import MRCLAM_CALIBRATION, RobotCalibration, white_noise
+from jaxslam.datasets.mrclam_reader import mrclam, mrclam_team
+from jaxslam.datasets.mrclam_robot import MRCLAM_CALIBRATION, RobotCalibration
 from jaxslam.datasets.noise_fit import DatasetFit, fit
 from jaxslam.datasets.plaza_reader import plaza
 from jaxslam.datasets.rosbag_reader import BagContents, rosbag, rosbag_contents
@@ -33,20 +28,21 @@ READERS: dict[str, Callable[..., Dataset]] = {
 
 __all__ = [
     "MRCLAM_CALIBRATION",
-    "MRCLAM_FITTED",
     "READERS",
+    "Added",
+    "Adjustable",
     "BagContents",
     "Dataset",
     "DatasetFit",
-    "FittedCalibration",
     "LaserLog",
+    "Parameter",
     "RobotCalibration",
     "StampedRelations",
     "bonn",
     "carmen",
+    "considered",
     "fit",
     "mrclam",
-    "mrclam_calibration",
     "mrclam_team",
     "plaza",
     "relation_file",
@@ -54,5 +50,4 @@ __all__ = [
     "rosbag_contents",
     "table",
     "victoria_park",
-    "white_noise",
 ]

@@ -4,29 +4,43 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 from typing import NamedTuple
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float
-from numpy.typing import ArrayLike
 
 from jaxslam.core.protocols import Motion, Sensor
-from jaxslam.core.types import JaxOrNumPy, Log
+from jaxslam.core.types import Log
 from jaxslam.core.validation.logs import check_log
 from jaxslam.filters.ekf.ekf_settings import EkfOptions
 from jaxslam.filters.multi_robot.team import Robot
 from jaxslam.sensors.suite import Suite
 
 
-class Adjustable(NamedTuple):
-    """The models of a data set by their standard deviations and the sensor's mount."""
+class Parameter(NamedTuple):
+    """A number of a data set's models that `fit` can estimate."""
 
-    names: tuple[str, ...]
-    """of the deviations: "motion v [m/s]", …, then "sensor range [m]", …"""
-    deviations: tuple[float, ...]
-    """those of the data set"""
-    mount: tuple[float, ...] | None
-    """(x [m], y [m], θ [rad]) of the sensor on the robot; None without a mount"""
-    models: Callable[[JaxOrNumPy, ArrayLike | None], tuple[Motion, Sensor]]
-    """(deviations (P,) an array, mount (3,) or None) -> motion and sensor"""
+    name: str
+    """with its unit, as "motion v [m/s]" or "scale turn" """
+    value: float
+    group: str
+    """"noise" of a standard deviation, else what `calibrate` names: "mount", "scale", …"""
+    place: tuple[str, str]
+    """section and key of the settings, whose list holds the parameters of one place in order"""
+
+
+class Adjustable(NamedTuple):
+    """The log and the models of a data set as functions of its parameters."""
+
+    parameters: tuple[Parameter, ...]
+    at: Callable[[Float[jax.Array, "P"]], tuple[Log, Motion, Sensor]]
+    """values, which may be traced -> log, motion and sensor"""
+    cov: Float[np.ndarray, "P P"] | None = None
+    """of the values as they were fitted, 0 for others; None if nothing is known of it"""
+
+    @property
+    def values(self) -> Float[np.ndarray, "P"]:
+        """The numbers of all parameters."""
+        return np.array([parameter.value for parameter in self.parameters])
 
 
 @dataclass(frozen=True, eq=False)
@@ -71,7 +85,8 @@ class Dataset:
     slots: int | None = None
     """landmark slots of the filter; None for one per tag"""
     adjustable: Adjustable | None = None
-    """the models as functions of noises and mount, for `datasets.fit`; None if they are fixed"""
+    """log and models as functions of noises and systematic errors, for `datasets.fit`; None if
+    they are fixed"""
     dropped: dict[str, int] = field(default_factory=dict)
     """number of measurements in the file that are not in the log, by reason"""
     corrections: tuple[str, ...] = ()

@@ -1,31 +1,24 @@
-"""Readers of MRCLAM, the UTIAS multi-robot data: of one robot, of several in one log, and the
-systematic errors of a robot from its log.
-"""
+"""Readers of MRCLAM, the UTIAS multi-robot data: of one robot, and of several in one log."""
 
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
-from typing import Literal, NamedTuple, cast
+from typing import Literal
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 
-from jaxslam.calibration import Calibration, calibrate
-from jaxslam.charts import RightInvariant
 from jaxslam.core.logs.streams import Rows, hold
 from jaxslam.core.noise import NoiseCov
-from jaxslam.core.numbers import is_concrete
-from jaxslam.core.protocols import Motion, Sensor
-from jaxslam.core.types import Info, Log
+from jaxslam.core.protocols import Sensor
+from jaxslam.core.types import Log
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.lines import stored
 from jaxslam.datasets.mrclam_robot import (
     DROP_REASONS,
-    MRCLAM_CALIBRATION,
     ROBOTS,
     SOURCE,
     RobotCalibration,
+    adjustable,
     associated,
     check_calibration,
     log_of,
@@ -34,13 +27,8 @@ from jaxslam.datasets.mrclam_robot import (
     read_lines,
     true_fields,
 )
-from jaxslam.driver import run
-from jaxslam.filters.ekf.ekf_settings import EkfOptions
-from jaxslam.filters.ekf.ekf_slam import EkfSlam
 from jaxslam.filters.multi_robot.team import Robot, TeamMotion, sensors_of
-from jaxslam.math.stats import sigma_gate
-from jaxslam.motion import Unicycle
-from jaxslam.sensors import Part, RangeBearing, Suite
+from jaxslam.sensors import Corrected, Part, Suite
 
 
 def mrclam(
@@ -73,15 +61,27 @@ def mrclam(
     0.19 m, with errors that persist for seconds, so that innovations show 0.11 m; 0.15 is between.
     With odometry noise of 0.01 m/√s and 0.05 rad/√s, NIS/dof is then 0.78, 1.22 and 0.92. Since the
     errors of ranges persist, the map's covariance is too small for any choice. A `calibration`
-    removes their causes, see `MRCLAM_CALIBRATION` and `mrclam_calibration`. The default is without
-    a gate; a gate at 5 σ changes the maps by millimetres.
+    removes their causes, and `fit` finds that of a robot from its log, without truth or survey:
+
+        fitted = fit(
+            mrclam(folder, 5, calibration=MRCLAM_CALIBRATION),
+            calibrate=("scale", "wheels", "mount", "axis"),
+            fixed=("noise",),
+            options={"gate": stats.sigma_gate(5.0)},
+        )
+        data = mrclam(folder, 5, calibration=RobotCalibration(*fitted.values))
+
+    Larger ranges and odometry in proportion give the same log of a larger world, so that `depth`
+    sets the scale of the map. The default is without a gate; a gate at 5 σ changes the maps by
+    millimetres.
 
     Source: Leung, Halpern, Barfoot, Liu, International Journal of Robotics Research 30(8), 2011.
 
     Args:
         folder: where the files of one data set are.
         robot: number of the robot, 1 to 5.
-        calibration: corrects odometry and ranges, and gives the noise. Default: as recorded.
+        calibration: the systematic errors of odometry and ranges, and the noise. Default: none, and
+            a noise for both together.
         errata: exchange the positions of subjects 11 and 17 if they are those of data set 1, see
             `mrclam_robot.EXCHANGED`; noted in `Dataset.corrections`.
     Raises:
@@ -98,120 +98,22 @@ def mrclam(
     time = np.unique(np.concatenate([lines.odometry[:, 0], lines.seen[:, 0]]))
     row, tag, kept, dropped = associated(lines.seen, time, subject_of, names)
     motion, sensor = models_of(calibration)
+    log = log_of(lines.odometry, time, row, tag, lines.seen[kept, 2:])
     return Dataset(
         name=f"mrclam robot {robot}",
-        log=log_of(lines.odometry, time, row, tag, lines.seen[kept, 2:]),
+        log=log,
         time=time,
         motion=motion,
         sensor=sensor,
         tags=names,
         filter_options={"correction": "sequential"},
         landmarks=points,
+        adjustable=None if calibration is None else adjustable(calibration, log, time),
         dropped=dropped,
         corrections=(*corrections, *lines.corrections),
         source=SOURCE,
         **true_fields([lines], time),
     )
-
-
-MRCLAM_FITTED = ("forward", "outer", "turn", "curvature", "ahead", "yaw", "axis")
-"""The fields of a `RobotCalibration` that a log determines; `depth` only in ratio to `forward`."""
-
-
-class FittedCalibration(NamedTuple):
-    """The calibration of a robot from its log, and the fit.
-
-    `at(p, scale=1.0)` returns the log and the models (`Log`, `Motion`, `Sensor`) with other
-    constants p (7,), in the order of `MRCLAM_FITTED`; ranges and travel, whose common scale no
-    log determines, are multiplied by a scale. p and the scale may be traced:
-
-        def poses(p):
-            log, motion, sensor = fitted.at(p[:-1], scale=1 + p[-1])
-            filter = EkfSlam(motion, sensor, data.capacity, **data.filter_options)
-            return run(filter, log, data.pose, data.pose_cov, key).estimate.pose
-
-        p = [*fitted.found.parameters, 0.0]
-        added = calibration.consider_cov(poses, p, block_diag(fitted.found.cov, 0.02**2))
-    """
-
-    robot: RobotCalibration
-    found: Calibration
-    """of `MRCLAM_FITTED`, in that order"""
-    at: Callable[..., tuple[Log, Motion, Sensor]]
-    """(p (7,), scale=1.0) -> log, motion, sensor"""
-
-
-def mrclam_calibration(
-    folder: str | Path,
-    robot: int = 1,
-    *,
-    known: RobotCalibration = MRCLAM_CALIBRATION,
-    errata: bool = True,
-) -> FittedCalibration:
-    """The systematic errors of a robot that minimize the innovations of its log.
-
-    `calibration.calibrate` on the innovations of the right-invariant EKF with a gate at 5 σ: wheels
-    (`forward`, `outer`, `turn`, `curvature`), place and yaw of the camera (`ahead`, `yaw`), and its
-    optical axis (`axis`). Neither the true path nor the survey is used, though `mrclam` cuts lines
-    (0, 0) after the end of a true path. Delay, noise and `depth` are those of `known`:
-    proportionally larger ranges and odometry give the same log of a larger world, so `depth` sets
-    the scale of the map.
-
-        fitted = mrclam_calibration(folder, 5)
-        data = mrclam(folder, 5, calibration=fitted.robot)
-
-    Args:
-        folder, robot, errata: as for `mrclam`.
-        known: the start of the search, and the constants that are held.
-    Raises:
-        ValueError: as `mrclam` and `calibrate` do.
-    """
-    check_calibration("mrclam_calibration", known)
-    data = mrclam(
-        folder,
-        robot,
-        calibration=known._replace(
-            forward=1.0, outer=0.0, turn=1.0, curvature=0.0, depth=1.0, axis=0.0
-        ),
-        errata=errata,
-    )
-    bearing = np.asarray(data.log.scan.z[..., 1])
-    depth = np.asarray(data.log.scan.z[..., 0]) * np.cos(bearing)
-
-    def at(p: jax.Array, scale: jax.Array | float = 1.0) -> tuple[Log, Motion, Sensor]:
-        if np.shape(p) != (len(MRCLAM_FITTED),) or (is_concrete(scale) and not float(scale) > 0):
-            raise ValueError(
-                f"FittedCalibration.at: expected constants of shape {(len(MRCLAM_FITTED),)} and a "
-                f"scale above 0, got {np.shape(p)} and {scale}"
-            )
-        traced = cast("dict[str, float]", dict(zip(MRCLAM_FITTED, p, strict=True)))
-        errors = known._replace(**traced)
-        v, omega, dt = jnp.asarray(data.log.control).T
-        forward, turn = errors.velocities(v, omega)
-        phi = jnp.asarray(bearing)
-        z = jnp.stack([scale * errors.range(jnp.asarray(depth), phi), phi], axis=-1)
-        log = data.log._replace(
-            control=jnp.stack([scale * forward, turn, dt], axis=-1),
-            scan=data.log.scan._replace(z=z),
-        )
-        ahead = scale * errors.ahead
-        mount = jnp.stack([ahead, 0.0 * ahead, errors.yaw])
-        return (
-            log,
-            Unicycle(errors.odometry_cov()),
-            RangeBearing(errors.measurement_cov(), mount=mount),
-        )
-
-    def info(p: jax.Array) -> Info:
-        log, motion, sensor = at(p)
-        more: EkfOptions = {"gate": sigma_gate(5.0), "chart": RightInvariant()}
-        options = data.filter_options | more
-        filter = EkfSlam(motion, sensor, data.capacity, **options)
-        return run(filter, log, jnp.zeros(3), jnp.zeros((3, 3)), jax.random.key(0)).info
-
-    found = calibrate(info, [getattr(known, name) for name in MRCLAM_FITTED])
-    values = dict(zip(MRCLAM_FITTED, found.parameters.tolist(), strict=True))
-    return FittedCalibration(known._replace(**values), found, at)
 
 
 def mrclam_team(
@@ -269,7 +171,7 @@ def mrclam_team(
     models = {one: models_of(one) for one in set(each)}
     sights = {one: eye for one, (_, eye) in models.items()}
     if sighting_cov is not None:
-        sights = {one: replace(eye, noise_cov=sighting_cov) for one, eye in sights.items()}
+        sights = {one: _with_noise(eye, sighting_cov) for one, eye in sights.items()}
     for robot, lines, constants in zip(numbers, files, each, strict=True):
         (model, eye), sight = models[constants], sights[constants]
         row, tag, kept, lost = associated(lines.seen, time, subject_of, names + numbers)
@@ -313,3 +215,10 @@ def mrclam_team(
         robots=tuple(team),
         **true_fields(files, time),
     )
+
+
+def _with_noise(sensor: Sensor, noise_cov: NoiseCov) -> Sensor:
+    """A camera with another noise, below its systematic errors if it has them."""
+    if isinstance(sensor, Corrected):
+        return replace(sensor, sensor=replace(sensor.sensor, noise_cov=noise_cov))
+    return replace(sensor, noise_cov=noise_cov)

@@ -2,19 +2,24 @@
 
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, TypeVar
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike
 
+from jaxslam import motion, sensors
+from jaxslam.calibration.delay import delayed
 from jaxslam.core.logs.streams import hold, interpolate_poses
-from jaxslam.core.noise import NoiseCov
+from jaxslam.core.numbers import is_concrete
+from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import Log
+from jaxslam.datasets.dataset import Adjustable, Parameter
 from jaxslam.datasets.lines import TextFile, stored
-from jaxslam.motion import Unicycle
-from jaxslam.sensors import RangeBearing
+from jaxslam.motion import Unicycle, WhiteNoise
+from jaxslam.sensors import RangeBearing, RangeBearingNoise
 
 ROBOTS = range(1, 6)
 """Subjects 1 to 5 are the robots; they carry barcodes like the landmarks, 6 to 20."""
@@ -111,29 +116,14 @@ def _read_survey(file: TextFile, names: tuple[int, ...]) -> dict[int, list[float
     return points
 
 
-Numbers = TypeVar("Numbers", np.ndarray, jax.Array)
-
-
 class RobotCalibration(NamedTuple):
     """The systematic errors of a robot's odometry and camera, and the noise that remains.
 
-    A recorded velocity (v, ω) at time t moves the robot at time t + delay, by
-
-        v' = forward v - outer |ω|,    ω' = turn ω + curvature v
-
-    since v is close to the speed of the outer wheel, half a track `outer` from the centre, and
-    wheels of unequal size bend the path of a robot that drives straight ahead (Borenstein & Feng
-    1996). The camera is at (ahead, 0, yaw) on the robot. Its range r is `depth` times the depth
-    along the optical axis, as the height of a barcode in the image gives it. That axis has the
-    bearing `axis`, so that with the recorded bearing φ the range is
-
-        r' = r / (depth cos(φ - axis))
-
-    Arrays and fields may be NumPy's or traced.
-
-    White noise per second has the variance forward_noise² of travel and turn_noise² +
-    (turn_share ω')² of heading. The range has the standard deviation range_share r', the bearing
-    bearing_noise.
+    A recorded velocity at time t moves the robot at time t + delay, with the errors of
+    `motion.Corrected`. The camera is at (ahead, 0, yaw) on the robot. What it records as the range
+    is `depth` times the depth along the optical axis, which has the bearing `axis`
+    (`sensors.Corrected`), as the height of a barcode in the image gives it. Noise is that of
+    `motion.WhiteNoise` and `sensors.RangeBearingNoise`. Fields may be traced.
     """
 
     delay: float
@@ -161,56 +151,60 @@ class RobotCalibration(NamedTuple):
     bearing_noise: float
     """[rad]"""
 
-    def odometry(self, recorded: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K 3"]:
-        """The lines (t, v, ω) corrected, at the times when the robot moves."""
-        t, v, omega = recorded.T
-        return np.column_stack([t + self.delay, *self.velocities(v, omega)])
-
-    def velocities(self, v: Numbers, omega: Numbers) -> tuple[Numbers, Numbers]:
-        """The calibrated velocities (v', ω') of recorded ones."""
-        return self.forward * v - self.outer * abs(omega), self.turn * omega + self.curvature * v
-
-    def range(self, recorded: Numbers, bearing: Numbers) -> Numbers:
-        """The calibrated range r' of a recorded range and bearing."""
-        cos = jnp.cos if isinstance(bearing, jax.Array) else np.cos
-        return recorded / (self.depth * cos(bearing - self.axis))
-
-    def measurements(self, recorded: Float[np.ndarray, "J 4"]) -> Float[np.ndarray, "J 4"]:
-        """The lines (t, barcode, range, bearing) with ranges corrected.
-
-        Raises ValueError on a bearing beyond a right angle, behind the image plane.
-        """
-        beyond = np.abs(recorded[:, 3] - self.axis) >= np.pi / 2
-        if beyond.any():
-            bearing = recorded[beyond, 3][0]
-            raise ValueError(f"Calibration: expected bearings below π/2, got {bearing}")
-        corrected = recorded.copy()
-        corrected[:, 2] = self.range(recorded[:, 2], recorded[:, 3])
-        return corrected
+    @property
+    def motion(self) -> Motion:
+        """The motion of the robot by its recorded velocities."""
+        noise = WhiteNoise(self.forward_noise, self.turn_noise, self.turn_share)
+        scale, wheels = _stacked(self.forward, self.turn), _stacked(self.outer, self.curvature)
+        return motion.Corrected(Unicycle(noise), scale, wheels)
 
     @property
-    def mount(self) -> Float[np.ndarray, "3"]:
-        """The pose of the camera on the robot."""
-        return np.array([self.ahead, 0.0, self.yaw])
+    def sensor(self) -> Sensor:
+        """The camera, with its recorded measurements."""
+        noise = RangeBearingNoise(0.0, self.bearing_noise, share=self.range_share)
+        mount = _stacked(self.ahead, 0.0, self.yaw)
+        line = _stacked(self.depth, 0.0)
+        return sensors.Corrected(RangeBearing(noise, mount=mount), line, self.axis)
 
-    def odometry_cov(self) -> NoiseCov:
-        """The covariance (2, 2) of (v', ω') over an interval Δt, a function of (pose, u)."""
 
-        def noise_cov(pose: jax.Array, u: jax.Array) -> jax.Array:
-            by_turn = (self.turn_share * u[1]) ** 2
-            forward = self.forward_noise**2 + 0 * by_turn
-            return per_interval(jnp.stack([forward, self.turn_noise**2 + by_turn]), u[2])
+def _stacked(*numbers: float) -> ArrayLike:
+    """Numbers as a vector: NumPy's, unless one is traced."""
+    return (
+        np.array(numbers)
+        if all(map(is_concrete, numbers))
+        else jnp.stack([*map(jnp.asarray, numbers)])
+    )
 
-        return noise_cov
 
-    def measurement_cov(self) -> NoiseCov:
-        """The covariance (2, 2) of (r', φ), a function of z."""
+GROUPS = {
+    "delay": "delay",
+    "forward": "scale",
+    "turn": "scale",
+    "outer": "wheels",
+    "curvature": "wheels",
+    "depth": "range",
+    "ahead": "mount",
+    "yaw": "mount",
+    "axis": "axis",
+}
+"""What a field is for `fit`; others are noises."""
 
-        def noise_cov(z: jax.Array) -> jax.Array:
-            share = self.range_share * z[0]
-            return jnp.diag(jnp.stack([share, self.bearing_noise + 0 * share]) ** 2)
 
-        return noise_cov
+def adjustable(calibration: RobotCalibration, log: Log, time: Float[np.ndarray, "T"]) -> Adjustable:
+    """Log and models as functions of the fields of a calibration, in their order."""
+    controls = calibration.motion.controls
+    parameters = tuple(
+        Parameter(field, float(value), GROUPS.get(field, "noise"), ("calibration", field))
+        for field, value in calibration._asdict().items()
+    )
+
+    def at(p: jax.Array) -> tuple[Log, Motion, Sensor]:
+        found = RobotCalibration(*p)
+        # Odometry is moved by the delay of the reader; what is left is of measurements before it.
+        moved = delayed(log, time, controls, found.delay - calibration.delay)
+        return moved, found.motion, found.sensor
+
+    return Adjustable(parameters, at)
 
 
 MRCLAM_CALIBRATION = RobotCalibration(
@@ -231,8 +225,8 @@ MRCLAM_CALIBRATION = RobotCalibration(
 )
 """Fitted on the true path of robot 1 of data set 6 (`python -m benchmarks --only mrclam_fit`).
 
-The yaw and the axis of the camera are left at zero, since they differ from robot to robot;
-`mrclam_calibration` finds them from the log of a robot.
+The yaw and the axis of the camera are left at zero, since they differ from robot to robot; `fit`
+finds them from the log of a robot.
 
 The ranges of that robot deviate from the survey by 0.12 m as recorded, by a function of the
 bearing, and by 1 % of the range once corrected. Persistent errors are included: the noise of
@@ -258,12 +252,6 @@ def check_calibration(name: str, calibration: object) -> None:
             raise ValueError(
                 f"{name}: expected the {field} of a calibration to be {wanted}, got {value!r}"
             )
-
-
-def per_interval(density: jax.Array, dt: jax.Array) -> jax.Array:
-    """The diagonal covariance density/Δt of velocities over Δt, zero where Δt = 0."""
-    moving = dt > 0
-    return jnp.diag(density) * jnp.where(moving, 1 / jnp.where(moving, dt, 1.0), 0.0)
 
 
 MAX_TRUTH_GAP = 0.2
@@ -306,14 +294,14 @@ SOURCE = (
     "K. Y. K. Leung, Y. Halpern, T. D. Barfoot, H. H. T. Liu, The UTIAS multi-robot cooperative "
     "localization and mapping dataset, International Journal of Robotics Research 30(8), 2011"
 )
-ODOMETRY_DENSITY = (0.01**2, 0.05**2)
-"""Variance of travel [m²/s] and heading [rad²/s] per second."""
+ODOMETRY_NOISE = (0.01, 0.05)
+"""Standard deviations of travel [m/√s] and heading [rad/√s]."""
 MEASUREMENT_COV = np.diag([0.15, 0.01]) ** 2
 DROP_REASONS = ("robot sightings", "unknown barcodes", "repeated in a scan")
 
 
 class Recorded(NamedTuple):
-    """The content of the files of a robot, corrected if a calibration is given."""
+    """The content of the files of a robot, its odometry delayed if a calibration is given."""
 
     odometry: Float[np.ndarray, "K 3"]
     seen: Float[np.ndarray, "J 4"]
@@ -322,7 +310,11 @@ class Recorded(NamedTuple):
 
 
 def read_lines(folder: Path, robot: int, calibration: RobotCalibration | None) -> Recorded:
-    """The lines of a robot, corrected, with its true path and descriptions of the corrections."""
+    """The lines of a robot, its true path, and descriptions of the corrections.
+
+    With a calibration, odometry is at the times when the robot moves. Raises ValueError on a
+    bearing beyond a right angle, behind the image plane of a calibrated camera.
+    """
     odometry, seen = read_robot(folder, robot)
     truth, corrections = read_truth(folder, robot), []
     if truth is not None:
@@ -332,16 +324,19 @@ def read_lines(folder: Path, robot: int, calibration: RobotCalibration | None) -
                 f"{cut:,} odometry lines (0, 0) of robot {robot} after its true path were left out"
             )
     if calibration is not None:
-        odometry, seen = calibration.odometry(odometry), calibration.measurements(seen)
+        odometry[:, 0] += calibration.delay
+        beyond = np.abs(seen[:, 3] - calibration.axis) >= np.pi / 2
+        if beyond.any():
+            bearing = seen[beyond, 3][0]
+            raise ValueError(f"Calibration: expected bearings below π/2, got {bearing}")
     return Recorded(odometry, seen, truth, tuple(corrections))
 
 
-def models_of(calibration: RobotCalibration | None) -> tuple[Unicycle, RangeBearing]:
+def models_of(calibration: RobotCalibration | None) -> tuple[Motion, Sensor]:
     """The motion model and the sensor of a robot, calibrated or as recorded."""
     if calibration is None:
-        return Unicycle(white_noise(*ODOMETRY_DENSITY)), RangeBearing(MEASUREMENT_COV)
-    sensor = RangeBearing(calibration.measurement_cov(), mount=calibration.mount)
-    return Unicycle(calibration.odometry_cov()), sensor
+        return Unicycle(WhiteNoise(*ODOMETRY_NOISE)), RangeBearing(MEASUREMENT_COV)
+    return calibration.motion, calibration.sensor
 
 
 def true_fields(files: Sequence[Recorded], time: Float[np.ndarray, "T"]) -> dict[str, Any]:
@@ -357,19 +352,6 @@ def true_fields(files: Sequence[Recorded], time: Float[np.ndarray, "T"]) -> dict
     if known[0]:
         found |= {"pose": paths[0], "pose_cov": START_COV, "one_frame": True}
     return found
-
-
-def white_noise(v: float, omega: float) -> NoiseCov:
-    """White noise of (v, ω) with covariance density/Δt, so that time steps can be divided.
-
-    v [m²/s], omega [rad²/s]: the variance of travel and heading per second. Where Δt = 0 it is 0.
-    """
-
-    def noise_cov(pose: jax.Array, u: jax.Array) -> jax.Array:
-        density = jnp.stack([jnp.asarray(v, u.dtype), jnp.asarray(omega, u.dtype)])
-        return per_interval(density, u[2])
-
-    return noise_cov
 
 
 def log_of(

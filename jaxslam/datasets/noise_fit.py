@@ -1,4 +1,4 @@
-"""The noises of a data set by maximum likelihood, from its log."""
+"""Noises and systematic errors of a data set by maximum likelihood, from its log."""
 
 from collections.abc import Iterable
 from typing import NamedTuple
@@ -6,13 +6,14 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Float
 
 from jaxslam.association.rules import Known
 from jaxslam.calibration import NoiseFit, as_associated, fit_noise
-from jaxslam.core.logs.tables import POSE, split_unit
-from jaxslam.core.protocols import Filter
-from jaxslam.core.types import Info, JaxOrNumPy, Log, Status
-from jaxslam.datasets.dataset import Adjustable, Dataset
+from jaxslam.charts import RightInvariant
+from jaxslam.core.logs.tables import split_unit
+from jaxslam.core.types import Info, Scan, Status
+from jaxslam.datasets.dataset import Dataset, Parameter
 from jaxslam.driver import run
 from jaxslam.filters.ekf.ekf_settings import EkfOptions
 from jaxslam.filters.ekf.ekf_slam import EkfSlam
@@ -20,12 +21,14 @@ from jaxslam.math.stats import normal_quantile
 
 
 class DatasetFit(NamedTuple):
-    """The noises that `fit` found for a data set."""
+    """The parameters that `fit` found for a data set."""
 
     found: NoiseFit
-    deviations: tuple[float, ...]
+    parameters: tuple[Parameter, ...]
     """all of them, fitted and held, in the order of `Dataset.adjustable`"""
-    mount: tuple[float, ...] | None
+    cov: Float[np.ndarray, "P P"]
+    """of the fitted systematic errors among them, and of held ones as known beforehand; 0 of
+    noises, and of those that the log does not determine"""
     held: dict[str, float]
     """the parameters that were not fitted, by name, with their values"""
     used: int
@@ -35,84 +38,110 @@ class DatasetFit(NamedTuple):
     rounds: int
     """how often the filter decided what to use"""
     settled: bool
-    """whether it decides with the noises found as it did before"""
+    """whether it decides with the parameters found as it did before"""
     autocorrelation: tuple[float, float]
     """of successive whitened innovations of a landmark, and the half width of its 95 % band about
     0; NaN if none is seen twice. Outside of it errors persist, and standard errors are too small"""
+
+    @property
+    def values(self) -> Float[np.ndarray, "P"]:
+        """The numbers of all parameters."""
+        return np.array([parameter.value for parameter in self.parameters])
 
 
 _ROUNDS = 5
 """Largest number of rounds of association and fit."""
 
 
-def fit(data: Dataset, *, mount: bool = False, fixed: Iterable[str] = ()) -> DatasetFit:
-    """The standard deviations of the noises of a data set that maximize the likelihood of its log.
+def fit(
+    data: Dataset,
+    *,
+    calibrate: Iterable[str] = (),
+    fixed: Iterable[str] = (),
+    options: EkfOptions | None = None,
+) -> DatasetFit:
+    """Noises and systematic errors of a data set that maximize the likelihood of its log.
 
     EKF-SLAM with the options of the data set runs over the log to associate and gate its
     measurements. With these decisions fixed, `calibration.fit_noise` maximizes the likelihood of
     the used measurements. Both are repeated, up to 5 times, until the decisions do not
     change; with known tags and without a gate that is after one round. A gate also cuts the tail of
     good measurements, so the noises come out a little too small: use a gate of 0.999 or more, or
-    none.
+    none. Of point landmarks the error coordinates are right-invariant, unless the options say
+    others: the plain EKF gains heading that nothing measured, and fits its noise to it.
 
     Truth and survey are not used, except for the pose at the start. A deviation of 0 is held.
 
     Args:
-        data: with `Dataset.adjustable`, as from `table`.
-        mount: whether the pose of the sensor on the robot is fitted, too.
-        fixed: names of parameters to hold, as "motion v" or "mount y".
+        data: with `Dataset.adjustable`, as from `table` or `mrclam`.
+        calibrate: groups of systematic errors to fit besides the noises: of a table "mount",
+            "scale", "wheels", "heading", "range", "axis", "delay".
+        fixed: names of parameters to hold, as "motion v" or "mount y", or groups, as "noise".
+        options: of `EkfSlam`, in place of those of the data set, as {"gate": None}.
     Raises:
-        ValueError: on a data set with fixed noises, a sensor without a mount, an unknown name,
-            nothing to fit, and as `fit_noise` does.
+        ValueError: on a data set with fixed noises, an unknown name or group, nothing to fit, and
+            as `fit_noise` does.
     """
     models = data.adjustable
     if models is None:
         raise ValueError(f"fit: expected a data set with adjustable noises, got {data.name}")
-    names, values, free = _parameters(models, mount, tuple(fixed))
-    count, key = len(models.deviations), jax.random.key(0)
-    decided = data.filter_options | {"gate": None, "associate": Known()}
+    free = _free(models.parameters, tuple(calibrate), tuple(fixed))
+    start, key = models.values, jax.random.key(0)
+    names = [parameter.name for parameter in models.parameters]
+    noise = np.array([parameter.group == "noise" for parameter in models.parameters])
+    chart: EkfOptions = {"chart": RightInvariant()} if data.sensor.of_points else {}
+    chosen = chart | data.filter_options | (options or {})
+    decided = chosen | {"gate": None, "associate": Known()}
 
-    def filter(parameters: JaxOrNumPy, options: EkfOptions) -> Filter:
-        fitted = mount and models.mount is not None
-        place = parameters[count:] if fitted else models.mount
-        motion, sensor = models.models(parameters[:count], place)
-        return EkfSlam(motion, sensor, data.capacity, **options)
+    def run_with(parameters: jax.Array, options: EkfOptions, scan: Scan) -> Info:
+        log, motion, sensor = models.at(parameters)
+        method = EkfSlam(motion, sensor, data.capacity, **options)
+        return run(method, log._replace(scan=scan), data.pose, data.pose_cov, key).info
 
-    def info(p: jax.Array, log: Log) -> Info:
-        parameters = jnp.asarray(values, p.dtype).at[free].set(p)
-        return run(filter(parameters, decided), log, data.pose, data.pose_cov, key).info
+    def info(p: jax.Array, scan: Scan) -> Info:
+        return run_with(jnp.asarray(start, p.dtype).at[free].set(p), decided, scan)
 
     def decide(parameters: np.ndarray) -> Info:
-        method = filter(parameters, data.filter_options)
-        found: Info = jax.device_get(run(method, data.log, data.pose, data.pose_cov, key).info)
+        # In the precision of the log, whatever that of the parameters.
+        held = jnp.asarray(parameters, jnp.asarray(data.log.control).dtype)
+        found: Info = jax.device_get(run_with(held, chosen, data.log.scan))
         return found
 
-    parameters, logged = np.array(values), np.arange(len(values)) < count
+    parameters = start.copy()
     info_of_log = decide(parameters)
     settled, taken = False, 0
     while taken < _ROUNDS and not settled:
         taken += 1
-        log = as_associated(data.log, info_of_log)
+        scan = as_associated(data.log, info_of_log).scan
         found = fit_noise(
             info,
-            values[free],
-            log,
+            start[free],
+            scan,
             names=[names[i] for i in free],
-            deviation=logged[free].tolist(),
+            deviation=noise[free].tolist(),
             guess=parameters[free],
         )
         parameters[free] = found.parameters
         info_of_log = decide(parameters)
-        settled = _same(log, as_associated(data.log, info_of_log))
+        settled = _same(scan, as_associated(data.log, info_of_log).scan)
     outcome = {s.name.lower(): int((np.asarray(info_of_log.status) == s).sum()) for s in Status}
     kept = ("empty", "fused", "born")
+    fitted = np.isin(np.arange(len(start)), free)
+    before = np.zeros((len(start), len(start))) if models.cov is None else models.cov
+    cov = np.where(fitted | fitted[:, None], 0.0, before)
+    cov[np.ix_(free, free)] = found.cov
+    known = ~noise & np.isfinite(np.diag(cov))
     return DatasetFit(
         found=found,
-        deviations=tuple(parameters[:count].tolist()),
-        mount=tuple(parameters[count:].tolist()) if mount else models.mount,
+        parameters=tuple(
+            parameter._replace(value=float(value))
+            for parameter, value in zip(models.parameters, parameters, strict=True)
+        ),
+        cov=np.where(np.outer(known, known), cov, 0.0),
         held={
-            names[i]: float(values[i])
-            for i in np.flatnonzero(~np.isin(np.arange(len(values)), free))
+            names[i]: float(start[i])
+            for i in np.flatnonzero(~fitted)
+            if noise[i] or models.parameters[i].group in calibrate
         },
         used=outcome["fused"] + outcome["born"],
         left_out={name: n for name, n in outcome.items() if n and name not in kept},
@@ -143,31 +172,34 @@ def autocorrelation(info: Info) -> tuple[float, float]:
     return float(found), normal_quantile(0.975) / float(np.sqrt(one.size))
 
 
-def _parameters(
-    models: Adjustable, mount: bool, fixed: tuple[str, ...]
-) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
-    """The names and values of all parameters, and the indices of those to fit."""
-    names, values = models.names, models.deviations
-    if mount:
-        if models.mount is None:
-            raise ValueError("fit: expected a sensor with a mount, got one without")
-        names += tuple(f"mount {name}" for name in POSE)
-        values += models.mount
-    plain = [split_unit(name)[0] for name in names]
+def _free(
+    parameters: tuple[Parameter, ...], calibrate: tuple[str, ...], fixed: tuple[str, ...]
+) -> np.ndarray:
+    """The indices of the parameters to fit."""
+    groups = [parameter.group for parameter in parameters]
+    plain = [split_unit(parameter.name)[0] for parameter in parameters]
+    errors = dict.fromkeys(group for group in groups if group != "noise")
+    for group in calibrate:
+        if group not in errors:
+            raise ValueError(
+                f"fit: expected calibrate to be some of {', '.join(errors) or 'nothing'}, which "
+                f"this data set can adjust, got {group!r}"
+            )
     held = {split_unit(name)[0] for name in fixed}
-    for name in held - set(plain):
-        raise ValueError(f"fit: expected fixed parameters of {', '.join(plain)}, got {name!r}")
+    known = dict.fromkeys([*plain, *groups])
+    for name in sorted(held - set(known)):
+        raise ValueError(f"fit: expected fixed parameters of {', '.join(known)}, got {name!r}")
     free = [
         i
-        for i, name in enumerate(plain)
-        if name not in held and (i >= len(models.deviations) or values[i] > 0)
+        for i, (name, group) in enumerate(zip(plain, groups, strict=True))
+        if not held & {name, group}
+        and (group in calibrate or (group == "noise" and parameters[i].value > 0))
     ]
     if not free:
         raise ValueError("fit: expected a parameter to fit, got all held")
-    return names, np.array(values), np.array(free)
+    return np.array(free)
 
 
-def _same(one: Log, other: Log) -> bool:
+def _same(a: Scan, b: Scan) -> bool:
     """Whether two logs use the same measurements for the same landmarks."""
-    a, b = one.scan, other.scan
     return np.array_equal(a.tag, b.tag) and np.array_equal(a.valid, b.valid)

@@ -6,14 +6,16 @@ import math
 from collections.abc import Sequence
 from pathlib import Path
 
+import jax
 import numpy as np
 
+from jaxslam.calibration.delay import delayed
 from jaxslam.core.logs import tables
 from jaxslam.core.logs.streams import interpolate_poses
 from jaxslam.core.logs.tables import POSE, TAG, TIME, UNITS, Columns, split_unit, unit_divisor
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import Log
-from jaxslam.datasets.dataset import Adjustable, Dataset
+from jaxslam.datasets.dataset import Adjustable, Dataset, Parameter
 from jaxslam.datasets.lines import read_bytes, stored
 from jaxslam.datasets.table_settings import Parametric, TableSettings
 
@@ -163,9 +165,11 @@ ODOMETRY, MEASUREMENTS = "odometry.csv", "measurements.csv"
 
 _GAP_FACTOR = 10
 """Intervals of odometry above this multiple of the median are noted."""
+_LARGEST = 0.01
+"""Share of ranges that equal the largest, above which they are noted."""
 
 
-def table(folder: str | Path) -> Dataset:
+def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
     """The data set in the CSV files of a folder.
 
     `odometry.csv` has the columns `t [s]` and the controls of a motion model without Δt, as
@@ -181,6 +185,8 @@ def table(folder: str | Path) -> Dataset:
         model = "range_bearing"
         noise = [0.05, 0.02]
         mount = [0.1, 0.0, 0.0]     # and further arguments of the model
+        delay = 0.05                # of measurements after odometry
+        max_range = 5.6             # from which on a range says nothing
         [filter]
         gate = 0.999                # probability
         start = [0.0, 0.0, 0.0]     # in the frame of truth and landmarks
@@ -188,8 +194,12 @@ def table(folder: str | Path) -> Dataset:
         capacity = 50
         associate = "nearest"
         update = "sequential"
+        spacing = 3.0               # least time between used measurements of a landmark
 
-    Missing settings have defaults, listed in `Dataset.assumed`. The log is `Log.from_records`. The
+    Systematic errors are keys of [motion], `scale`, `wheels` and `heading` of `motion.Corrected`,
+    and of [sensor], `range` and `axis` of `sensors.Corrected` and `across` of
+    `sensors.RangeBearingNoise`. [calibration] has the covariance in which they are known. Missing
+    settings have defaults, listed in `Dataset.assumed`. The log is `Log.from_records`. The
     noise of the motion is that of a line of odometry; a row that is shorter or longer has white
     noise of the same density. The start is that of the truth if it covers the first row; then all
     is in one frame. Other columns are not used, and listed. A CSV file may be packed by gzip, as
@@ -197,6 +207,7 @@ def table(folder: str | Path) -> Dataset:
 
     Args:
         folder: the folder of the files.
+        fitted: whether numbers of `fit.toml`, if there is one, replace those of `dataset.toml`.
     Raises:
         ValueError: `path:line: column: what was expected` on a header without a column or a unit, a
             cell that is not a finite number, a tag that is not a whole number, times that go back
@@ -213,18 +224,20 @@ def table(folder: str | Path) -> Dataset:
                 f"{folder}: expected a file {name}, with columns '{TIME}' and the {columns}, as "
                 "docs/guide/own_data.md shows"
             )
-    settings = TableSettings(folder / "dataset.toml")
+    settings = TableSettings(folder / "dataset.toml", fitted)
     odometry_file = CsvTable(folder / ODOMETRY)
     seen_file = CsvTable(folder / MEASUREMENTS)
     clock = odometry_file.table((TIME,), "the time").columns[TIME]
     interval = float(np.median(np.diff(clock))) if len(clock) > 1 else 1.0
     by_motion = settings.motion(odometry_file.header, abs(interval) or 1.0)
     by_sensor = settings.sensor(seen_file.header)
-    motion, sensor = by_motion.made(), by_sensor.made()
+    motion, sensor, delay = by_motion.made, by_sensor.made, settings.delay()
     moved = (TIME, *tables.odometry_columns(motion.controls, odometry_file.header))
     measured = tables.measurement_columns(sensor.measurements, sensor.landmark)
     odometry = odometry_file.table(moved, f"of the motion model {motion.name}")
     seen = seen_file.table(measured, f"of the sensor {sensor.name}")
+    seen.columns[TIME] = seen.columns[TIME] - delay
+    max_range, spacing = settings.max_range(), settings.spacing()
     notes = [
         f"column {column!r} of {file.path.name} is not used"
         for file, wanted in ((odometry_file, moved), (seen_file, measured))
@@ -236,9 +249,20 @@ def table(folder: str | Path) -> Dataset:
             f"{odometry.at(k + 1, TIME)}: {gaps[k]:.6g} s since the line before, the median is "
             f"{np.median(gaps):.6g} s; the odometry is taken to hold over it"
         )
+    if "range [m]" in seen.columns and not np.isfinite(max_range):
+        ranges = seen.columns["range [m]"]
+        largest = int((ranges == ranges.max()).sum())
+        if largest > max(10, _LARGEST * len(ranges)):
+            notes.append(
+                f"{largest:,} ranges are {ranges.max():.6g} m, the largest: if the sensor writes "
+                "it where it met nothing, set [sensor] max_range"
+            )
     survey = _survey(folder / "landmarks.csv")
     rows, tags, dropped = tables.align_tables(
-        odometry, [tables.Seen(seen, sensor.measurements)], motion.controls, tuple(survey or ())
+        odometry,
+        [tables.Seen(seen, sensor.measurements, max_range=max_range, spacing=spacing)],
+        motion.controls,
+        tuple(survey or ()),
     )
     known = tags if survey is None else survey
     for row, tag in enumerate(seen.tags or ()):
@@ -253,9 +277,11 @@ def table(folder: str | Path) -> Dataset:
         notes.append(f"[filter] start = {shown}" + ", the truth at the first row" * one_frame)
     unknown = None in (seen.tags or ())
     capacity = settings.capacity(len(tags), unknown)
+    log = Log.from_rows(rows)
+    adjustable = _adjustable(log, rows.time, by_motion, by_sensor, delay)
     return Dataset(
         name=settings.text("name", folder.resolve().name),
-        log=Log.from_rows(rows),
+        log=log,
         time=rows.time,
         motion=motion,
         sensor=sensor,
@@ -268,26 +294,32 @@ def table(folder: str | Path) -> Dataset:
         true_at=covered,
         one_frame=one_frame,
         slots=capacity,
-        adjustable=_adjustable(by_motion, by_sensor),
+        adjustable=adjustable._replace(cov=settings.uncertain(adjustable.parameters)),
         dropped=dropped,
         assumed=tuple(settings.assumed + notes),
         source=settings.text("source", ""),
     )
 
 
-def _adjustable(motion: Parametric[Motion], sensor: Parametric[Sensor]) -> Adjustable:
-    """Both models as functions of the deviations of both, one after the other."""
-    count = len(motion.names)
-    return Adjustable(
-        names=tuple(f"motion {n}" for n in motion.names)
-        + tuple(f"sensor {n}" for n in sensor.names),
-        deviations=motion.deviations + sensor.deviations,
-        mount=sensor.mount,
-        models=lambda sigma, mount: (
-            motion.make(sigma[:count], None),
-            sensor.make(sigma[count:], mount),
-        ),
-    )
+def _adjustable(
+    log: Log,
+    time: np.ndarray,
+    motion: Parametric[Motion],
+    sensor: Parametric[Sensor],
+    delay: float,
+) -> Adjustable:
+    """Log and models as functions of the parameters of both, and of the delay if there is one."""
+    count, size = len(motion.parameters), len(motion.parameters) + len(sensor.parameters)
+    parameters = motion.parameters + sensor.parameters
+    controls = motion.made.controls
+    if controls[-1:] == (tables.INTERVAL,):
+        parameters += (Parameter("delay [s]", delay, "delay", ("sensor", "delay")),)
+
+    def at(p: jax.Array) -> tuple[Log, Motion, Sensor]:
+        moved = log if p.shape[0] == size else delayed(log, time, controls, p[size] - delay)
+        return moved, motion.make(p[:count]), sensor.make(p[count:size])
+
+    return Adjustable(parameters, at)
 
 
 def _survey(path: Path) -> dict[int, tuple[float, float]] | None:

@@ -10,7 +10,6 @@ from typing import Any, Generic, NamedTuple, NoReturn, TypeVar
 import jax
 import jax.numpy as jnp
 import numpy as np
-from numpy.typing import ArrayLike
 
 from jaxslam import motion, sensors
 from jaxslam.association import (
@@ -21,11 +20,15 @@ from jaxslam.association import (
     Nearest,
 )
 from jaxslam.core.logs.tables import INTERVAL, POSE, odometry_columns, split_unit
+from jaxslam.core.noise import NoiseCov
 from jaxslam.core.protocols import Associate, Motion, Sensor
 from jaxslam.core.record import record, static
 from jaxslam.core.types import JaxOrNumPy
+from jaxslam.datasets.dataset import Parameter
 from jaxslam.filters.ekf.ekf_settings import EkfOptions
 from jaxslam.math import stats
+from jaxslam.motion import odometry_errors
+from jaxslam.sensors import range_errors
 
 _Model = TypeVar("_Model", bound=Motion | Sensor)
 
@@ -34,18 +37,13 @@ _DEFAULT_MODELS = ("unicycle", "pose_increment", "range_bearing")
 
 
 class Parametric(NamedTuple, Generic[_Model]):
-    """A model as a function of its noise deviations and its mount, with those of the file."""
+    """A model as a function of its parameters, and with those of the file."""
 
-    names: tuple[str, ...]
-    deviations: tuple[float, ...]
-    mount: tuple[float, ...] | None
-    """None for a model without one"""
-    make: Callable[[JaxOrNumPy, ArrayLike | None], _Model]
-    """(deviations (W,) an array, mount (3,) or None) -> model"""
-
-    def made(self) -> _Model:
-        """The model with the numbers of the file."""
-        return self.make(np.array(self.deviations), self.mount)
+    parameters: tuple[Parameter, ...]
+    make: Callable[[JaxOrNumPy], _Model]
+    """values, an array -> model"""
+    made: _Model
+    """the model of the file, without the systematic errors that it does not state"""
 
 
 def fitting_model(
@@ -136,19 +134,23 @@ FITTED = "fit.toml"
 """The file of fitted numbers, which replace those of `dataset.toml`."""
 
 
-def fitted_text(
-    numbers: Mapping[str, Mapping[str, Sequence[float]]], comments: Mapping[str, str]
-) -> str:
-    """The text of `FITTED` with numbers by section and key, and comments by "section.key"."""
-    parts = []
-    for section, keys in numbers.items():
-        lines = [
-            f"{key} = [{', '.join(f'{value:.4g}' for value in values)}]"
-            f"  # {comments[f'{section}.{key}']}\n"
-            for key, values in keys.items()
-        ]
-        parts.append(f"[{section}]\n" + "".join(lines))
-    return "\n".join(parts)
+def fitted_text(parameters: Sequence[Parameter], cov: np.ndarray) -> str:
+    """The text of `FITTED`: parameters by section and key, and the covariance of those with one."""
+    places = {parameter.place: None for parameter in parameters}
+    sections: dict[str, list[str]] = {section: [] for section, _ in places}
+    for section, key in places:
+        held = [one for one in parameters if one.place == (section, key)]
+        numbers = ", ".join(f"{one.value:.6g}" for one in held)
+        names = ", ".join(one.name.removeprefix(f"{section} ") for one in held)
+        sections[section].append(f"{key} = [{numbers}]  # {names}\n")
+    known = np.flatnonzero(np.diag(cov))
+    if known.size:
+        names = ", ".join(f'"{parameters[i].name}"' for i in known.tolist())
+        rows = "".join(
+            f"  [{', '.join(f'{value:.9g}' for value in row)}],\n" for row in cov[known][:, known]
+        )
+        sections["calibration"] = [f"parameters = [{names}]\n", f"covariance = [\n{rows}]\n"]
+    return "\n".join(f"[{name}]\n" + "".join(lines) for name, lines in sections.items())
 
 
 def _line_number(text: str, section: str, key: str) -> int | None:
@@ -171,7 +173,16 @@ _MEASUREMENT_NOISE = {"m": 0.1, "rad": 0.05, "1": 1.0}
 """Default standard deviations by unit."""
 ROOM = 100
 """Default number of landmarks, where identities are unknown."""
-_FILTER = ("gate", "capacity", "associate", "update", "start", "start_noise")
+RANGE_BEARING = ("range [m]", "bearing [rad]")
+_FILTER = ("gate", "capacity", "associate", "update", "start", "start_noise", "spacing")
+_ODOMETRY_ERRORS = {
+    "scale": (("travel", "turn"), (1.0, 1.0)),
+    "wheels": (("outer [m]", "curvature [rad/m]"), (0.0, 0.0)),
+    "heading": (("[rad]",), (0.0,)),
+}
+"""Keys of [motion] of `motion.Corrected`: names of their numbers, and those without an error."""
+_RANGE_ERRORS = {"range": (("scale", "offset [m]"), (1.0, 0.0)), "axis": (("[rad]",), (0.0,))}
+"""Keys of [sensor] of `sensors.Corrected`, likewise."""
 
 
 @record
@@ -235,22 +246,23 @@ def _read(path: Path) -> tuple[str, dict[str, Any]]:
 
 
 class TableSettings:
-    """The settings of a folder; `assumed` lists the defaults taken so far.
+    """The settings of a folder, with its fitted numbers if wanted; `assumed` lists the defaults
+    taken so far.
 
     Raises ValueError on a file that is not TOML, and on an unknown section or key.
     """
 
-    def __init__(self, path: Path) -> None:
+    def __init__(self, path: Path, fitted: bool = True) -> None:
         self.path = path
         self.assumed: list[str] = []
         self._text, self.content = _read(path)
         if not path.exists():
             self.assumed.append(f"no {path.name}")
-        fitted = _read(path.with_name(FITTED))[1]
-        for section in fitted.keys() & {"motion", "sensor"}:
-            self.content[section] = self.content.get(section, {}) | fitted[section]
-            self.assumed.append(f"[{section}] {', '.join(fitted[section])} of {FITTED}")
-        known = ("name", "source", "motion", "sensor", "filter")
+        found = _read(path.with_name(FITTED))[1] if fitted else {}
+        for section in sorted(found.keys() & {"motion", "sensor", "calibration"}):
+            self.content[section] = self.content.get(section, {}) | found[section]
+            self.assumed.append(f"[{section}] {', '.join(found[section])} of {FITTED}")
+        known = ("name", "source", "motion", "sensor", "filter", "calibration")
         self._check_keys("", self.content, known)
         for name in known:
             kind = str if name in ("name", "source") else dict
@@ -272,39 +284,122 @@ class TableSettings:
             given: the columns of the odometry.
             interval: the time between its lines [s].
         """
-        factory, options = self._model("motion", motion.REGISTRY, given)
+        factory, options = self._model("motion", motion.REGISTRY, given, (*_ODOMETRY_ERRORS,))
+        errors = {key: options.pop(key) for key in _ODOMETRY_ERRORS if key in options}
         shell = self._built("motion", factory, options, of_no_noise)
         from_poses = odometry_columns(shell.controls, given) == POSE
         with_interval = INTERVAL in shell.controls
+        count, correctable = len(shell.noises), odometry_errors.can_correct(shell)
+        parameters = self._noise("motion", shell.noises, _MOTION_NOISE)
+        parameters += self._errors("motion", _ODOMETRY_ERRORS if correctable else {}, errors)
 
-        def model(deviations: JaxOrNumPy, mount: ArrayLike | None = None) -> Motion:
-            noise = _TableNoise(deviations, interval, from_poses or with_interval, from_poses)
-            plain = self._built("motion", factory, options, noise)
-            return _WithInterval(plain, noise) if from_poses else plain
+        def plain(p: JaxOrNumPy) -> Motion:
+            noise = _TableNoise(p[:count], interval, from_poses or with_interval, from_poses)
+            model = self._built("motion", factory, options, noise)
+            return _WithInterval(model, noise) if from_poses else model
 
-        deviations = self._noise("motion", shell.noises, _MOTION_NOISE)
-        return Parametric(shell.noises, tuple(deviations), None, model)
+        def model(p: JaxOrNumPy) -> Motion:
+            if not correctable:
+                return plain(p)
+            scale, wheels = p[count : count + 2], p[count + 2 : count + 4]
+            return motion.Corrected(plain(p), scale, wheels, p[count + 4])
+
+        make = model if errors else plain
+        return Parametric(parameters, model, make(np.array([one.value for one in parameters])))
 
     def sensor(self, given: Sequence[str]) -> Parametric[Sensor]:
         """The sensor. given: the columns of the measurements."""
-        factory, options = self._model("sensor", sensors.REGISTRY, given)
+        more = (*_RANGE_ERRORS, "across", "delay", "max_range")
+        factory, options = self._model("sensor", sensors.REGISTRY, given, more)
+        errors = {key: options.pop(key) for key in _RANGE_ERRORS if key in options}
+        across = options.pop("across", None)
+        for key in ("delay", "max_range"):  # of the log
+            options.pop(key, None)
         mount, has_mount = None, "mount" in inspect.signature(factory).parameters
         if "mount" in options:
             mount = self._numbers("sensor", "mount", options.pop("mount"), POSE)
-        names = self._built("sensor", factory, options, of_no_noise).measurements
-        deviations = self._noise("sensor", names, _MEASUREMENT_NOISE)
-        if not all(deviations):
+        shell = self._built("sensor", factory, options, of_no_noise)
+        names = shell.measurements
+        parameters = self._noise("sensor", names, _MEASUREMENT_NOISE)
+        if not all(one.value for one in parameters):
             raise ValueError(f"{self._at('sensor', 'noise')}: expected numbers above 0")
-        if has_mount and mount is None:
-            mount = self._default("sensor", "mount", [0.0, 0.0, 0.0])
+        if across is not None:
+            (spread,) = self._numbers("sensor", "across", across, ("[m]",))
+            if names != RANGE_BEARING or spread < 0:
+                raise ValueError(
+                    f"{self._at('sensor', 'across')}: expected a number >= 0, of a sensor of "
+                    f"{' and '.join(RANGE_BEARING)}, got {spread:g} of {', '.join(names)}"
+                )
+            where = "sensor", "across"
+            parameters += (Parameter("sensor across [m]", spread, "noise", where),)
+        at = len(parameters)
+        if has_mount:
+            if mount is None:
+                mount = self._default("sensor", "mount", [0.0, 0.0, 0.0])
+            parameters += tuple(
+                Parameter(f"mount {name}", value, "mount", ("sensor", "mount"))
+                for name, value in zip(POSE, mount, strict=True)
+            )
+        after, correctable = len(parameters), range_errors.can_correct(shell)
+        known = {key: one for key, one in _RANGE_ERRORS.items() if key == "range" or key in errors}
+        parameters += self._errors("sensor", known if correctable else {}, errors)
 
-        def model(deviations: JaxOrNumPy, mount: ArrayLike | None) -> Sensor:
+        def plain(p: JaxOrNumPy) -> Sensor:
             # NumPy for plain numbers, so that nothing is compiled.
-            cov = deviations[:, None] ** 2 * np.eye(len(names))
-            more = options if mount is None else options | {"mount": mount}
-            return self._built("sensor", factory, more, cov)
+            noise: NoiseCov = p[: len(names), None] ** 2 * np.eye(len(names))
+            if across is not None:
+                noise = sensors.RangeBearingNoise(p[0], p[1], across=p[2])
+            more = options | {"mount": p[at : at + 3]} if has_mount else options
+            return self._built("sensor", factory, more, noise)
 
-        return Parametric(names, tuple(deviations), None if mount is None else tuple(mount), model)
+        def model(p: JaxOrNumPy) -> Sensor:
+            if not correctable:
+                return plain(p)
+            axis = p[after + 2] if "axis" in errors else None
+            try:
+                return sensors.Corrected(plain(p), p[after : after + 2], axis)
+            except ValueError as problem:
+                raise ValueError(f"{self.path}: [sensor] {problem}") from problem
+
+        make = model if errors else plain
+        return Parametric(parameters, model, make(np.array([one.value for one in parameters])))
+
+    def delay(self) -> float:
+        """By how much measurements are stamped later than they happened [s]."""
+        return self._number("sensor", "delay", 0.0)
+
+    def max_range(self) -> float:
+        """The range from which on the sensor says nothing [m]."""
+        return self._positive("sensor", "max_range", np.inf)
+
+    def spacing(self) -> float:
+        """The least time between two measurements of a landmark that are used [s]."""
+        return self._positive("filter", "spacing", 0.0)
+
+    def uncertain(self, parameters: tuple[Parameter, ...]) -> np.ndarray | None:
+        """The covariance of the parameters in [calibration] (P, P), 0 of others; None without."""
+        section = self.content.get("calibration")
+        if section is None:
+            return None
+        self._check_keys("calibration", section, ("parameters", "covariance"))
+        names, given = section.get("parameters"), section.get("covariance")
+        known = [parameter.name for parameter in parameters]
+        if not isinstance(names, list) or not names or not set(names) <= set(known):
+            raise ValueError(
+                f"{self._at('calibration', 'parameters')}: expected some of {', '.join(known)}, "
+                f"got {names!r}"
+            )
+        if not isinstance(given, list) or len(given) != len(names):
+            raise ValueError(
+                f"{self._at('calibration', 'covariance')}: expected {len(names)} rows of numbers"
+            )
+        rows = np.array([self._numbers("calibration", "covariance", row, names) for row in given])
+        if not np.allclose(rows, rows.T) or (np.linalg.eigvalsh(rows) < -1e-9 * rows.max()).any():
+            raise ValueError(f"{self._at('calibration', 'covariance')}: expected a covariance")
+        cov = np.zeros((len(known), len(known)))
+        at = [known.index(name) for name in names]
+        cov[np.ix_(at, at)] = rows
+        return cov
 
     def filter_options(self, size: int, unknown: bool) -> EkfOptions:
         """The options of `EkfSlam`. size: of a measurement; unknown: whether tags are unknown."""
@@ -366,9 +461,13 @@ class TableSettings:
         return np.array(self._numbers("filter", key, given, POSE))
 
     def _model(
-        self, section: str, registry: Mapping[str, Callable[..., _Model]], given: Sequence[str]
+        self,
+        section: str,
+        registry: Mapping[str, Callable[..., _Model]],
+        given: Sequence[str],
+        more: tuple[str, ...],
     ) -> tuple[Callable[..., _Model], dict[str, object]]:
-        """The factory named by a section, or else by the columns, and its options."""
+        """The factory named by a section, or else by the columns, its options and `more`."""
         options: dict[str, object] = dict(self.content.get(section, {}))
         name = options.pop("model", None)
         if name is None:
@@ -380,27 +479,62 @@ class TableSettings:
                 f"{self._at(section, 'model')}: expected one of {', '.join(registry)}, got {name!r}"
             )
         known = [key for key in inspect.signature(registry[name]).parameters if key != "noise_cov"]
-        self._check_keys(section, options, ("model", "noise", *known))
+        self._check_keys(section, options, ("model", "noise", *known, *more))
         options.pop("noise", None)
         return registry[name], options
 
     def _noise(
         self, section: str, names: tuple[str, ...], defaults: Mapping[str, float]
-    ) -> list[float]:
+    ) -> tuple[Parameter, ...]:
         """The standard deviations of the noise of a model, in its order."""
         given = self.content.get(section, {}).get("noise")
         if given is None:
-            usual = [defaults.get(split_unit(name)[1] or "", 0.1) for name in names]
-            self.assumed.append(f"[{section}] noise = {usual} ({', '.join(names)})")
-            return usual
-        found = self._numbers(section, "noise", given, names)
-        if min(found) < 0:
-            raise ValueError(
-                f"{self._at(section, 'noise')}: expected standard deviations >= 0, got {given}"
-            )
-        return found
+            found = [defaults.get(split_unit(name)[1] or "", 0.1) for name in names]
+            self.assumed.append(f"[{section}] noise = {found} ({', '.join(names)})")
+        else:
+            found = self._numbers(section, "noise", given, names)
+            if min(found) < 0:
+                raise ValueError(
+                    f"{self._at(section, 'noise')}: expected standard deviations >= 0, got {given}"
+                )
+        return tuple(
+            Parameter(f"{section} {name}", value, "noise", (section, "noise"))
+            for name, value in zip(names, found, strict=True)
+        )
+
+    def _errors(
+        self,
+        section: str,
+        known: Mapping[str, tuple[tuple[str, ...], tuple[float, ...]]],
+        given: Mapping[str, object],
+    ) -> tuple[Parameter, ...]:
+        """The systematic errors of a model, those of the settings or none."""
+        parameters: list[Parameter] = []
+        for key in given:
+            if key not in known:
+                raise ValueError(f"{self._at(section, key)}: expected a model that it can correct")
+        for key, (names, right) in known.items():
+            values = self._numbers(section, key, given.get(key, list(right)), names)
+            for name, value, without in zip(names, values, right, strict=True):
+                if without == 1.0 and value <= 0:
+                    raise ValueError(f"{self._at(section, key)}: expected a {name} above 0")
+                parameters.append(Parameter(f"{key} {name}", value, key, (section, key)))
+        return tuple(parameters)
+
+    def _number(self, section: str, key: str, default: float) -> float:
+        given = self.content.get(section, {}).get(key)
+        return default if given is None else self._numbers(section, key, given, ("[s] or [m]",))[0]
+
+    def _positive(self, section: str, key: str, default: float) -> float:
+        value = self._number(section, key, default)
+        if value < 0:
+            raise ValueError(f"{self._at(section, key)}: expected a number >= 0, got {value:g}")
+        return value
 
     def _numbers(self, section: str, key: str, given: object, names: Sequence[str]) -> list[float]:
+        """So many numbers in a list; one may also be without it."""
+        if len(names) == 1 and is_number(given):
+            given = [given]
         if (
             not isinstance(given, list)
             or len(given) != len(names)

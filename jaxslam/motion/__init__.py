@@ -11,8 +11,9 @@ from jaxslam.motion.odometry import (
     odometry_control,
     odometry_controls,
 )
+from jaxslam.motion.odometry_errors import Corrected
 from jaxslam.motion.substeps import Substeps
-from jaxslam.motion.unicycle import Unicycle
+from jaxslam.motion.unicycle import Unicycle, WhiteNoise
 from jaxslam.motion.velocity import Velocity, VelocityNoise
 
 REGISTRY: dict[str, Callable[..., Motion]] = {
@@ -26,6 +27,7 @@ REGISTRY: dict[str, Callable[..., Motion]] = {
 
 __all__ = [
     "Ackermann",
+    "Corrected",
     "Increment",
     "Odometry",
     "OdometryNoise",
@@ -34,6 +36,7 @@ __all__ = [
     "Unicycle",
     "Velocity",
     "VelocityNoise",
+    "WhiteNoise",
     "odometry_control",
     "odometry_controls",
 ]

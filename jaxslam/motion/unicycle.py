@@ -1,12 +1,13 @@
 """The unicycle model: constant velocities over an interval, integrated by one Euler step."""
 
 import jax.numpy as jnp
+from numpy.typing import ArrayLike
 
 from jaxslam.core.noise import NoiseCov
 from jaxslam.core.protocols import Motion
 from jaxslam.core.record import record
 from jaxslam.math import se2
-from jaxslam.math.arrays import Control, Pose, ProcessNoise, StepJacobians
+from jaxslam.math.arrays import Control, Pose, ProcessNoise, ProcessNoiseCov, StepJacobians
 
 
 @record
@@ -42,3 +43,28 @@ class Unicycle(Motion):
         by_noise = by_noise.at[0, 0].set(dt * c).at[1, 0].set(dt * s).at[2, 1].set(dt)
         by_dt = jnp.stack([v * c, v * s, omega])
         return by_pose, jnp.concatenate([by_noise, by_dt[:, None]], axis=1), by_noise
+
+
+@record
+class WhiteNoise:
+    """White noise of the velocities (v, ω), a function (pose, u) -> (2, 2).
+
+        diag(travel², turn² + (turn_share ω)²) / Δt
+
+    It does not depend on how time is cut into steps; where Δt = 0 it is 0.
+    """
+
+    travel: ArrayLike
+    """[m/√s] standard deviation of the travel in a second"""
+    turn: ArrayLike
+    """[rad/√s] of the heading in a second"""
+    turn_share: ArrayLike = 0.0
+    """[√s] of the heading in a second, as a share of ω"""
+
+    def __call__(self, pose: Pose, u: Control) -> ProcessNoiseCov:
+        travel, turn, share = (
+            jnp.asarray(given, u.dtype) for given in (self.travel, self.turn, self.turn_share)
+        )
+        moving = u[2] > 0
+        density = jnp.diag(jnp.stack([travel**2, turn**2 + (share * u[1]) ** 2]))
+        return density * jnp.where(moving, 1 / jnp.where(moving, u[2], 1.0), 0.0)

@@ -9,8 +9,9 @@ from jaxslam.sensors.absolute import Absolute, Compass, PositionFix
 from jaxslam.sensors.bearing_inverse_depth import BearingInverseDepth
 from jaxslam.sensors.line import Line
 from jaxslam.sensors.partial import BearingOnly, RangeOnly
-from jaxslam.sensors.range_bearing import RangeBearing
+from jaxslam.sensors.range_bearing import RangeBearing, RangeBearingNoise
 from jaxslam.sensors.range_bearing_signature import RangeBearingSignature
+from jaxslam.sensors.range_errors import Corrected
 from jaxslam.sensors.relative_position import RelativePosition
 from jaxslam.sensors.suite import Part, Suite
 
@@ -31,10 +32,12 @@ __all__ = [
     "BearingInverseDepth",
     "BearingOnly",
     "Compass",
+    "Corrected",
     "Line",
     "Part",
     "PositionFix",
     "RangeBearing",
+    "RangeBearingNoise",
     "RangeBearingSignature",
     "RangeOnly",
     "RelativePosition",

@@ -1,6 +1,7 @@
 """Range and bearing of a point landmark, from a laser scanner or a sonar."""
 
 import jax.numpy as jnp
+from jax import Array
 from numpy.typing import ArrayLike
 
 from jaxslam.core.noise import NoiseCov
@@ -51,3 +52,32 @@ class RangeBearing(Sensor):
         (inner,) = se2.rectangular_jacobians(z)
         by_s = jnp.zeros((2, 0), pose.dtype)
         return by_frame @ self.frame_jacobian(pose), by_point @ inner, by_s
+
+
+@record
+class RangeBearingNoise:
+    """The diagonal covariance of (range, bearing), a function z -> (2, 2).
+
+        var r = range² + (share r)²,    var φ = bearing² + across² / (r² + across²)
+
+    `across` is the standard deviation with which the place of a landmark is seen across the line
+    of sight, as on a post that is wider than a beam; at the sensor its bearing says nothing.
+    """
+
+    range: ArrayLike
+    """[m]"""
+    bearing: ArrayLike
+    """[rad]"""
+    share: ArrayLike = 0.0
+    """of the range [1]"""
+    across: ArrayLike = 0.0
+    """[m]"""
+
+    def __call__(self, z: Measurement) -> Array:
+        range, bearing, share, across = (
+            jnp.asarray(given, z.dtype)
+            for given in (self.range, self.bearing, self.share, self.across)
+        )
+        square = z[0] ** 2 + across**2
+        apart = jnp.where(square > 0, across**2 / jnp.where(square > 0, square, 1.0), 0.0)
+        return jnp.diag(jnp.stack([range**2 + (share * z[0]) ** 2, bearing**2 + apart]))

@@ -83,8 +83,8 @@ def test_the_noises_of_a_folder_are_fitted_and_written(tmp_path, capsys):
     assert (out / "fit.toml").read_text() == (tmp_path / "fit.toml").read_text()
     fitted = datasets.table(tmp_path)
     assert fitted.motion.name == "velocity" and "[sensor] noise of fit.toml" in fitted.assumed
-    after = fitted.adjustable.deviations
-    np.testing.assert_allclose(after[3], said["parameters"]["sensor range [m]"]["after"], rtol=1e-3)
+    after = {one.name: one.value for one in fitted.adjustable.parameters}["sensor range [m]"]
+    np.testing.assert_allclose(after, said["parameters"]["sensor range [m]"]["after"], rtol=1e-3)
     assert (out / "fit.toml").read_text().startswith("[motion]\nnoise = [")
     comment = "  # v [m/s], omega [rad/s], gamma [rad/s]\n\n[sensor]\nnoise = ["
     assert comment in (out / "fit.toml").read_text()
@@ -105,13 +105,12 @@ def test_what_cannot_be_fitted_is_refused(tmp_path, refused, options, message):
     assert not (tmp_path / "out").exists()
 
 
-def test_a_data_set_with_fixed_noises_or_no_mount_is_refused(tmp_path):
+def test_a_data_set_with_fixed_noises_or_other_errors_is_refused(tmp_path):
     data = datasets.table(write(tmp_path, 5))
     with pytest.raises(ValueError, match="fit: expected a data set with adjustable noises"):
         datasets.fit(dataclasses.replace(data, adjustable=None))
-    bare = data.adjustable._replace(mount=None)
-    with pytest.raises(ValueError, match="fit: expected a sensor with a mount"):
-        datasets.fit(dataclasses.replace(data, adjustable=bare), mount=True)
+    with pytest.raises(ValueError, match="fit: expected calibrate to be some of scale, wheels, he"):
+        datasets.fit(data, calibrate=["axis"])
 
 
 def test_innovations_that_last_are_correlated():

@@ -98,7 +98,7 @@ def test_a_pose_covariance_with_what_parameters_add_is_that_of_the_joint_estimat
     (3.0, [1.0], 1.0, "a function of p, got float"),
     (lambda p: jnp.where(p > 0, jnp.nan, p), [1.0], 1.0, "not finite"),
     (lambda p: p.sum(), [1.0, 2.0], np.eye(2), "array"),
-    (lambda p: (p, p), [1.0], 1.0, "array"),
+    (lambda p: (p, 3), [1.0], 1.0, "array"),
     (lambda p: p > 0, [1.0], 1.0, "real numbers"),
     (lambda p: jnp.sqrt(p), [0.0], 1.0, "derivatives"),
     told="consider_cov: .*",
@@ -213,6 +213,13 @@ def test_other_numbers_of_a_record_cost_no_trace_and_no_program():
         root, added = both(2.0)
     np.testing.assert_allclose(root, np.sqrt(2), rtol=1e-4)
     np.testing.assert_allclose(added, 8.0, rtol=1e-3)
+
+
+def test_results_may_be_a_tree():
+    added = consider_cov(lambda p: {"a": p, "b": jnp.outer(p, p)}, [2.0, 1.0], np.diag([0.1, 0.2]))
+    np.testing.assert_allclose(added["a"], np.diag([0.1, 0.2]), rtol=1e-6)
+    slope = np.array([[4.0, 0.0], [1.0, 2.0]])  # of (p0², p0 p1)
+    np.testing.assert_allclose(added["b"][0], slope @ np.diag([0.1, 0.2]) @ slope.T, rtol=1e-6)
 
 
 def test_what_is_empty_does_not_count_and_a_number_will_do():

@@ -2,15 +2,13 @@
 
 from collections import Counter
 
-import jax
-import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import swept
 from recordings import EPOCH, MRCLAM, assert_log, assert_spoiled, folder, mapped, mrclam, write
 
 from jaxslam import datasets
-from jaxslam.datasets.mrclam_robot import EXCHANGED, white_noise
+from jaxslam.datasets.mrclam_robot import EXCHANGED
 
 
 def test_mrclam_by_hand(tmp_path):
@@ -42,20 +40,6 @@ def test_mrclam_by_hand(tmp_path):
     assert data.dropped == {"robot sightings": 2, "unknown barcodes": 1, "repeated in a scan": 1}
     assert data.corrections == ()
     np.testing.assert_array_equal(data.landmarks, [[0, 3], [1.5, -2]])
-
-
-def test_white_noise_does_not_depend_on_how_time_is_cut():
-    """The variance of Δt·w over an interval is that of its halves added; none, and finite, at 0."""
-    noise_cov = white_noise(0.04, 0.09)
-
-    def gained(dt):
-        return dt**2 * noise_cov(jnp.zeros(3), jnp.array([1.0, 0.5, dt]))
-
-    np.testing.assert_allclose(gained(1.0), np.diag([0.04, 0.09]), rtol=1e-14)
-    np.testing.assert_allclose(gained(0.3) + gained(0.7), gained(1.0), rtol=1e-14)
-    np.testing.assert_array_equal(noise_cov(jnp.zeros(3), jnp.zeros(3)), np.zeros((2, 2)))
-    slope = jax.jacfwd(noise_cov, argnums=1)(jnp.zeros(3), jnp.zeros(3))
-    assert np.all(np.isfinite(slope))
 
 
 @pytest.mark.parametrize(

@@ -5,7 +5,7 @@ import pytest
 from recordings import TEAM, write
 
 from jaxslam import datasets
-from jaxslam.datasets import MRCLAM_FITTED, RobotCalibration
+from jaxslam.datasets import RobotCalibration
 
 KNOWN = RobotCalibration(
     0.0, 1.0, 0.05, 1.0, 0.0, 1.02, 0.0, 0.0, 0.0, 0.003, 0.01, 0.0, 0.01, 0.01
@@ -54,12 +54,8 @@ def recorded(steps=900, dt=0.2, seed=0):
 
 
 def test_what_is_no_calibration_is_refused(tmp_path):
-    for read in (
-        lambda: datasets.mrclam(tmp_path, 1, calibration={1: KNOWN}),
-        lambda: datasets.mrclam_calibration(tmp_path, 1, known=None),
-    ):
-        with pytest.raises(ValueError, match="expected a RobotCalibration, got"):
-            read()
+    with pytest.raises(ValueError, match="expected a RobotCalibration, got"):
+        datasets.mrclam(tmp_path, 1, calibration={1: KNOWN})
     for wrong, why in (
         ({"depth": 0.0}, "depth of a calibration to be a finite number above 0"),
         ({"bearing_noise": -1.0}, "bearing_noise of a calibration to be a finite number >= 0"),
@@ -76,39 +72,40 @@ def test_what_is_no_calibration_is_refused(tmp_path):
         datasets.mrclam_team(tmp_path, (1, 2), calibration=calibration)
         for calibration in (KNOWN, {1: KNOWN, 2: KNOWN._replace(forward=2.0)})
     )
-    np.testing.assert_array_equal(each.log.control[:, 0], shared.log.control[:, 0])
-    outer = KNOWN.outer * np.abs(shared.log.control[:, 4])
-    np.testing.assert_allclose(
-        each.log.control[:, 3] + outer, 2 * (shared.log.control[:, 3] + outer)
-    )
+    np.testing.assert_array_equal(each.log.control, shared.log.control)
+    u, pose = np.array([0.3, 0.2, 1.0]), np.zeros(3)
+    ahead = [robot.motion.step(pose, u, np.zeros(2))[0] for robot in each.robots]
+    np.testing.assert_allclose(ahead, np.array([1.0, 2.0]) * 0.3 - KNOWN.outer * 0.2, rtol=1e-6)
+
+
+GROUPS = ("scale", "wheels", "mount", "axis")
 
 
 @pytest.mark.sweep
 def test_the_constants_of_a_simulated_robot_are_found(tmp_path):
-    own = datasets.mrclam_calibration(write(tmp_path, recorded()), 1, known=KNOWN)
-    assert own.found.converged
-    error = own.found.parameters - [getattr(TRUE, name) for name in MRCLAM_FITTED]
+    data = datasets.mrclam(write(tmp_path, recorded()), 1, calibration=KNOWN)
+    own = datasets.fit(data, calibrate=GROUPS, fixed=("noise", "depth"))
+    assert own.found.converged and own.settled
+    assert own.found.names == ("forward", "outer", "turn", "curvature", "ahead", "yaw", "axis")
+    true = np.array([getattr(TRUE, name) for name in own.found.names])
+    error = own.found.parameters - true
     assert error @ np.linalg.solve(own.found.cov, error) < 20.0  # 7 degrees of freedom: p = 0.006
-    sigma = np.sqrt(np.diag(own.found.cov))
-    start = [getattr(TRUE, name) - getattr(KNOWN, name) for name in MRCLAM_FITTED]
-    assert (np.abs(start) > 4 * sigma).all()  # so that finding them is something
-    assert own.robot == KNOWN._replace(
-        **dict(zip(MRCLAM_FITTED, own.found.parameters.tolist(), strict=True))
+    assert (np.abs(own.found.start - true) > 4 * own.found.error).all()  # something to find
+    robot = RobotCalibration(*own.values)
+    found = dict(zip(own.found.names, own.found.parameters, strict=True))
+    np.testing.assert_array_equal(robot, KNOWN._replace(**found))
+    np.testing.assert_array_equal(own.cov[1:5, 1:5], own.found.cov[:4, :4])
+    assert (own.cov[5] == 0).all() and (own.cov[9:] == 0).all()  # of depth, and of noises
+    assert own.found.nis_per_dof[1] == pytest.approx(1.0, abs=0.15)
+
+
+def test_a_larger_world_has_the_same_log():
+    """Twice the range, recorded by a camera twice as far off with half the depth, and twice the travel."""
+    twice = TRUE._replace(
+        forward=2 * TRUE.forward, outer=2 * TRUE.outer, ahead=2 * TRUE.ahead, depth=TRUE.depth / 2
     )
-    assert own.found.misfit[-1] == pytest.approx(1.0, abs=0.15)
-    data = datasets.mrclam(tmp_path, 1, calibration=own.robot)
-    log, motion, sensor = own.at(own.found.parameters)
-    np.testing.assert_allclose(log.control, data.log.control, rtol=1e-12)
-    np.testing.assert_allclose(log.scan.z, data.log.scan.z, rtol=1e-12)
-    for p, scale in ((own.found.parameters[:-1], 1.0), (own.found.parameters, 0.0)):
-        with pytest.raises(ValueError, match=r"FittedCalibration\.at: expected constants of shape"):
-            own.at(p, scale)
-    larger, _, farther = own.at(own.found.parameters, scale=2.0)
-    np.testing.assert_allclose(larger.scan.z, np.asarray(log.scan.z) * [2.0, 1.0], rtol=1e-12)
-    np.testing.assert_allclose(
-        larger.control, np.asarray(log.control) * [2.0, 1.0, 1.0], rtol=1e-12
-    )
-    # A world twice as large, seen by a camera twice as far off: twice the range, the same bearing.
-    pose, point = np.array([0.0, 0.0, 0.3]), np.array([2.0, 1.0])
-    near, far = sensor.observe(pose, point), farther.observe(pose, 2 * point)
-    np.testing.assert_allclose(far, np.asarray(near) * [2.0, 1.0], rtol=1e-12)
+    pose, point, u = np.array([0.0, 0.0, 0.3]), np.array([2.0, 1.0]), np.array([0.2, -0.3, 0.5])
+    seen, again = TRUE.sensor.observe(pose, point), twice.sensor.observe(pose, 2 * point)
+    np.testing.assert_allclose(seen, again, rtol=1e-6)
+    moved, farther = (robot.motion.step(pose, u, np.zeros(2)) for robot in (TRUE, twice))
+    np.testing.assert_allclose(farther, moved * np.array([2.0, 2.0, 1.0]), rtol=1e-6)

@@ -112,36 +112,47 @@ def test_only_zeros_at_the_end_and_after_the_truth_are_cut():
     assert cut_after(odometry[:3], 0.5)[1] == 0
 
 
-def test_a_calibration_corrects_what_a_robot_recorded(tmp_path):
+def test_a_calibration_models_what_a_robot_recorded(tmp_path):
     own = PLAIN._replace(delay=0.5, forward=2.0, outer=0.5, turn=0.5, depth=2.0, ahead=0.1, yaw=0.2)
     own = own._replace(axis=0.05)
-    raw, data = (datasets.mrclam(write(tmp_path, MRCLAM), 2, calibration=c) for c in (PLAIN, own))
+    raw, data = (datasets.mrclam(write(tmp_path, MRCLAM), 2, calibration=c) for c in (None, own))
     # The first line (0.5 m/s, 0.125 rad/s) at 0.5 s moves the robot from 1 s on.
     row = np.searchsorted(data.time - EPOCH, 1.0) + 1
-    np.testing.assert_allclose(data.log.control[row, :2], [2 * 0.5 - 0.5 * 0.125, 0.0625])
+    np.testing.assert_array_equal(data.log.control[row, :2], [0.5, 0.125])
+    moved = data.motion.step(jnp.zeros(3), jnp.array([0.5, 0.125, 1.0]), jnp.zeros(2))
+    np.testing.assert_allclose(moved, [2 * 0.5 - 0.5 * 0.125, 0.0, 0.0625], rtol=1e-6)
     z, seen = raw.log.scan.z[raw.log.scan.valid], data.log.scan.z[data.log.scan.valid]
-    np.testing.assert_allclose(seen[:, 0], z[:, 0] * np.cos(z[:, 1]) / np.cos(z[:, 1] - 0.05) / 2)
-    np.testing.assert_array_equal(seen[:, 1], z[:, 1])
-    assert z[0, 0] == pytest.approx(1.5 / np.cos(0.25))
-    # A camera 0.1 m ahead and turned by 0.2 rad sees a point 1.1 m ahead at 1 m and -0.2 rad.
+    np.testing.assert_array_equal(seen, z)
+    # A camera 0.1 m ahead and turned by 0.2 rad sees a point 1.1 m ahead at 1 m and -0.2 rad, and
+    # records twice the depth along its axis.
     found = data.sensor.observe(jnp.zeros(3), jnp.array([1.1, 0.0]))
-    np.testing.assert_allclose(found, [1.0, -0.2], atol=1e-6)
+    np.testing.assert_allclose(found, [2 * np.cos(0.25), -0.2], atol=1e-6)
+    back = data.sensor.invert(jnp.zeros(3), found, jnp.zeros(0))
+    np.testing.assert_allclose(back, [1.1, 0.0], atol=1e-6)
 
 
-def test_the_noise_of_a_calibration():
-    moved = PLAIN.odometry_cov()(jnp.zeros(3), jnp.array([0.3, -0.2, 0.5]))
-    np.testing.assert_allclose(moved, np.diag([0.01**2, 0.02**2 + 0.1**2]) / 0.5, rtol=1e-6)
-    still = PLAIN.odometry_cov()(jnp.zeros(3), jnp.zeros(3))
-    np.testing.assert_array_equal(still, np.zeros((2, 2)))
-    slope = jax.jacfwd(PLAIN.odometry_cov(), argnums=1)(jnp.zeros(3), jnp.zeros(3))
-    assert np.all(np.isfinite(slope))
-    seen = PLAIN.measurement_cov()(jnp.array([3.0, 0.1]))
-    np.testing.assert_allclose(seen, np.diag([0.3, 0.02]) ** 2, rtol=1e-6)
+def test_a_later_delay_is_a_log_of_later_odometry(tmp_path):
+    """Of the parameters of a data set; where velocities are constant it is that of the reader."""
+    read = write(tmp_path, MRCLAM)
+    data = datasets.mrclam(read, 2, calibration=PLAIN)
+    later = datasets.mrclam(read, 2, calibration=PLAIN._replace(delay=0.5))
+    moved, _, _ = data.adjustable.at(jnp.array(PLAIN._replace(delay=0.5)))
+
+    def travelled(log, time):
+        return time - EPOCH, np.cumsum(log.control[:, :2] * log.control[:, 2:], axis=0)
+
+    when, expected = travelled(later.log, later.time)
+    at, found = travelled(moved, data.time)
+    for column in range(2):
+        np.testing.assert_allclose(
+            found[:, column], np.interp(at, when, expected[:, column]), atol=1e-5
+        )
 
 
-def test_a_bearing_behind_the_image_plane_is_refused():
+def test_a_bearing_behind_the_image_plane_is_refused(tmp_path):
+    files = {k: v.replace("1.50 0.25", "1.50 1.6") for k, v in MRCLAM.items()}
     with pytest.raises(ValueError, match=r"expected bearings below π/2, got 1\.6"):
-        PLAIN.measurements(np.array([[0.0, 5, 1, 0.5], [0.0, 5, 1, 1.6]]))
+        datasets.mrclam(write(tmp_path, files), 2, calibration=PLAIN)
 
 
 def test_ranges_of_data_set_6_are_depths():
@@ -152,10 +163,9 @@ def test_ranges_of_data_set_6_are_depths():
         data = datasets.mrclam(path, 1, calibration=calibration)
         row, slot = np.nonzero(data.log.scan.valid & data.true_at[:, None])
         pose, z = data.true_path[row], data.log.scan.z[row, slot]
-        ahead = 0.0 if calibration is None else calibration.ahead
-        camera = pose[:, :2] + ahead * np.column_stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])])
-        gap = data.landmarks[data.log.scan.tag[row, slot]] - camera
-        off[name] = z[:, 0] / np.hypot(*gap.T) - 1
+        point = data.landmarks[data.log.scan.tag[row, slot]]
+        expected = jax.vmap(data.sensor.observe)(pose, point)
+        off[name] = z[:, 0] / np.asarray(expected[:, 0]) - 1
     assert len(off["recorded"]) > 1500
     assert off["recorded"].std() > 0.03
     assert off["corrected"].std() < 0.0105

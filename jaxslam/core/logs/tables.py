@@ -5,7 +5,7 @@ from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
 import numpy as np
-from jaxtyping import Float, Int
+from jaxtyping import Bool, Float, Int
 
 from jaxslam.core.logs import streams
 
@@ -60,6 +60,10 @@ class Seen(NamedTuple, Generic[_Name]):
     """the names of z, with units"""
     places: int | None = None
     """its measurement slots in a scan; None for as many as its largest scan has"""
+    max_range: float = math.inf
+    """[m] the range from which on it says nothing"""
+    spacing: float = 0.0
+    """[s] the least time between two measurements of a landmark that are kept"""
 
 
 class Aligned(NamedTuple, Generic[_Name]):
@@ -108,8 +112,10 @@ def align_tables(
 
     Velocities (controls with an interval) hold until the next line; poses are interpolated; other
     controls are unchanged, and measurements must then be at their times. Measurements before
-    the first or after the last odometry are dropped and counted; the last velocity holds as long as
-    the longest interval between lines. A scan has the slots of the sensors in their order.
+    the first or after the last odometry are dropped and counted, as are ranges below 0 or of the
+    sensor's maximum, and measurements sooner after one of the same landmark than the spacing. The
+    last velocity holds as long as the longest interval between lines. A scan has the slots of the
+    sensors in their order.
 
     Args:
         controls: the names of the motion model, with units.
@@ -136,7 +142,7 @@ def align_tables(
     }
     tag_of = {name: tag for tag, name in enumerate(ordered({*names, *named}))}
     tags = [_tags_in_scans(seen, tag_of) for seen in sensors]
-    kept, outside, negative = [], 0, 0
+    kept, outside, negative, beyond, soon = [], 0, 0, 0, 0
     for seen, tag, inside in zip(sensors, tags, within, strict=True):
         when = seen.table.columns[TIME]
         lost = np.flatnonzero(inside & ~np.isin(when, clock))
@@ -149,10 +155,15 @@ def align_tables(
         values = seen.table.values(seen.measured)
         ranges = [k for k, name in enumerate(seen.measured) if split_unit(name)[0] == "range"]
         no_echo = inside & (values[:, ranges] < 0).any(axis=1)
-        taken = inside & ~no_echo
+        far = inside & (values[:, ranges] >= seen.max_range).any(axis=1)
+        taken = inside & ~no_echo & ~far
+        early = taken & _too_soon(seen, tag, taken)
+        taken &= ~early
         kept.append((when[taken], tag[taken], values[taken]))
         outside += int((~inside).sum())
         negative += int(no_echo.sum())
+        beyond += int(far.sum())
+        soon += int(early.sum())
     times = np.unique(np.concatenate([clock, *(when for when, *_ in kept)]))
     moved = clock, odometry.values(columns)
     places = [seen.places for seen in sensors]
@@ -161,8 +172,12 @@ def align_tables(
         interval = np.diff(rows.time, prepend=rows.time[:1])
         rows = rows._replace(control=np.column_stack([rows.control, interval]))
     dropped = {"measurements outside the odometry": outside}
-    if negative:
-        dropped["measurements with a range below 0"] = negative
+    counts = {
+        "measurements with a range below 0": negative,
+        "measurements of the maximum range": beyond,
+        "measurements closer than the spacing": soon,
+    }
+    dropped |= {reason: count for reason, count in counts.items() if count}
     return Aligned(rows, tuple(tag_of), dropped)
 
 
@@ -189,6 +204,26 @@ def _tags_in_scans(seen: Seen[_Name], tag_of: dict[_Name, int]) -> Int[np.ndarra
             f"measurement{'s' * (seen.places > 1)} at a time, the slots of the sensor, got more"
         )
     return np.array(tags, np.int64)
+
+
+def _too_soon(
+    seen: Seen[_Name], tag: Int[np.ndarray, "J"], taken: Bool[np.ndarray, "J"]
+) -> Bool[np.ndarray, "J"]:
+    """Which measurements come sooner after one of the same landmark than the spacing."""
+    found = np.zeros(len(tag), bool)
+    if not seen.spacing:
+        return found
+    if unknown := np.flatnonzero(taken & (tag < 0)).tolist():
+        where = seen.table.at(unknown[0], TAG)
+        raise ValueError(f"{where}: expected a tag, since a spacing is of one landmark, got none")
+    when = seen.table.columns[TIME]
+    last: dict[int, float] = {}
+    for row in np.flatnonzero(taken):
+        # A spacing of whole intervals is not to be missed by rounding of the stamps.
+        found[row] = when[row] - last.get(tag[row], -math.inf) < seen.spacing * (1 - 1e-6)
+        if not found[row]:
+            last[tag[row]] = when[row]
+    return found
 
 
 def _side_by_side(scans: Sequence[streams.Rows], places: Sequence[int | None]) -> streams.Rows:
