@@ -34,6 +34,7 @@ BENCHMARKS = {
     "victoria_park": "victoria_park",
     "real_data": "real_data",
     "mrclam": "mrclam.benchmark",
+    "woods": "woods",
     "association": "association.benchmark",
     "baselines": "baselines",
     "bearing": "bearing",

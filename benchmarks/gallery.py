@@ -22,6 +22,7 @@ FOLDERS = {
     "bonn": "bonn",
     "carmen": "carmen",
     "carmen_freiburg": "carmen",
+    "lost_in_the_woods": "lost_in_the_woods",
     "mrclam": "mrclam1",
     "mrclam_team": "mrclam1",
 }

@@ -83,9 +83,9 @@ OPEN = {
     "jaxslam.core.types": "Beams Estimate Info Log Scan Status Trace Truth",
     "jaxslam.core.validation": "check_count check_covariance check_gate check_record is_concrete",
     "jaxslam.datasets": (
-        "MRCLAM_CALIBRATION BagContents Dataset DatasetFit FittedCalibration LaserLog "
-        "RobotCalibration StampedRelations bonn carmen fit mrclam mrclam_calibration mrclam_team "
-        "plaza relation_file rosbag rosbag_contents table victoria_park white_noise"
+        "MRCLAM_CALIBRATION Added Adjustable BagContents Dataset DatasetFit LaserLog Parameter "
+        "RobotCalibration StampedRelations bonn carmen considered fit mrclam mrclam_team "
+        "plaza relation_file rosbag rosbag_contents table victoria_park"
     ),
     "jaxslam.datasets.evaluation": "Evaluation MapTest evaluate",
     "jaxslam.filters.map_management.relocalization": (

@@ -3,10 +3,20 @@
 `calibrate` finds parameters of which the noise covariances do not depend, by Gauss-Newton on the
 whitened innovations, also where associations change; `fit_noise` maximizes the likelihood, for
 standard deviations and what else is in it, with the associations held; `consider_cov` is what the
-uncertainty of parameters adds to the covariance of a result.
+uncertainty of parameters adds to the covariance of a result. `delayed` is a log whose measurements
+are late, by a delay that can be such a parameter.
 """
 
+from jaxslam.calibration.delay import delayed
 from jaxslam.calibration.maximum_likelihood import NoiseFit, as_associated, fit_noise
 from jaxslam.calibration.systematic import Calibration, calibrate, consider_cov
 
-__all__ = ["Calibration", "NoiseFit", "as_associated", "calibrate", "consider_cov", "fit_noise"]
+__all__ = [
+    "Calibration",
+    "NoiseFit",
+    "as_associated",
+    "calibrate",
+    "consider_cov",
+    "delayed",
+    "fit_noise",
+]

@@ -53,10 +53,11 @@ COMMANDS = {
     ),
     "fit": (
         fit,
-        "fit the noises of your data by maximum likelihood",
-        "Find the standard deviations of motion and sensor by maximum likelihood, with standard "
-        "errors, from a folder as of `jaxslam run --dataset table`. Prints a table and writes "
-        "fit.json, and fit.toml, which replaces the noises of dataset.toml.",
+        "fit noises and systematic errors of your data by maximum likelihood",
+        "Find the standard deviations of motion and sensor, and with --calibrate systematic "
+        "errors, by maximum likelihood, with standard errors, from a folder as of `jaxslam run "
+        "--dataset table`. Prints a table and writes fit.json, and fit.toml, whose numbers replace "
+        "those of dataset.toml.",
     ),
     "slam": (
         slam,

@@ -11,7 +11,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam import motion, sensors
-from jaxslam.calibration.delay import delayed
+from jaxslam.calibration import delayed
 from jaxslam.core.logs.streams import hold, interpolate_poses
 from jaxslam.core.numbers import is_concrete
 from jaxslam.core.protocols import Motion, Sensor

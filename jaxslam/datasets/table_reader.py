@@ -9,7 +9,7 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from jaxslam.calibration.delay import delayed
+from jaxslam.calibration import delayed
 from jaxslam.core.logs import tables
 from jaxslam.core.logs.streams import interpolate_poses
 from jaxslam.core.logs.tables import POSE, TAG, TIME, UNITS, Columns, split_unit, unit_divisor
