@@ -83,17 +83,30 @@ def filtered(data, chart):
     return trace, np.where(known[:, None], error, np.nan), np.where(known, nees, np.nan), row
 
 
+def ranges_by_the_truth(data):
+    """(scale, offset [m]) of the recorded ranges against the true distances, by least squares."""
+    row, slot = np.nonzero(data.log.scan.valid & data.true_at[:, None])
+    pose = data.true_path[row]
+    ahead = data.adjustable.values[
+        [p.name for p in data.adjustable.parameters].index("mount x [m]")
+    ]
+    laser = pose[:, :2] + ahead * np.stack([np.cos(pose[:, 2]), np.sin(pose[:, 2])], axis=1)
+    gap = data.landmarks[data.log.scan.tag[row, slot]] - laser
+    return np.polyfit(np.hypot(*gap.T), data.log.scan.z[row, slot, 0], 1)
+
+
 def figure_of(runs, data):
     """Posts of the map, the error of the position and the NEES of three runs."""
-    figure, (a, b, c) = panels_of(PAGE, 2.8, 1, 3, share=(False, False), widths=(1.15, 1, 1))
+    figure, (a, b, c) = panels_of(PAGE, 2.9, 1, 3, share=(False, False), widths=(1.5, 1, 1))
     true = data["calibrated, invariant"].landmarks
     a.plot(*true.T, "+", color=INK, ms=6, label="surveyed post")
     low, high = (float(chi2_quantile(p, 3)) for p in (0.025, 0.975))
     c.axhspan(low, high, fc=(SHADE, 0.35), ec=FAINT, lw=0.4, label="95 % of an honest NEES")
     for color, (name, (trace, error, nees, _)) in zip(COLORS, runs.items(), strict=False):
         points, covs = trace.estimate.points[-1], trace.estimate.point_covs[-1]
-        ends = true + MAGNIFIED * (points - true)
-        a.plot(*np.stack([true, ends], axis=1).transpose(2, 1, 0), color=color, lw=0.8)
+        at = true[trace.estimate.tag[-1]]
+        ends = at + MAGNIFIED * (points - at)
+        a.plot(*np.stack([at, ends], axis=1).transpose(2, 1, 0), color=color, lw=0.8)
         a.plot(*ellipses(ends, MAGNIFIED**2 * covs).transpose(2, 1, 0), color=color, lw=0.5)
         minutes = data[name].time / 60
         b.plot(minutes, np.hypot(*error[:, :2].T), color=color, lw=0.7, label=name)
@@ -142,6 +155,8 @@ def measure(quick: bool = False) -> list[Metric]:
     spaced = {f"{s:g} s": filtered(replace(each), invariant)[3] for s, each in calibrated.items()}
     show("Spacing, with these constants (invariant)", spaced)
     row = runs["calibrated, right-invariant EKF"][3]
+    scale, offset = ranges_by_the_truth(calibrated[3.0])
+    print(f"\nby the truth, ranges are {scale:.4f} times the distance and {offset:.4f} m")
     if not quick:
         chosen = {
             "as recorded, EKF": runs["as recorded, EKF"],

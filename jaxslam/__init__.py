@@ -6,6 +6,7 @@ configuration of JAX; for float64 set `jax_enable_x64` yourself, as the command 
 """
 
 import importlib
+import importlib.metadata
 from collections.abc import Callable
 from types import ModuleType
 
@@ -88,12 +89,14 @@ _ON_DEMAND = {
 }
 
 
-def __getattr__(name: str) -> ModuleType | Callable[..., Campaign]:
+def __getattr__(name: str) -> ModuleType | Callable[..., Campaign] | str:
     """What reads files or plots is imported on first access."""
     if name == "load":
         from jaxslam.results.campaign_files import load
 
         return load
+    if name == "__version__":
+        return importlib.metadata.version("jaxslam")
     if name in _ON_DEMAND:
         module = importlib.import_module(_ON_DEMAND[name])
         attach_field_docs()

@@ -4,12 +4,10 @@ import argparse
 import atexit
 import gc
 import os
-import platform
 import re
 import shlex
 import sys
 from collections.abc import Sequence
-from importlib.metadata import version
 from typing import Any, NoReturn
 
 import jax
@@ -29,6 +27,7 @@ from jaxslam.cli import (
     verify,
 )
 from jaxslam.cli.common import INTERRUPTED, CompileClock, as_folders, set_device_count
+from jaxslam.cli.environment import environment_text
 
 __all__ = ["main"]
 
@@ -105,6 +104,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     # Python's last collection would visit every object of JAX, which takes over half a second.
     atexit.register(gc.freeze)
+    if set(arguments) in ({"--version"}, {"--version", "--verbose"}):
+        print(environment_text("--verbose" in arguments))
+        return 0
     try:
         arguments = _laser_command(arguments)
         options = _parser().parse_args(arguments)
@@ -184,9 +186,11 @@ def _parser() -> argparse.ArgumentParser:
         description="2-D SLAM in JAX: landmark filters and their consistency, graphs, laser maps.",
         epilog="jaxslam COMMAND --help describes the options of a command.",
     )
-    versions = f"jax {jax.__version__}, Python {platform.python_version()}"
+    parser.add_argument("--version", action="store_true", help="print the versions, and exit")
     parser.add_argument(
-        "--version", action="version", version=f"jaxslam {version('jaxslam')} ({versions})"
+        "--verbose",
+        action="store_true",
+        help="with --version: all packages, devices and settings, for the report of a problem",
     )
     commands = parser.add_subparsers(required=True, metavar="COMMAND")
     for name, (module, line, description) in COMMANDS.items():

@@ -35,9 +35,9 @@ from jaxslam.core.protocols import Candidate, Filter, Motion, Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Log, Status, Truth
 from jaxslam.datasets import READERS, Dataset
-from jaxslam.datasets.considered import considered
 from jaxslam.datasets.evaluation import Evaluation, evaluate, joint_map_cov
 from jaxslam.datasets.table_settings import METHODS, association_options
+from jaxslam.datasets.uncertain_constants import considered
 from jaxslam.filters.ekf.ekf_settings import EkfOptions
 from jaxslam.results import report
 from jaxslam.results.campaign_files import FORMATS, check_figure_formats

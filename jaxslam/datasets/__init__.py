@@ -7,7 +7,6 @@ robots, the number of one.
 from collections.abc import Callable
 
 from jaxslam.datasets.carmen_reader import StampedRelations, carmen, relation_file
-from jaxslam.datasets.considered import Added, considered
 from jaxslam.datasets.dataset import Adjustable, Dataset, Parameter
 from jaxslam.datasets.laser_record import LaserLog
 from jaxslam.datasets.line_readers import bonn, victoria_park
@@ -17,6 +16,7 @@ from jaxslam.datasets.noise_fit import DatasetFit, fit
 from jaxslam.datasets.plaza_reader import plaza
 from jaxslam.datasets.rosbag_reader import BagContents, rosbag, rosbag_contents
 from jaxslam.datasets.table_reader import table
+from jaxslam.datasets.uncertain_constants import Added, considered
 
 READERS: dict[str, Callable[..., Dataset]] = {
     "bonn": bonn,

@@ -7,9 +7,11 @@ import subprocess
 import sys
 
 import jax
+import numpy as np
 import pytest
 from worlds import three_parameters
 
+import jaxslam
 from jaxslam import catalog, cli, scenarios
 from jaxslam.cli import common
 from jaxslam.consistency.campaign import Interrupted
@@ -62,7 +64,18 @@ def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys, monk
 
 def test_the_version_is_told(capsys):
     assert cli.main(["--version"]) == 0
-    assert f"(jax {jax.__version__}, Python 3." in capsys.readouterr().out
+    line = capsys.readouterr().out
+    assert f"(jax {jax.__version__}, Python 3." in line and jaxslam.__version__ in line
+
+
+def test_the_report_of_a_problem_has_versions_devices_and_settings(capsys, monkeypatch):
+    monkeypatch.setenv("XLA_FLAGS", "--xla_cpu_enable_fast_math=false")
+    monkeypatch.setenv("UNRELATED", "secret")
+    assert cli.main(["--version", "--verbose"]) == 0
+    lines = capsys.readouterr().out.split("\n")
+    assert f"numpy {np.__version__}" in lines and "device 0: cpu, cpu" in lines
+    assert "XLA_FLAGS=--xla_cpu_enable_fast_math=false" in lines
+    assert not [line for line in lines if "secret" in line]
 
 
 @pytest.mark.parametrize(

@@ -1,0 +1,39 @@
+"""What a report of a problem needs: versions, devices, and settings of JAX."""
+
+import os
+import platform
+from importlib.metadata import PackageNotFoundError, version
+
+import jax
+
+_PACKAGES = (
+    "jax",
+    "jaxlib",
+    "numpy",
+    "scipy",
+    "matplotlib",
+    "jaxtyping",
+    "rosbags",
+    "distributed",
+    "mpi4py",
+    "cloudpickle",
+)
+
+
+def environment_text(verbose: bool) -> str:
+    """The line of versions; verbose: with other packages, the machine, JAX's devices, and the
+    environment variables that change it."""
+    first = (
+        f"jaxslam {version('jaxslam')} (jax {jax.__version__}, Python {platform.python_version()})"
+    )
+    if not verbose:
+        return first
+    lines = [first, f"{platform.platform()}, {os.cpu_count()} processors"]
+    for name in _PACKAGES:
+        try:
+            lines.append(f"{name} {version(name)}")
+        except PackageNotFoundError:
+            lines.append(f"{name}: not installed")
+    lines += [f"device {d.id}: {d.platform}, {d.device_kind}" for d in jax.devices()]
+    flags = sorted(name for name in os.environ if name.startswith(("JAX_", "XLA_", "JAXSLAM_")))
+    return "\n".join([*lines, *(f"{name}={os.environ[name]}" for name in flags)])
