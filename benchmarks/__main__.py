@@ -56,6 +56,7 @@ BENCHMARKS = {
     "scan_matching": "scan_matching.benchmark",
     "lines": "lines",
     "scaling": "scaling",
+    "births": "births",
     "seif": "seif",
     "comparison": "campaigns:comparison",
     "soak": "soak",
