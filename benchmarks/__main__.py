@@ -57,6 +57,7 @@ BENCHMARKS = {
     "lines": "lines",
     "scaling": "scaling",
     "births": "births",
+    "honesty": "honesty",
     "seif": "seif",
     "comparison": "campaigns:comparison",
     "soak": "soak",
