@@ -57,6 +57,8 @@ BENCHMARKS = {
     "scan_matching": "scan_matching.benchmark",
     "lines": "lines",
     "scaling": "scaling",
+    "births": "births",
+    "honesty": "honesty",
     "seif": "seif",
     "comparison": "campaigns:comparison",
     "soak": "soak",

@@ -13,7 +13,10 @@ from jax import Array
 from jaxtyping import Bool, Float, Int, PyTree
 
 from jaxslam.math.linalg import cholesky, matmul, symmetrize, total, triangular_root
-from jaxslam.math.xla import materialize
+from jaxslam.math.xla import materialize, where_any
+
+CACHED = 128
+"""Up to this many rows P stays in the cache next to a core, and a pass over it is cheap."""
 
 
 class Joint(NamedTuple):
@@ -137,8 +140,9 @@ def scatter(
     """The joint with m landmarks in dead slots, correlated through the pose: Solà (35)-(38).
 
     With G the stacked by_pose: P_LR = G P_RR, P_LM = G P_RM, P_LL = G P_RR Gᵀ + diag(own_cov).
-    So the landmarks of one scan are correlated with each other through the robot. Written as
-    additions to the zeros of padding, in one pass over P; those not granted add none.
+    So the landmarks of one scan are correlated with each other through the robot. Their rows and
+    columns are written in place, O(N) a landmark; in a small map, whose P stays in the cache, by
+    one pass over P, which is faster in a batch. Those not granted change nothing.
     Of a square root X, X_L = G X_R beside a root of own_cov in the columns of the slot.
 
     Args:
@@ -150,7 +154,7 @@ def scatter(
     capacity = joint.landmarks.shape[0]
     if m == 0:
         return joint
-    # By slot: the index it is filled from. Whole passes over P are cheaper than scattered writes.
+    # By slot: the index it is filled from.
     place, born = last_true_column(
         granted[None, :] & (slot[None, :] == jnp.arange(capacity)[:, None])
     )
@@ -160,28 +164,81 @@ def scatter(
         return jnp.where(mask, values[place], jnp.zeros_like(values[:1]))
 
     gain = of_slots(by_pose).reshape(capacity * size, 3)
-    diagonal = of_slots(symmetrize(own_cov))
-    # Padding's unit variance goes first, to an exact zero: a small covariance plus 1 would lose it.
-    filled = jnp.concatenate([jnp.zeros(3, bool), jnp.repeat(born, size)])
-    cov = jnp.where(filled[:, None], 0.0, joint.cov)
+    own = of_slots(symmetrize(own_cov))
     if square_root:
-        root = jax.vmap(lambda cov: cholesky(cov)[0])(diagonal)
-        cov = cov.at[3:].add(total(gain[:, k, None] * joint.cov[None, k] for k in range(3)))
-        cov = _add_blocks(cov, root)
+        own = jax.vmap(lambda cov: cholesky(cov)[0])(own)
+    if len(joint.cov) <= CACHED:
+        cov = _add_in_one_pass(joint.cov, born, gain, own, square_root)
     else:
-        # R is zero at the new columns. With T = R + P_RR Gᵀ/2, G T + (G T)ᵀ is the cross-covariance
-        # with the map and, where rows and columns are both new, G P_RR Gᵀ; symmetric to the bit.
-        half = joint.cov[:3].at[:, 3:].add(0.5 * matmul(joint.cov[:3, :3], gain.T))
-        cross = total(gain[:, k, None] * half[k, None, :] for k in range(3))
-        cross = materialize(jnp.pad(cross, [(3, 0), (0, 0)]))
-        cov = cov + (cross + cross.T)
-        cov = _add_blocks(cov, diagonal)
+        cov = _write_in_place(joint.cov, slot, granted, gain, own, square_root)
     return joint._replace(
         landmarks=joint.landmarks + of_slots(landmarks),
         cov=cov,
         alive=joint.alive | born,
         tag=jnp.where(born, tag[place], joint.tag).astype(jnp.int32),
     )
+
+
+def _half_of(cov: Float[Array, "D D"], gain: Float[Array, "E 3"]) -> Float[Array, "3 D"]:
+    """T = R + P_RR Gᵀ/2 of the rows R of the robot, which are zero at the new columns.
+
+    G T + (G T)ᵀ is the cross-covariance with the map and, where rows and columns are both new,
+    G P_RR Gᵀ; symmetric to the bit.
+    """
+    return cov[:3].at[:, 3:].add(0.5 * matmul(cov[:3, :3], gain.T))
+
+
+def _add_in_one_pass(
+    cov: Float[Array, "D D"],
+    born: Bool[Array, "N"],
+    gain: Float[Array, "E 3"],
+    own: Float[Array, "N L L"],
+    square_root: bool,
+) -> Float[Array, "D D"]:
+    """The covariance with G P and blocks on the diagonal added to the zeros of padding."""
+    # Padding's unit variance goes first, to an exact zero: a small covariance plus 1 would lose it.
+    filled = jnp.concatenate([jnp.zeros(3, bool), jnp.repeat(born, own.shape[1])])
+    half = cov[:3] if square_root else _half_of(cov, gain)
+    cov = jnp.where(filled[:, None], 0.0, cov)
+    cross = total(gain[:, k, None] * half[k, None, :] for k in range(3))
+    if square_root:
+        return _add_blocks(cov.at[3:].add(cross), own)
+    cross = materialize(jnp.pad(cross, [(3, 0), (0, 0)]))
+    return _add_blocks(cov + (cross + cross.T), own)
+
+
+def _write_in_place(
+    cov: Float[Array, "D D"],
+    slot: Int[Array, "m"],
+    granted: Bool[Array, "m"],
+    gain: Float[Array, "E 3"],
+    own: Float[Array, "N L L"],
+    square_root: bool,
+) -> Float[Array, "D D"]:
+    """The same covariance, with the rows and columns of one new landmark after the other."""
+    size = own.shape[1]
+    half = materialize(cov[:3] if square_root else _half_of(cov, gain))
+
+    def write(cov: jax.Array, slot: jax.Array, granted: jax.Array) -> jax.Array:
+        first = 3 + slot * size
+        mine = jax.lax.dynamic_slice_in_dim(gain, slot * size, size)
+        rows = total(mine[:, k, None] * half[k, None, :] for k in range(3))
+        if not square_root:
+            there = jax.lax.dynamic_slice_in_dim(half, first, size, axis=1)
+            rows = rows.at[:, 3:].add(total(there[k, :, None] * gain[None, :, k] for k in range(3)))
+        block = jax.lax.dynamic_slice_in_dim(rows, first, size, axis=1) + own[slot]
+        rows = materialize(jax.lax.dynamic_update_slice_in_dim(rows, block, first, axis=1))
+        for values, axis in ((rows, 0),) if square_root else ((rows, 0), (rows.T, 1)):
+            # A run of a batch in which this one is not granted gets back what it had.
+            was = jax.lax.dynamic_slice_in_dim(cov, first, size, axis)
+            values = jnp.where(granted, values, was)
+            cov = jax.lax.dynamic_update_slice_in_dim(cov, values, first, axis)
+        return cov
+
+    def step(cov: jax.Array, one: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
+        return where_any(one[1], lambda cov: write(cov, *one), lambda cov: cov, cov), None
+
+    return jax.lax.scan(step, cov, (slot, granted))[0]
 
 
 def _add_blocks(cov: Float[Array, "D D"], blocks: Float[Array, "N L L"]) -> Float[Array, "D D"]:

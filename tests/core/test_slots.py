@@ -1,5 +1,7 @@
 """slots: the padding invariant under any sequence of operations, against a map that grows in NumPy."""
 
+from unittest import mock
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -11,6 +13,16 @@ CAPACITY = 4
 
 find, allocate = jax.jit(slots.find), jax.jit(slots.allocate)
 gather, scatter, remove = jax.jit(slots.gather), jax.jit(slots.scatter), jax.jit(slots.remove)
+
+
+def as_of_a_large_map(*arguments, **options):
+    """`scatter` as it is where P does not stay in the cache."""
+    with mock.patch.object(slots, "CACHED", 0):
+        return slots.scatter(*arguments, **options)
+
+
+in_place = jax.jit(as_of_a_large_map, static_argnames="square_root")
+both_ways = pytest.mark.parametrize("scatter", [scatter, in_place], ids=["one_pass", "in_place"])
 
 
 def start(size=2, seed=0):
@@ -89,8 +101,9 @@ def test_empty_map():
     assert not unknown.cov[:3, :3].any()
 
 
+@both_ways
 @pytest.mark.parametrize("size", [1, 2, 3])
-def test_scatter_is_dense_augmentation_of_several_landmarks_at_once(size):
+def test_scatter_is_dense_augmentation_of_several_landmarks_at_once(scatter, size):
     rng = np.random.default_rng(1)
     joint = start(size)
     dense = Dense(joint)
@@ -106,7 +119,8 @@ def test_scatter_is_dense_augmentation_of_several_landmarks_at_once(size):
     assert np.abs(cross).min() > 1e-6
 
 
-def test_scatter_keeps_the_digits_of_a_covariance_far_below_the_unit_variance_of_padding():
+@both_ways
+def test_scatter_keeps_the_digits_of_a_covariance_far_below_the_unit_variance_of_padding(scatter):
     """Millimetres in float32: the 1 that stood in the slot must leave no rounding behind."""
     rng = np.random.default_rng(9)
     slot, born, landmarks, by_pose, own, tag = births(rng, [True, True, False, False])
@@ -121,14 +135,16 @@ def test_scatter_keeps_the_digits_of_a_covariance_far_below_the_unit_variance_of
     np.testing.assert_allclose(out.cov[:7, :7], dense.p, rtol=1e-5, atol=1e-13)
 
 
-def test_scatter_does_not_depend_on_the_order_of_the_places():
+@both_ways
+def test_scatter_does_not_depend_on_the_order_of_the_places(scatter):
     part = births(np.random.default_rng(10), [True, False, True, True])
     shuffled = [table[[3, 0, 1, 2]] for table in part]
     for a, b in zip(scatter(start(), *part), scatter(start(), *shuffled), strict=True):
         np.testing.assert_array_equal(a, b)
 
 
-def test_scatter_of_nothing_changes_nothing():
+@both_ways
+def test_scatter_of_nothing_changes_nothing(scatter):
     rng = np.random.default_rng(2)
     joint = scatter(start(), *births(rng, [True, True, False, False]))
     same = scatter(joint, *births(rng, [False] * 4))
@@ -136,7 +152,61 @@ def test_scatter_of_nothing_changes_nothing():
         np.testing.assert_array_equal(a, b)
 
 
-def test_any_sequence_of_births_and_removals_equals_the_growing_map():
+@pytest.mark.parametrize("square_root", [False, True])
+def test_both_ways_give_the_same_numbers_and_gradients_in_a_batch(square_root):
+    """In runs with other births, one of them without any; dead places hold NaN."""
+    rng = np.random.default_rng(11)
+    old = scatter(start(), *births(rng, [False, True, False, False]))
+    old = old._replace(cov=jnp.linalg.cholesky(old.cov)) if square_root else old
+    each = [births(rng, born) for born in np.array([[1, 0, 1, 1], [0, 0, 0, 0], [0, 0, 0, 1]]) > 0]
+    slot, born, landmarks, by_pose, own, tag = map(np.stack, zip(*each, strict=True))
+    weights = rng.normal(size=(3, *old.cov.shape))
+
+    used = np.concatenate([np.ones(3, bool), np.repeat(old.alive, 2)])
+
+    def result(way, cov, by_pose, own):
+        cov = jnp.where(used[:, None] & used, cov, old.cov)  # padding is a constant
+
+        def one(slot, born, landmarks, by_pose, own, tag):
+            joint = old._replace(cov=cov)
+            return way(joint, slot, born, landmarks, by_pose, own, tag, square_root=square_root)
+
+        return jax.vmap(one)(slot, born, landmarks, by_pose, own, tag)
+
+    def loss(way, *variables):
+        return jnp.sum(weights * result(way, *variables).cov)
+
+    finite = np.nan_to_num(by_pose), np.where(np.isnan(own), np.eye(2), own)
+    ways = slots.scatter, as_of_a_large_map
+    a, b = (jax.jit(result, static_argnums=0)(way, old.cov, by_pose, own) for way in ways)
+    for x, y in zip(jax.tree.leaves(a), jax.tree.leaves(b), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-14, atol=1e-15)
+    np.testing.assert_array_equal(b.cov[1], old.cov)
+    slope = jax.jit(jax.grad(loss, argnums=(1, 2, 3)), static_argnums=0)
+    for x, y in zip(*(slope(way, old.cov, *finite) for way in ways), strict=True):
+        np.testing.assert_allclose(x, y, rtol=1e-12, atol=1e-12)
+
+
+def test_a_birth_in_a_large_map_is_written_in_place(full_optimization):
+    """Within a loop over scans: beside a donated P the program holds less than another one."""
+
+    def drive(joint, landmarks):
+        def step(joint, landmark):
+            slot, granted = slots.allocate(joint.alive, jnp.array([True, False]))
+            by_pose, own = jnp.ones((2, 2, 3)), jnp.stack([jnp.eye(2)] * 2)
+            part = slot, granted, landmark, by_pose, own, jnp.arange(2)
+            return slots.scatter(joint, *part), None
+
+        return jax.lax.scan(step, joint, landmarks)[0]
+
+    large = slots.empty(jnp.zeros(3), jnp.eye(3), 200, 2)
+    assert len(large.cov) > slots.CACHED
+    program = jax.jit(drive, donate_argnums=0).lower(large, jnp.zeros((5, 2, 2))).compile()
+    assert program.memory_analysis().temp_size_in_bytes < large.cov.nbytes / 4
+
+
+@both_ways
+def test_any_sequence_of_births_and_removals_equals_the_growing_map(scatter):
     rng = np.random.default_rng(3)
     joint = start()
     dense = Dense(joint)

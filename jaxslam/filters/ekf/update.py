@@ -13,6 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
+from jaxslam.core import slots
 from jaxslam.core.protocols import Chart
 from jaxslam.core.slots import Joint
 from jaxslam.filters.ekf.ekf_settings import Covariance, EkfSettings
@@ -98,9 +99,9 @@ def _joseph(
     return linalg.symmetrize(left - left_h @ gain.T + gain @ noise @ gain.T)
 
 
-# Up to this many rows P stays in the cache next to a core: the pass over it is bound by arithmetic,
-# on vectors of this many entries, and the rest of a row costs as much as a whole vector.
-_CACHED, _LANES = 128, 16
+# A pass over a P in the cache is bound by arithmetic, on vectors of this many entries, and the rest
+# of a row costs as much as a whole vector.
+_LANES = 16
 
 # Measurements a pass over P, where P is cached and where it is not. More of them cost more loads of
 # P_I, fewer cost more loads of P.
@@ -139,7 +140,7 @@ def correct_in_turn(
     size = joint.cov.shape[1]
     if settings.covariance != "plain":
         return _one_by_one(joint, measurements, settings)
-    cached = size <= _CACHED
+    cached = size <= slots.CACHED
     group = max(1, min(_GROUP if cached else _GROUP_BEYOND, z.shape[0]))
     if cached:
         joint = joint._replace(cov=jnp.pad(joint.cov, ((0, 0), (0, -size % _LANES))))
