@@ -48,6 +48,7 @@ BENCHMARKS = {
     "graph_bicocca": "graphs.bicocca",
     "false_loops": "graphs.false_loops",
     "graph_speed": "graphs.speed",
+    "graph_crossover": "graphs.crossover",
     "fastslam": "fastslam",
     "plain_particles": "plain_particles",
     "grids": "grids.benchmark",
