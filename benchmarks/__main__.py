@@ -34,6 +34,7 @@ BENCHMARKS = {
     "victoria_park": "victoria_park",
     "real_data": "real_data",
     "mrclam": "mrclam.benchmark",
+    "learned_noise": "mrclam.learned",
     "association": "association.benchmark",
     "baselines": "baselines",
     "bearing": "bearing",
