@@ -1,20 +1,24 @@
 """A plain particle filter over path and map against FastSLAM.
 
 Williams's reason for Rao-Blackwellization: the number of particles that a posterior needs grows
-exponentially with its dimension, 3 + 2N for the joint state (x, y, θ, l_1 … l_N). What is measured
-here is less: at a fixed number of particles the error grows with N. How the number needed grows is
-not measured. FastSLAM samples the pose alone and keeps each landmark as a Gaussian given the path.
-Same draws, same number of particles, a robot on a circle inside N landmarks that it always sees.
+exponentially with its dimension, 3 + 2N for the joint state (x, y, θ, l_1 … l_N). Two measurements:
+at a fixed number of particles the error by N; and the number needed for one accuracy by N, the
+smallest power of 2 at which the map's RMSE is at most 1.1 times that of FastSLAM with 500. FastSLAM
+samples the pose alone and keeps each landmark as a Gaussian given the path. Same draws for both, a
+robot on a circle inside N landmarks that it always sees. The needed number is of short logs, of 16
+scans: each further scan narrows the posterior against the first scan, from which landmarks are
+drawn, so that long logs need more.
 """
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 
-from benchmarks.gate import Metric, show
+from benchmarks.gate import Metric, save, show
 from jaxslam import filters, motion, run, sensors
 from jaxslam.math import gaussians, linalg
 from jaxslam.resampling import systematic
+from jaxslam.results.plot.style import COLORS, COLUMN, INK, caption, panels_of
 from jaxslam.simulation.worlds import Scenario, simulate
 
 MOTION = motion.Increment(np.diag([0.01, 0.01]) ** 2)
@@ -22,20 +26,24 @@ SENSOR = sensors.RangeBearing(np.diag([0.1, 0.03]) ** 2)
 LANDMARKS = (1, 2, 5, 10, 20)
 STEPS = 100
 PARTICLES = 500
+SHORT, NEEDED, WITHIN = 16, (1, 2, 3, 4), 1.1
+"""Scans of a log, landmarks, and the accuracy, relative to FastSLAM, of the needed number."""
+MOST = 2**19
+"""Particles at most."""
 
 
-def world(count: int) -> Scenario:
+def world(count: int, steps: int = STEPS) -> Scenario:
     around = 2 * np.pi * np.arange(count) / count
     return Scenario(
         name=f"{count} landmarks",
         motion=MOTION,
         sensor=SENSOR,
         landmarks=np.stack([4 * np.cos(around), 1.5 + 4 * np.sin(around)], axis=1),
-        controls=np.tile([0.1, 2 * np.pi / STEPS], (STEPS, 1)),
+        controls=np.tile([0.1, 2 * np.pi / STEPS], (steps, 1)),
     )
 
 
-def plain(log, key, count: int):
+def plain(log, key, count: int, particles: int = PARTICLES):
     """Bootstrap filter of pose and map: the map (N, 2) at the end, and the mean ESS over the steps.
 
     The landmarks of the first scan are drawn from what it says; all are seen in every scan.
@@ -54,14 +62,14 @@ def plain(log, key, count: int):
         return MOTION.step(pose, u, linalg.root_psd(MOTION.noise_cov(pose, u)) @ noise)
 
     key, first = jax.random.split(key)
-    noise = jax.random.normal(first, (PARTICLES, count, 2))
-    poses = jnp.zeros((PARTICLES, 3))
+    noise = jax.random.normal(first, (particles, count, 2))
+    poses = jnp.zeros((particles, 3))
 
     def step(carry, row):
         poses, maps, key, born = carry
         key, drive, again = jax.random.split(key, 3)
         poses = jax.vmap(moved, (0, None, 0))(
-            poses, row.control, jax.random.normal(drive, (PARTICLES, 2))
+            poses, row.control, jax.random.normal(drive, (particles, 2))
         )
         z = row.scan.z[jnp.argsort(row.scan.tag)]
         seen = jax.vmap(jax.vmap(place), (None, 0))(z, noise)
@@ -76,9 +84,67 @@ def plain(log, key, count: int):
         chosen = systematic(weight, again)
         return (poses[chosen], maps[chosen], key, jnp.asarray(True)), ess
 
-    maps = jnp.zeros((PARTICLES, count, 2))
+    maps = jnp.zeros((particles, count, 2))
     (_, maps, _, _), ess = jax.lax.scan(step, (poses, maps, key, jnp.asarray(False)), log)
     return maps.mean(axis=0), ess[1:].mean()
+
+
+def rmse_of(count: int, particles: int, steps: int, keys) -> float:
+    """Map RMSE [m] of the plain filter over the runs of some keys."""
+
+    def one(key):
+        truth, log = simulate(world(count, steps), key)
+        return ((plain(log, key, count, particles)[0] - truth.landmarks) ** 2).sum(axis=1).mean()
+
+    return float(np.sqrt(jax.jit(lambda keys: jax.lax.map(one, keys))(keys).mean()))
+
+
+def rmse_of_fastslam(count: int, steps: int, keys) -> float:
+    """The same of FastSLAM, with `PARTICLES`."""
+    scene = world(count, steps)
+    filter = filters.FastSlam(scene.motion, scene.sensor, count, PARTICLES)
+
+    def one(key):
+        truth, log = simulate(scene, key)
+        trace = run(filter, log, jnp.zeros(3), jnp.zeros((3, 3)), key)
+        estimate = jax.tree.map(lambda x: x[-1], trace.estimate)
+        return ((estimate.points - truth.landmarks[estimate.tag]) ** 2).sum(axis=1).mean()
+
+    return float(np.sqrt(jax.jit(lambda keys: jax.lax.map(one, keys))(keys).mean()))
+
+
+def draw(found: list[int], factor: float) -> None:
+    """The needed number by landmarks, and the exponential through its ends."""
+    figure, (axes,) = panels_of(COLUMN, 2.4, 1)
+    counts = np.arange(1, len(found) + 1)
+    line = found[0] * factor ** (counts - 1.0)
+    axes.semilogy(counts, line, color=INK, lw=0.8, label=f"factor {factor:.0f} a landmark")
+    axes.semilogy(counts, found, "o", color=COLORS[0], ms=4, label="needed")
+    axes.set(xlabel="landmarks", ylabel="particles of pose and map", xticks=counts)
+    caption(figure, "Particles needed for one accuracy")
+    save(figure, "plain_particles")
+
+
+def needed(quick: bool) -> list[Metric]:
+    """The needed number of particles by the number of landmarks, and the factor of one more."""
+    keys, rows, found = jax.random.split(jax.random.key(5), 10 if quick else 40), {}, []
+    for count in NEEDED[: 2 if quick else None]:
+        fast, particles, ratio = rmse_of_fastslam(count, SHORT, keys), 8, np.inf
+        while ratio > WITHIN and particles < MOST:
+            particles *= 2
+            ratio = rmse_of(count, particles, SHORT, keys) / fast
+        rows[f"{count} landmarks"] = {
+            "needed particles": f"{particles:,}" if ratio <= WITHIN else f"over {MOST:,}",
+            "map RMSE over FastSLAM's": ratio,
+            "of FastSLAM [m]": fast,
+        }
+        found.append(particles)
+    show(f"{len(keys)} runs, {SHORT} scans, RMSE within {WITHIN} of FastSLAM's", rows)
+    factor = float((found[-1] / found[0]) ** (1 / (len(found) - 1)))
+    if not quick:
+        draw(found, factor)
+    what = "plain particles: needed number, factor of one more landmark"
+    return [Metric(what, factor, low=2.0)]
 
 
 def measure(quick: bool = False) -> list[Metric]:
@@ -106,4 +172,5 @@ def measure(quick: bool = False) -> list[Metric]:
     show(f"{runs} runs, {PARTICLES} particles, {STEPS} steps", rows)
     first, *_, last = (row["map RMSE [m]"] / row["of FastSLAM [m]"] for row in rows.values())
     what = "plain particles: map RMSE over FastSLAM's"
-    return [Metric(f"{what}, 1 landmark", first), Metric(f"{what}, 20 landmarks", last, low=1.5)]
+    fixed = [Metric(f"{what}, 1 landmark", first), Metric(f"{what}, 20 landmarks", last, low=1.5)]
+    return fixed + needed(quick)
