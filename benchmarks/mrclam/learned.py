@@ -1,6 +1,6 @@
 """Does learned noise help? `examples/learned_noise.py` on five robots of MRCLAM 6.
 
-The systematic errors of each robot are those that its own log tells (`mrclam_calibration`). Rows of
+The systematic errors of each robot are those that its own log tells (`datasets.fit`). Rows of
 a log are its scans, and others a quarter of a second apart; measurements beyond 5 σ of the noise of
 `MRCLAM_CALIBRATION` are left out, the same ones for all. Then three noises, found on robots 1 and 2
 by the filter's likelihood: constant ones (`fit_noise`), and networks trained on the whole logs, and
@@ -18,6 +18,7 @@ import numpy as np
 
 import jaxslam
 from benchmarks.gate import Metric, save, table
+from benchmarks.mrclam.benchmark import own_log
 from benchmarks.mrclam.replays import from_first_scan
 from benchmarks.real_data import DATA
 from jaxslam import charts, datasets
@@ -69,20 +70,28 @@ class Robot(NamedTuple):
     cov: np.ndarray
 
 
+def without_errors(log: Any, own: Any) -> Any:
+    """The log with travel, turn and ranges corrected, whose noise is left."""
+    control = jax.vmap(own.motion.control)(jnp.asarray(log.control))
+    z = np.array(log.scan.z)
+    z[..., 0] /= own.depth * np.cos(z[..., 1] - own.axis)
+    return log._replace(control=np.asarray(control), scan=log.scan._replace(z=z))
+
+
 def read(folder: Path, robot: int) -> Robot:
-    own = datasets.mrclam_calibration(folder, robot).robot
+    own = own_log(folder, robot).robot
     data = datasets.mrclam(folder, robot, calibration=own)
     first, log = from_first_scan(data)
-    rows, short = thinned(log, data.time[first:])
-    cov = own.odometry_cov()
+    rows, short = thinned(without_errors(log, own), data.time[first:])
+    cov, camera = own.motion.motion.noise_cov, own.sensor.sensor
     motion = jaxslam.motion.Velocity(lambda pose, u: jnp.zeros((3, 3)).at[:2, :2].set(cov(pose, u)))
     options = {"gate": sigma_gate(5.0), "chart": charts.RightInvariant()}
-    ekf = jaxslam.filters.EkfSlam(motion, data.sensor, CAPACITY, **options)
+    ekf = jaxslam.filters.EkfSlam(motion, camera, CAPACITY, **options)
     path = data.true_path[first:][rows]
     found = jaxslam.run(ekf, short, path[0], data.pose_cov, jax.random.key(0))
     clean = jax.tree.map(np.asarray, as_associated(short, found.info))
     known = data.true_at[first:][rows]
-    return Robot(clean, data.time[first:][rows], path, known, own.mount, data.pose_cov)
+    return Robot(clean, data.time[first:][rows], path, known, camera.mount, data.pose_cov)
 
 
 def stacked(robots: list[Robot], span: float = np.inf) -> tuple[Log, np.ndarray, np.ndarray]:
