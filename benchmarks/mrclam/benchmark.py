@@ -154,24 +154,22 @@ class Own(NamedTuple):
 
     robot: RobotCalibration
     cov: np.ndarray
-    """of all fields, 0 of those that are held"""
+    """of the adjustable ones, 0 of those that are held"""
 
 
 def own_log(folder, robot):
     data = datasets.mrclam(folder, robot, calibration=MRCLAM_CALIBRATION)
     # The log alone: no pose of the truth, in no frame but the robot's.
     data = replace(data, pose=np.zeros(3), pose_cov=np.zeros((3, 3)))
-    found = datasets.fit(data, calibrate=GROUPS, fixed=("noise",), options={"gate": GATE})
-    assert found.found.converged
-    assert found.settled
-    return Own(RobotCalibration(*found.values.tolist()), found.cov)
+    found = datasets.fit(data, calibrate=GROUPS, options={"gate": GATE})
+    return Own(MRCLAM_CALIBRATION._replace(**found.by_name), found.cov)
 
 
-def scaled(own, scale):
+def scaled(own, names, scale):
     """The covariance with an unknown scale of the world, of a relative standard deviation."""
-    larger = own.robot._replace(**dict.fromkeys(own.robot._fields, 0.0))
     grow = {name: getattr(own.robot, name) for name in ("forward", "outer", "ahead")}
-    direction = np.array(larger._replace(**grow, depth=-own.robot.depth))
+    grow["depth"] = -own.robot.depth
+    direction = np.array([grow.get(name, 0.0) for name in names])
     return own.cov + scale**2 * np.outer(direction, direction)
 
 
@@ -184,7 +182,8 @@ def own_constants(folder, robot, own, scale, estimator):
     data = datasets.mrclam(folder, robot, calibration=own.robot)
     row, _ = from_first_scan(data)
     go = estimator(data, row)
-    cov, p = scaled(own, scale), np.array(own.robot)
+    names = [parameter.name for parameter in data.adjustable.parameters]
+    cov, p = scaled(own, names, scale), data.adjustable.values
     uncertain = np.flatnonzero(np.diag(cov))
 
     def trace(changed):

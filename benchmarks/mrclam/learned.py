@@ -71,11 +71,9 @@ class Robot(NamedTuple):
 
 
 def without_errors(log: Any, own: Any) -> Any:
-    """The log with travel, turn and ranges corrected, whose noise is left."""
+    """The log with travel and turn corrected, whose noise is left."""
     control = jax.vmap(own.motion.control)(jnp.asarray(log.control))
-    z = np.array(log.scan.z)
-    z[..., 0] /= own.depth * np.cos(z[..., 1] - own.axis)
-    return log._replace(control=np.asarray(control), scan=log.scan._replace(z=z))
+    return log._replace(control=np.asarray(control))
 
 
 def read(folder: Path, robot: int) -> Robot:
@@ -83,7 +81,7 @@ def read(folder: Path, robot: int) -> Robot:
     data = datasets.mrclam(folder, robot, calibration=own)
     first, log = from_first_scan(data)
     rows, short = thinned(without_errors(log, own), data.time[first:])
-    cov, camera = own.motion.motion.noise_cov, own.sensor.sensor
+    cov, camera = own.motion.motion.noise_cov, own.sensor
     motion = jaxslam.motion.Velocity(lambda pose, u: jnp.zeros((3, 3)).at[:2, :2].set(cov(pose, u)))
     options = {"gate": sigma_gate(5.0), "chart": charts.RightInvariant()}
     ekf = jaxslam.filters.EkfSlam(motion, camera, CAPACITY, **options)

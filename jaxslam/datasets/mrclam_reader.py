@@ -9,7 +9,6 @@ import numpy as np
 
 from jaxslam.core.logs.streams import Rows, hold
 from jaxslam.core.noise import NoiseCov
-from jaxslam.core.protocols import Sensor
 from jaxslam.core.types import Log
 from jaxslam.datasets.dataset import Dataset
 from jaxslam.datasets.lines import stored
@@ -28,7 +27,7 @@ from jaxslam.datasets.mrclam_robot import (
     true_fields,
 )
 from jaxslam.filters.multi_robot.team import Robot, TeamMotion, sensors_of
-from jaxslam.sensors import Corrected, Part, Suite
+from jaxslam.sensors import Part, Suite
 
 
 def mrclam(
@@ -66,10 +65,9 @@ def mrclam(
         fitted = fit(
             mrclam(folder, 5, calibration=MRCLAM_CALIBRATION),
             calibrate=("scale", "wheels", "mount", "axis"),
-            fixed=("noise",),
             options={"gate": stats.sigma_gate(5.0)},
         )
-        data = mrclam(folder, 5, calibration=RobotCalibration(*fitted.values))
+        data = mrclam(folder, 5, calibration=MRCLAM_CALIBRATION._replace(**fitted.by_name))
 
     Larger ranges and odometry in proportion give the same log of a larger world, so that `depth`
     sets the scale of the map. The default is without a gate; a gate at 5 σ changes the maps by
@@ -171,7 +169,7 @@ def mrclam_team(
     models = {one: models_of(one) for one in set(each)}
     sights = {one: eye for one, (_, eye) in models.items()}
     if sighting_cov is not None:
-        sights = {one: _with_noise(eye, sighting_cov) for one, eye in sights.items()}
+        sights = {one: replace(eye, noise_cov=sighting_cov) for one, eye in sights.items()}
     for robot, lines, constants in zip(numbers, files, each, strict=True):
         (model, eye), sight = models[constants], sights[constants]
         row, tag, kept, lost = associated(lines.seen, time, subject_of, names + numbers)
@@ -215,10 +213,3 @@ def mrclam_team(
         robots=tuple(team),
         **true_fields(files, time),
     )
-
-
-def _with_noise(sensor: Sensor, noise_cov: NoiseCov) -> Sensor:
-    """A camera with another noise, below its systematic errors if it has them."""
-    if isinstance(sensor, Corrected):
-        return replace(sensor, sensor=replace(sensor.sensor, noise_cov=noise_cov))
-    return replace(sensor, noise_cov=noise_cov)

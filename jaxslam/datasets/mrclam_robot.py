@@ -10,12 +10,12 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from jaxslam import motion, sensors
+from jaxslam import motion
 from jaxslam.calibration import delayed
 from jaxslam.core.logs.streams import hold, interpolate_poses
 from jaxslam.core.numbers import is_concrete
 from jaxslam.core.protocols import Motion, Sensor
-from jaxslam.core.types import Log
+from jaxslam.core.types import JaxOrNumPy, Log
 from jaxslam.datasets.dataset import Adjustable, Parameter
 from jaxslam.datasets.lines import TextFile, stored
 from jaxslam.motion import Unicycle, WhiteNoise
@@ -120,10 +120,14 @@ class RobotCalibration(NamedTuple):
     """The systematic errors of a robot's odometry and camera, and the noise that remains.
 
     A recorded velocity at time t moves the robot at time t + delay, with the errors of
-    `motion.Corrected`. The camera is at (ahead, 0, yaw) on the robot. What it records as the range
-    is `depth` times the depth along the optical axis, which has the bearing `axis`
-    (`sensors.Corrected`), as the height of a barcode in the image gives it. Noise is that of
-    `motion.WhiteNoise` and `sensors.RangeBearingNoise`. Fields may be traced.
+    `motion.Corrected`. The camera is at (ahead, 0, yaw) on the robot. Its range r is `depth` times
+    the depth along the optical axis, as the height of a barcode in the image gives it. That axis
+    has the bearing `axis`, so that with the recorded bearing φ the range is
+
+        r' = r / (depth cos(φ - axis))
+
+    Noise, of r' and φ, is that of `motion.WhiteNoise` and `sensors.RangeBearingNoise`. Fields may
+    be traced.
     """
 
     delay: float
@@ -160,11 +164,14 @@ class RobotCalibration(NamedTuple):
 
     @property
     def sensor(self) -> Sensor:
-        """The camera, with its recorded measurements."""
+        """The camera, of corrected ranges."""
         noise = RangeBearingNoise(0.0, self.bearing_noise, share=self.range_share)
-        mount = _stacked(self.ahead, 0.0, self.yaw)
-        line = _stacked(self.depth, 0.0)
-        return sensors.Corrected(RangeBearing(noise, mount=mount), line, self.axis)
+        return RangeBearing(noise, mount=_stacked(self.ahead, 0.0, self.yaw))
+
+    def range_factor(self, bearing: JaxOrNumPy) -> JaxOrNumPy:
+        """Recorded over corrected range at a bearing, depth cos(φ - axis)."""
+        cos = np.cos if is_concrete(self.axis) else jnp.cos
+        return self.depth * cos(bearing - self.axis)
 
 
 def _stacked(*numbers: float) -> ArrayLike:
@@ -187,22 +194,28 @@ GROUPS = {
     "yaw": "mount",
     "axis": "axis",
 }
-"""What a field is for `fit`; others are noises."""
+"""What a field is for `fit`. Noises are held: a likelihood of ranges that depend on constants is
+of other data for each, and innovations weighted by a given noise are not."""
 
 
 def adjustable(calibration: RobotCalibration, log: Log, time: Float[np.ndarray, "T"]) -> Adjustable:
-    """Log and models as functions of the fields of a calibration, in their order."""
+    """Log and models as functions of the systematic errors of a calibration, in its order."""
     controls = calibration.motion.controls
     parameters = tuple(
-        Parameter(field, float(value), GROUPS.get(field, "noise"), ("calibration", field))
+        Parameter(field, float(value), GROUPS[field], ("calibration", field))
         for field, value in calibration._asdict().items()
+        if field in GROUPS
     )
+    bearing = np.asarray(log.scan.z[..., 1])
+    recorded = np.asarray(log.scan.z[..., 0]) * calibration.range_factor(bearing)
 
     def at(p: jax.Array) -> tuple[Log, Motion, Sensor]:
-        found = RobotCalibration(*p)
+        found = RobotCalibration(*p, *calibration[len(GROUPS) :])
         # Odometry is moved by the delay of the reader; what is left is of measurements before it.
         moved = delayed(log, time, controls, found.delay - calibration.delay)
-        return moved, found.motion, found.sensor
+        ranges = jnp.asarray(recorded) / found.range_factor(jnp.asarray(bearing))
+        z = jnp.stack([ranges, jnp.asarray(bearing)], axis=-1)
+        return moved._replace(scan=log.scan._replace(z=z)), found.motion, found.sensor
 
     return Adjustable(parameters, at)
 
@@ -301,7 +314,8 @@ DROP_REASONS = ("robot sightings", "unknown barcodes", "repeated in a scan")
 
 
 class Recorded(NamedTuple):
-    """The content of the files of a robot, its odometry delayed if a calibration is given."""
+    """The content of the files of a robot; with a calibration odometry is delayed, and ranges are
+    corrected."""
 
     odometry: Float[np.ndarray, "K 3"]
     seen: Float[np.ndarray, "J 4"]
@@ -312,8 +326,8 @@ class Recorded(NamedTuple):
 def read_lines(folder: Path, robot: int, calibration: RobotCalibration | None) -> Recorded:
     """The lines of a robot, its true path, and descriptions of the corrections.
 
-    With a calibration, odometry is at the times when the robot moves. Raises ValueError on a
-    bearing beyond a right angle, behind the image plane of a calibrated camera.
+    With a calibration, odometry is at the times when the robot moves, and ranges are corrected.
+    Raises ValueError on a bearing beyond a right angle, behind the image plane of the camera.
     """
     odometry, seen = read_robot(folder, robot)
     truth, corrections = read_truth(folder, robot), []
@@ -329,6 +343,7 @@ def read_lines(folder: Path, robot: int, calibration: RobotCalibration | None) -
         if beyond.any():
             bearing = seen[beyond, 3][0]
             raise ValueError(f"Calibration: expected bearings below π/2, got {bearing}")
+        seen[:, 2] /= calibration.range_factor(seen[:, 3])
     return Recorded(odometry, seen, truth, tuple(corrections))
 
 

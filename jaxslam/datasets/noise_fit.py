@@ -8,8 +8,9 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from jaxslam import calibration
 from jaxslam.association.rules import Known
-from jaxslam.calibration import NoiseFit, as_associated, fit_noise
+from jaxslam.calibration import Calibration, NoiseFit, as_associated, fit_noise
 from jaxslam.charts import RightInvariant
 from jaxslam.core.logs.tables import split_unit
 from jaxslam.core.types import Info, Scan, Status
@@ -48,6 +49,11 @@ class DatasetFit(NamedTuple):
         """The numbers of all parameters."""
         return np.array([parameter.value for parameter in self.parameters])
 
+    @property
+    def by_name(self) -> dict[str, float]:
+        """The same by their names without units."""
+        return {split_unit(name)[0]: value for name, value, *_ in self.parameters}
+
 
 _ROUNDS = 5
 """Largest number of rounds of association and fit."""
@@ -67,8 +73,11 @@ def fit(
     the used measurements. Both are repeated, up to 5 times, until the decisions do not
     change; with known tags and without a gate that is after one round. A gate also cuts the tail of
     good measurements, so the noises come out a little too small: use a gate of 0.999 or more, or
-    none. Of point landmarks the error coordinates are right-invariant, unless the options say
-    others: the plain EKF gains heading that nothing measured, and fits its noise to it.
+    none. If all noises are held, `calibration.calibrate` weights the innovations by them instead,
+    and decides anew at each step: a likelihood would prefer constants with which a noise that is
+    too large comes out smaller. Of point landmarks the error coordinates are right-invariant,
+    unless the options say others: the plain EKF gains heading that nothing measured, and fits its
+    noise to it.
 
     Truth and survey are not used, except for the pose at the start. A deviation of 0 is held.
 
@@ -85,7 +94,8 @@ def fit(
     models = data.adjustable
     if models is None:
         raise ValueError(f"fit: expected a data set with adjustable noises, got {data.name}")
-    free = _free(models.parameters, tuple(calibrate), tuple(fixed))
+    groups = tuple(calibrate)
+    free = _free(models.parameters, groups, tuple(fixed))
     start, key = models.values, jax.random.key(0)
     names = [parameter.name for parameter in models.parameters]
     noise = np.array([parameter.group == "noise" for parameter in models.parameters])
@@ -93,10 +103,13 @@ def fit(
     chosen = chart | data.filter_options | (options or {})
     decided = chosen | {"gate": None, "associate": Known()}
 
-    def run_with(parameters: jax.Array, options: EkfOptions, scan: Scan) -> Info:
+    def run_with(parameters: jax.Array, options: EkfOptions, used: Scan | None) -> Info:
+        """used: a scan with the tags and measurements to use; None for those of the log."""
         log, motion, sensor = models.at(parameters)
+        if used is not None:
+            log = log._replace(scan=log.scan._replace(tag=used.tag, valid=used.valid))
         method = EkfSlam(motion, sensor, data.capacity, **options)
-        return run(method, log._replace(scan=scan), data.pose, data.pose_cov, key).info
+        return run(method, log, data.pose, data.pose_cov, key).info
 
     def info(p: jax.Array, scan: Scan) -> Info:
         return run_with(jnp.asarray(start, p.dtype).at[free].set(p), decided, scan)
@@ -104,12 +117,22 @@ def fit(
     def decide(parameters: np.ndarray) -> Info:
         # In the precision of the log, whatever that of the parameters.
         held = jnp.asarray(parameters, jnp.asarray(data.log.control).dtype)
-        found: Info = jax.device_get(run_with(held, chosen, data.log.scan))
+        found: Info = jax.device_get(run_with(held, chosen, None))
         return found
 
     parameters = start.copy()
-    info_of_log = decide(parameters)
-    settled, taken = False, 0
+    info_of_log = before_fit = decide(parameters)
+    settled, taken = not noise[free].any(), 0
+    if settled:
+
+        def decided_anew(p: jax.Array) -> Info:
+            held = jnp.asarray(start, p.dtype).at[free].set(p)
+            return run_with(held, chosen, None)
+
+        calibrated = calibration.calibrate(decided_anew, start[free])
+        parameters[free] = calibrated.parameters
+        info_of_log = decide(parameters)
+        found = _as_fit(calibrated, [names[i] for i in free], before_fit, info_of_log)
     while taken < _ROUNDS and not settled:
         taken += 1
         scan = as_associated(data.log, info_of_log).scan
@@ -141,7 +164,7 @@ def fit(
         held={
             names[i]: float(start[i])
             for i in np.flatnonzero(~fitted)
-            if noise[i] or models.parameters[i].group in calibrate
+            if noise[i] or models.parameters[i].group in groups
         },
         used=outcome["fused"] + outcome["born"],
         left_out={name: n for name, n in outcome.items() if n and name not in kept},
@@ -170,6 +193,32 @@ def autocorrelation(info: Info) -> tuple[float, float]:
         return np.nan, np.nan
     found = np.sum(one * other) / np.sqrt(np.sum(one**2) * np.sum(other**2))
     return float(found), normal_quantile(0.975) / float(np.sqrt(one.size))
+
+
+def _as_fit(found: Calibration, names: list[str], before: Info, after: Info) -> NoiseFit:
+    """The result of `calibrate` in the form of `fit_noise`, with what it found both runs to be."""
+
+    def nis_per_dof(info: Info) -> tuple[float, int]:
+        fused = np.asarray(info.status) == Status.FUSED
+        dof = int(np.asarray(info.dof)[fused].sum())
+        return float(np.asarray(info.nis)[fused].sum() / max(dof, 1)), dof
+
+    error = np.sqrt(np.diag(found.cov))
+    return NoiseFit(
+        names=tuple(names),
+        start=found.path[0],
+        parameters=found.parameters,
+        error=error,
+        robust_error=error,
+        cov=found.cov,
+        log_likelihood=(float(before.log_likelihood.sum()), float(after.log_likelihood.sum())),
+        nis_per_dof=(nis_per_dof(before)[0], nis_per_dof(after)[0]),
+        dof=nis_per_dof(after)[1],
+        path=found.path,
+        converged=found.converged,
+        upper={},
+        loose={},
+    )
 
 
 def _free(

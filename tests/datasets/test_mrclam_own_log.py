@@ -1,5 +1,6 @@
 """A robot's systematic errors found in its own log: a log simulated with known ones."""
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from recordings import TEAM, write
@@ -84,28 +85,39 @@ GROUPS = ("scale", "wheels", "mount", "axis")
 @pytest.mark.sweep
 def test_the_constants_of_a_simulated_robot_are_found(tmp_path):
     data = datasets.mrclam(write(tmp_path, recorded()), 1, calibration=KNOWN)
-    own = datasets.fit(data, calibrate=GROUPS, fixed=("noise", "depth"))
+    own = datasets.fit(data, calibrate=GROUPS)
     assert own.found.converged and own.settled
     assert own.found.names == ("forward", "outer", "turn", "curvature", "ahead", "yaw", "axis")
     true = np.array([getattr(TRUE, name) for name in own.found.names])
     error = own.found.parameters - true
     assert error @ np.linalg.solve(own.found.cov, error) < 20.0  # 7 degrees of freedom: p = 0.006
     assert (np.abs(own.found.start - true) > 4 * own.found.error).all()  # something to find
-    robot = RobotCalibration(*own.values)
-    found = dict(zip(own.found.names, own.found.parameters, strict=True))
-    np.testing.assert_array_equal(robot, KNOWN._replace(**found))
+    robot = KNOWN._replace(**own.by_name)
+    assert [getattr(robot, name) for name in own.found.names] == own.found.parameters.tolist()
+    assert robot.depth == KNOWN.depth and robot.delay == KNOWN.delay
     np.testing.assert_array_equal(own.cov[1:5, 1:5], own.found.cov[:4, :4])
-    assert (own.cov[5] == 0).all() and (own.cov[9:] == 0).all()  # of depth, and of noises
+    assert (own.cov[5] == 0).all()  # of depth, which is held
     assert own.found.nis_per_dof[1] == pytest.approx(1.0, abs=0.15)
+    # The reader with these constants gives the log and the models of the fit.
+    again = datasets.mrclam(tmp_path, 1, calibration=robot)
+    log, motion, sensor = data.adjustable.at(jnp.asarray(own.values))
+    np.testing.assert_allclose(log.scan.z, again.log.scan.z, rtol=1e-12)
+    np.testing.assert_allclose(log.control, again.log.control, rtol=1e-9, atol=1e-9)
+    u = np.array([0.2, -0.3, 0.5])
+    moved = motion.step(np.zeros(3), u, np.zeros(2)), again.motion.step(np.zeros(3), u, np.zeros(2))
+    np.testing.assert_allclose(*moved, rtol=1e-6)
+    np.testing.assert_allclose(sensor.mount, again.sensor.mount, rtol=1e-12)
 
 
 def test_a_larger_world_has_the_same_log():
-    """Twice the range, recorded by a camera twice as far off with half the depth, and twice the travel."""
+    """Twice the range of half the depth, seen by a camera twice as far off, and twice the travel."""
     twice = TRUE._replace(
         forward=2 * TRUE.forward, outer=2 * TRUE.outer, ahead=2 * TRUE.ahead, depth=TRUE.depth / 2
     )
     pose, point, u = np.array([0.0, 0.0, 0.3]), np.array([2.0, 1.0]), np.array([0.2, -0.3, 0.5])
-    seen, again = TRUE.sensor.observe(pose, point), twice.sensor.observe(pose, 2 * point)
-    np.testing.assert_allclose(seen, again, rtol=1e-6)
+    near, far = TRUE.sensor.observe(pose, point), twice.sensor.observe(pose, 2 * point)
+    np.testing.assert_allclose(far, near * np.array([2.0, 1.0]), rtol=1e-6)
+    recorded = [z[0] * robot.range_factor(z[1]) for z, robot in ((near, TRUE), (far, twice))]
+    np.testing.assert_allclose(*recorded, rtol=1e-6)
     moved, farther = (robot.motion.step(pose, u, np.zeros(2)) for robot in (TRUE, twice))
     np.testing.assert_allclose(farther, moved * np.array([2.0, 2.0, 1.0]), rtol=1e-6)

@@ -122,13 +122,11 @@ def test_a_calibration_models_what_a_robot_recorded(tmp_path):
     moved = data.motion.step(jnp.zeros(3), jnp.array([0.5, 0.125, 1.0]), jnp.zeros(2))
     np.testing.assert_allclose(moved, [2 * 0.5 - 0.5 * 0.125, 0.0, 0.0625], rtol=1e-6)
     z, seen = raw.log.scan.z[raw.log.scan.valid], data.log.scan.z[data.log.scan.valid]
-    np.testing.assert_array_equal(seen, z)
-    # A camera 0.1 m ahead and turned by 0.2 rad sees a point 1.1 m ahead at 1 m and -0.2 rad, and
-    # records twice the depth along its axis.
+    np.testing.assert_allclose(seen[:, 0], z[:, 0] / np.cos(z[:, 1] - 0.05) / 2)
+    np.testing.assert_array_equal(seen[:, 1], z[:, 1])
+    # A camera 0.1 m ahead and turned by 0.2 rad sees a point 1.1 m ahead at 1 m and -0.2 rad.
     found = data.sensor.observe(jnp.zeros(3), jnp.array([1.1, 0.0]))
-    np.testing.assert_allclose(found, [2 * np.cos(0.25), -0.2], atol=1e-6)
-    back = data.sensor.invert(jnp.zeros(3), found, jnp.zeros(0))
-    np.testing.assert_allclose(back, [1.1, 0.0], atol=1e-6)
+    np.testing.assert_allclose(found, [1.0, -0.2], atol=1e-6)
 
 
 def test_a_later_delay_is_a_log_of_later_odometry(tmp_path):
@@ -136,7 +134,7 @@ def test_a_later_delay_is_a_log_of_later_odometry(tmp_path):
     read = write(tmp_path, MRCLAM)
     data = datasets.mrclam(read, 2, calibration=PLAIN)
     later = datasets.mrclam(read, 2, calibration=PLAIN._replace(delay=0.5))
-    moved, _, _ = data.adjustable.at(jnp.array(PLAIN._replace(delay=0.5)))
+    moved, _, _ = data.adjustable.at(jnp.asarray(data.adjustable.values).at[0].set(0.5))
 
     def travelled(log, time):
         return time - EPOCH, np.cumsum(log.control[:, :2] * log.control[:, 2:], axis=0)
