@@ -49,6 +49,7 @@ BENCHMARKS = {
     "graph_bicocca": "graphs.bicocca",
     "false_loops": "graphs.false_loops",
     "graph_speed": "graphs.speed",
+    "alternatives": "alternatives",
     "fastslam": "fastslam",
     "plain_particles": "plain_particles",
     "grids": "grids.benchmark",
