@@ -182,7 +182,7 @@ def with_dynamax(world, log):
     def observe(state, row):
         tag, valid = row[3:].reshape(2, places)
         c, s = jnp.cos(state[2]), jnp.sin(state[2])
-        offset = landmarks[tag.astype(int)] - state[:2]
+        offset = landmarks[tag.astype(int)] - state[None, :2]
         z = offset @ jnp.array([[c, -s], [s, c]])
         return jnp.where(valid[:, None] > 0, z, 0.0).ravel()
 
