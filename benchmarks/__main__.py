@@ -51,6 +51,7 @@ BENCHMARKS = {
     "false_loops": "graphs.false_loops",
     "graph_speed": "graphs.speed",
     "graph_crossover": "graphs.crossover",
+    "alternatives": "alternatives",
     "fastslam": "fastslam",
     "plain_particles": "plain_particles",
     "grids": "grids.benchmark",
