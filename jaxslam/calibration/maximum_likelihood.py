@@ -106,6 +106,10 @@ def _standard_errors(
 _LOOSE = 1.0
 """Standard error of log σ above which a log does not determine σ: a factor e either way."""
 
+_INFLATED = 20.0
+"""Standard error over that with all other parameters known, above which a log determines a
+parameter only together with others."""
+
 
 _POLISH = 5
 """Newton's steps with the observed information at most."""
@@ -245,7 +249,9 @@ def fit_noise(
     cov, robust, related = _standard_errors(kept, here.spread)
     deviations = np.where(logged, np.exp(here.q), 1.0)
     error = np.sqrt(np.diag(cov))
+    alone = np.sqrt(np.maximum(np.diag(kept), 0.0))  # 1 / the error with the others known
     wide = ~np.isfinite(error) | (logged & (error > _LOOSE))
+    wide |= np.where(alone > 0, error, 0.0) * alone > _INFLATED
     loose = set(np.flatnonzero(wide & ~falling).tolist())
     return NoiseFit(
         names=labels,

@@ -67,12 +67,15 @@ def fit_folder(options: argparse.Namespace, command: str) -> int:
         FITTED: fitted,
     }
     written = write_files(options.out, files)
-    good = result.found.converged and result.settled
+    confounded = [one.name for one in result.parameters if one.group != "noise"]
+    confounded = [name for name in confounded if name in result.found.loose]
+    good = result.found.converged and result.settled and not confounded
     if options.write and good:
         written += write_files(Path(options.path), {FITTED: fitted})
     print("\nwrote " + ", ".join(map(str, written)))
     if options.write and not good:
-        print(f"{FITTED} was not written into {options.path}: the fit did not converge")
+        reason = f"hold {' or '.join(confounded)}" if confounded else "the fit did not converge"
+        print(f"{FITTED} was not written into {options.path}: {reason}")
     elif not options.write:
         print(
             f"use --write to write {FITTED} into {options.path}, too, where it replaces numbers of "
@@ -190,7 +193,9 @@ def _notes(result: DatasetFit) -> list[str]:
             "successive innovations of a landmark are correlated: errors last, so standard errors "
             "are too small"
         )
-    notes.append(
-        "NIS / dof is near 1 after any fit of all noises; test them on another log (jaxslam run)"
-    )
+    if any(name.startswith(("motion ", "sensor ")) for name in found.names):
+        notes.append(
+            "NIS / dof is near 1 after any fit of all noises; test them on another log (jaxslam "
+            "run)"
+        )
     return notes

@@ -188,3 +188,13 @@ def test_a_largest_range_that_repeats_is_noted(tmp_path):
     (folder / "dataset.toml").write_text(SETTINGS.replace("max_range = 5.0\n", ""))
     (note,) = [line for line in datasets.table(folder).assumed if "max_range" in line]
     assert "ranges are 5 m, the largest" in note
+
+
+@pytest.mark.sweep
+def test_what_is_seen_only_together_is_named_and_not_written(tmp_path, capsys):
+    folder = write(tmp_path, 120)
+    command = ["fit", str(folder), "--calibrate", "heading,mount"]
+    assert cli.main([*command, "--write", "--out", str(tmp_path / "o")]) == 0
+    printed = capsys.readouterr().out
+    assert "heading [rad]: the log does not determine it (only together with mount" in printed
+    assert "was not written into" in printed and not (folder / "fit.toml").exists()

@@ -93,6 +93,17 @@ def confounded(p, x):
     return of(x - p[2], p[0] ** 2 + p[1] ** 2 + 0 * x)
 
 
+def summed(p, x):
+    """The mean is the sum of two parameters, up to a millionth."""
+    return of(x - p[1] - p[2] * (1 + 1e-6 * jnp.cos(x)), jnp.full(x.shape, p[0] ** 2))
+
+
+def test_parameters_of_which_only_a_sum_is_seen_are_named_together():
+    found = fit_noise(summed, [1.0, 0.1, 0.2], X, names=("s", "b", "c"), deviation=[1, 0, 0])
+    assert found.loose == {"b": ("c",), "c": ("b",)}
+    np.testing.assert_allclose(found.parameters[1:].sum(), X.mean(), atol=1e-3)
+
+
 def test_noises_that_are_told_apart_by_nothing_are_named_together():
     found = fit_noise(confounded, [0.5, 0.7, 1.0], X, names=("a", "b", "c"), deviation=[1, 1, 0])
     assert found.loose == {"a": ("b",), "b": ("a",)}
