@@ -73,7 +73,7 @@ def filtered(data, chart):
     fused = trace.info.status == Status.FUSED
     path = metrics.ate(data.true_path[known], trace.estimate.pose[known], align=False)
     row = {
-        "measurements": data.measurements,
+        "measurements": f"{data.measurements:,}",
         "ATE [m]": metrics.statistics(path.translation).rmse,
         "heading [deg]": np.rad2deg(np.sqrt((error[known, 2] ** 2).mean())),
         "NEES, median": float(np.median(nees[known])),
