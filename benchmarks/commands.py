@@ -17,9 +17,13 @@ OF_WHEEL = {
     "jaxslam verify": "verify --states 4 --out verified",
 }
 FUZZED = {
-    "logs": "tests/conformance/test_fuzzed_logs.py",
-    "files": "tests/datasets/test_mutated.py",
+    "logs": ("tests/conformance/test_fuzzed_logs.py", 20),
+    "files, bytes changed": ("tests/datasets/test_mutated.py", 50),
+    "files of a grammar": ("tests/datasets/test_grammars.py", 50),
+    "ROS bags": ("tests/datasets/test_fuzzed_bags.py", 50),
+    "campaigns": ("tests/results/test_fuzzed_store.py", 50),
 }
+"""File of tests, and how many times as many examples as in the suite; 200 there are of a reader."""
 
 
 def measure(quick: bool = False) -> list[Metric]:
@@ -71,12 +75,14 @@ def wheel(quick: bool = False) -> list[Metric]:
 
 
 def fuzz(quick: bool = False) -> list[Metric]:
-    """The suite's fuzzed tests with 20 times as many examples: logs of any numbers through every
-    filter of the catalogue, and files of every reader with a few bytes changed."""
+    """The suite's fuzzed tests with more examples, 10,000 files for each reader: logs of any
+    numbers through every filter of the catalogue; files with bytes changed and bits flipped, and
+    files of a grammar with odd words, which a reader answers or refuses in one line of ValueError,
+    within 10 s and ten times the memory of the file."""
     metrics = []
-    for what, path in FUZZED.items():
+    for what, (path, times) in FUZZED.items():
         command = [sys.executable, "-m", "pytest", "-q", "-p", "no:cacheprovider", path]
-        env = os.environ | {"JAXSLAM_FUZZ": "2" if quick else "20"}
+        env = os.environ | {"JAXSLAM_FUZZ": str(2 if quick else times)}
         done = subprocess.run(command, cwd=ROOT, env=env, stdout=subprocess.PIPE, text=True)
         said = done.stdout.splitlines()
         print("\n".join(said if done.returncode else said[-1:]), flush=True)
