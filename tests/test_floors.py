@@ -23,7 +23,7 @@ FLOORS = [
     "motion sensors charts linearize association resampling life",
     "driver filters graphs laser simulation",
     "consistency verify catalog calibration",
-    "datasets results cli __main__",
+    "datasets results cli selftest __main__",
 ]
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names.split()}
 FLOOR[""] = len(FLOORS)  # jaxslam/__init__.py sees everything, and nothing sees it
