@@ -41,8 +41,8 @@ WITHIN_CALLS = {
 KEPT = {
     "matplotlib": ("results.plot", "datasets.ros_map"),
     "argparse": ("cli",),
-    # verify: float64 within a block, then as before; remote: in a worker, as where it is called
-    "jax.config": ("cli", "__main__", "verify", "consistency.campaign.remote"),
+    # arrays: float64 within a block, then as before; remote: in a worker, as where it is called
+    "jax.config": ("cli", "__main__", "math.arrays", "consistency.campaign.remote"),
 }
 # Left as it is: the decorator that pages import.
 SHADOWED = ["core.record.record"]
