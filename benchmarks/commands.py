@@ -39,23 +39,33 @@ def measure(quick: bool = False) -> list[Metric]:
 
 
 def wheel(quick: bool = False) -> list[Metric]:
-    """Builds the wheel, installs it with its dependencies from pip's index into a new environment,
-    and runs both commands there with an empty PYTHONPATH. Left out where pip has no index."""
+    """Builds the sdist, and the wheel from it; twine and check-wheel-contents check them.
+    Installs the wheel with its dependencies from pip's index into a new environment, and runs the
+    commands and the selftest there with an empty PYTHONPATH. Left out where pip has no index."""
     with tempfile.TemporaryDirectory() as name:
         folder = Path(name)
-        pip = [sys.executable, "-m", "pip", "--quiet", "--disable-pip-version-check"]
-        build = [*pip, "wheel", "--no-deps", "--wheel-dir", str(folder), str(ROOT)]
+        build = [sys.executable, "-m", "build", "--outdir", str(folder), str(ROOT)]
         built = subprocess.run(build, capture_output=True, text=True)
-        if built.returncode and "No matching distribution" in built.stderr:
+        if built.returncode and "No matching distribution" in built.stdout + built.stderr:
             print("left out: pip has no index from which to build")
             return []
         if built.returncode:
-            raise RuntimeError(built.stderr)
-        (file,) = folder.glob("*.whl")
+            raise RuntimeError(built.stdout + built.stderr)
+        (file,), (source,) = folder.glob("*.whl"), folder.glob("*.tar.gz")
         with zipfile.ZipFile(file) as content:
             names = [n for n in content.namelist() if not n.endswith("/")]
         print(f"{file.name}: {file.stat().st_size:,} bytes, {len(names)} files")
+        print(f"{source.name}: {source.stat().st_size:,} bytes")
         strange = [n for n in names if not n.startswith("jaxslam") or "/tests/" in n]
+        beside = Path(sys.executable).parent
+        checked = {
+            "twine check": [sys.executable, "-m", "twine", "check", "--strict", file, source],
+            "check-wheel-contents": [beside / "check-wheel-contents", file],
+        }
+        metrics = [
+            Metric(f"{what}: status", subprocess.run(command, cwd=ROOT).returncode, high=0)
+            for what, command in checked.items()
+        ]
         subprocess.run([sys.executable, "-m", "venv", str(folder / "env")], check=True)
         programs = folder / "env" / "bin"
         subprocess.run([programs / "python", "-m", "pip", "-q", "install", str(file)], check=True)
@@ -63,9 +73,15 @@ def wheel(quick: bool = False) -> list[Metric]:
         away = {"cwd": folder, "env": env | {"XDG_CACHE_HOME": str(folder / "cache")}}
         where = [programs / "python", "-c", "import jaxslam; print(jaxslam.__file__)"]
         found = subprocess.run(where, check=True, capture_output=True, text=True, **away).stdout
-        metrics = [
+        metrics += [
             Metric("files of the wheel outside the package", len(strange), high=0),
             Metric("imported from the checkout", str(ROOT) in found, high=0),
+        ]
+        began = time.perf_counter()
+        tested = subprocess.run([programs / "python", "-m", "jaxslam.selftest"], **away)
+        metrics += [
+            Metric("selftest of the wheel: status", tested.returncode, high=0),
+            Metric("selftest of the wheel [s]", time.perf_counter() - began, high=60.0),
         ]
         for command, arguments in OF_WHEEL.items():
             status = subprocess.run([programs / "jaxslam", *arguments.split()], **away).returncode
