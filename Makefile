@@ -19,7 +19,7 @@ unexport PYTHONDONTWRITEBYTECODE
 JEMALLOC := $(firstword $(wildcard /usr/lib/*/libjemalloc.so.2 /usr/lib64/libjemalloc.so.2))
 
 .DELETE_ON_ERROR:
-.PHONY: consistency test test-all check bench docs api links clean
+.PHONY: consistency test test-all test-oldest check bench docs api links clean
 
 ## The main job: is EKF-SLAM honest? 100 simulated runs; results in out/.
 consistency: $(VENV)/.run
@@ -30,6 +30,11 @@ consistency: $(VENV)/.run
 test: SELECTED := -m "not sweep"
 test test-all: $(VENV)/.dev
 	LD_PRELOAD=$(JEMALLOC) $(BIN)/python -m pytest -n auto --dist loadscope --no-loadscope-reorder $(SELECTED) $(ARGS)
+
+## The tests that ARGS names on the lowest versions that pyproject.toml allows:
+## make test-oldest PYTHON=python3.11 VENV=.venv-oldest ARGS="tests/core".
+test-oldest: $(VENV)/.oldest
+	$(BIN)/python -m pytest -n auto --dist loadscope --no-loadscope-reorder $(ARGS)
 
 ## Format, lint and types.
 check: $(VENV)/.dev
@@ -65,6 +70,11 @@ $(VENV)/.run: pyproject.toml | $(VENV)/bin/python
 
 $(VENV)/.dev: pyproject.toml | $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --editable . --group dev
+	@touch $@
+
+$(VENV)/.oldest: pyproject.toml | $(VENV)/bin/python
+	grep -v '^requires = ' pyproject.toml | grep -oE '"[a-z0-9-]+>=[0-9.]+"' | tr -d '"' | sed 's/>=/==/' | sort -u > $(VENV)/oldest.txt
+	$(BIN)/python -m pip install --quiet --editable . --group test --constraint $(VENV)/oldest.txt
 	@touch $@
 
 clean:

@@ -21,7 +21,6 @@ os.environ.setdefault("JAX_PERSISTENT_CACHE_MIN_ENTRY_SIZE_BYTES", "-1")
 os.environ.setdefault("JAX_TRACEBACK_IN_LOCATIONS_LIMIT", "0")  # a fifth of the time of lowering
 
 import jax
-import jax.experimental
 import shapes
 
 shapes.install("jaxslam")  # before the package is first imported, `spending` included
@@ -119,8 +118,7 @@ def assert_jacobians(differences):
 @pytest.fixture
 def float32_alone():
     """JAX as it is without x64."""
-    home = jax if hasattr(jax, "enable_x64") else jax.experimental  # from jax 0.8, and before
-    with home.enable_x64(False):
+    with jax.enable_x64(False):
         yield
 
 

@@ -23,7 +23,7 @@ FLOORS = [
     "motion sensors charts linearize association resampling life",
     "driver filters graphs laser simulation",
     "consistency verify catalog calibration",
-    "datasets results cli __main__",
+    "datasets results cli selftest __main__",
 ]
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names.split()}
 FLOOR[""] = len(FLOORS)  # jaxslam/__init__.py sees everything, and nothing sees it
@@ -41,8 +41,8 @@ WITHIN_CALLS = {
 KEPT = {
     "matplotlib": ("results.plot", "datasets.ros_map"),
     "argparse": ("cli",),
-    # verify: float64 within a block, then as before; remote: in a worker, as where it is called
-    "jax.config": ("cli", "__main__", "verify", "consistency.campaign.remote"),
+    # arrays: float64 within a block, then as before; remote: in a worker, as where it is called
+    "jax.config": ("cli", "__main__", "math.arrays", "consistency.campaign.remote"),
 }
 # Left as it is: the decorator that pages import.
 SHADOWED = ["core.record.record"]

@@ -1,5 +1,6 @@
 """Checks of numbers: counts, keys, gates, covariances."""
 
+import math
 from numbers import Integral
 from typing import Any
 
@@ -12,6 +13,14 @@ from numpy.typing import ArrayLike
 def is_concrete(*values: object) -> bool:
     """Whether the values are concrete, i.e. no leaf is a tracer."""
     return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
+
+
+def is_number(value: object) -> bool:
+    """Whether a value read from a file is a finite number."""
+    try:
+        return isinstance(value, int | float) and type(value) is not bool and math.isfinite(value)
+    except OverflowError:  # a whole number that no float holds
+        return False
 
 
 def largest(*values: ArrayLike) -> float:

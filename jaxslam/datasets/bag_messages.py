@@ -62,9 +62,16 @@ class Bag:
             count += 1
             yield connection.topic, recorded, message
 
+    def first(self, name: str) -> Any:
+        """The first message of a topic; raises ValueError, with the file, if it has none."""
+        found = next(self.messages([name]), None)
+        if found is None:
+            raise self.error(f"{name}: expected messages, as the index of the bag says, got none")
+        return found[2]
+
     def error(self, reason: str) -> ValueError:
         """A ValueError about the bag, for the caller to raise."""
-        return ValueError(f"{self.path}: {reason}")
+        return ValueError(f"{self.path}: {_one_line(reason)}")
 
 
 @contextmanager
@@ -101,5 +108,10 @@ def _unreadable(path: Path, problem: Exception, where: str = "") -> ValueError:
     if isinstance(problem, FileNotFoundError):
         what = "metadata.yaml" if path.is_dir() else "file"
         return ValueError(f"{path}: cannot be read: no such {what}")
-    reason = " ".join(str(problem).split()) or type(problem).__name__
+    reason = _one_line(str(problem)) or type(problem).__name__
     return ValueError(f"{path}: cannot be read as a ROS bag{where}: {reason}")
+
+
+def _one_line(text: str) -> str:
+    """A text that may quote a bag, without breaks of lines."""
+    return " ".join(text.split())

@@ -5,7 +5,7 @@ from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxslam.datasets.laser_record import MOUNT_TOLERANCE, pose_text
 
@@ -22,6 +22,8 @@ UPSIDE_DOWN = "the laser is upside down: the order of its beams is reversed"
 
 _UNIT = 0.01
 """Largest difference of the norm of a quaternion from 1."""
+_FARTHEST = 1e9
+"""Largest coordinate of a pose [m]."""
 
 
 class Transform(NamedTuple):
@@ -78,12 +80,17 @@ def stamp_of(header: Any) -> int:
 
 
 def planar(pose: Float[np.ndarray, "n 7"]) -> Float[np.ndarray, "n 3"]:
-    """The poses (x, y, θ) of poses with quaternions; NaN for a quaternion without norm 1."""
-    x, y, z, w = pose[:, 3:].T
-    with np.errstate(invalid="ignore", over="ignore"):
-        unit = np.abs(x**2 + y**2 + z**2 + w**2 - 1) < 2 * _UNIT
-        heading = np.arctan2(2 * (w * z + x * y), w**2 + x**2 - y**2 - z**2)
-    return np.column_stack([pose[:, :2], np.where(unit, heading, np.nan)])
+    """The poses (x, y, θ) of poses with quaternions; NaN for one of those that are none."""
+    x, y, z, w = np.where(_is_pose(pose)[:, None], pose[:, 3:], np.nan).T
+    heading = np.arctan2(2 * (w * z + x * y), w**2 + x**2 - y**2 - z**2)
+    return np.column_stack([pose[:, :2], heading])
+
+
+def _is_pose(pose: Float[np.ndarray, "n 7"]) -> Bool[np.ndarray, "n"]:
+    """Whether positions are finite and within `_FARTHEST`, and quaternions have norm 1."""
+    near = (np.abs(pose[:, :3]) <= _FARTHEST).all(axis=1)
+    within = np.where(np.abs(pose[:, 3:]) < 2, pose[:, 3:], np.nan)
+    return near & (np.abs((within**2).sum(axis=1) - 1) < 2 * _UNIT)
 
 
 class Frames:
@@ -142,9 +149,9 @@ class Frames:
 
 
 def _matrix(pose: Float[np.ndarray, "7"]) -> Float[np.ndarray, "4 4"]:
-    """A pose as a matrix; NaN if its quaternion has not norm 1."""
-    norm = np.linalg.norm(pose[3:])
-    x, y, z, w = pose[3:] / norm if abs(norm - 1) < _UNIT else np.full(4, np.nan)
+    """A pose as a matrix; NaN if it is none."""
+    known = bool(_is_pose(pose[None])[0])
+    x, y, z, w = pose[3:] / np.linalg.norm(pose[3:]) if known else np.full(4, np.nan)
     out = np.eye(4)
     out[:3, :3] = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],

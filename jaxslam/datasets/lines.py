@@ -6,6 +6,9 @@ import zlib
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
+DIGITS = 18
+"""Digits of the largest whole number that is read; it fits 64 bits."""
+
 
 def stored(path: str | Path) -> Path | None:
     """The file NAME, else NAME.gz beside it, else None."""
@@ -76,6 +79,8 @@ class TextFile:
         """A field as a whole number >= 0; raises ValueError otherwise."""
         if not (field.isascii() and field.isdigit()):
             raise self.error(line, f"{name} is not a whole number >= 0: {field!r}")
+        if len(field) > DIGITS:
+            raise self.error(line, f"{name} has {len(field)} digits, expected at most {DIGITS}")
         return int(field)
 
     def expect(self, line: int, fields: Sequence[str], names: Sequence[str]) -> None:

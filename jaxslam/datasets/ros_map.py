@@ -15,7 +15,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
-from jaxslam.datasets.lines import TextFile, read_bytes
+from jaxslam.datasets.lines import DIGITS, TextFile, read_bytes
 from jaxslam.laser.grids.grid import Grid, check_grid
 from jaxslam.results.files import Files, write_files
 
@@ -66,8 +66,9 @@ def _read_shades(path: Path) -> NDArray[np.float64]:
 def _whole(path: Path, words: Sequence[bytes]) -> list[int]:
     """Words as whole numbers; ValueError on any other."""
     for word in words:
-        if not word.isdigit():
-            raise ValueError(f"{path}: expected a whole number, got {word.decode('latin-1')!r}")
+        if not word.isdigit() or len(word) > DIGITS:
+            shown = word[: DIGITS + 1].decode("latin-1")
+            raise ValueError(f"{path}: expected a whole number, got {shown!r}")
     return [int(word) for word in words]
 
 
@@ -191,6 +192,8 @@ class _Header:
         except yaml.reader.ReaderError as problem:
             line = text.count("\n", 0, problem.position) + 1
             raise self.file.error(line, f"expected YAML, but {problem.reason}") from problem
+        except RecursionError as problem:
+            raise self.file.error(1, "expected `key: value`, got brackets in brackets") from problem
         if not isinstance(root, yaml.MappingNode):
             raise self.file.error(1, "expected `key: value`")
         self.found: dict[str, yaml.Node] = {}

@@ -167,11 +167,11 @@ def rosbag_contents(path: str | Path) -> BagContents:
         wheels = [one for one in bag.topics if one.type == ODOMETRY and one.count]
         base = None
         if len(wheels) == 1:
-            base = frame_name(next(bag.messages([wheels[0].name]))[2].child_frame_id)
+            base = frame_name(bag.first(wheels[0].name).child_frame_id)
         lasers = {}
         for topic in bag.topics:
             if topic.type == LASER_SCAN and topic.count:
-                frame = frame_name(next(bag.messages([topic.name]))[2].header.frame_id)
+                frame = frame_name(bag.first(topic.name).header.frame_id)
                 notes: list[str] = []
                 try:
                     placed = laser_mount(frames, frame, base, notes)

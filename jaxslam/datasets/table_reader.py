@@ -16,7 +16,7 @@ from jaxslam.core.logs.tables import POSE, TAG, TIME, UNITS, Columns, split_unit
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import Log
 from jaxslam.datasets.dataset import Adjustable, Dataset, Parameter
-from jaxslam.datasets.lines import read_bytes, stored
+from jaxslam.datasets.lines import DIGITS, read_bytes, stored
 from jaxslam.datasets.table_settings import Parametric, TableSettings
 
 
@@ -46,9 +46,12 @@ class CsvTable:
             above += 1
         reader = csv.reader(io.StringIO(text, newline=""))
         lines, begins = [], above + 1  # a cell in quotes may go over several lines of the file
-        for cells in reader:
-            lines.append((begins, [cell.strip() for cell in cells]))
-            begins = above + reader.line_num + 1
+        try:
+            for cells in reader:
+                lines.append((begins, [cell.strip() for cell in cells]))
+                begins = above + reader.line_num + 1
+        except csv.Error as problem:
+            raise self._error(begins, f"expected cells separated by commas: {problem}") from problem
         lines = [(number, cells) for number, cells in lines if any(cells)]
         if not lines:
             raise ValueError(f"{self.path}:1: expected a header, as 't [s],v [m/s]', got no text")
@@ -142,11 +145,14 @@ class CsvTable:
             if cell and not (cell.isascii() and cell.isdigit()):
                 reason = f"expected a whole number >= 0, or nothing if unknown, got {cell!r}"
                 raise self._error(number, reason, place)
+            if len(cell) > DIGITS:
+                reason = f"expected at most {DIGITS} digits, got {len(cell)}"
+                raise self._error(number, reason, place)
             tags.append(int(cell) if cell else None)
         return tags
 
     def _column(self, place: int) -> str:
-        return f"column {place + 1} ({self.header[place]})"
+        return f"column {place + 1} ({' '.join(self.header[place].split())})"
 
     def _error(self, line: int, reason: str, place: int | None = None) -> ValueError:
         where = "" if place is None else f"{self._column(place)}: "

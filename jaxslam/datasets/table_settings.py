@@ -21,6 +21,7 @@ from jaxslam.association import (
 )
 from jaxslam.core.logs.tables import INTERVAL, POSE, odometry_columns, split_unit
 from jaxslam.core.noise import NoiseCov
+from jaxslam.core.numbers import is_number
 from jaxslam.core.protocols import Associate, Motion, Sensor
 from jaxslam.core.record import record, static
 from jaxslam.core.types import JaxOrNumPy
@@ -121,13 +122,6 @@ def _probability(gate: object) -> float:
     if not isinstance(gate, int | float) or isinstance(gate, bool) or not 0 < gate < 1:
         raise ValueError(f"gate: expected a probability between 0 and 1, got {gate!r}")
     return gate
-
-
-def is_number(value: object) -> bool:
-    """Whether a value of a file is a finite number."""
-    return (
-        isinstance(value, int | float) and not isinstance(value, bool) and bool(np.isfinite(value))
-    )
 
 
 FITTED = "fit.toml"
@@ -241,6 +235,8 @@ def _read(path: Path) -> tuple[str, dict[str, Any]]:
         if at := re.search(r" \(at line (\d+), column \d+\)$", what):
             what, line = what[: at.start()], int(at[1])
         raise ValueError(f"{path}:{line}: expected TOML: {what}") from problem
+    except RecursionError as problem:
+        raise ValueError(f"{path}: expected TOML, got brackets in brackets") from problem
     except (OSError, UnicodeDecodeError) as problem:
         raise ValueError(f"{path}: cannot be read: {problem}") from problem
 

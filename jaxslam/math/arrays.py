@@ -4,11 +4,9 @@ Of one pose, one landmark, one measurement; `vmap` and `scan` add leading axes.
 """
 
 from contextlib import AbstractContextManager
-from types import ModuleType
 from typing import TypeVar, cast
 
 import jax
-import jax.experimental
 import jax.numpy as jnp
 from jax import Array
 from jax.typing import DTypeLike
@@ -57,7 +55,5 @@ def in_dtype(tree: _T, dtype: DTypeLike) -> _T:
 
 def float64() -> AbstractContextManager[object]:
     """A block in which JAX has 64-bit types, in this thread."""
-    # From jax 0.8 on, and before.
-    home: ModuleType = jax if hasattr(jax, "enable_x64") else jax.experimental
-    context: AbstractContextManager[object] = home.enable_x64(True)
+    context: AbstractContextManager[object] = jax.enable_x64(True)
     return context

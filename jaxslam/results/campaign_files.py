@@ -6,13 +6,14 @@ from collections.abc import Callable, Iterable, Mapping
 from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from jaxslam.consistency import Tally
 from jaxslam.consistency.campaign import Campaign, missing
 from jaxslam.consistency.campaign.block import BOUND
 from jaxslam.consistency.campaign.harness import summaries_of
 from jaxslam.consistency.campaign.kept import add_kept
+from jaxslam.core.numbers import is_number
 from jaxslam.results import report, store
 from jaxslam.results.files import Files, check_formats, check_writable, versions, write_files
 
@@ -110,14 +111,14 @@ def load(folder: str | Path) -> Campaign:
     kept, path = store.resume(folder / BLOCKS), folder / RESULT
     try:
         found = json.loads(path.read_text(encoding="utf-8"))
-        tallies = {name: Tally() for name in (*found["filters"], BOUND)}
-        runs = int(found["runs"])
-    except (OSError, ValueError, KeyError, TypeError) as error:
+        doubts = _checked(found, kept.campaign)
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(
             f"{path}: expected the results of a campaign: jaxslam consistency --resume {folder} "
             "writes them"
         ) from error
-    if missing(add_kept(tallies, kept, runs, lambda first: True), runs, max(runs, 1)):
+    runs, tallies = found["runs"], {name: Tally() for name in (*doubts, BOUND)}
+    if missing(add_kept(tallies, kept, runs, lambda first: True), runs, runs):
         raise ValueError(
             f"{folder}: the campaign is not finished: jaxslam consistency --resume {folder}"
         )
@@ -127,12 +128,32 @@ def load(folder: str | Path) -> Campaign:
         **{name: found[name] for name in (*entries, *TIMES)},
         runs=runs,
         divergence_limit=float(limit),
-        filters={
-            name: replace(one, doubts=tuple(found["filters"][name]["doubts"]))
-            for name, one in summaries.items()
-        },
+        filters={name: replace(one, doubts=doubts[name]) for name, one in summaries.items()},
         run_numbers=tallies[BOUND].numbers(),
     )
+
+
+def _checked(found: Any, campaign: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
+    """The doubts of each filter in the JSON of a report.
+
+    Raises one of several errors if it is not that of a campaign of this identity.
+    """
+    filters, published, step_seconds = (found[key] for key in ("filters", "published", TIMES[2]))
+    texts = [found[name] for name in ("scenario", "source", "dtype")]
+    numbers = [*(found[name] for name in TIMES[:2]), *step_seconds.values()]
+    numbers += [value for row in published.values() for value in row.values()]
+    doubts = {name: tuple(entry["doubts"]) for name, entry in filters.items()}
+    texts += [text for each in doubts.values() for text in each]
+    if (
+        not all(isinstance(text, str) for text in texts)
+        or not all(isinstance(entry["doubts"], list) for entry in filters.values())
+        or not all(map(is_number, numbers))
+        or not all(type(found[name]) is int and found[name] >= 1 for name in ("runs", "steps"))
+        or ", ".join(doubts) != campaign.get("filters", ", ".join(doubts))
+        or str(found["steps"]) != campaign.get("steps", str(found["steps"]))
+    ):
+        raise ValueError("not the results of this campaign")
+    return doubts
 
 
 def _holds(path: Path, text: object) -> bool:

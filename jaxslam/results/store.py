@@ -11,6 +11,7 @@ import errno
 import hashlib
 import io
 import json
+import math
 import operator
 import os
 import re
@@ -85,21 +86,26 @@ def read_block(path: Path, campaign: str) -> Block:
     content = path.read_bytes()
     try:
         with np.load(io.BytesIO(content), allow_pickle=False) as npz:
-            # All entries are tested first: a damaged header may ask for any amount of memory.
+            # All entries are tested first: a header may ask for any amount of memory.
+            if sum(entry.file_size for entry in npz.zip.infolist()) > len(content):
+                raise ValueError("its entries are larger than the file")
             if broken := npz.zip.testzip():
                 raise ValueError(f"entry {broken} is damaged")
+            for entry in npz.zip.infolist():
+                _check_size(npz.zip, entry)
             arrays = {name: np.asarray(npz[name]) for name in npz.files}
     except MemoryError:
         raise
     except Exception as error:  # NumPy and zipfile raise many types
-        raise ValueError(f"{path}: truncated or not an npz ({error})") from error
+        reason = " ".join(str(error).split())
+        raise ValueError(f"{path}: truncated or not an npz ({reason})") from error
     try:
         about = json.loads(arrays.pop(_ABOUT).tobytes())
         first, runs, checksum = about["first"], about["runs"], about.pop("sha256")
-        settings = about["settings"]
-    except (KeyError, TypeError, AttributeError, ValueError) as error:
+        settings, found = about["settings"], _checksum(about, arrays)
+    except (KeyError, TypeError, AttributeError, ValueError, RecursionError) as error:
         raise ValueError(f"{path}: an npz, but not a block of a campaign") from error
-    if checksum != _checksum(about, arrays):
+    if checksum != found:
         raise ValueError(f"{path}: its content does not match its checksum")
     if settings != campaign:
         raise ValueError(f"{path}: belongs to another campaign, or to other settings")
@@ -107,6 +113,18 @@ def read_block(path: Path, campaign: str) -> Block:
         names = f"names runs {named[0]} to {named[1]}" if named else "names no runs"
         raise ValueError(f"{path}: {names}, holds {first} to {first + runs}")
     return Block(first, runs, arrays)
+
+
+def _check_size(npz: zipfile.ZipFile, entry: zipfile.ZipInfo) -> None:
+    """Raise an error on an entry whose header announces more than it holds."""
+    with npz.open(entry) as file:
+        version = np.lib.format.read_magic(file)
+        shape, _, dtype = {
+            (1, 0): np.lib.format.read_array_header_1_0,
+            (2, 0): np.lib.format.read_array_header_2_0,
+        }[version](file)
+    if math.prod(shape) * dtype.itemsize > entry.file_size:
+        raise ValueError(f"entry {entry.filename} is damaged")
 
 
 def runs_of_name(path: Path) -> tuple[int, int] | None:
@@ -413,7 +431,7 @@ def resume(folder: str | os.PathLike[str], settings: Mapping[str, object] | None
         not isinstance(own, dict)
         or not isinstance(campaign, dict)
         or not isinstance(runs, int | None)
-        or manifest.get("digest") != digest_of({"settings": own, "campaign": campaign})
+        or not _is_original(manifest)
     ):
         raise ValueError(
             f"{path}: it was changed since the campaign began: put the original back, or begin a "
@@ -422,6 +440,15 @@ def resume(folder: str | os.PathLike[str], settings: Mapping[str, object] | None
     if settings is not None and (found := differences_of(own, as_stored(settings))):
         raise ValueError(f"{folder} holds another campaign: {'; '.join(found)}")
     return Store(folder, own, runs, campaign)
+
+
+def _is_original(manifest: Json) -> bool:
+    """Whether settings and campaign of a manifest have its digest."""
+    own = {key: manifest.get(key) for key in ("settings", "campaign")}
+    try:
+        return manifest.get("digest") == digest_of(own)
+    except ValueError:  # a number that JSON does not have
+        return False
 
 
 def _folder(folder: str | os.PathLike[str]) -> Path:

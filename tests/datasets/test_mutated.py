@@ -1,27 +1,22 @@
 """Every reader on files with a few bytes changed: an error that says where, or all of the data."""
 
+import gzip
 import os
 import re
+from functools import cache
+from pathlib import Path
 
 import chex
 import hypothesis.strategies as st
 import pytest
-from hypothesis import HealthCheck, given, settings
-from recordings import BONN, MRCLAM, TEAM, VICTORIA, write
+from fuzzing import EDITS, FLIPS, assert_one_line, edited, flipped, fuzz, watched
+from hypothesis import given
+from recordings import BONN, DATA, MRCLAM, TEAM, VICTORIA, write
 from test_plaza import written
 from test_table import OWN, SETTINGS, TRUTH
 
 from jaxslam import datasets, grids
 from jaxslam.datasets import g2o, ros_map
-
-WIDE = int(os.environ.get("JAXSLAM_FUZZ", "1"))
-"""How many times as many examples are tried, as by `python -m benchmarks --only fuzz`."""
-fuzz = settings(
-    max_examples=60 * WIDE,
-    deadline=None,
-    derandomize=WIDE == 1,
-    suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow],
-)
 
 TABLE = OWN | TRUTH | SETTINGS
 READ = {
@@ -46,34 +41,6 @@ def measured(name, path):
     if name == "bonn":
         return lines("sensor_data.dat", "SENSOR")
     return sum(lines(f"Robot{i}_Measurement.dat") for i in ((2,) if name == "mrclam" else (2, 1)))
-
-
-VALUES = st.one_of(
-    st.sampled_from(b"0123456789.-+eE, \t\n\r#\"'[]=_/\x00\xff\xef"), st.integers(0, 255)
-)
-EDITS = st.lists(
-    st.tuples(st.sampled_from("rids"), st.floats(0, 1, exclude_max=True), VALUES),
-    min_size=1,
-    max_size=3,
-)
-
-
-def edited(content, edits):
-    """Bytes replaced, inserted and deleted, and lines repeated."""
-    content = bytearray(content)
-    for kind, where, value in edits:
-        at = int(where * len(content))
-        if kind == "i":
-            content.insert(at, value)
-        elif content and kind == "r":
-            content[at] = value
-        elif content and kind == "d":
-            del content[at]
-        elif content:  # a line twice
-            begin = content.rfind(b"\n", 0, at) + 1
-            end = (content.find(b"\n", at) + 1) or len(content)
-            content[begin:begin] = content[begin:end]
-    return bytes(content)
 
 
 def assert_whole(data):
@@ -168,7 +135,7 @@ def assert_told(path, error):
 
 
 @pytest.mark.parametrize("name", READ)
-@fuzz
+@fuzz(100)
 @given(data=st.data())
 def test_text_with_other_bytes(name, data, tmp_path):
     files, read = READ[name]
@@ -177,7 +144,7 @@ def test_text_with_other_bytes(name, data, tmp_path):
     content = edited(files[file].encode(), data.draw(EDITS))
     (tmp_path / file).write_bytes(content)
     try:
-        found = read(tmp_path)
+        found = watched(read, tmp_path)
     except ValueError as error:
         assert_told(tmp_path, error)
     else:
@@ -188,7 +155,7 @@ def test_text_with_other_bytes(name, data, tmp_path):
 
 @pytest.mark.filterwarnings("ignore:.* is not read")
 @pytest.mark.parametrize("name", OTHERS)
-@fuzz
+@fuzz(100)
 @given(data=st.data())
 def test_graphs_laser_logs_and_maps_with_other_bytes(name, data, tmp_path):
     files, read, assert_read = OTHERS[name]
@@ -197,21 +164,73 @@ def test_graphs_laser_logs_and_maps_with_other_bytes(name, data, tmp_path):
     (tmp_path / file).write_bytes(edited(files[file].encode(), data.draw(EDITS)))
     first = tmp_path / min(files, key=lambda one: not one.endswith(".yaml"))
     try:
-        found = read(first)
+        found = watched(lambda _: read(first), tmp_path)
     except ValueError as error:
         assert_told(tmp_path, error)
     else:
         assert_read(found, first)
 
 
-@fuzz
+@fuzz(100)
 @given(edits=EDITS)
 def test_a_binary_file_with_other_bytes(edits, tmp_path):
     path = written(tmp_path)
     path.write_bytes(edited(path.read_bytes(), edits))
     try:
-        found = datasets.plaza(path)
+        found = watched(lambda _: datasets.plaza(path), tmp_path)
     except ValueError as error:
         assert_told(tmp_path, error)
     else:
         assert_whole(found)
+
+
+REAL = {
+    "g2o": ("graphs/MIT.g2o", g2o.load),
+    "toro": ("graphs/FRH_P_toro.graph", g2o.load),
+    "carmen": ("laser_graphs/mit-cscail.log.gz", datasets.carmen),
+    "relations": ("relations/mit-csail.relations.gz", datasets.relation_file),
+    "map": ("maps/turtlebot3_world.yaml", grids.read_map),
+    "image": ("maps/turtlebot3_world.pgm", grids.read_map),
+    "bonn": ("bonn/sensor_data.dat", lambda path: datasets.bonn(path.parent)),
+    "mrclam": ("mrclam1/Robot1_Measurement.dat", lambda path: datasets.mrclam(path.parent, 1)),
+}
+"""A file of each format as it was published, and its reader."""
+HEAD = 20_000
+"""Bytes of the beginning of a text that are read."""
+
+
+@cache
+def real(name):
+    """{file name: bytes} of a folder, long texts up to the end of a line."""
+    path = DATA / REAL[name][0]
+    files = {path.name: path}
+    if name in ("map", "image", "bonn", "mrclam"):
+        files = {each.name: each for each in path.parent.iterdir()}
+    found = {}
+    for file, whole in files.items():
+        content = whole.read_bytes()
+        content = gzip.decompress(content) if whole.suffix == ".gz" else content
+        if whole.suffix != ".pgm":
+            content = content[: content.find(b"\n", HEAD) + 1] or content
+        found[file.removesuffix(".gz")] = content
+    return found
+
+
+@pytest.mark.filterwarnings("ignore:.* is not read")
+@pytest.mark.parametrize("name", REAL)
+@fuzz(10)
+@given(flips=FLIPS)
+def test_published_files_with_flipped_bits(name, flips, tmp_path):
+    where, read = REAL[name]
+    if not (DATA / where).exists():
+        pytest.skip(f"no file {DATA / where}")
+    named = Path(where).name.removesuffix(".gz")
+    for file, content in real(name).items():
+        (tmp_path / file).write_bytes(flipped(content, flips) if file == named else content)
+    first = tmp_path / ("turtlebot3_world.yaml" if name == "image" else named)
+    try:
+        found = watched(lambda _: read(first), tmp_path)
+    except ValueError as error:
+        assert_one_line(error, tmp_path)
+    else:
+        chex.assert_tree_all_finite(found.graph.poses if name in ("g2o", "toro") else 0.0)

@@ -6,8 +6,8 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float, PyTree, UInt8
+from numpy.typing import ArrayLike
 
 from jaxslam.core.numbers import check_real, is_concrete, shape_text
 from jaxslam.laser.grids.distance import squared_distances

@@ -7,8 +7,8 @@ from typing import ClassVar, NamedTuple, TypeAlias
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jax.typing import ArrayLike
 from jaxtyping import Array, Float, Int, PyTree
+from numpy.typing import ArrayLike
 
 from jaxslam.core.numbers import is_concrete, shape_text
 from jaxslam.core.protocols import Component
