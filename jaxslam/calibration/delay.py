@@ -26,7 +26,10 @@ def delayed(
     Raises:
         ValueError: on controls that are neither velocities over an interval nor increments of one.
     """
-    check_delay(controls)
+    if controls[-1:] != (INTERVAL,):
+        raise ValueError(
+            f"a delay needs odometry with an interval, {INTERVAL}, got {', '.join(controls)}"
+        )
     u = jnp.asarray(log.control)
     t = jnp.asarray(time - time[0], u.dtype)
     dt = u[:, -1:]
@@ -38,11 +41,3 @@ def delayed(
     known = dt > 0
     velocities = jnp.where(known, moved / jnp.where(known, dt, 1.0), 0.0)
     return log._replace(control=jnp.concatenate([jnp.where(rates, velocities, moved), dt], axis=1))
-
-
-def check_delay(controls: tuple[str, ...]) -> None:
-    """Raise ValueError unless the controls can be divided in time."""
-    if controls[-1:] != (INTERVAL,):
-        raise ValueError(
-            f"a delay needs odometry with an interval, {INTERVAL}, got {', '.join(controls)}"
-        )

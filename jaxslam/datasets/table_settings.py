@@ -508,7 +508,10 @@ class TableSettings:
         parameters: list[Parameter] = []
         for key in given:
             if key not in known:
-                raise ValueError(f"{self._at(section, key)}: expected a model that it can correct")
+                wanted = {"motion": "controls of travel and turn", "sensor": "a range first"}
+                raise ValueError(
+                    f"{self._at(section, key)}: expected a model with {wanted[section]}"
+                )
         for key, (names, right) in known.items():
             values = self._numbers(section, key, given.get(key, list(right)), names)
             for name, value, without in zip(names, values, right, strict=True):
@@ -537,7 +540,7 @@ class TableSettings:
             or not all(map(is_number, given))
         ):
             raise ValueError(
-                f"{self._at(section, key)}: expected {len(names)} numbers "
+                f"{self._at(section, key)}: expected {len(names)} number{'s' * (len(names) > 1)} "
                 f"({', '.join(names)}), got {given!r}"
             )
         return [float(value) for value in given]

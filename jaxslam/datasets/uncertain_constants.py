@@ -32,7 +32,7 @@ def considered(data: Dataset, filter_of: Callable[[Motion, Sensor], Filter]) -> 
         filter_of: the filter of models with the constants, which are traced.
     """
     models = data.adjustable
-    if models is None or models.cov is None:
+    if models is None or models.cov is None or not models.cov.any():
         return None
     uncertain = np.flatnonzero(np.diag(models.cov))
     values = models.values

@@ -122,7 +122,7 @@ def test_the_errors_of_a_simulated_robot_are_found_and_their_uncertainty_is_coun
         ("motion", "scale = [0.0, 1.0]", "[motion] scale: expected a travel above 0"),
         ("motion", "axis = 0.1", "[motion] axis: expected one of model, noise"),
         ("sensor", "range = [-1, 0]", "[sensor] range: expected a scale above 0"),
-        ("sensor", "delay = true", "[sensor] delay: expected 1 numbers"),
+        ("sensor", "delay = true", "[sensor] delay: expected 1 number ("),
         ("sensor", "max_range = -1", "[sensor] max_range: expected a number >= 0, got -1"),
         ("filter", "spacing = -3", "[filter] spacing: expected a number >= 0, got -3"),
         (
@@ -198,3 +198,10 @@ def test_what_is_seen_only_together_is_named_and_not_written(tmp_path, capsys):
     printed = capsys.readouterr().out
     assert "heading [rad]: the log does not determine it (only together with mount" in printed
     assert "was not written into" in printed and not (folder / "fit.toml").exists()
+
+
+def test_constants_that_are_certain_add_nothing(tmp_path):
+    folder = write(tmp_path, 10)
+    known = '[calibration]\nparameters = ["scale turn"]\ncovariance = [[0.0]]\n'
+    (folder / "dataset.toml").write_text(SETTINGS + known)
+    assert datasets.considered(datasets.table(folder), lambda *models: None) is None
