@@ -126,8 +126,11 @@ def _together(
     def any_moves(state: tuple[_Square, Array, Array]) -> Array:
         return state[1].any()
 
-    def free(at: _Square, moving: Array) -> tuple[_Square, Array]:
-        """Move rays up to the next squares that stop; which have come to one."""
+    def free(at: _Square, moving: Array) -> tuple[_Square, Array, Array]:
+        """Move rays towards the next squares that stop; which still move, which have come to one.
+
+        On a CPU all come to one. A GPU takes one step, since its rays wait for the longest of all.
+        """
 
         def step(state: tuple[_Square, Array, Array]) -> tuple[_Square, Array, Array]:
             at, moving, stopped = state
@@ -138,24 +141,25 @@ def _together(
             return _where(goes, after, at), goes, stopped | (moving & (here == STOP))
 
         begin = at, moving, jnp.zeros_like(moving)
-        at, _, stopped = jax.lax.while_loop(any_moves, step, begin)
-        return at, stopped
+        if corners is not None and jax.default_backend() != "cpu":
+            return step(begin)
+        return jax.lax.while_loop(any_moves, step, begin)
 
     if corners is None:
-        at, found = free(first, inside)
+        at, _, found = free(first, inside)
         length = at.length
     else:
 
         def through(state: tuple[_Square, Array, Array]) -> tuple[_Square, Array, Array]:
             """To the next squares that stop, and out of those without the surface."""
             at, moving, found = state
-            at, stopped = free(at, moving)
+            at, moving, stopped = free(at, moving)
             crosses = _crossings(rays, at)
             leaves = jnp.minimum(*crosses)
             meets = _meets(_parabola(corners, rays, at), leaves - at.length)
             goes = stopped & ~meets & (leaves < limit)
             after = _next(rays, at, crosses, jnp.zeros_like(leaves))
-            return _where(goes, after, at), goes, found | (stopped & meets)
+            return _where(goes, after, at), moving | goes, found | (stopped & meets)
 
         begin = first, inside, jnp.zeros_like(inside)
         at, _, found = jax.lax.while_loop(any_moves, through, begin)
