@@ -1,8 +1,8 @@
 """A GPU beside all cores of the CPU of one machine; left out where JAX finds no GPU.
 
-- Campaigns of `cloister`, in float64 and float32: runs a second after the first block, which
-  compiles, and those of the filter without draws and scores; how far the pose NEES differ between
-  the two, run by run. The EKF has 10⁵ runs on the GPU.
+- Campaigns of `cloister`: runs a second after the first block, which compiles, and those of the
+  filter without draws and scores; how far the pose NEES differ between the two, run by run. The EKF
+  has 10⁵ runs on the GPU, in float64 and float32.
 - Rays in a grid of 2,000 × 2,000 cells, float32.
 - Pose graphs, float64: 256 of the pattern of `ring` in one batch, and `input_M3500_g2o` alone, from
   JAXSLAM_DATA as in `benchmarks.graphs.speed`.
@@ -26,11 +26,12 @@ from benchmarks.gate import Metric, child, table
 from benchmarks.real_data import DATA
 
 BLOCK = 4096
-RUNS = {"ekf": 25 * BLOCK, "right_invariant": 3 * BLOCK, "fastslam2": 3 * BLOCK // 4}
-"""Runs on the GPU."""
-
-CORES = {"ekf": 3072, "right_invariant": 3072, "fastslam2": 768}
-"""Runs on the cores, the first of those on the GPU."""
+CAMPAIGNS = {
+    ("ekf", "float64"): (25 * BLOCK, 3072),
+    ("ekf", "float32"): (25 * BLOCK, 3072),
+    ("fastslam2", "float64"): (3072, 512),
+}
+"""Runs on the GPU, and on the cores: the first of these."""
 
 GRAPHS = 256
 
@@ -71,9 +72,9 @@ def shared_out(function):
 
 
 def fastest(function, *arguments):
-    """Seconds of the fastest of five calls after the first, and what it returned."""
+    """Seconds of the fastest of three calls after the first, and what it returned."""
     out, seconds = jax.block_until_ready(function(*arguments)), []
-    for _ in range(5):
+    for _ in range(3):
         began = time.perf_counter()
         jax.block_until_ready(function(*arguments))
         seconds.append(time.perf_counter() - began)
@@ -129,27 +130,24 @@ def pose_graphs(count):
 def measure(quick: bool = False) -> list[Metric]:
     """Rates by device, and how far its results are from the cores'."""
     # In another process: one that has seen a GPU keeps most of its memory.
-    seen = (
-        "import json, jax; print(json.dumps([[d.platform, d.device_kind] for d in jax.devices()]))"
-    )
-    [platform, kind], cores = child("-c", seen)[0], len(os.sched_getaffinity(0))
+    seen = "import json, jax; d = jax.devices()[0]; print(json.dumps([d.platform, d.device_kind]))"
+    (platform, kind), cores = child("-c", seen), len(os.sched_getaffinity(0))
     if platform != "gpu":
         print("no GPU", file=sys.stderr)
         return []
     print(f"\n{kind}, {cores} cores beside it\n\nIn a cell: the GPU, the cores.\n")
     metrics, rows = [], []
-    for dtype in ("float64", "float32"):
-        for name, runs in RUNS.items():
-            *gpu, nees = on("cuda", dtype, "campaign", name, runs)
-            *cpu, nees_cpu = on("cpu", dtype, "campaign", name, CORES[name])
-            nees, nees_cpu = np.array(nees[: len(nees_cpu)]), np.array(nees_cpu)
-            pairs = [*zip(gpu, cpu, strict=True), (nees.mean(), nees_cpu.mean())]
-            rows.append([name, dtype, runs, *(f"{a:.4g}, {b:.4g}" for a, b in pairs)])
-            metrics.append(Metric(f"{name}, {dtype}, GPU / all cores", gpu[0] / cpu[0]))
-            off = np.abs(nees / nees_cpu - 1)
-            note = f"median; at most {off.max():.2g}"
-            what = f"{name}, {dtype}, NEES of a run, GPU / CPU - 1"
-            metrics.append(Metric(what, float(np.median(off)), note=note))
+    for (name, dtype), (runs, few) in CAMPAIGNS.items():
+        *gpu, nees = on("cuda", dtype, "campaign", name, runs)
+        *cpu, nees_cpu = on("cpu", dtype, "campaign", name, few)
+        nees, nees_cpu = np.array(nees[: len(nees_cpu)]), np.array(nees_cpu)
+        pairs = [*zip(gpu, cpu, strict=True), (nees.mean(), nees_cpu.mean())]
+        rows.append([name, dtype, f"{runs:,}", *(f"{a:.4g}, {b:.4g}" for a, b in pairs)])
+        metrics.append(Metric(f"{name}, {dtype}, GPU / all cores", gpu[0] / cpu[0]))
+        off = np.abs(nees / nees_cpu - 1)
+        note = f"median; at most {off.max():.2g}"
+        what = f"{name}, {dtype}, NEES of a run, GPU / CPU - 1"
+        metrics.append(Metric(what, float(np.median(off)), note=note))
     header = ["filter", "precision", "runs", "runs/s", "filter alone [runs/s]", "first block [s]"]
     print(table([*header, "mean pose NEES"], rows))
     gpu, cpu = (on(where, "float32", "rays", 16000) for where in ("cuda", "cpu"))
