@@ -22,7 +22,14 @@ GIVEN = {
     "docs/background/limits.md": {"3.11", "0.10"},  # versions of Python and jaxlib
     "docs/guide/animation.md": {"100"},  # frames
     "docs/guide/beyond_one_machine.md": {"3.13", "2026.8", "4.1", "22.05"},  # versions
-    "docs/guide/campaigns.md": {"200"},  # steps
+    "docs/guide/campaigns.md": {
+        "200",
+        "102,400",
+        "256",
+        "434",
+        "2,000",
+        "0.11",
+    },  # steps, sizes, jax
     "docs/guide/consistency.md": {"0.95"},  # a coverage
     "docs/guide/differentiating.md": {"200"},  # steps
     # beams, the range for none, measurements in a log

@@ -117,6 +117,16 @@ def test_many_rays_are_as_few(blocks):
     np.testing.assert_array_equal(many, np.tile(few, (2, 10, 3)))
 
 
+def test_rays_are_the_same_one_step_at_a_time_as_on_a_gpu(blocks, monkeypatch):
+    grid, _, _, pose = blocks
+    rays = grids.ray_map(grid, method="surface")
+    expected = grids.cast(rays, pose, ANGLES, 3.0)
+    jax.clear_caches()
+    monkeypatch.setattr(jax, "default_backend", lambda: "gpu")
+    np.testing.assert_array_equal(grids.cast(rays, pose, ANGLES, 3.0), expected)
+    jax.clear_caches()
+
+
 def test_poses_under_vmap_are_a_batch_of_poses_and_maps_may_vary(blocks):
     grid, _, _, pose = blocks
     rays = grids.ray_map(grid)
