@@ -1,15 +1,29 @@
-"""What a type checker says of a user's program."""
+"""What type checkers say of a user's program."""
 
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
 
 PROGRAM = Path(__file__).parent / "inputs" / "typed_user.py"
 
+pytestmark = pytest.mark.sweep  # half a minute without a cache
 
-@pytest.mark.sweep  # half a minute without mypy's cache
-def test_a_users_program_is_well_typed(monkeypatch):
+
+def test_mypy_has_nothing_to_say_of_a_users_program(monkeypatch):
     api = pytest.importorskip("mypy.api")
     monkeypatch.chdir(PROGRAM.parents[2])  # where pyproject.toml has mypy's settings
     said, problem, status = api.run(["--strict", str(PROGRAM)])
     assert (status, problem) == (0, ""), said
+
+
+def test_pyright_has_nothing_to_say_of_a_users_program():
+    def pyright(*arguments):
+        command = [sys.executable, "-m", "pyright", *arguments]
+        return subprocess.run(command, capture_output=True, text=True)
+
+    if pyright("--version").returncode:  # at its first run it fetches itself from npm
+        pytest.skip("pyright is not installed, or npm is out of reach")
+    found = pyright("--pythonpath", sys.executable, str(PROGRAM))
+    assert found.returncode == 0, found.stdout

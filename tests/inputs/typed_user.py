@@ -1,4 +1,4 @@
-"""A user's program as the pages write them, with annotations: mypy has nothing to say of it."""
+"""A user's program as the pages write them, with annotations: mypy and pyright have nothing to say of it."""
 
 from pathlib import Path
 
