@@ -9,6 +9,9 @@ from pathlib import Path
 DIGITS = 18
 """Digits of the largest whole number that is read; it fits 64 bits."""
 
+LARGEST = 1e60
+"""Of a number that is read; products of five such numbers are finite in float64."""
+
 
 def stored(path: str | Path) -> Path | None:
     """The file NAME, else NAME.gz beside it, else None."""
@@ -62,17 +65,20 @@ class TextFile:
         return self.error(max(len(self.lines) - (self.lines[-1] == ""), 1), reason)
 
     def numbers(self, line: int, fields: Sequence[str], names: Sequence[str]) -> list[float]:
-        """The fields of a line as finite numbers, one per name; ValueError otherwise."""
+        """The fields of a line as numbers within ±`LARGEST`, one per name; ValueError otherwise."""
         self.expect(line, fields, names)
         try:
             values = [float(field) for field in fields]
         except ValueError:
             values = []
         # float() also accepts 1_000.
-        if not values or not all(map(math.isfinite, values)) or "_" in self.lines[line - 1]:
+        finite = values and all(map(math.isfinite, values))
+        if not finite or max(map(abs, values)) > LARGEST or "_" in "".join(fields):
             for name, field in zip(names, fields, strict=True):
                 if not _is_finite(field):
                     raise self.error(line, f"{name} is not a finite number: {field!r}")
+                if abs(float(field)) > LARGEST:
+                    raise self.error(line, f"{name} is beyond ±{LARGEST:g}: {field}")
         return values
 
     def identity(self, line: int, field: str, name: str) -> int:

@@ -214,7 +214,8 @@ class _Header:
 
     def error(self, key: str, reason: str) -> ValueError:
         """A ValueError about the line of a value, for the caller to raise."""
-        return self.file.error(self.found[key].start_mark.line + 1, reason)
+        line = self.found[key].start_mark.line + 1
+        return self.file.error(line, " ".join(reason.split()))  # a value may go over lines
 
     def text(self, key: str) -> str:
         """The value of a key as written in the file, without quotes."""

@@ -16,7 +16,7 @@ from jaxslam.core.logs.tables import POSE, TAG, TIME, UNITS, Columns, split_unit
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import Log
 from jaxslam.datasets.dataset import Adjustable, Dataset, Parameter
-from jaxslam.datasets.lines import DIGITS, read_bytes, stored
+from jaxslam.datasets.lines import DIGITS, LARGEST, read_bytes, stored
 from jaxslam.datasets.table_settings import Parametric, TableSettings
 
 
@@ -129,13 +129,13 @@ class CsvTable:
         values = np.empty(len(self.cells))
         for row, cells in enumerate(self.cells):
             values[row] = _number(cells[place])
-        if not np.isfinite(values).all():
-            row = int(np.flatnonzero(~np.isfinite(values))[0])
+        usable = np.abs(values) <= LARGEST
+        if not usable.all():
+            row = int(np.flatnonzero(~usable)[0])
             cell = self.cells[row][place]
             hint = " (write a point: 0.5)" if "," in cell else ""
-            raise self._error(
-                self.lines[row], f"expected a finite number, got {cell!r}{hint}", place
-            )
+            what = f"number within ±{LARGEST:g}" if np.isfinite(values[row]) else "finite number"
+            raise self._error(self.lines[row], f"expected a {what}, got {cell!r}{hint}", place)
         return values / (divisor or 1.0)
 
     def _tags(self, place: int) -> list[int | None]:

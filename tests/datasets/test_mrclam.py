@@ -49,6 +49,7 @@ def test_mrclam_by_hand(tmp_path):
         ("Robot2_Odometry.dat", " 2.0 0.250", " 2.0", 4, "expected 3 fields (time v omega), got 2"),
         ("Robot2_Odometry.dat", " 2.0 0.250", " v 0.250", 4, "v is not a finite number: 'v'"),
         ("Robot2_Odometry.dat", " 2.0 0.250", " 2.0 inf", 4, "omega is not a finite number"),
+        ("Robot2_Odometry.dat", " 2.0 0.250", " 2.0 2e250", 4, "omega is beyond ±1e+60: 2e250"),
         ("Robot2_Odometry.dat", None, "# Time v omega\n", 1, "no data in the file"),
         ("Robot2_Odometry.dat", None, "", 1, "no data in the file"),
         ("Robot2_Measurement.dat", "273.500 5", "273.499 5", 4, "time goes back from"),

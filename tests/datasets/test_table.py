@@ -197,6 +197,7 @@ BAD = [
     (ODOMETRY, "1.2,", "0.9,", ":3: column 1 (t [s]): expected a time above 1.0, got 0.9"),
     (ODOMETRY, "1.2,", "1.0,", ":3: column 1 (t [s]): expected a time above 1.0, got 1.0"),
     (ODOMETRY, "1.2,1.0", "1.2,nan", ":3: column 2 (v [m/s]): expected a finite number, got 'nan'"),
+    (ODOMETRY, "1.2,1.0", "1.2,1e99", ":3: column 2 (v [m/s]): expected a number within ±1e+60, got '1e99'"),
     (ODOMETRY, "1.2,1.0", "1.2,", ":3: column 2 (v [m/s]): expected a finite number, got ''"),
     (ODOMETRY, "1.2,1.0", "1.2,1_0", ":3: column 2 (v [m/s]): expected a finite number, got '1_0'"),
     (ODOMETRY, "1.2,1.0", '1.2,"1,0"', ":3: column 2 (v [m/s]): expected a finite number, got '1,0' (w"),

@@ -151,6 +151,7 @@ def test_the_map_of_turtlebot(tmp_path):
         ("-1.5, 2.0, 0.25", "-1.5, 2.0", 4, "expected origin: [x, y, yaw], got [-1.5, 2.0]"),
         ("2.0, 0.25]", "2.0, 0.25", 4, "expected YAML, but "),
         ("-1.5, 2.0, 0.25", "-1.5, 2.0, inf", 4, "yaw is not a finite number"),
+        ("-1.5, 2.0, 0.25", "-1.5, 2.0, 0\n 25", 4, "got [-1.5, 2.0, 0 25]: yaw is not a finite"),
         ("negate: 0", "negate: 2", 5, "expected negate to be 0 or 1"),
         ("negate: 0", "mode: raw\nnegate: 0", 5, "expected mode to be trinary or scale"),
         ("0.65", "0.1", 6, "expected 0 <= free_thresh < occupied_thresh <= 1"),
@@ -166,7 +167,8 @@ def test_a_bad_yaml_is_refused_with_its_line(tmp_path, old, new, line, reason):
     recordings.assert_error(path, line, reason, lambda: grids.read_map(path))
 
 
-def test_a_byte_order_mark_is_no_key(tmp_path):
+def test_a_byte_order_mark_is_no_key_and_other_ends_of_lines_are_read(tmp_path):
+    assert grids.read_map(made(tmp_path, "\r\r" + YAML)).resolution == 0.05
     assert grids.read_map(made(tmp_path, "\ufeff" + YAML)).resolution == 0.05
 
 
