@@ -5,6 +5,7 @@ Grey images are PGM, P5 (binary) and P2 (text), read here; PNG and BMP are read 
 
 import io
 import math
+import os
 import re
 import warnings
 from collections.abc import Sequence
@@ -114,7 +115,7 @@ def load(path: str | Path) -> Grid:
     negate = head.choice("negate", {"0": False, "1": True, "false": False, "true": True})
     mode = head.choice("mode", dict(zip(_MODES, _MODES, strict=True)), "trinary")
     image = head.file.path.parent / head.text("image")
-    if not image.is_file():
+    if not os.path.isfile(image):  # Path.is_file raises on a name that is too long
         raise head.error("image", f"no image {image}")
     shade = _read_shades(image)
     p = shade if negate else 1.0 - shade

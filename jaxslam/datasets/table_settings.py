@@ -254,10 +254,6 @@ class TableSettings:
         self._text, self.content = _read(path)
         if not path.exists():
             self.assumed.append(f"no {path.name}")
-        found = _read(path.with_name(FITTED))[1] if fitted else {}
-        for section in sorted(found.keys() & {"motion", "sensor", "calibration"}):
-            self.content[section] = self.content.get(section, {}) | found[section]
-            self.assumed.append(f"[{section}] {', '.join(found[section])} of {FITTED}")
         known = ("name", "source", "motion", "sensor", "filter", "calibration")
         self._check_keys("", self.content, known)
         for name in known:
@@ -265,6 +261,13 @@ class TableSettings:
             if not isinstance(self.content.get(name, kind()), kind):
                 wanted = "text" if kind is str else f"a section [{name}]"
                 raise ValueError(f"{self._at('', name)}: expected {wanted}")
+        numbers = path.with_name(FITTED)
+        found = _read(numbers)[1] if fitted else {}
+        for section in sorted(found.keys() & {"motion", "sensor", "calibration"}):
+            if not isinstance(found[section], dict):
+                raise ValueError(f"{numbers}: expected a section [{section}]")
+            self.content[section] = self.content.get(section, {}) | found[section]
+            self.assumed.append(f"[{section}] {', '.join(found[section])} of {FITTED}")
 
     def text(self, name: str, default: str) -> str:
         """The name or the source of the data."""

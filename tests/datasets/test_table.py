@@ -290,6 +290,12 @@ def test_bad_settings_are_named(tmp_path, toml, reason):
     assert (f":2: {reason}" if reason[0] == "[" else reason) in str(caught.value)
 
 
+def test_bad_sections_of_fitted_numbers_are_named(tmp_path):
+    write(tmp_path, OWN | {"fit.toml": "[[motion]]\nnoise = [0.1, 0.1]\n"})
+    with pytest.raises(ValueError, match=r"fit\.toml: expected a section \[motion\]"):
+        datasets.table(tmp_path)
+
+
 def test_columns_of_no_model_list_those_of_all(tmp_path):
     with pytest.raises(ValueError, match=r"no model has the columns t \[s\], speed.*unicycle \(v"):
         datasets.table(write(tmp_path, OWN, ODOMETRY, "t [s],speed [m/s]\n1,1\n"))

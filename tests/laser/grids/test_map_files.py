@@ -144,6 +144,7 @@ def test_the_map_of_turtlebot(tmp_path):
     ("old", "new", "line", "reason"),
     [
         ("map.pgm", "none.pgm", 2, "no image"),
+        ("map.pgm", 300 * "9", 2, "no image"),
         ("0.05", "0", 3, "expected a resolution above 0"),
         ("0.05", "-0.05", 3, "expected a resolution above 0"),
         ("0.05", "fine", 3, "resolution is not a finite number: 'fine'"),
