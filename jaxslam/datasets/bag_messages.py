@@ -26,9 +26,10 @@ class Topic:
 class Bag:
     """An open bag: its topics, and the messages of some of them."""
 
-    def __init__(self, path: Path, reader: Any) -> None:
+    def __init__(self, path: Path, reader: Any, types: Any) -> None:
         self.path = path
         self._reader = reader
+        self._types = types
         self.topics = tuple(
             Topic(name, (of.msgtype or "several types").replace("/msg/", "/"), of.msgcount)
             for name, of in sorted(reader.topics.items())
@@ -42,11 +43,14 @@ class Bag:
     def messages(self, names: Collection[str]) -> Iterator[tuple[str, int, Any]]:
         """(topic, time of the recording [ns], message) of the named topics, in that order of time.
 
-        Raises ValueError, with the file, if one cannot be read.
+        Raises ValueError, with the file, if one cannot be read, or lacks a field that ROS gives it.
         """
         connections = [each for each in self._reader.connections if each.topic in names]
         if not connections:
             return
+        for each in connections:
+            if field := self._lacking(each.msgtype):
+                raise self.error(f"{each.topic}: expected the messages of ROS, without {field}")
         found = self._reader.messages(connections)
         count = 0
         while True:
@@ -69,6 +73,20 @@ class Bag:
             raise self.error(f"{name}: expected messages, as the index of the bag says, got none")
         return found[2]
 
+    def _lacking(self, name: str) -> str | None:
+        """A field of a type of ROS that the bag's own definition lacks or has as another type."""
+        if name not in self._types.fielddefs:  # no type of ROS 2, as tf/tfMessage
+            return None
+        own = dict(self._reader.typestore.fielddefs[name][1])
+        for field, kind in self._types.fielddefs[name][1]:
+            if own.get(field) != kind:
+                return f"{name}/{field}".replace("/msg/", "/")
+            while isinstance(kind[1][0], tuple):  # of an array
+                kind = kind[1][0]
+            if isinstance(kind[1], str) and (found := self._lacking(kind[1])):
+                return found
+        return None
+
     def error(self, reason: str) -> ValueError:
         """A ValueError about the bag, for the caller to raise."""
         return ValueError(f"{self.path}: {_one_line(reason)}")
@@ -88,12 +106,13 @@ def opened(path: str | Path) -> Iterator[Bag]:
     path = Path(path)
     try:
         # Bags of ROS 2 before Iron have no definitions; those of these types are equal in all.
-        reader = AnyReader([path], default_typestore=get_typestore(Stores.ROS2_HUMBLE))
+        types = get_typestore(Stores.ROS2_HUMBLE)
+        reader = AnyReader([path], default_typestore=types)
         reader.open()
     except Exception as problem:  # of SQLite, zstd, struct, … where a bag is damaged
         raise _unreadable(path, problem) from problem
     try:
-        yield Bag(path, reader)
+        yield Bag(path, reader, types)
     finally:
         reader.close()
 

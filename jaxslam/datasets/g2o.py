@@ -228,6 +228,8 @@ def _table(file: TextFile, rows: list[_Row], index: dict[str, dict[int, int]]) -
 
 def save(path: str | Path, graph: Graph) -> None:
     """Write a graph as a file of g2o, or TORO by the file's ending; see `graphs.write`."""
+    if not isinstance(graph, Graph):
+        raise ValueError(f"write: expected a path and a Graph, got a {type(graph).__name__}")
     path = Path(path)
     packed = path.suffix == ".gz"
     ending = path.with_suffix("").suffix if packed else path.suffix

@@ -237,7 +237,7 @@ def _read(path: Path) -> tuple[str, dict[str, Any]]:
         raise ValueError(f"{path}:{line}: expected TOML: {what}") from problem
     except RecursionError as problem:
         raise ValueError(f"{path}: expected TOML, got brackets in brackets") from problem
-    except (OSError, UnicodeDecodeError) as problem:
+    except (OSError, ValueError) as problem:  # not text, or a whole number of over 4,300 digits
         raise ValueError(f"{path}: cannot be read: {problem}") from problem
 
 

@@ -290,9 +290,16 @@ def test_bad_settings_are_named(tmp_path, toml, reason):
     assert (f":2: {reason}" if reason[0] == "[" else reason) in str(caught.value)
 
 
-def test_bad_sections_of_fitted_numbers_are_named(tmp_path):
-    write(tmp_path, OWN | {"fit.toml": "[[motion]]\nnoise = [0.1, 0.1]\n"})
-    with pytest.raises(ValueError, match=r"fit\.toml: expected a section \[motion\]"):
+@pytest.mark.parametrize(
+    ("toml", "reason"),
+    [
+        ("[[motion]]\nnoise = [0.1, 0.1]\n", r"expected a section \[motion\]"),
+        ("[motion]\nscale = " + 5000 * "9", "cannot be read: Exceeds the limit"),
+    ],
+)
+def test_bad_files_of_fitted_numbers_are_named(tmp_path, toml, reason):
+    write(tmp_path, OWN | {"fit.toml": toml})
+    with pytest.raises(ValueError, match=rf"fit\.toml: {reason}"):
         datasets.table(tmp_path)
 
 
