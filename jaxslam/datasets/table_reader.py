@@ -68,6 +68,7 @@ class CsvTable:
             )
         if not self.cells:
             raise self._error(self.head_line, "expected lines below the header, got none")
+        self.header = [" ".join(name.split()) for name in self.header]  # messages quote it
         self.names = [split_unit(name)[0] for name in self.header]
         for place, name in enumerate(self.names):
             if name in self.names[:place]:
@@ -152,7 +153,7 @@ class CsvTable:
         return tags
 
     def _column(self, place: int) -> str:
-        return f"column {place + 1} ({' '.join(self.header[place].split())})"
+        return f"column {place + 1} ({self.header[place]})"
 
     def _error(self, line: int, reason: str, place: int | None = None) -> ValueError:
         where = "" if place is None else f"{self._column(place)}: "

@@ -305,7 +305,7 @@ def test_bad_files_of_fitted_numbers_are_named(tmp_path, toml, reason):
 
 def test_columns_of_no_model_list_those_of_all(tmp_path):
     with pytest.raises(ValueError, match=r"no model has the columns t \[s\], speed.*unicycle \(v"):
-        datasets.table(write(tmp_path, OWN, ODOMETRY, "t [s],speed [m/s]\n1,1\n"))
+        datasets.table(write(tmp_path, OWN, ODOMETRY, 't [s],"speed\u2028[m/s]"\n1,1\n'))
 
 
 def estimates(data, shift):
