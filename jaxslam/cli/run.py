@@ -86,7 +86,9 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 def run_dataset(options: argparse.Namespace, command: str) -> int:
     """Run filters over the data set, print and write their results; returns the exit status."""
     formats = check_figure_formats("--figures", options.figures.split(","))
-    reader = pick("dataset", options.dataset, READERS)
+    if options.dataset not in READERS:  # laser logs are read by another command
+        pick("dataset", options.dataset, {**READERS, "carmen": None, "rosbag": None})
+    reader = READERS[options.dataset]
     if options.robot is not None and "robot" not in inspect.signature(reader).parameters:
         raise ValueError(
             f"--robot: expected none, since this data set has one robot, got {options.robot}"

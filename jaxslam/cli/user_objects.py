@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 
-from jaxslam import filters
 from jaxslam.catalog import ALL
 from jaxslam.cli.common import pick
 from jaxslam.consistency.campaign.candidates import check_fits, check_noise
@@ -105,7 +104,8 @@ class UserObjects:
     def _from_file(self, entry: str, scenario: World) -> tuple[str, Candidate]:
         """The name of a user's filter, and the filter for the scenario.
 
-        The name is that of the filter, or NAME if the filter has the name of one of the library.
+        The name is that of the filter if its class is the user's and the catalog has none of that
+        name, else NAME.
         """
         name, value = self._find("--filters", entry)
         made = value
@@ -116,7 +116,8 @@ class UserObjects:
                 f"{entry}: expected a Filter, or a function of the scenario that returns one, "
                 f"{_got(value, made)}"
             )
-        if isinstance(made, Filter) and not (made.name in ALL or hasattr(filters, made.name)):
+        own = not type(made).__module__.startswith("jaxslam.")
+        if isinstance(made, Filter) and own and made.name not in ALL:
             name = made.name
         check_fits(name, made, scenario)
         return name, made

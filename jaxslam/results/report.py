@@ -50,7 +50,9 @@ def campaign_table(campaign: Campaign) -> str:
             "--dtype in the command."
         )
     if campaign.published:
-        notes.append(f"published: {campaign.source}")
+        notes.append(
+            f"published: {campaign.source}; for the scenario and the filters as in the catalog"
+        )
     lines = (line for note in notes for line in textwrap.wrap(note, _WIDTH))
     return "\n".join([title, "", text, "", *lines])
 

@@ -151,8 +151,8 @@ def notes_on(campaign: Campaign) -> list[tuple[str, str]]:
         out.append(
             (
                 "gate",
-                "a gate drops the largest innovations, so that NIS / dof is honest from "
-                f"{', '.join(limits)} to 1, the range of the verdict; the band is without a gate",
+                "a gate drops the largest innovations: an honest NIS / dof lies between "
+                f"{', '.join(limits)} and 1; the verdict uses this range, the band does not",
             )
         )
     likely = [s for s in summaries.values() if "log_likelihood" in s.measures]

@@ -52,8 +52,10 @@ def make_walls(
             )
         segments.append(np.stack([corners, np.roll(corners, -1, axis=0)], axis=1))
     rounds = (
-        np.asarray(circles, np.float64).reshape(-1, 3) if np.size(circles) else np.zeros((0, 3))
+        np.atleast_2d(np.asarray(circles, np.float64)) if np.size(circles) else np.zeros((0, 3))
     )
+    if rounds.ndim != 2 or rounds.shape[1] != 3:
+        raise ValueError(f"make_walls: expected circles (x, y, radius), got shape {rounds.shape}")
     made = Walls(np.concatenate(segments), rounds)
     if not all(np.all(np.isfinite(part)) for part in made[:2]) or np.any(rounds[:, 2] <= 0):
         raise ValueError("make_walls: expected finite numbers and radii above 0")

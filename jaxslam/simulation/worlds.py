@@ -70,6 +70,8 @@ class World(Component):
     def __post_init__(self) -> None:
         what = f"{type(self).__name__} {self.name!r}"
         self._check(World, {"draw": "key"})
+        check_record(what, "motion", self.motion, Motion)
+        check_record(what, "sensor", self.sensor, Sensor)
         _check_table(f"{what}: landmarks", self.landmarks, len(self.sensor.landmark))
         _check_table(f"{what}: controls", self.controls, len(self.motion.controls))
         if np.shape(self.pose) != (3,):

@@ -105,6 +105,7 @@ def sensor_checks(sensor: Sensor, seen: Samples, inverse: Samples) -> Iterator[C
         f"the residual is a difference{wrapped}",
         lambda: _residual_error(residual, z, other, circle),
     )
+    yield from _guard("angles have [rad] in their names", lambda: _unnamed_angle(sensor, seen))
     if not sensor.landmark:
         return
 
@@ -132,6 +133,20 @@ def sensor_checks(sensor: Sensor, seen: Samples, inverse: Samples) -> Iterator[C
     yield from _guard(
         "invert undoes observe, within what is free", lambda: _inversion_error(sensor, seen)
     )
+
+
+def _unnamed_angle(sensor: Sensor, seen: Samples) -> str:
+    """An entry of z that jumps by 2π as the robot turns, and is not [rad] by its name, or ""."""
+    pose, *landmark = (values[0] for values in seen.values)
+    turns = np.linspace(0, 2 * np.pi, 65)
+    poses = np.stack([np.full(65, pose[0]), np.full(65, pose[1]), turns], axis=1)
+    z = quick_jit(jax.vmap(sensor.observe, in_axes=(0, *(None for _ in landmark))))
+    steps = np.abs(np.diff(np.asarray(z(poses, *landmark), np.float64), axis=0))
+    jumps = np.any(np.abs(steps - 2 * np.pi) < 0.5, axis=0) & (np.median(steps, axis=0) < 0.5)
+    jumps &= ~np.isfinite(periods(sensor.measurements))
+    for name in np.array(sensor.measurements)[jumps]:
+        return f"{name} jumps by 2π as the robot turns: name it '{name.split(' [')[0]} [rad]'"
+    return ""
 
 
 def _inversion_error(sensor: Sensor, seen: Samples) -> str:

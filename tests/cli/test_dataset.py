@@ -84,6 +84,7 @@ def test_run_writes_films_and_says_what_is_missing(tmp_path, capsys, monkeypatch
     ("asked", "spoil", "message"),
     [
         (["moon"], "", "unknown dataset 'moon'"),
+        (["rosbg"], "", "unknown dataset 'rosbg' (did you mean rosbag?)"),
         (["bonn"], "SENSOR 1 oops 0", "sensor_data.dat:10: "),
         (["victoria_park"], "", "victoria_park"),
         (["bonn", "--robot", "2"], "", "--robot: expected none, since this data set has one"),

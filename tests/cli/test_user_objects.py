@@ -48,6 +48,8 @@ def blind(scenario):
 ready = blind(world)
 alike = lambda scenario: lambda truth: blind(scenario)
 wrong = lambda scenario: scenario.nothing
+plain = lambda scenario: jaxslam.filters.EkfSlam(scenario.motion, scenario.sensor, 4)
+wide = lambda scenario: jaxslam.filters.EkfSlam(scenario.motion, scenario.sensor, 8)
 of_two = lambda scenario, capacity: ready
 untraceable = lambda scenario: Untraceable(ready)
 named = Named(ready.filter)
@@ -70,6 +72,7 @@ def test_filters_of_a_file_stand_beside_those_of_the_catalog(mine, capsys):
     assert all(isinstance(found[name], Filter) for name in ("ekf", "blind", "ready"))
     assert isinstance(found["alike"](None), Filter)
     assert capsys.readouterr().out == "loaded\n"  # once
+    assert list(files.filters(f"{mine}:plain,{mine}:wide", world)) == ["plain", "wide"]
     assert list(files.filters("all", world)) == list(catalog.ALL)
 
 

@@ -182,7 +182,7 @@ def test_notes_of_the_measures_stand_below_them():
     of.counts.update(born=3, fused=9, rejected=2)
     reader = Reader(campaign_page(campaign(a=of), "", None, {}, {}))
     words = " ".join("".join(reader.words).split())
-    assert "so that NIS / dof is honest from 0.950 (a) to 1" in words
+    assert "an honest NIS / dof lies between 0.950 (a) and 1" in words
     assert "initialized, measurements that started a landmark" in words
     assert row(reader, "initialized")[2] == "3"
 

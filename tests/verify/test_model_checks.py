@@ -38,6 +38,11 @@ BESIDE_JACOBIANS = {
         {"residual": lambda z, z_hat: LASER.residual(z_hat, z)},
         [DIFFERENCE],
     ),
+    "bearing without a unit": (
+        LASER,
+        {"measurements": ("range [m]", "bearing")},
+        ["angles have [rad] in their names"],
+    ),
     "residual not wrapped": (LASER, {"residual": lambda z, z_hat: z - z_hat}, [DIFFERENCE]),
     "residual with an offset": (
         LASER,

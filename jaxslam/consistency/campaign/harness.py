@@ -32,7 +32,7 @@ from jaxslam.consistency.campaign.pieces import check_part, cores, in_part, miss
 from jaxslam.consistency.campaign.remote import Executor
 from jaxslam.consistency.campaign.result import Campaign, Incomplete, Interrupted
 from jaxslam.consistency.campaign.work import Work, shown_progress
-from jaxslam.core.numbers import check_count, check_key
+from jaxslam.core.numbers import check_count, check_key, is_concrete
 from jaxslam.core.protocols import Candidate
 from jaxslam.core.validation import check_record
 from jaxslam.simulation.worlds import World, with_positions
@@ -170,7 +170,12 @@ def _check(
         )
     check_key("monte_carlo", key)
     if not isinstance(filters, Mapping) or not filters:
-        raise ValueError("monte_carlo: expected filters as {name: filter}, at least one")
+        got = "none" if isinstance(filters, Mapping) else f"a {type(filters).__name__}"
+        raise ValueError(
+            f"monte_carlo: expected filters as {{name: filter}}, at least one, got {got}"
+        )
+    if not is_concrete(key):
+        raise ValueError("monte_carlo: it compiles its own programs: call it outside of jax.jit")
     for name, candidate in filters.items():
         check_fits(name, candidate, scenario)
     check_noise(scenario)

@@ -39,7 +39,7 @@ def add_kept(
             add_block(tallies, first, count, by_filter(arrays, tallies))
     if most > runs:
         raise ValueError(
-            f"monte_carlo: keep holds {most} runs: expected at least as many, got {runs}"
+            f"monte_carlo: runs: expected at least {most}, as many as keep holds, got {runs}"
         )
     return finished
 

@@ -168,7 +168,8 @@ def split_target(target: str) -> tuple[Path, str]:
     if path.suffix != ".py":
         raise UnusableFile(f"{file}: expected a Python file, FILE.py or FILE.py:NAME")
     if not path.is_file():
-        raise UnusableFile(f"{file}: no such file")
+        where = "" if path.is_absolute() else f" in {Path.cwd()}"
+        raise UnusableFile(f"{file}: no such file{where}")
     return path, name
 
 

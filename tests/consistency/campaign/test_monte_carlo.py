@@ -397,7 +397,8 @@ def test_wrong_filters_are_found_out(name):
     ({"workers": 0}, "workers"),
     ({"devices": []}, "device"),
     ({"key": 0}, "monte_carlo: expected a PRNG key, as jax.random.key(0), got 0"),
-    ({"filters": {}}, "at least one"),
+    ({"filters": {}}, "at least one, got none"),
+    ({"filters": worlds.ekf(WORLD)}, "{name: filter}, at least one, got a EkfSlam"),
     ({"filters": {"x": 3}}, "expected x to be a Filter"),
     ({"filters": {"x": lambda log, key: None}}, "lambda truth"),
     (
