@@ -7,16 +7,16 @@ line run them side by side.
 Looked up by name; the error of an unknown one has suggestions for typos.
 """
 
-import difflib
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Literal, NoReturn, TypeVar, Unpack
+from typing import Any, Literal, Unpack
 
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxslam.charts import LeftInvariant, RightInvariant
+from jaxslam.core.names import Named
 from jaxslam.core.protocols import Candidate, Estimator, Filter
 from jaxslam.core.record import record, static
 from jaxslam.core.types import Truth
@@ -36,30 +36,6 @@ from jaxslam.graphs.smoothing.fixed_lag import FixedLag
 from jaxslam.linearize.other_points import AtTruth, FirstEstimate, Observability
 from jaxslam.linearize.unscented import Unscented
 from jaxslam.simulation.worlds import World
-
-_V = TypeVar("_V")
-
-
-class _UnknownName(KeyError):
-    """A name that is none of those known."""
-
-    def __str__(self) -> str:
-        return str(self.args[0])  # a KeyError shows it in quotes
-
-
-class Named(dict[str, _V]):
-    """A dict whose lookup error lists the known names and the closest match."""
-
-    def __missing__(self, name: object) -> NoReturn:
-        """Refuse a name."""
-        known = ", ".join(self)
-        raise _UnknownName(f"expected one of {known}, got {name!r}{meant(name, self)}")
-
-
-def meant(name: object, known: Iterable[str]) -> str:
-    """The closest known name, as a question in brackets, or ""."""
-    alike = difflib.get_close_matches(str(name), known, 1)
-    return "".join(f" (did you mean {each}?)" for each in alike)
 
 
 def variant(scenario: World, *, watch: bool = False, **options: Unpack[EkfOptions]) -> Filter:

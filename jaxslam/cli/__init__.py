@@ -13,7 +13,6 @@ from typing import Any, NoReturn
 import jax
 from threadpoolctl import threadpool_limits
 
-from jaxslam.catalog import meant
 from jaxslam.cli import (
     cache,
     consistency,
@@ -28,6 +27,7 @@ from jaxslam.cli import (
 )
 from jaxslam.cli.common import INTERRUPTED, CompileClock, as_folders, set_device_count
 from jaxslam.cli.environment import environment_text
+from jaxslam.core.names import meant
 
 __all__ = ["main"]
 

@@ -11,10 +11,10 @@ from typing import TYPE_CHECKING, TypeVar
 
 import jax
 
-from jaxslam.catalog import meant
 from jaxslam.consistency.campaign.pieces import cores
 from jaxslam.consistency.campaign.progress import Progress
 from jaxslam.consistency.measures.counts import count_label
+from jaxslam.core.names import meant
 from jaxslam.results.campaign_files import RESULT
 from jaxslam.results.files import Files, check_writable
 

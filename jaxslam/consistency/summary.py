@@ -16,6 +16,7 @@ from jaxslam.consistency.measures.innovations import autocorrelation_of, nis_ban
 from jaxslam.consistency.measures.nees import inside_bands
 from jaxslam.consistency.tally import SHOTS, Tally
 from jaxslam.consistency.verdict import judge
+from jaxslam.core.names import Named
 
 _IN_REPR = ("nees_pose", "nis_per_dof", "rmse_position")
 
@@ -71,6 +72,9 @@ class Summary:
     """sentences that qualify the verdict: most measurements dropped, directions lost"""
     honest_nis: float = 1.0
     """nis_per_dof from here on up to 1 is honest: below 1 where a gate dropped measurements"""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "measures", Named(self.measures))
 
     def __repr__(self) -> str:
         present = (name for name in _IN_REPR if name in self.measures)

@@ -214,7 +214,10 @@ def test_a_laser_and_its_world_hold_numbers_alone():
     (lambda: make_walls([[0, 0], [1, 0], [0, 1]], glass={(0, 3): 0.5}), "chain 0 has no side 3"),
     (lambda: make_walls([[0, 0], [1, 0], [0, 1]], glass={(0, 1): 1.5}), "share in"),
     (lambda: make_walls(), "make_walls: expected at least one wall"),
-    (lambda: make_walls(circles=[[1, 2]]), r"expected circles \(x, y, radius\), got shape \(1, 2\)"),
+    (
+        lambda: make_walls(circles=[[1, 2]]),
+        r"expected circles \(x, y, radius\), got shape \(1, 2\)",
+    ),
     (
         lambda: make_walls([[0, 0], [1, 1]]),
         "make_walls: expected chain 0 of at least three corners",

@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from jaxslam.consistency import Summary
+from jaxslam.core.names import Named
 from jaxslam.core.types import Estimate, Truth
 
 
@@ -46,6 +47,9 @@ class Campaign:
     run_numbers: np.ndarray = field(default_factory=lambda: np.arange(0))
     """(runs,) the number of each run, in the order of `Summary.per_run`; run i has key
     fold_in(key, i)"""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "filters", Named(self.filters))
 
     @property
     def size(self) -> str:

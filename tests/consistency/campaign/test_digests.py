@@ -105,7 +105,9 @@ def test_fewer_runs_than_are_kept_are_refused(tmp_path):
     kept.claim(identity(**campaign(), platform="cpu"))
     kept.save(0, {"0/x": np.zeros(2)}, 2)
     kept.save(2, {"0/x": np.zeros(2)}, 2)
-    with pytest.raises(ValueError, match=r"runs: expected at least 4, as many as keep holds, got 3"):
+    with pytest.raises(
+        ValueError, match=r"runs: expected at least 4, as many as keep holds, got 3"
+    ):
         monte_carlo(runs=3, keep=store.resume(tmp_path), **campaign())
 
 
