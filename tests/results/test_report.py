@@ -45,7 +45,7 @@ def test_the_notes_explain_the_gate_the_likelihood_and_the_counts(campaign):
     told = report.campaign_table(dataclasses.replace(campaign, filters={"a": ekf, "b": gated}))
     assert max(map(len, told.splitlines())) <= 88
     text = " ".join(told.split())
-    assert "gate: a gate drops the largest innovations" in text and "0.945 (b) to 1" in text
+    assert "gate: a gate drops the largest innovations" in text and "0.945 (b) and 1" in text
     assert "log-likelihood: comparable only between filters that fused the same" in text
     assert "initialized, measurements that started a landmark" in text
     assert "born" not in text

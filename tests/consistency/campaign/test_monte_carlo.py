@@ -212,13 +212,16 @@ def test_a_campaign_is_the_loop_over_its_runs(in_fours):
     np.testing.assert_allclose(measures["nees_pose"].value, np.mean(nees), rtol=1e-6)
 
 
-def test_another_seed_is_another_campaign(in_fours):
-    options = {"block": 4, "bound": True, "devices": jax.devices()[:1]}
-    other = monte_carlo(WORLD, {"ekf": EKF}, 10, worlds.key(1), **options)
+def test_a_name_that_is_not_there_is_told_with_those_that_are(in_fours):
     with pytest.raises(KeyError, match=r"expected one of .*nees_pose.*got 'pose_nees'"):
         in_fours.filters["ekf"].measures["pose_nees"]
     with pytest.raises(KeyError, match=r"expected one of ekf, .*got 'ekg' \(did you mean ekf\?\)"):
         in_fours.filters["ekg"]
+
+
+def test_another_seed_is_another_campaign(in_fours):
+    options = {"block": 4, "bound": True, "devices": jax.devices()[:1]}
+    other = monte_carlo(WORLD, {"ekf": EKF}, 10, worlds.key(1), **options)
     ours = in_fours.filters["ekf"].measures["rmse_position"].value
     assert abs(other.filters["ekf"].measures["rmse_position"].value / ours - 1) > 1e-3
 
