@@ -107,6 +107,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if set(arguments) in ({"--version"}, {"--version", "--verbose"}):
         print(environment_text("--verbose" in arguments))
         return 0
+    if arguments and arguments[0][:1] != "-" and arguments[0] not in COMMANDS:
+        hint = f"{meant(arguments[0], COMMANDS)}; jaxslam --help lists the commands"
+        print(f"jaxslam: unknown command {arguments[0]!r}{hint}", file=sys.stderr)
+        return USAGE_ERROR
     try:
         arguments = _laser_command(arguments)
         options = _parser().parse_args(arguments)

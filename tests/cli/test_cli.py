@@ -165,7 +165,7 @@ def test_an_unwritable_folder_exits_with_2_before_any_work(tmp_path, refused, mo
     ("arguments", "message"),
     [
         ([], "jaxslam: the following arguments are required: COMMAND; jaxslam --help describes"),
-        (["consistancy"], "jaxslam: argument COMMAND: invalid choice: 'consistancy' (choose from "),
+        (["consistancy"], "jaxslam: unknown command 'consistancy' (did you mean consistency?)"),
         (
             ["consistency", "--rnus", "3"],
             "jaxslam consistency: unrecognized arguments: --rnus 3 (did you mean --runs?); "
