@@ -14,6 +14,7 @@ from jaxslam.cli.piecewise import run_in_pieces
 from jaxslam.consistency.campaign.progress import Progress
 from jaxslam.core.types import Info
 from jaxslam.datasets import LaserLog
+from jaxslam.datasets.bag_messages import is_bag
 from jaxslam.laser import grids, laser_slam
 from jaxslam.laser.grids import Grid
 from jaxslam.math.numpy_poses import compose
@@ -94,6 +95,8 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> laser_log.Jo
     """
     from jaxslam.results import plot  # matplotlib is slow to load
 
+    if is_bag(options.map):
+        raise ValueError(f"expected a map of ROS, NAME.yaml, got {options.map}")
     grid = grids.read_map(options.map)
     if not np.any(np.asarray(grid.log_odds) < 0):
         raise ValueError(f"{options.map}: the map has no free cell")

@@ -203,6 +203,8 @@ def rasterize(
     Raises:
         ValueError: a resolution or a number of samples that is not above 0.
     """
+    if not isinstance(world, Walls):
+        raise ValueError(f"rasterize: expected Walls, got a {type(world).__name__}")
     if not 0 < resolution < np.inf or samples < 1:
         raise ValueError(
             f"rasterize: expected a resolution and samples above 0, got {resolution}, {samples}"

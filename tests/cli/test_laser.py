@@ -121,6 +121,7 @@ def test_scans_are_chosen_and_those_left_out_are_counted(log_file, tmp_path):
         (["map", "--scans", "3:4"], "room.log: none of 1 scans has a valid beam"),
         (["map", "--figures", "gif"], "--figures: expected formats"),
         (["map", "--max-range", "0.01"], "room.log: no beam returns within 0.01 m (--max-range)"),
+        (["localize", "m.bag"], "expected a map of ROS, NAME.yaml, got m.bag"),
         (["localize", "m.yaml", "--scans", "-3:3"], "--scans: -3:3 has none of the 70 scans"),
     ],
 )

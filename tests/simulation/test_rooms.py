@@ -213,6 +213,10 @@ def test_a_laser_and_its_world_hold_numbers_alone():
 @refused(
     (lambda: make_walls([[0, 0], [1, 0], [0, 1]], glass={(0, 3): 0.5}), "chain 0 has no side 3"),
     (lambda: make_walls([[0, 0], [1, 0], [0, 1]], glass={(0, 1): 1.5}), "share in"),
+    (
+        lambda: rasterize(0.1, make_walls(circles=[[0, 0, 1]])),
+        "rasterize: expected Walls, got a float",
+    ),
     (lambda: make_walls(), "make_walls: expected at least one wall"),
     (
         lambda: make_walls(circles=[[1, 2]]),

@@ -109,7 +109,7 @@ def block_nees(
 
     Args:
         pose: as estimated.
-        error, own: in (x, y, θ), and in the filter's coordinates.
+        error, chart_error: in (x, y, θ), and in the filter's coordinates.
         cov: as claimed. eps is that of its dtype.
     """
     eps = float(np.finfo(cov.dtype).eps)
