@@ -74,9 +74,11 @@ class Bag:
         return found[2]
 
     def _lacking(self, name: str) -> str | None:
-        """A field of a type of ROS that the bag's own definition lacks or has as another type."""
+        """A type of ROS that the bag does not define, or a field that it defines otherwise."""
         if name not in self._types.fielddefs:  # no type of ROS 2, as tf/tfMessage
             return None
+        if name not in self._reader.typestore.fielddefs:
+            return name.replace("/msg/", "/")
         own = dict(self._reader.typestore.fielddefs[name][1])
         for field, kind in self._types.fielddefs[name][1]:
             if own.get(field) != kind:

@@ -345,14 +345,18 @@ def test_a_truncated_bag_is_refused(tmp_path, form):
 
 @pytest.mark.parametrize(
     ("old", "new"),
-    [(b"float32 range_min", b"float32 range_low"), (b"string frame_id", b"string frame_no")],
+    [
+        (b"float32 range_min", b"float32 range_low"),
+        (b"string frame_id", b"string frame_no"),
+        (b"MSG: geometry_msgs/Point", b"MSG: geometry_msgs/Poinx"),
+    ],
 )
 def test_a_bag_that_defines_a_message_otherwise_is_refused(tmp_path, old, new):
     path = bags.write(tmp_path, DRIVE, "mcap")
     file = next(path.glob("*.mcap"))
     assert old in file.read_bytes()
     file.write_bytes(file.read_bytes().replace(old, new))
-    lacking = r"(sensor_msgs/LaserScan/range_min|std_msgs/Header/frame_id)$"
+    lacking = r"(sensor_msgs/LaserScan/range_min|std_msgs/Header/frame_id|geometry_msgs/Point)$"
     with pytest.raises(ValueError, match=r"expected the messages of ROS, without " + lacking):
         datasets.rosbag(file)  # with its folder the hashes of types differ
 
