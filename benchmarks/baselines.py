@@ -12,9 +12,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.gate import Metric
-from jaxslam import catalog, monte_carlo, run, simulate
+from jaxslam import _catalog as catalog
+from jaxslam import monte_carlo, run, simulate
 from jaxslam.filters import Mapping
-from jaxslam.math.gaussians import mahalanobis_squared
+from jaxslam.math._gaussians import mahalanobis_squared
 from jaxslam.math.stats import chi2_band
 from jaxslam.simulation.scenarios import circle
 

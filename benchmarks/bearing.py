@@ -35,7 +35,7 @@ from jaxslam.charts import RightInvariant
 from jaxslam.filters import EkfSlam
 from jaxslam.linearize import Unscented
 from jaxslam.math.stats import chi2_band
-from jaxslam.results.plot.style import COLUMN, INK, TEXT, caption, look, panels_of
+from jaxslam.results.plot import COLUMN, INK, TEXT, caption, look, panels_of
 from jaxslam.simulation.scenarios import circle, cloister
 from jaxslam.verify.linearity import sensor_linearity
 

@@ -20,17 +20,25 @@ import numpy as np
 
 from benchmarks.delayed import named
 from benchmarks.gate import Metric
-from jaxslam import catalog, life, motion, sensors, smoothing, team
-from jaxslam.consistency.campaign.candidates import estimator_of
+from jaxslam import (
+    Scenario,
+    TeamWorld,
+    World,
+    catalog,
+    life,
+    motion,
+    run,
+    sensors,
+    simulate,
+    smoothing,
+    team,
+)
+from jaxslam.consistency.campaign._candidates import estimator_of
 from jaxslam.core.protocols import Filter
 from jaxslam.core.types import Log, Trace, Truth
-from jaxslam.driver import run
-from jaxslam.filters import EkfSlam, TeamSlam
-from jaxslam.filters.map_management.merging import Merging
+from jaxslam.filters import EkfSlam, Merging, TeamSlam
 from jaxslam.sensors import Part, Suite
 from jaxslam.simulation.scenarios import circle
-from jaxslam.simulation.team_world import TeamWorld
-from jaxslam.simulation.worlds import Scenario, World, simulate
 
 GATE, DELAYED_GATE = 8.0, 10.0
 STEPS = 20

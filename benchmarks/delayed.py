@@ -23,15 +23,13 @@ import numpy as np
 
 import jaxslam
 from benchmarks.gate import Metric, show
-from jaxslam import motion, sensors
+from jaxslam import Scenario, motion, sensors
 from jaxslam.association import Nearest
-from jaxslam.filters import DelayedSlam, EkfSlam
-from jaxslam.filters.delayed.delayed_settings import Hypotheses, Promotion, StoredMeasurements
+from jaxslam.filters import DelayedSlam, EkfSlam, Hypotheses, Promotion, StoredMeasurements
+from jaxslam.math._gaussians import mahalanobis_squared
 from jaxslam.math.angles import wrap
-from jaxslam.math.gaussians import mahalanobis_squared
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.simulation.scenarios import cloister
-from jaxslam.simulation.worlds import Scenario
 
 SIGMA = np.deg2rad(1.0)
 FALSE = 1.0

@@ -23,8 +23,9 @@ from benchmarks.gate import Metric, child
 from benchmarks.speed import timing
 from benchmarks.speed.campaigns import campaign
 from jaxslam import catalog, monte_carlo, scenarios
-from jaxslam.consistency.campaign.block import CampaignPlan
-from jaxslam.consistency.campaign.remote import Processes, compute_block, packed
+from jaxslam.consistency.campaign import Processes
+from jaxslam.consistency.campaign._block import CampaignPlan
+from jaxslam.consistency.campaign._remote import compute_block, packed
 
 RUNS, BLOCK = 512, 16
 DEVICES = "--xla_force_host_platform_device_count="

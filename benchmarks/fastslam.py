@@ -17,7 +17,7 @@ import numpy as np
 from benchmarks.gate import Metric, save
 from jaxslam import monte_carlo
 from jaxslam.filters import EkfSlam, FastSlam
-from jaxslam.results.plot.style import PAGE, band, caption, curve, panels_of
+from jaxslam.results.plot import PAGE, band, caption, curve, panels_of
 from jaxslam.simulation.scenarios import webmap
 
 PARTICLES = (10, 100)

@@ -10,7 +10,7 @@ from typing import Any
 
 from matplotlib.figure import Figure
 
-from jaxslam.results.plot.style import png
+from jaxslam.results.plot._style import png
 
 FIGURES = Path(__file__).parent / "figures"
 

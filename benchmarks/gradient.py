@@ -13,12 +13,11 @@ import numpy as np
 
 from benchmarks.gate import Metric
 from benchmarks.speed.timing import together
-from jaxslam.driver import run
-from jaxslam.filters.ekf.ekf_slam import EkfSlam
-from jaxslam.motion.ackermann import Ackermann
-from jaxslam.sensors.range_bearing import RangeBearing
+from jaxslam import run, simulate
+from jaxslam.filters import EkfSlam
+from jaxslam.motion import Ackermann
+from jaxslam.sensors import RangeBearing
 from jaxslam.simulation.scenarios import cloister
-from jaxslam.simulation.worlds import simulate
 
 ROUNDS = 15
 WHEELBASE, SPEED, DT = 0.5, 1.0, 0.1

@@ -23,7 +23,8 @@ import numpy as np
 from benchmarks.gate import Metric, table
 from benchmarks.real_data import DATA
 from jaxslam import consistency, datasets, grids, motion, run
-from jaxslam.consistency.measures.nees import pose_error
+from jaxslam.consistency import pose_error
+from jaxslam.consistency._localization_scores import seed_spread
 from jaxslam.core.record import record
 from jaxslam.simulation import laser, walls
 from jaxslam.simulation.scenarios import office
@@ -109,7 +110,7 @@ def tempering(name, world, grid, model, exponents, runs, particles=500, seeds=10
         again = consistency.judge_localization(
             world, filter, seeds, key, start_cov=0 * START, same_log=True, every=4
         )
-        spread = float(np.median(consistency.seed_spread(again)[SKIP:]))
+        spread = float(np.median(seed_spread(again)[SKIP:]))
         return found.coverage.value, [
             f"{exponent:g}",
             told(found.coverage),

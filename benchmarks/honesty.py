@@ -16,11 +16,10 @@ from jaxtyping import Array, PyTree
 from matplotlib.colors import TwoSlopeNorm
 
 from benchmarks.gate import Metric, save
-from jaxslam import monte_carlo, motion, run, sensors, simulate
+from jaxslam import Scenario, monte_carlo, motion, run, sensors, simulate
 from jaxslam.catalog import FILTERS
-from jaxslam.results.plot.style import INK, PAGE, TEXT, caption, panels_of
-from jaxslam.simulation.scans import BetweenRanges
-from jaxslam.simulation.worlds import Scenario
+from jaxslam.results.plot import INK, PAGE, TEXT, caption, panels_of
+from jaxslam.simulation.scenarios import BetweenRanges
 
 NAMES = {"ekf": "EKF", "fej": "FEJ", "right_invariant": "invariant EKF", "ukf": "UKF"}
 MOST, FAR = 12, 1e3

@@ -14,10 +14,11 @@ import numpy as np
 
 from benchmarks.gate import Metric, show
 from jaxslam import features, filters, scenarios, sensors
-from jaxslam.consistency.measures.nees import block_nees, pose_error
+from jaxslam.consistency import block_nees, pose_error
 from jaxslam.core.types import Beams, Scan
 from jaxslam.math.stats import t_quantile
-from jaxslam.simulation import laser, walls
+from jaxslam.simulation import _walls as walls
+from jaxslam.simulation import laser
 
 PLACES, FAR = 16, (0.4, 0.3)
 """Measurement slots of a scan; from its wall a line is at most so far, [m] and [rad]."""

@@ -13,12 +13,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.gate import Metric, table
+from jaxslam import Scenario
 from jaxslam.catalog import FILTERS
 from jaxslam.consistency.campaign import monte_carlo
 from jaxslam.core.record import record, static
+from jaxslam.simulation._worlds import drawn
 from jaxslam.simulation.scenarios import loop
-from jaxslam.simulation.scenarios.published import loop_landmarks
-from jaxslam.simulation.worlds import Scenario, drawn
+from jaxslam.simulation.scenarios._published import loop_landmarks
 
 NAMES = ("ekf", "ideal", "fej", "oc", "right_invariant")
 RUNS = 4

@@ -22,7 +22,7 @@ import numpy as np
 from benchmarks.gate import Metric, show
 from jaxslam import run, sensors, simulate
 from jaxslam.filters import Localization, ParticleLocalization
-from jaxslam.filters.particles import pose_particles
+from jaxslam.filters._particles import pose_particles
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.simulation.scenarios import circle
 

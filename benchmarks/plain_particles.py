@@ -15,11 +15,11 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.gate import Metric, save, show
-from jaxslam import filters, motion, run, sensors
-from jaxslam.math import gaussians, linalg
+from jaxslam import Scenario, filters, motion, run, sensors, simulate
+from jaxslam.math import _gaussians as gaussians
+from jaxslam.math import _linalg as linalg
 from jaxslam.resampling import systematic
-from jaxslam.results.plot.style import COLORS, COLUMN, INK, caption, panels_of
-from jaxslam.simulation.worlds import Scenario, simulate
+from jaxslam.results.plot import COLORS, COLUMN, INK, caption, panels_of
 
 MOTION = motion.Increment(np.diag([0.01, 0.01]) ** 2)
 SENSOR = sensors.RangeBearing(np.diag([0.1, 0.03]) ** 2)

@@ -19,12 +19,12 @@ import jax
 import numpy as np
 
 from benchmarks.gate import Metric
+from jaxslam import Scenario
 from jaxslam.catalog import FILTERS
 from jaxslam.consistency import Average
 from jaxslam.consistency.campaign import Campaign, monte_carlo
 from jaxslam.math.stats import normal_quantile, t_quantile
 from jaxslam.simulation import scenarios
-from jaxslam.simulation.worlds import Scenario
 
 PUBLISHED_RUNS = 100
 LOOPS = 3

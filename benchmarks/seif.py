@@ -19,12 +19,11 @@ import numpy as np
 
 from benchmarks.gate import Metric, show
 from benchmarks.victoria_park import Solution, compare, run_batch
-from jaxslam import datasets, filters
-from jaxslam.filters.information.marginals import blanket_marginals, whole_marginals
+from jaxslam import datasets, filters, simulate
+from jaxslam.filters._information.marginals import blanket_marginals, whole_marginals
+from jaxslam.math._gaussians import mahalanobis_squared
 from jaxslam.math.angles import wrap
-from jaxslam.math.gaussians import mahalanobis_squared
 from jaxslam.simulation.scenarios import BetweenRanges, circle, cloister
-from jaxslam.simulation.worlds import simulate
 
 KEY = jax.random.key(0)
 EVERY = 10  # steps between two looks at covariances

@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 
 from benchmarks.gate import Metric, child
-from jaxslam.consistency.tally import SHOTS
+from jaxslam.consistency._tally import SHOTS
 
 SHARE = """
 import sys

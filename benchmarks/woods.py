@@ -21,22 +21,13 @@ from benchmarks.gate import Metric, save, show
 from benchmarks.real_data import DATA
 from examples.lost_in_the_woods import write_tables
 from jaxslam import charts, datasets, metrics
-from jaxslam.consistency.measures.nees import block_nees, pose_error
+from jaxslam.consistency import block_nees, pose_error
 from jaxslam.core.types import Status
-from jaxslam.datasets.noise_fit import autocorrelation
+from jaxslam.datasets._noise_fit import autocorrelation
 from jaxslam.filters import EkfSlam
 from jaxslam.math.stats import chi2_quantile
-from jaxslam.results.plot.landmarks import ellipses
-from jaxslam.results.plot.style import (
-    COLORS,
-    FAINT,
-    INK,
-    PAGE,
-    SHADE,
-    caption,
-    panels_of,
-    titled,
-)
+from jaxslam.results.plot import COLORS, FAINT, INK, PAGE, SHADE, caption, panels_of, titled
+from jaxslam.results.plot._landmarks import ellipses
 
 MAT = DATA / "lost_in_the_woods" / "dataset2.mat"
 SPACINGS = 0.0, 0.5, 1.0, 2.0, 3.0, 5.0
@@ -138,7 +129,7 @@ def measure(quick: bool = False) -> list[Metric]:
             f"What the log tells ({took:.0f} s)",
             {n: {"value": v, "std. error": e, "robust": r} for n, v, e, r in shown},
         )
-        from jaxslam.datasets.table_settings import fitted_text
+        from jaxslam.datasets._landmark_logs.table_settings import fitted_text
 
         text = fitted_text(fitted.parameters, fitted.cov)
         calibrated = {}

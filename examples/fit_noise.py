@@ -22,7 +22,6 @@ import jaxslam
 from jaxslam.calibration import NoiseFit, fit_noise
 from jaxslam.core.types import Info
 from jaxslam.datasets import mrclam
-from jaxslam.datasets.mrclam_robot import ODOMETRY_NOISE
 
 OFF = np.array([5.0, 0.2, 0.2, 5.0])
 """Factors from the truth, or from the reader's defaults, to the starts of the four parameters."""
@@ -107,9 +106,8 @@ def main() -> int:
             )
         else:
             data = mrclam(options.mrclam, options.robot)
-            known = np.array(
-                [*ODOMETRY_NOISE, *np.sqrt(np.diag(data.sensor.noise_cov(jnp.zeros(2))))]
-            )
+            noise, cov = data.motion.noise_cov, data.sensor.noise_cov(jnp.zeros(2))
+            known = np.array([noise.travel, noise.turn, *np.sqrt(np.diag(cov))])
             info, called, names = recorded(data, options.steps or 10_000), "default", RECORDED
         print(table(fit_noise(info, known * OFF, names=names), known, called))
     except (ValueError, OSError) as error:

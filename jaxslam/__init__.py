@@ -24,19 +24,19 @@ from jaxslam import (
     resampling,
     sensors,
 )
+from jaxslam._driver import run
 from jaxslam.consistency import metrics
 from jaxslam.consistency.campaign import Campaign, Incomplete, Interrupted, monte_carlo
 from jaxslam.core import protocols, slots, types
 from jaxslam.core._field_docs import attach_field_docs
-from jaxslam.driver import run
 from jaxslam.filters.multi_robot import team
 from jaxslam.graphs import smoothing
 from jaxslam.laser import features, grids, laser_slam, matching, topology
 from jaxslam.math import se2, stats, uncertain_poses
 from jaxslam.simulation import scenarios, spurious
-from jaxslam.simulation.recorded import recorded_world
-from jaxslam.simulation.team_world import TeamWorld
-from jaxslam.simulation.worlds import Scenario, simulate
+from jaxslam.simulation._recorded import recorded_world
+from jaxslam.simulation._team_world import TeamWorld
+from jaxslam.simulation._worlds import Scenario, World, simulate
 from jaxslam.verify import linearity, verify_jacobians
 from jaxslam.verify.linearity import linearity_index
 
@@ -46,6 +46,7 @@ __all__ = [
     "Interrupted",
     "Scenario",
     "TeamWorld",
+    "World",
     "association",
     "calibration",
     "catalog",
@@ -85,14 +86,14 @@ __all__ = [
 
 _ON_DEMAND = {
     "datasets": "jaxslam.datasets",
-    **{name: f"jaxslam.results.{name}" for name in ("page", "plot", "report", "store")},
+    **{name: f"jaxslam.results.{name}" for name in ("plot", "report", "store")},
 }
 
 
 def __getattr__(name: str) -> ModuleType | Callable[..., Campaign] | str:
     """What reads files or plots is imported on first access."""
     if name == "load":
-        from jaxslam.results.campaign_files import load
+        from jaxslam.results._campaign_files import load
 
         return load
     if name == "__version__":

@@ -2,7 +2,7 @@
 
 import sys
 
-from jaxslam.cli import main
+from jaxslam._cli import main
 
 if __name__ == "__main__":  # the workers of mpi4py.futures import this module under another name
     sys.exit(main())

@@ -12,12 +12,14 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.core import slots
-from jaxslam.core.numbers import check_count, is_concrete
+from jaxslam.core._numbers import check_count, is_concrete
+from jaxslam.core._record import hold_function, record, static
 from jaxslam.core.protocols import Life
-from jaxslam.core.record import hold_function, record, static
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Status
-from jaxslam.math.arrays import Number
+from jaxslam.math._arrays import Number
+
+__all__ = ["Evidence", "Existence", "Recency", "Times"]
 
 
 class Times(NamedTuple):

@@ -5,8 +5,8 @@ import re
 import numpy as np
 import pytest
 
-from jaxslam import selftest
-from jaxslam.selftest import Check
+from jaxslam import _selftest as selftest
+from jaxslam._selftest import Check
 
 
 @pytest.mark.sweep

@@ -20,12 +20,12 @@ from jaxslam import (
     smoothing,
     team,
 )
+from jaxslam.core._validation import check_models, checked_estimate, state_and_info
 from jaxslam.core.protocols import Free
 from jaxslam.core.record import record
 from jaxslam.core.types import Estimate, Log, Scan
-from jaxslam.core.validation import check_models, checked_estimate, state_and_info
-from jaxslam.filters import reporting
-from jaxslam.filters.map_management.closing import Closing
+from jaxslam.filters import _reporting as reporting
+from jaxslam.filters.map_management._closing import Closing
 
 MOVE = motion.PoseIncrement(np.diag([1e-4, 1e-4, 1e-6]))
 SEES = sensors.RangeBearing(np.diag([1e-2, 1e-4]))

@@ -11,19 +11,16 @@ import jax.numpy as jnp
 import numpy as np
 
 import jaxslam
-from jaxslam import association, charts, motion, sensors
-from jaxslam.consistency.measures.associations import identities
+from jaxslam import Scenario, association, charts, motion, sensors, simulate
+from jaxslam.consistency._measures.associations import identities
 from jaxslam.core.types import Status
-from jaxslam.filters import EkfSlam
-from jaxslam.filters.map_management.closing import Closing
-from jaxslam.filters.map_management.loop_closure import LoopSettings
+from jaxslam.filters import Closing, EkfSlam, LoopSettings
 from jaxslam.life import Recency
 from jaxslam.math.angles import wrap
 from jaxslam.math.stats import chi2_quantile
-from jaxslam.results.plot.style import COLORS, INK, PAGE, SHADE, caption, panels_of, titled
+from jaxslam.results.plot import COLORS, INK, PAGE, SHADE, caption, panels_of, titled
 from jaxslam.simulation.scenarios import BetweenRanges
 from jaxslam.simulation.spurious import Spurious
-from jaxslam.simulation.worlds import Scenario, simulate
 
 RUNS, BLOCK = 50, 10
 RADIUS, COUNT, CAPACITY = 30.0, 72, 120

@@ -16,11 +16,10 @@ from benchmarks.speed.timing import together
 from jaxslam import life, run
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Log, Scan
-from jaxslam.filters import EkfSlam
-from jaxslam.filters.ekf.ekf_settings import EkfSettings
-from jaxslam.filters.ekf.predicted_measurements import prediction_of
-from jaxslam.filters.ekf.update import correct_in_turn
-from jaxslam.filters.map_management.merging import Merging
+from jaxslam.filters import EkfSlam, Merging
+from jaxslam.filters._ekf.ekf_settings import EkfSettings
+from jaxslam.filters._ekf.predicted_measurements import prediction_of
+from jaxslam.filters._ekf.update import correct_in_turn
 from jaxslam.simulation.scenarios import cloister
 
 COUNT, SEEN, RUNS = 200, 20, 16

@@ -14,12 +14,12 @@ import numpy as np
 from benchmarks.association import rules
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Scan
-from jaxslam.filters.ekf.ekf_settings import EkfSettings
-from jaxslam.filters.ekf.predicted_measurements import prediction_of
+from jaxslam.filters._ekf.ekf_settings import EkfSettings
+from jaxslam.filters._ekf.predicted_measurements import prediction_of
 from jaxslam.math.angles import wrap
 from jaxslam.math.linalg import root_psd
 from jaxslam.math.stats import chi2_quantile
-from jaxslam.results.plot.style import PAGE, caption, curve, panels_of, titled
+from jaxslam.results.plot import PAGE, caption, curve, panels_of, titled
 from jaxslam.sensors import RangeBearing
 
 COUNT, SEEN, DRAWS = 14, 8, 500

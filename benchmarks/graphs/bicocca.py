@@ -22,7 +22,7 @@ from benchmarks.graphs import peer
 from benchmarks.graphs.worlds import with_false_closures
 from benchmarks.real_data import DATA
 from jaxslam import graphs, metrics
-from jaxslam.graphs.graph import LOOPS
+from jaxslam.graphs._graph import LOOPS
 from jaxslam.math import numpy_poses
 
 GRAPH = DATA / "graphs" / "B25b_0.500.g2o"

@@ -18,9 +18,9 @@ import scipy.stats
 from benchmarks.gate import Metric, save, show
 from benchmarks.graphs.worlds import MANHATTAN, manhattan, measured, ring
 from jaxslam import graphs
-from jaxslam.consistency.measures.nees import pose_error
+from jaxslam.consistency import pose_error
 from jaxslam.math import stats
-from jaxslam.results.plot.style import INK, PAGE, caption, curve, every_handle, panels_of, titled
+from jaxslam.results.plot import INK, PAGE, caption, curve, every_handle, panels_of, titled
 
 SCALES = (1.0, 3.0, 10.0)
 BLOCK = 8

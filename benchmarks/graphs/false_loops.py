@@ -20,9 +20,9 @@ from benchmarks.graphs import peer
 from benchmarks.graphs.worlds import with_false_loops
 from benchmarks.real_data import DATA
 from jaxslam import graphs
-from jaxslam.cli.optimize import ROBUST_STARTS
+from jaxslam._cli.optimize import ROBUST_STARTS
 from jaxslam.graphs import starts
-from jaxslam.graphs.graph import LOOPS
+from jaxslam.graphs._graph import LOOPS
 
 FILES = {
     "intel": ("intel.g2o", 1),

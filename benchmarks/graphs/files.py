@@ -13,7 +13,7 @@ import numpy as np
 from benchmarks.gate import Metric, show
 from benchmarks.real_data import DATA
 from jaxslam import graphs
-from jaxslam.consistency.measures.nees import pose_error
+from jaxslam.consistency import pose_error
 from jaxslam.graphs import Ending, Solution, starts
 
 FOLDER = DATA / "graphs"

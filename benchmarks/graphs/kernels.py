@@ -8,10 +8,10 @@ import numpy as np
 from benchmarks.gate import Metric, save, show
 from benchmarks.graphs.worlds import measured, ring, with_false_closures
 from jaxslam import graphs
-from jaxslam.consistency.measures.nees import block_nees, pose_error
-from jaxslam.graphs.graph import LOOPS
+from jaxslam.consistency import block_nees, pose_error
+from jaxslam.graphs._graph import LOOPS
 from jaxslam.math import stats
-from jaxslam.results.plot.style import INK, PAGE, caption, curve, panels_of, titled
+from jaxslam.results.plot import INK, PAGE, caption, curve, panels_of, titled
 
 SHARES = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5)
 

@@ -5,7 +5,7 @@ import time
 import gtsam
 import numpy as np
 
-from jaxslam.graphs.graph import LOOPS
+from jaxslam.graphs._graph import LOOPS
 from jaxslam.math import stats
 
 HELD = gtsam.noiseModel.Isotropic.Sigma(3, 1e-6)

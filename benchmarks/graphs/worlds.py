@@ -7,7 +7,7 @@ import numpy as np
 from benchmarks.real_data import DATA
 from jaxslam import graphs
 from jaxslam.graphs import Graph, Table
-from jaxslam.graphs.graph import LOOPS
+from jaxslam.graphs._graph import LOOPS
 from jaxslam.math import se2
 
 MANHATTAN = DATA / "graphs" / "manhattanOlson3500.g2o"

@@ -7,12 +7,13 @@ import numpy as np
 
 from benchmarks.gate import Metric, show
 from jaxslam import Campaign, filters, laser_slam, monte_carlo, recorded_world, scenarios, sensors
-from jaxslam.consistency.measures.nees import pose_error
+from jaxslam.consistency import pose_error
 from jaxslam.core.types import Log, Scan
-from jaxslam.laser.laser_slam import ScanLog, Settings, end_covariances
-from jaxslam.laser.laser_slam.odometry import raw
-from jaxslam.laser.laser_slam.odometry.log_odometry import laser_odometry
-from jaxslam.laser.laser_slam.scan_points import scans_of
+from jaxslam.laser.laser_slam import ScanLog, Settings
+from jaxslam.laser.laser_slam import _end_covariances as end_covariances
+from jaxslam.laser.laser_slam._odometry import raw
+from jaxslam.laser.laser_slam._odometry.log_odometry import laser_odometry
+from jaxslam.laser.laser_slam._scan_points import scans_of
 from jaxslam.math import numpy_poses as poses
 from jaxslam.simulation.laser import scan_world
 

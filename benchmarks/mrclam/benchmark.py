@@ -33,7 +33,7 @@ from benchmarks.mrclam.replays import cut, from_first_scan
 from benchmarks.real_data import DATA
 from jaxslam import charts, datasets, metrics, smoothing
 from jaxslam.calibration import consider_cov
-from jaxslam.consistency.measures.nees import block_nees, pose_error
+from jaxslam.consistency import block_nees, pose_error
 from jaxslam.core.types import Status
 from jaxslam.datasets import MRCLAM_CALIBRATION, RobotCalibration
 from jaxslam.filters import EkfSlam, TeamSlam

@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxslam.math.stats import chi2_quantile
-from jaxslam.results.plot.style import (
+from jaxslam.results.plot import (
     COLORS,
     FAINT,
     INK,

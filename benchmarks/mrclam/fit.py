@@ -8,9 +8,9 @@ from scipy.optimize import least_squares
 
 from benchmarks.gate import Metric
 from benchmarks.real_data import DATA
-from jaxslam.core.logs.streams import interpolate_poses
+from jaxslam.core.logs._streams import interpolate_poses
 from jaxslam.datasets import MRCLAM_CALIBRATION, RobotCalibration
-from jaxslam.datasets.mrclam_robot import read_landmarks, read_robot, read_truth
+from jaxslam.datasets._landmark_logs.mrclam_robot import read_landmarks, read_robot, read_truth
 
 RATE = 50.0
 """Of the grid on which odometry is compared with the truth [Hz]."""

@@ -23,10 +23,10 @@ from benchmarks.mrclam.replays import from_first_scan
 from benchmarks.real_data import DATA
 from jaxslam import charts, datasets
 from jaxslam.calibration import as_associated, fit_noise
-from jaxslam.consistency.measures.nees import block_nees, pose_error
+from jaxslam.consistency import block_nees, pose_error
 from jaxslam.core.types import Log, Scan
 from jaxslam.math.stats import sigma_gate
-from jaxslam.results.plot.style import PAGE, caption, curve, panels_of, titled
+from jaxslam.results.plot import PAGE, caption, curve, panels_of, titled
 
 TRAIN, TEST = (1, 2), (3, 4, 5)
 SHORT = 120.0

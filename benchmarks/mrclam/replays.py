@@ -11,7 +11,7 @@ import numpy as np
 import jaxslam
 from benchmarks.mrclam import fit as fitting
 from jaxslam import charts, datasets, linearize
-from jaxslam.consistency.measures.nees import block_nees, pose_error
+from jaxslam.consistency import block_nees, pose_error
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.record import record
 from jaxslam.core.types import Log, Scan, Truth

@@ -6,7 +6,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 from benchmarks.scan_matching.honesty import COVARIANCES, MATCHERS, WORLDS, Error, Row
-from jaxslam.results.plot.style import (
+from jaxslam.results.plot import (
     COLUMN,
     FAINT,
     INK,

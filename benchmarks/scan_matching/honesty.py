@@ -8,7 +8,7 @@ from jaxtyping import PyTree
 
 from benchmarks.scan_matching.pairs import START, Known, drawn, known
 from jaxslam import matching
-from jaxslam.consistency.measures.nees import pose_error
+from jaxslam.consistency import pose_error
 from jaxslam.core.record import record
 from jaxslam.graphs import Cauchy
 from jaxslam.laser.matching import MatchStatus

@@ -18,14 +18,13 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.speed.dense import dense_ekf
+from jaxslam import run, simulate
 from jaxslam.catalog import FILTERS
 from jaxslam.core.slots import Joint
-from jaxslam.driver import run
 from jaxslam.filters import CompressedEkfSlam, EkfSlam
-from jaxslam.filters.ekf.compressed_ekf_slam import opened
-from jaxslam.math.xla import hot_options
+from jaxslam.filters._ekf.compressed_ekf_slam import opened
+from jaxslam.math._xla import hot_options
 from jaxslam.simulation.scenarios import cloister
-from jaxslam.simulation.worlds import simulate
 
 RUNS = 32
 VISIBLE = 20

@@ -41,14 +41,14 @@ RECORD = ROOT / ".cache" / "commands.json"
 LIMIT = 900
 """seconds that a block may take"""
 BEGINS = {
-    "consistency": "jaxslam.cli.consistency:",
-    "fit": "jaxslam.cli.fit:",
-    "localize": "jaxslam.cli.localize:",
-    "map": "jaxslam.cli.make_map:",
-    "optimize": "jaxslam.cli.optimize:",
-    "run": "jaxslam.cli.run:",
-    "slam": "jaxslam.cli.slam:",
-    "verify": "jaxslam.cli.verify:",
+    "consistency": "jaxslam._cli.campaigns.consistency:",
+    "fit": "jaxslam._cli.recorded.fit:",
+    "localize": "jaxslam._cli.recorded.localize:",
+    "map": "jaxslam._cli.recorded.make_map:",
+    "optimize": "jaxslam._cli.optimize:",
+    "run": "jaxslam._cli.recorded.run:",
+    "slam": "jaxslam._cli.recorded.slam:",
+    "verify": "jaxslam._cli.verify:",
 }
 """where the code of a subcommand begins"""
 KEYS = {"exit": "0", "argument": "", "first": ""}
@@ -116,8 +116,8 @@ def digest(group: list[Block]) -> str:
     code = [*cells(script).values(), *(path.read_text(encoding="utf-8") for path in files)]
     names = frozenset().union(*(executed.named(ast.parse(text)) for text in code))
     if commands := re.findall(r"\bjaxslam (\w+)", script):
-        names |= {BEGINS[command] for command in commands} | {"jaxslam.cli.cache:"}
-        files |= {executed.home("jaxslam.cli:main")}
+        names |= {BEGINS[command] for command in commands} | {"jaxslam._cli.cache:"}
+        files |= {executed.home("jaxslam._cli:main")}
     return executed.hashed(files | executed.reached(names), "".join([script, *code]))
 
 

@@ -20,7 +20,7 @@ from typing import Any
 
 ROOT = Path(__file__).parents[2]
 PACKAGE = "jaxslam"
-COMMAND = {"jaxslam.cli:main"}
+COMMAND = {"jaxslam._cli:main"}
 KINDS = (".css", ".js")
 """files beside those of Python that code reads"""
 KERNEL = "  name: python3\n"

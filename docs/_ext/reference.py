@@ -1,11 +1,9 @@
 """Sphinx extension: writes the pages of the API reference from the package.
 
-The public names of a module are those that `OPEN` lists, else its `__all__`, else, directly below
-`jaxslam` and in `INTRODUCED`, all that it defines without an underscore. A name is shown under its
-shortest path: the package that lists it, else the module that defines it.
+The public names of a module are its `__all__`. A name is shown under its shortest path: the package
+that lists it, else the module that does.
 """
 
-import ast
 import importlib
 import inspect
 import pkgutil
@@ -56,80 +54,6 @@ INTRODUCED = {
 """Title of each page, in the order of the contents; a module that is not listed comes after."""
 
 
-OPEN = {
-    "jaxslam.charts": "Euclidean LeftInvariant RightInvariant",
-    "jaxslam.catalog": "ALL FILTERS ideal variant",
-    "jaxslam.consistency": (
-        "Average LocalizationScores LocalizationSummary Measure RunStatistics Score "
-        "Summary Verdict conditional_bound covering_level credibility judge "
-        "judge_localization posterior_bound register score summarize_localization"
-    ),
-    "jaxslam.consistency.campaign": "Keep Processes",
-    "jaxslam.consistency.metrics": (
-        "Errors MeanAndStd PathErrors Relations Statistics align_map alignment ate "
-        "benchmark_figures given map_entropy relation_errors relations revisits rpe "
-        "statistics summary"
-    ),
-    "jaxslam.core.logs.streams": "Rows Rule divide hold relative",
-    "jaxslam.core.logs.tables": "Aligned",
-    "jaxslam.core.noise": "Constant NoiseCov",
-    "jaxslam.core.numbers": "check_array check_positive",
-    "jaxslam.core.protocols": (
-        "Associate Association Basis Candidate Chart Estimator Free Here Life Linearizer "
-        "Model Motion Pairs Prediction Reduced Resample Sensor"
-    ),
-    "jaxslam.core.record": "record set_field static",
-    "jaxslam.core.slots": "Joint allocate empty find remove scatter",
-    "jaxslam.core.types": "Beams Estimate Info Log Scan Status Trace Truth",
-    "jaxslam.core.validation": "check_count check_covariance check_gate check_record is_concrete",
-    "jaxslam.datasets": (
-        "MRCLAM_CALIBRATION Added Adjustable BagContents Dataset DatasetFit LaserLog Parameter "
-        "RobotCalibration StampedRelations bonn carmen considered fit mrclam mrclam_team "
-        "plaza relation_file rosbag rosbag_contents table victoria_park"
-    ),
-    "jaxslam.datasets.evaluation": "Evaluation MapTest evaluate",
-    "jaxslam.filters.map_management.relocalization": (
-        "lost points_of_map relocalize relocated seen_points"
-    ),
-    "jaxslam.filters.multi_robot.team": "Robot pose_cross_cov poses",
-    "jaxslam.filters.reporting": "Mask Pruned info_of status_of with_extra",
-    "jaxslam.linearize.first_order": "invert_jacobians motion_jacobians observe_jacobians",
-    "jaxslam.math.angles": "sinc wrap",
-    "jaxslam.math.gaussians": "GaussianTerms gaussian_terms",
-    "jaxslam.math.linalg": "cholesky inverse root_psd solve_lower solve_psd symmetrize",
-    "jaxslam.math.se2": (
-        "adjoint align between boxminus boxplus compose exp from_frame "
-        "from_frame_jacobians inverse log polar polar_in_frame polar_jacobians "
-        "rectangular rectangular_jacobians rotation to_frame to_frame_jacobians"
-    ),
-    "jaxslam.math.stats": "chi2_band chi2_quantile sigma_gate",
-    "jaxslam.math.uncertain_poses": (
-        "Frame bhattacharyya compound mahalanobis_squared merge reverse"
-    ),
-    "jaxslam.results.page": "",
-    "jaxslam.results.plot": (
-        "COLORS COLUMN PAGE Figure Film Layer Panel Scene animate animate_world "
-        "cost_figure coverage_figure ellipse errors_figure gained_figure graph_figure "
-        "grid_figure loops_figure map_figure maps_before_after nees_figure probe "
-        "rmse_figure topology_figure walls_figure whiteness_figure"
-    ),
-    "jaxslam.results.plot.style": (
-        "FAINT INK SHADE TEXT band caption curve every_handle panels_of titled"
-    ),
-    "jaxslam.results.report": "map_csv trajectory_csv trajectory_tum",
-    "jaxslam.results.store": "open resume",
-    "jaxslam.driver": "",
-    "jaxslam.simulation.laser": (
-        "Laser LaserHistory LaserWorld Observability scan scan_information scan_world true_ranges"
-    ),
-    "jaxslam.simulation.scenarios.rooms": "from_start",
-    "jaxslam.simulation.walls": "Walls make_walls rasterize",
-    "jaxslam.simulation.worlds": "World",
-    "jaxslam.verify": "Check Finding Report",
-}
-"""Names, of modules whose other names only the package uses, that user code may call."""
-
-
 class Name(NamedTuple):
     """A public name under the path that a reader uses."""
 
@@ -140,53 +64,28 @@ class Name(NamedTuple):
 
 
 def modules() -> list[ModuleType]:
-    """All public modules of the package but the command line's."""
+    """All public modules of the package: those without an underscore in their path."""
     import jaxslam
 
     found = [jaxslam]
     for info in pkgutil.walk_packages(jaxslam.__path__, "jaxslam."):
-        parts = info.name.split(".")[1:]
-        if parts[0] != "cli" and not any(part.startswith("_") for part in parts):
+        if "._" not in info.name:
             found.append(importlib.import_module(info.name))
     return found
 
 
 def public_names() -> dict[str, list[Name]]:
     """The public names of each module that has some; a name stands once."""
-    walked = [m for m in modules() if listed_names(m) is not None or is_open(m.__name__)]
-    listed: dict[tuple[int, str], Name] = {}
-    pages: dict[str, list[Name]] = {module.__name__: [] for module in walked}
-    for module in walked:
-        for name in listed_names(module) or []:
+    listed: set[tuple[int, str]] = set()
+    pages: dict[str, list[Name]] = {}
+    for module in modules():
+        pages[module.__name__] = []
+        for name in getattr(module, "__all__", []):
             value = getattr(module, name)
             if not inspect.ismodule(value) and (key := key_of(name, value)) not in listed:
-                listed[key] = Name(module.__name__, name, kind_of(value))
-                pages[module.__name__].append(listed[key])
-    for module in walked:
-        if listed_names(module) is not None:
-            continue
-        constants = assigned(module)
-        for name, value in vars(module).items():
-            if name.startswith("_") or inspect.ismodule(value) or key_of(name, value) in listed:
-                continue
-            kind = kind_of(value)
-            foreign = inspect.isclass(value) and kind == "data" and not of_arrays(value)
-            own = name in constants if kind == "data" else value.__module__ == module.__name__
-            if own and not foreign:
-                pages[module.__name__].append(Name(module.__name__, name, kind))
+                listed.add(key)
+                pages[module.__name__].append(Name(module.__name__, name, kind_of(value)))
     return pages
-
-
-def listed_names(module: ModuleType) -> list[str] | None:
-    """The names of a module by `OPEN` or `__all__`; None without either."""
-    if module.__name__ in OPEN:
-        return OPEN[module.__name__].split()
-    return getattr(module, "__all__", None)
-
-
-def is_open(module: str) -> bool:
-    """Whether all names of a module without an underscore are public."""
-    return module.count(".") < 2 or module in INTRODUCED
 
 
 def key_of(name: str, value: Any) -> tuple[int, str]:
@@ -205,16 +104,6 @@ def kind_of(value: Any) -> str:
 def of_arrays(value: Any) -> bool:
     """Whether a value is a type of arrays, as `Float[Array, "3"]`; `Array` alone is JAX's."""
     return inspect.isclass(value) and value.__module__.startswith("jaxtyping")
-
-
-def assigned(module: ModuleType) -> set[str]:
-    """Names of the constants and types that a module itself assigns."""
-    names = set()
-    for node in ast.parse(inspect.getsource(module)).body:
-        if isinstance(node, ast.Assign | ast.AnnAssign):
-            target = node.target if isinstance(node, ast.AnnAssign) else node.targets[0]
-            names |= {each.id for each in ast.walk(target) if isinstance(each, ast.Name)}
-    return names
 
 
 def page_of(module: str) -> str:

@@ -1,7 +1,7 @@
 """Data association: methods that match measurements with landmarks."""
 
-from jaxslam.association.joint_compatibility import JointCompatibility
-from jaxslam.association.rules import Certain, GlobalNearest, Known, MaximumLikelihood, Nearest
+from jaxslam.association._joint_compatibility import JointCompatibility
+from jaxslam.association._rules import Certain, GlobalNearest, Known, MaximumLikelihood, Nearest
 
 __all__ = [
     "Certain",

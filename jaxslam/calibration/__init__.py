@@ -7,9 +7,9 @@ uncertainty of parameters adds to the covariance of a result. `delayed` is a log
 are late, by a delay that can be such a parameter.
 """
 
-from jaxslam.calibration.delay import delayed
-from jaxslam.calibration.maximum_likelihood import NoiseFit, as_associated, fit_noise
-from jaxslam.calibration.systematic import Calibration, calibrate, consider_cov
+from jaxslam.calibration._delay import delayed
+from jaxslam.calibration._maximum_likelihood import NoiseFit, as_associated, fit_noise
+from jaxslam.calibration._systematic import Calibration, calibrate, consider_cov
 
 __all__ = [
     "Calibration",

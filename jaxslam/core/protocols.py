@@ -7,25 +7,24 @@ Shapes: pose (3,); u (U,) control; w (W,) process noise; z (Z,) measurement; l (
 parameters; s (K,) landmark parameters that z does not determine (K = 0 if none).
 """
 
-import inspect
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from typing import Any, ClassVar, NamedTuple
 
-import jax
 import jax.numpy as jnp
 import numpy as np
+from jax import Array
 from jaxtyping import Bool, Float, Int, PyTree
 
-from jaxslam.core.noise import hold_noise
-from jaxslam.core.numbers import check_mount, held_array
-from jaxslam.core.record import record, set_field
+from jaxslam.core._names import unfit_signature
+from jaxslam.core._noise import hold_noise
+from jaxslam.core._numbers import check_mount, held_array
+from jaxslam.core._record import record, set_field
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, JaxOrNumPy, Log, Scan, Trace
 from jaxslam.math import se2
-from jaxslam.math.angles import wrap
-from jaxslam.math.arrays import (
+from jaxslam.math._arrays import (
     Control,
     Landmark,
     Measurement,
@@ -34,21 +33,32 @@ from jaxslam.math.arrays import (
     ProcessNoise,
     Unmeasured,
 )
+from jaxslam.math.angles import wrap
 
-Array = jax.Array
-
-
-def unfit_signature(function: Callable[..., object], count: int) -> str | None:
-    """The parameters of a function that does not take `count` arguments; None of one that does."""
-    try:
-        signature = inspect.signature(function)
-    except (TypeError, ValueError):  # a builtin has none
-        return None
-    try:
-        signature.bind(*[None] * count)
-    except TypeError:
-        return f"({', '.join(signature.parameters)})"
-    return None
+__all__ = [
+    "NOTHING_FREE",
+    "Associate",
+    "Association",
+    "Basis",
+    "Candidate",
+    "Chart",
+    "Component",
+    "Differentiable",
+    "Estimator",
+    "Filter",
+    "Free",
+    "Here",
+    "Life",
+    "Linearizer",
+    "Model",
+    "Motion",
+    "Pairs",
+    "Prediction",
+    "Reduced",
+    "Resample",
+    "Sensor",
+    "Wrapper",
+]
 
 
 def _lower(cls: type) -> str:

@@ -12,11 +12,21 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int, PyTree
 
-from jaxslam.math.linalg import cholesky, matmul, symmetrize, total, triangular_root
-from jaxslam.math.xla import materialize, where_any
+from jaxslam.math._linalg import cholesky, matmul, symmetrize, total, triangular_root
+from jaxslam.math._xla import CACHED, last_true_column, materialize, where_any
 
-CACHED = 128
-"""Up to this many rows P stays in the cache next to a core, and a pass over it is cheap."""
+__all__ = [
+    "Joint",
+    "allocate",
+    "empty",
+    "find",
+    "gather",
+    "local_cov",
+    "remove",
+    "robot_cov",
+    "scatter",
+    "slot_mask",
+]
 
 
 class Joint(NamedTuple):
@@ -82,16 +92,6 @@ def allocate(
     rank_of_slot = jnp.where(free, jnp.cumsum(free), 0)
     rank_of_wish = jnp.where(wanted, jnp.cumsum(wanted), -1)
     return last_true_column(rank_of_wish[:, None] == rank_of_slot[None, :])
-
-
-def last_true_column(match: Bool[Array, "M N"]) -> tuple[Int[Array, "M"], Bool[Array, "M"]]:
-    """The last column (M,) int32 in which each row (M, N) bool is set, 0 without one, and a mask of
-    the rows with one (M,). One pass, instead of two by `argmax` and `any`.
-    """
-    # Over the leading axis XLA takes maxima of whole rows.
-    at = jnp.where(match.T, jnp.arange(match.shape[1], dtype=jnp.int32)[:, None], -1)
-    at = at.max(axis=0, initial=-1)
-    return jnp.maximum(at, 0), at >= 0
 
 
 def slot_mask(slot: Int[Array, "M"], on: Bool[Array, "M"], count: int) -> Bool[Array, "N"]:

@@ -15,7 +15,21 @@ from jax import Array
 from jaxtyping import Bool, Float, Int, PyTree
 from numpy.typing import ArrayLike
 
-from jaxslam.core.logs import streams, tables
+from jaxslam.core.logs import _streams as streams
+from jaxslam.core.logs import _tables as tables
+
+__all__ = [
+    "Beams",
+    "Estimate",
+    "Info",
+    "JaxOrNumPy",
+    "Log",
+    "Recording",
+    "Scan",
+    "Status",
+    "Trace",
+    "Truth",
+]
 
 JaxOrNumPy: TypeAlias = Array | np.ndarray
 """The array of a record that is made in either: a compiled function takes both, and an operation

@@ -6,17 +6,18 @@ robots, the number of one.
 
 from collections.abc import Callable
 
-from jaxslam.datasets.carmen_reader import StampedRelations, carmen, relation_file
-from jaxslam.datasets.dataset import Adjustable, Dataset, Parameter
-from jaxslam.datasets.laser_record import LaserLog
-from jaxslam.datasets.line_readers import bonn, victoria_park
-from jaxslam.datasets.mrclam_reader import mrclam, mrclam_team
-from jaxslam.datasets.mrclam_robot import MRCLAM_CALIBRATION, RobotCalibration
-from jaxslam.datasets.noise_fit import DatasetFit, fit
-from jaxslam.datasets.plaza_reader import plaza
-from jaxslam.datasets.rosbag_reader import BagContents, rosbag, rosbag_contents
-from jaxslam.datasets.table_reader import table
-from jaxslam.datasets.uncertain_constants import Added, considered
+from jaxslam.datasets._dataset import Adjustable, Dataset, Parameter
+from jaxslam.datasets._evaluation import Evaluation, MapTest, evaluate
+from jaxslam.datasets._landmark_logs.line_readers import bonn, victoria_park
+from jaxslam.datasets._landmark_logs.mrclam_reader import mrclam, mrclam_team
+from jaxslam.datasets._landmark_logs.mrclam_robot import MRCLAM_CALIBRATION, RobotCalibration
+from jaxslam.datasets._landmark_logs.plaza_reader import plaza
+from jaxslam.datasets._landmark_logs.table_reader import table
+from jaxslam.datasets._laser_logs.carmen_reader import StampedRelations, carmen, relation_file
+from jaxslam.datasets._laser_logs.laser_record import LaserLog
+from jaxslam.datasets._laser_logs.rosbag_reader import BagContents, rosbag, rosbag_contents
+from jaxslam.datasets._noise_fit import DatasetFit, fit
+from jaxslam.datasets._uncertain_constants import Added, considered
 
 READERS: dict[str, Callable[..., Dataset]] = {
     "bonn": bonn,
@@ -34,13 +35,16 @@ __all__ = [
     "BagContents",
     "Dataset",
     "DatasetFit",
+    "Evaluation",
     "LaserLog",
+    "MapTest",
     "Parameter",
     "RobotCalibration",
     "StampedRelations",
     "bonn",
     "carmen",
     "considered",
+    "evaluate",
     "fit",
     "mrclam",
     "mrclam_team",

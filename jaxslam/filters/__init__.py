@@ -1,25 +1,27 @@
 """Filters: recursive estimators, all of type `Filter`."""
 
 from jaxslam.core.protocols import Filter, Wrapper
-from jaxslam.filters.delayed.delayed_settings import Hypotheses, Promotion, StoredMeasurements
-from jaxslam.filters.delayed.delayed_slam import DelayedSlam
-from jaxslam.filters.ekf.compressed_ekf_slam import CompressedEkfSlam
-from jaxslam.filters.ekf.ekf_slam import EkfSlam
-from jaxslam.filters.ekf.linear_system import LinearizedSteps
-from jaxslam.filters.ekf.monitor import Monitored
-from jaxslam.filters.information.eif_slam import EifSlam
-from jaxslam.filters.information.seif import Seif
-from jaxslam.filters.information.sparse_state import ApproximationCounts
-from jaxslam.filters.known.dead_reckoning import DeadReckoning
-from jaxslam.filters.known.localization import Localization
-from jaxslam.filters.known.mapping import Mapping, StartingAt
-from jaxslam.filters.map_management.closing import Closing
-from jaxslam.filters.map_management.loop_closure import LoopSettings
-from jaxslam.filters.map_management.merging import Merging
-from jaxslam.filters.multi_robot.team_slam import TeamSlam
-from jaxslam.filters.particles.fastslam import FastSlam
-from jaxslam.filters.particles.particle_localization import ParticleLocalization
-from jaxslam.filters.particles.slam_particles import ParticleInfo
+from jaxslam.filters._delayed.delayed_settings import Hypotheses, Promotion, StoredMeasurements
+from jaxslam.filters._delayed.delayed_slam import DelayedSlam
+from jaxslam.filters._ekf.compressed_ekf_slam import CompressedEkfSlam
+from jaxslam.filters._ekf.ekf_slam import EkfSlam
+from jaxslam.filters._ekf.linear_system import LinearizedSteps
+from jaxslam.filters._ekf.monitor import Monitored
+from jaxslam.filters._information.eif_slam import EifSlam
+from jaxslam.filters._information.marginals import whole_information
+from jaxslam.filters._information.seif import Seif
+from jaxslam.filters._information.sparse_state import ApproximationCounts
+from jaxslam.filters._known.dead_reckoning import DeadReckoning
+from jaxslam.filters._known.localization import Localization
+from jaxslam.filters._known.mapping import Mapping, StartingAt
+from jaxslam.filters._particles.fastslam import FastSlam
+from jaxslam.filters._particles.particle_localization import ParticleLocalization
+from jaxslam.filters._particles.slam_particles import ParticleInfo
+from jaxslam.filters._reporting import Mask, Pruned, info_of, status_of, with_extra
+from jaxslam.filters.map_management._closing import Closing
+from jaxslam.filters.map_management._loop_closure import LoopSettings
+from jaxslam.filters.map_management._merging import Merging
+from jaxslam.filters.multi_robot._team_slam import TeamSlam
 
 __all__ = [
     "ApproximationCounts",
@@ -36,14 +38,20 @@ __all__ = [
     "Localization",
     "LoopSettings",
     "Mapping",
+    "Mask",
     "Merging",
     "Monitored",
     "ParticleInfo",
     "ParticleLocalization",
     "Promotion",
+    "Pruned",
     "Seif",
     "StartingAt",
     "StoredMeasurements",
     "TeamSlam",
     "Wrapper",
+    "info_of",
+    "status_of",
+    "whole_information",
+    "with_extra",
 ]

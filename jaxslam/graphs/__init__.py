@@ -5,9 +5,9 @@ relative pose e = Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ) as (x, y, θ wrapped), without
 """
 
 from jaxslam.graphs import starts
-from jaxslam.graphs.checks import check_graph, with_gauge
-from jaxslam.graphs.covariances import Marginals, marginals
-from jaxslam.graphs.factor import (
+from jaxslam.graphs._checks import check_graph, with_gauge
+from jaxslam.graphs._covariances import Marginals, marginals
+from jaxslam.graphs._factor import (
     REGISTRY,
     Bearing,
     Factor,
@@ -18,20 +18,20 @@ from jaxslam.graphs.factor import (
     RelativePoseLog,
     RelativePosition,
 )
-from jaxslam.graphs.graph import Graph, Table, read, with_loops_apart, write
-from jaxslam.graphs.log import of_log
-from jaxslam.graphs.optimality import Certificate, certificate
-from jaxslam.graphs.optimizer import chi2, degrees_of_freedom, optimize, squared_residuals
-from jaxslam.graphs.solver.kernels import REGISTRY as KERNELS
-from jaxslam.graphs.solver.kernels import (
+from jaxslam.graphs._graph import Graph, Table, read, with_loops_apart, write
+from jaxslam.graphs._log import of_log
+from jaxslam.graphs._optimality import Certificate, certificate
+from jaxslam.graphs._optimizer import chi2, degrees_of_freedom, optimize, squared_residuals
+from jaxslam.graphs._solver.kernels import REGISTRY as KERNELS
+from jaxslam.graphs._solver.kernels import (
     Cauchy,
     DynamicCovarianceScaling,
     Huber,
     Kernel,
     Truncated,
 )
-from jaxslam.graphs.solver.plans import Plan, plan
-from jaxslam.graphs.solver.search import Ending, Solution
+from jaxslam.graphs._solver.plans import Plan, plan
+from jaxslam.graphs._solver.search import Ending, Solution
 
 __all__ = [
     "KERNELS",

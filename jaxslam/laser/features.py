@@ -11,6 +11,8 @@ from jaxtyping import Float, Int
 from jaxslam.core.types import Beams
 from jaxslam.math.stats import chi2_quantile
 
+__all__ = ["Segments", "fit_line", "segments"]
+
 _ITERATIONS = 4
 
 

@@ -1,7 +1,21 @@
 """Linearizers: affine approximations of the models, one a file."""
 
-from jaxslam.linearize.first_order import AtEstimate
-from jaxslam.linearize.other_points import AtTruth, FirstEstimate, Observability
-from jaxslam.linearize.unscented import Unscented
+from jaxslam.linearize._first_order import (
+    AtEstimate,
+    invert_jacobians,
+    motion_jacobians,
+    observe_jacobians,
+)
+from jaxslam.linearize._other_points import AtTruth, FirstEstimate, Observability
+from jaxslam.linearize._unscented import Unscented
 
-__all__ = ["AtEstimate", "AtTruth", "FirstEstimate", "Observability", "Unscented"]
+__all__ = [
+    "AtEstimate",
+    "AtTruth",
+    "FirstEstimate",
+    "Observability",
+    "Unscented",
+    "invert_jacobians",
+    "motion_jacobians",
+    "observe_jacobians",
+]

@@ -7,7 +7,10 @@ import jax.numpy as jnp
 import numpy as np
 from jax.typing import ArrayLike
 
-from jaxslam.math.xla import traced_once
+from jaxslam.math._series import horner
+from jaxslam.math._xla import traced_once
+
+__all__ = ["sin_cos", "sinc", "sinc_slope", "wrap"]
 
 # Below this the power series is used. There the first term dropped from it and from its first two
 # derivatives is under 1e-16, and above it the closed form loses at most a digit to cancellation.
@@ -90,11 +93,3 @@ def sinc_slope(x: ArrayLike) -> jax.Array:
     )
     far = jnp.where(small, 1.0, x)
     return jnp.where(small, series, (jnp.cos(far) - jnp.sin(far) / far) / far)
-
-
-def horner(x: jax.Array, coefficients: list[float]) -> jax.Array:
-    """Σ cₖ xᵏ, elementwise."""
-    total = jnp.full_like(x, coefficients[-1])
-    for c in reversed(coefficients[:-1]):
-        total = total * x + c
-    return total

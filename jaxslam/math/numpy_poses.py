@@ -4,6 +4,8 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
+__all__ = ["Poses", "adjoint", "between", "chain", "compose", "inverse", "part", "wrapped"]
+
 Poses = Float[np.ndarray, "... 3"]
 
 

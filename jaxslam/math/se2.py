@@ -16,9 +16,37 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Num
 
-from jaxslam.math.angles import horner, sinc, sinc_slope, wrap
-from jaxslam.math.arrays import Point, PointByPose, PointMatrix, Pose, PoseMatrix, Scalar
-from jaxslam.math.xla import traced_once
+from jaxslam.math._arrays import Point, PointByPose, PointMatrix, Pose, PoseMatrix, Scalar
+from jaxslam.math._series import horner
+from jaxslam.math._xla import traced_once
+from jaxslam.math.angles import sinc, sinc_slope, wrap
+
+__all__ = [
+    "adjoint",
+    "align",
+    "between",
+    "between_jacobians",
+    "boxminus",
+    "boxplus",
+    "compose",
+    "compose_jacobians",
+    "exp",
+    "exp_jacobians",
+    "from_frame",
+    "from_frame_jacobians",
+    "inverse",
+    "inverse_jacobians",
+    "log",
+    "log_jacobians",
+    "polar",
+    "polar_in_frame",
+    "polar_jacobians",
+    "rectangular",
+    "rectangular_jacobians",
+    "rotation",
+    "to_frame",
+    "to_frame_jacobians",
+]
 
 _ZETA_LESS_1 = [np.pi**2 / 6 - 1, np.pi**4 / 90 - 1]
 _ZETA_LESS_1 += [sum(k ** (-2.0 * n) for k in range(999, 1, -1)) for n in range(3, 14)]

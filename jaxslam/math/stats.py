@@ -8,6 +8,16 @@ longer than importing jaxslam.
 import numpy as np
 import scipy  # its parts load where they are used
 
+__all__ = [
+    "chi2_band",
+    "chi2_quantile",
+    "chi2_quantiles",
+    "normal_quantile",
+    "sigma_gate",
+    "t_quantile",
+    "truncated_chi2_mean",
+]
+
 
 def chi2_quantile(p: float, dof: float) -> float:
     """The x with P(χ²_dof <= x) = p. Raises ValueError unless 0 < p < 1 and dof > 0."""

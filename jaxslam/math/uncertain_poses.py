@@ -8,14 +8,16 @@ resistors in series and in parallel.
 
 from typing import NamedTuple
 
-import jax
 import jax.numpy as jnp
+from jax import Array
 
-from jaxslam.math import gaussians, linalg, se2
+from jaxslam.math import _gaussians as gaussians
+from jaxslam.math import _linalg as linalg
+from jaxslam.math import se2
+from jaxslam.math._gaussians import log_det_of
 from jaxslam.math.angles import wrap
-from jaxslam.math.gaussians import log_det_of
 
-Array = jax.Array
+__all__ = ["Frame", "bhattacharyya", "compound", "mahalanobis_squared", "merge", "reverse"]
 
 
 class Frame(NamedTuple):

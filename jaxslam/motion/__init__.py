@@ -3,18 +3,13 @@
 from collections.abc import Callable
 
 from jaxslam.core.protocols import Motion
-from jaxslam.motion.ackermann import Ackermann
-from jaxslam.motion.increments import Increment, PoseIncrement
-from jaxslam.motion.odometry import (
-    Odometry,
-    OdometryNoise,
-    odometry_control,
-    odometry_controls,
-)
-from jaxslam.motion.odometry_errors import Corrected
-from jaxslam.motion.substeps import Substeps
-from jaxslam.motion.unicycle import Unicycle, WhiteNoise
-from jaxslam.motion.velocity import Velocity, VelocityNoise
+from jaxslam.motion._ackermann import Ackermann
+from jaxslam.motion._increments import Increment, PoseIncrement
+from jaxslam.motion._odometry import Odometry, OdometryNoise, odometry_control, odometry_controls
+from jaxslam.motion._odometry_errors import Corrected
+from jaxslam.motion._substeps import Substeps
+from jaxslam.motion._unicycle import Unicycle, WhiteNoise
+from jaxslam.motion._velocity import Velocity, VelocityNoise
 
 REGISTRY: dict[str, Callable[..., Motion]] = {
     "ackermann": Ackermann,
@@ -26,6 +21,7 @@ REGISTRY: dict[str, Callable[..., Motion]] = {
 }
 
 __all__ = [
+    "REGISTRY",
     "Ackermann",
     "Corrected",
     "Increment",

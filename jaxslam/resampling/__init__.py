@@ -5,8 +5,8 @@ particles.
 """
 
 from jaxslam.core.protocols import Resample
-from jaxslam.resampling.kld import kld_bound
-from jaxslam.resampling.methods import (
+from jaxslam.resampling._kld import kld_bound
+from jaxslam.resampling._methods import (
     Soft,
     StopGradient,
     multinomial,
@@ -23,6 +23,7 @@ REGISTRY: dict[str, Resample] = {
 }
 
 __all__ = [
+    "REGISTRY",
     "Soft",
     "StopGradient",
     "kld_bound",

@@ -5,15 +5,15 @@ The conformance tests run over `REGISTRY`."""
 from collections.abc import Callable
 
 from jaxslam.core.protocols import Sensor
-from jaxslam.sensors.absolute import Absolute, Compass, PositionFix
-from jaxslam.sensors.bearing_inverse_depth import BearingInverseDepth
-from jaxslam.sensors.line import Line
-from jaxslam.sensors.partial import BearingOnly, RangeOnly
-from jaxslam.sensors.range_bearing import RangeBearing, RangeBearingNoise
-from jaxslam.sensors.range_bearing_signature import RangeBearingSignature
-from jaxslam.sensors.range_errors import Corrected
-from jaxslam.sensors.relative_position import RelativePosition
-from jaxslam.sensors.suite import Part, Suite
+from jaxslam.sensors._absolute import Absolute, Compass, PositionFix
+from jaxslam.sensors._bearing_inverse_depth import BearingInverseDepth
+from jaxslam.sensors._line import Line
+from jaxslam.sensors._partial import BearingOnly, RangeOnly
+from jaxslam.sensors._range_bearing import RangeBearing, RangeBearingNoise
+from jaxslam.sensors._range_bearing_signature import RangeBearingSignature
+from jaxslam.sensors._range_errors import Corrected
+from jaxslam.sensors._relative_position import RelativePosition
+from jaxslam.sensors._suite import Part, Suite
 
 REGISTRY: dict[str, Callable[..., Sensor]] = {
     "bearing_inverse_depth": BearingInverseDepth,
@@ -28,6 +28,7 @@ REGISTRY: dict[str, Callable[..., Sensor]] = {
 }
 
 __all__ = [
+    "REGISTRY",
     "Absolute",
     "BearingInverseDepth",
     "BearingOnly",

@@ -9,9 +9,11 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
-from jaxslam.core.numbers import check_covariance, is_concrete
+from jaxslam.core._numbers import check_covariance, is_concrete
 from jaxslam.core.protocols import Motion, Sensor
-from jaxslam.math.linalg import root_psd
+from jaxslam.math._linalg import root_psd
+
+__all__ = ["Linearity", "linearity_index", "motion_linearity", "sensor_linearity"]
 
 _DIRECTIONS = 64
 _RADII = (1.0, 0.5)

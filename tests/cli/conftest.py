@@ -1,7 +1,8 @@
 import jax
 import pytest
 
-from jaxslam import cli, plot
+from jaxslam import _cli as cli
+from jaxslam.results.plot import _style
 
 
 @pytest.fixture(scope="session", autouse=True)
@@ -17,7 +18,7 @@ def undrawn():
     `test_the_module_runs_as_a_program` draws them.
     """
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(plot, "encode", lambda figure, kind: kind.encode())
+        patch.setattr(_style, "encode", lambda figure, kind, *_: kind.encode())
         yield
 
 

@@ -8,9 +8,9 @@ from pathlib import Path
 import jax
 import pytest
 
-from jaxslam import cli
-from jaxslam.cli import cache
-from jaxslam.cli.common import CompileClock
+from jaxslam import _cli as cli
+from jaxslam._cli import cache
+from jaxslam._cli.common import CompileClock
 
 OURS = {
     "jax_compilation_cache_dir",

@@ -6,7 +6,8 @@ import re
 import numpy as np
 import pytest
 
-from jaxslam import cli, datasets
+from jaxslam import _cli as cli
+from jaxslam import datasets
 
 TRUE = {
     "scale travel": 0.97,

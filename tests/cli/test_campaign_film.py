@@ -6,8 +6,9 @@ import worlds
 from matplotlib.animation import FFMpegWriter
 from PIL import Image, ImageChops
 
-from jaxslam import catalog, plot
-from jaxslam.cli.consistency import _write_films as write_films
+from jaxslam import _catalog as catalog
+from jaxslam import plot
+from jaxslam._cli.campaigns.consistency import _write_films as write_films
 
 
 @pytest.mark.sweep

@@ -9,10 +9,11 @@ import numpy as np
 import pytest
 
 import jaxslam
-from jaxslam import cli, plot, store
-from jaxslam.cli.common import check_out
+from jaxslam import _cli as cli
+from jaxslam import plot, store
+from jaxslam._cli.common import check_out
 from jaxslam.consistency.campaign import Interrupted
-from jaxslam.results import report
+from jaxslam.results import _report as report
 
 QUICK = ["consistency", "--scenario", "circle", "--steps", "8", "--runs", "3"]
 

@@ -12,10 +12,13 @@ import pytest
 from worlds import three_parameters
 
 import jaxslam
-from jaxslam import catalog, cli, scenarios
-from jaxslam.cli import common
+from jaxslam import _catalog as catalog
+from jaxslam import _cli as cli
+from jaxslam import scenarios
+from jaxslam._cli import common
 from jaxslam.consistency.campaign import Interrupted
-from jaxslam.results import campaign_files, files
+from jaxslam.results import _campaign_files as campaign_files
+from jaxslam.results import _files as files
 
 QUICK = ["consistency", "--scenario", "circle", "--steps", "8", "--runs", "3"]
 
@@ -182,7 +185,7 @@ def test_what_is_no_command_or_option_is_told_in_a_line(refused, arguments, mess
 
 AS_A_PROGRAM = """
 import runpy, sys
-import jaxslam.cli
+import jaxslam._cli
 print(*sys.modules)
 sys.argv[0] = "jaxslam"
 runpy.run_module("jaxslam", run_name="__main__", alter_sys=True)
@@ -201,7 +204,7 @@ def test_the_module_runs_as_a_program_in_float32_and_imports_late_what_draws(tmp
     )
     assert done.returncode == 0, done.stderr
     modules, _, said = done.stdout.partition("\n")
-    assert "jaxslam.cli" in modules.split()
+    assert "jaxslam._cli" in modules.split()
     assert {"matplotlib", "scipy.optimize", "scipy.stats"}.isdisjoint(modules.split())
     assert "The filters ran in float32: for float64" in said
     assert json.loads((tmp_path / "consistency.json").read_text())["dtype"] == "float32"

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from matplotlib.animation import FFMpegWriter
 
-from jaxslam import cli
-from jaxslam.cli.run import NAMES, positive_definite
+from jaxslam import _cli as cli
+from jaxslam._cli.recorded.run import NAMES, positive_definite
 from jaxslam.results import plot
 
 

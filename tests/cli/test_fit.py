@@ -6,9 +6,10 @@ import json
 import numpy as np
 import pytest
 
-from jaxslam import cli, datasets
+from jaxslam import _cli as cli
+from jaxslam import datasets
 from jaxslam.core.types import Info, Status
-from jaxslam.datasets.noise_fit import autocorrelation
+from jaxslam.datasets._noise_fit import autocorrelation
 
 POINTS = {3: (3.0, 1.0), 5: (-1.0, 4.0), 8: (-3.0, -1.0)}
 SETTINGS = """[motion]

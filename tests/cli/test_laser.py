@@ -13,16 +13,19 @@ from matplotlib.animation import FFMpegWriter
 from PIL import Image
 from ring_of_rooms import FAR, ranges_of
 
-from jaxslam import cli, datasets, grids
-from jaxslam.cli import localize
-from jaxslam.cli.laser_log import read_log
-from jaxslam.cli.make_map import SCANS_AT_ONCE
+from jaxslam import _cli as cli
+from jaxslam import datasets, grids
+from jaxslam._cli.recorded import localize
+from jaxslam._cli.recorded.laser_log import read_log
+from jaxslam._cli.recorded.make_map import SCANS_AT_ONCE
 from jaxslam.core.types import Estimate
 from jaxslam.math import numpy_poses as poses
-from jaxslam.results import plot, report
+from jaxslam.results import _report as report
+from jaxslam.results import plot
+from jaxslam.simulation._walls import is_free
 from jaxslam.simulation.laser import scan_world
 from jaxslam.simulation.scenarios import square
-from jaxslam.simulation.walls import is_free, make_walls, rasterize
+from jaxslam.simulation.walls import make_walls, rasterize
 
 BEAMS, STEPS = 25, SCANS_AT_ONCE + 6
 FIT = "beams of the last 10 scans within 0.3 m of the map's range, share"

@@ -9,9 +9,11 @@ import pytest
 import small_graphs
 from reference import graph as plain
 
-from jaxslam import cli, graphs
-from jaxslam.cli import optimize
+from jaxslam import _cli as cli
+from jaxslam import graphs
+from jaxslam._cli import optimize
 from jaxslam.results import plot
+from jaxslam.results.plot import _film
 
 
 class Film:
@@ -49,7 +51,7 @@ def test_it_writes_the_optimum(file, tmp_path, capsys, monkeypatch):
 
     films = []
     monkeypatch.setattr(plot, "graph_figure", graph_figure)
-    monkeypatch.setattr(plot, "has_ffmpeg", lambda: False)
+    monkeypatch.setattr(_film, "has_ffmpeg", lambda: False)
     monkeypatch.setattr(plot, "Film", lambda *a, **b: films.append(Film(*a, **b)) or films[-1])
     out = tmp_path / "out"
     assert (

@@ -6,12 +6,12 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxslam import charts
-from jaxslam.cli import piecewise
-from jaxslam.cli.piecewise import run_in_pieces
+from jaxslam._cli.campaigns import piecewise
+from jaxslam._cli.campaigns.piecewise import run_in_pieces
 from jaxslam.core.protocols import Filter
 from jaxslam.core.record import record
 from jaxslam.core.types import Estimate, Log, Scan
-from jaxslam.filters.reporting import nothing_of
+from jaxslam.filters._reporting import nothing_of
 
 STEPS = 11
 

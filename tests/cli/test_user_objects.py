@@ -6,10 +6,12 @@ import json
 import pytest
 from own_models import changed
 
-from jaxslam import catalog, cli, scenarios
-from jaxslam.cli.user_objects import UserObjects
+from jaxslam import _catalog as catalog
+from jaxslam import _cli as cli
+from jaxslam import scenarios
+from jaxslam._cli.user_objects import UserObjects
 from jaxslam.core.protocols import Filter
-from jaxslam.simulation.worlds import Scenario
+from jaxslam.simulation._worlds import Scenario
 
 MINE = """
 import dataclasses

@@ -16,12 +16,13 @@ import worlds
 from cases import swept
 from hypothesis import given, settings
 
-from jaxslam import catalog, run
-from jaxslam.core.numbers import largest
+from jaxslam import _catalog as catalog
+from jaxslam import run
+from jaxslam.core._numbers import largest
+from jaxslam.core._validation import check_log
 from jaxslam.core.protocols import Filter
 from jaxslam.core.types import Log, Scan, Status
-from jaxslam.core.validation.logs import check_log
-from jaxslam.graphs.smoothing.forward_pass import LogEstimator
+from jaxslam.graphs.smoothing._forward_pass import LogEstimator
 
 WIDE = int(os.environ.get("JAXSLAM_FUZZ", "1"))
 STEPS, PLACES, LANDMARKS, LOGS = 4, 3, 4, 48

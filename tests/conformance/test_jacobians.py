@@ -8,10 +8,9 @@ from cases import swept
 
 from jaxslam import motion, sensors
 from jaxslam.core.protocols import Motion
-from jaxslam.verify import build
-from jaxslam.verify.comparison import compare_methods
-from jaxslam.verify.examination import examine, functions_of
-from jaxslam.verify.verifier import FLOAT32_TOLERANCE, TOLERANCE
+from jaxslam.verify._comparison import compare_methods
+from jaxslam.verify._examination import examine, functions_of
+from jaxslam.verify._verifier import FLOAT32_TOLERANCE, TOLERANCE, build
 
 MODELS = motion.REGISTRY | sensors.REGISTRY
 

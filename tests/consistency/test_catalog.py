@@ -11,14 +11,15 @@ import worlds
 from cases import refused, swept
 from layouts import kept_programs, wrong_layouts
 
-from jaxslam import catalog, charts, linearize, motion, sensors
+from jaxslam import _catalog as catalog
+from jaxslam import charts, linearize, motion, sensors
+from jaxslam._driver import run
 from jaxslam.core.protocols import Filter, Here
 from jaxslam.core.types import Status
-from jaxslam.driver import run
 from jaxslam.filters import EkfSlam
-from jaxslam.graphs.smoothing.forward_pass import LogEstimator
+from jaxslam.graphs.smoothing._forward_pass import LogEstimator
+from jaxslam.simulation._worlds import simulate
 from jaxslam.simulation.scenarios import SCENARIOS, loop, stationary
-from jaxslam.simulation.worlds import simulate
 
 KEY = jax.random.key(0)
 CURES = ["ideal", "fej", "oc", "right_invariant", "ukf_right"]

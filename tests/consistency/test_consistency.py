@@ -7,6 +7,9 @@ import scipy.stats
 import worlds
 
 from jaxslam import consistency
+from jaxslam.consistency._run_scores import run_statistics
+from jaxslam.consistency._summary import summarize
+from jaxslam.consistency._tally import Tally, condense
 from jaxslam.core.types import Estimate, Info, Status, Trace, Truth
 
 STEPS, PLACES, SLOTS = 12, 2, 3
@@ -51,7 +54,7 @@ def synthetic(rng, runs, claimed=1.0, singular=0):
 
 @jax.jit
 def _statistics(trace, truth):
-    return jax.vmap(lambda a, b: consistency.run_statistics(a, b, SENSOR))(trace, truth)
+    return jax.vmap(lambda a, b: run_statistics(a, b, SENSOR))(trace, truth)
 
 
 def scored(trace, truth, own_error_of=None):
@@ -71,12 +74,12 @@ def scored(trace, truth, own_error_of=None):
 
 def summed(trace, truth, limit=1e9):
     each = scored(trace, truth)
-    tally = consistency.Tally()
+    tally = Tally()
     # In two parts, as blocks come.
     for first, part in ((2, slice(2, None)), (0, slice(0, 2))):
         scores = jax.tree.map(lambda leaf, part=part: np.asarray(leaf)[part], each)
         if len(scores.finite) > 0:
-            tally.add(first, len(scores.finite), consistency.condense(scores, first, limit))
+            tally.add(first, len(scores.finite), condense(scores, first, limit))
     return tally
 
 
@@ -86,7 +89,7 @@ def plain_nees(error, cov):
 
 def test_measures_are_those_of_numpy():
     trace, truth, error = synthetic(np.random.default_rng(0), runs=9)
-    summary = consistency.summarize(summed(trace, truth))
+    summary = summarize(summed(trace, truth))
     cov = trace.estimate.pose_cov
     for block, at in (("pose", [0, 1, 2]), ("position", [0, 1]), ("heading", [2])):
         nees = plain_nees(error[..., at], cov[..., at, :][..., at])
@@ -120,7 +123,7 @@ def test_measures_are_those_of_numpy():
 
 def test_bands_are_chi_square_for_the_runs_that_count():
     trace, truth, _ = synthetic(np.random.default_rng(1), runs=30)
-    summary = consistency.summarize(summed(trace, truth))
+    summary = summarize(summed(trace, truth))
     low, high = scipy.stats.chi2.ppf([0.025, 0.975], 90) / 30
     np.testing.assert_allclose(summary.curves["nees_pose_low"], low)
     np.testing.assert_allclose(summary.curves["nees_pose_high"], high)
@@ -130,7 +133,7 @@ def test_bands_are_chi_square_for_the_runs_that_count():
 
 def test_a_singular_covariance_is_left_out_not_counted_as_zero():
     trace, truth, error = synthetic(np.random.default_rng(2), runs=5, singular=4)
-    summary = consistency.summarize(summed(trace, truth))
+    summary = summarize(summed(trace, truth))
     assert np.isnan(summary.curves["nees_pose"][:4]).all()
     assert (summary.curves["runs_pose"][:4] == 0).all()
     assert summary.counts["singular_steps"] == 5 * 4
@@ -151,9 +154,9 @@ def test_a_run_that_is_not_finite_is_counted_and_leaves_the_others_alone():
     trace, truth, _ = synthetic(np.random.default_rng(3), runs=6)
     trace.estimate.pose[2, 5, 0] = np.nan
     trace.info.nis[4, 1, 0] = np.inf
-    summary = consistency.summarize(summed(trace, truth))
+    summary = summarize(summed(trace, truth))
     kept = [0, 1, 3, 5]
-    alone = consistency.summarize(summed(*jax.tree.map(lambda a: a[kept], (trace, truth))))
+    alone = summarize(summed(*jax.tree.map(lambda a: a[kept], (trace, truth))))
     assert summary.counts["not_finite"] == 2
     assert summary.counts["runs"] == 4
     for name, measure in alone.measures.items():
@@ -163,10 +166,10 @@ def test_a_run_that_is_not_finite_is_counted_and_leaves_the_others_alone():
 def test_divergence_is_the_final_position_error_above_the_limit():
     trace, truth, error = synthetic(np.random.default_rng(4), runs=8)
     final = np.sort(np.linalg.norm(error[:, -1, :2], axis=1))
-    summary = consistency.summarize(summed(trace, truth, limit=(final[4] + final[5]) / 2))
+    summary = summarize(summed(trace, truth, limit=(final[4] + final[5]) / 2))
     assert summary.counts["divergent"] == 3
     assert summary.verdict != "diverged"
-    summary = consistency.summarize(summed(trace, truth, limit=(final[2] + final[3]) / 2))
+    summary = summarize(summed(trace, truth, limit=(final[2] + final[3]) / 2))
     assert summary.verdict == "diverged"
 
 
@@ -177,7 +180,7 @@ def test_the_verdict_tells_honest_from_dishonest(claimed, verdict):
     # The standard error over 400 runs of 12 steps is 0.035. By design one seed in 20 fails at 1.0;
     # this one is fixed.
     trace, truth, _ = synthetic(np.random.default_rng(7), runs=400, claimed=claimed)
-    summary = consistency.summarize(summed(trace, truth))
+    summary = summarize(summed(trace, truth))
     assert summary.verdict == verdict
     assert abs(summary.measures["nees_pose"].value - 3 / claimed) < 0.15
     assert summary.by == (() if claimed == 1 else ("nees_pose",))
@@ -190,7 +193,7 @@ def test_a_deviation_that_is_rounding_is_no_covariance():
     trace.estimate.pose_cov[:, 6] = np.diag([1.4e-29, 8.5e-31, 5.4e-32])
     trace.estimate.pose_cov[:, 7, 2] = trace.estimate.pose_cov[:, 7, :, 2] = 0
     trace.estimate.pose_cov[:, 7, 2, 2] = 5.4e-32
-    summary = consistency.summarize(summed(trace, truth))
+    summary = summarize(summed(trace, truth))
     assert summary.counts["singular_steps"] == 8 * 2
     assert summary.measures["nees_heading"].value < 3
     assert np.isnan(summary.curves["nees_heading"][[6, 7]]).all()
@@ -204,7 +207,7 @@ def test_most_measurements_dropped_is_said():
     trace.info.status[:] = np.where(trace.info.status == Status.FUSED, Status.SINGULAR, 0)
     trace.info.status[:, 0, 1] = Status.BORN
     trace = trace._replace(info=trace.info._replace(dof=np.zeros_like(trace.info.dof)))
-    summary = consistency.summarize(summed(trace, truth))
+    summary = summarize(summed(trace, truth))
     assert summary.verdict == "incomplete"
     assert summary.counts["singular"] == 8 * STEPS
     (doubt,) = summary.doubts
@@ -213,10 +216,10 @@ def test_most_measurements_dropped_is_said():
 
 def test_too_few_runs_are_undecided():
     trace, truth, _ = synthetic(np.random.default_rng(6), runs=1)
-    summary = consistency.summarize(summed(trace, truth))
+    summary = summarize(summed(trace, truth))
     assert summary.verdict == "undecided"
     assert summary.measures["nees_pose"][1:] == (0, np.inf)
     trace, truth, _ = synthetic(np.random.default_rng(6), runs=3, singular=STEPS)
-    summary = consistency.summarize(summed(trace, truth))
+    summary = summarize(summed(trace, truth))
     assert summary.verdict == "undecided"
     assert "nees_pose" not in summary.measures

@@ -7,6 +7,7 @@ from scipy import stats
 
 from jaxslam import consistency
 from jaxslam.consistency import LocalizationScores
+from jaxslam.consistency._localization_scores import energy_score, seed_spread
 
 RUNS = 600
 level = jax.jit(jax.vmap(consistency.covering_level))
@@ -48,7 +49,7 @@ def test_the_energy_score_is_that_of_the_definition():
     error = np.linalg.norm(draws - truth, axis=1).mean()
     apart = np.linalg.norm(draws[:, None] - draws[None], axis=-1)
     expected = error - 0.5 * apart[~np.eye(20, dtype=bool)].mean()
-    assert float(jax.jit(consistency.energy_score)(draws, truth)) == pytest.approx(expected)
+    assert float(jax.jit(energy_score)(draws, truth)) == pytest.approx(expected)
 
 
 def scores(error):
@@ -78,5 +79,5 @@ def test_the_summary_averages_runs_and_says_which_are_lost():
 
 def test_the_spread_over_seeds_is_in_units_of_the_claim():
     error = 0.1 * rng.normal(size=(4000, 2))
-    found = consistency.seed_spread(scores(error))
+    found = seed_spread(scores(error))
     np.testing.assert_allclose(found, 1 / 3, rtol=0.1)  # of three coordinates one differs

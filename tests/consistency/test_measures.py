@@ -13,27 +13,31 @@ from cases import refused
 from test_consistency import STEPS, plain_nees, scored, summed, synthetic
 
 from jaxslam import charts, consistency, motion, sensors
-from jaxslam.consistency.measures.counts import DROPS, KEPT, MEANINGS, counted
-from jaxslam.consistency.measures.nees import block_nees
-from jaxslam.consistency.measures.observability import unobservable_directions
+from jaxslam.consistency._bound import final_covariance, jacobians_at_truth, van_trees
+from jaxslam.consistency._measures.counts import DROPS, KEPT, MEANINGS, counted
+from jaxslam.consistency._measures.coverage import LEVELS
+from jaxslam.consistency._measures.nees import block_nees, own_error_of
+from jaxslam.consistency._measures.observability import unobservable_directions
+from jaxslam.consistency._run_scores import LAGS
+from jaxslam.consistency._summary import summarize
 from jaxslam.core.types import Estimate, Info, Log, Scan, Status, Trace, Truth
-from jaxslam.filters.ekf.map_coordinates import ToPoints
-from jaxslam.filters.ekf.monitor import Monitor
-from jaxslam.filters.map_management.merging import Merged
-from jaxslam.filters.particles.pose_particles import weighted_pose_moments
-from jaxslam.filters.particles.slam_particles import ParticleInfo
-from jaxslam.filters.reporting import Pruned
+from jaxslam.filters._ekf.map_coordinates import ToPoints
+from jaxslam.filters._ekf.monitor import Monitor
+from jaxslam.filters._particles.pose_particles import weighted_pose_moments
+from jaxslam.filters._particles.slam_particles import ParticleInfo
+from jaxslam.filters._reporting import Pruned
+from jaxslam.filters.map_management._merging import Merged
+from jaxslam.simulation._worlds import simulate
 from jaxslam.simulation.spurious import Spurious
-from jaxslam.simulation.worlds import simulate
 
 STATUSES = [status.name.lower() for status in (*KEPT, *DROPS)]
 
 
 def test_coverage_is_the_share_of_truth_inside_the_ellipsoids():
     trace, truth, error = synthetic(np.random.default_rng(0), runs=40)
-    summary = consistency.summarize(summed(trace, truth))
+    summary = summarize(summed(trace, truth))
     nees = plain_nees(error, trace.estimate.pose_cov)
-    for p, share in zip(consistency.LEVELS, summary.coverage["pose"], strict=True):
+    for p, share in zip(LEVELS, summary.coverage["pose"], strict=True):
         np.testing.assert_allclose(share, np.mean(nees <= scipy.stats.chi2.ppf(p, 3)), rtol=1e-12)
     inside = np.mean(nees <= scipy.stats.chi2.ppf(0.95, 3), axis=1)
     interval = scipy.stats.t.interval(0.95, 39, inside.mean(), scipy.stats.sem(inside))
@@ -154,13 +158,13 @@ def correlated(rng, rho, runs=30, steps=200, slots=3):
 @pytest.mark.parametrize("rho", [0.0, 0.4])
 def test_the_autocorrelation_of_innovations_is_found_lag_by_lag(rho):
     trace, truth = correlated(np.random.default_rng(3), rho)
-    summary = consistency.summarize(summed(trace, truth))
+    summary = summarize(summed(trace, truth))
     pairs = 30 * 199 * 3 * 2
-    expected = rho ** np.arange(1, consistency.LAGS + 1)
+    expected = rho ** np.arange(1, LAGS + 1)
     # Five standard errors of a product of two normals, and of an AR(1) sum where correlated.
     spread = 5 * np.sqrt((1 + rho**2) / (1 - rho**2) / pairs)
     np.testing.assert_allclose(summary.autocorrelation, expected, atol=spread)
-    products = 30 * (200 - np.arange(1, consistency.LAGS + 1)) * 3 * 2
+    products = 30 * (200 - np.arange(1, LAGS + 1)) * 3 * 2
     np.testing.assert_allclose(
         summary.autocorrelation_band, 1.959964 / np.sqrt(products), rtol=1e-6
     )
@@ -172,7 +176,7 @@ def test_runs_shorter_than_a_lag_have_no_autocorrelation_there():
     trace, truth, _ = synthetic(np.random.default_rng(4), runs=3)
     short = jax.tree.map(lambda leaf: leaf[:, :4], (trace, truth._replace(start=truth.pose)))
     short_truth = short[1]._replace(start=truth.start, landmarks=truth.landmarks)
-    summary = consistency.summarize(summed(short[0], short_truth))
+    summary = summarize(summed(short[0], short_truth))
     assert np.isnan(summary.autocorrelation[3:]).all()
 
 
@@ -181,7 +185,7 @@ def test_landmark_nees_and_own_coordinates():
     covs = np.random.default_rng(6).normal(size=(6, STEPS, 3, 2, 2))
     covs = covs @ covs.swapaxes(-1, -2) + 0.1 * np.eye(2)
     trace = trace._replace(estimate=trace.estimate._replace(point_covs=covs))
-    summary = consistency.summarize(summed(trace, truth))
+    summary = summarize(summed(trace, truth))
     kept = [0, 2]  # slots with tags 2 and 0
     off = truth.landmarks[:, None, [2, 0]] - trace.estimate.points[:, :, kept]
     nees = np.einsum(
@@ -189,9 +193,7 @@ def test_landmark_nees_and_own_coordinates():
     )
     np.testing.assert_allclose(summary.measures["nees_landmarks"].value, nees.mean(), rtol=1e-9)
 
-    own = jax.jit(
-        jax.vmap(partial(consistency.own_error_of, charts.RightInvariant(), worlds.ring().sensor))
-    )
+    own = jax.jit(jax.vmap(partial(own_error_of, charts.RightInvariant(), worlds.ring().sensor)))
     total, steps = scored(trace, truth, own).measures["nees_own"]
     found = total / steps
     local = jax.jit(jax.vmap(charts.RightInvariant().local, (0, None, 0, None)))
@@ -236,9 +238,9 @@ def test_the_bounds_obey_tichavskys_recursion():
     steps, own = consistency.posterior_bound(world, *alone, steps=[0, 7, 14])
     np.testing.assert_allclose(own, bounds[0, steps], rtol=1e-7, atol=1e-12)
     truth, bound = jax.tree.map(lambda leaf: leaf[0], truths), bounds[0]
-    jacobians = jax.jit(partial(consistency.jacobians_at_truth, world))
+    jacobians = jax.jit(partial(jacobians_at_truth, world))
     found = jax.device_get(jacobians(truth, jax.tree.map(lambda leaf: leaf[0], logs)))
-    last = consistency.final_covariance(found, world.pose_cov)
+    last = final_covariance(found, world.pose_cov)
     np.testing.assert_allclose(last, bound[-1], rtol=1e-4, atol=1e-9)
     n = 3 + 12
     j = np.zeros((n, n))  # the map is unknown beforehand: no information
@@ -274,7 +276,7 @@ def test_what_is_called_a_bound_bounds():
     slope, jacobian = np.ones((len(x), 1, 1)), 3 * x[:, None, None] ** 2
     noise, prior = np.array([[sigma**2]]), np.eye(1)
     given = np.sqrt(np.mean(1 / (1 + jacobian**2 / sigma**2)))
-    proper = np.sqrt(consistency.van_trees(slope, jacobian, noise, prior)[0, 0])
+    proper = np.sqrt(van_trees(slope, jacobian, noise, prior)[0, 0])
     np.testing.assert_allclose(proper, 1 / np.sqrt(1 + 27 / sigma**2), rtol=0.02)
     # The posterior mean by quadrature, of fewer draws.
     grid = np.linspace(-5, 5, 20_001)
@@ -303,7 +305,7 @@ def test_runs_that_are_not_finite_are_named():
     trace, truth, _ = synthetic(np.random.default_rng(7), runs=10)
     trace.estimate.pose[5, 3, 0] = np.nan
     trace.info.nis[2, 1, 0] = np.inf
-    summary = consistency.summarize(summed(trace, truth))
+    summary = summarize(summed(trace, truth))
     assert summary.not_finite_runs == [2, 5]
     for name in ("nees_pose", "noncredibility", "inclination"):  # by the number of the run
         assert len(summary.per_run[name]) == 10

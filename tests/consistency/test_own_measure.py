@@ -12,10 +12,11 @@ import worlds
 from cases import refused
 
 import jaxslam
-from jaxslam import filters, plot, report, store
+from jaxslam import filters, plot, store
 from jaxslam.consistency import Measure, register
-from jaxslam.consistency.measures import REGISTRY
-from jaxslam.results.page import campaign_page
+from jaxslam.consistency._measures import REGISTRY
+from jaxslam.results import _report as report
+from jaxslam.results._page import campaign_page
 
 WORLD = worlds.ring()
 RECKONING = {"reckoning": filters.DeadReckoning(WORLD.motion, WORLD.sensor)}

@@ -5,9 +5,9 @@ from fractions import Fraction
 import numpy as np
 import pytest
 
-from jaxslam.consistency import Score, Tally, condense
-from jaxslam.consistency.campaign import missing
-from jaxslam.consistency.tally import Sum, plus, sum_rows
+from jaxslam.consistency import Score
+from jaxslam.consistency._tally import Sum, Tally, condense, plus, sum_rows
+from jaxslam.consistency.campaign._pieces import missing
 
 
 def test_a_total_is_exact_where_a_plain_sum_is_not():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxslam import linearize
-from jaxslam.linearize.unscented import by_variables, regress
+from jaxslam.linearize._unscented import by_variables, regress
 
 
 def curved(xi):

@@ -9,11 +9,12 @@ import scipy.stats
 
 from benchmarks.verdict import averages, problem, rejected, verdicts
 from jaxslam import motion, sensors, stats
-from jaxslam.consistency import judge, lopsided, positive_interval, power_of
+from jaxslam.consistency import judge
+from jaxslam.consistency._intervals import Average, lopsided, positive_interval, spread
+from jaxslam.consistency._verdict import power_of
 from jaxslam.consistency.campaign import monte_carlo
-from jaxslam.consistency.campaign.candidates import check_noise
-from jaxslam.consistency.intervals import Average, spread
-from jaxslam.simulation.worlds import Scenario
+from jaxslam.consistency.campaign._candidates import check_noise
+from jaxslam.simulation._worlds import Scenario
 
 SENSOR = sensors.RangeBearing(np.eye(2))
 

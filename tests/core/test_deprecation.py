@@ -4,7 +4,7 @@ import warnings
 
 import pytest
 
-from jaxslam.core.deprecation import deprecated
+from jaxslam.core._deprecation import deprecated
 
 
 def test_a_deprecated_function_warns_once_where_it_is_called():

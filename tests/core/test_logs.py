@@ -12,9 +12,9 @@ from reference.plane import compose
 from worlds import narrow
 
 from jaxslam import graphs, run
-from jaxslam.core.logs import streams
+from jaxslam.core._validation import check_log
+from jaxslam.core.logs import _streams as streams
 from jaxslam.core.types import Info, Log, Scan, Status, Truth
-from jaxslam.core.validation import check_log
 from jaxslam.filters import EkfSlam
 from jaxslam.motion import PoseIncrement, Unicycle
 from jaxslam.sensors import Compass, Part, RangeBearing, Suite

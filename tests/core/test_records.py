@@ -15,12 +15,14 @@ from layouts import kept_programs, wrong_layouts
 from own_models import motion_of, sensor_of
 
 import jaxslam
-from jaxslam import catalog, filters, motion, run, sensors, simulate, smoothing
+from jaxslam import _catalog as catalog
+from jaxslam import filters, motion, run, sensors, simulate, smoothing
+from jaxslam.core._record import is_record
 from jaxslam.core.protocols import Filter, Motion
-from jaxslam.core.record import is_record, record, static
+from jaxslam.core.record import record, static
 from jaxslam.core.types import Log, Scan, Status
 from jaxslam.motion import OdometryNoise
-from jaxslam.simulation.worlds import World
+from jaxslam.simulation._worlds import World
 
 KEY = jax.random.key(0)
 R = np.diag([0.04, 0.01])

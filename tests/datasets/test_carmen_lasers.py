@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from jaxslam import datasets
-from jaxslam.datasets.laser_beams import _code_of_no_return
+from jaxslam.datasets._laser_logs.laser_beams import _code_of_no_return
 from jaxslam.math import numpy_poses as poses
 
 MOUNT = np.array([0.2, -0.1, np.pi])

@@ -11,8 +11,8 @@ from test_mutated import YAML, assert_map, assert_whole
 from test_table import OWN, SETTINGS, TRUTH
 
 from jaxslam import datasets, grids
-from jaxslam.datasets import g2o
-from jaxslam.datasets.carmen_odometry import odometry_of_file
+from jaxslam.datasets import _g2o as g2o
+from jaxslam.datasets._laser_logs.carmen_odometry import odometry_of_file
 
 COV = "0.01 0 0 0.04 0.001 0.09"
 FLASER = "FLASER 3 1.5 x 2 {} 3.5 host 2"

@@ -5,7 +5,7 @@ import gzip
 import pytest
 from recordings import assert_error
 
-from jaxslam.datasets.lines import TextFile, read_bytes, stored
+from jaxslam.datasets._lines import TextFile, read_bytes, stored
 
 
 def text_file(path, text, *options):

@@ -10,10 +10,10 @@ import pytest
 import jaxslam
 from examples.lost_in_the_woods import write_tables
 from jaxslam import charts, datasets
-from jaxslam.consistency.measures.nees import block_nees, pose_error
+from jaxslam.consistency._measures.nees import block_nees, pose_error
 from jaxslam.core.types import Status
-from jaxslam.datasets.noise_fit import autocorrelation
-from jaxslam.datasets.table_settings import fitted_text
+from jaxslam.datasets._landmark_logs.table_settings import fitted_text
+from jaxslam.datasets._noise_fit import autocorrelation
 
 MAT = Path(__file__).parents[3] / "shared" / "data" / "lost_in_the_woods" / "dataset2.mat"
 ROWS = 4000

@@ -6,7 +6,7 @@ import pytest
 import worlds
 
 from jaxslam import charts, filters
-from jaxslam.datasets.evaluation import joint_map_cov, judge_map
+from jaxslam.datasets._evaluation import joint_map_cov, judge_map
 from jaxslam.math.stats import chi2_band, chi2_quantile
 
 RNG = np.random.default_rng(7)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 import scipy.io
 
-from jaxslam.datasets.plaza_reader import read_matrices
+from jaxslam.datasets._landmark_logs.plaza_reader import read_matrices
 
 
 @pytest.mark.parametrize("compressed", [False, True])

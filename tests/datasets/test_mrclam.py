@@ -8,7 +8,7 @@ from cases import swept
 from recordings import EPOCH, MRCLAM, assert_log, assert_spoiled, folder, mapped, mrclam, write
 
 from jaxslam import datasets
-from jaxslam.datasets.mrclam_robot import EXCHANGED
+from jaxslam.datasets._landmark_logs.mrclam_robot import EXCHANGED
 
 
 def test_mrclam_by_hand(tmp_path):

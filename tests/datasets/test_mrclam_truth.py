@@ -11,7 +11,7 @@ from recordings import EPOCH, MRCLAM, TEAM, assert_error, folder, write
 
 from jaxslam import datasets
 from jaxslam.datasets import MRCLAM_CALIBRATION, RobotCalibration
-from jaxslam.datasets.mrclam_robot import START_COV, cut_after, true_poses
+from jaxslam.datasets._landmark_logs.mrclam_robot import START_COV, cut_after, true_poses
 
 TRUTH = """# Time x y theta
 1248272272.000 1.0 2.0 3.0

@@ -16,7 +16,8 @@ from test_plaza import written
 from test_table import OWN, SETTINGS, TRUTH
 
 from jaxslam import datasets, grids
-from jaxslam.datasets import g2o, ros_map
+from jaxslam.datasets import _g2o as g2o
+from jaxslam.datasets import _ros_map as ros_map
 
 TABLE = OWN | TRUTH | SETTINGS
 READ = {

@@ -11,7 +11,7 @@ from recordings import write
 
 from jaxslam import datasets, stats
 from jaxslam.core.types import Estimate
-from jaxslam.datasets.evaluation import evaluate
+from jaxslam.datasets._evaluation import evaluate
 
 OWN = {
     "odometry.csv": "t [s],v [m/s],omega [rad/s]\n1.0,0.5,0.1\n1.2,1.0,0\n1.4,0,0\n",

@@ -119,9 +119,9 @@ def test_what_is_run_again_after_a_change_of_the_code(commands):
             after = commands.digest(script), commands.digest(verify[-1:])
         return [one != other for one, other in zip(before, after, strict=True)]
 
-    assert changed("simulation/scenarios/published.py") == [True, False]
-    assert changed("verify/examination.py") == [False, True]
-    assert changed("cli/slam.py") == [False, False]
+    assert changed("simulation/scenarios/_published.py") == [True, False]
+    assert changed("verify/_examination.py") == [False, True]
+    assert changed("_cli/recorded/slam.py") == [False, False]
 
 
 def test_each_block_is_a_directive_or_is_run(commands):

@@ -14,7 +14,7 @@ from pathlib import Path
 
 import pytest
 
-from jaxslam import cli
+from jaxslam import _cli as cli
 
 ROOT = Path(__file__).parents[2]
 OUTSIDE = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "benchmarks/README.md")]
@@ -89,32 +89,16 @@ def reference():
 
 
 def public():
-    """(module, name) of every public name, by the files alone: those of `OPEN`, of `__all__`, or all.
-
-    The command line is no part of the API; nor is another library's class under a local name, as in
-    `Array = jax.Array`.
-    """
+    """(module, name) of every public name, by the files alone: `__all__` of a module whose path has
+    no underscore."""
     for path in sorted((ROOT / "jaxslam").rglob("*.py")):
         parts = path.relative_to(ROOT).with_suffix("").parts
         parts = parts[:-1] if parts[-1] == "__init__" else parts
-        if parts[1:2] == ("cli",) or any(part.startswith("_") for part in parts):
+        if any(part.startswith("_") for part in parts):
             continue
-        if (module := ".".join(parts)) in reference().OPEN:
-            yield from ((module, name) for name in reference().OPEN[module].split())
-            continue
-        names, is_open = [], reference().is_open(module)
         for node in ast.parse(path.read_text(encoding="utf-8")).body:
-            if isinstance(node, ast.FunctionDef | ast.ClassDef):
-                names.append(node.name)
-            elif isinstance(node, ast.Assign | ast.AnnAssign):
-                target = node.target if isinstance(node, ast.AnnAssign) else node.targets[0]
-                if ast.unparse(target) == "__all__":
-                    names, is_open = ast.literal_eval(node.value), True
-                    break
-                if not isinstance(node.value, ast.Name | ast.Attribute):
-                    names += [each.id for each in ast.walk(target) if isinstance(each, ast.Name)]
-        if is_open:
-            yield from ((module, name) for name in names if not name.startswith("_"))
+            if isinstance(node, ast.Assign) and ast.unparse(node.targets[0]) == "__all__":
+                yield from ((".".join(parts), name) for name in ast.literal_eval(node.value))
 
 
 def test_the_reference_misses_no_public_name(tmp_path, monkeypatch):
@@ -143,6 +127,23 @@ def test_the_reference_misses_no_public_name(tmp_path, monkeypatch):
         if kind != "data" and not inspect.getdoc(getattr(sys.modules[module], name))
     ]
     assert undocumented == []
+
+
+def test_pages_and_examples_import_public_names_only():
+    sources = dict(PAGES)
+    for path in (ROOT / "examples").rglob("*.py"):
+        sources[str(path.relative_to(ROOT))] = path.read_text(encoding="utf-8")
+    known = set(public())
+    for page, source in sources.items():
+        for of, names in re.findall(
+            r"^[ \t]*from (jaxslam[\w.]*) import (\([^)]*\)|[^\n#]+)", source, re.MULTILINE
+        ):
+            for name in (
+                each.split()[0] for each in names.strip("() \n").split(",") if each.strip()
+            ):
+                value = getattr(importlib.import_module(of), name)
+                is_public_module = inspect.ismodule(value) and "._" not in f"{of}.{name}"
+                assert is_public_module or (of, name) in known, (page, of, name)
 
 
 def test_a_dotted_path_in_the_text_is_reached_after_one_import():
@@ -185,9 +186,9 @@ def test_a_page_is_run_again_when_code_that_it_reaches_has_changed(tmp_path):
     names = extension.named(ast.parse("import jaxslam\nf = jaxslam.filters.Seif"))
     assert names == {"jaxslam:filters.Seif"}
     files = {p.relative_to(ROOT / "jaxslam").as_posix() for p in extension.reached(names)}
-    assert "filters/information/seif.py" in files
-    assert "filters/information/marginals.py" in files  # a step of it
-    assert "math/linalg/factors.py" in files
+    assert "filters/_information/seif.py" in files
+    assert "filters/_information/marginals.py" in files  # a step of it
+    assert "math/_linalg/factors.py" in files
     assert not any(name.startswith(("filters/particles", "results", "cli")) for name in files)
     page = PAGES["docs/getting_started.md"]
     everything = page.replace("print(campaign)", "!jaxslam verify")

@@ -14,7 +14,7 @@ import pytest
 import jaxslam
 from benchmarks import gallery
 from jaxslam import datasets, plot
-from jaxslam.catalog import KINDS
+from jaxslam._catalog import KINDS
 from jaxslam.simulation.scenarios import SCENARIOS
 
 ROOT = Path(__file__).parents[2]
@@ -26,7 +26,10 @@ IN_KINDS = {"ekf", "information", "particles", "known"}
 
 def families():
     """The kinds of the catalog, and the folders of filters that have none there."""
-    folders = {path.parent.name for path in (ROOT / "jaxslam" / "filters").glob("*/__init__.py")}
+    folders = {
+        path.parent.name.removeprefix("_")
+        for path in (ROOT / "jaxslam" / "filters").glob("*/__init__.py")
+    }
     return {kind.lower().replace(" ", "_") for kind in KINDS} | (folders - IN_KINDS)
 
 

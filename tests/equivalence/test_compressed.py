@@ -11,10 +11,10 @@ from cases import refused, swept
 from worlds import draw
 
 from jaxslam import charts, linearize, sensors
+from jaxslam._driver import run
 from jaxslam.core.types import Status
-from jaxslam.driver import run
 from jaxslam.filters import CompressedEkfSlam, EkfSlam
-from jaxslam.filters.ekf.compressed_ekf_slam import opened, up_to_date
+from jaxslam.filters._ekf.compressed_ekf_slam import opened, up_to_date
 from jaxslam.simulation.scenarios import cloister
 
 KEY = jax.random.key(4)

@@ -12,8 +12,8 @@ from cases import refused, swept
 from worlds import draw
 
 from jaxslam import filters, sensors
+from jaxslam._driver import run
 from jaxslam.core.types import Status
-from jaxslam.driver import run
 from jaxslam.simulation.scenarios import BetweenRanges, cloister
 
 KEY = jax.random.key(0)

@@ -10,8 +10,8 @@ from cases import swept
 from reference import ekf_slam as plain
 from worlds import draw
 
+from jaxslam._driver import run
 from jaxslam.core.types import Status
-from jaxslam.driver import run
 from jaxslam.filters import EkfSlam
 from jaxslam.simulation.scenarios import circle, cloister
 

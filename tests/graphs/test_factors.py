@@ -17,6 +17,7 @@ from reference.plane import between
 from jaxslam import graphs, motion, sensors
 from jaxslam.core.record import record
 from jaxslam.graphs import Ending, Table
+from jaxslam.graphs._factor import NominalMotion
 
 
 def test_the_factors_of_files_are_their_equations():
@@ -149,7 +150,7 @@ MADE = {
     "relative_pose_log": graphs.RelativePoseLog(),
     "from_sensor": graphs.FromSensor(SEEN),
     "from_motion": graphs.FromMotion(DRIVEN),
-    "nominal_motion": graphs.factor.NominalMotion(motion.Unicycle(np.eye(2))),
+    "nominal_motion": NominalMotion(motion.Unicycle(np.eye(2))),
 }
 PARTS = {"from_sensor": SEEN, "from_motion": DRIVEN, "nominal_motion": motion.Unicycle(np.eye(2))}
 

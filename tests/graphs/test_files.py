@@ -10,7 +10,7 @@ from cases import refused
 from recordings import DATA
 
 from jaxslam import graphs
-from jaxslam.datasets import g2o
+from jaxslam.datasets import _g2o as g2o
 
 SMALL = """# by hand
 VERTEX_SE2 7 0.5 -1.25 0.1

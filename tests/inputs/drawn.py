@@ -4,9 +4,12 @@ import dataclasses
 
 import numpy as np
 
-from jaxslam.consistency import DOF, LAGS, LEVELS, Average
+from jaxslam.consistency import Average
+from jaxslam.consistency._measures.coverage import LEVELS
+from jaxslam.consistency._measures.nees import DOF
+from jaxslam.consistency._run_scores import LAGS
+from jaxslam.consistency._summary import Summary
 from jaxslam.consistency.campaign import Campaign
-from jaxslam.consistency.summary import Summary
 from jaxslam.core.types import Estimate, Truth
 
 STEPS, RUNS = 200, 32

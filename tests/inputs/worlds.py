@@ -15,7 +15,7 @@ from jaxslam.consistency.campaign import monte_carlo
 from jaxslam.core.record import record
 from jaxslam.core.types import Status
 from jaxslam.math.stats import t_quantile
-from jaxslam.simulation.worlds import Scenario, simulate
+from jaxslam.simulation._worlds import Scenario, simulate
 
 
 def ring(steps: int = 100, seed: int = 3) -> Scenario:

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 from cases import refused, swept
 
-from jaxslam.core import validation
-from jaxslam.math import gaussians, linalg
+from jaxslam.core import _validation as validation
+from jaxslam.math import _gaussians as gaussians
+from jaxslam.math import _linalg as linalg
 
 UNROLLED, LAPACK = [1, 2, 3, 6, 8], [9, 20]  # 8 is the largest that is unrolled
 ROWS = 20

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam.math.xla import (
+from jaxslam.math._xla import (
     anywhere,
     hot_jit,
     hot_options,

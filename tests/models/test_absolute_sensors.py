@@ -11,11 +11,11 @@ from cases import swept
 from reference.plane import turn, wrap
 
 from jaxslam import charts, motion, sensors
+from jaxslam._driver import run
+from jaxslam.core._validation import check_log
 from jaxslam.core.types import Log, Scan, Status
-from jaxslam.core.validation import check_log
-from jaxslam.driver import run
 from jaxslam.filters import EkfSlam
-from jaxslam.simulation.worlds import Scenario, simulate
+from jaxslam.simulation._worlds import Scenario, simulate
 
 KEY = jax.random.key(0)
 STEPS, PLACES = 50, 3

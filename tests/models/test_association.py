@@ -14,7 +14,7 @@ from worlds import narrow
 from jaxslam import association
 from jaxslam.core.protocols import Association, Pairs, Prediction
 from jaxslam.core.types import Scan
-from jaxslam.math.assignment import assign
+from jaxslam.math._assignment import assign
 from jaxslam.math.stats import chi2_quantile
 
 METHODS = {

@@ -11,8 +11,9 @@ import pytest
 import scipy.stats
 from cases import swept
 
-from jaxslam.resampling import REGISTRY, Soft, StopGradient, kld, kld_bound, systematic
-from jaxslam.resampling.weights import at_points, effective_size, normalized, survivors, weights_of
+from jaxslam.resampling import REGISTRY, Soft, StopGradient, kld_bound, systematic
+from jaxslam.resampling import _kld as kld
+from jaxslam.resampling._weights import at_points, effective_size, normalized, survivors, weights_of
 
 WEIGHTS = np.array([0.02, 0.0, 0.35, 0.1, 0.03, 0.25, 0.05, 0.2])
 

@@ -10,9 +10,9 @@ from reference.plane import to_frame
 
 from jaxslam import motion, run
 from jaxslam.filters import EkfSlam
-from jaxslam.motion.substeps import Substeps
-from jaxslam.simulation.scenarios.drives import webmap
-from jaxslam.simulation.worlds import simulate
+from jaxslam.motion._substeps import Substeps
+from jaxslam.simulation._worlds import simulate
+from jaxslam.simulation.scenarios._drives import webmap
 
 Q = np.array([[0.04, 0.003], [0.003, 0.01]])
 COUNT = 3

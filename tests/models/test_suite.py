@@ -17,9 +17,9 @@ from jaxslam import charts, filters, linearize, motion, sensors
 from jaxslam.core.types import Status
 from jaxslam.filters import EkfSlam
 from jaxslam.sensors import Part, Suite
+from jaxslam.simulation._worlds import Scenario
 from jaxslam.simulation.scenarios import BetweenRanges
 from jaxslam.simulation.spurious import Spurious
-from jaxslam.simulation.worlds import Scenario
 
 EYES = sensors.RangeBearing(np.diag([0.05, 0.02]) ** 2, mount=(0.1, -0.05, 0.3))
 LASER = sensors.RelativePosition(np.diag([0.04, 0.06]) ** 2, mount=(-0.2, 0.0, 3.0))

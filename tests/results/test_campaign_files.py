@@ -12,10 +12,13 @@ import numpy as np
 import pytest
 from test_page import EVIL, GOOD, RUNS, STEPS, Reader, campaign, summary
 
-from jaxslam import plot, report
+from jaxslam import plot
 from jaxslam.consistency import Average
 from jaxslam.core.types import Estimate, Truth
-from jaxslam.results import campaign_files
+from jaxslam.results import _campaign_files as campaign_files
+from jaxslam.results import _report as report
+from jaxslam.results.plot import _style
+from jaxslam.results.plot._style import encode
 
 FIGURES = {*campaign_files.FIGURES}
 
@@ -97,7 +100,7 @@ def test_the_report_is_written_as_the_command_writes_it(found, tmp_path):
 @pytest.fixture
 def undrawn(monkeypatch):
     """Figures are made, and not drawn."""
-    monkeypatch.setattr(plot, "encode", lambda figure, kind: kind.encode())
+    monkeypatch.setattr(_style, "encode", lambda figure, kind, *_: kind.encode())
 
 
 def test_files_are_those_asked_for_and_without_run_0_its_figures_are_left_out(
@@ -132,7 +135,7 @@ def test_what_exists_is_not_overwritten_unasked_and_nothing_half_written_stays(
             raise KeyboardInterrupt
         return b""
 
-    monkeypatch.setattr(plot, "encode", broken)
+    monkeypatch.setattr(_style, "encode", broken)
     with pytest.raises(KeyboardInterrupt):
         found.save(tmp_path / "new" / "er", figures=("svg",))
     assert not (tmp_path / "new").exists()
@@ -168,7 +171,7 @@ def test_figures_of_another_campaign_do_not_stay_beside_the_report(found, tmp_pa
 
 def test_a_figure_is_the_same_bytes_each_time(found):
     for kind in ("pdf", "svg"):
-        first, again = (plot.encode(plot.nees_figure(found), kind) for _ in range(2))
+        first, again = (encode(plot.nees_figure(found), kind) for _ in range(2))
         assert first == again
 
 

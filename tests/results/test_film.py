@@ -10,7 +10,7 @@ from matplotlib.animation import FFMpegWriter
 from PIL import Image
 
 from jaxslam import plot
-from jaxslam.results.plot.run_film import MOST, frame_steps
+from jaxslam.results.plot._run_film import MOST, frame_steps
 
 COLORS = [(204, 0, 0), (0, 204, 0), (0, 0, 204)]
 

@@ -12,8 +12,8 @@ from hypothesis import given
 from stored import SETTINGS, assert_same
 
 import jaxslam
-from jaxslam import store
-from jaxslam.results.store import MANIFEST
+from jaxslam.results import _store as store
+from jaxslam.results._store import MANIFEST
 
 ARRAYS = {"ekf/nees": np.arange(96.0).reshape(32, 3), "finite": np.ones(32, bool)}
 
@@ -119,7 +119,7 @@ def test_odd_manifests(data, kept):
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     """The folder of a campaign of two runs, as the command writes it."""
-    from jaxslam import cli
+    from jaxslam import _cli as cli
 
     out = tmp_path_factory.mktemp("finished")
     options = ["--runs", "2", "--steps", "5", "--filters", "dead_reckoning", "--out", str(out)]

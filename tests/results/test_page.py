@@ -8,11 +8,13 @@ import numpy as np
 import pytest
 
 from jaxslam import plot
-from jaxslam.consistency import DOF, LEVELS, Average, Summary
+from jaxslam.consistency import Average, Summary
+from jaxslam.consistency._measures import BUILT_IN
+from jaxslam.consistency._measures.coverage import LEVELS
+from jaxslam.consistency._measures.nees import DOF
 from jaxslam.consistency.campaign import Campaign
-from jaxslam.consistency.measures import BUILT_IN
-from jaxslam.results.page import campaign_page
-from jaxslam.results.table import VERDICTS
+from jaxslam.results._page import campaign_page
+from jaxslam.results._table import VERDICTS
 
 STEPS, RUNS = 7, 30
 EVIL = "<script>alert(1)</script>&\"'"

@@ -9,12 +9,12 @@ import numpy as np
 import pytest
 import worlds
 
-from jaxslam import report
-from jaxslam.catalog import BASELINES
+from jaxslam._catalog import BASELINES
 from jaxslam.consistency import Average
-from jaxslam.consistency.measures import BUILT_IN
+from jaxslam.consistency._measures import BUILT_IN
 from jaxslam.core.types import Estimate
-from jaxslam.results import files
+from jaxslam.results import _files as files
+from jaxslam.results import _report as report
 
 WORLD = worlds.ring()
 

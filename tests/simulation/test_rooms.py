@@ -10,7 +10,10 @@ import pytest
 import worlds
 from cases import refused, swept
 
-from jaxslam import catalog, run
+from jaxslam import _catalog as catalog
+from jaxslam import run
+from jaxslam.simulation._walls import exact_ranges, is_free, wall_lines
+from jaxslam.simulation._worlds import simulate
 from jaxslam.simulation.laser import Laser, scan, scan_information, scan_world, true_ranges
 from jaxslam.simulation.scenarios import (
     ROOMS,
@@ -21,8 +24,7 @@ from jaxslam.simulation.scenarios import (
     square,
     square_lines,
 )
-from jaxslam.simulation.walls import exact_ranges, is_free, make_walls, rasterize, wall_lines
-from jaxslam.simulation.worlds import simulate
+from jaxslam.simulation.walls import make_walls, rasterize
 
 
 def reference_range(world, x, y, angle, limit):

@@ -6,6 +6,7 @@ import jax
 import numpy as np
 import pytest
 
+from jaxslam.simulation._worlds import simulate
 from jaxslam.simulation.scenarios import (
     cloister_noisy,
     explore,
@@ -13,8 +14,7 @@ from jaxslam.simulation.scenarios import (
     loop_bearing,
     stationary,
 )
-from jaxslam.simulation.scenarios.published import loop_landmarks
-from jaxslam.simulation.worlds import simulate
+from jaxslam.simulation.scenarios._published import loop_landmarks
 
 
 def draw(world, seed=0):

@@ -18,15 +18,15 @@ from own_models import changed
 from reference.plane import mounted, to_frame, wrap
 
 from jaxslam import motion, sensors
-from jaxslam.core.validation import check_log
+from jaxslam.core._validation import check_log
+from jaxslam.simulation._worlds import Scenario, simulate
 from jaxslam.simulation.scenarios import (
     SCENARIOS,
     BetweenRanges,
     circle,
     cloister,
 )
-from jaxslam.simulation.scenarios.published import cloister_landmarks
-from jaxslam.simulation.worlds import Scenario, simulate
+from jaxslam.simulation.scenarios._published import cloister_landmarks
 
 Q = np.array([[0.002, 0.0005], [0.0005, 0.001]])
 R = np.array([[0.04, -0.01], [-0.01, 0.01]]) * 0.25

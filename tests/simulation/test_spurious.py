@@ -11,10 +11,11 @@ import worlds
 from cases import refused, swept
 
 from jaxslam import association, life, monte_carlo, run, sensors, simulate
-from jaxslam.consistency.measures.associations import association_scores, identities
+from jaxslam.consistency._measures.associations import association_scores, identities
 from jaxslam.core.types import Estimate, Info, Scan, Status, Trace
 from jaxslam.filters import EkfSlam
-from jaxslam.simulation.spurious import Spurious, spoil
+from jaxslam.simulation._spurious import spoil
+from jaxslam.simulation.spurious import Spurious
 
 SENSOR = sensors.RangeBearing(np.diag([0.1, 0.02]) ** 2)
 M, RUNS = 12, 4000

@@ -9,16 +9,19 @@ import pytest
 from own_models import changed, sensor_of
 from verified import failed
 
-from jaxslam import cli, graphs, motion, sensors
+from jaxslam import _cli as cli
+from jaxslam import graphs, motion, sensors
 from jaxslam.core.protocols import Sensor
 from jaxslam.core.record import record
 from jaxslam.laser.grids import beam_models
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
-from jaxslam.verify import Check, Report, build, properties, verify_jacobians
-from jaxslam.verify.inputs import samples, user_files
-from jaxslam.verify.inputs.functions import motion_functions
-from jaxslam.verify.inputs.user_files import UnusableFile, load, verify_file
+from jaxslam.verify import Check, Report, verify_jacobians
+from jaxslam.verify import _properties as properties
+from jaxslam.verify._inputs import samples, user_files
+from jaxslam.verify._inputs.functions import motion_functions
+from jaxslam.verify._inputs.user_files import UnusableFile, load, verify_file
+from jaxslam.verify._verifier import build
 
 LASER = build(sensors.RangeBearing)
 CAMERA = build(sensors.BearingOnly)

@@ -6,8 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from jaxslam.cli import main
-from jaxslam.verify.inputs import user_files
+from jaxslam._cli import main
+from jaxslam.verify._inputs import user_files
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
 

@@ -13,8 +13,10 @@ from own_models import changed
 from verified import by_name, failed
 
 from jaxslam import sensors
-from jaxslam.verify import build, differences, verify_jacobians
-from jaxslam.verify.inputs.functions import plain_function
+from jaxslam.verify import _differences as differences
+from jaxslam.verify import verify_jacobians
+from jaxslam.verify._inputs.functions import plain_function
+from jaxslam.verify._verifier import build
 
 
 def observe(pose, landmark):

@@ -2,7 +2,7 @@
 
 import pytest
 
-from jaxslam.math import xla
+from jaxslam.math import _xla as xla
 
 
 @pytest.fixture(autouse=True, scope="module")

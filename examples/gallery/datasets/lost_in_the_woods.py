@@ -8,7 +8,7 @@ from pathlib import Path
 import jax
 
 import jaxslam
-from jaxslam.datasets.evaluation import evaluate
+from jaxslam.datasets import evaluate
 from jaxslam.filters import EkfSlam
 
 jax.config.update("jax_enable_x64", True)

@@ -5,7 +5,7 @@ import sys
 import jax
 
 import jaxslam
-from jaxslam.datasets.evaluation import evaluate
+from jaxslam.datasets import evaluate
 
 jax.config.update("jax_enable_x64", True)
 data = jaxslam.datasets.mrclam(sys.argv[1], robot=1)

@@ -4,8 +4,8 @@ import gtsam
 import jax
 
 import jaxslam
-from jaxslam.datasets.evaluation import evaluate
-from jaxslam.filters.delayed.delayed_settings import StoredMeasurements
+from jaxslam.datasets import evaluate
+from jaxslam.filters import StoredMeasurements
 
 jax.config.update("jax_enable_x64", True)
 data = jaxslam.datasets.plaza(gtsam.findExampleDataFile("Plaza1_.mat"))

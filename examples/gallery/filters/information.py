@@ -5,7 +5,7 @@ import numpy as np
 from matplotlib.figure import Figure
 
 import jaxslam
-from jaxslam.filters.information.marginals import whole_information
+from jaxslam.filters import whole_information
 
 jax.config.update("jax_enable_x64", True)
 world = jaxslam.scenarios.circle(steps=240)

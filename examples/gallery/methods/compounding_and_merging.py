@@ -6,7 +6,7 @@ import numpy as np
 import jaxslam
 from jaxslam.math import se2
 from jaxslam.math.uncertain_poses import Frame, compound, mahalanobis_squared, merge
-from jaxslam.results.plot.style import COLORS, FAINT, INK, PAGE, panels_of, titled
+from jaxslam.results.plot import COLORS, FAINT, INK, PAGE, panels_of, titled
 
 jax.config.update("jax_enable_x64", True)
 landmark, sigma = np.array([0.5, 4.0]), 0.1  # [m], [rad]

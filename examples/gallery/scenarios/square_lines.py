@@ -3,7 +3,7 @@
 import jax
 
 import jaxslam
-from jaxslam.simulation.scenarios.rooms import from_start
+from jaxslam.simulation.scenarios import from_start
 
 jax.config.update("jax_enable_x64", True)
 world = jaxslam.scenarios.square_lines()

@@ -3,22 +3,14 @@ estimator: absolute and relative errors of a path, errors of relations, alignmen
 correlation. On the host, by NumPy in float64.
 """
 
-from jaxslam.consistency.metrics.paths import (
-    PathErrors,
-    align_map,
-    alignment,
-    ate,
-    carried,
-    map_entropy,
-)
-from jaxslam.consistency.metrics.relative_poses import (
+from jaxslam.consistency.metrics._paths import PathErrors, align_map, alignment, ate, map_entropy
+from jaxslam.consistency.metrics._relative_poses import (
     Errors,
     MeanAndStd,
     Relations,
     Statistics,
     benchmark_figures,
     given,
-    joined,
     relation_errors,
     relations,
     revisits,
@@ -37,9 +29,7 @@ __all__ = [
     "alignment",
     "ate",
     "benchmark_figures",
-    "carried",
     "given",
-    "joined",
     "map_entropy",
     "relation_errors",
     "relations",

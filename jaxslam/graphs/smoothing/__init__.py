@@ -1,10 +1,10 @@
 """Smoothing: estimators of the whole path and map from the whole log, or from its last steps.
 
-Each is the graph of the log, solved along the path (`jaxslam.graphs.chain`).
+Each is the graph of the log, solved along the path (`jaxslam.graphs._chain`).
 """
 
-from jaxslam.graphs.smoothing.batch_map import BatchMap
-from jaxslam.graphs.smoothing.fixed_lag import FixedLag
-from jaxslam.graphs.smoothing.smoother import Smoother
+from jaxslam.graphs.smoothing._batch_map import BatchMap
+from jaxslam.graphs.smoothing._fixed_lag import FixedLag
+from jaxslam.graphs.smoothing._smoother import Smoother
 
 __all__ = ["BatchMap", "FixedLag", "Smoother"]

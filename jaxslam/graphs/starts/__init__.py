@@ -8,10 +8,10 @@ no other influence on the optimum.
 
 from collections.abc import Callable
 
-from jaxslam.graphs.graph import Graph
-from jaxslam.graphs.starts.chordal_relaxation import chordal
-from jaxslam.graphs.starts.relative import Factors
-from jaxslam.graphs.starts.tree import odometry, robust, spanning_tree
+from jaxslam.graphs._graph import Graph
+from jaxslam.graphs.starts._chordal_relaxation import chordal
+from jaxslam.graphs.starts._relative import Factors
+from jaxslam.graphs.starts._tree import odometry, robust, spanning_tree
 
 
 def given(graph: Graph, factors: Factors | None = None) -> Graph:
@@ -28,4 +28,4 @@ STARTS: dict[str, Callable[..., Graph]] = {
 }
 """The starts by name, for the command line."""
 
-__all__ = ["chordal", "given", "odometry", "robust", "spanning_tree"]
+__all__ = ["STARTS", "chordal", "given", "odometry", "robust", "spanning_tree"]

@@ -1,16 +1,8 @@
 """Occupancy grids: maps, files, distances, rays, beam models, mapping, localization."""
 
-from jaxslam.laser.grids.beam_models import (
-    BeamModel,
-    LikelihoodField,
-    Mixture,
-    RayCast,
-    fit,
-    log_likelihood,
-)
-from jaxslam.laser.grids.cell_counts import Counts, count, entropy, occupancy, reflection
-from jaxslam.laser.grids.distance import distance_field, gradient
-from jaxslam.laser.grids.grid import (
+from jaxslam.laser.grids._cell_counts import Counts, count, entropy, occupancy, reflection
+from jaxslam.laser.grids._distance import distance_field, gradient
+from jaxslam.laser.grids._grid import (
     Field,
     Grid,
     centers,
@@ -19,10 +11,18 @@ from jaxslam.laser.grids.grid import (
     to_cells,
     write_map,
 )
-from jaxslam.laser.grids.grid_localization import GridLocalization, beam_log
-from jaxslam.laser.grids.pose_clusters import Clusters, clusters
-from jaxslam.laser.grids.rays import RayMap, cast, ray_map
-from jaxslam.laser.grids.resolution import correlation, crop, resample
+from jaxslam.laser.grids._grid_localization import GridLocalization, beam_log
+from jaxslam.laser.grids._pose_clusters import Clusters, clusters
+from jaxslam.laser.grids._rays import RayMap, cast, ray_map
+from jaxslam.laser.grids._resolution import correlation, crop, resample
+from jaxslam.laser.grids.beam_models import (
+    BeamModel,
+    LikelihoodField,
+    Mixture,
+    RayCast,
+    fit,
+    log_likelihood,
+)
 
 __all__ = [
     "BeamModel",

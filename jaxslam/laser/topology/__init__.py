@@ -1,14 +1,14 @@
 """Topological maps: places and doors from a grid, routes, and the place of a particle set."""
 
-from jaxslam.laser.topology.places import (
+from jaxslam.laser.topology._places import (
     Door,
     PathPlaces,
     TopologicalMap,
     path_places,
     topological_map,
 )
-from jaxslam.laser.topology.planning import Route, place_of, place_weights, route
-from jaxslam.laser.topology.voronoi import Skeleton, skeleton
+from jaxslam.laser.topology._planning import Route, place_of, place_weights, route
+from jaxslam.laser.topology._voronoi import Skeleton, skeleton
 
 __all__ = [
     "Door",

@@ -5,17 +5,16 @@ Only this package draws. Figures are made without pyplot, without global state a
 column of a paper, with letters of the same size.
 """
 
-from jaxslam.results.plot.film import Film, Layer, Panel, Scene, has_ffmpeg
-from jaxslam.results.plot.graph_figures import graph_figure, graph_scene
-from jaxslam.results.plot.grid_figures import (
+from jaxslam.results.plot._film import Film, Layer, Panel, Scene
+from jaxslam.results.plot._graph_figures import graph_figure
+from jaxslam.results.plot._grid_figures import (
     grid_figure,
     loops_figure,
-    map_scene,
     maps_before_after,
     topology_figure,
 )
-from jaxslam.results.plot.landmarks import ellipse, map_figure, run_map_figure, walls_figure
-from jaxslam.results.plot.measure_figures import (
+from jaxslam.results.plot._landmarks import ellipse, map_figure, walls_figure
+from jaxslam.results.plot._measure_figures import (
     cost_figure,
     coverage_figure,
     gained_figure,
@@ -23,52 +22,61 @@ from jaxslam.results.plot.measure_figures import (
     rmse_figure,
     whiteness_figure,
 )
-from jaxslam.results.plot.pose_errors import errors_figure, run_errors_figure
-from jaxslam.results.plot.run_film import (
-    History,
-    animate,
-    animate_world,
-    frame_steps,
-    probe,
-    run_scene,
+from jaxslam.results.plot._pose_errors import errors_figure
+from jaxslam.results.plot._run_film import animate, animate_world, probe
+from jaxslam.results.plot._style import (
+    COLORS,
+    COLUMN,
+    FAINT,
+    INK,
+    PAGE,
+    SHADE,
+    TEXT,
+    Figure,
+    band,
+    caption,
+    curve,
+    every_handle,
+    look,
+    panels_of,
+    titled,
 )
-from jaxslam.results.plot.style import COLORS, COLUMN, PAGE, Figure, describe, encode, png
 
 __all__ = [
     "COLORS",
     "COLUMN",
+    "FAINT",
+    "INK",
     "PAGE",
+    "SHADE",
+    "TEXT",
     "Figure",
     "Film",
-    "History",
     "Layer",
     "Panel",
     "Scene",
     "animate",
     "animate_world",
+    "band",
+    "caption",
     "cost_figure",
     "coverage_figure",
-    "describe",
+    "curve",
     "ellipse",
-    "encode",
     "errors_figure",
-    "frame_steps",
+    "every_handle",
     "gained_figure",
     "graph_figure",
-    "graph_scene",
     "grid_figure",
-    "has_ffmpeg",
+    "look",
     "loops_figure",
     "map_figure",
-    "map_scene",
     "maps_before_after",
     "nees_figure",
-    "png",
+    "panels_of",
     "probe",
     "rmse_figure",
-    "run_errors_figure",
-    "run_map_figure",
-    "run_scene",
+    "titled",
     "topology_figure",
     "walls_figure",
     "whiteness_figure",

@@ -2,9 +2,10 @@
 
 from collections.abc import Callable
 
-from jaxslam.simulation.scans import BetweenRanges
-from jaxslam.simulation.scenarios.drives import explore, webmap
-from jaxslam.simulation.scenarios.published import (
+from jaxslam.simulation._scans import BetweenRanges
+from jaxslam.simulation._worlds import Scenario
+from jaxslam.simulation.scenarios._drives import explore, webmap
+from jaxslam.simulation.scenarios._published import (
     circle,
     cloister,
     cloister_noisy,
@@ -12,16 +13,16 @@ from jaxslam.simulation.scenarios.published import (
     loop_bearing,
     stationary,
 )
-from jaxslam.simulation.scenarios.rooms import (
+from jaxslam.simulation.scenarios._rooms import (
     ROOMS,
     circular_room,
     corridor,
+    from_start,
     office,
     office_lines,
     square,
     square_lines,
 )
-from jaxslam.simulation.worlds import Scenario
 
 SCENARIOS: dict[str, Callable[..., Scenario]] = {
     "circle": circle,
@@ -47,6 +48,7 @@ __all__ = [
     "cloister_noisy",
     "corridor",
     "explore",
+    "from_start",
     "loop",
     "loop_bearing",
     "office",

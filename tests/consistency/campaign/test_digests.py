@@ -12,8 +12,9 @@ import pytest
 import worlds
 
 from jaxslam import filters, sensors, store
-from jaxslam.consistency.campaign import digests, monte_carlo
-from jaxslam.consistency.campaign.digests import digest, identity
+from jaxslam.consistency.campaign import _digests as digests
+from jaxslam.consistency.campaign import monte_carlo
+from jaxslam.consistency.campaign._digests import digest, identity
 from jaxslam.core.record import record
 
 

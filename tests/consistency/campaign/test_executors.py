@@ -18,10 +18,20 @@ import pytest
 import worlds
 
 import jaxslam
-from jaxslam import cli, filters, store
-from jaxslam.consistency.campaign import Incomplete, flight, monte_carlo, remote
-from jaxslam.consistency.campaign.block import CampaignPlan
-from jaxslam.consistency.campaign.remote import Processes, compute_block, packed
+from jaxslam import _cli as cli
+from jaxslam import filters, store
+from jaxslam.consistency.campaign import (
+    Incomplete,
+    monte_carlo,
+)
+from jaxslam.consistency.campaign import (
+    _flight as flight,
+)
+from jaxslam.consistency.campaign import (
+    _remote as remote,
+)
+from jaxslam.consistency.campaign._block import CampaignPlan
+from jaxslam.consistency.campaign._remote import Processes, compute_block, packed
 from jaxslam.core.record import record
 
 WORLD = worlds.ring(20)

@@ -10,13 +10,16 @@ import pytest
 import worlds
 from cases import refused, swept
 
-from jaxslam import Scenario, catalog, filters, grids, motion, run, sensors, simulate, store
-from jaxslam.consistency.campaign import Interrupted, missing, monte_carlo, work
-from jaxslam.consistency.campaign.candidates import fitting_block, without_noise
+from jaxslam import Scenario, filters, grids, motion, run, sensors, simulate, store
+from jaxslam import _catalog as catalog
+from jaxslam.consistency.campaign import Interrupted, monte_carlo
+from jaxslam.consistency.campaign import _work as work
+from jaxslam.consistency.campaign._candidates import fitting_block, without_noise
+from jaxslam.consistency.campaign._pieces import missing
 from jaxslam.core.record import record
 from jaxslam.core.types import Status, Truth
-from jaxslam.filters import reporting
-from jaxslam.laser.grids.grid_localization import info_of_beams
+from jaxslam.filters import _reporting as reporting
+from jaxslam.laser.grids._grid_localization import info_of_beams
 from jaxslam.simulation.laser import scan_world
 from jaxslam.simulation.scenarios import square
 

@@ -10,9 +10,10 @@ import jax
 import pytest
 import worlds
 
-from jaxslam import cli, filters, store
+from jaxslam import _cli as cli
+from jaxslam import filters, store
 from jaxslam.consistency.campaign import monte_carlo
-from jaxslam.results import campaign_files
+from jaxslam.results import _campaign_files as campaign_files
 
 WORLD = worlds.ring(20)
 RECKONING = filters.DeadReckoning(WORLD.motion, WORLD.sensor)

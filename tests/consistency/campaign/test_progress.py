@@ -6,8 +6,9 @@ from types import SimpleNamespace
 import pytest
 import worlds
 
-from jaxslam.consistency.campaign import monte_carlo, progress
-from jaxslam.consistency.campaign.work import Work
+from jaxslam.consistency.campaign import _progress as progress
+from jaxslam.consistency.campaign import monte_carlo
+from jaxslam.consistency.campaign._work import Work
 
 
 def test_a_bar_tells_how_fast_it_goes_and_how_long_that_takes(capsys, monkeypatch):

@@ -11,7 +11,8 @@ from pathlib import Path
 import jax
 import pytest
 
-from jaxslam import cli, store
+from jaxslam import _cli as cli
+from jaxslam import store
 
 PROGRAMS = ("munged", "mungekey", "slurmctld", "slurmd", "sbatch", "squeue", "scancel")
 SCRIPT = Path(__file__).parents[3] / "examples" / "slurm_campaign.sh"

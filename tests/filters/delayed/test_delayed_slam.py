@@ -17,13 +17,13 @@ from jaxslam import Scenario, motion, sensors
 from jaxslam.association import Nearest
 from jaxslam.core.types import Status
 from jaxslam.filters import DeadReckoning, DelayedSlam
-from jaxslam.filters.delayed.confirmation import constraints_of, correct_hypotheses
-from jaxslam.filters.delayed.delayed_settings import Hypotheses, Promotion, StoredMeasurements
-from jaxslam.filters.delayed.hypotheses import UncertainPoints, closer_than, point_residuals
-from jaxslam.filters.delayed.initialization import add_landmark, initial_estimate
-from jaxslam.filters.delayed.intersection import add_hypotheses
-from jaxslam.filters.delayed.state import TableLayout
-from jaxslam.filters.delayed.triangulation import Circles, Rays, triangulation_of
+from jaxslam.filters._delayed.confirmation import constraints_of, correct_hypotheses
+from jaxslam.filters._delayed.delayed_settings import Hypotheses, Promotion, StoredMeasurements
+from jaxslam.filters._delayed.hypotheses import UncertainPoints, closer_than, point_residuals
+from jaxslam.filters._delayed.initialization import add_landmark, initial_estimate
+from jaxslam.filters._delayed.intersection import add_hypotheses
+from jaxslam.filters._delayed.state import TableLayout
+from jaxslam.filters._delayed.triangulation import Circles, Rays, triangulation_of
 from jaxslam.math.stats import chi2_quantile
 
 CAMERA = sensors.BearingOnly([[0.01**2]])

@@ -11,11 +11,11 @@ import scipy.stats
 from cases import refused
 
 from jaxslam import motion, sensors, slots
+from jaxslam._driver import run
 from jaxslam.core.types import Log, Scan, Status
-from jaxslam.driver import run
 from jaxslam.filters import EkfSlam
+from jaxslam.simulation._worlds import simulate
 from jaxslam.simulation.scenarios import cloister
-from jaxslam.simulation.worlds import simulate
 
 Q, R = np.diag([0.05, 0.03]) ** 2, np.diag([0.1, 0.05]) ** 2
 MOTION, SENSOR = motion.Increment(Q), sensors.RangeBearing(R)

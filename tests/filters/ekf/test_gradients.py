@@ -11,16 +11,16 @@ import worlds
 from worlds import draw, narrow
 
 from jaxslam import charts, linearize, motion, sensors
+from jaxslam._driver import run
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Status
-from jaxslam.driver import run
 from jaxslam.filters import EkfSlam
-from jaxslam.filters.ekf.ekf_settings import EkfSettings
-from jaxslam.filters.ekf.predict import propagate
-from jaxslam.filters.ekf.update import correct_in_turn
+from jaxslam.filters._ekf.ekf_settings import EkfSettings
+from jaxslam.filters._ekf.predict import propagate
+from jaxslam.filters._ekf.update import correct_in_turn
 from jaxslam.math.stats import sigma_gate
+from jaxslam.simulation._worlds import simulate
 from jaxslam.simulation.scenarios import circle, cloister
-from jaxslam.simulation.worlds import simulate
 
 KEY = jax.random.key(0)
 WHEELBASE, SPEED, DT = 0.5, 1.0, 0.1

@@ -10,15 +10,16 @@ import pytest
 import worlds
 from cases import refused, swept
 
-from jaxslam import catalog, charts, filters, life, linearize, sensors
+from jaxslam import _catalog as catalog
+from jaxslam import charts, filters, life, linearize, sensors
+from jaxslam._driver import run
 from jaxslam.core.record import record
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Scan
-from jaxslam.driver import run
 from jaxslam.filters import Closing, EkfSlam, Filter, Monitored, Wrapper
-from jaxslam.filters.ekf.ekf_settings import EkfSettings
-from jaxslam.filters.ekf.predicted_measurements import prediction_of
-from jaxslam.filters.ekf.update import correct
+from jaxslam.filters._ekf.ekf_settings import EkfSettings
+from jaxslam.filters._ekf.predicted_measurements import prediction_of
+from jaxslam.filters._ekf.update import correct
 from jaxslam.linearize import FirstEstimate
 
 SENSOR = sensors.RangeBearing(np.diag([0.1, 0.02]) ** 2, mount=(0.2, -0.1, 0.4))

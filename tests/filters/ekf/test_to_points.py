@@ -15,7 +15,7 @@ from jaxslam.charts import RightInvariant
 from jaxslam.core.protocols import Basis
 from jaxslam.core.types import Log, Scan, Status
 from jaxslam.filters import CompressedEkfSlam, EkfSlam
-from jaxslam.filters.ekf.map_coordinates import ready, reduce, reduction
+from jaxslam.filters._ekf.map_coordinates import ready, reduce, reduction
 from jaxslam.linearize import Unscented
 
 MOTION = motion.Increment(np.diag([0.02, 0.02]) ** 2)

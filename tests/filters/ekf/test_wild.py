@@ -12,7 +12,7 @@ from cases import swept
 from jaxslam import association, life, motion, run, sensors
 from jaxslam.core.types import Log, Scan, Status
 from jaxslam.filters import EkfSlam
-from jaxslam.filters.map_management.merging import Merging
+from jaxslam.filters.map_management._merging import Merging
 from jaxslam.math.stats import chi2_quantile
 
 STEPS, PLACES = 400, 4

@@ -10,22 +10,23 @@ import pytest
 from cases import refused
 from worlds import draw, narrow
 
-from jaxslam import catalog, filters, scenarios, sensors
+from jaxslam import _catalog as catalog
+from jaxslam import filters, scenarios, sensors
+from jaxslam._driver import run
 from jaxslam.charts import Euclidean
 from jaxslam.core.protocols import Filter
 from jaxslam.core.record import record
 from jaxslam.core.types import Scan, Status
-from jaxslam.driver import run
-from jaxslam.filters.information import active_set, sparse_state
-from jaxslam.filters.information.eif_slam import InPieces
-from jaxslam.filters.information.marginals import (
+from jaxslam.filters._information import active_set, sparse_state
+from jaxslam.filters._information.eif_slam import InPieces
+from jaxslam.filters._information.marginals import (
     blanket_cov,
     blanket_marginals,
     local_information,
     recover_passive_means,
     whole_information,
 )
-from jaxslam.filters.reporting import nothing_of
+from jaxslam.filters._reporting import nothing_of
 from jaxslam.simulation.scenarios import BetweenRanges, cloister
 
 COUNT = 36

@@ -14,7 +14,7 @@ from worlds import draw, nameless, ring
 from jaxslam import association, charts, linearize, motion, run, sensors, simulate
 from jaxslam.core.types import Status
 from jaxslam.filters import EkfSlam, Mapping
-from jaxslam.filters.known.mapping import as_prior
+from jaxslam.filters._known.mapping import as_prior
 from jaxslam.math.stats import chi2_band, chi2_quantile
 
 KEY = jax.random.key(0)

@@ -15,9 +15,9 @@ from jaxslam.core.protocols import Pairs, Prediction
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Info, Scan
 from jaxslam.filters import EifSlam, EkfSlam
-from jaxslam.filters.map_management.closing import Closing
-from jaxslam.filters.map_management.loop_closure import LoopSettings, close_loop
-from jaxslam.filters.map_management.merging import merge_landmarks
+from jaxslam.filters.map_management._closing import Closing
+from jaxslam.filters.map_management._loop_closure import LoopSettings, close_loop
+from jaxslam.filters.map_management._merging import merge_landmarks
 from jaxslam.life import Recency, Times
 
 EUCLIDEAN = charts.Euclidean()

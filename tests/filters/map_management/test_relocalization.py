@@ -15,8 +15,8 @@ from jaxslam import charts, motion, se2, sensors
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Scan, Status
 from jaxslam.filters import EkfSlam
-from jaxslam.filters.ekf.ekf_settings import EkfSettings
-from jaxslam.filters.ekf.update import correct
+from jaxslam.filters._ekf.ekf_settings import EkfSettings
+from jaxslam.filters._ekf.update import correct
 from jaxslam.filters.map_management.relocalization import (
     lost,
     points_of_map,

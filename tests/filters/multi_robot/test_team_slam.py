@@ -17,11 +17,11 @@ import jaxslam
 from jaxslam import filters, motion, sensors, team
 from jaxslam.core.types import Log, Scan, Status
 from jaxslam.filters import EkfSlam, TeamSlam
-from jaxslam.filters.multi_robot import pose_initialization
+from jaxslam.filters.multi_robot import _pose_initialization as pose_initialization
 from jaxslam.sensors import Part, Suite
+from jaxslam.simulation._team_world import TeamWorld
+from jaxslam.simulation._worlds import simulate
 from jaxslam.simulation.scenarios import BetweenRanges
-from jaxslam.simulation.team_world import TeamWorld
-from jaxslam.simulation.worlds import simulate
 
 Q = np.diag([0.01, 0.01]) ** 2
 R1, R2 = np.diag([0.05, 0.02]) ** 2, np.diag([0.08, 0.03]) ** 2

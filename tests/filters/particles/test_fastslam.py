@@ -13,12 +13,12 @@ from cases import refused, swept
 from reference.plane import from_frame
 
 from jaxslam import association, life, motion, resampling, sensors
-from jaxslam.consistency.measures.counts import counted
+from jaxslam._driver import run
+from jaxslam.consistency._measures.counts import counted
 from jaxslam.core.types import Scan, Status
-from jaxslam.driver import run
 from jaxslam.filters import FastSlam
-from jaxslam.filters.particles import slam_particles
-from jaxslam.filters.particles.slam_particles import SlamParticles
+from jaxslam.filters._particles import slam_particles
+from jaxslam.filters._particles.slam_particles import SlamParticles
 
 KEY = jax.random.key(5)
 MOUNT = np.array([0.1, -0.05, 0.3])  # of worlds.ring

@@ -17,7 +17,7 @@ from reference.plane import from_frame
 from jaxslam import association, motion, resampling, run, sensors
 from jaxslam.core.types import Scan, Status
 from jaxslam.filters import FastSlam, Localization, ParticleLocalization
-from jaxslam.filters.particles import pose_particles
+from jaxslam.filters._particles import pose_particles
 from jaxslam.sensors import Part, Suite
 
 KEY = jax.random.key(5)

@@ -12,7 +12,7 @@ from reference import graph as plain
 from small_graphs import POINTS, POSES
 
 from jaxslam import graphs, sensors
-from jaxslam.graphs.sparse.sweeps import Sums, places, sweep
+from jaxslam.graphs._sparse.sweeps import Sums, places, sweep
 
 WEIGHTS = np.array([40.0, 40.0, 300.0])
 

@@ -14,7 +14,7 @@ from worlds import nothing_compiled
 
 from jaxslam import graphs
 from jaxslam.graphs import Ending, starts
-from jaxslam.graphs.graph import LOOPS
+from jaxslam.graphs._graph import LOOPS
 
 
 def test_the_optimum_is_that_of_dense_gauss_newton():

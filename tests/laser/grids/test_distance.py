@@ -7,8 +7,8 @@ from cases import refused
 from scipy import ndimage
 
 from jaxslam import grids, se2
-from jaxslam.laser.grids.distance import near_distances, squared_distances
-from jaxslam.laser.grids.grid import Field
+from jaxslam.laser.grids._distance import near_distances, squared_distances
+from jaxslam.laser.grids._grid import Field
 
 
 def grid_of(log_odds, origin=(0.0, 0.0, 0.0), resolution=0.1):

@@ -7,7 +7,7 @@ import pytest
 import recordings
 
 from jaxslam import grids
-from jaxslam.datasets.ros_map import CERTAIN
+from jaxslam.datasets._ros_map import CERTAIN
 
 YAML = """# a map
 image: map.pgm

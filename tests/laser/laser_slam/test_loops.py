@@ -7,11 +7,12 @@ import pytest
 from ring_of_rooms import SETTINGS, driven
 
 from jaxslam import graphs, laser_slam, metrics
-from jaxslam.laser.laser_slam import end_covariances
-from jaxslam.laser.laser_slam import score as module
-from jaxslam.laser.laser_slam.assembly import ROOM, graph_of, relative_covs, table_of
-from jaxslam.laser.laser_slam.loops.loop_candidates import SECTORS, descriptors
-from jaxslam.laser.laser_slam.loops.pairwise import clique, consistent
+from jaxslam.consistency.metrics._relative_poses import joined
+from jaxslam.laser.laser_slam import _end_covariances as end_covariances
+from jaxslam.laser.laser_slam import _score as module
+from jaxslam.laser.laser_slam._assembly import ROOM, graph_of, relative_covs, table_of
+from jaxslam.laser.laser_slam._loops.loop_candidates import SECTORS, descriptors
+from jaxslam.laser.laser_slam._loops.pairwise import clique, consistent
 from jaxslam.math import numpy_poses as poses
 
 
@@ -192,7 +193,7 @@ def test_the_covariances_are_those_of_the_dense_inverse(drive, monkeypatch):
 
 def test_the_error_of_a_relation_by_its_covariance(drive):
     true, found = drive
-    made = metrics.joined(*(metrics.relations(true, rows=rows) for rows in (1, 3, 7, 24)))
+    made = joined(*(metrics.relations(true, rows=rows) for rows in (1, 3, 7, 24)))
     nees = laser_slam.relation_nees(found, *made)
     assert (nees < 7.81).mean() > 0.9 and 0.3 < nees.mean() < 6
     k = 40

@@ -9,11 +9,12 @@ from ring_of_rooms import SETTINGS, driven, errors, walls
 
 from jaxslam import grids, laser_slam
 from jaxslam.core.types import Beams
-from jaxslam.laser.laser_slam import ScanLog, log_map
-from jaxslam.laser.laser_slam.log_map import map_of
-from jaxslam.laser.laser_slam.odometry.log_odometry import laser_odometry
-from jaxslam.laser.laser_slam.odometry.raw import steps_of
-from jaxslam.laser.laser_slam.scan_points import check_laser_log, scans_of
+from jaxslam.laser.laser_slam import ScanLog
+from jaxslam.laser.laser_slam import _log_map as log_map
+from jaxslam.laser.laser_slam._log_map import map_of
+from jaxslam.laser.laser_slam._odometry.log_odometry import laser_odometry
+from jaxslam.laser.laser_slam._odometry.raw import steps_of
+from jaxslam.laser.laser_slam._scan_points import check_laser_log, scans_of
 from jaxslam.math import numpy_poses as poses
 
 RESOLUTION = 0.1

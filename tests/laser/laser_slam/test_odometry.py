@@ -9,11 +9,11 @@ from cases import swept
 from ring_of_rooms import SETTINGS, driven, errors, ranges_of
 
 from jaxslam import laser_slam
-from jaxslam.laser.laser_slam.odometry import log_odometry, tracking
-from jaxslam.laser.laser_slam.odometry.log_odometry import laser_odometry
-from jaxslam.laser.laser_slam.odometry.raw import FARTHEST, steps_of
-from jaxslam.laser.laser_slam.odometry.reference import _seen_through
-from jaxslam.laser.laser_slam.scan_points import scans_of
+from jaxslam.laser.laser_slam._odometry import log_odometry, tracking
+from jaxslam.laser.laser_slam._odometry.log_odometry import laser_odometry
+from jaxslam.laser.laser_slam._odometry.raw import FARTHEST, steps_of
+from jaxslam.laser.laser_slam._odometry.reference import _seen_through
+from jaxslam.laser.laser_slam._scan_points import scans_of
 from jaxslam.laser.matching import Points
 from jaxslam.math import numpy_poses as poses
 

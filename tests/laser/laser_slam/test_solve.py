@@ -11,16 +11,18 @@ from ring_of_rooms import FAR, SETTINGS, driven, errors
 from worlds import nothing_compiled
 
 from jaxslam import filters, laser_slam, metrics, run, sensors
-from jaxslam.cli import main
-from jaxslam.cli import slam as results
+from jaxslam._cli import main
+from jaxslam._cli.recorded import slam as results
+from jaxslam.consistency.metrics._relative_poses import joined
 from jaxslam.core.types import Beams, Log, Scan
-from jaxslam.laser.laser_slam import LoopOutcome, end_covariances
-from jaxslam.laser.laser_slam.log_map import growing_maps
-from jaxslam.laser.laser_slam.odometry.log_odometry import laser_odometry
-from jaxslam.laser.laser_slam.odometry.raw import steps_of
-from jaxslam.laser.laser_slam.scan_points import scans_of
+from jaxslam.laser.laser_slam import LoopOutcome
+from jaxslam.laser.laser_slam import _end_covariances as end_covariances
+from jaxslam.laser.laser_slam._log_map import growing_maps
+from jaxslam.laser.laser_slam._odometry.log_odometry import laser_odometry
+from jaxslam.laser.laser_slam._odometry.raw import steps_of
+from jaxslam.laser.laser_slam._scan_points import scans_of
 from jaxslam.math import numpy_poses as poses
-from jaxslam.results.files import write_files
+from jaxslam.results._files import write_files
 
 ONCE = dataclasses.replace(SETTINGS, rounds=1)  # and so fewer programs
 
@@ -301,7 +303,7 @@ def test_the_command_scores_it_by_relations(drive, monkeypatch, tmp_path, capsys
         for k, line in enumerate(carmen_lines(true, log))
     ]
     (tmp_path / "ring.log").write_text("\n".join(lines))
-    made = metrics.joined(*(metrics.relations(true, rows=rows) for rows in (1, 3, 30, 31)))
+    made = joined(*(metrics.relations(true, rows=rows) for rows in (1, 3, 30, 31)))
     far = int((made.second - made.first == 31).sum())
     text = relation_text(made, time) + "5 6 0 0 0 0 0 0\n"
     (tmp_path / "ring.relations").write_text(text)

@@ -15,8 +15,8 @@ from worlds import narrow
 from jaxslam import matching
 from jaxslam.core.types import Beams
 from jaxslam.graphs import Huber
-from jaxslam.laser.matching import IcpSettings, MatchStatus, Points, Prior
-from jaxslam.laser.matching.closed_form import added, least, of_lines, of_points, of_prior
+from jaxslam.laser.matching import IcpSettings, MatchStatus, Points, Prior, _point_sets
+from jaxslam.laser.matching._closed_form import added, least, of_lines, of_points, of_prior
 
 COUNT, GOOD = 8, 4
 SPAN, GAP, REACH = 2, 0.8, 0.5
@@ -237,7 +237,7 @@ def test_trimming_and_a_kernel_bear_outliers_and_forward_derivatives_are_finite(
     pose, slope = jax.jit(
         lambda by: jax.jvp(
             lambda d: matcher.match(
-                matcher.prepare(of), matching.point_sets.moved_along_rays(scan, d), STARTS[0]
+                matcher.prepare(of), _point_sets.moved_along_rays(scan, d), STARTS[0]
             ).pose,
             (0 * by,), (by,),
         )

@@ -12,8 +12,8 @@ from jaxslam import matching, verify_jacobians
 from jaxslam.core.record import record
 from jaxslam.laser.grids import Field
 from jaxslam.laser.matching import IcpSettings, MatchStatus, Prior, covariance
-from jaxslam.laser.matching.field import field_residuals
-from jaxslam.laser.matching.point_sets import Points
+from jaxslam.laser.matching._field import field_residuals
+from jaxslam.laser.matching._point_sets import Points
 from jaxslam.math.stats import chi2_band
 
 SIGMA, RUNS = 0.03, 60

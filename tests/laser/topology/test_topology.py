@@ -7,8 +7,8 @@ import pytest
 from cases import refused
 
 from jaxslam import grids, topology
-from jaxslam.laser.topology.places import cell_centers
-from jaxslam.simulation import walls
+from jaxslam.laser.topology._places import cell_centers
+from jaxslam.simulation import _walls as walls
 from jaxslam.simulation.scenarios import office
 
 ROOMS = np.array(

@@ -7,6 +7,7 @@ from matplotlib.collections import LineCollection
 from reference import graph as plain
 
 from jaxslam import plot
+from jaxslam.results.plot._style import describe, png
 
 
 def lines(axes):
@@ -51,7 +52,7 @@ def test_the_largest_residuals_for_their_size_are_marked(drawn):
     expected = [graph.poses[[7, 0], :2].mean(axis=0), middle]
     np.testing.assert_allclose(rings.get_xydata(), expected)
     assert rings.get_label() == "2 largest residuals"
-    assert "first pose" in plot.describe(figure)
+    assert "first pose" in describe(figure)
 
 
 def test_a_graph_without_residuals_is_drawn():
@@ -59,4 +60,4 @@ def test_a_graph_without_residuals_is_drawn():
     assert plain.chi2(graph) < 1e-20
     figure = plot.graph_figure(graph, graph, {"relative_pose": np.zeros(10)})
     assert not any("largest" in line.get_label() for line in figure.axes[0].lines)
-    assert plot.png(figure)
+    assert png(figure)

@@ -8,6 +8,7 @@ from PIL import Image
 
 from jaxslam import grids, plot
 from jaxslam.core.types import Beams
+from jaxslam.results.plot._style import png
 
 GRID = grids.Grid(
     np.array([[2.0, -2.0, 0.0], [2.0, 2.0, -1.0]]), np.array([1.0, 2.0, np.pi / 2]), np.float64(0.5)
@@ -28,14 +29,14 @@ def test_cells_stand_where_they_are_and_unknown_ones_are_told_apart():
     corners = mesh.get_coordinates()
     np.testing.assert_allclose(corners[0, 3], [1.0, 3.5], atol=1e-12)  # x of the grid is up
     np.testing.assert_allclose(corners[2, 0], [0.0, 2.0], atol=1e-12)
-    assert plot.png(figure, dpi=20)
+    assert png(figure, dpi=20)
 
 
 def test_a_wide_map_has_its_labels_within_the_page():
     log_odds = np.tile([2.0, -2.0, 0.5, 0.0], (31, 23))
     wide = grids.Grid(log_odds, np.array([-40.0, -8.0, 0.0]), np.float64(1.0))
     figure = plot.grid_figure(wide, poses=[[0, 0], [1, 1]], title="wide")
-    shown = Image.open(io.BytesIO(plot.png(figure, dpi=110))).convert("L")
+    shown = Image.open(io.BytesIO(png(figure, dpi=110))).convert("L")
     assert np.asarray(shown)[-1].min() == 255, "a label is cut by the lower edge"
 
 
@@ -52,4 +53,4 @@ def test_a_scan_and_a_path_are_drawn_and_dropouts_are_not():
 def test_a_field_has_a_scale():
     figure = plot.grid_figure(grids.Field(*GRID), label="distance [m]")
     assert figure.axes[1].get_ylabel() == "distance [m]"
-    assert plot.png(figure, dpi=20)
+    assert png(figure, dpi=20)

@@ -10,11 +10,17 @@ from cases import swept
 from matplotlib.colors import to_rgb
 
 from jaxslam import plot
-from jaxslam.catalog import ALL, KINDS
-from jaxslam.consistency import DOF, LAGS, LEVELS, Average
-from jaxslam.results.plot.measure_figures import INTERVAL
-from jaxslam.results.plot.panels import BEYOND, kinds_of, numbers_of, set_positive
-from jaxslam.results.plot.style import HUES, SHADE, TEXT, curves_of, look, panels_of
+from jaxslam._catalog import KINDS
+from jaxslam.catalog import ALL
+from jaxslam.consistency import Average
+from jaxslam.consistency._measures.coverage import LEVELS
+from jaxslam.consistency._measures.nees import DOF
+from jaxslam.consistency._run_scores import LAGS
+from jaxslam.results.plot._landmarks import run_map_figure
+from jaxslam.results.plot._measure_figures import INTERVAL
+from jaxslam.results.plot._panels import BEYOND, kinds_of, numbers_of, set_positive
+from jaxslam.results.plot._pose_errors import run_errors_figure
+from jaxslam.results.plot._style import HUES, SHADE, TEXT, curves_of, describe, look, panels_of
 
 FIVE = ("dead_reckoning", "ekf", "fej", "right_invariant", "fastslam1")
 TWELVE = (*FIVE, "localization", "ideal", "oc", "ukf", "seif", "batch_map", "fastslam2")
@@ -25,7 +31,7 @@ OVER_STEPS = (
     plot.whiteness_figure,
     plot.gained_figure,
 )
-FIGURES = (*OVER_STEPS, plot.cost_figure, plot.run_errors_figure, plot.run_map_figure)
+FIGURES = (*OVER_STEPS, plot.cost_figure, run_errors_figure, run_map_figure)
 
 
 @pytest.fixture(scope="module")
@@ -380,7 +386,7 @@ def test_five_filters_fit_a_page_and_a_column_in_letters_of_one_size(five, draw,
 
 @pytest.mark.parametrize("draw", swept(FIGURES, plot.nees_figure))
 def test_twenty_filters_can_be_read_and_nothing_overlaps(every, draw):
-    rows = draw is plot.run_errors_figure  # three panels a filter: slow to lay out, and all alike
+    rows = draw is run_errors_figure  # three panels a filter: slow to lay out, and all alike
     figure = draw(drawn.campaign(list(ALL)[:7]) if rows else every)
     figure.draw_without_rendering()
     page = figure.bbox
@@ -425,15 +431,15 @@ def test_filters_without_a_number_and_single_steps_can_be_drawn(draw, count):
         figure = draw(found)
         figure.draw_without_rendering()
         if draw is not plot.cost_figure:  # there they are tick labels
-            assert all(name in plot.describe(figure) for name in filters)
+            assert all(name in describe(figure) for name in filters)
 
 
 def test_a_figure_is_described_in_words(five):
-    said = plot.describe(plot.coverage_figure(five))
+    said = describe(plot.coverage_figure(five))
     assert "share of truth within" in said
     assert "against probability p" in said
     assert "Drawn: honest, dead_reckoning, ekf, fej," in said
-    assert "true path" in plot.describe(plot.run_map_figure(five))
+    assert "true path" in describe(run_map_figure(five))
 
 
 def test_a_notebook_shows_a_figure_as_it_is():

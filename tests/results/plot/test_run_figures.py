@@ -10,8 +10,10 @@ from cases import swept
 
 from jaxslam import plot
 from jaxslam.core.types import Trace
-from jaxslam.results.plot.panels import BEYOND
-from jaxslam.results.plot.style import curves_of
+from jaxslam.results.plot._landmarks import run_map_figure
+from jaxslam.results.plot._panels import BEYOND
+from jaxslam.results.plot._pose_errors import run_errors_figure
+from jaxslam.results.plot._style import curves_of, png
 
 
 @pytest.mark.parametrize("n_sigma", [1.0, 3.0])
@@ -70,7 +72,7 @@ def test_a_map_has_equal_aspect_units_a_start_and_an_end():
     assert expected <= set(named(figure)) and len(named(figure)) == len(set(named(figure)))
     for label, at in (("start", 0), ("end", -1)):
         np.testing.assert_array_equal(line(axes, label).get_xydata()[0], estimate.pose[at, :2])
-    assert plot.png(figure, 40).startswith(b"\x89PNG")
+    assert png(figure, 40).startswith(b"\x89PNG")
 
 
 def test_paths_that_coincide_can_all_be_seen_in_a_map():
@@ -88,7 +90,7 @@ def test_paths_that_coincide_can_all_be_seen_in_a_map():
 
 @pytest.mark.parametrize("count", swept([3, 5, 7, 11], 5))
 def test_the_lowest_map_of_each_column_has_the_abscissa(count):
-    figure = plot.run_map_figure(drawn.campaign([f"filter{i}" for i in range(count)]))
+    figure = run_map_figure(drawn.campaign([f"filter{i}" for i in range(count)]))
     figure.draw_without_rendering()
     shown = [axes for axes in figure.axes if axes.axison]
     columns = 3 if count <= 9 else 4
@@ -104,7 +106,7 @@ def test_the_lowest_map_of_each_column_has_the_abscissa(count):
 def test_maps_without_landmarks_and_with_broken_covariances_can_be_drawn():
     _, estimate = drawn.run_of("ekf")
     nothing = estimate._replace(alive=np.zeros_like(estimate.alive))
-    assert plot.png(plot.map_figure(nothing), 40).startswith(b"\x89PNG")
+    assert png(plot.map_figure(nothing), 40).startswith(b"\x89PNG")
     covs = estimate.point_covs.copy()
     covs[-1, 0] = np.nan
     figure = plot.map_figure(estimate._replace(point_covs=covs))
@@ -158,14 +160,14 @@ def test_errors_are_drawn_within_their_claimed_bounds():
 def test_errors_and_maps_show_every_filter_on_scales_that_dead_reckoning_does_not_set():
     names = ["dead_reckoning", "ekf", "fej"]
     found = drawn.campaign(names)
-    figure = plot.run_errors_figure(found, title="run 0")
+    figure = run_errors_figure(found, title="run 0")
     rows = np.array(figure.axes).reshape(3, 3)
     assert [row[0].get_ylabel().replace("\n", "") for row in rows] == names
     assert rows[0, 0].get_ylim() == rows[1, 0].get_ylim() == pytest.approx((-0.315, 0.315))
     marked = [any(each.get_gid() == BEYOND for each in axes.lines) for axes in rows[:, 0]]
     assert marked == [True, False, False]
     assert rows[0, 0].get_title("right") == "↓ to −4"
-    maps = plot.run_map_figure(found, title="run 0")
+    maps = run_map_figure(found, title="run 0")
     shown = [axes for axes in maps.axes if axes.axison]
     assert [axes.get_title("left") for axes in shown] == names
     assert len({axes.get_xlim() for axes in shown}) == 1
@@ -178,7 +180,7 @@ def test_errors_far_below_the_others_have_a_scale_of_their_own():
     near = truth.pose + (np.asarray(estimate.pose) - truth.pose) / 100
     close = estimate._replace(pose=near, pose_cov=np.asarray(estimate.pose_cov) / 100**2)
     first = found.first | {"localization": (truth, close)}
-    rows = plot.run_errors_figure(dataclasses.replace(found, first=first)).axes
+    rows = run_errors_figure(dataclasses.replace(found, first=first)).axes
     common, own = rows[0].get_ylim()[1], rows[6].get_ylim()[1]
     assert own == pytest.approx(common / 100)
     assert {label.get_weight() for label in rows[6].get_yticklabels()} == {"bold"}
@@ -186,10 +188,10 @@ def test_errors_far_below_the_others_have_a_scale_of_their_own():
 
 def test_a_run_of_one_filter_has_the_figure_of_one_and_none_is_refused():
     found = drawn.campaign(["ekf"])
-    assert len(plot.run_errors_figure(found).axes) == 3
-    assert len(plot.run_map_figure(found).axes) == 1
+    assert len(run_errors_figure(found).axes) == 3
+    assert len(run_map_figure(found).axes) == 1
     nothing = dataclasses.replace(found, first={})
-    for draw in (plot.run_errors_figure, plot.run_map_figure):
+    for draw in (run_errors_figure, run_map_figure):
         with pytest.raises(ValueError, match=f"{draw.__name__}: the campaign holds no run 0"):
             draw(nothing)
         with pytest.raises(ValueError, match="expected the first argument to be a Campaign, got"):

@@ -10,15 +10,17 @@ import pytest
 import worlds
 
 import jaxslam
-from jaxslam import catalog, filters, plot
+from jaxslam import _catalog as catalog
+from jaxslam import filters, plot
 from jaxslam.core.types import Info, Log, Scan, Status, Trace
-from jaxslam.filters.delayed.state import TableLayout, empty_state
-from jaxslam.filters.information.eif_slam import CanonicalState
-from jaxslam.filters.information.sparse_state import empty_map
-from jaxslam.filters.particles.slam_particles import initial_slam_particles
-from jaxslam.results.plot.film import still
-from jaxslam.results.plot.run_film import MOST, Cloud, Hypotheses, Links, history_of
-from jaxslam.results.plot.style import panels_of
+from jaxslam.filters._delayed.state import TableLayout, empty_state
+from jaxslam.filters._information.eif_slam import CanonicalState
+from jaxslam.filters._information.sparse_state import empty_map
+from jaxslam.filters._particles.slam_particles import initial_slam_particles
+from jaxslam.results.plot._film import still
+from jaxslam.results.plot._grid_figures import map_scene
+from jaxslam.results.plot._run_film import MOST, Cloud, Hypotheses, Links, history_of, run_scene
+from jaxslam.results.plot._style import panels_of
 
 STEPS = 3
 # Landmark 2 is new in the last step; a measurement of landmark 1 fails the gate there.
@@ -47,7 +49,7 @@ def run_of(steps=STEPS, seen=None):
 def scene_of(steps=STEPS, seen=None, frames=MOST, **more):
     trace, log, truth = run_of(steps, seen)
     true = {"true_points": truth.landmarks, "true_path": truth.pose} | more
-    return plot.run_scene(history_of(trace, log, frames), **true), trace.estimate, truth
+    return run_scene(history_of(trace, log, frames), **true), trace.estimate, truth
 
 
 def staged(panel):
@@ -175,9 +177,9 @@ def test_limits_are_those_of_the_truth_unless_the_estimate_is_near():
         assert low < values.min() and values.max() < high
     trace, log, truth = run_of()
     lost = trace._replace(estimate=trace.estimate._replace(pose=trace.estimate.pose * 100))
-    scene = plot.run_scene(history_of(lost, log), true_points=truth.landmarks, true_path=truth.pose)
+    scene = run_scene(history_of(lost, log), true_points=truth.landmarks, true_path=truth.pose)
     assert np.ptp(scene.main.xlim) < 12
-    assert np.ptp(plot.run_scene(history_of(lost, log)).main.xlim) > 200
+    assert np.ptp(run_scene(history_of(lost, log)).main.xlim) > 200
 
 
 def test_particles_are_drawn_by_weight():
@@ -394,7 +396,7 @@ def test_mapping_from_a_known_path_is_filmed():
 def test_a_map_scene_has_as_many_paths_as_maps():
     origin, path = np.zeros(3), np.zeros((2, 3))
     maps = [np.zeros((2, 3)), np.ones((2, 3))]
-    scene = plot.map_scene(maps, origin, 0.5, [path, path], ["one", "two"])
+    scene = map_scene(maps, origin, 0.5, [path, path], ["one", "two"])
     assert scene.frames == 2 and scene.caption(1) == "two"
     assert scene.main.xlim == (0.0, 1.5) and scene.main.ylim == (0.0, 1.0)
     for wrong, message in (
@@ -403,4 +405,4 @@ def test_a_map_scene_has_as_many_paths_as_maps():
         ((maps, np.ones(3), 0.5, [path, path], ["one", "two"]), "without yaw"),
     ):
         with pytest.raises(ValueError, match=message):
-            plot.map_scene(*wrong)
+            map_scene(*wrong)

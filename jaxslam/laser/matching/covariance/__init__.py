@@ -1,12 +1,12 @@
 """Covariances of a match, by the published methods."""
 
-from jaxslam.laser.matching.covariance.implicit import AlongNormals, Hessian, Implicit
-from jaxslam.laser.matching.covariance.match_covariance import (
+from jaxslam.laser.matching.covariance._implicit import AlongNormals, Hessian, Implicit
+from jaxslam.laser.matching.covariance._match_covariance import (
     MatchCovariance,
     MatchedScans,
     covariance,
 )
-from jaxslam.laser.matching.covariance.sampling import Lattice, Sampling, Unscented
+from jaxslam.laser.matching.covariance._sampling import Lattice, Sampling, Unscented
 
 __all__ = [
     "AlongNormals",

@@ -1,0 +1,1 @@
+"""Commands that run Monte-Carlo campaigns."""

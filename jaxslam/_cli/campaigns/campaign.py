@@ -1,0 +1,196 @@
+"""What a call of `jaxslam consistency` asks for, and the folder of its results."""
+
+import argparse
+import json
+import re
+import shutil
+from collections.abc import Mapping
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import NamedTuple
+
+import jax
+
+from jaxslam._cli.common import OUT, check_out, chosen_devices
+from jaxslam.consistency.campaign._pieces import missing
+from jaxslam.core._numbers import check_count
+from jaxslam.results import _campaign_files as campaign_files
+from jaxslam.results import _store as store
+from jaxslam.results._campaign_files import BLOCKS, RESULT
+from jaxslam.results._files import Json
+
+
+class CampaignOptions(NamedTuple):
+    """The options that define a campaign, with their defaults."""
+
+    scenario: str = "circle"
+    filters: str = "dead_reckoning,ekf"
+    runs: int = 100
+    steps: int | None = None
+    seed: int = 0
+    bound: bool = False
+    dtype: str = "float64"
+
+
+@dataclass(frozen=True)
+class Spec:
+    """The checked options of one call."""
+
+    campaign: CampaignOptions
+    out: Path
+    devices: list[jax.Device]
+    block: int | None
+    """runs computed together on a device"""
+    part: tuple[int, int] | None
+    """(i, n): compute part i of n alone"""
+    figures: tuple[str, ...]
+    """formats of the figures"""
+    animate: bool
+    overwrite: bool
+    settings: Mapping[str, object] = field(default_factory=dict)
+    """those that a campaign began with which is continued"""
+
+
+def spec_of(options: argparse.Namespace) -> Spec:
+    """The checked options; a campaign that is continued supplies those that are not given.
+
+    Raises ValueError that names the option, and OSError where no file can be written.
+    """
+    campaign, settings, block = _campaign(options)
+    out = options.resume or options.out or OUT
+    formats = campaign_files.check_figure_formats("--figures", options.figures.split(","))
+    for name, count in (("steps", campaign.steps), ("runs", campaign.runs), ("block", block)):
+        if count is not None:
+            check_count(f"--{name}", count)
+    if not 0 <= campaign.seed < 2**32:
+        raise ValueError(f"--seed: expected an integer from 0 to 2³²-1, got {campaign.seed}")
+    part = _part(options)
+    check_out(out, "consistency")
+    most = settings.get("devices")  # missing parts are computed as the parts would be
+    assert isinstance(most, int | None)
+    return Spec(
+        campaign=campaign,
+        out=out,
+        devices=chosen_devices(options.devices, most),
+        block=block,
+        part=part,
+        figures=formats,
+        animate=options.animate,
+        overwrite=options.overwrite,
+        settings=settings,
+    )
+
+
+def _campaign(
+    options: argparse.Namespace,
+) -> tuple[CampaignOptions, Mapping[str, object], int | None]:
+    """The campaign, the settings that one began with which is continued, and its size of blocks.
+
+    A folder that holds a campaign of the same options is continued. With --resume its options are
+    taken where the command does not give them, else the defaults.
+    """
+    given = {n: value for n, value in vars(options).items() if n in CampaignOptions._fields}
+    folder = options.resume or options.out or OUT
+    if options.resume is None:
+        given = CampaignOptions(**given)._asdict()
+        if options.overwrite or not (folder / BLOCKS / store.MANIFEST).exists():
+            return CampaignOptions(**given), {}, options.block
+    elif options.out is not None and options.out.resolve() != folder.resolve():
+        raise ValueError(
+            f"--resume: its results go to {folder}: expected no --out, got {options.out}"
+        )
+    kept = store.resume(folder / BLOCKS)
+    stored = kept.settings.get("asked")
+    if not isinstance(stored, dict):
+        raise ValueError(
+            f"--resume: {folder} holds a campaign that was begun from Python; continue it there, "
+            "with monte_carlo(keep=jaxslam.store.resume(folder))"
+        )
+    if different := _differences(stored, given):
+        option = "--out" if options.resume is None else "--resume"
+        raise ValueError(
+            f"{option}: {folder} holds another campaign: {different}: choose another folder with "
+            "--out, or continue it with --resume and without these options, or replace it with "
+            "--overwrite"
+        )
+    if (runs := given.get("runs")) is not None and runs < (kept.runs or 0):
+        raise ValueError(
+            f"--runs: the campaign in {folder} is to have {kept.runs} runs: expected at least as "
+            f"many, got {runs}; --resume {folder} without --runs has all of them; or choose "
+            "another folder"
+        )
+    # Blocks of another size would round differently.
+    block = kept.settings.get("block") if options.block is None else options.block
+    assert isinstance(block, int | None)
+    return CampaignOptions(**(stored | {"runs": kept.runs} | given)), kept.settings, block
+
+
+def _part(options: argparse.Namespace) -> tuple[int, int] | None:
+    """The part (i, n) of the runs that --part names; ValueError where it is none."""
+    if options.part is None:
+        return None
+    found = re.fullmatch(r"(\d+)/(\d+)", options.part, re.ASCII)
+    if found is None or not 1 <= int(found[1]) <= int(found[2]):
+        raise ValueError(f"--part: expected I/N with 1 <= I <= N, as 3/16, got {options.part!r}")
+    if options.overwrite:
+        raise ValueError("--part: expected no --overwrite with it")
+    return int(found[1]), int(found[2])
+
+
+def _differences(stored: Mapping[str, object], given: Mapping[str, object]) -> str:
+    """A phrase on every option whose stored value is another; "" where all agree."""
+    return "; ".join(
+        f"--{name} is {_as_option(stored[name])} there, {_as_option(value)} here"
+        for name, value in given.items()
+        if name in stored and stored[name] != value
+    )
+
+
+def _as_option(value: object) -> str:
+    """The value of an option, as its user would write it."""
+    if isinstance(value, bool):
+        return "on" if value else "off"
+    return "not given" if value is None else str(value)
+
+
+def open_store(spec: Spec) -> store.Store:
+    """The store of the campaign's blocks, in a new folder or in that of the campaign continued."""
+    out, folder = spec.out, spec.out / BLOCKS
+    settings: Mapping[str, object] = spec.settings
+    if spec.overwrite and (folder / store.MANIFEST).exists():
+        store.read_manifest(folder)  # raises where the folder is not a campaign's
+        shutil.rmtree(folder)
+    if not settings:
+        if folder.exists() and not all(map(store.is_unfinished, folder.iterdir())):
+            raise ValueError(
+                f"--out: {folder} holds files that are no campaign's: choose another folder"
+            )
+        if (out / RESULT).exists() and not spec.overwrite:
+            raise ValueError(
+                f"--out: {out} holds the results of a campaign: add --overwrite to replace them, "
+                "or choose another folder"
+            )
+        asked = {name: v for name, v in spec.campaign._asdict().items() if name != "runs"}
+        settings = {"asked": asked, "block": spec.block}
+        if spec.part is not None:
+            settings = {"devices": len(spec.devices), **settings}
+    elif spec.part is not None:
+        mine = {"block": spec.block, "devices": len(spec.devices)}
+        if different := _differences({"devices": None, **settings}, mine):
+            raise ValueError(
+                f"--part: {out} holds another campaign: {different}: give all parts the same "
+                "options, or begin another campaign with --out in another folder"
+            )
+    return store.open(folder, settings, spec.campaign.runs)
+
+
+def earlier_results(out: Path, keep: store.Store) -> Json | None:
+    """The results of a finished campaign in a folder; None without them or where runs miss."""
+    assert keep.runs is not None
+    if missing(keep.spans(), keep.runs, keep.runs):
+        return None
+    try:
+        found: Json = json.loads((out / RESULT).read_text(encoding="utf-8"))
+        return found if found["runs"] == keep.runs else None
+    except (OSError, ValueError, LookupError, TypeError):
+        return None

@@ -1,0 +1,228 @@
+"""The command `jaxslam consistency`: a Monte-Carlo campaign, its table and its files."""
+
+import argparse
+import contextlib
+import shutil
+import sys
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import jax
+
+from jaxslam._catalog import ALL
+from jaxslam._cli import cache
+from jaxslam._cli.campaigns.campaign import (
+    CampaignOptions,
+    Spec,
+    earlier_results,
+    open_store,
+    spec_of,
+)
+from jaxslam._cli.campaigns.engines import engine
+from jaxslam._cli.common import FAILED, INTERRUPTED, OUT, add_animate, add_figures, film_files
+from jaxslam._cli.user_objects import UserObjects
+from jaxslam.consistency.campaign import Campaign, Incomplete, Interrupted, monte_carlo
+from jaxslam.consistency.campaign._candidates import estimator_of, fitting_block, rounded
+from jaxslam.core.protocols import Candidate
+from jaxslam.results import _campaign_files as campaign_files
+from jaxslam.results._campaign_files import FORMATS
+from jaxslam.results._files import Json, write_files
+from jaxslam.simulation._worlds import World, run_keys, world_of_run
+from jaxslam.simulation.scenarios import SCENARIOS
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `jaxslam consistency`."""
+    campaign = parser.add_argument_group(
+        "campaign", "kept in the folder of results; --resume reads them there"
+    )
+    for name, text in {
+        "scenario": f"one of: {', '.join(SCENARIOS)}; or FILE.py:NAME, a Scenario or a function "
+        "that returns one",
+        "filters": f'"all", or some of: {", ".join(ALL)}; and FILE.py:NAME, a Filter or a function '
+        "of the scenario that returns one; comma-separated",
+        "runs": "number of simulated trajectories",
+        "steps": "number of steps of each trajectory; default: the scenario's own",
+        "seed": "seed of the random numbers",
+    }.items():
+        default = getattr(CampaignOptions(), name)
+        kind = str if isinstance(default, str) else int
+        text += "" if default is None else f" (default: {default})"
+        campaign.add_argument(f"--{name}", type=kind, default=argparse.SUPPRESS, help=text)
+    campaign.add_argument(
+        "--bound",
+        action=argparse.BooleanOptionalAction,
+        default=argparse.SUPPRESS,
+        help="also compute the Cramér-Rao bound conditional on each true trajectory (default: no)",
+    )
+    campaign.add_argument(
+        "--dtype",
+        default=argparse.SUPPRESS,
+        choices=["float32", "float64"],
+        help="floating-point type of the filters (default: float64)",
+    )
+    parser.add_argument(
+        "--out", metavar="DIR", help=f"folder for results (default: {OUT}; with --resume, its own)"
+    )
+    add_figures(parser, FORMATS, "; the page always has its own")
+    add_animate(parser, "of run 0 of each filter")
+    earlier = parser.add_mutually_exclusive_group()
+    earlier.add_argument(
+        "--resume",
+        metavar="DIR",
+        help="continue the campaign in a folder of results, with its options; a larger --runs "
+        "extends it",
+    )
+    earlier.add_argument(
+        "--overwrite", action="store_true", help="replace the campaign that is in the folder"
+    )
+    parser.add_argument(
+        "--block",
+        type=int,
+        help="number of runs computed together on each device (each core of a CPU is one); memory "
+        "grows with it (default: 16 on a CPU, elsewhere by the memory of the device)",
+    )
+    parser.add_argument(
+        "--devices", default="all", help='"all", a number, or a platform: cpu, gpu (default: all)'
+    )
+    cache.add_options(parser)
+    parser.add_argument(
+        "--part",
+        metavar="I/N",
+        help="compute only part I of N of the runs, as 3/16, in a folder that independent jobs "
+        "share; --resume then sums up, and computes what is missing",
+    )
+    parser.add_argument(
+        "--executor",
+        metavar="ENGINE",
+        help="compute the blocks in other processes: processes:N, on this machine; "
+        "dask://HOST:PORT, the workers of a Dask scheduler; mpi, the ranks of mpiexec "
+        "(mpi4py.futures)",
+    )
+    parser.set_defaults(command=run_campaign)
+
+
+def run_campaign(options: argparse.Namespace, command: str) -> int:
+    """Run a campaign, print its table and write its files; returns the exit status."""
+    # Worlds are drawn in float64 whatever the filters compute in, so both precisions see the same.
+    jax.config.update("jax_enable_x64", True)
+    if options.executor is not None and options.devices != "all":
+        raise ValueError("--executor: each worker has one device: expected no --devices with it")
+    spec = spec_of(options)
+    asked, part, user = spec.campaign, spec.part, UserObjects()
+    scenario = user.scenario(asked.scenario, asked.steps)
+    filters = user.filters(asked.filters, scenario)
+    if part is not None:
+        block = spec.block or fitting_block(scenario, filters, spec.devices[0])
+        spec = replace(spec, block=block)
+        if (part[0] - 1) * block * len(spec.devices) >= asked.runs:
+            print(f"part {part[0]} of {part[1]} has no block of the {asked.runs:,} runs")
+            return 0
+    keep = open_store(spec)
+    earlier = None if part else earlier_results(spec.out, keep)
+    try:
+        with user.located_errors(), engine(options.executor) as (executor, workers):
+            campaign = monte_carlo(
+                scenario,
+                filters,
+                asked.runs,
+                jax.random.key(asked.seed),
+                block=spec.block,
+                devices=None if executor else spec.devices,
+                workers=workers,
+                bound=asked.bound,
+                dtype=asked.dtype,
+                keep=keep,
+                part=part,
+                executor=executor,
+            )
+    except BaseException as stop:
+        if part is None and not keep.spans():  # other jobs may save some
+            shutil.rmtree(keep.folder, ignore_errors=True)
+            with contextlib.suppress(OSError):  # it has other files, as results
+                spec.out.rmdir()
+        if isinstance(stop, Incomplete) and stop.campaign is None:
+            raise ValueError(stop) from stop
+        if not isinstance(stop, Interrupted | Incomplete) or stop.campaign is None:
+            raise
+        print(stop.campaign)
+        what = "interrupted, " if isinstance(stop, Interrupted) else ""
+        print(f"\njaxslam: {what}{stop}; --resume {spec.out} continues it", file=sys.stderr)
+        return INTERRUPTED if what else FAILED
+    for sentence in keep.set_aside:
+        print(f"jaxslam: {sentence}", file=sys.stderr)
+    if part is not None:
+        print(
+            f"part {part[0]} of {part[1]} is done, {campaign.runs:,} runs; {keep.folder} holds "
+            f"{keep.done():,} of {asked.runs:,}; jaxslam consistency --resume {spec.out} computes "
+            "what is missing, and sums up"
+        )
+    else:
+        if keep.set_aside:  # some runs were computed again
+            earlier = None
+        _write(spec, scenario, filters, campaign, earlier, command)
+    return 0
+
+
+def _write(
+    spec: Spec,
+    scenario: World,
+    filters: Mapping[str, Candidate],
+    campaign: Campaign,
+    earlier: Json | None,
+    command: str,
+) -> None:
+    """Print a campaign and write its files; those of a finished one stay as they are."""
+    out, seed, took = spec.out, spec.campaign.seed, campaign.seconds
+    ran = took - campaign.compile_seconds if campaign.compile_seconds else 0.0
+    names = campaign_files.file_names(spec.figures)
+    if earlier is not None:
+        command = str(earlier["command"])
+        times: dict[str, Any] = {name: earlier[name] for name in campaign_files.TIMES}
+        campaign = replace(campaign, **times)
+    print(campaign)
+    if spec.animate:
+        _write_films(out, scenario, filters, seed, campaign.dtype)
+    if earlier is not None and all((out / name).exists() for name in names):
+        more = "but films" if spec.animate else "and nothing written"
+        print(
+            f"\n{out} holds this campaign, finished: nothing was run {more}; "
+            f"--runs above {campaign.runs} extends it"
+        )
+        return
+    if not campaign.first:
+        # Run 0 was computed by an earlier command: once more, of the first filter with a map.
+        mapping = [n for n, s in campaign.filters.items() if "rmse_landmarks" in s.measures]
+        name = next(iter(mapping or campaign.filters))
+        key = jax.random.key(seed)
+        truth, log = rounded(world_of_run(scenario, key, 0), campaign.dtype)
+        method, _ = estimator_of(filters[name], truth, scenario)
+        estimate = method(log, run_keys(key, 0)[1]).estimate
+        campaign = replace(campaign, first={name: jax.device_get((truth, estimate))})
+    paths = campaign_files.save_campaign(campaign, out, spec.figures, True, command, seed)
+    print("\nwrote " + ", ".join(map(str, paths)))
+    print(
+        f"results after {took:.1f} s"
+        + f", {ran:.1f} s of them for the runs once all programs were compiled" * (ran > 0)
+    )
+
+
+def _write_films(
+    out: Path, scenario: World, filters: Mapping[str, Candidate], seed: int, dtype: str
+) -> None:
+    """Write the film of run 0 of every filter, which runs once more, and print what was written."""
+    from jaxslam.results import plot  # matplotlib is slow to load
+
+    films = {
+        name: plot.animate_world(
+            scenario,
+            candidate,
+            jax.random.key(seed),
+            dtype=dtype,
+            title=f"{scenario.name}: {name}, run 0 of seed {seed}",
+        )
+        for name, candidate in filters.items()
+    }
+    print("\nwrote " + ", ".join(map(str, write_files(out, film_files(films, suffixed=True)))))

@@ -1,0 +1,301 @@
+"""Helpers of the commands: shared options, devices, compilation time, summaries, films."""
+
+import argparse
+import contextlib
+import json
+import threading
+import time
+from collections.abc import Callable, Collection, Mapping
+from pathlib import Path
+from typing import TYPE_CHECKING, TypeVar
+
+import jax
+
+from jaxslam.consistency._measures.counts import count_label
+from jaxslam.consistency.campaign._pieces import cores
+from jaxslam.consistency.campaign._progress import Progress
+from jaxslam.core._names import meant
+from jaxslam.results._campaign_files import RESULT
+from jaxslam.results._files import Files, check_writable
+
+if TYPE_CHECKING:  # Matplotlib is slow to load
+    from jaxslam.results.plot import Film
+
+_T = TypeVar("_T")
+
+FAILED = 1
+"""Exit status where models are wrong, or runs are missing."""
+INTERRUPTED = 130
+"""Exit status after Ctrl-C."""
+
+SUMMARY = "summary.json"
+"""The file with the summary of a command."""
+
+COUNT = "measurements "
+"""Prefix of the rows of a summary that count measurements by status."""
+
+FILMS = ("film.gif", "film.mp4", "film.html", "film-*.gif", "film-*.mp4", "film-*.html")
+"""Names of films; those of an earlier command are deleted."""
+
+OUT = Path("out")
+"""Default folder of results."""
+
+
+def pick(option: str, name: str, known: Mapping[str, _T], more: str = "") -> _T:
+    """The entry of `known` under a name given by an option, as `filters`.
+
+    Raises ValueError with the known names and `more`.
+    """
+    if name not in known:
+        unknown = f"unknown {option.removesuffix('s')} {name!r}{meant(name, known)}"
+        raise ValueError(f"--{option}: {unknown}; known: {', '.join(known)}{more}")
+    return known[name]
+
+
+def as_folders(options: argparse.Namespace) -> None:
+    """Convert the options that name folders to paths.
+
+    Raises ValueError on an empty name, which `Path` takes for the current folder.
+    """
+    for name in ("out", "resume", "cache"):
+        text = getattr(options, name, None)
+        if text is None:
+            continue
+        if not text.strip():
+            raise ValueError(f"--{name}: expected a folder, got {text!r}")
+        setattr(options, name, Path(text))
+
+
+def add_out(parser: argparse.ArgumentParser) -> None:
+    """Add the option of the folder of results."""
+    parser.add_argument(
+        "--out",
+        metavar="DIR",
+        default=str(OUT),
+        help=f"folder for results; earlier ones of the same command are replaced (default: {OUT})",
+    )
+
+
+def check_out(folder: Path, name: str) -> None:
+    """Check before any work that a command, as "run", can write its results to a folder.
+
+    Raises OSError if no file can be written, ValueError if the folder holds the results of another
+    command, since some files have the same names.
+    """
+    check_writable(folder)
+    for file in (RESULT, SUMMARY):
+        try:
+            command = str(json.loads((folder / file).read_text(encoding="utf-8"))["command"])
+        except (OSError, ValueError, LookupError, TypeError):
+            continue
+        if (other := " ".join(command.split()[:2])) not in ("", f"jaxslam {name}"):
+            raise ValueError(
+                f"--out: {folder} holds the results of {other}: choose another folder for those of "
+                f"jaxslam {name}"
+            )
+
+
+def add_dtype(parser: argparse.ArgumentParser, of: str = "") -> None:
+    """Add the option of the floating-point type; `of` completes the help, as " of the filters"."""
+    parser.add_argument(
+        "--dtype",
+        default="float64",
+        choices=["float32", "float64"],
+        help=f"floating-point type{of} (default: float64)",
+    )
+
+
+def add_figures(parser: argparse.ArgumentParser, formats: Collection[str], more: str = "") -> None:
+    """Add the option of the formats of figures; `more` follows the default in the help."""
+    parser.add_argument(
+        "--figures",
+        metavar="FORMATS",
+        default="png",
+        help=f"formats of figures, of {', '.join(formats)}; comma-separated (default: png{more})",
+    )
+
+
+def summary_table(columns: Mapping[str, Mapping[str, object]]) -> str:
+    """Summaries side by side, one row per entry; several have their names above them."""
+    rows = list(dict.fromkeys(key for column in columns.values() for key in column))
+    head = [["", *columns]] if len(columns) > 1 else []
+    lines = head + [
+        [
+            row,
+            *(
+                _shown(column.get(row, 0 if row.startswith(COUNT) else "-"))
+                for column in columns.values()
+            ),
+        ]
+        for row in rows
+    ]
+    widths = [max(len(line[i]) for line in lines) for i in range(len(columns))]
+    return "\n".join(
+        "  ".join(
+            [*(cell.ljust(w) for cell, w in zip(line, widths, strict=False)), line[-1]]
+        ).replace("\n", "\n" + " " * (widths[0] + 2))
+        for line in lines
+    )
+
+
+def _shown(value: object) -> str:
+    """A value of the summary as it is printed."""
+    if isinstance(value, dict):
+        return ", ".join(f"{count_label(key)} {count:,}" for key, count in value.items()) or "-"
+    if isinstance(value, list):
+        lines = all(isinstance(part, str) for part in value)
+        return ("\n" if lines else "; ").join(_shown(part) for part in value) or "-"
+    return f"{value:.6g}" if isinstance(value, float) else str(value) or "-"
+
+
+def film_files(films: Mapping[str, "Film"], *, suffixed: bool) -> Files:
+    """The functions that write each film as MP4, or GIF without ffmpeg, and as a page, by name.
+
+    Prints one line: how many steps are shown, and a missing ffmpeg.
+
+    Args:
+        films: by the name of the filter.
+        suffixed: whether file names contain the name of the filter.
+    """
+
+    from jaxslam.results.plot._film import has_ffmpeg  # matplotlib is slow to load
+
+    notes = dict.fromkeys(film.scene.note for film in films.values() if film.scene.note)
+    kind = "mp4" if has_ffmpeg() else "gif"
+    if kind == "gif":
+        notes["ffmpeg is not installed: GIF instead of MP4"] = None
+    if notes:
+        print("\nfilm: " + "; ".join(notes))
+    files: Files = {}
+    for name, film in films.items():
+        stem = f"film-{name}" if suffixed else "film"
+        files |= {f"{stem}.{kind}": _with_progress(film, name), f"{stem}.html": film.save}
+    return files
+
+
+def _with_progress(film: "Film", name: str) -> Callable[[Path], object]:
+    """The function that saves a film with a progress bar over its frames."""
+
+    def save(path: Path) -> None:
+        with Progress(f"{name}: film", "frames") as progress:
+            film.save(path, progress_callback=lambda k, of: progress(k + 1, of))
+
+    return save
+
+
+def add_animate(parser: argparse.ArgumentParser, of: str) -> None:
+    """Add the option of films."""
+    parser.add_argument(
+        "--animate",
+        action="store_true",
+        help=f"also write a film {of}: film.html to step and play, and film.mp4, or film.gif where "
+        "ffmpeg is missing",
+    )
+
+
+def set_device_count(devices: str) -> None:
+    """Set the number of CPU devices, before JAX first uses them; by default one per core.
+
+    At most the number of cores; `chosen_devices` then refuses a larger request.
+    """
+    count = cores() if devices in ("all", "cpu") else int(devices) if devices.isdecimal() else None
+    if count is not None and count < 1:
+        raise ValueError(f"--devices: expected at least 1, got {devices}")
+    if count is not None:
+        with contextlib.suppress(RuntimeError):  # JAX is already in use, as in a notebook
+            jax.config.update("jax_num_cpu_devices", min(count, cores()))
+
+
+def chosen_devices(devices: str, most: int | None = None) -> list[jax.Device]:
+    """The devices of this process for the option `--devices`: all, a number, or a platform.
+
+    most: largest number for "all".
+    """
+    if devices == "all":
+        return list(jax.local_devices()[:most])
+    if devices.isdecimal():
+        local = jax.local_devices()
+        if int(devices) > len(local):
+            kind = "CPU cores" if local[0].platform == "cpu" else local[0].platform
+            raise ValueError(
+                f"--devices: expected at most {len(local)}, the number of devices here ({kind}), "
+                f"got {devices}"
+            )
+        return list(local[: int(devices)])
+    try:
+        return list(jax.local_devices(backend=devices))
+    except RuntimeError as error:
+        known = sorted({device.platform for device in jax.local_devices()} | {"cpu"})
+        raise ValueError(
+            f"--devices: expected all, a number, or one of {', '.join(known)}, got {devices!r}"
+        ) from error
+
+
+_PARTS = (
+    "/jax/core/compile/jaxpr_trace_duration",
+    "/jax/core/compile/jaxpr_to_mlir_module_duration",
+    "/jax/core/compile/backend_compile_duration",
+)
+
+
+class CompileClock:
+    """A context manager that measures wall time and compilation time, and counts programs.
+
+    A program is traced, lowered, and compiled or loaded from the cache. Several threads compile at
+    once while compiled programs run; `compiling` is the time during which at least one of them
+    compiled.
+    """
+
+    def __init__(self) -> None:
+        self._lock = threading.Lock()
+        self._spans: list[tuple[float, float]] = []
+        self.programs = 0
+        """number of programs compiled or loaded from the cache"""
+        self.cached = 0
+        """number of programs loaded from the cache"""
+
+    def __enter__(self) -> "CompileClock":
+        self._began = time.perf_counter()
+        jax.monitoring.register_event_duration_secs_listener(self._took)
+        jax.monitoring.register_event_listener(self._happened)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        jax.monitoring.unregister_event_duration_listener(self._took)
+        jax.monitoring.unregister_event_listener(self._happened)
+
+    @property
+    def seconds(self) -> float:
+        """Wall time since the block was entered [s]."""
+        return time.perf_counter() - self._began
+
+    @property
+    def compiling(self) -> float:
+        """Wall time during which a program was traced, lowered or compiled [s]."""
+        total, at = 0.0, self._began
+        with self._lock:
+            spans = sorted(self._spans)
+        for begin, end in spans:
+            total += max(end - max(begin, at), 0.0)
+            at = max(at, end)
+        return total
+
+    def __str__(self) -> str:
+        made = f"{self.programs} programs" if self.programs != 1 else "1 program"
+        return (
+            f"{self.seconds:.1f} s in all, {self.compiling:.1f} s of them to compile or load "
+            f"{made}: {self.programs - self.cached} compiled, {self.cached} loaded from the cache"
+        )
+
+    def _took(self, event: str, duration_secs: float, **_: str | int) -> None:
+        if event in _PARTS:
+            now = time.perf_counter()
+            with self._lock:
+                self._spans.append((now - duration_secs, now))
+                # JAX reports a cached program as compiled, too.
+                self.programs += event == _PARTS[-1]
+
+    def _happened(self, event: str, **_: str | int) -> None:
+        if event == "/jax/compilation_cache/cache_hits":
+            with self._lock:
+                self.cached += 1

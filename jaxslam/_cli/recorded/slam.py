@@ -1,0 +1,321 @@
+"""The command `jaxslam slam`: laser SLAM, its files, and scores by poses or relations."""
+
+import argparse
+from collections.abc import Mapping
+from typing import TYPE_CHECKING
+
+import numpy as np
+from jaxtyping import Float
+
+from jaxslam._cli.common import add_animate, film_files, summary_table
+from jaxslam._cli.recorded import laser_log
+from jaxslam.consistency import metrics
+from jaxslam.consistency.campaign._progress import Progress
+from jaxslam.core.types import Estimate
+from jaxslam.datasets import LaserLog, relation_file
+from jaxslam.datasets import _g2o as g2o
+from jaxslam.datasets import _ros_map as ros_map
+from jaxslam.laser import laser_slam
+from jaxslam.laser.laser_slam import LoopOutcome, Settings, Solved
+from jaxslam.laser.laser_slam._log_map import growing_maps
+from jaxslam.math.stats import chi2_quantile
+from jaxslam.results import _report as report
+from jaxslam.results._files import Files, Json, csv_text
+
+if TYPE_CHECKING:  # Matplotlib is slow to load
+    from jaxslam.results.plot import Film
+
+METRES = (1.0, 2.0, 5.0, 10.0)
+"""Lengths of path of the relations that score the result."""
+
+FINAL_FRAMES = 12
+"""Number of frames of a film with the map after closing."""
+
+TOLERANCE = 1e-4
+"""Largest difference between the stamps of a relation and of its scan [s]: public files print five
+decimals, and times since 1970 have 2e-7 s in float64."""
+
+FAR_APART = 60.0
+"""Time between the scans of a relation beyond which they are far apart [s]."""
+
+ELLIPSE_SHARE = 0.95
+"""Expected share of relations in the ellipse, if the covariance is right and relations exact."""
+
+
+def add_options(parser: argparse.ArgumentParser) -> None:
+    """Add the options of `jaxslam slam`."""
+    laser_log.add_options(parser, run_slam)
+    add_animate(parser, "of the map growing")
+    parser.add_argument(
+        "--relations",
+        metavar="FILE",
+        help="relative poses between stamps that score the result, lines t1 t2 x y z roll pitch "
+        "yaw [s, m, rad]",
+    )
+
+
+def run_slam(log: LaserLog, options: argparse.Namespace) -> laser_log.Job:
+    """Path, graph, loops and map from raw odometry and scans, scored by the poses in the file and
+    the relations of another file."""
+    given = None if options.relations is None else given_relations(options.relations, log)
+    settings = Settings(resolution=options.resolution)
+    solved = _solved(log, settings)
+    coarser = float(solved.map.resolution) > 1.001 * settings.resolution
+    reference = log.corrected if log.placed else None
+    files = result_files(solved) | figures(solved, options.figures, reference)
+    if options.animate:
+        files |= film_files({"slam": film(log, solved, settings)}, suffixed=False)
+    summary = result_summary(solved) | laser_log.scored(log, lambda: _scores(log, solved))
+    if coarser:
+        summary["requested resolution, of too many cells [m]"] = settings.resolution
+    if given is None:
+        return laser_log.Job(summary, files)
+    relations, dropped = given
+    joined, scores = len(relations.first), relation_scores(relations, log, solved)
+    text = (
+        f"relations of {options.relations}: {joined:,} of {joined + dropped:,} join the scans, "
+        f"within {TOLERANCE:g} s; errors, mean ± standard deviation:\n{_score_text(scores)}"
+    )
+    if laser_log.odometry_is_poses(log):
+        text += (
+            "\nraw odometry is that of the poses in the file: if these are corrected, the errors "
+            "are not those of laser SLAM; --odometry FILE gives the odometry of the wheels"
+        )
+    entry: Json = {
+        "file": options.relations,
+        "relations in the file": joined + dropped,
+        "joined": joined,
+        "not joined": dropped,
+        "tolerance [s]": TOLERANCE,
+        **scores,
+    }
+    return laser_log.Job(summary, files, text, {"relations": entry})
+
+
+def _solved(log: LaserLog, settings: Settings) -> Solved:
+    """The result, with a bar of progress for each stage."""
+    with Progress(f"{log.name}, reading", "scans") as first:
+        bars = {"": first}
+
+        def report_stage(stage: str, done: int, of: int) -> None:
+            if stage not in bars:
+                unit = "candidates" if stage == "loop closing" else "scans"
+                bars[stage] = Progress(f"{log.name}, {stage}", unit)
+            bars[stage](done, of)
+
+        return laser_slam.solve(log, settings, progress=report_stage)
+
+
+def result_files(solved: Solved) -> Files:
+    """The files of a result by name, without figures.
+
+    | file | content |
+    |---|---|
+    | `trajectory.csv`, `trajectory.tum` | the pose of every scan, the first with its covariance |
+    | `graph.g2o` | the optimized graph of keyframes |
+    | `loops.csv` | every candidate of a loop, with its outcome |
+    | `map.yaml`, `map.pgm` | the map, as ROS has it |
+    """
+    count = len(solved.time)
+    path = Estimate(  # without landmarks
+        pose=solved.poses,
+        pose_cov=solved.cov,
+        points=np.zeros((count, 0, 2)),
+        point_covs=np.zeros((count, 0, 2, 2)),
+        alive=np.zeros((count, 0), bool),
+        tag=np.zeros((count, 0), int),
+    )
+    return {
+        "trajectory.csv": report.trajectory_csv(solved.time, path),
+        "trajectory.tum": report.trajectory_tum(solved.time, path),
+        # Without its gauge, pose 0: GTSAM's readG2o does not read the line FIX.
+        "graph.g2o": g2o.text_of(
+            solved.graph._replace(fixed_pose=np.zeros_like(solved.graph.fixed_pose))
+        ),
+        "loops.csv": _loops_csv(solved),
+        **ros_map.map_files("map", solved.map),
+    }
+
+
+def figures(
+    solved: Solved, formats: tuple[str, ...], corrected: Float[np.ndarray, "K 3"] | None
+) -> Files:
+    """`map_before`, `map_after` (maps of laser odometry alone, and of the optimum) and `graph`.
+
+    corrected: poses of reference, if there are some, drawn beside both paths in `graph`.
+    """
+    from jaxslam.results import plot  # matplotlib is slow to load
+    from jaxslam.results.plot._style import encode
+
+    before = plot.grid_figure(
+        solved.map_before,
+        poses=solved.odometry,
+        title="Laser odometry, before closing",
+        width=plot.PAGE,
+    )
+    after = plot.grid_figure(solved.map, poses=solved.poses, title="After closing", width=plot.PAGE)
+    graph = plot.loops_figure(solved, corrected)
+    pictures = {"map_before": before, "map_after": after, "graph": graph}
+    return {
+        f"{name}.{kind}": encode(figure, kind)
+        for name, figure in pictures.items()
+        for kind in formats
+    }
+
+
+def film(log: LaserLog, solved: Solved, settings: Settings) -> "Film":
+    """The film of a map that grows by laser odometry alone, and of the map after closing."""
+    from jaxslam.results import plot  # matplotlib is slow to load
+    from jaxslam.results.plot._grid_figures import map_scene
+
+    maps, until = growing_maps(log, solved.odometry, settings, others=[solved.poses])
+    closed, _ = growing_maps(log, solved.poses, settings, others=[solved.odometry])
+    kept = int((solved.loops.outcome == LoopOutcome.KEPT).sum())
+    last = [closed[-1]] * FINAL_FRAMES
+    paths = [solved.odometry[:end] for end in until] + [solved.poses] * FINAL_FRAMES
+    captions = [f"laser odometry, scan {end:,} of {until[-1]:,}" for end in until]
+    captions += [f"after closing by {kept:,} loops"] * FINAL_FRAMES
+    scene = map_scene(
+        [np.asarray(one.log_odds) for one in (*maps, *last)],
+        np.asarray(maps[0].origin),
+        float(maps[0].resolution),
+        paths,
+        captions,
+        title=log.name,
+    )
+    return plot.Film(scene)
+
+
+def result_summary(solved: Solved) -> dict[str, object]:
+    """The numbers of a result, for the table that is printed and for `summary.json`."""
+    return {
+        **solved.counts,
+        "chi2": solved.chi2,
+        "degrees of freedom": solved.dof,
+        "chi2 / degrees of freedom": solved.chi2 / solved.dof if solved.dof > 0 else None,
+        "covariances": _verdict(solved),
+        **laser_log.map_size(solved.map),
+        **{f"seconds, {stage}": round(value, 2) for stage, value in solved.seconds.items()},
+    }
+
+
+def _verdict(solved: Solved) -> str:
+    """The verdict of χ² on the covariances of matches."""
+    if solved.dof <= 0:
+        return "no loop tests them"
+    ratio = solved.chi2 / solved.dof
+    if 0.5 <= ratio <= 2:
+        return "consistent with χ² within a factor of 2"
+    if ratio > 2:
+        return f"overconfident: σ too small by a factor of {np.sqrt(ratio):.1f}"
+    return f"underconfident: σ too large by a factor of {1 / np.sqrt(ratio):.1f}"
+
+
+def _loops_csv(solved: Solved) -> str:
+    """The candidates of loops, one per row."""
+    loops = solved.loops
+    rows = [
+        [
+            str(int(first)),
+            str(int(second)),
+            *(f"{value:.9g}" for value in z),
+            f"{score:.4f}",
+            "appearance" if looks else "place",
+            LoopOutcome(int(outcome)).name.lower(),
+        ]
+        for first, second, z, _, score, looks, outcome in zip(*loops, strict=True)
+    ]
+    head = ["first", "second", "x [m]", "y [m]", "theta [rad]", "inliers", "found by", "outcome"]
+    return csv_text(head, rows)
+
+
+def _scores(log: LaserLog, solved: laser_slam.Solved) -> dict[str, object]:
+    """Errors of relations, ATE, and the number of correct loops, by the poses in the file."""
+    paths = {"raw odometry": solved.raw, "laser odometry": solved.odometry, "": solved.poses}
+    out: dict[str, object] = {}
+    try:
+        for name, path in paths.items():
+            found = [metrics.rpe(log.corrected, path, metres=m) for m in METRES]
+            every = np.concatenate([each.translation for each in found])
+            if not len(every):
+                raise ValueError(f"the path is shorter than {METRES[0]:g} m")
+            what = "mean relation error to 10 m [m]" + (f", {name}" if name else "")
+            out[what] = float(every.mean())
+        ate = metrics.ate(log.corrected, solved.poses).translation
+    except ValueError as problem:
+        return {"score": f"none: {problem}"}
+    score = laser_slam.closure_score(solved, log.corrected)
+    out["ATE, RMSE [m]"] = float(np.sqrt((ate**2).mean()))
+    out["loops kept that agree with the poses in the file"] = score.correct
+    if score.revisits:
+        out["recall of revisits"] = score.recall
+    return out
+
+
+def given_relations(path: str, log: LaserLog) -> tuple[metrics.Relations, int]:
+    """The relations of a file by rows of the log, and the number without a scan at a stamp.
+
+    Raises ValueError, with the file, if `relation_file` does or if no relation has its scans.
+    """
+    file = relation_file(path)
+    try:
+        return metrics.given(log.time, file.first, file.second, file.pose, tolerance=TOLERANCE)
+    except ValueError as problem:
+        reason = str(problem).removeprefix("given: ")
+        raise ValueError(f"--relations: {file.source}: {reason}") from problem
+
+
+def relation_scores(relations: metrics.Relations, log: LaserLog, solved: Solved) -> dict[str, Json]:
+    """Scores of all relations, and of those whose scans are far apart."""
+    nees = laser_slam.relation_nees(solved, *relations)
+    apart = np.abs(log.time[relations.second] - log.time[relations.first])
+    paths = {
+        "laser SLAM": solved.poses,
+        "laser odometry": solved.odometry,
+        "raw odometry": solved.raw,
+    }
+    out: dict[str, Json] = {}
+    for name, chosen in (("all", apart >= 0), (f"over {FAR_APART:g} s apart", apart > FAR_APART)):
+        some = metrics.Relations(*(field[chosen] for field in relations))
+        count, unknown = len(some.first), int(np.isnan(nees[chosen]).sum())
+        inside = int((nees[chosen] <= chi2_quantile(ELLIPSE_SHARE, 3)).sum())
+        errors = {path: metrics.relation_errors(some, at) for path, at in paths.items()}
+        figures = {
+            path: {what: of._asdict() for what, of in metrics.benchmark_figures(of).items()}
+            for path, of in errors.items()
+            if count
+        }
+        out[name] = {
+            "relations": count,
+            **figures,
+            "in the 95 % ellipse": inside,
+            "without a covariance": unknown,  # of a scan and itself
+            "share in the 95 % ellipse": inside / (count - unknown) if count > unknown else None,
+        }
+    return out
+
+
+def _score_text(scores: Mapping[str, Json]) -> str:
+    """The scores as text: a row for each path, a column for each quantity."""
+    columns: dict[str, dict[str, object]] = {}
+    lines = []
+    for name, score in scores.items():
+        for path, figures in score.items():
+            for quantity, of in figures.items() if isinstance(figures, dict) else ():
+                cell = f"{_shown(of['mean'])} ± {_shown(of['std'])}"
+                columns.setdefault(quantity, {})[f"{name}, {path}"] = cell
+        line, share = (
+            f"{name}: {score['relations']:,} relations",
+            score["share in the 95 % ellipse"],
+        )
+        if isinstance(share, float):
+            line += f", {100 * share:.1f} % in the 95 % ellipse of the graph's covariance"
+            if unknown := score["without a covariance"]:
+                line += f", {unknown:,} without a covariance"
+        lines.append(line)
+    return "\n".join([summary_table(columns), *lines])
+
+
+def _shown(value: float) -> str:
+    """Four decimals, one of numbers from 10 on."""
+    return f"{value:.4f}" if value < 10 else f"{value:,.1f}"

@@ -1,0 +1,171 @@
+"""The scenario and the filters of a campaign: by name, or from a Python file of the user.
+
+In place of a name, FILE.py:NAME takes NAME from a Python file: a `Scenario` or a function that
+returns one, a `Filter` or a function of the scenario that returns one.
+"""
+
+import contextlib
+import inspect
+import traceback
+from collections.abc import Callable, Iterator
+from pathlib import Path
+from types import ModuleType
+
+from jaxslam._catalog import ALL
+from jaxslam._cli.common import pick
+from jaxslam.consistency.campaign._candidates import check_fits, check_noise
+from jaxslam.core.protocols import Candidate, Filter
+from jaxslam.simulation._worlds import World
+from jaxslam.simulation.scenarios import SCENARIOS
+from jaxslam.verify._inputs.user_files import import_file, names_in, split_target
+from jaxslam.verify._user_errors import describe_error
+
+_FROM_FILE = "; or FILE.py:NAME, one of your own"
+
+
+class UserObjects:
+    """The objects of a user's files; each file is executed once."""
+
+    def __init__(self) -> None:
+        self._modules: dict[Path, ModuleType] = {}
+
+    def scenario(self, entry: str, steps: int | None) -> World:
+        """A scenario, by name or from a file; steps: None for its default.
+
+        Raises ValueError on an unknown one, and on a number of steps for a `Scenario`.
+        """
+        arguments = () if steps is None else (steps,)
+        if not _in_file(entry):
+            return pick("scenario", entry, SCENARIOS, _FROM_FILE)(*arguments)
+        _, value = self._find("--scenario", entry)
+        made = value
+        if isinstance(made, World) and steps is not None:
+            raise ValueError(
+                f"--steps: {entry} is a Scenario, which has {made.steps}; "
+                "expected a function of the number of steps"
+            )
+        if not isinstance(made, World) and callable(made):
+            given = "the number of steps" if arguments else "nothing"
+            made = self._call(entry, given, made, *arguments)
+        if not isinstance(made, World):
+            raise ValueError(
+                f"{entry}: expected a Scenario, or a function that returns one, {_got(value, made)}"
+            )
+        check_noise(made)
+        return made
+
+    def filters(self, names: str, scenario: World) -> dict[str, Candidate]:
+        """The filters of a comma-separated list, or all of the catalog, by name.
+
+        Raises ValueError on an unknown one, and on one that cannot run the scenario.
+        """
+        entries = [entry.strip() for entry in names.split(",")]
+        if entries == ["all"]:
+            entries = list(ALL)
+        if "" in entries:
+            raise ValueError(
+                "--filters: expected names of filters, or FILE.py:NAME, with commas between them, "
+                f"or all, got {names!r}"
+            )
+        found: dict[str, Candidate] = {}
+        for entry in entries:
+            name, candidate = (self._from_file if _in_file(entry) else _from_catalog)(
+                entry, scenario
+            )
+            if name in found:
+                raise ValueError(f"--filters: expected each name once, got {name} twice")
+            found[name] = candidate
+        return found
+
+    @contextlib.contextmanager
+    def located_errors(self) -> Iterator[None]:
+        """A block that turns an error in a user's file into a ValueError with file and line."""
+        try:
+            yield
+        except Exception as error:
+            frames = traceback.extract_tb(error.__traceback__)
+            if not any(Path(frame.filename) in self._modules for frame in frames):
+                raise
+            raise ValueError(describe_error(error)) from error
+
+    def _find(self, option: str, entry: str) -> tuple[str, object]:
+        """The name and the object of FILE.py:NAME."""
+        path, name = split_target(entry)
+        path = path.resolve()
+        if path not in self._modules:
+            self._modules[path] = import_file(path)
+        module = self._modules[path]
+        if not name:
+            raise ValueError(f"{option}: expected FILE.py:NAME, got {entry}{names_in(module)}")
+        if not hasattr(module, name):
+            raise ValueError(f"{option}: {path.name} has no {name!r}{names_in(module)}")
+        return name, getattr(module, name)
+
+    def _from_file(self, entry: str, scenario: World) -> tuple[str, Candidate]:
+        """The name of a user's filter, and the filter for the scenario.
+
+        The name is that of the filter if its class is the user's and the catalog has none of that
+        name, else NAME.
+        """
+        name, value = self._find("--filters", entry)
+        made = value
+        if not isinstance(made, Filter) and callable(made):
+            made = self._call(entry, "the scenario", made, scenario)
+        if not isinstance(made, Filter) and not callable(made):
+            raise ValueError(
+                f"{entry}: expected a Filter, or a function of the scenario that returns one, "
+                f"{_got(value, made)}"
+            )
+        own = not type(made).__module__.startswith("jaxslam.")
+        if isinstance(made, Filter) and own and made.name not in ALL:
+            name = made.name
+        check_fits(name, made, scenario)
+        return name, made
+
+    def _call(
+        self, entry: str, given: str, function: Callable[..., object], *arguments: object
+    ) -> object:
+        """The result of a user's function; given: its argument in words."""
+        count = "one argument" if arguments else "no argument"
+        try:
+            inspect.signature(function).bind(*arguments)
+        except TypeError as error:
+            raise ValueError(f"{entry} is called with {count}: {error}") from error
+        try:
+            return function(*arguments)
+        except Exception as error:
+            raise ValueError(
+                f"{entry}: called with {given}, it fails: {describe_error(error)}"
+            ) from error
+
+
+def _got(value: object, made: object) -> str:
+    """The object in the file that is not as expected, or the result of its function."""
+    return f"got {made!r:.60}" if made is value else f"got a function that returned {made!r:.60}"
+
+
+def _in_file(entry: str) -> bool:
+    """Whether an entry names a file."""
+    return ":" in entry or entry.endswith(".py")
+
+
+def _from_catalog(name: str, scenario: World) -> tuple[str, Candidate]:
+    """The name and a filter of the catalog; ValueError if it cannot run the scenario."""
+    make = pick("filters", name, ALL, _FROM_FILE)
+    try:
+        return name, make(scenario, watch=True)
+    except ValueError as error:
+        fit = ",".join(other for other in ALL if _can_run(other, scenario))
+        raise ValueError(
+            f"--filters: {name} cannot run scenario {scenario.name!r}: {error}"
+            + f"; those of the catalog that can: --filters {fit}" * bool(fit)
+        ) from error
+
+
+def _can_run(name: str, scenario: World) -> bool:
+    """Whether a filter of the catalog can be made for the scenario."""
+    try:
+        ALL[name](scenario)
+    except ValueError:
+        return False
+    return True

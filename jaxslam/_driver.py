@@ -1,0 +1,126 @@
+"""The driver of all filters: one `lax.scan` over a log."""
+
+from collections.abc import Callable
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+from numpy.typing import ArrayLike
+
+from jaxslam.core._numbers import check_covariance, check_key, is_concrete, largest, shape_text
+from jaxslam.core._validation import (
+    call_traced,
+    check_log,
+    check_record,
+    checked_estimate,
+    same_state,
+    state_and_info,
+)
+from jaxslam.core.protocols import Filter
+from jaxslam.core.types import Log, Scan, Status, Trace
+from jaxslam.math._xla import hot_jit
+
+
+def run(
+    filter: Filter,
+    log: Log,
+    pose: ArrayLike,
+    pose_cov: ArrayLike,
+    key: jax.Array,
+    *,
+    probe: Callable[[PyTree], PyTree] | None = None,
+) -> Trace:
+    """Run a filter over a log: at each row, predict with the control, then update with the scan.
+
+    Traceable: wrap it in `jax.jit`, `jax.vmap` over filters, logs and keys, or `jax.grad`. It is
+    compiled once for a structure: another call, with other values or a filter with other noises,
+    runs the same program. The arithmetic runs in the wider dtype of the log's controls and
+    measurements. A valid measurement that is not finite or beyond `core.numbers.largest` is refused
+    where its value is concrete, and dropped as `Status.REJECTED` under a trace. Reverse mode stores
+    one state a step, and recomputes each step in the backward pass.
+
+    Args:
+        filter: a record, as of `jaxslam.filters`.
+        log: T rows; control (T, U), scans of M measurement slots.
+        pose: (3,) where the robot is before the first control.
+        pose_cov: (3, 3) its covariance; zero is allowed.
+        key: a PRNG key, split into two a step; a filter without randomness ignores them.
+        probe: called with the filter's state after each update; its results are stacked.
+    Returns:
+        Trace with estimates and infos of leading axis T, and the final state.
+    Raises:
+        ValueError: on wrong shapes or kinds, and, where the values are concrete, on NaN or too
+            large numbers in controls or valid measurements, tags repeated within a scan, or an
+            invalid pose_cov.
+    """
+    check_record("run", "filter", filter, Filter)
+    check_record("run", "log", log, Log)
+    check_run("run", filter, log, pose, pose_cov)
+    check_key("run", key)
+    return _drive(filter, log, pose, pose_cov, key, probe)
+
+
+def check_run(name: str, filter: Filter, log: Log, pose: ArrayLike, pose_cov: ArrayLike) -> None:
+    """Raise ValueError, which begins with the caller's name, unless a log and a start are what
+    `run` takes."""
+    check_log(
+        name,
+        log,
+        control_size=len(filter.controls),
+        measurement_size=len(filter.measurements),
+        parts=filter.places,
+    )
+    if (got := shape_text(pose)) != "(3,)":
+        raise ValueError(f"{name}: expected a pose (x, y, θ) of shape (3,), got {got}")
+    if is_concrete(pose):
+        values = np.asarray(pose)
+        if values.dtype.kind not in "biuf":
+            raise ValueError(f"{name}: expected a pose of real numbers, got {pose!r}")
+        if not np.all(np.isfinite(values)):
+            raise ValueError(f"{name}: the initial pose is not finite, got {values.tolist()}")
+    check_covariance(f"{name}: pose_cov", pose_cov, 3)
+
+
+@partial(hot_jit, static_argnames=("probe",))
+def _drive(
+    filter: Filter,
+    log: Log,
+    pose: ArrayLike,
+    pose_cov: ArrayLike,
+    key: jax.Array,
+    probe: Callable[[PyTree], PyTree] | None,
+) -> Trace:
+    """The trace of a filter over a checked log."""
+    # XLA before jaxlib 0.11 compiles some loops over a constant `valid` (`run` in a user's jit, the
+    # log closed over) to wrong numbers.
+    log = jax.lax.optimization_barrier(jax.tree.map(jnp.asarray, log))
+    dtype = jnp.result_type(log.control, log.scan.z)
+    tag = log.scan.tag.astype(jnp.int32)  # of any integers, unsigned ones too
+    log = Log(log.control.astype(dtype), Scan(log.scan.z.astype(dtype), tag, log.scan.valid))
+    name, most = f"run: {filter.name}", largest(log.control)
+    at = jnp.asarray(pose, dtype), jnp.asarray(pose_cov, dtype)
+    start = call_traced(f"{name}: init", filter.init, *at)
+    keys = jax.random.split(key, (log.control.shape[0], 2))
+
+    def step(state: PyTree, row: tuple[Log, jax.Array]) -> tuple[PyTree, PyTree]:
+        (control, scan), (key_predict, key_update) = row
+        predict = f"{name}: predict"
+        moved = call_traced(predict, filter.predict, state, control, key_predict)
+        state = same_state(predict, state, moved)
+        # Under jit values are not checked before, and a NaN would spread through the whole state.
+        lost = scan.valid & ~(jnp.abs(scan.z) <= most).all(axis=1)
+        scan = scan._replace(valid=scan.valid & ~lost)
+        found = call_traced(f"{name}: update", filter.update, state, scan, key_update)
+        state, info = state_and_info(name, state, scan, found)
+        status = jnp.where(lost, jnp.int32(Status.REJECTED), info.status)
+        info = info._replace(status=status.astype(info.status.dtype))
+        moments = call_traced(f"{name}: estimate", filter.estimate, state)
+        estimate = checked_estimate(name, moments, dtype)
+        return state, (estimate, info, None if probe is None else probe(state))
+
+    # XLA cannot merge the body of a scan with its recomputation, so no barrier is needed.
+    body = jax.checkpoint(step, prevent_cse=False)
+    final, (estimate, info, probed) = jax.lax.scan(body, start, (log, keys))
+    return Trace(estimate, info, final, probed)

@@ -1,0 +1,222 @@
+"""Joint compatibility branch and bound (JCBB), with fixed memory and a search budget."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+from jaxslam.association._rules import check_gates, far_from_all
+from jaxslam.core._numbers import check_count
+from jaxslam.core._record import record, static
+from jaxslam.core.protocols import Association, Pairs, Prediction
+from jaxslam.core.types import Scan
+from jaxslam.math import _linalg as linalg
+from jaxslam.math._arrays import Number
+from jaxslam.math.stats import chi2_quantile
+
+
+@record
+class JointCompatibility:
+    """JCBB: the largest jointly compatible set of pairs; of several, that of least distance.
+
+    Of a hypothesis H = {(i, j)} with m pairs, D² = ν_Hᵀ S_H⁻¹ ν_H with all cross-covariances, and
+    it is compatible if every pair is (d² <= χ²(Z, p)) and D² <= χ²(m·Z, p). Neira & Tardós, "Data
+    association in stochastic mapping using the joint compatibility test", IEEE T-RA 17(6), 2001.
+
+    Depth first over the measurements, the nearest landmark first, none last. S_H = L Lᵀ grows by
+    one block row a pair, and D² with it, so a branch ends where it cannot have more pairs than
+    the best, or as many at a lower D², or where D² exceeds even χ² of all pairs it could still
+    make. (The original ends it where the pairs so far are not compatible, and then depends on
+    their order.) Without a measurement's landmark at most `new_gate` away it is new; by default
+    that is χ²(Z, p).
+
+    Raises ValueError on a probability outside 0 to 1, or a budget or candidates below 1; from the
+    filter's update, on a new_gate below the gate of single pairs.
+    """
+
+    probability: float = static(default=0.99)
+    """p of both tests, 0 to 1"""
+    new_gate: Number | None = None
+    """of squared distance, for new landmarks"""
+    budget: int = static(default=2000, kw_only=True)
+    """largest number of nodes of the search. At this limit the best result is returned, and
+    `Association.exhausted` is set"""
+    candidates: int = static(default=8, kw_only=True)
+    """number of nearest compatible landmarks tried for a measurement; if there are more,
+    `exhausted` is set"""
+
+    def __post_init__(self) -> None:
+        what = "JointCompatibility"
+        if not 0 <= self.probability <= 1:
+            raise ValueError(f"{what}: expected a probability from 0 to 1, got {self.probability}")
+        check_count(f"{what}: budget", self.budget)
+        check_count(f"{what}: candidates", self.candidates)
+
+    def __call__(self, prediction: Prediction, scan: Scan) -> Association:
+        pairs: Pairs = jax.lax.stop_gradient(prediction.pairs(scan))
+        m, _, size_z = pairs.innovation.shape
+        if m == 0:
+            return Association(jnp.full(0, -1, jnp.int32), scan.valid, jnp.asarray(False))
+        quantiles = _quantiles(self.probability, m, size_z)
+        gate = float(quantiles[1])
+        check_gates("JointCompatibility", gate, self.new_gate)
+        levels = jnp.asarray(quantiles, pairs.distance.dtype)
+        cross = jax.lax.stop_gradient(prediction.cross())
+        problem = _problem(pairs, cross, levels, self.candidates)
+        found = _search(problem, self.budget)
+        exhausted = (found.level >= 0) | problem.cut
+        slot = found.best
+        return Association(
+            slot, far_from_all(pairs, scan, gate, self.new_gate) & (slot < 0), exhausted
+        )
+
+
+def _quantiles(probability: float, m: int, size_z: int) -> np.ndarray:
+    """The quantiles χ²(k·Z, p) for k = 0 … m."""
+    if probability in (0, 1):
+        return np.append(0.0, np.full(m, np.inf if probability else 0.0))
+    return np.append(0.0, [chi2_quantile(probability, k * size_z) for k in range(1, m + 1)])
+
+
+class _Problem(NamedTuple):
+    slot: Int[Array, "M K"]
+    """candidates, the nearest first"""
+    fits: Bool[Array, "M K"]
+    innovation: Float[Array, "M K Z"]
+    cov: Float[Array, "M K Z Z"]
+    cross: Float[Array, "N Z N Z"]
+    levels: Float[Array, "M+1"]
+    """the gate of D² of k pairs"""
+    left: Int[Array, "M+1"]
+    """how many measurements from the i-th on have candidates"""
+    cut: Bool[Array, ""]
+    """there were more candidates than K"""
+
+
+def _problem(
+    pairs: Pairs, cross: Float[Array, "N Z N Z"], levels: Float[Array, "levels"], candidates: int
+) -> _Problem:
+    m, n = pairs.distance.shape
+    compatible = pairs.possible & (pairs.distance <= levels[1])
+    order = jnp.argsort(jnp.where(compatible, pairs.distance, jnp.inf), axis=1)
+    slot = order[:, : min(candidates, n)].astype(jnp.int32)
+    at = jnp.arange(m)[:, None], slot
+    some = compatible.any(axis=1)
+    left = jnp.append(jnp.cumsum(some[::-1])[::-1], 0)
+    return _Problem(
+        slot=slot,
+        fits=compatible[at],
+        innovation=pairs.innovation[at],
+        cov=pairs.cov[at],
+        cross=cross,
+        levels=levels,
+        left=left,
+        cut=(compatible.sum(axis=1) > slot.shape[1]).any(),
+    )
+
+
+class _Search(NamedTuple):
+    level: Int[Array, ""]
+    """the measurement to decide on; -1 when all is searched"""
+    option: Int[Array, "M"]
+    """which of its candidates comes next; K is none"""
+    chosen: Int[Array, "M"]
+    """slot of each measurement decided on, -1 for none"""
+    pairs: Int[Array, "M+1"]
+    """how many there are among the first k"""
+    distance: Float[Array, "M+1"]
+    """D² of the first k"""
+    inverse: Float[Array, "M*Z M*Z"]
+    """L⁻¹, rows of zeros without a pair"""
+    whitened: Float[Array, "M*Z"]
+    """L⁻¹ ν"""
+    best: Int[Array, "M"]
+    best_count: Int[Array, ""]
+    best_distance: Float[Array, ""]
+    nodes: Int[Array, ""]
+
+
+def _search(problem: _Problem, budget: int) -> _Search:
+    m, k, size_z = problem.innovation.shape
+    dtype = problem.innovation.dtype
+    zero = jnp.zeros((), jnp.int32)
+    start = _Search(
+        level=zero,
+        option=jnp.zeros(m, jnp.int32),
+        chosen=jnp.full(m, -1, jnp.int32),
+        pairs=jnp.zeros(m + 1, jnp.int32),
+        distance=jnp.zeros(m + 1, dtype),
+        inverse=jnp.zeros((m * size_z, m * size_z), dtype),
+        whitened=jnp.zeros(m * size_z, dtype),
+        best=jnp.full(m, -1, jnp.int32),
+        best_count=zero - 1,
+        best_distance=jnp.full((), jnp.inf, dtype),
+        nodes=zero,
+    )
+
+    def visit(at: _Search) -> _Search:
+        i, option = at.level, at.option[at.level]
+        which = jnp.minimum(option, k - 1)
+        slot = jnp.where(option < k, problem.slot[i, which], -1)
+        rows, white, more, regular = _block_row(problem, at, which)
+        taken = (jnp.arange(m) < i) & (at.chosen == slot)
+        fits = (option == k) | (problem.fits[i, which] & regular & ~taken.any())
+        pair = (option < k).astype(jnp.int32)
+        count, distance = at.pairs[i] + pair, at.distance[i] + pair * more
+        most = count + problem.left[i + 1]
+        better = (most > at.best_count) | ((most == at.best_count) & (distance < at.best_distance))
+        go = (option <= k) & fits & better & (distance <= problem.levels[most])
+        leaf = go & (i == m - 1)
+        deeper = go & ~leaf
+        chosen = at.chosen.at[i].set(slot)
+        start_row = i * size_z
+        keep = (deeper & (option < k)).astype(dtype)
+        inverse = jax.lax.dynamic_update_slice(at.inverse, keep * rows, (start_row, 0 * start_row))
+        whitened = jax.lax.dynamic_update_slice(at.whitened, keep * white, (start_row,))
+        following = jnp.minimum(i + 1, m - 1)
+        options = at.option.at[i].add(1)
+        options = options.at[following].set(jnp.where(deeper, 0, options[following]))
+        level = jnp.where(deeper, i + 1, jnp.where(option >= k, i - 1, i))
+        return _Search(
+            level=level,
+            option=options,
+            chosen=chosen,
+            pairs=at.pairs.at[i + 1].set(count),
+            distance=at.distance.at[i + 1].set(distance),
+            inverse=inverse,
+            whitened=whitened,
+            best=jnp.where(leaf, chosen, at.best),
+            best_count=jnp.where(leaf, count, at.best_count),
+            best_distance=jnp.where(leaf, distance, at.best_distance),
+            nodes=at.nodes + 1,
+        )
+
+    return jax.lax.while_loop(lambda at: (at.level >= 0) & (at.nodes < budget), visit, start)
+
+
+def _block_row(
+    problem: _Problem, at: _Search, which: Int[Array, ""]
+) -> tuple[Float[Array, "Z MZ"], Float[Array, "Z"], Float[Array, ""], Bool[Array, ""]]:
+    """The next pair's rows of L⁻¹ and L⁻¹ ν, its term of D², and whether S is positive definite.
+
+    With W = L⁻¹ C, C the covariance of the pairs before with it, and B = S - WᵀW = l lᵀ: the new
+    rows of L⁻¹ are l⁻¹ [-Wᵀ L⁻¹, I], and those of L⁻¹ ν are l⁻¹ (ν - Wᵀ L⁻¹ ν).
+    """
+    m, _, size_z = problem.innovation.shape
+    i = at.level
+    slot = problem.slot[i, which]
+    before = (jnp.arange(m) < i) & (at.chosen >= 0)
+    shared = problem.cross[jnp.maximum(at.chosen, 0), :, slot]
+    shared = jnp.where(before[:, None, None], shared, 0.0).reshape(m * size_z, size_z)
+    joined = jnp.repeat(before, size_z)
+    inverse = jnp.where(joined[:, None], at.inverse, 0.0)
+    whitened = jnp.where(joined, at.whitened, 0.0)
+    w = inverse @ shared
+    factor, regular = linalg.cholesky(problem.cov[i, which] - w.T @ w)
+    diagonal = jnp.arange(m * size_z)[None, :] == i * size_z + jnp.arange(size_z)[:, None]
+    rows = linalg.solve_lower(factor, diagonal.astype(w.dtype) - w.T @ inverse)
+    white = linalg.solve_lower(factor, problem.innovation[i, which] - w.T @ whitened)
+    return rows, white, (white**2).sum(), regular

@@ -1,0 +1,229 @@
+"""Association by tags, nearest neighbours or likelihood: the pairs, the rules and their gates."""
+
+import dataclasses
+from collections.abc import Callable
+from numbers import Real
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+from jaxslam.core import slots
+from jaxslam.core._numbers import check_positive, is_concrete
+from jaxslam.core._record import hold_function, record, static
+from jaxslam.core.protocols import Associate, Association, Pairs, Prediction, Sensor
+from jaxslam.core.types import Scan
+from jaxslam.math._arrays import Number
+from jaxslam.math._assignment import assign
+from jaxslam.math._gaussians import gaussian_terms
+
+
+def check_gates(name: str, gate: Number, new_gate: Number | None) -> None:
+    """Raise ValueError on a gate that is not a number >= 0, and on a new_gate below it."""
+    for each in (gate, new_gate):
+        if each is not None and not isinstance(each, Real | np.ndarray | jax.Array):
+            called = isinstance(each, Prediction | Scan)
+            again = f": as associate, give {name}(gate), not {name}" if called else ""
+            raise ValueError(f"{name}: expected a number as gate, got {type(each).__name__}{again}")
+    if is_concrete(gate) and not np.asarray(gate) >= 0:
+        raise ValueError(f"{name}: expected a gate of at least 0, got {gate}")
+    if new_gate is not None and is_concrete((gate, new_gate)) and not new_gate >= gate:
+        raise ValueError(f"{name}: expected new_gate >= gate = {gate}, got {new_gate}")
+
+
+def far_from_all(
+    pairs: Pairs, scan: Scan, gate: Number, new_gate: Number | None
+) -> Bool[Array, "M"]:
+    """Whether a measurement lies beyond the gate for new landmarks, by default the other one, of
+    every landmark of the map."""
+    near = pairs.possible & (pairs.distance <= (gate if new_gate is None else new_gate))
+    return scan.valid & ~near.any(axis=1)
+
+
+def mutual(score: Float[Array, "M N"], allowed: Bool[Array, "M N"]) -> Int[Array, "M"]:
+    """The slot of each measurement whose scores are mutually lowest, else -1."""
+    if 0 in score.shape:
+        return jnp.full(score.shape[0], -1, jnp.int32)
+    score = jnp.where(allowed, score, jnp.inf)
+    slot = jnp.argmin(score, axis=1).astype(jnp.int32)
+    best = jnp.argmin(score, axis=0)[slot] == jnp.arange(score.shape[0])
+    return jnp.where(allowed.any(axis=1) & best, slot, -1)
+
+
+@record
+class Known:
+    """Association by tags: a measurement has the landmark of its tag; a new tag starts one.
+
+    A measurement of unknown identity (tag -1) is neither, and becomes `Status.UNMATCHED`.
+    """
+
+    def __call__(self, prediction: Prediction, scan: Scan) -> Association:
+        slot, found = slots.find(prediction.tag, prediction.alive, scan.tag)
+        tagged = scan.valid & (scan.tag >= 0)
+        found = found & tagged
+        return Association(jnp.where(found, slot, -1), tagged & ~found)
+
+
+@record
+class Nearest:
+    """Individual compatibility nearest neighbour (ICNN; Neira & Tardós 2001, section II).
+
+    A pair is compatible if d² = νᵀ S⁻¹ ν <= gate. A measurement is associated with the landmark
+    of its least d² if it is also the nearest of that landmark's measurements. One with no landmark
+    within new_gate is new; one between the gates, or whose landmark has a nearer measurement, is
+    ignored (the two gates of Bailey, "Mobile robot localisation and mapping in extensive outdoor
+    environments", 2002, section 2.3). Tags are not used.
+
+    Raises ValueError on a negative gate, a new_gate below it, or an unknown policy.
+    """
+
+    gate: Number
+    """of squared Mahalanobis distance, 0 (nothing is compatible but a perfect match) to infinity;
+    `stats.chi2_quantile` gives it by probability"""
+    new_gate: Number | None = None
+    """at least the gate; the same by default"""
+    ambiguous: Literal["nearest", "leave"] = static(default="nearest", kw_only=True)
+    """"leave" ignores a measurement that is compatible with several landmarks, and several that are
+    compatible with one"""
+
+    def __post_init__(self) -> None:
+        check_gates("Nearest", self.gate, self.new_gate)
+        if self.ambiguous not in ("nearest", "leave"):
+            raise ValueError(
+                f'Nearest: expected ambiguous "nearest" or "leave", got {self.ambiguous!r}'
+            )
+
+    def __call__(self, prediction: Prediction, scan: Scan) -> Association:
+        pairs = prediction.pairs(scan)
+        allowed = compatible = pairs.possible & (pairs.distance <= self.gate)
+        if self.ambiguous == "leave":
+            allowed = compatible & (compatible.sum(axis=1) == 1)[:, None]
+            allowed = allowed & (compatible.sum(axis=0) == 1)[None, :]
+        slot = mutual(pairs.distance, allowed)
+        return Association(slot, far_from_all(pairs, scan, self.gate, self.new_gate) & (slot < 0))
+
+
+@record
+class MaximumLikelihood:
+    """Maximum-likelihood association: as `nearest`, by the least d² + log |S|.
+
+    d² + log |S| is -2 log N(ν; 0, S) up to a constant. The determinant matters: a landmark of large
+    covariance has small d² to all measurements, but a low likelihood (Thrun, Burgard &
+    Fox, Probabilistic Robotics, Table 7.3). The gates are of d², as those of `nearest`.
+
+    Raises:
+        ValueError: on a negative gate, or a new_gate below it.
+    """
+
+    gate: Number
+    new_gate: Number | None = None
+
+    def __post_init__(self) -> None:
+        check_gates("MaximumLikelihood", self.gate, self.new_gate)
+
+    def __call__(self, prediction: Prediction, scan: Scan) -> Association:
+        pairs = prediction.pairs(scan)
+        compatible = pairs.possible & (pairs.distance <= self.gate)
+        slot = mutual(pairs.distance + pairs.log_det, compatible)
+        return Association(slot, far_from_all(pairs, scan, self.gate, self.new_gate) & (slot < 0))
+
+
+@record
+class GlobalNearest:
+    """Global nearest neighbour: the assignment that minimizes Σ d² over its pairs, with the gate as
+    the cost of a measurement without a landmark.
+
+    Only compatible pairs (d² <= gate) are used; with an infinite gate, the largest number of
+    possible pairs. Solved exactly (`assignment.assign`). Blackman & Popoli, "Design and analysis
+    of modern tracking systems", 1999, section 6.4. The gates are as those of `nearest`.
+
+    Raises:
+        ValueError: on a negative gate, or a new_gate below it.
+    """
+
+    gate: Number
+    new_gate: Number | None = None
+
+    def __post_init__(self) -> None:
+        check_gates("GlobalNearest", self.gate, self.new_gate)
+
+    def __call__(self, prediction: Prediction, scan: Scan) -> Association:
+        pairs = prediction.pairs(scan)
+        m, n = pairs.distance.shape
+        compatible = pairs.possible & (pairs.distance <= self.gate)
+        within = jnp.where(compatible, pairs.distance, 0.0)
+        alone = jnp.minimum(self.gate, 1 + within.sum())
+        cost = jnp.where(compatible, pairs.distance, 2 * alone + 1)
+        # One more column for each measurement, for no landmark.
+        cost = jnp.concatenate([cost, jnp.broadcast_to(alone, (m, m))], axis=1)
+        column = assign(cost)
+        slot = jnp.where(column < n, column, -1)
+        return Association(slot, far_from_all(pairs, scan, self.gate, self.new_gate) & (slot < 0))
+
+
+@record
+class Certain:
+    """An association method restricted to landmarks with √(tr S/Z) <= spread.
+
+    S is the covariance of the innovation. After a long loop that of the first landmarks exceeds the
+    distances between landmarks, and single measurements may be associated wrongly. Landmarks
+    measured there become new ones at first; `filters.map_management.closing` then associates them
+    jointly with the old ones.
+
+    Raises ValueError on a spread not above 0.
+    """
+
+    associate: Associate
+    """the method; one that uses tags alone, as `Known`, is not restricted"""
+    spread: Number
+    """in units of the measurement, which should all be of one kind"""
+
+    def __post_init__(self) -> None:
+        hold_function(self, "associate", "prediction, scan")
+        check_positive("Certain", spread=self.spread)
+
+    def __call__(self, prediction: Prediction, scan: Scan) -> Association:
+        def pairs(scan: Scan) -> Pairs:
+            found = prediction.pairs(scan)
+            variance = jnp.trace(found.cov, axis1=2, axis2=3) / found.cov.shape[-1]
+            return found._replace(possible=found.possible & (variance <= self.spread**2))
+
+        return Association(*self.associate(dataclasses.replace(prediction, pairs=pairs), scan))
+
+
+def predicted(
+    sensor: Sensor,
+    tag: Int[Array, "N"],
+    alive: Bool[Array, "N"],
+    measurements: Callable[[], tuple[Float[Array, "N Z"], Float[Array, "N Z Z"] | None]],
+    cross: Callable[[], Float[Array, "N Z N Z"]],
+) -> Prediction:
+    """The `Prediction` of N landmarks, from predicted measurements and their covariances.
+
+    ν_ij = z_i ⊖ ẑ_j, S_ij = H_j P H_jᵀ + R_i. What a method does not call is not computed.
+
+    Args:
+        tag, alive: of the slots.
+        measurements: () -> ẑ and H_j P H_jᵀ; None instead of the latter where pose and map have no
+            error: then S_ij = R_i, which is factored once a measurement.
+        cross: () -> H_i P H_jᵀ.
+    """
+
+    def pairs(scan: Scan) -> Pairs:
+        expected, landmark_cov = measurements()
+        noise = jax.vmap(sensor.noise_cov)(scan.z)
+        over_slots = jax.vmap(sensor.residual, in_axes=(None, 0))
+        innovation = jax.vmap(over_slots, in_axes=(0, None))(scan.z, expected)
+        if landmark_cov is None:
+            cov = jnp.broadcast_to(noise[:, None], (*innovation.shape, innovation.shape[2]))
+            terms = jax.vmap(jax.vmap(gaussian_terms, in_axes=(0, None)))(innovation, noise)
+        else:
+            cov = landmark_cov[None] + noise[:, None]
+            terms = jax.vmap(jax.vmap(gaussian_terms))(innovation, cov)
+        possible = scan.valid[:, None] & alive[None, :] & terms.positive
+        return Pairs(innovation, cov, terms.distance, terms.log_det, possible)
+
+    return Prediction(tag, alive, pairs, cross)

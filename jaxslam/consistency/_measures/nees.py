@@ -1,0 +1,229 @@
+"""NEES: eᵀ P⁻¹ e of a pose and of its blocks, e = truth - estimate, in (x, y, θ) and in the
+error coordinates of the filter, and of landmarks; on the host, by NumPy in float64.
+"""
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxslam.consistency._intervals import LEVEL
+from jaxslam.consistency._measures.measure import Measure, Nees, Runs, RunScores, Sums, ratio
+from jaxslam.core.protocols import Chart, Sensor
+from jaxslam.core.types import Trace, Truth
+from jaxslam.math.stats import chi2_quantiles
+
+DOF = {"pose": 3, "position": 2, "heading": 1}
+"""Blocks of the pose error with a NEES, and its honest mean."""
+
+_ROUNDING = 32
+"""Largest claimed deviation, in ulp of its coordinate, that counts as zero."""
+
+
+@dataclass(frozen=True, eq=False)
+class NeesMeasure(Measure):
+    """The NEES of a block of `Runs.nees`. That of a pose block has a curve with a band."""
+
+    positive: bool = True
+    block: str = ""
+
+    def of_runs(self, runs: Runs) -> RunScores:
+        """Its sum over the steps with a regular covariance."""
+        value, regular = runs.nees[self.block]
+        sums = {self.key: value, f"regular_{self.block}": regular.astype(np.float64)}
+        return RunScores(value.sum(axis=1), regular.sum(axis=1), sums if self.block in DOF else {})
+
+    def curves(self, sums: Sums, runs: int) -> dict[str, np.ndarray]:
+        """The average NEES, its 95 % band, and over how many runs it is."""
+        if self.block not in DOF:
+            return {}
+        count, dof = sums[f"regular_{self.block}"], DOF[self.block]
+        safe, tail = np.maximum(count, 1), (1 - LEVEL) / 2
+        band = {"low": tail, "high": 1 - tail}
+        edges = {end: chi2_quantiles(p, dof * safe) / safe for end, p in band.items()}
+        return {
+            self.key: ratio(sums[self.key], count),
+            **{f"{self.key}_{end}": np.where(count > 0, x, np.nan) for end, x in edges.items()},
+            f"runs_{self.block}": count,
+        }
+
+
+MEASURES = tuple(
+    NeesMeasure(
+        f"nees_{block}",
+        label,
+        honest=dof,
+        block=block,
+        figure="nees" if block in DOF else "",
+        axis=f"{block} NEES (dof {dof})",
+    )
+    for block, label, dof in (
+        ("pose", "pose NEES (x, y, θ)", DOF["pose"]),
+        ("own", "pose NEES, in its chart", DOF["pose"]),
+        ("position", "position NEES", DOF["position"]),
+        ("heading", "heading NEES", DOF["heading"]),
+        ("landmarks", "landmark NEES", 2),
+    )
+)
+
+
+def inside_bands(curves: Mapping[str, np.ndarray]) -> dict[str, float]:
+    """The share of the steps whose average NEES lies in its band, by block."""
+    found = {}
+    for block in DOF:
+        mean, has = curves[f"nees_{block}"], curves[f"runs_{block}"] > 0
+        if has.any():
+            low, high = curves[f"nees_{block}_low"], curves[f"nees_{block}_high"]
+            found[block] = float(np.mean((mean >= low)[has] & (mean <= high)[has]))
+    return found
+
+
+def pose_error(
+    truth: Float[np.ndarray, "*steps 3"], pose: Float[np.ndarray, "*steps 3"]
+) -> Float[np.ndarray, "*steps 3"]:
+    """The error truth - estimate of a pose, heading wrapped to (-π, π]."""
+    error = np.asarray(truth, np.float64) - np.asarray(pose, np.float64)
+    turn = error[..., 2]
+    error[..., 2] = turn - 2 * np.pi * np.ceil((turn - np.pi) / (2 * np.pi))
+    return error
+
+
+def block_nees(
+    pose: Float[np.ndarray, "*steps 3"],
+    error: Float[np.ndarray, "*steps 3"],
+    chart_error: Float[np.ndarray, "*steps 3"],
+    cov: Float[np.ndarray, "*steps 3 3"],
+) -> dict[str, Nees]:
+    """The NEES of each block of `DOF`, and of the error in the coordinates of the filter ("own").
+
+    There is none where the claimed covariance is singular, i.e. some direction is known exactly:
+    1/tr P⁻¹, at most its least eigenvalue and at least a third of it, is at most 100 n·eps where P
+    is scaled to a diagonal of at most 1, x and y by one unit. And none
+    where a claimed deviation is what rounding makes of zero: at most `_ROUNDING` ulp of the
+    coordinate, that is of π for the heading and of max(|x|, |y|) for the position. So particles
+    that are copies of one, whose sample covariance is zero but for rounding, have no NEES, instead
+    of one of 1e27.
+
+    Args:
+        pose: as estimated.
+        error, chart_error: in (x, y, θ), and in the filter's coordinates.
+        cov: as claimed. eps is that of its dtype.
+
+    Raises:
+        ValueError: if the shapes differ.
+    """
+    shapes = [np.shape(each) for each in (pose, error, chart_error, cov)]
+    if shapes != [pose.shape] * 3 + [(*pose.shape, 3)] or pose.shape[-1:] != (3,):
+        raise ValueError(
+            "block_nees: expected pose, error and chart_error of one shape (..., 3) and cov of "
+            f"(..., 3, 3), got {', '.join(map(str, shapes))}"
+        )
+    eps = float(np.finfo(cov.dtype).eps)
+    with np.errstate(all="ignore"):
+        unit = _unit(pose, cov, eps)
+        scaled = {
+            (i, j): cov[..., i, j] * unit[i] * unit[j] for i in range(3) for j in range(i + 1)
+        }
+        factor, pivots = _cholesky(scaled, eps)
+        found = {}
+        for name, e in (("pose", error), ("own", chart_error)):
+            squares, known = _whiten(factor, e, unit)
+            for block, k in (("position", 2), ("pose", 3)):
+                if name == "pose" or block == "pose":
+                    regular = (_least_eigenvalue(factor, pivots, k) > 100 * k * eps) & _every(
+                        known[:k]
+                    )
+                    value = np.where(regular, sum(squares[:k]), 0.0)
+                    found[block if name == "pose" else name] = Nees(value, regular)
+        turn = error[..., 2]
+        regular = (scaled[2, 2] > 100 * eps) & np.isfinite(turn)
+        square = (turn * unit[2]) ** 2 / np.where(regular, scaled[2, 2], 1.0)
+        found["heading"] = Nees(np.where(regular, square, 0.0), regular)
+    return found
+
+
+def own_error_of(chart: Chart, sensor: Sensor, trace: Trace, truth: Truth) -> Float[Array, "T 3"]:
+    """The pose error in the filter's coordinates, brought to (x, y, θ) by its basis.
+
+    ξᵀ P_ξ⁻¹ ξ = (E ξ)ᵀ P⁻¹ (E ξ) with P = E P_ξ Eᵀ as the filter reports it.
+    """
+    ground = jnp.zeros(len(sensor.landmark), truth.pose.dtype)
+
+    def one(pose: Array, true_pose: Array) -> Array:
+        dx, _ = chart.local(pose, ground, true_pose, ground)
+        return dx if chart.basis is None else chart.basis(pose, ground).pose @ dx
+
+    return jax.vmap(one)(jnp.asarray(trace.estimate.pose), jnp.asarray(truth.pose))
+
+
+def _unit(pose: np.ndarray, cov: np.ndarray, eps: float) -> list[np.ndarray]:
+    """1/σ of x, y and θ, which scale a pose covariance to a unit diagonal; x and y, both metres,
+    share one. 0 where the deviation is rounding."""
+    x, y, heading = (np.maximum(cov[..., i, i].astype(np.float64), 0.0) for i in range(3))
+    reach = np.abs(pose[..., :2]).max(axis=-1)
+
+    def unit(variance: np.ndarray, size: np.ndarray | float) -> np.ndarray:
+        certain = variance > (_ROUNDING * eps * size) ** 2
+        return np.where(certain, 1.0 / np.sqrt(np.where(certain, variance, 1.0)), 0.0)
+
+    metres = unit(np.maximum(x, y), reach)
+    return [metres, metres, unit(heading, np.pi)]
+
+
+def _cholesky(
+    matrix: dict[tuple[int, int], np.ndarray], eps: float
+) -> tuple[dict[tuple[int, int], np.ndarray], list[np.ndarray]]:
+    """The lower factor of 3×3 matrices, entry by entry, and its pivots before the root is taken.
+
+    A pivot not above 3 eps times its diagonal entry counts as zero, as do the others of its column.
+    """
+    factor: dict[tuple[int, int], np.ndarray] = {}
+    pivots = []
+    for j in range(3):
+        pivot = matrix[j, j] - sum(factor[j, k] ** 2 for k in range(j))
+        good = pivot > 3 * eps * np.abs(matrix[j, j])
+        pivots.append(np.where(good, pivot, 0.0))
+        root = np.sqrt(np.where(good, pivot, 1.0))
+        factor[j, j] = np.where(good, root, 0.0)
+        for i in range(j + 1, 3):
+            rest = matrix[i, j] - sum(factor[i, k] * factor[j, k] for k in range(j))
+            factor[i, j] = np.where(good, rest / root, 0.0)
+    return factor, pivots
+
+
+def _whiten(
+    factor: dict[tuple[int, int], np.ndarray], error: np.ndarray, unit: list[np.ndarray]
+) -> tuple[list[np.ndarray], list[np.ndarray]]:
+    """The squares of L⁻¹e by coordinate, and whether the error is finite there."""
+    known = [np.isfinite(error[..., i]) for i in range(3)]
+    rows: list[np.ndarray] = []
+    for i in range(3):
+        rest = np.where(known[i], error[..., i], 0.0) * unit[i]
+        rest = rest - sum(factor[i, k] * rows[k] for k in range(i))
+        regular = factor[i, i] > 0
+        rows.append(np.where(regular, rest / np.where(regular, factor[i, i], 1.0), 0.0))
+    return [row**2 for row in rows], known
+
+
+def _least_eigenvalue(
+    factor: dict[tuple[int, int], np.ndarray], pivots: list[np.ndarray], size: int
+) -> np.ndarray:
+    """1/tr (L Lᵀ)⁻¹ of the leading block, between a third of its least eigenvalue and all of it; 0
+    where a pivot is."""
+    positive = _every([pivot > 0 for pivot in pivots[:size]])
+    rows: dict[tuple[int, int], np.ndarray] = {}
+    for i in range(size):
+        inverse = 1.0 / np.where(factor[i, i] > 0, factor[i, i], 1.0)
+        rows[i, i] = inverse
+        for j in range(i):
+            rows[i, j] = -inverse * sum(factor[i, k] * rows[k, j] for k in range(j, i))
+    out: np.ndarray = np.where(positive, 1.0 / sum(row**2 for row in rows.values()), 0.0)
+    return out
+
+
+def _every(flags: list[np.ndarray]) -> np.ndarray:
+    out: np.ndarray = np.logical_and.reduce(flags)
+    return out

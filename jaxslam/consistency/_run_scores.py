@@ -1,0 +1,248 @@
+"""The scores of runs: the numbers of each run that a campaign adds up or keeps.
+
+`run_statistics` takes sums over one run's maps and innovations, in JAX; `campaign.block_programs`
+compiles it. `score` takes them, and the poses and infos of many runs, to the measures of each run;
+`tally.condense` takes what that returns.
+
+A run's error is compared with the covariance the filter claims for it. With e = truth - estimate,
+heading wrapped, NEES = eᵀ P⁻¹ e has mean dof for an honest filter; it is *not* divided by dof
+anywhere here. While P is singular (a start with P0 = 0, or a deviation that is rounding; see
+`block_nees`) there is no NEES: such steps are left out, and counted, never filled with 0.
+(Bar-Shalom, Li, Kirubarajan 2001, 5.4; Bailey et al. 2006.)
+"""
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PyTree
+
+from jaxslam.consistency._measures import REGISTRY
+from jaxslam.consistency._measures.associations import association_scores, identities
+from jaxslam.consistency._measures.counts import counted
+from jaxslam.consistency._measures.measure import Measure, Nees, Runs, RunStatistics
+from jaxslam.consistency._measures.nees import block_nees, pose_error
+from jaxslam.core.protocols import Sensor
+from jaxslam.core.types import Estimate, Info, Status, Trace, Truth
+from jaxslam.math import _linalg as linalg
+
+LAGS = 10
+"""Largest lag of the autocorrelation of innovations, in steps."""
+
+_UNROLLED = 4
+"""Measurement slots that are looked at in one piece of compiled code."""
+
+_SNAPSHOTS = 25
+"""Steps of each run at which error and covariance are kept as they are."""
+
+
+class Score(NamedTuple):
+    """The scores of a filter in R runs; those of a run that is not finite mean nothing."""
+
+    finite: Bool[np.ndarray, "R"]
+    """every number of the run is finite."""
+    measures: dict[str, tuple[np.ndarray, np.ndarray]]
+    """averages of each run: the numbers, and their counts; none over 0."""
+    snapshots: tuple[np.ndarray, np.ndarray, np.ndarray]
+    """pose error (R, K, 3), its covariance (R, K, 3, 3), whether that is regular (R, K)."""
+    sums: dict[str, np.ndarray]
+    """sums over runs: counts (R,), and (R, …) of measures."""
+
+
+def snapshot_steps(steps: int) -> np.ndarray:
+    """The steps (K,) of the snapshots, the last among them."""
+    return np.unique(np.round(np.linspace(0, steps - 1, _SNAPSHOTS)).astype(int))
+
+
+def score(
+    trace: Trace,
+    truth: Truth,
+    found: RunStatistics,
+    own_error: Float[np.ndarray, "R T 3"] | None = None,
+) -> Score:
+    """The scores of R runs, by NumPy in float64; every array is the host's and has leading R.
+
+    Args:
+        trace: of the estimate only poses and their covariances are looked at, of the final state
+            its observability monitor (`monitor_of`), and where it has one, of `probe` the
+            information of that after each step (R, T, 3, 3).
+        found: `run_statistics` of each run.
+        own_error: the pose errors in the coordinates of the filter (see `own_error_of`), by default
+            those in (x, y, θ).
+    """
+    pose, cov = map(np.asarray, trace.estimate[:2])
+    error = pose_error(np.asarray(truth.pose), pose)
+    steps = error.shape[1]
+    nees = block_nees(pose, error, error if own_error is None else own_error, cov)
+    landmarks = found.landmark_nees, found.regular_landmarks
+    nees["landmarks"] = Nees(*(np.asarray(x, np.float64) for x in landmarks))
+    sums: dict[str, np.ndarray] = {
+        **counted(trace.info),
+        "missed": np.asarray(truth.missed).sum(axis=1),
+        "singular_steps": steps - nees["pose"].regular.sum(axis=1),
+    }
+    runs = Runs(truth, trace, found, error, nees)
+    measures: dict[str, tuple[np.ndarray, np.ndarray]] = {}
+    finite = np.array(found.finite)
+    for measure in REGISTRY.values():
+        each = measure.of_runs(runs)
+        if each is None:
+            continue
+        total, weight = np.asarray(each.total), np.broadcast_to(each.weight, finite.shape)
+        measures[measure.column] = total, weight
+        sums |= each.sums
+    for rows in jax.tree.leaves((measures, sums)):
+        finite &= np.isfinite(rows).reshape(len(rows), -1).all(axis=1)
+    at = snapshot_steps(steps)
+    return Score(
+        finite=finite,
+        measures=measures,
+        snapshots=(error[:, at], cov[:, at], nees["pose"].regular[:, at]),
+        sums=sums,
+    )
+
+
+class _Sums(NamedTuple):
+    poison: Array
+    """() 0 times every earlier number: NaN once one was not finite"""
+    recent: list[Array]
+    """(LAGS, N) each, the latest steps first: the numbers of w, |w|² and a mask of the values"""
+    pairs: list[Array]
+    """(LAGS, N) each: Σ wᵀw', |w|²|there'|, |there||w'|², |there||there'|"""
+
+
+def run_statistics(
+    trace: Trace, truth: Truth, sensor: Sensor, measures: Sequence[Measure] = ()
+) -> RunStatistics:
+    """The sums over one run that `score` is made of. For `vmap`, over runs.
+
+    measures: those with `of_run` are taken, too. Raises ValueError on one that returns neither a
+    number nor one a step.
+    """
+    estimate, info = trace.estimate, trace.info
+    held = jnp.where(estimate.alive, estimate.tag, -1)
+    values: dict[str, Array | tuple[Array, Array]] = {}
+    if truth.origin is not None:
+        origin = jnp.asarray(truth.origin)
+        held = identities(trace, origin)
+        values |= association_scores(trace, origin, held)
+    points = jax.vmap(sensor.position)(jnp.asarray(truth.landmarks))
+    size, count = info.innovation.shape[2], estimate.alive.shape[1] or info.slot.shape[1]
+    dtype = estimate.pose.dtype
+
+    def step(sums: _Sums, row: tuple[Estimate, Info, Array]) -> tuple[_Sums, PyTree]:
+        estimate, info, held = row
+        off = points[jnp.maximum(held, 0)] - estimate.points
+        nees, regular = _planar_nees(off, jnp.asarray(estimate.point_covs))
+        counts = regular & (held >= 0)
+        white = _white(estimate, info)
+        *w, energy, valid = sums.recent
+        *w_now, energy_now, valid_now = white
+        products = [
+            linalg.total(old * new[None] for old, new in zip(w, w_now, strict=True))
+            if size
+            else jnp.zeros_like(energy),
+            energy * valid_now[None],
+            valid * energy_now[None],
+            valid * valid_now[None],
+        ]
+        sums = _Sums(
+            poison=sums.poison + 0 * _numbers((estimate, info)),
+            recent=[
+                jnp.concatenate([new[None], old[:-1]])
+                for new, old in zip(white, sums.recent, strict=True)
+            ],
+            pairs=[old + new for old, new in zip(sums.pairs, products, strict=True)],
+        )
+        return sums, (jnp.where(counts, nees, 0.0).sum(), counts.sum().astype(dtype))
+
+    first = jax.tree.map(lambda leaf: leaf[0], (estimate, info))
+    nothing = _Sums(
+        poison=jnp.zeros_like(_numbers(first)),
+        recent=[jnp.zeros((LAGS, count), dtype)] * (size + 2),
+        pairs=[jnp.zeros((LAGS, count), dtype)] * 4,
+    )
+    sums, (nees, regular) = jax.lax.scan(step, nothing, (estimate, info, held))
+    product, left, right, pairs = (pair.sum(axis=1) for pair in sums.pairs)
+    both = left * right
+    length = jnp.where(both > 0, jnp.sqrt(jnp.where(both > 0, both, 1.0)), 0.0)
+    named = (held[-1] >= 0) & (estimate.point_covs[-1] != 0).any()  # a known map has no errors
+    off = points[jnp.maximum(held[-1], 0)] - estimate.points[-1]
+    square = jnp.where(named, (off**2).sum(axis=-1), 0.0).sum()
+    return RunStatistics(
+        finite=jnp.isfinite(sums.poison).all(),
+        landmark_nees=nees,
+        regular_landmarks=regular,
+        landmark_squares=jnp.stack([square, named.sum().astype(dtype)]),
+        autocorrelation=jnp.stack([product, length, pairs * size], axis=1),
+        values=values | {one.key: _value(one, trace, truth) for one in measures if one.of_run},
+    )
+
+
+def _value(measure: Measure, trace: Trace, truth: Truth) -> Array:
+    """What a measure is in one run, () or (T,)."""
+    assert measure.of_run is not None
+    dtype, steps = trace.estimate.pose.dtype, len(trace.estimate.pose)
+    value = jnp.asarray(measure.of_run(truth, trace), dtype)
+    if value.shape not in ((), (steps,)):
+        raise ValueError(
+            f"measure {measure.key}: expected of_run to return a number or one for each of the "
+            f"{steps} steps, got an array of shape {value.shape}"
+        )
+    return value
+
+
+def _numbers(tree: PyTree) -> Float[Array, "K"]:
+    """Every floating-point number of a tree, in one row."""
+    leaves = map(jnp.asarray, jax.tree.leaves(tree))
+    return jnp.concatenate(
+        [leaf.ravel() for leaf in leaves if jnp.issubdtype(leaf.dtype, jnp.floating)]
+    )
+
+
+def _planar_nees(
+    error: Float[Array, "N 2"], cov: Float[Array, "N 2 2"]
+) -> tuple[Float[Array, "N"], Bool[Array, "N"]]:
+    """The NEES eᵀ P⁻¹ e of each landmark, and whether P is regular: 1 - ρ² > 200 eps.
+
+    a²/p₁ + (b - a p₁₂/p₁)²/(p₂(1 - ρ²)); 0 where P is not regular or e not finite.
+    """
+    p1, p12, p2 = cov[:, 0, 0], cov[:, 1, 0], cov[:, 1, 1]
+    valid = (p1 > 0) & (p2 > 0) & jnp.isfinite(error).all(axis=1)
+    p1, p2 = (jnp.where(valid, p, 1.0) for p in (p1, p2))
+    left = 1 - (p12 / p1) * (p12 / p2)
+    regular = valid & (left > 200 * float(jnp.finfo(cov.dtype).eps))
+    a = error[:, 0]
+    b = error[:, 1] - a * (p12 / p1)
+    nees = a**2 / p1 + b**2 / (p2 * jnp.where(regular, left, 1.0))
+    return jnp.where(regular, nees, 0.0), regular
+
+
+def _white(estimate: Estimate, info: Info) -> list[Array]:
+    """The numbers of the whitened innovation w, |w|², and 1 where there is one, else 0; (N,) each.
+
+    By landmark, of the first measurement fused with it; by measurement slot without a map.
+    """
+    fused = info.status == Status.FUSED
+
+    def whiten(nu: Array, cov: Array) -> Array:
+        return linalg.solve_lower(linalg.cholesky(cov)[0], nu)
+
+    white = jax.vmap(whiten)(info.innovation, info.innovation_cov)
+    white = jnp.where(fused[:, None], white, 0.0)
+    rows = [*white.T, (white**2).sum(axis=1), fused.astype(white.dtype)]
+    count = estimate.alive.shape[0]
+    if count == 0:
+        return rows
+    slot = jnp.where(fused, info.slot, -1)
+
+    def place(kept: list[Array], at: tuple[list[Array], Array]) -> tuple[PyTree, None]:
+        row, slot = at
+        mine = jnp.arange(count) == slot
+        return [jnp.where(mine, new, old) for new, old in zip(row, kept, strict=True)], None
+
+    nothing = [jnp.zeros(count, white.dtype)] * len(rows)
+    unroll = max(min(len(slot), _UNROLLED), 1)
+    return jax.lax.scan(place, nothing, (rows, slot), reverse=True, unroll=unroll)[0]

@@ -1,0 +1,201 @@
+"""`condense` reduces a block of scores to its sums, and a `Tally` adds such blocks up.
+
+Called by `monte_carlo`: `block` condenses, `campaign` adds in any order and keeps the tallies, and
+`summary.summarize` takes them.
+
+Sums over runs are taken in pairs of float64 (106 bits), so that what they are rounded to does not
+depend on how the runs were divided; Knuth's two-sum, and the sums of Dekker 1971 ("A floating-point
+technique for extending the available precision", Numerische Mathematik 18).
+"""
+
+from collections.abc import Iterable
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxslam.consistency._run_scores import Score
+
+SHOTS = 2048
+"""Snapshots are kept of runs with numbers below this."""
+
+
+class Sum(NamedTuple):
+    """A sum high + low, where low is the rounding error of high."""
+
+    high: np.ndarray
+    low: np.ndarray
+
+
+def plus(a: Sum, b: Sum) -> Sum:
+    """The sum a + b, to about 2⁻¹⁰⁴ of |a| + |b|."""
+    high, rest = _two_sum(a.high, b.high)
+    low, last = _two_sum(a.low, b.low)
+    high, rest = _renormalize(high, rest + low)
+    return Sum(*_renormalize(high, rest + last))
+
+
+def sum_rows(rows: np.ndarray) -> Sum:
+    """The sum over the leading axis, which may be empty."""
+    rows = np.asarray(rows, np.float64)
+    if len(rows) == 0:
+        return Sum(np.zeros(rows.shape[1:]), np.zeros(rows.shape[1:]))
+    parts = Sum(rows, np.zeros_like(rows))
+    while len(parts.high) > 1:
+        even = len(parts.high) // 2 * 2
+        halves = plus(Sum(*(part[:even:2] for part in parts)), Sum(*(p[1:even:2] for p in parts)))
+        rest = (part[even:] for part in parts)
+        parts = Sum(*(np.concatenate(pair) for pair in zip(halves, rest, strict=True)))
+    return Sum(parts.high[0], parts.low[0])
+
+
+def condense(scores: Score, first: int, limit: float) -> dict[str, np.ndarray]:
+    """The arrays that a tally keeps of runs first, first + 1, … (leading axis), by name.
+
+    limit [m]: a finite run is divergent when its final position error exceeds it.
+    """
+    runs, finite = len(scores.finite), np.asarray(scores.finite)
+
+    def without_lost(rows: np.ndarray) -> np.ndarray:
+        rows = np.asarray(rows)
+        return np.where(finite.reshape(-1, *(1,) * (rows.ndim - 1)), rows, np.zeros_like(rows))
+
+    snapshots = [without_lost(leaf) for leaf in scores.snapshots]
+    far = np.sqrt((snapshots[0][:, -1, :2] ** 2).sum(axis=1)) > limit
+    out = {"finite": finite, "divergent": finite & far}
+    for name, (whole, weight) in scores.measures.items():
+        whole, weight = without_lost(whole), without_lost(weight).astype(whole.dtype)
+        out[f"defined/{name}"] = weight > 0
+        out[f"measure/{name}"] = whole / np.where(weight > 0, weight, 1)
+    kept = max(min(runs, SHOTS - first), 0)
+    for i, leaf in enumerate(snapshots):
+        out[f"snapshot/{i}"] = leaf[:kept]
+    return out | condensed_sums({name: without_lost(rows) for name, rows in scores.sums.items()})
+
+
+def condensed_sums(per_run: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
+    """The sums over the runs of named arrays, as `Tally.add` takes them."""
+    out = {}
+    for name, rows in per_run.items():
+        out[f"high/{name}"], out[f"low/{name}"] = sum_rows(np.asarray(rows))
+    return out
+
+
+class Tally:
+    """The sum of condensed blocks of scores, added in any order."""
+
+    def __init__(self) -> None:
+        self._sums: dict[str, Sum] = {}
+        self._blocks: dict[int, dict[str, np.ndarray]] = {}
+        """by first run; blocks that follow each other are joined"""
+        self._runs: dict[int, int] = {}
+        self._begins: dict[int, int] = {}
+        """first run of the block that ends at a run"""
+
+    def add(self, first: int, runs: int, block: dict[str, np.ndarray]) -> None:
+        """Add what `condense` returned of runs first … first + runs - 1."""
+        kept = {}
+        for name, value in block.items():
+            kind, _, what = name.partition("/")
+            if kind == "high":
+                new = Sum(value, block[f"low/{what}"])
+                self._sums[what] = plus(self._sums[what], new) if what in self._sums else new
+            elif kind != "low":
+                kept[name] = value
+        self._place(first, runs, kept)
+        self._join(first)
+
+    def merge(self, other: "Tally") -> None:
+        """Add the blocks of another tally, of other runs."""
+        for name, value in other._sums.items():
+            self._sums[name] = plus(self._sums[name], value) if name in self._sums else value
+        for first, runs in other._runs.items():
+            self._place(first, runs, other._blocks[first])
+
+    def _place(self, first: int, runs: int, block: dict[str, np.ndarray]) -> None:
+        self._blocks[first], self._runs[first] = block, runs
+        self._begins[first + runs] = first
+
+    def _join(self, first: int) -> None:
+        """Join a block with its neighbours, as long as these have no more runs.
+
+        So arrays are few, each run is copied a logarithm of times, and a campaign keeps about the
+        numbers alone: those of a block of 16 runs are a quarter of what their arrays take.
+        """
+        while True:
+            runs = self._runs[first]
+            left, right = self._begins.get(first), first + runs
+            if left is not None and self._runs[left] <= runs:
+                pair = left, first
+            elif right in self._runs and self._runs[right] <= runs:
+                pair = first, right
+            else:
+                return
+            runs = sum(self._runs.pop(one) for one in pair)
+            one, other = (self._blocks.pop(one) for one in pair)
+            joined = {
+                name: np.concatenate([value, other[name]]) if value.ndim else value
+                for name, value in one.items()
+            }
+            del self._begins[pair[1]]
+            first = pair[0]
+            self._place(first, runs, joined)
+
+    @property
+    def sums(self) -> dict[str, np.ndarray]:
+        """The sums over all runs, rounded to float64."""
+        return {name: value.high + value.low for name, value in self._sums.items()}
+
+    def pieces(self) -> list[tuple[int, int]]:
+        """The pieces (first, runs) that the blocks cover, in order; adjacent blocks may be one."""
+        return sorted(self._runs.items())
+
+    def numbers(self) -> np.ndarray:
+        """The numbers of the runs (runs,), in order."""
+        return _joined(np.arange(first, first + runs) for first, runs in self.pieces())
+
+    def flags(self, name: str) -> np.ndarray:
+        """Whether each run is finite, or divergent: flags (runs,)."""
+        return self._all(name)
+
+    def first(self, name: str) -> np.ndarray:
+        """A named array of the first block."""
+        return self._blocks[min(self._blocks)][name]
+
+    def measures(self) -> dict[str, np.ndarray]:
+        """Each run's average (runs,), NaN where it has none."""
+        some = next(iter(self._blocks.values()))
+        names = [name.removeprefix("measure/") for name in some if name.startswith("measure/")]
+        return {
+            name: np.where(
+                self._all(f"defined/{name}"),
+                self._all(f"measure/{name}").astype(np.float64),
+                np.nan,
+            )
+            for name in names
+        }
+
+    def snapshots(self) -> list[np.ndarray]:
+        """Errors (R, K, 3), covariances (R, K, 3, 3), regular (R, K), of the first finite runs."""
+        parts = [self._all(f"snapshot/{i}") for i in range(3)]
+        finite = self.flags("finite")[self.numbers() < SHOTS]
+        return [part[finite] for part in parts]
+
+    def _all(self, name: str) -> np.ndarray:
+        return _joined(self._blocks[first][name] for first in sorted(self._blocks))
+
+
+def _joined(parts: Iterable[np.ndarray]) -> np.ndarray:
+    return np.concatenate(list(parts))
+
+
+def _two_sum(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The sum a + b rounded, and the exact error of that rounding."""
+    high = a + b
+    of_b = high - a
+    return high, (a - (high - of_b)) + (b - of_b)
+
+
+def _renormalize(high: np.ndarray, low: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The sum high + low rounded, and the exact error of that rounding, for |high| >= |low|."""
+    out = high + low
+    return out, low - (out - high)

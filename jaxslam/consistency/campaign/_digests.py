@@ -1,0 +1,190 @@
+"""The identity of a campaign: what must agree for two blocks of runs to be of one campaign.
+
+World, filters and key are data, so it is their structure and their numbers, bit by bit, with the
+versions and a digest of the package's source. Of classes and functions outside the package it is
+their code too, with what that refers to: an edited line of a user's model is another campaign; a
+comment or a renamed file is not. Not seen: what other packages compute, and flags of XLA.
+"""
+
+import dataclasses
+import functools
+import hashlib
+import importlib.resources
+import inspect
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from types import CodeType, FunctionType
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import DTypeLike
+
+from jaxslam.consistency._measures import BUILT_IN, REGISTRY
+from jaxslam.core._record import is_record
+from jaxslam.core.protocols import Candidate
+from jaxslam.simulation._worlds import World
+
+_PACKAGE = Path(str(importlib.resources.files("jaxslam")))
+
+_OF_WORLD = ("landmarks", "controls", "pose", "pose_cov", "motion", "sensor")
+"""Parts of a world that are named where they differ."""
+
+_NO_PART_OF_DRAWS = frozenset({"name", "published", "source", "filter_options"})
+"""Fields of a world that do not change its draws."""
+
+_BY_DATACLASS = frozenset({"__init__", "__repr__", "__setattr__", "__delattr__", "__replace__"})
+"""Methods that are made of the fields."""
+
+_CONSTANT = (str, bytes, bool, int, float, complex, tuple, frozenset, np.ndarray, jax.Array)
+"""Attributes of a user's class that its methods may read."""
+
+
+def identity(
+    scenario: World,
+    filters: Mapping[str, Candidate],
+    key: jax.Array,
+    platform: str,
+    bound: bool = False,
+    dtype: DTypeLike | None = None,
+) -> dict[str, str]:
+    """A short text by the name of each thing that must agree.
+
+    The number of runs is not part of it: run i has its key. platform: of the devices that
+    compute, as "cpu"; rounding differs between platforms.
+    """
+    parts = {name: digest(getattr(scenario, name)) for name in _OF_WORLD}
+    registered = [one for one in REGISTRY.values() if one not in BUILT_IN]
+    fields = {field.name for field in dataclasses.fields(scenario)} - _NO_PART_OF_DRAWS
+    rest = {
+        f"world's {name}": digest(getattr(scenario, name))
+        for name in sorted(fields - set(_OF_WORLD))
+    }
+    return {
+        **{name: _version(name) for name in ("jaxslam", "jax", "jaxlib")},
+        "source": _source(),
+        "platform": platform,
+        "dtype": str(jnp.result_type(float) if dtype is None else jnp.dtype(dtype)),
+        "drawn in": str(jnp.result_type(float)),
+        "key": _key(key),
+        "bound": "yes" if bound else "no",
+        "filters": ", ".join(filters),
+        "scenario": scenario.name,
+        "steps": str(scenario.steps),
+        **parts,
+        "world": digest(type(scenario)),
+        **rest,
+        **{f"filter {name}": digest(candidate) for name, candidate in filters.items()},
+        **{f"measure {one.key}": digest((type(one), one.of_run)) for one in registered},
+    }
+
+
+def digest(value: object) -> str:
+    """A digest of records, arrays, functions and what they hold."""
+    return _short(_text(value, ()))
+
+
+def _text(value: object, within: tuple[object, ...]) -> str:
+    """A value as text, the same in every process. within: the functions that refer to it."""
+    if value is None or isinstance(value, str | bytes | bool | int | float | complex):
+        return repr(value)
+    if isinstance(value, jax.Array) and jnp.issubdtype(value.dtype, jax.dtypes.prng_key):
+        return _key(value)
+    if isinstance(value, np.ndarray | np.generic | jax.Array):
+        array = np.ascontiguousarray(value)
+        return f"{array.shape} {array.dtype} {hashlib.sha256(array.tobytes()).hexdigest()}"
+    if isinstance(value, Mapping):
+        return str([(str(k), _text(value[k], within)) for k in sorted(value, key=str)])
+    if is_record(value):
+        fields = [field.name for field in dataclasses.fields(value)]  # type: ignore[arg-type]
+        held = [(name, _text(getattr(value, name), within)) for name in fields]
+        return f"{_text(type(value), within)} {held}"
+    if isinstance(value, tuple | list):
+        return f"{type(value).__qualname__} {[_text(part, within) for part in value]}"
+    if isinstance(value, frozenset):
+        return f"frozenset {sorted(_text(part, within) for part in value)}"
+    if isinstance(value, functools.partial):
+        return _text((value.func, value.args, value.keywords), within)
+    if isinstance(value, type):
+        return _text_of_class(value, within)
+    inner = getattr(value, "__wrapped__", getattr(value, "__func__", value))
+    if isinstance(inner, FunctionType):
+        bound = _text(getattr(value, "__self__", None), within)
+        return f"{bound} {_text_of_function(inner, within)}"
+    if isinstance(value, CodeType):
+        return str([value.co_code.hex(), value.co_names, _text(value.co_consts, within)])
+    return _name(value)
+
+
+def _text_of_class(cls: type, within: tuple[object, ...]) -> str:
+    parts = {
+        name: getattr(part, "fget", getattr(part, "__func__", part))
+        for name, part in vars(cls).items()
+    }
+    methods = {
+        name: part
+        for name, part in parts.items()
+        if isinstance(part, FunctionType) and _of_user(part) and name not in _BY_DATACLASS
+    }
+    if not methods or cls in within or cls.__module__.startswith("jaxslam."):
+        return _name(cls)
+    constants = {
+        name: part
+        for name, part in parts.items()
+        if not name.startswith("__") and isinstance(part, _CONSTANT)
+    }
+    within = (*within, cls)
+    return f"{cls.__qualname__} {_text((methods, constants, cls.__bases__), within)}"
+
+
+def _text_of_function(function: FunctionType, within: tuple[object, ...]) -> str:
+    if not _of_user(function) or function in within:
+        return _name(function)
+    within = (*within, function)
+    held = inspect.getclosurevars(function)
+    values = {**held.globals, **held.nonlocals}
+    parts = (function.__code__, function.__defaults__, function.__kwdefaults__, values)
+    return _text(parts, within)
+
+
+def _of_user(function: FunctionType) -> bool:
+    """Whether code is neither of the package, nor of Python, nor of an installed package."""
+    path = Path(function.__code__.co_filename)
+    python = Path(inspect.__file__).parent
+    installed = {"site-packages", "dist-packages"} & set(path.parts)
+    return not (installed or path.is_relative_to(_PACKAGE) or path.is_relative_to(python))
+
+
+def _name(value: object) -> str:
+    of = value if hasattr(value, "__qualname__") else type(value)
+    return f"{of.__module__}.{of.__qualname__}"
+
+
+def _short(text: str) -> str:
+    return hashlib.sha256(text.encode()).hexdigest()[:16]
+
+
+def _key(key: jax.Array) -> str:
+    """A PRNG key as text: its kind and its numbers."""
+    typed = jnp.issubdtype(key.dtype, jax.dtypes.prng_key)
+    data = np.asarray(jax.random.key_data(key) if typed else key)
+    kind = str(jax.random.key_impl(key)) if typed else "raw"
+    return f"{kind} {':'.join(map(str, data.ravel().tolist()))}"
+
+
+def _version(name: str) -> str:
+    try:
+        return version(name)
+    except PackageNotFoundError:  # run from its source, as by PYTHONPATH
+        return "not installed"
+
+
+@functools.cache
+def _source() -> str:
+    """A digest of every source file of the package."""
+    total = hashlib.sha256()
+    for path in sorted(_PACKAGE.rglob("*.py")):
+        total.update(f"{path.relative_to(_PACKAGE).as_posix()}\n".encode())
+        total.update(path.read_bytes().replace(b"\r\n", b"\n"))
+    return total.hexdigest()[:16]

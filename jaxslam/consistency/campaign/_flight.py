@@ -1,0 +1,148 @@
+"""The blocks of a campaign that are being computed, in threads or on the workers of an executor."""
+
+import contextlib
+import time
+import warnings
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_COMPLETED, BrokenExecutor, CancelledError, Future, wait
+from dataclasses import dataclass, field
+from typing import Any
+
+import jax
+
+from jaxslam.consistency.campaign._block import BlockResult
+from jaxslam.consistency.campaign._result import Incomplete
+
+Piece = tuple[int, int]
+"""(first, runs) of a block"""
+
+TRIES = 3
+"""How often a block is computed on an executor, at most."""
+
+_LATE = 60.0
+"""A block is late after this time [s], and after ten times the longest of those before it."""
+
+
+def out_of_memory(error: BaseException) -> bool:
+    """Whether an error says that a block needs more memory than there is."""
+    whole = isinstance(error, jax.errors.JaxRuntimeError) and "RESOURCE_EXHAUSTED" in str(error)
+    return whole or isinstance(error, MemoryError)
+
+
+def _is_of_the_code(error: BaseException) -> bool:
+    """Whether the code that is run would raise an error on every worker."""
+    return isinstance(error, ValueError | TypeError | ImportError) or out_of_memory(error)
+
+
+@dataclass
+class _Block:
+    futures: list[tuple[Any, float]] = field(default_factory=list)
+    """those in flight, with the time when each began"""
+    tries: int = 0
+
+
+@dataclass
+class Flight:
+    """The blocks in flight."""
+
+    submit: Callable[[int, int], Any]
+    """begins the block (first, runs), and returns its future"""
+    tries: int = 1
+    """how often a block is begun, at most, where it fails or is late"""
+    _blocks: dict[Piece, _Block] = field(default_factory=dict)
+    _longest: float = 0.0
+    """time from the beginning of a block to its end"""
+    _ends: bool = False
+
+    def __len__(self) -> int:
+        return len(self._blocks)
+
+    def start(self, piece: Piece) -> None:
+        """Begin a block, or begin it once more.
+
+        Raises Incomplete if the executor takes no more.
+        """
+        try:
+            future = self.submit(*piece)
+        except Exception as error:
+            raise self._given_up(error) from error
+        block = self._blocks.setdefault(piece, _Block())
+        block.futures.append((future, time.monotonic()))
+        block.tries += 1
+
+    def cancel(self) -> None:
+        """Cancel the blocks that have not begun, and begin none once more."""
+        self._ends = True
+        for block in self._blocks.values():
+            for future, _ in block.futures:
+                with contextlib.suppress(AttributeError):  # not every engine has it
+                    future.cancel()
+
+    def finished(self) -> Iterator[tuple[Piece, BlockResult | BaseException]]:
+        """The results of the blocks that have ended since, or the error of one that failed.
+
+        Waits until a block ends, for a second at most.
+        """
+        self._wait()
+        for piece, block in list(self._blocks.items()):
+            found = self._result(block)
+            if isinstance(found, BaseException) and self._once_more(piece, block, found):
+                found = None
+            if found is not None:
+                del self._blocks[piece]
+                yield piece, self._given_up(found) if isinstance(found, BaseException) else found
+
+    def _given_up(self, error: BaseException) -> BaseException:
+        """The error of a block that is not computed again: of an executor an `Incomplete`."""
+        if self.tries == 1 or not isinstance(error, Exception) or _is_of_the_code(error):
+            return error
+        broken = isinstance(error, BrokenExecutor) and self._longest == 0
+        hint = "; does the script begin under `if __name__ == '__main__':`?" * broken
+        incomplete = Incomplete(f"{type(error).__name__}: {error}{hint}")
+        incomplete.__cause__ = error
+        return incomplete
+
+    def _wait(self) -> None:
+        futures = [future for block in self._blocks.values() for future, _ in block.futures]
+        if all(isinstance(future, Future) for future in futures):
+            wait(futures, 1.0, FIRST_COMPLETED)
+        elif not any(future.done() for future in futures):
+            time.sleep(0.1)
+
+    def _result(self, block: _Block) -> BlockResult | BaseException | None:
+        """The result of a block, its error once no future is left, or None."""
+        error: BaseException | None = None
+        for future, began in [one for one in block.futures if one[0].done()]:
+            block.futures.remove((future, began))
+            try:
+                error = future.exception()
+            except CancelledError as cancelled:
+                error = cancelled
+            if error is None:
+                self._longest = max(self._longest, time.monotonic() - began)
+                result: BlockResult = future.result()
+                return result
+        if not block.futures:
+            return error
+        late = max(_LATE, 10 * self._longest)
+        # Before the first result the workers compile, which takes as long as it takes.
+        judged = self.tries > 1 and self._longest > 0
+        if judged and time.monotonic() - block.futures[-1][1] > late:
+            return TimeoutError(f"no result after {late:.0f} s")
+        return None
+
+    def _once_more(self, piece: Piece, block: _Block, error: BaseException) -> bool:
+        """Begin a block once more, and warn, unless that is in vain; whether it was begun."""
+        in_vain = self._ends or block.tries >= self.tries
+        if in_vain or not isinstance(error, Exception) or _is_of_the_code(error):
+            return False
+        try:
+            self.start(piece)
+        except Exception:  # an executor that has been given up
+            return False
+        warnings.warn(
+            f"monte_carlo: runs {piece[0]} to {sum(piece) - 1} are computed once more "
+            f"({type(error).__name__}: {error})",
+            stacklevel=2,
+        )
+        return True

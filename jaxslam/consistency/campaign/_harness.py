@@ -1,0 +1,268 @@
+"""The campaign: blocks of runs over devices, kept as they finish, then summed up.
+
+A run is a number: its key and its place in a block. For one size of blocks and one number of
+devices its world and its filters' results are the same to the bit, for any workers, parts and
+interruptions; otherwise to rounding. Only scores are kept of a block, so
+memory is that of the blocks in flight however many runs there are.
+
+On a GPU particle filters agree to rounding alone (`docs/guide/campaigns.md`).
+"""
+
+import time
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import replace
+from typing import Literal
+
+import jax
+import numpy as np
+from jax.typing import DTypeLike
+
+from jaxslam.consistency import Summary
+from jaxslam.consistency._summary import summarize
+from jaxslam.consistency._tally import Tally
+from jaxslam.consistency.campaign._block import BOUND, CampaignPlan
+from jaxslam.consistency.campaign._candidates import (
+    check_dtype,
+    check_fits,
+    check_noise,
+    fitting_block,
+    without_noise,
+)
+from jaxslam.consistency.campaign._digests import identity
+from jaxslam.consistency.campaign._kept import Keep, add_kept
+from jaxslam.consistency.campaign._pieces import check_part, cores, in_part, missing
+from jaxslam.consistency.campaign._remote import Executor
+from jaxslam.consistency.campaign._result import Campaign, Incomplete, Interrupted
+from jaxslam.consistency.campaign._work import Work, shown_progress
+from jaxslam.core._numbers import check_count, check_key, is_concrete
+from jaxslam.core._validation import check_record
+from jaxslam.core.protocols import Candidate
+from jaxslam.simulation._worlds import World, with_positions
+
+
+def monte_carlo(
+    scenario: World,
+    filters: Mapping[str, Candidate],
+    runs: int,
+    key: jax.Array,
+    *,
+    block: int | None = None,
+    devices: Sequence[jax.Device] | None = None,
+    workers: int | None = None,
+    bound: bool = False,
+    dtype: DTypeLike | None = None,
+    keep: Keep | None = None,
+    part: tuple[int, int] | None = None,
+    progress: Callable[[int, int], None] | Literal[False] | None = None,
+    executor: Executor | None = None,
+) -> Campaign:
+    """Run every filter over the same `runs` worlds of a scenario and sum up its consistency.
+
+    Args:
+        scenario: what to draw; see `scenarios`.
+        filters: by name. A function instead of a filter is called with each run's `Truth`.
+        runs: how many worlds; run i has key fold_in(key, i).
+        key: a PRNG key.
+        block: runs vmapped together on a device, which sets memory; default 16 on a CPU, and
+            by its memory on an accelerator. Where memory does not suffice, half of it is tried,
+            with a warning.
+        devices: default all of `jax.local_devices()`.
+        workers: blocks in flight at once; default as many as keep every core of a CPU busy (2 on an
+            accelerator), and 64 with an executor.
+        bound: also take the conditional Cramér-Rao bound of every run (`conditional_bound`), at
+            the price of one more EKF.
+        dtype: float32 or float64, of the worlds and so of the filters. With `jax_enable_x64` worlds
+            are drawn in float64 and then rounded: both see the same. Default what JAX is set to.
+        keep: blocks are saved there as they finish, and those found there are not run again. It
+            holds one campaign: what must agree (key, scenario, models, filters, precision,
+            versions) is its `identity`. More runs than it has extend it.
+        part: (i, n) with 1 <= i <= n: only the blocks i - 1, i - 1 + n, … are computed, and the
+            returned campaign covers them. So n independent jobs compute a
+            campaign, each with a `keep` from `store.open` on one folder, with the same block and
+            number of devices; without `part` the blocks are summed up, and those that are missing
+            computed.
+        progress: called with (runs done, runs) after each block. Default a bar with
+            rate and remaining time, only on a terminal and in a notebook; False: none.
+        executor: where the blocks are computed, in place of this process: any object with the
+            `submit` of `concurrent.futures`, as `ProcessPoolExecutor`, Dask's, mpi4py's. Each
+            worker compiles the programs once and has one device, so results are the bits of
+            `devices` of one. A block whose worker dies, fails or is late is computed again.
+    Returns:
+        Campaign.
+    Raises:
+        ValueError: on runs, block or workers below 1, more runs than are recorded, no PRNG key, no
+            devices, no filters, a filter that does not fit the scenario, or a noise that is no
+            covariance, before anything is traced; where `keep` holds another campaign, by every
+            difference, or runs beyond the requested ones; on a part without a block.
+        MemoryError: if one run a device is too much.
+        Interrupted: on Ctrl-C, with the campaign so far.
+        Incomplete: where an executor computes no more, with the campaign so far.
+    """
+    _check(scenario, filters, runs, key, block, workers, devices, keep, part, progress, executor)
+    began, runs = time.perf_counter(), int(runs)
+    devices = jax.local_devices() if devices is None else list(devices)
+    if executor is not None:
+        devices = devices[:1]  # as every worker
+    dtype = check_dtype(dtype)
+    if workers is None and executor is not None:
+        workers = 64
+    if workers is None:
+        # An accelerator computes a block while the host scores the one before: 1.4 times the runs a
+        # second of one block at a time on an H100, and no more with three.
+        workers = -(-cores() // len(devices)) if devices[0].platform == "cpu" else 2
+    names = (*filters, BOUND)
+    tallies = {name: Tally() for name in names}
+    size = int(block or fitting_block(scenario, filters, devices[0]))
+    plan = CampaignPlan(scenario, filters, key, devices, size, bound, dtype)
+    if part is not None and (part[0] - 1) * plan.wide >= runs:
+        raise ValueError(
+            f"monte_carlo: part: expected one of the {-(-runs // plan.wide)} blocks of {plan.wide} "
+            f"runs that {runs} runs are, got part {part[0]} of {part[1]}"
+        )
+    finished: list[tuple[int, int]] = []
+    if keep is not None:
+        keep.claim(identity(scenario, filters, key, devices[0].platform, bound, dtype))
+        finished = add_kept(tallies, keep, runs, lambda first: in_part(first, plan.wide, part))
+    pieces = missing(finished, runs, plan.wide)
+    todo = [piece for piece in pieces if in_part(piece[0], plan.wide, part)]
+    work = Work(workers, keep, progress or None, {name: Tally() for name in names}, executor)
+    stop: KeyboardInterrupt | Incomplete | None = None
+    try:
+        with shown_progress(work, plan, progress is None):
+            work.in_blocks_that_fit(plan, todo)
+    except (KeyboardInterrupt, Incomplete) as error:
+        stop = error
+    for name, tally in work.tallies.items():
+        tallies[name].merge(tally)
+    campaign = None
+    if tallies[BOUND].pieces():
+        campaign = _summed_up(plan, tallies, work, time.perf_counter() - began)
+    if isinstance(stop, Incomplete):
+        done = f"{campaign.runs if campaign else 0} of {runs} runs done"
+        raise Incomplete(f"monte_carlo: executor: {stop}; {done}", campaign) from stop.__cause__
+    if stop is not None or campaign is None:
+        raise Interrupted(campaign, runs)
+    return campaign
+
+
+def _check(
+    scenario: World,
+    filters: Mapping[str, Candidate],
+    runs: int,
+    key: jax.Array,
+    block: int | None,
+    workers: int | None,
+    devices: Sequence[jax.Device] | None,
+    keep: Keep | None,
+    part: object,
+    progress: object,
+    executor: object,
+) -> None:
+    """Raise ValueError on arguments that `monte_carlo` does not take."""
+    for name, value in (("runs", runs), ("block", block), ("workers", workers)):
+        if value is not None:
+            check_count(f"monte_carlo: {name}", value)
+    if part is not None:
+        check_part("monte_carlo: part", part)
+    check_record("monte_carlo", "scenario", scenario, World)
+    if (most := scenario.recorded_runs) is not None and runs > most:
+        raise ValueError(
+            f"monte_carlo: runs: expected at most {most}, the recorded runs of {scenario.name}, "
+            f"got {runs}"
+        )
+    check_key("monte_carlo", key)
+    if not isinstance(filters, Mapping) or not filters:
+        got = "none" if isinstance(filters, Mapping) else f"a {type(filters).__name__}"
+        raise ValueError(
+            f"monte_carlo: expected filters as {{name: filter}}, at least one, got {got}"
+        )
+    if not is_concrete(key):
+        raise ValueError("monte_carlo: it compiles its own programs: call it outside of jax.jit")
+    for name, candidate in filters.items():
+        check_fits(name, candidate, scenario)
+    check_noise(scenario)
+    if devices is not None and not isinstance(devices, Sequence):
+        raise ValueError(
+            f"monte_carlo: expected devices as from jax.local_devices(), got {devices!r}"
+        )
+    submits = callable(getattr(executor, "submit", None)) and not isinstance(executor, type)
+    if executor is not None and not submits:
+        raise ValueError(
+            "monte_carlo: expected executor as of concurrent.futures, with a method submit, got "
+            f"{executor!r:.60}"
+        )
+    if executor is not None and devices is not None:
+        raise ValueError(
+            "monte_carlo: devices: each worker of an executor uses its first device: expected none"
+        )
+    if devices is not None and not devices:
+        raise ValueError("monte_carlo: expected at least one device, got none")
+    if keep is not None and not all(
+        callable(getattr(keep, name, None)) for name in ("claim", "save", "blocks")
+    ):
+        raise ValueError(
+            "monte_carlo: expected keep as from jaxslam.store.open(folder) or .resume(folder), "
+            f"got {keep!r}"
+        )
+    if not (progress is None or progress is False or callable(progress)):
+        raise ValueError(
+            "monte_carlo: expected progress as a function of (runs done, runs), or False for none, "
+            f"got {progress!r}"
+        )
+
+
+def summaries_of(tallies: dict[str, Tally]) -> tuple[int, np.ndarray, dict[str, Summary]]:
+    """How many runs there are, the divergence limit, and the summary of each filter."""
+    finished = sum(count for _, count in tallies[BOUND].pieces())
+    bound = {name: total / finished for name, total in tallies[BOUND].sums.items()} or None
+    found = {name: summarize(one, bound) for name, one in tallies.items() if name != BOUND}
+    return finished, tallies[BOUND].first("limit"), found
+
+
+def _summed_up(
+    plan: CampaignPlan, tallies: dict[str, Tally], work: Work, seconds: float
+) -> Campaign:
+    """The campaign of the runs in the tallies."""
+    scenario = plan.scenario
+    finished, limit, summaries = summaries_of(tallies)
+    steps = max(scenario.steps, 1)
+    return Campaign(
+        scenario=scenario.name,
+        source=scenario.source,
+        published={name: dict(values) for name, values in scenario.published.items()},
+        steps=scenario.steps,
+        runs=finished,
+        dtype=str(limit.dtype),
+        divergence_limit=float(limit),
+        filters=_qualify(summaries, scenario),
+        seconds=seconds,
+        compile_seconds=work.compile_seconds,
+        step_seconds={name: seconds / steps for name, seconds in work.run_seconds().items()},
+        first={
+            name: (jax.device_get(with_positions(scenario.sensor, truth)), estimate)
+            for name, (truth, estimate) in work.first.items()
+        },
+        run_numbers=tallies[BOUND].numbers(),
+    )
+
+
+def _qualify(found: dict[str, Summary], scenario: World) -> dict[str, Summary]:
+    """The summaries, with a doubt on those that an exact sensor left without a covariance."""
+    dropped = {name: one.counts.get("singular", 0) for name, one in found.items()}
+    exact = without_noise(scenario) if any(dropped.values()) else ""
+    if not exact:
+        return found
+    return {
+        name: replace(
+            one,
+            doubts=(
+                *one.doubts,
+                f"the sensor has {exact} without noise, so innovation covariances were singular: "
+                f"{dropped[name]:,} measurements were dropped and others weighted by rounding "
+                "errors; give the sensor a small noise",
+            ),
+        )
+        if dropped[name]
+        else one
+        for name, one in found.items()
+    }

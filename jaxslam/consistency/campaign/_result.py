@@ -1,0 +1,145 @@
+"""The result of a campaign, `Campaign`: its summaries, and how it is shown, saved and tabulated."""
+
+import importlib
+import textwrap
+from collections.abc import Iterable
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from jaxslam.consistency import Summary
+from jaxslam.core._names import Named
+from jaxslam.core.types import Estimate, Truth
+
+
+@dataclass(frozen=True, repr=False)
+class Campaign:
+    """The result of a campaign: its settings, and a `Summary` for each filter by name.
+
+    `print(campaign)` is the table of verdicts and measures that the command prints, and a notebook
+    shows verdicts and figures. `save` writes the whole report, `to_dataframe` has the runs.
+    """
+
+    scenario: str
+    source: str
+    published: dict[str, dict[str, float]]
+    steps: int
+    runs: int
+    dtype: str
+    divergence_limit: float
+    """final position error beyond which a run is divergent [m]: 5 σ, with σ² = tr P of the position
+    at the end of an EKF with Jacobians at the truth, in run 0"""
+    filters: dict[str, Summary]
+    seconds: float
+    """wall time, compilation included."""
+    compile_seconds: float
+    """wall time until the last program was traced, and compiled or loaded, while earlier blocks may
+    already run; 0 if no run was left"""
+    step_seconds: dict[str, float]
+    """Wall time of a step of one run on one device, by filter: the median over the blocks of this
+    process, if possible those without compilation beside them. Blocks may overlap. Filters that
+    this process did not time are absent."""
+    first: dict[str, tuple[Truth, Estimate]] = field(default_factory=dict)
+    """Run 0 by filter, host arrays; absent for filters that this process did not run. For
+    landmarks other than points, the truth has their positions."""
+    run_numbers: np.ndarray = field(default_factory=lambda: np.arange(0))
+    """(runs,) the number of each run, in the order of `Summary.per_run`; run i has key
+    fold_in(key, i)"""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "filters", Named(self.filters))
+
+    @property
+    def size(self) -> str:
+        """Runs, steps and precision, as "100 runs × 40 steps, float64"."""
+        counts = (
+            f"{n} {what}" + "s" * (n != 1) for n, what in ((self.runs, "run"), (self.steps, "step"))
+        )
+        return f"{' × '.join(counts)}, {self.dtype}"
+
+    def __repr__(self) -> str:
+        verdicts = ", ".join(f"{name}={s.verdict}" for name, s in self.filters.items())
+        text = f"Campaign({self.scenario}, {self.size}, {verdicts})"
+        return textwrap.fill(text, 100, subsequent_indent="    ", break_long_words=False)
+
+    def __str__(self) -> str:
+        from jaxslam.results import _report as report
+
+        return report.campaign_table(self)
+
+    def _repr_html_(self) -> str:
+        """Verdicts, two figures and all measures as HTML, for a notebook."""
+        from jaxslam.results import _campaign_files as campaign_files
+
+        return campaign_files.notebook(self)
+
+    def save(
+        self,
+        folder: str | Path,
+        figures: Iterable[str] = ("png",),
+        overwrite: bool = False,
+    ) -> list[Path]:
+        """Write the report into a folder, and return the paths of its files.
+
+        They are report.html (one page with its figures embedded), consistency.json (verdicts,
+        measures and counts), measures.csv (the table of them), consistency.csv (the averages of
+        every step) and the figures. All of them appear when all are complete, or none. Two figures
+        show run 0 of each filter; they are left out where this process did not compute that run
+        (`first`).
+
+        Args:
+            folder: it is created if needed.
+            figures: formats of the files of figures, of png, pdf and svg; () writes none.
+            overwrite: whether files of these names that are in the folder are replaced. Figures of
+                another campaign's report are then removed.
+        Raises:
+            ValueError: on another format, an empty name of a folder, and on the first file that is
+                there already unless it may be overwritten.
+            OSError: if the folder cannot be written, before anything is drawn.
+        """
+        from jaxslam.results import _campaign_files as campaign_files
+
+        return campaign_files.save_campaign(self, folder, figures, overwrite)
+
+    def to_dataframe(self) -> Any:
+        """A pandas DataFrame with a row for each run of each filter.
+
+        Columns: filter; run, its number; finite, whether the filter's numbers were; and each
+        measure of `Summary.per_run`, averaged over the steps of that run. Squares are in m² or
+        rad², as square_position, whose mean over runs has the RMSE as its root. NaN: the run has no
+        such average.
+
+        Raises:
+            ImportError: where pandas is not installed; jaxslam does not require it.
+        """
+        try:
+            pandas = importlib.import_module("pandas")
+        except ImportError:
+            raise ImportError(
+                "Campaign.to_dataframe needs pandas, which is not installed: pip install pandas"
+            ) from None
+        from jaxslam.results import _report as report
+
+        return pandas.DataFrame(report.run_columns(self))
+
+
+class Interrupted(KeyboardInterrupt):
+    """Ctrl-C, raised after the blocks in flight; `campaign` covers the finished runs, if any."""
+
+    def __init__(self, campaign: Campaign | None, runs: int) -> None:
+        super().__init__(f"{campaign.runs if campaign else 0} of {runs} runs done")
+        self.campaign = campaign
+        if campaign is not None:
+            self.add_note("The field `campaign` of this exception has the finished runs.")
+
+
+class Incomplete(RuntimeError):
+    """The workers of an executor failed; `campaign` covers the finished runs, if any."""
+
+    def __init__(self, message: str, campaign: Campaign | None = None) -> None:
+        super().__init__(message)
+        self.campaign = campaign
+        if campaign is not None:
+            self.add_note("The field `campaign` of this exception has the finished runs.")

@@ -1,0 +1,134 @@
+"""The missing blocks of a campaign, computed several at once, and the bar of progress."""
+
+import contextlib
+import warnings
+from collections import defaultdict
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass, field, replace
+
+import jax
+import numpy as np
+from threadpoolctl import threadpool_limits
+
+from jaxslam.consistency._tally import Tally
+from jaxslam.consistency.campaign._block import BOUND, BlockRunner, CampaignPlan
+from jaxslam.consistency.campaign._flight import TRIES, Flight, out_of_memory
+from jaxslam.consistency.campaign._kept import Keep, add_block, flat
+from jaxslam.consistency.campaign._pieces import missing
+from jaxslam.consistency.campaign._progress import Progress
+from jaxslam.consistency.campaign._remote import Executor, compute_block, packed
+from jaxslam.core.types import Estimate, Truth
+
+
+@dataclass
+class Work:
+    """Computes the missing blocks of a campaign, and keeps count."""
+
+    workers: int
+    """blocks in flight at once, beside one that waits"""
+    keep: Keep | None
+    progress: Callable[[int, int], None] | None
+    tallies: dict[str, Tally]
+    """the results of this process, by filter"""
+    executor: Executor | None = None
+    compile_seconds: float = 0.0
+    first: dict[str, tuple[Truth, Estimate]] = field(default_factory=dict)
+    spent: dict[str, list[float]] = field(default_factory=lambda: defaultdict(list))
+    """wall time of a run in each finished block, by filter [s]"""
+
+    def run_seconds(self) -> dict[str, float]:
+        """The time of one run on one device, by filter: the median over finished blocks."""
+        return {name: float(np.median(times)) for name, times in self.spent.items()}
+
+    def in_blocks_that_fit(self, plan: CampaignPlan, todo: Sequence[tuple[int, int]]) -> None:
+        """Compute the pieces, in blocks of half the size each time that memory does not suffice."""
+        while True:
+            try:
+                return self.go(plan, todo)
+            except (jax.errors.JaxRuntimeError, MemoryError) as error:
+                if not out_of_memory(error):
+                    raise
+                if plan.block == 1:
+                    raise MemoryError(
+                        "monte_carlo: out of memory with one run on each device (block=1): use "
+                        "fewer steps, landmarks or filters at a time"
+                    ) from error
+                half = plan.block // 2
+                warnings.warn(
+                    f"monte_carlo: out of memory with block={plan.block}; continuing with "
+                    f"block={half}",
+                    stacklevel=3,
+                )
+                plan = replace(plan, block=half)
+
+    def go(self, plan: CampaignPlan, todo: Sequence[tuple[int, int]]) -> None:
+        """Add those of the pieces that are not yet there to the tallies."""
+        if not todo:
+            return
+        before = self.tallies[BOUND].pieces()
+        queue = [
+            piece
+            for first, count in todo
+            for piece in missing([(0, first), *before], first + count, plan.wide)
+        ][::-1]
+        if self.executor is not None:
+            send, content = self.executor.submit, packed(plan)
+            flight = Flight(lambda first, runs: send(compute_block, content, first, runs), TRIES)
+            self._compute(flight, queue, todo)
+            return
+        runner = BlockRunner(plan)
+        # XLA uses the cores; additional threads of the BLAS below its LAPACK would only spin.
+        with threadpool_limits(1, "blas"), ThreadPoolExecutor(self.workers) as pool:
+            flight = Flight(lambda first, runs: pool.submit(runner.block, first, runs))
+            self._compute(flight, queue, todo)
+
+    def _compute(
+        self, flight: Flight, queue: list[tuple[int, int]], todo: Sequence[tuple[int, int]]
+    ) -> None:
+        """Compute the pieces of a queue, last first, and add them to the tallies.
+
+        After an error, or Ctrl-C, blocks in flight are finished and kept.
+        """
+        finished = sum(count for _, count in self.tallies[BOUND].pieces())
+        total = sum(count for _, count in todo)
+        stop: BaseException | None = None
+        while flight or (queue and stop is None):
+            try:
+                while queue and stop is None and len(flight) <= self.workers:
+                    flight.start(queue.pop())
+                for (first, count), result in flight.finished():
+                    if stop is not None and isinstance(result, BaseException):
+                        continue
+                    if isinstance(result, BaseException):
+                        raise result
+                    if self.keep is not None:
+                        self.keep.save(first, flat(result.scores, self.tallies), count)
+                    add_block(self.tallies, first, count, result.scores)
+                    self.first |= result.first
+                    for name, seconds in result.seconds.items():
+                        self.spent[name].append(seconds)
+                    self.compile_seconds = max(self.compile_seconds, result.compile_seconds)
+                    finished += count
+                    if self.progress is not None:
+                        self.progress(finished, total)
+            except BaseException as error:
+                if stop is not None:
+                    raise
+                stop = error
+                flight.cancel()
+        if stop is not None:
+            raise stop
+
+
+@contextlib.contextmanager
+def shown_progress(work: Work, plan: CampaignPlan, wanted: bool) -> Iterator[None]:
+    """A context with an optional progress bar on a terminal or in a notebook."""
+    count = len(plan.filters)
+    bar = Progress(f"{plan.scenario.name}, {count} filter{'s' * (count > 1)}") if wanted else None
+    if bar is None or not bar.shown:
+        yield
+        return
+    work.progress = bar
+    with bar:
+        yield

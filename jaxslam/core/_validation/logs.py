@@ -1,0 +1,72 @@
+"""Checks of a log: shapes, dtypes, finite values, repeated tags."""
+
+import numpy as np
+
+from jaxslam.core._numbers import check_array, is_concrete, largest
+from jaxslam.core.types import Log, Scan
+
+
+def check_log(
+    name: str,
+    log: Log,
+    *,
+    control_size: int,
+    measurement_size: int,
+    parts: tuple[int, ...] = (),
+) -> None:
+    """Raise ValueError, naming caller, field and row, unless a log is well formed.
+
+    Shapes and kinds are always checked, values (controls and valid measurements finite and at most
+    `largest`, tags >= -1, of 32 bits and not repeated within a scan) only where they are concrete.
+    parts: how many measurement slots each sensor has, where there are several; a tag may then occur
+    once with each.
+    """
+    control, scan = log.control, log.scan
+    if not isinstance(scan, Scan):
+        raise ValueError(
+            f"{name}: log.scan: expected a Scan(z, tag, valid), got {type(scan).__name__}"
+        )
+    z, tag, valid = scan
+    check_array(f"{name}: log.control", control, ("T", control_size), np.floating)
+    steps = np.shape(control)[0]
+    if np.ndim(tag) != 2:  # it gives the number of measurement slots
+        check_array(f"{name}: log.scan.tag", tag, (steps, "M"), np.integer)
+    places = np.shape(tag)[1]
+    check_array(f"{name}: log.scan.z", z, (steps, places, measurement_size), np.floating)
+    check_array(f"{name}: log.scan.tag", tag, (steps, places), np.integer)
+    check_array(f"{name}: log.scan.valid", valid, (steps, places), np.bool_)
+    if parts and places != sum(parts):
+        raise ValueError(
+            f"{name}: log.scan: expected {sum(parts)} measurement slots, "
+            f"{' + '.join(map(str, parts))} of the sensors, got {places}: log.scan.z of shape "
+            f"{np.shape(z)}"
+        )
+    if not is_concrete(log):
+        return
+    mask, tags = np.asarray(valid), np.asarray(tag)
+    most = largest(control, z)
+    for what, values, used, then in (
+        ("log.control", control, np.ones(steps, bool), "correct or leave out this row"),
+        ("log.scan.z: a valid measurement", z, mask, "set log.scan.valid to False there"),
+    ):
+        size = np.abs(np.asarray(values, np.float64)).max(axis=-1, initial=0.0)
+        _refuse(name, used & ~np.isfinite(size), f"{what} is not finite", then)
+        _refuse(name, used & (size > most), f"{what} is beyond ±{most:.2g}", then)
+    _refuse(name, mask & (tags < -1), "log.scan.tag: a tag is below -1")
+    _refuse(name, mask & (tags > np.iinfo(np.int32).max), "log.scan.tag: a tag is beyond int32")
+    named = np.where(mask & (tags >= 0), tags, -1 - np.arange(places))
+    for part in np.split(named, np.cumsum(parts)[:-1].astype(int), axis=1) if parts else (named,):
+        ordered = np.sort(part, axis=1)
+        repeats = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
+        _refuse(name, repeats, "log.scan.tag: a tag repeats within the scan")
+
+
+def _refuse(name: str, bad: np.ndarray, why: str, then: str = "") -> None:
+    """Raise ValueError if an entry of `bad` is set, by row or by row and measurement slot.
+
+    then: the next step.
+    """
+    if bad.any():
+        at = zip(("row", "slot"), np.argwhere(bad)[0], strict=False)
+        where = ", ".join(f"{what} {i}" for what, i in at)
+        raise ValueError(f"{name}: {why} ({where})" + f": {then}" * bool(then))

@@ -1,0 +1,281 @@
+"""Checks of models before tracing, and of the results of a user's filter, during it.
+
+Types of records, arguments of functions, sizes of results. Each error is one line that states what
+was expected.
+"""
+
+import inspect
+import traceback
+import weakref
+from collections.abc import Callable
+from pathlib import Path
+from typing import TypeVar
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import PyTree
+from numpy.typing import ArrayLike
+
+from jaxslam.core._names import unfit_signature
+from jaxslam.core._numbers import check_array, shape_text
+from jaxslam.core.protocols import Chart, Life, Linearizer, Motion, Sensor
+from jaxslam.core.types import Estimate, Info, Scan
+
+_Shape = tuple[int, ...]
+_Record = TypeVar("_Record")
+_Result = TypeVar("_Result")
+
+_SOUND: weakref.WeakSet[Motion | Sensor] = weakref.WeakSet()
+"""Models whose sizes have been checked."""
+
+
+_NEEDS_VALUES = (
+    jax.errors.ConcretizationTypeError,
+    jax.errors.TracerArrayConversionError,
+    jax.errors.TracerIntegerConversionError,
+)
+
+
+def call_traced(name: str, function: Callable[..., _Result], *arguments: PyTree) -> _Result:
+    """The result of a user's function within a trace.
+
+    Raises ValueError, which begins with a name, where it needs the value of an array.
+    """
+    try:
+        return function(*arguments)
+    except _NEEDS_VALUES as error:
+        frames = traceback.extract_tb(error.__traceback__)
+        at = [frame for frame in frames if "site-packages" not in frame.filename][-1]
+        raise ValueError(
+            f"{name}: {Path(at.filename).name}:{at.lineno} needs the value of an array, which is "
+            "not known while JAX traces: write jnp.where or lax.cond in place of `if`, jax.numpy "
+            "in place of NumPy, and no float(…)"
+        ) from error
+
+
+def check_models(name: str, motion: object, sensor: object) -> None:
+    """Raise ValueError, which begins with a caller's name, unless these are a Motion and a Sensor.
+
+    Their functions are evaluated on shapes alone (`jax.eval_shape`): they must take the arguments
+    of `protocols` and return arrays of the sizes of their names.
+    """
+    if isinstance(motion, Sensor) and isinstance(sensor, Motion):
+        raise ValueError(
+            f"{name}: expected a Motion, then a Sensor, got the sensor {motion.name} and "
+            f"the motion {sensor.name}: they are swapped"
+        )
+    check_motion(name, motion)
+    check_sensor(name, sensor)
+
+
+def check_motion(name: str, motion: object) -> None:
+    """Raise ValueError unless this is a Motion; see `check_models`."""
+    motion = check_record(name, "motion", motion, Motion)
+    if motion in _SOUND:
+        return
+    pose, u, w = _numbers(3), _numbers(len(motion.controls)), _numbers(len(motion.noises))
+    _check_size(name, motion, "step", {"pose": pose, "u": u, "w": w}, (3,))
+    _check_size(name, motion, "noise_cov", {"pose": pose, "u": u}, (len(motion.noises),) * 2)
+    _SOUND.add(motion)
+
+
+def check_sensor(name: str, sensor: object) -> None:
+    """Raise ValueError unless this is a Sensor, or a suite of them; see `check_models`."""
+    sensor = check_record(name, "sensor", sensor, Sensor)
+    if parts := getattr(sensor, "parts", ()):  # of a suite
+        for part in parts:
+            check_sensor(name, part.sensor)
+        return
+    if sensor in _SOUND:
+        return
+    size_z, size_l = len(sensor.measurements), len(sensor.landmark)
+    pose, z, landmark = _numbers(3), _numbers(size_z), _numbers(size_l)
+    free = np.shape(sensor.free.mean)
+    if len(free) != 1 or np.shape(sensor.free.cov) != free * 2:
+        raise ValueError(
+            f"{name}: expected {sensor.name}.free of shapes (K,) and (K, K), got {free} and "
+            f"{np.shape(sensor.free.cov)}"
+        )
+    _check_size(name, sensor, "observe", {"pose": pose, "l": landmark}, (size_z,))
+    _check_size(name, sensor, "residual", {"z": z, "z_hat": z}, (size_z,))
+    _check_size(name, sensor, "noise_cov", {"z": z}, (size_z, size_z))
+    _check_size(name, sensor, "invert", {"pose": pose, "z": z, "s": _numbers(*free)}, (size_l,))
+    _check_size(name, sensor, "position", {"l": landmark}, (2,))
+    _SOUND.add(sensor)
+
+
+def check_parts(
+    name: str,
+    chart: object = None,
+    linearize: object = None,
+    associate: object = None,
+    life: object = None,
+) -> None:
+    """Raise ValueError unless each part has its type; one that is None is absent."""
+    if chart is not None:
+        check_record(name, "chart", chart, Chart)
+    if linearize is not None:
+        check_record(name, "linearize", linearize, Linearizer)
+    if associate is not None:
+        check_associate(name, associate)
+    if life is not None:
+        check_record(name, "life", life, Life)
+
+
+def check_record(name: str, what: str, value: object, kind: type[_Record]) -> _Record:
+    """The value, if it is such a record; ValueError if not, as on a class that was not called."""
+    if isinstance(value, kind):
+        return value
+    what = f"{what} to be {'an' if kind.__name__[0] in 'AEIO' else 'a'} {kind.__name__}"
+    if callable(value):
+        factory = getattr(value, "__name__", repr(value))
+        is_a = "class" if isinstance(value, type) else "function"
+        raise ValueError(
+            f"{name}: expected {what}, got the {is_a} {factory}: call it, {factory}(…)"
+        )
+    fields = getattr(value, "_fields", ())
+    held = next((field for field in fields if isinstance(getattr(value, field), kind)), None)
+    raise ValueError(
+        f"{name}: expected {what}, got {type(value).__name__}"
+        + f"; give its field {held}" * bool(held)
+    )
+
+
+def check_associate(name: str, associate: object) -> None:
+    """Raise ValueError unless this is a function of (prediction, scan)."""
+    if not callable(associate):
+        raise ValueError(
+            f"{name}: expected associate to be a function of (prediction, scan), got "
+            f"{type(associate).__name__}"
+        )
+    if isinstance(associate, type):
+        raise ValueError(
+            f"{name}: expected associate to be a function of (prediction, scan), got the class "
+            f"{associate.__name__}: call it, {associate.__name__}(…)"
+        )
+    try:
+        inspect.signature(associate).bind(None, None)
+    except TypeError as error:
+        raise ValueError(
+            f"{name}: expected associate to be a function of (prediction, scan): {error}"
+        ) from None
+    except ValueError:  # a builtin, which has no signature
+        return
+
+
+def _numbers(*shape: int) -> jax.ShapeDtypeStruct:
+    return jax.ShapeDtypeStruct(shape, jnp.result_type(float))
+
+
+def _check_size(
+    name: str,
+    model: Motion | Sensor,
+    field: str,
+    arguments: dict[str, jax.ShapeDtypeStruct],
+    shape: _Shape,
+) -> None:
+    """Raise ValueError unless the model's function returns this shape for these arguments."""
+    function: Callable[..., object] = getattr(model, field)
+    if (got := unfit_signature(function, len(arguments))) is not None:
+        wanted = f"{model.name}.{field} to take ({', '.join(arguments)})"
+        raise ValueError(f"{name}: expected {wanted}, got {got}")
+    sizes = ", ".join(f"{key} {_shape_text(value.shape)}" for key, value in arguments.items())
+    call = f"{model.name}.{field}({sizes})"
+    try:
+        found = jax.eval_shape(function, *arguments.values())
+    except Exception as error:
+        why = next(iter(str(error).strip().splitlines()), "")
+        raise ValueError(f"{name}: {call} fails: {type(error).__name__}: {why}") from error
+    got = getattr(found, "shape", None)
+    if got != shape:
+        what = f"a {type(found).__name__}" if got is None else f"shape {_shape_text(got)}"
+        raise ValueError(
+            f"{name}: expected {call} to return shape {_shape_text(shape)}, got {what}"
+        )
+    if not jnp.issubdtype(getattr(found, "dtype", np.dtype(object)), jnp.floating):
+        raise ValueError(f"{name}: expected {call} to return real numbers, got {found.dtype}")
+    given = next(iter(arguments.values())).dtype
+    if field != "noise_cov" and found.dtype != given:
+        raise ValueError(
+            f"{name}: expected {call} to return {given}, as its arguments are, got {found.dtype}"
+        )
+
+
+def _shape_text(shape: _Shape) -> str:
+    return "(" + ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "") + ")"
+
+
+_S = TypeVar("_S")
+
+_REAL = ("nis", "innovation", "innovation_cov", "log_likelihood")
+"""Fields of `Info` in the dtype of the measurements."""
+
+
+def same_state(name: str, before: _S, after: PyTree) -> _S:
+    """The state that a filter's function returned; ValueError unless its structure is that before.
+
+    Tree, shapes and dtypes must be the same, since the state is the carry of a `lax.scan`.
+    """
+    old: PyTree = jax.tree.structure(before)
+    if old != jax.tree.structure(after):
+        message = f"expected a state as before, {_kind(before)}, got {_kind(after)}"
+        raise ValueError(f"{name}: {message}")
+    pairs = zip(jax.tree.leaves_with_path(before), jax.tree.leaves(after), strict=True)
+    unlike = [
+        f"state{jax.tree_util.keystr(path)}: expected {_array(old)}, got {_array(new)}"
+        for (path, old), new in pairs
+        if _array(old) != _array(new)
+    ]
+    if unlike:
+        raise ValueError(f"{name}: {'; '.join(unlike)}")
+    state: _S = after
+    return state
+
+
+def _kind(state: PyTree) -> str:
+    """The type of a state, and where its arrays are."""
+    at = [jax.tree_util.keystr(path) for path, _ in jax.tree.leaves_with_path(state)]
+    return "an array" if at == [""] else f"{type(state).__name__} of {', '.join(at) or 'nothing'}"
+
+
+def _array(leaf: ArrayLike) -> str:
+    return f"{jnp.result_type(leaf)} {shape_text(leaf)}"
+
+
+def state_and_info(name: str, state: _S, scan: Scan, found: object) -> tuple[_S, Info]:
+    """The result of a filter's update; ValueError unless it is a state as before, and an `Info`."""
+    if not (isinstance(found, tuple) and len(found) == 2 and isinstance(found[1], Info)):
+        got = type(found).__name__
+        if isinstance(found, tuple) and not hasattr(found, "_fields"):
+            got = "(" + ", ".join(type(part).__name__ for part in found) + ")"
+        raise ValueError(f"{name}: expected update to return (state, Info), got {got}")
+    info: Info = found[1]
+    m, real = scan.tag.shape[0], scan.z.dtype.type
+    for field, shape in {
+        "nis": (m,),
+        "dof": (m,),
+        "slot": (m,),
+        "status": (m,),
+        "innovation": (m, "Z"),
+        "innovation_cov": (m, "Z", "Z"),
+        "log_likelihood": (),
+    }.items():
+        kind = real if field in _REAL else np.integer if field == "status" else np.generic
+        check_array(f"{name}: update: Info.{field}", getattr(info, field), shape, kind)
+    return same_state(f"{name}: update", state, found[0]), info
+
+
+def checked_estimate(name: str, estimate: object, dtype: np.dtype) -> Estimate:
+    """The result of a filter's estimate; ValueError unless it is an `Estimate` of N landmarks, with
+    numbers of this dtype."""
+    if not isinstance(estimate, Estimate):
+        raise ValueError(
+            f"{name}: expected estimate to return an Estimate, got {type(estimate).__name__}"
+        )
+    n = np.shape(estimate.alive)[0] if np.ndim(estimate.alive) == 1 else -1
+    shapes = {"pose": (3,), "pose_cov": (3, 3), "points": (n, 2), "point_covs": (n, 2, 2)}
+    for field, shape in (shapes | {"alive": (n,), "tag": (n,)}).items():
+        kind = dtype.type if field in shapes else np.generic
+        check_array(f"{name}: Estimate.{field}", getattr(estimate, field), shape, kind)
+    return estimate

@@ -1,0 +1,361 @@
+"""Columns of odometry and measurements, from lists, arrays or data frames, as the rows of a log."""
+
+import math
+from collections.abc import Callable, Iterable, Mapping, Sequence
+from typing import Generic, NamedTuple, Protocol, TypeAlias, TypeVar
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+
+from jaxslam.core.logs import _streams as streams
+
+UNITS: dict[str, dict[str, float]] = {
+    "rad": {"deg": 180 / math.pi},
+    "rad/s": {"deg/s": 180 / math.pi},
+    "m": {"mm": 1000.0, "cm": 100.0},
+    "s": {"ms": 1000.0},
+}
+"""Other units in which a column may be given, and how many of them are one of the model's. Values
+are divided by it, so that 1400 ms are the 1.4 s of another file to the bit."""
+
+TIME, TAG, INTERVAL = "t [s]", "tag", "dt [s]"
+POSE = ("x [m]", "y [m]", "theta [rad]")
+_INCREMENT = ("forward [m]", "left [m]", "turn [rad]")
+
+
+_Name = TypeVar("_Name", bound=int | str)
+"""of a landmark"""
+
+
+class _ByName(Protocol):
+    """Columns by name: a mapping, a structured array, a data frame."""
+
+    def __getitem__(self, name: str, /) -> Iterable[object]: ...
+
+
+Tabular: TypeAlias = Sequence[Sequence[object]] | np.ndarray | _ByName
+"""Rows, or columns by name."""
+
+
+class Columns(NamedTuple, Generic[_Name]):
+    """Columns of one length by name, and where a cell is, for messages."""
+
+    columns: dict[str, Float[np.ndarray, "K"]]
+    """float64, by name with unit, as "v [m/s]" """
+    tags: list[_Name | None] | None
+    """the column `TAG`: names, None where unknown; None without such a column"""
+    at: Callable[[int, str], str]
+    """(row, column) -> the place of a cell, with which a message begins"""
+
+    def values(self, names: Sequence[str]) -> np.ndarray:
+        """Some columns side by side, (K, len(names))."""
+        return np.column_stack([self.columns[name] for name in names])
+
+
+class Seen(NamedTuple, Generic[_Name]):
+    """The measurements of one sensor."""
+
+    table: Columns[_Name]
+    measured: tuple[str, ...]
+    """the names of z, with units"""
+    places: int | None = None
+    """its measurement slots in a scan; None for as many as its largest scan has"""
+    max_range: float = math.inf
+    """[m] the range from which on it says nothing"""
+    spacing: float = 0.0
+    """[s] the least time between two measurements of a landmark that are kept"""
+
+
+class Aligned(NamedTuple, Generic[_Name]):
+    """The rows of all tables, and what became of their names and measurements."""
+
+    rows: streams.Rows
+    tags: tuple[_Name, ...]
+    """the names of the landmarks with tags 0, 1, …"""
+    dropped: dict[str, int]
+
+
+def split_unit(name: str) -> tuple[str, str | None]:
+    """Name and unit of a column, ("v", "m/s") of "v [m/s]"; None without a unit."""
+    bare, bracket, unit = name.strip().partition("[")
+    return bare.strip(), unit.rstrip("] ").strip() if bracket else None
+
+
+def unit_divisor(unit: str | None, wanted: str) -> float | None:
+    """The divisor that converts a column to the wanted unit; None if the units do not fit."""
+    target = split_unit(wanted)[1] or ""
+    if unit is None or unit == target:
+        return 1.0
+    return UNITS.get(target, {}).get(unit)
+
+
+def odometry_columns(controls: tuple[str, ...], given: Sequence[str]) -> tuple[str, ...]:
+    """The columns for a model's controls, without the time, among the given ones."""
+    measured = tuple(name for name in controls if name != INTERVAL)
+    poses = {split_unit(name)[0] for name in POSE} <= {split_unit(name)[0] for name in given}
+    return POSE if poses and measured == _INCREMENT else measured
+
+
+def measurement_columns(measured: tuple[str, ...], landmark: tuple[str, ...]) -> tuple[str, ...]:
+    """The columns of measurements: with a tag, unless the sensor has no landmark."""
+    return (TIME, *((TAG,) if landmark else ()), *measured)
+
+
+def align_tables(
+    odometry: Columns[_Name],
+    sensors: Sequence[Seen[_Name]],
+    controls: tuple[str, ...],
+    names: Sequence[_Name] = (),
+) -> Aligned[_Name]:
+    """The rows of odometry and of sensors with different rates (Solà 2.4): a row at every time
+    of odometry, and of measurements within it.
+
+    Velocities (controls with an interval) hold until the next line; poses are interpolated; other
+    controls are unchanged, and measurements must then be at their times. Measurements before
+    the first or after the last odometry are dropped and counted, as are ranges below 0 or of the
+    sensor's maximum, and measurements sooner after one of the same landmark than the spacing. The
+    last velocity holds as long as the longest interval between lines. A scan has the slots of the
+    sensors in their order.
+
+    Args:
+        controls: the names of the motion model, with units.
+        names: of landmarks that have a tag though none may be measured; else those measured.
+    Raises:
+        ValueError: with the place, on times that do not rise (equal ones are a scan), a tag that
+            occurs twice in a scan of a sensor, more measurements than slots, or a measurement
+            without odometry at its time.
+    """
+    clock = odometry.columns[TIME]
+    check_times(odometry, strict=True)
+    columns = odometry_columns(controls, tuple(odometry.columns))
+    last = clock[-1]
+    rule: streams.Rule = streams.relative_poses if columns == POSE else streams.as_recorded
+    if columns != POSE and INTERVAL in controls and controls[:3] != _INCREMENT:
+        rule = streams.hold
+        last += np.max(np.diff(clock), initial=0.0)
+    within = [(t >= clock[0]) & (t <= last) for t in (seen.table.columns[TIME] for seen in sensors)]
+    named = {
+        name
+        for seen, inside in zip(sensors, within, strict=True)
+        for name, kept in zip(seen.table.tags or (), inside, strict=False)
+        if kept
+    }
+    tag_of = {name: tag for tag, name in enumerate(ordered({*names, *named}))}
+    tags = [_tags_in_scans(seen, tag_of) for seen in sensors]
+    kept, outside, negative, beyond, soon = [], 0, 0, 0, 0
+    for seen, tag, inside in zip(sensors, tags, within, strict=True):
+        when = seen.table.columns[TIME]
+        lost = np.flatnonzero(inside & ~np.isin(when, clock))
+        if lost.size and rule is streams.as_recorded:
+            raise ValueError(
+                f"{seen.table.at(int(lost[0]), TIME)}: expected a time of the odometry, since "
+                f"{', '.join(columns)} cannot be divided, got {when[lost[0]]:.12g}; poses can: "
+                f"{TIME}, {', '.join(POSE)}"
+            )
+        values = seen.table.values(seen.measured)
+        ranges = [k for k, name in enumerate(seen.measured) if split_unit(name)[0] == "range"]
+        no_echo = inside & (values[:, ranges] < 0).any(axis=1)
+        far = inside & (values[:, ranges] >= seen.max_range).any(axis=1)
+        taken = inside & ~no_echo & ~far
+        early = taken & _too_soon(seen, tag, taken)
+        taken &= ~early
+        kept.append((when[taken], tag[taken], values[taken]))
+        outside += int((~inside).sum())
+        negative += int(no_echo.sum())
+        beyond += int(far.sum())
+        soon += int(early.sum())
+    times = np.unique(np.concatenate([clock, *(when for when, *_ in kept)]))
+    moved = clock, odometry.values(columns)
+    places = [seen.places for seen in sensors]
+    rows = _side_by_side([streams.align_streams(moved, one, rule, times) for one in kept], places)
+    if INTERVAL in controls and rule is not streams.hold:
+        interval = np.diff(rows.time, prepend=rows.time[:1])
+        rows = rows._replace(control=np.column_stack([rows.control, interval]))
+    dropped = {"measurements outside the odometry": outside}
+    counts = {
+        "measurements with a range below 0": negative,
+        "measurements of the maximum range": beyond,
+        "measurements closer than the spacing": soon,
+    }
+    dropped |= {reason: count for reason, count in counts.items() if count}
+    return Aligned(rows, tuple(tag_of), dropped)
+
+
+def _tags_in_scans(seen: Seen[_Name], tag_of: dict[_Name, int]) -> Int[np.ndarray, "J"]:
+    """The tag of each measurement of a sensor, -1 where unknown; ValueError as `align_tables`."""
+    table, when = seen.table, seen.table.columns[TIME]
+    check_times(table, strict=False)
+    named = table.tags or [None] * len(when)
+    tags = [-1 if name is None else tag_of.get(name, -1) for name in named]
+    scan: set[tuple[float, int]] = set()
+    for row, pair in enumerate(zip(when.tolist(), tags, strict=True)):
+        if pair[1] >= 0 and pair in scan:
+            raise ValueError(
+                f"{table.at(row, TAG)}: expected a tag once at a time, got "
+                f"{named[row]!r} twice at t = {pair[0]:.12g}"
+            )
+        scan.add(pair)
+    if (
+        seen.places is not None
+        and (late := np.flatnonzero(when[seen.places :] == when[: -seen.places])).size
+    ):
+        raise ValueError(
+            f"{table.at(int(late[0]) + seen.places, TIME)}: expected at most {seen.places} "
+            f"measurement{'s' * (seen.places > 1)} at a time, the slots of the sensor, got more"
+        )
+    return np.array(tags, np.int64)
+
+
+def _too_soon(
+    seen: Seen[_Name], tag: Int[np.ndarray, "J"], taken: Bool[np.ndarray, "J"]
+) -> Bool[np.ndarray, "J"]:
+    """Which measurements come sooner after one of the same landmark than the spacing."""
+    found = np.zeros(len(tag), bool)
+    if not seen.spacing:
+        return found
+    if unknown := np.flatnonzero(taken & (tag < 0)).tolist():
+        where = seen.table.at(unknown[0], TAG)
+        raise ValueError(f"{where}: expected a tag, since a spacing is of one landmark, got none")
+    when = seen.table.columns[TIME]
+    last: dict[int, float] = {}
+    for row in np.flatnonzero(taken):
+        # A spacing of whole intervals is not to be missed by rounding of the stamps.
+        found[row] = when[row] - last.get(tag[row], -math.inf) < seen.spacing * (1 - 1e-6)
+        if not found[row]:
+            last[tag[row]] = when[row]
+    return found
+
+
+def _side_by_side(scans: Sequence[streams.Rows], places: Sequence[int | None]) -> streams.Rows:
+    """Rows at the same times with the slots of several sensors, each padded to its places, and z to
+    the longest."""
+    size = max(rows.z.shape[2] for rows in scans)
+
+    def padded(rows: streams.Rows, count: int | None) -> streams.Rows:
+        spare = 0 if count is None else count - rows.tag.shape[1]
+        slots = (0, 0), (0, spare)
+        return rows._replace(
+            z=np.pad(rows.z, (*slots, (0, size - rows.z.shape[2]))),
+            tag=np.pad(rows.tag, slots, constant_values=-1),
+            valid=np.pad(rows.valid, slots),
+        )
+
+    each = [padded(*pair) for pair in zip(scans, places, strict=True)]
+    z, tag, valid = (
+        np.concatenate([getattr(rows, name) for rows in each], axis=1)
+        for name in ("z", "tag", "valid")
+    )
+    return streams.Rows(scans[0].time, scans[0].control, z, tag, valid)
+
+
+def check_times(table: Columns[_Name], *, strict: bool) -> None:
+    """Raise ValueError, with the place, unless times rise; equal ones pass where not strict."""
+    time = table.columns[TIME]
+    back = np.flatnonzero(np.diff(time) <= 0 if strict else np.diff(time) < 0)
+    if back.size:
+        before, at = time[back[0] : back[0] + 2].tolist()
+        wanted = f"above {before}" if strict else f"of at least {before}"
+        raise ValueError(f"{table.at(int(back[0]) + 1, TIME)}: expected a time {wanted}, got {at}")
+
+
+def ordered(names: set[_Name | None]) -> list[_Name]:
+    """The names of landmarks, whole numbers before text; None, the unknown one, is left out."""
+    known = (name for name in names if name is not None)
+    return sorted(known, key=lambda name: (isinstance(name, str), name))
+
+
+def columns_of(
+    what: str, given: Tabular, wanted: Callable[[Sequence[str]], Sequence[str]]
+) -> Columns[int | str]:
+    """The table of a data frame, a mapping of columns, a structured array, or a sequence of rows.
+
+    Columns with names are found by them; a name may have a unit ("bearing [deg]"). Without names
+    the columns are in the order wanted. Other columns are left out.
+
+    Args:
+        what: the name of the argument, for messages.
+        wanted: (names given) -> the columns needed, with units.
+    Raises:
+        ValueError: on a column that is missing, in another unit, of another length, or with a value
+            that is not a finite number.
+    """
+    names = _names(given)
+    needed = list(wanted(names or ()))
+
+    def at(row: int, column: str) -> str:
+        return f"{what}, row {row}, column {split_unit(column)[0]}"
+
+    if names is None:
+        rows = list(given) if isinstance(given, Sequence | np.ndarray) else None
+        if rows is None:
+            raise ValueError(f"{what}: expected rows or columns, got {type(given).__name__}")
+        for k, row in enumerate(rows):
+            size = len(row) if isinstance(row, Sequence | np.ndarray) else 1
+            if size != len(needed) or isinstance(row, str):
+                raise ValueError(
+                    f"{what}, row {k}: expected {len(needed)} values ({', '.join(needed)}), "
+                    f"got {size}"
+                )
+        found = {name: [row[i] for row in rows] for i, name in enumerate(needed)}
+        divisors = dict.fromkeys(needed, 1.0)
+    else:
+        assert not isinstance(given, Sequence)  # which has no names
+        header = {split_unit(name)[0]: name for name in names}
+        found, divisors = {}, {}
+        for name in needed:
+            bare = split_unit(name)[0]
+            if bare not in header:
+                raise ValueError(f"{what}: expected a column {name!r}, got {', '.join(names)}")
+            divisor = unit_divisor(split_unit(header[bare])[1], name)
+            if divisor is None:
+                raise ValueError(f"{what}: expected the column {name!r}, got {header[bare]!r}")
+            found[name], divisors[name] = list(given[header[bare]]), divisor
+        lengths = {name: len(column) for name, column in found.items()}
+        if len(set(lengths.values())) > 1:
+            raise ValueError(f"{what}: expected columns of one length, got {lengths}")
+    tags = None
+    if TAG in found:
+        tags = [_landmark(at(k, TAG), value) for k, value in enumerate(found.pop(TAG))]
+    columns = {n: _numbers(at, n, column) / divisors[n] for n, column in found.items()}
+    if not columns[TIME].size:
+        raise ValueError(f"{what}: expected at least one row, got none")
+    return Columns(columns, tags, at)
+
+
+def _names(given: Tabular) -> tuple[str, ...] | None:
+    """The names of the columns, or None where they have none."""
+    if isinstance(given, Mapping):
+        return tuple(map(str, given))
+    if isinstance(given, np.ndarray):
+        return None if given.dtype.names is None else tuple(given.dtype.names)
+    columns = getattr(given, "columns", None)
+    return None if columns is None else tuple(map(str, columns))
+
+
+def _numbers(
+    at: Callable[[int, str], str], name: str, column: Sequence[object]
+) -> Float[np.ndarray, "K"]:
+    """The column as float64 (K,); raises ValueError on anything but finite numbers."""
+    for row, value in enumerate(column):
+        if (
+            not isinstance(value, int | float | np.integer | np.floating)
+            or isinstance(value, bool)
+            or not math.isfinite(value)
+        ):
+            raise ValueError(f"{at(row, name)}: expected a finite number, got {value!r}")
+    return np.array(column, np.float64)
+
+
+def _landmark(place: str, value: object) -> int | str | None:
+    """The name of a landmark, an int or a str; None where it is unknown (None, "", -1 or NaN)."""
+    if isinstance(value, np.generic):
+        value = value.item()
+    if value is None or value in ("", -1) or value != value:
+        return None
+    if isinstance(value, float) and value.is_integer():
+        value = int(value)
+    if isinstance(value, bool) or not isinstance(value, int | str):
+        raise ValueError(f"{place}: expected a whole number or text, got {value!r}")
+    if isinstance(value, int) and value < 0:
+        raise ValueError(f"{place}: expected a number >= 0, or -1 for unknown, got {value}")
+    return value

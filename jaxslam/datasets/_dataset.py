@@ -1,0 +1,138 @@
+"""The result of a reader: a log with models, noises and options of a filter for it."""
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Bool, Float
+
+from jaxslam.core._validation import check_log
+from jaxslam.core.protocols import Motion, Sensor
+from jaxslam.core.types import Log
+from jaxslam.filters._ekf.ekf_settings import EkfOptions
+from jaxslam.filters.multi_robot._team import Robot
+from jaxslam.sensors._suite import Suite
+
+
+class Parameter(NamedTuple):
+    """A number of a data set's models that `fit` can estimate."""
+
+    name: str
+    """with its unit, as "motion v [m/s]" or "scale turn" """
+    value: float
+    group: str
+    """"noise" of a standard deviation, else what `calibrate` names: "mount", "scale", …"""
+    place: tuple[str, str]
+    """section and key of the settings, whose list holds the parameters of one place in order"""
+
+
+class Adjustable(NamedTuple):
+    """The log and the models of a data set as functions of its parameters."""
+
+    parameters: tuple[Parameter, ...]
+    at: Callable[[Float[jax.Array, "P"]], tuple[Log, Motion, Sensor]]
+    """values, which may be traced -> log, motion and sensor"""
+    cov: Float[np.ndarray, "P P"] | None = None
+    """of the values as they were fitted, 0 for others; None if nothing is known of it"""
+
+    @property
+    def values(self) -> Float[np.ndarray, "P"]:
+        """The numbers of all parameters."""
+        return np.array([parameter.value for parameter in self.parameters])
+
+
+@dataclass(frozen=True, eq=False)
+class Dataset:
+    """A recorded log of T rows and N landmarks, with models and options to filter it.
+
+        data = jaxslam.datasets.bonn(folder)
+        ekf = EkfSlam(data.motion, data.sensor, data.capacity, **data.filter_options)
+        trace = jaxslam.run(ekf, data.log, data.pose, data.pose_cov, key)
+
+    Arrays are NumPy's, in float64. Raises ValueError if their shapes do not fit together.
+    """
+
+    name: str
+    log: Log
+    """row t: the control that led to pose t, and the scan at pose t; tags are indices of `tags`"""
+    time: Float[np.ndarray, "T"]
+    """[s], or the number of the odometry line if the file has no times"""
+    motion: Motion
+    sensor: Sensor
+    tags: tuple[int, ...]
+    """the names in the file of the landmarks with tags 0, 1, …, N-1"""
+    pose: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
+    """pose of the robot before the first control, the frame of the map"""
+    pose_cov: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.zeros((3, 3)))
+    """zero, since the first pose defines the frame"""
+    filter_options: EkfOptions = field(default_factory=EkfOptions)
+    """keyword arguments of `filters.EkfSlam` for this data set (update, gate)"""
+    landmarks: Float[np.ndarray, "N 2"] | None = None
+    """surveyed positions [m] by tag, in their frame (see `one_frame`); None if unknown"""
+    true_path: Float[np.ndarray, "T 3"] | None = None
+    """true pose at each row [m, m, rad], in the frame of `landmarks`; None if unknown"""
+    true_at: Bool[np.ndarray, "T"] | None = None
+    """in which rows the true pose is known; None if in all"""
+    true_paths: Float[np.ndarray, "R T 3"] | None = None
+    """true poses of all robots of a log of several, if known; `true_path` is that of the first"""
+    true_paths_at: Bool[np.ndarray, "R T"] | None = None
+    """in which rows those are known; None if in all"""
+    one_frame: bool = False
+    """whether `pose`, `landmarks` and `true_path` are in one frame; if not, compare after an
+    alignment"""
+    slots: int | None = None
+    """landmark slots of the filter; None for one per tag"""
+    adjustable: Adjustable | None = None
+    """log and models as functions of noises and systematic errors, for `datasets.fit`; None if
+    they are fixed"""
+    dropped: dict[str, int] = field(default_factory=dict)
+    """number of measurements in the file that are not in the log, by reason"""
+    corrections: tuple[str, ...] = ()
+    """descriptions of the changes that the reader made"""
+    assumed: tuple[str, ...] = ()
+    """defaults that the reader took for settings missing in the files"""
+    source: str = ""
+    """the publication of the data"""
+    robots: tuple[Robot, ...] = ()
+    """the robots of a log of several, for `filters.TeamSlam(data.robots, data.capacity)`. They
+    have the tags N, N+1, …; `motion` and `sensor` are those of the first robot."""
+
+    def __post_init__(self) -> None:
+        check_log(
+            self.name,
+            self.log,
+            control_size=len(self.motion.controls),
+            measurement_size=len(self.sensor.measurements),
+            parts=self.sensor.places if isinstance(self.sensor, Suite) else (),
+        )
+        if np.shape(self.time) != (self.steps,):
+            raise ValueError(f"{self.name}: expected {self.steps} times, got {np.shape(self.time)}")
+        if np.max(self.log.scan.tag, initial=-1) >= self.capacity + len(self.robots):
+            raise ValueError(f"{self.name}: a tag is not below the capacity {self.capacity}")
+        if self.landmarks is not None and np.shape(self.landmarks) != (len(self.tags), 2):
+            raise ValueError(
+                f"{self.name}: expected landmarks of shape ({len(self.tags)}, 2), "
+                f"got {np.shape(self.landmarks)}"
+            )
+        if self.true_path is not None and np.shape(self.true_path) != (self.steps, 3):
+            raise ValueError(
+                f"{self.name}: expected a true path of shape ({self.steps}, 3), "
+                f"got {np.shape(self.true_path)}"
+            )
+
+    @property
+    def steps(self) -> int:
+        """The number of rows T."""
+        return int(np.shape(self.log.control)[0])
+
+    @property
+    def capacity(self) -> int:
+        """The number of landmark slots of a filter, that of tags N or `slots`."""
+        return len(self.tags) if self.slots is None else self.slots
+
+    @property
+    def measurements(self) -> int:
+        """The number of measurements in the log."""
+        return int(np.sum(self.log.scan.valid))

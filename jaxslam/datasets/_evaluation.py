@@ -1,0 +1,227 @@
+"""Errors of the path and the map of a filter, by the truth and the survey of a data set.
+
+The map is tested by the joint NEES of its landmarks, with a verdict.
+"""
+
+from typing import NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Float, PyTree
+
+from jaxslam.consistency import metrics
+from jaxslam.consistency._intervals import LEVEL, percentage
+from jaxslam.consistency._measures.nees import block_nees, pose_error
+from jaxslam.consistency.metrics._paths import alignment, carried
+from jaxslam.core.protocols import Filter
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Estimate
+from jaxslam.datasets._dataset import Dataset
+from jaxslam.filters._ekf.map_coordinates import cov_of_coordinates
+from jaxslam.math.stats import chi2_band, chi2_quantile
+
+_in_coordinates = jax.jit(cov_of_coordinates, static_argnames="square_root", inline=True)
+
+_POINT = ("x [m]", "y [m]")
+_ITERATIONS = 20
+
+
+class MapTest(NamedTuple):
+    """The NEES of a map, the band of an honest one, and the verdict."""
+
+    nees: float
+    """of all landmarks together, or the largest of a single one"""
+    dof: int
+    band: tuple[float, float]
+    """the interval of 95 % of honest maps; (0, high) for the largest"""
+    joint: bool
+    """whether the covariances between landmarks are known"""
+
+    @property
+    def verdict(self) -> str:
+        """The verdict: consistent (not rejected), optimistic (small covariances) or pessimistic."""
+        low, high = self.band
+        return (
+            "optimistic" if self.nees > high else "pessimistic" if self.nees < low else "consistent"
+        )
+
+    def rows(self) -> dict[str, object]:
+        """The test as rows of a summary."""
+        what = f"all landmarks, {self.dof} dof" if self.joint else "the worst landmark"
+        band = [float(f"{end:.4g}") for end in self.band]
+        return {
+            "map NEES": self.nees,
+            "map NEES of": what,
+            f"map NEES, {percentage(LEVEL)} of honest maps": band,
+            "map verdict": self.verdict,
+        }
+
+
+def joint_map_cov(filter: Filter, state: PyTree) -> Float[np.ndarray, "N 2 N 2"] | None:
+    """The covariance of all landmark positions together, by slots, in map coordinates.
+
+    None unless the state of the filter is a `slots.Joint` of point landmarks.
+    """
+    if not isinstance(state, Joint) or filter.landmark != _POINT:
+        return None
+    cov = np.asarray(_in_coordinates(state, filter.chart, square_root=filter.square_root))
+    count = state.landmarks.shape[0]
+    return cov[3:, 3:].reshape(count, 2, count, 2)
+
+
+def judge_map(
+    points: Float[np.ndarray, "n 2"],
+    survey: Float[np.ndarray, "n 2"],
+    covs: Float[np.ndarray, "n 2 2"],
+    joint_cov: Float[np.ndarray, "n 2 n 2"] | None,
+    one_frame: bool,
+) -> MapTest | None:
+    """The test of n landmarks at one time against their surveyed positions.
+
+    With e = points - survey and the joint covariance P, eᵀ P⁻¹ e of an honest map is χ² with 2n
+    degrees of freedom. In another frame the survey is first moved by the rigid motion that
+    minimizes it (least squares weighted by P⁻¹), which takes 3 of them.
+
+    Without P the correlation of the landmarks' errors is unknown. Then the largest eᵢᵀ Pᵢ⁻¹ eᵢ is
+    compared with its bound at level 0.95 by Bonferroni's inequality, which holds for any
+    correlation and can only reject an optimistic map. A motion of the frame reduces the errors, so
+    the test then rejects even less often.
+
+    It assumes Gaussian errors, models that are linear over them, and an exact survey. One map gives
+    one number: an inconsistent filter may pass.
+
+    Args:
+        points, covs: of the filter; covs without correlations between landmarks.
+        one_frame: whether the survey is in the filter's frame.
+    Returns:
+        None if the covariance is singular, or the landmarks are too few to find the frame.
+    """
+    count = len(points)
+    size = 2 * count - (0 if one_frame else 3)
+    if size <= 0:
+        return None
+    joint = joint_cov is not None
+    separate = np.zeros((count, 2, count, 2))
+    separate[np.arange(count), :, np.arange(count)] = covs
+    cov = np.asarray(separate if joint_cov is None else joint_cov, np.float64)
+    cov = cov.reshape(2 * count, 2 * count)
+    values, vectors = np.linalg.eigh((cov + cov.T) / 2)
+    if not values[0] > 1e-12 * values[-1]:
+        return None
+    white = vectors.T / np.sqrt(values)[:, None]
+    error = points - (survey if one_frame else carried(_best_frame(points, survey, white), survey))
+    if joint:
+        nees = float(np.sum((white @ error.reshape(-1)) ** 2))
+        return MapTest(nees, size, chi2_band(size, 1, LEVEL), True)
+    each = np.einsum("ni,nij,nj->n", error, np.linalg.inv(covs), error)
+    return MapTest(float(each.max()), 2, (0.0, chi2_quantile(1 - (1 - LEVEL) / count, 2)), False)
+
+
+def _best_frame(points: np.ndarray, survey: np.ndarray, white: np.ndarray) -> np.ndarray:
+    """The pose (3,) of the survey's frame that makes ‖L⁻¹ (points - moved survey)‖ smallest.
+
+    Gauss-Newton from the unweighted alignment; points may be far from the origin.
+    """
+    pose = alignment(survey, points)
+    for _ in range(_ITERATIONS):
+        at = carried(pose, survey)
+        lever = at - pose[:2]
+        slope = np.zeros((len(points), 2, 3))
+        slope[:, 0, 0] = slope[:, 1, 1] = 1.0
+        slope[:, 0, 2], slope[:, 1, 2] = -lever[:, 1], lever[:, 0]
+        step = np.linalg.lstsq(
+            white @ slope.reshape(-1, 3), white @ (points - at).reshape(-1), rcond=None
+        )[0]
+        pose = pose + step
+        if np.abs(step).max() < 1e-12:
+            break
+    return pose
+
+
+SPAN = 1.0
+"""Time over which relative errors of a path are taken [s]."""
+
+
+class Evaluation(NamedTuple):
+    """The errors of a filter, as far as they are known, and the truth in the frame of its map."""
+
+    errors: dict[str, float]
+    """by name with unit, as printed"""
+    points: Float[np.ndarray, "N 2"] | None
+    """surveyed landmarks [m]"""
+    path: Float[np.ndarray, "K 3"] | None
+    """true poses, of the rows with a known one"""
+    map_test: MapTest | None
+    """the test of the map by the survey; None without a survey or a regular covariance"""
+
+
+def evaluate(
+    data: Dataset,
+    path: Estimate,
+    last: Estimate,
+    map_cov: Float[np.ndarray, "N 2 N 2"] | None = None,
+) -> Evaluation:
+    """The errors of a path and its last map, as far as the data set has the truth.
+
+    In one frame: ATE (RMSE of the positions), RMSE of the heading, RPE (RMSE of the translation
+    from each row to the first at least `SPAN` later, in the frame of the former), mean and median
+    NEES of the pose where its covariance is regular; RMSE and mean NEES of the landmarks with a
+    tag, each landmark by its covariance alone. In different frames path and map are each compared
+    after the rigid motion that fits best, and the pose has no NEES. `map_test` has the verdict on
+    the map.
+
+    Args:
+        path: pose (T, 3) and pose_cov (T, 3, 3).
+        last: the map.
+        map_cov: the joint covariance of its landmarks, as of `joint_map_cov`.
+    """
+    errors: dict[str, float] = {}
+    after = "" if data.one_frame else " after alignment"
+    true = points = test = None
+    known = np.ones(data.steps, bool) if data.true_at is None else np.asarray(data.true_at)
+    if data.true_path is not None and known.any():
+        pose, cov = np.asarray(path.pose)[known], np.asarray(path.pose_cov)[known]
+        true = np.asarray(data.true_path)[known]
+    if true is not None and not np.isfinite(pose).all():  # the filter failed
+        errors |= {f"ATE{after} [m]": np.nan, f"heading RMSE{after} [°]": np.nan}
+    elif true is not None:
+        of_path = metrics.ate(pose, true, align=not data.one_frame)
+        true = carried(of_path.frame, true)
+        errors[f"ATE{after} [m]"] = metrics.statistics(of_path.translation).rmse
+        turn = np.rad2deg(of_path.rotation)
+        errors[f"heading RMSE{after} [°]"] = metrics.statistics(turn).rmse
+        of_steps = metrics.rpe(true, pose, seconds=SPAN, time=np.asarray(data.time)[known])
+        if len(of_steps.translation):
+            errors[f"RPE over {SPAN:g} s [m]"] = metrics.statistics(of_steps.translation).rmse
+        error = pose_error(true, pose)
+        nees, regular = block_nees(pose, error, error, cov)["pose"]
+        if data.one_frame and regular.any():
+            errors["pose NEES, mean (3 is honest)"] = float(nees[regular].mean())
+            errors["pose NEES, median (2.37 is honest)"] = float(np.median(nees[regular]))
+    named = np.asarray(last.alive) & (np.asarray(last.tag) >= 0)
+    if data.landmarks is not None and named.any():
+        points = np.asarray(data.landmarks, np.asarray(last.points).dtype)
+        tag, found = np.asarray(last.tag)[named], np.asarray(last.points)[named]
+        if not np.isfinite(found).all():
+            rmse = np.nan
+        elif data.one_frame:
+            rmse = metrics.statistics(np.linalg.norm(found - points[tag], axis=1)).rmse
+        else:
+            rmse = metrics.align_map(last, data.landmarks)[1]
+            frame = metrics.alignment(points[tag], found)
+            points = carried(frame, points)
+        errors[f"map RMSE{after} [m]"] = rmse
+        gap = (points[tag] - found)[:, :, None]
+        covs = np.asarray(last.point_covs)[named].astype(np.float64)
+        finite = np.isfinite(covs).all(axis=(1, 2)) & np.isfinite(found).all(axis=1)
+        regular = finite & (np.linalg.eigvalsh(np.where(finite[:, None, None], covs, 0))[:, 0] > 0)
+        if regular.all():
+            survey, among = np.asarray(data.landmarks)[tag], np.flatnonzero(named)
+            joint = None if map_cov is None else map_cov[among][:, :, among]
+            test = judge_map(found.astype(np.float64), survey, covs, joint, data.one_frame)
+        if regular.any():
+            gap, covs = gap[regular], covs[regular]
+            square = np.swapaxes(gap, 1, 2) @ np.linalg.solve(covs, gap)
+            honest = "(2 is honest)" if data.one_frame else "(honest: below 2)"
+            errors[f"landmark NEES{after} {honest}"] = float(square.mean())
+    return Evaluation(errors, points, true, test)

@@ -1,0 +1,308 @@
+"""Reader and writer of graphs as files of g2o and TORO; see `graphs.read`, `graphs.write`."""
+
+import gzip
+from collections.abc import Sequence
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+
+from jaxslam.datasets._lines import TextFile
+from jaxslam.graphs._checks import check_numbers, indefinite
+from jaxslam.graphs._factor import REGISTRY
+from jaxslam.graphs._graph import Graph, Table
+from jaxslam.graphs.starts import odometry
+from jaxslam.results._files import write_files
+
+
+class _Edge(NamedTuple):
+    """The fields of one kind of edge."""
+
+    table: str
+    who: tuple[str, ...]
+    """kinds of the variables, "pose" or "point" """
+    measured: tuple[str, ...]
+    entries: tuple[tuple[int, int], ...]
+    """row and column in Ω of each number"""
+
+
+_BY_ROWS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
+_TORO_ORDER = ((0, 0), (0, 1), (1, 1), (2, 2), (0, 2), (1, 2))
+_POSE = ("x", "y", "theta")
+EDGES = {
+    "EDGE_SE2": _Edge("relative_pose", ("pose", "pose"), _POSE, _BY_ROWS),
+    "EDGE2": _Edge("relative_pose", ("pose", "pose"), _POSE, _TORO_ORDER),
+    "EDGE": _Edge("relative_pose", ("pose", "pose"), _POSE, _TORO_ORDER),
+    "EDGE_PRIOR_SE2": _Edge("prior", ("pose",), _POSE, _BY_ROWS),
+    "EDGE_SE2_XY": _Edge(
+        "relative_position", ("pose", "point"), ("x", "y"), ((0, 0), (0, 1), (1, 1))
+    ),
+    "EDGE_BEARING_SE2_XY": _Edge("bearing", ("pose", "point"), ("bearing",), ((0, 0),)),
+}
+_VERTICES = {
+    "VERTEX_SE2": ("pose", _POSE),
+    "VERTEX2": ("pose", _POSE),
+    "VERTEX": ("pose", _POSE),
+    "VERTEX_XY": ("point", ("x", "y")),
+}
+_SKIPPED = {
+    "ROBOTLASER1": "laser scans",
+    "PARAMS_SE2OFFSET": "sensor offsets",  # no edge of EDGES refers to one
+    "VERTEX_TAG": "notes",
+    "VERTEX_ELLIPSE": "notes",
+}
+"""Lines that are not part of the graph, and the name under which they are counted."""
+
+
+class Format(NamedTuple):
+    """The kinds of lines of a file format."""
+
+    name: str
+    vertices: dict[str, str]
+    """of "pose" and "point" """
+    edges: dict[str, str]
+    """by table"""
+    fix: bool
+    """whether a variable can be fixed"""
+
+
+_G2O = Format(
+    "g2o",
+    {"pose": "VERTEX_SE2", "point": "VERTEX_XY"},
+    {edge.table: kind for kind, edge in EDGES.items() if edge.entries != _TORO_ORDER},
+    fix=True,
+)
+TORO = Format("TORO", {"pose": "VERTEX2"}, {"relative_pose": "EDGE2"}, fix=False)
+_ENDINGS = {".toro": TORO, ".graph": TORO}
+"""Endings of file names that are not written as g2o."""
+
+
+_LARGEST = 2**31 - 1
+
+
+class Loaded(NamedTuple):
+    """The graph in a file, and the changes made to it."""
+
+    graph: Graph
+    skipped: dict[str, int]
+    """number of lines that are not in the graph, by kind"""
+    placed: int
+    """number of poses and points without a line, placed along the edges"""
+
+
+class _Row(NamedTuple):
+    """The line of an edge."""
+
+    line: int
+    edge: _Edge
+    ids: list[int]
+    numbers: list[float]
+
+
+def load(path: str | Path) -> Loaded:
+    """The graph in a file; see `graphs.read`."""
+    file = TextFile(path)
+    vertices: dict[str, dict[int, list[float]]] = {"pose": {}, "point": {}}
+    rows: dict[str, list[_Row]] = {}
+    fixed: list[tuple[int, int]] = []
+    skipped: dict[str, int] = {}
+    for line, (kind, *fields) in file:
+        if kind in EDGES:
+            rows.setdefault(EDGES[kind].table, []).append(_row(file, line, EDGES[kind], fields))
+        elif kind in _VERTICES:
+            variable, names = _VERTICES[kind]
+            file.expect(line, fields, ("id", *names))
+            vertex = _identity(file, line, fields[0], "id")
+            if any(vertex in known for known in vertices.values()):
+                raise file.error(line, f"vertex {vertex} occurs twice")
+            vertices[variable][vertex] = file.numbers(line, fields[1:], names)
+        elif kind == "FIX":
+            if not fields:
+                raise file.error(line, "expected at least 1 field (id), got 0")
+            fixed += [(line, _identity(file, line, field, "id")) for field in fields]
+        elif kind in _SKIPPED or kind.startswith("#"):
+            what = _SKIPPED.get(kind, "comments")
+            skipped[what] = skipped.get(what, 0) + 1
+        else:
+            known = ", ".join([*_VERTICES, "FIX", *EDGES])
+            raise file.error(line, f"unknown kind {kind!r}; known: {known}")
+    if not rows:
+        raise file.end_error("no edge in the file")
+    unplaced = not any(vertices.values())
+    if unplaced:
+        vertices = _named_by_edges(file, rows)
+    graph = _assembled(file, vertices, rows, fixed)
+    if not unplaced:
+        return Loaded(graph, skipped, 0)
+    try:
+        return Loaded(odometry(graph), skipped, len(graph.poses) + len(graph.points))
+    except ValueError as problem:
+        why = str(problem).removeprefix("odometry: ")
+        raise file.end_error(f"no vertices in the file to start from, and {why}") from problem
+
+
+def _identity(file: TextFile, line: int, field: str, name: str) -> int:
+    found = file.identity(line, field, name)
+    if found > _LARGEST:
+        raise file.error(line, f"{name} is above {_LARGEST}: {field}")
+    return found
+
+
+def _row(file: TextFile, line: int, edge: _Edge, fields: list[str]) -> _Row:
+    """The line of an edge; raises ValueError on a malformed one."""
+    names = (*"ij"[: len(edge.who)], *edge.measured, *(f"I{i + 1}{j + 1}" for i, j in edge.entries))
+    file.expect(line, fields, names)
+    count = len(edge.who)
+    ids = [_identity(file, line, field, n) for field, n in zip(fields[:count], names, strict=False)]
+    if len(set(ids)) < count:
+        raise file.error(line, f"an edge from vertex {ids[0]} to itself")
+    return _Row(line, edge, ids, file.numbers(line, fields[count:], names[count:]))
+
+
+def _named_by_edges(
+    file: TextFile, rows: dict[str, list[_Row]]
+) -> dict[str, dict[int, list[float]]]:
+    """The vertices that edges name, at the origin, in the order of their ids."""
+    kinds: dict[int, str] = {}
+    for row in (row for table in rows.values() for row in table):
+        for vertex, kind in zip(row.ids, row.edge.who, strict=True):
+            if kinds.setdefault(vertex, kind) != kind:
+                raise file.error(
+                    row.line, f"vertex {vertex} is a pose in one edge, a point in another"
+                )
+    return {
+        kind: {vertex: [0.0] * size for vertex in sorted(kinds) if kinds[vertex] == kind}
+        for kind, size in (("pose", 3), ("point", 2))
+    }
+
+
+def _assembled(
+    file: TextFile,
+    vertices: dict[str, dict[int, list[float]]],
+    rows: dict[str, list[_Row]],
+    fixed: list[tuple[int, int]],
+) -> Graph:
+    """The graph of the lines of a file; ValueError if they do not fit together."""
+    index = {
+        kind: {vertex: at for at, vertex in enumerate(named)} for kind, named in vertices.items()
+    }
+    held = {kind: np.zeros(len(named), bool) for kind, named in vertices.items()}
+    for line, vertex in fixed:
+        kinds = [kind for kind, known in index.items() if vertex in known]
+        if not kinds:
+            raise file.error(line, f"vertex {vertex} is not defined in the file")
+        held[kinds[0]][index[kinds[0]][vertex]] = True
+    return Graph(
+        poses=np.array(list(vertices["pose"].values())).reshape(-1, 3),
+        points=np.array(list(vertices["point"].values())).reshape(-1, 2),
+        tables={key: _table(file, table, index) for key, table in rows.items()},
+        fixed_pose=held["pose"],
+        fixed_point=held["point"],
+        pose_id=np.array(list(vertices["pose"]), np.int32),
+        point_id=np.array(list(vertices["point"]), np.int32),
+    )
+
+
+def _table(file: TextFile, rows: list[_Row], index: dict[str, dict[int, int]]) -> Table:
+    """A table; ValueError on an undefined vertex, and on an indefinite information."""
+    who, size = [], len(rows[0].edge.measured)
+    information = np.zeros((len(rows), size, size))
+    for row, matrix in zip(rows, information, strict=True):
+        for vertex, kind in zip(row.ids, row.edge.who, strict=True):
+            if vertex not in index[kind]:
+                elsewhere = any(vertex in known for known in index.values())
+                why = f"is not a {kind}" if elsewhere else "is not defined in the file"
+                raise file.error(row.line, f"vertex {vertex} {why}")
+        who.append([index[kind][v] for v, kind in zip(row.ids, row.edge.who, strict=True)])
+        for (i, j), entry in zip(row.edge.entries, row.numbers[size:], strict=True):
+            matrix[i, j] = matrix[j, i] = entry
+    bad = indefinite(information)
+    if bad.any():
+        why = "the information is not positive semidefinite"
+        if size == 3:
+            why += "; EDGE2 has the order I11 I12 I22 I33 I13 I23, EDGE_SE2 that of the rows"
+        raise file.error(rows[int(bad.argmax())].line, why)
+    z = np.array([row.numbers[:size] for row in rows])
+    return Table(np.array(who, np.int32), z, information, np.ones(len(rows), bool))
+
+
+def save(path: str | Path, graph: Graph) -> None:
+    """Write a graph as a file of g2o, or TORO by the file's ending; see `graphs.write`."""
+    if not isinstance(graph, Graph):
+        raise ValueError(f"write: expected a path and a Graph, got a {type(graph).__name__}")
+    path = Path(path)
+    packed = path.suffix == ".gz"
+    ending = path.with_suffix("").suffix if packed else path.suffix
+    text = text_of(graph, _ENDINGS.get(ending, _G2O))
+    _check_readable(graph)
+
+    content = gzip.compress(text.encode("utf-8"), mtime=0) if packed else text
+    write_files(path.parent, {path.name: content})
+
+
+def text_of(graph: Graph, form: Format = _G2O) -> str:
+    """The graph in a format; raises ValueError as `graphs.write` does."""
+    _check_writable(graph, form)
+    ids = {"pose": np.asarray(graph.pose_id), "point": np.asarray(graph.point_id)}
+    values = {"pose": np.asarray(graph.poses), "point": np.asarray(graph.points)}
+    held = {"pose": np.asarray(graph.fixed_pose), "point": np.asarray(graph.fixed_point)}
+    lines = [
+        _line(name, [one], row)
+        for kind, name in form.vertices.items()
+        for one, row in zip(ids[kind], values[kind], strict=True)
+    ]
+    for key, table in graph.tables.items():
+        name = form.edges[key.split("/")[0]]
+        edge = EDGES[name]
+        valid = np.asarray(table.valid)
+        information = np.asarray(table.information)[valid]
+        entries = np.stack([information[:, i, j] for i, j in edge.entries], axis=1)
+        numbers = np.concatenate([np.asarray(table.z)[valid], entries], axis=1)
+        who = np.asarray(table.who)[valid]
+        names = np.stack([ids[kind][who[:, k]] for k, kind in enumerate(edge.who)], axis=1)
+        lines += [_line(name, *row) for row in zip(names, numbers, strict=True)]
+    # Last: GTSAM's readG2o stops at a line that does not begin with two numbers, as `FIX 0` does.
+    lines += [f"FIX {one}" for kind in form.vertices for one in ids[kind][held[kind]]]
+    return "\n".join(lines) + "\n"
+
+
+def _check_readable(graph: Graph) -> None:
+    """Raise ValueError on a graph that `read` refuses."""
+    ids = np.concatenate([np.asarray(graph.pose_id), np.asarray(graph.point_id)])
+    if (ids < 0).any():
+        raise ValueError(f"graphs.write: expected ids >= 0, got {ids.min()}")
+    known = {key: REGISTRY[key.split("/")[0]] for key in graph.tables}
+    check_numbers("graphs.write", graph, known)
+
+
+def _check_writable(graph: Graph, form: Format) -> None:
+    """Raise ValueError on a graph that the format cannot represent."""
+    if len(both := np.intersect1d(graph.pose_id, graph.point_id)):
+        raise ValueError(
+            f"graphs.write: {both[0]} is the id of a pose and of a point, which {form.name} does "
+            "not allow"
+        )
+    if len(graph.points) and "point" not in form.vertices:
+        raise ValueError(
+            f"graphs.write: {form.name} has no line for points, and the graph has "
+            f"{len(graph.points)}"
+        )
+    if len(graph.points) and graph.points.shape[1] != 2:
+        raise ValueError(
+            f"graphs.write: expected points (x, y), got {graph.points.shape[1]} numbers"
+        )
+    held = np.asarray(graph.pose_id)[np.asarray(graph.fixed_pose)]
+    if len(held) and not form.fix:
+        raise ValueError(
+            f"graphs.write: {form.name} has no line for fixed poses, and pose {held[0]} is fixed"
+        )
+    for key in graph.tables:
+        if key.split("/")[0] not in form.edges:
+            raise ValueError(
+                f"graphs.write: {form.name} has no line for table {key!r}; it has some for "
+                f"{', '.join(form.edges)}"
+            )
+
+
+def _line(kind: str, ids: Sequence[int], numbers: np.ndarray) -> str:
+    return " ".join([kind, *map(str, ids), *map(repr, np.asarray(numbers, float).tolist())])

@@ -1,0 +1,1 @@
+"""Logs of landmarks: public data sets, and your own tables."""

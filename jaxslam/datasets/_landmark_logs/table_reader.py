@@ -1,0 +1,361 @@
+"""Reader of your data: CSV files with units in the header, and a file of settings."""
+
+import csv
+import io
+import math
+from collections.abc import Sequence
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from jaxslam.calibration import delayed
+from jaxslam.core.logs import _tables as tables
+from jaxslam.core.logs._streams import interpolate_poses
+from jaxslam.core.logs._tables import POSE, TAG, TIME, UNITS, Columns, split_unit, unit_divisor
+from jaxslam.core.protocols import Motion, Sensor
+from jaxslam.core.types import Log
+from jaxslam.datasets._dataset import Adjustable, Dataset, Parameter
+from jaxslam.datasets._landmark_logs.table_settings import Parametric, TableSettings
+from jaxslam.datasets._lines import DIGITS, LARGEST, read_bytes, stored
+
+
+class CsvTable:
+    """The cells of a CSV file (UTF-8, separated by commas, any line ends) below its header.
+
+    It is NAME or NAME.gz. Every column but `tag` has its unit in the header, as in `v [m/s]`. Lines
+    above the header that begin with # are comments.
+    Raises ValueError if the file cannot be read, has no line below its header, or a line with
+    another number of cells.
+    """
+
+    def __init__(self, path: str | Path) -> None:
+        self.path, data = read_bytes(path)
+        try:
+            text = data.decode("utf-8-sig")
+        except UnicodeDecodeError as problem:
+            line = data.count(b"\n", 0, problem.start) + 1
+            raise ValueError(f"{self.path}:{line}: expected text in UTF-8") from problem
+        if "\0" in text:
+            raise self._error(
+                text.count("\n", 0, text.index("\0")) + 1, "expected text, got a zero byte"
+            )
+        above = 0
+        while text.lstrip(" \t\r\n").startswith("#"):  # with its quotes, which csv would pair
+            _, _, text = text.partition("\n")
+            above += 1
+        reader = csv.reader(io.StringIO(text, newline=""))
+        lines, begins = [], above + 1  # a cell in quotes may go over several lines of the file
+        try:
+            for cells in reader:
+                lines.append((begins, [cell.strip() for cell in cells]))
+                begins = above + reader.line_num + 1
+        except csv.Error as problem:
+            raise self._error(begins, f"expected cells separated by commas: {problem}") from problem
+        lines = [(number, cells) for number, cells in lines if any(cells)]
+        if not lines:
+            raise ValueError(f"{self.path}:1: expected a header, as 't [s],v [m/s]', got no text")
+        self.head_line, self.header = lines[0]
+        self.lines = [number for number, _ in lines[1:]]
+        self.cells = [cells for _, cells in lines[1:]]
+        for separator in ";\t":
+            if len(self.header) == 1 and separator in self.header[0]:
+                reason = f"expected cells separated by commas, got {separator!r}"
+                raise self._error(self.head_line, reason)
+        if all(math.isfinite(_number(cell)) for cell in self.header):
+            raise self._error(
+                self.head_line, f"expected a header, as 't [s],v [m/s]', got {self.header[0]!r}"
+            )
+        if not self.cells:
+            raise self._error(self.head_line, "expected lines below the header, got none")
+        self.header = [" ".join(name.split()) for name in self.header]  # messages quote it
+        self.names = [split_unit(name)[0] for name in self.header]
+        for place, name in enumerate(self.names):
+            if name in self.names[:place]:
+                raise self._error(self.head_line, f"the column {name!r} occurs twice", place)
+        for number, cells in zip(self.lines, self.cells, strict=True):
+            if len(cells) != len(self.header):
+                wanted, hint = len(self.header), ""
+                if "\n" in "".join(cells):
+                    hint = "; a quotation mark is not closed on its line"
+                elif len(cells) > wanted:
+                    hint = "; write a number with a point: 0.5"
+                raise self._error(
+                    number,
+                    f"expected {wanted} cells, as in line {self.head_line}, got {len(cells)}{hint}",
+                )
+
+    def table(self, wanted: Sequence[str], why: str) -> Columns[int]:
+        """The wanted columns ("v [m/s]"), in their units.
+
+        Raises ValueError on a column that is missing, or without a known unit, a cell that is not a
+        finite number, and a tag that is not a whole number >= 0 (or empty, for unknown).
+
+        Args:
+            why: what needs them, for messages.
+        """
+        places = {name: self._place(name, why) for name in wanted}
+
+        def at(row: int, column: str) -> str:
+            return f"{self.path}:{self.lines[row]}: {self._column(places[column])}"
+
+        columns = {n: self._numbers(place, n) for n, place in places.items() if n != TAG}
+        return Columns(columns, self._tags(places[TAG]) if TAG in places else None, at)
+
+    def unused(self, wanted: Sequence[str]) -> list[str]:
+        """The columns of the file that are not wanted."""
+        bare = {split_unit(name)[0] for name in wanted}
+        return [
+            whole for whole, name in zip(self.header, self.names, strict=True) if name not in bare
+        ]
+
+    def _place(self, name: str, why: str) -> int:
+        bare = split_unit(name)[0]
+        if bare not in self.names:
+            got = ", ".join(map(repr, self.header))
+            raise self._error(self.head_line, f"expected a column {name!r} ({why}), got {got}")
+        place = self.names.index(bare)
+        unit, target = split_unit(self.header[place])[1], split_unit(name)[1]
+        if target is None:
+            return place
+        if unit is None or unit_divisor(unit, name) is None:
+            known = " or ".join(f"[{one}]" for one in (target, *UNITS.get(target, {})))
+            raise self._error(
+                self.head_line, f"expected a unit {known}, got {self.header[place]!r}", place
+            )
+        return place
+
+    def _numbers(self, place: int, name: str) -> np.ndarray:
+        divisor = unit_divisor(split_unit(self.header[place])[1], name)
+        values = np.empty(len(self.cells))
+        for row, cells in enumerate(self.cells):
+            values[row] = _number(cells[place])
+        usable = np.abs(values) <= LARGEST
+        if not usable.all():
+            row = int(np.flatnonzero(~usable)[0])
+            cell = self.cells[row][place]
+            hint = " (write a point: 0.5)" if "," in cell else ""
+            what = f"number within ±{LARGEST:g}" if np.isfinite(values[row]) else "finite number"
+            raise self._error(self.lines[row], f"expected a {what}, got {cell!r}{hint}", place)
+        return values / (divisor or 1.0)
+
+    def _tags(self, place: int) -> list[int | None]:
+        tags: list[int | None] = []
+        for number, cells in zip(self.lines, self.cells, strict=True):
+            cell = cells[place]
+            if cell and not (cell.isascii() and cell.isdigit()):
+                reason = f"expected a whole number >= 0, or nothing if unknown, got {cell!r}"
+                raise self._error(number, reason, place)
+            if len(cell) > DIGITS:
+                reason = f"expected at most {DIGITS} digits, got {len(cell)}"
+                raise self._error(number, reason, place)
+            tags.append(int(cell) if cell else None)
+        return tags
+
+    def _column(self, place: int) -> str:
+        return f"column {place + 1} ({self.header[place]})"
+
+    def _error(self, line: int, reason: str, place: int | None = None) -> ValueError:
+        where = "" if place is None else f"{self._column(place)}: "
+        return ValueError(f"{self.path}:{line}: {where}{reason}")
+
+
+def _number(cell: str) -> float:
+    """The number in a cell, or NaN. float() alone accepts 1_000."""
+    try:
+        return math.nan if "_" in cell else float(cell)
+    except ValueError:
+        return math.nan
+
+
+ODOMETRY, MEASUREMENTS = "odometry.csv", "measurements.csv"
+
+_GAP_FACTOR = 10
+"""Intervals of odometry above this multiple of the median are noted."""
+_LARGEST = 0.01
+"""Share of ranges that equal the largest, above which they are noted."""
+
+
+def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
+    """The data set in the CSV files of a folder.
+
+    `odometry.csv` has the columns `t [s]` and the controls of a motion model without Δt, as
+    `v [m/s],omega [rad/s]`, or a path of poses, `x [m],y [m],theta [rad]`. `measurements.csv` has
+    `t [s]`, `tag` (empty if the landmark is unknown) and the measurements of a sensor, as
+    `range [m],bearing [rad]`. Optional are `truth.csv` (t, x, y, theta), `landmarks.csv` (tag, x, y
+    of every tag) and `dataset.toml`:
+
+        [motion]
+        model = "unicycle"
+        noise = [0.02, 0.01]        # standard deviations, in the order of the model
+        [sensor]
+        model = "range_bearing"
+        noise = [0.05, 0.02]
+        mount = [0.1, 0.0, 0.0]     # and further arguments of the model
+        delay = 0.05                # of measurements after odometry
+        max_range = 5.6             # from which on a range says nothing
+        [filter]
+        gate = 0.999                # probability
+        start = [0.0, 0.0, 0.0]     # in the frame of truth and landmarks
+        start_noise = [0.0, 0.0, 0.0]
+        capacity = 50
+        associate = "nearest"
+        update = "sequential"
+        spacing = 3.0               # least time between used measurements of a landmark
+
+    Systematic errors are keys of [motion], `scale`, `wheels` and `heading` of `motion.Corrected`,
+    and of [sensor], `range` and `axis` of `sensors.Corrected` and `across` of
+    `sensors.RangeBearingNoise`. [calibration] has the covariance in which they are known. Missing
+    settings have defaults, listed in `Dataset.assumed`. The log is `Log.from_records`. The
+    noise of the motion is that of a line of odometry; a row that is shorter or longer has white
+    noise of the same density. The start is that of the truth if it covers the first row; then all
+    is in one frame. Other columns are not used, and listed. A CSV file may be packed by gzip, as
+    `truth.csv.gz`; of both the plain one is read.
+
+    Args:
+        folder: the folder of the files.
+        fitted: whether numbers of `fit.toml`, if there is one, replace those of `dataset.toml`.
+    Raises:
+        ValueError: `path:line: column: what was expected` on a header without a column or a unit, a
+            cell that is not a finite number, a tag that is not a whole number, times that go back
+            (or repeat, but for measurements), a line with another number of cells, no lines; `path:
+            [section] key: …` on settings; and on a measured tag that `landmarks.csv` lacks.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        found = "is a file" if folder.exists() else "does not exist"
+        raise ValueError(f"{folder} {found}: expected a folder with {ODOMETRY} and {MEASUREMENTS}")
+    for name, columns in ((ODOMETRY, "controls of the motion"), (MEASUREMENTS, "measurements")):
+        if not any((folder / file).is_file() for file in (name, f"{name}.gz")):
+            raise ValueError(
+                f"{folder}: expected a file {name}, with columns '{TIME}' and the {columns}, as "
+                "docs/guide/own_data.md shows"
+            )
+    settings = TableSettings(folder / "dataset.toml", fitted)
+    odometry_file = CsvTable(folder / ODOMETRY)
+    seen_file = CsvTable(folder / MEASUREMENTS)
+    clock = odometry_file.table((TIME,), "the time").columns[TIME]
+    interval = float(np.median(np.diff(clock))) if len(clock) > 1 else 1.0
+    by_motion = settings.motion(odometry_file.header, abs(interval) or 1.0)
+    by_sensor = settings.sensor(seen_file.header)
+    motion, sensor, delay = by_motion.made, by_sensor.made, settings.delay()
+    moved = (TIME, *tables.odometry_columns(motion.controls, odometry_file.header))
+    measured = tables.measurement_columns(sensor.measurements, sensor.landmark)
+    odometry = odometry_file.table(moved, f"of the motion model {motion.name}")
+    seen = seen_file.table(measured, f"of the sensor {sensor.name}")
+    seen.columns[TIME] = seen.columns[TIME] - delay
+    max_range, spacing = settings.max_range(), settings.spacing()
+    notes = [
+        f"column {column!r} of {file.path.name} is not used"
+        for file, wanted in ((odometry_file, moved), (seen_file, measured))
+        for column in file.unused(wanted)
+    ]
+    if len(clock) > 2 and (gaps := np.diff(clock)).max() > _GAP_FACTOR * np.median(gaps):
+        k = int(np.argmax(gaps))
+        notes.append(
+            f"{odometry.at(k + 1, TIME)}: {gaps[k]:.6g} s since the line before, the median is "
+            f"{np.median(gaps):.6g} s; the odometry is taken to hold over it"
+        )
+    if "range [m]" in seen.columns and not np.isfinite(max_range):
+        ranges = seen.columns["range [m]"]
+        largest = int((ranges == ranges.max()).sum())
+        if largest > max(10, _LARGEST * len(ranges)):
+            notes.append(
+                f"{largest:,} ranges are {ranges.max():.6g} m, the largest: if the sensor writes "
+                "it where it met nothing, set [sensor] max_range"
+            )
+    survey = _survey(folder / "landmarks.csv")
+    rows, tags, dropped = tables.align_tables(
+        odometry,
+        [tables.Seen(seen, sensor.measurements, max_range=max_range, spacing=spacing)],
+        motion.controls,
+        tuple(survey or ()),
+    )
+    known = tags if survey is None else survey
+    for row, tag in enumerate(seen.tags or ()):
+        if tag is not None and tag not in known:
+            raise ValueError(f"{seen.at(row, TAG)}: expected a tag of landmarks.csv, got {tag}")
+    truth, covered = _truth(folder / "truth.csv", rows.time)
+    start, one_frame = settings.start(), True
+    if start is None:
+        one_frame = covered is not None and bool(covered[0])
+        start = truth[0] if truth is not None and one_frame else np.zeros(3)
+        shown = [float(f"{value:.6g}") for value in start]
+        notes.append(f"[filter] start = {shown}" + ", the truth at the first row" * one_frame)
+    unknown = None in (seen.tags or ())
+    capacity = settings.capacity(len(tags), unknown)
+    log = Log.from_rows(rows)
+    adjustable = _adjustable(log, rows.time, by_motion, by_sensor, delay)
+    return Dataset(
+        name=settings.text("name", folder.resolve().name),
+        log=log,
+        time=rows.time,
+        motion=motion,
+        sensor=sensor,
+        tags=tags,
+        pose=start,
+        pose_cov=np.diag(settings.start_noise()) ** 2,
+        filter_options=settings.filter_options(len(sensor.measurements), unknown),
+        landmarks=None if survey is None else np.array([survey[tag] for tag in tags]),
+        true_path=truth,
+        true_at=covered,
+        one_frame=one_frame,
+        slots=capacity,
+        adjustable=adjustable._replace(cov=settings.uncertain(adjustable.parameters)),
+        dropped=dropped,
+        assumed=tuple(settings.assumed + notes),
+        source=settings.text("source", ""),
+    )
+
+
+def _adjustable(
+    log: Log,
+    time: np.ndarray,
+    motion: Parametric[Motion],
+    sensor: Parametric[Sensor],
+    delay: float,
+) -> Adjustable:
+    """Log and models as functions of the parameters of both, and of the delay if there is one."""
+    count, size = len(motion.parameters), len(motion.parameters) + len(sensor.parameters)
+    parameters = motion.parameters + sensor.parameters
+    controls = motion.made.controls
+    if controls[-1:] == (tables.INTERVAL,):
+        parameters += (Parameter("delay [s]", delay, "delay", ("sensor", "delay")),)
+
+    def at(p: jax.Array) -> tuple[Log, Motion, Sensor]:
+        moved = log if p.shape[0] == size else delayed(log, time, controls, p[size] - delay)
+        return moved, motion.make(p[:count]), sensor.make(p[count:size])
+
+    return Adjustable(parameters, at)
+
+
+def _survey(path: Path) -> dict[int, tuple[float, float]] | None:
+    """The position of each tag; None without a file."""
+    if stored(path) is None:
+        return None
+    found = CsvTable(path).table((TAG, *POSE[:2]), "of landmarks")
+    survey: dict[int, tuple[float, float]] = {}
+    for row, tag in enumerate(found.tags or ()):
+        if tag is None or tag in survey:
+            got = "nothing" if tag is None else f"{tag} again"
+            raise ValueError(
+                f"{found.at(row, TAG)}: expected a tag that no other line has, got {got}"
+            )
+        survey[tag] = tuple(found.values(POSE[:2])[row])
+    return survey
+
+
+def _truth(path: Path, time: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
+    """The true pose at each row (T, 3), and whether it is known (T,); None without a file."""
+    if stored(path) is None:
+        return None, None
+    found = CsvTable(path).table((TIME, *POSE), "of a true path")
+    tables.check_times(found, strict=True)
+    clock = found.columns[TIME]
+    covered = (time >= clock[0]) & (time <= clock[-1])
+    if not covered.any():
+        raise ValueError(
+            f"{found.at(0, TIME)}: expected times within those of the log, {time[0]:.12g} to "
+            f"{time[-1]:.12g}, got {clock[0]:.12g} to {clock[-1]:.12g}"
+        )
+    return interpolate_poses(clock, found.values(POSE), time), covered

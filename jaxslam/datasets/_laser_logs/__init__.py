@@ -1,0 +1,1 @@
+"""Logs of laser scanners: CARMEN files and ROS bags."""

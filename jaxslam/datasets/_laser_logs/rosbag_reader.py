@@ -1,0 +1,525 @@
+"""Laser logs from ROS bags: scans, odometry at each, and the mount of the laser."""
+
+from bisect import bisect_right
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import numpy as np
+from jaxtyping import Bool, Float, Int
+from numpy.typing import ArrayLike
+
+from jaxslam.datasets._laser_logs.bag_messages import TRANSFORMS, Bag, Topic, opened
+from jaxslam.datasets._laser_logs.bag_transforms import (
+    UPSIDE_DOWN,
+    Frames,
+    LaserMount,
+    Transform,
+    frame_name,
+    laser_mount,
+    mount_text,
+    odometry_edges,
+    planar,
+    pose_of,
+    stamp_of,
+    transforms_of,
+)
+from jaxslam.datasets._laser_logs.laser_beams import beams_of
+from jaxslam.datasets._laser_logs.laser_record import LaserLog, checked_mount, wrapped_path
+from jaxslam.math import numpy_poses as poses
+
+LASER_SCAN = "sensor_msgs/LaserScan"
+ODOMETRY = "nav_msgs/Odometry"
+
+BACKWARD = 0.1
+"""Largest share of the messages of a topic whose stamps go back."""
+
+APART = 10**9
+"""Difference between the stamp and the time of the recording that is reported [ns]."""
+
+GAP = 10**9
+"""Time between two messages of odometry that is reported where a scan is in between [ns]."""
+
+OPTIONS = {"scan": "--laser", "odometry": "--odometry"}
+"""Arguments that choose a topic, and the options of the commands for them."""
+
+
+def rosbag(
+    path: str | Path,
+    scan: str | None = None,
+    odometry: str | None = None,
+    *,
+    max_range: float = 50.0,
+    mount: ArrayLike | None = None,
+) -> LaserLog:
+    """A laser log from a bag of ROS 1 (`.bag`) or ROS 2 (a folder, `.mcap`, `.db3`, zstd or not).
+
+    Needs the library rosbags: `pip install 'jaxslam[ros]'`.
+
+    | messages | read as |
+    |---|---|
+    | `sensor_msgs/LaserScan` of one topic | the scans; each at the stamp of its header |
+    | `nav_msgs/Odometry` of one topic | raw odometry; the robot's frame is `child_frame_id` |
+    | `/tf`, without a topic of odometry | raw odometry from `odom` to `base_link` or |
+    | | `base_footprint` |
+    | `/tf_static`, else `/tf` | the mount, along the chain from the robot's frame to that of |
+    | | the scans |
+
+    Messages of other topics are counted in `dropped`. Where several topics are possible, `scan` or
+    `odometry` names one.
+
+    **Ranges** at `range_max` or above, also ∞, are without a return; below `range_min`, NaN and -∞
+    are not valid. **Angles** increase in the result: a scan with a negative increment, or of a
+    laser upside down, is reversed. The motion within a scan is not corrected.
+
+    **Odometry** is interpolated on SE(2) at the stamp of each scan. A scan before the first or
+    after the last message takes its pose, the steps to and from it are unknown, and they are
+    counted. Without odometry all steps are unknown, and `raw` stands still: laser SLAM and
+    `jaxslam localize` then use laser odometry alone.
+
+    **Stamps** are those of the headers; the times of the recording if all headers have zero.
+    Messages whose stamps go back, or repeat, are dropped and counted, so that most are kept.
+
+    Args:
+        path: the file or the folder.
+        scan: topic of the scans; default: the only one.
+        odometry: topic of the odometry, or `odom:base_link`, the names of two frames of `/tf`;
+            default: the only topic, else the only such pair.
+        max_range: ranges from this one [m], or from `range_max`, are without a return.
+        mount: (3,) [m, m, rad] in place of that of the transforms.
+    Raises:
+        ValueError: with the file: if it is damaged or no bag; without scans; on several topics, or
+            a topic that is not there, empty or of another type; on angles that are not finite,
+            scans of several frames, a mount that changes or is tilted by more than 10°; if more
+            than a tenth of the stamps go back, or no scan is within the time of the odometry. Also
+            if rosbags is not installed, on a max_range that is not above 0, and a mount that is
+            not three finite numbers.
+    """
+    if not max_range > 0:
+        raise ValueError(f"rosbag: expected a max_range above 0, got {max_range}")
+    given = None if mount is None else checked_mount("rosbag", mount)
+    corrections: list[str] = []
+    dropped: Counter[str] = Counter()
+    with opened(path) as bag:
+        laser = _chosen(bag, "scan", LASER_SCAN, scan)
+        if laser is None:
+            raise bag.error(
+                f"expected a topic of {LASER_SCAN} with messages, got {_listed(bag.topics)}"
+            )
+        wheels = None if _is_pair(odometry) else _chosen(bag, "odometry", ODOMETRY, odometry)
+        messages = _read(bag, laser, wheels, corrections)
+        transforms = messages.transforms
+        frame = _frame_of(bag, laser, messages.scans)
+        if wheels is None or not Frames(transforms).connects(messages.base, frame):
+            transforms = transforms + _transforms(bag, static=False)
+        if wheels is None:
+            messages = _odometry_of_transforms(bag, messages, transforms, odometry)
+        placed, upside_down = _mount(bag, Frames(transforms), frame, messages, given, corrections)
+        for topic in bag.topics:
+            if topic.name not in (laser, wheels) and topic.type not in TRANSFORMS and topic.count:
+                dropped[f"messages {topic.name}"] = topic.count
+        stamp, kept = _in_order(bag, laser, "scans", messages.scans, dropped, corrections)
+        scans = [_ascending(messages.scans[k], upside_down) for k in kept]
+        found = _odometry_at(bag, stamp, messages, wheels, dropped, corrections)
+    beams, limit = beams_of(scans, max_range, dropped, corrections)
+    return LaserLog(
+        name=Path(path).resolve().name.split(".")[0],
+        source=str(path),
+        laser=laser,
+        placed=False,
+        time=_seconds(stamp),
+        beams=beams,
+        corrected=np.zeros((len(scans), 3)),
+        raw=wrapped_path(found.raw),
+        odometry_known=found.known,
+        row=found.row,
+        odometry=wrapped_path(found.poses),
+        odometry_time=_seconds(found.stamp),
+        max_range=limit,
+        mount=placed,
+        dropped=dict(dropped),
+        corrections=tuple(corrections),
+    )
+
+
+class BagContents(NamedTuple):
+    """What is in a bag."""
+
+    topics: tuple[Topic, ...]
+    start: float
+    """of the recording [s], NaN without messages"""
+    end: float
+    lasers: dict[str, str]
+    """by topic with scans: the mount, or why there is none"""
+    odometry: dict[str, int]
+    """pairs of frames of `/tf` that are odometry by their names, and their transforms"""
+
+
+def rosbag_contents(path: str | Path) -> BagContents:
+    """The topics, time and mounts of a bag, without its scans.
+
+    Raises ValueError, with the file, if the bag cannot be read.
+    """
+    with opened(path) as bag:
+        transforms = _transforms(bag, static=True) + _transforms(bag, static=False)
+        frames = Frames(transforms)
+        wheels = [one for one in bag.topics if one.type == ODOMETRY and one.count]
+        base = None
+        if len(wheels) == 1:
+            base = frame_name(bag.first(wheels[0].name).child_frame_id)
+        lasers = {}
+        for topic in bag.topics:
+            if topic.type == LASER_SCAN and topic.count:
+                frame = frame_name(bag.first(topic.name).header.frame_id)
+                notes: list[str] = []
+                try:
+                    placed = laser_mount(frames, frame, base, notes)
+                    lasers[topic.name] = notes[0] if placed is None else mount_text(placed)
+                except ValueError as problem:
+                    lasers[topic.name] = str(problem)
+        pairs = odometry_edges(transforms)
+        return BagContents(
+            bag.topics,
+            bag.start,
+            bag.end,
+            lasers,
+            {":".join(pair): count for pair, count in pairs.items()},
+        )
+
+
+class _ScanMessage(NamedTuple):
+    """A scan of n beams."""
+
+    stamp: int
+    """[ns]"""
+    recorded: int
+    """[ns]"""
+    frame: str
+    ranges: Float[np.ndarray, "n"]
+    """[m], 0 where the beam has none"""
+    angles: Float[np.ndarray, "n"]
+    limit: float
+    """`range_max` [m], infinite if it is not finite and above 0"""
+    bad_limit: bool
+
+
+class _PoseMessage(NamedTuple):
+    """A message of odometry."""
+
+    stamp: int
+    """[ns]"""
+    recorded: int
+    """[ns]"""
+    pose: Float[np.ndarray, "7"]
+
+
+class _Messages(NamedTuple):
+    """The messages that are used."""
+
+    scans: list[_ScanMessage]
+    odometry: list[_PoseMessage]
+    base: str
+    """the frame of the robot by odometry; empty if unknown"""
+    transforms: list[Transform]
+
+
+class _Odometry(NamedTuple):
+    """T poses of odometry, and the odometry at K scans."""
+
+    poses: Float[np.ndarray, "T 3"]
+    stamp: Int[np.ndarray, "T"]
+    """[ns]"""
+    row: Int[np.ndarray, "K"]
+    raw: Float[np.ndarray, "K 3"]
+    known: Bool[np.ndarray, "K"]
+
+
+def _listed(topics: Sequence[Topic]) -> str:
+    """The topics with their types and counts, as text."""
+    return ", ".join(f"{one.name} ({one.type}, {one.count:,})" for one in topics) or "no topics"
+
+
+def _chosen(bag: Bag, argument: str, kind: str, name: str | None) -> str | None:
+    """The topic of a type: the named one, else the only one with messages, else None."""
+    option = OPTIONS[argument]
+    if name is None:
+        found = [one for one in bag.topics if one.type == kind and one.count]
+        if len(found) > 1:
+            raise bag.error(
+                f"expected one topic of {kind}, got {_listed(found)}; choose by "
+                f"{argument}={found[0].name!r} ({option} {found[0].name})"
+            )
+        return found[0].name if found else None
+    topic = next((one for one in bag.topics if one.name in (name, f"/{name}")), None)
+    if topic is None:
+        listed = _listed([one for one in bag.topics if one.type == kind] or bag.topics)
+        raise bag.error(f"{argument} ({option}): expected a topic of {listed}; got {name!r}")
+    if topic.type != kind:
+        raise bag.error(
+            f"{argument} ({option}): expected a topic of {kind}, got {topic.name} of {topic.type}"
+        )
+    if not topic.count:
+        raise bag.error(f"{argument} ({option}): the topic {topic.name} has no messages")
+    return topic.name
+
+
+def _is_pair(odometry: str | None) -> bool:
+    """Whether odometry is given as two frames, as `odom:base_link`."""
+    return odometry is not None and ":" in odometry
+
+
+def _read(bag: Bag, laser: str, wheels: str | None, corrections: list[str]) -> _Messages:
+    """The scans, the odometry of a topic if one is named, and the static transforms."""
+    scans: list[_ScanMessage] = []
+    odometry: list[_PoseMessage] = []
+    base = ""
+    for name, recorded, message in bag.messages({laser} | ({wheels} if wheels else set())):
+        stamp = stamp_of(message.header)
+        if name == laser:
+            scans.append(_scan_of(bag, laser, len(scans), stamp, recorded, message))
+        else:
+            base = base or frame_name(message.child_frame_id)
+            pose = message.pose.pose
+            odometry.append(_PoseMessage(stamp, recorded, pose_of(pose.position, pose.orientation)))
+    read = {laser: len(scans), wheels: len(odometry)}
+    for topic in bag.topics:
+        if topic.name in read and read[topic.name] != topic.count:
+            corrections.append(
+                f"{topic.name} has {read[topic.name]:,} messages; the index of the bag says "
+                f"{topic.count:,}"
+            )
+    if not any(len(scan.ranges) for scan in scans):
+        raise bag.error(f"{laser}: expected scans with beams, got {len(scans)} of 0 beams")
+    return _Messages(scans, odometry, base, _transforms(bag, static=True))
+
+
+def _scan_of(
+    bag: Bag, topic: str, number: int, stamp: int, recorded: int, message: Any
+) -> _ScanMessage:
+    """The scan of a message."""
+    first, step = float(message.angle_min), float(message.angle_increment)
+    with np.errstate(invalid="ignore"):  # a signalling NaN
+        ranges = np.asarray(message.ranges, np.float64)
+    if not (np.isfinite(first) and np.isfinite(step)) or (step == 0 and len(ranges) > 1):
+        raise bag.error(
+            f"{topic}: scan {number}: expected a finite angle_min and angle_increment, which is "
+            f"not 0, got {first} and {step}"
+        )
+    shortest, limit = float(message.range_min), float(message.range_max)
+    good = 0 < limit < np.finfo(np.float32).max
+    with np.errstate(invalid="ignore"):
+        absent = np.isnan(ranges) | (ranges <= 0) | (ranges < shortest)
+    return _ScanMessage(
+        stamp,
+        recorded,
+        frame_name(message.header.frame_id),
+        np.where(absent, 0.0, np.minimum(ranges, np.finfo(float).max)),
+        first + step * np.arange(len(ranges)),
+        limit if good else np.inf,
+        not good,
+    )
+
+
+def _ascending(scan: _ScanMessage, upside_down: bool) -> _ScanMessage:
+    """The scan with increasing angles, seen from above."""
+    angles = -scan.angles if upside_down else scan.angles
+    if len(angles) > 1 and angles[1] < angles[0]:
+        return scan._replace(angles=angles[::-1], ranges=scan.ranges[::-1])
+    return scan._replace(angles=angles)
+
+
+def _frame_of(bag: Bag, topic: str, scans: Sequence[_ScanMessage]) -> str:
+    """The frame of the scans."""
+    frames = sorted({scan.frame for scan in scans})
+    if len(frames) > 1:
+        raise bag.error(f"{topic}: expected scans of one frame, got {', '.join(frames)}")
+    return frames[0]
+
+
+def _transforms(bag: Bag, static: bool) -> list[Transform]:
+    """The transforms of `/tf_static`, or of `/tf`."""
+    names = [
+        one.name
+        for one in bag.topics
+        if one.type in TRANSFORMS and one.name.endswith("static") == static
+    ]
+    return [each for _, at, message in bag.messages(names) for each in transforms_of(at, message)]
+
+
+def _odometry_of_transforms(
+    bag: Bag, messages: _Messages, transforms: Sequence[Transform], pair: str | None
+) -> _Messages:
+    """The messages with odometry from two frames of `/tf`: named ones, or the only such pair."""
+    option = OPTIONS["odometry"]
+    counts = odometry_edges(transforms)
+    if pair is not None:
+        frames = parent, child = tuple(frame_name(name) for name in pair.split(":", 1))
+        if not any((each.parent, each.child) == frames for each in transforms):
+            known = sorted({f"{each.parent}:{each.child}" for each in transforms})
+            raise bag.error(
+                f"odometry ({option}): expected two frames of the transforms "
+                f"{', '.join(known) or '(none)'}; got {pair!r}"
+            )
+    elif len(counts) > 1:
+        listed = ", ".join(f"{a}:{b} ({count:,})" for (a, b), count in sorted(counts.items()))
+        first = ":".join(sorted(counts)[0])
+        raise bag.error(
+            f"expected odometry in one pair of frames, got {listed}; choose by odometry={first!r} "
+            f"({option} {first})"
+        )
+    elif not counts:
+        return messages
+    else:
+        parent, child = next(iter(counts))
+    found = [
+        _PoseMessage(each.stamp, each.recorded, each.pose)
+        for each in transforms
+        if (each.parent, each.child) == (parent, child)
+    ]
+    return messages._replace(odometry=found, base=child)
+
+
+def _mount(
+    bag: Bag,
+    frames: Frames,
+    frame: str,
+    messages: _Messages,
+    given: Float[np.ndarray, "3"] | None,
+    corrections: list[str],
+) -> tuple[Float[np.ndarray, "3"], bool]:
+    """The pose of the laser on the robot, and whether the laser is upside down."""
+    notes: list[str] = []
+    placed: LaserMount | None = None
+    try:
+        placed = laser_mount(frames, frame, messages.base or None, notes)
+    except ValueError as problem:
+        if given is None:
+            raise bag.error(str(problem)) from problem
+    if given is None:
+        corrections += notes
+        return np.zeros(3) if placed is None else placed.pose, bool(placed and placed.upside_down)
+    if placed is not None and placed.upside_down:
+        corrections.append(UPSIDE_DOWN)
+    return given, bool(placed and placed.upside_down)
+
+
+def _in_order(
+    bag: Bag,
+    topic: str,
+    what: str,
+    messages: Sequence[_ScanMessage] | Sequence[_PoseMessage],
+    dropped: Counter[str],
+    corrections: list[str],
+) -> tuple[Int[np.ndarray, "K"], Int[np.ndarray, "K"]]:
+    """The increasing stamps [ns] of the messages that are kept, and their indices.
+
+    Raises ValueError if more than `BACKWARD` of the stamps go back.
+    """
+    stamp = np.array([each.stamp for each in messages], np.int64)
+    recorded = np.array([each.recorded for each in messages], np.int64)
+    if not stamp.any():
+        corrections.append(f"all stamps of {topic} are 0: times are those of the recording")
+        stamp = recorded
+    late = np.abs(stamp - recorded)
+    if far := int((late > APART).sum()):
+        corrections.append(
+            f"stamps of {topic} differ from the times of the recording by more than "
+            f"{APART * 1e-9:g} s in {far:,} of {len(stamp):,} messages, by up to "
+            f"{late.max() * 1e-9:.6g} s"
+        )
+    kept = _longest_in_order(stamp)
+    if back := len(stamp) - len(kept):
+        if back > BACKWARD * len(stamp):
+            at = int(np.argmax(np.diff(stamp) < 0)) + 1
+            raise bag.error(
+                f"{topic}: the stamps of {back:,} of {len(stamp):,} messages go back, first by "
+                f"{(stamp[at - 1] - stamp[at]) * 1e-9:.6g} s at message {at}; expected at most "
+                f"{BACKWARD:.0%}"
+            )
+        dropped[f"{what} whose stamp goes back"] = back
+    new = np.diff(stamp[kept], prepend=stamp[kept[0]] - 1) > 0
+    if repeated := int((~new).sum()):
+        dropped[f"{what} with the stamp of the one before"] = repeated
+    kept = kept[new]
+    return stamp[kept], kept
+
+
+def _longest_in_order(stamp: Int[np.ndarray, "n"]) -> Int[np.ndarray, "m"]:
+    """The indices of a longest subsequence that does not decrease."""
+    if (np.diff(stamp) >= 0).all():
+        return np.arange(len(stamp))
+    ends: list[int] = []  # the least last stamp of a subsequence, by its length
+    at: list[int] = []
+    before = np.full(len(stamp), -1)
+    for k, value in enumerate(stamp.tolist()):
+        length = bisect_right(ends, value)
+        before[k] = at[length - 1] if length else -1
+        ends[length : length + 1] = [value]
+        at[length : length + 1] = [k]
+    path = [at[-1]]
+    while (k := int(before[path[-1]])) >= 0:
+        path.append(k)
+    return np.array(path[::-1])
+
+
+def _odometry_at(
+    bag: Bag,
+    time: Int[np.ndarray, "K"],
+    messages: _Messages,
+    wheels: str | None,
+    dropped: Counter[str],
+    corrections: list[str],
+) -> _Odometry:
+    """The odometry at each scan, interpolated; it stands still, and is not known, if none is.
+
+    Raises ValueError if no scan is within its time.
+    """
+    first = np.arange(len(time)) == 0
+    if not messages.odometry:
+        corrections.append(
+            "the bag has no odometry: raw odometry stands still, and laser odometry takes its place"
+        )
+        none = np.full(len(time), -1)
+        return _Odometry(np.zeros((0, 3)), none[:0], none, np.zeros((len(time), 3)), first)
+    topic = wheels or "odometry in /tf"
+    path = planar(np.array([each.pose for each in messages.odometry]))
+    good = np.isfinite(path).all(axis=1)
+    if not good.any():
+        raise bag.error(f"{topic}: none of {len(path):,} messages has a pose in the plane")
+    if lost := int((~good).sum()):
+        dropped["odometry without a pose"] = lost
+    usable = [each for each, fine in zip(messages.odometry, good, strict=True) if fine]
+    stamp, kept = _in_order(bag, topic, "odometry", usable, dropped, corrections)
+    path = path[good][kept]
+    row = np.searchsorted(stamp, time, side="right") - 1
+    within = (row >= 0) & (time <= stamp[-1])
+    if not within.any():
+        (a, b), (c, d) = _seconds(time[[0, -1]]), _seconds(stamp[[0, -1]])
+        raise bag.error(
+            f"expected scans within the time of {topic}, from {c:.3f} s to {d:.3f} s, got scans "
+            f"from {a:.3f} s to {b:.3f} s"
+        )
+    if outside := int((~within).sum()):
+        corrections.append(
+            f"scans before the first or after the last message of {topic}, which take its pose: "
+            f"{outside:,}"
+        )
+    lower = np.maximum(row, 0)
+    upper = np.minimum(lower + 1, len(stamp) - 1)
+    between = np.maximum(stamp[upper] - stamp[lower], 1)
+    share = np.clip((time - stamp[lower]) / between, 0.0, 1.0)
+    if gaps := int(((between > GAP) & (share > 0) & (share < 1)).sum()):
+        corrections.append(
+            f"scans between two messages of {topic} that are more than {GAP * 1e-9:g} s apart, "
+            f"with a constant velocity in between: {gaps:,}"
+        )
+    step = poses.between(path[lower], path[upper])
+    raw = poses.compose(path[lower], poses.part(step, share))
+    known = first | (within & np.concatenate([[True], within[:-1]]))
+    return _Odometry(path, stamp, row, raw, known)
+
+
+def _seconds(stamp: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:
+    """Nanoseconds as seconds, rounded once."""
+    return np.asarray(stamp // 10**9 + (stamp % 10**9) * 1e-9)

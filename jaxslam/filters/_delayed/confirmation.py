@@ -1,0 +1,144 @@
+"""The second step: hypotheses are confirmed and corrected, or contradicted, by new measurements."""
+
+from typing import NamedTuple
+
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+from jaxslam.core.slots import Joint
+from jaxslam.filters._delayed.delayed_settings import DelayedSettings
+from jaxslam.filters._delayed.hypotheses import point_residuals
+from jaxslam.filters._delayed.state import (
+    SIZE,
+    DelayedState,
+    NewMeasurements,
+    TableLayout,
+    covariance_rows,
+    delete_slots_if_any,
+    increased,
+    slots_where,
+)
+from jaxslam.math import _linalg as linalg
+from jaxslam.math._xla import materialize
+
+
+def confirm_hypotheses(
+    settings: DelayedSettings,
+    state: DelayedState,
+    new: NewMeasurements,
+    slot: Int[Array, "M"],
+    stored: Bool[Array, "M"],
+) -> tuple[DelayedState, Bool[Array, "M"], Int[Array, "C"]]:
+    """The state with hypotheses confirmed and corrected, or deleted.
+
+    Each hypothesis is compared with the stored measurements of its tag; the least g²/var(g)
+    confirms it, if that is within the gate.
+
+    Args:
+        slot: of the measurements in the table.
+        stored: mask of the measurements in the table.
+    Returns:
+        The state; which measurements are within the gate of a hypothesis; and which measurement
+        confirmed each hypothesis, -1 where none did.
+    """
+    layout, joint = settings.layout, state.joint
+    alive, tag = joint.alive[layout.of_hypotheses], joint.tag[layout.of_hypotheses]
+    compared = alive[:, None] & stored[None, :] & (tag[:, None] == new.tag[None, :])
+    found = point_residuals(joint, settings.triangulation, layout.hypothesis_slots, slot)
+    squared = jnp.where(compared, found.squared_distance(), jnp.inf)
+    within = squared <= settings.gate
+    best = jnp.argmin(squared, axis=1)
+    every = jnp.arange(layout.hypotheses)
+    confirmed = within[every, best]
+    joint = correct_hypotheses(
+        joint,
+        layout,
+        constraints_of(
+            joint,
+            layout.hypothesis_slots,
+            slot[best],
+            found.value[every, best],
+            found.by_point[every, best],
+            found.by_stored[every, best],
+        ),
+        confirmed,
+    )
+
+    contradicted = compared.any(axis=1) & ~confirmed
+    lost = jnp.where(
+        contradicted, jnp.asarray(settings.hypotheses.decay, state.persistence.dtype), 0.0
+    )
+    persistence = state.persistence + jnp.where(confirmed, 1.0, 0.0) - lost
+    confirmed_at = jnp.where(confirmed, state.clock, state.confirmed_at)
+    stale = (state.clock - confirmed_at > settings.hypotheses.patience) & new.wanted.any()
+    vanished = alive & ((persistence <= 0) | stale)
+    state = state._replace(
+        joint=joint,
+        persistence=persistence,
+        confirmed_at=confirmed_at,
+        counts=state.counts._replace(vanished=increased(state.counts.vanished, vanished)),
+    )
+    state = delete_slots_if_any(layout, state, slots_where(layout, hypotheses=vanished))
+    return state, within.any(axis=0), jnp.where(confirmed & ~vanished, best, -1)
+
+
+class _Constraints(NamedTuple):
+    """m constraints g = 0, each between one point and one stored measurement; H = ∂g."""
+
+    value: Float[Array, "m"]
+    """g"""
+    hp: Float[Array, "m D"]
+    """H P"""
+    cov: Float[Array, "m m"]
+    """H P Hᵀ"""
+
+
+def constraints_of(
+    joint: Joint,
+    points: Int[Array, "m"],
+    stored: Int[Array, "m"],
+    value: Float[Array, "m"],
+    by_point: Float[Array, "m 2"],
+    by_stored: Float[Array, "m 3"],
+) -> _Constraints:
+    """The constraints between the points in these slots and the stored measurements in those."""
+    by_point = jnp.pad(by_point, [(0, 0), (0, SIZE - 2)])
+    rows = covariance_rows(joint)
+    hp = jnp.einsum("mi,mid->md", by_point, rows[points])
+    hp = hp + jnp.einsum("mi,mid->md", by_stored, rows[stored])
+    columns = hp[:, 3:].reshape(len(points), -1, SIZE)
+    cov = jnp.einsum("mni,ni->mn", columns[:, points], by_point)
+    cov = cov + jnp.einsum("mni,ni->mn", columns[:, stored], by_stored)
+    return materialize(_Constraints(value, hp, linalg.symmetrize(cov)))
+
+
+def correct_hypotheses(
+    joint: Joint, layout: TableLayout, constraints: _Constraints, which: Bool[Array, "C"]
+) -> Joint:
+    """The joint with each hypothesis corrected by its constraint, and nothing else changed.
+
+    g = 0 is a measurement without noise (the noise of the stored measurement is in P). A
+    hypothesis may be false, so of the optimal gain K = P Hᵀ/S only the rows of the hypothesis are
+    kept (Schmidt 1966, "Application of state-space methods to navigation problems": variables that
+    are considered, not estimated). Of any gain, P ← (I - KH) P (I - KH)ᵀ is the error's covariance:
+
+        x ← x - K g,  P ← P - K HP - (K HP)ᵀ + K S Kᵀ
+
+    and robot, landmarks and stored measurements keep theirs.
+    """
+    count, own_rows = layout.hypotheses, layout.hypothesis_rows
+    rows = SIZE * count
+    every = jnp.arange(count)
+    own_hp = constraints.hp[:, own_rows].reshape(count, count, SIZE)[every, every]
+    variance = jnp.diagonal(constraints.cov)
+    which = which & (variance > 0)
+    gain = jnp.where(which[:, None], own_hp / jnp.where(which, variance, 1.0)[:, None], 0.0)
+    k_hp = (gain[:, :, None] * constraints.hp[:, None, :]).reshape(rows, -1)
+    k_s_k = gain[:, :, None, None] * constraints.cov[:, None, :, None] * gain[None, None]
+    half = -k_hp.at[:, own_rows].add(-0.5 * k_s_k.reshape(rows, rows))
+    half = materialize(half)
+    return joint._replace(
+        landmarks=joint.landmarks.at[layout.of_hypotheses].add(-gain * constraints.value[:, None]),
+        cov=joint.cov.at[own_rows].add(half).at[:, own_rows].add(half.T),
+    )

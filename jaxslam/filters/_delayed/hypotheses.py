@@ -1,0 +1,121 @@
+"""Residuals of hypotheses against stored measurements, and their spread and distance."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+from jaxslam.core.slots import Joint
+from jaxslam.filters._delayed.delayed_settings import Distance
+from jaxslam.filters._delayed.state import SIZE, TableLayout, covariance_blocks
+from jaxslam.filters._delayed.triangulation import Triangulation
+from jaxslam.math import uncertain_poses
+from jaxslam.math._arrays import Number
+from jaxslam.math._xla import materialize
+from jaxslam.math.uncertain_poses import Frame
+
+_DISTANCES = {
+    "mahalanobis": uncertain_poses.mahalanobis_squared,
+    "bhattacharyya": uncertain_poses.bhattacharyya,
+}
+
+
+class _PointResiduals(NamedTuple):
+    """The residuals g(s, x) of p points x against q stored measurements s, and their moments."""
+
+    value: Float[Array, "p q"]
+    """g at the estimate; its true value is 0 for the same landmark [rad or m]"""
+    variance: Float[Array, "p q"]
+    """of g, with the correlation of the two"""
+    by_point: Float[Array, "p q 2"]
+    """∂g/∂x"""
+    by_stored: Float[Array, "p q 3"]
+    """∂g/∂s"""
+
+    def squared_distance(self) -> Float[Array, "p q"]:
+        """The squared distance g²/var(g), infinite where the variance is not positive."""
+        positive = self.variance > 0
+        ratio = self.value**2 / jnp.where(positive, self.variance, 1.0)
+        return jnp.where(positive, ratio, jnp.inf)
+
+
+def point_residuals(
+    joint: Joint, triangulation: Triangulation, points: Int[Array, "p"], stored: Int[Array, "q"]
+) -> _PointResiduals:
+    """The residuals of the points in these slots against the stored measurements in those.
+
+    With the Jacobians G_x, G_s: var(g) = G_x P_xx G_xᵀ + G_s P_ss G_sᵀ + 2 G_x P_xs G_sᵀ.
+    """
+    residual = triangulation.residual
+    of_pairs = jax.vmap(jax.vmap(residual, (0, None)), (None, 0))
+    jacobians = jax.vmap(jax.vmap(jax.jacfwd(residual, argnums=(1, 0)), (0, None)), (None, 0))
+    x, s = joint.landmarks[points, :2], joint.landmarks[stored]
+    value, (by_point, by_stored) = of_pairs(s, x), jacobians(s, x)
+    blocks = covariance_blocks(joint)
+    rows = blocks[points][:, :2]
+    p_xx, p_xs = rows[jnp.arange(points.shape[0]), :, points, :2], rows[:, :, stored]
+    p_ss = blocks[stored, :, stored]
+    variance = jnp.einsum("pqi,pij,pqj->pq", by_point, p_xx, by_point)
+    variance = variance + jnp.einsum("pqi,qij,pqj->pq", by_stored, p_ss, by_stored)
+    variance = variance + 2 * jnp.einsum("pqi,piqj,pqj->pq", by_point, p_xs, by_stored)
+    return materialize(_PointResiduals(value, variance, by_point, by_stored))
+
+
+class UncertainPoints(NamedTuple):
+    """Gaussian positions (x, y) [m]."""
+
+    mean: Float[Array, "*n 2"]
+    cov: Float[Array, "*n 2 2"]
+
+
+def relative_to_robot(joint: Joint, layout: TableLayout) -> UncertainPoints:
+    """The positions of the hypotheses (C,) relative to the robot's position."""
+    first, count = layout.landmarks, layout.hypotheses
+    blocks = covariance_blocks(joint)[first : first + count][:, :2]
+    blocks = blocks[jnp.arange(count), :, first + jnp.arange(count), :2]
+    cross = joint.cov[:2, 3:].reshape(2, layout.slots, SIZE)[:, first : first + count, :2]
+    cross = cross.transpose(1, 0, 2)
+    cov = blocks + joint.cov[None, :2, :2] - cross - cross.transpose(0, 2, 1)
+    return UncertainPoints(joint.landmarks[layout.of_hypotheses, :2] - joint.pose[None, :2], cov)
+
+
+def relative_spread(points: UncertainPoints) -> Float[Array, "*n"]:
+    """The relative spread: √(largest eigenvalue of the covariance) over the distance from 0."""
+    mean, cov = points
+    middle = 0.5 * (cov[..., 0, 0] + cov[..., 1, 1])
+    half = 0.5 * (cov[..., 0, 0] - cov[..., 1, 1])
+    square = half**2 + cov[..., 0, 1] * cov[..., 1, 0]
+    largest = middle + safe_root(square)
+    length = (mean**2).sum(axis=-1)
+    return safe_root(largest) / jnp.sqrt(jnp.where(length > 0, length, 1.0))
+
+
+def closer_than(
+    distance: Distance, limit: Number, points: UncertainPoints, others: UncertainPoints
+) -> Bool[Array, "p q"]:
+    """Whether the distance of each of p points from each of q others is below a limit.
+
+    By `mahalanobis_squared` (of independent points) or `bhattacharyya` of `uncertain_poses`; never
+    where a covariance is singular.
+    """
+    measure = _DISTANCES[distance]
+
+    def frame(point: UncertainPoints) -> Frame:
+        # Points as frames with equal headings and heading variances.
+        inert = jnp.pad(point.cov, [(0, 1), (0, 1)]).at[2, 2].set(1.0)
+        return Frame(jnp.pad(point.mean, [(0, 1)]), inert)
+
+    def one(point: UncertainPoints, other: UncertainPoints) -> Bool[Array, ""]:
+        how_far, regular = measure(frame(point), frame(other))
+        return regular & (how_far < limit)
+
+    out: Array = jax.vmap(jax.vmap(one, (None, 0)), (0, None))(points, others)
+    return materialize(out)
+
+
+def safe_root(square: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """The square root of x where x is positive, else 0, with a finite derivative."""
+    positive = square > 0
+    return jnp.where(positive, jnp.sqrt(jnp.where(positive, square, 1.0)), 0.0)

@@ -1,0 +1,162 @@
+"""Filter steps in the canonical (information) form of a Gaussian over a robot and A landmarks.
+
+The error e = x - μ, D = 3 + A·L numbers, has the information matrix Ω (D, D), the inverse of its
+covariance, and the information residual ρ = Ω E[e] (D,): the textbooks' information vector is
+ξ = Ω μ + ρ. Storing ρ instead of ξ is equivalent, and has advantages: a heading may wrap, a large
+map causes no cancellation in float32, ρ = 0 means that μ is the mean, and operations that keep the
+mean (sparsification: ξ̃ = ξ + (Ω̃ - Ω) μ) keep ρ.
+
+Padding, an index without a landmark: zero mean, zero links, unit diagonal of Ω, zero of ρ.
+Sources: Thrun et al., "Simultaneous localization and mapping with sparse extended information
+filters", IJRR 23(7-8), 2004; the Notes, with the corrections of the errata.
+"""
+
+import math
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int
+
+from jaxslam.core.protocols import Motion, Sensor
+from jaxslam.core.types import Info, Scan
+from jaxslam.filters._information.tag_innovation import (
+    CanonicalInnovations,
+    TagAssociation,
+    stack_jacobians,
+)
+from jaxslam.filters._reporting import info_of, status_of
+from jaxslam.linearize import _first_order as first_order
+from jaxslam.math import _linalg as linalg
+from jaxslam.math._arrays import Number
+from jaxslam.math.angles import wrap
+
+
+def initial_information(pose_cov: Float[Array, "3 3"], floor: Number) -> Float[Array, "3 3"]:
+    """The first information P0⁻¹, or (P0 + floor² I)⁻¹ where P0 is not positive definite."""
+    eye = jnp.eye(3, dtype=pose_cov.dtype)
+    positive = linalg.cholesky(pose_cov)[1]
+    safe = jnp.where(positive, pose_cov, pose_cov + jnp.asarray(floor, eye.dtype) ** 2 * eye)
+    return linalg.symmetrize(linalg.solve_psd(safe, eye)[0])
+
+
+def motion_update(
+    motion: Motion,
+    pose: Float[Array, "3"],
+    u: Float[Array, "U"],
+    omega: Float[Array, "D D"],
+    residual: Float[Array, "D"],
+) -> tuple[Float[Array, "3"], Float[Array, "D D"], Float[Array, "D"]]:
+    """Pose, Ω and ρ after a control, by 3×3 inversions only.
+
+    With F = ∂f/∂pose and S Sᵀ = W Q Wᵀ (any rank), Φ = F⁻ᵀ Ω F⁻¹ and φ = F⁻ᵀ ρ on the robot's rows,
+
+        G = Φ S (I + Sᵀ Φ S)⁻¹,   Ω ← (I - G Sᵀ) Φ (I - G Sᵀ)ᵀ + G Gᵀ,   ρ ← φ - G Sᵀ φ,
+
+    which is (Φ⁻¹ + W Q Wᵀ)⁻¹ by the inversion lemma, in Joseph's form, which is less sensitive to
+    rounding. G is zero except for the landmarks that the robot is linked to.
+    """
+    after, by_pose, noise = first_order.motion_at(motion, pose, u, pose)
+    root = linalg.root_psd(noise)
+    back = linalg.inverse(by_pose)
+    phi = omega.at[:3].set(back.T @ omega[:3])
+    phi = phi.at[:, :3].set(phi[:, :3] @ back)
+    residual = residual.at[:3].set(back.T @ residual[:3])
+    by_noise = root.T @ phi[:3]
+    inner = jnp.eye(3, dtype=omega.dtype) + by_noise[:, :3] @ root
+    gain = (linalg.inverse(linalg.symmetrize(inner)) @ by_noise).T
+    left = phi - gain @ by_noise
+    omega = left - (left[:, :3] @ root) @ gain.T + gain @ gain.T
+    return after, linalg.symmetrize(omega), residual - gain @ (root.T @ residual[:3])
+
+
+def measurement_update(
+    omega: Float[Array, "D D"], residual: Float[Array, "D"], of: CanonicalInnovations
+) -> tuple[Float[Array, "D D"], Float[Array, "D"]]:
+    """The update Ω ← Ω + Σ Hᵀ R⁻¹ H, ρ ← ρ + Σ Hᵀ R⁻¹ ν."""
+    rows = of.whitened_jacobian
+    return linalg.symmetrize(omega + rows.T @ rows), residual + rows.T @ of.whitened
+
+
+def mean_error(
+    omega: Float[Array, "D D"], residual: Float[Array, "D"], omega_positive: Bool[Array, ""]
+) -> tuple[Float[Array, "D"], Bool[Array, ""]]:
+    """The mean error Ω⁻¹ ρ, and whether it could be solved for: Ω is positive definite, as before
+    the scan (omega_positive). Zero where it could not."""
+    error, positive = linalg.solve_psd(omega, residual)
+    solved = omega_positive & positive
+    return jnp.where(solved, error, 0.0), solved
+
+
+def correct_pose(pose: Float[Array, "3"], error: Float[Array, "3"]) -> Float[Array, "3"]:
+    """The pose moved by an error, its heading wrapped."""
+    moved = pose + error
+    return moved.at[2].set(wrap(moved[2]))
+
+
+def initialize_landmarks(
+    sensor: Sensor,
+    omega: Float[Array, "D D"],
+    pose: Float[Array, "3"],
+    z: Float[Array, "M Z"],
+    index: Int[Array, "M"],
+    wanted: Bool[Array, "M"],
+) -> tuple[Float[Array, "D D"], Float[Array, "M L"], Bool[Array, "M"]]:
+    """Ω with new landmarks at empty indices where wanted, the landmarks, and which were started.
+
+    l = g(x, z), with C = G_z R G_zᵀ + G_s S G_sᵀ: Ω ← Ω + Jᵀ C⁻¹ J, J = [-G_x, I], the same as
+    augmentation in covariance form (Solà (32)-(38)), and ρ as it is. A landmark whose C is not
+    positive definite is not initialized.
+    """
+    size = len(sensor.landmark)
+    count = (omega.shape[0] - 3) // size
+    z = jnp.where(wanted[:, None], z, 1.0)
+    landmark, by_pose, cov = jax.vmap(lambda z: first_order.invert_at(sensor, pose, z, pose, z))(z)
+    root, positive = jax.vmap(linalg.cholesky)(cov)
+    initialized = wanted & positive
+    unit = jnp.broadcast_to(jnp.eye(size, dtype=omega.dtype), cov.shape)
+    both = jax.vmap(linalg.solve_lower)(root, jnp.concatenate([-by_pose, unit], axis=2))
+    both = jnp.where(initialized[:, None, None], both, 0.0)
+    rows = stack_jacobians(both[:, :, :3], both[:, :, 3:], index, count)
+    filled = (initialized[:, None] & (index[:, None] == jnp.arange(count)[None, :])).any(axis=0)
+    # Padding's unit goes first, to an exact zero.
+    padding = jnp.concatenate([jnp.zeros(3, bool), jnp.repeat(filled, size)])
+    omega = omega - jnp.diag(padding.astype(omega.dtype)) + rows.T @ rows
+    return linalg.symmetrize(omega), landmark, initialized
+
+
+def diagonal_loading(omega: Float[Array, "D D"]) -> Float[Array, "D D"]:
+    """The matrix Ω plus √eps of its diagonal, used where rounding made Ω indefinite."""
+    share = math.sqrt(float(jnp.finfo(omega.dtype).eps))
+    load: Array = share * jnp.diag(jnp.abs(jnp.diagonal(omega)))
+    return omega + load
+
+
+def report(
+    scan: Scan,
+    measured: TagAssociation,
+    of: CanonicalInnovations,
+    initialized: Bool[Array, "M"],
+) -> Info:
+    """The `Info` of a scan."""
+    status = status_of(
+        scan.valid,
+        matched=measured.known,
+        positive=of.positive,
+        inside=of.inside,
+        new=measured.new,
+        repeated=measured.repeated,
+        granted=initialized,
+        singular=measured.has_slot,
+    )
+    return info_of(
+        status,
+        of.compared,
+        size=scan.z.shape[1],
+        slot=measured.slot,
+        born=measured.slot,
+        nis=of.nis,
+        innovation=of.innovation,
+        innovation_cov=of.innovation_cov,
+        log_likelihood=of.log_likelihood.sum(),
+    )

@@ -1,0 +1,55 @@
+"""Dead reckoning: prediction of the pose without measurements, as a baseline."""
+
+import dataclasses
+
+from jaxtyping import Array, Float
+
+from jaxslam.charts import Euclidean
+from jaxslam.core import _validation as validation
+from jaxslam.core._record import record
+from jaxslam.core.protocols import Chart, Filter, Linearizer, Motion, Sensor
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Estimate, Info, Scan
+from jaxslam.filters._ekf.ekf_settings import EkfSettings, check_settings
+from jaxslam.filters._ekf.ekf_slam import initial_state
+from jaxslam.filters._ekf.map_coordinates import estimate_of
+from jaxslam.filters._ekf.predict import propagate
+from jaxslam.filters._reporting import nothing_of
+from jaxslam.linearize._first_order import AtEstimate
+
+
+@record
+class DeadReckoning(Filter):
+    """The predicted pose alone, x ← f(x, u, 0) and P ← F P Fᵀ + W Q Wᵀ (Solà (14), (15)).
+
+    Every measurement is `Status.UNMATCHED`, and the map stays empty. The sensor only gives the size
+    of measurements; chart and linearize are those of `EkfSlam`, with the same errors.
+    """
+
+    motion: Motion
+    sensor: Sensor
+    _: dataclasses.KW_ONLY
+    chart: Chart = Euclidean()
+    linearize: Linearizer = AtEstimate()
+
+    def __post_init__(self) -> None:
+        validation.check_models("DeadReckoning", self.motion, self.sensor)
+        validation.check_parts("DeadReckoning", self.chart, self.linearize)
+        check_settings("DeadReckoning", self._settings)
+        super().__post_init__()
+
+    def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:
+        return initial_state(pose, pose_cov, 1, self._settings)
+
+    def predict(self, state: Joint, u: Float[Array, "U"], key: Array) -> Joint:
+        return propagate(state, u, self.motion, self._settings)[0]
+
+    def update(self, state: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
+        return state, nothing_of(scan)
+
+    def estimate(self, state: Joint) -> Estimate:
+        return estimate_of(state, self.sensor, self.chart)
+
+    @property
+    def _settings(self) -> EkfSettings:
+        return EkfSettings(self.sensor, self.chart, self.linearize)

@@ -1,0 +1,150 @@
+"""Mapping from known poses, with independent landmarks."""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Float, PyTree
+from numpy.typing import ArrayLike
+
+from jaxslam.association._rules import Known
+from jaxslam.charts import Euclidean
+from jaxslam.core import _validation as validation
+from jaxslam.core._record import record, static
+from jaxslam.core.protocols import Associate, Filter, Life, Sensor, Wrapper
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Estimate, Info, Scan
+from jaxslam.filters._particles.landmark_ekf import update_map
+from jaxslam.filters._particles.particle_settings import check_particle_map, particle_map_settings
+from jaxslam.filters._particles.proposal import associate_particle, propose_pose
+from jaxslam.filters._particles.scan_association import zero_padding
+from jaxslam.filters._particles.slam_particles import (
+    SlamParticles,
+    as_only_particle,
+    initial_slam_particles,
+    slam_estimate,
+)
+from jaxslam.math._arrays import Number
+from jaxslam.math.angles import wrap
+
+
+@record
+class Mapping(Filter):
+    """A filter of the map for known poses (Williams): the control *is* the pose.
+
+    Given the path, landmarks are independent: each has a separate EKF, l ← l + C Hᵀ S⁻¹ ν with
+    S = H C Hᵀ + R, and a measurement costs O(1) for any size of the map. This is the map update of
+    one particle of `FastSlam`, without a joint covariance.
+
+    The state is one particle of a `SlamParticles`. `log._replace(control=poses)` makes a log
+    of recorded poses (T, 3) and scans; `as_prior` makes the map the initial state of `EkfSlam`.
+
+    Raises ValueError on a capacity or births below 1, a gate not above 0, or a sensor that is a
+    suite, absolute, or whose landmarks turn into points.
+    """
+
+    sensor: Sensor
+    """of landmarks; Jacobians come from `jax.jacfwd`"""
+    capacity: int = static()
+    """landmark slots N"""
+    _: dataclasses.KW_ONLY
+    associate: Associate = Known()
+    gate: Number | None = None
+    births: int | None = static(default=None)
+    life: Life | None = None
+    """these four as for `EkfSlam`"""
+    controls = ("x [m]", "y [m]", "theta [rad]")
+    chart = Euclidean()
+
+    def __post_init__(self) -> None:
+        validation.check_sensor("Mapping", self.sensor)
+        check_particle_map(self)
+        super().__post_init__()
+
+    def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> SlamParticles:
+        known, size = jnp.zeros_like(pose_cov), len(self.sensor.landmark)
+        state = initial_slam_particles(pose, known, 1, self.capacity, size)
+        one: SlamParticles = jax.tree.map(lambda leaf: leaf[0], state._replace(best=None))
+        if self.life is None:
+            return one
+        return one._replace(life=self.life.init(pose, one.landmarks))
+
+    def predict(self, state: SlamParticles, u: Float[Array, "3"], key: Array) -> SlamParticles:
+        return state._replace(pose=jnp.concatenate([u[:2], wrap(u[2:])]))
+
+    def update(self, state: SlamParticles, scan: Scan, key: Array) -> tuple[SlamParticles, Info]:
+        scan, settings = zero_padding(scan), particle_map_settings(self)
+        association = associate_particle(state, scan, settings)
+        # The pose is known, so the proposal does not change it; the other results are used.
+        proposed, innovations = propose_pose(state, association, scan, settings)
+        state, info = update_map(state, association, innovations, scan, settings)
+        return state, info._replace(log_likelihood=proposed.log_matched)
+
+    def estimate(self, state: SlamParticles) -> Estimate:
+        believed = slam_estimate(as_only_particle(state), self.sensor)
+        return believed._replace(pose=state.pose, pose_cov=state.pose_cov)
+
+
+@record
+class StartingAt(Wrapper):
+    """A filter whose first state is given, as of `as_prior`, or the final one of another run."""
+
+    filter: Filter
+    state: PyTree
+    """independent of the arguments of `init`"""
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        return self.filter.name
+
+    def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> PyTree:
+        return jax.tree.map(jnp.asarray, self.state)
+
+
+def as_prior(
+    state: SlamParticles,
+    filter: Filter,
+    pose: ArrayLike,
+    pose_cov: ArrayLike,
+) -> Joint:
+    """The initial state of a SLAM filter with this map as an uncorrelated prior.
+
+    `run(StartingAt(filter, as_prior(final, filter, pose, pose_cov)), …)` begins with it.
+
+    Args:
+        state: the final state of `mapping`.
+        filter: an `EkfSlam` of as many landmarks, in the Euclidean chart.
+        pose, pose_cov: (3,) and (3, 3) where its robot begins.
+    Raises:
+        ValueError: on other shapes; on a filter whose state is no `slots.Joint` of as many
+            landmarks, has a root of its covariance, is in another chart, or has a linearizer with
+            memory.
+    """
+    if np.shape(pose) != (3,) or np.shape(pose_cov) != (3, 3):
+        raise ValueError(
+            f"as_prior: expected a pose (3,) and covariance (3, 3), got {np.shape(pose)} and "
+            f"{np.shape(pose_cov)}"
+        )
+    capacity, size = state.landmarks.shape
+    kind = state.landmarks.dtype
+    joint = filter.init(jnp.asarray(pose, kind), jnp.asarray(pose_cov, kind))
+    if not isinstance(joint, Joint) or joint.landmarks.shape != (capacity, size):
+        raise ValueError(
+            f"as_prior: expected a filter of {capacity} landmarks with {size} parameters each, got "
+            f"{filter.name}"
+        )
+    if filter.chart.basis is not None or filter.square_root or jax.tree.leaves(joint.lin):
+        raise ValueError(
+            "as_prior: expected a filter in the Euclidean chart with a covariance, not its square "
+            "root, and with Jacobians at the estimate"
+        )
+    blocks = jnp.where(state.alive[:, None, None], state.covs, jnp.eye(size, dtype=kind)[None])
+    rows = 3 + jnp.arange(capacity)[:, None] * size + jnp.arange(size)[None, :]
+    return joint._replace(
+        landmarks=state.landmarks,
+        cov=joint.cov.at[rows[:, :, None], rows[:, None, :]].set(blocks),
+        alive=state.alive,
+        tag=state.tag,
+    )

@@ -1,0 +1,205 @@
+"""FastSLAM 1.0 and 2.0: particles for the robot's path, and a small EKF for each landmark."""
+
+import dataclasses
+from collections.abc import Callable
+from functools import partial
+from typing import Literal, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Bool, Float, Int, PyTree
+
+from jaxslam.association._rules import Known
+from jaxslam.charts import Euclidean
+from jaxslam.core import _validation as validation
+from jaxslam.core._record import record, static
+from jaxslam.core.protocols import Associate, Differentiable, Filter, Life, Motion, Resample, Sensor
+from jaxslam.core.types import Estimate, Info, Scan
+from jaxslam.filters._particles.landmark_ekf import update_map
+from jaxslam.filters._particles.particle_settings import (
+    ParticleMapSettings,
+    check_particle_map,
+    check_resampling,
+    particle_map_settings,
+)
+from jaxslam.filters._particles.pose_particles import weighted_nis
+from jaxslam.filters._particles.proposal import (
+    PoseProposal,
+    associate_particle,
+    predict_pose,
+    propose_pose,
+    sample_motion,
+)
+from jaxslam.filters._particles.scan_association import zero_padding
+from jaxslam.filters._particles.slam_particles import (
+    ParticleInfo,
+    SlamParticles,
+    draw_poses,
+    initial_slam_particles,
+    slam_estimate,
+    with_finite_poses,
+)
+from jaxslam.filters._reporting import has_distance, with_extra
+from jaxslam.math._arrays import Number
+from jaxslam.resampling._methods import systematic
+from jaxslam.resampling._weights import normalized, resampled_where
+
+_T = TypeVar("_T")
+
+
+@record
+class FastSlam(Filter):
+    """FastSLAM: weighted particles for the posterior of the path, and for each path independent
+    landmark Gaussians (exact except for linearization). The state is a
+    `SlamParticles`.
+
+    "motion", FastSLAM 1.0 (Montemerlo, Thrun, Koller & Wegbreit 2002, "FastSLAM: A factored
+    solution to the simultaneous localization and mapping problem"): poses are drawn from the motion
+    with its noise, and weighted by the scan. "measurement", 2.0 (Montemerlo et al. 2003, "FastSLAM
+    2.0: An improved particle filtering algorithm …"): the pose is a Gaussian that the motion
+    predicts and the scan corrects, measurement by measurement; the pose is drawn from the result.
+    The weight is the density of the scan with the pose integrated out (`proposal.propose_pose`),
+    which does not depend on the draw. So resampling comes first here, and copies of one particle
+    get different poses.
+
+    Resampling happens in steps with ESS = 1/Σ w² below threshold·P. Where all weights underflow,
+    all become 1/P and `ParticleInfo.underflow` is set; the log-likelihood, -∞, is then given as 0,
+    so `underflow` must be checked in a sum of log-likelihoods. A particle that a motion or a scan
+    leaves without a finite pose keeps its previous pose, with weight zero (`ParticleInfo.invalid`).
+
+    The measurements in an `Info` are those of the most likely particle (by its weight before
+    resampling), whose slots are those of the estimate; its innovations are given its path, with the
+    covariance of a pose not drawn yet in 2.0. Only nis is the mean over the particles by their
+    weights after the scan: of a consistent filter that is dof, E_z Σ_p (w_p N_p(z)/p(z)) d²_p =
+    Σ_p w_p E_{N_p} d²_p, while that of the most likely particle is biased low by selection. Its
+    log_likelihood is that of the scan given all before, log Σ w p(scan | particle), of the
+    measurements that a particle has landmarks for. `info.extra["particles"]` is a `ParticleInfo`.
+    Estimates: `slam_estimate`.
+
+    Raises ValueError on a capacity, particles or births below 1, a threshold outside [0, 1], a gate
+    not above 0, an unknown proposal, an invalid life or resample, or a
+    sensor that is a suite, absolute, or whose landmarks turn into points.
+    """
+
+    motion: Motion
+    sensor: Sensor
+    """the models; Jacobians come from `jax.jacfwd`"""
+    capacity: int = static()
+    """landmark slots N of each particle. A new landmark that finds a particle's map full is dropped
+    there (`Status.OVERFLOW`, and `SlamParticles.lost` for each particle)"""
+    particles: int = static()
+    """P, at least 1"""
+    _: dataclasses.KW_ONLY
+    proposal: Literal["motion", "measurement"] = static(default="measurement")
+    """what poses are drawn from"""
+    resample: Resample | Differentiable = systematic
+    """one of `jaxslam.resampling`. Through `StopGradient` of one, the gradient of
+    `Info.log_likelihood` is consistent; through `Soft` it is biased, and more so without either,
+    since the effect of resampling is then ignored"""
+    threshold: Number = 0.5
+    """of ESS, as a share of P; 0 never resamples, 1 in every step with unequal weights"""
+    associate: Associate = Known()
+    """other methods associate by each particle's map"""
+    gate: Number | None = None
+    """reject a measurement whose squared Mahalanobis distance exceeds this"""
+    births: int | None = static(default=None)
+    """largest number of new landmarks a scan and particle, the rest `Status.DEFERRED`"""
+    life: Life | None = None
+    """rule that removes landmarks from each particle's map (`jaxslam.life`), e.g. by negative
+    evidence: `life.Existence` keeps log-odds (P, N) in `SlamParticles.life`"""
+    name = "fastslam"
+    chart = Euclidean()
+
+    def __post_init__(self) -> None:
+        validation.check_models("FastSlam", self.motion, self.sensor)
+        validation.check_count("FastSlam: particles", self.particles)
+        if self.proposal not in ("motion", "measurement"):
+            raise ValueError(
+                f'FastSlam: expected proposal "motion" or "measurement", got {self.proposal!r}'
+            )
+        check_resampling(self)
+        check_particle_map(self)
+        super().__post_init__()
+
+    def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> SlamParticles:
+        size = len(self.sensor.landmark)
+        state = initial_slam_particles(pose, pose_cov, self.particles, self.capacity, size)
+        if self.life is None:
+            return state
+        return state._replace(life=jax.vmap(self.life.init)(state.pose, state.landmarks))
+
+    def predict(self, state: SlamParticles, u: Float[Array, "U"], key: Array) -> SlamParticles:
+        if self.proposal == "measurement":
+            ahead = jax.vmap(partial(predict_pose, self.motion, u=u))
+            return with_finite_poses(state, *ahead(state.pose, state.pose_cov))
+        key_pending, key_noise = jax.random.split(key)
+        state = state._replace(pose=draw_poses(state, key_pending))
+        moved = sample_motion(self.motion, state.pose, u, key_noise)
+        return with_finite_poses(state, moved, jnp.zeros_like(state.pose_cov))
+
+    def update(self, state: SlamParticles, scan: Scan, key: Array) -> tuple[SlamParticles, Info]:
+        each = partial(_of_each_particle, zero_padding(scan), particle_map_settings(self))
+        key_resample, key_draw = jax.random.split(key)
+        state = state._replace(best=None)
+        association = each(associate_particle, state)
+        proposed, innovations = each(propose_pose, state, association)
+        state = with_finite_poses(state, proposed.pose, proposed.pose_cov)
+        weight, log_likelihood, some = _weight_particles(state, proposed)
+        nis = weighted_nis(innovations.nis, association.matched, weight)
+        ess = 1.0 / jnp.exp(2 * weight).sum()
+        due = ess < self.threshold * self.particles
+        found = ParticleInfo(ess, resampled=due, underflow=~some, invalid=state.invalid.sum())
+        (state, association, innovations, before), weight = resampled_where(
+            due, (state, association, innovations, weight), weight, self.resample, key_resample
+        )
+        state = _with_drawn_poses(state._replace(log_weight=weight), key_draw)
+        state, infos = each(update_map, state, association, innovations)
+        best = jnp.argmax(before).astype(jnp.int32)
+        info = _report_best(infos, best, nis, log_likelihood, association.exhausted)
+        return state._replace(best=best), with_extra(info, "particles", found)
+
+    def estimate(self, state: SlamParticles) -> Estimate:
+        return slam_estimate(state, self.sensor)
+
+
+def _of_each_particle(
+    scan: Scan, settings: ParticleMapSettings, step: Callable[..., _T], *of_particles: PyTree
+) -> _T:
+    """The results of step(*of_particle, scan=…, settings=…) for every particle."""
+    return jax.vmap(partial(step, scan=scan, settings=settings))(*of_particles)
+
+
+def _report_best(
+    infos: Info,
+    best: Int[Array, ""],
+    nis: Float[Array, "M"],
+    log_likelihood: Float[Array, ""],
+    exhausted: Bool[Array, "P"],
+) -> Info:
+    """The `Info` of the best particle of `infos`, with the numbers of all particles."""
+    info: Info = jax.tree.map(lambda of_all: of_all[best], infos)
+    return info._replace(
+        nis=jnp.where(has_distance(info.status), nis, 0.0),
+        log_likelihood=log_likelihood,
+        exhausted=exhausted.any(),
+    )
+
+
+def _weight_particles(
+    state: SlamParticles, proposed: PoseProposal
+) -> tuple[Float[Array, "P"], Float[Array, ""], Bool[Array, ""]]:
+    """Log-weights log w_p p(scan | particle) with Σ w = 1, the log-likelihood of measurements with
+    landmarks, and whether any weight was left."""
+    seen = state.log_weight + proposed.log_matched
+    weight, _, some = normalized(seen + proposed.log_unmatched)
+    return weight, normalized(seen)[1], some
+
+
+def _with_drawn_poses(state: SlamParticles, key: Array) -> SlamParticles:
+    """The state with each pose drawn from its Gaussian, all finite."""
+    return state._replace(
+        pose=draw_poses(state, key),
+        pose_cov=jnp.zeros_like(state.pose_cov),
+        invalid=jnp.zeros_like(state.invalid),
+    )

@@ -1,0 +1,280 @@
+"""Geometric matching of a cluster of points with points of a map, by pairwise distances.
+
+The cluster's frame is arbitrary: that of a scan of a lost robot, or of a part of the map whose
+position has drifted. The full joint covariance of both is used, and the alignment is by weighted
+least squares.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxslam.core._numbers import check_count
+from jaxslam.filters.map_management._point_pairs import (
+    PointSets,
+    equal_lengths,
+    extend_pair,
+    longest_pairs,
+    mahalanobis_of_pairs,
+    quarter_turned,
+)
+from jaxslam.math import _linalg as linalg
+from jaxslam.math import se2
+from jaxslam.math.stats import chi2_quantile
+
+
+class _Alignment(NamedTuple):
+    """A weighted alignment of M cluster points, some of them paired with map points."""
+
+    pose: Float[Array, "3"]
+    """T with map = T ∘ cluster"""
+    distance: Float[Array, ""]
+    """D² = rᵀ Σ⁻¹ r"""
+    each: Float[Array, "M"]
+    """r_iᵀ Σ_ii⁻¹ r_i of the pairs, else 0"""
+    regular: Bool[Array, ""]
+    """Σ is positive definite, and the pose is determined"""
+    residual: Float[Array, "2*M"]
+    """r at the pose, to first order"""
+    jacobian: Float[Array, "2*M 3"]
+    """∂r/∂T"""
+    factor: Float[Array, "2*M 2*M"]
+    """Cholesky factor of Σ; the identity without a pair"""
+
+
+class _Residuals(NamedTuple):
+    """The residuals r_i = T z_i - m_i about the centroids, their covariance and derivative."""
+
+    error: Float[Array, "2*M"]
+    jacobian: Float[Array, "2*M 3"]
+    covs: Float[Array, "M 2 2"]
+    """of each alone"""
+    factor: Float[Array, "2*M 2*M"]
+    positive: Bool[Array, ""]
+
+
+def align_points(points: PointSets, slot: Int[Array, "M"]) -> _Alignment:
+    """The pose that aligns cluster points with their map points, -1 for none.
+
+    The closed form without weights (as `se2.align`), and from there one step of generalized least
+    squares. Further steps would change the linearization point but not the map, and drift along the
+    most uncertain directions. For the same reason ∂r/∂θ is evaluated at the map points, (m - t)⊥
+    and not (R z)⊥, which differ by the residual: then a rotation of the whole map rotates the pose
+    with it, and the residuals do not depend on it.
+    """
+    paired, target = slot >= 0, points.map[jnp.maximum(slot, 0)]
+    weight = jnp.where(paired, 1.0, 0.0).astype(target.dtype)
+    total = jnp.maximum(weight.sum(), 1.0)
+    centroid = (weight[:, None] * points.cluster).sum(axis=0) / total
+    map_centroid = (weight[:, None] * target).sum(axis=0) / total
+    z, goal = points.cluster - centroid[None, :], target - map_centroid[None, :]
+    dot = (weight[:, None] * z * goal).sum()
+    cross = (weight * (z[:, 0] * goal[:, 1] - z[:, 1] * goal[:, 0])).sum()
+    start = jnp.concatenate([jnp.zeros(2, z.dtype), se2.polar(jnp.stack([dot, cross]))[1:]])
+
+    r = _residuals(points, slot, z, goal, start)
+    whitened = linalg.solve_lower(r.factor, r.error)
+    by_pose = linalg.solve_lower(r.factor, r.jacobian)
+    step, solvable = linalg.solve_psd(by_pose.T @ by_pose, by_pose.T @ whitened)
+    left = r.error - r.jacobian @ step
+    each, _ = mahalanobis_of_pairs(left.reshape(-1, 2), r.covs)
+    # About the centroids the numbers are small; the pose is that of the frames themselves.
+    centred = start - step
+    shift = map_centroid + centred[:2] - se2.rotation(centred[2]) @ centroid
+    heading = jnp.arctan2(jnp.sin(centred[2:]), jnp.cos(centred[2:]))
+    by_turn = jnp.where(paired[:, None], quarter_turned(target - shift[None, :]), 0.0)
+    return _Alignment(
+        pose=jnp.concatenate([shift, heading]),
+        distance=((whitened - by_pose @ step) ** 2).sum(),
+        each=jnp.where(paired, each, 0.0),
+        regular=r.positive & solvable,
+        residual=left,
+        jacobian=r.jacobian.at[:, 2].set(by_turn.reshape(-1)),
+        factor=r.factor,
+    )
+
+
+def _residuals(
+    points: PointSets,
+    slot: Int[Array, "M"],
+    z: Float[Array, "M 2"],
+    goal: Float[Array, "M 2"],
+    pose: Float[Array, "3"],
+) -> _Residuals:
+    """The residuals of points z and goals about their centroids; 0 and identity without a pair."""
+    m, paired, at = slot.shape[0], slot >= 0, jnp.maximum(slot, 0)
+    rotation = se2.rotation(pose[2])
+    mixed = jnp.einsum("xy,iyjw->ixjw", rotation, points.cross_cov[:, :, at])
+    cov = jnp.einsum("xy,iyjw,vw->ixjv", rotation, points.cluster_cov, rotation)
+    cov = cov + points.map_cov[at][:, :, at] - mixed - mixed.transpose(2, 3, 0, 1)
+    cov = with_unit_blocks(cov, paired)
+    factor, positive = linalg.cholesky(linalg.symmetrize(cov.reshape(2 * m, 2 * m)))
+    error = jnp.where(paired[:, None], z @ rotation.T + pose[None, :2] - goal, 0.0)
+    eye = jnp.broadcast_to(jnp.eye(2, dtype=z.dtype), (m, 2, 2))
+    by_turn = quarter_turned(goal - pose[None, :2])[:, :, None]
+    jacobian = jnp.where(paired[:, None, None], jnp.concatenate([eye, by_turn], 2), 0.0)
+    blocks = cov[jnp.arange(m), :, jnp.arange(m)]
+    return _Residuals(error.reshape(-1), jacobian.reshape(2 * m, 3), blocks, factor, positive)
+
+
+def with_unit_blocks(
+    cov: Float[Array, "M 2 M 2"], used: Bool[Array, "M"]
+) -> Float[Array, "M 2 M 2"]:
+    """The covariance with the identity in the rows and columns of absent points."""
+    m = used.shape[0]
+    both = jnp.broadcast_to(used[:, None, None, None] & used[None, None, :, None], cov.shape)
+    return jnp.where(both, cov, jnp.eye(2 * m, dtype=cov.dtype).reshape(m, 2, m, 2))
+
+
+_BLOCK = 32  # candidates that are scored together; more cost memory
+_FINALISTS = 8  # hypotheses that are tried jointly
+
+
+class GeometricMatch(NamedTuple):
+    """The best match of M cluster points with N map points."""
+
+    pose: Float[Array, "3"]
+    """T with map = T ∘ cluster, by generalized least squares over the pairs"""
+    slot: Int[Array, "M"]
+    """the map point of each cluster point, -1 for none"""
+    explained: Int[Array, ""]
+    """pairs that fit jointly"""
+    distance: Float[Array, ""]
+    """D² of these, χ² of 2·explained - 3 degrees of freedom"""
+    runner_up: Int[Array, ""]
+    """most pairs of any other hypothesis, one that shares fewer than two pairs"""
+    exhausted: Bool[Array, ""]
+    """more pairs of points agreed than there was room for"""
+
+
+class _SearchLimits(NamedTuple):
+    """The limits of a search; made by `search_limits`."""
+
+    single: tuple[float, float]
+    """χ² of one and of two degrees of freedom"""
+    joint: np.ndarray
+    """(M + 1,) χ² of 2n - 3, for n pairs"""
+    pairs: int
+    candidates: int
+
+
+def check_search(caller: str, probability: float, pairs: int, candidates: int) -> None:
+    """Raise ValueError on a probability not between 0 and 1, or pairs or candidates below 1."""
+    if not 0 < probability < 1:
+        raise ValueError(f"{caller}: expected a probability between 0 and 1, got {probability}")
+    check_count(f"{caller}: pairs", pairs)
+    check_count(f"{caller}: candidates", candidates)
+
+
+def search_limits(size: int, probability: float, pairs: int, candidates: int) -> _SearchLimits:
+    """The limits of a search over M = size cluster points."""
+    joint = [chi2_quantile(probability, max(2 * n - 3, 1)) for n in range(size + 1)]
+    single = chi2_quantile(probability, 1), chi2_quantile(probability, 2)
+    return _SearchLimits(single, np.asarray(joint), pairs, candidates)
+
+
+class _Hypotheses(NamedTuple):
+    """The hypotheses of P pairs of cluster points times C candidates, with their matches."""
+
+    slot: Int[Array, "P C M"]
+    """the map point of each cluster point, -1 for none"""
+    explained: Int[Array, "P C"]
+    distance: Float[Array, "P C"]
+    """Σ d²"""
+    exhausted: Bool[Array, "P"]
+    """more candidates agreed than C"""
+
+
+def match_points(points: PointSets, limits: _SearchLimits) -> GeometricMatch:
+    """The match with the most cluster points; among equals, that of least D².
+
+    Each of a few pairs (a, b) of cluster points, the longest, is compared with all pairs (j, k) of
+    the map: with s and r the two distances, (s - r)²/var(s - r) <= χ²(1). Each agreement fixes the
+    frame T, in which the rest of the cluster is tested: δ_ik = T z_i - m_k, linear in the errors
+    of z_a, z_b, z_i, m_j, m_k and m_l, with d² <= χ²(2) and no point twice. The best hypotheses are
+    then fitted as a whole, and lose their worst pair until D² <= χ²(2n - 3).
+
+    No hypothesis (explained = 0, slots -1, the identity) where no two distances agree.
+    """
+    found = _hypotheses(points, limits)
+    finalists = found.slot.reshape(-1, len(points.cluster))[_finalists(found)]
+    fits = jax.vmap(lambda slot: _fit_hypothesis(points, slot, limits))(finalists)
+    best: GeometricMatch = jax.tree.map(
+        lambda leaf: leaf[jnp.argmax(_merit(fits.explained, fits.distance))], fits
+    )
+    same = ((found.slot == best.slot[None, None]) & (found.slot >= 0)).sum(axis=-1)
+    other = jnp.where(same < 2, found.explained, 0).max()
+    return best._replace(runner_up=other.astype(jnp.int32), exhausted=found.exhausted.any())
+
+
+def _hypotheses(points: PointSets, limits: _SearchLimits) -> _Hypotheses:
+    """Hypotheses of the longest cluster pairs with the map pairs whose lengths agree best."""
+    n = points.map.shape[0]
+    room = min(limits.candidates, n * n)
+
+    def of_pair(ends: tuple[Array, Array]) -> _Hypotheses:
+        test, agree = equal_lengths(points, *ends, limits.single[0])
+        least, best = jax.lax.top_k(-jnp.where(agree, test, jnp.inf).reshape(-1), room)
+
+        def extend(one: tuple[Array, Array]) -> tuple[Array, Array, Array]:
+            slots = jnp.stack([one[0] // n, one[0] % n])
+            return extend_pair(points, jnp.stack(ends), slots, one[1], limits.single[1])
+
+        slot, count, distance = jax.lax.map(extend, (best, -least), batch_size=min(_BLOCK, room))
+        return _Hypotheses(slot, count, distance, agree.sum() > room)
+
+    found: _Hypotheses = jax.lax.map(of_pair, longest_pairs(points, limits.pairs))
+    return found
+
+
+def _merit(count: Int[Array, "*batch"], distance: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
+    """The score of a match: the number of pairs first, then the distance."""
+    return count - distance / (1 + distance)
+
+
+def _finalists(found: _Hypotheses) -> Int[Array, "K"]:
+    """The hypotheses to fit: the best of each cluster pair, then the best of all.
+
+    The best of all alone may be one hypothesis, found from each of its pairs.
+    """
+    merit = _merit(found.explained, found.distance)
+    heads = merit.argmax(axis=1) + jnp.arange(merit.shape[0]) * merit.shape[1]
+    every = merit.reshape(-1)
+    return jnp.concatenate([heads, jax.lax.top_k(every, min(_FINALISTS, len(every)))[1]])
+
+
+def _fit_hypothesis(
+    points: PointSets, slot: Int[Array, "M"], limits: _SearchLimits
+) -> GeometricMatch:
+    """The match of one hypothesis: the least-squares frame of the pairs that fit.
+
+    r_i = T z_i - m_i over the pairs, Σ their joint covariance: min rᵀ Σ⁻¹ r over T, to first order
+    about the unweighted closed form. The pair of largest r_iᵀ Σ_ii⁻¹ r_i goes until D² <= χ²(2n-3).
+    """
+    m = points.cluster.shape[0]
+    levels = jnp.asarray(limits.joint, points.cluster.dtype)
+
+    def drop(_: int, slot: Array) -> Array:
+        aligned = align_points(points, slot)
+        count = (slot >= 0).sum()
+        over = (aligned.distance > levels[count]) & (count > 2)
+        worst = jnp.argmax(aligned.each)
+        return jnp.where(over & (jnp.arange(m) == worst), -1, slot)
+
+    # Two pairs always have one degree of freedom, which the agreement of distances has tested.
+    slot = jax.lax.fori_loop(0, max(m - 2, 0), drop, slot)
+    aligned = align_points(points, slot)
+    count = (slot >= 0).sum()
+    ok = (count >= 2) & aligned.regular & (aligned.distance <= levels[count])
+    none = jnp.zeros((), jnp.int32)
+    return GeometricMatch(
+        pose=jnp.where(ok, aligned.pose, 0.0),
+        slot=jnp.where(ok, slot, -1),
+        explained=jnp.where(ok, count, 0).astype(jnp.int32),
+        distance=jnp.where(ok, aligned.distance, 0.0),
+        runner_up=none,
+        exhausted=jnp.asarray(False),
+    )

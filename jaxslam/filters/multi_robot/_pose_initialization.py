@@ -1,0 +1,237 @@
+"""Initialization of a robot's pose in the map from one scan.
+
+Its pose x_b is a function g(y, q) of variables y of the map and of measurements q, so its
+covariances are P_bM = G_y P_yM and P_bb = G_y P_yy G_yᵀ + G_q C G_qᵀ (as Solà (32)-(38) for a
+landmark): correlated with the whole joint state. Every measurement is converted to a point in the
+frame of its robot, for any sensor.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxslam.core import slots
+from jaxslam.core.protocols import Sensor
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Scan
+from jaxslam.filters.multi_robot._team_state import (
+    SIZE,
+    InitialPose,
+    TeamSettings,
+    measures_points,
+    pose_of,
+    rows_of,
+)
+from jaxslam.linearize import _first_order as first_order
+from jaxslam.math import se2
+from jaxslam.math._linalg import symmetrize
+from jaxslam.math.angles import wrap
+from jaxslam.sensors._suite import Suite, split_scan
+
+
+class _ObservedPoints(NamedTuple):
+    """The measurements of a robot as points in its frame."""
+
+    point: Float[Array, "M 2"]
+    """[m]"""
+    cov: Float[Array, "M 2 2"]
+    tag: Int[Array, "M"]
+    valid: Bool[Array, "M"]
+    """mask of measurements of known identity that determine the point"""
+
+
+Candidate = tuple[InitialPose, list[Bool[Array, "M"]]]
+"""A pose for a robot, and which measurements of each robot of the team it is made of."""
+
+
+def best_initialization(
+    joint: Joint,
+    robot: int,
+    observed: list[_ObservedPoints],
+    in_map: Bool[Array, "R"],
+    settings: TeamSettings,
+) -> Candidate:
+    """The candidate pose of a robot whose heading has the least variance.
+
+    observed: by each robot. there: which robots are in the map.
+    """
+    candidates = [
+        _mutual_candidate(joint, robot, other, observed, in_map[other], settings)
+        for other in range(len(observed))
+        if other != robot
+    ]
+    if len(observed[robot].tag) > 1:
+        candidates.append(_landmark_candidate(joint, robot, observed, settings))
+    heading = [jnp.where(new.possible, new.cov[2, 2], jnp.inf) for new, _ in candidates]
+    best = jnp.argmin(jnp.stack(heading))
+    chosen: Candidate = jax.tree.map(lambda *leaves: jnp.stack(leaves)[best], *candidates)
+    return chosen
+
+
+def _mutual_candidate(
+    joint: Joint,
+    robot: int,
+    other: int,
+    observed: list[_ObservedPoints],
+    in_map: Bool[Array, ""],
+    settings: TeamSettings,
+) -> Candidate:
+    """The pose from another robot in the map, if the two measure each other."""
+    mine, theirs, rows = observed[robot], observed[other], rows_of(other, settings)
+    i, sees = _first(theirs, settings.tags[robot])
+    j, sees_back = _first(mine, settings.tags[other])
+    found = by_mutual_sight(
+        pose_of(joint, other, settings),
+        joint.cov[rows],
+        joint.cov[rows, rows],
+        (theirs.point[i], theirs.cov[i]),
+        (mine.point[j], mine.cov[j]),
+    )
+    used = _none_of(observed)
+    used[other] = jnp.arange(len(used[other])) == i
+    used[robot] = jnp.arange(len(used[robot])) == j
+    return InitialPose(*found, in_map & sees & sees_back), used
+
+
+def _landmark_candidate(
+    joint: Joint, robot: int, observed: list[_ObservedPoints], settings: TeamSettings
+) -> Candidate:
+    """The pose from the two measured landmarks of the map that are farthest apart."""
+    mine, capacity = observed[robot], settings.capacity
+    slot, known = slots.find(joint.tag[:capacity], joint.alive[:capacity], mine.tag)
+    i, j, two = _farthest_pair(mine.point, known & mine.valid)
+    pair, which = jnp.stack([i, j]), jnp.stack([slot[i], slot[j]])
+    at_pair = (3 + which[:, None] * SIZE + jnp.arange(2)[None, :]).reshape(-1)
+    rows = joint.cov[at_pair]
+    found = by_two_landmarks(
+        joint.landmarks[which, :2], rows, rows[:, at_pair], mine.point[pair], mine.cov[pair]
+    )
+    used, at = _none_of(observed), jnp.arange(len(mine.tag))
+    used[robot] = (at == i) | (at == j)
+    return InitialPose(*found, two & (which[0] != which[1])), used
+
+
+def _none_of(observed: list[_ObservedPoints]) -> list[Array]:
+    return [jnp.zeros_like(each.valid) for each in observed]
+
+
+def _first(observed: _ObservedPoints, tag: int) -> tuple[Int[Array, ""], Bool[Array, ""]]:
+    """The first measurement with a tag, and whether it exists."""
+    match = observed.valid & (observed.tag == tag)
+    return jnp.argmax(match), match.any()
+
+
+def observed_points(sensors: Suite, scan: Scan) -> _ObservedPoints:
+    """A robot's scan as points; valid if a measurement has a tag and determines a point."""
+    found = []
+    for part, part_scan in zip(sensors.parts, split_scan(scan, sensors.places), strict=True):
+        if measures_points(part.sensor):
+            points, covs = _points_of(part.sensor, part_scan)
+            found.append(
+                _ObservedPoints(points, covs, part_scan.tag, part_scan.valid & (part_scan.tag >= 0))
+            )
+        else:
+            m, dtype = part.places, scan.z.dtype
+            nothing = jnp.zeros((m, 2), dtype), jnp.zeros((m, 2, 2), dtype)
+            found.append(_ObservedPoints(*nothing, part_scan.tag, jnp.zeros(m, bool)))
+    return _ObservedPoints(*(jnp.concatenate(leaves) for leaves in zip(*found, strict=True)))
+
+
+def _points_of(sensor: Sensor, scan: Scan) -> tuple[Float[Array, "M 2"], Float[Array, "M 2 2"]]:
+    """Points in the robot's frame, with covariances, of measurements that determine them."""
+    z = scan.z[:, : len(sensor.measurements)]
+    origin = jnp.zeros(3, z.dtype)
+
+    def one(z: Array) -> tuple[Array, Array]:
+        point, _, cov = first_order.invert_at(sensor, origin, z, origin, z)
+        return point, cov
+
+    # Absent measurements are replaced by a value at which every model is smooth.
+    points: tuple[Array, Array] = jax.vmap(one)(jnp.where(scan.valid[:, None], z, 1.0))
+    return points
+
+
+def by_mutual_sight(
+    other: Float[Array, "3"],
+    rows: Float[Array, "3 D"],
+    cov: Float[Array, "3 3"],
+    seen: tuple[Float[Array, "2"], Float[Array, "2 2"]],
+    back: tuple[Float[Array, "2"], Float[Array, "2 2"]],
+) -> tuple[Float[Array, "3"], Float[Array, "3 D"], Float[Array, "3 3"]]:
+    """The pose of a robot b that robot a measures and that measures a: mean, rows, covariance.
+
+    With v the position of b measured by a, and w that of a measured by b, r is the mean of |v| and
+    |w| weighted by their inverse variances. In the frame of a, b is at r v/|v| with heading
+    atan2(-v) - atan2(w); then x_b = x_a ∘ that pose.
+
+    Args:
+        other, rows, cov: x_a, its covariance with all errors, and its covariance.
+        seen, back: v and w, each with its covariance.
+    """
+    (v, cov_v), (w, cov_w) = seen, back
+    share = jax.lax.stop_gradient(_distance_variance(w, cov_w))
+    share = share / (share + jax.lax.stop_gradient(_distance_variance(v, cov_v)))
+
+    def pose(other: Array, v: Array, w: Array) -> Array:
+        (far, at_v), (back, at_w) = se2.polar(v), se2.polar(w)
+        position = se2.rectangular(jnp.stack([share * far + (1 - share) * back, at_v]))
+        turn = at_v + jnp.pi - at_w
+        return se2.compose(other, jnp.stack([position[0], position[1], turn]))
+
+    by_other, by_v, by_w = jax.jacfwd(pose, argnums=(0, 1, 2))(other, v, w)
+    noise = by_v @ cov_v @ by_v.T + by_w @ cov_w @ by_w.T
+    noise = symmetrize(by_other @ cov @ by_other.T + noise)
+    return _wrap_heading(pose(other, v, w)), by_other @ rows, noise
+
+
+def by_two_landmarks(
+    points: Float[Array, "2 2"],
+    rows: Float[Array, "4 D"],
+    cov: Float[Array, "4 4"],
+    seen: Float[Array, "2 2"],
+    seen_cov: Float[Array, "2 2 2"],
+) -> tuple[Float[Array, "3"], Float[Array, "3 D"], Float[Array, "3 3"]]:
+    """The pose of a robot that measures two landmarks of the map: mean, rows, covariance.
+
+    The rigid motion that aligns the measured points q with the landmarks l (`se2.align`): the
+    directions of l_2 - l_1 and q_2 - q_1 agree, and so do the midpoints.
+
+    Args:
+        points, rows, cov: l, its covariance with all errors, and its covariance.
+        seen, seen_cov: q and its covariances.
+    """
+
+    def pose(points: Array, seen: Array) -> Array:
+        return se2.align(seen, points)
+
+    by_points, by_seen = jax.jacfwd(pose, argnums=(0, 1))(points, seen)
+    by_points = by_points.reshape(3, 4)
+    noise = jnp.einsum("ikl,klm,jkm->ij", by_seen, seen_cov, by_seen)
+    noise = symmetrize(by_points @ cov @ by_points.T + noise)
+    return _wrap_heading(pose(points, seen)), by_points @ rows, noise
+
+
+def _farthest_pair(
+    points: Float[Array, "M 2"], usable: Bool[Array, "M"]
+) -> tuple[Int[Array, ""], Int[Array, ""], Bool[Array, ""]]:
+    """Indices i < j of the usable points farthest from each other, and whether two differ."""
+    m = points.shape[0]
+    between = ((points[:, None] - points[None, :]) ** 2).sum(-1)
+    both = usable[:, None] & usable[None, :] & jnp.triu(jnp.ones((m, m), bool), 1)
+    best = jnp.argmax(jnp.where(both, between, -1.0))
+    i, j = best // m, best % m
+    return i, j, both[i, j] & (between[i, j] > 0)
+
+
+def _distance_variance(point: Float[Array, "2"], cov: Float[Array, "2 2"]) -> Float[Array, ""]:
+    """The variance of the distance of a point with that covariance; positive."""
+    square = (point**2).sum()
+    positive = square > 0
+    along = point @ cov @ point / jnp.where(positive, square, 1.0)
+    return jnp.where(along > 0, along, jnp.finfo(point.dtype).tiny)
+
+
+def _wrap_heading(pose: Float[Array, "3"]) -> Float[Array, "3"]:
+    return jnp.concatenate([pose[:2], wrap(pose[2:])])

@@ -1,0 +1,254 @@
+"""The nonlinear least-squares problem of a path and a map, and Gauss-Newton with line search on it.
+
+The unknowns are the noises of the start and of the motions, in units of their standard
+deviations, and the map; the path follows from the noises by the motion models. So the models hold
+exactly at every iterate, and singular process noise is not a special case.
+"""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxslam.core.protocols import Motion, Sensor
+from jaxslam.graphs._chain.elimination import (
+    Chain,
+    LinearizedStep,
+    Policy,
+    Start,
+    eliminate,
+    pose_difference,
+    whitened_rows,
+)
+from jaxslam.graphs._solver.search import Ending
+from jaxslam.math import _linalg as linalg
+from jaxslam.math.angles import wrap
+
+
+class Problem(NamedTuple):
+    """The data of the problem: prior, controls and the measurements used."""
+
+    pose: Float[Array, "3"]
+    """mean of the start"""
+    root: Float[Array, "3 3"]
+    """of its covariance"""
+    control: Float[Array, "T U"]
+    roots: Float[Array, "T W W"]
+    """of the covariances of the motions' noises"""
+    z: Float[Array, "T M Z"]
+    slot: Int[Array, "T M"]
+    used: Bool[Array, "T M"]
+
+
+class Iterate(NamedTuple):
+    """Values of all unknowns, and the resulting path."""
+
+    start: Float[Array, "3"]
+    """ξ"""
+    noise: Float[Array, "T W"]
+    """η"""
+    path: Float[Array, "T+1 3"]
+    """from the start on: x_0 = pose + L ξ, x_t = f(x_{t-1}, u_t, Q^{1/2} η_t)"""
+    landmarks: Float[Array, "N L"]
+
+
+def cost(sensor: Sensor, problem: Problem, at: Iterate) -> Float[Array, ""]:
+    """The cost ½ |ξ|² + ½ Σ |η_t|² + ½ Σ |R^{-1/2} (z ⊖ h(x_t, l))|² of an iterate.
+
+    Minus the log posterior density, up to a constant, for fixed noise covariances. The path is that
+    of the iterate.
+    """
+
+    def square(z: Array, slot: Array, used: Array, pose: Array) -> Array:
+        residual = sensor.residual(z, sensor.observe(pose, at.landmarks[slot]))
+        white = linalg.solve_lower(linalg.cholesky(sensor.noise_cov(z))[0], residual)
+        return jnp.where(used, (white**2).sum(), 0.0)
+
+    over_slots = jax.vmap(square, (0, 0, 0, None))
+    each = jax.vmap(over_slots)(problem.z, problem.slot, problem.used, at.path[1:])
+    return 0.5 * ((at.start**2).sum() + (at.noise**2).sum() + each.sum())
+
+
+def _linearize_at(motion: Motion, sensor: Sensor, problem: Problem, at: Iterate) -> Chain:
+    """The chain of the Gauss-Newton step: the models linearized at an iterate.
+
+    It has as many rows a measurement as the chain of a filter (`smoothing.linearization`).
+    """
+    spare = max(0, len(sensor.landmark) - len(sensor.measurements))
+
+    def moved(pose: Array, u: Array, root: Array, noise: Array) -> tuple[Array, Array]:
+        by_pose, by_noise = jax.jacfwd(motion.step, argnums=(0, 2))(pose, u, root @ noise)
+        return by_pose, by_noise @ root
+
+    by_pose, by_noise = jax.vmap(moved)(at.path[:-1], problem.control, problem.roots, at.noise)
+
+    def measured(z: Array, slot: Array, used: Array, pose: Array) -> tuple[Array, Array, Array]:
+        *rows, _ = whitened_rows(sensor, z, pose, at.landmarks[slot])
+        a, b, r = (
+            jnp.pad(jnp.where(used, row, 0.0), [(0, spare)] + [(0, 0)] * (row.ndim - 1))
+            for row in rows
+        )
+        return a, b, r
+
+    over_slots = jax.vmap(measured, (0, 0, 0, None))
+    a, b, r = jax.vmap(over_slots)(problem.z, problem.slot, problem.used, at.path[1:])
+    no_drift = jnp.zeros_like(at.path[1:])
+    steps = LinearizedStep(by_pose, by_noise, no_drift, at.noise, problem.slot, a, b, r)
+    return Chain(Start(problem.root, at.start), steps)
+
+
+def roll_out(
+    motion: Motion, problem: Problem, at: Iterate, policy: Policy, share: Float[Array, ""]
+) -> Iterate:
+    """The iterate after a share of the step, by the nonlinear models.
+
+    d_t = share k_t - J a_t - K δm with a_t = f(x_{t-1}, u_t, Q^{1/2} η̄_t) - x̄_t along the new
+    path: later noises react to the nonlinear effect of earlier ones, as in differential dynamic
+    programming (Jacobson & Mayne 1970). Otherwise a small early rotation would move the whole later
+    path. To first order it is share times the Gauss-Newton step. The path of the initial iterate
+    (x̄) need not satisfy the models; that of the result does.
+    """
+    shift = share * policy.landmarks
+    delta = shift.reshape(-1)
+    start = at.start + share * policy.start.constant - policy.start.by_map @ delta
+    first = problem.pose + problem.root @ start
+    first = first.at[2].set(wrap(first[2]))
+
+    def forward(pose: Array, row: tuple[Array, ...]) -> tuple[Array, tuple[Array, Array]]:
+        u, root, noise, reference, constant, by_pose, by_map = row
+        predicted = pose_difference(motion.step(pose, u, root @ noise), reference)
+        noise = noise + share * constant - by_pose @ predicted - by_map @ delta
+        pose = motion.step(pose, u, root @ noise)
+        return pose, (pose, noise)
+
+    gains = policy.steps
+    data = problem.control, problem.roots, at.noise, at.path[1:]
+    solved = gains.constant, gains.by_pose, gains.by_map
+    _, (path, noise) = jax.lax.scan(forward, first, (*data, *solved))
+    return Iterate(start, noise, jnp.concatenate([first[None], path]), at.landmarks + shift)
+
+
+_SHARES = (1.0, 0.5, 0.25, 0.1, 0.03, 0.01, 0.001)
+"""of the Gauss-Newton step, tried all at once; the first that lowers the cost is used."""
+
+_ARMIJO = 1e-4
+"""least share of the decrease predicted by the gradient (Armijo)."""
+
+
+class Iterations(NamedTuple):
+    """The state of the iterations, and their result."""
+
+    at: Iterate
+    chain: Chain
+    """about that iterate"""
+    policy: Policy
+    """the chain's solution"""
+    cost: Float[Array, ""]
+    costs: Float[Array, "iterations"]
+    """after each step, that of the last repeated"""
+    taken: Int[Array, ""]
+    """steps"""
+    ending: Int[Array, ""]
+    """EXHAUSTED while the iterations continue"""
+
+
+def optimize_chain(
+    motion: Motion,
+    sensor: Sensor,
+    problem: Problem,
+    start: Iterate,
+    chain: Chain,
+    alive: Bool[Array, "N"],
+    *,
+    iterations: int,
+    tolerance: float | None,
+) -> Iterations:
+    """The result of the iterations from a start; the first step is by the given chain, so the start
+    need not satisfy the models.
+
+    Without tolerance all iterations are made, in a loop of fixed length.
+    """
+
+    def step(search: Iterations) -> tuple[Iterations, Bool[Array, ""]]:
+        """The search after one iteration: solve the chain, then step or end. Whether it stepped."""
+        policy = eliminate(search.chain, alive)
+        converged = jnp.asarray(False)
+        if tolerance is not None:
+            converged = _has_converged(search, policy, tolerance)
+        may = (search.taken < iterations) & ~converged
+        after, value, lower = _line_search(motion, sensor, problem, search, policy)
+        moved = may & lower
+        trial = after, _linearize_at(motion, sensor, problem, after), value
+        here = search.at, search.chain, search.cost
+        at, chain, value = jax.tree.map(lambda a, b: jnp.where(moved, a, b), trial, here)
+        ending = jnp.where(converged, Ending.CONVERGED, Ending.EXHAUSTED)
+        ending = jnp.where(may & ~lower, Ending.STALLED, ending)
+        late = jnp.arange(iterations) >= search.taken
+        found = Iterations(
+            at=at,
+            chain=chain,
+            policy=policy,
+            cost=value,
+            costs=jnp.where(late, value, search.costs),
+            taken=search.taken + moved,
+            ending=ending.astype(jnp.int32),
+        )
+        return found, moved
+
+    begin = _initial_noise(start, chain, alive, iterations)
+    # One iteration more than steps: the last solves the chain at the final iterate.
+    if tolerance is None:
+        fixed: Iterations = jax.lax.fori_loop(
+            0, iterations + 1, lambda _, search: step(search)[0], begin
+        )
+        return fixed
+    out: tuple[Iterations, Array] = jax.lax.while_loop(
+        lambda carry: carry[1], lambda carry: step(carry[0]), (begin, jnp.asarray(True))
+    )
+    return out[0]
+
+
+def _initial_noise(
+    start: Iterate, chain: Chain, alive: Bool[Array, "N"], iterations: int
+) -> Iterations:
+    """The search before the first step: no chain solved, and infinite cost."""
+    kind = chain.steps.residual.dtype
+    unsolved = jax.tree.map(
+        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(eliminate, chain, alive)
+    )
+    far, none = jnp.asarray(jnp.inf, kind), jnp.zeros((), jnp.int32)
+    costs = jnp.full(iterations, jnp.inf, kind)
+    return Iterations(start, chain, unsolved, far, costs, none, none + Ending.EXHAUSTED)
+
+
+def _has_converged(search: Iterations, policy: Policy, tolerance: float) -> Bool[Array, ""]:
+    """Whether the next step is shorter than the tolerance, in posterior standard deviations.
+
+    A step of √eps is rounding of the gradient; so is one whose decrease of the cost is below
+    rounding and that is hardly shorter than the last. The first step is always made.
+    """
+    eps = float(jnp.finfo(search.cost.dtype).eps)
+    least = jnp.maximum(tolerance, eps**0.5)
+    idle = policy.decrement > 0.8 * search.policy.decrement
+    idle = idle & (policy.decrement <= eps * search.cost)
+    return (search.taken > 0) & ((policy.decrement <= least**2) | idle)
+
+
+def _line_search(
+    motion: Motion, sensor: Sensor, problem: Problem, search: Iterations, policy: Policy
+) -> tuple[Iterate, Float[Array, ""], Bool[Array, ""]]:
+    """The iterate at the first share of the step that lowers the cost enough, its cost, and whether
+    there is such a share. The first step may raise the cost, if it stays finite."""
+    kind = search.cost.dtype
+    shares, eps = jnp.asarray(_SHARES, kind), float(jnp.finfo(kind).eps)
+    tried = jax.vmap(lambda share: roll_out(motion, problem, search.at, policy, share))(shares)
+    costs = jax.vmap(lambda at: cost(sensor, problem, at))(tried)
+    # To first order a step lowers the cost by share · λ²; the margin is the rounding of sums.
+    first = search.taken == 0
+    known = jnp.where(first, 0.0, search.cost)
+    enough = known * (1 + 10 * eps) - _ARMIJO * shares * policy.decrement
+    good = jnp.isfinite(costs) & (first | (costs <= enough))
+    chosen = jnp.argmax(good)
+    after: Iterate = jax.tree.map(lambda leaf: leaf[chosen], tried)
+    return after, costs[chosen], good.any()

@@ -1,0 +1,169 @@
+"""Marginal covariances of poses and points, from the information matrix of a graph."""
+
+from collections.abc import Mapping
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
+
+from jaxslam.core._numbers import is_concrete
+from jaxslam.graphs._checks import check_graph, label
+from jaxslam.graphs._factor import Factor
+from jaxslam.graphs._graph import Graph
+from jaxslam.graphs._solver.batch import (
+    LEAST,
+    cut,
+    graph_in_one_dtype,
+    over_batch,
+    own_number,
+    padded_graph,
+    padded_number,
+)
+from jaxslam.graphs._solver.linearized import data_of, linearize, variables_of
+from jaxslam.graphs._solver.model import Model, model_of
+from jaxslam.graphs._solver.plans import Plan, checked_pairs, plan_for
+from jaxslam.graphs._solver.search import Solution
+from jaxslam.graphs._sparse.cholesky import by, by_transposed, factorize, selected_inverse
+from jaxslam.graphs._sparse.sweeps import padded_size
+
+
+class Marginals(NamedTuple):
+    """Covariances of a graph's variables, zero for fixed ones; leading axes by `vmap`."""
+
+    poses: Float[Array, "N 3 3"]
+    """of (x, y, θ), in world coordinates as the poses themselves"""
+    points: Float[Array, "P L L"]
+    pairs: Float[Array, "Q 2 2 d d"]
+    """the joint covariance of each pair by its two variables, d = max(3, L); rows and columns that
+    a variable does not have are zero"""
+    singular: Int[Array, ""]
+    """the first variable that the measurements do not determine, poses before points; then the
+    covariances are not valid. -1: none"""
+
+
+def marginals(
+    solution: Solution,
+    factors: Mapping[str, Factor] | None = None,
+    *,
+    pairs: ArrayLike = (),
+    plan: Plan | None = None,
+    room: int = 0,
+) -> Marginals:
+    """The covariances (Σ Jᵀ ρ' Ω J)⁻¹ of all poses and points of a graph, and of pairs of them.
+
+    J and the weights ρ' of robust kernels are those of the solution: a row that a kernel leaves out
+    does not count. The inverse is computed where the Cholesky factor has blocks (`sparse.inverse`),
+    and at the pairs.
+
+    Args:
+        solution: of `optimize`. Outside of a trace its graph is checked. Of a graph as it is:
+            `optimize(graph, iterations=0)`.
+        factors: as in `optimize`.
+        pairs: (Q, 2), two variables each, points counted on from the poses.
+        plan: of `plan(graph, marginals=True, pairs=pairs)`; needed under `jit` and `vmap`. Its
+            pairs stand if none are given here.
+        room: as in `optimize`.
+    Raises:
+        ValueError: on a graph in place of a solution, on what `check_graph` refuses, on a plan
+            without marginals or those pairs, and outside of a trace on a variable that the
+            measurements do not determine.
+    """
+    caller = "graphs.marginals"
+    if not isinstance(solution, Solution):
+        raise ValueError(
+            f"{caller}: expected a Solution, whose weights say what a kernel left out, got a "
+            f"{type(solution).__name__}; of a graph as it is: graphs.optimize(graph, iterations=0)"
+        )
+    model = model_of(caller, solution.graph, factors)
+    check_graph(caller, solution.graph, model.factors)
+    graph = _weighted_tables(solution)
+    wanted = checked_pairs(caller, pairs, len(graph.poses) + len(graph.points))
+    if plan is None and is_concrete(graph):
+        more = padded_graph(graph, room)
+        rows = np.zeros((padded_size(max(len(wanted), 4 * room), LEAST), 2), int)
+        rows[: len(wanted)] = padded_number(wanted, graph, more)
+        plan = plan_for(caller, more, model.factors, None, marginals=True, pairs=rows, room=room)
+        whole: Marginals = _marginals(model, more, plan)
+        poses, points, pairs = cut(whole[:3], (graph.poses, graph.points, wanted))
+        found = Marginals(poses, points, pairs, own_number(whole.singular, graph, more))
+    else:
+        plan = plan_for(caller, graph, model.factors, plan, marginals=True, pairs=wanted)
+        found = _marginals(model, graph, plan)
+    if is_concrete(found.singular) and np.ndim(found.singular) == 0 and found.singular >= 0:
+        raise ValueError(
+            f"{caller}: the measurements do not determine {label(graph, int(found.singular))}"
+        )
+    return found
+
+
+def _weighted_tables(solution: Solution) -> Graph:
+    """The graph of a solution, each information multiplied by the weight of its row."""
+    array = np.asarray if is_concrete(solution) else jnp.asarray  # no program for each shape
+    tables = {
+        name: table._replace(
+            information=array(table.information) * array(solution.weights[name])[:, None, None]
+        )
+        for name, table in solution.graph.tables.items()
+    }
+    return solution.graph._replace(tables=tables)
+
+
+@partial(jax.jit, inline=True)
+def _marginals(model: Model, graph: Graph, plan: Plan) -> Marginals:
+    return over_batch("graphs.marginals", _invert)((model, plan), graph_in_one_dtype(graph))
+
+
+def _invert(model: Model, plan: Plan, graph: Graph) -> Marginals:
+    """Of graphs with a last axis B."""
+    assert plan.inverse is not None
+    data, variables = data_of(graph, plan.column), variables_of(graph)
+    system = linearize(model, plan, variables, data)
+    factored = factorize(plan.cholesky, system.blocks)
+    blocks = selected_inverse(plan.inverse, factored)
+    diagonal = blocks[plan.inverse.diagonal[plan.column]]  # by variable
+    diagonal = _mask(diagonal, *[data.free[plan.column]] * 2)
+    poses, size = len(graph.poses), graph.points.shape[1]
+    width = data.free.shape[1]
+    turn = _turns(graph, width)
+    diagonal = by_transposed(by(turn, diagonal), turn)
+    first, second = plan.pairs[:, 0], plan.pairs[:, 1]
+    cross = blocks[plan.inverse.pairs]
+    turned = plan.inverse.turned[:, None, None, None]
+    cross = jnp.where(turned, jnp.swapaxes(cross, 1, 2), cross)
+    cross = _mask(cross, data.free[plan.column[first]], data.free[plan.column[second]])
+    cross = by_transposed(by(turn[first], cross), turn[second])
+    joint = jnp.stack(
+        [
+            jnp.stack([diagonal[first], cross], axis=1),
+            jnp.stack([jnp.swapaxes(cross, 1, 2), diagonal[second]], axis=1),
+        ],
+        axis=1,
+    )
+    regular = factored.regular
+    culprit = plan.order[jnp.argmin(regular, axis=0)].astype(jnp.int32)
+    return Marginals(
+        poses=diagonal[:poses, :3, :3],
+        points=diagonal[poses:, :size, :size],
+        pairs=joint,
+        singular=jnp.where(regular.all(axis=0), -1, culprit).astype(jnp.int32),
+    )
+
+
+def _mask(
+    blocks: Float[Array, "k d d B"], rows: Bool[Array, "k d B"], columns: Bool[Array, "k d B"]
+) -> Float[Array, "k d d B"]:
+    return jnp.where(rows[:, :, None] & columns[:, None], blocks, 0.0)
+
+
+def _turns(graph: Graph, width: int) -> Float[Array, "n d d B"]:
+    """The derivative of each variable by its increments: R(θ) for the position of a pose."""
+    poses, points, batch = len(graph.poses), len(graph.points), graph.poses.shape[-1]
+    unit = jnp.eye(width, dtype=graph.poses.dtype)[None, ..., None]
+    every = jnp.broadcast_to(unit, (poses + points, width, width, batch))
+    cos, sin = jnp.cos(graph.poses[:, 2]), jnp.sin(graph.poses[:, 2])
+    turn = jnp.stack([jnp.stack([cos, -sin], axis=1), jnp.stack([sin, cos], axis=1)], axis=1)
+    return every.at[:poses, :2, :2].set(turn)

@@ -1,0 +1,304 @@
+"""The graph of a log: its motions, measurements and prior as factors."""
+
+from functools import partial
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
+
+from jaxslam.core import _validation as validation
+from jaxslam.core._numbers import is_concrete
+from jaxslam.core.protocols import Motion, Sensor
+from jaxslam.core.types import JaxOrNumPy, Log
+from jaxslam.graphs._factor import Factor, FromMotion, FromSensor, NominalMotion, Prior
+from jaxslam.graphs._graph import Graph, Table
+from jaxslam.linearize._first_order import motion_jacobians
+from jaxslam.math import _linalg as linalg
+from jaxslam.math import se2
+from jaxslam.sensors._suite import Suite
+
+_STILL = 1e-9
+"""∂step/∂w with columns of length one and a determinant below this is singular."""
+
+
+def of_log(
+    log: Log,
+    motion: Motion,
+    sensor: Sensor,
+    pose: ArrayLike,
+    pose_cov: ArrayLike,
+    *,
+    slack: float | None = None,
+    tags: ArrayLike | None = None,
+    capacity: int | None = None,
+) -> tuple[Graph, dict[str, Factor]]:
+    """The graph of a log of T steps, and its factors: its optimum is that of `BatchMap`.
+
+    Its tables, their factors, and the number of their rows:
+
+        prior    Prior() of the pose before the first control              1; none where P0 = 0
+        motion   FromMotion(motion), z = u, Ω = Q⁻¹; or NominalMotion     T
+        sensor   FromSensor(sensor), Ω = R⁻¹                              T·M
+
+    χ² of the graph is twice the cost of `smoothing.BatchMap`, and `pose_id` t is the pose after t
+    controls. Poses start along the nominal motion, points at their first measurement, where Q and R
+    are evaluated: as data of the graph they are fixed.
+
+    A noise of other than three components is not determined by two poses. Then, and where `slack` s
+    is given, the factor of the motion is `NominalMotion` with Ω = (G Q Gᵀ + s² I)⁻¹. With fewer
+    components (`Unicycle`, `Increment`, `Ackermann`) the motion is a constraint, which s > 0, the
+    standard deviation of each coordinate [m, m, rad], makes soft: the optimum differs from that of
+    `BatchMap` by the order of s², and the condition of the problem is worse by s⁻².
+
+    With `capacity` a tag is the number of its point, and all shapes are known, so that logs may be
+    traced and batched; points that no scan saw are fixed at the origin. Without, the points are the
+    tags that occur, in ascending order. Bad tags, and noise that has no information, are noticed
+    where the log is concrete.
+
+    Args:
+        log: row t of the scans was taken at pose t + 1.
+        motion: the model; without `slack` its noise has at least three components.
+        sensor: of landmarks, or an absolute one; not a suite. Landmark parameters that it does not
+            measure start at the mean of its `free`; that prior is not in the graph.
+        pose, pose_cov: (3,) and (3, 3) of the robot before the first control; zero fixes it.
+        slack: see above.
+        tags: (T, M) identities from an association, -1 where a measurement is left out; by default
+            those of the scans, which must be known.
+        capacity: number of points.
+    Raises:
+        ValueError: on models, a log or a covariance that do not fit, and at the row where a motion
+            or a measurement has a singular noise, or a noise does not move the pose in all
+            directions (a robot at rest, with `Odometry`).
+    """
+    name = "graphs.of_log"
+    validation.check_models(name, motion, sensor)
+    if isinstance(sensor, Suite) or sensor.reduced is not None:
+        raise ValueError(
+            f"{name}: expected one sensor of landmarks that stay what they are, got {sensor.name}"
+        )
+    exact = len(motion.noises) == 3 and slack is None
+    _check_slack(name, motion, slack)
+    of_motion = FromMotion(motion) if exact else NominalMotion(motion)
+    factors: dict[str, Factor] = {"motion": of_motion, "sensor": FromSensor(sensor)}
+    validation.check_covariance(f"{name}: pose_cov", pose_cov, 3)
+    size_u, size_z = len(motion.controls), len(sensor.measurements)
+    validation.check_log(name, log, control_size=size_u, measurement_size=size_z)
+    if np.shape(pose) != (3,):
+        raise ValueError(f"{name}: expected a pose of shape (3,), got {np.shape(pose)}")
+    if is_concrete(pose) and not np.isfinite(np.asarray(pose)).all():
+        raise ValueError(f"{name}: the pose is not finite")
+    known = is_concrete(pose_cov) and not np.any(np.asarray(pose_cov))
+    index, valid, ids = _points_of(name, log, sensor, tags, capacity)
+    arguments = jnp.asarray(pose), jnp.asarray(pose_cov), index, valid, ids
+    soft = None if exact else np.asarray(slack or 0.0)
+    graph, noise = _graph_of(motion, sensor, known, log, *arguments, soft)
+    _check_noise(name, noise, motion, sensor, valid, known)
+    if not known:
+        factors["prior"] = Prior()
+    return graph, factors
+
+
+class _Noise(NamedTuple):
+    """Which covariances can be inverted."""
+
+    prior: Bool[Array, ""]
+    motion: Bool[Array, "T"]
+    sensor: Bool[Array, "T M"]
+    moving: Bool[Array, "T"]
+    """whether the noise moves the pose in all directions"""
+
+
+def _check_slack(name: str, motion: Motion, slack: float | None) -> None:
+    """Raise ValueError on a slack that is negative or lacking."""
+    if slack is not None and not 0 <= slack < np.inf:
+        raise ValueError(f"{name}: expected slack to be a finite number >= 0, got {slack}")
+    if not slack and len(motion.noises) < 3:
+        raise ValueError(
+            f"{name}: {motion.name} has {len(motion.noises)} noises, which do not move the pose in "
+            "all directions: give slack, the standard deviation of a soft constraint, as slack=1e-3"
+        )
+
+
+def _points_of(
+    name: str, log: Log, sensor: Sensor, tags: ArrayLike | None, capacity: int | None
+) -> tuple[JaxOrNumPy, JaxOrNumPy, Int[np.ndarray, "P"]]:
+    """The point of each measurement, whether it is used, and the tags of the points."""
+    given = log.scan.tag if tags is None else tags
+    array: JaxOrNumPy = given if isinstance(given, Array) else np.asarray(given)
+    valid = log.scan.valid
+    if not sensor.landmark:
+        return log.scan.tag * 0, valid, np.zeros(0, np.int32)
+    if np.shape(array) != np.shape(valid):
+        raise ValueError(f"{name}: expected tags of shape {np.shape(valid)}, got {np.shape(array)}")
+    if not jnp.issubdtype(array.dtype, np.integer):
+        raise ValueError(f"{name}: expected tags to be integers, got {array.dtype}")
+    if is_concrete(array) and is_concrete(valid):
+        unknown = np.asarray(valid) & (np.asarray(array) < 0)
+        if tags is None and unknown.any():
+            row, place = np.argwhere(unknown)[0]
+            raise ValueError(
+                f"{name}: the measurement of row {row}, slot {place} has no identity: give tags= "
+                "of an association"
+            )
+        high = np.asarray(valid) & (np.asarray(array) >= (2**31 if capacity is None else capacity))
+        if high.any():
+            raise ValueError(
+                f"{name}: expected tags below {capacity}, the capacity, got "
+                f"{np.asarray(array)[high][0]}"
+            )
+    elif capacity is None:
+        raise ValueError(f"{name}: expected capacity, the number of points, of a traced log")
+    if capacity is not None:
+        validation.check_count(f"{name}: capacity", capacity)
+        used = valid & (array >= 0)
+        return array * used, used, np.arange(capacity, dtype=np.int32)
+    here = np.asarray(valid) & (np.asarray(array) >= 0)
+    ids = np.unique(np.asarray(array)[here]).astype(np.int32)
+    if not len(ids):
+        raise ValueError(f"{name}: the log has no measurement of a landmark")
+    return np.where(here, np.searchsorted(ids, array), 0).astype(np.int32), here, ids
+
+
+@partial(jax.jit, static_argnames="known", inline=True)
+def _graph_of(
+    motion: Motion,
+    sensor: Sensor,
+    known: bool,
+    log: Log,
+    pose: Float[Array, "3"],
+    pose_cov: Float[Array, "3 3"],
+    index: Int[Array, "T M"],
+    valid: Bool[Array, "T M"],
+    ids: Int[Array, "P"],
+    slack: Float[Array, ""] | None,
+) -> tuple[Graph, _Noise]:
+    """The graph, each measurement at the point of its index. known: the first pose is fixed.
+
+    slack: None for the exact factor of the motion.
+    """
+    kind = jnp.result_type(log.control, log.scan.z)
+    control, pose = log.control.astype(kind), pose.astype(kind)
+    z = jnp.where(valid[:, :, None], log.scan.z.astype(kind), 0.0)
+    nominal = jnp.zeros(len(motion.noises), kind)
+
+    def move(before: Array, u: Array) -> tuple[Array, Array]:
+        after = motion.step(before, u, nominal)
+        return after, after
+
+    path = jnp.concatenate([pose[None], jax.lax.scan(move, pose, control)[1]])
+    of_motion = jax.vmap(motion.noise_cov)(path[:-1], control)
+    by_noise = jax.vmap(lambda x, u: motion_jacobians(motion, x, u)[1])(path[:-1], control)
+    moving = jnp.ones(len(control), bool)
+    if slack is None:
+        moving = _moving(by_noise)
+    else:
+        of_motion = jax.vmap(_local, (0, 0, 0, None))(path[1:], by_noise, of_motion, slack)
+    of_sensor = jax.vmap(jax.vmap(sensor.noise_cov))(z)
+    # The prior's error is rotated into the frame of its mean, as the factor needs it.
+    turned = jnp.eye(3, dtype=kind).at[:2, :2].set(se2.rotation(pose[2]))
+    q, q_regular = jax.vmap(_information)(of_motion)
+    r, r_regular = jax.vmap(jax.vmap(_information))(of_sensor)
+    p, p_regular = _information(turned.T @ pose_cov.astype(kind) @ turned)
+    points, seen = _place_poses(sensor, path[1:], z, index, valid, ids.shape[0])
+
+    count = jnp.arange(path.shape[0], dtype=jnp.int32)
+    rows = jnp.repeat(count[1:], valid.shape[1])
+    who = [rows, index.reshape(-1).astype(rows.dtype)] if sensor.landmark else [rows]
+    size = z.shape[2]
+    tables = {
+        "motion": Table(
+            jnp.stack([count[:-1], count[1:]], axis=1), control, q, jnp.ones(len(control), bool)
+        ),
+        "sensor": Table(
+            jnp.stack(who, axis=1),
+            z.reshape(-1, size),
+            r.reshape(-1, size, size),
+            valid.reshape(-1),
+        ),
+    }
+    if not known:
+        first = jnp.zeros((1, 1), count.dtype)
+        tables["prior"] = Table(first, path[:1], p[None], jnp.ones(1, bool))
+    graph = Graph(path, points, tables, (count == 0) & known, ~seen, count, ids)
+    return graph, _Noise(p_regular, q_regular, r_regular, moving)
+
+
+def _local(
+    pose: Float[Array, "3"],
+    by_noise: Float[Array, "3 W"],
+    noise_cov: Float[Array, "W W"],
+    slack: Float[Array, ""],
+) -> Float[Array, "3 3"]:
+    """The noise covariance G Q Gᵀ + s² I of a motion, in the frame of the pose that it led to."""
+    turned = jnp.eye(3, dtype=pose.dtype).at[:2, :2].set(se2.rotation(pose[2]))
+    local = turned.T @ by_noise
+    return local @ noise_cov @ local.T + slack.astype(pose.dtype) ** 2 * jnp.eye(
+        3, dtype=pose.dtype
+    )
+
+
+def _moving(by_noise: Float[Array, "T 3 3"]) -> Bool[Array, "T"]:
+    """Whether matrices are regular, for any lengths of their columns."""
+    length = jnp.linalg.norm(by_noise, axis=1, keepdims=True)
+    a, b, c = jnp.moveaxis(by_noise / jnp.where(length > 0, length, 1.0), 2, 0)
+    return jnp.abs((a * jnp.cross(b, c)).sum(axis=1)) > _STILL
+
+
+def _information(cov: Float[Array, "R R"]) -> tuple[Float[Array, "R R"], Bool[Array, ""]]:
+    """The inverse of a covariance, and whether it is positive definite."""
+    inverse, regular = linalg.solve_psd(cov, jnp.eye(cov.shape[0], dtype=cov.dtype))
+    return linalg.symmetrize(inverse), regular
+
+
+def _place_poses(
+    sensor: Sensor,
+    path: Float[Array, "T 3"],
+    z: Float[Array, "T M Z"],
+    index: Int[Array, "T M"],
+    valid: Bool[Array, "T M"],
+    count: int,
+) -> tuple[Float[Array, "P L"], Bool[Array, "P"]]:
+    """Each point by its first measurement, and whether it has one."""
+    size = len(sensor.landmark)
+    if count == 0:
+        return jnp.zeros((0, size), z.dtype), jnp.zeros(0, bool)
+    mean = jnp.asarray(sensor.free.mean, z.dtype)
+    places, total = index.shape[1], index.size
+    order = jnp.where(valid, jnp.arange(total).reshape(index.shape), total).reshape(-1)
+    first = jnp.full(count, total).at[index.reshape(-1)].min(order)
+    seen = first < total
+    row = jnp.where(seen, first, 0)
+    flat = z.reshape(total, -1)
+    found = jax.vmap(lambda x, one: sensor.invert(x, one, mean))(path[row // places], flat[row])
+    return jnp.where(seen[:, None], found, 0.0), seen
+
+
+def _check_noise(
+    name: str, noise: _Noise, motion: Motion, sensor: Sensor, valid: JaxOrNumPy, known: bool
+) -> None:
+    """Raise ValueError where a covariance has no inverse, if the values are concrete."""
+    if not is_concrete((noise, valid)):
+        return
+    prior, moved, measured, moving = (np.asarray(part) for part in noise)
+    if not known and not prior:
+        raise ValueError(
+            f"{name}: pose_cov is singular; expected zero, which fixes the first pose, or a "
+            "positive definite covariance"
+        )
+    for good, what in (
+        (moved, f"the noise covariance of {motion.name} is singular"),
+        (
+            moving,
+            f"the noise of {motion.name} does not move the pose in all directions",
+        ),
+        (
+            (measured | ~np.asarray(valid)).all(axis=1),
+            f"the noise covariance of {sensor.name} is singular",
+        ),
+    ):
+        if not good.all():
+            row = int(good.argmin())
+            raise ValueError(f"{name}: {what} at row {row}, so that it has no information")

@@ -1,0 +1,245 @@
+"""The optimum of a graph, by Levenberg-Marquardt on sparse blocks, and its squared residuals.
+
+Derivatives of the optimum are by implicit differentiation.
+"""
+
+from collections.abc import Mapping
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, PyTree
+
+from jaxslam.core._numbers import check_count, is_concrete
+from jaxslam.graphs._checks import check_graph
+from jaxslam.graphs._factor import Factor
+from jaxslam.graphs._graph import Graph
+from jaxslam.graphs._solver.batch import (
+    cut,
+    graph_in_one_dtype,
+    over_batch,
+    own_number,
+    padded_graph,
+    with_batch,
+)
+from jaxslam.graphs._solver.gnc import graduated
+from jaxslam.graphs._solver.kernels import Kernel, Truncated
+from jaxslam.graphs._solver.linearized import (
+    chi2_of,
+    data_of,
+    half_hessian,
+    linearize,
+    retract,
+    row_weights,
+    variables_of,
+)
+from jaxslam.graphs._solver.model import Model, factors_of, model_of
+from jaxslam.graphs._solver.plans import Plan, plan_for
+from jaxslam.graphs._solver.search import Solution, minimize
+from jaxslam.graphs._sparse.cholesky import factorize, substitute
+
+
+def squared_residuals(
+    graph: Graph, factors: Mapping[str, Factor] | None = None, *, room: int = 0
+) -> dict[str, Float[Array, "E"]]:
+    """The squared residual eᵀ Ω e of every row of every table, 0 where not valid; their sum is χ².
+
+    Of a row with R residuals, at the truth and with the right Ω, it is χ² distributed with R
+    degrees of freedom. factors, room: as for `optimize`.
+    """
+    factors = factors_of("graphs.squared_residuals", graph, factors)
+    found = _squared_of(factors, padded_graph(graph, room) if is_concrete(graph) else graph)
+    return {key: cut(square, graph.tables[key].valid) for key, square in found.items()}
+
+
+def degrees_of_freedom(graph: Graph, factors: Mapping[str, Factor] | None = None) -> int:
+    """The residuals of all valid rows minus the free numbers of poses and points."""
+    factors = factors_of("graphs.degrees_of_freedom", graph, factors)
+    residuals = sum(
+        int(table.valid.sum()) * len(factors[key].errors) for key, table in graph.tables.items()
+    )
+    free = 3 * int((~graph.fixed_pose).sum())
+    return residuals - free - graph.points.shape[1] * int((~graph.fixed_point).sum())
+
+
+@partial(jax.jit, inline=True)
+def _squared_of(factors: dict[str, Factor], graph: Graph) -> dict[str, Float[Array, "E"]]:
+    found = {}
+    for key, factor in factors.items():
+        table = graph.tables[key]
+
+        def square(who: Array, z: Array, information: Array, factor: Factor = factor) -> Array:
+            values = tuple(
+                (graph.poses if kind == "pose" else graph.points)[who[k]]
+                for k, kind in enumerate(factor.variables)
+            )
+            e = factor.residual(values, z)
+            return e @ information @ e
+
+        who, z, information = (jnp.asarray(part) for part in table[:3])
+        found[key] = jnp.where(table.valid, jax.vmap(square)(who, z, information), 0.0)
+    return found
+
+
+def followed(model: Model, plan: Plan, graph: Graph, found: Solution) -> Solution:
+    """The solution as a function of graph and model: the same numbers, with derivatives.
+
+    At the optimum F(δ; θ) = ½ ∂χ²/∂δ = 0, so that dδ = -(∂F/∂δ)⁻¹ (∂F/∂θ) dθ: a Newton step from
+    the optimum, of which only F is differentiated. ∂F/∂δ is half the Hessian of χ² with its second
+    derivatives of the residuals, not Gauss-Newton's. θ are the measurements, the information,
+    the variables that are fixed, and the numbers of factors and kernels.
+    """
+    still = jax.lax.stop_gradient((found.graph.poses, found.graph.points))
+    poses = jnp.where(graph.fixed_pose[:, None], graph.poses, still[0])
+    points = jnp.where(graph.fixed_point[:, None], graph.points, still[1])
+    trial = with_batch(graph._replace(poses=poses, points=points))
+    variables, data = variables_of(trial), data_of(trial, plan.column)
+    blocks = half_hessian(*jax.lax.stop_gradient((model, plan, variables, data)))
+    gradient = linearize(model, plan, variables, data).gradient
+    step = _solve_by_factor(plan, blocks[..., 0], gradient[..., 0])
+    end = retract(variables, -step[..., None], plan)
+    return jax.lax.stop_gradient(found)._replace(
+        graph=graph._replace(poses=end.poses[..., 0], points=end.points[..., 0]),
+        chi2=chi2_of(model, plan.who, variables, data)[0],
+        weights={
+            name: weight[..., 0] for name, weight in row_weights(model, plan.who, end, data).items()
+        },
+    )
+
+
+def _solve_by_factor(
+    plan: Plan, blocks: Float[Array, "M d d"], rhs: Float[Array, "n d"]
+) -> Float[Array, "n d"]:
+    """The solution A⁻¹ b, with derivatives by b."""
+
+    def times(x: Float[Array, "n d"]) -> Float[Array, "n d"]:
+        below = jnp.einsum("mij,mj->mi", blocks, x[plan.block_column])
+        above = jnp.einsum("mji,mj->mi", blocks, x[plan.block_row])
+        above = jnp.where(plan.on_diagonal[:, None], 0.0, above)
+        y = jnp.zeros_like(x).at[plan.block_row].add(below)
+        return y.at[plan.block_column].add(above)
+
+    def solve(_: object, b: Float[Array, "n d"]) -> Float[Array, "n d"]:
+        return _by_factor((plan,), (blocks, b))
+
+    out: Array = jax.lax.custom_linear_solve(times, rhs, solve, symmetric=True)
+    return out
+
+
+def _factor_and_solve(plan: Plan, system: tuple[Array, Array]) -> Array:
+    blocks, rhs = system
+    return substitute(plan.cholesky, factorize(plan.cholesky, blocks), rhs)
+
+
+_by_factor = over_batch("graphs.optimize", _factor_and_solve)
+
+
+def optimize(
+    graph: Graph,
+    factors: Mapping[str, Factor] | None = None,
+    *,
+    kernel: Kernel | Mapping[str, Kernel] | None = None,
+    iterations: int = 100,
+    tolerance: float = 1e-12,
+    plan: Plan | None = None,
+    room: int = 0,
+) -> Solution:
+    """The graph at a minimum of χ² = Σ ρ(eᵀ Ω e), from the variables it has.
+
+    Each step of Levenberg and Marquardt solves (H + λD) δ = -g with H = Σ Jᵀ ρ' Ω J and
+    g = Σ Jᵀ ρ' Ω e, J by increments δ in the frame of a pose, X ∘ exp(δ) as in `se2.boxplus`, and
+    D = diag H.
+
+    Args:
+        graph: outside of a trace it is checked.
+        factors: the factor of each table; those of files by default. A table "name/part" takes the
+            factor "name".
+        kernel: robust kernels, one for all tables or by table. With `Truncated` the iterations are
+            rounds of graduated non-convexity (`gnc`), and `iterations` is the limit of each.
+        iterations: largest number of steps; with 0 the solution is the graph itself.
+        tolerance: done when a step lowers χ² by less than this share of it, as the quadratic model
+            predicts, and at least by rounding.
+        plan: of `plan`; needed under `jit` and `vmap`, where `who` is traced. Without one, graphs
+            of about the same size share a compiled program (`solver.padding`).
+        room: without a plan, graphs of up to about this number of variables share one.
+    Raises:
+        ValueError: on what `check_graph` refuses, and on unknown tables.
+    """
+    caller = "graphs.optimize"
+    check_count(f"{caller}: iterations", iterations, least=0)
+    if is_concrete(tolerance) and not 0 <= tolerance < np.inf:
+        raise ValueError(
+            f"{caller}: expected tolerance to be a finite number >= 0, got {tolerance}"
+        )
+    model = model_of(caller, graph, factors, kernel)
+    check_graph(caller, graph, model.factors)
+    original, fill = graph, plan is None and is_concrete(graph)
+    graph = padded_graph(graph, room) if fill else graph
+    plan = plan_for(caller, graph, model.factors, plan, room=room)
+    found: Solution = _optimize(model, graph, plan, iterations, tolerance)
+    if not fill:
+        return found
+    singular = own_number(found.singular, original, graph)
+    rows = {name: table.valid for name, table in original.tables.items()}
+    return found._replace(
+        graph=cut(found.graph, original), singular=singular, weights=cut(found.weights, rows)
+    )
+
+
+def chi2(
+    graph: Graph,
+    factors: Mapping[str, Factor] | None = None,
+    *,
+    kernel: Kernel | Mapping[str, Kernel] | None = None,
+) -> Float[Array, ""]:
+    """The cost χ² = Σ ρ(eᵀ Ω e) of a graph as it is, without a factor ½."""
+    cost: Array = _chi2(model_of("graphs.chi2", graph, factors, kernel), graph)
+    return cost
+
+
+@partial(jax.jit, inline=True)
+def _chi2(model: Model, graph: Graph) -> Float[Array, ""]:
+    graph = graph_in_one_dtype(graph)
+    who = {name: jnp.asarray(table.who) for name, table in graph.tables.items()}
+    batch = with_batch(graph)
+    none = jnp.arange(len(graph.poses) + len(graph.points))
+    return chi2_of(model, who, variables_of(batch), data_of(batch, none))[0]
+
+
+@partial(jax.jit, inline=True)
+def _optimize(
+    model: Model, graph: Graph, plan: Plan, iterations: Array, tolerance: Array
+) -> Solution:
+    graph = graph_in_one_dtype(graph)
+    return _solved(model, graph, plan, iterations, jnp.asarray(tolerance, graph.poses.dtype))
+
+
+def _search(
+    model: Model, plan: Plan, iterations: Array, tolerance: Array, graph: Graph
+) -> Solution:
+    """The solutions of graphs with a last axis B."""
+    rounds = any(isinstance(kernel, Truncated) for kernel in model.kernels.values())
+    return (graduated if rounds else minimize)(model, plan, iterations, tolerance, graph)
+
+
+_solve = over_batch("graphs.optimize", _search)
+
+
+@jax.custom_jvp
+def _solved(
+    model: Model, graph: Graph, plan: Plan, iterations: Array, tolerance: Array
+) -> Solution:
+    """The solution of one graph, with derivatives by the graph and by the numbers of the model."""
+    return _solve((model, plan, iterations, tolerance), graph)
+
+
+@_solved.defjvp
+def _slope(primals: PyTree, tangents: PyTree) -> tuple[Solution, PyTree]:
+    model, graph, plan, *_ = primals
+    found = _solved(*primals)
+
+    def near(model: Model, graph: Graph) -> Solution:
+        return followed(model, plan, graph, found)
+
+    return found, jax.jvp(near, (model, graph), tangents[:2])[1]

@@ -1,0 +1,191 @@
+"""The plan of a graph: which variables its measurements join, and the tables to solve it."""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Array, Bool, Int
+from numpy.typing import ArrayLike
+
+from jaxslam.core._numbers import is_concrete
+from jaxslam.graphs._factor import Factor
+from jaxslam.graphs._graph import Graph
+from jaxslam.graphs._solver.model import factors_of
+from jaxslam.graphs._sparse.cholesky import (
+    CholeskyTables,
+    InverseTables,
+    block_count,
+    cholesky_tables,
+    inverse_tables,
+)
+from jaxslam.graphs._sparse.sweeps import Stages, index_table, stages
+from jaxslam.graphs._sparse.symbolic import factor_pattern
+
+
+class Plan(NamedTuple):
+    """The symbolic part of a graph's solution, for n variables: N poses, then P points.
+
+    It depends on the numbers of variables and on `who` of each table, and serves all graphs that
+    have these in common.
+    """
+
+    who: dict[str, Int[Array, "_ _"]]
+    order: Int[Array, "n"]
+    """the variable of each column of the matrix"""
+    column: Int[Array, "n"]
+    """the column of each variable"""
+    information: Stages
+    """from blocks (row, one variable, other variable) of all tables to those of the matrix"""
+    gradient: Stages
+    """from (row, variable) of all tables to columns"""
+    block_column: Int[Array, "padded"]
+    """of the M blocks of the factor; rows beyond are of no block (`sweeps.padded_size`)"""
+    block_row: Int[Array, "padded"]
+    on_diagonal: Bool[Array, "padded"]
+    cholesky: CholeskyTables
+    inverse: InverseTables | None
+    """None without `marginals`"""
+    pairs: Int[Array, "Q 2"]
+
+
+def plan(
+    graph: Graph,
+    factors: Mapping[str, Factor] | None = None,
+    *,
+    marginals: bool = False,
+    pairs: ArrayLike = (),
+    room: int = 0,
+) -> Plan:
+    """The plan of a graph, made on the host from `who`, which must be concrete.
+
+    Give it to `optimize` to solve many graphs of one pattern, under `vmap` or one by one:
+
+        plan = graphs.plan(graph)
+        jax.vmap(lambda g: graphs.optimize(g, plan=plan))(many)
+
+    Rows that are not valid are in the pattern all the same, since which are may differ from graph
+    to graph; but rows of a variable out of range, as -1, are not.
+
+    Args:
+        graph: only its `who` and the numbers of poses and points are read.
+        factors: as in `optimize`.
+        marginals: whether to plan `marginals` as well.
+        pairs: (Q, 2), two variables each, points counted on from the poses, of which `marginals`
+            shall give the joint covariance.
+        room: the number of variables for which tables have room, so that graphs of fewer share a
+            compiled program.
+    Raises:
+        ValueError: where `who` is traced, or the tables do not fit their factors.
+    """
+    factors = factors_of("graphs.plan", graph, factors)
+    poses, points = len(graph.poses), len(graph.points)
+    size = poses + points
+    who, rows = {}, []
+    for name in factors:
+        its = graph.tables[name]
+        if not is_concrete(its.who):
+            raise ValueError(
+                f"graphs.plan: `who` of the table {name!r} is traced: make the plan of one graph "
+                "outside, and give it as `plan`"
+            )
+        who[name] = np.asarray(its.who, np.int32)
+        count = np.array([poses if kind == "pose" else points for kind in factors[name].variables])
+        lost = ((who[name] < 0) | (who[name] >= count)).any(axis=1)
+        bad = lost & np.asarray(its.valid) if is_concrete(its.valid) else lost
+        if bad.any():
+            raise ValueError(
+                f"graphs.plan: row {bad.argmax()} of the table {name!r} has a variable out of "
+                f"range: {np.asarray(its.who)[bad.argmax()].tolist()}"
+            )
+        who[name] = np.where(lost[:, None], 0, who[name])
+        shift = np.array([poses * (kind == "point") for kind in factors[name].variables])
+        rows.append((who[name] + shift, lost))
+    joined = [
+        np.stack([r[~lost, a], r[~lost, b]])
+        for r, lost in rows
+        for a in range(r.shape[1])
+        for b in range(a)
+    ]
+    wanted = checked_pairs("graphs.plan", pairs, size)
+    first, second = np.concatenate([wanted.T, *joined], axis=1)
+    pattern = factor_pattern(size, first, second)
+    cholesky, place = cholesky_tables(pattern, room)
+    order = np.argsort(place[:-1])
+    blocks, columns = [], []
+    for its, lost in rows:
+        column = pattern.position[its]
+        one, other = np.broadcast_arrays(column[:, :, None], column[:, None, :])
+        lower = (one >= other) & ~lost[:, None, None]
+        target = np.full(one.shape, -1)
+        target[lower] = place[pattern.find(one[lower], other[lower])]
+        blocks.append(target.ravel())
+        columns.append(np.where(lost[:, None], -1, column).ravel())
+    block_column, block_row = pattern.columns[order], pattern.rows[order]
+    width = block_count(pattern, room)
+    return Plan(
+        who={name: index_table(rows) for name, rows in who.items()},
+        order=index_table(pattern.order),
+        column=index_table(pattern.position),
+        information=stages(np.concatenate(blocks), width, 8 * room),
+        gradient=stages(np.concatenate(columns), size, 4 * room),
+        block_column=index_table(block_column, width),
+        block_row=index_table(block_row, width),
+        on_diagonal=index_table(block_row == block_column, width),
+        cholesky=cholesky,
+        inverse=inverse_tables(pattern, place, wanted[:, 0], wanted[:, 1], room)
+        if marginals
+        else None,
+        pairs=index_table(wanted),
+    )
+
+
+def checked_pairs(name: str, pairs: ArrayLike, size: int) -> Int[np.ndarray, "Q 2"]:
+    """Pairs of variables, (Q, 2); raises ValueError, which begins with a caller's name, on another
+    shape, on numbers that are not whole, and on one out of range."""
+    given = np.asarray(pairs)
+    if given.size == 0:
+        return np.zeros((0, 2), int)
+    if given.ndim != 2 or given.shape[1] != 2 or not np.issubdtype(given.dtype, np.integer):
+        raise ValueError(
+            f"{name}: expected pairs of whole numbers, (Q, 2), got {given.dtype} of shape "
+            f"{given.shape}"
+        )
+    wanted = given.astype(int)
+    if ((wanted < 0) | (wanted >= size)).any():
+        raise ValueError(
+            f"{name}: expected pairs of variables from 0 to {size - 1}, got {wanted.tolist()}"
+        )
+    return wanted
+
+
+def plan_for(
+    name: str,
+    graph: Graph,
+    factors: Mapping[str, Factor],
+    given: Plan | None,
+    *,
+    marginals: bool = False,
+    pairs: Int[np.ndarray, "Q 2"] | None = None,
+    room: int = 0,
+) -> Plan:
+    """The given plan, checked against the graph as far as that is concrete, or a new one."""
+    if given is None:
+        wanted = () if pairs is None else pairs
+        return plan(graph, factors, marginals=marginals, pairs=wanted, room=room)
+    size = len(graph.poses) + len(graph.points)
+    same = given.order.shape == (size,) and set(given.who) == set(graph.tables)
+    for key, who in given.who.items():
+        same = same and np.shape(graph.tables[key].who) == np.shape(who)
+        if same and is_concrete(graph.tables[key].who) and is_concrete(who):
+            same = bool(np.array_equal(graph.tables[key].who, who))
+    if not same:
+        raise ValueError(f"{name}: the plan is of another graph: variables or `who` differ")
+    if marginals and given.inverse is None:
+        raise ValueError(f"{name}: the plan is without marginals: `plan(graph, marginals=True)`")
+    if (
+        pairs is not None
+        and len(pairs)
+        and not (is_concrete(given.pairs) and np.array_equal(given.pairs, pairs))
+    ):
+        raise ValueError(f"{name}: the plan is of other pairs: `plan(graph, pairs=…)`")
+    return given

@@ -1,0 +1,280 @@
+"""The Cholesky factor of a block-sparse matrix, solutions by it, and blocks of the inverse.
+
+Arrays have the batch B as their last axis: matrices of one pattern share every index, and each
+operation runs over contiguous numbers of all of them.
+"""
+
+from itertools import pairwise
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxslam.graphs._sparse.sweeps import (
+    TARGETS,
+    Sums,
+    Sweep,
+    finish,
+    index_table,
+    level_table,
+    nothing,
+    padded,
+    padded_size,
+    padded_table_size,
+    places,
+    subtract_products,
+    sweep,
+)
+from jaxslam.graphs._sparse.symbolic import Ints, Pattern
+from jaxslam.math._linalg import total
+
+
+class CholeskyTables(NamedTuple):
+    """What the factorization of a pattern of n columns and M blocks needs."""
+
+    factor: Sweep
+    diagonal: Int[Array, "n"]
+    """the place of each column's diagonal block"""
+    pivots: Int[Array, "levels+1"]
+    """the first chunk of columns of each level, and the end of the last"""
+    pivot_base: Int[Array, "chunks"]
+    """the first column of each chunk"""
+    forward: Sweep
+    forward_order: Int[Array, "n"]
+    """the column at each place of the forward substitution"""
+    backward: Sweep
+    backward_order: Int[Array, "n"]
+
+
+class Factored(NamedTuple):
+    """A Cholesky factor L of n columns."""
+
+    blocks: Float[Array, "places d d B"]
+    """`padded_size(M)` and T + 1 more, which are zero beyond the M of the pattern"""
+    inverses: Float[Array, "n+T+1 d d B"]
+    """L_jj⁻¹; the last is the identity"""
+    regular: Bool[Array, "n B"]
+    """whether the pivots of a column are positive"""
+
+
+def cholesky_tables(pattern: Pattern, room: int = 0) -> tuple[CholeskyTables, Ints]:
+    """The tables of a pattern, with room for more variables, and the place of each of its
+    blocks, and of none, in `Factored.blocks`."""
+    size, heights, columns, rows = (
+        len(pattern.order),
+        pattern.heights,
+        pattern.columns,
+        pattern.rows,
+    )
+    target, left, right = [], [], []
+    for _, blocks in pattern.below():
+        one, other = np.tril_indices(blocks.shape[1])
+        left.append(blocks[:, one].ravel())
+        right.append(blocks[:, other].ravel())
+        target.append(pattern.find(rows[left[-1]], rows[right[-1]]))
+    sums = Sums(heights[columns], *map(np.concatenate, (target, left, right)))
+    _, place = places(sums, block_count(pattern, room))
+    one = np.append(np.arange(size), nothing(size))
+    factor = sweep(sums, place, place, one[np.append(columns, size)], room)
+    # Columns are sorted by height: those of a level lie side by side.
+    first = np.searchsorted(heights, np.arange(heights[-1] + 2)).tolist()
+    chunks = [range(low, high, TARGETS) for low, high in pairwise(first)]
+    pivot_base = np.concatenate(chunks)
+    below = np.flatnonzero(rows > columns)
+    downward = Sums(heights, rows[below], below, columns[below])
+    upward = Sums(heights[-1] - heights, columns[below], below, rows[below])
+    forward_order, forward_place = places(downward, size)
+    backward_order, backward_place = places(upward, size)
+    return CholeskyTables(
+        factor,
+        diagonal=index_table(place[pattern.first[:-1]]),
+        pivots=level_table(np.cumsum([0, *map(len, chunks)]).tolist(), room),
+        pivot_base=index_table(pivot_base, padded_table_size(len(pivot_base), room)),
+        forward=sweep(downward, place, forward_place, one, room),
+        forward_order=index_table(forward_order),
+        backward=sweep(upward, place, backward_place, one, room),
+        backward_order=index_table(backward_order),
+    ), place
+
+
+def block_count(pattern: Pattern, room: int) -> int:
+    """The size of the array of a pattern's blocks, with room for more variables."""
+    return padded_size(max(len(pattern.columns), 8 * room))
+
+
+def by_transposed(a: jax.Array, b: jax.Array) -> jax.Array:
+    """A Bᵀ of blocks (T, d, d, B)."""
+    return total(a[:, :, None, m] * b[:, None, :, m] for m in range(a.shape[2]))
+
+
+def by(a: jax.Array, b: jax.Array) -> jax.Array:
+    """A B of blocks (T, d, d, B)."""
+    return total(a[:, :, m, None] * b[:, None, m] for m in range(a.shape[2]))
+
+
+def _on_vector(a: jax.Array, x: jax.Array) -> jax.Array:
+    """A x of blocks (T, d, d, B) and vectors (T, d, B)."""
+    return total(a[:, :, m] * x[:, None, m] for m in range(a.shape[2]))
+
+
+def _transposed_on_vector(a: jax.Array, x: jax.Array) -> jax.Array:
+    return total(a[:, m] * x[:, m, None] for m in range(a.shape[2]))
+
+
+def factorize(tables: CholeskyTables, blocks: Float[Array, "padded d d B"]) -> Factored:
+    """The factor of a matrix, from its blocks at their places (lower triangle).
+
+    A pivot that may be rounding of zero, compared with the diagonal entry of the matrix, makes its
+    column irregular; its inverse is then taken as zero, so that all numbers stay finite.
+    """
+    size, width = len(tables.diagonal), blocks.shape[1]
+    entries = jnp.diagonal(blocks[tables.diagonal], axis1=1, axis2=2)  # (n, B, d)
+    least = 32 * float(jnp.finfo(blocks.dtype).eps) * jnp.moveaxis(entries, 2, 1)
+    least = jnp.pad(least, [(0, TARGETS), (0, 0), (0, 0)])
+    one = jnp.broadcast_to(jnp.eye(width, dtype=blocks.dtype)[..., None], blocks.shape[1:])
+    inverses = padded(jnp.zeros((size, *blocks.shape[1:]), blocks.dtype)).at[-1].set(one)
+    regular = jnp.ones((size + TARGETS, blocks.shape[-1]), bool)
+    diagonal = jnp.pad(tables.diagonal, (0, TARGETS))
+
+    def level(i: jax.Array, state: tuple[jax.Array, ...]) -> tuple[jax.Array, ...]:
+        blocks, inverses, regular = state
+        blocks = subtract_products(tables.factor, i, blocks, None, None, by_transposed)
+
+        def pivots(c: jax.Array, state: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, jax.Array]:
+            inverses, regular = state
+            base = tables.pivot_base[c]
+            here = blocks[jax.lax.dynamic_slice_in_dim(diagonal, base, TARGETS)]
+            inverse, good = _inverse_factor(
+                here, jax.lax.dynamic_slice_in_dim(least, base, TARGETS)
+            )
+            return (
+                jax.lax.dynamic_update_slice_in_dim(inverses, inverse, base, 0),
+                jax.lax.dynamic_update_slice_in_dim(regular, good, base, 0),
+            )
+
+        inverses, regular = jax.lax.fori_loop(
+            tables.pivots[i], tables.pivots[i + 1], pivots, (inverses, regular)
+        )
+        return finish(tables.factor, i, blocks, inverses, by_transposed), inverses, regular
+
+    state = jax.lax.fori_loop(0, tables.factor.levels, level, (padded(blocks), inverses, regular))
+    return Factored(state[0], state[1], state[2][:size])
+
+
+def _inverse_factor(
+    matrix: Float[Array, "T d d B"], least: Float[Array, "T d B"]
+) -> tuple[Float[Array, "T d d B"], Bool[Array, "T B"]]:
+    """The inverse factor L⁻¹, as `linalg.whitener`, and whether each pivot is above its least."""
+    width = matrix.shape[1]
+    zero = jnp.zeros_like(matrix[:, 0, 0])
+    factor = [[zero] * width for _ in range(width)]
+    rows = [[zero] * width for _ in range(width)]
+    regular = jnp.ones(zero.shape, bool)
+    for j in range(width):
+        pivot = matrix[:, j, j] - total([zero, *(factor[j][k] ** 2 for k in range(j))])
+        good = pivot > least[:, j]
+        regular = regular & good
+        rows[j][j] = jnp.where(good, jax.lax.rsqrt(jnp.where(good, pivot, 1.0)), 0.0)
+        for k in range(j):
+            rows[j][k] = -rows[j][j] * total(factor[j][i] * rows[i][k] for i in range(k, j))
+        for i in range(j + 1, width):
+            rest = matrix[:, i, j] - total([zero, *(factor[i][k] * factor[j][k] for k in range(j))])
+            factor[i][j] = rest * rows[j][j]
+    return jnp.stack([jnp.stack(row, axis=1) for row in rows], axis=1), regular
+
+
+def substitute(
+    tables: CholeskyTables, factored: Factored, rhs: Float[Array, "n d B"]
+) -> Float[Array, "n d B"]:
+    """The solution A⁻¹ b, by columns of the factor."""
+    x = rhs
+    for tables_of, order, on in (
+        (tables.forward, tables.forward_order, _on_vector),
+        (tables.backward, tables.backward_order, _transposed_on_vector),
+    ):
+
+        def level(i: jax.Array, x: jax.Array) -> jax.Array:
+            x = subtract_products(tables_of, i, x, factored.blocks, None, on)  # noqa: B023
+            return finish(tables_of, i, x, factored.inverses, lambda x, a: on(a, x))  # noqa: B023
+
+        solved = jax.lax.fori_loop(0, tables_of.levels, level, padded(x[order]))
+        x = jnp.zeros_like(rhs).at[order].set(solved[: len(order)], unique_indices=True)
+    return x
+
+
+class InverseTables(NamedTuple):
+    """What the selected inversion of a pattern of n columns and M blocks needs."""
+
+    sweep: Sweep
+    diagonal: Int[Array, "n"]
+    """the place of each column's diagonal block"""
+    pairs: Int[Array, "Q"]
+    """the place of the block of each pair of variables"""
+    turned: Bool[Array, "Q"]
+    """whether that block has the second variable's rows and the first one's columns"""
+
+
+def inverse_tables(
+    pattern: Pattern, cholesky_places: Ints, first: Ints, second: Ints, room: int = 0
+) -> InverseTables:
+    """The tables of a pattern, and of pairs of its variables whose blocks it has.
+
+    cholesky_places: of each block in `Factored.blocks`, and of none.
+    """
+    size = len(pattern.order)
+    sums = _sums(pattern)
+    _, place = places(sums, block_count(pattern, room))
+    end = np.append(pattern.columns, nothing(size))
+    one, other = pattern.position[first], pattern.position[second]
+    pairs = place[pattern.find(np.maximum(one, other), np.minimum(one, other))]
+    return InverseTables(
+        sweep(sums, place, cholesky_places, end, 2 * room),
+        index_table(place[pattern.first[:-1]]),
+        index_table(pairs),
+        index_table(one < other),
+    )
+
+
+def _sums(pattern: Pattern) -> Sums:
+    """The products of the selected inversion; a large graph has millions."""
+    rows, columns = pattern.rows, pattern.columns
+    target, left, right, flip = [], [], [], []
+    for column, blocks in pattern.below():
+        involved = rows[blocks]  # (C, m)
+        # The rows of a column, with the diagonal, by the rows below its diagonal.
+        every = np.concatenate([column[:, None], involved], axis=1)
+        one, other = np.broadcast_arrays(every[:, :, None], involved[:, None, :])
+        at = np.concatenate([pattern.first[column][:, None], blocks], axis=1, dtype=np.int32)
+        target.append(np.broadcast_to(at[:, :, None], one.shape).ravel())
+        left.append(pattern.find(np.maximum(one, other).ravel(), np.minimum(one, other).ravel()))
+        flip.append((one < other).ravel())
+        right.append(np.broadcast_to(blocks[:, None, :], one.shape).ravel())
+    depth = pattern.heights[-1] - pattern.heights
+    # The diagonal block of a column comes after the blocks below it, which it sums.
+    level = 2 * depth[columns] + (rows == columns)
+    return Sums(level, *map(np.concatenate, (target, left, right, flip)))
+
+
+def selected_inverse(tables: InverseTables, factored: Factored) -> Float[Array, "places d d B"]:
+    """The blocks of A⁻¹ where L has blocks.
+
+        Z_ij = (δ_ij L_jjᵀ⁻¹ - Σ_k Z_ik L_kj) L_jj⁻¹, k the rows of L below the diagonal of column j
+
+    from the last column to the first (Takahashi, Fagan and Chin 1973; Erisman and Tinney 1975, "On
+    computing certain elements of the inverse of a sparse matrix", Comm. ACM 18(3)).
+    """
+    size = len(tables.diagonal)
+    count = len(factored.blocks)
+    inverses = jnp.swapaxes(factored.inverses[:size], 1, 2)
+    start = (
+        jnp.zeros((count, *inverses.shape[1:]), inverses.dtype).at[tables.diagonal].set(inverses)
+    )
+
+    def level(i: jax.Array, blocks: jax.Array) -> jax.Array:
+        blocks = subtract_products(tables.sweep, i, blocks, None, factored.blocks, by)
+        return finish(tables.sweep, i, blocks, factored.inverses, by)
+
+    out: jax.Array = jax.lax.fori_loop(0, tables.sweep.levels, level, start)
+    return out

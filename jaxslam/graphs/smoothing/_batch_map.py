@@ -1,0 +1,186 @@
+"""The maximum a posteriori (MAP) path and landmarks of a log, a reference for accuracy."""
+
+import dataclasses
+import math
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+from numpy.typing import ArrayLike
+
+from jaxslam.core._numbers import check_count
+from jaxslam.core._record import record, static
+from jaxslam.core.protocols import Motion, Sensor
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Estimate, Info, Log, Trace
+from jaxslam.graphs._chain.elimination import Chain
+from jaxslam.graphs._chain.problem import Iterate, Iterations, Problem, optimize_chain
+from jaxslam.graphs._solver.search import Ending
+from jaxslam.graphs.smoothing._forward_pass import ForwardPass, LogEstimator, log_in_one_dtype
+from jaxslam.graphs.smoothing._smoother import (
+    chain_of,
+    noise_roots,
+    solution,
+    start_of,
+    with_singular,
+)
+
+
+class BatchSolution(NamedTuple):
+    """The `final` of the trace of `BatchMap`."""
+
+    start: Float[Array, "3"]
+    """pose before the first control"""
+    start_cov: Float[Array, "3 3"]
+    joint: Joint
+    """the last pose and the map, a possible initial state of a filter"""
+    regular: Bool[Array, ""]
+    """the information on the map is positive definite; otherwise covariances are invalid"""
+    filtered: Estimate
+    """with leading T, of the filter that gave the initial path"""
+    start_noise: Float[Array, "3"]
+    """ξ, the start's error in standard deviations: start = pose + P0^{1/2} ξ"""
+    noise: Float[Array, "T W"]
+    """η, the same of the motions: w = Q^{1/2} η"""
+    cost: Float[Array, ""]
+    """½ Σ of the squared, whitened residuals"""
+    costs: Float[Array, "iterations"]
+    """after each step, that of the last repeated; infinite where not even the first,
+    to the smoother's path, has a finite cost"""
+    iterations: Int[Array, ""]
+    """steps taken"""
+    step: Float[Array, ""]
+    """length of the next step, in posterior standard deviations"""
+    ending: Int[Array, ""]
+    """a `graphs.Ending`: converged, stalled or exhausted"""
+
+
+@record
+class BatchMap(LogEstimator):
+    """The MAP estimator: Gauss-Newton on all poses and landmarks, which minimizes `problem.cost`.
+
+        ½ |x_0 ⊖ pose|²_{P0} + ½ Σ_t |w_t|²_{Q_t} + ½ Σ_{t,i} |z_ti ⊖ h(x_t, l_i)|²_{R_ti}
+        with x_t = f(x_{t-1}, u_t, w_t)
+
+    over x_0, w_1 … w_T and the landmarks, which have no prior. EKF-SLAM gives the initial path; its
+    `Smoother` is the first step. Each further step linearizes the models along the newest path and
+    solves for all unknowns (`eliminate`): a Gauss-Newton step is a smoother, and
+    iterating the smoother is Gauss-Newton (Bell 1994, "The iterated Kalman smoother as a
+    Gauss-Newton method", SIAM J. Optimization 4(3)). A step is shortened until the cost falls
+    (Armijo). P0 and Q may be singular; O(T N²) a step.
+
+    It maps (log, key) to a `Trace`: estimates with leading T, the poses at the optimum
+    with their covariances there (Laplace's), the map the same at every step; the infos of the
+    filter, the last one `exhausted` where the batch did not converge, so that campaigns count it;
+    and a `BatchSolution`. Every measurement is used that the filter fused or initialized a landmark
+    with, except those of a singular R, whose status becomes `Status.SINGULAR`. Where Q depends on
+    the pose, it is evaluated once at the filter's path.
+
+    It is the graph of the log (`graphs.of_log`) with another solution: where the noises of a motion
+    are three and not singular, `graphs.optimize` has the same optimum. Here (`graphs.chain`) a
+    motion is a constraint, and the run itself associates the measurements; the
+    sparse plan of `graphs.optimize` has to know that on the host.
+
+    Raises ValueError as `LogEstimator`; on a sensor with K > 0, iterations below 1, or a tolerance
+    that is not above 0.
+    """
+
+    _: dataclasses.KW_ONLY
+    iterations: int = static(default=30)
+    """largest number of steps"""
+    tolerance: float | None = static(default=1e-6)
+    """end when the next step is below this many posterior standard deviations (the Newton
+    decrement), or than √eps of the dtype, 3e-4 in float32, or where steps do not get shorter
+    because of rounding. None runs all iterations in a loop of fixed length, which supports
+    reverse-mode derivatives; they are those of the optimum if the search has converged"""
+
+    def __post_init__(self) -> None:
+        check_count("BatchMap: iterations", self.iterations)
+        if self.tolerance is not None and not 0 < self.tolerance < math.inf:
+            raise ValueError(f"BatchMap: expected a tolerance above 0, got {self.tolerance}")
+        super().__post_init__()
+        free = self.sensor.free.mean.shape[0]
+        if free > 0:
+            raise ValueError(
+                "BatchMap: expected a sensor that measures all of a landmark, got "
+                f"{self.sensor.name}, which leaves {free} of its parameters free"
+            )
+
+    def solve(self, log: Log, key: Array) -> Trace:
+        motion, sensor, passed = self.motion, self.sensor, self._forward(log, key)
+        log = log_in_one_dtype(log)
+        problem, start, chain = _problem_of(motion, sensor, passed, log, self.pose, self.pose_cov)
+        search = optimize_chain(
+            motion,
+            sensor,
+            problem,
+            start,
+            chain,
+            passed.trace.final.alive,
+            iterations=self.iterations,
+            tolerance=self.tolerance,
+        )
+        estimate, solved = _solve(sensor, search, passed)
+        info = with_singular(passed.trace.info, problem.used)
+        info = info if self.tolerance is None else _with_exhausted(info, search.ending)
+        return Trace(estimate, info, solved, None)
+
+
+def _problem_of(
+    motion: Motion,
+    sensor: Sensor,
+    passed: ForwardPass,
+    log: Log,
+    pose: ArrayLike,
+    pose_cov: ArrayLike,
+) -> tuple[Problem, Iterate, Chain]:
+    """The problem of a log, and the initial iterate: the filter's path and its chain."""
+    kind = log.control.dtype
+    mean, cov = jnp.asarray(pose, kind), jnp.asarray(pose_cov, kind)
+    # The optimum does not depend on the initial iterate, so it has no derivative by it.
+    passed = jax.lax.stop_gradient(passed)
+    roots = noise_roots(motion, passed, log.control)
+    chain, used = jax.lax.stop_gradient(chain_of(motion, sensor, passed, log, cov, roots))
+    z = jnp.where(used[:, :, None], log.scan.z, 0.0)
+    root = start_of(cov).root
+    problem = Problem(mean, root, log.control, roots, z, chain.steps.slot, used)
+    path = jnp.concatenate([mean[None], passed.corrected])
+    landmarks = passed.trace.final.landmarks
+    return problem, Iterate(chain.start.noise, chain.steps.noise, path, landmarks), chain
+
+
+def _solve(
+    sensor: Sensor, search: Iterations, passed: ForwardPass
+) -> tuple[Estimate, BatchSolution]:
+    """The estimates at the end of a search."""
+    at, policy = search.at, search.policy
+    joint = jax.lax.stop_gradient(passed.trace.final)._replace(landmarks=at.landmarks)
+    # The last step computed is shorter than the tolerance, and is not taken.
+    no_step = policy._replace(
+        start=policy.start._replace(constant=jnp.zeros_like(at.start)),
+        steps=policy.steps._replace(constant=jnp.zeros_like(at.noise)),
+        landmarks=jnp.zeros_like(at.landmarks),
+    )
+    left = policy.decrement > 0
+    step = jnp.sqrt(jnp.where(left, policy.decrement, 1.0))
+    estimate, smoothed = solution(sensor, search.chain, no_step, at.path, joint, passed)
+    solved = BatchSolution(
+        *smoothed,
+        start_noise=at.start,
+        noise=at.noise,
+        cost=search.cost,
+        costs=search.costs,
+        iterations=search.taken,
+        step=jnp.where(left, step, 0.0),
+        ending=search.ending,
+    )
+    return estimate, solved
+
+
+def _with_exhausted(info: Info, ending: Array) -> Info:
+    """The infos, with `exhausted` set in the last where the iterations did not converge."""
+    if info.exhausted is None or info.exhausted.shape[0] == 0:
+        return info
+    cut_short = info.exhausted.at[-1].max(ending != Ending.CONVERGED)
+    return info._replace(exhausted=cut_short)

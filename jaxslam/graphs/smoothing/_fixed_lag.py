@@ -1,0 +1,244 @@
+"""The fixed-lag smoother: the last poses and the map are optimized together at every scan."""
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxslam.association._rules import Known
+from jaxslam.charts import Euclidean
+from jaxslam.core import _validation as validation
+from jaxslam.core._numbers import check_count
+from jaxslam.core._record import hold_function, record, static
+from jaxslam.core.protocols import Associate, Filter, Motion, Sensor
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Estimate, Info, Scan, Status
+from jaxslam.filters._ekf.ekf_settings import check_ekf_options
+from jaxslam.filters._ekf.ekf_slam import EkfSlam
+from jaxslam.graphs._chain.window import (
+    WindowIterate,
+    WindowPrior,
+    WindowSteps,
+    linearize_window,
+    marginalize_oldest,
+    moved_by,
+    newest_cov,
+    solve_window,
+)
+from jaxslam.graphs.smoothing._forward_pass import joint_ekf
+from jaxslam.math import _linalg as linalg
+from jaxslam.math._arrays import Number
+from jaxslam.sensors._suite import Suite
+
+_POINT = ("x [m]", "y [m]")
+
+
+class _WindowState(NamedTuple):
+    """The state of `FixedLag`."""
+
+    joint: Joint
+    """the newest pose and the map"""
+    prior: WindowPrior
+    """of the oldest pose of the window, and of the map before it"""
+    steps: WindowSteps
+    at: WindowIterate
+    """the path in the window, and the map"""
+
+
+@record
+class FixedLag(Filter):
+    """Fixed-lag smoothing SLAM: Gauss-Newton over the last `window` motions and scans, and the map.
+
+    At each scan EKF-SLAM predicts, associates, gates and starts landmarks; then the poses of the
+    window, the noises of its motions and the map are optimized together (`window`), and the
+    estimate is the newest pose and the map. The oldest step leaves the window by marginalization:
+    its motion and scan, linearized at the estimates of then, become the prior of the next pose
+    and the map.
+
+    That prior keeps its linearization, while later Jacobians are taken at newer estimates; so the
+    window's linearized system has two unobservable directions instead of three, and the heading
+    becomes certain without reason. With first_estimates Jacobians by a variable of the prior are
+    taken where that was linearized, and there are three (Dong-Si & Mourikis 2011, "Motion tracking
+    with fixed-lag smoothing: algorithm and consistency analysis", ICRA). A window as long as the
+    log marginalizes nothing: then the newest pose and the map are those of `BatchMap`.
+
+    A measurement with a singular R is dropped as `Status.SINGULAR`. Where the numbers of the window
+    are not finite (it is optimized without step control), it restarts from the state of EKF-SLAM,
+    and `exhausted` is set. O(W N²) for the window, and
+    O(N³) for the prior, an iteration.
+
+    Raises ValueError as `EkfSlam` does; on a sensor of another kind, and on a slots, window or
+    iterations below 1; from `update`, on a scan of more measurement slots.
+    """
+
+    motion: Motion
+    sensor: Sensor
+    """the models; Jacobians come from `jax.jacfwd`. A measurement must determine its landmark and
+    have as many numbers (K = 0, Z = L)"""
+    capacity: int = static()
+    """landmark slots N"""
+    slots: int = static()
+    """most measurement slots M of a scan; the window stores scans"""
+    _: dataclasses.KW_ONLY
+    window: int = static(default=5)
+    """motions and scans W that are optimized"""
+    first_estimates: bool = static(default=False)
+    """as above; for landmarks that are points (x, y)"""
+    iterations: int = static(default=2)
+    """Gauss-Newton steps at each scan"""
+    associate: Associate = Known()
+    gate: Number | None = None
+    births: int | None = static(default=None)
+    """these three of the EKF-SLAM, as for `EkfSlam`. NIS is that of its innovations"""
+    chart = Euclidean()
+
+    def __post_init__(self) -> None:
+        name, sensor = type(self).__name__, self.sensor
+        validation.check_models(name, self.motion, sensor)
+        validation.check_parts(name, associate=self.associate)
+        hold_function(self, "associate", "prediction, scan")
+        check_ekf_options(name, self.capacity, "joint", self.gate, self.iterations, self.births)
+        same = len(sensor.measurements) == len(sensor.landmark)
+        several = isinstance(sensor, Suite) or sensor.reduced is not None
+        if several or sensor.free.mean.shape[0] or not same:
+            raise ValueError(
+                f"{name}: expected one sensor whose measurement determines its landmark by as many "
+                f"numbers as it has, got {sensor.name}"
+            )
+        if self.first_estimates and sensor.landmark != _POINT:
+            raise ValueError(
+                f"{name}: expected landmarks (x, y) for first_estimates, got {sensor.landmark}"
+            )
+        check_count(f"{name}: slots", self.slots)
+        check_count(f"{name}: window", self.window)
+        super().__post_init__()
+
+    @property
+    def landmark(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self.sensor.landmark
+
+    def init(self, pose: Array, pose_cov: Array) -> _WindowState:
+        return self._begun(self._ekf.init(pose, pose_cov))
+
+    def predict(self, state: _WindowState, u: Array, key: Array) -> _WindowState:
+        motion, joint = self.motion, self._ekf.predict(state.joint, u, key)
+        system = linearize_window(
+            motion, self.sensor, state.prior, state.steps, state.at, self.first_estimates
+        )
+        prior = marginalize_oldest(state.prior, system, state.steps, state.at, joint.tag)
+        state = _finite_or(state._replace(prior=prior), self._begun(state.joint))
+        root = linalg.root_psd(motion.noise_cov(state.joint.pose, u))
+        steps, at = shift(state.steps, state.at, u, root, joint.pose)
+        return _WindowState(joint, state.prior, steps, at)
+
+    def update(self, state: _WindowState, scan: Scan, key: Array) -> tuple[_WindowState, Info]:
+        motion, sensor = self.motion, self.sensor
+        if scan.z.shape[0] > self.slots:
+            raise ValueError(
+                f"FixedLag: expected scans of at most {self.slots} measurement slots, as `slots` "
+                f"says, got {scan.z.shape[0]}"
+            )
+        # The window weights by R⁻¹.
+        regular = jax.vmap(lambda z: linalg.cholesky(sensor.noise_cov(z))[1])(scan.z)
+        lost = scan.valid & ~regular
+        kept = scan._replace(valid=scan.valid & regular)
+        joint, info = self._ekf.update(state.joint, kept, key)
+        status = jnp.where(lost, jnp.int32(Status.SINGULAR), info.status)
+        info = info._replace(status=status.astype(info.status.dtype))
+        steps = _with_scan(state.steps, scan, info)
+        born = joint.alive & ~state.joint.alive
+        landmarks = jnp.where(born[:, None], joint.landmarks, state.at.landmarks)
+        at = state.at._replace(landmarks=landmarks)
+        for _ in range(self.iterations):
+            system = linearize_window(motion, sensor, state.prior, steps, at, self.first_estimates)
+            solved = solve_window(state.prior, system, at, joint.alive)
+            at = moved_by(motion, steps, at, solved)
+        newest = _with_newest(joint, at, newest_cov(system, solved))
+        after = _WindowState(newest, state.prior, steps, at)
+        exhausted = jnp.asarray(info.exhausted) | ~_is_finite(after)
+        return _finite_or(after, self._begun(joint)), info._replace(exhausted=exhausted)
+
+    def estimate(self, state: _WindowState) -> Estimate:
+        return self._ekf.estimate(state.joint)
+
+    @property
+    def _ekf(self) -> EkfSlam:
+        return joint_ekf(self)
+
+    def _begun(self, joint: Joint) -> _WindowState:
+        sizes = len(self.motion.controls), len(self.motion.noises)
+        return _empty_window(joint, sizes, (self.window, self.slots))
+
+
+def _empty_window(joint: Joint, sizes: tuple[int, int], shape: tuple[int, int]) -> _WindowState:
+    """The state before the first step. sizes: of a control and its noise; shape: W and M."""
+    (control, noise), (window, places), kind = sizes, shape, joint.pose.dtype
+    steps = WindowSteps(
+        present=jnp.zeros(window, bool),
+        control=jnp.zeros((window, control), kind),
+        root=jnp.zeros((window, noise, noise), kind),
+        z=jnp.zeros((window, places, joint.landmarks.shape[1]), kind),
+        slot=jnp.zeros((window, places), jnp.int32),
+        used=jnp.zeros((window, places), bool),
+    )
+    path = jnp.tile(joint.pose, (window + 1, 1))
+    at = WindowIterate(path, jnp.zeros((window, noise), kind), joint.landmarks)
+    return _WindowState(joint, WindowPrior(joint, (joint.pose, joint.landmarks)), steps, at)
+
+
+def _is_finite(state: _WindowState) -> Bool[Array, ""]:
+    """Whether all numbers of a state are finite."""
+    return jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(state)]).all()
+
+
+def _finite_or(state: _WindowState, other: _WindowState) -> _WindowState:
+    """The state if all its numbers are finite, else the other state."""
+    finite = _is_finite(state)
+    chosen: _WindowState = jax.tree.map(lambda a, b: jnp.where(finite, a, b), state, other)
+    return chosen
+
+
+def shift(
+    steps: WindowSteps,
+    at: WindowIterate,
+    u: Float[Array, "U"],
+    root: Float[Array, "Q Q"],
+    pose: Array,
+) -> tuple[WindowSteps, WindowIterate]:
+    """The window without its oldest step, and with a new motion to a predicted pose (3,)."""
+
+    def append(rows: Array, new: Array | bool | float) -> Array:
+        return jnp.roll(rows, -1, axis=0).at[-1].set(new)
+
+    after = WindowSteps(
+        present=append(steps.present, True),
+        control=append(steps.control, u),
+        root=append(steps.root, root),
+        z=append(steps.z, 0.0),
+        slot=append(steps.slot, 0),
+        used=append(steps.used, False),
+    )
+    return after, at._replace(path=append(at.path, pose), noise=append(at.noise, 0.0))
+
+
+def _with_scan(steps: WindowSteps, scan: Scan, info: Info) -> WindowSteps:
+    """The window with the measurements of its newest scan that were fused or started landmarks."""
+    used = (info.status == Status.FUSED) | (info.status == Status.BORN)
+    z = jnp.where(scan.valid[:, None], scan.z, 0.0)
+    slot, count = jnp.maximum(info.slot, 0), scan.z.shape[0]
+    return steps._replace(
+        z=steps.z.at[-1, :count].set(z),
+        slot=steps.slot.at[-1, :count].set(slot),
+        used=steps.used.at[-1, :count].set(used),
+    )
+
+
+def _with_newest(joint: Joint, at: WindowIterate, cov: Float[Array, "D D"]) -> Joint:
+    """The joint with the newest pose and the map of a window; unit variance at dead slots."""
+    alive = jnp.repeat(joint.alive, joint.landmarks.shape[1])
+    alive = jnp.concatenate([jnp.ones(3, bool), alive])
+    padded = jnp.where(alive[:, None] & alive[None], cov, jnp.eye(len(alive), dtype=cov.dtype))
+    landmarks = jnp.where(joint.alive[:, None], at.landmarks, 0.0)
+    return joint._replace(pose=at.path[-1], landmarks=landmarks, cov=padded)

@@ -1,0 +1,163 @@
+"""The forward pass of a smoother: EKF-SLAM over the log, which stores its linearization points."""
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from jaxslam._driver import check_run, run
+from jaxslam.association._rules import Known
+from jaxslam.core import _validation as validation
+from jaxslam.core._numbers import held_array
+from jaxslam.core._record import hold_function, record, set_field, static
+from jaxslam.core.protocols import Associate, Component, Filter, Motion, Sensor, Wrapper
+from jaxslam.core.slots import Joint
+from jaxslam.core.types import Estimate, Info, Log, Scan, Trace
+from jaxslam.filters._ekf.ekf_settings import check_ekf_options
+from jaxslam.filters._ekf.ekf_slam import EkfSlam
+from jaxslam.math._arrays import Number
+from jaxslam.math._xla import hot_jit
+from jaxslam.sensors._suite import Suite
+
+
+class ForwardPass(NamedTuple):
+    """A filtered log, and the points at which the filter linearized the models."""
+
+    trace: Trace
+    """the filter's own, its `final` a `slots.Joint`"""
+    before: Float[Array, "T 3"]
+    """the pose from which each motion was linearized"""
+    predicted: Float[Array, "T 3"]
+    """the pose after it, at which known landmarks were linearized"""
+    predicted_map: Float[Array, "T N L"]
+    """the map there"""
+    corrected: Float[Array, "T 3"]
+    """the pose after the scan, where new landmarks were linearized"""
+    corrected_map: Float[Array, "T N L"]
+
+
+class _State(NamedTuple):
+    """The filter's state, and the first linearization points of the current step."""
+
+    joint: Joint
+    before: Array
+    predicted: Array
+    predicted_map: Array
+
+
+@record
+class _Forward(Wrapper):
+    """The EKF-SLAM of a forward pass, which keeps its linearization points; state `_State`."""
+
+    filter: Filter
+
+    def init(self, pose: Array, pose_cov: Array) -> _State:
+        joint = self.filter.init(pose, pose_cov)
+        return _State(joint, pose, pose, joint.landmarks)
+
+    def predict(self, state: _State, u: Array, key: Array) -> _State:
+        joint = self.filter.predict(state.joint, u, key)
+        return _State(joint, state.joint.pose, joint.pose, joint.landmarks)
+
+    def update(self, state: _State, scan: Scan, key: Array) -> tuple[_State, Info]:
+        joint, info = self.filter.update(state.joint, scan, key)
+        return state._replace(joint=joint), info
+
+    def estimate(self, state: _State) -> Estimate:
+        return self.filter.estimate(state.joint)
+
+
+def joint_ekf(of: Any) -> EkfSlam:
+    """The EKF-SLAM with joint correction in the Euclidean chart of an estimator's fields."""
+    return EkfSlam(
+        of.motion,
+        of.sensor,
+        of.capacity,
+        associate=of.associate,
+        correction="joint",
+        gate=of.gate,
+        births=of.births,
+    )
+
+
+@record
+class LogEstimator(Component):
+    """What estimators of a whole log share: models, start, and the EKF-SLAM of the forward pass.
+
+    A subclass is a record that defines `solve`. Called with (log, key) it gives a `Trace`. Raises
+    ValueError as `EkfSlam` does, and for sensors that it does not support: a suite, landmarks that
+    become points, or landmarks with parameters that are exact given the pose (the anchor of a ray);
+    and, when called, as `run` does.
+    """
+
+    motion: Motion
+    sensor: Sensor
+    """the models; Jacobians come from `jax.jacfwd`"""
+    capacity: int = static()
+    """landmark slots N"""
+    pose: ArrayLike = dataclasses.field()
+    """(3,) of the robot before the first control"""
+    pose_cov: ArrayLike = dataclasses.field()
+    """(3, 3)"""
+    _: dataclasses.KW_ONLY
+    associate: Associate = Known()
+    gate: Number | None = None
+    births: int | None = static(default=None)
+    """these three of the filter, as for `EkfSlam`"""
+
+    def __post_init__(self) -> None:
+        name, sensor = type(self).__name__, self.sensor
+        validation.check_models(name, self.motion, sensor)
+        validation.check_parts(name, associate=self.associate)
+        hold_function(self, "associate", "prediction, scan")
+        if isinstance(sensor, Suite) or sensor.reduced is not None:
+            raise ValueError(
+                f"{name}: expected one sensor of landmarks, not a suite or landmarks that are "
+                f"converted to points, got {sensor.name}"
+            )
+        if len(sensor.landmark) > len(sensor.measurements) + sensor.free.mean.shape[0]:
+            raise ValueError(
+                f"{name}: expected landmarks that measurement and prior determine, got "
+                f"{sensor.landmark} of {sensor.name}"
+            )
+        for field in ("pose", "pose_cov"):
+            set_field(self, field, held_array(getattr(self, field)))
+        check_ekf_options(name, self.capacity, "joint", self.gate, 1, self.births)
+        self._check(LogEstimator, {"solve": "log, key"})
+
+    def solve(self, log: Log, key: Array) -> Trace:
+        """The estimates of a checked log."""
+        raise NotImplementedError
+
+    def __call__(self, log: Log, key: Array) -> Trace:
+        check_run(self.name, self._filter, log, self.pose, self.pose_cov)
+        return _solve(self, log, key)
+
+    @property
+    def _filter(self) -> Filter:
+        return _Forward(joint_ekf(self))
+
+    def _forward(self, log: Log, key: Array) -> ForwardPass:
+        """The forward pass; arguments and errors are those of `run`."""
+
+        def linearized_at(state: _State) -> tuple[Array, ...]:
+            joint = state.joint
+            return state.before, state.predicted, state.predicted_map, joint.pose, joint.landmarks
+
+        trace = run(self._filter, log, self.pose, self.pose_cov, key, probe=linearized_at)
+        return ForwardPass(trace._replace(final=trace.final.joint, probe=None), *trace.probe)
+
+
+@hot_jit
+def _solve(estimator: LogEstimator, log: Log, key: Array) -> Trace:
+    return estimator.solve(log, key)
+
+
+def log_in_one_dtype(log: Log) -> Log:
+    """The log as arrays, controls and measurements in the wider dtype of the two, as in `run`."""
+    log = jax.tree.map(jnp.asarray, log)
+    dtype = jnp.result_type(log.control, log.scan.z)
+    return Log(log.control.astype(dtype), log.scan._replace(z=log.scan.z.astype(dtype)))

@@ -1,0 +1,253 @@
+"""Maps from scans at known poses: hits and misses of each cell, and the log-odds they add to it."""
+
+from functools import partial
+from numbers import Integral
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, Int, PyTree
+
+from jaxslam.core._numbers import check_mount, check_positive, is_concrete
+from jaxslam.core.types import Beams, JaxOrNumPy
+from jaxslam.laser.grids._grid import Grid, check_frame, to_cells
+from jaxslam.laser.grids.beam_models._beam_model import usable_beams
+from jaxslam.math import se2
+from jaxslam.math._arrays import Number
+from jaxslam.math._xla import hot_jit
+
+_FARTHEST = 2.0**29
+"""An end of a beam farther off [cells] counts as this far, lest the number of cells overflow."""
+
+
+class Counts(NamedTuple):
+    """How many beams ended in each cell, and how many passed through it."""
+
+    hits: Int[JaxOrNumPy, "H W"]
+    misses: Int[JaxOrNumPy, "H W"]
+    origin: Float[JaxOrNumPy, "3"]
+    resolution: Float[JaxOrNumPy, ""]
+    outside: Int[JaxOrNumPy, ""]
+    """usable beams without effect: their origin is off the map"""
+    unusable: Int[JaxOrNumPy, ""]
+    """beams without information: not valid, or of a range of 0, below 0 or NaN (`Beams`)"""
+
+
+def count(
+    shape: tuple[int, int],
+    origin: ArrayLike,
+    resolution: ArrayLike,
+    poses: Float[JaxOrNumPy, "T 3"],
+    beams: Beams,
+    *,
+    max_range: float,
+    no_return: float | None = None,
+    mount: ArrayLike | tuple[float, ...] = (0.0, 0.0, 0.0),
+) -> Counts:
+    """The hits and misses of a map of (H, W) cells by T scans at known poses.
+
+    A beam misses each cell that it crosses, in order (Amanatides & Woo 1987), before the one in
+    which it ends, which it hits. One of max_range or more hits nothing, and misses the cells up to
+    no_return; where that is 0 it says nothing. What other ranges say: `Beams`. What is off the map
+    is not counted. The counts are sums of integers: the order of the scans does not matter, and
+    those of two logs add.
+
+    Args:
+        origin, resolution: of the map, as in `Grid`.
+        no_return: [m] how far a beam of max_range is free; None for max_range. A laser that misses
+            black or wet walls needs less.
+        poses: of the robot. beams: with leading T. max_range: [m].
+        mount: (3,) pose of the laser on the robot.
+    Raises:
+        ValueError: a shape, a frame, a mount, poses and beams that do not fit; outside a trace, no
+            usable beam, or a usable pose that is not finite.
+    """
+    _check_shape(shape)
+    check_frame("count", origin, resolution)
+    check_mount("count", mount)
+    _check_scans(poses, beams, max_range)
+    free = max_range if no_return is None else no_return
+    if not 0 <= free <= max_range:
+        raise ValueError(f"count: expected no_return from 0 to {max_range}, got {no_return}")
+    frame = jnp.asarray(origin, float), jnp.asarray(resolution, float)
+    eye = jnp.asarray(mount, float)
+    size = int(shape[0]), int(shape[1])
+    return _count(size, *frame, poses, beams, max_range, free, eye)
+
+
+def _check_shape(shape: tuple[int, int]) -> None:
+    """Raise ValueError unless the shape (H, W) of a map is two integers of at least 1."""
+    if np.shape(shape) != (2,) or not all(isinstance(n, Integral) and n >= 1 for n in shape):
+        raise ValueError(
+            f"count: expected a shape (H, W), integers, of at least one cell, got {shape!r}"
+        )
+
+
+def _check_scans(poses: JaxOrNumPy, beams: Beams, max_range: float) -> None:
+    if not isinstance(beams, Beams):
+        raise ValueError(f"count: expected Beams, got {type(beams).__name__}")
+    if not all(hasattr(part, "dtype") for part in beams):
+        kinds = ", ".join(type(part).__name__ for part in beams)
+        raise ValueError(f"count: expected ranges, angles and masks in arrays, got {kinds}")
+    shapes = [np.shape(part) for part in beams]
+    if len(set(shapes)) != 1 or len(shapes[0]) != 2:
+        raise ValueError(f"count: expected as many ranges, angles and masks (T, B), got {shapes}")
+    if np.shape(poses) != (shapes[0][0], 3):
+        raise ValueError(
+            f"count: expected a pose (x, y, θ) for each of {shapes[0][0]} scans, got "
+            f"{np.shape(poses)}"
+        )
+    check_positive("count", max_range=max_range)
+    if not is_concrete(beams, poses):
+        return
+    if not np.all(np.isfinite(poses)):
+        raise ValueError("count: expected finite poses")
+    if not np.any(usable_beams(Beams(*map(np.asarray, beams)))):
+        raise ValueError("count: no scan has a valid beam")
+
+
+@partial(hot_jit, static_argnames=("shape",))
+def _count(
+    shape: tuple[int, int],
+    origin: Array,
+    resolution: Array,
+    poses: Array,
+    beams: Beams,
+    max_range: Array,
+    free: Array,
+    mount: Array,
+) -> Counts:
+    def add(total: PyTree, row: tuple[Array, Beams]) -> tuple[PyTree, None]:
+        hits, misses, outside, unusable = total
+        pose, scan = row
+        eye = se2.compose(pose, mount)
+        hits, misses, lost = _add_scan(
+            hits, misses, shape, origin, resolution, eye, scan, max_range, free
+        )
+        usable = usable_beams(scan)
+        return (hits, misses, outside + lost, unusable + (~usable).sum(dtype=jnp.int32)), None
+
+    none = jnp.zeros(shape[0] * shape[1], jnp.int32)
+    zero = jnp.zeros((), jnp.int32)
+    total, _ = jax.lax.scan(add, (none, none, zero, zero), (poses, beams))
+    return Counts(total[0].reshape(shape), total[1].reshape(shape), origin, resolution, *total[2:])
+
+
+def _add_scan(
+    hits: Int[Array, "HW"],
+    misses: Int[Array, "HW"],
+    shape: tuple[int, int],
+    origin: Float[Array, "3"],
+    resolution: Array,
+    eye: Float[Array, "3"],
+    scan: Beams,
+    max_range: Number,
+    free: ArrayLike,
+) -> tuple[Int[Array, "HW"], Int[Array, "HW"], Int[Array, ""]]:
+    """The counts with one scan more, and the number of usable beams if its pose is off the map.
+
+    Args:
+        eye: pose of the laser. free: as `no_return` of `count`.
+    """
+    height, width = shape
+    nowhere = hits.shape[0]
+    met, far = scan.returns(jnp.asarray(max_range))
+    usable = met | far
+    length = jnp.where(met, scan.range, jnp.where(far, free, 0.0))
+    heading = eye[2] + jnp.where(usable, scan.angle, 0.0)
+    e = jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=-1)
+    ends = to_cells(origin, resolution, eye[None, :2] + length[:, None] * e)
+    start = to_cells(origin, resolution, eye[:2])
+    inside = (start >= 0).all() & (start[0] < width) & (start[1] < height)
+    live = inside & usable & ~(far & (jnp.asarray(free) <= 0))
+    misses, last = _cross(misses, jnp.broadcast_to(start, ends.shape), ends, live, shape)
+    on_map = (ends >= 0).all(axis=1) & (ends[:, 0] < width) & (ends[:, 1] < height)
+    at = jnp.where(live & on_map, last, nowhere)
+    hits = hits.at[at].add((~far).astype(jnp.int32), mode="drop")
+    misses = misses.at[at].add(far.astype(jnp.int32), mode="drop")
+    lost = jnp.where(inside, 0, usable.sum(dtype=jnp.int32))
+    return hits, misses, lost
+
+
+def _cross(
+    misses: Array, start: Array, ends: Array, live: Array, shape: tuple[int, int]
+) -> tuple[Array, Array]:
+    """Add one to each cell from start up to, without, that of the end; and the latter's index.
+
+    A beam crosses as many lines of the table as there are between the two cells; one that leaves
+    the map does not return.
+    """
+    height, width = shape
+    nowhere = misses.shape[0]
+    delta = ends - start
+    forward = jnp.where(delta >= 0, 1, -1)
+    first = jnp.floor(start).astype(jnp.int32)
+    last = jnp.floor(jnp.clip(ends, -_FARTHEST, _FARTHEST)).astype(jnp.int32)
+    steps = jnp.where(live, jnp.abs(last - first).sum(axis=1), 0)
+    slope = jnp.where(delta != 0, 1.0 / jnp.where(delta != 0, delta, 1.0), 0.0)
+
+    def unfinished(state: tuple[Array, ...]) -> Array:
+        return (state[2] < steps).any()
+
+    def step(state: tuple[Array, ...]) -> tuple[Array, ...]:
+        misses, cell, arrived = state
+        going = arrived < steps
+        inside = (cell >= 0).all(axis=1) & (cell[:, 0] < width) & (cell[:, 1] < height)
+        at = jnp.where(going & inside, cell[:, 1] * width + cell[:, 0], nowhere)
+        misses = misses.at[at].add(1, mode="drop")
+        # The share of the beam up to the next line of each axis; none where the end is reached.
+        crossing = (cell + (forward > 0) - start) * slope
+        crossing = jnp.where(cell == last, jnp.inf, crossing)
+        across = crossing[:, 0] < crossing[:, 1]
+        move = jnp.stack([across, ~across], axis=1) * forward
+        arrived = jnp.where(inside, arrived + going, steps)
+        return misses, jnp.where(going[:, None], cell + move, cell), arrived
+
+    begin: tuple[Array, ...] = (misses, first, jnp.zeros_like(steps))
+    misses, *_ = jax.lax.while_loop(unfinished, step, begin)
+    return misses, last[:, 1] * width + last[:, 0]
+
+
+def occupancy(counts: Counts, *, hit: Number = 0.7, miss: ArrayLike = 0.4) -> Grid:
+    """The log-odds of an inverse sensor model: hits · logit(hit) + misses · logit(miss).
+
+    As the occupancy-grid filter sums them beam by beam, with a prior of ½ (Thrun, Burgard & Fox
+    2005, "Probabilistic robotics", table 9.1). A cell of no beam has exactly 0. Cells and beams are
+    taken to be independent, so the log-odds are overconfident. Differentiable by both numbers.
+
+    Raises ValueError unless 0 < miss < ½ < hit < 1.
+    """
+    if (
+        is_concrete(hit, miss)
+        and not 0 < float(np.asarray(miss)) < 0.5 < float(np.asarray(hit)) < 1
+    ):
+        raise ValueError(f"occupancy: expected 0 < miss < 0.5 < hit < 1, got {miss!r} and {hit!r}")
+    log_hit = jnp.log(hit) - jnp.log1p(-jnp.asarray(hit))
+    log_miss = jnp.log(miss) - jnp.log1p(-jnp.asarray(miss))
+    log_odds = counts.hits * log_hit + counts.misses * log_miss
+    return Grid(log_odds, counts.origin, counts.resolution)
+
+
+def reflection(counts: Counts, *, prior: ArrayLike = 1.0) -> Grid:
+    """The counting model: p = (hits + prior)/(hits + misses + 2 prior), how often a cell reflects.
+
+    The mean of a Beta(prior, prior) distribution updated by the counts. A cell of no beam has a
+    log-odds of exactly 0; the counts, not the grid, show how certain p is.
+
+    Raises ValueError unless prior is above 0.
+    """
+    if is_concrete(prior) and not float(np.asarray(prior)) > 0:
+        raise ValueError(f"reflection: expected a prior above 0, got {prior!r}")
+    log_odds = jnp.log(counts.hits + prior) - jnp.log(counts.misses + prior)
+    return Grid(log_odds, counts.origin, counts.resolution)
+
+
+def entropy(grid: Grid) -> Float[Array, "H W"]:
+    """The entropy -p log₂ p - (1 - p) log₂(1 - p) [bit] of each cell: 1 where it is unknown."""
+    size = jnp.abs(grid.log_odds)
+    odds = jnp.exp(-size)
+    # With the larger share 1/(1 + odds): -log of it is log1p(odds), of the other size more.
+    nats = jnp.log1p(odds) + size * odds / (1 + odds)
+    return jnp.asarray(nats / np.log(2.0))

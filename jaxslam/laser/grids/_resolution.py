@@ -1,0 +1,102 @@
+"""Maps of another resolution, parts of maps, and how alike two maps are."""
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+from numpy.typing import ArrayLike
+
+from jaxslam.core._numbers import check_real, is_concrete
+from jaxslam.laser.grids._grid import Field, Grid, centers, check_grid, interpolate
+from jaxslam.math import se2
+
+
+def resample(grid: Grid, resolution: float) -> Grid:
+    """The map in cells of another size [m], with the same origin.
+
+    A new cell has the mean log-odds of the covered cells, weighted by area; beyond the map is
+    unknown,
+    0. So a cell over unknown cells alone is unknown, and the integral of the log-odds over the map
+    is unchanged. A wall thinner than a new cell fades: the mean is not the maximum.
+
+    Raises ValueError on a grid that is none, a resolution that is not above 0, or one within a
+    trace, since it sets the shape.
+    """
+    check_grid("resample", grid)
+    if not is_concrete(resolution, grid.resolution):
+        raise ValueError("resample: the resolution sets the shape: expected one outside the trace")
+    check_real("resample", resolution=resolution)
+    if not 0 < resolution < np.inf:
+        raise ValueError(f"resample: expected a resolution above 0, got {resolution}")
+    factor = float(resolution) / float(grid.resolution)
+    log_odds = jnp.asarray(grid.log_odds)
+    up, across = (jnp.asarray(_overlaps(n, factor), log_odds.dtype) for n in log_odds.shape)
+    log_odds = up @ log_odds @ across.T
+    return Grid(log_odds, grid.origin, jnp.asarray(resolution, log_odds.dtype))
+
+
+def _overlaps(size: int, factor: float) -> Float[np.ndarray, "new old"]:
+    """The share of each new cell, factor old ones long, that each of the old ones covers."""
+    count = int(np.ceil(size / factor - 1e-9))
+    begins = factor * np.arange(count)[:, None]
+    old = np.arange(size)[None, :]
+    shared = np.minimum(begins + factor, old + 1) - np.maximum(begins, old)
+    return np.asarray(np.maximum(shared, 0.0) / factor)
+
+
+def crop(grid: Grid, low: ArrayLike, high: ArrayLike) -> Grid:
+    """The part of the map between two corners (x, y) [m] of a box in the frame of the grid.
+
+    The box grows to whole cells and ends at the border of the map.
+
+    Raises ValueError on a grid that is none, corners within a trace, and a box off the map.
+    """
+    check_grid("crop", grid)
+    if not is_concrete(low, high, grid.resolution):
+        raise ValueError("crop: the box sets the shape: expected corners outside the trace")
+    corners = np.stack([np.asarray(low, float), np.asarray(high, float)])
+    if corners.shape != (2, 2) or not np.all(np.isfinite(corners)):
+        raise ValueError(f"crop: expected two corners (x, y), got {low!r} and {high!r}")
+    cells = corners / float(grid.resolution)
+    height, width = np.shape(grid.log_odds)
+    first = np.maximum(np.floor(cells[0] + 1e-9), 0).astype(int)
+    last = np.minimum(np.ceil(cells[1] - 1e-9), (width, height)).astype(int)
+    if np.any(first >= last):
+        raise ValueError(
+            f"crop: the box from {corners[0]} to {corners[1]} has no cell of the map, which has "
+            f"{width} × {height} of {grid.resolution} m"
+        )
+    shift = jnp.asarray([*(first * float(grid.resolution)), 0.0], jnp.result_type(float))
+    log_odds = grid.log_odds[first[1] : last[1], first[0] : last[0]]
+    return Grid(log_odds, se2.compose(jnp.asarray(grid.origin), shift), grid.resolution)
+
+
+def correlation(a: Grid, b: Grid) -> Float[Array, ""]:
+    """The correlation, in [-1, 1], of the occupancy of two maps where both are known.
+
+    r = Σ w (m_a - m̄_a)(m_b - m̄_b) / sqrt(Σ w (m_a - m̄_a)² Σ w (m_b - m̄_b)²), with m the
+    probability of a cell. Map b, which may have another origin and resolution, is interpolated at
+    the centres of the cells of a; w is 1 where a is known, times the share of b that is known
+    there. Differentiable by the origins, so that a map can be matched to another. 0 where one of
+    them is constant or they have no known cell in common.
+
+    Thrun, Burgard & Fox 2005, "Probabilistic robotics", section 6.5, with a mean of each map.
+    """
+    check_grid("correlation", a)
+    check_grid("correlation", b)
+    points = centers(a)
+    bordered = Grid(jnp.pad(b.log_odds, 1), b.origin, b.resolution)  # unknown off the map
+    corner = jnp.asarray([-1.0, -1.0, 0.0]) * b.resolution
+    frame = se2.compose(jnp.asarray(b.origin), corner), jnp.asarray(b.resolution)
+    weight = a.known * interpolate(Field(jnp.asarray(bordered.known, points.dtype), *frame), points)
+    other = interpolate(Field(bordered.probability, *frame), points)
+    total = weight.sum()
+    total = jnp.where(total > 0, total, 1.0)
+
+    def centred(values: Array) -> Array:
+        return values - (weight * values).sum() / total
+
+    one, two = centred(a.probability), centred(other)
+    product = (weight * one * one).sum() * (weight * two * two).sum()
+    varies = product > 1e-12 * total**2
+    found = (weight * one * two).sum() / jnp.sqrt(jnp.where(varies, product, 1.0))
+    return jnp.where(varies, jnp.clip(found, -1.0, 1.0), 0.0)

@@ -1,0 +1,238 @@
+"""Rays through a table of squares: every square that a ray crosses, or long steps where it may."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, PyTree, UInt8
+
+from jaxslam.math._xla import one_kernel
+
+STOP, OFF = 255, 254
+"""Squares in which a ray may end, and squares off the map."""
+
+MOST = 253
+"""The longest step, in quarters of a square: steps are bytes, so that more of a map fits into a
+processor's cache."""
+
+_ROUNDING = 1e-3
+"""[squares] by which a ray may end off the map."""
+
+_CHUNK = 32
+"""Rays that a CPU advances together. A loop runs until the longest ray of a chunk ends, so the
+fewer the better; 32 fill its vectors."""
+
+
+@jax.custom_batching.custom_vmap
+def march(
+    ahead: UInt8[Array, "H W"],
+    corners: Float[Array, "H2 W2"] | None,
+    start: Float[Array, "R 2"],
+    direction: Float[Array, "R 2"],
+    limit: Float[Array, ""],
+) -> tuple[Float[Array, "R"], Bool[Array, "R"]]:
+    """The length [squares] of rays up to an obstacle, and whether they meet one within the limit.
+
+    ahead: of each square, how far a ray may go from anywhere in it [quarters of a square], or
+    `STOP` or `OFF`; it has a border of `OFF`. start (x, y) counts from the corner of the first
+    square within. corners None: a ray ends where it enters a square that is `STOP`. Else it ends in
+    such a square where the bilinear interpolation of its four corners is 0, if it is, and the outer
+    half of the outermost squares is off the map. Rays of a
+    batch under `vmap` are as many rays of one call.
+    """
+    return _march(ahead, corners, start, direction, limit)
+
+
+@march.def_vmap
+def _over_batch(size: int, batched: PyTree, *arguments: PyTree) -> tuple[PyTree, PyTree]:
+    ahead, corners, *rays, limit = arguments
+    on_rays = batched[2:4]
+    if any(jax.tree.leaves((batched[:2], batched[4]))):  # maps vary
+        axes = jax.tree.map(lambda on: 0 if on else None, tuple(batched))
+        return jax.vmap(_march, in_axes=axes)(*arguments), (True, True)
+    each = [
+        x if on else jnp.broadcast_to(x, (size, *x.shape))
+        for x, on in zip(rays, on_rays, strict=True)
+    ]
+    # The rays of one beam from all poses lie together: of poses close together they are as long.
+    flat = [x.swapaxes(0, 1).reshape(-1, 2) for x in each]
+    found = march(ahead, corners, *flat, limit)
+    return jax.tree.map(lambda x: x.reshape(-1, size).T, found), (True, True)
+
+
+def _march(
+    ahead: Array, corners: Array | None, start: Array, direction: Array, limit: Array
+) -> tuple[Array, Array]:
+    count = start.shape[0]
+    if count <= _CHUNK or jax.default_backend() != "cpu":
+        return one_kernel(_together, ahead, corners, start, direction, limit)
+    parts = -(-count // _CHUNK)
+    padded = parts * _CHUNK - count
+
+    def split(x: Array) -> Array:
+        return jnp.pad(x, [(0, padded), (0, 0)], mode="edge").reshape(parts, _CHUNK, 2)
+
+    length, hit = jax.lax.map(
+        lambda rays: one_kernel(_together, ahead, corners, rays[0], rays[1], limit),
+        (split(start), split(direction)),
+    )
+    return length.reshape(-1)[:count], hit.reshape(-1)[:count]
+
+
+class _Rays(NamedTuple):
+    """What stays the same along rays."""
+
+    x: Array
+    y: Array
+    """the start, in squares with the border"""
+    dx: Array
+    dy: Array
+    over_x: Array
+    over_y: Array
+    """1/dx and 1/dy, 0 where the ray is along the other axis"""
+    far_x: Array
+    far_y: Array
+    """infinite there: lines of one axis are never crossed, 0 elsewhere"""
+
+
+class _Square(NamedTuple):
+    """Where rays are: the squares (x, y), and the lengths up to them."""
+
+    x: Array
+    y: Array
+    length: Array
+
+
+def _together(
+    ahead: Array, corners: Array | None, start: Array, direction: Array, limit: Array
+) -> tuple[Array, Array]:
+    height, width = ahead.shape
+    x, y = start[:, 0] + 1, start[:, 1] + 1
+    # Squares of corners reach half a square beyond the map: a hit there is off the map.
+    edge = 1.0 if corners is None else 1.5 - _ROUNDING
+
+    def on_map(x: Array, y: Array) -> Array:
+        return (x >= edge) & (x <= width - edge) & (y >= edge) & (y <= height - edge)
+
+    inside = on_map(x, y)
+    x, y = jnp.where(inside, x, 1.0), jnp.where(inside, y, 1.0)
+    over = jnp.where(direction != 0, 1.0 / jnp.where(direction != 0, direction, 1.0), 0.0)
+    far = jnp.where(direction != 0, 0.0, jnp.inf)
+    rays = _Rays(x, y, *direction.T, *over.T, *far.T)
+    # A start on the upper border belongs to the last square.
+    first = _Square(jnp.minimum(x, width - 1.5), jnp.minimum(y, height - 1.5), jnp.zeros_like(x))
+    first = first._replace(x=jnp.floor(first.x), y=jnp.floor(first.y))
+
+    def any_moves(state: tuple[_Square, Array, Array]) -> Array:
+        return state[1].any()
+
+    def free(at: _Square, moving: Array) -> tuple[_Square, Array, Array]:
+        """Move rays towards the next squares that stop; which still move, which have come to one.
+
+        On a CPU all come to one. A GPU takes one step, since its rays wait for the longest of all.
+        """
+
+        def step(state: tuple[_Square, Array, Array]) -> tuple[_Square, Array, Array]:
+            at, moving, stopped = state
+            here = _taken(ahead, at.x, at.y)
+            crosses = _crossings(rays, at)
+            goes = moving & (here < OFF) & (jnp.minimum(*crosses) < limit)
+            after = _next(rays, at, crosses, here.astype(x.dtype) * 0.25)
+            return _where(goes, after, at), goes, stopped | (moving & (here == STOP))
+
+        begin = at, moving, jnp.zeros_like(moving)
+        if corners is not None and jax.default_backend() != "cpu":
+            return step(begin)
+        return jax.lax.while_loop(any_moves, step, begin)
+
+    if corners is None:
+        at, _, found = free(first, inside)
+        length = at.length
+    else:
+
+        def through(state: tuple[_Square, Array, Array]) -> tuple[_Square, Array, Array]:
+            """To the next squares that stop, and out of those without the surface."""
+            at, moving, found = state
+            at, moving, stopped = free(at, moving)
+            crosses = _crossings(rays, at)
+            leaves = jnp.minimum(*crosses)
+            meets = _meets(_parabola(corners, rays, at), leaves - at.length)
+            goes = stopped & ~meets & (leaves < limit)
+            after = _next(rays, at, crosses, jnp.zeros_like(leaves))
+            return _where(goes, after, at), moving | goes, found | (stopped & meets)
+
+        begin = first, inside, jnp.zeros_like(inside)
+        at, _, found = jax.lax.while_loop(any_moves, through, begin)
+        length = at.length + _root(_parabola(corners, rays, at))
+        found = found & on_map(rays.x + length * rays.dx, rays.y + length * rays.dy)
+    found = found & (length < limit)
+    return jnp.where(found, length, limit), found
+
+
+def _taken(table: Array, x: Array, y: Array) -> Array:
+    """The entries (y, x) of a table, which are in it."""
+    place = y.astype(jnp.int32) * table.shape[1] + x.astype(jnp.int32)
+    flat = table.reshape(-1)
+    return flat.at[place].get(mode="promise_in_bounds", wrap_negative_indices=False)
+
+
+def _where(goes: Array, after: _Square, at: _Square) -> _Square:
+    return _Square(*(jnp.where(goes, a, b) for a, b in zip(after, at, strict=True)))
+
+
+def _crossings(rays: _Rays, at: _Square) -> tuple[Array, Array]:
+    """The lengths at which rays cross the next line of either axis."""
+    exit_x = (at.x + (rays.dx > 0) - rays.x) * rays.over_x + rays.far_x
+    exit_y = (at.y + (rays.dy > 0) - rays.y) * rays.over_y + rays.far_y
+    return exit_x, exit_y
+
+
+def _next(rays: _Rays, at: _Square, crosses: tuple[Array, Array], ahead: Array) -> _Square:
+    """The end of a step: that of the free distance if beyond the square, else out of the square."""
+    exit_x, exit_y = crosses
+    leaves, jump = jnp.minimum(exit_x, exit_y), at.length + ahead
+    far, first = (ahead > 0) & (jump > leaves), exit_x < exit_y
+    step_x = jnp.where(first, at.x + jnp.where(rays.dx > 0, 1.0, -1.0), at.x)
+    step_y = jnp.where(first, at.y, at.y + jnp.where(rays.dy > 0, 1.0, -1.0))
+    return _Square(
+        jnp.where(far, jnp.floor(rays.x + jump * rays.dx), step_x),
+        jnp.where(far, jnp.floor(rays.y + jump * rays.dy), step_y),
+        jnp.where(far, jump, jnp.maximum(leaves, at.length)),
+    )
+
+
+def _parabola(corners: Array, rays: _Rays, at: _Square) -> tuple[Array, Array, Array]:
+    """The interpolation of the corners along rays in their squares, by powers of the length.
+
+    With u, v the coordinates in the square where the ray is now, and s the length from there,
+    f = f00 + b u + c v + e u v is (f00 + b u + c v + e u v) + s (b dx + c dy + e (u dy + v dx))
+    + s² e dx dy.
+    """
+    x, y = at.x - 1, at.y - 1
+    f00, f10 = _taken(corners, x, y), _taken(corners, x + 1, y)
+    f01, f11 = _taken(corners, x, y + 1), _taken(corners, x + 1, y + 1)
+    u = rays.x + at.length * rays.dx - at.x
+    v = rays.y + at.length * rays.dy - at.y
+    b, c, e = f10 - f00, f01 - f00, f00 - f10 - f01 + f11
+    linear = b * rays.dx + c * rays.dy + e * (u * rays.dy + v * rays.dx)
+    return f00 + b * u + c * v + e * u * v, linear, e * rays.dx * rays.dy
+
+
+def _meets(parabola: tuple[Array, Array, Array], length: Array) -> Array:
+    """Whether a parabola is above 0 at s = 0, at the length, or between."""
+    value, slope, curve = parabola
+    steepest = -2.0 * curve * length
+    between = (curve < 0) & (slope > 0) & (slope < steepest) & (slope**2 >= 4.0 * curve * value)
+    return (value > 0) | (value + length * (slope + length * curve) >= 0) | between
+
+
+def _root(parabola: tuple[Array, Array, Array]) -> Array:
+    """The first s >= 0 at which a parabola is 0; 0 where it begins above."""
+    value, slope, curve = parabola
+    root = jnp.sqrt(jnp.maximum(slope**2 - 4.0 * curve * value, 0.0))
+    half = -0.5 * (slope + jnp.where(slope >= 0, root, -root))
+    one = jnp.where(curve != 0, half / jnp.where(curve != 0, curve, 1.0), jnp.inf)
+    two = jnp.where(half != 0, value / jnp.where(half != 0, half, 1.0), jnp.inf)
+    # Rounding may put a root a little before the start.
+    one, two = (jnp.where(s >= -1e-4, s, jnp.inf) for s in (one, two))
+    return jnp.where(value > 0, 0.0, jnp.maximum(jnp.minimum(one, two), 0.0))

@@ -1,0 +1,118 @@
+"""The base class of beam models, and the log-likelihood of a scan under it."""
+
+from typing import Any
+
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Bool, Float, PyTree
+
+from jaxslam.core._numbers import check_count, check_mount, held_array, is_concrete, shape_text
+from jaxslam.core._record import set_field
+from jaxslam.core.protocols import Component
+from jaxslam.core.types import Beams, JaxOrNumPy
+from jaxslam.laser.grids._grid import Grid
+from jaxslam.math import se2
+from jaxslam.math._arrays import Number
+
+
+class BeamModel(Component):
+    """A density of the range of each beam, given pose and map; a subclass is a record."""
+
+    jacobian: Any = None
+    """(prepared, pose, beams) -> (B, 3), their derivatives by the pose, derived by hand: `verify`
+    compares them with automatic differentiation and differences"""
+    mount: ArrayLike | None = None
+    """(3,) pose of the laser on the robot, which `each` takes into account"""
+
+    def __post_init__(self) -> None:
+        self._check(BeamModel, {"prepare": "grid", "each": "prepared, pose, beams"})
+
+    def prepare(self, grid: Grid) -> PyTree:
+        """What the model needs of the map, once for all scans: a pytree of arrays."""
+        raise NotImplementedError
+
+    def each(self, prepared: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
+        """The log-densities of the beams, finite also where a beam is not valid."""
+        raise NotImplementedError
+
+    def frame(self, pose: Array) -> Array:
+        """The pose of the laser, pose ∘ mount."""
+        if self.mount is None:
+            return pose
+        return se2.compose(pose, jnp.asarray(self.mount, pose.dtype))
+
+
+def hold_mount(model: BeamModel) -> None:
+    """Check and hold the field mount, in `__post_init__`."""
+    if model.mount is not None:
+        check_mount(type(model).__name__, model.mount)
+        set_field(model, "mount", held_array(model.mount))
+
+
+def log_likelihood(
+    model: BeamModel,
+    prepared: PyTree,
+    pose: ArrayLike,
+    beams: Beams,
+    *,
+    every: int = 1,
+    exponent: Number = 1.0,
+) -> Float[Array, ""]:
+    """The log-likelihood of a scan at a pose (3,): exponent · Σ log p(z_k) over its valid beams.
+
+    Beams without information (`Beams`) add nothing. The beams of a scan are
+    assumed independent given the pose, which they are not: what the map lacks, or a pose
+    between two cells, spoils many of them in the same way. `every` takes each n-th beam alone, and
+    an exponent below 1 tempers the likelihood; both make it wider. Differentiable by pose and
+    exponent; `jax.vmap` it over poses.
+
+    Raises ValueError on beams that `_check_beams` refuses, a pose that is not (3,), every below 1,
+    an exponent below 0, and a grid in place of the result of `model.prepare`.
+    """
+    _check_beams("log_likelihood", beams)
+    if np.shape(pose) != (3,):
+        raise ValueError(f"log_likelihood: expected a pose (x, y, θ), got {shape_text(pose)}")
+    if is_concrete(pose) and not np.all(np.isfinite(np.asarray(pose))):
+        raise ValueError(f"log_likelihood: expected a finite pose, got {pose!r}")
+    if is_concrete(exponent) and not np.all(np.asarray(exponent) >= 0):
+        raise ValueError(f"log_likelihood: expected an exponent >= 0, got {exponent!r}")
+    check_count("log_likelihood: every", every)
+    if isinstance(prepared, Grid):
+        raise ValueError(
+            "log_likelihood: expected what model.prepare makes of the grid, got the Grid itself"
+        )
+    taken = Beams(*(jnp.asarray(part)[::every] for part in beams))
+    usable = usable_beams(taken)
+    ranges, angles = jnp.where(usable, taken.range, 1.0), jnp.where(usable, taken.angle, 0.0)
+    clean = Beams(ranges, angles, usable)
+    at = jnp.asarray(pose)
+    each = model.each(prepared, at.astype(jnp.result_type(at, 0.0)), clean)
+    return jnp.asarray(exponent) * jnp.where(usable, each, 0.0).sum()
+
+
+def usable_beams(beams: Beams) -> Bool[JaxOrNumPy, "*n"]:
+    """Mask of the beams with information, by `Beams.returns`."""
+    met, free = beams.returns()
+    return met | free
+
+
+def _check_beams(name: str, beams: object) -> None:
+    """Raise ValueError, which begins with a caller's name, unless beams are one scan.
+
+    Ranges, angles and masks must be as many, and outside a trace at least one beam must be usable,
+    and the angles of valid beams finite.
+    """
+    if not isinstance(beams, Beams):
+        raise ValueError(f"{name}: expected Beams, got {type(beams).__name__}")
+    shapes = [np.shape(part) for part in beams]
+    if len(shapes[0]) != 1 or len(set(shapes)) != 1:
+        listed = ", ".join(shape_text(part) for part in beams)
+        raise ValueError(f"{name}: expected as many ranges, angles and masks, got {listed}")
+    if not is_concrete(beams):
+        return
+    valid = np.asarray(beams.valid) & (np.asarray(beams.range) > 0)
+    if not np.all(np.isfinite(np.asarray(beams.angle)[valid])):
+        raise ValueError(f"{name}: expected finite angles of valid beams")
+    if not np.any(valid):
+        raise ValueError(f"{name}: the scan of {shapes[0][0]} beams has no valid beam")

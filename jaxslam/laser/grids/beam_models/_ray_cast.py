@@ -1,0 +1,254 @@
+"""The range of a beam against the one that the map predicts: a mixture of four components, and the
+fit of its parameters to measured ranges.
+"""
+
+import dataclasses
+import math
+from typing import Literal, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.scipy.special import ndtr
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float, PyTree
+
+from jaxslam.core._numbers import check_positive, is_concrete
+from jaxslam.core._record import record, static
+from jaxslam.core.types import Beams
+from jaxslam.laser.grids._grid import Grid
+from jaxslam.laser.grids._rays import RayMap, cast, check_method, ray_map
+from jaxslam.laser.grids.beam_models._beam_model import BeamModel, hold_mount
+from jaxslam.math._arrays import Number
+
+
+class Mixture(NamedTuple):
+    """The parameters of `RayCast`."""
+
+    hit: Number
+    """share of beams that end at the obstacle of the map, with Gaussian noise"""
+    short: ArrayLike
+    """share that ends earlier, at objects that the map does not have"""
+    maximum: Number
+    """share that returns nothing, and so max_range"""
+    random: Number
+    """share of any range"""
+    sigma: Number
+    """standard deviation of a hit [m]"""
+    rate: ArrayLike
+    """rate λ of the exponential density of short ones [1/m]"""
+
+
+_USUAL = Mixture(0.75, 0.1, 0.05, 0.1, 0.1, 0.5)
+"""Parameters of a laser in a building whose map is good."""
+
+
+def mixture_log_density(
+    mixture: Mixture, z: Float[Array, "*n"], expected: Float[Array, "*n"], max_range: Number
+) -> Float[Array, "*n"]:
+    """The log-density of ranges z given those expected: a density below max_range, a mass there.
+
+    Below max_range: hit · N(z; z*, σ²)/Φ + short · λ exp(-λ z)/(1 - exp(-λ z*)) [z <= z*]
+    + random/max_range, Φ the mass of the normal within [0, max_range]. At max_range: maximum, and
+    with it the hit where max_range is expected, because nothing can be hit. Integral and mass
+    sum to 1.
+
+    Thrun, Burgard & Fox 2005, "Probabilistic robotics", (6.4) to (6.12).
+    """
+    hit, short, maximum, random, sigma, rate = (jnp.asarray(value) for value in mixture)
+    nothing = expected >= max_range
+    star = jnp.where(nothing, 0.5 * max_range, expected)
+    mass = ndtr((max_range - star) / sigma) - ndtr(-star / sigma)
+    normal = jnp.exp(-0.5 * ((z - star) / sigma) ** 2) / (sigma * math.sqrt(2 * math.pi) * mass)
+    # Where max_range is expected, short ones are spread over all of it.
+    end = jnp.where(nothing, max_range, jnp.maximum(expected, 1e-6))
+    early = jnp.where(z <= end, rate * jnp.exp(-rate * z) / -jnp.expm1(-rate * end), 0.0)
+    near = jnp.where(nothing, 0.0, hit * normal) + short * early + random / max_range
+    far = maximum + jnp.where(nothing, hit, 0.0)
+    least = jnp.finfo(jnp.result_type(z, float)).tiny
+    return jnp.log(jnp.maximum(jnp.where(z >= max_range, far, near), least))
+
+
+def _density_slope(
+    mixture: Mixture, z: Float[Array, "*n"], expected: Float[Array, "*n"], max_range: Number
+) -> Float[Array, "*n"]:
+    """The derivative of `mixture_log_density` by the expected range z*, by hand.
+
+    With N the hit, Φ its mass and φ the normal density: ∂(N/Φ) = (N/Φ) ((z - z*)/σ² - ∂Φ/Φ),
+    ∂Φ = (φ(-z*/σ) - φ((z_max - z*)/σ))/σ; the short ones E = λ exp(-λ z)/(1 - exp(-λ z*)) have
+    ∂E = -E λ exp(-λ z*)/(1 - exp(-λ z*)). 0 at max_range, and where max_range is expected.
+    """
+    hit, short, _, random, sigma, rate = (jnp.asarray(value) for value in mixture)
+    star = jnp.minimum(jnp.maximum(expected, 1e-6), max_range)
+    low, high = -star / sigma, (max_range - star) / sigma
+    mass = ndtr(high) - ndtr(low)
+    by_mass = (jnp.exp(-0.5 * low**2) - jnp.exp(-0.5 * high**2)) / (sigma * math.sqrt(2 * math.pi))
+    normal = jnp.exp(-0.5 * ((z - star) / sigma) ** 2) / (sigma * math.sqrt(2 * math.pi) * mass)
+    rest = -jnp.expm1(-rate * star)
+    early = jnp.where(z <= star, rate * jnp.exp(-rate * z) / rest, 0.0)
+    near = hit * normal + short * early + random / max_range
+    rise = hit * normal * ((z - star) / sigma**2 - by_mass / mass)
+    rise = rise - short * early * rate * jnp.exp(-rate * star) / rest
+    known = (z < max_range) & (expected < max_range) & (near > 0)
+    return jnp.where(known, rise / jnp.where(near > 0, near, 1.0), 0.0)
+
+
+@record
+class RayCast(BeamModel):
+    """The ray-cast model: `mixture_log_density` of each range given that of `grids.cast`.
+
+    Differentiable by the parameters, and by the pose in the sense of `cast`, with either method.
+
+    Raises ValueError on numbers out of range, an unknown method, an invalid mount.
+    """
+
+    mixture: Mixture = _USUAL
+    """parameters, which `fit` learns from data; the four shares have sum 1"""
+    _: dataclasses.KW_ONLY
+    max_range: Number
+    """[m]"""
+    method: str | None = static(default=None)
+    """of `ray_map`; None chooses by the map"""
+    mount: ArrayLike | None = None
+    """(3,) pose of the laser on the robot"""
+
+    def __post_init__(self) -> None:
+        name, mixture = type(self).__name__, self.mixture
+        check_positive(name, max_range=self.max_range, sigma=mixture.sigma, rate=mixture.rate)
+        if self.method is not None:
+            check_method(name, self.method)
+        hold_mount(self)
+        check_weights(name, dict(zip(Mixture._fields[:4], mixture[:4], strict=True)))
+        super().__post_init__()
+
+    def prepare(self, grid: Grid) -> RayMap:
+        return ray_map(grid, method=self.method)
+
+    def each(self, prepared: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
+        expected = self._expected_range(prepared, pose, beams)
+        far = jnp.asarray(self.max_range, expected.dtype)
+        z = jnp.where(beams.returns(far)[1], far, beams.range)
+        return mixture_log_density(self.mixture, z, expected, far)
+
+    def jacobian(self, prepared: PyTree, pose: Array, beams: Beams) -> Float[Array, "B 3"]:
+        """The derivative by z*, times that of z*, for which `cast` has a custom rule."""
+        expected = self._expected_range(prepared, pose, beams)
+        by_pose = jax.jacfwd(lambda pose: self._expected_range(prepared, pose, beams))(pose)
+        far = jnp.asarray(self.max_range, expected.dtype)
+        z = jnp.where(beams.returns(far)[1], far, beams.range)
+        by_range: Array = _density_slope(self.mixture, z, expected, far)
+        return by_range[:, None] * jnp.asarray(by_pose)
+
+    def _expected_range(self, rays: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
+        return cast(rays, self.frame(pose), beams.angle, self.max_range)
+
+
+def check_weights(name: str, weights: dict[str, ArrayLike]) -> None:
+    """Raise ValueError unless the shares of a mixture are >= 0 and have sum 1."""
+    if not is_concrete(weights):
+        return
+    values = np.array([float(np.asarray(value)) for value in weights.values()])
+    if np.any(values < 0) or not abs(values.sum() - 1) < 1e-6:
+        listed = ", ".join(f"{key} {value:g}" for key, value in zip(weights, values, strict=True))
+        raise ValueError(f"{name}: expected shares >= 0 of sum 1, got {listed}")
+
+
+START = Mixture(0.6, 0.15, 0.1, 0.15, 0.2, 0.5)
+"""Where the search begins."""
+_LEAST = 1e-6
+"""The least σ [m], where ranges are as expected, and length 1/λ."""
+
+
+def fit(
+    z: ArrayLike,
+    expected: ArrayLike,
+    max_range: float,
+    *,
+    method: Literal["gradient", "em"] = "gradient",
+    start: Mixture = START,
+    iterations: int = 200,
+) -> Mixture:
+    """The mixture of the largest likelihood for ranges (K,) and those expected (K,).
+
+    "gradient": BFGS on the log-likelihood, by automatic differentiation, over the logarithms of
+        shares (normalized), σ and λ.
+    "em": expectation-maximization; σ² and 1/λ are the weighted means of (z - z*)² and z, which
+        neglects the limits [0, max_range] and [0, z*] of the two densities: Thrun, Burgard & Fox
+        2005, "Probabilistic robotics", table 6.2. So λ is too large where obstacles are near.
+
+    Ranges without information are left out (`Beams`).
+
+    Raises ValueError on lengths that differ, expected ranges that are not finite or below 0, no
+    range with information, an invalid start, and a max_range that is not above 0.
+    """
+    ranges, stars = np.asarray(z, np.float64), np.asarray(expected, np.float64)
+    if ranges.ndim != 1 or ranges.shape != stars.shape or len(ranges) == 0:
+        raise ValueError(
+            "fit: expected at least one range, and as many as expected ones, got "
+            f"{ranges.shape} and {stars.shape}"
+        )
+    check_positive("fit: start", sigma=start.sigma, rate=start.rate)
+    check_weights("fit: start", dict(zip(Mixture._fields[:4], start[:4], strict=True)))
+    check_positive("fit", max_range=max_range)
+    if not np.all(np.isfinite(stars)) or stars.min() < 0:
+        raise ValueError("fit: expected predicted ranges that are finite and not below 0")
+    met, far = Beams(ranges, np.zeros_like(ranges), np.ones(len(ranges), bool)).returns(max_range)
+    if not (met | far).any():
+        raise ValueError(f"fit: none of {len(ranges)} ranges is above 0")
+    if method not in ("gradient", "em"):
+        raise ValueError(f'fit: expected method "gradient" or "em", got {method!r}')
+    ranges = np.where(far, max_range, ranges)[met | far]
+    stars = np.minimum(stars, max_range)[met | far]
+    if method == "em":
+        mixture = Mixture(*(float(np.asarray(value)) for value in start))
+        for _ in range(iterations):
+            mixture = _em_step(mixture, ranges, stars, max_range)
+        return mixture
+
+    from scipy.optimize import minimize  # slow to load
+
+    def cost(x: np.ndarray) -> tuple[float, np.ndarray]:
+        value, slope = _cost_and_slope(x, ranges, stars, max_range)
+        return float(value), np.asarray(slope, np.float64)
+
+    first = np.log(np.maximum([float(np.asarray(value)) for value in start], 1e-6))
+    found = minimize(cost, first, jac=True, method="BFGS", options={"maxiter": iterations})
+    return Mixture(*(float(np.asarray(value)) for value in _mixture(jnp.asarray(found.x))))
+
+
+def _mixture(x: Float[Array, "6"]) -> Mixture:
+    shares, scales = jax.nn.softmax(x[:4]), _LEAST + jnp.exp(x[4:])
+    return Mixture(shares[0], shares[1], shares[2], shares[3], scales[0], scales[1])
+
+
+@jax.jit
+def _cost_and_slope(x: Array, z: Array, stars: Array, max_range: Array) -> tuple[Array, Array]:
+    def cost(x: Array) -> Array:
+        return -mixture_log_density(_mixture(x), z, stars, max_range).mean()
+
+    return jax.value_and_grad(cost)(x)
+
+
+def _em_step(mixture: Mixture, z: np.ndarray, stars: np.ndarray, max_range: float) -> Mixture:
+    """The shares of the four components in each range, and from these the parameters."""
+    hit, short, maximum, random, sigma, rate = (float(np.asarray(value)) for value in mixture)
+    far, nothing = z >= max_range, stars >= max_range
+    normal = np.exp(-0.5 * ((z - stars) / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
+    end = np.maximum(stars, 1e-6)
+    early = np.where(z <= end, rate * np.exp(-rate * z) / -np.expm1(-rate * end), 0.0)
+    parts = np.stack(
+        [
+            hit * np.where(nothing, far, np.where(far, 0.0, normal)),
+            short * np.where(far, 0.0, early),
+            maximum * far,
+            random * np.where(far, 0.0, 1 / max_range),
+        ]
+    )
+    total = parts.sum(axis=0)
+    share = parts / np.where(total > 0, total, 1.0)
+    at = share[0] * ~nothing
+    variance = (at * (z - stars) ** 2).sum() / max(at.sum(), 1e-12)
+    weights = share.mean(axis=1) / max(share.mean(axis=1).sum(), 1e-12)
+    length = (share[1] * z).sum() / max(share[1].sum(), 1e-12)
+    scales = max(np.sqrt(variance), _LEAST), 1 / max(length, _LEAST)
+    return Mixture(*(float(value) for value in (*weights, *scales)))

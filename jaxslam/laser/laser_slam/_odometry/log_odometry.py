@@ -1,0 +1,206 @@
+"""Laser odometry of a log, tracked in pieces side by side; and as the input of a filter.
+
+The input is the pose of each keyframe relative to the previous one.
+"""
+
+import itertools
+import os
+import threading
+from collections.abc import Callable
+from concurrent.futures import ThreadPoolExecutor, as_completed
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Float, Int
+
+from jaxslam.core._record import record
+from jaxslam.core.protocols import Motion
+from jaxslam.laser.laser_slam._odometry.raw import Steps
+from jaxslam.laser.laser_slam._odometry.reference import match, reference_of, taken
+from jaxslam.laser.laser_slam._odometry.tracking import (
+    FAR,
+    NEAR,
+    NO_FLOOR,
+    Odometry,
+    match_to_keyframes,
+    place_unmatched,
+)
+from jaxslam.laser.laser_slam._records import Settings, Solved
+from jaxslam.laser.laser_slam._scan_points import Scans
+from jaxslam.math import numpy_poses as poses
+from jaxslam.math import se2
+from jaxslam.math._arrays import Control, Pose, ProcessNoise, ProcessNoiseCov
+
+_ENDS = ("x [m]", "y [m]", "θ [rad]")
+_ROOTS = ("Lxx [m]", "Lyx [m]", "Lyy [m]", "Lθx [rad]", "Lθy [rad]", "Lθθ [rad]")
+
+
+@record
+class MatchMotion(Motion):
+    """The motion model of a relative pose whose covariance is part of the control: pose ∘ z ∘ w.
+
+    u = (z, L): z = (x [m], y [m], θ [rad]) in the robot's frame, and by rows the lower triangular
+    root of the covariance of its end. w ~ N(0, L Lᵀ), (x [m], y [m], θ [rad]) in the frame of the
+    robot after z. `match_controls` makes u of the matches of laser odometry.
+    """
+
+    controls = (*_ENDS, *_ROOTS)
+    noises = _ENDS
+
+    def step(self, pose: Pose, u: Control, w: ProcessNoise) -> Pose:
+        return se2.compose(se2.compose(pose, u[:3]), w)
+
+    def noise_cov(self, pose: Pose, u: Control) -> ProcessNoiseCov:
+        xx, yx, yy, tx, ty, tt = u[3:]
+        zero = jnp.zeros_like(xx)
+        rows = [xx, zero, zero], [yx, yy, zero], [tx, ty, tt]
+        root = jnp.stack([jnp.stack(row) for row in rows])
+        return root @ root.T
+
+
+def match_controls(of: Odometry | Solved) -> Float[np.ndarray, "N 9"]:
+    """The controls (N, 9) of `MatchMotion` along the N keyframes of laser odometry, in NumPy.
+
+    Row n leads to keyframe n, and row 0 has no motion: with the scans of `of.keyframe` they make a
+    `Log`. Loops take no part. The filter takes noises of successive rows to be independent; matches
+    that share scans are not.
+
+    Args:
+        of: what `laser_odometry` or `solve` found.
+    Raises:
+        ValueError: on anything else.
+    """
+    if isinstance(of, Odometry):
+        z, cov = of.z[of.keyframe[1:]], of.cov[of.keyframe[1:]]
+    elif isinstance(of, Solved):
+        steps = of.graph.tables["relative_pose"]
+        z, cov = np.asarray(steps.z), np.linalg.inv(np.asarray(steps.information, np.float64))
+    else:
+        raise ValueError(f"match_controls: expected Odometry or Solved, got {type(of).__name__}")
+    controls = np.zeros((len(of.keyframe), 9))
+    controls[1:, :3] = z
+    row, column = np.tril_indices(3)
+    controls[1:, 3:] = np.linalg.cholesky(cov)[:, row, column]
+    return controls
+
+
+PIECE = 400
+"""Scans of a piece of a log, at least."""
+_MARGIN = 5
+"""Scans to either side of the first of a piece in which raw odometry is right."""
+
+
+def laser_odometry(
+    scans: Scans,
+    steps: Steps,
+    settings: Settings,
+    first: Float[np.ndarray, "3"],
+    progress: Callable[[int, int], object] | None = None,
+) -> Odometry:
+    """The path of a log's scans, each matched with the last keyframes and fused with raw odometry.
+
+    The pose in the frame of the last keyframe minimizes the squared distances of the points from
+    the lines of the reference, and the error of raw odometry from the scan before, by their
+    covariances; its covariance is (H/σ² + P⁻¹)⁻¹ + floor², H the information of the lines divided
+    by 2, for beams that err together.
+
+    If fewer than 0.6 of the points meet a wall, or raw odometry is unusable (a jump, a
+    frozen step, one that lags), all poses are searched that the robot can have reached in that time
+    (`Steps.reach`). Such a match counts if it is as good as that of a loop, no other pose is nearly
+    as good, and few beams pass through the reference; about raw odometry also if it is better by
+    0.2 than the match there.
+
+    Where raw odometry was frozen, or a match contradicts it, the next step may make up for that, or
+    not: the scan is matched from the match before and from raw odometry before, and the better of
+    both counts.
+
+    A scan without a match has the pose of raw odometry, is not a keyframe, and is matched again at
+    the end, with the keyframes before and after it, from the path between its neighbours. After
+    `LOST` such scans in a row the next one is a keyframe, and only keyframes since then are matched
+    with; so is the first where raw odometry is frozen, but there matches that are less good count,
+    too, and are in doubt.
+
+    A match is in doubt that has few points on walls, or that raw odometry contradicts: it may be of
+    another place that looks the same. It stays, and is assumed wrong with probability p = 0.1:
+    its covariance is about that of the mixture with raw odometry, C + p (P + diag(d², d², t²)),
+    where d is the distance and t the turn from one to the other. So are those of the scans after
+    it until the next keyframe.
+
+    A log of twice `PIECE` scans or more is tracked in pieces, side by side on every core. The first
+    scan of a piece is a keyframe, and its scans are not matched with keyframes of the previous
+    piece.
+    """
+    count = len(scans.usable)
+    borders = _borders(scans, steps)
+    _compile(scans, settings)
+    progress_count, lock = itertools.count(2), threading.Lock()
+    stopped = threading.Event()
+
+    def advance() -> None:
+        if stopped.is_set():  # another piece failed, or the user interrupts
+            raise InterruptedError
+        if progress is not None:
+            with lock:
+                progress(next(progress_count), count)
+
+    def piece(begin: int, end: int) -> Odometry:
+        rows = slice(begin, end)
+        return match_to_keyframes(taken(scans, rows), taken(steps, rows), settings, advance)
+
+    # The last scan of a piece is the first of the next.
+    ends = [*(borders[1:-1] + 1).tolist(), count]
+    with ThreadPoolExecutor(os.cpu_count()) as pool:
+        pieces = [pool.submit(piece, *rows) for rows in zip(borders.tolist(), ends, strict=False)]
+        try:
+            for one in as_completed(pieces):
+                one.result()
+        except BaseException:
+            stopped.set()
+            raise
+    result = _joined([one.result() for one in pieces], borders, first)
+    place_unmatched(result, scans, steps, settings)
+    return result
+
+
+def _borders(scans: Scans, steps: Steps) -> Int[np.ndarray, "n"]:
+    """The first scan of each piece, and the number of scans.
+
+    A piece begins where raw odometry seems right for some scans.
+    """
+    count = len(scans.usable)
+    odd = ~scans.usable | steps.unknown | steps.lags | steps.gap
+    odd = np.convolve(odd, np.ones(2 * _MARGIN + 1), "same") > 0
+    borders = [0]
+    for wanted in np.linspace(0, count, max(count // PIECE, 1) + 1)[1:-1].astype(int):
+        near = np.arange(wanted - PIECE // 4, wanted + PIECE // 4)
+        near = near[~odd[near]]
+        if len(near):
+            borders.append(int(near[np.abs(near - wanted).argmin()]))
+    return np.array([*borders, count])
+
+
+def _joined(
+    pieces: list[Odometry], borders: Int[np.ndarray, "n"], first: Float[np.ndarray, "3"]
+) -> Odometry:
+    """The odometry of all scans from pieces; each piece ends where the next begins."""
+    parts = []
+    for piece, begin in zip(pieces, borders[:-1].tolist(), strict=True):
+        path = poses.compose(first, piece.poses)
+        first = path[-1]
+        moved = piece._replace(poses=path, base=piece.base + begin)
+        # What the piece before knows of the first scan counts.
+        kept = Odometry(*(part[bool(begin) :] for part in moved))
+        parts.append(kept._replace(keyframe=piece.keyframe + begin))
+    whole = Odometry(*(np.concatenate(part) for part in zip(*parts, strict=True)))
+    return whole._replace(keyframe=np.unique(whole.keyframe))
+
+
+def _compile(scans: Scans, settings: Settings) -> None:
+    """Compile the programs of the pieces, and in parallel the wider search."""
+    row, start = np.zeros(1, int), np.zeros((1, 3))
+    reference = reference_of(scans, row, start, start[0], settings.scans_of_reference)
+    rest = reference, taken(scans.points, 0), start[0], np.eye(3), NO_FLOOR, settings
+    match(NEAR, *rest)
+    pool = ThreadPoolExecutor(1)
+    pool.submit(match, FAR, *rest)
+    pool.shutdown(wait=False)

@@ -1,0 +1,161 @@
+"""The scans of a log as points with the directions of their walls, and what of it is unusable."""
+
+from typing import Any, NamedTuple
+
+import jax
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxslam.core.types import Beams
+from jaxslam.laser.laser_slam._records import LogOfScans, Settings
+from jaxslam.laser.matching import Points
+from jaxslam.laser.matching._surfaces import Surface, surface
+
+GAP = 0.5
+"""[m] between points beyond which they are not of one wall"""
+SPAN = np.deg2rad(2.0)
+"""Angle to either side of a point within which its neighbours lie."""
+_MAX_NEIGHBOURS = 8
+"""to either side"""
+WIDTH, ROWS = 384, 64
+"""Beams and scans of one call that fits lines: logs are cut and filled up to these, so that all
+share one program."""
+_CHANGED, SHARE = 0.1, 0.2
+"""A scan differs from the previous one if more than this share of its beams do, by this [m]."""
+
+
+class Scans(NamedTuple):
+    """K scans of at most B points, in the frame of the robot; float32, as matching computes."""
+
+    points: Points
+    """(K, B), the robot's place where not valid"""
+    surface: Surface
+    """(K, B) the lines through them and their neighbours"""
+    usable: Bool[np.ndarray, "K"]
+    """enough points to match"""
+    changed: Bool[np.ndarray, "K"]
+    """whether a scan differs from the previous one; a scan of a robot at rest does not"""
+
+
+def check_laser_log(name: str, log: LogOfScans) -> None:
+    """Raise ValueError, which begins with a caller's name, unless a log can be used."""
+    shape = np.shape(log.beams.range)
+    if len(shape) != 2 or 0 in shape:
+        raise ValueError(f"{name}: expected ranges (scans, beams), at least one, got {shape}")
+    if np.shape(log.beams.angle) != shape or np.shape(log.beams.valid) != shape:
+        raise ValueError(f"{name}: expected angles and masks {shape}, as the ranges have")
+    if np.shape(log.raw) != (shape[0], 3):
+        raise ValueError(
+            f"{name}: expected raw odometry (x, y, θ) at each of {shape[0]} scans, got "
+            f"{np.shape(log.raw)}"
+        )
+    if np.shape(log.time) != (shape[0],):
+        raise ValueError(f"{name}: expected {shape[0]} times, got {np.shape(log.time)}")
+    if log.odometry_known is not None and np.shape(log.odometry_known) != (shape[0],):
+        raise ValueError(
+            f"{name}: expected odometry_known of each of {shape[0]} scans, got "
+            f"{np.shape(log.odometry_known)}"
+        )
+    if np.shape(log.mount) != (3,) or not np.isfinite(log.mount).all():
+        raise ValueError(f"{name}: expected a mount of three finite numbers, got {log.mount}")
+    lost = np.asarray(log.beams.valid, bool) & ~np.isfinite(log.beams.angle)
+    for what, bad in (
+        ("raw odometry", ~np.isfinite(log.raw).all(axis=1)),
+        ("the time", ~np.isfinite(log.time)),
+        ("the angle of a valid beam", lost.any(axis=1)),
+    ):
+        if bad.any():
+            raise ValueError(f"{name}: {what} of scan {int(bad.argmax())} is not finite")
+    if not log.max_range > 0:
+        raise ValueError(f"{name}: expected a max_range above 0, got {log.max_range}")
+
+
+def met_something(beams: Beams, max_range: float) -> Beams:
+    """The beams of some scans; valid are those that met something."""
+    some = Beams(*(np.asarray(part) for part in beams))
+    met = np.asarray(some.returns(max_range)[0])
+    angles = np.where(some.valid > 0, some.angle, 0.0)
+    return Beams(np.where(met, some.range, 0.0), angles, met)
+
+
+def scans_of(log: LogOfScans, settings: Settings) -> Scans:
+    """The points of a log's scans in the robot's frame, and the lines through those within two
+    degrees of each."""
+    count, beams = np.shape(log.beams.range)
+    stride = -(-beams // WIDTH)
+    some = slice(None, None, -(-count // ROWS))
+    angles, valid = np.asarray(log.beams.angle)[some], np.asarray(log.beams.valid)[some] > 0
+    spacing = max(_spacing(angles[:, ::stride], valid[:, ::stride]), 1e-3)
+    span = np.int32(np.clip(round(SPAN / spacing), 2, _MAX_NEIGHBOURS))
+    every, kept = -(-len(range(0, beams, stride)) // settings.beams), settings.beams
+    changed = []
+    scans: Any = None
+    for begin in range(0, count, ROWS):  # some at a time, since a log may be long
+        last = max(begin - 1, 0)
+        near = met_something(
+            Beams(*(np.asarray(part)[last : begin + ROWS] for part in log.beams)), log.max_range
+        )
+        differs = _has_changed(np.asarray(near.range), np.asarray(near.valid))
+        changed.append(differs if begin == 0 else differs[1:])
+        rows = Beams(*(np.asarray(part)[begin - last :, ::stride] for part in near))
+        points = _points(rows, np.asarray(log.mount), settings.max_range)
+        filled = _fill(points)
+        lines = jax.tree.map(np.asarray, _surfaces(filled, span))
+        # Beams that fill a scan up come last: they are cut off, or stay without a point.
+        size = len(rows.range)
+        found = jax.tree.map(lambda part, n=size: _thin(part[:n], every, kept), (filled, lines))
+        if not begin:  # all at once: parts and their concatenation would take twice the memory
+            scans = jax.tree.map(lambda of: np.empty((count, *of.shape[1:]), of.dtype), found)
+        for whole, part in zip(jax.tree.leaves(scans), jax.tree.leaves(found), strict=True):
+            whole[begin : begin + size] = part
+    points, lines = scans
+    usable = points.valid.sum(axis=1) >= settings.fewest
+    return Scans(points, lines, usable, np.concatenate(changed))
+
+
+def _points(beams: Beams, mount: Float[np.ndarray, "3"], max_range: float) -> Points:
+    """The ends of the beams that met something nearer than max_range, in the robot's frame."""
+    ranges, angles, met = (np.asarray(part) for part in beams)
+    near = met & (ranges < max_range)
+    x, y, heading = np.asarray(mount, float)
+    rays = np.stack([np.cos(heading + angles), np.sin(heading + angles)], axis=-1)
+    position = np.where(near[..., None], [x, y] + ranges[..., None] * rays, 0.0)
+    parts: Any = position.astype(np.float32), rays.astype(np.float32), near
+    return Points(*parts)
+
+
+def _thin(part: np.ndarray, every: int, width: int) -> np.ndarray:
+    """Each n-th of the beams, cut or filled up to a width."""
+    found = part[:, ::every][:, :width]
+    return np.pad(found, [(0, 0), (0, width - found.shape[1])] + [(0, 0)] * (part.ndim - 2))
+
+
+def _fill(points: Points) -> Points:
+    """Some scans, filled up to `ROWS` of `WIDTH` beams by points that are not valid."""
+
+    def one(part: np.ndarray) -> np.ndarray:
+        more = [(0, ROWS - len(part)), (0, WIDTH - part.shape[1])] + [(0, 0)] * (part.ndim - 2)
+        return np.pad(part, more)
+
+    filled: Points = jax.tree.map(one, points)
+    return filled
+
+
+@jax.jit
+def _surfaces(points: Points, span: Int[Array, ""]) -> Surface:
+    found: Surface = jax.vmap(lambda of: surface(of, span, GAP, most=_MAX_NEIGHBOURS))(points)
+    return found
+
+
+def _spacing(angles: np.ndarray, valid: np.ndarray) -> float:
+    """The angle between beams [rad]."""
+    steps = np.abs(np.diff(angles, axis=1))[valid[:, 1:] & valid[:, :-1]]
+    return float(np.median(steps)) if steps.size else 0.02
+
+
+def _has_changed(ranges: Float[np.ndarray, "K B"], met: Bool[np.ndarray, "K B"]) -> np.ndarray:
+    """Whether each scan differs from the previous one; the first does."""
+    differs = (np.abs(np.diff(ranges, axis=0)) > _CHANGED) | (met[1:] != met[:-1])
+    either = met[1:] | met[:-1]
+    share = (differs & either).sum(axis=1) / np.maximum(either.sum(axis=1), 1)
+    return np.concatenate([[True], share > SHARE])

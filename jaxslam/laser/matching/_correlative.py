@@ -1,0 +1,335 @@
+"""The best of all poses of a window: correlative scan matching, exact on its lattice.
+
+By branch and bound: blocks of shifts are bounded, divided and left out.
+"""
+
+import dataclasses
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxslam.core._numbers import check_positive, is_concrete
+from jaxslam.core._record import record, static
+from jaxslam.laser.grids._distance import near_distances
+from jaxslam.laser.grids._grid import Field, Grid, interpolate, to_cells
+from jaxslam.laser.matching._field import field_cost
+from jaxslam.laser.matching._matcher import Match, Matcher
+from jaxslam.laser.matching._outcome import Limits, length_of, make_match
+from jaxslam.laser.matching._point_sets import Points, Prior, prior_cost
+from jaxslam.laser.matching._surfaces import surface, surface_information
+from jaxslam.math import se2
+from jaxslam.math._arrays import Number, in_dtype
+from jaxslam.math.angles import wrap
+
+_CHUNK = 16
+"""Blocks that are divided in one step."""
+
+
+class _Nodes(NamedTuple):
+    """Blocks of 2^level × 2^level shifts at a heading each."""
+
+    level: Int[Array, "n"]
+    turn: Int[Array, "n"]
+    """number of the heading"""
+    shift: Int[Array, "n 2"]
+    """(rows, columns), the lower left one of the block"""
+
+
+class _Best(NamedTuple):
+    """The best pose found."""
+
+    value: Float[Array, ""]
+    """-inf of none"""
+    turn: Int[Array, ""]
+    shift: Int[Array, "2"]
+    divided: Int[Array, ""]
+    """how many blocks were"""
+
+
+def _best_shift(
+    bound_of: Callable[[_Nodes], Float[Array, "n"]],
+    roots: _Nodes,
+    bounds: Float[Array, "n"],
+    levels: int,
+    shifts: int,
+    *,
+    above: Array | float = -jnp.inf,
+    counts: Callable[[_Nodes], Bool[Array, "n"]] | None = None,
+    first: bool = False,
+) -> _Best:
+    """The best shift of all blocks, by depth first search with the best bound ahead.
+
+    A block whose bound is not above the best value so far is skipped; others are divided into four
+    (Hess et al. 2016, "Real-time loop closure in 2D LIDAR SLAM", ICRA).
+
+    Args:
+        bound_of: an upper bound of the values in each block; at level 0 the value.
+        roots, bounds: of one level, `levels` at least 1.
+        shifts: those farther than this are outside the window.
+        above: only poses of a greater value count.
+        counts: which poses count, of nodes at level 0; default all.
+        first: whether the first pose that counts will do.
+    """
+    order = jnp.argsort(bounds)
+    count = len(bounds)
+    room = 4 * _CHUNK * levels
+    # Deeper blocks lie above shallower ones, so that those of a level are divided before any more
+    # of it come: at most 4 · chunk of each at a time.
+    value = jnp.concatenate([bounds[order], jnp.zeros(room, bounds.dtype)])
+    stack = _Nodes(
+        *(jnp.concatenate([p[order], jnp.zeros((room, *p.shape[1:]), p.dtype)]) for p in roots)
+    )
+    corner = jnp.asarray(np.array([[0, 0], [0, 1], [1, 0], [1, 1]], np.int32))
+
+    def unfinished(state: tuple[Array, _Nodes, Array, _Best]) -> Array:
+        size, _, value, best = state
+        rest_is_worse = (size <= count) & (value[jnp.maximum(size - 1, 0)] <= best.value)
+        more = (size > 0) & ~rest_is_worse
+        return jnp.asarray(more & (best.value <= above) if first else more)
+
+    def step(state: tuple[Array, _Nodes, Array, _Best]) -> tuple[Array, _Nodes, Array, _Best]:
+        size, stack, value, best = state
+        at = size - 1 - jnp.arange(_CHUNK)
+        live = (at >= 0) & (value[jnp.maximum(at, 0)] > best.value)
+        parent = jax.tree.map(lambda part: jnp.repeat(part[jnp.maximum(at, 0)], 4, axis=0), stack)
+        level = parent.level - 1
+        shift = parent.shift + (1 << level)[:, None] * jnp.tile(corner, (_CHUNK, 1))
+        child = _Nodes(level, parent.turn, shift)
+        bound = bound_of(child)
+        good = jnp.repeat(live, 4) & jnp.all(shift <= shifts, axis=1) & (bound > best.value)
+        leaf = level == 0
+        score = jnp.where(good & leaf, bound, -jnp.inf)
+        if counts is not None:
+            score = jnp.where(counts(child), score, -jnp.inf)
+        top = jnp.argmax(score)
+        better = score[top] > best.value
+        best = _Best(
+            jnp.where(better, score[top], best.value),
+            jnp.where(better, child.turn[top], best.turn),
+            jnp.where(better, shift[top], best.shift),
+            best.divided + live.sum(dtype=jnp.int32),
+        )
+        kept = good & ~leaf & (bound > best.value)
+        rank = jnp.lexsort((bound, -level, ~kept))
+        base = size - jnp.minimum(size, _CHUNK)
+
+        def pushed(onto: Array, these: Array) -> Array:
+            begin = (base, *[jnp.zeros_like(base)] * (onto.ndim - 1))
+            return jax.lax.dynamic_update_slice(onto, these[rank], begin)
+
+        stack = jax.tree.map(pushed, stack, child)
+        return base + kept.sum(dtype=jnp.int32), stack, pushed(value, bound), best
+
+    zero = jnp.zeros((), jnp.int32)
+    none = _Best(jnp.asarray(above, bounds.dtype), zero, jnp.zeros(2, jnp.int32), zero)
+    size = jnp.asarray(count, jnp.int32)
+    *_, best = jax.lax.while_loop(unfinished, step, (size, stack, value, none))
+    return best
+
+
+class Scores(NamedTuple):
+    """What a point scores by its cell, with `block` cells of 0 around the map."""
+
+    table: Float[Array, "L H W"]
+    """first exp(-d²/2σ²), d the distance to the nearest occupied cell, 0 beyond `_REACH` σ; at
+    level l, the largest of the 2^l × 2^l cells with this cell at the lower left"""
+    field: Field
+    """d [m], of the map alone, up to `_REACH` σ"""
+
+
+_REACH = 4.0
+"""Distance in σ beyond which a point scores 0, where exp(-d²/2σ²) is below 3.4e-4."""
+
+
+@record
+class Correlative(Matcher):
+    """The pose of a window with the highest mean score of the points, exp(-d²/2σ²) each.
+
+    The window holds the headings start ± turn_window in steps of `turn` [rad], and shifts of the
+    start by whole cells of the reference's grid up to ± window [m] along its axes. A point scores
+    by the cell that it falls into, 0 off the map and beyond 4 σ. A prior takes eᵀ Λ e/(2 σ² n) from
+    the mean score of n points, as near a wall exp(-d²/2σ²) is 1 - d²/2σ².
+
+    The maximum is exact on this lattice: blocks of shifts are scored by the largest score of any
+    cell that a point meets within the block, less what the prior takes at least there: an upper
+    bound. Those that may hold the best are divided, down to single shifts (`_best_shift`).
+
+    Olson 2009, "Real-time correlative scan matching", ICRA; bounds over sliding blocks as Hess et
+    al. 2016, "Real-time loop closure in 2D LIDAR SLAM", ICRA. The pose is one of the lattice:
+    `FieldMatcher` from there refines it. The reference is a `Grid`. A point takes part within 3 σ
+    of an occupied cell; the lines that tell what the scan determines, and when a match is refused,
+    are those of `IcpSettings()`.
+
+    What fixes the number of shifts, headings and cells is static: another one is another program.
+
+    Raises ValueError on a number out of range.
+    """
+
+    _: dataclasses.KW_ONLY
+    window: float = static(default=0.3)
+    """[m] to either side"""
+    turn_window: float = static(default=float(np.deg2rad(20.0)))
+    """[rad] to either side"""
+    turn: float = static(default=float(np.deg2rad(0.5)))
+    """[rad] between headings"""
+    cell: float = static(default=0.05)
+    """resolution of the grids [m], which fixes the number of shifts; that of another grid counts in
+    place of it, with as many cells"""
+    sigma: float = static(default=0.05)
+    """[m] of the score"""
+    block: int = static(default=4)
+    """shifts along each axis that are bounded together at first: 2, 4, 8, …"""
+    ambiguous: Number | None = 0.95
+    """the status is AMBIGUOUS where a pose more than `apart` away from the best scores above this
+    share of it; None does not look for one"""
+    apart: Number = 0.3
+    """[m], angles times the RMS range"""
+    of_grid = True
+
+    def __post_init__(self) -> None:
+        name = "Correlative"
+        check_positive(name, turn=self.turn, cell=self.cell, sigma=self.sigma, apart=self.apart)
+        if not (0 <= self.window < np.inf and 0 <= self.turn_window < np.inf):
+            got = f"{self.window}, {self.turn_window}"
+            raise ValueError(f"{name}: expected window and turn_window of at least 0, got {got}")
+        if self.block < 2 or self.block & (self.block - 1):
+            raise ValueError(f"{name}: expected block 2, 4, 8, …, got {self.block}")
+        share = self.ambiguous
+        if share is not None and is_concrete(share) and not 0 < share < 1:
+            raise ValueError(f"{name}: expected ambiguous in (0, 1), or None, got {share}")
+        super().__post_init__()
+
+    @property
+    def _shifts(self) -> int:
+        """The largest shift along an axis [cells]."""
+        return int(np.ceil(self.window / self.cell - 1e-9))
+
+    @property
+    def _levels(self) -> int:
+        """Divisions of a block."""
+        return self.block.bit_length() - 1
+
+    def prepare(self, reference: Grid) -> Scores:
+        sigma, block = self.sigma, self.block
+        reach = int(np.ceil(_REACH * sigma / self.cell))
+        squared = near_distances(reference.log_odds > 0, reach)
+        dtype = reference.log_odds.dtype
+        d = jnp.asarray(reference.resolution, dtype) * jnp.sqrt(squared.astype(dtype))
+        score = jnp.where(squared <= reach**2, jnp.exp(-0.5 * (d / sigma) ** 2), 0.0)
+        tables = [jnp.pad(score, block)]
+        for level in range(self._levels):
+            right = jnp.maximum(tables[-1], jnp.roll(tables[-1], -(2**level), 1))
+            tables.append(jnp.maximum(right, jnp.roll(right, -(2**level), 0)))
+        frame = jnp.asarray(reference.origin), jnp.asarray(reference.resolution)
+        return Scores(jnp.stack(tables), Field(d, *frame))
+
+    def match(
+        self,
+        prepared: Scores,
+        points: Points,
+        start: Float[Array, "3"],
+        prior: Prior | None = None,
+    ) -> Match:
+        sigma, block, shifts, levels = self.sigma, self.block, self._shifts, self._levels
+        ambiguous, apart = in_dtype((self.ambiguous, self.apart), start.dtype)
+        corners = _square(np.arange(-shifts, shifts + 1, block))
+        steps = int(np.ceil(self.turn_window / self.turn - 1e-9))
+        turns = start[2] + jnp.asarray(self.turn * np.arange(-steps, steps + 1), start.dtype)
+        count = jnp.maximum(points.valid.sum(), 1)
+        _, height, width = prepared.table.shape
+        cell_size = prepared.field.resolution
+        axes = cell_size * se2.rotation(prepared.field.origin[2])[:, ::-1]  # of a row, of a column
+
+        def cells(turn: Array) -> Int[Array, "N 2"]:
+            """The cells (row, column) of the points at the start, turned so."""
+            moved = points.position @ se2.rotation(turn).T + start[None, :2]
+            at = to_cells(prepared.field.origin, prepared.field.resolution, moved)[:, ::-1]
+            return jnp.floor(at).astype(jnp.int32) + block
+
+        here = jax.vmap(cells)(turns)
+
+        def seen(nodes: _Nodes) -> Float[Array, "n"]:
+            """The mean score of the points."""
+            at = here[nodes.turn] + nodes.shift[:, None, :]
+            row, column = jnp.clip(at[..., 0], 0, height - 1), jnp.clip(at[..., 1], 0, width - 1)
+            flat = (nodes.level[:, None] * height + row) * width + column
+            score = prepared.table.reshape(-1)[flat]
+            return jnp.where(points.valid, score, 0.0).sum(axis=1) / count
+
+        def taken(nodes: _Nodes) -> Float[Array, "n"]:
+            """The score that a prior takes at least within each block.
+
+            At the middle it is √(eᵀ Λ e); at a corner it is less by √(uᵀ Λ u) at most."""
+            if prior is None:
+                return jnp.zeros(len(nodes.turn), start.dtype)
+            half = 0.5 * ((1 << nodes.level) - 1).astype(start.dtype)
+            middle = (nodes.shift + half[:, None]) @ axes.T + start[None, :2]
+            pose = jnp.concatenate([middle, turns[nodes.turn][:, None]], axis=1)
+            e = jax.vmap(prior.error)(pose)
+            square = jnp.maximum(((e @ prior.information) * e).sum(axis=1), 0.0)
+            corner = jnp.asarray([[1.0, 1.0], [1.0, -1.0]], start.dtype) @ axes.T
+            far = ((corner @ prior.information[:2, :2]) * corner).sum(axis=1).max()
+            least = jnp.maximum(jnp.sqrt(square) - half * jnp.sqrt(jnp.maximum(far, 0.0)), 0.0)
+            least = jnp.where(nodes.level == 0, square, least**2)
+            return least / (2 * sigma**2 * count)
+
+        def bound_of(nodes: _Nodes) -> Float[Array, "n"]:
+            return seen(nodes) - taken(nodes)
+
+        def roots_of(turn: Array) -> _Nodes:
+            full = jnp.full(len(corners), levels, jnp.int32)
+            return _Nodes(full, jnp.broadcast_to(turn, full.shape), jnp.asarray(corners))
+
+        numbers = jnp.arange(len(turns), dtype=jnp.int32)
+        bounds = jax.lax.map(lambda turn: bound_of(roots_of(turn)), numbers).reshape(-1)
+        roots = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), jax.vmap(roots_of)(numbers))
+        best = _best_shift(bound_of, roots, bounds, levels, shifts)
+        elsewhere: Array | bool = False
+        if ambiguous is not None:
+            by_turn = length_of(points) * self.turn
+
+            def far(nodes: _Nodes) -> Array:
+                way = cell_size * (nodes.shift - best.shift[None])
+                return jnp.hypot(*way.T) + by_turn * jnp.abs(nodes.turn - best.turn) > apart
+
+            limit = ambiguous * best.value
+            other = _best_shift(
+                bound_of, roots, bounds, levels, shifts, above=limit, counts=far, first=True
+            )
+            elsewhere = other.value > limit
+        pose = jnp.concatenate([start[:2] + axes @ best.shift, wrap(turns[best.turn])[None]])
+        moved = points.position @ se2.rotation(pose[2]).T + pose[None, :2]
+        residual = interpolate(prepared.field, moved)
+        weight = (points.valid & (residual < 3 * sigma)).astype(residual.dtype)
+        only = _Nodes(jnp.zeros(1, jnp.int32), best.turn[None], best.shift[None])
+        return make_match(
+            start,
+            pose,
+            points,
+            residual=residual,
+            weight=weight,
+            pair=jnp.zeros(weight.shape, jnp.int32),
+            information=surface_information(surface(points), pose, weight),
+            spread=sigma,
+            iterations=best.divided,
+            converged=jnp.ones((), bool),
+            limits=Limits(),
+            ambiguous=elsewhere,
+            score=seen(only)[0],
+            prior=prior,
+        )
+
+    def cost(
+        self, prepared: Scores, points: Points, pose: Float[Array, "3"], match: Match
+    ) -> Float[Array, ""]:
+        of_points = field_cost(prepared.field, points, pose, match.weight)
+        return of_points + prior_cost(match.prior, pose)
+
+
+def _square(axis: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n*n 2"]:
+    """All pairs of the entries, (n², 2)."""
+    return np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2).astype(np.int32)

@@ -1,0 +1,326 @@
+"""Iterative closest point: pairs of nearest points and an exact step, again and again.
+
+With distances between points, or from points to lines (PL-ICP).
+"""
+
+from typing import NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from jaxslam.core._numbers import check_count, check_positive, is_concrete
+from jaxslam.core._record import record, static
+from jaxslam.graphs._solver.kernels import Kernel
+from jaxslam.laser.matching._closed_form import (
+    Quadratic,
+    added,
+    least,
+    linearized,
+    of_lines,
+    of_points,
+    of_prior,
+)
+from jaxslam.laser.matching._matcher import Match, Matcher
+from jaxslam.laser.matching._outcome import (
+    Limits,
+    determined,
+    fused,
+    information_along,
+    length_of,
+    make_match,
+)
+from jaxslam.laser.matching._point_sets import Points, Prior, prior_cost, prior_terms
+from jaxslam.laser.matching._surfaces import GAP, SPAN, Surface, nearest_points, surface, weights
+from jaxslam.math import _linalg as linalg
+from jaxslam.math import se2
+from jaxslam.math._arrays import Number, in_dtype
+from jaxslam.math.angles import wrap
+
+
+@record
+class IcpSettings:
+    """The numbers of `PointToPoint` and `PointToLine`; ValueError if out of range."""
+
+    reach: Number = 0.5
+    """largest distance of partners [m]"""
+    trim: Number | None = None
+    """share of the pairs kept at each step, those of the smallest residuals; None for all"""
+    kernel: Kernel | None = None
+    """robust, as `graphs.Huber()`, of (residual/scale)²; None for squares"""
+    scale: Number = 0.1
+    """[m] of the kernel and of `Match.score`"""
+    span: int = static(default=SPAN)
+    """neighbours on each side that a line is fitted to"""
+    gap: Number = GAP
+    """[m] between points beyond which they are not neighbours"""
+    lone: Number | None = None
+    """of `PointToLine`: the factor of the distance from a point that has no line, as in clutter;
+    None leaves such points out"""
+    iterations: int = static(default=200)
+    """at most"""
+    tolerance: Number = 1e-6
+    """of convergence: the motion of a step [m], angles times the RMS range"""
+    fewest: int = static(default=10)
+    """pairs below which the status is TOO_FEW"""
+    least_score: Number = 0.5
+    """`Match.score` below which it is UNLIKE"""
+    least_condition: Number | None = 0.01
+    """`Match.condition` below which it is DEGENERATE; None: never"""
+
+    def __post_init__(self) -> None:
+        name, trim = "IcpSettings", self.trim
+        check_positive(name, reach=self.reach, scale=self.scale, gap=self.gap)
+        check_positive(name, tolerance=self.tolerance)
+        for optional in ("lone", "least_condition"):
+            if getattr(self, optional) is not None:
+                check_positive(name, **{optional: getattr(self, optional)})
+        check_count(f"{name}: span", self.span)
+        check_count(f"{name}: iterations", self.iterations)
+        check_count(f"{name}: fewest", self.fewest, 0)
+        if trim is not None and is_concrete(trim) and not 0 < trim <= 1:
+            raise ValueError(f"{name}: expected trim in (0, 1], got {trim}")
+
+
+class _PairedPoints(NamedTuple):
+    """A scan at a pose, and its partners."""
+
+    moved: Float[Array, "N 2"]
+    """the points of the scan in the frame of the reference"""
+    partner: Int[Array, "N"]
+    residual: Float[Array, "N"]
+    """not below 0 for point-to-point [m]"""
+    weight: Float[Array, "N"]
+
+
+_State: TypeAlias = tuple[Array, Array, Array, Array]
+"""iterations, pose, the pose before, how far the last step went"""
+
+
+class Icp(Matcher):
+    """An iterative closest point method: a subclass has the cost of pairs and its minimum."""
+
+    settings: IcpSettings
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        if not isinstance(self.settings, IcpSettings):
+            got = type(self.settings).__name__
+            raise ValueError(f"{type(self).__name__}: expected settings of IcpSettings, got {got}")
+
+    def residual(self, of: Surface, moved: Array, partner: Array) -> Float[Array, "N"]:
+        """The residual [m] of each point of a scan and its partner."""
+        raise NotImplementedError
+
+    def usable(self, of: Surface) -> Bool[Array, "M"]:
+        """Which points of the reference may be partners."""
+        return jnp.ones_like(of.straight)
+
+    def quadratic(self, of: Surface, pairs: _PairedPoints, middle: Array) -> Quadratic:
+        """The cost Σ w e² of a motion about a middle (2,)."""
+        raise NotImplementedError
+
+    def cost_of_pairs(
+        self, of: Surface, moved: Array, partner: Array, weight: Array
+    ) -> Float[Array, ""]:
+        """The cost ½ Σ w e²."""
+        raise NotImplementedError
+
+    def prepare(self, reference: Points) -> Surface:
+        return surface(reference, self.settings.span, self.settings.gap)
+
+    def match(
+        self,
+        prepared: Surface,
+        points: Points,
+        start: Float[Array, "3"],
+        prior: Prior | None = None,
+    ) -> Match:
+        icp = in_dtype(self, start.dtype)
+        settings, length = icp.settings, length_of(points)
+        limits = Limits(settings.fewest, settings.least_score, settings.least_condition)
+
+        def within(of: Quadratic, middle: Array, onto: Array, pose: Array) -> Array:
+            arm = middle - pose[:2]
+            to_middle = jnp.eye(3, dtype=pose.dtype).at[:2, 2].set(jnp.stack([-arm[1], arm[0]]))
+            curvature, slope = linearized(of)
+            curvature, slope = to_middle.T @ curvature @ to_middle, to_middle.T @ slope
+            curvature, slope = fused(curvature, slope, prior_terms(prior, pose), onto, length)
+            return to_middle @ linalg.solve_psd(curvature, -slope)[0]
+
+        def unfinished(state: _State) -> Array:
+            k, _, _, change = state
+            return jnp.asarray((k < settings.iterations) & (change > settings.tolerance))
+
+        def step(state: _State) -> _State:
+            k, pose, before, _ = state
+            pairs = icp._pairs(prepared, points, pose)
+            total = pairs.weight.sum()
+            middle = pairs.weight @ pairs.moved / jnp.where(total > 0, total, 1.0)
+            quadratic = icp.quadratic(prepared, pairs, middle)
+            both = quadratic
+            if prior is not None:
+                both = added(quadratic, of_prior(prior, pose, middle))
+            information = _information(prepared, pairs, pose[:2], settings.lone)
+            onto = determined(information, length, limits.condition)
+            # The exact step where the scans determine all of it, else that of Gauss and Newton.
+            moved = jnp.where(
+                (onto == jnp.eye(3)).all(),
+                least(both),
+                within(quadratic, middle, onto, pose),
+            )
+            pivot = se2.from_frame(moved, pose[:2] - middle) + middle
+            after = jnp.concatenate([pivot, wrap(pose[2] + moved[2])[None]])
+            # A limit cycle of two steps, where pairs alternate, has ended as well.
+            change = jnp.minimum(_size(after, pose, length), _size(after, before, length))
+            return k + 1, after, pose, change
+
+        far = jnp.full(3, jnp.inf, start.dtype).at[2].set(0.0)
+        first = jnp.zeros((), jnp.int32), start, far, jnp.asarray(jnp.inf, start.dtype)
+        k, pose, _, change = jax.lax.while_loop(unfinished, step, first)
+        at = icp._pairs(prepared, points, pose)
+        return make_match(
+            start,
+            pose,
+            points,
+            residual=at.residual,
+            weight=at.weight,
+            pair=at.partner,
+            information=_information(prepared, at, pose[:2], settings.lone),
+            spread=settings.scale,
+            iterations=k,
+            converged=change <= settings.tolerance,
+            limits=limits,
+            prior=prior,
+        )
+
+    def cost(
+        self, prepared: Surface, points: Points, pose: Float[Array, "3"], match: Match
+    ) -> Float[Array, ""]:
+        icp = in_dtype(self, pose.dtype)
+        moved = points.position @ se2.rotation(pose[2]).T + pose[None, :2]
+        partner = jnp.maximum(match.pair, 0)
+        of_pairs = icp.cost_of_pairs(prepared, moved, partner, match.weight)
+        return of_pairs + prior_cost(match.prior, pose)
+
+    def _pairs(self, of: Surface, points: Points, pose: Array) -> _PairedPoints:
+        settings = self.settings
+        moved = points.position @ se2.rotation(pose[2]).T + pose[None, :2]
+        partner = nearest_points(of.position, moved)
+        distance = ((moved - of.position[partner]) ** 2).sum(axis=1)
+        possible = points.valid & (distance < settings.reach**2) & self.usable(of)[partner]
+        residual = jnp.where(possible, self.residual(of, moved, partner), 0.0)
+        weight = weights(residual, possible, settings.kernel, settings.scale, settings.trim)
+        return _PairedPoints(moved, partner, residual, weight)
+
+
+def _size(a: Array, b: Array, length: Array) -> Array:
+    """How far two poses are apart [m]."""
+    return jnp.hypot(a[0] - b[0], a[1] - b[1]) + length * jnp.abs(wrap(a[2] - b[2]))
+
+
+def _information(
+    of: Surface, at: _PairedPoints, pivot: Float[Array, "2"], lone: Number | None
+) -> Float[Array, "3 3"]:
+    """The information Σ w J Jᵀ about the pivot, of partners with a line and of those without."""
+    j, arm = at.partner, at.moved - pivot[None]
+    straight = of.straight[j]
+    by_lines = information_along(of.normal[j], of.tilt[j], arm, jnp.where(straight, at.weight, 0.0))
+    if lone is None:
+        return by_lines
+    weight = lone**2 * jnp.where(straight, 0.0, at.weight)
+    axis = jnp.zeros_like(arm).at[:, 0].set(1.0)
+    none = jnp.zeros_like(weight)
+    return (
+        by_lines
+        + information_along(axis, none, arm, weight)
+        + information_along(axis[:, ::-1], none, arm, weight)
+    )
+
+
+@record
+class PointToPoint(Icp):
+    """ICP: the pose that minimizes Σ w |T ∘ p_i - q_j(i)|², q_j(i) the nearest point.
+
+    Each step is the exact minimum for its pairs (`closed_form.least`); its error falls by a
+    constant factor a step. Besl & McKay 1992, "A method for registration of 3-D shapes", IEEE
+    PAMI 14; Lu & Milios 1997. Lines serve only the status.
+    """
+
+    settings: IcpSettings = IcpSettings()
+
+    def residual(self, of: Surface, moved: Array, partner: Array) -> Float[Array, "N"]:
+        return distance(of, moved, partner)
+
+    def quadratic(self, of: Surface, pairs: _PairedPoints, middle: Array) -> Quadratic:
+        used = (pairs.weight > 0)[:, None]
+        source = jnp.where(used, pairs.moved - middle[None], 0.0)
+        target = jnp.where(used, of.position[pairs.partner] - middle[None], 0.0)
+        return of_points(source, target, pairs.weight)
+
+    def cost_of_pairs(
+        self, of: Surface, moved: Array, partner: Array, weight: Array
+    ) -> Float[Array, ""]:
+        apart = jnp.where((weight > 0)[:, None], moved - of.position[partner], 0.0)
+        return 0.5 * (weight * (apart**2).sum(axis=1)).sum()
+
+
+def distance(of: Surface, moved: Array, partner: Array) -> Float[Array, "N"]:
+    """The distance [m] of each point from its partner."""
+    square = ((moved - of.position[partner]) ** 2).sum(axis=1)
+    return jnp.where(square > 0, jnp.sqrt(jnp.where(square > 0, square, 1.0)), 0.0)
+
+
+@record
+class PointToLine(Icp):
+    """PL-ICP: the pose that minimizes Σ w (n_j · (T ∘ p_i - m_j))², j(i) the nearest point.
+
+    The line (m_j, n_j) is fitted to point j of the reference and its neighbours (`Surface`); each
+    step is the exact minimum for its pairs (`closed_form.least`), so that it converges
+    quadratically. Censi 2008, "An ICP variant using a point-to-line metric", ICRA, where the line
+    joins the two nearest points. Without a line, the residual is `lone` |T ∘ p_i - q_j|.
+    """
+
+    settings: IcpSettings = IcpSettings()
+
+    def residual(self, of: Surface, moved: Array, partner: Array) -> Float[Array, "N"]:
+        across = (of.normal[partner] * (moved - of.middle[partner])).sum(axis=1)
+        lone = self.settings.lone
+        if lone is None:
+            return across
+        return jnp.where(of.straight[partner], across, lone * distance(of, moved, partner))
+
+    def usable(self, of: Surface) -> Bool[Array, "M"]:
+        return of.straight if self.settings.lone is None else super().usable(of)
+
+    def quadratic(self, of: Surface, pairs: _PairedPoints, middle: Array) -> Quadratic:
+        j, lone = pairs.partner, self.settings.lone
+        by_line, by_point = _weights(of, j, pairs.weight)
+
+        def about(points: Array, weight: Array) -> Array:
+            return jnp.where((weight > 0)[:, None], points - middle[None], 0.0)
+
+        source = about(pairs.moved, pairs.weight)
+        lines = of_lines(source, about(of.middle[j], by_line), of.normal[j], by_line)
+        if lone is None:
+            return lines
+        points = of_points(source, about(of.position[j], by_point), lone**2 * by_point)
+        return added(lines, points)
+
+    def cost_of_pairs(
+        self, of: Surface, moved: Array, partner: Array, weight: Array
+    ) -> Float[Array, ""]:
+        by_line, by_point = _weights(of, partner, weight)
+        apart = jnp.where((by_line > 0)[:, None], moved - of.middle[partner], 0.0)
+        total = (by_line * (of.normal[partner] * apart).sum(axis=1) ** 2).sum()
+        lone = self.settings.lone
+        if lone is not None:
+            apart = jnp.where((by_point > 0)[:, None], moved - of.position[partner], 0.0)
+            total = total + lone**2 * (by_point * (apart**2).sum(axis=1)).sum()
+        return 0.5 * total
+
+
+def _weights(of: Surface, partner: Array, weight: Array) -> tuple[Array, Array]:
+    """The weights of pairs with a line, and of those without."""
+    straight = of.straight[partner]
+    return jnp.where(straight, weight, 0.0), jnp.where(straight, 0.0, weight)

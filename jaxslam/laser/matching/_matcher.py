@@ -1,0 +1,237 @@
+"""The base class of matchers, and what they find; `match` calls one outside traces."""
+
+from enum import IntEnum
+from functools import partial
+from typing import ClassVar, NamedTuple, TypeAlias
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, PyTree
+from numpy.typing import ArrayLike
+
+from jaxslam.core._numbers import is_concrete, shape_text
+from jaxslam.core.protocols import Component
+from jaxslam.laser.grids._grid import Grid, check_grid
+from jaxslam.laser.matching._point_sets import Points, Prior
+from jaxslam.math._arrays import in_dtype
+
+Reference: TypeAlias = Points | Grid
+
+
+class MatchStatus(IntEnum):
+    """The outcome of a match; of several that apply the last counts."""
+
+    CONVERGED = 0
+    """The pose no longer changes."""
+    NOT_CONVERGED = 1
+    """It ended at its limit of iterations."""
+    AMBIGUOUS = 2
+    """Another pose of the window, apart from this one, fits almost as well."""
+    DEGENERATE = 3
+    """The scans do not determine the motion along `Match.weakest`; the pose is usable across it."""
+    UNLIKE = 4
+    """The score is too low: few points have a partner, or they lie far from it."""
+    TOO_FEW = 5
+    """Too few points have a partner; the pose is the start."""
+
+
+class Match(NamedTuple):
+    """Where a scan lies in the frame of its reference."""
+
+    pose: Float[Array, "3"]
+    """T of the scan's frame in the reference's frame, so that T ∘ p lies on the reference"""
+    status: Int[Array, ""]
+    """see `MatchStatus`"""
+    iterations: Int[Array, ""]
+    """steps taken; of `Correlative` the blocks of the lattice that were divided"""
+    residual: Float[Array, ""]
+    """weighted root mean square of the residuals that took part [m]"""
+    inliers: Float[Array, ""]
+    """share of the valid points of the scan that took part, in [0, 1]"""
+    score: Float[Array, ""]
+    """mean of exp(-½ (e/s)²) over the scan's valid points, 0 for one without partner: in [0, 1]"""
+    information: Float[Array, "3 3"]
+    """Σ w J Jᵀ of the residuals across the reference's surface, in metres, by (x, y, θ)"""
+    weakest: Float[Array, "3"]
+    """(dx, dy, dθ), of unit length where dθ is times the RMS range: the least eigenvector of the
+    information"""
+    condition: Float[Array, ""]
+    """its eigenvalue over the largest, lengths in RMS ranges"""
+    determined: Float[Array, "3 3"]
+    """projection of a motion (dx, dy, dθ) onto the determined directions: the identity, unless the
+    match is DEGENERATE"""
+    pair: Int[Array, "N"]
+    """the partner of each point in the reference, -1 without; in a grid 0 where it took part"""
+    weight: Float[Array, "N"]
+    """of each pair, 0 where it took no part"""
+    prior: Prior | None = None
+    """with which it was found"""
+
+
+class Matcher(Component):
+    """A way to match a scan to a reference; a subclass is a record.
+
+    The methods are pure and of one pair: vmap them.
+    """
+
+    of_grid: ClassVar[bool] = False
+    """whether the reference is a `Grid`, else `Points`"""
+
+    def __post_init__(self) -> None:
+        prepared = "prepared, points"
+        methods = {"prepare": "reference", "match": f"{prepared}, start, prior"}
+        self._check(Matcher, methods | {"cost": f"{prepared}, pose, match"})
+
+    def prepare(self, reference: PyTree) -> PyTree:
+        """What the matcher needs of a reference, once for all scans: a pytree of arrays."""
+        raise NotImplementedError
+
+    def match(
+        self,
+        prepared: PyTree,
+        points: Points,
+        start: Float[Array, "3"],
+        prior: Prior | None = None,
+    ) -> Match:
+        """The match of a scan, by while loops, which have only forward derivatives."""
+        raise NotImplementedError
+
+    def cost(
+        self, prepared: PyTree, points: Points, pose: Float[Array, "3"], match: Match
+    ) -> Float[Array, ""]:
+        """The cost ½ Σ w e² [m²] and the prior's, with the pairs, weights and prior of a match.
+
+        Differentiable by the pose, the points, and by the reference through `prepare`.
+        """
+        raise NotImplementedError
+
+
+def match(
+    matcher: Matcher,
+    reference: Reference,
+    points: Points,
+    start: ArrayLike,
+    prior: Prior | None = None,
+) -> Match:
+    """The match of a scan to a reference.
+
+    Args:
+        reference: `Points`, or a `Grid` where `matcher.of_grid`; with a leading axis on all of its
+            arrays for many pairs at once, as `points` and `start` then have.
+        start: (3,) where the search begins.
+        prior: of the pose; without a prior only the start is known.
+
+    It is computed in the higher precision of reference and points.
+
+    Raises:
+        ValueError: a reference of another kind, arrays that do not fit each other, numbers that
+            are not finite. A scan without points is a status.
+    """
+    batch = _checked(matcher, reference, points, start)
+    if prior is not None:
+        _check_prior(prior, batch)
+    dtype = jnp.result_type(points.position, *floats(reference), jnp.float32)
+    start = jnp.asarray(start, dtype)
+    reference, points, prior = in_dtype((reference, points, prior), dtype)
+    found: Match = (_many if batch else _one)(matcher, reference, points, start, prior)
+    return found
+
+
+def floats(tree: PyTree) -> list[Array]:
+    """The arrays of a tree that hold real numbers."""
+    leaves = jax.tree.leaves(tree)
+    return [leaf for leaf in leaves if jnp.issubdtype(jnp.result_type(leaf), jnp.floating)]
+
+
+@partial(jax.jit, inline=True)
+def _one(
+    matcher: Matcher, reference: Reference, points: Points, start: Array, prior: Prior | None
+) -> Match:
+    return matcher.match(matcher.prepare(reference), points, start, prior)
+
+
+@partial(jax.jit, inline=True)
+def _many(
+    matcher: Matcher, reference: Reference, points: Points, start: Array, prior: Prior | None
+) -> Match:
+    return jax.vmap(matcher.match)(_prepared_all(matcher, reference), points, start, prior)
+
+
+def _prepared_all(matcher: Matcher, references: Reference) -> PyTree:
+    """What the matcher needs of each reference; grids one after another, as loops over cells go
+    slowly side by side."""
+    if matcher.of_grid:
+        return jax.lax.map(matcher.prepare, references)
+    return jax.vmap(matcher.prepare)(references)
+
+
+def _checked(
+    matcher: object, reference: object, points: object, start: ArrayLike
+) -> tuple[int, ...]:
+    """The leading axis, () of one pair; raises ValueError on what `match` refuses."""
+    if not isinstance(matcher, Matcher):
+        raise ValueError(f"match: expected a Matcher, got {type(matcher).__name__}")
+    kind = Grid if matcher.of_grid else Points
+    if not isinstance(reference, kind):
+        raise ValueError(
+            f"match: {matcher.name} takes a reference of {kind.__name__}, "
+            f"got {type(reference).__name__}"
+        )
+    batch: tuple[int, ...] = np.shape(start)[:-1]
+    if len(batch) > 1 or np.shape(start)[-1:] != (3,):
+        raise ValueError(f"match: expected a start of poses (x, y, θ), got {shape_text(start)}")
+    _check_points("match: points", points, batch)
+    if isinstance(reference, Points):
+        _check_points("match: reference", reference, batch)
+        if not reference.valid.shape[-1]:
+            raise ValueError("match: expected a reference of at least one point, valid or not")
+    elif not batch:
+        check_grid("match", reference)
+    elif np.ndim(reference.log_odds) != 3 or len(reference.log_odds) != batch[0]:
+        raise ValueError(
+            f"match: expected {batch[0]} grids, got log-odds of {shape_text(reference.log_odds)}"
+        )
+    if is_concrete(start) and not np.all(np.isfinite(np.asarray(start))):
+        raise ValueError(f"match: expected a finite start, got {np.asarray(start)}")
+    return batch
+
+
+def _check_prior(prior: object, batch: tuple[int, ...]) -> None:
+    if not isinstance(prior, Prior):
+        raise ValueError(f"match: expected a Prior, got {type(prior).__name__}")
+    if np.shape(prior.pose) != (*batch, 3) or np.shape(prior.information) != (*batch, 3, 3):
+        whole = " x ".join(str(size) for size in (*batch, 3))
+        raise ValueError(
+            f"match: expected a prior of a pose {whole} and an information {whole} x 3, got "
+            f"{shape_text(prior.pose)} and {shape_text(prior.information)}"
+        )
+    if is_concrete(prior):
+        information = np.asarray(prior.information)
+        if not (np.all(np.isfinite(np.asarray(prior.pose))) and np.all(np.isfinite(information))):
+            raise ValueError("match: expected a finite prior")
+        scale = np.abs(information).max(axis=(-1, -2), initial=0.0)
+        crooked = np.abs(information - np.swapaxes(information, -1, -2)).max(axis=(-1, -2))
+        if np.any(crooked > 1e-4 * scale) or np.any(
+            np.linalg.eigvalsh(information).min(axis=-1) < -1e-4 * scale
+        ):
+            raise ValueError(
+                "match: expected a symmetric information of the prior, positive semi-definite"
+            )
+
+
+def _check_points(name: str, of: object, batch: tuple[int, ...] = ()) -> None:
+    """Raise ValueError, which begins with a caller's name, unless they are finite `Points`."""
+    if not isinstance(of, Points):
+        raise ValueError(f"{name}: expected Points, got {type(of).__name__}")
+    shape = np.shape(of.valid)
+    if (
+        len(shape) != len(batch) + 1
+        or shape[:-1] != batch
+        or any(np.shape(part) != (*shape, 2) for part in of[:2])
+    ):
+        shapes = ", ".join(shape_text(part) for part in of)
+        whole = " x ".join(str(size) for size in (*batch, "N"))
+        raise ValueError(f"{name}: expected {whole} positions, rays and masks, got {shapes}")
+    if is_concrete(of) and not all(np.all(np.isfinite(np.asarray(part))) for part in of[:2]):
+        raise ValueError(f"{name}: expected finite points; those that are not valid, too")

@@ -1,0 +1,219 @@
+"""Common results of all matchers: the weakest direction, the score, the status."""
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxslam.laser.matching._matcher import Match, MatchStatus
+from jaxslam.laser.matching._point_sets import Points, Prior
+from jaxslam.math import _linalg as linalg
+from jaxslam.math._arrays import Number
+
+
+class Limits(NamedTuple):
+    """Thresholds below which a match is flagged."""
+
+    fewest: int = 10
+    """points with a partner"""
+    score: Number = 0.5
+    """of `Match.score`"""
+    condition: Number | None = 0.01
+    """of `Match.condition`; None: no match is DEGENERATE"""
+
+
+def make_match(
+    start: Float[Array, "3"],
+    pose: Float[Array, "3"],
+    points: Points,
+    *,
+    residual: Float[Array, "N"],
+    weight: Float[Array, "N"],
+    pair: Array,
+    information: Float[Array, "3 3"],
+    spread: Number,
+    iterations: Array,
+    converged: Array,
+    limits: Limits,
+    ambiguous: Array | bool = False,
+    score: Array | None = None,
+    prior: Prior | None = None,
+) -> Match:
+    """The `Match` of a pose that a search ended at, with its status.
+
+    The score is that of the residuals over `spread`, unless given. Along a degenerate direction
+    other poses fit as well, so that a match is only called ambiguous where it is not degenerate.
+    """
+    took_part = weight > 0
+    total = jnp.maximum(weight.sum(), jnp.finfo(weight.dtype).tiny)
+    count = jnp.maximum(points.valid.sum(), 1)
+    if score is None:
+        closeness = jnp.where(took_part, jnp.exp(-0.5 * (residual / spread) ** 2), 0.0)
+        score = closeness.sum() / count
+    length = length_of(points)
+    condition, weakest = _weakest_direction(information, length)
+    few = took_part.sum() < limits.fewest
+    status = jnp.asarray(MatchStatus.CONVERGED, jnp.int32)
+    for applies, value in (
+        (~converged, MatchStatus.NOT_CONVERGED),
+        (ambiguous, MatchStatus.AMBIGUOUS),
+        (limits.condition is not None and condition < limits.condition, MatchStatus.DEGENERATE),
+        (score < limits.score, MatchStatus.UNLIKE),
+        (few, MatchStatus.TOO_FEW),
+    ):
+        status = jnp.where(applies, jnp.asarray(value, jnp.int32), status)
+    return Match(
+        pose=jnp.where(few, start, pose),
+        status=status,
+        iterations=iterations,
+        residual=jnp.sqrt((weight * residual**2).sum() / total),
+        inliers=took_part.sum() / count.astype(weight.dtype),
+        score=score,
+        information=information,
+        weakest=weakest,
+        condition=condition,
+        determined=determined(information, length, limits.condition),
+        pair=jnp.where(took_part, pair, -1),
+        weight=weight,
+        prior=prior,
+    )
+
+
+def length_of(points: Points) -> Float[Array, ""]:
+    """The root mean square distance of the points from the origin of their frame [m]; 1 of none.
+
+    The factor of an angle beside lengths.
+    """
+    square = jnp.where(points.valid, (points.position**2).sum(axis=1), 0.0).sum()
+    mean = square / jnp.maximum(points.valid.sum(), 1)
+    return jnp.sqrt(jnp.where(mean > 0, mean, 1.0))
+
+
+def information_of(jacobian: Float[Array, "N 3"], weight: Float[Array, "N"]) -> Array:
+    """The information Σ w J Jᵀ (3, 3) of weighted rows."""
+    return linalg.gram(weight[:, None] * jacobian, jacobian)
+
+
+def information_along(
+    normal: Float[Array, "N 2"],
+    tilt: Float[Array, "N"],
+    arm: Float[Array, "N 2"],
+    weight: Float[Array, "N"],
+) -> Float[Array, "3 3"]:
+    """The information Σ w J Jᵀ, J = (n, n·∂(R p)/∂θ), of lines; arms [m] from the pivot.
+
+    A normal that is turned by noise of variance τ² has E n̂n̂ᵀ = (1 - τ²) nnᵀ + τ² ttᵀ, t along the
+    line, which feigns information along a wall; hence the sum of (1 + τ²) n̂n̂ᵀ - τ² ttᵀ.
+    """
+    along = jnp.stack([normal[:, 1], -normal[:, 0]], axis=-1)
+
+    def by_motion(v: Array) -> Array:
+        turn = v[:, 1] * arm[:, 0] - v[:, 0] * arm[:, 1]
+        return jnp.concatenate([v, turn[:, None]], axis=1)
+
+    both = information_of(by_motion(normal), weight * (1 + tilt))
+    return both - information_of(by_motion(along), weight * tilt)
+
+
+def _weakest_direction(
+    information: Float[Array, "3 3"], length: Float[Array, ""]
+) -> tuple[Float[Array, ""], Float[Array, "3"]]:
+    """The least over the largest eigenvalue, in [0, 1], and the eigenvector of the least.
+
+    The third coordinate is an angle, multiplied by a length [m]. Both are constants for
+    derivatives.
+    """
+    scale = jnp.stack([jnp.ones_like(length), jnp.ones_like(length), 1 / length])
+    a = jax.lax.stop_gradient(scale[:, None] * information * scale[None, :])
+    least, largest = _extreme_eigenvalues(a)
+    positive = largest > 0
+    condition = jnp.clip(least / jnp.where(positive, largest, 1.0), 0.0, 1.0)
+    return jnp.where(positive, condition, 0.0), eigenvector(a, least) * scale
+
+
+def determined(
+    information: Float[Array, "3 3"], length: Float[Array, ""], least: Number | None
+) -> Float[Array, "3 3"]:
+    """The projection D of a motion onto the determined directions; the identity for all directions,
+    or `least` is None.
+
+    With lengths in RMS ranges, the directions of the eigenvectors whose eigenvalue is at least
+    `least` of the largest are kept (Zhang, Kaess & Singh 2016, "On degeneracy of optimization-based
+    state estimation problems", ICRA). A constant for derivatives.
+    """
+    eye = jnp.eye(3, dtype=information.dtype)
+    if least is None:
+        return eye
+    scale = jnp.stack([jnp.ones_like(length), jnp.ones_like(length), 1 / length])
+    a = jax.lax.stop_gradient(scale[:, None] * information * scale[None, :])
+    low, high = _extreme_eigenvalues(a)
+    some = high > 0
+
+    def below(value: Array) -> Array:
+        return jnp.clip(value / jnp.where(some, high, 1.0), 0.0, 1.0) < least
+
+    weak, strong = eigenvector(a, low), eigenvector(a, high)
+    across = eye - weak[:, None] * weak[None, :]
+    along = jnp.where(some, strong[:, None] * strong[None, :], 0.0)
+    two = below(jnp.trace(a) - low - high) | ~some
+    kept = jnp.where(two, along, jnp.where(below(low), across, eye))
+    return scale[:, None] * kept / scale[None, :]
+
+
+def fused(
+    curvature: Float[Array, "3 3"],
+    slope: Float[Array, "3"],
+    prior: tuple[Float[Array, "3 3"], Float[Array, "3"]],
+    onto: Float[Array, "3 3"],
+    length: Float[Array, ""],
+) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
+    """Curvature Dᵀ A D + Λ and slope Dᵀ g + Λ e of a step: what the scans do not determine (D of
+    `determined`) is the prior's alone, however little it says.
+
+    A small share of Λ, and where it is zero of A, keeps a motion at zero that neither determines.
+    """
+    scale = jnp.stack([jnp.ones_like(length), jnp.ones_like(length), length])
+    eye = jnp.eye(3, dtype=curvature.dtype)
+    free = scale[:, None] * (eye - onto)
+    of_prior, of_scans = jnp.trace(prior[0]), jnp.trace(curvature)
+    size = jnp.where(of_prior > 0, of_prior, jnp.where(of_scans > 0, of_scans, 1.0))
+    keep = float(jnp.finfo(curvature.dtype).eps) ** 0.75 * size / length**2
+    return onto.T @ curvature @ onto + prior[0] + keep * free.T @ free, onto.T @ slope + prior[1]
+
+
+def _extreme_eigenvalues(a: Float[Array, "3 3"]) -> tuple[Float[Array, ""], Float[Array, ""]]:
+    """The least and the largest eigenvalue of a symmetric matrix.
+
+    By the roots of its characteristic polynomial as cosines: with q = tr A/3, p² = |A - q I|²/6
+    and B = (A - q I)/p, they are q + 2 p cos(φ + 2πk/3), 3φ = acos(det B/2) (Smith 1961,
+    "Eigenvalues of a symmetric 3 × 3 matrix", Communications of the ACM 4). Errors are rounding of
+    the largest.
+    """
+    q = jnp.trace(a) / 3
+    b = a - q * jnp.eye(3, dtype=a.dtype)
+    p = jnp.sqrt((b * b).sum() / 6)
+    b = b / jnp.where(p > 0, p, 1.0)
+    half = 0.5 * (b[0] * jnp.cross(b[1], b[2])).sum()
+    phi = jnp.arccos(jnp.clip(half, -1.0, 1.0)) / 3
+    return q + 2 * p * jnp.cos(phi + 2 * np.pi / 3), q + 2 * p * jnp.cos(phi)
+
+
+def eigenvector(a: Float[Array, "3 3"], value: Float[Array, ""]) -> Float[Array, "3"]:
+    """A unit eigenvector of a symmetric matrix: across two rows of A - λI, the largest product.
+
+    Where λ is a double eigenvalue, any vector across one row; of a multiple of I, (1, 0, 0).
+    """
+    rows = a - value * jnp.eye(3, dtype=a.dtype)
+    across = jnp.stack([jnp.cross(rows[i], rows[j]) for i, j in ((0, 1), (1, 2), (2, 0))])
+    size = (across**2).sum(axis=1)
+    row = rows[jnp.argmax((rows**2).sum(axis=1))]
+    tiny = 100 * jnp.finfo(a.dtype).eps
+    norm = (row**2).sum()
+    # Across one row: with the axis of its least entry.
+    axis = jnp.eye(3, dtype=a.dtype)[jnp.argmin(jnp.abs(row))]
+    lone = jnp.where(norm > 0, jnp.cross(row, axis), jnp.eye(3, dtype=a.dtype)[0])
+    double = size.max() <= (tiny * norm) ** 2
+    vector = jnp.where(double, lone, across[jnp.argmax(size)])
+    return vector / jnp.sqrt((vector**2).sum())

@@ -1,0 +1,142 @@
+"""Covariances of a match from derivatives of its cost at the minimum.
+
+The noise of the ranges through the condition that the match is a minimum (Censi 2007); that of a
+quadratic cost, its inverse second derivative; and the closed form with residuals across the surface
+alone (Bonnabel, Barczyk & Goulette 2016).
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from jaxslam.core._numbers import check_count, check_positive
+from jaxslam.core._record import record, static
+from jaxslam.laser.matching._matcher import Matcher
+from jaxslam.laser.matching._outcome import information_of
+from jaxslam.laser.matching._point_sets import Points, moved_along_rays
+from jaxslam.laser.matching._surfaces import GAP, SPAN, surface
+from jaxslam.laser.matching.covariance._match_covariance import (
+    MatchCovariance,
+    MatchedScans,
+    beside_prior,
+    curvature,
+    inverse_of,
+    propagated,
+    range_count,
+    with_ranges,
+)
+from jaxslam.math import se2
+from jaxslam.math._arrays import Number
+
+
+@record
+class Implicit(MatchCovariance):
+    """The covariance A⁻¹ B σ² Bᵀ A⁻¹, A = ∂²E/∂x², B = ∂²E/∂x∂z, with the ranges z of both scans.
+
+    From ∂E/∂x = 0 at the minimum: dx/dz = -(∂²E/∂x²)⁻¹ ∂²E/∂z∂x. The derivatives are those of the
+    matcher's cost by automatic differentiation, through the lines that are fitted to the reference;
+    pairs and weights are kept. Of a grid only the noise of the scan counts. A prior adds the noise
+    of its pose, σ² Λ in the middle.
+    Where pairs follow the scan, as those of point-to-point along a wall, keeping them feigns
+    information (Bonnabel et al. 2016; see `AlongNormals`).
+
+    Censi 2007, "An accurate closed-form estimate of ICP's covariance", ICRA.
+    """
+
+    sigma: ArrayLike
+    """standard deviation of a range [m]"""
+
+    def of_usable(self, matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
+        reference, points, found, *_ = scans
+        prepared = matcher.prepare(reference)
+
+        def slope(of_reference: Array, of_scan: Array) -> Array:
+            changed = with_ranges(reference, of_reference)
+            changed_prepared = (
+                matcher.prepare(changed) if isinstance(reference, Points) else prepared
+            )
+            moved = moved_along_rays(points, of_scan)
+            by_pose: Array = jax.grad(
+                lambda pose: matcher.cost(changed_prepared, moved, pose, found)
+            )(found.pose)
+            return by_pose
+
+        dtype = points.position.dtype
+        zeros = jnp.zeros(range_count(reference), dtype), jnp.zeros(len(points.valid), dtype)
+        by_ranges = jnp.concatenate(jax.jacrev(slope, argnums=(0, 1))(*zeros), axis=1)
+        shape = curvature(matcher, prepared, points, found)
+        return propagated(found, shape, by_ranges @ by_ranges.T, self.sigma)
+
+
+@record
+class Hessian(MatchCovariance):
+    """The covariance s² (∂²E/∂x²)⁻¹, E = ½ Σ w e², s² = 2E/(n - 3) of n pairs; 2E/n with a prior.
+
+    Right for independent residuals of one variance that the pairs do not follow. Two scans of
+    different density, and pairs that change with the pose, break that.
+    Bengtsson & Baerveldt 2003, "Robot localization based on scan-matching: estimating the
+    covariance matrix for the IDC algorithm", Robotics and Autonomous Systems 44.
+    """
+
+    def of_usable(self, matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
+        reference, points, found, *_ = scans
+        prepared = matcher.prepare(reference)
+        free = (found.weight > 0).sum() - (3 if found.prior is None else 0)
+        least = 2 * matcher.cost(prepared, points, found.pose, found) / jnp.maximum(free, 1)
+        shape = curvature(matcher, prepared, points, found)
+        return least * inverse_of(shape, beside_prior(found, found.information))
+
+
+@record
+class AlongNormals(MatchCovariance):
+    """The covariance A⁻¹ B A⁻¹, A = Σ w J Jᵀ, J = (n, n·∂(R p)/∂θ), B the noise of Σ w J e.
+
+    A scan that slides along a wall finds other partners, so that the part of a residual along the
+    wall has no information: the second derivative of point-to-point with fixed pairs counts it as
+    information, whatever the noise. Across the wall a change of partner matters to second order
+    only (Bonnabel, Barczyk & Goulette 2016, "On the covariance of ICP-based scan-matching
+    techniques", ACC). Hence n alone, for both ICPs. A range of the scan moves its residual by n·Ru,
+    u the beam; one of the reference those of all its partners by -n·u:
+
+        B = σ² (Σ_i w_i² (n·R u_i)² J_i J_iᵀ + Σ_j (n_j·u_j)² s_j s_jᵀ),
+
+    s_j the sum of w_i J_i over the partners i of j. A prior adds Λ to A and σ² Λ to B.
+
+    References are `Points`.
+    """
+
+    sigma: ArrayLike
+    """standard deviation of a range [m]"""
+    _: dataclasses.KW_ONLY
+    span: int = static(default=SPAN)
+    gap: Number = GAP
+    """of the lines, as in `IcpSettings`"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_count("AlongNormals: span", self.span)
+        check_positive("AlongNormals", gap=self.gap)
+
+    def of_usable(self, matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
+        reference, points, found, *_ = scans
+        if not isinstance(reference, Points):
+            raise ValueError(
+                f"AlongNormals: takes a reference of Points, got {type(reference).__name__}"
+            )
+        lines = surface(reference, self.span, self.gap)
+        j = jnp.maximum(found.pair, 0)
+        weight = jnp.where(lines.straight[j], found.weight, 0.0)
+        turn = se2.rotation(found.pose[2]).T
+        arm, ray, n = points.position @ turn, points.ray @ turn, lines.normal[j]
+        jacobian = jnp.concatenate(
+            [n, (n[:, 1] * arm[:, 0] - n[:, 0] * arm[:, 1])[:, None]], axis=1
+        )
+        shape = information_of(jacobian, weight)
+        by_scan = (weight * (n * ray).sum(axis=1))[:, None] * jacobian
+        of_partner = jax.ops.segment_sum(weight[:, None] * jacobian, j, len(reference.valid))
+        by_reference = (lines.normal * reference.ray).sum(axis=1)[:, None] * of_partner
+        noise = by_scan.T @ by_scan + by_reference.T @ by_reference
+        return propagated(found, beside_prior(found, shape), noise, self.sigma)

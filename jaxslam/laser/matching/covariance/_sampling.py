@@ -1,0 +1,184 @@
+"""Covariances of a match from its cost at many poses, or from matching again.
+
+The covariance of the likelihood over a lattice of poses (Olson 2009); and that of matches from
+other starts and with other noise.
+"""
+
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Array, Float
+
+from jaxslam.core._numbers import check_count, check_covariance, check_positive, held_array
+from jaxslam.core._record import record, set_field, static
+from jaxslam.laser.matching._matcher import Matcher
+from jaxslam.laser.matching._point_sets import Points, moved_along_rays, prior_cost
+from jaxslam.laser.matching.covariance._implicit import Implicit
+from jaxslam.laser.matching.covariance._match_covariance import (
+    MatchCovariance,
+    MatchedScans,
+    beside_prior,
+    curvature,
+    inverse_of,
+    range_count,
+    with_ranges,
+)
+from jaxslam.math import _linalg as linalg
+from jaxslam.math._arrays import Number
+from jaxslam.math.angles import wrap
+
+
+@record
+class Lattice(MatchCovariance):
+    """The covariance of p(x) ∝ exp(-E(x)/σ²) over a lattice of steps³ poses around the match.
+
+    K = Σ p x xᵀ, u = Σ p x, and the covariance K - u uᵀ with Σ p = 1. The lattice is x̂ + L z, z in
+    [-4, 4]³, L Lᵀ the inverse of ∂²E/∂x²/σ² and the window's information: as fine as the peak
+    needs, and as wide as the window where nothing else bounds it. Residuals are evaluated at each
+    pose: in a grid all that a shift changes counts, with the pairs of an ICP kept.
+
+    Olson 2009, "Real-time correlative scan matching", ICRA, where the lattice is the search's.
+    """
+
+    sigma: ArrayLike
+    """standard deviation of a residual [m]"""
+    _: dataclasses.KW_ONLY
+    window: Number = 0.3
+    """[m] and"""
+    turn_window: Number = 0.3
+    """[rad]: standard deviations of a prior, in addition to that of the match"""
+    steps: int = static(default=13)
+    """along each axis"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        check_positive("Lattice", window=self.window, turn_window=self.turn_window)
+        check_count("Lattice: steps", self.steps, 3)
+
+    def of_usable(self, matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
+        axis = np.linspace(-4.0, 4.0, self.steps)
+        grid = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
+        reference, points, found, *_ = scans
+        prepared = matcher.prepare(reference)
+        dtype = found.pose.dtype
+        alone = found._replace(prior=None)
+        windows = jnp.asarray([self.window, self.window, self.turn_window], dtype)
+        bound = jnp.diag(windows**-2.0)
+        variance = jnp.asarray(self.sigma, dtype) ** 2
+        shape = curvature(matcher, prepared, points, found) / variance + bound
+        peak = inverse_of(shape, beside_prior(found, found.information) / variance + bound)
+        root = linalg.cholesky(peak)[0]
+        offset = jnp.asarray(grid, dtype) @ root.T
+
+        def one(shift: Array) -> Array:
+            far = (shift * (bound @ shift)).sum()
+            here = prior_cost(found.prior, found.pose + shift)
+            if found.prior is not None:
+                shift = found.determined @ shift
+            here = here + matcher.cost(prepared, points, found.pose + shift, alone)
+            return -here / variance - 0.5 * far
+
+        weight = jax.nn.softmax(jax.lax.map(one, offset, batch_size=64))
+        mean = weight @ offset
+        apart = offset - mean[None]
+        return (weight[:, None] * apart).T @ apart
+
+
+@record
+class Unscented(MatchCovariance):
+    """The covariance of what six starts lead to, plus `Implicit` of the noise of the ranges.
+
+    The starts are start ± √3 L_k, L Lᵀ = start_cov, with weights 1/6 each: Σ (x_k - x̂)(x_k - x̂)ᵀ/6.
+    It includes wrong minima and directions that the scans do not determine, where a match stays as
+    far off as it began. Brossard, Bonnabel & Barrau 2020, "A new approach to 3D ICP covariance
+    estimation", IEEE Robotics and Automation Letters 5, which adds the bias of the sensor.
+    """
+
+    sigma: ArrayLike
+    """standard deviation of a range [m]"""
+    start_cov: ArrayLike
+    """(3, 3) covariance of the start"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _hold_start_cov(self)
+
+    def of_usable(self, matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
+        reference, points, found, start, _ = scans
+        root = linalg.root_psd(jnp.asarray(self.start_cov, start.dtype))
+        sides = jnp.sqrt(3.0).astype(start.dtype) * jnp.concatenate([root.T, -root.T])
+        prepared = matcher.prepare(reference)
+        ends = jax.vmap(lambda off: matcher.match(prepared, points, start + off, found.prior).pose)(
+            sides
+        )
+        apart = _apart(ends, found.pose)
+        return apart.T @ apart / 6 + Implicit(self.sigma).of(matcher, scans)
+
+
+@record
+class Sampling(MatchCovariance):
+    """The second moment about the match of matches with noise added, from starts that are drawn.
+
+    Noise N(0, σ²) is added to the ranges of both scans (of a grid: to those of the scan),
+    N(0, start_cov) to the start, and N(0, σ² Λ⁻¹) to the pose of a prior. The scans have noise
+    already, so partners lie a little farther apart than in the truth.
+    """
+
+    sigma: ArrayLike
+    """standard deviation of a range [m]"""
+    start_cov: ArrayLike
+    """(3, 3) covariance of the start"""
+    samples: int = static(default=30)
+    """number of matches"""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        _hold_start_cov(self)
+        check_count("Sampling: samples", self.samples)
+
+    def of_usable(self, matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
+        reference, points, found, start, key = scans
+        root = linalg.root_psd(jnp.asarray(self.start_cov, start.dtype))
+        sigma = jnp.asarray(self.sigma, start.dtype)
+
+        def one(key: Array) -> Array:
+            key_reference, key_scan, key_start, key_prior = jax.random.split(key, 4)
+            dtype = start.dtype
+            other = reference
+            if isinstance(reference, Points):
+                noise = jax.random.normal(key_reference, (range_count(reference),), dtype)
+                other = with_ranges(reference, sigma * noise)
+            scan = moved_along_rays(
+                points, sigma * jax.random.normal(key_scan, points.valid.shape, dtype)
+            )
+            begin = start + root @ jax.random.normal(key_start, (3,), dtype)
+            prior = found.prior
+            if prior is not None:
+                spread = sigma * _inverse_root(prior.information)
+                drawn = spread @ jax.random.normal(key_prior, (3,), dtype)
+                prior = prior._replace(pose=prior.pose + drawn)
+            return matcher.match(matcher.prepare(other), scan, begin, prior).pose
+
+        ends = jax.vmap(one)(jax.random.split(key, self.samples))
+        apart = _apart(ends, found.pose)
+        return apart.T @ apart / self.samples
+
+
+def _hold_start_cov(of: Unscented | Sampling) -> None:
+    check_covariance(type(of).__name__, of.start_cov, 3)
+    set_field(of, "start_cov", held_array(of.start_cov))
+
+
+def _inverse_root(information: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """The root Wᵀ with WᵀW = Λ⁻¹; of a share 1e-6 of the trace along what Λ does not determine."""
+    floor = 1e-6 * jnp.trace(information)
+    floor = jnp.where(floor > 0, floor, 1.0) * jnp.eye(3, dtype=information.dtype)
+    return linalg.whitener(linalg.symmetrize(information) + floor)[0].T
+
+
+def _apart(poses: Float[Array, "S 3"], middle: Float[Array, "3"]) -> Float[Array, "S 3"]:
+    off = poses - middle[None]
+    return off.at[:, 2].set(wrap(off[:, 2]))

@@ -1,0 +1,99 @@
+"""Jacobians at the current estimate, and at other linearization points: the standard EKF.
+
+They are taken by forward-mode automatic differentiation. The hand-derived Jacobians of models are
+for verification; filters do not use them, so a user's model needs none.
+"""
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+from jaxtyping import Float
+
+from jaxslam.core._record import record
+from jaxslam.core.protocols import Here, Linearizer, Motion, Sensor
+from jaxslam.math._arrays import (
+    Control,
+    InvertJacobians,
+    Landmark,
+    Measurement,
+    ObserveJacobians,
+    Pose,
+    PoseMatrix,
+    Unmeasured,
+)
+from jaxslam.math._linalg import matmul
+
+
+def motion_jacobians(
+    motion: Motion, pose: Pose, u: Control
+) -> tuple[PoseMatrix, Float[Array, "3 W"]]:
+    """The Jacobians F, W of a motion, ∂step/∂pose and ∂step/∂w at w = 0 (Solà (13))."""
+    w = jnp.zeros(len(motion.noises), pose.dtype)
+    by_pose, by_noise = jax.jacfwd(motion.step, argnums=(0, 2))(pose, u, w)
+    return by_pose, by_noise
+
+
+def observe_jacobians(sensor: Sensor, pose: Pose, landmark: Landmark) -> ObserveJacobians:
+    """The Jacobians H of a measurement, ∂observe/∂pose and ∂observe/∂l (Solà (25))."""
+    by_pose, by_landmark = jax.jacfwd(sensor.observe, argnums=(0, 1))(pose, landmark)
+    return by_pose, by_landmark
+
+
+def invert_jacobians(sensor: Sensor, pose: Pose, z: Measurement, s: Unmeasured) -> InvertJacobians:
+    """The Jacobians G of a new landmark by pose, z and s, ∂invert/∂… (Solà (41)-(43))."""
+    by_pose, by_z, by_s = jax.jacfwd(sensor.invert, argnums=(0, 1, 2))(pose, z, s)
+    return by_pose, by_z, by_s
+
+
+def motion_at(
+    motion: Motion, pose: Pose, u: Control, at: Pose
+) -> tuple[Pose, PoseMatrix, PoseMatrix]:
+    """The motion f(pose, u, 0), with ∂f/∂pose (3, 3) and W Q Wᵀ (3, 3) taken at another pose."""
+    by_pose, by_noise = motion_jacobians(motion, at, u)
+    moved = motion.step(pose, u, jnp.zeros(by_noise.shape[1], pose.dtype))
+    noise = motion.noise_cov(pose, u)
+    return moved, by_pose, matmul(matmul(by_noise, noise), by_noise.T)
+
+
+def observe_at(
+    sensor: Sensor, here: Here, at_pose: Pose, at_landmark: Landmark
+) -> tuple[Measurement, Float[Array, "Z 3"], Float[Array, "Z L"], Float[Array, "Z Z"]]:
+    """The measurement h(pose, l), Jacobians at another pose and landmark, and no added noise."""
+    by_pose, by_landmark = observe_jacobians(sensor, at_pose, at_landmark)
+    expected = sensor.observe(here.pose, here.landmark)
+    return expected, by_pose, by_landmark, jnp.zeros((expected.shape[0],) * 2, expected.dtype)
+
+
+def invert_at(
+    sensor: Sensor, pose: Pose, z: Measurement, at_pose: Pose, at_z: Measurement
+) -> tuple[Landmark, Float[Array, "L 3"], Float[Array, "L L"]]:
+    """The landmark g(pose, z, s̄), ∂g/∂pose (L, 3) and its covariance; Jacobians at another pose.
+
+    The covariance is G_z R G_zᵀ + G_s S G_sᵀ (L, L), with R at z: Solà (32)-(38), with the prior's
+    term of (44).
+    """
+    mean, cov_s = (jnp.asarray(part, z.dtype) for part in sensor.free)
+    by_pose, by_z, by_s = invert_jacobians(sensor, at_pose, at_z, mean)
+    cov = by_z @ sensor.noise_cov(z) @ by_z.T + by_s @ cov_s @ by_s.T
+    return sensor.invert(pose, z, mean), by_pose, cov
+
+
+def with_lever_arm(by_pose: Float[Array, "L 3"], offset: Float[Array, "2"]) -> Float[Array, "L 3"]:
+    """The derivative of a point by the pose (·, 3), with an offset (2,) added to the lever arm."""
+    return by_pose.at[:2, 2].add(jnp.stack([-offset[1], offset[0]]))
+
+
+@record
+class AtEstimate(Linearizer):
+    """The EKF linearizer: Jacobians at the current estimate (Solà (13), (25), (33)); no memory."""
+
+    def motion(self, motion: Motion, u: Array, here: Here) -> tuple[Array, Array, Array, tuple[()]]:
+        return (*motion_at(motion, here.pose, u, here.pose), ())
+
+    def observe(self, sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
+        return observe_at(sensor, here, here.pose, here.landmark)
+
+    def invert(
+        self, sensor: Sensor, z: Array, tag: Array, here: Here
+    ) -> tuple[Array, Array, Array]:
+        return invert_at(sensor, here.pose, z, here.pose, z)

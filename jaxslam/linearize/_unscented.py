@@ -1,0 +1,160 @@
+"""Statistical linearization by the unscented transform, in any chart."""
+
+from collections.abc import Callable
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxslam.core._numbers import is_concrete
+from jaxslam.core._record import record
+from jaxslam.core.protocols import Here, Linearizer, Motion, Sensor
+from jaxslam.math import _linalg as linalg
+from jaxslam.math._arrays import Number
+
+
+class _Regression(NamedTuple):
+    """The affine fit y ≈ mean + slope · ξ + rest, ξ ~ N(0, L Lᵀ), through sigma points."""
+
+    mean: Array
+    """(m,)"""
+    slope: Array
+    """(m, n) times L; that is, by the standard normals"""
+    rest: Array
+    """(m, m) covariance of y that no affine function of ξ has"""
+
+
+@record
+class Unscented(Linearizer):
+    """The linearizer of the UKF: sigma points of the pose, or of pose and landmark, in the chart.
+
+    With n variables and P = L Lᵀ, points at 0 and ±α√n L_j, weights 1/(2α²n) and, for the centre,
+    1 - 1/α² for means and that + 3 - α² for covariances (UKF-M: Brossard, Barrau, Bonnabel, "A Code
+    for Unscented Kalman Filtering on Manifolds", ICRA 2020). The slope of the fit replaces the
+    Jacobian, and the residual covariance is added to the noise; so the correction by one
+    measurement is that of a UKF on the whole map, in which only robot and landmark are perturbed,
+    and P may be singular. A joint update assumes uncorrelated residuals of different measurements,
+    which in a UKF of the whole scan they are not. The residual covariance is used here, as in
+    UKF-M; the authors' own program for SLAM (JUKF) drops it. As there, the predicted pose and a
+    new landmark are those of the centre. In the charts `right_invariant` and `left_invariant` this
+    is their UKF on SE_{1+N}(2).
+
+    Raises ValueError unless 0 < alpha <= 1.
+    """
+
+    alpha: Number | None = None
+    """spread of the sigma points; default 1e-3 in float64, as theirs, with which the UKF equals an
+    EKF to rounding, and 0.1 in float32, because of rounding. 1 reaches √n σ."""
+    iterates = False
+
+    def __post_init__(self) -> None:
+        if self.alpha is not None and is_concrete(self.alpha) and not 0 < self.alpha <= 1:
+            raise ValueError(f"Unscented: expected alpha in (0, 1], got {self.alpha}")
+        super().__post_init__()
+
+    def motion(self, motion: Motion, u: Array, here: Here) -> tuple[Array, Array, Array, tuple[()]]:
+        pose, chart, width = here.pose, here.chart, len(motion.noises)
+        ground = jnp.zeros(here.joint.landmarks.shape[1], pose.dtype)
+        moved = motion.step(pose, u, jnp.zeros(width, pose.dtype))
+        root = _root(here.cov)
+        root_noise = linalg.root_psd(motion.noise_cov(pose, u))
+
+        def f(xi: Array) -> Array:
+            start, _ = chart.retract(pose, ground, xi[:3], ground)
+            return chart.local(moved, ground, motion.step(start, u, xi[3:]), ground)[0]
+
+        by = self._fit(f, jax.scipy.linalg.block_diag(root, root_noise))
+        by_pose = by_variables(by.slope[:, :3], root)
+        noise = linalg.matmul(by.slope[:, 3:], by.slope[:, 3:].T) + by.rest
+        if chart.basis is not None:
+            after = chart.basis(moved, ground).pose
+            by_pose = after @ by_pose @ linalg.inverse(chart.basis(pose, ground).pose)
+            noise = after @ noise @ after.T
+        return moved, by_pose, noise, ()
+
+    def observe(self, sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
+        pose, landmark, chart = here.pose, here.landmark, here.chart
+        root = _root(here.cov)
+        centre = sensor.observe(pose, landmark)
+
+        def h(xi: Array) -> Array:
+            return sensor.residual(
+                sensor.observe(*chart.retract(pose, landmark, xi[:3], xi[3:])), centre
+            )
+
+        by = self._fit(h, root)
+        slope = by_variables(by.slope, root)
+        by_pose, by_landmark = slope[:, :3], slope[:, 3:]
+        if chart.basis is not None:
+            basis = chart.basis(pose, landmark)
+            if basis.landmark is not None:
+                by_landmark = by_landmark @ linalg.inverse(basis.landmark)
+            by_pose = (by_pose - by_landmark @ basis.cross) @ linalg.inverse(basis.pose)
+        return centre + by.mean, by_pose, by_landmark, by.rest
+
+    def invert(
+        self, sensor: Sensor, z: Array, tag: Array, here: Here
+    ) -> tuple[Array, Array, Array]:
+        pose, chart, size_z = here.pose, here.chart, z.shape[0]
+        mean, cov_s = (jnp.asarray(part, z.dtype) for part in sensor.free)
+        centre = sensor.invert(pose, z, mean)
+        still = jnp.zeros_like(centre)
+        root = _root(here.cov)
+        own_roots = [linalg.root_psd(sensor.noise_cov(z)), linalg.root_psd(cov_s)]
+
+        def g(xi: Array) -> Array:
+            seen_from, _ = chart.retract(pose, still, xi[:3], still)
+            landmark = sensor.invert(seen_from, z + xi[3 : 3 + size_z], mean + xi[3 + size_z :])
+            return chart.local(pose, centre, seen_from, landmark)[1]
+
+        by = self._fit(g, jax.scipy.linalg.block_diag(root, *own_roots))
+        by_pose = by_variables(by.slope[:, :3], root)
+        cov = linalg.matmul(by.slope[:, 3:], by.slope[:, 3:].T) + by.rest
+        if chart.basis is not None:
+            basis = chart.basis(pose, centre)
+            if basis.landmark is not None:
+                by_pose, cov = basis.landmark @ by_pose, basis.landmark @ cov @ basis.landmark.T
+            by_pose = (basis.cross + by_pose) @ linalg.inverse(basis.pose)
+        return centre, by_pose, cov
+
+    def _fit(self, f: Callable[[Array], Array], root: Array) -> _Regression:
+        alpha = _spread(root) if self.alpha is None else jnp.asarray(self.alpha, root.dtype)
+        return regress(f, root, alpha)
+
+
+def regress(f: Callable[[Array], Array], root: Array, alpha: float | Array) -> _Regression:
+    """The unscented transform of f: (n,) -> (m,), f(0) = 0, over ξ ~ N(0, L Lᵀ), L = root (n, n).
+
+    With o_j and e_j the odd and even parts of f at α√n L_j, the transform's sums come to
+    mean = Σ e_j/(α²n), slope·L = (o_j/(α√n))_j and rest = Σ e_j e_jᵀ/(α²n) + (2 - α²) mean meanᵀ,
+    without cancellation of large terms.
+    """
+    reach2 = alpha**2 * root.shape[0]
+    points = jnp.sqrt(reach2) * root.T
+    ahead, back = jax.vmap(f)(points), jax.vmap(f)(-points)
+    odd, even = (ahead - back) / 2, (ahead + back) / 2
+    mean = even.sum(axis=0) / reach2
+    rest = linalg.gram(even, even) / reach2 + (2 - alpha**2) * mean[:, None] * mean[None, :]
+    return _Regression(mean, odd.T / jnp.sqrt(reach2), rest)
+
+
+def by_variables(slope: Array, root: Array) -> Array:
+    """The Jacobian H with H L = slope (m, n), for a regular lower L (n, n)."""
+    return linalg.solve_lower(root.T[::-1, ::-1], slope.T[::-1])[::-1].T
+
+
+def _root(cov: Array) -> Array:
+    """A regular square root of P; zero variances are raised to about the square root of eps.
+
+    Along such a direction the slope is then the derivative; a column of zeros would leave it
+    undetermined.
+    """
+    root = linalg.cholesky(cov)[0]
+    floor = float(jnp.finfo(cov.dtype).eps) ** 0.5
+    pivots = jnp.diagonal(root)
+    return root + jnp.diag(jnp.where(pivots > floor, 0.0, floor))
+
+
+def _spread(root: Array) -> float:
+    return 1e-3 if root.dtype == jnp.float64 else 0.1

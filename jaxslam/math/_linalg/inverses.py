@@ -1,0 +1,103 @@
+"""Inverses of small matrices, and of their Cholesky factors."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax import Array
+from jaxtyping import Bool, Float, PyTree
+
+from jaxslam.math._linalg import batched
+from jaxslam.math._linalg.factors import (
+    UNROLLED,
+    cholesky,
+    lower_half,
+    mirrored,
+    pivot_tolerance,
+    solve_lower,
+)
+from jaxslam.math._linalg.products import self_gram, total
+from jaxslam.math._xla import traced_once
+
+
+@jax.custom_jvp
+@traced_once
+def whitener(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
+    """The inverse Cholesky factor W = L⁻¹ (n, n) of a small A = L Lᵀ, and `cholesky`'s flag.
+
+    A pivot that counts as zero gives a row of zeros. It takes one division and one square root a
+    pivot, where `cholesky` and `solve_lower` take three.
+    """
+    n, tolerance = matrix.shape[-1], pivot_tolerance(matrix)
+    zero = jnp.zeros((), matrix.dtype)
+    factor = [[zero] * n for _ in range(n)]
+    rows = [[zero] * n for _ in range(n)]
+    positive = jnp.asarray(True)
+    for j in range(n):
+        pivot = matrix[j, j] - sum((factor[j][k] ** 2 for k in range(j)), zero)
+        good = pivot > tolerance * jnp.abs(matrix[j, j])
+        positive = positive & good
+        rows[j][j] = jnp.where(good, jax.lax.rsqrt(jnp.where(good, pivot, 1.0)), 0.0)
+        for k in range(j):
+            rows[j][k] = -rows[j][j] * total(factor[j][i] * rows[i][k] for i in range(k, j))
+        for i in range(j + 1, n):
+            rest = matrix[i, j] - sum((factor[i][k] * factor[j][k] for k in range(j)), zero)
+            factor[i][j] = jnp.where(good, rest * rows[j][j], 0.0)
+    return jnp.stack([jnp.stack(row) for row in rows]), positive
+
+
+@whitener.defjvp
+def _whitener_slope(primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
+    """dW = -Φ(W dA Wᵀ) W, with rows and columns of zeros where a pivot is zero."""
+    white, positive = whitener(*primals)
+    slope = -lower_half(white @ mirrored(tangents[0]) @ white.T) @ white
+    return (white, positive), (slope, np.zeros(positive.shape, jax.dtypes.float0))
+
+
+def whitener_by_rows(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
+    """The inverse Cholesky factor by a loop over rows, which compiles faster than `whitener`.
+
+    Beyond 8×8 by `cholesky`, and all zero if a pivot is zero.
+    """
+    n, tolerance = matrix.shape[-1], pivot_tolerance(matrix)
+    if n == 0:
+        return matrix, jnp.asarray(True)
+    if n > UNROLLED:
+        factor, positive = cholesky(matrix)
+        return solve_lower(factor, jnp.eye(n, dtype=matrix.dtype)), positive
+    every = jnp.arange(n)
+
+    def row(carry: PyTree, j: jax.Array) -> tuple[PyTree, PyTree]:
+        rest, ahead = carry
+        pivot = rest[j, j]
+        good = pivot > tolerance * jnp.abs(matrix[j, j])
+        scale = jnp.where(good, jax.lax.rsqrt(jnp.where(good, pivot, 1.0)), 0.0)
+        below, scaled = jnp.where(every > j, rest[:, j] * scale, 0.0), ahead[j] * scale
+        return (
+            rest - below[:, None] * below[None, :],
+            ahead - below[:, None] * scaled[None, :],
+        ), (scaled, good)
+
+    rows, good = jax.lax.scan(row, (matrix, jnp.eye(n, dtype=matrix.dtype)), every)[1]
+    return rows, good.all()
+
+
+def inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """The inverse of a regular (n, n) matrix: by cofactors up to 3×3, which fuses; by LU beyond."""
+    n = matrix.shape[-1]
+    a = matrix
+    if n == 1:
+        return jnp.reciprocal(a)
+    if n == 2:
+        det = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
+        return jnp.stack([jnp.stack([a[1, 1], -a[0, 1]]), jnp.stack([-a[1, 0], a[0, 0]])]) / det
+    if n == 3:
+        cofactors = jnp.stack(
+            [jnp.cross(a[1], a[2]), jnp.cross(a[2], a[0]), jnp.cross(a[0], a[1])], axis=1
+        )
+        return cofactors / jnp.dot(a[0], cofactors[:, 0])
+    return batched.inverse(a)
+
+
+def inverse_psd(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
+    """A⁻¹ of a positive definite A (n, n), exactly symmetric; zero where A is not (n > 8)."""
+    return self_gram(whitener_by_rows(matrix)[0])

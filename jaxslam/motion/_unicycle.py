@@ -1,0 +1,70 @@
+"""The unicycle model: constant velocities over an interval, integrated by one Euler step."""
+
+import jax.numpy as jnp
+from numpy.typing import ArrayLike
+
+from jaxslam.core._noise import NoiseCov
+from jaxslam.core._record import record
+from jaxslam.core.protocols import Motion
+from jaxslam.math import se2
+from jaxslam.math._arrays import Control, Pose, ProcessNoise, ProcessNoiseCov, StepJacobians
+
+
+@record
+class Unicycle(Motion):
+    """The unicycle model, integrated by one Euler step.
+
+    u = (v [m/s], ω [rad/s], Δt [s]), with noise added to the velocities.
+
+    pose ← (x + (v+w_v)Δt cos θ, y + (v+w_v)Δt sin θ, wrap(θ + (ω+w_ω)Δt)). The robot of Huang et
+    al. 2010 and of UKF-M's 2-D SLAM example (Brossard et al. 2020); Δt = 0 gives no motion and no
+    noise.
+    """
+
+    noise_cov: NoiseCov
+    """(2, 2) covariance of w = (w_v, w_ω), or a function of (pose, u): of the *velocity* over the
+    interval, so the displacement's grows with Δt²."""
+    controls = ("v [m/s]", "omega [rad/s]", "dt [s]")
+    noises = ("v [m/s]", "omega [rad/s]")
+
+    def step(self, pose: Pose, u: Control, w: ProcessNoise) -> Pose:
+        v, omega, dt = self.perturb(u, w)
+        return se2.compose(pose, jnp.stack([v * dt, jnp.zeros_like(dt), omega * dt]))
+
+    def perturb(self, u: Control, w: ProcessNoise) -> Control:
+        return jnp.stack([u[0] + w[0], u[1] + w[1], u[2]])
+
+    def jacobians(self, pose: Pose, u: Control, w: ProcessNoise) -> StepJacobians:
+        v, omega, dt = u[0] + w[0], u[1] + w[1], u[2]
+        c, s = jnp.cos(pose[2]), jnp.sin(pose[2])
+        by_pose = jnp.eye(3, dtype=pose.dtype)
+        by_pose = by_pose.at[0, 2].set(-v * dt * s).at[1, 2].set(v * dt * c)
+        by_noise = jnp.zeros((3, 2), pose.dtype)
+        by_noise = by_noise.at[0, 0].set(dt * c).at[1, 0].set(dt * s).at[2, 1].set(dt)
+        by_dt = jnp.stack([v * c, v * s, omega])
+        return by_pose, jnp.concatenate([by_noise, by_dt[:, None]], axis=1), by_noise
+
+
+@record
+class WhiteNoise:
+    """White noise of the velocities (v, ω), a function (pose, u) -> (2, 2).
+
+        diag(travel², turn² + (turn_share ω)²) / Δt
+
+    It does not depend on how time is cut into steps; where Δt = 0 it is 0.
+    """
+
+    travel: ArrayLike
+    """[m/√s] standard deviation of the travel in a second"""
+    turn: ArrayLike
+    """[rad/√s] of the heading in a second"""
+    turn_share: ArrayLike = 0.0
+    """[√s] of the heading in a second, as a share of ω"""
+
+    def __call__(self, pose: Pose, u: Control) -> ProcessNoiseCov:
+        travel, turn, share = (
+            jnp.asarray(given, u.dtype) for given in (self.travel, self.turn, self.turn_share)
+        )
+        moving = u[2] > 0
+        density = jnp.diag(jnp.stack([travel**2, turn**2 + (share * u[1]) ** 2]))
+        return density * jnp.where(moving, 1 / jnp.where(moving, u[2], 1.0), 0.0)

@@ -1,0 +1,215 @@
+"""The report of a campaign: its files, written all or none, and a fragment for notebooks."""
+
+import json
+import os
+from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
+from functools import cache, partial
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from jaxslam.consistency._tally import Tally
+from jaxslam.consistency.campaign import Campaign
+from jaxslam.consistency.campaign._block import BOUND
+from jaxslam.consistency.campaign._harness import summaries_of
+from jaxslam.consistency.campaign._kept import add_kept
+from jaxslam.consistency.campaign._pieces import missing
+from jaxslam.core._numbers import is_number
+from jaxslam.results import _report as report
+from jaxslam.results import _store as store
+from jaxslam.results._files import Files, check_formats, check_writable, versions, write_files
+
+if TYPE_CHECKING:  # Matplotlib is slow to load
+    from jaxslam.results.plot import Figure
+
+PAGE, RESULT, CURVES = "report.html", "consistency.json", "consistency.csv"
+"""The page; the verdicts, measures and counts; the averages of every step."""
+
+TABLE = "measures.csv"
+"""The table of the page."""
+
+TIMES = ("seconds", "compile_seconds", "step_seconds")
+"""Entries of `RESULT` that differ between computations of the same runs."""
+
+BLOCKS = "blocks"
+"""The folder of a campaign's finished blocks, beside its results."""
+
+FORMATS = ("png", "pdf", "svg")
+"""Formats of the files of figures."""
+
+FIGURES = ("nees", "rmse", "cost", "coverage", "whiteness", "gained", "errors", "map")
+"""The figures, by the names of their files; the last two are of run 0."""
+
+_IN_NOTEBOOK = ("nees", "rmse")
+
+
+def file_names(formats: Iterable[str], figures: Iterable[str] = FIGURES) -> list[str]:
+    """The names of the files of a campaign's report, with figures of these formats."""
+    kinds = list(formats)
+    return [PAGE, RESULT, CURVES, TABLE, *(f"{name}.{kind}" for name in figures for kind in kinds)]
+
+
+def check_figure_formats(caller: str, given: str | Iterable[str]) -> tuple[str, ...]:
+    """The formats of figures, each once; ValueError on an unknown one."""
+    return check_formats(caller, given, FORMATS)
+
+
+def save_campaign(
+    campaign: Campaign,
+    folder: str | Path,
+    figures: str | Iterable[str] = ("png",),
+    overwrite: bool = False,
+    command: str = "",
+    seed: int | None = None,
+) -> list[Path]:
+    """Write the files of a campaign's report, and return their paths; see `Campaign.save`.
+
+    Args:
+        command, seed: those of the campaign, for the page and the JSON; "" and None if unknown.
+    """
+    formats = check_figure_formats("Campaign.save", figures)
+    if not isinstance(folder, str | os.PathLike) or not str(folder).strip():
+        raise ValueError(f"Campaign.save: expected a folder, got {folder!r}")
+    folder = Path(folder)
+    check_writable(folder)
+    drawings = _drawings(campaign, seed)
+    existing = [name for name in file_names(formats, drawings) if (folder / name).exists()]
+    if existing and not overwrite:
+        raise ValueError(
+            f"Campaign.save: {folder / existing[0]} exists: overwrite=True replaces it, or choose "
+            "another folder"
+        )
+    from jaxslam.results import _page as page  # matplotlib is slow to load
+    from jaxslam.results.plot._style import encode
+
+    drawn = {name: (caption, make()) for name, (caption, make) in drawings.items()}
+    drawn_once = cache(encode)  # the page and a file have the same picture
+    files: Files = {
+        PAGE: page.campaign_page(
+            campaign, command, seed, versions(), drawn, lambda figure: drawn_once(figure, "png")
+        ),
+        RESULT: report.as_json(campaign, command, seed),
+        CURVES: report.as_csv(campaign),
+        TABLE: report.table_csv(campaign),
+    }
+    for name, (_, figure) in drawn.items():
+        files |= {f"{name}.{kind}": drawn_once(figure, kind) for kind in formats}
+    stale = () if _holds(folder / RESULT, files[RESULT]) else file_names(FORMATS)
+    return write_files(folder, files, replaces=stale)
+
+
+def load(folder: str | Path) -> Campaign:
+    """The finished campaign in a folder written by `jaxslam consistency`.
+
+        campaign = jaxslam.load("out")
+        jaxslam.plot.nees_figure(campaign, width=3.5).savefig("nees.pdf")
+
+    It is read from `blocks/` and `consistency.json`, without the scenario or the filters. Run 0 of
+    each filter is not kept: `Campaign.first` is empty, and its two figures need the command.
+
+    Raises:
+        ValueError: if the folder holds no campaign, or one that is not finished.
+    """
+    folder = Path(folder)
+    kept, path = store.resume(folder / BLOCKS), folder / RESULT
+    try:
+        found = json.loads(path.read_text(encoding="utf-8"))
+        doubts = _checked(found, kept.campaign)
+    except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
+        raise ValueError(
+            f"{path}: expected the results of a campaign: jaxslam consistency --resume {folder} "
+            "writes them"
+        ) from error
+    runs, tallies = found["runs"], {name: Tally() for name in (*doubts, BOUND)}
+    if missing(add_kept(tallies, kept, runs, lambda first: True), runs, runs):
+        raise ValueError(
+            f"{folder}: the campaign is not finished: jaxslam consistency --resume {folder}"
+        )
+    _, limit, summaries = summaries_of(tallies)
+    entries = ("scenario", "source", "published", "steps", "dtype")
+    return Campaign(
+        **{name: found[name] for name in (*entries, *TIMES)},
+        runs=runs,
+        divergence_limit=float(limit),
+        filters={name: replace(one, doubts=doubts[name]) for name, one in summaries.items()},
+        run_numbers=tallies[BOUND].numbers(),
+    )
+
+
+def _checked(found: Any, campaign: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
+    """The doubts of each filter in the JSON of a report.
+
+    Raises one of several errors if it is not that of a campaign of this identity.
+    """
+    filters, published, step_seconds = (found[key] for key in ("filters", "published", TIMES[2]))
+    texts = [found[name] for name in ("scenario", "source", "dtype")]
+    numbers = [*(found[name] for name in TIMES[:2]), *step_seconds.values()]
+    numbers += [value for row in published.values() for value in row.values()]
+    doubts = {name: tuple(entry["doubts"]) for name, entry in filters.items()}
+    texts += [text for each in doubts.values() for text in each]
+    if (
+        not all(isinstance(text, str) for text in texts)
+        or not all(isinstance(entry["doubts"], list) for entry in filters.values())
+        or not all(map(is_number, numbers))
+        or not all(type(found[name]) is int and found[name] >= 1 for name in ("runs", "steps"))
+        or ", ".join(doubts) != campaign.get("filters", ", ".join(doubts))
+        or str(found["steps"]) != campaign.get("steps", str(found["steps"]))
+    ):
+        raise ValueError("not the results of this campaign")
+    return doubts
+
+
+def _holds(path: Path, text: object) -> bool:
+    """Whether a file has this text."""
+    try:
+        return path.read_text(encoding="utf-8") == text
+    except (OSError, ValueError):
+        return False
+
+
+def notebook(campaign: Campaign) -> str:
+    """The campaign as a fragment of HTML: verdicts, NEES and RMSE over the steps, all measures."""
+    from jaxslam.results import _page as page  # matplotlib is slow to load
+    from jaxslam.results.plot._style import png
+
+    drawings = _drawings(campaign, None)
+    shown = ((name, *drawings[name]) for name in _IN_NOTEBOOK)
+    figures = {name: (caption, make()) for name, caption, make in shown}
+    return page.fragment(campaign, figures, partial(png, dpi=110))
+
+
+def _drawings(
+    campaign: Campaign, seed: int | None
+) -> Mapping[str, tuple[str, Callable[[], "Figure"]]]:
+    """The caption of each figure, and a function that draws it, by name."""
+    from jaxslam.results import plot  # matplotlib is slow to load
+    from jaxslam.results.plot._landmarks import run_map_figure
+    from jaxslam.results.plot._pose_errors import run_errors_figure
+
+    bound = any("bound_position" in found.curves for found in campaign.filters.values())
+    found = {
+        "nees": ("NEES against time, with its 95 % band", partial(plot.nees_figure, campaign)),
+        "rmse": (
+            "RMSE, and the conditional Cramér-Rao bound" if bound else "RMSE",
+            partial(plot.rmse_figure, campaign),
+        ),
+        "cost": (
+            "Time of a step, error and NEES",
+            partial(plot.cost_figure, campaign),
+        ),
+        "coverage": ("Coverage of the ellipsoids", partial(plot.coverage_figure, campaign)),
+        "whiteness": ("Autocorrelation of innovations", partial(plot.whiteness_figure, campaign)),
+        "gained": (
+            "Information gained about a rotation of the whole frame",
+            partial(plot.gained_figure, campaign),
+        ),
+    }
+    if campaign.first:
+        title = f"{campaign.scenario}, run 0" + ("" if seed is None else f" of seed {seed}")
+        if len(campaign.first) == 1 < len(campaign.filters):
+            title += f", {next(iter(campaign.first))}"
+        found |= {
+            "errors": (f"Errors: {title}", partial(run_errors_figure, campaign, title=title)),
+            "map": (f"Maps: {title}", partial(run_map_figure, campaign, title=title)),
+        }
+    return found

@@ -1,0 +1,286 @@
+"""The report of a campaign as one self-contained HTML5 file; and as a fragment for a notebook.
+
+Figures are embedded. The page has no scripts, and forbids the browser to load anything else.
+"""
+
+import base64
+from collections.abc import Callable, Mapping
+from html import escape
+from importlib.resources import files
+from itertools import groupby
+
+import numpy as np
+
+from jaxslam.consistency import Average, Summary
+from jaxslam.consistency._intervals import LEVEL, percentage
+from jaxslam.consistency._verdict import TESTS
+from jaxslam.consistency.campaign import Campaign
+from jaxslam.results import _report as report
+from jaxslam.results import _table as table
+from jaxslam.results._table import VERDICTS, cell_text, short
+from jaxslam.results.plot import Figure
+from jaxslam.results.plot._style import describe, png
+
+
+def _text(name: str) -> str:
+    """A file of this package."""
+    return files("jaxslam.results").joinpath("css", name).read_text(encoding="utf-8").strip()
+
+
+_LIGHT, _DARK, _PARTS = map(_text, ("light.css", "dark.css", "parts.css"))
+
+CSS = f""":root {{ {_LIGHT} }}
+@media (prefers-color-scheme: dark) {{ :root {{ {_DARK} }} }}
+{_PARTS}
+{_text("page.css")}
+"""
+
+FRAGMENT_CSS = f"""
+.jaxslam {{ {_LIGHT}
+  padding: .2rem 1rem 1rem; background: var(--back); color: var(--ink);
+  font: 14px/1.5 system-ui, sans-serif; & * {{ box-sizing: border-box; }}
+  summary {{ cursor: pointer; }}
+{_PARTS}
+figure {{ margin: 1rem 0; }} }}"""
+"""Rules nested below one class, with light colours alone: figures are light, too."""
+
+
+_UPRIGHT = 5
+"""With more filters, the table is printed on a separate landscape page."""
+
+
+def campaign_page(
+    campaign: Campaign,
+    command: str,
+    seed: int | None,
+    versions: Mapping[str, str],
+    figures: Mapping[str, tuple[str, Figure]],
+    draw: Callable[[Figure], bytes] = png,
+) -> str:
+    """The HTML report of a campaign.
+
+    Args:
+        campaign: the campaign.
+        command, seed: those of the campaign; None without a seed.
+        versions: of the software, by name.
+        figures: in order, by name, each with its caption.
+        draw: returns a figure as a PNG file; a cached function if the files are needed elsewhere.
+    """
+    heading = f"{campaign.scenario}: consistency of {with_noun(len(campaign.filters), 'filter')}"
+    sections = {
+        "Verdicts": verdict_list(campaign),
+        "Measures": measures_table(campaign) + measure_notes(campaign),
+        "How to read it": _conventions(campaign),
+        "Figures": _figures(figures, draw),
+        "Parameters": _parameters(campaign, command, seed, versions),
+    }
+    broad = {"Measures": ' class="broad"'} if len(campaign.filters) > _UPRIGHT else {}
+    main = "\n".join(
+        f"<section{broad.get(title, '')}>\n<h2>{title}</h2>\n{content}\n</section>"
+        for title, content in sections.items()
+        if content
+    )
+    return f"""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta name="color-scheme" content="light dark">
+<meta http-equiv="Content-Security-Policy"
+content="default-src 'none'; img-src data:; style-src 'unsafe-inline'">
+<title>{escape(heading)}</title>
+<style>{CSS}</style>
+</head>
+<body>
+<header>
+<p class="kicker">jaxslam · consistency report</p>
+<h1>{escape(heading)}</h1>
+<p class="lead">{_setup(campaign)}; every filter on the same draws.</p>
+</header>
+<main>
+{main}
+</main>
+</body>
+</html>
+"""
+
+
+def fragment(
+    campaign: Campaign,
+    figures: Mapping[str, tuple[str, Figure]],
+    draw: Callable[[Figure], bytes] = png,
+) -> str:
+    """The campaign as HTML for a notebook: verdicts, these figures, and the measures folded.
+
+    Arguments as for `campaign_page`. Its style does not apply to the rest of the page.
+    """
+    return f"""<div class="jaxslam">
+<style>{FRAGMENT_CSS}</style>
+<p><strong>{escape(campaign.scenario)}</strong>: {_setup(campaign)}</p>
+{verdict_list(campaign)}
+{_figures(figures, draw)}
+<details><summary>All measures</summary>
+{measures_table(campaign)}
+{measure_notes(campaign)}
+</details>
+</div>
+"""
+
+
+def _setup(campaign: Campaign) -> str:
+    """The numbers of runs and steps and the number format, as HTML."""
+    runs, steps = with_noun(campaign.runs, "Monte-Carlo run"), with_noun(campaign.steps, "step")
+    return escape(f"{runs} of {steps} each, in {campaign.dtype}")
+
+
+def _figures(figures: Mapping[str, tuple[str, Figure]], draw: Callable[[Figure], bytes]) -> str:
+    """The figures as HTML, numbered, with the PNG files embedded."""
+    out = []
+    for i, (caption, figure) in enumerate(figures.values(), 1):
+        width, height = (round(96 * inches) for inches in figure.get_size_inches())
+        data = base64.b64encode(draw(figure)).decode("ascii")
+        out.append(
+            f'<figure><img width="{width}" height="{height}" alt="{escape(describe(figure))}" '
+            f'src="data:image/png;base64,{data}">'
+            f"<figcaption><strong>Figure {i}.</strong> {escape(caption)}</figcaption></figure>"
+        )
+    return "\n".join(out)
+
+
+def _conventions(campaign: Campaign) -> str:
+    """The definitions of measures and verdicts as HTML."""
+    level, rest = (_unbroken(percentage(share)) for share in (LEVEL, 1 - LEVEL))
+    meanings = "\n".join(
+        f"<dt>{badge(verdict)}</dt><dd>{escape(meaning)}.</dd>"
+        for verdict, (_, meaning) in VERDICTS.items()
+    )
+    return f"""<p><strong>NEES</strong> = eᵀP⁻¹e is <em>not</em> divided by its degrees of freedom,
+which are the honest value. <strong>±</strong> is half the {level} interval of the mean
+over independent runs. A run is <strong>divergent</strong> when its final position error exceeds
+{campaign.divergence_limit:.3g} m, 5 σ of the EKF with Jacobians at the truth.</p>
+<p>The <strong>verdict</strong> goes by the pose NEES and by NIS / dof, averaged over time, with
+intervals so wide that an honest filter of a linear problem is rejected in {rest}
+of campaigns. An asterisk marks a verdict with a reservation:</p>
+<dl class="meanings">
+{meanings}
+</dl>"""
+
+
+def _parameters(
+    campaign: Campaign, command: str, seed: int | None, versions: Mapping[str, str]
+) -> str:
+    """The parameters of the campaign as HTML."""
+    compiling = duration(campaign.compile_seconds)
+    rows = {
+        "scenario": campaign.scenario,
+        "source": campaign.source,
+        "runs": f"{campaign.runs:,}",
+        "steps": f"{campaign.steps:,}",
+        "number format": campaign.dtype,
+        "seed": "–" if seed is None else str(seed),
+        "command": command,
+        "divergence limit": f"{campaign.divergence_limit:.4g} m",
+        "time": f"{duration(campaign.seconds)}, {compiling} of it compilation",
+        "versions": ", ".join(f"{name} {number}" for name, number in versions.items()),
+    }
+    shown = (f"<dt>{name}</dt><dd>{escape(value)}</dd>" for name, value in rows.items() if value)
+    return f'<dl class="parameters">{"".join(shown)}</dl>'
+
+
+def verdict_list(campaign: Campaign) -> str:
+    """Name, badge and tested measures of each filter, and notes on the verdicts, as HTML."""
+    items = []
+    for name, summary in campaign.filters.items():
+        tested = [key for key in TESTS if key in summary.measures]
+        values = [f"{TESTS[key]} {cell_text(summary.measures[key])}" for key in tested]
+        lines = "".join(f'<span class="why">{line}</span>' for line in values or ["no pose NEES"])
+        label = f'<span class="name">{breakable(name)}</span>'
+        items.append(f"<li>{label}{badge(summary.verdict, summary)}{lines}</li>")
+    lost = (f"{name} {phrase}" for name, phrase in table.lost_runs(campaign))
+    sentences = [*report.qualified(campaign), *lost]
+    notes = (f'<p class="note">{escape(sentence)}.</p>' for sentence in sentences)
+    return "\n".join(['<ul class="verdicts">', *items, "</ul>", *notes])
+
+
+def badge(verdict: str, summary: Summary | None = None) -> str:
+    """A verdict as HTML, with the tests that rejected; grey and with an asterisk if in doubt."""
+    sign, meaning = VERDICTS[verdict]
+    rejected = [TESTS[test] for test in summary.by] if summary is not None else []
+    doubts = summary.doubts if summary is not None else ()
+    kind = "undecided" if doubts and verdict == "consistent" else verdict
+    title = escape("; ".join([meaning, *doubts]))
+    text = escape(verdict + f" ({', '.join(rejected)})" * bool(rejected))
+    mark = f'<span aria-hidden="true">{sign}{"*" * bool(doubts)}</span>'
+    return f'<span class="badge {kind}" title="{title}">{mark} {text}</span>'
+
+
+def measures_table(campaign: Campaign) -> str:
+    """The table of measures × filters as HTML; published values below them."""
+    names = list(campaign.filters)
+    head = "".join(f'<th scope="col">{breakable(name)}</th>' for name in names)
+    parts = []
+    for group, rows in groupby(table.rows_of(campaign, names), lambda row: row.group):
+        title = f'<th colspan="{len(names) + 2}" scope="rowgroup">{group}</th>'
+        lines = [f'<tr class="group">{title}</tr>'] * bool(group) + [_row(row) for row in rows]
+        parts.append("<tbody>" + "\n".join(lines) + "</tbody>")
+    body = "\n".join(parts)
+    return (
+        '<div class="scroll" tabindex="0" role="region" aria-label="Measures of every filter">'
+        f'<table><thead><tr><th scope="col">measure</th><th scope="col">honest</th>{head}</tr>'
+        f"</thead>\n{body}</table></div>"
+    )
+
+
+def _row(row: table.Row) -> str:
+    """A row of the table as HTML."""
+    kind = ' class="sub"' if row.label.startswith(" ") else ""
+    published = row.published or [None] * len(row.cells)
+    cells = (_cell(cell, value) for cell, value in zip(row.cells, published, strict=True))
+    return (
+        f'<tr><th scope="row"{kind}>{escape(row.label.strip())}</th>'
+        f'<td class="honest">{escape(_unbroken(row.honest))}</td>{"".join(cells)}</tr>'
+    )
+
+
+def _cell(cell: table.Cell, published: float | None) -> str:
+    """A cell of the table as HTML; the pointer on a measure shows its interval."""
+    title, text = "", escape(_unbroken(cell_text(cell)))
+    if isinstance(cell, Summary):
+        text = badge(cell.verdict, cell)
+    elif isinstance(cell, Average) and np.isfinite(cell.high):
+        ends = f"{cell.low:.5g} to {cell.high:.5g}"
+        title = f' title="{_unbroken(percentage(LEVEL))} interval {ends}"'
+    if published is not None:
+        text += f'<span class="published">published {short(published)}</span>'
+    return f"<td{title}>{text}</td>"
+
+
+def _unbroken(text: str) -> str:
+    """A text whose percentages do not break."""
+    return text.replace(" %", "\N{NO-BREAK SPACE}%")
+
+
+def measure_notes(campaign: Campaign) -> str:
+    """The notes on the measures, as HTML."""
+    return "\n".join(
+        f'<p class="note"><strong>{escape(term)}</strong>: {escape(sentence)}.</p>'
+        for term, sentence in table.notes_on(campaign)
+    )
+
+
+def with_noun(number: int, noun: str) -> str:
+    """A number with its noun: 1 run, 2 runs."""
+    return f"{number:,} {noun}{'' if number == 1 else 's'}"
+
+
+def duration(seconds: float) -> str:
+    """A duration in seconds, minutes or hours."""
+    if seconds < 120:
+        return f"{seconds:.1f} s"
+    minutes = round(seconds / 60)
+    return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
+
+
+def breakable(name: str) -> str:
+    """A name escaped for HTML, with places where it may break."""
+    return escape(name).replace("_", "_<wbr>")

@@ -1,0 +1,184 @@
+"""The rows of the table of a campaign, shared by text, HTML and CSV, and notes on its terms."""
+
+from collections.abc import Sequence
+from typing import NamedTuple, TypeAlias
+
+import numpy as np
+
+from jaxslam.consistency import Average, Summary
+from jaxslam.consistency._intervals import LEVEL, lopsided, percentage
+from jaxslam.consistency._measures import Measure, measures_of
+from jaxslam.consistency._measures.counts import MEANINGS, count_label
+from jaxslam.consistency._measures.nees import DOF
+from jaxslam.consistency._verdict import TESTS
+from jaxslam.consistency.campaign import Campaign
+
+VERDICTS = {
+    "consistent": ("✓", "neither test rejects, which is not a proof"),
+    "optimistic": (
+        "▲",
+        "the interval of pose NEES or of NIS / dof lies above the honest value: covariances are "
+        "claimed too small",
+    ),
+    "pessimistic": (
+        "▼",
+        "the interval of pose NEES or of NIS / dof lies below the honest value: covariances are "
+        "claimed too large",
+    ),
+    "diverged": ("✕", "over half of the runs diverged or were not finite"),
+    "incomplete": ("–", "not rejected, but over half of the measurements were dropped"),
+    "undecided": (
+        "?",
+        "too few runs, or too unequal, to reject even a pose NEES of 6: take more runs; a pose "
+        "that is known exactly, as by mapping, has no NEES",
+    ),
+}
+"""Verdicts, each with its sign and its meaning."""
+
+_ALWAYS = ("runs", "not_finite", "divergent")
+"""Counts that are shown even if they are 0."""
+
+
+class Figure(NamedTuple):
+    """A cell without an interval."""
+
+    text: str
+    value: float | None = None
+    """in CSV"""
+
+
+Cell: TypeAlias = Summary | Average | Figure | None
+"""A summary shows its verdict."""
+
+
+class Row(NamedTuple):
+    """A row of the table, with a cell per filter."""
+
+    label: str
+    """one that starts with a space belongs to the row above"""
+    honest: str
+    """the value of a consistent filter, if known"""
+    cells: Sequence[Cell]
+    published: Sequence[float | None] = ()
+    """of each filter, if any has one"""
+    group: str = ""
+    """heading above the rows, on a page"""
+
+
+def cell_text(cell: Cell) -> str:
+    """A cell as text: a verdict with the tests that rejected, and an asterisk if in doubt."""
+    if cell is None:
+        return "-"
+    if isinstance(cell, Summary):
+        tests = [TESTS[name].removeprefix("pose ").removesuffix(" / dof") for name in cell.by]
+        rejected = f" ({', '.join(tests)})" * bool(tests)
+        return cell.verdict + rejected + "*" * bool(cell.doubts)
+    if not isinstance(cell, Average):
+        return cell.text
+    value, low, high = cell
+    if not (np.isfinite(low) or np.isfinite(high)) or (low, high) == (0.0, np.inf):
+        return short(value)
+    if lopsided(cell):
+        return f"{short(value)} [{short(low, 3)}, {short(high, 3)}]".replace("inf", "∞")
+    return f"{short(value)} ± {short((high - low) / 2, 2)}"
+
+
+def short(value: float, digits: int = 4) -> str:
+    """A number with some significant digits; large ones with all of the digits before the point."""
+    return f"{value:,.0f}" if 10**digits <= abs(value) < 1e6 else f"{value:.{digits}g}"
+
+
+def rows_of(campaign: Campaign, names: Sequence[str]) -> list[Row]:
+    """The rows of the table of some filters, without measures that none of them has."""
+    summaries = [campaign.filters[name] for name in names]
+    rows = [Row("verdict", "consistent", summaries)]
+    for measure in _shown(summaries):
+        cells = [s.measures.get(measure.key) for s in summaries]
+        published = [campaign.published.get(name, {}).get(measure.key) for name in names]
+        has_published = any(value is not None for value in published)
+        if has_published or any(cell is not None for cell in cells):
+            honest = "" if measure.honest is None else f"{measure.honest:g}"
+            rows.append(Row(measure.title, honest, cells, published if has_published else ()))
+    return rows + _bands(summaries) + _counts(campaign, names)
+
+
+def _shown(summaries: Sequence[Summary]) -> list[Measure]:
+    """The measures that tables show."""
+    return [one for one in measures_of(key for s in summaries for key in s.measures) if one.row]
+
+
+def _bands(summaries: Sequence[Summary]) -> list[Row]:
+    """The rows of the bands of honest filters, and of the share of steps within them."""
+    nis = [s.nis_band and Figure("[{:.4f}, {:.4f}]".format(*s.nis_band)) for s in summaries]
+    half = [s.autocorrelation_band[0] for s in summaries]
+    white = [Figure(f"± {width:.4f}") if np.isfinite(width) else None for width in half]
+    rows = [
+        Row(f"NIS / dof, {percentage(LEVEL)} band", "", nis, group="Bands"),
+        Row(f"autocorrelation, {percentage(LEVEL)} band", "", white, group="Bands"),
+    ]
+    for block in DOF:
+        shares = [s.inside.get(block) for s in summaries]
+        cells = [None if one is None else Figure(percentage(one, 1), one) for one in shares]
+        rows.append(Row(f"steps in {block} band", percentage(LEVEL, 1), cells, group="Bands"))
+    return rows
+
+
+def _counts(campaign: Campaign, names: Sequence[str]) -> list[Row]:
+    """The rows of the time of a step, and of counts that are not 0 for all filters."""
+    rows = []
+    times = [campaign.step_seconds.get(name) for name in names]
+    if any(times):
+        took = [None if one is None else Figure(f"{1e6 * one:.3g}", 1e6 * one) for one in times]
+        rows.append(Row("time of a step [µs]", "", took, group="Time and counts"))
+    every = [campaign.filters[name].counts for name in names]
+    for key in dict.fromkeys(key for counts in every for key in counts):
+        found = [counts.get(key) for counts in every]
+        if key in _ALWAYS or any(found):
+            cells = [None if one is None else Figure(f"{one:,}", one) for one in found]
+            rows.append(Row(count_label(key), "", cells, group="Time and counts"))
+    return rows
+
+
+def notes_on(campaign: Campaign) -> list[tuple[str, str]]:
+    """Notes on the measures of this campaign: terms, each with a sentence."""
+    summaries = campaign.filters
+    known = {key for summary in summaries.values() for key in summary.measures}
+    out = [one.note for one in measures_of(known) if one.note and one.key in known]
+    lowest: dict[str, list[str]] = {}
+    for name, summary in summaries.items():
+        if summary.honest_nis < 1:
+            lowest.setdefault(f"{summary.honest_nis:.3f}", []).append(name)
+    if lowest:
+        limits = [f"{least} ({', '.join(names)})" for least, names in lowest.items()]
+        out.append(
+            (
+                "gate",
+                "a gate drops the largest innovations: an honest NIS / dof lies between "
+                f"{', '.join(limits)} and 1; the verdict uses this range, the band does not",
+            )
+        )
+    likely = [s for s in summaries.values() if "log_likelihood" in s.measures]
+    if len({s.counts.get("fused") for s in likely}) > 1:
+        out.append(
+            (
+                "log-likelihood",
+                "comparable only between filters that fused the same measurements; their numbers "
+                "differ here",
+            )
+        )
+    counted = {name for s in summaries.values() for name, count in s.counts.items() if count}
+    terms = [f"{count_label(name)}, {what}" for name, what in MEANINGS.items() if name in counted]
+    return out + [("counts, over all runs", "; ".join(terms))] * bool(terms)
+
+
+def lost_runs(campaign: Campaign) -> list[tuple[str, str]]:
+    """The filters that were not finite in some runs, each with a phrase that lists the runs."""
+    out = []
+    for name, summary in campaign.filters.items():
+        lost = summary.not_finite_runs
+        if lost:
+            numbers = ", ".join(map(str, lost[:20])) + (", …" if len(lost) > 20 else "")
+            share = f"{len(lost):,} of {campaign.runs:,} runs"
+            phrase = f"was not finite in {share}, which its measures leave out: {numbers}"
+            out.append((name, phrase))
+    return out

@@ -1,0 +1,183 @@
+"""The figure of a graph before and after its optimization, and the film of the iterates."""
+
+from collections.abc import Mapping, Sequence
+
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Float
+from matplotlib.axes import Axes
+from matplotlib.collections import LineCollection
+from matplotlib.figure import Figure
+
+from jaxslam.graphs import Factor, Graph
+from jaxslam.graphs._graph import successive
+from jaxslam.graphs._solver.model import factors_of
+from jaxslam.results.plot._film import Layer, Panel, Scene, lines_between, marks, still
+from jaxslam.results.plot._style import (
+    COLORS,
+    FAINT,
+    INK,
+    PAGE,
+    SHADE,
+    Look,
+    caption,
+    every_handle,
+    panels_of,
+    titled,
+)
+
+_EDGES: dict[str, Look] = {
+    "measurements of points": {"color": SHADE, "lw": 0.4, "zorder": 1.5},
+    "loop edges": {"color": FAINT, "lw": 0.5, "zorder": 2.0},
+    "path": {"color": COLORS[0], "lw": 0.9, "zorder": 3.0},
+}
+"""How edges look: the path is between poses of successive ids."""
+
+
+def graph_figure(
+    before: Graph,
+    after: Graph,
+    squared: Mapping[str, ArrayLike],
+    *,
+    factors: Mapping[str, Factor] | None = None,
+    worst: int = 10,
+    subtitles: tuple[str, str] = ("before", "after"),
+    title: str = "",
+    width: float = PAGE,
+) -> Figure:
+    """A graph before and after its optimization, side by side, with its worst residuals.
+
+    Edges between poses of successive ids are the path, others are loop edges. Measurements of
+    one variable alone are not drawn.
+
+    Args:
+        before, after: the same graph with different values.
+        squared: eᵀ Ω e of each row after, of `graphs.squared_residuals`.
+        factors: of the tables; by default those of files.
+        worst: number of rows marked in both panels: those with the largest eᵀ Ω e for its size.
+        subtitles: of the panels. width: [in].
+    """
+    factors = factors_of("graph_figure", after, factors)
+    ratios = [
+        (float(value) / len(factors[key].errors), key, row)
+        for key in _drawn(after, factors)
+        for row, value in enumerate(np.asarray(squared[key]))
+    ]
+    largest = sorted((each for each in ratios if each[0] > 0), key=lambda each: -each[0])[:worst]
+    figure, panels = panels_of(width, 0.52 * width, 1, 2, share=(False, False))
+    for axes, graph, text in zip(panels, (before, after), subtitles, strict=True):
+        _draw(axes, graph, factors)
+        if largest:
+            ends = [_ends(graph, factors[key], key)[row] for _, key, row in largest]
+            _mark(axes, np.array(ends))
+        titled(axes, text)
+        axes.set_xlabel("x [m]")
+    panels[0].set_ylabel("y [m]")
+    caption(figure, title, every_handle(panels))
+    return figure
+
+
+def _drawn(graph: Graph, factors: Mapping[str, Factor]) -> list[str]:
+    """The tables of edges between two variables, which are drawn."""
+    return [key for key in graph.tables if len(factors[key].variables) == 2]
+
+
+def _ends(graph: Graph, factor: Factor, key: str) -> Float[np.ndarray, "E 2 2"]:
+    """The positions that the edges of a table join."""
+    poses, who = np.asarray(graph.poses)[:, :2], np.asarray(graph.tables[key].who)
+    other = poses if factor.variables == ("pose", "pose") else np.asarray(graph.points)[:, :2]
+    return np.stack([poses[who[:, 0]], other[who[:, 1]]], axis=1)
+
+
+def _edges(graph: Graph, factors: Mapping[str, Factor]) -> dict[str, Float[np.ndarray, "E 2 2"]]:
+    """The ends of all edges, by the names of `_EDGES`."""
+    found = {name: [np.zeros((0, 2, 2))] for name in _EDGES}
+    for key in _drawn(graph, factors):
+        table, ends = graph.tables[key], _ends(graph, factors[key], key)
+        valid = np.asarray(table.valid)
+        if factors[key].variables == ("pose", "pose"):
+            along = successive(graph, np.asarray(table.who))
+            found["path"].append(ends[valid & along])
+            found["loop edges"].append(ends[valid & ~along])
+        else:
+            found["measurements of points"].append(ends[valid])
+    return {name: np.concatenate(each) for name, each in found.items()}
+
+
+def _draw(axes: Axes, graph: Graph, factors: Mapping[str, Factor]) -> None:
+    """Draw path, loop edges and points."""
+    for name, ends in _edges(graph, factors).items():
+        if len(ends):
+            axes.add_collection(LineCollection(list(ends), alpha=0.8, label=name, **_EDGES[name]))
+            axes.update_datalim(ends.reshape(-1, 2))
+    if len(graph.points):
+        points = np.asarray(graph.points)[:, :2]
+        axes.plot(*points.T, ".", color=COLORS[2], ms=3, label="points", zorder=4)
+    start: Look = {"ls": "none", "color": INK, "mfc": "white", "mew": 1.2, "ms": 5, "zorder": 6}
+    axes.plot(*np.asarray(graph.poses)[0, :2], marker="o", label="first pose", **start)
+    axes.set_aspect("equal", adjustable="datalim")
+    axes.margins(0.04)
+
+
+def _mark(axes: Axes, ends: Float[np.ndarray, "E 2 2"]) -> None:
+    """Mark edges with large residuals."""
+    axes.add_collection(LineCollection(list(ends), colors=COLORS[1], linewidths=1.4, zorder=5))
+    ring: Look = {"ls": "none", "mfc": "none", "mec": COLORS[1], "mew": 0.9, "ms": 5, "zorder": 5}
+    label = f"{len(ends)} largest residuals"
+    axes.plot(*ends.mean(axis=1).T, marker="o", label=label, **ring)
+
+
+def graph_scene(
+    iterates: Sequence[Graph],
+    chi2: Sequence[float],
+    *,
+    steps: Sequence[int] | None = None,
+    factors: Mapping[str, Factor] | None = None,
+    title: str = "",
+    note: str = "",
+) -> Scene:
+    """The scene of one graph at each of F iterates: path, loop edges, points, and χ² as text.
+
+    The last iterate stays in the background. Edges between poses of successive ids are the
+    path, others are loop edges.
+
+    Args:
+        iterates: the same graph with different values, F of them.
+        chi2: of each.
+        steps: the number of the iteration of each; default 0, 1, …
+        factors: of the tables; by default those of files.
+    Raises:
+        ValueError: without iterates, or another number of χ².
+    """
+    if not iterates or len(chi2) != len(iterates):
+        raise ValueError(
+            f"graph_scene: expected as many χ² as iterates, at least 1, got {len(chi2)} "
+            f"and {len(iterates)}"
+        )
+    factors = factors_of("graph_scene", iterates[0], factors)
+    poses = np.stack([np.asarray(graph.poses)[:, :2] for graph in iterates])
+    points = np.stack([np.asarray(graph.points)[:, :2] for graph in iterates])
+    every = [_edges(graph, factors) for graph in iterates]
+    layers: list[Layer] = [still(poses[-1], color=SHADE, lw=2.5, label="path at the end", zorder=1)]
+    for name, look in _EDGES.items():
+        if len(every[0][name]):
+            layers.append(lines_between([edges[name] for edges in every], label=name, **look))
+    if points.shape[1]:
+        dots: Look = {"marker": ".", "ms": 3, "color": COLORS[2], "label": "points", "zorder": 4}
+        layers.append(marks(points, np.ones(points.shape[:2], bool), **dots))
+    first: Look = {"marker": "o", "ms": 5, "mec": INK, "mfc": "white", "label": "first pose"}
+    layers.append(marks(poses[:, :1], np.ones((len(poses), 1), bool), **first))
+
+    def caption(k: int) -> str:
+        step = k if steps is None else steps[k]
+        when = f"iteration {step}" if step else "start"
+        return f"{when}, χ² = {chi2[k]:.6g}"
+
+    # The limits hold the first and the last iterate, and of the others the bulk.
+    places = np.concatenate([poses, points], axis=1)
+    ends, rest = places[[0, -1]].reshape(-1, 2), places.reshape(-1, 2)
+    least = np.minimum(ends.min(axis=0), np.quantile(rest, 0.01, axis=0))
+    most = np.maximum(ends.max(axis=0), np.quantile(rest, 0.99, axis=0))
+    margin = 0.04 * max(float((most - least).max()), 1.0)
+    x, y = ((float(a - margin), float(b + margin)) for a, b in zip(least, most, strict=True))
+    return Scene(len(iterates), Panel(layers, x, y), None, caption, title, note)

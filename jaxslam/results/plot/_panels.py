@@ -1,0 +1,316 @@
+"""Panels of a campaign's filters, all in one or a row for each kind, and their scales.
+
+One extreme filter does not set a scale; values beyond it are marked.
+"""
+
+from collections.abc import Container, Sequence
+from typing import NamedTuple
+
+import numpy as np
+from matplotlib.axes import Axes
+from matplotlib.figure import Figure
+from matplotlib.ticker import LogLocator, NullLocator
+
+from jaxslam._catalog import KINDS
+from jaxslam.consistency._measures.nees import DOF
+from jaxslam.consistency.campaign import Campaign
+from jaxslam.core._validation import check_record
+from jaxslam.results.plot._style import (
+    INK,
+    PAGE,
+    TEXT,
+    caption,
+    curves_of,
+    ordinate,
+    panels_of,
+    plain,
+    titled,
+)
+
+TOGETHER = 5
+"""largest number of curves in a panel"""
+
+
+class Row(NamedTuple):
+    """Filters that are drawn together."""
+
+    kind: str
+    names: dict[str, int]
+    """each with its number (`numbers_of`)"""
+    panels: list[Axes]
+    """one for each quantity"""
+
+
+def kinds_of(names: Sequence[str]) -> list[tuple[str, list[str]]]:
+    """Groups (kind, names) of at most five filters: those of `catalog.KINDS`, then others."""
+    known = {name: kind for kind, members in KINDS.items() for name in members}
+    found = []
+    for kind in [*KINDS, "others"]:
+        chosen = [name for name in names if known.get(name, "others") == kind]
+        found += [(kind, chosen[at : at + TOGETHER]) for at in range(0, len(chosen), TOGETHER)]
+    return found
+
+
+def numbers_of(names: Sequence[str]) -> dict[str, int]:
+    """The number of each filter of a campaign, which gives its look (`look`) in every figure.
+
+    It is the position among the filters, sorted by kind if they are more than five; so the filters
+    of a panel have successive numbers.
+    """
+    if len(names) > TOGETHER:
+        names = [name for _, members in kinds_of(names) for name in members]
+    return {name: i for i, name in enumerate(names)}
+
+
+def sheet(
+    campaign: Campaign,
+    quantities: Sequence[str],
+    *,
+    width: float,
+    only: Container[str] | None = None,
+    height: float | None = None,
+    across: bool = False,
+) -> tuple[Figure, list[Row]]:
+    """An empty figure and its rows of panels, one panel for each quantity in each row.
+
+    Up to five filters share a row, with the panels below each other, or side by side (across). The
+    filters of a larger campaign have a row for each kind, and the figure is as wide as a page at
+    least; panels of a quantity have the same ordinate.
+
+    Args:
+        quantities: what the panels show, with units.
+        width: of the figure [in].
+        only: the filters shown; default all.
+        height: of a panel [in] of few filters; default by the width.
+    """
+    check_record("plot", "the first argument", campaign, Campaign)
+    count = len(quantities)
+    numbers = numbers_of(list(campaign.filters))
+    groups = kinds_of([name for name in numbers if only is None or name in only])
+    if len(numbers) <= TOGETHER or not groups:
+        height = 0.22 * width + 0.35 if height is None else height
+        tall = height * (1 if across else count) + 0.6
+        shape = (1, count) if across else (count, 1)
+        figure, panels = panels_of(width, tall, *shape, share=(True, across))
+        for axes, quantity in zip(panels, quantities, strict=True):
+            if across:
+                titled(axes, quantity)
+            else:
+                ordinate(axes, quantity, height)
+        chosen = {name: i for name, i in numbers.items() if only is None or name in only}
+        return figure, [Row("", chosen, panels)]
+    figure, panels = panels_of(
+        max(width, PAGE),
+        1.05 * len(groups) + 0.7,
+        len(groups),
+        count + 1,
+        share=("col", "col"),
+        widths=[*[1.0] * count, 0.02],
+    )
+    rows = []
+    for i, (kind, members) in enumerate(groups):
+        *measured, beside = panels[i * (count + 1) : (i + 1) * (count + 1)]
+        beside.set_axis_off()
+        measured[0].set_ylabel(kind.replace(" ", "\n"))
+        rows.append(Row(kind, {name: numbers[name] for name in members}, measured))
+    for axes, quantity in zip(rows[0].panels, quantities, strict=True):
+        titled(axes, quantity)
+    return figure, rows
+
+
+def add_legends(figure: Figure, rows: Sequence[Row], title: str, across: str) -> None:
+    """Add the legends, the title, and the label of the abscissa across the last row."""
+    for axes in rows[-1].panels:
+        axes.set_xlabel(across)
+    if not rows[0].kind:
+        for axes in rows[0].panels:
+            axes.label_outer()
+        caption(figure, title)
+        return
+    for row in rows:
+        curves = curves_of(row.panels[0])
+        beside = figure.axes[figure.axes.index(row.panels[-1]) + 1]
+        beside.legend(
+            curves,
+            [str(curve.get_label()) for curve in curves],
+            loc="center left",
+            frameon=False,
+            fontsize=TEXT,
+            borderpad=0,
+            handlelength=2.6,
+        )
+    curves = curves_of(rows[0].panels[0])
+    everything = rows[0].panels[0].get_legend_handles_labels()[0]
+    caption(figure, title, [handle for handle in everything if handle not in curves])
+
+
+def title_of(campaign: Campaign, what: str) -> str:
+    """The title of a figure: the scenario, what is shown, and the number of runs."""
+    runs = f"{campaign.runs:,} run{'s' if campaign.runs != 1 else ''}"
+    return f"{plain(campaign.scenario)}: {what} {runs}"
+
+
+_FAR = 3.0
+"""A filter whose curve exceeds this multiple of the median does not set a scale."""
+
+_NEES = (1 / 10, 10.0, 100.0)
+"""lowest end of a scale of NEES, and least and greatest upper end, in multiples of dof"""
+
+_BAND = 0.06
+"""share of the height of a panel that the 95 % band fills at least, where the scale allows it"""
+
+_POWERS = 6
+"""largest number of powers of ten for which a logarithmic axis labels all of them"""
+
+BEYOND = "beyond"
+"""`gid` of the marks of values beyond an axis."""
+
+_NO_MARK = "", " ", "None", "none"
+"""Matplotlib's names for a line without markers"""
+
+_PLACES = 12
+"""number of marks along an edge"""
+
+
+def scale_setters(campaign: Campaign) -> list[str]:
+    """The filters that set the scale of errors: those that fused measurements and do not diverge.
+
+    All filters if there are none.
+    """
+    names = [
+        name
+        for name, summary in campaign.filters.items()
+        if summary.counts.get("fused", 0) > 0 and summary.verdict != "diverged"
+    ]
+    return names or list(campaign.filters)
+
+
+def common_top(peaks: dict[str, float], setters: list[str]) -> float:
+    """The largest of the peaks that are at most three times the median peak of the setters.
+
+    0 without a finite peak.
+    """
+    finite = {name: peak for name, peak in peaks.items() if np.isfinite(peak)}
+    chosen = [peak for name, peak in finite.items() if name in setters] or list(finite.values())
+    if not chosen:
+        return 0.0
+    limit = _FAR * sorted(chosen)[len(chosen) // 2]
+    return max(peak for peak in finite.values() if peak <= limit)
+
+
+def nees_scale(axes: Axes, campaign: Campaign, block: str) -> None:
+    """Set the ordinate for the NEES of a block, the 95 % band visible.
+
+    It shows the values of all filters within 0.1 to 100 times dof, and less above where the band is
+    narrow; logarithmic over more than a decade.
+    """
+    dof = DOF[block]
+
+    def every(end: str) -> np.ndarray:
+        curves = (summary.curves[f"nees_{block}{end}"] for summary in campaign.filters.values())
+        found = np.concatenate([np.ravel(values) for values in curves])
+        return found[np.isfinite(found) & (found > 0)]
+
+    values, below, above = every(""), every("_low"), every("_high")
+    shown = np.concatenate([values, below, above, [dof / 1.5, dof * 1.5]])
+    low = max(shown.min(), _NEES[0] * dof)
+    decades = np.log(np.median(above) / np.median(below)) / _BAND if below.size else np.inf
+    cap = dof * np.clip(low / dof * np.exp(min(decades, 50.0)), _NEES[1], _NEES[2])
+    set_positive(axes, low, min(shown.max(), cap))
+
+
+def set_positive(
+    axes: Axes,
+    low: float,
+    high: float,
+    which: str = "y",
+    *,
+    margin: float = 0.06,
+    linear: float = 10.0,
+) -> None:
+    """Set an axis (x or y) for numbers from low to high, with a margin as a share of the length.
+
+    It is logarithmic if the largest is over `linear` times the smallest, with labels at 1, 2 and 5
+    of each decade, or 1 and 3, or 1 alone, by the room.
+    """
+    axis = axes.yaxis if which == "y" else axes.xaxis
+    set_limits = axes.set_ylim if which == "y" else axes.set_xlim
+    if high <= linear * low:
+        room = margin * (high - low) or 0.1 * high
+        set_limits(max(low - room, 0.0), high + room)
+        return
+    axes.set(**{f"{which}scale": "log"})
+    room = (high / low) ** margin
+    set_limits(low / room, high * room)
+    length, label = (axes.bbox.height, 11) if which == "y" else (axes.bbox.width, 28)  # [pt]
+    length *= 72 / axes.figure.dpi
+    axis.set_major_locator(LogLocator(numticks=int(np.clip(length / label, 2, _POWERS))))
+    axis.set_major_formatter(_short)
+    decade = length / np.log10(high / low)
+    digits = next((d for d in ("25", "3") if np.log10(int(d[0])) * decade > label), "")
+    if digits:
+        axis.set_minor_formatter(lambda x, _: _short(x) if f"{x:.0e}"[0] in digits else "")
+    else:
+        axis.set_minor_locator(NullLocator())
+
+
+def _short(x: float, _: float = 0.0) -> str:
+    return f"{x:g}" if 1e-3 <= abs(x) < 1e5 else power(x)
+
+
+def power(x: float) -> str:
+    """A positive number to two digits, with a power of ten where it is large or small."""
+    if 1e-3 <= x < 1e4:
+        return f"{x:.2g}" if x < 100 else f"{x:.0f}"
+    mantissa, exponent = f"{x:.0e}".split("e")
+    times = "" if mantissa == "1" else rf"{mantissa}\cdot "
+    return f"${times}10^{{{int(exponent)}}}$"
+
+
+def mark_beyond(axes: Axes) -> None:
+    """Mark values beyond the ends of the ordinate with the markers of their curves, at the edges.
+
+    Marks of different filters are at different places; a curve without marks has arrows. The
+    greatest value is written above the panel, the least one only if the axis goes below 0. Call it
+    after the limits are set.
+    """
+    low, high = axes.get_ylim()
+    left, right = axes.get_xlim()
+    curves, largest, least = curves_of(axes), -np.inf, np.inf
+    for i, line in enumerate(curves):
+        x, y = (np.asarray(part, float) for part in line.get_data())
+        order = np.flatnonzero(np.isfinite(x) & np.isfinite(y))
+        if not order.size:
+            continue
+        x, y = x[order], y[order]
+        places = x
+        if len(x) > _PLACES:
+            offset = (i + 0.5) / max(len(curves), 1)
+            places = np.interp((np.arange(_PLACES) + offset) / _PLACES, [0, 1], [left, right])
+        near = np.abs(x[:, None] - places).argmin(axis=0)
+        marker = str(line.get_marker())
+        for out, edge, arrow in ((y > high, 1.0, "$\u2191$"), (y < low, 0.0, "$\u2193$")):
+            if not out.any():
+                continue
+            at = np.unique(near[out[near]])
+            at = at if at.size else np.flatnonzero(out)[:1]
+            axes.plot(
+                x[at],
+                np.full(len(at), edge),
+                marker=arrow if marker in _NO_MARK else marker,
+                linestyle="none",
+                transform=axes.get_xaxis_transform(),
+                color=line.get_color(),
+                mec=INK,
+                mew=0.4,
+                ms=4.5,
+                clip_on=False,
+                zorder=6,
+                gid=BEYOND,
+            )
+        largest = max(largest, y.max())
+        least = min(least, y.min())
+    texts = [f"↑ to {power(largest)}"] if largest > high else []
+    texts += [f"↓ to −{power(-least)}"] if least < low < 0 else []
+    if texts:
+        axes.set_title(", ".join(texts), loc="right", fontsize=7, color=INK)

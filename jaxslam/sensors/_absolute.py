@@ -1,0 +1,80 @@
+"""Sensors of the robot's state in the map, without a landmark."""
+
+import jax.numpy as jnp
+from numpy.typing import ArrayLike
+
+from jaxslam.core._noise import NoiseCov
+from jaxslam.core._record import record
+from jaxslam.core.protocols import Sensor
+from jaxslam.math._arrays import (
+    InvertJacobians,
+    Landmark,
+    Measurement,
+    ObserveJacobians,
+    Point,
+    Pose,
+    Unmeasured,
+)
+
+
+class Absolute(Sensor):
+    """A sensor z = rows of pose ∘ mount, with L = 0: invert, embed and position are not used."""
+
+    landmark = ()
+    rows: slice
+
+    def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
+        return self.frame(pose)[self.rows]
+
+    def observe_jacobians(self, pose: Pose, landmark: Landmark) -> ObserveJacobians:
+        by_pose = self.frame_jacobian(pose)[self.rows]
+        return by_pose, by_pose[:, :0]
+
+    def invert(self, pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
+        return jnp.zeros(0, pose.dtype)
+
+    def invert_jacobians(self, pose: Pose, z: Measurement, s: Unmeasured) -> InvertJacobians:
+        none = jnp.zeros((0, 3), pose.dtype)
+        return none, none[:, : len(self.measurements)], none[:, :0]
+
+    def position(self, landmark: Landmark) -> Point:
+        return jnp.zeros(2, landmark.dtype)
+
+    def embed(self, pose: Pose, point: Point) -> Landmark:
+        return jnp.zeros(0, pose.dtype)
+
+
+@record
+class Compass(Absolute):
+    """The compass, an absolute sensor of the heading.
+
+    z = (heading [rad]) = wrap(θ + θ_mount), counter-clockwise from the map's x-axis.
+
+    An absolute sensor (Williams' list of observations): there is no landmark, L = 0, and `invert`,
+    `embed` and `position` (zeros) are not used.
+    """
+
+    noise_cov: NoiseCov
+    """(1, 1) covariance of the heading, or a function of z."""
+    mount: ArrayLike | None = None
+    """(3,) pose of the sensor on the robot; only its angle matters."""
+    measurements = ("heading [rad]",)
+    rows = slice(2, 3)
+
+
+@record
+class PositionFix(Absolute):
+    """The position fix, an absolute sensor of the antenna's position.
+
+    z = (x [m], y [m]) of the antenna: t + R(θ) t_mount, the translation of pose ∘ mount.
+
+    An absolute sensor (GPS in Williams' list of observations): there is no landmark, L = 0, and
+    `invert`, `embed` and `position` (zeros) are not used.
+    """
+
+    noise_cov: NoiseCov
+    """(2, 2) covariance of z, or a function of z."""
+    mount: ArrayLike | None = None
+    """(3,) pose of the antenna on the robot; its angle does not matter."""
+    measurements = ("x [m]", "y [m]")
+    rows = slice(0, 2)

@@ -1,0 +1,260 @@
+"""Several sensors on one robot, each with a model, mount, rate and measurement slots.
+
+And the base class of sensors that change some methods of another.
+"""
+
+import itertools
+from collections.abc import Callable, Sequence
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+from jax import Array
+
+from jaxslam.core._numbers import check_count
+from jaxslam.core._record import hold_function, record, set_field, static
+from jaxslam.core.protocols import Free, Reduced, Sensor
+from jaxslam.core.types import Scan
+from jaxslam.math._arrays import Landmark, Measurement, Point, Pose, Unmeasured
+
+
+class Wrapped(Sensor):
+    """A sensor that holds another, with whose methods it answers unless it defines them."""
+
+    sensor: Sensor
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        return self.sensor.name
+
+    @property
+    def measurements(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self.sensor.measurements
+
+    @property
+    def landmark(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self.sensor.landmark
+
+    @property
+    def free(self) -> Free:  # type: ignore[override]
+        return self.sensor.free
+
+    def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
+        return self.sensor.observe(pose, landmark)
+
+    def residual(self, z: Measurement, z_hat: Measurement) -> Measurement:
+        return self.sensor.residual(z, z_hat)
+
+    def noise_cov(self, z: Measurement) -> Array:
+        cov: Array = self.sensor.noise_cov(z)
+        return cov
+
+    def invert(self, pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
+        return self.sensor.invert(pose, z, s)
+
+    def position(self, landmark: Landmark) -> Point:
+        return self.sensor.position(landmark)
+
+    def embed(self, pose: Pose, point: Point) -> Landmark:
+        return self.sensor.embed(pose, point)
+
+
+@record
+class Part:
+    """One sensor of a suite. Raises ValueError on places or every below 1, or an invalid start."""
+
+    sensor: Sensor
+    places: int = static()
+    """its measurement slots in a scan; 1 of an absolute sensor"""
+    every: int = static(default=1)
+    """interval of its measurements in a simulation, in steps,"""
+    start: int = static(default=0)
+    """and first step; a filter uses only `Scan.valid`"""
+    visible: Callable[[Array, Array], Array] | None = None
+    """(pose, l) -> (): its field of view in a simulation; None for that of the scenario"""
+    sees: Literal["landmarks", "robots"] = static(default="landmarks")
+    """what its slots measure in a simulation. A filter of one robot ignores measurements of
+    robots (`Status.UNMATCHED`); that of a team uses the tags, and starts no landmark there."""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.sensor, Sensor) or isinstance(self.sensor, Suite):
+            raise ValueError(f"Part: expected one Sensor, got {type(self.sensor).__name__}")
+        check_count(f"Part: places of {self.sensor.name}", self.places)
+        check_count(f"Part: every of {self.sensor.name}", self.every)
+        if type(self.start) is not int or self.start < 0:
+            raise ValueError(f"Part: expected a start of at least 0, got {self.start!r}")
+        if self.sees not in ("landmarks", "robots"):
+            raise ValueError(f'Part: expected sees "landmarks" or "robots", got {self.sees!r}')
+        if self.visible is not None:
+            hold_function(self, "visible", "pose, l")
+        if not self.sensor.landmark and self.places != 1:
+            raise ValueError(
+                f"Part: expected places=1 of the absolute sensor {self.sensor.name}, got "
+                f"{self.places}"
+            )
+
+    @property
+    def absolute(self) -> bool:
+        """Whether it is an absolute sensor, which measures the robot and no landmark."""
+        return not self.sensor.landmark
+
+
+@record
+class Suite(Sensor):
+    """The sensors of one robot (Solà's loop over sensors), to be used where a `Sensor` is.
+
+    A filter processes the parts one after the other: each corrects by its measurements of known
+    landmarks, then starts its new ones, which the next part may correct in the same scan.
+    A tag may occur once a part. Absent measurements are slots that are not valid.
+
+        eyes = Suite([(RangeBearing(R, mount=front), 8), Part(Compass(S), 1, every=10)])
+        filter = EkfSlam(motion, eyes, capacity)
+
+    The first slots of a scan are the first part's, the next ones the second's, and so on. Rows of
+    z are padded with zeros to the largest measurement. As a `Sensor` it only gives the sizes of
+    measurements and landmarks; the models are those of its parts.
+
+    Raises ValueError without parts, on a part of another type, or if several sensors of landmarks
+    do not share landmarks (x, y): only a single one may have others.
+    """
+
+    parts: tuple[Part, ...]
+    """each given as a `Part` or (sensor, places)"""
+
+    def __post_init__(self) -> None:
+        if not isinstance(self.parts, Sequence):
+            got = type(self.parts).__name__
+            raise ValueError(f"Suite: expected parts in a list or a tuple, got {got}")
+        made = tuple(part if isinstance(part, Part) else _part(part) for part in self.parts)
+        if not made:
+            raise ValueError("Suite: expected at least one sensor")
+        grounded = [part.sensor for part in made if not part.absolute]
+        for sensor in grounded[1:]:
+            if sensor.landmark != grounded[0].landmark or not sensor.of_points:
+                raise ValueError(
+                    f"Suite: expected sensors that share landmarks (x, y), got "
+                    f"{grounded[0].landmark} of {grounded[0].name} and {sensor.landmark} of "
+                    f"{sensor.name}"
+                )
+        set_field(self, "parts", made)
+
+    @property
+    def first(self) -> Sensor:
+        """The first sensor of landmarks, whose kind of landmarks all have; or of all."""
+        grounded = [part.sensor for part in self.parts if not part.absolute]
+        return grounded[0] if grounded else self.parts[0].sensor
+
+    @property
+    def places(self) -> tuple[int, ...]:
+        """The number of measurement slots of each part."""
+        return tuple(part.places for part in self.parts)
+
+    @property
+    def name(self) -> str:  # type: ignore[override]
+        return " + ".join(part.sensor.name for part in self.parts)
+
+    @property
+    def measurements(self) -> tuple[str, ...]:  # type: ignore[override]
+        size = max(len(part.sensor.measurements) for part in self.parts)
+        return tuple(f"entry {i} of its sensor" for i in range(size))
+
+    @property
+    def landmark(self) -> tuple[str, ...]:  # type: ignore[override]
+        return self.first.landmark
+
+    @property
+    def carry(self) -> Callable[[Array, Array], Array] | None:
+        carry: Callable[[Array, Array], Array] | None = self.first.carry
+        return carry
+
+    @property
+    def reduced(self) -> Reduced | None:  # type: ignore[override]
+        return self.first.reduced
+
+    def position(self, landmark: Landmark) -> Point:
+        return self.first.position(landmark)
+
+    def embed(self, pose: Pose, point: Point) -> Landmark:
+        return self.first.embed(pose, point)
+
+    def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
+        raise ValueError("Suite: a suite has no model of its own: call those of its parts")
+
+    def residual(self, z: Measurement, z_hat: Measurement) -> Measurement:
+        return self.observe(z, z_hat)
+
+    def noise_cov(self, z: Measurement) -> Array:
+        return self.observe(z, z)
+
+    def invert(self, pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
+        return self.observe(pose, z)
+
+
+def _part(given: object) -> Part:
+    if not isinstance(given, tuple) or len(given) != 2:
+        raise ValueError(f"Suite: expected a Part or (sensor, places), got {type(given).__name__}")
+    return Part(*given)
+
+
+def split_scan(scan: Scan, places: Sequence[int]) -> list[Scan]:
+    """The scan (M,) divided into the scans of the sensors, in order.
+
+    Raises ValueError unless the scan has as many slots as the sensors together.
+    """
+    if sum(places) != scan.tag.shape[0]:
+        raise ValueError(
+            f"suite: expected {sum(places)} measurement slots in a scan, {tuple(places)} by "
+            f"sensor, got {scan.tag.shape[0]}"
+        )
+    ends = list(itertools.accumulate(places))
+    return [
+        jax.tree.map(lambda leaf, first=end - count, end=end: leaf[first:end], scan)
+        for end, count in zip(ends, places, strict=True)
+    ]
+
+
+def on_ground(sensor: Sensor, size: int) -> Sensor:
+    """The sensor for landmarks of `size` numbers, of which it uses the first."""
+    return sensor if len(sensor.landmark) == size else _OnGround(sensor, size)
+
+
+@record
+class _OnGround(Wrapped):
+    """A sensor for landmarks of more numbers than it uses.
+
+    A measurement does not depend on the others: an absolute sensor ignores them all, and in a new
+    landmark they have zero mean, unit variance and no correlation, as padding.
+    """
+
+    sensor: Sensor
+    size: int = static()
+
+    @property
+    def landmark(self) -> tuple[str, ...]:  # type: ignore[override]
+        entries = self.sensor.landmark
+        return (*entries, *("-",) * (self.size - len(entries)))
+
+    @property
+    def free(self) -> Free:  # type: ignore[override]
+        prior, spare = self.sensor.free, self.size - len(self.sensor.landmark)
+        mean = jnp.asarray(prior.mean)
+        kept = mean.shape[0]
+        cov = jnp.eye(kept + spare, dtype=mean.dtype).at[:kept, :kept].set(prior.cov)
+        return Free(jnp.concatenate([mean, jnp.zeros(spare, mean.dtype)]), cov)
+
+    def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
+        return self.sensor.observe(pose, self._own(landmark))
+
+    def invert(self, pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
+        kept = self.sensor.free.mean.shape[0]
+        return jnp.concatenate([self.sensor.invert(pose, z, s[:kept]), s[kept:]])
+
+    def position(self, landmark: Landmark) -> Point:
+        return self.sensor.position(self._own(landmark))
+
+    def embed(self, pose: Pose, point: Point) -> Landmark:
+        landmark = self.sensor.embed(pose, point)
+        return jnp.concatenate([landmark, jnp.zeros(self.size - len(landmark), pose.dtype)])
+
+    def _own(self, landmark: Landmark) -> Array:
+        return landmark[: len(self.sensor.landmark)]

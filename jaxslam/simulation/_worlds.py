@@ -1,0 +1,297 @@
+"""The world generator: `simulate` draws a truth and the log a robot records, from a scenario and a
+key."""
+
+from collections.abc import Mapping
+from dataclasses import field
+from functools import partial
+from typing import Literal
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+from numpy.typing import ArrayLike
+
+from jaxslam.core._numbers import check_covariance, check_key, held_array, is_concrete
+from jaxslam.core._record import FrozenDict, hold_function, record, set_field, static
+from jaxslam.core._validation import call_traced, check_record
+from jaxslam.core.protocols import Component, Motion, Sensor
+from jaxslam.core.types import Log, Scan, Truth
+from jaxslam.filters._ekf.ekf_settings import EkfOptions
+from jaxslam.math.angles import wrap
+from jaxslam.sensors._suite import Suite
+from jaxslam.simulation._scans import (
+    Visible,
+    draw_gaussian,
+    everywhere,
+    normals_like,
+    part_scan,
+    sensor_scans,
+    side_by_side,
+)
+from jaxslam.simulation._spurious import Spurious, spoil
+
+
+class World(Component):
+    """A simulated experiment: models, a map, controls, and options of the filters under test.
+
+    A subclass is a record (`core.record`) that has these fields or properties and defines `draw`.
+    Arrays are held on the host in float64 and enter a simulation in the dtype JAX is set to.
+    """
+
+    motion: Motion
+    sensor: Sensor
+    """the models that filters and bounds assume"""
+    landmarks: ArrayLike
+    """(N, L) true landmarks; the tag of one is its row. May be traced: maps vary under `vmap`."""
+    controls: ArrayLike
+    """(T, U) nominal controls."""
+    pose: ArrayLike
+    """(3,) mean of the filter's prior of the pose before the first control."""
+    pose_cov: ArrayLike
+    """(3, 3) covariance of the true start about `pose`, and of that prior."""
+    places: int | None = None
+    """M measurement slots of a scan; None for as many as there are landmarks."""
+    spurious: Spurious | None = None
+    filter_options: EkfOptions = EkfOptions()
+    """keyword arguments of `filters.EkfSlam` that belong to the experiment: update, gate, …"""
+    published: Mapping[str, Mapping[str, float]] = FrozenDict()
+    """figures of the paper, by filter and by the names of `consistency.Summary.measures`."""
+    source: str = ""
+    """where the experiment is published."""
+    recorded_runs: int | None = None
+    """how many runs there are; None where they are drawn"""
+
+    def __repr__(self) -> str:
+        landmarks, models = np.shape(self.landmarks)[0], f"{self.motion.name}, {self.sensor.name}"
+        what = f"{self.name!r}, {self.steps} steps, {landmarks} landmarks, {models}"
+        return f"{type(self).__name__}({what})"
+
+    def __post_init__(self) -> None:
+        what = f"{type(self).__name__} {self.name!r}"
+        self._check(World, {"draw": "key"})
+        check_record(what, "motion", self.motion, Motion)
+        check_record(what, "sensor", self.sensor, Sensor)
+        _check_table(f"{what}: landmarks", self.landmarks, len(self.sensor.landmark))
+        _check_table(f"{what}: controls", self.controls, len(self.motion.controls))
+        if np.shape(self.pose) != (3,):
+            raise ValueError(f"{what}: pose: expected shape (3,), got {np.shape(self.pose)}")
+        _check_table(f"{what}: pose", np.reshape(self.pose, (1, -1)), 3)
+        check_covariance(f"{what}: pose_cov", self.pose_cov, 3)
+        for name in ("landmarks", "controls", "pose", "pose_cov"):
+            if name in self.__dict__:
+                set_field(self, name, held_array(getattr(self, name)))
+        for name in ("filter_options", "published"):
+            if name in self.__dict__:
+                set_field(self, name, FrozenDict.of(f"{what}: {name}", getattr(self, name)))
+
+    @property
+    def steps(self) -> int:
+        """The number of steps T."""
+        return int(np.shape(self.controls)[0])
+
+    def draw(self, key: Array) -> tuple[Truth, Log]:
+        """A random history: the truth, and the log of controls and noisy scans."""
+        raise NotImplementedError
+
+    def run(self, key: Array, number: int | Array) -> tuple[Truth, Log]:
+        """The history of run `number` of a campaign with that key; traceable."""
+        return drawn(self, run_keys(key, number)[0])
+
+
+@record
+class Scenario(World):
+    """A simulated experiment of one robot among landmarks.
+
+    Raises ValueError on inconsistent shapes or values that are not finite.
+    """
+
+    name: str = static()
+    motion: Motion = field()
+    sensor: Sensor = field()
+    landmarks: ArrayLike = field()
+    """(N, L) true landmarks; the tag of one is its row. May be traced: maps vary under `vmap`."""
+    controls: ArrayLike = field()
+    """(T, U) nominal controls."""
+    pose: ArrayLike = (0.0, 0.0, 0.0)
+    """(3,) mean of the filter's prior of the pose before the first control."""
+    pose_cov: ArrayLike = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
+    """(3, 3) covariance of the true start about `pose`, and of that prior."""
+    noise_on: Literal["robot", "odometry"] = static(default="robot")
+    """"robot": the noise moves the true robot, and the log holds the nominal control. "odometry":
+    the true robot follows the nominal control, and the noise is on the control in the log."""
+    visible: Visible = everywhere
+    """the sensor's field of view."""
+    places: int | None = static(default=None)
+    """M measurement slots of a scan; default N. The lowest tags get a slot first, and the landmarks
+    in view beyond M are counted in `Truth.missed`."""
+    spurious: Spurious | None = None
+    """clutter, misses, outliers and wrong labels; where given, if only as `Spurious()`, the truth
+    says which landmark each measurement is of, and associations are scored."""
+    filter_options: EkfOptions = static(default=FrozenDict())
+    """keyword arguments of `filters.EkfSlam` that belong to the experiment: update, gate, …"""
+    published: Mapping[str, Mapping[str, float]] = static(default=FrozenDict())
+    """figures of the paper, by filter and by the names of `consistency.Summary.measures`."""
+    source: str = static(default="")
+    """where the experiment is published."""
+
+    def __post_init__(self) -> None:
+        super().__post_init__()
+        what = f"Scenario {self.name!r}"
+        hold_function(self, "visible", "pose, l")
+        if self.noise_on not in ("robot", "odometry"):
+            raise ValueError(
+                f'{what}: expected noise_on "robot" or "odometry", got {self.noise_on!r}'
+            )
+        if self.noise_on == "odometry" and self.motion.perturb is None:
+            raise ValueError(f"{what}: expected a motion with `perturb` for noise on the odometry")
+        if self.places is not None and self.places < 1:
+            raise ValueError(f"{what}: expected places >= 1, got {self.places}")
+        if isinstance(self.sensor, Suite) and (self.places or self.spurious) is not None:
+            raise ValueError(
+                f"{what}: expected neither places nor spurious with a suite: each Part has "
+                "its own places"
+            )
+
+    def draw(self, key: Array) -> tuple[Truth, Log]:
+        """Draw the start, the path, the scans, and their spurious measurements."""
+        dtype = jnp.result_type(float)
+        controls = jnp.asarray(self.controls, dtype)
+        landmarks = jnp.asarray(self.landmarks, dtype)
+        # Three keys without spurious measurements: faults do not change the other draws.
+        keys = jax.random.split(key, 3 if self.spurious is None else 4)
+        key_motion, key_scan, key_start = keys[:3]
+        start = drawn_near(jnp.asarray(self.pose, dtype), self.pose_cov, key_start)
+        poses, logged = drive(self.motion, start, controls, key_motion, self.noise_on)
+        if isinstance(self.sensor, Suite):
+            scan, missed = self._suite_scans(self.sensor, poses, landmarks, key_scan)
+            return Truth(poses, landmarks, missed, start), Log(logged, scan)
+        places = self.places or landmarks.shape[0]
+        scan, missed = sensor_scans(
+            self.sensor, self.visible, places, poses, landmarks, None, key_scan
+        )
+        truth = Truth(poses, landmarks, missed, start)
+        if self.spurious is not None:
+            wrong = partial(spoil, self.spurious, self.sensor)
+            scan, origin = jax.vmap(wrong)(poses, scan, jax.random.split(keys[3], self.steps))
+            truth = truth._replace(origin=origin)
+        return truth, Log(logged, scan)
+
+    def _suite_scans(
+        self,
+        sensors: Suite,
+        poses: Float[Array, "T 3"],
+        landmarks: Float[Array, "N L"],
+        key: Array,
+    ) -> tuple[Scan, Int[Array, "T"]]:
+        """The scans of all sensors of a single robot, side by side; it measures no other robot."""
+        tags = jnp.arange(landmarks.shape[0])
+        targets = {"landmarks": (landmarks, tags), "robots": (landmarks[:0], tags[:0])}
+        keys = jax.random.split(key, len(sensors.parts))
+        scans = [
+            part_scan(part, self.visible, poses, *targets[part.sees], part_key)
+            for part, part_key in zip(sensors.parts, keys, strict=True)
+        ]
+        return side_by_side(scans, len(sensors.measurements))
+
+
+def simulate(scenario: World, key: Array) -> tuple[Truth, Log]:
+    """One random history of a world: the truth, and the log of controls and noisy scans.
+
+    Of a world of recorded runs it is one of them.
+
+    Traceable, so `jax.vmap(partial(simulate, scenario))(keys)` draws a batch. It is compiled once
+    for a structure, as `run` is. The filters of a campaign all get the same draws.
+    """
+    check_record("simulate", "scenario", scenario, World)
+    check_key("simulate", key)
+    found: tuple[Truth, Log] = _draw(scenario, key)
+    return found
+
+
+@partial(jax.jit, inline=True)
+def _draw(scenario: World, key: Array) -> tuple[Truth, Log]:
+    return drawn(scenario, key)
+
+
+def drawn(scenario: World, key: Array) -> tuple[Truth, Log]:
+    """The truth and log that a world draws; raises ValueError on anything else."""
+    name = f"{scenario.name}: draw"
+    found = call_traced(name, scenario.draw, key)
+    kinds = tuple(map(type, found)) if isinstance(found, tuple) else (type(found),)
+    if kinds != (Truth, Log):
+        got = ", ".join(kind.__name__ for kind in kinds)
+        raise ValueError(f"{name}: expected (Truth, Log), got {got}")
+    return found
+
+
+def world_of_run(scenario: World, key: Array, number: int) -> tuple[Truth, Log]:
+    """The truth and the log of run `number` of a campaign with that key.
+
+    Raises ValueError where that run is not among the recorded ones.
+    """
+    most = scenario.recorded_runs
+    if most is not None and not 0 <= number < most:
+        raise ValueError(
+            f"{scenario.name}: expected a run from 0 to {most - 1}, the recorded ones, got {number}"
+        )
+    found: tuple[Truth, Log] = _draw_run(scenario, key, number)
+    return found
+
+
+@jax.jit
+def _draw_run(scenario: World, key: Array, number: int) -> tuple[Truth, Log]:
+    return scenario.run(key, number)
+
+
+def run_keys(key: Array, number: int | Array) -> Array:
+    """The two keys of a campaign's run of that number: of its world, and of its filter."""
+    return jax.random.split(jax.random.fold_in(key, number))
+
+
+def with_positions(sensor: Sensor, truth: Truth) -> Truth:
+    """The truth with positions (N, 2) for landmarks other than points, as figures need them."""
+    if sensor.of_points or not sensor.landmark:
+        return truth
+    return truth._replace(landmarks=jax.vmap(sensor.position)(jnp.asarray(truth.landmarks)))
+
+
+def drawn_near(pose: Float[Array, "3"], cov: ArrayLike, key: Array) -> Float[Array, "3"]:
+    """A random pose, from the normal distribution of that mean and covariance (3, 3)."""
+    start = pose + draw_gaussian(jnp.asarray(cov, pose.dtype), normals_like(key, pose))
+    return start.at[2].set(wrap(start[2]))
+
+
+def drive(
+    motion: Motion,
+    start: Float[Array, "3"],
+    controls: Float[Array, "T U"],
+    key: Array,
+    noise_on: str = "robot",
+) -> tuple[Float[Array, "T 3"], Float[Array, "T U"]]:
+    """The true poses, and the controls that the robot's log shows."""
+    normals = normals_like(key, jnp.zeros((controls.shape[0], len(motion.noises)), controls.dtype))
+
+    def step(pose: Array, row: tuple[Array, Array]) -> tuple[Array, tuple[Array, Array]]:
+        u, normal = row
+        w = draw_gaussian(motion.noise_cov(pose, u), normal)
+        if noise_on == "robot":
+            pose = motion.step(pose, u, w)
+            return pose, (pose, u)
+        assert motion.perturb is not None
+        pose = motion.step(pose, u, jnp.zeros_like(w))
+        return pose, (pose, motion.perturb(u, w))
+
+    _, history = jax.lax.scan(step, start, (controls, normals))
+    return history
+
+
+def _check_table(name: str, values: ArrayLike, columns: int) -> None:
+    shape = np.shape(values)
+    if len(shape) == 2 and shape[1] == columns and shape[0] > 0 and not is_concrete(values):
+        return  # a tracer, as when maps are drawn under vmap
+    table = np.asarray(values)
+    if table.ndim != 2 or table.shape[1] != columns or table.shape[0] == 0:
+        raise ValueError(f"{name}: expected shape (N, {columns}) with N >= 1, got {table.shape}")
+    if not np.issubdtype(table.dtype, np.number) or not np.all(np.isfinite(table)):
+        raise ValueError(f"{name}: expected finite numbers")

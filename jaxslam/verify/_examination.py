@@ -1,0 +1,131 @@
+"""All Jacobians of a model at all states, with the other checks, in float64."""
+
+import contextlib
+from collections.abc import Callable, Iterator
+from typing import NamedTuple, TypeAlias
+
+import jax
+import numpy as np
+
+from jaxslam.core.protocols import Motion, Sensor
+from jaxslam.graphs import Factor
+from jaxslam.laser.grids.beam_models import BeamModel
+from jaxslam.math._arrays import float64
+from jaxslam.math._xla import quick_jit
+from jaxslam.verify import _properties as properties
+from jaxslam.verify._findings import Check
+from jaxslam.verify._finite import singular_notes
+from jaxslam.verify._inputs import samples
+from jaxslam.verify._inputs.functions import Function, motion_functions, sensor_functions
+from jaxslam.verify._inputs.samples import Samples
+from jaxslam.verify._jacobians import Evaluated, evaluate_jacobians
+from jaxslam.verify._user_errors import describe_error
+from jaxslam.verify.linearity import motion_linearity, sensor_linearity
+
+Model: TypeAlias = Motion | Sensor | Factor | BeamModel | Callable[..., jax.Array]
+
+
+class _Examined(NamedTuple):
+    """All Jacobians of a model at all states, and the results of the other checks."""
+
+    evaluated: tuple[Evaluated, ...]
+    checks: tuple[Check, ...]
+    singular: tuple[str, ...]
+    """notes on where a function of places is not finite"""
+
+
+def examine(
+    model: Model,
+    functions: tuple[Function, ...],
+    given: Samples | None = None,
+    count: int = 24,
+    seed: int = 0,
+) -> _Examined:
+    """Evaluate all Jacobians of a model, and run the other checks, in float64.
+
+    Args:
+        model: a `Motion`, a `Sensor`, or a function.
+        functions: of the model, as from `functions_of`.
+        given: the states for the first function, instead of samples.
+        count, seed: of the random states.
+    """
+    with float64(), np.errstate(all="ignore"):
+        drawn = _samples_of(functions, model, count, seed)
+        if given is not None:
+            drawn = (given, *drawn[1:])
+            if isinstance(model, Sensor) and model.landmark:
+                # Where `observe` fails, its own checks say so, and `invert` keeps the drawn states.
+                with contextlib.suppress(Exception, SystemExit):
+                    drawn = (given, samples.given_inverse(model, given, drawn[1]))
+        evaluated = tuple(
+            evaluate_jacobians(f, sampled) for f, sampled in zip(functions, drawn, strict=True)
+        )
+        checks: list[Check] = []
+        for one in evaluated:
+            checks += [*one.checks, *properties.function_checks(one)]
+            if isinstance(model, Motion | Sensor | BeamModel):
+                checks += properties.dtype_checks(one)
+        if all(one.values is not None for one in evaluated):  # else they fail for the same reason
+            checks += _model_checks(model, drawn)
+        singular: list[str] = []
+        if given is None and not isinstance(model, Motion | Sensor):
+            singular = [note for one in evaluated for note in singular_notes(one)]
+    return _Examined(evaluated, tuple(checks), tuple(singular))
+
+
+def functions_of(model: Motion | Sensor) -> tuple[Function, ...]:
+    """The functions of a model whose Jacobians are verified."""
+    return motion_functions(model) if isinstance(model, Motion) else sensor_functions(model)
+
+
+def _model_checks(model: Model, drawn: tuple[Samples, ...]) -> Iterator[Check]:
+    """The checks of a motion model or a sensor as a whole."""
+    try:
+        if isinstance(model, Motion):
+            yield from properties.motion_checks(model, drawn[0])
+        elif isinstance(model, Sensor):
+            yield from properties.sensor_checks(model, *drawn)
+    except (Exception, SystemExit) as error:
+        yield Check("the remaining checks", False, describe_error(error))
+
+
+def typical_linearity(model: Model, examined: _Examined) -> float | None:
+    """The median linearity index over the random states; None for a function or if it fails.
+
+    Standard deviations follow from the units.
+    """
+    if not isinstance(model, Motion | Sensor):
+        return None
+    first = examined.evaluated[0]
+    usual = [i for i, label in enumerate(first.samples.labels) if label in samples.NOMINAL]
+    states = tuple(a[usual] for a in first.samples.values)
+    spread = [
+        np.array([_standard_deviation(e) for e in a.entries]) for a in first.function.arguments
+    ]
+
+    def index(*state: jax.Array) -> jax.Array:
+        if isinstance(model, Motion):
+            return motion_linearity(model, state[0], state[1], np.diag(spread[0]) ** 2).hessian
+        cov = np.diag(np.concatenate(spread)) ** 2
+        return sensor_linearity(model, state[0], state[1], cov).hessian
+
+    try:
+        return float(np.median(np.asarray(quick_jit(jax.vmap(index))(*states))))
+    except (Exception, SystemExit):  # the checks report what is wrong with the model
+        return None
+
+
+def _standard_deviation(entry: str) -> float:
+    """The standard deviation of a start: 0.05 of an angle or inverse depth, 0.1 of all else."""
+    return 0.05 if entry.endswith(("[rad]", "[1/m]")) else 0.1
+
+
+def _samples_of(
+    functions: tuple[Function, ...], model: Model, count: int, seed: int
+) -> tuple[Samples, ...]:
+    """The states at which each function is evaluated."""
+    if isinstance(model, Sensor):
+        # A sensor whose `embed` fails is tried at states drawn by units alone.
+        with contextlib.suppress(Exception, SystemExit):
+            return samples.sensor_samples(model, count, seed)
+    return tuple(samples.argument_samples(f.arguments, count, seed) for f in functions)

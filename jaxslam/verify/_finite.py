@@ -1,0 +1,88 @@
+"""Values and derivatives that are not finite: at which state, and by which line."""
+
+import contextlib
+import io
+from collections.abc import Callable, Iterator, Sequence
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from jaxslam.math._xla import quick_jit
+from jaxslam.verify._findings import Check
+from jaxslam.verify._inputs.functions import Function, at_state
+from jaxslam.verify._inputs.samples import coincident
+from jaxslam.verify._jacobians import Evaluated
+from jaxslam.verify._user_errors import place_of_error
+
+State = Sequence[np.ndarray]
+
+
+def finite_check(evaluated: Evaluated) -> Check:
+    """The check that values and Jacobians are finite at every state."""
+    function, samples = evaluated.function, evaluated.samples
+    assert evaluated.values is not None
+    parts = {"a value": evaluated.values}
+    for argument, evaluation in zip(function.arguments, evaluated.by_argument, strict=True):
+        for how, jacobian in evaluation.methods.items():
+            parts[f"{how} by {argument.name}"] = jacobian
+        for how, jacobian in evaluation.single.items():
+            parts[f"{how} by {argument.name} in float32"] = jacobian
+    name, count = f"{function.name} and its derivatives are finite", len(samples.labels)
+    for what, part in parts.items():
+        bad = ~np.isfinite(part).all(axis=tuple(range(1, part.ndim)))
+        if bad.any():
+            i = int(np.argmax(bad))
+            state = tuple(a[i] for a in samples.values)
+            hand = function.hand if what.startswith("hand") else None
+            where = _line_of_nan(function, state, hand, derivative=what != "a value")
+            often = f"at {int(np.sum(bad))} of {count} states"
+            at = f"{samples.labels[i]}: {at_state(function, state)}"
+            return Check(name, False, f"{where}{what} is not finite, {often}; {at}")
+    return Check(name, True, f"{count} states")
+
+
+def singular_notes(evaluated: Evaluated) -> Iterator[str]:
+    """What is not finite with a place at the origin, or two places at one: a note for each.
+
+    A claim need not be defined there, so this is not a failure; but a gradient through it is NaN.
+    """
+    function = evaluated.function
+    if evaluated.values is None or any("jacfwd" not in x.methods for x in evaluated.by_argument):
+        return
+    over = tuple(range(len(function.arguments)))
+
+    @quick_jit
+    def both(*state: jax.Array) -> tuple[jax.Array, tuple[jax.Array, ...]]:
+        return function.call(*state), jax.jacfwd(function.call, argnums=over)(*state)
+
+    for label, state in coincident(function.arguments, evaluated.samples):
+        value, by_argument = both(*state)
+        if not np.isfinite(value).all():
+            what = "the value"
+        elif bad := [
+            argument.name
+            for argument, part in zip(function.arguments, by_argument, strict=True)
+            if not np.isfinite(part).all()
+        ]:
+            what = f"the derivative by {' and '.join(bad)}"
+        else:
+            continue
+        where = _line_of_nan(function, state, None, derivative=what != "the value")
+        yield f"{where}{what} is not finite with the {label}: {at_state(function, state)}"
+
+
+def _line_of_nan(
+    function: Function, state: State, hand: Callable[..., object] | None, *, derivative: bool
+) -> str:
+    """The user's line at which a NaN or an infinity first appears, as "line: " or ""."""
+    call: Callable[..., object] = hand or function.call
+    if derivative and hand is None:
+        call = jax.jacfwd(function.call, argnums=tuple(range(len(state))))
+    try:  # JAX prints what it found
+        with jax.debug_nans(True), jax.debug_infs(True), contextlib.redirect_stdout(io.StringIO()):
+            call(*(jnp.asarray(a) for a in state))
+    except (Exception, SystemExit) as error:
+        where = place_of_error(error)
+        return f"{where}: " if where else ""
+    return ""
