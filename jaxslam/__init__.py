@@ -34,7 +34,7 @@ from jaxslam.graphs import smoothing
 from jaxslam.laser import features, grids, laser_slam, matching, topology
 from jaxslam.math import se2, stats, uncertain_poses
 from jaxslam.simulation import scenarios, spurious
-from jaxslam.simulation._recorded import recorded_world
+from jaxslam.simulation._recorded import RecordedWorld, recorded_world
 from jaxslam.simulation._team_world import TeamWorld
 from jaxslam.simulation._worlds import Scenario, World, simulate
 from jaxslam.verify import linearity, verify_jacobians
@@ -44,6 +44,7 @@ __all__ = [
     "Campaign",
     "Incomplete",
     "Interrupted",
+    "RecordedWorld",
     "Scenario",
     "TeamWorld",
     "World",
@@ -52,6 +53,7 @@ __all__ = [
     "catalog",
     "charts",
     "consistency",
+    "datasets",
     "features",
     "filters",
     "graphs",
@@ -61,12 +63,15 @@ __all__ = [
     "linearity",
     "linearity_index",
     "linearize",
+    "load",
     "matching",
     "metrics",
     "monte_carlo",
     "motion",
+    "plot",
     "protocols",
     "recorded_world",
+    "report",
     "resampling",
     "run",
     "scenarios",
@@ -77,6 +82,7 @@ __all__ = [
     "smoothing",
     "spurious",
     "stats",
+    "store",
     "team",
     "topology",
     "types",
@@ -103,6 +109,11 @@ def __getattr__(name: str) -> ModuleType | Callable[..., Campaign] | str:
         attach_field_docs()
         return module
     raise AttributeError(f"module 'jaxslam' has no attribute {name!r}")
+
+
+def __dir__() -> list[str]:
+    """The public names, those on demand too."""
+    return [*__all__, "__version__"]
 
 
 attach_field_docs()

@@ -37,9 +37,8 @@ def run(
     Traceable: wrap it in `jax.jit`, `jax.vmap` over filters, logs and keys, or `jax.grad`. It is
     compiled once for a structure: another call, with other values or a filter with other noises,
     runs the same program. The arithmetic runs in the wider dtype of the log's controls and
-    measurements. A valid measurement that is not finite or beyond `core.numbers.largest` is refused
-    where its value is concrete, and dropped as `Status.REJECTED` under a trace. Reverse mode stores
-    one state a step, and recomputes each step in the backward pass.
+    measurements. A valid measurement that is not finite, or beyond 4e61 (float32: 5e7), is refused
+    where its value is concrete, and dropped as `Status.REJECTED` under a trace. Reverse mode stores one state a step, and recomputes each step in the backward pass.
 
     Args:
         filter: a record, as of `jaxslam.filters`.

@@ -170,7 +170,7 @@ class Certain:
 
     S is the covariance of the innovation. After a long loop that of the first landmarks exceeds the
     distances between landmarks, and single measurements may be associated wrongly. Landmarks
-    measured there become new ones at first; `filters.map_management.closing` then associates them
+    measured there become new ones at first; `filters.Closing` then associates them
     jointly with the old ones.
 
     Raises ValueError on a spread not above 0.

@@ -11,7 +11,7 @@ from jaxslam.consistency._localization_scores import (
 )
 from jaxslam.consistency._measures import Measure, register
 from jaxslam.consistency._measures.coverage import credibility
-from jaxslam.consistency._measures.measure import Nees, RunStatistics
+from jaxslam.consistency._measures.measure import Nees, Runs, RunScores, RunStatistics
 from jaxslam.consistency._measures.nees import block_nees, pose_error
 from jaxslam.consistency._run_scores import Score, score
 from jaxslam.consistency._summary import Summary
@@ -23,7 +23,9 @@ __all__ = [
     "LocalizationSummary",
     "Measure",
     "Nees",
+    "RunScores",
     "RunStatistics",
+    "Runs",
     "Score",
     "Summary",
     "Verdict",

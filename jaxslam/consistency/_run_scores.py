@@ -1,6 +1,6 @@
 """The scores of runs: the numbers of each run that a campaign adds up or keeps.
 
-`run_statistics` takes sums over one run's maps and innovations, in JAX; `campaign.block_programs`
+`run_statistics` takes sums over one run's maps and innovations, in JAX; `campaign._block_programs`
 compiles it. `score` takes them, and the poses and infos of many runs, to the measures of each run;
 `tally.condense` takes what that returns.
 

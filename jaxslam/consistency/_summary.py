@@ -1,6 +1,6 @@
 """`summarize` returns the `Summary` of one filter: averages, bands, intervals and a verdict.
 
-Called by `monte_carlo.campaign` on the tally of each filter; reports and plots read the summaries.
+Called by `monte_carlo` on the tally of each filter; reports and plots read the summaries.
 """
 
 from collections.abc import Mapping

@@ -19,7 +19,8 @@ def deprecated(removed: str, instead: str) -> Callable[[_F], _F]:
     """
 
     def mark(function: _F) -> _F:
-        name = f"{function.__module__}.{function.__qualname__}"
+        public = function.__module__.partition("._")[0]  # the package that passes the name on
+        name = f"{public}.{function.__qualname__}"
         text = f"{name} goes in jaxslam {removed}: use {instead}"
         told: list[None] = []
 

@@ -79,7 +79,9 @@ class Component:
             cls.name = _lower(cls)
 
     def __init__(self, *_: object, **__: object) -> None:  # a record has its own
-        raise ValueError(f"{type(self).__name__}: expected @record above the class, of core.record")
+        raise ValueError(
+            f"{type(self).__name__}: expected @record above the class, of jaxslam.core.record"
+        )
 
     def _check(self, base: type, methods: Mapping[str, str]) -> None:
         """Check that a subclass of `base` is a record and defines methods of these parameters.

@@ -39,7 +39,7 @@ of NumPy compiles nothing."""
 class Status(IntEnum):
     """The outcome of a measurement; `Info.status` holds one a measurement slot.
 
-    `filters.reporting.status_of` has the decision table.
+    `filters.status_of` has the decision table.
     """
 
     EMPTY = 0
@@ -92,8 +92,18 @@ class Log(NamedTuple):
         rule: streams.Rule,
         rows: ArrayLike | None = None,
     ) -> "Log":
-        """The log of odometry (times, values) and measurements (times, tags, values), in NumPy;
-        `logs.streams.align_streams` says what they, the rule and the rows are."""
+        """The log of a stream of odometry and a stream of measurements, in NumPy.
+
+        Args:
+            odometry: times (K,), and values (K, V).
+            measurements: times (J,) in any order, tags (J,), and values (J, Z). Those of one time
+                are a scan, padded to the largest one with z 0, tag -1.
+            rule: what a row's control is: `core.logs.hold`, `divide`, `relative`, or a function.
+            rows: (T,) the times of the rows, rising; default every time of either stream.
+
+        Raises:
+            ValueError: on a measurement at a time without a row.
+        """
         return cls.from_rows(streams.align_streams(odometry, measurements, rule, rows))
 
     @classmethod

@@ -6,6 +6,7 @@ robots, the number of one.
 
 from collections.abc import Callable
 
+from jaxslam.core._names import Named
 from jaxslam.datasets._dataset import Adjustable, Dataset, Parameter
 from jaxslam.datasets._evaluation import Evaluation, MapTest, evaluate
 from jaxslam.datasets._landmark_logs.line_readers import bonn, victoria_park
@@ -13,19 +14,23 @@ from jaxslam.datasets._landmark_logs.mrclam_reader import mrclam, mrclam_team
 from jaxslam.datasets._landmark_logs.mrclam_robot import MRCLAM_CALIBRATION, RobotCalibration
 from jaxslam.datasets._landmark_logs.plaza_reader import plaza
 from jaxslam.datasets._landmark_logs.table_reader import table
+from jaxslam.datasets._laser_logs.bag_messages import Topic
 from jaxslam.datasets._laser_logs.carmen_reader import StampedRelations, carmen, relation_file
 from jaxslam.datasets._laser_logs.laser_record import LaserLog
 from jaxslam.datasets._laser_logs.rosbag_reader import BagContents, rosbag, rosbag_contents
 from jaxslam.datasets._noise_fit import DatasetFit, fit
 from jaxslam.datasets._uncertain_constants import Added, considered
 
-READERS: dict[str, Callable[..., Dataset]] = {
-    "bonn": bonn,
-    "mrclam": mrclam,
-    "plaza": plaza,
-    "table": table,
-    "victoria_park": victoria_park,
-}
+READERS: dict[str, Callable[..., Dataset]] = Named(
+    {
+        "bonn": bonn,
+        "mrclam": mrclam,
+        "plaza": plaza,
+        "table": table,
+        "victoria_park": victoria_park,
+    }
+)
+
 
 __all__ = [
     "MRCLAM_CALIBRATION",
@@ -41,6 +46,7 @@ __all__ = [
     "Parameter",
     "RobotCalibration",
     "StampedRelations",
+    "Topic",
     "bonn",
     "carmen",
     "considered",

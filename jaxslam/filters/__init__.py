@@ -4,8 +4,14 @@ from jaxslam.core.protocols import Filter, Wrapper
 from jaxslam.filters._delayed.delayed_settings import Hypotheses, Promotion, StoredMeasurements
 from jaxslam.filters._delayed.delayed_slam import DelayedSlam
 from jaxslam.filters._ekf.compressed_ekf_slam import CompressedEkfSlam
+from jaxslam.filters._ekf.ekf_settings import EkfOptions
 from jaxslam.filters._ekf.ekf_slam import EkfSlam
-from jaxslam.filters._ekf.linear_system import LinearizedSteps
+from jaxslam.filters._ekf.linear_system import (
+    LinearizedSteps,
+    LinearLandmarks,
+    LinearMeasurements,
+    Transition,
+)
 from jaxslam.filters._ekf.monitor import Monitored
 from jaxslam.filters._information.eif_slam import EifSlam
 from jaxslam.filters._information.marginals import whole_information
@@ -20,7 +26,7 @@ from jaxslam.filters._particles.slam_particles import ParticleInfo
 from jaxslam.filters._reporting import Mask, Pruned, info_of, status_of, with_extra
 from jaxslam.filters.map_management._closing import Closing
 from jaxslam.filters.map_management._loop_closure import LoopSettings
-from jaxslam.filters.map_management._merging import Merging
+from jaxslam.filters.map_management._merging import Managed, Merging
 from jaxslam.filters.multi_robot._team_slam import TeamSlam
 
 __all__ = [
@@ -30,13 +36,17 @@ __all__ = [
     "DeadReckoning",
     "DelayedSlam",
     "EifSlam",
+    "EkfOptions",
     "EkfSlam",
     "FastSlam",
     "Filter",
     "Hypotheses",
+    "LinearLandmarks",
+    "LinearMeasurements",
     "LinearizedSteps",
     "Localization",
     "LoopSettings",
+    "Managed",
     "Mapping",
     "Mask",
     "Merging",
@@ -49,6 +59,7 @@ __all__ = [
     "StartingAt",
     "StoredMeasurements",
     "TeamSlam",
+    "Transition",
     "Wrapper",
     "info_of",
     "status_of",

@@ -1,8 +1,8 @@
 """The data of a graph: variables, and measurements between them in tables by kind; its files.
 
 The cost of a graph is χ² = Σ eᵀ Ω e over all valid rows of all tables, without a factor ½: e is the
-residual of the row (`factor.Factor`) and Ω its information. `read` and `write` are the public names
-of what `datasets.g2o` does.
+residual of the row (`Factor`) and Ω its information. `read` and `write` are the public names
+of what `datasets._g2o` does.
 """
 
 from pathlib import Path
@@ -105,8 +105,8 @@ def read(path: str | Path) -> Graph:
     Poses and points are in the order of the file; the last five name tables.
     Numbers are those of the file. Comments (`#`), scans (`ROBOTLASER1`), notes (`VERTEX_TAG`,
     `VERTEX_ELLIPSE`) and offsets of sensors (`PARAMS_SE2OFFSET`, to which no edge that is read
-    refers) are skipped; `datasets.g2o.load` counts them. In a file without vertices, poses
-    and points have the order of their ids and are placed along the edges, `starts.odometry`. The
+    refers) are skipped; the command `jaxslam optimize` counts them. In a file without vertices,
+    poses and points have the order of their ids and are placed along the edges, `starts.odometry`. The
     cost of the graph is χ² = Σ eᵀ Ω e, with e from `graphs.REGISTRY` and without a factor ½.
 
     Kümmerle et al. 2011, "g2o: A general framework for graph optimization", ICRA; Grisetti et al.

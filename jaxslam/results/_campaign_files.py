@@ -111,6 +111,10 @@ def load(folder: str | Path) -> Campaign:
         ValueError: if the folder holds no campaign, or one that is not finished.
     """
     folder = Path(folder)
+    if not (folder / BLOCKS).is_dir():
+        raise ValueError(
+            f"jaxslam.load: there is no campaign in {folder}: expected {BLOCKS}/ there"
+        )
     kept, path = store.resume(folder / BLOCKS), folder / RESULT
     try:
         found = json.loads(path.read_text(encoding="utf-8"))

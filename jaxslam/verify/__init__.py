@@ -1,6 +1,6 @@
 """Verification of hand-derived Jacobians: of a motion model, a sensor, or any function."""
 
-from jaxslam.verify._findings import Check, Finding, Report
-from jaxslam.verify._verifier import verify_jacobians
+from jaxslam.verify._findings import Check, Finding, Report, WorstState, WrongEntry
+from jaxslam.verify._verifier import build, verify_jacobians
 
-__all__ = ["Check", "Finding", "Report", "verify_jacobians"]
+__all__ = ["Check", "Finding", "Report", "WorstState", "WrongEntry", "build", "verify_jacobians"]

@@ -2,7 +2,7 @@
 
 from jaxslam.consistency.campaign._harness import monte_carlo
 from jaxslam.consistency.campaign._kept import Keep
-from jaxslam.consistency.campaign._remote import Processes
+from jaxslam.consistency.campaign._remote import Executor, Processes
 from jaxslam.consistency.campaign._result import Campaign, Incomplete, Interrupted
 
-__all__ = ["Campaign", "Incomplete", "Interrupted", "Keep", "Processes", "monte_carlo"]
+__all__ = ["Campaign", "Executor", "Incomplete", "Interrupted", "Keep", "Processes", "monte_carlo"]

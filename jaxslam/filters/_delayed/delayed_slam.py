@@ -100,7 +100,7 @@ class DelayedSlam(Filter):
 
     1. it confirms the *hypotheses* that agree with it: g² <= gate·var(g), g the difference between
        the measurement and its prediction from the point, with all correlations. Their persistence
-       rises by 1, and they are corrected, but not the robot (`confirmation.correct_hypotheses`).
+       rises by 1, and they are corrected, but not the robot.
        Those of its tag that it does not confirm lose `decay`; at 0 they are deleted.
     2. if it confirms none it is intersected with older stored measurements. Well conditioned
        intersections become hypotheses of persistence 1, unless one exists at that position.
@@ -129,7 +129,7 @@ class DelayedSlam(Filter):
     """landmarks N"""
     _: dataclasses.KW_ONLY
     triangulation: Triangulation | None = None
-    """how stored measurements intersect; default `triangulation.Rays` or `triangulation.Circles`,
+    """how stored measurements intersect; default the intersection of rays or of circles,
     by what the sensor measures"""
     stored: StoredMeasurements = StoredMeasurements()
     hypotheses: Hypotheses = Hypotheses()

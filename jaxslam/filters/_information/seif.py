@@ -46,10 +46,10 @@ class Seif(InformationFilter):
     The robot is linked to at most `active` landmarks, the most recent ones, each landmark to at
     most `links` others. The four steps do not touch the rest of the map:
 
-    1. motion update (`canonical.motion_update`), of the robot and the active landmarks;
-    2. sparsification (`sparse_state.sparsify`): the least recently measured active landmarks
+    1. motion update, of the robot and the active landmarks;
+    2. sparsification: the least recently measured active landmarks
        lose their links to the robot, as many as the scan needs indices for;
-    3. measurement update and new landmarks (`canonical`);
+    3. measurement update and new landmarks;
     4. mean recovery (`marginals`), one block at a time: the block of robot and active
        landmarks, and `passive` landmarks in rotation.
 
@@ -82,7 +82,7 @@ class Seif(InformationFilter):
     sweeps: int = static(default=1)
     """rounds of mean recovery a scan: passive landmarks, then the active block"""
     conservative: bool = static(default=False)
-    """how a full list drops its weakest link, `sparse_state.drop_link`. False: overconfidently, Ω
+    """how a full list drops its weakest link. False: overconfidently, Ω
     stays positive definite. True: with loss of information; where a map needs many more links than
     it may have, Ω does not stay positive definite"""
     whole: bool = static(default=False)

@@ -59,7 +59,7 @@ class FastSlam(Filter):
     with its noise, and weighted by the scan. "measurement", 2.0 (Montemerlo et al. 2003, "FastSLAM
     2.0: An improved particle filtering algorithm …"): the pose is a Gaussian that the motion
     predicts and the scan corrects, measurement by measurement; the pose is drawn from the result.
-    The weight is the density of the scan with the pose integrated out (`proposal.propose_pose`),
+    The weight is the density of the scan with the pose integrated out,
     which does not depend on the draw. So resampling comes first here, and copies of one particle
     get different poses.
 

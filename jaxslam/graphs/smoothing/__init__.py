@@ -1,6 +1,6 @@
 """Smoothing: estimators of the whole path and map from the whole log, or from its last steps.
 
-Each is the graph of the log, solved along the path (`jaxslam.graphs._chain`).
+Each is the graph of the log, solved along the path.
 """
 
 from jaxslam.graphs.smoothing._batch_map import BatchMap

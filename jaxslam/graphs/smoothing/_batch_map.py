@@ -58,7 +58,7 @@ class BatchSolution(NamedTuple):
 
 @record
 class BatchMap(LogEstimator):
-    """The MAP estimator: Gauss-Newton on all poses and landmarks, which minimizes `problem.cost`.
+    """The MAP estimator: Gauss-Newton on all poses and landmarks, minimizing the cost.
 
         ½ |x_0 ⊖ pose|²_{P0} + ½ Σ_t |w_t|²_{Q_t} + ½ Σ_{t,i} |z_ti ⊖ h(x_t, l_i)|²_{R_ti}
         with x_t = f(x_{t-1}, u_t, w_t)
@@ -78,7 +78,7 @@ class BatchMap(LogEstimator):
     the pose, it is evaluated once at the filter's path.
 
     It is the graph of the log (`graphs.of_log`) with another solution: where the noises of a motion
-    are three and not singular, `graphs.optimize` has the same optimum. Here (`graphs.chain`) a
+    are three and not singular, `graphs.optimize` has the same optimum. Here a
     motion is a constraint, and the run itself associates the measurements; the
     sparse plan of `graphs.optimize` has to know that on the host.
 

@@ -1,6 +1,6 @@
 """The data of a grid map and of a field over one: coordinates, interpolation, files.
 
-`read_map` and `write_map` are the public names of what `datasets.ros_map` does.
+`read_map` and `write_map` are the public names of what `datasets._ros_map` does.
 """
 
 from pathlib import Path

@@ -1,4 +1,4 @@
-"""Figures of maps, errors and campaigns, all in one style (`plot.style`).
+"""Figures of maps, errors and campaigns, all in one style.
 
 Only this package draws. Figures are made without pyplot, without global state and windows;
 `figure.savefig(path)` saves one. They are as wide as a page; `width=plot.COLUMN` makes one for a

@@ -311,7 +311,7 @@ def walls_figure(
     the line. Of walls that were not measured only the true ones are drawn.
 
     Args:
-        estimate: (T, …); the map is the last one. Tags are those of `simulation.walls.wall_lines`.
+        estimate: (T, …); the map is the last one. Tags are the rows of the walls.
         walls: true ones, in the frame of the map.
         path: (T, 2 or 3) true one.
     Raises:

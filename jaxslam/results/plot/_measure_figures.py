@@ -58,7 +58,7 @@ def nees_figure(
     """Average NEES over the steps for every filter of a campaign, with the 95 % chi-square band.
 
     The band is that of the filter with the most finite runs, the narrowest. More than five filters
-    are drawn in a row of panels for each kind of filter (`catalog.KINDS`). The scale ends at 100
+    are drawn in a row of panels for each kind of filter of the catalog. The scale ends at 100
     times dof, or lower if the band would be too narrow to be seen; marks at the edge are of
     larger values, and the largest is written above. width [in]: `COLUMN` for a paper.
     """

@@ -42,7 +42,7 @@ class Row(NamedTuple):
 
 
 def kinds_of(names: Sequence[str]) -> list[tuple[str, list[str]]]:
-    """Groups (kind, names) of at most five filters: those of `catalog.KINDS`, then others."""
+    """Groups (kind, names) of at most five filters: those of `_catalog.KINDS`, then others."""
     known = {name: kind for kind, members in KINDS.items() for name in members}
     found = []
     for kind in [*KINDS, "others"]:

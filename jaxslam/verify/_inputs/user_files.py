@@ -99,8 +99,7 @@ def load(target: str) -> list[_Target]:
             raise UnusableFile(
                 f"{path.name}: expected {name} to be a Motion, a Sensor, a class of one whose only "
                 "required field is noise_cov, a factory of one, a Factor, a BeamModel, or a "
-                f"function with its Jacobian: define {name}{_CLAIMS[0]}, or call "
-                f"jaxslam.verify_jacobians({name}) from Python, which needs none"
+                f"function with its Jacobian{_without_claim(name, vars(module)[name])}"
             )
         if not found:
             raise UnusableFile(f"{path.name}: there is no {name!r} to verify{names_in(module)}")
@@ -210,6 +209,16 @@ def names_in(module: ModuleType) -> str:
         )
     ]
     return f"; it defines: {', '.join(found)}" if found else "; it defines nothing"
+
+
+def _without_claim(name: str, value: object) -> str:
+    """What to do with a function that has no Jacobian; of another object its type."""
+    if not callable(value):
+        return f", got a {type(value).__name__}"
+    return (
+        f": define {name}{_CLAIMS[0]}, or call jaxslam.verify_jacobians({name}) from Python, which "
+        "needs none"
+    )
 
 
 def _target(module: ModuleType, name: str) -> _Target | None:
