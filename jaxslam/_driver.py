@@ -38,7 +38,8 @@ def run(
     compiled once for a structure: another call, with other values or a filter with other noises,
     runs the same program. The arithmetic runs in the wider dtype of the log's controls and
     measurements. A valid measurement that is not finite, or beyond 4e61 (float32: 5e7), is refused
-    where its value is concrete, and dropped as `Status.REJECTED` under a trace. Reverse mode stores one state a step, and recomputes each step in the backward pass.
+    where its value is concrete, and dropped as `Status.REJECTED` under a trace. Reverse mode
+    stores one state a step, and recomputes each step in the backward pass.
 
     Args:
         filter: a record, as of `jaxslam.filters`.

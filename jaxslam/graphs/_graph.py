@@ -106,8 +106,8 @@ def read(path: str | Path) -> Graph:
     Numbers are those of the file. Comments (`#`), scans (`ROBOTLASER1`), notes (`VERTEX_TAG`,
     `VERTEX_ELLIPSE`) and offsets of sensors (`PARAMS_SE2OFFSET`, to which no edge that is read
     refers) are skipped; the command `jaxslam optimize` counts them. In a file without vertices,
-    poses and points have the order of their ids and are placed along the edges, `starts.odometry`. The
-    cost of the graph is χ² = Σ eᵀ Ω e, with e from `graphs.REGISTRY` and without a factor ½.
+    poses and points have the order of their ids and are placed along the edges, `starts.odometry`.
+    The cost of the graph is χ² = Σ eᵀ Ω e, with e from `graphs.REGISTRY` and without a factor ½.
 
     Kümmerle et al. 2011, "g2o: A general framework for graph optimization", ICRA; Grisetti et al.
     2007, "A tree parameterization for efficiently computing maximum likelihood maps using gradient
