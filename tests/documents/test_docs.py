@@ -6,6 +6,7 @@ import importlib
 import importlib.util
 import inspect
 import io
+import operator
 import re
 import shlex
 import subprocess
@@ -14,6 +15,7 @@ from pathlib import Path
 
 import pytest
 
+import jaxslam
 from jaxslam import _cli as cli
 
 ROOT = Path(__file__).parents[2]
@@ -144,6 +146,37 @@ def test_pages_and_examples_import_public_names_only():
                 value = getattr(importlib.import_module(of), name)
                 is_public_module = inspect.ismodule(value) and "._" not in f"{of}.{name}"
                 assert is_public_module or (of, name) in known, (page, of, name)
+
+
+def test_a_name_in_a_public_docstring_is_public():
+    """`filters.Closing` is `jaxslam.filters.Closing`, which a reader can import."""
+    packages = {name.split(".")[1] for name, _ in public() if "." in name} | set(dir(jaxslam))
+    lost, checked = [], 0
+    for names in reference().public_names().values():
+        for module, name, _ in names:
+            value = getattr(sys.modules[module], name)
+            if not (inspect.isclass(value) or inspect.isroutine(value)):
+                continue
+            members = vars(value).values() if inspect.isclass(value) else ()
+            texts = [inspect.getdoc(each) or "" for each in (value, *members) if callable(each)]
+            for path in re.findall(r"`(?:jaxslam\.)?(\w+(?:\.\w+)+)", "\n".join(texts)):
+                if path.split(".")[0] in packages and not path.endswith((".json", ".csv", ".toml")):
+                    checked += 1
+                    if not is_reached(path):
+                        lost.append((module, name, path))
+    assert lost == [], lost
+    assert checked > 40
+
+
+def is_reached(path):
+    """Whether a dotted path below `jaxslam`, of a name or a field, leads without an underscore."""
+    owner, _, name = path.rpartition(".")
+    try:
+        value = operator.attrgetter(owner)(jaxslam)
+    except AttributeError:
+        return False
+    there = hasattr(value, name) or name in getattr(value, "__annotations__", ())
+    return there and "._" not in f".{path}"
 
 
 def test_a_dotted_path_in_the_text_is_reached_after_one_import():

@@ -34,7 +34,7 @@ class ParticleLocalization(MonteCarloFilter):
     Robotics", table 8.2). The state is a `PoseParticles`. Particles are resampled before a motion,
     if the last scan left ESS = 1/Σ w² below threshold · (particles in use). The number of particles
     in use is then the KLD bound for the bins that they occupy after the motion (Fox 2001;
-    `resampling.kld`), at most `particles`; the others have weight zero. In
+    `resampling.kld_bound`), at most `particles`; the others have weight zero. In
     `info.extra["particles"]`, a `ParticleInfo`, see `active` and `capped`.
 
     A kidnapped robot is found again by particles from the whole box (table 8.3). With c the
