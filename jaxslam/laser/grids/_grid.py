@@ -181,8 +181,8 @@ def read_map(path: str | Path) -> Grid:
     the mean of its channels.
 
     An occupied cell gets log-odds of ln 509 (p = 1 - 0.5/255, half a level of grey), a free one the
-    negative of it, an unknown one 0. In mode `scale` a cell between the thresholds has the probability
-    (p - free_thresh)/(occupied_thresh - free_thresh), bounded in the same way.
+    negative of it, an unknown one 0. In mode `scale` a cell between the thresholds has the
+    probability (p - free_thresh)/(occupied_thresh - free_thresh), bounded in the same way.
 
     Source: the map format of the ROS package `map_server`, wiki.ros.org/map_server.
 
