@@ -1,11 +1,4 @@
-"""All filters by name, configured for a scenario: the variants of EKF-SLAM, and filters to compare
-them with.
-
-A variant is a chart, a linearizer or an option, given in one line; `monte_carlo` and the command
-line run them side by side.
-
-Looked up by name; the error of an unknown one has suggestions for typos.
-"""
+"""The filters of a campaign by name, configured for a scenario."""
 
 from collections.abc import Callable
 from dataclasses import replace

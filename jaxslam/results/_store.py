@@ -1,10 +1,4 @@
-"""The folder of a campaign's finished blocks of runs, from which a campaign can be resumed.
-
-A block is an npz file that appears only when it is complete, so an interrupted
-program loses no other block than the current one. A file that is damaged or belongs to another
-campaign is renamed and not counted. A manifest holds the caller's settings and the identity of
-the campaign.
-"""
+"""The folder of a campaign's finished blocks of runs, from which a campaign can be resumed."""
 
 import contextlib
 import errno

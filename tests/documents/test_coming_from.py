@@ -99,9 +99,11 @@ FILTERS = ("KalmanFilter", "ExtendedKalmanFilter")
 
 def test_every_name_of_gtsam_exists():
     gtsam = pytest.importorskip("gtsam", reason="GTSAM is not installed")
+    unstable = importlib.import_module("gtsam_unstable")
     names = [n for theirs, _, _ in rows("GTSAM") for n in re.findall(r"`([\w.]+)`", theirs)]
     for name in names:
-        reached(gtsam, name)
+        # Until GTSAM 4.3 some names are in its second module.
+        reached(gtsam if hasattr(gtsam, name.split(".")[0]) else unstable, name)
     assert len(names) > 25
 
 

@@ -1,7 +1,4 @@
-"""The robots of a team, and the layout of their controls, scans and states.
-
-`filters.TeamSlam` is their filter, and `TeamWorld` simulates their worlds.
-"""
+"""The robots of a team, and the layout of their controls, scans and states."""
 
 from collections.abc import Sequence
 
