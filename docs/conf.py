@@ -1,5 +1,6 @@
 """How the documentation is built: `make docs`, with every warning an error; `make api`, whose tag
-is "api", runs no code of the pages."""
+is "api", runs no code of the pages; with the tag "portion" code of the pages that CI runs for the
+commit (`.ci/portion.py`)."""
 
 import importlib.metadata
 import os
@@ -53,6 +54,12 @@ nb_merge_streams = True
 
 # What a page printed and drew is kept until its cells, or code that they reach, change.
 nb_execution_mode = "off" if tags.has("api") else "cache"  # noqa: F821
+if tags.has("portion"):  # noqa: F821
+    sys.path.insert(0, str(ROOT / ".ci"))
+    import portion
+
+    nb_execution_excludepatterns = [str(page) for page in portion.left_out(HERE.rglob("*.md"))]
+    del portion  # a name left here would be a setting of Sphinx
 nb_execution_cache_path = str(ROOT / ".cache" / "docs")
 get_cache(nb_execution_cache_path).list_cache_records()  # makes it, before several processes do
 

@@ -3,6 +3,7 @@
 import gc
 import importlib.metadata
 import os
+import sys
 from pathlib import Path
 
 import numpy as np
@@ -33,6 +34,32 @@ gc.set_threshold(100_000, 20, 50)  # tracing allocates much and frees little: a 
 PROGRAMS = Path(__file__).parents[1] / ".cache"
 KEPT = 2**29
 """Bytes of compiled programs that stay in the checkout after a run."""
+
+
+def pytest_addoption(parser):
+    parser.addoption(
+        "--portion",
+        action="store_true",
+        help="of the sweeps, those that CI runs for this commit: python .ci/portion.py",
+    )
+
+
+def pytest_collection_modifyitems(config, items):
+    """With --portion without the sweeps of the other two thirds."""
+    if not config.getoption("--portion"):
+        return
+    sys.path.insert(0, str(config.rootpath / ".ci"))
+    import portion
+
+    kept, others = [], []
+    for item in items:
+        file, _, function = item.nodeid.partition("::")
+        touched = str(Path(file).parent) in portion.rooms()
+        name = f"{file}::{function.partition('[')[0]}"
+        is_sweep = item.get_closest_marker("sweep") is not None
+        (others if is_sweep and not portion.chosen(name, touched) else kept).append(item)
+    items[:] = kept
+    config.hook.pytest_deselected(items=others)
 
 
 def pytest_configure(config):

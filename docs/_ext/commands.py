@@ -25,7 +25,7 @@ import re
 import subprocess
 import tempfile
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Collection, Iterator
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -157,12 +157,17 @@ def run(group: list[Block]) -> tuple[Block, str] | None:
     return None
 
 
-def check(pages: list[Path], record: Path) -> tuple[list[tuple[Block, str]], Counter[str]]:
-    """Run what pages show and has not passed; what failed, and what was counted."""
+def check(
+    pages: list[Path], record: Path, left_out: Collection[Path] = ()
+) -> tuple[list[tuple[Block, str]], Counter[str]]:
+    """Run what pages show and has not passed, but for pages left out; what failed, and what was
+    counted."""
     passed = json.loads(record.read_text(encoding="utf-8")) if record.is_file() else []
     counted: Counter[str] = Counter()
     todo, kept = {}, []
     for group in (group for page in pages for group in groups(page)):
+        if group and group[0].page in left_out:
+            group = [block._replace(left_out="of another third") for block in group]
         counted.update(block.left_out for block in group if block.left_out)
         group = [block for block in group if not block.left_out]
         if group and (key := digest(group)) in passed:
@@ -189,8 +194,13 @@ def after_build(app: Any, exception: Exception | None) -> None:
 
     if exception is not None or app.builder.name != "html":
         return
-    pages = [Path(app.env.doc2path(page)) for page in sorted(app.env.found_docs)]
-    failed, counted = check([*OTHERS, *pages], RECORD)
+    pages = [*OTHERS, *(Path(app.env.doc2path(page)) for page in sorted(app.env.found_docs))]
+    left_out: list[Path] = []
+    if app.tags.has("portion"):
+        import portion  # of `.ci`, which conf.py put on the path
+
+        left_out = portion.left_out(pages)
+    failed, counted = check(pages, RECORD, left_out)
     for block, said in failed:
         getLogger(__name__).warning(said, location=f"{block.page}:{block.line}")
     done = [f"{counted.pop(what, 0)} {what}" for what in ("run", "passed before")]
