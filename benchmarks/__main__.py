@@ -16,6 +16,7 @@ import jax
 
 from benchmarks.gate import Metric, report
 from benchmarks.results import measured
+from jaxslam.core._optional import first_line
 
 BENCHMARKS = {
     "commands": "commands",
@@ -107,7 +108,11 @@ def main() -> int:
     metrics: list[Metric] = []
     for name in wanted:
         print(f"\n{name}", flush=True)
-        began, measure = time.perf_counter(), benchmark(name)
+        began = time.perf_counter()
+        try:
+            measure = benchmark(name)
+        except Exception as error:  # of GTSAM and others, where they are missing or broken
+            raise SystemExit(f"{name}: {first_line(error)}: pip install --group bench") from error
         found = measured(name, measure, options.quick) if options.record else measure(options.quick)
         # What was measured stays on the screen, whatever becomes of the parts after it.
         if found:

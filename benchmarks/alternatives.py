@@ -26,8 +26,8 @@ import inspect
 import time
 from collections.abc import Callable
 from functools import partial
+from importlib import import_module
 from importlib.metadata import version
-from importlib.util import find_spec
 
 import jax
 import jax.numpy as jnp
@@ -251,7 +251,12 @@ def task(steps: int):
 
 
 def installed(name: str) -> bool:
-    return find_spec(DISTRIBUTIONS[name]) is not None
+    """Whether a library can be used; one that is there may fail to load."""
+    try:
+        import_module(DISTRIBUTIONS[name])
+    except Exception:
+        return False
+    return True
 
 
 def difference(found, ours) -> tuple[float, float]:

@@ -15,7 +15,7 @@ import jax
 
 from benchmarks.gate import Metric
 from jaxslam import catalog, filters, plot, run, scenarios, simulate
-from jaxslam.results.plot._film import has_ffmpeg
+from jaxslam.results.plot._film import mp4_problem
 
 MOST = 30.0
 """processor seconds of a film of 10 s"""
@@ -43,7 +43,7 @@ def measure(quick: bool = False) -> list[Metric]:
         jax.block_until_ready(trace)
         film = plot.animate(trace, log, truth, title=f"{world.name}: {name}")
         total, sizes = 0.0, []
-        for kind in [*["mp4"] * has_ffmpeg(), "gif", "html"]:
+        for kind in [*["mp4"] * (mp4_problem() is None), "gif", "html"]:
             with tempfile.NamedTemporaryFile(suffix=f".{kind}") as file:
                 began = processor_seconds()
                 film.save(Path(file.name))

@@ -19,6 +19,7 @@ from jaxslam._cli.common import INTERRUPTED, CompileClock, as_folders, set_devic
 from jaxslam._cli.environment import environment_text
 from jaxslam._cli.recorded import fit, laser_log, localize, make_map, run, slam
 from jaxslam.core._names import meant
+from jaxslam.core._optional import first_line
 
 __all__ = ["main"]
 
@@ -117,6 +118,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
             set_device_count(options.devices)
         else:
             jax.config.update("jax_enable_x64", options.dtype == "float64")
+        try:
+            jax.devices()
+        except Exception as error:  # RuntimeError or AssertionError of a plugin without its device
+            raise ValueError(
+                f"JAX finds no device, JAX_PLATFORMS={jax.config.jax_platforms or ''} "
+                f"({first_line(error)}): JAX_PLATFORMS=cpu takes the processor"
+            ) from error
         with CompileClock() as clock, cache.from_options(options), threadpool_limits(1, "blas"):
             status = int(options.command(options, shlex.join(["jaxslam", *arguments])))
             if status != INTERRUPTED:

@@ -15,6 +15,7 @@ from jaxslam.consistency._measures.counts import count_label
 from jaxslam.consistency.campaign._pieces import cores
 from jaxslam.consistency.campaign._progress import Progress
 from jaxslam.core._names import meant
+from jaxslam.core._optional import loading
 from jaxslam.results._campaign_files import RESULT
 from jaxslam.results._files import Files, check_writable
 
@@ -76,13 +77,17 @@ def add_out(parser: argparse.ArgumentParser) -> None:
     )
 
 
-def check_out(folder: Path, name: str) -> None:
+def check_out(folder: Path, name: str, *, draws: bool = True) -> None:
     """Check before any work that a command, as "run", can write its results to a folder.
 
-    Raises OSError if no file can be written, ValueError if the folder holds the results of another
-    command, since some files have the same names.
+    Raises OSError if no file can be written, ValueError if no figure can be drawn or the folder
+    holds the results of another command, since some files have the same names.
     """
     check_writable(folder)
+    if draws:
+        with loading("figures", "matplotlib"):
+            from jaxslam.results.plot._style import check_font
+        check_font()
     for file in (RESULT, SUMMARY):
         try:
             command = str(json.loads((folder / file).read_text(encoding="utf-8"))["command"])
@@ -149,21 +154,22 @@ def _shown(value: object) -> str:
 
 
 def film_files(films: Mapping[str, "Film"], *, suffixed: bool) -> Files:
-    """The functions that write each film as MP4, or GIF without ffmpeg, and as a page, by name.
+    """The functions that write each film as MP4, or GIF without it, and as a page, by name.
 
-    Prints one line: how many steps are shown, and a missing ffmpeg.
+    Prints one line: how many steps are shown, and why there is no MP4.
 
     Args:
         films: by the name of the filter.
         suffixed: whether file names contain the name of the filter.
     """
 
-    from jaxslam.results.plot._film import has_ffmpeg  # matplotlib is slow to load
+    from jaxslam.results.plot._film import mp4_problem  # matplotlib is slow to load
 
     notes = dict.fromkeys(film.scene.note for film in films.values() if film.scene.note)
-    kind = "mp4" if has_ffmpeg() else "gif"
-    if kind == "gif":
-        notes["ffmpeg is not installed: GIF instead of MP4"] = None
+    problem = mp4_problem()
+    kind = "gif" if problem else "mp4"
+    if problem:
+        notes[f"{problem}: GIF instead of MP4"] = None
     if notes:
         print("\nfilm: " + "; ".join(notes))
     files: Files = {}

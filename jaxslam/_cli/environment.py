@@ -6,6 +6,8 @@ from importlib.metadata import PackageNotFoundError, version
 
 import jax
 
+from jaxslam.core._optional import first_line
+
 _PACKAGES = (
     "jax",
     "jaxlib",
@@ -34,6 +36,9 @@ def environment_text(verbose: bool) -> str:
             lines.append(f"{name} {version(name)}")
         except PackageNotFoundError:
             lines.append(f"{name}: not installed")
-    lines += [f"device {d.id}: {d.platform}, {d.device_kind}" for d in jax.devices()]
+    try:
+        lines += [f"device {d.id}: {d.platform}, {d.device_kind}" for d in jax.devices()]
+    except Exception as error:  # of a plugin without its device
+        lines.append(f"device: none ({first_line(error)})")
     flags = sorted(name for name in os.environ if name.startswith(("JAX_", "XLA_", "JAXSLAM_")))
     return "\n".join([*lines, *(f"{name}={os.environ[name]}" for name in flags)])

@@ -24,6 +24,16 @@ quantile of χ² with one degree of freedom, since half of the estimates are 0 w
 _CONFOUNDED = 0.9
 """Correlation of two estimates above which they are named together."""
 
+_PART = 0.01
+"""Share of a parameter in the directions without information, from 0 to 1, above which it is not
+determined. Directions over a hundred parameters have as much; rounding leaves below 1e-6."""
+
+_STEP = 0.01
+"""Largest step of log σ in the differences of the gradient."""
+
+_NONE = 1e-3
+"""A standard deviation over its estimate which counts as 0."""
+
 
 class _LikelihoodPoint(NamedTuple):
     """The likelihood at one set of parameters, by the coordinates q."""
@@ -37,16 +47,51 @@ class _LikelihoodPoint(NamedTuple):
     """the expected information"""
     nis: float
     dof: int
+    dtype: np.dtype
+    """in which the run was"""
 
 
-def _newton_step(information: np.ndarray, gradient: np.ndarray) -> tuple[np.ndarray, float]:
-    """Newton's step, in each direction at most 1, and the gain of log L that it promises.
+def _without_information(here: _LikelihoodPoint) -> np.ndarray:
+    """An orthonormal basis (P, K) of the directions without information, by q √diag F.
 
-    Where log L is convex the step goes uphill by as much as it would where it is concave.
+    In these coordinates it does not depend on units. Along such a direction no innovation and no S
+    has a derivative: nothing is to be gained, and the gradient and the observed information along
+    it are rounding.
     """
-    values, vectors = np.linalg.eigh(information)
-    along = vectors.T @ gradient
-    step = np.clip(along / np.maximum(np.abs(values), 1e-300), -1.0, 1.0)
+    expected = here.expected
+    unit, there = _units(expected), np.flatnonzero(np.diag(expected) > 0)
+    values, vectors = np.linalg.eigh((expected / np.outer(unit, unit))[np.ix_(there, there)])
+    # A sum over T rows leaves T eps of 1 where it should be 0, and with derivatives handed on by a
+    # run some thousand times that; above 1/400 = 1/_INFLATED² a direction is determined.
+    none = values < np.sqrt(np.finfo(here.dtype).eps)
+    return np.asarray(np.eye(len(expected))[:, there] @ vectors[:, none])
+
+
+def _units(information: np.ndarray) -> np.ndarray:
+    """√diag of the information; 1 for a parameter without any."""
+    scale = np.sqrt(np.maximum(np.diag(information), 0.0))
+    return np.where(scale > 0, scale, 1.0)
+
+
+def _newton_step(
+    information: np.ndarray, here: _LikelihoodPoint, logged: np.ndarray
+) -> tuple[np.ndarray, float]:
+    """Newton's step where there is information, and the gain of log L that it promises.
+
+    In each direction a log σ moves by at most 1. Where log L is convex the step goes uphill by as
+    much as it would where it is concave.
+    """
+    of_all = _units(here.expected)
+    # Others than log σ in units in which they have the information of the best known log σ.
+    unit = np.where(logged, 1.0, of_all / of_all[logged].max(initial=1.0))
+    none = (unit / of_all)[:, None] * _without_information(here)
+    seen = np.linalg.svd(none.T)[2][none.shape[1] :].T
+    values, vectors = np.linalg.eigh(seen.T @ (information / np.outer(unit, unit)) @ seen)
+    vectors = seen @ vectors / unit[:, None]
+    along = vectors.T @ here.gradient
+    step = along / np.maximum(np.abs(values), np.finfo(float).tiny)
+    moves = np.abs(vectors * step)[logged].max(axis=0, initial=0.0)
+    step /= np.maximum(moves, 1.0)
     return vectors @ step, float(np.abs(along * step).sum() / 2)
 
 
@@ -57,9 +102,9 @@ def _observed_information(
     rows = []
     for i, scale in enumerate(np.diag(here.spread)):
         h = 0.05 / np.sqrt(scale) if scale > 0 else 1e-3
-        move = (min(h, 0.01) if logged[i] else h) * np.eye(len(here.q))[i]
-        slopes = [at(here.q + sign * move).gradient for sign in (-1, 1)]
-        rows.append((slopes[0] - slopes[1]) / (2 * move[i]))
+        move = (min(h, _STEP) if logged[i] else h) * np.eye(len(here.q))[i]
+        below, above = (at((here.q + sign * move).astype(here.dtype)) for sign in (-1, 1))
+        rows.append((below.gradient - above.gradient) / (above.q - below.q)[i])
     found: np.ndarray = np.array(rows)
     return np.asarray((found + found.T) / 2)
 
@@ -79,26 +124,33 @@ def _upper_limit(
 
 
 def _standard_errors(
-    observed: np.ndarray, spread: np.ndarray
+    observed: np.ndarray, spread: np.ndarray, without: np.ndarray
 ) -> tuple[np.ndarray, np.ndarray, list[list[int]]]:
     """The inverse of the observed information, robust errors, and confounded parameters of each.
 
     A parameter that has part in a direction without information has no error, and the others have
     that which they have when it is known.
+
+    Args:
+        without: basis of the directions without, of `_without_information`.
     """
-    scale = np.sqrt(np.maximum(np.diag(observed), 0.0))
-    unit = np.where(scale > 0, scale, 1.0)
-    values, vectors = np.linalg.eigh(observed / np.outer(unit, unit))
-    part = np.abs(vectors[:, values < 1e-6]) > 0.3
-    lost = (scale == 0) | part.any(axis=1)
-    keep = np.ix_(~lost, ~lost)
-    inverse = np.linalg.inv(observed[keep])
+    without = without @ without.T
+    lost = (np.diag(observed) <= 0) | (np.diag(without) > _PART)
+    keep = np.flatnonzero(~lost)
+    unit = _units(observed)
+    values, vectors = np.linalg.eigh((observed / np.outer(unit, unit))[np.ix_(keep, keep)])
+    # Differences over 0.01 have an error of that squared.
+    none = vectors[:, values < _STEP**2]
+    without[np.ix_(keep, keep)] += none @ none.T
+    lost[keep] = np.diag(none @ none.T) > _PART
+    regular = np.ix_(~lost, ~lost)
+    inverse = np.linalg.inv(observed[regular])
     error = np.sqrt(np.diag(inverse))
     cov, robust = np.diag(np.where(lost, np.inf, 0.0)), np.where(lost, np.inf, 0.0)
-    cov[keep] = inverse
-    robust[~lost] = np.sqrt(np.diag(inverse @ spread[keep] @ inverse))
-    related = part.astype(int) @ part.T > 0
-    related[keep] = np.abs(inverse / np.outer(error, error)) > _CONFOUNDED
+    cov[regular] = inverse
+    robust[~lost] = np.sqrt(np.diag(inverse @ spread[regular] @ inverse))
+    related = np.abs(without) > _PART
+    related[regular] = np.abs(inverse / np.outer(error, error)) > _CONFOUNDED
     np.fill_diagonal(related, False)
     return cov, robust, [list(np.flatnonzero(row)) for row in related]
 
@@ -200,7 +252,9 @@ def fit_noise(
     def tried(q: np.ndarray) -> _LikelihoodPoint:
         found = jax.device_get(_evaluate(of_run, q, logged, data))
         value, gradient, spread, expected, nis, dof = (np.asarray(x, np.float64) for x in found)
-        return _LikelihoodPoint(q, float(value), gradient, spread, expected, float(nis), int(dof))
+        return _LikelihoodPoint(
+            q, float(value), gradient, spread, expected, float(nis), int(dof), found[1].dtype
+        )
 
     def at(q: np.ndarray) -> _LikelihoodPoint:
         point = tried(q)
@@ -223,7 +277,7 @@ def fit_noise(
         return None
 
     for _ in range(iterations):
-        step, gain = _newton_step(here.expected, here.gradient)
+        step, gain = _newton_step(here.expected, here, logged)
         higher = better(step)
         if higher is None:
             break
@@ -233,7 +287,7 @@ def fit_noise(
             break
     observed = _observed_information(at, here, logged)
     for _ in range(_POLISH):
-        step, gain = _newton_step(observed, here.gradient)
+        step, gain = _newton_step(observed, here, logged)
         if gain <= tolerance:
             break
         higher = better(step)
@@ -242,12 +296,21 @@ def fit_noise(
         here = higher
         path.append(here.q)
         observed = _observed_information(at, here, logged)
-    # A deviation at 0, of which little is known and less the smaller it is, has no error, and the
-    # others have that which they have without it.
-    falling = logged & (here.gradient < 0) & (np.diag(observed) < 1 / _LOOSE**2)
+    without = _without_information(here)
+
+    def may_be_none(i: int) -> bool:
+        """Whether log L at a deviation of 0 is not lower than here by `_BOUND`."""
+        at_none = tried(here.q + np.log(_NONE) * np.eye(len(here.q))[i])
+        return at_none.dof == here.dof and bool(at_none.value > here.value - _BOUND)
+
+    # A deviation that may be 0, of which little is known and less the smaller it is, has no error,
+    # and the others have that which they have without it.
+    little = logged & (np.diag(observed) < 1 / _LOOSE**2) & (np.diag(here.expected) > 0)
+    falling = np.array([bool(little[i]) and may_be_none(i) for i in range(len(here.q))])
+    falling &= (without**2).sum(axis=1) <= _PART
     kept = np.where(falling | falling[:, None], 0.0, observed)
-    cov, robust, related = _standard_errors(kept, here.spread)
-    deviations = np.where(logged, np.exp(here.q), 1.0)
+    cov, robust, related = _standard_errors(kept, here.spread, without)
+    deviations = np.where(logged, _parameters(here.q, logged), 1.0)
     error = np.sqrt(np.diag(cov))
     alone = np.sqrt(np.maximum(np.diag(kept), 0.0))  # 1 / the error with the others known
     wide = ~np.isfinite(error) | (logged & (error > _LOOSE))
@@ -256,15 +319,15 @@ def fit_noise(
     return NoiseFit(
         names=labels,
         start=first,
-        parameters=np.where(logged, deviations, here.q),
+        parameters=_parameters(here.q, logged),
         error=deviations * error,
         robust_error=deviations * robust,
         cov=cov,
         log_likelihood=(before.value, here.value),
         nis_per_dof=(before.nis / before.dof, here.nis / here.dof),
         dof=here.dof,
-        path=np.where(logged, np.exp(np.where(logged, path, 0.0)), path),
-        converged=_newton_step(observed, here.gradient)[1] <= tolerance,
+        path=_parameters(np.array(path), logged),
+        converged=_newton_step(observed, here, logged)[1] <= tolerance,
         upper={labels[i]: _upper_limit(at, here, int(i)) for i in np.flatnonzero(falling)},
         loose={
             labels[i]: tuple(labels[j] for j in related[i])
@@ -328,6 +391,10 @@ def _coordinates(p: np.ndarray, logged: np.ndarray) -> np.ndarray:
     return np.where(logged, np.log(np.where(logged, p, 1.0)), p)
 
 
+def _parameters(q: np.ndarray, logged: np.ndarray) -> np.ndarray:
+    return np.where(logged, np.exp(np.where(logged, q, 0.0)), q)
+
+
 def _check_start(
     start: ArrayLike,
     guess: ArrayLike | None,
@@ -355,7 +422,7 @@ def _check_start(
 
 
 def _check_point(point: _LikelihoodPoint, logged: np.ndarray) -> None:
-    where = f"at parameters {np.where(logged, np.exp(point.q), point.q)}"
+    where = f"at parameters {_parameters(point.q, logged)}"
     if not point.dof:
         raise ValueError(f"fit_noise: expected fused measurements, got none {where}")
     if not (np.isfinite(point.value) and np.isfinite(point.gradient).all()):
@@ -364,7 +431,7 @@ def _check_point(point: _LikelihoodPoint, logged: np.ndarray) -> None:
 
 def _check_same(one: _LikelihoodPoint, other: _LikelihoodPoint, logged: np.ndarray) -> None:
     if one.dof != other.dof:
-        p, q = (np.where(logged, np.exp(point.q), point.q) for point in (one, other))
+        p, q = (_parameters(point.q, logged) for point in (one, other))
         raise ValueError(
             f"fit_noise: expected the same measurements at all parameters, got {one.dof} fused "
             f"components at {p} and {other.dof} at {q}: take a filter without a gate and with "

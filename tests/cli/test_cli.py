@@ -81,6 +81,19 @@ def test_the_report_of_a_problem_has_versions_devices_and_settings(capsys, monke
     assert not [line for line in lines if "secret" in line]
 
 
+def test_a_platform_without_its_device_is_one_line(capsys, monkeypatch, refused):
+    """As JAX_PLATFORMS=cuda without a GPU."""
+
+    def devices():
+        raise RuntimeError("Unable to initialize backend 'cuda'\nno driver")
+
+    monkeypatch.setattr(jax, "devices", devices)
+    message = refused(QUICK, "jaxslam: JAX finds no device", "initialize backend 'cuda')")
+    assert message.count("\n") == 1
+    assert cli.main(["--version", "--verbose"]) == 0
+    assert "device: none (RuntimeError: Unable to" in capsys.readouterr().out
+
+
 @pytest.mark.parametrize(
     ("change", "message"),
     [

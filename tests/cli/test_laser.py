@@ -5,6 +5,7 @@ import json
 from types import SimpleNamespace
 
 import bags
+import broken
 import jax
 import numpy as np
 import pytest
@@ -315,7 +316,7 @@ def check_as_ros_reads_it(path):
 
 
 def test_evo_reads_the_path(tmp_path):
-    file_interface = pytest.importorskip("evo.tools.file_interface", reason="evo is not installed")
+    file_interface = broken.optional("evo.tools.file_interface")
     pose = np.array([[1.0, 2.0, 0.5], [1.5, 2.5, -3.0]])
     path = Estimate(pose, np.zeros((2, 3, 3)), *[np.zeros(0)] * 4)
     (tmp_path / "a.tum").write_text(report.trajectory_tum(np.array([1.7e9, 1.7e9 + 0.25]), path))

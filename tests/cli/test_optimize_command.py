@@ -4,6 +4,7 @@ import csv
 import json
 from types import SimpleNamespace
 
+import broken
 import numpy as np
 import pytest
 import small_graphs
@@ -51,7 +52,7 @@ def test_it_writes_the_optimum(file, tmp_path, capsys, monkeypatch):
 
     films = []
     monkeypatch.setattr(plot, "graph_figure", graph_figure)
-    monkeypatch.setattr(_film, "has_ffmpeg", lambda: False)
+    monkeypatch.setattr(_film, "mp4_problem", lambda: "ffmpeg is not installed")
     monkeypatch.setattr(plot, "Film", lambda *a, **b: films.append(Film(*a, **b)) or films[-1])
     out = tmp_path / "out"
     assert (
@@ -138,7 +139,7 @@ EDGE_SE2 0 2 2.1 0 0 5 0 0 5 0 5
 @pytest.mark.parametrize("fixed", ["", "FIX 0\n"])
 def test_gtsam_reads_what_is_written(tmp_path, undrawn, fixed):
     """Poses, relative poses and informations; FIX stands only where the file has it."""
-    gtsam = pytest.importorskip("gtsam", reason="gtsam is not installed")
+    gtsam = broken.optional("gtsam")
     (tmp_path / "a.g2o").write_text(fixed + "".join(sorted(ORDERED.splitlines(True))))
     run = ["optimize", str(tmp_path / "a.g2o"), "--kernel", "huber", "--out", str(tmp_path / "o")]
     assert cli.main(run) == 0

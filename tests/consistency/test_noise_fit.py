@@ -104,12 +104,81 @@ def test_parameters_of_which_only_a_sum_is_seen_are_named_together():
     np.testing.assert_allclose(found.parameters[1:].sum(), X.mean(), atol=1e-3)
 
 
-def test_noises_that_are_told_apart_by_nothing_are_named_together():
-    found = fit_noise(confounded, [0.5, 0.7, 1.0], X, names=("a", "b", "c"), deviation=[1, 1, 0])
+SAMPLES = {
+    "as drawn": X,
+    "another order": np.random.default_rng(1).permutation(X),
+    "a rounding off": X * (1 + 4e-16 * RNG.normal(size=X.size)),
+    "in millimetres": 1000 * X,
+    "in kilometres": X / 1000,
+}
+
+
+@pytest.mark.parametrize("start", [(0.5, 0.7), (0.01, 1.0), (1.0, 0.3)])
+@pytest.mark.parametrize("sample", SAMPLES)
+def test_noises_that_are_told_apart_by_nothing_are_named_together(sample, start):
+    x = SAMPLES[sample]
+    unit = x.std() / X.std()
+    start = np.array([*start, 1.0]) * unit
+    found = fit_noise(confounded, start, x, names=("a", "b", "c"), deviation=[1, 1, 0])
+    assert found.converged and not found.upper
     assert found.loose == {"a": ("b",), "b": ("a",)}
-    assert (found.error[:2] > 0.5 * found.parameters[:2]).all()  # rounding in place of none
-    np.testing.assert_allclose(found.error[2], X.std() / np.sqrt(len(X)), rtol=1e-2)
-    np.testing.assert_allclose(np.hypot(*found.parameters[:2]), X.std(), rtol=1e-2)
+    assert np.isinf(found.error[:2]).all()
+    np.testing.assert_allclose(found.error[2], x.std() / np.sqrt(len(x)), rtol=1e-2)
+    np.testing.assert_allclose(np.hypot(*found.parameters[:2]), x.std(), rtol=1e-2)
+
+
+def told_apart(p, x):
+    """The second noise is in every other measurement alone."""
+    return of(x - p[2], p[0] ** 2 + p[1] ** 2 * (jnp.arange(x.size) % 2))
+
+
+@pytest.mark.parametrize("sample", SAMPLES)
+def test_noises_that_are_told_apart_have_errors_in_any_unit(sample):
+    """By the other rows a² and b² have the information n/4S² each, with S that of the row."""
+    draws = np.random.default_rng(5).normal(size=len(X)) * np.where(np.arange(len(X)) % 2, 2.0, 1.0)
+    x = draws * SAMPLES[sample].std() / X.std() * (1 + 1e-15 * (sample == "a rounding off"))
+    unit = x.std() / draws.std()
+    start = np.array([0.3, 3.0, -1.0]) * unit
+    found = fit_noise(told_apart, start, x, names=("a", "b", "c"), deviation=[1, 1, 0])
+    assert found.converged and not found.loose and not found.upper
+    np.testing.assert_allclose(found.parameters / unit, [1, np.sqrt(3), 0], atol=0.3)
+    a, b = found.parameters[:2]
+    variance = np.array([a**2, a**2 + b**2])
+    by_log = np.array([[2 * a**2, 0], [2 * a**2, 2 * b**2]]) / variance[:, None]
+    information = len(x) / 4 * by_log.T @ by_log
+    error = np.sqrt(np.diag(np.linalg.inv(information))) * [a, b]
+    np.testing.assert_allclose(found.error[:2], error, rtol=0.05)
+
+
+def in_pairs(p, x):
+    """One pair of noises in the first half, another in the second."""
+    first = jnp.arange(x.size) < x.size // 2
+    return of(x, jnp.where(first, p[0] ** 2 + p[1] ** 2, p[2] ** 2 + p[3] ** 2))
+
+
+def test_what_is_confounded_within_pairs_is_named_by_pairs():
+    found = fit_noise(in_pairs, [1.0, 0.8, 0.9, 1.1], X)
+    assert found.loose == {"p0": ("p1",), "p1": ("p0",), "p2": ("p3",), "p3": ("p2",)}
+
+
+def of_a_sum(p, x):
+    return of(x - p[1:].sum(), jnp.full(x.shape, p[0] ** 2))
+
+
+def test_of_many_that_are_seen_as_a_sum_all_are_named():
+    found = fit_noise(of_a_sum, [1.0, *np.arange(12.0)], X, deviation=[1] + [0] * 12)
+    assert list(found.loose) == [f"p{i}" for i in range(1, 13)]
+    assert all(len(others) == 11 for others in found.loose.values())
+    np.testing.assert_allclose(found.error[0], found.parameters[0] / np.sqrt(2 * len(X)), rtol=1e-2)
+
+
+def test_the_decisions_hold_in_float32(float32_alone):
+    x = X.astype(np.float32)
+    options = {"names": ("a", "b", "c"), "deviation": [1, 1, 0]}
+    found = fit_noise(confounded, [0.5, 0.7, 1.0], x, **options)
+    assert found.converged and found.loose == {"a": ("b",), "b": ("a",)}
+    found = fit_noise(told_apart, [0.5, 0.7, 1.0], x * (1 + np.arange(x.size) % 2), **options)
+    assert found.converged and not found.loose
 
 
 def gated(p, x):

@@ -2,6 +2,7 @@
 
 from functools import partial
 
+import broken
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -75,7 +76,7 @@ def test_the_truth_has_a_uniform_rank_in_its_posterior(drawn):
 @pytest.mark.sweep
 def test_nuts_samples_the_same_posterior(drawn):
     """Mean and deviation of one log's, by an independent sampler, beside those of the grid."""
-    blackjax = pytest.importorskip("blackjax")
+    blackjax = broken.optional("blackjax")
     true, logs, half, share = drawn
     i, offsets = 0, np.linspace(-1, 1, 25)
     log = jax.tree.map(lambda leaf: leaf[i], logs)

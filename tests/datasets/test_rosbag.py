@@ -1,8 +1,7 @@
 """ROS bags: what is read of each message, dropped and counted, refused; the same log in every format."""
 
-import sys
-
 import bags
+import broken
 import numpy as np
 import pytest
 from bags import SECOND, fixed, odometry, quaternion, scan, transform
@@ -10,6 +9,7 @@ from cases import refused, swept
 from recordings import folder
 from scipy.linalg import expm, logm
 
+from jaxslam import _cli as cli
 from jaxslam import datasets, laser_slam
 from jaxslam.math import numpy_poses as poses
 
@@ -361,10 +361,16 @@ def test_a_bag_that_defines_a_message_otherwise_is_refused(tmp_path, old, new):
         datasets.rosbag(file)  # with its folder the hashes of types differ
 
 
-def test_a_missing_library_is_named(tmp_path, monkeypatch):
-    monkeypatch.setitem(sys.modules, "rosbags.highlevel", None)
-    with pytest.raises(ValueError, match=r"pip install 'jaxslam\[ros\]'"):
+def test_a_library_that_cannot_be_used_is_named(tmp_path, monkeypatch, capsys):
+    sources = {"highlevel": "class AnyReader: pass", "typesys": "class Stores: pass"}
+    broken.library(monkeypatch, tmp_path, "rosbags", sources)
+    with pytest.raises(ValueError, match=r"rosbag: rosbags .* cannot be used .*get_typestore"):
         datasets.rosbag(tmp_path)
+    broken.library(monkeypatch, tmp_path, "rosbags", {}, "0.10.1")
+    with pytest.raises(ImportError, match=r"0.10.1 is too old, .* pip install 'jaxslam\[ros\]'$"):
+        datasets.rosbag_contents(tmp_path)
+    assert cli.main(["slam", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    assert capsys.readouterr().err.count("\n") == 1
 
 
 def test_the_contents_of_a_bag(tmp_path):

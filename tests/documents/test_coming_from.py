@@ -3,6 +3,7 @@
 import importlib
 import re
 
+import broken
 import jax
 import numpy as np
 import pytest
@@ -76,7 +77,7 @@ def test_measures_and_tables_that_it_names_exist():
 
 
 def test_every_name_of_filterpy_exists():
-    kalman = pytest.importorskip("filterpy.kalman", reason="filterpy is not installed")
+    kalman = broken.optional("filterpy.kalman")
     modules = [kalman, *(importlib.import_module(f"filterpy.{n}") for n in THEIRS)]
     holders = {name: getattr(kalman, name)(2, 1) for name in FILTERS}
     found = 0
@@ -98,8 +99,8 @@ FILTERS = ("KalmanFilter", "ExtendedKalmanFilter")
 
 
 def test_every_name_of_gtsam_exists():
-    gtsam = pytest.importorskip("gtsam", reason="GTSAM is not installed")
-    unstable = importlib.import_module("gtsam_unstable")
+    gtsam = broken.optional("gtsam")
+    unstable = broken.optional("gtsam_unstable")
     names = [n for theirs, _, _ in rows("GTSAM") for n in re.findall(r"`([\w.]+)`", theirs)]
     for name in names:
         # Until GTSAM 4.3 some names are in its second module.
@@ -110,8 +111,8 @@ def test_every_name_of_gtsam_exists():
 @pytest.mark.sweep
 def test_its_cells_run():
     """They end where the libraries differ; `make docs` runs them too."""
-    pytest.importorskip("filterpy", reason="filterpy is not installed")
-    pytest.importorskip("gtsam", reason="GTSAM is not installed")
+    broken.optional("filterpy")
+    broken.optional("gtsam")
     code = executed().code_of(PAGES[PAGE])
     assert code.count("assert_allclose") > 10
     exec(compile(code, PAGE, "exec"), {"__name__": "cells"})

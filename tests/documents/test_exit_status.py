@@ -1,13 +1,13 @@
 """The extension that checks the exit status of `!…` in the cells of pages, in one kernel."""
 
-import pytest
+import broken
 from test_docs import ROOT
 
 
 def test_a_command_in_a_cell_ends_with_the_status_that_its_tag_says(monkeypatch, tmp_path):
     monkeypatch.syspath_prepend(ROOT / "docs" / "_ext")
-    nbformat = pytest.importorskip("nbformat")
-    cache = pytest.importorskip("myst_nb.core.execute.cache")
+    nbformat = broken.optional("nbformat")
+    cache = broken.optional("myst_nb.core.execute.cache")
     import exit_status
 
     monkeypatch.setattr(exit_status.utils, "executenb", None)

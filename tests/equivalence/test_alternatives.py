@@ -3,6 +3,7 @@
 import importlib
 import pkgutil
 
+import broken
 import jax
 import numpy as np
 import pytest
@@ -28,7 +29,7 @@ def test_another_library_gives_the_same_localization(name, task):
 
 
 def test_the_reset_of_gtsam_is_what_differs(task):
-    pytest.importorskip("gtsam", reason="GTSAM is not installed")
+    broken.optional("gtsam")
     ours = alternatives.left_invariant(*task)
     assert alternatives.difference(alternatives.with_gtsam(*task, reset=False), ours)[0] < 1e-12
     assert alternatives.difference(alternatives.with_gtsam(*task, reset=True), ours)[0] > 1e-5
@@ -36,9 +37,9 @@ def test_the_reset_of_gtsam_is_what_differs(task):
 
 def test_who_has_a_nees():
     """As the page that compares the libraries says."""
-    stats = pytest.importorskip("filterpy.stats", reason="filterpy is not installed")
+    stats = broken.optional("filterpy.stats")
     assert callable(stats.NEES)
-    metrics = pytest.importorskip("stonesoup.metricgenerator", reason="Stone Soup is not installed")
+    metrics = broken.optional("stonesoup.metricgenerator")
     names = [
         name
         for module in pkgutil.iter_modules(metrics.__path__)
@@ -48,7 +49,7 @@ def test_who_has_a_nees():
 
 
 def test_dynamax_has_gradients_too(task):
-    pytest.importorskip("dynamax", reason="dynamax is not installed")
+    broken.optional("dynamax")
     world, log = task
 
     def last(scale):

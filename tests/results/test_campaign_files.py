@@ -8,6 +8,7 @@ import json
 import sys
 import types
 
+import broken
 import numpy as np
 import pytest
 from test_page import EVIL, GOOD, RUNS, STEPS, Reader, campaign, summary
@@ -187,7 +188,7 @@ def test_a_data_frame_has_a_row_for_each_run_of_each_filter(found, monkeypatch):
 
 
 def test_pandas_takes_it(found):
-    pandas = pytest.importorskip("pandas")
+    pandas = broken.optional("pandas")
     frame = found.to_dataframe()
     assert isinstance(frame, pandas.DataFrame)
     assert frame.groupby("filter").nees_pose.mean().to_dict() == {"good": 1.0, "other": 6.0}
@@ -195,5 +196,7 @@ def test_pandas_takes_it(found):
 
 def test_without_pandas_a_line_says_so(found, monkeypatch):
     monkeypatch.setitem(sys.modules, "pandas", None)
-    with pytest.raises(ImportError, match="to_dataframe needs pandas, which is not inst"):
+    with pytest.raises(
+        ImportError, match="to_dataframe: pandas is not installed: pip install pandas"
+    ):
         found.to_dataframe()

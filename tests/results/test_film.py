@@ -4,12 +4,15 @@ import re
 import shutil
 import subprocess
 
+import broken
 import numpy as np
 import pytest
 from matplotlib.animation import FFMpegWriter
 from PIL import Image
 
 from jaxslam import plot
+from jaxslam.results.plot import _style
+from jaxslam.results.plot._film import mp4_problem
 from jaxslam.results.plot._run_film import MOST, frame_steps
 
 COLORS = [(204, 0, 0), (0, 204, 0), (0, 0, 204)]
@@ -100,11 +103,47 @@ def test_a_file_that_cannot_be_written_is_refused(three, tmp_path, monkeypatch):
     monkeypatch.setattr(FFMpegWriter, "isAvailable", lambda: False)
     for name, message in (
         *((name, r"expected a name in .gif, .html, .mp4, got") for name in ("a.avi", "a", "a.GIF")),
-        ("a.mp4", "a.mp4 needs ffmpeg, which is not installed: save a .gif"),
+        ("a.mp4", r"a.mp4 cannot be written \(ffmpeg is not installed\): save a .gif"),
     ):
         with pytest.raises(ValueError, match=f"Film.save: .*{message}"):
             three.save(tmp_path / name)
     assert not list(tmp_path.iterdir())
+
+
+ENCODERLESS = "#!/bin/sh\necho 'Unknown encoder h264' >&2\nexit 1\n"
+
+
+@pytest.mark.parametrize(
+    ("script", "told"),
+    [
+        (ENCODERLESS, "Unknown encoder h264"),
+        ("#!/bin/sh\nexec 0<&-\nexit 127\n", "127"),
+    ],
+)
+def test_an_ffmpeg_that_fails_is_one_line(three, tmp_path, monkeypatch, script, told):
+    broken.program(monkeypatch, tmp_path, "ffmpeg", script)
+    assert mp4_problem().startswith("ffmpeg: ")
+    for writer in (None, "ffmpeg"):  # the latter only when the frames are drawn
+        with pytest.raises(ValueError, match=r"(?s)^Film.save: .*: save a .gif$") as caught:
+            three.save(tmp_path / "a.mp4", writer)
+        assert "\n" not in str(caught.value) and told in str(caught.value)
+
+
+def test_an_ffmpeg_that_does_not_start_or_is_not_there_is_named(tmp_path, monkeypatch):
+    broken.program(monkeypatch, tmp_path, "ffmpeg", "#!/no/such/shell\n")
+    assert "Error: [Errno" in mp4_problem()
+    monkeypatch.setenv("PATH", str(tmp_path / "nothing"))
+    assert mp4_problem() == "ffmpeg is not installed"
+
+
+def test_without_a_font_nothing_is_drawn(tmp_path, monkeypatch):
+    (tmp_path / "damaged.ttf").write_bytes(b"no font")
+    monkeypatch.setattr(_style, "findfont", lambda _: str(tmp_path / "damaged.ttf"))
+    with pytest.raises(
+        ValueError, match=r"^figures: matplotlib .* cannot be used \(.*: pip"
+    ) as caught:
+        plot.panels_of(2, 2, 1)
+    assert "\n" not in str(caught.value)
 
 
 # --- the player ---------------------------------------------------------------------------------

@@ -65,7 +65,7 @@ def spec_of(options: argparse.Namespace) -> Spec:
     if not 0 <= campaign.seed < 2**32:
         raise ValueError(f"--seed: expected an integer from 0 to 2³²-1, got {campaign.seed}")
     part = _part(options)
-    check_out(out, "consistency")
+    check_out(out, "consistency", draws=part is None)
     most = settings.get("devices")  # missing parts are computed as the parts would be
     assert isinstance(most, int | None)
     return Spec(

@@ -1,13 +1,14 @@
 """The executors of `jaxslam consistency --executor`."""
 
 import contextlib
-import importlib
 import re
 from collections.abc import Iterator
-from types import ModuleType
+from concurrent.futures import Future
+from threading import Thread
 from typing import Any
 
 from jaxslam.consistency.campaign._remote import Executor, Processes
+from jaxslam.core._optional import first_line, loading
 
 _MPI = "mpiexec -n 4 python -m mpi4py.futures -m jaxslam consistency --executor mpi …"
 _TIMEOUT = 10
@@ -18,7 +19,7 @@ _TIMEOUT = 10
 def engine(value: str | None) -> Iterator[tuple[Executor | None, int | None]]:
     """A context with the executor that an option names, and the number of blocks in flight.
 
-    Raises ValueError on another value, on a library that is not installed, and where no worker
+    Raises ValueError on another value, on a library that cannot be used, and where no worker
     answers.
     """
     if value is None:
@@ -42,33 +43,41 @@ def engine(value: str | None) -> Iterator[tuple[Executor | None, int | None]]:
 
 
 def _of_mpi() -> Any:
-    if _library("mpi4py.MPI", "mpi").COMM_WORLD.Get_size() < 2:
+    with loading("--executor", "mpi4py"):
+        from mpi4py import MPI
+        from mpi4py.futures import MPIPoolExecutor
+
+        ranks = MPI.COMM_WORLD.Get_size()
+    if ranks < 2:
         raise ValueError(f"--executor: expected two ranks of MPI or more: {_MPI}")
-    return importlib.import_module("mpi4py.futures").MPIPoolExecutor()
+    return MPIPoolExecutor()
 
 
 def _client(address: str) -> Any:
-    distributed = _library("distributed", "dask")
+    with loading("--executor", "distributed"):
+        from distributed import Client
+    connected: Future[Any] = Future()
+
+    def connect() -> None:
+        try:
+            connected.set_result(Client(f"tcp://{address}", timeout=_TIMEOUT))
+        except BaseException as error:
+            connected.set_exception(error)
+
+    # In a thread, since Dask waits for ever for a service that is not its own, as of HTTP.
+    Thread(target=connect, daemon=True).start()
     try:
-        client = distributed.Client(f"tcp://{address}", timeout=_TIMEOUT)
-    except (OSError, TimeoutError, ValueError) as error:
+        client = connected.result(timeout=1.5 * _TIMEOUT)
+    except Exception as error:  # of sockets, of time, of other versions of Dask
         raise ValueError(
-            f"--executor: no Dask scheduler answers at {address} within {_TIMEOUT} s"
+            f"--executor: no Dask scheduler answers at {address} within {_TIMEOUT} s: `dask "
+            f"scheduler` starts one, `dask worker {address}` its workers ({first_line(error)})"
         ) from error
     try:
         client.wait_for_workers(1, timeout=_TIMEOUT)
     except TimeoutError as error:
         client.close()
-        raise ValueError(f"--executor: the Dask scheduler {address} has no workers") from error
-    return client
-
-
-def _library(name: str, extra: str) -> ModuleType:
-    """A module of an optional library; ValueError with the line that installs it."""
-    try:
-        return importlib.import_module(name)
-    except ImportError as error:
         raise ValueError(
-            f"--executor: {name.partition('.')[0]} cannot be imported ({error}): "
-            f"pip install 'jaxslam[{extra}]'"
+            f"--executor: the Dask scheduler {address} has no workers: dask worker {address}"
         ) from error
+    return client

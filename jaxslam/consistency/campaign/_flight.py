@@ -34,6 +34,11 @@ def _is_of_the_code(error: BaseException) -> bool:
     return isinstance(error, ValueError | TypeError | ImportError) or out_of_memory(error)
 
 
+def _text(error: BaseException) -> str:
+    """An error in one line."""
+    return " ".join(f"{type(error).__name__}: {error}".split())
+
+
 @dataclass
 class _Block:
     futures: list[tuple[Any, float]] = field(default_factory=list)
@@ -98,7 +103,7 @@ class Flight:
             return error
         broken = isinstance(error, BrokenExecutor) and self._longest == 0
         hint = "; does the script begin under `if __name__ == '__main__':`?" * broken
-        incomplete = Incomplete(f"{type(error).__name__}: {error}{hint}")
+        incomplete = Incomplete(f"{_text(error)}{hint}")
         incomplete.__cause__ = error
         return incomplete
 
@@ -142,7 +147,7 @@ class Flight:
             return False
         warnings.warn(
             f"monte_carlo: runs {piece[0]} to {sum(piece) - 1} are computed once more "
-            f"({type(error).__name__}: {error})",
+            f"({_text(error)})",
             stacklevel=2,
         )
         return True

@@ -1,7 +1,6 @@
 """The blocks of a campaign on the workers of an executor: what is sent, and what a worker does."""
 
 import functools
-import importlib
 import pickle
 import signal
 import threading
@@ -16,6 +15,7 @@ from jaxtyping import PyTree
 from threadpoolctl import threadpool_limits
 
 from jaxslam.consistency.campaign._block import BlockResult, BlockRunner, CampaignPlan
+from jaxslam.core._optional import Unusable, first_line, loading
 
 _SETTINGS = (
     "jax_enable_x64",
@@ -44,15 +44,17 @@ def packed(plan: CampaignPlan) -> bytes:
     """
     sent: PyTree = replace(plan, devices=[one.platform for one in plan.devices])
     settings = {name: getattr(jax.config, name) for name in _SETTINGS}
+    by: Any = pickle
+    more = ""
     try:
         # By cloudpickle classes and functions of a script, a notebook or a file can be sent, too.
-        by: Any = importlib.import_module("cloudpickle")
-    except ImportError:
-        by = pickle
+        with loading("a module holds it, or", "cloudpickle"):
+            import cloudpickle as by
+    except Unusable as lacking:
+        more = f": {lacking}"
     try:
         content: bytes = by.dumps((sent, settings))
     except (pickle.PicklingError, AttributeError, TypeError) as error:
-        more = "" if by is not pickle else ": pip install cloudpickle, or move it to a module"
         raise ValueError(
             f"monte_carlo: executor: a filter or the world cannot be sent ({error}){more}"
         ) from error
@@ -78,7 +80,13 @@ _COMPILING = threading.Lock()
 
 @functools.lru_cache(maxsize=1)
 def _runner(plan: bytes) -> BlockRunner:
-    sent, settings = pickle.loads(plan)
+    try:
+        sent, settings = pickle.loads(plan)
+    except (ImportError, AttributeError) as error:  # cloudpickle, or a module of the user
+        raise Unusable(
+            f"monte_carlo: executor: a worker cannot read what is sent ({first_line(error)}): "
+            "install there the packages that are installed here"
+        ) from error
     for name, value in settings.items():
         if getattr(jax.config, name) != value:
             jax.config.update(name, value)

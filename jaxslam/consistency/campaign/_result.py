@@ -1,6 +1,5 @@
 """The result of a campaign, `Campaign`: its summaries, and how it is shown, saved and tabulated."""
 
-import importlib
 import textwrap
 from collections.abc import Iterable
 from dataclasses import dataclass, field
@@ -11,6 +10,7 @@ import numpy as np
 
 from jaxslam.consistency import Summary
 from jaxslam.core._names import Named
+from jaxslam.core._optional import loading
 from jaxslam.core.types import Estimate, Truth
 
 
@@ -112,14 +112,10 @@ class Campaign:
         such average.
 
         Raises:
-            ImportError: where pandas is not installed; jaxslam does not require it.
+            ImportError: where pandas cannot be used; jaxslam does not require it.
         """
-        try:
-            pandas = importlib.import_module("pandas")
-        except ImportError:
-            raise ImportError(
-                "Campaign.to_dataframe needs pandas, which is not installed: pip install pandas"
-            ) from None
+        with loading("Campaign.to_dataframe", "pandas"):
+            import pandas
         from jaxslam.results import _report as report
 
         return pandas.DataFrame(report.run_columns(self))

@@ -7,9 +7,9 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-TRANSFORMS = ("tf2_msgs/TFMessage", "tf/tfMessage")
+from jaxslam.core._optional import loading
 
-INSTALL = "pip install 'jaxslam[ros]'"
+TRANSFORMS = ("tf2_msgs/TFMessage", "tf/tfMessage")
 
 
 @dataclass(frozen=True)
@@ -98,17 +98,16 @@ class Bag:
 def opened(path: str | Path) -> Iterator[Bag]:
     """The bag in a file (ROS 1 `.bag`, ROS 2 `.mcap` or `.db3`) or in a folder of ROS 2.
 
-    Raises ValueError if `rosbags` is not installed, and, with the file, if the bag cannot be read.
+    Raises ValueError if `rosbags` cannot be used, and, with the file, if the bag cannot be read.
     """
-    try:
+    with loading("rosbag", "rosbags"):
         from rosbags.highlevel import AnyReader
         from rosbags.typesys import Stores, get_typestore
-    except ImportError as problem:
-        raise ValueError(f"rosbag: the library rosbags reads bags: {INSTALL}") from problem
-    path = Path(path)
-    try:
+
         # Bags of ROS 2 before Iron have no definitions; those of these types are equal in all.
         types = get_typestore(Stores.ROS2_HUMBLE)
+    path = Path(path)
+    try:
         reader = AnyReader([path], default_typestore=types)
         reader.open()
     except Exception as problem:  # of SQLite, zstd, struct, … where a bag is damaged

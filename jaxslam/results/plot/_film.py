@@ -12,6 +12,8 @@ function that sets those to frame k. Another kind of film is another layer:
     film = Film(Scene(len(maps), Panel([growing(maps)], xlim, ylim)))
 """
 
+import subprocess
+import tempfile
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -31,6 +33,7 @@ from matplotlib.layout_engine import ConstrainedLayoutEngine
 from matplotlib.patches import Polygon
 
 from jaxslam.core._numbers import check_count
+from jaxslam.core._optional import Unusable, first_line
 from jaxslam.results.plot._landmarks import ellipses
 from jaxslam.results.plot._style import INK, PAGE, TEXT, TITLE, panels_of, titled
 
@@ -141,12 +144,17 @@ class Film(FuncAnimation):
             writer: another writer of Matplotlib, for any ending.
             arguments, options: of Matplotlib's `Animation.save`.
         Raises:
-            ValueError: on another ending, or .mp4 without ffmpeg.
+            ValueError: on another ending, or .mp4 where ffmpeg is missing or fails.
         """
         if writer is None and Path(filename).suffix == ".html":
             Path(filename).write_text(self.to_jshtml(), encoding="utf-8")
-        else:
+            return
+        try:
             super().save(filename, writer or _writer_of(filename), *arguments, **options)
+        except (subprocess.CalledProcessError, BrokenPipeError) as error:
+            raise Unusable(
+                f"Film.save: {filename} cannot be written ({_reason(error)}): save a .gif"
+            ) from error
 
     def to_jshtml(self, *arguments: Any, **options: Any) -> str:
         """The player in HTML, which loads nothing; arguments as for Matplotlib's method."""
@@ -157,9 +165,36 @@ class Film(FuncAnimation):
         return self.to_jshtml()
 
 
-def has_ffmpeg() -> bool:
-    """Whether the program ffmpeg, which writes MP4, is installed."""
-    return FFMpegWriter.isAvailable()
+def mp4_problem() -> str | None:
+    """Why no MP4 can be written, or None: ffmpeg is missing, does not start, or has no H.264.
+
+    Two black frames are written.
+    """
+    if not FFMpegWriter.isAvailable():
+        return "ffmpeg is not installed"
+    source = ["-f", "rawvideo", "-s", "64x64", "-pix_fmt", "rgba", "-framerate", "2", "-i", "pipe:"]
+    codec = ["-vcodec", matplotlib.rcParams["animation.codec"], "-pix_fmt", "yuv420p"]
+    try:
+        with tempfile.TemporaryDirectory() as folder:
+            subprocess.run(
+                [FFMpegWriter.bin_path(), "-loglevel", "error", *source, *codec, "trial.mp4"],
+                input=bytes(2 * 64 * 64 * 4),
+                capture_output=True,
+                check=True,
+                cwd=folder,
+            )
+    except (subprocess.CalledProcessError, OSError) as error:
+        return f"ffmpeg: {_reason(error)}"
+    return None
+
+
+def _reason(error: BaseException) -> str:
+    """Why a program failed: the last line that it wrote, or the error."""
+    wrote = getattr(error, "stderr", None) or ""
+    text = wrote.decode(errors="replace") if isinstance(wrote, bytes) else wrote
+    return next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "") or (
+        first_line(error)
+    )
 
 
 def _writer_of(filename: str | Path) -> str:
@@ -167,8 +202,8 @@ def _writer_of(filename: str | Path) -> str:
     kind = Path(filename).suffix
     if kind not in (".gif", ".mp4"):
         raise ValueError(f"Film.save: expected a name in .gif, .html, .mp4, got {filename}")
-    if kind == ".mp4" and not has_ffmpeg():
-        raise ValueError(f"Film.save: {filename} needs ffmpeg, which is not installed: save a .gif")
+    if kind == ".mp4" and (problem := mp4_problem()):
+        raise Unusable(f"Film.save: {filename} cannot be written ({problem}): save a .gif")
     return "pillow" if kind == ".gif" else "ffmpeg"
 
 

@@ -10,7 +10,10 @@ import numpy as np
 from matplotlib.artist import Artist
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure as Figure  # re-exported: only this package imports Matplotlib
+from matplotlib.font_manager import FontProperties, findfont, get_font
 from matplotlib.lines import Line2D
+
+from jaxslam.core._optional import loading
 
 Share: TypeAlias = bool | Literal["none", "all", "row", "col"]
 
@@ -56,6 +59,12 @@ def look(i: int) -> Look:
         "mec": INK,
         "mew": 0.4,
     }
+
+
+def check_font() -> None:
+    """Raise `Unusable` where Matplotlib has no font to write with: its own is gone, or damaged."""
+    with loading("figures", "matplotlib"):
+        get_font(findfont(FontProperties()))
 
 
 def encode(figure: Figure, kind: str, dpi: float = 200) -> bytes:
@@ -118,6 +127,7 @@ def panels_of(
     share: whether panels share abscissae and ordinates, as in Matplotlib. widths, heights:
     ratios of columns and rows.
     """
+    check_font()
     figure = _ShownFigure(figsize=(width, height), dpi=150, layout="constrained")
     grid = figure.subplots(
         rows,

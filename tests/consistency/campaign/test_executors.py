@@ -10,8 +10,11 @@ import sys
 import time
 import warnings
 from concurrent.futures import BrokenExecutor, Future, ProcessPoolExecutor, ThreadPoolExecutor
+from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from multiprocessing import get_context
+from threading import Thread
 
+import broken
 import jax
 import numpy as np
 import pytest
@@ -20,6 +23,7 @@ import worlds
 import jaxslam
 from jaxslam import _cli as cli
 from jaxslam import filters, store
+from jaxslam._cli.campaigns import engines
 from jaxslam.consistency.campaign import (
     Incomplete,
     monte_carlo,
@@ -172,15 +176,21 @@ def test_what_is_no_executor_is_refused(options, told):
         campaign_of(**options)
 
 
-def test_what_cannot_be_pickled_is_refused(monkeypatch):
+def test_what_cannot_be_pickled_is_refused(tmp_path, monkeypatch):
+    def send():
+        monte_carlo(WORLD, {"own": lambda truth: RECKONING}, 4, worlds.key(), executor=Unreliable())
+
     monkeypatch.setitem(sys.modules, "cloudpickle", None)
     with pytest.raises(ValueError, match=r"cannot be sent .*pip install cloudpickle"):
-        monte_carlo(WORLD, {"own": lambda truth: RECKONING}, 4, worlds.key(), executor=Unreliable())
+        send()
+    broken.library(monkeypatch, tmp_path, "cloudpickle", {"": "raise AttributeError('opcode')"})
+    with pytest.raises(ValueError, match=r"cannot be sent .*\(AttributeError: opcode\)"):
+        send()
 
 
 def test_a_class_of_a_script_is_a_record_in_another_process(tmp_path):
     """By cloudpickle, which makes the class anew there."""
-    cloudpickle = pytest.importorskip("cloudpickle")
+    cloudpickle = broken.optional("cloudpickle")
 
     @record
     class Slow(jaxslam.motion.Unicycle):
@@ -236,7 +246,7 @@ def test_processes_of_which_one_is_killed(whole, tmp_path):
 
 @pytest.mark.sweep
 def test_dask_with_a_worker_killed(whole):
-    distributed = pytest.importorskip("distributed")
+    distributed = broken.optional("distributed")
     with (
         distributed.LocalCluster(
             n_workers=2, threads_per_worker=1, processes=True, dashboard_address=None
@@ -283,20 +293,23 @@ def test_the_command_on_processes(tmp_path, in_one_go):
 
 @pytest.mark.sweep
 def test_the_command_on_open_mpi(tmp_path, in_one_go):
-    pytest.importorskip("mpi4py")
     started = ["mpiexec", "--allow-run-as-root", "--oversubscribe", "-n", "3", sys.executable]
     options = ["--runs", "32", "--executor", "mpi", "--out", str(tmp_path / "out")]
     command = [*started, "-m", "mpi4py.futures", "-m", "jaxslam", "consistency", *ASKED, *options]
+    options = {"capture_output": True, "text": True, "timeout": 300}
     try:
-        ran = subprocess.run(command, capture_output=True, text=True, timeout=300)
+        tried = subprocess.run([*started, "-c", "from mpi4py import MPI"], **options)
     except FileNotFoundError:
         pytest.skip("mpiexec is not installed")
+    if tried.returncode:
+        pytest.skip(f"MPI cannot be used: {' '.join(tried.stderr.split())[:200]}")
+    ran = subprocess.run(command, **options)
     assert ran.returncode == 0, ran.stderr
     assert results(tmp_path / "out") == results(in_one_go)
 
 
 def test_an_address_that_does_not_answer_ends_the_command(tmp_path, capsys):
-    pytest.importorskip("distributed")
+    broken.optional("distributed")
     began = time.monotonic()
     options = ["--executor", "dask://127.0.0.1:1", "--out", str(tmp_path / "out")]
     assert cli.main(["consistency", *ASKED, *options]) == 2
@@ -310,7 +323,8 @@ def test_an_address_that_does_not_answer_ends_the_command(tmp_path, capsys):
     [
         (["--executor", "threads:2"], "expected processes:N, dask://HOST:PORT or mpi"),
         (["--executor", "processes:2", "--devices", "1"], "expected no --devices with it"),
-        (["--executor", "mpi"], "mpiexec -n 4|pip install 'jaxslam.mpi.'"),
+        # One rank, or no library of MPI, or no mpi4py.
+        (["--executor", "mpi"], "mpiexec -n 4|an MPI library|pip install 'jaxslam.mpi.'"),
     ],
 )
 def test_the_command_refuses(tmp_path, capsys, options, told):
@@ -319,8 +333,58 @@ def test_the_command_refuses(tmp_path, capsys, options, told):
     assert not (tmp_path / "out").exists()
 
 
-def test_an_engine_that_is_not_installed_is_named(tmp_path, capsys, monkeypatch):
-    monkeypatch.setitem(sys.modules, "distributed", None)
-    options = ["--executor", "dask://127.0.0.1:1", "--out", str(tmp_path / "out")]
-    assert cli.main(["consistency", *ASKED, *options]) == 2
-    assert "pip install 'jaxslam[dask]'" in capsys.readouterr().err
+NO_MPI = "raise RuntimeError('cannot load MPI library\\n libmpi.so: cannot open')"
+
+
+@pytest.mark.parametrize(
+    ("executor", "name", "sources", "version", "told"),
+    [
+        ("dask://127.0.0.1:1", "distributed", None, None, "pip install 'jaxslam[dask]'"),
+        ("dask://127.0.0.1:1", "distributed", {"": "import dask.gone"}, None, "'dask.gone'"),
+        ("dask://127.0.0.1:1", "distributed", {}, "2023.4.1", "2023.4.1 is too old"),
+        (
+            "mpi",
+            "mpi4py",
+            {"MPI": NO_MPI},
+            None,
+            "(RuntimeError: cannot load MPI library): install",
+        ),
+        ("mpi", "mpi4py", {}, "3.1.4", "mpi4py 3.1.4 is too old, expected 4.1 or later"),
+    ],
+)
+def test_an_engine_that_cannot_be_used_is_named(
+    tmp_path, capsys, monkeypatch, executor, name, sources, version, told
+):
+    if sources is None:
+        monkeypatch.setitem(sys.modules, name, None)
+    else:
+        broken.library(monkeypatch, tmp_path, name, sources, version)
+    out = tmp_path / "out"
+    assert cli.main(["consistency", *ASKED, "--executor", executor, "--out", str(out)]) == 2
+    written = capsys.readouterr().err
+    assert told in written and written.startswith("jaxslam: --executor: ")
+    assert written.count("\n") == 1 and not out.exists()
+
+
+@pytest.mark.sweep
+def test_a_service_that_is_not_dasks_ends_the_command(tmp_path, capsys, monkeypatch):
+    """Dask's own time limit does not hold while it reads another protocol."""
+    broken.optional("distributed")
+    monkeypatch.setattr(engines, "_TIMEOUT", 1)
+    with ThreadingHTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler) as server:
+        Thread(target=server.serve_forever, daemon=True).start()
+        options = ["--executor", f"dask://127.0.0.1:{server.server_port}"]
+        assert cli.main(["consistency", *ASKED, *options, "--out", str(tmp_path / "out")]) == 2
+        server.shutdown()
+    assert "no Dask scheduler answers at 127.0.0.1" in capsys.readouterr().err
+
+
+def test_what_a_worker_lacks_is_named():
+    """Of a class of a module that is not there, and of cloudpickle."""
+    for content in (b"cnowhere_to_be_found\nCloud\n.", b"cjaxslam.motion\nNowhere\n."):
+        with pytest.raises(
+            ValueError, match=r"a worker cannot read what is sent .*owhere"
+        ) as caught:
+            compute_block(content, 0, 4)
+        assert "\n" not in str(caught.value)
+        assert pickle.loads(pickle.dumps(caught.value)).args == caught.value.args

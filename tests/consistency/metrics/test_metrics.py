@@ -1,5 +1,6 @@
 """Errors of paths and maps, against values by hand and homogeneous matrices."""
 
+import broken
 import numpy as np
 import pytest
 from cases import refused
@@ -244,7 +245,7 @@ def test_bad_input_is_refused_by_name(call):
 
 
 def test_the_errors_are_those_of_evo():
-    pytest.importorskip("evo", reason="evo is not installed")
+    broken.optional("evo")
     from evo.core import metrics as theirs
     from evo.core.trajectory import PosePath3D
 
