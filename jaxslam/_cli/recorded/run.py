@@ -204,7 +204,7 @@ def run_filter(
         map_cov = None if map_cov is None else map_cov + added.points
     uncertain = data.adjustable is not None and data.adjustable.cov is not None
     found = evaluate(data, result.path, last, map_cov)
-    summary = {
+    summary: Json = {
         "landmarks": int(last.alive.sum()),
         "status": {
             s.name.lower(): int((result.status == s).sum()) for s in Status if s != Status.EMPTY

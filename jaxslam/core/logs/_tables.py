@@ -298,10 +298,10 @@ def columns_of(
         return f"{what}, row {row}, column {split_unit(column)[0]}"
 
     if names is None:
-        rows = list(given) if isinstance(given, Sequence) or np.ndim(given) else None
-        if rows is None:
+        without_axes = isinstance(given, np.ndarray) and given.ndim == 0
+        if without_axes or not isinstance(given, Sequence | np.ndarray):
             raise ValueError(f"{what}: expected rows or columns, got {type(given).__name__}")
-        rows = [_held(row) for row in rows]
+        rows = [_held(row) for row in given]
         for k, row in enumerate(rows):
             size = len(row) if isinstance(row, Sequence) or np.ndim(row) else 1
             if size != len(needed) or isinstance(row, str):

@@ -388,8 +388,9 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
     )
     if not rows.valid.any():
         raise none_left(f"{seen_file.path}:{seen_file.lines[0]}", dropped)
-    for row, tag in enumerate(seen.tags or () if survey is not None else ()):
-        if tag in tags and tag not in survey:  # others are outside the odometry, and counted
+    for row, tag in enumerate(seen.tags or ()):
+        # A tag that is not in the log is measured outside of the odometry alone, and counted.
+        if survey is not None and tag in tags and tag not in survey:
             raise ValueError(f"{seen.at(row, TAG)}: expected a tag of landmarks.csv, got {tag}")
     truth, covered, of_truth = _truth(folder / "truth.csv", rows.time)
     notes += of_truth
