@@ -1,5 +1,6 @@
 """The driver of all filters: one `lax.scan` over a log."""
 
+import warnings
 from collections.abc import Callable
 from functools import partial
 
@@ -54,10 +55,14 @@ def run(
         ValueError: on wrong shapes or kinds, and, where the values are concrete, on NaN or too
             large numbers in controls or valid measurements, tags repeated within a scan, or an
             invalid pose_cov.
+    Warns:
+        UserWarning: on concrete ranges below 0, which a sensor writes where it met nothing. Noise
+            makes few of them of landmarks that are near.
     """
     check_record("run", "filter", filter, Filter)
     check_record("run", "log", log, Log)
     check_run("run", filter, log, pose, pose_cov)
+    _notice_negative_ranges(filter, log.scan)
     check_key("run", key)
     return _drive(filter, log, pose, pose_cov, key, probe)
 
@@ -81,6 +86,22 @@ def check_run(name: str, filter: Filter, log: Log, pose: ArrayLike, pose_cov: Ar
         if not np.all(np.isfinite(values)):
             raise ValueError(f"{name}: the initial pose is not finite, got {values.tolist()}")
     check_covariance(f"{name}: pose_cov", pose_cov, 3)
+
+
+def _notice_negative_ranges(filter: Filter, scan: Scan) -> None:
+    """Warn of valid ranges below 0, where they are concrete."""
+    ranges = [name.startswith("range") for name in filter.measurements]
+    if not any(ranges) or not is_concrete(scan):
+        return
+    negative = np.asarray(scan.valid) & (np.asarray(scan.z)[..., ranges] < 0).any(axis=-1)
+    if count := int(negative.sum()):
+        row, slot = np.argwhere(negative)[0]
+        warnings.warn(
+            f"run: {count:,} valid measurement{'s have' if count > 1 else ' has'} a range below 0 "
+            f"(first in row {row}, slot {slot}): set log.scan.valid to False where the sensor met "
+            "nothing",
+            stacklevel=3,
+        )
 
 
 @partial(hot_jit, static_argnames=("probe",))

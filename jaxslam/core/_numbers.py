@@ -1,6 +1,7 @@
 """Checks of numbers: counts, keys, gates, covariances."""
 
 import math
+import warnings
 from numbers import Integral
 from typing import Any
 
@@ -8,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
+
+from jaxslam.core._units import TURN
 
 
 def is_concrete(*values: object) -> bool:
@@ -86,13 +89,22 @@ def check_positive(name: str, **values: ArrayLike) -> None:
 
 
 def check_mount(name: str, mount: ArrayLike) -> None:
-    """Raise ValueError unless mount is a finite (3,); only the shape of a tracer is checked."""
+    """Raise ValueError unless mount is a finite (3,); only the shape of a tracer is checked.
+
+    Warns of a heading beyond 2π, which may be in degrees.
+    """
     got = shape_text(mount if is_concrete(mount) else jnp.asarray(mount))
     if got != "(3,)":
         raise ValueError(f"{name}: expected a mounting pose of shape (3,), got {got}")
     check_real(name, mount=mount)
     if is_concrete(mount) and not np.all(np.isfinite(np.asarray(mount))):
         raise ValueError(f"{name}: the mounting pose is not finite")
+    if is_concrete(mount) and abs(heading := float(np.asarray(mount)[2])) > TURN:
+        warnings.warn(
+            f"{name}: the heading of the mounting pose, {heading:g} rad, is beyond 2π: is it in "
+            "degrees?",
+            stacklevel=4,  # through __post_init__ and the __init__ of the record
+        )
 
 
 def held_array(values: ArrayLike) -> ArrayLike:

@@ -126,16 +126,18 @@ class Log(NamedTuple):
 
         odometry has columns t and the motion's controls without Δt; measurements has t, tag and
         what the sensor measures (no tag for a sensor of no landmark, as a compass). Either is a
-        sequence of rows in this order (lists, a NumPy array), or has columns with names: a mapping,
-        a structured array, a data frame. A name may have a unit, as "bearing [deg]"; else it is the
-        model's. With `PoseIncrement` columns named t, x, y, theta may be a path of poses. Of a
-        `sensors.Suite` measurements are one such table a part, in order: (of_laser, of_compass).
+        sequence of rows in this order (lists, an array of NumPy or JAX), or has columns with names:
+        a mapping, a structured array, a data frame. A name may have a unit, as "bearing [deg]";
+        else it is the model's. With `PoseIncrement` columns named t, x, y, theta may be a path of
+        poses. Of a `sensors.Suite` measurements are one such table a part, in order: (of_laser,
+        of_compass).
 
         There is a row at every time of either. A velocity holds until the next; poses are
-        interpolated; other controls stand as they are, and measurements must be at their times.
-        Tags are whole numbers or text, in any order; None, "", NaN and -1 are unknown. Measurements
-        before the first or after the last line of odometry are dropped and counted; the last
-        velocity holds for the longest interval.
+        interpolated, but not in a gap, an interval above ten times the median; other controls stand
+        as they are, and measurements must be at their times. Tags are whole numbers or text, in any
+        order; None, "", NaN, -1 and a missing value of pandas or NumPy are unknown. Measurements
+        before the first or after the last line of odometry, or in a gap between poses, are dropped
+        and counted; the last velocity holds for the longest interval.
 
         Args:
             motion, sensor: the models.

@@ -61,7 +61,7 @@ class Dataset:
     """[s], or the number of the odometry line if the file has no times"""
     motion: Motion
     sensor: Sensor
-    tags: tuple[int, ...]
+    tags: tuple[int | str, ...]
     """the names in the file of the landmarks with tags 0, 1, …, N-1"""
     pose: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
     """pose of the robot before the first control, the frame of the map"""
@@ -72,7 +72,8 @@ class Dataset:
     landmarks: Float[np.ndarray, "N 2"] | None = None
     """surveyed positions [m] by tag, in their frame (see `one_frame`); None if unknown"""
     true_path: Float[np.ndarray, "T 3"] | None = None
-    """true pose at each row [m, m, rad], in the frame of `landmarks`; None if unknown"""
+    """true pose at each row [m, m, rad], in the frame of `landmarks`; None if unknown. Where it is
+    not known (`true_at`), the last known one, and before it the first"""
     true_at: Bool[np.ndarray, "T"] | None = None
     """in which rows the true pose is known; None if in all"""
     true_paths: Float[np.ndarray, "R T 3"] | None = None
@@ -131,6 +132,13 @@ class Dataset:
     def capacity(self) -> int:
         """The number of landmark slots of a filter, that of tags N or `slots`."""
         return len(self.tags) if self.slots is None else self.slots
+
+    @property
+    def rows_without_truth(self) -> int:
+        """The number of rows whose true pose is not known; T without a true path."""
+        if self.true_path is None:
+            return self.steps
+        return 0 if self.true_at is None else self.steps - int(np.sum(self.true_at))
 
     @property
     def measurements(self) -> int:

@@ -105,6 +105,7 @@ def load(path: str | Path) -> Loaded:
     vertices: dict[str, dict[int, list[float]]] = {"pose": {}, "point": {}}
     rows: dict[str, list[_Row]] = {}
     fixed: list[tuple[int, int]] = []
+    equal: list[tuple[int, ...]] = []
     skipped: dict[str, int] = {}
     for line, (kind, *fields) in file:
         if kind in EDGES:
@@ -120,14 +121,22 @@ def load(path: str | Path) -> Loaded:
             if not fields:
                 raise file.error(line, "expected at least 1 field (id), got 0")
             fixed += [(line, _identity(file, line, field, "id")) for field in fields]
+        elif kind == "EQUIV":
+            file.expect(line, fields, ("i", "j"))
+            equal.append((line, *(_identity(file, line, field, "id") for field in fields)))
         elif kind in _SKIPPED or kind.startswith("#"):
             what = _SKIPPED.get(kind, "comments")
             skipped[what] = skipped.get(what, 0) + 1
         else:
-            known = ", ".join([*_VERTICES, "FIX", *EDGES])
+            known = ", ".join([*_VERTICES, "FIX", "EQUIV", *EDGES])
             raise file.error(line, f"unknown kind {kind!r}; known: {known}")
     if not rows:
         raise file.end_error("no edge in the file")
+    if equal:
+        rows, fixed, merged = _merged(file, vertices, rows, fixed, equal)
+        skipped |= merged
+        if not rows:
+            raise file.end_error("no edge is left: all are within vertices that EQUIV merges")
     unplaced = not any(vertices.values())
     if unplaced:
         vertices = _named_by_edges(file, rows)
@@ -157,6 +166,58 @@ def _row(file: TextFile, line: int, edge: _Edge, fields: list[str]) -> _Row:
     if len(set(ids)) < count:
         raise file.error(line, f"an edge from vertex {ids[0]} to itself")
     return _Row(line, edge, ids, file.numbers(line, fields[count:], names[count:]))
+
+
+def _merged(
+    file: TextFile,
+    vertices: dict[str, dict[int, list[float]]],
+    rows: dict[str, list[_Row]],
+    fixed: list[tuple[int, int]],
+    equal: list[tuple[int, ...]],
+) -> tuple[dict[str, list[_Row]], list[tuple[int, int]], dict[str, int]]:
+    """The rows and the fixed vertices of a file in which lines EQUIV i j make vertices one.
+
+    Of vertices that are equal, through any number of lines, the one with the smallest id stays with
+    its pose; the others leave `vertices`. An edge within them is left out. Also the counts. Raises
+    ValueError on a vertex that is not in the file, and on a pose that equals a point.
+    """
+    kinds = {vertex: kind for kind, named in vertices.items() for vertex in named}
+    named = set(kinds) or {vertex for table in rows.values() for row in table for vertex in row.ids}
+    parent: dict[int, int] = {}
+
+    def smallest(vertex: int) -> int:
+        while (above := parent.get(vertex, vertex)) != vertex:
+            parent[vertex] = vertex = parent.get(above, above)
+        return vertex
+
+    for line, i, j in equal:
+        for vertex in (i, j):
+            if vertex not in named:
+                raise file.error(line, f"vertex {vertex} is not defined in the file")
+        if kinds.get(i) != kinds.get(j):
+            raise file.error(line, f"one of the vertices {i} and {j} is a pose, the other a point")
+        low, high = sorted((smallest(i), smallest(j)))
+        if low != high:
+            parent[high] = low
+    for vertex in parent:
+        if vertex in kinds:
+            del vertices[kinds[vertex]][vertex]
+    kept: dict[str, list[_Row]] = {}
+    within = 0
+    for key, table in rows.items():
+        moved = [row._replace(ids=[smallest(vertex) for vertex in row.ids]) for row in table]
+        kept[key] = [row for row in moved if len(set(row.ids)) == len(row.ids)]
+        within += len(moved) - len(kept[key])
+    counts = {
+        "equivalences": len(equal),
+        "vertices merged into another": len(parent),
+        "edges within merged vertices": within,
+    }
+    return (
+        {key: table for key, table in kept.items() if table},
+        [(line, smallest(vertex)) for line, vertex in fixed],
+        {what: count for what, count in counts.items() if count},
+    )
 
 
 def _named_by_edges(

@@ -102,7 +102,9 @@ def read(path: str | Path) -> Graph:
         EDGE_SE2_XY          i l x y I11 I12 I22                       relative_position
         EDGE_BEARING_SE2_XY  i l bearing I11                           bearing
 
-    Poses and points are in the order of the file; the last five name tables.
+    Poses and points are in the order of the file; the last five name tables. A line `EQUIV i j` of
+    TORO makes two vertices one: that of the smaller id stays with its pose and has the edges of
+    both, but for edges between them, which are left out.
     Numbers are those of the file. Comments (`#`), scans (`ROBOTLASER1`), notes (`VERTEX_TAG`,
     `VERTEX_ELLIPSE`) and offsets of sensors (`PARAMS_SE2OFFSET`, to which no edge that is read
     refers) are skipped; the command `jaxslam optimize` counts them. In a file without vertices,
@@ -115,8 +117,8 @@ def read(path: str | Path) -> Graph:
 
     Raises:
         ValueError: `path:line: reason` for an unknown or malformed line, a vertex that occurs
-            twice, an edge to a missing vertex or from one to itself, and an information
-            that is not positive semidefinite.
+            twice, an edge to a missing vertex or from one to itself, an information that is not
+            positive semidefinite, and equal vertices that are missing, or a pose and a point.
     """
     from jaxslam.datasets import _g2o as g2o
 

@@ -200,7 +200,7 @@ def trajectory_tum(time: np.ndarray, estimate: Estimate) -> str:
     return "".join(lines)
 
 
-def map_csv(estimate: Estimate, names: Sequence[int]) -> str:
+def map_csv(estimate: Estimate, names: Sequence[int | str]) -> str:
     """A map as CSV: per landmark its name in the data set, position and covariance."""
     rows = []
     for i in np.flatnonzero(np.asarray(estimate.alive)):

@@ -1,5 +1,6 @@
 """Worlds of runs that were recorded, or simulated by other means, for campaigns."""
 
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import field
 
@@ -11,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from jaxslam.core._numbers import check_array
 from jaxslam.core._record import FrozenDict, record, static
+from jaxslam.core._units import are_headings_in_degrees
 from jaxslam.core._validation import check_log, check_record
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import Log, Truth
@@ -99,6 +101,8 @@ def recorded_world(
     Raises:
         ValueError: on no runs, a log that `run` would refuse (which), runs of different shapes, a
             tag without a landmark, a truth that is not finite, and as `Scenario` does.
+    Warns:
+        UserWarning: on true headings that fit their path in degrees.
     """
     check_record("recorded_world", "motion", motion, Motion)
     check_record("recorded_world", "sensor", sensor, Sensor)
@@ -144,6 +148,12 @@ def recorded_world(
         if not np.isfinite(getattr(truth, what)).all():
             run = np.argwhere(~np.isfinite(getattr(truth, what)))[0][0]
             raise ValueError(f"recorded_world: true {what} of run {run}: expected finite numbers")
+    if wrong := [i for i, path in enumerate(truth.pose) if are_headings_in_degrees(path)]:
+        warnings.warn(
+            f"recorded_world: the true headings of run {wrong[0]} contradict the directions "
+            "between its positions, which fit them as degrees: expected [rad]",
+            stacklevel=2,
+        )
     tags = np.where(log.scan.valid, log.scan.tag, -1)
     if tags.max(initial=-1) >= table.shape[1]:
         run, row, _ = np.argwhere(tags >= table.shape[1])[0]

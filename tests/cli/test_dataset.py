@@ -9,7 +9,7 @@ import pytest
 from matplotlib.animation import FFMpegWriter
 
 from jaxslam import _cli as cli
-from jaxslam._cli.recorded.run import NAMES, positive_definite
+from jaxslam._cli.recorded.run import NAMES, positive_definite, suspicions
 from jaxslam.results import plot
 
 
@@ -133,6 +133,7 @@ def test_mapping_takes_the_true_path(tmp_path, capsys):
     assert cli.main(asked) == 0
     summary = json.loads((out / "summary.json").read_text())
     assert summary["measurements without a true pose, left out"] == 2
+    assert summary["rows without a true pose"] == 1
     assert summary["status"]["born"] == 1
     rows = (out / "map.csv").read_text().splitlines()
     (point,) = csv.DictReader(rows)
@@ -154,6 +155,7 @@ def test_a_table_is_run_and_compared_with_its_truth(tmp_path, capsys):
     assert "[sensor] noise = [0.1, 0.05] (range [m], bearing [rad])" in printed
     summary = json.loads((out / "summary.json").read_text())
     assert summary["ATE [m]"] < 0.2
+    assert summary["rows without a true pose"] == 0 and "notes" not in summary
     # Of one landmark the joint NEES is its own.
     assert summary["map NEES of"] == "all landmarks, 2 dof"
     np.testing.assert_allclose(summary["map NEES"], summary["landmark NEES (2 is honest)"])
@@ -164,6 +166,40 @@ def test_a_table_is_run_and_compared_with_its_truth(tmp_path, capsys):
     # The landmark without a tag has no name.
     named = [line.split(",")[0] for line in (out / "map.csv").read_text().splitlines()]
     assert named == ["landmark", "7", ""]
+
+
+def test_a_run_that_nothing_honest_explains_says_so():
+    """Innovations of 5 σ, most of them rejected, or a truth that they contradict."""
+    honest = {
+        "status": {"fused": 90, "born": 4, "rejected": 6},
+        "NIS / dof": 1.1,
+        "pose NEES, median (2.37 is honest)": 3.0,
+    }
+    assert suspicions(honest) == suspicions({"status": honest["status"]}) == []
+    for changed, begins in (
+        ({"NIS / dof": 160.0}, "NIS / dof is 160, where 1 is honest: models or units are wrong"),
+        ({"status": {"fused": 10, "rejected": 90}}, "the gate rejects 90 of 100: models or units"),
+        ({"pose NEES, median (2.37 is honest)": 1e4}, "the median NEES of the pose is 1e+04, wh"),
+    ):
+        (note,) = suspicions(honest | changed)
+        assert note.startswith(begins)
+
+
+@pytest.mark.parametrize("filters", ["ekf", "ekf,dead_reckoning"])
+def test_wrong_units_are_told_after_the_run(tmp_path, capsys, undrawn, filters):
+    """Millimetres under [m]: a landmark that is seen again, and the truth does not know."""
+    write_table(tmp_path)
+    rows = "\n".join(f"{t},7,{5000 - 1000 * t},{0.4 * (t % 2)}" for t in range(4))
+    (tmp_path / "measurements.csv").write_text(f"t [s],tag,range [m],bearing [rad]\n{rows}\n")
+    odometry = "".join(f"{t},1,0.1\n" for t in range(4))
+    (tmp_path / "odometry.csv").write_text(f"t [s],v [m/s],omega [rad/s]\n{odometry}")
+    out = tmp_path / "out"
+    asked = ["run", "--dataset", "table", str(tmp_path), "--filters", filters, "--out", str(out)]
+    assert cli.main(asked) == 0
+    told = "where 1 is honest: models or units are wrong (degrees under [rad]"
+    assert capsys.readouterr().out.count(told) == 1
+    summary = json.loads((out / "summary.json").read_text())
+    assert told in str(summary.get("filters", {}).get("ekf", summary)["notes"])
 
 
 def test_several_filters_side_by_side(tmp_path, capsys):

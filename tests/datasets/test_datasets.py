@@ -54,6 +54,23 @@ def test_a_missing_file_is_named(tmp_path, name, file):
         read(tmp_path)
 
 
+@pytest.mark.parametrize(
+    ("files", "name", "old", "new", "read", "message"),
+    [
+        (BONN, "sensor_data.dat", "SENSOR", "#", datasets.bonn, r"sensor_data.dat:8: no measurement is left, of 1 negative ranges"),
+        (MRCLAM, "Robot2_Measurement.dat", " 7", " 9", lambda path: datasets.mrclam(path, 2), r"Measurement.dat:1: no measurement is left, of 2 robot sightings, 6 unknown barcodes"),
+    ],
+)  # fmt: skip
+def test_measurements_that_are_all_left_out_are_said(
+    tmp_path, files, name, old, new, read, message
+):
+    text = files[name].replace(old, new)
+    if new == "#":
+        text = "ODOMETRY 0 1 0\n" * 7 + "SENSOR 4 -0.25 1"
+    with pytest.raises(ValueError, match=message):
+        read(write(tmp_path, files, name, text))
+
+
 def test_readers_by_name(tmp_path):
     first = {name.replace("2", "1"): text for name, text in MRCLAM.items()}
     both = write(tmp_path, VICTORIA | BONN | MRCLAM | first)

@@ -53,6 +53,28 @@ def test_a_little_file(tmp_path):
     assert data.corrections == ("ranges: 1.0 m and 0.0 % subtracted",)
 
 
+def test_nothing_is_interpolated_over_a_gap(tmp_path):
+    """Of the truth, after its end, or of the odometry, in which ranges are left out and counted."""
+    t = np.arange(0.0, 40.0)
+    drive = np.stack([t, 0 * t + 1, 0 * t], axis=1)
+    truth = np.stack([t, t, 0 * t, 0 * t], axis=1)
+    ranges = np.stack([t[:-1] + 0.5, 0 * t[1:], 0 * t[1:] + 7, 0 * t[1:] + 5], axis=1)
+    kept = lambda a, b: (t < a) | (t > b)  # noqa: E731
+    path = written(tmp_path, DR=drive, TD=ranges, GT=truth[kept(15, 30)][:-3])
+    data = plaza(path, range_bias=(0.0, 0.0))
+    known = (data.time < 14) | ((data.time > 31) & (data.time < 36))
+    np.testing.assert_array_equal(data.true_at, known)
+    np.testing.assert_allclose(data.true_path[known, 0], data.time[known])
+    assert data.rows_without_truth == (~known).sum()
+    path = written(tmp_path, DR=drive[kept(15, 30)], TD=ranges, GT=truth)
+    data = plaza(path, range_bias=(0.0, 0.0))
+    assert data.dropped["ranges in a gap of the odometry"] == 17
+    assert not ((data.time > 14) & (data.time < 31)).any() and data.measurements == 22
+    assert data.true_at is None
+    with pytest.raises(ValueError, match=r"no measurement is left, of .* shorter than their bias"):
+        plaza(path, range_bias=(6.0, 0.0))
+
+
 def test_the_bias_is_undone_and_what_is_below_it_dropped(tmp_path):
     data = plaza(written(tmp_path), range_bias=(4.5, 0.5))
     np.testing.assert_allclose(data.log.scan.z[data.log.scan.valid][:, 0], [0.5 / 1.5, 1.0])

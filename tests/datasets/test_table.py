@@ -12,6 +12,7 @@ from recordings import write
 from jaxslam import datasets, stats
 from jaxslam.core.types import Estimate
 from jaxslam.datasets._evaluation import evaluate
+from jaxslam.math.numpy_poses import compose
 
 OWN = {
     "odometry.csv": "t [s],v [m/s],omega [rad/s]\n1.0,0.5,0.1\n1.2,1.0,0\n1.4,0,0\n",
@@ -201,16 +202,30 @@ BAD = [
     (ODOMETRY, "1.2,1.0", "1.2,", ":3: column 2 (v [m/s]): expected a finite number, got ''"),
     (ODOMETRY, "1.2,1.0", "1.2,1_0", ":3: column 2 (v [m/s]): expected a finite number, got '1_0'"),
     (ODOMETRY, "1.2,1.0", '1.2,"1,0"', ":3: column 2 (v [m/s]): expected a finite number, got '1,0' (w"),
+    ("truth.csv", "1.3,1.4", "1.3,inf", ":3: column 2 (x [m]): expected a finite number, got 'inf'"),
+    ("truth.csv", "1.3,1.4", "nan,1.4", ":3: column 1 (t [s]): expected a finite number, got 'nan'"),
     (ODOMETRY, "1.2,1.0", "1,2,1,0", ":3: expected 3 cells, as in line 1, got 5; write a number with a point"),
     (ODOMETRY, "1.2,1.0,0", "1.2,1.0", ":3: expected 3 cells, as in line 1, got 2"),
     (ODOMETRY, None, "", ":1: expected a header"),
     (ODOMETRY, "t [s]", "# by robot\n1,2,3\n# t [s]", ":2: expected a header, as 't [s],v [m/s]', got '1'"),
-    (ODOMETRY, "t [s]", "sep=,\nt [s]", ":2: expected 2 cells, as in line 1, got 3"),
+    (ODOMETRY, "t [s]", "sep=|\nt [s]", ":1: expected sep= and , or ; or a tab, got '|'"),
+    (ODOMETRY, "t [s],v", "t [s];,v", ":1: expected one separator of cells in the header, got ',' and ';'"),
+    (ODOMETRY, "1.2,1.0", '1.2,"1,200.5"', ":3: column 2 (v [m/s]): expected a finite number, got '1,200.5' (write a p"),
+    (ODOMETRY, None, "t [s];v [m/s];omega [rad/s]\n1;1,250;2\n2;1,500;3\n", ":2: column 2 (v [m/s]): expected a finite number, got '1,250' (decimals or thousands?"),
+    (ODOMETRY, None, "t [s];v [m/s];omega [rad/s]\n1;1.250;2\n2;1.500;3\n", ":2: column 2 (v [m/s]): expected a finite number, got '1.250' (decimals or thousands?"),
+    (ODOMETRY, None, "t [s];v [m/s];omega [rad/s]\n1;0,25;2\n2;1.500;3\n", ":2: column 2 (v [m/s]): expected a finite number, got '0,25' (write a point"),
+    (ODOMETRY, None, "t [s];v [m/s];omega [rad/s]\n1;1.250,5;0,1\n", ":2: column 2 (v [m/s]): expected a finite number, got '1.250,5' (write a point"),
+    (ODOMETRY, None, "t [s];v [m/s];omega [rad/s]\n1;2;3;4\n", ":2: expected 3 cells, as in line 1, got 4"),
     (ODOMETRY, None, "t [s],v [m/s],omega [rad/s]\n", ":1: expected lines below the header, got none"),
-    (ODOMETRY, None, "t [s];v [m/s];omega [rad/s]\n1;2;3\n", ":1: expected cells separated by commas, got ';'"),
+    (ODOMETRY, None, "t [s]|v [m/s]|omega [rad/s]\n1|2|3\n", ":1: column 1 (t [s]|v [m/s]|omega [rad/s]): expected a unit [s]"),
+    (ODOMETRY, "t [s]", "t [min]", ":1: column 1 (t [min]): expected a unit [s] or [ms] or [us] or [ns], got"),
     (SEEN, "1.4,3", "0.4,3", ":4: column 1 (t [s]): expected a time of at least 1.1"),
     (SEEN, "1.4,3", "1.4,3.5", ":4: column 2 (tag): expected a whole number >= 0, or nothing if"),
-    (SEEN, "1.4,3", "1.4,tree", ":4: column 2 (tag): expected a whole number"),
+    (SEEN, "1.4,3", "1.4,inf", ":4: column 2 (tag): expected a whole number >= 0, or nothing if"),
+    (SEEN, "1.4,3", '1.4,"3,000"', ":4: column 2 (tag): expected a whole number >= 0, or nothing if"),
+    (SEEN, "1.4,3", '1.4,"a\nb"', ":4: column 2 (tag): expected a name of at most 100 characters in one line"),
+    (SEEN, "1.4,3", "1.4,tree", ":4: column 2 (tag): expected a tag of landmarks.csv, got tree"),
+    (SEEN, "range [m],bearing [rad]\n1.1,7,2,0.25\n1.1,3,3,-0.5\n1.4,3,4,0.5", "range [m],bearing [rad]\n1.1,7,-2,0\n1.2,7,-1,0\n9,7,2,0", ":2: no measurement is left, of 1 measurements outside the odometry, 2 measurements with a range below 0"),
     (SEEN, "1.4,3", "1.1,3", ":4: column 2 (tag): expected a tag once at a time, got 3 twice"),
     (SEEN, "tag,", "id,", ":1: expected a column 'tag' (of the sensor range_bearing), got 't [s]'"),
     ("truth.csv", "1.3,", "0.8,", ":3: column 1 (t [s]): expected a time above 0.9, got 0.8"),
@@ -306,6 +321,219 @@ def test_bad_files_of_fitted_numbers_are_named(tmp_path, toml, reason):
 def test_columns_of_no_model_list_those_of_all(tmp_path):
     with pytest.raises(ValueError, match=r"no model has the columns t \[s\], speed.*unicycle \(v"):
         datasets.table(write(tmp_path, OWN, ODOMETRY, 't [s],"speed\u2028[m/s]"\n1,1\n'))
+
+
+DRIVE = np.arange(301) / 10
+CIRCLE = np.stack([np.sin(0.3 * DRIVE), 1 - np.cos(0.3 * DRIVE), 0.3 * DRIVE], axis=1)
+"""Times and poses of a robot on a circle of 1 m, 0.3 rad/s."""
+
+
+def on_a_circle(folder, truth=CIRCLE, header="t [s],x [m],y [m],theta [rad]", **files):
+    """The folder of this drive, with odometry of velocities, or the files given by name."""
+
+    def table(head, *columns):
+        rows = (",".join(map("{:.9g}".format, row)) for row in np.column_stack(columns))
+        return "\n".join([head, *rows]).replace("nan", "") + "\n"
+
+    every = {
+        "odometry": table("t [s],v [m/s],omega [rad/s]", DRIVE, np.tile([0.3, 0.3], (301, 1))),
+        "measurements": "t [s],tag,range [m],bearing [rad]\n0.5,7,2,0.25\n14.95,7,2,1\n25,7,3,1\n",
+        "truth": table(header, DRIVE, truth) if isinstance(truth, np.ndarray) else truth,
+    }
+    folder.mkdir(exist_ok=True)
+    return write(folder, {f"{name}.csv": text for name, text in (every | files).items()})
+
+
+HOLES = {
+    "a hole": (slice(100, 200), None, range(100, 200)),
+    "two holes and late": ([*range(20), *range(50, 80), *range(200, 301)], None, [*range(20), *range(50, 80), *range(200, 301)]),
+    "no heading": (slice(0), slice(100, 103), [*range(100, 103)]),
+    "a tenth of the rate": ([k for k in range(301) if k % 10], None, []),
+    "a tenth of the rate and a hole": ([k for k in range(301) if k % 10 or 50 < k < 170], None, range(51, 170)),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", HOLES)
+def test_no_true_pose_is_interpolated_over_a_hole(tmp_path, name):
+    """Before the first line, after the last, over ten intervals, or beside a line without a pose."""
+    absent, empty, unknown = HOLES[name]
+    truth = CIRCLE.copy()
+    if empty is not None:
+        truth[empty, 2] = np.nan
+    lines = on_a_circle(tmp_path, truth).joinpath("truth.csv").read_text().splitlines()
+    kept = np.delete(np.arange(301), absent)
+    (tmp_path / "truth.csv").write_text("\n".join([lines[0], *(lines[1 + k] for k in kept)]))
+    data = datasets.table(tmp_path)
+    known = ~np.isin(data.time, DRIVE[list(unknown)])
+    # The row between two lines of the odometry, at 14.95 s, has a pose if both of these have.
+    known[data.time == 14.95] = not {149, 150} & {*unknown}
+    np.testing.assert_array_equal(data.true_at, known)
+    assert data.rows_without_truth == (~known).sum()
+    exact = np.stack([np.sin(0.3 * data.time), 1 - np.cos(0.3 * data.time)], axis=1)
+    np.testing.assert_allclose(data.true_path[known, :2], exact[known], atol=0.02)
+    # Elsewhere it is a pose of the file.
+    held = data.true_path[~known, None, 0] - CIRCLE[:, 0]
+    assert not held.size or (np.abs(held).min(axis=1) < 1e-8).all()
+    said = [note for note in data.assumed if "have no true pose" in note]
+    assert [note.split(" rows")[0] for note in said] == (
+        [f"{(~known).sum()} of {len(known)}"] if unknown else []
+    )
+    assert any("no pose is interpolated over it" in note for note in data.assumed) == (
+        "hole" in name
+    )
+    assert any("1 of" not in n and "lines have no pose" in n for n in data.assumed) == (
+        empty is not None
+    )
+
+
+def test_errors_are_those_of_the_rows_with_a_truth(tmp_path):
+    """A path 0.2 m beside the truth everywhere: no error is of the hole, nor of a pair across it."""
+    text = on_a_circle(tmp_path).joinpath("truth.csv").read_text().splitlines(keepends=True)
+    (tmp_path / "truth.csv").write_text("".join(text[:101] + text[250:]))
+    data = datasets.table(tmp_path)
+    true = np.stack([np.sin(0.3 * data.time), 1 - np.cos(0.3 * data.time), 0.3 * data.time], axis=1)
+    late = np.array([0.0, 0.3, 0.0]) * (data.time > 20)[:, None]  # drifts within the hole
+    cov = np.tile(0.01 * np.eye(3), (data.steps, 1, 1))
+    path = Estimate(true + [0.2, 0, 0] + late, cov, (), (), (), ())
+    last = Estimate(*(leaf[-1] for leaf in (path.pose, cov)), np.zeros((1, 2)), cov[:1, :2, :2], np.zeros(1, bool), -np.ones(1, int))  # fmt: skip
+    errors = evaluate(data, path, last).errors
+    known = np.flatnonzero(data.true_at)
+    square = np.where(data.time[known] > 20, 0.2**2 + 0.3**2, 0.2**2)
+    np.testing.assert_allclose(errors["ATE [m]"], np.sqrt(square.mean()), rtol=1e-4)
+    np.testing.assert_allclose(errors["pose NEES, mean (3 is honest)"], 100 * square.mean(), rtol=1e-3)  # fmt: skip
+    assert errors["RPE over 1 s [m]"] < 1e-3
+
+
+def test_measurements_in_a_gap_of_poses_are_left_out_and_counted(tmp_path):
+    """Of a path of poses, between which a measurement would take an interpolated one."""
+    text = on_a_circle(tmp_path).joinpath("truth.csv").read_text().splitlines(keepends=True)
+    (tmp_path / "odometry.csv").write_text("".join(text[:101] + text[250:]))
+    data = datasets.table(tmp_path)
+    assert data.dropped["measurements in a gap of the odometry"] == 1
+    assert data.measurements == 2 and 14.95 not in data.time
+    assert any("no pose is interpolated over it" in note for note in data.assumed)
+    # The increment over the gap is that of its two poses.
+    whole = datasets.table(on_a_circle(tmp_path / "whole", odometry="".join(text)))
+    at, pose = {}, np.zeros(3)
+    for name, one in (("gap", data), ("whole", whole)):
+        for t, u in zip(one.time, one.log.control, strict=True):
+            pose = np.where(t == 0, 0.0, compose(pose, u[:3]))
+            at[name, round(t, 6)] = pose
+    np.testing.assert_allclose(at["gap", 30.0], at["whole", 30.0], atol=1e-6)
+
+
+UNITS = {
+    "bearing": ({"measurements": "t [s],tag,range [m],bearing [rad]\n0.5,7,2,14\n25,7,3,-170\n"}, "numbers are beyond 2π, up to -170: degrees? then write [deg] in the header"),
+    "omega": ({"odometry": "t [s],v [m/s],omega [rad/s]\n0,0.3,17.2\n30,0.3,17.2\n"}, "2 of 2 numbers are beyond 2π, up to 17.2: degrees? then write [deg/s]"),
+    "mount": ({"settings": "[sensor]\nmount = [0, 0, 180]"}, "[sensor] mount: theta [rad] = 180 is beyond 2π: degrees?"),
+    "start": ({"settings": "[filter]\nstart = [0, 0, -90.0]"}, "[filter] start: theta [rad] = -90 is beyond 2π: degrees?"),
+    "truth": ({"truth": CIRCLE * [1, 1, 180 / np.pi]}, "truth.csv: theta [rad] contradicts the directions between the positions"),
+    "backwards": ({"truth": np.stack([*CIRCLE.T[:2], (np.rad2deg(CIRCLE[:, 2]) + 360) % 360 - 180], axis=1)}, "truth.csv: theta [rad] contradicts"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", UNITS)
+def test_degrees_under_rad_are_noted(tmp_path, name):
+    files, note = UNITS[name]
+    settings = files.pop("settings", "") if name in ("mount", "start") else ""
+    on_a_circle(tmp_path, **files)
+    (tmp_path / "dataset.toml").write_text(settings)
+    (said,) = (line for line in datasets.table(tmp_path).assumed if note in line)
+    assert "\n" not in said
+
+
+@pytest.mark.parametrize(
+    "path",
+    [
+        CIRCLE * [1, 1, 4],  # turns four times as fast as its way
+        np.stack([DRIVE, 0 * DRIVE, 5 * DRIVE], axis=1),  # spins on its way along x
+        CIRCLE + [0, 0, np.pi / 2],  # drives sideways
+        CIRCLE * [0, 0, 1],
+        np.stack([*CIRCLE.T[:2], 5 * np.sin(DRIVE)], axis=1),
+    ],
+)
+def test_radians_and_other_robots_are_not_noted(tmp_path, path):
+    data = datasets.table(on_a_circle(tmp_path, path))
+    assert not any("contradicts" in note or "beyond" in note for note in data.assumed)
+
+
+def test_tags_are_names_and_whole_numbers_as_pandas_writes_them(tmp_path):
+    """As in `Log.from_records`: 11.0 is 11, text is a name, an empty cell, NaN and -1 are none."""
+    seen = "t [s],tag,range [m],bearing [rad]\n0.5,11.0,2,0\n0.5,post_3,2,0\n0.5,,2,0\n1,NaN,2,0\n"
+    seen += "1,<NA>,2,0\n1,-1,2,0\n1,11,2,0\n1,Post 3,2,0\n2,post_3,2,0\n2,1.2e1,2,0\n"
+    data = datasets.table(on_a_circle(tmp_path, measurements=seen))
+    assert data.tags == (11, 12, "Post 3", "post_3")
+    scan = data.log.scan
+    tags = [tag[valid].tolist() for tag, valid in zip(scan.tag, scan.valid, strict=True)]
+    assert [tag for tag in tags if tag] == [[0, 3, -1], [-1, -1, -1, 0, 2], [3, 1]]
+    survey = "tag,x [m],y [m]\npost_3,1,2\n11.0,3,4\nPost 3,5,6\n12,7,8\n"
+    data = datasets.table(on_a_circle(tmp_path, measurements=seen, landmarks=survey))
+    np.testing.assert_array_equal(data.landmarks, [[3, 4], [7, 8], [5, 6], [1, 2]])
+
+
+@pytest.mark.parametrize(("unit", "factor"), [("ns", 10**9), ("us", 10**6), ("µs", 10**6), ("ms", 1000)])  # fmt: skip
+def test_stamps_of_nineteen_digits_are_rounded_once(tmp_path, unit, factor):
+    """As a quotient of whole numbers; float64 has 16 digits of 1,700,000,000,123,456,789 ns."""
+    stamps = [1_700_000_000_123_456_789 * factor // 10**9 + k * (factor // 5) for k in range(3)]
+    odometry = f"t [{unit}],v [m/s],omega [rad/s]\n" + "".join(f"{n},1,0\n" for n in stamps)
+    seen = f"t [s],tag,range [m],bearing [rad]\n{stamps[1] / factor!r},7,2,0\n"
+    folder = write(tmp_path, {"odometry.csv": odometry, "measurements.csv": seen})
+    data = datasets.table(folder)
+    np.testing.assert_array_equal(data.time, [n / factor for n in stamps])
+    np.testing.assert_array_equal(data.log.scan.valid[:, 0], [False, True, False])
+
+
+EXCEL = {
+    "semicolons and decimal commas": (";", ",", "", ""),
+    "quoted, a mark and sep=": (";", ",", "\ufeffsep=;\r\n", '"'),
+    "semicolons and points": (";", ".", "", ""),
+    "tabs and points": ("\t", ".", "", ""),
+    "tabs and decimal commas": ("\t", ",", "sep=\t\n", ""),
+    "commas and quoted decimal commas": (",", ",", "", '"'),
+}
+
+
+@pytest.mark.parametrize("name", EXCEL)
+def test_what_excel_writes_is_read_where_it_is_certain(tmp_path, name):
+    separator, decimal, head, quote = EXCEL[name]
+    plain = datasets.table(on_a_circle(tmp_path / "plain"))
+    for path in on_a_circle(tmp_path / "excel").iterdir():
+        lines = path.read_text().splitlines()
+        rows = [[cell.replace(".", decimal) for cell in line.split(",")] for line in lines]
+        text = "\r\n".join(separator.join(f"{quote}{c}{quote}" for c in row) for row in rows)
+        path.write_bytes((head + text + "\r\n").encode())
+    data = datasets.table(tmp_path / "excel")
+    chex.assert_trees_all_equal(data.log, plain.log)
+    chex.assert_trees_all_equal(data.true_path, plain.true_path)
+    signs = {";": "semicolons", "\t": "tabs", ",": "commas"}[separator]
+    commas = ", decimal commas" * (decimal == ",")
+    assert f"odometry.csv: cells separated by {signs}{commas}" in data.assumed
+
+
+def test_a_landmark_that_is_only_measured_outside_the_odometry_is_left_out(tmp_path):
+    """And counted, with a survey that lacks it, too."""
+    seen = "t [s],tag,range [m],bearing [rad]\n0.5,7,2,0\n99,8,2,0\n"
+    for survey in ({}, {"landmarks": "tag,x [m],y [m]\n7,1,2\n"}):
+        data = datasets.table(on_a_circle(tmp_path, measurements=seen, **survey))
+        assert (data.tags, data.measurements) == ((7,), 1)
+        assert data.dropped == {"measurements outside the odometry": 1}
+
+
+def test_the_prior_of_what_is_not_measured_is_a_default(tmp_path):
+    """And with a survey localization is named, which needs none."""
+    seen = "t [s],tag,range [m]\n0.5,7,2\n25,7,3\n"
+    data = datasets.table(on_a_circle(tmp_path, measurements=seen))
+    (line,) = (note for note in data.assumed if "free" in note)
+    assert line.startswith("[sensor] free = [[0.0], [[3.28987]]] (prior mean and variance of the")
+    assert "docs/methods/bearings_and_ranges.md" in line
+    given = tmp_path / "dataset.toml"
+    given.write_text("[sensor]\nfree = [[1.5], [[0.25]]]")
+    data = datasets.table(
+        on_a_circle(tmp_path, measurements=seen, landmarks="tag,x [m],y [m]\n7,1,2\n")
+    )
+    np.testing.assert_array_equal(data.sensor.free.mean, [1.5])
+    (line,) = (note for note in data.assumed if "free" in note)
+    assert "range [m] alone" in line and "--filters localization" in line
 
 
 def estimates(data, shift):

@@ -221,6 +221,63 @@ def test_a_file_without_vertices_is_placed_along_its_edges(tmp_path):
     np.testing.assert_allclose(graph.points, [[-1, 1]], atol=1e-15)
 
 
+UNIT = "1 0 0 1 0 1"
+RING = {i: f"VERTEX_SE2 {i} {i} 0 0.5" for i in (4, 1, 2, 3, 5, 9)}
+
+
+def equal_vertices(form, equal, edges):
+    """A file of the ring's vertices, or of edges alone, with lines EQUIV at a place."""
+    vertices = [] if form == "edges alone" else [*RING.values(), "FIX 5", "VERTEX_XY 8 1 1"]
+    lines = [*edges, "EDGE_SE2_XY 5 8 1 2 1 0 1", f"EDGE_PRIOR_SE2 3 0 0 0 {UNIT}"]
+    parts = [equal, vertices, lines] if form == "first" else [vertices, lines, equal]
+    return "\n".join(line for part in parts for line in part)
+
+
+@pytest.mark.parametrize("form", ["first", "last", "edges alone"])
+def test_equivalent_vertices_are_one(tmp_path, form):
+    """A chain 5 = 3 = 2 and a line twice: as a file that has 2 in place of 3 and 5."""
+    moves = {(1, 2): 1.0, (2, 3): 2.0, (3, 4): 3.0, (5, 9): 4.0, (4, 5): 5.0}
+    edges = [f"EDGE_SE2 {i} {j} {x} 0 0.5 {UNIT}" for (i, j), x in moves.items()]
+    equal = ["EQUIV 5 3", "EQUIV 3 2", "EQUIV 2 3", "EQUIV 4 4"]
+    loaded = g2o.load(wrote(tmp_path, equal_vertices(form, equal, edges)))
+    name = {3: 2, 5: 2}
+    same = [
+        f"EDGE_SE2 {name.get(i, i)} {name.get(j, j)} {x} 0 0.5 {UNIT}"
+        for (i, j), x in moves.items()
+        if (i, j) != (2, 3)
+    ]
+    text = equal_vertices(form, [], same).replace("XY 5", "XY 2").replace("SE2 3 0 0 0", "SE2 2 0 0 0")  # fmt: skip
+    text = "\n".join(line for line in text.replace("FIX 5", "FIX 2").split("\n") if line not in (RING[3], RING[5]))  # fmt: skip
+    assert_same(loaded.graph, graphs.read(wrote(tmp_path, text)))
+    assert loaded.skipped == {
+        "equivalences": 4,
+        "vertices merged into another": 2,
+        "edges within merged vertices": 1,
+    }
+    graphs.write(tmp_path / "again.g2o", loaded.graph)
+    again = g2o.load(tmp_path / "again.g2o")
+    assert_same(again.graph, loaded.graph)
+    assert not again.skipped
+
+
+@refused(
+    ("EQUIV 1", ":14: expected 2 fields (i j), got 1"),
+    ("EQUIV 1 x", ":14: id is not a whole number >= 0: 'x'"),
+    ("EQUIV 1 7", ":14: vertex 7 is not defined in the file"),
+    ("EQUIV 1 8", ":14: one of the vertices 1 and 8 is a pose, the other a point"),
+    escaped=True,
+)
+def test_what_cannot_be_equivalent_is_refused(line, tmp_path):
+    edges = [f"EDGE_SE2 {i} {i + 1} 1 0 0 {UNIT}" for i in (1, 2, 3)]
+    graphs.read(wrote(tmp_path, equal_vertices("last", [line], edges)))
+
+
+def test_a_file_whose_edges_are_all_within_equal_vertices_is_refused(tmp_path):
+    path = wrote(tmp_path, f"EDGE_SE2 1 2 1 0 0 {UNIT}\nEQUIV 1 2\n")
+    with pytest.raises(ValueError, match=r":2: no edge is left: all are within vertices that EQU"):
+        graphs.read(path)
+
+
 @pytest.mark.parametrize(
     ("old", "new", "line", "reason"),
     [

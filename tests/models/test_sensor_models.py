@@ -64,6 +64,17 @@ def same_angle(a, b, atol=1e-11):
 # --- full and partial measurements of points ----------------------------------------------------
 
 
+def test_a_mount_in_degrees_is_told():
+    for made in (
+        lambda: sensors.RangeBearing(np.eye(2), mount=(0.0, 0.0, 90.0)),
+        lambda: sensors.RangeOnly(np.eye(1), mount=np.array([0.0, 0.0, -45.0])),
+    ):
+        with pytest.warns(UserWarning, match=r"heading of the mounting pose, -?\d+ rad, is beyond"):
+            sensor = made()
+        assert abs(sensor.mount[2]) > 40  # as it was given
+    sensors.RangeBearing(np.eye(2), mount=(0.0, 0.0, -2 * np.pi))
+
+
 def test_range_only():
     sensor = sensors.RangeOnly(VARIANCE, mount=MOUNT)
     rng, pose, point = draw(0)

@@ -60,6 +60,15 @@ def test_a_campaign_of_records_is_that_of_the_draws(tmp_path):
         campaign(other, runs=5, key=key, keep=store.resume(tmp_path / "kept"))
 
 
+def test_true_headings_in_degrees_are_told():
+    """That is, those that contradict the path as radians and fit it as degrees."""
+    turn = np.linspace(0.0, 5.0, 6)
+    path = np.stack([np.sin(turn), 1 - np.cos(turn), turn], axis=1)
+    poses = np.stack([path, path * [1, 1, 180 / np.pi]])
+    with pytest.warns(UserWarning, match="recorded_world: the true headings of run 1 contradict"):
+        recorded(2, poses=poses)
+
+
 def test_simulate_takes_one_of_the_records():
     world = recorded()
     poses = np.asarray(world.truth.pose)

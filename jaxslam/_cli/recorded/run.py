@@ -113,11 +113,15 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
         "dropped by the reader": data.dropped,
         "corrections to the data": list(data.corrections),
         "defaults taken": list(data.assumed),
+        **({} if data.true_path is None else {"rows without a true pose": data.rows_without_truth}),
     }
     several = len(runs) > 1
     if several:
         print(summary_table({"": summary}), end="\n\n")
         print(summary_table({name: _flat(run.summary) for name, run in runs.items()}))
+        for name, run in runs.items():
+            if notes := run.summary.get("notes"):
+                print(summary_table({"": {name: notes}}))
         summary["filters"] = {name: run.summary for name, run in runs.items()}
     else:
         summary |= next(iter(runs.values())).summary
@@ -200,7 +204,7 @@ def run_filter(
         map_cov = None if map_cov is None else map_cov + added.points
     uncertain = data.adjustable is not None and data.adjustable.cov is not None
     found = evaluate(data, result.path, last, map_cov)
-    summary = {
+    summary: Json = {
         "landmarks": int(last.alive.sum()),
         "status": {
             s.name.lower(): int((result.status == s).sum()) for s in Status if s != Status.EMPTY
@@ -213,7 +217,36 @@ def run_filter(
         "seconds": round(seconds, 2),
     }
     tested = {} if found.map_test is None else found.map_test.rows()
-    return FilterRun(result, found, summary | found.errors | tested)
+    summary |= found.errors | tested
+    notes = suspicions(summary)
+    return FilterRun(result, found, summary | ({"notes": notes} if notes else {}))
+
+
+_NIS, _NEES = 30.0, 100.0
+"""NIS / dof, and the median NEES of the pose over the honest one, above which noises are not the
+cause: innovations of 5 σ, errors of 10 σ."""
+
+
+def suspicions(summary: Json) -> list[str]:
+    """Sentences on numbers of a run that no honest filter with the models of the data has."""
+    status, found = summary["status"], []
+    assert isinstance(status, dict)
+    nis, nees = (
+        float(str(summary.get(name, 0.0)))
+        for name in ("NIS / dof", "pose NEES, median (2.37 is honest)")
+    )
+    units = "models or units are wrong (degrees under [rad], millimetres under [m], the mount)"
+    if nis > _NIS:
+        found.append(f"NIS / dof is {nis:.4g}, where 1 is honest: {units}")
+    elif (rejected := status["rejected"]) > sum(status.values()) / 2:
+        found.append(f"the gate rejects {rejected:,} of {sum(status.values()):,}: {units}")
+    elif nees > 2.37 * _NEES:
+        found.append(
+            f"the median NEES of the pose is {nees:.4g}, where 2.37 is honest, though the "
+            "innovations fit: the truth may have other units (degrees under [rad], millimetres "
+            "under [m]), stamps or axes than the log"
+        )
+    return found
 
 
 def _figure(data: Dataset, runs: dict[str, FilterRun], formats: tuple[str, ...]) -> Files:
@@ -227,12 +260,21 @@ def _figure(data: Dataset, runs: dict[str, FilterRun], formats: tuple[str, ...])
         _whole(first.result),
         true_points=found.points,
         names=None if found.points is None else data.tags,
-        true_path=found.path,
+        true_path=_true_path(data, found),
         dead_reckoning=_dead_reckoning(data),
         others={each: _whole(run.result) for each, run in rest},
         title=f"{data.name}: {name} with ellipses" if rest else data.name,
     )
     return {f"map.{kind}": encode(figure, kind) for kind in formats}
+
+
+def _true_path(data: Dataset, found: Evaluation) -> Float[np.ndarray, "T 3"] | None:
+    """The true path in the frame of the map, NaN where it is not known."""
+    if found.path is None:
+        return None
+    path = np.full((data.steps, 3), np.nan)
+    path[slice(None) if data.true_at is None else data.true_at] = found.path
+    return path
 
 
 def _films(data: Dataset, runs: Mapping[str, FilterRun], at: Int[np.ndarray, "F"]) -> Files:
@@ -243,11 +285,6 @@ def _films(data: Dataset, runs: Mapping[str, FilterRun], at: Int[np.ndarray, "F"
     made = {}
     for name, (run, found, _) in runs.items():
         assert run.estimates is not None
-        true_path = None
-        if found.path is not None:  # in the frame of the map, NaN where it is not known
-            true_path = np.full((data.steps, 3), np.nan)
-            known = slice(None) if data.true_at is None else data.true_at
-            true_path[known] = found.path
         history = History(
             path=np.asarray(run.path.pose),
             step=at,
@@ -260,7 +297,7 @@ def _films(data: Dataset, runs: Mapping[str, FilterRun], at: Int[np.ndarray, "F"
         scene = run_scene(
             history,
             true_points=found.points,
-            true_path=true_path,
+            true_path=_true_path(data, found),
             title=f"{data.name}: {name}",
         )
         made[name] = plot.Film(scene)
@@ -314,7 +351,7 @@ def _flat(summary: Json) -> Json:
     counts = {f"{COUNT}{count_label(name)}": count for name, count in status.items() if count}
     names = ("x [m]", "y [m]", "theta [rad]")
     pose = {f"final {n}": value for n, value in zip(names, final, strict=True)}
-    rows = {key: summary[key] for key in summary if key not in ("status", "final pose")}
+    rows = {key: summary[key] for key in summary if key not in ("status", "final pose", "notes")}
     return counts | rows | pose
 
 

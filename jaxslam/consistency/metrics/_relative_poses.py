@@ -8,6 +8,7 @@ from jaxtyping import Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam.consistency.metrics._paths import PathErrors, pose_pair, poses_of
+from jaxslam.core.logs._streams import is_gap
 from jaxslam.math.numpy_poses import between, wrapped
 
 Spacing = float | Sequence[float] | None
@@ -45,7 +46,9 @@ def relations(
 ) -> Relations:
     """The relations of a reference path from each row to the first that is far enough after it.
 
-    A row without one that far after it has no relation; there may be none at all.
+    A row without one that far after it has no relation; there may be none at all. With `seconds` it
+    has none across a gap of the stamps, a step longer than the spacing and than ten times their
+    median: that would be of another time.
 
     Args:
         reference: (K, 3) poses, in the order of time.
@@ -83,10 +86,13 @@ def relations(
         or not (np.isfinite(spacings) & (spacings > 0)).all()
     ):
         raise ValueError(f"relations: expected finite spacings above 0, got {given}")
+    gaps = is_gap(at) if seconds is not None else np.zeros(len(path) - 1, bool)
     pairs = []
     for spacing in spacings:
         after = np.searchsorted(at, at + spacing - _ROUNDING * min(1.0, spacing))
         start = np.flatnonzero(after < len(path))
+        passed = np.concatenate([[0], np.cumsum(gaps & (np.diff(at) > spacing))])
+        start = start[passed[start] == passed[after[start]]]
         pairs.append((start, after[start]))
     first, second = (np.concatenate(part) for part in zip(*pairs, strict=True))
     return _between(path, first, second)

@@ -138,6 +138,55 @@ def interpolate_poses(
     return np.column_stack([x, y, np.arctan2(np.sin(heading), np.cos(heading))])
 
 
+GAP_FACTOR = 10
+"""A longer interval between lines, in multiples of their median, is a gap."""
+
+
+def is_gap(clock: Float[np.ndarray, "K"], longest: float | None = None) -> Bool[np.ndarray, "_"]:
+    """Which intervals between K lines are longer than `longest` [s], (K - 1,).
+
+    Default: `GAP_FACTOR` times their median, above the rounding of stamps of ten digits.
+    """
+    steps = np.diff(clock)
+    if longest is None:
+        longest = GAP_FACTOR * float(np.median(steps)) if steps.size else 0.0
+    return np.asarray(steps > longest * (1 + 1e-6) + 1e-6)
+
+
+def between_lines(
+    clock: Float[np.ndarray, "K"],
+    rows: Float[np.ndarray, "T"],
+    joined: Bool[np.ndarray, "_"],
+) -> Bool[np.ndarray, "T"]:
+    """Which rows have the time of a line, or are between two lines that are joined (K - 1,)."""
+    after = np.searchsorted(clock, rows)
+    last = len(clock) - 1
+    within = np.concatenate([[False], joined, [False]])[after]
+    return np.asarray(within | (clock[np.minimum(after, last)] == rows))
+
+
+def known_poses(
+    clock: Float[np.ndarray, "K"],
+    pose: Float[np.ndarray, "K 3"],
+    rows: Float[np.ndarray, "T"],
+    longest: float | None = None,
+) -> tuple[Float[np.ndarray, "T 3"], Bool[np.ndarray, "T"]]:
+    """Poses at some times as `interpolate_poses`, and in which rows they are known.
+
+    A pose is unknown before the first line, after the last, in a gap (`is_gap`), and next to a line
+    that is not finite. It is then the last known one, of leading rows the first.
+    """
+    finite = np.isfinite(pose).all(axis=1)
+    if not finite.any():
+        return np.zeros((len(rows), 3)), np.zeros(len(rows), bool)
+    joined = ~is_gap(clock, longest) & finite[:-1] & finite[1:]
+    unusable = clock[~finite]
+    known = between_lines(clock, rows, joined) & ~np.isin(rows, unusable)
+    path = interpolate_poses(clock[finite], pose[finite], rows)
+    latest = np.maximum.accumulate(np.where(known, np.arange(len(rows)), int(np.argmax(known))))
+    return path[latest], known
+
+
 def relative(
     before: Float[np.ndarray, "T 3"], after: Float[np.ndarray, "T 3"]
 ) -> Float[np.ndarray, "T 3"]:

@@ -2,21 +2,24 @@
 
 import math
 from collections.abc import Callable, Iterable, Mapping, Sequence
-from typing import Generic, NamedTuple, Protocol, TypeAlias, TypeVar
+from typing import Any, Generic, NamedTuple, Protocol, TypeAlias, TypeVar
 
+import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxslam.core._numbers import is_concrete
 from jaxslam.core.logs import _streams as streams
 
 UNITS: dict[str, dict[str, float]] = {
     "rad": {"deg": 180 / math.pi},
     "rad/s": {"deg/s": 180 / math.pi},
-    "m": {"mm": 1000.0, "cm": 100.0},
-    "s": {"ms": 1000.0},
+    "m": {"mm": 1000, "cm": 100},
+    "s": {"ms": 1000, "us": 10**6, "ns": 10**9},
 }
 """Other units in which a column may be given, and how many of them are one of the model's. Values
-are divided by it, so that 1400 ms are the 1.4 s of another file to the bit."""
+are divided by it, so that 1400 ms are the 1.4 s of another file to the bit. Whole numbers are
+divided by whole numbers, rounded once: of 19 digits of nanoseconds float64 holds 16."""
 
 TIME, TAG, INTERVAL = "t [s]", "tag", "dt [s]"
 POSE = ("x [m]", "y [m]", "theta [rad]")
@@ -85,8 +88,8 @@ def unit_divisor(unit: str | None, wanted: str) -> float | None:
     """The divisor that converts a column to the wanted unit; None if the units do not fit."""
     target = split_unit(wanted)[1] or ""
     if unit is None or unit == target:
-        return 1.0
-    return UNITS.get(target, {}).get(unit)
+        return 1
+    return UNITS.get(target, {}).get(unit.replace("µ", "u").replace("μ", "u"))
 
 
 def odometry_columns(controls: tuple[str, ...], given: Sequence[str]) -> tuple[str, ...]:
@@ -110,12 +113,12 @@ def align_tables(
     """The rows of odometry and of sensors with different rates (Solà 2.4): a row at every time
     of odometry, and of measurements within it.
 
-    Velocities (controls with an interval) hold until the next line; poses are interpolated; other
-    controls are unchanged, and measurements must then be at their times. Measurements before
-    the first or after the last odometry are dropped and counted, as are ranges below 0 or of the
-    sensor's maximum, and measurements sooner after one of the same landmark than the spacing. The
-    last velocity holds as long as the longest interval between lines. A scan has the slots of the
-    sensors in their order.
+    Velocities (controls with an interval) hold until the next line; poses are interpolated, but for
+    gaps (`streams.is_gap`); other controls are unchanged, and measurements must then be at their
+    times. Measurements before the first or after the last odometry, or in a gap between poses, are
+    dropped and counted, as are ranges below 0 or of the sensor's maximum, and measurements sooner
+    after one of the same landmark than the spacing. The last velocity holds as long as the longest
+    interval between lines. A scan has the slots of the sensors in their order.
 
     Args:
         controls: the names of the motion model, with units.
@@ -133,7 +136,14 @@ def align_tables(
     if columns != POSE and INTERVAL in controls and controls[:3] != _INCREMENT:
         rule = streams.hold
         last += np.max(np.diff(clock), initial=0.0)
-    within = [(t >= clock[0]) & (t <= last) for t in (seen.table.columns[TIME] for seen in sensors)]
+    stamps = [seen.table.columns[TIME] for seen in sensors]
+    within = [(t >= clock[0]) & (t <= last) for t in stamps]
+    in_gap = 0
+    if columns == POSE:
+        joined = ~streams.is_gap(clock)
+        covered = [streams.between_lines(clock, t, joined) for t in stamps]
+        in_gap = sum(int((w & ~c).sum()) for w, c in zip(within, covered, strict=True))
+        within = [w & c for w, c in zip(within, covered, strict=True)]
     named = {
         name
         for seen, inside in zip(sensors, within, strict=True)
@@ -142,7 +152,7 @@ def align_tables(
     }
     tag_of = {name: tag for tag, name in enumerate(ordered({*names, *named}))}
     tags = [_tags_in_scans(seen, tag_of) for seen in sensors]
-    kept, outside, negative, beyond, soon = [], 0, 0, 0, 0
+    kept, outside, negative, beyond, soon = [], -in_gap, 0, 0, 0
     for seen, tag, inside in zip(sensors, tags, within, strict=True):
         when = seen.table.columns[TIME]
         lost = np.flatnonzero(inside & ~np.isin(when, clock))
@@ -173,6 +183,7 @@ def align_tables(
         rows = rows._replace(control=np.column_stack([rows.control, interval]))
     dropped = {"measurements outside the odometry": outside}
     counts = {
+        "measurements in a gap of the odometry": in_gap,
         "measurements with a range below 0": negative,
         "measurements of the maximum range": beyond,
         "measurements closer than the spacing": soon,
@@ -279,6 +290,7 @@ def columns_of(
         ValueError: on a column that is missing, in another unit, of another length, or with a value
             that is not a finite number.
     """
+    given = _held(given)
     names = _names(given)
     needed = list(wanted(names or ()))
 
@@ -286,18 +298,19 @@ def columns_of(
         return f"{what}, row {row}, column {split_unit(column)[0]}"
 
     if names is None:
-        rows = list(given) if isinstance(given, Sequence | np.ndarray) else None
-        if rows is None:
+        without_axes = isinstance(given, np.ndarray) and given.ndim == 0
+        if without_axes or not isinstance(given, Sequence | np.ndarray):
             raise ValueError(f"{what}: expected rows or columns, got {type(given).__name__}")
+        rows = [_held(row) for row in given]
         for k, row in enumerate(rows):
-            size = len(row) if isinstance(row, Sequence | np.ndarray) else 1
+            size = len(row) if isinstance(row, Sequence) or np.ndim(row) else 1
             if size != len(needed) or isinstance(row, str):
                 raise ValueError(
                     f"{what}, row {k}: expected {len(needed)} values ({', '.join(needed)}), "
                     f"got {size}"
                 )
         found = {name: [row[i] for row in rows] for i, name in enumerate(needed)}
-        divisors = dict.fromkeys(needed, 1.0)
+        divisors: dict[str, float] = dict.fromkeys(needed, 1)
     else:
         assert not isinstance(given, Sequence)  # which has no names
         header = {split_unit(name)[0]: name for name in names}
@@ -309,17 +322,25 @@ def columns_of(
             divisor = unit_divisor(split_unit(header[bare])[1], name)
             if divisor is None:
                 raise ValueError(f"{what}: expected the column {name!r}, got {header[bare]!r}")
-            found[name], divisors[name] = list(given[header[bare]]), divisor
+            column = _held(given[header[bare]])
+            if not isinstance(column, Iterable):
+                raise ValueError(f"{what}: expected a column {name!r}, got {column!r}")
+            found[name], divisors[name] = list(column), divisor
         lengths = {name: len(column) for name, column in found.items()}
         if len(set(lengths.values())) > 1:
             raise ValueError(f"{what}: expected columns of one length, got {lengths}")
     tags = None
     if TAG in found:
         tags = [_landmark(at(k, TAG), value) for k, value in enumerate(found.pop(TAG))]
-    columns = {n: _numbers(at, n, column) / divisors[n] for n, column in found.items()}
+    columns = {n: _numbers(at, n, column, divisors[n]) for n, column in found.items()}
     if not columns[TIME].size:
         raise ValueError(f"{what}: expected at least one row, got none")
     return Columns(columns, tags, at)
+
+
+def _held(value: Any) -> Any:
+    """A JAX array as NumPy's; a traced one and anything else are unchanged, and then refused."""
+    return np.asarray(value) if isinstance(value, jax.Array) and is_concrete(value) else value
 
 
 def _names(given: Tabular) -> tuple[str, ...] | None:
@@ -333,24 +354,49 @@ def _names(given: Tabular) -> tuple[str, ...] | None:
 
 
 def _numbers(
-    at: Callable[[int, str], str], name: str, column: Sequence[object]
+    at: Callable[[int, str], str], name: str, column: Sequence[object], divisor: float
 ) -> Float[np.ndarray, "K"]:
-    """The column as float64 (K,); raises ValueError on anything but finite numbers."""
-    for row, value in enumerate(column):
-        if (
-            not isinstance(value, int | float | np.integer | np.floating)
-            or isinstance(value, bool)
-            or not math.isfinite(value)
-        ):
-            raise ValueError(f"{at(row, name)}: expected a finite number, got {value!r}")
-    return np.array(column, np.float64)
+    """The column, divided, as float64 (K,); raises ValueError on anything but finite numbers."""
+    numbers = np.empty(len(column))
+    for row, given in enumerate(column):
+        value = _scalar(given)
+        try:
+            good = isinstance(value, int | float) and not isinstance(value, bool)
+            quotient = value / divisor if good else math.nan  # type: ignore[operator]
+        except OverflowError:  # a whole number that no float holds
+            quotient = math.nan
+        if not math.isfinite(quotient):
+            raise ValueError(f"{at(row, name)}: expected a finite number, got {given!r}")
+        numbers[row] = quotient
+    return numbers
+
+
+def _scalar(value: object) -> object:
+    """The Python number or text of a scalar, or an array without axes, of NumPy or JAX.
+
+    None of a masked one. Times of NumPy, whose numbers have units of their own, are unchanged.
+    """
+    value = _held(value)
+    if value is np.ma.masked:
+        return None
+    if isinstance(value, np.ndarray) and value.ndim == 0:
+        value = value[()]
+    if not isinstance(value, np.generic) or isinstance(value, np.datetime64 | np.timedelta64):
+        return value
+    item: object = value.item()
+    return float(item) if isinstance(item, np.floating) else item  # of a long double
 
 
 def _landmark(place: str, value: object) -> int | str | None:
     """The name of a landmark, an int or a str; None where it is unknown (None, "", -1 or NaN)."""
-    if isinstance(value, np.generic):
-        value = value.item()
-    if value is None or value in ("", -1) or value != value:
+    value = _scalar(value)
+    try:
+        unknown = value is None or bool(value != value) or value in ("", -1)
+    except TypeError:  # the truth of a comparison with pandas' <NA> is not defined
+        unknown = True
+    except ValueError:  # an array
+        unknown = False
+    if unknown:
         return None
     if isinstance(value, float) and value.is_integer():
         value = int(value)

@@ -12,7 +12,7 @@ from jaxslam.core._numbers import check_covariance
 from jaxslam.core.logs._streams import as_recorded
 from jaxslam.core.types import Log
 from jaxslam.datasets._dataset import Dataset
-from jaxslam.datasets._lines import TextFile
+from jaxslam.datasets._lines import TextFile, none_left
 from jaxslam.motion import PoseIncrement
 from jaxslam.sensors import RangeBearing, RelativePosition
 
@@ -76,6 +76,8 @@ def bonn(folder: str | Path) -> Dataset:
         else:
             raise file.error(line, f"unknown keyword {keyword!r}")
     if not z:
+        if dropped["negative ranges"]:
+            raise none_left(f"{file.path}:{len(file.lines)}", dropped)
         raise file.end_error(f"no {'SENSOR' if controls else 'ODOMETRY'} line in the file")
     time = np.arange(1.0, len(controls) + 1.0)
     return Dataset(

@@ -25,7 +25,7 @@ from jaxslam.datasets._landmark_logs.mrclam_robot import (
     read_lines,
     true_fields,
 )
-from jaxslam.datasets._lines import stored
+from jaxslam.datasets._lines import none_left, stored
 from jaxslam.filters.multi_robot._team import Robot, TeamMotion, sensors_of
 from jaxslam.sensors import Part, Suite
 
@@ -95,6 +95,8 @@ def mrclam(
     lines = read_lines(Path(folder), robot, calibration)
     time = np.unique(np.concatenate([lines.odometry[:, 0], lines.seen[:, 0]]))
     row, tag, kept, dropped = associated(lines.seen, time, subject_of, names)
+    if not tag:
+        raise none_left(f"{stored(Path(folder) / f'Robot{robot}_Measurement.dat')}:1", dropped)
     motion, sensor = models_of(calibration)
     log = log_of(lines.odometry, time, row, tag, lines.seen[kept, 2:])
     return Dataset(

@@ -13,7 +13,7 @@ from numpy.typing import ArrayLike
 from jaxslam import motion
 from jaxslam.calibration import delayed
 from jaxslam.core._numbers import is_concrete
-from jaxslam.core.logs._streams import hold, interpolate_poses
+from jaxslam.core.logs._streams import hold, known_poses
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import JaxOrNumPy, Log
 from jaxslam.datasets._dataset import Adjustable, Parameter
@@ -295,12 +295,7 @@ def true_poses(
     They are unknown before the first line, after the last, and between lines more than
     `MAX_TRUTH_GAP` apart.
     """
-    clock = truth[:, 0]
-    after = np.clip(np.searchsorted(clock, time), 1, max(len(clock) - 1, 1))
-    last = np.minimum(after, len(clock) - 1)
-    near = clock[last] - clock[after - 1] <= MAX_TRUTH_GAP
-    known = (time >= clock[0]) & (time <= clock[-1]) & (near | np.isin(time, clock))
-    return interpolate_poses(clock, truth[:, 1:], time), known
+    return known_poses(truth[:, 0], truth[:, 1:], time, MAX_TRUTH_GAP)
 
 
 SOURCE = (

@@ -18,10 +18,10 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.core.logs._streams import divide, interpolate_poses
+from jaxslam.core.logs._streams import between_lines, divide, is_gap, known_poses
 from jaxslam.core.types import Log
 from jaxslam.datasets._dataset import Dataset
-from jaxslam.datasets._lines import read_bytes
+from jaxslam.datasets._lines import none_left, read_bytes
 from jaxslam.motion import PoseIncrement
 from jaxslam.sensors import RangeOnly
 
@@ -125,10 +125,12 @@ def plaza(
     beacon) and GT (t, x, y, θ). The log has a row at the time of every range: its control is the
     pose increment (dx, dy, dθ) of the odometry since the row before, with a proportional part of
     an odometry row that this time divides. Ranges of one time share a row. Dropped and counted are
-    ranges before the first ground truth or after the last odometry, and all but the first range of
-    a beacon at one time. A range z is corrected to (z - offset)/(1 + scale) by `range_bias`.
+    ranges before the first ground truth or after the last odometry, or in a gap of it, and all but
+    the first range of a beacon at one time. A range z is corrected to (z - offset)/(1 + scale) by
+    `range_bias`.
 
-    `true_path` is the ground truth at the time of each row, interpolated linearly. The map's frame
+    `true_path` is the ground truth at the time of each row, interpolated linearly, but not in a gap
+    or after the last (`true_at`). A gap is an interval above ten times the median. The map's frame
     is the robot's first pose; survey and true path are in another frame.
 
     Source: Djugash, Hamner & Roth, Journal of Field Robotics 26(9), 2009, as with GTSAM:
@@ -162,16 +164,30 @@ def plaza(
     begin, end = truth[0, 0], odometry[-1, 0]
     ranges = ranges[np.argsort(ranges[:, 0], kind="stable")]
     inside = (ranges[:, 0] > begin) & (ranges[:, 0] <= end)
+    edges = np.concatenate([[min(begin, odometry[0, 0])], odometry[:, 0]])
+    in_gap = inside & ~between_lines(edges, ranges[:, 0], np.append(True, ~is_gap(odometry[:, 0])))
+    outside, inside = ~inside, inside & ~in_gap
     times, row = np.unique(ranges[inside, 0], return_inverse=True)
     if len(times) == 0:
         raise ValueError(
             f"{path}: no range in TD is between the first ground truth and the last odometry"
+            + ", outside of its gaps" * bool(in_gap.any())
         )
     tag = np.searchsorted(names, ranges[inside, 2].astype(int))
     first = np.unique(row * len(names) + tag, return_index=True)[1]
     offset, scale = range_bias
     z = (ranges[inside, 3] - offset) / (1 + scale)
     positive = first[z[first] > 0]
+    gaps = {"ranges in a gap of the odometry": int(in_gap.sum())} if in_gap.any() else {}
+    dropped = {
+        "ranges outside the odometry": int(outside.sum()),
+        **gaps,
+        "repeated ranges": int(inside.sum() - len(first)),
+        "ranges shorter than their bias": len(first) - len(positive),
+    }
+    if not len(positive):
+        raise none_left(path, dropped)
+    truth_of_rows, known = known_poses(truth[:, 0], truth[:, 1:], times)
     points = {int(name): (x, y) for name, x, y in survey}
     return Dataset(
         name="plaza",
@@ -186,12 +202,9 @@ def plaza(
         sensor=RangeOnly(_RANGE_COV),
         tags=names,
         landmarks=np.array([points[name] for name in names]),
-        true_path=interpolate_poses(truth[:, 0], truth[:, 1:], times),
-        dropped={
-            "ranges outside the odometry": int((~inside).sum()),
-            "repeated ranges": int(inside.sum() - len(first)),
-            "ranges shorter than their bias": len(first) - len(positive),
-        },
+        true_path=truth_of_rows,
+        true_at=None if known.all() else known,
+        dropped=dropped,
         corrections=(
             (f"ranges: {offset} m and {100 * scale} % subtracted",) if any(range_bias) else ()
         ),

@@ -3,28 +3,51 @@
 import csv
 import io
 import math
-from collections.abc import Sequence
+import re
+from collections.abc import Iterator, Sequence
+from fractions import Fraction
 from pathlib import Path
 
 import jax
 import numpy as np
 
 from jaxslam.calibration import delayed
+from jaxslam.core._units import TURN, are_headings_in_degrees
 from jaxslam.core.logs import _tables as tables
-from jaxslam.core.logs._streams import interpolate_poses
+from jaxslam.core.logs._streams import is_gap, known_poses
 from jaxslam.core.logs._tables import POSE, TAG, TIME, UNITS, Columns, split_unit, unit_divisor
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import Log
 from jaxslam.datasets._dataset import Adjustable, Dataset, Parameter
-from jaxslam.datasets._landmark_logs.table_settings import Parametric, TableSettings
-from jaxslam.datasets._lines import DIGITS, LARGEST, read_bytes, stored
+from jaxslam.datasets._landmark_logs.table_settings import (
+    UNMEASURED,
+    Parametric,
+    TableSettings,
+)
+from jaxslam.datasets._lines import DIGITS, LARGEST, none_left, read_bytes, stored
+
+MISSING = frozenset(
+    {"", "nan", "-nan", "<na>", "na", "n/a", "#n/a", "#na", "null", "none"}
+    | {f"{sign}1.#{kind}" for sign in ("", "-") for kind in ("ind", "qnan")}
+)
+"""Cells without a value, as pandas reads them, in lower case."""
+
+_NAME = 100
+"""Characters of the longest name of a landmark."""
+
+_SIGNED = re.compile(r"[+-]?(?:\d+([.,])\d*|([.,])\d+)(?:[eE][+-]?\d+)?")
+"""A number with one decimal sign."""
+_GROUPED = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}")
+"""A number that is also one of thousands: 1,234."""
 
 
 class CsvTable:
-    """The cells of a CSV file (UTF-8, separated by commas, any line ends) below its header.
+    """The cells of a CSV file (UTF-8, any line ends) below its header.
 
     It is NAME or NAME.gz. Every column but `tag` has its unit in the header, as in `v [m/s]`. Lines
-    above the header that begin with # are comments.
+    above the header that begin with # are comments. The header, or a line `sep=;` above it, shows
+    whether commas, semicolons or tabs separate cells. Decimal commas are read where no other number
+    of the file has a point, and some number cannot be one of thousands; `dialect` says so.
     Raises ValueError if the file cannot be read, has no line below its header, or a line with
     another number of cells.
     """
@@ -44,25 +67,37 @@ class CsvTable:
         while text.lstrip(" \t\r\n").startswith("#"):  # with its quotes, which csv would pair
             _, _, text = text.partition("\n")
             above += 1
-        reader = csv.reader(io.StringIO(text, newline=""))
+        separator = None
+        if marked := re.match(r"\s*\"?sep=(.)\"?[^\S\r\n]*(?=[\r\n]|$)", text, re.IGNORECASE):
+            separator, text = marked[1], text[marked.end() :]
+            above += marked[0].count("\n")
+            if separator not in _SEPARATORS:
+                raise self._error(
+                    above + 1, f"expected sep= and , or ; or a tab, got {separator!r}"
+                )
+        first = re.search(r"[^\r\n]*\S[^\r\n]*", text)
+        separators = _separators(first[0] if first else "")
+        if separator is None and len(separators) > 1:
+            got = " and ".join(map(repr, separators))
+            line = above + 1 + text.count("\n", 0, first.start() if first else 0)
+            raise self._error(line, f"expected one separator of cells in the header, got {got}")
+        self.separator = separator or (separators or ",")[0]
+        reader = csv.reader(io.StringIO(text, newline=""), delimiter=self.separator)
         lines, begins = [], above + 1  # a cell in quotes may go over several lines of the file
         try:
             for cells in reader:
                 lines.append((begins, [cell.strip() for cell in cells]))
                 begins = above + reader.line_num + 1
         except csv.Error as problem:
-            raise self._error(begins, f"expected cells separated by commas: {problem}") from problem
+            reason = f"expected cells separated by {_SEPARATORS[self.separator]}: {problem}"
+            raise self._error(begins, reason) from problem
         lines = [(number, cells) for number, cells in lines if any(cells)]
         if not lines:
             raise ValueError(f"{self.path}:1: expected a header, as 't [s],v [m/s]', got no text")
         self.head_line, self.header = lines[0]
         self.lines = [number for number, _ in lines[1:]]
         self.cells = [cells for _, cells in lines[1:]]
-        for separator in ";\t":
-            if len(self.header) == 1 and separator in self.header[0]:
-                reason = f"expected cells separated by commas, got {separator!r}"
-                raise self._error(self.head_line, reason)
-        if all(math.isfinite(_number(cell)) for cell in self.header):
+        if all(math.isfinite(_number(cell.replace(",", "."))) for cell in self.header):
             raise self._error(
                 self.head_line, f"expected a header, as 't [s],v [m/s]', got {self.header[0]!r}"
             )
@@ -78,28 +113,50 @@ class CsvTable:
                 wanted, hint = len(self.header), ""
                 if "\n" in "".join(cells):
                     hint = "; a quotation mark is not closed on its line"
-                elif len(cells) > wanted:
+                elif len(cells) > wanted and self.separator == ",":
                     hint = "; write a number with a point: 0.5"
                 raise self._error(
                     number,
                     f"expected {wanted} cells, as in line {self.head_line}, got {len(cells)}{hint}",
                 )
 
-    def table(self, wanted: Sequence[str], why: str) -> Columns[int]:
+        signs = {"," if "," in cell else "." for cell in self._decimals()}
+        self.decimal = "," if signs == {","} else "."
+        # A point is a decimal point, but not surely beside semicolons: Excel writes both where a
+        # comma is the decimal sign, and a point is that of thousands.
+        self._ambiguous = (self.decimal == "," or self.separator == ";") and all(
+            _GROUPED.fullmatch(cell) for cell in self._decimals()
+        )
+
+    @property
+    def dialect(self) -> str:
+        """What the separators are, and decimal signs, where they are not commas and points."""
+        decimals = ", decimal commas" * (self.decimal == ",")
+        if self.separator == "," and not decimals:
+            return ""
+        return f"{self.path.name}: cells separated by {_SEPARATORS[self.separator]}{decimals}"
+
+    def table(
+        self, wanted: Sequence[str], why: str, optional: Sequence[str] = ()
+    ) -> Columns[int | str]:
         """The wanted columns ("v [m/s]"), in their units.
 
         Raises ValueError on a column that is missing, or without a known unit, a cell that is not a
-        finite number, and a tag that is not a whole number >= 0 (or empty, for unknown).
+        finite number, and a tag that is a number, but not a whole one >= 0. A tag is unknown in a
+        cell of `MISSING`, and of -1.
 
         Args:
             why: what needs them, for messages.
+            optional: columns in which a cell of `MISSING` is NaN.
         """
         places = {name: self._place(name, why) for name in wanted}
 
         def at(row: int, column: str) -> str:
             return f"{self.path}:{self.lines[row]}: {self._column(places[column])}"
 
-        columns = {n: self._numbers(place, n) for n, place in places.items() if n != TAG}
+        columns = {
+            n: self._numbers(place, n, n in optional) for n, place in places.items() if n != TAG
+        }
         return Columns(columns, self._tags(places[TAG]) if TAG in places else None, at)
 
     def unused(self, wanted: Sequence[str]) -> list[str]:
@@ -125,32 +182,66 @@ class CsvTable:
             )
         return place
 
-    def _numbers(self, place: int, name: str) -> np.ndarray:
-        divisor = unit_divisor(split_unit(self.header[place])[1], name)
+    def _decimals(self) -> Iterator[str]:
+        """The numbers with one decimal sign."""
+        return (cell for cells in self.cells for cell in cells if _SIGNED.fullmatch(cell))
+
+    def _value(self, cell: str) -> float:
+        """The number in a cell by the decimal sign of the file; NaN of other text."""
+        if _SIGNED.fullmatch(cell):
+            return math.nan if self._ambiguous else _number(cell.replace(self.decimal, "."))
+        return _number(cell)
+
+    def _numbers(self, place: int, name: str, optional: bool) -> np.ndarray:
+        divisor = unit_divisor(split_unit(self.header[place])[1], name) or 1
         values = np.empty(len(self.cells))
+        missing = np.zeros(len(self.cells), bool)
         for row, cells in enumerate(self.cells):
-            values[row] = _number(cells[place])
-        usable = np.abs(values) <= LARGEST
+            value = self._value(cells[place])
+            if isinstance(divisor, int) and divisor > 1 and 2**53 <= abs(value) <= LARGEST:
+                # Stamps in nanoseconds: float64 does not hold them before they are divided.
+                exact = Fraction(cells[place].replace(self.decimal, ".")) / divisor
+                values[row] = float(exact)
+            else:
+                values[row] = value / divisor
+            missing[row] = optional and cells[place].lower() in MISSING
+        usable = missing | (np.abs(values) <= LARGEST)
         if not usable.all():
             row = int(np.flatnonzero(~usable)[0])
             cell = self.cells[row][place]
-            hint = " (write a point: 0.5)" if "," in cell else ""
+            hint = " (write a point: 0.5, and no thousands separator)" if "," in cell else ""
+            if self._ambiguous and _SIGNED.fullmatch(cell):
+                hint = " (decimals or thousands? separate cells by commas, write a point: 0.5)"
             what = f"number within ±{LARGEST:g}" if np.isfinite(values[row]) else "finite number"
             raise self._error(self.lines[row], f"expected a {what}, got {cell!r}{hint}", place)
-        return values / (divisor or 1.0)
+        return values
 
-    def _tags(self, place: int) -> list[int | None]:
-        tags: list[int | None] = []
-        for number, cells in zip(self.lines, self.cells, strict=True):
-            cell = cells[place]
-            if cell and not (cell.isascii() and cell.isdigit()):
-                reason = f"expected a whole number >= 0, or nothing if unknown, got {cell!r}"
-                raise self._error(number, reason, place)
-            if len(cell) > DIGITS:
-                reason = f"expected at most {DIGITS} digits, got {len(cell)}"
-                raise self._error(number, reason, place)
-            tags.append(int(cell) if cell else None)
-        return tags
+    def _tags(self, place: int) -> list[int | str | None]:
+        return [
+            self._tag(cells[place], number, place)
+            for number, cells in zip(self.lines, self.cells, strict=True)
+        ]
+
+    def _tag(self, cell: str, line: int, place: int) -> int | str | None:
+        """The name of a landmark: 11 of 11.0, which pandas writes; text; None if unknown."""
+        if cell.lower() in MISSING:
+            return None
+        digits = cell.isascii() and cell.isdigit()
+        value = self._value(cell)
+        if value == -1:
+            return None
+        if digits and len(cell) > DIGITS:
+            raise self._error(line, f"expected at most {DIGITS} digits, got {len(cell)}", place)
+        if digits:
+            return int(cell)
+        numeric = not math.isnan(value) or _SIGNED.fullmatch(cell)
+        if numeric and not (value.is_integer() and 0 <= value < 2**53):
+            reason = f"expected a whole number >= 0, or nothing if unknown, or a name, got {cell!r}"
+            raise self._error(line, reason, place)
+        if not numeric and not (cell.isprintable() and len(cell) <= _NAME):
+            reason = f"expected a name of at most {_NAME} characters in one line, got {cell!r:.80}"
+            raise self._error(line, reason, place)
+        return int(value) if numeric else cell
 
     def _column(self, place: int) -> str:
         return f"column {place + 1} ({self.header[place]})"
@@ -158,6 +249,28 @@ class CsvTable:
     def _error(self, line: int, reason: str, place: int | None = None) -> ValueError:
         where = "" if place is None else f"{self._column(place)}: "
         return ValueError(f"{self.path}:{line}: {where}{reason}")
+
+
+_SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
+
+
+def _separators(header: str) -> list[str]:
+    """The characters that separate the cells of a header, without another such in a cell."""
+
+    def cells(separator: str) -> list[str]:
+        try:
+            return next(csv.reader([header], delimiter=separator), [])
+        except csv.Error:
+            return []
+
+    split = {one: cells(one) for one in _SEPARATORS}
+    possible = [one for one, parts in split.items() if len(parts) > 1]
+    clean = [
+        one
+        for one in possible
+        if not any(other in cell.strip() for other in possible for cell in split[one])
+    ]
+    return clean or possible
 
 
 def _number(cell: str) -> float:
@@ -170,8 +283,6 @@ def _number(cell: str) -> float:
 
 ODOMETRY, MEASUREMENTS = "odometry.csv", "measurements.csv"
 
-_GAP_FACTOR = 10
-"""Intervals of odometry above this multiple of the median are noted."""
 _LARGEST = 0.01
 """Share of ranges that equal the largest, above which they are noted."""
 
@@ -181,9 +292,9 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
 
     `odometry.csv` has the columns `t [s]` and the controls of a motion model without Δt, as
     `v [m/s],omega [rad/s]`, or a path of poses, `x [m],y [m],theta [rad]`. `measurements.csv` has
-    `t [s]`, `tag` (empty if the landmark is unknown) and the measurements of a sensor, as
-    `range [m],bearing [rad]`. Optional are `truth.csv` (t, x, y, theta), `landmarks.csv` (tag, x, y
-    of every tag) and `dataset.toml`:
+    `t [s]`, `tag` (a whole number or a name; empty if the landmark is unknown) and the measurements
+    of a sensor, as `range [m],bearing [rad]`. Optional are `truth.csv` (t, x, y, theta; empty or
+    NaN where unknown), `landmarks.csv` (tag, x, y of every tag) and `dataset.toml`:
 
         [motion]
         model = "unicycle"
@@ -208,18 +319,21 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
     `sensors.RangeBearingNoise`. [calibration] has the covariance in which they are known. Missing
     settings have defaults, listed in `Dataset.assumed`. The log is `Log.from_records`. The
     noise of the motion is that of a line of odometry; a row that is shorter or longer has white
-    noise of the same density. The start is that of the truth if it covers the first row; then all
-    is in one frame. Other columns are not used, and listed. A CSV file may be packed by gzip, as
-    `truth.csv.gz`; of both the plain one is read.
+    noise of the same density. The true pose of a row is interpolated between two lines of the
+    truth, but not in a gap, an interval above ten times their median: there, and before and after
+    the truth, it is unknown (`Dataset.true_at`). The start is that of the truth if it covers the
+    first row; then all is in one frame. Other columns are not used, and listed. A CSV file may be
+    packed by gzip, as `truth.csv.gz`; of both the plain one is read.
 
     Args:
         folder: the folder of the files.
         fitted: whether numbers of `fit.toml`, if there is one, replace those of `dataset.toml`.
     Raises:
         ValueError: `path:line: column: what was expected` on a header without a column or a unit, a
-            cell that is not a finite number, a tag that is not a whole number, times that go back
-            (or repeat, but for measurements), a line with another number of cells, no lines; `path:
-            [section] key: …` on settings; and on a measured tag that `landmarks.csv` lacks.
+            cell that is not a finite number, a tag that is a number and not whole, times that go
+            back (or repeat, but for measurements), a line with another number of cells, no lines;
+            `path: [section] key: …` on settings; on a measured tag that `landmarks.csv` lacks; and
+            where no measurement is left.
     """
     folder = Path(folder)
     if not folder.is_dir():
@@ -245,17 +359,18 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
     seen = seen_file.table(measured, f"of the sensor {sensor.name}")
     seen.columns[TIME] = seen.columns[TIME] - delay
     max_range, spacing = settings.max_range(), settings.spacing()
-    notes = [
+    notes = [file.dialect for file in (odometry_file, seen_file) if file.dialect]
+    notes += [
         f"column {column!r} of {file.path.name} is not used"
         for file, wanted in ((odometry_file, moved), (seen_file, measured))
         for column in file.unused(wanted)
     ]
-    if len(clock) > 2 and (gaps := np.diff(clock)).max() > _GAP_FACTOR * np.median(gaps):
-        k = int(np.argmax(gaps))
-        notes.append(
-            f"{odometry.at(k + 1, TIME)}: {gaps[k]:.6g} s since the line before, the median is "
-            f"{np.median(gaps):.6g} s; the odometry is taken to hold over it"
-        )
+    if gap := _longest_gap(odometry):
+        of_poses = "no pose is interpolated over" if moved[1:] == POSE else ""
+        notes.append(f"{gap}; {of_poses or 'the odometry is taken to hold over'} it")
+    if moved[1:] == POSE and are_headings_in_degrees(odometry.values(POSE)):
+        notes.append(f"{odometry_file.path.name}: {_DEGREES_OF_PATH}")
+    notes += [note for file in (odometry, seen) if (note := _beyond_a_turn(file))]
     if "range [m]" in seen.columns and not np.isfinite(max_range):
         ranges = seen.columns["range [m]"]
         largest = int((ranges == ranges.max()).sum())
@@ -264,24 +379,32 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
                 f"{largest:,} ranges are {ranges.max():.6g} m, the largest: if the sensor writes "
                 "it where it met nothing, set [sensor] max_range"
             )
-    survey = _survey(folder / "landmarks.csv")
+    survey = _survey(folder / "landmarks.csv", notes)
     rows, tags, dropped = tables.align_tables(
         odometry,
         [tables.Seen(seen, sensor.measurements, max_range=max_range, spacing=spacing)],
         motion.controls,
         tuple(survey or ()),
     )
-    known = tags if survey is None else survey
+    if not rows.valid.any():
+        raise none_left(f"{seen_file.path}:{seen_file.lines[0]}", dropped)
     for row, tag in enumerate(seen.tags or ()):
-        if tag is not None and tag not in known:
+        # A tag that is not in the log is measured outside of the odometry alone, and counted.
+        if survey is not None and tag in tags and tag not in survey:
             raise ValueError(f"{seen.at(row, TAG)}: expected a tag of landmarks.csv, got {tag}")
-    truth, covered = _truth(folder / "truth.csv", rows.time)
+    truth, covered, of_truth = _truth(folder / "truth.csv", rows.time)
+    notes += of_truth
     start, one_frame = settings.start(), True
     if start is None:
         one_frame = covered is not None and bool(covered[0])
         start = truth[0] if truth is not None and one_frame else np.zeros(3)
         shown = [float(f"{value:.6g}") for value in start]
         notes.append(f"[filter] start = {shown}" + ", the truth at the first row" * one_frame)
+    if sensor.name in UNMEASURED and survey is not None and one_frame:
+        notes.append(
+            f"{', '.join(sensor.measurements)} alone: a filter starts each landmark from the prior "
+            "[sensor] free; --filters localization takes those of landmarks.csv, and needs none"
+        )
     unknown = None in (seen.tags or ())
     capacity = settings.capacity(len(tags), unknown)
     log = Log.from_rows(rows)
@@ -329,12 +452,47 @@ def _adjustable(
     return Adjustable(parameters, at)
 
 
-def _survey(path: Path) -> dict[int, tuple[float, float]] | None:
-    """The position of each tag; None without a file."""
+_DEGREES_OF_PATH = (
+    "theta [rad] contradicts the directions between the positions, which fit it as degrees: "
+    "write [deg] in the header"
+)
+
+
+def _longest_gap(table: Columns[int | str]) -> str:
+    """The place and the length of the longest gap between lines; empty without one."""
+    clock = table.columns[TIME]
+    if not is_gap(clock).any():
+        return ""
+    steps = np.diff(clock)
+    k = int(np.argmax(steps))
+    return (
+        f"{table.at(k + 1, TIME)}: {steps[k]:.6g} s since the line before, the median is "
+        f"{np.median(steps):.6g} s"
+    )
+
+
+def _beyond_a_turn(table: Columns[int | str]) -> str:
+    """A note on a column of [rad] or [rad/s], but for headings, with numbers beyond 2π."""
+    for name, values in table.columns.items():
+        unit = split_unit(name)[1] or ""
+        beyond = np.abs(values) > TURN
+        if unit in ("rad", "rad/s") and name != POSE[2] and beyond.any():
+            row, degrees = int(np.argmax(np.abs(values))), unit.replace("rad", "deg")
+            return (
+                f"{table.at(row, name)}: {int(beyond.sum()):,} of {len(values):,} numbers are "
+                f"beyond 2π, up to {values[row]:.6g}: degrees? then write [{degrees}] in the header"
+            )
+    return ""
+
+
+def _survey(path: Path, notes: list[str]) -> dict[int | str, tuple[float, float]] | None:
+    """The position of each tag, and notes added; None without a file."""
     if stored(path) is None:
         return None
-    found = CsvTable(path).table((TAG, *POSE[:2]), "of landmarks")
-    survey: dict[int, tuple[float, float]] = {}
+    file = CsvTable(path)
+    notes += [file.dialect] if file.dialect else []
+    found = file.table((TAG, *POSE[:2]), "of landmarks")
+    survey: dict[int | str, tuple[float, float]] = {}
     for row, tag in enumerate(found.tags or ()):
         if tag is None or tag in survey:
             got = "nothing" if tag is None else f"{tag} again"
@@ -345,17 +503,30 @@ def _survey(path: Path) -> dict[int, tuple[float, float]] | None:
     return survey
 
 
-def _truth(path: Path, time: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None]:
-    """The true pose at each row (T, 3), and whether it is known (T,); None without a file."""
+def _truth(path: Path, time: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None, list[str]]:
+    """The true pose at each row (T, 3), whether it is known (T,), and notes."""
     if stored(path) is None:
-        return None, None
-    found = CsvTable(path).table((TIME, *POSE), "of a true path")
+        return None, None, []
+    file = CsvTable(path)
+    found = file.table((TIME, *POSE), "of a true path", optional=POSE)
     tables.check_times(found, strict=True)
-    clock = found.columns[TIME]
-    covered = (time >= clock[0]) & (time <= clock[-1])
-    if not covered.any():
+    clock, pose = found.columns[TIME], found.values(POSE)
+    if time[0] > clock[-1] or time[-1] < clock[0]:
         raise ValueError(
             f"{found.at(0, TIME)}: expected times within those of the log, {time[0]:.12g} to "
             f"{time[-1]:.12g}, got {clock[0]:.12g} to {clock[-1]:.12g}"
         )
-    return interpolate_poses(clock, found.values(POSE), time), covered
+    truth, known = known_poses(clock, pose, time)
+    notes = [file.dialect] if file.dialect else []
+    if lost := int((~np.isfinite(pose).all(axis=1)).sum()):
+        notes.append(f"{file.path.name}: {lost:,} of {len(pose):,} lines have no pose")
+    if gap := _longest_gap(found):
+        notes.append(f"{gap}: no pose is interpolated over it")
+    if unknown := int((~known).sum()):
+        notes.append(
+            f"{unknown:,} of {len(time):,} rows have no true pose: before the first or after the "
+            f"last line of {file.path.name}, in a gap of it, or beside a line without a pose"
+        )
+    if are_headings_in_degrees(pose):
+        notes.append(f"{file.path.name}: {_DEGREES_OF_PATH}")
+    return truth, known, notes

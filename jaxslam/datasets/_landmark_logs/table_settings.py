@@ -3,6 +3,7 @@
 import inspect
 import re
 import tomllib
+import warnings
 from collections.abc import Callable, Mapping, Sequence
 from pathlib import Path
 from typing import Any, Generic, NamedTuple, NoReturn, TypeVar
@@ -22,6 +23,7 @@ from jaxslam.association import (
 from jaxslam.core._noise import NoiseCov
 from jaxslam.core._numbers import is_number
 from jaxslam.core._record import record, static
+from jaxslam.core._units import TURN
 from jaxslam.core.logs._tables import INTERVAL, POSE, odometry_columns, split_unit
 from jaxslam.core.protocols import Associate, Motion, Sensor
 from jaxslam.core.types import JaxOrNumPy
@@ -161,6 +163,17 @@ def _line_number(text: str, section: str, key: str) -> int | None:
 
 
 _Value = TypeVar("_Value")
+
+UNMEASURED = {"range_only": "bearing [rad]", "bearing_only": "range [m]"}
+"""What a sensor does not measure, and its option `free` is the prior of."""
+
+
+def _listed(value: object) -> object:
+    """A default as in TOML: lists in place of tuples, six digits."""
+    if isinstance(value, tuple):
+        return [_listed(part) for part in value]
+    return float(f"{value:.6g}") if isinstance(value, float) else value
+
 
 _MOTION_NOISE = {"m/s": 0.1, "rad/s": 0.1, "m": 0.02, "rad": 0.02}
 _MEASUREMENT_NOISE = {"m": 0.1, "rad": 0.05, "1": 1.0}
@@ -477,9 +490,21 @@ class TableSettings:
             raise ValueError(
                 f"{self._at(section, 'model')}: expected one of {', '.join(registry)}, got {name!r}"
             )
-        known = [key for key in inspect.signature(registry[name]).parameters if key != "noise_cov"]
+        parameters = inspect.signature(registry[name]).parameters
+        known = [key for key in parameters if key != "noise_cov"]
         self._check_keys(section, options, ("model", "noise", *known, *more))
         options.pop("noise", None)
+        for key in known:
+            if key not in options and key != "mount":
+                default = parameters[key].default
+                shown = "none" if default is None else _listed(default)
+                of = ""
+                if key == "free" and name in UNMEASURED:
+                    of = (
+                        f" (prior mean and variance of the {UNMEASURED[name]}, which is not "
+                        "measured: see docs/methods/bearings_and_ranges.md)"
+                    )
+                self.assumed.append(f"[{section}] {key} = {shown}{of}")
         return registry[name], options
 
     def _noise(
@@ -546,7 +571,13 @@ class TableSettings:
                 f"{self._at(section, key)}: expected {len(names)} number{'s' * (len(names) > 1)} "
                 f"({', '.join(names)}), got {given!r}"
             )
-        return [float(value) for value in given]
+        numbers = [float(value) for value in given]
+        for unit, value in zip(names, numbers, strict=True):
+            if "[rad]" in unit and abs(value) > TURN and key != "covariance":
+                self.assumed.append(
+                    f"[{section}] {key}: {unit} = {value:g} is beyond 2π: degrees? write radians"
+                )
+        return numbers
 
     def _built(
         self,
@@ -556,7 +587,9 @@ class TableSettings:
         noise: object,
     ) -> _Model:
         try:
-            return factory(noise, **options)
+            with warnings.catch_warnings():  # `_numbers` has noted a mount beyond 2π
+                warnings.filterwarnings("ignore", message=".*beyond 2π")
+                return factory(noise, **options)
         except (ValueError, TypeError) as problem:
             raise ValueError(f"{self.path}: [{section}] {problem}") from problem
 

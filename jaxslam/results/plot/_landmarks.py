@@ -136,7 +136,7 @@ def map_figure(
         truth: of a simulated world whose landmarks begin with a position (for lines use
             `worlds.with_positions`); or, drawn without alignment,
         true_points: (N, 2) landmarks [m], in the order of tags if names are given, and
-        true_path: (T, 2 or 3) poses.
+        true_path: (T, 2 or 3) poses, NaN where unknown.
         dead_reckoning: (T, 2 or 3) poses; parts far from the rest of the map are not shown.
         others: estimates of other filters by name; their paths and landmarks are drawn.
         names: of the landmarks, by tag. A panel below shows the distance of each landmark of the
@@ -283,7 +283,7 @@ def _draw_residuals(
     claimed = "3 σ claimed in its direction"
     axes.bar(at, claim, 0.7, color=SHADE, label=claimed)
     axes.plot(at, far, "D", color=COLORS[2], ms=4.5, mec="white", mew=0.4, label=label)
-    axes.set_xticks(at, [str(names[tag[i]]) for i in tagged])
+    axes.set_xticks(at, [plain(str(names[tag[i]])) for i in tagged])
     if len(tagged) > _UPRIGHT:
         axes.tick_params(axis="x", rotation=90)
     axes.grid(axis="x", visible=False)

@@ -102,6 +102,20 @@ def test_relations_at_stated_spacings():
     assert len(both.first) == len(both.pose) == 9
 
 
+def test_no_relation_is_across_a_gap_of_the_stamps():
+    """A step of over ten medians that is longer than the spacing; a shorter one is spanned."""
+    time = np.concatenate([np.arange(11) / 10, np.arange(30, 51) / 10, np.arange(65, 76) / 10])
+    path = np.stack([time, 0 * time, 0 * time], axis=1)
+    found = metrics.relations(path, seconds=(0.5, 1.8), time=time)
+    np.testing.assert_allclose(found.pose[:, 0], time[found.second] - time[found.first])
+    near = found.pose[:, 0] < 1.5
+    # Of each part all rows but its last five; of 1.8 s only the gap of 1.5 s may be spanned.
+    assert near.sum() == (11 - 5) + (21 - 5) + (11 - 5)
+    np.testing.assert_allclose(found.pose[near, 0], 0.5)
+    assert (found.pose[~near, 0] < 1.8 + 1.5).all()
+    assert time[found.first[~near]].min() == 3.0
+
+
 def test_revisits_are_near_in_space_and_far_along_the_path():
     found = metrics.revisits(SQUARE, radius=0.5, apart=3.0)
     np.testing.assert_array_equal([found.first, found.second], [[0], [4]])
