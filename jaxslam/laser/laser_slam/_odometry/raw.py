@@ -3,7 +3,7 @@
 from typing import NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxslam.laser.laser_slam._records import Settings
 from jaxslam.math import numpy_poses as poses
@@ -49,6 +49,8 @@ class Steps(NamedTuple):
     """`reach` without that of odd steps, which is all that is searched"""
     reset: Bool[np.ndarray, "K"]
     """a jump in which odometry was set anew, while the robot went on as it did"""
+    logged: Float[np.ndarray, "K 3"]
+    """the steps of the log, also where these are jumps"""
 
     @property
     def unknown(self) -> Bool[np.ndarray, "K"]:
@@ -60,7 +62,7 @@ def steps_of(
     raw: Float[np.ndarray, "K 3"],
     settings: Settings,
     time: Float[np.ndarray, "K"] | None = None,
-    changed: Bool[np.ndarray, "K"] | None = None,
+    changed: Int[np.ndarray, "K"] | Bool[np.ndarray, "K"] | None = None,
     known: Bool[np.ndarray, "K"] | None = None,
 ) -> Steps:
     """The steps of raw odometry; σ of position and heading grow with distance and turn.
@@ -74,18 +76,24 @@ def steps_of(
 
     Args:
         time: [s] of the scans; None: no speed is known.
-        changed: whether each scan differs from the previous one; None: none does.
+        changed: as `Scans.changed`, or whether each scan differs from the previous one; None: none
+            does.
         known: whether odometry was logged since the scan before; None: always.
     """
     step = np.zeros((len(raw), 3))
     step[1:] = poses.between(np.asarray(raw[:-1], float), np.asarray(raw[1:], float))
+    logged = step.copy()
     reset = odometry_jumps(np.asarray(raw, float), time)
     jump = reset | (np.hypot(step[:, 0], step[:, 1]) > settings.jump)
     step[jump] = 0.0
     unknown = np.zeros(len(raw), bool) if known is None else ~np.asarray(known, bool)
     frozen = unknown & ~jump
     if changed is not None:
-        frozen |= changed & np.all(step == 0, axis=1) & ~jump
+        still = np.concatenate([[0], np.cumsum(np.all(step == 0, axis=1) & ~jump)])
+        back = np.asarray(changed, int)
+        for k in np.flatnonzero(back):
+            if still[k + 1] - still[k + 1 - back[k]] == back[k]:  # all steps since that scan
+                frozen[k + 1 - back[k] : k + 1] = True
     frozen[0] = False
     duration = np.zeros(len(raw)) if time is None else np.diff(time, prepend=time[:1])
     size = np.stack([np.hypot(step[:, 0], step[:, 1]), np.abs(step[:, 2])], axis=1)
@@ -105,7 +113,7 @@ def steps_of(
     cov[anywhere] += reach_cov(reach[anywhere])
     cov[onward] += reach_cov(STEP_CHANGE * reach[onward])
     gap = duration > 2.5 * usual
-    return Steps(step, cov, reach, jump, frozen, lags, gap, odd, usual_reach, reset)
+    return Steps(step, cov, reach, jump, frozen, lags, gap, odd, usual_reach, reset, logged)
 
 
 def reach_cov(reach: Float[np.ndarray, "... 2"]) -> Float[np.ndarray, "... 3 3"]:

@@ -170,6 +170,12 @@ def match_to_keyframes(
             missed += 1
             if steps.gap[scan]:
                 cov = cov + reach_cov(steps.reach[scan])
+        if steps.jump[scan] and not steps.reset[scan]:  # the next step may take it back
+            spike = steps.logged[scan]
+            other = (
+                poses.compose(begin, spike),
+                end_covariances.composed_cov(begin_cov, spike, step_cov),
+            )
         last = poses.between(before, z)
         doubt = end_covariances.moved(doubt, last)
         if doubted and found is not None:
