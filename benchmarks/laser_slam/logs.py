@@ -80,7 +80,7 @@ def measure(quick: bool = False) -> list[Metric]:
         stages = ", ".join(f"{stage} {value:.1f}" for stage, value in solved.seconds.items())
         print(f"seconds: {stages}", flush=True)
         ratio = solved.chi2 / max(solved.dof, 1)
-        off = f"σ too {'small' if ratio > 1 else 'large'} by {max(ratio, 1 / ratio) ** 0.5:.1f}"
+        off = f"residuals {ratio**0.5:.1f} times the σ of the edges"
         found += [
             Metric(f"{name}, chi2 / degrees of freedom", ratio, 0.5, 2.0, off),
             Metric(f"{name}, seconds", seconds, high=LOGS[name].seconds),

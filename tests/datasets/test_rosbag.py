@@ -281,7 +281,7 @@ NONE = [("/scan", "sensor_msgs/msg/LaserScan"), ("/odom", "nav_msgs/msg/Odometry
 
 @refused(
     (ODOMETRY, NONE, {}, r"got /odom \(nav_msgs/Odometry, 5\), /scan \(sensor_msgs/LaserScan, 0\)"),
-    (DRIVE, (), {"scan": "/odom"}, r"scan \(--laser\): expected a topic of sensor_msgs/LaserScan, got /odom of nav"),
+    (DRIVE, (), {"scan": "/odom"}, r"scan \(--laser\): expected a topic of sensor_msgs/LaserScan or sensor_msgs/MultiEchoLaserScan, got /odom of nav"),
     (DRIVE, (), {"odometry": "/scan"}, r"odometry \(--odometry\): expected a topic of nav_msgs/Odometry, got /scan"),
     (DRIVE, (), {"scan": "no"}, r"scan \(--laser\): expected a topic of /scan \(sensor.*, 8\); got 'no'"),
     (SCANS, NONE, {"odometry": "odom"}, r"odometry \(--odometry\): the topic /odom has no messages"),
@@ -339,8 +339,9 @@ def test_a_truncated_bag_is_refused(tmp_path, form):
     (tmp_path / "text.bag").write_text("ODOM 1 2 3\n")
     with pytest.raises(ValueError, match=r"text.bag: cannot be read as a ROS bag: File magic"):
         datasets.rosbag(tmp_path / "text.bag")
+    (tmp_path / "empty").mkdir()
     with pytest.raises(ValueError, match=r"cannot be read: no such metadata.yaml"):
-        datasets.rosbag(tmp_path)
+        datasets.rosbag(tmp_path / "empty")
 
 
 @pytest.mark.parametrize(

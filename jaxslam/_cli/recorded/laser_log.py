@@ -25,6 +25,7 @@ from jaxslam._cli.common import (
 from jaxslam.datasets import LaserLog
 from jaxslam.datasets._laser_logs.bag_messages import is_bag
 from jaxslam.laser.grids import Grid
+from jaxslam.math._odometry_jumps import odometry_jumps
 from jaxslam.results._campaign_files import FORMATS, check_figure_formats
 from jaxslam.results._files import Files, Json, json_text, versions, write_files
 
@@ -59,7 +60,8 @@ def add_options(parser: argparse.ArgumentParser, work: Work, *, map_is_made: boo
     parser.add_argument(
         "path",
         metavar="FILE",
-        help="the log: a file of CARMEN, or a ROS bag (.bag, .mcap, .db3, or the folder of ROS 2)",
+        help="the log: a file of CARMEN, or a ROS bag (.bag, .mcap, .db3, the folder of ROS 2, or a "
+        "folder with the parts NAME_0.bag, NAME_1.bag, … of a recording)",
     )
     parser.add_argument(
         "--dataset",
@@ -69,7 +71,7 @@ def add_options(parser: argparse.ArgumentParser, work: Work, *, map_is_made: boo
     parser.add_argument(
         "--list",
         action="store_true",
-        help="print the topics of a ROS bag, its time and the mounts of its lasers, and stop",
+        help="print the topics of a ROS bag, its time, frames and mounts of its lasers, and stop",
     )
     if map_is_made:
         parser.add_argument(
@@ -106,7 +108,7 @@ def add_options(parser: argparse.ArgumentParser, work: Work, *, map_is_made: boo
         "--odometry",
         metavar="FILE",
         help="raw odometry, lines t x y heading [s, m, m, rad], in place of the log's; of a bag "
-        "the topic, or two frames odom:base_link (default: the only one)",
+        "the topic, or two frames odom:base_link (default: the only one, else the frames that move)",
     )
     parser.add_argument(
         "--mount",
@@ -176,8 +178,11 @@ def read_log(options: argparse.Namespace) -> tuple[LaserLog, dict[str, int]]:
     keep = np.arange(first, last)[:: options.every]
     if not len(keep):
         raise ValueError(f"--scans: {options.scans} has none of the {total} scans of {log.source}")
-    # Odometry between two selected scans is known if that of any step between them is.
+    # Odometry between two selected scans is known if that of any step between them is, and none
+    # is a jump.
     known = np.diff(np.cumsum(log.odometry_known)[keep], prepend=-1) > 0
+    jumps = np.cumsum(odometry_jumps(log.raw, log.time))[keep]
+    known &= np.diff(jumps, prepend=jumps[:1]) == 0
     log = dataclasses.replace(
         log,
         **{name: getattr(log, name)[keep] for name in ("time", "corrected", "raw", "row")},
@@ -209,6 +214,8 @@ def bag_text(path: str) -> str:
         )
     lines += [f"mount of {topic}: {mount}" for topic, mount in found.lasers.items()]
     lines += [f"odometry {pair}: {count:,} transforms" for pair, count in found.odometry.items()]
+    lines += [f"frames {pair}: {text}" for pair, text in found.frames.items()]
+    lines += found.notes
     return "\n".join(lines)
 
 

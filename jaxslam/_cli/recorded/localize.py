@@ -17,6 +17,7 @@ from jaxslam.datasets import LaserLog
 from jaxslam.datasets._laser_logs.bag_messages import is_bag
 from jaxslam.laser import grids, laser_slam
 from jaxslam.laser.grids import Grid
+from jaxslam.math._odometry_jumps import odometry_jumps
 from jaxslam.math.numpy_poses import compose
 from jaxslam.results import _report as report
 from jaxslam.results._files import Files, Json
@@ -121,7 +122,8 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> laser_log.Jo
         every=max(1, np.shape(log.beams.range)[1] // BEAMS),
     )
     logged = len(log.time) == 1 or bool(log.odometry_known[1:].any())
-    raw = log.raw if logged else laser_slam.solve(log).odometry
+    jumps = int(odometry_jumps(log.raw, log.time).sum())
+    raw = log.raw if logged and not jumps else laser_slam.solve(log).odometry
     rows = grids.beam_log(motion.odometry_controls(raw), log.beams)
     last = len(log.time) - 1
     with Progress(f"{log.name}, localization", "scans") as progress:
@@ -146,7 +148,13 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> laser_log.Jo
         "job": "localization",
         "map": str(options.map),
         "start": start,
-        "odometry": "of the log" if logged else "laser odometry, since the log has none",
+        "odometry": (
+            "laser odometry, since the log has none"
+            if not logged
+            else f"laser odometry, since that of the log jumps {jumps} times"
+            if jumps
+            else "of the log"
+        ),
         "particles": options.particles,
         "particles in use, mean": float(np.mean(info.active)),
         "particles drawn anywhere, to recover": int(np.sum(info.injected)),

@@ -1,9 +1,11 @@
 """Messages of a ROS bag by the library `rosbags`: only here is it imported."""
 
 import math
+import re
 from collections.abc import Collection, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
+from itertools import pairwise
 from pathlib import Path
 from typing import Any
 
@@ -26,8 +28,10 @@ class Topic:
 class Bag:
     """An open bag: its topics, and the messages of some of them."""
 
-    def __init__(self, path: Path, reader: Any, types: Any) -> None:
+    def __init__(self, path: Path, reader: Any, types: Any, notes: list[str]) -> None:
         self.path = path
+        self.notes = notes
+        """on parts of the recording that are in other files"""
         self._reader = reader
         self._types = types
         self.topics = tuple(
@@ -96,7 +100,8 @@ class Bag:
 
 @contextmanager
 def opened(path: str | Path) -> Iterator[Bag]:
-    """The bag in a file (ROS 1 `.bag`, ROS 2 `.mcap` or `.db3`) or in a folder of ROS 2.
+    """The bag in a file (ROS 1 `.bag`, ROS 2 `.mcap` or `.db3`), in a folder of ROS 2, or in the
+    parts of a recording that are alone in a folder.
 
     Raises ValueError if `rosbags` cannot be used, and, with the file, if the bag cannot be read.
     """
@@ -107,20 +112,83 @@ def opened(path: str | Path) -> Iterator[Bag]:
         # Bags of ROS 2 before Iron have no definitions; those of these types are equal in all.
         types = get_typestore(Stores.ROS2_HUMBLE)
     path = Path(path)
+    files, notes = _parts(path)
     try:
-        reader = AnyReader([path], default_typestore=types)
+        reader = AnyReader(files, default_typestore=types)
         reader.open()
     except Exception as problem:  # of SQLite, zstd, struct, … where a bag is damaged
         raise _unreadable(path, problem) from problem
     try:
-        yield Bag(path, reader, types)
+        _check_succession(path, files, reader.readers)
+        yield Bag(path, reader, types, notes)
     finally:
         reader.close()
 
 
+_SPLIT = re.compile(r"(.*?)(?:[_-]?\d{4}(?:-\d\d){5})?_(\d+)")
+"""Name of a part, NAME_0; `rosbag record --split` puts the time of its start before the number."""
+_SUFFIXES = ".bag", ".mcap", ".db3"
+_PAUSE, _OVERLAP = 60.0, 5.0
+"""Time between two parts of a recording, and overlap of them, at most [s]."""
+
+
+def _parts(path: Path) -> tuple[list[Path], list[str]]:
+    """The files to read as one recording, and notes on parts that are not among them.
+
+    They are the path itself, or the bags in a folder without `metadata.yaml`: one, or parts of the
+    same name. Raises ValueError, with the folder, on bags of several names.
+    """
+    if not path.exists() or (path / "metadata.yaml").exists():
+        return [path], []
+    folder, kinds = (path, _SUFFIXES) if path.is_dir() else (path.parent, (path.suffix,))
+    names: dict[tuple[str, str], dict[int, Path]] = {}
+    files = sorted(each for each in folder.iterdir() if each.suffix in kinds and each.is_file())
+    for each in files:
+        if of := _SPLIT.fullmatch(each.stem):
+            names.setdefault((of[1], each.suffix), {})[int(of[2])] = each
+    if path.is_file():
+        others = [
+            each.name
+            for parts in names.values()
+            if path in parts.values()
+            for each in parts.values()
+            if each != path
+        ]
+        note = (
+            f"{path.name} is read alone; beside it may be other parts of the recording, which the "
+            f"folder reads as one: {', '.join(others[:9])}" + ", …" * (len(others) > 9)
+        )
+        return [path], [note] * bool(others)
+    if len(files) <= 1:
+        return files or [path], []
+    parts = next(iter(names.values()), {})
+    if len(names) != 1 or len(parts) < len(files):
+        raise ValueError(
+            f"{path}: expected one bag, or the parts NAME_0.bag, NAME_1.bag, … of a recording, got "
+            f"{', '.join(each.name for each in files)}; name one of them"
+        )
+    notes = [f"one recording of {len(parts)} files, {', '.join(each.name for each in files[:9])}"]
+    if missing := sorted(set(range(max(parts))) - set(parts)):
+        notes.append(f"parts that are missing in the folder: {', '.join(map(str, missing))}")
+    return [parts[number] for number in sorted(parts)], notes
+
+
+def _check_succession(path: Path, files: list[Path], readers: Any) -> None:
+    """Raise ValueError unless each part of a recording begins about when that before it ends."""
+    order = sorted(range(len(files)), key=lambda k: readers[k].start_time)
+    for before, after in pairwise(order):
+        pause = (readers[after].start_time - readers[before].end_time) * 1e-9
+        if not -_OVERLAP <= pause <= _PAUSE:
+            raise ValueError(
+                f"{path}: expected parts of one recording, and {files[after].name} begins "
+                f"{abs(pause):,.1f} s {'after' if pause > 0 else 'before'} {files[before].name} "
+                "ends; name one of them"
+            )
+
+
 def is_bag(path: str | Path) -> bool:
     """Whether a path is that of a bag: a folder, or a file .bag, .mcap or .db3."""
-    return Path(path).is_dir() or Path(path).suffix in (".bag", ".mcap", ".db3")
+    return Path(path).is_dir() or Path(path).suffix in _SUFFIXES
 
 
 def _unreadable(path: Path, problem: Exception, where: str = "") -> ValueError:

@@ -1,13 +1,13 @@
 """Transforms between frames in a bag: the pose of the laser on the robot, and odometry."""
 
-from collections import Counter
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, NamedTuple
 
 import numpy as np
-from jaxtyping import Bool, Float
+from jaxtyping import Bool, Float, Int
 
 from jaxslam.datasets._laser_logs.laser_record import MOUNT_TOLERANCE, pose_text
+from jaxslam.math import numpy_poses as poses
 
 BASES = ("base_link", "base_footprint")
 """Usual names of the robot's frame."""
@@ -20,6 +20,8 @@ TILTED, TOO_TILTED = np.deg2rad(1.0), np.deg2rad(10.0)
 
 UPSIDE_DOWN = "the laser is upside down: the order of its beams is reversed"
 
+_EQUAL = 1e-4
+"""Difference of two static transforms [m], [rad], up to which one repeats the other."""
 _UNIT = 0.01
 """Largest difference of the norm of a quaternion from 1."""
 _FARTHEST = 1e9
@@ -37,6 +39,28 @@ class Transform(NamedTuple):
     child: str
     pose: Float[np.ndarray, "7"]
     """x, y, z and the quaternion x, y, z, w"""
+    static: bool
+    """whether it is of `/tf_static`"""
+
+
+class FramePair(NamedTuple):
+    """Two frames between which a bag has transforms."""
+
+    parent: str
+    child: str
+    count: int
+    """number of transforms"""
+    static: bool
+    """whether they are of `/tf_static`"""
+    moves: bool
+    """whether the child moves in the plane of its parent, by more than the tolerance of a mount"""
+    turns: bool
+    """whether it turns in this plane"""
+
+    @property
+    def name(self) -> str:
+        """as `odom:base_link`"""
+        return f"{self.parent}:{self.child}"
 
 
 class LaserMount(NamedTuple):
@@ -61,7 +85,7 @@ def pose_of(position: Any, orientation: Any) -> Float[np.ndarray, "7"]:
     return np.array([position.x, position.y, position.z, q.x, q.y, q.z, q.w], float)
 
 
-def transforms_of(recorded: int, message: Any) -> Iterator[Transform]:
+def transforms_of(recorded: int, message: Any, static: bool) -> Iterator[Transform]:
     """The transforms of a message of /tf or /tf_static."""
     for each in message.transforms:
         moved = each.transform
@@ -71,6 +95,7 @@ def transforms_of(recorded: int, message: Any) -> Iterator[Transform]:
             frame_name(each.header.frame_id),
             frame_name(each.child_frame_id),
             pose_of(moved.translation, moved.rotation),
+            static,
         )
 
 
@@ -94,7 +119,7 @@ def _is_pose(pose: Float[np.ndarray, "n 7"]) -> Bool[np.ndarray, "n"]:
 
 
 class Frames:
-    """The tree of the frames of a bag, in which each has one parent."""
+    """The tree of the frames of a bag, in which each has one parent, that of its last transform."""
 
     def __init__(self, transforms: Sequence[Transform]) -> None:
         self._to: dict[str, list[Transform]] = {}
@@ -103,105 +128,170 @@ class Frames:
 
     def connects(self, base: str, frame: str) -> bool:
         """Whether the pose of a frame in another is known."""
-        return self._above(base)[-1] == self._above(frame)[-1]
+        return self.above(base)[-1] == self.above(frame)[-1]
 
-    def pose(self, base: str, frame: str) -> Float[np.ndarray, "4 4"]:
-        """The pose of a frame in the base, which are connected.
-
-        Raises ValueError if a transform between the two changes, or is not one.
-        """
-        shared = set(self._above(base)) & set(self._above(frame))
-        pose: np.ndarray = np.linalg.solve(self._up(base, shared), self._up(frame, shared))
-        return pose
-
-    def _above(self, frame: str) -> list[str]:
+    def above(self, frame: str) -> list[str]:
         """A frame, its parent, the parent of that, and so on."""
         path = [frame]
         while path[-1] in self._to and (parent := self._to[path[-1]][-1].parent) not in path:
             path.append(parent)
         return path
 
-    def _up(self, frame: str, shared: set[str]) -> Float[np.ndarray, "4 4"]:
-        """The pose of a frame in the first of the shared frames above it."""
-        pose = np.eye(4)
-        for child in self._above(frame):
-            if child in shared:
-                break
-            pose = self._fixed(child) @ pose
-        return pose
+    def pose(
+        self, base: str, frame: str, corrections: list[str]
+    ) -> tuple[Float[np.ndarray, "n 4 4"], str]:
+        """The poses of a frame in the base, which are connected, at the times of the transforms
+        between them that change, and the names of the frames of these.
 
-    def _fixed(self, child: str) -> Float[np.ndarray, "4 4"]:
-        """The pose of a frame in its parent, which may not change."""
-        of = self._to[child]
-        poses = np.array([_matrix(each.pose) for each in of])
-        between = f"the transform from {of[-1].parent} to {child}"
-        if not np.isfinite(poses).all():
-            raise ValueError(f"{between} is not a pose: {of[-1].pose.tolist()}")
-        far = np.linalg.norm(poses[:, :3, 3] - poses[0, :3, 3], axis=1).max()
-        cosine = (np.einsum("nij,ij->n", poses[:, :3, :3], poses[0, :3, :3]) - 1) / 2
-        turned = np.arccos(np.clip(cosine, -1, 1)).max()
-        if far > MOUNT_TOLERANCE[0] or turned > MOUNT_TOLERANCE[1]:
-            raise ValueError(
-                f"{between} changes by {far:.4g} m and {np.rad2deg(turned):.4g}°, so the laser "
-                "moves on the robot; expected one mount, or one that is given"
-            )
-        return np.asarray(poses[0])
+        Of static transforms the last counts, as for tf2; it is described if it differs from others.
+
+        Raises ValueError if a transform between the two is not a pose.
+        """
+        shared = set(self.above(base)) & set(self.above(frame))
+        sides = [
+            [child for child in self.above(end) if child not in shared] for end in (base, frame)
+        ]
+        edges = {
+            child: self._edge(child, corrections) for child in dict.fromkeys(sides[0] + sides[1])
+        }
+        changing = [time for time, _ in edges.values() if len(time) > 1]
+        times = np.unique(np.concatenate(changing)) if changing else np.zeros(1, np.int64)
+        up = []
+        for side in sides:
+            pose = np.broadcast_to(np.eye(4), (len(times), 4, 4))
+            for child in side:
+                time, at = edges[child]
+                pose = at[np.maximum(np.searchsorted(time, times, side="right") - 1, 0)] @ pose
+            up.append(pose)
+        between = ", ".join(
+            f"from {self._to[child][-1].parent} to {child}"
+            for child, (time, _) in edges.items()
+            if len(time) > 1
+        )
+        return np.linalg.solve(up[0], up[1]), between
+
+    def _edge(
+        self, child: str, corrections: list[str]
+    ) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n 4 4"]]:
+        """The times of the recording [ns] and poses of a frame in its parent: the last static one,
+        then those of `/tf`; one if all are equal."""
+        parent = self._to[child][-1].parent
+        of = [each for each in self._to[child] if each.parent == parent]
+        pose = _matrices(np.array([each.pose for each in of]))
+        if not np.isfinite(pose).all():
+            bad = of[int(np.argmax(~np.isfinite(pose).all(axis=(1, 2))))].pose.tolist()
+            raise ValueError(f"the transform from {parent} to {child} is not a pose: {bad}")
+        static = np.array([each.static for each in of])
+        if static.any():
+            far, turned = _largest_change(pose[static], pose[static][-1])
+            if far > _EQUAL or turned > _EQUAL:
+                corrections.append(
+                    f"the static transform from {parent} to {child} was sent again, with a change "
+                    f"of {far:.4g} m and {np.rad2deg(turned):.4g}°: the last one is used"
+                )
+            kept = ~static
+            kept[np.flatnonzero(static)[-1]] = True
+            of, pose = [each for each, use in zip(of, kept, strict=True) if use], pose[kept]
+        time = np.array([each.recorded for each in of], np.int64)
+        order = np.argsort(time, kind="stable")
+        if max(_largest_change(pose, pose[0])) < 1e-9:
+            order = order[:1]
+        return time[order], pose[order]
 
 
-def _matrix(pose: Float[np.ndarray, "7"]) -> Float[np.ndarray, "4 4"]:
-    """A pose as a matrix; NaN if it is none."""
-    known = bool(_is_pose(pose[None])[0])
-    x, y, z, w = pose[3:] / np.linalg.norm(pose[3:]) if known else np.full(4, np.nan)
-    out = np.eye(4)
-    out[:3, :3] = [
+def _largest_change(
+    pose: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "4 4"]
+) -> tuple[float, float]:
+    """The largest distance [m], and angle [rad], of poses from one of them."""
+    far = np.linalg.norm(pose[:, :3, 3] - reference[:3, 3], axis=1).max()
+    # By the sine of half the angle: its cosine has no digits for small angles.
+    off = np.linalg.norm(pose[:, :3, :3] - reference[:3, :3], axis=(1, 2)).max()
+    return float(far), float(2 * np.arcsin(min(off / np.sqrt(8), 1.0)))
+
+
+def _matrices(pose: Float[np.ndarray, "n 7"]) -> Float[np.ndarray, "n 4 4"]:
+    """Poses as matrices; NaN for one that is none."""
+    q = np.where(_is_pose(pose)[:, None], pose[:, 3:], np.nan)
+    x, y, z, w = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
+    out = np.tile(np.eye(4), (len(pose), 1, 1))
+    rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ]
-    out[:3, 3] = pose[:3]
+    out[:, :3, :3] = np.moveaxis(np.array(rows), 2, 0)
+    out[:, :3, 3] = pose[:, :3]
     return out
 
 
 def laser_mount(
-    frames: Frames, laser: str, base: str | None, corrections: list[str]
+    frames: Frames, laser: str, bases: Sequence[str], corrections: list[str], moving: str = ""
 ) -> LaserMount | None:
     """The mount of a laser, by the transforms between its frame and the robot's.
 
-    base: the robot's frame by odometry; if the laser is not connected to it, `BASES` are tried.
+    It is that in the plane, the median of all times. The tilt may change, as by an IMU between two
+    frames of the robot; the mount may not, beyond what that tilt moves it.
+
+    Args:
+        bases: the robot's frame by odometry, if known; then `BASES` are tried.
+        moving: a frame that moves, which is tried last.
     None, which is described, if none is connected.
 
     Raises ValueError if the mount changes, or the plane of the laser is too far from the floor.
     """
-    tried = ([base] if base else []) + [one for one in BASES if one != base]
-    found = next((one for one in tried if frames.connects(one, laser)), None)
-    if found is None:
+    tried = list(dict.fromkeys([*bases, *BASES]))
+    base = next((each for each in tried if frames.connects(each, laser)), None)
+    if base is None and moving and frames.connects(moving, laser):
+        base = moving
+    if base is None:
+        above = frames.above(laser)
         corrections.append(
             f"no transform from {' or '.join(tried)} to the laser's frame {laser!r}: the laser is "
             "taken to be at the robot's centre, looking ahead"
+            + f"; its frame is below {above[-1]!r}" * (len(above) > 1)
         )
         return None
-    pose = frames.pose(found, laser)
-    up = pose[2, 2]
-    tilt = float(np.arccos(min(abs(up), 1.0)))
-    x, y = pose[:2, 3]
-    mount = np.array([x, y, np.arctan2(pose[1, 0], pose[0, 0])])
+    pose, changing = frames.pose(base, laser, corrections)
+    up = pose[:, 2, 2]
+    upside_down = bool(np.median(up) < 0)
+    mounts = np.column_stack([pose[:, :2, 3], np.arctan2(pose[:, 1, 0], pose[:, 0, 0])])
+    mount = np.median(mounts[:, :2], axis=0)
+    middle = mounts[np.argmin(np.hypot(*(mounts[:, :2] - mount).T)), 2]
+    turned = poses.wrapped(mounts[:, 2] - middle)
+    mount = np.append(mount, poses.wrapped(middle + np.median(turned)))
+    tilts = np.arccos(np.minimum(np.where(upside_down, -up, up), 1.0))
+    tilt, most = float(np.quantile(tilts, 0.95)), float(tilts.max())
     if tilt > TOO_TILTED:
         raise ValueError(
-            f"the laser's frame {laser!r} is tilted by {np.rad2deg(tilt):.3g}° against {found}; "
+            f"the laser's frame {laser!r} is tilted by {np.rad2deg(tilt):.3g}° against {base}; "
             f"expected at most {np.rad2deg(TOO_TILTED):.3g}°"
         )
-    if tilt > TILTED:
+    far = float(np.hypot(*(mounts[:, :2] - mount[:2]).T).max())
+    turn = float(np.abs(poses.wrapped(mounts[:, 2] - mount[2])).max())
+    height = float(np.abs(pose[:, 2, 3]).max())
+    if far > MOUNT_TOLERANCE[0] + height * np.sin(most) or turn > MOUNT_TOLERANCE[1]:
+        raise ValueError(
+            f"the transform {changing} changes by {far:.4g} m and {np.rad2deg(turn):.4g}°, so the "
+            "laser moves on the robot; expected one mount, or one that is given"
+        )
+    if np.ptp(tilts) > _EQUAL:
+        corrections.append(
+            f"the transform {changing} changes: the laser is tilted by up to "
+            f"{np.rad2deg(most):.3g}°, its mount in the plane is constant to {round(far, 4):g} m and "
+            f"{round(np.rad2deg(turn), 3):g}°, and its ranges are taken for level ones"
+        )
+    elif tilt > TILTED:
         corrections.append(
             f"the laser is tilted by {np.rad2deg(tilt):.3g}°: its ranges are taken for level ones"
         )
-    if base and found != base:
+    if bases and base not in bases:
         corrections.append(
-            f"no transform from {base}, the frame of the odometry, to the laser's frame {laser!r}: "
-            f"the mount is that on {found}"
+            f"no transform from {bases[0]}, the frame of the odometry, to the laser's frame "
+            f"{laser!r}: the mount is that on {base}"
         )
-    if up < 0:
+    if upside_down:
         corrections.append(UPSIDE_DOWN)
-    return LaserMount(mount, bool(up < 0), tilt, found)
+    return LaserMount(mount, upside_down, tilt, base)
 
 
 def mount_text(mount: LaserMount) -> str:
@@ -209,16 +299,50 @@ def mount_text(mount: LaserMount) -> str:
     return f"{pose_text(mount.pose)} on {mount.base}" + (", upside down" * mount.upside_down)
 
 
-def odometry_edges(transforms: Sequence[Transform]) -> Mapping[tuple[str, str], int]:
-    """The pairs of frames that are odometry by their names, and the number of their transforms."""
-    pairs = Counter((each.parent, each.child) for each in transforms)
-    return {
-        pair: count
-        for pair, count in pairs.items()
-        if _last(pair[0]) in ODOMS and _last(pair[1]) in BASES
-    }
+def frame_pairs(transforms: Sequence[Transform]) -> tuple[FramePair, ...]:
+    """All pairs of frames with transforms, by name, and which of them move."""
+    of: dict[tuple[str, str, bool], list[Transform]] = {}
+    for each in transforms:
+        of.setdefault((each.parent, each.child, each.static), []).append(each)
+    pairs = []
+    for (parent, child, static), some in sorted(of.items()):
+        path = planar(np.array([each.pose for each in some]))
+        path = path[np.isfinite(path).all(axis=1)]
+        far = np.hypot(*np.ptp(path[:, :2], axis=0)) if len(path) else 0.0
+        turn = np.abs(poses.wrapped(path[:, 2] - path[:1, 2])).max() if len(path) else 0.0
+        moves = not static and far > MOUNT_TOLERANCE[0]
+        turns = not static and turn > MOUNT_TOLERANCE[1]
+        pairs.append(FramePair(parent, child, len(some), static, bool(moves), bool(turns)))
+    return tuple(pairs)
 
 
-def _last(frame: str) -> str:
-    """The last part of a frame's name, as `odom` of `robot1/odom`."""
-    return frame.rsplit("/", 1)[-1]
+def odometry_pairs(
+    pairs: Sequence[FramePair], frames: Frames, laser: str
+) -> tuple[list[FramePair], list[FramePair]]:
+    """The pairs of frames of `/tf` that are odometry, and others that move.
+
+    Those named so (`ODOMS` to `BASES`); if none is, those that move in the plane and have the laser
+    below them; if it is below none, those without a transform to the laser. A pair that only turns,
+    as a joint does, is none.
+    """
+    of_tf = [each for each in pairs if not each.static]
+    odometry = [each for each in of_tf if is_named_odometry(each)]
+    moving = [each for each in of_tf if each.moves]
+    if not odometry:
+        chain = frames.above(laser)
+        odometry = [each for each in moving if each.child in chain and each.parent in chain]
+    if not odometry:
+        odometry = [each for each in moving if not frames.connects(each.child, laser)]
+    others = [each for each in of_tf if (each.moves or each.turns) and each not in odometry]
+    return odometry, others
+
+
+def pairs_text(pairs: Sequence[FramePair]) -> str:
+    """Pairs of frames with the numbers of their transforms."""
+    return ", ".join(f"{each.name} ({each.count:,})" for each in pairs)
+
+
+def is_named_odometry(pair: FramePair) -> bool:
+    """Whether the last parts of the names, as `odom` of `robot1/odom`, are those of odometry."""
+    parent, child = (frame.rsplit("/", 1)[-1] for frame in (pair.parent, pair.child))
+    return parent in ODOMS and child in BASES

@@ -13,13 +13,17 @@ from numpy.typing import ArrayLike
 from jaxslam.datasets._laser_logs.bag_messages import TRANSFORMS, Bag, Topic, opened
 from jaxslam.datasets._laser_logs.bag_transforms import (
     UPSIDE_DOWN,
+    FramePair,
     Frames,
     LaserMount,
     Transform,
     frame_name,
+    frame_pairs,
+    is_named_odometry,
     laser_mount,
     mount_text,
-    odometry_edges,
+    odometry_pairs,
+    pairs_text,
     planar,
     pose_of,
     stamp_of,
@@ -28,8 +32,10 @@ from jaxslam.datasets._laser_logs.bag_transforms import (
 from jaxslam.datasets._laser_logs.laser_beams import beams_of
 from jaxslam.datasets._laser_logs.laser_record import LaserLog, checked_mount, wrapped_path
 from jaxslam.math import numpy_poses as poses
+from jaxslam.math._odometry_jumps import LONG, odometry_jumps, step_sizes
 
 LASER_SCAN = "sensor_msgs/LaserScan"
+MULTI_ECHO = "sensor_msgs/MultiEchoLaserScan"
 ODOMETRY = "nav_msgs/Odometry"
 
 BACKWARD = 0.1
@@ -55,16 +61,20 @@ def rosbag(
 ) -> LaserLog:
     """A laser log from a bag of ROS 1 (`.bag`) or ROS 2 (a folder, `.mcap`, `.db3`, zstd or not).
 
+    The parts `NAME_0.bag`, `NAME_1.bag`, … in a folder are one recording.
+
     Needs the library rosbags: `pip install 'jaxslam[ros]'`.
 
     | messages | read as |
     |---|---|
     | `sensor_msgs/LaserScan` of one topic | the scans; each at the stamp of its header |
+    | `sensor_msgs/MultiEchoLaserScan` of one | the same by the first echo of each beam, if there |
+    | topic | is no `LaserScan` |
     | `nav_msgs/Odometry` of one topic | raw odometry; the robot's frame is `child_frame_id` |
     | `/tf`, without a topic of odometry | raw odometry from `odom` to `base_link` or |
-    | | `base_footprint` |
+    | | `base_footprint`; else of the only frames that move, with the laser below them |
     | `/tf_static`, else `/tf` | the mount, along the chain from the robot's frame to that of |
-    | | the scans |
+    | | the scans; of a static transform that is sent again, the last |
 
     Messages of other topics are counted in `dropped`. Where several topics are possible, `scan` or
     `odometry` names one.
@@ -75,8 +85,13 @@ def rosbag(
 
     **Odometry** is interpolated on SE(2) at the stamp of each scan. A scan before the first or
     after the last message takes its pose, the steps to and from it are unknown, and they are
-    counted. Without odometry all steps are unknown, and `raw` stands still: laser SLAM and
-    `jaxslam localize` then use laser odometry alone.
+    counted. So are scans between two messages more than 1 s and ten median intervals apart, and the
+    steps over a jump, where odometry was set to zero or to another pose on the way. Without
+    odometry all steps are unknown, and `raw` stands still: laser SLAM and `jaxslam localize` then
+    use laser odometry alone.
+
+    **Mount**: in the plane. A laser may be tilted by up to 10°, also by a changing roll and pitch,
+    as an IMU gives them; `corrections` says so.
 
     **Stamps** are those of the headers; the times of the recording if all headers have zero.
     Messages whose stamps go back, or repeat, are dropped and counted, so that most are kept.
@@ -85,7 +100,7 @@ def rosbag(
         path: the file or the folder.
         scan: topic of the scans; default: the only one.
         odometry: topic of the odometry, or `odom:base_link`, the names of two frames of `/tf`;
-            default: the only topic, else the only such pair.
+            default: the only topic, else the only such pair, else the only pair that moves.
         max_range: ranges from this one [m], or from `range_max`, are without a return.
         mount: (3,) [m, m, rad] in place of that of the transforms.
     Raises:
@@ -100,27 +115,30 @@ def rosbag(
         raise ValueError(f"rosbag: expected a max_range above 0, got {max_range}")
     given = None if mount is None else checked_mount("rosbag", mount)
     corrections: list[str] = []
+    source: list[str] = []  # notes on where odometry is from
     dropped: Counter[str] = Counter()
     with opened(path) as bag:
-        laser = _chosen(bag, "scan", LASER_SCAN, scan)
+        corrections += bag.notes
+        laser = _chosen(bag, "scan", (LASER_SCAN, MULTI_ECHO), scan)
         if laser is None:
             raise bag.error(
                 f"expected a topic of {LASER_SCAN} with messages, got {_listed(bag.topics)}"
             )
-        wheels = None if _is_pair(odometry) else _chosen(bag, "odometry", ODOMETRY, odometry)
+        wheels = None if _is_pair(odometry) else _chosen(bag, "odometry", (ODOMETRY,), odometry)
         messages = _read(bag, laser, wheels, corrections)
         transforms = messages.transforms
         frame = _frame_of(bag, laser, messages.scans)
         if wheels is None or not Frames(transforms).connects(messages.base, frame):
             transforms = transforms + _transforms(bag, static=False)
         if wheels is None:
-            messages = _odometry_of_transforms(bag, messages, transforms, odometry)
-        placed, upside_down = _mount(bag, Frames(transforms), frame, messages, given, corrections)
+            messages = _odometry_of_transforms(bag, messages, transforms, frame, odometry, source)
+        placed, upside_down = _mount(bag, transforms, frame, messages, given, corrections)
         for topic in bag.topics:
             if topic.name not in (laser, wheels) and topic.type not in TRANSFORMS and topic.count:
                 dropped[f"messages {topic.name}"] = topic.count
         stamp, kept = _in_order(bag, laser, "scans", messages.scans, dropped, corrections)
         scans = [_ascending(messages.scans[k], upside_down) for k in kept]
+        corrections += source
         found = _odometry_at(bag, stamp, messages, wheels, dropped, corrections)
     beams, limit = beams_of(scans, max_range, dropped, corrections)
     return LaserLog(
@@ -153,39 +171,53 @@ class BagContents(NamedTuple):
     lasers: dict[str, str]
     """by topic with scans: the mount, or why there is none"""
     odometry: dict[str, int]
-    """pairs of frames of `/tf` that are odometry by their names, and their transforms"""
+    """pairs of frames of `/tf` that are odometry for one of the lasers, and their transforms"""
+    frames: dict[str, str]
+    """all pairs of frames `parent:child` with transforms: how many, and whether the child moves"""
+    notes: tuple[str, ...]
+    """on the files"""
 
 
 def rosbag_contents(path: str | Path) -> BagContents:
-    """The topics, time and mounts of a bag, without its scans.
+    """The topics, time, frames and mounts of a bag, without its scans.
 
     Raises ValueError, with the file, if the bag cannot be read.
     """
     with opened(path) as bag:
         transforms = _transforms(bag, static=True) + _transforms(bag, static=False)
-        frames = Frames(transforms)
-        wheels = [one for one in bag.topics if one.type == ODOMETRY and one.count]
-        base = None
+        frames, pairs = Frames(transforms), frame_pairs(transforms)
+        wheels = [topic for topic in bag.topics if topic.type == ODOMETRY and topic.count]
+        base = ""
         if len(wheels) == 1:
             base = frame_name(bag.first(wheels[0].name).child_frame_id)
         lasers = {}
+        odometry = {pair.name: pair.count for pair in pairs if is_named_odometry(pair)}
         for topic in bag.topics:
-            if topic.type == LASER_SCAN and topic.count:
+            if topic.type in (LASER_SCAN, MULTI_ECHO) and topic.count:
                 frame = frame_name(bag.first(topic.name).header.frame_id)
+                moving, _ = odometry_pairs(pairs, frames, frame)
+                odometry |= {pair.name: pair.count for pair in moving}
                 notes: list[str] = []
                 try:
-                    placed = laser_mount(frames, frame, base, notes)
+                    placed = laser_mount(
+                        frames, frame, [base] * bool(base), notes, _only_child(moving)
+                    )
                     lasers[topic.name] = notes[0] if placed is None else mount_text(placed)
                 except ValueError as problem:
                     lasers[topic.name] = str(problem)
-        pairs = odometry_edges(transforms)
+        listed: dict[str, str] = {}
+        for pair in pairs:
+            how = "static" if pair.static else "moves" if pair.moves else "turns" * pair.turns
+            text = f"{pair.count:,} transforms" + f", {how}" * bool(how)
+            listed[pair.name] = "; ".join(filter(None, [listed.get(pair.name), text]))
         return BagContents(
-            bag.topics,
-            bag.start,
-            bag.end,
-            lasers,
-            {":".join(pair): count for pair, count in pairs.items()},
+            bag.topics, bag.start, bag.end, lasers, odometry, listed, tuple(bag.notes)
         )
+
+
+def _only_child(pairs: Sequence[FramePair]) -> str:
+    """The frame that moves, if there is one pair."""
+    return pairs[0].child if len(pairs) == 1 else ""
 
 
 class _ScanMessage(NamedTuple):
@@ -240,24 +272,31 @@ def _listed(topics: Sequence[Topic]) -> str:
     return ", ".join(f"{one.name} ({one.type}, {one.count:,})" for one in topics) or "no topics"
 
 
-def _chosen(bag: Bag, argument: str, kind: str, name: str | None) -> str | None:
-    """The topic of a type: the named one, else the only one with messages, else None."""
+def _chosen(bag: Bag, argument: str, kinds: tuple[str, ...], name: str | None) -> str | None:
+    """The topic of a type: the named one; else the only one with messages, of the first of the
+    types that has any; else None."""
     option = OPTIONS[argument]
+    expected = " or ".join(kinds)
     if name is None:
-        found = [one for one in bag.topics if one.type == kind and one.count]
-        if len(found) > 1:
-            raise bag.error(
-                f"expected one topic of {kind}, got {_listed(found)}; choose by "
-                f"{argument}={found[0].name!r} ({option} {found[0].name})"
-            )
-        return found[0].name if found else None
-    topic = next((one for one in bag.topics if one.name in (name, f"/{name}")), None)
+        for kind in kinds:
+            candidates = [topic for topic in bag.topics if topic.type == kind and topic.count]
+            if len(candidates) > 1:
+                first = candidates[0].name
+                raise bag.error(
+                    f"expected one topic of {kind}, got {_listed(candidates)}; choose by "
+                    f"{argument}={first!r} ({option} {first})"
+                )
+            if candidates:
+                return candidates[0].name
+        return None
+    topic = next((topic for topic in bag.topics if topic.name in (name, f"/{name}")), None)
     if topic is None:
-        listed = _listed([one for one in bag.topics if one.type == kind] or bag.topics)
+        listed = _listed([topic for topic in bag.topics if topic.type in kinds] or bag.topics)
         raise bag.error(f"{argument} ({option}): expected a topic of {listed}; got {name!r}")
-    if topic.type != kind:
+    if topic.type not in kinds:
         raise bag.error(
-            f"{argument} ({option}): expected a topic of {kind}, got {topic.name} of {topic.type}"
+            f"{argument} ({option}): expected a topic of {expected}, got {topic.name} of "
+            f"{topic.type}"
         )
     if not topic.count:
         raise bag.error(f"{argument} ({option}): the topic {topic.name} has no messages")
@@ -299,8 +338,11 @@ def _scan_of(
 ) -> _ScanMessage:
     """The scan of a message."""
     first, step = float(message.angle_min), float(message.angle_increment)
+    values = message.ranges
+    if len(values) and hasattr(values[0], "echoes"):  # MULTI_ECHO
+        values = [beam.echoes[0] if len(beam.echoes) else np.nan for beam in values]
     with np.errstate(invalid="ignore"):  # a signalling NaN
-        ranges = np.asarray(message.ranges, np.float64)
+        ranges = np.asarray(values, np.float64)
     if not (np.isfinite(first) and np.isfinite(step)) or (step == 0 and len(ranges) > 1):
         raise bag.error(
             f"{topic}: scan {number}: expected a finite angle_min and angle_increment, which is "
@@ -344,45 +386,67 @@ def _transforms(bag: Bag, static: bool) -> list[Transform]:
         for one in bag.topics
         if one.type in TRANSFORMS and one.name.endswith("static") == static
     ]
-    return [each for _, at, message in bag.messages(names) for each in transforms_of(at, message)]
+    return [
+        each
+        for _, at, message in bag.messages(names)
+        for each in transforms_of(at, message, static)
+    ]
 
 
 def _odometry_of_transforms(
-    bag: Bag, messages: _Messages, transforms: Sequence[Transform], pair: str | None
+    bag: Bag,
+    messages: _Messages,
+    transforms: Sequence[Transform],
+    laser: str,
+    pair: str | None,
+    corrections: list[str],
 ) -> _Messages:
     """The messages with odometry from two frames of `/tf`: named ones, or the only such pair."""
     option = OPTIONS["odometry"]
-    counts = odometry_edges(transforms)
+    pairs = frame_pairs(transforms)
+    candidates, others = odometry_pairs(pairs, Frames(transforms), laser)
     if pair is not None:
-        frames = parent, child = tuple(frame_name(name) for name in pair.split(":", 1))
-        if not any((each.parent, each.child) == frames for each in transforms):
-            known = sorted({f"{each.parent}:{each.child}" for each in transforms})
+        parent, child = (frame_name(name) for name in pair.split(":", 1))
+        if not any((each.parent, each.child) == (parent, child) for each in pairs):
+            names = ", ".join(sorted({each.name for each in pairs}))
             raise bag.error(
                 f"odometry ({option}): expected two frames of the transforms "
-                f"{', '.join(known) or '(none)'}; got {pair!r}"
+                f"{names or '(none)'}; got {pair!r}"
             )
-    elif len(counts) > 1:
-        listed = ", ".join(f"{a}:{b} ({count:,})" for (a, b), count in sorted(counts.items()))
-        first = ":".join(sorted(counts)[0])
+    elif len(candidates) > 1:
+        first = candidates[0].name
         raise bag.error(
-            f"expected odometry in one pair of frames, got {listed}; choose by odometry={first!r} "
-            f"({option} {first})"
+            f"expected odometry in one pair of frames, got {pairs_text(candidates)}; choose by "
+            f"odometry={first!r} ({option} {first})"
         )
-    elif not counts:
+    elif not candidates:
+        corrections.append(
+            "no odometry is read: raw odometry stands still, and laser odometry takes its place; "
+            f"frames of /tf that move: {pairs_text(others)}, of which {option} "
+            f"{others[0].name} reads one"
+            if others
+            else "the bag has no odometry: raw odometry stands still, and laser odometry takes its "
+            "place"
+        )
         return messages
     else:
-        parent, child = next(iter(counts))
-    found = [
+        parent, child = candidates[0].parent, candidates[0].child
+        if not is_named_odometry(candidates[0]):
+            corrections.append(
+                f"odometry is the transform from {parent} to {child}, the only frames of /tf that "
+                "move in the plane"
+            )
+    odometry = [
         _PoseMessage(each.stamp, each.recorded, each.pose)
         for each in transforms
         if (each.parent, each.child) == (parent, child)
     ]
-    return messages._replace(odometry=found, base=child)
+    return messages._replace(odometry=odometry, base=child)
 
 
 def _mount(
     bag: Bag,
-    frames: Frames,
+    transforms: Sequence[Transform],
     frame: str,
     messages: _Messages,
     given: Float[np.ndarray, "3"] | None,
@@ -391,8 +455,12 @@ def _mount(
     """The pose of the laser on the robot, and whether the laser is upside down."""
     notes: list[str] = []
     placed: LaserMount | None = None
+    frames = Frames(transforms)
+    moving, _ = odometry_pairs(frame_pairs(transforms), frames, frame)
     try:
-        placed = laser_mount(frames, frame, messages.base or None, notes)
+        placed = laser_mount(
+            frames, frame, [messages.base] * bool(messages.base), notes, _only_child(moving)
+        )
     except ValueError as problem:
         if given is None:
             raise bag.error(str(problem)) from problem
@@ -477,9 +545,6 @@ def _odometry_at(
     """
     first = np.arange(len(time)) == 0
     if not messages.odometry:
-        corrections.append(
-            "the bag has no odometry: raw odometry stands still, and laser odometry takes its place"
-        )
         none = np.full(len(time), -1)
         return _Odometry(np.zeros((0, 3)), none[:0], none, np.zeros((len(time), 3)), first)
     topic = wheels or "odometry in /tf"
@@ -509,15 +574,37 @@ def _odometry_at(
     upper = np.minimum(lower + 1, len(stamp) - 1)
     between = np.maximum(stamp[upper] - stamp[lower], 1)
     share = np.clip((time - stamp[lower]) / between, 0.0, 1.0)
-    if gaps := int(((between > GAP) & (share > 0) & (share < 1)).sum()):
+    inside = (share > 0) & (share < 1)
+    interval = np.diff(stamp, prepend=stamp[:1])
+    median = np.median(interval[1:]) if len(stamp) > 1 else 0.0
+    gap = (between > GAP) & (between > LONG * median) & inside
+    if gap.any():
+        corrections.append(
+            f"scans between two messages of {topic} that are more than {GAP * 1e-9:g} s and "
+            f"{LONG:g} median intervals apart, with unknown steps: {int(gap.sum()):,}"
+        )
+    if slow := int(((between > GAP) & inside & ~gap).sum()):
         corrections.append(
             f"scans between two messages of {topic} that are more than {GAP * 1e-9:g} s apart, "
-            f"with a constant velocity in between: {gaps:,}"
+            f"with a constant velocity in between: {slow:,}"
         )
+    jump = odometry_jumps(path, _seconds(stamp - stamp[0]))
+    if jump.any():
+        at = int(np.argmax(jump))
+        far, turn = step_sizes(path)[at]
+        corrections.append(
+            f"jumps of {topic}, which are no motion, so that the steps over them are unknown: "
+            f"{int(jump.sum()):,}, first by {far:.3g} m and {np.rad2deg(turn):.3g}° in "
+            f"{interval[at] * 1e-9:.3g} s at {_seconds(stamp[at : at + 1])[0]:.3f} s"
+        )
+    # Nothing is interpolated over these: the scan has the pose of the message before it.
+    share[gap | (jump[upper] & inside)] = 0.0
     step = poses.between(path[lower], path[upper])
     raw = poses.compose(path[lower], poses.part(step, share))
-    known = first | (within & np.concatenate([[True], within[:-1]]))
-    return _Odometry(path, stamp, row, raw, known)
+    jumps = np.cumsum(jump)[lower]
+    known = within & np.concatenate([[True], within[:-1]])
+    known &= ~gap & ~np.concatenate([[False], gap[:-1]]) & (np.diff(jumps, prepend=jumps[:1]) == 0)
+    return _Odometry(path, stamp, row, raw, first | known)
 
 
 def _seconds(stamp: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:

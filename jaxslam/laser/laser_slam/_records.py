@@ -31,7 +31,8 @@ class Settings:
     sigma: float = 0.02
     """least standard deviation of a point's distance from a wall"""
     jump: float = 3.0
-    """a longer step of raw odometry is assumed to be an error"""
+    """a longer step of raw odometry is assumed to be an error; so is one that is impossible by its
+    speed or turn rate, whatever its length"""
     reference: int = 8
     """keyframes that a scan is matched with; 1 is scan to scan"""
     key_distance: float = 0.4
@@ -173,7 +174,8 @@ class Solved(NamedTuple):
     counts: dict[str, int]
     """counts of used and unused data"""
     chi2: float
-    """of the graph, without a kernel"""
+    """of the graph, without a kernel. √(chi2/dof) is the size of the residuals of its edges against
+    their σ. It is no factor for `cov`: edges share scans, so their errors are not independent"""
     dof: int
     seconds: dict[str, float]
     """by stage, compilation included"""

@@ -21,7 +21,9 @@ WIDTH, ROWS = 384, 64
 """Beams and scans of one call that fits lines: logs are cut and filled up to these, so that all
 share one program."""
 _CHANGED, SHARE = 0.1, 0.2
-"""A scan differs from the previous one if more than this share of its beams do, by this [m]."""
+"""A scan differs from another one if more than this share of its beams do, by this [m]."""
+_BACK = 8
+"""Scans back with which a scan is compared: a slow robot changes little from one to the next."""
 
 
 class Scans(NamedTuple):
@@ -33,8 +35,9 @@ class Scans(NamedTuple):
     """(K, B) the lines through them and their neighbours"""
     usable: Bool[np.ndarray, "K"]
     """enough points to match"""
-    changed: Bool[np.ndarray, "K"]
-    """whether a scan differs from the previous one; a scan of a robot at rest does not"""
+    changed: Int[np.ndarray, "K"]
+    """scans back to the nearest of the last eight from which a scan differs, 0 if from none, as of a
+    robot at rest"""
 
 
 def check_laser_log(name: str, log: LogOfScans) -> None:
@@ -91,12 +94,12 @@ def scans_of(log: LogOfScans, settings: Settings) -> Scans:
     changed = []
     scans: Any = None
     for begin in range(0, count, ROWS):  # some at a time, since a log may be long
-        last = max(begin - 1, 0)
+        last = max(begin - _BACK, 0)
         near = met_something(
             Beams(*(np.asarray(part)[last : begin + ROWS] for part in log.beams)), log.max_range
         )
         differs = _has_changed(np.asarray(near.range), np.asarray(near.valid))
-        changed.append(differs if begin == 0 else differs[1:])
+        changed.append(differs[begin - last :])
         rows = Beams(*(np.asarray(part)[begin - last :, ::stride] for part in near))
         points = _points(rows, np.asarray(log.mount), settings.max_range)
         filled = _fill(points)
@@ -153,9 +156,16 @@ def _spacing(angles: np.ndarray, valid: np.ndarray) -> float:
     return float(np.median(steps)) if steps.size else 0.02
 
 
-def _has_changed(ranges: Float[np.ndarray, "K B"], met: Bool[np.ndarray, "K B"]) -> np.ndarray:
-    """Whether each scan differs from the previous one; the first does."""
-    differs = (np.abs(np.diff(ranges, axis=0)) > _CHANGED) | (met[1:] != met[:-1])
-    either = met[1:] | met[:-1]
-    share = (differs & either).sum(axis=1) / np.maximum(either.sum(axis=1), 1)
-    return np.concatenate([[True], share > SHARE])
+def _has_changed(
+    ranges: Float[np.ndarray, "K B"], met: Bool[np.ndarray, "K B"]
+) -> Int[np.ndarray, "K"]:
+    """`Scans.changed`; 1 for the first."""
+    changed = np.zeros(len(ranges), int)
+    for back in range(min(_BACK, len(ranges) - 1), 0, -1):
+        differs = np.abs(ranges[back:] - ranges[:-back]) > _CHANGED
+        differs |= met[back:] != met[:-back]
+        either = met[back:] | met[:-back]
+        share = (differs & either).sum(axis=1) / np.maximum(either.sum(axis=1), 1)
+        changed[back:] = np.where(share > SHARE, back, changed[back:])
+    changed[0] = 1
+    return changed

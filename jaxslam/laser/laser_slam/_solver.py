@@ -132,7 +132,7 @@ def _counts(
         "scans with too few points": int((~usable).sum()),
         "scans by raw odometry alone": int((~odometry.matched[1:]).sum()),
         "scans whose match is in doubt": int(odometry.doubted.sum()),
-        "jumps of raw odometry": int(steps.jump.sum()),
+        "jumps of raw odometry": int((steps.jump | odometry.refuted).sum()),
         "steps in which raw odometry is frozen": int(steps.frozen.sum()),
         "steps in which raw odometry lags": int(steps.lags.sum()),
         "scans stamped before their predecessor": int((np.diff(log.time) < 0).sum()),

@@ -7,7 +7,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.laser.laser_slam import _end_covariances as end_covariances
-from jaxslam.laser.laser_slam._odometry.raw import FARTHEST, Steps, reach_cov
+from jaxslam.laser.laser_slam._odometry.raw import FARTHEST, STEP_CHANGE, Steps, reach_cov
 from jaxslam.laser.laser_slam._odometry.reference import (
     Reference,
     ScanMatch,
@@ -42,6 +42,10 @@ _MAX_THROUGH = 0.15
 _MAX_THROUGH_LIKELY = 0.4
 """The same about raw odometry, and where that is frozen: a pose without a match would be farther
 off than most wrong matches, so these are taken, and are in doubt."""
+_TOO_ODD = 3.0
+"""Times the usual reach above which an odd step is believed only if its match is clearly better."""
+_CLEAR_GAIN = 0.05
+"""Extra share of points on walls, less those passed through, of a clearly better match."""
 _DOUBT_GATE = 30.66
 """χ² of three degrees of freedom at 1 - 1e-6: a match farther from raw odometry is in doubt."""
 _DOUBT_PROBABILITY = 0.1
@@ -72,6 +76,8 @@ class Odometry(NamedTuple):
     """share of the points on walls, 0 without a match"""
     residual: Float[np.ndarray, "K"]
     """[m] root mean square of their distances from these"""
+    refuted: Bool[np.ndarray, "K"]
+    """raw odometry was too fast, and the scan matches where the robot was heading"""
 
 
 def match_to_keyframes(
@@ -90,6 +96,7 @@ def match_to_keyframes(
         doubted=np.zeros(count, bool),
         inliers=np.zeros(count),
         residual=np.zeros(count),
+        refuted=np.zeros(count, bool),
     )
     keys, since = [0], 0  # since: the keyframe from which on scans are matched with
     reference = _reference_of_last(scans, keys, result.poses, settings)
@@ -103,7 +110,7 @@ def match_to_keyframes(
     other: tuple[np.ndarray, np.ndarray] | None = None
     for scan in range(1, count):
         step, step_cov = steps.step[scan], steps.cov[scan]
-        if steps.frozen[scan]:
+        if steps.frozen[scan] or steps.reset[scan]:
             step = last  # the robot most likely goes on as it did
         begin, begin_cov = (z, cov) if late is None else late
         guess = poses.compose(begin, step)
@@ -130,13 +137,27 @@ def match_to_keyframes(
                 )
                 if back.accepted and back.quality > found.quality:
                     found, guess, prior = back, prediction, wide
+            if steps.odd[scan]:
+                onward = poses.compose(begin, last)
+                change = step_cov + reach_cov(STEP_CHANGE * steps.usual_reach[scan])
+                wide = end_covariances.composed_cov(begin_cov, last, change)
+                unknown = how._replace(unknown=True)
+                steady = _matched(
+                    reference, points, onward, wide, steps.usual_reach[scan], unknown, settings
+                )
+                size = np.array([np.hypot(step[0], step[1]), abs(step[2])])
+                too_odd = (size > _TOO_ODD * steps.usual_reach[scan]).any()
+                gain = -_CLEAR_GAIN if too_odd else _CLEAR_GAIN
+                better = steady.accepted and steady.quality > found.quality + gain
+                if better and _contradicts(steady.pose, guess, prior):
+                    result.refuted[scan] = True
+                    found, guess, prior = steady, onward, wide
             result.inliers[scan] = found.inliers
             result.residual[scan] = found.residual
         if found is not None and found.accepted:
             result.matched[scan] = True
             z, cov = found.pose, found.cov
-            off = poses.between(guess, z)
-            contradicted = off @ np.linalg.solve(found.prior, off) > _DOUBT_GATE
+            contradicted = _contradicts(z, guess, found.prior)
             doubted = bool(contradicted or not found.sure)
             if steps.frozen[scan]:
                 other = (begin, begin_cov) if other is None else other
@@ -149,6 +170,12 @@ def match_to_keyframes(
             missed += 1
             if steps.gap[scan]:
                 cov = cov + reach_cov(steps.reach[scan])
+        if steps.jump[scan] and not steps.reset[scan]:  # the next step may take it back
+            spike = steps.logged[scan]
+            other = (
+                poses.compose(begin, spike),
+                end_covariances.composed_cov(begin_cov, spike, step_cov),
+            )
         last = poses.between(before, z)
         doubt = end_covariances.moved(doubt, last)
         if doubted and found is not None:
@@ -254,6 +281,14 @@ def _within_reach(
     off, sigma = poses.between(guess, fit.pose), np.sqrt(prior.diagonal())
     near = np.hypot(off[0], off[1]) <= reach[0] + 2 * sigma[:2].max()
     return bool(near and abs(off[2]) <= reach[1] + 2 * sigma[2])
+
+
+def _contradicts(
+    pose: Float[np.ndarray, "3"], guess: Float[np.ndarray, "3"], prior: Float[np.ndarray, "3 3"]
+) -> bool:
+    """Whether a match is too far from raw odometry for its covariance."""
+    off = poses.between(guess, pose)
+    return bool(off @ np.linalg.solve(prior, off) > _DOUBT_GATE)
 
 
 def _quality(fit: ScanMatch) -> float:
