@@ -10,6 +10,7 @@ parameters; s (K,) landmark parameters that z does not determine (K = 0 if none)
 import re
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
+from types import MappingProxyType
 from typing import Any, ClassVar, NamedTuple
 
 import jax.numpy as jnp
@@ -186,6 +187,9 @@ class Sensor(Model):
 
     measurements: tuple[str, ...]
     """What z holds, with units; its length is Z."""
+    support: Mapping[str, tuple[float, float]] = MappingProxyType({})
+    """The open interval in which an entry of z lies, by its name, as {"range [m]": (0, np.inf)};
+    others are not limited. The verifier tries `invert` at no other measurement."""
     landmark: tuple[str, ...] = ("x [m]", "y [m]")
     """What l holds, with units; its length is L, 0 for an absolute sensor."""
     noise_cov: Any
@@ -207,6 +211,13 @@ class Sensor(Model):
 
     def __post_init__(self) -> None:
         self._check_model(Sensor, ("observe", "invert"), ("landmark", "measurements"))
+        for entry, limits in self.support.items():
+            low, high = limits if np.shape(limits) == (2,) else (np.nan, np.nan)
+            if entry not in self.measurements or not low < high:
+                raise ValueError(
+                    f"{type(self).__name__}: expected support as {{entry: (low, high)}} of "
+                    f"{', '.join(self.measurements)}, got {entry!r}: {limits!r}"
+                )
         free = self.__dict__.get("free", type(self).free)
         if not isinstance(free, Free | property):
             what = f"{type(self).__name__}: expected free to be a Free(mean, cov)"

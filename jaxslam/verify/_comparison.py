@@ -64,11 +64,11 @@ class _Compared(NamedTuple):
     gap: Values
     """largest difference among jacfwd, jacrev and hand in float64"""
     relative: Values
-    """the same over `scale`"""
+    """the same over `scale`, as it is compared with the tolerance"""
     relative32: Values
     """the same in float32"""
     from_quotient: Values
-    """largest relative difference from the quotients, where they converge"""
+    """the same from the quotients, where they converge"""
     scale: Float[np.ndarray, "S m 1"]
     """the size of the row"""
     excess: Values
@@ -83,14 +83,13 @@ def _compare(evaluation: Jacobians, tolerance: float, float32_tolerance: float) 
     """All differences between the methods, relative to their tolerances."""
     gap, scale = _largest_gap(evaluation.methods)
     gap32, scale32 = _largest_gap(evaluation.single)
-    away, excess_away, lost = np.zeros_like(gap), np.zeros_like(gap), 0
+    away, error, lost, nothing_compared = np.zeros_like(gap), np.zeros_like(gap), 0, False
     if evaluation.quotient is not None:
         value, error, kink = evaluation.quotient
         away = np.abs(np.stack(list(evaluation.methods.values())) - value).max(axis=0)
         magnitude = np.abs(value).max(axis=2, keepdims=True, initial=0.0)
         trusted = ((error <= _CONVERGED * magnitude) | (error <= _NOTHING)) & ~kink
         away = np.where(trusted, np.where(np.isfinite(away), away, np.inf), 0.0)
-        excess_away = _relative(away, _DIFFERENCES_TOLERANCE * scale + 10 * error)
         # At a kink any value between the one-sided derivatives is accepted. Elsewhere, if the
         # quotients do not converge, the result of autodiff may depend on rounding; where its two
         # modes differ, the entries are not compared.
@@ -102,25 +101,35 @@ def _compare(evaluation: Jacobians, tolerance: float, float32_tolerance: float) 
         ):
             if g.size:
                 g[kink | (odd & _modes_differ(methods, size, limit))] = 0.0
-        if gap.size and lost == len(gap):
-            excess_away = np.full_like(gap, np.inf)  # nothing was compared, so nothing passes
-    relative, relative32 = _relative(gap, scale), _relative(gap32, scale32)
-    # Cancellation rounds by more than the size suggests: in float64 by 2⁻²⁹ of float32's error.
-    rounded = gap <= 2.0**-28 * evaluation.single_error
-    in_double = np.where(rounded, np.minimum(relative / tolerance, 1.0), relative / tolerance)
-    in_double = np.maximum(in_double, excess_away)
-    # The hand-derived Jacobian need not be more accurate in float32 than autodiff.
-    in_single = _relative(gap32, float32_tolerance * scale32 + 2 * evaluation.single_error)
+        nothing_compared = bool(gap.size) and lost == len(gap)  # so nothing passes
+    # Cancellation rounds by more than the size suggests: in float64 by 2⁻²⁹ of float32's error, and
+    # in float32 the hand-derived Jacobian need not be more accurate than autodiff.
+    relative = _beyond(gap, 2.0**-28 * evaluation.single_error, scale, tolerance)
+    relative32 = np.zeros_like(gap)
+    if gap32.size:
+        relative32 = _beyond(gap32, 2 * evaluation.single_error, scale32, float32_tolerance)
+    from_quotient = _beyond(away, 10 * error, scale, _DIFFERENCES_TOLERANCE)
+    in_double = np.maximum(relative / tolerance, from_quotient / _DIFFERENCES_TOLERANCE)
+    in_double = np.where(nothing_compared, np.inf, in_double)
+    in_single = relative32 / float32_tolerance
     return _Compared(
         gap,
         relative,
         relative32,
-        _relative(away, scale),
+        from_quotient,
         scale,
         np.maximum(in_double, in_single),
         in_single > in_double,
         lost,
     )
+
+
+def _beyond(gap: Values, rounding: np.ndarray, scale: np.ndarray, tolerance: float) -> Values:
+    """The relative difference, or the rest beyond rounding where that is within the tolerance."""
+    relative = _relative(gap, scale)
+    with np.errstate(invalid="ignore"):  # ∞ - ∞
+        rest = _relative(np.where(np.isinf(gap), gap, np.maximum(gap - rounding, 0.0)), scale)
+    return np.where((relative > tolerance) & (rest <= tolerance), rest, relative)
 
 
 def _finding(

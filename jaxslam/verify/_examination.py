@@ -1,12 +1,14 @@
 """All Jacobians of a model at all states, with the other checks, in float64."""
 
 import contextlib
+import copy
 from collections.abc import Callable, Iterator
 from typing import NamedTuple, TypeAlias
 
 import jax
 import numpy as np
 
+from jaxslam.core._record import set_field
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.graphs import Factor
 from jaxslam.laser.grids.beam_models import BeamModel
@@ -19,6 +21,7 @@ from jaxslam.verify._inputs import samples
 from jaxslam.verify._inputs.functions import Function, motion_functions, sensor_functions
 from jaxslam.verify._inputs.samples import Samples
 from jaxslam.verify._jacobians import Evaluated, evaluate_jacobians
+from jaxslam.verify._loops import has_loop, limited
 from jaxslam.verify._user_errors import describe_error
 from jaxslam.verify.linearity import motion_linearity, sensor_linearity
 
@@ -30,8 +33,9 @@ class _Examined(NamedTuple):
 
     evaluated: tuple[Evaluated, ...]
     checks: tuple[Check, ...]
-    singular: tuple[str, ...]
-    """notes on where a function of places is not finite"""
+    notes: tuple[str, ...]
+    """a missing mode of differentiation, loops, where a function of places is not finite"""
+    linearity: float | None
 
 
 def examine(
@@ -50,6 +54,7 @@ def examine(
         count, seed: of the random states.
     """
     with float64(), np.errstate(all="ignore"):
+        model = _with_limited_loops(model, functions)
         drawn = _samples_of(functions, model, count, seed)
         if given is not None:
             drawn = (given, *drawn[1:])
@@ -66,16 +71,33 @@ def examine(
             if isinstance(model, Motion | Sensor | BeamModel):
                 checks += properties.dtype_checks(one)
         if all(one.values is not None for one in evaluated):  # else they fail for the same reason
-            checks += _model_checks(model, drawn)
-        singular: list[str] = []
+            checks += _model_checks(model, tuple(one.samples for one in evaluated))
+        notes = [note for one in evaluated for note in one.notes]
         if given is None and not isinstance(model, Motion | Sensor):
-            singular = [note for one in evaluated for note in singular_notes(one)]
-    return _Examined(evaluated, tuple(checks), tuple(singular))
+            notes += [note for one in evaluated for note in singular_notes(one)]
+        linearity = _typical_linearity(model, evaluated[0])
+    return _Examined(evaluated, tuple(checks), tuple(notes), linearity)
 
 
 def functions_of(model: Motion | Sensor) -> tuple[Function, ...]:
     """The functions of a model whose Jacobians are verified."""
     return motion_functions(model) if isinstance(model, Motion) else sensor_functions(model)
+
+
+def _with_limited_loops(model: Model, functions: tuple[Function, ...]) -> Model:
+    """A model whose functions have `while` loops, with these limited; any other as it is."""
+    if not isinstance(model, Motion | Sensor):
+        return model
+    looping = []
+    for function in functions:
+        sizes = [len(argument.entries) for argument in function.arguments]
+        with contextlib.suppress(Exception, SystemExit):  # other checks report what fails
+            if has_loop(jax.make_jaxpr(function.call)(*map(np.ones, sizes)).jaxpr):
+                looping.append(function)
+    model = copy.copy(model) if looping else model
+    for function in looping:
+        set_field(model, function.name, limited(function.call))
+    return model
 
 
 def _model_checks(model: Model, drawn: tuple[Samples, ...]) -> Iterator[Check]:
@@ -89,14 +111,13 @@ def _model_checks(model: Model, drawn: tuple[Samples, ...]) -> Iterator[Check]:
         yield Check("the remaining checks", False, describe_error(error))
 
 
-def typical_linearity(model: Model, examined: _Examined) -> float | None:
+def _typical_linearity(model: Model, first: Evaluated) -> float | None:
     """The median linearity index over the random states; None for a function or if it fails.
 
     Standard deviations follow from the units.
     """
     if not isinstance(model, Motion | Sensor):
         return None
-    first = examined.evaluated[0]
     usual = [i for i, label in enumerate(first.samples.labels) if label in samples.NOMINAL]
     states = tuple(a[usual] for a in first.samples.values)
     spread = [

@@ -73,13 +73,14 @@ class Finding:
     absolute: float
     """largest difference among jacfwd, jacrev and hand, in float64"""
     relative: float
-    """the same over the largest entry of the Jacobian's row at that state"""
+    """largest difference over the largest entry of the Jacobian's row at that state; without the
+    rounding of autodiff, where only that is beyond the tolerance"""
     tolerance: float
     float32: float | None
-    """largest relative difference in float32; None where it was not computed"""
+    """the same in float32; None where it was not computed"""
     float32_tolerance: float
     differences: float | None
-    """largest relative difference from the quotients, where they converge"""
+    """the same from the quotients, where they converge; rounding is their estimated error"""
     differences_tolerance: float
     quotient: str
     """the kind of quotient: differences or complex step"""

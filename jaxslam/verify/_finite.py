@@ -12,8 +12,9 @@ from jaxslam.math._xla import quick_jit
 from jaxslam.verify._findings import Check
 from jaxslam.verify._inputs.functions import Function, at_state
 from jaxslam.verify._inputs.samples import coincident
-from jaxslam.verify._jacobians import Evaluated
-from jaxslam.verify._user_errors import place_of_error
+from jaxslam.verify._jacobians import MODES, Evaluated
+from jaxslam.verify._loops import ending, has_loop
+from jaxslam.verify._user_errors import describe_error, place_of_error
 
 State = Sequence[np.ndarray]
 
@@ -48,16 +49,22 @@ def singular_notes(evaluated: Evaluated) -> Iterator[str]:
     A claim need not be defined there, so this is not a failure; but a gradient through it is NaN.
     """
     function = evaluated.function
-    if evaluated.values is None or any("jacfwd" not in x.methods for x in evaluated.by_argument):
+    methods = [x.methods for x in evaluated.by_argument]
+    modes = [mode for mode in MODES if methods and all(mode in one for one in methods)]
+    if evaluated.values is None or not modes:
         return
-    over = tuple(range(len(function.arguments)))
+    jacobian = MODES[modes[0]](function.call, argnums=tuple(range(len(function.arguments))))
 
     @quick_jit
     def both(*state: jax.Array) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-        return function.call(*state), jax.jacfwd(function.call, argnums=over)(*state)
+        return ending(function.call)(*state)[0], ending(jacobian)(*state)[0]
 
     for label, state in coincident(function.arguments, evaluated.samples):
-        value, by_argument = both(*state)
+        try:
+            value, by_argument = both(*state)
+        except (Exception, SystemExit) as error:  # as of a callback
+            yield f"{describe_error(error)}; with the {label}: {at_state(function, state)}"
+            continue
         if not np.isfinite(value).all():
             what = "the value"
         elif bad := [
@@ -79,6 +86,9 @@ def _line_of_nan(
     call: Callable[..., object] = hand or function.call
     if derivative and hand is None:
         call = jax.jacfwd(function.call, argnums=tuple(range(len(state))))
+    with contextlib.suppress(Exception, SystemExit):  # one that cannot be traced is called
+        if has_loop(jax.make_jaxpr(call)(*map(jnp.asarray, state)).jaxpr):
+            return ""  # it might not end
     try:  # JAX prints what it found
         with jax.debug_nans(True), jax.debug_infs(True), contextlib.redirect_stdout(io.StringIO()):
             call(*(jnp.asarray(a) for a in state))

@@ -18,6 +18,7 @@ from jaxslam.verify._finite import finite_check
 from jaxslam.verify._inputs.functions import Function, at_state, periods, sensor_functions
 from jaxslam.verify._inputs.samples import NOMINAL, Samples
 from jaxslam.verify._jacobians import Evaluated
+from jaxslam.verify._loops import limited
 from jaxslam.verify._user_errors import describe_error
 
 Values: TypeAlias = np.ndarray
@@ -250,9 +251,10 @@ def _pure(function: Function, evaluated: Evaluated) -> str:
     """Whether the function agrees with itself when called twice, and under jit and vmap; or ""."""
     assert evaluated.values is not None
     finite = np.flatnonzero(np.isfinite(evaluated.values).all(axis=1))
+    call = limited(function.call) if evaluated.loops else function.call
     for i in finite[[0, -1]] if len(finite) else ():
         state = tuple(jnp.asarray(a[i]) for a in evaluated.samples.values)
-        first, second = (np.asarray(function.call(*state), np.float64) for _ in range(2))
+        first, second = (np.asarray(call(*state), np.float64) for _ in range(2))
         if not np.array_equal(first, second, equal_nan=True):
             return (
                 "two calls with the same arguments differ: it keeps a state or draws random numbers"

@@ -6,6 +6,7 @@ from functools import partial
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from cases import refused
 from own_models import changed, sensor_of
 from verified import failed
 
@@ -245,6 +246,46 @@ def test_the_states_of_a_sensor_are_those_of_its_inverse_too():
     assert np.isfinite(report.linearity)
     drawn = samples.sensor_samples(mast_camera(), 24, 0)
     assert [c.name for c in properties.sensor_checks(mast_camera(), *drawn) if not c.passed] == []
+
+
+def stereo(support):
+    """Bearing and inverse range, which is positive, of landmarks up to 1 km."""
+
+    def observe(pose, landmark):
+        r, bearing = se2.polar_in_frame(pose, landmark)
+        return jnp.stack([bearing, 1 / jnp.maximum(r, 1e-3)])
+
+    def invert(pose, z, s):
+        return se2.from_frame(pose, se2.rectangular(jnp.stack([1 / z[1], z[0]])))
+
+    return sensor_of(
+        name="stereo",
+        measurements=("bearing [rad]", "inverse range [1/m]"),
+        support=support,
+        observe=observe,
+        invert=invert,
+        noise_cov=lambda z: 1e-4 * jnp.eye(2, dtype=z.dtype),
+    )
+
+
+def test_a_measurement_outside_its_support_is_not_tried():
+    unlimited, limited = stereo({}), stereo({"inverse range [1/m]": (0.0, np.inf)})
+    assert "invert and its derivatives are finite" in failed(verify_jacobians(unlimited, count=4))
+    report = verify_jacobians(limited, count=4)
+    assert report.passed, report
+    drawn = [samples.sensor_samples(model, 4, 0) for model in (unlimited, limited)]
+    np.testing.assert_equal(drawn[1][0].values, drawn[0][0].values)  # of `observe` all remain
+    z = drawn[1][1].values[1]
+    assert (z[:, 1] > 0).all() and (z[:, 0] == 0).any() and (np.abs(z[:, 0]) > 3.14159).any()
+
+
+@refused(
+    ({"range [m]": (0, 1)}, "expected support as .* of bearing .*, got 'range"),
+    ({"bearing [rad]": (1, 0)}, "got 'bearing .*: .1, 0."),
+    ({"bearing [rad]": 3.0}, "got 'bearing .*: 3.0"),
+)
+def test_a_support_that_is_none_is_refused(support):
+    stereo(support)
 
 
 def test_a_failed_round_trip_names_entry_and_state():

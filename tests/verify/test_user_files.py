@@ -137,6 +137,17 @@ def test_models_and_factories_are_found(verify):
     assert status == 0 and [r["model"] for r in content["reports"]] == ["laser"]
 
 
+def test_the_states_beside_a_model_are_used(verify):
+    beside = (
+        "import numpy as np\nlaser_states = (np.eye(3), np.full((3, 2), 5.0))\n"
+        "laser_outputs = ('range [m]',)\n"
+    )
+    _, _, _, content = verify(MODELS + beside, ":laser")
+    (report,) = content["reports"]
+    assert {part["samples"] for part in report["jacobians"]} == {3}
+    assert report["notes"] == ["not used: laser_outputs (a model names its entries)"]
+
+
 @pytest.mark.parametrize(
     ("text", "name", "why"),
     [

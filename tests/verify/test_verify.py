@@ -236,6 +236,30 @@ def test_a_claim_just_off_is_the_claims_fault():
     assert wrong.dissent == ("hand",)
 
 
+def test_the_worst_that_is_printed_is_what_is_compared():
+    """Of a difference that loses digits, far from the origin, in autodiff as in the claim."""
+    offset = 1e4 * (1 + np.random.default_rng(0).uniform(size=(6, 2)))
+    states = (offset, offset + np.random.default_rng(1).uniform(1, 3, size=(6, 2)))
+
+    def squared(point, other):
+        return ((other - point) ** 2).sum()[None]
+
+    def claim(point, other):  # multiplied out, so rounded otherwise
+        return (2 * point - 2 * other)[None], (2 * other - 2 * point)[None]
+
+    for limit in (1e-5, 1e-9):
+        report = verify_jacobians(
+            squared, claim, arguments={"other": 2}, states=states, float32_tolerance=limit
+        )
+        for finding in report.findings:
+            parts = (
+                (finding.relative, finding.tolerance),
+                (finding.float32, finding.float32_tolerance),
+                (finding.differences, finding.differences_tolerance),
+            )
+            assert finding.passed == all(worst <= tolerance for worst, tolerance in parts)
+
+
 # --- house --------------------------------------------------------------------------------------
 
 
@@ -265,7 +289,13 @@ def test_the_report_is_json_and_text():
     (lambda: verify_jacobians(observe, count=1), "count >= 2"),
     (lambda: verify_jacobians(observe, tolerance=0.0), "above 0"),
     (lambda: verify_jacobians(observe, states=[np.zeros((4, 3))]), "expected states of shapes"),
+    (
+        lambda: verify_jacobians(lambda point: point, states=[np.zeros((4, 3))]),
+        'the name point fixes 2 entries, which arguments={"point": 3} changes',
+    ),
     (lambda: verify_jacobians(observe, arguments={"pose": "xyz"}), "a tuple of names"),
+    (lambda: verify_jacobians(observe, arguments={"pose": 3.0}), "a tuple of names or their"),
+    (lambda: verify_jacobians(observe, arguments={"pose": -1}), "expected a number of entries"),
     (lambda: verify_jacobians(observe, arguments=("pose", "l")), "name: entries"),
     (lambda: verify_jacobians(observe, outputs="x [m]"), "outputs as a tuple"),
     (lambda: verify_jacobians(observe, seed=-1), "a seed between"),
@@ -281,6 +311,8 @@ def test_lengths_are_those_of_the_states():
     states = (np.ones((4, 2)), np.ones((4, 5)))
     function = plain_function(lambda a, b: a * b[:2], None, states=states)
     assert {a.name: len(a.entries) for a in function.arguments} == {"a": 2, "b": 5}
+    sized = plain_function(lambda u: u, None, {"u": np.int64(2)})  # from the shape of an array
+    assert sized.arguments[0].entries == ("u[0]", "u[1]")
 
 
 @pytest.mark.parametrize(

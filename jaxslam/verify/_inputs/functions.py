@@ -3,8 +3,10 @@
 And what a hand-derived Jacobian may return, split by the function's arguments.
 """
 
+import contextlib
 import copy
 import inspect
+import operator
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
@@ -80,6 +82,9 @@ _GLOSSARY = {
     "point": _POINT,
 }
 """Default entries of an argument by its name."""
+
+NAMED = tuple(_GLOSSARY)
+"""Names of arguments whose entries are known."""
 
 _PERIODS = {"[rad]": 2 * np.pi, "[deg]": 360.0, "[°]": 360.0}
 """A whole turn by its unit."""
@@ -260,11 +265,17 @@ def _entries(
     """The names of an argument's entries, or None where they are unknown."""
     if entries is None:
         return None
-    if isinstance(entries, int):
-        return _number_names(parameter, entries)
-    if isinstance(entries, str) or not all(isinstance(entry, str) for entry in entries):
-        raise ValueError(f"{name}: {parameter}: expected a tuple of names, got {entries!r}")
-    return tuple(entries)
+    with contextlib.suppress(TypeError):
+        count = operator.index(entries)  # type: ignore[arg-type]  # also a whole number of NumPy
+        if count < 0:
+            raise ValueError(f"{name}: {parameter}: expected a number of entries, got {count}")
+        return _number_names(parameter, count)
+    names = entries if isinstance(entries, Sequence) and not isinstance(entries, str) else [None]
+    if not all(isinstance(entry, str) for entry in names):
+        raise ValueError(
+            f"{name}: {parameter}: expected a tuple of names or their number, got {entries!r}"
+        )
+    return tuple(names)
 
 
 def _number_names(parameter: str, count: int) -> tuple[str, ...]:

@@ -140,12 +140,11 @@ def sensor_samples(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samp
 
     back: list[_Group] = [("random", (pose, z, s))]
     back += list(_one_at_a_time((pose, z, s), 0, Argument("pose", POSE)))
-    angular = np.isfinite(periods(sensor.measurements))
     seen = np.asarray(quick_jit(jax.vmap(sensor.observe))(*observed.values), np.float64)
-    reached = _reach(seen, periods(sensor.measurements))
+    reached = _reach(seen, sensor)
     difficult = _one_at_a_time((pose, z, s), 1, Argument("measurement", sensor.measurements))
     back += [(label, part) for label, part in difficult if reached(part[1]).all()]
-    zero = np.where(angular & ~reached(0 * z[few]), z[few], 0.0)
+    zero = np.where(reached(0 * z[few]), 0.0, z[few])
     back.append(("zero measurement", (pose[few], zero, s[few])))
     if len(mean):
         back.append(("free coordinates zero", (pose[few], z[few], 0 * s[few])))
@@ -163,15 +162,17 @@ def given_inverse(sensor: Sensor, given: Samples, drawn: Samples) -> Samples:
     return Samples((given.values[0], z, s), given.labels)
 
 
-def _reach(seen: Values, circle: Float[np.ndarray, "m"]) -> Callable[[Values], np.ndarray]:
+def _reach(seen: Values, sensor: Sensor) -> Callable[[Values], np.ndarray]:
     """The function of measurements (B, m) -> whether each entry is one that the sensor can return.
 
     An angle is, if it is between the smallest and the largest observed one, or if these cover
-    nearly the whole turn; other entries always are.
+    nearly the whole turn. Any entry is only within the sensor's `support`.
     """
-    low, high = np.fmin.reduce(seen), np.fmax.reduce(seen)
-    free = ~np.isfinite(circle) | (high - low > 0.9 * circle)
-    return lambda z: free | ((low < z) & (z < high))
+    names, circle = sensor.measurements, periods(sensor.measurements)
+    least, most = np.fmin.reduce(seen), np.fmax.reduce(seen)
+    whole_turn = ~np.isfinite(circle) | (most - least > 0.9 * circle)
+    low, high = np.transpose([sensor.support.get(name, (-np.inf, np.inf)) for name in names])
+    return lambda z: (whole_turn | ((least < z) & (z < most))) & (low < z) & (z < high)
 
 
 def _sampled_entry(rng: np.random.Generator, name: str, count: int) -> Float[np.ndarray, "S"]:

@@ -8,6 +8,7 @@ import sys
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 from numpy.typing import ArrayLike
 
@@ -93,7 +94,7 @@ def load(target: str) -> list[_Target]:
     skipped = [key for key in keys if isinstance(vars(module)[key], Chart | Linearizer)]
     if found and skipped:
         note = f"not verified: {', '.join(skipped)} (no chart and no linearizer is)"
-        found[0] = dataclasses.replace(found[0], notes=(note,))
+        found[0] = dataclasses.replace(found[0], notes=(*found[0].notes, note))
     if name:
         if not found and keys:
             raise UnusableFile(
@@ -224,20 +225,29 @@ def _without_claim(name: str, value: object) -> str:
 def _target(module: ModuleType, name: str) -> _Target | None:
     """The object to verify under a name of the module, or None."""
     value = getattr(module, name)
+    about: dict[str, Any] = {what: getattr(module, f"{name}_{what}", None) for what in _ABOUT}
     if isinstance(value, Motion | Sensor | Factor | BeamModel):
-        return _Target(name, value)
+        return _model_target(name, value, about)
     if not callable(value):
         return None
     claims = [getattr(module, name + end) for end in _CLAIMS if hasattr(module, name + end)]
     if len(claims) > 1:
         raise UnusableFile(f"expected {name}_jacobian or {name}_jacobians, got both")
     if claims:
-        arguments, outputs, states = (getattr(module, f"{name}_{what}", None) for what in _ABOUT)
-        return _Target(name, value, claims[0], arguments, outputs, states)
+        return _Target(name, value, claims[0], **about)
     if getattr(value, "__module__", "") == module.__name__ and makes_a_model(value):
         try:
-            return _Target(name, build(value))
+            return _model_target(name, build(value), about)
         except Exception as error:
             what = "class" if isinstance(value, type) else "factory"
             raise UnusableFile(f"the {what} {name}: {describe_error(error)}") from error
     return None
+
+
+def _model_target(
+    name: str, model: Motion | Sensor | Factor | BeamModel, about: Mapping[str, Any]
+) -> _Target:
+    """A model with the states beside it; it names its entries and has its claims itself."""
+    unused = [f"{name}_{what}" for what in ("arguments", "outputs") if about[what] is not None]
+    notes = (f"not used: {', '.join(unused)} (a model names its entries)",) if unused else ()
+    return _Target(name, model, states=about["states"], notes=notes)
