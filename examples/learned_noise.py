@@ -35,7 +35,7 @@ class Network:
 
 @record
 class OfMeasurement(Network):
-    """R of range and bearing, by the measurement."""
+    """R of range and bearing, by the predicted measurement."""
 
     def __call__(self, z: jax.Array) -> jax.Array:
         return jnp.diag(self.sigma(z) ** 2)

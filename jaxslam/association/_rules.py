@@ -203,26 +203,24 @@ def predicted(
 ) -> Prediction:
     """The `Prediction` of N landmarks, from predicted measurements and their covariances.
 
-    ν_ij = z_i ⊖ ẑ_j, S_ij = H_j P H_jᵀ + R_i. What a method does not call is not computed.
+    ν_ij = z_i ⊖ ẑ_j, S_ij = H_j P H_jᵀ + R(ẑ_j). What a method does not call is not computed.
 
     Args:
         tag, alive: of the slots.
         measurements: () -> ẑ and H_j P H_jᵀ; None instead of the latter where pose and map have no
-            error: then S_ij = R_i, which is factored once a measurement.
+            error: then S_ij = R(ẑ_j), which is factored once a landmark.
         cross: () -> H_i P H_jᵀ.
     """
 
     def pairs(scan: Scan) -> Pairs:
         expected, landmark_cov = measurements()
-        noise = jax.vmap(sensor.noise_cov)(scan.z)
+        noise = jax.vmap(sensor.noise_cov)(expected)
         over_slots = jax.vmap(sensor.residual, in_axes=(None, 0))
         innovation = jax.vmap(over_slots, in_axes=(0, None))(scan.z, expected)
-        if landmark_cov is None:
-            cov = jnp.broadcast_to(noise[:, None], (*innovation.shape, innovation.shape[2]))
-            terms = jax.vmap(jax.vmap(gaussian_terms, in_axes=(0, None)))(innovation, noise)
-        else:
-            cov = landmark_cov[None] + noise[:, None]
-            terms = jax.vmap(jax.vmap(gaussian_terms))(innovation, cov)
+        s = noise if landmark_cov is None else landmark_cov + noise
+        # S has no axis of measurements: it is factored once a landmark.
+        terms = jax.vmap(jax.vmap(gaussian_terms), in_axes=(0, None))(innovation, s)
+        cov = jnp.broadcast_to(s, (*innovation.shape, innovation.shape[2]))
         possible = scan.valid[:, None] & alive[None, :] & terms.positive
         return Pairs(innovation, cov, terms.distance, terms.log_det, possible)
 

@@ -38,7 +38,7 @@ def conditional_bound(scenario: World, truth: Truth, log: Log, key: Array) -> Es
     the Jacobians of one trajectory in place of their means. Its inverse is the covariance of the
     Kalman filter of that linear system, which also exists for a singular Q or P0; so this runs the
     ideal EKF without gate and without a quota of new landmarks. The noise of a measurement is what
-    the sensor states for what it measured.
+    the sensor states for its prediction.
     """
     options: EkfOptions = scenario.filter_options | {
         "gate": None,
@@ -68,7 +68,7 @@ def posterior_bound(
     the map beforehand and are unbiased in it (a hybrid bound: Rockah & Schultheiss, IEEE Trans.
     ASSP 35(3), 1987; van Trees, "Detection, Estimation, and Modulation Theory I", 1968, 2.4.3).
     Jacobians by the noise are taken at ω = 0, and Q and R are what the models state at the truth
-    and for what was measured; what could be learnt of the state from their dependence on it, or
+    and for the exact measurement; what could be learnt of the state from their dependence on it, or
     from which landmarks are in view, is not counted. The time is that of the eigenvalues of K
     matrices of size 3 + W T + L N.
 
@@ -173,17 +173,15 @@ def jacobians_at_truth(scenario: World, truth: Truth, log: Log) -> RunJacobians:
     sensors: list[SensorJacobians] = []
     first = 0
     for model, places in parts:
-        size = len(model.measurements)
 
-        def seen(
-            pose: Array, z: Array, tag: Array, model: Sensor = model
-        ) -> tuple[Array, Array, Array]:
+        def seen(pose: Array, tag: Array, model: Sensor = model) -> tuple[Array, Array, Array]:
             landmark = landmarks[tag][: len(model.landmark)]
-            return *first_order.observe_jacobians(model, pose, landmark), model.noise_cov(z)
+            noise = model.noise_cov(model.observe(pose, landmark))
+            return *first_order.observe_jacobians(model, pose, landmark), noise
 
-        z, tag, valid = (leaf[:, first : first + places] for leaf in log.scan)
+        tag, valid = (leaf[:, first : first + places] for leaf in log.scan[1:])
         tag = jnp.maximum(tag, 0)
-        found = jax.vmap(jax.vmap(seen, (None, 0, 0)))(path, z[:, :, :size], tag)
+        found = jax.vmap(jax.vmap(seen, (None, 0)))(path, tag)
         by_pose_there, by_landmark, noise_cov = found
         sensors.append(SensorJacobians(by_pose_there, by_landmark, noise_cov, tag, valid))
         first += places

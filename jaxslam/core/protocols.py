@@ -193,7 +193,9 @@ class Sensor(Model):
     landmark: tuple[str, ...] = ("x [m]", "y [m]")
     """What l holds, with units; its length is L, 0 for an absolute sensor."""
     noise_cov: Any
-    """(z) -> (Z, Z). Given as a covariance, a record with `__call__`, or a function."""
+    """(z) -> (Z, Z), R where the exact measurement is z. Given as a covariance, a record with
+    `__call__`, or a function. Worlds call it at the exact measurement, filters at the predicted
+    one, ẑ, and at the measured one where there is no ẑ: for new landmarks, and in empty slots."""
     mount: Any = None
     """(3,) pose of the sensor on the robot, Solà's S; None where it is the robot's."""
     free: Free = NOTHING_FREE
@@ -386,7 +388,7 @@ class Pairs(NamedTuple):
     innovation: Float[Array, "M N Z"]
     """ν_ij = z_i ⊖ ẑ_j."""
     cov: Float[Array, "M N Z Z"]
-    """S_ij = H_j P H_jᵀ + R_i."""
+    """S_ij = H_j P H_jᵀ + R(ẑ_j)."""
     distance: Float[Array, "M N"]
     """ν_ijᵀ S_ij⁻¹ ν_ij."""
     log_det: Float[Array, "M N"]

@@ -10,8 +10,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxslam.core._record import record
+from jaxslam.core._record import record, static
 from jaxslam.core.protocols import Component, Motion, Sensor
+from jaxslam.math import _linalg as linalg
 from jaxslam.math import se2
 from jaxslam.math.angles import sin_cos, wrap
 
@@ -83,6 +84,10 @@ class Factor(Component):
     predict: Any = None
     """(first variable, z) -> the second of two, where the residual is zero: what `starts` places
     variables with; None where z does not tell it"""
+    whiten: Any = None
+    """(variables, z) -> W (R, R), for noise that depends on the variables: taken at each iterate,
+    and held while its step is computed and judged. The information of the table is then that of
+    W e; None where it is that of e"""
     chordal: Chordal | None = None
     """the residual where a heading is cosine and sine, by which `certificate` bounds the cost; None
     where there is none"""
@@ -205,9 +210,18 @@ class FromSensor(Factor):
 
     With an absolute sensor (L = 0) the pose is the only variable. What z does not determine of a
     landmark, `predict` takes from the mean of `sensor.free`. The name is that of the sensor.
+
+    With own_noise the noise of a row is R(ẑ) of the sensor at the prediction ẑ of each iterate,
+    held: the optimum is where the sum of Hᵀ R(ẑ)⁻¹ (z ⊖ ẑ) and of the other rows' terms is zero. At
+    the truth each has mean zero (a quasi-score: Wedderburn 1974, "Quasi-likelihood functions,
+    generalized linear models, and the Gauss-Newton method", Biometrika 61(3)). The least χ² with
+    R(ẑ) not held would prefer predictions of large noise, since a density has log |R(ẑ)| besides;
+    R(z) prefers measurements that came out small. A row whose R(ẑ) is singular has no weight.
     """
 
     sensor: Sensor
+    own_noise: bool = static(default=False, kw_only=True)
+    """the information of the table is that of R(ẑ)^{-1/2} e, the identity, and not that of e"""
 
     def __post_init__(self) -> None:
         _check_model("FromSensor", "sensor", self.sensor, Sensor)
@@ -236,6 +250,16 @@ class FromSensor(Factor):
     @property
     def predict(self) -> Any:
         return self._inverse if self.sensor.landmark else None
+
+    @property
+    def whiten(self) -> Any:
+        return self._whitener if self.own_noise else None
+
+    def _whitener(self, variables: tuple[Array, ...], z: Array) -> Array:
+        landmark = variables[1] if self.sensor.landmark else z[:0]
+        noise = self.sensor.noise_cov(self.sensor.observe(variables[0], landmark))
+        inverse, positive = linalg.whitener(noise)
+        return jnp.where(positive, inverse, 0.0)
 
     def _inverse(self, pose: Array, z: Array) -> Array:
         return self.sensor.invert(pose, z, jnp.asarray(self.sensor.free.mean, z.dtype))

@@ -10,6 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam.core import _validation as validation
+from jaxslam.core._noise import Constant
 from jaxslam.core._numbers import is_concrete
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import JaxOrNumPy, Log
@@ -18,7 +19,7 @@ from jaxslam.graphs._graph import Graph, Table
 from jaxslam.linearize._first_order import motion_jacobians
 from jaxslam.math import _linalg as linalg
 from jaxslam.math import se2
-from jaxslam.sensors._suite import Suite
+from jaxslam.sensors._suite import Suite, Wrapped
 
 _STILL = 1e-9
 """∂step/∂w with columns of length one and a determinant below this is singular."""
@@ -41,11 +42,12 @@ def of_log(
 
         prior    Prior() of the pose before the first control              1; none where P0 = 0
         motion   FromMotion(motion), z = u, Ω = Q⁻¹; or NominalMotion     T
-        sensor   FromSensor(sensor), Ω = R⁻¹                              T·M
+        sensor   FromSensor(sensor), Ω = R⁻¹; or with own_noise, Ω = I    T·M
 
     χ² of the graph is twice the cost of `smoothing.BatchMap`, and `pose_id` t is the pose after t
-    controls. Poses start along the nominal motion, points at their first measurement, where Q and R
-    are evaluated: as data of the graph they are fixed.
+    controls. Poses start along the nominal motion, points at their first measurement. There Q is
+    evaluated: as data of the graph it is fixed. An R that is no constant is R(ẑ) of each iterate
+    (`FromSensor.own_noise`).
 
     A noise of other than three components is not determined by two poses. Then, and where `slack` s
     is given, the factor of the motion is `NominalMotion` with Ω = (G Q Gᵀ + s² I)⁻¹. With fewer
@@ -82,7 +84,9 @@ def of_log(
     exact = len(motion.noises) == 3 and slack is None
     _check_slack(name, motion, slack)
     of_motion = FromMotion(motion) if exact else NominalMotion(motion)
-    factors: dict[str, Factor] = {"motion": of_motion, "sensor": FromSensor(sensor)}
+    varies = _noise_varies(sensor)
+    of_sensor = FromSensor(sensor, own_noise=varies)
+    factors: dict[str, Factor] = {"motion": of_motion, "sensor": of_sensor}
     validation.check_covariance(f"{name}: pose_cov", pose_cov, 3)
     size_u, size_z = len(motion.controls), len(sensor.measurements)
     validation.check_log(name, log, control_size=size_u, measurement_size=size_z)
@@ -94,7 +98,7 @@ def of_log(
     index, valid, ids = _points_of(name, log, sensor, tags, capacity)
     arguments = jnp.asarray(pose), jnp.asarray(pose_cov), index, valid, ids
     soft = None if exact else np.asarray(slack or 0.0)
-    graph, noise = _graph_of(motion, sensor, known, log, *arguments, soft)
+    graph, noise = _graph_of(motion, of_sensor, known, log, *arguments, soft)
     _check_noise(name, noise, motion, sensor, valid, known)
     if not known:
         factors["prior"] = Prior()
@@ -109,6 +113,13 @@ class _Noise(NamedTuple):
     sensor: Bool[Array, "T M"]
     moving: Bool[Array, "T"]
     """whether the noise moves the pose in all directions"""
+
+
+def _noise_varies(sensor: Sensor) -> bool:
+    """Whether R may depend on z."""
+    while isinstance(sensor, Wrapped) and type(sensor).noise_cov is Wrapped.noise_cov:
+        sensor = sensor.sensor
+    return not isinstance(sensor.noise_cov, Constant)
 
 
 def _check_slack(name: str, motion: Motion, slack: float | None) -> None:
@@ -165,7 +176,7 @@ def _points_of(
 @partial(jax.jit, static_argnames="known", inline=True)
 def _graph_of(
     motion: Motion,
-    sensor: Sensor,
+    factor: FromSensor,
     known: bool,
     log: Log,
     pose: Float[Array, "3"],
@@ -179,7 +190,7 @@ def _graph_of(
 
     slack: None for the exact factor of the motion.
     """
-    kind = jnp.result_type(log.control, log.scan.z)
+    sensor, kind = factor.sensor, jnp.result_type(log.control, log.scan.z)
     control, pose = log.control.astype(kind), pose.astype(kind)
     z = jnp.where(valid[:, :, None], log.scan.z.astype(kind), 0.0)
     nominal = jnp.zeros(len(motion.noises), kind)
@@ -201,6 +212,8 @@ def _graph_of(
     turned = jnp.eye(3, dtype=kind).at[:2, :2].set(se2.rotation(pose[2]))
     q, q_regular = jax.vmap(_information)(of_motion)
     r, r_regular = jax.vmap(jax.vmap(_information))(of_sensor)
+    if factor.own_noise:
+        r = jnp.broadcast_to(jnp.eye(r.shape[-1], dtype=kind), r.shape)
     p, p_regular = _information(turned.T @ pose_cov.astype(kind) @ turned)
     points, seen = _place_poses(sensor, path[1:], z, index, valid, ids.shape[0])
 

@@ -26,6 +26,7 @@ from jaxslam.graphs._solver.batch import (
 from jaxslam.graphs._solver.gnc import graduated
 from jaxslam.graphs._solver.kernels import Kernel, Truncated
 from jaxslam.graphs._solver.linearized import (
+    Variables,
     chi2_of,
     data_of,
     half_hessian,
@@ -75,11 +76,18 @@ def _squared_of(factors: dict[str, Factor], graph: Graph) -> dict[str, Float[Arr
                 for k, kind in enumerate(factor.variables)
             )
             e = factor.residual(values, z)
+            if factor.whiten is not None:
+                e = factor.whiten(values, z) @ e
             return e @ information @ e
 
         who, z, information = (jnp.asarray(part) for part in table[:3])
         found[key] = jnp.where(table.valid, jax.vmap(square)(who, z, information), 0.0)
     return found
+
+
+_HELD_STEPS = 20
+"""Steps of `followed` where factors whiten. With σ a share a of the range, the error falls by some
+2a a step."""
 
 
 def followed(model: Model, plan: Plan, graph: Graph, found: Solution) -> Solution:
@@ -89,6 +97,10 @@ def followed(model: Model, plan: Plan, graph: Graph, found: Solution) -> Solutio
     the optimum, of which only F is differentiated. ∂F/∂δ is half the Hessian of χ² with its second
     derivatives of the residuals, not Gauss-Newton's. θ are the measurements, the information,
     the variables that are fixed, and the numbers of factors and kernels.
+
+    Where factors whiten (`Factor.whiten`), F has W at the variables, and ∂F/∂δ is not symmetric.
+    Several steps then have H, ∂F/∂δ for a fixed W, in its place:
+    dδ ← dδ - H⁻¹ (∂F/∂δ dδ + ∂F/∂θ dθ), whose fixed point is the same.
     """
     still = jax.lax.stop_gradient((found.graph.poses, found.graph.points))
     poses = jnp.where(graph.fixed_pose[:, None], graph.poses, still[0])
@@ -96,12 +108,18 @@ def followed(model: Model, plan: Plan, graph: Graph, found: Solution) -> Solutio
     trial = with_batch(graph._replace(poses=poses, points=points))
     variables, data = variables_of(trial), data_of(trial, plan.column)
     blocks = half_hessian(*jax.lax.stop_gradient((model, plan, variables, data)))
-    gradient = linearize(model, plan, variables, data).gradient
-    step = _solve_by_factor(plan, blocks[..., 0], gradient[..., 0])
-    end = retract(variables, -step[..., None], plan)
+
+    def newton(at: Variables) -> Variables:
+        gradient = linearize(model, plan, at, data).gradient
+        step = _solve_by_factor(plan, blocks[..., 0], gradient[..., 0])
+        return retract(at, -step[..., None], plan)
+
+    end = newton(variables)
+    if model.holds:
+        end = jax.lax.fori_loop(1, _HELD_STEPS, lambda _, at: newton(at), end)
     return jax.lax.stop_gradient(found)._replace(
         graph=graph._replace(poses=end.poses[..., 0], points=end.points[..., 0]),
-        chi2=chi2_of(model, plan.who, variables, data)[0],
+        chi2=chi2_of(model, plan.who, end if model.holds else variables, data)[0],
         weights={
             name: weight[..., 0] for name, weight in row_weights(model, plan.who, end, data).items()
         },

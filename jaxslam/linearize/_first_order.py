@@ -7,7 +7,7 @@ for verification; filters do not use them, so a user's model needs none.
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Float
+from jaxtyping import Bool, Float
 
 from jaxslam.core._record import record
 from jaxslam.core.protocols import Here, Linearizer, Motion, Sensor
@@ -43,6 +43,19 @@ def invert_jacobians(sensor: Sensor, pose: Pose, z: Measurement, s: Unmeasured) 
     """The Jacobians G of a new landmark by pose, z and s, ∂invert/∂… (Solà (41)-(43))."""
     by_pose, by_z, by_s = jax.jacfwd(sensor.invert, argnums=(0, 1, 2))(pose, z, s)
     return by_pose, by_z, by_s
+
+
+def predicted_noise(
+    sensor: Sensor, z_hat: Measurement, z: Measurement, known: Bool[Array, ""]
+) -> Float[Array, "Z Z"]:
+    """The measurement noise R(ẑ) of a known landmark, and R(z) where there is no prediction.
+
+    N(z; ẑ, H P Hᵀ + R(z)) is no density of z: where σ grows with the range, a range that came out
+    short is trusted too much, the estimate is biased, and NIS exceeds its degrees of freedom. R(ẑ)
+    does not depend on the noise of z.
+    """
+    cov: Array = sensor.noise_cov(jnp.where(known, z_hat, z))
+    return cov
 
 
 def motion_at(

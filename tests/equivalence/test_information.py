@@ -22,8 +22,11 @@ UNGATED = 1e6
 
 
 def world(steps=60, **changes):
-    """Three metres of sight in the cloister, from a start that is not exactly known."""
-    changes = {"visible": BetweenRanges(0.0, 3.0), "places": 14, "pose_cov": P0} | changes
+    """Three metres of sight in the cloister, from a start that is not exactly known, with a noise
+    that grows with the range."""
+    sensor = sensors.RangeBearing(sensors.RangeBearingNoise(0.05, np.deg2rad(1.0), share=0.1))
+    changes = {"sensor": sensor, "pose_cov": P0} | changes
+    changes = {"visible": BetweenRanges(0.0, 3.0), "places": 14} | changes
     return dataclasses.replace(cloister(steps), **changes)
 
 

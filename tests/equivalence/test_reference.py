@@ -10,6 +10,7 @@ from cases import swept
 from reference import ekf_slam as plain
 from worlds import draw
 
+from jaxslam import sensors
 from jaxslam._driver import run
 from jaxslam.core.types import Status
 from jaxslam.filters import EkfSlam
@@ -31,6 +32,9 @@ MODELS = {
         "Q": np.diag([0.05 * 0.25 / np.sqrt(2), 0.05 * 0.25 * 2 * np.sqrt(2)]) ** 2,
         "R": 0.1**2 * np.eye(2),
     },
+}
+MODELS["growing"] = MODELS["cloister"] | {
+    "R": lambda z: np.diag([0.05**2 + (0.1 * z[0]) ** 2, 0.01**2 + 0.02**2 / (z[0] ** 2 + 0.02**2)])
 }
 
 
@@ -62,6 +66,14 @@ def assert_equal_at_every_step(states, steps):
     assert largest > 1e-4  # 1e-9 is small beside what is compared
 
 
+def growing(steps):
+    """The cloister with noise that depends on the range."""
+    noise = sensors.RangeBearingNoise(0.05, 0.01, share=0.1, across=0.02)
+    return dataclasses.replace(
+        cloister(steps), name="growing", sensor=sensors.RangeBearing(noise), filter_options={}
+    )
+
+
 CASES = {
     "cloister": (cloister(60), {"correction": "sequential", "gate": 9.0, "births": 1}),
     "circle": (circle(150), {"correction": "joint"}),
@@ -69,6 +81,8 @@ CASES = {
         dataclasses.replace(cloister(60), noise_on="odometry"),
         {"correction": "joint", "gate": 5.0, "births": 3},
     ),
+    "growing": (growing(60), {"correction": "sequential", "gate": 6.0, "births": 1}),
+    "growing joint": (growing(60), {"correction": "joint", "gate": 6.0, "births": 3}),
 }
 
 
@@ -97,7 +111,7 @@ def reference(case, log, steps=None, **changes):
     )
 
 
-@pytest.mark.parametrize("case", swept(CASES, "circle", "cloister joint with gate"))
+@pytest.mark.parametrize("case", swept(CASES, "circle", "cloister joint with gate", "growing"))
 def test_filter_equals_the_reference_at_every_step(case):
     log, trace = filtered(case)
     assert_equal_at_every_step(trace.probe, list(reference(case, log)))

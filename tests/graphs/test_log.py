@@ -59,9 +59,10 @@ def turned(pose, u):
     return np.array([pose[0] + u[1] * np.cos(h), pose[1] + u[1] * np.sin(h), h + u[2]])
 
 
-def optimum(log, points, step, sigma_w, start, root=None):
+def optimum(log, points, step, sigma_w, start, root=None, sigma_z=lambda z: SIGMA_Z):
     """(cost, poses, points) by SciPy over noises and points, as in the batch, but from the equations
-    in NumPy; root: of the covariance of the start, which else is known."""
+    in NumPy; root: of the covariance of the start, which else is known. sigma_z: of a measurement,
+    by its prediction at the last optimum, until that stays."""
     free, size = 0 if root is None else 3, len(sigma_w)
     ends = free, free + STEPS * size
 
@@ -71,18 +72,27 @@ def optimum(log, points, step, sigma_w, start, root=None):
             poses.append(step(poses[-1], u + sigma_w * w))
         return poses
 
-    def residuals(x):
-        points, out = x[ends[1] :].reshape(-1, 2), [x[: ends[1]]]
+    def predictions(x):
+        points = x[ends[1] :].reshape(-1, 2)
         for pose, *scan in zip(path(x)[1:], *log.scan, strict=True):
             for z, tag, there in zip(*scan, strict=True):
                 if there:
-                    off = z - ekf_slam.range_bearing(pose, points[tag])[0]
-                    out.append(np.array([off[0], plane.wrap(off[1])]) / SIGMA_Z)
+                    yield z, ekf_slam.range_bearing(pose, points[tag])[0]
+
+    def residuals(x, sigmas):
+        out = [x[: ends[1]]]
+        for (z, z_hat), sigma in zip(predictions(x), sigmas, strict=True):
+            off = z - z_hat
+            out.append(np.array([off[0], plane.wrap(off[1])]) / sigma)
         return np.concatenate(out)
 
-    begun = np.concatenate([np.zeros(ends[1]), points.ravel()])
+    at = np.concatenate([np.zeros(ends[1]), points.ravel()])
     ending = {"ftol": 1e-15, "xtol": 1e-15, "gtol": 1e-12}
-    found = scipy.optimize.least_squares(residuals, begun, "3-point", **ending)
+    sigmas, before = [sigma_z(z_hat) for _, z_hat in predictions(at)], None
+    while before is None or np.abs(np.subtract(sigmas, before)).max() > 1e-10:
+        found = scipy.optimize.least_squares(residuals, at, "3-point", args=(sigmas,), **ending)
+        at, before = found.x, sigmas
+        sigmas = [sigma_z(z_hat) for _, z_hat in predictions(at)]
     return found.cost, np.array(path(found.x)), found.x[ends[1] :].reshape(-1, 2)
 
 
@@ -117,6 +127,66 @@ def test_it_has_the_optimum_of_batch_map(known):
     assert set(batch.joint.tag.tolist()) == set(graph.point_id.tolist())
     order = np.searchsorted(graph.point_id, batch.joint.tag)
     np.testing.assert_allclose(batch.joint.landmarks, solution.graph.points[order], atol=1e-8)
+
+
+GROWING = {"range": 0.02, "bearing": 0.02, "share": 0.15}
+
+
+@cache
+def grown():
+    """World, log, graph, factors and solution, with a noise that grows with the range."""
+    noise = sensors.RangeBearingNoise(**GROWING)
+    here = dataclasses.replace(world(), sensor=sensors.RangeBearing(noise))
+    log = jax.device_get(simulate(here, KEY)[1])
+    graph, factors = graphs.of_log(log, here.motion, here.sensor, START, START_COV)
+    return here, log, graph, factors, graphs.optimize(graph, factors, tolerance=1e-16)
+
+
+def test_a_noise_that_grows_is_that_of_the_predictions():
+    """The optimum by SciPy with R of the predictions held, and repeated until it stays. χ² of the
+    batch and its path are the same; R at the measurements has another optimum."""
+    here, log, graph, factors, solution = grown()
+    assert solution.status == Ending.CONVERGED
+
+    def sigma_z(z):
+        return np.array([np.hypot(GROWING["range"], GROWING["share"] * z[0]), GROWING["bearing"]])
+
+    root = np.linalg.cholesky(START_COV)
+    start = log, np.asarray(graph.points), turned, SIGMA_W, np.array(START), root
+    cost, poses, points = optimum(*start, sigma_z)
+    np.testing.assert_allclose(solution.graph.points, points, atol=1e-6)
+    off = np.asarray(solution.graph.poses) - poses
+    np.testing.assert_allclose(np.c_[off[:, :2], plane.wrap(off[:, 2])], 0, atol=1e-6)
+    np.testing.assert_allclose(solution.chi2, 2 * cost, rtol=1e-8)
+    np.testing.assert_allclose(graphs.chi2(solution.graph, factors), 2 * cost, rtol=1e-8)
+    squares = graphs.squared_residuals(solution.graph, factors)
+    np.testing.assert_allclose(sum(map(np.sum, squares.values())), 2 * cost, rtol=1e-8)
+
+    trace = BatchMap(here.motion, here.sensor, 6, START, START_COV, tolerance=1e-9)(log, KEY)
+    assert trace.final.ending == Ending.CONVERGED
+    np.testing.assert_allclose(2 * trace.final.cost, solution.chi2, rtol=1e-8)
+    np.testing.assert_allclose(trace.estimate.pose[:, :2], poses[1:, :2], atol=1e-6)
+    covs = graphs.marginals(solution, factors).poses
+    np.testing.assert_allclose(covs[1:], trace.estimate.pose_cov, rtol=0, atol=1e-7)
+
+
+@pytest.mark.sweep
+def test_derivatives_where_the_noise_grows_are_differences():
+    here, log, graph, factors, _ = grown()
+    plan, random = graphs.plan(graph, factors), np.random.default_rng(2)
+    look = random.normal(size=graph.points.shape), random.normal(size=graph.poses.shape)
+
+    def seen(share):
+        noise = sensors.RangeBearingNoise(**(GROWING | {"share": share}))
+        models = here.motion, sensors.RangeBearing(noise)
+        made, by_table = graphs.of_log(log, *models, START, START_COV)
+        found = graphs.optimize(made, by_table, plan=plan, tolerance=1e-16)
+        poses, points = found.graph.poses, found.graph.points
+        return (points * look[0]).sum() + (poses * look[1]).sum() + found.chi2
+
+    both = jax.jit(jax.value_and_grad(seen))
+    ends = [both(0.15 + step)[0] for step in (1e-5, -1e-5)]
+    np.testing.assert_allclose(both(0.15)[1], (ends[0] - ends[1]) / 2e-5, rtol=1e-6)
 
 
 @pytest.mark.sweep

@@ -6,6 +6,7 @@ and its Jacobians.
 """
 
 import numpy as np
+import scipy.linalg
 
 
 def wrap(a):
@@ -85,9 +86,11 @@ def run(
 ):
     """Filter a log; scans[t] is a list of (tag, z). Yields (x, P, tags in order of birth) a step.
 
+    R: a covariance, or a function of the predicted measurement; of z for a new landmark.
     bearing: which entry of z is an angle.
     """
     x, P, tags = np.array(pose, float), np.array(pose_cov, float), []
+    noise = R if callable(R) else lambda z: R
 
     def residual(z, h):
         nu = z - h
@@ -100,7 +103,7 @@ def run(
         h, Hx, Hl = observe(x[:3], x[at : at + 2])
         H = np.zeros((len(z), len(x)))
         H[:, :3], H[:, at : at + 2] = Hx, Hl
-        return residual(z, h), H
+        return residual(z, h), H, noise(h)
 
     def update(x, P, nu, H, R):
         S = H @ P @ H.T + R
@@ -121,18 +124,17 @@ def run(
         if joint:
             accepted = []
             for tag, z in known:
-                nu, H = rows(x, P, tag, z)
-                if nu @ np.linalg.inv(H @ P @ H.T + R) @ nu <= gate:
-                    accepted.append((nu, H))
+                nu, H, R_hat = rows(x, P, tag, z)
+                if nu @ np.linalg.inv(H @ P @ H.T + R_hat) @ nu <= gate:
+                    accepted.append((nu, H, R_hat))
             if accepted:
-                nu = np.concatenate([nu for nu, _ in accepted])
-                H = np.concatenate([H for _, H in accepted])
-                x, P = update(x, P, nu, H, np.kron(np.eye(len(accepted)), R))
+                nu, H = (np.concatenate([row[k] for row in accepted]) for k in (0, 1))
+                x, P = update(x, P, nu, H, scipy.linalg.block_diag(*(R for *_, R in accepted)))
         else:
             for tag, z in known:
-                nu, H = rows(x, P, tag, z)
-                if nu @ np.linalg.inv(H @ P @ H.T + R) @ nu <= gate:
-                    x, P = update(x, P, nu, H, R)
+                nu, H, R_hat = rows(x, P, tag, z)
+                if nu @ np.linalg.inv(H @ P @ H.T + R_hat) @ nu <= gate:
+                    x, P = update(x, P, nu, H, R_hat)
 
         new = [(tag, z) for tag, z in scan if tag not in tags]
         for tag, z in new[:births]:
@@ -142,7 +144,7 @@ def run(
             big[:n, :n] = P
             big[n:, :n] = Gx @ P[:3]
             big[:n, n:] = big[n:, :n].T
-            big[n:, n:] = Gx @ P[:3, :3] @ Gx.T + Gz @ R @ Gz.T
+            big[n:, n:] = Gx @ P[:3, :3] @ Gx.T + Gz @ noise(z) @ Gz.T
             x, P = np.concatenate([x, lm]), big
             tags.append(tag)
         yield x.copy(), P.copy(), list(tags)

@@ -19,6 +19,7 @@ from jaxslam.filters._ekf.linear_system import basis_of_each
 from jaxslam.filters._ekf.map_coordinates import at_slot
 from jaxslam.filters._ekf.predicted_measurements import in_chart, projected_cov
 from jaxslam.filters._ekf.whitening import InnovationFactor, factor_of, whiten, whitened_by
+from jaxslam.linearize._first_order import predicted_noise
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._gaussians import log_density, log_det_of_pivots
 from jaxslam.math._xla import materialize, no_inline
@@ -27,6 +28,8 @@ from jaxslam.math._xla import materialize, no_inline
 class Correction(NamedTuple):
     """The results of `correct` for its m measurements; the numbers are finite for all of them."""
 
+    z_hat: Float[Array, "m Z"]
+    """the predicted measurement ẑ, from the prior"""
     innovation: Float[Array, "m Z"]
     """against the prior"""
     innovation_cov: Float[Array, "m Z Z"]
@@ -71,7 +74,7 @@ class Innovation(NamedTuple):
     hx: Float[Array, "m Z D"]
     """H X of a square-root filter, else H P"""
     noise: Float[Array, "m Z Z"]
-    """R with the linearizer's addition"""
+    """R(ẑ) with the linearizer's addition"""
     jacobians: tuple[Float[Array, "m Z 3"], Float[Array, "m Z L"]]
     """H by the errors of pose and landmark"""
     fuse: Bool[Array, "m"]
@@ -84,6 +87,7 @@ class _Linearized(NamedTuple):
 
     rows: Float[Array, "m Z 3+L+1"]
     """H by the errors of pose and landmark, and ν beside them"""
+    z_hat: Float[Array, "m Z"]
     rest: Float[Array, "m Z Z"]
     """the linearizer's addition to R"""
     seen: tuple[Float[Array, "m Z 3"], Float[Array, "m Z L"]]
@@ -124,40 +128,39 @@ def innovate(
         robot (3, D)     by pose (m, Z, 3)       (m·Z, D)     (m, Z, m, Z) = L Lᵀ
         own (m, L, D)    by landmark (m, Z, L)   V = L⁻¹ H P  ξ = Vᵀ L⁻¹ ν (D,)
 
-    Each iteration linearizes at the prior retracted by the last ξ; gate and reported numbers are
-    those of the first one.
+    Each iteration linearizes at the prior retracted by the last ξ; gate, reported numbers and
+    R(ẑ) are those of the first one. ẑ of a later one depends on the noise of z, as z itself does
+    (`predicted_noise`), by the share of the gain.
 
     memory: the state with the linearizer's memory, and the landmarks' slots (m,) there. P may
     have further columns, of other errors.
     """
     m, size_z = z.shape
     capacity = joint.landmarks.shape[0]
-    own_noise = jax.vmap(settings.sensor.noise_cov)(z)
     same = jnp.eye(m, dtype=z.dtype)[:, None, :, None]
     xi: jax.Array | None = None
-    gated: _Gated | None = None
-    for _ in range(settings.iterations):
+    for i in range(settings.iterations):
         model = _linearize(joint, slot, view, z, memory, xi, settings)
-        noise = own_noise + model.rest
         by_pose, by_landmark, nu = _split_rows(model.rows)
+        if i == 0:
+            each = jax.vmap(partial(predicted_noise, settings.sensor))
+            noise = each(model.z_hat, z, known) + model.rest
         hx, hp = _project(model.rows, view, joint, settings)
         s = projected_cov(hp, by_pose, by_landmark, slot, capacity)
         s = s + same * noise[:, :, None]
         marginal = s[jnp.arange(m), :, jnp.arange(m)]
         inverse, definite = no_inline(jax.vmap(linalg.whitener), marginal)
-        first = gated is None
-        if gated is None:
+        if i == 0:
             gated = _gate(nu, marginal, inverse, definite, known, settings.gate)
         hp = hp.reshape(m * size_z, -1)
         factored = factor_of(s, same, inverse, definite, gated.fuse)
         v, whitened = whiten(factored, gated.fuse, hp, nu)
         xi = linalg.gram(v, whitened[:, None])[:, 0]
-        if first:
+        if i == 0:
             jacobian = jnp.concatenate(model.seen, axis=2)
             basis = basis_of_each(settings.chart, joint.pose, joint.landmarks[slot])
-            correction = _report(gated, factored, whitened, jacobian, basis)
+            correction = _report(model.z_hat, gated, factored, whitened, jacobian, basis)
     assert xi is not None
-    assert gated is not None
     return Innovation(
         xi=xi,
         v=v,
@@ -203,8 +206,8 @@ def _linearize(
         here = Here(whole, chart, pose, cov, at, landmark)
         return settings.linearize.observe(at_slot(sensor, whole, at), here)
 
-    expected, by_pose, by_landmark, rest = jax.vmap(observe)(slot_in_whole, landmark, view.local)
-    nu = jax.vmap(sensor.residual)(z, expected)
+    z_hat, by_pose, by_landmark, rest = jax.vmap(observe)(slot_in_whole, landmark, view.local)
+    nu = jax.vmap(sensor.residual)(z, z_hat)
     seen = by_pose, by_landmark
     if chart.basis is not None:
         by_pose, by_landmark = in_chart(chart, joint.pose, prior, by_pose, by_landmark, moved)
@@ -213,7 +216,7 @@ def _linearize(
         nu = nu + jnp.einsum("mzi,mi->mz", by_landmark, moved[1])
     # One array, and so one kernel and not three.
     rows = materialize(jnp.concatenate([by_pose, by_landmark, nu[:, :, None]], axis=2))
-    return _Linearized(rows, rest, seen)
+    return _Linearized(rows, z_hat, rest, seen)
 
 
 def _split_rows(
@@ -250,6 +253,7 @@ def _gate(
 
 
 def _report(
+    z_hat: Float[Array, "m Z"],
     gated: _Gated,
     factored: InnovationFactor,
     whitened: Float[Array, "K"],
@@ -264,6 +268,7 @@ def _report(
     nis = (whitened.reshape(m, size_z) ** 2).sum(axis=1)
     log_likelihood = log_density(nis, log_det, size_z)
     return Correction(
+        z_hat=z_hat,
         innovation=gated.innovation,
         innovation_cov=gated.cov,
         nis=jnp.where(gated.fuse, nis, gated.distance),

@@ -67,7 +67,7 @@ class LinearMeasurements(NamedTuple):
     basis: Float[Array, "m K K"] | None
     """E, the coordinates by the errors; None is the identity"""
     noise: Float[Array, "m Z Z"]
-    """the covariance R of v"""
+    """the covariance R(ẑ) of v"""
     slot: Int[Array, "m"]
     """of the landmark"""
     fused: Bool[Array, "m"]

@@ -24,6 +24,7 @@ from jaxslam.filters._ekf.linear_system import LinearLandmarks, LinearMeasuremen
 from jaxslam.filters._ekf.predicted_measurements import prediction_of
 from jaxslam.filters._ekf.update import correct, correct_in_turn
 from jaxslam.filters._reporting import info_of, joined_info, nothing_of, seen_before, status_of
+from jaxslam.linearize._first_order import predicted_noise
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._xla import change_where, last_true_column, materialize, where_any
 from jaxslam.sensors._suite import Part, Suite, on_ground, split_scan
@@ -156,12 +157,13 @@ def _update_by_sensor(joint: Joint, scan: Scan, settings: EkfSettings) -> _ScanU
     joint, correction = by_scan(joint, scan.z, slot, matched, settings)
     joint, new = initialize_landmarks(joint, scan, found, matched, correction, settings)
     info = _report_scan(scan, found, matched, correction, new, settings)
+    fused = matched & correction.inside & correction.positive
     seen = LinearMeasurements(
         jacobian=correction.jacobian,
         basis=correction.basis,
-        noise=jax.vmap(settings.sensor.noise_cov)(scan.z),
+        noise=jax.vmap(partial(predicted_noise, settings.sensor))(correction.z_hat, scan.z, fused),
         slot=slot,
-        fused=matched & correction.inside & correction.positive,
+        fused=fused,
     )
     born = LinearLandmarks(new.slot, new.granted, new.by_pose)
     return _ScanUpdate(joint, info, new.evicted, (seen, born))

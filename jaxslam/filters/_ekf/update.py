@@ -31,8 +31,8 @@ def correct(
 ) -> tuple[Joint, Correction]:
     """The joint corrected by m measurements z (m, Z) of landmarks in slot (m,): Solà (26)-(30).
 
-    With S = H P Hᵀ + R = L Lᵀ and V = L⁻¹ H P: x ← x ⊞ Vᵀ L⁻¹ ν and P ← P - Vᵀ V, symmetric as it
-    stands. H is Z×(3+L) a measurement; where L = 0 (an absolute sensor) slot is not used.
+    With S = H P Hᵀ + R(ẑ) = L Lᵀ and V = L⁻¹ H P: x ← x ⊞ Vᵀ L⁻¹ ν and P ← P - Vᵀ V, symmetric as
+    it stands. H is Z×(3+L) a measurement; where L = 0 (an absolute sensor) slot is not used.
     Measurements not known (m,), outside the gate (ν_iᵀ S_ii⁻¹ ν_i above it, each against the prior)
     or with a singular S have no effect.
 
@@ -251,6 +251,7 @@ def _nothing(joint: Joint, unused: Measurements, chart: Chart) -> Correction:
     dtype = jnp.result_type(z, joint.pose, joint.cov)
     each, flags = jnp.zeros(m, dtype), jnp.zeros(m, bool)
     return Correction(
+        z_hat=jnp.zeros((m, size), dtype),
         innovation=jnp.zeros((m, size), dtype),
         innovation_cov=jnp.zeros((m, size, size), dtype),
         nis=each,

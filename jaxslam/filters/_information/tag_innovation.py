@@ -4,6 +4,7 @@ With what these filters share: their models and options, checked where a filter 
 """
 
 import dataclasses
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -19,7 +20,7 @@ from jaxslam.core._record import record, static
 from jaxslam.core.protocols import Filter, Motion, Sensor
 from jaxslam.core.types import Scan
 from jaxslam.filters._reporting import seen_before
-from jaxslam.linearize._first_order import observe_jacobians
+from jaxslam.linearize._first_order import observe_jacobians, predicted_noise
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import Number
 from jaxslam.math._gaussians import gaussian_terms, log_density, log_det_of_pivots
@@ -141,7 +142,7 @@ def innovations(
     index: Int[Array, "M"],
     known: Bool[Array, "M"],
 ) -> CanonicalInnovations:
-    """Gated innovations ν = z ⊖ h(x, l) and S = H Ω⁻¹ Hᵀ + R; Ω is factored once.
+    """Gated innovations ν = z ⊖ ẑ, ẑ = h(x, l), and S = H Ω⁻¹ Hᵀ + R(ẑ); Ω is factored once.
 
     A measurement whose R or S is not positive definite has no effect and is `Status.SINGULAR`, as
     are all where Ω is not.
@@ -153,10 +154,10 @@ def innovations(
     m, size = scan.z.shape
     z = jnp.where(scan.valid[:, None], scan.z, 0.0)
     measured = landmarks[index]
-    predicted = jax.vmap(sensor.observe, (None, 0))(pose, measured)
+    z_hat = jax.vmap(sensor.observe, (None, 0))(pose, measured)
     by_pose, by_landmark = jax.vmap(lambda at: observe_jacobians(sensor, pose, at))(measured)
-    innovation = jax.vmap(sensor.residual)(z, predicted)
-    noise = jax.vmap(sensor.noise_cov)(z)
+    innovation = jax.vmap(sensor.residual)(z, z_hat)
+    noise = jax.vmap(partial(predicted_noise, sensor))(z_hat, z, known)
     jacobian = stack_jacobians(by_pose, by_landmark, index, landmarks.shape[0])
 
     factor, omega_positive = linalg.cholesky(omega)

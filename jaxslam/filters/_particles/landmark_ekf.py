@@ -75,19 +75,21 @@ def _correct_landmarks(
 ) -> SlamParticles:
     """The landmarks of a particle, each corrected by a separate EKF at a known pose.
 
-    With S = H_l C H_lᵀ + R: l ← l + C H_lᵀ S⁻¹ ν, C ← C - C H_lᵀ S⁻¹ H_l C.
+    With S = H_l C H_lᵀ + R(ẑ): l ← l + C H_lᵀ S⁻¹ ν, C ← C - C H_lᵀ S⁻¹ H_l C.
     """
     sensor, pose = settings.sensor, particle.pose
 
-    def one(z: Array, landmark: Array, cov: Array) -> tuple[Array, Array]:
+    def one(z: Array, known: Array, landmark: Array, cov: Array) -> tuple[Array, Array]:
+        z_hat = sensor.observe(pose, landmark)
         by_landmark = jax.jacfwd(sensor.observe, argnums=1)(pose, landmark)
         hc = linalg.matmul(by_landmark, cov)
-        s = linalg.symmetrize(linalg.matmul(hc, by_landmark.T) + sensor.noise_cov(z))
-        terms = gaussian_terms(sensor.residual(z, sensor.observe(pose, landmark)), s)
+        noise = first_order.predicted_noise(sensor, z_hat, z, known)
+        s = linalg.symmetrize(linalg.matmul(hc, by_landmark.T) + noise)
+        terms = gaussian_terms(sensor.residual(z, z_hat), s)
         v = linalg.solve_lower(terms.factor, hc)
         return landmark + linalg.matmul(terms.whitened[None], v)[0], cov - linalg.gram(v, v)
 
-    landmarks, covs = jax.vmap(one)(scan.z, particle.landmarks[slot], particle.covs[slot])
+    landmarks, covs = jax.vmap(one)(scan.z, used, particle.landmarks[slot], particle.covs[slot])
     into = jnp.where(used, slot, particle.landmarks.shape[0])
     return particle._replace(
         landmarks=particle.landmarks.at[into].set(landmarks, mode="drop"),

@@ -1,9 +1,10 @@
 """The likelihood of a scan given a pose in a known map.
 
 All functions act on one pose; `particle_localization` vmaps them. Pose and map have no error here,
-so the covariance of an innovation is the sensor's noise.
+so the covariance of an innovation is the sensor's noise R(ẑ), which differs between poses.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -20,7 +21,9 @@ from jaxslam.filters._particles.scan_association import (
     gate_distance,
     particle_association,
 )
-from jaxslam.math._gaussians import GaussianTerms, gaussian_terms, log_density
+from jaxslam.linearize._first_order import predicted_noise
+from jaxslam.math import _linalg as linalg
+from jaxslam.math._gaussians import gaussian_terms, log_density, log_det_of
 from jaxslam.sensors._suite import split_scan
 
 
@@ -33,21 +36,24 @@ class ScanLikelihood(NamedTuple):
     """of the landmark measured; -1 of an absolute sensor"""
     matched: Bool[Array, "*P M"]
     positive: Bool[Array, "*P M"]
-    """R is positive definite"""
+    """R(ẑ) is positive definite"""
     inside: Bool[Array, "*P M"]
     """in the gate; without one, of a d² that did not overflow"""
     innovation: Float[Array, "*P M Z"]
     innovation_cov: Float[Array, "*P M Z Z"]
-    """R"""
+    """R(ẑ)"""
     nis: Float[Array, "*P M"]
-    """d² = νᵀ R⁻¹ ν"""
+    """d² = νᵀ R(ẑ)⁻¹ ν"""
     dof: Int[Array, "*P M"]
     """Z of the sensor"""
     counted: Float[Array, "*P M"]
     """d² in the weight: clipped at the gate, `unmatched_distance` without a landmark, 0 where
     there is no measurement"""
+    spread: Float[Array, "*P M"]
+    """log |R(ẑ)| - log |R(z)| of measurements matched to a landmark, else 0; the latter is the same
+    at all poses"""
     log_density: Float[Array, "*P M"]
-    """-(counted + log |2πR|)/2 of measurements matched to a landmark, else 0"""
+    """-(counted + log |2πR(ẑ)|)/2 of measurements matched to a landmark, else 0"""
     exhausted: Bool[Array, "*P"]
     """of the association"""
 
@@ -88,15 +94,11 @@ def _sensor_likelihood(
     # In a suite an absolute sensor, whose landmarks have no parameters, shares the others' map.
     landmarks = jnp.asarray(settings.landmarks, pose.dtype)[:, :size_l]
     slot, matched, _, exhausted = _associate_known(pose, scan, landmarks, settings)
-    noise = jax.vmap(sensor.noise_cov)(scan.z)
-
-    def compare(
-        z: Float[Array, "Z"], slot: Int[Array, ""], noise: Float[Array, "Z Z"]
-    ) -> tuple[Float[Array, "Z"], GaussianTerms]:
-        nu = sensor.residual(z, sensor.observe(pose, landmarks[slot]))
-        return nu, gaussian_terms(nu, noise)
-
-    nu, terms = jax.vmap(compare)(scan.z, slot, noise)
+    z_hat = jax.vmap(sensor.observe, (None, 0))(pose, landmarks[slot])
+    noise = jax.vmap(partial(predicted_noise, sensor))(z_hat, scan.z, matched)
+    nu = jax.vmap(sensor.residual)(scan.z, z_hat)
+    terms = jax.vmap(gaussian_terms)(nu, noise)
+    factor_at_z = jax.vmap(lambda z: linalg.cholesky(sensor.noise_cov(z))[0])(scan.z)
     gated = gate_distance(terms.distance, settings.gate)
     of_map = matched & terms.positive
     far = jnp.asarray(settings.unmatched_distance, scan.z.dtype)
@@ -114,6 +116,7 @@ def _sensor_likelihood(
         nis=jnp.where(matched, gated.reported, 0.0),
         dof=jnp.full_like(slot, size_z),
         counted=counted,
+        spread=jnp.where(of_map, terms.log_det - jax.vmap(log_det_of)(factor_at_z), 0.0),
         log_density=jnp.where(of_map, density, 0.0),
         exhausted=exhausted,
     )
@@ -136,6 +139,7 @@ def _ignored_likelihood(
         nis=zero,
         dof=jnp.full_like(none, size),
         counted=zero,
+        spread=zero,
         log_density=zero,
         exhausted=jnp.asarray(False),
     )
@@ -158,7 +162,7 @@ def _associate_known(
 def _predict_known(
     pose: Float[Array, "3"], landmarks: Float[Array, "N L"], settings: KnownMapSensor
 ) -> Prediction:
-    """The `Prediction` of a known map from an exact pose: S_ij = R_i."""
+    """The `Prediction` of a known map from an exact pose: S_ij = R(ẑ_j)."""
     sensor, count = settings.sensor, landmarks.shape[0]
     size = len(sensor.measurements)
 

@@ -102,10 +102,11 @@ class ParticleLocalization(MonteCarloFilter):
         sensors = known_map_sensors(self)
         likelihood = jax.vmap(partial(scan_likelihood, scan=scan, sensors=sensors))(state.pose)
         log_likelihood = normalized(state.log_weight + likelihood.log_density.sum(axis=1))[1]
-        # Besides d², a weight has the term log |2πR|, which is the same for all.
-        misfit = 0.5 * likelihood.counted.sum(axis=1)
+        misfit = 0.5 * (likelihood.counted + likelihood.spread).sum(axis=1)
+        # Recovery compares scans, and so leaves out how large their noise is.
+        fit = 0.5 * likelihood.counted.sum(axis=1)
         measured = likelihood.measured[0].sum()
-        state, found = self.weigh(state, misfit, misfit, measured)
+        state, found = self.weigh(state, misfit, fit, measured)
         info = _info_of_scan(scan, likelihood, state.log_weight, log_likelihood)
         return state, with_extra(info, "particles", found)
 

@@ -91,13 +91,13 @@ def propose_pose(
     et al. 2003, FastSLAM 2.0): with H_x, H_l at the means of pose and landmark, C the landmark's
     covariance,
 
-        S = H_x P H_xᵀ + H_l C H_lᵀ + R    x ← x + P H_xᵀ S⁻¹ ν    P ← P - P H_xᵀ S⁻¹ H_x P
+        S = H_x P H_xᵀ + H_l C H_lᵀ + R(ẑ)    x ← x + P H_xᵀ S⁻¹ ν    P ← P - P H_xᵀ S⁻¹ H_x P
         log w += log N(ν; 0, S)
 
     whose product is the density of the scan given the path. P = 0 (a pose that is drawn
     already) is not changed, and gives the weights of FastSLAM 1.0. P is not inverted, so it may be
     singular. A measurement outside the gate gets the d² of the gate, and one without a landmark
-    d² = `unmatched_distance` of a landmark known exactly, log N = -(d² + log |2πR|)/2, so that a
+    d² = `unmatched_distance` of a landmark known exactly, log N = -(d² + log |2πR(z)|)/2, so that a
     particle with fewer associations is not preferred.
     """
     sensor, gate = settings.sensor, settings.gate
@@ -110,8 +110,9 @@ def propose_pose(
         x, p, log_matched, log_unmatched = carry
         z, landmark, cov, matched, valid = row
         by_pose, by_landmark = first_order.observe_jacobians(sensor, x, landmark)
-        noise = sensor.noise_cov(z)
-        nu = sensor.residual(z, sensor.observe(x, landmark))
+        z_hat = sensor.observe(x, landmark)
+        noise = first_order.predicted_noise(sensor, z_hat, z, matched)
+        nu = sensor.residual(z, z_hat)
         hp = linalg.matmul(by_pose, p)
         s = linalg.matmul(hp, by_pose.T) + noise
         s = linalg.symmetrize(s + linalg.matmul(linalg.matmul(by_landmark, cov), by_landmark.T))

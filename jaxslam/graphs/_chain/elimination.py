@@ -31,13 +31,24 @@ noise; and () bool, whether the covariance of that noise is positive definite.""
 
 
 def whitened_rows(
-    sensor: Sensor, z: Float[Array, "Z"], pose: Float[Array, "3"], landmark: Float[Array, "L"]
+    sensor: Sensor,
+    z: Float[Array, "Z"],
+    pose: Float[Array, "3"],
+    landmark: Float[Array, "L"],
+    used: Bool[Array, ""],
+    at_landmark: Float[Array, "L"] | None = None,
 ) -> Rows:
-    """The rows of a measurement: R^{-1/2} times H_pose, H_l and z ⊖ h."""
-    by_pose, by_landmark = first_order.observe_jacobians(sensor, pose, landmark)
-    innovation = sensor.residual(z, sensor.observe(pose, landmark))
-    factor, positive = linalg.cholesky(sensor.noise_cov(z))
-    a, b, r = (linalg.solve_lower(factor, part) for part in (by_pose, by_landmark, innovation))
+    """The rows of a measurement: R(ẑ)^{-1/2} times H_pose, H_l and z ⊖ ẑ.
+
+    used: whether it is one of this landmark. at_landmark: where H is taken, if elsewhere.
+    """
+    at_landmark = landmark if at_landmark is None else at_landmark
+    by_pose, by_landmark = first_order.observe_jacobians(sensor, pose, at_landmark)
+    z_hat = sensor.observe(pose, landmark)
+    noise = first_order.predicted_noise(sensor, z_hat, z, used)
+    factor, positive = linalg.cholesky(noise)
+    parts = by_pose, by_landmark, sensor.residual(z, z_hat)
+    a, b, r = (linalg.solve_lower(factor, part) for part in parts)
     return a, b, r, positive
 
 

@@ -22,6 +22,7 @@ from jaxslam.graphs._chain.elimination import (
     whitened_rows,
 )
 from jaxslam.graphs._solver.search import Ending
+from jaxslam.linearize._first_order import predicted_noise
 from jaxslam.math import _linalg as linalg
 from jaxslam.math.angles import wrap
 
@@ -53,20 +54,25 @@ class Iterate(NamedTuple):
     landmarks: Float[Array, "N L"]
 
 
-def cost(sensor: Sensor, problem: Problem, at: Iterate) -> Float[Array, ""]:
+def cost(sensor: Sensor, problem: Problem, at: Iterate, held: Iterate) -> Float[Array, ""]:
     """The cost ½ |ξ|² + ½ Σ |η_t|² + ½ Σ |R^{-1/2} (z ⊖ h(x_t, l))|² of an iterate.
 
-    Minus the log posterior density, up to a constant, for fixed noise covariances. The path is that
-    of the iterate.
+    Minus the log posterior density, up to a constant, for fixed noise covariances: R is that of the
+    predictions of another iterate, `held`. A cost with R at its own predictions would fall where R
+    grows, and so prefer long ranges. The path is that of the iterate.
     """
 
-    def square(z: Array, slot: Array, used: Array, pose: Array) -> Array:
+    def square(z: Array, slot: Array, used: Array, pose: Array, held_pose: Array) -> Array:
+        z_hat = sensor.observe(held_pose, held.landmarks[slot])
+        noise = predicted_noise(sensor, z_hat, z, used)
         residual = sensor.residual(z, sensor.observe(pose, at.landmarks[slot]))
-        white = linalg.solve_lower(linalg.cholesky(sensor.noise_cov(z))[0], residual)
-        return jnp.where(used, (white**2).sum(), 0.0)
+        factor, positive = linalg.cholesky(noise)
+        white = linalg.solve_lower(factor, residual)
+        return jnp.where(used & positive, (white**2).sum(), 0.0)
 
-    over_slots = jax.vmap(square, (0, 0, 0, None))
-    each = jax.vmap(over_slots)(problem.z, problem.slot, problem.used, at.path[1:])
+    over_slots = jax.vmap(square, (0, 0, 0, None, None))
+    data = problem.z, problem.slot, problem.used
+    each = jax.vmap(over_slots)(*data, at.path[1:], held.path[1:])
     return 0.5 * ((at.start**2).sum() + (at.noise**2).sum() + each.sum())
 
 
@@ -84,11 +90,9 @@ def _linearize_at(motion: Motion, sensor: Sensor, problem: Problem, at: Iterate)
     by_pose, by_noise = jax.vmap(moved)(at.path[:-1], problem.control, problem.roots, at.noise)
 
     def measured(z: Array, slot: Array, used: Array, pose: Array) -> tuple[Array, Array, Array]:
-        *rows, _ = whitened_rows(sensor, z, pose, at.landmarks[slot])
-        a, b, r = (
-            jnp.pad(jnp.where(used, row, 0.0), [(0, spare)] + [(0, 0)] * (row.ndim - 1))
-            for row in rows
-        )
+        *rows, positive = whitened_rows(sensor, z, pose, at.landmarks[slot], used)
+        rows = [jnp.where(used & positive, row, 0.0) for row in rows]
+        a, b, r = (jnp.pad(row, [(0, spare)] + [(0, 0)] * (row.ndim - 1)) for row in rows)
         return a, b, r
 
     over_slots = jax.vmap(measured, (0, 0, 0, None))
@@ -145,6 +149,7 @@ class Iterations(NamedTuple):
     policy: Policy
     """the chain's solution"""
     cost: Float[Array, ""]
+    """of the iterate, R at its own predictions"""
     costs: Float[Array, "iterations"]
     """after each step, that of the last repeated"""
     taken: Int[Array, ""]
@@ -177,9 +182,11 @@ def optimize_chain(
         if tolerance is not None:
             converged = _has_converged(search, policy, tolerance)
         may = (search.taken < iterations) & ~converged
-        after, value, lower = _line_search(motion, sensor, problem, search, policy)
+        after, lower = _line_search(motion, sensor, problem, search, policy)
         moved = may & lower
-        trial = after, _linearize_at(motion, sensor, problem, after), value
+        chain = _linearize_at(motion, sensor, problem, after)
+        squares = [(part**2).sum() for part in (after.start, after.noise, chain.steps.residual)]
+        trial = after, chain, 0.5 * linalg.total(squares)
         here = search.at, search.chain, search.cost
         at, chain, value = jax.tree.map(lambda a, b: jnp.where(moved, a, b), trial, here)
         ending = jnp.where(converged, Ending.CONVERGED, Ending.EXHAUSTED)
@@ -237,13 +244,13 @@ def _has_converged(search: Iterations, policy: Policy, tolerance: float) -> Bool
 
 def _line_search(
     motion: Motion, sensor: Sensor, problem: Problem, search: Iterations, policy: Policy
-) -> tuple[Iterate, Float[Array, ""], Bool[Array, ""]]:
-    """The iterate at the first share of the step that lowers the cost enough, its cost, and whether
+) -> tuple[Iterate, Bool[Array, ""]]:
+    """The iterate at the first share of the step that lowers the cost enough, R held, and whether
     there is such a share. The first step may raise the cost, if it stays finite."""
     kind = search.cost.dtype
     shares, eps = jnp.asarray(_SHARES, kind), float(jnp.finfo(kind).eps)
     tried = jax.vmap(lambda share: roll_out(motion, problem, search.at, policy, share))(shares)
-    costs = jax.vmap(lambda at: cost(sensor, problem, at))(tried)
+    costs = jax.vmap(lambda at: cost(sensor, problem, at, search.at))(tried)
     # To first order a step lowers the cost by share · λ²; the margin is the rounding of sums.
     first = search.taken == 0
     known = jnp.where(first, 0.0, search.cost)
@@ -251,4 +258,4 @@ def _line_search(
     good = jnp.isfinite(costs) & (first | (costs <= enough))
     chosen = jnp.argmax(good)
     after: Iterate = jax.tree.map(lambda leaf: leaf[chosen], tried)
-    return after, costs[chosen], good.any()
+    return after, good.any()

@@ -103,10 +103,11 @@ def linearize_window(
         return by_pose, jnp.where(present, by_noise @ root, 0.0)
 
     def measured(z: Array, slot: Array, used: Array, pose: Array) -> tuple[Array, Array, Array]:
-        a, b, r, _ = whitened_rows(sensor, z, pose, at.landmarks[slot])
-        if first:
-            a, b, _, _ = whitened_rows(sensor, z, pose, landmark_points[slot])
-        return tuple(jnp.where(used, row, 0.0) for row in (a, b, r))  # type: ignore[return-value]
+        *rows, positive = whitened_rows(
+            sensor, z, pose, at.landmarks[slot], used, landmark_points[slot]
+        )
+        a, b, r = (jnp.where(used & positive, row, 0.0) for row in rows)
+        return a, b, r
 
     data = steps.control, steps.root, at.noise, steps.present
     by_pose, by_noise = jax.vmap(moved)(at.path[:-1], *data)

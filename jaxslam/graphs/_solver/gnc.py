@@ -8,7 +8,14 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.graphs._graph import Graph
 from jaxslam.graphs._solver.kernels import Truncated
-from jaxslam.graphs._solver.linearized import chi2_of, data_of, row_costs, row_weights, variables_of
+from jaxslam.graphs._solver.linearized import (
+    chi2_of,
+    data_of,
+    held_data,
+    row_costs,
+    row_weights,
+    variables_of,
+)
 from jaxslam.graphs._solver.model import Model
 from jaxslam.graphs._solver.plans import Plan
 from jaxslam.graphs._solver.search import Ending, Solution, minimize
@@ -65,6 +72,8 @@ def graduated(
 
     def ratios(found: Solution) -> dict[str, Array]:
         """s/c² of the rows that can be left out."""
+        here = variables_of(found.graph)
+        held = held_data(model, plan.who, here, data)
         out = {}
         for name, factor in model.factors.items():
             if name in truncated:
@@ -72,9 +81,9 @@ def graduated(
                     factor,
                     None,
                     plan.who[name],
-                    variables_of(found.graph),
-                    data.z[name],
-                    data.information[name],
+                    here,
+                    held.z[name],
+                    held.information[name],
                 )[1]
                 out[name] = truncated[name].ratio(jnp.where(data.valid[name], s, 0.0))
         return out

@@ -88,10 +88,26 @@ def row_costs(
     return e, s, s if kernel is None else kernel.cost(s)
 
 
+def held_data(model: Model, who: Mapping[str, Array], at: Variables, data: Data) -> Data:
+    """The data with Wᵀ Ω W as the information of factors that whiten, W at the variables `at`."""
+    information = dict(data.information)
+    for name, factor in model.factors.items():
+        if factor.whiten is None:
+            continue
+        w = _over_rows(factor.whiten, _taken(factor, who[name], at), data.z[name])
+        information[name] = jnp.einsum("erib,ersb,esjb->eijb", w, information[name], w)
+    return data._replace(information=information)
+
+
 def chi2_of(
-    model: Model, who: Mapping[str, Array], variables: Variables, data: Data
+    model: Model,
+    who: Mapping[str, Array],
+    variables: Variables,
+    data: Data,
+    held: Variables | None = None,
 ) -> Float[Array, "B"]:
-    """The cost χ² of the graph at some variables."""
+    """The cost χ² of the graph at some variables; held: where factors whiten, if elsewhere."""
+    data = held_data(model, who, variables if held is None else held, data)
     parts = []
     for name, factor in model.factors.items():
         rows = row_costs(
@@ -110,6 +126,7 @@ def row_weights(
     model: Model, who: Mapping[str, Array], variables: Variables, data: Data
 ) -> dict[str, Float[Array, "_ B"]]:
     """The weights ρ'(s) of the rows of each table: 1 without a kernel, 0 where not valid."""
+    data = held_data(model, who, variables, data)
     weights = {}
     for name, factor in model.factors.items():
         z, info, kernel = data.z[name], data.information[name], model.kernels.get(name)
@@ -123,6 +140,7 @@ def row_weights(
 
 def linearize(model: Model, plan: Plan, variables: Variables, data: Data) -> System:
     """The normal equations about the variables."""
+    data = held_data(model, plan.who, variables, data)
     width, poses = data.free.shape[1], len(variables.poses)
     chi2, gradients, blocks = [], [], []
     for name, factor in model.factors.items():
@@ -162,7 +180,8 @@ def _assemble(plan: Plan, blocks: list[Array], data: Data) -> Float[Array, "M d 
 def half_hessian(
     model: Model, plan: Plan, variables: Variables, data: Data
 ) -> Float[Array, "M d d B"]:
-    """Half the second derivative of χ² by the increments, as `System.blocks`."""
+    """Half the second derivative of χ² by the increments, as `System.blocks`; information held."""
+    data = held_data(model, plan.who, variables, data)
     width, poses = data.free.shape[1], len(variables.poses)
     blocks = []
     for name, factor in model.factors.items():

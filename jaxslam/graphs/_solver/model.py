@@ -23,6 +23,11 @@ class Model:
     kernels: dict[str, Kernel]
     """of the tables that have one"""
 
+    @property
+    def holds(self) -> bool:
+        """Whether the noise of a factor depends on the variables (`Factor.whiten`)."""
+        return any(factor.whiten is not None for factor in self.factors.values())
+
 
 def model_of(
     name: str,

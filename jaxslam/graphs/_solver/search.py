@@ -11,6 +11,7 @@ from jaxslam.graphs._graph import Graph
 from jaxslam.graphs._solver.linearized import (
     System,
     Variables,
+    chi2_of,
     data_of,
     linearize,
     retract,
@@ -167,7 +168,10 @@ def minimize(
         """The search after its trial is accepted or refused."""
         trial = linearize(model, plan, search.trial, data)
         finite, began = jnp.isfinite(trial.chi2), search.taken < 0
-        gain = search.system.chi2 - trial.chi2
+        lowered = trial.chi2
+        if model.holds:
+            lowered = chi2_of(model, plan.who, search.trial, data, held=search.variables)
+        gain = search.system.chi2 - lowered
         ratio = gain / jnp.where(search.predicted > 0, search.predicted, 1.0)
         # A step hardly damped may go uphill, as far as the iterate before: it crosses curved
         # valleys along which damped steps crawl (Grippo, Lampariello and Lucidi 1986, "A

@@ -46,8 +46,8 @@ class BatchSolution(NamedTuple):
     cost: Float[Array, ""]
     """½ Σ of the squared, whitened residuals"""
     costs: Float[Array, "iterations"]
-    """after each step, that of the last repeated; infinite where not even the first,
-    to the smoother's path, has a finite cost"""
+    """after each step, that of the last repeated, falling where R is constant; infinite where
+    not even the first, to the smoother's path, has a finite cost"""
     iterations: Int[Array, ""]
     """steps taken"""
     step: Float[Array, ""]
@@ -68,7 +68,8 @@ class BatchMap(LogEstimator):
     solves for all unknowns (`eliminate`): a Gauss-Newton step is a smoother, and
     iterating the smoother is Gauss-Newton (Bell 1994, "The iterated Kalman smoother as a
     Gauss-Newton method", SIAM J. Optimization 4(3)). A step is shortened until the cost falls
-    (Armijo). P0 and Q may be singular; O(T N²) a step.
+    (Armijo). P0 and Q may be singular; O(T N²) a step. R is that of the predictions of an iterate,
+    held while its step is computed and judged (`graphs.FromSensor`).
 
     It maps (log, key) to a `Trace`: estimates with leading T, the poses at the optimum
     with their covariances there (Laplace's), the map the same at every step; the infos of the

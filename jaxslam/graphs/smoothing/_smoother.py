@@ -97,7 +97,7 @@ def _measurements(
         z: Array, slot: Array, fused: Array, new: Array, at: tuple[Array, ...]
     ) -> tuple[Array, Array, Array, Array]:
         predicted, predicted_map, corrected, corrected_map = at
-        *parts, positive = whitened_rows(sensor, z, predicted, predicted_map[slot])
+        *parts, positive = whitened_rows(sensor, z, predicted, predicted_map[slot], fused)
         rows = [padded(part) for part in parts]
         pose, landmark = predicted, predicted_map[slot]
         if size_l > 0:

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import worlds
 from cases import refused
-from test_smoothing import KEY, P0, START, arguments, linear_log, linear_world
+from test_smoothing import KEY, P0, START, arguments, linear_log, linear_world, regular
 
 from jaxslam import motion, run, sensors, simulate
 from jaxslam.core.types import Log, Scan, Status
@@ -37,8 +37,11 @@ def lag(world, **options):
 
 @pytest.mark.sweep
 def test_a_window_as_long_as_the_log_is_the_batch(short):
-    world, log = short
-    filter = lag(world, window=4, iterations=5)
+    """With a noise that grows with the range, held at the predictions of each iterate."""
+    grows = sensors.RangeBearing(sensors.RangeBearingNoise(0.03, 0.02, share=0.1))
+    world = dataclasses.replace(short[0], sensor=grows)
+    log = simulate(world, KEY)[1]
+    filter = lag(world, window=4, iterations=12)
     trace = run(filter, log, world.pose, world.pose_cov, KEY)
     batch = BatchMap(*arguments(world))(log, KEY)
     for name in ("pose", "pose_cov", "points", "point_covs"):
@@ -69,20 +72,15 @@ def test_in_a_linear_world_it_is_the_kalman_filter():
     """What leaves the window is marginalized without loss; landmarks enter at any time."""
     log = linear_log(steps=9)
     moves, sees = linear_world()
-    kalman = run(EkfSlam(moves, sees, 4, correction="joint"), regular(log), START, P0, KEY)
+    used = log._replace(scan=log.scan._replace(valid=regular(log)))
+    kalman = run(EkfSlam(moves, sees, 4, correction="joint"), used, START, P0, KEY)
     trace = run(FixedLag(moves, sees, 4, 4, window=3, iterations=1), log, START, P0, KEY)
     for ours, theirs in zip(trace.estimate, kalman.estimate, strict=True):
         np.testing.assert_allclose(ours, theirs, rtol=1e-8, atol=1e-10)
     np.testing.assert_allclose(trace.final.joint.cov, kalman.final.cov, rtol=1e-8, atol=1e-10)
-    exact = np.asarray(log.scan.valid) & ~np.asarray(regular(log).scan.valid)
+    exact = log.scan.valid & ~regular(log)
     assert exact.sum() == 1
     assert (np.asarray(trace.info.status)[exact] == Status.SINGULAR).all()
-
-
-def regular(log):
-    """The log without the measurement that claims to be exact."""
-    exact = log.scan.z[:, :, 0] == 5.0
-    return log._replace(scan=log.scan._replace(valid=log.scan.valid & ~exact))
 
 
 @pytest.mark.sweep
