@@ -89,7 +89,7 @@ def case(name: str, scale: float) -> tuple[World, Any]:
         return there, smoothing.Smoother(*parts, there.pose, there.pose_cov)
     if name == "batch_map":
         return there, smoothing.BatchMap(*parts, there.pose, there.pose_cov)
-    return there, catalog.ALL[name](there, gate=9.21 * scale)
+    return there, catalog.ALL[name](there, gate=0.9 * scale)
 
 
 @jax.jit

@@ -28,7 +28,6 @@ from jaxslam.association import Nearest
 from jaxslam.filters import DelayedSlam, EkfSlam, Hypotheses, Promotion, StoredMeasurements
 from jaxslam.math._gaussians import mahalanobis_squared
 from jaxslam.math.angles import wrap
-from jaxslam.math.stats import chi2_quantile
 from jaxslam.simulation.scenarios import cloister
 
 SIGMA = np.deg2rad(1.0)
@@ -67,7 +66,6 @@ def nameless():
         landmarks=[[4.0, 5.0], [-3.0, 4.0], [-2.0, 0.5], [5.0, -1.0], [0.5, 8.0]],
         controls=np.tile([0.2, 0.08], (120, 1)),
     )
-    gates = chi2_quantile(0.99, 1), chi2_quantile(0.9999, 1)
     filter = DelayedSlam(
         scenario.motion,
         camera,
@@ -75,7 +73,7 @@ def nameless():
         stored=StoredMeasurements(capacity=40),
         hypotheses=Hypotheses(capacity=40, decay=0.7),
         promotion=Promotion(persistence=6),
-        associate=Nearest(*gates),
+        associate=Nearest(0.99, 0.9999),
     )
     return scenario, filter
 

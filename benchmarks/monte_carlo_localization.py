@@ -23,7 +23,7 @@ from benchmarks.gate import Metric, show
 from jaxslam import run, sensors, simulate
 from jaxslam.filters import Localization, ParticleLocalization
 from jaxslam.filters._particles import pose_particles
-from jaxslam.math.stats import chi2_quantile
+from jaxslam.math.stats import sigma_gate
 from jaxslam.simulation.scenarios import circle
 
 BOX = np.array([[-14.0, -4.0], [14.0, 23.0]])
@@ -49,16 +49,21 @@ def filters_of(world):
     anywhere = pose_particles.uniform_pose_moments(jnp.asarray(BOX))
     known = jnp.array([0.0, 0.5 / np.deg2rad(1.5), np.pi]), jnp.zeros((3, 3))
     models = world.motion, world.sensor, world.landmarks
-    gate = chi2_quantile(0.999, 2)
     return {
         "particles": (
             ParticleLocalization(
-                world.motion, blunt, world.landmarks, PARTICLES, box=BOX, start="uniform", gate=25.0
+                world.motion,
+                blunt,
+                world.landmarks,
+                PARTICLES,
+                box=BOX,
+                start="uniform",
+                gate=sigma_gate(5, 2),
             ),
             *anywhere,
         ),
         "EKF, box, no gate": (Localization(*models), *anywhere),
-        "EKF, start, gate": (Localization(*models, gate=gate), *known),
+        "EKF, start, gate": (Localization(*models, gate=0.999), *known),
     }
 
 

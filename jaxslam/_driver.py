@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
+from jaxslam.association._rules import Known
 from jaxslam.core._numbers import check_covariance, check_key, is_concrete, largest, shape_text
 from jaxslam.core._validation import (
     call_traced,
@@ -19,7 +20,7 @@ from jaxslam.core._validation import (
     same_state,
     state_and_info,
 )
-from jaxslam.core.protocols import Filter
+from jaxslam.core.protocols import Filter, Wrapper
 from jaxslam.core.types import Log, Scan, Status, Trace
 from jaxslam.math._xla import hot_jit
 
@@ -53,8 +54,8 @@ def run(
         Trace with estimates and infos of leading axis T, and the final state.
     Raises:
         ValueError: on wrong shapes or kinds, and, where the values are concrete, on NaN or too
-            large numbers in controls or valid measurements, tags repeated within a scan, or an
-            invalid pose_cov.
+            large numbers in controls or valid measurements, tags repeated within a scan or
+            beyond a known map, or an invalid pose_cov.
     Warns:
         UserWarning: on concrete ranges below 0, which a sensor writes where it met nothing. Noise
             makes few of them of landmarks that are near.
@@ -77,6 +78,19 @@ def check_run(name: str, filter: Filter, log: Log, pose: ArrayLike, pose_cov: Ar
         measurement_size=len(filter.measurements),
         parts=filter.places,
     )
+    inner = filter
+    while isinstance(inner, Wrapper):
+        inner = inner.filter
+    by_tag = isinstance(getattr(inner, "associate", None), Known)
+    size, scan = filter.map_size, log.scan
+    # Of a suite the absolute sensors, whose tags mean nothing, are not told from the others here.
+    if by_tag and size is not None and not filter.places and is_concrete(scan.tag, scan.valid):
+        tag = np.max(np.where(scan.valid, scan.tag, -1), initial=-1)
+        if tag >= size:
+            raise ValueError(
+                f"{name}: the log has a measurement of landmark {tag}, the map of {filter.name} "
+                f"has {size}, 0 to {size - 1}; a map of some landmarks needs their tags"
+            )
     if (got := shape_text(pose)) != "(3,)":
         raise ValueError(f"{name}: expected a pose (x, y, θ) of shape (3,), got {got}")
     if is_concrete(pose):

@@ -17,7 +17,6 @@ from jaxslam.core.types import Status
 from jaxslam.filters import Closing, EkfSlam, LoopSettings
 from jaxslam.life import Recency
 from jaxslam.math.angles import wrap
-from jaxslam.math.stats import chi2_quantile
 from jaxslam.results.plot import COLORS, INK, PAGE, SHADE, caption, panels_of, titled
 from jaxslam.simulation.scenarios import BetweenRanges
 from jaxslam.simulation.spurious import Spurious
@@ -25,7 +24,7 @@ from jaxslam.simulation.spurious import Spurious
 RUNS, BLOCK = 50, 10
 RADIUS, COUNT, CAPACITY = 30.0, 72, 120
 ROUND, MORE, STEP = 240, 80, 2 * np.pi * RADIUS / 240
-GATE = chi2_quantile(0.99, 2)
+GATE = 0.99
 SEARCH = LoopSettings(window=30, cluster=10, sightings=2, least=5, candidates=32)
 SHOWN = 5
 """the run of the figure"""

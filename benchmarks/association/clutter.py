@@ -10,14 +10,13 @@ from jaxslam import motion
 from jaxslam.consistency.campaign import monte_carlo
 from jaxslam.filters import EkfSlam
 from jaxslam.life import Existence
-from jaxslam.math.stats import chi2_quantile
 from jaxslam.simulation.scenarios import BetweenRanges, cloister
 from jaxslam.simulation.spurious import Spurious
 
 RUNS = 32
 REACH = 4.0
 CAPACITY = 60
-GATES = chi2_quantile(0.99, 2), chi2_quantile(0.9999, 2)
+GATES = 0.99, 0.9999
 METHODS = rules(*GATES, budget=500)
 ROWS = ("precision", "recall", "false_landmarks", "nees_pose", "rmse_position")
 

@@ -18,14 +18,13 @@ from jaxslam.filters._ekf.ekf_settings import EkfSettings
 from jaxslam.filters._ekf.predicted_measurements import prediction_of
 from jaxslam.math.angles import wrap
 from jaxslam.math.linalg import root_psd
-from jaxslam.math.stats import chi2_quantile
 from jaxslam.results.plot import PAGE, caption, curve, panels_of, titled
 from jaxslam.sensors import RangeBearing
 
 COUNT, SEEN, DRAWS = 14, 8, 500
 SIGMAS = np.array([0.5, 2, 4, 6, 8, 10, 12, 15, 20, 25, 30, 35, 40, 45])
 SENSOR = RangeBearing(np.diag([0.1, np.deg2rad(1.0)]) ** 2)
-METHODS = rules(chi2_quantile(0.99, 2), budget=20_000, candidates=COUNT)
+METHODS = rules(0.99, budget=20_000, candidates=COUNT)
 
 
 def decide(method, sigma, key):

@@ -34,12 +34,11 @@ from jaxslam.calibration import calibrate
 from jaxslam.core.types import Status
 from jaxslam.filters import EkfSlam
 from jaxslam.life import Recency
-from jaxslam.math.stats import chi2_quantile
 
 CAPACITY, LOCAL, PATIENCE = 200, 16, 30
 NARROW, WIDE = ((0.02, 0.02, 0.003), 0.3), ((0.03, 0.03, 0.006), 0.3)
 """standard deviations a step [m, m, rad], and of a measurement [m]"""
-GATE, WIDE_GATE, NEW_GATE = (chi2_quantile(1 - p, 2) for p in (1e-3, 1e-5, 1e-7))
+GATE, WIDE_GATE, NEW_GATE = 1 - 1e-3, 1 - 1e-5, 1 - 1e-7
 SETTINGS = {
     "narrow": (NARROW, GATE),
     "narrow, wide gate": (NARROW, WIDE_GATE),

@@ -45,7 +45,7 @@ ASKED = 0.15, 6.0
 HELD = {2: (0.3, 6.0), 3: (0.15, 6.0), 4: (0.25, 6.0), 5: (0.25, 6.0)}
 """Gates of the invariant EKF with the constants of their own logs, considered, ATE and median NEES:
 what was asked, or reached with a margin."""
-GATE = sigma_gate(5.0)
+GATE = sigma_gate(5, 2)
 STEPS = 15
 """Gauss-Newton steps of the smoother at most."""
 SIGHTING = np.diag([0.18, 0.048]) ** 2

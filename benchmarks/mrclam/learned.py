@@ -83,7 +83,7 @@ def read(folder: Path, robot: int) -> Robot:
     rows, short = thinned(without_errors(log, own), data.time[first:])
     cov, camera = own.motion.motion.noise_cov, own.sensor
     motion = jaxslam.motion.Velocity(lambda pose, u: jnp.zeros((3, 3)).at[:2, :2].set(cov(pose, u)))
-    options = {"gate": sigma_gate(5.0), "chart": charts.RightInvariant()}
+    options = {"gate": sigma_gate(5, 2), "chart": charts.RightInvariant()}
     ekf = jaxslam.filters.EkfSlam(motion, camera, CAPACITY, **options)
     path = data.true_path[first:][rows]
     found = jaxslam.run(ekf, short, path[0], data.pose_cov, jax.random.key(0))

@@ -4,7 +4,6 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
@@ -30,17 +29,16 @@ class JointCompatibility:
     one block row a pair, and D² with it, so a branch ends where it cannot have more pairs than
     the best, or as many at a lower D², or where D² exceeds even χ² of all pairs it could still
     make. (The original ends it where the pairs so far are not compatible, and then depends on
-    their order.) Without a measurement's landmark at most `new_gate` away it is new; by default
-    that is χ²(Z, p).
+    their order.) A measurement with no landmark within `new_gate` is new.
 
-    Raises ValueError on a probability outside 0 to 1, or a budget or candidates below 1; from the
-    filter's update, on a new_gate below the gate of single pairs.
+    Raises ValueError on a probability not above 0 and below 1, a new_gate below it, or a budget or
+    candidates below 1.
     """
 
     probability: float = static(default=0.99)
-    """p of both tests, 0 to 1"""
+    """p of both tests"""
     new_gate: Number | None = None
-    """of squared distance, for new landmarks"""
+    """another probability, at least the first; the same by default"""
     budget: int = static(default=2000, kw_only=True)
     """largest number of nodes of the search. At this limit the best result is returned, and
     `Association.exhausted` is set"""
@@ -50,8 +48,7 @@ class JointCompatibility:
 
     def __post_init__(self) -> None:
         what = "JointCompatibility"
-        if not 0 <= self.probability <= 1:
-            raise ValueError(f"{what}: expected a probability from 0 to 1, got {self.probability}")
+        check_gates(what, self.probability, self.new_gate)
         check_count(f"{what}: budget", self.budget)
         check_count(f"{what}: candidates", self.candidates)
 
@@ -60,25 +57,15 @@ class JointCompatibility:
         m, _, size_z = pairs.innovation.shape
         if m == 0:
             return Association(jnp.full(0, -1, jnp.int32), scan.valid, jnp.asarray(False))
-        quantiles = _quantiles(self.probability, m, size_z)
-        gate = float(quantiles[1])
-        check_gates("JointCompatibility", gate, self.new_gate)
-        levels = jnp.asarray(quantiles, pairs.distance.dtype)
+        quantiles = [chi2_quantile(self.probability, k * size_z) for k in range(1, m + 1)]
+        levels = jnp.asarray([0.0, *quantiles], pairs.distance.dtype)
         cross = jax.lax.stop_gradient(prediction.cross())
         problem = _problem(pairs, cross, levels, self.candidates)
         found = _search(problem, self.budget)
         exhausted = (found.level >= 0) | problem.cut
         slot = found.best
-        return Association(
-            slot, far_from_all(pairs, scan, gate, self.new_gate) & (slot < 0), exhausted
-        )
-
-
-def _quantiles(probability: float, m: int, size_z: int) -> np.ndarray:
-    """The quantiles χ²(k·Z, p) for k = 0 … m."""
-    if probability in (0, 1):
-        return np.append(0.0, np.full(m, np.inf if probability else 0.0))
-    return np.append(0.0, [chi2_quantile(probability, k * size_z) for k in range(1, m + 1)])
+        far = far_from_all(pairs, scan, self.probability, self.new_gate)
+        return Association(slot, far & (slot < 0), exhausted)
 
 
 class _Problem(NamedTuple):
@@ -89,7 +76,7 @@ class _Problem(NamedTuple):
     cov: Float[Array, "M K Z Z"]
     cross: Float[Array, "N Z N Z"]
     levels: Float[Array, "M+1"]
-    """the gate of D² of k pairs"""
+    """χ²(k·Z, p), the largest D² of k pairs"""
     left: Int[Array, "M+1"]
     """how many measurements from the i-th on have candidates"""
     cut: Bool[Array, ""]

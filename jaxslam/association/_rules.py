@@ -12,7 +12,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.core import slots
-from jaxslam.core._numbers import check_positive, is_concrete
+from jaxslam.core._numbers import check_gate, check_positive, gate_quantile, is_concrete
 from jaxslam.core._record import hold_function, record, static
 from jaxslam.core.protocols import Associate, Association, Pairs, Prediction, Sensor
 from jaxslam.core.types import Scan
@@ -21,25 +21,35 @@ from jaxslam.math._assignment import assign
 from jaxslam.math._gaussians import gaussian_terms
 
 
-def check_gates(name: str, gate: Number, new_gate: Number | None) -> None:
-    """Raise ValueError on a gate that is not a number >= 0, and on a new_gate below it."""
+def check_gates(name: str, gate: Number | None, new_gate: Number | None) -> None:
+    """Raise ValueError on a gate that is no probability, and on a new_gate below it."""
     for each in (gate, new_gate):
         if each is not None and not isinstance(each, Real | np.ndarray | jax.Array):
             called = isinstance(each, Prediction | Scan)
             again = f": as associate, give {name}(gate), not {name}" if called else ""
             raise ValueError(f"{name}: expected a number as gate, got {type(each).__name__}{again}")
-    if is_concrete(gate) and not np.asarray(gate) >= 0:
-        raise ValueError(f"{name}: expected a gate of at least 0, got {gate}")
-    if new_gate is not None and is_concrete((gate, new_gate)) and not new_gate >= gate:
+        check_gate(name, each)
+    if new_gate is None:
+        return
+    if gate is None:
+        raise ValueError(f"{name}: expected no new_gate without a gate, got {new_gate}")
+    if is_concrete((gate, new_gate)) and not new_gate >= gate:
         raise ValueError(f"{name}: expected new_gate >= gate = {gate}, got {new_gate}")
 
 
+def within_gate(pairs: Pairs, gate: Number | None) -> Bool[Array, "M N"]:
+    """Which possible pairs are within the gate; without one, those of finite d²."""
+    gamma = gate_quantile(gate, pairs.innovation.shape[2])
+    near = jnp.isfinite(pairs.distance) if gamma is None else pairs.distance <= gamma
+    return pairs.possible & near
+
+
 def far_from_all(
-    pairs: Pairs, scan: Scan, gate: Number, new_gate: Number | None
+    pairs: Pairs, scan: Scan, gate: Number | None, new_gate: Number | None
 ) -> Bool[Array, "M"]:
     """Whether a measurement lies beyond the gate for new landmarks, by default the other one, of
     every landmark of the map."""
-    near = pairs.possible & (pairs.distance <= (gate if new_gate is None else new_gate))
+    near = within_gate(pairs, gate if new_gate is None else new_gate)
     return scan.valid & ~near.any(axis=1)
 
 
@@ -71,20 +81,21 @@ class Known:
 class Nearest:
     """Individual compatibility nearest neighbour (ICNN; Neira & Tardós 2001, section II).
 
-    A pair is compatible if d² = νᵀ S⁻¹ ν <= gate. A measurement is associated with the landmark
-    of its least d² if it is also the nearest of that landmark's measurements. One with no landmark
-    within new_gate is new; one between the gates, or whose landmark has a nearer measurement, is
-    ignored (the two gates of Bailey, "Mobile robot localisation and mapping in extensive outdoor
-    environments", 2002, section 2.3). Tags are not used.
+    A pair is compatible if d² = νᵀ S⁻¹ ν <= χ²(Z, gate), the quantile of Z degrees of freedom for a
+    measurement of Z numbers. A measurement is associated with the landmark of its least d² if it is
+    also the nearest of that landmark's measurements. One with no landmark within new_gate is new;
+    one between the gates, or whose landmark has a nearer measurement, is ignored (the two gates of
+    Bailey, "Mobile robot localisation and mapping in extensive outdoor environments", 2002, section
+    2.3). Tags are not used.
 
-    Raises ValueError on a negative gate, a new_gate below it, or an unknown policy.
+    Raises ValueError on a gate that is no probability, a new_gate below it, or an unknown policy.
     """
 
-    gate: Number
-    """of squared Mahalanobis distance, 0 (nothing is compatible but a perfect match) to infinity;
-    `stats.chi2_quantile` gives it by probability"""
+    gate: Number | None
+    """probability that a measurement is compatible with its own landmark, above 0 and below 1;
+    None: all pairs are compatible"""
     new_gate: Number | None = None
-    """at least the gate; the same by default"""
+    """another probability, at least the gate; the same by default"""
     ambiguous: Literal["nearest", "leave"] = static(default="nearest", kw_only=True)
     """"leave" ignores a measurement that is compatible with several landmarks, and several that are
     compatible with one"""
@@ -98,7 +109,7 @@ class Nearest:
 
     def __call__(self, prediction: Prediction, scan: Scan) -> Association:
         pairs = prediction.pairs(scan)
-        allowed = compatible = pairs.possible & (pairs.distance <= self.gate)
+        allowed = compatible = within_gate(pairs, self.gate)
         if self.ambiguous == "leave":
             allowed = compatible & (compatible.sum(axis=1) == 1)[:, None]
             allowed = allowed & (compatible.sum(axis=0) == 1)[None, :]
@@ -112,13 +123,13 @@ class MaximumLikelihood:
 
     d² + log |S| is -2 log N(ν; 0, S) up to a constant. The determinant matters: a landmark of large
     covariance has small d² to all measurements, but a low likelihood (Thrun, Burgard &
-    Fox, Probabilistic Robotics, Table 7.3). The gates are of d², as those of `nearest`.
+    Fox, Probabilistic Robotics, Table 7.3). The gates are as those of `Nearest`.
 
     Raises:
-        ValueError: on a negative gate, or a new_gate below it.
+        ValueError: on a gate that is no probability, or a new_gate below it.
     """
 
-    gate: Number
+    gate: Number | None
     new_gate: Number | None = None
 
     def __post_init__(self) -> None:
@@ -126,25 +137,25 @@ class MaximumLikelihood:
 
     def __call__(self, prediction: Prediction, scan: Scan) -> Association:
         pairs = prediction.pairs(scan)
-        compatible = pairs.possible & (pairs.distance <= self.gate)
+        compatible = within_gate(pairs, self.gate)
         slot = mutual(pairs.distance + pairs.log_det, compatible)
         return Association(slot, far_from_all(pairs, scan, self.gate, self.new_gate) & (slot < 0))
 
 
 @record
 class GlobalNearest:
-    """Global nearest neighbour: the assignment that minimizes Σ d² over its pairs, with the gate as
-    the cost of a measurement without a landmark.
+    """Global nearest neighbour: the assignment that minimizes Σ d² over its pairs, with the
+    quantile of the gate as the cost of a measurement without a landmark.
 
-    Only compatible pairs (d² <= gate) are used; with an infinite gate, the largest number of
-    possible pairs. Solved exactly (`assignment.assign`). Blackman & Popoli, "Design and analysis
-    of modern tracking systems", 1999, section 6.4. The gates are as those of `nearest`.
+    Only compatible pairs are used; without a gate, the largest number of possible pairs. Solved
+    exactly (`assignment.assign`). Blackman & Popoli, "Design and analysis of modern tracking
+    systems", 1999, section 6.4. The gates are as those of `Nearest`.
 
     Raises:
-        ValueError: on a negative gate, or a new_gate below it.
+        ValueError: on a gate that is no probability, or a new_gate below it.
     """
 
-    gate: Number
+    gate: Number | None
     new_gate: Number | None = None
 
     def __post_init__(self) -> None:
@@ -152,10 +163,12 @@ class GlobalNearest:
 
     def __call__(self, prediction: Prediction, scan: Scan) -> Association:
         pairs = prediction.pairs(scan)
-        m, n = pairs.distance.shape
-        compatible = pairs.possible & (pairs.distance <= self.gate)
-        within = jnp.where(compatible, pairs.distance, 0.0)
-        alone = jnp.minimum(self.gate, 1 + within.sum())
+        m, n, size_z = pairs.innovation.shape
+        compatible = within_gate(pairs, self.gate)
+        alone = 1 + jnp.where(compatible, pairs.distance, 0.0).sum()
+        gamma = gate_quantile(self.gate, size_z)
+        if gamma is not None:
+            alone = jnp.minimum(gamma, alone)
         cost = jnp.where(compatible, pairs.distance, 2 * alone + 1)
         # One more column for each measurement, for no landmark.
         cost = jnp.concatenate([cost, jnp.broadcast_to(alone, (m, m))], axis=1)

@@ -11,6 +11,8 @@ import numpy as np
 from numpy.typing import ArrayLike
 
 from jaxslam.core._units import TURN
+from jaxslam.math._arrays import Number
+from jaxslam.math.stats import chi2_quantile
 
 
 def is_concrete(*values: object) -> bool:
@@ -137,12 +139,28 @@ def check_key(name: str, key: object) -> None:
 
 
 def check_gate(name: str, gate: ArrayLike | None) -> None:
-    """Raise ValueError unless the gate is None, a tracer, or above 0."""
+    """Raise ValueError unless the gate is None, a tracer, or a probability above 0 and below 1."""
     if gate is None or not is_concrete(gate):
         return
     check_real(name, gate=gate)
-    if np.shape(gate) != () or not np.asarray(gate) > 0:
-        raise ValueError(f"{name}: expected a gate above 0, got {gate}")
+    value = np.asarray(gate, np.float64)
+    if value.shape == () and 0 < value < 1:
+        return
+    hint = ""
+    if value.shape == () and value >= 1:
+        tail = math.exp(-float(value) / 2)
+        hint = " (None for no gate)"
+        if value > 1 and tail > 1e-12:  # d² is meant
+            p = f"{1 - tail:.{1 - math.floor(math.log10(tail))}f}".rstrip("0")
+            hint = f" (the χ² quantile {value:g} of 2 degrees of freedom is that of {p})"
+    raise ValueError(
+        f"{name}: expected a probability above 0 and below 1 as gate, as 0.999, got {gate}{hint}"
+    )
+
+
+def gate_quantile(gate: Number | None, dof: int) -> Number | None:
+    """γ, the largest d² of dof numbers within a gate: its χ² quantile; None without a gate."""
+    return None if gate is None else chi2_quantile(gate, dof)
 
 
 def check_covariance(name: str, cov: ArrayLike, size: int) -> None:

@@ -485,6 +485,8 @@ class Filter(Component):
     another state."""
     linearized: Any = None
     """the `LinearizedSteps` of a filter whose steps return the linear system they use."""
+    map_size: int | None = None
+    """N of a filter in a known map of all landmarks, whose tags are 0 … N-1; None of another."""
 
     def __post_init__(self) -> None:
         self._check(
@@ -574,6 +576,10 @@ class Wrapper(Filter):
     @property
     def landmark(self) -> tuple[str, ...]:  # type: ignore[override]
         return self.filter.landmark
+
+    @property
+    def map_size(self) -> int | None:  # type: ignore[override]
+        return self.filter.map_size
 
     def init(self, pose: Pose, pose_cov: Float[Array, "3 3"]) -> PyTree:
         return self.filter.init(pose, pose_cov)

@@ -145,7 +145,7 @@ def test_odometry_is_calibrated_without_identities():
     logs = [drive(seed) for seed in range(4)]
     together = jax.tree.map(lambda *leaves: jnp.stack(leaves), *logs)
     model, sensor = motion.PoseIncrement(NOISE), sensors.RelativePosition(R)
-    near, local = association.Nearest(11.8), Recency(patience=20)
+    near, local = association.Nearest(0.9973), Recency(patience=20)
     filter = EkfSlam(model, sensor, 20, associate=near, correction="joint", life=local)
 
     def info(p):

@@ -221,7 +221,7 @@ def test_the_bounds_obey_tichavskys_recursion():
         sensor=sensors.RelativePosition(r),
         controls=np.tile([0.3, 0.05, 0.2], (15, 1)),
         pose_cov=np.diag([0.1, 0.2, 0.05]) ** 2,
-        filter_options={"gate": 9.0, "births": 1},
+        filter_options={"gate": 0.99, "births": 1},
     )
 
     @jax.jit

@@ -253,7 +253,7 @@ def test_decisions_are_held_in_the_log():
     z = np.array(log.scan.z)
     z[20, 1] += [0.25, 0]
     log = log._replace(scan=log.scan._replace(z=z, tag=np.full_like(log.scan.tag, -1)))
-    nearest = association.Nearest(stats.chi2_quantile(0.999, 2), stats.chi2_quantile(0.9999999, 2))
+    nearest = association.Nearest(0.999, 0.9999999)
     options = {"capacity": 5, "correction": "joint"}
     start = np.zeros(3), np.zeros((3, 3)), KEY
     by_gate = filters.EkfSlam(*models(TRUE), associate=nearest, **options)

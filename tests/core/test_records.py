@@ -174,7 +174,7 @@ LOG, START = standing(), (np.zeros(3), np.diag([0.1, 0.1, 0.01]) ** 2, jax.rando
 def toy_filter(noise=1.0):
     model = Counted(noise * np.diag([0.01, 0.01]) ** 2)
     return filters.EkfSlam(
-        model, sensors.RangeBearing(R, MOUNT), 6, gate=50.0 * noise, correction="joint"
+        model, sensors.RangeBearing(R, MOUNT), 6, gate=1 - 1e-11 * noise, correction="joint"
     )
 
 
@@ -286,7 +286,7 @@ WORLDS = {
         worlds.scaled(scale, 3),
         spurious=jaxslam.spurious.Spurious(1.0, 0.1 * scale, 0.1, 0.1, reach=5.0 * scale),
         visible=jaxslam.scenarios.BetweenRanges(0.1, 9.0 * scale),
-        filter_options={"correction": "joint", "gate": 9.0},
+        filter_options={"correction": "joint", "gate": 0.99},
         published={"ekf": {"nees_pose": 3.0}},
     ),
     "team": team,
@@ -388,7 +388,7 @@ def test_other_numbers_run_what_is_there(smooths):
         start = there.pose, there.pose_cov
         if smooths:
             return smoothing.Smoother(there.motion, there.sensor, 6, *start)(log, KEY)
-        method = catalog.FILTERS["square_root"](there, gate=9.0 * scale)
+        method = catalog.FILTERS["square_root"](there, gate=0.9 * scale)
         return run(method, log, *start, jax.random.key(seed))
 
     kept = kept_programs()
@@ -404,7 +404,7 @@ def test_other_numbers_run_what_is_there(smooths):
 def test_a_program_gives_what_the_function_does():
     """The numbers of records are arguments: the same trace as with constants, to rounding."""
     there = worlds.scaled(1.0)
-    ekf = worlds.ekf(there, gate=5.991, correction="joint")
+    ekf = worlds.ekf(there, gate=0.95, correction="joint")
     key = jax.random.key(0)
     truth, log = simulate(there, key)
     plain = jax.jit(lambda log: run(ekf, log, there.pose, there.pose_cov, key))(log)

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 from recordings import write
 
-from jaxslam import datasets, stats
+from jaxslam import datasets
 from jaxslam.core.types import Estimate
 from jaxslam.datasets._evaluation import evaluate
 from jaxslam.math.numpy_poses import compose
@@ -60,7 +60,7 @@ def test_a_table_by_hand_with_every_setting(tmp_path):
     assert not np.any(data.motion.noise_cov(np.zeros(3), 0 * U))
     np.testing.assert_allclose(data.sensor.noise_cov(np.zeros(2)), np.diag([0.05, 0.02]) ** 2)
     np.testing.assert_allclose(data.sensor.observe(np.zeros(3), np.array([2.1, 0])), [2, 0])
-    assert data.filter_options == {"correction": "joint", "gate": stats.chi2_quantile(0.999, 2)}
+    assert data.filter_options == {"correction": "joint", "gate": 0.999}
     np.testing.assert_array_equal(data.pose, [1, 2, 0.5])
     np.testing.assert_allclose(data.pose_cov, np.diag([0.01, 0.04, 0.09]))
     assert data.one_frame
@@ -286,7 +286,7 @@ def test_a_file_that_is_missing_or_no_text_is_named(tmp_path, name):
         ("[sensor]\nnoise = [0.1, nan]", "[sensor] noise: expected 2 numbers"),
         ("[sensor]\nmount = [1, 2]", "[sensor] mount: expected 3 numbers (x [m], y [m], theta [rad])"),
         ("[sensor]\nheight = 2", "[sensor] height: expected one of model, noise, mount"),
-        ("[filter]\ngate = 9.2", "[filter] gate: expected a probability between 0 and 1, got 9.2"),
+        ("[filter]\ngate = 9.2", "[filter] gate: expected a probability above 0 and below 1 as gate, as 0.999, got 9.2 "),
         ("[filter]\ncapacity = 1", "[filter] capacity: expected a whole number of at least 2"),
         ("[filter]\nstart = [0, 0]", "[filter] start: expected 3 numbers (x [m], y [m], theta [rad])"),
         ("[filter]\nstart_noise = [0, 0, -1]", "[filter] start_noise: expected numbers of at least"),

@@ -36,7 +36,7 @@ def tour():
     return near, jax.tree.map(lambda *leaves: np.stack(leaves), *logs)
 
 
-GATED = {"births": 1, "gate": 9.0, "iterations": 2}
+GATED = {"births": 1, "gate": 0.99, "iterations": 2}
 CASES = {
     "in turn": (PLACES, GATED),
     "at once": (

@@ -6,6 +6,7 @@ import functools
 import jax
 import numpy as np
 import pytest
+import scipy.stats
 from cases import swept
 from reference import ekf_slam as plain
 from worlds import draw
@@ -75,11 +76,11 @@ def growing(steps):
 
 
 CASES = {
-    "cloister": (cloister(60), {"correction": "sequential", "gate": 9.0, "births": 1}),
+    "cloister": (cloister(60), {"correction": "sequential", "gate": 0.99, "births": 1}),
     "circle": (circle(150), {"correction": "joint"}),
     "cloister joint with gate": (
         dataclasses.replace(cloister(60), noise_on="odometry"),
-        {"correction": "joint", "gate": 5.0, "births": 3},
+        {"correction": "joint", "gate": 0.9, "births": 3},
     ),
     "growing": (growing(60), {"correction": "sequential", "gate": 6.0, "births": 1}),
     "growing joint": (growing(60), {"correction": "joint", "gate": 6.0, "births": 3}),
@@ -105,7 +106,7 @@ def reference(case, log, steps=None, **changes):
         np.asarray(log.control)[:steps],
         scans_of(log)[:steps],
         joint=options["correction"] == "joint",
-        gate=options.get("gate", np.inf),
+        gate=scipy.stats.chi2.ppf(options.get("gate", 1.0), 2),
         births=options.get("births"),
         **(MODELS[scenario.name] | changes),
     )

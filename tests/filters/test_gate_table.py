@@ -87,6 +87,7 @@ def test_a_scan_left_alone_is_unmatched_where_there_is_one():
 
 # One world for every family: three landmarks that a first scan starts, in a map with room for five.
 LANDMARKS = np.array([[4.0, 0.0], [4.0, 3.0], [4.0, -3.0], [2.0, 2.0], [2.0, -2.0]])
+GATE = 0.99995
 WILD = 50.0
 """a first coordinate beyond which the sensor's claimed noise is no covariance"""
 
@@ -120,21 +121,21 @@ def seen_in_the_map():
 MOVE = motion.PoseIncrement(np.diag([1e-4, 1e-4, 1e-6]))
 KNOWN = np.concatenate([LANDMARKS[:3], np.full((2, 2), 77.0)])
 FAMILIES = {
-    "ekf_slam": lambda s: filters.EkfSlam(MOVE, s, 5, gate=20.0),
-    "ekf_slam, at once": lambda s: filters.EkfSlam(MOVE, s, 5, gate=20.0, correction="joint"),
+    "ekf_slam": lambda s: filters.EkfSlam(MOVE, s, 5, gate=GATE),
+    "ekf_slam, at once": lambda s: filters.EkfSlam(MOVE, s, 5, gate=GATE, correction="joint"),
     "compressed_ekf_slam": lambda s: filters.CompressedEkfSlam(
-        filters.EkfSlam(MOVE, s, 5, gate=20.0), area=9
+        filters.EkfSlam(MOVE, s, 5, gate=GATE), area=9
     ),
-    "eif_slam": lambda s: filters.EifSlam(MOVE, s, 5, gate=20.0),
-    "fastslam": lambda s: filters.FastSlam(MOVE, s, 5, 3, gate=20.0),
-    "mapping": lambda s: filters.Mapping(s, 5, gate=20.0),
-    "localization": lambda s: filters.Localization(MOVE, s, LANDMARKS[:3], gate=20.0),
+    "eif_slam": lambda s: filters.EifSlam(MOVE, s, 5, gate=GATE),
+    "fastslam": lambda s: filters.FastSlam(MOVE, s, 5, 3, gate=GATE),
+    "mapping": lambda s: filters.Mapping(s, 5, gate=GATE),
+    "localization": lambda s: filters.Localization(MOVE, s, LANDMARKS[:3], gate=GATE),
     "particle_localization": lambda s: filters.ParticleLocalization(
-        MOVE, s, LANDMARKS[:3], 3, gate=20.0
+        MOVE, s, LANDMARKS[:3], 3, gate=GATE
     ),
 }
 SPARSE = {
-    "seif": lambda s: filters.Seif(MOVE, s, 5, active=9, links=4, gate=20.0),
+    "seif": lambda s: filters.Seif(MOVE, s, 5, active=9, links=4, gate=GATE),
 }
 
 
@@ -239,7 +240,7 @@ def test_a_delayed_filter_reports_bearings_by_the_table():
         MOVE,
         sensor,
         2,
-        gate=20.0,
+        gate=GATE,
         stored=StoredMeasurements(capacity=4),
         hypotheses=Hypotheses(capacity=2),
     )

@@ -1,5 +1,7 @@
 """stats: chi-square quantiles and bands against SciPy, published tables and sampling."""
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import scipy.stats
@@ -21,10 +23,34 @@ def test_quantile_undoes_the_tail_of_scipy(dof):
 def test_sigma_ellipses_hold_what_solas_table_says():
     """Solà B.3.1 Table 3, with the digits of the errata, per cent."""
     for dof, table in ((2, [39.35, 86.47, 98.89, 99.97]), (3, [19.87, 73.85, 97.07, 99.89])):
-        held = [100 * scipy.stats.chi2.cdf(stats.sigma_gate(n), dof) for n in (1, 2, 3, 4)]
+        held = [100 * stats.sigma_gate(n, dof) for n in (1, 2, 3, 4)]
         np.testing.assert_allclose(held, table, atol=0.005)
-    assert stats.sigma_gate(3) == 9
-    assert stats.sigma_gate(0.5) == 0.25
+        for n in (0.5, 3, 5):
+            np.testing.assert_allclose(stats.chi2_quantile(stats.sigma_gate(n, dof), dof), n**2)
+
+
+@pytest.mark.parametrize("dof", [1, 2, 3, 4, 7, 12])
+def test_quantile_of_an_array_is_scipys(dof):
+    """Of the gate of a filter within a trace: in both precisions, batched, and its derivative."""
+    p = np.array([0.001, 0.01, 0.3, 0.5, 0.9, 0.99, 0.999, 0.9999, 0.999999])
+    for dtype, rtol in ((np.float64, 1e-9), (np.float32, 4e-5)):
+        rounded = p.astype(dtype)
+        x = stats.chi2_quantile(jnp.asarray(rounded), dof)
+        slope = jax.vmap(jax.grad(lambda p: stats.chi2_quantile(p, dof)))(jnp.asarray(rounded))
+        assert x.dtype == slope.dtype == dtype
+        expected = scipy.stats.chi2.isf(1 - rounded.astype(float), dof)
+        np.testing.assert_allclose(x, expected, rtol=rtol)
+        np.testing.assert_allclose(slope, 1 / scipy.stats.chi2.pdf(expected, dof), rtol=10 * rtol)
+
+
+@pytest.mark.parametrize("dof", [1, 2, 3, 4])
+def test_quantile_of_an_array_at_its_limits(dof):
+    """1 is the number below it, a number outside 0 to 1 counts as 0; no slope there, and no NaN."""
+    p = jnp.asarray([0.0, -1.0, 9.0, jnp.nan, 1.0])
+    values, slopes = jax.vmap(jax.value_and_grad(lambda p: stats.chi2_quantile(p, dof)))(p)
+    np.testing.assert_array_equal(values[:4], 0)
+    np.testing.assert_allclose(values[4], scipy.stats.chi2.isf(2.0**-53, dof), rtol=1e-12)
+    np.testing.assert_array_equal(slopes, 0)
 
 
 @pytest.mark.parametrize(("dof", "runs", "level"), [(3, 50, 0.95), (2, 1, 0.99), (5, 2000, 0.5)])
@@ -60,8 +86,9 @@ def test_t_quantile():
     (lambda: stats.chi2_quantile(float("nan"), 2), "probability"),
     (lambda: stats.chi2_quantile(0.5, 0), "dof above 0"),
     (lambda: stats.chi2_quantile(0.5, float("nan")), "dof above 0"),
-    (lambda: stats.sigma_gate(0), "n_sigma above 0"),
-    (lambda: stats.sigma_gate(-3), "n_sigma above 0"),
+    (lambda: stats.sigma_gate(0, 2), "n_sigma above 0"),
+    (lambda: stats.sigma_gate(-3, 2), "n_sigma above 0"),
+    (lambda: stats.sigma_gate(3, 0), "dof above 0"),
     (lambda: stats.chi2_band(2, 0), "run"),
     (lambda: stats.chi2_band(2, 10, 1.0), "probability"),
     (lambda: stats.chi2_band(2, 10, 1.5), "probability"),

@@ -15,12 +15,13 @@ from jaxslam import association
 from jaxslam.core.protocols import Association, Pairs, Prediction
 from jaxslam.core.types import Scan
 from jaxslam.math._assignment import assign
-from jaxslam.math.stats import chi2_quantile
+from jaxslam.math.stats import chi2_quantile, sigma_gate
 
+GATE = sigma_gate(3, 2)
 METHODS = {
-    "nearest": partial(association.Nearest, 9.0),
-    "maximum_likelihood": partial(association.MaximumLikelihood, 9.0),
-    "global_nearest": partial(association.GlobalNearest, 9.0),
+    "nearest": partial(association.Nearest, GATE),
+    "maximum_likelihood": partial(association.MaximumLikelihood, GATE),
+    "global_nearest": partial(association.GlobalNearest, GATE),
     "joint": association.JointCompatibility,
 }
 
@@ -183,7 +184,7 @@ def test_a_budget_that_does_not_suffice_is_said(thorough):
 def by_rule():
     """Association.slot of two measurements and two landmarks by each rule, in one program."""
     rules = {name: METHODS[name]() for name in METHODS if name != "joint"}
-    rules["careful"] = association.Nearest(9.0, ambiguous="leave")
+    rules["careful"] = association.Nearest(GATE, ambiguous="leave")
     rules["joint"] = association.JointCompatibility(0.98)
     return jax.jit(lambda *parts: {name: plainly(rule, *parts) for name, rule in rules.items()})
 
@@ -269,7 +270,7 @@ def test_everything_is_new_in_an_empty_map_and_nothing_in_an_empty_scan(batch):
 )
 def test_gates_of_nothing_and_of_everything(method):
     parts = posed(*problem(np.random.default_rng(1), 3, 5))
-    gates = np.array([0.0, 0.0, np.inf]), np.array([0.0, np.inf, np.inf])
+    gates = np.array([0.0, 0.0, 1.0]), np.array([0.0, 1.0, 1.0])
 
     def of_gates(gate, new_gate, *parts):
         return plainly(method(gate, new_gate), *parts)
@@ -283,33 +284,55 @@ def test_gates_of_nothing_and_of_everything(method):
         np.testing.assert_array_equal(slot[2], best)
 
 
-def test_joint_probabilities_of_nothing_and_of_everything():
+def test_no_gate_is_a_traced_gate_of_1():
     parts = posed(*problem(np.random.default_rng(1), 3, 5))
-    assert associated(association.JointCompatibility(0.0), *parts).is_new.all()
-    everything = associated(association.JointCompatibility(1.0, budget=10_000), *parts)
-    assert (np.asarray(everything.slot) >= 0).all()
+    for method in (association.Nearest, association.MaximumLikelihood, association.GlobalNearest):
+        without = plainly(method(None), *parts)
+        within = jax.jit(lambda gate, method=method: plainly(method(gate), *parts))(1.0)
+        np.testing.assert_array_equal(without.slot, within.slot)
+        assert (np.asarray(without.slot) >= 0).any() and not without.is_new.any()
+
+
+@pytest.mark.parametrize("size", [1, 2, 3])
+def test_a_gate_is_a_probability_for_a_measurement_of_any_size(size):
+    """Just inside and outside the quantile of Z numbers, S = I."""
+    edge = np.sqrt(scipy.stats.chi2.ppf(0.9, size))
+    for distance, inside in ((edge - 1e-6, True), (edge + 1e-6, False)):
+        innovation = np.zeros((1, 1, size))
+        innovation[..., 0] = distance
+        noise = np.eye(size)[None]
+        parts = posed(innovation, np.zeros((1, size, 1, size)), noise)
+        for rule in (
+            association.Nearest(0.9),
+            association.Nearest(jnp.asarray(0.9)),
+            association.JointCompatibility(0.9),
+        ):
+            found = jax.jit(plainly)(rule, *parts)
+            assert (bool(found.slot[0] == 0), bool(found.is_new[0])) == (inside, not inside)
 
 
 @refused(
-    (lambda: association.Nearest(-1.0), "at least 0"),
-    (lambda: association.Nearest(np.nan), "at least 0"),
+    (lambda: association.Nearest(-1.0), "Nearest: .*above 0 and below 1 as gate"),
+    (lambda: association.Nearest(np.nan), "above 0 and below 1 as gate"),
+    (
+        lambda: association.Nearest(9.21),
+        r"as 0.999, got 9.21 \(the χ² quantile 9.21 of 2 degrees of freedom is that of 0.99\)$",
+    ),
+    (lambda: association.MaximumLikelihood(1.0), r"got 1.0 \(None for no gate\)$"),
+    (lambda: association.Nearest(0.99, 13.8), "below 1 as gate.* 13.8 of .* that of 0.999"),
+    (lambda: association.Nearest(None, 0.99), "no new_gate without a gate"),
     (lambda: association.Nearest("9"), "Nearest: .*gate.* got str$"),
     (
         lambda: plainly(association.Nearest, *posed(*problem(np.random.default_rng(1), 3, 5))),
         r"expected a number .*: as associate, give Nearest\(gate\), not Nearest$",
     ),
-    (lambda: association.MaximumLikelihood(9.0, 4.0), "new_gate >= gate"),
-    (lambda: association.GlobalNearest(9.0, 4.0), "new_gate >= gate"),
-    (lambda: association.Nearest(9.0, ambiguous="guess"), "guess"),
-    (lambda: association.JointCompatibility(1.5), "probability"),
+    (lambda: association.MaximumLikelihood(0.99, 0.9), "new_gate >= gate"),
+    (lambda: association.GlobalNearest(0.99, 0.9), "new_gate >= gate"),
+    (lambda: association.Nearest(0.99, ambiguous="guess"), "guess"),
+    (lambda: association.JointCompatibility(1.5), "JointCompatibility: expected a probability"),
+    (lambda: association.JointCompatibility(0.99, 0.9), "new_gate >= gate"),
     (lambda: association.JointCompatibility(budget=0), "budget"),
     (lambda: association.JointCompatibility(candidates=0), "candidates"),
 )
 def test_refusals(make):
     make()
-
-
-def test_joint_refuses_a_gate_for_new_ones_below_its_own():
-    parts = posed(*problem(np.random.default_rng(1), 3, 5))
-    with pytest.raises(ValueError, match="new_gate >= gate"):
-        associated(association.JointCompatibility(0.99, new_gate=1.0), *parts)

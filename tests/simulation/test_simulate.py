@@ -19,6 +19,7 @@ from reference.plane import mounted, to_frame, wrap
 
 from jaxslam import motion, sensors
 from jaxslam.core._validation import check_log
+from jaxslam.math.stats import sigma_gate
 from jaxslam.simulation._worlds import Scenario, simulate
 from jaxslam.simulation.scenarios import (
     SCENARIOS,
@@ -399,7 +400,8 @@ def test_cloister_is_the_guides_simulation():
     z_cov = np.diag([0.01, np.deg2rad(1) ** 2])
     np.testing.assert_allclose(scenario.sensor.noise_cov(jnp.zeros(2)), z_cov)
     assert scenario.noise_on == "robot"
-    assert scenario.filter_options == {"correction": "sequential", "gate": 9.0, "births": 1}
+    gate = sigma_gate(3, 2)
+    assert scenario.filter_options == {"correction": "sequential", "gate": gate, "births": 1}
 
 
 @pytest.mark.parametrize("n", [4, 7, 9])

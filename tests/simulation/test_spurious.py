@@ -113,10 +113,10 @@ def test_associations_are_counted_by_what_a_slot_was_born_of():
 
 
 METHODS = {
-    "nearest": association.Nearest(16.0, 36.0),
-    "maximum_likelihood": association.MaximumLikelihood(16.0, 36.0),
-    "global_nearest": association.GlobalNearest(16.0, 36.0),
-    "joint": association.JointCompatibility(0.999, 36.0),
+    "nearest": association.Nearest(0.9997, 1 - 1e-8),
+    "maximum_likelihood": association.MaximumLikelihood(0.9997, 1 - 1e-8),
+    "global_nearest": association.GlobalNearest(0.9997, 1 - 1e-8),
+    "joint": association.JointCompatibility(0.999, 1 - 1e-8),
 }
 
 

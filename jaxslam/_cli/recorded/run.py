@@ -366,8 +366,7 @@ def with_options(data: Dataset, options: argparse.Namespace) -> Dataset:
     if options.associate is None and data.filter_options.get("associate") is not None:
         raise ValueError("--gate: expected --associate, too, since the tags are not used")
     try:
-        size = len(data.sensor.measurements)
-        chosen = association_options(options.associate or "known", options.gate, size)
+        chosen = association_options(options.associate or "known", options.gate)
     except ValueError as problem:
         raise ValueError(f"--{problem}") from problem
     given = [name for name in ("gate", "associate") if getattr(options, name) is not None]

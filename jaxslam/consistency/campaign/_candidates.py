@@ -190,6 +190,13 @@ def check_fits(name: str, candidate: Candidate, scenario: World) -> None:
                 f"the scenario {scenario.name} gives ({', '.join(given)})"
             )
 
+    size, count = candidate.map_size, np.shape(scenario.landmarks)[0]
+    if size is not None and size != count:
+        raise ValueError(
+            f"monte_carlo: filter {name} has a map of {size} landmarks, the scenario "
+            f"{scenario.name} has {count}; a map of some of them needs their tags"
+        )
+
 
 def _one_unit(name: str, other: str) -> bool:
     """Whether two names have the same unit; True where either has none."""

@@ -65,7 +65,7 @@ def mrclam(
         fitted = fit(
             mrclam(folder, 5, calibration=MRCLAM_CALIBRATION),
             calibrate=("scale", "wheels", "mount", "axis"),
-            options={"gate": stats.sigma_gate(5.0)},
+            options={"gate": stats.sigma_gate(5, 2)},
         )
         data = mrclam(folder, 5, calibration=MRCLAM_CALIBRATION._replace(**fitted.by_name))
 

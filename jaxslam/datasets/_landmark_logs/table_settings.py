@@ -21,7 +21,7 @@ from jaxslam.association import (
     Nearest,
 )
 from jaxslam.core._noise import NoiseCov
-from jaxslam.core._numbers import is_number
+from jaxslam.core._numbers import check_gate, is_number
 from jaxslam.core._record import record, static
 from jaxslam.core._units import TURN
 from jaxslam.core.logs._tables import INTERVAL, POSE, odometry_columns, split_unit
@@ -29,7 +29,6 @@ from jaxslam.core.protocols import Associate, Motion, Sensor
 from jaxslam.core.types import JaxOrNumPy
 from jaxslam.datasets._dataset import Parameter
 from jaxslam.filters._ekf.ekf_settings import EkfOptions
-from jaxslam.math import stats
 from jaxslam.motion import _odometry_errors as odometry_errors
 from jaxslam.sensors import _range_errors as range_errors
 
@@ -97,8 +96,8 @@ METHODS: dict[str, Callable[..., Associate]] = {
 }
 
 
-def association_options(method: object, gate: object, size: int) -> EkfOptions:
-    """Options of `EkfSlam` for a method by name and a gate by probability.
+def association_options(method: object, gate: Any) -> EkfOptions:
+    """Options of `EkfSlam` for a method by name and a gate.
 
     Raises ValueError, "associate: …" or "gate: …", on an unknown name and a gate that is not a
     probability. By default known identities have no gate, other methods `GATE`.
@@ -106,24 +105,14 @@ def association_options(method: object, gate: object, size: int) -> EkfOptions:
     Args:
         method: one of `METHODS`.
         gate: the probability that a correct measurement passes.
-        size: numbers of a measurement.
     """
-    probability = None if gate is None else _probability(gate)
+    check_gate("gate", gate)
     if not isinstance(method, str) or method not in METHODS:
         raise ValueError(f"associate: expected one of {', '.join(METHODS)}, got {method!r}")
     if method == "known":
-        return {} if probability is None else {"gate": stats.chi2_quantile(probability, size)}
-    inner = GATE if probability is None else probability
-    beyond = stats.chi2_quantile(max(inner, NEW_GATE), size)
-    limit = inner if method == "joint" else stats.chi2_quantile(inner, size)
-    return {"associate": METHODS[method](limit, beyond)}
-
-
-def _probability(gate: object) -> float:
-    """The gate as a probability; ValueError if it is not one."""
-    if not isinstance(gate, int | float) or isinstance(gate, bool) or not 0 < gate < 1:
-        raise ValueError(f"gate: expected a probability between 0 and 1, got {gate!r}")
-    return gate
+        return {} if gate is None else {"gate": gate}
+    inner = GATE if gate is None else gate
+    return {"associate": METHODS[method](inner, max(inner, NEW_GATE))}
 
 
 FITTED = "fit.toml"
@@ -413,8 +402,8 @@ class TableSettings:
         cov[np.ix_(at, at)] = rows
         return cov
 
-    def filter_options(self, size: int, unknown: bool) -> EkfOptions:
-        """The options of `EkfSlam`. size: of a measurement; unknown: whether tags are unknown."""
+    def filter_options(self, unknown: bool) -> EkfOptions:
+        """The options of `EkfSlam`. unknown: whether tags are unknown."""
         section = self._filter()
         update = section.get("update")
         if update is None:
@@ -428,7 +417,7 @@ class TableSettings:
         if method is None:
             method = self._default("filter", "associate", "nearest" if unknown else "known")
         try:
-            options |= association_options(method, gate, size)
+            options |= association_options(method, gate)
         except ValueError as problem:
             key, _, reason = str(problem).partition(": ")
             raise ValueError(f"{self._at('filter', key)}: {reason}") from problem

@@ -47,7 +47,7 @@ def confirm_hypotheses(
     compared = alive[:, None] & stored[None, :] & (tag[:, None] == new.tag[None, :])
     found = point_residuals(joint, settings.triangulation, layout.hypothesis_slots, slot)
     squared = jnp.where(compared, found.squared_distance(), jnp.inf)
-    within = squared <= settings.gate
+    within = squared <= settings.gamma
     best = jnp.argmin(squared, axis=1)
     every = jnp.arange(layout.hypotheses)
     confirmed = within[every, best]

@@ -115,7 +115,9 @@ class DelayedSettings:
     by_tag: bool
     """identities are known: only measurements of one tag intersect"""
     gate: Number
-    """of squared Mahalanobis distances of one degree of freedom"""
+    """a probability"""
+    gamma: Number
+    """the largest d² of one degree of freedom within the gate"""
     stored: StoredMeasurements
     hypotheses: Hypotheses
     promotion: Promotion

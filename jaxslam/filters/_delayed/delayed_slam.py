@@ -98,7 +98,7 @@ class DelayedSlam(Filter):
     a landmark in the map becomes a *stored measurement*, a variable of the state (`state` has a
     diagram). Then
 
-    1. it confirms the *hypotheses* that agree with it: g² <= gate·var(g), g the difference between
+    1. it confirms the *hypotheses* that agree with it: g² <= γ·var(g), g the difference between
        the measurement and its prediction from the point, with all correlations. Their persistence
        rises by 1, and they are corrected, but not the robot.
        Those of its tag that it does not confirm lose `decay`; at 0 they are deleted.
@@ -118,8 +118,8 @@ class DelayedSlam(Filter):
     before its persistence exceeds that of the other by `lead` and it fits its measurements clearly
     better than its mirror solution. So a range-only landmark needs a path that is not straight.
 
-    Raises ValueError on a capacity below 1, a gate not above 0, a part of another kind, or a sensor
-    that does not fit.
+    Raises ValueError on a capacity below 1, a gate not above 0 and below 1, a part of another kind,
+    or a sensor that does not fit.
     """
 
     motion: Motion
@@ -135,7 +135,7 @@ class DelayedSlam(Filter):
     hypotheses: Hypotheses = Hypotheses()
     promotion: Promotion = Promotion()
     gate: Number | None = None
-    """chi-square, of one degree of freedom, of every comparison; default that of 99 %"""
+    """the probability that a correct comparison passes, by γ = χ²(1, gate); default 0.99"""
     associate: Associate = Known()
     """with `Known` only measurements of one tag intersect. With any other method, the measurements
     it declares new intersect all others, and tags only name the landmarks"""
@@ -213,6 +213,7 @@ class DelayedSlam(Filter):
     @property
     def _settings(self) -> DelayedSettings:
         capacities = self.hypotheses.capacity, self.stored.capacity
+        gate = 0.99 if self.gate is None else self.gate
         assert self.triangulation is not None
         return DelayedSettings(
             sensor=on_ground(self.sensor, SIZE),
@@ -220,7 +221,8 @@ class DelayedSlam(Filter):
             layout=TableLayout(self.capacity, *capacities),
             associate=self.associate,
             by_tag=isinstance(self.associate, Known),
-            gate=chi2_quantile(0.99, 1) if self.gate is None else self.gate,
+            gate=gate,
+            gamma=chi2_quantile(gate, 1),
             stored=self.stored,
             hypotheses=self.hypotheses,
             promotion=self.promotion,

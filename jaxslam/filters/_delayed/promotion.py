@@ -175,7 +175,7 @@ def _measurements_of(
     # After the correction by its measurements g has almost no variance: that of the noise is
     # added, for rounding and curvature.
     variance = found.variance[0] + state.noise_var
-    return same_tag, same_tag & (found.value[0] ** 2 <= settings.gate * variance)
+    return same_tag, same_tag & (found.value[0] ** 2 <= settings.gamma * variance)
 
 
 def _outermost(

@@ -9,7 +9,7 @@ from jaxtyping import PyTree
 
 from jaxslam.association._rules import Known
 from jaxslam.charts import Euclidean
-from jaxslam.core._numbers import check_count, check_gate
+from jaxslam.core._numbers import check_count, check_gate, gate_quantile
 from jaxslam.core.protocols import Associate, Chart, Life, Linearizer, Sensor
 from jaxslam.linearize._first_order import AtEstimate
 from jaxslam.math._arrays import Number
@@ -59,6 +59,13 @@ class EkfSettings:
     """every valid measurement corrects the robot, for any tag"""
     reserved: PyTree = None
     """(N,) bool: slots that no new landmark may take; None for no such slots"""
+    gamma: Number | None = field(init=False)
+    """the largest d² within the gate for the sensor's measurements; None without a gate. It is
+    computed here, once a trace, not for each measurement"""
+
+    def __post_init__(self) -> None:
+        gamma = gate_quantile(self.gate, len(self.sensor.measurements))
+        object.__setattr__(self, "gamma", gamma)
 
     @property
     def square_root(self) -> bool:

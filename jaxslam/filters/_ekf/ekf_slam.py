@@ -44,10 +44,10 @@ class EkfSlam(Filter):
     Several sensors are one `sensors.Suite`, whose parts are processed one after the other.
 
     Raises ValueError on models, charts, linearizers or associations of another type or size
-    (`validation`), a capacity, iterations or births below 1, a gate not above 0, an unknown
-    correction or covariance, a chart or linearizer that does not fit the sensor's landmarks or one
-    another, several iterations of a statistical linearizer, or a linearizer of landmarks for a
-    suite with an absolute sensor.
+    (`validation`), a capacity, iterations or births below 1, a gate not above 0 and below 1, an
+    unknown correction or covariance, a chart or linearizer that does not fit the sensor's landmarks
+    or one another, several iterations of a statistical linearizer, or a linearizer of landmarks for
+    a suite with an absolute sensor.
     """
 
     motion: Motion
@@ -67,8 +67,10 @@ class EkfSlam(Filter):
     """"sequential" corrects by one measurement after the other, relinearizing each time, as the
     guide does; "joint" corrects by the whole scan at once"""
     gate: Number | None = None
-    """reject a measurement whose squared Mahalanobis distance exceeds this; None: none. The guide's
-    3 σ is `stats.sigma_gate(3)`, and `stats.chi2_quantile` gives a probability"""
+    """the probability that a correct measurement passes, above 0 and below 1, as 0.999: one whose
+    squared Mahalanobis distance d² exceeds the χ² quantile of its Z numbers is rejected; None: none
+    is. The guide's 3 σ is `stats.sigma_gate(3, 2)`. float32 has no number between 1 - 6e-8
+    (d² = 33 of Z = 2) and 1"""
     iterations: int = static(default=1)
     """passes of the iterated EKF, each from the same prior; 1 is the plain EKF"""
     covariance: Covariance = static(default="plain")

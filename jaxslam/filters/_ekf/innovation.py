@@ -151,7 +151,7 @@ def innovate(
         marginal = s[jnp.arange(m), :, jnp.arange(m)]
         inverse, definite = no_inline(jax.vmap(linalg.whitener), marginal)
         if i == 0:
-            gated = _gate(nu, marginal, inverse, definite, known, settings.gate)
+            gated = _gate(nu, marginal, inverse, definite, known, settings.gamma)
         hp = hp.reshape(m * size_z, -1)
         factored = factor_of(s, same, inverse, definite, gated.fuse)
         v, whitened = whiten(factored, gated.fuse, hp, nu)
@@ -243,12 +243,12 @@ def _gate(
     inverse: Float[Array, "m Z Z"],
     definite: Bool[Array, "m"],
     known: Bool[Array, "m"],
-    gate: PyTree,
+    gamma: PyTree,
 ) -> _Gated:
-    """The gate: which measurements are fused. inverse: L⁻¹ of each cov = L Lᵀ."""
+    """The gate d² <= γ: which measurements are fused. inverse: L⁻¹ of each cov = L Lᵀ."""
     distance = (whitened_by(inverse, nu[:, :, None]) ** 2).sum(axis=(1, 2))
     # A finite measurement whose d² overflows is outside any gate.
-    inside = jnp.isfinite(distance) if gate is None else distance <= gate
+    inside = jnp.isfinite(distance) if gamma is None else distance <= gamma
     return _Gated(nu, cov, distance, inside, definite, known & inside & definite)
 
 

@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from jaxslam.charts import Euclidean
 from jaxslam.core import _validation as validation
 from jaxslam.core import slots
-from jaxslam.core._numbers import check_count, check_gate, check_positive
+from jaxslam.core._numbers import check_count, check_gate, check_positive, gate_quantile
 from jaxslam.core._record import record, static
 from jaxslam.core.protocols import Filter, Motion, Sensor
 from jaxslam.core.types import Scan
@@ -31,8 +31,8 @@ from jaxslam.sensors._suite import Suite
 class InformationFilter(Filter):
     """Models and options of an information filter, whose error is in map coordinates.
 
-    Raises ValueError on a capacity below 1, a gate or floor not above 0, a suite, or a sensor that
-    has no landmarks or whose landmarks become points.
+    Raises ValueError on a capacity below 1, a gate that is no probability, a floor not above 0, a
+    suite, or a sensor that has no landmarks or whose landmarks become points.
     """
 
     motion: Motion
@@ -42,7 +42,7 @@ class InformationFilter(Filter):
     """landmark slots N; a new landmark in a full map is `Status.OVERFLOW`"""
     _: dataclasses.KW_ONLY
     gate: Number | None = None
-    """reject a measurement whose squared Mahalanobis distance exceeds this"""
+    """as for `EkfSlam`"""
     floor: Number = 1e-4
     """standard deviation [m, rad] added to a singular pose_cov, which has no inverse"""
     chart = Euclidean()
@@ -150,8 +150,9 @@ def innovations(
     Args:
         index: the landmark of each measurement, where known.
     """
-    sensor, gate = settings.sensor, settings.gate
+    sensor = settings.sensor
     m, size = scan.z.shape
+    gamma = gate_quantile(settings.gate, size)
     z = jnp.where(scan.valid[:, None], scan.z, 0.0)
     measured = landmarks[index]
     z_hat = jax.vmap(sensor.observe, (None, 0))(pose, measured)
@@ -168,7 +169,7 @@ def innovations(
     alone = jax.vmap(gaussian_terms)(innovation, innovation_cov)
     noise_factor, noise_positive = jax.vmap(linalg.cholesky)(noise)
     positive = alone.positive & noise_positive & omega_positive
-    inside = jnp.isfinite(alone.distance) if gate is None else alone.distance <= gate
+    inside = jnp.isfinite(alone.distance) if gamma is None else alone.distance <= gamma
     fused = known & inside & positive
 
     fused_innovation = jnp.where(fused[:, None], innovation, 0.0)

@@ -71,7 +71,7 @@ class Localization(Filter):
     """(N, L) the map, in the sensor's parameters"""
     _: dataclasses.KW_ONLY
     tags: tuple[int, ...] | None = static(default=None)
-    """N different ones, in any form; default the row numbers"""
+    """N different ones, in any form, as of a map of some landmarks; default the row numbers"""
     chart: Chart = Euclidean()
     """the error coordinates of P; its pose part"""
     linearize: Linearizer = AtEstimate()
@@ -99,6 +99,11 @@ class Localization(Filter):
             )
         check_iterations(name, linearize, self.iterations)
         super().__post_init__()
+
+    @property
+    def map_size(self) -> int | None:  # type: ignore[override]
+        is_whole = self.tags is None and self.sensor.landmark
+        return np.shape(self.landmarks)[0] if is_whole else None
 
     def init(self, pose: Array, pose_cov: Array) -> Joint:
         chart, capacity = _OfPose(self.chart), np.shape(self.landmarks)[0]

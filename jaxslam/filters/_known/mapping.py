@@ -41,8 +41,8 @@ class Mapping(Filter):
     The state is one particle of a `SlamParticles`. `log._replace(control=poses)` makes a log
     of recorded poses (T, 3) and scans; `as_prior` makes the map the initial state of `EkfSlam`.
 
-    Raises ValueError on a capacity or births below 1, a gate not above 0, or a sensor that is a
-    suite, absolute, or whose landmarks turn into points.
+    Raises ValueError on a capacity or births below 1, a gate not above 0 and below 1, or a sensor
+    that is a suite, absolute, or whose landmarks turn into points.
     """
 
     sensor: Sensor

@@ -78,7 +78,7 @@ class FastSlam(Filter):
     Estimates: `slam_estimate`.
 
     Raises ValueError on a capacity, particles or births below 1, a threshold outside [0, 1], a gate
-    not above 0, an unknown proposal, an invalid life or resample, or a
+    not above 0 and below 1, an unknown proposal, an invalid life or resample, or a
     sensor that is a suite, absolute, or whose landmarks turn into points.
     """
 
@@ -102,7 +102,7 @@ class FastSlam(Filter):
     associate: Associate = Known()
     """other methods associate by each particle's map"""
     gate: Number | None = None
-    """reject a measurement whose squared Mahalanobis distance exceeds this"""
+    """as for `EkfSlam`"""
     births: int | None = static(default=None)
     """largest number of new landmarks a scan and particle, the rest `Status.DEFERRED`"""
     life: Life | None = None

@@ -47,7 +47,7 @@ class ScanLikelihood(NamedTuple):
     dof: Int[Array, "*P M"]
     """Z of the sensor"""
     counted: Float[Array, "*P M"]
-    """d² in the weight: clipped at the gate, `unmatched_distance` without a landmark, 0 where
+    """d² in the weight: at most γ of the gate, `unmatched_distance` without a landmark, 0 where
     there is no measurement"""
     spread: Float[Array, "*P M"]
     """log |R(ẑ)| - log |R(z)| of measurements matched to a landmark, else 0; the latter is the same
@@ -85,7 +85,7 @@ def _sensor_likelihood(
 ) -> ScanLikelihood:
     """The likelihood of one sensor's measurements.
 
-    A measurement outside the gate gets the d² of the gate, and one without a landmark
+    A measurement outside the gate gets d² = γ of the gate, and one without a landmark
     `unmatched_distance`, so that a particle with fewer associations is not preferred. With a gate
     no weight underflows because of a single outlier.
     """
@@ -99,7 +99,7 @@ def _sensor_likelihood(
     nu = jax.vmap(sensor.residual)(scan.z, z_hat)
     terms = jax.vmap(gaussian_terms)(nu, noise)
     factor_at_z = jax.vmap(lambda z: linalg.cholesky(sensor.noise_cov(z))[0])(scan.z)
-    gated = gate_distance(terms.distance, settings.gate)
+    gated = gate_distance(terms.distance, settings.gamma)
     of_map = matched & terms.positive
     far = jnp.asarray(settings.unmatched_distance, scan.z.dtype)
     unmatched = jnp.where(scan.valid, far, 0.0)

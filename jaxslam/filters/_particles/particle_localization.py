@@ -5,6 +5,7 @@ from functools import partial
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
@@ -62,7 +63,7 @@ class ParticleLocalization(MonteCarloFilter):
     customary; the estimate is then conservative.
 
     Raises ValueError as `MonteCarloFilter`, on a map or tags as `Localization` refuses them, or a
-    gate not above 0.
+    gate not above 0 and below 1.
     """
 
     motion: Motion
@@ -74,13 +75,12 @@ class ParticleLocalization(MonteCarloFilter):
     """the capacity P, at least 1"""
     _: dataclasses.KW_ONLY
     tags: tuple[int, ...] | None = static(default=None)
-    """N different ones, in any form; default the row numbers"""
+    """N different ones, in any form, as of a map of some landmarks; default the row numbers"""
     associate: Associate = Known()
-    """any other than by tag decides for each particle, by its pose alone (MaximumLikelihood with an
-    infinite gate: the most likely landmark)"""
+    """any other than by tag decides for each particle, by its pose alone (MaximumLikelihood(None):
+    the most likely landmark)"""
     gate: Number | None = None
-    """a measurement whose squared Mahalanobis distance exceeds this counts as one on the gate, and
-    is reported as rejected"""
+    """as for `EkfSlam`; a measurement beyond it counts as one on it, and is reported as rejected"""
 
     def __post_init__(self) -> None:
         name = type(self).__name__
@@ -92,6 +92,11 @@ class ParticleLocalization(MonteCarloFilter):
         if self.start == "uniform" and self.box is None:
             raise ValueError(f"{name}: expected a box with a uniform start, got none")
         super().__post_init__()
+
+    @property
+    def map_size(self) -> int | None:  # type: ignore[override]
+        is_whole = self.tags is None and self.sensor.landmark
+        return np.shape(self.landmarks)[0] if is_whole else None
 
     @property
     def region(self) -> Box | None:

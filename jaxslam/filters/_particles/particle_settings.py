@@ -7,6 +7,7 @@ from jax import Array
 from numpy.typing import ArrayLike
 
 from jaxslam.core import _validation as validation
+from jaxslam.core._numbers import gate_quantile
 from jaxslam.core._record import hold_function
 from jaxslam.core.protocols import Associate, Life, Sensor
 from jaxslam.filters._known.localization import map_tags
@@ -27,11 +28,15 @@ class _AssociationSettings:
     gate: Number | None
 
     @property
+    def gamma(self) -> Number | None:
+        """The largest d² within the gate; None without one."""
+        return gate_quantile(self.gate, len(self.sensor.measurements))
+
+    @property
     def unmatched_distance(self) -> Number:
-        """The d² assigned to a measurement without a landmark: the gate, or a high quantile."""
-        if self.gate is not None:
-            return self.gate
-        return chi2_quantile(_NEAR, len(self.sensor.measurements))
+        """The d² assigned to a measurement without a landmark: γ, or that of a gate of `_NEAR`."""
+        near = _NEAR if self.gate is None else self.gate
+        return chi2_quantile(near, len(self.sensor.measurements))
 
 
 @dataclass(frozen=True, eq=False)

@@ -96,11 +96,11 @@ def propose_pose(
 
     whose product is the density of the scan given the path. P = 0 (a pose that is drawn
     already) is not changed, and gives the weights of FastSLAM 1.0. P is not inverted, so it may be
-    singular. A measurement outside the gate gets the d² of the gate, and one without a landmark
+    singular. A measurement outside the gate gets d² = γ of the gate, and one without a landmark
     d² = `unmatched_distance` of a landmark known exactly, log N = -(d² + log |2πR(z)|)/2, so that a
     particle with fewer associations is not preferred.
     """
-    sensor, gate = settings.sensor, settings.gate
+    sensor, gamma = settings.sensor, settings.gamma
     size_z = len(sensor.measurements)
     unmatched = jnp.asarray(settings.unmatched_distance, particle.pose.dtype)
 
@@ -117,7 +117,7 @@ def propose_pose(
         s = linalg.matmul(hp, by_pose.T) + noise
         s = linalg.symmetrize(s + linalg.matmul(linalg.matmul(by_landmark, cov), by_landmark.T))
         terms = gaussian_terms(nu, s)
-        gated = gate_distance(terms.distance, gate)
+        gated = gate_distance(terms.distance, gamma)
         of_map = matched & terms.positive
         used = of_map & gated.inside
         v = jnp.where(used, linalg.solve_lower(terms.factor, hp), 0.0)

@@ -46,17 +46,20 @@ class _GatedDistance(NamedTuple):
     inside: Bool[Array, "..."]
     """within the gate; without one, d² is finite"""
     counted: Float[Array, "..."]
-    """d² in the weight, clipped at the gate"""
+    """d² in the weight, at most γ"""
     reported: Float[Array, "..."]
     """d², a large number where it is not finite"""
 
 
-def gate_distance(distance: Float[Array, "*M"], gate: Number | None) -> _GatedDistance:
-    """The gated distance: whether d² passes, and its values for weights and for `Info`."""
+def gate_distance(distance: Float[Array, "*M"], gamma: Number | None) -> _GatedDistance:
+    """The gated distance: whether d² passes, and its values for weights and for `Info`.
+
+    gamma: the largest d² within the gate; None without one.
+    """
     finite = jnp.isfinite(distance)
-    if gate is not None:
-        gate = jnp.asarray(gate, distance.dtype)
-    inside = finite if gate is None else finite & (distance <= gate)
-    counted = distance if gate is None else jnp.where(inside, distance, gate)
+    if gamma is not None:
+        gamma = jnp.asarray(gamma, distance.dtype)
+    inside = finite if gamma is None else finite & (distance <= gamma)
+    counted = distance if gamma is None else jnp.where(inside, distance, gamma)
     largest = 0.5 * float(jnp.finfo(distance.dtype).max)
     return _GatedDistance(inside, counted, jnp.where(finite, distance, largest))

@@ -77,7 +77,7 @@ def cloister(steps: int = 200) -> Scenario:
         landmarks=cloister_landmarks(-4.0, 4.0, 7),
         controls=np.tile([0.1, 0.05], (steps, 1)),
         pose=(0.0, -2.0, 0.0),
-        filter_options={"correction": "sequential", "gate": sigma_gate(3), "births": 1},
+        filter_options={"correction": "sequential", "gate": sigma_gate(3, 2), "births": 1},
         source="Solà, EKF-SLAM guide, 2014, appendix C.3",
     )
 

@@ -28,6 +28,10 @@ BESIDE = dataclasses.replace(WORLD, sensor=sensors.RelativePosition(np.eye(2)))
 EKF = worlds.ekf(WORLD)
 
 
+def known_map(landmarks):
+    return filters.Localization(WORLD.motion, WORLD.sensor, landmarks)
+
+
 @pytest.fixture(scope="module")
 def in_fours():
     """Runs 0 to 3, 4 to 7, 8 and 9; one device, one worker."""
@@ -431,6 +435,14 @@ def test_wrong_filters_are_found_out(name):
     (
         {"filters": {"x": lambda truth: worlds.ekf(BESIDE)}},
         "filter ekf_slam takes measurements (ahead [m]",
+    ),
+    (
+        {"filters": {"x": known_map(np.asarray(WORLD.landmarks)[:4])}},
+        "filter x has a map of 4 landmarks, the scenario ring has 6; a map of some of them needs",
+    ),
+    (
+        {"filters": {"x": lambda truth: known_map(jnp.concatenate([truth.landmarks] * 2))}},
+        "filter localization has a map of 12 landmarks, the scenario ring has 6",
     ),
     escaped=True,
 )

@@ -24,7 +24,6 @@ from jaxslam.filters._delayed.initialization import add_landmark, initial_estima
 from jaxslam.filters._delayed.intersection import add_hypotheses
 from jaxslam.filters._delayed.state import TableLayout
 from jaxslam.filters._delayed.triangulation import Circles, Rays, triangulation_of
-from jaxslam.math.stats import chi2_quantile
 
 CAMERA = sensors.BearingOnly([[0.01**2]])
 BEACON = sensors.RangeOnly([[0.05**2]])
@@ -542,7 +541,6 @@ def test_in_reverse_what_makes_a_landmark_is_as_forward():
 def test_without_names_intersections_find_the_landmarks():
     """Every bearing may be of any landmark; the names in the log are not looked at."""
     scenario = world("rays")
-    gates = chi2_quantile(0.99, 1), chi2_quantile(0.9999, 1)
     filter = DelayedSlam(
         scenario.motion,
         scenario.sensor,
@@ -550,7 +548,7 @@ def test_without_names_intersections_find_the_landmarks():
         stored=StoredMeasurements(capacity=40),
         hypotheses=Hypotheses(capacity=40, decay=0.7),
         promotion=Promotion(persistence=6.0),
-        associate=Nearest(*gates),
+        associate=Nearest(0.99, 0.9999),
     )
     truth, log = draw(scenario, 4)
     final = jax.tree.map(lambda x: np.asarray(x[-1]), driven(filter, nameless(log)).estimate)
@@ -563,7 +561,7 @@ def test_without_names_intersections_find_the_landmarks():
 @refused(
     (lambda: slam(sensors.RangeBearing(np.eye(2))), "one bearing or one range"),
     (lambda: slam(capacity=0), "DelayedSlam: capacity"),
-    (lambda: slam(gate=0), "DelayedSlam: expected a gate above 0"),
+    (lambda: slam(gate=0), "DelayedSlam: expected a probability above 0 and below 1 as gate"),
     (lambda: slam(triangulation=3), "DelayedSlam: expected triangulation to be a Triangulation"),
     (lambda: slam(triangulation=Rays), "got the class Rays: call it"),
     (lambda: slam(stored=32), "DelayedSlam: expected stored to be a StoredMeasurements, got int"),

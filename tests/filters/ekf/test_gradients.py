@@ -109,7 +109,7 @@ def gated():
     """In float32, with the 3 σ gate and a map six landmarks too small."""
     return jax.jit(
         jax.value_and_grad(
-            lambda p, log: log_likelihood(p, log, capacity=30, gate=sigma_gate(3)), has_aux=True
+            lambda p, log: log_likelihood(p, log, capacity=30, gate=sigma_gate(3, 2)), has_aux=True
         )
     )
 

@@ -13,12 +13,11 @@ from jaxslam import association, life, motion, run, sensors
 from jaxslam.core.types import Log, Scan, Status
 from jaxslam.filters import EkfSlam
 from jaxslam.filters.map_management._merging import Merging
-from jaxslam.math.stats import chi2_quantile
 
 STEPS, PLACES = 400, 4
 MOTION = motion.Increment(np.diag([0.01, 0.01]) ** 2)
 SENSOR = sensors.RangeBearing(np.diag([0.05, 0.02]) ** 2)
-GATE, NEW = chi2_quantile(0.99, 2), chi2_quantile(0.9999, 2)
+GATE, NEW = 0.99, 0.9999
 MAKERS = {
     "nearest": association.Nearest,
     "maximum_likelihood": association.MaximumLikelihood,
@@ -26,8 +25,8 @@ MAKERS = {
     "joint": lambda _, new: association.JointCompatibility(0.99, new, budget=50),
 }
 METHODS = {name: (name, GATE, NEW) for name in MAKERS} | {
-    "gates of 0 and ∞": ("nearest", 0.0, np.inf),
-    "gates of ∞": ("nearest", np.inf, np.inf),
+    "gates of 0 and 1": ("nearest", 0.0, 1.0),
+    "gates of 1": ("nearest", 1.0, 1.0),
 }
 CASES = [(method, 6) for method in METHODS] + [("joint", 1)]
 OF_NEAREST = [case for case in CASES if METHODS[case[0]][0] == "nearest"]

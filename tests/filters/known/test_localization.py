@@ -11,14 +11,20 @@ from cases import refused, swept
 from worlds import draw, judged, nameless, narrow, ring
 
 from jaxslam import association, charts, linearize, run, sensors, simulate
+from jaxslam._driver import check_run
 from jaxslam.core.types import Scan, Status
-from jaxslam.filters import DeadReckoning, EkfSlam, Localization, StartingAt
-from jaxslam.math.stats import chi2_quantile
+from jaxslam.filters import (
+    DeadReckoning,
+    EkfSlam,
+    Localization,
+    ParticleLocalization,
+    StartingAt,
+)
 from jaxslam.sensors import Part, Suite
 
 KEY = jax.random.key(0)
 START, SPREAD = np.array([0.1, -0.05, 0.02]), np.diag([0.2, 0.1, 0.05]) ** 2
-GATE, NEW = chi2_quantile(0.999, 2), chi2_quantile(0.99999, 2)
+GATE, NEW = 0.999, 0.99999
 
 
 @cache
@@ -77,7 +83,7 @@ def slam_in_a_known_map(scenario, log, chart_name, options):
     ("chart", "options", "compass"),
     swept(
         [
-            ("euclidean", {"iterations": 3, "covariance": "joseph", "gate": 4.0}, False),
+            ("euclidean", {"iterations": 3, "covariance": "joseph", "gate": 0.9}, False),
             ("euclidean", {}, True),
             ("right_invariant", {}, False),
             ("left_invariant", {"correction": "joint"}, False),
@@ -101,8 +107,7 @@ def test_it_is_slam_in_a_map_without_error(chart, options, compass):
 def test_it_finds_its_landmarks_without_tags(method):
     scenario, (_, log) = world()
     make = {"nearest": association.Nearest, "joint": association.JointCompatibility}[method]
-    associate = make(0.999, NEW) if method == "joint" else make(GATE, NEW)
-    trace = driven(here(associate=associate), nameless(log))
+    trace = driven(here(associate=make(GATE, NEW)), nameless(log))
     fused = np.asarray(trace.info.status == Status.FUSED)
     assert fused.mean() > 0.98
     right = np.asarray(trace.info.slot) == np.asarray(log.scan.tag)
@@ -157,6 +162,21 @@ def test_dead_reckoning_is_the_motion_alone():
         pose = move(pose, u, np.zeros(2))
         np.testing.assert_allclose(estimate, pose, atol=1e-12)
     assert not trace.estimate.alive.any()
+
+
+def test_a_map_of_fewer_landmarks_than_the_log_has_is_refused():
+    """By row numbers; one with tags is of some landmarks, and without tags any map will do."""
+    scenario, (_, log) = world()
+    parts = scenario.motion, scenario.sensor, np.asarray(scenario.landmarks)[:4]
+    for filter in (
+        Localization(*parts),
+        StartingAt(Localization(*parts), None),
+        ParticleLocalization(*parts, 5),
+    ):
+        with pytest.raises(ValueError, match=r"^run: .* landmark 5, the map of .* has 4, 0 to 3; "):
+            run(filter, log, START, SPREAD, KEY)
+    for options in ({"tags": range(4)}, {"associate": association.Nearest(GATE)}):
+        check_run("run", Localization(*parts, **options), log, START, SPREAD)
 
 
 @pytest.mark.sweep

@@ -152,7 +152,7 @@ def test_certain_hides_what_cannot_be_foretold():
     pairs = Pairs(jnp.zeros((1, 2, 2)), cov, distance, jnp.zeros((1, 2)), jnp.ones((1, 2), bool))
     prediction = Prediction(jnp.full(2, -1), jnp.ones(2, bool), lambda scan: pairs, lambda: None)
     scan = Scan(jnp.zeros((1, 2)), jnp.array([-1]), jnp.array([True]))
-    near = association.Nearest(9.0)
+    near = association.Nearest(0.99)
     assert int(near(prediction, scan).slot[0]) == 1
     assert int(association.Certain(near, 0.5)(prediction, scan).slot[0]) == 0
     hidden = association.Certain(near, 0.05)(prediction, scan)
@@ -171,7 +171,7 @@ def test_a_whole_run_ends_with_each_landmark_once():
             20,
             chart=charts.RightInvariant(),
             correction="joint",
-            associate=association.Certain(association.Nearest(9.21, 30.0), 0.4),
+            associate=association.Certain(association.Nearest(0.99, 0.9999997), 0.4),
             life=Recency(),
         ),
         reach=1.0,
@@ -211,7 +211,7 @@ MODELS = motion.PoseIncrement(np.eye(3)), sensors.RelativePosition(np.eye(2)), 3
     (lambda: LoopSettings(drift=1.0), "LoopSettings: .*drift"),
     (lambda: LoopSettings(probability=0.0), "probability"),
     (lambda: look(two_visits()[0]._replace(life=None)), "keeps times"),
-    (lambda: association.Certain(association.Nearest(9.0), 0.0), "spread"),
+    (lambda: association.Certain(association.Nearest(0.99), 0.0), "spread"),
     (lambda: Closing(EkfSlam(*MODELS), every=0), "every"),
     (lambda: Closing(EkfSlam(*MODELS), reach=-1.0), "reach"),
     (lambda: Closing(EkfSlam(*MODELS)).init(jnp.zeros(3), jnp.eye(3)), "keeps times"),

@@ -366,9 +366,7 @@ def test_a_kidnapped_robot_finds_itself_and_goes_on():
     landmarks = rng.uniform(-12, 12, (25, 2))
     model = motion.PoseIncrement(np.diag([0.02, 0.02, 0.01]) ** 2)
     sensor = sensors.RangeBearing(np.diag([0.05, 0.01]) ** 2)
-    filter = EkfSlam(
-        model, sensor, 25, chart=chart, gate=chi2_quantile(0.9999, 2), correction="joint"
-    )
+    filter = EkfSlam(model, sensor, 25, chart=chart, gate=0.9999, correction="joint")
     predict, update = jax.jit(filter.predict), jax.jit(filter.update)
     look = jax.jit(jax.vmap(sensor.observe, (None, 0)))
     points_of = jax.jit(partial(seen_points, sensor))

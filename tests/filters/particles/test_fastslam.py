@@ -19,6 +19,7 @@ from jaxslam.core.types import Scan, Status
 from jaxslam.filters import FastSlam
 from jaxslam.filters._particles import slam_particles
 from jaxslam.filters._particles.slam_particles import SlamParticles
+from jaxslam.math.stats import sigma_gate
 
 KEY = jax.random.key(5)
 MOUNT = np.array([0.1, -0.05, 0.3])  # of worlds.ring
@@ -312,7 +313,10 @@ def test_where_all_weights_underflow_the_filter_goes_on_and_counts():
 
 
 def test_a_gate_drops_an_outlier_and_births_have_a_quota_and_a_tag_is_born_once():
-    strict, start = of(count=4, capacity=4, gate=16.0, births=1), known_map([[0, 1, -1, -1]] * 4)
+    strict, start = (
+        of(count=4, capacity=4, gate=sigma_gate(4, 2), births=1),
+        known_map([[0, 1, -1, -1]] * 4),
+    )
     after, info = updated(strict, start, scan_of([(0, 3.0, 0.0)]))
     np.testing.assert_array_equal(info.status, [Status.REJECTED] + [Status.EMPTY] * 3)
     assert info.nis[0] > 16
@@ -462,7 +466,7 @@ def test_gradients_are_finite_where_the_pose_is_known_exactly(proposal):
     ({"proposal": "optimal"}, 'expected proposal "motion" or "measurement"'),
     ({"threshold": 1.5}, "threshold from 0 to 1"),
     ({"threshold": np.nan}, "threshold from 0 to 1"),
-    ({"gate": 0.0}, "gate above 0"),
+    ({"gate": 0.0}, "above 0 and below 1 as gate"),
     ({"resample": "systematic"}, "resample to be a function"),
     ({"life": "existence"}, "life to be a Life"),
     ({"sensor": sensors.Compass(np.eye(1))}, "not a suite"),

@@ -18,6 +18,7 @@ from jaxslam import association, motion, resampling, run, sensors
 from jaxslam.core.types import Scan, Status
 from jaxslam.filters import FastSlam, Localization, ParticleLocalization
 from jaxslam.filters._particles import pose_particles
+from jaxslam.math.stats import sigma_gate
 from jaxslam.sensors import Part, Suite
 
 KEY = jax.random.key(5)
@@ -119,7 +120,7 @@ def test_weights_are_the_scans_densities(gate):
     scan = jax.tree.map(np.array, one_scan())
     scan.tag[2], scan.valid[5] = -1, False
     scan.z[4] += [3.0, 0.0]
-    filter = of(30, BLUNT, gate=None if gate == math.inf else gate)
+    filter = of(30, BLUNT, gate=None if gate == math.inf else sigma_gate(4, 2))
     after, info = updated(filter, scan, [0.3, 0.3, 0.2])
     assert len(np.unique(after.pose[:, 0])) == 30  # drawn, each for itself
     edge = {} if gate == math.inf else {"edge": gate}
@@ -138,7 +139,7 @@ def test_weights_are_the_scans_densities(gate):
 @pytest.mark.sweep
 def test_landmarks_far_apart_are_known_without_tags_by_each_particle():
     truth, log = history(8)
-    likeliest = association.MaximumLikelihood(1e6)
+    likeliest = association.MaximumLikelihood(None)
     trace = drive(
         of(60, BLUNT, associate=likeliest), worlds.nameless(log), cov=np.diag([0.1, 0.1, 0.05]) ** 2
     )
@@ -178,7 +179,7 @@ def carried():
     keys = jax.random.split(KEY, 6)
     go = jax.jit(jax.vmap(lambda key: run(lost, log, np.zeros(3), np.zeros((3, 3)), key)))
     ours = go(keys)
-    ekf = Localization(WORLD.motion, BLUNT, WORLD.landmarks, gate=16.0)
+    ekf = Localization(WORLD.motion, BLUNT, WORLD.landmarks, gate=sigma_gate(4, 2))
     theirs = drive(ekf, log, (0.5, 1.0, 2.0))  # which is told where it starts
     off = np.linalg.norm(np.asarray(ours.estimate.pose)[:, :, :2] - truth[:, :2], axis=2)
     ekf_off = np.linalg.norm(np.asarray(theirs.estimate.pose)[:, :2] - truth[:, :2], axis=1)
@@ -365,7 +366,7 @@ def test_gradients_are_finite_from_a_start_that_is_known_exactly():
     ({"box": [[0, 0, 0], [1, 1, 1]]}, r"a box of shape \(2, 2\)"),
     ({"box": [[1, 1], [0, 2]]}, "a box of"),
     ({"threshold": 1.5}, "threshold from 0 to 1"),
-    ({"gate": 0.0}, "gate above 0"),
+    ({"gate": 0.0}, "above 0 and below 1 as gate"),
     ({"forget": (0.2, 0.1)}, "0 < slow <= fast <= 1"),
     ({"resample": "systematic"}, "resample to be a function"),
 )

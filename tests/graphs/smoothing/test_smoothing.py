@@ -287,7 +287,7 @@ def fixed_ring(steps=14):
 
 @pytest.mark.parametrize(
     ("make", "options"),
-    swept([(camera_ring, {"gate": 1.0, "births": 1}), (fixed_ring, {})], (fixed_ring, {})),
+    swept([(camera_ring, {"gate": 0.6, "births": 1}), (fixed_ring, {})], (fixed_ring, {})),
 )
 def test_it_ends_where_the_filter_ends(make, options):
     """The last pose and the map, with all covariances: births, gates and priors as the filter has
