@@ -25,7 +25,7 @@ if TYPE_CHECKING:  # Matplotlib is slow to load
 _T = TypeVar("_T")
 
 FAILED = 1
-"""Exit status where models are wrong, or runs are missing."""
+"""Exit status where models or filters are wrong, or runs are missing."""
 INTERRUPTED = 130
 """Exit status after Ctrl-C."""
 

@@ -102,11 +102,7 @@ class UserObjects:
         return name, getattr(module, name)
 
     def _from_file(self, entry: str, scenario: World) -> tuple[str, Candidate]:
-        """The name of a user's filter, and the filter for the scenario.
-
-        The name is that of the filter if its class is the user's and the catalog has none of that
-        name, else NAME.
-        """
+        """NAME of a user's file, and the filter for the scenario."""
         name, value = self._find("--filters", entry)
         made = value
         if not isinstance(made, Filter) and callable(made):
@@ -116,9 +112,6 @@ class UserObjects:
                 f"{entry}: expected a Filter, or a function of the scenario that returns one, "
                 f"{_got(value, made)}"
             )
-        own = not type(made).__module__.startswith("jaxslam.")
-        if isinstance(made, Filter) and own and made.name not in ALL:
-            name = made.name
         check_fits(name, made, scenario)
         return name, made
 

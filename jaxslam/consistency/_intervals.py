@@ -8,7 +8,11 @@ import numpy as np
 from jaxslam.math.stats import t_quantile
 
 LEVEL = 0.95
-"""of every band and interval."""
+"""of every band, and of the two tests of a verdict together"""
+
+EACH = LEVEL**0.5
+"""of each of the two tests, and of every interval over the runs: 97.5 %. So the verdict can be read
+off the intervals."""
 
 _SKEW = 1.5
 """The factor by which the skewness of a run's average NEES reduces degrees of freedom."""
@@ -20,7 +24,7 @@ def percentage(share: float, digits: int = 0) -> str:
 
 
 class Average(NamedTuple):
-    """An average over all runs, with its 95 % interval from the spread between runs."""
+    """An average over all runs, with its interval of level `EACH` from the spread between runs."""
 
     value: float
     low: float
@@ -79,7 +83,7 @@ class Spread(NamedTuple):
 
 
 def spread(
-    values: np.ndarray | Sequence[float], level: float = LEVEL, skewed: bool = True
+    values: np.ndarray | Sequence[float], level: float = EACH, skewed: bool = True
 ) -> Spread | None:
     """The mean of positive numbers, one an independent run, NaN left out; None without any.
 
@@ -97,7 +101,7 @@ def spread(
 
 
 def positive_interval(
-    values: np.ndarray | Sequence[float], level: float = LEVEL, skewed: bool = True
+    values: np.ndarray | Sequence[float], level: float = EACH, skewed: bool = True
 ) -> Average | None:
     """The mean of positive numbers with the interval of `Spread`; None without numbers.
 
@@ -111,7 +115,7 @@ def positive_interval(
     return Average(found.mean, found.low, found.high)
 
 
-def interval(values: np.ndarray | Sequence[float]) -> Average | None:
+def interval(values: np.ndarray | Sequence[float], level: float = EACH) -> Average | None:
     """Mean of independent runs with its t interval, NaN left out; None where nothing is left.
 
     For what may be of either sign; what cannot be negative has `positive_interval`.
@@ -122,7 +126,7 @@ def interval(values: np.ndarray | Sequence[float]) -> Average | None:
     mean = float(finite.mean())
     if finite.size < 2:
         return Average(mean, -np.inf, np.inf)
-    half = t_quantile(0.5 + LEVEL / 2, finite.size - 1) * finite.std(ddof=1) / np.sqrt(finite.size)
+    half = t_quantile(0.5 + level / 2, finite.size - 1) * finite.std(ddof=1) / np.sqrt(finite.size)
     return Average(mean, mean - float(half), mean + float(half))
 
 

@@ -10,7 +10,7 @@ from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam._driver import run
-from jaxslam.consistency._intervals import Average, interval, positive_interval
+from jaxslam.consistency._intervals import LEVEL, Average, interval, positive_interval
 from jaxslam.consistency._measures.nees import block_nees, pose_error
 from jaxslam.core._numbers import check_count, check_covariance, check_key
 from jaxslam.core.protocols import Filter
@@ -250,11 +250,11 @@ def summarize_localization(
     )
     rmse = np.sqrt((off[kept, at] ** 2).mean(axis=1))
     return LocalizationSummary(
-        coverage=interval((np.asarray(scores.level)[:, at] <= 0.95 + 1e-9).mean(axis=1)),
-        nees=positive_interval(np.where(counted.any(axis=1), per_run, np.nan)),
+        coverage=interval((np.asarray(scores.level)[:, at] <= 0.95 + 1e-9).mean(axis=1), LEVEL),
+        nees=positive_interval(np.where(counted.any(axis=1), per_run, np.nan), LEVEL),
         unimodal=float(scores.together[:, at].mean()),
-        energy=positive_interval(np.asarray(scores.energy[:, at]).mean(axis=1)),
-        rmse=positive_interval(rmse),
+        energy=positive_interval(np.asarray(scores.energy[:, at]).mean(axis=1), LEVEL),
+        rmse=positive_interval(rmse, LEVEL),
         heading=float(np.median(np.abs(error[kept, at, 2]))) if kept.any() else np.nan,
         found=found,
         lost=float(1 - kept.mean()),

@@ -17,7 +17,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, PyTree
+from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam.consistency._measures import REGISTRY
 from jaxslam.consistency._measures.associations import association_scores, identities
@@ -27,6 +27,7 @@ from jaxslam.consistency._measures.nees import block_nees, pose_error
 from jaxslam.core.protocols import Sensor
 from jaxslam.core.types import Estimate, Info, Status, Trace, Truth
 from jaxslam.math import _linalg as linalg
+from jaxslam.math._pose_covariances import covariance_faults
 
 LAGS = 10
 """Largest lag of the autocorrelation of innovations, in steps."""
@@ -61,6 +62,7 @@ def score(
     truth: Truth,
     found: RunStatistics,
     own_error: Float[np.ndarray, "R T 3"] | None = None,
+    measured: Int[np.ndarray, "R"] | None = None,
 ) -> Score:
     """The scores of R runs, by NumPy in float64; every array is the host's and has leading R.
 
@@ -71,6 +73,7 @@ def score(
         found: `run_statistics` of each run.
         own_error: the pose errors in the coordinates of the filter (see `own_error_of`), by default
             those in (x, y, θ).
+        measured: the measurements in the log of each run, by default those that the infos have.
     """
     pose, cov = map(np.asarray, trace.estimate[:2])
     error = pose_error(np.asarray(truth.pose), pose)
@@ -78,10 +81,18 @@ def score(
     nees = block_nees(pose, error, error if own_error is None else own_error, cov)
     landmarks = found.landmark_nees, found.regular_landmarks
     nees["landmarks"] = Nees(*(np.asarray(x, np.float64) for x in landmarks))
+    became, faults = counted(trace.info), covariance_faults(pose, cov)
+    if measured is None:
+        measured = (np.asarray(trace.info.status) != Status.EMPTY).sum(axis=(1, 2))
     sums: dict[str, np.ndarray] = {
-        **counted(trace.info),
+        "steps": np.full(len(error), steps),
+        "measured": np.asarray(measured),
+        **became,
         "missed": np.asarray(truth.missed).sum(axis=1),
         "singular_steps": steps - nees["pose"].regular.sum(axis=1),
+        "asymmetric_steps": faults.asymmetric.sum(axis=1),
+        "indefinite_steps": faults.indefinite.sum(axis=1),
+        "constant": _is_constant(trace, truth),
     }
     runs = Runs(truth, trace, found, error, nees)
     measures: dict[str, tuple[np.ndarray, np.ndarray]] = {}
@@ -102,6 +113,17 @@ def score(
         snapshots=(error[:, at], cov[:, at], nees["pose"].regular[:, at]),
         sums=sums,
     )
+
+
+def _is_constant(trace: Trace, truth: Truth) -> Bool[np.ndarray, "R"]:
+    """Whether pose and covariance of a run stay as they are, to the bit, while the robot moves."""
+
+    def still(values: np.ndarray) -> np.ndarray:
+        rows = np.asarray(values)
+        out: np.ndarray = (rows == rows[:, :1]).reshape(len(rows), -1).all(axis=1)
+        return out
+
+    return still(trace.estimate.pose) & still(trace.estimate.pose_cov) & ~still(truth.pose)
 
 
 class _Sums(NamedTuple):

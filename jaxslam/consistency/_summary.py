@@ -57,8 +57,10 @@ class Summary:
     """(LAGS,) half-width of the 95 % band about 0 in which that of white innovations lies,
     1.96/√(products of numbers in it) (Bar-Shalom 2001, 5.4.2)."""
     counts: dict[str, int]
-    """runs (finite), not_finite, divergent, singular_steps, dropped measurements by reason, and,
-    of filters that have them, landmarks removed, merged and reduced, and searches exhausted."""
+    """runs (finite), not_finite, inaccurate, divergent, steps, measured (measurements in the logs),
+    used and dropped measurements by `Status`, missed, singular_steps, asymmetric_steps,
+    indefinite_steps, constant, and, of filters that have them, landmarks removed, merged and
+    reduced, and searches exhausted. All but the first three are of the finite runs."""
     per_run: dict[str, np.ndarray]
     """(runs,) the average of each measure in each run, NaN without one: squares, radians."""
     not_finite_runs: list[int]
@@ -69,7 +71,7 @@ class Summary:
     """by measure, the averages (at most, at least) that such a campaign notices nine times in ten:
     what "consistent" says, which means not rejected"""
     doubts: tuple[str, ...] = ()
-    """sentences that qualify the verdict: most measurements dropped, directions lost"""
+    """sentences that qualify the verdict, the gravest first: see `judge`"""
     honest_nis: float = 1.0
     """nis_per_dof from here on up to 1 is honest: below 1 where a gate dropped measurements"""
 
@@ -112,6 +114,7 @@ def summarize(tally: Tally, bound: Mapping[str, np.ndarray] | None = None) -> Su
     counts = {
         "runs": runs,
         "not_finite": int((~finite).sum()),
+        "inaccurate": int(tally.flags("inaccurate").sum()),
         "divergent": int(tally.flags("divergent").sum()),
     }
     counts |= {name: int(value) for name, value in sums.items() if value.ndim == 0}

@@ -15,6 +15,10 @@ import numpy as np
 
 from jaxslam.consistency._run_scores import Score
 
+FAR = 5.0
+"""Standard deviations √tr P of the position beyond which a final error is far: of a normal error
+with equal deviations in x and y that is exp(-25) of the runs, 1e-11."""
+
 SHOTS = 2048
 """Snapshots are kept of runs with numbers below this."""
 
@@ -51,7 +55,8 @@ def sum_rows(rows: np.ndarray) -> Sum:
 def condense(scores: Score, first: int, limit: float) -> dict[str, np.ndarray]:
     """The arrays that a tally keeps of runs first, first + 1, … (leading axis), by name.
 
-    limit [m]: a finite run is divergent when its final position error exceeds it.
+    A finite run is inaccurate when its final position error exceeds limit [m], and divergent when
+    it also exceeds 5 σ of what the filter claims, σ² = tr P of the position (`FAR`).
     """
     runs, finite = len(scores.finite), np.asarray(scores.finite)
 
@@ -60,8 +65,11 @@ def condense(scores: Score, first: int, limit: float) -> dict[str, np.ndarray]:
         return np.where(finite.reshape(-1, *(1,) * (rows.ndim - 1)), rows, np.zeros_like(rows))
 
     snapshots = [without_lost(leaf) for leaf in scores.snapshots]
-    far = np.sqrt((snapshots[0][:, -1, :2] ** 2).sum(axis=1)) > limit
-    out = {"finite": finite, "divergent": finite & far}
+    last = np.sqrt((snapshots[0][:, -1, :2] ** 2).sum(axis=1))
+    claimed = np.trace(snapshots[1][:, -1, :2, :2], axis1=1, axis2=2, dtype=np.float64)
+    inaccurate = finite & (last > limit)
+    beyond = last > FAR * np.sqrt(np.maximum(claimed, 0.0))
+    out = {"finite": finite, "inaccurate": inaccurate, "divergent": inaccurate & beyond}
     for name, (whole, weight) in scores.measures.items():
         whole, weight = without_lost(whole), without_lost(weight).astype(whole.dtype)
         out[f"defined/{name}"] = weight > 0
@@ -154,7 +162,7 @@ class Tally:
         return _joined(np.arange(first, first + runs) for first, runs in self.pieces())
 
     def flags(self, name: str) -> np.ndarray:
-        """Whether each run is finite, or divergent: flags (runs,)."""
+        """Whether each run is finite, inaccurate, or divergent: flags (runs,)."""
         return self._all(name)
 
     def first(self, name: str) -> np.ndarray:

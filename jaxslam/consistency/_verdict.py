@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxslam.consistency._intervals import LEVEL, Spread, percentage, spread
+from jaxslam.consistency._intervals import EACH, LEVEL, Spread, percentage, spread
 from jaxslam.consistency._measures.counts import DROPS, KEPT
 from jaxslam.consistency._measures.nees import DOF
 from jaxslam.core.types import Status
@@ -20,8 +20,13 @@ from jaxslam.math.stats import normal_quantile, truncated_chi2_mean
 TESTS = {"nees_pose": "pose NEES", "nis_per_dof": "NIS / dof"}
 """The measures that are tested, and their names in messages."""
 
-_TOLERANCE = 0.01
+TOLERANCE = 0.01
 """An interval that lies wholly so near the honest value, relative to it, rejects nothing."""
+
+_FAULTY = 1 - LEVEL
+"""The share of runs that are not finite, or of steps whose covariance is none, beyond which the
+others do not decide. A lost run lies in no ellipsoid: with more of them a 95 % ellipsoid holds the
+truth in fewer than 95 % of the runs, whatever the others do."""
 
 POWER = 0.9
 """The probability with which an effect that is called noticeable is noticed."""
@@ -49,53 +54,75 @@ def judge(
     """The verdict on a filter from the averages of each run and the counts of the campaign.
 
     Each run gives one average of the pose NEES over time and one of NIS/dof, and runs are
-    independent. Each average over the runs has an interval (`Spread`) of such a level, √0.95 with
-    two tests and 0.95 with one, that an honest filter of a linear Gaussian problem is rejected in
-    5 % of campaigns. Honest is 3 for the NEES and 1 for the NIS; a gate drops the largest
-    innovations, so if a share ρ failed it, all from `truncated_chi2_mean`(ρ) to 1 is honest.
+    independent. Each average over the runs has an interval (`Spread`) of level √0.95 (`EACH`), that
+    of `Summary.measures`: the two tests together reject an honest filter of a linear Gaussian
+    problem in 5 % of campaigns, one alone in 2.5 %. Honest is 3 for the NEES and 1 for the NIS; a
+    gate drops the largest innovations, so if a share ρ failed it, all from
+    `truncated_chi2_mean`(ρ) to 1 is honest.
 
-    optimistic: an interval lies above, covariances are claimed too small; pessimistic: below. If
-    the tests disagree, the NEES decides. consistent: neither rejects, which proves nothing:
-    `noticed` has the detectable averages. undecided: under two runs have a NEES, or neither
-    rejects, but an average NEES of twice the honest one would not have been rejected either.
-    incomplete: neither rejects, but over half of the measurements that arrived were dropped.
-    diverged: over half of the runs are not finite or divergent.
+    The first of these that holds:
 
-    An interval that lies within 1 % (`_TOLERANCE`) of the honest value rejects nothing: a nonlinear
+    diverged: over half of the runs are not finite or divergent (an error far beyond that of the
+    ideal EKF, and far beyond what the filter claims).
+    optimistic: an interval lies above, covariances are claimed too small. If the tests disagree,
+    the NEES decides.
+    incomplete: over 5 % (`_FAULTY`) of the runs are not finite, of the steps have a covariance that
+    is not symmetric or not positive definite, or of the runs have an estimate that is constant.
+    The runs that are left may be those of small errors, so that they excuse nothing.
+    pessimistic: an interval lies below.
+    incomplete: nothing was measured, or over half of what was measured, or of what was in view, was
+    not used.
+    undecided: under two runs have a NEES, or an average NEES of twice the honest one would not have
+    been rejected either.
+    consistent: neither test rejects, which proves nothing: `noticed` has the detectable averages.
+
+    Each of these that occurs in a single run or step is counted in one of `doubts`. Accuracy is not
+    honesty: a filter that is inaccurate and claims so, as dead reckoning, is consistent; a doubt
+    counts the inaccurate runs if they are over half.
+
+    An interval that lies within 1 % (`TOLERANCE`) of the honest value rejects nothing: a nonlinear
     filter is never exactly honest, and enough runs would reject any. It changes nothing where the
     interval is wider than that, as the NIS's is below some 400,000 degrees of freedom.
 
     Args:
         per_run: (runs,) nees_pose, nis_per_dof and unobservable, those that there are; NaN for a
             run without.
-        counts: runs, not_finite, divergent, and measurements by status, as in
-            `Summary.counts`; an absent count is 0.
+        counts: as in `Summary.counts`: runs, not_finite, and the others, of which an absent one is
+            0 (of measured: all that have a status).
         nis_dof: the degrees of freedom of all NIS together.
     """
-    doubts, honest_nis = _doubts(per_run, counts), _after_gate(counts, nis_dof)
-    lost = counts["not_finite"] + counts["divergent"]
-    if lost > 0.5 * (counts["runs"] + counts["not_finite"]):
+    doubts, honest_nis = doubts_on(per_run, counts, nis_dof), _after_gate(counts, nis_dof)
+    runs = counts["runs"] + counts["not_finite"]
+    if counts["not_finite"] + counts.get("divergent", 0) > 0.5 * runs:
         return Verdict("diverged", (), {}, doubts, honest_nis)
     tested = {name: per_run[name] for name in TESTS if np.isfinite(per_run.get(name, ())).sum() > 1}
-    level = LEVEL ** (1 / max(len(tested), 1))
     signs: dict[str, int] = {}
     noticed: dict[str, tuple[float, float]] = {}
     wide = True
     for name, values in tested.items():
         of_nees = name == "nees_pose"
-        found = spread(values, level, skewed=of_nees)
-        assert found is not None
-        honest = (DOF["pose"],) * 2 if of_nees else (honest_nis, 1.0)
-        signs[name], noticed[name] = _side(found, *honest), _noticed(found, *honest)
-        wide = wide and not (of_nees and found.above <= 2)
+        average = spread(values, EACH, skewed=of_nees)
+        assert average is not None
+        honest = honest_values(honest_nis)[name]
+        signs[name], noticed[name] = _side(average, *honest), _noticed(average, *honest)
+        wide = wide and not (of_nees and average.above <= 2)
     by = tuple(name for name, sign in signs.items() if sign)
-    if by:
-        word = "optimistic" if signs[by[0]] > 0 else "pessimistic"
-    elif wide:
-        word = "undecided"
+    if by and signs[by[0]] > 0:
+        word = "optimistic"
+    elif is_faulty(counts):
+        word = "incomplete"
+    elif by:
+        word = "pessimistic"
+    elif _is_starved(counts):
+        word = "incomplete"
     else:
-        word = "incomplete" if _starved(counts) else "consistent"
+        word = "undecided" if wide else "consistent"
     return Verdict(word, by, noticed, doubts, honest_nis)
+
+
+def honest_values(honest_nis: float) -> dict[str, tuple[float, float]]:
+    """The lowest and the highest honest value of each test."""
+    return {"nees_pose": (DOF["pose"],) * 2, "nis_per_dof": (honest_nis, 1.0)}
 
 
 def power_of(noticed: Mapping[str, tuple[float, float]]) -> str:
@@ -110,9 +137,9 @@ def power_of(noticed: Mapping[str, tuple[float, float]]) -> str:
 
 def _side(found: Spread, low: float, high: float) -> int:
     """The sign of a rejection: 1 for an interval above the honest value, -1 for below, else 0."""
-    if found.low > high and found.high > high * (1 + _TOLERANCE):
+    if found.low > high and found.high > high * (1 + TOLERANCE):
         return 1
-    return -1 if found.high < low and found.low < low / (1 + _TOLERANCE) else 0
+    return -1 if found.high < low and found.low < low / (1 + TOLERANCE) else 0
 
 
 def _noticed(found: Spread, low: float, high: float) -> tuple[float, float]:
@@ -122,7 +149,7 @@ def _noticed(found: Spread, low: float, high: float) -> tuple[float, float]:
     lies beyond that is z standard errors farther.
     """
     margin = normal_quantile(POWER) * found.error
-    least, most = low * found.below, high * max(found.above, 1 + _TOLERANCE)
+    least, most = low * found.below, high * max(found.above, 1 + TOLERANCE)
     return least / (1 + margin), most / (1 - margin) if margin < 1 else np.inf
 
 
@@ -134,41 +161,144 @@ def _after_gate(counts: Mapping[str, int], nis_dof: float) -> float:
     return truncated_chi2_mean(rejected / (fused + rejected), nis_dof / fused)
 
 
-def _became(counts: Mapping[str, int]) -> tuple[int, dict[str, int]]:
-    """How many measurements were used, and how many dropped by reason."""
-    drops = {name: counts.get(name, 0) for name in map(_name, DROPS)}
-    return sum(counts.get(name, 0) for name in map(_name, KEPT)), drops
+def is_faulty(counts: Mapping[str, int]) -> bool:
+    """Whether over 5 % of the runs or steps are none that a filter may give: see `judge`."""
+    runs, steps = counts["runs"], counts.get("steps", 0)
+    bad_steps = max(counts.get("asymmetric_steps", 0), counts.get("indefinite_steps", 0))
+    return (
+        counts["not_finite"] > _FAULTY * (runs + counts["not_finite"])
+        or bad_steps > _FAULTY * steps
+        or counts.get("constant", 0) > _FAULTY * runs
+    )
 
 
-def _starved(counts: Mapping[str, int]) -> bool:
-    """Whether over half of the measurements were dropped, by a filter that takes measurements."""
-    used, drops = _became(counts)
-    dropped = sum(drops.values())
-    takes_none = not used and dropped == drops["unmatched"]  # dead reckoning
-    return dropped > used and not takes_none
+class _Measured(NamedTuple):
+    """What became of the measurements of the finite runs."""
+
+    count: int
+    """in the logs"""
+    used: int
+    dropped: dict[str, int]
+    """by reason"""
+    missed: int
+    """landmarks in view that have no measurement in the log"""
+
+    @property
+    def none_taken(self) -> bool:
+        """Whether the filter takes no measurements, as dead reckoning: all are unmatched, or none
+        has a status."""
+        return not self.used and sum(self.dropped.values()) == self.dropped["unmatched"]
 
 
-def _doubts(per_run: Mapping[str, np.ndarray], counts: Mapping[str, int]) -> tuple[str, ...]:
-    out = []
-    if _starved(counts):
-        used, drops = _became(counts)
-        dropped = sum(drops.values())
-        reasons = ", ".join(f"{count:,} {name}" for name, count in drops.items() if count)
-        out.append(f"{dropped:,} of {used + dropped:,} measurements were dropped: {reasons}")
-    elif counts.get("overflow", 0):
+def _measured(counts: Mapping[str, int]) -> _Measured:
+    dropped = {name: counts.get(name, 0) for name in map(_name, DROPS)}
+    used = sum(counts.get(name, 0) for name in map(_name, KEPT))
+    every = used + sum(dropped.values())
+    return _Measured(max(counts.get("measured", 0), every), used, dropped, counts.get("missed", 0))
+
+
+def _is_starved(counts: Mapping[str, int]) -> bool:
+    """Whether nothing was measured, or over half was not used, or had no place in the scan."""
+    measured = _measured(counts)
+    if counts.get("measured") == 0:
+        return True
+    if measured.none_taken:
+        return False
+    return measured.count > 2 * measured.used or measured.missed > measured.count
+
+
+def doubts_on(
+    per_run: Mapping[str, np.ndarray], counts: Mapping[str, int], nis_dof: float
+) -> tuple[str, ...]:
+    """Sentences that qualify a verdict, from the counts and measures that `judge` takes."""
+    runs, lost = counts["runs"], counts["not_finite"]
+    steps, out = counts.get("steps", 0), list[str]()
+    if lost:
+        rest = f"averages of the {runs:,} finite runs" if runs else "there are no averages"
+        out.append(f"not finite (NaN or ∞) in {lost:,} of {runs + lost:,} runs: {rest}")
+    if count := counts.get("divergent", 0):
         out.append(
-            f"{counts['overflow']:,} measurements of new landmarks found the map full: expected a "
-            "larger capacity, or a filter that removes landmarks"
+            f"divergent in {count:,} of {runs:,} runs: final position errors far beyond those of "
+            "the ideal EKF, and over 5 σ of what is claimed"
         )
+    for name, fault in (
+        ("asymmetric_steps", "not symmetric"),
+        ("indefinite_steps", "not positive definite"),
+    ):
+        if count := counts.get(name, 0):
+            out.append(
+                f"the pose covariance is {fault} in {count:,} of {steps:,} steps, by more than "
+                "rounding: look at the filter's covariance; such a step has no pose NEES"
+            )
+    if count := counts.get("constant", 0):
+        out.append(f"pose and covariance never change in {count:,} of {runs:,} runs")
+    singular = counts.get("singular_steps", 0)
+    explained = counts.get("asymmetric_steps", 0) + counts.get("indefinite_steps", 0)
+    if singular - explained > 0.5 * steps > 0:
+        out.append(
+            f"the pose covariance is singular in {singular:,} of {steps:,} steps, which have no "
+            "pose NEES: a direction is claimed to be known exactly; more runs do not help"
+        )
+    if 2 * (count := counts.get("inaccurate", 0)) > runs and count > counts.get("divergent", 0):
+        out.append(
+            f"inaccurate in {count:,} of {runs:,} runs: final position errors over 5 σ of the "
+            "ideal EKF"
+        )
+    if runs:
+        out += _doubts_on_measurements(counts, nis_dof)
     free = np.asarray(per_run.get("unobservable", ()), np.float64)
     free = free[np.isfinite(free)]
     if free.size and free.mean() < 3:
         out.append(
             f"unobservable directions {free.mean():.3g} instead of 3: the filter gained "
             "information on the pose of the map as a whole, which only a sensor of absolute "
-            "position or heading gives; with one, the value of ideal is the honest one"
+            "position or heading gives; if the robot has such a sensor, compare with the row of "
+            "the filter ideal"
         )
     return tuple(out)
+
+
+def _doubts_on_measurements(counts: Mapping[str, int], nis_dof: float) -> list[str]:
+    measured, out = _measured(counts), list[str]()
+    if counts.get("measured") == 0:
+        out.append("nothing was measured in any run: only the motion was judged")
+    if measured.missed:
+        out.append(
+            f"{measured.missed:,} landmarks in view, beside {measured.count:,} measured ones, had "
+            "no place in the scan: expected more places in the world"
+        )
+    if not measured.count:
+        return out
+    ignored = measured.count - measured.used - sum(measured.dropped.values())
+    if measured.none_taken:
+        out.append(
+            f"takes none of the {measured.count:,} measurements (by its Info): judged by the NEES "
+            "alone"
+        )
+    elif measured.count > 2 * measured.used:
+        reasons = [f"{count:,} {name}" for name, count in measured.dropped.items() if count]
+        reasons += [f"{ignored:,} without a status in Info"] * bool(ignored)
+        out.append(
+            f"{measured.count - measured.used:,} of {measured.count:,} measurements were "
+            f"{'not used' if ignored else 'dropped'}: {', '.join(reasons)}"
+        )
+    else:
+        if ignored:
+            out.append(
+                f"{ignored:,} of {measured.count:,} measurements have no status in Info: they may "
+                "have been ignored"
+            )
+        if count := measured.dropped["overflow"]:
+            out.append(
+                f"{count:,} measurements of new landmarks found the map full: expected a larger "
+                "capacity, or a filter that removes landmarks"
+            )
+        if counts.get("fused", 0) and "measured" in counts and not nis_dof > 0:
+            out.append(
+                f"{counts['fused']:,} fused measurements have no degrees of freedom in Info: no "
+                "NIS, judged by the NEES alone"
+            )
+    return out
 
 
 def _name(status: Status) -> str:

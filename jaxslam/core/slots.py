@@ -12,6 +12,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int, PyTree
 
+from jaxslam.core._reprs import short_repr
 from jaxslam.math._linalg import cholesky, matmul, symmetrize, total, triangular_root
 from jaxslam.math._xla import CACHED, last_true_column, materialize, where_any
 
@@ -49,6 +50,9 @@ class Joint(NamedTuple):
     a sensor whose landmarks may become points"""
     co_observed: jax.Array | None = None
     """(N, N) bool: pairs of landmarks that one scan measured, of a filter that merges others"""
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def empty(

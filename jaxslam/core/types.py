@@ -15,8 +15,11 @@ from jax import Array
 from jaxtyping import Bool, Float, Int, PyTree
 from numpy.typing import ArrayLike
 
+from jaxslam.core._numbers import is_concrete
+from jaxslam.core._reprs import short_repr, text_of
 from jaxslam.core.logs import _streams as streams
 from jaxslam.core.logs import _tables as tables
+from jaxslam.math._pose_covariances import covariance_faults
 
 __all__ = [
     "Beams",
@@ -74,6 +77,9 @@ class Scan(NamedTuple):
     tag: Int[Array, "M"]
     """landmark identity, -1 = unknown."""
     valid: Bool[Array, "M"]
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 class Log(NamedTuple):
@@ -185,6 +191,9 @@ class Log(NamedTuple):
         rows, tags, dropped = tables.align_tables(moved, seen, controls)
         return Recording(cls.from_rows(rows), rows.time, tags, dropped)
 
+    def __repr__(self) -> str:
+        return short_repr(self)
+
 
 class Recording(NamedTuple):
     """The result of `Log.from_records`."""
@@ -196,6 +205,9 @@ class Recording(NamedTuple):
     """the names of the landmarks with tags 0, 1, …, N-1, sorted"""
     dropped: dict[str, int]
     """number of measurements that are not in the log, by reason"""
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 class Truth(NamedTuple):
@@ -213,6 +225,9 @@ class Truth(NamedTuple):
     """the tag of the landmark each measurement is truly of, -1 of none; None but in a world with
     `spurious` data."""
 
+    def __repr__(self) -> str:
+        return short_repr(self)
+
 
 class Estimate(NamedTuple):
     """Means and marginal covariances in map coordinates, for any chart of the filter."""
@@ -226,6 +241,9 @@ class Estimate(NamedTuple):
     alive: Bool[JaxOrNumPy, "N"]
     tag: Int[JaxOrNumPy, "N"]
     """-1 where not alive."""
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 class Info(NamedTuple):
@@ -261,6 +279,9 @@ class Info(NamedTuple):
         """The number of measurements with that status: () of a step, (T,) of a whole trace."""
         return (self.status == status).sum(-1)
 
+    def __repr__(self) -> str:
+        return short_repr(self)
+
 
 class Trace(NamedTuple):
     """The result of `run`: the estimates of a run, and the report of each step."""
@@ -273,6 +294,52 @@ class Trace(NamedTuple):
     """the filter's state at the end."""
     probe: PyTree
     """results of the caller's probe after each update, leading T; None without one."""
+
+    @property
+    def doubts(self) -> tuple[str, ...]:
+        """What is wrong with the estimates, each with its count: NaN or ∞, or a pose covariance
+        that is not symmetric or not positive definite by more than rounding; () if nothing is.
+
+        Of the values of one run or of many, outside of a trace (else ValueError).
+        """
+        if not is_concrete(self.estimate, self.info):
+            raise ValueError(
+                "Trace.doubts: it needs values: use it outside of jax.jit and jax.vmap"
+            )
+        estimate, info = jax.device_get((self.estimate, self.info))
+        pose, cov = np.asarray(estimate.pose), np.asarray(estimate.pose_cov)
+        steps, faults = pose[..., 0].size, covariance_faults(pose, cov)
+        finite = np.ones(pose.shape[:-1], bool)
+        for leaf in map(np.asarray, jax.tree.leaves((estimate, info._replace(extra=None)))):
+            rows = leaf.reshape(*finite.shape, -1)
+            finite &= np.isfinite(rows).all(axis=-1) if leaf.dtype.kind == "f" else True
+        counts = {
+            "estimate or Info is not finite": ~finite,
+            "pose_cov is not symmetric": faults.asymmetric,
+            "pose_cov is not positive definite": faults.indefinite,
+        }
+        return tuple(
+            f"{what} in {int(bad.sum()):,} of {steps:,} steps"
+            for what, bad in counts.items()
+            if bad.any()
+        )
+
+    def __repr__(self) -> str:
+        lines = [
+            f"{name}={text}" for name, text in zip(self._fields, map(text_of, self), strict=True)
+        ]
+        pose, status = getattr(self.estimate, "pose", None), getattr(self.info, "status", None)
+        arrays = all(isinstance(leaf, np.ndarray | Array) for leaf in jax.tree.leaves(self[:2]))
+        if arrays and is_concrete(self[:2]) and np.shape(pose)[:-1] == np.shape(status)[:-1] != ():
+            became = {s: int((jax.device_get(status) == s).sum()) for s in Status if s}
+            counts = [f"{count:,} {s.name.lower()}" for s, count in became.items() if count]
+            steps = " × ".join(map(str, np.shape(pose)[:-1]))
+            lines = [
+                f"{steps} steps: {', '.join(counts) or 'no measurements'}",
+                *self.doubts,
+                *lines,
+            ]
+        return "Trace(" + ",\n      ".join(lines) + ")"
 
 
 class Beams(NamedTuple):
@@ -294,6 +361,9 @@ class Beams(NamedTuple):
     valid: Bool[JaxOrNumPy, "B"]
     """false for a beam without information: a dropout or padding. A beam that met nothing has the
     laser's maximum range, and is valid."""
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
     def returns(
         self, max_range: float | JaxOrNumPy = np.inf, *, min_range: float | JaxOrNumPy = 0.0

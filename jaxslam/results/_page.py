@@ -12,7 +12,7 @@ from itertools import groupby
 import numpy as np
 
 from jaxslam.consistency import Average, Summary
-from jaxslam.consistency._intervals import LEVEL, percentage
+from jaxslam.consistency._intervals import EACH, LEVEL, percentage
 from jaxslam.consistency._verdict import TESTS
 from jaxslam.consistency.campaign import Campaign
 from jaxslam.results import _report as report
@@ -149,18 +149,19 @@ def _figures(figures: Mapping[str, tuple[str, Figure]], draw: Callable[[Figure],
 
 def _conventions(campaign: Campaign) -> str:
     """The definitions of measures and verdicts as HTML."""
-    level, rest = (_unbroken(percentage(share)) for share in (LEVEL, 1 - LEVEL))
+    level, rest = _unbroken(percentage(EACH, 1)), _unbroken(percentage(1 - LEVEL))
     meanings = "\n".join(
         f"<dt>{badge(verdict)}</dt><dd>{escape(meaning)}.</dd>"
         for verdict, (_, meaning) in VERDICTS.items()
     )
     return f"""<p><strong>NEES</strong> = eᵀP⁻¹e is <em>not</em> divided by its degrees of freedom,
 which are the honest value. <strong>±</strong> is half the {level} interval of the mean
-over independent runs. A run is <strong>divergent</strong> when its final position error exceeds
-{campaign.divergence_limit:.3g} m, 5 σ of the EKF with Jacobians at the truth.</p>
-<p>The <strong>verdict</strong> goes by the pose NEES and by NIS / dof, averaged over time, with
-intervals so wide that an honest filter of a linear problem is rejected in {rest}
-of campaigns. An asterisk marks a verdict with a reservation:</p>
+over independent runs. A run is <strong>inaccurate</strong> when its final position error exceeds
+{campaign.divergence_limit:.3g} m, 5 σ of the EKF with Jacobians at the truth, and
+<strong>divergent</strong> when it also exceeds 5 σ of what the filter claims.</p>
+<p>The <strong>verdict</strong> goes by the intervals of the pose NEES and of NIS / dof, averaged
+over time: together they reject an honest filter of a linear problem in {rest}
+of campaigns. An asterisk marks a verdict with a doubt:</p>
 <dl class="meanings">
 {meanings}
 </dl>"""
@@ -193,6 +194,8 @@ def verdict_list(campaign: Campaign) -> str:
     for name, summary in campaign.filters.items():
         tested = [key for key in TESTS if key in summary.measures]
         values = [f"{TESTS[key]} {cell_text(summary.measures[key])}" for key in tested]
+        if tested and summary.not_finite_runs:
+            values.append(f"averages of the {summary.counts['runs']:,} finite runs")
         lines = "".join(f'<span class="why">{line}</span>' for line in values or ["no pose NEES"])
         label = f'<span class="name">{breakable(name)}</span>'
         items.append(f"<li>{label}{badge(summary.verdict, summary)}{lines}</li>")
@@ -203,7 +206,8 @@ def verdict_list(campaign: Campaign) -> str:
 
 
 def badge(verdict: str, summary: Summary | None = None) -> str:
-    """A verdict as HTML, with the tests that rejected; grey and with an asterisk if in doubt."""
+    """A verdict as HTML, with the tests that rejected; with doubts it has an asterisk, and is grey
+    if consistent."""
     sign, meaning = VERDICTS[verdict]
     rejected = [TESTS[test] for test in summary.by] if summary is not None else []
     doubts = summary.doubts if summary is not None else ()
@@ -249,7 +253,7 @@ def _cell(cell: table.Cell, published: float | None) -> str:
         text = badge(cell.verdict, cell)
     elif isinstance(cell, Average) and np.isfinite(cell.high):
         ends = f"{cell.low:.5g} to {cell.high:.5g}"
-        title = f' title="{_unbroken(percentage(LEVEL))} interval {ends}"'
+        title = f' title="{_unbroken(percentage(EACH, 1))} interval {ends}"'
     if published is not None:
         text += f'<span class="published">published {short(published)}</span>'
     return f"<td{title}>{text}</td>"

@@ -21,7 +21,7 @@ import numpy as np
 from jaxslam.consistency.campaign._pieces import missing
 from jaxslam.results._files import Json
 
-FORMAT = 3
+FORMAT = 4
 """Format of the folder, written in its manifest; others are refused."""
 
 MANIFEST = "manifest.json"

@@ -25,18 +25,26 @@ VERDICTS = {
         "the interval of pose NEES or of NIS / dof lies below the honest value: covariances are "
         "claimed too large",
     ),
-    "diverged": ("✕", "over half of the runs diverged or were not finite"),
-    "incomplete": ("–", "not rejected, but over half of the measurements were dropped"),
+    "diverged": ("✕", "over half of the runs are divergent or not finite"),
+    "incomplete": (
+        "–",
+        f"not optimistic, but over {percentage(1 - LEVEL)} of the runs are not finite, or of the "
+        "covariances are none; or not rejected, but over half of the measurements were not used, "
+        "or there were none: a doubt says which",
+    ),
     "undecided": (
         "?",
-        "too few runs, or too unequal, to reject even a pose NEES of 6: take more runs; a pose "
-        "that is known exactly, as by mapping, has no NEES",
+        "too few runs have a NEES, or their NEES differ too much, to reject even a pose NEES of "
+        "6: take more runs, unless a doubt says that the pose has no NEES",
     ),
 }
 """Verdicts, each with its sign and its meaning."""
 
 _ALWAYS = ("runs", "not_finite", "divergent")
 """Counts that are shown even if they are 0."""
+
+_NEVER = ("steps",)
+"""Counts that only doubts show."""
 
 
 class Figure(NamedTuple):
@@ -66,7 +74,7 @@ class Row(NamedTuple):
 
 
 def cell_text(cell: Cell) -> str:
-    """A cell as text: a verdict with the tests that rejected, and an asterisk if in doubt."""
+    """A cell as text: a verdict with the tests that rejected, and an asterisk if it has doubts."""
     if cell is None:
         return "-"
     if isinstance(cell, Summary):
@@ -133,7 +141,7 @@ def _counts(campaign: Campaign, names: Sequence[str]) -> list[Row]:
     every = [campaign.filters[name].counts for name in names]
     for key in dict.fromkeys(key for counts in every for key in counts):
         found = [counts.get(key) for counts in every]
-        if key in _ALWAYS or any(found):
+        if key not in _NEVER and (key in _ALWAYS or any(found)):
             cells = [None if one is None else Figure(f"{one:,}", one) for one in found]
             rows.append(Row(count_label(key), "", cells, group="Time and counts"))
     return rows
@@ -178,7 +186,5 @@ def lost_runs(campaign: Campaign) -> list[tuple[str, str]]:
         lost = summary.not_finite_runs
         if lost:
             numbers = ", ".join(map(str, lost[:20])) + (", …" if len(lost) > 20 else "")
-            share = f"{len(lost):,} of {campaign.runs:,} runs"
-            phrase = f"was not finite in {share}, which its measures leave out: {numbers}"
-            out.append((name, phrase))
+            out.append((name, f"was not finite in runs {numbers}"))
     return out

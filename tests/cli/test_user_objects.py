@@ -6,6 +6,7 @@ import json
 import pytest
 from own_models import changed
 
+import jaxslam
 from jaxslam import _catalog as catalog
 from jaxslam import _cli as cli
 from jaxslam import scenarios
@@ -15,6 +16,7 @@ from jaxslam.simulation._worlds import Scenario
 
 MINE = """
 import dataclasses
+import jax
 import jaxslam
 from jaxslam.core.record import record
 
@@ -55,6 +57,15 @@ wide = lambda scenario: jaxslam.filters.EkfSlam(scenario.motion, scenario.sensor
 of_two = lambda scenario, capacity: ready
 untraceable = lambda scenario: Untraceable(ready)
 named = Named(ready.filter)
+
+@record
+class Lost(Doubting):
+    def update(self, state, scan, key):
+        state, info = self.filter.update(state, scan, key)
+        lost = jax.random.bernoulli(key, 0.1)
+        return state._replace(pose=jax.numpy.where(lost, jax.numpy.nan, state.pose)), info
+
+lost = Lost(ready.filter)
 """
 
 
@@ -70,7 +81,7 @@ def test_filters_of_a_file_stand_beside_those_of_the_catalog(mine, capsys):
     world = scenarios.circle(3)
     asked = f"ekf, {mine}:blind,{mine}:ready,{mine}:alike,{mine}:named"
     found = files.filters(asked, world)
-    assert list(found) == ["ekf", "blind", "ready", "alike", "my filter"]
+    assert list(found) == ["ekf", "blind", "ready", "alike", "named"]  # as they were asked for
     assert all(isinstance(found[name], Filter) for name in ("ekf", "blind", "ready"))
     assert isinstance(found["alike"](None), Filter)
     assert capsys.readouterr().out == "loaded\n"  # once
@@ -105,10 +116,10 @@ def test_a_scenario_of_a_file_may_be_a_function_of_its_steps(mine):
         ),
         (
             ["--filters", "mine.py:wrong"],
-            "mine.py:wrong: called with the scenario, it fails: mine.py:37: AttributeError: 'Scen",
+            "mine.py:wrong: called with the scenario, it fails: mine.py:38: AttributeError: 'Scen",
         ),
         (["--filters", "mine.py:of_two"], "mine.py:of_two is called with one argument: missing a"),
-        (["--filters", "mine.py:untraceable"], "mine.py:25: NameError: name 'undefined'"),
+        (["--filters", "mine.py:untraceable"], "mine.py:26: NameError: name 'undefined'"),
         (["--filters", "mine.py:blind,mine.py:blind"], "expected each name once, got blind twice"),
         (
             ["--scenario", "mine.py:number"],
@@ -150,6 +161,36 @@ def test_a_filter_of_another_size_and_a_world_without_covariance_are_refused(min
     )
     with pytest.raises(ValueError, match="noise_cov of"):
         UserObjects().scenario(f"{mine}:noisy", None)
+
+
+def test_a_filter_that_is_lost_in_some_runs_is_told_everywhere(mine, tmp_path, capsys, undrawn):
+    """Table, JSON, page, a campaign read back, and the exit status."""
+    out = tmp_path / "out"
+    asked = [
+        "--scenario",
+        f"{mine}:short",
+        "--filters",
+        f"{mine}:blind,{mine}:lost",
+        "--runs",
+        "16",
+    ]
+    shape = ["--block", "16", "--devices", "1", "--figures", "svg", "--out", str(out)]
+    assert cli.main(["consistency", *asked, *shape]) == 1
+    printed = " ".join(capsys.readouterr().out.split())
+    campaign = jaxslam.load(out)
+    runs = campaign.filters["lost"].counts["runs"]
+    assert 8 < runs < 16
+    doubt = f"not finite (NaN or ∞) in {16 - runs} of 16 runs: averages of the {runs} finite runs"
+    assert (
+        campaign.filters["lost"].doubts[0] == doubt and campaign.verdicts["lost"] == "incomplete*"
+    )
+    assert not any("finite" in said for said in campaign.filters["blind"].doubts)
+    page = (out / "report.html").read_text()
+    assert f"lost*: {doubt}" in printed and f"lost*: {doubt}." in page
+    assert "incomplete" in printed and "lost=incomplete*" in repr(campaign)
+    assert f"averages of the {runs} finite runs</span>" in page
+    found = json.loads((out / "consistency.json").read_text())["filters"]["lost"]
+    assert (found["verdict"], found["doubts"][0]) == ("incomplete", doubt)
 
 
 @pytest.mark.sweep

@@ -11,6 +11,7 @@ from jaxslam.consistency._run_scores import run_statistics
 from jaxslam.consistency._summary import summarize
 from jaxslam.consistency._tally import Tally, condense
 from jaxslam.core.types import Estimate, Info, Status, Trace, Truth
+from jaxslam.math._pose_covariances import covariance_faults
 
 STEPS, PLACES, SLOTS = 12, 2, 3
 TOGETHER = 40
@@ -96,7 +97,7 @@ def test_measures_are_those_of_numpy():
         np.testing.assert_allclose(summary.curves[f"nees_{block}"], nees.mean(0), rtol=1e-9)
         per_run = nees.mean(1)
         mean, u = per_run.mean(), scipy.stats.sem(per_run) / per_run.mean()
-        reach = scipy.stats.t.ppf(0.975, 8 / 1.5) * u
+        reach = scipy.stats.t.ppf(0.5 + 0.95**0.5 / 2, 8 / 1.5) * u
         np.testing.assert_allclose(
             summary.measures[f"nees_{block}"],
             (mean, mean / (1 + reach - u**2 / 2), mean / (1 - reach - u**2 / 2)),
@@ -159,18 +160,100 @@ def test_a_run_that_is_not_finite_is_counted_and_leaves_the_others_alone():
     alone = summarize(summed(*jax.tree.map(lambda a: a[kept], (trace, truth))))
     assert summary.counts["not_finite"] == 2
     assert summary.counts["runs"] == 4
+    said = "not finite (NaN or ∞) in 2 of 6 runs: averages of the 4 finite runs"
+    assert (summary.verdict, summary.doubts) == ("incomplete", (said,))
+    assert said in repr(summary)
     for name, measure in alone.measures.items():
         np.testing.assert_allclose(summary.measures[name], measure, rtol=1e-12)
 
 
-def test_divergence_is_the_final_position_error_above_the_limit():
+def test_inaccurate_is_a_final_error_above_the_limit_and_divergent_beyond_the_claim_too():
     trace, truth, error = synthetic(np.random.default_rng(4), runs=8)
-    final = np.sort(np.linalg.norm(error[:, -1, :2], axis=1))
-    summary = summarize(summed(trace, truth, limit=(final[4] + final[5]) / 2))
-    assert summary.counts["divergent"] == 3
-    assert summary.verdict != "diverged"
-    summary = summarize(summed(trace, truth, limit=(final[2] + final[3]) / 2))
+    final = np.linalg.norm(error[:, -1, :2], axis=1)
+    limit = (np.sort(final)[2] + np.sort(final)[3]) / 2
+    summary = summarize(summed(trace, truth, limit=limit))
+    assert (summary.counts["inaccurate"], summary.counts["divergent"]) == (5, 0)
+    assert summary.verdict != "diverged"  # all of it is claimed, as dead reckoning does
+    assert summary.doubts[0].startswith("inaccurate in 5 of 8 runs")
+    far = np.argsort(final)[-5:]
+    claimed = final[far] / 5.01
+    trace.estimate.pose_cov[far, -1] = np.eye(3) * (claimed**2 / 2)[:, None, None]
+    summary = summarize(summed(trace, truth, limit=limit))
+    assert (summary.counts["inaccurate"], summary.counts["divergent"]) == (5, 5)
     assert summary.verdict == "diverged"
+
+
+def test_the_printed_interval_is_that_of_the_test():
+    """The verdict can be read off the brackets, with measurements in unlike numbers in the runs."""
+    rng = np.random.default_rng(11)
+    seen = set()
+    for scale in np.linspace(0.7, 1.5, 17):
+        trace, truth, _ = synthetic(rng, runs=30, claimed=scale)
+        trace.info.nis[:] *= scale**0.25
+        gone = np.arange(STEPS) < rng.integers(0, STEPS, (30, 1))
+        trace.info.status[..., 0] = np.where(gone, Status.EMPTY, Status.FUSED)
+        trace.info.dof[..., 0] = np.where(gone, 0, 2)
+        trace.info.status[..., 1] = Status.EMPTY
+        summary = summarize(summed(trace, truth))
+        outside = tuple(
+            name
+            for name, honest in (("nees_pose", 3), ("nis_per_dof", 1))
+            if not summary.measures[name].low <= honest <= summary.measures[name].high
+        )
+        assert outside == summary.by
+        seen.add(outside)
+    assert len(seen) > 2
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_covariance_that_is_none_is_told_from_rounding(dtype):
+    rng = np.random.default_rng(12)
+    root = rng.normal(size=(200, 3, 3)) * np.array([3.0, 3.0, 0.03])[:, None]
+    cov = root @ root.transpose(0, 2, 1) + np.diag([0.5, 0.5, 1e-4])
+    pose = rng.normal(size=(200, 3)).astype(dtype)
+
+    def faults(cov):
+        found = covariance_faults(pose, np.asarray(cov, dtype))
+        return int(found.asymmetric.sum()), int(found.indefinite.sum())
+
+    eps = np.finfo(dtype).eps
+    sigma = np.sqrt(np.einsum("ni,nj->nij", *[np.diagonal(cov, axis1=1, axis2=2)] * 2))
+    rounding = 400 * eps * rng.uniform(-1, 1, cov.shape) * sigma
+    flat = root * [1.0, 1.0, 0.0]  # of rank 2
+    singular = flat @ flat.transpose(0, 2, 1)
+    for sound in (cov, cov + rounding, 1e9 * cov, 1e-9 * cov, singular, 0 * cov):
+        assert faults(sound) == (0, 0)
+    assert faults(singular + rounding) == (0, 0)
+    assert faults(np.diag([1.0, 1.0, -(eps**2)])[None] + 0 * cov) == (0, 0)  # θ is known
+    assert faults(-cov) == (0, 200)
+    assert faults(np.diag([1.0, 1.0, -1.0]) * cov)[1] == 200
+    assert faults(np.tril(cov))[0] > 190 and faults(np.triu(cov))[0] > 190
+    too_correlated = np.diagonal(cov, axis1=1, axis2=2)[:, None] * np.eye(3)
+    too_correlated[:, 0, 2] = too_correlated[:, 2, 0] = 1.1 * sigma[:, 0, 2]
+    assert faults(too_correlated) == (0, 200)
+    assert faults(np.nan * cov) == (0, 0)  # not finite, which is another fault
+
+
+@pytest.mark.parametrize("kind", ["-P", "triangular", "constant", "no heading"])
+def test_a_covariance_that_is_none_is_no_consistent_filter(kind):
+    trace, truth, _ = synthetic(np.random.default_rng(13), runs=40)
+    pose, cov = trace.estimate.pose, trace.estimate.pose_cov
+    steps = f"{40 * STEPS} of {40 * STEPS} steps"
+    if kind == "-P":
+        cov *= -1
+        word, doubt = "incomplete", f"not positive definite in {steps}"
+    elif kind == "triangular":
+        cov[:] = np.tril(cov)
+        word, doubt = "incomplete", "not symmetric in "
+    elif kind == "constant":
+        pose[:], cov[:] = 0.0, 1000 * np.eye(3)
+        word, doubt = "incomplete", "never change in 40 of 40 runs"
+    else:
+        cov[..., 2, :] = cov[..., :, 2] = 0
+        word, doubt = "undecided", f"singular in {steps}"
+    summary = summarize(summed(trace, truth))
+    assert (summary.verdict, len(summary.doubts)) == (word, 1)
+    assert doubt in summary.doubts[0]
 
 
 @pytest.mark.parametrize(

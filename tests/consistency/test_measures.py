@@ -40,7 +40,7 @@ def test_coverage_is_the_share_of_truth_inside_the_ellipsoids():
     for p, share in zip(LEVELS, summary.coverage["pose"], strict=True):
         np.testing.assert_allclose(share, np.mean(nees <= scipy.stats.chi2.ppf(p, 3)), rtol=1e-12)
     inside = np.mean(nees <= scipy.stats.chi2.ppf(0.95, 3), axis=1)
-    interval = scipy.stats.t.interval(0.95, 39, inside.mean(), scipy.stats.sem(inside))
+    interval = scipy.stats.t.interval(0.95**0.5, 39, inside.mean(), scipy.stats.sem(inside))
     found = summary.measures["coverage_95_pose"]
     np.testing.assert_allclose(found, (inside.mean(), *interval), rtol=1e-9)
     # Honest errors: 480 independent steps at 0.95, five standard errors.

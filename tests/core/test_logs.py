@@ -123,6 +123,10 @@ BAD_SHAPES = {
     "control size": ({"control": np.zeros((4, 2))}, r"control: expected shape \(T, 3\), got \(4, 2\)"),
     "control rank": ({"control": np.zeros(3)}, r"control: expected shape \(T, 3\), got \(3,\)"),
     "control kind": ({"control": np.zeros((4, 3), int)}, "control: expected floating values, got int64"),
+    "float16": (
+        {"control": np.zeros((4, 3), np.float16), "z": np.ones((4, 3, 2), np.float16)},
+        "expected float32 or float64, got float16",
+    ),
     "z size": ({"z": np.ones((4, 3, 1))}, r"scan.z: expected shape \(4, 3, 2\), got \(4, 3, 1\)"),
     "z kind": ({"z": np.ones((4, 3, 2), bool)}, "scan.z: expected floating values, got bool"),
     "steps": ({"scan": good_log(5).scan}, r"scan.z: expected shape \(4, 3, 2\), got \(5, 3, 2\)"),

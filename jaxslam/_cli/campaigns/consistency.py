@@ -23,6 +23,7 @@ from jaxslam._cli.campaigns.campaign import (
 from jaxslam._cli.campaigns.engines import engine
 from jaxslam._cli.common import FAILED, INTERRUPTED, OUT, add_animate, add_figures, film_files
 from jaxslam._cli.user_objects import UserObjects
+from jaxslam.consistency._verdict import is_faulty
 from jaxslam.consistency.campaign import Campaign, Incomplete, Interrupted, monte_carlo
 from jaxslam.consistency.campaign._candidates import estimator_of, fitting_block, rounded
 from jaxslam.core.protocols import Candidate
@@ -105,7 +106,11 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run_campaign(options: argparse.Namespace, command: str) -> int:
-    """Run a campaign, print its table and write its files; returns the exit status."""
+    """Run a campaign, print its table and write its files; returns the exit status.
+
+    It is 1 where a filter is faulty, as not finite (`is_faulty`), or runs are missing; a verdict
+    does not change it.
+    """
     # Worlds are drawn in float64 whatever the filters compute in, so both precisions see the same.
     jax.config.update("jax_enable_x64", True)
     if options.executor is not None and options.devices != "all":
@@ -163,6 +168,8 @@ def run_campaign(options: argparse.Namespace, command: str) -> int:
         if keep.set_aside:  # some runs were computed again
             earlier = None
         _write(spec, scenario, filters, campaign, earlier, command)
+        if any(is_faulty(summary.counts) for summary in campaign.filters.values()):
+            return FAILED
     return 0
 
 
@@ -175,8 +182,7 @@ def _write(
     command: str,
 ) -> None:
     """Print a campaign and write its files; those of a finished one stay as they are."""
-    out, seed, took = spec.out, spec.campaign.seed, campaign.seconds
-    ran = took - campaign.compile_seconds if campaign.compile_seconds else 0.0
+    out, seed = spec.out, spec.campaign.seed
     names = campaign_files.file_names(spec.figures)
     if earlier is not None:
         command = str(earlier["command"])
@@ -203,10 +209,6 @@ def _write(
         campaign = replace(campaign, first={name: jax.device_get((truth, estimate))})
     paths = campaign_files.save_campaign(campaign, out, spec.figures, True, command, seed)
     print("\nwrote " + ", ".join(map(str, paths)))
-    print(
-        f"results after {took:.1f} s"
-        + f", {ran:.1f} s of them for the runs once all programs were compiled" * (ran > 0)
-    )
 
 
 def _write_films(

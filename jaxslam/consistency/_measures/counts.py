@@ -19,6 +19,7 @@ DROPS = (
 """What can keep a measurement from the map; each is counted."""
 
 MEANINGS = {
+    "measured": "measurements in the logs",
     "fused": "measurements that corrected the estimate",
     "born": "measurements that started a landmark",
     "sighted": "measurements kept until a landmark can be started from them",
@@ -29,7 +30,11 @@ MEANINGS = {
     "singular": "measurements whose innovation covariance has no inverse",
     "unmatched": "measurements that were assigned to no landmark, old or new",
     "missed": "landmarks in view for which the scan had no place",
-    "singular_steps": "steps without a NEES, since the covariance of the pose has no inverse",
+    "singular_steps": "steps without a NEES, since the covariance of the pose has no inverse, is "
+    "not symmetric or is not positive definite",
+    "asymmetric_steps": "steps whose pose covariance is not symmetric, by more than rounding",
+    "indefinite_steps": "steps whose pose covariance has a negative eigenvalue, beyond rounding",
+    "constant": "runs whose pose and covariance never change while the robot moves",
     "removed": "landmarks removed from the map",
     "merged": "pairs of landmarks made one",
     "reduced": "landmarks converted to points",

@@ -12,7 +12,7 @@ from jaxslam.math.stats import chi2_quantile, normal_quantile
 
 @dataclass(frozen=True, eq=False)
 class Nis(Measure):
-    """The NIS of fused measurements over their degrees of freedom, of all runs together."""
+    """The NIS of a run's fused measurements over their degrees of freedom."""
 
     def of_runs(self, runs: Runs) -> RunScores:
         """The sum of each run, and its degrees of freedom."""
@@ -23,13 +23,8 @@ class Nis(Measure):
         return RunScores(nis.sum(axis=1), dof.sum(axis=1), {"nis": nis, "nis_dof": dof})
 
     def average(self, per_run: np.ndarray, sums: Sums) -> Average | None:
-        """All NIS over all degrees of freedom; the relative interval is that of the runs."""
-        by_runs, total = positive_interval(per_run, skewed=False), float(np.sum(sums["nis_dof"]))
-        if by_runs is None or total <= 0:
-            return by_runs
-        share = float(np.sum(sums["nis"])) / total
-        scale = share / by_runs.value if by_runs.value > 0 else 1.0
-        return Average(share, scale * by_runs.low, scale * by_runs.high)
+        """The average over the runs and its interval, which are those that the verdict tests."""
+        return positive_interval(per_run, skewed=False)
 
     def curves(self, sums: Sums, runs: int) -> dict[str, np.ndarray]:
         """NIS over degrees of freedom at each step."""

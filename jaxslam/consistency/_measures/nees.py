@@ -14,13 +14,11 @@ from jaxslam.consistency._intervals import LEVEL
 from jaxslam.consistency._measures.measure import Measure, Nees, Runs, RunScores, Sums, ratio
 from jaxslam.core.protocols import Chart, Sensor
 from jaxslam.core.types import Trace, Truth
+from jaxslam.math._pose_covariances import asymmetry, inverse_deviations
 from jaxslam.math.stats import chi2_quantiles
 
 DOF = {"pose": 3, "position": 2, "heading": 1}
 """Blocks of the pose error with a NEES, and its honest mean."""
-
-_ROUNDING = 32
-"""Largest claimed deviation, in ulp of its coordinate, that counts as zero."""
 
 
 @dataclass(frozen=True, eq=False)
@@ -102,10 +100,10 @@ def block_nees(
     There is none where the claimed covariance is singular, i.e. some direction is known exactly:
     1/tr P⁻¹, at most its least eigenvalue and at least a third of it, is at most 100 n·eps where P
     is scaled to a diagonal of at most 1, x and y by one unit. And none
-    where a claimed deviation is what rounding makes of zero: at most `_ROUNDING` ulp of the
+    where a claimed deviation is what rounding makes of zero: at most 32 ulp of the
     coordinate, that is of π for the heading and of max(|x|, |y|) for the position. So particles
     that are copies of one, whose sample covariance is zero but for rounding, have no NEES, instead
-    of one of 1e27.
+    of one of 1e27. And none where P is not symmetric (`covariance_faults`).
 
     Args:
         pose: as estimated.
@@ -123,7 +121,7 @@ def block_nees(
         )
     eps = float(np.finfo(cov.dtype).eps)
     with np.errstate(all="ignore"):
-        unit = _unit(pose, cov, eps)
+        unit = inverse_deviations(pose, cov, eps)
         scaled = {
             (i, j): cov[..., i, j] * unit[i] * unit[j] for i in range(3) for j in range(i + 1)
         }
@@ -133,8 +131,10 @@ def block_nees(
             squares, known = _whiten(factor, e, unit)
             for block, k in (("position", 2), ("pose", 3)):
                 if name == "pose" or block == "pose":
-                    regular = (_least_eigenvalue(factor, pivots, k) > 100 * k * eps) & _every(
-                        known[:k]
+                    regular = (
+                        (_least_eigenvalue(factor, pivots, k) > 100 * k * eps)
+                        & _every(known[:k])
+                        & (asymmetry(cov, unit, k) <= np.cbrt(eps))
                     )
                     value = np.where(regular, sum(squares[:k]), 0.0)
                     found[block if name == "pose" else name] = Nees(value, regular)
@@ -157,20 +157,6 @@ def own_error_of(chart: Chart, sensor: Sensor, trace: Trace, truth: Truth) -> Fl
         return dx if chart.basis is None else chart.basis(pose, ground).pose @ dx
 
     return jax.vmap(one)(jnp.asarray(trace.estimate.pose), jnp.asarray(truth.pose))
-
-
-def _unit(pose: np.ndarray, cov: np.ndarray, eps: float) -> list[np.ndarray]:
-    """1/σ of x, y and θ, which scale a pose covariance to a unit diagonal; x and y, both metres,
-    share one. 0 where the deviation is rounding."""
-    x, y, heading = (np.maximum(cov[..., i, i].astype(np.float64), 0.0) for i in range(3))
-    reach = np.abs(pose[..., :2]).max(axis=-1)
-
-    def unit(variance: np.ndarray, size: np.ndarray | float) -> np.ndarray:
-        certain = variance > (_ROUNDING * eps * size) ** 2
-        return np.where(certain, 1.0 / np.sqrt(np.where(certain, variance, 1.0)), 0.0)
-
-    metres = unit(np.maximum(x, y), reach)
-    return [metres, metres, unit(heading, np.pi)]
 
 
 def _cholesky(

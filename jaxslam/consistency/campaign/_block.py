@@ -10,12 +10,12 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import NamedSharding
-from jaxtyping import Float, PyTree
+from jaxtyping import Float, Int, PyTree
 
 from jaxslam.consistency import Score, score
 from jaxslam.consistency._bound import final_covariance
 from jaxslam.consistency._measures import REGISTRY
-from jaxslam.consistency._tally import condense, condensed_sums
+from jaxslam.consistency._tally import FAR, condense, condensed_sums
 from jaxslam.consistency.campaign._block_programs import (
     RUN_AXES,
     Draws,
@@ -33,8 +33,9 @@ from jaxslam.core.types import Estimate, Info, Trace, Truth
 from jaxslam.filters._ekf.monitor import MonitoredState
 from jaxslam.simulation._worlds import Scenario, World
 
-BOUND = "bound"
-"""Under this name a block keeps the sums of the conditional bound, and the divergence limit."""
+BOUND = ""
+"""Under this name, which no filter has, a block keeps the sums of the conditional bound, and the
+limit of accuracy."""
 
 
 @dataclass(frozen=True)
@@ -135,7 +136,7 @@ class BlockRunner:
         return np.arange(first, first + self.plan.wide, dtype=jnp.result_type(int))
 
     def _divergence_limit(self) -> Float[np.ndarray, ""]:
-        """The limit of divergence: 5 σ [m] of the ideal spread of run 0's last position.
+        """The limit of accuracy: 5 σ [m] of the ideal spread of run 0's last position.
 
         In a world without noise it is what rounding can do.
         """
@@ -153,7 +154,7 @@ class BlockRunner:
         dtype = draws[0].pose.dtype
         reach = 1.0 + float(np.max(np.abs(np.asarray(plan.scenario.landmarks)), initial=0.0))
         rounding = 1000 * float(jnp.finfo(dtype).eps) * reach
-        return np.asarray(max(5 * max(variance, 0.0) ** 0.5, rounding), dtype)
+        return np.asarray(max(FAR * max(variance, 0.0) ** 0.5, rounding), dtype)
 
     def block(self, first: int, runs: int) -> BlockResult:
         """The result of runs first … first + runs - 1, all within a block."""
@@ -164,6 +165,8 @@ class BlockRunner:
         which = self._numbers(base)
         draws: Draws = jax.block_until_ready(made.draw(self._world, self._key, which))
         truth = jax.device_get(draws[0])
+        valid = np.asarray(jax.device_get(draws[1].scan.valid))
+        measured = valid.reshape(len(valid), -1).sum(axis=1)
         out: dict[str, dict[str, np.ndarray]] = {}
         run_0, seconds = {}, {}
         for name, one in self._filters.items():
@@ -177,7 +180,7 @@ class BlockRunner:
                     jax.tree.map(lambda leaf: leaf[0], truth),
                     jax.tree.map(lambda leaf: first_run(leaf, 1), results.estimate),
                 )
-            scores = self._score(results, draws[0], truth, mine)
+            scores = self._score(results, draws[0], truth, measured, mine)
             out[name] = condense(scores, first, float(self._limit))
         out[BOUND] = {"limit": self._limit}
         if plan.bound:
@@ -185,14 +188,25 @@ class BlockRunner:
             out[BOUND] |= condensed_sums({name: rows[mine] for name, rows in bound.items()})
         return BlockResult(out, run_0, seconds, self.compile_seconds)
 
-    def _score(self, results: FilterResults, drawn: Truth, truth: Truth, mine: slice) -> Score:
-        """The scores of the runs mine. drawn: the truth on the devices, truth: on the host."""
+    def _score(
+        self,
+        results: FilterResults,
+        drawn: Truth,
+        truth: Truth,
+        measured: Int[np.ndarray, "B"],
+        mine: slice,
+    ) -> Score:
+        """The scores of the runs mine.
+
+        drawn: the truth on the devices, truth: on the host. measured: how many measurements.
+        """
         found = jax.device_get(
             self._statistics(self._world.sensor, drawn, results.estimate, results.info)
         )
         chart_error = np.swapaxes(jax.device_get(results.own_error), 0, 1)
         trace = _on_host(results)
-        return score(*jax.tree.map(lambda leaf: leaf[mine], (trace, truth, found, chart_error)))
+        given = trace, truth, found, chart_error, measured
+        return score(*jax.tree.map(lambda leaf: leaf[mine], given))
 
 
 def first_run(leaf: jax.Array, axis: int = 0) -> np.ndarray:

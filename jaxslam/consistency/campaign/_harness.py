@@ -179,6 +179,10 @@ def _check(
     if not is_concrete(key):
         raise ValueError("monte_carlo: it compiles its own programs: call it outside of jax.jit")
     for name, candidate in filters.items():
+        if not isinstance(name, str) or not name.strip() or not name.isprintable():
+            raise ValueError(
+                f"monte_carlo: filters: expected a name for each, as 'ekf', got {name!r}"
+            )
         check_fits(name, candidate, scenario)
     check_noise(scenario)
     if devices is not None and not isinstance(devices, Sequence):
@@ -212,7 +216,7 @@ def _check(
 
 
 def summaries_of(tallies: dict[str, Tally]) -> tuple[int, np.ndarray, dict[str, Summary]]:
-    """How many runs there are, the divergence limit, and the summary of each filter."""
+    """How many runs there are, the limit of accuracy, and the summary of each filter."""
     finished = sum(count for _, count in tallies[BOUND].pieces())
     bound = {name: total / finished for name, total in tallies[BOUND].sums.items()} or None
     found = {name: summarize(one, bound) for name, one in tallies.items() if name != BOUND}

@@ -29,8 +29,9 @@ class Campaign:
     runs: int
     dtype: str
     divergence_limit: float
-    """final position error beyond which a run is divergent [m]: 5 σ, with σ² = tr P of the position
-    at the end of an EKF with Jacobians at the truth, in run 0"""
+    """final position error beyond which a run is inaccurate [m]: 5 σ, with σ² = tr P of the
+    position at the end of an EKF with Jacobians at the truth, in run 0. One whose error is also
+    over 5 σ of what the filter claims is divergent"""
     filters: dict[str, Summary]
     seconds: float
     """wall time, compilation included."""
@@ -59,8 +60,13 @@ class Campaign:
         )
         return f"{' × '.join(counts)}, {self.dtype}"
 
+    @property
+    def verdicts(self) -> dict[str, str]:
+        """The verdict of each filter, as printed: with an asterisk if it has doubts."""
+        return Named({n: s.verdict + "*" * bool(s.doubts) for n, s in self.filters.items()})
+
     def __repr__(self) -> str:
-        verdicts = ", ".join(f"{name}={s.verdict}" for name, s in self.filters.items())
+        verdicts = ", ".join(f"{name}={verdict}" for name, verdict in self.verdicts.items())
         text = f"Campaign({self.scenario}, {self.size}, {verdicts})"
         return textwrap.fill(text, 100, subsequent_indent="    ", break_long_words=False)
 

@@ -1,5 +1,6 @@
 """Checks of a log: shapes, dtypes, finite values, repeated tags."""
 
+import jax.numpy as jnp
 import numpy as np
 
 from jaxslam.core._numbers import check_array, is_concrete, largest
@@ -40,6 +41,11 @@ def check_log(
             f"{name}: log.scan: expected {sum(parts)} measurement slots, "
             f"{' + '.join(map(str, parts))} of the sensors, got {places}: log.scan.z of shape "
             f"{np.shape(z)}"
+        )
+    dtype = jnp.promote_types(jnp.result_type(control), jnp.result_type(z))
+    if dtype not in (jnp.float32, jnp.float64):
+        raise ValueError(
+            f"{name}: log.control, log.scan.z: expected float32 or float64, got {dtype}"
         )
     if not is_concrete(log):
         return

@@ -7,6 +7,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from jaxslam.consistency import Average
+from jaxslam.consistency._intervals import EACH, percentage
 from jaxslam.consistency._measures import REGISTRY, in_figure
 from jaxslam.consistency._measures.coverage import LEVELS
 from jaxslam.consistency._measures.errors import bound_curve
@@ -72,7 +73,7 @@ def nees_figure(
             _draw_band(axes, campaign, block)
             for name, i in row.names.items():
                 summary = campaign.filters[name]
-                label = f"{name} ({summary.verdict})"
+                label = f"{name} ({summary.verdict}{'*' * bool(summary.doubts)})"
                 curve(axes, i, step, summary.curves[f"nees_{block}"], label, absent="no NEES")
             axes.set_xlim(step_limits(campaign.steps))
             mark_beyond(axes)
@@ -85,7 +86,8 @@ def rmse_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
 
     Other measures with the figure "rmse" have a panel, too.
 
-    More than five filters are drawn by kind. Filters that fuse no measurement, that diverge, or
+    More than five filters are drawn by kind. Filters that fuse no measurement, that are inaccurate,
+    or
     whose error is over three times the median of the others do not set the scale: larger
     values have marks at the edge, and the largest one is written above. width [in].
     """
@@ -264,9 +266,9 @@ INTERVAL = "interval"
 def cost_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     """Time of a step, position error and pose NEES of every filter: a row each, by kind.
 
-    Error and NEES have their 95 % intervals, with an arrow where one leaves the scale. A NEES over
-    100 times dof is marked at the edge. Filters that were not timed have no point. width [in]; at
-    least that of a page for more than five filters.
+    Error and NEES have their 97.5 % intervals, with an arrow where one leaves the scale. A NEES
+    over 100 times dof is marked at the edge. Filters that were not timed have no point. width [in];
+    at least that of a page for more than five filters.
     """
     check_record("cost_figure", "the first argument", campaign, Campaign)
     times = {name: 1e6 * campaign.step_seconds.get(name, np.nan) for name in campaign.filters}
@@ -305,7 +307,7 @@ def cost_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     for axes, text in zip(panels, titles, strict=True):
         axes.set_xlabel(text if width >= PAGE else text.replace(" [", "\n[").replace(" (", "\n("))
     honest = panels[2].axvline(DOF["pose"], color=INK, lw=0.8, zorder=1.5, label="honest")
-    what = "error and NEES, with 95 % intervals, and the time of a step,"
+    what = f"error and NEES, with {percentage(EACH, 1)} intervals, and the time of a step,"
     caption(figure, title_of(campaign, what), [honest])
     return figure
 

@@ -173,14 +173,16 @@ _PLACES = 12
 
 
 def scale_setters(campaign: Campaign) -> list[str]:
-    """The filters that set the scale of errors: those that fused measurements and do not diverge.
+    """The filters that set the scale of errors: those that fused measurements and are accurate.
 
     All filters if there are none.
     """
     names = [
         name
         for name, summary in campaign.filters.items()
-        if summary.counts.get("fused", 0) > 0 and summary.verdict != "diverged"
+        if summary.counts.get("fused", 0) > 0
+        and summary.verdict != "diverged"
+        and summary.counts.get("inaccurate", 0) <= summary.counts["runs"] / 2
     ]
     return names or list(campaign.filters)
 

@@ -66,8 +66,8 @@ def run_errors_figure(campaign: Campaign, *, title: str = "", width: float = PAG
     found = {n: _errors(estimate, truth) for n, (truth, estimate) in campaign.first.items()}
     setters = scale_setters(campaign)
     peaks = {
-        name: np.nanmax([np.abs(error).max(axis=0), bound.max(axis=0)], axis=0)
-        for name, (error, bound) in found.items()
+        name: np.max(np.abs(both), axis=(0, 1), where=np.isfinite(both), initial=0.0)
+        for name, both in found.items()
     }
     tops = [common_top({name: peak[i] for name, peak in peaks.items()}, setters) for i in range(3)]
     figure, panels = panels_of(width, 0.8 * len(found) + 0.8, len(found), 3)

@@ -12,6 +12,7 @@ from cases import refused, swept
 
 from jaxslam import Scenario, filters, grids, motion, run, sensors, simulate, store
 from jaxslam import _catalog as catalog
+from jaxslam.consistency._measures.counts import DROPS, KEPT
 from jaxslam.consistency.campaign import Interrupted, monte_carlo
 from jaxslam.consistency.campaign import _work as work
 from jaxslam.consistency.campaign._candidates import fitting_block, without_noise
@@ -21,7 +22,7 @@ from jaxslam.core.types import Status, Truth
 from jaxslam.filters import _reporting as reporting
 from jaxslam.laser.grids._grid_localization import info_of_beams
 from jaxslam.simulation.laser import scan_world
-from jaxslam.simulation.scenarios import square
+from jaxslam.simulation.scenarios import BetweenRanges, square
 
 WORLD = worlds.ring()
 BESIDE = dataclasses.replace(WORLD, sensor=sensors.RelativePosition(np.eye(2)))
@@ -297,6 +298,8 @@ def test_drops_and_losses_are_counted_and_leave_the_others_valid(in_fours):
     assert poisoned.counts["runs"] + poisoned.counts["not_finite"] == 10
     assert 0 < poisoned.counts["not_finite"] < 10
     assert all(np.isfinite(m.value) for m in poisoned.measures.values())
+    assert f"averages of the {poisoned.counts['runs']} finite runs" in poisoned.doubts[0]
+    assert poisoned.verdict in ("incomplete", "optimistic", "diverged")
     assert campaign.filters["small"].counts["overflow"] == 10 * WORLD.steps * 2
     lost = campaign.filters["always lost"]
     assert lost.verdict == "diverged"
@@ -360,6 +363,33 @@ def test_a_sensor_without_noise_is_told_where_it_left_nothing_to_judge():
     assert f"{2 * still.steps * len(still.landmarks):,} measurements were dropped and" in b[-1]
 
 
+@pytest.mark.parametrize("name", swept(catalog.ALL, "ekf", "dead_reckoning"))
+def test_every_filter_accounts_for_every_measurement(name):
+    """A status in its Info for each that the logs hold."""
+    counts = worlds.campaign(WORLD, {"it": catalog.ALL[name](WORLD)}, 2).filters["it"].counts
+    assert counts["measured"] == 2 * WORLD.steps * len(WORLD.landmarks)
+    assert counts["measured"] == sum(counts[status.name.lower()] for status in KEPT + DROPS)
+
+
+@pytest.mark.parametrize(
+    ("change", "word", "told"),
+    [
+        ({"visible": BetweenRanges(0.0, 0.01)}, "incomplete", "nothing was measured in any run"),
+        ({"places": 1}, "incomplete", "landmarks in view, beside 600 measured ones, had no place"),
+        ({"places": 5}, None, "600 landmarks in view, beside 3,000 measured ones, had no place"),
+    ],
+)
+def test_a_world_that_gives_its_filter_little_is_told(change, word, told):
+    world = dataclasses.replace(WORLD, **change)
+    reckoning = filters.DeadReckoning(WORLD.motion, WORLD.sensor)
+    found = worlds.campaign(world, {"ekf": EKF, "blind": reckoning}, 6).filters
+    assert any(told in doubt for doubt in found["ekf"].doubts)
+    assert found["ekf"].verdict == word or word is None
+    # Dead reckoning takes none, and says so.
+    assert any(told in doubt for doubt in found["blind"].doubts)
+    assert "takes none of the" in found["blind"].doubts[-1] or change.get("visible")
+
+
 @pytest.mark.parametrize(
     ("noise", "told"),
     [
@@ -414,6 +444,11 @@ def test_wrong_filters_are_found_out(name):
     ({"filters": {}}, "at least one, got none"),
     ({"filters": worlds.ekf(WORLD)}, "{name: filter}, at least one, got a EkfSlam"),
     ({"filters": {"x": 3}}, "expected x to be a Filter"),
+    ({"filters": {1: EKF}}, "filters: expected a name for each, as 'ekf', got 1"),
+    ({"filters": {None: EKF}}, "expected a name for each, as 'ekf', got None"),
+    ({"filters": {b"ekf": EKF}}, "expected a name for each, as 'ekf', got b'ekf'"),
+    ({"filters": {" ": EKF}}, "expected a name for each, as 'ekf', got ' '"),
+    ({"filters": {"a\nb": EKF}}, "expected a name for each, as 'ekf', got 'a\\nb'"),
     ({"filters": {"x": lambda log, key: None}}, "lambda truth"),
     (
         {"filters": {"x": filters.EkfSlam}},
