@@ -77,10 +77,10 @@ def may_move(near: PyTree, origin: Origin, controls: ArrayLike | None = None) ->
 
 
 def holds_far_numbers(tree: PyTree, origin: Origin) -> bool:
-    """Whether a number of a tree is at least half as large as an origin."""
+    """Whether a number of a tree is finite, and at least half as large as an origin."""
     leaves = [np.asarray(jax.device_get(leaf)) for leaf in jax.tree.leaves(tree)]
-    far = 0.5 * np.abs(origin).max()
-    return any((np.abs(leaf) >= far).any() for leaf in leaves if leaf.dtype.kind in "iuf")
+    sizes = [np.abs(leaf[np.isfinite(leaf)]) for leaf in leaves if leaf.dtype.kind == "f"]
+    return any((size >= 0.5 * np.abs(origin).max()).any() for size in sizes)
 
 
 def _is_ours(of: Any, models: list[PyTree]) -> bool:

@@ -45,10 +45,13 @@ def precision_doubts(
     for name, candidate in plan.filters.items():
         tally = tallies[name]
         rounding = _rounding(plan.scenario, candidate, tally, dtype, least)
+        singular = int(tally.sums["singular"])
+        suspect = rounding.may_decide or singular or not tally.flags("finite").all()
         doubt = rounding.doubt
-        suspect = rounding.may_decide or not tally.flags("finite").all()
         if dtype == np.float32 and suspect and rounding.of_position < 0.1:
             difference = _difference(plan, candidate, tally.numbers())
+            if difference == "" and singular and least > 0:
+                difference = f"{singular:,} innovation covariances were singular in float32"
             if difference is not None:
                 doubt = difference and f"precision decides: {difference}: {rounding.remedy}"
         if doubt:
