@@ -116,7 +116,7 @@ def _difference(plan: CampaignPlan, candidate: Candidate, numbers: np.ndarray) -
             if not gaps.max() > SAME:
                 return ""
             another, _ = filtered(wide, jax.random.fold_in(plan.key, 0))
-    except (TypeError, ValueError):  # a filter that computes in float32 alone
+    except Exception:  # a user's filter that computes in float32 alone
         return None
     if not np.array_equal(double.pose, another.pose, equal_nan=True):
         return None
