@@ -27,6 +27,7 @@ BENCHMARKS = {
     "gradient": "gradient",
     "film": "film",
     "verdict": "verdict",
+    "precision": "precision",
     "campaigns": "campaigns",
     "circle": "published:circle",
     "loop": "loop",

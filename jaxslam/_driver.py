@@ -10,6 +10,8 @@ import numpy as np
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
+from jaxslam._origin import FAR, far_origin, holds_far_numbers, moved, returned, shifted
+from jaxslam._rounding import doubt_on_run
 from jaxslam.association._rules import Known
 from jaxslam.core._numbers import check_covariance, check_key, is_concrete, largest, shape_text
 from jaxslam.core._validation import (
@@ -43,6 +45,15 @@ def run(
     where its value is concrete, and dropped as `Status.REJECTED` under a trace. Reverse mode
     stores one state a step, and recomputes each step in the backward pass.
 
+    In float32, a log that starts over 1 km from the origin of its coordinates is filtered with
+    positions relative to the start, if that makes no difference to the models, and the estimates
+    are returned in float64, on the host: float32 could not hold them. `final` is then the state
+    relative to the (x, y) of the start. This needs concrete arguments and no probe.
+
+    Where rounding comes near the noise of the measurements (a vague start, coordinates far from the
+    origin, in float32), a run outside a trace warns: it is computed again in float64, and where
+    the measurements used, NIS or poses differ, the warning has the numbers.
+
     Args:
         filter: a record, as of `jaxslam.filters`.
         log: T rows; control (T, U), scans of M measurement slots.
@@ -65,7 +76,24 @@ def run(
     check_run("run", filter, log, pose, pose_cov)
     _notice_negative_ranges(filter, log.scan)
     check_key("run", key)
-    return _drive(filter, log, pose, pose_cov, key, probe)
+    # A new array is a tracer where a trace is active, also where all arguments are constants.
+    if not is_concrete(filter, log, pose, pose_cov, key, jnp.zeros(())):
+        return _drive(filter, log, pose, pose_cov, key, probe)
+    origin = None
+    if probe is None and jnp.result_type(log.control, log.scan.z) == jnp.float32:
+        origin = far_origin(pose, least=FAR)
+    near = filter if origin is None else moved(filter, origin)
+    if origin is None or near is None or holds_far_numbers(log.control, origin):
+        near, origin, start = filter, None, pose
+    else:
+        start = shifted(pose, -origin)
+    trace = _drive(near, log, start, pose_cov, key, probe)
+    arguments = near, log, start, pose_cov, key
+    if doubt := doubt_on_run(lambda *those: _drive(*those, None), arguments, trace):
+        warnings.warn(f"run: {filter.name}: {doubt}", stacklevel=2)
+    if origin is None:
+        return trace
+    return trace._replace(estimate=returned(jax.device_get(trace.estimate), origin))
 
 
 def check_run(name: str, filter: Filter, log: Log, pose: ArrayLike, pose_cov: ArrayLike) -> None:

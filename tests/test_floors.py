@@ -22,7 +22,7 @@ FLOORS = [
     "math",
     "core",
     "motion sensors charts linearize association resampling life",
-    "_driver filters graphs laser simulation",
+    "_driver _origin _rounding filters graphs laser simulation",
     "consistency verify catalog _catalog calibration",
     "datasets results _cli selftest _selftest __main__",
 ]

@@ -12,6 +12,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
+from jaxslam._origin import FAR, far_origin, moved, returned
 from jaxslam.core._numbers import check_covariance, check_key, held_array, is_concrete
 from jaxslam.core._record import FrozenDict, hold_function, record, set_field, static
 from jaxslam.core._validation import call_traced, check_record
@@ -202,11 +203,23 @@ def simulate(scenario: World, key: Array) -> tuple[Truth, Log]:
 
     Traceable, so `jax.vmap(partial(simulate, scenario))(keys)` draws a batch. It is compiled once
     for a structure, as `run` is. The filters of a campaign all get the same draws.
+
+    In float32, a world over 1 km from the origin of its coordinates is drawn with positions
+    relative to its start, if that makes no difference to its models, and the truth is returned in
+    float64, on the host: float32 could not hold it.
     """
     check_record("simulate", "scenario", scenario, World)
     check_key("simulate", key)
-    found: tuple[Truth, Log] = _draw(scenario, key)
-    return found
+    near, origin = scenario, None
+    # A new array is a tracer where a trace is active, also where all arguments are constants.
+    if jnp.result_type(float) == jnp.float32 and is_concrete(scenario, key, jnp.zeros(())):
+        origin = far_origin(scenario.pose, scenario.landmarks, FAR)
+        near = scenario if origin is None else moved(scenario, origin, scenario.controls)
+    if near is None or origin is None:
+        found: tuple[Truth, Log] = _draw(scenario, key)
+        return found
+    truth, log = _draw(near, key)
+    return returned(jax.device_get(truth), origin), log
 
 
 @partial(jax.jit, inline=True)

@@ -74,14 +74,20 @@ class Programs(NamedTuple):
 @functools.cache
 def programs(devices: Sequence[jax.Device], dtype: np.dtype | None) -> Programs:
     """The programs on these devices; dtype: of the worlds, None for that of JAX."""
-    platform = devices[0].platform
-    hot, quick = hot_options(platform), quick_options(platform)
     of_draw = functools.partial(draw_worlds, dtype)
     draw = over_runs(devices, of_draw, (None, None, 0), 0)
+    quick = quick_options(devices[0].platform)
+    return Programs(jax.jit(draw, compiler_options=quick), *_programs_of_draws(devices))
+
+
+@functools.cache
+def _programs_of_draws(devices: Sequence[jax.Device]) -> tuple[PyTree, PyTree, PyTree]:
+    """The programs drive, bound and jacobians, which take what was drawn in any dtype."""
+    platform = devices[0].platform
+    hot, quick = hot_options(platform), quick_options(platform)
     drive = over_runs(devices, drive_filter, (None, None, None, 0, 0), RUN_AXES)
     bound = over_runs(devices, bound_variances, (None, None, 0, 0), 0)
-    return Programs(
-        jax.jit(draw, compiler_options=quick),
+    return (
         jax.jit(drive, compiler_options=hot),
         jax.jit(bound, compiler_options=hot),
         jax.jit(jacobians_at_truth, compiler_options=quick),

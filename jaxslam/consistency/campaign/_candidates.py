@@ -109,6 +109,21 @@ def without_noise(scenario: World) -> str:
     return " and ".join(found)
 
 
+def least_noise(scenario: World) -> float:
+    """The least eigenvalue of the noise covariances of the scenario's sensors; 0 of exact ones.
+
+    Looked at where `check_noise` looks, the larger of both places: noise may grow from 0 with z.
+    """
+    if not is_concrete(scenario.pose, scenario.landmarks):
+        return 0.0
+    least = []
+    for model in _sensors(scenario):
+        places = _number(np.zeros(len(model.measurements))), _first_measurement(model, scenario)
+        covs = [np.asarray(_noise_cov(model, z), np.float64) for z in places]
+        least.append(max(float(np.linalg.eigvalsh(cov).min(initial=np.inf)) for cov in covs))
+    return max(min(least, default=0.0), 0.0)
+
+
 def _exact(sensor: Sensor, cov: np.ndarray) -> str:
     """The measurements of variance 0; a combination of them if no single one has variance 0."""
     sigma = np.sqrt(np.diagonal(cov))

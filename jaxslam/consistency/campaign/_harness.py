@@ -11,12 +11,13 @@ On a GPU particle filters agree to rounding alone (`docs/guide/campaigns.md`).
 import time
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
-from typing import Literal
+from typing import Literal, TypeVar
 
 import jax
 import numpy as np
 from jax.typing import DTypeLike
 
+from jaxslam._origin import far_origin, may_move, moved, returned
 from jaxslam.consistency import Summary
 from jaxslam.consistency._summary import summarize
 from jaxslam.consistency._tally import Tally
@@ -26,18 +27,24 @@ from jaxslam.consistency.campaign._candidates import (
     check_fits,
     check_noise,
     fitting_block,
+    method_of,
     without_noise,
 )
 from jaxslam.consistency.campaign._digests import identity
 from jaxslam.consistency.campaign._kept import Keep, add_kept
 from jaxslam.consistency.campaign._pieces import check_part, cores, in_part, missing
+from jaxslam.consistency.campaign._precision import precision_doubts
 from jaxslam.consistency.campaign._remote import Executor
 from jaxslam.consistency.campaign._result import Campaign, Incomplete, Interrupted
 from jaxslam.consistency.campaign._work import Work, shown_progress
 from jaxslam.core._numbers import check_count, check_key, is_concrete
 from jaxslam.core._validation import check_record
-from jaxslam.core.protocols import Candidate
+from jaxslam.core.protocols import Candidate, Filter
+from jaxslam.core.types import Truth
+from jaxslam.graphs.smoothing._forward_pass import LogEstimator
 from jaxslam.simulation._worlds import World, with_positions
+
+_T = TypeVar("_T")
 
 
 def monte_carlo(
@@ -113,7 +120,8 @@ def monte_carlo(
     names = (*filters, BOUND)
     tallies = {name: Tally() for name in names}
     size = int(block or fitting_block(scenario, filters, devices[0]))
-    plan = CampaignPlan(scenario, filters, key, devices, size, bound, dtype)
+    near, near_filters, origin = _near_the_origin(scenario, filters)
+    plan = CampaignPlan(near, near_filters, key, devices, size, bound, dtype)
     if part is not None and (part[0] - 1) * plan.wide >= runs:
         raise ValueError(
             f"monte_carlo: part: expected one of the {-(-runs // plan.wide)} blocks of {plan.wide} "
@@ -136,7 +144,7 @@ def monte_carlo(
         tallies[name].merge(tally)
     campaign = None
     if tallies[BOUND].pieces():
-        campaign = _summed_up(plan, tallies, work, time.perf_counter() - began)
+        campaign = _summed_up(plan, tallies, work, origin, time.perf_counter() - began)
     if isinstance(stop, Incomplete):
         done = f"{campaign.runs if campaign else 0} of {runs} runs done"
         raise Incomplete(f"monte_carlo: executor: {stop}; {done}", campaign) from stop.__cause__
@@ -224,11 +232,21 @@ def summaries_of(tallies: dict[str, Tally]) -> tuple[int, np.ndarray, dict[str, 
 
 
 def _summed_up(
-    plan: CampaignPlan, tallies: dict[str, Tally], work: Work, seconds: float
+    plan: CampaignPlan,
+    tallies: dict[str, Tally],
+    work: Work,
+    origin: np.ndarray | None,
+    seconds: float,
 ) -> Campaign:
-    """The campaign of the runs in the tallies."""
+    """The campaign of the runs in the tallies; origin: what positions are relative to."""
+
+    def in_the_map(found: _T) -> _T:
+        return found if origin is None else returned(found, origin)
+
     scenario = plan.scenario
     finished, limit, summaries = summaries_of(tallies)
+    for name, doubt in precision_doubts(plan, tallies, limit.dtype).items():
+        summaries[name] = replace(summaries[name], doubts=(*summaries[name].doubts, doubt))
     steps = max(scenario.steps, 1)
     return Campaign(
         scenario=scenario.name,
@@ -243,11 +261,42 @@ def _summed_up(
         compile_seconds=work.compile_seconds,
         step_seconds={name: seconds / steps for name, seconds in work.run_seconds().items()},
         first={
-            name: (jax.device_get(with_positions(scenario.sensor, truth)), estimate)
+            name: (
+                in_the_map(jax.device_get(with_positions(scenario.sensor, truth))),
+                in_the_map(estimate),
+            )
             for name, (truth, estimate) in work.first.items()
         },
         run_numbers=tallies[BOUND].numbers(),
     )
+
+
+def _near_the_origin(
+    scenario: World, filters: Mapping[str, Candidate]
+) -> tuple[World, Mapping[str, Candidate], np.ndarray | None]:
+    """World and filters with positions relative to the start, and the (x, y) of that in the map,
+    where its origin is far and none of them depends on where it is; else as they are, and None."""
+    origin = far_origin(scenario.pose, scenario.landmarks)
+    if origin is None or (near := moved(scenario, origin, scenario.controls)) is None:
+        return scenario, filters, None
+    truth = Truth(
+        pose=np.tile(np.asarray(near.pose), (near.steps, 1)),
+        landmarks=np.asarray(near.landmarks),
+        missed=np.zeros(near.steps, int),
+        start=np.asarray(near.pose),
+    )
+    out: dict[str, Candidate] = {}
+    for name, candidate in filters.items():
+        if isinstance(candidate, Filter | LogEstimator):
+            there = moved(candidate, origin, scenario.controls)
+        else:  # a function of the truth, which is relative
+            made = method_of(candidate, truth)
+            known = isinstance(made, Filter | LogEstimator)
+            there = candidate if known and may_move(made, origin, scenario.controls) else None
+        if there is None:
+            return scenario, filters, None
+        out[name] = there
+    return near, out, origin
 
 
 def _qualify(found: dict[str, Summary], scenario: World) -> dict[str, Summary]:

@@ -74,9 +74,9 @@ class EkfSlam(Filter):
     iterations: int = static(default=1)
     """passes of the iterated EKF, each from the same prior; 1 is the plain EKF"""
     covariance: Covariance = static(default="plain")
-    """"plain"; "joseph", Joseph's form of the update, which costs more and is safer in float32; or
-    "square_root", a root X of P = X Xᵀ instead of P, as accurate in float32 as P is in float64, at
-    a higher cost (the prediction is O(N³))"""
+    """"plain"; "joseph", Joseph's form of the update, which costs more, and in float32 fails where
+    "plain" does; or "square_root", a root X of P = X Xᵀ instead of P, which in float32 is right to
+    starts of σ = 1 km, at a higher cost (the prediction is O(N³))"""
     births: int | None = static(default=None)
     """largest number of new landmarks a scan, the first in its order (that of tags in simulated
     scans), the rest `Status.DEFERRED`. The guide starts one, picked at random. None: no limit"""

@@ -1,0 +1,163 @@
+"""Doubts on a campaign whose precision decides: its first runs again, in float64.
+
+Where the rounding of covariances or coordinates comes near the noise (`Rounding`), the first runs
+of a float32 campaign are filtered in both precisions, over the same logs: what differs is rounding.
+In float64 there is nothing to compare with, nor of a filter that draws random numbers, which differ
+between precisions; there the size of the rounding is the doubt.
+"""
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jax.sharding import NamedSharding
+from jaxtyping import Float, Int
+
+from jaxslam._rounding import SAME, Rounding, rounding_of
+from jaxslam.consistency._measures.nees import block_nees, pose_error
+from jaxslam.consistency._tally import Tally
+from jaxslam.consistency.campaign._block import CampaignPlan
+from jaxslam.consistency.campaign._block_programs import (
+    Draws,
+    FilterResults,
+    mesh_of,
+    programs,
+    spec,
+)
+from jaxslam.consistency.campaign._candidates import least_noise
+from jaxslam.core._record import as_record
+from jaxslam.core.protocols import Candidate
+from jaxslam.core.types import Status
+from jaxslam.math._arrays import float64
+from jaxslam.simulation._worlds import World
+
+RUNS = 16
+"""As many runs, at most, are filtered again: a block on a CPU, whose programs are there."""
+
+
+def precision_doubts(
+    plan: CampaignPlan, tallies: Mapping[str, Tally], dtype: np.dtype
+) -> dict[str, str]:
+    """By filter, a sentence on the precision of its runs, where that decides; dtype: theirs."""
+    least, doubts = least_noise(plan.scenario), {}
+    for name, candidate in plan.filters.items():
+        tally = tallies[name]
+        rounding = _rounding(plan.scenario, candidate, tally, dtype, least)
+        singular = int(tally.sums["singular"])
+        suspect = rounding.may_decide or singular or not tally.flags("finite").all()
+        doubt = rounding.doubt
+        if dtype == np.float32 and suspect and rounding.of_position < 0.1:
+            difference = _difference(plan, candidate, tally.numbers())
+            if difference == "" and singular and least > 0:
+                difference = f"{singular:,} innovation covariances were singular in float32"
+            if difference is not None:
+                doubt = difference and f"precision decides: {difference}: {rounding.remedy}"
+        if doubt:
+            doubts[name] = doubt
+    return doubts
+
+
+def _rounding(
+    scenario: World, candidate: Candidate, tally: Tally, dtype: np.dtype, least: float
+) -> Rounding:
+    """The rounding of a filter's runs, from its covariances at some steps."""
+    start = np.asarray(scenario.pose, np.float64)[None, :2]
+    points = np.asarray(scenario.landmarks, np.float64)[:, :2]
+    places = np.concatenate([start, np.pad(points, [(0, 0), (0, 2 - points.shape[1])])])
+    start_cov = np.asarray(scenario.pose_cov, np.float64)[None]
+    covs = np.concatenate([start_cov, tally.snapshots()[1].reshape(-1, 3, 3)])
+    return rounding_of(candidate, dtype, covs, places, least)
+
+
+class _Runs(NamedTuple):
+    """R runs of a filter in one precision, on the host, by step first."""
+
+    pose: Float[np.ndarray, "T R 3"]
+    pose_cov: Float[np.ndarray, "T R 3 3"]
+    own_error: Float[np.ndarray, "T R 3"]
+    status: Int[np.ndarray, "T R M"]
+    nis: Float[np.ndarray, "T R M"]
+    dof: Int[np.ndarray, "T R M"]
+
+
+def _difference(plan: CampaignPlan, candidate: Candidate, numbers: np.ndarray) -> str | None:
+    """The run of a filter that differs most between float32 and float64, as a sentence; "" where
+    none does by more than `SAME`, None where they cannot be compared: a filter that draws random
+    numbers, or computes in one precision alone."""
+    devices = tuple(plan.devices[:1])
+    wanted = numbers[: min(RUNS, plan.block)]
+    which = np.resize(wanted, min(RUNS, plan.block))
+    everywhere = NamedSharding(mesh_of(devices), spec(None))
+
+    def filtered(draws: Draws | None, key: jax.Array) -> tuple[_Runs, Draws]:
+        world, method = jax.device_put((plan.scenario, as_record(candidate)), everywhere)
+        made, these = programs(devices, plan.dtype), which.astype(jnp.result_type(int))
+        own_key = jax.device_put(plan.key, everywhere)
+        if draws is None:
+            draws = made.draw(world, own_key, these)
+        results: FilterResults = made.drive(
+            world, method, jax.device_put(key, everywhere), these, draws
+        )
+        info = results.info
+        runs = _Runs(*results.estimate[:2], results.own_error, info.status, info.nis, info.dof)
+        return jax.device_get((runs, draws))
+
+    single, draws = filtered(None, plan.key)
+    try:
+        with float64():
+            wide = jax.tree.map(
+                lambda leaf: leaf.astype(float) if leaf.dtype == np.float32 else leaf, draws
+            )
+            double, _ = filtered(wide, plan.key)
+            scores = _scores((single, double), draws[0].pose)
+            gaps = np.stack([_gap(*pair) for pair in scores.values()])[:, : len(wanted)]
+            if not gaps.max() > SAME:
+                return ""
+            another, _ = filtered(wide, jax.random.fold_in(plan.key, 0))
+    except Exception:  # a user's filter that computes in float32 alone
+        return None
+    if not np.array_equal(double.pose, another.pose, equal_nan=True):
+        return None
+    run = int(gaps.max(axis=0).argmax())
+    pairs = [
+        f"{what} {a[run]:,.4g} and {b[run]:,.4g}"
+        for what, (a, b) in scores.items()
+        if np.isfinite([a[run], b[run]]).any()
+    ]
+    return f"run {wanted[run]} has, in float32 and in float64, {', '.join(pairs)}"
+
+
+def _scores(
+    both: tuple[_Runs, _Runs], truth: Float[np.ndarray, "R T 3"]
+) -> dict[str, list[Float[np.ndarray, "R"]]]:
+    """Numbers of each run, in either precision: the average NEES over the steps at which both have
+    one, NIS/dof, and how many measurements were used."""
+    path = np.swapaxes(truth, 0, 1)
+    nees = [
+        block_nees(runs.pose, pose_error(path, runs.pose), runs.own_error, runs.pose_cov)["pose"]
+        for runs in both
+    ]
+    regular = nees[0].regular & nees[1].regular
+    fused = [runs.status == Status.FUSED for runs in both]
+    with np.errstate(all="ignore"):
+        return {
+            "pose NEES": [
+                np.where(regular, value, 0.0).sum(axis=0) / regular.sum(axis=0) for value, _ in nees
+            ],
+            "NIS/dof": [
+                np.where(used, runs.nis, 0.0).sum(axis=(0, 2), dtype=np.float64)
+                / runs.dof.sum(axis=(0, 2))
+                for used, runs in zip(fused, both, strict=True)
+            ],
+            "measurements used": [used.sum(axis=(0, 2)).astype(np.float64) for used in fused],
+        }
+
+
+def _gap(a: Float[np.ndarray, "R"], b: Float[np.ndarray, "R"]) -> Float[np.ndarray, "R"]:
+    """|a/b - 1|; ∞ where one alone is a number."""
+    with np.errstate(all="ignore"):
+        gap = np.where(a == b, 0.0, np.abs(a / b - 1))
+    lone = np.isfinite(a) != np.isfinite(b)
+    return np.where(lone, np.inf, np.nan_to_num(gap, nan=0.0, posinf=np.inf))
