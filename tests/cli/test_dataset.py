@@ -179,7 +179,8 @@ def test_a_run_that_nothing_honest_explains_says_so():
     for changed, begins in (
         ({"NIS / dof": 160.0}, "NIS / dof is 160, where 1 is honest: models or units are wrong"),
         ({"status": {"fused": 10, "rejected": 90}}, "the gate rejects 90 of 100: models or units"),
-        ({"pose NEES, median (2.37 is honest)": 1e4}, "the median NEES of the pose is 1e+04, wh"),
+        ({"pose NEES, median (2.37 is honest)": 1e4}, "pose NEES, median is 1e+04, where 2.37 is"),
+        ({"landmark NEES (2 is honest)": 1e4}, "landmark NEES is 1e+04, where 2 is honest, thoug"),
     ):
         (note,) = suspicions(honest | changed)
         assert note.startswith(begins)

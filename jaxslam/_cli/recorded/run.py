@@ -223,7 +223,7 @@ def run_filter(
 
 
 _NIS, _NEES = 30.0, 100.0
-"""NIS / dof, and the median NEES of the pose over the honest one, above which noises are not the
+"""NIS / dof, and the NEES of pose or landmarks over the honest one, above which noises are not the
 cause: innovations of 5 σ, errors of 10 σ."""
 
 
@@ -231,21 +231,23 @@ def suspicions(summary: Json) -> list[str]:
     """Sentences on numbers of a run that no honest filter with the models of the data has."""
     status, found = summary["status"], []
     assert isinstance(status, dict)
-    nis, nees = (
-        float(str(summary.get(name, 0.0)))
-        for name in ("NIS / dof", "pose NEES, median (2.37 is honest)")
-    )
+    nis = float(str(summary.get("NIS / dof", 0.0)))
     units = "models or units are wrong (degrees under [rad], millimetres under [m], the mount)"
     if nis > _NIS:
         found.append(f"NIS / dof is {nis:.4g}, where 1 is honest: {units}")
     elif (rejected := status["rejected"]) > sum(status.values()) / 2:
         found.append(f"the gate rejects {rejected:,} of {sum(status.values()):,}: {units}")
-    elif nees > 2.37 * _NEES:
-        found.append(
-            f"the median NEES of the pose is {nees:.4g}, where 2.37 is honest, though the "
-            "innovations fit: the truth may have other units (degrees under [rad], millimetres "
-            "under [m]), stamps or axes than the log"
-        )
+    else:
+        for name, value in summary.items():
+            of, honest = ("truth", 2.37) if name.startswith("pose NEES, median") else ("survey", 2)
+            if name.startswith(("pose NEES, median", "landmark NEES")) and (
+                (nees := float(str(value))) > honest * _NEES
+            ):
+                found.append(
+                    f"{name.partition(' (')[0]} is {nees:.4g}, where {honest:g} is honest, though "
+                    f"the innovations fit: the {of} may have other units (degrees under [rad], "
+                    "millimetres under [m]), stamps or axes than the log"
+                )
     return found
 
 

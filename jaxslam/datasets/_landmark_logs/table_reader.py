@@ -35,7 +35,7 @@ MISSING = frozenset(
 _NAME = 100
 """Characters of the longest name of a landmark."""
 
-_SIGNED = re.compile(r"[+-]?(?:\d+([.,])\d*|([.,])\d+)(?:[eE][+-]?\d+)?")
+_SIGNED = re.compile(r"[+-]?(?:\d+[.,]\d*|[.,]\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 """A number with one decimal sign."""
 _GROUPED = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}")
 """A number that is also one of thousands: 1,234."""
