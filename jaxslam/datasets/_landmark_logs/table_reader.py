@@ -18,6 +18,7 @@ from jaxslam.core.types import Log
 from jaxslam.datasets._dataset import Adjustable, Dataset, Parameter
 from jaxslam.datasets._landmark_logs.table_settings import Parametric, TableSettings
 from jaxslam.datasets._lines import DIGITS, LARGEST, read_bytes, stored
+from jaxslam.math._odometry_jumps import odometry_jumps, step_sizes, without_jumps
 
 
 class CsvTable:
@@ -242,6 +243,10 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
     moved = (TIME, *tables.odometry_columns(motion.controls, odometry_file.header))
     measured = tables.measurement_columns(sensor.measurements, sensor.landmark)
     odometry = odometry_file.table(moved, f"of the motion model {motion.name}")
+    jumps, path = np.zeros(len(clock), bool), np.zeros((0, 3))
+    if set(POSE) <= set(odometry.columns):
+        path = odometry.values(POSE)
+        jumps = odometry_jumps(path, clock)
     seen = seen_file.table(measured, f"of the sensor {sensor.name}")
     seen.columns[TIME] = seen.columns[TIME] - delay
     max_range, spacing = settings.max_range(), settings.spacing()
@@ -250,6 +255,16 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
         for file, wanted in ((odometry_file, moved), (seen_file, measured))
         for column in file.unused(wanted)
     ]
+    if jumps.any():
+        k = int(np.argmax(jumps))
+        far, turn = step_sizes(path)[k]
+        notes.append(
+            f"{odometry.at(k, POSE[0])}: a jump of the odometry by {far:.3g} m and "
+            f"{np.rad2deg(turn):.3g}° in {clock[k] - clock[k - 1]:.3g} s is no motion, "
+            f"{int(jumps.sum()):,} in all: the step before it takes its place"
+        )
+        for name, column in zip(POSE, without_jumps(path, jumps).T, strict=True):
+            odometry.columns[name] = column
     if len(clock) > 2 and (gaps := np.diff(clock)).max() > _GAP_FACTOR * np.median(gaps):
         k = int(np.argmax(gaps))
         notes.append(
