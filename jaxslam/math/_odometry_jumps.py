@@ -55,6 +55,16 @@ def odometry_jumps(
     return jump
 
 
+def without_jumps(
+    path: Float[np.ndarray, "n 3"], jump: Bool[np.ndarray, "n"]
+) -> Float[np.ndarray, "n 3"]:
+    """The path in which each jump is a step equal to the one before it, and zero at the start."""
+    steps = poses.between(path[:-1], path[1:])
+    for k in np.flatnonzero(jump[1:]):
+        steps[k] = steps[k - 1] if k else 0.0
+    return poses.chain(path[0], steps)
+
+
 def step_sizes(path: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
     """Distance and absolute turn of the step to each pose from the previous one; first zero."""
     step = np.zeros((len(path), 3))
@@ -64,9 +74,10 @@ def step_sizes(path: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
 
 def _usual(speed: Float[np.ndarray, "n"], possible: float) -> float:
     """The 95 % quantile of the speeds of steps with motion, without impossible ones if these are
-    few; of fewer than `_MIN_STEPS`, zero with a limit, infinite without one."""
+    few. Of fewer than `_MIN_STEPS` zero in a log at rest, whose limit then counts alone; else ∞."""
     moving = speed[speed > 1e-9]
     if len(moving) < _MIN_STEPS:
-        return 0.0 if np.isfinite(possible) else np.inf
+        at_rest = len(speed) >= 4 * _MIN_STEPS and np.isfinite(possible)
+        return 0.0 if at_rest else np.inf
     slow = moving[moving <= possible]
     return float(np.quantile(slow if 2 * len(slow) >= len(moving) else moving, 0.95))

@@ -1,5 +1,7 @@
 """ROS bags: what is read of each message, dropped and counted, refused; the same log in every format."""
 
+import tempfile
+
 import bags
 import broken
 import numpy as np
@@ -28,7 +30,8 @@ ODOMETRY = [each for each in DRIVE if each.topic == "/odom"]
 
 
 def read(folder, messages, form="db3", *, empty=(), **options):
-    return datasets.rosbag(bags.write(folder, messages, form, empty=empty), **options)
+    into = tempfile.mkdtemp(dir=folder)
+    return datasets.rosbag(bags.write(into, messages, form, empty=empty), **options)
 
 
 def matrix(pose):
@@ -233,6 +236,235 @@ def test_other_topics_are_counted_and_one_of_several_lasers_is_read(tmp_path):
     assert (log.laser, log.beams.range.shape) == ("/rear", (5, 2))
     assert log.dropped == {"messages /filtered": 8, "messages /scan": 8}
     np.testing.assert_array_equal(datasets.rosbag(bag, "/scan", "/filtered").raw, np.ones((8, 3)))
+
+
+def test_the_first_echo_of_each_beam_is_its_range(tmp_path):
+    many = [bags.echoes(t, [[1.5, 2.0], [], [np.inf], [3.0 + k]]) for k, t in enumerate(TIMES)]
+    for form in ("bag", "mcap"):
+        log = read(tmp_path, [DRIVE[0], *ODOMETRY, *many], form)
+        assert log.laser == "/echoes"
+        np.testing.assert_array_equal(log.beams.range[2], [1.5, 0, 30, 5])
+        np.testing.assert_array_equal(log.beams.valid[2], [1, 0, 1, 1])
+    # A LaserScan goes first; the other is read by its name.
+    both = bags.write(tmp_path, [*DRIVE, *many], name="both")
+    log = datasets.rosbag(both)
+    assert (log.laser, log.dropped["messages /echoes"]) == ("/scan", 8)
+    assert datasets.rosbag(both, "/echoes").beams.range.shape == (8, 4)
+    two = [*many, *(each._replace(topic="/low") for each in many)]
+    with pytest.raises(
+        ValueError, match=r"one topic of sensor_msgs/MultiEchoLaserScan, got /echoes"
+    ):
+        read(tmp_path, two)
+
+
+def split(messages, parts):
+    """The messages of each part of a recording, by its time."""
+    ends = np.quantile([each.recorded for each in messages], np.arange(1, parts) / parts)
+    part = [np.searchsorted(ends, each.recorded) for each in messages]
+    return [[m for m, k in zip(messages, part, strict=True) if k == n] for n in range(parts)]
+
+
+@pytest.mark.parametrize("form", ["bag", "mcap", "db3"])
+@pytest.mark.parametrize("name", ["drive_{}", "run_2024-05-01-12-0{0}-00_{0}"])
+def test_parts_of_a_recording_are_one_log(tmp_path, form, name):
+    whole = datasets.rosbag(bags.write(tmp_path, DRIVE, form, name="whole"))
+    folder = tmp_path / "split"
+    folder.mkdir()
+    for k, messages in enumerate(split(DRIVE, 3)):
+        path = bags.write(tmp_path, messages, form, name=name.format(k))
+        file = path if form == "bag" else next(path.glob(f"*.{form}"))
+        file.rename(folder / f"{name.format(k)}.{form}")
+    log = datasets.rosbag(folder)
+    for field in ("time", "raw", "odometry", "mount", "row", "odometry_known"):
+        np.testing.assert_array_equal(getattr(log, field), getattr(whole, field))
+    np.testing.assert_array_equal(log.beams.range, whole.beams.range)
+    files = [f"{name.format(k)}.{form}" for k in range(3)]
+    assert log.corrections == (f"one recording of 3 files, {', '.join(files)}",)
+    assert datasets.rosbag_contents(folder).notes == log.corrections
+    alone = datasets.rosbag(folder / files[2])
+    assert alone.corrections[0] == (
+        f"{files[2]} is read alone; beside it may be other parts of the recording, which the folder "
+        f"reads as one: {files[0]}, {files[1]}"
+    )
+    (folder / files[1]).unlink()
+    assert "parts that are missing in the folder: 1" in datasets.rosbag(folder).corrections
+
+
+def test_bags_that_are_no_parts_of_one_recording_are_refused(tmp_path):
+    later = [each._replace(recorded=each.recorded + 3600 * SECOND) for each in SCANS]
+    for name, messages in (("run_1", SCANS), ("run_2", later)):
+        bags.write(tmp_path, messages, name=name)
+    with pytest.raises(
+        ValueError, match=r"run_2.bag begins 3,598.2 s after run_1.bag ends; name one"
+    ):
+        datasets.rosbag(tmp_path)
+    bags.write(tmp_path, SCANS, name="other")
+    with pytest.raises(ValueError, match=r"NAME_1.bag, … of a recording, got other.bag, run_1.bag"):
+        datasets.rosbag(tmp_path)
+
+
+def rolled(roll, pitch, heading=0.0):
+    """The quaternion (x, y, z, w) of the rotations by heading, pitch and roll."""
+    (a, b, c), (d, e, f) = (
+        np.cos([roll / 2, pitch / 2, heading / 2]),
+        np.sin([roll / 2, pitch / 2, heading / 2]),
+    )
+    return (
+        d * b * c - a * e * f,
+        a * e * c + d * b * f,
+        a * b * f - d * e * c,
+        a * b * c + d * e * f,
+    )
+
+
+@pytest.mark.parametrize("upside_down", [False, True])
+def test_roll_and_pitch_of_an_imu_leave_the_mount_in_the_plane(tmp_path, upside_down):
+    tilts = 0.015 * np.random.default_rng(2).uniform(-1, 1, (8, 2))
+    turned = UPSIDE_DOWN if upside_down else quaternion(0.4)
+    imu = [
+        transform(t, "base_footprint", "base_link", (0, 0, 0.1), rolled(*tilt))
+        for t, tilt in zip(TIMES, tilts, strict=True)
+    ]
+    laser = fixed("base_link", "laser", (0.15, 0.1, 0.2), turned)._replace(recorded=TIMES[0])
+    moved = [
+        odometry(m.recorded, p, base="base_footprint") for m, p in zip(ODOMETRY, PATH, strict=True)
+    ]
+    log = read(tmp_path, [*SCANS, *moved, laser, *imu])
+    np.testing.assert_allclose(log.mount[:2], [0.15, 0.1], atol=0.004)
+    np.testing.assert_allclose(log.mount[2], 0 if upside_down else 0.4, atol=3e-4)
+    assert log.corrections[0].startswith("the transform from base_footprint to base_link changes: ")
+    assert ("the laser is upside down" in " ".join(log.corrections)) == upside_down
+    # A laser that turns on the robot is none.
+    turning = [each._replace(make=transform(each.recorded, "base_footprint", "base_link", (0, 0, 0.1), rolled(0, 0, 0.02 * k)).make) for k, each in enumerate(imu)]  # fmt: skip
+    with pytest.raises(
+        ValueError, match=r"from base_footprint to base_link changes by .* laser moves"
+    ):
+        read(tmp_path, [*SCANS, *moved, laser, *turning])
+    # Nor one that nods by 20°.
+    nods = [each._replace(make=transform(each.recorded, "base_footprint", "base_link", (0, 0, 0.1), rolled(0, 0.05 * k)).make) for k, each in enumerate(imu)]  # fmt: skip
+    with pytest.raises(ValueError, match=r"is tilted by .* expected at most 10°"):
+        read(tmp_path, [*SCANS, *moved, laser, *nods])
+
+
+def test_the_last_static_transform_counts(tmp_path):
+    again = fixed("base_link", "laser", (0.2, -0.05, 0.3), quaternion(0.6))
+    log = read(tmp_path, [*DRIVE, again._replace(recorded=TIMES[1])])
+    np.testing.assert_allclose(log.mount, [0.2, -0.05, 0.6], atol=1e-12)
+    assert log.corrections == (
+        "the static transform from base_link to laser was sent again, with a change of 0.05 m and "
+        "5.73°: the last one is used",
+    )
+    same = DRIVE[0]._replace(recorded=TIMES[1])
+    assert read(tmp_path, [*DRIVE, same]).corrections == ()
+
+
+def named(parent, child):
+    """The drive with odometry and mount in frames of these names, and a wheel that turns."""
+    moved = [
+        transform(m.recorded, parent, child, (*pose[:2], 0), quaternion(pose[2]))
+        for m, pose in zip(ODOMETRY, PATH, strict=True)
+    ]
+    wheel = [
+        transform(t, child, "wheel", (0, 0.2, 0), rolled(0, 0.3 * k)) for k, t in enumerate(TIMES)
+    ]
+    laser = fixed(child, "laser", (0.2, -0.1, 0.3), quaternion(0.5))._replace(recorded=TIMES[0])
+    return [*SCANS, laser, *moved, *wheel]
+
+
+@pytest.mark.parametrize(
+    ("parent", "child"),
+    [
+        ("summit_odom", "summit_base_footprint"),
+        ("odom_comb", "base_footprint"),
+        ("odom", "chassis"),
+    ],
+)
+def test_the_frames_that_move_are_the_odometry(tmp_path, parent, child):
+    messages = named(parent, child)
+    bag = bags.write(tmp_path, messages)
+    log, plain = datasets.rosbag(bag), datasets.rosbag(bags.write(tmp_path, DRIVE, name="plain"))
+    np.testing.assert_allclose(log.raw, plain.raw, atol=1e-12)
+    np.testing.assert_allclose(log.mount, plain.mount, atol=1e-12)
+    assert log.corrections == (
+        f"odometry is the transform from {parent} to {child}, the only frames of /tf that move in "
+        "the plane",
+    )
+    found = datasets.rosbag_contents(bag)
+    assert found.odometry == {f"{parent}:{child}": 5}
+    assert found.lasers["/scan"] == f"(0.2, -0.1, 28.65°) on {child}"
+    assert found.frames == {
+        f"{parent}:{child}": "5 transforms, moves",
+        f"{child}:laser": "1 transforms, static",
+        f"{child}:wheel": "8 transforms, turns",
+    }
+    # A map that moves, too: one of the two is chosen.
+    above = [
+        transform(t, "map", parent, (0.1 * k, 0, 0), quaternion(0)) for k, t in enumerate(TIMES)
+    ]
+    with pytest.raises(
+        ValueError, match=rf"got map:{parent} \(8\), {parent}:{child} \(5\); choose"
+    ):
+        read(tmp_path, [*messages, *above])
+    chosen = read(tmp_path, [*messages, *above], odometry=f"{parent}:{child}")
+    np.testing.assert_allclose(chosen.raw, plain.raw, atol=1e-12)
+
+
+def test_joints_are_no_odometry(tmp_path):
+    """A wheel, a lift, and a laser that is not below what moves."""
+    turns = [
+        transform(t, "base_link", "wheel", (0, 0, 0), quaternion(0.1 * k))
+        for k, t in enumerate(TIMES)
+    ]
+    lift = [
+        transform(t, "base_link", "lift", (0.1 * k, 0, 0), quaternion(0))
+        for k, t in enumerate(TIMES)
+    ]
+    log = read(tmp_path, [*SCANS, DRIVE[0], *turns, *lift])
+    assert not log.odometry_known[1:].any()
+    assert log.corrections == (
+        "no odometry is read: raw odometry stands still, and laser odometry takes its place; frames "
+        "of /tf that move: base_link:lift (8), base_link:wheel (8), of which --odometry "
+        "base_link:lift reads one",
+    )
+
+
+def steadily(times):
+    """Odometry of 6 cm and 3° in 0.2 s, 20 messages a second."""
+    path = poses.chain(np.array([0.0, -1.2, 0.0]), np.tile([0.015, 0.0, 0.0125], (times - 1, 1)))
+    stamps = [START + k * SECOND // 20 for k in range(times)]
+    return stamps, path
+
+
+@pytest.mark.parametrize("to", [(0.0, 0.0, 0.0), (2.0, -1.0, 1.0)])
+def test_nothing_is_interpolated_over_a_jump_of_the_odometry(tmp_path, to):
+    """A scan between two messages has the pose of the first, and the step over the jump is unknown."""
+    stamps, path = steadily(200)
+    path[100:] = poses.compose(np.array(to), poses.between(path[100], path[100:]))
+    middle = stamps[1::4]
+    scans = [scan(t + SECOND // 40, RANGES) for t in middle]
+    log = read(tmp_path, [*scans, *map(odometry, stamps, path)])
+    k = next(k for k, t in enumerate(middle) if t >= stamps[100])
+    np.testing.assert_array_equal(np.flatnonzero(~log.odometry_known), [k])
+    assert log.corrections[-1].startswith("jumps of /odom, which are no motion, so that the steps")
+    assert ": 1, first by " in log.corrections[-1]
+    at_jump = [scan(stamps[99] + SECOND // 40, RANGES)]
+    log = read(tmp_path, [*scans, *at_jump, *map(odometry, stamps, path)])
+    np.testing.assert_allclose(log.raw[k], path[99], atol=1e-12)
+    np.testing.assert_array_equal(np.flatnonzero(~log.odometry_known), [k + 1])
+
+
+def test_nothing_is_interpolated_over_a_long_gap_of_the_odometry(tmp_path):
+    stamps, path = steadily(200)
+    kept = [k for k in range(200) if not 50 <= k < 110]
+    scans = [scan(t, RANGES) for t in stamps[::4]]
+    log = read(tmp_path, [*scans, *(odometry(stamps[k], path[k]) for k in kept)])
+    unknown = np.arange(52, 113, 4) // 4
+    np.testing.assert_array_equal(np.flatnonzero(~log.odometry_known), unknown)
+    np.testing.assert_allclose(log.raw[13:28], np.tile(path[49], (15, 1)), atol=1e-12)
+    assert log.corrections[-1] == (
+        "scans between two messages of /odom that are more than 1 s and 10 median intervals apart, "
+        "with unknown steps: 15"
+    )
 
 
 def test_ranges_of_lasers_without_a_maximum(tmp_path):

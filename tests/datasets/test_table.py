@@ -598,3 +598,21 @@ def test_a_relative_error_by_hand(tmp_path):
     errors = evaluate(data, path, empty).errors
     np.testing.assert_allclose(errors["RPE over 1 s [m]"], 0.3 / np.sqrt(2))
     assert "pose NEES, mean (3 is honest)" not in errors
+
+
+def test_a_jump_of_the_odometry_is_no_motion(tmp_path):
+    """Poses begin again at zero, at line 32 of the file."""
+    t = 0.2 * np.arange(50)
+    path = np.column_stack([5 + 0.1 * np.arange(50), 0 * t, 0 * t])
+    path[30:] -= path[30]
+    rows = "".join(
+        f"{a:.1f},{x:.6f},{y:.6f},{h:.6f}\n" for a, (x, y, h) in zip(t, path, strict=True)
+    )
+    files = {
+        "odometry.csv": "t [s],x [m],y [m],theta [rad]\n" + rows,
+        "measurements.csv": "t [s],tag,range [m],bearing [rad]\n1.0,7,2,0.25\n",
+    }
+    data = datasets.table(write(tmp_path, files))
+    np.testing.assert_allclose(data.log.control[1:, :3], np.tile([0.1, 0, 0], (49, 1)), atol=1e-6)
+    told = [text for text in data.assumed if "a jump of the odometry" in text]
+    assert len(told) == 1 and "odometry.csv:32" in told[0] and "by 7.9 m and 0°" in told[0]

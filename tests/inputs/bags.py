@@ -72,6 +72,20 @@ def scan(stamp, ranges, topic="/scan", *, recorded=None, **changed):
     )
 
 
+def echoes(stamp, beams, topic="/echoes", *, frame="laser"):
+    """A MultiEchoLaserScan: beams of several ranges each, nearest first."""
+
+    def make(types):
+        of = types("sensor_msgs/msg/LaserEcho")
+        values = [of(np.asarray(beam, np.float32)) for beam in beams]
+        last = -1.5 + 0.5 * (len(beams) - 1)
+        return types("sensor_msgs/msg/MultiEchoLaserScan")(
+            header(types, stamp, frame), -1.5, last, 0.5, 0.0, 0.1, 0.1, 30.0, values, []
+        )
+
+    return Message(topic, "sensor_msgs/msg/MultiEchoLaserScan", stamp, make)
+
+
 def quaternion(heading):
     """(x, y, z, w)"""
     return 0.0, 0.0, np.sin(heading / 2), np.cos(heading / 2)

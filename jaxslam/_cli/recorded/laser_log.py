@@ -60,8 +60,8 @@ def add_options(parser: argparse.ArgumentParser, work: Work, *, map_is_made: boo
     parser.add_argument(
         "path",
         metavar="FILE",
-        help="the log: a file of CARMEN, or a ROS bag (.bag, .mcap, .db3, the folder of ROS 2, or a "
-        "folder with the parts NAME_0.bag, NAME_1.bag, … of a recording)",
+        help="the log: a file of CARMEN, or a ROS bag (.bag, .mcap, .db3, the folder of ROS 2, or "
+        "a folder with the parts NAME_0.bag, NAME_1.bag, … of a recording)",
     )
     parser.add_argument(
         "--dataset",
@@ -108,7 +108,7 @@ def add_options(parser: argparse.ArgumentParser, work: Work, *, map_is_made: boo
         "--odometry",
         metavar="FILE",
         help="raw odometry, lines t x y heading [s, m, m, rad], in place of the log's; of a bag "
-        "the topic, or two frames odom:base_link (default: the only one, else the frames that move)",
+        "the topic, or two frames odom:base_link (default: the only one, else frames that move)",
     )
     parser.add_argument(
         "--mount",

@@ -25,6 +25,7 @@ from jaxslam.datasets._landmark_logs.table_settings import (
     TableSettings,
 )
 from jaxslam.datasets._lines import DIGITS, LARGEST, none_left, read_bytes, stored
+from jaxslam.math._odometry_jumps import odometry_jumps, step_sizes, without_jumps
 
 MISSING = frozenset(
     {"", "nan", "-nan", "<na>", "na", "n/a", "#n/a", "#na", "null", "none"}
@@ -356,6 +357,10 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
     moved = (TIME, *tables.odometry_columns(motion.controls, odometry_file.header))
     measured = tables.measurement_columns(sensor.measurements, sensor.landmark)
     odometry = odometry_file.table(moved, f"of the motion model {motion.name}")
+    jumps, path = np.zeros(len(clock), bool), np.zeros((0, 3))
+    if set(POSE) <= set(odometry.columns):
+        path = odometry.values(POSE)
+        jumps = odometry_jumps(path, clock)
     seen = seen_file.table(measured, f"of the sensor {sensor.name}")
     seen.columns[TIME] = seen.columns[TIME] - delay
     max_range, spacing = settings.max_range(), settings.spacing()
@@ -365,11 +370,21 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
         for file, wanted in ((odometry_file, moved), (seen_file, measured))
         for column in file.unused(wanted)
     ]
+    if moved[1:] == POSE and are_headings_in_degrees(odometry.values(POSE)):
+        notes.append(f"{odometry_file.path.name}: {_DEGREES_OF_PATH}")
+    if jumps.any():
+        k = int(np.argmax(jumps))
+        far, turn = step_sizes(path)[k]
+        notes.append(
+            f"{odometry.at(k, POSE[0])}: a jump of the odometry by {far:.3g} m and "
+            f"{np.rad2deg(turn):.3g}° in {clock[k] - clock[k - 1]:.3g} s is no motion, "
+            f"{int(jumps.sum()):,} in all: the step before it takes its place"
+        )
+        for name, column in zip(POSE, without_jumps(path, jumps).T, strict=True):
+            odometry.columns[name] = column
     if gap := _longest_gap(odometry):
         of_poses = "no pose is interpolated over" if moved[1:] == POSE else ""
         notes.append(f"{gap}; {of_poses or 'the odometry is taken to hold over'} it")
-    if moved[1:] == POSE and are_headings_in_degrees(odometry.values(POSE)):
-        notes.append(f"{odometry_file.path.name}: {_DEGREES_OF_PATH}")
     notes += [note for file in (odometry, seen) if (note := _beyond_a_turn(file))]
     if "range [m]" in seen.columns and not np.isfinite(max_range):
         ranges = seen.columns["range [m]"]

@@ -48,8 +48,8 @@ class FramePair(NamedTuple):
 
     parent: str
     child: str
-    count: int
-    """number of transforms"""
+    number: int
+    """of transforms"""
     static: bool
     """whether they are of `/tf_static`"""
     moves: bool
@@ -248,7 +248,8 @@ def laser_mount(
         corrections.append(
             f"no transform from {' or '.join(tried)} to the laser's frame {laser!r}: the laser is "
             "taken to be at the robot's centre, looking ahead"
-            + f"; its frame is below {above[-1]!r}" * (len(above) > 1)
+            + f"; its frame is below {above[-1]!r}"
+            * (len(above) > 1)
         )
         return None
     pose, changing = frames.pose(base, laser, corrections)
@@ -277,8 +278,8 @@ def laser_mount(
     if np.ptp(tilts) > _EQUAL:
         corrections.append(
             f"the transform {changing} changes: the laser is tilted by up to "
-            f"{np.rad2deg(most):.3g}°, its mount in the plane is constant to {round(far, 4):g} m and "
-            f"{round(np.rad2deg(turn), 3):g}°, and its ranges are taken for level ones"
+            f"{np.rad2deg(most):.3g}°, its mount in the plane is constant to {round(far, 4):g} m "
+            f"and {round(np.rad2deg(turn), 3):g}°, and its ranges are taken for level ones"
         )
     elif tilt > TILTED:
         corrections.append(
@@ -339,7 +340,7 @@ def odometry_pairs(
 
 def pairs_text(pairs: Sequence[FramePair]) -> str:
     """Pairs of frames with the numbers of their transforms."""
-    return ", ".join(f"{each.name} ({each.count:,})" for each in pairs)
+    return ", ".join(f"{each.name} ({each.number:,})" for each in pairs)
 
 
 def is_named_odometry(pair: FramePair) -> bool:

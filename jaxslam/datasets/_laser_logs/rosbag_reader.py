@@ -191,12 +191,12 @@ def rosbag_contents(path: str | Path) -> BagContents:
         if len(wheels) == 1:
             base = frame_name(bag.first(wheels[0].name).child_frame_id)
         lasers = {}
-        odometry = {pair.name: pair.count for pair in pairs if is_named_odometry(pair)}
+        odometry = {pair.name: pair.number for pair in pairs if is_named_odometry(pair)}
         for topic in bag.topics:
             if topic.type in (LASER_SCAN, MULTI_ECHO) and topic.count:
                 frame = frame_name(bag.first(topic.name).header.frame_id)
                 moving, _ = odometry_pairs(pairs, frames, frame)
-                odometry |= {pair.name: pair.count for pair in moving}
+                odometry |= {pair.name: pair.number for pair in moving}
                 notes: list[str] = []
                 try:
                     placed = laser_mount(
@@ -208,7 +208,7 @@ def rosbag_contents(path: str | Path) -> BagContents:
         listed: dict[str, str] = {}
         for pair in pairs:
             how = "static" if pair.static else "moves" if pair.moves else "turns" * pair.turns
-            text = f"{pair.count:,} transforms" + f", {how}" * bool(how)
+            text = f"{pair.number:,} transforms" + f", {how}" * bool(how)
             listed[pair.name] = "; ".join(filter(None, [listed.get(pair.name), text]))
         return BagContents(
             bag.topics, bag.start, bag.end, lasers, odometry, listed, tuple(bag.notes)

@@ -36,8 +36,8 @@ class Scans(NamedTuple):
     usable: Bool[np.ndarray, "K"]
     """enough points to match"""
     changed: Int[np.ndarray, "K"]
-    """scans back to the nearest of the last eight from which a scan differs, 0 if from none, as of a
-    robot at rest"""
+    """scans back to the nearest of the last eight from which a scan differs; 0 if from none, as of
+    a robot at rest"""
 
 
 def check_laser_log(name: str, log: LogOfScans) -> None:

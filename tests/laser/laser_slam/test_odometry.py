@@ -9,6 +9,7 @@ from cases import swept
 from ring_of_rooms import SETTINGS, driven, errors, ranges_of
 
 from jaxslam import laser_slam
+from jaxslam.core.types import Beams
 from jaxslam.laser.laser_slam._odometry import log_odometry, tracking
 from jaxslam.laser.laser_slam._odometry.log_odometry import laser_odometry
 from jaxslam.laser.laser_slam._odometry.raw import FARTHEST, steps_of
@@ -16,6 +17,7 @@ from jaxslam.laser.laser_slam._odometry.reference import _seen_through
 from jaxslam.laser.laser_slam._scan_points import scans_of
 from jaxslam.laser.matching import Points
 from jaxslam.math import numpy_poses as poses
+from jaxslam.math._odometry_jumps import odometry_jumps, without_jumps
 
 COUNT = 40
 CORNERS = [6, 12, 18, 24, 30, 36]
@@ -132,6 +134,27 @@ def test_a_single_wrong_pose_of_raw_odometry_moves_no_other_scan(drive, k, wrong
     assert np.delete(position, k).max() < 0.2
     assert position[k] < 0.2 or found.doubted[k]
     assert nees(found, true, k) < 20
+
+
+ANEW = {
+    "to zero": lambda raw: poses.between(raw[0], raw),
+    "spike above the limit": lambda raw: poses.compose(raw[:1], np.array([2.1, 0.0, 0.0])),
+    "spike below the limit": lambda raw: poses.compose(raw[:1], np.array([1.5, 1.0, 3.0])),
+}
+
+
+@pytest.mark.parametrize("k", swept([10, 21, 27], 27))
+@pytest.mark.parametrize("how", swept(list(ANEW), "to zero", "spike above the limit"))
+def test_odometry_that_is_set_anew_moves_no_scan(drive, how, k):
+    true, log, _ = drive
+    raw = log.raw.copy()
+    new = ANEW[how](raw[k:])
+    raw[k : k + len(new)] = new
+    steps, found = solved(drive, raw)
+    position, heading = errors(found.poses, true)
+    assert position.max() < 0.2 and heading.max() < np.deg2rad(5)
+    assert steps.jump[k] or found.refuted[k] or found.doubted[k]
+    assert not (found.refuted & ~steps.odd).any()
 
 
 @pytest.mark.parametrize("first", swept([4, 15, 23, 33], 15))
@@ -340,10 +363,101 @@ def test_odometry_is_frozen_where_it_says_nothing_while_scans_change():
     np.testing.assert_array_equal(none.frozen, ~only(0))
 
 
+def turning(count=120):
+    """6 cm and 3° in 0.2 s, a circle of 1.2 m that begins off the pose zero."""
+    return poses.chain(np.array([0.0, -1.2, 0.0]), np.tile([0.06, 0.0, 0.05], (count - 1, 1)))
+
+
+CLOCK = 0.2 * np.arange(120)
+
+
+@pytest.mark.parametrize(
+    ("change", "jumps"),
+    [
+        (lambda path: path, []),
+        (lambda path: np.concatenate([path[:60], poses.between(path[60], path[60:])]), [60]),
+        (lambda path: np.concatenate([path[:60], poses.compose(poses.compose(path[60], np.array([0, 0, 1.5])), poses.between(path[60], path[60:]))]), [60]),
+        (lambda path: np.concatenate([path[:60], path[60:] + [1.0, 0.5, 0.0]]), [60]),
+        (lambda path: np.concatenate([path[:60], path[60:61] + [0, 2.0, 0.0], path[61:]]), [60, 61]),
+    ],
+)  # fmt: skip
+def test_steps_that_no_robot_makes(change, jumps):
+    path = change(turning())
+    np.testing.assert_array_equal(np.flatnonzero(odometry_jumps(path, CLOCK)), jumps)
+    # Without them only the steps over them are not those of the log.
+    rest = without_jumps(path, odometry_jumps(path, CLOCK))
+    np.testing.assert_allclose(steps(rest), steps(turning()), atol=1e-9)
+
+
+def test_a_return_to_zero_is_a_jump_at_any_rate():
+    """By its speed alone, a metre a second, it could be motion."""
+    path, time = turning(), 1.0 * np.arange(120)
+    away, back = path.copy(), path.copy()
+    back[30:] = poses.between(path[30], path[30:])
+    away[30:] = poses.compose(np.array([-1.0, 0.4, 1.0]), back[30:])
+    np.testing.assert_array_equal(np.flatnonzero(odometry_jumps(back, time)), [30])
+    assert not odometry_jumps(away, time).any()
+
+
+def test_fast_robots_and_rough_stamps_do_not_jump():
+    random = np.random.default_rng(5)
+    car = poses.chain(np.zeros(3), np.tile([3.0, 0.0, 0.02], (99, 1)))
+    assert not odometry_jumps(car, 0.2 * np.arange(100)).any()  # 15 m/s
+    # A turn on the spot at 170°/s after a straight drive with little noise.
+    step = np.array([[0.1, 0.0, 0.0]] * 95 + [[0.0, 0.0, np.deg2rad(34)]] * 4)
+    step[:95, 2] = 0.005 * random.normal(size=95)
+    path = poses.chain(np.zeros(3), step)
+    assert not odometry_jumps(path, 0.2 * np.arange(100)).any()
+    # Messages that come in bursts, and a loop that ends at the pose zero.
+    burst = np.repeat(0.8 * np.arange(25), 4) + 1e-3 * np.tile(np.arange(4), 25)
+    ring = poses.chain(np.zeros(3), np.tile([0.4, 0.0, 2 * np.pi / 50], (100, 1)))
+    assert not odometry_jumps(ring[:100], burst).any()
+    assert not odometry_jumps(ring, np.arange(101.0)).any()
+    for time in (None, np.zeros(101)):
+        assert not odometry_jumps(ring, time).any()
+
+
+def test_a_jump_that_a_reader_found_is_one_where_the_step_is_too_long():
+    """Two messages apart by a jump: the scan between has the pose of the first."""
+    raw = path()
+    raw[30:] = poses.compose(
+        poses.compose(raw[30], np.array([1.0, 0, 0])), poses.between(raw[30], raw[30:])
+    )
+    known = ~only(30)
+    found = steps_of(raw, SETTINGS, TIME, None, known)
+    np.testing.assert_array_equal(found.jump, only(30))
+    assert not found.frozen.any()
+    np.testing.assert_array_equal(steps_of(path(), SETTINGS, TIME, None, known).frozen, only(30))
+
+
+def test_frozen_odometry_of_a_slow_robot_is_counted():
+    """No scan differs from the one before it, but from those four back."""
+    raw = path()
+    raw[20:40] = raw[19]
+    changed = np.where(np.arange(LENGTH) >= 4, 4, 0)
+    found = steps_of(raw, SETTINGS, TIME, changed)
+    np.testing.assert_array_equal(found.frozen, np.isin(np.arange(LENGTH), np.arange(20, 40)))
+    assert not steps_of(raw, SETTINGS, TIME, np.zeros(LENGTH, int)).frozen.any()
+
+
+def test_scans_of_a_slow_robot_differ_from_those_some_back():
+    angles = np.linspace(-np.pi, np.pi, 90, endpoint=False)
+    true = poses.chain(np.array([-1.0, 0.0, 0.0]), np.tile([0.05, 0.0, 0.0], (19, 1)))
+    true = np.concatenate([np.repeat(true[:1], 10, axis=0), true])
+    ranges = np.array([ranges_of(pose, angles, WALLS) for pose in true])
+    beams = Beams(ranges, np.broadcast_to(angles, ranges.shape), np.ones(ranges.shape, bool))
+    log = laser_slam.ScanLog(np.arange(30.0), beams, 0 * true, 8.0)
+    changed = scans_of(log, SETTINGS).changed
+    assert not changed[1:10].any() and (changed[20:] > 1).all() and changed.max() <= 8
+    frozen = steps_of(0 * true, SETTINGS, log.time, changed).frozen
+    assert frozen[11:].all() and not frozen[:7].any()
+
+
 def test_a_jump_is_no_step_and_may_lead_anywhere():
     raw = path()
-    raw[30:] += [40.0, -30.0, 0.0]
+    raw[30:] += [3.2, -2.0, 0.0]
     found = steps_of(raw, SETTINGS, TIME, np.ones(LENGTH, bool))
+    assert not found.reset.any()
     np.testing.assert_array_equal(found.jump, only(30))
     np.testing.assert_array_equal(found.unknown, only(30))
     assert not found.frozen.any() and not found.lags.any()

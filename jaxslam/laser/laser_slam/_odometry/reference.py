@@ -61,7 +61,7 @@ class ScanMatch(NamedTuple):
     cov: Float[np.ndarray, "3 3"]
     """of the end of the pose"""
     inliers: float
-    """share of the points that lie on walls"""
+    """share of the points that lie on walls; 0 where the pose is far off the search's window"""
     residual: float
     """[m] root mean square of their distances from these"""
     ambiguous: bool
@@ -72,7 +72,7 @@ class ScanMatch(NamedTuple):
 
 def search(
     distance: float, angle: float, turn: float, *, ambiguous: float | None = _AMBIGUOUS_SHARE
-) -> Matcher:
+) -> Correlative:
     """The search over a window of the reference's grid, [m] and [rad] to either side."""
     return Correlative(
         window=distance,
@@ -85,6 +85,10 @@ def search(
         apart=0.5,
     )
 
+
+_REFINED = 0.5, 0.35
+"""[m], [rad]: farthest from the window of its search that a match may end. Where few points are on
+walls, the iterations may lead metres off, to a place that looks alike."""
 
 # What the walls hardly determine is not held at the start, which is of a lattice: the covariance
 # tells it, and the prior bounds it.
@@ -119,7 +123,7 @@ def reference_of(
 
 
 def match(
-    matcher: Matcher,
+    matcher: Correlative,
     reference: Reference,
     scan: Points,
     guess: Float[np.ndarray, "3"],
@@ -151,6 +155,13 @@ def match(
     )
     pose, information = found[:3], found[3:12].reshape(3, 3)
     inliers, residual, ambiguous, through = found[12:]
+    off = poses.between(guess, pose)
+    lattice = np.sqrt(2) * matcher.window, matcher.turn_window  # its farthest corner
+    if (
+        np.hypot(off[0], off[1]) > lattice[0] + _REFINED[0]
+        or abs(off[2]) > lattice[1] + _REFINED[1]
+    ):
+        inliers = 0.0
     sigma = max(settings.sigma, residual) ** 2 * _CORRELATION
     cov = np.linalg.inv(end_covariances.semidefinite(information) / sigma + known)
     return ScanMatch(

@@ -18,7 +18,7 @@ from jaxslam.laser.laser_slam._odometry.reference import (
 )
 from jaxslam.laser.laser_slam._records import Settings
 from jaxslam.laser.laser_slam._scan_points import Scans
-from jaxslam.laser.matching import Matcher, Points
+from jaxslam.laser.matching import Correlative, Points
 from jaxslam.math import numpy_poses as poses
 
 NEAR = search(0.6, np.deg2rad(22.0), np.deg2rad(2.0), ambiguous=None)
@@ -241,7 +241,7 @@ def _matched(
 ) -> _Search:
     """The match of a scan about raw odometry, or over all that the robot can have reached."""
 
-    def by(matcher: Matcher, prior: np.ndarray) -> ScanMatch:
+    def by(matcher: Correlative, prior: np.ndarray) -> ScanMatch:
         return match(matcher, reference, points, guess, prior, NO_FLOOR, settings)
 
     least = _LEAST_INLIERS
@@ -308,8 +308,9 @@ def _reference_of_last(
 def place_unmatched(result: Odometry, scans: Scans, steps: Steps, settings: Settings) -> None:
     """Match the scans without a match with the keyframes around them, in place.
 
-    They are assumed midway between their neighbours, up to half the distance between these.
-    The poses of the others do not change.
+    They are assumed midway between their neighbours, up to half the distance between these. A match
+    that raw odometry contradicts must be as good as that of a loop, and is in doubt. The poses of
+    the others do not change.
     """
     keys = result.keyframe
     placed = result.matched.copy()
@@ -337,9 +338,15 @@ def place_unmatched(result: Odometry, scans: Scans, steps: Steps, settings: Sett
         fit = match(FAR, reference, points, guess, prior, NO_FLOOR, settings)
         if fit.inliers < _MIN_INLIERS - 0.1 or fit.through > _MAX_THROUGH or fit.ambiguous:
             continue
-        result.matched[scan] = True
+        by_raw, raw_cov = result.z[scan].copy(), result.cov[scan].copy()
+        contradicted = _contradicts(fit.pose, by_raw, raw_cov)
+        if contradicted and not _sure(fit, settings):
+            continue
+        result.matched[scan], result.doubted[scan] = True, contradicted
         result.inliers[scan], result.residual[scan] = fit.inliers, fit.residual
         result.z[scan], result.cov[scan], result.cov_if_right[scan] = fit.pose, fit.cov, fit.cov
+        if contradicted:
+            result.cov[scan] += _doubt(raw_cov, poses.between(fit.pose, by_raw))
         result.poses[scan] = poses.compose(path[base], fit.pose)
 
 
