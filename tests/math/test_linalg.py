@@ -186,6 +186,40 @@ def test_indefinite_and_non_finite_matrices_are_flagged(n):
     np.testing.assert_array_equal(flags, [True, False, False, False, False])
 
 
+def products(n, rank, terms, seed):
+    """H P Hᵀ of random H (n, terms) of a rank and random P, in random units; by NumPy."""
+    rng, count = np.random.default_rng(seed), 300
+    h = rng.normal(size=(count, n, rank)) @ rng.normal(size=(count, rank, terms))
+    h = h * 10.0 ** rng.uniform(-3, 3, size=(count, n, 1))
+    root = rng.normal(size=(count, terms, terms))
+    return h, root @ root.transpose(0, 2, 1)
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize(
+    ("n", "terms"), swept([(2, 3), (3, 5), (4, 30), (6, 8), (10, 30)], (3, 5), (4, 30), (10, 30))
+)
+def test_a_product_of_less_rank_is_singular_and_of_full_rank_regular(n, terms, dtype):
+    """With the rounding of all terms; by the entry on the diagonal alone a fifth is taken for regular.
+
+    Regular in float32 are those of condition below 1e3, scaled to a unit diagonal.
+    """
+    flag = jax.jit(jax.vmap(lambda a: linalg.cholesky(a)[1]))
+    loop = jax.jit(jax.vmap(lambda a: linalg.whitener_by_rows(a)[1]))
+    white = flag if n > 8 else jax.jit(jax.vmap(lambda a: linalg.whitener(a)[1]))
+    for rank in (n - 1, n):
+        for seed in (0, 1):
+            h, p = (x.astype(dtype) for x in products(n, rank, terms, seed))
+            s = h @ p @ h.transpose(0, 2, 1)
+            s = (s + s.transpose(0, 2, 1)) / 2
+            unit = 1 / np.sqrt(np.diagonal(s, axis1=1, axis2=2).astype(float))
+            least = np.linalg.eigvalsh(s * unit[:, :, None] * unit[:, None, :])[:, 0]
+            clear = least > 1e-3 if rank == n else np.ones(len(s), bool)
+            assert clear.sum() > 100
+            for flags in (flag(s), loop(s), white(s)):
+                assert (np.asarray(flags)[clear] == (rank == n)).mean() > 0.995
+
+
 @pytest.mark.parametrize("n", [1, 2, 4])
 def test_inverse_equals_numpy(n):
     a = np.random.default_rng(2).normal(size=(20, n, n))  # not symmetric

@@ -32,11 +32,16 @@ def whitener(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Arr
     factor = [[zero] * n for _ in range(n)]
     rows = [[zero] * n for _ in range(n)]
     positive = jnp.asarray(True)
+    ratios: list[jax.Array] = []  # s_k / p_k of `factors._sizes`
     for j in range(n):
-        pivot = matrix[j, j] - sum((factor[j][k] ** 2 for k in range(j)), zero)
-        good = pivot > tolerance * jnp.abs(matrix[j, j])
+        squares = [factor[j][k] ** 2 for k in range(j)]
+        pivot = matrix[j, j] - sum(squares, zero)
+        size = jnp.abs(matrix[j, j])
+        size = size + sum((s * q for s, q in zip(squares, ratios, strict=True)), zero)
+        good = pivot > tolerance * size
         positive = positive & good
         rows[j][j] = jnp.where(good, jax.lax.rsqrt(jnp.where(good, pivot, 1.0)), 0.0)
+        ratios.append(size * rows[j][j] ** 2)
         for k in range(j):
             rows[j][k] = -rows[j][j] * total(factor[j][i] * rows[i][k] for i in range(k, j))
         for i in range(j + 1, n):
@@ -67,17 +72,19 @@ def whitener_by_rows(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], 
     every = jnp.arange(n)
 
     def row(carry: PyTree, j: jax.Array) -> tuple[PyTree, PyTree]:
-        rest, ahead = carry
+        rest, ahead, size = carry
         pivot = rest[j, j]
-        good = pivot > tolerance * jnp.abs(matrix[j, j])
+        good = pivot > tolerance * size[j]
         scale = jnp.where(good, jax.lax.rsqrt(jnp.where(good, pivot, 1.0)), 0.0)
         below, scaled = jnp.where(every > j, rest[:, j] * scale, 0.0), ahead[j] * scale
         return (
             rest - below[:, None] * below[None, :],
             ahead - below[:, None] * scaled[None, :],
+            size + jax.lax.stop_gradient(below**2 * (size[j] * scale**2)),
         ), (scaled, good)
 
-    rows, good = jax.lax.scan(row, (matrix, jnp.eye(n, dtype=matrix.dtype)), every)[1]
+    eye, size = jnp.eye(n, dtype=matrix.dtype), jax.lax.stop_gradient(jnp.abs(jnp.diag(matrix)))
+    rows, good = jax.lax.scan(row, (matrix, eye, size), every)[1]
     return rows, good.all()
 
 
