@@ -90,8 +90,9 @@ COMMANDS = {
 def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit status.
 
-    0 on success, 1 for a wrong model or an optimization that did not converge, 2 on bad input, 130
-    if interrupted, 141 if the reader of the output has closed the pipe.
+    0 on success, 1 for a wrong model, an optimization that did not converge or a figure that could
+    not be drawn, 2 on bad input, 130 if interrupted, 141 if the reader of the output has closed the
+    pipe.
     """
     arguments = sys.argv[1:] if arguments is None else list(arguments)
     # Python's last collection would visit every object of JAX, which takes over half a second.
@@ -137,8 +138,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     except (ValueError, OSError) as error:
         print(f"jaxslam: {error}", file=sys.stderr)
         return USAGE_ERROR
-    except KeyboardInterrupt:
-        print("\njaxslam: interrupted; nothing was written", file=sys.stderr)
+    except KeyboardInterrupt as stop:
+        told = str(stop) if type(stop) is KeyboardInterrupt else ""  # by `write_results`
+        print(f"\njaxslam: interrupted; {told or 'nothing was written'}", file=sys.stderr)
         return INTERRUPTED
 
 

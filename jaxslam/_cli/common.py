@@ -2,12 +2,14 @@
 
 import argparse
 import contextlib
+import glob
 import json
+import sys
 import threading
 import time
-from collections.abc import Callable, Collection, Mapping
+from collections.abc import Callable, Collection, Mapping, Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, TypeVar
+from typing import TYPE_CHECKING, TypeAlias, TypeVar
 
 import jax
 
@@ -16,8 +18,9 @@ from jaxslam.consistency.campaign._pieces import cores
 from jaxslam.consistency.campaign._progress import Progress
 from jaxslam.core._names import meant
 from jaxslam.core._optional import loading
-from jaxslam.results._campaign_files import RESULT
-from jaxslam.results._files import Files, check_writable
+from jaxslam.results._campaign_files import FORMATS, RESULT
+from jaxslam.results._files import Files, check_writable, write_files
+from jaxslam.verify._user_errors import describe_error
 
 if TYPE_CHECKING:  # Matplotlib is slow to load
     from jaxslam.results.plot import Film
@@ -25,7 +28,7 @@ if TYPE_CHECKING:  # Matplotlib is slow to load
 _T = TypeVar("_T")
 
 FAILED = 1
-"""Exit status where models or filters are wrong, or runs are missing."""
+"""Exit status where models or filters are wrong, runs are missing, or a figure cannot be drawn."""
 INTERRUPTED = 130
 """Exit status after Ctrl-C."""
 
@@ -98,6 +101,35 @@ def check_out(folder: Path, name: str, *, draws: bool = True) -> None:
                 f"--out: {folder} holds the results of {other}: choose another folder for those of "
                 f"jaxslam {name}"
             )
+
+
+Drawings: TypeAlias = dict[str, Callable[[], Files]]
+"""Figures and films by name: functions that draw one, and return its files."""
+
+
+def write_results(
+    folder: Path, files: Files, drawings: Drawings, replaces: Sequence[str] = ()
+) -> int:
+    """Write the numbers, then draw and write each figure; returns the exit status.
+
+    Prints what was written. A figure that fails is named in one line, with the status `FAILED`;
+    nothing else is lost. Figures of an earlier command are deleted, as are files that `replaces`.
+    """
+    earlier = [f"{glob.escape(name)}.{kind}" for name in drawings for kind in FORMATS]
+    written = write_files(folder, files, replaces=(*replaces, *earlier))
+    status, failures = 0, []
+    for name, draw in drawings.items():
+        try:
+            written += write_files(folder, draw())
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(f"wrote {', '.join(map(str, written))}") from None
+        except Exception as error:
+            failures.append(f"jaxslam: {name} was not drawn: {describe_error(error)}")
+            status = FAILED
+    if written:
+        print("\nwrote " + ", ".join(map(str, written)))
+    print(*failures, sep="\n", end="\n" * bool(failures), file=sys.stderr)
+    return status
 
 
 def add_dtype(parser: argparse.ArgumentParser, of: str = "") -> None:

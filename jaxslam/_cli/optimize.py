@@ -15,6 +15,7 @@ from jaxslam._cli.common import (
     FILMS,
     SUMMARY,
     CompileClock,
+    Drawings,
     add_animate,
     add_dtype,
     add_out,
@@ -22,6 +23,7 @@ from jaxslam._cli.common import (
     film_files,
     pick,
     summary_table,
+    write_results,
 )
 from jaxslam.consistency.campaign._progress import Progress
 from jaxslam.core._numbers import check_count
@@ -33,7 +35,7 @@ from jaxslam.graphs._factor import Factor
 from jaxslam.graphs._graph import TRUSTED
 from jaxslam.graphs._solver.kernels import REGISTRY as KERNELS
 from jaxslam.graphs.starts import STARTS
-from jaxslam.results._files import Files, csv_text, json_number, json_text, versions, write_files
+from jaxslam.results._files import Files, csv_text, json_number, json_text, versions
 
 ERRORS = {
     "pose": (graphs.RelativePose(), "e = Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ) as (x, y, θ)"),
@@ -183,18 +185,22 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
     }
     print(summary_table({"": {key: as_text(value) for key, value in summary.items()}}))
     worst = _worst(found, squared, factors)
-    from jaxslam.results import plot  # matplotlib is slow to load
-    from jaxslam.results.plot._style import png
 
-    edges = sum(int(table.valid.sum()) for table in found.tables.values())
-    figure = plot.graph_figure(
-        start_graph,
-        found,
-        squared,
-        worst=WORST_ROWS,
-        subtitles=subtitles,
-        title=f"{Path(options.path).name}: {len(found.poses):,} poses, {edges:,} edges",
-    )
+    def draw() -> Files:
+        from jaxslam.results import plot  # matplotlib is slow to load
+        from jaxslam.results.plot._style import pictures
+
+        edges = sum(int(table.valid.sum()) for table in found.tables.values())
+        figure = plot.graph_figure(
+            start_graph,
+            found,
+            squared,
+            worst=WORST_ROWS,
+            subtitles=subtitles,
+            title=f"{Path(options.path).name}: {len(found.poses):,} poses, {edges:,} edges",
+        )
+        return {**pictures("graph", figure, ("png",))}
+
     files: Files = {
         SUMMARY: json_text(
             summary | {"worst residuals": worst, "versions": versions()},
@@ -203,16 +209,15 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
         "optimized.g2o": g2o.text_of(
             found._replace(fixed_pose=loaded.graph.fixed_pose, fixed_point=loaded.graph.fixed_point)
         ),
-        "graph.png": png(figure),
     }
+    drawings: Drawings = {"graph": draw}
     if options.animate:
-        files |= _film(options, start_graph, factors, kernels, solution)
+        drawings["film"] = lambda: _film(options, start_graph, factors, kernels, solution)
     if len(found.points):
         files["points.csv"] = _csv(("x", "y"), found.point_id, found.points, found.fixed_point)
-    written = write_files(options.out, files, replaces=(*FILMS, "points.csv"))
-    print("\nwrote " + ", ".join(str(path) for path in written))
+    status_of_files = write_results(options.out, files, drawings, (*FILMS, "points.csv"))
     if converged:
-        return 0
+        return status_of_files
     print(f"jaxslam: {status}{_advice(int(solution.status), tried)}", file=sys.stderr)
     return NOT_CONVERGED
 

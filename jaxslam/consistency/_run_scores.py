@@ -262,7 +262,7 @@ def _white(estimate: Estimate, info: Info) -> list[Array]:
 
     def place(kept: list[Array], at: tuple[list[Array], Array]) -> tuple[PyTree, None]:
         row, slot = at
-        mine = jnp.arange(count) == slot
+        mine = jnp.arange(count, dtype=slot.dtype) == slot
         return [jnp.where(mine, new, old) for new, old in zip(row, kept, strict=True)], None
 
     nothing = [jnp.zeros(count, white.dtype)] * len(rows)

@@ -34,7 +34,8 @@ def largest(*values: ArrayLike) -> float:
     The fifth root of the largest number of the dtype, 4e61 (float64) or 5e7 (float32): so a filter
     can form the products of two covariances.
     """
-    dtype = jnp.promote_types(jnp.result_type(*values), jnp.float32)
+    with jax.numpy_dtype_promotion("standard"):  # the user may have refused promotion: "strict"
+        dtype = jnp.promote_types(jnp.result_type(*values), jnp.float32)
     return float(float(jnp.finfo(dtype).max) ** 0.2)
 
 

@@ -160,7 +160,7 @@ def scatter(
         return joint
     # By slot: the index it is filled from.
     place, born = last_true_column(
-        granted[None, :] & (slot[None, :] == jnp.arange(capacity)[:, None])
+        granted[None, :] & (slot[None, :] == jnp.arange(capacity, dtype=slot.dtype)[:, None])
     )
 
     def of_slots(values: jax.Array) -> jax.Array:

@@ -74,7 +74,11 @@ def _whole(path: Path, words: Sequence[bytes]) -> list[int]:
 
 
 def _by_matplotlib(path: Path, data: bytes, form: str) -> NDArray[np.float64]:
-    import matplotlib.image  # slow to load, and most commands read no image
+    # Slow to load, and most commands read no image; `plot` loads it whatever the user's backend is.
+    import jaxslam.results.plot  # noqa: F401
+
+    # isort: split
+    import matplotlib.image
 
     try:
         image = np.asarray(matplotlib.image.imread(io.BytesIO(data), format=form))

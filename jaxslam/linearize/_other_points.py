@@ -158,7 +158,7 @@ class Observability(Linearizer):
         moved, by_pose, noise = first_order.motion_at(motion, here.pose, u, here.pose)
         arms = joint.landmarks - joint.pose[None, :2] - old.landmarks + old.robot[None]
         arms = jnp.where(joint.alive[:, None], arms, 0.0)
-        shift = arms.sum(axis=0) / (1 + joint.alive.sum())
+        shift = arms.sum(axis=0) / (1 + joint.alive.sum(dtype=arms.dtype))
         # Of numbers whose squares overflow, the EKF's point.
         shift = jnp.where(jnp.abs(shift) <= largest(shift), shift, 0.0)
         robot = old.robot + moved[:2] - joint.pose[:2] - shift

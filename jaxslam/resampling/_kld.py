@@ -78,6 +78,7 @@ def enough(
     """
     count = bins.shape[0]
     size = jnp.arange(1, count + 1)
-    fits = (size >= least) & (size >= kld_bound(occupied(bins), error, confidence))
+    bound = kld_bound(occupied(bins), error, confidence)
+    fits = (size >= least) & (size.astype(bound.dtype) >= bound)
     some = fits.any()
     return jnp.where(some, jnp.argmax(fits) + 1, count).astype(jnp.int32), ~some

@@ -69,7 +69,7 @@ def stratified(log_weights: Float[Array, "P"], key: Array) -> Int[Array, "P"]:
     weights = weights_of(log_weights)
     count = weights.shape[0]
     u = jax.random.uniform(key, (count,), weights.dtype)
-    return at_points(weights, (jnp.arange(count) + u) / count)
+    return at_points(weights, (jnp.arange(count, dtype=u.dtype) + u) / count)
 
 
 def systematic(log_weights: Float[Array, "P"], key: Array) -> Int[Array, "P"]:
@@ -88,7 +88,7 @@ def systematic(log_weights: Float[Array, "P"], key: Array) -> Int[Array, "P"]:
     weights = weights_of(log_weights)
     count = weights.shape[0]
     u = jax.random.uniform(key, (), weights.dtype)
-    return at_points(weights, (jnp.arange(count) + u) / count)
+    return at_points(weights, (jnp.arange(count, dtype=u.dtype) + u) / count)
 
 
 @record

@@ -68,7 +68,7 @@ def resampled_where(
     def survive(carried: tuple[_T, Array]) -> tuple[_T, Array]:
         particles, log_weights = carried
         chosen, after = survivors(resample, log_weights, key)
-        ancestor = jnp.where(due, chosen, jnp.arange(log_weights.shape[0]))
+        ancestor = jnp.where(due, chosen, jnp.arange(log_weights.shape[0], dtype=chosen.dtype))
         copies: _T = jax.tree.map(lambda leaf: leaf[ancestor], particles)
         return copies, jnp.where(due, after, log_weights)
 
@@ -95,4 +95,4 @@ def at_points(weights: Float[Array, "P"], points: Float[Array, "K"]) -> Int[Arra
     above = jnp.cumsum(weights)
     index = jnp.searchsorted(above, points * above[-1], side="right")
     last = weights.shape[0] - 1 - jnp.argmax((weights > 0)[::-1])
-    return jnp.minimum(index, last).astype(jnp.int32)
+    return jnp.minimum(index.astype(jnp.int32), last.astype(jnp.int32))

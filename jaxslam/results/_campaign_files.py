@@ -7,6 +7,7 @@ from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
+from warnings import warn
 
 from jaxslam.consistency._tally import Tally
 from jaxslam.consistency.campaign import Campaign
@@ -18,6 +19,7 @@ from jaxslam.core._numbers import is_number
 from jaxslam.results import _report as report
 from jaxslam.results import _store as store
 from jaxslam.results._files import Files, check_formats, check_writable, versions, write_files
+from jaxslam.verify._user_errors import describe_error
 
 if TYPE_CHECKING:  # Matplotlib is slow to load
     from jaxslam.results.plot import Figure
@@ -61,11 +63,15 @@ def save_campaign(
     overwrite: bool = False,
     command: str = "",
     seed: int | None = None,
+    tell: Callable[[str], object] = warn,
 ) -> list[Path]:
     """Write the files of a campaign's report, and return their paths; see `Campaign.save`.
 
+    The numbers are written before a figure is drawn, and one that fails is left out.
+
     Args:
         command, seed: those of the campaign, for the page and the JSON; "" and None if unknown.
+        tell: called with a line on a figure that could not be drawn.
     """
     formats = check_figure_formats("Campaign.save", figures)
     if not isinstance(folder, str | os.PathLike) or not str(folder).strip():
@@ -82,20 +88,33 @@ def save_campaign(
     from jaxslam.results import _page as page  # matplotlib is slow to load
     from jaxslam.results.plot._style import encode
 
-    drawn = {name: (caption, make()) for name, (caption, make) in drawings.items()}
-    drawn_once = cache(encode)  # the page and a file have the same picture
-    files: Files = {
-        PAGE: page.campaign_page(
-            campaign, command, seed, versions(), drawn, lambda figure: drawn_once(figure, "png")
-        ),
+    numbers: Files = {
         RESULT: report.as_json(campaign, command, seed),
         CURVES: report.as_csv(campaign),
         TABLE: report.table_csv(campaign),
     }
-    for name, (_, figure) in drawn.items():
-        files |= {f"{name}.{kind}": drawn_once(figure, kind) for kind in formats}
-    stale = () if _holds(folder / RESULT, files[RESULT]) else file_names(FORMATS)
-    return write_files(folder, files, replaces=stale)
+    stale = () if _holds(folder / RESULT, numbers[RESULT]) else file_names(FORMATS)
+    write_files(folder, numbers, replaces=stale)
+    drawn_once = cache(encode)  # the page and a file have the same picture
+    drawn: dict[str, tuple[str, Figure]] = {}
+    pictures: Files = {}
+    for name, (caption, make) in drawings.items():
+        try:
+            figure = make()
+            drawn_once(figure, "png")
+            files = {f"{name}.{kind}": drawn_once(figure, kind) for kind in formats}
+        except KeyboardInterrupt:
+            raise KeyboardInterrupt(f"{folder} has the numbers, and no figures") from None
+        except Exception as error:
+            tell(f"{name} was not drawn: {describe_error(error)}")
+        else:
+            drawn[name] = caption, figure
+            pictures |= files
+    html = page.campaign_page(
+        campaign, command, seed, versions(), drawn, lambda figure: drawn_once(figure, "png")
+    )
+    page_and_figures = write_files(folder, {PAGE: html, **pictures})
+    return [page_and_figures[0], *(folder / name for name in numbers), *page_and_figures[1:]]
 
 
 def load(folder: str | Path) -> Campaign:

@@ -25,7 +25,7 @@ QUICK = ["consistency", "--scenario", "circle", "--steps", "8", "--runs", "3"]
 
 def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys, monkeypatch, undrawn):
     out, filmed = tmp_path / "results", []
-    monkeypatch.setattr(cli.consistency, "_write_films", lambda *a: filmed.append(a))
+    monkeypatch.setattr(cli.consistency, "_write_films", lambda *a: filmed.append(a) or 0)
     asked = ["--filters", "dead_reckoning,localization", "--no-bound", "--seed", "4", "--animate"]
     shape = ["--block", "1", "--devices", "1"]
     assert cli.main([*QUICK, *asked, *shape, "--out", str(out)]) == 0
@@ -219,6 +219,57 @@ def test_the_module_runs_as_a_program_in_float32_and_imports_late_what_draws(tmp
     assert "The filters ran in float32: for float64" in said
     assert json.loads((tmp_path / "consistency.json").read_text())["dtype"] == "float32"
     assert (tmp_path / "nees.png").read_bytes().startswith(b"\x89PNG")
+
+
+WITH_ITS_FIGURE = """
+import hashlib, sys
+from jaxslam import plot
+figure, (axes,) = plot.panels_of(2, 1, 1)
+plot.titled(axes, "x")
+figure.savefig(sys.argv[1])
+"""
+
+
+def test_a_figure_is_drawn_where_the_users_backend_and_latex_are_missing(tmp_path):
+    (tmp_path / "matplotlibrc").write_text("text.usetex: True\nsavefig.dpi: 20\n")
+    without = {k: v for k, v in os.environ.items() if k not in ("MPLBACKEND", "MATPLOTLIBRC")}
+    settings = {"MPLBACKEND": "module://of_a.notebook", "MATPLOTLIBRC": str(tmp_path)}
+    for name, more in {"usual": {}, "other": settings}.items():
+        subprocess.run(
+            [sys.executable, "-W", "error", "-c", WITH_ITS_FIGURE, tmp_path / f"{name}.png"],
+            check=True,
+            env=without | more,
+        )
+    assert (tmp_path / "other.png").read_bytes() == (tmp_path / "usual.png").read_bytes()
+
+
+def test_numbers_are_written_before_figures_and_one_that_fails_is_named(tmp_path, capsys):
+    (tmp_path / "map.pdf").write_text("of an earlier command")
+    (tmp_path / "map.csv").write_text("earlier")
+
+    def fails():
+        assert (tmp_path / "map.csv").read_text() == "numbers"
+        raise RuntimeError("latex could not be found\nin a hundred lines")
+
+    drawings = {"map": fails, "graph": lambda: {"graph.png": b"drawn"}}
+    assert common.write_results(tmp_path, {"map.csv": "numbers"}, drawings) == common.FAILED
+    assert {path.name for path in tmp_path.iterdir()} == {"map.csv", "graph.png"}
+    printed = capsys.readouterr()
+    assert f"wrote {tmp_path / 'map.csv'}, {tmp_path / 'graph.png'}" in printed.out
+    assert printed.err.startswith("jaxslam: map was not drawn: ")
+    assert printed.err.endswith("RuntimeError: latex could not be found\n")
+
+
+def test_an_interrupt_while_a_figure_is_drawn_says_what_is_written(tmp_path, monkeypatch, capsys):
+    def interrupted():
+        raise KeyboardInterrupt
+
+    def command(options, _):
+        return common.write_results(options.out, {"a.csv": "1"}, {"map": interrupted})
+
+    monkeypatch.setattr(cli.verify, "verify_models", command)
+    assert cli.main(["verify", "--out", str(tmp_path)]) == common.INTERRUPTED
+    assert f"interrupted; wrote {tmp_path / 'a.csv'}" in capsys.readouterr().err
 
 
 def test_a_closed_pipe_ends_the_command_silently(tmp_path, monkeypatch, capfd):

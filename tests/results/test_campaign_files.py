@@ -9,6 +9,7 @@ import sys
 import types
 
 import broken
+import matplotlib
 import numpy as np
 import pytest
 from test_page import EVIL, GOOD, RUNS, STEPS, Reader, campaign, summary
@@ -22,6 +23,7 @@ from jaxslam.results.plot import _style
 from jaxslam.results.plot._style import encode
 
 FIGURES = {*campaign_files.FIGURES}
+NUMBERS = {"consistency.json", "consistency.csv", "measures.csv"}
 
 
 def run_zero():
@@ -137,9 +139,21 @@ def test_what_exists_is_not_overwritten_unasked_and_nothing_half_written_stays(
         return b""
 
     monkeypatch.setattr(_style, "encode", broken)
-    with pytest.raises(KeyboardInterrupt):
-        found.save(tmp_path / "new" / "er", figures=("svg",))
-    assert not (tmp_path / "new").exists()
+    with pytest.raises(KeyboardInterrupt, match="has the numbers, and no figures"):
+        found.save(tmp_path / "new", figures=("svg",))
+    assert {path.name for path in (tmp_path / "new").iterdir()} == NUMBERS
+
+
+def test_a_figure_that_fails_is_left_out_and_told(found, tmp_path, undrawn, monkeypatch):
+    def fails(*_, **__):
+        raise RuntimeError("no LaTeX\nin many lines")
+
+    monkeypatch.setattr(plot, "rmse_figure", fails)
+    with pytest.warns(UserWarning, match=r"^rmse was not drawn: .*RuntimeError: no LaTeX$"):
+        paths = found.save(tmp_path, "pdf")
+    assert {path.name for path in tmp_path.iterdir()} == {path.name for path in paths}
+    assert {path.stem for path in paths if path.suffix == ".pdf"} == FIGURES - {"rmse"}
+    assert {path.name for path in paths} > {*NUMBERS, "report.html"}
 
 
 def test_a_folder_that_cannot_be_used_is_refused_before_anything_is_drawn(
@@ -174,6 +188,33 @@ def test_a_figure_is_the_same_bytes_each_time(found):
     for kind in ("pdf", "svg"):
         first, again = (encode(plot.nees_figure(found), kind) for _ in range(2))
         assert first == again
+
+
+OTHER_SETTINGS = {
+    "text.usetex": True,
+    "font.family": "no such font",
+    "font.size": 30.0,
+    "axes.formatter.use_locale": True,
+    "axes.grid": True,
+    "lines.linewidth": 9.0,
+    "image.origin": "lower",
+    "legend.frameon": True,
+    "savefig.bbox": "tight",
+    "savefig.transparent": True,
+    "svg.hashsalt": "mine",
+}
+
+
+def test_a_figure_does_not_depend_on_the_users_settings_and_leaves_them(found):
+    def drawn():
+        map_figure = plot.map_figure(run_zero()[1], title="$x$ and 1.5")
+        return encode(plot.nees_figure(found), "svg"), encode(map_figure, "png")
+
+    usual = drawn()
+    with matplotlib.rc_context(OTHER_SETTINGS):
+        before = dict(matplotlib.rcParams)
+        assert drawn() == usual
+        assert dict(matplotlib.rcParams) == before
 
 
 def test_a_data_frame_has_a_row_for_each_run_of_each_filter(found, monkeypatch):

@@ -5,6 +5,7 @@ import shutil
 import subprocess
 
 import broken
+import matplotlib
 import numpy as np
 import pytest
 from matplotlib.animation import FFMpegWriter
@@ -28,6 +29,17 @@ def three():
         return lambda k: image.set_data(pictures[k])
 
     return plot.Film(plot.Scene(3, plot.Panel([colored], (0, 1), (0, 1))), width=2.0, fps=4)
+
+
+def test_a_film_does_not_depend_on_the_users_settings(three):
+    usual = three.to_jshtml()
+    with matplotlib.rc_context({"font.size": 30.0, "axes.grid": True, "image.origin": "lower"}):
+        other = plot.Film(three.scene, width=2.0, fps=4).to_jshtml()
+
+    def frames(page):
+        return re.findall(r"data:image/png;base64,[^\"]*", page)
+
+    assert len(frames(usual)) == 3 and frames(other) == frames(usual)
 
 
 # --- steps --------------------------------------------------------------------------------------

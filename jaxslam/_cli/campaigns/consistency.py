@@ -21,7 +21,15 @@ from jaxslam._cli.campaigns.campaign import (
     spec_of,
 )
 from jaxslam._cli.campaigns.engines import engine
-from jaxslam._cli.common import FAILED, INTERRUPTED, OUT, add_animate, add_figures, film_files
+from jaxslam._cli.common import (
+    FAILED,
+    INTERRUPTED,
+    OUT,
+    add_animate,
+    add_figures,
+    film_files,
+    write_results,
+)
 from jaxslam._cli.user_objects import UserObjects
 from jaxslam.consistency._verdict import is_faulty
 from jaxslam.consistency.campaign import Campaign, Incomplete, Interrupted, monte_carlo
@@ -29,7 +37,7 @@ from jaxslam.consistency.campaign._candidates import estimator_of, fitting_block
 from jaxslam.core.protocols import Candidate
 from jaxslam.results import _campaign_files as campaign_files
 from jaxslam.results._campaign_files import FORMATS
-from jaxslam.results._files import Json, write_files
+from jaxslam.results._files import Files, Json
 from jaxslam.simulation._worlds import World, run_keys, world_of_run
 from jaxslam.simulation.scenarios import SCENARIOS
 
@@ -167,9 +175,9 @@ def run_campaign(options: argparse.Namespace, command: str) -> int:
     else:
         if keep.set_aside:  # some runs were computed again
             earlier = None
-        _write(spec, scenario, filters, campaign, earlier, command)
-        if any(is_faulty(summary.counts) for summary in campaign.filters.values()):
-            return FAILED
+        status = _write(spec, scenario, filters, campaign, earlier, command)
+        is_wrong = any(is_faulty(summary.counts) for summary in campaign.filters.values())
+        return FAILED if is_wrong else status
     return 0
 
 
@@ -180,8 +188,11 @@ def _write(
     campaign: Campaign,
     earlier: Json | None,
     command: str,
-) -> None:
-    """Print a campaign and write its files; those of a finished one stay as they are."""
+) -> int:
+    """Print a campaign and write its files; those of a finished one stay as they are.
+
+    Returns the exit status.
+    """
     out, seed = spec.out, spec.campaign.seed
     names = campaign_files.file_names(spec.figures)
     if earlier is not None:
@@ -189,15 +200,19 @@ def _write(
         times: dict[str, Any] = {name: earlier[name] for name in campaign_files.TIMES}
         campaign = replace(campaign, **times)
     print(campaign)
-    if spec.animate:
-        _write_films(out, scenario, filters, seed, campaign.dtype)
+
+    def film() -> int:
+        if not spec.animate:
+            return 0
+        return _write_films(out, scenario, filters, seed, campaign.dtype)
+
     if earlier is not None and all((out / name).exists() for name in names):
         more = "but films" if spec.animate else "and nothing written"
         print(
             f"\n{out} holds this campaign, finished: nothing was run {more}; "
             f"--runs above {campaign.runs} extends it"
         )
-        return
+        return film()
     if not campaign.first:
         # Run 0 was computed by an earlier command: once more, of the first filter with a map.
         mapping = [n for n, s in campaign.filters.items() if "rmse_landmarks" in s.measures]
@@ -207,24 +222,33 @@ def _write(
         method, _ = estimator_of(filters[name], truth, scenario)
         estimate = method(log, run_keys(key, 0)[1]).estimate
         campaign = replace(campaign, first={name: jax.device_get((truth, estimate))})
-    paths = campaign_files.save_campaign(campaign, out, spec.figures, True, command, seed)
+    failed: list[str] = []
+    paths = campaign_files.save_campaign(
+        campaign, out, spec.figures, True, command, seed, failed.append
+    )
     print("\nwrote " + ", ".join(map(str, paths)))
+    for sentence in failed:
+        print(f"jaxslam: {sentence}", file=sys.stderr)
+    return FAILED if film() or failed else 0
 
 
 def _write_films(
     out: Path, scenario: World, filters: Mapping[str, Candidate], seed: int, dtype: str
-) -> None:
-    """Write the film of run 0 of every filter, which runs once more, and print what was written."""
+) -> int:
+    """Write the film of run 0 of every filter, which runs once more; returns the exit status."""
     from jaxslam.results import plot  # matplotlib is slow to load
 
-    films = {
-        name: plot.animate_world(
-            scenario,
-            candidate,
-            jax.random.key(seed),
-            dtype=dtype,
-            title=f"{scenario.name}: {name}, run 0 of seed {seed}",
-        )
-        for name, candidate in filters.items()
-    }
-    print("\nwrote " + ", ".join(map(str, write_files(out, film_files(films, suffixed=True)))))
+    def draw() -> Files:
+        films = {
+            name: plot.animate_world(
+                scenario,
+                candidate,
+                jax.random.key(seed),
+                dtype=dtype,
+                title=f"{scenario.name}: {name}, run 0 of seed {seed}",
+            )
+            for name, candidate in filters.items()
+        }
+        return film_files(films, suffixed=True)
+
+    return write_results(out, {}, {"film": draw})

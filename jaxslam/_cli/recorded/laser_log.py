@@ -16,18 +16,20 @@ from jaxslam._cli import cache
 from jaxslam._cli.common import (
     FILMS,
     SUMMARY,
+    Drawings,
     add_dtype,
     add_figures,
     add_out,
     check_out,
     summary_table,
+    write_results,
 )
 from jaxslam.datasets import LaserLog
 from jaxslam.datasets._laser_logs.bag_messages import is_bag
 from jaxslam.laser.grids import Grid
 from jaxslam.math._odometry_jumps import odometry_jumps
 from jaxslam.results._campaign_files import FORMATS, check_figure_formats
-from jaxslam.results._files import Files, Json, json_text, versions, write_files
+from jaxslam.results._files import Files, Json, json_text, versions
 
 
 class Job(NamedTuple):
@@ -40,6 +42,7 @@ class Job(NamedTuple):
     """printed below the summary"""
     details: Json | None = None
     """further entries of `summary.json`, which `text` already shows"""
+    drawings: Drawings | None = None
 
 
 READERS: dict[str, Callable[..., LaserLog]] = {
@@ -155,9 +158,7 @@ def run_job(work: Work, options: argparse.Namespace, command: str) -> int:
     if job.text:
         print("\n" + job.text)
     text = json_text(summary | (job.details or {}) | {"versions": versions()})
-    written = write_files(options.out, job.files | {SUMMARY: text}, replaces=FILMS)
-    print("\nwrote " + ", ".join(str(path) for path in written))
-    return 0
+    return write_results(options.out, job.files | {SUMMARY: text}, job.drawings or {}, FILMS)
 
 
 def read_log(options: argparse.Namespace) -> tuple[LaserLog, dict[str, int]]:

@@ -95,7 +95,7 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> laser_log.Jo
     The poses in the file score the result, and are otherwise used only by the start `file`.
     """
     from jaxslam.results import plot  # matplotlib is slow to load
-    from jaxslam.results.plot._style import encode
+    from jaxslam.results.plot._style import pictures
 
     if is_bag(options.map):
         raise ValueError(f"expected a map of ROS, NAME.yaml, got {options.map}")
@@ -177,19 +177,21 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> laser_log.Jo
         "final pose [m, m, rad]": [float(value) for value in path.pose[-1]],
     } | laser_log.scored(log, lambda: scores(np.asarray(path.pose), log.corrected))
 
-    figure = plot.grid_figure(
-        grid,
-        poses=path.pose,
-        width=plot.PAGE,
-        others={"poses in the file": log.corrected} if log.placed else {},
-        title=f"{log.name}: localization",
-    )
+    def draw() -> Files:
+        figure = plot.grid_figure(
+            grid,
+            poses=path.pose,
+            width=plot.PAGE,
+            others={"poses in the file": log.corrected} if log.placed else {},
+            title=f"{log.name}: localization",
+        )
+        return {**pictures("localization", figure, options.figures)}
+
     files: Files = {
         "trajectory.csv": report.trajectory_csv(log.time, path),
         "trajectory.tum": report.trajectory_tum(log.time, path),
-        **{f"localization.{kind}": encode(figure, kind) for kind in options.figures},
     }
-    return laser_log.Job(summary, files)
+    return laser_log.Job(summary, files, drawings={"localization": draw})
 
 
 def _start(text: str, log: LaserLog) -> np.ndarray | None:

@@ -40,7 +40,7 @@ def run_mapping(log: LaserLog, options: argparse.Namespace) -> laser_log.Job:
     A beam without a return is not used. The written path is that of the robot.
     """
     from jaxslam.results import plot  # matplotlib is slow to load
-    from jaxslam.results.plot._style import encode
+    from jaxslam.results.plot._style import pictures
 
     laser_log.check_poses(log)
     shape, origin = map_frame(log, options.resolution)
@@ -49,17 +49,16 @@ def run_mapping(log: LaserLog, options: argparse.Namespace) -> laser_log.Job:
     grid = jax.device_get(grids.occupancy(counts))
     zero = np.zeros((len(log.time), 3, 3))
     path = Estimate(log.corrected, zero, *[np.zeros(0)] * 4)
-    figure = plot.grid_figure(
-        grid,
-        poses=log.corrected,
-        width=plot.PAGE,
-        title=f"{log.name}: {len(log.time):,} scans at known poses",
-    )
+
+    def draw() -> Files:
+        title = f"{log.name}: {len(log.time):,} scans at known poses"
+        figure = plot.grid_figure(grid, poses=log.corrected, width=plot.PAGE, title=title)
+        return {**pictures("map", figure, options.figures)}
+
     files: Files = {
         **ros_map.map_files("map", grid),
         "trajectory.csv": report.trajectory_csv(log.time, path),
         "trajectory.tum": report.trajectory_tum(log.time, path),
-        **{f"map.{kind}": encode(figure, kind) for kind in options.figures},
     }
     known = np.asarray(grid.known)
     bits = np.asarray(grids.entropy(grid))[known]
@@ -76,7 +75,7 @@ def run_mapping(log: LaserLog, options: argparse.Namespace) -> laser_log.Job:
         "mean entropy of a known cell [bit]": float(bits.mean()),
         "entropy of the map [bit]": float(bits.sum() + (~known).sum()),
     }
-    return laser_log.Job(summary, files)
+    return laser_log.Job(summary, files, drawings={"map": draw})
 
 
 def map_frame(log: LaserLog, resolution: float) -> tuple[tuple[int, int], Float[np.ndarray, "3"]]:

@@ -19,6 +19,7 @@ from jaxslam._cli.common import (
     COUNT,
     FILMS,
     SUMMARY,
+    Drawings,
     add_animate,
     add_dtype,
     add_figures,
@@ -27,6 +28,7 @@ from jaxslam._cli.common import (
     film_files,
     pick,
     summary_table,
+    write_results,
 )
 from jaxslam.association._rules import Known
 from jaxslam.consistency._measures.counts import count_label
@@ -41,7 +43,7 @@ from jaxslam.datasets._uncertain_constants import considered
 from jaxslam.filters._ekf.ekf_settings import EkfOptions
 from jaxslam.results import _report as report
 from jaxslam.results._campaign_files import FORMATS, check_figure_formats
-from jaxslam.results._files import Files, Json, json_text, versions, write_files
+from jaxslam.results._files import Files, Json, json_text, versions
 from jaxslam.simulation._worlds import Scenario
 
 
@@ -133,12 +135,10 @@ def run_dataset(options: argparse.Namespace, command: str) -> int:
         files[f"trajectory{suffix}.tum"] = report.trajectory_tum(data.time, run.result.path)
         files[f"map{suffix}.csv"] = report.map_csv(run.result.last, data.tags)
     files[SUMMARY] = json_text(summary | {"versions": versions()})
-    files |= _figure(data, runs, formats)
+    drawings: Drawings = {"map": lambda: _figure(data, runs, formats)}
     if at is not None:
-        files |= _films(data, runs, at)
-    written = write_files(options.out, files, replaces=FILMS)
-    print("\nwrote " + ", ".join(str(path) for path in written))
-    return 0
+        drawings["film"] = lambda: _films(data, runs, at)
+    return write_results(options.out, files, drawings, FILMS)
 
 
 class FilterRun(NamedTuple):
@@ -254,7 +254,7 @@ def suspicions(summary: Json) -> list[str]:
 def _figure(data: Dataset, runs: dict[str, FilterRun], formats: tuple[str, ...]) -> Files:
     """The figure of the map: the first filter with ellipses and truth, others without."""
     from jaxslam.results import plot  # matplotlib is slow to load
-    from jaxslam.results.plot._style import encode
+    from jaxslam.results.plot._style import pictures
 
     (name, first), *rest = runs.items()
     found = first.found
@@ -267,7 +267,7 @@ def _figure(data: Dataset, runs: dict[str, FilterRun], formats: tuple[str, ...])
         others={each: _whole(run.result) for each, run in rest},
         title=f"{data.name}: {name} with ellipses" if rest else data.name,
     )
-    return {f"map.{kind}": encode(figure, kind) for kind in formats}
+    return {**pictures("map", figure, formats)}
 
 
 def _true_path(data: Dataset, found: Evaluation) -> Float[np.ndarray, "T 3"] | None:

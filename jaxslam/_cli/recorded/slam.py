@@ -2,12 +2,13 @@
 
 import argparse
 from collections.abc import Mapping
+from functools import partial
 from typing import TYPE_CHECKING
 
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam._cli.common import add_animate, film_files, summary_table
+from jaxslam._cli.common import Drawings, add_animate, film_files, summary_table
 from jaxslam._cli.recorded import laser_log
 from jaxslam.consistency import metrics
 from jaxslam.consistency.campaign._progress import Progress
@@ -62,14 +63,14 @@ def run_slam(log: LaserLog, options: argparse.Namespace) -> laser_log.Job:
     solved = _solved(log, settings)
     coarser = float(solved.map.resolution) > 1.001 * settings.resolution
     reference = log.corrected if log.placed else None
-    files = result_files(solved) | figures(solved, options.figures, reference)
+    files, drawings = result_files(solved), figures(solved, options.figures, reference)
     if options.animate:
-        files |= film_files({"slam": film(log, solved, settings)}, suffixed=False)
+        drawings["film"] = lambda: film_files({"slam": film(log, solved, settings)}, suffixed=False)
     summary = result_summary(solved) | laser_log.scored(log, lambda: _scores(log, solved))
     if coarser:
         summary["requested resolution, of too many cells [m]"] = settings.resolution
     if given is None:
-        return laser_log.Job(summary, files)
+        return laser_log.Job(summary, files, drawings=drawings)
     relations, dropped = given
     joined, scores = len(relations.first), relation_scores(relations, log, solved)
     text = (
@@ -89,7 +90,7 @@ def run_slam(log: LaserLog, options: argparse.Namespace) -> laser_log.Job:
         "tolerance [s]": TOLERANCE,
         **scores,
     }
-    return laser_log.Job(summary, files, text, {"relations": entry})
+    return laser_log.Job(summary, files, text, {"relations": entry}, drawings)
 
 
 def _solved(log: LaserLog, settings: Settings) -> Solved:
@@ -139,28 +140,27 @@ def result_files(solved: Solved) -> Files:
 
 def figures(
     solved: Solved, formats: tuple[str, ...], corrected: Float[np.ndarray, "K 3"] | None
-) -> Files:
+) -> Drawings:
     """`map_before`, `map_after` (maps of laser odometry alone, and of the optimum) and `graph`.
 
     corrected: poses of reference, if there are some, drawn beside both paths in `graph`.
     """
     from jaxslam.results import plot  # matplotlib is slow to load
-    from jaxslam.results.plot._style import encode
+    from jaxslam.results.plot._style import pictures
 
-    before = plot.grid_figure(
-        solved.map_before,
-        poses=solved.odometry,
-        title="Laser odometry, before closing",
-        width=plot.PAGE,
-    )
-    after = plot.grid_figure(solved.map, poses=solved.poses, title="After closing", width=plot.PAGE)
-    graph = plot.loops_figure(solved, corrected)
-    pictures = {"map_before": before, "map_after": after, "graph": graph}
-    return {
-        f"{name}.{kind}": encode(figure, kind)
-        for name, figure in pictures.items()
-        for kind in formats
+    grid = partial(plot.grid_figure, width=plot.PAGE)
+    makers = {
+        "map_before": lambda: grid(
+            solved.map_before, poses=solved.odometry, title="Laser odometry, before closing"
+        ),
+        "map_after": lambda: grid(solved.map, poses=solved.poses, title="After closing"),
+        "graph": lambda: plot.loops_figure(solved, corrected),
     }
+
+    def files_of(name: str) -> Files:
+        return {**pictures(name, makers[name](), formats)}
+
+    return {name: partial(files_of, name) for name in makers}
 
 
 def film(log: LaserLog, solved: Solved, settings: Settings) -> "Film":

@@ -199,7 +199,7 @@ def _correct_group(
     """
     slot, chart = part[1], settings.chart
     size_l, size = joint.landmarks.shape[1], joint.cov.shape[0]
-    of_landmarks = 3 + slot[:, None] * size_l + jnp.arange(size_l)[None, :]
+    of_landmarks = 3 + slot[:, None] * size_l + jnp.arange(size_l, dtype=slot.dtype)[None, :]
     at = jnp.concatenate([jnp.arange(3), of_landmarks.reshape(-1)])
     rows = joint.cov[at]
     local = joint._replace(

@@ -118,7 +118,8 @@ def initialize_landmarks(
     both = jax.vmap(linalg.solve_lower)(root, jnp.concatenate([-by_pose, unit], axis=2))
     both = jnp.where(initialized[:, None, None], both, 0.0)
     rows = stack_jacobians(both[:, :, :3], both[:, :, 3:], index, count)
-    filled = (initialized[:, None] & (index[:, None] == jnp.arange(count)[None, :])).any(axis=0)
+    slots = jnp.arange(count, dtype=index.dtype)
+    filled = (initialized[:, None] & (index[:, None] == slots[None, :])).any(axis=0)
     # Padding's unit goes first, to an exact zero.
     padding = jnp.concatenate([jnp.zeros(3, bool), jnp.repeat(filled, size)])
     omega = omega - jnp.diag(padding.astype(omega.dtype)) + rows.T @ rows

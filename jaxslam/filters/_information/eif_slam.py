@@ -99,7 +99,7 @@ class EifSlam(InformationFilter):
             residual=jnp.where(solved, 0.0, state.residual),
             alive=state.alive.at[into].set(True, mode="drop"),
             tag=state.tag.at[into].set(scan.tag.astype(jnp.int32), mode="drop"),
-            refused=state.refused + (scan.valid.any() & ~solved),
+            refused=state.refused + (scan.valid.any() & ~solved).astype(jnp.int32),
         )
         innovations = tag_innovation.refuse_unless(solved, innovations)
         return after, canonical.report(scan, measured, innovations, initialized)

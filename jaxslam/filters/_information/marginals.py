@@ -59,7 +59,7 @@ def recover_passive_means(state: SparseState, count: int) -> SparseState:
         left = state.landmark_residual.at[jnp.where(on, slot, n)].set(0.0, mode="drop")
         return state._replace(landmark_residual=left), None
 
-    state, _ = jax.lax.scan(recover_one, state, jnp.arange(count))
+    state, _ = jax.lax.scan(recover_one, state, jnp.arange(count, dtype=state.next_recovered.dtype))
     return state._replace(next_recovered=((state.next_recovered + count) % n).astype(jnp.int32))
 
 

@@ -197,7 +197,8 @@ def stack_jacobians(
 ) -> Float[Array, "MZ D"]:
     """The Jacobian H of M functions of pose and a landmark, index of `count`; D = 3 + count·L."""
     m, rows, size = by_landmark.shape
-    at = (index[:, None] == jnp.arange(count)[None, :]).astype(by_landmark.dtype)
+    slots = jnp.arange(count, dtype=index.dtype)
+    at = (index[:, None] == slots[None, :]).astype(by_landmark.dtype)
     wide = jnp.einsum("mkl,ma->mkal", by_landmark, at).reshape(m, rows, count * size)
     return jnp.concatenate([by_pose, wide], axis=2).reshape(m * rows, 3 + count * size)
 

@@ -219,7 +219,7 @@ def draw_start(state: PoseParticles, key: Array, region: Region | None) -> PoseP
 
 def active_mask(state: PoseParticles) -> Bool[Array, "P"]:
     """Which particles are in use."""
-    return jnp.arange(state.pose.shape[0]) < state.active
+    return jnp.arange(state.pose.shape[0], dtype=state.active.dtype) < state.active
 
 
 def pose_particle_moments(

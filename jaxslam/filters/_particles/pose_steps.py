@@ -58,7 +58,7 @@ def update_averages(
     if rates is None:
         return state._replace(injection=jnp.zeros_like(state.fast))
     finite = jnp.isfinite(misfit)
-    exponent = -jnp.where(finite, misfit, 0.0) / jnp.maximum(measured, 1)
+    exponent = -jnp.where(finite, misfit, 0.0) / jnp.maximum(measured, 1).astype(misfit.dtype)
     each = jnp.where(finite, jnp.exp(exponent), 0.0)
     fit = jax.lax.stop_gradient((jnp.exp(state.log_weight) * each).sum())
     first = state.slow <= 0
@@ -200,7 +200,7 @@ class MonteCarloFilter(_Particles):
         pose = jnp.where(good[:, None], moved, old)
         count, few = enough(bins_of(pose, _BINS), self.fewest, _ERROR, _CONFIDENCE)
         active = jnp.where(due, count, state.active)
-        used = jnp.arange(self.particles) < active
+        used = jnp.arange(self.particles, dtype=active.dtype) < active
         log_weight = jnp.where(used, drawn.log_weight, -jnp.inf)
         # The sum becomes 1; its gradient is the resampling method's.
         log_weight = log_weight - normalized(jax.lax.stop_gradient(log_weight))[1]
@@ -245,7 +245,7 @@ class MonteCarloFilter(_Particles):
         state = state._replace(
             log_weight=weight,
             best=jnp.argmax(weight).astype(jnp.int32),
-            due=(ess < self.threshold * state.active) | lost,
+            due=(ess < self.threshold * state.active.astype(ess.dtype)) | lost,
             events=no_events(),
         )
         return state, found

@@ -147,7 +147,7 @@ def slam_estimate(state: SlamParticles, sensor: Sensor) -> Estimate:
     best = state.best
     assert best is not None
     named = (state.tag == state.tag[best][None]) & (state.tag[best] >= 0)[None]
-    is_best = (jnp.arange(state.pose.shape[0]) == best)[:, None]
+    is_best = (jnp.arange(state.pose.shape[0], dtype=best.dtype) == best)[:, None]
     same = state.alive & state.alive[best][None] & (named | is_best)
     # A most likely particle of weight zero would cause a division by zero.
     w = jnp.where(same, jnp.exp(state.log_weight)[:, None], 0.0)

@@ -191,14 +191,14 @@ def optimize_chain(
         at, chain, value = jax.tree.map(lambda a, b: jnp.where(moved, a, b), trial, here)
         ending = jnp.where(converged, Ending.CONVERGED, Ending.EXHAUSTED)
         ending = jnp.where(may & ~lower, Ending.STALLED, ending)
-        late = jnp.arange(iterations) >= search.taken
+        late = jnp.arange(iterations, dtype=search.taken.dtype) >= search.taken
         found = Iterations(
             at=at,
             chain=chain,
             policy=policy,
             cost=value,
             costs=jnp.where(late, value, search.costs),
-            taken=search.taken + moved,
+            taken=search.taken + moved.astype(search.taken.dtype),
             ending=ending.astype(jnp.int32),
         )
         return found, moved

@@ -2,8 +2,22 @@
 
 Only this package draws. Figures are made without pyplot, without global state and windows;
 `figure.savefig(path)` saves one. They are as wide as a page; `width=plot.COLUMN` makes one for a
-column of a paper, with letters of the same size.
+column of a paper, with letters of the same size. Matplotlib's backend and settings are not used.
 """
+
+import locale
+import os
+import sys
+
+try:
+    import matplotlib
+except (ValueError, locale.Error):  # the user's backend, or locale, is not installed
+    from unittest import mock
+
+    for _half_loaded in [name for name in sys.modules if name.partition(".")[0] == "matplotlib"]:
+        del sys.modules[_half_loaded]
+    with mock.patch.dict(os.environ, {"MPLBACKEND": "agg", "LC_ALL": "C"}):
+        import matplotlib  # noqa: F401
 
 from jaxslam.results.plot._film import Film, Layer, Panel, Scene
 from jaxslam.results.plot._graph_figures import graph_figure

@@ -35,7 +35,7 @@ from matplotlib.patches import Polygon
 from jaxslam.core._numbers import check_count
 from jaxslam.core._optional import Unusable, first_line
 from jaxslam.results.plot._landmarks import ellipses
-from jaxslam.results.plot._style import INK, PAGE, TEXT, TITLE, panels_of, titled
+from jaxslam.results.plot._style import INK, PAGE, TEXT, TITLE, own_settings, panels_of, titled
 
 Draw: TypeAlias = Callable[[int], object]
 """Sets the moving artists of a layer to frame k."""
@@ -111,6 +111,7 @@ class Film(FuncAnimation):
         ValueError: on a scene without frames, an fps or a width that is not above 0.
     """
 
+    @own_settings()
     def __init__(self, scene: Scene, *, fps: float | None = None, width: float = PAGE) -> None:
         check_count("Film: frames", scene.frames)
         fps = np.clip(scene.frames / _SECONDS, _SLOWEST, _FASTEST) if fps is None else fps
@@ -134,6 +135,7 @@ class Film(FuncAnimation):
     def __del__(self) -> None:
         """No warning about a film that was never drawn, unlike Matplotlib."""
 
+    @own_settings()
     def save(
         self, filename: str | Path, writer: Any = None, *arguments: Any, **options: Any
     ) -> None:
@@ -156,6 +158,7 @@ class Film(FuncAnimation):
                 f"Film.save: {filename} cannot be written ({_reason(error)}): save a .gif"
             ) from error
 
+    @own_settings()
     def to_jshtml(self, *arguments: Any, **options: Any) -> str:
         """The player in HTML, which loads nothing; arguments as for Matplotlib's method."""
         with matplotlib.rc_context({"animation.embed_limit": _EMBEDDED}):

@@ -22,6 +22,7 @@ from jaxslam.results.plot._style import (
     Look,
     caption,
     every_handle,
+    own_settings,
     panels_of,
     titled,
 )
@@ -34,6 +35,7 @@ _EDGES: dict[str, Look] = {
 """How edges look: the path is between poses of successive ids."""
 
 
+@own_settings()
 def graph_figure(
     before: Graph,
     after: Graph,

@@ -28,6 +28,7 @@ from jaxslam.results.plot._style import (
     Look,
     caption,
     every_handle,
+    own_settings,
     panels_of,
     titled,
 )
@@ -36,6 +37,7 @@ _UNKNOWN = "#c9d3dd"
 """Colour of unknown cells, not a shade of grey."""
 
 
+@own_settings()
 def grid_figure(
     grid: Grid | Field,
     *,
@@ -136,6 +138,7 @@ def _corners(
 _PALE = ("#cfe3f1", "#f8dcc8", "#cdebdf", "#f2dde9", "#f9e6c0", "#d9edf8", "#e3dccb", "#dcdcdc")
 
 
+@own_settings()
 def topology_figure(
     places: TopologicalMap,
     *,
@@ -207,6 +210,7 @@ CELLS = 400
 """along a side of a map as drawn: walls of one cell stay visible"""
 
 
+@own_settings()
 def loops_figure(
     solved: Solved,
     reference: ArrayLike | None = None,
@@ -251,6 +255,7 @@ def _draw_loops(
     axes.set_aspect("equal", adjustable="datalim")
 
 
+@own_settings()
 def maps_before_after(solved: Solved, *, title: str = "", width: float = PAGE) -> Figure:
     """The maps of laser odometry alone and after closing, side by side. width: [in]."""
     known = np.argwhere(np.asarray(solved.map.known) | np.asarray(solved.map_before.known))

@@ -25,6 +25,7 @@ from jaxslam.results.plot._style import (
     Look,
     caption,
     every_handle,
+    own_settings,
     panels_of,
     plain,
     titled,
@@ -117,6 +118,7 @@ _UPRIGHT = 15
 """largest number of landmarks whose names are written horizontally"""
 
 
+@own_settings()
 def map_figure(
     estimate: Estimate,
     *,
@@ -174,6 +176,7 @@ def map_figure(
     return figure
 
 
+@own_settings()
 def run_map_figure(campaign: Campaign, *, title: str = "", width: float = PAGE) -> Figure:
     """Path and final map of run 0 of every filter of `Campaign.first`, with the truth.
 
@@ -297,6 +300,7 @@ def _limit(axes: Axes, clouds: Sequence[np.ndarray]) -> None:
     axes.set(xlim=xlim, ylim=ylim)
 
 
+@own_settings()
 def walls_figure(
     estimate: Estimate,
     walls: Walls,

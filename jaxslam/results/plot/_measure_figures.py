@@ -38,6 +38,7 @@ from jaxslam.results.plot._style import (
     caption,
     curve,
     look,
+    own_settings,
     panels_of,
     plain,
     step_limits,
@@ -53,6 +54,7 @@ _ASIDE = 0.12
 """Distance of two filters at the same lag [steps]."""
 
 
+@own_settings()
 def nees_figure(
     campaign: Campaign, *, blocks: Sequence[str] = tuple(DOF), width: float = PAGE
 ) -> Figure:
@@ -81,6 +83,7 @@ def nees_figure(
     return figure
 
 
+@own_settings()
 def rmse_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     """RMSE of position and heading over the steps, with the conditional Cramér-Rao bound if known.
 
@@ -118,6 +121,7 @@ def rmse_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     return figure
 
 
+@own_settings()
 def coverage_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     """Share of steps with the truth in the ellipsoid of probability p, against p.
 
@@ -150,6 +154,7 @@ def coverage_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     return figure
 
 
+@own_settings()
 def whiteness_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     """Autocorrelation of normalized innovations against the lag; that of a consistent filter is 0.
 
@@ -182,6 +187,7 @@ def whiteness_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     return figure
 
 
+@own_settings()
 def gained_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     """Spurious information on the rotation of the whole frame over the steps; 0 is consistent.
 
@@ -263,6 +269,7 @@ INTERVAL = "interval"
 """`gid` of the lines of intervals, and of the arrows where they leave the scale."""
 
 
+@own_settings()
 def cost_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     """Time of a step, position error and pose NEES of every filter: a row each, by kind.
 

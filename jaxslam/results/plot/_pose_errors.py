@@ -17,6 +17,7 @@ from jaxslam.results.plot._style import (
     PAGE,
     caption,
     ordinate,
+    own_settings,
     panels_of,
     plain,
     step_limits,
@@ -35,6 +36,7 @@ _SMALL = 0.1
 """Errors and bounds below this share of a common scale have a separate scale."""
 
 
+@own_settings()
 def errors_figure(
     estimate: Estimate, truth: Truth, *, title: str = "", width: float = PAGE
 ) -> Figure:
@@ -50,6 +52,7 @@ def errors_figure(
     return figure
 
 
+@own_settings()
 def run_errors_figure(campaign: Campaign, *, title: str = "", width: float = PAGE) -> Figure:
     """Errors of run 0 of every filter of `Campaign.first`, one row each, as in `errors_figure`.
 

@@ -1,8 +1,9 @@
 """The one style of all figures: sizes, colours, lines, marks, legends, and files."""
 
+import contextlib
 import io
 import textwrap
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from typing import Any, Literal, TypeAlias
 
 import matplotlib
@@ -67,13 +68,33 @@ def check_font() -> None:
         get_font(findfont(FontProperties()))
 
 
+@contextlib.contextmanager
+def own_settings() -> Iterator[None]:
+    """A block, or by @own_settings() a function, in which Matplotlib has its defaults and ours.
+
+    A figure does not depend on the user's matplotlibrc: neither on LaTeX, nor on fonts, sizes, or
+    decimal commas. The settings are those of the user afterwards.
+    """
+    ffmpeg = matplotlib.rcParams["animation.ffmpeg_path"]  # where a program is, not how it looks
+    with matplotlib.rc_context():
+        matplotlib.rcdefaults()
+        matplotlib.rcParams["animation.ffmpeg_path"] = ffmpeg
+        matplotlib.rcParams["pdf.fonttype"] = 42  # TrueType, which publishers require
+        matplotlib.rcParams["svg.hashsalt"] = "jaxslam"  # reproducible names of parts
+        yield
+
+
+@own_settings()
 def encode(figure: Figure, kind: str, dpi: float = 200) -> bytes:
     """The figure as a file of a kind, png, pdf or svg; the same bytes every time."""
     out = io.BytesIO()
-    # TrueType fonts in PDF, which publishers require; reproducible names of parts in SVG.
-    with matplotlib.rc_context({"pdf.fonttype": 42, "svg.hashsalt": "jaxslam"}):
-        figure.savefig(out, format=kind, dpi=dpi, metadata=_NO_DATE.get(kind))
+    figure.savefig(out, format=kind, dpi=dpi, metadata=_NO_DATE.get(kind))
     return out.getvalue()
+
+
+def pictures(name: str, figure: Figure, kinds: Sequence[str]) -> dict[str, bytes]:
+    """The figure as files of some kinds, by their names."""
+    return {f"{name}.{kind}": encode(figure, kind) for kind in kinds}
 
 
 def png(figure: Figure, dpi: float = 200) -> bytes:
@@ -101,6 +122,7 @@ class _ShownFigure(Figure):
     shape, so that labels may lie outside: such a figure is laid out twice.
     """
 
+    @own_settings()
     def savefig(self, *args: Any, **options: Any) -> None:
         """Write the figure, as Matplotlib does it."""
         if any(axes.get_aspect() != "auto" for axes in self.axes):
@@ -112,6 +134,7 @@ class _ShownFigure(Figure):
         return png(self, dpi=110)
 
 
+@own_settings()
 def panels_of(
     width: float,
     height: float,

@@ -270,12 +270,12 @@ def _entries(
         if count < 0:
             raise ValueError(f"{name}: {parameter}: expected a number of entries, got {count}")
         return _number_names(parameter, count)
-    names = entries if isinstance(entries, Sequence) and not isinstance(entries, str) else [None]
-    if not all(isinstance(entry, str) for entry in names):
+    listed = isinstance(entries, Sequence) and not isinstance(entries, str)
+    if not (isinstance(entries, Sequence) and listed and all(isinstance(e, str) for e in entries)):
         raise ValueError(
             f"{name}: {parameter}: expected a tuple of names or their number, got {entries!r}"
         )
-    return tuple(names)
+    return tuple(entries)
 
 
 def _number_names(parameter: str, count: int) -> tuple[str, ...]:
