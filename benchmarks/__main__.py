@@ -39,6 +39,7 @@ BENCHMARKS = {
     "association": "association.benchmark",
     "baselines": "baselines",
     "bearing": "bearing",
+    "iterations": "iterations",
     "team": "team",
     "delayed": "delayed",
     "plaza": "plaza",
