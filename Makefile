@@ -51,7 +51,7 @@ docs: $(VENV)/.dev
 	$(BIN)/sphinx-build --builder html --jobs auto --fail-on-warning --keep-going --quiet docs docs/_build/html $(ARGS)
 
 ## The reference and the text of all pages, in docs/_build/api: none of their code is run.
-api: $(VENV)/.dev
+api: $(VENV)/.docs
 	$(BIN)/sphinx-build --builder html --tag api --jobs auto --quiet docs docs/_build/api $(ARGS)
 
 ## Whether the documentation's links to other sites are alive; needs the network.
@@ -70,6 +70,10 @@ $(VENV)/.run: pyproject.toml | $(VENV)/bin/python
 
 $(VENV)/.dev: pyproject.toml | $(VENV)/bin/python
 	$(BIN)/python -m pip install --quiet --editable . --group dev
+	@touch $@
+
+$(VENV)/.docs: pyproject.toml | $(VENV)/bin/python
+	$(BIN)/python -m pip install --quiet --editable . --group docs
 	@touch $@
 
 $(VENV)/.oldest: pyproject.toml | $(VENV)/bin/python

@@ -41,6 +41,7 @@ BENCHMARKS = {
     "association": "association.benchmark",
     "baselines": "baselines",
     "bearing": "bearing",
+    "iterations": "iterations",
     "team": "team",
     "delayed": "delayed",
     "plaza": "plaza",

@@ -30,6 +30,7 @@ GIVEN = {
         "2,000",
         "0.11",
     },  # steps, sizes, jax
+    "docs/guide/choosing_a_filter.md": {"0.5", "0.1"},  # of a start, of a sensor
     "docs/guide/consistency.md": {"0.95"},  # a coverage
     "docs/guide/differentiating.md": {"200"},  # steps
     # beams, the range for none, measurements in a log
