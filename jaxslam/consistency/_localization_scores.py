@@ -13,6 +13,7 @@ from jaxslam._driver import run
 from jaxslam.consistency._intervals import LEVEL, Average, interval, positive_interval
 from jaxslam.consistency._measures.nees import block_nees, pose_error
 from jaxslam.core._numbers import check_count, check_covariance, check_key
+from jaxslam.core._reprs import short_repr
 from jaxslam.core.protocols import Filter
 from jaxslam.core.types import JaxOrNumPy, Log
 from jaxslam.filters._particles.pose_particles import PoseParticles
@@ -47,6 +48,9 @@ class LocalizationScores(NamedTuple):
     """95 % of the weight lies near the mean: the particles are one group"""
     ess: Float[JaxOrNumPy, "R T"]
     active: Int[JaxOrNumPy, "R T"]
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 class LocalizationSummary(NamedTuple):

@@ -25,7 +25,7 @@ from jaxslam.consistency._measures.counts import counted
 from jaxslam.consistency._measures.measure import Measure, Nees, Runs, RunStatistics
 from jaxslam.consistency._measures.nees import block_nees, pose_error
 from jaxslam.core.protocols import Sensor
-from jaxslam.core.types import Estimate, Info, Status, Trace, Truth
+from jaxslam.core.types import Estimate, Info, JaxOrNumPy, Status, Trace, Truth
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._pose_covariances import covariance_faults
 
@@ -118,12 +118,13 @@ def score(
 def _is_constant(trace: Trace, truth: Truth) -> Bool[np.ndarray, "R"]:
     """Whether pose and covariance of a run stay as they are, to the bit, while the robot moves."""
 
-    def still(values: np.ndarray) -> np.ndarray:
+    def still(values: JaxOrNumPy) -> np.ndarray:
         rows = np.asarray(values)
         out: np.ndarray = (rows == rows[:, :1]).reshape(len(rows), -1).all(axis=1)
         return out
 
-    return still(trace.estimate.pose) & still(trace.estimate.pose_cov) & ~still(truth.pose)
+    fixed = still(trace.estimate.pose) & still(trace.estimate.pose_cov)
+    return np.asarray(fixed & ~still(truth.pose))
 
 
 class _Sums(NamedTuple):

@@ -175,7 +175,7 @@ def is_faulty(counts: Mapping[str, int]) -> bool:
 class _Measured(NamedTuple):
     """What became of the measurements of the finite runs."""
 
-    count: int
+    total: int
     """in the logs"""
     used: int
     dropped: dict[str, int]
@@ -204,7 +204,7 @@ def _is_starved(counts: Mapping[str, int]) -> bool:
         return True
     if measured.none_taken:
         return False
-    return measured.count > 2 * measured.used or measured.missed > measured.count
+    return measured.total > 2 * measured.used or measured.missed > measured.total
 
 
 def doubts_on(
@@ -252,8 +252,8 @@ def doubts_on(
         out.append(
             f"unobservable directions {free.mean():.3g} instead of 3: the filter gained "
             "information on the pose of the map as a whole, which only a sensor of absolute "
-            "position or heading gives; if the robot has such a sensor, compare with the row of "
-            "the filter ideal"
+            "position or heading gives; if the robot has such a sensor, compare with the filter "
+            "ideal"
         )
     return tuple(out)
 
@@ -264,28 +264,28 @@ def _doubts_on_measurements(counts: Mapping[str, int], nis_dof: float) -> list[s
         out.append("nothing was measured in any run: only the motion was judged")
     if measured.missed:
         out.append(
-            f"{measured.missed:,} landmarks in view, beside {measured.count:,} measured ones, had "
+            f"{measured.missed:,} landmarks in view, beside {measured.total:,} measured ones, had "
             "no place in the scan: expected more places in the world"
         )
-    if not measured.count:
+    if not measured.total:
         return out
-    ignored = measured.count - measured.used - sum(measured.dropped.values())
+    ignored = measured.total - measured.used - sum(measured.dropped.values())
     if measured.none_taken:
         out.append(
-            f"takes none of the {measured.count:,} measurements (by its Info): judged by the NEES "
+            f"takes none of the {measured.total:,} measurements (by its Info): judged by the NEES "
             "alone"
         )
-    elif measured.count > 2 * measured.used:
+    elif measured.total > 2 * measured.used:
         reasons = [f"{count:,} {name}" for name, count in measured.dropped.items() if count]
         reasons += [f"{ignored:,} without a status in Info"] * bool(ignored)
         out.append(
-            f"{measured.count - measured.used:,} of {measured.count:,} measurements were "
+            f"{measured.total - measured.used:,} of {measured.total:,} measurements were "
             f"{'not used' if ignored else 'dropped'}: {', '.join(reasons)}"
         )
     else:
         if ignored:
             out.append(
-                f"{ignored:,} of {measured.count:,} measurements have no status in Info: they may "
+                f"{ignored:,} of {measured.total:,} measurements have no status in Info: they may "
                 "have been ignored"
             )
         if count := measured.dropped["overflow"]:

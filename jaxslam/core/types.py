@@ -328,7 +328,9 @@ class Trace(NamedTuple):
         lines = [
             f"{name}={text}" for name, text in zip(self._fields, map(text_of, self), strict=True)
         ]
-        pose, status = getattr(self.estimate, "pose", None), getattr(self.info, "status", None)
+        # Fields are absent where JAX has mapped a tree to another kind of leaf.
+        pose: PyTree = getattr(self.estimate, "pose", None)
+        status: PyTree = getattr(self.info, "status", None)
         arrays = all(isinstance(leaf, np.ndarray | Array) for leaf in jax.tree.leaves(self[:2]))
         if arrays and is_concrete(self[:2]) and np.shape(pose)[:-1] == np.shape(status)[:-1] != ():
             became = {s: int((jax.device_get(status) == s).sum()) for s in Status if s}

@@ -11,6 +11,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxslam.core._reprs import short_repr
 from jaxslam.core.types import JaxOrNumPy
 
 LOOPS = "relative_pose/loops"
@@ -32,6 +33,9 @@ class Table(NamedTuple):
     valid: Bool[JaxOrNumPy, "E"]
     """false for padding, and for rows that are left out"""
 
+    def __repr__(self) -> str:
+        return short_repr(self)
+
 
 class Graph(NamedTuple):
     """A graph of N poses and P points (or landmarks of L numbers); leading axes by `vmap`.
@@ -51,6 +55,9 @@ class Graph(NamedTuple):
     """identity in a file, or in a log the number of controls before it"""
     point_id: Int[JaxOrNumPy, "P"]
     """identity in a file, or tag in a log"""
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def ranks(graph: Graph) -> Int[np.ndarray, "N"]:

@@ -81,7 +81,7 @@ def qualified(campaign: Campaign) -> list[str]:
                     f"{percentage(TOLERANCE)} of the honest value"
                 )
         ends = {test: pair for test, pair in summary.noticed.items() if pair != (0.0, np.inf)}
-        if ends and summary.verdict in ("consistent", "incomplete", "undecided"):
+        if ends and not summary.by and summary.verdict != "diverged":
             limits = " and ".join(f"[{low:.3g}, {high:.3g}]" for low, high in ends.values())
             tests = " and ".join(f"a {TESTS[test]}" for test in ends)
             powers.setdefault(tests, []).append(f"{name} {limits}")

@@ -28,9 +28,9 @@ VERDICTS = {
     "diverged": ("✕", "over half of the runs are divergent or not finite"),
     "incomplete": (
         "–",
-        f"not optimistic, but over {percentage(1 - LEVEL)} of the runs are not finite, or of the "
-        "covariances are none; or not rejected, but over half of the measurements were not used, "
-        "or there were none: a doubt says which",
+        f"not optimistic, but over {percentage(1 - LEVEL)} of the runs are not finite or of the "
+        "covariances are not valid, or over half of the measurements were not used; a doubt says "
+        "which",
     ),
     "undecided": (
         "?",

@@ -11,6 +11,7 @@ from numpy.typing import ArrayLike
 
 from jaxslam.core._numbers import check_key, check_mount, check_positive, held_array, is_concrete
 from jaxslam.core._record import record, set_field, static
+from jaxslam.core._reprs import short_repr
 from jaxslam.core.protocols import Motion
 from jaxslam.core.types import Beams, JaxOrNumPy
 from jaxslam.math import se2
@@ -84,6 +85,9 @@ class LaserHistory(NamedTuple):
     """with noise, as the robot records it"""
     beams: Beams
     """with leading T"""
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 def true_ranges(

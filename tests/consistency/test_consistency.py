@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 import scipy.stats
 import worlds
+from reference.ekf_slam import increment, range_bearing, range_bearing_inverse
 
 from jaxslam import consistency
 from jaxslam.consistency._run_scores import run_statistics
@@ -232,6 +233,42 @@ def test_a_covariance_that_is_none_is_told_from_rounding(dtype):
     too_correlated[:, 0, 2] = too_correlated[:, 2, 0] = 1.1 * sigma[:, 0, 2]
     assert faults(too_correlated) == (0, 200)
     assert faults(np.nan * cov) == (0, 0)  # not finite, which is another fault
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_rounding_of_a_textbook_filter_is_no_fault(dtype):
+    """P = (I - K H) P, never symmetrized, from a start of 1 m; 600 steps among 12 landmarks."""
+    q, r = np.diag([0.02, 0.01]) ** 2, (np.diag([0.1, 0.03]) ** 2).astype(dtype)
+    around = 2 * np.pi * np.arange(12) / 12
+    landmarks = 4.5 * np.stack([np.cos(around), np.sin(around)], axis=1) + [0.0, 3.0]
+    pose, size = np.zeros(3), 3 + landmarks.size
+    cov = np.zeros((size, size), dtype)
+    cov[0, 0] = cov[1, 1] = 1.0
+    covs, seen = [], set()
+    for _ in range(600):
+        pose, by_pose, by_noise = increment(pose, (0.2, 2 * np.pi / 100))
+        turned = np.eye(size, dtype=dtype)
+        turned[:3, :3] = by_pose
+        cov = turned @ cov @ turned.T
+        cov[:3, :3] += (by_noise @ q @ by_noise.T).astype(dtype)
+        for i in np.flatnonzero(np.hypot(*(landmarks - pose[:2]).T) < 4):
+            z, h_pose, h_landmark = range_bearing(pose, landmarks[i])
+            at = slice(3 + 2 * i, 5 + 2 * i)
+            if i not in seen:
+                seen.add(i)
+                _, g_pose, g_z = range_bearing_inverse(pose, z)
+                cov[at] = g_pose.astype(dtype) @ cov[:3]
+                cov[:, at] = cov[at].T
+                cov[at, at] = g_pose @ cov[:3, :3] @ g_pose.T + g_z @ r @ g_z.T
+                continue
+            h = np.zeros((2, size), dtype)
+            h[:, :3], h[:, at] = h_pose, h_landmark
+            gain = cov @ h.T @ np.linalg.inv(h @ cov @ h.T + r)
+            cov = ((np.eye(size, dtype=dtype) - gain @ h) @ cov).astype(dtype)
+        covs.append(cov[:3, :3])
+    found = covariance_faults(np.zeros((600, 3), dtype), np.stack(covs))
+    assert cov.dtype == dtype and (np.stack(covs) != np.swapaxes(covs, 1, 2)).any()
+    assert not found.asymmetric.any() and not found.indefinite.any()
 
 
 @pytest.mark.parametrize("kind", ["-P", "triangular", "constant", "no heading"])

@@ -15,7 +15,7 @@ from worlds import narrow
 from jaxslam import graphs, run
 from jaxslam.core._validation import check_log
 from jaxslam.core.logs import _streams as streams
-from jaxslam.core.types import Info, Log, Scan, Status, Truth
+from jaxslam.core.types import Estimate, Info, Log, Scan, Status, Trace, Truth
 from jaxslam.filters import DeadReckoning, EkfSlam
 from jaxslam.motion import PoseIncrement, Unicycle
 from jaxslam.sensors import Compass, Part, RangeBearing, Suite
@@ -459,3 +459,65 @@ def test_streams_need_a_row_for_each_measurement():
         streams.align_streams(stream, ([0.5], [0], np.ones((1, 2))), streams.as_recorded, [0, 1])
     with pytest.raises(ValueError, match="expected a row at each time of the odometry"):
         streams.align_streams(stream, ([0.5], [0], np.ones((1, 2))), streams.as_recorded)
+
+
+def made_trace(steps=5, runs=()):
+    """A trace of NumPy arrays, whose fields are as those of `run`; of one measurement a step."""
+    shape = (*runs, steps)
+    status = np.full((*shape, 1), Status.FUSED)
+    status[..., 0, 0] = Status.BORN
+    info = Info(
+        *(np.ones((*shape, 1)), np.ones((*shape, 1), int), np.zeros((*shape, 1, 2))),
+        *(np.zeros((*shape, 1, 2, 2)), np.zeros((*shape, 1), int), status, np.zeros(shape)),
+    )
+    cov = np.broadcast_to(np.diag([1.0, 2.0, 0.1]), (*shape, 3, 3)).copy()
+    point_covs, alive = np.zeros((*shape, 4, 2, 2)), np.zeros((*shape, 4), bool)
+    points, tag = np.zeros((*shape, 4, 2)), np.full((*shape, 4), -1)
+    estimate = Estimate(np.zeros((*shape, 3)), cov, points, point_covs, alive, tag)
+    return Trace(estimate, info, None, None)
+
+
+def test_records_of_arrays_are_shown_by_kind_and_shape():
+    log, trace = good_log(steps=2000), made_trace(2000)
+    assert repr(log) == (
+        "Log(control=float64[2000,3], scan=Scan(z=float64[2000,3,2], tag=int64[2000,3], "
+        "valid=bool[2000,3]))"
+    )
+    truth = Truth(np.zeros((7, 3)), np.zeros((2, 2)), np.zeros(7, int), np.zeros(3))
+    assert repr(truth).endswith("missed=int64[7], start=float64[3], origin=None)")
+    assert repr(trace).startswith("Trace(2000 steps: 1,999 fused, 1 born,\n")
+    assert "pose_cov=float64[2000,3,3]" in repr(trace) and len(repr(trace)) < 800
+    assert repr(made_trace(5, runs=(3,))).startswith("Trace(3 × 5 steps: 12 fused, 3 born,")
+    assert "log_likelihood=0.5" in repr(trace.info._replace(log_likelihood=np.float64(0.5)))
+
+    def traced(log, trace):
+        shown.extend((repr(log), repr(trace)))
+        return log, trace
+
+    shown = []
+    given = jax.tree.map(jnp.asarray, (log, trace))
+    jax.eval_shape(traced, *given)
+    jax.make_jaxpr(jax.vmap(traced))(*jax.tree.map(lambda leaf: leaf[None], given))
+    assert shown[0] == shown[2] == repr(log)
+    assert shown[1] == shown[3] and shown[1].startswith("Trace(estimate=Estimate(pose=float64[2000")
+    shapes = jax.eval_shape(lambda *given: given, *given)
+    assert (repr(shapes[0]), repr(shapes[1])) == tuple(shown[:2])
+    assert repr(jax.tree.map(lambda _: None, log)).startswith("Log(control=None, scan=Scan(")
+
+
+def test_a_trace_counts_what_is_wrong_with_its_estimates():
+    trace = made_trace(10)
+    assert trace.doubts == ()
+    cov = trace.estimate.pose_cov
+    cov[3, 0, 1], cov[4:6], cov[7, 2, 2] = 0.5, -cov[4:6], 0.0
+    trace.estimate.pose[8, 0] = np.nan
+    trace.info.nis[9] = np.inf
+    assert trace.doubts == (
+        "estimate or Info is not finite in 2 of 10 steps",
+        "pose_cov is not symmetric in 1 of 10 steps",
+        "pose_cov is not positive definite in 2 of 10 steps",
+    )
+    assert all(doubt in repr(trace) for doubt in trace.doubts)
+    assert jax.tree.map(jnp.asarray, trace).doubts == trace.doubts
+    with pytest.raises(ValueError, match=r"Trace\.doubts: it needs values"):
+        jax.eval_shape(lambda trace: trace.doubts and trace, trace)

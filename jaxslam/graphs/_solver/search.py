@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from jaxslam.core._reprs import short_repr
 from jaxslam.graphs._graph import Graph
 from jaxslam.graphs._solver.linearized import (
     System,
@@ -98,6 +99,9 @@ class Solution(NamedTuple):
     weights: dict[str, Float[Array, "E"]]
     """ρ'(s) of the rows of each table at the last iterate, by which a kernel multiplies their
     information: 1 without a kernel, 0 of rows that are not valid"""
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
 
 class _Search(NamedTuple):

@@ -13,6 +13,7 @@ from jax.typing import ArrayLike
 from jaxtyping import Array, Bool, Float
 
 from jaxslam.core._numbers import check_real, is_concrete, shape_text
+from jaxslam.core._reprs import short_repr
 from jaxslam.core.types import JaxOrNumPy
 from jaxslam.math import se2
 
@@ -31,6 +32,9 @@ class Grid(NamedTuple):
     """pose of the lower left corner of cell (0, 0) in the world"""
     resolution: Float[JaxOrNumPy, ""]
     """side of a cell [m]"""
+
+    def __repr__(self) -> str:
+        return short_repr(self)
 
     @property
     def probability(self) -> Float[Array, "H W"]:
