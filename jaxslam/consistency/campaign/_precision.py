@@ -101,10 +101,10 @@ def _difference(plan: CampaignPlan, candidate: Candidate, numbers: np.ndarray) -
             world, method, jax.device_put(key, everywhere), these, draws
         )
         estimate, info = results.estimate, results.info
-        runs: PyTree = estimate.pose, estimate.pose_cov, results.own_error
-        runs = _Runs(*runs, info.status, info.nis, info.dof)
-        on_host: tuple[_Runs, Draws] = jax.device_get((runs, draws))
-        return on_host
+        of_estimate = estimate.pose, estimate.pose_cov, results.own_error
+        parts: PyTree = (*of_estimate, info.status, info.nis, info.dof)
+        parts, draws = jax.device_get((parts, draws))
+        return _Runs(*parts), draws
 
     single, draws = filtered(None, plan.key)
     try:
