@@ -61,7 +61,7 @@ def moved(of: _T, origin: Origin, controls: ArrayLike | None = None) -> _T | Non
     """
     if not _is_ours(of, []):
         return None
-    there = _relative(of, origin)
+    there: _T = _relative(of, origin)
     return there if may_move(there, origin, controls) else None
 
 
@@ -158,13 +158,12 @@ def _change(
     return jnp.stack([jnp.abs(far - near).max(initial=0.0) for near, far in pairs]).max()
 
 
-def _relative(of: _T, origin: Origin) -> _T:
+def _relative(of: Any, origin: Origin) -> Any:
     """The record, or the truth, with the positions among its fields relative to an origin."""
     if isinstance(of, Truth):
-        of_truth = {
-            name: shifted(getattr(of, name), -origin) for name in ("pose", "landmarks", "start")
-        }
-        return of._replace(**of_truth)
+        places = of.pose, of.landmarks, of.start
+        pose, landmarks, start = (shifted(each, -origin) for each in places)
+        return of._replace(pose=pose, landmarks=landmarks, start=start)
     names = {field.name for field in dataclasses.fields(of)}
     changed: dict[str, Any] = {
         name: shifted(getattr(of, name), -origin) for name in names & {"pose", "landmarks"}
@@ -184,7 +183,8 @@ def shifted(positions: ArrayLike, by: Origin) -> np.ndarray:
 def returned(of: _T, origin: Origin) -> _T:
     """A truth or an estimate relative to an origin, in the coordinates of the map, in float64."""
     if isinstance(of, Truth):
-        return _relative(of, -origin)
+        truth: _T = _relative(of, -origin)
+        return truth
     assert isinstance(of, Estimate)
     points = np.where(np.asarray(of.alive)[..., None], shifted(of.points, origin), 0.0)
     return of._replace(pose=shifted(of.pose, origin), points=points)

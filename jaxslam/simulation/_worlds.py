@@ -210,11 +210,12 @@ def simulate(scenario: World, key: Array) -> tuple[Truth, Log]:
     """
     check_record("simulate", "scenario", scenario, World)
     check_key("simulate", key)
-    near, origin = scenario, None
+    near: World | None = None
+    origin = None
     # A new array is a tracer where a trace is active, also where all arguments are constants.
     if jnp.result_type(float) == jnp.float32 and is_concrete(scenario, key, jnp.zeros(())):
         origin = far_origin(scenario.pose, scenario.landmarks, FAR)
-        near = scenario if origin is None else moved(scenario, origin, scenario.controls)
+        near = None if origin is None else moved(scenario, origin, scenario.controls)
     if near is None or origin is None:
         found: tuple[Truth, Log] = _draw(scenario, key)
         return found

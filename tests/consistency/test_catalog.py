@@ -360,6 +360,7 @@ def test_the_square_root_filter_is_the_filter(name, options):
 
 
 @pytest.mark.sweep
+@pytest.mark.filterwarnings("ignore:run. .*precision decides:UserWarning")
 def test_in_float32_the_square_root_survives_what_the_covariance_does_not():
     """Sharp measurements of a vague map: P loses its definiteness to rounding, X cannot."""
     sharp = sensors.RangeBearing(np.diag([1e-4, 1e-4]) ** 2)

@@ -287,10 +287,14 @@ def _near_the_origin(
     )
     out: dict[str, Candidate] = {}
     for name, candidate in filters.items():
+        there: Candidate | None
         if isinstance(candidate, Filter | LogEstimator):
             there = moved(candidate, origin, scenario.controls)
         else:  # a function of the truth, which is relative
-            made = method_of(candidate, truth)
+            try:
+                made = method_of(candidate, truth)
+            except Exception:  # it may need the truth of a run; where it is wrong, that says so
+                made = None
             known = isinstance(made, Filter | LogEstimator)
             there = candidate if known and may_move(made, origin, scenario.controls) else None
         if there is None:

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import NamedSharding
-from jaxtyping import Float, Int
+from jaxtyping import Float, Int, PyTree
 
 from jaxslam._rounding import SAME, Rounding, rounding_of
 from jaxslam.consistency._measures.nees import block_nees, pose_error
@@ -100,9 +100,11 @@ def _difference(plan: CampaignPlan, candidate: Candidate, numbers: np.ndarray) -
         results: FilterResults = made.drive(
             world, method, jax.device_put(key, everywhere), these, draws
         )
-        info = results.info
-        runs = _Runs(*results.estimate[:2], results.own_error, info.status, info.nis, info.dof)
-        return jax.device_get((runs, draws))
+        estimate, info = results.estimate, results.info
+        of_estimate = estimate.pose, estimate.pose_cov, results.own_error
+        parts: PyTree = (*of_estimate, info.status, info.nis, info.dof)
+        parts, draws = jax.device_get((parts, draws))
+        return _Runs(*parts), draws
 
     single, draws = filtered(None, plan.key)
     try:
@@ -111,7 +113,7 @@ def _difference(plan: CampaignPlan, candidate: Candidate, numbers: np.ndarray) -
                 lambda leaf: leaf.astype(float) if leaf.dtype == np.float32 else leaf, draws
             )
             double, _ = filtered(wide, plan.key)
-            scores = _scores((single, double), draws[0].pose)
+            scores = _scores((single, double), np.asarray(draws[0].pose))
             gaps = np.stack([_gap(*pair) for pair in scores.values()])[:, : len(wanted)]
             if not gaps.max() > SAME:
                 return ""

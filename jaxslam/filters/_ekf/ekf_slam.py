@@ -75,8 +75,8 @@ class EkfSlam(Filter):
     """passes of the iterated EKF, each from the same prior; 1 is the plain EKF"""
     covariance: Covariance = static(default="plain")
     """"plain"; "joseph", Joseph's form of the update, which costs more, and in float32 fails where
-    "plain" does; or "square_root", a root X of P = X Xᵀ instead of P, which in float32 is right to
-    starts of σ = 1 km, at a higher cost (the prediction is O(N³))"""
+    "plain" does; or "square_root", a root X of P = X Xᵀ instead of P, which holds twice the digits,
+    at a higher cost (the prediction is O(N³))"""
     births: int | None = static(default=None)
     """largest number of new landmarks a scan, the first in its order (that of tags in simulated
     scans), the rest `Status.DEFERRED`. The guide starts one, picked at random. None: no limit"""
