@@ -66,7 +66,7 @@ def test_a_manifest_is_whole_or_refused(made, tmp_path):
         ('{\n"format": 1,\n"settings": {]}', "manifest.json, line 3: "),
         ("[]", "manifest.json: not the manifest"),
         ("\udcff", "manifest.json: not JSON"),
-        (text.replace('"format": 3', '"format": 2'), "manifest.json: expected format 3, got 2"),
+        (text.replace('"format": 4', '"format": 2'), "manifest.json: expected format 4, got 2"),
         (
             text.replace('"seed": 3', '"seed": 4'),
             "manifest.json: it was changed since .*: put the original back",
