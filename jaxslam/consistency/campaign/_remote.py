@@ -44,16 +44,18 @@ def packed(plan: CampaignPlan) -> bytes:
     """
     sent: PyTree = replace(plan, devices=[one.platform for one in plan.devices])
     settings = {name: getattr(jax.config, name) for name in _SETTINGS}
-    by: Any = pickle
+    pickler: Any = pickle
     more = ""
     try:
         # By cloudpickle classes and functions of a script, a notebook or a file can be sent, too.
         with loading("a module holds it, or", "cloudpickle"):
-            import cloudpickle as by
+            import cloudpickle
+
+            pickler = cloudpickle
     except Unusable as lacking:
         more = f": {lacking}"
     try:
-        content: bytes = by.dumps((sent, settings))
+        content: bytes = pickler.dumps((sent, settings))
     except (pickle.PicklingError, AttributeError, TypeError) as error:
         raise ValueError(
             f"monte_carlo: executor: a filter or the world cannot be sent ({error}){more}"
