@@ -71,7 +71,8 @@ class Summary:
     """by measure, the averages (at most, at least) that such a campaign notices nine times in ten:
     what "consistent" says, which means not rejected"""
     doubts: tuple[str, ...] = ()
-    """sentences that qualify the verdict, the gravest first: see `judge`"""
+    """sentences that qualify the verdict, the gravest first (see `judge`), and last whether the
+    precision of the arithmetic decides"""
     honest_nis: float = 1.0
     """nis_per_dof from here on up to 1 is honest: below 1 where a gate dropped measurements"""
 

@@ -65,6 +65,11 @@ def monte_carlo(
 ) -> Campaign:
     """Run every filter over the same `runs` worlds of a scenario and sum up its consistency.
 
+    Where rounding comes near the noise in float32, the first runs are filtered again in float64: a
+    filter whose precision decides gets a doubt with the numbers of both (`Summary.doubts`). A world
+    whose origin is far from its map is computed with positions relative to the start, if neither
+    world nor filters depend on where that is.
+
     Args:
         scenario: what to draw; see `scenarios`.
         filters: by name. A function instead of a filter is called with each run's `Truth`.
@@ -144,7 +149,8 @@ def monte_carlo(
         tallies[name].merge(tally)
     campaign = None
     if tallies[BOUND].pieces():
-        campaign = _summed_up(plan, tallies, work, origin, time.perf_counter() - began)
+        seconds = time.perf_counter() - began
+        campaign = _summed_up(plan, tallies, work, origin, seconds, compare=stop is None)
     if isinstance(stop, Incomplete):
         done = f"{campaign.runs if campaign else 0} of {runs} runs done"
         raise Incomplete(f"monte_carlo: executor: {stop}; {done}", campaign) from stop.__cause__
@@ -237,15 +243,19 @@ def _summed_up(
     work: Work,
     origin: np.ndarray | None,
     seconds: float,
+    compare: bool,
 ) -> Campaign:
-    """The campaign of the runs in the tallies; origin: what positions are relative to."""
+    """The campaign of the runs in the tallies.
+
+    origin: what positions are relative to. compare: whether runs may be filtered again in float64.
+    """
 
     def in_the_map(found: _T) -> _T:
         return found if origin is None else returned(found, origin)
 
     scenario = plan.scenario
     finished, limit, summaries = summaries_of(tallies)
-    for name, doubt in precision_doubts(plan, tallies, limit.dtype).items():
+    for name, doubt in precision_doubts(plan, tallies, limit.dtype, compare).items():
         summaries[name] = replace(summaries[name], doubts=(*summaries[name].doubts, doubt))
     steps = max(scenario.steps, 1)
     return Campaign(

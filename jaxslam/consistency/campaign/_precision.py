@@ -38,9 +38,12 @@ RUNS = 16
 
 
 def precision_doubts(
-    plan: CampaignPlan, tallies: Mapping[str, Tally], dtype: np.dtype
+    plan: CampaignPlan, tallies: Mapping[str, Tally], dtype: np.dtype, compare: bool = True
 ) -> dict[str, str]:
-    """By filter, a sentence on the precision of its runs, where that decides; dtype: theirs."""
+    """By filter, a sentence on the precision of its runs, where that decides.
+
+    dtype: that of the runs. compare: whether they may be filtered again.
+    """
     least, doubts = least_noise(plan.scenario), {}
     for name, candidate in plan.filters.items():
         tally = tallies[name]
@@ -48,7 +51,8 @@ def precision_doubts(
         singular = int(tally.sums["singular"])
         suspect = rounding.may_decide or singular or not tally.flags("finite").all()
         doubt = rounding.doubt
-        if dtype == np.float32 and suspect and rounding.of_position < 0.1:
+        comparable = dtype == np.float32 and rounding.of_position < 0.1
+        if compare and comparable and suspect:
             difference = _difference(plan, candidate, tally.numbers())
             if difference == "" and singular and least > 0:
                 difference = f"{singular:,} innovation covariances were singular in float32"
