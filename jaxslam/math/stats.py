@@ -8,7 +8,7 @@ computed by JAX.
 
 import math
 from functools import partial
-from typing import overload
+from typing import TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -31,11 +31,10 @@ __all__ = [
 ]
 
 
-@overload
-def chi2_quantile(p: float, dof: float) -> float: ...
-@overload
-def chi2_quantile(p: Array, dof: int) -> Array: ...
-def chi2_quantile(p: Number, dof: float) -> Number:
+_P = TypeVar("_P", bound=Number)
+
+
+def chi2_quantile(p: _P, dof: float) -> _P:
     """The x with P(χ²_dof <= x) = p. Raises ValueError unless 0 < p < 1 and dof > 0.
 
     p may be a JAX array of any shape, traced or not, whose values are not checked: 1 counts as the
@@ -43,13 +42,12 @@ def chi2_quantile(p: Number, dof: float) -> Number:
     dof is then a whole number.
     """
     if isinstance(p, jax.Array):
-        quantile: Array = _traced_quantile(p, dof)
-        return quantile
+        return cast(_P, _traced_quantile(p, dof))
     if not 0 < p < 1:
         raise ValueError(f"chi2_quantile: expected a probability between 0 and 1, got {p}")
     if not dof > 0:
         raise ValueError(f"chi2_quantile: expected dof above 0, got {dof}")
-    return float(chi2_quantiles(p, np.asarray(dof)))
+    return cast(_P, float(chi2_quantiles(p, np.asarray(dof))))
 
 
 def chi2_quantiles(p: float, dof: np.ndarray) -> np.ndarray:
@@ -87,7 +85,7 @@ def _half_quantile(p: Float[Array, "*B"], dof: int) -> Float[Array, "*B"]:
     for _ in range(_NEWTON_STEPS):
         # The last step alone gives the derivative by p.
         h = jax.lax.stop_gradient(jnp.maximum(h, least))
-        terms = [h**j / math.gamma(j + 1) for j in np.arange(a - 1, -0.5, -1)]
+        terms = [h**j / math.gamma(j + 1) for j in np.arange(a - 1, -0.5, -1).tolist()]
         tail = sum(terms) + (jnp.exp(h) * erfc(jnp.sqrt(h)) if dof % 2 else 0.0)  # eʰ Q
         h = h + (jnp.log(tail) - h - jnp.log1p(-p)) * tail / terms[0]
     return h
