@@ -37,9 +37,11 @@ from jaxslam.consistency.campaign._work import Work, shown_progress
 from jaxslam.core._numbers import check_count, check_key, is_concrete
 from jaxslam.core._validation import check_record
 from jaxslam.core.protocols import Candidate
+from jaxslam.math._xla import moves_numbers
 from jaxslam.simulation._worlds import World, with_positions
 
 
+@moves_numbers
 def monte_carlo(
     scenario: World,
     filters: Mapping[str, Candidate],
