@@ -24,9 +24,10 @@ from jaxslam.core._validation import (
 )
 from jaxslam.core.protocols import Filter, Wrapper
 from jaxslam.core.types import Log, Scan, Status, Trace
-from jaxslam.math._xla import hot_jit
+from jaxslam.math._xla import hot_jit, moves_numbers
 
 
+@moves_numbers
 def run(
     filter: Filter,
     log: Log,

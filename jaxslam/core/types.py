@@ -376,7 +376,7 @@ class Beams(NamedTuple):
         `Beams`.
         """
         with np.errstate(invalid="ignore"):  # comparisons with NaN, which are false
-            says = (self.range > min_range) & (self.valid != 0)
+            says = (self.range > min_range) & self.valid.astype(bool)
             says = says & (self.angle > -np.inf) & (self.angle < np.inf)
             met = self.range < max_range * (1 - 1e-6)  # less the rounding of float32
         return says & met, says & ~met

@@ -19,6 +19,7 @@ from jaxslam.core._validation import call_traced, check_record
 from jaxslam.core.protocols import Component, Motion, Sensor
 from jaxslam.core.types import Log, Scan, Truth
 from jaxslam.filters._ekf.ekf_settings import EkfOptions
+from jaxslam.math._xla import moves_numbers
 from jaxslam.math.angles import wrap
 from jaxslam.sensors._suite import Suite
 from jaxslam.simulation._scans import (
@@ -196,6 +197,7 @@ class Scenario(World):
         return side_by_side(scans, len(sensors.measurements))
 
 
+@moves_numbers
 def simulate(scenario: World, key: Array) -> tuple[Truth, Log]:
     """One random history of a world: the truth, and the log of controls and noisy scans.
 

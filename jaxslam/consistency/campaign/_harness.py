@@ -42,11 +42,13 @@ from jaxslam.core._validation import check_record
 from jaxslam.core.protocols import Candidate, Filter
 from jaxslam.core.types import Truth
 from jaxslam.graphs.smoothing._forward_pass import LogEstimator
+from jaxslam.math._xla import moves_numbers
 from jaxslam.simulation._worlds import World, with_positions
 
 _T = TypeVar("_T")
 
 
+@moves_numbers
 def monte_carlo(
     scenario: World,
     filters: Mapping[str, Candidate],

@@ -225,7 +225,7 @@ def _finish_scan(
     index: where the measured landmarks are in the active set.
     """
     at = jnp.where(has_slot, index, state.active.shape[0])
-    refused = state.counts.refused + (scan.valid.any() & ~solved)
+    refused = state.counts.refused + (scan.valid.any() & ~solved).astype(jnp.int32)
     return state._replace(
         omega=jnp.where(solved, omega, canonical.diagonal_loading(state.omega)),
         last_measured=state.last_measured.at[at].set(state.scans + 1, mode="drop"),

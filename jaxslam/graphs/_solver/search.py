@@ -197,7 +197,7 @@ def minimize(
             damping=jnp.where(active & ~began, damping_after(search, good, ratio), search.damping),
             going=search.going & ~lost,
             ending=jnp.where(lost, Ending.DIVERGED, search.ending).astype(jnp.int32),
-            taken=search.taken + active,
+            taken=search.taken + active.astype(jnp.int32),
             refused=refused,
             careful=jnp.where(active, ~good, search.careful),
             former=jnp.where(take & ~began, search.system.chi2, search.former),

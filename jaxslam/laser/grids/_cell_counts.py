@@ -182,7 +182,7 @@ def _cross(
     height, width = shape
     nowhere = misses.shape[0]
     delta = ends - start
-    forward = jnp.where(delta >= 0, 1, -1)
+    forward = jnp.where(delta >= 0, 1, -1).astype(jnp.int32)
     first = jnp.floor(start).astype(jnp.int32)
     last = jnp.floor(jnp.clip(ends, -_FARTHEST, _FARTHEST)).astype(jnp.int32)
     steps = jnp.where(live, jnp.abs(last - first).sum(axis=1), 0)
@@ -198,11 +198,12 @@ def _cross(
         at = jnp.where(going & inside, cell[:, 1] * width + cell[:, 0], nowhere)
         misses = misses.at[at].add(1, mode="drop")
         # The share of the beam up to the next line of each axis; none where the end is reached.
-        crossing = (cell + (forward > 0) - start) * slope
+        line = (cell + (forward > 0).astype(jnp.int32)).astype(start.dtype)
+        crossing = (line - start) * slope
         crossing = jnp.where(cell == last, jnp.inf, crossing)
         across = crossing[:, 0] < crossing[:, 1]
-        move = jnp.stack([across, ~across], axis=1) * forward
-        arrived = jnp.where(inside, arrived + going, steps)
+        move = jnp.where(jnp.stack([across, ~across], axis=1), forward, 0)
+        arrived = jnp.where(inside, arrived + going.astype(steps.dtype), steps)
         return misses, jnp.where(going[:, None], cell + move, cell), arrived
 
     begin: tuple[Array, ...] = (misses, first, jnp.zeros_like(steps))

@@ -126,7 +126,7 @@ def _envelope(column: Int[Array, "W H"]) -> Int[Array, "W H"]:
         cell = jnp.ceil(rise.astype(jnp.float32) / run.astype(jnp.float32))
         cell = jnp.clip(cell, -1, width).astype(jnp.int32)
         beyond = cell * run - rise
-        return cell + (beyond < 0) - (beyond >= run)
+        return cell + (beyond < 0).astype(jnp.int32) - (beyond >= run).astype(jnp.int32)
 
     def unfinished(state: tuple[Array, ...]) -> Array:
         return (state[0] < width).any()

@@ -166,7 +166,7 @@ def _around(
     i = jnp.clip(jnp.floor(y).astype(jnp.int32), 0, max(height - 2, 0))
     right, up = jnp.minimum(j + 1, width - 1), jnp.minimum(i + 1, height - 1)
     entries = values[i, j], values[i, right], values[up, j], values[up, right]
-    return entries, (x - j, y - i)
+    return entries, (x - j.astype(x.dtype), y - i.astype(y.dtype))
 
 
 def read_map(path: str | Path) -> Grid:

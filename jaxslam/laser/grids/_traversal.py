@@ -182,8 +182,9 @@ def _where(goes: Array, after: _Square, at: _Square) -> _Square:
 
 def _crossings(rays: _Rays, at: _Square) -> tuple[Array, Array]:
     """The lengths at which rays cross the next line of either axis."""
-    exit_x = (at.x + (rays.dx > 0) - rays.x) * rays.over_x + rays.far_x
-    exit_y = (at.y + (rays.dy > 0) - rays.y) * rays.over_y + rays.far_y
+    right, up = (rays.dx > 0).astype(at.x.dtype), (rays.dy > 0).astype(at.y.dtype)
+    exit_x = (at.x + right - rays.x) * rays.over_x + rays.far_x
+    exit_y = (at.y + up - rays.y) * rays.over_y + rays.far_y
     return exit_x, exit_y
 
 

@@ -93,7 +93,7 @@ def _best_shift(
 
     def step(state: tuple[Array, _Nodes, Array, _Best]) -> tuple[Array, _Nodes, Array, _Best]:
         size, stack, value, best = state
-        at = size - 1 - jnp.arange(_CHUNK)
+        at = size - 1 - jnp.arange(_CHUNK, dtype=size.dtype)
         live = (at >= 0) & (value[jnp.maximum(at, 0)] > best.value)
         parent = jax.tree.map(lambda part: jnp.repeat(part[jnp.maximum(at, 0)], 4, axis=0), stack)
         level = parent.level - 1
@@ -239,7 +239,7 @@ class Correlative(Matcher):
         corners = _square(np.arange(-shifts, shifts + 1, block))
         steps = int(np.ceil(self.turn_window / self.turn - 1e-9))
         turns = start[2] + jnp.asarray(self.turn * np.arange(-steps, steps + 1), start.dtype)
-        count = jnp.maximum(points.valid.sum(), 1)
+        count = jnp.maximum(points.valid.sum(dtype=start.dtype), 1)
         _, height, width = prepared.table.shape
         cell_size = prepared.field.resolution
         axes = cell_size * se2.rotation(prepared.field.origin[2])[:, ::-1]  # of a row, of a column
@@ -267,7 +267,7 @@ class Correlative(Matcher):
             if prior is None:
                 return jnp.zeros(len(nodes.turn), start.dtype)
             half = 0.5 * ((1 << nodes.level) - 1).astype(start.dtype)
-            middle = (nodes.shift + half[:, None]) @ axes.T + start[None, :2]
+            middle = (nodes.shift.astype(half.dtype) + half[:, None]) @ axes.T + start[None, :2]
             pose = jnp.concatenate([middle, turns[nodes.turn][:, None]], axis=1)
             e = jax.vmap(prior.error)(pose)
             square = jnp.maximum(((e @ prior.information) * e).sum(axis=1), 0.0)
@@ -290,18 +290,21 @@ class Correlative(Matcher):
         best = _best_shift(bound_of, roots, bounds, levels, shifts)
         elsewhere: Array | bool = False
         if ambiguous is not None:
-            by_turn = length_of(points) * self.turn
+            by_turn = length_of(points) * float(self.turn)
 
             def far(nodes: _Nodes) -> Array:
-                way = cell_size * (nodes.shift - best.shift[None])
-                return jnp.hypot(*way.T) + by_turn * jnp.abs(nodes.turn - best.turn) > apart
+                way = cell_size * (nodes.shift - best.shift[None]).astype(start.dtype)
+                turned = jnp.abs(nodes.turn - best.turn).astype(start.dtype)
+                return jnp.hypot(*way.T) + by_turn * turned > apart
 
             limit = ambiguous * best.value
             other = _best_shift(
                 bound_of, roots, bounds, levels, shifts, above=limit, counts=far, first=True
             )
             elsewhere = other.value > limit
-        pose = jnp.concatenate([start[:2] + axes @ best.shift, wrap(turns[best.turn])[None]])
+        pose = jnp.concatenate(
+            [start[:2] + axes @ best.shift.astype(axes.dtype), wrap(turns[best.turn])[None]]
+        )
         moved = points.position @ se2.rotation(pose[2]).T + pose[None, :2]
         residual = interpolate(prepared.field, moved)
         weight = (points.valid & (residual < 3 * sigma)).astype(residual.dtype)

@@ -165,7 +165,7 @@ class Icp(Matcher):
             onto = determined(information, length, limits.condition)
             # The exact step where the scans determine all of it, else that of Gauss and Newton.
             moved = jnp.where(
-                (onto == jnp.eye(3)).all(),
+                (onto == jnp.eye(3, dtype=onto.dtype)).all(),
                 least(both),
                 within(quadratic, middle, onto, pose),
             )

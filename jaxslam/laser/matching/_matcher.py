@@ -131,7 +131,8 @@ def match(
     batch = _checked(matcher, reference, points, start)
     if prior is not None:
         _check_prior(prior, batch)
-    dtype = jnp.result_type(points.position, *floats(reference), jnp.float32)
+    with jax.numpy_dtype_promotion("standard"):  # the user may have refused promotion: "strict"
+        dtype = jnp.result_type(points.position, *floats(reference), jnp.float32)
     start = jnp.asarray(start, dtype)
     reference, points, prior = in_dtype((reference, points, prior), dtype)
     found: Match = (_many if batch else _one)(matcher, reference, points, start, prior)

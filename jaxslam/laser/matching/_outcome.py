@@ -69,7 +69,7 @@ def make_match(
         status=status,
         iterations=iterations,
         residual=jnp.sqrt((weight * residual**2).sum() / total),
-        inliers=took_part.sum() / count.astype(weight.dtype),
+        inliers=took_part.sum(dtype=weight.dtype) / count.astype(weight.dtype),
         score=score,
         information=information,
         weakest=weakest,
@@ -87,7 +87,7 @@ def length_of(points: Points) -> Float[Array, ""]:
     The factor of an angle beside lengths.
     """
     square = jnp.where(points.valid, (points.position**2).sum(axis=1), 0.0).sum()
-    mean = square / jnp.maximum(points.valid.sum(), 1)
+    mean = square / jnp.maximum(points.valid.sum(dtype=square.dtype), 1)
     return jnp.sqrt(jnp.where(mean > 0, mean, 1.0))
 
 

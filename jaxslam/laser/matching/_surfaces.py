@@ -159,7 +159,7 @@ def weights(
     kept = possible
     if trim is not None:
         size = jnp.where(possible, jnp.abs(residual), jnp.inf)
-        count = jnp.ceil(trim * possible.sum()).astype(jnp.int32)
+        count = jnp.ceil(trim * possible.sum(dtype=residual.dtype)).astype(jnp.int32)
         limit = jnp.sort(size)[jnp.clip(count - 1, 0, len(size) - 1)]
         kept = possible & (size <= limit)
     weight = kept.astype(residual.dtype)
