@@ -130,8 +130,9 @@ def dual(
 _FIRST_GAP = 1e-6
 """The first gap, relative to χ² + 1."""
 
-_NEGLIGIBLE_GAP = 1e-5
-"""The gap that counts as zero."""
+_NEGLIGIBLE_GAP = 3e-5
+"""The gap that counts as zero, relative to χ² + 1: between two of those that are tried, each ten
+times the last."""
 
 _POWERS = 100
 """iterations for the smallest eigenvalue"""
@@ -250,14 +251,16 @@ def _prove(model: Model, plan: Plan, graph: Graph) -> Certificate:
     value = found.chi2
     bound = multipliers.sum(axis=0)
     margin = jnp.maximum(
-        _FIRST_GAP * (value + 1.0) / poses, 16 * jnp.finfo(dtype).eps * blocks.max((0, 1, 2))
+        _FIRST_GAP * (value + 1.0) / poses,
+        16 * jnp.finfo(dtype).eps * (blocks * turns).max((0, 1, 2)),
     )
 
     def shifted(shift: Array) -> Array:
         return blocks + shift[None, None, None] * turns
 
     def proof(shift: Array) -> Array:
-        return factorize(plan.cholesky, shifted(shift)).regular.all(axis=0)
+        # A pivot with an error below a thirtieth of itself is positive.
+        return factorize(plan.cholesky, shifted(shift), uncertain=1 / 32).regular.all(axis=0)
 
     def wider(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
         shift, good, count = carry

@@ -191,6 +191,9 @@ def optimize_chain(
         at, chain, value = jax.tree.map(lambda a, b: jnp.where(moved, a, b), trial, here)
         ending = jnp.where(converged, Ending.CONVERGED, Ending.EXHAUSTED)
         ending = jnp.where(may & ~lower, Ending.STALLED, ending)
+        if tolerance is not None:
+            hidden = ~moved & (policy.decrement <= _rounding_of_cost(search))
+            ending = jnp.where(hidden, Ending.CONVERGED, ending)
         late = jnp.arange(iterations, dtype=search.taken.dtype) >= search.taken
         found = Iterations(
             at=at,
@@ -240,6 +243,20 @@ def _has_converged(search: Iterations, policy: Policy, tolerance: float) -> Bool
     idle = policy.decrement > 0.8 * search.policy.decrement
     idle = idle & (policy.decrement <= eps * search.cost)
     return (search.taken > 0) & ((policy.decrement <= least**2) | idle)
+
+
+def _rounding_of_cost(search: Iterations) -> Float[Array, ""]:
+    """What rounding of the coordinates changes of the cost, |r| |δr|; at most 0.01, a step of a
+    tenth of a standard deviation.
+
+    δr is by two ulp of the largest coordinate of a position, and of π.
+    """
+    at, steps = search.at, search.chain.steps
+    far = jnp.abs(jnp.concatenate([at.path[:, :2].ravel(), at.landmarks.ravel()])).max(initial=0.0)
+    by_pose, by_map = jnp.abs(steps.pose_rows), jnp.abs(steps.landmark_rows)
+    change = far * (by_pose[..., :2].sum(-1) + by_map.sum(-1)) + jnp.pi * by_pose[..., 2]
+    change = 2 * float(jnp.finfo(search.cost.dtype).eps) * jnp.sqrt((change**2).sum())
+    return jnp.minimum(jnp.sqrt(2 * search.cost) * change, 0.01)
 
 
 def _line_search(

@@ -65,7 +65,8 @@ class Ending(IntEnum):
     """The reason for the end of the iterations: the `status` of a `Solution`."""
 
     CONVERGED = 0
-    """The next step lowers χ² by less than the tolerance, and the information is regular."""
+    """The next step lowers χ² by less than the tolerance, or than rounding of the coordinates does,
+    and the information is regular."""
     STALLED = 1
     """No step lowers χ²: rounding, or a residual whose derivatives are wrong. Another start may
     end in a minimum."""
@@ -216,6 +217,20 @@ def minimize(
         more = jnp.where(search.careful, 100.0, 10.0) * search.damping
         return jnp.where(good, kept, jnp.maximum(more, _FIRST_DAMPING))
 
+    def unresolved(search: _Search) -> Float[Array, "B"]:
+        """What a step of two ulp of the largest coordinates changes, δᵀ diag(H) δ; 0 where that is
+        a tenth of a σ on average, and rounding spoils the result."""
+        poses, points = search.variables
+        ulp = [
+            jnp.broadcast_to(jnp.abs(x).max(axis=1, keepdims=True), (len(x), width, *batch))
+            for x in (poses[:, :2], points)
+        ]
+        ulp[0] = ulp[0].at[:, 2].set(jnp.pi)
+        step = 2 * eps * jnp.concatenate(ulp)[plan.order]
+        diagonal = jnp.diagonal(search.system.blocks[plan.cholesky.diagonal], axis1=1, axis2=2)
+        change = dot(jnp.where(data.free, jnp.moveaxis(diagonal, 2, 1), 0.0) * step, step)
+        return jnp.where(change < 0.01 * data.free.sum(axis=(0, 1)), change, 0.0)
+
     def proposed(search: _Search) -> _Search:
         """The search with its next trial, or at its end."""
         plain = search.damping == 0
@@ -226,7 +241,7 @@ def minimize(
         singular = jnp.where(plain & ~regular & ~known, culprit, search.singular)
         chi2 = search.system.chi2
         least = jnp.maximum(tolerance * chi2, 32 * eps * (chi2 + 1))
-        small = step.predicted <= least
+        small = step.predicted <= jnp.maximum(least, unresolved(search))
         # Only regularity at the end matters, not on the way.
         singular = jnp.where(plain & regular & small, -1, singular)
         known = singular >= 0
