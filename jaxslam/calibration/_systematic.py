@@ -17,6 +17,7 @@ from jaxslam.core._numbers import check_count, is_concrete
 from jaxslam.core._record import as_record
 from jaxslam.core.types import Info, Status
 from jaxslam.math import _linalg as linalg
+from jaxslam.math._definite import asymmetric, indefinite
 
 
 class Calibration(NamedTuple):
@@ -238,12 +239,8 @@ def _covariance(cov: ArrayLike, size: int) -> Float[np.ndarray, "P P"]:
         )
     if not np.isfinite(c).all():
         raise ValueError("consider_cov: expected a covariance, got one that is not finite")
-    if not np.allclose(c, c.T):
+    if asymmetric(c, 1e-6):  # written with six digits
         raise ValueError("consider_cov: expected a covariance, got one that is not symmetric")
-    deviation = np.sqrt(np.maximum(np.diag(c), 0.0))
-    scale = np.outer(deviation, deviation)
-    correlation = c / np.where(scale > 0, scale, 1.0)
-    none = (np.diag(c) < 0).any() or (c[scale == 0] != 0).any()
-    if none or np.linalg.eigvalsh(correlation)[0] < -1e-9:
+    if indefinite(c, 1e-6):
         raise ValueError("consider_cov: expected a covariance, got one with a negative eigenvalue")
     return c

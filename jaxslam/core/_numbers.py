@@ -12,6 +12,7 @@ from numpy.typing import ArrayLike
 
 from jaxslam.core._units import TURN
 from jaxslam.math._arrays import Number
+from jaxslam.math._definite import asymmetric, indefinite
 from jaxslam.math.stats import chi2_quantile
 
 
@@ -177,21 +178,17 @@ def check_covariance(name: str, cov: ArrayLike, size: int) -> None:
     values = np.asarray(cov)
     if not np.issubdtype(values.dtype, np.number) or np.iscomplexobj(values):
         raise ValueError(f"{name}: expected real numbers, got dtype {values.dtype}")
-    values = values.astype(np.float64)
+    if not np.issubdtype(values.dtype, np.floating):
+        values = values.astype(np.float64)
     if not np.all(np.isfinite(values)):
         raise ValueError(f"{name}: the covariance has a NaN or an infinity")
-    scale = np.max(np.abs(values), initial=0.0)
-    if np.max(np.abs(values - values.T), initial=0.0) > 1e-6 * scale:
+    # Numbers are often written with six digits.
+    if asymmetric(values, 1e-6):
         raise ValueError(f"{name}: the covariance is not symmetric")
-    if np.min(np.diagonal(values), initial=0.0) < 0:
-        raise ValueError(
-            f"{name}: the covariance is not positive semi-definite (negative variance)"
-        )
-    smallest = np.min(np.linalg.eigvalsh(values), initial=np.inf)
-    if smallest < -1e-6 * scale:
-        raise ValueError(
-            f"{name}: the covariance is not positive semi-definite (eigenvalue {smallest:.3g})"
-        )
+    if indefinite(values, 1e-6):
+        smallest = np.linalg.eigvalsh(values.astype(np.float64))[0]
+        why = "negative variance" if np.diagonal(values).min() < 0 else f"eigenvalue {smallest:.3g}"
+        raise ValueError(f"{name}: the covariance is not positive semi-definite ({why})")
 
 
 def check_alpha(name: str, alpha: ArrayLike, count: int) -> None:

@@ -18,6 +18,7 @@ from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate
 from jaxslam.datasets._dataset import Dataset
 from jaxslam.filters._ekf.map_coordinates import cov_of_coordinates
+from jaxslam.math._definite import invertible
 from jaxslam.math.stats import chi2_band, chi2_quantile
 
 _in_coordinates = jax.jit(cov_of_coordinates, static_argnames="square_root", inline=True)
@@ -103,10 +104,12 @@ def judge_map(
     joint = joint_cov is not None
     separate = np.zeros((count, 2, count, 2))
     separate[np.arange(count), :, np.arange(count)] = covs
+    of_filter = np.asarray(covs if joint_cov is None else joint_cov)
     cov = np.asarray(separate if joint_cov is None else joint_cov, np.float64)
     cov = cov.reshape(2 * count, 2 * count)
     values, vectors = np.linalg.eigh((cov + cov.T) / 2)
-    if not values[0] > 1e-12 * values[-1]:
+    # Rounding of the filter leaves n eps of the largest of a singular one, and a margin of ten.
+    if not values[0] > 20 * count * np.finfo(of_filter.dtype).eps * values[-1]:
         return None
     white = vectors.T / np.sqrt(values)[:, None]
     error = points - (survey if one_frame else carried(_best_frame(points, survey, white), survey))
@@ -212,9 +215,9 @@ def evaluate(
             points = carried(frame, points)
         errors[f"map RMSE{after} [m]"] = rmse
         gap = (points[tag] - found)[:, :, None]
-        covs = np.asarray(last.point_covs)[named].astype(np.float64)
+        covs = np.asarray(last.point_covs)[named]
         finite = np.isfinite(covs).all(axis=(1, 2)) & np.isfinite(found).all(axis=1)
-        regular = finite & (np.linalg.eigvalsh(np.where(finite[:, None, None], covs, 0))[:, 0] > 0)
+        regular = finite & invertible(np.where(finite[:, None, None], covs, 0))
         if regular.all():
             survey, among = np.asarray(data.landmarks)[tag], np.flatnonzero(named)
             joint = None if map_cov is None else map_cov[among][:, :, among]

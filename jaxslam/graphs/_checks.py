@@ -13,10 +13,11 @@ from jaxslam.core.types import JaxOrNumPy
 from jaxslam.graphs._factor import Factor
 from jaxslam.graphs._graph import Graph, Table
 from jaxslam.graphs._solver.model import factors_of
+from jaxslam.math import _definite as definite
 
-_INDEFINITE = 1e-6
-"""An eigenvalue of an information above minus this share of its largest entry is one of rounding:
-files have about six digits."""
+_DIGITS = 1e-6
+"""The rounding of an information, with a unit diagonal and next to its largest entry: files have
+about six digits."""
 
 
 class Parts(NamedTuple):
@@ -99,10 +100,7 @@ def variables_in(graph: Graph, table: Table, factor: Factor) -> Int[np.ndarray, 
 
 def indefinite(information: Float[np.ndarray, "E R R"]) -> Bool[np.ndarray, "E"]:
     """Which informations are not positive semidefinite, beyond the rounding of a file."""
-    if information.size == 0:
-        return np.zeros(len(information), bool)
-    scale = np.abs(information).max(axis=(1, 2))
-    return np.asarray(np.linalg.eigvalsh(information)[:, 0] < -_INDEFINITE * scale)
+    return definite.indefinite(information, _DIGITS, _DIGITS)
 
 
 def label(graph: Graph, variable: int) -> str:
@@ -181,15 +179,13 @@ def _check_rows(name: str, graph: Graph, key: str, table: Table, factor: Factor)
     of = variables_in(graph, table, factor)
     twice = np.zeros(len(valid), bool)
     twice[valid] = (np.sort(of, axis=1)[:, 1:] == np.sort(of, axis=1)[:, :-1]).any(axis=1)
-    scale = np.abs(information).max(axis=(1, 2), initial=0.0)
     finite = np.isfinite(information).all(axis=(1, 2))
     clean = np.where(finite[:, None, None], information, 0.0)
-    skew = np.abs(clean - np.swapaxes(clean, 1, 2)).max(axis=(1, 2), initial=0.0)
     for bad, why in (
         (twice, "joins a variable to itself"),
         (~np.isfinite(z).all(axis=1), "z is not finite"),
         (~finite, "the information is not finite"),
-        (finite & (skew > _INDEFINITE * scale), "the information is not symmetric"),
+        (definite.asymmetric(clean, _DIGITS), "the information is not symmetric"),
         (indefinite(clean), "the information is not positive semidefinite"),
     ):
         if (bad & valid).any():

@@ -22,6 +22,7 @@ from jaxslam.math._arrays import (
     Pose,
     Unmeasured,
 )
+from jaxslam.math._definite import invertible
 
 FreeLike = Free | tuple[ArrayLike, ArrayLike]
 
@@ -42,7 +43,7 @@ def free_parameters(name: str, free: FreeLike, size: int) -> Free:
     if is_concrete(mean) and not (_is_real(mean) and np.all(np.isfinite(mean))):
         raise ValueError(f"{name}: expected a finite prior mean, got {mean}")
     check_covariance(f"{name}: prior", cov, size)
-    if is_concrete(cov) and not np.linalg.eigvalsh(np.asarray(cov, np.float64))[0] > 0:
+    if is_concrete(cov) and not invertible(np.asarray(cov)):
         raise ValueError(f"{name}: expected a positive definite prior covariance")
     return Free(mean, cov)
 

@@ -10,6 +10,7 @@ import pytest
 from cases import refused, swept
 
 from jaxslam.core import _validation as validation
+from jaxslam.math import _definite as definite
 from jaxslam.math import _gaussians as gaussians
 from jaxslam.math import _linalg as linalg
 
@@ -186,11 +187,11 @@ def test_indefinite_and_non_finite_matrices_are_flagged(n):
     np.testing.assert_array_equal(flags, [True, False, False, False, False])
 
 
-def products(n, rank, terms, seed):
-    """H P Hᵀ of random H (n, terms) of a rank and random P, in random units; by NumPy."""
+def products(n, rank, terms, seed, units=3):
+    """H P Hᵀ of random H (n, terms) of a rank and random P, in units that are 10^±units apart."""
     rng, count = np.random.default_rng(seed), 300
     h = rng.normal(size=(count, n, rank)) @ rng.normal(size=(count, rank, terms))
-    h = h * 10.0 ** rng.uniform(-3, 3, size=(count, n, 1))
+    h = h * 10.0 ** rng.uniform(-units, units, size=(count, n, 1))
     root = rng.normal(size=(count, terms, terms))
     return h, root @ root.transpose(0, 2, 1)
 
@@ -278,6 +279,52 @@ def test_mahalanobis_masks_directions_that_are_known_exactly():
     by_error, by_cov = jax.jit(jax.vmap(slopes))(error[:4], cov[:4])
     assert not by_error.any()
     assert not by_cov.any()
+
+
+# --- decisions about matrices on the host ---------------------------------------------------------
+
+
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+@pytest.mark.parametrize("n", [2, 3, 6])
+def test_a_matrix_is_singular_regular_or_indefinite_in_any_unit(n, dtype):
+    """Products of less rank; of full rank with a condition below 1e3; and with an eigenvalue changed.
+
+    In float32 the latter is -1e-2 of a unit diagonal, next to rounding of 1e-4; in float64 -1e-6.
+    """
+    units = 1 if dtype == np.float32 else 3
+    for rank in (n - 1, n):
+        h, p = (x.astype(dtype) for x in products(n, rank, n + 3, 3, units))
+        s = h @ p @ h.transpose(0, 2, 1)
+        s = (s + s.transpose(0, 2, 1)) / 2
+        unit = np.sqrt(np.diagonal(s, axis1=1, axis2=2).astype(float))
+        values, vectors = np.linalg.eigh(s / (unit[:, :, None] * unit[:, None, :]))
+        clear = values[:, 0] > 1e-3 if rank == n else np.ones(len(s), bool)
+        assert clear.sum() > 60
+        s, values, vectors, unit = s[clear], values[clear], vectors[clear], unit[clear]
+        assert not definite.indefinite(s).any() and not definite.asymmetric(s).any()
+        assert (definite.invertible(s) == (rank == n)).all()
+        values[:, 0] = -1e-2 if dtype == np.float32 else -1e-6
+        other = np.einsum("cij,cj,ckj->cik", vectors, values, vectors)
+        other = (other * unit[:, :, None] * unit[:, None, :]).astype(dtype)
+        other = (other + other.transpose(0, 2, 1)) / 2
+        assert definite.indefinite(other).all() and not definite.invertible(other).any()
+        turned = s.copy()
+        turned[:, 0, 1] += np.asarray(1e-2 * unit[:, 0] * unit[:, 1], dtype)
+        assert definite.asymmetric(turned, 1e-6).all()
+
+
+def test_a_variance_of_rounding_is_zero_and_a_negative_one_is_not():
+    near = np.diag([4.0, -1e-16])
+    near[0, 1] = near[1, 0] = 3e-16
+    assert not definite.indefinite(near) and not definite.invertible(near)
+    validation.check_covariance("thing", near, 2)
+    assert definite.indefinite(np.diag([4.0, -1e-12]))
+    assert not definite.indefinite(np.zeros((2, 2)))
+    # Metres beside radians: an indefinite part hides behind no large entry.
+    mixed = np.diag([1e6, 1e-4, 1e-4])
+    mixed[1, 2] = mixed[2, 1] = 2e-4
+    with pytest.raises(ValueError, match=r"thing: the covariance is not positive semi-definite"):
+        validation.check_covariance("thing", mixed, 3)
 
 
 # --- checks -------------------------------------------------------------------------------------

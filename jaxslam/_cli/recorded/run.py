@@ -41,6 +41,7 @@ from jaxslam.datasets._evaluation import Evaluation, evaluate, joint_map_cov
 from jaxslam.datasets._landmark_logs.table_settings import METHODS, association_options
 from jaxslam.datasets._uncertain_constants import considered
 from jaxslam.filters._ekf.ekf_settings import EkfOptions
+from jaxslam.math._definite import indefinite
 from jaxslam.results import _report as report
 from jaxslam.results._campaign_files import FORMATS, check_figure_formats
 from jaxslam.results._files import Files, Json, json_text, versions
@@ -314,11 +315,8 @@ def _whole(result: PiecewiseRun) -> Estimate:
 
 
 def positive_definite(cov: Float[np.ndarray, "D D"]) -> bool:
-    """Whether a covariance has a finite Cholesky factor, by NumPy."""
-    try:
-        return bool(np.isfinite(np.linalg.cholesky(cov)).all())
-    except np.linalg.LinAlgError:
-        return False
+    """Whether a covariance is finite and has no negative eigenvalue; 0 may be one."""
+    return bool(np.isfinite(cov).all()) and not indefinite(cov)
 
 
 def _dead_reckoning(data: Dataset) -> Float[np.ndarray, "T 3"]:

@@ -19,6 +19,7 @@ from jaxslam.core.logs._tables import split_unit
 from jaxslam.core.protocols import Candidate, Chart, Estimator, Filter, Motion, Sensor
 from jaxslam.core.types import Log, Trace, Truth
 from jaxslam.graphs.smoothing._forward_pass import LogEstimator
+from jaxslam.math._definite import invertible
 from jaxslam.sensors._suite import Suite
 from jaxslam.simulation._worlds import World
 
@@ -101,7 +102,7 @@ def without_noise(scenario: World) -> str:
     found = []
     for model in _sensors(scenario):
         for z in (_number(np.zeros(len(model.measurements))), _first_measurement(model, scenario)):
-            exact = _exact(model, np.asarray(_noise_cov(model, z), np.float64))
+            exact = _exact(model, np.asarray(_noise_cov(model, z)))
             if not exact:
                 break
         if exact:
@@ -129,8 +130,7 @@ def _exact(sensor: Sensor, cov: np.ndarray) -> str:
     sigma = np.sqrt(np.diagonal(cov))
     if (sigma == 0).any():
         return ", ".join(n for n, one in zip(sensor.measurements, sigma, strict=True) if one == 0)
-    whole = np.linalg.eigvalsh(cov / np.outer(sigma, sigma))[:1].min(initial=1.0) > 1e-12
-    return "" if whole else f"a combination of {', '.join(sensor.measurements)}"
+    return "" if invertible(cov) else f"a combination of {', '.join(sensor.measurements)}"
 
 
 def _sensors(scenario: World) -> list[Sensor]:

@@ -29,6 +29,7 @@ from jaxslam.core.protocols import Associate, Motion, Sensor
 from jaxslam.core.types import JaxOrNumPy
 from jaxslam.datasets._dataset import Parameter
 from jaxslam.filters._ekf.ekf_settings import EkfOptions
+from jaxslam.math._definite import asymmetric, indefinite
 from jaxslam.motion import _odometry_errors as odometry_errors
 from jaxslam.sensors import _range_errors as range_errors
 
@@ -395,7 +396,7 @@ class TableSettings:
                 f"{self._at('calibration', 'covariance')}: expected {len(names)} rows of numbers"
             )
         rows = np.array([self._numbers("calibration", "covariance", row, names) for row in given])
-        if not np.allclose(rows, rows.T) or (np.linalg.eigvalsh(rows) < -1e-9 * rows.max()).any():
+        if asymmetric(rows, 1e-6) or indefinite(rows, 1e-6):  # written with six digits
             raise ValueError(f"{self._at('calibration', 'covariance')}: expected a covariance")
         cov = np.zeros((len(known), len(known)))
         at = [known.index(name) for name in names]

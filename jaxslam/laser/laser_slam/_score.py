@@ -14,6 +14,7 @@ from jaxslam.laser.laser_slam import _end_covariances as end_covariances
 from jaxslam.laser.laser_slam._assembly import ROOM, relative_covs
 from jaxslam.laser.laser_slam._records import LoopOutcome, Loops, Solved
 from jaxslam.math import numpy_poses as poses
+from jaxslam.math._definite import invertible
 
 TOGETHER = 512
 """Pairs of keyframes whose marginals are computed at once. A pair adds a block to the Cholesky
@@ -84,7 +85,7 @@ def relation_nees(
     i, j = np.asarray(first), np.asarray(second)
     e = poses.between(poses.between(solved.poses[i], solved.poses[j]), np.asarray(z))
     out = np.full(len(e), np.nan)
-    known = np.linalg.eigvalsh(cov)[:, 0] > 0
+    known = invertible(cov)
     out[known] = np.einsum(
         "ri,ri->r", e[known], np.linalg.solve(cov[known], e[known][..., None])[..., 0]
     )

@@ -15,6 +15,7 @@ from jaxslam.core.protocols import Component
 from jaxslam.laser.grids._grid import Grid, check_grid
 from jaxslam.laser.matching._point_sets import Points, Prior
 from jaxslam.math._arrays import in_dtype
+from jaxslam.math._definite import asymmetric, indefinite
 
 Reference: TypeAlias = Points | Grid
 
@@ -211,11 +212,8 @@ def _check_prior(prior: object, batch: tuple[int, ...]) -> None:
         information = np.asarray(prior.information)
         if not (np.all(np.isfinite(np.asarray(prior.pose))) and np.all(np.isfinite(information))):
             raise ValueError("match: expected a finite prior")
-        scale = np.abs(information).max(axis=(-1, -2), initial=0.0)
-        crooked = np.abs(information - np.swapaxes(information, -1, -2)).max(axis=(-1, -2))
-        if np.any(crooked > 1e-4 * scale) or np.any(
-            np.linalg.eigvalsh(information).min(axis=-1) < -1e-4 * scale
-        ):
+        # By the inverse of a covariance in float32, which may have few digits.
+        if asymmetric(information, 1e-4).any() or indefinite(information, 1e-4).any():
             raise ValueError(
                 "match: expected a symmetric information of the prior, positive semi-definite"
             )
