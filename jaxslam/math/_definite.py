@@ -73,4 +73,4 @@ def _eps(matrix: np.ndarray) -> float:
 
 
 def _allowed(matrix: Float[np.ndarray, "*batch n n"], tolerance: float) -> float:
-    return max(tolerance, _ROUNDED * matrix.shape[-1] * _eps(matrix))
+    return float(max(tolerance, _ROUNDED * matrix.shape[-1] * _eps(matrix)))
