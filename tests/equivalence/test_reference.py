@@ -82,8 +82,8 @@ CASES = {
         dataclasses.replace(cloister(60), noise_on="odometry"),
         {"correction": "joint", "gate": 0.9, "births": 3},
     ),
-    "growing": (growing(60), {"correction": "sequential", "gate": 6.0, "births": 1}),
-    "growing joint": (growing(60), {"correction": "joint", "gate": 6.0, "births": 3}),
+    "growing": (growing(60), {"correction": "sequential", "gate": 0.95, "births": 1}),
+    "growing joint": (growing(60), {"correction": "joint", "gate": 0.95, "births": 3}),
 }
 
 

@@ -225,7 +225,7 @@ def test_association_expects_the_noise_of_each_landmark(rule):
     """A range of 5.5 m is 4.2 σ beyond a landmark at 3 m, and 2.3 σ before one at 10 m; with the σ
     of 5.5 m for both it would be the first."""
     far = np.array([[3.0, 0.0], [10.0, 0.0]])
-    filter = filters.Localization(world(0.2).motion, sensor(0.2), far, associate=rule(16.0))
+    filter = filters.Localization(world(0.2).motion, sensor(0.2), far, associate=rule(0.9997))
     state = filter.init(jnp.zeros(3), jnp.zeros((3, 3)))
     scan = Scan(np.array([[5.5, 0.0]]), np.full(1, -1, np.int32), np.ones(1, bool))
     _, info = updated(filter, state, scan)
