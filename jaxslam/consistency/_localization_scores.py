@@ -204,8 +204,9 @@ def covering_level(draws: Float[Array, "S 3"], truth: Float[Array, "3"]) -> Floa
     other = scaled > 0
     kernels = jnp.where(other, jnp.exp(-0.5 * scaled / _KERNEL**2), 0.0).sum(axis=1)
     density = kernels / jnp.maximum(other.sum(axis=1), 1)
-    # Rounding must not break a tie, as in a sample of one point.
-    return (density >= density[0] * (1 - 1e-6)).sum() / count
+    # Rounding of sums of so many terms must not break a tie, as in a sample of one point.
+    rounding = count * float(jnp.finfo(density.dtype).eps)
+    return (density >= density[0] * (1 - rounding)).sum() / count
 
 
 def energy_score(draws: Float[Array, "S D"], truth: Float[Array, "D"]) -> Float[Array, ""]:

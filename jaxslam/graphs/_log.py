@@ -22,7 +22,8 @@ from jaxslam.math import se2
 from jaxslam.sensors._suite import Suite, Wrapped
 
 _STILL = 1e-9
-"""∂step/∂w with columns of length one and a determinant below this is singular."""
+"""∂step/∂w with columns of length one and a determinant below this, or below its rounding in
+float32, is singular."""
 
 
 def of_log(
@@ -257,7 +258,8 @@ def _moving(by_noise: Float[Array, "T 3 3"]) -> Bool[Array, "T"]:
     """Whether matrices are regular, for any lengths of their columns."""
     length = jnp.linalg.norm(by_noise, axis=1, keepdims=True)
     a, b, c = jnp.moveaxis(by_noise / jnp.where(length > 0, length, 1.0), 2, 0)
-    return jnp.abs((a * jnp.cross(b, c)).sum(axis=1)) > _STILL
+    least = max(_STILL, 10 * float(jnp.finfo(by_noise.dtype).eps))
+    return jnp.abs((a * jnp.cross(b, c)).sum(axis=1)) > least
 
 
 def _information(cov: Float[Array, "R R"]) -> tuple[Float[Array, "R R"], Bool[Array, ""]]:

@@ -103,7 +103,9 @@ def initial_estimate(
     value, by_stored, by_point, inverse_root, positive = terms
     q = materialize(_triangularizing(by_point))
     r, value, transform = (q @ by_point)[:2], q @ value, q @ inverse_root
-    regular = (use.sum() >= 2) & (jnp.abs(r[0, 0] * r[1, 1]) > 0)
+    # A product of m terms leaves m eps of a pivot of 0, as of parallel rays.
+    least = 8 * m * float(jnp.finfo(r.dtype).eps) * (r**2).sum()
+    regular = (use.sum() >= 2) & (jnp.abs(r[0, 0] * r[1, 1]) > least)
     safe = jnp.where(regular, r, jnp.eye(2, dtype=r.dtype))
     minus_r_inv = -linalg.inverse(safe.at[1, 0].set(0.0))
     point = point + minus_r_inv @ value[:2]

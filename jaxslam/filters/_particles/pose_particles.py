@@ -53,7 +53,9 @@ def weighted_pose_moments(
     xy = (w[:, None] * pose[:, :2]).sum(axis=0)
     # Headings that cancel have no mean; then the heading of the most likely particle is used.
     sine, cosine = (w * jnp.sin(pose[:, 2])).sum(), (w * jnp.cos(pose[:, 2])).sum()
-    cancel = sine**2 + cosine**2 < jnp.finfo(w.dtype).eps ** 2
+    # Sums of P terms of random rounding; P headings at random leave 1/√P.
+    rounding = 8 * len(w) ** 0.5 * float(jnp.finfo(w.dtype).eps)
+    cancel = sine**2 + cosine**2 < rounding**2
     heading = pose[best, 2]
     theta = jnp.where(
         cancel, heading, jnp.arctan2(jnp.where(cancel, 0.0, sine), jnp.where(cancel, 1.0, cosine))

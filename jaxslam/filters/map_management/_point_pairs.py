@@ -183,7 +183,8 @@ def mahalanobis_of_pairs(
     """The squared distance eᵀ P⁻¹ e in closed form, and whether P is positive definite; else 0."""
     p, q, r = cov[..., 0, 0], cov[..., 1, 1], cov[..., 0, 1]
     det = p * q - r * r
-    positive = (p > 0) & (q > 0) & (det > 4 * jnp.finfo(cov.dtype).eps * p * q)
+    # 4 eps are the rounding of the determinant, and the covariance is a sum of four.
+    positive = (p > 0) & (q > 0) & (det > 16 * jnp.finfo(cov.dtype).eps * p * q)
     x, y = error[..., 0], error[..., 1]
     squared = (q * x * x - 2 * r * x * y + p * y * y) / jnp.where(positive, det, 1.0)
     return jnp.where(positive, squared, 0.0), positive

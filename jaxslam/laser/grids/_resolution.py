@@ -97,6 +97,6 @@ def correlation(a: Grid, b: Grid) -> Float[Array, ""]:
 
     one, two = centred(a.probability), centred(other)
     product = (weight * one * one).sum() * (weight * two * two).sum()
-    varies = product > 1e-12 * total**2
+    varies = product > 1e-12 * total**2  # probabilities that vary by a thousandth; rounding: 1e-28
     found = (weight * one * two).sum() / jnp.sqrt(jnp.where(varies, product, 1.0))
     return jnp.where(varies, jnp.clip(found, -1.0, 1.0), 0.0)

@@ -17,7 +17,7 @@ from jaxslam._driver import run
 from jaxslam.consistency._measures.counts import counted
 from jaxslam.core.types import Scan, Status
 from jaxslam.filters import FastSlam
-from jaxslam.filters._particles import slam_particles
+from jaxslam.filters._particles import pose_particles, slam_particles
 from jaxslam.filters._particles.slam_particles import SlamParticles
 from jaxslam.math.stats import sigma_gate
 
@@ -202,6 +202,24 @@ def test_headings_that_cancel_have_no_mean_and_no_nan():
         )
     )(state.pose)
     chex.assert_tree_all_finite((mean, slope))
+
+
+@pytest.mark.parametrize("count", [2, 4, 12])
+def test_headings_that_cancel_are_those_of_the_likeliest_whatever_the_rounding(count):
+    """Evenly spread headings, some ulp off: the mean is about that of the first particle."""
+    rng = np.random.default_rng(count)
+    turn = 2 * np.pi * np.arange(count) / count
+    moments = jax.jit(pose_particles.weighted_pose_moments, static_argnums=2)
+    for _ in range(20):
+        first = rng.uniform(-3, 3)
+        heading = np.angle(np.exp(1j * (first + turn))) * (1 + 4e-16 * rng.normal(size=count))
+        pose = np.stack([np.zeros(count), np.zeros(count), heading], axis=1)
+        mean = moments(pose, np.full(count, -np.log(count)), 0)[0]
+        # Half a turn from the first may count as either side.
+        off = np.angle(np.exp(1j * (heading - heading[0])))
+        wanted = {np.round(s * np.pi / count, 6) for s in (-1, 1)}
+        assert abs(np.abs(off).max() - np.pi) < 1e-9
+        assert np.round(np.angle(np.exp(1j * (mean[2] - heading[0]))), 6) in wanted
 
 
 # --- against the EKF, on worlds where linearization does no harm ---------------------------------

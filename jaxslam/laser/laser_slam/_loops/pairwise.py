@@ -8,6 +8,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.laser.laser_slam import _end_covariances as end_covariances
+from jaxslam.math import _linalg as linalg
 from jaxslam.math import numpy_poses as poses
 from jaxslam.math import se2
 from jaxslam.math._arrays import float64
@@ -93,7 +94,8 @@ def _fill(part: np.ndarray) -> np.ndarray:
 
 @jax.jit
 def _squared_distances(a: _Loop, b: _Loop) -> Float[Array, "tile tile"]:
-    """eᵀ Σ⁻¹ e of each loop of one tile with each of another, the first of them the earlier."""
+    """eᵀ Σ⁻¹ e of each loop of one tile with each of another, the first of them the earlier; ∞
+    where Σ is not positive definite."""
     return jax.vmap(lambda one: jax.vmap(lambda other: _of_pair(one, other))(b))(a)
 
 
@@ -105,14 +107,8 @@ def _of_pair(a: _Loop, b: _Loop) -> Float[Array, ""]:
     first = forward * (b.total_first - a.total_first)
     second = backward * (b.total_second - a.total_second)
     cov = a.cov + b.cov + first + ad @ second @ ad.T
-    # By cofactors: XLA's solver takes the matrices one by one.
-    x, y, t = error
-    xx, xy, xt, yy, yt, tt = (cov[i, j] for i, j in zip(*np.triu_indices(3), strict=True))
-    c_xx, c_xy, c_xt = yy * tt - yt * yt, xt * yt - xy * tt, xy * yt - xt * yy
-    c_yy, c_yt, c_tt = xx * tt - xt * xt, xy * xt - xx * yt, xx * yy - xy * xy
-    determinant = xx * c_xx + xy * c_xy + xt * c_xt
-    square = c_xx * x * x + c_yy * y * y + c_tt * t * t
-    return (square + 2 * (c_xy * x * y + c_xt * x * t + c_yt * y * t)) / determinant
+    white, regular = linalg.whitener(cov)
+    return jnp.where(regular, ((white @ error) ** 2).sum(), jnp.inf)
 
 
 def clique(agree: Bool[np.ndarray, "M M"], weight: Float[np.ndarray, "M"]) -> Bool[np.ndarray, "M"]:
