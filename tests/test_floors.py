@@ -7,6 +7,9 @@ import ast
 import graphlib
 import importlib
 import re
+import subprocess
+import sys
+import types
 from pathlib import Path
 
 import numpy as np
@@ -201,6 +204,30 @@ def test_what_is_not_public_has_an_underscore():
         assert all(hasattr(module, each) for each in names), name
         checked += len(names)
     assert checked > 400
+
+
+def test_names_are_imported_on_demand_from_where_type_checkers_read_them():
+    tree = ast.parse((PACKAGE / "__init__.py").read_text(encoding="utf-8"))
+    homes = {
+        alias.name: node.module
+        for node in ast.walk(tree)
+        if isinstance(node, ast.ImportFrom) and node.module.partition(".")[0] == "jaxslam"
+        for alias in node.names
+    }
+    del homes["attach_field_docs"]
+    assert set(homes) == set(jaxslam.__all__)
+    for name, home in homes.items():
+        value = getattr(jaxslam, name)
+        if isinstance(value, types.ModuleType):
+            assert value.__name__ == f"{home}.{name}"
+        else:
+            assert value is getattr(importlib.import_module(home), name)
+
+
+def test_the_import_alone_loads_no_module_of_the_package():
+    script = "import sys, jaxslam; print(sum(name.startswith('jaxslam.') for name in sys.modules))"
+    done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
+    assert done.stdout == "0\n", done.stderr
 
 
 def test_shapes_in_signatures_are_checked_in_the_package():
