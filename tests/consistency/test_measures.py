@@ -356,6 +356,7 @@ def test_poses_on_a_plane_have_no_nees():
         assert regular.mean() == pytest.approx(expected, abs=0.01)
 
 
+@pytest.mark.decision
 @pytest.mark.parametrize("dtype", [np.float64, np.float32])
 def test_a_direction_is_unobservable_below_a_share_of_what_was_measured(dtype):
     """4e-11 is what sigma points leave on `circle`, 2e-5 what the EKF gains in 120 steps."""

@@ -12,6 +12,8 @@ from jaxslam.calibration import as_associated, fit_noise
 from jaxslam.core.types import Info, Status
 from jaxslam.math import stats
 
+pytestmark = pytest.mark.decision
+
 RNG = np.random.default_rng(2)
 X = RNG.normal(0.3, 2.0, 400)
 

@@ -16,6 +16,8 @@ from jaxslam.consistency.campaign import monte_carlo
 from jaxslam.consistency.campaign._candidates import check_noise
 from jaxslam.simulation._worlds import Scenario
 
+pytestmark = pytest.mark.decision
+
 SENSOR = sensors.RangeBearing(np.eye(2))
 
 COUNTS = {"runs": 20, "not_finite": 0, "divergent": 0}

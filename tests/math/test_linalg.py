@@ -14,6 +14,8 @@ from jaxslam.math import _definite as definite
 from jaxslam.math import _gaussians as gaussians
 from jaxslam.math import _linalg as linalg
 
+pytestmark = pytest.mark.decision
+
 UNROLLED, LAPACK = [1, 2, 3, 6, 8], [9, 20]  # 8 is the largest that is unrolled
 ROWS = 20
 

@@ -16,6 +16,8 @@ from jaxslam import graphs
 from jaxslam.graphs import Ending, starts
 from jaxslam.graphs._graph import LOOPS
 
+pytestmark = pytest.mark.decision
+
 
 def test_the_optimum_is_that_of_dense_gauss_newton():
     graph = ring()
