@@ -36,10 +36,13 @@ def test_without_a_repository_everything_is_run(portion, monkeypatch):
 
 
 def test_what_changed_in_the_last_day_is_always_run(portion, monkeypatch):
-    before = {"jaxslam/math/se2.py": 'def f():\n    "Old."\n    return 1\n', "docs/a.md": "Old.\n"}
+    before = {
+        "jaxslam/math/se2.py": 'def f():\n    "Old."\n    return 1\n',
+        "docs/gallery.md": "Old.\n",
+    }
     after = {
         "jaxslam/math/se2.py": 'def f():\n    "New."  # words alone\n    return 1\n',
-        "docs/a.md": "New.\n\n```{code-cell}\nx = 1\n```\n",
+        "docs/gallery.md": "New.\n\n```{code-cell}\nx = 1\n```\n",
         "jaxslam/filters/_ekf/scan.py": "x = 1\n",
         "jaxslam/calibration/_delay.py": "x = 1\n",
         "jaxslam/_driver.py": "x = 1\n",
@@ -54,5 +57,11 @@ def test_what_changed_in_the_last_day_is_always_run(portion, monkeypatch):
     monkeypatch.setattr(portion, "git", git)
     assert portion.changed() == set(after) - {"jaxslam/math/se2.py"}
     assert portion.rooms() == {"tests/filters/ekf", "tests/consistency", "tests"}
-    assert portion.pages() == {"docs/a.md"}
-    assert portion.left_out([portion.ROOT / "docs/a.md"]) == []
+    assert portion.pages() == {"docs/gallery.md"}
+    assert portion.left_out([portion.ROOT / "docs/gallery.md"]) == []
+
+
+def test_after_a_day_that_changed_more_than_half_the_third_is_run_alone(portion):
+    every = {f"tests/{i}" for i in range(4)}
+    assert portion._if_few({"tests/0", "tests/1", "elsewhere"}, every) == {"tests/0", "tests/1"}
+    assert portion._if_few({"tests/0", "tests/1", "tests/2"}, every) == set()
