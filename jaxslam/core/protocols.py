@@ -263,6 +263,19 @@ class Sensor(Model):
     def _mount(self, pose: Pose) -> Pose:
         return jnp.asarray(self.mount, pose.dtype)
 
+    def scans(self, scan: Scan) -> "list[tuple[Sensor | None, Scan]]":
+        """The sensors of a suite in order, each with its scan; here this sensor with the scan.
+
+        Those of a suite are of landmarks of one size; None measures other robots. Raises ValueError
+        unless the scan has as many slots as the sensors together.
+        """
+        return [(self, scan)]
+
+    @property
+    def absolute(self) -> bool:
+        """Whether it measures the robot and no landmark (L = 0), as a compass."""
+        return not self.landmark
+
     @property
     def of_points(self) -> bool:
         """Whether a landmark is a point (x, y), as some methods need."""
@@ -318,6 +331,26 @@ class Chart(Component):
         """The errors (dx, dl) with retract(pose0, l0, dx, dl) = (pose, l)."""
         raise NotImplementedError
 
+    def retract_pose(self, pose: Pose, dx: Pose) -> Pose:
+        """(3,) pose moved by errors dx (3,), which no landmark changes."""
+        ground = self._ground(pose)
+        return self.retract(pose, ground, dx, ground)[0]
+
+    def local_pose(self, pose0: Pose, pose: Pose) -> Pose:
+        """The errors dx (3,) with retract_pose(pose0, dx) = pose."""
+        ground = self._ground(pose)
+        return self.local(pose0, ground, pose, ground)[0]
+
+    def pose_basis(self, pose: Pose) -> Float[Array, "3 3"]:
+        """The derivative of `retract_pose` at zero, of a chart with a `basis`."""
+        basis: Basis = self.basis(pose, self._ground(pose))
+        return basis.pose
+
+    def _ground(self, pose: Pose) -> Array:
+        """A landmark of zeros."""
+        size = 2 if self.landmark_size is None else self.landmark_size
+        return jnp.zeros(size, pose.dtype)
+
 
 class Here(NamedTuple):
     """The state at which a model is linearized, the input of a linearizer."""
@@ -328,7 +361,8 @@ class Here(NamedTuple):
     pose: Float[Array, "3"]
     """estimate of the robot"""
     cov: Array
-    """P in the chart: of the robot (3, 3), or for `observe` of robot and landmark (3+L, 3+L)"""
+    """P in the chart: of the robot (3, 3); for `observe` of robot and landmark (3+L, 3+L), or of
+    the robot alone where the landmark is known without an error"""
     slot: PyTree = None
     """() of the landmark, for `observe`"""
     landmark: PyTree = None

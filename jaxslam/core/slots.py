@@ -26,6 +26,7 @@ __all__ = [
     "remove",
     "robot_cov",
     "scatter",
+    "seen_before",
     "slot_mask",
 ]
 
@@ -98,6 +99,13 @@ def allocate(
     return last_true_column(rank_of_wish[:, None] == rank_of_slot[None, :])
 
 
+def seen_before(tag: Int[Array, "M"], among: Bool[Array, "M"]) -> Bool[Array, "M"]:
+    """Whether a tag (M,), if not negative, occurs earlier in the scan among the tags (M,)."""
+    earlier = jnp.tril(jnp.ones((tag.shape[0], tag.shape[0]), bool), -1)
+    same = (tag[:, None] == tag[None, :]) & (tag >= 0)[:, None] & among[None, :]
+    return (same & earlier).any(axis=1)
+
+
 def slot_mask(slot: Int[Array, "M"], on: Bool[Array, "M"], count: int) -> Bool[Array, "N"]:
     """Mask (count,) of the slots that occur in slot (M,) where on (M,)."""
     return jnp.zeros(count, bool).at[jnp.where(on, slot, count)].set(True, mode="drop")
@@ -158,6 +166,8 @@ def scatter(
     capacity = joint.landmarks.shape[0]
     if m == 0:
         return joint
+    # Stored: each of them is in many of the D² entries of P, and would be computed again for each.
+    landmarks, by_pose, own_cov = materialize((landmarks, by_pose, own_cov))
     # By slot: the index it is filled from.
     place, born = last_true_column(
         granted[None, :] & (slot[None, :] == jnp.arange(capacity, dtype=slot.dtype)[:, None])

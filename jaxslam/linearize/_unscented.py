@@ -55,21 +55,20 @@ class Unscented(Linearizer):
 
     def motion(self, motion: Motion, u: Array, here: Here) -> tuple[Array, Array, Array, tuple[()]]:
         pose, chart, width = here.pose, here.chart, len(motion.noises)
-        ground = jnp.zeros(here.joint.landmarks.shape[1], pose.dtype)
         moved = motion.step(pose, u, jnp.zeros(width, pose.dtype))
         root = _root(here.cov)
         root_noise = linalg.root_psd(motion.noise_cov(pose, u))
 
         def f(xi: Array) -> Array:
-            start, _ = chart.retract(pose, ground, xi[:3], ground)
-            return chart.local(moved, ground, motion.step(start, u, xi[3:]), ground)[0]
+            start = chart.retract_pose(pose, xi[:3])
+            return chart.local_pose(moved, motion.step(start, u, xi[3:]))
 
         by = self._fit(f, jax.scipy.linalg.block_diag(root, root_noise))
         by_pose = by_variables(by.slope[:, :3], root)
         noise = linalg.matmul(by.slope[:, 3:], by.slope[:, 3:].T) + by.rest
         if chart.basis is not None:
-            after = chart.basis(moved, ground).pose
-            by_pose = after @ by_pose @ linalg.inverse(chart.basis(pose, ground).pose)
+            after = chart.pose_basis(moved)
+            by_pose = after @ by_pose @ linalg.inverse(chart.pose_basis(pose))
             noise = after @ noise @ after.T
         return moved, by_pose, noise, ()
 
@@ -77,16 +76,23 @@ class Unscented(Linearizer):
         pose, landmark, chart = here.pose, here.landmark, here.chart
         root = _root(here.cov)
         centre = sensor.observe(pose, landmark)
+        is_known = len(here.cov) == 3  # P is that of the robot alone
 
         def h(xi: Array) -> Array:
-            return sensor.residual(
-                sensor.observe(*chart.retract(pose, landmark, xi[:3], xi[3:])), centre
-            )
+            if is_known:
+                seen_from, seen = chart.retract_pose(pose, xi), landmark
+            else:
+                seen_from, seen = chart.retract(pose, landmark, xi[:3], xi[3:])
+            return sensor.residual(sensor.observe(seen_from, seen), centre)
 
         by = self._fit(h, root)
         slope = by_variables(by.slope, root)
         by_pose, by_landmark = slope[:, :3], slope[:, 3:]
-        if chart.basis is not None:
+        if is_known:
+            by_landmark = jnp.zeros((len(centre), len(landmark)), centre.dtype)
+        if chart.basis is not None and is_known:
+            by_pose = by_pose @ linalg.inverse(chart.pose_basis(pose))
+        elif chart.basis is not None:
             basis = chart.basis(pose, landmark)
             if basis.landmark is not None:
                 by_landmark = by_landmark @ linalg.inverse(basis.landmark)

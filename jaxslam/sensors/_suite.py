@@ -96,7 +96,7 @@ class Part:
     @property
     def absolute(self) -> bool:
         """Whether it is an absolute sensor, which measures the robot and no landmark."""
-        return not self.sensor.landmark
+        return self.sensor.absolute
 
 
 @record
@@ -171,6 +171,17 @@ class Suite(Sensor):
     def reduced(self) -> Reduced | None:  # type: ignore[override]
         return self.first.reduced
 
+    def scans(self, scan: Scan) -> list[tuple[Sensor | None, Scan]]:
+        size = len(self.landmark)
+        pairs: list[tuple[Sensor | None, Scan]] = []
+        for part, part_scan in zip(self.parts, split_scan(scan, self.places), strict=True):
+            if part.sees == "robots":
+                pairs.append((None, part_scan))
+            else:
+                z = part_scan.z[:, : len(part.sensor.measurements)]
+                pairs.append((on_ground(part.sensor, size), part_scan._replace(z=z)))
+        return pairs
+
     def position(self, landmark: Landmark) -> Point:
         return self.first.position(landmark)
 
@@ -233,6 +244,10 @@ class _OnGround(Wrapped):
     def landmark(self) -> tuple[str, ...]:  # type: ignore[override]
         entries = self.sensor.landmark
         return (*entries, *("-",) * (self.size - len(entries)))
+
+    @property
+    def absolute(self) -> bool:
+        return self.sensor.absolute
 
     @property
     def free(self) -> Free:  # type: ignore[override]

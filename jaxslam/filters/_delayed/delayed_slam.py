@@ -37,13 +37,11 @@ from jaxslam.filters._delayed.state import (
     slots_where,
 )
 from jaxslam.filters._delayed.triangulation import Triangulation, triangulation_of
-from jaxslam.filters._ekf.ekf_settings import EkfSettings
-from jaxslam.filters._ekf.innovation import Correction
+from jaxslam.filters._ekf.correction import Correction, correct_in_turn
+from jaxslam.filters._ekf.ekf_slam import EkfSlam, associate_scan
 from jaxslam.filters._ekf.map_coordinates import estimate_of
-from jaxslam.filters._ekf.predict import propagate
-from jaxslam.filters._ekf.scan import associate_scan
-from jaxslam.filters._ekf.update import correct_in_turn
-from jaxslam.filters._reporting import info_of, seen_before, status_of
+from jaxslam.filters._ekf.predicted_measurements import prediction_of
+from jaxslam.filters._reporting import info_of, status_of
 from jaxslam.math._arrays import Number
 from jaxslam.math._xla import where_any
 from jaxslam.math.stats import chi2_quantile
@@ -174,16 +172,23 @@ class DelayedSlam(Filter):
         return empty_state(self._settings.layout, pose, pose_cov)
 
     def predict(self, state: DelayedState, u: Float[Array, "U"], key: Array) -> DelayedState:
-        settings = _ekf_settings(self._settings)
-        return state._replace(joint=propagate(state.joint, u, self.motion, settings)[0])
+        return state._replace(joint=self._ekf.predict(state.joint, u, key))
 
     def update(self, state: DelayedState, scan: Scan, key: Array) -> tuple[DelayedState, Info]:
         settings = self._settings
         # Padding may hold any number, and is multiplied by zero below.
         scan = scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
         state = state._replace(clock=state.clock + 1)
-        found, matched = _associate(settings, state, scan)
-        state, correction = _correct(settings, state, scan, found, matched)
+        sensor, ekf = settings.sensor, self._ekf
+        # Hypotheses and stored measurements are not landmarks.
+        is_landmark = jnp.arange(settings.layout.slots) < settings.layout.landmarks
+        landmarks = state.joint._replace(alive=state.joint.alive & is_landmark)
+        found, matched = associate_scan(
+            self.associate, sensor, scan, lambda: prediction_of(ekf, sensor, landmarks)
+        )
+        slot = jnp.maximum(found.slot, 0)
+        joint, correction = correct_in_turn(ekf, sensor, state.joint, scan.z, slot, matched)
+        state = state._replace(joint=joint)
         new = _new_measurements(settings, scan, found)
 
         def initialize(state: DelayedState) -> tuple[DelayedState, _Outcome]:
@@ -211,6 +216,12 @@ class DelayedSlam(Filter):
         return estimate_of(landmarks, self._settings.sensor, self.chart)
 
     @property
+    def _ekf(self) -> EkfSlam:
+        """The EKF-SLAM by which landmarks of the map are associated and corrected."""
+        gate = 0.99 if self.gate is None else self.gate
+        return EkfSlam(self.motion, self.sensor, self.capacity, associate=self.associate, gate=gate)
+
+    @property
     def _settings(self) -> DelayedSettings:
         capacities = self.hypotheses.capacity, self.stored.capacity
         gate = 0.99 if self.gate is None else self.gate
@@ -236,41 +247,13 @@ class _Outcome(NamedTuple):
     promoted: Promoted
 
 
-def _ekf_settings(settings: DelayedSettings) -> EkfSettings:
-    """The settings of `EkfSlam`, by which landmarks of the map are associated and corrected."""
-    return EkfSettings(sensor=settings.sensor, associate=settings.associate, gate=settings.gate)
-
-
-def _associate(
-    settings: DelayedSettings, state: DelayedState, scan: Scan
-) -> tuple[Association, Bool[Array, "M"]]:
-    """The landmark slot of each measurement, and which measurements have one.
-
-    Hypotheses and stored measurements are not landmarks.
-    """
-    joint = state.joint
-    landmarks = joint.alive & (jnp.arange(settings.layout.slots) < settings.layout.landmarks)
-    return associate_scan(joint._replace(alive=landmarks), scan, _ekf_settings(settings))
-
-
-def _correct(
-    settings: DelayedSettings,
-    state: DelayedState,
-    scan: Scan,
-    found: Association,
-    matched: Bool[Array, "M"],
-) -> tuple[DelayedState, Correction]:
-    """The state corrected by the measurements of landmarks of the map that are within the gate."""
-    slot = jnp.maximum(found.slot, 0)
-    joint, correction = correct_in_turn(state.joint, scan.z, slot, matched, _ekf_settings(settings))
-    return state._replace(joint=joint), correction
-
-
 def _new_measurements(settings: DelayedSettings, scan: Scan, found: Association) -> NewMeasurements:
     """The measurements of a scan that association declares new."""
     is_new = scan.valid & found.is_new
     if settings.by_tag:
-        return NewMeasurements(scan.z, scan.tag, scan.tag, is_new, seen_before(scan.tag, is_new))
+        return NewMeasurements(
+            scan.z, scan.tag, scan.tag, is_new, slots.seen_before(scan.tag, is_new)
+        )
     unknown = jnp.full_like(scan.tag, -1)
     return NewMeasurements(scan.z, unknown, scan.tag, is_new, jnp.zeros_like(is_new))
 

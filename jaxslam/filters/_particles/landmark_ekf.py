@@ -18,7 +18,7 @@ from jaxslam.filters._particles.particle_settings import ParticleMapSettings
 from jaxslam.filters._particles.proposal import ParticleInnovations
 from jaxslam.filters._particles.scan_association import ParticleAssociation
 from jaxslam.filters._particles.slam_particles import SlamParticles, as_only_particle, slam_estimate
-from jaxslam.filters._reporting import info_of, seen_before, status_of, with_removed
+from jaxslam.filters._reporting import info_of, status_of, with_removed
 from jaxslam.linearize import _first_order as first_order
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._gaussians import gaussian_terms
@@ -171,7 +171,7 @@ def _allocate_slots(
     is_new: Bool[Array, "M"], tag: Int[Array, "M"], alive: Bool[Array, "N"], quota: int | None
 ) -> _AllocatedSlots:
     """A free slot for each new landmark, in the order of the scan."""
-    repeated = is_new & seen_before(tag, is_new)
+    repeated = is_new & slots.seen_before(tag, is_new)
     wanted = is_new & ~repeated
     deferred = wanted & (jnp.cumsum(wanted) > (tag.shape[0] if quota is None else quota))
     slot, granted = slots.allocate(alive, wanted & ~deferred)

@@ -15,7 +15,7 @@ from jaxslam.core import _validation as validation
 from jaxslam.core._record import hold_function, record, static
 from jaxslam.core.protocols import Associate, Motion, Sensor
 from jaxslam.core.types import Estimate, Info, Scan
-from jaxslam.filters._known.localization import hold_map, map_tags
+from jaxslam.filters._known_map import hold_map, map_tags
 from jaxslam.filters._particles.likelihood import ScanLikelihood, scan_likelihood
 from jaxslam.filters._particles.particle_settings import known_map_sensors
 from jaxslam.filters._particles.pose_particles import Box, PoseParticles, draw_start, weighted_nis

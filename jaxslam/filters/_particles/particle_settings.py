@@ -10,7 +10,7 @@ from jaxslam.core import _validation as validation
 from jaxslam.core._numbers import gate_quantile
 from jaxslam.core._record import hold_function
 from jaxslam.core.protocols import Associate, Life, Sensor
-from jaxslam.filters._known.localization import map_tags
+from jaxslam.filters._known_map import map_tags
 from jaxslam.math._arrays import Number
 from jaxslam.math.stats import chi2_quantile
 from jaxslam.sensors._suite import Suite

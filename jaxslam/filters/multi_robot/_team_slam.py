@@ -1,10 +1,10 @@
 """EKF-SLAM of several robots in one joint state (Solà's loop over robots, sensors, landmarks)."""
 
 import dataclasses
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxslam.association._rules import Known
@@ -16,15 +16,9 @@ from jaxslam.core._record import hold_function, record, set_field, static
 from jaxslam.core.protocols import Associate, Filter
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan, Status
-from jaxslam.filters._ekf.ekf_settings import (
-    CorrectionOrder,
-    Covariance,
-    EkfSettings,
-    check_covariance_form,
-    check_ekf_options,
-)
-from jaxslam.filters._ekf.predict import propagate
-from jaxslam.filters._ekf.scan import SensorStage, stage_of, update_by_scan
+from jaxslam.filters._ekf.checks import check_choice, check_map_options
+from jaxslam.filters._ekf.correction import Covariance
+from jaxslam.filters._ekf.ekf_slam import CorrectionOrder, EkfSlam, propagate, update_by_sensor
 from jaxslam.filters._reporting import joined_info
 from jaxslam.filters.multi_robot._pose_initialization import best_initialization, observed_points
 from jaxslam.filters.multi_robot._team import Robot, check_team, poses, sizes
@@ -42,7 +36,7 @@ from jaxslam.math import se2
 from jaxslam.math._arrays import Number
 from jaxslam.math._xla import where_any
 from jaxslam.math.angles import wrap
-from jaxslam.sensors._suite import Part, split_scan
+from jaxslam.sensors._suite import on_ground, split_scan
 
 
 @record
@@ -107,10 +101,10 @@ class TeamSlam(Filter):
             validation.check_models(name, robot.motion, robot.sensors)
         validation.check_parts(name, associate=self.associate)
         hold_function(self, "associate", "prediction, scan")
-        check_ekf_options(
-            name, self.capacity, self.correction, self.gate, self.iterations, self.births
-        )
-        check_covariance_form(name, self.covariance, ("plain", "joseph"))
+        check_map_options(name, self.capacity, self.gate, self.births)
+        check_count(f"{name}: iterations", self.iterations)
+        check_choice(name, "correction", self.correction, get_args(CorrectionOrder))
+        check_choice(name, "covariance", self.covariance, ("plain", "joseph"))
         if type(self.report) is not int or not 0 <= self.report < len(robots):
             raise ValueError(
                 f"{name}: expected report from 0 to {len(robots) - 1}, got {self.report!r}"
@@ -178,26 +172,23 @@ class TeamSlam(Filter):
     @property
     def _settings(self) -> TeamSettings:
         capacity, robots = self.capacity, self.robots
-        ekf = EkfSettings(
-            sensor=robots[0].sensors,
-            chart=_HeadingsWrapped(),
-            associate=self.associate,
-            correction=self.correction,
-            gate=self.gate,
-            iterations=self.iterations,
-            covariance=self.covariance,
-            births=self.births,
-            reserved=np.arange(capacity + len(robots) - 1) >= capacity,
+        ekfs = tuple(
+            EkfSlam(
+                robot.motion,
+                robot.sensors,
+                capacity + len(robots) - 1,
+                chart=_HeadingsWrapped(),
+                associate=self.associate,
+                correction=self.correction,
+                gate=self.gate,
+                iterations=self.iterations,
+                covariance=self.covariance,
+                births=self.births,
+            )
+            for robot in robots
         )
-        stages = tuple([_stage_of(part, ekf) for part in robot.sensors.parts] for robot in robots)
         tags = self.tags or tuple(range(capacity, capacity + len(robots)))
-        return TeamSettings(robots, capacity, tags, ekf, stages)
-
-
-def _stage_of(part: Part, ekf: EkfSettings) -> SensorStage:
-    """The stage of one sensor in a scan; sensors of robots initialize no landmarks."""
-    births = 0 if part.sees == "robots" else ekf.births
-    return stage_of(part, SIZE, dataclasses.replace(ekf, births=births))
+        return TeamSettings(robots, capacity, tags, ekfs)
 
 
 @record
@@ -231,9 +222,7 @@ def _predicted_robot(
     joint: Joint, robot: int, u: Float[Array, "U"], settings: TeamSettings
 ) -> Joint:
     """The state after the prediction of one robot, if it is in the map."""
-    after, _ = propagate(
-        seen_from(joint, robot, settings), u, settings.robots[robot].motion, settings.ekf
-    )
+    after, _ = propagate(settings.ekfs[robot], seen_from(joint, robot, settings), u)
     after = seen_from_first(after, robot, joint, settings)
     if robot in settings.started:
         return after
@@ -273,10 +262,19 @@ def corrected(joint: Joint, robot: int, scan: Scan, settings: TeamSettings) -> t
     of_robot = scan.tag[:, None] == jnp.asarray(settings.tags, jnp.int32)[None, :]
     others = jnp.where(jnp.arange(len(in_map)) == robot, False, in_map)
     unknown = (of_robot & ~others[None, :]).any(axis=1) | ~in_map[robot]
-    part_scan = scan._replace(valid=scan.valid & ~unknown)
-    after, info = update_by_scan(
-        seen_from(joint, robot, settings), part_scan, settings.stages[robot]
-    )[:2]
+    after = seen_from(joint, robot, settings)
+    ekf, sensors, infos = settings.ekfs[robot], settings.robots[robot].sensors, []
+    is_robot = jnp.arange(len(joint.alive)) >= settings.capacity
+    of_sensors = split_scan(scan._replace(valid=scan.valid & ~unknown), sensors.places)
+    for part, part_scan in zip(sensors.parts, of_sensors, strict=True):
+        sensor = on_ground(part.sensor, SIZE)
+        part_scan = part_scan._replace(z=part_scan.z[:, : len(sensor.measurements)])
+        births = 0 if part.sees == "robots" else ekf.births
+        after, part_info, _, _ = update_by_sensor(
+            ekf, sensor, after, part_scan, births, reserved=is_robot
+        )
+        infos.append(part_info)
+    info = joined_info(infos, scan.z.shape[1])
     status = jnp.where(scan.valid & unknown, Status.UNMATCHED, info.status)
     info = info._replace(status=status.astype(jnp.int32))
     return seen_from_first(after, robot, joint, settings), info

@@ -14,8 +14,7 @@ from jaxtyping import Array, Bool, Float
 
 from jaxslam.core.protocols import Sensor
 from jaxslam.core.slots import Joint
-from jaxslam.filters._ekf.ekf_settings import EkfSettings
-from jaxslam.filters._ekf.scan import SensorStage
+from jaxslam.filters._ekf.ekf_slam import EkfSlam
 from jaxslam.filters.multi_robot._team import Robot
 
 SIZE = 3
@@ -31,10 +30,8 @@ class TeamSettings:
     """landmark slots N"""
     tags: tuple[int, ...]
     """(R,) that mean robots"""
-    ekf: EkfSettings
-    """settings of the prediction and the correction of each robot"""
-    stages: tuple[list[SensorStage], ...]
-    """stages of the sensors of each robot in a scan"""
+    ekfs: tuple[EkfSlam, ...]
+    """the EKF-SLAM by which each robot predicts and corrects"""
 
     @property
     def started(self) -> list[int]:

@@ -15,7 +15,7 @@ from jaxslam.core._record import hold_function, record, static
 from jaxslam.core.protocols import Associate, Filter, Motion, Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan, Status
-from jaxslam.filters._ekf.ekf_settings import check_ekf_options
+from jaxslam.filters._ekf.checks import check_map_options
 from jaxslam.filters._ekf.ekf_slam import EkfSlam
 from jaxslam.graphs._chain.window import (
     WindowIterate,
@@ -99,7 +99,8 @@ class FixedLag(Filter):
         validation.check_models(name, self.motion, sensor)
         validation.check_parts(name, associate=self.associate)
         hold_function(self, "associate", "prediction, scan")
-        check_ekf_options(name, self.capacity, "joint", self.gate, self.iterations, self.births)
+        check_map_options(name, self.capacity, self.gate, self.births)
+        validation.check_count(f"{name}: iterations", self.iterations)
         same = len(sensor.measurements) == len(sensor.landmark)
         several = isinstance(sensor, Suite) or sensor.reduced is not None
         if several or sensor.free.mean.shape[0] or not same:

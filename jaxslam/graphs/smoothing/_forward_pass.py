@@ -16,7 +16,7 @@ from jaxslam.core._record import hold_function, record, set_field, static
 from jaxslam.core.protocols import Associate, Component, Filter, Motion, Sensor, Wrapper
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Log, Scan, Trace
-from jaxslam.filters._ekf.ekf_settings import check_ekf_options
+from jaxslam.filters._ekf.checks import check_map_options
 from jaxslam.filters._ekf.ekf_slam import EkfSlam
 from jaxslam.math._arrays import Number
 from jaxslam.math._xla import hot_jit
@@ -125,7 +125,7 @@ class LogEstimator(Component):
             )
         for field in ("pose", "pose_cov"):
             set_field(self, field, held_array(getattr(self, field)))
-        check_ekf_options(name, self.capacity, "joint", self.gate, 1, self.births)
+        check_map_options(name, self.capacity, self.gate, self.births)
         self._check(LogEstimator, {"solve": "log, key"})
 
     def solve(self, log: Log, key: Array) -> Trace:
