@@ -48,8 +48,8 @@ __all__ = [
     "Estimator",
     "Filter",
     "Free",
-    "Here",
     "Life",
+    "LinearizationPoint",
     "Linearizer",
     "Model",
     "Motion",
@@ -319,7 +319,7 @@ class Chart(Component):
         raise NotImplementedError
 
 
-class Here(NamedTuple):
+class LinearizationPoint(NamedTuple):
     """The state at which a model is linearized, the input of a linearizer."""
 
     joint: Joint
@@ -354,25 +354,33 @@ class Linearizer(Component):
     def __post_init__(self) -> None:
         self._check(
             Linearizer,
-            {"motion": "motion, u, here", "observe": "sensor, here", "invert": "s, z, tag, here"},
+            {
+                "motion": "motion, u, point",
+                "observe": "sensor, point",
+                "invert": "s, z, tag, point",
+            },
         )
 
     def init(self, pose: Pose, landmarks: Float[Array, "N L"]) -> PyTree:
         """The first memory, of a start with landmarks (N, L) zeros: arrays of fixed shape."""
         return ()
 
-    def motion(self, motion: Motion, u: Control, here: Here) -> tuple[Array, Array, Array, PyTree]:
+    def motion(
+        self, motion: Motion, u: Control, point: LinearizationPoint
+    ) -> tuple[Array, Array, Array, PyTree]:
         """The new pose, its derivative by the old one (3, 3), the covariance that the noise adds to
         it (3, 3), and the memory."""
         raise NotImplementedError
 
-    def observe(self, sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
+    def observe(
+        self, sensor: Sensor, point: LinearizationPoint
+    ) -> tuple[Array, Array, Array, Array]:
         """The predicted z, its derivatives by pose (Z, 3) and by l (Z, L), and a covariance (Z, Z)
         to add to that of the measurement noise."""
         raise NotImplementedError
 
     def invert(
-        self, sensor: Sensor, z: Measurement, tag: Int[Array, ""], here: Here
+        self, sensor: Sensor, z: Measurement, tag: Int[Array, ""], point: LinearizationPoint
     ) -> tuple[Array, Array, Array]:
         """The new l, its derivative by the pose (L, 3), its covariance for a known pose (L, L)."""
         raise NotImplementedError

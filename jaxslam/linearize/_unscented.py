@@ -9,7 +9,7 @@ from jax import Array
 
 from jaxslam.core._numbers import is_concrete
 from jaxslam.core._record import record
-from jaxslam.core.protocols import Here, Linearizer, Motion, Sensor
+from jaxslam.core.protocols import LinearizationPoint, Linearizer, Motion, Sensor
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import Number
 
@@ -53,11 +53,13 @@ class Unscented(Linearizer):
             raise ValueError(f"Unscented: expected alpha in (0, 1], got {self.alpha}")
         super().__post_init__()
 
-    def motion(self, motion: Motion, u: Array, here: Here) -> tuple[Array, Array, Array, tuple[()]]:
-        pose, chart, width = here.pose, here.chart, len(motion.noises)
-        ground = jnp.zeros(here.joint.landmarks.shape[1], pose.dtype)
+    def motion(
+        self, motion: Motion, u: Array, point: LinearizationPoint
+    ) -> tuple[Array, Array, Array, tuple[()]]:
+        pose, chart, width = point.pose, point.chart, len(motion.noises)
+        ground = jnp.zeros(point.joint.landmarks.shape[1], pose.dtype)
         moved = motion.step(pose, u, jnp.zeros(width, pose.dtype))
-        root = _root(here.cov)
+        root = _root(point.cov)
         root_noise = linalg.root_psd(motion.noise_cov(pose, u))
 
         def f(xi: Array) -> Array:
@@ -73,9 +75,11 @@ class Unscented(Linearizer):
             noise = after @ noise @ after.T
         return moved, by_pose, noise, ()
 
-    def observe(self, sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
-        pose, landmark, chart = here.pose, here.landmark, here.chart
-        root = _root(here.cov)
+    def observe(
+        self, sensor: Sensor, point: LinearizationPoint
+    ) -> tuple[Array, Array, Array, Array]:
+        pose, landmark, chart = point.pose, point.landmark, point.chart
+        root = _root(point.cov)
         centre = sensor.observe(pose, landmark)
 
         def h(xi: Array) -> Array:
@@ -94,13 +98,13 @@ class Unscented(Linearizer):
         return centre + by.mean, by_pose, by_landmark, by.rest
 
     def invert(
-        self, sensor: Sensor, z: Array, tag: Array, here: Here
+        self, sensor: Sensor, z: Array, tag: Array, point: LinearizationPoint
     ) -> tuple[Array, Array, Array]:
-        pose, chart, size_z = here.pose, here.chart, z.shape[0]
+        pose, chart, size_z = point.pose, point.chart, z.shape[0]
         mean, cov_s = (jnp.asarray(part, z.dtype) for part in sensor.free)
         centre = sensor.invert(pose, z, mean)
         still = jnp.zeros_like(centre)
-        root = _root(here.cov)
+        root = _root(point.cov)
         own_roots = [linalg.root_psd(sensor.noise_cov(z)), linalg.root_psd(cov_s)]
 
         def g(xi: Array) -> Array:

@@ -12,7 +12,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam.core import slots
-from jaxslam.core.protocols import Here
+from jaxslam.core.protocols import LinearizationPoint
 from jaxslam.core.slots import Joint
 from jaxslam.filters._ekf.ekf_settings import EkfSettings
 from jaxslam.filters._ekf.linear_system import basis_of_each
@@ -203,8 +203,8 @@ def _linearize(
     def observe(
         at: Int[Array, ""], landmark: Float[Array, "L"], cov: Float[Array, "3+L 3+L"]
     ) -> PyTree:
-        here = Here(whole, chart, pose, cov, at, landmark)
-        return settings.linearize.observe(at_slot(sensor, whole, at), here)
+        point = LinearizationPoint(whole, chart, pose, cov, at, landmark)
+        return settings.linearize.observe(at_slot(sensor, whole, at), point)
 
     z_hat, by_pose, by_landmark, rest = jax.vmap(observe)(slot_in_whole, landmark, view.local)
     nu = jax.vmap(sensor.residual)(z, z_hat)

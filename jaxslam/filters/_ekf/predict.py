@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from jaxslam.core import slots
-from jaxslam.core.protocols import Basis, Here, Motion
+from jaxslam.core.protocols import Basis, LinearizationPoint, Motion
 from jaxslam.core.slots import Joint
 from jaxslam.filters._ekf.ekf_settings import EkfSettings
 from jaxslam.filters._ekf.linear_system import Transition
@@ -24,8 +24,8 @@ def propagate(
     """
     chart, square_root = settings.chart, settings.square_root
     robot = slots.robot_cov(joint, square_root)
-    here = Here(joint, chart, joint.pose, robot)
-    pose, by_pose, noise, lin = settings.linearize.motion(motion, u, here)
+    point = LinearizationPoint(joint, chart, joint.pose, robot)
+    pose, by_pose, noise, lin = settings.linearize.motion(motion, u, point)
     if chart.basis is None:
         moved = Transition(by_pose, None, None, jnp.eye(3, dtype=noise.dtype), None)
     else:

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from jaxslam.association._rules import predicted
-from jaxslam.core.protocols import Basis, Chart, Here, Prediction
+from jaxslam.core.protocols import Basis, Chart, LinearizationPoint, Prediction
 from jaxslam.core.slots import Joint
 from jaxslam.filters._ekf.ekf_settings import EkfSettings
 from jaxslam.filters._ekf.map_coordinates import at_slot
@@ -29,7 +29,8 @@ def prediction_of(joint: Joint, settings: EkfSettings) -> Prediction:
         local = jnp.concatenate([top, bottom], axis=1)
         expected, by_pose, by_landmark, rest = jax.vmap(
             lambda slot, landmark, cov: settings.linearize.observe(
-                at_slot(sensor, joint, slot), Here(joint, chart, joint.pose, cov, slot, landmark)
+                at_slot(sensor, joint, slot),
+                LinearizationPoint(joint, chart, joint.pose, cov, slot, landmark),
             )
         )(every, joint.landmarks, local)
         if chart.basis is not None:

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.core import slots
-from jaxslam.core.protocols import Association, Here, Sensor
+from jaxslam.core.protocols import Association, LinearizationPoint, Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Info, Scan
 from jaxslam.filters._ekf.ekf_settings import EkfSettings
@@ -45,13 +45,13 @@ def augment(
     with the prior's term of (44); several in one scan are correlated through the robot.
     """
     chart, square_root = settings.chart, settings.square_root
-    here = Here(joint, chart, joint.pose, slots.robot_cov(joint, square_root))
+    point = LinearizationPoint(joint, chart, joint.pose, slots.robot_cov(joint, square_root))
 
     def one(
         z_i: Float[Array, "Z"], tag_i: Int[Array, ""]
     ) -> tuple[Float[Array, "L"], Float[Array, "L 3"], Float[Array, "L L"]]:
         landmark, by_pose, landmark_cov = settings.linearize.invert(
-            settings.sensor, z_i, tag_i, here
+            settings.sensor, z_i, tag_i, point
         )
         if chart.basis is not None:
             basis = chart.basis(joint.pose, landmark)

@@ -23,7 +23,7 @@ from jaxslam.core.protocols import (
     Basis,
     Chart,
     Filter,
-    Here,
+    LinearizationPoint,
     Linearizer,
     Motion,
     Prediction,
@@ -171,17 +171,21 @@ class _OnMap(Linearizer):
     def init(self, pose: Array, landmarks: Array) -> PyTree:
         return self.linearize.init(pose, landmarks)
 
-    def motion(self, motion: Motion, u: Array, here: Here) -> tuple[Array, Array, Array, PyTree]:
-        return self.linearize.motion(motion, u, here)
+    def motion(
+        self, motion: Motion, u: Array, point: LinearizationPoint
+    ) -> tuple[Array, Array, Array, PyTree]:
+        return self.linearize.motion(motion, u, point)
 
-    def observe(self, sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
-        landmark = jnp.asarray(self.points, here.pose.dtype)[here.slot]
-        return self.linearize.observe(dataclasses.replace(sensor, known=landmark), here)
+    def observe(
+        self, sensor: Sensor, point: LinearizationPoint
+    ) -> tuple[Array, Array, Array, Array]:
+        landmark = jnp.asarray(self.points, point.pose.dtype)[point.slot]
+        return self.linearize.observe(dataclasses.replace(sensor, known=landmark), point)
 
     def invert(
-        self, sensor: Sensor, z: Array, tag: Array, here: Here
+        self, sensor: Sensor, z: Array, tag: Array, point: LinearizationPoint
     ) -> tuple[Array, Array, Array]:
-        return self.linearize.invert(sensor, z, tag, here)
+        return self.linearize.invert(sensor, z, tag, point)
 
 
 @record
