@@ -21,8 +21,8 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 from numpy.typing import ArrayLike
 
-from jaxslam.core._record import is_record
 from jaxslam.core.protocols import Motion, Sensor
+from jaxslam.core.record import is_record
 from jaxslam.core.types import Estimate, Truth
 from jaxslam.math._arrays import float64
 from jaxslam.sensors._suite import Suite

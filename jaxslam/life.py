@@ -12,12 +12,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.core import slots
-from jaxslam.core._numbers import check_count, is_concrete
-from jaxslam.core._record import hold_function, record, static
 from jaxslam.core.protocols import Life
+from jaxslam.core.record import field, function_of, record, static
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Status
-from jaxslam.math._arrays import Number
+from jaxslam.core.validation import InvalidField, at_least, or_none, positive
+from jaxslam.math._arrays import Number, is_concrete
 
 __all__ = ["Evidence", "Existence", "Recency", "Times"]
 
@@ -42,14 +42,9 @@ class Recency(Life):
     Raises ValueError on a patience below 1.
     """
 
-    patience: int | None = static(default=None)
+    patience: int | None = static(default=None, check=or_none(at_least(1)))
     """a landmark not measured for this many scans, empty ones too, is removed, which leaves a local
     map. None removes no landmark."""
-
-    def __post_init__(self) -> None:
-        if self.patience is not None:
-            check_count("Recency: patience", self.patience)
-        super().__post_init__()
 
     def init(self, pose: Float[Array, "3"], landmarks: Float[Array, "N L"]) -> Times:
         none = jnp.zeros(landmarks.shape[0], jnp.int32)
@@ -110,7 +105,7 @@ class Existence(Life):
     0 < remove < 1/2 < confirm < 1; on a patience below 1 or a spread not above 0.
     """
 
-    visible: Callable[[Array, Array], Array]
+    visible: Callable[[Array, Array], Array] = field(check=function_of("pose", "l"))
     """(pose, l) -> () bool: whether a scan from there should measure the landmark. Prefer a strict
     one: a sensor misses many landmarks near the edge of its view."""
     _: dataclasses.KW_ONLY
@@ -122,9 +117,9 @@ class Existence(Life):
     """probability"""
     remove: Number = 0.05
     """probability"""
-    patience: int | None = static(default=None)
+    patience: int | None = static(default=None, check=or_none(at_least(1)))
     """a provisional landmark not measured for this many scans is removed"""
-    spread: Number | None = None
+    spread: Number | None = field(default=None, check=or_none(positive))
     """[m] a landmark with a larger standard deviation, √(tr P/2), is removed"""
     replace: bool = static(default=False)
     """in a full map, new landmarks take the place of those least likely to exist among the
@@ -132,20 +127,13 @@ class Existence(Life):
     (`Status.OVERFLOW`)"""
 
     def __post_init__(self) -> None:
-        hold_function(self, "visible", "pose, l")
         false, detected, remove, confirm = self.false, self.detected, self.remove, self.confirm
         if is_concrete(false, detected) and not 0 < false < detected < 1:
-            raise ValueError(
-                f"Existence: expected 0 < false < detected < 1, got {false}, {detected}"
-            )
+            reason = f"expected 0 < false < detected < 1, got {false}, {detected}"
+            raise InvalidField(type(self).__name__, "", reason)
         if is_concrete(remove, confirm) and not 0 < remove < 0.5 < confirm < 1:
-            raise ValueError(
-                f"Existence: expected 0 < remove < 1/2 < confirm < 1, got {remove}, {confirm}"
-            )
-        if self.patience is not None:
-            check_count("Existence: patience", self.patience)
-        if self.spread is not None and is_concrete(self.spread) and not self.spread > 0:
-            raise ValueError(f"Existence: expected a spread above 0, got {self.spread}")
+            reason = f"expected 0 < remove < 1/2 < confirm < 1, got {remove}, {confirm}"
+            raise InvalidField(type(self).__name__, "", reason)
         super().__post_init__()
 
     def init(self, pose: Float[Array, "3"], landmarks: Float[Array, "N L"]) -> Evidence:

@@ -7,11 +7,11 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.association._rules import check_gates, far_from_all
-from jaxslam.core._numbers import check_count
-from jaxslam.core._record import record, static
+from jaxslam.association._rules import check_new_gate, far_from_all, gate_probability
 from jaxslam.core.protocols import Association, Pairs, Prediction
+from jaxslam.core.record import field, record, static
 from jaxslam.core.types import Scan
+from jaxslam.core.validation import at_least, probability
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import Number
 from jaxslam.math.stats import chi2_quantile
@@ -35,22 +35,19 @@ class JointCompatibility:
     candidates below 1.
     """
 
-    probability: float = static(default=0.99)
+    probability: float = static(default=0.99, check=probability)
     """p of both tests"""
-    new_gate: Number | None = None
-    """another probability, at least the first; the same by default"""
-    budget: int = static(default=2000, kw_only=True)
+    new_gate: Number | None = field(default=None, check=gate_probability)
+    """probability of the gate of new landmarks, at least `probability`; default `probability`"""
+    budget: int = static(default=2000, kw_only=True, check=at_least(1))
     """largest number of nodes of the search. At this limit the best result is returned, and
     `Association.exhausted` is set"""
-    candidates: int = static(default=8, kw_only=True)
+    candidates: int = static(default=8, kw_only=True, check=at_least(1))
     """number of nearest compatible landmarks tried for a measurement; if there are more,
     `exhausted` is set"""
 
     def __post_init__(self) -> None:
-        what = "JointCompatibility"
-        check_gates(what, self.probability, self.new_gate)
-        check_count(f"{what}: budget", self.budget)
-        check_count(f"{what}: candidates", self.candidates)
+        check_new_gate("JointCompatibility", self.probability, self.new_gate)
 
     def __call__(self, prediction: Prediction, scan: Scan) -> Association:
         pairs: Pairs = jax.lax.stop_gradient(prediction.pairs(scan))

@@ -2,39 +2,44 @@
 
 import dataclasses
 from collections.abc import Callable
-from numbers import Real
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.core import slots
-from jaxslam.core._numbers import check_gate, check_positive, gate_quantile, is_concrete
-from jaxslam.core._record import hold_function, record, static
+from jaxslam.core._numbers import gate_quantile
 from jaxslam.core.protocols import Associate, Association, Pairs, Prediction, Sensor
+from jaxslam.core.record import field, function_of, record, static
 from jaxslam.core.types import Scan
-from jaxslam.math._arrays import Number
+from jaxslam.core.validation import InvalidField, a, one_of, or_none, positive, probability
+from jaxslam.math._arrays import Number, is_concrete
 from jaxslam.math._assignment import assign
 from jaxslam.math._gaussians import gaussian_terms
 
 
-def check_gates(name: str, gate: Number | None, new_gate: Number | None) -> None:
-    """Raise ValueError on a gate that is no probability, and on a new_gate below it."""
-    for each in (gate, new_gate):
-        if each is not None and not isinstance(each, Real | np.ndarray | jax.Array):
-            called = isinstance(each, Prediction | Scan)
-            again = f": as associate, give {name}(gate), not {name}" if called else ""
-            raise ValueError(f"{name}: expected a number as gate, got {type(each).__name__}{again}")
-        check_gate(name, each)
+def gate_probability(value: Number | None) -> Number | None:
+    """The check of a gate, a probability or None."""
+    if isinstance(value, Prediction | Scan):  # the class was given as the method, and is called
+        raise ValueError(
+            f"expected a probability, got {a(type(value).__name__)}: as associate, give a rule "
+            "with its gate, not its class"
+        )
+    gate: Number | None = or_none(probability)(value)
+    return gate
+
+
+def check_new_gate(owner: str, gate: Number | None, new_gate: Number | None) -> None:
+    """Raise InvalidField on a new_gate that is not at least the gate."""
     if new_gate is None:
         return
     if gate is None:
-        raise ValueError(f"{name}: expected no new_gate without a gate, got {new_gate}")
+        raise InvalidField(owner, "new_gate", f"expected None without a gate, got {new_gate}")
     if is_concrete((gate, new_gate)) and not new_gate >= gate:
-        raise ValueError(f"{name}: expected new_gate >= gate = {gate}, got {new_gate}")
+        reason = f"expected new_gate >= gate = {gate}, got {new_gate}"
+        raise InvalidField(owner, "new_gate", reason)
 
 
 def within_gate(pairs: Pairs, gate: Number | None) -> Bool[Array, "M N"]:
@@ -91,21 +96,19 @@ class Nearest:
     Raises ValueError on a gate that is no probability, a new_gate below it, or an unknown policy.
     """
 
-    gate: Number | None
+    gate: Number | None = field(check=gate_probability)
     """probability that a measurement is compatible with its own landmark, above 0 and below 1;
     None: all pairs are compatible"""
-    new_gate: Number | None = None
-    """another probability, at least the gate; the same by default"""
-    ambiguous: Literal["nearest", "leave"] = static(default="nearest", kw_only=True)
+    new_gate: Number | None = field(default=None, check=gate_probability)
+    """probability of the gate of new landmarks, at least the gate; default the gate"""
+    ambiguous: Literal["nearest", "leave"] = static(
+        default="nearest", kw_only=True, check=one_of("nearest", "leave")
+    )
     """"leave" ignores a measurement that is compatible with several landmarks, and several that are
     compatible with one"""
 
     def __post_init__(self) -> None:
-        check_gates("Nearest", self.gate, self.new_gate)
-        if self.ambiguous not in ("nearest", "leave"):
-            raise ValueError(
-                f'Nearest: expected ambiguous "nearest" or "leave", got {self.ambiguous!r}'
-            )
+        check_new_gate("Nearest", self.gate, self.new_gate)
 
     def __call__(self, prediction: Prediction, scan: Scan) -> Association:
         pairs = prediction.pairs(scan)
@@ -129,11 +132,11 @@ class MaximumLikelihood:
         ValueError: on a gate that is no probability, or a new_gate below it.
     """
 
-    gate: Number | None
-    new_gate: Number | None = None
+    gate: Number | None = field(check=gate_probability)
+    new_gate: Number | None = field(default=None, check=gate_probability)
 
     def __post_init__(self) -> None:
-        check_gates("MaximumLikelihood", self.gate, self.new_gate)
+        check_new_gate("MaximumLikelihood", self.gate, self.new_gate)
 
     def __call__(self, prediction: Prediction, scan: Scan) -> Association:
         pairs = prediction.pairs(scan)
@@ -155,11 +158,11 @@ class GlobalNearest:
         ValueError: on a gate that is no probability, or a new_gate below it.
     """
 
-    gate: Number | None
-    new_gate: Number | None = None
+    gate: Number | None = field(check=gate_probability)
+    new_gate: Number | None = field(default=None, check=gate_probability)
 
     def __post_init__(self) -> None:
-        check_gates("GlobalNearest", self.gate, self.new_gate)
+        check_new_gate("GlobalNearest", self.gate, self.new_gate)
 
     def __call__(self, prediction: Prediction, scan: Scan) -> Association:
         pairs = prediction.pairs(scan)
@@ -189,14 +192,10 @@ class Certain:
     Raises ValueError on a spread not above 0.
     """
 
-    associate: Associate
+    associate: Associate = field(check=function_of("prediction", "scan"))
     """the method; one that uses tags alone, as `Known`, is not restricted"""
-    spread: Number
+    spread: Number = field(check=positive)
     """in units of the measurement, which should all be of one kind"""
-
-    def __post_init__(self) -> None:
-        hold_function(self, "associate", "prediction, scan")
-        check_positive("Certain", spread=self.spread)
 
     def __call__(self, prediction: Prediction, scan: Scan) -> Association:
         def pairs(scan: Scan) -> Pairs:

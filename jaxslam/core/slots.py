@@ -13,6 +13,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int, PyTree
 
 from jaxslam.core._reprs import short_repr
+from jaxslam.core.validation import InvalidField
 from jaxslam.math._linalg import cholesky, matmul, symmetrize, total, triangular_root
 from jaxslam.math._xla import CACHED, last_true_column, materialize, where_any
 
@@ -262,10 +263,9 @@ def remove(joint: Joint, dead: Array, *, square_root: bool = False) -> Joint:
     Raises ValueError unless dead is bool, one for each slot.
     """
     if jnp.shape(dead) != joint.alive.shape or jnp.result_type(dead) != jnp.bool_:
-        raise ValueError(
-            f"remove: expected bool of shape {joint.alive.shape}, got {jnp.result_type(dead)} of "
-            f"{jnp.shape(dead)}"
-        )
+        got = f"{jnp.result_type(dead)} of {jnp.shape(dead)}"
+        reason = f"expected bool of shape {joint.alive.shape}, got {got}"
+        raise InvalidField("remove", "dead", reason)
     size = joint.landmarks.shape[1]
     keep = jnp.concatenate([jnp.ones(3, bool), jnp.repeat(~dead, size)])
     eye = jnp.eye(joint.cov.shape[0], dtype=joint.cov.dtype)

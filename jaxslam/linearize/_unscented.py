@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxslam.core._numbers import is_concrete
-from jaxslam.core._record import record
 from jaxslam.core.protocols import LinearizationPoint, Linearizer, Motion, Sensor
+from jaxslam.core.record import field, record
+from jaxslam.core.validation import in_range, or_none, positive
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import Number
 
@@ -43,15 +43,12 @@ class Unscented(Linearizer):
     Raises ValueError unless 0 < alpha <= 1.
     """
 
-    alpha: Number | None = None
+    alpha: Number | None = field(
+        default=None, check=or_none(lambda alpha: in_range(0.0, 1.0)(positive(alpha)))
+    )
     """spread of the sigma points; default 1e-3 in float64, as theirs, with which the UKF equals an
     EKF to rounding, and 0.1 in float32, because of rounding. 1 reaches √n σ."""
     iterates = False
-
-    def __post_init__(self) -> None:
-        if self.alpha is not None and is_concrete(self.alpha) and not 0 < self.alpha <= 1:
-            raise ValueError(f"Unscented: expected alpha in (0, 1], got {self.alpha}")
-        super().__post_init__()
 
     def motion(
         self, motion: Motion, u: Array, point: LinearizationPoint

@@ -8,8 +8,9 @@ from typing import TypeVar, cast
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
-from jax.typing import DTypeLike
+from jax.typing import ArrayLike, DTypeLike
 from jaxtyping import Float, PyTree
 
 _T = TypeVar("_T")
@@ -40,6 +41,21 @@ ObserveJacobians = tuple[Float[Array, "Z 3"], Float[Array, "Z L"]]
 """∂z/∂(pose, l)"""
 InvertJacobians = tuple[Float[Array, "L 3"], Float[Array, "L Z"], Float[Array, "L K"]]
 """∂l/∂(pose, z, s)"""
+
+
+def is_concrete(*values: object) -> bool:
+    """Whether no leaf of the values is a tracer, whose number is not known."""
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
+
+
+def held_array(values: ArrayLike) -> ArrayLike:
+    """An array unchanged; numbers in lists or tuples as an array of float64 on the host."""
+    if hasattr(values, "dtype"):
+        return values
+    if not is_concrete(values):
+        return jnp.asarray(values)
+    # NumPy, since jnp.asarray would round to float32 unless the user has 64-bit types on.
+    return np.asarray(values, np.float64)
 
 
 def in_dtype(tree: _T, dtype: DTypeLike) -> _T:

@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxslam.core._numbers import check_count
-from jaxslam.core._record import record, static
 from jaxslam.core.protocols import Motion
+from jaxslam.core.record import field, record, static
+from jaxslam.core.validation import at_least, instance_of
 from jaxslam.math._arrays import Control, Pose, ProcessNoise, StepJacobians
 
 _Rows = tuple[Array, Array]
@@ -34,14 +34,10 @@ class Substeps(Motion):
     the unit. It perturbs controls, and has hand-derived Jacobians, where the model does.
     """
 
-    motion: Motion
+    motion: Motion = field(check=instance_of(Motion))
     """the model, with U controls and W noises"""
-    count: int = static()
-    """n; ValueError unless it is an integer >= 1"""
-
-    def __post_init__(self) -> None:
-        check_count("Substeps: count", self.count)
-        super().__post_init__()
+    count: int = static(check=at_least(1))
+    """n"""
 
     @property
     def name(self) -> str:  # type: ignore[override]

@@ -59,9 +59,12 @@ NO_Z = "log.scan.z: a valid measurement is"
 BAD_VALUES = {
     "control nan": (
         changed("control", (2, 1), np.nan),
-        r"log.control is not finite \(row 2\): correct or leave out",
+        r"log.control: a control is not finite \(row 2\): correct or omit",
     ),
-    "control inf": (changed("control", (3, 0), np.inf), r"log.control is not finite \(row 3\)"),
+    "control inf": (
+        changed("control", (3, 0), np.inf),
+        r"log.control: a control is not finite \(row 3\)",
+    ),
     "z nan": (changed("z", (1, 2, 0), np.nan), rf"{NO_Z} not finite \(row 1, slot 2\)"),
     "z inf": (changed("z", (0, 0, 1), -np.inf), rf"{NO_Z} not finite \(row 0, slot 0\)"),
     "control beyond": (changed("control", (2, 0), -5e61), r"control is beyond ±4.5e\+61 \(row 2\)"),

@@ -255,7 +255,7 @@ def test_a_log_of_beams_drops_what_says_nothing():
     (lambda: grids.GridLocalization(3, MODEL, MOVE, 9), "GridLocalization: expected a Grid"),
     (
         lambda: grids.GridLocalization(GRID, MOVE, MODEL, 9),
-        "GridLocalization: expected model to be a BeamModel",
+        "GridLocalization: model: expected a BeamModel",
     ),
     (
         lambda: grids.beam_log(
