@@ -21,8 +21,8 @@ import numpy as np
 from jaxtyping import Array, Float, PyTree
 from numpy.typing import ArrayLike
 
+from jaxslam.core._record import is_record
 from jaxslam.core.protocols import Motion, Sensor
-from jaxslam.core.record import is_record
 from jaxslam.core.types import Estimate, Truth
 from jaxslam.math._arrays import float64
 from jaxslam.sensors._suite import Suite
@@ -95,7 +95,7 @@ def _is_ours(of: Any, models: list[PyTree]) -> bool:
         return all(_is_ours(each, models) for each in of)
     if not is_record(of):
         return True
-    if not type(of).__module__.startswith("jaxslam."):
+    if type(of).__module__.partition(".")[0] != "jaxslam":
         return False
     for field in dataclasses.fields(of):
         value = getattr(of, field.name)

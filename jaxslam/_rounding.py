@@ -124,7 +124,7 @@ def rounding_of(
         reach=reach,
         least=least,
         square_root=bool(getattr(method, "square_root", False)),
-        first_order=by_jacobians and type(method).__module__.startswith("jaxslam."),
+        first_order=by_jacobians and type(method).__module__.partition(".")[0] == "jaxslam",
     )
 
 

@@ -8,8 +8,8 @@ robot and map is one constant direction.
 import jax.numpy as jnp
 from jax import Array
 
+from jaxslam.core._record import record, static
 from jaxslam.core.protocols import Basis, Chart
-from jaxslam.core.record import record, static
 from jaxslam.core.validation import InvalidField
 from jaxslam.math import se2
 from jaxslam.math._arrays import Landmark, Pose

@@ -12,8 +12,8 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.core import slots
+from jaxslam.core._record import field, function_of, record, static
 from jaxslam.core.protocols import Life
-from jaxslam.core.record import field, function_of, record, static
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Status
 from jaxslam.core.validation import InvalidField, at_least, or_none, positive

@@ -8,8 +8,8 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.association._rules import check_new_gate, far_from_all, gate_probability
+from jaxslam.core._record import field, record, static
 from jaxslam.core.protocols import Association, Pairs, Prediction
-from jaxslam.core.record import field, record, static
 from jaxslam.core.types import Scan
 from jaxslam.core.validation import at_least, probability
 from jaxslam.math import _linalg as linalg

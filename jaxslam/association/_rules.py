@@ -11,10 +11,11 @@ from jaxtyping import Bool, Float, Int
 
 from jaxslam.core import slots
 from jaxslam.core._numbers import gate_quantile
+from jaxslam.core._record import field, function_of, record, static
+from jaxslam.core._reprs import describe
 from jaxslam.core.protocols import Associate, Association, Pairs, Prediction, Sensor
-from jaxslam.core.record import field, function_of, record, static
 from jaxslam.core.types import Scan
-from jaxslam.core.validation import InvalidField, a, one_of, or_none, positive, probability
+from jaxslam.core.validation import InvalidField, one_of, or_none, positive, probability
 from jaxslam.math._arrays import Number, is_concrete
 from jaxslam.math._assignment import assign
 from jaxslam.math._gaussians import gaussian_terms
@@ -24,7 +25,7 @@ def gate_probability(value: Number | None) -> Number | None:
     """The check of a gate, a probability or None."""
     if isinstance(value, Prediction | Scan):  # the class was given as the method, and is called
         raise ValueError(
-            f"expected a probability, got {a(type(value).__name__)}: as associate, give a rule "
+            f"expected a probability, got {describe(value)}: as associate, give a rule "
             "with its gate, not its class"
         )
     gate: Number | None = or_none(probability)(value)

@@ -11,9 +11,9 @@ import jax.numpy as jnp
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxslam.core._reprs import with_article
 from jaxslam.core.validation import (
     InvalidField,
-    a,
     at_least,
     covariance,
     mounting_pose,
@@ -71,7 +71,7 @@ def shape_text(value: ArrayLike) -> str:
         return "rows of unlike lengths"
     if shape == () and not hasattr(value, "shape"):
         plain = value is None or isinstance(value, str | int | float | complex)
-        return repr(value) if plain else a(type(value).__name__)
+        return repr(value) if plain else with_article(type(value).__name__)
     return str(shape)
 
 
@@ -87,7 +87,7 @@ def check_array(
         expected = ", ".join(map(str, shape)) + "," * (len(shape) == 1)
         raise InvalidField(name, "", f"expected shape ({expected}), got {got}")
     if not hasattr(value, "dtype"):
-        raise InvalidField(name, "", f"expected an array, got {a(type(value).__name__)}")
+        raise InvalidField(name, "", f"expected an array, got {with_article(type(value).__name__)}")
     dtype = jnp.result_type(value)
     if not jnp.issubdtype(dtype, kind):
         raise InvalidField(name, "", f"expected {kind.__name__} values, got {dtype}")

@@ -19,16 +19,19 @@ from jax import Array
 from jaxtyping import Bool, Float, Int, PyTree
 
 from jaxslam.core._names import unfit_signature
-from jaxslam.core.noise import noise_of
-from jaxslam.core.record import check_field, field, record
+from jaxslam.core._record import Function, check_field, field, is_record, record, static
+from jaxslam.core.noise import Constant, NoiseCov
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, JaxOrNumPy, Log, Scan, Trace
 from jaxslam.core.validation import (
+    Check,
     InvalidField,
+    covariance,
     instance_of,
     mounting_pose,
     names,
     or_none,
+    require,
 )
 from jaxslam.math import se2
 from jaxslam.math._arrays import (
@@ -111,6 +114,32 @@ class Component:
             check_field(self, name, names)
 
 
+@record
+class _CovarianceFunction(Function):
+    """A plain function that returns a covariance, which is checked where its numbers are known."""
+
+    owner: str = static()
+    """the class of the model"""
+    size: int = static()
+
+    def __call__(self, *arguments: Array) -> Array:
+        cov = require(self.owner, "noise_cov", self.function(*arguments), covariance(self.size))
+        return jnp.asarray(cov, arguments[0].dtype)
+
+
+def _noise_of(owner: str, size: int) -> Check:
+    """The check of a model's noise_cov (size, size), which it makes a record that can be called."""
+
+    def check(value: NoiseCov) -> object:
+        if is_record(value):
+            return value
+        if callable(value):
+            return _CovarianceFunction(value, owner, size)
+        return Constant(covariance(size)(value))
+
+    return check
+
+
 class Model(Component):
     """What motion models and sensors share: noise."""
 
@@ -125,7 +154,7 @@ class Model(Component):
             raise InvalidField(type(self).__name__, "noise_cov", "expected a field or a method")
         if "noise_cov" in self.__dict__:
             size = len(getattr(self, named[-1]))
-            check_field(self, "noise_cov", noise_of(type(self).__name__, size))
+            check_field(self, "noise_cov", _noise_of(type(self).__name__, size))
 
 
 class Motion(Model):

@@ -17,6 +17,8 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
+from jaxslam._public import publish
+from jaxslam.core._reprs import describe, real_array, with_article
 from jaxslam.core._units import TURN
 from jaxslam.math._arrays import held_array, is_concrete
 from jaxslam.math._definite import asymmetric, indefinite
@@ -95,39 +97,12 @@ def require(owner: str, field: str, value: Any, check: Check) -> Any:
         raise InvalidField(owner, field, str(error)) from None
 
 
-def describe(value: object) -> str:
-    """What was got, in a few words: a number or text as it is, the shape of an array, a kind."""
-    if value is None or isinstance(value, str | int | float | complex):
-        return repr(value)
-    if isinstance(value, type):
-        return f"the class {value.__name__}: call it, {value.__name__}(…)"
-    shape = getattr(value, "shape", None)
-    if shape == () and is_concrete(value) and _real_array(value) is not None:
-        return str(value)
-    if isinstance(shape, tuple):
-        dtype = getattr(value, "dtype", None)
-        key = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
-        return f"{'PRNG keys' if key else 'an array'} of shape {shape}"
-    if type(value) in (list, tuple) and (array := _real_array(value)) is not None:
-        return f"{a(type(value).__name__)} of shape {array.shape}"
-    return a(type(value).__name__)
-
-
-def a(noun: str) -> str:
-    """The noun with its article: "an EkfSlam", "a Motion", "a Unicycle", "an Unscented"."""
-    vowel = noun[:1] in "AEIOaeio" or (noun[:2] in ("Un", "un") and noun[2:3] != "i")
-    return f"{'an' if vowel or noun == 'ndarray' else 'a'} {noun}"
-
-
-def _real_array(value: Any) -> Any:
-    """Real numbers as an array of their dtype; None of anything else."""
+def _shape(value: Any) -> tuple[int, ...] | None:
+    """The shape of an array, or of numbers in lists; None of rows of unlike lengths."""
     try:
-        if not hasattr(value, "dtype"):
-            value = np.asarray(value) if is_concrete(value) else jnp.asarray(value)
-    except (TypeError, ValueError):  # rows of unlike lengths, tracers beside text
+        return np.shape(value) if is_concrete(value) else jnp.asarray(value).shape
+    except (TypeError, ValueError):
         return None
-    real = any(jnp.issubdtype(value.dtype, kind) for kind in (np.integer, np.floating))
-    return value if real else None
 
 
 # --- checks -------------------------------------------------------------------------------------
@@ -155,7 +130,7 @@ def instance_of(kind: type, hint: str = "") -> Check:
         fields = getattr(value, "_fields", ())
         field = next((name for name in fields if isinstance(getattr(value, name), kind)), None)
         advice = f"; give its field {field}" if field else hint
-        raise ValueError(f"expected {a(kind.__name__)}, got {got}{advice}")
+        raise ValueError(f"expected {with_article(kind.__name__)}, got {got}{advice}")
 
     return check
 
@@ -202,7 +177,7 @@ def in_range(low: float, high: float, *, open: bool = False) -> Check:
         expected = f"a number above {low:g}" + f" and below {high:g}" * (high < math.inf)
 
     def check(value: Any) -> Any:
-        number = _real_array(value)
+        number = real_array(value)
         if number is not None and number.shape == ():
             inside = True  # a tracer, whose value is not known
             if is_concrete(number):
@@ -219,7 +194,7 @@ def probability(value: Any) -> Any:
 
     A number that seems to be a squared distance d² is answered with its probability.
     """
-    number = _real_array(value)
+    number = real_array(value)
     if number is not None and number.shape == ():
         if not is_concrete(number) or 0 < number < 1:
             return value
@@ -240,7 +215,7 @@ def finite(*shape: int, least: float = -math.inf) -> Check:
     expected += f" >= {least:g}" * (least > -math.inf)
 
     def check(value: Any) -> Any:
-        array = _real_array(value)
+        array = real_array(value)
         if array is None or array.shape != shape:
             raise ValueError(f"expected {expected}, got {describe(value)}")
         if is_concrete(array):
@@ -256,31 +231,30 @@ def covariance(size: int) -> Check:
     """The check of a covariance (size, size): finite, symmetric, positive semi-definite."""
 
     def check(value: Any) -> Any:
-        array = _real_array(value)
-        shape = getattr(array, "shape", None)
+        shape = _shape(value)
         if shape != (size, size):
-            got = describe(value) if shape is None or shape == () else str(shape)
+            got = str(shape) if shape else describe(value)
             raise ValueError(f"expected a covariance of shape {(size, size)}, got {got}")
-        if is_concrete(array):
-            check_definite(np.asarray(array))
+        if (array := real_array(value)) is None:
+            raise ValueError(f"expected real numbers, got dtype {np.asarray(value).dtype}")
+        if not is_concrete(array):
+            return held_array(value)
+        matrix = np.asarray(array)
+        if not np.issubdtype(matrix.dtype, np.floating):
+            matrix = matrix.astype(np.float64)
+        if not np.all(np.isfinite(matrix)):
+            raise ValueError("the covariance has a NaN or an infinity")
+        # 1e-6: numbers are often written with six digits.
+        if asymmetric(matrix, 1e-6):
+            raise ValueError("the covariance is not symmetric")
+        if indefinite(matrix, 1e-6):
+            variance = np.diagonal(matrix).min()
+            eigenvalue = np.linalg.eigvalsh(matrix.astype(np.float64))[0]
+            cause = "negative variance" if variance < 0 else f"eigenvalue {eigenvalue:.3g}"
+            raise ValueError(f"the covariance is not positive semi-definite ({cause})")
         return held_array(value)
 
     return check
-
-
-def check_definite(matrix: np.ndarray) -> None:
-    """Raise ValueError unless a matrix is finite, symmetric and positive semi-definite."""
-    if not np.issubdtype(matrix.dtype, np.floating):
-        matrix = matrix.astype(np.float64)
-    if not np.all(np.isfinite(matrix)):
-        raise ValueError("the covariance has a NaN or an infinity")
-    # 1e-6: numbers are often written with six digits.
-    if asymmetric(matrix, 1e-6):
-        raise ValueError("the covariance is not symmetric")
-    if indefinite(matrix, 1e-6):
-        smallest = np.linalg.eigvalsh(matrix.astype(np.float64))[0]
-        why = "negative variance" if np.diagonal(matrix).min() < 0 else f"eigenvalue {smallest:.3g}"
-        raise ValueError(f"the covariance is not positive semi-definite ({why})")
 
 
 def mounting_pose(value: Any) -> Any:
@@ -288,9 +262,9 @@ def mounting_pose(value: Any) -> Any:
 
     Warns of a heading beyond 2π, which may be in degrees.
     """
-    array = _real_array(value)
-    if array is None or array.shape != (3,):
-        got = describe(value) if array is None or array.shape == () else str(array.shape)
+    array, shape = real_array(value), _shape(value)
+    if array is None or shape != (3,):
+        got = str(shape) if shape else describe(value)
         raise ValueError(f"expected a mounting pose of shape (3,), got {got}")
     if is_concrete(array):
         if not np.all(np.isfinite(np.asarray(array))):
@@ -315,3 +289,6 @@ def prng_key(value: Any) -> Any:
         got = repr(value) if dtype is None else f"an array of {dtype} of shape {shape}"
         raise ValueError(f"expected a PRNG key, as jax.random.key(0), got {got}")
     return value
+
+
+publish(__name__)

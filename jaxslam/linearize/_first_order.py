@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
 
+from jaxslam.core._record import record
 from jaxslam.core.protocols import LinearizationPoint, Linearizer, Motion, Sensor
-from jaxslam.core.record import record
 from jaxslam.math._arrays import (
     Control,
     InvertJacobians,

@@ -10,8 +10,8 @@ import jax.numpy as jnp
 from jax import Array
 
 from jaxslam.core._numbers import largest
+from jaxslam.core._record import record
 from jaxslam.core.protocols import LinearizationPoint, Linearizer, Motion, Sensor
-from jaxslam.core.record import record
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Truth
 from jaxslam.linearize import _first_order as first_order

@@ -7,8 +7,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxslam.core._record import field, record
 from jaxslam.core.protocols import LinearizationPoint, Linearizer, Motion, Sensor
-from jaxslam.core.record import field, record
 from jaxslam.core.validation import in_range, or_none, positive
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import Number

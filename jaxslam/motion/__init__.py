@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+from jaxslam._public import publish
 from jaxslam.core.protocols import Motion
 from jaxslam.motion._ackermann import Ackermann
 from jaxslam.motion._increments import Increment, PoseIncrement
@@ -36,3 +37,5 @@ __all__ = [
     "odometry_control",
     "odometry_controls",
 ]
+
+publish(__name__)

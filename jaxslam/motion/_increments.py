@@ -2,9 +2,9 @@
 
 import jax.numpy as jnp
 
+from jaxslam.core._record import record
 from jaxslam.core.noise import NoiseCov
 from jaxslam.core.protocols import Motion
-from jaxslam.core.record import record
 from jaxslam.math import se2
 from jaxslam.math._arrays import Control, Pose, ProcessNoise, StepJacobians
 

@@ -4,8 +4,8 @@ import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
 
+from jaxslam.core._record import field, record
 from jaxslam.core.protocols import Motion
-from jaxslam.core.record import field, record
 from jaxslam.core.validation import instance_of
 from jaxslam.math import se2
 from jaxslam.math._arrays import Control, Pose, ProcessNoise

@@ -6,8 +6,8 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxslam.core._record import field, record, static
 from jaxslam.core.protocols import Motion
-from jaxslam.core.record import field, record, static
 from jaxslam.core.validation import at_least, instance_of
 from jaxslam.math._arrays import Control, Pose, ProcessNoise, StepJacobians
 

@@ -4,9 +4,9 @@ import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
 
+from jaxslam.core._record import field, record
 from jaxslam.core.noise import NoiseCov
 from jaxslam.core.protocols import Motion
-from jaxslam.core.record import field, record
 from jaxslam.core.validation import finite
 from jaxslam.math import se2
 from jaxslam.math._arrays import Control, Pose, ProcessNoise, ProcessNoiseCov, StepJacobians

@@ -4,6 +4,7 @@
 particles.
 """
 
+from jaxslam._public import publish
 from jaxslam.core.protocols import Resample
 from jaxslam.resampling._kld import kld_bound
 from jaxslam.resampling._methods import (
@@ -32,3 +33,5 @@ __all__ = [
     "stratified",
     "systematic",
 ]
+
+publish(__name__)

@@ -9,8 +9,8 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
+from jaxslam.core._record import field, function_of, record
 from jaxslam.core.protocols import Resample
-from jaxslam.core.record import field, function_of, record
 from jaxslam.core.validation import in_range
 from jaxslam.math._arrays import Number
 from jaxslam.resampling._weights import at_points, even, normalized, weights_of

@@ -4,6 +4,7 @@ The conformance tests run over `REGISTRY`."""
 
 from collections.abc import Callable
 
+from jaxslam._public import publish
 from jaxslam.core.protocols import Sensor
 from jaxslam.sensors._absolute import Absolute, Compass, PositionFix
 from jaxslam.sensors._bearing_inverse_depth import BearingInverseDepth
@@ -44,3 +45,5 @@ __all__ = [
     "RelativePosition",
     "Suite",
 ]
+
+publish(__name__)

@@ -6,9 +6,9 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
+from jaxslam.core._record import field, record
 from jaxslam.core.noise import NoiseCov
 from jaxslam.core.protocols import Free, Reduced, Sensor
-from jaxslam.core.record import field, record
 from jaxslam.core.validation import or_none, positive
 from jaxslam.math import se2
 from jaxslam.math._arrays import (

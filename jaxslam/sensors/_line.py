@@ -4,9 +4,9 @@ import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
 
+from jaxslam.core._record import record
 from jaxslam.core.noise import NoiseCov
 from jaxslam.core.protocols import Sensor
-from jaxslam.core.record import record
 from jaxslam.math import se2
 from jaxslam.math._arrays import (
     InvertJacobians,

@@ -8,9 +8,9 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
+from jaxslam.core._record import field, record
 from jaxslam.core.noise import NoiseCov
 from jaxslam.core.protocols import Free, Sensor
-from jaxslam.core.record import field, record
 from jaxslam.core.types import JaxOrNumPy
 from jaxslam.core.validation import Check, covariance
 from jaxslam.math import se2

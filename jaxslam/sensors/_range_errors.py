@@ -4,8 +4,8 @@ import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
 
+from jaxslam.core._record import field, record
 from jaxslam.core.protocols import Sensor
-from jaxslam.core.record import field, record
 from jaxslam.core.validation import InvalidField, instance_of
 from jaxslam.math._arrays import Landmark, Measurement, Pose, Unmeasured
 from jaxslam.sensors._suite import Wrapped

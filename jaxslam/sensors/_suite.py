@@ -11,10 +11,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
+from jaxslam.core._record import field, function_of, record, static
+from jaxslam.core._reprs import describe
 from jaxslam.core.protocols import Free, Reduced, Sensor
-from jaxslam.core.record import field, function_of, record, static
 from jaxslam.core.types import Scan
-from jaxslam.core.validation import InvalidField, a, at_least, instance_of, one_of, or_none
+from jaxslam.core.validation import InvalidField, at_least, instance_of, one_of, or_none
 from jaxslam.math._arrays import Landmark, Measurement, Point, Pose, Unmeasured
 
 
@@ -101,10 +102,10 @@ class Part:
 def _parts(parts: Sequence[Part | tuple[Sensor, int]]) -> tuple[Part, ...]:
     """The check of the parts of a suite: at least one, whose sensors share landmarks."""
     if not isinstance(parts, Sequence):
-        raise ValueError(f"expected a list or a tuple, got {a(type(parts).__name__)}")
+        raise ValueError(f"expected a list or a tuple, got {describe(parts)}")
     for part in parts:
         if not isinstance(part, Part) and not (isinstance(part, tuple) and len(part) == 2):
-            raise ValueError(f"expected a Part or (sensor, places), got {a(type(part).__name__)}")
+            raise ValueError(f"expected a Part or (sensor, places), got {describe(part)}")
     result = tuple(part if isinstance(part, Part) else Part(*part) for part in parts)
     if not result:
         raise ValueError("expected at least one sensor, got none")

@@ -224,7 +224,7 @@ def check_called(name: str, candidate: Callable[..., object]) -> None:
     first = next(iter(inspect.signature(candidate).parameters.values()), None)
     if first is None:
         return
-    ours = (getattr(candidate, "__module__", None) or "").startswith("jaxslam.")
+    ours = (getattr(candidate, "__module__", None) or "").partition(".")[0] == "jaxslam"
     named = first.name in ("motion", "sensor", "robots", "scenario", "world")
     if (ours and named) or first.annotation in (Motion, Sensor, World):
         raise ValueError(f"monte_carlo: {name!r} is a factory: call it, {name}({first.name}, …)")

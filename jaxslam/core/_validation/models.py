@@ -18,10 +18,11 @@ from numpy.typing import ArrayLike
 
 from jaxslam.core._names import unfit_signature
 from jaxslam.core._numbers import check_array, shape_text
+from jaxslam.core._record import function_of
+from jaxslam.core._reprs import with_article
 from jaxslam.core.protocols import Chart, Life, Linearizer, Motion, Sensor
-from jaxslam.core.record import function_of
 from jaxslam.core.types import Estimate, Info, Scan
-from jaxslam.core.validation import InvalidField, a, instance_of, require
+from jaxslam.core.validation import InvalidField, instance_of, require
 
 _Shape = tuple[int, ...]
 _Record = TypeVar("_Record")
@@ -168,7 +169,7 @@ def _check_size(
         raise InvalidField(name, "", reason) from error
     result_shape = getattr(result, "shape", None)
     if result_shape != shape:
-        got = a(type(result).__name__)
+        got = with_article(type(result).__name__)
         if result_shape is not None:
             got = f"shape {_shape_text(result_shape)}"
         reason = f"expected {call} to return shape {_shape_text(shape)}, got {got}"
@@ -225,7 +226,7 @@ def _array(leaf: ArrayLike) -> str:
 def state_and_info(name: str, state: _S, scan: Scan, result: object) -> tuple[_S, Info]:
     """The result of a filter's update; ValueError unless it is a state as before, and an `Info`."""
     if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], Info)):
-        got = a(type(result).__name__)
+        got = with_article(type(result).__name__)
         if isinstance(result, tuple) and not hasattr(result, "_fields"):
             got = "(" + ", ".join(type(part).__name__ for part in result) + ")"
         raise InvalidField(name, "", f"expected update to return (state, Info), got {got}")
@@ -249,7 +250,7 @@ def checked_estimate(name: str, estimate: object, dtype: np.dtype) -> Estimate:
     """The result of a filter's estimate; ValueError unless it is an `Estimate` of N landmarks, with
     numbers of this dtype."""
     if not isinstance(estimate, Estimate):
-        got = a(type(estimate).__name__)
+        got = with_article(type(estimate).__name__)
         raise InvalidField(name, "", f"expected estimate to return an Estimate, got {got}")
     n = np.shape(estimate.alive)[0] if np.ndim(estimate.alive) == 1 else -1
     shapes = {"pose": (3,), "pose_cov": (3, 3), "points": (n, 2), "point_covs": (n, 2, 2)}

@@ -485,7 +485,7 @@ def test_gradients_are_finite_where_the_pose_is_known_exactly(proposal):
     ({"threshold": 1.5}, "threshold from 0 to 1"),
     ({"threshold": np.nan}, "threshold from 0 to 1"),
     ({"gate": 0.0}, "gate: expected a probability above 0 and below 1"),
-    ({"resample": "systematic"}, "resample to be a function"),
+    ({"resample": "systematic"}, "resample: expected a function"),
     ({"life": "existence"}, "life: expected a Life"),
     ({"sensor": sensors.Compass(np.eye(1))}, "not a suite"),
     (
