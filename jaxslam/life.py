@@ -53,17 +53,17 @@ class Recency(Life):
     def after(
         self, joint: Joint, info: Info, estimate: Callable[[], Estimate]
     ) -> tuple[Times, Bool[Array, "N"]]:
-        known: Times = joint.life
-        now = known.now + 1
+        times: Times = joint.life
+        now = times.now + 1
         count = len(joint.alive)
         born = slots.slot_mask(info.slot, info.status == Status.BORN, count)
         hit = born | slots.slot_mask(info.slot, info.status == Status.FUSED, count)
-        zero = jnp.zeros_like(known.last)
+        zero = jnp.zeros_like(times.last)
         memory = Times(
             now,
-            jnp.where(born, now, jnp.where(joint.alive, known.born, zero)),
-            jnp.where(hit, now, jnp.where(joint.alive, known.last, zero)),
-            jnp.where(born, 1, jnp.where(joint.alive, known.seen + hit, zero)),
+            jnp.where(born, now, jnp.where(joint.alive, times.born, zero)),
+            jnp.where(hit, now, jnp.where(joint.alive, times.last, zero)),
+            jnp.where(born, 1, jnp.where(joint.alive, times.seen + hit, zero)),
         )
         if self.patience is None:
             return memory, jnp.zeros_like(joint.alive)
@@ -80,7 +80,7 @@ class Evidence(NamedTuple):
     log_odds: Float[Array, "N"]
     """log-odds that it exists"""
     confirmed: Bool[Array, "N"]
-    """its probability has reached `confirm`; before that it is provisional"""
+    """whether its probability has reached `confirm`; before that it is provisional"""
     seen: Int[Array, "N"]
     """scans that measured it"""
     missed: Int[Array, "N"]
@@ -110,13 +110,13 @@ class Existence(Life):
     one: a sensor misses many landmarks near the edge of its view."""
     _: dataclasses.KW_ONLY
     detected: Number = 0.9
-    """probability that it then does, P(seen | there)"""
+    """probability that a scan measures a visible landmark, P(seen | there)"""
     false: Number = 0.1
-    """probability of a false detection, P(seen | not there)"""
+    """probability that a scan measures a landmark that is not there, P(seen | not there)"""
     confirm: Number = 0.95
-    """probability"""
+    """probability from which a landmark is confirmed"""
     remove: Number = 0.05
-    """probability"""
+    """probability down to which a landmark is kept"""
     patience: int | None = static(default=None, check=or_none(at_least(1)))
     """a provisional landmark not measured for this many scans is removed"""
     spread: Number | None = field(default=None, check=or_none(positive))
@@ -149,8 +149,8 @@ class Existence(Life):
         count = len(joint.alive)
         born = slots.slot_mask(info.slot, info.status == Status.BORN, count)
         hit = born | slots.slot_mask(info.slot, info.status == Status.FUSED, count)
-        known: Evidence = joint.life
-        old = jax.tree.map(lambda x: jnp.where(born | ~joint.alive, jnp.zeros_like(x), x), known)
+        evidence: Evidence = joint.life
+        old = jax.tree.map(lambda x: jnp.where(born | ~joint.alive, jnp.zeros_like(x), x), evidence)
         view = jax.vmap(self.visible, (None, 0))(joint.pose, joint.landmarks)
         expected = joint.alive & ~hit & view
         dtype = old.log_odds.dtype
@@ -180,7 +180,7 @@ class Existence(Life):
     ) -> Bool[Array, "N"]:
         provisional = joint.alive & ~joint.life.confirmed & ~measured
         odds = jnp.where(provisional, joint.life.log_odds, jnp.inf)
-        rank = jnp.argsort(jnp.argsort(odds))
+        rank = jnp.argsort(jnp.argsort(odds))  # of each slot, 0 for the least likely
         evicted: Array = provisional & (rank < needed)
         return evicted
 

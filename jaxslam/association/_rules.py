@@ -77,10 +77,10 @@ class Known:
     """
 
     def __call__(self, prediction: Prediction, scan: Scan) -> Association:
-        slot, found = slots.find(prediction.tag, prediction.alive, scan.tag)
+        slot, in_map = slots.find(prediction.tag, prediction.alive, scan.tag)
         tagged = scan.valid & (scan.tag >= 0)
-        found = found & tagged
-        return Association(jnp.where(found, slot, -1), tagged & ~found)
+        in_map = in_map & tagged
+        return Association(jnp.where(in_map, slot, -1), tagged & ~in_map)
 
 
 @record
@@ -123,7 +123,7 @@ class Nearest:
 
 @record
 class MaximumLikelihood:
-    """Maximum-likelihood association: as `nearest`, by the least d² + log |S|.
+    """Maximum-likelihood association: as `Nearest`, by the least d² + log |S|.
 
     d² + log |S| is -2 log N(ν; 0, S) up to a constant. The determinant matters: a landmark of large
     covariance has small d² to all measurements, but a low likelihood (Thrun, Burgard &
@@ -169,10 +169,13 @@ class GlobalNearest:
         pairs = prediction.pairs(scan)
         m, n, size_z = pairs.innovation.shape
         compatible = within_gate(pairs, self.gate)
+        # Without a gate, more than all distances together: every possible pair is worth making.
         alone = 1 + jnp.where(compatible, pairs.distance, 0.0).sum()
         gamma = gate_quantile(self.gate, size_z)
         if gamma is not None:
             alone = jnp.minimum(gamma, alone)
+        # A pair that is not compatible costs more than two measurements without a landmark, so it
+        # is never part of the minimum.
         cost = jnp.where(compatible, pairs.distance, 2 * alone + 1)
         # One more column for each measurement, for no landmark.
         cost = jnp.concatenate([cost, jnp.broadcast_to(alone, (m, m))], axis=1)
@@ -185,7 +188,7 @@ class GlobalNearest:
 class Certain:
     """An association method restricted to landmarks with √(tr S/Z) <= spread.
 
-    S is the covariance of the innovation. After a long loop that of the first landmarks exceeds the
+    S is the covariance of the innovation. After a long loop S of the first landmarks exceeds the
     distances between landmarks, and single measurements may be associated wrongly. Landmarks
     measured there become new ones at first; `filters.Closing` then associates them
     jointly with the old ones.
@@ -199,12 +202,13 @@ class Certain:
     """in units of the measurement, which should all be of one kind"""
 
     def __call__(self, prediction: Prediction, scan: Scan) -> Association:
-        def pairs(scan: Scan) -> Pairs:
-            found = prediction.pairs(scan)
-            variance = jnp.trace(found.cov, axis1=2, axis2=3) / found.cov.shape[-1]
-            return found._replace(possible=found.possible & (variance <= self.spread**2))
+        def certain_pairs(scan: Scan) -> Pairs:
+            pairs = prediction.pairs(scan)
+            variance = jnp.trace(pairs.cov, axis1=2, axis2=3) / pairs.cov.shape[-1]
+            return pairs._replace(possible=pairs.possible & (variance <= self.spread**2))
 
-        return Association(*self.associate(dataclasses.replace(prediction, pairs=pairs), scan))
+        certain = dataclasses.replace(prediction, pairs=certain_pairs)
+        return Association(*self.associate(certain, scan))
 
 
 def predicted(

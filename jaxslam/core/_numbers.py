@@ -95,7 +95,7 @@ def check_array(
 
 def check_real(name: str, **values: Any) -> None:
     """Raise ValueError unless values are real numbers or arrays of them; a tracer is accepted."""
-    for what, value in values.items():
+    for field, value in values.items():
         if not is_concrete(value):
             continue
         try:
@@ -104,17 +104,17 @@ def check_real(name: str, **values: Any) -> None:
             dtype = np.dtype(object)
         if not any(jnp.issubdtype(dtype, kind) for kind in (np.integer, np.floating, np.bool_)):
             got = value if isinstance(value, str | tuple | list) else shape_text(value)
-            raise InvalidField(name, "", f"expected real numbers as {what}, got {got!s}")
+            raise InvalidField(name, "", f"expected real numbers as {field}, got {got!s}")
 
 
 def check_positive(name: str, **values: ArrayLike) -> None:
     """Raise ValueError unless numbers are above 0 and finite; a tracer is accepted."""
     check_real(name, **values)
-    for what, value in values.items():
+    for field, value in values.items():
         try:
             positive(value)
         except ValueError:
-            reason = f"expected {what} above 0, got {np.asarray(value)}"
+            reason = f"expected {field} above 0, got {np.asarray(value)}"
             raise InvalidField(name, "", reason) from None
 
 

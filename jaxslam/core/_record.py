@@ -65,7 +65,7 @@ def record(cls: type[_T]) -> type[_T]:
     cls.__post_init__ = __post_init__  # type: ignore[attr-defined]
     cls.__setstate__ = _set_state  # type: ignore[attr-defined]
     if cls.__repr__ is object.__repr__:  # else the class, or one above it, has a repr of its own
-        cls.__repr__ = _repr_of_fields  # type: ignore[method-assign, assignment]
+        cls.__repr__ = _repr_of_fields  # type: ignore[method-assign]
     dataclasses.dataclass(frozen=True, eq=False, repr=False)(cls)
     # A field that is declared again, with another default say, keeps the check from above.
     checks = {

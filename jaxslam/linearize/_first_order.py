@@ -46,15 +46,15 @@ def invert_jacobians(sensor: Sensor, pose: Pose, z: Measurement, s: Unmeasured) 
 
 
 def predicted_noise(
-    sensor: Sensor, z_hat: Measurement, z: Measurement, known: Bool[Array, ""]
+    sensor: Sensor, z_hat: Measurement, z: Measurement, has_prediction: Bool[Array, ""]
 ) -> Float[Array, "Z Z"]:
-    """The measurement noise R(ẑ) of a known landmark, and R(z) where there is no prediction.
+    """The measurement noise R(ẑ), and R(z) where there is no prediction.
 
     N(z; ẑ, H P Hᵀ + R(z)) is no density of z: where σ grows with the range, a range that came out
     short is trusted too much, the estimate is biased, and NIS exceeds its degrees of freedom. R(ẑ)
     does not depend on the noise of z.
     """
-    cov: Array = sensor.noise_cov(jnp.where(known, z_hat, z))
+    cov: Array = sensor.noise_cov(jnp.where(has_prediction, z_hat, z))
     return cov
 
 

@@ -54,6 +54,7 @@ class Unscented(Linearizer):
         self, motion: Motion, u: Array, point: LinearizationPoint
     ) -> tuple[Array, Array, Array, tuple[()]]:
         pose, chart, width = point.pose, point.chart, len(motion.noises)
+        # Charts act on a pose and a landmark; the landmark of a motion is a placeholder.
         ground = jnp.zeros(point.joint.landmarks.shape[1], pose.dtype)
         moved = motion.step(pose, u, jnp.zeros(width, pose.dtype))
         root = _root(point.cov)
@@ -63,13 +64,14 @@ class Unscented(Linearizer):
             start, _ = chart.retract(pose, ground, xi[:3], ground)
             return chart.local(moved, ground, motion.step(start, u, xi[3:]), ground)[0]
 
-        by = self._fit(f, jax.scipy.linalg.block_diag(root, root_noise))
-        by_pose = by_variables(by.slope[:, :3], root)
-        noise = linalg.matmul(by.slope[:, 3:], by.slope[:, 3:].T) + by.rest
+        fit = self._fit(f, jax.scipy.linalg.block_diag(root, root_noise))
+        by_pose = by_variables(fit.slope[:, :3], root)
+        noise = linalg.matmul(fit.slope[:, 3:], fit.slope[:, 3:].T) + fit.rest
         if chart.basis is not None:
-            after = chart.basis(moved, ground).pose
-            by_pose = after @ by_pose @ linalg.inverse(chart.basis(pose, ground).pose)
-            noise = after @ noise @ after.T
+            # From errors in the chart to differences of coordinates, after and before the motion.
+            basis = chart.basis(moved, ground).pose
+            by_pose = basis @ by_pose @ linalg.inverse(chart.basis(pose, ground).pose)
+            noise = basis @ noise @ basis.T
         return moved, by_pose, noise, ()
 
     def observe(
@@ -84,15 +86,15 @@ class Unscented(Linearizer):
                 sensor.observe(*chart.retract(pose, landmark, xi[:3], xi[3:])), centre
             )
 
-        by = self._fit(h, root)
-        slope = by_variables(by.slope, root)
+        fit = self._fit(h, root)
+        slope = by_variables(fit.slope, root)
         by_pose, by_landmark = slope[:, :3], slope[:, 3:]
         if chart.basis is not None:
             basis = chart.basis(pose, landmark)
             if basis.landmark is not None:
                 by_landmark = by_landmark @ linalg.inverse(basis.landmark)
             by_pose = (by_pose - by_landmark @ basis.cross) @ linalg.inverse(basis.pose)
-        return centre + by.mean, by_pose, by_landmark, by.rest
+        return centre + fit.mean, by_pose, by_landmark, fit.rest
 
     def invert(
         self, sensor: Sensor, z: Array, tag: Array, point: LinearizationPoint
@@ -100,18 +102,18 @@ class Unscented(Linearizer):
         pose, chart, size_z = point.pose, point.chart, z.shape[0]
         mean, cov_s = (jnp.asarray(part, z.dtype) for part in sensor.free)
         centre = sensor.invert(pose, z, mean)
-        still = jnp.zeros_like(centre)
+        zero = jnp.zeros_like(centre)
         root = _root(point.cov)
-        own_roots = [linalg.root_psd(sensor.noise_cov(z)), linalg.root_psd(cov_s)]
+        noise_roots = [linalg.root_psd(sensor.noise_cov(z)), linalg.root_psd(cov_s)]
 
         def g(xi: Array) -> Array:
-            seen_from, _ = chart.retract(pose, still, xi[:3], still)
-            landmark = sensor.invert(seen_from, z + xi[3 : 3 + size_z], mean + xi[3 + size_z :])
-            return chart.local(pose, centre, seen_from, landmark)[1]
+            start, _ = chart.retract(pose, zero, xi[:3], zero)
+            landmark = sensor.invert(start, z + xi[3 : 3 + size_z], mean + xi[3 + size_z :])
+            return chart.local(pose, centre, start, landmark)[1]
 
-        by = self._fit(g, jax.scipy.linalg.block_diag(root, *own_roots))
-        by_pose = by_variables(by.slope[:, :3], root)
-        cov = linalg.matmul(by.slope[:, 3:], by.slope[:, 3:].T) + by.rest
+        fit = self._fit(g, jax.scipy.linalg.block_diag(root, *noise_roots))
+        by_pose = by_variables(fit.slope[:, :3], root)
+        cov = linalg.matmul(fit.slope[:, 3:], fit.slope[:, 3:].T) + fit.rest
         if chart.basis is not None:
             basis = chart.basis(pose, centre)
             if basis.landmark is not None:
@@ -142,6 +144,7 @@ def regress(f: Callable[[Array], Array], root: Array, alpha: float | Array) -> _
 
 def by_variables(slope: Array, root: Array) -> Array:
     """The Jacobian H with H L = slope (m, n), for a regular lower L (n, n)."""
+    # H = slope L⁻¹ is (L⁻ᵀ slopeᵀ)ᵀ; Lᵀ is lower with its rows and columns reversed.
     return linalg.solve_lower(root.T[::-1, ::-1], slope.T[::-1])[::-1].T
 
 
@@ -152,10 +155,12 @@ def _root(cov: Array) -> Array:
     undetermined.
     """
     root = linalg.cholesky(cov)[0]
+    # √eps: variances of eps add nothing to P, and a quotient over √eps keeps half of the digits.
     floor = float(jnp.finfo(cov.dtype).eps) ** 0.5
     pivots = jnp.diagonal(root)
     return root + jnp.diag(jnp.where(pivots > floor, 0.0, floor))
 
 
 def _spread(root: Array) -> float:
+    """The default of alpha, by the dtype of a root of P."""
     return 1e-3 if root.dtype == jnp.float64 else 0.1

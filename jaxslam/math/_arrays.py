@@ -61,12 +61,12 @@ def held_array(values: ArrayLike) -> ArrayLike:
 def in_dtype(tree: _T, dtype: DTypeLike) -> _T:
     """The tree with its real numbers in one precision; arrays of it stay as they are."""
 
-    def one(leaf: PyTree) -> PyTree:
+    def convert(leaf: PyTree) -> PyTree:
         kind = jnp.result_type(leaf)
-        other = jnp.issubdtype(kind, jnp.floating) and kind != dtype
-        return jnp.asarray(leaf, dtype) if other else leaf
+        differs = jnp.issubdtype(kind, jnp.floating) and kind != dtype
+        return jnp.asarray(leaf, dtype) if differs else leaf
 
-    return cast(_T, jax.tree.map(one, tree))
+    return cast(_T, jax.tree.map(convert, tree))
 
 
 def float64() -> AbstractContextManager[object]:

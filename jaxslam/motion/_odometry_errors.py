@@ -81,7 +81,7 @@ class Corrected(Motion):
         """The control (U,) without its systematic errors."""
         names = [name.split(" ")[0] for name in self.motion.controls]
         along, turn = (next(k for k, n in enumerate(names) if n in of) for of in (_TRAVEL, _TURN))
-        scale, wheels = (jnp.asarray(given, u.dtype) for given in (self.scale, self.wheels))
+        scale, wheels = (jnp.asarray(pair, u.dtype) for pair in (self.scale, self.wheels))
         corrected = list(u)
         corrected[along] = scale[0] * u[along] - wheels[0] * jnp.abs(u[turn])
         corrected[turn] = scale[1] * u[turn] + wheels[1] * u[along]

@@ -47,10 +47,10 @@ def survivors(
 ) -> tuple[Int[Array, "P"], Float[Array, "P"]]:
     """The ancestors and their log-weights: log 1/P unless the method is a `Differentiable`, which
     returns its own."""
-    found = resample(log_weights, key)
-    if isinstance(found, tuple):
-        return found
-    return found, jnp.broadcast_to(even(log_weights), log_weights.shape)
+    result = resample(log_weights, key)
+    if isinstance(result, tuple):
+        return result
+    return result, jnp.broadcast_to(even(log_weights), log_weights.shape)
 
 
 def resampled_where(

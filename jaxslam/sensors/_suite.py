@@ -69,12 +69,12 @@ def _check_single(sensor: Sensor) -> Sensor:
 
 @record
 class Part:
-    """One sensor of a suite. Raises ValueError on places or every below 1, or an invalid start."""
+    """One sensor of a suite. Raises InvalidField on places or an interval below 1."""
 
     sensor: Sensor = field(check=_check_single)
     places: int = static(check=at_least(1))
     """its measurement slots in a scan; 1 of an absolute sensor"""
-    every: int = static(default=1, check=at_least(1))
+    interval: int = static(default=1, check=at_least(1))
     """interval of its measurements in a simulation [steps]; a filter uses only `Scan.valid`"""
     start: int = static(default=0, check=at_least(0))
     """step of its first measurement in a simulation"""
@@ -127,7 +127,7 @@ class Suite(Sensor):
     landmarks, then starts its new ones, which the next part may correct in the same scan.
     A tag may occur once a part. Absent measurements are slots that are not valid.
 
-        eyes = Suite([(RangeBearing(R, mount=front), 8), Part(Compass(S), 1, every=10)])
+        eyes = Suite([(RangeBearing(R, mount=front), 8), Part(Compass(S), 1, interval=10)])
         filter = EkfSlam(motion, eyes, capacity)
 
     The first slots of a scan are the first part's, the next ones the second's, and so on. Rows of

@@ -132,9 +132,9 @@ def check_parts(
         check_record(name, "life", life, Life)
 
 
-def check_record(name: str, what: str, value: object, kind: type[_Record]) -> _Record:
+def check_record(name: str, field: str, value: object, kind: type[_Record]) -> _Record:
     """The value, if it is such a record; InvalidField if not, as on a class that was not called."""
-    record: _Record = require(name, what, value, instance_of(kind))
+    record: _Record = require(name, field, value, instance_of(kind))
     return record
 
 
