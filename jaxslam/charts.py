@@ -8,6 +8,7 @@ robot and map is one constant direction.
 import jax.numpy as jnp
 from jax import Array
 
+from jaxslam.core._names import Named
 from jaxslam.core._record import record, static
 from jaxslam.core.protocols import Basis, Chart
 from jaxslam.core.validation import InvalidField
@@ -128,8 +129,10 @@ class RightInvariant(Chart):
         )
 
 
-REGISTRY: dict[str, type[Chart]] = {
-    "euclidean": Euclidean,
-    "left_invariant": LeftInvariant,
-    "right_invariant": RightInvariant,
-}
+REGISTRY: dict[str, type[Chart]] = Named(
+    {
+        "euclidean": Euclidean,
+        "left_invariant": LeftInvariant,
+        "right_invariant": RightInvariant,
+    }
+)

@@ -273,7 +273,7 @@ def test_pickles_have_public_paths_and_load_in_a_fresh_process():
         "print(*(type(value).__name__ for value in values), values[3])"
     )
     done = subprocess.run([sys.executable, "-c", script], input=data, capture_output=True)
-    text = "EkfSlam RangeBearing function InvalidField Own: gate: expected a number, got None\n"
+    text = "EkfSlam RelativePosition function InvalidField Own: gate: expected a number, got None\n"
     assert done.stdout.decode() == text, done.stderr.decode()
 
 

@@ -49,7 +49,7 @@ INTRODUCED = {
     "jaxslam.math": "Mathematics",
     "jaxslam.core.noise": "Noise models",
     "jaxslam.core.slots": "The table of landmarks",
-    "jaxslam.core.validation": "What is refused",
+    "jaxslam.core.validation": "Checks, and the errors of bad input",
 }
 """Title of each page, in the order of the contents; a module that is not listed comes after."""
 

@@ -165,12 +165,12 @@ class Log(NamedTuple):
             sources = [(f"{name}: measurements", sensor, measurements, None)]
         else:
             if not isinstance(measurements, Sequence) or len(measurements) != len(parts):
-                names = ", ".join(part.sensor.name for part in parts)
+                parts_text = ", ".join(part.sensor.name for part in parts)
                 raise InvalidField(
                     name,
                     "measurements",
                     f"expected a table for each of the {len(parts)} sensors of the suite, "
-                    f"({names}), got {describe(measurements)}",
+                    f"({parts_text}), got {describe(measurements)}",
                 )
             if any(part.sees == "robots" for part in parts):
                 raise InvalidField(

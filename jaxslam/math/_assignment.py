@@ -38,9 +38,7 @@ def assign(cost: Array) -> Array:
     if m == 0:
         return jnp.zeros(0, jnp.int32)
     cost = jax.lax.stop_gradient(cost)
-    no_row = jnp.full(n, -1, jnp.int32)
-    no_column = no_row[:m]
-    dual = jnp.zeros(n, cost.dtype)
+    unassigned, dual = jnp.full(n, -1, jnp.int32), jnp.zeros(n, cost.dtype)
 
     def add_row(matching: _Matching, row: Array) -> tuple[_Matching, None]:
         path = _shortest_path(cost, matching, row)
@@ -53,9 +51,7 @@ def assign(cost: Array) -> Array:
         column_of, row_of = _augment(matching, path, row)
         return _Matching(by_row, matching.by_column - shorter, column_of, row_of), None
 
-    start = _Matching(
-        jnp.zeros(m, cost.dtype), jnp.zeros(n, cost.dtype), unassigned[:m], unassigned
-    )
+    start = _Matching(dual[:m], dual, unassigned[:m], unassigned)
     return jax.lax.scan(add_row, start, jnp.arange(m, dtype=jnp.int32))[0].column_of
 
 

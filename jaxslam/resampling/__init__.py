@@ -5,6 +5,7 @@ particles.
 """
 
 from jaxslam._public import publish
+from jaxslam.core._names import Named
 from jaxslam.core.protocols import Resample
 from jaxslam.resampling._kld import kld_bound
 from jaxslam.resampling._methods import (
@@ -16,12 +17,14 @@ from jaxslam.resampling._methods import (
     systematic,
 )
 
-REGISTRY: dict[str, Resample] = {
-    "multinomial": multinomial,
-    "residual": residual,
-    "stratified": stratified,
-    "systematic": systematic,
-}
+REGISTRY: dict[str, Resample] = Named(
+    {
+        "multinomial": multinomial,
+        "residual": residual,
+        "stratified": stratified,
+        "systematic": systematic,
+    }
+)
 
 __all__ = [
     "REGISTRY",

@@ -390,7 +390,7 @@ def test_tables_that_are_not_those_of_the_suite_are_refused():
     for seen, message in (
         (
             SEEN,
-            r"a table for each of the 2 sensors of the suite, \(range_bearing, compass\), got list",
+            r"a table for each of the 2 sensors of the suite, \(range_bearing, compass\), got a list",
         ),
         (
             (SEEN, [(1.5, 0.3)] * 2),
