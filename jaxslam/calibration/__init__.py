@@ -7,6 +7,7 @@ uncertainty of parameters adds to the covariance of a result. `delayed` is a log
 are late, by a delay that can be such a parameter.
 """
 
+from jaxslam._public import publish
 from jaxslam.calibration._delay import delayed
 from jaxslam.calibration._maximum_likelihood import NoiseFit, as_associated, fit_noise
 from jaxslam.calibration._systematic import Calibration, calibrate, consider_cov
@@ -20,3 +21,5 @@ __all__ = [
     "delayed",
     "fit_noise",
 ]
+
+publish(__name__)

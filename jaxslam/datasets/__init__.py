@@ -6,6 +6,7 @@ robots, the number of one.
 
 from collections.abc import Callable
 
+from jaxslam._public import publish
 from jaxslam.core._names import Named
 from jaxslam.datasets._dataset import Adjustable, Dataset, Parameter
 from jaxslam.datasets._evaluation import Evaluation, MapTest, evaluate
@@ -61,3 +62,5 @@ __all__ = [
     "table",
     "victoria_park",
 ]
+
+publish(__name__)

@@ -4,6 +4,7 @@ The cost of a graph is χ² = Σ eᵀ Ω e over the valid rows of its tables, wi
 relative pose e = Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ) as (x, y, θ wrapped), without a logarithm.
 """
 
+from jaxslam._public import publish
 from jaxslam.graphs import starts
 from jaxslam.graphs._checks import check_graph, with_gauge
 from jaxslam.graphs._covariances import Marginals, marginals
@@ -71,3 +72,5 @@ __all__ = [
     "with_loops_apart",
     "write",
 ]
+
+publish(__name__)

@@ -125,7 +125,7 @@ def test_a_variable_is_a_pose_or_a_point():
     names = {"measurements": ("x [m]",), "errors": ("x [m]",)}
     with pytest.raises(ValueError, match="Own: expected variables 'pose' and 'point', got 'place'"):
         made(graphs.Factor, variables=("place",), residual=lambda v, z: z, **names)
-    with pytest.raises(ValueError, match="Own: expected a method residual"):
+    with pytest.raises(ValueError, match="Own: residual: expected a method"):
         made(graphs.Factor, variables=("pose",), **names)
     with pytest.raises(
         ValueError, match="FromSensor: expected sensor to be a Sensor, got the class"

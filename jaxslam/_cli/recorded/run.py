@@ -36,6 +36,7 @@ from jaxslam.consistency.campaign._progress import Progress
 from jaxslam.core.protocols import Candidate, Filter, Motion, Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Log, Status, Truth
+from jaxslam.core.validation import InvalidField
 from jaxslam.datasets import READERS, Dataset
 from jaxslam.datasets._evaluation import Evaluation, evaluate, joint_map_cov
 from jaxslam.datasets._landmark_logs.table_settings import METHODS, association_options
@@ -367,8 +368,8 @@ def with_options(data: Dataset, options: argparse.Namespace) -> Dataset:
         raise ValueError("--gate: expected --associate, too, since the tags are not used")
     try:
         chosen = association_options(options.associate or "known", options.gate)
-    except ValueError as problem:
-        raise ValueError(f"--{problem}") from problem
+    except InvalidField as problem:
+        raise ValueError(f"--{problem.field}: {problem.reason}") from problem
     given = [name for name in ("gate", "associate") if getattr(options, name) is not None]
     assumed = (
         line for line in data.assumed if not line.startswith(tuple(f"[filter] {n}" for n in given))

@@ -18,7 +18,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam.core import slots
 from jaxslam.core._numbers import gate_quantile
-from jaxslam.core.protocols import Chart, Here, Linearizer, Sensor
+from jaxslam.core.protocols import Chart, LinearizationPoint, Linearizer, Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.filters._ekf.kernels import factor_of, project, projected_cov, whiten, whitened_by
 from jaxslam.filters._ekf.linear_system import basis_of_each, chart_jacobians
@@ -264,7 +264,7 @@ def _linearize(
     def observe(
         at: Int[Array, ""], landmark: Float[Array, "L"], cov: Float[Array, "3+L 3+L"]
     ) -> PyTree:
-        point = Here(state, chart, pose, cov, at, landmark)
+        point = LinearizationPoint(state, chart, pose, cov, at, landmark)
         return filter.linearize.observe(at_slot(sensor, state, at), point)
 
     z_hat, by_pose, by_landmark, rest = jax.vmap(observe)(slot_in_state, landmark, local_cov)

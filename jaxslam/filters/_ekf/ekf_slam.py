@@ -26,8 +26,8 @@ from jaxslam.core.protocols import (
     Association,
     Chart,
     Filter,
-    Here,
     Life,
+    LinearizationPoint,
     Linearizer,
     Motion,
     Prediction,
@@ -180,7 +180,7 @@ def propagate(filter: EkfSlam, joint: Joint, u: Float[Array, "U"]) -> tuple[Join
     triangular root of [A X, G √N], O(N³).
     """
     chart = filter.chart
-    point = Here(joint, chart, joint.pose, slots.robot_cov(joint, filter.square_root))
+    point = LinearizationPoint(joint, chart, joint.pose, slots.robot_cov(joint, filter.square_root))
     pose, f, noise, lin = filter.linearize.motion(filter.motion, u, point)
     if chart.basis is None:
         transition = Transition(f, None, None, jnp.eye(3, dtype=noise.dtype), None)
@@ -358,7 +358,7 @@ def augment(
     with the prior's term of (44); several in one scan are correlated through the robot.
     """
     chart, square_root = filter.chart, filter.square_root
-    point = Here(joint, chart, joint.pose, slots.robot_cov(joint, square_root))
+    point = LinearizationPoint(joint, chart, joint.pose, slots.robot_cov(joint, square_root))
 
     def invert(
         z: Float[Array, "Z"], tag: Int[Array, ""]

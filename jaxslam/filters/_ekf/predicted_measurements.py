@@ -5,7 +5,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxslam.association._rules import predicted
-from jaxslam.core.protocols import Here, Prediction, Sensor
+from jaxslam.core.protocols import LinearizationPoint, Prediction, Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.filters._ekf.correction import KalmanFilter
 from jaxslam.filters._ekf.kernels import projected_cov
@@ -31,7 +31,8 @@ def prediction_of(filter: KalmanFilter, sensor: Sensor, joint: Joint) -> Predict
         local = jnp.concatenate([top, bottom], axis=1)
         expected, by_pose, by_landmark, rest = jax.vmap(
             lambda slot, landmark, cov: filter.linearize.observe(
-                at_slot(sensor, joint, slot), Here(joint, chart, joint.pose, cov, slot, landmark)
+                at_slot(sensor, joint, slot),
+                LinearizationPoint(joint, chart, joint.pose, cov, slot, landmark),
             )
         )(every, joint.landmarks, local)
         if chart.basis is not None:

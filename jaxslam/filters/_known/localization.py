@@ -19,7 +19,7 @@ from jaxslam.core.protocols import (
     Associate,
     Chart,
     Filter,
-    Here,
+    LinearizationPoint,
     Linearizer,
     Motion,
     Prediction,
@@ -109,7 +109,7 @@ class Localization(Filter):
         return Joint(pose, landmarks, pose_cov, jnp.ones(len(tags), bool), tags, lin)
 
     def predict(self, state: Joint, u: Float[Array, "U"], key: Array) -> Joint:
-        point = Here(state, self.chart, state.pose, state.cov)
+        point = LinearizationPoint(state, self.chart, state.pose, state.cov)
         pose, f, noise, lin = self.linearize.motion(self.motion, u, point)
         if self.chart.basis is not None:
             undo = linalg.inverse(self.chart.pose_basis(pose))
@@ -188,7 +188,7 @@ def _linearize(
     def observe(
         slot: Int[Array, ""], landmark: Float[Array, "L"]
     ) -> tuple[Float[Array, "Z"], Float[Array, "Z 3"], Float[Array, "Z Z"]]:
-        point = Here(state, filter.chart, pose, state.cov, slot, landmark)
+        point = LinearizationPoint(state, filter.chart, pose, state.cov, slot, landmark)
         z_hat, by_pose, _, rest = filter.linearize.observe(sensor, point)
         return z_hat, by_pose, rest
 

@@ -1,5 +1,6 @@
 """Relocalization of a lost robot in its map by geometric matching of one scan."""
 
+from jaxslam._public import publish
 from jaxslam.filters.map_management._relocalization import (
     lost,
     points_of_map,
@@ -9,3 +10,5 @@ from jaxslam.filters.map_management._relocalization import (
 )
 
 __all__ = ["lost", "points_of_map", "relocalize", "relocated", "seen_points"]
+
+publish(__name__)

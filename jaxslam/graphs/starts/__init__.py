@@ -8,6 +8,7 @@ no other influence on the optimum.
 
 from collections.abc import Callable
 
+from jaxslam._public import publish
 from jaxslam.graphs._graph import Graph
 from jaxslam.graphs.starts._chordal_relaxation import chordal
 from jaxslam.graphs.starts._relative import Factors
@@ -29,3 +30,5 @@ STARTS: dict[str, Callable[..., Graph]] = {
 """The starts by name, for the command line."""
 
 __all__ = ["STARTS", "chordal", "given", "odometry", "robust", "spanning_tree"]
+
+publish(__name__)

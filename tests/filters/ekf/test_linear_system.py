@@ -161,7 +161,7 @@ def test_landmarks_that_leave_the_map_and_come_back_tell_nothing_of_a_turn():
     (filters.EifSlam(WORLD.motion, WORLD.sensor, 4), "eif_slam do not return"),
     (Wrapped(FEJ), "wrapped ekf_slam do not return"),
     (Corrected(WORLD.motion, WORLD.sensor, 4), "corrected do not return"),
-    (filters.EkfSlam, "expected a filter, got the class EkfSlam: call it"),
+    (filters.EkfSlam, "filter: expected a Filter, got the class EkfSlam: call it"),
     told="^Monitored: .*",
 )
 def test_a_filter_without_a_linear_system_is_refused(filter):

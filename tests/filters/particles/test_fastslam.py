@@ -484,9 +484,9 @@ def test_gradients_are_finite_where_the_pose_is_known_exactly(proposal):
     ({"proposal": "optimal"}, 'expected proposal "motion" or "measurement"'),
     ({"threshold": 1.5}, "threshold from 0 to 1"),
     ({"threshold": np.nan}, "threshold from 0 to 1"),
-    ({"gate": 0.0}, "above 0 and below 1 as gate"),
-    ({"resample": "systematic"}, "resample to be a function"),
-    ({"life": "existence"}, "life to be a Life"),
+    ({"gate": 0.0}, "gate: expected a probability above 0 and below 1"),
+    ({"resample": "systematic"}, "resample: expected a function"),
+    ({"life": "existence"}, "life: expected a Life"),
     ({"sensor": sensors.Compass(np.eye(1))}, "not a suite"),
     (
         {"sensor": sensors.BearingInverseDepth(np.eye(1), min_distance=1.0, to_point=0.1)},
