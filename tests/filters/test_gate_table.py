@@ -13,7 +13,7 @@ from own_models import changed
 
 from jaxslam import filters, motion, sensors
 from jaxslam.core.types import Scan, Status
-from jaxslam.filters._delayed.delayed_settings import Hypotheses, StoredMeasurements
+from jaxslam.filters._delayed.delayed_filter import Hypotheses, StoredMeasurements
 from jaxslam.filters._reporting import info_of, nothing_of, status_of
 
 MASKS = (
