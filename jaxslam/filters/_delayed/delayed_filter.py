@@ -124,11 +124,7 @@ def _check_not_negative(record: object, *fields: str) -> None:
 
 @record
 class DelayedFilter(Filter):
-    """The models and options of `DelayedSlam`, and what follows from them.
-
-    Raises ValueError on a capacity below 1, a gate not above 0 and below 1, a part of another kind,
-    or a sensor that does not fit.
-    """
+    """The models and options of `DelayedSlam`, and what follows from them."""
 
     motion: Motion
     sensor: Sensor

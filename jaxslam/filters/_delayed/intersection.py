@@ -93,9 +93,8 @@ def _sharpest_intersections(
     # top_k finds the largest, hence the negative; a choice has no derivative.
     count = min(spread.size, layout.hypotheses)
     best = jax.lax.top_k(-jax.lax.stop_gradient(spread.reshape(-1)), count)[1]
-    # The flat index of (measurement, partner, point) is (measurement·w + partner)·a + point.
-    pair, which = best // a, best % a
-    measurement, partner = best // (w * a), pair % w
+    measurement, partner, which = jnp.unravel_index(best, spread.shape)
+    pair = measurement * w + partner
     tag = new.tag[measurement]
     return _Candidates(
         points=UncertainPoints(points.reshape(-1, 2)[best], cov.reshape(-1, 2, 2)[best]),
