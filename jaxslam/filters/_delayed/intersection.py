@@ -89,7 +89,7 @@ def _sharpest_intersections(
         partner = jnp.argmin(spread.min(axis=2), axis=1)
         sharp = sharp & (partner[:, None] == jnp.arange(layout.stored)[None, :])[:, :, None]
         spread = jnp.where(sharp, spread, jnp.inf)
-    m, w, a = spread.shape
+    m, w, _ = spread.shape
     # top_k finds the largest, hence the negative; a choice has no derivative.
     count = min(spread.size, layout.hypotheses)
     best = jax.lax.top_k(-jax.lax.stop_gradient(spread.reshape(-1)), count)[1]

@@ -212,7 +212,7 @@ MODELS = motion.PoseIncrement(np.eye(3)), sensors.RelativePosition(np.eye(2)), 3
     (lambda: LoopSettings(probability=0.0), "probability"),
     (lambda: look(two_visits()[0]._replace(life=None)), "keeps times"),
     (lambda: association.Certain(association.Nearest(0.99), 0.0), "spread"),
-    (lambda: Closing(EkfSlam(*MODELS), every=0), "every"),
+    (lambda: Closing(EkfSlam(*MODELS), period=0), "period"),
     (lambda: Closing(EkfSlam(*MODELS), reach=-1.0), "reach"),
     (lambda: Closing(EkfSlam(*MODELS)).init(jnp.zeros(3), jnp.eye(3)), "keeps times"),
     (lambda: Closing(EkfSlam(*MODELS, covariance="square_root", life=Recency())), "root"),
