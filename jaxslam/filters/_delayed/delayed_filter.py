@@ -128,7 +128,7 @@ class DelayedFilter(Filter):
 
     motion: Motion
     sensor: Sensor
-    """of one bearing or one range of points"""
+    """a sensor of one bearing or one range of points"""
     capacity: int = static()
     """landmarks N"""
     _: dataclasses.KW_ONLY
@@ -141,8 +141,9 @@ class DelayedFilter(Filter):
     gate: Number | None = None
     """the probability that a correct comparison passes, by γ = χ²(1, gate); default 0.99"""
     associate: Associate = Known()
-    """with `Known` only measurements of one tag intersect. With any other method, the measurements
-    it declares new intersect all others, and tags only name the landmarks"""
+    """the landmark of each measurement. With `Known` only measurements of one tag intersect. With
+    any different method, the measurements it declares new intersect all stored ones, and tags only
+    name the landmarks"""
     chart = Euclidean()
 
     def __post_init__(self) -> None:
@@ -186,7 +187,7 @@ class DelayedFilter(Filter):
 
     @property
     def by_tag(self) -> bool:
-        """Whether identities are known, so that only measurements of one tag intersect."""
+        """Identities are known: only measurements of one tag intersect."""
         return isinstance(self.associate, Known)
 
     @property

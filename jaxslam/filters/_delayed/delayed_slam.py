@@ -86,6 +86,7 @@ class DelayedSlam(DelayedFilter):
         def initialize(
             state: DelayedState,
         ) -> tuple[DelayedState, tuple[Bool[Array, "M"], Promoted]]:
+            # Only a measurement that no hypothesis explains may form one.
             state, slot, stored = _store_measurements(self, state, new)
             state, explained, confirmed_by = confirm_hypotheses(self, state, new, slot, stored)
             state = intersect_measurements(self, state, new, slot, stored & ~explained)
@@ -95,6 +96,7 @@ class DelayedSlam(DelayedFilter):
         def leave(state: DelayedState) -> tuple[DelayedState, tuple[Bool[Array, "M"], Promoted]]:
             return state, (jnp.zeros_like(new.is_new), Promoted.none(new))
 
+        # The steps take an argmin over the measurements, of which there must be one.
         steps = initialize if len(scan.tag) > 0 else leave
         state, (stored, promoted) = where_any(new.wanted.any(), steps, leave, state)
         return state, _report(scan, association, matched, correction, new, stored, promoted)
@@ -170,6 +172,7 @@ def _store_measurements(
     wanted = new.wanted & ~(close & (new.tag[:, None] == tag[None])).any(axis=1)
 
     needed = wanted.sum() - (~alive).sum()
+    # The sum of a column of `is_newer` is the rank from the oldest; a free slot counts as newest.
     age = jnp.where(alive, state.taken_at, state.clock + 1)
     evicted = alive & (is_newer(age).sum(axis=0) < needed)
     state = delete_slots_if_any(layout, state, slots_where(layout, stored=evicted))

@@ -62,6 +62,7 @@ def motion_update(
     phi = omega.at[:3].set(back.T @ omega[:3])
     phi = phi.at[:, :3].set(phi[:, :3] @ back)
     residual = residual.at[:3].set(back.T @ residual[:3])
+    # Sᵀ Φ; the inner matrix I + Sᵀ Φ S is 3×3 and positive definite for any rank of S.
     by_noise = root.T @ phi[:3]
     inner = jnp.eye(3, dtype=omega.dtype) + by_noise[:, :3] @ root
     gain = (linalg.inverse(linalg.symmetrize(inner)) @ by_noise).T
@@ -130,6 +131,7 @@ def initialize_landmarks(
 
 def diagonal_loading(omega: Float[Array, "D D"]) -> Float[Array, "D D"]:
     """The matrix Ω plus √eps of its diagonal, used where rounding made Ω indefinite."""
+    # Rounding errs by some eps of the diagonal; √eps exceeds that after many steps, and is small.
     share = math.sqrt(float(jnp.finfo(omega.dtype).eps))
     load: Array = share * jnp.diag(jnp.abs(jnp.diagonal(omega)))
     return omega + load

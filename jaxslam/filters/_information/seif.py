@@ -125,6 +125,7 @@ class Seif(InformationFilter):
                 f"Seif: expected active >= {size}, the measurement slots of a scan, got "
                 f"{self.active}"
             )
+        # Means are recovered before they are linearized at, so that Jacobians are up to date.
         state = recover_passive_means(state, self.recovered)
         association = associate_by_index(state.alive, scan)
         state, index = _sparsify_and_activate(self, state, association)
@@ -165,6 +166,7 @@ def _sparsify_and_activate(
     matches = active_matches(state, association)
     enters = association.has_slot & ~matches.any(axis=1)
     empty = state.active >= filter.capacity
+    # A measured landmark never leaves; an empty index comes before all.
     order = jnp.where(matches.any(axis=0), jnp.iinfo(jnp.int32).max, state.last_measured)
     order = jnp.where(empty, -1, order)
     index, assigned = assign_indices(order, jnp.cumsum(enters) - 1, enters, matches)

@@ -200,6 +200,7 @@ def psd_completion(
 
     The square root of a 2×2 matrix M is (M + √|M| I)/√(tr M + 2 √|M|), and √|B Bᵀ| = |det B|.
     """
+    # `square` is tr M + 2 √|M| of M = B Bᵀ or Bᵀ B, which have the same trace and determinant.
     det = jnp.abs(link[0, 0] * link[1, 1] - link[0, 1] * link[1, 0])
     square = (link**2).sum() + 2 * det
     nonzero = square > 0
@@ -227,6 +228,7 @@ def drop_link(
     them would lose half of its information in some direction, the link is dropped overconfidently.
     """
     u, v = psd_completion(link)
+    # Slot n is beyond the end: reads give 0, writes are dropped.
     n = diagonal.shape[0]
     i, j = jnp.where(on, i, n), jnp.where(on, j, n)
     sign = jnp.ones((), diagonal.dtype)

@@ -170,6 +170,7 @@ def innovations(
 
     fused_nu = jnp.where(fused[:, None], nu, 0.0)
     nis, log_likelihood = _densities_in_turn(fused_nu, joint_cov, fused)
+    # N⁻¹ H and N⁻¹ ν, whose products add Hᵀ R⁻¹ H to Ω without an inverse of R.
     rows = jax.vmap(linalg.solve_lower)(noise_factor, jacobian.reshape(m, size, jacobian.shape[1]))
     return CanonicalInnovations(
         whitened_jacobian=jnp.where(fused[:, None, None], rows, 0.0).reshape(jacobian.shape),

@@ -56,18 +56,18 @@ class FastSlam(ParticleMapFilter):
     get different poses.
 
     Resampling happens in steps with ESS = 1/Σ w² below threshold·P. Where all weights underflow,
-    all become 1/P and `ParticleInfo.underflow` is set; the log-likelihood, -∞, is then given as 0,
-    so `underflow` must be checked in a sum of log-likelihoods. A particle that a motion or a scan
+    all become 1/P and `ParticleInfo.underflow` is set; the log-likelihood, -∞, is then 0, so
+    `underflow` must be checked in a sum of log-likelihoods. A particle that a motion or a scan
     leaves without a finite pose keeps its previous pose, with weight zero (`ParticleInfo.invalid`).
 
-    The measurements in an `Info` are those of the most likely particle (by its weight before
-    resampling), whose slots are those of the estimate; its innovations are given its path, with the
-    covariance of a pose not drawn yet in 2.0. Only nis is the mean over the particles by their
-    weights after the scan: of a consistent filter that is dof, E_z Σ_p (w_p N_p(z)/p(z)) d²_p =
-    Σ_p w_p E_{N_p} d²_p, while that of the most likely particle is biased low by selection. Its
-    log_likelihood is that of the scan given all before, log Σ w p(scan | particle), of the
-    measurements that a particle has landmarks for. `info.extra["particles"]` is a `ParticleInfo`.
-    Estimates: `slam_estimate`.
+    An `Info` reports the measurements of the most likely particle (by its weight before
+    resampling), whose slots the estimate has. Innovations are conditional on the path of this
+    particle; in 2.0 their covariance includes that of the pose, which is not drawn yet. Only nis is
+    the mean over the particles by their weights after the scan: its expectation in a consistent
+    filter is dof, E_z Σ_p (w_p N_p(z)/p(z)) d²_p = Σ_p w_p E_{N_p} d²_p, while the nis of the most
+    likely particle is biased low by selection. log_likelihood is log Σ w p(scan | particle) given
+    all earlier scans, of the measurements that a particle has landmarks for.
+    `info.extra["particles"]` is a `ParticleInfo`. Estimates: `slam_estimate`.
 
     Raises ValueError on a capacity, particles or births below 1, a threshold outside [0, 1], a gate
     not above 0 and below 1, an unknown proposal, an invalid life or resample, or a
@@ -84,15 +84,17 @@ class FastSlam(ParticleMapFilter):
     """P, at least 1"""
     _: dataclasses.KW_ONLY
     proposal: Literal["motion", "measurement"] = static(default="measurement")
-    """what poses are drawn from"""
+    """distribution from which poses are drawn"""
     resample: Resample | Differentiable = systematic
     """one of `jaxslam.resampling`. Through `StopGradient` of one, the gradient of
     `Info.log_likelihood` is consistent; through `Soft` it is biased, and more so without either,
     since the effect of resampling is then ignored"""
     threshold: Number = 0.5
-    """of ESS, as a share of P; 0 never resamples, 1 in every step with unequal weights"""
+    """ESS below which to resample, as a share of P; 0 never resamples, 1 in every step with unequal
+    weights"""
     associate: Associate = Known()
-    """other methods associate by each particle's map"""
+    """the landmark of each measurement; a method other than `Known` decides by each particle's
+    map"""
     gate: Number | None = None
     """See `EkfSlam.gate`."""
     births: int | None = static(default=None)
@@ -132,7 +134,7 @@ class FastSlam(ParticleMapFilter):
     def update(self, state: SlamParticles, scan: Scan, key: Array) -> tuple[SlamParticles, Info]:
         scan = zero_padding(scan)
         key_resample, key_draw = jax.random.split(key)
-        state = state._replace(best=None)  # of all particles: no field to map over
+        state = state._replace(best=None)  # a number of the whole state: nothing to map over
         association = jax.vmap(partial(associate_particle, self, scan=scan))(state)
         proposal, innovations = jax.vmap(partial(propose_pose, self, scan=scan))(state, association)
         state = with_finite_poses(state, proposal.pose, proposal.pose_cov)
@@ -141,6 +143,8 @@ class FastSlam(ParticleMapFilter):
         ess = 1.0 / jnp.exp(2 * log_weight).sum()
         resampled = ess < self.threshold * self.particles
         particles = ParticleInfo(ess, resampled, underflow, invalid=state.invalid.sum())
+        # The weight is marginal over the pose, so resampling comes before the draw: copies of one
+        # particle get different poses. Association and innovations move with their particle.
         (state, association, innovations, weight_before), log_weight = resampled_where(
             resampled,
             (state, association, innovations, log_weight),
@@ -152,6 +156,7 @@ class FastSlam(ParticleMapFilter):
         state, infos = jax.vmap(partial(update_map, self, scan=scan))(
             state, association, innovations
         )
+        # After resampling all weights are equal.
         best = jnp.argmax(weight_before).astype(jnp.int32)
         info = _report(infos, best, nis, log_likelihood, association.exhausted)
         return state._replace(best=best), with_extra(info, "particles", particles)

@@ -36,6 +36,7 @@ def update_map(
 
     The log-likelihood of the `Info` is left at 0.
     """
+    # Landmarks are corrected before eviction, so that `Life` makes room by the current map.
     particle = _correct_landmarks(filter.sensor, particle, association.slot, innovations.used, scan)
     particle, evicted = _evict_for_new(filter.life, particle, association, innovations.used)
     particle, new = _initialize_landmarks(filter, particle, association.is_new, scan)
@@ -86,6 +87,7 @@ def _correct_landmarks(
         noise = first_order.predicted_noise(sensor, z_hat, z, used)
         s = linalg.symmetrize(linalg.matmul(hc, by_landmark.T) + noise)
         terms = gaussian_terms(sensor.residual(z, z_hat), s)
+        # With S = L Lᵀ and V = L⁻¹ H_l C: l ← l + Vᵀ L⁻¹ ν, C ← C - Vᵀ V.
         v = linalg.solve_lower(terms.factor, hc)
         return landmark + linalg.matmul(terms.whitened[None], v)[0], cov - linalg.gram(v, v)
 
@@ -120,7 +122,7 @@ class _NewLandmarks(NamedTuple):
     """a free landmark slot, where granted"""
     granted: Bool[Array, "M"]
     deferred: Bool[Array, "M"]
-    """beyond `births`, the limit of a scan"""
+    """the measurement is beyond `births`, the limit of a scan"""
     repeated: Bool[Array, "M"]
     """the tag occurs earlier in the scan"""
 

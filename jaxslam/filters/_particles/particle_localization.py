@@ -61,8 +61,8 @@ class ParticleLocalization(MonteCarloFilter):
     `weighted_pose_moments`, a single mean and covariance even if the particles form several modes.
     Where all weights underflow, all in use become equal (`underflow`). A motion
     that leaves a non-finite pose is undone, and the particle gets weight zero (`invalid`).
-    The measurements in an `Info` are those of the most likely particle, and nis is the mean over
-    the particles by weight, as of `FastSlam`; log_likelihood is log Σ w p(scan | x) of measurements
+    An `Info` reports the measurements of the most likely particle; nis is the mean over the
+    particles by weight, as in `FastSlam`; log_likelihood is log Σ w p(scan | x) of the measurements
     matched to a landmark.
 
     Shapes are fixed, so the cost of a step depends on the capacity, not on the particles in use.
@@ -77,7 +77,7 @@ class ParticleLocalization(MonteCarloFilter):
 
     motion: Motion
     sensor: Sensor
-    """any; with a `sensors.Suite`, absolute sensors enter the weights too"""
+    """any sensor; in a `sensors.Suite`, absolute sensors enter the weights too"""
     landmarks: ArrayLike
     """(N, L) the map, in the sensor's parameters"""
     particles: int = static()
@@ -218,6 +218,8 @@ def _sensor_likelihood(
     noise = jax.vmap(partial(predicted_noise, sensor))(z_hat, scan.z, matched)
     nu = jax.vmap(sensor.residual)(scan.z, z_hat)
     terms = jax.vmap(gaussian_terms)(nu, noise)
+    # A measurement without a landmark would count with log |R(z)|, as in `propose_pose`. It is the
+    # same at all poses, and is taken out of all weights.
     factor_at_z = jax.vmap(lambda z: linalg.cholesky(sensor.noise_cov(z))[0])(scan.z)
     inside, gated, nis = gate_distance(terms.distance, gate_quantile(filter.gate, size_z))
     of_map = matched & terms.positive

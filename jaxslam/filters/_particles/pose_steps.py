@@ -142,9 +142,10 @@ class MonteCarloFilter(_Particles):
     resample: Resample | Differentiable = systematic
     """one of `jaxslam.resampling`; also `Soft` or `StopGradient` of one"""
     threshold: Number = 1.0
-    """of ESS, as a share; 1 resamples (and chooses the number) in every step with unequal weights,
-    0 only to inject. If odometry is more precise than the scans, copies stay together, and a lower
-    threshold gives a more consistent covariance"""
+    """ESS below which to resample, as a share of the particles in use; 1 resamples (and chooses
+    their number) in every step with unequal weights, 0 only to inject. If odometry is more precise
+    than the scans, copies stay together, and a lower threshold makes the covariance more
+    consistent"""
     least: int | None = static(default=None)
     """least number of particles in use; default 50, or the capacity if that is less. With
     least = particles their number is fixed"""
@@ -189,10 +190,12 @@ class MonteCarloFilter(_Particles):
         resampled, weight_resampled, injected = resample_and_inject(
             state, key_renew, self.resample, None if self.forget is None else self.region
         )
+        # Copies of one particle are separated by the noise of the motion.
         old = jnp.where(due, resampled, state.pose)
         moved = sample_motion(self.motion, old, u, key_noise)
         good = jnp.isfinite(moved).all(axis=1)
         pose = jnp.where(good[:, None], moved, old)
+        # The number of particles follows from the bins that they occupy after the motion.
         count, few = enough(bins_of(pose, _BINS), self.fewest, _ERROR, _CONFIDENCE)
         active = jnp.where(due, count, state.active)
         used = jnp.arange(self.particles, dtype=active.dtype) < active

@@ -73,7 +73,7 @@ class ParticleInnovations(NamedTuple):
     positive: Bool[Array, "*P M"]
     """S is positive definite"""
     inside: Bool[Array, "*P M"]
-    """in the gate; without one, of a d² that did not overflow"""
+    """d² is within the gate; without a gate, finite"""
     used: Bool[Array, "*P M"]
     """matched, inside, and positive"""
     innovation: Float[Array, "*P M Z"]
@@ -123,6 +123,7 @@ def propose_pose(
         inside, counted, nis = gate_distance(terms.distance, gamma)
         of_map = matched & terms.positive
         used = of_map & inside
+        # With S = L Lᵀ and V = L⁻¹ H_x P: x ← x + Vᵀ L⁻¹ ν, P ← P - Vᵀ V. Without use V = 0.
         v = jnp.where(used, linalg.solve_lower(terms.factor, hp), 0.0)
         x = x + linalg.matmul(jnp.where(used, terms.whitened, 0.0)[None], v)[0]
         x = jnp.concatenate([x[:2], wrap(x[2:])])
@@ -168,6 +169,7 @@ def _predict_measurements(particle: SlamParticles, sensor: Sensor) -> Prediction
 
     def cross() -> Float[Array, "N Z N Z"]:
         _, by_pose, landmark_cov = linearized()
+        # Landmarks i and j are correlated by the pose: H_i P H_jᵀ, and H_l C H_lᵀ where i = j.
         shared = jnp.einsum("izx,xy,jwy->izjw", by_pose, particle.pose_cov, by_pose)
         j = jnp.arange(particle.alive.shape[0])
         return shared.at[j, :, j, :].add(landmark_cov)

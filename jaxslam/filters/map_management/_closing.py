@@ -73,6 +73,7 @@ class Closing(Managed):
         return joint
 
     def manage(self, joint: Joint, scan: Scan, info: Info) -> tuple[Joint, Info]:
+        # A merged landmark counts as removed, whichever way it was merged.
         before = joint.alive
         joint, report = change_where(
             (joint.life.now % self.period == 0) & scan.valid.any(),

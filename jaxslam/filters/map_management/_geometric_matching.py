@@ -108,6 +108,7 @@ def _residuals(
     m, paired, at = slot.shape[0], slot >= 0, jnp.maximum(slot, 0)
     rotation = se2.rotation(pose[2])
     mixed = jnp.einsum("xy,iyjw->ixjw", rotation, points.cross_cov[:, :, at])
+    # cov(r) = R Z Rᵀ + P_mm - R Z_m - (R Z_m)ᵀ, axes (i, xy of i, j, xy of j).
     cov = jnp.einsum("xy,iyjw,vw->ixjv", rotation, points.cluster_cov, rotation)
     cov = cov + points.map_cov[at][:, :, at] - mixed - mixed.transpose(2, 3, 0, 1)
     cov = with_unit_blocks(cov, paired)
@@ -266,6 +267,7 @@ def _fit_hypothesis(
     m = points.cluster.shape[0]
     levels = jnp.asarray(limits.joint, points.cluster.dtype)
 
+    # Each pass drops at most one pair, so m - 2 passes reach two pairs.
     def drop(_: int, slot: Array) -> Array:
         alignment = align_points(points, slot)
         count = (slot >= 0).sum()

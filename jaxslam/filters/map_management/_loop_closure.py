@@ -64,6 +64,7 @@ def successive_duplicate(
     pairs = (later | later.T) & joint.alive[:, None] & joint.alive[None, :] & near
 
     def search(joint: Joint) -> tuple[Array, Array, Array]:
+        # tr cov(l_i - l_j) = tr P_ii + tr P_jj - 2 tr P_ij.
         cov = cov_of_coordinates(joint, chart)[3:, 3:].reshape(capacity, 2, capacity, 2)
         k = jnp.arange(capacity)
         traces = jnp.trace(cov[k, :, k], axis1=1, axis2=2)
@@ -169,9 +170,10 @@ def close_loop(joint: Joint, chart: Chart, settings: LoopSettings) -> tuple[Join
     """
     check_recency("close_loop", joint, chart)
     recent, candidates = _recent_cluster(joint, settings)
+    # Each test before the search costs less than the search: most scans end here.
     old, report = change_where(
         candidates.any(axis=1).sum() >= settings.least,
-        lambda _: _old_slots(joint, chart, recent, candidates, settings),
+        lambda _: _match_cluster(joint, chart, recent, candidates, settings),
         (jnp.full(recent.shape, -1, jnp.int32), no_closing()),
     )
     joint = change_where(
@@ -201,7 +203,7 @@ def _recent_cluster(
     return cluster, recent[cluster][:, None] & joint.alive[None, :] & later
 
 
-def _old_slots(
+def _match_cluster(
     joint: Joint,
     chart: Chart,
     recent: Int[Array, "M"],
@@ -210,6 +212,7 @@ def _old_slots(
 ) -> tuple[Int[Array, "M"], LoopReport]:
     """The old slot of each recent landmark, -1 without a merge, and the report."""
     capacity, m = joint.landmarks.shape[0], recent.shape[0]
+    # χ² by the number of pairs; no pair has the distance 0.
     levels = jnp.asarray(
         [0.0, *(chi2_quantile(settings.drift, 2 * n) for n in range(1, settings.cluster + 1))]
     )

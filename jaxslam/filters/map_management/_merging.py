@@ -203,7 +203,8 @@ def closest_pair(
         pairs = pairs & allowed
     d2 = jnp.where(pairs, jax.vmap(jax.vmap(squared_distance))(delta, delta_covs), jnp.inf)
     best = jnp.argmin(d2)
-    return *jnp.unravel_index(best, d2.shape), d2.reshape(-1)[best]
+    i, j = jnp.unravel_index(best, d2.shape)
+    return i, j, d2.reshape(-1)[best]
 
 
 def squared_distance(error: Float[Array, "n"], cov: Float[Array, "n n"]) -> Float[Array, ""]:
@@ -226,6 +227,7 @@ def merge_landmarks(
     by_robot, by_landmark = (part[jnp.stack([i, j])] for part in _derivatives(joint, chart))
     rows = joint.cov @ joint.cov.T if square_root else joint.cov
     rows_of = [jax.lax.dynamic_slice_in_dim(rows, 3 + slot * size, size) for slot in (i, j)]
+    # cov(δ, ·), δ = l_i - l_j, of which each coordinate depends on pose and landmark.
     with_all = (by_robot[0] - by_robot[1]) @ rows[:3]
     with_all = with_all + by_landmark[0] @ rows_of[0] - by_landmark[1] @ rows_of[1]
     columns_of = [
@@ -235,6 +237,7 @@ def merge_landmarks(
     s = s + columns_of[0] @ by_landmark[0].T - columns_of[1] @ by_landmark[1].T
     factor, positive = linalg.cholesky(linalg.symmetrize(s))
     ok = positive & (i != j)
+    # A factor of zero gives V = 0, which changes nothing.
     factor = jnp.where(ok, factor, 0.0)
     v = linalg.solve_lower(factor, with_all)
     white = linalg.solve_lower(factor, joint.landmarks[j] - joint.landmarks[i])

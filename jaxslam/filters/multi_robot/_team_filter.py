@@ -136,5 +136,5 @@ def _check_sensors(robots: Sequence[Robot]) -> None:
 
 
 def measures_points(sensor: Sensor) -> bool:
-    """Whether one measurement determines a point (x, y), given the pose."""
+    """True if one measurement determines a point (x, y), for a known pose."""
     return sensor.of_points and np.shape(sensor.free.mean) == (0,)

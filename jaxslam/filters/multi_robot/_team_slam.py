@@ -152,7 +152,7 @@ def _predict_robot(filter: TeamSlam, joint: Joint, robot: int, u: Float[Array, "
         seen_from(filter, joint, robot), u, filter.robots[robot].motion, filter._ekf
     )
     after = seen_from_first(filter, after, robot, joint)
-    if robot in filter.started:
+    if robot in filter.started:  # always in the map
         return after
     in_map = joint.alive[filter.slot_of(robot)]
     moved: Joint = jax.tree.map(lambda new, old: jnp.where(in_map, new, old), after, joint)
@@ -188,6 +188,7 @@ def _correct_by_robot(filter: TeamSlam, joint: Joint, robot: int, scan: Scan) ->
     in_map = robots_in_map(filter, joint)
     of_robot = scan.tag[:, None] == jnp.asarray(filter.robot_tags, jnp.int32)[None, :]
     others = jnp.where(jnp.arange(len(in_map)) == robot, False, in_map)
+    # Measurements of a robot without a pose in the map, and all by one, cannot correct.
     unknown = (of_robot & ~others[None, :]).any(axis=1) | ~in_map[robot]
     part_scan = scan._replace(valid=scan.valid & ~unknown)
     stages = [_stage_of(part, filter._ekf) for part in filter.robots[robot].sensors.parts]
