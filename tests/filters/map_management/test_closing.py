@@ -14,9 +14,8 @@ from jaxslam import association, charts, motion, sensors, slots
 from jaxslam.core.protocols import Pairs, Prediction
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Info, Scan
-from jaxslam.filters import EifSlam, EkfSlam
-from jaxslam.filters.map_management._closing import Closing
-from jaxslam.filters.map_management._loop_closure import LoopSettings, close_loop
+from jaxslam.filters import Closing, EifSlam, EkfSlam, LoopSettings
+from jaxslam.filters.map_management._loop_closure import close_loop
 from jaxslam.filters.map_management._merging import merge_landmarks
 from jaxslam.life import Recency, Times
 
