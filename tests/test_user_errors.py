@@ -24,8 +24,8 @@ from jaxslam.core._validation import check_models, checked_estimate, state_and_i
 from jaxslam.core.protocols import Free
 from jaxslam.core.record import record
 from jaxslam.core.types import Estimate, Log, Scan
+from jaxslam.filters import Closing
 from jaxslam.filters import _reporting as reporting
-from jaxslam.filters.map_management._closing import Closing
 
 MOVE = motion.PoseIncrement(np.diag([1e-4, 1e-4, 1e-6]))
 SEES = sensors.RangeBearing(np.diag([1e-2, 1e-4]))

@@ -2,7 +2,7 @@
 
 from jaxslam._public import publish
 from jaxslam.core.protocols import Filter, Wrapper
-from jaxslam.filters._delayed.delayed_settings import Hypotheses, Promotion, StoredMeasurements
+from jaxslam.filters._delayed.delayed_filter import Hypotheses, Promotion, StoredMeasurements
 from jaxslam.filters._delayed.delayed_slam import DelayedSlam
 from jaxslam.filters._ekf.compressed_ekf_slam import CompressedEkfSlam
 from jaxslam.filters._ekf.ekf_settings import EkfOptions

@@ -1,4 +1,4 @@
-"""The fields of filters in a known map: landmarks (N, L) and tags."""
+"""The known map of a filter: its fields landmarks and tags, checked and held."""
 
 from typing import Any
 

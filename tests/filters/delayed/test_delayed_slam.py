@@ -16,9 +16,14 @@ import jaxslam
 from jaxslam import Scenario, motion, sensors
 from jaxslam.association import Nearest
 from jaxslam.core.types import Status
-from jaxslam.filters import DeadReckoning, DelayedSlam
+from jaxslam.filters import (
+    DeadReckoning,
+    DelayedSlam,
+    Hypotheses,
+    Promotion,
+    StoredMeasurements,
+)
 from jaxslam.filters._delayed.confirmation import constraints_of, correct_hypotheses
-from jaxslam.filters._delayed.delayed_settings import Hypotheses, Promotion, StoredMeasurements
 from jaxslam.filters._delayed.hypotheses import UncertainPoints, closer_than, point_residuals
 from jaxslam.filters._delayed.initialization import add_landmark, initial_estimate
 from jaxslam.filters._delayed.intersection import add_hypotheses

@@ -19,8 +19,6 @@ from jaxslam.core.types import Log, Scan, Status
 from jaxslam.filters import EkfSlam, TeamSlam
 from jaxslam.filters.multi_robot import _pose_initialization as pose_initialization
 from jaxslam.sensors import Part, Suite
-from jaxslam.simulation._team_world import TeamWorld
-from jaxslam.simulation._worlds import simulate
 from jaxslam.simulation.scenarios import BetweenRanges
 
 Q = np.diag([0.01, 0.01]) ** 2
@@ -56,7 +54,7 @@ def world(robots, steps=40, **options):
     points = np.stack([radius * np.cos(around), 1.0 + radius * np.sin(around)], axis=1)
     turns = [4 * np.pi / 100, -0.1, 0.15][: len(robots)]
     controls = np.tile(np.ravel([(0.12, turn) for turn in turns]), (steps, 1))
-    return TeamWorld(robots, points, controls, **options)
+    return jaxslam.TeamWorld(robots, points, controls, **options)
 
 
 @cache
@@ -273,7 +271,11 @@ def hundred(report, first):
     ]
     scenario = world(robots, 30, report=report)
     keys = jax.random.split(jax.random.key(2), RUNS)
-    return robots, scenario, *jax.device_get(jax.jit(jax.vmap(partial(simulate, scenario)))(keys))
+    return (
+        robots,
+        scenario,
+        *jax.device_get(jax.jit(jax.vmap(partial(jaxslam.simulate, scenario)))(keys)),
+    )
 
 
 @cache
@@ -336,7 +338,9 @@ def test_a_world_is_the_same_whatever_is_reported():
 
     @jax.jit
     def all_of_them(key):
-        truths, logs = zip(*(simulate(scenario, key) for scenario in scenarios), strict=True)
+        truths, logs = zip(
+            *(jaxslam.simulate(scenario, key) for scenario in scenarios), strict=True
+        )
         return truths, logs, scenarios[0].histories(key)
 
     truths, logs, (starts, paths, _) = all_of_them(jax.random.key(0))

@@ -18,7 +18,6 @@ from jaxslam.consistency._measures.counts import counted
 from jaxslam.core.types import Scan, Status
 from jaxslam.filters import FastSlam
 from jaxslam.filters._particles import pose_particles, slam_particles
-from jaxslam.filters._particles.slam_particles import SlamParticles
 from jaxslam.math.stats import sigma_gate
 
 KEY = jax.random.key(5)
@@ -116,7 +115,7 @@ def weighted(**fields):
     """A state in which no particle has lost anything."""
     count = len(fields["pose"])
     zero = np.zeros(count, np.int32)
-    return SlamParticles(**fields, lost=zero, invalid=zero.astype(bool))
+    return slam_particles.SlamParticles(**fields, lost=zero, invalid=zero.astype(bool))
 
 
 def random_particles(rng, count=7, capacity=3):
