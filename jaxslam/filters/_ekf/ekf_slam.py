@@ -18,9 +18,9 @@ from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.association._rules import Known
 from jaxslam.charts import Euclidean
-from jaxslam.core import _validation as validation
 from jaxslam.core import slots
-from jaxslam.core._record import hold_function, record, static
+from jaxslam.core._record import field, function_of, record, static
+from jaxslam.core._validation import check_models
 from jaxslam.core.protocols import (
     Associate,
     Association,
@@ -35,8 +35,9 @@ from jaxslam.core.protocols import (
 )
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan
+from jaxslam.core.validation import at_least, instance_of, one_of, or_none, probability
 from jaxslam.filters._ekf import map_coordinates
-from jaxslam.filters._ekf.checks import check_choice, check_fit, check_map_options
+from jaxslam.filters._ekf.checks import check_fit
 from jaxslam.filters._ekf.correction import Covariance, correct, correct_in_turn
 from jaxslam.filters._ekf.linear_system import (
     LinearizedSteps,
@@ -87,46 +88,42 @@ class EkfSlam(Filter):
     motion: Motion
     sensor: Sensor
     """the models; Jacobians come from `jax.jacfwd`"""
-    capacity: int = static()
+    capacity: int = static(check=at_least(1))
     """landmark slots N. A new landmark that finds the map full is dropped and marked
     `Status.OVERFLOW`"""
     _: dataclasses.KW_ONLY
-    chart: Chart = Euclidean()
+    chart: Chart = field(default=Euclidean(), check=instance_of(Chart))
     """the error coordinates of P"""
-    linearize: Linearizer = AtEstimate()
+    linearize: Linearizer = field(default=AtEstimate(), check=instance_of(Linearizer))
     """where Jacobians are taken"""
-    associate: Associate = Known()
+    associate: Associate = field(default=Known(), check=function_of("prediction", "scan"))
     """the landmark of each measurement"""
-    correction: CorrectionOrder = static(default="sequential")
+    correction: CorrectionOrder = static(
+        default="sequential", check=one_of(*get_args(CorrectionOrder))
+    )
     """"sequential" corrects by one measurement after the other, relinearizing each time, as the
     guide does; "joint" corrects by the whole scan at once"""
-    gate: Number | None = None
+    gate: Number | None = field(default=None, check=or_none(probability))
     """the probability that a correct measurement passes, above 0 and below 1, as 0.999: one whose
     squared Mahalanobis distance d² exceeds the χ² quantile of its Z numbers is rejected; None: none
     is. The guide's 3 σ is `stats.sigma_gate(3, 2)`. float32 has no number between 1 - 6e-8
     (d² = 33 of Z = 2) and 1"""
-    iterations: int = static(default=1)
+    iterations: int = static(default=1, check=at_least(1))
     """passes of the iterated EKF, each from the same prior; 1 is the plain EKF"""
-    covariance: Covariance = static(default="plain")
+    covariance: Covariance = static(default="plain", check=one_of(*get_args(Covariance)))
     """"plain"; "joseph", Joseph's form of the update, which costs more, and in float32 fails where
     "plain" does; or "square_root", a root X of P = X Xᵀ instead of P, which holds twice the digits,
     at a higher cost (the prediction is O(N³))"""
-    births: int | None = static(default=None)
+    births: int | None = static(default=None, check=or_none(at_least(1)))
     """largest number of new landmarks a scan, the first in its order (that of tags in simulated
     scans), the rest `Status.DEFERRED`. The guide starts one, picked at random. None: no limit"""
-    life: Life | None = None
+    life: Life | None = field(default=None, check=or_none(instance_of(Life)))
     """a rule that removes landmarks after each scan, and may make room in a full map. Its memory is
     `Joint.life`; `info.extra["pruning"].removed` (N,) bool marks the slots"""
 
     def __post_init__(self) -> None:
         name = type(self).__name__
-        validation.check_models(name, self.motion, self.sensor)
-        validation.check_parts(name, self.chart, self.linearize, self.associate, self.life)
-        hold_function(self, "associate", "prediction, scan")
-        check_map_options(name, self.capacity, self.gate, self.births)
-        validation.check_count(f"{name}: iterations", self.iterations)
-        check_choice(name, "correction", self.correction, get_args(CorrectionOrder))
-        check_choice(name, "covariance", self.covariance, get_args(Covariance))
+        check_models(name, self.motion, self.sensor)
         check_fit(name, self.sensor, self.chart, self.linearize, self.iterations)
         super().__post_init__()
 

@@ -5,11 +5,12 @@ import dataclasses
 from jaxtyping import Array, Float
 
 from jaxslam.charts import Euclidean
-from jaxslam.core import _validation as validation
-from jaxslam.core._record import record
+from jaxslam.core._record import field, record
+from jaxslam.core._validation import check_models
 from jaxslam.core.protocols import Chart, Filter, Linearizer, Motion, Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan
+from jaxslam.core.validation import instance_of
 from jaxslam.filters._ekf.checks import check_fit
 from jaxslam.filters._ekf.ekf_slam import EkfSlam
 from jaxslam.filters._reporting import nothing_of
@@ -27,12 +28,11 @@ class DeadReckoning(Filter):
     motion: Motion
     sensor: Sensor
     _: dataclasses.KW_ONLY
-    chart: Chart = Euclidean()
-    linearize: Linearizer = AtEstimate()
+    chart: Chart = field(default=Euclidean(), check=instance_of(Chart))
+    linearize: Linearizer = field(default=AtEstimate(), check=instance_of(Linearizer))
 
     def __post_init__(self) -> None:
-        validation.check_models("DeadReckoning", self.motion, self.sensor)
-        validation.check_parts("DeadReckoning", self.chart, self.linearize)
+        check_models("DeadReckoning", self.motion, self.sensor)
         check_fit("DeadReckoning", self.sensor, self.chart, self.linearize)
         super().__post_init__()
 

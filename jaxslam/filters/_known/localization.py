@@ -12,9 +12,9 @@ from numpy.typing import ArrayLike
 
 from jaxslam.association._rules import Known, predicted
 from jaxslam.charts import Euclidean
-from jaxslam.core import _validation as validation
 from jaxslam.core._numbers import gate_quantile
-from jaxslam.core._record import hold_function, record, static
+from jaxslam.core._record import field, function_of, record, static
+from jaxslam.core._validation import check_models
 from jaxslam.core.protocols import (
     Associate,
     Chart,
@@ -27,7 +27,8 @@ from jaxslam.core.protocols import (
 )
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan
-from jaxslam.filters._ekf.checks import check_choice, check_iterations
+from jaxslam.core.validation import at_least, instance_of, one_of, or_none, probability
+from jaxslam.filters._ekf.checks import check_iterations
 from jaxslam.filters._ekf.correction import Correction, in_groups, no_correction
 from jaxslam.filters._ekf.ekf_slam import CorrectionOrder, associate_scan
 from jaxslam.filters._gaussian_correction import correct_gaussian
@@ -62,31 +63,29 @@ class Localization(Filter):
     _: dataclasses.KW_ONLY
     tags: tuple[int, ...] | None = static(default=None)
     """N different ones, in any form, as of a map of some landmarks; default the row numbers"""
-    chart: Chart = Euclidean()
+    chart: Chart = field(default=Euclidean(), check=instance_of(Chart))
     """the error coordinates of P; its pose part"""
-    linearize: Linearizer = AtEstimate()
+    linearize: Linearizer = field(default=AtEstimate(), check=instance_of(Linearizer))
     """one without a memory of landmarks (AtEstimate, Unscented)"""
-    associate: Associate = Known()
+    associate: Associate = field(default=Known(), check=function_of("prediction", "scan"))
     """see `EkfSlam.associate`"""
-    correction: CorrectionOrder = static(default="sequential")
+    correction: CorrectionOrder = static(
+        default="sequential", check=one_of(*get_args(CorrectionOrder))
+    )
     """see `EkfSlam.correction`"""
-    gate: Number | None = None
+    gate: Number | None = field(default=None, check=or_none(probability))
     """see `EkfSlam.gate`"""
-    iterations: int = static(default=1)
+    iterations: int = static(default=1, check=at_least(1))
     """see `EkfSlam.iterations`"""
-    covariance: Literal["plain", "joseph"] = static(default="plain")
+    covariance: Literal["plain", "joseph"] = static(
+        default="plain", check=one_of("plain", "joseph")
+    )
     """see `EkfSlam.covariance`"""
 
     def __post_init__(self) -> None:
         name, linearize = "Localization", self.linearize
-        validation.check_models(name, self.motion, self.sensor)
-        validation.check_parts(name, self.chart, linearize, self.associate)
-        hold_function(self, "associate", "prediction, scan")
+        check_models(name, self.motion, self.sensor)
         hold_map(self)
-        validation.check_gate(name, self.gate)
-        validation.check_count(f"{name}: iterations", self.iterations)
-        check_choice(name, "correction", self.correction, get_args(CorrectionOrder))
-        check_choice(name, "covariance", self.covariance, ("plain", "joseph"))
         if linearize.own_landmarks:
             raise ValueError(
                 f"{name}: the linearizer {linearize.name} is for estimated maps, not for a known "
