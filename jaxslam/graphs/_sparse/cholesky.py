@@ -29,6 +29,7 @@ from jaxslam.graphs._sparse.sweeps import (
 )
 from jaxslam.graphs._sparse.symbolic import Ints, Pattern
 from jaxslam.math._linalg import total
+from jaxslam.math._xla import where_any
 
 
 class CholeskyTables(NamedTuple):
@@ -177,8 +178,14 @@ def factorize(
     pivots = 1.0 / jnp.maximum(_diagonal(factored.inverses[:size]), jnp.finfo(blocks.dtype).tiny)
     entries = jnp.moveaxis(entries, 2, 1)
     small = pivots**2 < _SMALL * entries
-    lost = small & (eps * _roundings(tables, factored, entries) > uncertain)
-    return factored._replace(regular=factored.regular & ~lost.any(axis=1))
+
+    def without_uncertain(regular: jax.Array) -> jax.Array:
+        lost = small & (eps * _roundings(tables, factored, entries) > uncertain)
+        return regular & ~lost.any(axis=1)
+
+    # Nearly every matrix has no small pivot, and then costs no substitution.
+    regular = where_any(small.any(), without_uncertain, lambda regular: regular, factored.regular)
+    return factored._replace(regular=regular)
 
 
 def _diagonal(blocks: Float[Array, "n d d B"]) -> Float[Array, "n d B"]:
