@@ -1,4 +1,4 @@
-"""Reader and writer of graphs as files of g2o and TORO; see `graphs.read`, `graphs.write`."""
+"""Reader and writer of graphs as files of g2o and TORO."""
 
 import gzip
 from collections.abc import Sequence
@@ -99,8 +99,44 @@ class _Row(NamedTuple):
     numbers: list[float]
 
 
+def read_graph(path: str | Path) -> Graph:
+    """The graph in a file of g2o or TORO, packed by gzip or not; arrays are NumPy's, of float64.
+
+    The lines, their fields, and where they are in the graph:
+
+        VERTEX_SE2           id x y θ                                  poses
+        VERTEX2, VERTEX      id x y θ                                  poses (TORO)
+        VERTEX_XY            id x y                                    points
+        FIX                  ids                                       fixed_pose, fixed_point
+        EDGE_SE2             i j x y θ I11 I12 I13 I22 I23 I33         relative_pose
+        EDGE2, EDGE          a b f s r I_ff I_fs I_ss I_rr I_fr I_sr   relative_pose (TORO)
+        EDGE_PRIOR_SE2       i x y θ, and Ω as EDGE_SE2 has it         prior
+        EDGE_SE2_XY          i l x y I11 I12 I22                       relative_position
+        EDGE_BEARING_SE2_XY  i l bearing I11                           bearing
+
+    Poses and points are in the order of the file; the last five name tables. A line `EQUIV i j` of
+    TORO makes two vertices one: that of the smaller id stays with its pose and has the edges of
+    both, but for edges between them, which are left out.
+    Numbers are those of the file. Comments (`#`), scans (`ROBOTLASER1`), notes (`VERTEX_TAG`,
+    `VERTEX_ELLIPSE`) and offsets of sensors (`PARAMS_SE2OFFSET`, to which no edge that is read
+    refers) are skipped; the command `jaxslam optimize` counts them. In a file without vertices,
+    poses and points have the order of their ids and are placed along the edges, `starts.odometry`.
+    The cost of the graph is χ² = Σ eᵀ Ω e, with e from `graphs.REGISTRY` and without a factor ½.
+
+    Kümmerle et al. 2011, "g2o: A general framework for graph optimization", ICRA; Grisetti et al.
+    2007, "A tree parameterization for efficiently computing maximum likelihood maps using gradient
+    descent", RSS (TORO).
+
+    Raises:
+        ValueError: `path:line: reason` for an unknown or malformed line, a vertex that occurs
+            twice, an edge to a missing vertex or from one to itself, an information that is not
+            positive semidefinite, and equal vertices that are missing, or a pose and a point.
+    """
+    return load(path).graph
+
+
 def load(path: str | Path) -> Loaded:
-    """The graph in a file; see `graphs.read`."""
+    """The graph in a file, as of `read_graph`, and the changes made to it."""
     file = TextFile(path)
     vertices: dict[str, dict[int, list[float]]] = {"pose": {}, "point": {}}
     rows: dict[str, list[_Row]] = {}
@@ -146,8 +182,7 @@ def load(path: str | Path) -> Loaded:
     try:
         return Loaded(odometry(graph), skipped, len(graph.poses) + len(graph.points))
     except ValueError as problem:
-        why = str(problem).removeprefix("odometry: ")
-        raise file.end_error(f"no vertices in the file to start from, and {why}") from problem
+        raise file.end_error(f"no vertices in the file to start from: {problem}") from problem
 
 
 def _identity(file: TextFile, line: int, field: str, name: str) -> int:
@@ -287,10 +322,26 @@ def _table(file: TextFile, rows: list[_Row], index: dict[str, dict[int, int]]) -
     return Table(np.array(who, np.int32), z, information, np.ones(len(rows), bool))
 
 
-def save(path: str | Path, graph: Graph) -> None:
-    """Write a graph as a file of g2o, or TORO by the file's ending; see `graphs.write`."""
+def write_graph(path: str | Path, graph: Graph) -> None:
+    """Write a graph as a file that `read_graph` reads as the same graph, number by number.
+
+    The format is g2o; in a file that ends in .toro or .graph it is TORO, which has lines for poses
+    and relative poses. A file that ends in .gz, after that, is packed by gzip.
+
+    Poses, points, the tables in their order, then `FIX`, at which GTSAM's reader stops. Rows that
+    are not valid are left out. A table "name/part" is written as the table "name", and read as
+    part of it.
+
+    Raises:
+        ValueError: before anything is written, on data without a line in the format: in TORO
+            points, fixed poses, and tables other than relative poses; in g2o tables that
+            `read_graph` does not name and points of other than two numbers. In both on an id of
+            both a pose and a point, and on what `read_graph` refuses: ids twice or below zero,
+            numbers that are not finite, and informations that are not symmetric and positive
+            semidefinite.
+    """
     if not isinstance(graph, Graph):
-        raise ValueError(f"write: expected a path and a Graph, got a {type(graph).__name__}")
+        raise ValueError(f"write_graph: expected a path and a Graph, got a {type(graph).__name__}")
     path = Path(path)
     packed = path.suffix == ".gz"
     ending = path.with_suffix("").suffix if packed else path.suffix
@@ -302,7 +353,7 @@ def save(path: str | Path, graph: Graph) -> None:
 
 
 def text_of(graph: Graph, form: Format = _G2O) -> str:
-    """The graph in a format; raises ValueError as `graphs.write` does."""
+    """The graph in a format; raises ValueError as `write_graph` does."""
     _check_writable(graph, form)
     ids = {"pose": np.asarray(graph.pose_id), "point": np.asarray(graph.point_id)}
     values = {"pose": np.asarray(graph.poses), "point": np.asarray(graph.points)}
@@ -328,39 +379,39 @@ def text_of(graph: Graph, form: Format = _G2O) -> str:
 
 
 def _check_readable(graph: Graph) -> None:
-    """Raise ValueError on a graph that `read` refuses."""
+    """Raise ValueError on a graph that `read_graph` refuses."""
     ids = np.concatenate([np.asarray(graph.pose_id), np.asarray(graph.point_id)])
     if (ids < 0).any():
-        raise ValueError(f"graphs.write: expected ids >= 0, got {ids.min()}")
+        raise ValueError(f"write_graph: expected ids >= 0, got {ids.min()}")
     known = {key: REGISTRY[key.split("/")[0]] for key in graph.tables}
-    check_numbers("graphs.write", graph, known)
+    check_numbers("write_graph", graph, known)
 
 
 def _check_writable(graph: Graph, form: Format) -> None:
     """Raise ValueError on a graph that the format cannot represent."""
     if len(both := np.intersect1d(graph.pose_id, graph.point_id)):
         raise ValueError(
-            f"graphs.write: {both[0]} is the id of a pose and of a point, which {form.name} does "
+            f"write_graph: {both[0]} is the id of a pose and of a point, which {form.name} does "
             "not allow"
         )
     if len(graph.points) and "point" not in form.vertices:
         raise ValueError(
-            f"graphs.write: {form.name} has no line for points, and the graph has "
+            f"write_graph: {form.name} has no line for points, and the graph has "
             f"{len(graph.points)}"
         )
     if len(graph.points) and graph.points.shape[1] != 2:
         raise ValueError(
-            f"graphs.write: expected points (x, y), got {graph.points.shape[1]} numbers"
+            f"write_graph: expected points (x, y), got {graph.points.shape[1]} numbers"
         )
     held = np.asarray(graph.pose_id)[np.asarray(graph.fixed_pose)]
     if len(held) and not form.fix:
         raise ValueError(
-            f"graphs.write: {form.name} has no line for fixed poses, and pose {held[0]} is fixed"
+            f"write_graph: {form.name} has no line for fixed poses, and pose {held[0]} is fixed"
         )
     for key in graph.tables:
         if key.split("/")[0] not in form.edges:
             raise ValueError(
-                f"graphs.write: {form.name} has no line for table {key!r}; it has some for "
+                f"write_graph: {form.name} has no line for table {key!r}; it has some for "
                 f"{', '.join(form.edges)}"
             )
 

@@ -18,8 +18,8 @@ from jaxslam.graphs._solver.batch import (
     LEAST,
     cut,
     graph_in_one_dtype,
+    original_number,
     over_batch,
-    own_number,
     padded_graph,
     padded_number,
 )
@@ -89,7 +89,7 @@ def marginals(
         plan = plan_for(caller, more, model.factors, None, marginals=True, pairs=rows, room=room)
         whole: Marginals = _marginals(model, more, plan)
         poses, points, pairs = cut(whole[:3], (graph.poses, graph.points, wanted))
-        found = Marginals(poses, points, pairs, own_number(whole.singular, graph, more))
+        found = Marginals(poses, points, pairs, original_number(whole.singular, graph, more))
     else:
         plan = plan_for(caller, graph, model.factors, plan, marginals=True, pairs=wanted)
         found = _marginals(model, graph, plan)

@@ -18,8 +18,8 @@ from jaxslam.graphs._graph import Graph
 from jaxslam.graphs._solver.batch import (
     cut,
     graph_in_one_dtype,
+    original_number,
     over_batch,
-    own_number,
     padded_graph,
     with_batch,
 )
@@ -198,7 +198,7 @@ def optimize(
     found: Solution = _optimize(model, graph, plan, iterations, tolerance)
     if not fill:
         return found
-    singular = own_number(found.singular, original, graph)
+    singular = original_number(found.singular, original, graph)
     rows = {name: table.valid for name, table in original.tables.items()}
     return found._replace(
         graph=cut(found.graph, original), singular=singular, weights=cut(found.weights, rows)

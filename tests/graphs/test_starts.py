@@ -8,7 +8,7 @@ from reference import graph as plain
 from reference import plane
 from worlds import narrow
 
-from jaxslam import graphs, motion, sensors
+from jaxslam import datasets, graphs, motion, sensors
 from jaxslam.graphs import starts
 
 PLACING = ("odometry", "spanning_tree", "chordal")
@@ -127,7 +127,7 @@ def test_chordal_lies_close_to_the_optimum_of_real_graphs(name, best, share):
     path = DATA / "graphs" / f"{name}.g2o"
     if not path.exists():
         pytest.skip(f"{path} is not there")
-    found = plain.chi2(starts.chordal(graphs.read(path)))
+    found = plain.chi2(starts.chordal(datasets.read_graph(path)))
     assert best < found < share * best
 
 

@@ -50,6 +50,23 @@ class System(NamedTuple):
     """Σ Jᵀ ρ' Ω J; one on the diagonal of fixed variables"""
 
 
+def diagonal_of(plan: Plan, blocks: Float[Array, "M d d *B"]) -> Float[Array, "n d *B"]:
+    """The diagonal of a matrix of the plan's pattern, by column."""
+    diagonal = jnp.diagonal(blocks[plan.cholesky.diagonal], axis1=1, axis2=2)  # (n, B, d)
+    return jnp.moveaxis(diagonal, 2, 1)
+
+
+def dot(a: Float[Array, "n d B"], b: Float[Array, "n d B"]) -> Float[Array, "B"]:
+    """The inner product Σ a b over all variables."""
+    return (a * b).sum(axis=(0, 1))
+
+
+def outer(a: Float[Array, "E K d B"], b: Float[Array, "E K d B"]) -> Float[Array, "E K K d d B"]:
+    """The products a_k b_lᵀ of each two variables k and l of a row."""
+    # a: (E, K, 1, d, 1, B), b: (E, 1, K, 1, d, B)
+    return a[:, :, None, :, None] * b[:, None, :, None]
+
+
 def retract(variables: Variables, increments: Float[Array, "n d B"], plan: Plan) -> Variables:
     """The variables moved by increments."""
     by_variable = increments[plan.column]
@@ -158,9 +175,7 @@ def linearize(model: Model, plan: Plan, variables: Variables, data: Data) -> Sys
         e = jnp.where(valid[:, None], e, 0.0)
         gradient = total(weighted[:, r] * e[:, r, None, None] for r in range(size))
         gradients.append(gradient.reshape(-1, *gradient.shape[2:]))
-        product = total(
-            jacobian[:, r, :, None, :, None] * weighted[:, r, None, :, None, :] for r in range(size)
-        )
+        product = total(outer(jacobian[:, r], weighted[:, r]) for r in range(size))
         blocks.append(product.reshape(rows * len(factor.variables) ** 2, *product.shape[3:]))
     return System(
         total(chi2),

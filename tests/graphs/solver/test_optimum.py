@@ -12,7 +12,7 @@ from reference import graph as plain
 from reference.plane import between, wrap
 from worlds import nothing_compiled
 
-from jaxslam import graphs
+from jaxslam import datasets, graphs
 from jaxslam.graphs import Ending, starts
 from jaxslam.graphs._graph import LOOPS
 
@@ -257,7 +257,7 @@ def test_they_are_gtsams(name, start, best):
     path = DATA / "graphs" / f"{name}.g2o"
     if not path.exists():
         pytest.skip(f"{path} is not there")
-    graph = graphs.with_gauge(graphs.read(path))
+    graph = graphs.with_gauge(datasets.read_graph(path))
     begun = starts.STARTS[start](graph)
     found = graphs.optimize(begun, {"relative_pose": graphs.RelativePoseLog()})
     assert found.status == Ending.CONVERGED
