@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxslam.datasets._lines import TextFile
-from jaxslam.graphs._checks import check_numbers, indefinite
+from jaxslam.graphs._checks import check_numbers, is_indefinite
 from jaxslam.graphs._factor import REGISTRY
 from jaxslam.graphs._graph import Graph, Table
 from jaxslam.graphs.starts import odometry
@@ -26,6 +26,7 @@ class _Edge(NamedTuple):
     """row and column in Ω of each number"""
 
 
+# The order in which the formats write the entries of Ω.
 _BY_ROWS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _TORO_ORDER = ((0, 0), (0, 1), (1, 1), (2, 2), (0, 2), (1, 2))
 _POSE = ("x", "y", "theta")
@@ -59,9 +60,9 @@ class Format(NamedTuple):
 
     name: str
     vertices: dict[str, str]
-    """of "pose" and "point" """
+    """the kind of line of "pose" and "point" """
     edges: dict[str, str]
-    """by table"""
+    """the kind of line of each table"""
     fix: bool
     """whether a variable can be fixed"""
 
@@ -78,6 +79,7 @@ _ENDINGS = {".toro": TORO, ".graph": TORO}
 
 
 _LARGEST = 2**31 - 1
+"""The largest id: ids are int32."""
 
 
 class Loaded(NamedTuple):
@@ -150,7 +152,7 @@ def load(path: str | Path) -> Loaded:
             variable, names = _VERTICES[kind]
             file.expect(line, fields, ("id", *names))
             vertex = _identity(file, line, fields[0], "id")
-            if any(vertex in known for known in vertices.values()):
+            if any(vertex in named for named in vertices.values()):
                 raise file.error(line, f"vertex {vertex} occurs twice")
             vertices[variable][vertex] = file.numbers(line, fields[1:], names)
         elif kind == "FIX":
@@ -161,22 +163,22 @@ def load(path: str | Path) -> Loaded:
             file.expect(line, fields, ("i", "j"))
             equal.append((line, *(_identity(file, line, field, "id") for field in fields)))
         elif kind in _SKIPPED or kind.startswith("#"):
-            what = _SKIPPED.get(kind, "comments")
-            skipped[what] = skipped.get(what, 0) + 1
+            label = _SKIPPED.get(kind, "comments")
+            skipped[label] = skipped.get(label, 0) + 1
         else:
-            known = ", ".join([*_VERTICES, "FIX", "EQUIV", *EDGES])
-            raise file.error(line, f"unknown kind {kind!r}; known: {known}")
+            kinds = ", ".join([*_VERTICES, "FIX", "EQUIV", *EDGES])
+            raise file.error(line, f"unknown kind {kind!r}; known: {kinds}")
     if not rows:
         raise file.end_error("no edge in the file")
     if equal:
-        rows, fixed, merged = _merged(file, vertices, rows, fixed, equal)
+        rows, fixed, merged = _merge(file, vertices, rows, fixed, equal)
         skipped |= merged
         if not rows:
             raise file.end_error("no edge is left: all are within vertices that EQUIV merges")
     unplaced = not any(vertices.values())
     if unplaced:
-        vertices = _named_by_edges(file, rows)
-    graph = _assembled(file, vertices, rows, fixed)
+        vertices = _vertices_of_edges(file, rows)
+    graph = _assemble(file, vertices, rows, fixed)
     if not unplaced:
         return Loaded(graph, skipped, 0)
     try:
@@ -186,14 +188,15 @@ def load(path: str | Path) -> Loaded:
 
 
 def _identity(file: TextFile, line: int, field: str, name: str) -> int:
-    found = file.identity(line, field, name)
-    if found > _LARGEST:
+    """A field as an id; raises ValueError on what is none."""
+    identity = file.identity(line, field, name)
+    if identity > _LARGEST:
         raise file.error(line, f"{name} is above {_LARGEST}: {field}")
-    return found
+    return identity
 
 
 def _row(file: TextFile, line: int, edge: _Edge, fields: list[str]) -> _Row:
-    """The line of an edge; raises ValueError on a malformed one."""
+    """The row of an edge; raises ValueError on a malformed line."""
     names = (*"ij"[: len(edge.who)], *edge.measured, *(f"I{i + 1}{j + 1}" for i, j in edge.entries))
     file.expect(line, fields, names)
     count = len(edge.who)
@@ -203,7 +206,7 @@ def _row(file: TextFile, line: int, edge: _Edge, fields: list[str]) -> _Row:
     return _Row(line, edge, ids, file.numbers(line, fields[count:], names[count:]))
 
 
-def _merged(
+def _merge(
     file: TextFile,
     vertices: dict[str, dict[int, list[float]]],
     rows: dict[str, list[_Row]],
@@ -221,6 +224,7 @@ def _merged(
     parent: dict[int, int] = {}
 
     def smallest(vertex: int) -> int:
+        """The root of a vertex in the union-find forest, whose paths are halved on the way."""
         while (above := parent.get(vertex, vertex)) != vertex:
             parent[vertex] = vertex = parent.get(above, above)
         return vertex
@@ -251,11 +255,11 @@ def _merged(
     return (
         {key: table for key, table in kept.items() if table},
         [(line, smallest(vertex)) for line, vertex in fixed],
-        {what: count for what, count in counts.items() if count},
+        {label: count for label, count in counts.items() if count},
     )
 
 
-def _named_by_edges(
+def _vertices_of_edges(
     file: TextFile, rows: dict[str, list[_Row]]
 ) -> dict[str, dict[int, list[float]]]:
     """The vertices that edges name, at the origin, in the order of their ids."""
@@ -272,7 +276,7 @@ def _named_by_edges(
     }
 
 
-def _assembled(
+def _assemble(
     file: TextFile,
     vertices: dict[str, dict[int, list[float]]],
     rows: dict[str, list[_Row]],
@@ -284,10 +288,10 @@ def _assembled(
     }
     held = {kind: np.zeros(len(named), bool) for kind, named in vertices.items()}
     for line, vertex in fixed:
-        kinds = [kind for kind, known in index.items() if vertex in known]
-        if not kinds:
+        kind = next((kind for kind, named in index.items() if vertex in named), None)
+        if kind is None:
             raise file.error(line, f"vertex {vertex} is not defined in the file")
-        held[kinds[0]][index[kinds[0]][vertex]] = True
+        held[kind][index[kind][vertex]] = True
     return Graph(
         poses=np.array(list(vertices["pose"].values())).reshape(-1, 3),
         points=np.array(list(vertices["point"].values())).reshape(-1, 2),
@@ -306,13 +310,13 @@ def _table(file: TextFile, rows: list[_Row], index: dict[str, dict[int, int]]) -
     for row, matrix in zip(rows, information, strict=True):
         for vertex, kind in zip(row.ids, row.edge.who, strict=True):
             if vertex not in index[kind]:
-                elsewhere = any(vertex in known for known in index.values())
+                elsewhere = any(vertex in named for named in index.values())
                 why = f"is not a {kind}" if elsewhere else "is not defined in the file"
                 raise file.error(row.line, f"vertex {vertex} {why}")
         who.append([index[kind][v] for v, kind in zip(row.ids, row.edge.who, strict=True)])
         for (i, j), entry in zip(row.edge.entries, row.numbers[size:], strict=True):
             matrix[i, j] = matrix[j, i] = entry
-    bad = indefinite(information)
+    bad = is_indefinite(information)
     if bad.any():
         why = "the information is not positive semidefinite"
         if size == 3:
@@ -346,22 +350,27 @@ def write_graph(path: str | Path, graph: Graph) -> None:
     packed = path.suffix == ".gz"
     ending = path.with_suffix("").suffix if packed else path.suffix
     text = text_of(graph, _ENDINGS.get(ending, _G2O))
-    _check_readable(graph)
+    ids = np.concatenate([np.asarray(graph.pose_id), np.asarray(graph.point_id)])
+    if (ids < 0).any():
+        raise ValueError(f"write_graph: expected ids >= 0, got {ids.min()}")
+    factors = {key: REGISTRY[key.split("/")[0]] for key in graph.tables}
+    check_numbers("write_graph", graph, factors)
 
+    # Without the time, so that equal graphs give equal files.
     content = gzip.compress(text.encode("utf-8"), mtime=0) if packed else text
     write_files(path.parent, {path.name: content})
 
 
 def text_of(graph: Graph, form: Format = _G2O) -> str:
-    """The graph in a format; raises ValueError as `write_graph` does."""
+    """The text of a graph in a format; raises ValueError as `write_graph` does."""
     _check_writable(graph, form)
     ids = {"pose": np.asarray(graph.pose_id), "point": np.asarray(graph.point_id)}
     values = {"pose": np.asarray(graph.poses), "point": np.asarray(graph.points)}
     held = {"pose": np.asarray(graph.fixed_pose), "point": np.asarray(graph.fixed_point)}
     lines = [
-        _line(name, [one], row)
+        _line(name, [vertex], row)
         for kind, name in form.vertices.items()
-        for one, row in zip(ids[kind], values[kind], strict=True)
+        for vertex, row in zip(ids[kind], values[kind], strict=True)
     ]
     for key, table in graph.tables.items():
         name = form.edges[key.split("/")[0]]
@@ -374,17 +383,8 @@ def text_of(graph: Graph, form: Format = _G2O) -> str:
         names = np.stack([ids[kind][who[:, k]] for k, kind in enumerate(edge.who)], axis=1)
         lines += [_line(name, *row) for row in zip(names, numbers, strict=True)]
     # Last: GTSAM's readG2o stops at a line that does not begin with two numbers, as `FIX 0` does.
-    lines += [f"FIX {one}" for kind in form.vertices for one in ids[kind][held[kind]]]
+    lines += [f"FIX {vertex}" for kind in form.vertices for vertex in ids[kind][held[kind]]]
     return "\n".join(lines) + "\n"
-
-
-def _check_readable(graph: Graph) -> None:
-    """Raise ValueError on a graph that `read_graph` refuses."""
-    ids = np.concatenate([np.asarray(graph.pose_id), np.asarray(graph.point_id)])
-    if (ids < 0).any():
-        raise ValueError(f"write_graph: expected ids >= 0, got {ids.min()}")
-    known = {key: REGISTRY[key.split("/")[0]] for key in graph.tables}
-    check_numbers("write_graph", graph, known)
 
 
 def _check_writable(graph: Graph, form: Format) -> None:
@@ -417,4 +417,5 @@ def _check_writable(graph: Graph, form: Format) -> None:
 
 
 def _line(kind: str, ids: Sequence[int], numbers: np.ndarray) -> str:
+    """A line of a file; `repr` of a float64 is read as the same number."""
     return " ".join([kind, *map(str, ids), *map(repr, np.asarray(numbers, float).tolist())])

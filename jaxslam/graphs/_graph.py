@@ -30,7 +30,7 @@ class Table(NamedTuple):
     information: Float[JaxOrNumPy, "E R R"]
     """Ω, the inverse of the residual's covariance; symmetric, positive semidefinite"""
     valid: Bool[JaxOrNumPy, "E"]
-    """false for padding, and for rows that are left out"""
+    """False for padding, and for rows that are left out"""
 
     def __repr__(self) -> str:
         return short_repr(self)
@@ -64,8 +64,8 @@ def ranks(graph: Graph) -> Int[np.ndarray, "N"]:
     return np.argsort(np.argsort(np.asarray(graph.pose_id), kind="stable"))
 
 
-def successive(graph: Graph, who: Int[JaxOrNumPy, "E 2"]) -> Bool[np.ndarray, "E"]:
-    """Which rows join poses that follow each other in the order of the ids: the odometry."""
+def is_successive(graph: Graph, who: Int[JaxOrNumPy, "E 2"]) -> Bool[np.ndarray, "E"]:
+    """Whether each row joins poses that follow each other in the order of the ids: odometry."""
     first, second = ranks(graph)[np.asarray(who)].reshape(-1, 2).T
     return np.asarray(np.abs(second - first) == 1)
 
@@ -73,11 +73,11 @@ def successive(graph: Graph, who: Int[JaxOrNumPy, "E 2"]) -> Bool[np.ndarray, "E
 def with_loops_apart(graph: Graph) -> Graph:
     """The graph with its loop edges in the table "relative_pose/loops".
 
-    They are the rows of `relative_pose` between poses that do not follow each other in the order of
-    the ids; those of the odometry stay. The order of poses and rows has no influence.
-    `graphs.optimize(graph, kernel={"relative_pose/loops": graphs.Cauchy()})`
-    then doubts the loops alone. Concrete graphs only; a table without rows is left out. A graph
-    that has a table of loops is returned as it is.
+    Loop edges are the rows of `relative_pose` between poses that do not follow each other in the
+    order of the ids; odometry stays. The order of poses and rows has no influence.
+    `graphs.optimize(graph, kernel={"relative_pose/loops": graphs.Cauchy()})` then doubts the loops
+    alone. Concrete graphs only; a table without rows is left out. A graph that has a table of loops
+    is returned as it is.
     """
     if LOOPS in graph.tables:
         return graph
@@ -86,7 +86,7 @@ def with_loops_apart(graph: Graph) -> Graph:
         if key != "relative_pose":
             tables[key] = table
             continue
-        along = successive(graph, table.who)
+        along = is_successive(graph, table.who)
         for name, rows in ((key, along), (LOOPS, ~along)):
             if rows.any():
                 tables[name] = Table(*(part[rows] for part in table))

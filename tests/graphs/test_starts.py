@@ -49,7 +49,7 @@ def test_a_prior_holds_where_no_pose_is_fixed(name):
 
 def test_given_is_the_graph():
     graph = small_graphs.drawn()
-    assert starts.given(graph) is graph
+    assert starts.identity(graph) is graph
 
 
 def test_odometry_follows_the_path_and_the_tree_the_fewest_edges():

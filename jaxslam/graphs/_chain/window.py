@@ -18,7 +18,6 @@ from jaxslam.core import slots
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.graphs._chain.elimination import (
-    CostToGo,
     Gain,
     LinearizedStep,
     eliminate_steps,
@@ -92,8 +91,8 @@ def linearize_window(
     """
     landmark_points = at.landmarks
     if first:
-        known = prior.joint.alive[:, None]
-        landmark_points = jnp.where(known, prior.points[1], at.landmarks)
+        has_prior = prior.joint.alive[:, None]
+        landmark_points = jnp.where(has_prior, prior.points[1], at.landmarks)
 
     def moved(
         pose: Array, u: Array, root: Array, noise: Array, present: Array
@@ -131,29 +130,27 @@ def solve_window(
     """
     joint, (capacity, size) = prior.joint, at.landmarks.shape
     cost, gains, _ = eliminate_steps(system, capacity)
-    information, y = _join(cost)
-    known = jnp.concatenate([jnp.ones(3, bool), jnp.repeat(joint.alive, size)])
-    new = jnp.concatenate([jnp.zeros(3, bool), jnp.repeat(alive & ~joint.alive, size)])
+    information = jnp.block([[cost.pose, cost.cross], [cost.cross.T, cost.map]])
+    information = linalg.symmetrize(information)
+    y = jnp.concatenate([cost.pose_y, cost.map_y])
+    # Rows of the prior, and of landmarks without one; those of dead slots are of the identity.
+    in_prior = jnp.concatenate([jnp.ones(3, bool), jnp.repeat(joint.alive, size)])
+    is_new = jnp.concatenate([jnp.zeros(3, bool), jnp.repeat(alive & ~joint.alive, size)])
     off = jnp.where(joint.alive[:, None], at.landmarks - joint.landmarks, 0.0)
     error = jnp.concatenate([pose_difference(at.path[0], joint.pose), off.reshape(-1)])
-    cov = jnp.where(known[:, None] & known[None], joint.cov, 0.0)
+    cov = jnp.where(in_prior[:, None] & in_prior[None], joint.cov, 0.0)
     eye = jnp.eye(len(y), dtype=y.dtype)
     matrix = jnp.where(
-        known[:, None], eye + cov @ information, jnp.where(new[:, None], information, eye)
+        in_prior[:, None], eye + cov @ information, jnp.where(is_new[:, None], information, eye)
     )
-    right = jnp.where(known, cov @ y - error, jnp.where(new, y, 0.0))
-    rows = jnp.where(known[:, None], cov, jnp.diag(new.astype(y.dtype)))
+    right = jnp.where(in_prior, cov @ y - error, jnp.where(is_new, y, 0.0))
+    rows = jnp.where(in_prior[:, None], cov, jnp.diag(is_new.astype(y.dtype)))
     delta, of_delta = jnp.linalg.solve(matrix, right), jnp.linalg.solve(matrix, rows)
     landmarks = delta[3:].reshape(capacity, size)
     return _WindowSolution(delta[:3], landmarks, gains, linalg.symmetrize(of_delta))
 
 
-def _join(cost: CostToGo) -> tuple[Float[Array, "D D"], Float[Array, "D"]]:
-    information = jnp.block([[cost.pose, cost.cross], [cost.cross.T, cost.map]])
-    return linalg.symmetrize(information), jnp.concatenate([cost.pose_y, cost.map_y])
-
-
-def moved_by(
+def step_window(
     motion: Motion, steps: WindowSteps, at: WindowIterate, solved: _WindowSolution
 ) -> WindowIterate:
     """The iterate after the Gauss-Newton step, by the nonlinear models (see `problem.roll_out`)."""
@@ -218,8 +215,8 @@ def marginalize_oldest(
     scan, and new landmarks l = l̂ + B⁻¹ (b - A (x_1 - x̂_1) - v). They and x_1 get their points
     here. tag: of the map's slots. The prior itself if there is no first step.
     """
-    one = jax.tree.map(lambda leaf: leaf[0], (system, steps))
-    step, (present, _, _, _, slot, used) = one
+    step, oldest = jax.tree.map(lambda leaf: leaf[0], (system, steps))
+    present, slot, used = oldest.present, oldest.slot, oldest.used
     joint, (capacity, size) = prior.joint, at.landmarks.shape
     # Prediction: x_1 = x̂_1 + F (x_0 - x̂_0) + G (η - η̄).
     mean = step.by_pose @ pose_difference(joint.pose, at.path[0]) - step.by_noise @ step.noise
@@ -228,11 +225,12 @@ def marginalize_oldest(
     corner = rows[:, :3] @ step.by_pose.T + step.by_noise @ step.by_noise.T
     cov = cov.at[:3, :3].set(linalg.symmetrize(corner))
     # Correction: b = A (x_1 - x̂_1) + B (l - l̂) + v.
-    known = used & joint.alive[slot]
+    seen_before = used & joint.alive[slot]
     a, b, r = (
-        jnp.where(known.reshape(-1, *[1] * (part.ndim - 1)), part, 0.0)
+        jnp.where(seen_before.reshape(-1, *[1] * (part.ndim - 1)), part, 0.0)
         for part in (step.pose_rows, step.landmark_rows, step.residual)
     )
+    # B of the whole map: (M, Z, N, L) to (M Z, N L).
     wide = jnp.zeros((*b.shape[:2], capacity, size), b.dtype)
     by_map = wide.at[jnp.arange(len(slot)), :, slot].set(b).reshape(r.size, -1)
     jacobian = jnp.concatenate([a.reshape(r.size, 3), by_map], axis=1)

@@ -42,14 +42,14 @@ class BatchSolution(NamedTuple):
     start_noise: Float[Array, "3"]
     """ξ, the start's error in standard deviations: start = pose + P0^{1/2} ξ"""
     noise: Float[Array, "T W"]
-    """η, the same of the motions: w = Q^{1/2} η"""
+    """η, the noises of the motions in standard deviations: w = Q^{1/2} η"""
     cost: Float[Array, ""]
     """½ Σ of the squared, whitened residuals"""
     costs: Float[Array, "iterations"]
-    """after each step, that of the last repeated, falling where R is constant; infinite where
-    not even the first, to the smoother's path, has a finite cost"""
+    """cost after each step, the last one repeated; it falls where R is constant, and is infinite
+    where not even the first step, to the smoother's path, has a finite cost"""
     iterations: Int[Array, ""]
-    """steps taken"""
+    """steps made"""
     step: Float[Array, ""]
     """length of the next step, in posterior standard deviations"""
     ending: Int[Array, ""]
@@ -136,7 +136,7 @@ def _problem_of(
     pose: ArrayLike,
     pose_cov: ArrayLike,
 ) -> tuple[Problem, Iterate, Chain]:
-    """The problem of a log, and the initial iterate: the filter's path and its chain."""
+    """The problem of a log, and the initial iterate: the filter's path, with its chain."""
     kind = log.control.dtype
     mean, cov = jnp.asarray(pose, kind), jnp.asarray(pose_cov, kind)
     # The optimum does not depend on the initial iterate, so it has no derivative by it.
@@ -154,17 +154,18 @@ def _problem_of(
 def _solve(
     sensor: Sensor, search: Iterations, passed: ForwardPass
 ) -> tuple[Estimate, BatchSolution]:
-    """The estimates at the end of a search."""
+    """The estimates at the end of a search, and the `final` of the trace."""
     at, policy = search.at, search.policy
     joint = jax.lax.stop_gradient(passed.trace.final)._replace(landmarks=at.landmarks)
-    # The last step computed is shorter than the tolerance, and is not taken.
+    # The last step computed is shorter than the tolerance, and is not made.
     no_step = policy._replace(
         start=policy.start._replace(constant=jnp.zeros_like(at.start)),
         steps=policy.steps._replace(constant=jnp.zeros_like(at.noise)),
         landmarks=jnp.zeros_like(at.landmarks),
     )
-    left = policy.decrement > 0
-    step = jnp.sqrt(jnp.where(left, policy.decrement, 1.0))
+    # Gradients are finite where the decrement is zero, whose root has none.
+    positive = policy.decrement > 0
+    step = jnp.sqrt(jnp.where(positive, policy.decrement, 1.0))
     estimate, smoothed = solution(sensor, search.chain, no_step, at.path, joint, passed)
     solved = BatchSolution(
         *smoothed,
@@ -172,8 +173,8 @@ def _solve(
         noise=at.noise,
         cost=search.cost,
         costs=search.costs,
-        iterations=search.taken,
-        step=jnp.where(left, step, 0.0),
+        iterations=search.count,
+        step=jnp.where(positive, step, 0.0),
         ending=search.ending,
     )
     return estimate, solved
