@@ -126,7 +126,7 @@ def _step(
 ) -> tuple[Float[Array, "K P"], tuple[Float[Array, "K"], Int[Array, ""]]]:
     """The derivative of the whitened innovations, these, and their degrees of freedom."""
 
-    def whitened(
+    def whiten(
         p: Float[Array, "P"],
     ) -> tuple[Float[Array, "K"], tuple[Float[Array, "K"], Int[Array, ""]]]:
         """The whitened innovations, twice (one for `jacfwd`), and their degrees of freedom."""
@@ -148,7 +148,7 @@ def _step(
         w = jax.vmap(linalg.solve_lower)(factor, residual).reshape(-1)
         return w, (w, jnp.where(fused, run.dof, 0).sum())
 
-    derivative: tuple[Array, tuple[Array, Array]] = jax.jacfwd(whitened, has_aux=True)(p)
+    derivative: tuple[Array, tuple[Array, Array]] = jax.jacfwd(whiten, has_aux=True)(p)
     return derivative
 
 
@@ -201,11 +201,11 @@ def consider_cov(
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((jacobians, values))):
         raise ValueError(f"consider_cov: the result or its derivatives at {p} are not finite")
 
-    def added(jacobian: np.ndarray) -> np.ndarray:
+    def propagate(jacobian: np.ndarray) -> np.ndarray:
         jacobian = np.asarray(jacobian, np.float64)
         return np.asarray(jacobian @ c @ np.swapaxes(jacobian, -1, -2))
 
-    return jax.tree.map(added, jacobians)
+    return jax.tree.map(propagate, jacobians)
 
 
 @partial(jax.jit, inline=True)

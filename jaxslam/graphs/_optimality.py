@@ -33,7 +33,7 @@ from jaxslam.graphs._solver.model import Model, model_of
 from jaxslam.graphs._solver.plans import Plan, plan_for
 from jaxslam.graphs._solver.search import minimize
 from jaxslam.graphs._sparse.cholesky import factorize, substitute
-from jaxslam.graphs._sparse.sweeps import summed
+from jaxslam.graphs._sparse.sweeps import sum_rows
 from jaxslam.math._linalg import total
 
 
@@ -80,7 +80,7 @@ def dual(
 ) -> tuple[Float[Array, "M 4 4 B"], Float[Array, "N B"], Float[Array, "M 4 4 1"]]:
     """The dual matrix M - Λ of the chordal cost at some variables, of graphs with a last axis B.
 
-    Of a pose v = (x, y, u), u = (cos θ, sin θ), of a point v = (x, y). The chordal cost is
+    A pose has v = (x, y, u) with u = (cos θ, sin θ), a point v = (x, y). The chordal cost is
 
         vᵀ M v = Σ w (Σ_k J_k v_k)²,    M_kl = Σ J_kᵀ w J_l
 
@@ -89,11 +89,11 @@ def dual(
 
         Λ_ii = diag(0, 0, λ_i, λ_i),    λ_i = u_i · (M v)_i
 
-    The position of the held pose, and the last two of the four numbers of a point, which it does
-    not have, have the rows and columns of the identity.
+    Rows and columns of the position of the held pose, and of the two numbers of four that a point
+    does not have, are those of the identity.
 
     Returns:
-        The blocks of M - Λ at their places in the plan; λ; and those of Λ for λ = 1.
+        The blocks of M - Λ at their places in the plan; λ; the blocks of Λ for λ = 1.
     """
     poses, dtype = len(variables.poses), variables.poses.dtype
     count, batch = len(plan.order), variables.poses.shape[-1]
@@ -133,7 +133,7 @@ def dual(
         )
         # (E, K, K, 4, 4, B): a block for each two variables of a row.
         blocks.append(product.reshape(rows * size_k * size_k, 4, 4, batch))
-    m_v = summed(plan.gradient, jnp.concatenate(gradients))[plan.column]
+    m_v = sum_rows(plan.gradient, jnp.concatenate(gradients))[plan.column]
     multipliers = (m_v[:poses, 2:] * v[:poses, 2:]).sum(axis=1)
     by_variable = jnp.concatenate([multipliers, jnp.zeros((count - poses, batch), dtype)])
     # The blocks of Λ for λ = 1: diag(0, 0, 1, 1) on the diagonal where the column is a pose.
@@ -142,7 +142,7 @@ def dual(
     on_diagonal = plan.on_diagonal[:, None, None, None]
     of_pose = is_pose[plan.order][plan.block_column][:, None, None, None]
     unit_lambda = jnp.where(on_diagonal & of_pose, unit_of_u, 0.0)
-    m = summed(plan.information, jnp.concatenate(blocks))
+    m = sum_rows(plan.information, jnp.concatenate(blocks))
     m = m + jnp.where(on_diagonal & ~free[plan.block_column][:, None], unit, 0.0)
     by_block = by_variable[plan.order][plan.block_column][:, None, None]
     return m - unit_lambda * by_block, multipliers, unit_lambda
@@ -325,7 +325,9 @@ def _proved_shift(
         shift, proved, count = carry
         shift = jnp.where(proved, shift, 10 * shift)
         # A pivot with an error below a thirtieth of itself is positive.
-        factored = factorize(plan.cholesky, _shifted(blocks, unit_lambda, shift), uncertain=1 / 32)
+        factored = factorize(
+            plan.cholesky, _shift_diagonal(blocks, unit_lambda, shift), uncertain=1 / 32
+        )
         return shift, factored.regular.all(axis=0), count + 1
 
     shift, proved, _ = jax.lax.while_loop(
@@ -347,7 +349,7 @@ def _smallest_eigenvalue(
     With P the selection of u and S the Schur complement of the positions,
     (S + η)⁻¹ = P (M - Λ + η P)⁻¹ P, whose largest eigenvalue is 1/(μ + η).
     """
-    factored = factorize(plan.cholesky, _shifted(blocks, unit_lambda, shift))
+    factored = factorize(plan.cholesky, _shift_diagonal(blocks, unit_lambda, shift))
     of_u = diagonal_of(plan, unit_lambda)  # (n, 4, 1), the diagonal of P
 
     def power(i: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
@@ -367,7 +369,7 @@ def _smallest_eigenvalue(
     return smallest
 
 
-def _shifted(
+def _shift_diagonal(
     blocks: Float[Array, "M 4 4 B"], unit_lambda: Float[Array, "M 4 4 1"], shift: Float[Array, "B"]
 ) -> Float[Array, "M 4 4 B"]:
     """The blocks of M - Λ + η, with η on the diagonal of u."""

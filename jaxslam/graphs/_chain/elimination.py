@@ -183,14 +183,14 @@ def eliminate_steps(
         after, gain, gained = _eliminate_noise(after, step.by_noise, step.noise)
         return (_by_pose_before(after, step), decrement + gained), gain
 
-    nothing = CostToGo(
+    no_cost = CostToGo(
         pose=jnp.zeros((3, 3), kind),
         cross=jnp.zeros((3, wide), kind),
         map=jnp.zeros((wide, wide), kind),
         pose_y=jnp.zeros(3, kind),
         map_y=jnp.zeros(wide, kind),
     )
-    end = nothing, jnp.zeros((), kind)
+    end = no_cost, jnp.zeros((), kind)
     (to_go, decrement), gains = jax.lax.scan(back, end, steps, reverse=True)
     return to_go, gains, decrement
 

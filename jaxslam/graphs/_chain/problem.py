@@ -83,19 +83,23 @@ def _linearize_at(motion: Motion, sensor: Sensor, problem: Problem, at: Iterate)
     """
     spare = max(0, len(sensor.landmark) - len(sensor.measurements))
 
-    def moved(pose: Array, u: Array, root: Array, noise: Array) -> tuple[Array, Array]:
+    def linearize_motion(pose: Array, u: Array, root: Array, noise: Array) -> tuple[Array, Array]:
         by_pose, by_noise = jax.jacfwd(motion.step, argnums=(0, 2))(pose, u, root @ noise)
         return by_pose, by_noise @ root
 
-    by_pose, by_noise = jax.vmap(moved)(at.path[:-1], problem.control, problem.roots, at.noise)
+    by_pose, by_noise = jax.vmap(linearize_motion)(
+        at.path[:-1], problem.control, problem.roots, at.noise
+    )
 
-    def measured(z: Array, slot: Array, used: Array, pose: Array) -> tuple[Array, Array, Array]:
+    def linearize_measurement(
+        z: Array, slot: Array, used: Array, pose: Array
+    ) -> tuple[Array, Array, Array]:
         *rows, positive = whitened_rows(sensor, z, pose, at.landmarks[slot], used)
         rows = [jnp.where(used & positive, row, 0.0) for row in rows]
         a, b, r = (jnp.pad(row, [(0, spare)] + [(0, 0)] * (row.ndim - 1)) for row in rows)
         return a, b, r
 
-    over_slots = jax.vmap(measured, (0, 0, 0, None))
+    over_slots = jax.vmap(linearize_measurement, (0, 0, 0, None))
     a, b, r = jax.vmap(over_slots)(problem.z, problem.slot, problem.used, at.path[1:])
     no_drift = jnp.zeros_like(at.path[1:])
     steps = LinearizedStep(by_pose, by_noise, no_drift, at.noise, problem.slot, a, b, r)

@@ -94,14 +94,16 @@ def linearize_window(
         has_prior = prior.joint.alive[:, None]
         landmark_points = jnp.where(has_prior, prior.points[1], at.landmarks)
 
-    def moved(
+    def linearize_motion(
         pose: Array, u: Array, root: Array, noise: Array, present: Array
     ) -> tuple[Array, Array]:
         by_pose, by_noise = jax.jacfwd(motion.step, argnums=(0, 2))(pose, u, root @ noise)
         by_pose = jnp.where(present, by_pose, jnp.eye(3, dtype=pose.dtype))
         return by_pose, jnp.where(present, by_noise @ root, 0.0)
 
-    def measured(z: Array, slot: Array, used: Array, pose: Array) -> tuple[Array, Array, Array]:
+    def linearize_measurement(
+        z: Array, slot: Array, used: Array, pose: Array
+    ) -> tuple[Array, Array, Array]:
         *rows, positive = whitened_rows(
             sensor, z, pose, at.landmarks[slot], used, landmark_points[slot]
         )
@@ -109,11 +111,11 @@ def linearize_window(
         return a, b, r
 
     data = steps.control, steps.root, at.noise, steps.present
-    by_pose, by_noise = jax.vmap(moved)(at.path[:-1], *data)
+    by_pose, by_noise = jax.vmap(linearize_motion)(at.path[:-1], *data)
     if first:
         offset = jnp.where(steps.present[0], at.path[0, :2] - prior.points[0][:2], 0.0)
         by_pose = by_pose.at[0].set(with_lever_arm(by_pose[0], offset))
-    over_slots = jax.vmap(measured, (0, 0, 0, None))
+    over_slots = jax.vmap(linearize_measurement, (0, 0, 0, None))
     a, b, r = jax.vmap(over_slots)(steps.z, steps.slot, steps.used, at.path[1:])
     no_drift = jnp.zeros_like(at.path[1:])
     return LinearizedStep(by_pose, by_noise, no_drift, at.noise, steps.slot, a, b, r)
@@ -267,7 +269,5 @@ def marginalize_oldest(
     )
     points = at.path[1], jnp.where(joint.alive[:, None], prior.points[1], at.landmarks)
     moved = WindowPrior(after, points)
-    chosen: WindowPrior = jax.tree.map(
-        lambda then, now: jnp.where(present, then, now), moved, prior
-    )
+    chosen: WindowPrior = jax.tree.map(lambda a, b: jnp.where(present, a, b), moved, prior)
     return chosen

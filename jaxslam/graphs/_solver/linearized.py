@@ -17,7 +17,7 @@ from jaxslam.graphs._graph import Graph
 from jaxslam.graphs._solver.kernels import Kernel
 from jaxslam.graphs._solver.model import Model
 from jaxslam.graphs._solver.plans import Plan
-from jaxslam.graphs._sparse.sweeps import summed
+from jaxslam.graphs._sparse.sweeps import sum_rows
 from jaxslam.math import se2
 from jaxslam.math._linalg import total
 from jaxslam.math.angles import sin_cos
@@ -91,7 +91,7 @@ def _over_rows(function: Callable[..., PyTree], *arguments: PyTree) -> PyTree:
     return jax.vmap(jax.vmap(function, -1, -1))(*arguments)
 
 
-def squared(information: Float[Array, "E R R B"], e: Float[Array, "E R B"]) -> Float[Array, "E B"]:
+def squares(information: Float[Array, "E R R B"], e: Float[Array, "E R B"]) -> Float[Array, "E B"]:
     """The squared residual s = eᵀ Ω e of each row."""
     size = e.shape[1]
     return total(e[:, i] * information[:, i, j] * e[:, j] for i in range(size) for j in range(size))
@@ -102,7 +102,7 @@ def row_costs(
 ) -> tuple[Float[Array, "E R B"], Float[Array, "E B"], Float[Array, "E B"]]:
     """Residuals, squared residuals s, and costs ρ(s) of the rows of a table."""
     e = _over_rows(factor.residual, _select(factor, who, variables), z)
-    s = squared(info, e)
+    s = squares(info, e)
     return e, s, s if kernel is None else kernel.cost(s)
 
 
@@ -161,7 +161,7 @@ def linearize(model: Model, plan: Plan, variables: Variables, data: Data) -> Sys
     for name, factor in model.factors.items():
         e, jacobian = _jacobians(factor, plan.who[name], variables, data.z[name], width)
         info, valid = data.information[name], data.valid[name]
-        s, kernel = squared(info, e), model.kernels.get(name)
+        s, kernel = squares(info, e), model.kernels.get(name)
         chi2.append(jnp.where(valid, s if kernel is None else kernel.cost(s), 0.0).sum(axis=0))
         weight = 1.0 if kernel is None else kernel.weight(s)
         info = info * jnp.where(valid, weight, 0.0)[:, None, None]
@@ -178,14 +178,14 @@ def linearize(model: Model, plan: Plan, variables: Variables, data: Data) -> Sys
         blocks.append(product.reshape(rows * len(factor.variables) ** 2, *product.shape[3:]))
     return System(
         total(chi2),
-        summed(plan.gradient, jnp.concatenate(gradients)),
+        sum_rows(plan.gradient, jnp.concatenate(gradients)),
         _assemble(plan, blocks, data),
     )
 
 
 def _assemble(plan: Plan, blocks: list[Array], data: Data) -> Float[Array, "M d d B"]:
     """The blocks of the matrix, from those of the rows of each table, (E K K, d, d, B)."""
-    matrix = summed(plan.information, jnp.concatenate(blocks))
+    matrix = sum_rows(plan.information, jnp.concatenate(blocks))
     held = plan.on_diagonal[:, None, None] & ~data.free[plan.block_column]
     unit = jnp.eye(matrix.shape[1], dtype=matrix.dtype)[None, ..., None]
     return matrix + jnp.where(held[:, None], unit, 0.0)

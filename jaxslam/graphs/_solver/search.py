@@ -304,7 +304,9 @@ def _damping_after(
 def _propose(problem: _Problem, search: _Search) -> _Search:
     """The search with its next trial, or at its end.
 
-    Besides the endings of `_ending_of`, λ above its maximum is a stall.
+    A damped step that is small does not prove that the search has converged: the factor is that of
+    H + λD. The next one is undamped. Besides the endings of `_ending_of`, λ above its maximum is a
+    stall.
     """
     plan, tolerance = problem.plan, problem.tolerance
     undamped = search.damping == 0
@@ -326,8 +328,8 @@ def _propose(problem: _Problem, search: _Search) -> _Search:
         refused=search.undamped_refused,
         decrease=step.decrease,
     )
-    # No step, only another λ: a higher one where the factor failed, none where a damped step is
-    # small and an undamped factor has to confirm that the search has converged.
+    # Where the factor failed, or has to confirm that the search has converged, there is no step but
+    # only another λ.
     higher = jnp.maximum(_FACTOR * search.damping, _FIRST_DAMPING)
     damping = jnp.where(regular, search.damping, higher)
     to_confirm = regular & small & ~undamped & ~ends
@@ -359,17 +361,17 @@ def _ending_of(
 
     The step is blocked if the undamped one was refused, or if it predicts no decrease.
 
-    | small | undamped | singular | again | blocked                | the search        |
-    |-------|----------|----------|-------|------------------------|-------------------|
-    | no    |          |          |       |                        | goes on           |
-    | yes   | yes      | no       |       | no, or a decrease of 0 | ends: CONVERGED   |
-    | yes   | yes      | no       |       | else                   | ends: STALLED     |
-    | yes   | yes      | yes      |       |                        | ends: SINGULAR    |
-    | yes   | no       | no       |       | yes                    | ends: STALLED     |
-    | yes   | no       | no       |       | no                     | goes on, undamped |
-    | yes   | no       | yes      | no    | no                     | goes on, undamped |
-    | yes   | no       | yes      | yes   |                        | ends: SINGULAR    |
-    | yes   | no       | yes      |       | yes                    | ends: SINGULAR    |
+    | small | undamped | singular | again | blocked                | the search      |
+    |-------|----------|----------|-------|------------------------|-----------------|
+    | no    |          |          |       |                        | goes on         |
+    | yes   | yes      | no       |       | no, or a decrease of 0 | ends: CONVERGED |
+    | yes   | yes      | no       |       | else                   | ends: STALLED   |
+    | yes   | yes      | yes      |       |                        | ends: SINGULAR  |
+    | yes   | no       | no       |       | no                     | goes on         |
+    | yes   | no       | no       |       | yes                    | ends: STALLED   |
+    | yes   | no       | yes      | no    | no                     | goes on         |
+    | yes   | no       | yes      | no    | yes                    | ends: SINGULAR  |
+    | yes   | no       | yes      | yes   |                        | ends: SINGULAR  |
 
     Args:
         small: the step predicts a decrease of χ² below the tolerance or below rounding.

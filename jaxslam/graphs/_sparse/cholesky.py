@@ -19,8 +19,8 @@ from jaxslam.graphs._sparse.sweeps import (
     finish,
     index_table,
     level_table,
-    nothing,
-    padded,
+    no_place,
+    pad_targets,
     padded_size,
     padded_table_size,
     places,
@@ -62,7 +62,7 @@ class Factored(NamedTuple):
 
 def cholesky_tables(pattern: Pattern, room: int = 0) -> tuple[CholeskyTables, Ints]:
     """The tables of a pattern, with room for more variables, and the place of each block in
-    `Factored.blocks` (M+1,); the last is the place of no block, `nothing`."""
+    `Factored.blocks` (M+1,); the last is the place of no block, `no_place`."""
     size, heights, columns, rows = (
         len(pattern.order),
         pattern.heights,
@@ -78,7 +78,7 @@ def cholesky_tables(pattern: Pattern, room: int = 0) -> tuple[CholeskyTables, In
         target.append(pattern.find(rows[left[-1]], rows[right[-1]]))
     sums = Sums(heights[columns], *map(np.concatenate, (target, left, right)))
     _, place = places(sums, block_count(pattern, room))
-    column_place = np.append(np.arange(size), nothing(size))
+    column_place = np.append(np.arange(size), no_place(size))
     factor = sweep(sums, place, place, column_place[np.append(columns, size)], room)
     # Columns are sorted by height: those of a level lie side by side.
     first = np.searchsorted(heights, np.arange(heights[-1] + 2)).tolist()
@@ -154,11 +154,11 @@ def factorize(
     entries = jnp.diagonal(blocks[tables.diagonal], axis1=1, axis2=2)  # (n, B, d)
     entries = jnp.moveaxis(entries, 2, 1)
     # A chunk of TARGETS columns may begin at the last one, hence the rows beyond n. The last
-    # inverse is the identity, which leaves a target of no column as it is (`sweeps.nothing`).
+    # inverse is the identity, which leaves a target of no column as it is (`sweeps.no_place`).
     least = jnp.pad(_PIVOT_ROUNDING * eps * entries, [(0, TARGETS), (0, 0), (0, 0)])
     identity = jnp.eye(width, dtype=blocks.dtype)[..., None]
     identity = jnp.broadcast_to(identity, blocks.shape[1:])
-    inverses = padded(jnp.zeros((size, *blocks.shape[1:]), blocks.dtype)).at[-1].set(identity)
+    inverses = pad_targets(jnp.zeros((size, *blocks.shape[1:]), blocks.dtype)).at[-1].set(identity)
     regular = jnp.ones((size + TARGETS, blocks.shape[-1]), bool)
     diagonal = jnp.pad(tables.diagonal, (0, TARGETS))
 
@@ -183,7 +183,9 @@ def factorize(
         )
         return finish(tables.factor, i, blocks, inverses, by_transposed), inverses, regular
 
-    state = jax.lax.fori_loop(0, tables.factor.levels, level, (padded(blocks), inverses, regular))
+    state = jax.lax.fori_loop(
+        0, tables.factor.levels, level, (pad_targets(blocks), inverses, regular)
+    )
     factored = Factored(state[0], state[1], state[2][:size])
     if _PIVOT_ROUNDING * eps > _SMALL:  # float32: no regular pivot is below _SMALL
         return factored
@@ -255,7 +257,7 @@ def _roundings(
         return finish(tables.forward, i, t, diagonal_squares, within)
 
     order = tables.forward_order
-    solved = jax.lax.fori_loop(0, tables.forward.levels, level, padded(entries[order]))
+    solved = jax.lax.fori_loop(0, tables.forward.levels, level, pad_targets(entries[order]))
     return jnp.zeros_like(entries).at[order].set(solved[: len(order)], unique_indices=True)
 
 
@@ -306,7 +308,7 @@ def substitute(
                 lambda x, a: product(a, x),  # noqa: B023
             )
 
-        solved = jax.lax.fori_loop(0, direction.levels, level, padded(x[order]))
+        solved = jax.lax.fori_loop(0, direction.levels, level, pad_targets(x[order]))
         x = jnp.zeros_like(rhs).at[order].set(solved[: len(order)], unique_indices=True)
     return x
 
@@ -333,7 +335,7 @@ def inverse_tables(
     size = len(pattern.order)
     sums = _inverse_sums(pattern)
     _, place = places(sums, block_count(pattern, room))
-    end = np.append(pattern.columns, nothing(size))
+    end = np.append(pattern.columns, no_place(size))
     i, j = pattern.position[first], pattern.position[second]
     pairs = place[pattern.find(np.maximum(i, j), np.minimum(i, j))]
     return InverseTables(

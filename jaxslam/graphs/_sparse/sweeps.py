@@ -111,17 +111,17 @@ def places(sums: Sums, size: int) -> tuple[Ints, Ints]:
     order = np.lexsort((-count, sums.level))
     place = np.empty(len(order) + 1, int)
     place[order] = np.arange(len(order))
-    place[-1] = nothing(size)
+    place[-1] = no_place(size)
     return order, place
 
 
-def nothing(size: int) -> int:
+def no_place(size: int) -> int:
     """The place in an array of targets that is always zero (or the identity)."""
     return size + TARGETS
 
 
-def padded(array: jax.Array) -> jax.Array:
-    """The array (M, …) with zeros for the overhang of the last chunk, and at `nothing`."""
+def pad_targets(array: jax.Array) -> jax.Array:
+    """The array (M, …) with zeros for the overhang of the last chunk, and at `no_place`."""
     return jnp.pad(array, [(0, TARGETS + 1)] + [(0, 0)] * (array.ndim - 1))
 
 
@@ -271,7 +271,7 @@ def stages(target: Int[np.ndarray, "rows"], size: int, room: int = 0) -> Stages:
         numbers, absent = np.arange(len(owner)), rows
 
 
-def summed(stages: Stages, rows: Float[Array, "rows *rest"]) -> Float[Array, "size *rest"]:
+def sum_rows(stages: Stages, rows: Float[Array, "rows *rest"]) -> Float[Array, "size *rest"]:
     """The sums of the rows of each target; zero where it has none."""
     for sums in stages:
         terms = rows.at[sums].get(mode="fill", fill_value=0)
