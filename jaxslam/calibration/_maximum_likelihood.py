@@ -114,7 +114,7 @@ def _observed_information(
 def _upper_limit(
     evaluate: Callable[[np.ndarray], _LikelihoodPoint], point: _LikelihoodPoint, i: int
 ) -> float:
-    """The deviation, above that of parameter i, at which log L is lower by `_BOUND`; to 2 %."""
+    """The deviation i, above its estimate, at which log L is lower by `_BOUND`; to 2 %."""
     unit, low, high = np.eye(len(point.q))[i], 0.0, np.log(2.0)
     while evaluate(point.q + high * unit).value > point.value - _BOUND and high < 20:
         low, high = high, high + np.log(2.0)
@@ -172,7 +172,7 @@ _HALVINGS = 8
 
 
 class NoiseFit(NamedTuple):
-    """The parameters that `fit_noise` found, and what they rest on."""
+    """The result of `fit_noise`: parameters, their errors, and the likelihood."""
 
     names: tuple[str, ...]
     start: Float[np.ndarray, "P"]
@@ -218,7 +218,7 @@ def fit_noise(
 
     Fisher scoring in the coordinates q = log p of standard deviations and q = p of others, then
     Newton's steps. The gradient is exact, from one run in forward mode, which also gives the
-    expected information Σ ∂νᵀS⁻¹∂ν + ½ tr(S⁻¹∂S S⁻¹∂S), that of a scan being the sum over its
+    expected information Σ ∂νᵀS⁻¹∂ν + ½ tr(S⁻¹∂S S⁻¹∂S), for a scan the sum over its
     measurements. The observed information H = -∂²log L/∂q² comes from central differences of the
     gradient. Maximum likelihood by the prediction-error decomposition: Schweppe, IEEE Trans.
     Information Theory 11(1), 1965; scoring: Harvey, "Forecasting, structural time series models

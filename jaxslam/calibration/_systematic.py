@@ -19,7 +19,7 @@ from jaxslam.math._definite import asymmetric, indefinite
 
 
 class Calibration(NamedTuple):
-    """The parameters that `calibrate` found, their covariance, and its iterates."""
+    """The result of `calibrate`: parameters, their covariance, and the iterates."""
 
     parameters: Float[np.ndarray, "P"]
     cov: Float[np.ndarray, "P P"]
@@ -56,8 +56,8 @@ def calibrate(
     with `association.Nearest` and `life.Recency(patience=…)` keeps a local map, in which landmarks
     seen close in time are associated whatever the drift, and no loop is closed.
 
-    Each measurement of a scan is whitened by its S; the correlation between those of one joint
-    update is ignored, which costs a little precision.
+    Each measurement of a scan is whitened by its S; the correlation between the measurements of
+    one joint update is ignored, which costs a little precision.
 
     Args:
         info: p (P,) -> the `Info` of a run, `lambda p: jaxslam.run(…).info`, where p may enter the
@@ -231,7 +231,7 @@ def _differentiate(
 
 
 def _covariance(cov: ArrayLike, size: int) -> Float[np.ndarray, "P P"]:
-    """A covariance of so many parameters; raises ValueError on what is none, in any units."""
+    """The covariance of so many parameters, as an array; raises ValueError on an invalid one."""
     c = np.asarray(cov, np.float64)
     c = c.reshape(1, 1) if c.ndim == 0 and size == 1 else c
     if c.shape != (size, size):

@@ -188,7 +188,7 @@ def load(path: str | Path) -> Loaded:
 
 
 def _identity(file: TextFile, line: int, field: str, name: str) -> int:
-    """A field as an id; raises ValueError on what is none."""
+    """A field as an id; raises ValueError on another text, and on one above `_LARGEST`."""
     identity = file.identity(line, field, name)
     if identity > _LARGEST:
         raise file.error(line, f"{name} is above {_LARGEST}: {field}")

@@ -35,7 +35,7 @@ class Marginals(NamedTuple):
     """Covariances of a graph's variables, zero for fixed ones; leading axes by `vmap`."""
 
     poses: Float[Array, "N 3 3"]
-    """of (x, y, θ), in world coordinates as the poses themselves"""
+    """covariance of (x, y, θ), in world coordinates like the poses"""
     points: Float[Array, "P L L"]
     pairs: Float[Array, "Q 2 2 d d"]
     """the joint covariance of each pair by its two variables, d = max(3, L); rows and columns that
@@ -55,9 +55,9 @@ def marginals(
 ) -> Marginals:
     """The covariances (Σ Jᵀ ρ' Ω J)⁻¹ of all poses and points of a graph, and of pairs of them.
 
-    J and the weights ρ' of robust kernels are those of the solution: a row that a kernel leaves out
-    does not count. The inverse is computed where the Cholesky factor has blocks (`sparse.inverse`),
-    and at the pairs.
+    J and the weights ρ' of robust kernels are taken from the solution: a row that a kernel leaves
+    out does not count. The inverse is computed where the Cholesky factor has blocks
+    (`selected_inverse`), and at the pairs.
 
     Args:
         solution: of `optimize`. Outside of a trace its graph is checked. Of a graph as it is:

@@ -26,7 +26,7 @@ class Chordal(NamedTuple):
     residual: Callable[[tuple[Array, ...], Array], Array]
     """(variables, z) -> r (S,), on one row"""
     size: int
-    """S: two of the position, then those of the heading"""
+    """S: two residuals of the position, then two or none of the heading"""
     rows: Callable[[Array], Rows] | None
     """(z) -> ∂r/∂(p, u) of each variable; None of a prior, which is left out of the cost"""
 
@@ -83,7 +83,7 @@ class Factor(Component):
     variables: tuple[str, ...]
     """the kind of each variable, "pose" or "point", in the order of `Table.who`; its length is K"""
     measurements: tuple[str, ...]
-    """what z holds, with units; its length is Z"""
+    """the entries of z, with units; its length is Z"""
     errors: tuple[str, ...]
     """the entries of the residual, with units; its length is R"""
     jacobians: Any = None
@@ -94,8 +94,8 @@ class Factor(Component):
     does not determine it"""
     whiten: Any = None
     """(variables, z) -> W (R, R), for noise that depends on the variables: taken at each iterate,
-    and held while its step is computed and judged. The information of the table is then that of
-    W e; None where it is that of e"""
+    and held while its step is computed and judged. The information of the table is then the inverse
+    covariance of W e; None where it is the inverse covariance of e"""
     chordal: Chordal | None = None
     """the residual where a heading is cosine and sine, by which `certificate` bounds the cost; None
     where there is none"""
@@ -216,8 +216,8 @@ class Bearing(Factor):
 class FromSensor(Factor):
     """The factor of a sensor: e = z ⊖ h(x, l), `sensor.residual(z, sensor.observe(x, l))`.
 
-    With an absolute sensor (L = 0) the pose is the only variable. What z does not determine of a
-    landmark, `predict` takes from the mean of `sensor.free`. The name is that of the sensor.
+    With an absolute sensor (L = 0) the pose is the only variable. `predict` takes parameters of a
+    landmark that z does not determine from the mean of `sensor.free`. The name is the sensor's.
 
     With own_noise the noise of a row is R(ẑ) of the sensor at the prediction ẑ of each iterate,
     held: the optimum is where the sum of Hᵀ R(ẑ)⁻¹ (z ⊖ ẑ) and of the other rows' terms is zero. At
@@ -229,7 +229,7 @@ class FromSensor(Factor):
 
     sensor: Sensor
     own_noise: bool = static(default=False, kw_only=True)
-    """the information of the table is that of R(ẑ)^{-1/2} e, the identity, and not that of e"""
+    """the information of the table is for R(ẑ)^{-1/2} e, the identity, and not for e"""
 
     def __post_init__(self) -> None:
         _check_model("FromSensor", "sensor", self.sensor, Sensor)
@@ -301,11 +301,11 @@ class FromMotion(_MotionFactor):
 
         e = w with step(x, u, w) = x', z = u
 
-    The cost wᵀ Q⁻¹ w is that of `smoothing.BatchMap`. The pose error of the nominal motion with
-    the covariance G Q Gᵀ, G = ∂step/∂w at w = 0, is the same to first order in w, and exactly
-    where step is affine in w; its optimum is another elsewhere. w is found by Newton's method from
+    `smoothing.BatchMap` has the same cost wᵀ Q⁻¹ w. The pose error of the nominal motion, with the
+    covariance G Q Gᵀ, G = ∂step/∂w at w = 0, is equal to it to first order in w, and exactly where
+    step is affine in w; elsewhere its optimum is another. w is found by Newton's method from
     w = 0: ten steps without derivatives, then two with them, whose error is of the fourth order in
-    a change of the poses, so derivatives up to the third are those of w. Where ∂step/∂w is
+    a change of the poses, so derivatives up to the third are exact. Where ∂step/∂w is
     singular (a robot at rest, with `Odometry`) no step is made.
 
     Raises ValueError unless the noise has three components, which the two poses determine; see

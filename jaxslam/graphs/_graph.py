@@ -39,8 +39,8 @@ class Table(NamedTuple):
 class Graph(NamedTuple):
     """A graph of N poses and P points (or landmarks of L numbers); leading axes by `vmap`.
 
-    The factor of a table is in a separate dictionary with the same keys, because data hold
-    no functions: `graphs.REGISTRY` has those of files.
+    The factor of a table is in a separate dictionary with the same keys, because data hold no
+    functions: `graphs.REGISTRY` has the factors of files.
     """
 
     poses: Float[JaxOrNumPy, "N 3"]

@@ -37,7 +37,7 @@ def of_log(
     tags: ArrayLike | None = None,
     capacity: int | None = None,
 ) -> tuple[Graph, dict[str, Factor]]:
-    """The graph of a log of T steps, and its factors: its optimum is that of `BatchMap`.
+    """The graph of a log of T steps, and its factors: `BatchMap` has the same optimum.
 
     Its tables, their factors, and the number of their rows:
 
@@ -53,8 +53,8 @@ def of_log(
     A noise of other than three components is not determined by two poses. Then, and where `slack` s
     is given, the factor of the motion is `NominalMotion` with Ω = (G Q Gᵀ + s² I)⁻¹. With fewer
     components (`Unicycle`, `Increment`, `Ackermann`) the motion is a constraint, which s > 0, the
-    standard deviation of each coordinate [m, m, rad], makes soft: the optimum differs from that of
-    `BatchMap` by the order of s², and the condition of the problem is worse by s⁻².
+    standard deviation of each coordinate [m, m, rad], makes soft: its optimum and the one of
+    `BatchMap` differ by the order of s², and the condition of the problem is worse by s⁻².
 
     With `capacity` a tag is the number of its point, and all shapes are known, so that logs may be
     traced and batched; points that no scan saw are fixed at the origin. Without, the points are the
@@ -69,7 +69,7 @@ def of_log(
         pose, pose_cov: (3,) and (3, 3) of the robot before the first control; zero fixes it.
         slack: see above.
         tags: (T, M) identities from an association, -1 where a measurement is left out; by default
-            those of the scans, which must be known.
+            the tags of the scans, which must be known.
         capacity: number of points.
     Raises:
         ValueError: on models, a log or a covariance that do not fit, and at the row where a motion

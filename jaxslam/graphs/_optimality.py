@@ -39,7 +39,7 @@ from jaxslam.math._linalg import total
 
 @record
 class _Relaxed(Factor):
-    """The factor of the same measurement with chordal residuals, `Factor.chordal`."""
+    """The factor of a factor's measurement with chordal residuals, `Factor.chordal`."""
 
     factor: Factor
 
@@ -169,7 +169,7 @@ _NEGLIGIBLE_GAP = 3e-5
 times the last."""
 
 _DIAGONAL_ROUNDING = 16
-"""The least shift, in eps of the largest diagonal entry: what a Cholesky factor resolves."""
+"""The least shift, in eps of the largest diagonal entry, for a Cholesky factor to resolve it."""
 
 _SHIFTS = 40
 """The largest number of shifts that are tried, each ten times the last."""
@@ -201,11 +201,11 @@ class Certificate(NamedTuple):
     chi2: Float[Array, ""]
     """chordal cost at the optimum of the surrogate next to the graph"""
     graph: Graph
-    """with the poses of that optimum"""
+    """the graph at the optimum of the surrogate"""
     position: Float[Array, ""]
     """[m], root mean square distance of the poses of both optima"""
     heading: Float[Array, ""]
-    """[rad], the same of their headings"""
+    """[rad], root mean square difference of the headings of both optima"""
 
 
 def certificate(

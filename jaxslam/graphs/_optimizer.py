@@ -47,7 +47,7 @@ def squared_residuals(
     """The squared residual eᵀ Ω e of every row of every table, 0 where not valid; their sum is χ².
 
     Of a row with R residuals, at the truth and with the right Ω, it is χ² distributed with R
-    degrees of freedom. factors, room: as for `optimize`.
+    degrees of freedom. factors, room: see `optimize`.
     """
     factors = factors_of("graphs.squared_residuals", graph, factors)
     squares = _squares_of(factors, padded_graph(graph, room) if is_concrete(graph) else graph)
@@ -91,7 +91,7 @@ some 2a of the error."""
 
 
 def attach_derivatives(model: Model, plan: Plan, graph: Graph, solution: Solution) -> Solution:
-    """The solution as a function of graph and model: the same numbers, with derivatives.
+    """The solution, with derivatives by graph and model.
 
     At the optimum F(δ; θ) = ½ ∂χ²/∂δ = 0, so that dδ = -(∂F/∂δ)⁻¹ (∂F/∂θ) dθ: a Newton step from
     the optimum, of which only F is differentiated. ∂F/∂δ is half the Hessian of χ² with its second
@@ -181,7 +181,7 @@ def optimize(
         tolerance: done when a step lowers χ² by less than this share of it, as the quadratic model
             predicts, and at least by rounding.
         plan: of `plan`; needed under `jit` and `vmap`, where `who` is traced. Without one, graphs
-            of about the same size share a compiled program (`solver.padding`).
+            of about the same size share a compiled program (`padded_graph`).
         room: without a plan, graphs of up to about this number of variables share one.
     Raises:
         ValueError: on what `check_graph` refuses, and on unknown tables.

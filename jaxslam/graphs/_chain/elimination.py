@@ -86,7 +86,7 @@ class LinearizedStep(NamedTuple):
     noise: Float[Array, "W"]
     """η̄"""
     slot: Int[Array, "M"]
-    """of the landmark measured; any number where the rows are zeros"""
+    """slot of the landmark measured; any number where the rows are zeros"""
     pose_rows: Float[Array, "M Z 3"]
     """A"""
     landmark_rows: Float[Array, "M Z L"]
@@ -120,9 +120,9 @@ class Policy(NamedTuple):
     """The solution of a chain: the gains of all noises, and the map."""
 
     start: Gain
-    """of d_0, where a = 0"""
+    """gain of d_0, where a = 0"""
     steps: Gain
-    """with leading T"""
+    """gains of the motions' noises, with leading T"""
     landmarks: Float[Array, "N L"]
     """δm"""
     map_factor: Float[Array, "NL NL"]
@@ -138,11 +138,11 @@ class CostToGo(NamedTuple):
     """The cost to go ½ aᵀ Λ a - aᵀ y + constant, with a = (δpose, δmap)."""
 
     pose: Float[Array, "3 3"]
-    """of Λ"""
+    """block of Λ; so are the next two"""
     cross: Float[Array, "3 NL"]
     map: Float[Array, "NL NL"]
     pose_y: Float[Array, "3"]
-    """of y"""
+    """part of y; so is the next one"""
     map_y: Float[Array, "NL"]
 
 
@@ -255,25 +255,20 @@ def _solve_upper(factor: Array, rhs: Array) -> Array:
     return linalg.solve_lower(factor[::-1, ::-1].T, rhs[::-1])[::-1]
 
 
-class _ChainMarginals(NamedTuple):
-    """The marginals of a chain: of each pose, and of the last pose with the map."""
-
-    path: Float[Array, "T+1 3"]
-    """δx, from the start on"""
-    covs: Float[Array, "T+1 3 3"]
-    cov: Float[Array, "D D"]
-    """joint of the last pose and the map, D = 3 + NL; unit variance at dead slots"""
-
-
-def chain_marginals(chain: Chain, policy: Policy) -> _ChainMarginals:
+def chain_marginals(
+    chain: Chain, policy: Policy
+) -> tuple[Float[Array, "T+1 3"], Float[Array, "T+1 3 3"], Float[Array, "D D"]]:
     """The marginals of a chain, in O(T N) plus one triangular system of 3T columns.
+
+    They are δx from the start on, the covariance of each pose, and the joint covariance of the last
+    pose and the map, D = 3 + NL, with unit variance at dead slots.
 
     With n standard normal and M = R Rᵀ the matrix of the gain,
 
         δx_t = (I - G J)(F δx_{t-1} + c) + G (k - K δm + R⁻ᵀ n):
 
     for a given map δx_t has covariance S_t and depends on the map by T_t δm. Its covariance is
-    S_t + T_t Σ T_tᵀ, where Σ is that of the map.
+    S_t + T_t Σ T_tᵀ, where Σ is the covariance of the map.
     """
     delta = policy.landmarks.reshape(-1)
     wide = delta.shape[0]
@@ -309,7 +304,7 @@ def chain_marginals(chain: Chain, policy: Policy) -> _ChainMarginals:
         jnp.concatenate([first[None], later]) for first, later in zip(start, rest, strict=True)
     )
     if wide == 0:
-        return _ChainMarginals(path, pose_covs, pose_covs[-1])
+        return path, pose_covs, pose_covs[-1]
     # Σ = L⁻ᵀ L⁻¹ with the factor L of the map: T_t Σ T_tᵀ is the square of L⁻¹ T_tᵀ. All T_t
     # together are one right-hand side of 3T columns.
     poses = path.shape[0]
@@ -320,4 +315,4 @@ def chain_marginals(chain: Chain, policy: Policy) -> _ChainMarginals:
     of_map = unit.T @ unit
     cross = by_map[-1] @ of_map
     cov = jnp.block([[covs[-1], cross], [cross.T, of_map]])
-    return _ChainMarginals(path, covs, cov)
+    return path, covs, cov

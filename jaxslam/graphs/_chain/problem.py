@@ -33,10 +33,10 @@ class Problem(NamedTuple):
     pose: Float[Array, "3"]
     """mean of the start"""
     root: Float[Array, "3 3"]
-    """of its covariance"""
+    """L, with L Lᵀ the covariance of the start"""
     control: Float[Array, "T U"]
     roots: Float[Array, "T W W"]
-    """of the covariances of the motions' noises"""
+    """square roots of the noise covariances of the motions"""
     z: Float[Array, "T M Z"]
     slot: Int[Array, "T M"]
     used: Bool[Array, "T M"]
@@ -57,9 +57,9 @@ class Iterate(NamedTuple):
 def cost(sensor: Sensor, problem: Problem, at: Iterate, held: Iterate) -> Float[Array, ""]:
     """The cost ½ |ξ|² + ½ Σ |η_t|² + ½ Σ |R^{-1/2} (z ⊖ h(x_t, l))|² of an iterate.
 
-    Minus the log posterior density, up to a constant, for fixed noise covariances: R is that of the
-    predictions of another iterate, `held`. A cost with R at its own predictions would fall where R
-    grows, and so prefer long ranges. The path is that of the iterate.
+    Minus the log posterior density, up to a constant, for fixed noise covariances: R is taken at
+    the predictions of another iterate, `held`. A cost with R at its own predictions would fall
+    where R grows, and so prefer long ranges.
     """
 
     def square(z: Array, slot: Array, used: Array, pose: Array, held_pose: Array) -> Array:
@@ -115,7 +115,7 @@ def roll_out(
     path: later noises react to the nonlinear effect of earlier ones, as in differential dynamic
     programming (Jacobson & Mayne 1970). Otherwise a small early rotation would move the whole later
     path. To first order it is share times the Gauss-Newton step. The path of the initial iterate
-    (x̄) need not satisfy the models; that of the result does.
+    (x̄) need not satisfy the models; the path of the result does.
     """
     shift = share * policy.landmarks
     delta = shift.reshape(-1)
@@ -160,9 +160,9 @@ class Iterations(NamedTuple):
     policy: Policy
     """the chain's solution"""
     cost: Float[Array, ""]
-    """of the iterate, R at its own predictions"""
+    """cost of the iterate, R at its own predictions"""
     costs: Float[Array, "iterations"]
-    """after each step, that of the last repeated"""
+    """cost after each step, the last one repeated"""
     count: Int[Array, ""]
     """steps made"""
     ending: Int[Array, ""]

@@ -44,7 +44,7 @@ class WindowSteps(NamedTuple):
     present: Bool[Array, "W"]
     control: Float[Array, "W U"]
     root: Float[Array, "W Q Q"]
-    """of the covariances of the motions' noises"""
+    """square roots of the noise covariances of the motions"""
     z: Float[Array, "W M Z"]
     slot: Int[Array, "W M"]
     used: Bool[Array, "W M"]
@@ -64,12 +64,12 @@ class _WindowSolution(NamedTuple):
     """The deviations from an iterate that solve its linearized problem."""
 
     pose: Float[Array, "3"]
-    """of the oldest pose"""
+    """deviation of the oldest pose"""
     landmarks: Float[Array, "N L"]
     gains: Gain
-    """of the noises, with leading W"""
+    """gains of the noises, with leading W"""
     cov: Float[Array, "D D"]
-    """of the oldest pose and the map; zero at dead slots"""
+    """joint covariance of the oldest pose and the map; zero at dead slots"""
 
 
 def linearize_window(
@@ -127,8 +127,8 @@ def solve_window(
     """The solution of a linearized window. alive: the landmarks of the map.
 
     With Λ and y of all steps (`eliminate_steps`) and e = (x_0, m) - μ at the iterate, the
-    deviation δ has (I + P Λ) δ = P y - e in the rows of the prior, Λ δ = y in those of landmarks
-    without one; its covariance is the inverse of that matrix times P, or I.
+    deviation δ has (I + P Λ) δ = P y - e in the rows of the prior, Λ δ = y in the rows of
+    landmarks without one; its covariance is the inverse of that matrix times P, or I.
     """
     joint, (capacity, size) = prior.joint, at.landmarks.shape
     cost, gains, _ = eliminate_steps(system, capacity)

@@ -1,7 +1,7 @@
 """Programs that many graphs share: of one pattern in a batch, or padded to sizes that recur.
 
-A program is compiled for the sizes of its arrays. Those of a graph are the numbers of poses, points
-and rows, which differ from log to log and from round to round of loop closing.
+A program is compiled for the sizes of its arrays: of a graph the numbers of poses, points and rows,
+which differ from log to log and from round to round of loop closing.
 """
 
 from collections.abc import Callable

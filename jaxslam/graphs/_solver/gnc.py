@@ -54,9 +54,9 @@ def minimize_truncated(
         1 if s <= μ c²/(μ + 1), 0 if s >= (μ + 1) c²/μ, else c √(μ(μ + 1)/s) - μ
 
     and μ grows by 1.4 a round, at least to c²/(2 max s - c²), until all weights are zeros or ones.
-    In the paper the first round has all weights one. Here it has those of the start's residuals,
-    zeros and ones where s <= c² for half of the rows or more: false loops can bend the plain
-    optimum by more than later rounds mend, and a good start must not be given up for it.
+    In the paper the first round has all weights one. Here it has the weights for the residuals of
+    the start, zeros and ones where s <= c² for half of the rows or more: false loops can bend the
+    plain optimum by more than later rounds mend, and a good start must not be given up for it.
     """
     kernels = model.kernels.items()
     truncated = {name: kernel for name, kernel in kernels if isinstance(kernel, Truncated)}

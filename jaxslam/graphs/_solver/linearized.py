@@ -1,7 +1,7 @@
 """A graph about its variables: residuals, gradient, and the blocks of the information matrix.
 
-Arrays have a batch B as their last axis, as those of `sparse.cholesky`. Increments are local, in
-the frame of a pose, X ∘ exp(δ) (`se2.boxplus`); those of a point are added.
+Arrays have a batch B as their last axis, as in `_sparse/cholesky.py`. Increments of a pose are
+local, in its frame, X ∘ exp(δ) (`se2.boxplus`); increments of a point are added.
 """
 
 from collections.abc import Callable, Mapping
@@ -37,7 +37,7 @@ class Data(NamedTuple):
     information: dict[str, Float[Array, "_ _ _ B"]]
     valid: dict[str, Bool[Array, "_ B"]]
     free: Bool[Array, "n d B"]
-    """which entries of the increments are estimated, by column"""
+    """whether each entry of the increments is estimated, by column"""
 
 
 class System(NamedTuple):
@@ -254,8 +254,8 @@ def _jacobians(
     """Residuals of rows, and their derivatives by the increments of each variable.
 
     They are derivatives by coordinates, the first two of a pose turned into its frame; derivatives
-    by the increments themselves take two to five times as long. What the derivatives have in common
-    is computed once: without the barrier XLA would compute it again for each of their entries.
+    by the increments themselves take two to five times as long. Common parts of the derivatives
+    are computed once: without the barrier XLA would compute it again for each of their entries.
     """
     involved = _select(factor, who, variables)
     e, slope = jax.linearize(lambda *involved: _over_rows(factor.residual, involved, z), *involved)

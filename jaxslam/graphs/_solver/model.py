@@ -21,7 +21,7 @@ class Model:
     factors: dict[str, Factor]
     """in the order of the names"""
     kernels: dict[str, Kernel]
-    """of the tables that have one"""
+    """kernels of the tables that have one"""
 
     @property
     def holds(self) -> bool:
@@ -50,7 +50,7 @@ def model_of(
 
 
 def factors_of(name: str, graph: Graph, factors: Mapping[str, Factor] | None) -> dict[str, Factor]:
-    """The factor of each table: that of the same name, or of the part before a slash.
+    """The factor of each table, by its name or by the part of the name before a slash.
 
     The tables are in the order of their names, as in a graph that has been through `jax.tree.map`.
     By default the factors are `REGISTRY`. Raises ValueError, which begins with a caller's name,

@@ -35,11 +35,12 @@ class Plan(NamedTuple):
     column: Int[Array, "n"]
     """the column of each variable"""
     information: Stages
-    """from blocks (row, variable, variable) of all tables to those of the matrix"""
+    """sums of blocks (row, variable, variable) of all tables to the blocks of the matrix"""
     gradient: Stages
-    """from (row, variable) of all tables to columns"""
+    """sums of vectors (row, variable) of all tables to columns"""
     block_column: Int[Array, "padded"]
-    """of the M blocks of the factor; rows beyond are of no block (`sweeps.padded_size`)"""
+    """column of each of the M blocks of the factor; rows beyond M are of no block
+    (`sweeps.padded_size`)"""
     block_row: Int[Array, "padded"]
     on_diagonal: Bool[Array, "padded"]
     cholesky: CholeskyTables
@@ -63,8 +64,8 @@ def plan(
         plan = graphs.plan(graph)
         jax.vmap(lambda g: graphs.optimize(g, plan=plan))(many)
 
-    Rows that are not valid are in the pattern all the same, since which are may differ from graph
-    to graph; but rows of a variable out of range, as -1, are not.
+    Rows that are not valid are in the pattern as well, since another graph may have other valid
+    rows; rows of a variable out of range, as -1, are not.
 
     Args:
         graph: only its `who` and the numbers of poses and points are read.

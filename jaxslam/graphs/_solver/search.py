@@ -84,7 +84,7 @@ class Solution(NamedTuple):
     """The result of `optimize`; leading axes by `vmap`."""
 
     graph: Graph
-    """with poses and points of the last iterate"""
+    """the graph at the poses and points of the last iterate"""
     chi2: Float[Array, ""]
     """χ² = Σ ρ(eᵀ Ω e), without a factor ½"""
     status: Int[Array, ""]
@@ -105,21 +105,14 @@ class Solution(NamedTuple):
         return short_repr(self)
 
 
-class _Step(NamedTuple):
-    """An increment, and its prediction by the quadratic model of χ²."""
+def _marquardt(
+    plan: Plan, system: System, damping: Float[Array, "B"]
+) -> tuple[Float[Array, "n d B"], Float[Array, "B"], Bool[Array, "n B"]]:
+    """The step δ of (H + λD) δ = -g, D = diag H, the decrease of χ² that it predicts, and whether
+    each column of the factor is regular.
 
-    increments: Float[Array, "n d B"]
-    decrease: Float[Array, "B"]
-    """predicted decrease of χ²: -2 gᵀδ - δᵀHδ = λ δᵀDδ - gᵀδ"""
-    regular: Bool[Array, "n B"]
-    """whether the pivots of a column of the factor are positive"""
-
-
-def _marquardt(plan: Plan, system: System, damping: Float[Array, "B"]) -> _Step:
-    """The step of (H + λD) δ = -g, D = diag H.
-
-    Marquardt 1963, "An algorithm for least-squares estimation of nonlinear parameters", J. SIAM
-    11(2).
+    The decrease is that of the quadratic model of χ²: -2 gᵀδ - δᵀHδ = λ δᵀDδ - gᵀδ. Marquardt 1963,
+    "An algorithm for least-squares estimation of nonlinear parameters", J. SIAM 11(2).
     """
     width = system.blocks.shape[1]
     # The entries of D among the blocks (M, d, d, B).
@@ -130,7 +123,7 @@ def _marquardt(plan: Plan, system: System, damping: Float[Array, "B"]) -> _Step:
     factored = factorize(plan.cholesky, blocks)
     step = substitute(plan.cholesky, factored, -system.gradient)
     square = dot(step * diagonal_of(plan, system.blocks), step)
-    return _Step(step, damping * square - dot(step, system.gradient), factored.regular)
+    return step, damping * square - dot(step, system.gradient), factored.regular
 
 
 class _Problem(NamedTuple):
@@ -310,14 +303,14 @@ def _propose(problem: _Problem, search: _Search) -> _Search:
     """
     plan, tolerance = problem.plan, problem.tolerance
     undamped = search.damping == 0
-    step = _marquardt(plan, search.system, search.damping)
-    regular = step.regular.all(axis=0)
-    culprit = plan.order[jnp.argmin(step.regular, axis=0)].astype(jnp.int32)
+    step, decrease, regular_columns = _marquardt(plan, search.system, search.damping)
+    regular = regular_columns.all(axis=0)
+    culprit = plan.order[jnp.argmin(regular_columns, axis=0)].astype(jnp.int32)
     is_first = undamped & ~regular & ~(search.singular >= 0)
     singular = jnp.where(is_first, culprit, search.singular)
     chi2, eps = search.system.chi2, float(jnp.finfo(search.system.chi2.dtype).eps)
     least = jnp.maximum(tolerance * chi2, _SUM_ROUNDING * eps * (chi2 + 1))
-    small = step.decrease <= jnp.maximum(least, _change_by_rounding(problem, search))
+    small = decrease <= jnp.maximum(least, _change_by_rounding(problem, search))
     # Only regularity at the end matters, not on the way.
     singular = jnp.where(undamped & regular & small, -1, singular)
     ends, ending = _ending_of(
@@ -326,7 +319,7 @@ def _propose(problem: _Problem, search: _Search) -> _Search:
         singular=singular >= 0,
         again=search.undamped_again,
         refused=search.undamped_refused,
-        decrease=step.decrease,
+        decrease=decrease,
     )
     # Where the factor failed, or has to confirm that the search has converged, there is no step but
     # only another λ.
@@ -337,8 +330,8 @@ def _propose(problem: _Problem, search: _Search) -> _Search:
     stalls = ~ends & (damping > _MOST_DAMPING)
     ends, ending = ends | stalls, jnp.where(stalls, Ending.STALLED, ending)
     return search._replace(
-        trial=retract(search.variables, step.increments, plan),
-        decrease=step.decrease,
+        trial=retract(search.variables, step, plan),
+        decrease=decrease,
         stepped=regular & (~small | undamped),
         damping=jnp.where(search.going, damping, search.damping),
         undamped_again=search.undamped_again | (to_confirm & (singular >= 0)),
@@ -357,7 +350,7 @@ def _ending_of(
     refused: Bool[Array, "B"],
     decrease: Float[Array, "B"],
 ) -> tuple[Bool[Array, "B"], Int[Array, "B"]]:
-    """Whether a search ends at its iterate, and the `Ending`, from what is known of the next step.
+    """Whether a search ends at its iterate, and the `Ending`, by its next step.
 
     The step is blocked if the undamped one was refused, or if it predicts no decrease.
 

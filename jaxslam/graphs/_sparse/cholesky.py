@@ -218,8 +218,8 @@ def _roundings(
 
         t_j = (a_jj + Σ_k L_jk² t_k) / p_j,    k < j
 
-    a substitution like L y = b, with L_jk² in place of L_jk, and added. Irregular columns count as
-    exact, t_j = 0: their L_jj⁻¹ is zero.
+    It is a forward substitution with L_jk² in place of L_jk, whose products are added. Irregular
+    columns count as exact, t_j = 0: their L_jj⁻¹ is zero.
 
     entries: a_jj, the diagonal of the matrix.
     """
@@ -322,7 +322,7 @@ class InverseTables(NamedTuple):
     pairs: Int[Array, "Q"]
     """the place of the block of each pair of variables"""
     turned: Bool[Array, "Q"]
-    """whether that block has the second variable's rows and the first one's columns"""
+    """whether that block has the rows of the second variable and the columns of the first"""
 
 
 def inverse_tables(
@@ -386,5 +386,5 @@ def selected_inverse(tables: InverseTables, factored: Factored) -> Float[Array, 
         blocks = subtract_products(tables.sweep, i, blocks, None, factored.blocks, by)
         return finish(tables.sweep, i, blocks, factored.inverses, by)
 
-    out: jax.Array = jax.lax.fori_loop(0, tables.sweep.levels, level, start)
-    return out
+    inverse: jax.Array = jax.lax.fori_loop(0, tables.sweep.levels, level, start)
+    return inverse

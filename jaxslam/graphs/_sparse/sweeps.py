@@ -4,8 +4,8 @@ A factorization, a substitution and a selected inversion have one form: target b
 which a sum of products of finished blocks is subtracted before it is finished. Targets that do not
 depend on each other make a level. A level is done in rounds: round r subtracts the products rK to
 rK + K - 1 of each target that has so many. The targets of a level are sorted by their number of
-products, so that those of a round are the first of the level and lie side by side in memory: no
-scatter is needed, and the size of the compiled program does not depend on that of the graph.
+products, so that the targets of a round are the first of the level and lie side by side in memory:
+no scatter is needed, and the size of the compiled program does not depend on the graph.
 
 Tables and arrays are longer than they need be (`padded_size`), so that patterns of about one size
 share their compiled programs: rows beyond the last level are not visited.
@@ -37,9 +37,9 @@ class Sums(NamedTuple):
     """The M targets of a sweep, and the P products that are subtracted from them."""
 
     level: Ints
-    """of each target, from 0, (M,)"""
+    """level of each target, from 0, (M,)"""
     target: Ints
-    """of each product, (P,)"""
+    """target of each product, (P,)"""
     left: Ints
     """the left factor of each product, (P,)"""
     right: Ints
@@ -130,7 +130,7 @@ def sweep(sums: Sums, left: Ints, right: Ints, end: Ints, room: int = 0) -> Swee
 
     Args:
         sums: the targets and products.
-        left, right: the place of each factor by its number; the last is that of no factor.
+        left, right: the place of each factor by its number; the last is the place of no factor.
         end: the operand that finishes each target (`finish`); the last leaves a target as it is.
         room: the number of variables for which the tables have room.
     """
@@ -211,10 +211,10 @@ def subtract_products(
             block = block - product(a[:, k], b[:, k])
         return jax.lax.dynamic_update_slice_in_dim(target, block, tables.base[c], 0)
 
-    out: jax.Array = jax.lax.fori_loop(
+    subtracted: jax.Array = jax.lax.fori_loop(
         tables.rounds[level], tables.rounds[level + 1], chunk, target
     )
-    return out
+    return subtracted
 
 
 def finish(
@@ -230,8 +230,10 @@ def finish(
         block = product(block, by[tables.end[c]])
         return jax.lax.dynamic_update_slice_in_dim(target, block, tables.end_base[c], 0)
 
-    out: jax.Array = jax.lax.fori_loop(tables.ends[level], tables.ends[level + 1], chunk, target)
-    return out
+    finished: jax.Array = jax.lax.fori_loop(
+        tables.ends[level], tables.ends[level + 1], chunk, target
+    )
+    return finished
 
 
 _SUMMED = 4
@@ -240,7 +242,7 @@ _LEAST_STAGES = 2
 """The least number of stages, which up to sixteen rows of a target need: with fewer a graph would
 have another program."""
 _STAGES_WITH_ROOM = 4
-"""The same with room: enough for 256 rows of a target."""
+"""The least number of stages with room, enough for 256 rows of a target."""
 
 Stages = tuple[Int[Array, "_ terms"], ...]
 

@@ -46,10 +46,10 @@ class Pattern:
     order: Ints
     """the variable of each column, (n,)"""
     heights: Ints
-    """(n,), of the columns, ascending"""
+    """height of each column, (n,), ascending"""
     rows: Ints
     columns: Ints
-    """of each block (B,), rows >= columns; sorted by column, then row"""
+    """row and column of each block (B,), rows >= columns; sorted by column, then row"""
 
     @cached_property
     def position(self) -> Ints:

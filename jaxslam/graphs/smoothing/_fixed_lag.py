@@ -41,7 +41,7 @@ class _WindowState(NamedTuple):
     joint: Joint
     """the newest pose and the map"""
     prior: WindowPrior
-    """of the oldest pose of the window, and of the map before it"""
+    """prior of the oldest pose of the window, and of the map before it"""
     steps: WindowSteps
     at: WindowIterate
     """the path in the window, and the map"""

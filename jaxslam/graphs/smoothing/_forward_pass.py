@@ -142,7 +142,7 @@ class LogEstimator(Component):
         return _Forward(joint_ekf(self))
 
     def _forward(self, log: Log, key: Array) -> ForwardPass:
-        """The forward pass; arguments and errors are those of `run`."""
+        """The forward pass; arguments and errors as in `run`."""
 
         def linearized_at(state: _State) -> tuple[Array, ...]:
             joint = state.joint

@@ -139,7 +139,7 @@ class Smoothed(NamedTuple):
     regular: Bool[Array, ""]
     """the information on the map is positive definite; otherwise covariances are invalid"""
     filtered: Estimate
-    """with leading T, of the filter"""
+    """estimates of the filter, with leading T"""
 
 
 @record
@@ -187,17 +187,17 @@ def solution(
     passed: ForwardPass,
 ) -> tuple[Estimate, Smoothed]:
     """The estimates at the optimum of a chain about a path and the map of a joint."""
-    marginals = chain_marginals(chain, policy)
-    poses = path + marginals.path
+    deviation, covs, last_cov = chain_marginals(chain, policy)
+    poses = path + deviation
     poses = poses.at[:, 2].set(wrap(poses[:, 2]))
     landmarks = jnp.where(joint.alive[:, None], joint.landmarks + policy.landmarks, 0.0)
-    last = joint._replace(pose=poses[-1], landmarks=landmarks, cov=marginals.cov)
+    last = joint._replace(pose=poses[-1], landmarks=landmarks, cov=last_cov)
     at_end = estimate_of(last, sensor, Euclidean())
     steps = path.shape[0] - 1
     always = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (steps, *leaf.shape)), at_end)
-    estimate = always._replace(pose=poses[1:], pose_cov=marginals.covs[1:])
+    estimate = always._replace(pose=poses[1:], pose_cov=covs[1:])
     filtered = passed.trace.estimate
-    return estimate, Smoothed(poses[0], marginals.covs[0], last, policy.regular, filtered)
+    return estimate, Smoothed(poses[0], covs[0], last, policy.regular, filtered)
 
 
 def with_singular(info: Info, used: Bool[Array, "T M"]) -> Info:

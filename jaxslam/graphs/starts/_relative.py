@@ -27,7 +27,7 @@ class Relative(NamedTuple):
     pose: Float[np.ndarray, "E 3"]
     """the second in the frame of the first"""
     information: Float[np.ndarray, "E 3 3"]
-    """of the error e = pose⁻¹ ∘ (xᵢ⁻¹ ∘ xⱼ), to first order"""
+    """Ω of the error e = pose⁻¹ ∘ (xᵢ⁻¹ ∘ xⱼ), to first order"""
 
 
 def measured_relative_poses(graph: Graph, factors: Factors | None) -> Relative:
@@ -87,7 +87,7 @@ def _measured_poses(factor: Factor, z: jax.Array) -> tuple[jax.Array, jax.Array]
 def anchors_of(
     name: str, graph: Graph, relative: Relative
 ) -> tuple[Bool[np.ndarray, "N"], Float[np.ndarray, "N 3"]]:
-    """Whether each pose is an anchor, which holds its part of the graph, and all poses, those of
+    """Whether each pose is an anchor, which holds its part of the graph, and all poses, with the
     anchors where they are held.
 
     Raises ValueError, which begins with the name of the start, if a part has no anchor.

@@ -31,7 +31,7 @@ def odometry(graph: Graph, factors: Factors | None = None) -> Graph:
     that locates it. The order of poses and rows has no influence.
 
     Args:
-        factors: as for `optimize`; by default those of the tables of files.
+        factors: see `optimize`; by default `graphs.REGISTRY`.
     Raises:
         ValueError: if some pose is not connected to an anchor by relative poses.
     """
