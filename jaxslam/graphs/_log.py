@@ -161,11 +161,11 @@ def _points_of(
         validation.check_count(f"{name}: capacity", capacity)
         used = valid & (array >= 0)
         return array * used, used, np.arange(capacity, dtype=np.int32)
-    used = np.asarray(valid) & (np.asarray(array) >= 0)
-    ids = np.unique(np.asarray(array)[used]).astype(np.int32)
+    tagged = np.asarray(valid) & (np.asarray(array) >= 0)
+    ids = np.unique(np.asarray(array)[tagged]).astype(np.int32)
     if not len(ids):
         raise ValueError(f"{name}: the log has no measurement of a landmark")
-    return np.where(used, np.searchsorted(ids, array), 0).astype(np.int32), used, ids
+    return np.where(tagged, np.searchsorted(ids, array), 0).astype(np.int32), tagged, ids
 
 
 @partial(jax.jit, static_argnames="fixed", inline=True)
@@ -287,8 +287,7 @@ def _place_points(
     seen = first < total
     row = jnp.where(seen, first, 0)
     flat = z.reshape(total, -1)
-    invert = jax.vmap(lambda pose, z: sensor.invert(pose, z, mean))
-    places = invert(path[row // slots], flat[row])
+    places = jax.vmap(lambda x, z: sensor.invert(x, z, mean))(path[row // slots], flat[row])
     return jnp.where(seen[:, None], places, 0.0), seen
 
 

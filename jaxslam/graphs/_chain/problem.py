@@ -163,7 +163,7 @@ class Iterations(NamedTuple):
     """cost of the iterate, R at its own predictions"""
     costs: Float[Array, "iterations"]
     """cost after each step, the last one repeated"""
-    count: Int[Array, ""]
+    steps: Int[Array, ""]
     """steps made"""
     ending: Int[Array, ""]
     """EXHAUSTED while the iterations continue"""
@@ -204,7 +204,7 @@ def optimize_chain(
         converged = jnp.asarray(False)
         if tolerance is not None:
             converged = _has_converged(search, policy, tolerance)
-        may_step = (search.count < iterations) & ~converged
+        may_step = (search.steps < iterations) & ~converged
         after, lower = _line_search(motion, sensor, problem, search, policy)
         moved = may_step & lower
         chain = _linearize_at(motion, sensor, problem, after)
@@ -217,14 +217,14 @@ def optimize_chain(
         if tolerance is not None:
             hidden = ~moved & (policy.decrement <= _rounding_of_cost(search))
             ending = jnp.where(hidden, Ending.CONVERGED, ending)
-        later = jnp.arange(iterations, dtype=search.count.dtype) >= search.count
+        later = jnp.arange(iterations, dtype=search.steps.dtype) >= search.steps
         after_step = Iterations(
             at=at,
             chain=chain,
             policy=policy,
             cost=value,
             costs=jnp.where(later, value, search.costs),
-            count=search.count + moved.astype(search.count.dtype),
+            steps=search.steps + moved.astype(search.steps.dtype),
             ending=ending.astype(jnp.int32),
         )
         return after_step, moved
@@ -265,7 +265,7 @@ def _has_converged(search: Iterations, policy: Policy, tolerance: float) -> Bool
     least = jnp.maximum(tolerance, eps**0.5)
     idle = policy.decrement > _IDLE * search.policy.decrement
     idle = idle & (policy.decrement <= eps * search.cost)
-    return (search.count > 0) & ((policy.decrement <= least**2) | idle)
+    return (search.steps > 0) & ((policy.decrement <= least**2) | idle)
 
 
 def _rounding_of_cost(search: Iterations) -> Float[Array, ""]:
@@ -291,7 +291,7 @@ def _line_search(
     tried = jax.vmap(lambda share: roll_out(motion, problem, search.at, policy, share))(shares)
     costs = jax.vmap(lambda at: cost(sensor, problem, at, search.at))(tried)
     # To first order a step lowers the cost by share · λ²; the margin is the rounding of sums.
-    first = search.count == 0
+    first = search.steps == 0
     before = jnp.where(first, 0.0, search.cost)  # of the first step infinite
     enough = before * (1 + 10 * eps) - _ARMIJO * shares * policy.decrement
     good = jnp.isfinite(costs) & (first | (costs <= enough))

@@ -175,7 +175,7 @@ def _at_end(
         noise=at.noise,
         cost=search.cost,
         costs=search.costs,
-        iterations=search.count,
+        iterations=search.steps,
         step=jnp.where(positive, step, 0.0),
         ending=search.ending,
     )
