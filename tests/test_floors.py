@@ -36,9 +36,8 @@ FLOOR[""] = len(FLOORS)  # jaxslam/__init__.py sees everything, and nothing sees
 
 # Methods of these modules may import what is above, when they are called: `print(campaign)` and
 # `campaign.save(folder)` are where a user looks for them, and results are drawn and written above;
-# so are `graphs.read(path)` and `grids.read_map(path)`, and files are read above.
+# so is `grids.read_map(path)`, and files are read above.
 WITHIN_CALLS = {
-    "graphs._graph": "datasets",
     "laser.grids._grid": "datasets",
     "consistency.campaign._result": "results",
 }

@@ -2,8 +2,8 @@
 
 `calibrate` finds parameters of which the noise covariances do not depend, by Gauss-Newton on the
 whitened innovations, also where associations change; `fit_noise` maximizes the likelihood, for
-standard deviations and what else is in it, with the associations held; `consider_cov` is what the
-uncertainty of parameters adds to the covariance of a result. `delayed` is a log whose measurements
+standard deviations and other parameters, with the associations held; `consider_cov` is the
+covariance that uncertain parameters add to a result. `delayed` is a log whose measurements
 are late, by a delay that can be such a parameter.
 """
 

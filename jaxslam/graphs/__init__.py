@@ -19,7 +19,7 @@ from jaxslam.graphs._factor import (
     RelativePoseLog,
     RelativePosition,
 )
-from jaxslam.graphs._graph import Graph, Table, read, with_loops_apart, write
+from jaxslam.graphs._graph import Graph, Table, with_loops_apart
 from jaxslam.graphs._log import of_log
 from jaxslam.graphs._optimality import Certificate, certificate
 from jaxslam.graphs._optimizer import chi2, degrees_of_freedom, optimize, squared_residuals
@@ -65,12 +65,10 @@ __all__ = [
     "of_log",
     "optimize",
     "plan",
-    "read",
     "squared_residuals",
     "starts",
     "with_gauge",
     "with_loops_apart",
-    "write",
 ]
 
 publish(__name__)

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxslam import motion, sensors
-from jaxslam.calibration._delay import delayed
+from jaxslam.calibration import delayed
 from jaxslam.core.types import Log
 from jaxslam.motion import WhiteNoise
 from jaxslam.sensors import RangeBearingNoise

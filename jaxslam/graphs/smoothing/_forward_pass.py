@@ -31,12 +31,13 @@ class ForwardPass(NamedTuple):
     before: Float[Array, "T 3"]
     """the pose from which each motion was linearized"""
     predicted: Float[Array, "T 3"]
-    """the pose after it, at which known landmarks were linearized"""
+    """the pose after the motion, at which measurements of the map were linearized"""
     predicted_map: Float[Array, "T N L"]
-    """the map there"""
+    """the map before the scan"""
     corrected: Float[Array, "T 3"]
     """the pose after the scan, where new landmarks were linearized"""
     corrected_map: Float[Array, "T N L"]
+    """the map after the scan"""
 
 
 class _State(NamedTuple):
@@ -85,7 +86,7 @@ def joint_ekf(of: Any) -> EkfSlam:
 
 @record
 class LogEstimator(Component):
-    """What estimators of a whole log share: models, start, and the EKF-SLAM of the forward pass.
+    """The base of estimators of a whole log: models, start, and the EKF-SLAM of the forward pass.
 
     A subclass is a record that defines `solve`. Called with (log, key) it gives a `Trace`. Raises
     ValueError as `EkfSlam` does, and for sensors that it does not support: a suite, landmarks that
@@ -106,7 +107,7 @@ class LogEstimator(Component):
     associate: Associate = Known()
     gate: Number | None = None
     births: int | None = static(default=None)
-    """these three of the filter, as for `EkfSlam`"""
+    """these three as the fields of `EkfSlam`"""
 
     def __post_init__(self) -> None:
         name, sensor = type(self).__name__, self.sensor
@@ -141,7 +142,7 @@ class LogEstimator(Component):
         return _Forward(joint_ekf(self))
 
     def _forward(self, log: Log, key: Array) -> ForwardPass:
-        """The forward pass; arguments and errors are those of `run`."""
+        """The forward pass; arguments and errors as in `run`."""
 
         def linearized_at(state: _State) -> tuple[Array, ...]:
             joint = state.joint
