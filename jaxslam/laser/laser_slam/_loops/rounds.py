@@ -36,8 +36,8 @@ from jaxslam.laser.laser_slam._odometry.reference import (
     Reference,
     match,
     reference_of,
-    search,
-    taken,
+    rows_of,
+    window_search,
 )
 from jaxslam.laser.laser_slam._odometry.tracking import LOOP_INLIERS, Odometry
 from jaxslam.laser.laser_slam._records import LoopOutcome, Loops, Settings
@@ -59,7 +59,7 @@ def give_back() -> None:
 
 _NARROW, _WIDE = (0.8, float(np.deg2rad(14.0))), (4.0, float(np.deg2rad(40.0)))
 """Windows of the search, [m] and [rad] to either side."""
-_SEARCHES = [search(*window, np.deg2rad(2.0)) for window in (_NARROW, _WIDE)]
+_SEARCHES = [window_search(*window, np.deg2rad(2.0)) for window in (_NARROW, _WIDE)]
 _WINDOW = np.diag(1 / np.square([_WIDE[0], *_WIDE]))
 """Information of the window, which bounds directions that the walls do not determine."""
 
@@ -99,7 +99,7 @@ def matched(
             fit = match(
                 _SEARCHES[int(candidates.wide[row])],
                 submap,
-                taken(scans.points, keyframe[candidates.second[row]]),
+                rows_of(scans.points, keyframe[candidates.second[row]]),
                 candidates.z[row],
                 None,
                 _WINDOW,

@@ -16,7 +16,7 @@ from jaxtyping import Float, Int
 from jaxslam.core._record import record
 from jaxslam.core.protocols import Motion
 from jaxslam.laser.laser_slam._odometry.raw import Steps
-from jaxslam.laser.laser_slam._odometry.reference import match, reference_of, taken
+from jaxslam.laser.laser_slam._odometry.reference import match, reference_of, rows_of
 from jaxslam.laser.laser_slam._odometry.tracking import (
     FAR,
     NEAR,
@@ -116,7 +116,7 @@ def laser_odometry(
 
     A scan without a match has the pose of raw odometry, is not a keyframe, and is matched again at
     the end, with the keyframes before and after it, from the path between its neighbours. After
-    `LOST` such scans in a row the next one is a keyframe, and only keyframes since then are matched
+    `LOST_AFTER` such scans in a row the next one is a keyframe, and only keyframes since then are matched
     with; so is the first where raw odometry is frozen, but there matches that are less good count,
     too, and are in doubt.
 
@@ -145,7 +145,7 @@ def laser_odometry(
 
     def piece(begin: int, end: int) -> Odometry:
         rows = slice(begin, end)
-        return match_to_keyframes(taken(scans, rows), taken(steps, rows), settings, advance)
+        return match_to_keyframes(rows_of(scans, rows), rows_of(steps, rows), settings, advance)
 
     # The last scan of a piece is the first of the next.
     ends = [*(borders[1:-1] + 1).tolist(), count]
@@ -199,7 +199,7 @@ def _compile(scans: Scans, settings: Settings) -> None:
     """Compile the programs of the pieces, and in parallel the wider search."""
     row, start = np.zeros(1, int), np.zeros((1, 3))
     reference = reference_of(scans, row, start, start[0], settings.scans_of_reference)
-    rest = reference, taken(scans.points, 0), start[0], np.eye(3), NO_FLOOR, settings
+    rest = reference, rows_of(scans.points, 0), start[0], np.eye(3), NO_FLOOR, settings
     match(NEAR, *rest)
     pool = ThreadPoolExecutor(1)
     pool.submit(match, FAR, *rest)

@@ -28,32 +28,35 @@ _MIN_TIMED_STEP = (0.3, 0.35)
 
 
 class Steps(NamedTuple):
-    """The steps of raw odometry to each scan from the previous one; the first is zero."""
+    """Steps of raw odometry to each of K scans from the previous one, or one of them.
 
-    step: Float[np.ndarray, "K 3"]
-    cov: Float[np.ndarray, "K 3 3"]
+    The first is zero.
+    """
+
+    step: Float[np.ndarray, "*K 3"]
+    cov: Float[np.ndarray, "*K 3 3"]
     """of the end of the step"""
-    reach: Float[np.ndarray, "K 2"]
+    reach: Float[np.ndarray, "*K 2"]
     """how far the robot can have gone in that time [m], and turned [rad], by its speeds"""
-    jump: Bool[np.ndarray, "K"]
+    jump: Bool[np.ndarray, "*K"]
     """longer than can be, or no motion: the step is zero"""
-    frozen: Bool[np.ndarray, "K"]
+    frozen: Bool[np.ndarray, "*K"]
     """none, though the scan changed"""
-    lags: Bool[np.ndarray, "K"]
+    lags: Bool[np.ndarray, "*K"]
     """slow, before one that is faster than can be and makes up for it: a message came late"""
-    gap: Bool[np.ndarray, "K"]
+    gap: Bool[np.ndarray, "*K"]
     """long after the scan before"""
-    odd: Bool[np.ndarray, "K"]
+    odd: Bool[np.ndarray, "*K"]
     """faster than the robot can be, though no jump: stamps or raw odometry are wrong"""
-    usual_reach: Float[np.ndarray, "K 2"]
+    usual_reach: Float[np.ndarray, "*K 2"]
     """`reach` without that of odd steps, which is all that is searched"""
-    reset: Bool[np.ndarray, "K"]
+    reset: Bool[np.ndarray, "*K"]
     """a jump in which odometry was set anew, while the robot went on as it did"""
-    logged: Float[np.ndarray, "K 3"]
+    logged: Float[np.ndarray, "*K 3"]
     """the steps of the log, also where these are jumps"""
 
     @property
-    def unknown(self) -> Bool[np.ndarray, "K"]:
+    def unknown(self) -> Bool[np.ndarray, "*K"]:
         """Mask of the steps without raw odometry."""
         return np.asarray(self.jump | self.frozen)
 

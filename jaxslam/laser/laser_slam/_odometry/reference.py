@@ -70,7 +70,7 @@ class ScanMatch(NamedTuple):
     """share of the reference's points in view that the scan's beams pass through"""
 
 
-def search(
+def window_search(
     distance: float, angle: float, turn: float, *, ambiguous: float | None = _AMBIGUOUS_SHARE
 ) -> Correlative:
     """The search over a window of the reference's grid, [m] and [rad] to either side."""
@@ -100,7 +100,7 @@ _OF_WALLS = IcpSettings(kernel=Cauchy(), scale=0.05, lone=0.5, iterations=10, le
 WALLS = PointToLine(replace(_OF_WALLS, reach=0.5))
 _NEAR_WALLS = PointToLine(replace(_OF_WALLS, reach=0.15))
 """From where `WALLS` ends: its pairs are the points that lie on walls."""
-_TABLE_SEARCH = search(1.0, 0.5, 0.1)
+_TABLE_SEARCH = window_search(1.0, 0.5, 0.1)
 """Its table serves all searches, which differ only in their windows."""
 
 
@@ -114,11 +114,11 @@ def reference_of(
     """The reference of at most `size` scans at their poses, in the frame of a pose."""
     take = np.append(rows, np.repeat(rows[-1:], size - len(rows)))
     at = np.concatenate([path, np.repeat(path[-1:], size - len(rows), axis=0)])
-    points = taken(scans.points, take)
+    points = rows_of(scans.points, take)
     # The last scan is repeated without its points: a reference always has as many scans.
     points = points._replace(valid=points.valid & (np.arange(size) < len(rows))[:, None])
     relative = poses.between(origin, at).astype(np.float32)
-    gathered: Reference = _gather(points, taken(scans.surface, take), relative)
+    gathered: Reference = _gather(points, rows_of(scans.surface, take), relative)
     return gathered
 
 
@@ -239,7 +239,7 @@ def _thin(of: Points) -> Points:
 Of = TypeVar("Of", bound=PyTree)
 
 
-def taken(of: Of, rows: int | np.integer | np.ndarray | slice) -> Of:
+def rows_of(of: Of, rows: int | np.integer | np.ndarray | slice) -> Of:
     """Some scans of many."""
     found: Of = jax.tree.map(lambda part: part[rows], of)
     return found
