@@ -82,4 +82,4 @@ def relative_covs(
     jacobian = np.concatenate([by_i, by_j], axis=2)
     # Blocks (Q, 2, 2, 3, 3) of the two poses to (Q, 6, 6): pose and coordinate of the row first.
     joint = np.swapaxes(blocks, 2, 3).reshape(-1, 6, 6)
-    return end_covariances.propagated(jacobian, joint)
+    return end_covariances.propagate(jacobian, joint)

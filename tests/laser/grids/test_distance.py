@@ -101,7 +101,7 @@ def test_resampling_keeps_the_integral_and_the_unknown():
     halved = grids.resample(grid, 0.2)
     blocks = log_odds.reshape(4, 2, 6, 2).mean(axis=(1, 3))
     np.testing.assert_allclose(halved.log_odds, blocks, atol=1e-12)
-    assert not np.any(np.asarray(halved.known)[:2, :3])
+    assert not np.any(np.asarray(halved.observed)[:2, :3])
     assert grids.resample(jax.tree.map(np.float32, grid), 0.2).log_odds.dtype == np.float32
     odd = grids.resample(grid, 0.13)
     assert odd.log_odds.shape == (7, 10)

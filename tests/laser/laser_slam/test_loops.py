@@ -37,7 +37,7 @@ def test_covariance_along_a_chain_step_by_step(chain):
     )
     z = poses.between(path[4], path[9])
     back = end_covariances.relative_cov(total, path, np.array(9), np.array(4))
-    np.testing.assert_allclose(end_covariances.moved(cov, poses.inverse(z)), back, rtol=1e-9)
+    np.testing.assert_allclose(end_covariances.move(cov, poses.inverse(z)), back, rtol=1e-9)
     np.testing.assert_allclose(
         end_covariances.at_end(end_covariances.of_coordinates(cov, z), z), cov, rtol=1e-9
     )

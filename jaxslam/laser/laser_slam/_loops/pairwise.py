@@ -54,7 +54,7 @@ def pairwise_consistency(
     agree = np.zeros((count, count), bool)
     end = poses.compose(path[first], z)
     moved = poses.compose(end, poses.inverse(path[second]))
-    loop_cov = end_covariances.propagated(poses.adjoint(end), cov)
+    loop_cov = end_covariances.propagate(poses.adjoint(end), cov)
     parts = path[second], end, moved, loop_cov, total[first], total[second], first, second
     with float64():
         # The last loop is repeated up to the size of a tile.

@@ -237,7 +237,7 @@ def step(
         if raw.gap:  # steps of the pause may be missing from raw odometry
             at = at._replace(cov=at.cov + reach_cov(raw.reach))
     motion = poses.between(track.at.pose, at.pose)
-    doubt = end_covariances.moved(track.doubt, motion)
+    doubt = end_covariances.move(track.doubt, motion)
     if doubted:  # replaces earlier doubt, since the next scans depend on this match
         doubt = _doubt_cov(fit.prior_cov, poses.between(fit.pose, fit.guess.pose))
     last = track.keyframes[-1]
@@ -487,7 +487,7 @@ def _doubt_cov(
         prior_cov: P, of raw odometry.
         off: e, the pose by raw odometry in the frame of the match.
     """
-    at_match = end_covariances.propagated(end_covariances.turns(off[2]), prior_cov)
+    at_match = end_covariances.propagate(end_covariances.turns(off[2]), prior_cov)
     square = off[0] ** 2 + off[1] ** 2
     return np.asarray(_DOUBT_PROBABILITY * (at_match + np.diag([square, square, off[2] ** 2])))
 
