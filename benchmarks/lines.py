@@ -17,7 +17,7 @@ from jaxslam import features, filters, scenarios, sensors
 from jaxslam.consistency import block_nees, pose_error
 from jaxslam.core.types import Beams, Scan
 from jaxslam.math.stats import t_quantile
-from jaxslam.simulation import _walls as walls
+from jaxslam.simulation import walls
 from jaxslam.simulation import laser
 
 PLACES, FAR = 16, (0.4, 0.3)

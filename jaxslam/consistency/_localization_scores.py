@@ -21,7 +21,7 @@ from jaxslam.laser.grids._grid_localization import beam_log
 from jaxslam.math._linalg import root_psd
 from jaxslam.math.angles import wrap
 from jaxslam.resampling._weights import at_points, weights_of
-from jaxslam.simulation._laser import LaserWorld, check_world, scan_world
+from jaxslam.simulation.laser import LaserWorld, check_world, scan_world
 
 _DRAWS = 199
 """Draws from the particles that represent them in a step; with the truth they are 200."""

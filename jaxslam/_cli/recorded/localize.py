@@ -120,7 +120,7 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> laser_log.Jo
         options.particles,
         start="uniform" if pose is None else "gaussian",
         **weighing,
-        every=max(1, np.shape(log.beams.range)[1] // BEAMS),
+        stride=max(1, np.shape(log.beams.range)[1] // BEAMS),
     )
     logged = len(log.time) == 1 or bool(log.odometry_known[1:].any())
     jumps = int(odometry_jumps(log.raw, log.time).sum())

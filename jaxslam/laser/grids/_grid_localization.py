@@ -89,9 +89,9 @@ def beam_log(control: ArrayLike, beams: Beams) -> Log:
     return Log(controls, scan)
 
 
-def beams_of(scan: Scan, every: int) -> Beams:
+def beams_of(scan: Scan, stride: int) -> Beams:
     """Each n-th beam of a scan of `beam_log`; beams that are not valid have range 0."""
-    z, valid = scan.z[::every], scan.valid[::every]
+    z, valid = scan.z[::stride], scan.valid[::stride]
     used = valid & (z[:, 0] > 0)
     clean = jnp.where(used[:, None], z, 0.0)
     return Beams(clean[:, 0], clean[:, 1], used)
@@ -154,7 +154,7 @@ class GridLocalization(MonteCarloFilter):
 
         (Π_k p(z_k | x, map))^exponent
 
-    over the usable beams of the scan, each `every`-th. An exponent below 1 tempers the likelihood:
+    over the usable beams of the scan, each `stride`-th. An exponent below 1 tempers the likelihood:
     beams are not independent given the pose, and without it the particles are overconfident
     (Thrun, Burgard & Fox 2005, "Probabilistic robotics", sections 6.3.4 and 8.3.4). Which exponent
     is honest depends on model, map and number of beams; `consistency.judge_localization` measures
@@ -169,12 +169,12 @@ class GridLocalization(MonteCarloFilter):
     `clusters` of `final.pose` and `final.log_weight` finds these. A particle off the map or in an
     occupied cell has weight zero; `blocked` of `info.extra["particles"]`, a `ParticleInfo`, counts
     those in use. A scan without a usable beam gives no more information. The status of a beam is
-    FUSED if it entered the weights, UNMATCHED if `every` left it out or the scan left no particle a
-    weight (`underflow`), as where all are off the map. log_likelihood is
+    FUSED if it entered the weights, UNMATCHED if `stride` left it out or the scan left no particle
+    a weight (`underflow`), as where all are off the map. log_likelihood is
     log Σ w p(z | x)^exponent.
 
     Raises ValueError as `MonteCarloFilter`, on a grid that is none, is a tracer, or has no free
-    cell (in the box), a model that is none, an exponent not above 0 or every below 1.
+    cell (in the box), a model that is none, an exponent not above 0 or stride below 1.
     """
 
     grid: Grid
@@ -184,11 +184,11 @@ class GridLocalization(MonteCarloFilter):
     motion: Motion
     """motion model; for odometry `motion.Odometry` with `odometry_controls`"""
     particles: int = static()
-    """capacity P, at least 1; a step has P · B/every look-ups"""
+    """capacity P, at least 1; a step has P · B/stride look-ups"""
     _: dataclasses.KW_ONLY
     exponent: Number = 0.1
     """of the likelihood, above 0; differentiable"""
-    every: int = static(default=1)
+    stride: int = static(default=1)
     """use each n-th beam, at least 1"""
     prepared: PyTree = dataclasses.field(init=False, repr=False)
     """result of `model.prepare` for the map"""
@@ -205,7 +205,7 @@ class GridLocalization(MonteCarloFilter):
             )
         validation.check_record(name, "model", self.model, BeamModel)
         check_motion(name, self.motion)
-        validation.check_count(f"{name}: every", self.every)
+        validation.check_count(f"{name}: stride", self.stride)
         check_positive(name, exponent=self.exponent)
         hold_box(self)
         box = None if self.box is None else np.asarray(self.box)
@@ -214,7 +214,7 @@ class GridLocalization(MonteCarloFilter):
         super().__post_init__()
 
     def update(self, state: PoseParticles, scan: Scan, key: Array) -> tuple[PoseParticles, Info]:
-        state, beams = draw_start(state, key, self._start_region), beams_of(scan, self.every)
+        state, beams = draw_start(state, key, self._start_region), beams_of(scan, self.stride)
 
         def fit_of(poses: Float[Array, "P 3"], map_of: PyTree, beams: Beams) -> Float[Array, "P"]:
             log_p = partial(log_likelihood, self.model, map_of, beams=beams)
@@ -229,7 +229,7 @@ class GridLocalization(MonteCarloFilter):
         blocked = blocked & active_mask(state)
         state, report = self.weigh(state, misfit, fit, beams.valid.sum())
         report = report._replace(blocked=blocked.sum(dtype=jnp.int32))
-        info = info_of_beams(scan, self.every, evidence, ~report.underflow)
+        info = info_of_beams(scan, self.stride, evidence, ~report.underflow)
         return state, with_extra(info, "particles", report)
 
     def estimate(self, state: PoseParticles) -> Estimate:
@@ -247,14 +247,14 @@ def _is_blocked(grid: Grid, pose: Float[Array, "P 3"]) -> Bool[Array, "P"]:
 
 
 def info_of_beams(
-    scan: Scan, every: int, log_likelihood: Float[Array, ""], used: Bool[Array, ""]
+    scan: Scan, stride: int, log_likelihood: Float[Array, ""], used: Bool[Array, ""]
 ) -> Info:
     """The `Info` of a scan with the status of each beam; a beam has no innovation.
 
     Each n-th beam is FUSED where the scan was used; all others are UNMATCHED.
     """
     m = scan.valid.shape[0]
-    fused = (jnp.arange(m) % every == 0) & used
+    fused = (jnp.arange(m) % stride == 0) & used
     dtype = scan.z.dtype
     return info_of(
         status_of(scan.valid, matched=fused, inside=scan.z[:, 0] > 0),

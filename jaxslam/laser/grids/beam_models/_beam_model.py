@@ -56,17 +56,18 @@ def log_likelihood(
     pose: ArrayLike,
     beams: Beams,
     *,
-    every: int = 1,
+    stride: int = 1,
     exponent: Number = 1.0,
 ) -> Float[Array, ""]:
     """The log-likelihood of a scan at a pose (3,): exponent · Σ log p(z_k) over its valid beams.
 
     Beams without information (`Beams`) add nothing. The beams of a scan are assumed independent
     given the pose, which they are not: what the map lacks, or a pose between two cells, spoils many
-    of them in the same way. `every` takes only each n-th beam, and an exponent below 1 tempers the
-    likelihood; both make it wider. Differentiable by pose and exponent; `jax.vmap` it over poses.
+    of them in the same way. A `stride` n takes each n-th beam only, and an exponent below 1 tempers
+    the likelihood; both make it wider. Differentiable by pose and exponent; `jax.vmap` it over
+    poses.
 
-    Raises ValueError on beams that `_check_beams` refuses, a pose that is not (3,), every below 1,
+    Raises ValueError on beams that `_check_beams` refuses, a pose that is not (3,), stride below 1,
     an exponent below 0, and a grid in place of the result of `model.prepare`.
     """
     _check_beams("log_likelihood", beams)
@@ -76,12 +77,12 @@ def log_likelihood(
         raise ValueError(f"log_likelihood: expected a finite pose, got {pose!r}")
     if is_concrete(exponent) and not np.all(np.asarray(exponent) >= 0):
         raise ValueError(f"log_likelihood: expected an exponent >= 0, got {exponent!r}")
-    check_count("log_likelihood: every", every)
+    check_count("log_likelihood: stride", stride)
     if isinstance(prepared, Grid):
         raise ValueError(
             "log_likelihood: expected what model.prepare makes of the grid, got the Grid itself"
         )
-    beams = Beams(*(jnp.asarray(part)[::every] for part in beams))
+    beams = Beams(*(jnp.asarray(part)[::stride] for part in beams))
     usable = usable_beams(beams)
     # A harmless range and angle where a beam has no information: its derivative must be finite.
     ranges, angles = jnp.where(usable, beams.range, 1.0), jnp.where(usable, beams.angle, 0.0)
