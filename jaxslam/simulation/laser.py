@@ -16,8 +16,8 @@ from jaxslam.core.protocols import Motion
 from jaxslam.core.types import Beams, JaxOrNumPy
 from jaxslam.math import se2
 from jaxslam.math._arrays import Number, Pose
+from jaxslam.simulation._wall_geometry import Walls, exact_ranges, wall_ranges
 from jaxslam.simulation._worlds import drive
-from jaxslam.simulation.walls import Walls, exact_ranges, wall_ranges
 
 __all__ = [
     "Laser",
@@ -139,16 +139,11 @@ def scan(laser: Laser, walls: Walls, pose: Float[Array, "3"], key: Array) -> Bea
 
 def scan_world(world: LaserWorld, key: Array) -> LaserHistory:
     """A random history of a world: its path, odometry and scans; traceable, as `simulate` is."""
-    check_world("scan_world", world)
+    if not isinstance(world, LaserWorld):
+        raise ValueError(f"scan_world: expected a LaserWorld, got {type(world).__name__}")
     check_key("scan_world", key)
     history: LaserHistory = _scan_world(world, key)
     return history
-
-
-def check_world(name: str, world: object) -> None:
-    """Raise ValueError, which begins with a caller's name, unless world is a `LaserWorld`."""
-    if not isinstance(world, LaserWorld):
-        raise ValueError(f"{name}: expected a LaserWorld, got {type(world).__name__}")
 
 
 @partial(jax.jit, inline=True)

@@ -179,6 +179,6 @@ def odometry_of_file(
             f"{time.max():.6f} s, within {_STAMP_TOLERANCE:g} s; expected all, or a line for each "
             "scan"
         )
-    path = table[:, 1:]
+    logged = table[:, 1:]
     step_known = np.ones(scans, bool)
-    return RawOdometry(path, stamps, row, path[row], step_known, 0), time, note
+    return RawOdometry(logged, stamps, row, logged[row], step_known, 0), time, note

@@ -124,8 +124,8 @@ def _count(
     in_window = tuple(
         slice(s.start - f, s.stop - f) for s, f in zip(in_map, first[::-1], strict=True)
     )
-    for total, part in zip(counts, (window_counts.hits, window_counts.misses), strict=True):
-        total[in_map] += np.asarray(part)[in_window]
+    for total, added in zip(counts, (window_counts.hits, window_counts.misses), strict=True):
+        total[in_map] += np.asarray(added)[in_window]
 
 
 def _occupancy(

@@ -107,9 +107,8 @@ def scans_of(log: LogOfScans, settings: Settings) -> Scans:
         size, width = points.valid.shape
         # Filled up to `ROWS` scans of `WIDTH` beams by points that are not valid.
         fill = [(0, ROWS - size), (0, WIDTH - width)]
-        filled = jax.tree.map(
-            lambda part, f=fill: np.pad(part, f + [(0, 0)] * (part.ndim - 2)), points
-        )
+        padded: Any = [np.pad(part, fill + [(0, 0)] * (part.ndim - 2)) for part in points]
+        filled = Points(*padded)
         lines = jax.tree.map(np.asarray, _surfaces(filled, span))
         # Beams that fill a scan up come last: they are cut off, or stay without a point.
         thinned = jax.tree.map(
@@ -137,9 +136,9 @@ def _points(beams: Beams, mount: Float[np.ndarray, "3"], max_range: float) -> Po
     return Points(*parts)
 
 
-def _thin(part: np.ndarray, every: int, width: int) -> np.ndarray:
+def _thin(part: np.ndarray, stride: int, width: int) -> np.ndarray:
     """Each n-th of the beams, cut or filled up to a width."""
-    beams = part[:, ::every][:, :width]
+    beams = part[:, ::stride][:, :width]
     return np.pad(beams, [(0, 0), (0, width - beams.shape[1])] + [(0, 0)] * (part.ndim - 2))
 
 

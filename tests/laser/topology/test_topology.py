@@ -8,6 +8,7 @@ from cases import refused
 
 from jaxslam import grids, topology
 from jaxslam.simulation import walls
+from jaxslam.simulation._wall_geometry import is_free
 from jaxslam.simulation.scenarios import office
 
 ROOMS = np.array(
@@ -81,7 +82,7 @@ def test_the_shortest_way_goes_through_the_doors():
     corners = np.stack([ROOMS[0], DOORS[0], DOORS[5], ROOMS[5]])
     least = np.linalg.norm(np.diff(corners, axis=0), axis=1).sum()
     assert least - 0.2 < way.length < 1.25 * least
-    assert walls.is_free(office().walls, way.path).all()
+    assert is_free(office().walls, way.path).all()
     assert topology.route(found, ROOMS[0], ROOMS[0] + 0.1).places == (own[0],)
 
 
