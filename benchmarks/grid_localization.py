@@ -75,8 +75,8 @@ def learnt(grid, world):
 class SingleRayCast(grids.RayCast):
     """The ray-cast model in float32, in half the time; the world's draws stay in float64."""
 
-    def each(self, prepared, pose, beams):
-        return super().each(*single_log((prepared, pose, beams))).astype(pose.dtype)
+    def log_likelihoods(self, prepared, pose, beams):
+        return super().log_likelihoods(*single_log((prepared, pose, beams))).astype(pose.dtype)
 
 
 def tempering_field(runs):

@@ -21,7 +21,7 @@ from jaxslam.laser.grids._grid_localization import beam_log
 from jaxslam.math._linalg import root_psd
 from jaxslam.math.angles import wrap
 from jaxslam.resampling._weights import at_points, weights_of
-from jaxslam.simulation._laser import LaserWorld, check_world, scan_world
+from jaxslam.simulation.laser import LaserWorld, scan_world
 
 _DRAWS = 199
 """Draws from the particles that represent them in a step; with the truth they are 200."""
@@ -97,7 +97,9 @@ def judge_localization(
     Raises:
         ValueError: a world, a filter, a key, a covariance or a number that is none.
     """
-    check_world("judge_localization", world)
+    if not isinstance(world, LaserWorld):
+        got = type(world).__name__
+        raise ValueError(f"judge_localization: expected a LaserWorld, got {got}")
     if not isinstance(filter, Filter):
         raise ValueError(f"judge_localization: expected a Filter, got {type(filter).__name__}")
     check_count("judge_localization: runs", runs)

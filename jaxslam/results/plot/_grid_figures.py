@@ -258,7 +258,7 @@ def _draw_loops(
 @own_settings()
 def maps_before_after(solved: Solved, *, title: str = "", width: float = PAGE) -> Figure:
     """The maps of laser odometry alone and after closing, side by side. width: [in]."""
-    known = np.argwhere(np.asarray(solved.map.known) | np.asarray(solved.map_before.known))
+    known = np.argwhere(np.asarray(solved.map.observed) | np.asarray(solved.map_before.observed))
     if not len(known):
         known = np.array([[0, 0]])
     low, high = known.min(axis=0), known.max(axis=0) + 1

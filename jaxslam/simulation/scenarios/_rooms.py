@@ -11,9 +11,10 @@ from jaxslam.core._record import record
 from jaxslam.math._arrays import Landmark, Number, Pose
 from jaxslam.motion._unicycle import Unicycle
 from jaxslam.sensors._line import Line
-from jaxslam.simulation._laser import Laser, LaserWorld
-from jaxslam.simulation._walls import Walls, exact_ranges, make_walls, wall_lines
+from jaxslam.simulation._wall_geometry import Walls, exact_ranges, wall_lines
 from jaxslam.simulation._worlds import Scenario
+from jaxslam.simulation.laser import Laser, LaserWorld
+from jaxslam.simulation.walls import make_walls
 
 _SPEED, TURN, _STEP = 0.5, np.deg2rad(45.0), 0.25
 """Speed [m/s], rate of turn [rad/s] and interval [s] of the robot in these worlds."""

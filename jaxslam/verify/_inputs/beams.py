@@ -45,7 +45,7 @@ def beam_function(model: BeamModel) -> Function:
         )
 
     def log_density(pose: jax.Array, ranges: jax.Array) -> jax.Array:
-        return model.each(own(pose), pose, beams_of(ranges))
+        return model.log_likelihoods(own(pose), pose, beams_of(ranges))
 
     def claim(pose: jax.Array, ranges: jax.Array) -> tuple[jax.Array, None]:
         assert model.jacobian is not None

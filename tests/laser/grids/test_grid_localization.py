@@ -108,7 +108,7 @@ def test_one_update_weighs_the_particles_as_numpy_does(history):
 
 def test_a_scan_without_a_beam_changes_no_weight_and_every_takes_each_nth(history):
     _, log = history
-    filter = of(4, every=5, least=4)
+    filter = of(4, stride=5, least=4)
     start = filter.init(np.array([1.5, 1.2, 0.0]), 0.01 * np.eye(3))
     update = jax.jit(filter.update)
     scan = Scan(*(part[0].copy() for part in log.scan))
@@ -248,7 +248,7 @@ def test_a_log_of_beams_drops_what_says_nothing():
     ),
     (lambda: of(box=[[1, 1], [0, 0]]), "GridLocalization: expected a box"),
     (lambda: of(exponent=0.0), "GridLocalization: expected exponent above 0"),
-    (lambda: of(every=0), "GridLocalization: every"),
+    (lambda: of(stride=0), "GridLocalization: stride"),
     (lambda: of(0), "GridLocalization: particles"),
     (lambda: of(start="somewhere"), "GridLocalization: expected start"),
     (lambda: of(forget=(1, 0.1)), "GridLocalization: expected forget"),
