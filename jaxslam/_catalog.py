@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import Any, Literal, Unpack
+from typing import Any, Literal
 
 import jax.numpy as jnp
 import numpy as np
@@ -14,7 +14,6 @@ from jaxslam.core._names import Named
 from jaxslam.core._record import record, static
 from jaxslam.core.protocols import Candidate, Estimator, Filter
 from jaxslam.core.types import Truth
-from jaxslam.filters._ekf.ekf_settings import EkfOptions
 from jaxslam.filters._ekf.ekf_slam import EkfSlam
 from jaxslam.filters._ekf.monitor import Monitored
 from jaxslam.filters._information.eif_slam import EifSlam, InPieces
@@ -30,8 +29,23 @@ from jaxslam.linearize._other_points import AtTruth, FirstEstimate, Observabilit
 from jaxslam.linearize._unscented import Unscented
 from jaxslam.simulation._worlds import World
 
+_WINDOW = 5
+"""motions and scans in the window of the fixed-lag smoother"""
 
-def variant(scenario: World, *, watch: bool = False, **options: Unpack[EkfOptions]) -> Filter:
+_SLAM_PARTICLES = 50
+"""particles of FastSLAM; few, for campaigns of all filters"""
+
+_LOCALIZATION_PARTICLES = 300
+"""particles of Monte-Carlo localization, at every step"""
+
+_LEAST_AREA, _LARGEST_AREA = 8, 20
+"""active landmarks of the sparse information filter"""
+
+_OF_MAPS = "gate", "associate", "births"
+"""the options of `EkfSlam` that all filters which initialize landmarks have"""
+
+
+def variant(scenario: World, *, watch: bool = False, **options: Any) -> Filter:
     """EKF-SLAM with the scenario's options, which these arguments of `filters.EkfSlam` replace.
 
     watch: with an observability monitor (`filters.Monitored`).
@@ -40,20 +54,26 @@ def variant(scenario: World, *, watch: bool = False, **options: Unpack[EkfOption
         scenario.motion,
         scenario.sensor,
         _capacity(scenario),
-        **(scenario.filter_options | options),
+        **{**scenario.filter_options, **options},
     )
     return Monitored(filter) if watch else filter
 
 
-def ideal(
-    scenario: World, *, watch: bool = False, **options: Unpack[EkfOptions]
-) -> Callable[[Truth], Filter]:
+def ideal(scenario: World, *, watch: bool = False, **options: Any) -> Callable[[Truth], Filter]:
     """The ideal EKF, with Jacobians at the truth: a function of the truth that returns a filter."""
-    return _AtTheTruth(variant(scenario, **options), watch)
+    return _LinearizedAtTruth(variant(scenario, **options), watch)
+
+
+def on_given_poses(scenario: World, **options: Any) -> Filter:
+    """Mapping, whose controls are the poses, with those options of `EkfSlam` that it has."""
+    return Mapping(scenario.sensor, _capacity(scenario), **_options(scenario, options, *_OF_MAPS))
+
+
+# --- functions of a run's truth: records, so that their numbers are arguments of the programs -----
 
 
 @record
-class _AtTheTruth:
+class _LinearizedAtTruth:
     """An EKF, as a function of the truth that it is linearized at."""
 
     ekf: Filter
@@ -65,8 +85,8 @@ class _AtTheTruth:
 
 
 @record
-class _InTheTrueMap:
-    """A localization filter, as a function of the truth whose map it is given."""
+class _InTrueMap:
+    """A localization filter, as a function of the truth whose map it gets."""
 
     filter: Localization | ParticleLocalization
 
@@ -75,8 +95,8 @@ class _InTheTrueMap:
 
 
 @record
-class _OnTheTruePath:
-    """A filter of mapping, as a function of the truth whose poses it is given."""
+class _OnTruePath:
+    """A filter of mapping, as a function of the truth whose poses it gets."""
 
     filter: Filter
     start: ArrayLike
@@ -88,44 +108,37 @@ class _OnTheTruePath:
         )
 
 
-def _without_measurements(scenario: World, **options: Unpack[EkfOptions]) -> Filter:
-    """Dead reckoning in a scenario; it has none of the options of `EkfSlam`."""
+# --- filters for a scenario: each takes the options of `EkfSlam`, and uses those that it has ------
+
+
+def _capacity(scenario: World) -> int:
+    """A slot for each landmark."""
+    return int(np.shape(scenario.landmarks)[0])
+
+
+def _options(scenario: World, overrides: dict[str, Any], *names: str) -> dict[str, Any]:
+    """The options of these names, of the scenario or in place of the scenario's."""
+    options = {**scenario.filter_options, **overrides}
+    return {name: options[name] for name in names if name in options}
+
+
+def _dead_reckoning(scenario: World, **options: Any) -> Filter:
     return DeadReckoning(scenario.motion, scenario.sensor)
 
 
-def _options(scenario: World, more: EkfOptions, *names: str) -> dict[str, Any]:
-    """Those of the scenario's options and of some more that have these names."""
-    given = {**scenario.filter_options, **more}
-    return {name: given[name] for name in names if name in given}
+def _localization(scenario: World, **options: Any) -> Callable[[Truth], Filter]:
+    used = _options(scenario, options, "correction", "gate", "iterations")
+    return _InTrueMap(Localization(scenario.motion, scenario.sensor, scenario.landmarks, **used))
 
 
-_OF_MAPS = "gate", "associate", "births"
-"""The options of filters that initialize landmarks, without those only of `EkfSlam`."""
+def _mapping(scenario: World, **options: Any) -> Callable[[Truth], Estimator]:
+    """Mapping from the true path. Its pose has no NEES: it is exact."""
+    return _OnTruePath(on_given_poses(scenario, **options), np.asarray(scenario.pose))
 
 
-def _in_a_known_map(scenario: World, **options: Unpack[EkfOptions]) -> Callable[[Truth], Filter]:
-    """Localization in the true map, with those options of `EkfSlam` that it has."""
-    mine = _options(scenario, options, "correction", "gate", "iterations")
-    return _InTheTrueMap(Localization(scenario.motion, scenario.sensor, scenario.landmarks, **mine))
-
-
-def on_given_poses(scenario: World, **options: Unpack[EkfOptions]) -> Filter:
-    """Mapping, whose controls are the poses, with those options of `EkfSlam` that it has."""
-    mine = _options(scenario, options, *_OF_MAPS)
-    return Mapping(scenario.sensor, _capacity(scenario), **mine)
-
-
-def _on_the_true_path(
-    scenario: World, **options: Unpack[EkfOptions]
-) -> Callable[[Truth], Estimator]:
-    """Mapping from the true path; options as above. Its pose has no NEES: it is exact."""
-    return _OnTheTruePath(on_given_poses(scenario, **options), np.asarray(scenario.pose))
-
-
-def _by_particles(
-    scenario: World, proposal: Literal["motion", "measurement"], **options: Unpack[EkfOptions]
+def _fastslam(
+    scenario: World, proposal: Literal["motion", "measurement"], **options: Any
 ) -> Filter:
-    """FastSLAM of 50 particles, with those options of `EkfSlam` that it has."""
     return FastSlam(
         scenario.motion,
         scenario.sensor,
@@ -136,111 +149,84 @@ def _by_particles(
     )
 
 
-def _by_particles_in_a_known_map(
-    scenario: World, **options: Unpack[EkfOptions]
-) -> Callable[[Truth], Filter]:
-    """Monte-Carlo localization in the true map, of 300 particles; options as above."""
-    count, mine = _LOCALIZATION_PARTICLES, _options(scenario, options, "gate", "associate")
-    return _InTheTrueMap(
+def _particle_localization(scenario: World, **options: Any) -> Callable[[Truth], Filter]:
+    return _InTrueMap(
         ParticleLocalization(
             scenario.motion,
             scenario.sensor,
             scenario.landmarks,
-            count,
-            least=count,
+            _LOCALIZATION_PARTICLES,
+            least=_LOCALIZATION_PARTICLES,
             threshold=0.5,
-            **mine,
+            **_options(scenario, options, "gate", "associate"),
         )
     )
 
 
-def _in_a_window(
-    scenario: World, *, first_estimates: bool = False, **options: Unpack[EkfOptions]
-) -> Filter:
-    """The fixed-lag smoother of 5 steps, with those options of `EkfSlam` that it has."""
+def _fixed_lag(scenario: World, *, first_estimates: bool = False, **options: Any) -> Filter:
     capacity = _capacity(scenario)
-    false = 0 if scenario.spurious is None else scenario.spurious.places
+    clutter = 0 if scenario.spurious is None else scenario.spurious.places
     return FixedLag(
         scenario.motion,
         scenario.sensor,
         capacity,
-        (scenario.places or capacity) + false,
+        (scenario.places or capacity) + clutter,
         window=_WINDOW,
         first_estimates=first_estimates,
         **_options(scenario, options, *_OF_MAPS),
     )
 
 
-def _in_one_batch(scenario: World, **options: Unpack[EkfOptions]) -> BatchMap:
-    """The graph of the whole log (`smoothing.BatchMap`), with those options of `EkfSlam` that it
-    has."""
+def _batch_map(scenario: World, **options: Any) -> BatchMap:
     start = np.asarray(scenario.pose), np.asarray(scenario.pose_cov)
-    mine = _options(scenario, options, *_OF_MAPS)
-    return BatchMap(scenario.motion, scenario.sensor, _capacity(scenario), *start, **mine)
+    used = _options(scenario, options, *_OF_MAPS)
+    return BatchMap(scenario.motion, scenario.sensor, _capacity(scenario), *start, **used)
 
 
-_WINDOW = 5
-"""motions and scans in the window of the fixed-lag smoother in the catalog"""
-
-_SLAM_PARTICLES = 50
-"""number of particles of FastSLAM in the catalog; small, for campaigns of all filters."""
-
-_LOCALIZATION_PARTICLES = 300
-"""of Monte-Carlo localization in the catalog, at every step"""
+def _eif_slam(scenario: World, **options: Any) -> Filter:
+    used = _options(scenario, options, "gate")
+    return EifSlam(scenario.motion, scenario.sensor, _capacity(scenario), **used)
 
 
-def _in_canonical_form(scenario: World, **options: Unpack[EkfOptions]) -> Filter:
-    """The exact information filter in a scenario; of the options of `EkfSlam` it takes the gate."""
-    mine = _options(scenario, options, "gate")
-    return EifSlam(scenario.motion, scenario.sensor, _capacity(scenario), **mine)
+def _seif(scenario: World, **options: Any) -> Filter:
+    """The sparse information filter, with half the map active and all links.
 
-
-def _sparse_in_canonical_form(scenario: World, **options: Unpack[EkfOptions]) -> Filter:
-    """The sparse information filter in a scenario; of the options of `EkfSlam` it takes the gate.
-
-    It has half the map active, 8 landmarks at least and 20 at most, and all links. It reports
-    covariances from its whole Ω, not from Markov-blanket marginals, so that a campaign evaluates
-    the sparsification alone. With all of the map active it would be `EifSlam` by definition. All
-    landmarks that a scan measures must be active at once; so a scan of more measurement slots than
-    half of what is active (in `cloister` all 36 columns are measured in every step) is divided
-    (`InPieces`).
+    It reports covariances from its whole Ω, not from Markov-blanket marginals, so that a campaign
+    evaluates the sparsification alone. With all of the map active it would be `EifSlam` by
+    definition. All landmarks that a scan measures must be active at once; so a scan of more
+    measurement slots than half of what is active (in `cloister` all 36 columns are measured in
+    every step) is divided (`InPieces`).
     """
-    count = _capacity(scenario)
-    active = min(max(min(_LARGEST_AREA, count // 2), _LEAST_AREA), count)
+    capacity = _capacity(scenario)
+    active = min(max(min(_LARGEST_AREA, capacity // 2), _LEAST_AREA), capacity)
     filter = Seif(
         scenario.motion,
         scenario.sensor,
-        count,
+        capacity,
         active=active,
-        links=max(1, count - 1),
+        links=max(1, capacity - 1),
         whole=True,
         **_options(scenario, options, "gate"),
     )
-    return filter if active == count else InPieces(filter, active // 2)
-
-
-def _capacity(scenario: World) -> int:
-    return int(np.shape(scenario.landmarks)[0])
-
-
-_LEAST_AREA, _LARGEST_AREA = 8, 20
-"""active landmarks of the sparse information filter in the catalog"""
+    return filter if active == capacity else InPieces(filter, active // 2)
 
 
 FILTERS: Named[Callable[..., Candidate]] = Named(
     {
         "ekf": variant,
         "ideal": ideal,
-        "iterated": lambda world, **more: variant(world, iterations=3, **more),
-        "fej": lambda world, **more: variant(world, linearize=FirstEstimate(), **more),
-        "oc": lambda world, **more: variant(world, linearize=Observability(), **more),
-        "right_invariant": lambda world, **more: variant(world, chart=RightInvariant(), **more),
-        "left_invariant": lambda world, **more: variant(world, chart=LeftInvariant(), **more),
-        "ukf": lambda world, **more: variant(world, linearize=Unscented(), **more),
-        "ukf_right": lambda world, **more: variant(
-            world, chart=RightInvariant(), linearize=Unscented(), **more
+        "iterated": lambda world, **options: variant(world, iterations=3, **options),
+        "fej": lambda world, **options: variant(world, linearize=FirstEstimate(), **options),
+        "oc": lambda world, **options: variant(world, linearize=Observability(), **options),
+        "right_invariant": lambda world, **options: variant(
+            world, chart=RightInvariant(), **options
         ),
-        "square_root": lambda world, **more: variant(world, covariance="square_root", **more),
+        "left_invariant": lambda world, **options: variant(world, chart=LeftInvariant(), **options),
+        "ukf": lambda world, **options: variant(world, linearize=Unscented(), **options),
+        "ukf_right": lambda world, **options: variant(
+            world, chart=RightInvariant(), linearize=Unscented(), **options
+        ),
+        "square_root": lambda world, **options: variant(world, covariance="square_root", **options),
     }
 )
 """By name; each takes a scenario, further options of `EkfSlam`, and `watch` of `variant`, and
@@ -248,9 +234,9 @@ returns what `monte_carlo` runs on it."""
 
 BASELINES: Named[Callable[..., Candidate]] = Named(
     {
-        "dead_reckoning": _without_measurements,
-        "localization": _in_a_known_map,
-        "mapping": _on_the_true_path,
+        "dead_reckoning": _dead_reckoning,
+        "localization": _localization,
+        "mapping": _mapping,
     }
 )
 """The worst and the best cases of a SLAM filter: no measurements, a known map, and a known path; as
@@ -258,23 +244,23 @@ FILTERS."""
 
 PARTICLES: Named[Callable[..., Candidate]] = Named(
     {
-        "fastslam1": lambda world, **more: _by_particles(world, "motion", **more),
-        "fastslam2": lambda world, **more: _by_particles(world, "measurement", **more),
-        "particle_localization": _by_particles_in_a_known_map,
+        "fastslam1": lambda world, **options: _fastslam(world, "motion", **options),
+        "fastslam2": lambda world, **options: _fastslam(world, "measurement", **options),
+        "particle_localization": _particle_localization,
     }
 )
 """The particle filters; as FILTERS."""
 
-CANONICAL: Named[Callable[..., Candidate]] = Named(
-    {"eif_slam": _in_canonical_form, "seif": _sparse_in_canonical_form}
-)
+CANONICAL: Named[Callable[..., Candidate]] = Named({"eif_slam": _eif_slam, "seif": _seif})
 """The information filters, exact and sparse; as FILTERS."""
 
 SMOOTHERS: Named[Callable[..., Candidate]] = Named(
     {
-        "fixed_lag": _in_a_window,
-        "fixed_lag_fej": lambda world, **more: _in_a_window(world, first_estimates=True, **more),
-        "batch_map": _in_one_batch,
+        "fixed_lag": _fixed_lag,
+        "fixed_lag_fej": lambda world, **options: _fixed_lag(
+            world, first_estimates=True, **options
+        ),
+        "batch_map": _batch_map,
     }
 )
 """The fixed-lag smoothers, and the batch solution of the whole log; as FILTERS."""

@@ -29,21 +29,22 @@ from jaxslam.simulation._worlds import Scenario, simulate
 STEPS, RUNS = 25, 200
 POSTS = np.array([[2.0, 1.0], [-1.0, 3.0], [4.0, -2.0]])
 SIGMA = {"start": 0.1, "motion": 0.05, "sensor": 0.2, "heading": 1e-6}
-"""Standard deviations of the linear world [m]; of the heading [rad], which makes it nonlinear."""
+"""Standard deviations of the linear world [m]; of the heading [rad], which makes it nonlinear, so
+small that this is below the tolerances."""
 
 
 class Check(NamedTuple):
-    """A number that a check has found, and the interval it must lie in."""
+    """A number, and the interval it must lie in."""
 
     name: str
-    found: float
+    value: float
     high: float
     low: float = 0.0
 
     @property
     def passed(self) -> bool:
         """Whether it does; NaN does not."""
-        return bool(self.low <= self.found <= self.high)
+        return bool(self.low <= self.value <= self.high)
 
 
 def linear_world() -> Scenario:
@@ -86,8 +87,8 @@ def kalman_filter(log: Log) -> tuple[np.ndarray, np.ndarray]:
         cov[:2, :2] += SIGMA["motion"] ** 2 * np.eye(2)
         gain = np.linalg.solve(H @ cov @ H.T + R, H @ cov).T
         mean = mean + gain @ (np.asarray(z)[np.argsort(tag)].ravel() - H @ mean)
-        rest = np.eye(count) - gain @ H
-        cov = rest @ cov @ rest.T + gain @ R @ gain.T
+        I_KH = np.eye(count) - gain @ H
+        cov = I_KH @ cov @ I_KH.T + gain @ R @ gain.T
     return mean, cov
 
 
@@ -95,20 +96,21 @@ def against_kalman(log: Log, device: jax.Device) -> Check:
     """EKF-SLAM on a device against the Kalman filter, in the linear world."""
     mean, cov = kalman_filter(log)
     with jax.default_device(device):
-        found = jax.device_get(estimate_of(ekf_of(linear_world()), linear_world(), log))
-    order = np.argsort(found.tag[-1])
-    means = np.append(found.pose[-1, :2], found.points[-1, order])
-    covs = found.pose_cov[-1, :2, :2], found.point_covs[-1, order[0]]
+        estimate = jax.device_get(estimate_of(ekf_of(linear_world()), linear_world(), log))
+    order = np.argsort(estimate.tag[-1])
+    means = np.append(estimate.pose[-1, :2], estimate.points[-1, order])
+    covs = estimate.pose_cov[-1, :2, :2], estimate.point_covs[-1, order[0]]
     off = means - mean, covs[0] - cov[:2, :2], covs[1] - cov[2:4, 2:4]
-    worst = max(float(np.abs(each).max()) for each in off)
+    worst = max(float(np.abs(difference).max()) for difference in off)
     return Check(f"EKF-SLAM against a Kalman filter by NumPy, {device} [m]", worst, 1e-7)
 
 
 def information_form(log: Log) -> Check:
     """The information filter against EKF-SLAM, in the cloister."""
     world, eif = cloister(), EifSlam(cloister().motion, cloister().sensor, 36)
-    one, other = (estimate_of(each, world, log) for each in (ekf_of(world), eif))
-    worst = max(float(jnp.abs(a - b).max()) for a, b in zip(one[:4], other[:4], strict=True))
+    dense, information = (estimate_of(filter, world, log) for filter in (ekf_of(world), eif))
+    pairs = zip(dense[:4], information[:4], strict=True)
+    worst = max(float(jnp.abs(a - b).max()) for a, b in pairs)
     return Check("information form against covariance form", worst, 1e-7)
 
 
@@ -116,8 +118,8 @@ def graph(log: Log) -> Check:
     """The optimum of the graph of a log against the filter, at the last pose of a linear world."""
     world = linear_world()
     start, cov = np.asarray(world.pose), np.asarray(world.pose_cov)
-    made, factors = graphs.of_log(log, world.motion, world.sensor, start, cov)
-    optimum = graphs.optimize(made, factors, tolerance=1e-16).graph.poses[-1]
+    initial, factors = graphs.of_log(log, world.motion, world.sensor, start, cov)
+    optimum = graphs.optimize(initial, factors, tolerance=1e-16).graph.poses[-1]
     filtered = estimate_of(ekf_of(world), world, log).pose[-1]
     off = float(jnp.abs(optimum - filtered)[:2].max())
     return Check("optimum of a graph against EKF-SLAM, linear [m]", off, 1e-7)
@@ -164,9 +166,9 @@ def consistency() -> Check:
         error = (last.pose[-1] - truth.pose[-1])[:2]
         return jnp.vdot(error, jnp.linalg.solve(last.pose_cov[-1, :2, :2], error))
 
-    found = jax.jit(jax.vmap(nees))(jax.random.split(jax.random.key(0), RUNS)).mean()
+    average = jax.jit(jax.vmap(nees))(jax.random.split(jax.random.key(0), RUNS)).mean()
     low, high = chi2_band(2, RUNS, 0.999)
-    return Check(f"NEES of the position, {RUNS} runs", float(found), high, low)
+    return Check(f"NEES of the position, {RUNS} runs", float(average), high, low)
 
 
 def checks() -> Iterator[Check]:
@@ -188,7 +190,7 @@ def main() -> int:
     began, failed = time.perf_counter(), 0
     print(", ".join(f"{name} {version}" for name, version in versions().items()), flush=True)
     for check in checks():
-        line = f"{check.name:<62} {check.found:10.3g}  in [{check.low:.4g}, {check.high:.4g}]"
+        line = f"{check.name:<62} {check.value:10.3g}  in [{check.low:.4g}, {check.high:.4g}]"
         print("ok    " if check.passed else "FAILED", line, sep="  ", flush=True)
         failed += not check.passed
     print(f"{failed} failed, {time.perf_counter() - began:.0f} s")

@@ -107,12 +107,12 @@ def positive_interval(
 
     Of a single number the interval is all that is positive, (0, ∞).
     """
-    found = spread(values, level, skewed)
-    if found is None:
+    average = spread(values, level, skewed)
+    if average is None:
         return None
-    if not np.isfinite(found.error):
-        return Average(found.mean, 0.0, np.inf)
-    return Average(found.mean, found.low, found.high)
+    if not np.isfinite(average.error):
+        return Average(average.mean, 0.0, np.inf)
+    return Average(average.mean, average.low, average.high)
 
 
 def interval(values: np.ndarray | Sequence[float], level: float = EACH) -> Average | None:

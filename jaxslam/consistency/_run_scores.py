@@ -60,7 +60,7 @@ def snapshot_steps(steps: int) -> np.ndarray:
 def score(
     trace: Trace,
     truth: Truth,
-    found: RunStatistics,
+    statistics: RunStatistics,
     own_error: Float[np.ndarray, "R T 3"] | None = None,
     measured: Int[np.ndarray, "R"] | None = None,
 ) -> Score:
@@ -70,7 +70,7 @@ def score(
         trace: of the estimate only poses and their covariances are looked at, of the final state
             its observability monitor (`monitor_of`), and where it has one, of `probe` the
             information of that after each step (R, T, 3, 3).
-        found: `run_statistics` of each run.
+        statistics: `run_statistics` of each run.
         own_error: the pose errors in the coordinates of the filter (see `own_error_of`), by default
             those in (x, y, θ).
         measured: the measurements in the log of each run, by default those that the infos have.
@@ -79,7 +79,7 @@ def score(
     error = pose_error(np.asarray(truth.pose), pose)
     steps = error.shape[1]
     nees = block_nees(pose, error, error if own_error is None else own_error, cov)
-    landmarks = found.landmark_nees, found.regular_landmarks
+    landmarks = statistics.landmark_nees, statistics.regular_landmarks
     nees["landmarks"] = Nees(*(np.asarray(x, np.float64) for x in landmarks))
     became, faults = counted(trace.info), covariance_faults(pose, cov)
     if measured is None:
@@ -94,16 +94,16 @@ def score(
         "indefinite_steps": faults.indefinite.sum(axis=1),
         "constant": _is_constant(trace, truth),
     }
-    runs = Runs(truth, trace, found, error, nees)
+    runs = Runs(truth, trace, statistics, error, nees)
     measures: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-    finite = np.array(found.finite)
+    finite = np.array(statistics.finite)
     for measure in REGISTRY.values():
-        each = measure.of_runs(runs)
-        if each is None:
+        scores = measure.of_runs(runs)
+        if scores is None:
             continue
-        total, weight = np.asarray(each.total), np.broadcast_to(each.weight, finite.shape)
+        total, weight = np.asarray(scores.total), np.broadcast_to(scores.weight, finite.shape)
         measures[measure.column] = total, weight
-        sums |= each.sums
+        sums |= scores.sums
     for rows in jax.tree.leaves((measures, sums)):
         finite &= np.isfinite(rows).reshape(len(rows), -1).all(axis=1)
     at = snapshot_steps(steps)
@@ -133,7 +133,7 @@ class _Sums(NamedTuple):
     recent: list[Array]
     """(LAGS, N) each, the latest steps first: the numbers of w, |w|² and a mask of the values"""
     pairs: list[Array]
-    """(LAGS, N) each: Σ wᵀw', |w|²|there'|, |there||w'|², |there||there'|"""
+    """(LAGS, N) each: Σ wᵀw', |w|² v', v |w'|², v v', with v the mask of the values"""
 
 
 def run_statistics(
@@ -200,7 +200,7 @@ def run_statistics(
         regular_landmarks=regular,
         landmark_squares=jnp.stack([square, named.sum().astype(dtype)]),
         autocorrelation=jnp.stack([product, length, pairs * size], axis=1),
-        values=values | {one.key: _value(one, trace, truth) for one in measures if one.of_run},
+        values=values | {m.key: _value(m, trace, truth) for m in measures if m.of_run},
     )
 
 
@@ -235,7 +235,7 @@ def _planar_nees(
     p1, p12, p2 = cov[:, 0, 0], cov[:, 1, 0], cov[:, 1, 1]
     valid = (p1 > 0) & (p2 > 0) & jnp.isfinite(error).all(axis=1)
     p1, p2 = (jnp.where(valid, p, 1.0) for p in (p1, p2))
-    left = 1 - (p12 / p1) * (p12 / p2)
+    left = 1 - (p12 / p1) * (p12 / p2)  # 1 - ρ², without products that underflow
     regular = valid & (left > 200 * float(jnp.finfo(cov.dtype).eps))
     a = error[:, 0]
     b = error[:, 1] - a * (p12 / p1)
@@ -263,8 +263,8 @@ def _white(estimate: Estimate, info: Info) -> list[Array]:
 
     def place(kept: list[Array], at: tuple[list[Array], Array]) -> tuple[PyTree, None]:
         row, slot = at
-        mine = jnp.arange(count, dtype=slot.dtype) == slot
-        return [jnp.where(mine, new, old) for new, old in zip(row, kept, strict=True)], None
+        is_slot = jnp.arange(count, dtype=slot.dtype) == slot
+        return [jnp.where(is_slot, new, old) for new, old in zip(row, kept, strict=True)], None
 
     nothing = [jnp.zeros(count, white.dtype)] * len(rows)
     unroll = max(min(len(slot), _UNROLLED), 1)

@@ -92,11 +92,11 @@ def summarize(tally: Tally, bound: Mapping[str, np.ndarray] | None = None) -> Su
     """
     sums, finite = tally.sums, tally.flags("finite")
     runs, per_run = int(finite.sum()), tally.measures()
-    every, snapshots = measures_of(per_run), tally.snapshots()
+    registered, snapshots = measures_of(per_run), tally.snapshots()
     of_snapshots = np.flatnonzero(finite & (tally.numbers() < SHOTS))
     measures: dict[str, Average] = {}
     curves: dict[str, np.ndarray] = {}
-    for measure in every:
+    for measure in registered:
         shot = measure.of_snapshots(*snapshots)
         if shot is not None:
             per_run[measure.column] = np.full(len(finite), np.nan)

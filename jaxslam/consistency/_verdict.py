@@ -104,7 +104,7 @@ def judge(
         average = spread(values, EACH, skewed=of_nees)
         assert average is not None
         honest = honest_values(honest_nis)[name]
-        signs[name], noticed[name] = _side(average, *honest), _noticed(average, *honest)
+        signs[name], noticed[name] = _side(average, *honest), _noticeable(average, *honest)
         wide = wide and not (of_nees and average.above <= 2)
     by = tuple(name for name, sign in signs.items() if sign)
     if by and signs[by[0]] > 0:
@@ -135,21 +135,21 @@ def power_of(noticed: Mapping[str, tuple[float, float]]) -> str:
     return f"{percentage(POWER)} power to reject {', '.join(parts)}" if parts else ""
 
 
-def _side(found: Spread, low: float, high: float) -> int:
+def _side(average: Spread, low: float, high: float) -> int:
     """The sign of a rejection: 1 for an interval above the honest value, -1 for below, else 0."""
-    if found.low > high and found.high > high * (1 + TOLERANCE):
+    if average.low > high and average.high > high * (1 + TOLERANCE):
         return 1
-    return -1 if found.high < low and found.low < low / (1 + TOLERANCE) else 0
+    return -1 if average.high < low and average.low < low / (1 + TOLERANCE) else 0
 
 
-def _noticed(found: Spread, low: float, high: float) -> tuple[float, float]:
+def _noticeable(average: Spread, low: float, high: float) -> tuple[float, float]:
     """Averages that are noticed with probability `POWER`, of a relative spread as found.
 
     An average m is rejected beyond high·(m/μ at the lower end); the mean of which a share `POWER`
     lies beyond that is z standard errors farther.
     """
-    margin = normal_quantile(POWER) * found.error
-    least, most = low * found.below, high * max(found.above, 1 + TOLERANCE)
+    margin = normal_quantile(POWER) * average.error
+    least, most = low * average.below, high * max(average.above, 1 + TOLERANCE)
     return least / (1 + margin), most / (1 - margin) if margin < 1 else np.inf
 
 
@@ -184,8 +184,8 @@ class _Measured(NamedTuple):
     """landmarks in view that have no measurement in the log"""
 
     @property
-    def none_taken(self) -> bool:
-        """Whether the filter takes no measurements, as dead reckoning: all are unmatched, or none
+    def uses_none(self) -> bool:
+        """Whether the filter uses no measurement, as dead reckoning: all are unmatched, or none
         has a status."""
         return not self.used and sum(self.dropped.values()) == self.dropped["unmatched"]
 
@@ -193,8 +193,9 @@ class _Measured(NamedTuple):
 def _measured(counts: Mapping[str, int]) -> _Measured:
     dropped = {name: counts.get(name, 0) for name in map(_name, DROPS)}
     used = sum(counts.get(name, 0) for name in map(_name, KEPT))
-    every = used + sum(dropped.values())
-    return _Measured(max(counts.get("measured", 0), every), used, dropped, counts.get("missed", 0))
+    with_status = used + sum(dropped.values())
+    total = max(counts.get("measured", 0), with_status)
+    return _Measured(total, used, dropped, counts.get("missed", 0))
 
 
 def _is_starved(counts: Mapping[str, int]) -> bool:
@@ -202,7 +203,7 @@ def _is_starved(counts: Mapping[str, int]) -> bool:
     measured = _measured(counts)
     if counts.get("measured") == 0:
         return True
-    if measured.none_taken:
+    if measured.uses_none:
         return False
     return measured.total > 2 * measured.used or measured.missed > measured.total
 
@@ -270,7 +271,7 @@ def _doubts_on_measurements(counts: Mapping[str, int], nis_dof: float) -> list[s
     if not measured.total:
         return out
     ignored = measured.total - measured.used - sum(measured.dropped.values())
-    if measured.none_taken:
+    if measured.uses_none:
         out.append(
             f"takes none of the {measured.total:,} measurements (by its Info): judged by the NEES "
             "alone"

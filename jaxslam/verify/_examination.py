@@ -41,7 +41,7 @@ class _Examined(NamedTuple):
 def examine(
     model: Model,
     functions: tuple[Function, ...],
-    given: Samples | None = None,
+    states: Samples | None = None,
     count: int = 24,
     seed: int = 0,
 ) -> _Examined:
@@ -50,31 +50,31 @@ def examine(
     Args:
         model: a `Motion`, a `Sensor`, or a function.
         functions: of the model, as from `functions_of`.
-        given: the states for the first function, instead of samples.
+        states: of the first function, instead of samples.
         count, seed: of the random states.
     """
     with float64(), np.errstate(all="ignore"):
         model = _with_limited_loops(model, functions)
-        drawn = _samples_of(functions, model, count, seed)
-        if given is not None:
-            drawn = (given, *drawn[1:])
+        sampled = _samples_of(functions, model, count, seed)
+        if states is not None:
+            sampled = (states, *sampled[1:])
             if isinstance(model, Sensor) and model.landmark:
-                # Where `observe` fails, its own checks say so, and `invert` keeps the drawn states.
+                # Where `observe` fails, its own checks say so, and `invert` keeps its samples.
                 with contextlib.suppress(Exception, SystemExit):
-                    drawn = (given, samples.given_inverse(model, given, drawn[1]))
+                    sampled = (states, samples.inverse_samples(model, states, sampled[1]))
         evaluated = tuple(
-            evaluate_jacobians(f, sampled) for f, sampled in zip(functions, drawn, strict=True)
+            evaluate_jacobians(*pair) for pair in zip(functions, sampled, strict=True)
         )
         checks: list[Check] = []
-        for one in evaluated:
-            checks += [*one.checks, *properties.function_checks(one)]
+        for e in evaluated:
+            checks += [*e.checks, *properties.function_checks(e)]
             if isinstance(model, Motion | Sensor | BeamModel):
-                checks += properties.dtype_checks(one)
-        if all(one.values is not None for one in evaluated):  # else they fail for the same reason
-            checks += _model_checks(model, tuple(one.samples for one in evaluated))
-        notes = [note for one in evaluated for note in one.notes]
-        if given is None and not isinstance(model, Motion | Sensor):
-            notes += [note for one in evaluated for note in singular_notes(one)]
+                checks += properties.dtype_checks(e)
+        if all(e.values is not None for e in evaluated):  # else they fail for the same reason
+            checks += _model_checks(model, tuple(e.samples for e in evaluated))
+        notes = [note for e in evaluated for note in e.notes]
+        if states is None and not isinstance(model, Motion | Sensor):
+            notes += [note for e in evaluated for note in singular_notes(e)]
         linearity = _typical_linearity(model, evaluated[0])
     return _Examined(evaluated, tuple(checks), tuple(notes), linearity)
 
@@ -100,13 +100,13 @@ def _with_limited_loops(model: Model, functions: tuple[Function, ...]) -> Model:
     return model
 
 
-def _model_checks(model: Model, drawn: tuple[Samples, ...]) -> Iterator[Check]:
+def _model_checks(model: Model, sampled: tuple[Samples, ...]) -> Iterator[Check]:
     """The checks of a motion model or a sensor as a whole."""
     try:
         if isinstance(model, Motion):
-            yield from properties.motion_checks(model, drawn[0])
+            yield from properties.motion_checks(model, sampled[0])
         elif isinstance(model, Sensor):
-            yield from properties.sensor_checks(model, *drawn)
+            yield from properties.sensor_checks(model, *sampled)
     except (Exception, SystemExit) as error:
         yield Check("the remaining checks", False, describe_error(error))
 

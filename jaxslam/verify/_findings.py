@@ -112,10 +112,10 @@ class Finding:
             worst += f", {self.quotient} {_two_digits(self.differences)}"
         if not (self.samples and math.isfinite(self.absolute)):
             worst = "a derivative is not finite" if self.samples else "no value is finite"
-        what = "hand-derived" if self.claimed else "no hand-derived claim"
+        claim = "hand-derived" if self.claimed else "no hand-derived claim"
         if not {"jacfwd", "jacrev"} & {*self.methods}:
-            what += f", compared with {self.quotient} alone"
-        yield f"{verdict}  {self.name} ({what}): {worst}; {self.samples} states{odd}"
+            claim += f", compared with {self.quotient} alone"
+        yield f"{verdict}  {self.name} ({claim}): {worst}; {self.samples} states{odd}"
         for entry in self.wrong_entries[:_SHOWN]:
             yield from (f"      {line}" for line in entry.lines(self.samples))
         if len(self.wrong_entries) > _SHOWN:
@@ -249,9 +249,9 @@ def _wrapped(text: str, indent: int) -> list[str]:
 
 
 def _worst(values: Sequence[float | None]) -> str:
-    """The largest of the values that are known, as text."""
-    known = [value for value in values if value is not None]
-    return _two_digits(max(known)) if known else "-"
+    """The largest of the values that are not None, as text."""
+    present = [value for value in values if value is not None]
+    return _two_digits(max(present)) if present else "-"
 
 
 def _two_digits(value: float) -> str:

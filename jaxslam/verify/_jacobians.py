@@ -175,7 +175,7 @@ class _Evaluator:
             self.samples = Samples(tuple(a[rows] for a in self.arguments), labels)
         return np.asarray(values[ended], np.float64)
 
-    def _check_loops(self, what: str, ended: Bool[np.ndarray, "S"]) -> None:
+    def _check_loops(self, subject: str, ended: Bool[np.ndarray, "S"]) -> None:
         """Add a failed check if the loops of something have not ended at some states."""
         if ended.all():
             return
@@ -183,7 +183,7 @@ class _Evaluator:
         state = at_state(self.function, [a[first] for a in self.arguments])
         self.checks.append(
             Check(
-                f"the loops of {what} end",
+                f"the loops of {subject} end",
                 False,
                 f"in float64 a while loop has not ended after {ROUNDS:,} rounds at "
                 f"{np.sum(~ended)} of {len(ended)} states; {self.samples.labels[first]}: {state}",
@@ -252,10 +252,10 @@ class _Evaluator:
             name: ending(MODES[name](self.function.call, argnums=self.over)) for name in self.modes
         }
 
-        def each(*arguments: jax.Array) -> PyTree:
+        def jacobians_at(*arguments: jax.Array) -> PyTree:
             return {name: jacobian(*arguments) for name, jacobian in jacobians.items()}
 
-        return quick_jit(jax.vmap(each))
+        return quick_jit(jax.vmap(jacobians_at))
 
     def _autodiff(
         self, arguments: tuple[States, ...]
@@ -369,19 +369,21 @@ class _Evaluator:
         arguments = self.arguments
         one_by_one = isinstance(self.values_and_ends, _StateByState)
         halvings = {"halvings": _FEW} if one_by_one else {}
-        found = quotients(self.values, arguments, which, circle, **halvings)
+        by_differences = quotients(self.values, arguments, which, circle, **halvings)
         if not one_by_one and arguments[which].shape[1] and not np.isfinite(circle).any():
             try:
                 exact = complex_step(self.values, arguments, which)
             except (Exception, SystemExit):
-                return found, "differences"
+                return by_differences, "differences"
             # Only where differences confirm it: `abs` and comparisons make it wrong.
-            off = np.abs(exact - found.value) > 10 * found.error + 1e-9 * np.abs(found.value)
-            if np.isfinite(exact).all() and not off[found.error < np.inf].any():
+            off = np.abs(exact - by_differences.value) > 10 * by_differences.error + 1e-9 * np.abs(
+                by_differences.value
+            )
+            if np.isfinite(exact).all() and not off[by_differences.error < np.inf].any():
                 rounding = 1e-14 * np.abs(exact).max(axis=2, keepdims=True, initial=0)
                 error = np.broadcast_to(rounding, exact.shape)
-                return Quotient(exact, error, found.kink), "complex step"
-        return found, "differences"
+                return Quotient(exact, error, by_differences.kink), "complex step"
+        return by_differences, "differences"
 
 
 def _in_chunks(batch: Callable[..., PyTree]) -> Callable[..., tuple[np.ndarray, np.ndarray]]:

@@ -92,19 +92,19 @@ def sensor_checks(sensor: Sensor, seen: Samples, inverse: Samples) -> Iterator[C
     if not all(check.passed for check in size):
         yield from size
         return
-    other = z[::-1] + np.random.default_rng(0).uniform(-1, 1, z.shape)
+    z_hat = z[::-1] + np.random.default_rng(0).uniform(-1, 1, z.shape)
     yield from _guard(
         "the residual is zero at equality",
         lambda: _exactly(residual(z, z)),
     )
     yield from _guard(
         "the residual is antisymmetric",
-        lambda: _deviation(residual(z, other) + residual(other, z), circle),
+        lambda: _deviation(residual(z, z_hat) + residual(z_hat, z), circle),
     )
     wrapped = ", wrapped on the circle" if np.isfinite(circle).any() else ""
     yield from _guard(
         f"the residual is a difference{wrapped}",
-        lambda: _residual_error(residual, z, other, circle),
+        lambda: _residual_error(residual, z, z_hat, circle),
     )
     yield from _guard("angles have [rad] in their names", lambda: _unnamed_angle(sensor, seen))
     if not sensor.landmark:
@@ -200,20 +200,20 @@ def _wrap_named(difference: Float[jax.Array, "L"], names: tuple[str, ...]) -> ja
 
 
 def _residual_error(
-    residual: Callable[[Values, Values], jax.Array], z: Values, other: Values, circle: Values
+    residual: Callable[[Values, Values], jax.Array], z: Values, z_hat: Values, circle: Values
 ) -> str:
     """What is wrong with residual(z, ẑ) = z - ẑ modulo the periods, or ""."""
-    plain = np.asarray(residual(z, other))
+    plain = np.asarray(residual(z, z_hat))
     circular = np.isfinite(circle)
     period = np.where(circular, circle, 1.0)
-    off = modulo_periods(plain - modulo_periods(z - other, circle), circle)
+    off = modulo_periods(plain - modulo_periods(z - z_hat, circle), circle)
     if np.abs(off).max() > _ROUNDING * (1 + np.abs(z).max()):
         return f"residual(z, ẑ) differs from z - ẑ by {np.abs(off).max():.3g}"
     if np.any(np.abs(plain)[:, circular] > period[circular] / 2 + 1e-12):
         return "it returns an angle beyond half a turn"
     for turns in (1, -3):
-        whole = np.where(circular, turns * period, 0.0)
-        far = np.abs(np.asarray(residual(z + whole, other)) - plain)
+        shift = np.where(circular, turns * period, 0.0)
+        far = np.abs(np.asarray(residual(z + shift, z_hat)) - plain)
         far = np.where(circular, np.minimum(far, np.abs(far - period)), far)
         if far.max() > 1e-8:
             return "adding whole turns to z changes the residual"

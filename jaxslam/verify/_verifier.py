@@ -103,8 +103,7 @@ def verify_jacobians(
     if not (isinstance(model, Motion | Sensor | Factor | BeamModel) or callable(model)):
         raise ValueError(
             "verify_jacobians: expected a Motion, a Sensor, a Factor, a BeamModel or a function of "
-            f"vectors, got "
-            f"{type(model).__name__}"
+            f"vectors, got {type(model).__name__}"
         )
     if (
         not isinstance(model, Motion | Sensor | Factor | BeamModel)
@@ -112,11 +111,11 @@ def verify_jacobians(
         and makes_a_model(model)
     ):
         factory = getattr(model, "__name__", "factory")
-        what = "class" if isinstance(model, type) else "factory"
+        factory_kind = "class" if isinstance(model, type) else "factory"
         parameters = inspect.signature(model).parameters.values()
         noise = "noise_cov" if any(p.default is p.empty for p in parameters) else ""
         raise ValueError(
-            f"verify_jacobians: expected a Motion, a Sensor or a Factor, got the {what} "
+            f"verify_jacobians: expected a Motion, a Sensor or a Factor, got the {factory_kind} "
             f"{factory} of one: call it, as in {factory}({noise}), or use "
             f"jaxslam.verify.build({factory})"
         )
@@ -138,12 +137,14 @@ def verify_jacobians(
         with float64():
             functions = (plain_function(model, jacobian, arguments, outputs, name, states),)
         kind, name = "function", functions[0].name
-    given = None
+    samples = None
     if states is not None:
-        given = _given_samples(functions[0], states, by_name=kind == "function" and not arguments)
-    if given is None and isinstance(model, BeamModel):
-        given = beam_samples(model, count, seed)
-    examined = examine(model, functions, given, count, seed)
+        samples = _samples_of_states(
+            functions[0], states, by_name=kind == "function" and not arguments
+        )
+    if samples is None and isinstance(model, BeamModel):
+        samples = beam_samples(model, count, seed)
+    examined = examine(model, functions, samples, count, seed)
     with np.errstate(all="ignore"):
         findings = [
             finding
@@ -166,13 +167,13 @@ def build(
     parameters = inspect.signature(factory).parameters
     mounted = {"mount": _MOUNT} if "mount" in parameters else {}
     if "max_range" in parameters:
-        made = factory(max_range=FAR, **mounted)
-        if isinstance(made, BeamModel):
-            return made
+        model = factory(max_range=FAR, **mounted)
+        if isinstance(model, BeamModel):
+            return model
     if all(p.default is not p.empty for p in parameters.values()):
-        made = factory(**mounted)
-        if isinstance(made, Factor | Motion | Sensor):
-            return made
+        model = factory(**mounted)
+        if isinstance(model, Factor | Motion | Sensor):
+            return model
     probe = factory(lambda *_: None)
     if not isinstance(probe, Motion | Sensor):
         raise ValueError(f"expected a Motion or a Sensor, got {type(probe).__name__}")
@@ -180,7 +181,9 @@ def build(
     return factory(0.01 * np.eye(size), **mounted)
 
 
-def _given_samples(function: Function, states: Sequence[ArrayLike], *, by_name: bool) -> Samples:
+def _samples_of_states(
+    function: Function, states: Sequence[ArrayLike], *, by_name: bool
+) -> Samples:
     """The states of the caller; raises ValueError on a wrong shape.
 
     by_name: whether lengths may follow from the names of the arguments.

@@ -5,7 +5,7 @@ import dataclasses
 import inspect
 import time
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -40,7 +40,6 @@ from jaxslam.datasets import READERS, Dataset
 from jaxslam.datasets._evaluation import Evaluation, evaluate, joint_map_cov
 from jaxslam.datasets._landmark_logs.table_settings import METHODS, association_options
 from jaxslam.datasets._uncertain_constants import considered
-from jaxslam.filters._ekf.ekf_settings import EkfOptions
 from jaxslam.math._definite import indefinite
 from jaxslam.results import _report as report
 from jaxslam.results._campaign_files import FORMATS, check_figure_formats
@@ -373,7 +372,7 @@ def with_options(data: Dataset, options: argparse.Namespace) -> Dataset:
     assumed = (
         line for line in data.assumed if not line.startswith(tuple(f"[filter] {n}" for n in given))
     )
-    plain: EkfOptions = {"gate": None, "associate": Known()}
+    plain: dict[str, Any] = {"gate": None, "associate": Known()}
     changed = data.filter_options | plain | chosen
     return dataclasses.replace(data, filter_options=changed, assumed=tuple(assumed))
 

@@ -49,7 +49,7 @@ def association_scores(
     before = jnp.pad(held[:-1], [(1, 0), (0, 0)], constant_values=-1)
     mine = jnp.take_along_axis(before, jnp.maximum(info.slot, 0), axis=1)
     right = (fused & (origin >= 0) & (mine == origin)).sum()
-    known = (origin >= 0) & (origin[:, :, None] == before[:, None, :]).any(axis=2)
+    in_map = (origin >= 0) & (origin[:, :, None] == before[:, None, :]).any(axis=2)
     last, alive = held[-1], trace.estimate.alive[-1]
     same = (last[:, None] == last[None, :]) & alive[None, :]
     again = (same & jnp.tril(jnp.ones(same.shape, bool), -1)).any(axis=1)
@@ -57,6 +57,6 @@ def association_scores(
     dtype = trace.estimate.pose.dtype
     return {
         "precision": (right.astype(dtype), fused.sum()),
-        "recall": (right.astype(dtype), known.sum()),
+        "recall": (right.astype(dtype), in_map.sum()),
         "false_landmarks": (false.sum().astype(dtype), jnp.asarray(1)),
     }

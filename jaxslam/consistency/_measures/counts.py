@@ -60,13 +60,16 @@ def counted(info: Info) -> dict[str, Int[np.ndarray, "R"]]:
     …), by name.
     """
     runs = len(info.status)
+    # A number for each pair of run and status, which one bincount counts.
     at = np.asarray(info.status).reshape(runs, -1) + np.arange(runs)[:, None] * len(Status)
     became = np.bincount(at.ravel(), minlength=runs * len(Status)).reshape(runs, -1)
-    found = {status.name.lower(): became[:, status] for status in KEPT + DROPS}
-    reports = [each.counts() for each in (info.extra or {}).values() if hasattr(each, "counts")]
+    counts = {status.name.lower(): became[:, status] for status in KEPT + DROPS}
+    reports = [
+        report.counts() for report in (info.extra or {}).values() if hasattr(report, "counts")
+    ]
     if info.exhausted is not None:
         reports.append({"exhausted": info.exhausted})
     events = {name: happened for report in reports for name, happened in report.items()}
     for name in sorted(events, key=[*MEANINGS, *events].index):
-        found[name] = np.asarray(events[name]).reshape(runs, -1).sum(axis=1)
-    return found
+        counts[name] = np.asarray(events[name]).reshape(runs, -1).sum(axis=1)
+    return counts

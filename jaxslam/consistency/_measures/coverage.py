@@ -27,9 +27,9 @@ class Credibility(Measure):
         covs: Float[np.ndarray, "R K 3 3"],
         regular: Bool[np.ndarray, "R K"],
     ) -> Float[np.ndarray, "R"] | None:
-        """It of each run, by the actual covariance of all."""
-        found = credibility(errors, covs, regular)
-        return None if found is None else found[self.part]
+        """The number of each run, by the actual covariance of all runs."""
+        parts = credibility(errors, covs, regular)
+        return None if parts is None else parts[self.part]
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,6 +141,7 @@ def _coverage(nees: Nees, dof: int) -> Int[np.ndarray, "R LEVELS"]:
     runs, bins = len(nees.value), len(LEVELS) + 1
     radii = [chi2_quantile(p, dof) for p in LEVELS]
     beyond = np.searchsorted(radii, np.where(nees.regular, nees.value, np.inf))
+    # A number for each pair of run and bin, which one bincount counts.
     at = beyond + np.arange(runs)[:, None] * bins
     within = np.bincount(at.ravel(), minlength=runs * bins).reshape(runs, bins)
     out: np.ndarray = within.cumsum(axis=1)[:, :-1]

@@ -28,8 +28,10 @@ class Rmse(Measure):
 
     def average(self, per_run: np.ndarray, sums: Sums) -> Average | None:
         """The root of the mean square, and those of the ends of its interval."""
-        found = positive_interval(per_run)
-        return found and Average(*(self.scale * float(np.sqrt(value)) for value in found))
+        mean_square = positive_interval(per_run)
+        return mean_square and Average(
+            *(self.scale * float(np.sqrt(value)) for value in mean_square)
+        )
 
     def curves(self, sums: Sums, runs: int) -> dict[str, np.ndarray]:
         """The error at each step, over all runs."""

@@ -37,8 +37,8 @@ class Autocorrelation(Measure):
 
     def of_runs(self, runs: Runs) -> RunScores:
         """Products and squares at lag 1; sums of all lags."""
-        found = np.asarray(runs.statistics.autocorrelation)
-        return RunScores(found[:, 0, 0], found[:, 0, 1], {"autocorrelation": found})
+        products = np.asarray(runs.statistics.autocorrelation)
+        return RunScores(products[:, 0, 0], products[:, 0, 1], {"autocorrelation": products})
 
 
 @dataclass(frozen=True, eq=False)

@@ -113,13 +113,13 @@ class Measure:
 
     def of_runs(self, runs: Runs) -> RunScores | None:
         """The measure of each run; None where such a filter has none."""
-        found = runs.statistics.values.get(self.key)
-        if found is None:
+        value = runs.statistics.values.get(self.key)
+        if value is None:
             return None
-        if isinstance(found, tuple):
-            return RunScores(np.asarray(found[0]), np.asarray(found[1]))
-        finite = np.isfinite(found)
-        values = np.where(finite, found, 0.0).astype(np.float64)
+        if isinstance(value, tuple):
+            return RunScores(np.asarray(value[0]), np.asarray(value[1]))
+        finite = np.isfinite(value)
+        values = np.where(finite, value, 0.0).astype(np.float64)
         if values.ndim == 1:
             return RunScores(values, finite)
         sums = {self.key: values, f"runs_{self.key}": finite.astype(np.float64)}

@@ -70,13 +70,13 @@ MEASURES = tuple(
 
 def inside_bands(curves: Mapping[str, np.ndarray]) -> dict[str, float]:
     """The share of the steps whose average NEES lies in its band, by block."""
-    found = {}
+    shares = {}
     for block in DOF:
         mean, has = curves[f"nees_{block}"], curves[f"runs_{block}"] > 0
         if has.any():
             low, high = curves[f"nees_{block}_low"], curves[f"nees_{block}_high"]
-            found[block] = float(np.mean((mean >= low)[has] & (mean <= high)[has]))
-    return found
+            shares[block] = float(np.mean((mean >= low)[has] & (mean <= high)[has]))
+    return shares
 
 
 def pose_error(
@@ -113,7 +113,7 @@ def block_nees(
     Raises:
         ValueError: if the shapes differ.
     """
-    shapes = [np.shape(each) for each in (pose, error, chart_error, cov)]
+    shapes = [np.shape(array) for array in (pose, error, chart_error, cov)]
     if shapes != [pose.shape] * 3 + [(*pose.shape, 3)] or pose.shape[-1:] != (3,):
         raise ValueError(
             "block_nees: expected pose, error and chart_error of one shape (..., 3) and cov of "
@@ -126,23 +126,23 @@ def block_nees(
             (i, j): cov[..., i, j] * unit[i] * unit[j] for i in range(3) for j in range(i + 1)
         }
         factor, pivots = _cholesky(scaled, eps)
-        found = {}
+        nees = {}
         for name, e in (("pose", error), ("own", chart_error)):
-            squares, known = _whiten(factor, e, unit)
+            squares, finite = _whiten(factor, e, unit)
             for block, k in (("position", 2), ("pose", 3)):
                 if name == "pose" or block == "pose":
                     regular = (
                         (_least_eigenvalue(factor, pivots, k) > 100 * k * eps)
-                        & _every(known[:k])
+                        & _all(finite[:k])
                         & (asymmetry(cov, unit, k) <= np.cbrt(eps))
                     )
                     value = np.where(regular, sum(squares[:k]), 0.0)
-                    found[block if name == "pose" else name] = Nees(value, regular)
+                    nees[block if name == "pose" else name] = Nees(value, regular)
         turn = error[..., 2]
         regular = (scaled[2, 2] > 100 * eps) & np.isfinite(turn)
         square = (turn * unit[2]) ** 2 / np.where(regular, scaled[2, 2], 1.0)
-        found["heading"] = Nees(np.where(regular, square, 0.0), regular)
-    return found
+        nees["heading"] = Nees(np.where(regular, square, 0.0), regular)
+    return nees
 
 
 def own_error_of(chart: Chart, sensor: Sensor, trace: Trace, truth: Truth) -> Float[Array, "T 3"]:
@@ -152,11 +152,11 @@ def own_error_of(chart: Chart, sensor: Sensor, trace: Trace, truth: Truth) -> Fl
     """
     ground = jnp.zeros(len(sensor.landmark), truth.pose.dtype)
 
-    def one(pose: Array, true_pose: Array) -> Array:
+    def error_at(pose: Array, true_pose: Array) -> Array:
         dx, _ = chart.local(pose, ground, true_pose, ground)
         return dx if chart.basis is None else chart.basis(pose, ground).pose @ dx
 
-    return jax.vmap(one)(jnp.asarray(trace.estimate.pose), jnp.asarray(truth.pose))
+    return jax.vmap(error_at)(jnp.asarray(trace.estimate.pose), jnp.asarray(truth.pose))
 
 
 def _cholesky(
@@ -164,7 +164,8 @@ def _cholesky(
 ) -> tuple[dict[tuple[int, int], np.ndarray], list[np.ndarray]]:
     """The lower factor of 3×3 matrices, entry by entry, and its pivots before the root is taken.
 
-    A pivot not above 3 eps times its diagonal entry counts as zero, as do the others of its column.
+    A pivot not above 3 eps times its diagonal entry counts as zero, as do the entries below it:
+    np.linalg.cholesky raises an error for the whole stack where one of its matrices is singular.
     """
     factor: dict[tuple[int, int], np.ndarray] = {}
     pivots = []
@@ -184,14 +185,14 @@ def _whiten(
     factor: dict[tuple[int, int], np.ndarray], error: np.ndarray, unit: list[np.ndarray]
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """The squares of L⁻¹e by coordinate, and whether the error is finite there."""
-    known = [np.isfinite(error[..., i]) for i in range(3)]
+    finite = [np.isfinite(error[..., i]) for i in range(3)]
     rows: list[np.ndarray] = []
     for i in range(3):
-        rest = np.where(known[i], error[..., i], 0.0) * unit[i]
+        rest = np.where(finite[i], error[..., i], 0.0) * unit[i]
         rest = rest - sum(factor[i, k] * rows[k] for k in range(i))
         regular = factor[i, i] > 0
         rows.append(np.where(regular, rest / np.where(regular, factor[i, i], 1.0), 0.0))
-    return [row**2 for row in rows], known
+    return [row**2 for row in rows], finite
 
 
 def _least_eigenvalue(
@@ -199,7 +200,7 @@ def _least_eigenvalue(
 ) -> np.ndarray:
     """1/tr (L Lᵀ)⁻¹ of the leading block, between a third of its least eigenvalue and all of it; 0
     where a pivot is."""
-    positive = _every([pivot > 0 for pivot in pivots[:size]])
+    positive = _all([pivot > 0 for pivot in pivots[:size]])
     rows: dict[tuple[int, int], np.ndarray] = {}
     for i in range(size):
         inverse = 1.0 / np.where(factor[i, i] > 0, factor[i, i], 1.0)
@@ -210,6 +211,6 @@ def _least_eigenvalue(
     return out
 
 
-def _every(flags: list[np.ndarray]) -> np.ndarray:
+def _all(flags: list[np.ndarray]) -> np.ndarray:
     out: np.ndarray = np.logical_and.reduce(flags)
     return out

@@ -55,7 +55,7 @@ def identity(
     compute, as "cpu"; rounding differs between platforms.
     """
     parts = {name: digest(getattr(scenario, name)) for name in _OF_WORLD}
-    registered = [one for one in REGISTRY.values() if one not in BUILT_IN]
+    registered = [measure for measure in REGISTRY.values() if measure not in BUILT_IN]
     fields = {field.name for field in dataclasses.fields(scenario)} - _NO_PART_OF_DRAWS
     rest = {
         f"world's {name}": digest(getattr(scenario, name))
@@ -76,7 +76,10 @@ def identity(
         "world": digest(type(scenario)),
         **rest,
         **{f"filter {name}": digest(candidate) for name, candidate in filters.items()},
-        **{f"measure {one.key}": digest((type(one), one.of_run)) for one in registered},
+        **{
+            f"measure {measure.key}": digest((type(measure), measure.of_run))
+            for measure in registered
+        },
     }
 
 

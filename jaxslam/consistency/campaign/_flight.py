@@ -25,8 +25,8 @@ _LATE = 60.0
 
 def out_of_memory(error: BaseException) -> bool:
     """Whether an error says that a block needs more memory than there is."""
-    whole = isinstance(error, jax.errors.JaxRuntimeError) and "RESOURCE_EXHAUSTED" in str(error)
-    return whole or isinstance(error, MemoryError)
+    exhausted = isinstance(error, jax.errors.JaxRuntimeError) and "RESOURCE_EXHAUSTED" in str(error)
+    return exhausted or isinstance(error, MemoryError)
 
 
 def _is_of_the_code(error: BaseException) -> bool:
@@ -90,12 +90,12 @@ class Flight:
         """
         self._wait()
         for piece, block in list(self._blocks.items()):
-            found = self._result(block)
-            if isinstance(found, BaseException) and self._once_more(piece, block, found):
-                found = None
-            if found is not None:
+            result = self._result(block)
+            if isinstance(result, BaseException) and self._once_more(piece, block, result):
+                result = None
+            if result is not None:
                 del self._blocks[piece]
-                yield piece, self._given_up(found) if isinstance(found, BaseException) else found
+                yield piece, self._given_up(result) if isinstance(result, BaseException) else result
 
     def _given_up(self, error: BaseException) -> BaseException:
         """The error of a block that is not computed again: of an executor an `Incomplete`."""
@@ -117,7 +117,7 @@ class Flight:
     def _result(self, block: _Block) -> BlockResult | BaseException | None:
         """The result of a block, its error once no future is left, or None."""
         error: BaseException | None = None
-        for future, began in [one for one in block.futures if one[0].done()]:
+        for future, began in [pair for pair in block.futures if pair[0].done()]:
             block.futures.remove((future, began))
             try:
                 error = future.exception()
@@ -131,8 +131,8 @@ class Flight:
             return error
         late = max(_LATE, 10 * self._longest)
         # Before the first result the workers compile, which takes as long as it takes.
-        judged = self.tries > 1 and self._longest > 0
-        if judged and time.monotonic() - block.futures[-1][1] > late:
+        has_limit = self.tries > 1 and self._longest > 0
+        if has_limit and time.monotonic() - block.futures[-1][1] > late:
             return TimeoutError(f"no result after {late:.0f} s")
         return None
 

@@ -92,17 +92,17 @@ def _difference(plan: CampaignPlan, candidate: Candidate, numbers: np.ndarray) -
     numbers, or computes in one precision alone."""
     devices = tuple(plan.devices[:1])
     wanted = numbers[: min(RUNS, plan.block)]
-    which = np.resize(wanted, min(RUNS, plan.block))
+    run_numbers = np.resize(wanted, min(RUNS, plan.block))
     everywhere = NamedSharding(mesh_of(devices), spec(None))
 
     def filtered(draws: Draws | None, key: jax.Array) -> tuple[_Runs, Draws]:
         world, method = jax.device_put((plan.scenario, as_record(candidate)), everywhere)
-        made, these = programs(devices, plan.dtype), which.astype(jnp.result_type(int))
+        compiled, runs = programs(devices, plan.dtype), run_numbers.astype(jnp.result_type(int))
         own_key = jax.device_put(plan.key, everywhere)
         if draws is None:
-            draws = made.draw(world, own_key, these)
-        results: FilterResults = made.drive(
-            world, method, jax.device_put(key, everywhere), these, draws
+            draws = compiled.draw(world, own_key, runs)
+        results: FilterResults = compiled.drive(
+            world, method, jax.device_put(key, everywhere), runs, *draws
         )
         estimate, info = results.estimate, results.info
         of_estimate = estimate.pose, estimate.pose_cov, results.own_error
@@ -128,8 +128,8 @@ def _difference(plan: CampaignPlan, candidate: Candidate, numbers: np.ndarray) -
         return None
     run = int(gaps.max(axis=0).argmax())
     pairs = [
-        f"{what} {a[run]:,.4g} and {b[run]:,.4g}"
-        for what, (a, b) in scores.items()
+        f"{name} {a[run]:,.4g} and {b[run]:,.4g}"
+        for name, (a, b) in scores.items()
         if np.isfinite([a[run], b[run]]).any()
     ]
     return f"run {wanted[run]} has, in float32 and in float64, {', '.join(pairs)}"

@@ -56,7 +56,7 @@ class Campaign:
     def size(self) -> str:
         """Runs, steps and precision, as "100 runs × 40 steps, float64"."""
         counts = (
-            f"{n} {what}" + "s" * (n != 1) for n, what in ((self.runs, "run"), (self.steps, "step"))
+            f"{n} {noun}" + "s" * (n != 1) for n, noun in ((self.runs, "run"), (self.steps, "step"))
         )
         return f"{' × '.join(counts)}, {self.dtype}"
 

@@ -6,6 +6,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import partial
 
 import jax
 import numpy as np
@@ -41,11 +42,27 @@ class Work:
         """The time of one run on one device, by filter: the median over finished blocks."""
         return {name: float(np.median(times)) for name, times in self.spent.items()}
 
-    def in_blocks_that_fit(self, plan: CampaignPlan, todo: Sequence[tuple[int, int]]) -> None:
-        """Compute the pieces, in blocks of half the size each time that memory does not suffice."""
-        while True:
+    def compute(self, plan: CampaignPlan, todo: Sequence[tuple[int, int]]) -> None:
+        """Add the pieces (first, runs) to the tallies, in blocks of half the size each time that
+        memory does not suffice."""
+        while todo:
+            before = self.tallies[BOUND].pieces()
+            queue = [
+                piece
+                for first, count in todo
+                for piece in missing([(0, first), *before], first + count, plan.wide)
+            ][::-1]
             try:
-                return self.go(plan, todo)
+                if self.executor is not None:
+                    submit = partial(self.executor.submit, compute_block, packed(plan))
+                    self._compute_queue(Flight(submit, TRIES), queue, todo)
+                    return
+                runner = BlockRunner(plan)
+                runner.compile()
+                # XLA uses the cores; threads of the BLAS below its LAPACK would only spin.
+                with threadpool_limits(1, "blas"), ThreadPoolExecutor(self.workers) as pool:
+                    self._compute_queue(Flight(partial(pool.submit, runner.block)), queue, todo)
+                return
             except (jax.errors.JaxRuntimeError, MemoryError) as error:
                 if not out_of_memory(error):
                     raise
@@ -62,28 +79,7 @@ class Work:
                 )
                 plan = replace(plan, block=half)
 
-    def go(self, plan: CampaignPlan, todo: Sequence[tuple[int, int]]) -> None:
-        """Add those of the pieces that are not yet there to the tallies."""
-        if not todo:
-            return
-        before = self.tallies[BOUND].pieces()
-        queue = [
-            piece
-            for first, count in todo
-            for piece in missing([(0, first), *before], first + count, plan.wide)
-        ][::-1]
-        if self.executor is not None:
-            send, content = self.executor.submit, packed(plan)
-            flight = Flight(lambda first, runs: send(compute_block, content, first, runs), TRIES)
-            self._compute(flight, queue, todo)
-            return
-        runner = BlockRunner(plan)
-        # XLA uses the cores; additional threads of the BLAS below its LAPACK would only spin.
-        with threadpool_limits(1, "blas"), ThreadPoolExecutor(self.workers) as pool:
-            flight = Flight(lambda first, runs: pool.submit(runner.block, first, runs))
-            self._compute(flight, queue, todo)
-
-    def _compute(
+    def _compute_queue(
         self, flight: Flight, queue: list[tuple[int, int]], todo: Sequence[tuple[int, int]]
     ) -> None:
         """Compute the pieces of a queue, last first, and add them to the tallies.

@@ -1,7 +1,7 @@
 """The settings of a Kalman-type SLAM filter, and their validation."""
 
 from dataclasses import dataclass, field
-from typing import Literal, TypedDict, get_args
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
@@ -19,20 +19,6 @@ CorrectionOrder = Literal["sequential", "joint"]
 
 Covariance = Literal["plain", "joseph", "square_root"]
 """P ← P - Vᵀ V; Joseph's (I-KH) P (I-KH)ᵀ + K R Kᵀ; or the update of a root X of P = X Xᵀ"""
-
-
-class EkfOptions(TypedDict, total=False):
-    """The options of `EkfSlam`, where they are handed on."""
-
-    chart: Chart
-    linearize: Linearizer
-    associate: Associate
-    correction: CorrectionOrder
-    gate: Number | None
-    iterations: int
-    covariance: Covariance
-    births: int | None
-    life: Life | None
 
 
 @dataclass(frozen=True, eq=False)

@@ -43,8 +43,8 @@ def office(beams: int = 180, glass: float = 0.0) -> LaserWorld:
     cabinets = [_box(6.6, 0.6, 7.4, 1.4), _box(0.6, 6.9, 1.5, 7.4)]
     stops = [(0.8, 4.1), (1.8, 4.1), (1.8, 1.5), (1.8, 4.1), (7.2, 4.1), (7.2, 6.6), (7.2, 4.1)]
     stops += [(10.2, 4.1), (10.2, 1.5), (10.2, 4.1), (0.8, 4.1)]
-    made = make_walls(outline, *cabinets, glass={(0, east): glass} if glass else None)
-    return _world("office", made, stops, beams, 8.0)
+    walls = make_walls(outline, *cabinets, glass={(0, east): glass} if glass else None)
+    return _world("office", walls, stops, beams, 8.0)
 
 
 def corridor(beams: int = 180) -> LaserWorld:
@@ -83,13 +83,13 @@ def _box(left: float, low: float, right: float, high: float) -> list[tuple[float
 
 
 def _world(
-    name: str, of: Walls, stops: Sequence[tuple[float, float]], beams: int, max_range: float
+    name: str, walls: Walls, stops: Sequence[tuple[float, float]], beams: int, max_range: float
 ) -> LaserWorld:
     turns = 2 * np.pi * np.arange(beams) / beams - np.pi
     pose, controls = _between(stops)
     return LaserWorld(
         name=name,
-        walls=of,
+        walls=walls,
         laser=Laser(turns, sigma=0.02, max_range=max_range, dropout=0.02),
         motion=Unicycle(np.diag([0.05, np.deg2rad(3.0)]) ** 2),
         controls=controls,

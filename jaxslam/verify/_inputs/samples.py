@@ -25,6 +25,7 @@ NOMINAL = ("random", "given")
 LARGE = "large coordinates"
 """Label of the states `FAR` from the origin."""
 _SEAM = 1e-9
+"""Distance from the seam of an angle, and from 0 of a rate; well above the rounding of π."""
 
 # One coordinate at a time takes these values while the others are random. Between 0.499 and 0.501
 # `angles.sinc` changes from its series to the closed form.
@@ -152,14 +153,14 @@ def sensor_samples(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samp
     return observed, _concatenate(back)
 
 
-def given_inverse(sensor: Sensor, given: Samples, drawn: Samples) -> Samples:
-    """Samples (pose, measurement, free) for `invert`: what `observe` returns at given states.
+def inverse_samples(sensor: Sensor, states: Samples, sampled: Samples) -> Samples:
+    """Samples (pose, measurement, free) for `invert`: what `observe` returns at a user's states.
 
-    The free coordinates are those of drawn samples.
+    sampled: samples of `invert`, whose free coordinates are used.
     """
-    z = np.asarray(quick_jit(jax.vmap(sensor.observe))(*given.values), np.float64)
-    s = np.resize(drawn.values[2], (len(z), drawn.values[2].shape[1]))
-    return Samples((given.values[0], z, s), given.labels)
+    z = np.asarray(quick_jit(jax.vmap(sensor.observe))(*states.values), np.float64)
+    s = np.resize(sampled.values[2], (len(z), sampled.values[2].shape[1]))
+    return Samples((states.values[0], z, s), states.labels)
 
 
 def _reach(seen: Values, sensor: Sensor) -> Callable[[Values], np.ndarray]:
@@ -218,9 +219,9 @@ def _one_at_a_time(base: tuple[Values, ...], which: int, argument: Argument) -> 
             moved = base[which][rows].copy()
             moved[:, column] = hard
             for i, value in enumerate(hard):
-                here = tuple(a[rows[i : i + 1]] for a in base)
+                state = tuple(a[rows[i : i + 1]] for a in base)
                 label = f"{argument.name} {name.split(' ')[0]} = {value:.4g}"
-                yield label, _replace(here, which, moved[i : i + 1], 1)
+                yield label, _replace(state, which, moved[i : i + 1], 1)
 
 
 def _replace(base: tuple[Values, ...], which: int, new: Values, count: int) -> tuple[Values, ...]:

@@ -126,7 +126,9 @@ def test_revisits_are_near_in_space_and_far_along_the_path():
 def test_given_relations_take_the_nearest_rows_and_count_what_is_dropped():
     time = np.arange(5.0)
     pose = np.array([[1, 0, np.pi / 2], [0, 0, 0], [0, 0, 0]])
-    found, dropped = metrics.given(time, [0.1, 4.4, 0], [1.2, 0, 9.0], pose, tolerance=0.3)
+    found, dropped = metrics.relations_at_stamps(
+        time, [0.1, 4.4, 0], [1.2, 0, 9.0], pose, tolerance=0.3
+    )
     assert dropped == 2
     np.testing.assert_array_equal([found.first, found.second], [[0], [1]])
     np.testing.assert_allclose(metrics.relation_errors(found, SQUARE).translation, 0, atol=1e-15)
@@ -135,10 +137,10 @@ def test_given_relations_take_the_nearest_rows_and_count_what_is_dropped():
 def test_given_relations_join_a_path_whose_stamps_go_back():
     time = 1e9 + np.array([0.0, 2.0, 1.0, 1.0, 3.0])
     pose, ends = np.zeros((4, 3)), 1e9 + np.array([[1, 2, 3.1, 3.1], [2, 0, 0, 9]])
-    found, dropped = metrics.given(time, *ends, pose, tolerance=0.2)
+    found, dropped = metrics.relations_at_stamps(time, *ends, pose, tolerance=0.2)
     assert dropped == 1
     np.testing.assert_array_equal([found.first, found.second], [[2, 1, 4], [1, 0, 0]])
-    found, dropped = metrics.given([7, 7], [7], [7.1], pose[:1], tolerance=0.1 + 1e-9)
+    found, dropped = metrics.relations_at_stamps([7, 7], [7], [7.1], pose[:1], tolerance=0.1 + 1e-9)
     assert (found.first, found.second, dropped) == (0, 0, 0)
 
 
@@ -226,23 +228,26 @@ def test_the_entropy_of_a_map_is_that_of_its_known_cells():
         lambda: metrics.relation_errors(metrics.relations(SQUARE, rows=4), SQUARE[:3]),
         "relation_errors: the relations are of rows up to 4, and the path has 3",
     ),
-    (lambda: metrics.given([0, 1], [0], [1, 2], SQUARE[:1], tolerance=1), "given: expected 1"),
     (
-        lambda: metrics.given([3, 0, 1], [7, 0], [8, 9], SQUARE[:2], tolerance=0.5),
-        r"given: none of 2 relations, from 0\.0+ s to 9\.0+ s, joins the path, from 0\.0+ s to "
+        lambda: metrics.relations_at_stamps([0, 1], [0], [1, 2], SQUARE[:1], tolerance=1),
+        "relations_at_stamps: expected 1",
+    ),
+    (
+        lambda: metrics.relations_at_stamps([3, 0, 1], [7, 0], [8, 9], SQUARE[:2], tolerance=0.5),
+        r"relations_at_stamps: none of 2 relations, from 0\.0+ s to 9\.0+ s, joins the path, from 0\.0+ s to "
         r"3\.0+ s, within 0\.5 s",
     ),
     (
-        lambda: metrics.given([0, 1], [0], [np.nan], SQUARE[:1], tolerance=1),
-        "given: expected finite stamps of relations, got nan in row 0",
+        lambda: metrics.relations_at_stamps([0, 1], [0], [np.nan], SQUARE[:1], tolerance=1),
+        "relations_at_stamps: expected finite stamps of relations, got nan in row 0",
     ),
     (
-        lambda: metrics.given([0, np.inf], [0], [1], SQUARE[:1], tolerance=1),
-        "given: expected finite stamps",
+        lambda: metrics.relations_at_stamps([0, np.inf], [0], [1], SQUARE[:1], tolerance=1),
+        "relations_at_stamps: expected finite stamps",
     ),
     (
-        lambda: metrics.given([0, 1], [0], [1], SQUARE[:1], tolerance=-1),
-        "given: expected a tolerance",
+        lambda: metrics.relations_at_stamps([0, 1], [0], [1], SQUARE[:1], tolerance=-1),
+        "relations_at_stamps: expected a tolerance",
     ),
     (lambda: joined(), "joined: expected at least one"),
     (lambda: metrics.statistics([]), "statistics: expected finite"),
