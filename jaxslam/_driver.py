@@ -79,7 +79,8 @@ def run(
         check_key("run", key)
         # A new array is a tracer where a trace is active, also where all arguments are constants.
         if not is_concrete(filter, log, pose, pose_cov, key, jnp.zeros(())):
-            return _drive_in_trace(filter, log, pose, pose_cov, key, probe)
+            traced: Trace = _drive_in_trace(filter, log, pose, pose_cov, key, probe)
+            return traced
         origin = None
         if probe is None and jnp.result_type(log.control, log.scan.z) == jnp.float32:
             origin = far_origin(pose, least=FAR)

@@ -7,8 +7,7 @@ import pytest
 from cases import swept
 
 import jaxslam
-from jaxslam import _catalog as catalog
-from jaxslam import motion, sensors
+from jaxslam import catalog, motion, sensors
 from jaxslam.consistency.campaign._block_programs import drive_run
 from jaxslam.core.protocols import Sensor
 from jaxslam.simulation.scenarios import SCENARIOS

@@ -126,18 +126,18 @@ class SensorJacobians(NamedTuple):
     by_landmark: Float[Array, "T M Z L"]
     noise_cov: Float[Array, "T M Z Z"]
     tag: Int[Array, "T M"]
-    """which landmark"""
+    """row of the landmark"""
     valid: Bool[Array, "T M"]
-    """whether anything was measured there"""
+    """mask of the measurements"""
 
 
 class RunJacobians(NamedTuple):
     """The Jacobians of the models along the true path of one run."""
 
     by_pose: Float[Array, "T 3 3"]
-    """of the motion"""
+    """∂f/∂x of the motion"""
     by_noise: Float[Array, "T 3 W"]
-    """of the motion, times √Q"""
+    """∂f/∂w √Q of the motion"""
     sensors: list[SensorJacobians]
     landmarks: Float[Array, "N L"]
 
@@ -212,7 +212,8 @@ def final_covariance(
                 block = slice(begin, begin + by_landmark.shape[1])
                 if by_landmark.shape[1] and not in_map[seen.tag[t, i]]:
                     in_map[seen.tag[t, i]] = True
-                    # Beyond a condition of 1e6 the inverse would lose 12 of the 16 digits.
+                    # With a larger condition number the landmark is not determined: 6 of 16 digits
+                    # of its position would be lost, and 12 of its covariance.
                     if by_landmark.shape == (size, size) and np.linalg.cond(by_landmark) < 1e6:
                         by = np.linalg.inv(by_landmark)
                         cov[block] = -by @ by_pose @ cov[:3]

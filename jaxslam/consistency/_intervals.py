@@ -8,14 +8,15 @@ import numpy as np
 from jaxslam.math.stats import t_quantile
 
 LEVEL = 0.95
-"""of every band, and of the two tests of a verdict together"""
+"""Level of every band, and of the two tests of a verdict together."""
 
 EACH = LEVEL**0.5
-"""of each of the two tests, and of every interval over the runs: 97.5 %. So the verdict can be read
-off the intervals."""
+"""Level of each of the two tests, and of every interval over the runs: 97.5 %. So the intervals
+show the verdict."""
 
 _SKEW = 1.5
-"""The factor by which the skewness of a run's average NEES reduces degrees of freedom."""
+"""The factor by which the skewness of a run's average NEES reduces degrees of freedom; chosen by
+simulation, see `Spread`."""
 
 
 def percentage(share: float, digits: int = 0) -> str:

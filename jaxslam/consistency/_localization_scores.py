@@ -24,13 +24,15 @@ from jaxslam.resampling._weights import at_points, weights_of
 from jaxslam.simulation._laser import LaserWorld, check_world, scan_world
 
 _DRAWS = 199
-"""Draws from the particles that represent them in a step; with the truth they are 200."""
+"""Draws from the particles in a step: with the truth 200 poses, so that levels are multiples of
+0.5 %."""
 
 NEAR = 0.5, np.deg2rad(30.0)
 """Distance [m] and turn [rad] from the mean within which 95 % of the weight must lie for a NEES."""
 
 _KERNEL = 0.5
-"""Width of the kernel of `covering_level` in standard deviations."""
+"""Width of the kernel of `covering_level` in standard deviations; for any width an honest filter's
+level is uniform."""
 
 
 class LocalizationScores(NamedTuple):
@@ -41,7 +43,7 @@ class LocalizationScores(NamedTuple):
     """the estimate"""
     pose_cov: Float[JaxOrNumPy, "R T 3 3"]
     level: Float[JaxOrNumPy, "R T"]
-    """of the smallest set of the particles that covers the truth, see `covering_level`"""
+    """level of the smallest set of the particles that covers the truth, see `covering_level`"""
     energy: Float[JaxOrNumPy, "R T"]
     """energy score of the position [m], see `energy_score`"""
     together: Bool[JaxOrNumPy, "R T"]
@@ -61,17 +63,17 @@ class LocalizationSummary(NamedTuple):
     nees: Average | None
     """mean pose NEES where the particles are one group; 3 is honest; None where they never are"""
     unimodal: float
-    """share of the steps in which they are"""
+    """share of the steps in which the particles are one group"""
     energy: Average | None
     """mean energy score of the position [m]: less is better"""
     rmse: Average | None
-    """of the position [m], of runs that are not lost"""
+    """position RMSE [m] of the runs that are not lost"""
     heading: float
-    """median of the size of the heading error [rad], of runs that are not lost"""
+    """median size of the heading error [rad] of the runs that are not lost"""
     converged_at: Float[np.ndarray, "R"]
     """the step from which the error stays below the limit; inf for a run that is lost"""
     lost: float
-    """share of runs"""
+    """share of the runs that are lost"""
 
 
 def judge_localization(

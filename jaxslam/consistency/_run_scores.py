@@ -25,7 +25,7 @@ from jaxslam.consistency._measures.counts import counted
 from jaxslam.consistency._measures.measure import Measure, Nees, Runs, RunStatistics
 from jaxslam.consistency._measures.nees import block_nees, pose_error
 from jaxslam.core.protocols import Sensor
-from jaxslam.core.types import Estimate, Info, JaxOrNumPy, Status, Trace, Truth
+from jaxslam.core.types import Estimate, Info, Status, Trace, Truth
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._pose_covariances import covariance_faults
 
@@ -43,11 +43,11 @@ class Score(NamedTuple):
     """The scores of a filter in R runs; those of a run that is not finite mean nothing."""
 
     finite: Bool[np.ndarray, "R"]
-    """every number of the run is finite."""
+    """True if all numbers of the run are finite"""
     measures: dict[str, tuple[np.ndarray, np.ndarray]]
-    """averages of each run: the numbers, and their counts; none over 0."""
+    """averages of each run, and their weights; no average where the weight is 0"""
     snapshots: tuple[np.ndarray, np.ndarray, np.ndarray]
-    """pose error (R, K, 3), its covariance (R, K, 3, 3), whether that is regular (R, K)."""
+    """pose error (R, K, 3), its covariance (R, K, 3, 3), mask of the regular ones (R, K)"""
     sums: dict[str, np.ndarray]
     """sums over runs: counts (R,), and (R, …) of measures."""
 
@@ -81,18 +81,23 @@ def score(
     nees = block_nees(pose, error, error if own_error is None else own_error, cov)
     landmarks = statistics.landmark_nees, statistics.regular_landmarks
     nees["landmarks"] = Nees(*(np.asarray(x, np.float64) for x in landmarks))
-    became, faults = counted(trace.info), covariance_faults(pose, cov)
+    faults = covariance_faults(pose, cov)
+    is_still = [
+        (rows == rows[:, :1]).reshape(len(rows), -1).all(axis=1)
+        for rows in map(np.asarray, (trace.estimate.pose, trace.estimate.pose_cov, truth.pose))
+    ]
     if measured is None:
         measured = (np.asarray(trace.info.status) != Status.EMPTY).sum(axis=(1, 2))
     sums: dict[str, np.ndarray] = {
         "steps": np.full(len(error), steps),
         "measured": np.asarray(measured),
-        **became,
+        **counted(trace.info),
         "missed": np.asarray(truth.missed).sum(axis=1),
         "singular_steps": steps - nees["pose"].regular.sum(axis=1),
         "asymmetric_steps": faults.asymmetric.sum(axis=1),
         "indefinite_steps": faults.indefinite.sum(axis=1),
-        "constant": _is_constant(trace, truth),
+        # Pose and covariance stay as they are, to the bit, while the robot moves.
+        "constant": is_still[0] & is_still[1] & ~is_still[2],
     }
     runs = Runs(truth, trace, statistics, error, nees)
     measures: dict[str, tuple[np.ndarray, np.ndarray]] = {}
@@ -113,18 +118,6 @@ def score(
         snapshots=(error[:, at], cov[:, at], nees["pose"].regular[:, at]),
         sums=sums,
     )
-
-
-def _is_constant(trace: Trace, truth: Truth) -> Bool[np.ndarray, "R"]:
-    """Whether pose and covariance of a run stay as they are, to the bit, while the robot moves."""
-
-    def still(values: JaxOrNumPy) -> np.ndarray:
-        rows = np.asarray(values)
-        out: np.ndarray = (rows == rows[:, :1]).reshape(len(rows), -1).all(axis=1)
-        return out
-
-    fixed = still(trace.estimate.pose) & still(trace.estimate.pose_cov)
-    return np.asarray(fixed & ~still(truth.pose))
 
 
 class _Sums(NamedTuple):
@@ -151,6 +144,17 @@ def run_statistics(
         origin = jnp.asarray(truth.origin)
         held = identities(trace, origin)
         values |= association_scores(trace, origin, held)
+    for measure in measures:
+        if measure.of_run is None:
+            continue
+        value = jnp.asarray(measure.of_run(truth, trace), estimate.pose.dtype)
+        steps = len(estimate.pose)
+        if value.shape not in ((), (steps,)):
+            raise ValueError(
+                f"measure {measure.key}: expected of_run to return a number or one for each of the "
+                f"{steps} steps, got an array of shape {value.shape}"
+            )
+        values[measure.key] = value
     points = jax.vmap(sensor.position)(jnp.asarray(truth.landmarks))
     size, count = info.innovation.shape[2], estimate.alive.shape[1] or info.slot.shape[1]
     dtype = estimate.pose.dtype
@@ -200,21 +204,8 @@ def run_statistics(
         regular_landmarks=regular,
         landmark_squares=jnp.stack([square, named.sum().astype(dtype)]),
         autocorrelation=jnp.stack([product, length, pairs * size], axis=1),
-        values=values | {m.key: _value(m, trace, truth) for m in measures if m.of_run},
+        values=values,
     )
-
-
-def _value(measure: Measure, trace: Trace, truth: Truth) -> Array:
-    """What a measure is in one run, () or (T,)."""
-    assert measure.of_run is not None
-    dtype, steps = trace.estimate.pose.dtype, len(trace.estimate.pose)
-    value = jnp.asarray(measure.of_run(truth, trace), dtype)
-    if value.shape not in ((), (steps,)):
-        raise ValueError(
-            f"measure {measure.key}: expected of_run to return a number or one for each of the "
-            f"{steps} steps, got an array of shape {value.shape}"
-        )
-    return value
 
 
 def _numbers(tree: PyTree) -> Float[Array, "K"]:

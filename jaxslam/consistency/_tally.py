@@ -94,7 +94,7 @@ class Tally:
     def __init__(self) -> None:
         self._sums: dict[str, Sum] = {}
         self._blocks: dict[int, dict[str, np.ndarray]] = {}
-        """by first run; blocks that follow each other are joined"""
+        """arrays by first run; blocks that follow each other are joined"""
         self._runs: dict[int, int] = {}
         self._begins: dict[int, int] = {}
         """first run of the block that ends at a run"""

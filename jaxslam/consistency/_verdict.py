@@ -38,10 +38,10 @@ class Verdict(NamedTuple):
     word: str
     """consistent, optimistic, pessimistic, diverged, incomplete or undecided"""
     by: tuple[str, ...] = ()
-    """which tests rejected, by the names of `TESTS`"""
+    """tests that reject, by the names of `TESTS`"""
     noticed: Mapping[str, tuple[float, float]] = {}
-    """by test, (low, high): this campaign would have noticed an average of at most low (0: none)
-    and of at least high (∞: none), with probability `POWER` or more"""
+    """(low, high) by test: this campaign would have noticed an average of at most low (0: none) and
+    of at least high (∞: none), with probability `POWER` or more"""
     doubts: tuple[str, ...] = ()
     """sentences that qualify the word"""
     honest_nis: float = 1.0
@@ -176,10 +176,10 @@ class _Measured(NamedTuple):
     """What became of the measurements of the finite runs."""
 
     total: int
-    """in the logs"""
+    """measurements in the logs"""
     used: int
     dropped: dict[str, int]
-    """by reason"""
+    """counts by reason"""
     missed: int
     """landmarks in view that have no measurement in the log"""
 

@@ -37,7 +37,7 @@ class RecordedWorld(World):
     filter_options: dict[str, Any] = static(default=FrozenDict())
     published: Mapping[str, Mapping[str, float]] = static(default=FrozenDict())
     source: str = static(default="")
-    """these as of `Scenario`"""
+    """see `Scenario` for these fields"""
 
     @property
     def landmarks(self) -> ArrayLike:  # type: ignore[override]

@@ -35,7 +35,7 @@ class TeamWorld(World):
     """
 
     robots: tuple[Robot, ...]
-    """R of them, in a list or tuple"""
+    """R robots, in a list or tuple"""
     landmarks: ArrayLike = field()
     """(N, 2)"""
     controls: ArrayLike = field()
@@ -53,7 +53,7 @@ class TeamWorld(World):
     visible: Visible = everywhere
     published: Mapping[str, Mapping[str, float]] = static(default=FrozenDict())
     source: str = static(default="")
-    """these three as of `Scenario`"""
+    """see `Scenario` for these three fields"""
 
     def __post_init__(self) -> None:
         count = int(np.shape(self.landmarks)[0]) if np.ndim(self.landmarks) == 2 else 0

@@ -41,7 +41,7 @@ class World(Component):
 
     motion: Motion
     sensor: Sensor
-    """the models that filters and bounds assume"""
+    """models that filters and bounds assume"""
     landmarks: ArrayLike
     """(N, L) true landmarks; the tag of one is its row. May be traced: maps vary under `vmap`."""
     controls: ArrayLike
@@ -59,9 +59,9 @@ class World(Component):
     published: Mapping[str, Mapping[str, float]] = FrozenDict()
     """figures of the paper, by filter and by the names of `consistency.Summary.measures`."""
     source: str = ""
-    """where the experiment is published."""
+    """publication of the experiment"""
     recorded_runs: int | None = None
-    """how many runs there are; None where they are drawn"""
+    """number of runs; None where they are drawn"""
 
     def __repr__(self) -> str:
         landmarks, models = np.shape(self.landmarks)[0], f"{self.motion.name}, {self.sensor.name}"
@@ -135,7 +135,7 @@ class Scenario(World):
     published: Mapping[str, Mapping[str, float]] = static(default=FrozenDict())
     """figures of the paper, by filter and by the names of `consistency.Summary.measures`."""
     source: str = static(default="")
-    """where the experiment is published."""
+    """publication of the experiment"""
 
     def __post_init__(self) -> None:
         super().__post_init__()

@@ -64,17 +64,17 @@ class _Compared(NamedTuple):
     gap: Values
     """largest difference among jacfwd, jacrev and hand in float64"""
     relative: Values
-    """the same over `scale`, as it is compared with the tolerance"""
+    """the gap over `scale`, as it is compared with the tolerance"""
     relative32: Values
-    """the same in float32"""
+    """the relative gap in float32"""
     from_quotient: Values
-    """the same from the quotients, where they converge"""
+    """the relative distance from the quotients, where they converge"""
     scale: Float[np.ndarray, "S m 1"]
     """the size of the row"""
     excess: Values
     """the largest of the three over its tolerance; above 1 the entry is wrong"""
     in_float32: Bool[np.ndarray, "S m n"]
-    """whether float32 exceeds its tolerance most"""
+    """mask of the entries where float32 exceeds its tolerance most"""
     no_derivative: int
     """number of states at which the quotients do not converge"""
 

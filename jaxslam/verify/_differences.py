@@ -30,7 +30,7 @@ class Quotient(NamedTuple):
     error: Float[np.ndarray, "S m n"]
     """estimated; inf where the quotients do not converge"""
     kink: Bool[np.ndarray, "S m n"]
-    """whether the one-sided derivatives differ"""
+    """mask of the entries whose one-sided derivatives differ"""
 
 
 def quotients(

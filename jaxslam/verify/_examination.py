@@ -120,8 +120,10 @@ def _typical_linearity(model: Model, first: Evaluated) -> float | None:
         return None
     usual = [i for i, label in enumerate(first.samples.labels) if label in samples.NOMINAL]
     states = tuple(a[usual] for a in first.samples.values)
+    # The standard deviations of a usual start: 0.05 of an angle or inverse depth, 0.1 of all else.
     spread = [
-        np.array([_standard_deviation(e) for e in a.entries]) for a in first.function.arguments
+        np.array([0.05 if e.endswith(("[rad]", "[1/m]")) else 0.1 for e in argument.entries])
+        for argument in first.function.arguments
     ]
 
     def index(*state: jax.Array) -> jax.Array:
@@ -134,11 +136,6 @@ def _typical_linearity(model: Model, first: Evaluated) -> float | None:
         return float(np.median(np.asarray(quick_jit(jax.vmap(index))(*states))))
     except (Exception, SystemExit):  # the checks report what is wrong with the model
         return None
-
-
-def _standard_deviation(entry: str) -> float:
-    """The standard deviation of a start: 0.05 of an angle or inverse depth, 0.1 of all else."""
-    return 0.05 if entry.endswith(("[rad]", "[1/m]")) else 0.1
 
 
 def _samples_of(

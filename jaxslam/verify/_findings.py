@@ -35,7 +35,7 @@ class WrongEntry:
     dissent: tuple[str, ...]
     """the methods that disagree with the others at that state"""
     far_alone: bool = False
-    """it is wrong only at large coordinates, as if a subtraction lost digits"""
+    """True if it is wrong only at large coordinates, as if a subtraction lost digits"""
 
     def lines(self, samples: int) -> Iterator[str]:
         """The entry as lines of text."""
@@ -77,10 +77,11 @@ class Finding:
     rounding of autodiff, where only that is beyond the tolerance"""
     tolerance: float
     float32: float | None
-    """the same in float32; None where it was not computed"""
+    """largest relative difference in float32; None where it was not computed"""
     float32_tolerance: float
     differences: float | None
-    """the same from the quotients, where they converge; rounding is their estimated error"""
+    """largest relative difference from the quotients, where they converge; their estimated error
+    counts as rounding"""
     differences_tolerance: float
     quotient: str
     """the kind of quotient: differences or complex step"""
@@ -146,8 +147,8 @@ class Report:
     findings: tuple[Finding, ...] = ()
     checks: tuple[Check, ...] = ()
     linearity: float | None = None
-    """of a model, the median of `linearity_index` over the random states, for standard deviations
-    of 0.1 (0.05 of [rad] and [1/m])"""
+    """median of a model's `linearity_index` over the random states, for standard deviations of 0.1
+    (0.05 of [rad] and [1/m])"""
     notes: tuple[str, ...] = field(default=())
     """remarks that are not failures"""
 

@@ -41,7 +41,7 @@ class Jacobians(NamedTuple):
     methods: dict[str, Values]
     """jacfwd, jacrev and hand in float64; a method that failed is missing"""
     single: dict[str, Values]
-    """the same computed in float32, held in float64; 0 at states where a loop has not ended"""
+    """Jacobians computed in float32, held in float64; 0 at states where a loop has not ended"""
     single_error: np.ndarray
     """(S, m, n) error of autodiff in float32: of its arithmetic at the states rounded to float32,
     plus that of rounding the states; () if unknown"""
@@ -54,17 +54,17 @@ class Evaluated(NamedTuple):
     """A function with its values and Jacobians at the samples."""
 
     function: Function
-    """with its outputs named"""
+    """function with its outputs named"""
     samples: Samples
-    """those at which its loops end"""
+    """states at which the loops of the function end"""
     values: Float[np.ndarray, "S m"] | None
-    """in float64; None if the function cannot be called"""
+    """values in float64; None if the function cannot be called"""
     by_argument: tuple[Jacobians, ...]
     checks: tuple[Check, ...]
     notes: tuple[str, ...] = ()
     """remarks that are not failures"""
     loops: bool = False
-    """whether it has `while` loops"""
+    """True if the function has `while` loops"""
 
 
 def evaluate_jacobians(function: Function, samples: Samples) -> Evaluated:
@@ -283,7 +283,7 @@ class _Evaluator:
         return jacobians, np.logical_and.reduce([np.asarray(end) for _, end in by_mode.values()])
 
     def _one_mode_is_missing(self) -> bool:
-        """Whether the function has the other mode; the missing one is noted and not used.
+        """Whether one mode of differentiation is missing; it is noted and not used.
 
         A `while` loop has no reverse mode, a function with its own vector-Jacobian product
         (`jax.custom_vjp`) no forward mode.

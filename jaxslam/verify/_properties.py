@@ -26,7 +26,7 @@ Values: TypeAlias = np.ndarray
 _ROUNDING = 1e-9
 """tolerance of round trips in float64, relative to the coordinates"""
 _GAUSS_NEWTON = 12
-"""number of iterations"""
+"""number of Gauss-Newton iterations for the free coordinates of a landmark"""
 
 
 def function_checks(evaluated: Evaluated) -> Iterator[Check]:
@@ -243,7 +243,7 @@ def _deviation(difference: ArrayLike, circle: Float[np.ndarray, "m"]) -> str:
 
 
 def _exactly(difference: ArrayLike) -> str:
-    """As `_deviation`, for entries that are not on a circle."""
+    """The `_deviation` of entries that are not on a circle."""
     return _deviation(difference, np.full(np.shape(difference)[-1], np.inf))
 
 

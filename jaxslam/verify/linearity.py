@@ -16,7 +16,9 @@ from jaxslam.math._linalg import root_psd
 __all__ = ["Linearity", "linearity_index", "motion_linearity", "sensor_linearity"]
 
 _DIRECTIONS = 64
+"""number of fixed random directions in which the region is sampled"""
 _RADII = (1.0, 0.5)
+"""radii of the sampled points, relative to that of the region"""
 
 
 class Linearity(NamedTuple):
@@ -27,13 +29,13 @@ class Linearity(NamedTuple):
     """
 
     hessian: Float[Array, ""]
-    """largest of the outputs, to second order"""
+    """largest index of an output, to second order"""
     sampled: Float[Array, ""]
-    """largest of the outputs, at points of the region"""
+    """largest index of an output, at points of the region"""
     hessian_rows: Float[Array, "m"]
-    """of each output, to second order"""
+    """index of each output, to second order"""
     sampled_rows: Float[Array, "m"]
-    """of each output, at points of the region"""
+    """index of each output, at points of the region"""
 
 
 def linearity_index(
@@ -98,7 +100,9 @@ def linearity_index(
     by_hessian = sigmas**2 / 2 * jnp.max(jnp.abs(values), axis=1, initial=0.0)
     by_hessian = jnp.where(smooth, by_hessian, jnp.inf)
 
-    axes, random = jnp.eye(len(zero), dtype=point.dtype), _random_directions(len(zero), point.dtype)
+    axes = jnp.eye(len(zero), dtype=point.dtype)
+    draws = np.random.default_rng(0).normal(size=(_DIRECTIONS, len(zero)))
+    random = jnp.asarray(draws / np.linalg.norm(draws, axis=1, keepdims=True), point.dtype)
     eigenvectors = jnp.swapaxes(jax.lax.stop_gradient(vectors), 1, 2).reshape(-1, len(zero))
     directions = jnp.concatenate([axes, random, eigenvectors])
     tries = jnp.concatenate([sign * r * directions for r in _RADII for sign in (1, -1)]) * sigmas
@@ -184,9 +188,3 @@ def _index(bend: Float[Array, "m"], sigmas: float, reach2: Float[Array, "m"]) ->
     bend, reach2 = jnp.where(defined, bend, 0.0), jnp.where(defined & ~flat, reach2, 1.0)
     ratio = jnp.where(flat & (bend > 0), jnp.inf, bend / (sigmas * jnp.sqrt(reach2)))
     return jnp.where(defined, jnp.where(flat & (bend == 0), 0.0, ratio), jnp.inf)
-
-
-def _random_directions(n: int, dtype: np.dtype[np.floating]) -> Float[Array, "K n"]:
-    """Fixed random unit vectors (64, n)."""
-    draws = np.random.default_rng(0).normal(size=(_DIRECTIONS, n))
-    return jnp.asarray(draws / np.linalg.norm(draws, axis=1, keepdims=True), dtype)

@@ -12,11 +12,12 @@ import worlds
 from cases import refused
 from test_consistency import STEPS, plain_nees, scored, summed, synthetic
 
-from jaxslam import charts, consistency, motion, sensors
+from jaxslam import charts, consistency, motion, sensors, simulate
+from jaxslam.consistency import block_nees
 from jaxslam.consistency._bound import final_covariance, jacobians_at_truth, van_trees
 from jaxslam.consistency._measures.counts import DROPS, KEPT, MEANINGS, counted
 from jaxslam.consistency._measures.coverage import LEVELS
-from jaxslam.consistency._measures.nees import block_nees, own_error_of
+from jaxslam.consistency._measures.nees import own_error_of
 from jaxslam.consistency._measures.observability import unobservable_directions
 from jaxslam.consistency._run_scores import LAGS
 from jaxslam.consistency._summary import summarize
@@ -27,7 +28,6 @@ from jaxslam.filters._particles.pose_particles import weighted_pose_moments
 from jaxslam.filters._particles.slam_particles import ParticleInfo
 from jaxslam.filters._reporting import Pruned
 from jaxslam.filters.map_management._merging import Merged
-from jaxslam.simulation._worlds import simulate
 from jaxslam.simulation.spurious import Spurious
 
 STATUSES = [status.name.lower() for status in (*KEPT, *DROPS)]

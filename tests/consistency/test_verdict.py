@@ -8,13 +8,12 @@ import scipy.integrate
 import scipy.stats
 
 from benchmarks.verdict import averages, problem, rejected, verdicts
-from jaxslam import motion, sensors, stats
-from jaxslam.consistency import judge
-from jaxslam.consistency._intervals import Average, lopsided, positive_interval, spread
+from jaxslam import Scenario, motion, sensors, stats
+from jaxslam.consistency import Average, judge
+from jaxslam.consistency._intervals import lopsided, positive_interval, spread
 from jaxslam.consistency._verdict import power_of
 from jaxslam.consistency.campaign import monte_carlo
 from jaxslam.consistency.campaign._candidates import check_noise
-from jaxslam.simulation._worlds import Scenario
 
 pytestmark = pytest.mark.decision
 

@@ -15,8 +15,7 @@ from layouts import kept_programs, wrong_layouts
 from own_models import motion_of, sensor_of
 
 import jaxslam
-from jaxslam import _catalog as catalog
-from jaxslam import filters, motion, run, sensors, simulate, smoothing
+from jaxslam import catalog, filters, motion, run, sensors, simulate, smoothing
 from jaxslam.core._record import is_record
 from jaxslam.core.protocols import Filter, Motion
 from jaxslam.core.record import record, static

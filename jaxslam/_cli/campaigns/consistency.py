@@ -11,7 +11,6 @@ from typing import Any
 
 import jax
 
-from jaxslam._catalog import ALL
 from jaxslam._cli import cache
 from jaxslam._cli.campaigns.campaign import (
     CampaignOptions,
@@ -31,6 +30,7 @@ from jaxslam._cli.common import (
     write_results,
 )
 from jaxslam._cli.user_objects import UserObjects
+from jaxslam.catalog import ALL
 from jaxslam.consistency._verdict import is_faulty
 from jaxslam.consistency.campaign import Campaign, Incomplete, Interrupted, monte_carlo
 from jaxslam.consistency.campaign._block_programs import drive_run, fitting_block

@@ -12,7 +12,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxslam._catalog import ALL, CANONICAL, SMOOTHERS, on_given_poses
 from jaxslam._cli import cache
 from jaxslam._cli.campaigns.piecewise import PiecewiseRun, run_in_pieces
 from jaxslam._cli.common import (
@@ -31,6 +30,7 @@ from jaxslam._cli.common import (
     write_results,
 )
 from jaxslam.association._rules import Known
+from jaxslam.catalog import ALL, KINDS, SMOOTHERS, on_given_poses
 from jaxslam.consistency._measures.counts import count_label
 from jaxslam.consistency.campaign._progress import Progress
 from jaxslam.core.protocols import Candidate, Filter, Motion, Sensor
@@ -425,7 +425,7 @@ def on_true_poses(data: Dataset) -> tuple[Log, int]:
 
 def _filter(name: str, candidate: Candidate, data: Dataset) -> Filter:
     if data.filter_options.get("associate") is not None and (
-        name in CANONICAL or name == "localization"
+        name in KINDS["information"] or name == "localization"
     ):
         raise ValueError(f"--filters: {name} needs the tag of every measurement")
     if name == "mapping" and data.true_path is None:

@@ -6,7 +6,7 @@ from jaxtyping import Int
 from jaxslam.core.types import Info, Status
 
 KEPT = (Status.FUSED, Status.BORN, Status.SIGHTED)
-"""What a measurement does for the map; each is counted."""
+"""Statuses of measurements that serve the map."""
 
 DROPS = (
     Status.REJECTED,
@@ -16,7 +16,7 @@ DROPS = (
     Status.SINGULAR,
     Status.UNMATCHED,
 )
-"""What can keep a measurement from the map; each is counted."""
+"""Statuses of measurements that the map does not get: the reasons."""
 
 MEANINGS = {
     "measured": "measurements in the logs",

@@ -35,8 +35,8 @@ from jaxslam.filters._ekf.monitor import MonitoredState
 from jaxslam.simulation._worlds import Scenario, World
 
 BOUND = ""
-"""Under this name, which no filter has, a block keeps the sums of the conditional bound, and the
-limit of accuracy."""
+"""The name, which no filter has, under which a block keeps the sums of the conditional bound and
+the limit of accuracy."""
 
 
 @dataclass(frozen=True)
@@ -51,9 +51,9 @@ class CampaignPlan:
     block: int
     """runs a device"""
     bound: bool = False
-    """whether to compute the conditional Cramér-Rao bound of every run"""
+    """compute the conditional Cramér-Rao bound of every run"""
     dtype: np.dtype | None = None
-    """of the worlds; None for that of JAX"""
+    """dtype of the worlds; None for that of JAX"""
 
     @property
     def wide(self) -> int:
@@ -70,7 +70,7 @@ class CampaignPlan:
 
 
 class BlockResult(NamedTuple):
-    """What a block of runs gives."""
+    """The scores of a block of runs, and its times."""
 
     scores: dict[str, dict[str, np.ndarray]]
     """condensed scores by filter"""
@@ -212,7 +212,7 @@ def first_run(leaf: jax.Array, axis: int = 0) -> np.ndarray:
 
 
 def _on_host(results: FilterResults) -> Trace:
-    """What `score` looks at itself, on the host, by run first; the rest is None."""
+    """The part of a trace that `score` reads, on the host, axis of the runs first; else None."""
     absent: PyTree = None
     estimate, info = results.estimate, results.info
     by_time = (

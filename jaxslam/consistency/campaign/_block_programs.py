@@ -56,9 +56,9 @@ class FilterResults(NamedTuple):
     own_error: Float[Array, "T B 3"]
     """the pose error in the coordinates of the filter"""
     monitor: Monitor | None
-    """(B, …) its observability monitor at the end, where it has one"""
+    """(B, …) the observability monitor at the end, if the filter has one"""
     information: Float[Array, "T B 3 3"] | None
-    """what that monitor had gained after each step"""
+    """information in the monitor after each step"""
 
 
 RUN_AXES = FilterResults._make((1, 1, 1, 0, 1))
@@ -84,7 +84,8 @@ def programs(devices: Sequence[jax.Device], dtype: np.dtype | None) -> Programs:
 
 @functools.cache
 def _programs_of_draws(devices: Sequence[jax.Device]) -> tuple[PyTree, PyTree, PyTree]:
-    """The programs drive, bound and jacobians, which take draws of any dtype."""
+    """The programs drive, bound and jacobians; apart, since they are compiled once for draws of any
+    dtype."""
     platform = devices[0].platform
     hot, quick = hot_options(platform), quick_options(platform)
     drive = over_runs(devices, drive_run, (None, None, None, 0, 0, 0), RUN_AXES)
@@ -181,7 +182,10 @@ def drive_run(
 
 
 def _information_gained(state: PyTree) -> Array | None:
-    """The information in a filter's observability monitor, where it has one."""
+    """The information in a filter's observability monitor, where it has one.
+
+    The probe of `run`: a function of the module, since another one would be compiled anew.
+    """
     monitor = monitor_of(state)
     return None if monitor is None else monitor.information
 

@@ -36,13 +36,13 @@ def check_dtype(dtype: DTypeLike | None) -> np.dtype | None:
 
 
 def rounded(tree: _T, dtype: DTypeLike | None) -> _T:
-    """The same arrays, those of floating-point numbers in the dtype; None leaves them."""
+    """A tree whose arrays of floating-point numbers are in the dtype; None leaves them."""
     if dtype is None:
         return tree
-    out: _T = jax.tree.map(
+    in_dtype: _T = jax.tree.map(
         lambda leaf: leaf.astype(dtype) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, tree
     )
-    return out
+    return in_dtype
 
 
 def check_noise(scenario: World) -> None:

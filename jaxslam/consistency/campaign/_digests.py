@@ -1,4 +1,4 @@
-"""The identity of a campaign: what must agree for two blocks of runs to be of one campaign.
+"""The identity of a campaign: the things that agree between two blocks of runs of one campaign.
 
 World, filters and key are data, so it is their structure and their numbers, bit by bit, with the
 versions and a digest of the package's source. Of classes and functions outside the package it is
@@ -85,7 +85,7 @@ def identity(
 
 def digest(value: object) -> str:
     """A digest of records, arrays, functions and what they hold."""
-    return _short(_text(value, ()))
+    return hashlib.sha256(_text(value, ()).encode()).hexdigest()[:16]
 
 
 def _text(value: object, within: tuple[object, ...]) -> str:
@@ -162,10 +162,6 @@ def _of_user(function: FunctionType) -> bool:
 def _name(value: object) -> str:
     of = value if hasattr(value, "__qualname__") else type(value)
     return f"{of.__module__}.{of.__qualname__}"
-
-
-def _short(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def _key(key: jax.Array) -> str:

@@ -17,7 +17,7 @@ Piece = tuple[int, int]
 """(first, runs) of a block"""
 
 TRIES = 3
-"""How often a block is computed on an executor, at most."""
+"""Largest number of times that a block is computed on an executor."""
 
 _LATE = 60.0
 """A block is late after this time [s], and after ten times the longest of those before it."""
@@ -42,7 +42,7 @@ def _text(error: BaseException) -> str:
 @dataclass
 class _Block:
     futures: list[tuple[Any, float]] = field(default_factory=list)
-    """those in flight, with the time when each began"""
+    """futures in flight, with the time when each began"""
     tries: int = 0
 
 
@@ -51,9 +51,9 @@ class Flight:
     """The blocks in flight."""
 
     submit: Callable[[int, int], Any]
-    """begins the block (first, runs), and returns its future"""
+    """function (first, runs) -> future of that block"""
     tries: int = 1
-    """how often a block is begun, at most, where it fails or is late"""
+    """largest number of times that a block is begun, where it fails or is late"""
     _blocks: dict[Piece, _Block] = field(default_factory=dict)
     _longest: float = 0.0
     """time from the beginning of a block to its end"""

@@ -34,13 +34,13 @@ from jaxslam.math._arrays import float64
 from jaxslam.simulation._worlds import World
 
 RUNS = 16
-"""As many runs, at most, are filtered again: a block on a CPU, whose programs are there."""
+"""Largest number of runs that are filtered again: a block on a CPU, whose programs are there."""
 
 
 def precision_doubts(
     plan: CampaignPlan, tallies: Mapping[str, Tally], dtype: np.dtype, compare: bool = True
 ) -> dict[str, str]:
-    """By filter, a sentence on the precision of its runs, where that decides.
+    """Sentences, by filter, on the precision of its runs, where that decides.
 
     dtype: that of the runs. compare: whether they may be filtered again.
     """

@@ -24,7 +24,7 @@ class Progress:
 
     @property
     def shown(self) -> bool:
-        """Whether anybody can see it."""
+        """Whether there is a terminal or a notebook to show it."""
         return self._terminal or self._cell is not None
 
     def __enter__(self) -> "Progress":
@@ -50,7 +50,8 @@ class Progress:
             self._first = now, finished
         elif finished > self._first[1] and now > self._first[0]:
             rate = (finished - self._first[1]) / (now - self._first[0])
-            line += f", {_rate(rate)} a second, {_duration((total - finished) / rate)} left"
+            digits = f"{rate:,.0f}" if rate >= 10 else f"{rate:.2g}"
+            line += f", {digits} a second, {_duration((total - finished) / rate)} left"
         self._draw(line)
 
     def __exit__(self, *_: object) -> None:
@@ -65,17 +66,13 @@ class Progress:
 
 
 def _notebook_cell() -> Callable[[str], object] | None:
-    """What replaces a line of output below the running cell of a notebook; None elsewhere."""
+    """A function that replaces a line of output below a notebook's cell; None elsewhere."""
     ipython = sys.modules.get("IPython")
     shell = ipython.get_ipython() if ipython is not None else None
     if ipython is None or not hasattr(shell, "kernel"):
         return None
     handle = ipython.display.display({"text/plain": ""}, raw=True, display_id=True)
     return lambda line: handle.update({"text/plain": line}, raw=True)
-
-
-def _rate(rate: float) -> str:
-    return f"{rate:,.0f}" if rate >= 10 else f"{rate:.2g}"
 
 
 def _duration(seconds: float) -> str:

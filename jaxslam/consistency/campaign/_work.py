@@ -7,6 +7,7 @@ from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
 from functools import partial
+from typing import Any
 
 import jax
 import numpy as np
@@ -54,14 +55,15 @@ class Work:
             ][::-1]
             try:
                 if self.executor is not None:
-                    submit = partial(self.executor.submit, compute_block, packed(plan))
-                    self._compute_queue(Flight(submit, TRIES), queue, todo)
+                    start = partial(self.executor.submit, compute_block, packed(plan))
+                    self._compute_queue(Flight(start, TRIES), queue, todo)
                     return
                 runner = BlockRunner(plan)
                 runner.compile()
                 # XLA uses the cores; threads of the BLAS below its LAPACK would only spin.
                 with threadpool_limits(1, "blas"), ThreadPoolExecutor(self.workers) as pool:
-                    self._compute_queue(Flight(partial(pool.submit, runner.block)), queue, todo)
+                    submit: Any = pool.submit
+                    self._compute_queue(Flight(partial(submit, runner.block)), queue, todo)
                 return
             except (jax.errors.JaxRuntimeError, MemoryError) as error:
                 if not out_of_memory(error):

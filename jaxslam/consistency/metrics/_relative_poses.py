@@ -14,7 +14,7 @@ from jaxslam.math.numpy_poses import between, wrapped
 Spacing = float | Sequence[float] | None
 
 _ROUNDING = 1e-6
-"""What a spacing may be short by: times since 1970 have 2e-7 s [s, m]"""
+"""Tolerance of a spacing [s, m]: times since 1970 are rounded to 2e-7 s."""
 
 
 class Relations(NamedTuple):
@@ -24,7 +24,7 @@ class Relations(NamedTuple):
     second: Int[np.ndarray, "R"]
     """rows of the path"""
     pose: Float[np.ndarray, "R 3"]
-    """of the second row in the frame of the first"""
+    """pose of the second row in the frame of the first"""
 
 
 class Errors(NamedTuple):
@@ -245,7 +245,7 @@ class Statistics(NamedTuple):
     size: int
     mean: float
     std: float
-    """of the values themselves, divided by their count"""
+    """standard deviation of the values, divided by their count"""
     rmse: float
     median: float
     min: float
@@ -253,7 +253,7 @@ class Statistics(NamedTuple):
 
 
 def statistics(values: ArrayLike) -> Statistics:
-    """The figures of errors (R,); those of their squares are `statistics(values**2)`.
+    """The figures of errors (R,); for the squares, `statistics(values**2)`.
 
     Raises ValueError unless there is at least one, and all are finite.
     """

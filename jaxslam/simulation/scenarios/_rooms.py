@@ -86,7 +86,7 @@ def _world(
     name: str, walls: Walls, stops: Sequence[tuple[float, float]], beams: int, max_range: float
 ) -> LaserWorld:
     turns = 2 * np.pi * np.arange(beams) / beams - np.pi
-    pose, controls = _between(stops)
+    pose, controls = _drive_to(stops)
     return LaserWorld(
         name=name,
         walls=walls,
@@ -97,7 +97,7 @@ def _world(
     )
 
 
-def _between(stops: Sequence[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:
+def _drive_to(stops: Sequence[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:
     """The pose at the first stop, and controls (v, ω, Δt) that turn and drive to the others."""
     places = np.asarray(stops, float)
     legs = np.diff(places, axis=0)

@@ -252,11 +252,15 @@ def plain_function(
 
 def _parameters(call: Callable[..., object], lengths: dict[str, Sequence[str] | int]) -> list[str]:
     """The names of a function's required parameters, or of `lengths` where Python has none."""
-    if lengths and not _has_signature(call):
-        return list(lengths)
+    try:
+        signature = inspect.signature(call)
+    except (TypeError, ValueError):
+        if lengths:
+            return list(lengths)
+        raise
     return [
         p.name
-        for p in inspect.signature(call).parameters.values()
+        for p in signature.parameters.values()
         if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
     ]
 
@@ -290,15 +294,6 @@ def _example(name: str, parameters: Sequence[str]) -> str:
     if name.isidentifier():
         return f"{name}_arguments = {{{line}}} in the file, or arguments= in Python"
     return f"arguments={{{line}}} in Python; in a file define a function, which has a name"
-
-
-def _has_signature(call: Callable[..., object]) -> bool:
-    """Whether Python knows the parameters of a callable."""
-    try:
-        inspect.signature(call)
-    except (TypeError, ValueError):
-        return False
-    return True
 
 
 def makes_a_model(factory: Callable[..., object]) -> bool:

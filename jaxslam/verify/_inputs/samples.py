@@ -64,8 +64,11 @@ def argument_samples(arguments: tuple[Argument, ...], count: int, seed: int) -> 
         groups.append((f"zero {' and '.join(arguments[k].name for k in others)}", still))
     places = [k for k, argument in enumerate(arguments) if _is_place(argument)]
     if places:
-        shift = np.zeros((2, 2)) + [[FAR, -FAR], [-FAR, FAR]]
-        groups.append((LARGE, tuple(_shift(base, places, shift))))
+        shift = np.array([[FAR, -FAR], [-FAR, FAR]])
+        far = [table[:2].copy() for table in base]
+        for k in places:
+            far[k][:, :2] += shift
+        groups.append((LARGE, tuple(far)))
     for k in places[1:]:
         for distance in (_NEAR, 2.0**-4):
             close = base[k][:2].copy()
@@ -227,15 +230,6 @@ def _one_at_a_time(base: tuple[Values, ...], which: int, argument: Argument) -> 
 def _replace(base: tuple[Values, ...], which: int, new: Values, count: int) -> tuple[Values, ...]:
     """The first states, with another value of one argument."""
     return tuple(new[:count] if k == which else a[:count] for k, a in enumerate(base))
-
-
-def _shift(base: tuple[Values, ...], places: list[int], shift: Values) -> Iterable[Values]:
-    """The first states, with all poses and points shifted."""
-    for k, a in enumerate(base):
-        rows = a[: len(shift)].copy()
-        if k in places:
-            rows[:, :2] += shift
-        yield rows
 
 
 def _concatenate(groups: list[_Group]) -> Samples:

@@ -12,8 +12,7 @@ import worlds
 from cases import refused, swept
 
 import jaxslam
-from jaxslam import Scenario, filters, grids, motion, run, sensors, simulate, store
-from jaxslam import _catalog as catalog
+from jaxslam import Scenario, catalog, filters, grids, motion, run, sensors, simulate, store
 from jaxslam.consistency._measures.counts import DROPS, KEPT
 from jaxslam.consistency.campaign import Interrupted, monte_carlo
 from jaxslam.consistency.campaign import _work as work
