@@ -213,12 +213,12 @@ def doubts_on(
 ) -> tuple[str, ...]:
     """Sentences that qualify a verdict, from the counts and measures that `judge` takes."""
     runs, lost = counts["runs"], counts["not_finite"]
-    steps, out = counts.get("steps", 0), list[str]()
+    steps, doubts = counts.get("steps", 0), list[str]()
     if lost:
         rest = f"averages of the {runs:,} finite runs" if runs else "there are no averages"
-        out.append(f"not finite (NaN or ∞) in {lost:,} of {runs + lost:,} runs: {rest}")
+        doubts.append(f"not finite (NaN or ∞) in {lost:,} of {runs + lost:,} runs: {rest}")
     if count := counts.get("divergent", 0):
-        out.append(
+        doubts.append(
             f"divergent in {count:,} of {runs:,} runs: final position errors far beyond those of "
             "the ideal EKF, and over 5 σ of what is claimed"
         )
@@ -227,79 +227,79 @@ def doubts_on(
         ("indefinite_steps", "not positive definite"),
     ):
         if count := counts.get(name, 0):
-            out.append(
+            doubts.append(
                 f"the pose covariance is {fault} in {count:,} of {steps:,} steps, by more than "
                 "rounding: look at the filter's covariance; such a step has no pose NEES"
             )
     if count := counts.get("constant", 0):
-        out.append(f"pose and covariance never change in {count:,} of {runs:,} runs")
+        doubts.append(f"pose and covariance never change in {count:,} of {runs:,} runs")
     singular = counts.get("singular_steps", 0)
     explained = counts.get("asymmetric_steps", 0) + counts.get("indefinite_steps", 0)
     if singular - explained > 0.5 * steps > 0:
-        out.append(
+        doubts.append(
             f"the pose covariance is singular in {singular:,} of {steps:,} steps, which have no "
             "pose NEES: a direction is claimed to be known exactly; more runs do not help"
         )
     if 2 * (count := counts.get("inaccurate", 0)) > runs and count > counts.get("divergent", 0):
-        out.append(
+        doubts.append(
             f"inaccurate in {count:,} of {runs:,} runs: final position errors over 5 σ of the "
             "ideal EKF"
         )
     if runs:
-        out += _doubts_on_measurements(counts, nis_dof)
+        doubts += _doubts_on_measurements(counts, nis_dof)
     free = np.asarray(per_run.get("unobservable", ()), np.float64)
     free = free[np.isfinite(free)]
     if free.size and free.mean() < 3:
-        out.append(
+        doubts.append(
             f"unobservable directions {free.mean():.3g} instead of 3: the filter gained "
             "information on the pose of the map as a whole, which only a sensor of absolute "
             "position or heading gives; if the robot has such a sensor, compare with the filter "
             "ideal"
         )
-    return tuple(out)
+    return tuple(doubts)
 
 
 def _doubts_on_measurements(counts: Mapping[str, int], nis_dof: float) -> list[str]:
-    measured, out = _measured(counts), list[str]()
+    measured, doubts = _measured(counts), list[str]()
     if counts.get("measured") == 0:
-        out.append("nothing was measured in any run: only the motion was judged")
+        doubts.append("nothing was measured in any run: only the motion was judged")
     if measured.missed:
-        out.append(
+        doubts.append(
             f"{measured.missed:,} landmarks in view, beside {measured.total:,} measured ones, had "
             "no place in the scan: expected more places in the world"
         )
     if not measured.total:
-        return out
+        return doubts
     ignored = measured.total - measured.used - sum(measured.dropped.values())
     if measured.uses_none:
-        out.append(
+        doubts.append(
             f"takes none of the {measured.total:,} measurements (by its Info): judged by the NEES "
             "alone"
         )
     elif measured.total > 2 * measured.used:
         reasons = [f"{count:,} {name}" for name, count in measured.dropped.items() if count]
         reasons += [f"{ignored:,} without a status in Info"] * bool(ignored)
-        out.append(
+        doubts.append(
             f"{measured.total - measured.used:,} of {measured.total:,} measurements were "
             f"{'not used' if ignored else 'dropped'}: {', '.join(reasons)}"
         )
     else:
         if ignored:
-            out.append(
+            doubts.append(
                 f"{ignored:,} of {measured.total:,} measurements have no status in Info: they may "
                 "have been ignored"
             )
         if count := measured.dropped["overflow"]:
-            out.append(
+            doubts.append(
                 f"{count:,} measurements of new landmarks found the map full: expected a larger "
                 "capacity, or a filter that removes landmarks"
             )
         if counts.get("fused", 0) and "measured" in counts and not nis_dof > 0:
-            out.append(
+            doubts.append(
                 f"{counts['fused']:,} fused measurements have no degrees of freedom in Info: no "
                 "NIS, judged by the NEES alone"
             )
-    return out
+    return doubts
 
 
 def _name(status: Status) -> str:

@@ -132,6 +132,6 @@ class TeamWorld(World):
                 if b == self.report:
                     missed.append(scans[-1][1])
         scan, _ = side_by_side(scans, sizes(robots)[2])
-        mine = jnp.stack(missed).sum(axis=0)
-        truth = Truth(poses[self.report], landmarks, mine, starts[self.report])
+        missed_by_robot = jnp.stack(missed).sum(axis=0)
+        truth = Truth(poses[self.report], landmarks, missed_by_robot, starts[self.report])
         return truth, Log(controls, scan)

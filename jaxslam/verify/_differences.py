@@ -36,7 +36,7 @@ class Quotient(NamedTuple):
 def quotients(
     function: Batch,
     arguments: tuple[Values, ...],
-    which: int,
+    k: int,
     periods: Float[np.ndarray, "m"],
     halvings: int = _HALVINGS,
 ) -> Quotient:
@@ -53,11 +53,11 @@ def quotients(
     Args:
         function: float64 in and out; called once with all columns, steps and states.
         arguments: (S, n_k) each.
-        which: the argument to differentiate by.
+        k: the argument to differentiate by.
         periods: (m,) period of an output on a circle, inf on a line; a jump by one is undone.
         halvings: number of steps.
     """
-    x = arguments[which]
+    x = arguments[k]
     count, n = x.shape
     if n == 0:
         none = np.zeros((count, len(periods), 0))
@@ -66,7 +66,7 @@ def quotients(
     moves = steps[:, None, None] * np.eye(n)  # (H, n, n)
     ends = x[:, None, None, None] + np.stack([moves, -moves])[None]  # (S, 2, H, n, n)
     flat = [np.repeat(a, 2 * halvings * n, axis=0) for a in arguments]
-    flat[which] = ends.reshape(-1, n)
+    flat[k] = ends.reshape(-1, n)
     values = np.asarray(function(*flat), np.float64).reshape(count, 2, halvings, n, -1)
     rise = values[:, 0] - values[:, 1]
     rise = modulo_periods(rise, periods)
@@ -114,15 +114,15 @@ def modulo_periods(
 
 
 def complex_step(
-    function: Batch, arguments: tuple[Values, ...], which: int, step: float = 1e-30
+    function: Batch, arguments: tuple[Values, ...], k: int, step: float = 1e-30
 ) -> Float[np.ndarray, "S m n"]:
     """The derivative ∂f/∂argument as Im f(x + ih)/h, without cancellation (Squire & Trapp 1998).
 
     Right only for a function that is analytic and takes complex numbers.
     """
-    x = arguments[which]
+    x = arguments[k]
     count, n = x.shape
     flat = [np.repeat(a, n, axis=0).astype(np.complex128) for a in arguments]
-    flat[which] = (x[:, None] + 1j * step * np.eye(n)).reshape(-1, n)
+    flat[k] = (x[:, None] + 1j * step * np.eye(n)).reshape(-1, n)
     values = np.asarray(function(*flat)).reshape(count, n, -1)
     return np.swapaxes(values.imag / step, 1, 2)

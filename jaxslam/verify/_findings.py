@@ -192,7 +192,7 @@ class Report:
 
     def as_dict(self) -> dict[str, object]:
         """The report as a dictionary for JSON; numbers that are not finite are None."""
-        out = {
+        fields = {
             "model": self.model,
             "kind": self.kind,
             "passed": self.passed,
@@ -201,7 +201,7 @@ class Report:
             "linearity_index": self.linearity,
             "notes": self.notes,
         }
-        return {key: _json_value(part) for key, part in out.items()}
+        return {key: _json_value(part) for key, part in fields.items()}
 
 
 def report_table(reports: Sequence[Report]) -> str:

@@ -210,12 +210,12 @@ class _Evaluator:
         first = [jnp.asarray(a[0]) for a in self.arguments]
         call = self.function.call
         try:
-            out = jax.eval_shape(call, *first) if self.traceable else call(*first)
+            value = jax.eval_shape(call, *first) if self.traceable else call(*first)
         except (Exception, SystemExit) as error:
             self.checks.append(Check(f"{name} can be called", False, describe_error(error)))
             return None
-        shape = getattr(out, "shape", None)
-        if np.issubdtype(getattr(out, "dtype", float), np.complexfloating):
+        shape = getattr(value, "shape", None)
+        if np.issubdtype(getattr(value, "dtype", float), np.complexfloating):
             self.checks.append(
                 Check(
                     f"{name} returns its shape",
@@ -226,7 +226,7 @@ class _Evaluator:
             return None
         wanted = f"({len(named)},)" if named else "(m,)"
         if shape is None or len(shape) != 1 or (named and shape != (len(named),)):
-            got = type(out).__name__ if shape is None else shape
+            got = type(value).__name__ if shape is None else shape
             detail = f"returns {got} where an array of shape {wanted} is expected"
             self.checks.append(Check(f"{name} returns its shape", False, detail))
             return None
@@ -363,16 +363,16 @@ class _Evaluator:
         names = [argument.name for argument in self.function.arguments]
         return split_claim(claim, len(self.function.outputs), names, self.sizes)
 
-    def _quotient(self, which: int) -> tuple[Quotient, str]:
+    def _quotient(self, k: int) -> tuple[Quotient, str]:
         """The Jacobian by differences or, where possible, by the complex step; and which it is."""
         circle = periods(self.function.outputs)
         arguments = self.arguments
         one_by_one = isinstance(self.values_and_ends, _StateByState)
         halvings = {"halvings": _FEW} if one_by_one else {}
-        by_differences = quotients(self.values, arguments, which, circle, **halvings)
-        if not one_by_one and arguments[which].shape[1] and not np.isfinite(circle).any():
+        by_differences = quotients(self.values, arguments, k, circle, **halvings)
+        if not one_by_one and arguments[k].shape[1] and not np.isfinite(circle).any():
             try:
-                exact = complex_step(self.values, arguments, which)
+                exact = complex_step(self.values, arguments, k)
             except (Exception, SystemExit):
                 return by_differences, "differences"
             # Only where differences confirm it: `abs` and comparisons make it wrong.

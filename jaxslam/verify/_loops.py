@@ -171,11 +171,11 @@ def _cond(
 ) -> tuple[list[Any], jax.Array]:
     """A branch, with loops in some of the branches."""
 
-    def of(branch: Any) -> Callable[..., tuple[list[Any], jax.Array]]:
+    def evaluate(branch: Any) -> Callable[..., tuple[list[Any], jax.Array]]:
         return lambda left, *operands: _evaluate(branch, operands, left)
 
-    which, *operands = inputs
+    index, *operands = inputs
     outputs: tuple[list[Any], jax.Array] = jax.lax.switch(
-        which, [of(branch) for branch in params["branches"]], left, *operands
+        index, [evaluate(branch) for branch in params["branches"]], left, *operands
     )
     return outputs

@@ -270,9 +270,9 @@ def _dtypes(function: Function, samples: Samples) -> str:
     """Which dtype is not kept, or ""."""
     for dtype in (np.float32, np.float64):
         shapes = (jax.ShapeDtypeStruct(a.shape[1:], dtype) for a in samples.values)
-        out = jax.eval_shape(function.call, *shapes)
-        if out.dtype != dtype:
-            return f"{np.dtype(dtype).name} in, {out.dtype} out"
+        result = jax.eval_shape(function.call, *shapes)
+        if result.dtype != dtype:
+            return f"{np.dtype(dtype).name} in, {result.dtype} out"
     return ""
 
 

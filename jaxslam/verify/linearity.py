@@ -174,11 +174,11 @@ def sensor_linearity(
 
 def _vector(name: str, value: ArrayLike, size: int | None = None) -> Float[Array, "n"]:
     """A value as a floating-point vector; raises ValueError on another shape."""
-    out = jnp.asarray(value)
-    if out.ndim != 1 or size not in (None, out.shape[0]):
+    vector = jnp.asarray(value)
+    if vector.ndim != 1 or size not in (None, vector.shape[0]):
         expected = "(n,)" if size is None else f"({size},)"
-        raise ValueError(f"{name}: expected shape {expected}, got {out.shape}")
-    return out.astype(jnp.result_type(out, float))
+        raise ValueError(f"{name}: expected shape {expected}, got {vector.shape}")
+    return vector.astype(jnp.result_type(vector, float))
 
 
 def _index(bend: Float[Array, "m"], sigmas: float, reach2: Float[Array, "m"]) -> Float[Array, "m"]:

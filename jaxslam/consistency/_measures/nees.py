@@ -207,10 +207,10 @@ def _least_eigenvalue(
         rows[i, i] = inverse
         for j in range(i):
             rows[i, j] = -inverse * sum(factor[i, k] * rows[k, j] for k in range(j, i))
-    out: np.ndarray = np.where(positive, 1.0 / sum(row**2 for row in rows.values()), 0.0)
-    return out
+    inverse_trace: np.ndarray = np.where(positive, 1.0 / sum(row**2 for row in rows.values()), 0.0)
+    return inverse_trace
 
 
 def _all(flags: list[np.ndarray]) -> np.ndarray:
-    out: np.ndarray = np.logical_and.reduce(flags)
-    return out
+    conjunction: np.ndarray = np.logical_and.reduce(flags)
+    return conjunction

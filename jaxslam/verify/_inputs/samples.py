@@ -210,7 +210,7 @@ def _is_place(argument: Argument) -> bool:
     return argument.entries[:2] == POSE[:2]
 
 
-def _one_at_a_time(base: tuple[Values, ...], which: int, argument: Argument) -> Iterable[_Group]:
+def _one_at_a_time(base: tuple[Values, ...], k: int, argument: Argument) -> Iterable[_Group]:
     """States in which one entry of an argument has a difficult value."""
     for column, name in enumerate(argument.entries):
         hard = np.array(_HARD.get(name.split(" ")[-1], ()))
@@ -218,18 +218,18 @@ def _one_at_a_time(base: tuple[Values, ...], which: int, argument: Argument) -> 
             hard = hard[np.abs(hard) < 1]
         if len(hard) and argument.scale == 1:
             count = len(hard)
-            rows = np.arange(count) % len(base[which])
-            moved = base[which][rows].copy()
+            rows = np.arange(count) % len(base[k])
+            moved = base[k][rows].copy()
             moved[:, column] = hard
             for i, value in enumerate(hard):
                 state = tuple(a[rows[i : i + 1]] for a in base)
                 label = f"{argument.name} {name.split(' ')[0]} = {value:.4g}"
-                yield label, _replace(state, which, moved[i : i + 1], 1)
+                yield label, _replace(state, k, moved[i : i + 1], 1)
 
 
-def _replace(base: tuple[Values, ...], which: int, new: Values, count: int) -> tuple[Values, ...]:
+def _replace(base: tuple[Values, ...], k: int, new: Values, count: int) -> tuple[Values, ...]:
     """The first states, with another value of one argument."""
-    return tuple(new[:count] if k == which else a[:count] for k, a in enumerate(base))
+    return tuple(new[:count] if i == k else a[:count] for i, a in enumerate(base))
 
 
 def _concatenate(groups: list[_Group]) -> Samples:
