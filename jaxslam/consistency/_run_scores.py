@@ -61,7 +61,7 @@ def score(
     trace: Trace,
     truth: Truth,
     statistics: RunStatistics,
-    own_error: Float[np.ndarray, "R T 3"] | None = None,
+    chart_error: Float[np.ndarray, "R T 3"] | None = None,
     measured: Int[np.ndarray, "R"] | None = None,
 ) -> Score:
     """The scores of R runs, by NumPy in float64; every array is the host's and has leading R.
@@ -71,14 +71,14 @@ def score(
             its observability monitor (`monitor_of`), and where it has one, of `probe` the
             information of that after each step (R, T, 3, 3).
         statistics: `run_statistics` of each run.
-        own_error: the pose errors in the coordinates of the filter (see `own_error_of`), by default
-            those in (x, y, θ).
-        measured: the measurements in the log of each run, by default those that the infos have.
+        chart_error: the pose errors in the coordinates of the filter (`chart_error_of`), by default
+            the errors in (x, y, θ).
+        measured: (R,) number of measurements in the log, by default that of the infos.
     """
     pose, cov = map(np.asarray, trace.estimate[:2])
     error = pose_error(np.asarray(truth.pose), pose)
     steps = error.shape[1]
-    nees = block_nees(pose, error, error if own_error is None else own_error, cov)
+    nees = block_nees(pose, error, error if chart_error is None else chart_error, cov)
     landmarks = statistics.landmark_nees, statistics.regular_landmarks
     nees["landmarks"] = Nees(*(np.asarray(x, np.float64) for x in landmarks))
     faults = covariance_faults(pose, cov)

@@ -17,7 +17,7 @@ from jaxslam.consistency import block_nees
 from jaxslam.consistency._bound import final_covariance, jacobians_at_truth, van_trees
 from jaxslam.consistency._measures.counts import DROPS, KEPT, MEANINGS, counted
 from jaxslam.consistency._measures.coverage import LEVELS
-from jaxslam.consistency._measures.nees import own_error_of
+from jaxslam.consistency._measures.nees import chart_error_of
 from jaxslam.consistency._measures.observability import unobservable_directions
 from jaxslam.consistency._run_scores import LAGS
 from jaxslam.consistency._summary import summarize
@@ -193,7 +193,7 @@ def test_landmark_nees_and_own_coordinates():
     )
     np.testing.assert_allclose(summary.measures["nees_landmarks"].value, nees.mean(), rtol=1e-9)
 
-    own = jax.jit(jax.vmap(partial(own_error_of, charts.RightInvariant(), worlds.ring().sensor)))
+    own = jax.jit(jax.vmap(partial(chart_error_of, charts.RightInvariant(), worlds.ring().sensor)))
     total, steps = scored(trace, truth, own).measures["nees_own"]
     found = total / steps
     local = jax.jit(jax.vmap(charts.RightInvariant().local, (0, None, 0, None)))

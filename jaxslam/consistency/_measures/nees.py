@@ -97,18 +97,20 @@ def block_nees(
 ) -> dict[str, Nees]:
     """The NEES of each block of `DOF`, and of the error in the coordinates of the filter ("own").
 
-    There is none where the claimed covariance is singular, i.e. some direction is known exactly:
-    1/tr P⁻¹, at most its least eigenvalue and at least a third of it, is at most 100 n·eps where P
-    is scaled to a diagonal of at most 1, x and y by one unit. And none
-    where a claimed deviation is what rounding makes of zero: at most 32 ulp of the
-    coordinate, that is of π for the heading and of max(|x|, |y|) for the position. So particles
-    that are copies of one, whose sample covariance is zero but for rounding, have no NEES, instead
-    of one of 1e27. And none where P is not symmetric (`covariance_faults`).
+    A step has no NEES in three cases:
+
+    - P is singular, that is, a direction is known exactly: 1/tr P⁻¹, between a third of the least
+      eigenvalue and all of it, is at most 100 n·eps, for P scaled to a diagonal of at most 1, x and
+      y by one unit.
+    - A claimed deviation is what rounding makes of zero: at most 32 ulp of the coordinate, of π for
+      the heading and of max(|x|, |y|) for the position. So particles that are copies of one
+      particle, whose sample covariance is rounding, have no NEES, instead of 1e27.
+    - P is not symmetric (`covariance_faults`).
 
     Args:
-        pose: as estimated.
-        error, chart_error: in (x, y, θ), and in the filter's coordinates.
-        cov: as claimed. eps is that of its dtype.
+        pose: the estimated pose.
+        error, chart_error: the error in (x, y, θ), and in the filter's coordinates.
+        cov: P, the claimed covariance. eps is that of its dtype.
 
     Raises:
         ValueError: if the shapes differ.
@@ -145,7 +147,7 @@ def block_nees(
     return nees
 
 
-def own_error_of(chart: Chart, sensor: Sensor, trace: Trace, truth: Truth) -> Float[Array, "T 3"]:
+def chart_error_of(chart: Chart, sensor: Sensor, trace: Trace, truth: Truth) -> Float[Array, "T 3"]:
     """The pose error in the filter's coordinates, brought to (x, y, θ) by its basis.
 
     ξᵀ P_ξ⁻¹ ξ = (E ξ)ᵀ P⁻¹ (E ξ) with P = E P_ξ Eᵀ as the filter reports it.

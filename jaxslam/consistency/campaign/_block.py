@@ -193,7 +193,7 @@ class BlockRunner:
             statistics = jax.device_get(
                 self._statistics(self._world.sensor, draws[0], results.estimate, results.info)
             )
-            chart_error = np.swapaxes(jax.device_get(results.own_error), 0, 1)
+            chart_error = np.swapaxes(jax.device_get(results.chart_error), 0, 1)
             by_run = _on_host(results), truth, statistics, chart_error, measured
             score_of_runs = score(*jax.tree.map(lambda leaf: leaf[wanted], by_run))
             scores[name] = condense(score_of_runs, first, float(self._limit))

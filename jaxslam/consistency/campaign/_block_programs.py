@@ -33,7 +33,7 @@ from jaxslam._driver import run
 from jaxslam.charts import Euclidean
 from jaxslam.consistency import Measure, RunStatistics, conditional_bound
 from jaxslam.consistency._bound import jacobians_at_truth
-from jaxslam.consistency._measures.nees import own_error_of
+from jaxslam.consistency._measures.nees import chart_error_of
 from jaxslam.consistency._measures.observability import monitor_of
 from jaxslam.consistency._run_scores import run_statistics
 from jaxslam.consistency.campaign._candidates import check_fits, method_of, rounded
@@ -53,7 +53,7 @@ class FilterResults(NamedTuple):
     """(T, B, …)"""
     info: Info
     """(T, B, …)"""
-    own_error: Float[Array, "T B 3"]
+    chart_error: Float[Array, "T B 3"]
     """the pose error in the coordinates of the filter"""
     monitor: Monitor | None
     """(B, …) the observability monitor at the end, if the filter has one"""
@@ -170,12 +170,11 @@ def drive_run(
     method, filter_key = method_of(candidate, truth), run_keys(key, number)[1]
     if isinstance(method, Filter):
         check_fits(method.name, method, scenario)
-        start = scenario.pose, scenario.pose_cov
+        chart, start = getattr(method, "chart", Euclidean()), (scenario.pose, scenario.pose_cov)
         trace = run(method, log, *start, filter_key, probe=_information_gained)
     else:
-        trace = method(log, filter_key)
-    chart = getattr(method, "chart", Euclidean()) if isinstance(method, Filter) else Euclidean()
-    chart_error = own_error_of(chart, scenario.sensor, trace, truth)
+        trace, chart = method(log, filter_key), Euclidean()
+    chart_error = chart_error_of(chart, scenario.sensor, trace, truth)
     monitor = monitor_of(trace.final)
     information = None if monitor is None else trace.probe
     return FilterResults(trace.estimate, trace.info, chart_error, monitor, information)

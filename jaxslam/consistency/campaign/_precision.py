@@ -80,7 +80,7 @@ class _Runs(NamedTuple):
 
     pose: Float[np.ndarray, "T R 3"]
     pose_cov: Float[np.ndarray, "T R 3 3"]
-    own_error: Float[np.ndarray, "T R 3"]
+    chart_error: Float[np.ndarray, "T R 3"]
     status: Int[np.ndarray, "T R M"]
     nis: Float[np.ndarray, "T R M"]
     dof: Int[np.ndarray, "T R M"]
@@ -105,7 +105,7 @@ def _difference(plan: CampaignPlan, candidate: Candidate, numbers: np.ndarray) -
             world, method, jax.device_put(key, everywhere), runs, *draws
         )
         estimate, info = results.estimate, results.info
-        of_estimate = estimate.pose, estimate.pose_cov, results.own_error
+        of_estimate = estimate.pose, estimate.pose_cov, results.chart_error
         parts: PyTree = (*of_estimate, info.status, info.nis, info.dof)
         parts, draws = jax.device_get((parts, draws))
         return _Runs(*parts), draws
@@ -142,7 +142,7 @@ def _scores(
     one, NIS/dof, and how many measurements were used."""
     path = np.swapaxes(truth, 0, 1)
     nees = [
-        block_nees(runs.pose, pose_error(path, runs.pose), runs.own_error, runs.pose_cov)["pose"]
+        block_nees(runs.pose, pose_error(path, runs.pose), runs.chart_error, runs.pose_cov)["pose"]
         for runs in both
     ]
     regular = nees[0].regular & nees[1].regular
