@@ -32,7 +32,7 @@ class Average(NamedTuple):
     high: float
 
 
-def lopsided(average: Average) -> bool:
+def is_lopsided(average: Average) -> bool:
     """Whether one side of the interval is over a quarter longer than the other, so that ± would
     mislead."""
     sides = sorted((average.value - average.low, average.high - average.value))

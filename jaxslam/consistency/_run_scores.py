@@ -21,7 +21,7 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam.consistency._measures import REGISTRY
 from jaxslam.consistency._measures.associations import association_scores, identities
-from jaxslam.consistency._measures.counts import counted
+from jaxslam.consistency._measures.counts import counts_of
 from jaxslam.consistency._measures.measure import Measure, Nees, Runs, RunStatistics
 from jaxslam.consistency._measures.nees import block_nees, pose_error
 from jaxslam.core.protocols import Sensor
@@ -91,7 +91,7 @@ def score(
     sums: dict[str, np.ndarray] = {
         "steps": np.full(len(error), steps),
         "measured": np.asarray(measured),
-        **counted(trace.info),
+        **counts_of(trace.info),
         "missed": np.asarray(truth.missed).sum(axis=1),
         "singular_steps": steps - nees["pose"].regular.sum(axis=1),
         "asymmetric_steps": faults.asymmetric.sum(axis=1),

@@ -15,7 +15,7 @@ from jaxslam.core.types import Log, Scan, Truth
 from jaxslam.filters.multi_robot._team import Robot, TeamMotion, check_team, sensors_of, sizes
 from jaxslam.math import se2
 from jaxslam.simulation._scans import Visible, everywhere, part_scan, side_by_side
-from jaxslam.simulation._worlds import World, drawn_near, drive
+from jaxslam.simulation._worlds import World, drive, random_pose
 
 
 @record
@@ -90,7 +90,7 @@ class TeamWorld(World):
         dtype = jnp.result_type(float)
         key_motion, _, key_start = jax.random.split(key, 3)
         controls = jnp.asarray(self.controls, dtype)
-        first = drawn_near(jnp.asarray(self.pose, dtype), self.pose_cov, key_start)
+        first = random_pose(jnp.asarray(self.pose, dtype), self.pose_cov, key_start)
         ends, _, _ = sizes(self.robots)
         starts, poses, logged = [], [], []
         for b, robot in enumerate(self.robots):
@@ -98,7 +98,7 @@ class TeamWorld(World):
             start = first
             if robot.start is not None:
                 mean, cov = robot.start
-                start = se2.compose(first, drawn_near(jnp.asarray(mean, dtype), cov, own_key))
+                start = se2.compose(first, random_pose(jnp.asarray(mean, dtype), cov, own_key))
             robot_controls = controls[:, ends[b] - len(robot.motion.controls) : ends[b]]
             path, log = drive(
                 robot.motion, start, robot_controls, jax.random.fold_in(key_motion, b)

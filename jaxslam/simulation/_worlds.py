@@ -97,7 +97,7 @@ class World(Component):
 
     def run(self, key: Array, number: int | Array) -> tuple[Truth, Log]:
         """The history of run `number` of a campaign with that key; traceable."""
-        return drawn(self, run_keys(key, number)[0])
+        return draw_history(self, run_keys(key, number)[0])
 
 
 @record
@@ -163,7 +163,7 @@ class Scenario(World):
         # Three keys without spurious measurements: faults do not change the other draws.
         keys = jax.random.split(key, 3 if self.spurious is None else 4)
         key_motion, key_scan, key_start = keys[:3]
-        start = drawn_near(jnp.asarray(self.pose, dtype), self.pose_cov, key_start)
+        start = random_pose(jnp.asarray(self.pose, dtype), self.pose_cov, key_start)
         poses, logged = drive(self.motion, start, controls, key_motion, self.noise_on)
         if isinstance(self.sensor, Suite):
             scan, missed = self._suite_scans(self.sensor, poses, landmarks, key_scan)
@@ -227,10 +227,10 @@ def simulate(scenario: World, key: Array) -> tuple[Truth, Log]:
 
 @partial(jax.jit, inline=True)
 def _draw(scenario: World, key: Array) -> tuple[Truth, Log]:
-    return drawn(scenario, key)
+    return draw_history(scenario, key)
 
 
-def drawn(scenario: World, key: Array) -> tuple[Truth, Log]:
+def draw_history(scenario: World, key: Array) -> tuple[Truth, Log]:
     """The truth and log that a world draws; raises ValueError on anything else."""
     history = scenario.draw(key)
     kinds = tuple(map(type, history)) if isinstance(history, tuple) else (type(history),)
@@ -272,7 +272,7 @@ def with_positions(sensor: Sensor, truth: Truth) -> Truth:
     return truth._replace(landmarks=jax.vmap(sensor.position)(jnp.asarray(truth.landmarks)))
 
 
-def drawn_near(pose: Float[Array, "3"], cov: ArrayLike, key: Array) -> Float[Array, "3"]:
+def random_pose(pose: Float[Array, "3"], cov: ArrayLike, key: Array) -> Float[Array, "3"]:
     """A random pose, from the normal distribution of that mean and covariance (3, 3)."""
     start = pose + draw_gaussian(jnp.asarray(cov, pose.dtype), normals_like(key, pose))
     return start.at[2].set(wrap(start[2]))

@@ -21,7 +21,7 @@ from jaxslam.verify._inputs import samples
 from jaxslam.verify._inputs.functions import Function, motion_functions, sensor_functions
 from jaxslam.verify._inputs.samples import Samples
 from jaxslam.verify._jacobians import Evaluated, evaluate_jacobians
-from jaxslam.verify._loops import has_loop, limited
+from jaxslam.verify._loops import has_loop, limit_loops
 from jaxslam.verify._user_errors import describe_error
 from jaxslam.verify.linearity import motion_linearity, sensor_linearity
 
@@ -96,7 +96,7 @@ def _with_limited_loops(model: Model, functions: tuple[Function, ...]) -> Model:
                 looping.append(function)
     model = copy.copy(model) if looping else model
     for function in looping:
-        set_field(model, function.name, limited(function.call))
+        set_field(model, function.name, limit_loops(function.call))
     return model
 
 

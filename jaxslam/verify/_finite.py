@@ -11,9 +11,9 @@ import numpy as np
 from jaxslam.math._xla import quick_jit
 from jaxslam.verify._findings import Check
 from jaxslam.verify._inputs.functions import Function, at_state
-from jaxslam.verify._inputs.samples import coincident
+from jaxslam.verify._inputs.samples import coincident_states
 from jaxslam.verify._jacobians import MODES, Evaluated
-from jaxslam.verify._loops import ending, has_loop
+from jaxslam.verify._loops import has_loop, with_loop_end
 from jaxslam.verify._user_errors import describe_error, place_of_error
 
 State = Sequence[np.ndarray]
@@ -57,9 +57,9 @@ def singular_notes(evaluated: Evaluated) -> Iterator[str]:
 
     @quick_jit
     def both(*state: jax.Array) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-        return ending(function.call)(*state)[0], ending(jacobian)(*state)[0]
+        return with_loop_end(function.call)(*state)[0], with_loop_end(jacobian)(*state)[0]
 
-    for label, state in coincident(function.arguments, evaluated.samples):
+    for label, state in coincident_states(function.arguments, evaluated.samples):
         try:
             value, by_argument = both(*state)
         except (Exception, SystemExit) as error:  # as of a callback

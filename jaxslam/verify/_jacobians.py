@@ -16,7 +16,7 @@ from jaxslam.verify._differences import Quotient, complex_step, quotients
 from jaxslam.verify._findings import Check
 from jaxslam.verify._inputs.functions import Function, as_claim, at_state, periods, split_claim
 from jaxslam.verify._inputs.samples import Samples
-from jaxslam.verify._loops import ROUNDS, ending, has_loop
+from jaxslam.verify._loops import ROUNDS, has_loop, with_loop_end
 from jaxslam.verify._user_errors import describe_error
 
 Values: TypeAlias = Float[np.ndarray, "_ _ _"]
@@ -237,7 +237,7 @@ class _Evaluator:
     def values_and_ends(self) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
         """The function of batches of arguments -> values (B, m), and (B,) whether its loops end."""
         if self.traceable:
-            return _in_chunks(quick_jit(jax.vmap(ending(self.function.call))))
+            return _in_chunks(quick_jit(jax.vmap(with_loop_end(self.function.call))))
         return _StateByState(self.function.call)
 
     def values(self, *arguments: States) -> np.ndarray:
@@ -249,7 +249,8 @@ class _Evaluator:
     def by_modes(self) -> Callable[..., PyTree]:
         """The function of batches of arguments -> by each mode, Jacobians and whether loops end."""
         jacobians = {
-            name: ending(MODES[name](self.function.call, argnums=self.over)) for name in self.modes
+            name: with_loop_end(MODES[name](self.function.call, argnums=self.over))
+            for name in self.modes
         }
 
         def jacobians_at(*arguments: jax.Array) -> PyTree:
@@ -327,7 +328,7 @@ class _Evaluator:
             first = [jnp.asarray(a[0]) for a in self.arguments]
             try:
                 shaped = self._split(jax.eval_shape(hand, *first))
-                batch: Callable[..., PyTree] = quick_jit(jax.vmap(ending(hand)))
+                batch: Callable[..., PyTree] = quick_jit(jax.vmap(with_loop_end(hand)))
             except (jax.errors.JAXTypeError, TypeError) as error:
                 shaped = self._split(hand(*first))  # raises again unless tracing was the fault
                 batch = _StateByState(hand)

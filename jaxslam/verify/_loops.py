@@ -19,12 +19,12 @@ ROUNDS = 10_000
 ends long before, and a batch of states takes this many in seconds"""
 
 
-def ending(function: Callable[..., PyTree]) -> Callable[..., tuple[PyTree, jax.Array]]:
+def with_loop_end(function: Callable[..., PyTree]) -> Callable[..., tuple[PyTree, jax.Array]]:
     """The function (arguments) -> its result, and () bool: whether its loops ended by themselves.
 
-    Where they did not, the result is that after `ROUNDS` rounds. Of a derivative take
-    ending(jax.jacfwd(f)) and not jax.jacfwd(ending(f)): so the loops of derivative rules are
-    limited, and these rules are used.
+    Where they did not, the result is that after `ROUNDS` rounds. For a derivative use
+    with_loop_end(jax.jacfwd(f)), not jax.jacfwd(with_loop_end(f)): then loops in derivative rules
+    are limited, and these rules are used.
     """
 
     def call(*arguments: PyTree) -> tuple[PyTree, jax.Array]:
@@ -37,11 +37,11 @@ def ending(function: Callable[..., PyTree]) -> Callable[..., tuple[PyTree, jax.A
     return call
 
 
-def limited(function: _F) -> _F:
+def limit_loops(function: _F) -> _F:
     """The function with limited loops, NaN where they have not ended; also if differentiated."""
 
     def until_limit(function: Callable[..., PyTree], *arguments: PyTree) -> PyTree:
-        values, ended = ending(function)(*arguments)
+        values, ended = with_loop_end(function)(*arguments)
         return jax.tree.map(lambda value: jnp.where(ended, value, jnp.nan), values)
 
     @jax.custom_jvp

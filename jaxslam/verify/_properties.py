@@ -18,7 +18,7 @@ from jaxslam.verify._finite import finite_check
 from jaxslam.verify._inputs.functions import Function, at_state, periods, sensor_functions
 from jaxslam.verify._inputs.samples import NOMINAL, Samples
 from jaxslam.verify._jacobians import Evaluated
-from jaxslam.verify._loops import limited
+from jaxslam.verify._loops import limit_loops
 from jaxslam.verify._user_errors import describe_error
 
 Values: TypeAlias = np.ndarray
@@ -251,7 +251,7 @@ def _pure(function: Function, evaluated: Evaluated) -> str:
     """Whether the function agrees with itself when called twice, and under jit and vmap; or ""."""
     assert evaluated.values is not None
     finite = np.flatnonzero(np.isfinite(evaluated.values).all(axis=1))
-    call = limited(function.call) if evaluated.loops else function.call
+    call = limit_loops(function.call) if evaluated.loops else function.call
     for i in finite[[0, -1]] if len(finite) else ():
         state = tuple(jnp.asarray(a[i]) for a in evaluated.samples.values)
         first, second = (np.asarray(call(*state), np.float64) for _ in range(2))

@@ -15,7 +15,7 @@ from test_consistency import STEPS, plain_nees, scored, summed, synthetic
 from jaxslam import charts, consistency, motion, sensors, simulate
 from jaxslam.consistency import block_nees
 from jaxslam.consistency._bound import final_covariance, jacobians_at_truth, van_trees
-from jaxslam.consistency._measures.counts import DROPS, KEPT, MEANINGS, counted
+from jaxslam.consistency._measures.counts import DROPS, KEPT, MEANINGS, counts_of
 from jaxslam.consistency._measures.coverage import LEVELS
 from jaxslam.consistency._measures.nees import chart_error_of
 from jaxslam.consistency._measures.observability import unobservable_directions
@@ -332,7 +332,7 @@ def test_what_filters_report_of_themselves_is_counted():
     }
     trace, _, _ = synthetic(np.random.default_rng(0), runs=2)
     info = jax.tree.map(lambda leaf: leaf[:, :3], trace.info)
-    found = counted(info._replace(extra=extra, exhausted=flags))
+    found = counts_of(info._replace(extra=extra, exhausted=flags))
     events = {name: each.tolist() for name, each in found.items() if name not in STATUSES}
     thrice = {key: [6, 0] for key in ("resampled", "underflow", "invalid")}
     once = {key: [2, 0] for key in ("merged", "reduced", "exhausted")}

@@ -34,7 +34,7 @@ from jaxslam.catalog import ALL
 from jaxslam.consistency._verdict import is_faulty
 from jaxslam.consistency.campaign import Campaign, Incomplete, Interrupted, monte_carlo
 from jaxslam.consistency.campaign._block_programs import drive_run, fitting_block
-from jaxslam.consistency.campaign._candidates import rounded
+from jaxslam.consistency.campaign._candidates import cast_floats
 from jaxslam.core.protocols import Candidate
 from jaxslam.results import _campaign_files as campaign_files
 from jaxslam.results._campaign_files import FORMATS
@@ -219,7 +219,7 @@ def _write(
         mapping = [n for n, s in campaign.filters.items() if "rmse_landmarks" in s.measures]
         name = next(iter(mapping or campaign.filters))
         key = jax.random.key(seed)
-        truth, log = rounded(world_of_run(scenario, key, 0), campaign.dtype)
+        truth, log = cast_floats(world_of_run(scenario, key, 0), campaign.dtype)
         estimate = drive_run(scenario, filters[name], key, 0, truth, log).estimate
         campaign = replace(campaign, first={name: jax.device_get((truth, estimate))})
     failed: list[str] = []

@@ -53,7 +53,7 @@ def count_label(name: str) -> str:
     return {"born": "initialized", "runs": "finite runs"}.get(name, name.replace("_", " "))
 
 
-def counted(info: Info) -> dict[str, Int[np.ndarray, "R"]]:
+def counts_of(info: Info) -> dict[str, Int[np.ndarray, "R"]]:
     """The counts of measurements of R runs by status, and those of the filter.
 
     The counts of a filter come from the method `counts` of records of `Info.extra`: arrays (R, T,

@@ -36,7 +36,7 @@ from jaxslam.consistency._bound import jacobians_at_truth
 from jaxslam.consistency._measures.nees import chart_error_of
 from jaxslam.consistency._measures.observability import monitor_of
 from jaxslam.consistency._run_scores import run_statistics
-from jaxslam.consistency.campaign._candidates import check_fits, method_of, rounded
+from jaxslam.consistency.campaign._candidates import cast_floats, check_fits, method_of
 from jaxslam.core.protocols import Candidate, Filter, Sensor
 from jaxslam.core.types import Estimate, Info, Log, Trace, Truth
 from jaxslam.filters._ekf.monitor import Monitor
@@ -155,7 +155,7 @@ def structs(shapes: PyTree, devices: Sequence[jax.Device], axes: PyTree = 0) -> 
 
 def draw_run(dtype: DTypeLike | None, scenario: World, key: Array, number: Int[Array, ""]) -> Draws:
     """The truth and log of a run, floating-point numbers in the dtype."""
-    return rounded(scenario.run(key, number), dtype)
+    return cast_floats(scenario.run(key, number), dtype)
 
 
 def drive_run(

@@ -35,7 +35,7 @@ def check_dtype(dtype: DTypeLike | None) -> np.dtype | None:
     return wanted
 
 
-def rounded(tree: _T, dtype: DTypeLike | None) -> _T:
+def cast_floats(tree: _T, dtype: DTypeLike | None) -> _T:
     """A tree whose arrays of floating-point numbers are in the dtype; None leaves them."""
     if dtype is None:
         return tree

@@ -32,11 +32,11 @@ from jaxslam.consistency.campaign._candidates import (
 )
 from jaxslam.consistency.campaign._digests import identity
 from jaxslam.consistency.campaign._kept import Keep, add_kept
-from jaxslam.consistency.campaign._pieces import check_part, cores, in_part, missing
+from jaxslam.consistency.campaign._pieces import check_part, cores, in_part, missing_pieces
 from jaxslam.consistency.campaign._precision import precision_doubts
 from jaxslam.consistency.campaign._remote import Executor
 from jaxslam.consistency.campaign._result import Campaign, Incomplete, Interrupted
-from jaxslam.consistency.campaign._work import Work, shown_progress
+from jaxslam.consistency.campaign._work import Work, show_progress
 from jaxslam.core._numbers import check_count, check_key, is_concrete
 from jaxslam.core._validation import check_record
 from jaxslam.core.protocols import Candidate, Filter
@@ -140,12 +140,12 @@ def monte_carlo(
         if keep is not None:
             keep.claim(identity(scenario, filters, key, devices[0].platform, bound, dtype))
             finished = add_kept(tallies, keep, runs, lambda first: in_part(first, plan.wide, part))
-        pieces = missing(finished, runs, plan.wide)
+        pieces = missing_pieces(finished, runs, plan.wide)
         todo = [piece for piece in pieces if in_part(piece[0], plan.wide, part)]
         work = Work(workers, keep, progress or None, {name: Tally() for name in names}, executor)
         stop: KeyboardInterrupt | Incomplete | None = None
         try:
-            with shown_progress(work, plan, progress is None):
+            with show_progress(work, plan, progress is None):
                 work.compute(plan, todo)
         except (KeyboardInterrupt, Incomplete) as error:
             stop = error

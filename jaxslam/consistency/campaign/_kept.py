@@ -52,7 +52,9 @@ def add_block(
         tallies[name].add(first, runs, arrays)
 
 
-def flat(scores: dict[str, dict[str, np.ndarray]], names: Iterable[str]) -> dict[str, np.ndarray]:
+def flatten(
+    scores: dict[str, dict[str, np.ndarray]], names: Iterable[str]
+) -> dict[str, np.ndarray]:
     """The arrays of all filters in one mapping, by "position/name"."""
     return {
         f"{i}/{key}": array
@@ -64,7 +66,7 @@ def flat(scores: dict[str, dict[str, np.ndarray]], names: Iterable[str]) -> dict
 def by_filter(
     arrays: Mapping[str, np.ndarray], names: Iterable[str]
 ) -> dict[str, dict[str, np.ndarray]]:
-    """The inverse of `flat`."""
+    """The inverse of `flatten`."""
     scores: dict[str, dict[str, np.ndarray]] = {}
     order = list(names)
     for label, array in arrays.items():

@@ -4,7 +4,9 @@ import os
 from collections.abc import Iterable
 
 
-def missing(finished: Iterable[tuple[int, int]], runs: int, block: int) -> list[tuple[int, int]]:
+def missing_pieces(
+    finished: Iterable[tuple[int, int]], runs: int, block: int
+) -> list[tuple[int, int]]:
     """The unfinished pieces (first, runs) of runs 0 … runs-1, in order, split at block borders:
     each is within runs n block … (n + 1) block - 1 for some n.
 

@@ -37,8 +37,8 @@ class Executor(Protocol):
         """The future of fn(*args), which a worker computes."""
 
 
-def packed(plan: CampaignPlan) -> bytes:
-    """A plan and JAX's settings, as `compute_block` takes them.
+def pack(plan: CampaignPlan) -> bytes:
+    """A plan and JAX's settings as bytes, which `compute_block` takes.
 
     Raises ValueError where a filter or the world cannot be pickled.
     """
@@ -67,7 +67,7 @@ def compute_block(plan: bytes, first: int, runs: int) -> BlockResult:
     """The scores of runs first … first + runs - 1 on the first device of this process.
 
     The first call for a plan takes over JAX's settings and compiles; the next ones find its
-    programs. plan: of `packed`.
+    programs. plan: of `pack`.
     """
     with _COMPILING:
         runner = _runner(plan)

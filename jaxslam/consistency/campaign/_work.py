@@ -16,10 +16,10 @@ from threadpoolctl import threadpool_limits
 from jaxslam.consistency._tally import Tally
 from jaxslam.consistency.campaign._block import BOUND, BlockRunner, CampaignPlan
 from jaxslam.consistency.campaign._flight import TRIES, Flight, out_of_memory
-from jaxslam.consistency.campaign._kept import Keep, add_block, flat
-from jaxslam.consistency.campaign._pieces import missing
+from jaxslam.consistency.campaign._kept import Keep, add_block, flatten
+from jaxslam.consistency.campaign._pieces import missing_pieces
 from jaxslam.consistency.campaign._progress import Progress
-from jaxslam.consistency.campaign._remote import Executor, compute_block, packed
+from jaxslam.consistency.campaign._remote import Executor, compute_block, pack
 from jaxslam.core.types import Estimate, Truth
 
 
@@ -51,11 +51,11 @@ class Work:
             queue = [
                 piece
                 for first, count in todo
-                for piece in missing([(0, first), *before], first + count, plan.wide)
+                for piece in missing_pieces([(0, first), *before], first + count, plan.wide)
             ][::-1]
             try:
                 if self.executor is not None:
-                    start = partial(self.executor.submit, compute_block, packed(plan))
+                    start = partial(self.executor.submit, compute_block, pack(plan))
                     self._compute_queue(Flight(start, TRIES), queue, todo)
                     return
                 runner = BlockRunner(plan)
@@ -101,7 +101,7 @@ class Work:
                     if isinstance(result, BaseException):
                         raise result
                     if self.keep is not None:
-                        self.keep.save(first, flat(result.scores, self.tallies), count)
+                        self.keep.save(first, flatten(result.scores, self.tallies), count)
                     add_block(self.tallies, first, count, result.scores)
                     self.first |= result.first
                     for name, seconds in result.seconds.items():
@@ -120,7 +120,7 @@ class Work:
 
 
 @contextlib.contextmanager
-def shown_progress(work: Work, plan: CampaignPlan, wanted: bool) -> Iterator[None]:
+def show_progress(work: Work, plan: CampaignPlan, wanted: bool) -> Iterator[None]:
     """A context with an optional progress bar on a terminal or in a notebook."""
     count = len(plan.filters)
     bar = Progress(f"{plan.scenario.name}, {count} filter{'s' * (count > 1)}") if wanted else None

@@ -38,7 +38,7 @@ def ate(reference: ArrayLike, estimate: ArrayLike, *, align: bool = True) -> Pat
     """
     true, path = pose_pair("ate", reference, estimate)
     frame = alignment(path[:, :2], true[:, :2]) if align else np.zeros(3)
-    path = carried(frame, path)
+    path = transform(frame, path)
     gap = path - true
     return PathErrors(np.hypot(gap[:, 0], gap[:, 1]), np.abs(wrapped(gap[:, 2])), frame)
 
@@ -58,14 +58,14 @@ def alignment(source: ArrayLike, target: ArrayLike) -> Float[np.ndarray, "3"]:
     return np.array([q0[0] - c * p0[0] + s * p0[1], q0[1] - s * p0[0] - c * p0[1], theta])
 
 
-def carried(frame: ArrayLike, rows: ArrayLike) -> Float[np.ndarray, "K n"]:
+def transform(frame: ArrayLike, rows: ArrayLike) -> Float[np.ndarray, "K n"]:
     """Poses (K, 3) or points (K, 2) of a frame, in the coordinates that its pose (3,) is in.
 
     Headings are wrapped to (-π, π]. Raises ValueError on other shapes and on numbers that are not
     finite.
     """
-    pose = _table("carried", np.reshape(np.asarray(frame, np.float64), (1, -1)), 3)
-    table = _table("carried", rows, 3 if np.shape(rows)[-1:] == (3,) else 2)
+    pose = _table("transform", np.reshape(np.asarray(frame, np.float64), (1, -1)), 3)
+    table = _table("transform", rows, 3 if np.shape(rows)[-1:] == (3,) else 2)
     width = table.shape[1]
     return compose(pose, np.pad(table, ((0, 0), (0, 3 - width))))[:, :width]
 
@@ -120,7 +120,7 @@ def align_map(
     points = np.asarray(estimate.points, np.float64)[named]
     targets = np.asarray(true_points, np.float64)[np.asarray(estimate.tag)[named]]
     pose = alignment(points, targets)
-    left = carried(pose, points) - targets
+    left = transform(pose, points) - targets
     return pose, float(np.sqrt((left**2).sum(axis=1).mean()))
 
 

@@ -67,7 +67,7 @@ def relations(
         raise ValueError("relations: expected the stamps, time=, with seconds= and nowhere else")
     if rows is not None and not float(rows).is_integer():
         raise ValueError(f"relations: expected a whole number of rows, got {rows}")
-    at = travelled(path) if seconds is None else np.asarray(time, np.float64)
+    at = distance_travelled(path) if seconds is None else np.asarray(time, np.float64)
     if rows is not None:
         at = np.arange(len(path), dtype=np.float64)
     if at.shape != (len(path),):
@@ -109,7 +109,7 @@ def revisits(reference: ArrayLike, *, radius: float, apart: float) -> Relations:
     path = poses_of("revisits", reference)
     if not (radius > 0 and apart > 0):
         raise ValueError(f"revisits: expected numbers above 0, got {radius} and {apart}")
-    at = travelled(path)
+    at = distance_travelled(path)
     before = np.searchsorted(at, at - apart, side="right")  # rows [0, before) are far enough back
     pairs = []
     for k in np.flatnonzero(before):
@@ -165,13 +165,6 @@ def relations_at_stamps(
     return Relations(rows[0][near], rows[1][near], of[near]), int((~near).sum())
 
 
-def joined(*parts: Relations) -> Relations:
-    """All relations of some sets, one after the other. Raises ValueError without a set."""
-    if not parts:
-        raise ValueError("joined: expected at least one set of relations")
-    return Relations(*(np.concatenate(field) for field in zip(*parts, strict=True)))
-
-
 def relation_errors(of: Relations, estimate: ArrayLike) -> Errors:
     """The errors of an estimated path over relations, translation and rotation apart.
 
@@ -215,7 +208,7 @@ def rpe(
     return relation_errors(related, path)
 
 
-def travelled(path: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K"]:
+def distance_travelled(path: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K"]:
     """The length of a path up to each of its poses [m]."""
     steps = np.diff(path[:, :2], axis=0)
     return np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))])

@@ -77,7 +77,7 @@ def argument_samples(arguments: tuple[Argument, ...], count: int, seed: int) -> 
     return _concatenate(groups)
 
 
-def coincident(
+def coincident_states(
     arguments: tuple[Argument, ...], samples: Samples
 ) -> Iterable[tuple[str, tuple[np.ndarray, ...]]]:
     """States where distances vanish, with a label: each place at the origin, or at the first."""

@@ -18,7 +18,7 @@ from jaxslam.consistency.campaign import Interrupted, monte_carlo
 from jaxslam.consistency.campaign import _work as work
 from jaxslam.consistency.campaign._block_programs import fitting_block
 from jaxslam.consistency.campaign._candidates import without_noise
-from jaxslam.consistency.campaign._pieces import missing
+from jaxslam.consistency.campaign._pieces import missing_pieces
 from jaxslam.core.record import record
 from jaxslam.core.types import Status, Truth
 from jaxslam.filters import _reporting as reporting
@@ -90,10 +90,10 @@ def test_other_blocks_change_what_rounding_does(in_fours, block):
 
 
 def test_pieces_lie_within_the_blocks_of_their_numbers():
-    assert missing([], 10, 4) == [(0, 4), (4, 4), (8, 2)]
-    assert missing([(0, 3), (6, 1)], 10, 4) == [(3, 1), (4, 2), (7, 1), (8, 2)]
-    assert missing([(0, 20)], 10, 4) == []
-    assert missing([(0, 10)], 13, 8) == [(10, 3)]
+    assert missing_pieces([], 10, 4) == [(0, 4), (4, 4), (8, 2)]
+    assert missing_pieces([(0, 3), (6, 1)], 10, 4) == [(3, 1), (4, 2), (7, 1), (8, 2)]
+    assert missing_pieces([(0, 20)], 10, 4) == []
+    assert missing_pieces([(0, 10)], 13, 8) == [(10, 3)]
 
 
 class Spy:
