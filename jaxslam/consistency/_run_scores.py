@@ -227,6 +227,7 @@ def _planar_nees(
     valid = (p1 > 0) & (p2 > 0) & jnp.isfinite(error).all(axis=1)
     p1, p2 = (jnp.where(valid, p, 1.0) for p in (p1, p2))
     left = 1 - (p12 / p1) * (p12 / p2)  # 1 - ρ², without products that underflow
+    # 100 n·eps with n = 2, as in `block_nees`.
     regular = valid & (left > 200 * float(jnp.finfo(cov.dtype).eps))
     a = error[:, 0]
     b = error[:, 1] - a * (p12 / p1)
@@ -258,5 +259,6 @@ def _white(estimate: Estimate, info: Info) -> list[Array]:
         return [jnp.where(is_slot, new, old) for new, old in zip(row, kept, strict=True)], None
 
     nothing = [jnp.zeros(count, white.dtype)] * len(rows)
+    # In reverse, so that the first measurement of a landmark is written last, and stays.
     unroll = max(min(len(slot), _UNROLLED), 1)
     return jax.lax.scan(place, nothing, (rows, slot), reverse=True, unroll=unroll)[0]

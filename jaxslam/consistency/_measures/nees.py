@@ -122,6 +122,7 @@ def block_nees(
             f"(..., 3, 3), got {', '.join(map(str, shapes))}"
         )
     eps = float(np.finfo(cov.dtype).eps)
+    # A covariance that is none may overflow; its steps are masked below.
     with np.errstate(all="ignore"):
         unit = inverse_deviations(pose, cov, eps)
         scaled = {
@@ -131,6 +132,8 @@ def block_nees(
         nees = {}
         for name, e in (("pose", error), ("own", chart_error)):
             squares, finite = _whiten(factor, e, unit)
+            # The leading two rows of the factor are that of the position; the error in the filter's
+            # coordinates has no position of its own.
             for block, k in (("position", 2), ("pose", 3)):
                 if name == "pose" or block == "pose":
                     regular = (

@@ -163,6 +163,7 @@ class BlockRunner:
             variance = float(np.trace(cov[:2, :2]))
         dtype = draws[0].pose.dtype
         reach = 1.0 + float(np.max(np.abs(np.asarray(plan.scenario.landmarks)), initial=0.0))
+        # In a world without noise σ is 0, and only rounding is left.
         rounding = 1000 * float(jnp.finfo(dtype).eps) * reach
         return np.asarray(max(FAR * max(variance, 0.0) ** 0.5, rounding), dtype)
 
