@@ -29,12 +29,12 @@ def out_of_memory(error: BaseException) -> bool:
     return exhausted or isinstance(error, MemoryError)
 
 
-def _is_of_the_code(error: BaseException) -> bool:
-    """Whether the code that is run would raise an error on every worker."""
+def _fails_everywhere(error: BaseException) -> bool:
+    """Whether an error is of the code that is run, so that every worker would raise it."""
     return isinstance(error, ValueError | TypeError | ImportError) or out_of_memory(error)
 
 
-def _text(error: BaseException) -> str:
+def _one_line(error: BaseException) -> str:
     """An error in one line."""
     return " ".join(f"{type(error).__name__}: {error}".split())
 
@@ -70,7 +70,7 @@ class Flight:
         try:
             future = self.submit(*piece)
         except Exception as error:
-            raise self._given_up(error) from error
+            raise self._final_error(error) from error
         block = self._blocks.setdefault(piece, _Block())
         block.futures.append((future, time.monotonic()))
         block.tries += 1
@@ -91,19 +91,21 @@ class Flight:
         self._wait()
         for piece, block in list(self._blocks.items()):
             result = self._result(block)
-            if isinstance(result, BaseException) and self._once_more(piece, block, result):
-                result = None
+            if isinstance(result, BaseException):
+                if self._restart(piece, block, result):
+                    continue
+                result = self._final_error(result)
             if result is not None:
                 del self._blocks[piece]
-                yield piece, self._given_up(result) if isinstance(result, BaseException) else result
+                yield piece, result
 
-    def _given_up(self, error: BaseException) -> BaseException:
-        """The error of a block that is not computed again: of an executor an `Incomplete`."""
-        if self.tries == 1 or not isinstance(error, Exception) or _is_of_the_code(error):
+    def _final_error(self, error: BaseException) -> BaseException:
+        """The error of a block that is not computed again; `Incomplete` for one of an executor."""
+        if self.tries == 1 or not isinstance(error, Exception) or _fails_everywhere(error):
             return error
         broken = isinstance(error, BrokenExecutor) and self._longest == 0
         hint = "; does the script begin under `if __name__ == '__main__':`?" * broken
-        incomplete = Incomplete(f"{_text(error)}{hint}")
+        incomplete = Incomplete(f"{_one_line(error)}{hint}")
         incomplete.__cause__ = error
         return incomplete
 
@@ -136,10 +138,10 @@ class Flight:
             return TimeoutError(f"no result after {late:.0f} s")
         return None
 
-    def _once_more(self, piece: Piece, block: _Block, error: BaseException) -> bool:
-        """Begin a block once more, and warn, unless that is in vain; whether it was begun."""
+    def _restart(self, piece: Piece, block: _Block, error: BaseException) -> bool:
+        """Begin a block again, with a warning, unless that is in vain; whether it was begun."""
         in_vain = self._ends or block.tries >= self.tries
-        if in_vain or not isinstance(error, Exception) or _is_of_the_code(error):
+        if in_vain or not isinstance(error, Exception) or _fails_everywhere(error):
             return False
         try:
             self.start(piece)
@@ -147,7 +149,7 @@ class Flight:
             return False
         warnings.warn(
             f"monte_carlo: runs {piece[0]} to {sum(piece) - 1} are computed once more "
-            f"({_text(error)})",
+            f"({_one_line(error)})",
             stacklevel=2,
         )
         return True

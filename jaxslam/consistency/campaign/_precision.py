@@ -95,12 +95,12 @@ def _difference(plan: CampaignPlan, candidate: Candidate, numbers: np.ndarray) -
     run_numbers = np.resize(wanted, min(RUNS, plan.block))
     everywhere = NamedSharding(mesh_of(devices), spec(None))
 
-    def filtered(draws: Draws | None, key: jax.Array) -> tuple[_Runs, Draws]:
+    def filter_again(draws: Draws | None, key: jax.Array) -> tuple[_Runs, Draws]:
         world, method = jax.device_put((plan.scenario, as_record(candidate)), everywhere)
         compiled, runs = programs(devices, plan.dtype), run_numbers.astype(jnp.result_type(int))
-        own_key = jax.device_put(plan.key, everywhere)
+        campaign_key = jax.device_put(plan.key, everywhere)
         if draws is None:
-            draws = compiled.draw(world, own_key, runs)
+            draws = compiled.draw(world, campaign_key, runs)
         results: FilterResults = compiled.drive(
             world, method, jax.device_put(key, everywhere), runs, *draws
         )
@@ -110,18 +110,18 @@ def _difference(plan: CampaignPlan, candidate: Candidate, numbers: np.ndarray) -
         parts, draws = jax.device_get((parts, draws))
         return _Runs(*parts), draws
 
-    single, draws = filtered(None, plan.key)
+    single, draws = filter_again(None, plan.key)
     try:
         with float64():
             wide = jax.tree.map(
                 lambda leaf: leaf.astype(float) if leaf.dtype == np.float32 else leaf, draws
             )
-            double, _ = filtered(wide, plan.key)
+            double, _ = filter_again(wide, plan.key)
             scores = _scores((single, double), np.asarray(draws[0].pose))
             gaps = np.stack([_gap(*pair) for pair in scores.values()])[:, : len(wanted)]
             if not gaps.max() > SAME:
                 return ""
-            another, _ = filtered(wide, jax.random.fold_in(plan.key, 0))
+            another, _ = filter_again(wide, jax.random.fold_in(plan.key, 0))
     except Exception:  # a user's filter that computes in float32 alone
         return None
     if not np.array_equal(double.pose, another.pose, equal_nan=True):
