@@ -131,10 +131,6 @@ def _options(scenario: World, overrides: dict[str, Any], *names: str) -> dict[st
     return {name: options[name] for name in names if name in options}
 
 
-def _dead_reckoning(scenario: World, **options: Any) -> Filter:
-    return DeadReckoning(scenario.motion, scenario.sensor)
-
-
 def _localization(scenario: World, **options: Any) -> Callable[[Truth], Filter]:
     used = _options(scenario, options, "correction", "gate", "iterations")
     return _InTrueMap(Localization(scenario.motion, scenario.sensor, scenario.landmarks, **used))
@@ -257,7 +253,7 @@ _BY_KIND: dict[str, dict[str, Callable[..., Candidate]]] = {
         "particle_localization": _particle_localization,
     },
     "baselines": {
-        "dead_reckoning": _dead_reckoning,
+        "dead_reckoning": lambda world, **options: DeadReckoning(world.motion, world.sensor),
         "localization": _localization,
         "mapping": _mapping,
     },

@@ -3,7 +3,7 @@
 import contextlib
 import copy
 from collections.abc import Callable, Iterator
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import jax
 import numpy as np
@@ -28,23 +28,13 @@ from jaxslam.verify.linearity import motion_linearity, sensor_linearity
 Model: TypeAlias = Motion | Sensor | Factor | BeamModel | Callable[..., jax.Array]
 
 
-class _Examined(NamedTuple):
-    """All Jacobians of a model at all states, and the results of the other checks."""
-
-    evaluated: tuple[Evaluated, ...]
-    checks: tuple[Check, ...]
-    notes: tuple[str, ...]
-    """a missing mode of differentiation, loops, where a function of places is not finite"""
-    linearity: float | None
-
-
 def examine(
     model: Model,
     functions: tuple[Function, ...],
     states: Samples | None = None,
     count: int = 24,
     seed: int = 0,
-) -> _Examined:
+) -> tuple[tuple[Evaluated, ...], tuple[Check, ...], tuple[str, ...], float | None]:
     """Evaluate all Jacobians of a model, and run the other checks, in float64.
 
     Args:
@@ -52,6 +42,9 @@ def examine(
         functions: of the model, as from `functions_of`.
         states: of the first function, instead of samples.
         count, seed: of the random states.
+    Returns:
+        The Jacobians of each function, the other checks, the notes (a missing mode of
+        differentiation, loops, where a function of places is not finite), and the linearity index.
     """
     with float64(), np.errstate(all="ignore"):
         model = _with_limited_loops(model, functions)
@@ -76,7 +69,7 @@ def examine(
         if states is None and not isinstance(model, Motion | Sensor):
             notes += [note for e in evaluated for note in singular_notes(e)]
         linearity = _typical_linearity(model, evaluated[0])
-    return _Examined(evaluated, tuple(checks), tuple(notes), linearity)
+    return evaluated, tuple(checks), tuple(notes), linearity
 
 
 def functions_of(model: Motion | Sensor) -> tuple[Function, ...]:

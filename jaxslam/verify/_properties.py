@@ -159,13 +159,17 @@ def _inversion_error(sensor: Sensor, seen: Samples) -> str:
         point = seen.values[1]
     mean = np.asarray(sensor.free.mean, np.float64)
     spread = np.sqrt(np.diagonal(np.asarray(sensor.free.cov, np.float64)))
+    circular = np.isfinite(circle := periods(sensor.landmark))
+    period = np.where(circular, circle, 1.0)
 
     def gap(pose: jax.Array, point: jax.Array) -> jax.Array:
         landmark = sensor.embed(pose, point)
         z = sensor.observe(pose, landmark)
 
         def miss(s: jax.Array) -> jax.Array:
-            return _wrap_named(sensor.invert(pose, z, s) - landmark, sensor.landmark)
+            difference = sensor.invert(pose, z, s) - landmark
+            turns = jnp.round(difference / period)
+            return difference - jnp.where(circular, turns * period, 0.0)
 
         if not len(mean):
             return jnp.abs(miss(jnp.zeros(0, pose.dtype))).max()
@@ -189,14 +193,6 @@ def _inversion_error(sensor: Sensor, seen: Samples) -> str:
         f"({', '.join(f'{v:.4g}' for v in pose[worst])}) is returned with an error of "
         f"{gaps[worst]:.3g}"
     )
-
-
-def _wrap_named(difference: Float[jax.Array, "L"], names: tuple[str, ...]) -> jax.Array:
-    """A difference of named entries, with angles wrapped."""
-    circle = periods(names)
-    circular = np.isfinite(circle)
-    turn = np.where(circular, circle, 1.0)
-    return difference - jnp.where(circular, turn * jnp.round(difference / turn), 0.0)
 
 
 def _residual_error(

@@ -144,14 +144,14 @@ def verify_jacobians(
         )
     if samples is None and isinstance(model, BeamModel):
         samples = beam_samples(model, count, seed)
-    examined = examine(model, functions, samples, count, seed)
+    evaluated, checks, notes, linearity = examine(model, functions, samples, count, seed)
     with np.errstate(all="ignore"):
         findings = [
             finding
-            for evaluated in examined.evaluated
-            for finding in compare_methods(evaluated, tolerance, float32_tolerance)
+            for of_function in evaluated
+            for finding in compare_methods(of_function, tolerance, float32_tolerance)
         ]
-    return Report(name, kind, tuple(findings), examined.checks, examined.linearity, examined.notes)
+    return Report(name, kind, tuple(findings), checks, linearity, notes)
 
 
 def build(

@@ -149,7 +149,18 @@ def relations_at_stamps(
         )
     order = np.argsort(stamps, kind="stable")
     ordered = stamps[order]
-    ends = np.stack([_stamps_of("relations_at_stamps", end, len(of)) for end in (first, second)])
+    for end in (np.asarray(first, np.float64), np.asarray(second, np.float64)):
+        if end.shape != (len(of),):
+            raise ValueError(
+                f"relations_at_stamps: expected {len(of)} stamps of relations, got {end.shape}"
+            )
+        if not (finite := np.isfinite(end)).all():
+            row = int(finite.argmin())
+            raise ValueError(
+                "relations_at_stamps: expected finite stamps of relations, got "
+                f"{end[row]} in row {row}"
+            )
+    ends = np.stack([first, second]).astype(np.float64)
     after = np.clip(np.searchsorted(ordered, ends), 0, len(ordered) - 1)
     before = np.maximum(after - 1, 0)
     place = np.where(np.abs(ends - ordered[before]) <= np.abs(ordered[after] - ends), before, after)
@@ -212,18 +223,6 @@ def distance_travelled(path: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K"]
     """The length of a path up to each of its poses [m]."""
     steps = np.diff(path[:, :2], axis=0)
     return np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))])
-
-
-def _stamps_of(caller: str, values: ArrayLike, count: int) -> Float[np.ndarray, "R"]:
-    stamps = np.asarray(values, np.float64)
-    if stamps.shape != (count,):
-        raise ValueError(f"{caller}: expected {count} stamps of relations, got {stamps.shape}")
-    if not (finite := np.isfinite(stamps)).all():
-        row = int(finite.argmin())
-        raise ValueError(
-            f"{caller}: expected finite stamps of relations, got {stamps[row]} in row {row}"
-        )
-    return stamps
 
 
 def _between(
