@@ -117,7 +117,7 @@ class _OnTruePath:
         )
 
 
-# --- filters for a scenario: each takes the options of `EkfSlam`, and uses those that it has ------
+# --- filters for a scenario: each takes the options of `EkfSlam`, and uses the ones that it has ---
 
 
 def _capacity(scenario: World) -> int:

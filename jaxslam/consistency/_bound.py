@@ -64,12 +64,12 @@ def posterior_bound(
     ASSP 35(3), 1987; van Trees, "Detection, Estimation, and Modulation Theory I", 1968, 2.4.3).
     Jacobians by the noise are taken at ω = 0, and Q and R are what the models state at the truth
     and for the exact measurement; what could be learnt of the state from their dependence on it, or
-    from which landmarks are in view, is not counted. The time is that of the eigenvalues of K
-    matrices of size 3 + W T + L N.
+    from which landmarks are in view, is not counted. Most of the time goes into the eigenvalues of
+    K matrices of size 3 + W T + L N.
 
     Args:
         truth, log: of `simulate`, with a leading axis over runs; identities known.
-        steps: counted from 0, default those of the snapshots.
+        steps: counted from 0; default the steps of the snapshots.
     Raises:
         ValueError: on a world of spurious data or of several robots, arrays without runs, or a
             measurement noise that is singular.

@@ -42,7 +42,7 @@ def is_lopsided(average: Average) -> bool:
 class Spread(NamedTuple):
     """The mean m of n positive numbers, and how far from the expectation μ it may lie.
 
-    The statistic is that of Student's t test with the standard error under the hypothesis: when a
+    The statistic is Student's t with the standard error under the hypothesis: when a
     covariance is claimed c times too small, the NEES of every run, their mean and their deviation s
     all grow by c, so the deviation that belongs to μ is s μ/m. With u = s/(m √n),
 
@@ -50,9 +50,9 @@ class Spread(NamedTuple):
 
     hence μ between m/(1 + q u - u²/2) and m/(1 - q u - u²/2): never negative, longer above than
     below, as the average of a skewed quantity is. u²/2 centres the statistic where the skewness is
-    three times s/m, which that of a run's average NEES is about (the χ² of the common factor of its
-    steps has 2, a sum of a constant and such a χ² more). f = `_SKEW` accounts for the spread of s
-    for skewed numbers, and 1 is for numbers whose spread is small. Calibrated by simulation:
+    three times s/m: about so skewed is a run's average NEES (the χ² of the common factor of its
+    steps has 2 s/m, a sum of a constant and such a χ² more). f = `_SKEW` accounts for the spread of
+    s for skewed numbers, and 1 is for numbers whose spread is small. Calibrated by simulation:
     `python -m benchmarks --record --only verdict`.
     """
 

@@ -40,7 +40,7 @@ _SNAPSHOTS = 25
 
 
 class Score(NamedTuple):
-    """The scores of a filter in R runs; those of a run that is not finite mean nothing."""
+    """The scores of a filter in R runs; the scores of a run that is not finite mean nothing."""
 
     finite: Bool[np.ndarray, "R"]
     """True if all numbers of the run are finite"""
@@ -73,7 +73,7 @@ def score(
         statistics: `run_statistics` of each run.
         chart_error: the pose errors in the coordinates of the filter (`chart_error_of`), by default
             the errors in (x, y, θ).
-        measured: (R,) number of measurements in the log, by default that of the infos.
+        measured: (R,) number of measurements in the log, by default counted in the infos.
     """
     pose, cov = map(np.asarray, trace.estimate[:2])
     error = pose_error(np.asarray(truth.pose), pose)

@@ -54,8 +54,8 @@ class Summary:
     autocorrelation: np.ndarray
     """(LAGS,) of whitened innovations at lags of 1, 2, … steps; NaN without pairs."""
     autocorrelation_band: np.ndarray
-    """(LAGS,) half-width of the 95 % band about 0 in which that of white innovations lies,
-    1.96/√(products of numbers in it) (Bar-Shalom 2001, 5.4.2)."""
+    """(LAGS,) half-width of the 95 % band about 0 for white innovations, 1.96/√(number of products)
+    (Bar-Shalom 2001, 5.4.2)."""
     counts: dict[str, int]
     """runs (finite), not_finite, inaccurate, divergent, steps, measured (measurements in the logs),
     used and dropped measurements by `Status`, missed, singular_steps, asymmetric_steps,

@@ -126,8 +126,8 @@ class Tally:
     def _join(self, first: int) -> None:
         """Join a block with its neighbours, as long as these have no more runs.
 
-        So arrays are few, each run is copied a logarithm of times, and a campaign keeps about the
-        numbers alone: those of a block of 16 runs are a quarter of what their arrays take.
+        So arrays are few, each run is copied a logarithm of times, and a campaign keeps little more
+        than the numbers: an array of 16 numbers takes four times the memory of the numbers.
         """
         while True:
             runs = self._runs[first]

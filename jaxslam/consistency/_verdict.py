@@ -68,7 +68,7 @@ def judge(
     the NEES decides.
     incomplete: over 5 % (`_FAULTY`) of the runs are not finite, of the steps have a covariance that
     is not symmetric or not positive definite, or of the runs have an estimate that is constant.
-    The runs that are left may be those of small errors, so that they excuse nothing.
+    The remaining runs may be the runs with small errors, so they excuse nothing.
     pessimistic: an interval lies below.
     incomplete: nothing was measured, or over half of what was measured, or of what was in view, was
     not used.
@@ -85,8 +85,8 @@ def judge(
     interval is wider than that, as the NIS's is below some 400,000 degrees of freedom.
 
     Args:
-        per_run: (runs,) nees_pose, nis_per_dof and unobservable, those that there are; NaN for a
-            run without.
+        per_run: (runs,) nees_pose, nis_per_dof and unobservable, as far as present; NaN for a run
+            without.
         counts: as in `Summary.counts`: runs, not_finite, and the others, of which an absent one is
             0 (of measured: all that have a status).
         nis_dof: the degrees of freedom of all NIS together.

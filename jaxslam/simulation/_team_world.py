@@ -26,9 +26,9 @@ class TeamWorld(World):
     their tags, in its places. Every robot needs a start, which the truth is drawn around; a filter
     for which it is unknown is made from `dataclasses.replace(robot, start=None)`.
 
-    The truth is that of one robot, so campaigns judge the filter whose `report` is the same; the
-    draws are the same for any report. Divergence limit and bound of a campaign are those of
-    that robot alone, started as robot 0 is.
+    The truth is one robot's, so campaigns judge the filter whose `report` is the same; the draws
+    are the same for any report. Divergence limit and bound of a campaign are computed for that
+    robot alone, started as robot 0 is.
 
     Raises ValueError on no robots, tags that clash, a robot without start, one that is not there to
     report, and as `Scenario` does.
@@ -39,7 +39,7 @@ class TeamWorld(World):
     landmarks: ArrayLike = field()
     """(N, 2)"""
     controls: ArrayLike = field()
-    """(T, ΣU), those of robot 0 first"""
+    """(T, ΣU) of all robots, robot 0 first"""
     _: KW_ONLY
     tags: tuple[int, ...] | None = static(default=None)
     """(R,) of the robots; default N, N + 1, …"""

@@ -19,8 +19,8 @@ __all__ = ["Spurious"]
 class Spurious:
     """The rates of sensor faults.
 
-    A false measurement is that of a point drawn uniformly from a square of half-width `reach`
-    around the robot. Raises ValueError on a probability outside 0 to 1, a negative clutter, or
+    A false measurement is the measurement of a point drawn uniformly from a square of half-width
+    `reach` around the robot. Raises ValueError on a probability outside 0 to 1, a negative clutter, or
     false measurements without a reach.
     """
 
@@ -105,7 +105,7 @@ class Spurious:
 
 
 def _permute(tag: Int[Array, "M"], wrong: Bool[Array, "M"]) -> Int[Array, "M"]:
-    """The tags, each wrong one replaced by that of the next wrong slot."""
+    """The tags, each wrong one replaced by the tag of the next wrong slot."""
     slots = jnp.argsort(~wrong, stable=True)  # the wrong ones first
     following = jnp.cumsum(wrong) % jnp.maximum(wrong.sum(), 1)
     return jnp.where(wrong, tag[slots[following]], tag)

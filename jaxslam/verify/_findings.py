@@ -126,7 +126,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Check:
-    """The result of a check other than that of a Jacobian."""
+    """The result of a check, of a property other than a Jacobian."""
 
     name: str
     passed: bool

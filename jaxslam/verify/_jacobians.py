@@ -44,7 +44,7 @@ class Jacobians(NamedTuple):
     """Jacobians computed in float32, held in float64; 0 at states where a loop has not ended"""
     single_error: np.ndarray
     """(S, m, n) error of autodiff in float32: of its arithmetic at the states rounded to float32,
-    plus that of rounding the states; () if unknown"""
+    plus the error of rounding the states; () if unknown"""
     quotient: Quotient | None
     how: str
     """the kind of quotient: differences or complex step"""

@@ -80,7 +80,7 @@ def verify_jacobians(
             pose, frame, landmark, l or point need not be given, nor others where `states` are.
         outputs: of a function, the names of its outputs with units; [rad] is modulo 2π.
         states: your own states, one array (S, n_k) an argument, instead of the sampled ones. For a
-            sensor those of `observe`; `invert` is tried at the measurements of these.
+            sensor the states of `observe`; `invert` is tried at their measurements.
         name: name of a function in the report; default: its `__name__`.
         count: number of random states.
         seed: seed of the random states.
@@ -157,7 +157,7 @@ def verify_jacobians(
 def build(
     factory: Callable[..., Motion | Sensor | BeamModel | Factor],
 ) -> Motion | Sensor | BeamModel | Factor:
-    """A model made by a class or factory like those of the registries: with noise 0.01 I unless
+    """A model made by a class or factory of the registries' form: with noise 0.01 I unless
     noise has a default, or, of a beam model, with the maximum range of the trial; a factor with
     nothing.
 

@@ -18,7 +18,7 @@ __all__ = ["Linearity", "linearity_index", "motion_linearity", "sensor_linearity
 _DIRECTIONS = 64
 """number of fixed random directions in which the region is sampled"""
 _RADII = (1.0, 0.5)
-"""radii of the sampled points, relative to that of the region"""
+"""radii of the sampled points, in radii of the region"""
 
 
 class Linearity(NamedTuple):
@@ -57,9 +57,9 @@ def linearity_index(
 
     the supremum once to second order, (n_σ²/2)‖Lᵀ H_i L‖₂, and once as the maximum over points of
     the region: along ± each axis and ± each eigenvector of Lᵀ H_i L, and in 64 fixed random
-    directions, at n_σ and n_σ/2. It has no unit, and changing those of x changes nothing. R, where
-    given, is the covariance of noise added to f: a smaller departure does no harm. (Civera, Davison
-    & Montiel 2008 use a related index, along the line of sight.)
+    directions, at n_σ and n_σ/2. The index has no unit, and the units of x do not change it. R,
+    where given, is the covariance of noise added to f: a smaller departure does no harm. (Civera,
+    Davison & Montiel 2008 use a related index, along the line of sight.)
 
     Traceable: wrap it in `jax.jit`, or in `jax.vmap` over states.
 

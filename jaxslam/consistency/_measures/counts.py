@@ -54,7 +54,7 @@ def count_label(name: str) -> str:
 
 
 def counts_of(info: Info) -> dict[str, Int[np.ndarray, "R"]]:
-    """The counts of measurements of R runs by status, and those of the filter.
+    """The counts (R,) of measurements by status, and of the events that the filter reports.
 
     The counts of a filter come from the method `counts` of records of `Info.extra`: arrays (R, T,
     …), by name.

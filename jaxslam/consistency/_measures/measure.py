@@ -90,11 +90,11 @@ class Measure:
     """the average of a consistent filter, if it is known"""
     unit: str = ""
     positive: bool = False
-    """whether it is never negative: the interval is `positive_interval`, else `interval`"""
+    """True if it is never negative: the interval is `positive_interval`, else `interval`"""
     note: tuple[str, str] | None = None
     """a term and a sentence below the table, if the label is not enough"""
     row: bool = True
-    """whether tables show it"""
+    """True if tables show it"""
     figure: str = ""
     """the figure that has a panel for its curve: "nees", "rmse" or "gained" """
     axis: str = ""

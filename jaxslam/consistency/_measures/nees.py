@@ -110,7 +110,7 @@ def block_nees(
     Args:
         pose: the estimated pose.
         error, chart_error: the error in (x, y, θ), and in the filter's coordinates.
-        cov: P, the claimed covariance. eps is that of its dtype.
+        cov: P, the claimed covariance. Its dtype gives eps.
 
     Raises:
         ValueError: if the shapes differ.
@@ -132,8 +132,8 @@ def block_nees(
         nees = {}
         for name, e in (("pose", error), ("own", chart_error)):
             squares, finite = _whiten(factor, e, unit)
-            # The leading two rows of the factor are that of the position; the error in the filter's
-            # coordinates has no position of its own.
+            # The two leading rows of the factor are the position's. The error in the filter's
+            # coordinates has no such block.
             for block, k in (("position", 2), ("pose", 3)):
                 if name == "pose" or block == "pose":
                     regular = (

@@ -53,11 +53,11 @@ class CampaignPlan:
     bound: bool = False
     """compute the conditional Cramér-Rao bound of every run"""
     dtype: np.dtype | None = None
-    """dtype of the worlds; None for that of JAX"""
+    """dtype of the worlds; None for JAX's default"""
 
     @property
     def wide(self) -> int:
-        """The number B of runs of a block, those of all devices."""
+        """The number B of runs of a block, on all devices together."""
         return self.block * len(self.devices)
 
     @property
@@ -206,7 +206,7 @@ class BlockRunner:
 
 
 def first_run(leaf: jax.Array, axis: int = 0) -> np.ndarray:
-    """Run 0 of an array on the devices, copied from its shard. axis: that of the runs."""
+    """Run 0 of an array on the devices, copied from its shard. axis: over the runs."""
     shard = next(part for part in leaf.addressable_shards if not part.index[axis].start)
     run: np.ndarray = np.take(np.asarray(shard.data), 0, axis)
     return run.copy()

@@ -76,7 +76,7 @@ class Programs(NamedTuple):
 
 @functools.cache
 def programs(devices: Sequence[jax.Device], dtype: np.dtype | None) -> Programs:
-    """The programs on these devices; dtype: of the worlds, None for that of JAX."""
+    """The programs on these devices; dtype: of the worlds, None for JAX's default."""
     draw = over_runs(devices, functools.partial(draw_run, dtype), (None, None, 0), 0)
     quick = quick_options(devices[0].platform)
     return Programs(jax.jit(draw, compiler_options=quick), *_programs_of_draws(devices))
@@ -130,7 +130,7 @@ def mesh_of(devices: Sequence[jax.Device]) -> Mesh:
 
 
 def spec(axis: int | None) -> PartitionSpec:
-    """How an array is divided over the devices; axis: that of the runs."""
+    """The division of an array over the devices; axis: over the runs, None without one."""
     return PartitionSpec() if axis is None else PartitionSpec(*[None] * axis, "runs")
 
 

@@ -49,7 +49,7 @@ def check_noise(scenario: World) -> None:
     """Raise ValueError if the noise of a model of the scenario is not a covariance.
 
     A `noise_cov` that is a function can only be looked at where it is called. That of the motion is
-    called for the start and the first control, that of a sensor, or of each part of a suite, for
+    called for the start and the first control; a sensor's, and each part's of a suite, for
     z = 0 and, if it is not a covariance there, for the first landmark as measured from the start.
     """
     if not is_concrete(scenario.controls, scenario.pose, scenario.landmarks):

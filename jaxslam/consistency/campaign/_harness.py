@@ -2,8 +2,8 @@
 
 A run is a number: its key and its place in a block. For one size of blocks and one number of
 devices its world and its filters' results are the same to the bit, for any workers, parts and
-interruptions; otherwise to rounding. Only scores are kept of a block, so
-memory is that of the blocks in flight however many runs there are.
+interruptions; otherwise to rounding. Only scores are kept of a block, so the blocks in flight set
+the memory, for any number of runs.
 
 On a GPU particle filters agree to rounding alone (`docs/guide/campaigns.md`).
 """
@@ -91,7 +91,7 @@ def monte_carlo(
         part: (i, n) with 1 <= i <= n: only the blocks i - 1, i - 1 + n, … are computed, and the
             returned campaign covers them. So n independent jobs compute a
             campaign, each with a `keep` from `store.open` on one folder, with the same block and
-            number of devices; without `part` the blocks are summed up, and those that are missing
+            number of devices; without `part` the blocks are summed up, and missing blocks are
             computed.
         progress: called with (runs done, runs) after each block. Default a bar with
             rate and remaining time, only on a terminal and in a notebook; False: none.

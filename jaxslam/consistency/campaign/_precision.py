@@ -42,7 +42,7 @@ def precision_doubts(
 ) -> dict[str, str]:
     """Sentences, by filter, on the precision of its runs, where that decides.
 
-    dtype: that of the runs. compare: whether they may be filtered again.
+    dtype: of the runs. compare: whether runs may be filtered again.
     """
     least, doubts = least_noise(plan.scenario), {}
     for name, candidate in plan.filters.items():

@@ -111,7 +111,7 @@ def align_map(
     """The pose that carries a map onto surveyed points best, and the RMSE [m] that remains.
 
     estimate: of one time, landmarks tagged. true_points: by tag. The frame of a map made from
-    data is that of the robot's start, so only its shape can be compared (`alignment`). Raises
+    data begins at the robot's start, so only its shape can be compared (`alignment`). Raises
     ValueError if the map is empty.
     """
     named = np.asarray(estimate.alive) & (np.asarray(estimate.tag) >= 0)

@@ -75,7 +75,7 @@ ROOMS: dict[str, Callable[..., LaserWorld]] = {
     "office": office,
     "square": square,
 }
-"""By name; each takes the number of beams."""
+"""Rooms by name; each takes the number of beams."""
 
 
 def _box(left: float, low: float, right: float, high: float) -> list[tuple[float, float]]:

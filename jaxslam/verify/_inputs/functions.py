@@ -216,7 +216,7 @@ def plain_function(
 ) -> Function:
     """A function of vectors, whose arguments have the names of its parameters.
 
-    Lengths that neither `arguments` nor a parameter's name states are those of the states.
+    Lengths that neither `arguments` nor a parameter's name states are taken from the states.
     Raises ValueError where the length of an argument is not known.
     """
     name = name or str(getattr(call, "__name__", type(call).__name__))
