@@ -20,8 +20,8 @@ class Spurious:
     """The rates of sensor faults.
 
     A false measurement is the measurement of a point drawn uniformly from a square of half-width
-    `reach` around the robot. Raises ValueError on a probability outside 0 to 1, a negative clutter, or
-    false measurements without a reach.
+    `reach` around the robot. Raises ValueError on a probability outside 0 to 1, a negative clutter,
+    or false measurements without a reach.
     """
 
     clutter: float = static(default=0.0)

@@ -104,7 +104,8 @@ def credibility(
     At each step, with the actual mean square error Σ = mean over runs of e eᵀ and the ratio
     ρ = (eᵀ P⁻¹ e)/(eᵀ Σ⁻¹ e) of a run, the index is the mean of 10 |log10 ρ| and the inclination
     the mean of 10 log10 ρ: decibels, 0 for a credible filter, a positive inclination for an
-    optimistic one. X. R. Li, Z. Zhao, "Measuring estimator's credibility: noncredibility index", FUSION 2006.
+    optimistic one. X. R. Li, Z. Zhao, "Measuring estimator's credibility: noncredibility index",
+    FUSION 2006.
 
     Args:
         covs: as claimed.
