@@ -98,14 +98,16 @@ def judge(
     tested = {name: per_run[name] for name in TESTS if np.isfinite(per_run.get(name, ())).sum() > 1}
     signs: dict[str, int] = {}
     noticed: dict[str, tuple[float, float]] = {}
-    wide = True
+    is_wide = True
     for name, values in tested.items():
         of_nees = name == "nees_pose"
         average = spread(values, EACH, skewed=of_nees)
         assert average is not None
         honest = honest_values(honest_nis)[name]
         signs[name], noticed[name] = _side(average, *honest), _noticeable(average, *honest)
-        wide = wide and not (of_nees and average.above <= 2)
+        # Narrow enough to reject a NEES of twice the honest one.
+        if of_nees and average.above <= 2:
+            is_wide = False
     by = tuple(name for name, sign in signs.items() if sign)
     if by and signs[by[0]] > 0:
         word = "optimistic"
@@ -116,7 +118,7 @@ def judge(
     elif _is_starved(counts):
         word = "incomplete"
     else:
-        word = "undecided" if wide else "consistent"
+        word = "undecided" if is_wide else "consistent"
     return Verdict(word, by, noticed, doubts, honest_nis)
 
 
