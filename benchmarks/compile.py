@@ -33,7 +33,7 @@ from jaxslam import (
     smoothing,
     team,
 )
-from jaxslam.consistency.campaign._candidates import estimator_of
+from jaxslam.consistency.campaign._candidates import method_of
 from jaxslam.core.protocols import Filter
 from jaxslam.core.types import Log, Trace, Truth
 from jaxslam.filters import EkfSlam, Merging, TeamSlam
@@ -95,8 +95,10 @@ def case(name: str, scale: float) -> tuple[World, Any]:
 @jax.jit
 def drive(method: Any, there: World, truth: Truth, log: Log, key: jax.Array) -> Trace:
     """The trace of a campaign's candidate over a log."""
-    estimate, _ = estimator_of(method, truth, there)
-    return estimate(log, key)
+    estimator = method_of(method, truth)
+    if isinstance(estimator, Filter):
+        return run(estimator, log, there.pose, there.pose_cov, key)
+    return estimator(log, key)
 
 
 def first_run(name: str, program: Any, *arguments: Any) -> Metric:

@@ -28,8 +28,8 @@ FLOORS = [
     "core",
     "motion sensors charts linearize association resampling life",
     "_driver _origin _rounding filters graphs laser simulation",
-    "consistency verify catalog _catalog calibration",
-    "datasets results _cli selftest _selftest __main__",
+    "consistency verify catalog calibration",
+    "datasets results _cli selftest __main__",
 ]
 FLOOR = {name: floor for floor, names in enumerate(FLOORS) for name in names.split()}
 FLOOR[""] = len(FLOORS)  # jaxslam/__init__.py sees everything, and nothing sees it

@@ -5,7 +5,6 @@ from jaxslam.core.protocols import Filter, Wrapper
 from jaxslam.filters._delayed.delayed_filter import Hypotheses, Promotion, StoredMeasurements
 from jaxslam.filters._delayed.delayed_slam import DelayedSlam
 from jaxslam.filters._ekf.compressed_ekf_slam import CompressedEkfSlam
-from jaxslam.filters._ekf.ekf_settings import EkfOptions
 from jaxslam.filters._ekf.ekf_slam import EkfSlam
 from jaxslam.filters._ekf.linear_system import (
     LinearizedSteps,
@@ -37,7 +36,6 @@ __all__ = [
     "DeadReckoning",
     "DelayedSlam",
     "EifSlam",
-    "EkfOptions",
     "EkfSlam",
     "FastSlam",
     "Filter",

@@ -2,7 +2,7 @@
 
 import functools
 from collections.abc import Callable
-from typing import Any, TypeVar, cast
+from typing import TypeVar, cast
 
 import jax
 import jax.numpy as jnp
@@ -177,21 +177,6 @@ def hot_jit(
         return cast(_T, (within if traced else alone())(*arguments))
 
     return call
-
-
-def moves_numbers(function: _F) -> _F:
-    """The function, which moves numbers between host and device under any `jax.transfer_guard`.
-
-    For functions called from the host that take the numbers of models, which NumPy may hold, check
-    values and return results; a guard is there for the loops of a user.
-    """
-
-    @functools.wraps(function)
-    def call(*arguments: Any, **options: Any) -> Any:
-        with jax.transfer_guard("allow"):
-            return function(*arguments, **options)
-
-    return cast(_F, call)
 
 
 def last_true_column(match: Bool[Array, "M N"]) -> tuple[Int[Array, "M"], Bool[Array, "M"]]:

@@ -15,7 +15,7 @@ from jaxslam.consistency.campaign import Campaign
 from jaxslam.consistency.campaign._block import BOUND
 from jaxslam.consistency.campaign._harness import summaries_of
 from jaxslam.consistency.campaign._kept import add_kept
-from jaxslam.consistency.campaign._pieces import missing
+from jaxslam.consistency.campaign._pieces import missing_pieces
 from jaxslam.core._numbers import is_number
 from jaxslam.results import _report as report
 from jaxslam.results import _store as store
@@ -145,7 +145,7 @@ def load(folder: str | Path) -> Campaign:
             "writes them"
         ) from error
     runs, tallies = found["runs"], {name: Tally() for name in (*doubts, BOUND)}
-    if missing(add_kept(tallies, kept, runs, lambda first: True), runs, runs):
+    if missing_pieces(add_kept(tallies, kept, runs, lambda first: True), runs, runs):
         raise ValueError(
             f"{folder}: the campaign is not finished: jaxslam consistency --resume {folder}"
         )

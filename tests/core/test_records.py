@@ -15,8 +15,7 @@ from layouts import kept_programs, wrong_layouts
 from own_models import motion_of, sensor_of
 
 import jaxslam
-from jaxslam import _catalog as catalog
-from jaxslam import filters, motion, run, sensors, simulate, smoothing
+from jaxslam import catalog, filters, motion, run, sensors, simulate, smoothing
 from jaxslam.core._record import is_record
 from jaxslam.core.protocols import Filter, Motion
 from jaxslam.core.record import field, function_of, record, static
@@ -451,12 +450,14 @@ def test_what_cannot_be_traced_is_told_by_method_and_line():
             return float(jax.random.uniform(key))
 
     world = worlds.ring(3)
-    with pytest.raises(ValueError, match=r"dead_reckoning: predict: test_records.py:\d+ needs the"):
+    with pytest.raises(ValueError, match=r"records.py:\d+, in predict, needs the") as error:
         driven(Branching(filters.DeadReckoning(world.motion, world.sensor)))
+    assert str(error.value).startswith("run: branching dead_reckoning: ")
+    assert "\n" not in str(pickle.loads(pickle.dumps(error.value)))  # as a worker sends it
     fields = {field.name: getattr(world, field.name) for field in dataclasses.fields(world)}
     with pytest.raises(ValueError, match=r"ring: draw: expected \(Truth, Log\), got int"):
         simulate(Drawn(**fields), KEY)
-    with pytest.raises(ValueError, match=r"ring: draw: test_records.py:\d+ needs the value"):
+    with pytest.raises(ValueError, match=r"ring: draw: test_records.py:\d+, in draw, needs"):
         simulate(Counted(**fields), KEY)
     assert "\n" not in repr(Drawn(**fields))
 

@@ -8,8 +8,7 @@ import numpy as np
 import pytest
 from cases import refused
 
-from jaxslam import Scenario, monte_carlo, motion, recorded_world, sensors, simulate, store
-from jaxslam import _catalog as catalog
+from jaxslam import Scenario, catalog, monte_carlo, motion, recorded_world, sensors, simulate, store
 from jaxslam.core.types import Log, Scan
 from jaxslam.results import plot
 

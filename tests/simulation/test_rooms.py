@@ -10,10 +10,8 @@ import pytest
 import worlds
 from cases import refused, swept
 
-from jaxslam import _catalog as catalog
-from jaxslam import run
+from jaxslam import catalog, run, simulate
 from jaxslam.simulation._wall_geometry import exact_ranges, is_free, wall_lines
-from jaxslam.simulation._worlds import simulate
 from jaxslam.simulation.laser import Laser, scan, scan_information, scan_world, true_ranges
 from jaxslam.simulation.scenarios import (
     ROOMS,

@@ -17,10 +17,9 @@ from cases import refused
 from own_models import changed
 from reference.plane import mounted, to_frame, wrap
 
-from jaxslam import motion, sensors
+from jaxslam import Scenario, motion, sensors, simulate
 from jaxslam.core._validation import check_log
 from jaxslam.math.stats import sigma_gate
-from jaxslam.simulation._worlds import Scenario, simulate
 from jaxslam.simulation.scenarios import (
     SCENARIOS,
     BetweenRanges,

@@ -17,12 +17,11 @@ from jaxslam.core.record import record
 from jaxslam.laser.grids import beam_models
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
-from jaxslam.verify import Check, Report, verify_jacobians
+from jaxslam.verify import Check, Report, build, verify_jacobians
 from jaxslam.verify import _properties as properties
 from jaxslam.verify._inputs import samples, user_files
 from jaxslam.verify._inputs.functions import motion_functions
 from jaxslam.verify._inputs.user_files import UnusableFile, load, verify_file
-from jaxslam.verify._verifier import build
 
 LASER = build(sensors.RangeBearing)
 CAMERA = build(sensors.BearingOnly)

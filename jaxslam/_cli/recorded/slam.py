@@ -260,7 +260,9 @@ def given_relations(path: str, log: LaserLog) -> tuple[metrics.Relations, int]:
     """
     file = relation_file(path)
     try:
-        return metrics.given(log.time, file.first, file.second, file.pose, tolerance=TOLERANCE)
+        return metrics.relations_at_stamps(
+            log.time, file.first, file.second, file.pose, tolerance=TOLERANCE
+        )
     except ValueError as problem:
         reason = str(problem).removeprefix("given: ")
         raise ValueError(f"--relations: {file.source}: {reason}") from problem

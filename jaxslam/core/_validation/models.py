@@ -4,9 +4,10 @@ Types of records, arguments of functions, sizes of results. Each error is one li
 was expected.
 """
 
+import contextlib
 import traceback
 import weakref
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 from pathlib import Path
 from typing import TypeVar
 
@@ -26,7 +27,6 @@ from jaxslam.core.validation import InvalidField, instance_of, require
 
 _Shape = tuple[int, ...]
 _Record = TypeVar("_Record")
-_Result = TypeVar("_Result")
 _S = TypeVar("_S")
 
 _SOUND: weakref.WeakSet[Motion | Sensor] = weakref.WeakSet()
@@ -40,22 +40,34 @@ _NEEDS_VALUES = (
 )
 
 
-def call_traced(name: str, function: Callable[..., _Result], *arguments: PyTree) -> _Result:
-    """The result of a user's function within a trace.
+_PACKAGE = str(Path(__file__).parents[2])
 
-    Raises ValueError, which begins with a name, where it needs the value of an array.
+
+@contextlib.contextmanager
+def reworded_tracer_errors(name: str) -> Iterator[None]:
+    """A context that names the line of a user's code which needs the value of a traced array.
+
+    As a context it adds no frame between `run` and a user's model. JAX's own errors say it in
+    twenty lines, and cannot be pickled: a worker of an executor could not send them.
+
+    Raises ValueError, which begins with a name, in place of a tracer's error.
     """
     try:
-        return function(*arguments)
+        yield
     except _NEEDS_VALUES as error:
         frames = traceback.extract_tb(error.__traceback__)
-        at = [frame for frame in frames if "site-packages" not in frame.filename][-1]
+        of_user = [
+            frame
+            for frame in frames
+            if "site-packages" not in frame.filename and not frame.filename.startswith(_PACKAGE)
+        ]
+        last = (of_user or frames)[-1]
         raise InvalidField(
             name,
             "",
-            f"{Path(at.filename).name}:{at.lineno} needs the value of an array, which is not known "
-            "while JAX traces: write jnp.where or lax.cond in place of `if`, jax.numpy in place of "
-            "NumPy, and no float(…)",
+            f"{Path(last.filename).name}:{last.lineno}, in {last.name}, needs the value of an "
+            "array, which is not known while JAX traces: write jnp.where or lax.cond in place of "
+            "`if`, jax.numpy in place of NumPy, and no float(…)",
         ) from error
 
 

@@ -29,7 +29,6 @@ from jaxslam.core.protocols import Associate, Motion, Sensor
 from jaxslam.core.types import JaxOrNumPy
 from jaxslam.core.validation import InvalidField
 from jaxslam.datasets._dataset import Parameter
-from jaxslam.filters._ekf.ekf_settings import EkfOptions
 from jaxslam.math._definite import asymmetric, indefinite
 from jaxslam.motion import _odometry_errors as odometry_errors
 from jaxslam.sensors import _range_errors as range_errors
@@ -98,7 +97,7 @@ METHODS: dict[str, Callable[..., Associate]] = {
 }
 
 
-def association_options(method: object, gate: Any) -> EkfOptions:
+def association_options(method: object, gate: Any) -> dict[str, Any]:
     """Options of `EkfSlam` for a method by name and a gate.
 
     Raises InvalidField, of associate or gate, on an unknown name and a gate that is not a
@@ -405,7 +404,7 @@ class TableSettings:
         cov[np.ix_(at, at)] = rows
         return cov
 
-    def filter_options(self, unknown: bool) -> EkfOptions:
+    def filter_options(self, unknown: bool) -> dict[str, Any]:
         """The options of `EkfSlam`. unknown: whether tags are unknown."""
         section = self._filter()
         update = section.get("update")
@@ -415,7 +414,7 @@ class TableSettings:
             raise ValueError(
                 f'{self._at("filter", "update")}: expected "sequential" or "joint", got {update!r}'
             )
-        options: EkfOptions = {"correction": update}
+        options: dict[str, Any] = {"correction": update}
         method, gate = section.get("associate"), section.get("gate")
         if method is None:
             method = self._default("filter", "associate", "nearest" if unknown else "known")

@@ -243,7 +243,8 @@ def relation_file(path: str | Path) -> StampedRelations:
     """The relations of a file of the Freiburg benchmark, packed by gzip or not.
 
     A line: `t1 t2 x y z roll pitch yaw` [s, m, rad], the pose at t2 in the frame of that at t1.
-    Blank lines and lines that begin with # are skipped. `metrics.given` joins them to a path.
+    Blank lines and lines that begin with # are skipped. `metrics.relations_at_stamps` joins the
+    relations to a path.
 
     Source: Kümmerle, Steder, Dornhege, Ruhnke, Grisetti, Stachniss & Kleiner 2009, "On measuring
     the accuracy of SLAM algorithms", Autonomous Robots 27.

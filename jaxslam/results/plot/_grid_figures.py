@@ -12,7 +12,7 @@ from matplotlib.patches import Patch
 from numpy.typing import ArrayLike
 
 from jaxslam.consistency.metrics import ate
-from jaxslam.consistency.metrics._paths import carried
+from jaxslam.consistency.metrics._paths import transform
 from jaxslam.core.types import Beams
 from jaxslam.laser.grids import Field, Grid
 from jaxslam.laser.laser_slam import LoopOutcome, Solved
@@ -231,7 +231,7 @@ def loops_figure(
     for axes, (path, text) in zip(panels, paths, strict=True):
         known = None
         if reference is not None:
-            known = carried(ate(path, np.asarray(reference)).frame, np.asarray(reference))
+            known = transform(ate(path, np.asarray(reference)).frame, np.asarray(reference))
         _draw_loops(axes, path[:, :2], ends, known)
         titled(axes, text)
         axes.set_xlabel("x [m]")

@@ -37,7 +37,7 @@ SCENARIOS: dict[str, Callable[..., Scenario]] = {
     "stationary": stationary,
     "webmap": webmap,
 }
-"""By name; each takes the number of steps, by default that of the publication."""
+"""Scenarios by name; each takes the number of steps, by default the publication's."""
 
 __all__ = [
     "ROOMS",

@@ -10,8 +10,7 @@ import pytest
 import worlds
 from cases import refused, swept
 
-from jaxslam import _catalog as catalog
-from jaxslam import charts, filters, life, linearize, sensors
+from jaxslam import catalog, charts, filters, life, linearize, sensors
 from jaxslam._driver import run
 from jaxslam.core.record import record
 from jaxslam.core.slots import Joint

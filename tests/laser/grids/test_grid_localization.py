@@ -158,7 +158,7 @@ def test_the_ray_cast_model_keeps_the_robot_on_the_draws_that_both_models_get():
     for model, count in ((MODEL, 200), (ray_cast, 150)):
         filter = grids.GridLocalization(GRID, model, MOVE, count, exponent=0.2)
         scores = consistency.judge_localization(
-            world, filter, 2, KEY, start_cov=np.diag([0.1, 0.1, 0.05]) ** 2, every=5
+            world, filter, 2, KEY, start_cov=np.diag([0.1, 0.1, 0.05]) ** 2, stride=5
         )
         error = np.asarray(scores.pose - scores.truth)[:, 1:]
         assert np.hypot(error[..., 0], error[..., 1]).max() < 0.15
@@ -281,8 +281,8 @@ def test_a_log_of_beams_drops_what_says_nothing():
     ),
     (lambda: consistency.judge_localization(WORLD, of(), 0, KEY), "judge_localization: runs"),
     (
-        lambda: consistency.judge_localization(WORLD, of(), 1, KEY, every=61),
-        "judge_localization: expected every <= 60 steps, got 61",
+        lambda: consistency.judge_localization(WORLD, of(), 1, KEY, stride=61),
+        "judge_localization: expected stride <= 60 steps, got 61",
     ),
     (lambda: consistency.judge_localization(WORLD, 3, 1, KEY), "expected a Filter, got int"),
     (lambda: consistency.judge_localization(3, of(), 1, KEY), "localization: expected a Laser"),
