@@ -37,8 +37,8 @@ class _Compressed(NamedTuple):
     treats them as landmarks that are never measured.
     """
 
-    whole: Joint
-    """the whole map as it was when the area was opened, with the current tags and alive slots"""
+    full: Joint
+    """the full map as it was when the area was opened, with the current tags and alive slots"""
     area: Joint
     """robot, K landmarks, and slots for Φ, Ψ and θ"""
     slot: jax.Array
@@ -79,7 +79,7 @@ class CompressedEkfSlam(Wrapper):
         check_count(f"{name}: area", self.area)
         sensor = filter.sensor
         joint = jax.eval_shape(filter.init, jnp.zeros(3), jnp.eye(3))
-        for what, unfit in {
+        for feature, is_unfit in {
             "a life": filter.life is not None,
             "an association other than by tags": not isinstance(filter.associate, Known),
             'the covariance "square_root"': filter.square_root,
@@ -94,8 +94,8 @@ class CompressedEkfSlam(Wrapper):
                 jax.tree.leaves(joint.lin)
             ),
         }.items():
-            if unfit:
-                raise ValueError(f"{name}: {what} is not supported")
+            if is_unfit:
+                raise ValueError(f"{name}: {feature} is not supported")
 
     @property
     def name(self) -> str:  # type: ignore[override]
@@ -119,19 +119,26 @@ class CompressedEkfSlam(Wrapper):
         return _with_updated_area(state, inside), info._replace(slot=in_map)
 
     def estimate(self, state: _Compressed) -> Estimate:
-        def one(*of_landmark: jax.Array) -> Estimate:
-            landmark, alive, tag, landmark_cov, with_robot = of_landmark
+        def estimate_landmark(
+            landmark: jax.Array,
+            alive: jax.Array,
+            tag: jax.Array,
+            landmark_cov: jax.Array,
+            with_robot: jax.Array,
+        ) -> Estimate:
             cov = jnp.block([[robot, with_robot], [with_robot.T, landmark_cov]])
             place = state.area.pose, landmark[None], cov, alive[None], tag[None]
             return self.filter.estimate(Joint(*place, ()))
 
-        robot, joint = state.area.cov[:3, :3], state.whole
-        each = jax.vmap(one)(_moved_map(state), joint.alive, joint.tag, *_marginals(state))
+        robot, joint = state.area.cov[:3, :3], state.full
+        landmarks = jax.vmap(estimate_landmark)(
+            _moved_map(state), joint.alive, joint.tag, *_marginals(state)
+        )
         return Estimate(
             pose=state.area.pose,
             pose_cov=robot,
-            points=each.points[:, 0],
-            point_covs=each.point_covs[:, 0],
+            points=landmarks.points[:, 0],
+            point_covs=landmarks.point_covs[:, 0],
             alive=joint.alive,
             tag=joint.tag,
         )
@@ -140,8 +147,8 @@ class CompressedEkfSlam(Wrapper):
     def _local(self) -> EkfSlam:
         """The filter of the area, with slots for the postponed update."""
         area = min(self.area, self.filter.capacity)
-        more = _more(area, len(self.filter.sensor.landmark))
-        return dataclasses.replace(self.filter, capacity=area + more)
+        spare = _postponed_slots(area, len(self.filter.sensor.landmark))
+        return dataclasses.replace(self.filter, capacity=area + spare)
 
 
 def opened(joint: Joint, area: int) -> _Compressed:
@@ -151,7 +158,7 @@ def opened(joint: Joint, area: int) -> _Compressed:
 
 def up_to_date(state: _Compressed) -> Joint:
     """The map with the postponed update applied, O(K·N²)."""
-    joint = state.whole
+    joint = state.full
     at = _rows(state.slot, joint.landmarks.shape[1])
     before = joint.cov[at]
     phi, psi, _ = _postponed_update(state)
@@ -169,41 +176,41 @@ def _with_area_of(scan: Scan, state: _Compressed, sensor: Sensor, most: int | No
 
     most: new landmarks a scan.
     """
-    joint, area = state.whole, state.slot.shape[0]
+    joint, area = state.full, state.slot.shape[0]
     tagged = scan.valid & (scan.tag >= 0)
-    slot, found = slots.find(joint.tag, joint.alive, scan.tag)
-    seen = jnp.zeros(joint.alive.shape, bool).at[slot].max(tagged & found)
-    new = jnp.minimum((tagged & ~found).sum(), scan.tag.shape[0] if most is None else most)
+    slot, in_map = slots.find(joint.tag, joint.alive, scan.tag)
+    seen = jnp.zeros(joint.alive.shape, bool).at[slot].max(tagged & in_map)
+    new = jnp.minimum((tagged & ~in_map).sum(), scan.tag.shape[0] if most is None else most)
     room, room_anywhere = (~state.area.alive).sum(), (~joint.alive).sum()
     outside = seen & ~jnp.zeros(joint.alive.shape, bool).at[state.slot].set(True)
     leave = outside.any() | ((new > room) & (room_anywhere > room))
 
-    def anew(state: _Compressed) -> _Compressed:
+    def reopen(state: _Compressed) -> _Compressed:
         joint = up_to_date(state)
         # The result of a run must not depend on other runs of the batch.
-        other = _opened_at(joint, _chosen(joint, area, sensor, seen, new))
-        both: _Compressed = jax.tree.map(lambda a, b: jnp.where(leave, a, b), other, state)
-        return both
+        opened = _opened_at(joint, _chosen_area(joint, area, sensor, seen, new))
+        chosen: _Compressed = jax.tree.map(lambda a, b: jnp.where(leave, a, b), opened, state)
+        return chosen
 
-    after: _Compressed = where_any(leave, anew, lambda state: state, state)
+    after: _Compressed = where_any(leave, reopen, lambda state: state, state)
     return after
 
 
 def _with_updated_area(state: _Compressed, area: Joint) -> _Compressed:
     """The state with its area updated, and tags and alive slots of the map as in the area."""
-    joint, count = state.whole, state.slot.shape[0]
+    joint, count = state.full, state.slot.shape[0]
     joint = joint._replace(
         alive=joint.alive.at[state.slot].set(area.alive[:count]),
         tag=joint.tag.at[state.slot].set(area.tag[:count]),
     )
-    return state._replace(whole=joint, area=area)
+    return state._replace(full=joint, area=area)
 
 
 def _moved_map(state: _Compressed) -> jax.Array:
     """The current landmarks (N, L)."""
-    landmarks, area = state.whole.landmarks, state.slot.shape[0]
+    landmarks, area = state.full.landmarks, state.slot.shape[0]
     theta = _postponed_update(state)[2]
-    moved = (theta @ state.whole.cov[_rows(state.slot, landmarks.shape[1])])[3:]
+    moved = (theta @ state.full.cov[_rows(state.slot, landmarks.shape[1])])[3:]
     return (
         (landmarks + moved.reshape(landmarks.shape)).at[state.slot].set(state.area.landmarks[:area])
     )
@@ -211,20 +218,21 @@ def _moved_map(state: _Compressed) -> jax.Array:
 
 def _marginals(state: _Compressed) -> tuple[jax.Array, jax.Array]:
     """The current P of each landmark with itself (N, L, L) and with the robot (N, 3, L)."""
-    capacity, size = state.whole.landmarks.shape
+    capacity, size = state.full.landmarks.shape
     area, at = state.slot.shape[0], _rows(state.slot, size)
 
     def by_landmark(rows: jax.Array) -> jax.Array:
         return rows[:, 3:].reshape(len(rows), -1, size).transpose(1, 0, 2)
 
     def with_itself(cov: jax.Array, count: int) -> jax.Array:
-        every = jnp.arange(count)
-        return cov[3:, 3:].reshape(count, size, count, size)[every, :, every]
+        k = jnp.arange(count)
+        # Landmarks by number and entry, (count, L, count, L): the diagonal blocks.
+        return cov[3:, 3:].reshape(count, size, count, size)[k, :, k]
 
     phi, psi, _ = _postponed_update(state)
-    before, inside = state.whole.cov[at], state.area.cov[: len(at), : len(at)]
+    before, inside = state.full.cov[at], state.area.cov[: len(at), : len(at)]
     lost = jnp.einsum("nal,nak->nlk", by_landmark(before), by_landmark(psi @ before))
-    alone = with_itself(state.whole.cov, capacity) - lost
+    alone = with_itself(state.full.cov, capacity) - lost
     with_robot = by_landmark(phi[:3] @ before)
     return (
         alone.at[state.slot].set(with_itself(inside, area)),
@@ -247,24 +255,26 @@ def _postponed_update(state: _Compressed) -> tuple[jax.Array, jax.Array, jax.Arr
 def _opened_at(joint: Joint, slot: jax.Array) -> _Compressed:
     """The state with nothing postponed and the landmarks of slots (K,) as its area."""
     count, size = slot.shape[0], joint.landmarks.shape[1]
-    at, more = _rows(slot, size), _more(count, size)
+    at, spare = _rows(slot, size), _postponed_slots(count, size)
     inside = joint.cov[at][:, at]
     living = jnp.concatenate([jnp.ones(3, bool), jnp.repeat(joint.alive[slot], size)])
     phi = jnp.diag(living.astype(inside.dtype))
-    cov = jnp.zeros((len(at) + more * size,) * 2, inside.dtype)
+    cov = jnp.zeros((len(at) + spare * size,) * 2, inside.dtype)
     cov = cov.at[: 2 * len(at), : 2 * len(at)].set(jnp.block([[inside, phi], [phi, 0 * phi]]))
     area = Joint(
         pose=joint.pose,
-        landmarks=jnp.concatenate([joint.landmarks[slot], jnp.zeros((more, size), inside.dtype)]),
+        landmarks=jnp.concatenate([joint.landmarks[slot], jnp.zeros((spare, size), inside.dtype)]),
         cov=cov,
-        alive=jnp.concatenate([joint.alive[slot], jnp.ones(more, bool)]),
-        tag=jnp.concatenate([joint.tag[slot], jnp.full(more, _NONE, joint.tag.dtype)]),
+        alive=jnp.concatenate([joint.alive[slot], jnp.ones(spare, bool)]),
+        tag=jnp.concatenate([joint.tag[slot], jnp.full(spare, _NONE, joint.tag.dtype)]),
         lin=joint.lin,
     )
     return _Compressed(joint, area, slot)
 
 
-def _chosen(joint: Joint, area: int, sensor: Sensor, seen: jax.Array, new: jax.Array) -> jax.Array:
+def _chosen_area(
+    joint: Joint, area: int, sensor: Sensor, seen: jax.Array, new: jax.Array
+) -> jax.Array:
     """The slots (own,) of a new area, ascending: those seen, free ones, the nearest to the pose."""
     points = jax.vmap(sensor.position)(joint.landmarks)
     distance = ((points - joint.pose[None, :2]) ** 2).sum(axis=1)
@@ -281,6 +291,6 @@ def _rows(slot: jax.Array, size: int) -> jax.Array:
     return jnp.concatenate([jnp.arange(3), of_landmarks.reshape(-1)])
 
 
-def _more(area: int, size: int) -> int:
+def _postponed_slots(area: int, size: int) -> int:
     """The number of landmark slots that hold 3 + own·size variables."""
     return -(-(3 + area * size) // size)

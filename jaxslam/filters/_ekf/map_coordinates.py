@@ -76,8 +76,8 @@ def reduced_where_ready(
 def ready(joint: Joint, sensor: Sensor, square_root: bool) -> Bool[Array, "N"]:
     """Which landmarks may become points now."""
     assert sensor.reduced is not None
-    every = jnp.arange(joint.landmarks.shape[0])
-    covs = jax.vmap(partial(slots.local_cov, joint, square_root=square_root))(every)[:, 3:, 3:]
+    slot = jnp.arange(joint.landmarks.shape[0])
+    covs = jax.vmap(partial(slots.local_cov, joint, square_root=square_root))(slot)[:, 3:, 3:]
     linear = jax.vmap(sensor.reduced.ready, (None, 0, 0))(joint.pose, joint.landmarks, covs)
     good: jax.Array = linear & joint.alive & ~joint.reduced
     return good
@@ -128,8 +128,9 @@ def estimate_of(
     capacity, size = joint.landmarks.shape
     cov = joint.cov @ joint.cov.T if square_root else joint.cov
     pose_cov = cov[:3, :3]
-    every = jnp.arange(capacity)
-    own_covs = cov[3:, 3:].reshape(capacity, size, capacity, size)[every, :, every]
+    slot = jnp.arange(capacity)
+    # P of landmarks by slot and entry, (N, L, N, L): its diagonal blocks.
+    own_covs = cov[3:, 3:].reshape(capacity, size, capacity, size)[slot, :, slot]
     with_pose = cov[3:, :3].reshape(capacity, size, 3)
 
     def point(

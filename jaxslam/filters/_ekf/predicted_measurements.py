@@ -24,7 +24,7 @@ def prediction_of(filter: KalmanFilter, sensor: Sensor, joint: Joint) -> Predict
         Float[Array, "N Z"], Float[Array, "N Z 3"], Float[Array, "N Z L"], Float[Array, "N Z Z"]
     ]:
         """The predicted ẑ, H by errors of pose and landmark, and H P Hᵀ, for each landmark."""
-        every = jnp.arange(capacity)
+        slots = jnp.arange(capacity)
         robot, cross, landmarks = materialize(_blocks(joint, square_root))
         top = jnp.concatenate([jnp.broadcast_to(robot, (capacity, 3, 3)), cross], axis=2)
         bottom = jnp.concatenate([cross.transpose(0, 2, 1), landmarks], axis=2)
@@ -34,7 +34,7 @@ def prediction_of(filter: KalmanFilter, sensor: Sensor, joint: Joint) -> Predict
                 at_slot(sensor, joint, slot),
                 LinearizationPoint(joint, chart, joint.pose, cov, slot, landmark),
             )
-        )(every, joint.landmarks, local)
+        )(slots, joint.landmarks, local)
         if chart.basis is not None:
             by_pose, by_landmark = chart_jacobians(
                 chart, joint.pose, joint.landmarks, by_pose, by_landmark
@@ -72,7 +72,7 @@ def _blocks(
         robot, rows = joint.cov[:3], joint.cov[3:].reshape(capacity, size, -1)
         cross = jnp.einsum("ik,nlk->nil", robot, rows)
         return robot @ robot.T, cross, jnp.einsum("nlk,nmk->nlm", rows, rows)
-    every = jnp.arange(capacity)
-    landmark = joint.cov[3:, 3:].reshape(capacity, size, capacity, size)[every, :, every]
+    slots = jnp.arange(capacity)
+    landmark = joint.cov[3:, 3:].reshape(capacity, size, capacity, size)[slots, :, slots]
     cross = joint.cov[:3, 3:].reshape(3, capacity, size).transpose(1, 0, 2)
     return joint.cov[:3, :3], cross, landmark

@@ -68,19 +68,19 @@ class Localization(Filter):
     linearize: Linearizer = field(default=AtEstimate(), check=instance_of(Linearizer))
     """one without a memory of landmarks (AtEstimate, Unscented)"""
     associate: Associate = field(default=Known(), check=function_of("prediction", "scan"))
-    """see `EkfSlam.associate`"""
+    """See `EkfSlam.associate`."""
     correction: CorrectionOrder = static(
         default="sequential", check=one_of(*get_args(CorrectionOrder))
     )
-    """see `EkfSlam.correction`"""
+    """See `EkfSlam.correction`."""
     gate: Number | None = field(default=None, check=or_none(probability))
-    """see `EkfSlam.gate`"""
+    """See `EkfSlam.gate`."""
     iterations: int = static(default=1, check=at_least(1))
-    """see `EkfSlam.iterations`"""
+    """See `EkfSlam.iterations`."""
     covariance: Literal["plain", "joseph"] = static(
         default="plain", check=one_of("plain", "joseph")
     )
-    """see `EkfSlam.covariance`"""
+    """See `EkfSlam.covariance`."""
 
     def __post_init__(self) -> None:
         name, linearize = "Localization", self.linearize

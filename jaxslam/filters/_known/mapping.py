@@ -46,15 +46,18 @@ class Mapping(ParticleMapFilter):
     """
 
     sensor: Sensor
-    """of landmarks; Jacobians come from `jax.jacfwd`"""
+    """a sensor of landmarks; Jacobians come from `jax.jacfwd`"""
     capacity: int = static()
     """landmark slots N"""
     _: dataclasses.KW_ONLY
     associate: Associate = Known()
+    """See `EkfSlam.associate`."""
     gate: Number | None = None
+    """See `EkfSlam.gate`."""
     births: int | None = static(default=None)
+    """See `EkfSlam.births`."""
     life: Life | None = None
-    """these four as for `EkfSlam`"""
+    """See `EkfSlam.life`."""
     controls = ("x [m]", "y [m]", "theta [rad]")
     chart = Euclidean()
 
@@ -63,12 +66,12 @@ class Mapping(ParticleMapFilter):
         super().__post_init__()
 
     def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> SlamParticles:
-        known, size = jnp.zeros_like(pose_cov), len(self.sensor.landmark)
-        state = initial_slam_particles(pose, known, 1, self.capacity, size)
-        one: SlamParticles = jax.tree.map(lambda leaf: leaf[0], state._replace(best=None))
+        exact, size = jnp.zeros_like(pose_cov), len(self.sensor.landmark)
+        state = initial_slam_particles(pose, exact, 1, self.capacity, size)
+        particle: SlamParticles = jax.tree.map(lambda leaf: leaf[0], state._replace(best=None))
         if self.life is None:
-            return one
-        return one._replace(life=self.life.init(pose, one.landmarks))
+            return particle
+        return particle._replace(life=self.life.init(pose, particle.landmarks))
 
     def predict(self, state: SlamParticles, u: Float[Array, "3"], key: Array) -> SlamParticles:
         return state._replace(pose=jnp.concatenate([u[:2], wrap(u[2:])]))
