@@ -148,7 +148,7 @@ def test_a_filter_that_cannot_run_a_scenario_is_refused_by_name(tmp_path, refuse
     parts = (
         "--filters: fej cannot run scenario 'ring'",
         "needs landmarks (x, y), not those of range_bearing_signature: choose linearize.AtEst",
-        "those of the catalog that can: --filters ekf,ideal,iterated,ukf,",
+        "those of the catalog that can: --filters ekf,ideal,iterated,square_root,ukf,",
     )
     said = refused([*asked, "--out", tmp_path], *parts)
     assert "chart" not in said and "fej" not in said.split("can: ")[1]
