@@ -145,8 +145,7 @@ def _thin(part: np.ndarray, stride: int, width: int) -> np.ndarray:
 
 @jax.jit
 def _surfaces(points: Points, span: Int[Array, ""]) -> Surface:
-    surface_of = jax.vmap(lambda scan: surface(scan, span, GAP, most=_MAX_NEIGHBOURS))
-    lines: Surface = surface_of(points)
+    lines: Surface = jax.vmap(lambda scan: surface(scan, span, GAP, most=_MAX_NEIGHBOURS))(points)
     return lines
 
 
