@@ -163,6 +163,7 @@ def _add_scan(
     ends = to_cells(origin, resolution, eye[None, :2] + length[:, None] * e)
     start = to_cells(origin, resolution, eye[:2])
     inside = (start >= 0).all() & (start[0] < width) & (start[1] < height)
+    # Without free space before a beam of max_range it has no effect, not even on the laser's cell.
     live = inside & usable & ~(far & (jnp.asarray(free) <= 0))
     misses, last = _cross(misses, jnp.broadcast_to(start, ends.shape), ends, live, shape)
     on_map = (ends >= 0).all(axis=1) & (ends[:, 0] < width) & (ends[:, 1] < height)
@@ -187,6 +188,8 @@ def _cross(
     forward = jnp.where(delta >= 0, 1, -1).astype(jnp.int32)
     first = jnp.floor(start).astype(jnp.int32)
     last = jnp.floor(jnp.clip(ends, -_FARTHEST, _FARTHEST)).astype(jnp.int32)
+    # One step for each line between the two cells: the loop ends without comparing lengths, whose
+    # rounding could miss the last cell.
     steps = jnp.where(live, jnp.abs(last - first).sum(axis=1), 0)
     slope = jnp.where(delta != 0, 1.0 / jnp.where(delta != 0, delta, 1.0), 0.0)
 

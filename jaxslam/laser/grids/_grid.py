@@ -134,6 +134,7 @@ def interpolated(values: Float[Array, "H W"], at: Float[Array, "*n 2"]) -> Float
     f = a (1-u)(1-v) + b u (1-v) + c (1-u) v + d u v on the unit square of the four entries around.
     """
     (a, b, c, d), (u, v) = _around(values, at)
+    # By differences: a constant field stays constant to the last bit.
     bottom, top = a + u * (b - a), c + u * (d - c)
     return bottom + v * (top - bottom)
 
@@ -162,6 +163,7 @@ def _around(
     height, width = values.shape
     values = jnp.asarray(values)
     x, y = jnp.clip(at[..., 0], 0, width - 1), jnp.clip(at[..., 1], 0, height - 1)
+    # The last but one at most, so that there is an entry to the right, unless there is only one.
     j = jnp.clip(jnp.floor(x).astype(jnp.int32), 0, max(width - 2, 0))
     i = jnp.clip(jnp.floor(y).astype(jnp.int32), 0, max(height - 2, 0))
     right, up = jnp.minimum(j + 1, width - 1), jnp.minimum(i + 1, height - 1)

@@ -71,6 +71,7 @@ def beam_log(control: ArrayLike, beams: Beams) -> Log:
     concrete = is_concrete(control, beams)
     xp: ModuleType = np if concrete else jnp
     controls, ranges, angle, valid = (xp.asarray(part) for part in (control, *beams))
+    # Without max_range only infinite ranges are free.
     met, free = Beams(ranges, angle, valid).returns()
     usable = xp.asarray(met | free)
     if concrete:
@@ -136,7 +137,7 @@ def _free_space(name: str, grid: Grid, box: Float[np.ndarray, "2 2"] | None) -> 
     c, s = np.cos(origin[2]), np.sin(origin[2])
     sides = cell * np.array([[c, s], [-s, c]])
     i, j = np.indices(free.shape) + 0.5
-    middle = np.stack([j, i], axis=-1) @ sides + origin[:2]
+    middle = np.stack([j, i], axis=-1) @ sides + origin[:2]  # (x, y) is (column, row)
     if box is not None:
         free = free & ((middle >= box[0]) & (middle <= box[1])).all(axis=2)
         if not free.any():
@@ -222,6 +223,7 @@ class GridLocalization(MonteCarloFilter):
 
         # Without `no_inline` XLA computes it again in each of its consumers.
         fit = no_inline(fit_of, state.pose, in_dtype(self.prepared, state.pose.dtype), beams)
+        # After the likelihood, which is finite there: ∞ must not enter its derivative.
         blocked = _is_blocked(self.grid, state.pose)
         fit = jnp.where(blocked, jnp.inf, fit)
         misfit = jnp.where(blocked, jnp.inf, jnp.asarray(self.exponent, fit.dtype) * fit)

@@ -58,9 +58,12 @@ def clusters(
     used = np.flatnonzero(np.isfinite(weights) & np.isfinite(poses).all(axis=1))
     if len(used) == 0:
         raise ValueError("clusters: no particle has a finite pose and a positive weight")
+    # Relative to the largest: weights of any scale, without underflow of all.
     w = np.exp(weights[used] - weights[used].max())
     w = w / w.sum()
+    # 1e-9: a bin that divides the turn must not lose one to rounding.
     turns = max(int(2 * math.pi / bins[2] + 1e-9), 1)
+    # The last `% turns` is for a share that is rounded up to 1.
     heading = np.floor((poses[used, 2] / (2 * math.pi) % 1.0) * turns) % turns
     at = np.column_stack([np.floor(poses[used, :2] / bins[:2]), heading]).astype(np.int64)
     cells, cell = np.unique(at, axis=0, return_inverse=True)
@@ -72,6 +75,7 @@ def clusters(
     rank[order] = np.arange(len(order))
     label = np.full(len(poses), -1)
     label[used] = rank[group]
+    # A weight of 0 times NaN would be NaN.
     safe = np.where(np.isfinite(poses), poses, 0.0)
     moments = [_moments(safe, weights, label == k) for k in range(len(order))]
     mean = np.array([np.asarray(m) for m, _ in moments]).reshape(-1, 3)

@@ -35,6 +35,7 @@ def resample(grid: Grid, resolution: float) -> Grid:
 
 def _overlaps(size: int, factor: float) -> Float[np.ndarray, "new old"]:
     """The share of each new cell, `factor` old cells long, that each old cell covers."""
+    # 1e-9: a size that is a multiple of the new cells must not get another by rounding.
     count = int(np.ceil(size / factor - 1e-9))
     begins = factor * np.arange(count)[:, None]
     old = np.arange(size)[None, :]
@@ -57,6 +58,7 @@ def crop(grid: Grid, low: ArrayLike, high: ArrayLike) -> Grid:
         raise ValueError(f"crop: expected two corners (x, y), got {low!r} and {high!r}")
     cells = corners / float(grid.resolution)
     height, width = np.shape(grid.log_odds)
+    # 1e-9: a corner on a border between cells takes no further cell by rounding.
     first = np.maximum(np.floor(cells[0] + 1e-9), 0).astype(int)
     last = np.minimum(np.ceil(cells[1] - 1e-9), (width, height)).astype(int)
     if np.any(first >= last):

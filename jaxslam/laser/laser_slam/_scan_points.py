@@ -87,7 +87,8 @@ def scans_of(log: LogOfScans, settings: Settings) -> Scans:
     """The points of a log's scans in the robot's frame, and the lines through those within two
     degrees of each."""
     count, beams = np.shape(log.beams.range)
-    stride = -(-beams // WIDTH)
+    stride = -(-beams // WIDTH)  # so that a scan fits the program
+    # The spacing of the beams by some of the scans: `ROWS` at most.
     sampled = slice(None, None, -(-count // ROWS))
     angles, valid = np.asarray(log.beams.angle)[sampled], np.asarray(log.beams.valid)[sampled] > 0
     spacing = max(_spacing(angles[:, ::stride], valid[:, ::stride]), 1e-3)
@@ -96,7 +97,7 @@ def scans_of(log: LogOfScans, settings: Settings) -> Scans:
     changed = []
     scans: Any = None
     for begin in range(0, count, ROWS):  # a part at a time, since a log may be long
-        last = max(begin - _BACK, 0)
+        last = max(begin - _BACK, 0)  # scans before this part, which its first scans compare with
         near = met_something(
             Beams(*(np.asarray(part)[last : begin + ROWS] for part in log.beams)), log.max_range
         )
@@ -161,6 +162,7 @@ def _has_changed(
 ) -> Int[np.ndarray, "K"]:
     """`Scans.changed`; 1 for the first."""
     changed = np.zeros(len(ranges), int)
+    # From the farthest to the nearest, so that the nearest that differs counts.
     for back in range(min(_BACK, len(ranges) - 1), 0, -1):
         differs = np.abs(ranges[back:] - ranges[:-back]) > _CHANGED
         differs |= met[back:] != met[:-back]

@@ -56,8 +56,10 @@ def relation_covs(
     a, b = solved.base[i], solved.base[j]
     between = np.zeros((len(i), 3, 3))
     apart = a != b
+    # Each pair of keyframes once: a pair costs fill in the factor.
     pairs, row = np.unique(np.stack([a, b], axis=1)[apart], axis=0, return_inverse=True)
     if len(pairs):
+        # No iteration: the graph is at its optimum, and only the factor is needed.
         optimum = graphs.optimize(solved.graph, room=ROOM, iterations=0)
         starts = range(0, len(pairs), TOGETHER)
         parts = [relative_covs(optimum, pairs[k : k + TOGETHER]) for k in starts]

@@ -67,7 +67,9 @@ def solve(
         squared = graphs.squared_residuals(graph, room=ROOM)
     chi2 = float(sum(np.asarray(table).sum() for table in squared.values())) if squared else 0.0
     lap("marginals")
+    # A common frame, so that the maps before and after compare cell by cell.
     frame = frame_of(log, [path, odometry.poses], settings)
+    # The two maps side by side.
     with ThreadPoolExecutor(2) as pool:
         paths = path, odometry.poses
         maps = pool.map(lambda path: map_of(log, path, scans.usable, frame, settings), paths)
@@ -126,6 +128,7 @@ def _scans_on_keyframes(
     if len(at) == 1:
         marginals = np.zeros((1, 3, 3))
     else:
+        # No iteration: the graph is at its optimum, and only the factor is needed.
         optimum = graphs.optimize(graph, room=ROOM, iterations=0)
         marginals = np.asarray(graphs.marginals(optimum, room=ROOM).poses, np.float64)
     # The marginals are of coordinates in the world's frame.

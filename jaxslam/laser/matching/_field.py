@@ -135,6 +135,7 @@ class FieldMatcher(Matcher):
             move, _ = linalg.solve_psd(curvature, -slope)
             tried = moved(pose, move)
             trial = matcher._linearize(prepared, points, tried, prior)
+            # A refused step counts as small as well: then μ is so large that no step helps.
             better = trial.cost < at.cost
             small = jnp.hypot(move[0], move[1]) + length * jnp.abs(move[2]) <= matcher.tolerance
             pose = jnp.where(better, tried, pose)

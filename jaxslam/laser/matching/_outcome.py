@@ -62,6 +62,7 @@ def make_match(
     partners the pose is the start.
     """
     took_part = pairs.weight > 0
+    # `tiny` and 1: without pairs or points the residual and the shares are 0, not NaN.
     total = jnp.maximum(pairs.weight.sum(), jnp.finfo(pairs.weight.dtype).tiny)
     count = jnp.maximum(points.valid.sum(), 1)
     length = length_of(points)
@@ -229,7 +230,7 @@ def _extreme_eigenvalues(a: Float[Array, "3 3"]) -> tuple[Float[Array, ""], Floa
     b = a - q * jnp.eye(3, dtype=a.dtype)
     p = jnp.sqrt((b * b).sum() / 6)
     b = b / jnp.where(p > 0, p, 1.0)
-    half = 0.5 * (b[0] * jnp.cross(b[1], b[2])).sum()
+    half = 0.5 * (b[0] * jnp.cross(b[1], b[2])).sum()  # det B/2, by rounding beyond [-1, 1]
     phi = jnp.arccos(jnp.clip(half, -1.0, 1.0)) / 3
     return q + 2 * p * jnp.cos(phi + 2 * np.pi / 3), q + 2 * p * jnp.cos(phi)
 

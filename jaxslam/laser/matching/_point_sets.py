@@ -54,6 +54,7 @@ def points(
         jnp.asarray(max_range), min_range=jnp.asarray(min_range)
     )
     valid = jnp.asarray(valid)
+    # Any finite range and angle: positions must be finite, with finite derivatives.
     r = jnp.where(valid, r, 1.0)
     eye = jnp.asarray(mount, r.dtype)
     heading = eye[2] + jnp.where(valid, beams.angle, 0.0)
@@ -90,10 +91,12 @@ def raster(
         raise ValueError(
             f"raster: expected resolution and half_width above 0, got {resolution}, {half_width}"
         )
+    # 1e-9: a width that is a multiple of the cells must not get another by rounding.
     size = int(np.ceil(2 * half_width / resolution - 1e-9))
     corner = jnp.asarray(center, of.position.dtype) - 0.5 * size * resolution
     cell = jnp.floor((of.position - corner[None]) / resolution).astype(jnp.int32)
     inside = of.valid & jnp.all((cell >= 0) & (cell < size), axis=1)
+    # Points off the grid have an index beyond it, which "drop" leaves out.
     row, column = jnp.where(inside[:, None], cell, size).T[::-1]
     free = jnp.full((size, size), -1.0, of.position.dtype)
     log_odds = free.at[row, column].set(1.0, mode="drop")

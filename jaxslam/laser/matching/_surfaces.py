@@ -62,6 +62,8 @@ def surface(
     """
     p, valid = of.position, of.valid
     step = jnp.where(valid[1:] & valid[:-1], ((p[1:] - p[:-1]) ** 2).sum(axis=1), jnp.inf)
+    # Entry k: whether points k - 1 and k are neighbours; the ends of the scan have none, so that
+    # rolling joins nothing across the seam.
     joined = jnp.concatenate([jnp.zeros(1, bool), step < gap**2, jnp.zeros(1, bool)])
     weight = [valid.astype(p.dtype)]
     shifted = [p]
@@ -90,6 +92,7 @@ def surface(
     direction = 0.5 * jnp.arctan2(cross, flat)
     largest, least = 0.5 * (xx + yy + root), jnp.maximum(0.5 * (xx + yy - root), 0.0)
     variance = least / jnp.maximum(n - 2, 1)
+    # A threshold: no derivative goes through the median.
     usual = jax.lax.stop_gradient(_median(variance, ~has_no_line))
     return Surface(
         position=jnp.where(valid[:, None], p, _FAR),

@@ -138,6 +138,7 @@ def _label(
     place_of_start = np.array([index[root] for root in part.values()], int)
     weights = neighbours((away > 0).reshape(shape))
     size = float(np.asarray(grid.resolution))
+    # `min_only`: a single search from all cells of the skeleton, and the nearest of each cell.
     _, _, source = scipy.sparse.csgraph.dijkstra(
         weights, directed=False, indices=starts, min_only=True, return_predecessors=True
     )

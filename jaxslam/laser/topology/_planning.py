@@ -67,7 +67,7 @@ def route(places: TopologicalMap, start: ArrayLike, goal: ArrayLike) -> Route:
 def _in_sight(places: TopologicalMap, ends: Float[np.ndarray, "2 2"]) -> bool:
     """Whether the straight line between two points stays in the place of the first."""
     gap = float(np.linalg.norm(ends[1] - ends[0]))
-    count = 2 + int(2 * gap / float(places.grid.resolution))
+    count = 2 + int(2 * gap / float(places.grid.resolution))  # half a cell apart
     share = np.linspace(0.0, 1.0, count)[:, None]
     seen = place_of(places, (1 - share) * ends[:1] + share * ends[1:])
     return bool(seen[0] >= 0 and (seen == seen[0]).all())

@@ -39,11 +39,11 @@ AROUND = np.linspace(-np.pi, np.pi, 360, endpoint=False)
 
 
 def test_a_room_has_its_four_walls_each_once_and_across_the_seam():
-    found = segments(scan(AROUND), sigma=SIGMA, max_range=10)
-    assert sorted(nearest(found)) == [0, 1, 2, 3]  # the seam is within wall 3
-    np.testing.assert_allclose(off(found.line, WALLS[nearest(found)]), 0, atol=1e-9)
-    assert found.left == 360 - found.size.sum() == 4 * 4
-    for (r, alpha), ends in zip(found.line, found.ends, strict=True):
+    walls = segments(scan(AROUND), sigma=SIGMA, max_range=10)
+    assert sorted(nearest(walls)) == [0, 1, 2, 3]  # the seam is within wall 3
+    np.testing.assert_allclose(off(walls.line, WALLS[nearest(walls)]), 0, atol=1e-9)
+    assert walls.left == 360 - walls.size.sum() == 4 * 4
+    for (r, alpha), ends in zip(walls.line, walls.ends, strict=True):
         np.testing.assert_allclose(ends @ [np.cos(alpha), np.sin(alpha)], r, atol=1e-9)
 
 
@@ -61,9 +61,9 @@ def test_the_first_beam_once_more_is_no_other_beam(angle, lost):
     beams = scan(np.append(angle, np.nan), 0)  # a direction that is not finite says nothing
     beams.range[0] = np.nan if lost else beams.range[0]
     once = Beams(*(part[1:-1] if lost else part[:-2] for part in beams))
-    found, expected = (segments(of, sigma=SIGMA, max_range=10) for of in (beams, once))
-    assert sorted(nearest(found)) == [0, 1, 2, 3]
-    for a, b in zip(found, expected, strict=True):
+    walls, expected = (segments(of, sigma=SIGMA, max_range=10) for of in (beams, once))
+    assert sorted(nearest(walls)) == [0, 1, 2, 3]
+    for a, b in zip(walls, expected, strict=True):
         np.testing.assert_array_equal(a, b)
 
 
@@ -90,11 +90,11 @@ def test_the_covariance_of_a_fit_is_that_of_the_draws():
 def test_segments_of_noisy_scans_are_honest():
     white = []
     for seed in range(60):
-        found = segments(scan(AROUND, seed), sigma=SIGMA, max_range=10)
-        which = nearest(found)
+        walls = segments(scan(AROUND, seed), sigma=SIGMA, max_range=10)
+        which = nearest(walls)
         assert len(set(which)) == len(which)  # no wall twice
-        gap = off(found.line, WALLS[which])
-        white += list(np.einsum("ki,kij,kj->k", gap, np.linalg.inv(found.cov), gap))
+        gap = off(walls.line, WALLS[which])
+        white += list(np.einsum("ki,kij,kj->k", gap, np.linalg.inv(walls.cov), gap))
     assert len(white) >= 0.98 * 240
     assert abs(np.mean(white) - 2) < 4 * np.sqrt(4 / len(white))
 
@@ -111,9 +111,9 @@ def test_jumps_divide_and_what_is_no_wall_is_left_out():
     beams.range[200] = np.nan
     beams.valid[201] = False
     beams.range[300:310] = 12.0
-    found = segments(beams, sigma=SIGMA, max_range=10)
-    assert set(nearest(found)) == {0, 1, 2, 3}
-    assert found.left == 348 - found.size.sum()
+    walls = segments(beams, sigma=SIGMA, max_range=10)
+    assert set(nearest(walls)) == {0, 1, 2, 3}
+    assert walls.left == 348 - walls.size.sum()
     none = beams._replace(valid=np.zeros(360, bool))
     assert segments(none, sigma=SIGMA, max_range=10).left == 0
 

@@ -46,10 +46,10 @@ def test_covariance_along_a_chain_is_that_of_the_graph(chain):
     path, steps, covs, total = chain
     index = np.arange(len(path))
     graph = graph_of(path, index, table_of(index[:-1], index[1:], steps, covs))
-    found = graphs.optimize(graph, room=ROOM, iterations=0)
+    solved = graphs.optimize(graph, room=ROOM, iterations=0)
     pairs = np.array([[2, 7], [0, 11]])
     np.testing.assert_allclose(
-        relative_covs(found, pairs),
+        relative_covs(solved, pairs),
         end_covariances.relative_cov(total, path, *pairs.T),
         rtol=1e-6,
     )
@@ -92,9 +92,9 @@ def test_the_clique_is_one_and_large():
     inside = np.arange(25)
     agree[np.ix_(inside, inside)] = True
     agree |= agree.T
-    found = clique(agree, np.ones(60))
-    assert found.sum() >= 25
-    members = np.flatnonzero(found)
+    solved = clique(agree, np.ones(60))
+    assert solved.sum() >= 25
+    members = np.flatnonzero(solved)
     assert (agree[np.ix_(members, members)] | np.eye(len(members), dtype=bool)).all()
     assert not clique(np.zeros((0, 0), bool), np.zeros(0)).any()
 
@@ -120,9 +120,9 @@ def test_a_descriptor_does_not_see_the_heading():
 def drive():
     """(true path, result): every second scan is a keyframe."""
     true, log = driven()
-    found = laser_slam.solve(log, dataclasses.replace(SETTINGS, key_distance=1.5, loop_gap=8))
-    assert found.counts["loops kept"] >= 3
-    return true, found
+    solved = laser_slam.solve(log, dataclasses.replace(SETTINGS, key_distance=1.5, loop_gap=8))
+    assert solved.counts["loops kept"] >= 3
+    return true, solved
 
 
 def residuals(variables, graph):
@@ -144,22 +144,22 @@ def derivatives(function, at, step=1e-6):
     return np.stack([(function(at + d) - function(at - d)) / (2 * step) for d in steps], axis=1)
 
 
-def dense(found, i, j):
+def dense(solved, i, j):
     """The covariance of the end of x_i⁻¹ ∘ x_j: that of all keyframes and all scans on them,
     through one function of all."""
-    graph = found.graph
+    graph = solved.graph
     at = np.asarray(graph.poses)
     free = at[1:].ravel()
     jacobian = derivatives(lambda v: residuals(v, graph), free)
     cov = np.zeros((len(free) + 6, len(free) + 6))
     cov[:-6, :-6] = np.linalg.inv(jacobian.T @ jacobian)
-    cov[-6:-3, -6:-3], cov[-3:, -3:] = found.z_cov[i], found.z_cov[j]
-    estimate = poses.between(found.poses[i], found.poses[j])
+    cov[-6:-3, -6:-3], cov[-3:, -3:] = solved.z_cov[i], solved.z_cov[j]
+    estimate = poses.between(solved.poses[i], solved.poses[j])
 
     def end(v):
         keys = np.concatenate([at[:1], v[:-6].reshape(-1, 3)])
-        ends = poses.compose(found.z[[i, j]], v[-6:].reshape(2, 3))
-        x = poses.compose(keys[found.base[[i, j]]], ends)
+        ends = poses.compose(solved.z[[i, j]], v[-6:].reshape(2, 3))
+        x = poses.compose(keys[solved.base[[i, j]]], ends)
         return poses.between(estimate, poses.between(x[0], x[1]))
 
     by = derivatives(end, np.concatenate([free, np.zeros(6)]))
@@ -168,46 +168,50 @@ def dense(found, i, j):
 
 @pytest.mark.sweep
 def test_the_covariances_are_those_of_the_dense_inverse(drive, monkeypatch):
-    _, found = drive
-    count = len(found.poses)
-    between = np.setdiff1d(np.arange(count), found.keyframe)
-    assert len(found.keyframe) > 8 and len(between) > 8 and found.base[3] == 1
+    _, solved = drive
+    count = len(solved.poses)
+    between = np.setdiff1d(np.arange(count), solved.keyframe)
+    assert len(solved.keyframe) > 8 and len(between) > 8 and solved.base[3] == 1
     scans = np.arange(1, count)
     of_path = end_covariances.of_coordinates(
-        laser_slam.relation_covs(found, 0 * scans, scans), found.poses[1:]
+        laser_slam.relation_covs(solved, 0 * scans, scans), solved.poses[1:]
     )
-    np.testing.assert_allclose(of_path, found.cov[1:], rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(of_path, solved.cov[1:], rtol=1e-6, atol=1e-12)
     # Scan 5 beside 3 on the keyframe 2.
-    base, z, z_cov, path = (np.array(x) for x in (found.base, found.z, found.z_cov, found.poses))
+    base, z, z_cov, path = (
+        np.array(x) for x in (solved.base, solved.z, solved.z_cov, solved.poses)
+    )
     base[5], z[5] = 1, [0.3, -0.2, 1.0]
     path[5] = poses.compose(path[2], z[5])
-    found = found._replace(base=base, z=z, z_cov=z_cov, poses=path)
-    ends = [0, *found.keyframe[[3, -1]], 1, 3, 5, 39]
+    solved = solved._replace(base=base, z=z, z_cov=z_cov, poses=path)
+    ends = [0, *solved.keyframe[[3, -1]], 1, 3, 5, 39]
     pairs = np.array([(i, j) for i in ends for j in ends if i != j])
     monkeypatch.setattr(module, "TOGETHER", 7)
-    covs = laser_slam.relation_covs(found, *pairs.T)
+    covs = laser_slam.relation_covs(solved, *pairs.T)
     for (i, j), cov in zip(pairs, covs, strict=True):
-        np.testing.assert_allclose(cov, dense(found, i, j), rtol=1e-6, atol=1e-6 * cov.max())
+        np.testing.assert_allclose(cov, dense(solved, i, j), rtol=1e-6, atol=1e-6 * cov.max())
 
 
 def test_the_error_of_a_relation_by_its_covariance(drive):
-    true, found = drive
+    true, solved = drive
     parts = [metrics.relations(true, rows=rows) for rows in (1, 3, 7, 24)]
-    made = metrics.Relations(*map(np.concatenate, zip(*parts, strict=True)))
-    nees = laser_slam.relation_nees(found, *made)
+    relations = metrics.Relations(*map(np.concatenate, zip(*parts, strict=True)))
+    nees = laser_slam.relation_nees(solved, *relations)
     assert (nees < 7.81).mean() > 0.9 and 0.3 < nees.mean() < 6
     k = 40
-    cov = laser_slam.relation_covs(found, made.first[k : k + 1], made.second[k : k + 1])[0]
-    estimate = poses.between(found.poses[made.first[k]], found.poses[made.second[k]])
+    cov = laser_slam.relation_covs(solved, relations.first[k : k + 1], relations.second[k : k + 1])[
+        0
+    ]
+    estimate = poses.between(solved.poses[relations.first[k]], solved.poses[relations.second[k]])
     e = 2 * np.linalg.cholesky(cov)[:, 1]
-    off = made._replace(pose=poses.compose(estimate, e)[None].repeat(len(nees), 0))
-    assert laser_slam.relation_nees(found, *off)[k] == pytest.approx(4)
-    same = metrics.Relations(made.first[:2], made.first[:2], np.zeros((2, 3)))
-    assert np.isnan(laser_slam.relation_nees(found, *same)).all()
+    off = relations._replace(pose=poses.compose(estimate, e)[None].repeat(len(nees), 0))
+    assert laser_slam.relation_nees(solved, *off)[k] == pytest.approx(4)
+    same = metrics.Relations(relations.first[:2], relations.first[:2], np.zeros((2, 3)))
+    assert np.isnan(laser_slam.relation_nees(solved, *same)).all()
 
 
 def test_scans_that_are_none_are_refused(drive):
-    _, found = drive
+    _, solved = drive
     for first, second, message in (
         ([0, 1], [1], "expected two rows"),
         ([0.5], [1], "expected two rows of whole numbers"),
@@ -215,6 +219,6 @@ def test_scans_that_are_none_are_refused(drive):
         ([-1], [1], "expected scans from 0 to 39, got -1"),
     ):
         with pytest.raises(ValueError, match=f"relation_covs: {message}"):
-            laser_slam.relation_covs(found, first, second)
-    assert laser_slam.relation_covs(found, [0, 3], [0, 3]).max() == 0
-    assert laser_slam.relation_covs(found, np.zeros(0, int), np.zeros(0, int)).shape == (0, 3, 3)
+            laser_slam.relation_covs(solved, first, second)
+    assert laser_slam.relation_covs(solved, [0, 3], [0, 3]).max() == 0
+    assert laser_slam.relation_covs(solved, np.zeros(0, int), np.zeros(0, int)).shape == (0, 3, 3)

@@ -47,9 +47,9 @@ def both(log, monkeypatch, window, settings=SETTINGS):
         return count(size, *rest, **options)
 
     monkeypatch.setattr(grids, "count", counting)
-    found = np.zeros((2, *shape), np.int32)
-    log_map._count(found, origin, resolution, laser, beams, settings)
-    return found, np.stack([whole.hits, whole.misses]), calls
+    counts = np.zeros((2, *shape), np.int32)
+    log_map._count(counts, origin, resolution, laser, beams, settings)
+    return counts, np.stack([whole.hits, whole.misses]), calls
 
 
 def test_scans_that_do_not_fit_a_window_are_split(monkeypatch):
@@ -133,15 +133,15 @@ def distance_from_walls(points):
 @pytest.mark.parametrize("k", swept(range(2), 1))
 def test_the_path_is_the_robots_and_the_map_is_of_the_walls(k):
     true, log = driven(mount=MOUNTS[k])
-    found = laser_slam.solve(log, SETTINGS)
-    position, heading = errors(found.poses, true)
+    solved = laser_slam.solve(log, SETTINGS)
+    position, heading = errors(solved.poses, true)
     assert position.max() < 0.1 and heading.max() < np.deg2rad(1.5)
-    score = laser_slam.closure_score(found, true)
+    score = laser_slam.closure_score(solved, true)
     assert score.kept >= 5 and score.precision == 1.0
-    error = found.poses[1:] - true[1:]
+    error = solved.poses[1:] - true[1:]
     error[:, 2] = poses.wrapped(error[:, 2])
-    assert np.einsum("ki,kij,kj->k", error, np.linalg.inv(found.cov[1:]), error).mean() < 9
-    grid = found.map
+    assert np.einsum("ki,kij,kj->k", error, np.linalg.inv(solved.cov[1:]), error).mean() < 9
+    grid = solved.map
     occupied = np.argwhere(grid.log_odds > 0)[:, ::-1] * 0.1 + 0.05 + grid.origin[:2]
     assert len(occupied) > 100 and np.quantile(distance_from_walls(occupied), 0.95) < 0.15
     # A place on the way is free.
@@ -151,7 +151,7 @@ def test_the_path_is_the_robots_and_the_map_is_of_the_walls(k):
     frame = grid.log_odds.shape, grid.origin, float(grid.resolution)
     usable = np.ones(len(true), bool)
     wrong = log_map.map_of(
-        log._replace(mount=(0.0, 0.0, 0.0)), found.poses, usable, frame, SETTINGS
+        log._replace(mount=(0.0, 0.0, 0.0)), solved.poses, usable, frame, SETTINGS
     )
     off = np.argwhere(wrong.log_odds > 0)[:, ::-1] * 0.1 + 0.05 + grid.origin[:2]
     assert np.quantile(distance_from_walls(off), 0.95) > 0.25

@@ -39,14 +39,14 @@ def solved(drive, raw=None, scans=None, known=None):
     return steps, laser_odometry(scans, steps, SETTINGS, true[0])
 
 
-def nees(found, true, k):
+def nees(odometry, true, k):
     """Of a scan in the frame of the keyframe before it."""
-    off = relative_error(found, true, k)
-    return off @ np.linalg.solve(found.cov[k], off)
+    off = relative_error(odometry, true, k)
+    return off @ np.linalg.solve(odometry.cov[k], off)
 
 
-def relative_error(found, true, k):
-    return poses.between(poses.between(true[found.base[k]], true[k]), found.z[k])
+def relative_error(odometry, true, k):
+    return poses.between(poses.between(true[odometry.base[k]], true[k]), odometry.z[k])
 
 
 def late(raw, k, share=0.05):
@@ -58,30 +58,30 @@ def late(raw, k, share=0.05):
 
 def check_late(drive, k, share):
     true, log, _ = drive
-    steps, found = solved(drive, late(log.raw, k, share))
-    position, heading = errors(found.poses, true)
+    steps, odometry = solved(drive, late(log.raw, k, share))
+    position, heading = errors(odometry.poses, true)
     others = np.arange(COUNT) != k
     # Without loops the path drifts by a tenth of a metre, whatever a single step does.
     assert position[others].max() < 0.2 and heading[others].max() < np.deg2rad(5), k
-    assert nees(found, true, k) < 20
-    assert position[k] < 0.3 or not found.matched[k]
+    assert nees(odometry, true, k) < 20
+    assert position[k] < 0.3 or not odometry.matched[k]
     return steps
 
 
 @pytest.mark.sweep
 def test_a_log_in_pieces_has_the_path_of_one(drive, monkeypatch):
     true, _, _ = drive
-    _, whole = solved(drive)
+    _, unbroken = solved(drive)
     monkeypatch.setattr(log_odometry, "PIECE", 13)
-    _, found = solved(drive)
-    inner = sorted({13, 26} & set(found.keyframe.tolist()))
+    _, odometry = solved(drive)
+    inner = sorted({13, 26} & set(odometry.keyframe.tolist()))
     assert inner == [13, 26], "the first scan of a piece is a keyframe"
-    assert (found.base[1:] < np.arange(1, COUNT)).all() and found.matched[1:].all()
-    for path in (whole.poses, found.poses):
+    assert (odometry.base[1:] < np.arange(1, COUNT)).all() and odometry.matched[1:].all()
+    for path in (unbroken.poses, odometry.poses):
         position, heading = errors(path, true)
         assert position.max() < 0.2 and heading.max() < np.deg2rad(5)
-    chained = poses.compose(found.poses[found.base[1:]], found.z[1:])
-    np.testing.assert_allclose(chained, found.poses[1:], atol=1e-9)
+    chained = poses.compose(odometry.poses[odometry.base[1:]], odometry.z[1:])
+    np.testing.assert_allclose(chained, odometry.poses[1:], atol=1e-9)
 
 
 @pytest.mark.sweep
@@ -129,11 +129,11 @@ def test_a_single_wrong_pose_of_raw_odometry_moves_no_other_scan(drive, k, wrong
     true, log, _ = drive
     raw = log.raw.copy()
     raw[k] = poses.compose(raw[k], np.array(wrong))
-    _, found = solved(drive, raw)
-    position, _ = errors(found.poses, true)
+    _, odometry = solved(drive, raw)
+    position, _ = errors(odometry.poses, true)
     assert np.delete(position, k).max() < 0.2
-    assert position[k] < 0.2 or found.doubted[k]
-    assert nees(found, true, k) < 20
+    assert position[k] < 0.2 or odometry.doubted[k]
+    assert nees(odometry, true, k) < 20
 
 
 ANEW = {
@@ -150,11 +150,11 @@ def test_odometry_that_is_set_anew_moves_no_scan(drive, how, k):
     raw = log.raw.copy()
     new = ANEW[how](raw[k:])
     raw[k : k + len(new)] = new
-    steps, found = solved(drive, raw)
-    position, heading = errors(found.poses, true)
+    steps, odometry = solved(drive, raw)
+    position, heading = errors(odometry.poses, true)
     assert position.max() < 0.2 and heading.max() < np.deg2rad(5)
-    assert steps.jump[k] or found.refuted[k] or found.doubted[k]
-    assert not (found.refuted & ~steps.odd).any()
+    assert steps.jump[k] or odometry.refuted[k] or odometry.doubted[k]
+    assert not (odometry.refuted & ~steps.odd).any()
 
 
 @pytest.mark.parametrize("first", swept([4, 15, 23, 33], 15))
@@ -165,11 +165,11 @@ def test_odometry_that_is_frozen_for_some_steps_is_found_by_the_scans(drive, fir
     step[first - 1 : first + 3] = 0.0
     at = np.arange(first, first + 4)
     known = ~np.isin(np.arange(COUNT), at)
-    steps, found = solved(drive, poses.chain(true[0], step), known=known)
+    steps, odometry = solved(drive, poses.chain(true[0], step), known=known)
     np.testing.assert_array_equal(steps.frozen, ~known)
-    assert found.matched[at].all()
-    assert errors(found.poses, true)[0].max() < 0.2
-    assert max(nees(found, true, k) for k in at) < 30
+    assert odometry.matched[at].all()
+    assert errors(odometry.poses, true)[0].max() < 0.2
+    assert max(nees(odometry, true, k) for k in at) < 30
 
 
 def test_odometry_that_is_frozen_on_the_whole_drive(drive):
@@ -177,14 +177,16 @@ def test_odometry_that_is_frozen_on_the_whole_drive(drive):
     turned by 90°, so that there a match may be wrong."""
     true, log, _ = drive
     raw, known = np.zeros((COUNT, 3)), np.arange(COUNT) == 0
-    steps, found = solved(drive, raw, known=known)
+    steps, odometry = solved(drive, raw, known=known)
     assert steps.frozen[1:].all() and not steps.jump.any()
-    off = np.array([relative_error(found, true, k) for k in range(1, COUNT)])
+    off = np.array([relative_error(odometry, true, k) for k in range(1, COUNT)])
     right = (np.hypot(off[:, 0], off[:, 1]) < 0.2) & (np.abs(off[:, 2]) < np.deg2rad(6))
     turns = np.isin(np.arange(1, COUNT), [*CORNERS, *(k + 1 for k in CORNERS)])
     assert right[~turns].mean() > 0.9
     assert right.mean() > 0.75
-    assert found.doubted[1:].sum() >= 4 and (found.cov[1:].diagonal(axis1=1, axis2=2) > 0).all()
+    assert (
+        odometry.doubted[1:].sum() >= 4 and (odometry.cov[1:].diagonal(axis1=1, axis2=2) > 0).all()
+    )
 
 
 @pytest.mark.sweep
@@ -205,13 +207,15 @@ def test_a_scan_without_points_stays_where_raw_odometry_leads(drive, k):
     true, log, every = drive
     scans = jax.tree.map(np.array, every)
     scans.points.valid[k], scans.usable[k] = False, False
-    _, found = solved(drive, scans=scans)
-    assert not found.matched[k] and k not in found.keyframe
+    _, odometry = solved(drive, scans=scans)
+    assert not odometry.matched[k] and k not in odometry.keyframe
     step = poses.between(log.raw[k - 1], log.raw[k])
-    np.testing.assert_allclose(found.poses[k], poses.compose(found.poses[k - 1], step), atol=1e-9)
-    assert np.delete(found.matched[1:], k - 1).all()
-    assert np.delete(errors(found.poses, true)[0], k).max() < 0.2
-    assert nees(found, true, k) < 20
+    np.testing.assert_allclose(
+        odometry.poses[k], poses.compose(odometry.poses[k - 1], step), atol=1e-9
+    )
+    assert np.delete(odometry.matched[1:], k - 1).all()
+    assert np.delete(errors(odometry.poses, true)[0], k).max() < 0.2
+    assert nees(odometry, true, k) < 20
 
 
 @pytest.mark.parametrize("k", swept([5, 16, 25], 16))
@@ -224,25 +228,27 @@ def test_a_scan_that_matches_nothing_before_is_placed_by_what_comes_after(drive,
     match = tracking._match_about
 
     def refusing(reference, points, *rest):
-        found = match(reference, points, *rest)
+        odometry = match(reference, points, *rest)
         same = np.array_equal(points.position, refused)
-        return found._replace(accepted=found.accepted and not same)
+        return odometry._replace(accepted=odometry.accepted and not same)
 
     monkeypatch.setattr(tracking, "_match_about", refusing)
-    _, found = solved(drive, raw)
-    assert k not in found.keyframe and found.matched[k]
+    _, odometry = solved(drive, raw)
+    assert k not in odometry.keyframe and odometry.matched[k]
     assert np.linalg.norm(poses.between(raw[k - 1], raw[k]) - [1.0, 0.0, 0.0]) > 0.4
-    assert errors(found.poses, true)[0].max() < 0.2
-    assert np.hypot(*relative_error(found, true, k)[:2]) < 0.1
-    assert nees(found, true, k) < 20
+    assert errors(odometry.poses, true)[0].max() < 0.2
+    assert np.hypot(*relative_error(odometry, true, k)[:2]) < 0.1
+    assert nees(odometry, true, k) < 20
     # With nothing but the scans before it, it stays where raw odometry leads.
     monkeypatch.setattr(log_odometry, "place_unmatched", lambda *_: None)
     _, alone = solved(drive, raw)
     assert k not in alone.keyframe and not alone.matched[k]
     others = np.arange(COUNT) != k
-    np.testing.assert_array_equal(alone.poses[others], found.poses[others])
+    np.testing.assert_array_equal(alone.poses[others], odometry.poses[others])
     step = poses.between(raw[k - 1], raw[k])
-    np.testing.assert_allclose(alone.poses[k], poses.compose(found.poses[k - 1], step), atol=1e-9)
+    np.testing.assert_allclose(
+        alone.poses[k], poses.compose(odometry.poses[k - 1], step), atol=1e-9
+    )
 
 
 # --- Steps of raw odometry that cannot be right: late, frozen, jumps; and how far a robot can go --
@@ -275,15 +281,17 @@ def diagonal(reach):
 @pytest.mark.parametrize("k", [1, 7, 30, LENGTH - 2])
 def test_a_message_that_comes_late_is_found_where_it_was_missing(k):
     raw = late(path(), k)
-    found = steps_of(raw, SETTINGS, TIME)
-    np.testing.assert_array_equal(found.lags, only(k))
-    assert not found.unknown.any() and not found.gap.any()
+    raw_steps = steps_of(raw, SETTINGS, TIME)
+    np.testing.assert_array_equal(raw_steps.lags, only(k))
+    assert not raw_steps.unknown.any() and not raw_steps.gap.any()
     untimed = steps_of(raw, SETTINGS)
-    np.testing.assert_array_equal(found.step, untimed.step)
-    np.testing.assert_allclose(found.cov[k] - untimed.cov[k], diagonal(found.reach[k]), rtol=1e-9)
-    np.testing.assert_array_equal(found.cov[~only(k)], untimed.cov[~only(k)])
+    np.testing.assert_array_equal(raw_steps.step, untimed.step)
+    np.testing.assert_allclose(
+        raw_steps.cov[k] - untimed.cov[k], diagonal(raw_steps.reach[k]), rtol=1e-9
+    )
+    np.testing.assert_array_equal(raw_steps.cov[~only(k)], untimed.cov[~only(k)])
     # 0.7 m in 0.8 s, and half as much again.
-    assert found.reach[k, 0] == pytest.approx(1.5 * 0.7, rel=0.1)
+    assert raw_steps.reach[k, 0] == pytest.approx(1.5 * 0.7, rel=0.1)
 
 
 @pytest.mark.parametrize("k", [5, 31])
@@ -292,8 +300,8 @@ def test_a_turn_that_comes_late_is_found(k):
     raw = path(turn=0.4)
     step = steps(raw)
     step[k - 1, 2], step[k, 2] = 0.01, step[k - 1, 2] + step[k, 2]
-    found = steps_of(poses.chain(raw[0], step), SETTINGS, TIME)
-    np.testing.assert_array_equal(found.lags, only(k))
+    raw_steps = steps_of(poses.chain(raw[0], step), SETTINGS, TIME)
+    np.testing.assert_array_equal(raw_steps.lags, only(k))
 
 
 def test_a_message_that_comes_late_at_a_gap_in_the_stamps_is_found():
@@ -302,17 +310,17 @@ def test_a_message_that_comes_late_at_a_gap_in_the_stamps_is_found():
     time[k:] += 0.8  # two steps' time, of which the log says nothing, and three after it
     step[k - 1], step[k, 0] = [0.05, 0.0, 0.01], 3 * 0.7 - 0.05
     settings = dataclasses.replace(SETTINGS, jump=10.0)
-    found = steps_of(poses.chain(np.zeros(3), step), settings, time)
-    np.testing.assert_array_equal(found.lags, only(k))
-    assert found.reach[k, 0] == pytest.approx(2 * 1.5 * 0.7, rel=0.1)
+    raw_steps = steps_of(poses.chain(np.zeros(3), step), settings, time)
+    np.testing.assert_array_equal(raw_steps.lags, only(k))
+    assert raw_steps.reach[k, 0] == pytest.approx(2 * 1.5 * 0.7, rel=0.1)
 
 
 def test_without_stamps_no_step_is_late_and_all_that_is_searched_can_be_reached():
     raw = late(path(), 30)
     for time in (None, np.full(LENGTH, 7.0)):
-        found = steps_of(raw, SETTINGS, time)
-        assert not found.lags.any() and not found.gap.any()
-        np.testing.assert_array_equal(found.reach, np.broadcast_to(FARTHEST, (LENGTH, 2)))
+        raw_steps = steps_of(raw, SETTINGS, time)
+        assert not raw_steps.lags.any() and not raw_steps.gap.any()
+        np.testing.assert_array_equal(raw_steps.reach, np.broadcast_to(FARTHEST, (LENGTH, 2)))
 
 
 def test_a_robot_that_stops_and_starts_and_turns_on_the_spot_is_not_late():
@@ -324,8 +332,8 @@ def test_a_robot_that_stops_and_starts_and_turns_on_the_spot_is_not_late():
     step[(step != 0).any(axis=1)] *= 1 + 0.05 * random.normal(size=((step != 0).any(1).sum(), 1))
     raw = poses.chain(np.zeros(3), step)
     time = 0.5 * np.arange(len(raw)) + 0.02 * random.normal(size=len(raw))
-    found = steps_of(raw, SETTINGS, time, np.zeros(len(raw), bool))
-    assert not found.lags.any() and not found.unknown.any()
+    raw_steps = steps_of(raw, SETTINGS, time, np.zeros(len(raw), bool))
+    assert not raw_steps.lags.any() and not raw_steps.unknown.any()
     # And at full speed from one scan to the next, as a log of key scans has it.
     step = step[(step != slow).any(axis=1)]
     raw = poses.chain(np.zeros(3), step)
@@ -334,8 +342,8 @@ def test_a_robot_that_stops_and_starts_and_turns_on_the_spot_is_not_late():
 
 def test_the_ring_is_not_late():
     _, log = driven()
-    found = steps_of(log.raw, SETTINGS, log.time, np.ones(len(log.time), bool))
-    assert not found.lags.any() and not found.unknown.any() and not found.gap.any()
+    raw_steps = steps_of(log.raw, SETTINGS, log.time, np.ones(len(log.time), bool))
+    assert not raw_steps.lags.any() and not raw_steps.unknown.any() and not raw_steps.gap.any()
 
 
 def test_odometry_is_frozen_where_it_says_nothing_while_scans_change():
@@ -346,14 +354,14 @@ def test_odometry_is_frozen_where_it_says_nothing_while_scans_change():
     raw[20:24] = raw[19]
     changed, known = np.ones(LENGTH, bool), np.ones(LENGTH, bool)
     at = np.isin(np.arange(LENGTH), [20, 21, 22, 23])
-    found = steps_of(raw, SETTINGS, TIME, changed, known)
-    np.testing.assert_array_equal(found.frozen, at)
-    np.testing.assert_array_equal(found.unknown, at)
+    raw_steps = steps_of(raw, SETTINGS, TIME, changed, known)
+    np.testing.assert_array_equal(raw_steps.frozen, at)
+    np.testing.assert_array_equal(raw_steps.unknown, at)
     base = steps_of(raw, SETTINGS, TIME).cov
     for k in (20, 23):
-        assert (found.cov[k] - base[k]).diagonal().min() > 0
-        assert found.cov[k, 0, 0] < found.reach[k, 0] ** 2
-    np.testing.assert_array_equal(found.cov[~at], base[~at])
+        assert (raw_steps.cov[k] - base[k]).diagonal().min() > 0
+        assert raw_steps.cov[k, 0, 0] < raw_steps.reach[k, 0] ** 2
+    np.testing.assert_array_equal(raw_steps.cov[~at], base[~at])
     # A robot at rest sees the same scan again.
     assert not steps_of(raw, SETTINGS, TIME, ~at, known).frozen.any()
     assert not steps_of(raw, SETTINGS, TIME, None, None).frozen.any()
@@ -424,9 +432,9 @@ def test_a_jump_that_a_reader_found_is_one_where_the_step_is_too_long():
         poses.compose(raw[30], np.array([1.0, 0, 0])), poses.between(raw[30], raw[30:])
     )
     known = ~only(30)
-    found = steps_of(raw, SETTINGS, TIME, None, known)
-    np.testing.assert_array_equal(found.jump, only(30))
-    assert not found.frozen.any()
+    raw_steps = steps_of(raw, SETTINGS, TIME, None, known)
+    np.testing.assert_array_equal(raw_steps.jump, only(30))
+    assert not raw_steps.frozen.any()
     np.testing.assert_array_equal(steps_of(path(), SETTINGS, TIME, None, known).frozen, only(30))
 
 
@@ -435,8 +443,8 @@ def test_frozen_odometry_of_a_slow_robot_is_counted():
     raw = path()
     raw[20:40] = raw[19]
     changed = np.where(np.arange(LENGTH) >= 4, 4, 0)
-    found = steps_of(raw, SETTINGS, TIME, changed)
-    np.testing.assert_array_equal(found.frozen, np.isin(np.arange(LENGTH), np.arange(20, 40)))
+    raw_steps = steps_of(raw, SETTINGS, TIME, changed)
+    np.testing.assert_array_equal(raw_steps.frozen, np.isin(np.arange(LENGTH), np.arange(20, 40)))
     assert not steps_of(raw, SETTINGS, TIME, np.zeros(LENGTH, int)).frozen.any()
 
 
@@ -456,35 +464,35 @@ def test_scans_of_a_slow_robot_differ_from_those_some_back():
 def test_a_jump_is_no_step_and_may_lead_anywhere():
     raw = path()
     raw[30:] += [3.2, -2.0, 0.0]
-    found = steps_of(raw, SETTINGS, TIME, np.ones(LENGTH, bool))
-    assert not found.reset.any()
-    np.testing.assert_array_equal(found.jump, only(30))
-    np.testing.assert_array_equal(found.unknown, only(30))
-    assert not found.frozen.any() and not found.lags.any()
-    np.testing.assert_array_equal(found.step[30], 0.0)
-    assert (found.cov[30].diagonal() >= diagonal(found.reach[30]).diagonal()).all()
+    raw_steps = steps_of(raw, SETTINGS, TIME, np.ones(LENGTH, bool))
+    assert not raw_steps.reset.any()
+    np.testing.assert_array_equal(raw_steps.jump, only(30))
+    np.testing.assert_array_equal(raw_steps.unknown, only(30))
+    assert not raw_steps.frozen.any() and not raw_steps.lags.any()
+    np.testing.assert_array_equal(raw_steps.step[30], 0.0)
+    assert (raw_steps.cov[30].diagonal() >= diagonal(raw_steps.reach[30]).diagonal()).all()
 
 
 def test_the_reach_grows_with_the_time_and_ends_where_is_searched():
     time = TIME.copy()
     time[40:] += 0.8
     time[50:] += 100.0
-    found = steps_of(path(turn=0.1), SETTINGS, time)
-    assert (found.reach <= FARTHEST).all() and (found.reach > 0).all()
-    np.testing.assert_allclose(found.reach[40], 2 * found.reach[39], rtol=1e-9)
-    np.testing.assert_array_equal(found.reach[50], FARTHEST)
-    np.testing.assert_array_equal(found.gap, only(50))
-    assert found.reach[39, 0] == pytest.approx(1.5 * 0.7, rel=0.1)
-    assert found.reach[39, 1] == pytest.approx(1.5 * 0.1, rel=0.2)
+    raw_steps = steps_of(path(turn=0.1), SETTINGS, time)
+    assert (raw_steps.reach <= FARTHEST).all() and (raw_steps.reach > 0).all()
+    np.testing.assert_allclose(raw_steps.reach[40], 2 * raw_steps.reach[39], rtol=1e-9)
+    np.testing.assert_array_equal(raw_steps.reach[50], FARTHEST)
+    np.testing.assert_array_equal(raw_steps.gap, only(50))
+    assert raw_steps.reach[39, 0] == pytest.approx(1.5 * 0.7, rel=0.1)
+    assert raw_steps.reach[39, 1] == pytest.approx(1.5 * 0.1, rel=0.2)
 
 
 def test_a_step_that_is_faster_than_can_be_and_makes_up_for_none_has_wrong_stamps():
     raw, time = path(), TIME.copy()
     time[30] = time[29] + 0.1
-    found = steps_of(raw, SETTINGS, time)
-    assert not found.lags.any()
-    np.testing.assert_array_equal(found.reach[30], FARTHEST)
-    assert (found.reach[29] < FARTHEST[0]).all()
+    raw_steps = steps_of(raw, SETTINGS, time)
+    assert not raw_steps.lags.any()
+    np.testing.assert_array_equal(raw_steps.reach[30], FARTHEST)
+    assert (raw_steps.reach[29] < FARTHEST[0]).all()
 
 
 # --- The share of a place's walls that the beams of a scan would pass through ---------------------

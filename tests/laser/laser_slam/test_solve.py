@@ -33,34 +33,34 @@ def drive():
 
 
 def test_loops_close(drive):
-    true, log, found = drive
-    position, heading = errors(found.poses, true)
-    before, _ = errors(found.odometry, true)
-    raw, _ = errors(found.raw, true)
+    true, log, solved = drive
+    position, heading = errors(solved.poses, true)
+    before, _ = errors(solved.odometry, true)
+    raw, _ = errors(solved.raw, true)
     assert position.max() < 0.1 and heading.max() < np.deg2rad(1.5)
     assert position.mean() < before.mean() < raw.mean()
-    score = laser_slam.closure_score(found, true)
+    score = laser_slam.closure_score(solved, true)
     assert score.kept >= 5 and score.precision == 1.0 and score.recall > 0.5
 
 
 def test_the_covariances_are_of_the_right_size(drive):
     """The mean NEES of a run: its poses are correlated, so the band is wide."""
-    true, _, found = drive
-    error = found.poses[1:] - true[1:]
+    true, _, solved = drive
+    error = solved.poses[1:] - true[1:]
     error[:, 2] = np.angle(np.exp(1j * error[:, 2]))
-    nees = np.einsum("ki,kij,kj->k", error, np.linalg.inv(found.cov[1:]), error)
+    nees = np.einsum("ki,kij,kj->k", error, np.linalg.inv(solved.cov[1:]), error)
     assert 0.02 < nees.mean() < 9
-    assert 0.02 < found.chi2 / found.dof < 2
+    assert 0.02 < solved.chi2 / solved.dof < 2
 
 
 def test_a_filter_is_driven_by_the_matches(drive):
     """It follows laser odometry, and its covariance is that of the chain of matches."""
-    _, log, found = drive
+    _, log, solved = drive
     of = scans_of(log, SETTINGS), steps_of(log.raw, SETTINGS)
     odometry = laser_odometry(*of, SETTINGS, log.raw[0])
     keys = odometry.keyframe
     control = laser_slam.match_controls(odometry)
-    np.testing.assert_allclose(laser_slam.match_controls(found), control, rtol=1e-6, atol=1e-12)
+    np.testing.assert_allclose(laser_slam.match_controls(solved), control, rtol=1e-6, atol=1e-12)
     nothing = len(control), 1
     scan = Scan(np.zeros((*nothing, 2)), np.full(nothing, -1), np.zeros(nothing, bool))
     ekf = filters.DeadReckoning(laser_slam.MatchMotion(), sensors.RangeBearing(np.eye(2)))
@@ -77,9 +77,9 @@ def test_a_filter_is_driven_by_the_matches(drive):
 
 
 def test_maps_of_a_film_grow_to_the_whole(drive):
-    _, log, found = drive
-    grown, until = growing_maps(log, found.odometry, SETTINGS, frames=4, others=[found.poses])
-    (whole,), _ = growing_maps(log, found.odometry, SETTINGS, frames=1, others=[found.poses])
+    _, log, solved = drive
+    grown, until = growing_maps(log, solved.odometry, SETTINGS, frames=4, others=[solved.poses])
+    (whole,), _ = growing_maps(log, solved.odometry, SETTINGS, frames=1, others=[solved.poses])
     assert until[-1] == len(log.time) and len(grown) == len(until) <= 4
     np.testing.assert_array_equal(grown[-1].log_odds, whole.log_odds)
     known = [(one.log_odds != 0).sum() for one in grown]
@@ -87,8 +87,8 @@ def test_maps_of_a_film_grow_to_the_whole(drive):
 
 
 def test_the_map_is_of_the_walls(drive):
-    true, log, found = drive
-    grid = found.map
+    true, log, solved = drive
+    grid = solved.map
     occupied = np.argwhere(grid.log_odds > 0)[:, ::-1] * 0.1 + 0.05 + grid.origin[:2]
     ends = log.beams.range < FAR
     angle = true[:, 2:3] + log.beams.angle
@@ -98,7 +98,7 @@ def test_the_map_is_of_the_walls(drive):
     walls = walls[ends]
     gap = np.linalg.norm(occupied[:, None] - walls[None], axis=-1).min(axis=1)
     assert np.quantile(gap, 0.95) < 0.15
-    assert grid.log_odds.shape == found.map_before.log_odds.shape
+    assert grid.log_odds.shape == solved.map_before.log_odds.shape
 
 
 def test_what_is_wrong_is_counted_and_the_run_goes_on(drive):
@@ -112,13 +112,13 @@ def test_what_is_wrong_is_counted_and_the_run_goes_on(drive):
     time[30] -= 3.0
     bad = log._replace(time=time, raw=raw, beams=Beams(ranges, angles, valid))
     told = []
-    found = laser_slam.solve(bad, ONCE, progress=lambda *what: told.append(what))
-    counts = found.counts
+    solved = laser_slam.solve(bad, ONCE, progress=lambda *what: told.append(what))
+    counts = solved.counts
     assert counts["scans with too few points"] == 2
     assert counts["jumps of raw odometry"] == 1
     assert counts["scans stamped before their predecessor"] == 1
-    assert np.isfinite(found.poses).all() and np.isfinite(found.cov).all()
-    assert errors(found.poses, true)[0].max() < 0.3
+    assert np.isfinite(solved.poses).all() and np.isfinite(solved.cov).all()
+    assert errors(solved.poses, true)[0].max() < 0.3
     assert {what[0] for what in told} == {"odometry", "loop closing"}
     assert sum(counts[f"loops {o.name.lower()}"] for o in LoopOutcome) == counts["loops matched"]
 
@@ -132,12 +132,12 @@ def test_after_a_jump_a_match_is_right_or_refused(drive):
         at = np.arange(k - 5, k + 1)
         raw = log.raw[at] + np.where(at == k, 40.0, 0.0)[:, None] * [1, 0, 0]
         scans = jax.tree.map(lambda part, at=at: np.asarray(part)[at], every)
-        found = laser_odometry(scans, steps_of(raw, SETTINGS), SETTINGS, raw[0])
-        z = poses.between(true[at[found.base[5]]], true[k])
-        off = poses.between(found.z[5], z)
-        assert np.hypot(off[0], off[1]) < 0.2 or not found.matched[5], k
-        assert off @ np.linalg.solve(found.cov[5], off) < 30, k
-        refused += not found.matched[5]
+        odometry = laser_odometry(scans, steps_of(raw, SETTINGS), SETTINGS, raw[0])
+        z = poses.between(true[at[odometry.base[5]]], true[k])
+        off = poses.between(odometry.z[5], z)
+        assert np.hypot(off[0], off[1]) < 0.2 or not odometry.matched[5], k
+        assert off @ np.linalg.solve(odometry.cov[5], off) < 30, k
+        refused += not odometry.matched[5]
     assert refused < 4
 
 
@@ -150,14 +150,14 @@ def test_a_match_with_another_place_is_in_doubt(drive):
         seen = np.append(at[:-1], (k + 17) % len(true))
         scans = jax.tree.map(lambda part, seen=seen: np.asarray(part)[seen], every)
         steps = steps_of(log.raw[at], SETTINGS)
-        found = laser_odometry(scans, steps, SETTINGS, log.raw[k - 5])
-        z = poses.between(true[at[found.base[5]]], true[k])
-        off = poses.between(found.z[5], z)
-        matched += found.matched[5]
-        doubted += found.doubted[5]
-        wrong += off @ np.linalg.solve(found.cov[5], off) > 30
-        narrow = found.cov[5] - found.cov_if_right[5]
-        assert np.any(narrow) == found.doubted[5] and np.linalg.eigvalsh(narrow).min() > -1e-12
+        odometry = laser_odometry(scans, steps, SETTINGS, log.raw[k - 5])
+        z = poses.between(true[at[odometry.base[5]]], true[k])
+        off = poses.between(odometry.z[5], z)
+        matched += odometry.matched[5]
+        doubted += odometry.doubted[5]
+        wrong += off @ np.linalg.solve(odometry.cov[5], off) > 30
+        narrow = odometry.cov[5] - odometry.cov_if_right[5]
+        assert np.any(narrow) == odometry.doubted[5] and np.linalg.eigvalsh(narrow).min() > -1e-12
     # A place within the error of raw odometry that looks the same cannot be told from this one.
     assert matched > 25 and matched - doubted < 5 and wrong < 3
 
@@ -169,16 +169,16 @@ def test_a_scan_of_another_place_does_not_move_the_path(drive):
     odd = 30
     seen = np.where(np.arange(len(true)) == odd, odd + 17 - len(true), np.arange(len(true)))
     beams = jax.tree.map(lambda part: np.asarray(part)[seen], log.beams)
-    found = laser_slam.solve(log._replace(beams=beams), SETTINGS)
-    position, _ = errors(found.poses, true)
-    error = found.poses[1:] - true[1:]
+    solved = laser_slam.solve(log._replace(beams=beams), SETTINGS)
+    position, _ = errors(solved.poses, true)
+    error = solved.poses[1:] - true[1:]
     error[:, 2] = poses.wrapped(error[:, 2])
-    nees = np.einsum("ki,kij,kj->k", error, np.linalg.inv(found.cov[1:]), error)
+    nees = np.einsum("ki,kij,kj->k", error, np.linalg.inv(solved.cov[1:]), error)
     assert position[odd] > 0.5 and np.delete(position, odd).max() < 0.1
     assert nees.max() < 30 and np.delete(nees, odd - 1).max() < 10
-    assert found.doubted[odd]
-    assert found.counts["scans whose match is in doubt"] == found.doubted.sum() < 4
-    assert laser_slam.closure_score(found, true).precision == 1.0
+    assert solved.doubted[odd]
+    assert solved.counts["scans whose match is in doubt"] == solved.doubted.sum() < 4
+    assert laser_slam.closure_score(solved, true).precision == 1.0
 
 
 def test_matches_beyond_raw_odometry_that_stands_still_are_in_doubt(drive):
@@ -186,8 +186,8 @@ def test_matches_beyond_raw_odometry_that_stands_still_are_in_doubt(drive):
     steps = poses.between(log.raw[:-1], log.raw[1:])
     steps[10:20] = 0.0
     raw = poses.chain(log.raw[0], steps)
-    found = laser_odometry(scans_of(log, SETTINGS), steps_of(raw, SETTINGS), SETTINGS, raw[0])
-    assert found.doubted[11:21].sum() >= 4 and not found.doubted[:11].any()
+    odometry = laser_odometry(scans_of(log, SETTINGS), steps_of(raw, SETTINGS), SETTINGS, raw[0])
+    assert odometry.doubted[11:21].sum() >= 4 and not odometry.doubted[:11].any()
 
 
 def test_a_log_of_maximum_ranges_is_raw_odometry(drive):
@@ -196,9 +196,9 @@ def test_a_log_of_maximum_ranges_is_raw_odometry(drive):
     beams = log.beams._replace(
         range=np.full((3, 60), FAR), angle=log.beams.angle[:3], valid=log.beams.valid[:3]
     )
-    found = laser_slam.solve(short._replace(beams=beams), SETTINGS)
-    np.testing.assert_allclose(found.poses, log.raw[:3], atol=1e-9)
-    assert found.counts["keyframes"] == 1 and not np.any(found.map.log_odds)
+    solved = laser_slam.solve(short._replace(beams=beams), SETTINGS)
+    np.testing.assert_allclose(solved.poses, log.raw[:3], atol=1e-9)
+    assert solved.counts["keyframes"] == 1 and not np.any(solved.map.log_odds)
 
 
 @refused(
@@ -287,9 +287,9 @@ def test_the_command_scores_it_by_the_poses_in_the_file(drive, monkeypatch, tmp_
     assert summary["score"].startswith("none: ") and "ATE, RMSE [m]" not in summary
 
 
-def relation_text(made, time):
+def relation_text(relations, time):
     """Lines of a file of relations."""
-    rows = zip(time[made.first], time[made.second], made.pose.tolist(), strict=True)
+    rows = zip(time[relations.first], time[relations.second], relations.pose.tolist(), strict=True)
     return "".join(f"{a:.5f} {b:.5f} {x} {y} 0 0 0 {yaw}\n" for a, b, (x, y, yaw) in rows)
 
 
@@ -303,19 +303,19 @@ def test_the_command_scores_it_by_relations(drive, monkeypatch, tmp_path, capsys
     ]
     (tmp_path / "ring.log").write_text("\n".join(lines))
     parts = [metrics.relations(true, rows=rows) for rows in (1, 3, 30, 31)]
-    made = metrics.Relations(*map(np.concatenate, zip(*parts, strict=True)))
-    far = int((made.second - made.first == 31).sum())
-    text = relation_text(made, time) + "5 6 0 0 0 0 0 0\n"
+    relations = metrics.Relations(*map(np.concatenate, zip(*parts, strict=True)))
+    far = int((relations.second - relations.first == 31).sum())
+    text = relation_text(relations, time) + "5 6 0 0 0 0 0 0\n"
     (tmp_path / "ring.relations").write_text(text)
     out = tmp_path / "out"
     command = ["slam", str(tmp_path / "ring.log"), "--out", str(out)]
     asked = ["--relations", str(tmp_path / "ring.relations"), "--figures", "svg"]
     assert main([*command, *asked]) == 0
-    told = json.loads((out / "summary.json").read_text())["relations"]
-    count = len(made.first)
-    assert (told["joined"], told["not joined"], told["tolerance [s]"]) == (count, 1, 1e-4)
-    assert told["all"]["relations"] == count and told["over 60 s apart"]["relations"] == far
-    for name, some in (("all", made), ("over 60 s apart", metrics.relations(true, rows=31))):
+    summary = json.loads((out / "summary.json").read_text())["relations"]
+    count = len(relations.first)
+    assert (summary["joined"], summary["not joined"], summary["tolerance [s]"]) == (count, 1, 1e-4)
+    assert summary["all"]["relations"] == count and summary["over 60 s apart"]["relations"] == far
+    for name, some in (("all", relations), ("over 60 s apart", metrics.relations(true, rows=31))):
         for path, at in (
             ("laser SLAM", found.poses),
             ("laser odometry", found.odometry),
@@ -323,11 +323,11 @@ def test_the_command_scores_it_by_relations(drive, monkeypatch, tmp_path, capsys
         ):
             errors = metrics.relation_errors(some, at)
             expected = metrics.benchmark_figures(errors)
-            for quantity, figures in told[name][path].items():
+            for quantity, figures in summary[name][path].items():
                 given = figures["mean"], figures["std"]
                 np.testing.assert_allclose(given, expected[quantity], rtol=1e-6)
-    assert told["all"]["in the 95 % ellipse"] == count
-    assert told["all"]["without a covariance"] == 0
+    assert summary["all"]["in the 95 % ellipse"] == count
+    assert summary["all"]["without a covariance"] == 0
     printed = capsys.readouterr().out
     assert f"{count} of {count + 1} join the scans, within 0.0001 s" in printed
     assert f"all: {count} relations, 100.0 % in the 95 % ellipse" in printed

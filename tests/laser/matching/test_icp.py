@@ -181,10 +181,10 @@ def test_in_a_corridor_the_prior_decides_whatever_it_is_worth(make, sigma):
         reference = jax.vmap(lambda of: matching.raster(of, 0.05, 8.0))(reference)
     along = np.stack([np.cos(turn), np.sin(turn)], axis=1)
     prior = Prior(np.c_[0.35 * along, np.zeros(5)], worth[:, None, None] * np.eye(3))
-    found = jax.device_get(matching.match(matcher, reference, scan, np.zeros((5, 3)), prior))
-    assert np.all(found.status == MatchStatus.DEGENERATE)
-    np.testing.assert_allclose((found.pose[:, :2] * along).sum(axis=1), 0.35, atol=2e-3)
-    np.testing.assert_allclose(found.determined[0], np.diag([0, 1, 1]), atol=0.02)
+    fit = jax.device_get(matching.match(matcher, reference, scan, np.zeros((5, 3)), prior))
+    assert np.all(fit.status == MatchStatus.DEGENERATE)
+    np.testing.assert_allclose((fit.pose[:, :2] * along).sum(axis=1), 0.35, atol=2e-3)
+    np.testing.assert_allclose(fit.determined[0], np.diag([0, 1, 1]), atol=0.02)
     alone = matching.match(matcher, reference, scan, np.zeros((5, 3)))
     np.testing.assert_allclose((alone.pose[:, :2] * along).sum(axis=1), 0, atol=2e-3)
 
@@ -198,20 +198,20 @@ def test_a_prior_holds_what_the_scans_do_not_determine(make):
     matcher = make(IcpSettings(**OPTIONS, tolerance=1e-9, kernel=Huber(), scale=0.05))
     information = np.diag([0.5, 0.5, 0.5]) + 0.2
     prior = Prior(STARTS + [0.03, -0.02, 0.01], np.tile(information, (COUNT, 1, 1)))
-    found = jax.device_get(matching.match(matcher, REFERENCES, SCANS, STARTS, prior))
+    fit = jax.device_get(matching.match(matcher, REFERENCES, SCANS, STARTS, prior))
 
     @jax.jit
     @jax.vmap
     def slope(of, scan, end):
         return jax.grad(lambda pose: matcher.cost(matcher.prepare(of), scan, pose, end))(end.pose)
 
-    np.testing.assert_allclose(slope(REFERENCES, SCANS, found)[:GOOD], 0, atol=1e-5)
-    np.testing.assert_array_equal(found.determined[0], np.eye(3))
+    np.testing.assert_allclose(slope(REFERENCES, SCANS, fit)[:GOOD], 0, atol=1e-5)
+    np.testing.assert_array_equal(fit.determined[0], np.eye(3))
     # In the corridor the slope of the scans' cost counts across it alone.
-    whole, of_prior = slope(REFERENCES, SCANS, found)[7], information @ (found.pose - prior.pose)[7]
-    left = found.determined[7].T @ (whole - of_prior) + of_prior
+    whole, of_prior = slope(REFERENCES, SCANS, fit)[7], information @ (fit.pose - prior.pose)[7]
+    left = fit.determined[7].T @ (whole - of_prior) + of_prior
     np.testing.assert_allclose(left, 0, atol=2e-5)
-    assert np.linalg.matrix_rank(found.determined[7], tol=1e-6) == 2
+    assert np.linalg.matrix_rank(fit.determined[7], tol=1e-6) == 2
 
 
 @pytest.mark.sweep

@@ -32,9 +32,9 @@ REFERENCES, SCANS, TRUTH, STARTS = pairs(RUNS, sigma=SIGMA)
 
 def all_of(matcher, ways):
     def one(reference, scan, start, key):
-        found = matcher.match(matcher.prepare(reference), scan, start)
-        scans = covariance.MatchedScans(reference, scan, found, start, key)
-        return found, {name: WAYS[name].of(matcher, scans) for name in ways}
+        fit = matcher.match(matcher.prepare(reference), scan, start)
+        scans = covariance.MatchedScans(reference, scan, fit, start, key)
+        return fit, {name: WAYS[name].of(matcher, scans) for name in ways}
 
     keys = jax.random.split(jax.random.key(0), RUNS)
     return jax.device_get(jax.jit(jax.vmap(one))(REFERENCES, SCANS, STARTS, keys))
@@ -51,21 +51,21 @@ def nees(found, cov):
 
 
 def test_the_noise_through_lines_is_honest_and_others_are_not(by_lines):
-    found, covs = by_lines
-    assert np.all(found.status == MatchStatus.CONVERGED)
+    fits, covs = by_lines
+    assert np.all(fits.status == MatchStatus.CONVERGED)
     low, high = chi2_band(3, RUNS, 0.999)
-    assert low < nees(found, covs["implicit"]) < high
+    assert low < nees(fits, covs["implicit"]) < high
     # A single variance σ² for residuals that have that of two scans.
-    assert nees(found, covs["lattice"]) > high
+    assert nees(fits, covs["lattice"]) > high
     for cov in covs.values():
         assert np.all(np.linalg.eigvalsh(cov) > 0)
 
 
 @pytest.mark.sweep
 def test_so_is_the_noise_through_the_unscented_transform_and_all_are_positive_definite():
-    found, covs = all_of(LINES, WAYS)
+    fits, covs = all_of(LINES, WAYS)
     low, high = chi2_band(3, RUNS, 0.999)
-    assert low < nees(found, covs["unscented"]) < high
+    assert low < nees(fits, covs["unscented"]) < high
     for cov in covs.values():
         assert np.all(np.linalg.eigvalsh(cov) > 0)
 
@@ -84,11 +84,11 @@ def test_a_prior_tells_what_a_corridor_does_not():
     expected = truth + np.random.default_rng(6).multivariate_normal(np.zeros(3), cov, RUNS)
     information = np.tile(0.01**2 * np.linalg.inv(cov), (RUNS, 1, 1))
     prior = Prior(expected, information)
-    found = matching.match(LINES, references, scans, expected, prior)
+    fit = matching.match(LINES, references, scans, expected, prior)
     claimed = covariance.covariance(
-        covariance.Implicit(0.01), LINES, references, scans, found, expected, jax.random.key(0)
+        covariance.Implicit(0.01), LINES, references, scans, fit, expected, jax.random.key(0)
     )
-    error, claimed = np.asarray(found.pose) - truth, np.asarray(claimed)
+    error, claimed = np.asarray(fit.pose) - truth, np.asarray(claimed)
     low, high = chi2_band(3, RUNS, 0.999)
     assert low < np.einsum("ri,rij,rj->", error, np.linalg.inv(claimed), error) / RUNS < high
     along = np.sqrt(np.linalg.eigvalsh(claimed[:, :2, :2])[:, 1])
@@ -97,9 +97,9 @@ def test_a_prior_tells_what_a_corridor_does_not():
 
 @pytest.mark.sweep
 def test_points_with_their_partners_kept_feign_information():
-    found, covs = all_of(POINTS, ("implicit", "along_normals"))
-    assert nees(found, covs["implicit"]) > 30
-    assert nees(found, covs["along_normals"]) < 0.1 * nees(found, covs["implicit"])
+    fits, covs = all_of(POINTS, ("implicit", "along_normals"))
+    assert nees(fits, covs["implicit"]) > 30
+    assert nees(fits, covs["along_normals"]) < 0.1 * nees(fits, covs["implicit"])
 
 
 def least(reference, scan, pair, used):
@@ -159,11 +159,11 @@ def test_a_match_that_failed_is_known_by_its_prior_or_not_at_all(by_lines):
 
 def test_the_noise_through_is_that_of_differences(by_lines):
     """dx/dz of each range of both scans, the minimum computed again with the pairs kept."""
-    found, covs = by_lines
-    k = whole_run(found)
-    used = found.weight[k] > 0
+    fits, covs = by_lines
+    k = whole_run(fits)
+    used = fits.weight[k] > 0
     p, q = REFERENCES.position[k], SCANS.position[k]
-    np.testing.assert_allclose(least(p, q, found.pair[k], used), found.pose[k], atol=1e-6)
+    np.testing.assert_allclose(least(p, q, fits.pair[k], used), fits.pose[k], atol=1e-6)
     gain, h = [], 1e-5
     for which in range(2):
         for beam in range(BEAMS):
@@ -172,19 +172,19 @@ def test_the_noise_through_is_that_of_differences(by_lines):
                 parts = [p.copy(), q.copy()]
                 ray = (REFERENCES, SCANS)[which].ray[k, beam]
                 parts[which][beam] += sign * h * ray
-                ends.append(least(*parts, found.pair[k], used))
+                ends.append(least(*parts, fits.pair[k], used))
             gain.append((ends[0] - ends[1]) / (2 * h))
     gain = np.array(gain)
     np.testing.assert_allclose(covs["implicit"][k], SIGMA**2 * gain.T @ gain, rtol=1e-3, atol=1e-10)
 
 
 def test_the_lattice_of_a_quadratic_cost_is_its_inverse(by_lines):
-    found, covs = by_lines
+    fits, covs = by_lines
     prior = np.eye(3) * 0.3**-2
-    k = whole_run(found)
-    used = found.weight[k] > 0
-    arm = from_frame(found.pose[k], SCANS.position[k])[used] - found.pose[k, :2]
-    own = REFERENCES.position[k][found_neighbours[found.pair[k][used]]]
+    k = whole_run(fits)
+    used = fits.weight[k] > 0
+    arm = from_frame(fits.pose[k], SCANS.position[k])[used] - fits.pose[k, :2]
+    own = REFERENCES.position[k][found_neighbours[fits.pair[k][used]]]
     apart = own - own.mean(axis=1, keepdims=True)
     n = np.linalg.eigh(np.einsum("nka,nkb->nab", apart, apart))[1][:, :, 0]
     jacobian = np.column_stack([n, n[:, 1] * arm[:, 0] - n[:, 0] * arm[:, 1]])

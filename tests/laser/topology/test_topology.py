@@ -31,27 +31,27 @@ def drawn(*rows):
 
 
 def test_the_office_has_six_rooms_a_corridor_and_six_doors():
-    found = places()
-    assert len(found.center) == 7 and len(found.doors) == 6
-    at = np.array([door.position for door in found.doors])
+    rooms = places()
+    assert len(rooms.center) == 7 and len(rooms.doors) == 6
+    at = np.array([door.position for door in rooms.doors])
     gap = np.linalg.norm(at[:, None] - DOORS[None], axis=2)
     assert sorted(gap.argmin(axis=1)) == [0, 1, 2, 3, 4, 5]
     assert gap.min(axis=1).max() < 0.2
-    assert all(abs(door.width - 1.0) <= 0.2 for door in found.doors)
-    own = topology.place_of(found, ROOMS)
+    assert all(abs(door.width - 1.0) <= 0.2 for door in rooms.doors)
+    own = topology.place_of(rooms, ROOMS)
     assert sorted(own) == list(range(7))
-    for door, k in zip(found.doors, gap.argmin(axis=1), strict=True):
+    for door, k in zip(rooms.doors, gap.argmin(axis=1), strict=True):
         assert set(door.places) == {own[k], own[6]}
-    np.testing.assert_array_equal(found.adjacent.sum(axis=1)[own], [1] * 6 + [6])
+    np.testing.assert_array_equal(rooms.adjacent.sum(axis=1)[own], [1] * 6 + [6])
     # Rooms have the areas that they have; doors belong to one side or the other.
     free = sum(np.prod(size) for size in ([3.6, 3], [4, 3], [4, 3], [4.6, 2.8], [3.4, 2.8]))
     free += 3.6 * 2.8 + 12 * 1.8 - 0.8 * 0.8 - 0.9 * 0.5 + 6 * 0.2
-    assert abs(found.area.sum() - free) < 0.03 * free
+    assert abs(rooms.area.sum() - free) < 0.03 * free
 
 
 def test_every_free_cell_has_a_place_and_no_other():
-    found = places()
-    np.testing.assert_array_equal(found.label >= 0, np.asarray(found.grid.log_odds) < 0)
+    rooms = places()
+    np.testing.assert_array_equal(rooms.label >= 0, np.asarray(rooms.grid.log_odds) < 0)
 
 
 def test_the_skeleton_is_thin_connected_and_far_from_walls():
@@ -72,8 +72,8 @@ def test_the_skeleton_is_thin_connected_and_far_from_walls():
 
 
 def test_the_shortest_way_goes_through_the_doors():
-    found, own = places(), topology.place_of(places(), ROOMS)
-    way = topology.route(found, ROOMS[0], ROOMS[5])
+    rooms, own = places(), topology.place_of(places(), ROOMS)
+    way = topology.route(rooms, ROOMS[0], ROOMS[5])
     assert way.places == (own[0], own[6], own[5])
     np.testing.assert_array_equal(way.path[[0, -1]], ROOMS[[0, 5]])
     steps = np.linalg.norm(np.diff(way.path, axis=0), axis=1)
@@ -83,25 +83,25 @@ def test_the_shortest_way_goes_through_the_doors():
     least = np.linalg.norm(np.diff(corners, axis=0), axis=1).sum()
     assert least - 0.2 < way.length < 1.25 * least
     assert is_free(office().walls, way.path).all()
-    assert topology.route(found, ROOMS[0], ROOMS[0] + 0.1).places == (own[0],)
+    assert topology.route(rooms, ROOMS[0], ROOMS[0] + 0.1).places == (own[0],)
 
 
 def test_two_doors_between_the_same_rooms_are_two():
     """A wall with two gaps: union by distance alone would take the second for a loop."""
     room = "." * 9
     grid = drawn("#" * 11, *[f"#{room}#"] * 5, "##.#####.##", *[f"#{room}#"] * 5, "#" * 11)
-    found = topology.topological_map(grid, clearance=0.4, max_width=1.5, prominence=1.0)
-    assert len(found.center) == 2
-    assert sorted(door.position[0] for door in found.doors) == [2.5, 8.5]
-    assert all(door.places == (0, 1) for door in found.doors)
+    topology_of = topology.topological_map(grid, clearance=0.4, max_width=1.5, prominence=1.0)
+    assert len(topology_of.center) == 2
+    assert sorted(door.position[0] for door in topology_of.doors) == [2.5, 8.5]
+    assert all(door.places == (0, 1) for door in topology_of.doors)
 
 
 def test_unknown_cells_are_no_way_and_a_gap_too_narrow_connects_nothing():
     apart = drawn("#######", "#..?..#", "#..?..#", "#######")
-    found = topology.topological_map(apart, clearance=0.5)
-    assert len(found.center) == 2 and not found.doors
+    topology_of = topology.topological_map(apart, clearance=0.5)
+    assert len(topology_of.center) == 2 and not topology_of.doors
     with pytest.raises(ValueError, match="route: no way leads from place 0 to place 1"):
-        topology.route(found, [1.5, 1.5], [5.5, 1.5])
+        topology.route(topology_of, [1.5, 1.5], [5.5, 1.5])
     narrow = drawn(
         *["#" * 11] * 1, *["#....#....#"] * 2, "#.........#", *["#....#....#"] * 2, "#" * 11
     )
@@ -109,10 +109,10 @@ def test_unknown_cells_are_no_way_and_a_gap_too_narrow_connects_nothing():
 
 
 def test_particles_are_summed_up_by_place():
-    found, own = places(), topology.place_of(places(), ROOMS)
+    rooms, own = places(), topology.place_of(places(), ROOMS)
     poses = np.column_stack([ROOMS[[0, 0, 6]], np.zeros(3)])
     poses = np.concatenate([poses, [[-5.0, 0.0, 1.0]]])  # off the map
-    weights, nowhere = topology.place_weights(found, poses, np.log([1.0, 2.0, 4.0, 1.0]) + 700)
+    weights, nowhere = topology.place_weights(rooms, poses, np.log([1.0, 2.0, 4.0, 1.0]) + 700)
     np.testing.assert_allclose(weights[own[[0, 6, 1]]], [3 / 8, 1 / 2, 0])
     assert nowhere == pytest.approx(1 / 8)
 

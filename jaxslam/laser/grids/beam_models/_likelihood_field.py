@@ -63,6 +63,7 @@ class LikelihoodField(BeamModel):
         far, ends = self._ends(pose, beams)
         log_near = jnp.log(self._total(self._near(interpolate(prepared, ends))))
         maximum = jnp.asarray(self.maximum)
+        # A weight of 0 is left out (log 1), and its logarithm must have a finite derivative.
         silent = maximum == 0
         log_far = jnp.where(silent, 0.0, jnp.log(jnp.where(silent, 1.0, maximum)))
         return jnp.where(far, log_far.astype(log_near.dtype), log_near)

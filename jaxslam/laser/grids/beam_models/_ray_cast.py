@@ -213,6 +213,7 @@ def fit(
         value, slope = _cost_and_slope(x, ranges, stars, max_range)
         return float(value), np.asarray(slope, np.float64)
 
+    # By logarithms shares, σ and λ stay above 0 without bounds; a share of 0 begins at 1e-6.
     first = np.log(np.maximum([float(np.asarray(value)) for value in start], 1e-6))
     optimum = minimize(cost, first, jac=True, method="BFGS", options={"maxiter": iterations})
     return Mixture(*(float(np.asarray(value)) for value in _mixture(jnp.asarray(optimum.x))))
@@ -248,7 +249,9 @@ def _em_step(mixture: Mixture, z: np.ndarray, stars: np.ndarray, max_range: floa
         ]
     )
     total = densities.sum(axis=0)
+    # Responsibilities; a range that no component can make, of density 0, has none.
     share = densities / np.where(total > 0, total, 1.0)
+    # Where max_range is expected, a hit says nothing on σ.
     at = share[0] * ~nothing
     variance = (at * (z - stars) ** 2).sum() / max(at.sum(), 1e-12)
     weights = share.mean(axis=1) / max(share.mean(axis=1).sum(), 1e-12)

@@ -130,6 +130,7 @@ def laser_odometry(
     count = len(scans.usable)
     borders = _borders(scans, steps)
     _compile(scans, settings)
+    # From 2: the first scan has no match, and is done at the start.
     progress_count, lock = itertools.count(2), threading.Lock()
     stopped = threading.Event()
 
@@ -171,6 +172,7 @@ def _borders(scans: Scans, steps: Steps) -> Int[np.ndarray, "n"]:
     odd = ~scans.usable | steps.unknown | steps.lags | steps.gap
     odd = np.convolve(odd, np.ones(2 * _MARGIN + 1), "same") > 0
     borders = [0]
+    # The nearest such scan to even parts; a part without any stays with the part before.
     for even in np.linspace(0, count, max(count // PIECE, 1) + 1)[1:-1].astype(int):
         near = np.arange(even - PIECE // 4, even + PIECE // 4)
         near = near[~odd[near]]

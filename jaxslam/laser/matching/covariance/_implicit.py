@@ -65,6 +65,7 @@ class Implicit(MatchCovariance):
             )(match.pose)
             return by_pose
 
+        # At no change: the derivatives by the ranges of the reference and of the scan.
         dtype = points.position.dtype
         zeros = jnp.zeros(range_count(reference), dtype), jnp.zeros(len(points.valid), dtype)
         by_ranges = jnp.concatenate(jax.jacrev(slope, argnums=(0, 1))(*zeros), axis=1)
@@ -85,6 +86,7 @@ class Hessian(MatchCovariance):
     def of_usable(self, matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
         reference, points, match, *_ = scans
         prepared = matcher.prepare(reference)
+        # With a prior the pose is no free parameter of the residuals.
         free = (match.weight > 0).sum() - (3 if match.prior is None else 0)
         least = 2 * matcher.cost(prepared, points, match.pose, match) / jnp.maximum(free, 1)
         shape = curvature(matcher, prepared, points, match)
@@ -129,7 +131,7 @@ class AlongNormals(MatchCovariance):
                 f"AlongNormals: takes a reference of Points, got {type(reference).__name__}"
             )
         lines = surface(reference, self.span, self.gap)
-        j = jnp.maximum(match.pair, 0)
+        j = jnp.maximum(match.pair, 0)  # any partner for points without: their weight is 0
         weight = jnp.where(lines.straight[j], match.weight, 0.0)
         turn = se2.rotation(match.pose[2]).T
         arm, ray, n = points.position @ turn, points.ray @ turn, lines.normal[j]
@@ -137,6 +139,7 @@ class AlongNormals(MatchCovariance):
             [n, (n[:, 1] * arm[:, 0] - n[:, 0] * arm[:, 1])[:, None]], axis=1
         )
         shape = information_of(jacobian, weight)
+        # The columns w (n·R u) J of the scan's ranges, and (n_j·u_j) s_j of the reference's.
         by_scan = (weight * (n * ray).sum(axis=1))[:, None] * jacobian
         of_partner = jax.ops.segment_sum(weight[:, None] * jacobian, j, len(reference.valid))
         by_reference = (lines.normal * reference.ray).sum(axis=1)[:, None] * of_partner

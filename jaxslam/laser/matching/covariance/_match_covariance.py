@@ -104,6 +104,7 @@ def inverse_of(
     information, so that an undetermined direction is known to a kilometre or a thousand radians.
     """
     floor = (sigma * 1e-3) ** 2 * jnp.eye(3, dtype=curvature.dtype)
+    # All three, and a choice between them: shapes are static, and each is finite.
     first, positive = linalg.whitener(linalg.symmetrize(curvature) + floor)
     second, usable = linalg.whitener(linalg.symmetrize(otherwise) + floor)
     last = jnp.eye(3, dtype=curvature.dtype) / (sigma * 1e-3)
@@ -125,6 +126,7 @@ def noise_cov(
 
 def curvature(matcher: Matcher, prepared: PyTree, points: Points, match: Match) -> Array:
     """The curvature ∂²E/∂x² (3, 3) of the matcher's cost at the pose, pairs and weights kept."""
+    # Without the prior, whose exact curvature Λ is added with the projection of the scans.
     alone = match._replace(prior=None)
     by_pose = jax.hessian(lambda pose: matcher.cost(prepared, points, pose, alone))
     return add_prior(match, jnp.asarray(by_pose(match.pose)))

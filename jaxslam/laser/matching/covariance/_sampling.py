@@ -59,7 +59,7 @@ class Lattice(MatchCovariance):
         check_count("Lattice: steps", self.steps, 3)
 
     def of_usable(self, matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
-        axis = np.linspace(-4.0, 4.0, self.steps)
+        axis = np.linspace(-4.0, 4.0, self.steps)  # 4 σ of the peak: exp(-8) is left out
         grid = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
         reference, points, match, *_ = scans
         prepared = matcher.prepare(reference)
@@ -110,6 +110,7 @@ class Unscented(MatchCovariance):
     def of_usable(self, matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
         reference, points, match, start, _ = scans
         root = linalg.root_psd(jnp.asarray(self.start_cov, start.dtype))
+        # √n σ for n = 3: six points of equal weight have the covariance of the start.
         sides = jnp.sqrt(3.0).astype(start.dtype) * jnp.concatenate([root.T, -root.T])
         prepared = matcher.prepare(reference)
         ends = jax.vmap(lambda off: matcher.match(prepared, points, start + off, match.prior).pose)(
