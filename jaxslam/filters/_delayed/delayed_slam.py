@@ -78,9 +78,15 @@ class DelayedSlam(DelayedFilter):
     def update(self, state: DelayedState, scan: Scan, key: Array) -> tuple[DelayedState, Info]:
         # Padding may hold any number, and is multiplied by zero below.
         scan = scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
-        state = state._replace(clock=state.clock + 1)
-        association, matched = _associate(self, state, scan)
-        state, correction = _correct(self, state, scan, association, matched)
+        # Hypotheses and stored measurements are not landmarks.
+        landmarks = state.joint.alive & (jnp.arange(self.layout.slots) < self.capacity)
+        association, matched = associate_scan(
+            state.joint._replace(alive=landmarks), scan, self._ekf
+        )
+        joint, correction = correct_in_turn(
+            state.joint, scan.z, jnp.maximum(association.slot, 0), matched, self._ekf
+        )
+        state = state._replace(joint=joint, clock=state.clock + 1)
         new = _new_measurements(self, scan, association)
 
         def initialize(
@@ -117,30 +123,6 @@ class DelayedSlam(DelayedFilter):
         return EkfSettings(
             sensor=self.sensor_of_table, associate=self.associate, gate=self.probability
         )
-
-
-def _associate(
-    filter: DelayedSlam, state: DelayedState, scan: Scan
-) -> tuple[Association, Bool[Array, "M"]]:
-    """The landmark slot of each measurement, and the mask of the measurements that have one.
-
-    Hypotheses and stored measurements are not landmarks.
-    """
-    landmarks = state.joint.alive & (jnp.arange(filter.layout.slots) < filter.capacity)
-    return associate_scan(state.joint._replace(alive=landmarks), scan, filter._ekf)
-
-
-def _correct(
-    filter: DelayedSlam,
-    state: DelayedState,
-    scan: Scan,
-    association: Association,
-    matched: Bool[Array, "M"],
-) -> tuple[DelayedState, Correction]:
-    """The state corrected by the measurements of landmarks of the map that are within the gate."""
-    slot = jnp.maximum(association.slot, 0)
-    joint, correction = correct_in_turn(state.joint, scan.z, slot, matched, filter._ekf)
-    return state._replace(joint=joint), correction
 
 
 def _new_measurements(
