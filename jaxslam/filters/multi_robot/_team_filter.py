@@ -17,7 +17,8 @@ from jaxslam.filters._ekf.ekf_settings import (
     check_covariance_form,
     check_ekf_options,
 )
-from jaxslam.filters.multi_robot.team import Robot, check_team, sizes
+from jaxslam.filters.multi_robot._team import check_team, sizes
+from jaxslam.filters.multi_robot.team import Robot
 from jaxslam.math._arrays import Number
 
 SIZE = 3

@@ -17,6 +17,7 @@ from jaxslam.filters._ekf.predict import propagate
 from jaxslam.filters._ekf.scan import SensorStage, stage_of, update_by_scan
 from jaxslam.filters._reporting import joined_info
 from jaxslam.filters.multi_robot._pose_initialization import best_initialization, observed_points
+from jaxslam.filters.multi_robot._team import sizes
 from jaxslam.filters.multi_robot._team_filter import SIZE, TeamFilter
 from jaxslam.filters.multi_robot._team_state import (
     InitialPose,
@@ -25,7 +26,7 @@ from jaxslam.filters.multi_robot._team_state import (
     seen_from_first,
     with_robot,
 )
-from jaxslam.filters.multi_robot.team import poses, sizes
+from jaxslam.filters.multi_robot.team import poses
 from jaxslam.math import se2
 from jaxslam.math._xla import where_any
 from jaxslam.math.angles import wrap
