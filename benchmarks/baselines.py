@@ -12,8 +12,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.gate import Metric
-from jaxslam import _catalog as catalog
-from jaxslam import monte_carlo, run, simulate
+from jaxslam import catalog, monte_carlo, run, simulate
 from jaxslam.filters import Mapping
 from jaxslam.math._gaussians import mahalanobis_squared
 from jaxslam.math.stats import chi2_band
@@ -40,7 +39,7 @@ def map_nees(world, runs):
 
 def measure(quick: bool = False) -> list[Metric]:
     world, runs = circle(), 100 if quick else 1000
-    filters = {name: catalog.BASELINES[name](world) for name in ("dead_reckoning", "localization")}
+    filters = {name: catalog.ALL[name](world) for name in ("dead_reckoning", "localization")}
     campaign = monte_carlo(world, filters, runs, jax.random.key(0))
     print(campaign)
     share = campaign.filters["localization"].inside["pose"]

@@ -33,7 +33,7 @@ from jaxslam import (
     smoothing,
     team,
 )
-from jaxslam.consistency.campaign._candidates import estimator_of
+from jaxslam.consistency.campaign._candidates import method_of
 from jaxslam.core.protocols import Filter
 from jaxslam.core.types import Log, Trace, Truth
 from jaxslam.filters import EkfSlam, Merging, TeamSlam
@@ -60,7 +60,7 @@ def world(scale: float) -> Scenario:
 
 def crew(scale: float) -> tuple[World, Filter]:
     eyes = sensors.RangeBearing(np.diag([0.05, 0.02]) ** 2 * scale)
-    sees = Suite((Part(eyes, 4), Part(eyes, 1, every=2, sees="robots")))
+    sees = Suite((Part(eyes, 4), Part(eyes, 1, interval=2, sees="robots")))
     moves = motion.Increment(np.diag([0.01, 0.01]) ** 2 * scale)
     second = (0.8, 0.6, 1.0), np.diag([0.05, 0.05, 0.05]) ** 2
     robots = [team.Robot(moves, sees), team.Robot(moves, sees, second)]
@@ -95,8 +95,10 @@ def case(name: str, scale: float) -> tuple[World, Any]:
 @jax.jit
 def drive(method: Any, there: World, truth: Truth, log: Log, key: jax.Array) -> Trace:
     """The trace of a campaign's candidate over a log."""
-    estimate, _ = estimator_of(method, truth, there)
-    return estimate(log, key)
+    estimator = method_of(method, truth)
+    if isinstance(estimator, Filter):
+        return run(estimator, log, there.pose, there.pose_cov, key)
+    return estimator(log, key)
 
 
 def first_run(name: str, program: Any, *arguments: Any) -> Metric:

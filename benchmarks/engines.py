@@ -25,7 +25,7 @@ from benchmarks.speed.campaigns import campaign
 from jaxslam import catalog, monte_carlo, scenarios
 from jaxslam.consistency.campaign import Processes
 from jaxslam.consistency.campaign._block import CampaignPlan
-from jaxslam.consistency.campaign._remote import compute_block, packed
+from jaxslam.consistency.campaign._remote import compute_block, pack
 
 RUNS, BLOCK = 512, 16
 DEVICES = "--xla_force_host_platform_device_count="
@@ -84,7 +84,7 @@ def on_one_core() -> tuple[list[float], list[float], int, int]:
     jax.config.update("jax_enable_x64", True)
     world, marks = scenarios.cloister(), []
     filters, key = {"ekf": catalog.FILTERS["ekf"](world)}, jax.random.key(0)
-    content = packed(CampaignPlan(world, filters, key, jax.devices()[:1], BLOCK))
+    content = pack(CampaignPlan(world, filters, key, jax.devices()[:1], BLOCK))
     back = len(pickle.dumps(compute_block(content, BLOCK, BLOCK)))
 
     def seconds(**options) -> list[float]:

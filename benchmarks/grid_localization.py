@@ -75,8 +75,8 @@ def learnt(grid, world):
 class SingleRayCast(grids.RayCast):
     """The ray-cast model in float32, in half the time; the world's draws stay in float64."""
 
-    def each(self, prepared, pose, beams):
-        return super().each(*single_log((prepared, pose, beams))).astype(pose.dtype)
+    def log_likelihoods(self, prepared, pose, beams):
+        return super().log_likelihoods(*single_log((prepared, pose, beams))).astype(pose.dtype)
 
 
 def tempering_field(runs):
@@ -105,10 +105,10 @@ def tempering(name, world, grid, model, exponents, runs, particles=500, seeds=10
             grid, model, world.motion, particles, least=particles, exponent=exponent
         )
         key = jax.random.key(0)
-        scores = consistency.judge_localization(world, filter, runs, key, start_cov=START, every=4)
+        scores = consistency.judge_localization(world, filter, runs, key, start_cov=START, stride=4)
         found = consistency.summarize_localization(scores, skip=SKIP, limit=FOUND)
         again = consistency.judge_localization(
-            world, filter, seeds, key, start_cov=0 * START, same_log=True, every=4
+            world, filter, seeds, key, start_cov=0 * START, same_log=True, stride=4
         )
         spread = float(np.median(seed_spread(again)[SKIP:]))
         return found.coverage.value, [
@@ -153,9 +153,9 @@ def anywhere(runs, particles=5000):
         office_map(), model, world.motion, particles,
         start="uniform", exponent=0.1, forget=(0.05, 0.5),
     )  # fmt: skip
-    scores = consistency.judge_localization(world, filter, runs, jax.random.key(0), every=4)
+    scores = consistency.judge_localization(world, filter, runs, jax.random.key(0), stride=4)
     found = consistency.summarize_localization(scores, limit=FOUND)
-    after = found.found[np.isfinite(found.found)]
+    after = found.converged_at[np.isfinite(found.converged_at)]
     return [
         Metric("office, anywhere: share of runs found", 1 - found.lost, low=0.95),
         Metric("office, anywhere: median time to converge [s]", float(np.median(after))),

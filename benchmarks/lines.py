@@ -17,8 +17,8 @@ from jaxslam import features, filters, scenarios, sensors
 from jaxslam.consistency import block_nees, pose_error
 from jaxslam.core.types import Beams, Scan
 from jaxslam.math.stats import t_quantile
-from jaxslam.simulation import _walls as walls
 from jaxslam.simulation import laser
+from jaxslam.simulation._wall_geometry import wall_lines
 
 PLACES, FAR = 16, (0.4, 0.3)
 """Measurement slots of a scan; from its wall a line is at most so far, [m] and [rad]."""
@@ -72,7 +72,7 @@ def drive(world, count: int, control, scans) -> Any:
 def judge(name: str, runs: int, every: int) -> tuple[float, float, float]:
     """NEES of lines, NEES of the pose, NIS/dof; prints them with their intervals."""
     world = scenarios.ROOMS[name]()
-    lines, _ = walls.wall_lines(world.walls)
+    lines, _ = wall_lines(world.walls)
     keys = jax.random.split(jax.random.key(0), runs)
     logs = jax.device_get(jax.jit(jax.vmap(lambda key: laser.scan_world(world, key)))(keys))
     steps, nees, none = logs.pose.shape[1], [], 0

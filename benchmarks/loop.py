@@ -17,7 +17,7 @@ from jaxslam import Scenario
 from jaxslam.catalog import FILTERS
 from jaxslam.consistency.campaign import monte_carlo
 from jaxslam.core.record import record, static
-from jaxslam.simulation._worlds import drawn
+from jaxslam.simulation._worlds import draw_history
 from jaxslam.simulation.scenarios import loop
 from jaxslam.simulation.scenarios._published import loop_landmarks
 
@@ -37,7 +37,7 @@ class ManyMaps(Scenario):
         keys = jax.random.split(key, self.maps * RUNS)
         tables = jnp.stack([jnp.asarray(loop_landmarks(seed)) for seed in range(self.maps)])
         here = dataclasses.replace(self, landmarks=tables[number // RUNS])
-        return drawn(here, jax.random.split(keys[number])[0])
+        return draw_history(here, jax.random.split(keys[number])[0])
 
 
 def campaign(names, maps: int, noise: float = 1.0):

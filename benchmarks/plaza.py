@@ -20,7 +20,7 @@ import numpy as np
 import jaxslam
 from benchmarks.gate import Metric, save, show
 from jaxslam import datasets, metrics
-from jaxslam.consistency.metrics._paths import carried
+from jaxslam.consistency.metrics._paths import transform
 from jaxslam.core.types import Status
 from jaxslam.filters import DelayedSlam, StoredMeasurements
 from jaxslam.results.plot import COLORS, FAINT, INK, PAGE, SHADE, caption, panels_of
@@ -52,7 +52,7 @@ def dead_reckoning(data):
 def aligned(path, data):
     """The motion onto the ground truth, the path there (T, 2), and its RMSE [m]."""
     motion = metrics.alignment(path[:, :2], data.true_path[:, :2])
-    path = carried(motion, path[:, :2])
+    path = transform(motion, path[:, :2])
     off = np.linalg.norm(path - data.true_path[:, :2], axis=1)
     return motion, path, metrics.statistics(off).rmse
 
@@ -60,7 +60,7 @@ def aligned(path, data):
 def beacons(motion, estimate, data):
     """Where the beacons of the map are in the survey's frame (K, 2), and their errors, by tag."""
     alive = np.asarray(estimate.alive)
-    points = carried(motion, estimate.points[alive])
+    points = transform(motion, estimate.points[alive])
     tags = np.asarray(estimate.tag)[alive]
     return points, np.linalg.norm(points - data.landmarks[tags], axis=1)[np.argsort(tags)]
 

@@ -20,7 +20,7 @@ from gtsam.symbol_shorthand import L, X
 import jaxslam
 from benchmarks.gate import Metric, show
 from jaxslam import charts, datasets, metrics
-from jaxslam.consistency.metrics._paths import carried
+from jaxslam.consistency.metrics._paths import transform
 from jaxslam.core.types import Status
 from jaxslam.datasets import Dataset
 from jaxslam.filters import EkfSlam
@@ -127,8 +127,8 @@ def position_error(z):
 def compare(filtered: Solution, batch: Solution) -> dict[str, float]:
     """How far a solution is from the batch's after the best SE(2) motion onto it."""
     move = metrics.alignment(filtered.points, batch.points)
-    points = carried(move, filtered.points) - batch.points
-    path = carried(move, filtered.path[:, :2]) - batch.path[:, :2]
+    points = transform(move, filtered.points) - batch.points
+    path = transform(move, filtered.path[:, :2]) - batch.path[:, :2]
     of_map, of_path = (metrics.statistics(np.linalg.norm(gap, axis=1)) for gap in (points, path))
     return {
         "map RMSE [m]": of_map.rmse,

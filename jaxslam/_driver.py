@@ -2,7 +2,6 @@
 
 import warnings
 from collections.abc import Callable
-from functools import partial
 
 import jax
 import jax.numpy as jnp
@@ -11,23 +10,23 @@ from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
 from jaxslam._origin import FAR, far_origin, holds_far_numbers, moved, returned, shifted
+from jaxslam._public import publish
 from jaxslam._rounding import doubt_on_run
 from jaxslam.association._rules import Known
 from jaxslam.core._numbers import check_covariance, check_key, is_concrete, largest, shape_text
 from jaxslam.core._validation import (
-    call_traced,
     check_log,
     check_record,
     checked_estimate,
+    reworded_tracer_errors,
     same_state,
     state_and_info,
 )
 from jaxslam.core.protocols import Filter, Wrapper
 from jaxslam.core.types import Log, Scan, Status, Trace
-from jaxslam.math._xla import hot_jit, moves_numbers
+from jaxslam.math._xla import hot_jit
 
 
-@moves_numbers
 def run(
     filter: Filter,
     log: Log,
@@ -74,27 +73,32 @@ def run(
     """
     check_record("run", "filter", filter, Filter)
     check_record("run", "log", log, Log)
-    check_run("run", filter, log, pose, pose_cov)
-    _notice_negative_ranges(filter, log.scan)
-    check_key("run", key)
-    # A new array is a tracer where a trace is active, also where all arguments are constants.
-    if not is_concrete(filter, log, pose, pose_cov, key, jnp.zeros(())):
-        return _drive(filter, log, pose, pose_cov, key, probe)
-    origin = None
-    if probe is None and jnp.result_type(log.control, log.scan.z) == jnp.float32:
-        origin = far_origin(pose, least=FAR)
-    near = filter if origin is None else moved(filter, origin)
-    if origin is None or near is None or holds_far_numbers(log.control, origin):
-        near, origin, start = filter, None, pose
-    else:
-        start = shifted(pose, -origin)
-    trace = _drive(near, log, start, pose_cov, key, probe)
-    arguments = near, log, start, pose_cov, key
-    if doubt := doubt_on_run(lambda *those: _drive(*those, None), arguments, trace):
-        warnings.warn(f"run: {filter.name}: {doubt}", stacklevel=2)
-    if origin is None:
-        return trace
-    return trace._replace(estimate=returned(jax.device_get(trace.estimate), origin))
+    # A user's transfer guard is there for loops of the user's; arguments may be on the host.
+    with jax.transfer_guard("allow"), reworded_tracer_errors(f"run: {filter.name}"):
+        check_run("run", filter, log, pose, pose_cov)
+        _notice_negative_ranges(filter, log.scan)
+        check_key("run", key)
+        # A new array is a tracer where a trace is active, also where all arguments are constants.
+        if not is_concrete(filter, log, pose, pose_cov, key, jnp.zeros(())):
+            traced: Trace = _drive_in_trace(filter, log, pose, pose_cov, key, probe)
+            return traced
+        origin = None
+        if probe is None and jnp.result_type(log.control, log.scan.z) == jnp.float32:
+            origin = far_origin(pose, least=FAR)
+        near = filter if origin is None else moved(filter, origin)
+        if origin is None or near is None or holds_far_numbers(log.control, origin):
+            near, origin, start = filter, None, pose
+        else:
+            start = shifted(pose, -origin)
+        trace = _drive_alone(near, log, start, pose_cov, key, probe)
+        arguments = near, log, start, pose_cov, key
+        if doubt := doubt_on_run(
+            lambda *arguments: _drive_alone(*arguments, None), arguments, trace
+        ):
+            warnings.warn(f"run: {filter.name}: {doubt}", stacklevel=2)
+        if origin is None:
+            return trace
+        return trace._replace(estimate=returned(jax.device_get(trace.estimate), origin))
 
 
 def check_run(name: str, filter: Filter, log: Log, pose: ArrayLike, pose_cov: ArrayLike) -> None:
@@ -147,7 +151,6 @@ def _notice_negative_ranges(filter: Filter, scan: Scan) -> None:
         )
 
 
-@partial(hot_jit, static_argnames=("probe",))
 def _drive(
     filter: Filter,
     log: Log,
@@ -164,27 +167,31 @@ def _drive(
     tag = log.scan.tag.astype(jnp.int32)  # of any integers, unsigned ones too
     log = Log(log.control.astype(dtype), Scan(log.scan.z.astype(dtype), tag, log.scan.valid))
     name, most = f"run: {filter.name}", largest(log.control)
-    at = jnp.asarray(pose, dtype), jnp.asarray(pose_cov, dtype)
-    start = call_traced(f"{name}: init", filter.init, *at)
+    start = filter.init(jnp.asarray(pose, dtype), jnp.asarray(pose_cov, dtype))
     keys = jax.random.split(key, (log.control.shape[0], 2))
 
     def step(state: PyTree, row: tuple[Log, jax.Array]) -> tuple[PyTree, PyTree]:
         (control, scan), (key_predict, key_update) = row
-        predict = f"{name}: predict"
-        moved = call_traced(predict, filter.predict, state, control, key_predict)
-        state = same_state(predict, state, moved)
+        predicted = filter.predict(state, control, key_predict)
+        state = same_state(f"{name}: predict", state, predicted)
         # Under jit values are not checked before, and a NaN would spread through the whole state.
         lost = scan.valid & ~(jnp.abs(scan.z) <= most).all(axis=1)
         scan = scan._replace(valid=scan.valid & ~lost)
-        found = call_traced(f"{name}: update", filter.update, state, scan, key_update)
-        state, info = state_and_info(name, state, scan, found)
+        state, info = state_and_info(name, state, scan, filter.update(state, scan, key_update))
         status = jnp.where(lost, jnp.int32(Status.REJECTED), info.status)
         info = info._replace(status=status.astype(info.status.dtype))
-        moments = call_traced(f"{name}: estimate", filter.estimate, state)
-        estimate = checked_estimate(name, moments, dtype)
+        estimate = checked_estimate(name, filter.estimate(state), dtype)
         return state, (estimate, info, None if probe is None else probe(state))
 
     # XLA cannot merge the body of a scan with its recomputation, so no barrier is needed.
     body = jax.checkpoint(step, prevent_cse=False)
     final, (estimate, info, probed) = jax.lax.scan(body, start, (log, keys))
     return Trace(estimate, info, final, probed)
+
+
+_drive_alone = hot_jit(_drive, static_argnames=("probe",))
+# Without the wrapper of `hot_jit`, which would be a frame of every traceback in a user's model. It
+# is jitted, since `jax.grad` and `jax.vmap` outside of a jit would else run it step by step.
+_drive_in_trace = jax.jit(_drive, static_argnames=("probe",), inline=True)
+
+publish("jaxslam", run)

@@ -7,9 +7,8 @@ import pytest
 from cases import swept
 
 import jaxslam
-from jaxslam import _catalog as catalog
-from jaxslam import motion, sensors
-from jaxslam.consistency.campaign._candidates import estimator_of
+from jaxslam import catalog, motion, sensors
+from jaxslam.consistency.campaign._block_programs import drive_run
 from jaxslam.core.protocols import Sensor
 from jaxslam.simulation.scenarios import SCENARIOS
 from jaxslam.verify import build
@@ -38,8 +37,7 @@ def test_no_filter_promotes_dtypes(strict, name, dtype):
         truth, log = jax.eval_shape(lambda key: jaxslam.simulate(world, key), KEY)
 
         def estimated(truth, log):
-            method, _ = estimator_of(catalog.ALL[name](world), truth, world)
-            return method(log, KEY)
+            return drive_run(world, catalog.ALL[name](world), KEY, 0, truth, log)
 
         traced((estimated, truth, log))
         assert truth.pose.dtype == dtype

@@ -5,8 +5,8 @@ import re
 import numpy as np
 import pytest
 
-from jaxslam import _selftest as selftest
-from jaxslam._selftest import Check
+from jaxslam import selftest
+from jaxslam.selftest import Check
 
 
 @pytest.mark.sweep
@@ -34,9 +34,9 @@ def test_a_failed_check_is_told(found, capsys, monkeypatch):
 
 def test_a_filter_that_is_off_is_found(monkeypatch):
     """Half the noise of the sensor in the Kalman filter is no rounding."""
-    monkeypatch.setitem(selftest.SIGMA, "sensor", 0.1)
-    worlds = selftest.linear_world()
-    monkeypatch.setitem(selftest.SIGMA, "sensor", 0.2)
-    monkeypatch.setattr(selftest, "linear_world", lambda: worlds)
+    monkeypatch.setitem(selftest._SIGMA, "sensor", 0.1)
+    worlds = selftest._linear_world()
+    monkeypatch.setitem(selftest._SIGMA, "sensor", 0.2)
+    monkeypatch.setattr(selftest, "_linear_world", lambda: worlds)
     first = next(selftest.checks())
     assert not first.passed

@@ -11,7 +11,7 @@ from benchmarks.gate import Metric, child
 from benchmarks.grid_localization import counts_of, read
 from benchmarks.speed.timing import together
 from jaxslam import grids
-from jaxslam.simulation._walls import exact_ranges
+from jaxslam.simulation._wall_geometry import exact_ranges
 from jaxslam.simulation.scenarios import ROOMS
 from jaxslam.simulation.walls import rasterize
 

@@ -122,7 +122,9 @@ def by_file(name: str, log: datasets.LaserLog, solved: laser_slam.Solved) -> lis
 def by_relations(name: str, log: datasets.LaserLog, solved: laser_slam.Solved) -> list[Metric]:
     """Errors of relations that were checked by hand, as their benchmark has them."""
     read = datasets.relation_file(DATA / "relations" / str(LOGS[name].relations))
-    of, lost = metrics.given(log.time, read.first, read.second, read.pose, tolerance=TOLERANCE)
+    of, lost = metrics.relations_at_stamps(
+        log.time, read.first, read.second, read.pose, tolerance=TOLERANCE
+    )
     far = np.abs(log.time[of.first] - log.time[of.second]) > LONG
     inside = laser_slam.relation_nees(solved, *of) <= chi2_quantile(0.95, 3)
     print(f"{len(of.pose)} relations of {len(of.pose) + lost} join, {far.sum()} over {LONG:g} s")

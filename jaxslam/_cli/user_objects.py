@@ -11,8 +11,8 @@ from collections.abc import Callable, Iterator
 from pathlib import Path
 from types import ModuleType
 
-from jaxslam._catalog import ALL
 from jaxslam._cli.common import pick
+from jaxslam.catalog import ALL
 from jaxslam.consistency.campaign._candidates import check_fits, check_noise
 from jaxslam.core.protocols import Candidate, Filter
 from jaxslam.simulation._worlds import World

@@ -13,7 +13,6 @@ from jaxslam._driver import run
 from jaxslam.consistency._run_scores import snapshot_steps
 from jaxslam.core.protocols import Sensor
 from jaxslam.core.types import Estimate, Log, Truth
-from jaxslam.filters._ekf.ekf_settings import EkfOptions
 from jaxslam.filters._ekf.ekf_slam import EkfSlam
 from jaxslam.linearize import _first_order as first_order
 from jaxslam.linearize._first_order import with_lever_arm
@@ -40,13 +39,9 @@ def conditional_bound(scenario: World, truth: Truth, log: Log, key: Array) -> Es
     ideal EKF without gate and without a quota of new landmarks. The noise of a measurement is what
     the sensor states for its prediction.
     """
-    options: EkfOptions = scenario.filter_options | {
-        "gate": None,
-        "births": None,
-        "linearize": AtTruth(truth),
-    }
+    options = {**scenario.filter_options, "gate": None, "births": None}
     capacity = truth.landmarks.shape[0]
-    ideal = EkfSlam(scenario.motion, scenario.sensor, capacity, **options)
+    ideal = EkfSlam(scenario.motion, scenario.sensor, capacity, **options, linearize=AtTruth(truth))
     return run(ideal, log, scenario.pose, scenario.pose_cov, key).estimate
 
 
@@ -69,18 +64,18 @@ def posterior_bound(
     ASSP 35(3), 1987; van Trees, "Detection, Estimation, and Modulation Theory I", 1968, 2.4.3).
     Jacobians by the noise are taken at ω = 0, and Q and R are what the models state at the truth
     and for the exact measurement; what could be learnt of the state from their dependence on it, or
-    from which landmarks are in view, is not counted. The time is that of the eigenvalues of K
-    matrices of size 3 + W T + L N.
+    from which landmarks are in view, is not counted. Most of the time goes into the eigenvalues of
+    K matrices of size 3 + W T + L N.
 
     Args:
         truth, log: of `simulate`, with a leading axis over runs; identities known.
-        steps: counted from 0, default those of the snapshots.
+        steps: counted from 0; default the steps of the snapshots.
     Raises:
         ValueError: on a world of spurious data or of several robots, arrays without runs, or a
             measurement noise that is singular.
     """
-    one = isinstance(scenario, Scenario | RecordedWorld)
-    if not one or scenario.spurious is not None:
+    is_single = isinstance(scenario, Scenario | RecordedWorld)
+    if not is_single or scenario.spurious is not None:
         raise ValueError(
             "posterior_bound: expected a scenario of one robot without spurious measurements"
         )
@@ -131,18 +126,18 @@ class SensorJacobians(NamedTuple):
     by_landmark: Float[Array, "T M Z L"]
     noise_cov: Float[Array, "T M Z Z"]
     tag: Int[Array, "T M"]
-    """which landmark"""
+    """row of the landmark"""
     valid: Bool[Array, "T M"]
-    """whether anything was measured there"""
+    """mask of the measurements"""
 
 
 class RunJacobians(NamedTuple):
     """The Jacobians of the models along the true path of one run."""
 
     by_pose: Float[Array, "T 3 3"]
-    """of the motion"""
+    """∂f/∂x of the motion"""
     by_noise: Float[Array, "T 3 W"]
-    """of the motion, times √Q"""
+    """∂f/∂w √Q of the motion"""
     sensors: list[SensorJacobians]
     landmarks: Float[Array, "N L"]
 
@@ -157,13 +152,13 @@ def jacobians_at_truth(scenario: World, truth: Truth, log: Log) -> RunJacobians:
     old = jnp.concatenate([truth.start[None], path[:-1]])
     still = jnp.zeros(len(motion.noises), dtype)
 
-    def moved(old: Array, new: Array, u: Array) -> tuple[Array, Array]:
+    def motion_jacobians(old: Array, new: Array, u: Array) -> tuple[Array, Array]:
         by_pose, by_noise = first_order.motion_jacobians(motion, old, u)
         ahead = motion.step(old, u, still)
         root = root_psd(motion.noise_cov(old, u))
         return with_lever_arm(by_pose, new[:2] - ahead[:2]), by_noise @ root
 
-    by_pose, by_noise = jax.vmap(moved)(old, path, log.control)
+    by_pose, by_noise = jax.vmap(motion_jacobians)(old, path, log.control)
     sensor = scenario.sensor
     parts = (
         [(p.sensor, p.places) for p in sensor.parts]
@@ -174,16 +169,17 @@ def jacobians_at_truth(scenario: World, truth: Truth, log: Log) -> RunJacobians:
     first = 0
     for model, places in parts:
 
-        def seen(pose: Array, tag: Array, model: Sensor = model) -> tuple[Array, Array, Array]:
+        def observe_jacobians(
+            pose: Array, tag: Array, model: Sensor = model
+        ) -> tuple[Array, Array, Array]:
             landmark = landmarks[tag][: len(model.landmark)]
             noise = model.noise_cov(model.observe(pose, landmark))
             return *first_order.observe_jacobians(model, pose, landmark), noise
 
         tag, valid = (leaf[:, first : first + places] for leaf in log.scan[1:])
         tag = jnp.maximum(tag, 0)
-        found = jax.vmap(jax.vmap(seen, (None, 0)))(path, tag)
-        by_pose_there, by_landmark, noise_cov = found
-        sensors.append(SensorJacobians(by_pose_there, by_landmark, noise_cov, tag, valid))
+        jacobians = jax.vmap(jax.vmap(observe_jacobians, (None, 0)))(path, tag)
+        sensors.append(SensorJacobians(*jacobians, tag, valid))
         first += places
     return RunJacobians(by_pose, by_noise, sensors, landmarks)
 
@@ -198,10 +194,12 @@ def final_covariance(
     reach. A billionth of the reach is added to the noise of measurements, which may be none.
     """
     count, size = jacobians.landmarks.shape
+    # Deviations relative to the map's reach: large enough for "unknown" (100), and small enough
+    # that a measurement without noise has an innovation covariance with an inverse (1e-9).
     reach = 1.0 + float(np.max(np.abs(jacobians.landmarks), initial=0.0))
     cov = np.zeros((3 + count * size,) * 2)
     cov[:3, :3] = pose_cov
-    known = np.zeros(count, bool)
+    in_map = np.zeros(count, bool)
     for t in range(len(jacobians.by_pose)):
         cov[:3] = jacobians.by_pose[t] @ cov[:3]
         cov[:, :3] = cov[:, :3] @ jacobians.by_pose[t].T
@@ -212,16 +210,18 @@ def final_covariance(
                 noise = seen.noise_cov[t, i] + (1e-9 * reach) ** 2 * np.eye(len(by_pose))
                 begin = 3 + int(seen.tag[t, i]) * size
                 block = slice(begin, begin + by_landmark.shape[1])
-                if by_landmark.shape[1] and not known[seen.tag[t, i]]:
-                    known[seen.tag[t, i]] = True
+                if by_landmark.shape[1] and not in_map[seen.tag[t, i]]:
+                    in_map[seen.tag[t, i]] = True
+                    # With a larger condition number the landmark is not determined: 6 of 16 digits
+                    # of its position would be lost, and 12 of its covariance.
                     if by_landmark.shape == (size, size) and np.linalg.cond(by_landmark) < 1e6:
                         by = np.linalg.inv(by_landmark)
                         cov[block] = -by @ by_pose @ cov[:3]
                         cov[:, block] = cov[block].T
                         cov[block, block] = by @ (by_pose @ cov[:3, :3] @ by_pose.T + noise) @ by.T
                         continue
-                    whole = slice(begin, begin + size)
-                    cov[whole, whole] = (100 * reach) ** 2 * np.eye(size)
+                    parameters = slice(begin, begin + size)
+                    cov[parameters, parameters] = (100 * reach) ** 2 * np.eye(size)
                 cross = by_pose @ cov[:3] + by_landmark @ cov[block]
                 innovation = cross[:, :3] @ by_pose.T + cross[:, block] @ by_landmark.T + noise
                 cov -= cross.T @ np.linalg.solve(innovation, cross)

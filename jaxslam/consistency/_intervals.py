@@ -8,14 +8,15 @@ import numpy as np
 from jaxslam.math.stats import t_quantile
 
 LEVEL = 0.95
-"""of every band, and of the two tests of a verdict together"""
+"""Level of every band, and of the two tests of a verdict together."""
 
 EACH = LEVEL**0.5
-"""of each of the two tests, and of every interval over the runs: 97.5 %. So the verdict can be read
-off the intervals."""
+"""Level of each of the two tests, and of every interval over the runs: 97.5 %. So the intervals
+show the verdict."""
 
 _SKEW = 1.5
-"""The factor by which the skewness of a run's average NEES reduces degrees of freedom."""
+"""The factor by which the skewness of a run's average NEES reduces degrees of freedom; chosen by
+simulation, see `Spread`."""
 
 
 def percentage(share: float, digits: int = 0) -> str:
@@ -31,7 +32,7 @@ class Average(NamedTuple):
     high: float
 
 
-def lopsided(average: Average) -> bool:
+def is_lopsided(average: Average) -> bool:
     """Whether one side of the interval is over a quarter longer than the other, so that ± would
     mislead."""
     sides = sorted((average.value - average.low, average.high - average.value))
@@ -41,7 +42,7 @@ def lopsided(average: Average) -> bool:
 class Spread(NamedTuple):
     """The mean m of n positive numbers, and how far from the expectation μ it may lie.
 
-    The statistic is that of Student's t test with the standard error under the hypothesis: when a
+    The statistic is Student's t with the standard error under the hypothesis: when a
     covariance is claimed c times too small, the NEES of every run, their mean and their deviation s
     all grow by c, so the deviation that belongs to μ is s μ/m. With u = s/(m √n),
 
@@ -49,9 +50,9 @@ class Spread(NamedTuple):
 
     hence μ between m/(1 + q u - u²/2) and m/(1 - q u - u²/2): never negative, longer above than
     below, as the average of a skewed quantity is. u²/2 centres the statistic where the skewness is
-    three times s/m, which that of a run's average NEES is about (the χ² of the common factor of its
-    steps has 2, a sum of a constant and such a χ² more). f = `_SKEW` accounts for the spread of s
-    for skewed numbers, and 1 is for numbers whose spread is small. Calibrated by simulation:
+    three times s/m: about so skewed is a run's average NEES (the χ² of the common factor of its
+    steps has 2 s/m, a sum of a constant and such a χ² more). f = `_SKEW` accounts for the spread of
+    s for skewed numbers, and 1 is for numbers whose spread is small. Calibrated by simulation:
     `python -m benchmarks --record --only verdict`.
     """
 
@@ -107,12 +108,12 @@ def positive_interval(
 
     Of a single number the interval is all that is positive, (0, ∞).
     """
-    found = spread(values, level, skewed)
-    if found is None:
+    average = spread(values, level, skewed)
+    if average is None:
         return None
-    if not np.isfinite(found.error):
-        return Average(found.mean, 0.0, np.inf)
-    return Average(found.mean, found.low, found.high)
+    if not np.isfinite(average.error):
+        return Average(average.mean, 0.0, np.inf)
+    return Average(average.mean, average.low, average.high)
 
 
 def interval(values: np.ndarray | Sequence[float], level: float = EACH) -> Average | None:

@@ -21,16 +21,18 @@ from jaxslam.laser.grids._grid_localization import beam_log
 from jaxslam.math._linalg import root_psd
 from jaxslam.math.angles import wrap
 from jaxslam.resampling._weights import at_points, weights_of
-from jaxslam.simulation._laser import LaserWorld, check_world, scan_world
+from jaxslam.simulation.laser import LaserWorld, scan_world
 
 _DRAWS = 199
-"""Draws from the particles that represent them in a step; with the truth they are 200."""
+"""Draws from the particles in a step: with the truth 200 poses, so that levels are multiples of
+0.5 %."""
 
 NEAR = 0.5, np.deg2rad(30.0)
 """Distance [m] and turn [rad] from the mean within which 95 % of the weight must lie for a NEES."""
 
 _KERNEL = 0.5
-"""Width of the kernel of `covering_level` in standard deviations."""
+"""Width of the kernel of `covering_level` in standard deviations; for any width an honest filter's
+level is uniform."""
 
 
 class LocalizationScores(NamedTuple):
@@ -41,7 +43,7 @@ class LocalizationScores(NamedTuple):
     """the estimate"""
     pose_cov: Float[JaxOrNumPy, "R T 3 3"]
     level: Float[JaxOrNumPy, "R T"]
-    """of the smallest set of the particles that covers the truth, see `covering_level`"""
+    """level of the smallest set of the particles that covers the truth, see `covering_level`"""
     energy: Float[JaxOrNumPy, "R T"]
     """energy score of the position [m], see `energy_score`"""
     together: Bool[JaxOrNumPy, "R T"]
@@ -61,17 +63,17 @@ class LocalizationSummary(NamedTuple):
     nees: Average | None
     """mean pose NEES where the particles are one group; 3 is honest; None where they never are"""
     unimodal: float
-    """share of the steps in which they are"""
+    """share of the steps in which the particles are one group"""
     energy: Average | None
     """mean energy score of the position [m]: less is better"""
     rmse: Average | None
-    """of the position [m], of runs that are not lost"""
+    """position RMSE [m] of the runs that are not lost"""
     heading: float
-    """median of the size of the heading error [rad], of runs that are not lost"""
-    found: Float[np.ndarray, "R"]
-    """the step from which the error stays below the limit, inf for a run that is lost"""
+    """median size of the heading error [rad] of the runs that are not lost"""
+    converged_at: Float[np.ndarray, "R"]
+    """the step from which the error stays below the limit; inf for a run that is lost"""
     lost: float
-    """share of runs"""
+    """share of the runs that are lost"""
 
 
 def judge_localization(
@@ -82,7 +84,7 @@ def judge_localization(
     *,
     start_cov: ArrayLike = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
     same_log: bool = False,
-    every: int = 1,
+    stride: int = 1,
 ) -> LocalizationScores:
     """The scores of a filter over many draws of a laser world; the same key gives the same draws.
 
@@ -93,17 +95,19 @@ def judge_localization(
         filter: of `grids.GridLocalization`.
         start_cov: (3, 3), which may be zero.
         same_log: one history for all runs, which differ only in the draws of the filter.
-        every: scores are computed at each n-th step, from the n-th on.
+        stride: scores are computed at each n-th step, from the n-th on.
     Raises:
         ValueError: a world, a filter, a key, a covariance or a number that is none.
     """
-    check_world("judge_localization", world)
+    if not isinstance(world, LaserWorld):
+        got = type(world).__name__
+        raise ValueError(f"judge_localization: expected a LaserWorld, got {got}")
     if not isinstance(filter, Filter):
         raise ValueError(f"judge_localization: expected a Filter, got {type(filter).__name__}")
     check_count("judge_localization: runs", runs)
-    check_count("judge_localization: every", every)
-    if every > (steps := len(np.asarray(world.controls))):
-        raise ValueError(f"judge_localization: expected every <= {steps} steps, got {every}")
+    check_count("judge_localization: stride", stride)
+    if stride > (steps := len(np.asarray(world.controls))):
+        raise ValueError(f"judge_localization: expected stride <= {steps} steps, got {stride}")
     check_key("judge_localization", key)
     check_covariance("judge_localization: start_cov", start_cov, 3)
     key_log, key_start, key_filter = jax.random.split(key, 3)
@@ -113,19 +117,19 @@ def judge_localization(
         jax.random.split(key_start, runs),
         jax.random.split(key_filter, runs),
     )
-    scores: LocalizationScores = _judge(world, filter, every, keys, np.asarray(start_cov, float))
+    scores: LocalizationScores = _judge(world, filter, stride, keys, np.asarray(start_cov, float))
     return scores
 
 
-@partial(jax.jit, static_argnames="every", inline=True)
+@partial(jax.jit, static_argnames="stride", inline=True)
 def _judge(
     world: LaserWorld,
     filter: Filter,
-    every: int,
+    stride: int,
     keys: tuple[Array, Array, Array],
     start_cov: Array,
 ) -> LocalizationScores:
-    def one(keys: tuple[Array, Array, Array]) -> LocalizationScores:
+    def score_run(keys: tuple[Array, Array, Array]) -> LocalizationScores:
         history = scan_world(world, keys[0])
         dtype = history.pose.dtype
         root = root_psd(start_cov.astype(dtype))
@@ -133,11 +137,11 @@ def _judge(
         start = jnp.asarray(world.pose, dtype) + offset
         log = beam_log(history.control, history.beams)
         return score_localization(
-            filter, log, history.pose, start, start_cov.astype(dtype), keys[2], every=every
+            filter, log, history.pose, start, start_cov.astype(dtype), keys[2], stride=stride
         )
 
-    found: LocalizationScores = jax.lax.map(one, keys)
-    return found
+    scores: LocalizationScores = jax.lax.map(score_run, keys)
+    return scores
 
 
 def score_localization(
@@ -148,14 +152,14 @@ def score_localization(
     pose_cov: ArrayLike,
     key: Array,
     *,
-    every: int = 1,
+    stride: int = 1,
 ) -> LocalizationScores:
     """The scores of one run, without the leading R; traceable: `jax.lax.map` it over keys.
 
     Args:
         filter: whose state is a `PoseParticles`, as of `grids.GridLocalization`.
         log, pose, pose_cov: as `run` takes them. truth: true poses.
-        every: score each n-th step, from the n-th on.
+        stride: score each n-th step, from the n-th on.
     """
     key_run, key_draw = jax.random.split(key)
 
@@ -166,12 +170,12 @@ def score_localization(
     particles = trace.info.extra["particles"]  # type: ignore[index]
     scored = (truth, trace.estimate.pose, trace.estimate.pose_cov, trace.probe)
     scored, ess, active = jax.tree.map(
-        lambda leaf: leaf[every - 1 :: every], (scored, particles.ess, particles.active)
+        lambda leaf: leaf[stride - 1 :: stride], (scored, particles.ess, particles.active)
     )
     true, mean, cov, (poses, log_weights) = scored
     keys = jax.random.split(key_draw, len(true))
 
-    def each(row: tuple[Array, ...]) -> tuple[Array, Array, Array]:
+    def score_step(row: tuple[Array, ...]) -> tuple[Array, Array, Array]:
         true, mean, poses, log_weights, key = row
         weights = weights_of(log_weights)
         draws = poses[at_points(weights, jax.random.uniform(key, (_DRAWS,), weights.dtype))]
@@ -180,7 +184,7 @@ def score_localization(
         together = (weights * near).sum() >= 0.95
         return covering_level(draws, true), energy_score(draws[:, :2], true[:2]), together
 
-    level, energy, together = jax.lax.map(each, (true, mean, poses, log_weights, keys))
+    level, energy, together = jax.lax.map(score_step, (true, mean, poses, log_weights, keys))
     return LocalizationScores(true, mean, cov, level, energy, together, ess, active)
 
 
@@ -201,9 +205,9 @@ def covering_level(draws: Float[Array, "S 3"], truth: Float[Array, "3"]) -> Floa
     variance = (d * d).sum(axis=(0, 1)) / (2 * count * (count - 1))
     scale = jnp.where(variance > 0, variance, 1.0)[None, None]
     scaled = (d * d / scale).sum(axis=-1)
-    other = scaled > 0
-    kernels = jnp.where(other, jnp.exp(-0.5 * scaled / _KERNEL**2), 0.0).sum(axis=1)
-    density = kernels / jnp.maximum(other.sum(axis=1), 1)
+    distinct = scaled > 0
+    kernels = jnp.where(distinct, jnp.exp(-0.5 * scaled / _KERNEL**2), 0.0).sum(axis=1)
+    density = kernels / jnp.maximum(distinct.sum(axis=1), 1)
     # Rounding of sums of so many terms must not break a tie, as in a sample of one point.
     rounding = count * float(jnp.finfo(density.dtype).eps)
     return (density >= density[0] * (1 - rounding)).sum() / count
@@ -228,8 +232,8 @@ def summarize_localization(
 ) -> LocalizationSummary:
     """The averages of scores over the runs.
 
-    A run is found from the step on from which the errors stay below a limit to the end, and lost
-    where that is no step.
+    A run has converged at the step from which the errors stay below a limit to the end; without
+    such a step it is lost.
 
     Args:
         skip: steps at the beginning that no average counts.
@@ -245,23 +249,25 @@ def summarize_localization(
     off = np.hypot(error[..., 0], error[..., 1])
     wrong = (off >= limit[0]) | (np.abs(error[..., 2]) >= limit[1])
     last = np.where(wrong.any(axis=1), steps - np.argmax(wrong[:, ::-1], axis=1), 0)
-    found = np.where(last < steps, last, np.inf)
-    kept = np.isfinite(found)
-    at = slice(skip, None)
+    converged_at = np.where(last < steps, last, np.inf)
+    kept = np.isfinite(converged_at)
+    counted_steps = slice(skip, None)
     nees = block_nees(scores.pose, error, error, scores.pose_cov)["pose"]  # type: ignore[arg-type]
-    counted = (nees.regular & scores.together)[:, at]
-    per_run = np.where(counted, nees.value[:, at], 0.0).sum(axis=1) / np.maximum(
+    counted = (nees.regular & scores.together)[:, counted_steps]
+    per_run = np.where(counted, nees.value[:, counted_steps], 0.0).sum(axis=1) / np.maximum(
         counted.sum(axis=1), 1
     )
-    rmse = np.sqrt((off[kept, at] ** 2).mean(axis=1))
+    rmse = np.sqrt((off[kept, counted_steps] ** 2).mean(axis=1))
     return LocalizationSummary(
-        coverage=interval((np.asarray(scores.level)[:, at] <= 0.95 + 1e-9).mean(axis=1), LEVEL),
+        coverage=interval(
+            (np.asarray(scores.level)[:, counted_steps] <= 0.95 + 1e-9).mean(axis=1), LEVEL
+        ),
         nees=positive_interval(np.where(counted.any(axis=1), per_run, np.nan), LEVEL),
-        unimodal=float(scores.together[:, at].mean()),
-        energy=positive_interval(np.asarray(scores.energy[:, at]).mean(axis=1), LEVEL),
+        unimodal=float(scores.together[:, counted_steps].mean()),
+        energy=positive_interval(np.asarray(scores.energy[:, counted_steps]).mean(axis=1), LEVEL),
         rmse=positive_interval(rmse, LEVEL),
-        heading=float(np.median(np.abs(error[kept, at, 2]))) if kept.any() else np.nan,
-        found=found,
+        heading=float(np.median(np.abs(error[kept, counted_steps, 2]))) if kept.any() else np.nan,
+        converged_at=converged_at,
         lost=float(1 - kept.mean()),
     )
 

@@ -21,11 +21,11 @@ from jaxtyping import Array, Bool, Float, Int, PyTree
 
 from jaxslam.consistency._measures import REGISTRY
 from jaxslam.consistency._measures.associations import association_scores, identities
-from jaxslam.consistency._measures.counts import counted
+from jaxslam.consistency._measures.counts import counts_of
 from jaxslam.consistency._measures.measure import Measure, Nees, Runs, RunStatistics
 from jaxslam.consistency._measures.nees import block_nees, pose_error
 from jaxslam.core.protocols import Sensor
-from jaxslam.core.types import Estimate, Info, JaxOrNumPy, Status, Trace, Truth
+from jaxslam.core.types import Estimate, Info, Status, Trace, Truth
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._pose_covariances import covariance_faults
 
@@ -40,14 +40,14 @@ _SNAPSHOTS = 25
 
 
 class Score(NamedTuple):
-    """The scores of a filter in R runs; those of a run that is not finite mean nothing."""
+    """The scores of a filter in R runs; the scores of a run that is not finite mean nothing."""
 
     finite: Bool[np.ndarray, "R"]
-    """every number of the run is finite."""
+    """True if all numbers of the run are finite"""
     measures: dict[str, tuple[np.ndarray, np.ndarray]]
-    """averages of each run: the numbers, and their counts; none over 0."""
+    """averages of each run, and their weights; no average where the weight is 0"""
     snapshots: tuple[np.ndarray, np.ndarray, np.ndarray]
-    """pose error (R, K, 3), its covariance (R, K, 3, 3), whether that is regular (R, K)."""
+    """pose error (R, K, 3), its covariance (R, K, 3, 3), mask of the regular ones (R, K)"""
     sums: dict[str, np.ndarray]
     """sums over runs: counts (R,), and (R, …) of measures."""
 
@@ -60,8 +60,8 @@ def snapshot_steps(steps: int) -> np.ndarray:
 def score(
     trace: Trace,
     truth: Truth,
-    found: RunStatistics,
-    own_error: Float[np.ndarray, "R T 3"] | None = None,
+    statistics: RunStatistics,
+    chart_error: Float[np.ndarray, "R T 3"] | None = None,
     measured: Int[np.ndarray, "R"] | None = None,
 ) -> Score:
     """The scores of R runs, by NumPy in float64; every array is the host's and has leading R.
@@ -70,40 +70,45 @@ def score(
         trace: of the estimate only poses and their covariances are looked at, of the final state
             its observability monitor (`monitor_of`), and where it has one, of `probe` the
             information of that after each step (R, T, 3, 3).
-        found: `run_statistics` of each run.
-        own_error: the pose errors in the coordinates of the filter (see `own_error_of`), by default
-            those in (x, y, θ).
-        measured: the measurements in the log of each run, by default those that the infos have.
+        statistics: `run_statistics` of each run.
+        chart_error: the pose errors in the coordinates of the filter (`chart_error_of`), by default
+            the errors in (x, y, θ).
+        measured: (R,) number of measurements in the log, by default counted in the infos.
     """
     pose, cov = map(np.asarray, trace.estimate[:2])
     error = pose_error(np.asarray(truth.pose), pose)
     steps = error.shape[1]
-    nees = block_nees(pose, error, error if own_error is None else own_error, cov)
-    landmarks = found.landmark_nees, found.regular_landmarks
+    nees = block_nees(pose, error, error if chart_error is None else chart_error, cov)
+    landmarks = statistics.landmark_nees, statistics.regular_landmarks
     nees["landmarks"] = Nees(*(np.asarray(x, np.float64) for x in landmarks))
-    became, faults = counted(trace.info), covariance_faults(pose, cov)
+    faults = covariance_faults(pose, cov)
+    is_still = [
+        (rows == rows[:, :1]).reshape(len(rows), -1).all(axis=1)
+        for rows in map(np.asarray, (trace.estimate.pose, trace.estimate.pose_cov, truth.pose))
+    ]
     if measured is None:
         measured = (np.asarray(trace.info.status) != Status.EMPTY).sum(axis=(1, 2))
     sums: dict[str, np.ndarray] = {
         "steps": np.full(len(error), steps),
         "measured": np.asarray(measured),
-        **became,
+        **counts_of(trace.info),
         "missed": np.asarray(truth.missed).sum(axis=1),
         "singular_steps": steps - nees["pose"].regular.sum(axis=1),
         "asymmetric_steps": faults.asymmetric.sum(axis=1),
         "indefinite_steps": faults.indefinite.sum(axis=1),
-        "constant": _is_constant(trace, truth),
+        # Pose and covariance stay as they are, to the bit, while the robot moves.
+        "constant": is_still[0] & is_still[1] & ~is_still[2],
     }
-    runs = Runs(truth, trace, found, error, nees)
+    runs = Runs(truth, trace, statistics, error, nees)
     measures: dict[str, tuple[np.ndarray, np.ndarray]] = {}
-    finite = np.array(found.finite)
+    finite = np.array(statistics.finite)
     for measure in REGISTRY.values():
-        each = measure.of_runs(runs)
-        if each is None:
+        scores = measure.of_runs(runs)
+        if scores is None:
             continue
-        total, weight = np.asarray(each.total), np.broadcast_to(each.weight, finite.shape)
+        total, weight = np.asarray(scores.total), np.broadcast_to(scores.weight, finite.shape)
         measures[measure.column] = total, weight
-        sums |= each.sums
+        sums |= scores.sums
     for rows in jax.tree.leaves((measures, sums)):
         finite &= np.isfinite(rows).reshape(len(rows), -1).all(axis=1)
     at = snapshot_steps(steps)
@@ -115,25 +120,13 @@ def score(
     )
 
 
-def _is_constant(trace: Trace, truth: Truth) -> Bool[np.ndarray, "R"]:
-    """Whether pose and covariance of a run stay as they are, to the bit, while the robot moves."""
-
-    def still(values: JaxOrNumPy) -> np.ndarray:
-        rows = np.asarray(values)
-        out: np.ndarray = (rows == rows[:, :1]).reshape(len(rows), -1).all(axis=1)
-        return out
-
-    fixed = still(trace.estimate.pose) & still(trace.estimate.pose_cov)
-    return np.asarray(fixed & ~still(truth.pose))
-
-
 class _Sums(NamedTuple):
     poison: Array
     """() 0 times every earlier number: NaN once one was not finite"""
     recent: list[Array]
     """(LAGS, N) each, the latest steps first: the numbers of w, |w|² and a mask of the values"""
     pairs: list[Array]
-    """(LAGS, N) each: Σ wᵀw', |w|²|there'|, |there||w'|², |there||there'|"""
+    """(LAGS, N) each: Σ wᵀw', |w|² v', v |w'|², v v', with v the mask of the values"""
 
 
 def run_statistics(
@@ -151,6 +144,17 @@ def run_statistics(
         origin = jnp.asarray(truth.origin)
         held = identities(trace, origin)
         values |= association_scores(trace, origin, held)
+    for measure in measures:
+        if measure.of_run is None:
+            continue
+        value = jnp.asarray(measure.of_run(truth, trace), estimate.pose.dtype)
+        steps = len(estimate.pose)
+        if value.shape not in ((), (steps,)):
+            raise ValueError(
+                f"measure {measure.key}: expected of_run to return a number or one for each of the "
+                f"{steps} steps, got an array of shape {value.shape}"
+            )
+        values[measure.key] = value
     points = jax.vmap(sensor.position)(jnp.asarray(truth.landmarks))
     size, count = info.innovation.shape[2], estimate.alive.shape[1] or info.slot.shape[1]
     dtype = estimate.pose.dtype
@@ -200,21 +204,8 @@ def run_statistics(
         regular_landmarks=regular,
         landmark_squares=jnp.stack([square, named.sum().astype(dtype)]),
         autocorrelation=jnp.stack([product, length, pairs * size], axis=1),
-        values=values | {one.key: _value(one, trace, truth) for one in measures if one.of_run},
+        values=values,
     )
-
-
-def _value(measure: Measure, trace: Trace, truth: Truth) -> Array:
-    """What a measure is in one run, () or (T,)."""
-    assert measure.of_run is not None
-    dtype, steps = trace.estimate.pose.dtype, len(trace.estimate.pose)
-    value = jnp.asarray(measure.of_run(truth, trace), dtype)
-    if value.shape not in ((), (steps,)):
-        raise ValueError(
-            f"measure {measure.key}: expected of_run to return a number or one for each of the "
-            f"{steps} steps, got an array of shape {value.shape}"
-        )
-    return value
 
 
 def _numbers(tree: PyTree) -> Float[Array, "K"]:
@@ -235,7 +226,8 @@ def _planar_nees(
     p1, p12, p2 = cov[:, 0, 0], cov[:, 1, 0], cov[:, 1, 1]
     valid = (p1 > 0) & (p2 > 0) & jnp.isfinite(error).all(axis=1)
     p1, p2 = (jnp.where(valid, p, 1.0) for p in (p1, p2))
-    left = 1 - (p12 / p1) * (p12 / p2)
+    left = 1 - (p12 / p1) * (p12 / p2)  # 1 - ρ², without products that underflow
+    # 100 n·eps with n = 2, as in `block_nees`.
     regular = valid & (left > 200 * float(jnp.finfo(cov.dtype).eps))
     a = error[:, 0]
     b = error[:, 1] - a * (p12 / p1)
@@ -263,9 +255,10 @@ def _white(estimate: Estimate, info: Info) -> list[Array]:
 
     def place(kept: list[Array], at: tuple[list[Array], Array]) -> tuple[PyTree, None]:
         row, slot = at
-        mine = jnp.arange(count, dtype=slot.dtype) == slot
-        return [jnp.where(mine, new, old) for new, old in zip(row, kept, strict=True)], None
+        is_slot = jnp.arange(count, dtype=slot.dtype) == slot
+        return [jnp.where(is_slot, new, old) for new, old in zip(row, kept, strict=True)], None
 
     nothing = [jnp.zeros(count, white.dtype)] * len(rows)
+    # In reverse, so that the first measurement of a landmark is written last, and stays.
     unroll = max(min(len(slot), _UNROLLED), 1)
     return jax.lax.scan(place, nothing, (rows, slot), reverse=True, unroll=unroll)[0]

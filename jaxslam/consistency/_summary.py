@@ -50,12 +50,12 @@ class Summary:
     """(T,) averages over runs: nees_* with *_low and *_high bands (NaN where no run has one),
     rmse_position, rmse_heading_deg, nis_per_dof, rotation_information, and runs_* that count."""
     coverage: dict[str, np.ndarray]
-    """by block: share of runs' steps with the truth in the ellipsoid of each of `LEVELS`."""
+    """share, by block, of runs' steps with the truth in the ellipsoid of each of `LEVELS`"""
     autocorrelation: np.ndarray
     """(LAGS,) of whitened innovations at lags of 1, 2, … steps; NaN without pairs."""
     autocorrelation_band: np.ndarray
-    """(LAGS,) half-width of the 95 % band about 0 in which that of white innovations lies,
-    1.96/√(products of numbers in it) (Bar-Shalom 2001, 5.4.2)."""
+    """(LAGS,) half-width of the 95 % band about 0 for white innovations, 1.96/√(number of products)
+    (Bar-Shalom 2001, 5.4.2)."""
     counts: dict[str, int]
     """runs (finite), not_finite, inaccurate, divergent, steps, measured (measurements in the logs),
     used and dropped measurements by `Status`, missed, singular_steps, asymmetric_steps,
@@ -66,9 +66,9 @@ class Summary:
     not_finite_runs: list[int]
     """the numbers of the runs that are not finite; run i has key fold_in(key, i)."""
     by: tuple[str, ...] = ()
-    """the measures that spoke against the filter, nees_pose and nis_per_dof, if any did"""
+    """measures that reject the filter, of nees_pose and nis_per_dof"""
     noticed: Mapping[str, tuple[float, float]] = field(default_factory=dict)
-    """by measure, the averages (at most, at least) that such a campaign notices nine times in ten:
+    """averages (at most, at least), by measure, that such a campaign notices nine times in ten:
     what "consistent" says, which means not rejected"""
     doubts: tuple[str, ...] = ()
     """sentences that qualify the verdict, the gravest first (see `judge`), and last whether the
@@ -92,11 +92,11 @@ def summarize(tally: Tally, bound: Mapping[str, np.ndarray] | None = None) -> Su
     """
     sums, finite = tally.sums, tally.flags("finite")
     runs, per_run = int(finite.sum()), tally.measures()
-    every, snapshots = measures_of(per_run), tally.snapshots()
+    registered, snapshots = measures_of(per_run), tally.snapshots()
     of_snapshots = np.flatnonzero(finite & (tally.numbers() < SHOTS))
     measures: dict[str, Average] = {}
     curves: dict[str, np.ndarray] = {}
-    for measure in every:
+    for measure in registered:
         shot = measure.of_snapshots(*snapshots)
         if shot is not None:
             per_run[measure.column] = np.full(len(finite), np.nan)

@@ -32,10 +32,10 @@ class Sum(NamedTuple):
 
 def plus(a: Sum, b: Sum) -> Sum:
     """The sum a + b, to about 2⁻¹⁰⁴ of |a| + |b|."""
-    high, rest = _two_sum(a.high, b.high)
+    high, error = _two_sum(a.high, b.high)
     low, last = _two_sum(a.low, b.low)
-    high, rest = _renormalize(high, rest + low)
-    return Sum(*_renormalize(high, rest + last))
+    high, error = _renormalize(high, error + low)
+    return Sum(*_renormalize(high, error + last))
 
 
 def sum_rows(rows: np.ndarray) -> Sum:
@@ -47,8 +47,8 @@ def sum_rows(rows: np.ndarray) -> Sum:
     while len(parts.high) > 1:
         even = len(parts.high) // 2 * 2
         halves = plus(Sum(*(part[:even:2] for part in parts)), Sum(*(p[1:even:2] for p in parts)))
-        rest = (part[even:] for part in parts)
-        parts = Sum(*(np.concatenate(pair) for pair in zip(halves, rest, strict=True)))
+        odd = (part[even:] for part in parts)
+        parts = Sum(*(np.concatenate(pair) for pair in zip(halves, odd, strict=True)))
     return Sum(parts.high[0], parts.low[0])
 
 
@@ -69,23 +69,23 @@ def condense(scores: Score, first: int, limit: float) -> dict[str, np.ndarray]:
     claimed = np.trace(snapshots[1][:, -1, :2, :2], axis1=1, axis2=2, dtype=np.float64)
     inaccurate = finite & (last > limit)
     beyond = last > FAR * np.sqrt(np.maximum(claimed, 0.0))
-    out = {"finite": finite, "inaccurate": inaccurate, "divergent": inaccurate & beyond}
-    for name, (whole, weight) in scores.measures.items():
-        whole, weight = without_lost(whole), without_lost(weight).astype(whole.dtype)
-        out[f"defined/{name}"] = weight > 0
-        out[f"measure/{name}"] = whole / np.where(weight > 0, weight, 1)
+    block = {"finite": finite, "inaccurate": inaccurate, "divergent": inaccurate & beyond}
+    for name, (total, weight) in scores.measures.items():
+        total, weight = without_lost(total), without_lost(weight).astype(total.dtype)
+        block[f"defined/{name}"] = weight > 0
+        block[f"measure/{name}"] = total / np.where(weight > 0, weight, 1)
     kept = max(min(runs, SHOTS - first), 0)
     for i, leaf in enumerate(snapshots):
-        out[f"snapshot/{i}"] = leaf[:kept]
-    return out | condensed_sums({name: without_lost(rows) for name, rows in scores.sums.items()})
+        block[f"snapshot/{i}"] = leaf[:kept]
+    return block | condensed_sums({name: without_lost(rows) for name, rows in scores.sums.items()})
 
 
 def condensed_sums(per_run: dict[str, np.ndarray]) -> dict[str, np.ndarray]:
     """The sums over the runs of named arrays, as `Tally.add` takes them."""
-    out = {}
+    sums = {}
     for name, rows in per_run.items():
-        out[f"high/{name}"], out[f"low/{name}"] = sum_rows(np.asarray(rows))
-    return out
+        sums[f"high/{name}"], sums[f"low/{name}"] = sum_rows(np.asarray(rows))
+    return sums
 
 
 class Tally:
@@ -94,7 +94,7 @@ class Tally:
     def __init__(self) -> None:
         self._sums: dict[str, Sum] = {}
         self._blocks: dict[int, dict[str, np.ndarray]] = {}
-        """by first run; blocks that follow each other are joined"""
+        """arrays by first run; blocks that follow each other are joined"""
         self._runs: dict[int, int] = {}
         self._begins: dict[int, int] = {}
         """first run of the block that ends at a run"""
@@ -103,21 +103,21 @@ class Tally:
         """Add what `condense` returned of runs first … first + runs - 1."""
         kept = {}
         for name, value in block.items():
-            kind, _, what = name.partition("/")
+            kind, _, key = name.partition("/")
             if kind == "high":
-                new = Sum(value, block[f"low/{what}"])
-                self._sums[what] = plus(self._sums[what], new) if what in self._sums else new
+                new = Sum(value, block[f"low/{key}"])
+                self._sums[key] = plus(self._sums[key], new) if key in self._sums else new
             elif kind != "low":
                 kept[name] = value
         self._place(first, runs, kept)
         self._join(first)
 
-    def merge(self, other: "Tally") -> None:
+    def merge(self, tally: "Tally") -> None:
         """Add the blocks of another tally, of other runs."""
-        for name, value in other._sums.items():
+        for name, value in tally._sums.items():
             self._sums[name] = plus(self._sums[name], value) if name in self._sums else value
-        for first, runs in other._runs.items():
-            self._place(first, runs, other._blocks[first])
+        for first, runs in tally._runs.items():
+            self._place(first, runs, tally._blocks[first])
 
     def _place(self, first: int, runs: int, block: dict[str, np.ndarray]) -> None:
         self._blocks[first], self._runs[first] = block, runs
@@ -126,8 +126,8 @@ class Tally:
     def _join(self, first: int) -> None:
         """Join a block with its neighbours, as long as these have no more runs.
 
-        So arrays are few, each run is copied a logarithm of times, and a campaign keeps about the
-        numbers alone: those of a block of 16 runs are a quarter of what their arrays take.
+        So arrays are few, each run is copied a logarithm of times, and a campaign keeps little more
+        than the numbers: an array of 16 numbers takes four times the memory of the numbers.
         """
         while True:
             runs = self._runs[first]
@@ -138,11 +138,11 @@ class Tally:
                 pair = first, right
             else:
                 return
-            runs = sum(self._runs.pop(one) for one in pair)
-            one, other = (self._blocks.pop(one) for one in pair)
+            runs = sum(self._runs.pop(begin) for begin in pair)
+            before, after = (self._blocks.pop(begin) for begin in pair)
             joined = {
-                name: np.concatenate([value, other[name]]) if value.ndim else value
-                for name, value in one.items()
+                name: np.concatenate([value, after[name]]) if value.ndim else value
+                for name, value in before.items()
             }
             del self._begins[pair[1]]
             first = pair[0]
@@ -199,11 +199,11 @@ def _joined(parts: Iterable[np.ndarray]) -> np.ndarray:
 def _two_sum(a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The sum a + b rounded, and the exact error of that rounding."""
     high = a + b
-    of_b = high - a
-    return high, (a - (high - of_b)) + (b - of_b)
+    b_in_high = high - a  # what is left of b once the sum is rounded
+    return high, (a - (high - b_in_high)) + (b - b_in_high)
 
 
 def _renormalize(high: np.ndarray, low: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The sum high + low rounded, and the exact error of that rounding, for |high| >= |low|."""
-    out = high + low
-    return out, low - (out - high)
+    total = high + low
+    return total, low - (total - high)

@@ -38,10 +38,10 @@ class Verdict(NamedTuple):
     word: str
     """consistent, optimistic, pessimistic, diverged, incomplete or undecided"""
     by: tuple[str, ...] = ()
-    """which tests rejected, by the names of `TESTS`"""
+    """tests that reject, by the names of `TESTS`"""
     noticed: Mapping[str, tuple[float, float]] = {}
-    """by test, (low, high): this campaign would have noticed an average of at most low (0: none)
-    and of at least high (∞: none), with probability `POWER` or more"""
+    """(low, high) by test: this campaign would have noticed an average of at most low (0: none) and
+    of at least high (∞: none), with probability `POWER` or more"""
     doubts: tuple[str, ...] = ()
     """sentences that qualify the word"""
     honest_nis: float = 1.0
@@ -68,7 +68,7 @@ def judge(
     the NEES decides.
     incomplete: over 5 % (`_FAULTY`) of the runs are not finite, of the steps have a covariance that
     is not symmetric or not positive definite, or of the runs have an estimate that is constant.
-    The runs that are left may be those of small errors, so that they excuse nothing.
+    The remaining runs may be the runs with small errors, so they excuse nothing.
     pessimistic: an interval lies below.
     incomplete: nothing was measured, or over half of what was measured, or of what was in view, was
     not used.
@@ -85,8 +85,8 @@ def judge(
     interval is wider than that, as the NIS's is below some 400,000 degrees of freedom.
 
     Args:
-        per_run: (runs,) nees_pose, nis_per_dof and unobservable, those that there are; NaN for a
-            run without.
+        per_run: (runs,) nees_pose, nis_per_dof and unobservable, as far as present; NaN for a run
+            without.
         counts: as in `Summary.counts`: runs, not_finite, and the others, of which an absent one is
             0 (of measured: all that have a status).
         nis_dof: the degrees of freedom of all NIS together.
@@ -98,14 +98,16 @@ def judge(
     tested = {name: per_run[name] for name in TESTS if np.isfinite(per_run.get(name, ())).sum() > 1}
     signs: dict[str, int] = {}
     noticed: dict[str, tuple[float, float]] = {}
-    wide = True
+    is_wide = True
     for name, values in tested.items():
         of_nees = name == "nees_pose"
         average = spread(values, EACH, skewed=of_nees)
         assert average is not None
         honest = honest_values(honest_nis)[name]
-        signs[name], noticed[name] = _side(average, *honest), _noticed(average, *honest)
-        wide = wide and not (of_nees and average.above <= 2)
+        signs[name], noticed[name] = _side(average, *honest), _noticeable(average, *honest)
+        # Narrow enough to reject a NEES of twice the honest one.
+        if of_nees and average.above <= 2:
+            is_wide = False
     by = tuple(name for name, sign in signs.items() if sign)
     if by and signs[by[0]] > 0:
         word = "optimistic"
@@ -116,7 +118,7 @@ def judge(
     elif _is_starved(counts):
         word = "incomplete"
     else:
-        word = "undecided" if wide else "consistent"
+        word = "undecided" if is_wide else "consistent"
     return Verdict(word, by, noticed, doubts, honest_nis)
 
 
@@ -135,21 +137,21 @@ def power_of(noticed: Mapping[str, tuple[float, float]]) -> str:
     return f"{percentage(POWER)} power to reject {', '.join(parts)}" if parts else ""
 
 
-def _side(found: Spread, low: float, high: float) -> int:
+def _side(average: Spread, low: float, high: float) -> int:
     """The sign of a rejection: 1 for an interval above the honest value, -1 for below, else 0."""
-    if found.low > high and found.high > high * (1 + TOLERANCE):
+    if average.low > high and average.high > high * (1 + TOLERANCE):
         return 1
-    return -1 if found.high < low and found.low < low / (1 + TOLERANCE) else 0
+    return -1 if average.high < low and average.low < low / (1 + TOLERANCE) else 0
 
 
-def _noticed(found: Spread, low: float, high: float) -> tuple[float, float]:
+def _noticeable(average: Spread, low: float, high: float) -> tuple[float, float]:
     """Averages that are noticed with probability `POWER`, of a relative spread as found.
 
     An average m is rejected beyond high·(m/μ at the lower end); the mean of which a share `POWER`
     lies beyond that is z standard errors farther.
     """
-    margin = normal_quantile(POWER) * found.error
-    least, most = low * found.below, high * max(found.above, 1 + TOLERANCE)
+    margin = normal_quantile(POWER) * average.error
+    least, most = low * average.below, high * max(average.above, 1 + TOLERANCE)
     return least / (1 + margin), most / (1 - margin) if margin < 1 else np.inf
 
 
@@ -176,16 +178,16 @@ class _Measured(NamedTuple):
     """What became of the measurements of the finite runs."""
 
     total: int
-    """in the logs"""
+    """measurements in the logs"""
     used: int
     dropped: dict[str, int]
-    """by reason"""
+    """counts by reason"""
     missed: int
     """landmarks in view that have no measurement in the log"""
 
     @property
-    def none_taken(self) -> bool:
-        """Whether the filter takes no measurements, as dead reckoning: all are unmatched, or none
+    def uses_none(self) -> bool:
+        """Whether the filter uses no measurement, as dead reckoning: all are unmatched, or none
         has a status."""
         return not self.used and sum(self.dropped.values()) == self.dropped["unmatched"]
 
@@ -193,8 +195,9 @@ class _Measured(NamedTuple):
 def _measured(counts: Mapping[str, int]) -> _Measured:
     dropped = {name: counts.get(name, 0) for name in map(_name, DROPS)}
     used = sum(counts.get(name, 0) for name in map(_name, KEPT))
-    every = used + sum(dropped.values())
-    return _Measured(max(counts.get("measured", 0), every), used, dropped, counts.get("missed", 0))
+    with_status = used + sum(dropped.values())
+    total = max(counts.get("measured", 0), with_status)
+    return _Measured(total, used, dropped, counts.get("missed", 0))
 
 
 def _is_starved(counts: Mapping[str, int]) -> bool:
@@ -202,7 +205,7 @@ def _is_starved(counts: Mapping[str, int]) -> bool:
     measured = _measured(counts)
     if counts.get("measured") == 0:
         return True
-    if measured.none_taken:
+    if measured.uses_none:
         return False
     return measured.total > 2 * measured.used or measured.missed > measured.total
 
@@ -212,12 +215,12 @@ def doubts_on(
 ) -> tuple[str, ...]:
     """Sentences that qualify a verdict, from the counts and measures that `judge` takes."""
     runs, lost = counts["runs"], counts["not_finite"]
-    steps, out = counts.get("steps", 0), list[str]()
+    steps, doubts = counts.get("steps", 0), list[str]()
     if lost:
         rest = f"averages of the {runs:,} finite runs" if runs else "there are no averages"
-        out.append(f"not finite (NaN or ∞) in {lost:,} of {runs + lost:,} runs: {rest}")
+        doubts.append(f"not finite (NaN or ∞) in {lost:,} of {runs + lost:,} runs: {rest}")
     if count := counts.get("divergent", 0):
-        out.append(
+        doubts.append(
             f"divergent in {count:,} of {runs:,} runs: final position errors far beyond those of "
             "the ideal EKF, and over 5 σ of what is claimed"
         )
@@ -226,79 +229,79 @@ def doubts_on(
         ("indefinite_steps", "not positive definite"),
     ):
         if count := counts.get(name, 0):
-            out.append(
+            doubts.append(
                 f"the pose covariance is {fault} in {count:,} of {steps:,} steps, by more than "
                 "rounding: look at the filter's covariance; such a step has no pose NEES"
             )
     if count := counts.get("constant", 0):
-        out.append(f"pose and covariance never change in {count:,} of {runs:,} runs")
+        doubts.append(f"pose and covariance never change in {count:,} of {runs:,} runs")
     singular = counts.get("singular_steps", 0)
     explained = counts.get("asymmetric_steps", 0) + counts.get("indefinite_steps", 0)
     if singular - explained > 0.5 * steps > 0:
-        out.append(
+        doubts.append(
             f"the pose covariance is singular in {singular:,} of {steps:,} steps, which have no "
             "pose NEES: a direction is claimed to be known exactly; more runs do not help"
         )
     if 2 * (count := counts.get("inaccurate", 0)) > runs and count > counts.get("divergent", 0):
-        out.append(
+        doubts.append(
             f"inaccurate in {count:,} of {runs:,} runs: final position errors over 5 σ of the "
             "ideal EKF"
         )
     if runs:
-        out += _doubts_on_measurements(counts, nis_dof)
+        doubts += _doubts_on_measurements(counts, nis_dof)
     free = np.asarray(per_run.get("unobservable", ()), np.float64)
     free = free[np.isfinite(free)]
     if free.size and free.mean() < 3:
-        out.append(
+        doubts.append(
             f"unobservable directions {free.mean():.3g} instead of 3: the filter gained "
             "information on the pose of the map as a whole, which only a sensor of absolute "
             "position or heading gives; if the robot has such a sensor, compare with the filter "
             "ideal"
         )
-    return tuple(out)
+    return tuple(doubts)
 
 
 def _doubts_on_measurements(counts: Mapping[str, int], nis_dof: float) -> list[str]:
-    measured, out = _measured(counts), list[str]()
+    measured, doubts = _measured(counts), list[str]()
     if counts.get("measured") == 0:
-        out.append("nothing was measured in any run: only the motion was judged")
+        doubts.append("nothing was measured in any run: only the motion was judged")
     if measured.missed:
-        out.append(
+        doubts.append(
             f"{measured.missed:,} landmarks in view, beside {measured.total:,} measured ones, had "
             "no place in the scan: expected more places in the world"
         )
     if not measured.total:
-        return out
+        return doubts
     ignored = measured.total - measured.used - sum(measured.dropped.values())
-    if measured.none_taken:
-        out.append(
+    if measured.uses_none:
+        doubts.append(
             f"takes none of the {measured.total:,} measurements (by its Info): judged by the NEES "
             "alone"
         )
     elif measured.total > 2 * measured.used:
         reasons = [f"{count:,} {name}" for name, count in measured.dropped.items() if count]
         reasons += [f"{ignored:,} without a status in Info"] * bool(ignored)
-        out.append(
+        doubts.append(
             f"{measured.total - measured.used:,} of {measured.total:,} measurements were "
             f"{'not used' if ignored else 'dropped'}: {', '.join(reasons)}"
         )
     else:
         if ignored:
-            out.append(
+            doubts.append(
                 f"{ignored:,} of {measured.total:,} measurements have no status in Info: they may "
                 "have been ignored"
             )
         if count := measured.dropped["overflow"]:
-            out.append(
+            doubts.append(
                 f"{count:,} measurements of new landmarks found the map full: expected a larger "
                 "capacity, or a filter that removes landmarks"
             )
         if counts.get("fused", 0) and "measured" in counts and not nis_dof > 0:
-            out.append(
+            doubts.append(
                 f"{counts['fused']:,} fused measurements have no degrees of freedom in Info: no "
                 "NIS, judged by the NEES alone"
             )
-    return out
+    return doubts
 
 
 def _name(status: Status) -> str:

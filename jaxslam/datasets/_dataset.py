@@ -2,7 +2,7 @@
 
 from collections.abc import Callable
 from dataclasses import dataclass, field
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import numpy as np
@@ -11,7 +11,6 @@ from jaxtyping import Bool, Float
 from jaxslam.core._validation import check_log
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import Log
-from jaxslam.filters._ekf.ekf_settings import EkfOptions
 from jaxslam.filters.multi_robot.team import Robot
 from jaxslam.sensors._suite import Suite
 
@@ -67,7 +66,7 @@ class Dataset:
     """pose of the robot before the first control, the frame of the map"""
     pose_cov: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.zeros((3, 3)))
     """zero, since the first pose defines the frame"""
-    filter_options: EkfOptions = field(default_factory=EkfOptions)
+    filter_options: dict[str, Any] = field(default_factory=dict)
     """keyword arguments of `filters.EkfSlam` for this data set (update, gate)"""
     landmarks: Float[np.ndarray, "N 2"] | None = None
     """surveyed positions [m] by tag, in their frame (see `one_frame`); None if unknown"""

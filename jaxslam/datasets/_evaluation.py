@@ -12,7 +12,7 @@ from jaxtyping import Float, PyTree
 from jaxslam.consistency import metrics
 from jaxslam.consistency._intervals import LEVEL, percentage
 from jaxslam.consistency._measures.nees import block_nees, pose_error
-from jaxslam.consistency.metrics._paths import alignment, carried
+from jaxslam.consistency.metrics._paths import alignment, transform
 from jaxslam.core.protocols import Filter
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate
@@ -112,7 +112,9 @@ def judge_map(
     if not values[0] > 20 * count * np.finfo(of_filter.dtype).eps * values[-1]:
         return None
     white = vectors.T / np.sqrt(values)[:, None]
-    error = points - (survey if one_frame else carried(_best_frame(points, survey, white), survey))
+    error = points - (
+        survey if one_frame else transform(_best_frame(points, survey, white), survey)
+    )
     if joint:
         nees = float(np.sum((white @ error.reshape(-1)) ** 2))
         return MapTest(nees, size, chi2_band(size, 1, LEVEL), True)
@@ -127,7 +129,7 @@ def _best_frame(points: np.ndarray, survey: np.ndarray, white: np.ndarray) -> np
     """
     pose = alignment(survey, points)
     for _ in range(_ITERATIONS):
-        at = carried(pose, survey)
+        at = transform(pose, survey)
         lever = at - pose[:2]
         slope = np.zeros((len(points), 2, 3))
         slope[:, 0, 0] = slope[:, 1, 1] = 1.0
@@ -189,7 +191,7 @@ def evaluate(
         errors |= {f"ATE{after} [m]": np.nan, f"heading RMSE{after} [°]": np.nan}
     elif true is not None:
         of_path = metrics.ate(pose, true, align=not data.one_frame)
-        true = carried(of_path.frame, true)
+        true = transform(of_path.frame, true)
         errors[f"ATE{after} [m]"] = metrics.statistics(of_path.translation).rmse
         turn = np.rad2deg(of_path.rotation)
         errors[f"heading RMSE{after} [°]"] = metrics.statistics(turn).rmse
@@ -212,7 +214,7 @@ def evaluate(
         else:
             rmse = metrics.align_map(last, data.landmarks)[1]
             frame = metrics.alignment(points[tag], found)
-            points = carried(frame, points)
+            points = transform(frame, points)
         errors[f"map RMSE{after} [m]"] = rmse
         gap = (points[tag] - found)[:, :, None]
         covs = np.asarray(last.point_covs)[named]

@@ -1,7 +1,7 @@
 """Noises and systematic errors of a data set by maximum likelihood, from its log."""
 
 from collections.abc import Iterable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,6 @@ from jaxslam.charts import RightInvariant
 from jaxslam.core.logs._tables import split_unit
 from jaxslam.core.types import Info, Scan, Status
 from jaxslam.datasets._dataset import Dataset, Parameter
-from jaxslam.filters._ekf.ekf_settings import EkfOptions
 from jaxslam.filters._ekf.ekf_slam import EkfSlam
 from jaxslam.math.stats import normal_quantile
 
@@ -64,7 +63,7 @@ def fit(
     *,
     calibrate: Iterable[str] = (),
     fixed: Iterable[str] = (),
-    options: EkfOptions | None = None,
+    options: dict[str, Any] | None = None,
 ) -> DatasetFit:
     """Noises and systematic errors of a data set that maximize the likelihood of its log.
 
@@ -99,11 +98,11 @@ def fit(
     start, key = models.values, jax.random.key(0)
     names = [parameter.name for parameter in models.parameters]
     noise = np.array([parameter.group == "noise" for parameter in models.parameters])
-    chart: EkfOptions = {"chart": RightInvariant()} if data.sensor.of_points else {}
+    chart: dict[str, Any] = {"chart": RightInvariant()} if data.sensor.of_points else {}
     chosen = chart | data.filter_options | (options or {})
     decided = chosen | {"gate": None, "associate": Known()}
 
-    def run_with(parameters: jax.Array, options: EkfOptions, used: Scan | None) -> Info:
+    def run_with(parameters: jax.Array, options: dict[str, Any], used: Scan | None) -> Info:
         """used: a scan with the tags and measurements to use; None for those of the log."""
         log, motion, sensor = models.at(parameters)
         if used is not None:

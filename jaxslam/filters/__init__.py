@@ -1,10 +1,10 @@
 """Filters: recursive estimators, all of type `Filter`."""
 
+from jaxslam._public import publish
 from jaxslam.core.protocols import Filter, Wrapper
 from jaxslam.filters._delayed.delayed_filter import Hypotheses, Promotion, StoredMeasurements
 from jaxslam.filters._delayed.delayed_slam import DelayedSlam
 from jaxslam.filters._ekf.compressed_ekf_slam import CompressedEkfSlam
-from jaxslam.filters._ekf.ekf_settings import EkfOptions
 from jaxslam.filters._ekf.ekf_slam import EkfSlam
 from jaxslam.filters._ekf.linear_system import (
     LinearizedSteps,
@@ -36,7 +36,6 @@ __all__ = [
     "DeadReckoning",
     "DelayedSlam",
     "EifSlam",
-    "EkfOptions",
     "EkfSlam",
     "FastSlam",
     "Filter",
@@ -66,3 +65,5 @@ __all__ = [
     "whole_information",
     "with_extra",
 ]
+
+publish(__name__)

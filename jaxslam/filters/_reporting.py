@@ -1,11 +1,12 @@
 """`Status` and `Info` of the measurements of a scan, for all filters."""
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
+from jaxslam.core.protocols import Association
 from jaxslam.core.types import Info, Scan, Status
 
 Mask = jax.Array | None
@@ -119,6 +120,67 @@ def info_of(
     )
 
 
+class NewLandmarks(NamedTuple):
+    """The outcome of the measurements without a landmark in the map, (M,) each."""
+
+    slot: jax.Array
+    """of the landmark, where granted"""
+    granted: jax.Array
+    """a landmark was started"""
+    deferred: jax.Array
+    """beyond `births`"""
+    repeated: jax.Array
+    """of a tag that occurs earlier in the scan"""
+
+
+class Innovations(Protocol):
+    """The innovations of M measurements against the prior, (M,) and more axes."""
+
+    @property
+    def innovation(self) -> jax.Array: ...
+    @property
+    def innovation_cov(self) -> jax.Array: ...
+    @property
+    def nis(self) -> jax.Array: ...
+    @property
+    def log_likelihood(self) -> jax.Array: ...
+    @property
+    def inside(self) -> jax.Array: ...
+    @property
+    def positive(self) -> jax.Array: ...
+
+
+def report_scan(
+    scan: Scan,
+    association: Association,
+    matched: jax.Array,
+    innovations: Innovations,
+    new: NewLandmarks | None = None,
+) -> Info:
+    """The `Info` of the measurements of one sensor; new is None where no landmark starts."""
+    outcome = {} if new is None else {"new": association.is_new, **new._asdict()}
+    born = outcome.pop("slot", None)
+    status = status_of(
+        scan.valid,
+        matched=matched,
+        positive=innovations.positive,
+        inside=innovations.inside,
+        **outcome,
+    )
+    return info_of(
+        status,
+        matched,
+        size=scan.z.shape[1],
+        slot=association.slot,
+        born=born,
+        nis=innovations.nis,
+        innovation=innovations.innovation,
+        innovation_cov=innovations.innovation_cov,
+        log_likelihood=innovations.log_likelihood.sum(),
+        exhausted=jnp.asarray(association.exhausted),
+    )
+
+
 def has_distance(status: jax.Array) -> jax.Array:
     """Mask (M,) of the measurements with a squared distance: those fused or rejected."""
     return (status == Status.FUSED) | (status == Status.REJECTED)
@@ -142,6 +204,8 @@ def nothing_of(scan: Scan) -> Info:
 
 def joined_info(infos: list[Info], size_z: int) -> Info:
     """The `Info` of the scans of several sensors, padded with zeros to innovations of size_z."""
+    if len(infos) == 1:
+        return infos[0]
 
     def join(name: str, padded_axes: int = 0) -> jax.Array:
         values = [getattr(info, name) for info in infos]
@@ -161,13 +225,6 @@ def joined_info(infos: list[Info], size_z: int) -> Info:
         log_likelihood=jnp.stack([info.log_likelihood for info in infos]).sum(),
         exhausted=jnp.stack([jnp.asarray(info.exhausted) for info in infos]).any(),
     )
-
-
-def seen_before(tag: jax.Array, among: jax.Array) -> jax.Array:
-    """Mask (M,) of the measurements whose tag, not negative, occurs earlier in the scan."""
-    earlier = jnp.tril(jnp.ones((tag.shape[0], tag.shape[0]), bool), -1)
-    same = (tag[:, None] == tag[None, :]) & (tag >= 0)[:, None] & among[None, :]
-    return (same & earlier).any(axis=1)
 
 
 def with_extra(info: Info, name: str, record: PyTree) -> Info:

@@ -14,6 +14,10 @@ from jaxslam.math.stats import chi2_quantile
 __all__ = ["Segments", "fit_line", "segments"]
 
 _ITERATIONS = 4
+"""Gauss-Newton steps of a fit: it is nearly linear, and starts at the total least squares."""
+_LEAST_TOWARD = 1e-3
+"""Least n·e of a beam, and least noise of an end in σ: a beam along the wall has no information on
+the line, and must not have an infinite weight."""
 
 
 def _ends_of(
@@ -33,10 +37,10 @@ def fit_line(
 
     With e the direction of a beam and n the normal, the wall is met at ρ* = r/(n·e), and the end ρe
     is off the line by d = n·e (ρ - ρ*). To first order d has the variance
-    w⁻¹ = (n·e)² σ² + (ρ* n⊥·e)² σ_β². Minimized is Σ w d², the total least squares weighted so, in
-    closed form with weights that are 1 at first, then by Gauss-Newton steps with the slopes
-    g = ∂d/∂(r, α) = (-1, n⊥·ρ*e) at the predicted points; at the measured ones the noise in g would
-    bias α. The covariance is (Σ w g gᵀ)⁻¹, the bound of Cramér and Rao.
+    w⁻¹ = (n·e)² σ² + (ρ* n⊥·e)² σ_β². The fit minimizes Σ w d²: first in closed form with weights
+    of 1, the total least squares, then by Gauss-Newton steps with the slopes
+    g = ∂d/∂(r, α) = (-1, n⊥·ρ*e) at the predicted points; at the measured points the noise in g
+    would bias α. The covariance is (Σ w g gᵀ)⁻¹, the bound of Cramér and Rao.
 
     The normal points away from the laser (n·e > 0), so r may come out below 0 for a wall that the
     laser is nearly on.
@@ -68,7 +72,7 @@ def fit_line(
     for _ in range(_ITERATIONS):
         n = np.array([np.cos(line[1]), np.sin(line[1])])
         toward, across = e @ n, e @ np.array([-n[1], n[0]])
-        toward = np.maximum(toward, 1e-3)  # a beam along the wall has no information on it
+        toward = np.maximum(toward, _LEAST_TOWARD)
         met = line[0] / toward
         if np.ptp(met * across) <= 1e-9 * max(sigma, np.abs(distance).max()):
             raise ValueError("fit_line: expected beams whose ends are not in line with the laser")
@@ -105,18 +109,19 @@ def _misfit_of_parabola(
         deviation = np.hypot(
             (toward - slope * along) * sigma, distance * (along + slope * toward) * sigma_angle
         )
-        deviation = np.maximum(deviation, 1e-3 * sigma)  # a beam along the wall, as in `fit_line`
-        found = np.linalg.lstsq(powers / deviation[:, None], y / deviation)[0]
-        slope = (found[1] + 2 * found[2] * x / scale) / scale
-        off = (y - powers @ found) / deviation
+        deviation = np.maximum(deviation, _LEAST_TOWARD * sigma)
+        coefficients = np.linalg.lstsq(powers / deviation[:, None], y / deviation)[0]
+        slope = (coefficients[1] + 2 * coefficients[2] * x / scale) / scale
+        off = (y - powers @ coefficients) / deviation
     return float(off @ off)
 
 
 _SLANT = np.deg2rad(10.0)
 """Least angle between a beam and a wall on which neighbouring beams count as connected."""
 _SPLIT = 4.0
-"""[σ] from a chord to a point at which a run of points is divided."""
-_SAME = -2 * np.log(0.001)  # the 99.9 % quantile of χ² with two degrees of freedom
+"""[σ] from a chord to a point at which a run of points is divided (chosen)."""
+_MERGE_GATE = -2 * np.log(0.001)
+"""χ² up to which two lines are the same: the 99.9 % quantile of two degrees of freedom."""
 
 
 class Segments(NamedTuple):
@@ -160,7 +165,7 @@ def segments(
 
     For n beams that meet the wall steeply, an arc of sagitta h adds λ = (4/45) n (h/σ)² to χ² of
     the second test. At `probability` 0.999 that shows h = 11 σ/√n in one of two segments, and 17
-    σ/√n in 95 %: 4 and 6 σ for 8 beams. What is flatter is found by its neighbours. In a round room
+    σ/√n in 95 %: 4 and 6 σ for 8 beams. A flatter arc shows beside its neighbours. In a round room
     of radius 3 m (σ = 2 cm, 90 to 720 beams) at most 0.04 segments a scan remain. A flat arc that
     is seen alone may pass. Two walls are also lost if their corner is too low to be told from an
     arc: one in two where it is 46 σ/√n above their common chord, n beams on both.
@@ -191,15 +196,15 @@ def segments(
             "segments: expected sigma and max_range above 0, sigma_angle and trim of at least 0, "
             f"least of at least 3, got {sigma}, {max_range}, {sigma_angle}, {trim}, {least}"
         )
-    known = np.isfinite(angle)
-    angle, distance, valid = angle[known], distance[known], valid[known]
+    finite = np.isfinite(angle)
+    angle, distance, valid = angle[finite], distance[finite], valid[finite]
     step = np.diff(angle)
     beyond = np.sum(step) - 2 * np.pi
     half = 0.5 * np.median(step) if len(step) else 0.0
     if not (step > 0).all() or not beyond <= half:
         raise ValueError("segments: expected angles that increase within one turn")
     used, _ = Beams(distance, angle, valid).returns(max_range)
-    if beyond > -half and used[0]:  # the first direction once more
+    if beyond > -half and used[0]:  # the last beam has the direction of the first
         used[-1] = False
     angle, distance = angle[used], distance[used]
     noise = sigma, sigma_angle
@@ -218,46 +223,47 @@ def segments(
     long = [piece for piece in pieces if len(piece) >= least]
     pieces = _merge(long, angle, distance, noise, trim)
     misfit = [line_of(piece)[2] for piece in pieces]
-    more = chi2_quantile(probability, 1)
+    gain = chi2_quantile(probability, 1)  # of a further parameter
 
-    def parabola(run: Int[np.ndarray, "n"]) -> float:
+    def parabola_misfit(run: Int[np.ndarray, "n"]) -> float:
         return _misfit_of_parabola(angle[run], distance[run], *noise)
 
-    def arc(k: int) -> bool:
-        """Whether a piece and the next one belong to one arc."""
-        other = (k + 1) % len(pieces)
-        if other == k or not _adjacent(pieces[k][-1], pieces[other][0], angle):
+    def is_arc(k: int) -> bool:
+        """Whether a piece and its successor belong to a common arc."""
+        after = (k + 1) % len(pieces)
+        if after == k or not _adjacent(pieces[k][-1], pieces[after][0], angle):
             return False
-        both = parabola(np.concatenate([pieces[k], pieces[other]]))
-        return both <= misfit[k] + misfit[other] + more
+        together = parabola_misfit(np.concatenate([pieces[k], pieces[after]]))
+        return together <= misfit[k] + misfit[after] + gain
 
-    arcs = [arc(k) for k in range(len(pieces))]
-    found, counted = [], 0
+    arcs = [is_arc(k) for k in range(len(pieces))]
+    rows, counted = [], 0
     for k, piece in enumerate(pieces):
         run = piece[trim : len(piece) - trim]
         if len(run) < least or arcs[k] or arcs[k - 1]:
             continue
         line, cov, chi2 = line_of(run)
-        if not chi2 <= min(chi2_quantile(probability, len(run) - 2), parabola(run) + more):
+        if not chi2 <= min(chi2_quantile(probability, len(run) - 2), parabola_misfit(run) + gain):
             continue
         n = np.array([np.cos(line[1]), np.sin(line[1])])
         ends = _ends_of(angle[run[[0, -1]]], distance[run[[0, -1]]])
         ends = ends - (ends @ n - line[0])[:, None] * n
-        found.append((line, cov, ends, len(run), chi2))
+        rows.append((line, cov, ends, len(run), chi2))
         counted += len(run)
-    rows = [np.array(part, np.float64) for part in zip(*found, strict=True)] or [np.zeros(0)] * 5
+    columns = [np.array(part, np.float64) for part in zip(*rows, strict=True)]
+    columns = columns or [np.zeros(0)] * 5
     return Segments(
-        line=rows[0].reshape(-1, 2),
-        cov=rows[1].reshape(-1, 2, 2),
-        ends=rows[2].reshape(-1, 2, 2),
-        size=rows[3].astype(int),
-        chi2=rows[4],
+        line=columns[0].reshape(-1, 2),
+        cov=columns[1].reshape(-1, 2, 2),
+        ends=columns[2].reshape(-1, 2, 2),
+        size=columns[3].astype(int),
+        chi2=columns[4],
         left=len(angle) - counted,
     )
 
 
 def _runs(angle: np.ndarray, distance: np.ndarray, sigma: float) -> list[Int[np.ndarray, "n"]]:
-    """Beams in runs without a jump, the first after one where a scan all around has one."""
+    """Runs of beams without a jump; a scan all around begins after a jump, if it has any."""
     count = len(angle)
     if count < 2:
         return []
@@ -265,11 +271,11 @@ def _runs(angle: np.ndarray, distance: np.ndarray, sigma: float) -> list[Int[np.
     after = np.roll(order, -1)
     turn = np.mod(angle[after] - angle, 2 * np.pi)
     near = np.minimum(distance, distance[after])
-    # Across a wall at the least slant, λ: near sin(Δφ)/sin(λ - Δφ).
+    # Gap on a wall at the least slant λ, by the law of sines: near sin(Δφ)/sin(λ - Δφ).
     reach = np.where(turn < _SLANT, np.sin(turn) / np.sin(np.maximum(_SLANT - turn, 1e-3)), 0.0)
     points = _ends_of(angle, distance)
     gap = np.linalg.norm(points[after] - points, axis=1)
-    breaks = gap > near * reach + 3 * np.sqrt(2) * sigma
+    breaks = gap > near * reach + 3 * np.sqrt(2) * sigma  # 3 σ of the difference of two ranges
     starts = np.flatnonzero(breaks) + 1
     if not len(starts):  # all around without a jump: from the farthest point, which is a corner
         return [np.roll(order, -int(np.argmax(distance)))]
@@ -296,10 +302,9 @@ def _divide(
     # The ends of the chord have noise as well.
     if off[at] <= _SPLIT * np.sqrt(sigma[at] ** 2 + max(sigma[0], sigma[-1]) ** 2):
         return [run]
-    before, behind = run[: at + 1], run[at:]
     return [
-        *_divide(before, angle, distance, noise),
-        *_divide(behind[1:], angle, distance, noise),
+        *_divide(run[: at + 1], angle, distance, noise),
+        *_divide(run[at + 1 :], angle, distance, noise),
     ]
 
 
@@ -319,15 +324,17 @@ def _merge(
     fits = [fit(piece) for piece in pieces]
     k = 0
     while k < len(pieces) and len(pieces) > 1:
-        other = (k + 1) % len(pieces)
-        gap = fits[other][0] - fits[k][0]
+        after = (k + 1) % len(pieces)
+        gap = fits[after][0] - fits[k][0]
         gap[1] = np.arctan2(np.sin(gap[1]), np.cos(gap[1]))
-        near = _adjacent(pieces[k][-1], pieces[other][0], angle)
-        if near and gap @ np.linalg.solve(fits[k][1] + fits[other][1], gap) <= _SAME:
-            joined = np.concatenate([pieces[k], pieces[other]])
+        near = _adjacent(pieces[k][-1], pieces[after][0], angle)
+        if near and gap @ np.linalg.solve(fits[k][1] + fits[after][1], gap) <= _MERGE_GATE:
+            joined = np.concatenate([pieces[k], pieces[after]])
             pieces[k], fits[k] = joined, fit(joined)
-            del pieces[other], fits[other]
-            k = max(k - 1 - (other < k), 0)
+            del pieces[after], fits[after]
+            # The piece before may agree with the joined one; its index fell if `after` was the
+            # first piece.
+            k = max(k - 1 - (after < k), 0)
         else:
             k += 1
     return pieces

@@ -9,12 +9,13 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from warnings import warn
 
+from jaxslam._public import publish
 from jaxslam.consistency._tally import Tally
 from jaxslam.consistency.campaign import Campaign
 from jaxslam.consistency.campaign._block import BOUND
 from jaxslam.consistency.campaign._harness import summaries_of
 from jaxslam.consistency.campaign._kept import add_kept
-from jaxslam.consistency.campaign._pieces import missing
+from jaxslam.consistency.campaign._pieces import missing_pieces
 from jaxslam.core._numbers import is_number
 from jaxslam.results import _report as report
 from jaxslam.results import _store as store
@@ -144,7 +145,7 @@ def load(folder: str | Path) -> Campaign:
             "writes them"
         ) from error
     runs, tallies = found["runs"], {name: Tally() for name in (*doubts, BOUND)}
-    if missing(add_kept(tallies, kept, runs, lambda first: True), runs, runs):
+    if missing_pieces(add_kept(tallies, kept, runs, lambda first: True), runs, runs):
         raise ValueError(
             f"{folder}: the campaign is not finished: jaxslam consistency --resume {folder}"
         )
@@ -236,3 +237,6 @@ def _drawings(
             "map": (f"Maps: {title}", partial(run_map_figure, campaign, title=title)),
         }
     return found
+
+
+publish("jaxslam", load)

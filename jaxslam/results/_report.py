@@ -173,21 +173,6 @@ def as_csv(campaign: Campaign) -> str:
     return csv_text(["filter", "step", *keys], rows)
 
 
-def run_columns(campaign: Campaign) -> dict[str, np.ndarray]:
-    """The columns of `Campaign.to_dataframe`, which has a row for each run of each filter."""
-    numbers, filters = campaign.run_numbers, campaign.filters
-    none = np.full(len(numbers), np.nan)
-    names = dict.fromkeys(name for s in filters.values() for name in s.per_run)
-    found: dict[str, np.ndarray] = {
-        "filter": np.repeat(np.array(list(filters), object), len(numbers)),
-        "run": np.tile(numbers, len(filters)),
-        "finite": np.concatenate([~np.isin(numbers, s.not_finite_runs) for s in filters.values()]),
-    }
-    for name in names:
-        found[name] = np.concatenate([s.per_run.get(name, none) for s in filters.values()])
-    return found
-
-
 def trajectory_csv(time: np.ndarray, estimate: Estimate) -> str:
     """A path as CSV: per step time, pose and the upper triangle of its covariance."""
     header = ["time", "x", "y", "theta", "c_xx", "c_xy", "c_xt", "c_yy", "c_yt", "c_tt"]

@@ -18,7 +18,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxslam.consistency.campaign._pieces import missing
+from jaxslam.consistency.campaign._pieces import missing_pieces
 from jaxslam.results._files import Json
 
 FORMAT = 4
@@ -332,7 +332,7 @@ class Store:
         """Number of finished runs, by the names of the blocks."""
         spans = self.spans()
         end = max((first + runs for first, runs in spans), default=0)
-        return end - sum(count for _, count in missing(spans, end, max(end, 1)))
+        return end - sum(count for _, count in missing_pieces(spans, end, max(end, 1)))
 
     def blocks(self) -> Iterator[Block]:
         """The valid blocks in order of their runs, read one at a time; no run occurs twice.

@@ -6,7 +6,7 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from jaxslam.consistency import Average, Summary
-from jaxslam.consistency._intervals import LEVEL, lopsided, percentage
+from jaxslam.consistency._intervals import LEVEL, is_lopsided, percentage
 from jaxslam.consistency._measures import Measure, measures_of
 from jaxslam.consistency._measures.counts import MEANINGS, count_label
 from jaxslam.consistency._measures.nees import DOF
@@ -86,7 +86,7 @@ def cell_text(cell: Cell) -> str:
     value, low, high = cell
     if not (np.isfinite(low) or np.isfinite(high)) or (low, high) == (0.0, np.inf):
         return short(value)
-    if lopsided(cell):
+    if is_lopsided(cell):
         return f"{short(value)} [{short(low, 3)}, {short(high, 3)}]".replace("inf", "∞")
     return f"{short(value)} ± {short((high - low) / 2, 2)}"
 

@@ -6,6 +6,9 @@ campaign is renamed and not counted. A manifest holds the caller's settings and 
 the campaign.
 """
 
+from jaxslam._public import publish
 from jaxslam.results._store import Store, open, resume
 
 __all__ = ["Store", "open", "resume"]
+
+publish(__name__)

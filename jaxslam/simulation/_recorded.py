@@ -3,6 +3,7 @@
 import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import field
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -10,13 +11,13 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import ArrayLike
 
+from jaxslam._public import publish
 from jaxslam.core._numbers import check_array
 from jaxslam.core._record import FrozenDict, record, static
 from jaxslam.core._units import are_headings_in_degrees
 from jaxslam.core._validation import check_log, check_record
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import Log, Truth
-from jaxslam.filters._ekf.ekf_settings import EkfOptions
 from jaxslam.sensors._suite import Suite
 from jaxslam.simulation._worlds import World
 
@@ -34,10 +35,10 @@ class RecordedWorld(World):
     """(R, …)"""
     pose: ArrayLike = (0.0, 0.0, 0.0)
     pose_cov: ArrayLike = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0))
-    filter_options: EkfOptions = static(default=FrozenDict())
+    filter_options: dict[str, Any] = static(default=FrozenDict())
     published: Mapping[str, Mapping[str, float]] = static(default=FrozenDict())
     source: str = static(default="")
-    """these as of `Scenario`"""
+    """see `Scenario` for these fields"""
 
     @property
     def landmarks(self) -> ArrayLike:  # type: ignore[override]
@@ -58,10 +59,10 @@ class RecordedWorld(World):
         return self._record(number)
 
     def _record(self, number: int | Array) -> tuple[Truth, Log]:
-        both: tuple[Truth, Log] = jax.tree.map(
+        record: tuple[Truth, Log] = jax.tree.map(
             lambda leaf: jnp.asarray(leaf)[number], (self.truth, self.log)
         )
-        return both
+        return record
 
 
 def recorded_world(
@@ -76,7 +77,7 @@ def recorded_world(
     pose_cov: ArrayLike = ((0.0, 0.0, 0.0), (0.0, 0.0, 0.0), (0.0, 0.0, 0.0)),
     starts: ArrayLike | None = None,
     origin: ArrayLike | None = None,
-    filter_options: EkfOptions | None = None,
+    filter_options: dict[str, Any] | None = None,
     published: Mapping[str, Mapping[str, float]] | None = None,
     source: str = "",
 ) -> RecordedWorld:
@@ -144,10 +145,13 @@ def recorded_world(
     check_array("recorded_world: starts", truth.start, (runs, 3))
     if truth.origin is not None:
         check_array("recorded_world: origin", truth.origin, (runs, steps, places), np.integer)
-    for what in ("pose", "landmarks", "start"):
-        if not np.isfinite(getattr(truth, what)).all():
-            run = np.argwhere(~np.isfinite(getattr(truth, what)))[0][0]
-            raise ValueError(f"recorded_world: true {what} of run {run}: expected finite numbers")
+    for name_of_field in ("pose", "landmarks", "start"):
+        finite = np.isfinite(getattr(truth, name_of_field))
+        if not finite.all():
+            run = np.argwhere(~finite)[0][0]
+            raise ValueError(
+                f"recorded_world: true {name_of_field} of run {run}: expected finite numbers"
+            )
     if wrong := [i for i, path in enumerate(truth.pose) if are_headings_in_degrees(path)]:
         warnings.warn(
             f"recorded_world: the true headings of run {wrong[0]} contradict the directions "
@@ -173,3 +177,6 @@ def recorded_world(
         published=published or {},
         source=source,
     )
+
+
+publish("jaxslam", RecordedWorld, recorded_world)

@@ -9,6 +9,7 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from jaxslam._public import publish
 from jaxslam.core._record import FrozenDict, hold_function, record, set_field, static
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import Log, Scan, Truth
@@ -16,7 +17,7 @@ from jaxslam.filters.multi_robot._team import TeamMotion, check_team, sensors_of
 from jaxslam.filters.multi_robot.team import Robot
 from jaxslam.math import se2
 from jaxslam.simulation._scans import Visible, everywhere, part_scan, side_by_side
-from jaxslam.simulation._worlds import World, drawn_near, drive
+from jaxslam.simulation._worlds import World, drive, random_pose
 
 
 @record
@@ -27,20 +28,20 @@ class TeamWorld(World):
     their tags, in its places. Every robot needs a start, which the truth is drawn around; a filter
     for which it is unknown is made from `dataclasses.replace(robot, start=None)`.
 
-    The truth is that of one robot, so campaigns judge the filter whose `report` is the same; the
-    draws are the same for any report. Divergence limit and bound of a campaign are those of
-    that robot alone, started as robot 0 is.
+    The truth is one robot's, so campaigns judge the filter whose `report` is the same; the draws
+    are the same for any report. Divergence limit and bound of a campaign are computed for that
+    robot alone, started as robot 0 is.
 
     Raises ValueError on no robots, tags that clash, a robot without start, one that is not there to
     report, and as `Scenario` does.
     """
 
     robots: tuple[Robot, ...]
-    """R of them, in a list or tuple"""
+    """R robots, in a list or tuple"""
     landmarks: ArrayLike = field()
     """(N, 2)"""
     controls: ArrayLike = field()
-    """(T, ΣU), those of robot 0 first"""
+    """(T, ΣU) of all robots, robot 0 first"""
     _: KW_ONLY
     tags: tuple[int, ...] | None = static(default=None)
     """(R,) of the robots; default N, N + 1, …"""
@@ -54,7 +55,7 @@ class TeamWorld(World):
     visible: Visible = everywhere
     published: Mapping[str, Mapping[str, float]] = static(default=FrozenDict())
     source: str = static(default="")
-    """these three as of `Scenario`"""
+    """see `Scenario` for these three fields"""
 
     def __post_init__(self) -> None:
         count = int(np.shape(self.landmarks)[0]) if np.ndim(self.landmarks) == 2 else 0
@@ -91,7 +92,7 @@ class TeamWorld(World):
         dtype = jnp.result_type(float)
         key_motion, _, key_start = jax.random.split(key, 3)
         controls = jnp.asarray(self.controls, dtype)
-        first = drawn_near(jnp.asarray(self.pose, dtype), self.pose_cov, key_start)
+        first = random_pose(jnp.asarray(self.pose, dtype), self.pose_cov, key_start)
         ends, _, _ = sizes(self.robots)
         starts, poses, logged = [], [], []
         for b, robot in enumerate(self.robots):
@@ -99,7 +100,7 @@ class TeamWorld(World):
             start = first
             if robot.start is not None:
                 mean, cov = robot.start
-                start = se2.compose(first, drawn_near(jnp.asarray(mean, dtype), cov, own_key))
+                start = se2.compose(first, random_pose(jnp.asarray(mean, dtype), cov, own_key))
             robot_controls = controls[:, ends[b] - len(robot.motion.controls) : ends[b]]
             path, log = drive(
                 robot.motion, start, robot_controls, jax.random.fold_in(key_motion, b)
@@ -133,6 +134,9 @@ class TeamWorld(World):
                 if b == self.report:
                     missed.append(scans[-1][1])
         scan, _ = side_by_side(scans, sizes(robots)[2])
-        mine = jnp.stack(missed).sum(axis=0)
-        truth = Truth(poses[self.report], landmarks, mine, starts[self.report])
+        missed_by_robot = jnp.stack(missed).sum(axis=0)
+        truth = Truth(poses[self.report], landmarks, missed_by_robot, starts[self.report])
         return truth, Log(controls, scan)
+
+
+publish("jaxslam", TeamWorld)

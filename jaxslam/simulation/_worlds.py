@@ -4,7 +4,7 @@ key."""
 from collections.abc import Mapping
 from dataclasses import field
 from functools import partial
-from typing import Literal
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -13,13 +13,12 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam._origin import FAR, far_origin, moved, returned
+from jaxslam._public import publish
 from jaxslam.core._numbers import check_covariance, check_key, held_array, is_concrete
 from jaxslam.core._record import FrozenDict, hold_function, record, set_field, static
-from jaxslam.core._validation import call_traced, check_record
+from jaxslam.core._validation import check_record, reworded_tracer_errors
 from jaxslam.core.protocols import Component, Motion, Sensor
 from jaxslam.core.types import Log, Scan, Truth
-from jaxslam.filters._ekf.ekf_settings import EkfOptions
-from jaxslam.math._xla import moves_numbers
 from jaxslam.math.angles import wrap
 from jaxslam.sensors._suite import Suite
 from jaxslam.simulation._scans import (
@@ -31,7 +30,7 @@ from jaxslam.simulation._scans import (
     sensor_scans,
     side_by_side,
 )
-from jaxslam.simulation._spurious import Spurious, spoil
+from jaxslam.simulation.spurious import Spurious
 
 
 class World(Component):
@@ -43,7 +42,7 @@ class World(Component):
 
     motion: Motion
     sensor: Sensor
-    """the models that filters and bounds assume"""
+    """models that filters and bounds assume"""
     landmarks: ArrayLike
     """(N, L) true landmarks; the tag of one is its row. May be traced: maps vary under `vmap`."""
     controls: ArrayLike
@@ -55,37 +54,38 @@ class World(Component):
     places: int | None = None
     """M measurement slots of a scan; None for as many as there are landmarks."""
     spurious: Spurious | None = None
-    filter_options: EkfOptions = EkfOptions()
-    """keyword arguments of `filters.EkfSlam` that belong to the experiment: update, gate, …"""
+    filter_options: dict[str, Any] = FrozenDict()
+    """keyword arguments of `filters.EkfSlam` that belong to the experiment, as correction and gate;
+    the filters of the catalog have them"""
     published: Mapping[str, Mapping[str, float]] = FrozenDict()
     """figures of the paper, by filter and by the names of `consistency.Summary.measures`."""
     source: str = ""
-    """where the experiment is published."""
+    """publication of the experiment"""
     recorded_runs: int | None = None
-    """how many runs there are; None where they are drawn"""
+    """number of runs; None where they are drawn"""
 
     def __repr__(self) -> str:
         landmarks, models = np.shape(self.landmarks)[0], f"{self.motion.name}, {self.sensor.name}"
-        what = f"{self.name!r}, {self.steps} steps, {landmarks} landmarks, {models}"
-        return f"{type(self).__name__}({what})"
+        contents = f"{self.name!r}, {self.steps} steps, {landmarks} landmarks, {models}"
+        return f"{type(self).__name__}({contents})"
 
     def __post_init__(self) -> None:
-        what = f"{type(self).__name__} {self.name!r}"
+        title = f"{type(self).__name__} {self.name!r}"
         self._check(World, {"draw": "key"})
-        check_record(what, "motion", self.motion, Motion)
-        check_record(what, "sensor", self.sensor, Sensor)
-        _check_table(f"{what}: landmarks", self.landmarks, len(self.sensor.landmark))
-        _check_table(f"{what}: controls", self.controls, len(self.motion.controls))
+        check_record(title, "motion", self.motion, Motion)
+        check_record(title, "sensor", self.sensor, Sensor)
+        _check_table(f"{title}: landmarks", self.landmarks, len(self.sensor.landmark))
+        _check_table(f"{title}: controls", self.controls, len(self.motion.controls))
         if np.shape(self.pose) != (3,):
-            raise ValueError(f"{what}: pose: expected shape (3,), got {np.shape(self.pose)}")
-        _check_table(f"{what}: pose", np.reshape(self.pose, (1, -1)), 3)
-        check_covariance(f"{what}: pose_cov", self.pose_cov, 3)
+            raise ValueError(f"{title}: pose: expected shape (3,), got {np.shape(self.pose)}")
+        _check_table(f"{title}: pose", np.reshape(self.pose, (1, -1)), 3)
+        check_covariance(f"{title}: pose_cov", self.pose_cov, 3)
         for name in ("landmarks", "controls", "pose", "pose_cov"):
             if name in self.__dict__:
                 set_field(self, name, held_array(getattr(self, name)))
         for name in ("filter_options", "published"):
             if name in self.__dict__:
-                set_field(self, name, FrozenDict.of(f"{what}: {name}", getattr(self, name)))
+                set_field(self, name, FrozenDict.of(f"{title}: {name}", getattr(self, name)))
 
     @property
     def steps(self) -> int:
@@ -98,7 +98,7 @@ class World(Component):
 
     def run(self, key: Array, number: int | Array) -> tuple[Truth, Log]:
         """The history of run `number` of a campaign with that key; traceable."""
-        return drawn(self, run_keys(key, number)[0])
+        return draw_history(self, run_keys(key, number)[0])
 
 
 @record
@@ -130,28 +130,29 @@ class Scenario(World):
     spurious: Spurious | None = None
     """clutter, misses, outliers and wrong labels; where given, if only as `Spurious()`, the truth
     says which landmark each measurement is of, and associations are scored."""
-    filter_options: EkfOptions = static(default=FrozenDict())
-    """keyword arguments of `filters.EkfSlam` that belong to the experiment: update, gate, …"""
+    filter_options: dict[str, Any] = static(default=FrozenDict())
+    """keyword arguments of `filters.EkfSlam` that belong to the experiment, as correction and gate;
+    the filters of the catalog have them"""
     published: Mapping[str, Mapping[str, float]] = static(default=FrozenDict())
     """figures of the paper, by filter and by the names of `consistency.Summary.measures`."""
     source: str = static(default="")
-    """where the experiment is published."""
+    """publication of the experiment"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
-        what = f"Scenario {self.name!r}"
+        title = f"Scenario {self.name!r}"
         hold_function(self, "visible", "pose, l")
         if self.noise_on not in ("robot", "odometry"):
             raise ValueError(
-                f'{what}: expected noise_on "robot" or "odometry", got {self.noise_on!r}'
+                f'{title}: expected noise_on "robot" or "odometry", got {self.noise_on!r}'
             )
         if self.noise_on == "odometry" and self.motion.perturb is None:
-            raise ValueError(f"{what}: expected a motion with `perturb` for noise on the odometry")
+            raise ValueError(f"{title}: expected a motion with `perturb` for noise on the odometry")
         if self.places is not None and self.places < 1:
-            raise ValueError(f"{what}: expected places >= 1, got {self.places}")
+            raise ValueError(f"{title}: expected places >= 1, got {self.places}")
         if isinstance(self.sensor, Suite) and (self.places or self.spurious) is not None:
             raise ValueError(
-                f"{what}: expected neither places nor spurious with a suite: each Part has "
+                f"{title}: expected neither places nor spurious with a suite: each Part has "
                 "its own places"
             )
 
@@ -163,7 +164,7 @@ class Scenario(World):
         # Three keys without spurious measurements: faults do not change the other draws.
         keys = jax.random.split(key, 3 if self.spurious is None else 4)
         key_motion, key_scan, key_start = keys[:3]
-        start = drawn_near(jnp.asarray(self.pose, dtype), self.pose_cov, key_start)
+        start = random_pose(jnp.asarray(self.pose, dtype), self.pose_cov, key_start)
         poses, logged = drive(self.motion, start, controls, key_motion, self.noise_on)
         if isinstance(self.sensor, Suite):
             scan, missed = self._suite_scans(self.sensor, poses, landmarks, key_scan)
@@ -174,8 +175,8 @@ class Scenario(World):
         )
         truth = Truth(poses, landmarks, missed, start)
         if self.spurious is not None:
-            wrong = partial(spoil, self.spurious, self.sensor)
-            scan, origin = jax.vmap(wrong)(poses, scan, jax.random.split(keys[3], self.steps))
+            spoil = partial(self.spurious.spoil, self.sensor)
+            scan, origin = jax.vmap(spoil)(poses, scan, jax.random.split(keys[3], self.steps))
             truth = truth._replace(origin=origin)
         return truth, Log(logged, scan)
 
@@ -197,7 +198,6 @@ class Scenario(World):
         return side_by_side(scans, len(sensors.measurements))
 
 
-@moves_numbers
 def simulate(scenario: World, key: Array) -> tuple[Truth, Log]:
     """One random history of a world: the truth, and the log of controls and noisy scans.
 
@@ -211,34 +211,34 @@ def simulate(scenario: World, key: Array) -> tuple[Truth, Log]:
     float64, on the host: float32 could not hold it.
     """
     check_record("simulate", "scenario", scenario, World)
-    check_key("simulate", key)
-    near: World | None = None
-    origin = None
-    # A new array is a tracer where a trace is active, also where all arguments are constants.
-    if jnp.result_type(float) == jnp.float32 and is_concrete(scenario, key, jnp.zeros(())):
-        origin = far_origin(scenario.pose, scenario.landmarks, FAR)
-        near = None if origin is None else moved(scenario, origin, scenario.controls)
-    if near is None or origin is None:
-        found: tuple[Truth, Log] = _draw(scenario, key)
-        return found
-    truth, log = _draw(near, key)
-    return returned(jax.device_get(truth), origin), log
+    with jax.transfer_guard("allow"), reworded_tracer_errors(f"{scenario.name}: draw"):
+        check_key("simulate", key)
+        near: World | None = None
+        origin = None
+        # A new array is a tracer where a trace is active, also where all arguments are constants.
+        if jnp.result_type(float) == jnp.float32 and is_concrete(scenario, key, jnp.zeros(())):
+            origin = far_origin(scenario.pose, scenario.landmarks, FAR)
+            near = None if origin is None else moved(scenario, origin, scenario.controls)
+        if near is None or origin is None:
+            history: tuple[Truth, Log] = _draw(scenario, key)
+            return history
+        truth, log = _draw(near, key)
+        return returned(jax.device_get(truth), origin), log
 
 
 @partial(jax.jit, inline=True)
 def _draw(scenario: World, key: Array) -> tuple[Truth, Log]:
-    return drawn(scenario, key)
+    return draw_history(scenario, key)
 
 
-def drawn(scenario: World, key: Array) -> tuple[Truth, Log]:
+def draw_history(scenario: World, key: Array) -> tuple[Truth, Log]:
     """The truth and log that a world draws; raises ValueError on anything else."""
-    name = f"{scenario.name}: draw"
-    found = call_traced(name, scenario.draw, key)
-    kinds = tuple(map(type, found)) if isinstance(found, tuple) else (type(found),)
+    history = scenario.draw(key)
+    kinds = tuple(map(type, history)) if isinstance(history, tuple) else (type(history),)
     if kinds != (Truth, Log):
         got = ", ".join(kind.__name__ for kind in kinds)
-        raise ValueError(f"{name}: expected (Truth, Log), got {got}")
-    return found
+        raise ValueError(f"{scenario.name}: draw: expected (Truth, Log), got {got}")
+    return history
 
 
 def world_of_run(scenario: World, key: Array, number: int) -> tuple[Truth, Log]:
@@ -251,8 +251,9 @@ def world_of_run(scenario: World, key: Array, number: int) -> tuple[Truth, Log]:
         raise ValueError(
             f"{scenario.name}: expected a run from 0 to {most - 1}, the recorded ones, got {number}"
         )
-    found: tuple[Truth, Log] = _draw_run(scenario, key, number)
-    return found
+    with reworded_tracer_errors(f"{scenario.name}: draw"):
+        history: tuple[Truth, Log] = _draw_run(scenario, key, number)
+        return history
 
 
 @jax.jit
@@ -272,7 +273,7 @@ def with_positions(sensor: Sensor, truth: Truth) -> Truth:
     return truth._replace(landmarks=jax.vmap(sensor.position)(jnp.asarray(truth.landmarks)))
 
 
-def drawn_near(pose: Float[Array, "3"], cov: ArrayLike, key: Array) -> Float[Array, "3"]:
+def random_pose(pose: Float[Array, "3"], cov: ArrayLike, key: Array) -> Float[Array, "3"]:
     """A random pose, from the normal distribution of that mean and covariance (3, 3)."""
     start = pose + draw_gaussian(jnp.asarray(cov, pose.dtype), normals_like(key, pose))
     return start.at[2].set(wrap(start[2]))
@@ -311,3 +312,6 @@ def _check_table(name: str, values: ArrayLike, columns: int) -> None:
         raise ValueError(f"{name}: expected shape (N, {columns}) with N >= 1, got {table.shape}")
     if not np.issubdtype(table.dtype, np.number) or not np.all(np.isfinite(table)):
         raise ValueError(f"{name}: expected finite numbers")
+
+
+publish("jaxslam", World, Scenario, simulate)

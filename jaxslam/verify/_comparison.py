@@ -64,17 +64,17 @@ class _Compared(NamedTuple):
     gap: Values
     """largest difference among jacfwd, jacrev and hand in float64"""
     relative: Values
-    """the same over `scale`, as it is compared with the tolerance"""
+    """the gap over `scale`, as it is compared with the tolerance"""
     relative32: Values
-    """the same in float32"""
+    """the relative gap in float32"""
     from_quotient: Values
-    """the same from the quotients, where they converge"""
+    """the relative distance from the quotients, where they converge"""
     scale: Float[np.ndarray, "S m 1"]
     """the size of the row"""
     excess: Values
     """the largest of the three over its tolerance; above 1 the entry is wrong"""
     in_float32: Bool[np.ndarray, "S m n"]
-    """whether float32 exceeds its tolerance most"""
+    """mask of the entries where float32 exceeds its tolerance most"""
     no_derivative: int
     """number of states at which the quotients do not converge"""
 
@@ -132,11 +132,9 @@ def _beyond(gap: Values, rounding: np.ndarray, scale: np.ndarray, tolerance: flo
     return np.where((relative > tolerance) & (rest <= tolerance), rest, relative)
 
 
-def _finding(
-    evaluated: Evaluated, which: int, tolerance: float, float32_tolerance: float
-) -> Finding:
+def _finding(evaluated: Evaluated, k: int, tolerance: float, float32_tolerance: float) -> Finding:
     function, samples = evaluated.function, evaluated.samples
-    evaluation, argument = evaluated.by_argument[which], function.arguments[which]
+    evaluation, argument = evaluated.by_argument[k], function.arguments[k]
     compared = _compare(evaluation, tolerance, float32_tolerance)
     wrong = compared.excess > 1
     often = wrong.sum(axis=0)
@@ -190,18 +188,18 @@ def _finding(
         quotient=evaluation.how,
         samples=len(samples.labels),
         no_derivative=compared.no_derivative,
-        worst_state=_worst_state(compared, evaluated, which),
+        worst_state=_worst_state(compared, evaluated, k),
         wrong_entries=tuple(entries),
     )
 
 
-def _worst_state(compared: _Compared, evaluated: Evaluated, which: int) -> WorstState:
+def _worst_state(compared: _Compared, evaluated: Evaluated, k: int) -> WorstState:
     """The state and entry with the largest excess over a tolerance, wrong or not."""
     if not compared.excess.size:
         return {}
     s, i, j = (int(k) for k in np.unravel_index(np.argmax(compared.excess), compared.excess.shape))
     function = evaluated.function
-    entry = (function.outputs[i], function.arguments[which].entries[j])
+    entry = (function.outputs[i], function.arguments[k].entries[j])
     return {
         "label": evaluated.samples.labels[s],
         "entry": entry,

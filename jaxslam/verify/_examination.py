@@ -3,7 +3,7 @@
 import contextlib
 import copy
 from collections.abc import Callable, Iterator
-from typing import NamedTuple, TypeAlias
+from typing import TypeAlias
 
 import jax
 import numpy as np
@@ -21,62 +21,55 @@ from jaxslam.verify._inputs import samples
 from jaxslam.verify._inputs.functions import Function, motion_functions, sensor_functions
 from jaxslam.verify._inputs.samples import Samples
 from jaxslam.verify._jacobians import Evaluated, evaluate_jacobians
-from jaxslam.verify._loops import has_loop, limited
+from jaxslam.verify._loops import has_loop, limit_loops
 from jaxslam.verify._user_errors import describe_error
 from jaxslam.verify.linearity import motion_linearity, sensor_linearity
 
 Model: TypeAlias = Motion | Sensor | Factor | BeamModel | Callable[..., jax.Array]
 
 
-class _Examined(NamedTuple):
-    """All Jacobians of a model at all states, and the results of the other checks."""
-
-    evaluated: tuple[Evaluated, ...]
-    checks: tuple[Check, ...]
-    notes: tuple[str, ...]
-    """a missing mode of differentiation, loops, where a function of places is not finite"""
-    linearity: float | None
-
-
 def examine(
     model: Model,
     functions: tuple[Function, ...],
-    given: Samples | None = None,
+    states: Samples | None = None,
     count: int = 24,
     seed: int = 0,
-) -> _Examined:
+) -> tuple[tuple[Evaluated, ...], tuple[Check, ...], tuple[str, ...], float | None]:
     """Evaluate all Jacobians of a model, and run the other checks, in float64.
 
     Args:
         model: a `Motion`, a `Sensor`, or a function.
         functions: of the model, as from `functions_of`.
-        given: the states for the first function, instead of samples.
+        states: of the first function, instead of samples.
         count, seed: of the random states.
+    Returns:
+        The Jacobians of each function, the other checks, the notes (a missing mode of
+        differentiation, loops, where a function of places is not finite), and the linearity index.
     """
     with float64(), np.errstate(all="ignore"):
         model = _with_limited_loops(model, functions)
-        drawn = _samples_of(functions, model, count, seed)
-        if given is not None:
-            drawn = (given, *drawn[1:])
+        sampled = _samples_of(functions, model, count, seed)
+        if states is not None:
+            sampled = (states, *sampled[1:])
             if isinstance(model, Sensor) and model.landmark:
-                # Where `observe` fails, its own checks say so, and `invert` keeps the drawn states.
+                # Where `observe` fails, its own checks say so, and `invert` keeps its samples.
                 with contextlib.suppress(Exception, SystemExit):
-                    drawn = (given, samples.given_inverse(model, given, drawn[1]))
+                    sampled = (states, samples.inverse_samples(model, states, sampled[1]))
         evaluated = tuple(
-            evaluate_jacobians(f, sampled) for f, sampled in zip(functions, drawn, strict=True)
+            evaluate_jacobians(*pair) for pair in zip(functions, sampled, strict=True)
         )
         checks: list[Check] = []
-        for one in evaluated:
-            checks += [*one.checks, *properties.function_checks(one)]
+        for e in evaluated:
+            checks += [*e.checks, *properties.function_checks(e)]
             if isinstance(model, Motion | Sensor | BeamModel):
-                checks += properties.dtype_checks(one)
-        if all(one.values is not None for one in evaluated):  # else they fail for the same reason
-            checks += _model_checks(model, tuple(one.samples for one in evaluated))
-        notes = [note for one in evaluated for note in one.notes]
-        if given is None and not isinstance(model, Motion | Sensor):
-            notes += [note for one in evaluated for note in singular_notes(one)]
+                checks += properties.dtype_checks(e)
+        if all(e.values is not None for e in evaluated):  # else they fail for the same reason
+            checks += _model_checks(model, tuple(e.samples for e in evaluated))
+        notes = [note for e in evaluated for note in e.notes]
+        if states is None and not isinstance(model, Motion | Sensor):
+            notes += [note for e in evaluated for note in singular_notes(e)]
         linearity = _typical_linearity(model, evaluated[0])
-    return _Examined(evaluated, tuple(checks), tuple(notes), linearity)
+    return evaluated, tuple(checks), tuple(notes), linearity
 
 
 def functions_of(model: Motion | Sensor) -> tuple[Function, ...]:
@@ -96,17 +89,17 @@ def _with_limited_loops(model: Model, functions: tuple[Function, ...]) -> Model:
                 looping.append(function)
     model = copy.copy(model) if looping else model
     for function in looping:
-        set_field(model, function.name, limited(function.call))
+        set_field(model, function.name, limit_loops(function.call))
     return model
 
 
-def _model_checks(model: Model, drawn: tuple[Samples, ...]) -> Iterator[Check]:
+def _model_checks(model: Model, sampled: tuple[Samples, ...]) -> Iterator[Check]:
     """The checks of a motion model or a sensor as a whole."""
     try:
         if isinstance(model, Motion):
-            yield from properties.motion_checks(model, drawn[0])
+            yield from properties.motion_checks(model, sampled[0])
         elif isinstance(model, Sensor):
-            yield from properties.sensor_checks(model, *drawn)
+            yield from properties.sensor_checks(model, *sampled)
     except (Exception, SystemExit) as error:
         yield Check("the remaining checks", False, describe_error(error))
 
@@ -120,8 +113,10 @@ def _typical_linearity(model: Model, first: Evaluated) -> float | None:
         return None
     usual = [i for i, label in enumerate(first.samples.labels) if label in samples.NOMINAL]
     states = tuple(a[usual] for a in first.samples.values)
+    # The standard deviations of a usual start: 0.05 of an angle or inverse depth, 0.1 of all else.
     spread = [
-        np.array([_standard_deviation(e) for e in a.entries]) for a in first.function.arguments
+        np.array([0.05 if e.endswith(("[rad]", "[1/m]")) else 0.1 for e in argument.entries])
+        for argument in first.function.arguments
     ]
 
     def index(*state: jax.Array) -> jax.Array:
@@ -134,11 +129,6 @@ def _typical_linearity(model: Model, first: Evaluated) -> float | None:
         return float(np.median(np.asarray(quick_jit(jax.vmap(index))(*states))))
     except (Exception, SystemExit):  # the checks report what is wrong with the model
         return None
-
-
-def _standard_deviation(entry: str) -> float:
-    """The standard deviation of a start: 0.05 of an angle or inverse depth, 0.1 of all else."""
-    return 0.05 if entry.endswith(("[rad]", "[1/m]")) else 0.1
 
 
 def _samples_of(

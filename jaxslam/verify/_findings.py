@@ -35,7 +35,7 @@ class WrongEntry:
     dissent: tuple[str, ...]
     """the methods that disagree with the others at that state"""
     far_alone: bool = False
-    """it is wrong only at large coordinates, as if a subtraction lost digits"""
+    """True if it is wrong only at large coordinates, as if a subtraction lost digits"""
 
     def lines(self, samples: int) -> Iterator[str]:
         """The entry as lines of text."""
@@ -77,10 +77,11 @@ class Finding:
     rounding of autodiff, where only that is beyond the tolerance"""
     tolerance: float
     float32: float | None
-    """the same in float32; None where it was not computed"""
+    """largest relative difference in float32; None where it was not computed"""
     float32_tolerance: float
     differences: float | None
-    """the same from the quotients, where they converge; rounding is their estimated error"""
+    """largest relative difference from the quotients, where they converge; their estimated error
+    counts as rounding"""
     differences_tolerance: float
     quotient: str
     """the kind of quotient: differences or complex step"""
@@ -112,10 +113,10 @@ class Finding:
             worst += f", {self.quotient} {_two_digits(self.differences)}"
         if not (self.samples and math.isfinite(self.absolute)):
             worst = "a derivative is not finite" if self.samples else "no value is finite"
-        what = "hand-derived" if self.claimed else "no hand-derived claim"
+        claim = "hand-derived" if self.claimed else "no hand-derived claim"
         if not {"jacfwd", "jacrev"} & {*self.methods}:
-            what += f", compared with {self.quotient} alone"
-        yield f"{verdict}  {self.name} ({what}): {worst}; {self.samples} states{odd}"
+            claim += f", compared with {self.quotient} alone"
+        yield f"{verdict}  {self.name} ({claim}): {worst}; {self.samples} states{odd}"
         for entry in self.wrong_entries[:_SHOWN]:
             yield from (f"      {line}" for line in entry.lines(self.samples))
         if len(self.wrong_entries) > _SHOWN:
@@ -125,7 +126,7 @@ class Finding:
 
 @dataclass(frozen=True)
 class Check:
-    """The result of a check other than that of a Jacobian."""
+    """The result of a check, of a property other than a Jacobian."""
 
     name: str
     passed: bool
@@ -146,8 +147,8 @@ class Report:
     findings: tuple[Finding, ...] = ()
     checks: tuple[Check, ...] = ()
     linearity: float | None = None
-    """of a model, the median of `linearity_index` over the random states, for standard deviations
-    of 0.1 (0.05 of [rad] and [1/m])"""
+    """median of a model's `linearity_index` over the random states, for standard deviations of 0.1
+    (0.05 of [rad] and [1/m])"""
     notes: tuple[str, ...] = field(default=())
     """remarks that are not failures"""
 
@@ -191,7 +192,7 @@ class Report:
 
     def as_dict(self) -> dict[str, object]:
         """The report as a dictionary for JSON; numbers that are not finite are None."""
-        out = {
+        fields = {
             "model": self.model,
             "kind": self.kind,
             "passed": self.passed,
@@ -200,7 +201,7 @@ class Report:
             "linearity_index": self.linearity,
             "notes": self.notes,
         }
-        return {key: _json_value(part) for key, part in out.items()}
+        return {key: _json_value(part) for key, part in fields.items()}
 
 
 def report_table(reports: Sequence[Report]) -> str:
@@ -249,9 +250,9 @@ def _wrapped(text: str, indent: int) -> list[str]:
 
 
 def _worst(values: Sequence[float | None]) -> str:
-    """The largest of the values that are known, as text."""
-    known = [value for value in values if value is not None]
-    return _two_digits(max(known)) if known else "-"
+    """The largest of the values that are not None, as text."""
+    present = [value for value in values if value is not None]
+    return _two_digits(max(present)) if present else "-"
 
 
 def _two_digits(value: float) -> str:

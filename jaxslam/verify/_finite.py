@@ -11,9 +11,9 @@ import numpy as np
 from jaxslam.math._xla import quick_jit
 from jaxslam.verify._findings import Check
 from jaxslam.verify._inputs.functions import Function, at_state
-from jaxslam.verify._inputs.samples import coincident
+from jaxslam.verify._inputs.samples import coincident_states
 from jaxslam.verify._jacobians import MODES, Evaluated
-from jaxslam.verify._loops import ending, has_loop
+from jaxslam.verify._loops import has_loop, with_loop_end
 from jaxslam.verify._user_errors import describe_error, place_of_error
 
 State = Sequence[np.ndarray]
@@ -30,53 +30,53 @@ def finite_check(evaluated: Evaluated) -> Check:
         for how, jacobian in evaluation.single.items():
             parts[f"{how} by {argument.name} in float32"] = jacobian
     name, count = f"{function.name} and its derivatives are finite", len(samples.labels)
-    for what, part in parts.items():
+    for quantity, part in parts.items():
         bad = ~np.isfinite(part).all(axis=tuple(range(1, part.ndim)))
         if bad.any():
             i = int(np.argmax(bad))
             state = tuple(a[i] for a in samples.values)
-            hand = function.hand if what.startswith("hand") else None
-            where = _line_of_nan(function, state, hand, derivative=what != "a value")
+            hand = function.hand if quantity.startswith("hand") else None
+            where = _line_of_nan(function, state, hand, derivative=quantity != "a value")
             often = f"at {int(np.sum(bad))} of {count} states"
             at = f"{samples.labels[i]}: {at_state(function, state)}"
-            return Check(name, False, f"{where}{what} is not finite, {often}; {at}")
+            return Check(name, False, f"{where}{quantity} is not finite, {often}; {at}")
     return Check(name, True, f"{count} states")
 
 
 def singular_notes(evaluated: Evaluated) -> Iterator[str]:
-    """What is not finite with a place at the origin, or two places at one: a note for each.
+    """Notes on what is not finite with a place at the origin, or with two places at one point.
 
     A claim need not be defined there, so this is not a failure; but a gradient through it is NaN.
     """
     function = evaluated.function
     methods = [x.methods for x in evaluated.by_argument]
-    modes = [mode for mode in MODES if methods and all(mode in one for one in methods)]
+    modes = [mode for mode in MODES if methods and all(mode in by_mode for by_mode in methods)]
     if evaluated.values is None or not modes:
         return
     jacobian = MODES[modes[0]](function.call, argnums=tuple(range(len(function.arguments))))
 
     @quick_jit
     def both(*state: jax.Array) -> tuple[jax.Array, tuple[jax.Array, ...]]:
-        return ending(function.call)(*state)[0], ending(jacobian)(*state)[0]
+        return with_loop_end(function.call)(*state)[0], with_loop_end(jacobian)(*state)[0]
 
-    for label, state in coincident(function.arguments, evaluated.samples):
+    for label, state in coincident_states(function.arguments, evaluated.samples):
         try:
             value, by_argument = both(*state)
         except (Exception, SystemExit) as error:  # as of a callback
             yield f"{describe_error(error)}; with the {label}: {at_state(function, state)}"
             continue
         if not np.isfinite(value).all():
-            what = "the value"
+            quantity = "the value"
         elif bad := [
             argument.name
             for argument, part in zip(function.arguments, by_argument, strict=True)
             if not np.isfinite(part).all()
         ]:
-            what = f"the derivative by {' and '.join(bad)}"
+            quantity = f"the derivative by {' and '.join(bad)}"
         else:
             continue
-        where = _line_of_nan(function, state, None, derivative=what != "the value")
-        yield f"{where}{what} is not finite with the {label}: {at_state(function, state)}"
+        where = _line_of_nan(function, state, None, derivative=quantity != "the value")
+        yield f"{where}{quantity} is not finite with the {label}: {at_state(function, state)}"
 
 
 def _line_of_nan(
@@ -89,7 +89,7 @@ def _line_of_nan(
     with contextlib.suppress(Exception, SystemExit):  # one that cannot be traced is called
         if has_loop(jax.make_jaxpr(call)(*map(jnp.asarray, state)).jaxpr):
             return ""  # it might not end
-    try:  # JAX prints what it found
+    try:  # JAX prints where the number is
         with jax.debug_nans(True), jax.debug_infs(True), contextlib.redirect_stdout(io.StringIO()):
             call(*(jnp.asarray(a) for a in state))
     except (Exception, SystemExit) as error:

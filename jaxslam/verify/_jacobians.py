@@ -16,7 +16,7 @@ from jaxslam.verify._differences import Quotient, complex_step, quotients
 from jaxslam.verify._findings import Check
 from jaxslam.verify._inputs.functions import Function, as_claim, at_state, periods, split_claim
 from jaxslam.verify._inputs.samples import Samples
-from jaxslam.verify._loops import ROUNDS, ending, has_loop
+from jaxslam.verify._loops import ROUNDS, has_loop, with_loop_end
 from jaxslam.verify._user_errors import describe_error
 
 Values: TypeAlias = Float[np.ndarray, "_ _ _"]
@@ -41,10 +41,10 @@ class Jacobians(NamedTuple):
     methods: dict[str, Values]
     """jacfwd, jacrev and hand in float64; a method that failed is missing"""
     single: dict[str, Values]
-    """the same computed in float32, held in float64; 0 at states where a loop has not ended"""
+    """Jacobians computed in float32, held in float64; 0 at states where a loop has not ended"""
     single_error: np.ndarray
     """(S, m, n) error of autodiff in float32: of its arithmetic at the states rounded to float32,
-    plus that of rounding the states; () if unknown"""
+    plus the error of rounding the states; () if unknown"""
     quotient: Quotient | None
     how: str
     """the kind of quotient: differences or complex step"""
@@ -54,17 +54,17 @@ class Evaluated(NamedTuple):
     """A function with its values and Jacobians at the samples."""
 
     function: Function
-    """with its outputs named"""
+    """function with its outputs named"""
     samples: Samples
-    """those at which its loops end"""
+    """states at which the loops of the function end"""
     values: Float[np.ndarray, "S m"] | None
-    """in float64; None if the function cannot be called"""
+    """values in float64; None if the function cannot be called"""
     by_argument: tuple[Jacobians, ...]
     checks: tuple[Check, ...]
     notes: tuple[str, ...] = ()
     """remarks that are not failures"""
     loops: bool = False
-    """whether it has `while` loops"""
+    """True if the function has `while` loops"""
 
 
 def evaluate_jacobians(function: Function, samples: Samples) -> Evaluated:
@@ -175,7 +175,7 @@ class _Evaluator:
             self.samples = Samples(tuple(a[rows] for a in self.arguments), labels)
         return np.asarray(values[ended], np.float64)
 
-    def _check_loops(self, what: str, ended: Bool[np.ndarray, "S"]) -> None:
+    def _check_loops(self, subject: str, ended: Bool[np.ndarray, "S"]) -> None:
         """Add a failed check if the loops of something have not ended at some states."""
         if ended.all():
             return
@@ -183,7 +183,7 @@ class _Evaluator:
         state = at_state(self.function, [a[first] for a in self.arguments])
         self.checks.append(
             Check(
-                f"the loops of {what} end",
+                f"the loops of {subject} end",
                 False,
                 f"in float64 a while loop has not ended after {ROUNDS:,} rounds at "
                 f"{np.sum(~ended)} of {len(ended)} states; {self.samples.labels[first]}: {state}",
@@ -210,12 +210,12 @@ class _Evaluator:
         first = [jnp.asarray(a[0]) for a in self.arguments]
         call = self.function.call
         try:
-            out = jax.eval_shape(call, *first) if self.traceable else call(*first)
+            value = jax.eval_shape(call, *first) if self.traceable else call(*first)
         except (Exception, SystemExit) as error:
             self.checks.append(Check(f"{name} can be called", False, describe_error(error)))
             return None
-        shape = getattr(out, "shape", None)
-        if np.issubdtype(getattr(out, "dtype", float), np.complexfloating):
+        shape = getattr(value, "shape", None)
+        if np.issubdtype(getattr(value, "dtype", float), np.complexfloating):
             self.checks.append(
                 Check(
                     f"{name} returns its shape",
@@ -226,7 +226,7 @@ class _Evaluator:
             return None
         wanted = f"({len(named)},)" if named else "(m,)"
         if shape is None or len(shape) != 1 or (named and shape != (len(named),)):
-            got = type(out).__name__ if shape is None else shape
+            got = type(value).__name__ if shape is None else shape
             detail = f"returns {got} where an array of shape {wanted} is expected"
             self.checks.append(Check(f"{name} returns its shape", False, detail))
             return None
@@ -237,7 +237,7 @@ class _Evaluator:
     def values_and_ends(self) -> Callable[..., tuple[np.ndarray, np.ndarray]]:
         """The function of batches of arguments -> values (B, m), and (B,) whether its loops end."""
         if self.traceable:
-            return _in_chunks(quick_jit(jax.vmap(ending(self.function.call))))
+            return _in_chunks(quick_jit(jax.vmap(with_loop_end(self.function.call))))
         return _StateByState(self.function.call)
 
     def values(self, *arguments: States) -> np.ndarray:
@@ -249,13 +249,14 @@ class _Evaluator:
     def by_modes(self) -> Callable[..., PyTree]:
         """The function of batches of arguments -> by each mode, Jacobians and whether loops end."""
         jacobians = {
-            name: ending(MODES[name](self.function.call, argnums=self.over)) for name in self.modes
+            name: with_loop_end(MODES[name](self.function.call, argnums=self.over))
+            for name in self.modes
         }
 
-        def each(*arguments: jax.Array) -> PyTree:
+        def jacobians_at(*arguments: jax.Array) -> PyTree:
             return {name: jacobian(*arguments) for name, jacobian in jacobians.items()}
 
-        return quick_jit(jax.vmap(each))
+        return quick_jit(jax.vmap(jacobians_at))
 
     def _autodiff(
         self, arguments: tuple[States, ...]
@@ -283,7 +284,7 @@ class _Evaluator:
         return jacobians, np.logical_and.reduce([np.asarray(end) for _, end in by_mode.values()])
 
     def _one_mode_is_missing(self) -> bool:
-        """Whether the function has the other mode; the missing one is noted and not used.
+        """Whether one mode of differentiation is missing; it is noted and not used.
 
         A `while` loop has no reverse mode, a function with its own vector-Jacobian product
         (`jax.custom_vjp`) no forward mode.
@@ -327,7 +328,7 @@ class _Evaluator:
             first = [jnp.asarray(a[0]) for a in self.arguments]
             try:
                 shaped = self._split(jax.eval_shape(hand, *first))
-                batch: Callable[..., PyTree] = quick_jit(jax.vmap(ending(hand)))
+                batch: Callable[..., PyTree] = quick_jit(jax.vmap(with_loop_end(hand)))
             except (jax.errors.JAXTypeError, TypeError) as error:
                 shaped = self._split(hand(*first))  # raises again unless tracing was the fault
                 batch = _StateByState(hand)
@@ -363,25 +364,27 @@ class _Evaluator:
         names = [argument.name for argument in self.function.arguments]
         return split_claim(claim, len(self.function.outputs), names, self.sizes)
 
-    def _quotient(self, which: int) -> tuple[Quotient, str]:
+    def _quotient(self, k: int) -> tuple[Quotient, str]:
         """The Jacobian by differences or, where possible, by the complex step; and which it is."""
         circle = periods(self.function.outputs)
         arguments = self.arguments
         one_by_one = isinstance(self.values_and_ends, _StateByState)
         halvings = {"halvings": _FEW} if one_by_one else {}
-        found = quotients(self.values, arguments, which, circle, **halvings)
-        if not one_by_one and arguments[which].shape[1] and not np.isfinite(circle).any():
+        by_differences = quotients(self.values, arguments, k, circle, **halvings)
+        if not one_by_one and arguments[k].shape[1] and not np.isfinite(circle).any():
             try:
-                exact = complex_step(self.values, arguments, which)
+                exact = complex_step(self.values, arguments, k)
             except (Exception, SystemExit):
-                return found, "differences"
+                return by_differences, "differences"
             # Only where differences confirm it: `abs` and comparisons make it wrong.
-            off = np.abs(exact - found.value) > 10 * found.error + 1e-9 * np.abs(found.value)
-            if np.isfinite(exact).all() and not off[found.error < np.inf].any():
+            off = np.abs(exact - by_differences.value) > 10 * by_differences.error + 1e-9 * np.abs(
+                by_differences.value
+            )
+            if np.isfinite(exact).all() and not off[by_differences.error < np.inf].any():
                 rounding = 1e-14 * np.abs(exact).max(axis=2, keepdims=True, initial=0)
                 error = np.broadcast_to(rounding, exact.shape)
-                return Quotient(exact, error, found.kink), "complex step"
-        return found, "differences"
+                return Quotient(exact, error, by_differences.kink), "complex step"
+        return by_differences, "differences"
 
 
 def _in_chunks(batch: Callable[..., PyTree]) -> Callable[..., tuple[np.ndarray, np.ndarray]]:

@@ -19,12 +19,12 @@ ROUNDS = 10_000
 ends long before, and a batch of states takes this many in seconds"""
 
 
-def ending(function: Callable[..., PyTree]) -> Callable[..., tuple[PyTree, jax.Array]]:
+def with_loop_end(function: Callable[..., PyTree]) -> Callable[..., tuple[PyTree, jax.Array]]:
     """The function (arguments) -> its result, and () bool: whether its loops ended by themselves.
 
-    Where they did not, the result is that after `ROUNDS` rounds. Of a derivative take
-    ending(jax.jacfwd(f)) and not jax.jacfwd(ending(f)): so the loops of derivative rules are
-    limited, and these rules are used.
+    Where they did not, the result is that after `ROUNDS` rounds. For a derivative use
+    with_loop_end(jax.jacfwd(f)), not jax.jacfwd(with_loop_end(f)): then loops in derivative rules
+    are limited, and these rules are used.
     """
 
     def call(*arguments: PyTree) -> tuple[PyTree, jax.Array]:
@@ -37,11 +37,11 @@ def ending(function: Callable[..., PyTree]) -> Callable[..., tuple[PyTree, jax.A
     return call
 
 
-def limited(function: _F) -> _F:
+def limit_loops(function: _F) -> _F:
     """The function with limited loops, NaN where they have not ended; also if differentiated."""
 
     def until_limit(function: Callable[..., PyTree], *arguments: PyTree) -> PyTree:
-        values, ended = ending(function)(*arguments)
+        values, ended = with_loop_end(function)(*arguments)
         return jax.tree.map(lambda value: jnp.where(ended, value, jnp.nan), values)
 
     @jax.custom_jvp
@@ -121,16 +121,16 @@ def _while(
     of_cond, of_body = params["cond_nconsts"], params["body_nconsts"]
     for_cond, for_body = inputs[:of_cond], inputs[of_cond : of_cond + of_body]
 
-    def going_on(values: list[Any], left: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def condition(values: list[Any], left: jax.Array) -> tuple[jax.Array, jax.Array]:
         (go_on,), left = _evaluate(params["cond_jaxpr"], [*for_cond, *values], left)
         return go_on & (left > 0), left
 
-    def more(state: tuple[list[Any], jax.Array]) -> jax.Array:
-        return going_on(*state)[0].any()
+    def goes_on(state: tuple[list[Any], jax.Array]) -> jax.Array:
+        return condition(*state)[0].any()
 
     def body(state: tuple[list[Any], jax.Array]) -> tuple[list[Any], jax.Array]:
         values, left = state
-        go_on, _ = going_on(values, left)
+        go_on, _ = condition(values, left)
         new, left = _evaluate(params["body_jaxpr"], [*for_body, *values], left)
         if go_on.ndim:  # a `vmap` inside, as of jacfwd: a part that has ended stays as it is
             new = [
@@ -139,21 +139,21 @@ def _while(
             ]
         return new, jnp.maximum(left - 1, 0)
 
-    return jax.lax.while_loop(more, body, (inputs[of_cond + of_body :], left))
+    return jax.lax.while_loop(goes_on, body, (inputs[of_cond + of_body :], left))
 
 
 def _scan(equation: Any, inputs: list[Any], left: jax.Array) -> tuple[list[Any], jax.Array]:
     """A scan with loops inside, which share the rounds that are left."""
     program, reverse = equation.params["jaxpr"], equation.params["reverse"]
 
-    def same(outside: Sequence[Any], inside: Sequence[Any]) -> int:
-        """How many come before those with the axis of the scan."""
+    def count_whole(outside: Sequence[Any], inside: Sequence[Any]) -> int:
+        """The number of variables that enter whole; those with the axis of the scan come after."""
         pairs = zip(outside, inside, strict=True)
         return sum(len(a.aval.shape) == len(b.aval.shape) for a, b in pairs)
 
     # The parameters that say what is a constant and what is carried differ between versions of JAX.
-    end = same(equation.invars, program.jaxpr.invars)
-    carried = same(equation.outvars, program.jaxpr.outvars)
+    end = count_whole(equation.invars, program.jaxpr.invars)
+    carried = count_whole(equation.outvars, program.jaxpr.outvars)
     consts = inputs[: end - carried]
 
     def step(state: tuple[list[Any], jax.Array], x: list[Any]) -> tuple[Any, list[Any]]:
@@ -171,11 +171,11 @@ def _cond(
 ) -> tuple[list[Any], jax.Array]:
     """A branch, with loops in some of the branches."""
 
-    def of(branch: Any) -> Callable[..., tuple[list[Any], jax.Array]]:
+    def evaluate(branch: Any) -> Callable[..., tuple[list[Any], jax.Array]]:
         return lambda left, *operands: _evaluate(branch, operands, left)
 
-    which, *operands = inputs
+    index, *operands = inputs
     outputs: tuple[list[Any], jax.Array] = jax.lax.switch(
-        which, [of(branch) for branch in params["branches"]], left, *operands
+        index, [evaluate(branch) for branch in params["branches"]], left, *operands
     )
     return outputs

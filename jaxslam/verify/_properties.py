@@ -18,7 +18,7 @@ from jaxslam.verify._finite import finite_check
 from jaxslam.verify._inputs.functions import Function, at_state, periods, sensor_functions
 from jaxslam.verify._inputs.samples import NOMINAL, Samples
 from jaxslam.verify._jacobians import Evaluated
-from jaxslam.verify._loops import limited
+from jaxslam.verify._loops import limit_loops
 from jaxslam.verify._user_errors import describe_error
 
 Values: TypeAlias = np.ndarray
@@ -26,7 +26,7 @@ Values: TypeAlias = np.ndarray
 _ROUNDING = 1e-9
 """tolerance of round trips in float64, relative to the coordinates"""
 _GAUSS_NEWTON = 12
-"""number of iterations"""
+"""number of Gauss-Newton iterations for the free coordinates of a landmark"""
 
 
 def function_checks(evaluated: Evaluated) -> Iterator[Check]:
@@ -92,19 +92,19 @@ def sensor_checks(sensor: Sensor, seen: Samples, inverse: Samples) -> Iterator[C
     if not all(check.passed for check in size):
         yield from size
         return
-    other = z[::-1] + np.random.default_rng(0).uniform(-1, 1, z.shape)
+    z_hat = z[::-1] + np.random.default_rng(0).uniform(-1, 1, z.shape)
     yield from _guard(
         "the residual is zero at equality",
         lambda: _exactly(residual(z, z)),
     )
     yield from _guard(
         "the residual is antisymmetric",
-        lambda: _deviation(residual(z, other) + residual(other, z), circle),
+        lambda: _deviation(residual(z, z_hat) + residual(z_hat, z), circle),
     )
     wrapped = ", wrapped on the circle" if np.isfinite(circle).any() else ""
     yield from _guard(
         f"the residual is a difference{wrapped}",
-        lambda: _residual_error(residual, z, other, circle),
+        lambda: _residual_error(residual, z, z_hat, circle),
     )
     yield from _guard("angles have [rad] in their names", lambda: _unnamed_angle(sensor, seen))
     if not sensor.landmark:
@@ -159,13 +159,17 @@ def _inversion_error(sensor: Sensor, seen: Samples) -> str:
         point = seen.values[1]
     mean = np.asarray(sensor.free.mean, np.float64)
     spread = np.sqrt(np.diagonal(np.asarray(sensor.free.cov, np.float64)))
+    circular = np.isfinite(circle := periods(sensor.landmark))
+    period = np.where(circular, circle, 1.0)
 
     def gap(pose: jax.Array, point: jax.Array) -> jax.Array:
         landmark = sensor.embed(pose, point)
         z = sensor.observe(pose, landmark)
 
         def miss(s: jax.Array) -> jax.Array:
-            return _wrap_named(sensor.invert(pose, z, s) - landmark, sensor.landmark)
+            difference = sensor.invert(pose, z, s) - landmark
+            turns = jnp.round(difference / period)
+            return difference - jnp.where(circular, turns * period, 0.0)
 
         if not len(mean):
             return jnp.abs(miss(jnp.zeros(0, pose.dtype))).max()
@@ -191,29 +195,21 @@ def _inversion_error(sensor: Sensor, seen: Samples) -> str:
     )
 
 
-def _wrap_named(difference: Float[jax.Array, "L"], names: tuple[str, ...]) -> jax.Array:
-    """A difference of named entries, with angles wrapped."""
-    circle = periods(names)
-    circular = np.isfinite(circle)
-    turn = np.where(circular, circle, 1.0)
-    return difference - jnp.where(circular, turn * jnp.round(difference / turn), 0.0)
-
-
 def _residual_error(
-    residual: Callable[[Values, Values], jax.Array], z: Values, other: Values, circle: Values
+    residual: Callable[[Values, Values], jax.Array], z: Values, z_hat: Values, circle: Values
 ) -> str:
     """What is wrong with residual(z, ẑ) = z - ẑ modulo the periods, or ""."""
-    plain = np.asarray(residual(z, other))
+    plain = np.asarray(residual(z, z_hat))
     circular = np.isfinite(circle)
     period = np.where(circular, circle, 1.0)
-    off = modulo_periods(plain - modulo_periods(z - other, circle), circle)
+    off = modulo_periods(plain - modulo_periods(z - z_hat, circle), circle)
     if np.abs(off).max() > _ROUNDING * (1 + np.abs(z).max()):
         return f"residual(z, ẑ) differs from z - ẑ by {np.abs(off).max():.3g}"
     if np.any(np.abs(plain)[:, circular] > period[circular] / 2 + 1e-12):
         return "it returns an angle beyond half a turn"
     for turns in (1, -3):
-        whole = np.where(circular, turns * period, 0.0)
-        far = np.abs(np.asarray(residual(z + whole, other)) - plain)
+        shift = np.where(circular, turns * period, 0.0)
+        far = np.abs(np.asarray(residual(z + shift, z_hat)) - plain)
         far = np.where(circular, np.minimum(far, np.abs(far - period)), far)
         if far.max() > 1e-8:
             return "adding whole turns to z changes the residual"
@@ -243,7 +239,7 @@ def _deviation(difference: ArrayLike, circle: Float[np.ndarray, "m"]) -> str:
 
 
 def _exactly(difference: ArrayLike) -> str:
-    """As `_deviation`, for entries that are not on a circle."""
+    """The `_deviation` of entries that are not on a circle."""
     return _deviation(difference, np.full(np.shape(difference)[-1], np.inf))
 
 
@@ -251,7 +247,7 @@ def _pure(function: Function, evaluated: Evaluated) -> str:
     """Whether the function agrees with itself when called twice, and under jit and vmap; or ""."""
     assert evaluated.values is not None
     finite = np.flatnonzero(np.isfinite(evaluated.values).all(axis=1))
-    call = limited(function.call) if evaluated.loops else function.call
+    call = limit_loops(function.call) if evaluated.loops else function.call
     for i in finite[[0, -1]] if len(finite) else ():
         state = tuple(jnp.asarray(a[i]) for a in evaluated.samples.values)
         first, second = (np.asarray(call(*state), np.float64) for _ in range(2))
@@ -270,9 +266,9 @@ def _dtypes(function: Function, samples: Samples) -> str:
     """Which dtype is not kept, or ""."""
     for dtype in (np.float32, np.float64):
         shapes = (jax.ShapeDtypeStruct(a.shape[1:], dtype) for a in samples.values)
-        out = jax.eval_shape(function.call, *shapes)
-        if out.dtype != dtype:
-            return f"{np.dtype(dtype).name} in, {out.dtype} out"
+        result = jax.eval_shape(function.call, *shapes)
+        if result.dtype != dtype:
+            return f"{np.dtype(dtype).name} in, {result.dtype} out"
     return ""
 
 

@@ -80,7 +80,7 @@ def verify_jacobians(
             pose, frame, landmark, l or point need not be given, nor others where `states` are.
         outputs: of a function, the names of its outputs with units; [rad] is modulo 2π.
         states: your own states, one array (S, n_k) an argument, instead of the sampled ones. For a
-            sensor those of `observe`; `invert` is tried at the measurements of these.
+            sensor the states of `observe`; `invert` is tried at their measurements.
         name: name of a function in the report; default: its `__name__`.
         count: number of random states.
         seed: seed of the random states.
@@ -103,8 +103,7 @@ def verify_jacobians(
     if not (isinstance(model, Motion | Sensor | Factor | BeamModel) or callable(model)):
         raise ValueError(
             "verify_jacobians: expected a Motion, a Sensor, a Factor, a BeamModel or a function of "
-            f"vectors, got "
-            f"{type(model).__name__}"
+            f"vectors, got {type(model).__name__}"
         )
     if (
         not isinstance(model, Motion | Sensor | Factor | BeamModel)
@@ -112,11 +111,11 @@ def verify_jacobians(
         and makes_a_model(model)
     ):
         factory = getattr(model, "__name__", "factory")
-        what = "class" if isinstance(model, type) else "factory"
+        factory_kind = "class" if isinstance(model, type) else "factory"
         parameters = inspect.signature(model).parameters.values()
         noise = "noise_cov" if any(p.default is p.empty for p in parameters) else ""
         raise ValueError(
-            f"verify_jacobians: expected a Motion, a Sensor or a Factor, got the {what} "
+            f"verify_jacobians: expected a Motion, a Sensor or a Factor, got the {factory_kind} "
             f"{factory} of one: call it, as in {factory}({noise}), or use "
             f"jaxslam.verify.build({factory})"
         )
@@ -138,25 +137,27 @@ def verify_jacobians(
         with float64():
             functions = (plain_function(model, jacobian, arguments, outputs, name, states),)
         kind, name = "function", functions[0].name
-    given = None
+    samples = None
     if states is not None:
-        given = _given_samples(functions[0], states, by_name=kind == "function" and not arguments)
-    if given is None and isinstance(model, BeamModel):
-        given = beam_samples(model, count, seed)
-    examined = examine(model, functions, given, count, seed)
+        samples = _samples_of_states(
+            functions[0], states, by_name=kind == "function" and not arguments
+        )
+    if samples is None and isinstance(model, BeamModel):
+        samples = beam_samples(model, count, seed)
+    evaluated, checks, notes, linearity = examine(model, functions, samples, count, seed)
     with np.errstate(all="ignore"):
         findings = [
             finding
-            for evaluated in examined.evaluated
-            for finding in compare_methods(evaluated, tolerance, float32_tolerance)
+            for of_function in evaluated
+            for finding in compare_methods(of_function, tolerance, float32_tolerance)
         ]
-    return Report(name, kind, tuple(findings), examined.checks, examined.linearity, examined.notes)
+    return Report(name, kind, tuple(findings), checks, linearity, notes)
 
 
 def build(
     factory: Callable[..., Motion | Sensor | BeamModel | Factor],
 ) -> Motion | Sensor | BeamModel | Factor:
-    """A model made by a class or factory like those of the registries: with noise 0.01 I unless
+    """A model made by a class or factory of the registries' form: with noise 0.01 I unless
     noise has a default, or, of a beam model, with the maximum range of the trial; a factor with
     nothing.
 
@@ -166,13 +167,13 @@ def build(
     parameters = inspect.signature(factory).parameters
     mounted = {"mount": _MOUNT} if "mount" in parameters else {}
     if "max_range" in parameters:
-        made = factory(max_range=FAR, **mounted)
-        if isinstance(made, BeamModel):
-            return made
+        model = factory(max_range=FAR, **mounted)
+        if isinstance(model, BeamModel):
+            return model
     if all(p.default is not p.empty for p in parameters.values()):
-        made = factory(**mounted)
-        if isinstance(made, Factor | Motion | Sensor):
-            return made
+        model = factory(**mounted)
+        if isinstance(model, Factor | Motion | Sensor):
+            return model
     probe = factory(lambda *_: None)
     if not isinstance(probe, Motion | Sensor):
         raise ValueError(f"expected a Motion or a Sensor, got {type(probe).__name__}")
@@ -180,7 +181,9 @@ def build(
     return factory(0.01 * np.eye(size), **mounted)
 
 
-def _given_samples(function: Function, states: Sequence[ArrayLike], *, by_name: bool) -> Samples:
+def _samples_of_states(
+    function: Function, states: Sequence[ArrayLike], *, by_name: bool
+) -> Samples:
     """The states of the caller; raises ValueError on a wrong shape.
 
     by_name: whether lengths may follow from the names of the arguments.

@@ -16,7 +16,9 @@ from jaxslam.math._linalg import root_psd
 __all__ = ["Linearity", "linearity_index", "motion_linearity", "sensor_linearity"]
 
 _DIRECTIONS = 64
+"""number of fixed random directions in which the region is sampled"""
 _RADII = (1.0, 0.5)
+"""radii of the sampled points, in radii of the region"""
 
 
 class Linearity(NamedTuple):
@@ -27,13 +29,13 @@ class Linearity(NamedTuple):
     """
 
     hessian: Float[Array, ""]
-    """largest of the outputs, to second order"""
+    """largest index of an output, to second order"""
     sampled: Float[Array, ""]
-    """largest of the outputs, at points of the region"""
+    """largest index of an output, at points of the region"""
     hessian_rows: Float[Array, "m"]
-    """of each output, to second order"""
+    """index of each output, to second order"""
     sampled_rows: Float[Array, "m"]
-    """of each output, at points of the region"""
+    """index of each output, at points of the region"""
 
 
 def linearity_index(
@@ -55,9 +57,9 @@ def linearity_index(
 
     the supremum once to second order, (n_σ²/2)‖Lᵀ H_i L‖₂, and once as the maximum over points of
     the region: along ± each axis and ± each eigenvector of Lᵀ H_i L, and in 64 fixed random
-    directions, at n_σ and n_σ/2. It has no unit, and changing those of x changes nothing. R, where
-    given, is the covariance of noise added to f: a smaller departure does no harm. (Civera, Davison
-    & Montiel 2008 use a related index, along the line of sight.)
+    directions, at n_σ and n_σ/2. The index has no unit, and the units of x do not change it. R,
+    where given, is the covariance of noise added to f: a smaller departure does no harm. (Civera,
+    Davison & Montiel 2008 use a related index, along the line of sight.)
 
     Traceable: wrap it in `jax.jit`, or in `jax.vmap` over states.
 
@@ -98,7 +100,9 @@ def linearity_index(
     by_hessian = sigmas**2 / 2 * jnp.max(jnp.abs(values), axis=1, initial=0.0)
     by_hessian = jnp.where(smooth, by_hessian, jnp.inf)
 
-    axes, random = jnp.eye(len(zero), dtype=point.dtype), _random_directions(len(zero), point.dtype)
+    axes = jnp.eye(len(zero), dtype=point.dtype)
+    draws = np.random.default_rng(0).normal(size=(_DIRECTIONS, len(zero)))
+    random = jnp.asarray(draws / np.linalg.norm(draws, axis=1, keepdims=True), point.dtype)
     eigenvectors = jnp.swapaxes(jax.lax.stop_gradient(vectors), 1, 2).reshape(-1, len(zero))
     directions = jnp.concatenate([axes, random, eigenvectors])
     tries = jnp.concatenate([sign * r * directions for r in _RADII for sign in (1, -1)]) * sigmas
@@ -170,11 +174,11 @@ def sensor_linearity(
 
 def _vector(name: str, value: ArrayLike, size: int | None = None) -> Float[Array, "n"]:
     """A value as a floating-point vector; raises ValueError on another shape."""
-    out = jnp.asarray(value)
-    if out.ndim != 1 or size not in (None, out.shape[0]):
+    vector = jnp.asarray(value)
+    if vector.ndim != 1 or size not in (None, vector.shape[0]):
         expected = "(n,)" if size is None else f"({size},)"
-        raise ValueError(f"{name}: expected shape {expected}, got {out.shape}")
-    return out.astype(jnp.result_type(out, float))
+        raise ValueError(f"{name}: expected shape {expected}, got {vector.shape}")
+    return vector.astype(jnp.result_type(vector, float))
 
 
 def _index(bend: Float[Array, "m"], sigmas: float, reach2: Float[Array, "m"]) -> Float[Array, "m"]:
@@ -184,9 +188,3 @@ def _index(bend: Float[Array, "m"], sigmas: float, reach2: Float[Array, "m"]) ->
     bend, reach2 = jnp.where(defined, bend, 0.0), jnp.where(defined & ~flat, reach2, 1.0)
     ratio = jnp.where(flat & (bend > 0), jnp.inf, bend / (sigmas * jnp.sqrt(reach2)))
     return jnp.where(defined, jnp.where(flat & (bend == 0), 0.0, ratio), jnp.inf)
-
-
-def _random_directions(n: int, dtype: np.dtype[np.floating]) -> Float[Array, "K n"]:
-    """Fixed random unit vectors (64, n)."""
-    draws = np.random.default_rng(0).normal(size=(_DIRECTIONS, n))
-    return jnp.asarray(draws / np.linalg.norm(draws, axis=1, keepdims=True), dtype)

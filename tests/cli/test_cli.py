@@ -12,9 +12,8 @@ import pytest
 from worlds import three_parameters
 
 import jaxslam
-from jaxslam import _catalog as catalog
 from jaxslam import _cli as cli
-from jaxslam import scenarios
+from jaxslam import catalog, scenarios
 from jaxslam._cli import common
 from jaxslam.consistency.campaign import Interrupted
 from jaxslam.results import _campaign_files as campaign_files
@@ -137,7 +136,7 @@ def test_particles_are_named_as_any_filter_and_all_spans_them(tmp_path, monkeypa
 
     monkeypatch.setattr(cli.consistency, "monte_carlo", begun)
     assert cli.main([*QUICK, "--filters", asked, "--out", str(tmp_path / "out")]) == 130
-    assert seen == (list(catalog.ALL) if asked == "all" else list(catalog.PARTICLES))
+    assert seen == (list(catalog.ALL) if asked == "all" else list(catalog.KINDS["particles"]))
 
 
 def test_a_filter_that_cannot_run_a_scenario_is_refused_by_name(tmp_path, refused, monkeypatch):

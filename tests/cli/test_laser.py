@@ -23,7 +23,7 @@ from jaxslam.core.types import Estimate
 from jaxslam.math import numpy_poses as poses
 from jaxslam.results import _report as report
 from jaxslam.results import plot
-from jaxslam.simulation._walls import is_free
+from jaxslam.simulation._wall_geometry import is_free
 from jaxslam.simulation.laser import scan_world
 from jaxslam.simulation.scenarios import square
 from jaxslam.simulation.walls import make_walls, rasterize

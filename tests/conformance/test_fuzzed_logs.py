@@ -16,8 +16,7 @@ import worlds
 from cases import swept
 from hypothesis import given, settings
 
-from jaxslam import _catalog as catalog
-from jaxslam import run
+from jaxslam import catalog, run
 from jaxslam.core._numbers import largest
 from jaxslam.core._validation import check_log
 from jaxslam.core.protocols import Filter

@@ -11,14 +11,11 @@ import worlds
 from cases import refused, swept
 from layouts import kept_programs, wrong_layouts
 
-from jaxslam import _catalog as catalog
-from jaxslam import charts, linearize, motion, sensors
-from jaxslam._driver import run
-from jaxslam.core.protocols import Filter, Here
+from jaxslam import catalog, charts, linearize, motion, run, sensors, simulate
+from jaxslam.core.protocols import Filter, LinearizationPoint
 from jaxslam.core.types import Status
 from jaxslam.filters import EkfSlam
 from jaxslam.graphs.smoothing._forward_pass import LogEstimator
-from jaxslam.simulation._worlds import simulate
 from jaxslam.simulation.scenarios import SCENARIOS, loop, stationary
 
 KEY = jax.random.key(0)
@@ -56,11 +53,11 @@ def test_what_draws_instead_of_linearizing_fits_a_scenario_of_bearings():
     truth, log = jax.eval_shape(partial(simulate, world), jax.random.key(0))
 
     def go(name, truth, log):
-        candidate = catalog.PARTICLES[name](world, watch=True)
+        candidate = catalog.ALL[name](world, watch=True)
         filter = candidate if isinstance(candidate, Filter) else candidate(truth)
         return run(filter, log, world.pose, world.pose_cov, KEY)
 
-    for name in catalog.PARTICLES:
+    for name in catalog.KINDS["particles"]:
         assert_shapes_of_particles(jax.eval_shape(partial(go, name), truth, log), world, 3)
 
 
@@ -132,7 +129,7 @@ def test_other_numbers_run_what_is_there(name):
     assert (compiled, wrong_layouts) == (0, [])
     assert np.isfinite(second.estimate.pose).all()
     assert not np.allclose(first.estimate.pose, second.estimate.pose)
-    if name in catalog.PARTICLES:
+    if name in catalog.KINDS["particles"]:
         assert_shapes_of_particles(first, around()[0], 80)
         assert_shapes_of_particles(second, still()[0], 80)
 
@@ -241,7 +238,7 @@ def test_linearization_points_solve_the_constrained_least_squares():
     u = np.array([0.25, 0.025, 1.0])
     moved, by_pose, _, after = jax.jit(
         lambda joint: oc.motion(
-            world.motion, u, Here(joint, charts.Euclidean(), joint.pose, jnp.eye(3))
+            world.motion, u, LinearizationPoint(joint, charts.Euclidean(), joint.pose, jnp.eye(3))
         )
     )(joint)
     # Unknown p*; l*_i = p* + d_i: stacked, each coordinate is a mean of p̂ and the l̂_i - d_i.
@@ -264,8 +261,8 @@ def test_all_variants_have_the_process_noise_of_the_standard_filter():
 
         def noise(pose, filter=filter, linearizer=linearizer):
             joint = filter.init(pose, jnp.eye(3) * 0.01)
-            here = Here(joint, charts.Euclidean(), joint.pose, jnp.eye(3))
-            return linearizer.motion(world.motion, u, here)[2]
+            point = LinearizationPoint(joint, charts.Euclidean(), joint.pose, jnp.eye(3))
+            return linearizer.motion(world.motion, u, point)[2]
 
         noises.append(jax.jit(noise)(np.array([1.0, 2.0, 0.3])))
     np.testing.assert_array_equal(noises[0], noises[1])
@@ -385,7 +382,7 @@ def test_information_filters_stand_beside_the_family():
     """All active, they are the EKF by other numbers; what they do not know of is left out."""
     plain = around_and_still("ekf")[0]
     for name in ("eif_slam", "seif"):
-        assert catalog.CANONICAL[name](worlds.ring(steps=2)).name == name
+        assert catalog.ALL[name](worlds.ring(steps=2)).name == name
         trace = around_and_still(name)[0]
         np.testing.assert_allclose(trace.estimate.pose, plain.estimate.pose, atol=1e-8)
         np.testing.assert_allclose(trace.estimate.pose_cov, plain.estimate.pose_cov, atol=1e-8)
@@ -394,9 +391,7 @@ def test_information_filters_stand_beside_the_family():
 # --- refusals -----------------------------------------------------------------------------------
 
 
-@pytest.mark.parametrize(
-    "table", ["FILTERS", "BASELINES", "PARTICLES", "CANONICAL", "SMOOTHERS", "KINDS", "ALL"]
-)
+@pytest.mark.parametrize("table", ["FILTERS", "SMOOTHERS", "KINDS", "ALL"])
 def test_an_unknown_name_is_told_with_the_names_there_are(table):
     known = getattr(catalog, table)
     name = next(iter(known))

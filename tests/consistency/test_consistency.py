@@ -59,11 +59,11 @@ def _statistics(trace, truth):
     return jax.vmap(lambda a, b: run_statistics(a, b, SENSOR))(trace, truth)
 
 
-def scored(trace, truth, own_error_of=None):
+def scored(trace, truth, chart_error_of=None):
     """The scores of all runs. Their statistics are by one program, of `TOGETHER` runs: repeated, so
     that they are a multiple of it."""
     given = jax.tree.map(np.asarray, (trace, truth))
-    own = None if own_error_of is None else np.asarray(own_error_of(*given))
+    own = None if chart_error_of is None else np.asarray(chart_error_of(*given))
     runs = len(given[1].pose)
     more = jax.tree.map(lambda leaf: leaf[np.arange(-runs % TOGETHER + runs) % runs], given)
     found = [

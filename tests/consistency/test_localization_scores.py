@@ -68,7 +68,7 @@ def scores(error):
 def test_the_summary_averages_runs_and_says_which_are_lost():
     error = np.array([[3.0, 0.1, 0.1, 0.1], [3.0, 3.0, 0.3, 0.1], [0.1, 0.1, 0.1, 2.0]])
     found = consistency.summarize_localization(scores(error), skip=1)
-    np.testing.assert_array_equal(found.found, [1, 2, np.inf])
+    np.testing.assert_array_equal(found.converged_at, [1, 2, np.inf])
     assert found.lost == pytest.approx(1 / 3)
     assert found.coverage.value == pytest.approx(np.mean([1, 1 / 3, 2 / 3]))
     assert found.nees.value == pytest.approx(np.mean([1, (9 + 1) / 2, 1]))

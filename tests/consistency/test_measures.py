@@ -12,11 +12,12 @@ import worlds
 from cases import refused
 from test_consistency import STEPS, plain_nees, scored, summed, synthetic
 
-from jaxslam import charts, consistency, motion, sensors
+from jaxslam import charts, consistency, motion, sensors, simulate
+from jaxslam.consistency import block_nees
 from jaxslam.consistency._bound import final_covariance, jacobians_at_truth, van_trees
-from jaxslam.consistency._measures.counts import DROPS, KEPT, MEANINGS, counted
+from jaxslam.consistency._measures.counts import DROPS, KEPT, MEANINGS, counts_of
 from jaxslam.consistency._measures.coverage import LEVELS
-from jaxslam.consistency._measures.nees import block_nees, own_error_of
+from jaxslam.consistency._measures.nees import chart_error_of
 from jaxslam.consistency._measures.observability import unobservable_directions
 from jaxslam.consistency._run_scores import LAGS
 from jaxslam.consistency._summary import summarize
@@ -27,7 +28,6 @@ from jaxslam.filters._particles.pose_particles import weighted_pose_moments
 from jaxslam.filters._particles.slam_particles import ParticleInfo
 from jaxslam.filters._reporting import Pruned
 from jaxslam.filters.map_management._merging import Merged
-from jaxslam.simulation._worlds import simulate
 from jaxslam.simulation.spurious import Spurious
 
 STATUSES = [status.name.lower() for status in (*KEPT, *DROPS)]
@@ -193,7 +193,7 @@ def test_landmark_nees_and_own_coordinates():
     )
     np.testing.assert_allclose(summary.measures["nees_landmarks"].value, nees.mean(), rtol=1e-9)
 
-    own = jax.jit(jax.vmap(partial(own_error_of, charts.RightInvariant(), worlds.ring().sensor)))
+    own = jax.jit(jax.vmap(partial(chart_error_of, charts.RightInvariant(), worlds.ring().sensor)))
     total, steps = scored(trace, truth, own).measures["nees_own"]
     found = total / steps
     local = jax.jit(jax.vmap(charts.RightInvariant().local, (0, None, 0, None)))
@@ -332,7 +332,7 @@ def test_what_filters_report_of_themselves_is_counted():
     }
     trace, _, _ = synthetic(np.random.default_rng(0), runs=2)
     info = jax.tree.map(lambda leaf: leaf[:, :3], trace.info)
-    found = counted(info._replace(extra=extra, exhausted=flags))
+    found = counts_of(info._replace(extra=extra, exhausted=flags))
     events = {name: each.tolist() for name, each in found.items() if name not in STATUSES}
     thrice = {key: [6, 0] for key in ("resampled", "underflow", "invalid")}
     once = {key: [2, 0] for key in ("merged", "reduced", "exhausted")}

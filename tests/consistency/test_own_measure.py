@@ -65,7 +65,7 @@ def test_a_measure_of_ones_own_is_everywhere(registered, tmp_path):
     assert float(rows["claimed σ [m]"]["reckoning low"]) == pytest.approx(average.low, rel=1e-8)
     assert rows["farthest"]["honest"] == "0.25" and rows["verdict"]["reckoning"] == summary.verdict
     assert "claimed" in _rows(report.as_csv(campaign))[0]
-    assert "claimed" in report.run_columns(campaign)
+    assert "claimed" in campaign._run_columns()
     assert json.loads(report.as_json(campaign))["filters"]["reckoning"]["measures"]["claimed"]
     assert plot.rmse_figure(campaign).axes[-1].get_ylabel() == "claimed σ [m]"
 

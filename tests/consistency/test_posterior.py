@@ -9,9 +9,7 @@ import numpy as np
 import pytest
 from scipy.stats import chi2, kstest, norm
 
-from jaxslam import filters, motion, sensors
-from jaxslam._driver import run
-from jaxslam.simulation._worlds import Scenario, simulate
+from jaxslam import Scenario, filters, motion, run, sensors, simulate
 
 STEPS, DRAWS = 16, 120
 PRIOR, SPREAD = np.array([np.log(np.deg2rad(1.0)), 0.0]), np.array([0.5, 0.1])

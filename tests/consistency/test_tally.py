@@ -7,7 +7,7 @@ import pytest
 
 from jaxslam.consistency import Score
 from jaxslam.consistency._tally import Sum, Tally, condense, plus, sum_rows
-from jaxslam.consistency.campaign._pieces import missing
+from jaxslam.consistency.campaign._pieces import missing_pieces
 
 
 def test_a_total_is_exact_where_a_plain_sum_is_not():
@@ -130,12 +130,12 @@ def test_missing_is_every_run_not_done():
     for _ in range(500):
         runs, block = int(rng.integers(0, 60)), int(rng.integers(1, 20))
         done = [tuple(map(int, rng.integers(0, [70, 25]))) for _ in range(rng.integers(0, 6))]
-        todo = missing(iter(done), runs, block)
+        todo = missing_pieces(iter(done), runs, block)
         assert all(0 < size <= block for _, size in todo)
         listed = [run for first, size in todo for run in range(first, first + size)]
         finished = {run for first, size in done for run in range(first, first + size)}
         assert listed == [run for run in range(runs) if run not in finished]
-    assert missing([(32, 32)], 128, 32) == [(0, 32), (64, 32), (96, 32)]
-    assert missing([(8, 8)], 40, 16) == [(0, 8), (16, 16), (32, 8)]
+    assert missing_pieces([(32, 32)], 128, 32) == [(0, 32), (64, 32), (96, 32)]
+    assert missing_pieces([(8, 8)], 40, 16) == [(0, 8), (16, 16), (32, 8)]
     with pytest.raises(ValueError, match="block: expected an integer >= 1, got 0"):
-        missing([], 3, 0)
+        missing_pieces([], 3, 0)

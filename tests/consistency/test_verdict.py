@@ -8,13 +8,12 @@ import scipy.integrate
 import scipy.stats
 
 from benchmarks.verdict import averages, problem, rejected, verdicts
-from jaxslam import motion, sensors, stats
-from jaxslam.consistency import judge
-from jaxslam.consistency._intervals import Average, lopsided, positive_interval, spread
+from jaxslam import Scenario, motion, sensors, stats
+from jaxslam.consistency import Average, judge
+from jaxslam.consistency._intervals import is_lopsided, positive_interval, spread
 from jaxslam.consistency._verdict import power_of
 from jaxslam.consistency.campaign import monte_carlo
 from jaxslam.consistency.campaign._candidates import check_noise
-from jaxslam.simulation._worlds import Scenario
 
 pytestmark = pytest.mark.decision
 
@@ -78,7 +77,7 @@ def test_many_runs_have_the_interval_of_the_normal():
     found = positive_interval(values)
     half = scipy.stats.norm.ppf(0.5 + 0.95**0.5 / 2) * scipy.stats.sem(values)
     np.testing.assert_allclose(found[1:], [found.value - half, found.value + half], rtol=1e-3)
-    assert not lopsided(found)
+    assert not is_lopsided(found)
 
 
 @pytest.mark.parametrize(
@@ -277,7 +276,7 @@ def test_a_noise_that_zero_has_none_of_is_taken_where_it_is():
 
 
 def test_lopsided_is_what_plus_minus_would_hide():
-    assert lopsided(Average(3.0, 2.0, 5.0))
-    assert lopsided(Average(3.0, 2.0, np.inf))
-    assert not lopsided(Average(3.0, 2.0, 4.1))
-    assert not lopsided(Average(3.0, 3.0, 3.0))
+    assert is_lopsided(Average(3.0, 2.0, 5.0))
+    assert is_lopsided(Average(3.0, 2.0, np.inf))
+    assert not is_lopsided(Average(3.0, 2.0, 4.1))
+    assert not is_lopsided(Average(3.0, 3.0, 3.0))

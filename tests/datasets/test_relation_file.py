@@ -57,5 +57,5 @@ def test_relations_of_the_public_benchmark_join(log, odometry, file, joined, dro
     odometry = DATA / "relations" / f"{odometry}_raw_odometry.txt"
     time = datasets.carmen(DATA / f"{log}.log", odometry=odometry).time
     assert told.pose.shape == (joined + dropped, 3)
-    found, without = metrics.given(time, *told[:3], tolerance=1e-4)
+    found, without = metrics.relations_at_stamps(time, *told[:3], tolerance=1e-4)
     assert (len(found.first), without) == (joined, dropped)

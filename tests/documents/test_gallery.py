@@ -14,7 +14,7 @@ import pytest
 import jaxslam
 from benchmarks import gallery
 from jaxslam import datasets, plot
-from jaxslam._catalog import KINDS
+from jaxslam.catalog import KINDS
 from jaxslam.simulation.scenarios import SCENARIOS
 
 ROOT = Path(__file__).parents[2]

@@ -10,10 +10,8 @@ import pytest
 import worlds
 from cases import refused, swept
 
-from jaxslam import _catalog as catalog
-from jaxslam import run
-from jaxslam.simulation._walls import exact_ranges, is_free, wall_lines
-from jaxslam.simulation._worlds import simulate
+from jaxslam import catalog, run, simulate
+from jaxslam.simulation._wall_geometry import exact_ranges, is_free, wall_lines
 from jaxslam.simulation.laser import Laser, scan, scan_information, scan_world, true_ranges
 from jaxslam.simulation.scenarios import (
     ROOMS,
@@ -103,7 +101,7 @@ def test_a_grid_of_shares_has_the_area_of_the_room():
     area = 0.01 * np.sum(1 - np.asarray(grid.probability))
     edge = 0.01 * grid.log_odds.size * 0.5 / 64
     assert area == pytest.approx(np.pi * 9, abs=edge + 0.02)
-    assert np.all(grid.known)
+    assert np.all(grid.observed)
 
 
 def test_the_directions_that_a_scan_does_not_see_are_named():

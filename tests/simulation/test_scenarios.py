@@ -6,7 +6,7 @@ import jax
 import numpy as np
 import pytest
 
-from jaxslam.simulation._worlds import simulate
+from jaxslam import simulate
 from jaxslam.simulation.scenarios import (
     cloister_noisy,
     explore,

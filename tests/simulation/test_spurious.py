@@ -14,7 +14,6 @@ from jaxslam import association, life, monte_carlo, run, sensors, simulate
 from jaxslam.consistency._measures.associations import association_scores, identities
 from jaxslam.core.types import Estimate, Info, Scan, Status, Trace
 from jaxslam.filters import EkfSlam
-from jaxslam.simulation._spurious import spoil
 from jaxslam.simulation.spurious import Spurious
 
 SENSOR = sensors.RangeBearing(np.diag([0.1, 0.02]) ** 2)
@@ -30,7 +29,7 @@ def spoilt():
     scan = Scan(jnp.asarray(z), jnp.arange(M, dtype=jnp.int32), jnp.arange(M) < 10)
     wrong = Spurious(clutter=1.5, missed=0.2, outliers=0.1, mislabelled=0.25, reach=5.0)
     keys = jax.random.split(jax.random.key(0), RUNS)
-    many = jax.jit(jax.vmap(lambda key: spoil(wrong, SENSOR, jnp.zeros(3), scan, key)))
+    many = jax.jit(jax.vmap(lambda key: wrong.spoil(SENSOR, jnp.zeros(3), scan, key)))
     return scan, jax.device_get(many(keys))
 
 

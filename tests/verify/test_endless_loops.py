@@ -10,7 +10,7 @@ from verified import by_name, failed
 
 from jaxslam import sensors
 from jaxslam.verify import verify_jacobians
-from jaxslam.verify._loops import ROUNDS, ending, limited
+from jaxslam.verify._loops import ROUNDS, limit_loops, with_loop_end
 
 SOME = (0.1 + 0.5 * np.random.default_rng(1).uniform(size=(8, 2)),)
 
@@ -142,9 +142,9 @@ def nested(x, n):
 @pytest.mark.parametrize("x", swept((0.3, 0.7), 0.3))
 def test_loops_that_end_give_the_same_numbers(x):
     x, n = jnp.asarray(x), jnp.asarray(3.0)
-    for function in (nested, jax.jacfwd(nested), jax.jacfwd(limited(nested))):
+    for function in (nested, jax.jacfwd(nested), jax.jacfwd(limit_loops(nested))):
         wanted = (nested if function is nested else jax.jacfwd(nested))(x, n)
-        found, ended = jax.vmap(ending(function), in_axes=(0, None))(x[None], n)
+        found, ended = jax.vmap(with_loop_end(function), in_axes=(0, None))(x[None], n)
         assert ended.all()
         np.testing.assert_allclose(found[0], wanted, rtol=1e-14)
 
@@ -156,7 +156,7 @@ def test_the_rounds_of_nested_loops_are_counted_together():
 
         return jax.lax.while_loop(lambda y: y > -1, inner, x)
 
-    value, ended = jax.jit(jax.vmap(ending(never)))(jnp.arange(2.0))
+    value, ended = jax.jit(jax.vmap(with_loop_end(never)))(jnp.arange(2.0))
     np.testing.assert_array_equal(value, ROUNDS + np.arange(2.0))
     assert not ended.any()
-    assert np.isnan(limited(never)(1.0))
+    assert np.isnan(limit_loops(never)(1.0))

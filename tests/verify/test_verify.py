@@ -14,9 +14,8 @@ from verified import by_name, failed
 
 from jaxslam import sensors
 from jaxslam.verify import _differences as differences
-from jaxslam.verify import verify_jacobians
+from jaxslam.verify import build, verify_jacobians
 from jaxslam.verify._inputs.functions import plain_function
-from jaxslam.verify._verifier import build
 
 
 def observe(pose, landmark):

@@ -12,7 +12,7 @@ from typing import NamedTuple
 import jax
 
 from jaxslam._cli.common import OUT, check_out, chosen_devices
-from jaxslam.consistency.campaign._pieces import missing
+from jaxslam.consistency.campaign._pieces import missing_pieces
 from jaxslam.core._numbers import check_count
 from jaxslam.results import _campaign_files as campaign_files
 from jaxslam.results import _store as store
@@ -187,7 +187,7 @@ def open_store(spec: Spec) -> store.Store:
 def earlier_results(out: Path, keep: store.Store) -> Json | None:
     """The results of a finished campaign in a folder; None without them or where runs miss."""
     assert keep.runs is not None
-    if missing(keep.spans(), keep.runs, keep.runs):
+    if missing_pieces(keep.spans(), keep.runs, keep.runs):
         return None
     try:
         found: Json = json.loads((out / RESULT).read_text(encoding="utf-8"))

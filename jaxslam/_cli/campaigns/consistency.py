@@ -11,7 +11,6 @@ from typing import Any
 
 import jax
 
-from jaxslam._catalog import ALL
 from jaxslam._cli import cache
 from jaxslam._cli.campaigns.campaign import (
     CampaignOptions,
@@ -31,14 +30,16 @@ from jaxslam._cli.common import (
     write_results,
 )
 from jaxslam._cli.user_objects import UserObjects
+from jaxslam.catalog import ALL
 from jaxslam.consistency._verdict import is_faulty
 from jaxslam.consistency.campaign import Campaign, Incomplete, Interrupted, monte_carlo
-from jaxslam.consistency.campaign._candidates import estimator_of, fitting_block, rounded
+from jaxslam.consistency.campaign._block_programs import drive_run, fitting_block
+from jaxslam.consistency.campaign._candidates import cast_floats
 from jaxslam.core.protocols import Candidate
 from jaxslam.results import _campaign_files as campaign_files
 from jaxslam.results._campaign_files import FORMATS
 from jaxslam.results._files import Files, Json
-from jaxslam.simulation._worlds import World, run_keys, world_of_run
+from jaxslam.simulation._worlds import World, world_of_run
 from jaxslam.simulation.scenarios import SCENARIOS
 
 
@@ -218,9 +219,8 @@ def _write(
         mapping = [n for n, s in campaign.filters.items() if "rmse_landmarks" in s.measures]
         name = next(iter(mapping or campaign.filters))
         key = jax.random.key(seed)
-        truth, log = rounded(world_of_run(scenario, key, 0), campaign.dtype)
-        method, _ = estimator_of(filters[name], truth, scenario)
-        estimate = method(log, run_keys(key, 0)[1]).estimate
+        truth, log = cast_floats(world_of_run(scenario, key, 0), campaign.dtype)
+        estimate = drive_run(scenario, filters[name], key, 0, truth, log).estimate
         campaign = replace(campaign, first={name: jax.device_get((truth, estimate))})
     failed: list[str] = []
     paths = campaign_files.save_campaign(

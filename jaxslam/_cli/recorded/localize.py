@@ -11,6 +11,7 @@ from jaxtyping import Float, PyTree
 from jaxslam import motion
 from jaxslam._cli.campaigns.piecewise import run_in_pieces
 from jaxslam._cli.recorded import laser_log
+from jaxslam._cli.recorded.memory import memory_returned
 from jaxslam.consistency.campaign._progress import Progress
 from jaxslam.core.types import Info
 from jaxslam.datasets import LaserLog
@@ -119,11 +120,12 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> laser_log.Jo
         options.particles,
         start="uniform" if pose is None else "gaussian",
         **weighing,
-        every=max(1, np.shape(log.beams.range)[1] // BEAMS),
+        stride=max(1, np.shape(log.beams.range)[1] // BEAMS),
     )
     logged = len(log.time) == 1 or bool(log.odometry_known[1:].any())
     jumps = int(odometry_jumps(log.raw, log.time).sum())
-    raw = log.raw if logged and not jumps else laser_slam.solve(log).odometry
+    with memory_returned():
+        raw = log.raw if logged and not jumps else laser_slam.solve(log).odometry
     rows = grids.beam_log(motion.odometry_controls(raw), log.beams)
     last = len(log.time) - 1
     with Progress(f"{log.name}, localization", "scans") as progress:

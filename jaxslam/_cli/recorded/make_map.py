@@ -60,7 +60,7 @@ def run_mapping(log: LaserLog, options: argparse.Namespace) -> laser_log.Job:
         "trajectory.csv": report.trajectory_csv(log.time, path),
         "trajectory.tum": report.trajectory_tum(log.time, path),
     }
-    known = np.asarray(grid.known)
+    known = np.asarray(grid.observed)
     bits = np.asarray(grids.entropy(grid))[known]
     summary = {
         "job": "map from the poses in the file",

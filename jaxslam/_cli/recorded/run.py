@@ -5,14 +5,13 @@ import dataclasses
 import inspect
 import time
 from collections.abc import Mapping
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, Int
 
-from jaxslam._catalog import ALL, CANONICAL, SMOOTHERS, on_given_poses
 from jaxslam._cli import cache
 from jaxslam._cli.campaigns.piecewise import PiecewiseRun, run_in_pieces
 from jaxslam._cli.common import (
@@ -31,16 +30,17 @@ from jaxslam._cli.common import (
     write_results,
 )
 from jaxslam.association._rules import Known
+from jaxslam.catalog import ALL, KINDS, SMOOTHERS, on_given_poses
 from jaxslam.consistency._measures.counts import count_label
 from jaxslam.consistency.campaign._progress import Progress
 from jaxslam.core.protocols import Candidate, Filter, Motion, Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Log, Status, Truth
+from jaxslam.core.validation import InvalidField
 from jaxslam.datasets import READERS, Dataset
 from jaxslam.datasets._evaluation import Evaluation, evaluate, joint_map_cov
 from jaxslam.datasets._landmark_logs.table_settings import METHODS, association_options
 from jaxslam.datasets._uncertain_constants import considered
-from jaxslam.filters._ekf.ekf_settings import EkfOptions
 from jaxslam.math._definite import indefinite
 from jaxslam.results import _report as report
 from jaxslam.results._campaign_files import FORMATS, check_figure_formats
@@ -367,13 +367,13 @@ def with_options(data: Dataset, options: argparse.Namespace) -> Dataset:
         raise ValueError("--gate: expected --associate, too, since the tags are not used")
     try:
         chosen = association_options(options.associate or "known", options.gate)
-    except ValueError as problem:
-        raise ValueError(f"--{problem}") from problem
+    except InvalidField as problem:
+        raise ValueError(f"--{problem.field}: {problem.reason}") from problem
     given = [name for name in ("gate", "associate") if getattr(options, name) is not None]
     assumed = (
         line for line in data.assumed if not line.startswith(tuple(f"[filter] {n}" for n in given))
     )
-    plain: EkfOptions = {"gate": None, "associate": Known()}
+    plain: dict[str, Any] = {"gate": None, "associate": Known()}
     changed = data.filter_options | plain | chosen
     return dataclasses.replace(data, filter_options=changed, assumed=tuple(assumed))
 
@@ -426,7 +426,7 @@ def on_true_poses(data: Dataset) -> tuple[Log, int]:
 
 def _filter(name: str, candidate: Candidate, data: Dataset) -> Filter:
     if data.filter_options.get("associate") is not None and (
-        name in CANONICAL or name == "localization"
+        name in KINDS["information"] or name == "localization"
     ):
         raise ValueError(f"--filters: {name} needs the tag of every measurement")
     if name == "mapping" and data.true_path is None:

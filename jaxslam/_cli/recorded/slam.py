@@ -10,6 +10,7 @@ from jaxtyping import Float
 
 from jaxslam._cli.common import Drawings, add_animate, film_files, summary_table
 from jaxslam._cli.recorded import laser_log
+from jaxslam._cli.recorded.memory import memory_returned, trim
 from jaxslam.consistency import metrics
 from jaxslam.consistency.campaign._progress import Progress
 from jaxslam.core.types import Estimate
@@ -95,7 +96,7 @@ def run_slam(log: LaserLog, options: argparse.Namespace) -> laser_log.Job:
 
 def _solved(log: LaserLog, settings: Settings) -> Solved:
     """The result, with a bar of progress for each stage."""
-    with Progress(f"{log.name}, reading", "scans") as first:
+    with memory_returned(), Progress(f"{log.name}, reading", "scans") as first:
         bars = {"": first}
 
         def report_stage(stage: str, done: int, of: int) -> None:
@@ -103,6 +104,8 @@ def _solved(log: LaserLog, settings: Settings) -> Solved:
                 unit = "candidates" if stage == "loop closing" else "scans"
                 bars[stage] = Progress(f"{log.name}, {stage}", unit)
             bars[stage](done, of)
+            if done == of:
+                trim()
 
         return laser_slam.solve(log, settings, progress=report_stage)
 
@@ -257,7 +260,9 @@ def given_relations(path: str, log: LaserLog) -> tuple[metrics.Relations, int]:
     """
     file = relation_file(path)
     try:
-        return metrics.given(log.time, file.first, file.second, file.pose, tolerance=TOLERANCE)
+        return metrics.relations_at_stamps(
+            log.time, file.first, file.second, file.pose, tolerance=TOLERANCE
+        )
     except ValueError as problem:
         reason = str(problem).removeprefix("given: ")
         raise ValueError(f"--relations: {file.source}: {reason}") from problem

@@ -37,7 +37,7 @@ def register(measure: Measure) -> Measure:
 
     Raises ValueError where its key is one of this package's, or without a function of a run.
     """
-    names = {name for one in BUILT_IN for name in (one.key, one.column)} | {*MEANINGS}
+    names = {name for m in BUILT_IN for name in (m.key, m.column)} | {*MEANINGS}
     if measure.key in names:
         raise ValueError(f"register: {measure.key!r} is the key of a measure of jaxslam")
     if measure.of_run is None and type(measure) is Measure:
@@ -56,8 +56,8 @@ def measures_of(names: Iterable[str]) -> list[Measure]:
 
     So a stored campaign can be read without the file that registered its measures.
     """
-    known = {name for one in REGISTRY.values() for name in (one.key, one.column)}
-    return [*REGISTRY.values(), *(Measure(name, name) for name in names if name not in known)]
+    registered = {name for m in REGISTRY.values() for name in (m.key, m.column)}
+    return [*REGISTRY.values(), *(Measure(name, name) for name in names if name not in registered)]
 
 
 __all__ = ["Measure", "register"]

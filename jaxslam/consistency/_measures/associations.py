@@ -47,16 +47,16 @@ def association_scores(
     fused = info.status == Status.FUSED
     # A slot may be corrected and then given to a new landmark within one scan.
     before = jnp.pad(held[:-1], [(1, 0), (0, 0)], constant_values=-1)
-    mine = jnp.take_along_axis(before, jnp.maximum(info.slot, 0), axis=1)
-    right = (fused & (origin >= 0) & (mine == origin)).sum()
-    known = (origin >= 0) & (origin[:, :, None] == before[:, None, :]).any(axis=2)
+    landmark_of_slot = jnp.take_along_axis(before, jnp.maximum(info.slot, 0), axis=1)
+    correct = (fused & (origin >= 0) & (landmark_of_slot == origin)).sum()
+    in_map = (origin >= 0) & (origin[:, :, None] == before[:, None, :]).any(axis=2)
     last, alive = held[-1], trace.estimate.alive[-1]
     same = (last[:, None] == last[None, :]) & alive[None, :]
     again = (same & jnp.tril(jnp.ones(same.shape, bool), -1)).any(axis=1)
     false = alive & (again | (last < 0))
     dtype = trace.estimate.pose.dtype
     return {
-        "precision": (right.astype(dtype), fused.sum()),
-        "recall": (right.astype(dtype), known.sum()),
+        "precision": (correct.astype(dtype), fused.sum()),
+        "recall": (correct.astype(dtype), in_map.sum()),
         "false_landmarks": (false.sum().astype(dtype), jnp.asarray(1)),
     }

@@ -6,7 +6,7 @@ from jaxtyping import Int
 from jaxslam.core.types import Info, Status
 
 KEPT = (Status.FUSED, Status.BORN, Status.SIGHTED)
-"""What a measurement does for the map; each is counted."""
+"""Statuses of measurements that serve the map."""
 
 DROPS = (
     Status.REJECTED,
@@ -16,7 +16,7 @@ DROPS = (
     Status.SINGULAR,
     Status.UNMATCHED,
 )
-"""What can keep a measurement from the map; each is counted."""
+"""Statuses of measurements that the map does not get: the reasons."""
 
 MEANINGS = {
     "measured": "measurements in the logs",
@@ -53,20 +53,23 @@ def count_label(name: str) -> str:
     return {"born": "initialized", "runs": "finite runs"}.get(name, name.replace("_", " "))
 
 
-def counted(info: Info) -> dict[str, Int[np.ndarray, "R"]]:
-    """The counts of measurements of R runs by status, and those of the filter.
+def counts_of(info: Info) -> dict[str, Int[np.ndarray, "R"]]:
+    """The counts (R,) of measurements by status, and of the events that the filter reports.
 
     The counts of a filter come from the method `counts` of records of `Info.extra`: arrays (R, T,
     …), by name.
     """
     runs = len(info.status)
+    # A number for each pair of run and status, which one bincount counts.
     at = np.asarray(info.status).reshape(runs, -1) + np.arange(runs)[:, None] * len(Status)
     became = np.bincount(at.ravel(), minlength=runs * len(Status)).reshape(runs, -1)
-    found = {status.name.lower(): became[:, status] for status in KEPT + DROPS}
-    reports = [each.counts() for each in (info.extra or {}).values() if hasattr(each, "counts")]
+    counts = {status.name.lower(): became[:, status] for status in KEPT + DROPS}
+    reports = [
+        report.counts() for report in (info.extra or {}).values() if hasattr(report, "counts")
+    ]
     if info.exhausted is not None:
         reports.append({"exhausted": info.exhausted})
     events = {name: happened for report in reports for name, happened in report.items()}
     for name in sorted(events, key=[*MEANINGS, *events].index):
-        found[name] = np.asarray(events[name]).reshape(runs, -1).sum(axis=1)
-    return found
+        counts[name] = np.asarray(events[name]).reshape(runs, -1).sum(axis=1)
+    return counts

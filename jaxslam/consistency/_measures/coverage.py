@@ -4,9 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
-from jaxslam.consistency._measures.measure import Measure, Nees, Runs, RunScores, Sums, ratio
+from jaxslam.consistency._measures.measure import Measure, Runs, RunScores, Sums, ratio
 from jaxslam.consistency._measures.nees import DOF
 from jaxslam.math._definite import invertible
 from jaxslam.math.stats import chi2_quantile
@@ -27,9 +27,9 @@ class Credibility(Measure):
         covs: Float[np.ndarray, "R K 3 3"],
         regular: Bool[np.ndarray, "R K"],
     ) -> Float[np.ndarray, "R"] | None:
-        """It of each run, by the actual covariance of all."""
-        found = credibility(errors, covs, regular)
-        return None if found is None else found[self.part]
+        """The number of each run, by the actual covariance of all runs."""
+        parts = credibility(errors, covs, regular)
+        return None if parts is None else parts[self.part]
 
 
 @dataclass(frozen=True, eq=False)
@@ -42,7 +42,14 @@ class Coverage(Measure):
         """The steps within the ellipsoid, of those with a regular covariance."""
         nees = runs.nees[self.block]
         count = nees.regular.sum(axis=1)
-        covered = _coverage(nees, DOF[self.block])
+        radii = [chi2_quantile(p, DOF[self.block]) for p in LEVELS]
+        # The number of steps in each shell between two ellipsoids: a number for each pair of run
+        # and shell, which one bincount counts. Summed outwards, within each ellipsoid.
+        total, shells = len(nees.value), len(LEVELS) + 1
+        shell = np.searchsorted(radii, np.where(nees.regular, nees.value, np.inf))
+        pairs = shell + np.arange(total)[:, None] * shells
+        in_shell = np.bincount(pairs.ravel(), minlength=total * shells).reshape(total, shells)
+        covered = in_shell.cumsum(axis=1)[:, :-1]
         sums = {f"coverage_{self.block}": covered / np.maximum(count, 1)[:, None]}
         return RunScores(covered[:, LEVELS.index(0.95)], count, sums)
 
@@ -96,8 +103,9 @@ def credibility(
 
     At each step, with the actual mean square error Σ = mean over runs of e eᵀ and the ratio
     ρ = (eᵀ P⁻¹ e)/(eᵀ Σ⁻¹ e) of a run, the index is the mean of 10 |log10 ρ| and the inclination
-    that of 10 log10 ρ: decibels, 0 for a credible filter, a positive inclination for an optimistic
-    one. X. R. Li, Z. Zhao, "Measuring estimator's credibility: noncredibility index", FUSION 2006.
+    the mean of 10 log10 ρ: decibels, 0 for a credible filter, a positive inclination for an
+    optimistic one. X. R. Li, Z. Zhao, "Measuring estimator's credibility: noncredibility index",
+    FUSION 2006.
 
     Args:
         covs: as claimed.
@@ -129,19 +137,8 @@ def credibility(
 
 
 def coverage_curves(sums: Sums, per_run: Mapping[str, np.ndarray]) -> dict[str, np.ndarray]:
-    """By block, the share of runs' steps with the truth in the ellipsoid of each of `LEVELS`."""
+    """Shares, by block, of runs' steps with the truth in the ellipsoid of each of `LEVELS`."""
     return {
         block: ratio(sums[f"coverage_{block}"], np.isfinite(per_run[f"coverage_95_{block}"]).sum())
         for block in DOF
     }
-
-
-def _coverage(nees: Nees, dof: int) -> Int[np.ndarray, "R LEVELS"]:
-    """At how many steps the truth lies in the ellipsoid of each of the probabilities `LEVELS`."""
-    runs, bins = len(nees.value), len(LEVELS) + 1
-    radii = [chi2_quantile(p, dof) for p in LEVELS]
-    beyond = np.searchsorted(radii, np.where(nees.regular, nees.value, np.inf))
-    at = beyond + np.arange(runs)[:, None] * bins
-    within = np.bincount(at.ravel(), minlength=runs * bins).reshape(runs, bins)
-    out: np.ndarray = within.cumsum(axis=1)[:, :-1]
-    return out

@@ -15,9 +15,9 @@ class Rmse(Measure):
 
     positive: bool = True
     scale: float = 1.0
-    """of the unit, from that of the squares"""
+    """factor from the root of the squares to the unit"""
     coordinates: tuple[int, int] | None = None
-    """of the pose, from the first to before the second, for all steps; None: of the final map"""
+    """range [first, end) of the pose's coordinates, at all steps; None: points of the final map"""
 
     def of_runs(self, runs: Runs) -> RunScores:
         """The squares, summed over the steps or over the landmarks."""
@@ -27,9 +27,11 @@ class Rmse(Measure):
         return RunScores(squares.sum(axis=1), squares.shape[1], {self.column: squares})
 
     def average(self, per_run: np.ndarray, sums: Sums) -> Average | None:
-        """The root of the mean square, and those of the ends of its interval."""
-        found = positive_interval(per_run)
-        return found and Average(*(self.scale * float(np.sqrt(value)) for value in found))
+        """The root of the mean square, and the roots of the ends of its interval."""
+        mean_square = positive_interval(per_run)
+        return mean_square and Average(
+            *(self.scale * float(np.sqrt(value)) for value in mean_square)
+        )
 
     def curves(self, sums: Sums, runs: int) -> dict[str, np.ndarray]:
         """The error at each step, over all runs."""

@@ -23,7 +23,7 @@ class Nis(Measure):
         return RunScores(nis.sum(axis=1), dof.sum(axis=1), {"nis": nis, "nis_dof": dof})
 
     def average(self, per_run: np.ndarray, sums: Sums) -> Average | None:
-        """The average over the runs and its interval, which are those that the verdict tests."""
+        """The average over the runs and the interval that the verdict tests."""
         return positive_interval(per_run, skewed=False)
 
     def curves(self, sums: Sums, runs: int) -> dict[str, np.ndarray]:
@@ -37,8 +37,8 @@ class Autocorrelation(Measure):
 
     def of_runs(self, runs: Runs) -> RunScores:
         """Products and squares at lag 1; sums of all lags."""
-        found = np.asarray(runs.statistics.autocorrelation)
-        return RunScores(found[:, 0, 0], found[:, 0, 1], {"autocorrelation": found})
+        products = np.asarray(runs.statistics.autocorrelation)
+        return RunScores(products[:, 0, 0], products[:, 0, 1], {"autocorrelation": products})
 
 
 @dataclass(frozen=True, eq=False)

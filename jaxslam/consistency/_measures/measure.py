@@ -33,21 +33,21 @@ class RunStatistics(NamedTuple):
     """The sums over the steps of one run; with a leading axis, of many."""
 
     finite: Bool[Array, ""]
-    """every number of its estimates and infos is finite."""
+    """True if all numbers of the estimates and infos are finite"""
     landmark_nees: Float[Array, "T"]
-    """summed over the landmarks of the map."""
+    """NEES summed over the landmarks of the map"""
     regular_landmarks: Float[Array, "T"]
-    """how many of them have a NEES."""
+    """number of landmarks that have a NEES"""
     landmark_squares: Float[Array, "2"]
-    """of the final map, unaligned: Σ |p̂ - p|² [m²], and over how many landmarks that is; 0 of a map
-    that is known, without covariances."""
+    """Σ |p̂ - p|² [m²] over the final map, unaligned, and the number of landmarks in it; 0 for a
+    known map, without covariances"""
     autocorrelation: Float[Array, "LAGS 3"]
-    """of whitened innovations: Σ w_tᵀ w_{t+l}, √(Σ|w_t|² Σ|w_{t+l}|²), and how many
-    products of numbers that is. Of the same landmark at t and t + l, w = L⁻¹ν with S = L Lᵀ;
-    without a map, of one measurement slot."""
+    """Σ w_tᵀ w_{t+l}, √(Σ|w_t|² Σ|w_{t+l}|²), and the number of products of numbers in it, for
+    whitened innovations w = L⁻¹ν, S = L Lᵀ, of one landmark at t and t + l; without a map, of one
+    measurement slot"""
     values: dict[str, Array | tuple[Array, Array]]
-    """by key of a measure, what its `of_run` returned; in a world of spurious data, sum and weight
-    of each of `associations`"""
+    """results of `of_run` by key of the measure; in a world of spurious data, sum and weight of
+    each of `associations`"""
 
 
 class Runs(NamedTuple):
@@ -55,8 +55,8 @@ class Runs(NamedTuple):
 
     truth: Truth
     trace: Trace
-    """of the estimate the poses and their covariances, of the infos all but innovations and slots;
-    of a monitored filter the monitor, and as `probe` the information of each step"""
+    """poses and their covariances of the estimate, infos without innovations and slots; of a
+    monitored filter the monitor, and as `probe` the information of each step"""
     statistics: RunStatistics
     error: Float[np.ndarray, "R T 3"]
     """truth - estimate of the pose, in float64"""
@@ -82,19 +82,19 @@ class Measure:
     key: str
     """its name in `Summary.measures`, in JSON and in CSV"""
     label: str
-    """of its row in tables; one that starts with a space belongs to the row above"""
+    """label of its row in tables; one that starts with a space belongs to the row above"""
     of_run: Callable[[Truth, Trace], Array] | None = None
-    """of one run, traced by JAX: a number, or a curve (T,) whose average over the steps is the
-    number. What is not finite is absent. The trace has no final state and no probe."""
+    """function of one run, traced by JAX: a number, or a curve (T,) whose average over the steps is
+    the number. What is not finite is absent. The trace has no final state and no probe."""
     honest: float | None = None
     """the average of a consistent filter, if it is known"""
     unit: str = ""
     positive: bool = False
-    """it is never negative: the interval is `positive_interval`, else `interval`"""
+    """True if it is never negative: the interval is `positive_interval`, else `interval`"""
     note: tuple[str, str] | None = None
     """a term and a sentence below the table, if the label is not enough"""
     row: bool = True
-    """whether tables show it"""
+    """True if tables show it"""
     figure: str = ""
     """the figure that has a panel for its curve: "nees", "rmse" or "gained" """
     axis: str = ""
@@ -113,13 +113,13 @@ class Measure:
 
     def of_runs(self, runs: Runs) -> RunScores | None:
         """The measure of each run; None where such a filter has none."""
-        found = runs.statistics.values.get(self.key)
-        if found is None:
+        value = runs.statistics.values.get(self.key)
+        if value is None:
             return None
-        if isinstance(found, tuple):
-            return RunScores(np.asarray(found[0]), np.asarray(found[1]))
-        finite = np.isfinite(found)
-        values = np.where(finite, found, 0.0).astype(np.float64)
+        if isinstance(value, tuple):
+            return RunScores(np.asarray(value[0]), np.asarray(value[1]))
+        finite = np.isfinite(value)
+        values = np.where(finite, value, 0.0).astype(np.float64)
         if values.ndim == 1:
             return RunScores(values, finite)
         sums = {self.key: values, f"runs_{self.key}": finite.astype(np.float64)}

@@ -70,13 +70,13 @@ MEASURES = tuple(
 
 def inside_bands(curves: Mapping[str, np.ndarray]) -> dict[str, float]:
     """The share of the steps whose average NEES lies in its band, by block."""
-    found = {}
+    shares = {}
     for block in DOF:
         mean, has = curves[f"nees_{block}"], curves[f"runs_{block}"] > 0
         if has.any():
             low, high = curves[f"nees_{block}_low"], curves[f"nees_{block}_high"]
-            found[block] = float(np.mean((mean >= low)[has] & (mean <= high)[has]))
-    return found
+            shares[block] = float(np.mean((mean >= low)[has] & (mean <= high)[has]))
+    return shares
 
 
 def pose_error(
@@ -97,66 +97,71 @@ def block_nees(
 ) -> dict[str, Nees]:
     """The NEES of each block of `DOF`, and of the error in the coordinates of the filter ("own").
 
-    There is none where the claimed covariance is singular, i.e. some direction is known exactly:
-    1/tr P⁻¹, at most its least eigenvalue and at least a third of it, is at most 100 n·eps where P
-    is scaled to a diagonal of at most 1, x and y by one unit. And none
-    where a claimed deviation is what rounding makes of zero: at most 32 ulp of the
-    coordinate, that is of π for the heading and of max(|x|, |y|) for the position. So particles
-    that are copies of one, whose sample covariance is zero but for rounding, have no NEES, instead
-    of one of 1e27. And none where P is not symmetric (`covariance_faults`).
+    A step has no NEES in three cases:
+
+    - P is singular, that is, a direction is known exactly: 1/tr P⁻¹, between a third of the least
+      eigenvalue and all of it, is at most 100 n·eps, for P scaled to a diagonal of at most 1, x and
+      y by one unit.
+    - A claimed deviation is what rounding makes of zero: at most 32 ulp of the coordinate, of π for
+      the heading and of max(|x|, |y|) for the position. So particles that are copies of one
+      particle, whose sample covariance is rounding, have no NEES, instead of 1e27.
+    - P is not symmetric (`covariance_faults`).
 
     Args:
-        pose: as estimated.
-        error, chart_error: in (x, y, θ), and in the filter's coordinates.
-        cov: as claimed. eps is that of its dtype.
+        pose: the estimated pose.
+        error, chart_error: the error in (x, y, θ), and in the filter's coordinates.
+        cov: P, the claimed covariance. Its dtype gives eps.
 
     Raises:
         ValueError: if the shapes differ.
     """
-    shapes = [np.shape(each) for each in (pose, error, chart_error, cov)]
+    shapes = [np.shape(array) for array in (pose, error, chart_error, cov)]
     if shapes != [pose.shape] * 3 + [(*pose.shape, 3)] or pose.shape[-1:] != (3,):
         raise ValueError(
             "block_nees: expected pose, error and chart_error of one shape (..., 3) and cov of "
             f"(..., 3, 3), got {', '.join(map(str, shapes))}"
         )
     eps = float(np.finfo(cov.dtype).eps)
+    # A covariance that is none may overflow; its steps are masked below.
     with np.errstate(all="ignore"):
         unit = inverse_deviations(pose, cov, eps)
         scaled = {
             (i, j): cov[..., i, j] * unit[i] * unit[j] for i in range(3) for j in range(i + 1)
         }
         factor, pivots = _cholesky(scaled, eps)
-        found = {}
+        nees = {}
         for name, e in (("pose", error), ("own", chart_error)):
-            squares, known = _whiten(factor, e, unit)
+            squares, finite = _whiten(factor, e, unit)
+            # The two leading rows of the factor are the position's. The error in the filter's
+            # coordinates has no such block.
             for block, k in (("position", 2), ("pose", 3)):
                 if name == "pose" or block == "pose":
                     regular = (
                         (_least_eigenvalue(factor, pivots, k) > 100 * k * eps)
-                        & _every(known[:k])
+                        & _all(finite[:k])
                         & (asymmetry(cov, unit, k) <= np.cbrt(eps))
                     )
                     value = np.where(regular, sum(squares[:k]), 0.0)
-                    found[block if name == "pose" else name] = Nees(value, regular)
+                    nees[block if name == "pose" else name] = Nees(value, regular)
         turn = error[..., 2]
         regular = (scaled[2, 2] > 100 * eps) & np.isfinite(turn)
         square = (turn * unit[2]) ** 2 / np.where(regular, scaled[2, 2], 1.0)
-        found["heading"] = Nees(np.where(regular, square, 0.0), regular)
-    return found
+        nees["heading"] = Nees(np.where(regular, square, 0.0), regular)
+    return nees
 
 
-def own_error_of(chart: Chart, sensor: Sensor, trace: Trace, truth: Truth) -> Float[Array, "T 3"]:
+def chart_error_of(chart: Chart, sensor: Sensor, trace: Trace, truth: Truth) -> Float[Array, "T 3"]:
     """The pose error in the filter's coordinates, brought to (x, y, θ) by its basis.
 
     ξᵀ P_ξ⁻¹ ξ = (E ξ)ᵀ P⁻¹ (E ξ) with P = E P_ξ Eᵀ as the filter reports it.
     """
     ground = jnp.zeros(len(sensor.landmark), truth.pose.dtype)
 
-    def one(pose: Array, true_pose: Array) -> Array:
+    def error_at(pose: Array, true_pose: Array) -> Array:
         dx, _ = chart.local(pose, ground, true_pose, ground)
         return dx if chart.basis is None else chart.basis(pose, ground).pose @ dx
 
-    return jax.vmap(one)(jnp.asarray(trace.estimate.pose), jnp.asarray(truth.pose))
+    return jax.vmap(error_at)(jnp.asarray(trace.estimate.pose), jnp.asarray(truth.pose))
 
 
 def _cholesky(
@@ -164,7 +169,8 @@ def _cholesky(
 ) -> tuple[dict[tuple[int, int], np.ndarray], list[np.ndarray]]:
     """The lower factor of 3×3 matrices, entry by entry, and its pivots before the root is taken.
 
-    A pivot not above 3 eps times its diagonal entry counts as zero, as do the others of its column.
+    A pivot not above 3 eps times its diagonal entry counts as zero, as do the entries below it:
+    np.linalg.cholesky raises an error for the whole stack where one of its matrices is singular.
     """
     factor: dict[tuple[int, int], np.ndarray] = {}
     pivots = []
@@ -184,14 +190,14 @@ def _whiten(
     factor: dict[tuple[int, int], np.ndarray], error: np.ndarray, unit: list[np.ndarray]
 ) -> tuple[list[np.ndarray], list[np.ndarray]]:
     """The squares of L⁻¹e by coordinate, and whether the error is finite there."""
-    known = [np.isfinite(error[..., i]) for i in range(3)]
+    finite = [np.isfinite(error[..., i]) for i in range(3)]
     rows: list[np.ndarray] = []
     for i in range(3):
-        rest = np.where(known[i], error[..., i], 0.0) * unit[i]
+        rest = np.where(finite[i], error[..., i], 0.0) * unit[i]
         rest = rest - sum(factor[i, k] * rows[k] for k in range(i))
         regular = factor[i, i] > 0
         rows.append(np.where(regular, rest / np.where(regular, factor[i, i], 1.0), 0.0))
-    return [row**2 for row in rows], known
+    return [row**2 for row in rows], finite
 
 
 def _least_eigenvalue(
@@ -199,17 +205,17 @@ def _least_eigenvalue(
 ) -> np.ndarray:
     """1/tr (L Lᵀ)⁻¹ of the leading block, between a third of its least eigenvalue and all of it; 0
     where a pivot is."""
-    positive = _every([pivot > 0 for pivot in pivots[:size]])
+    positive = _all([pivot > 0 for pivot in pivots[:size]])
     rows: dict[tuple[int, int], np.ndarray] = {}
     for i in range(size):
         inverse = 1.0 / np.where(factor[i, i] > 0, factor[i, i], 1.0)
         rows[i, i] = inverse
         for j in range(i):
             rows[i, j] = -inverse * sum(factor[i, k] * rows[k, j] for k in range(j, i))
-    out: np.ndarray = np.where(positive, 1.0 / sum(row**2 for row in rows.values()), 0.0)
-    return out
+    inverse_trace: np.ndarray = np.where(positive, 1.0 / sum(row**2 for row in rows.values()), 0.0)
+    return inverse_trace
 
 
-def _every(flags: list[np.ndarray]) -> np.ndarray:
-    out: np.ndarray = np.logical_and.reduce(flags)
-    return out
+def _all(flags: list[np.ndarray]) -> np.ndarray:
+    conjunction: np.ndarray = np.logical_and.reduce(flags)
+    return conjunction

@@ -14,7 +14,7 @@ class Unobservable(Measure):
     """The dimension of the unobservable subspace at the end of a run."""
 
     def of_runs(self, runs: Runs) -> RunScores | None:
-        """That of each run."""
+        """The dimension in each run."""
         monitor = monitor_of(runs.trace.final)
         return None if monitor is None else RunScores(unobservable_directions(monitor), 1)
 
@@ -24,7 +24,7 @@ class RotationInformation(Measure):
     """The information gained on a rotation of the whole frame by the end of a run."""
 
     def of_runs(self, runs: Runs) -> RunScores | None:
-        """That of each run, and of each step."""
+        """The information by the end of each run, and its curve."""
         monitor = monitor_of(runs.trace.final)
         if monitor is None:
             return None

@@ -10,9 +10,9 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 from jax.sharding import NamedSharding
-from jaxtyping import Float, Int, PyTree
+from jaxtyping import Float, PyTree
 
-from jaxslam.consistency import Score, score
+from jaxslam.consistency import score
 from jaxslam.consistency._bound import final_covariance
 from jaxslam.consistency._measures import REGISTRY
 from jaxslam.consistency._tally import FAR, condense, condensed_sums
@@ -28,14 +28,15 @@ from jaxslam.consistency.campaign._block_programs import (
 )
 from jaxslam.consistency.campaign._pieces import cores
 from jaxslam.core._record import as_record
+from jaxslam.core._validation import reworded_tracer_errors
 from jaxslam.core.protocols import Candidate
 from jaxslam.core.types import Estimate, Info, Trace, Truth
 from jaxslam.filters._ekf.monitor import MonitoredState
 from jaxslam.simulation._worlds import Scenario, World
 
 BOUND = ""
-"""Under this name, which no filter has, a block keeps the sums of the conditional bound, and the
-limit of accuracy."""
+"""The name, which no filter has, under which a block keeps the sums of the conditional bound and
+the limit of accuracy."""
 
 
 @dataclass(frozen=True)
@@ -50,13 +51,13 @@ class CampaignPlan:
     block: int
     """runs a device"""
     bound: bool = False
-    """whether to compute the conditional Cramér-Rao bound of every run"""
+    """compute the conditional Cramér-Rao bound of every run"""
     dtype: np.dtype | None = None
-    """of the worlds; None for that of JAX"""
+    """dtype of the worlds; None for JAX's default"""
 
     @property
     def wide(self) -> int:
-        """The number B of runs of a block, those of all devices."""
+        """The number B of runs of a block, on all devices together."""
         return self.block * len(self.devices)
 
     @property
@@ -69,7 +70,7 @@ class CampaignPlan:
 
 
 class BlockResult(NamedTuple):
-    """What a block of runs gives."""
+    """The scores of a block of runs, and its times."""
 
     scores: dict[str, dict[str, np.ndarray]]
     """condensed scores by filter"""
@@ -82,54 +83,63 @@ class BlockResult(NamedTuple):
 
 
 class BlockRunner:
-    """Compiles the programs of a plan where it is made, and computes its blocks."""
+    """Computes the blocks of a plan, once its programs are compiled."""
 
     def __init__(self, plan: CampaignPlan) -> None:
         self.plan, self._devices = plan, tuple(plan.devices)
         self.programs = programs(self._devices, plan.dtype)
-        traced = tuple(one for one in REGISTRY.values() if one.of_run is not None)
-        self._statistics = statistics_program(self._devices, traced)
+        measures = tuple(m for m in REGISTRY.values() if m.of_run is not None)
+        self._statistics = statistics_program(self._devices, measures)
         # The numbers of world and filters are put on every device once.
         everywhere = NamedSharding(mesh_of(self._devices), spec(None))
         self._world: World = jax.device_put(plan.scenario, everywhere)
         self._key = jax.device_put(plan.key, everywhere)
         self._filters: dict[str, Candidate] = {
-            name: jax.device_put(as_record(one), everywhere) for name, one in plan.filters.items()
+            name: jax.device_put(as_record(candidate), everywhere)
+            for name, candidate in plan.filters.items()
         }
-        began = time.perf_counter()
-        self._compile()
-        self.compile_seconds = time.perf_counter() - began
-        self._limit = self._divergence_limit()
+        self.compile_seconds = 0.0
+        self._limit: Float[np.ndarray, ""] = np.zeros(())
 
-    def _compile(self) -> None:
-        """Compile all programs, each while the next one is traced: a call finds them compiled."""
+    def compile(self) -> None:
+        """Compile all programs, each while the next one is traced: a block finds them compiled.
+
+        A program is traced here, and not in a helper: each call would be a frame of the tracebacks
+        in a user's model.
+        """
+        began = time.perf_counter()
         # Compiling one program keeps nearly two cores busy; more at once only delay the first.
         pool = ThreadPoolExecutor(max(cores() // 2, 1))
         compiling: dict[Hashable, Future[PyTree]] = {}
 
-        def start(program: PyTree, *arguments: PyTree) -> PyTree:
+        def start(program: PyTree, traced: PyTree) -> PyTree:
             """Start a compilation; returns the shapes of the results."""
-            leaves, tree = jax.tree.flatten(arguments)
-            key = program, tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
-            traced = program.trace(*arguments)
-            if key not in compiling:
-                compiling[key] = pool.submit(traced.lower().compile)
+            leaves, tree = jax.tree.flatten(traced.args_info)
+            shapes = program, tree, tuple((leaf.shape, leaf.dtype) for leaf in leaves)
+            if shapes not in compiling:
+                compiling[shapes] = pool.submit(traced.lower().compile)
             return traced.out_info
 
-        plan, made, world, devices = self.plan, self.programs, self._world, self._devices
-        runs = self._numbers(0)
+        plan, world, devices, numbers = self.plan, self._world, self._devices, self._numbers(0)
+        draw, drive, bound, _ = self.programs
         try:
-            draws = structs(start(made.draw, world, self._key, runs), devices)
-            for one in self._filters.values():
-                shapes = start(made.drive, world, one, self._key, runs, draws)
-                results: FilterResults = structs(shapes, devices, RUN_AXES)
-                start(self._statistics, world.sensor, draws[0], results.estimate, results.info)
+            with reworded_tracer_errors(f"{world.name}: draw"):
+                traced = draw.trace(world, self._key, numbers)
+            draws: Draws = structs(start(draw, traced), devices)
+            for name, candidate in self._filters.items():
+                with reworded_tracer_errors(f"monte_carlo: {name}"):
+                    traced = drive.trace(world, candidate, self._key, numbers, *draws)
+                results: FilterResults = structs(start(drive, traced), devices, RUN_AXES)
+                scored = world.sensor, draws[0], results.estimate, results.info
+                start(self._statistics, self._statistics.trace(*scored))
             if plan.limit_by_bound:
-                start(made.bound, world, self._key, runs, draws)
-            for each in compiling.values():
-                each.result()
+                start(bound, bound.trace(world, self._key, numbers, *draws))
+            for program in compiling.values():
+                program.result()
         finally:
             pool.shutdown(cancel_futures=True)
+        self.compile_seconds = time.perf_counter() - began
+        self._limit = self._divergence_limit()
 
     def _numbers(self, first: int) -> np.ndarray:
         """The numbers (B,) of the runs of a block."""
@@ -140,39 +150,40 @@ class BlockRunner:
 
         In a world without noise it is what rounding can do.
         """
-        plan, which = self.plan, self._numbers(0)
-        draws: Draws = self.programs.draw(self._world, self._key, which)
+        plan, numbers = self.plan, self._numbers(0)
+        draws: Draws = self.programs.draw(self._world, self._key, numbers)
         if plan.limit_by_bound:
-            bound = self.programs.bound(self._world, self._key, which, draws)
+            bound = self.programs.bound(self._world, self._key, numbers, *draws)
             variance = float(first_run(bound["position"])[-1])
         else:
-            found = jax.device_get(
+            jacobians = jax.device_get(
                 self.programs.jacobians(plan.scenario, *jax.tree.map(first_run, draws))
             )
-            cov = final_covariance(found, np.asarray(plan.scenario.pose_cov))
+            cov = final_covariance(jacobians, np.asarray(plan.scenario.pose_cov))
             variance = float(np.trace(cov[:2, :2]))
         dtype = draws[0].pose.dtype
         reach = 1.0 + float(np.max(np.abs(np.asarray(plan.scenario.landmarks)), initial=0.0))
+        # In a world without noise σ is 0, and only rounding is left.
         rounding = 1000 * float(jnp.finfo(dtype).eps) * reach
         return np.asarray(max(FAR * max(variance, 0.0) ** 0.5, rounding), dtype)
 
     def block(self, first: int, runs: int) -> BlockResult:
         """The result of runs first … first + runs - 1, all within a block."""
-        plan, made = self.plan, self.programs
+        plan, (draw, drive, bound, _) = self.plan, self.programs
         # The number of a run sets its place in a block, in any piece: the same bits.
         base = first // plan.wide * plan.wide
-        mine = slice(first - base, first - base + runs)
-        which = self._numbers(base)
-        draws: Draws = jax.block_until_ready(made.draw(self._world, self._key, which))
+        wanted = slice(first - base, first - base + runs)
+        numbers = self._numbers(base)
+        draws: Draws = jax.block_until_ready(draw(self._world, self._key, numbers))
         truth = jax.device_get(draws[0])
         valid = np.asarray(jax.device_get(draws[1].scan.valid))
         measured = valid.reshape(len(valid), -1).sum(axis=1)
-        out: dict[str, dict[str, np.ndarray]] = {}
+        scores: dict[str, dict[str, np.ndarray]] = {}
         run_0, seconds = {}, {}
-        for name, one in self._filters.items():
+        for name, candidate in self._filters.items():
             began = time.perf_counter()
             results: FilterResults = jax.block_until_ready(
-                made.drive(self._world, one, self._key, which, draws)
+                drive(self._world, candidate, self._key, numbers, *draws)
             )
             seconds[name] = (time.perf_counter() - began) / plan.block
             if first == 0:
@@ -180,44 +191,29 @@ class BlockRunner:
                     jax.tree.map(lambda leaf: leaf[0], truth),
                     jax.tree.map(lambda leaf: first_run(leaf, 1), results.estimate),
                 )
-            scores = self._score(results, draws[0], truth, measured, mine)
-            out[name] = condense(scores, first, float(self._limit))
-        out[BOUND] = {"limit": self._limit}
+            statistics = jax.device_get(
+                self._statistics(self._world.sensor, draws[0], results.estimate, results.info)
+            )
+            chart_error = np.swapaxes(jax.device_get(results.chart_error), 0, 1)
+            by_run = _on_host(results), truth, statistics, chart_error, measured
+            score_of_runs = score(*jax.tree.map(lambda leaf: leaf[wanted], by_run))
+            scores[name] = condense(score_of_runs, first, float(self._limit))
+        scores[BOUND] = {"limit": self._limit}
         if plan.bound:
-            bound = jax.device_get(made.bound(self._world, self._key, which, draws))
-            out[BOUND] |= condensed_sums({name: rows[mine] for name, rows in bound.items()})
-        return BlockResult(out, run_0, seconds, self.compile_seconds)
-
-    def _score(
-        self,
-        results: FilterResults,
-        drawn: Truth,
-        truth: Truth,
-        measured: Int[np.ndarray, "B"],
-        mine: slice,
-    ) -> Score:
-        """The scores of the runs mine.
-
-        drawn: the truth on the devices, truth: on the host. measured: how many measurements.
-        """
-        found = jax.device_get(
-            self._statistics(self._world.sensor, drawn, results.estimate, results.info)
-        )
-        chart_error = np.swapaxes(jax.device_get(results.own_error), 0, 1)
-        trace = _on_host(results)
-        given = trace, truth, found, chart_error, measured
-        return score(*jax.tree.map(lambda leaf: leaf[mine], given))
+            variances = jax.device_get(bound(self._world, self._key, numbers, *draws))
+            scores[BOUND] |= condensed_sums({n: rows[wanted] for n, rows in variances.items()})
+        return BlockResult(scores, run_0, seconds, self.compile_seconds)
 
 
 def first_run(leaf: jax.Array, axis: int = 0) -> np.ndarray:
-    """Run 0 of an array on the devices, copied from its shard. axis: that of the runs."""
-    shard = next(one for one in leaf.addressable_shards if not one.index[axis].start)
+    """Run 0 of an array on the devices, copied from its shard. axis: over the runs."""
+    shard = next(part for part in leaf.addressable_shards if not part.index[axis].start)
     run: np.ndarray = np.take(np.asarray(shard.data), 0, axis)
     return run.copy()
 
 
 def _on_host(results: FilterResults) -> Trace:
-    """What `score` looks at itself, on the host, by run first; the rest is None."""
+    """The part of a trace that `score` reads, on the host, axis of the runs first; else None."""
     absent: PyTree = None
     estimate, info = results.estimate, results.info
     by_time = (
@@ -225,10 +221,10 @@ def _on_host(results: FilterResults) -> Trace:
         info._replace(innovation=absent, innovation_cov=absent, slot=absent),
         results.information,
     )
-    found: tuple[Estimate, Info, PyTree] = jax.tree.map(
+    by_run: tuple[Estimate, Info, PyTree] = jax.tree.map(
         lambda leaf: np.swapaxes(leaf, 0, 1), jax.device_get(by_time)
     )
     final: MonitoredState | None = None
     if results.monitor is not None:
         final = MonitoredState(None, jax.device_get(results.monitor._replace(directions=absent)))
-    return Trace(found[0], found[1], final, found[2])
+    return Trace(by_run[0], by_run[1], final, by_run[2])

@@ -1,7 +1,7 @@
-"""Checks of the filters of a campaign, and the number of runs that fit a device."""
+"""Checks of the filters of a campaign, and of the noise and the dtype of its worlds."""
 
 import inspect
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from typing import TypeVar
 
 import jax
@@ -11,43 +11,17 @@ from jax.typing import DTypeLike
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
-from jaxslam._driver import run
-from jaxslam.charts import Euclidean
-from jaxslam.consistency._measures.observability import monitor_of
 from jaxslam.core._numbers import check_covariance, is_concrete
 from jaxslam.core.logs._tables import split_unit
-from jaxslam.core.protocols import Candidate, Chart, Estimator, Filter, Motion, Sensor
-from jaxslam.core.types import Log, Trace, Truth
+from jaxslam.core.protocols import Candidate, Estimator, Filter, Motion, Sensor
+from jaxslam.core.types import Truth
+from jaxslam.core.validation import InvalidField
 from jaxslam.graphs.smoothing._forward_pass import LogEstimator
 from jaxslam.math._definite import invertible
 from jaxslam.sensors._suite import Suite
 from jaxslam.simulation._worlds import World
 
 _T = TypeVar("_T")
-
-
-def fitting_block(scenario: World, filters: Mapping[str, Candidate], device: jax.Device) -> int:
-    """The number of runs computed together on a device: 16 on a CPU, whose caches they fit.
-
-    On an accelerator as many as take a quarter of its memory, counting a run's world and what the
-    first filter makes of it, which the scores read several times over: a power of two from 32 on,
-    4096 at most, and 1024 where the device does not tell its memory.
-    """
-    if device.platform == "cpu":
-        return 16
-    room = (device.memory_stats() or {}).get("bytes_limit")
-    if room is None:
-        return 1024
-
-    def one(key: jax.Array) -> PyTree:
-        truth, log = scenario.draw(key)
-        method, _ = estimator_of(next(iter(filters.values())), truth, scenario)
-        trace = method(log, key)
-        return truth, log, trace.estimate, trace.info
-
-    shapes = jax.tree.leaves(jax.eval_shape(one, jax.random.key(0)))
-    each = sum(leaf.size * leaf.dtype.itemsize for leaf in shapes)
-    return int(np.clip(2 ** int(np.log2(max(room / 4 / each, 1.0))), 32, 4096))
 
 
 def check_dtype(dtype: DTypeLike | None) -> np.dtype | None:
@@ -62,21 +36,21 @@ def check_dtype(dtype: DTypeLike | None) -> np.dtype | None:
     return wanted
 
 
-def rounded(tree: _T, dtype: DTypeLike | None) -> _T:
-    """The same arrays, those of floating-point numbers in the dtype; None leaves them."""
+def cast_floats(tree: _T, dtype: DTypeLike | None) -> _T:
+    """A tree whose arrays of floating-point numbers are in the dtype; None leaves them."""
     if dtype is None:
         return tree
-    out: _T = jax.tree.map(
+    in_dtype: _T = jax.tree.map(
         lambda leaf: leaf.astype(dtype) if jnp.issubdtype(leaf.dtype, jnp.floating) else leaf, tree
     )
-    return out
+    return in_dtype
 
 
 def check_noise(scenario: World) -> None:
     """Raise ValueError if the noise of a model of the scenario is not a covariance.
 
     A `noise_cov` that is a function can only be looked at where it is called. That of the motion is
-    called for the start and the first control, that of a sensor, or of each part of a suite, for
+    called for the start and the first control; a sensor's, and each part's of a suite, for
     z = 0 and, if it is not a covariance there, for the first landmark as measured from the start.
     """
     if not is_concrete(scenario.controls, scenario.pose, scenario.landmarks):
@@ -99,15 +73,15 @@ def without_noise(scenario: World) -> str:
     """
     if not is_concrete(scenario.pose, scenario.landmarks):
         return ""
-    found = []
+    exact_sensors = []
     for model in _sensors(scenario):
         for z in (_number(np.zeros(len(model.measurements))), _first_measurement(model, scenario)):
             exact = _exact(model, np.asarray(_noise_cov(model, z)))
             if not exact:
                 break
         if exact:
-            found.append(f"{exact} of {model.name}")
-    return " and ".join(found)
+            exact_sensors.append(f"{exact} of {model.name}")
+    return " and ".join(exact_sensors)
 
 
 def least_noise(scenario: World) -> float:
@@ -129,7 +103,8 @@ def _exact(sensor: Sensor, cov: np.ndarray) -> str:
     """The measurements of variance 0; a combination of them if no single one has variance 0."""
     sigma = np.sqrt(np.diagonal(cov))
     if (sigma == 0).any():
-        return ", ".join(n for n, one in zip(sensor.measurements, sigma, strict=True) if one == 0)
+        exact = (n for n, s in zip(sensor.measurements, sigma, strict=True) if s == 0)
+        return ", ".join(exact)
     return "" if invertible(cov) else f"a combination of {', '.join(sensor.measurements)}"
 
 
@@ -163,9 +138,8 @@ def _number(values: ArrayLike) -> np.ndarray:
 def _check_stated(name: str, size: int, model: Motion | Sensor, *at: PyTree) -> None:
     try:
         check_covariance(name, _noise_cov(model, *at), size)
-    except ValueError as error:
-        message = str(error).removeprefix(f"{name}: ")
-        raise ValueError(f"monte_carlo: noise_cov of {name}: {message}") from None
+    except InvalidField as error:
+        raise InvalidField("monte_carlo", f"noise_cov of {name}", error.reason) from None
 
 
 def check_fits(name: str, candidate: Candidate, scenario: World) -> None:
@@ -195,14 +169,14 @@ def check_fits(name: str, candidate: Candidate, scenario: World) -> None:
                 "(log, key) is given as lambda truth: estimator"
             ) from None
         return
-    for what, taken, given in (
+    for field, expected, present in (
         ("controls", candidate.controls, scenario.motion.controls),
         ("measurements", candidate.measurements, scenario.sensor.measurements),
     ):
-        if len(taken) != len(given) or not all(map(_one_unit, taken, given)):
+        if len(expected) != len(present) or not all(map(_have_one_unit, expected, present)):
             raise ValueError(
-                f"monte_carlo: filter {name} takes {what} ({', '.join(taken)}), "
-                f"the scenario {scenario.name} gives ({', '.join(given)})"
+                f"monte_carlo: filter {name} takes {field} ({', '.join(expected)}), "
+                f"the scenario {scenario.name} gives ({', '.join(present)})"
             )
 
     size, count = candidate.map_size, np.shape(scenario.landmarks)[0]
@@ -213,9 +187,9 @@ def check_fits(name: str, candidate: Candidate, scenario: World) -> None:
         )
 
 
-def _one_unit(name: str, other: str) -> bool:
+def _have_one_unit(a: str, b: str) -> bool:
     """Whether two names have the same unit; True where either has none."""
-    units = {split_unit(each)[1] for each in (name, other)}
+    units = {split_unit(name)[1] for name in (a, b)}
     return len(units) == 1 or None in units
 
 
@@ -224,7 +198,7 @@ def check_called(name: str, candidate: Callable[..., object]) -> None:
     first = next(iter(inspect.signature(candidate).parameters.values()), None)
     if first is None:
         return
-    ours = (getattr(candidate, "__module__", None) or "").startswith("jaxslam.")
+    ours = (getattr(candidate, "__module__", None) or "").partition(".")[0] == "jaxslam"
     named = first.name in ("motion", "sensor", "robots", "scenario", "world")
     if (ours and named) or first.annotation in (Motion, Sensor, World):
         raise ValueError(f"monte_carlo: {name!r} is a factory: call it, {name}({first.name}, …)")
@@ -238,37 +212,16 @@ def method_of(candidate: Candidate, truth: Truth) -> Filter | Estimator:
     if isinstance(candidate, Filter | LogEstimator):
         return candidate
     try:
-        made: Filter | Estimator = candidate(truth)
+        method: Filter | Estimator = candidate(truth)
     except AttributeError as error:
         name = getattr(getattr(candidate, "function", candidate), "__name__", str(candidate))
         raise ValueError(
             f"monte_carlo: {name} was called with the truth (poses and landmarks) and fails: "
             f"{error}; of a function of the scenario give what it returns, {name}(scenario)"
         ) from error
-    if not callable(made) and not isinstance(made, Filter):
+    if not callable(method) and not isinstance(method, Filter):
         raise ValueError(
             "monte_carlo: expected a function of the truth to return a filter or an estimator, got "
-            f"{type(made).__name__}"
+            f"{type(method).__name__}"
         )
-    return made
-
-
-def estimator_of(candidate: Candidate, truth: Truth, scenario: World) -> tuple[Estimator, Chart]:
-    """The estimator that a candidate is, and the chart of its errors.
-
-    Its probe is the information in the filter's observability monitor, where it has one.
-    """
-    method = method_of(candidate, truth)
-    if not isinstance(method, Filter):
-        return method, Euclidean()
-    check_fits(method.name, method, scenario)
-
-    def drive(log: Log, key: jax.Array) -> Trace:
-        return run(method, log, scenario.pose, scenario.pose_cov, key, probe=_gained)
-
-    return drive, getattr(method, "chart", Euclidean())
-
-
-def _gained(state: PyTree) -> jax.Array | None:
-    monitor = monitor_of(state)
-    return None if monitor is None else monitor.information
+    return method

@@ -1,4 +1,4 @@
-"""The identity of a campaign: what must agree for two blocks of runs to be of one campaign.
+"""The identity of a campaign: the things that agree between two blocks of runs of one campaign.
 
 World, filters and key are data, so it is their structure and their numbers, bit by bit, with the
 versions and a digest of the package's source. Of classes and functions outside the package it is
@@ -55,7 +55,7 @@ def identity(
     compute, as "cpu"; rounding differs between platforms.
     """
     parts = {name: digest(getattr(scenario, name)) for name in _OF_WORLD}
-    registered = [one for one in REGISTRY.values() if one not in BUILT_IN]
+    registered = [measure for measure in REGISTRY.values() if measure not in BUILT_IN]
     fields = {field.name for field in dataclasses.fields(scenario)} - _NO_PART_OF_DRAWS
     rest = {
         f"world's {name}": digest(getattr(scenario, name))
@@ -76,13 +76,16 @@ def identity(
         "world": digest(type(scenario)),
         **rest,
         **{f"filter {name}": digest(candidate) for name, candidate in filters.items()},
-        **{f"measure {one.key}": digest((type(one), one.of_run)) for one in registered},
+        **{
+            f"measure {measure.key}": digest((type(measure), measure.of_run))
+            for measure in registered
+        },
     }
 
 
 def digest(value: object) -> str:
     """A digest of records, arrays, functions and what they hold."""
-    return _short(_text(value, ()))
+    return hashlib.sha256(_text(value, ()).encode()).hexdigest()[:16]
 
 
 def _text(value: object, within: tuple[object, ...]) -> str:
@@ -127,7 +130,7 @@ def _text_of_class(cls: type, within: tuple[object, ...]) -> str:
         for name, part in parts.items()
         if isinstance(part, FunctionType) and _of_user(part) and name not in _BY_DATACLASS
     }
-    if not methods or cls in within or cls.__module__.startswith("jaxslam."):
+    if not methods or cls in within or cls.__module__.partition(".")[0] == "jaxslam":
         return _name(cls)
     constants = {
         name: part
@@ -159,10 +162,6 @@ def _of_user(function: FunctionType) -> bool:
 def _name(value: object) -> str:
     of = value if hasattr(value, "__qualname__") else type(value)
     return f"{of.__module__}.{of.__qualname__}"
-
-
-def _short(text: str) -> str:
-    return hashlib.sha256(text.encode()).hexdigest()[:16]
 
 
 def _key(key: jax.Array) -> str:

@@ -17,7 +17,7 @@ Piece = tuple[int, int]
 """(first, runs) of a block"""
 
 TRIES = 3
-"""How often a block is computed on an executor, at most."""
+"""Largest number of times that a block is computed on an executor."""
 
 _LATE = 60.0
 """A block is late after this time [s], and after ten times the longest of those before it."""
@@ -25,16 +25,16 @@ _LATE = 60.0
 
 def out_of_memory(error: BaseException) -> bool:
     """Whether an error says that a block needs more memory than there is."""
-    whole = isinstance(error, jax.errors.JaxRuntimeError) and "RESOURCE_EXHAUSTED" in str(error)
-    return whole or isinstance(error, MemoryError)
+    exhausted = isinstance(error, jax.errors.JaxRuntimeError) and "RESOURCE_EXHAUSTED" in str(error)
+    return exhausted or isinstance(error, MemoryError)
 
 
-def _is_of_the_code(error: BaseException) -> bool:
-    """Whether the code that is run would raise an error on every worker."""
+def _fails_everywhere(error: BaseException) -> bool:
+    """Whether an error is of the code that is run, so that every worker would raise it."""
     return isinstance(error, ValueError | TypeError | ImportError) or out_of_memory(error)
 
 
-def _text(error: BaseException) -> str:
+def _one_line(error: BaseException) -> str:
     """An error in one line."""
     return " ".join(f"{type(error).__name__}: {error}".split())
 
@@ -42,7 +42,7 @@ def _text(error: BaseException) -> str:
 @dataclass
 class _Block:
     futures: list[tuple[Any, float]] = field(default_factory=list)
-    """those in flight, with the time when each began"""
+    """futures in flight, with the time when each began"""
     tries: int = 0
 
 
@@ -51,9 +51,9 @@ class Flight:
     """The blocks in flight."""
 
     submit: Callable[[int, int], Any]
-    """begins the block (first, runs), and returns its future"""
+    """function (first, runs) -> future of that block"""
     tries: int = 1
-    """how often a block is begun, at most, where it fails or is late"""
+    """largest number of times that a block is begun, where it fails or is late"""
     _blocks: dict[Piece, _Block] = field(default_factory=dict)
     _longest: float = 0.0
     """time from the beginning of a block to its end"""
@@ -70,7 +70,7 @@ class Flight:
         try:
             future = self.submit(*piece)
         except Exception as error:
-            raise self._given_up(error) from error
+            raise self._final_error(error) from error
         block = self._blocks.setdefault(piece, _Block())
         block.futures.append((future, time.monotonic()))
         block.tries += 1
@@ -90,20 +90,22 @@ class Flight:
         """
         self._wait()
         for piece, block in list(self._blocks.items()):
-            found = self._result(block)
-            if isinstance(found, BaseException) and self._once_more(piece, block, found):
-                found = None
-            if found is not None:
+            result = self._result(block)
+            if isinstance(result, BaseException):
+                if self._restart(piece, block, result):
+                    continue
+                result = self._final_error(result)
+            if result is not None:
                 del self._blocks[piece]
-                yield piece, self._given_up(found) if isinstance(found, BaseException) else found
+                yield piece, result
 
-    def _given_up(self, error: BaseException) -> BaseException:
-        """The error of a block that is not computed again: of an executor an `Incomplete`."""
-        if self.tries == 1 or not isinstance(error, Exception) or _is_of_the_code(error):
+    def _final_error(self, error: BaseException) -> BaseException:
+        """The error of a block that is not computed again; `Incomplete` for one of an executor."""
+        if self.tries == 1 or not isinstance(error, Exception) or _fails_everywhere(error):
             return error
         broken = isinstance(error, BrokenExecutor) and self._longest == 0
         hint = "; does the script begin under `if __name__ == '__main__':`?" * broken
-        incomplete = Incomplete(f"{_text(error)}{hint}")
+        incomplete = Incomplete(f"{_one_line(error)}{hint}")
         incomplete.__cause__ = error
         return incomplete
 
@@ -117,7 +119,7 @@ class Flight:
     def _result(self, block: _Block) -> BlockResult | BaseException | None:
         """The result of a block, its error once no future is left, or None."""
         error: BaseException | None = None
-        for future, began in [one for one in block.futures if one[0].done()]:
+        for future, began in [pair for pair in block.futures if pair[0].done()]:
             block.futures.remove((future, began))
             try:
                 error = future.exception()
@@ -131,15 +133,15 @@ class Flight:
             return error
         late = max(_LATE, 10 * self._longest)
         # Before the first result the workers compile, which takes as long as it takes.
-        judged = self.tries > 1 and self._longest > 0
-        if judged and time.monotonic() - block.futures[-1][1] > late:
+        has_limit = self.tries > 1 and self._longest > 0
+        if has_limit and time.monotonic() - block.futures[-1][1] > late:
             return TimeoutError(f"no result after {late:.0f} s")
         return None
 
-    def _once_more(self, piece: Piece, block: _Block, error: BaseException) -> bool:
-        """Begin a block once more, and warn, unless that is in vain; whether it was begun."""
+    def _restart(self, piece: Piece, block: _Block, error: BaseException) -> bool:
+        """Begin a block again, with a warning, unless that is in vain; whether it was begun."""
         in_vain = self._ends or block.tries >= self.tries
-        if in_vain or not isinstance(error, Exception) or _is_of_the_code(error):
+        if in_vain or not isinstance(error, Exception) or _fails_everywhere(error):
             return False
         try:
             self.start(piece)
@@ -147,7 +149,7 @@ class Flight:
             return False
         warnings.warn(
             f"monte_carlo: runs {piece[0]} to {sum(piece) - 1} are computed once more "
-            f"({_text(error)})",
+            f"({_one_line(error)})",
             stacklevel=2,
         )
         return True

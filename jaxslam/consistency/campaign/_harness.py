@@ -2,8 +2,8 @@
 
 A run is a number: its key and its place in a block. For one size of blocks and one number of
 devices its world and its filters' results are the same to the bit, for any workers, parts and
-interruptions; otherwise to rounding. Only scores are kept of a block, so
-memory is that of the blocks in flight however many runs there are.
+interruptions; otherwise to rounding. Only scores are kept of a block, so the blocks in flight set
+the memory, for any number of runs.
 
 On a GPU particle filters agree to rounding alone (`docs/guide/campaigns.md`).
 """
@@ -22,33 +22,31 @@ from jaxslam.consistency import Summary
 from jaxslam.consistency._summary import summarize
 from jaxslam.consistency._tally import Tally
 from jaxslam.consistency.campaign._block import BOUND, CampaignPlan
+from jaxslam.consistency.campaign._block_programs import fitting_block
 from jaxslam.consistency.campaign._candidates import (
     check_dtype,
     check_fits,
     check_noise,
-    fitting_block,
     method_of,
     without_noise,
 )
 from jaxslam.consistency.campaign._digests import identity
 from jaxslam.consistency.campaign._kept import Keep, add_kept
-from jaxslam.consistency.campaign._pieces import check_part, cores, in_part, missing
+from jaxslam.consistency.campaign._pieces import check_part, cores, in_part, missing_pieces
 from jaxslam.consistency.campaign._precision import precision_doubts
 from jaxslam.consistency.campaign._remote import Executor
 from jaxslam.consistency.campaign._result import Campaign, Incomplete, Interrupted
-from jaxslam.consistency.campaign._work import Work, shown_progress
+from jaxslam.consistency.campaign._work import Work, show_progress
 from jaxslam.core._numbers import check_count, check_key, is_concrete
 from jaxslam.core._validation import check_record
 from jaxslam.core.protocols import Candidate, Filter
 from jaxslam.core.types import Truth
 from jaxslam.graphs.smoothing._forward_pass import LogEstimator
-from jaxslam.math._xla import moves_numbers
 from jaxslam.simulation._worlds import World, with_positions
 
 _T = TypeVar("_T")
 
 
-@moves_numbers
 def monte_carlo(
     scenario: World,
     filters: Mapping[str, Candidate],
@@ -93,7 +91,7 @@ def monte_carlo(
         part: (i, n) with 1 <= i <= n: only the blocks i - 1, i - 1 + n, … are computed, and the
             returned campaign covers them. So n independent jobs compute a
             campaign, each with a `keep` from `store.open` on one folder, with the same block and
-            number of devices; without `part` the blocks are summed up, and those that are missing
+            number of devices; without `part` the blocks are summed up, and missing blocks are
             computed.
         progress: called with (runs done, runs) after each block. Default a bar with
             rate and remaining time, only on a terminal and in a notebook; False: none.
@@ -112,53 +110,57 @@ def monte_carlo(
         Interrupted: on Ctrl-C, with the campaign so far.
         Incomplete: where an executor computes no more, with the campaign so far.
     """
-    _check(scenario, filters, runs, key, block, workers, devices, keep, part, progress, executor)
-    began, runs = time.perf_counter(), int(runs)
-    devices = jax.local_devices() if devices is None else list(devices)
-    if executor is not None:
-        devices = devices[:1]  # as every worker
-    dtype = check_dtype(dtype)
-    if workers is None and executor is not None:
-        workers = 64
-    if workers is None:
-        # An accelerator computes a block while the host scores the one before: 1.4 times the runs a
-        # second of one block at a time on an H100, and no more with three.
-        workers = -(-cores() // len(devices)) if devices[0].platform == "cpu" else 2
-    names = (*filters, BOUND)
-    tallies = {name: Tally() for name in names}
-    size = int(block or fitting_block(scenario, filters, devices[0]))
-    near, near_filters, origin = _near_the_origin(scenario, filters)
-    plan = CampaignPlan(near, near_filters, key, devices, size, bound, dtype)
-    if part is not None and (part[0] - 1) * plan.wide >= runs:
-        raise ValueError(
-            f"monte_carlo: part: expected one of the {-(-runs // plan.wide)} blocks of {plan.wide} "
-            f"runs that {runs} runs are, got part {part[0]} of {part[1]}"
+    # A user's transfer guard is there for loops of the user's; a campaign moves its numbers itself.
+    with jax.transfer_guard("allow"):
+        _check(
+            scenario, filters, runs, key, block, workers, devices, keep, part, progress, executor
         )
-    finished: list[tuple[int, int]] = []
-    if keep is not None:
-        keep.claim(identity(scenario, filters, key, devices[0].platform, bound, dtype))
-        finished = add_kept(tallies, keep, runs, lambda first: in_part(first, plan.wide, part))
-    pieces = missing(finished, runs, plan.wide)
-    todo = [piece for piece in pieces if in_part(piece[0], plan.wide, part)]
-    work = Work(workers, keep, progress or None, {name: Tally() for name in names}, executor)
-    stop: KeyboardInterrupt | Incomplete | None = None
-    try:
-        with shown_progress(work, plan, progress is None):
-            work.in_blocks_that_fit(plan, todo)
-    except (KeyboardInterrupt, Incomplete) as error:
-        stop = error
-    for name, tally in work.tallies.items():
-        tallies[name].merge(tally)
-    campaign = None
-    if tallies[BOUND].pieces():
-        seconds = time.perf_counter() - began
-        campaign = _summed_up(plan, tallies, work, origin, seconds, compare=stop is None)
-    if isinstance(stop, Incomplete):
-        done = f"{campaign.runs if campaign else 0} of {runs} runs done"
-        raise Incomplete(f"monte_carlo: executor: {stop}; {done}", campaign) from stop.__cause__
-    if stop is not None or campaign is None:
-        raise Interrupted(campaign, runs)
-    return campaign
+        began, runs = time.perf_counter(), int(runs)
+        devices = jax.local_devices() if devices is None else list(devices)
+        if executor is not None:
+            devices = devices[:1]  # as every worker
+        dtype = check_dtype(dtype)
+        if workers is None and executor is not None:
+            workers = 64
+        if workers is None:
+            # An accelerator computes a block while the host scores the one before: 1.4 times the
+            # runs a second of one block at a time on an H100, and no more with three.
+            workers = -(-cores() // len(devices)) if devices[0].platform == "cpu" else 2
+        names = (*filters, BOUND)
+        tallies = {name: Tally() for name in names}
+        size = int(block or fitting_block(scenario, filters, devices[0]))
+        near, near_filters, origin = _near_the_origin(scenario, filters)
+        plan = CampaignPlan(near, near_filters, key, devices, size, bound, dtype)
+        if part is not None and (part[0] - 1) * plan.wide >= runs:
+            raise ValueError(
+                f"monte_carlo: part: expected one of the {-(-runs // plan.wide)} blocks of "
+                f"{plan.wide} runs that {runs} runs are, got part {part[0]} of {part[1]}"
+            )
+        finished: list[tuple[int, int]] = []
+        if keep is not None:
+            keep.claim(identity(scenario, filters, key, devices[0].platform, bound, dtype))
+            finished = add_kept(tallies, keep, runs, lambda first: in_part(first, plan.wide, part))
+        pieces = missing_pieces(finished, runs, plan.wide)
+        todo = [piece for piece in pieces if in_part(piece[0], plan.wide, part)]
+        work = Work(workers, keep, progress or None, {name: Tally() for name in names}, executor)
+        stop: KeyboardInterrupt | Incomplete | None = None
+        try:
+            with show_progress(work, plan, progress is None):
+                work.compute(plan, todo)
+        except (KeyboardInterrupt, Incomplete) as error:
+            stop = error
+        for name, tally in work.tallies.items():
+            tallies[name].merge(tally)
+        campaign = None
+        if tallies[BOUND].pieces():
+            seconds = time.perf_counter() - began
+            campaign = _summed_up(plan, tallies, work, origin, seconds, compare=stop is None)
+        if isinstance(stop, Incomplete):
+            done = f"{campaign.runs if campaign else 0} of {runs} runs done"
+            raise Incomplete(f"monte_carlo: executor: {stop}; {done}", campaign) from stop.__cause__
+        if stop is not None or campaign is None:
+            raise Interrupted(campaign, runs)
+        return campaign
 
 
 def _check(
@@ -232,11 +234,11 @@ def _check(
 
 
 def summaries_of(tallies: dict[str, Tally]) -> tuple[int, np.ndarray, dict[str, Summary]]:
-    """How many runs there are, the limit of accuracy, and the summary of each filter."""
+    """The number of runs, the limit of accuracy [m], and the summary of each filter."""
     finished = sum(count for _, count in tallies[BOUND].pieces())
     bound = {name: total / finished for name, total in tallies[BOUND].sums.items()} or None
-    found = {name: summarize(one, bound) for name, one in tallies.items() if name != BOUND}
-    return finished, tallies[BOUND].first("limit"), found
+    summaries = {name: summarize(tally, bound) for name, tally in tallies.items() if name != BOUND}
+    return finished, tallies[BOUND].first("limit"), summaries
 
 
 def _summed_up(
@@ -252,8 +254,8 @@ def _summed_up(
     origin: what positions are relative to. compare: whether runs may be filtered again in float64.
     """
 
-    def in_the_map(found: _T) -> _T:
-        return found if origin is None else returned(found, origin)
+    def in_map(tree: _T) -> _T:
+        return tree if origin is None else returned(tree, origin)
 
     scenario = plan.scenario
     finished, limit, summaries = summaries_of(tallies)
@@ -274,8 +276,8 @@ def _summed_up(
         step_seconds={name: seconds / steps for name, seconds in work.run_seconds().items()},
         first={
             name: (
-                in_the_map(jax.device_get(with_positions(scenario.sensor, truth))),
-                in_the_map(estimate),
+                in_map(jax.device_get(with_positions(scenario.sensor, truth))),
+                in_map(estimate),
             )
             for name, (truth, estimate) in work.first.items()
         },
@@ -286,8 +288,11 @@ def _summed_up(
 def _near_the_origin(
     scenario: World, filters: Mapping[str, Candidate]
 ) -> tuple[World, Mapping[str, Candidate], np.ndarray | None]:
-    """World and filters with positions relative to the start, and the (x, y) of that in the map,
-    where its origin is far and none of them depends on where it is; else as they are, and None."""
+    """World and filters with positions relative to the start, and the start's (x, y) in the map.
+
+    Unchanged, and None, where the map's origin is near, or the world or a filter depends on where
+    it is.
+    """
     origin = far_origin(scenario.pose, scenario.landmarks)
     if origin is None or (near := moved(scenario, origin, scenario.controls)) is None:
         return scenario, filters, None
@@ -297,41 +302,42 @@ def _near_the_origin(
         missed=np.zeros(near.steps, int),
         start=np.asarray(near.pose),
     )
-    out: dict[str, Candidate] = {}
+    near_filters: dict[str, Candidate] = {}
     for name, candidate in filters.items():
-        there: Candidate | None
+        near_filter: Candidate | None
         if isinstance(candidate, Filter | LogEstimator):
-            there = moved(candidate, origin, scenario.controls)
+            near_filter = moved(candidate, origin, scenario.controls)
         else:  # a function of the truth, which is relative
             try:
-                made = method_of(candidate, truth)
+                method = method_of(candidate, truth)
             except Exception:  # it may need the truth of a run; where it is wrong, that says so
-                made = None
-            known = isinstance(made, Filter | LogEstimator)
-            there = candidate if known and may_move(made, origin, scenario.controls) else None
-        if there is None:
+                method = None
+            is_record = isinstance(method, Filter | LogEstimator)
+            movable = is_record and may_move(method, origin, scenario.controls)
+            near_filter = candidate if movable else None
+        if near_filter is None:
             return scenario, filters, None
-        out[name] = there
-    return near, out, origin
+        near_filters[name] = near_filter
+    return near, near_filters, origin
 
 
-def _qualify(found: dict[str, Summary], scenario: World) -> dict[str, Summary]:
-    """The summaries, with a doubt on those that an exact sensor left without a covariance."""
-    dropped = {name: one.counts.get("singular", 0) for name, one in found.items()}
+def _qualify(summaries: dict[str, Summary], scenario: World) -> dict[str, Summary]:
+    """The summaries, with a doubt on filters that an exact sensor left without a covariance."""
+    dropped = {name: summary.counts.get("singular", 0) for name, summary in summaries.items()}
     exact = without_noise(scenario) if any(dropped.values()) else ""
     if not exact:
-        return found
+        return summaries
     return {
         name: replace(
-            one,
+            summary,
             doubts=(
-                *one.doubts,
+                *summary.doubts,
                 f"the sensor has {exact} without noise, so innovation covariances were singular: "
                 f"{dropped[name]:,} measurements were dropped and others weighted by rounding "
                 "errors; give the sensor a small noise",
             ),
         )
         if dropped[name]
-        else one
-        for name, one in found.items()
+        else summary
+        for name, summary in summaries.items()
     }

@@ -45,29 +45,31 @@ def add_kept(
 
 
 def add_block(
-    tallies: dict[str, Tally], first: int, runs: int, found: dict[str, dict[str, np.ndarray]]
+    tallies: dict[str, Tally], first: int, runs: int, scores: dict[str, dict[str, np.ndarray]]
 ) -> None:
     """Add the arrays of a block to the tally of each filter."""
-    for name, arrays in found.items():
+    for name, arrays in scores.items():
         tallies[name].add(first, runs, arrays)
 
 
-def flat(found: dict[str, dict[str, np.ndarray]], names: Iterable[str]) -> dict[str, np.ndarray]:
+def flatten(
+    scores: dict[str, dict[str, np.ndarray]], names: Iterable[str]
+) -> dict[str, np.ndarray]:
     """The arrays of all filters in one mapping, by "position/name"."""
     return {
         f"{i}/{key}": array
         for i, name in enumerate(names)
-        for key, array in found.get(name, {}).items()
+        for key, array in scores.get(name, {}).items()
     }
 
 
 def by_filter(
     arrays: Mapping[str, np.ndarray], names: Iterable[str]
 ) -> dict[str, dict[str, np.ndarray]]:
-    """The inverse of `flat`."""
-    out: dict[str, dict[str, np.ndarray]] = {}
+    """The inverse of `flatten`."""
+    scores: dict[str, dict[str, np.ndarray]] = {}
     order = list(names)
     for label, array in arrays.items():
         i, _, key = label.partition("/")
-        out.setdefault(order[int(i)], {})[key] = array
-    return out
+        scores.setdefault(order[int(i)], {})[key] = array
+    return scores

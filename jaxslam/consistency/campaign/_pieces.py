@@ -4,7 +4,9 @@ import os
 from collections.abc import Iterable
 
 
-def missing(finished: Iterable[tuple[int, int]], runs: int, block: int) -> list[tuple[int, int]]:
+def missing_pieces(
+    finished: Iterable[tuple[int, int]], runs: int, block: int
+) -> list[tuple[int, int]]:
     """The unfinished pieces (first, runs) of runs 0 … runs-1, in order, split at block borders:
     each is within runs n block … (n + 1) block - 1 for some n.
 
@@ -26,8 +28,8 @@ def missing(finished: Iterable[tuple[int, int]], runs: int, block: int) -> list[
 
 def check_part(name: str, part: object) -> None:
     """Raise ValueError, which begins with a name, unless part is (i, n) with 1 <= i <= n."""
-    whole = isinstance(part, tuple) and len(part) == 2 and all(type(n) is int for n in part)
-    if not whole or not 1 <= part[0] <= part[1]:  # type: ignore[index]
+    is_pair = isinstance(part, tuple) and len(part) == 2 and all(type(n) is int for n in part)
+    if not is_pair or not 1 <= part[0] <= part[1]:  # type: ignore[index]
         raise ValueError(f"{name}: expected (i, n) with 1 <= i <= n, got {part!r}")
 
 

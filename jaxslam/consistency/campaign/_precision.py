@@ -34,15 +34,15 @@ from jaxslam.math._arrays import float64
 from jaxslam.simulation._worlds import World
 
 RUNS = 16
-"""As many runs, at most, are filtered again: a block on a CPU, whose programs are there."""
+"""Largest number of runs that are filtered again: a block on a CPU, whose programs are there."""
 
 
 def precision_doubts(
     plan: CampaignPlan, tallies: Mapping[str, Tally], dtype: np.dtype, compare: bool = True
 ) -> dict[str, str]:
-    """By filter, a sentence on the precision of its runs, where that decides.
+    """Sentences, by filter, on the precision of its runs, where that decides.
 
-    dtype: that of the runs. compare: whether they may be filtered again.
+    dtype: of the runs. compare: whether runs may be filtered again.
     """
     least, doubts = least_noise(plan.scenario), {}
     for name, candidate in plan.filters.items():
@@ -80,7 +80,7 @@ class _Runs(NamedTuple):
 
     pose: Float[np.ndarray, "T R 3"]
     pose_cov: Float[np.ndarray, "T R 3 3"]
-    own_error: Float[np.ndarray, "T R 3"]
+    chart_error: Float[np.ndarray, "T R 3"]
     status: Int[np.ndarray, "T R M"]
     nis: Float[np.ndarray, "T R M"]
     dof: Int[np.ndarray, "T R M"]
@@ -92,44 +92,44 @@ def _difference(plan: CampaignPlan, candidate: Candidate, numbers: np.ndarray) -
     numbers, or computes in one precision alone."""
     devices = tuple(plan.devices[:1])
     wanted = numbers[: min(RUNS, plan.block)]
-    which = np.resize(wanted, min(RUNS, plan.block))
+    run_numbers = np.resize(wanted, min(RUNS, plan.block))
     everywhere = NamedSharding(mesh_of(devices), spec(None))
 
-    def filtered(draws: Draws | None, key: jax.Array) -> tuple[_Runs, Draws]:
+    def filter_again(draws: Draws | None, key: jax.Array) -> tuple[_Runs, Draws]:
         world, method = jax.device_put((plan.scenario, as_record(candidate)), everywhere)
-        made, these = programs(devices, plan.dtype), which.astype(jnp.result_type(int))
-        own_key = jax.device_put(plan.key, everywhere)
+        compiled, runs = programs(devices, plan.dtype), run_numbers.astype(jnp.result_type(int))
+        campaign_key = jax.device_put(plan.key, everywhere)
         if draws is None:
-            draws = made.draw(world, own_key, these)
-        results: FilterResults = made.drive(
-            world, method, jax.device_put(key, everywhere), these, draws
+            draws = compiled.draw(world, campaign_key, runs)
+        results: FilterResults = compiled.drive(
+            world, method, jax.device_put(key, everywhere), runs, *draws
         )
         estimate, info = results.estimate, results.info
-        of_estimate = estimate.pose, estimate.pose_cov, results.own_error
+        of_estimate = estimate.pose, estimate.pose_cov, results.chart_error
         parts: PyTree = (*of_estimate, info.status, info.nis, info.dof)
         parts, draws = jax.device_get((parts, draws))
         return _Runs(*parts), draws
 
-    single, draws = filtered(None, plan.key)
+    single, draws = filter_again(None, plan.key)
     try:
         with float64():
             wide = jax.tree.map(
                 lambda leaf: leaf.astype(float) if leaf.dtype == np.float32 else leaf, draws
             )
-            double, _ = filtered(wide, plan.key)
+            double, _ = filter_again(wide, plan.key)
             scores = _scores((single, double), np.asarray(draws[0].pose))
             gaps = np.stack([_gap(*pair) for pair in scores.values()])[:, : len(wanted)]
             if not gaps.max() > SAME:
                 return ""
-            another, _ = filtered(wide, jax.random.fold_in(plan.key, 0))
+            another, _ = filter_again(wide, jax.random.fold_in(plan.key, 0))
     except Exception:  # a user's filter that computes in float32 alone
         return None
     if not np.array_equal(double.pose, another.pose, equal_nan=True):
         return None
     run = int(gaps.max(axis=0).argmax())
     pairs = [
-        f"{what} {a[run]:,.4g} and {b[run]:,.4g}"
-        for what, (a, b) in scores.items()
+        f"{name} {a[run]:,.4g} and {b[run]:,.4g}"
+        for name, (a, b) in scores.items()
         if np.isfinite([a[run], b[run]]).any()
     ]
     return f"run {wanted[run]} has, in float32 and in float64, {', '.join(pairs)}"
@@ -142,7 +142,7 @@ def _scores(
     one, NIS/dof, and how many measurements were used."""
     path = np.swapaxes(truth, 0, 1)
     nees = [
-        block_nees(runs.pose, pose_error(path, runs.pose), runs.own_error, runs.pose_cov)["pose"]
+        block_nees(runs.pose, pose_error(path, runs.pose), runs.chart_error, runs.pose_cov)["pose"]
         for runs in both
     ]
     regular = nees[0].regular & nees[1].regular

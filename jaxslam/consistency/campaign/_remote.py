@@ -37,15 +37,15 @@ class Executor(Protocol):
         """The future of fn(*args), which a worker computes."""
 
 
-def packed(plan: CampaignPlan) -> bytes:
-    """A plan and JAX's settings, as `compute_block` takes them.
+def pack(plan: CampaignPlan) -> bytes:
+    """A plan and JAX's settings as bytes, which `compute_block` takes.
 
     Raises ValueError where a filter or the world cannot be pickled.
     """
-    sent: PyTree = replace(plan, devices=[one.platform for one in plan.devices])
+    sent: PyTree = replace(plan, devices=[device.platform for device in plan.devices])
     settings = {name: getattr(jax.config, name) for name in _SETTINGS}
     pickler: Any = pickle
-    more = ""
+    hint = ""
     try:
         # By cloudpickle classes and functions of a script, a notebook or a file can be sent, too.
         with loading("a module holds it, or", "cloudpickle"):
@@ -53,12 +53,12 @@ def packed(plan: CampaignPlan) -> bytes:
 
             pickler = cloudpickle
     except Unusable as lacking:
-        more = f": {lacking}"
+        hint = f": {lacking}"
     try:
         content: bytes = pickler.dumps((sent, settings))
     except (pickle.PicklingError, AttributeError, TypeError) as error:
         raise ValueError(
-            f"monte_carlo: executor: a filter or the world cannot be sent ({error}){more}"
+            f"monte_carlo: executor: a filter or the world cannot be sent ({error}){hint}"
         ) from error
     return content
 
@@ -67,7 +67,7 @@ def compute_block(plan: bytes, first: int, runs: int) -> BlockResult:
     """The scores of runs first … first + runs - 1 on the first device of this process.
 
     The first call for a plan takes over JAX's settings and compiles; the next ones find its
-    programs. plan: of `packed`.
+    programs. plan: of `pack`.
     """
     with _COMPILING:
         runner = _runner(plan)
@@ -92,7 +92,10 @@ def _runner(plan: bytes) -> BlockRunner:
     for name, value in settings.items():
         if getattr(jax.config, name) != value:
             jax.config.update(name, value)
-    return BlockRunner(replace(sent, devices=jax.local_devices(backend=sent.devices[0])[:1]))
+    device = jax.local_devices(backend=sent.devices[0])[0]
+    runner = BlockRunner(replace(sent, devices=[device]))
+    runner.compile()
+    return runner
 
 
 class Processes:

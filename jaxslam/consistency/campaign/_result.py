@@ -56,7 +56,7 @@ class Campaign:
     def size(self) -> str:
         """Runs, steps and precision, as "100 runs × 40 steps, float64"."""
         counts = (
-            f"{n} {what}" + "s" * (n != 1) for n, what in ((self.runs, "run"), (self.steps, "step"))
+            f"{n} {noun}" + "s" * (n != 1) for n, noun in ((self.runs, "run"), (self.steps, "step"))
         )
         return f"{' × '.join(counts)}, {self.dtype}"
 
@@ -122,9 +122,21 @@ class Campaign:
         """
         with loading("Campaign.to_dataframe", "pandas"):
             import pandas
-        from jaxslam.results import _report as report
+        return pandas.DataFrame(self._run_columns())
 
-        return pandas.DataFrame(report.run_columns(self))
+    def _run_columns(self) -> dict[str, np.ndarray]:
+        numbers, filters = self.run_numbers, self.filters
+        absent = np.full(len(numbers), np.nan)
+        names = dict.fromkeys(name for s in filters.values() for name in s.per_run)
+        lost = [np.isin(numbers, s.not_finite_runs) for s in filters.values()]
+        columns: dict[str, np.ndarray] = {
+            "filter": np.repeat(np.array(list(filters), object), len(numbers)),
+            "run": np.tile(numbers, len(filters)),
+            "finite": ~np.concatenate(lost),
+        }
+        for name in names:
+            columns[name] = np.concatenate([s.per_run.get(name, absent) for s in filters.values()])
+        return columns
 
 
 class Interrupted(KeyboardInterrupt):

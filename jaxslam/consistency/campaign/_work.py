@@ -6,6 +6,8 @@ from collections import defaultdict
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, field, replace
+from functools import partial
+from typing import Any
 
 import jax
 import numpy as np
@@ -14,10 +16,10 @@ from threadpoolctl import threadpool_limits
 from jaxslam.consistency._tally import Tally
 from jaxslam.consistency.campaign._block import BOUND, BlockRunner, CampaignPlan
 from jaxslam.consistency.campaign._flight import TRIES, Flight, out_of_memory
-from jaxslam.consistency.campaign._kept import Keep, add_block, flat
-from jaxslam.consistency.campaign._pieces import missing
+from jaxslam.consistency.campaign._kept import Keep, add_block, flatten
+from jaxslam.consistency.campaign._pieces import missing_pieces
 from jaxslam.consistency.campaign._progress import Progress
-from jaxslam.consistency.campaign._remote import Executor, compute_block, packed
+from jaxslam.consistency.campaign._remote import Executor, compute_block, pack
 from jaxslam.core.types import Estimate, Truth
 
 
@@ -41,11 +43,28 @@ class Work:
         """The time of one run on one device, by filter: the median over finished blocks."""
         return {name: float(np.median(times)) for name, times in self.spent.items()}
 
-    def in_blocks_that_fit(self, plan: CampaignPlan, todo: Sequence[tuple[int, int]]) -> None:
-        """Compute the pieces, in blocks of half the size each time that memory does not suffice."""
-        while True:
+    def compute(self, plan: CampaignPlan, todo: Sequence[tuple[int, int]]) -> None:
+        """Add the pieces (first, runs) to the tallies, in blocks of half the size each time that
+        memory does not suffice."""
+        while todo:
+            before = self.tallies[BOUND].pieces()
+            queue = [
+                piece
+                for first, count in todo
+                for piece in missing_pieces([(0, first), *before], first + count, plan.wide)
+            ][::-1]
             try:
-                return self.go(plan, todo)
+                if self.executor is not None:
+                    start = partial(self.executor.submit, compute_block, pack(plan))
+                    self._compute_queue(Flight(start, TRIES), queue, todo)
+                    return
+                runner = BlockRunner(plan)
+                runner.compile()
+                # XLA uses the cores; threads of the BLAS below its LAPACK would only spin.
+                with threadpool_limits(1, "blas"), ThreadPoolExecutor(self.workers) as pool:
+                    submit: Any = pool.submit
+                    self._compute_queue(Flight(partial(submit, runner.block)), queue, todo)
+                return
             except (jax.errors.JaxRuntimeError, MemoryError) as error:
                 if not out_of_memory(error):
                     raise
@@ -62,28 +81,7 @@ class Work:
                 )
                 plan = replace(plan, block=half)
 
-    def go(self, plan: CampaignPlan, todo: Sequence[tuple[int, int]]) -> None:
-        """Add those of the pieces that are not yet there to the tallies."""
-        if not todo:
-            return
-        before = self.tallies[BOUND].pieces()
-        queue = [
-            piece
-            for first, count in todo
-            for piece in missing([(0, first), *before], first + count, plan.wide)
-        ][::-1]
-        if self.executor is not None:
-            send, content = self.executor.submit, packed(plan)
-            flight = Flight(lambda first, runs: send(compute_block, content, first, runs), TRIES)
-            self._compute(flight, queue, todo)
-            return
-        runner = BlockRunner(plan)
-        # XLA uses the cores; additional threads of the BLAS below its LAPACK would only spin.
-        with threadpool_limits(1, "blas"), ThreadPoolExecutor(self.workers) as pool:
-            flight = Flight(lambda first, runs: pool.submit(runner.block, first, runs))
-            self._compute(flight, queue, todo)
-
-    def _compute(
+    def _compute_queue(
         self, flight: Flight, queue: list[tuple[int, int]], todo: Sequence[tuple[int, int]]
     ) -> None:
         """Compute the pieces of a queue, last first, and add them to the tallies.
@@ -103,7 +101,7 @@ class Work:
                     if isinstance(result, BaseException):
                         raise result
                     if self.keep is not None:
-                        self.keep.save(first, flat(result.scores, self.tallies), count)
+                        self.keep.save(first, flatten(result.scores, self.tallies), count)
                     add_block(self.tallies, first, count, result.scores)
                     self.first |= result.first
                     for name, seconds in result.seconds.items():
@@ -122,7 +120,7 @@ class Work:
 
 
 @contextlib.contextmanager
-def shown_progress(work: Work, plan: CampaignPlan, wanted: bool) -> Iterator[None]:
+def show_progress(work: Work, plan: CampaignPlan, wanted: bool) -> Iterator[None]:
     """A context with an optional progress bar on a terminal or in a notebook."""
     count = len(plan.filters)
     bar = Progress(f"{plan.scenario.name}, {count} filter{'s' * (count > 1)}") if wanted else None

@@ -3,6 +3,7 @@ estimator: absolute and relative errors of a path, errors of relations, alignmen
 correlation. On the host, by NumPy in float64.
 """
 
+from jaxslam._public import publish
 from jaxslam.consistency.metrics._paths import PathErrors, align_map, alignment, ate, map_entropy
 from jaxslam.consistency.metrics._relative_poses import (
     Errors,
@@ -10,9 +11,9 @@ from jaxslam.consistency.metrics._relative_poses import (
     Relations,
     Statistics,
     benchmark_figures,
-    given,
     relation_errors,
     relations,
+    relations_at_stamps,
     revisits,
     rpe,
     statistics,
@@ -29,12 +30,14 @@ __all__ = [
     "alignment",
     "ate",
     "benchmark_figures",
-    "given",
     "map_entropy",
     "relation_errors",
     "relations",
+    "relations_at_stamps",
     "revisits",
     "rpe",
     "statistics",
     "summary",
 ]
+
+publish(__name__)

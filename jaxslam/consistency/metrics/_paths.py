@@ -38,7 +38,7 @@ def ate(reference: ArrayLike, estimate: ArrayLike, *, align: bool = True) -> Pat
     """
     true, path = pose_pair("ate", reference, estimate)
     frame = alignment(path[:, :2], true[:, :2]) if align else np.zeros(3)
-    path = carried(frame, path)
+    path = transform(frame, path)
     gap = path - true
     return PathErrors(np.hypot(gap[:, 0], gap[:, 1]), np.abs(wrapped(gap[:, 2])), frame)
 
@@ -49,7 +49,7 @@ def alignment(source: ArrayLike, target: ArrayLike) -> Float[np.ndarray, "3"]:
     As `math.se2.align`, on the host in float64. source, target (N, 2); one point gives θ = 0.
     Raises ValueError on tables that are not N >= 1 finite points each.
     """
-    p, q = (_table("alignment", given, 2) for given in (source, target))
+    p, q = (_table("alignment", points, 2) for points in (source, target))
     _same_length("alignment", p, q)
     p0, q0 = p.mean(axis=0), q.mean(axis=0)
     a, b = p - p0, q - q0
@@ -58,50 +58,50 @@ def alignment(source: ArrayLike, target: ArrayLike) -> Float[np.ndarray, "3"]:
     return np.array([q0[0] - c * p0[0] + s * p0[1], q0[1] - s * p0[0] - c * p0[1], theta])
 
 
-def carried(frame: ArrayLike, rows: ArrayLike) -> Float[np.ndarray, "K n"]:
+def transform(frame: ArrayLike, rows: ArrayLike) -> Float[np.ndarray, "K n"]:
     """Poses (K, 3) or points (K, 2) of a frame, in the coordinates that its pose (3,) is in.
 
     Headings are wrapped to (-π, π]. Raises ValueError on other shapes and on numbers that are not
     finite.
     """
-    of = _table("carried", np.reshape(np.asarray(frame, np.float64), (1, -1)), 3)
-    table = _table("carried", rows, 3 if np.shape(rows)[-1:] == (3,) else 2)
+    pose = _table("transform", np.reshape(np.asarray(frame, np.float64), (1, -1)), 3)
+    table = _table("transform", rows, 3 if np.shape(rows)[-1:] == (3,) else 2)
     width = table.shape[1]
-    return compose(of, np.pad(table, ((0, 0), (0, 3 - width))))[:, :width]
+    return compose(pose, np.pad(table, ((0, 0), (0, 3 - width))))[:, :width]
 
 
 def pose_pair(
     caller: str, reference: ArrayLike, estimate: ArrayLike
 ) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "K 3"]]:
     """Both as finite tables (K, 3) in float64; else a ValueError that begins with the caller."""
-    true, path = (_table(caller, given, 3) for given in (reference, estimate))
+    true, path = (_table(caller, poses, 3) for poses in (reference, estimate))
     _same_length(caller, true, path)
     return true, path
 
 
-def poses_of(caller: str, given: ArrayLike) -> Float[np.ndarray, "K 3"]:
+def poses_of(caller: str, poses: ArrayLike) -> Float[np.ndarray, "K 3"]:
     """A finite table (K, 3) in float64; else a ValueError that begins with the caller."""
-    return _table(caller, given, 3)
+    return _table(caller, poses, 3)
 
 
-def _table(caller: str, given: ArrayLike, columns: int) -> Float[np.ndarray, "K n"]:
-    what = "poses (x, y, θ)" if columns == 3 else "points (x, y)"
+def _table(caller: str, values: ArrayLike, columns: int) -> Float[np.ndarray, "K n"]:
+    rows = "poses (x, y, θ)" if columns == 3 else "points (x, y)"
     try:
-        table = np.asarray(given, np.float64)
+        table = np.asarray(values, np.float64)
     except (TypeError, ValueError):
-        raise ValueError(f"{caller}: expected a table of {what}") from None
+        raise ValueError(f"{caller}: expected a table of {rows}") from None
     if table.ndim != 2 or table.shape[1] != columns or len(table) == 0:
-        raise ValueError(f"{caller}: expected at least one of {what}, got shape {table.shape}")
+        raise ValueError(f"{caller}: expected at least one of {rows}, got shape {table.shape}")
     bad = ~np.isfinite(table).all(axis=1)
     if bad.any():
-        raise ValueError(f"{caller}: expected finite {what}, row {int(np.argmax(bad))} is not")
+        raise ValueError(f"{caller}: expected finite {rows}, row {int(np.argmax(bad))} is not")
     return table
 
 
-def _same_length(caller: str, one: np.ndarray, other: np.ndarray) -> None:
-    if len(one) != len(other):
+def _same_length(caller: str, a: np.ndarray, b: np.ndarray) -> None:
+    if len(a) != len(b):
         raise ValueError(
-            f"{caller}: expected tables of the same length, got {len(one)} and {len(other)} rows"
+            f"{caller}: expected tables of the same length, got {len(a)} and {len(b)} rows"
         )
 
 
@@ -111,7 +111,7 @@ def align_map(
     """The pose that carries a map onto surveyed points best, and the RMSE [m] that remains.
 
     estimate: of one time, landmarks tagged. true_points: by tag. The frame of a map made from
-    data is that of the robot's start, so only its shape can be compared (`alignment`). Raises
+    data begins at the robot's start, so only its shape can be compared (`alignment`). Raises
     ValueError if the map is empty.
     """
     named = np.asarray(estimate.alive) & (np.asarray(estimate.tag) >= 0)
@@ -120,7 +120,7 @@ def align_map(
     points = np.asarray(estimate.points, np.float64)[named]
     targets = np.asarray(true_points, np.float64)[np.asarray(estimate.tag)[named]]
     pose = alignment(points, targets)
-    left = carried(pose, points) - targets
+    left = transform(pose, points) - targets
     return pose, float(np.sqrt((left**2).sum(axis=1).mean()))
 
 
@@ -131,7 +131,7 @@ def map_entropy(grid: Grid) -> float:
     on how much is around the map. Raises ValueError on a grid that is none or has no known cell.
     """
     check_grid("map_entropy", grid)
-    known = np.asarray(grid.log_odds) != 0
-    if not known.any():
+    is_known = np.asarray(grid.log_odds) != 0
+    if not is_known.any():
         raise ValueError("map_entropy: no cell of the map is known")
-    return float(np.asarray(entropy(grid), np.float64)[known].mean())
+    return float(np.asarray(entropy(grid), np.float64)[is_known].mean())

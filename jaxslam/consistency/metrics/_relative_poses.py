@@ -14,7 +14,7 @@ from jaxslam.math.numpy_poses import between, wrapped
 Spacing = float | Sequence[float] | None
 
 _ROUNDING = 1e-6
-"""What a spacing may be short by: times since 1970 have 2e-7 s [s, m]"""
+"""Tolerance of a spacing [s, m]: times since 1970 are rounded to 2e-7 s."""
 
 
 class Relations(NamedTuple):
@@ -24,7 +24,7 @@ class Relations(NamedTuple):
     second: Int[np.ndarray, "R"]
     """rows of the path"""
     pose: Float[np.ndarray, "R 3"]
-    """of the second row in the frame of the first"""
+    """pose of the second row in the frame of the first"""
 
 
 class Errors(NamedTuple):
@@ -67,7 +67,7 @@ def relations(
         raise ValueError("relations: expected the stamps, time=, with seconds= and nowhere else")
     if rows is not None and not float(rows).is_integer():
         raise ValueError(f"relations: expected a whole number of rows, got {rows}")
-    at = travelled(path) if seconds is None else np.asarray(time, np.float64)
+    at = distance_travelled(path) if seconds is None else np.asarray(time, np.float64)
     if rows is not None:
         at = np.arange(len(path), dtype=np.float64)
     if at.shape != (len(path),):
@@ -78,14 +78,14 @@ def relations(
             f"relations: expected stamps that do not go back, got {at[row + 1]} in row {row + 1} "
             f"after {at[row]}"
         )
-    given = next(spacing for spacing in (rows, seconds, metres) if spacing is not None)
-    spacings = np.atleast_1d(np.asarray(given, np.float64))
+    distance = next(spacing for spacing in (rows, seconds, metres) if spacing is not None)
+    spacings = np.atleast_1d(np.asarray(distance, np.float64))
     if (
         spacings.ndim != 1
         or not len(spacings)
         or not (np.isfinite(spacings) & (spacings > 0)).all()
     ):
-        raise ValueError(f"relations: expected finite spacings above 0, got {given}")
+        raise ValueError(f"relations: expected finite spacings above 0, got {distance}")
     gaps = is_gap(at) if seconds is not None else np.zeros(len(path) - 1, bool)
     pairs = []
     for spacing in spacings:
@@ -109,7 +109,7 @@ def revisits(reference: ArrayLike, *, radius: float, apart: float) -> Relations:
     path = poses_of("revisits", reference)
     if not (radius > 0 and apart > 0):
         raise ValueError(f"revisits: expected numbers above 0, got {radius} and {apart}")
-    at = travelled(path)
+    at = distance_travelled(path)
     before = np.searchsorted(at, at - apart, side="right")  # rows [0, before) are far enough back
     pairs = []
     for k in np.flatnonzero(before):
@@ -118,14 +118,14 @@ def revisits(reference: ArrayLike, *, radius: float, apart: float) -> Relations:
         nearest = int(np.argmin(squared))
         if squared[nearest] <= radius**2:
             pairs.append((nearest, k))
-    found = np.array(pairs, int).reshape(-1, 2)
-    return _between(path, found[:, 0], found[:, 1])
+    rows = np.array(pairs, int).reshape(-1, 2)
+    return _between(path, rows[:, 0], rows[:, 1])
 
 
-def given(
+def relations_at_stamps(
     time: ArrayLike, first: ArrayLike, second: ArrayLike, pose: ArrayLike, *, tolerance: float
 ) -> tuple[Relations, int]:
-    """Relations that a file gives by their stamps, by the rows of a path, and how many are dropped.
+    """The relations of a file, by rows of a path instead of by stamps, and how many are dropped.
 
     Each stamp takes the row nearest in time, the first of several with the same stamp; a relation
     with one further than `tolerance` away is dropped.
@@ -140,14 +140,27 @@ def given(
         ValueError: on shapes that do not fit, stamps of the path that are not finite, a tolerance
             that is not a number of at least 0; and if no relation is kept, with both time ranges.
     """
-    stamps, of = np.asarray(time, np.float64), poses_of("given", pose)
+    stamps, of = np.asarray(time, np.float64), poses_of("relations_at_stamps", pose)
     if stamps.ndim != 1 or not len(stamps) or not np.isfinite(stamps).all():
-        raise ValueError(f"given: expected finite stamps (K,), got {stamps.shape}")
+        raise ValueError(f"relations_at_stamps: expected finite stamps (K,), got {stamps.shape}")
     if not tolerance >= 0:
-        raise ValueError(f"given: expected a tolerance of at least 0 s, got {tolerance}")
+        raise ValueError(
+            f"relations_at_stamps: expected a tolerance of at least 0 s, got {tolerance}"
+        )
     order = np.argsort(stamps, kind="stable")
     ordered = stamps[order]
-    ends = np.stack([_stamps_of("given", each, len(of)) for each in (first, second)])
+    for end in (np.asarray(first, np.float64), np.asarray(second, np.float64)):
+        if end.shape != (len(of),):
+            raise ValueError(
+                f"relations_at_stamps: expected {len(of)} stamps of relations, got {end.shape}"
+            )
+        if not (finite := np.isfinite(end)).all():
+            row = int(finite.argmin())
+            raise ValueError(
+                "relations_at_stamps: expected finite stamps of relations, got "
+                f"{end[row]} in row {row}"
+            )
+    ends = np.stack([first, second]).astype(np.float64)
     after = np.clip(np.searchsorted(ordered, ends), 0, len(ordered) - 1)
     before = np.maximum(after - 1, 0)
     place = np.where(np.abs(ends - ordered[before]) <= np.abs(ordered[after] - ends), before, after)
@@ -155,19 +168,12 @@ def given(
     near = (np.abs(ordered[place] - ends) <= tolerance).all(axis=0)
     if not near.any():
         raise ValueError(
-            f"given: none of {len(of):,} relations, from {ends.min():.6f} s to {ends.max():.6f} s, "
-            f"joins the path, from {ordered[0]:.6f} s to {ordered[-1]:.6f} s, within {tolerance:g} "
-            "s at both ends"
+            f"relations_at_stamps: none of {len(of):,} relations, from {ends.min():.6f} s to "
+            f"{ends.max():.6f} s, joins the path, from {ordered[0]:.6f} s to {ordered[-1]:.6f} s, "
+            f"within {tolerance:g} s at both ends"
         )
     rows = order[place]
     return Relations(rows[0][near], rows[1][near], of[near]), int((~near).sum())
-
-
-def joined(*parts: Relations) -> Relations:
-    """All relations of some sets, one after the other. Raises ValueError without a set."""
-    if not parts:
-        raise ValueError("joined: expected at least one set of relations")
-    return Relations(*(np.concatenate(field) for field in zip(*parts, strict=True)))
 
 
 def relation_errors(of: Relations, estimate: ArrayLike) -> Errors:
@@ -209,26 +215,14 @@ def rpe(
     ValueError as those two do.
     """
     true, path = pose_pair("rpe", reference, estimate)
-    made = relations(true, rows=rows, seconds=seconds, metres=metres, time=time)
-    return relation_errors(made, path)
+    related = relations(true, rows=rows, seconds=seconds, metres=metres, time=time)
+    return relation_errors(related, path)
 
 
-def travelled(path: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K"]:
+def distance_travelled(path: Float[np.ndarray, "K 3"]) -> Float[np.ndarray, "K"]:
     """The length of a path up to each of its poses [m]."""
     steps = np.diff(path[:, :2], axis=0)
     return np.concatenate([[0.0], np.cumsum(np.hypot(steps[:, 0], steps[:, 1]))])
-
-
-def _stamps_of(caller: str, given: ArrayLike, count: int) -> Float[np.ndarray, "R"]:
-    stamps = np.asarray(given, np.float64)
-    if stamps.shape != (count,):
-        raise ValueError(f"{caller}: expected {count} stamps of relations, got {stamps.shape}")
-    if not (finite := np.isfinite(stamps)).all():
-        row = int(finite.argmin())
-        raise ValueError(
-            f"{caller}: expected finite stamps of relations, got {stamps[row]} in row {row}"
-        )
-    return stamps
 
 
 def _between(
@@ -243,7 +237,7 @@ class Statistics(NamedTuple):
     size: int
     mean: float
     std: float
-    """of the values themselves, divided by their count"""
+    """standard deviation of the values, divided by their count"""
     rmse: float
     median: float
     min: float
@@ -251,7 +245,7 @@ class Statistics(NamedTuple):
 
 
 def statistics(values: ArrayLike) -> Statistics:
-    """The figures of errors (R,); those of their squares are `statistics(values**2)`.
+    """The figures of errors (R,); for the squares, `statistics(values**2)`.
 
     Raises ValueError unless there is at least one, and all are finite.
     """
@@ -275,7 +269,7 @@ def summary(errors: Errors | PathErrors) -> dict[str, float]:
     For tables and JSON: "translation mean [m]", …, "rotation max [deg]". Raises ValueError where
     there are no errors.
     """
-    found = {}
+    figures_by_name = {}
     for name, unit, values in (
         ("translation", "m", errors.translation),
         ("rotation", "deg", np.rad2deg(errors.rotation)),
@@ -283,8 +277,8 @@ def summary(errors: Errors | PathErrors) -> dict[str, float]:
         figures = statistics(values)
         for figure in ("mean", "std", "rmse", "median", "max"):
             title = "RMSE" if figure == "rmse" else figure
-            found[f"{name} {title} [{unit}]"] = float(getattr(figures, figure))
-    return found
+            figures_by_name[f"{name} {title} [{unit}]"] = float(getattr(figures, figure))
+    return figures_by_name
 
 
 class MeanAndStd(NamedTuple):
@@ -302,12 +296,12 @@ def benchmark_figures(errors: Errors) -> dict[str, MeanAndStd]:
 
     Kümmerle et al. 2009, as in `relation_errors`. Raises ValueError where there are no errors.
     """
-    found = {}
+    by_quantity = {}
     for name, unit, values in (
         ("translation", "m", np.asarray(errors.translation, np.float64)),
         ("rotation", "deg", np.rad2deg(errors.rotation)),
     ):
         for mark, power in (("", 1), ("²", 2)):
             figures = statistics(values**power)
-            found[f"{name}{mark} [{unit}{mark}]"] = MeanAndStd(figures.mean, figures.std)
-    return found
+            by_quantity[f"{name}{mark} [{unit}{mark}]"] = MeanAndStd(figures.mean, figures.std)
+    return by_quantity

@@ -1,7 +1,6 @@
 """Checks of arguments before tracing; each error is one line that states what was expected."""
 
 from jaxslam.core._numbers import (
-    check_alpha,
     check_count,
     check_covariance,
     check_gate,
@@ -11,7 +10,6 @@ from jaxslam.core._numbers import (
 )
 from jaxslam.core._validation.logs import check_log
 from jaxslam.core._validation.models import (
-    call_traced,
     check_associate,
     check_models,
     check_motion,
@@ -19,13 +17,12 @@ from jaxslam.core._validation.models import (
     check_record,
     check_sensor,
     checked_estimate,
+    reworded_tracer_errors,
     same_state,
     state_and_info,
 )
 
 __all__ = [
-    "call_traced",
-    "check_alpha",
     "check_associate",
     "check_count",
     "check_covariance",
@@ -39,6 +36,7 @@ __all__ = [
     "check_sensor",
     "checked_estimate",
     "is_concrete",
+    "reworded_tracer_errors",
     "same_state",
     "shape_text",
     "state_and_info",

@@ -27,8 +27,8 @@ from jaxslam.core._units import TURN
 from jaxslam.core.logs._tables import INTERVAL, POSE, odometry_columns, split_unit
 from jaxslam.core.protocols import Associate, Motion, Sensor
 from jaxslam.core.types import JaxOrNumPy
+from jaxslam.core.validation import InvalidField
 from jaxslam.datasets._dataset import Parameter
-from jaxslam.filters._ekf.ekf_settings import EkfOptions
 from jaxslam.math._definite import asymmetric, indefinite
 from jaxslam.motion import _odometry_errors as odometry_errors
 from jaxslam.sensors import _range_errors as range_errors
@@ -97,19 +97,20 @@ METHODS: dict[str, Callable[..., Associate]] = {
 }
 
 
-def association_options(method: object, gate: Any) -> EkfOptions:
+def association_options(method: object, gate: Any) -> dict[str, Any]:
     """Options of `EkfSlam` for a method by name and a gate.
 
-    Raises ValueError, "associate: …" or "gate: …", on an unknown name and a gate that is not a
+    Raises InvalidField, of associate or gate, on an unknown name and a gate that is not a
     probability. By default known identities have no gate, other methods `GATE`.
 
     Args:
         method: one of `METHODS`.
         gate: the probability that a correct measurement passes.
     """
-    check_gate("gate", gate)
+    check_gate("filter", gate)
     if not isinstance(method, str) or method not in METHODS:
-        raise ValueError(f"associate: expected one of {', '.join(METHODS)}, got {method!r}")
+        reason = f"expected one of {', '.join(METHODS)}, got {method!r}"
+        raise InvalidField("filter", "associate", reason)
     if method == "known":
         return {} if gate is None else {"gate": gate}
     inner = GATE if gate is None else gate
@@ -403,7 +404,7 @@ class TableSettings:
         cov[np.ix_(at, at)] = rows
         return cov
 
-    def filter_options(self, unknown: bool) -> EkfOptions:
+    def filter_options(self, unknown: bool) -> dict[str, Any]:
         """The options of `EkfSlam`. unknown: whether tags are unknown."""
         section = self._filter()
         update = section.get("update")
@@ -413,15 +414,14 @@ class TableSettings:
             raise ValueError(
                 f'{self._at("filter", "update")}: expected "sequential" or "joint", got {update!r}'
             )
-        options: EkfOptions = {"correction": update}
+        options: dict[str, Any] = {"correction": update}
         method, gate = section.get("associate"), section.get("gate")
         if method is None:
             method = self._default("filter", "associate", "nearest" if unknown else "known")
         try:
             options |= association_options(method, gate)
-        except ValueError as problem:
-            key, _, reason = str(problem).partition(": ")
-            raise ValueError(f"{self._at('filter', key)}: {reason}") from problem
+        except InvalidField as problem:
+            raise ValueError(f"{self._at('filter', problem.field)}: {problem.reason}") from problem
         if gate is None:
             self.assumed.append(f"[filter] gate{': none' if method == 'known' else f' = {GATE}'}")
         return options

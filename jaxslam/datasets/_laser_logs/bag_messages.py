@@ -39,27 +39,31 @@ class Bag:
             for name, of in sorted(reader.topics.items())
         )
         """by name"""
-        some = any(topic.count for topic in self.topics)
-        self.start = reader.start_time * 1e-9 if some else math.nan
-        """of the recording [s]"""
-        self.end = reader.end_time * 1e-9 if some else math.nan
+        has_messages = any(topic.count for topic in self.topics)
+        self.start = reader.start_time * 1e-9 if has_messages else math.nan
+        """start of the recording [s]"""
+        self.end = reader.end_time * 1e-9 if has_messages else math.nan
 
     def messages(self, names: Collection[str]) -> Iterator[tuple[str, int, Any]]:
         """(topic, time of the recording [ns], message) of the named topics, in that order of time.
 
-        Raises ValueError, with the file, if one cannot be read, or lacks a field that ROS gives it.
+        Raises ValueError, with the file, if a message cannot be read, or lacks a field of ROS.
         """
-        connections = [each for each in self._reader.connections if each.topic in names]
+        connections = [
+            connection for connection in self._reader.connections if connection.topic in names
+        ]
         if not connections:
             return
-        for each in connections:
-            if field := self._lacking(each.msgtype):
-                raise self.error(f"{each.topic}: expected the messages of ROS, without {field}")
-        found = self._reader.messages(connections)
+        for connection in connections:
+            if field := self._missing_field(connection.msgtype):
+                raise self.error(
+                    f"{connection.topic}: expected the messages of ROS, without {field}"
+                )
+        raw_messages = self._reader.messages(connections)
         count = 0
         while True:
             try:
-                connection, recorded, data = next(found)
+                connection, recorded, data = next(raw_messages)
                 message = self._reader.deserialize(data, connection.msgtype)
             except StopIteration:
                 return
@@ -72,25 +76,25 @@ class Bag:
 
     def first(self, name: str) -> Any:
         """The first message of a topic; raises ValueError, with the file, if it has none."""
-        found = next(self.messages([name]), None)
-        if found is None:
+        first = next(self.messages([name]), None)
+        if first is None:
             raise self.error(f"{name}: expected messages, as the index of the bag says, got none")
-        return found[2]
+        return first[2]
 
-    def _lacking(self, name: str) -> str | None:
+    def _missing_field(self, name: str) -> str | None:
         """A type of ROS that the bag does not define, or a field that it defines otherwise."""
         if name not in self._types.fielddefs:  # no type of ROS 2, as tf/tfMessage
             return None
         if name not in self._reader.typestore.fielddefs:
             return name.replace("/msg/", "/")
-        own = dict(self._reader.typestore.fielddefs[name][1])
+        bag_fields = dict(self._reader.typestore.fielddefs[name][1])
         for field, kind in self._types.fielddefs[name][1]:
-            if own.get(field) != kind:
+            if bag_fields.get(field) != kind:
                 return f"{name}/{field}".replace("/msg/", "/")
             while isinstance(kind[1][0], tuple):  # of an array
                 kind = kind[1][0]
-            if isinstance(kind[1], str) and (found := self._lacking(kind[1])):
-                return found
+            if isinstance(kind[1], str) and (field := self._missing_field(kind[1])):
+                return field
         return None
 
     def error(self, reason: str) -> ValueError:
@@ -99,7 +103,7 @@ class Bag:
 
 
 @contextmanager
-def opened(path: str | Path) -> Iterator[Bag]:
+def open_bag(path: str | Path) -> Iterator[Bag]:
     """The bag in a file (ROS 1 `.bag`, ROS 2 `.mcap` or `.db3`), in a folder of ROS 2, or in the
     parts of a recording that are alone in a folder.
 
@@ -142,17 +146,17 @@ def _parts(path: Path) -> tuple[list[Path], list[str]]:
         return [path], []
     folder, kinds = (path, _SUFFIXES) if path.is_dir() else (path.parent, (path.suffix,))
     names: dict[tuple[str, str], dict[int, Path]] = {}
-    files = sorted(each for each in folder.iterdir() if each.suffix in kinds and each.is_file())
-    for each in files:
-        if of := _SPLIT.fullmatch(each.stem):
-            names.setdefault((of[1], each.suffix), {})[int(of[2])] = each
+    files = sorted(file for file in folder.iterdir() if file.suffix in kinds and file.is_file())
+    for file in files:
+        if split := _SPLIT.fullmatch(file.stem):
+            names.setdefault((split[1], file.suffix), {})[int(split[2])] = file
     if path.is_file():
         others = [
-            each.name
+            file.name
             for parts in names.values()
             if path in parts.values()
-            for each in parts.values()
-            if each != path
+            for file in parts.values()
+            if file != path
         ]
         note = (
             f"{path.name} is read alone; beside it may be other parts of the recording, which the "
@@ -165,9 +169,9 @@ def _parts(path: Path) -> tuple[list[Path], list[str]]:
     if len(names) != 1 or len(parts) < len(files):
         raise ValueError(
             f"{path}: expected one bag, or the parts NAME_0.bag, NAME_1.bag, … of a recording, got "
-            f"{', '.join(each.name for each in files)}; name one of them"
+            f"{', '.join(file.name for file in files)}; name one of them"
         )
-    notes = [f"one recording of {len(parts)} files, {', '.join(each.name for each in files[:9])}"]
+    notes = [f"one recording of {len(parts)} files, {', '.join(file.name for file in files[:9])}"]
     if missing := sorted(set(range(max(parts))) - set(parts)):
         notes.append(f"parts that are missing in the folder: {', '.join(map(str, missing))}")
     return [parts[number] for number in sorted(parts)], notes
@@ -192,10 +196,10 @@ def is_bag(path: str | Path) -> bool:
 
 
 def _unreadable(path: Path, problem: Exception, where: str = "") -> ValueError:
-    """The error on a bag that is damaged or none."""
+    """The error on a bag that is damaged, or on a file that is no bag."""
     if isinstance(problem, FileNotFoundError):
-        what = "metadata.yaml" if path.is_dir() else "file"
-        return ValueError(f"{path}: cannot be read: no such {what}")
+        missing = "metadata.yaml" if path.is_dir() else "file"
+        return ValueError(f"{path}: cannot be read: no such {missing}")
     reason = _one_line(str(problem)) or type(problem).__name__
     return ValueError(f"{path}: cannot be read as a ROS bag{where}: {reason}")
 

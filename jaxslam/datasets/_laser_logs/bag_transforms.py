@@ -49,29 +49,29 @@ class FramePair(NamedTuple):
     parent: str
     child: str
     number: int
-    """of transforms"""
+    """number of transforms"""
     static: bool
-    """whether they are of `/tf_static`"""
+    """whether the transforms are of `/tf_static`"""
     moves: bool
     """whether the child moves in the plane of its parent, by more than the tolerance of a mount"""
     turns: bool
-    """whether it turns in this plane"""
+    """whether the child turns in this plane"""
 
     @property
     def name(self) -> str:
-        """as `odom:base_link`"""
+        """The names of the frames, as `odom:base_link`."""
         return f"{self.parent}:{self.child}"
 
 
 class LaserMount(NamedTuple):
-    """How a laser is mounted on the robot."""
+    """The mount of a laser on the robot."""
 
     pose: Float[np.ndarray, "3"]
     upside_down: bool
     tilt: float
-    """between its plane and the floor [rad]"""
+    """angle between the plane of the laser and the floor [rad]"""
     base: str
-    """the frame of the robot"""
+    """name of the robot's frame"""
 
 
 def frame_name(name: str) -> str:
@@ -87,14 +87,13 @@ def pose_of(position: Any, orientation: Any) -> Float[np.ndarray, "7"]:
 
 def transforms_of(recorded: int, message: Any, static: bool) -> Iterator[Transform]:
     """The transforms of a message of /tf or /tf_static."""
-    for each in message.transforms:
-        moved = each.transform
+    for stamped in message.transforms:
         yield Transform(
-            stamp_of(each.header),
+            stamp_of(stamped.header),
             recorded,
-            frame_name(each.header.frame_id),
-            frame_name(each.child_frame_id),
-            pose_of(moved.translation, moved.rotation),
+            frame_name(stamped.header.frame_id),
+            frame_name(stamped.child_frame_id),
+            pose_of(stamped.transform.translation, stamped.transform.rotation),
             static,
         )
 
@@ -105,26 +104,26 @@ def stamp_of(header: Any) -> int:
 
 
 def planar(pose: Float[np.ndarray, "n 7"]) -> Float[np.ndarray, "n 3"]:
-    """The poses (x, y, θ) of poses with quaternions; NaN for one of those that are none."""
+    """The poses (x, y, θ) of poses with quaternions; NaN for numbers that are no pose."""
     x, y, z, w = np.where(_is_pose(pose)[:, None], pose[:, 3:], np.nan).T
     heading = np.arctan2(2 * (w * z + x * y), w**2 + x**2 - y**2 - z**2)
     return np.column_stack([pose[:, :2], heading])
 
 
 def _is_pose(pose: Float[np.ndarray, "n 7"]) -> Bool[np.ndarray, "n"]:
-    """Whether positions are finite and within `_FARTHEST`, and quaternions have norm 1."""
+    """The mask of poses: positions finite and within `_FARTHEST`, quaternions of norm 1."""
     near = (np.abs(pose[:, :3]) <= _FARTHEST).all(axis=1)
     within = np.where(np.abs(pose[:, 3:]) < 2, pose[:, 3:], np.nan)
     return near & (np.abs((within**2).sum(axis=1) - 1) < 2 * _UNIT)
 
 
 class Frames:
-    """The tree of the frames of a bag, in which each has one parent, that of its last transform."""
+    """The tree of the frames of a bag; the parent of a frame is that of its last transform."""
 
     def __init__(self, transforms: Sequence[Transform]) -> None:
         self._to: dict[str, list[Transform]] = {}
-        for each in transforms:
-            self._to.setdefault(each.child, []).append(each)
+        for transform in transforms:
+            self._to.setdefault(transform.child, []).append(transform)
 
     def connects(self, base: str, frame: str) -> bool:
         """Whether the pose of a frame in another is known."""
@@ -173,15 +172,17 @@ class Frames:
     def _edge(
         self, child: str, corrections: list[str]
     ) -> tuple[Int[np.ndarray, "n"], Float[np.ndarray, "n 4 4"]]:
-        """The times of the recording [ns] and poses of a frame in its parent: the last static one,
-        then those of `/tf`; one if all are equal."""
+        """The times of the recording [ns] and the poses of a frame in its parent.
+
+        The last static pose, and the poses of `/tf`; a single pose if all are equal.
+        """
         parent = self._to[child][-1].parent
-        of = [each for each in self._to[child] if each.parent == parent]
-        pose = _matrices(np.array([each.pose for each in of]))
+        transforms = [edge for edge in self._to[child] if edge.parent == parent]
+        pose = _matrices(np.array([edge.pose for edge in transforms]))
         if not np.isfinite(pose).all():
-            bad = of[int(np.argmax(~np.isfinite(pose).all(axis=(1, 2))))].pose.tolist()
+            bad = transforms[int(np.argmax(~np.isfinite(pose).all(axis=(1, 2))))].pose.tolist()
             raise ValueError(f"the transform from {parent} to {child} is not a pose: {bad}")
-        static = np.array([each.static for each in of])
+        static = np.array([edge.static for edge in transforms])
         if static.any():
             far, turned = _largest_change(pose[static], pose[static][-1])
             if far > _EQUAL or turned > _EQUAL:
@@ -191,8 +192,9 @@ class Frames:
                 )
             kept = ~static
             kept[np.flatnonzero(static)[-1]] = True
-            of, pose = [each for each, use in zip(of, kept, strict=True) if use], pose[kept]
-        time = np.array([each.recorded for each in of], np.int64)
+            transforms = [edge for edge, keep in zip(transforms, kept, strict=True) if keep]
+            pose = pose[kept]
+        time = np.array([edge.recorded for edge in transforms], np.int64)
         order = np.argsort(time, kind="stable")
         if max(_largest_change(pose, pose[0])) < 1e-9:
             order = order[:1]
@@ -202,7 +204,7 @@ class Frames:
 def _largest_change(
     pose: Float[np.ndarray, "n 4 4"], reference: Float[np.ndarray, "4 4"]
 ) -> tuple[float, float]:
-    """The largest distance [m], and angle [rad], of poses from one of them."""
+    """The largest distance [m] and angle [rad] of poses from a reference."""
     far = np.linalg.norm(pose[:, :3, 3] - reference[:3, 3], axis=1).max()
     # By the sine of half the angle: its cosine has no digits for small angles.
     off = np.linalg.norm(pose[:, :3, :3] - reference[:3, :3], axis=(1, 2)).max()
@@ -210,37 +212,37 @@ def _largest_change(
 
 
 def _matrices(pose: Float[np.ndarray, "n 7"]) -> Float[np.ndarray, "n 4 4"]:
-    """Poses as matrices; NaN for one that is none."""
+    """The poses as matrices; NaN for numbers that are no pose."""
     q = np.where(_is_pose(pose)[:, None], pose[:, 3:], np.nan)
     x, y, z, w = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
-    out = np.tile(np.eye(4), (len(pose), 1, 1))
+    matrix = np.tile(np.eye(4), (len(pose), 1, 1))
     rows = [
         [1 - 2 * (y * y + z * z), 2 * (x * y - z * w), 2 * (x * z + y * w)],
         [2 * (x * y + z * w), 1 - 2 * (x * x + z * z), 2 * (y * z - x * w)],
         [2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)],
     ]
-    out[:, :3, :3] = np.moveaxis(np.array(rows), 2, 0)
-    out[:, :3, 3] = pose[:, :3]
-    return out
+    matrix[:, :3, :3] = np.moveaxis(np.array(rows), 2, 0)
+    matrix[:, :3, 3] = pose[:, :3]
+    return matrix
 
 
 def laser_mount(
     frames: Frames, laser: str, bases: Sequence[str], corrections: list[str], moving: str = ""
 ) -> LaserMount | None:
-    """The mount of a laser, by the transforms between its frame and the robot's.
+    """The mount of a laser, by the transforms between its frame and the robot's; None without any.
 
-    It is that in the plane, the median of all times. The tilt may change, as by an IMU between two
-    frames of the robot; the mount may not, beyond what that tilt moves it.
+    The mount is in the plane, the median over all times. The tilt may change, as by an IMU between
+    two frames of the robot; the mount may not, beyond the motion by the tilt.
 
     Args:
+        corrections: receives a description of each assumption.
         bases: the robot's frame by odometry, if known; then `BASES` are tried.
         moving: a frame that moves, which is tried last.
-    None, which is described, if none is connected.
 
     Raises ValueError if the mount changes, or the plane of the laser is too far from the floor.
     """
     tried = list(dict.fromkeys([*bases, *BASES]))
-    base = next((each for each in tried if frames.connects(each, laser)), None)
+    base = next((name for name in tried if frames.connects(name, laser)), None)
     if base is None and moving and frames.connects(moving, laser):
         base = moving
     if base is None:
@@ -302,18 +304,18 @@ def mount_text(mount: LaserMount) -> str:
 
 def frame_pairs(transforms: Sequence[Transform]) -> tuple[FramePair, ...]:
     """All pairs of frames with transforms, by name, and which of them move."""
-    of: dict[tuple[str, str, bool], list[Transform]] = {}
-    for each in transforms:
-        of.setdefault((each.parent, each.child, each.static), []).append(each)
+    by_pair: dict[tuple[str, str, bool], list[Transform]] = {}
+    for edge in transforms:
+        by_pair.setdefault((edge.parent, edge.child, edge.static), []).append(edge)
     pairs = []
-    for (parent, child, static), some in sorted(of.items()):
-        path = planar(np.array([each.pose for each in some]))
+    for (parent, child, static), edges in sorted(by_pair.items()):
+        path = planar(np.array([edge.pose for edge in edges]))
         path = path[np.isfinite(path).all(axis=1)]
         far = np.hypot(*np.ptp(path[:, :2], axis=0)) if len(path) else 0.0
         turn = np.abs(poses.wrapped(path[:, 2] - path[:1, 2])).max() if len(path) else 0.0
         moves = not static and far > MOUNT_TOLERANCE[0]
         turns = not static and turn > MOUNT_TOLERANCE[1]
-        pairs.append(FramePair(parent, child, len(some), static, bool(moves), bool(turns)))
+        pairs.append(FramePair(parent, child, len(edges), static, bool(moves), bool(turns)))
     return tuple(pairs)
 
 
@@ -322,28 +324,32 @@ def odometry_pairs(
 ) -> tuple[list[FramePair], list[FramePair]]:
     """The pairs of frames of `/tf` that are odometry, and others that move.
 
-    Those named so (`ODOMS` to `BASES`); if none is, those that move in the plane and have the laser
-    below them; if it is below none, those without a transform to the laser. A pair that only turns,
-    as a joint does, is none.
+    Odometry are, in this order, the first kind of pair that a bag has:
+
+    1. pairs with the usual names (`ODOMS` to `BASES`);
+    2. pairs that move in the plane, with the laser below them;
+    3. pairs that move in the plane, without a transform to the laser.
+
+    A pair that only turns, as a joint does, is no odometry.
     """
-    of_tf = [each for each in pairs if not each.static]
-    odometry = [each for each in of_tf if is_named_odometry(each)]
-    moving = [each for each in of_tf if each.moves]
+    dynamic = [pair for pair in pairs if not pair.static]
+    odometry = [pair for pair in dynamic if is_named_odometry(pair)]
+    moving = [pair for pair in dynamic if pair.moves]
     if not odometry:
         chain = frames.above(laser)
-        odometry = [each for each in moving if each.child in chain and each.parent in chain]
+        odometry = [pair for pair in moving if pair.child in chain and pair.parent in chain]
     if not odometry:
-        odometry = [each for each in moving if not frames.connects(each.child, laser)]
-    others = [each for each in of_tf if (each.moves or each.turns) and each not in odometry]
+        odometry = [pair for pair in moving if not frames.connects(pair.child, laser)]
+    others = [pair for pair in dynamic if (pair.moves or pair.turns) and pair not in odometry]
     return odometry, others
 
 
 def pairs_text(pairs: Sequence[FramePair]) -> str:
     """Pairs of frames with the numbers of their transforms."""
-    return ", ".join(f"{each.name} ({each.number:,})" for each in pairs)
+    return ", ".join(f"{pair.name} ({pair.number:,})" for pair in pairs)
 
 
 def is_named_odometry(pair: FramePair) -> bool:
-    """Whether the last parts of the names, as `odom` of `robot1/odom`, are those of odometry."""
+    """Whether the names are usual ones of odometry; of `robot1/odom` the last part counts."""
     parent, child = (frame.rsplit("/", 1)[-1] for frame in (pair.parent, pair.child))
     return parent in ODOMS and child in BASES

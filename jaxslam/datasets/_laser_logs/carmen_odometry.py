@@ -27,9 +27,10 @@ class RawOdometry(NamedTuple):
     poses: Float[np.ndarray, "T 3"]
     time: Float[np.ndarray, "T"]
     row: Int[np.ndarray, "K"]
-    """the last line before each scan; -1 if none"""
+    """index of the last line before each scan; -1 if none"""
     raw: Float[np.ndarray, "K 3"]
-    known: Bool[np.ndarray, "K"]
+    """odometry at each scan"""
+    step_known: Bool[np.ndarray, "K"]
     """whether the step from the previous scan is known; True for the first"""
     setting: int
     """number of lines that set the odometry"""
@@ -48,15 +49,16 @@ def odometry_of_lines(
     Args:
         row: of each scan, the last ODOM line before it, -1 if none.
     """
-    out = path.copy()
+    chained = path.copy()
     begins = [*np.flatnonzero(setting), len(path)]
     for i, end in pairwise(begins):
-        out[i] = out[i - 1]
+        chained[i] = chained[i - 1]
         step = poses.between(path[i], path[i + 1 : end])
-        out[i + 1 : end] = poses.compose(out[i], step)
+        chained[i + 1 : end] = poses.compose(chained[i], step)
     moves = np.cumsum(np.concatenate([[0], ~setting]))[row + 1]
-    known = np.diff(moves, prepend=-1) > 0
-    return RawOdometry(out, time, row, out[np.maximum(row, 0)], known, int(setting.sum()))
+    step_known = np.diff(moves, prepend=-1) > 0
+    raw = chained[np.maximum(row, 0)]
+    return RawOdometry(chained, time, row, raw, step_known, int(setting.sum()))
 
 
 def setting_lines(
@@ -65,21 +67,25 @@ def setting_lines(
     row: Int[np.ndarray, "S"],
     robot: Float[np.ndarray, "S 3"],
 ) -> tuple[Bool[np.ndarray, "T"], str]:
-    """Which ODOM lines set the odometry, and a note where that is judged by the motion.
+    """The mask of the ODOM lines that set the odometry, and a note if that is judged by the motion.
 
-    Programs that correct a log write such lines.
+    Programs that correct a log write such lines. They repeat the pose of the previous scan, and so
+    differ from the ODOM line before that scan. In a raw log a line may repeat the pose by chance,
+    or since the logger writes the two in this order.
 
-    They repeat the pose of the previous scan, and so differ from the ODOM line before that scan. In
-    a raw log a line may repeat it by chance, or since the logger writes the two in this order. So a
-    line with a later stamp than the previous one sets the odometry only if at least half of the
-    lines after a scan are such, other lines remain, and either another such line goes back in time,
-    or the steps to these lines are not a part of the motion: corrections have mean zero.
+    | line that repeats the scan's pose | sets the odometry |
+    |---|---|
+    | its stamp goes back | yes |
+    | rare: fewer than half of the lines after a scan, or no other lines remain | no |
+    | common, and such a line goes back in time | yes |
+    | common, and the steps to such lines are part of the motion | no |
+    | common, and the steps are not: corrections have mean zero | yes |
 
     Args:
         row: of each scan of any laser, the last ODOM line before it, -1 if none.
         robot: the pose of the robot in the line of the scan, NaN if it has none.
     """
-    near = _printed(path, robot)
+    near = _print_tolerance(path, robot)
     line = row + 1
     # The first line gives the start of the odometry.
     scans = np.flatnonzero((line > 0) & (line < len(path)) & np.isfinite(robot).all(axis=1))
@@ -88,24 +94,24 @@ def setting_lines(
     at_scan[line[scans[_equal(path[line[scans]], robot[scans], near)]]] = True
     as_before = np.zeros(len(path), bool)
     as_before[1:] = _equal(path[1:], path[:-1], near)
-    found = at_scan & ~as_before
-    rest = len(path) - 1 - max(int(row[0]), 0) - int(found.sum())
-    common = 2 * found.sum() >= (follows & ~(at_scan & as_before)).sum() and rest > 0
+    repeats = at_scan & ~as_before
+    others = len(path) - 1 - max(int(row[0]), 0) - int(repeats.sum())
+    common = 2 * repeats.sum() >= (follows & ~(at_scan & as_before)).sum() and others > 0
     back = np.diff(time, prepend=time[0]) < 0
     ahead = poses.between(path[:-1], path[1:])[:, 0]
-    share = abs(ahead[found[1:]].sum()) / max(abs(ahead.sum()), 1e-9)
-    judged = bool(common and found.any() and not (found & back).any())
-    setting = found & (back | (common and not (judged and share > _MIN_MOTION)))
-    taken = "set the odometry" if share <= _MIN_MOTION else "are motion"
+    share = abs(ahead[repeats[1:]].sum()) / max(abs(ahead.sum()), 1e-9)
+    by_motion = bool(common and repeats.any() and not (repeats & back).any())
+    setting = repeats & (back | (common and not (by_motion and share > _MIN_MOTION)))
+    meaning = "set the odometry" if share <= _MIN_MOTION else "are motion"
     note = (
-        f"{found.sum():,} lines ODOM repeat the pose of the scan before them, with later stamps: "
-        f"they {taken}, since the steps to them are {100 * share:.0f} % of the way ahead"
+        f"{repeats.sum():,} lines ODOM repeat the pose of the scan before them, with later stamps: "
+        f"they {meaning}, since the steps to them are {100 * share:.0f} % of the way ahead"
     )
-    return np.asarray(setting), note if judged else ""
+    return np.asarray(setting), note if by_motion else ""
 
 
-def _printed(path: Float[np.ndarray, "T 3"], robot: Float[np.ndarray, "K 3"]) -> np.ndarray:
-    """(3,) half of the last digit that both kinds of lines have, at most half a millimetre."""
+def _print_tolerance(path: Float[np.ndarray, "T 3"], robot: Float[np.ndarray, "K 3"]) -> np.ndarray:
+    """Half of the last printed digit (3,) that both kinds of lines have, at most 0.5 mm."""
 
     def digits(values: np.ndarray) -> int:
         for count in range(3, 7):
@@ -113,14 +119,14 @@ def _printed(path: Float[np.ndarray, "T 3"], robot: Float[np.ndarray, "K 3"]) ->
                 return count
         return 7
 
-    of = [min(digits(path[:, k]), digits(robot[:, k])) for k in range(3)]
-    return 0.5 * 10.0 ** -np.array(of, float) + 1e-9
+    common = [min(digits(path[:, k]), digits(robot[:, k])) for k in range(3)]
+    return 0.5 * 10.0 ** -np.array(common, float) + 1e-9
 
 
 def _equal(
     a: Float[np.ndarray, "n 3"], b: Float[np.ndarray, "n 3"], near: np.ndarray
 ) -> Bool[np.ndarray, "n"]:
-    """Whether poses are equal; False for NaN."""
+    """The mask of equal poses; False for NaN."""
     off = np.abs(a - b)
     off[:, 2] = np.abs(poses.wrapped(off[:, 2]))
     return np.asarray((off <= near).all(axis=1))
@@ -129,11 +135,11 @@ def _equal(
 def odometry_of_poses(robot: Float[np.ndarray, "K 3"]) -> RawOdometry:
     """The odometry of a log without ODOM lines: the poses of the robot, zero if unknown."""
     finite = np.isfinite(robot).all(axis=1)
-    known = finite.copy()
-    known[0] = True
+    step_known = finite.copy()
+    step_known[0] = True
     raw = np.where(finite[:, None], robot, 0.0)
     row = np.full(len(robot), -1)
-    return RawOdometry(np.zeros((0, 3)), np.zeros(0), row, raw, known, 0)
+    return RawOdometry(np.zeros((0, 3)), np.zeros(0), row, raw, step_known, 0)
 
 
 def odometry_of_file(
@@ -173,6 +179,6 @@ def odometry_of_file(
             f"{time.max():.6f} s, within {_STAMP_TOLERANCE:g} s; expected all, or a line for each "
             "scan"
         )
-    path_of = table[:, 1:]
-    everywhere = np.ones(scans, bool)
-    return RawOdometry(path_of, stamps, row, path_of[row], everywhere, 0), time, note
+    logged = table[:, 1:]
+    step_known = np.ones(scans, bool)
+    return RawOdometry(logged, stamps, row, logged[row], step_known, 0), time, note

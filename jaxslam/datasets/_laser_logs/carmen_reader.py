@@ -31,7 +31,7 @@ from jaxslam.datasets._laser_logs.carmen_scans import (
     scan_of,
 )
 from jaxslam.datasets._laser_logs.laser_beams import beams_of
-from jaxslam.datasets._laser_logs.laser_record import LaserLog, checked_mount, wrapped_path
+from jaxslam.datasets._laser_logs.laser_record import LaserLog, check_given_mount, wrapped_path
 from jaxslam.datasets._lines import TextFile
 from jaxslam.math import numpy_poses as poses
 from jaxslam.math.numpy_poses import wrapped
@@ -96,7 +96,7 @@ def carmen(
     """
     if not max_range > 0:
         raise ValueError(f"carmen: expected a max_range above 0, got {max_range}")
-    given = None if mount is None else checked_mount("carmen", mount)
+    given_mount = None if mount is None else check_given_mount("carmen", mount)
     file = TextFile(path)
     lines = list(file)
     kind = _kind(file, Counter(fields[0] for _, fields in lines if is_scan(fields[0])), laser)
@@ -123,23 +123,26 @@ def carmen(
     corrections: list[str] = []
     clock = clock_of(scans, corrections)
     time = np.array([scan.times[clock] for scan in scans])
-    frame = mount_of(file, kind, scans, corrections) if given is None else given
-    corrected, robot = robot_poses(kind, scans, frame, given is not None)
+    frame = mount_of(file, kind, scans, corrections) if given_mount is None else given_mount
+    corrected, robot = robot_poses(kind, scans, frame, given_mount is not None)
     if odometry is not None:
-        found, time, note = odometry_of_file(odometry, time, str(file.path))
+        joined, time, note = odometry_of_file(odometry, time, str(file.path))
         corrections.append(note)
         if logged:
             dropped["lines ODOM"] = len(logged)
     elif logged:
-        table, every = np.array(logged), np.array(scan_poses)
-        moved, stamp = table[:, :3], table[:, 3 + clock]
-        setting, note = setting_lines(moved, stamp, every[:, 0].astype(int), every[:, 1:])
+        table, all_scans = np.array(logged), np.array(scan_poses)
+        path_logged, stamp = table[:, :3], table[:, 3 + clock]
+        setting, note = setting_lines(
+            path_logged, stamp, all_scans[:, 0].astype(int), all_scans[:, 1:]
+        )
         corrections += [note] * bool(note)
-        found = odometry_of_lines(moved, stamp, setting, np.array([scan.row for scan in scans]))
+        rows = np.array([scan.row for scan in scans])
+        joined = odometry_of_lines(path_logged, stamp, setting, rows)
     else:
-        found = odometry_of_poses(robot)
+        joined = odometry_of_poses(robot)
     beams, limit = beams_of(scans, max_range, dropped, corrections)
-    corrections += _irregularities(kind, time, found, corrected)
+    corrections += _irregularities(kind, time, joined, corrected)
     if file.lines[-1].strip():
         corrections.append(
             f"the last line, {len(file.lines)}, has no newline: its last number may be cut off"
@@ -152,11 +155,11 @@ def carmen(
         time=time,
         beams=beams,
         corrected=wrapped_path(corrected),
-        raw=wrapped_path(found.raw),
-        odometry_known=found.known,
-        row=found.row,
-        odometry=wrapped_path(found.poses),
-        odometry_time=found.time,
+        raw=wrapped_path(joined.raw),
+        odometry_known=joined.step_known,
+        row=joined.row,
+        odometry=wrapped_path(joined.poses),
+        odometry_time=joined.time,
         max_range=limit,
         mount=frame,
         dropped=dict(dropped),
@@ -164,52 +167,52 @@ def carmen(
     )
 
 
-def _kind(file: TextFile, counts: Counter[str], given: str | None) -> str:
-    """The kind of lines to read: the given one, or that with poses and most scans."""
+def _kind(file: TextFile, counts: Counter[str], laser: str | None) -> str:
+    """The kind of lines to read: `laser`, or the kind with poses and most scans."""
     if not counts:
         raise file.end_error(
             "expected a line FLASER, RLASER, ROBOTLASER1 or RAWLASER1, and so on, got none"
         )
-    if given is None:
-        first = {kind: rank for rank, kind in enumerate(_PREFERRED)}
-        rank = [
-            (not has_poses(kind), -count, first.get(kind, len(first)), kind)
+    if laser is None:
+        preference = {kind: rank for rank, kind in enumerate(_PREFERRED)}
+        ranking = [
+            (not has_poses(kind), -count, preference.get(kind, len(preference)), kind)
             for kind, count in counts.items()
         ]
-        return min(rank)[-1]
-    if given not in counts:
+        return min(ranking)[-1]
+    if laser not in counts:
         kinds = ", ".join(f"{count} {kind}" for kind, count in sorted(counts.items()))
-        raise file.end_error(f"expected scans of the laser {given}, got {kinds}")
-    return given
+        raise file.end_error(f"expected scans of the laser {laser}, got {kinds}")
+    return laser
 
 
 def _irregularities(
     kind: str,
     time: Float[np.ndarray, "K"],
-    found: RawOdometry,
+    odometry: RawOdometry,
     corrected: Float[np.ndarray, "K 3"],
 ) -> list[str]:
     """Descriptions of the irregularities of a log."""
     notes = []
-    if len(found.poses) and (early := int((found.row < 0).sum())):
+    if len(odometry.poses) and (early := int((odometry.row < 0).sum())):
         notes.append(f"scans before the first ODOM line, which take its pose: {early}")
     if not has_poses(kind):
         notes.append(f"lines {kind} have no poses to compare with")
-    if not len(found.poses):
+    if not len(odometry.poses):
         notes.append(
             "no ODOM lines: raw odometry is the robot's pose of each scan"
             if has_poses(kind)
             else "no ODOM lines and no poses: raw odometry is unknown, and zero"
         )
-    elif has_poses(kind) and found.setting:
-        apart = poses.between(found.raw[0], found.raw)[:, :2]
+    elif has_poses(kind) and odometry.setting:
+        apart = poses.between(odometry.raw[0], odometry.raw)[:, :2]
         apart = np.hypot(*(apart - poses.between(corrected[0], corrected)[:, :2]).T)
         notes.append(
-            f"ODOM lines that set the odometry to the pose of the scan before: {found.setting}; "
+            f"ODOM lines that set the odometry to the pose of the scan before: {odometry.setting}; "
             "raw odometry is the chain of the increments between them, and differs from the scans' "
             f"poses by up to {apart.max():.2f} m, {apart[-1]:.2f} m at the end"
         )
-    if len(found.poses) and (still := int((~found.known).sum())):
+    if len(odometry.poses) and (still := int((~odometry.step_known).sum())):
         notes.append(
             f"scans without an ODOM line since the previous scan, with a zero step: {still}"
         )
@@ -240,7 +243,8 @@ def relation_file(path: str | Path) -> StampedRelations:
     """The relations of a file of the Freiburg benchmark, packed by gzip or not.
 
     A line: `t1 t2 x y z roll pitch yaw` [s, m, rad], the pose at t2 in the frame of that at t1.
-    Blank lines and lines that begin with # are skipped. `metrics.given` joins them to a path.
+    Blank lines and lines that begin with # are skipped. `metrics.relations_at_stamps` joins the
+    relations to a path.
 
     Source: Kümmerle, Steder, Dornhege, Ruhnke, Grisetti, Stachniss & Kleiner 2009, "On measuring
     the accuracy of SLAM algorithms", Autonomous Robots 27.

@@ -6,7 +6,7 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from jaxslam.datasets._laser_logs.laser_record import beyond, pose_text
+from jaxslam.datasets._laser_logs.laser_record import differs_from_zero, pose_text
 from jaxslam.datasets._lines import TextFile
 from jaxslam.math import numpy_poses as poses
 
@@ -26,9 +26,9 @@ class Scan(NamedTuple):
     laser: list[float]
     """pose of the laser, NaN if the line has none"""
     robot: list[float]
-    """pose of the robot, likewise"""
+    """pose of the robot, NaN if the line has none"""
     times: list[float]
-    """of the scan and of the logger [s]"""
+    """times of the measurement and of the logger [s]"""
     limit: float
     """maximum range in the line [m], infinite if it has none"""
     bad_limit: bool
@@ -48,7 +48,7 @@ def is_scan(kind: str) -> bool:
 
 
 def scan_of(file: TextFile, line: int, fields: list[str], row: int) -> Scan:
-    """The scan of a line; ValueError, with file and line, on a malformed one."""
+    """The scan of a line; ValueError, with file and line, if it is malformed."""
     read = _flaser if fields[0] in ("FLASER", "RLASER") else _configured_laser
     return read(file, line, fields, row)
 
@@ -65,7 +65,7 @@ def _flaser(file: TextFile, line: int, fields: list[str], row: int) -> Scan:
 
 
 def _angles_of(count: int) -> Float[np.ndarray, "n"]:
-    """The angles of the n beams of a FLASER line [rad]: those of a SICK LMS, as in CARMEN.
+    """The angles of the n beams of a FLASER line [rad], of a SICK LMS, as in CARMEN.
 
     From -90°, 1° apart for 180 beams and ½° for 360, without the last beam; from -50°, ¼° apart
     for 400 and 401, the field of 100° of the laser; else over 180°, from -90°.
@@ -126,8 +126,9 @@ def _ranges(
     if bad is not None:
         which = f"{name} {bad + 1}" if name == "range" else name
         raise file.error(line, f"{which} is not a number: {fields[bad]!r}")
-    known: np.ndarray = np.nan_to_num(values, nan=0.0, posinf=np.finfo(float).max, neginf=0.0)
-    return known
+    # ∞ is a range without a return, as the largest number is.
+    finite: np.ndarray = np.nan_to_num(values, nan=0.0, posinf=np.finfo(float).max, neginf=0.0)
+    return finite
 
 
 def _is_number(field: str) -> bool:
@@ -139,13 +140,16 @@ def _is_number(field: str) -> bool:
 
 
 _REAR = np.array([0.0, 0.0, np.pi])
+"""Mount of a laser that looks back."""
 
 
 def clock_of(scans: list[Scan], corrections: list[str]) -> int:
-    """Which of the two times of a line to use: 0 for that of the measurement, 1 for that of the
-    logger, if all measurements have the same time."""
-    taken, logged = np.array([scan.times for scan in scans]).T
-    if len(scans) == 1 or np.ptp(taken) > 0:
+    """The index in `Scan.times` of the clock to use.
+
+    0 for the measurement; 1 for the logger, if all measurements have the same time.
+    """
+    measured, logged = np.array([scan.times for scan in scans]).T
+    if len(scans) == 1 or np.ptp(measured) > 0:
         return 0
     if np.ptp(logged) > 0:
         corrections.append("all scans have the same timestamp: times are the logger's")
@@ -170,14 +174,14 @@ def mount_of(
     laser, robot = (np.array([getattr(scan, of) for scan in scans]) for of in ("laser", "robot"))
     mounts = poses.between(robot, laser)
     off = poses.between(mounts[0], mounts)
-    far = beyond(off)
+    far = differs_from_zero(off)
     if not kind.startswith("ROBOTLASER"):
         if far.any():
             corrections.append(
                 f"the two poses of {kind} do not differ by a constant mount: the first is taken "
                 "for the corrected pose of the robot"
             )
-        if far.any() or not beyond(mounts[:1]).any():
+        if far.any() or not differs_from_zero(mounts[:1]).any():
             return default
         corrections.append(f"the mount is that of the two poses of {kind}: {pose_text(mounts[0])}")
     elif far.any():
@@ -192,14 +196,14 @@ def mount_of(
 
 
 def robot_poses(
-    kind: str, scans: list[Scan], mount: Float[np.ndarray, "3"], given: bool
+    kind: str, scans: list[Scan], mount: Float[np.ndarray, "3"], is_given: bool
 ) -> tuple[Float[np.ndarray, "K 3"], Float[np.ndarray, "K 3"]]:
     """The corrected poses of the robot, and its poses in the lines.
 
-    given: whether the mount is given, not from the lines.
+    is_given: whether the mount is an argument of the reader, not from the lines.
     """
     laser, robot = (np.array([getattr(scan, of) for scan in scans]) for of in ("laser", "robot"))
-    if kind.startswith("ROBOTLASER") and not given:
+    if kind.startswith("ROBOTLASER") and not is_given:
         return robot, robot
     if kind.startswith("RAWLASER"):
         return np.zeros_like(robot), robot

@@ -11,7 +11,7 @@ from jaxslam.core.types import Beams
 
 
 class RangeScan(Protocol):
-    """What is read of a scan of n beams."""
+    """The parts of a scan of n beams that are read."""
 
     @property
     def ranges(self) -> Float[np.ndarray, "n"]:
@@ -64,6 +64,10 @@ def beams_of(
     return Beams(np.where(valid, ranges, 0.0), angles, valid), limit
 
 
+_LEAST_CODED = 1000
+"""Ranges from which on a code is looked for."""
+
+
 def _code_of_no_return(ranges: Float[np.ndarray, "n"]) -> float | None:
     """The range that codes "no return" [m], of a laser that reports it as its largest range.
 
@@ -71,7 +75,7 @@ def _code_of_no_return(ranges: Float[np.ndarray, "n"]) -> float | None:
     many as the tenth below it, and two values are 93 % of them: ranges of a wall have noise, but a
     code is one number, or two after a conversion of units.
     """
-    if len(ranges) < 1000:
+    if len(ranges) < _LEAST_CODED:
         return None
     code = 0.99 * float(ranges.max())
     last = ranges[ranges >= code]

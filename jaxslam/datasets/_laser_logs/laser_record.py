@@ -17,11 +17,11 @@ class LaserLog:
     name: str
     source: str
     laser: str
-    """the kind of the lines of the scans, as FLASER, or their topic"""
+    """kind of the lines of the scans, as FLASER, or their topic"""
     placed: bool
     """whether the scans have poses in the file; else `corrected` is zero"""
     time: Float[np.ndarray, "K"]
-    """of each scan [s]; may repeat if the file has few digits"""
+    """stamp of each scan [s]; may repeat if the file has few digits"""
     beams: Beams
     """with leading K, in the frame of the laser; shorter scans are padded by invalid beams"""
     corrected: Float[np.ndarray, "K 3"]
@@ -34,9 +34,9 @@ class LaserLog:
     """the last odometry before each scan, as an index of `odometry`; -1 if none"""
     odometry: Float[np.ndarray, "T 3"]
     odometry_time: Float[np.ndarray, "T"]
-    """as logged [s]; arbitrary in a line of CARMEN that sets the odometry"""
+    """stamp as logged [s]; arbitrary in a line of CARMEN that sets the odometry"""
     max_range: float
-    """the range of beams without a return [m]"""
+    """range of beams without a return [m]"""
     mount: Float[np.ndarray, "3"]
     """pose of the laser on the robot"""
     dropped: Mapping[str, int]
@@ -49,8 +49,8 @@ MOUNT_TOLERANCE = 0.01, np.deg2rad(0.5)
 """Largest difference of the mount within a log [m], [rad]."""
 
 
-def checked_mount(caller: str, mount: ArrayLike) -> Float[np.ndarray, "3"]:
-    """The mount given to a reader; ValueError unless it is three finite numbers."""
+def check_given_mount(caller: str, mount: ArrayLike) -> Float[np.ndarray, "3"]:
+    """The mount as an array; ValueError unless it is three finite numbers."""
     try:
         frame = np.asarray(mount, float)
     except (TypeError, ValueError):
@@ -61,12 +61,10 @@ def checked_mount(caller: str, mount: ArrayLike) -> Float[np.ndarray, "3"]:
     return frame
 
 
-def beyond(off: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
-    """Which poses differ from zero by more than by rounding."""
-    far = (np.hypot(off[:, 0], off[:, 1]) > MOUNT_TOLERANCE[0]) | (
-        np.abs(off[:, 2]) > MOUNT_TOLERANCE[1]
-    )
-    return np.asarray(far)
+def differs_from_zero(pose: Float[np.ndarray, "n 3"]) -> Bool[np.ndarray, "n"]:
+    """The mask of the poses that are not the identity, with tolerance `MOUNT_TOLERANCE`."""
+    far = np.hypot(pose[:, 0], pose[:, 1]) > MOUNT_TOLERANCE[0]
+    return np.asarray(far | (np.abs(pose[:, 2]) > MOUNT_TOLERANCE[1]))
 
 
 def pose_text(pose: Float[np.ndarray, "3"]) -> str:

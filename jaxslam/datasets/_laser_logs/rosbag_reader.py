@@ -10,7 +10,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from jaxslam.datasets._laser_logs.bag_messages import TRANSFORMS, Bag, Topic, opened
+from jaxslam.datasets._laser_logs.bag_messages import TRANSFORMS, Bag, Topic, open_bag
 from jaxslam.datasets._laser_logs.bag_transforms import (
     UPSIDE_DOWN,
     FramePair,
@@ -30,7 +30,7 @@ from jaxslam.datasets._laser_logs.bag_transforms import (
     transforms_of,
 )
 from jaxslam.datasets._laser_logs.laser_beams import beams_of
-from jaxslam.datasets._laser_logs.laser_record import LaserLog, checked_mount, wrapped_path
+from jaxslam.datasets._laser_logs.laser_record import LaserLog, check_given_mount, wrapped_path
 from jaxslam.math import numpy_poses as poses
 from jaxslam.math._odometry_jumps import LONG, odometry_jumps, step_sizes
 
@@ -113,11 +113,11 @@ def rosbag(
     """
     if not max_range > 0:
         raise ValueError(f"rosbag: expected a max_range above 0, got {max_range}")
-    given = None if mount is None else checked_mount("rosbag", mount)
+    given_mount = None if mount is None else check_given_mount("rosbag", mount)
     corrections: list[str] = []
-    source: list[str] = []  # notes on where odometry is from
+    source: list[str] = []  # notes on the source of odometry, after the notes on the scans
     dropped: Counter[str] = Counter()
-    with opened(path) as bag:
+    with open_bag(path) as bag:
         corrections += bag.notes
         laser = _chosen(bag, "scan", (LASER_SCAN, MULTI_ECHO), scan)
         if laser is None:
@@ -132,14 +132,14 @@ def rosbag(
             transforms = transforms + _transforms(bag, static=False)
         if wheels is None:
             messages = _odometry_of_transforms(bag, messages, transforms, frame, odometry, source)
-        placed, upside_down = _mount(bag, transforms, frame, messages, given, corrections)
+        placed, upside_down = _mount(bag, transforms, frame, messages, given_mount, corrections)
         for topic in bag.topics:
             if topic.name not in (laser, wheels) and topic.type not in TRANSFORMS and topic.count:
                 dropped[f"messages {topic.name}"] = topic.count
         stamp, kept = _in_order(bag, laser, "scans", messages.scans, dropped, corrections)
         scans = [_ascending(messages.scans[k], upside_down) for k in kept]
         corrections += source
-        found = _odometry_at(bag, stamp, messages, wheels, dropped, corrections)
+        joined = _odometry_at(bag, stamp, messages, wheels, dropped, corrections)
     beams, limit = beams_of(scans, max_range, dropped, corrections)
     return LaserLog(
         name=Path(path).resolve().name.split(".")[0],
@@ -149,11 +149,11 @@ def rosbag(
         time=_seconds(stamp),
         beams=beams,
         corrected=np.zeros((len(scans), 3)),
-        raw=wrapped_path(found.raw),
-        odometry_known=found.known,
-        row=found.row,
-        odometry=wrapped_path(found.poses),
-        odometry_time=_seconds(found.stamp),
+        raw=wrapped_path(joined.raw),
+        odometry_known=joined.step_known,
+        row=joined.row,
+        odometry=wrapped_path(joined.poses),
+        odometry_time=_seconds(joined.stamp),
         max_range=limit,
         mount=placed,
         dropped=dict(dropped),
@@ -162,20 +162,21 @@ def rosbag(
 
 
 class BagContents(NamedTuple):
-    """What is in a bag."""
+    """The contents of a bag, without its scans."""
 
     topics: tuple[Topic, ...]
     start: float
-    """of the recording [s], NaN without messages"""
+    """start of the recording [s], NaN without messages"""
     end: float
+    """end of the recording [s]"""
     lasers: dict[str, str]
-    """by topic with scans: the mount, or why there is none"""
+    """mount of each topic with scans, or the reason why it has none"""
     odometry: dict[str, int]
-    """pairs of frames of `/tf` that are odometry for one of the lasers, and their transforms"""
+    """number of transforms of each pair of frames of `/tf` that is odometry for a laser"""
     frames: dict[str, str]
-    """all pairs of frames `parent:child` with transforms: how many, and whether the child moves"""
+    """number of transforms of each pair of frames `parent:child`, and whether the child moves"""
     notes: tuple[str, ...]
-    """on the files"""
+    """notes on the files"""
 
 
 def rosbag_contents(path: str | Path) -> BagContents:
@@ -183,7 +184,7 @@ def rosbag_contents(path: str | Path) -> BagContents:
 
     Raises ValueError, with the file, if the bag cannot be read.
     """
-    with opened(path) as bag:
+    with open_bag(path) as bag:
         transforms = _transforms(bag, static=True) + _transforms(bag, static=False)
         frames, pairs = Frames(transforms), frame_pairs(transforms)
         wheels = [topic for topic in bag.topics if topic.type == ODOMETRY and topic.count]
@@ -264,17 +265,17 @@ class _Odometry(NamedTuple):
     """[ns]"""
     row: Int[np.ndarray, "K"]
     raw: Float[np.ndarray, "K 3"]
-    known: Bool[np.ndarray, "K"]
+    step_known: Bool[np.ndarray, "K"]
 
 
 def _listed(topics: Sequence[Topic]) -> str:
-    """The topics with their types and counts, as text."""
-    return ", ".join(f"{one.name} ({one.type}, {one.count:,})" for one in topics) or "no topics"
+    """The text of topics with their types and counts."""
+    listed = (f"{topic.name} ({topic.type}, {topic.count:,})" for topic in topics)
+    return ", ".join(listed) or "no topics"
 
 
 def _chosen(bag: Bag, argument: str, kinds: tuple[str, ...], name: str | None) -> str | None:
-    """The topic of a type: the named one; else the only one with messages, of the first of the
-    types that has any; else None."""
+    """The named topic; else the only topic with messages of the first type that has any."""
     option = OPTIONS[argument]
     expected = " or ".join(kinds)
     if name is None:
@@ -382,14 +383,14 @@ def _frame_of(bag: Bag, topic: str, scans: Sequence[_ScanMessage]) -> str:
 def _transforms(bag: Bag, static: bool) -> list[Transform]:
     """The transforms of `/tf_static`, or of `/tf`."""
     names = [
-        one.name
-        for one in bag.topics
-        if one.type in TRANSFORMS and one.name.endswith("static") == static
+        topic.name
+        for topic in bag.topics
+        if topic.type in TRANSFORMS and topic.name.endswith("static") == static
     ]
     return [
-        each
-        for _, at, message in bag.messages(names)
-        for each in transforms_of(at, message, static)
+        transform
+        for _, recorded, message in bag.messages(names)
+        for transform in transforms_of(recorded, message, static)
     ]
 
 
@@ -401,14 +402,14 @@ def _odometry_of_transforms(
     pair: str | None,
     corrections: list[str],
 ) -> _Messages:
-    """The messages with odometry from two frames of `/tf`: named ones, or the only such pair."""
+    """The messages with odometry from two frames of `/tf`: the named pair, or the only pair."""
     option = OPTIONS["odometry"]
     pairs = frame_pairs(transforms)
     candidates, others = odometry_pairs(pairs, Frames(transforms), laser)
     if pair is not None:
         parent, child = (frame_name(name) for name in pair.split(":", 1))
-        if not any((each.parent, each.child) == (parent, child) for each in pairs):
-            names = ", ".join(sorted({each.name for each in pairs}))
+        if (parent, child) not in {(frames.parent, frames.child) for frames in pairs}:
+            names = ", ".join(sorted({frames.name for frames in pairs}))
             raise bag.error(
                 f"odometry ({option}): expected two frames of the transforms "
                 f"{names or '(none)'}; got {pair!r}"
@@ -437,9 +438,9 @@ def _odometry_of_transforms(
                 "move in the plane"
             )
     odometry = [
-        _PoseMessage(each.stamp, each.recorded, each.pose)
-        for each in transforms
-        if (each.parent, each.child) == (parent, child)
+        _PoseMessage(edge.stamp, edge.recorded, edge.pose)
+        for edge in transforms
+        if (edge.parent, edge.child) == (parent, child)
     ]
     return messages._replace(odometry=odometry, base=child)
 
@@ -449,7 +450,7 @@ def _mount(
     transforms: Sequence[Transform],
     frame: str,
     messages: _Messages,
-    given: Float[np.ndarray, "3"] | None,
+    given_mount: Float[np.ndarray, "3"] | None,
     corrections: list[str],
 ) -> tuple[Float[np.ndarray, "3"], bool]:
     """The pose of the laser on the robot, and whether the laser is upside down."""
@@ -462,30 +463,32 @@ def _mount(
             frames, frame, [messages.base] * bool(messages.base), notes, _only_child(moving)
         )
     except ValueError as problem:
-        if given is None:
+        if given_mount is None:
             raise bag.error(str(problem)) from problem
-    if given is None:
+    if given_mount is None:
         corrections += notes
         return np.zeros(3) if placed is None else placed.pose, bool(placed and placed.upside_down)
     if placed is not None and placed.upside_down:
         corrections.append(UPSIDE_DOWN)
-    return given, bool(placed and placed.upside_down)
+    return given_mount, bool(placed and placed.upside_down)
 
 
 def _in_order(
     bag: Bag,
     topic: str,
-    what: str,
+    kind: str,
     messages: Sequence[_ScanMessage] | Sequence[_PoseMessage],
     dropped: Counter[str],
     corrections: list[str],
 ) -> tuple[Int[np.ndarray, "K"], Int[np.ndarray, "K"]]:
     """The increasing stamps [ns] of the messages that are kept, and their indices.
 
+    kind: plural noun for the counts in `dropped`.
+
     Raises ValueError if more than `BACKWARD` of the stamps go back.
     """
-    stamp = np.array([each.stamp for each in messages], np.int64)
-    recorded = np.array([each.recorded for each in messages], np.int64)
+    stamp = np.array([message.stamp for message in messages], np.int64)
+    recorded = np.array([message.recorded for message in messages], np.int64)
     if not stamp.any():
         corrections.append(f"all stamps of {topic} are 0: times are those of the recording")
         stamp = recorded
@@ -505,10 +508,10 @@ def _in_order(
                 f"{(stamp[at - 1] - stamp[at]) * 1e-9:.6g} s at message {at}; expected at most "
                 f"{BACKWARD:.0%}"
             )
-        dropped[f"{what} whose stamp goes back"] = back
+        dropped[f"{kind} whose stamp goes back"] = back
     new = np.diff(stamp[kept], prepend=stamp[kept[0]] - 1) > 0
     if repeated := int((~new).sum()):
-        dropped[f"{what} with the stamp of the one before"] = repeated
+        dropped[f"{kind} with the stamp of the one before"] = repeated
     kept = kept[new]
     return stamp[kept], kept
 
@@ -539,22 +542,22 @@ def _odometry_at(
     dropped: Counter[str],
     corrections: list[str],
 ) -> _Odometry:
-    """The odometry at each scan, interpolated; it stands still, and is not known, if none is.
+    """The odometry at each scan, interpolated; without messages zero, with unknown steps.
 
-    Raises ValueError if no scan is within its time.
+    Raises ValueError if no scan is within the time of the odometry.
     """
     first = np.arange(len(time)) == 0
     if not messages.odometry:
-        none = np.full(len(time), -1)
-        return _Odometry(np.zeros((0, 3)), none[:0], none, np.zeros((len(time), 3)), first)
+        no_row, no_stamp = np.full(len(time), -1), np.zeros(0, int)
+        return _Odometry(np.zeros((0, 3)), no_stamp, no_row, np.zeros((len(time), 3)), first)
     topic = wheels or "odometry in /tf"
-    path = planar(np.array([each.pose for each in messages.odometry]))
+    path = planar(np.array([message.pose for message in messages.odometry]))
     good = np.isfinite(path).all(axis=1)
     if not good.any():
         raise bag.error(f"{topic}: none of {len(path):,} messages has a pose in the plane")
     if lost := int((~good).sum()):
         dropped["odometry without a pose"] = lost
-    usable = [each for each, fine in zip(messages.odometry, good, strict=True) if fine]
+    usable = [message for message, fine in zip(messages.odometry, good, strict=True) if fine]
     stamp, kept = _in_order(bag, topic, "odometry", usable, dropped, corrections)
     path = path[good][kept]
     row = np.searchsorted(stamp, time, side="right") - 1
@@ -597,14 +600,15 @@ def _odometry_at(
             f"{int(jump.sum()):,}, first by {far:.3g} m and {np.rad2deg(turn):.3g}° in "
             f"{interval[at] * 1e-9:.3g} s at {_seconds(stamp[at : at + 1])[0]:.3f} s"
         )
-    # Nothing is interpolated over these: the scan has the pose of the message before it.
+    # Not over gaps and jumps: there a scan has the pose of the message before it.
     share[gap | (jump[upper] & inside)] = 0.0
     step = poses.between(path[lower], path[upper])
     raw = poses.compose(path[lower], poses.part(step, share))
     jumps = np.cumsum(jump)[lower]
-    known = within & np.concatenate([[True], within[:-1]])
-    known &= ~gap & ~np.concatenate([[False], gap[:-1]]) & (np.diff(jumps, prepend=jumps[:1]) == 0)
-    return _Odometry(path, stamp, row, raw, first | known)
+    step_known = within & np.concatenate([[True], within[:-1]])
+    step_known &= ~gap & ~np.concatenate([[False], gap[:-1]])
+    step_known &= np.diff(jumps, prepend=jumps[:1]) == 0
+    return _Odometry(path, stamp, row, raw, first | step_known)
 
 
 def _seconds(stamp: Int[np.ndarray, "n"]) -> Float[np.ndarray, "n"]:

@@ -25,13 +25,11 @@ from jaxslam.filters._delayed.state import (
     is_newer,
     slots_where,
 )
-from jaxslam.filters._ekf.ekf_settings import EkfSettings
-from jaxslam.filters._ekf.innovation import Correction
+from jaxslam.filters._ekf.correction import Correction, correct_in_turn
+from jaxslam.filters._ekf.ekf_slam import EkfSlam, associate_scan
 from jaxslam.filters._ekf.map_coordinates import estimate_of
-from jaxslam.filters._ekf.predict import propagate
-from jaxslam.filters._ekf.scan import associate_scan
-from jaxslam.filters._ekf.update import correct_in_turn
-from jaxslam.filters._reporting import info_of, seen_before, status_of
+from jaxslam.filters._ekf.predicted_measurements import prediction_of
+from jaxslam.filters._reporting import info_of, status_of
 from jaxslam.math._xla import where_any
 
 
@@ -73,20 +71,14 @@ class DelayedSlam(DelayedFilter):
         return empty_state(self.layout, pose, pose_cov)
 
     def predict(self, state: DelayedState, u: Float[Array, "U"], key: Array) -> DelayedState:
-        return state._replace(joint=propagate(state.joint, u, self.motion, self._ekf)[0])
+        return state._replace(joint=self._ekf.predict(state.joint, u, key))
 
     def update(self, state: DelayedState, scan: Scan, key: Array) -> tuple[DelayedState, Info]:
         # Padding may hold any number, and is multiplied by zero below.
         scan = scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
-        # Hypotheses and stored measurements are not landmarks.
-        landmarks = state.joint.alive & (jnp.arange(self.layout.slots) < self.capacity)
-        association, matched = associate_scan(
-            state.joint._replace(alive=landmarks), scan, self._ekf
-        )
-        joint, correction = correct_in_turn(
-            state.joint, scan.z, jnp.maximum(association.slot, 0), matched, self._ekf
-        )
-        state = state._replace(joint=joint, clock=state.clock + 1)
+        state = state._replace(clock=state.clock + 1)
+        association, matched = _associate(self, state, scan)
+        state, correction = _correct(self, state, scan, association, matched)
         new = _new_measurements(self, scan, association)
 
         def initialize(
@@ -118,11 +110,45 @@ class DelayedSlam(DelayedFilter):
         return estimate_of(landmarks, self.sensor_of_table, self.chart)
 
     @property
-    def _ekf(self) -> EkfSettings:
-        """The settings of `EkfSlam`, by which landmarks of the map are associated and corrected."""
-        return EkfSettings(
-            sensor=self.sensor_of_table, associate=self.associate, gate=self.probability
+    def _ekf(self) -> EkfSlam:
+        """The EKF-SLAM by which landmarks of the map are associated and corrected."""
+        return EkfSlam(
+            self.motion,
+            self.sensor,
+            self.capacity,
+            associate=self.associate,
+            gate=self.probability,
         )
+
+
+def _associate(
+    filter: DelayedSlam, state: DelayedState, scan: Scan
+) -> tuple[Association, Bool[Array, "M"]]:
+    """The landmark slot of each measurement, and the mask of the measurements that have one.
+
+    Hypotheses and stored measurements are not landmarks.
+    """
+    is_landmark = jnp.arange(filter.layout.slots) < filter.capacity
+    landmarks = state.joint._replace(alive=state.joint.alive & is_landmark)
+    ekf, sensor = filter._ekf, filter.sensor_of_table
+    return associate_scan(
+        filter.associate, sensor, scan, lambda: prediction_of(ekf, sensor, landmarks)
+    )
+
+
+def _correct(
+    filter: DelayedSlam,
+    state: DelayedState,
+    scan: Scan,
+    association: Association,
+    matched: Bool[Array, "M"],
+) -> tuple[DelayedState, Correction]:
+    """The state corrected by the measurements of landmarks of the map that are within the gate."""
+    slot = jnp.maximum(association.slot, 0)
+    joint, correction = correct_in_turn(
+        filter._ekf, filter.sensor_of_table, state.joint, scan.z, slot, matched
+    )
+    return state._replace(joint=joint), correction
 
 
 def _new_measurements(
@@ -131,7 +157,9 @@ def _new_measurements(
     """The measurements of a scan that association declares new."""
     is_new = scan.valid & association.is_new
     if filter.by_tag:
-        return NewMeasurements(scan.z, scan.tag, scan.tag, is_new, seen_before(scan.tag, is_new))
+        return NewMeasurements(
+            scan.z, scan.tag, scan.tag, is_new, slots.seen_before(scan.tag, is_new)
+        )
     unknown = jnp.full_like(scan.tag, -1)
     return NewMeasurements(scan.z, unknown, scan.tag, is_new, jnp.zeros_like(is_new))
 

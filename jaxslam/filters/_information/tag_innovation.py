@@ -16,7 +16,6 @@ from jaxslam.core._numbers import check_count, check_gate, check_positive, gate_
 from jaxslam.core._record import record, static
 from jaxslam.core.protocols import Filter, Motion, Sensor
 from jaxslam.core.types import Scan
-from jaxslam.filters._reporting import seen_before
 from jaxslam.linearize._first_order import observe_jacobians, predicted_noise
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import Number
@@ -85,7 +84,7 @@ def associate_by_table(tag: Int[Array, "N"], alive: Bool[Array, "N"], scan: Scan
     tagged = scan.valid & (scan.tag >= 0)
     slot, in_map = slots.find(tag, alive, scan.tag)
     matched, new = tagged & in_map, tagged & ~in_map
-    repeated = new & seen_before(scan.tag, new)
+    repeated = new & slots.seen_before(scan.tag, new)
     free_slot, granted = slots.allocate(alive, new & ~repeated)
     slot = jnp.where(new, free_slot, slot)
     return TagAssociation(matched, new, repeated, matched | granted, slot)
@@ -98,7 +97,7 @@ def associate_by_index(alive: Bool[Array, "N"], scan: Scan) -> TagAssociation:
     """
     capacity = alive.shape[0]
     tagged = scan.valid & (scan.tag >= 0)
-    repeated = tagged & seen_before(scan.tag, tagged)
+    repeated = tagged & slots.seen_before(scan.tag, tagged)
     has_slot = tagged & ~repeated & (scan.tag < capacity)
     slot = jnp.where(has_slot, scan.tag, capacity).astype(jnp.int32)
     matched = has_slot & alive.at[slot].get(mode="fill", fill_value=False)

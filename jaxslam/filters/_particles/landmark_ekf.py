@@ -3,8 +3,6 @@
 All functions act on one particle; `FastSlam` vmaps them, `Mapping` has only one.
 """
 
-from typing import NamedTuple
-
 import jax
 import jax.numpy as jnp
 from jax import Array
@@ -14,14 +12,14 @@ from jaxslam.core import slots
 from jaxslam.core.protocols import Life, Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan, Status
+from jaxslam.filters._gaussian_correction import correct_gaussian
 from jaxslam.filters._particles.particle_map import ParticleMapFilter
 from jaxslam.filters._particles.proposal import ParticleInnovations
 from jaxslam.filters._particles.scan_association import ParticleAssociation
 from jaxslam.filters._particles.slam_particles import SlamParticles, as_only_particle, slam_estimate
-from jaxslam.filters._reporting import info_of, seen_before, status_of, with_removed
+from jaxslam.filters._reporting import NewLandmarks, info_of, status_of, with_removed
 from jaxslam.linearize import _first_order as first_order
 from jaxslam.math import _linalg as linalg
-from jaxslam.math._gaussians import gaussian_terms
 from jaxslam.math._xla import where_any
 
 
@@ -83,13 +81,9 @@ def _correct_landmarks(
     def correct(z: Array, used: Array, landmark: Array, cov: Array) -> tuple[Array, Array]:
         z_hat = sensor.observe(pose, landmark)
         by_landmark = jax.jacfwd(sensor.observe, argnums=1)(pose, landmark)
-        hc = linalg.matmul(by_landmark, cov)
         noise = first_order.predicted_noise(sensor, z_hat, z, used)
-        s = linalg.symmetrize(linalg.matmul(hc, by_landmark.T) + noise)
-        terms = gaussian_terms(sensor.residual(z, z_hat), s)
-        # With S = L Lᵀ and V = L⁻¹ H_l C: l ← l + Vᵀ L⁻¹ ν, C ← C - Vᵀ V.
-        v = linalg.solve_lower(terms.factor, hc)
-        return landmark + linalg.matmul(terms.whitened[None], v)[0], cov - linalg.gram(v, v)
+        correction = correct_gaussian(sensor.residual(z, z_hat), by_landmark, cov, noise)
+        return landmark + correction.xi, correction.cov
 
     landmarks, covs = jax.vmap(correct)(scan.z, used, particle.landmarks[slot], particle.covs[slot])
     into = jnp.where(used, slot, particle.landmarks.shape[0])  # beyond the end: dropped
@@ -115,21 +109,9 @@ def _evict_for_new(
     return _without_landmarks(particle, evicted), evicted
 
 
-class _NewLandmarks(NamedTuple):
-    """The slots of new landmarks, and the outcome of measurements without a landmark."""
-
-    slot: Int[Array, "M"]
-    """a free landmark slot, where granted"""
-    granted: Bool[Array, "M"]
-    deferred: Bool[Array, "M"]
-    """the measurement is beyond `births`, the limit of a scan"""
-    repeated: Bool[Array, "M"]
-    """the tag occurs earlier in the scan"""
-
-
 def _initialize_landmarks(
     filter: ParticleMapFilter, particle: SlamParticles, is_new: Bool[Array, "M"], scan: Scan
-) -> tuple[SlamParticles, _NewLandmarks]:
+) -> tuple[SlamParticles, NewLandmarks]:
     """The particle with new landmarks in free slots, in the order of the scan, as many as fit.
 
     l = g(x, z, s̄), C = G_z R G_zᵀ + G_s S G_sᵀ: the pose of a particle has no error.
@@ -138,22 +120,22 @@ def _initialize_landmarks(
     capacity, size = particle.landmarks.shape
     births = m if filter.births is None else filter.births
 
-    def initialize(particle: SlamParticles) -> tuple[_NewLandmarks, Array, Array]:
+    def initialize(particle: SlamParticles) -> tuple[NewLandmarks, Array, Array]:
         def invert(z: Float[Array, "Z"]) -> tuple[Float[Array, "L"], Float[Array, "L L"]]:
             landmark, _, cov = first_order.invert_at(
                 filter.sensor, particle.pose, z, particle.pose, z
             )
             return landmark, linalg.symmetrize(cov)
 
-        repeated = is_new & seen_before(scan.tag, is_new)
+        repeated = is_new & slots.seen_before(scan.tag, is_new)
         wanted = is_new & ~repeated
         deferred = wanted & (jnp.cumsum(wanted) > births)
         slot, granted = slots.allocate(particle.alive, wanted & ~deferred)
-        return _NewLandmarks(slot, granted, deferred, repeated), *jax.vmap(invert)(scan.z)
+        return NewLandmarks(slot, granted, deferred, repeated), *jax.vmap(invert)(scan.z)
 
-    def leave(particle: SlamParticles) -> tuple[_NewLandmarks, Array, Array]:
+    def leave(particle: SlamParticles) -> tuple[NewLandmarks, Array, Array]:
         no = jnp.zeros_like(is_new)
-        new = _NewLandmarks(jnp.zeros(m, jnp.int32), no, no, no)
+        new = NewLandmarks(jnp.zeros(m, jnp.int32), no, no, no)
         return new, jnp.zeros((m, size), dtype), jnp.zeros((m, size, size), dtype)
 
     new, landmarks, covs = where_any(is_new.any(), initialize, leave, particle)

@@ -2,6 +2,7 @@
 
 import dataclasses
 from collections.abc import Sequence
+from typing import get_args
 
 import numpy as np
 
@@ -11,12 +12,9 @@ from jaxslam.core import _validation as validation
 from jaxslam.core._numbers import check_count
 from jaxslam.core._record import hold_function, record, set_field, static
 from jaxslam.core.protocols import Associate, Filter, Sensor
-from jaxslam.filters._ekf.ekf_settings import (
-    CorrectionOrder,
-    Covariance,
-    check_covariance_form,
-    check_ekf_options,
-)
+from jaxslam.filters._ekf.checks import check_choice, check_map_options
+from jaxslam.filters._ekf.correction import Covariance
+from jaxslam.filters._ekf.ekf_slam import CorrectionOrder
 from jaxslam.filters.multi_robot._team import check_team, sizes
 from jaxslam.filters.multi_robot.team import Robot
 from jaxslam.math._arrays import Number
@@ -64,10 +62,10 @@ class TeamFilter(Filter):
             validation.check_models(name, robot.motion, robot.sensors)
         validation.check_parts(name, associate=self.associate)
         hold_function(self, "associate", "prediction, scan")
-        check_ekf_options(
-            name, self.capacity, self.correction, self.gate, self.iterations, self.births
-        )
-        check_covariance_form(name, self.covariance, ("plain", "joseph"))
+        check_map_options(name, self.capacity, self.gate, self.births)
+        check_count(f"{name}: iterations", self.iterations)
+        check_choice(name, "correction", self.correction, get_args(CorrectionOrder))
+        check_choice(name, "covariance", self.covariance, ("plain", "joseph"))
         if type(self.report) is not int or not 0 <= self.report < len(robots):
             raise ValueError(
                 f"{name}: expected report from 0 to {len(robots) - 1}, got {self.report!r}"

@@ -1,10 +1,7 @@
 """EKF-SLAM of several robots in one joint state (Solà's loop over robots, sensors, landmarks)."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxslam.charts import Euclidean
@@ -12,9 +9,7 @@ from jaxslam.core import slots
 from jaxslam.core._record import record
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan, Status
-from jaxslam.filters._ekf.ekf_settings import EkfSettings
-from jaxslam.filters._ekf.predict import propagate
-from jaxslam.filters._ekf.scan import SensorStage, stage_of, update_by_scan
+from jaxslam.filters._ekf.ekf_slam import EkfSlam, update_by_sensor
 from jaxslam.filters._reporting import joined_info
 from jaxslam.filters.multi_robot._pose_initialization import best_initialization, observed_points
 from jaxslam.filters.multi_robot._team import sizes
@@ -30,7 +25,7 @@ from jaxslam.filters.multi_robot.team import poses
 from jaxslam.math import se2
 from jaxslam.math._xla import where_any
 from jaxslam.math.angles import wrap
-from jaxslam.sensors._suite import Part, split_scan
+from jaxslam.sensors._suite import on_ground, split_scan
 
 
 @record
@@ -79,7 +74,7 @@ class TeamSlam(TeamFilter):
 
     def predict(self, state: Joint, u: Float[Array, "U"], key: Array) -> Joint:
         for b, control in enumerate(jnp.split(u, sizes(self.robots)[0][:-1])):
-            state = _predict_robot(self, state, b, control)
+            state = _predict_robot(self, state, b, control, key)
         return state
 
     def update(self, state: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
@@ -121,12 +116,12 @@ class TeamSlam(TeamFilter):
             tag=state.tag[:capacity],
         )
 
-    @property
-    def _ekf(self) -> EkfSettings:
-        """The settings of `EkfSlam`, by which each robot moves and corrects the map."""
-        count = self.capacity + len(self.robots) - 1
-        return EkfSettings(
-            sensor=self.robots[0].sensors,
+    def ekf_of(self, robot: int) -> EkfSlam:
+        """The EKF-SLAM by which a robot moves and corrects the map."""
+        return EkfSlam(
+            self.robots[robot].motion,
+            self.robots[robot].sensors,
+            self.capacity + len(self.robots) - 1,
             chart=_WrappedHeadings(),
             associate=self.associate,
             correction=self.correction,
@@ -134,7 +129,6 @@ class TeamSlam(TeamFilter):
             iterations=self.iterations,
             covariance=self.covariance,
             births=self.births,
-            reserved=np.arange(count) >= self.capacity,
         )
 
 
@@ -147,11 +141,11 @@ class _WrappedHeadings(Euclidean):
         return pose, jnp.concatenate([landmark[:2], wrap(landmark[2:])])
 
 
-def _predict_robot(filter: TeamSlam, joint: Joint, robot: int, u: Float[Array, "U"]) -> Joint:
+def _predict_robot(
+    filter: TeamSlam, joint: Joint, robot: int, u: Float[Array, "U"], key: Array
+) -> Joint:
     """The state after the prediction of one robot, if it is in the map."""
-    after, _ = propagate(
-        seen_from(filter, joint, robot), u, filter.robots[robot].motion, filter._ekf
-    )
+    after = filter.ekf_of(robot).predict(seen_from(filter, joint, robot), u, key)
     after = seen_from_first(filter, after, robot, joint)
     if robot in filter.started:  # always in the map
         return after
@@ -191,18 +185,22 @@ def _correct_by_robot(filter: TeamSlam, joint: Joint, robot: int, scan: Scan) ->
     others = jnp.where(jnp.arange(len(in_map)) == robot, False, in_map)
     # Measurements of a robot without a pose in the map, and all by one, cannot correct.
     unknown = (of_robot & ~others[None, :]).any(axis=1) | ~in_map[robot]
-    part_scan = scan._replace(valid=scan.valid & ~unknown)
-    stages = [_stage_of(part, filter._ekf) for part in filter.robots[robot].sensors.parts]
-    after, info = update_by_scan(seen_from(filter, joint, robot), part_scan, stages)[:2]
+    after = seen_from(filter, joint, robot)
+    ekf, sensors, infos = filter.ekf_of(robot), filter.robots[robot].sensors, []
+    is_robot = jnp.arange(len(joint.alive)) >= filter.capacity
+    scans = split_scan(scan._replace(valid=scan.valid & ~unknown), sensors.places)
+    for part, part_scan in zip(sensors.parts, scans, strict=True):
+        sensor = on_ground(part.sensor, SIZE)
+        part_scan = part_scan._replace(z=part_scan.z[:, : len(sensor.measurements)])
+        births = 0 if part.sees == "robots" else filter.births  # a robot is no new landmark
+        after, info, _, _ = update_by_sensor(
+            ekf, sensor, after, part_scan, births, reserved=is_robot
+        )
+        infos.append(info)
+    info = joined_info(infos, scan.z.shape[1])
     status = jnp.where(scan.valid & unknown, Status.UNMATCHED, info.status)
     info = info._replace(status=status.astype(jnp.int32))
     return seen_from_first(filter, after, robot, joint), info
-
-
-def _stage_of(part: Part, ekf: EkfSettings) -> SensorStage:
-    """The stage of one sensor in a scan; sensors of robots initialize no landmarks."""
-    births = 0 if part.sees == "robots" else ekf.births
-    return stage_of(part, SIZE, dataclasses.replace(ekf, births=births))
 
 
 def _mark_born(info: Info, used: Bool[Array, "M"], slot: int) -> Info:

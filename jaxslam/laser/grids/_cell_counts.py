@@ -1,4 +1,4 @@
-"""Maps from scans at known poses: hits and misses of each cell, and the log-odds they add to it."""
+"""Maps from scans at known poses: hits and misses of each cell, and the log-odds by them."""
 
 from functools import partial
 from numbers import Integral
@@ -19,11 +19,12 @@ from jaxslam.math._arrays import Number
 from jaxslam.math._xla import hot_jit
 
 _FARTHEST = 2.0**29
-"""An end of a beam farther off [cells] counts as this far, lest the number of cells overflow."""
+"""[cells] Ends of beams farther off count as this far: the number of cells crossed, the sum along
+two axes, must fit into an int32."""
 
 
 class Counts(NamedTuple):
-    """How many beams ended in each cell, and how many passed through it."""
+    """The numbers of beams that ended in each cell, and that passed through it."""
 
     hits: Int[JaxOrNumPy, "H W"]
     misses: Int[JaxOrNumPy, "H W"]
@@ -48,11 +49,11 @@ def count(
 ) -> Counts:
     """The hits and misses of a map of (H, W) cells by T scans at known poses.
 
-    A beam misses each cell that it crosses, in order (Amanatides & Woo 1987), before the one in
-    which it ends, which it hits. One of max_range or more hits nothing, and misses the cells up to
-    no_return; where that is 0 it says nothing. What other ranges say: `Beams`. What is off the map
-    is not counted. The counts are sums of integers: the order of the scans does not matter, and
-    those of two logs add.
+    A beam misses each cell that it crosses, in order (Amanatides & Woo 1987), and hits the cell in
+    which it ends. A beam of max_range or more hits nothing, and misses the cells up to no_return; a
+    no_return of 0 leaves it out. `Beams` says what other ranges mean. Cells off the map are not
+    counted. The counts are sums of integers: the order of the scans does not matter, and the counts
+    of two logs add.
 
     Args:
         origin, resolution: of the map, as in `Grid`.
@@ -129,9 +130,10 @@ def _count(
         usable = usable_beams(scan)
         return (hits, misses, outside + lost, unusable + (~usable).sum(dtype=jnp.int32)), None
 
-    none = jnp.zeros(shape[0] * shape[1], jnp.int32)
+    # Flat tables with an index beyond the end for what is not counted: scatters of mode "drop".
+    empty = jnp.zeros(shape[0] * shape[1], jnp.int32)
     zero = jnp.zeros((), jnp.int32)
-    total, _ = jax.lax.scan(add, (none, none, zero, zero), (poses, beams))
+    total, _ = jax.lax.scan(add, (empty, empty, zero, zero), (poses, beams))
     return Counts(total[0].reshape(shape), total[1].reshape(shape), origin, resolution, *total[2:])
 
 
@@ -146,7 +148,7 @@ def _add_scan(
     max_range: Number,
     free: ArrayLike,
 ) -> tuple[Int[Array, "HW"], Int[Array, "HW"], Int[Array, ""]]:
-    """The counts with one scan more, and the number of usable beams if its pose is off the map.
+    """The counts with a further scan, and its number of usable beams if its pose is off the map.
 
     Args:
         eye: pose of the laser. free: as `no_return` of `count`.
@@ -174,10 +176,10 @@ def _add_scan(
 def _cross(
     misses: Array, start: Array, ends: Array, live: Array, shape: tuple[int, int]
 ) -> tuple[Array, Array]:
-    """Add one to each cell from start up to, without, that of the end; and the latter's index.
+    """The misses with each cell from start up to the last one, without it; and its index.
 
-    A beam crosses as many lines of the table as there are between the two cells; one that leaves
-    the map does not return.
+    A beam crosses as many lines of the table as lie between the two cells; a beam that leaves the
+    map does not return.
     """
     height, width = shape
     nowhere = misses.shape[0]
@@ -249,6 +251,6 @@ def entropy(grid: Grid) -> Float[Array, "H W"]:
     """The entropy -p log₂ p - (1 - p) log₂(1 - p) [bit] of each cell: 1 where it is unknown."""
     size = jnp.abs(grid.log_odds)
     odds = jnp.exp(-size)
-    # With the larger share 1/(1 + odds): -log of it is log1p(odds), of the other size more.
+    # The larger share is 1/(1 + odds), with -log of log1p(odds); the smaller has `size` more.
     nats = jnp.log1p(odds) + size * odds / (1 + odds)
     return jnp.asarray(nats / np.log(2.0))

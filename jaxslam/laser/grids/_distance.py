@@ -1,4 +1,4 @@
-"""The exact Euclidean distance of each cell from the nearest one that is occupied."""
+"""The exact Euclidean distance of each cell from the nearest occupied cell."""
 
 import functools
 
@@ -66,15 +66,15 @@ def gradient(field: Field) -> Float[Array, "H W 2"]:
 
 
 def squared_distances(occupied: Bool[JaxOrNumPy, "H W"]) -> Int[Array, "H W"]:
-    """The squared distance, in cells, of each cell from the nearest occupied one: an integer.
+    """The squared distance, in cells, of each cell from the nearest occupied cell: an integer.
 
-    First d(i, j), to the nearest one in the same column. Then min over k of (j - k)² + d(i, k)²,
-    the lower envelope of a parabola for each column k (Felzenszwalb & Huttenlocher 2012, "Distance
-    transforms of sampled functions", Theory of Computing 8). Where parabola q goes below parabola p
-    is (h_q - h_p)/(2 (q - p)) with h_k = k² + d(i, k)²; the first cell from there on is found in
-    integers, exactly in float32 too. All rows are treated together, each with a
-    separate stack; a step of the loop adds a parabola to a row or removes one, so that there are
-    at most 2 W steps however unlike the rows are. H² + W² where nothing is occupied.
+    First d(i, j), to the nearest occupied cell in the same column. Then the minimum over k of
+    (j - k)² + d(i, k)², the lower envelope of a parabola for each column k (Felzenszwalb &
+    Huttenlocher 2012, "Distance transforms of sampled functions", Theory of Computing 8). Parabola
+    q goes below parabola p at (h_q - h_p)/(2 (q - p)) with h_k = k² + d(i, k)²; the first cell from
+    there on is computed in integers, exactly in float32 too. All rows are treated together, each
+    with a separate stack; a step of the loop adds a parabola to a row or removes it, so that there
+    are at most 2 W steps however unlike the rows are. H² + W² if no cell is occupied.
     """
     height, width = occupied.shape
     nothing = height**2 + width**2
@@ -114,12 +114,19 @@ def near_distances(occupied: Bool[JaxOrNumPy, "H W"], reach: int) -> Int[Array, 
 
 @jax.custom_batching.custom_vmap
 def _envelope(column: Int[Array, "W H"]) -> Int[Array, "W H"]:
-    """For each place of a row, a column here, the parabola that is lowest there."""
+    """The column whose parabola is lowest, at each place of each row (rows are columns here).
+
+    | parabola q of a row | step |
+    |---|---|
+    | goes below the last one only where that has not yet begun | removes the last one |
+    | otherwise | is added, and q grows |
+    | q = W | the row waits for the others |
+    """
     width, rows = column.shape
     row = jnp.arange(rows, dtype=jnp.int32)
     k = jnp.arange(width, dtype=jnp.int32)[:, None]
     h = (column**2 + k**2).reshape(-1)
-    everywhere = -3  # before all that `first_cell` returns: the first parabola stays
+    everywhere = -3  # below all results of `first_cell`, so that the first parabola stays
 
     def first_cell(rise: Array, run: Array) -> Array:
         """The cell ⌈rise/run⌉, by one division of floats, corrected; exact from 0 to width."""
@@ -158,7 +165,7 @@ def _envelope(column: Int[Array, "W H"]) -> Int[Array, "W H"]:
         begins[:rows],
     )
     _, top, parabola, begins, *_ = jax.lax.while_loop(unfinished, step, start)
-    # Parabolas are in the order of their columns, so the last that began is the lowest.
+    # Parabolas are in the order of their columns, so the last to begin is the lowest.
     depth = jnp.arange(width, dtype=jnp.int32)[:, None]
     first = jnp.where(depth <= top[None, :], begins.reshape(width, rows), width)
     first = jnp.clip(first, 0, width)
@@ -171,5 +178,5 @@ def _envelope(column: Int[Array, "W H"]) -> Int[Array, "W H"]:
 def _of_all(size: int, _: object, columns: Int[Array, "P W H"]) -> tuple[Array, bool]:
     """The rows of all tables of a batch together: a separate loop for each would copy all."""
     _, width, rows = columns.shape
-    found = _envelope(jnp.swapaxes(columns, 0, 1).reshape(width, size * rows))
-    return jnp.swapaxes(found.reshape(width, size, rows), 0, 1), True
+    nearest = _envelope(jnp.swapaxes(columns, 0, 1).reshape(width, size * rows))
+    return jnp.swapaxes(nearest.reshape(width, size, rows), 0, 1), True

@@ -42,13 +42,13 @@ class Grid(NamedTuple):
         return jax.nn.sigmoid(self.log_odds)
 
     @property
-    def known(self) -> Bool[JaxOrNumPy, "H W"]:
+    def observed(self) -> Bool[JaxOrNumPy, "H W"]:
         """Mask of the cells with evidence: their log-odds are not 0."""
         return self.log_odds != 0
 
 
 class Field(NamedTuple):
-    """Numbers at the centres of the cells of a grid, as a distance field has them."""
+    """Numbers at the centres of the cells of a grid, as of a distance field."""
 
     values: Float[Array, "H W"]
     origin: Float[Array, "3"]

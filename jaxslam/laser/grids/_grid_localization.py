@@ -1,8 +1,4 @@
-"""Monte-Carlo localization in an occupancy grid, from the beams of a laser.
-
-With the log that `run` takes, made of odometry and laser scans, and the free cells of a map as the
-region where a robot may be.
-"""
+"""Monte-Carlo localization in an occupancy grid, from the beams of a laser, and its log."""
 
 import dataclasses
 import math
@@ -40,13 +36,10 @@ from jaxslam.math.angles import wrap
 from jaxslam.resampling._weights import normalized
 
 _BEAM = ("range [m]", "angle [rad]")
-"""The measurements of such a log."""
-
-_BEAM = ("range [m]", "angle [rad]")
-"""The measurements of such a log."""
+"""Measurements of a beam in a log."""
 
 _NOTHING = 1e6
-"""Range [m] in a log of a beam that met nothing and is infinite in the scan: a log is finite."""
+"""[m] finite stand-in in a log for the infinite range of a beam that met nothing."""
 
 
 def beam_log(control: ArrayLike, beams: Beams) -> Log:
@@ -77,7 +70,7 @@ def beam_log(control: ArrayLike, beams: Beams) -> Log:
         )
     concrete = is_concrete(control, beams)
     xp: ModuleType = np if concrete else jnp
-    moved, ranges, angle, valid = (xp.asarray(part) for part in (control, *beams))
+    controls, ranges, angle, valid = (xp.asarray(part) for part in (control, *beams))
     met, free = Beams(ranges, angle, valid).returns()
     usable = xp.asarray(met | free)
     if concrete:
@@ -89,16 +82,16 @@ def beam_log(control: ArrayLike, beams: Beams) -> Log:
             raise ValueError(f"beam_log: none of {steps} scans has a valid beam")
     z = xp.stack([xp.minimum(ranges, _NOTHING), angle], axis=-1)
     scan = Scan(
-        z=xp.where(usable[..., None], z, 0.0).astype(moved.dtype),
+        z=xp.where(usable[..., None], z, 0.0).astype(controls.dtype),
         tag=xp.full(shapes[0], -1, np.int32),
         valid=usable,
     )
-    return Log(moved, scan)
+    return Log(controls, scan)
 
 
-def beams_of(scan: Scan, every: int) -> Beams:
-    """Each n-th beam of a scan of such a log; beams that are not valid have range 0."""
-    z, valid = scan.z[::every], scan.valid[::every]
+def beams_of(scan: Scan, stride: int) -> Beams:
+    """Each n-th beam of a scan of `beam_log`; beams that are not valid have range 0."""
+    z, valid = scan.z[::stride], scan.valid[::stride]
     used = valid & (z[:, 0] > 0)
     clean = jnp.where(used[:, None], z, 0.0)
     return Beams(clean[:, 0], clean[:, 1], used)
@@ -109,24 +102,24 @@ class _FreeSpace(Region):
     """The free cells of a map."""
 
     places: ArrayLike
-    """(K, 2) their centres"""
+    """(K, 2) centres of the cells"""
     sides: ArrayLike
-    """(2, 2) of a cell, as rows"""
+    """(2, 2) sides of a cell, as rows"""
 
     def draw(self, count: int, key: Array, dtype: DTypeLike) -> Float[Array, "P 3"]:
-        key_which, key_where = jax.random.split(key)
+        key_cell, key_share = jax.random.split(key)
         places = jnp.asarray(self.places, dtype)
-        which = jax.random.randint(key_which, (count,), 0, len(places))
-        share = jax.random.uniform(key_where, (count, 3), dtype) - 0.5
-        place = places[which] + share[:, :2] @ jnp.asarray(self.sides, dtype)
+        cell = jax.random.randint(key_cell, (count,), 0, len(places))
+        share = jax.random.uniform(key_share, (count, 3), dtype) - 0.5
+        place = places[cell] + share[:, :2] @ jnp.asarray(self.sides, dtype)
         return jnp.concatenate([place, wrap(2 * math.pi * share[:, 2:])], axis=1)
 
     def moments(self, dtype: DTypeLike) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
         places, sides = jnp.asarray(self.places, dtype), jnp.asarray(self.sides, dtype)
         mean = places.mean(axis=0)
-        spread = (places - mean[None]).T @ (places - mean[None]) / len(
-            places
-        ) + sides.T @ sides / 12
+        # Of the centres, and of a uniform place within a cell; likewise a uniform heading, π²/3.
+        off = places - mean[None]
+        spread = off.T @ off / len(places) + sides.T @ sides / 12
         cov = jnp.zeros((3, 3), dtype).at[:2, :2].set(spread).at[2, 2].set(math.pi**2 / 3)
         return jnp.concatenate([mean, jnp.zeros(1, dtype)]), cov
 
@@ -161,7 +154,7 @@ class GridLocalization(MonteCarloFilter):
 
         (Π_k p(z_k | x, map))^exponent
 
-    over the usable beams of the scan, each `every`-th. An exponent below 1 tempers the likelihood:
+    over the usable beams of the scan, each `stride`-th. An exponent below 1 tempers the likelihood:
     beams are not independent given the pose, and without it the particles are overconfident
     (Thrun, Burgard & Fox 2005, "Probabilistic robotics", sections 6.3.4 and 8.3.4). Which exponent
     is honest depends on model, map and number of beams; `consistency.judge_localization` measures
@@ -176,12 +169,12 @@ class GridLocalization(MonteCarloFilter):
     `clusters` of `final.pose` and `final.log_weight` finds these. A particle off the map or in an
     occupied cell has weight zero; `blocked` of `info.extra["particles"]`, a `ParticleInfo`, counts
     those in use. A scan without a usable beam gives no more information. The status of a beam is
-    FUSED if it entered the weights, UNMATCHED if `every` left it out or the scan left no particle a
-    weight (`underflow`), as where all are off the map. log_likelihood is
+    FUSED if it entered the weights, UNMATCHED if `stride` left it out or the scan left no particle
+    a weight (`underflow`), as where all are off the map. log_likelihood is
     log Σ w p(z | x)^exponent.
 
     Raises ValueError as `MonteCarloFilter`, on a grid that is none, is a tracer, or has no free
-    cell (in the box), a model that is none, an exponent not above 0 or every below 1.
+    cell (in the box), a model that is none, an exponent not above 0 or stride below 1.
     """
 
     grid: Grid
@@ -189,18 +182,18 @@ class GridLocalization(MonteCarloFilter):
     model: BeamModel
     """as `LikelihoodField` or `RayCast`"""
     motion: Motion
-    """any; for odometry `motion.Odometry` with `odometry_controls`"""
+    """motion model; for odometry `motion.Odometry` with `odometry_controls`"""
     particles: int = static()
-    """the capacity P, at least 1. Its cost is that of P · B/every look-ups a step"""
+    """capacity P, at least 1; a step has P · B/stride look-ups"""
     _: dataclasses.KW_ONLY
     exponent: Number = 0.1
     """of the likelihood, above 0; differentiable"""
-    every: int = static(default=1)
+    stride: int = static(default=1)
     """use each n-th beam, at least 1"""
     prepared: PyTree = dataclasses.field(init=False, repr=False)
-    """the map as prepared for the model"""
+    """result of `model.prepare` for the map"""
     region: _FreeSpace = dataclasses.field(init=False, repr=False)
-    """where the robot may be: the free cells of the map (in the box)"""
+    """free cells of the map (in the box), where the robot may be"""
     measurements = _BEAM
 
     def __post_init__(self) -> None:
@@ -212,7 +205,7 @@ class GridLocalization(MonteCarloFilter):
             )
         validation.check_record(name, "model", self.model, BeamModel)
         check_motion(name, self.motion)
-        validation.check_count(f"{name}: every", self.every)
+        validation.check_count(f"{name}: stride", self.stride)
         check_positive(name, exponent=self.exponent)
         hold_box(self)
         box = None if self.box is None else np.asarray(self.box)
@@ -221,31 +214,31 @@ class GridLocalization(MonteCarloFilter):
         super().__post_init__()
 
     def update(self, state: PoseParticles, scan: Scan, key: Array) -> tuple[PoseParticles, Info]:
-        state, beams = draw_start(state, key, self._start_region), beams_of(scan, self.every)
+        state, beams = draw_start(state, key, self._start_region), beams_of(scan, self.stride)
 
         def fit_of(poses: Float[Array, "P 3"], map_of: PyTree, beams: Beams) -> Float[Array, "P"]:
-            one = partial(log_likelihood, self.model, map_of, beams=beams)
-            return -jax.vmap(one)(poses)
+            log_p = partial(log_likelihood, self.model, map_of, beams=beams)
+            return -jax.vmap(log_p)(poses)
 
-        # Else XLA computes it again in each of its consumers.
+        # Without `no_inline` XLA computes it again in each of its consumers.
         fit = no_inline(fit_of, state.pose, in_dtype(self.prepared, state.pose.dtype), beams)
         blocked = _is_blocked(self.grid, state.pose)
         fit = jnp.where(blocked, jnp.inf, fit)
         misfit = jnp.where(blocked, jnp.inf, jnp.asarray(self.exponent, fit.dtype) * fit)
         evidence = normalized(state.log_weight - misfit)[1]
         blocked = blocked & active_mask(state)
-        state, found = self.weigh(state, misfit, fit, beams.valid.sum())
-        found = found._replace(blocked=blocked.sum(dtype=jnp.int32))
-        info = info_of_beams(scan, self.every, evidence, ~found.underflow)
-        return state, with_extra(info, "particles", found)
+        state, report = self.weigh(state, misfit, fit, beams.valid.sum())
+        report = report._replace(blocked=blocked.sum(dtype=jnp.int32))
+        info = info_of_beams(scan, self.stride, evidence, ~report.underflow)
+        return state, with_extra(info, "particles", report)
 
     def estimate(self, state: PoseParticles) -> Estimate:
-        none = jnp.zeros((0, 2), state.pose.dtype)
-        return self.pose_estimate(state, none, jnp.zeros(0, jnp.int32))
+        no_points = jnp.zeros((0, 2), state.pose.dtype)
+        return self.pose_estimate(state, no_points, jnp.zeros(0, jnp.int32))
 
 
 def _is_blocked(grid: Grid, pose: Float[Array, "P 3"]) -> Bool[Array, "P"]:
-    """Which poses are off the map or in an occupied cell."""
+    """The mask of the poses off the map or in an occupied cell."""
     height, width = grid.log_odds.shape
     at = jnp.floor(to_cells(jnp.asarray(grid.origin), grid.resolution, pose[:, :2]))
     inside = (at >= 0).all(axis=1) & (at[:, 0] < width) & (at[:, 1] < height)
@@ -254,22 +247,22 @@ def _is_blocked(grid: Grid, pose: Float[Array, "P 3"]) -> Bool[Array, "P"]:
 
 
 def info_of_beams(
-    scan: Scan, every: int, log_likelihood: Float[Array, ""], used: Bool[Array, ""]
+    scan: Scan, stride: int, log_likelihood: Float[Array, ""], used: Bool[Array, ""]
 ) -> Info:
-    """The `Info` of a scan: what became of each beam; a beam has no innovation.
+    """The `Info` of a scan with the status of each beam; a beam has no innovation.
 
     Each n-th beam is FUSED where the scan was used; all others are UNMATCHED.
     """
     m = scan.valid.shape[0]
-    taken = (jnp.arange(m) % every == 0) & used
-    kind = scan.z.dtype
+    fused = (jnp.arange(m) % stride == 0) & used
+    dtype = scan.z.dtype
     return info_of(
-        status_of(scan.valid, matched=taken, inside=scan.z[:, 0] > 0),
-        taken,
+        status_of(scan.valid, matched=fused, inside=scan.z[:, 0] > 0),
+        fused,
         size=0,
         slot=jnp.full(m, -1, jnp.int32),
-        nis=jnp.zeros(m, kind),
-        innovation=jnp.zeros((m, 0), kind),
-        innovation_cov=jnp.zeros((m, 0, 0), kind),
-        log_likelihood=log_likelihood.astype(kind),
+        nis=jnp.zeros(m, dtype),
+        innovation=jnp.zeros((m, 0), dtype),
+        innovation_cov=jnp.zeros((m, 0, 0), dtype),
+        log_likelihood=log_likelihood.astype(dtype),
     )

@@ -19,13 +19,13 @@ class Clusters(NamedTuple):
     """K groups of particles, the heaviest first, each a hypothesis on the pose."""
 
     weight: Float[np.ndarray, "K"]
-    """Σ w of each; the sum is 1 less what `least` left out"""
+    """Σ w of a group; the sum is 1 less the groups that `least` left out"""
     mean: Float[np.ndarray, "K 3"]
     cov: Float[np.ndarray, "K 3 3"]
     size: Int[np.ndarray, "K"]
     """particles of positive weight"""
     label: Int[np.ndarray, "P"]
-    """the group of each particle, -1 of none"""
+    """group of each particle, -1 without"""
 
 
 def clusters(
@@ -63,8 +63,8 @@ def clusters(
     turns = max(int(2 * math.pi / bins[2] + 1e-9), 1)
     heading = np.floor((poses[used, 2] / (2 * math.pi) % 1.0) * turns) % turns
     at = np.column_stack([np.floor(poses[used, :2] / bins[:2]), heading]).astype(np.int64)
-    cells, which = np.unique(at, axis=0, return_inverse=True)
-    group = _connect(cells, turns)[which.reshape(-1)]
+    cells, cell = np.unique(at, axis=0, return_inverse=True)
+    group = _connect(cells, turns)[cell.reshape(-1)]
     total = np.bincount(group, weights=w)
     order = np.argsort(-total, kind="stable")
     order = order[total[order] >= least]
@@ -73,24 +73,26 @@ def clusters(
     label = np.full(len(poses), -1)
     label[used] = rank[group]
     safe = np.where(np.isfinite(poses), poses, 0.0)
-    found = [_moments(safe, weights, label == k) for k in range(len(order))]
-    mean = np.array([np.asarray(m) for m, _ in found]).reshape(-1, 3)
-    cov = np.array([np.asarray(c) for _, c in found]).reshape(-1, 3, 3)
+    moments = [_moments(safe, weights, label == k) for k in range(len(order))]
+    mean = np.array([np.asarray(m) for m, _ in moments]).reshape(-1, 3)
+    cov = np.array([np.asarray(c) for _, c in moments]).reshape(-1, 3, 3)
     return Clusters(total[order], mean, cov, np.bincount(group)[order], label)
 
 
 @jax.jit
 def _moments(pose: Array, log_weight: Array, mine: Array) -> tuple[Array, Array]:
-    """Mean and covariance of the particles that are marked."""
-    log_weight_in = jnp.where(mine, log_weight, -jnp.inf)
-    top = log_weight_in.max()
-    log_weight_in = log_weight_in - (top + jnp.log(jnp.exp(log_weight_in - top).sum()))
-    return weighted_pose_moments(pose, log_weight_in, jnp.argmax(log_weight_in))
+    """The mean and covariance of the particles of a mask."""
+    log_w = jnp.where(mine, log_weight, -jnp.inf)
+    top = log_w.max()
+    log_w = log_w - (top + jnp.log(jnp.exp(log_w - top).sum()))
+    return weighted_pose_moments(pose, log_w, jnp.argmax(log_w))
 
 
 def _connect(cells: Int[np.ndarray, "C 3"], turns: int) -> Int[np.ndarray, "C"]:
-    """The group of each of C different bins, two being neighbours if no index differs by more
-    than 1; the last is on a circle."""
+    """The group of each of C different bins.
+
+    Two bins are neighbours if no index differs by more than 1; the third index is on a circle.
+    """
     index = {tuple(cell): k for k, cell in enumerate(cells.tolist())}
     pairs = [
         (k, near)

@@ -16,7 +16,8 @@ from jaxslam.laser.grids._traversal import MOST, OFF, STOP, march
 from jaxslam.math._xla import hot_jit
 
 _GRAZING = 0.05
-"""Least |cos| of the angle between a ray and the normal of a wall in a derivative."""
+"""Least |cos| of the angle between a ray and the normal of a wall in a derivative (chosen: 87°), so
+that a beam along a wall has no huge derivative."""
 
 METHODS = ("surface", "cells")
 
@@ -25,10 +26,10 @@ class RayMap(NamedTuple):
     """A grid prepared for many rays by `ray_map`; `cast` takes it in place of the grid."""
 
     solid: Float[Array, "H W"]
-    """the share of a cell that is solid less ½: p - ½, and -½ where unknown"""
+    """solid share of a cell less ½: p - ½, and -½ where unknown"""
     ahead: UInt8[Array, "H2 W2"]
-    """of each square that rays traverse: how far a ray may go from anywhere in it [quarters of a
-    square], `STOP` where it may end, `OFF` in a border off the map"""
+    """how far a ray may go from anywhere in a square [quarters of a square], `STOP` where it may
+    end, `OFF` in a border off the map; squares are cells, or lie between four centres of cells"""
     origin: Float[Array, "3"]
     resolution: Float[Array, ""]
 
@@ -47,7 +48,8 @@ def ray_map(grid: Grid, *, method: str | None = None, skip: bool = True) -> RayM
         ValueError: a grid that is none, or without a free cell; an unknown method.
     """
     check_grid("ray_map", grid)
-    method = _default_method(grid) if method is None else method
+    if method is None:
+        method = "surface" if _has_grades(grid) else "cells"
     check_method("ray_map", method)
     if is_concrete(grid.log_odds) and not np.any(np.asarray(grid.log_odds) < 0):
         raise ValueError("ray_map: the map has no free cell (log-odds below 0)")
@@ -55,22 +57,21 @@ def ray_map(grid: Grid, *, method: str | None = None, skip: bool = True) -> RayM
     return rays
 
 
-def _default_method(grid: Grid) -> str:
-    """The method of `ray_map` for a grid: "surface" where p may be the share of a cell that is
-    solid.
+def _has_grades(grid: Grid) -> bool:
+    """Whether p may be the share of a cell that is solid.
 
-    It is not with three log-odds or fewer, which have no grades, nor where cells are unknown, which
-    a map made from scans has: its p is the certainty of a cell. There "surface" goes too far
-    (`cast`).
+    It is not with three log-odds or fewer, nor where cells are unknown, as in a map made from
+    scans, whose p is the certainty of a cell. There "surface" goes too far (`cast`). Within a
+    trace the values are not known.
     """
     if not is_concrete(grid.log_odds):
-        return "cells"
+        return False
     log_odds = np.asarray(grid.log_odds)
     if np.any(log_odds == 0):
-        return "cells"
+        return False
     # More than three values: at least two between the ends. Without sorting millions of cells.
     between = log_odds[(log_odds > log_odds.min()) & (log_odds < log_odds.max())]
-    return "surface" if between.size and between.min() < between.max() else "cells"
+    return bool(between.size and between.min() < between.max())
 
 
 def check_method(name: str, method: str) -> None:
@@ -81,42 +82,30 @@ def check_method(name: str, method: str) -> None:
 
 @partial(jax.jit, static_argnames=("method", "skip"), inline=True)
 def _ray_map(grid: Grid, method: str, skip: bool) -> RayMap:
-    solid = jnp.where(grid.known, grid.probability, 0.0) - 0.5
-    stops = _SQUARES[method](solid)
+    solid = jnp.where(grid.observed, grid.probability, 0.0) - 0.5
+    stops = solid > 0 if method == "cells" else _squares_with_surface(solid)
     ahead = jnp.zeros(stops.shape, jnp.uint8)
     if skip:
-        # Beyond the border it is as if all were occupied: no step leads off the map. The distance
-        # of two squares is that of the centre of one from those around the other.
-        around = _dilate(jnp.pad(stops, 1, constant_values=True))
+        # Beyond the border all counts as occupied: no step leads off the map. The distance between
+        # two squares is at least that from the centre of the first to the squares around the
+        # second, hence the dilation.
+        bordered = jnp.pad(jnp.pad(stops, 1, constant_values=True), 1)
+        rows = bordered[2:] | bordered[1:-1] | bordered[:-2]
+        around = rows[:, 2:] | rows[:, 1:-1] | rows[:, :-2]
         away = jnp.sqrt(squared_distances(around))[1:-1, 1:-1]
         ahead = jnp.minimum(jnp.floor(4.0 * away), MOST).astype(jnp.uint8)
     ahead = jnp.pad(jnp.where(stops, jnp.uint8(STOP), ahead), 1, constant_values=OFF)
     return RayMap(solid, ahead, jnp.asarray(grid.origin), jnp.asarray(grid.resolution, solid.dtype))
 
 
-def _dilate(stops: Bool[Array, "H W"]) -> Array:
-    """Whether a square or one of the eight around it stops."""
-    wide = jnp.pad(stops, 1)
-    rows = wide[2:] | wide[1:-1] | wide[:-2]
-    return rows[:, 2:] | rows[:, 1:-1] | rows[:, :-2]
-
-
-def _cells(solid: Float[Array, "H W"]) -> Array:
-    """Whether a cell is occupied."""
-    return solid > 0
-
-
-def _squares_of_centres(solid: Float[Array, "H W"]) -> Array:
-    """Whether a surface may be in a square between four centres of cells; (H+1, W+1).
+def _squares_with_surface(solid: Float[Array, "H W"]) -> Array:
+    """The mask (H+1, W+1) of squares between four centres of cells in which a surface may be.
 
     The cells at the border are repeated, so that the squares cover the map.
     """
     edged = jnp.pad(solid, 1, mode="edge")
     across = jnp.maximum(edged[:, 1:], edged[:, :-1])
     return jnp.maximum(across[1:], across[:-1]) > 0
-
-
-_SQUARES = {"surface": _squares_of_centres, "cells": _cells}
 
 
 def cast(
@@ -214,10 +203,8 @@ def _cast(
 ) -> Float[Array, "*poses B"]:
     shape = (*pose.shape[:-1], len(angles))
     dtype = jnp.result_type(pose, angles, grid.solid, 0.0)
-    cast_to = partial(jax.tree.map, lambda x: x.astype(dtype))
-    pose, angles = cast_to((pose, angles))
-    grid = cast_to(grid)._replace(ahead=grid.ahead)
-    pose = pose.reshape(-1, 3)
+    pose, angles = pose.reshape(-1, 3).astype(dtype), angles.astype(dtype)
+    grid = jax.tree.map(lambda part: part.astype(dtype), grid)._replace(ahead=grid.ahead)
     heading = (pose[:, 2] - grid.origin[2])[:, None] + angles[None, :]
     direction = jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=-1)
     start = to_cells(grid.origin, grid.resolution, pose[:, :2])
@@ -233,11 +220,11 @@ def _lengths(
 ) -> tuple[Float[Array, "R"], Bool[Array, "R"]]:
     """The lengths [cells] of rays from start (x, y) [cells], and whether something is hit."""
     if grid.ahead.shape[0] == grid.solid.shape[0] + 2:  # its squares are cells
-        found: tuple[Array, Array] = march(grid.ahead, None, start, direction, limit)
+        length_and_hit: tuple[Array, Array] = march(grid.ahead, None, start, direction, limit)
     else:
         corners = jnp.pad(grid.solid, 1, mode="edge")
-        found = march(grid.ahead, corners, start + 0.5, direction, limit)
-    return found
+        length_and_hit = march(grid.ahead, corners, start + 0.5, direction, limit)
+    return length_and_hit
 
 
 @_lengths.defjvp
@@ -261,7 +248,9 @@ def _derivative(primals: PyTree, tangents: PyTree) -> PyTree:
 
 
 _AROUND = np.array([(x, y) for x in (-1.0, 0.0, 1.0) for y in (-1.0, 0.0, 1.0)])
+"""Offsets (x, y) of nine cells."""
 _WEIGHTS = _AROUND * np.array([2.0 if 0 in place else 1.0 for place in _AROUND])[:, None] / 8
+"""Sobel's weights of the slopes in x and y: (-1, 0, 1)/2 along an axis, (1, 2, 1)/4 across."""
 
 
 def _slope(solid: Float[Array, "H W"], at: Float[Array, "R 2"]) -> Float[Array, "R 2"]:

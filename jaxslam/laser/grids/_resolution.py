@@ -13,10 +13,9 @@ from jaxslam.math import se2
 def resample(grid: Grid, resolution: float) -> Grid:
     """The map in cells of another size [m], with the same origin.
 
-    A new cell has the mean log-odds of the covered cells, weighted by area; beyond the map is
-    unknown,
-    0. So a cell over unknown cells alone is unknown, and the integral of the log-odds over the map
-    is unchanged. A wall thinner than a new cell fades: the mean is not the maximum.
+    A new cell has the mean log-odds of the covered cells, weighted by area, with 0 (unknown) beyond
+    the map. So a cell over unknown cells alone is unknown, and the integral of the log-odds over
+    the map is unchanged. A wall thinner than a new cell fades: the mean is not the maximum.
 
     Raises ValueError on a grid that is none, a resolution that is not above 0, or one within a
     trace, since it sets the shape.
@@ -35,7 +34,7 @@ def resample(grid: Grid, resolution: float) -> Grid:
 
 
 def _overlaps(size: int, factor: float) -> Float[np.ndarray, "new old"]:
-    """The share of each new cell, factor old ones long, that each of the old ones covers."""
+    """The share of each new cell, `factor` old cells long, that each old cell covers."""
     count = int(np.ceil(size / factor - 1e-9))
     begins = factor * np.arange(count)[:, None]
     old = np.arange(size)[None, :]
@@ -87,16 +86,18 @@ def correlation(a: Grid, b: Grid) -> Float[Array, ""]:
     bordered = Grid(jnp.pad(b.log_odds, 1), b.origin, b.resolution)  # unknown off the map
     corner = jnp.asarray([-1.0, -1.0, 0.0]) * b.resolution
     frame = se2.compose(jnp.asarray(b.origin), corner), jnp.asarray(b.resolution)
-    weight = a.known * interpolate(Field(jnp.asarray(bordered.known, points.dtype), *frame), points)
-    other = interpolate(Field(bordered.probability, *frame), points)
+    weight = a.observed * interpolate(
+        Field(jnp.asarray(bordered.observed, points.dtype), *frame), points
+    )
+    probability_b = interpolate(Field(bordered.probability, *frame), points)
     total = weight.sum()
     total = jnp.where(total > 0, total, 1.0)
 
     def centred(values: Array) -> Array:
         return values - (weight * values).sum() / total
 
-    one, two = centred(a.probability), centred(other)
-    product = (weight * one * one).sum() * (weight * two * two).sum()
+    off_a, off_b = centred(a.probability), centred(probability_b)
+    product = (weight * off_a * off_a).sum() * (weight * off_b * off_b).sum()
     varies = product > 1e-12 * total**2  # probabilities that vary by a thousandth; rounding: 1e-28
-    found = (weight * one * two).sum() / jnp.sqrt(jnp.where(varies, product, 1.0))
-    return jnp.where(varies, jnp.clip(found, -1.0, 1.0), 0.0)
+    r = (weight * off_a * off_b).sum() / jnp.sqrt(jnp.where(varies, product, 1.0))
+    return jnp.where(varies, jnp.clip(r, -1.0, 1.0), 0.0)

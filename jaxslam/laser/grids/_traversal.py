@@ -1,4 +1,4 @@
-"""Rays through a table of squares: every square that a ray crosses, or long steps where it may."""
+"""Rays through a table of squares: square by square, or in long steps through free space."""
 
 from typing import NamedTuple
 
@@ -9,18 +9,21 @@ from jaxtyping import Array, Bool, Float, PyTree, UInt8
 from jaxslam.math._xla import one_kernel
 
 STOP, OFF = 255, 254
-"""Squares in which a ray may end, and squares off the map."""
+"""Squares in which a ray may end, and squares off the map: the two bytes above `MOST`."""
 
 MOST = 253
-"""The longest step, in quarters of a square: steps are bytes, so that more of a map fits into a
+"""Longest step [quarters of a square]: steps are bytes, so that more of a map fits into a
 processor's cache."""
 
 _ROUNDING = 1e-3
-"""[squares] by which a ray may end off the map."""
+"""Tolerance [squares] for a ray that ends off the map, of float32 coordinates in large maps."""
+
+_BEFORE_START = 1e-4
+"""[squares] that rounding may put a root before the start of its parabola."""
 
 _CHUNK = 32
-"""Rays that a CPU advances together. A loop runs until the longest ray of a chunk ends, so the
-fewer the better; 32 fill its vectors."""
+"""Rays that a CPU advances together. A loop runs until the longest ray of a chunk ends, so fewer
+rays are better; 32 fill its vectors."""
 
 
 @jax.custom_batching.custom_vmap
@@ -33,12 +36,18 @@ def march(
 ) -> tuple[Float[Array, "R"], Bool[Array, "R"]]:
     """The length [squares] of rays up to an obstacle, and whether they meet one within the limit.
 
-    ahead: of each square, how far a ray may go from anywhere in it [quarters of a square], or
-    `STOP` or `OFF`; it has a border of `OFF`. start (x, y) counts from the corner of the first
-    square within. corners None: a ray ends where it enters a square that is `STOP`. Else it ends in
-    such a square where the bilinear interpolation of its four corners is 0, if it is, and the outer
-    half of the outermost squares is off the map. Rays of a
-    batch under `vmap` are as many rays of one call.
+    Without corners a ray ends where it enters a square that is `STOP`. With corners it ends in such
+    a square where the bilinear interpolation of the four corners is 0, if it is 0 anywhere, and the
+    outer half of the outermost squares is off the map. Rays of a batch under `vmap` become rays of
+    a single call.
+
+    Args:
+        ahead: of each square, how far a ray may go from anywhere in it [quarters of a square], or
+            `STOP` or `OFF`; the border is `OFF`.
+        corners: values at the corners of the squares.
+        start: (x, y) [squares] from the corner of the first square within the border.
+        direction: unit vectors.
+        limit: largest length [squares].
     """
     return _march(ahead, corners, start, direction, limit)
 
@@ -46,18 +55,18 @@ def march(
 @march.def_vmap
 def _over_batch(size: int, batched: PyTree, *arguments: PyTree) -> tuple[PyTree, PyTree]:
     ahead, corners, *rays, limit = arguments
-    on_rays = batched[2:4]
     if any(jax.tree.leaves((batched[:2], batched[4]))):  # maps vary
-        axes = jax.tree.map(lambda on: 0 if on else None, tuple(batched))
+        axes = jax.tree.map(lambda is_batched: 0 if is_batched else None, tuple(batched))
         return jax.vmap(_march, in_axes=axes)(*arguments), (True, True)
-    each = [
-        x if on else jnp.broadcast_to(x, (size, *x.shape))
-        for x, on in zip(rays, on_rays, strict=True)
+    rays = [
+        part if is_batched else jnp.broadcast_to(part, (size, *part.shape))
+        for part, is_batched in zip(rays, batched[2:4], strict=True)
     ]
-    # The rays of one beam from all poses lie together: of poses close together they are as long.
-    flat = [x.swapaxes(0, 1).reshape(-1, 2) for x in each]
-    found = march(ahead, corners, *flat, limit)
-    return jax.tree.map(lambda x: x.reshape(-1, size).T, found), (True, True)
+    # (pose, beam) to (beam, pose): rays of a beam from close poses are about as long, and a loop
+    # runs until the longest ray of a chunk ends.
+    flat = [part.swapaxes(0, 1).reshape(-1, 2) for part in rays]
+    lengths_and_hits = march(ahead, corners, *flat, limit)
+    return jax.tree.map(lambda part: part.reshape(-1, size).T, lengths_and_hits), (True, True)
 
 
 def _march(
@@ -65,47 +74,56 @@ def _march(
 ) -> tuple[Array, Array]:
     count = start.shape[0]
     if count <= _CHUNK or jax.default_backend() != "cpu":
-        return one_kernel(_together, ahead, corners, start, direction, limit)
-    parts = -(-count // _CHUNK)
-    padded = parts * _CHUNK - count
+        return one_kernel(_march_together, ahead, corners, start, direction, limit)
+    chunks = -(-count // _CHUNK)
+    padding = chunks * _CHUNK - count
 
-    def split(x: Array) -> Array:
-        return jnp.pad(x, [(0, padded), (0, 0)], mode="edge").reshape(parts, _CHUNK, 2)
+    def split(part: Array) -> Array:
+        return jnp.pad(part, [(0, padding), (0, 0)], mode="edge").reshape(chunks, _CHUNK, 2)
 
     length, hit = jax.lax.map(
-        lambda rays: one_kernel(_together, ahead, corners, rays[0], rays[1], limit),
+        lambda rays: one_kernel(_march_together, ahead, corners, rays[0], rays[1], limit),
         (split(start), split(direction)),
     )
     return length.reshape(-1)[:count], hit.reshape(-1)[:count]
 
 
 class _Rays(NamedTuple):
-    """What stays the same along rays."""
+    """The constants of rays; a suffix names the axis."""
 
     x: Array
     y: Array
-    """the start, in squares with the border"""
+    """start [squares], from the corner of the border"""
     dx: Array
     dy: Array
+    """direction"""
     over_x: Array
     over_y: Array
-    """1/dx and 1/dy, 0 where the ray is along the other axis"""
+    """1/dx and 1/dy, 0 for a ray along the other axis"""
     far_x: Array
     far_y: Array
-    """infinite there: lines of one axis are never crossed, 0 elsewhere"""
+    """infinite for a ray along the other axis, which crosses no line of this one; else 0"""
 
 
 class _Square(NamedTuple):
-    """Where rays are: the squares (x, y), and the lengths up to them."""
+    """The squares (x, y) in which rays are, and the lengths of the rays so far."""
 
     x: Array
     y: Array
     length: Array
 
 
-def _together(
+def _march_together(
     ahead: Array, corners: Array | None, start: Array, direction: Array, limit: Array
 ) -> tuple[Array, Array]:
+    """`march` of rays that advance in a common loop.
+
+    | square of a ray | without corners | with corners |
+    |---|---|---|
+    | free | moves on | moves on |
+    | `STOP` | hit | hit where the parabola is 0, else moves on |
+    | `OFF`, or left beyond the limit | ends without a hit | ends without a hit |
+    """
     height, width = ahead.shape
     x, y = start[:, 0] + 1, start[:, 1] + 1
     # Squares of corners reach half a square beyond the map: a hit there is off the map.
@@ -127,18 +145,19 @@ def _together(
         return state[1].any()
 
     def free(at: _Square, moving: Array) -> tuple[_Square, Array, Array]:
-        """Move rays towards the next squares that stop; which still move, which have come to one.
+        """Rays moved towards the next `STOP`, which of them still move, which have reached one.
 
-        On a CPU all come to one. A GPU takes one step, since its rays wait for the longest of all.
+        On a CPU all rays arrive. A GPU takes a single step, since there all rays would wait for
+        the longest.
         """
 
         def step(state: tuple[_Square, Array, Array]) -> tuple[_Square, Array, Array]:
             at, moving, stopped = state
-            here = _taken(ahead, at.x, at.y)
+            square = _entries(ahead, at.x, at.y)
             crosses = _crossings(rays, at)
-            goes = moving & (here < OFF) & (jnp.minimum(*crosses) < limit)
-            after = _next(rays, at, crosses, here.astype(x.dtype) * 0.25)
-            return _where(goes, after, at), goes, stopped | (moving & (here == STOP))
+            goes = moving & (square < OFF) & (jnp.minimum(*crosses) < limit)
+            after = _next(rays, at, crosses, square.astype(x.dtype) * 0.25)
+            return _where(goes, after, at), goes, stopped | (moving & (square == STOP))
 
         begin = at, moving, jnp.zeros_like(moving)
         if corners is not None and jax.default_backend() != "cpu":
@@ -146,37 +165,38 @@ def _together(
         return jax.lax.while_loop(any_moves, step, begin)
 
     if corners is None:
-        at, _, found = free(first, inside)
+        at, _, hit = free(first, inside)
         length = at.length
     else:
 
-        def through(state: tuple[_Square, Array, Array]) -> tuple[_Square, Array, Array]:
-            """To the next squares that stop, and out of those without the surface."""
-            at, moving, found = state
+        def visit(state: tuple[_Square, Array, Array]) -> tuple[_Square, Array, Array]:
+            """Rays moved to the next `STOP`, and out of it if the surface is not in it."""
+            at, moving, hit = state
             at, moving, stopped = free(at, moving)
             crosses = _crossings(rays, at)
             leaves = jnp.minimum(*crosses)
             meets = _meets(_parabola(corners, rays, at), leaves - at.length)
             goes = stopped & ~meets & (leaves < limit)
             after = _next(rays, at, crosses, jnp.zeros_like(leaves))
-            return _where(goes, after, at), moving | goes, found | (stopped & meets)
+            return _where(goes, after, at), moving | goes, hit | (stopped & meets)
 
         begin = first, inside, jnp.zeros_like(inside)
-        at, _, found = jax.lax.while_loop(any_moves, through, begin)
+        at, _, hit = jax.lax.while_loop(any_moves, visit, begin)
         length = at.length + _root(_parabola(corners, rays, at))
-        found = found & on_map(rays.x + length * rays.dx, rays.y + length * rays.dy)
-    found = found & (length < limit)
-    return jnp.where(found, length, limit), found
+        hit = hit & on_map(rays.x + length * rays.dx, rays.y + length * rays.dy)
+    hit = hit & (length < limit)
+    return jnp.where(hit, length, limit), hit
 
 
-def _taken(table: Array, x: Array, y: Array) -> Array:
-    """The entries (y, x) of a table, which are in it."""
-    place = y.astype(jnp.int32) * table.shape[1] + x.astype(jnp.int32)
-    flat = table.reshape(-1)
-    return flat.at[place].get(mode="promise_in_bounds", wrap_negative_indices=False)
+def _entries(table: Array, x: Array, y: Array) -> Array:
+    """The entries (y, x) of a table; the indices must be in it."""
+    # A flat index without bounds checks: a gather of two indices takes longer.
+    flat = y.astype(jnp.int32) * table.shape[1] + x.astype(jnp.int32)
+    return table.reshape(-1).at[flat].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
 def _where(goes: Array, after: _Square, at: _Square) -> _Square:
+    """The square after a step for rays that go, else the square before."""
     return _Square(*(jnp.where(goes, a, b) for a, b in zip(after, at, strict=True)))
 
 
@@ -189,7 +209,7 @@ def _crossings(rays: _Rays, at: _Square) -> tuple[Array, Array]:
 
 
 def _next(rays: _Rays, at: _Square, crosses: tuple[Array, Array], ahead: Array) -> _Square:
-    """The end of a step: that of the free distance if beyond the square, else out of the square."""
+    """The square after a step: over the free distance, or the neighbour if that is farther."""
     exit_x, exit_y = crosses
     leaves, jump = jnp.minimum(exit_x, exit_y), at.length + ahead
     far, first = (ahead > 0) & (jump > leaves), exit_x < exit_y
@@ -210,8 +230,8 @@ def _parabola(corners: Array, rays: _Rays, at: _Square) -> tuple[Array, Array, A
     + s² e dx dy.
     """
     x, y = at.x - 1, at.y - 1
-    f00, f10 = _taken(corners, x, y), _taken(corners, x + 1, y)
-    f01, f11 = _taken(corners, x, y + 1), _taken(corners, x + 1, y + 1)
+    f00, f10 = _entries(corners, x, y), _entries(corners, x + 1, y)
+    f01, f11 = _entries(corners, x, y + 1), _entries(corners, x + 1, y + 1)
     u = rays.x + at.length * rays.dx - at.x
     v = rays.y + at.length * rays.dy - at.y
     b, c, e = f10 - f00, f01 - f00, f00 - f10 - f01 + f11
@@ -232,8 +252,8 @@ def _root(parabola: tuple[Array, Array, Array]) -> Array:
     value, slope, curve = parabola
     root = jnp.sqrt(jnp.maximum(slope**2 - 4.0 * curve * value, 0.0))
     half = -0.5 * (slope + jnp.where(slope >= 0, root, -root))
-    one = jnp.where(curve != 0, half / jnp.where(curve != 0, curve, 1.0), jnp.inf)
-    two = jnp.where(half != 0, value / jnp.where(half != 0, half, 1.0), jnp.inf)
-    # Rounding may put a root a little before the start.
-    one, two = (jnp.where(s >= -1e-4, s, jnp.inf) for s in (one, two))
-    return jnp.where(value > 0, 0.0, jnp.maximum(jnp.minimum(one, two), 0.0))
+    # The roots half/curve and value/half: without cancellation where slope² is much larger.
+    s1 = jnp.where(curve != 0, half / jnp.where(curve != 0, curve, 1.0), jnp.inf)
+    s2 = jnp.where(half != 0, value / jnp.where(half != 0, half, 1.0), jnp.inf)
+    s1, s2 = (jnp.where(s >= -_BEFORE_START, s, jnp.inf) for s in (s1, s2))
+    return jnp.where(value > 0, 0.0, jnp.maximum(jnp.minimum(s1, s2), 0.0))

@@ -21,7 +21,11 @@ def table_of(
     z: Float[np.ndarray, "E 3"],
     cov: Float[np.ndarray, "E 3 3"],
 ) -> Table:
-    """Relative poses between rows of the graph; cov is of the end of z."""
+    """The table of relative poses z of rows `second` in the frames of rows `first` of the graph.
+
+    Args:
+        cov: of the end of z.
+    """
     information = np.linalg.inv(cov)
     return Table(
         np.stack([first, second], axis=1),
@@ -37,7 +41,12 @@ def graph_of(
     odometry: Table,
     loops: Table | None = None,
 ) -> Graph:
-    """The graph of keyframes; the first is fixed."""
+    """The graph of keyframes, whose first pose is fixed.
+
+    Args:
+        path: poses where the optimizer begins.
+        keyframe: scan of each pose.
+    """
     tables = {"relative_pose": odometry}
     if loops is not None and len(loops.z):
         tables[LOOPS] = loops
@@ -60,14 +69,17 @@ def relative_covs(
     From the joint marginals of both, by the Jacobians of x_i⁻¹ ∘ x_j.
     """
     # Each pair fills the factor, so that time and memory grow with the pairs of a part.
-    parts = [pairs[begin : begin + _PART] for begin in range(0, len(pairs), _PART)]
-    found = [np.asarray(graphs.marginals(solution, pairs=of, room=ROOM).pairs) for of in parts]
-    joint = np.concatenate(found).astype(np.float64)
+    parts = [
+        np.asarray(graphs.marginals(solution, pairs=pairs[begin : begin + _PART], room=ROOM).pairs)
+        for begin in range(0, len(pairs), _PART)
+    ]
+    blocks = np.concatenate(parts).astype(np.float64)
     at = np.asarray(solution.graph.poses, np.float64)
     i, j = at[pairs[:, 0]], at[pairs[:, 1]]
     # x_i + δ_i is x_i ∘ R(θ_i)ᵀ δ_i to first order, which moves the end by -Ad(z)⁻¹ of it.
     by_i = -poses.adjoint(poses.between(j, i)) @ end_covariances.turns(-i[:, 2])
     by_j = end_covariances.turns(-j[:, 2])
-    both = np.concatenate([by_i, by_j], axis=2)
-    whole = np.swapaxes(joint, 2, 3).reshape(-1, 6, 6)
-    return end_covariances.propagated(both, whole)
+    jacobian = np.concatenate([by_i, by_j], axis=2)
+    # Blocks (Q, 2, 2, 3, 3) of the two poses to (Q, 6, 6): pose and coordinate of the row first.
+    joint = np.swapaxes(blocks, 2, 3).reshape(-1, 6, 6)
+    return end_covariances.propagate(jacobian, joint)

@@ -19,52 +19,53 @@ _MAY_BE_ZERO = "fewest", "loop_gap", "submap"
 class Settings:
     """Numbers of laser SLAM; lengths in metres. ValueError on counts below 1, lengths not above 0.
 
-    Counts that may be 0 are `fewest`, `loop_gap` and `submap`.
+    Counts that may be 0 are `fewest`, `loop_gap` and `submap`. The defaults were chosen on the logs
+    intel, edmonton, freiburg-101 and CSAIL.
     """
 
     max_range: float = 25.0
-    """ranges from here on are not used"""
+    """ranges from this one on are not used"""
     beams: int = 192
-    """of a scan at most; of one with more, each second, third … is used"""
+    """largest number of beams of a scan; of a scan with more each second, third … is used"""
     fewest: int = 20
     """a scan with fewer points is left out"""
     sigma: float = 0.02
     """least standard deviation of a point's distance from a wall"""
     jump: float = 3.0
-    """a longer step of raw odometry is assumed to be an error; so is one that is impossible by its
-    speed or turn rate, whatever its length"""
+    """a longer step of raw odometry is assumed to be an error; so is a step that is impossible by
+    its speed or turn rate, whatever its length"""
     reference: int = 8
     """keyframes that a scan is matched with; 1 is scan to scan"""
     key_distance: float = 0.4
-    """a scan farther than this from the last keyframe is one"""
+    """distance from the last keyframe above which a scan is a keyframe"""
     loop_gap: int = 20
     """keyframes between the two ends of a loop, at least"""
     submap: int = 5
     """keyframes before and after its middle in a submap that loops are closed with"""
     submap_every: int = 3
-    """keyframes from the middle of a submap to that of the next"""
+    """keyframes from the middle of a submap to the middle of the next"""
     rounds: int = 2
-    """of candidates, matches and optimization"""
+    """number of rounds of candidates, matches and optimization"""
     resolution: float = 0.05
     """side of a cell of the map; larger where the map would have more than 4,000 cells a side"""
 
     def __post_init__(self) -> None:
         caller = "laser_slam.Settings"
         for field in fields(self):
-            given = getattr(self, field.name)
+            value = getattr(self, field.name)
             if isinstance(field.default, float):
-                check_positive(caller, **{field.name: given})
-            elif field.name not in _MAY_BE_ZERO or given != 0:
-                check_count(f"{caller}: {field.name}", given)
+                check_positive(caller, **{field.name: value})
+            elif field.name not in _MAY_BE_ZERO or value != 0:
+                check_count(f"{caller}: {field.name}", value)
 
     @property
     def scans_of_reference(self) -> int:
-        """Scans of a reference, the largest of odometry and loops, which share a program."""
+        """Number of scans of a reference: odometry and loops share a program."""
         return max(self.reference, 2 * self.submap + 1)
 
 
 class LogOfScans(Protocol):
-    """What is read of a log: `datasets.LaserLog` and `ScanLog` have it."""
+    """The parts of a log that laser SLAM reads: `datasets.LaserLog` and `ScanLog` have them."""
 
     @property
     def time(self) -> Float[np.ndarray, "K"]:
@@ -109,7 +110,7 @@ class ScanLog(NamedTuple):
 
 
 class LoopOutcome(IntEnum):
-    """What became of a candidate of a loop."""
+    """The outcome of a candidate of a loop."""
 
     KEPT = 0
     """an edge of the graph"""
@@ -132,11 +133,11 @@ class Loops(NamedTuple):
     z: Float[np.ndarray, "M 3"]
     """pose of the second in the frame of the first"""
     cov: Float[np.ndarray, "M 3 3"]
-    """of the end of z, in the frame of the second"""
+    """covariance of the end of z, in the frame of the second"""
     score: Float[np.ndarray, "M"]
     """share of the points on walls of the other place"""
     appearance: Int[np.ndarray, "M"]
-    """1 where the candidate was found by its looks, 0 where by its place"""
+    """1 for a candidate by appearance, 0 for a candidate by place"""
     outcome: Int[np.ndarray, "M"]
     """a `LoopOutcome`"""
 
@@ -146,13 +147,13 @@ class Solved(NamedTuple):
 
     time: Float[np.ndarray, "K"]
     poses: Float[np.ndarray, "K 3"]
-    """of every scan, after closing"""
+    """pose of every scan, after closing"""
     odometry: Float[np.ndarray, "K 3"]
-    """of every scan, by laser odometry alone"""
+    """pose of every scan by laser odometry alone"""
     raw: Float[np.ndarray, "K 3"]
-    """of every scan, by raw odometry"""
+    """pose of every scan by raw odometry"""
     cov: Float[np.ndarray, "K 3 3"]
-    """of (x, y, θ) of `poses`, relative to the first"""
+    """covariance of (x, y, θ) of `poses`, relative to the first"""
     doubted: Bool[np.ndarray, "K"]
     """scans whose match is in doubt (`laser_odometry`)"""
     keyframe: Int[np.ndarray, "N"]
@@ -160,22 +161,25 @@ class Solved(NamedTuple):
     base: Int[np.ndarray, "K"]
     """row in the graph of each scan's keyframe; for a keyframe, its own row"""
     z: Float[np.ndarray, "K 3"]
-    """pose of each scan in the frame of that keyframe; zero for keyframes"""
+    """pose of each scan in the frame of its keyframe; zero for keyframes"""
     z_cov: Float[np.ndarray, "K 3 3"]
-    """of the end of `z`; zero for keyframes"""
+    """covariance of the end of `z`; zero for keyframes"""
     graph: Graph
-    """the optimum; `pose_id` is the index of the scan"""
+    """optimal graph; `pose_id` is the index of the scan"""
     start: Graph
-    """the same graph at the poses of laser odometry"""
+    """the graph at the poses of laser odometry"""
     loops: Loops
     map: Grid
+    """map at `poses`"""
     map_before: Grid
-    """of the poses of laser odometry"""
+    """map at the poses of laser odometry"""
     counts: dict[str, int]
     """counts of used and unused data"""
     chi2: float
-    """of the graph, without a kernel. √(chi2/dof) is the size of the residuals of its edges against
-    their σ. It is no factor for `cov`: edges share scans, so their errors are not independent"""
+    """χ² of the graph, without a kernel. √(chi2/dof) is the size of the residuals of its edges
+    against their σ. It is no factor for `cov`: edges share scans, so their errors are not
+    independent"""
     dof: int
+    """degrees of freedom of the graph"""
     seconds: dict[str, float]
-    """by stage, compilation included"""
+    """duration of each stage, compilation included"""

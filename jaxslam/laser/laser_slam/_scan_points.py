@@ -1,4 +1,4 @@
-"""The scans of a log as points with the directions of their walls, and what of it is unusable."""
+"""The scans of a log as points with the directions of their walls, and which scans are usable."""
 
 from typing import Any, NamedTuple
 
@@ -12,16 +12,18 @@ from jaxslam.laser.matching import Points
 from jaxslam.laser.matching._surfaces import Surface, surface
 
 GAP = 0.5
-"""[m] between points beyond which they are not of one wall"""
+"""[m] between points beyond which they are not of the same wall."""
 SPAN = np.deg2rad(2.0)
 """Angle to either side of a point within which its neighbours lie."""
 _MAX_NEIGHBOURS = 8
-"""to either side"""
+"""Neighbours to either side at most, for time: lines take a shift of the scan for each."""
 WIDTH, ROWS = 384, 64
 """Beams and scans of one call that fits lines: logs are cut and filled up to these, so that all
 share one program."""
 _CHANGED, SHARE = 0.1, 0.2
-"""A scan differs from another one if more than this share of its beams do, by this [m]."""
+"""A beam has changed if its range differs by this [m], a scan if this share of its beams has."""
+_USUAL_SPACING = 0.02
+"""[rad] between beams, if no two valid beams follow each other."""
 _BACK = 8
 """Scans back with which a scan is compared: a slow robot changes little from one to the next."""
 
@@ -32,12 +34,12 @@ class Scans(NamedTuple):
     points: Points
     """(K, B), the robot's place where not valid"""
     surface: Surface
-    """(K, B) the lines through them and their neighbours"""
+    """(K, B) lines through the points and their neighbours"""
     usable: Bool[np.ndarray, "K"]
     """enough points to match"""
     changed: Int[np.ndarray, "K"]
-    """scans back to the nearest of the last eight from which a scan differs; 0 if from none, as of
-    a robot at rest"""
+    """number of scans back to the nearest of the last eight from which a scan differs; 0 if it
+    differs from none, as of a robot at rest"""
 
 
 def check_laser_log(name: str, log: LogOfScans) -> None:
@@ -62,23 +64,23 @@ def check_laser_log(name: str, log: LogOfScans) -> None:
     if np.shape(log.mount) != (3,) or not np.isfinite(log.mount).all():
         raise ValueError(f"{name}: expected a mount of three finite numbers, got {log.mount}")
     lost = np.asarray(log.beams.valid, bool) & ~np.isfinite(log.beams.angle)
-    for what, bad in (
+    for quantity, bad in (
         ("raw odometry", ~np.isfinite(log.raw).all(axis=1)),
         ("the time", ~np.isfinite(log.time)),
         ("the angle of a valid beam", lost.any(axis=1)),
     ):
         if bad.any():
-            raise ValueError(f"{name}: {what} of scan {int(bad.argmax())} is not finite")
+            raise ValueError(f"{name}: {quantity} of scan {int(bad.argmax())} is not finite")
     if not log.max_range > 0:
         raise ValueError(f"{name}: expected a max_range above 0, got {log.max_range}")
 
 
 def met_something(beams: Beams, max_range: float) -> Beams:
-    """The beams of some scans; valid are those that met something."""
-    some = Beams(*(np.asarray(part) for part in beams))
-    met = np.asarray(some.returns(max_range)[0])
-    angles = np.where(some.valid > 0, some.angle, 0.0)
-    return Beams(np.where(met, some.range, 0.0), angles, met)
+    """The beams of scans, of which only those with a hit stay valid; others have range 0."""
+    beams = Beams(*(np.asarray(part) for part in beams))
+    met = np.asarray(beams.returns(max_range)[0])
+    angles = np.where(beams.valid > 0, beams.angle, 0.0)
+    return Beams(np.where(met, beams.range, 0.0), angles, met)
 
 
 def scans_of(log: LogOfScans, settings: Settings) -> Scans:
@@ -86,14 +88,14 @@ def scans_of(log: LogOfScans, settings: Settings) -> Scans:
     degrees of each."""
     count, beams = np.shape(log.beams.range)
     stride = -(-beams // WIDTH)
-    some = slice(None, None, -(-count // ROWS))
-    angles, valid = np.asarray(log.beams.angle)[some], np.asarray(log.beams.valid)[some] > 0
+    sampled = slice(None, None, -(-count // ROWS))
+    angles, valid = np.asarray(log.beams.angle)[sampled], np.asarray(log.beams.valid)[sampled] > 0
     spacing = max(_spacing(angles[:, ::stride], valid[:, ::stride]), 1e-3)
     span = np.int32(np.clip(round(SPAN / spacing), 2, _MAX_NEIGHBOURS))
-    every, kept = -(-len(range(0, beams, stride)) // settings.beams), settings.beams
+    thinning = -(-len(range(0, beams, stride)) // settings.beams)
     changed = []
     scans: Any = None
-    for begin in range(0, count, ROWS):  # some at a time, since a log may be long
+    for begin in range(0, count, ROWS):  # a part at a time, since a log may be long
         last = max(begin - _BACK, 0)
         near = met_something(
             Beams(*(np.asarray(part)[last : begin + ROWS] for part in log.beams)), log.max_range
@@ -102,15 +104,22 @@ def scans_of(log: LogOfScans, settings: Settings) -> Scans:
         changed.append(differs[begin - last :])
         rows = Beams(*(np.asarray(part)[begin - last :, ::stride] for part in near))
         points = _points(rows, np.asarray(log.mount), settings.max_range)
-        filled = _fill(points)
+        size, width = points.valid.shape
+        # Filled up to `ROWS` scans of `WIDTH` beams by points that are not valid.
+        fill = [(0, ROWS - size), (0, WIDTH - width)]
+        padded: Any = [np.pad(part, fill + [(0, 0)] * (part.ndim - 2)) for part in points]
+        filled = Points(*padded)
         lines = jax.tree.map(np.asarray, _surfaces(filled, span))
         # Beams that fill a scan up come last: they are cut off, or stay without a point.
-        size = len(rows.range)
-        found = jax.tree.map(lambda part, n=size: _thin(part[:n], every, kept), (filled, lines))
-        if not begin:  # all at once: parts and their concatenation would take twice the memory
-            scans = jax.tree.map(lambda of: np.empty((count, *of.shape[1:]), of.dtype), found)
-        for whole, part in zip(jax.tree.leaves(scans), jax.tree.leaves(found), strict=True):
-            whole[begin : begin + size] = part
+        thinned = jax.tree.map(
+            lambda part, n=size: _thin(part[:n], thinning, settings.beams), (filled, lines)
+        )
+        if not begin:  # allocated once: parts and their concatenation would take twice the memory
+            scans = jax.tree.map(
+                lambda part: np.empty((count, *part.shape[1:]), part.dtype), thinned
+            )
+        for table, part in zip(jax.tree.leaves(scans), jax.tree.leaves(thinned), strict=True):
+            table[begin : begin + size] = part
     points, lines = scans
     usable = points.valid.sum(axis=1) >= settings.fewest
     return Scans(points, lines, usable, np.concatenate(changed))
@@ -127,33 +136,24 @@ def _points(beams: Beams, mount: Float[np.ndarray, "3"], max_range: float) -> Po
     return Points(*parts)
 
 
-def _thin(part: np.ndarray, every: int, width: int) -> np.ndarray:
+def _thin(part: np.ndarray, stride: int, width: int) -> np.ndarray:
     """Each n-th of the beams, cut or filled up to a width."""
-    found = part[:, ::every][:, :width]
-    return np.pad(found, [(0, 0), (0, width - found.shape[1])] + [(0, 0)] * (part.ndim - 2))
-
-
-def _fill(points: Points) -> Points:
-    """Some scans, filled up to `ROWS` of `WIDTH` beams by points that are not valid."""
-
-    def one(part: np.ndarray) -> np.ndarray:
-        more = [(0, ROWS - len(part)), (0, WIDTH - part.shape[1])] + [(0, 0)] * (part.ndim - 2)
-        return np.pad(part, more)
-
-    filled: Points = jax.tree.map(one, points)
-    return filled
+    beams = part[:, ::stride][:, :width]
+    return np.pad(beams, [(0, 0), (0, width - beams.shape[1])] + [(0, 0)] * (part.ndim - 2))
 
 
 @jax.jit
 def _surfaces(points: Points, span: Int[Array, ""]) -> Surface:
-    found: Surface = jax.vmap(lambda of: surface(of, span, GAP, most=_MAX_NEIGHBOURS))(points)
-    return found
+    def surface_of(scan: Points) -> Surface:
+        return surface(scan, span, GAP, most=_MAX_NEIGHBOURS)
+
+    return jax.vmap(surface_of)(points)
 
 
 def _spacing(angles: np.ndarray, valid: np.ndarray) -> float:
-    """The angle between beams [rad]."""
+    """The median angle between neighbouring beams [rad]."""
     steps = np.abs(np.diff(angles, axis=1))[valid[:, 1:] & valid[:, :-1]]
-    return float(np.median(steps)) if steps.size else 0.02
+    return float(np.median(steps)) if steps.size else _USUAL_SPACING
 
 
 def _has_changed(

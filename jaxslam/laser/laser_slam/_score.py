@@ -27,31 +27,31 @@ def relation_covs(
 ) -> Float[np.ndarray, "R 3 3"]:
     """The covariances of the relative poses z = x_i⁻¹ ∘ x_j of R pairs of scans, by the graph.
 
-    Each is of the end of z: of the small pose e with true z = z ∘ e, in the frame of scan j [m, m,
-    rad]. With a and b the keyframes of i and j (`Solved.base`), and Ad the adjoint,
+    Covariances are of the end of z: of the small pose e with true z = z ∘ e, in the frame of scan j
+    [m, m, rad]. With a and b the keyframes of i and j (`Solved.base`), and Ad the adjoint,
 
         Σ = Ad(z)⁻¹ Σ_i Ad(z)⁻ᵀ + Ad(z_j)⁻¹ Σ_ab Ad(z_j)⁻ᵀ + Σ_j
 
-    where Σ_ab is from the joint marginals of the keyframes, zero if they are one, and Σ_i, Σ_j are
-    those of the scans relative to their keyframes (`Solved.z_cov`), taken to be independent of each
-    other and of the graph. Zero for a scan and itself.
+    where Σ_ab is from the joint marginals of the keyframes, zero if a = b, and Σ_i, Σ_j are the
+    covariances of the scans relative to their keyframes (`Solved.z_cov`), taken to be independent
+    of each other and of the graph. Zero for a scan and itself.
 
     Args:
         first, second: (R,) scans i and j, in either order.
     Raises:
         ValueError: on other shapes, and on scans that the result does not have.
     """
-    i, j = (np.asarray(each) for each in (first, second))
+    i, j = np.asarray(first), np.asarray(second)
     count = len(solved.poses)
-    for each in (i, j):
-        if each.ndim != 1 or each.shape != i.shape or each.dtype.kind not in "iu":
+    for scans in (i, j):
+        if scans.ndim != 1 or scans.shape != i.shape or scans.dtype.kind not in "iu":
             raise ValueError(
                 f"relation_covs: expected two rows of whole numbers, got {i.shape} and {j.shape}"
             )
-        if len(each) and not (each.min() >= 0 and each.max() < count):
+        if len(scans) and not (scans.min() >= 0 and scans.max() < count):
             raise ValueError(
-                f"relation_covs: expected scans from 0 to {count - 1}, got {each.min()} to "
-                f"{each.max()}"
+                f"relation_covs: expected scans from 0 to {count - 1}, got {scans.min()} to "
+                f"{scans.max()}"
             )
     a, b = solved.base[i], solved.base[j]
     between = np.zeros((len(i), 3, 3))
@@ -63,7 +63,7 @@ def relation_covs(
         parts = [relative_covs(optimum, pairs[k : k + TOGETHER]) for k in starts]
         between[apart] = np.concatenate(parts)[row.reshape(-1)]
     z = poses.between(solved.poses[i], solved.poses[j])
-    at_start = end_covariances.moved(solved.z_cov[i], z)
+    at_start = end_covariances.move(solved.z_cov[i], z)
     cov = at_start + end_covariances.composed_cov(between, solved.z[j], solved.z_cov[j])
     cov[i == j] = 0.0
     return np.asarray(0.5 * (cov + np.swapaxes(cov, 1, 2)))
@@ -84,16 +84,16 @@ def relation_nees(
     cov = relation_covs(solved, first, second)
     i, j = np.asarray(first), np.asarray(second)
     e = poses.between(poses.between(solved.poses[i], solved.poses[j]), np.asarray(z))
-    out = np.full(len(e), np.nan)
-    known = invertible(cov)
-    out[known] = np.einsum(
-        "ri,ri->r", e[known], np.linalg.solve(cov[known], e[known][..., None])[..., 0]
+    nees = np.full(len(e), np.nan)
+    regular = invertible(cov)
+    nees[regular] = np.einsum(
+        "ri,ri->r", e[regular], np.linalg.solve(cov[regular], e[regular][..., None])[..., 0]
     )
-    return out
+    return nees
 
 
 class ClosureScore(NamedTuple):
-    """How many of the loops that were kept are right, and how many places were seen again."""
+    """The precision and recall of the loops that were kept."""
 
     precision: float
     """correct / kept; NaN without loops"""
@@ -123,13 +123,13 @@ def closure_score(
 
     reference: (K, 3) poses of all scans, true or corrected.
     """
-    known: Float[np.ndarray, "K 3"] = np.asarray(reference, np.float64)
+    truth: Float[np.ndarray, "K 3"] = np.asarray(reference, np.float64)
     loops: Loops = solved.loops
     kept = loops.outcome == LoopOutcome.KEPT
     first, second = loops.first[kept], loops.second[kept]
-    off = poses.between(loops.z[kept], poses.between(known[first], known[second]))
+    off = poses.between(loops.z[kept], poses.between(truth[first], truth[second]))
     right = (np.hypot(off[:, 0], off[:, 1]) < position) & (np.abs(off[:, 2]) < heading)
-    keys = known[solved.keyframe]
+    keys = truth[solved.keyframe]
     seen = np.zeros(len(keys), bool)
     for k in range(gap, len(keys)):
         before = keys[: k - gap + 1]

@@ -10,11 +10,11 @@ from jaxslam import graphs
 from jaxslam.laser.laser_slam import _end_covariances as end_covariances
 from jaxslam.laser.laser_slam._assembly import ROOM
 from jaxslam.laser.laser_slam._log_map import frame_of, map_of
-from jaxslam.laser.laser_slam._loops.rounds import closed, give_back
+from jaxslam.laser.laser_slam._loops.rounds import close_loops
 from jaxslam.laser.laser_slam._odometry.log_odometry import laser_odometry
-from jaxslam.laser.laser_slam._odometry.raw import Steps, steps_of
+from jaxslam.laser.laser_slam._odometry.raw import steps_of
 from jaxslam.laser.laser_slam._odometry.tracking import Odometry
-from jaxslam.laser.laser_slam._records import LogOfScans, LoopOutcome, Loops, Settings, Solved
+from jaxslam.laser.laser_slam._records import LogOfScans, LoopOutcome, Settings, Solved
 from jaxslam.laser.laser_slam._scan_points import check_laser_log, scans_of
 from jaxslam.math import numpy_poses as poses
 from jaxslam.math._arrays import float64
@@ -50,86 +50,33 @@ def solve(
         nonlocal began
         now = time.perf_counter()
         seconds[stage], began = now - began, now
-        give_back()
 
-    def telling(stage: str) -> Callable[[int, int], object] | None:
-        return None if progress is None else lambda finished, of: progress(stage, finished, of)
+    def progress_of(stage: str) -> Callable[[int, int], object] | None:
+        return None if progress is None else lambda done, of: progress(stage, done, of)
 
     raw = np.asarray(log.raw, np.float64)
     scans = scans_of(log, settings)
     steps = steps_of(raw, settings, np.asarray(log.time, float), scans.changed, log.odometry_known)
     lap("reading the scans")
-    odometry = laser_odometry(scans, steps, settings, raw[0], telling("odometry"))
+    odometry = laser_odometry(scans, steps, settings, raw[0], progress_of("odometry"))
     lap("odometry")
     with float64():  # a step that is hardly known and a match differ too much for 32 bits
-        graph, loops, left_out = closed(scans, odometry, settings, telling("loop closing"))
+        graph, loops, left_out = close_loops(scans, odometry, settings, progress_of("loop closing"))
         lap("loop closing")
-        path, cov, hung = _of_scans(graph, odometry)
+        base, z, z_cov, path, cov = _scans_on_keyframes(graph, odometry)
         squared = graphs.squared_residuals(graph, room=ROOM)
-    chi2 = float(sum(np.asarray(each).sum() for each in squared.values())) if squared else 0.0
+    chi2 = float(sum(np.asarray(table).sum() for table in squared.values())) if squared else 0.0
     lap("marginals")
     frame = frame_of(log, [path, odometry.poses], settings)
     with ThreadPoolExecutor(2) as pool:
-        maps = list(
-            pool.map(
-                lambda each: map_of(log, each, scans.usable, frame, settings),
-                (path, odometry.poses),
-            )
-        )
+        paths = path, odometry.poses
+        maps = pool.map(lambda path: map_of(log, path, scans.usable, frame, settings), paths)
+        map_after, map_before = maps
     lap("map")
-    return Solved(
-        time=np.asarray(log.time, np.float64),
-        poses=path,
-        odometry=odometry.poses,
-        raw=raw,
-        cov=cov,
-        doubted=odometry.doubted,
-        keyframe=odometry.keyframe,
-        base=hung[0],
-        z=hung[1],
-        z_cov=hung[2],
-        graph=graph,
-        start=graph._replace(poses=odometry.poses[odometry.keyframe]),
-        loops=loops,
-        map=maps[0],
-        map_before=maps[1],
-        counts=_counts(log, scans.usable, steps, odometry, loops)
-        | {"keyframes and candidates of loops left out, being too many": left_out},
-        chi2=chi2,
-        dof=graphs.degrees_of_freedom(graph) if len(graph.poses) > 1 else 0,
-        seconds=seconds,
-    )
-
-
-def _of_scans(
-    graph: graphs.Graph, odometry: Odometry
-) -> tuple[np.ndarray, np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """The pose of every scan and its covariance, from those of the keyframes; then `Solved.base`,
-    `z` and `z_cov`."""
-    keyframe = odometry.keyframe
-    at = np.asarray(graph.poses, np.float64)
-    row = np.searchsorted(keyframe, np.arange(len(odometry.poses)), side="right") - 1
-    is_key = keyframe[row] == np.arange(len(row))
-    z = np.where(is_key[:, None], 0.0, odometry.z)
-    path = poses.compose(at[row], z)
-    if len(at) == 1:
-        marginal = np.zeros((1, 3, 3))
-    else:
-        optimum = graphs.optimize(graph, room=ROOM, iterations=0)
-        marginal = np.asarray(graphs.marginals(optimum, room=ROOM).poses, np.float64)
-    at_key = end_covariances.turns(-at[row, 2]) @ marginal[row] @ end_covariances.turns(at[row, 2])
-    step = np.where(is_key[:, None, None], 0.0, odometry.cov)
-    cov = end_covariances.of_coordinates(end_covariances.composed_cov(at_key, z, step), path)
-    return path, cov, (row, z, step)
-
-
-def _counts(
-    log: LogOfScans, usable: np.ndarray, steps: Steps, odometry: Odometry, loops: Loops
-) -> dict[str, int]:
     counts = {
-        "scans": len(usable),
+        "scans": len(scans.usable),
         "keyframes": len(odometry.keyframe),
-        "scans with too few points": int((~usable).sum()),
+        "scans with too few points": int((~scans.usable).sum()),
         "scans by raw odometry alone": int((~odometry.matched[1:]).sum()),
         "scans whose match is in doubt": int(odometry.doubted.sum()),
         "jumps of raw odometry": int((steps.jump | odometry.refuted).sum()),
@@ -140,4 +87,49 @@ def _counts(
     }
     for outcome in LoopOutcome:
         counts[f"loops {outcome.name.lower()}"] = int((loops.outcome == outcome).sum())
-    return counts
+    counts["keyframes and candidates of loops left out, being too many"] = left_out
+    return Solved(
+        time=np.asarray(log.time, np.float64),
+        poses=path,
+        odometry=odometry.poses,
+        raw=raw,
+        cov=cov,
+        doubted=odometry.doubted,
+        keyframe=odometry.keyframe,
+        base=base,
+        z=z,
+        z_cov=z_cov,
+        graph=graph,
+        start=graph._replace(poses=odometry.poses[odometry.keyframe]),
+        loops=loops,
+        map=map_after,
+        map_before=map_before,
+        counts=counts,
+        chi2=chi2,
+        dof=graphs.degrees_of_freedom(graph) if len(graph.poses) > 1 else 0,
+        seconds=seconds,
+    )
+
+
+def _scans_on_keyframes(
+    graph: graphs.Graph, odometry: Odometry
+) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """`base`, `z`, `z_cov`, `poses` and `cov` of `Solved`, from the poses of the keyframes."""
+    keyframe = odometry.keyframe
+    at = np.asarray(graph.poses, np.float64)
+    scan = np.arange(len(odometry.poses))
+    base = np.searchsorted(keyframe, scan, side="right") - 1
+    is_key = keyframe[base] == scan
+    z = np.where(is_key[:, None], 0.0, odometry.z)
+    z_cov = np.where(is_key[:, None, None], 0.0, odometry.cov)
+    path = poses.compose(at[base], z)
+    if len(at) == 1:
+        marginals = np.zeros((1, 3, 3))
+    else:
+        optimum = graphs.optimize(graph, room=ROOM, iterations=0)
+        marginals = np.asarray(graphs.marginals(optimum, room=ROOM).poses, np.float64)
+    # The marginals are of coordinates in the world's frame.
+    heading = at[base, 2]
+    end_cov = end_covariances.turns(-heading) @ marginals[base] @ end_covariances.turns(heading)
+    end_cov = end_covariances.composed_cov(end_cov, z, z_cov)
+    return base, z, z_cov, path, end_covariances.of_coordinates(end_cov, path)

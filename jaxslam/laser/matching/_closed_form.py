@@ -10,7 +10,8 @@ from jaxslam.laser.matching._point_sets import Prior
 from jaxslam.math import _linalg as linalg
 
 _NEWTON = 12
-"""Steps of the secular equation: it converges quadratically from the left, without a safeguard."""
+"""Newton steps for the secular equation: they converge quadratically from the left, without a
+safeguard."""
 
 
 class Quadratic(NamedTuple):
@@ -83,9 +84,9 @@ def of_prior(prior: Prior, pose: Float[Array, "3"], middle: Float[Array, "2"]) -
     θ + δ - θ₀ and has its slope where δ = 0, so that the minimum is exact where a pose stays.
     """
     arm, off = pose[:2] - middle, prior.error(pose)[2]
-    zero, one = jnp.zeros_like(off), jnp.ones_like(off)
+    zero, unit = jnp.zeros_like(off), jnp.ones_like(off)
     by_turn = jnp.stack(
-        [jnp.stack([arm[0], -arm[1]]), jnp.stack([arm[1], arm[0]]), jnp.stack([off, one])]
+        [jnp.stack([arm[0], -arm[1]]), jnp.stack([arm[1], arm[0]]), jnp.stack([off, unit])]
     )
     offset = jnp.concatenate([prior.pose[:2] - middle, zero[None]])
     weighted = prior.information @ by_turn
@@ -149,11 +150,12 @@ def _on_circle(s: Float[Array, "2 2"], h: Float[Array, "2"]) -> Float[Array, "2"
     apart = square > 0
     root = jnp.where(apart, jnp.sqrt(jnp.where(apart, square, 1.0)), 0.0)
     angle = 0.5 * jnp.arctan2(jnp.where(apart, off, 0.0), jnp.where(apart, half, 1.0))
-    e2 = jnp.stack([jnp.cos(angle), jnp.sin(angle)])  # of the larger eigenvalue
+    e2 = jnp.stack([jnp.cos(angle), jnp.sin(angle)])  # eigenvector of the larger eigenvalue
     e1 = jnp.stack([-e2[1], e2[0]])
     low, high = mean - root, mean + root
     h1, h2 = e1 @ h, e2 @ h
     size = jnp.sqrt(h1**2 + h2**2)
+    # h along e1 is not 0: φ would have no pole at -s₁, and perhaps no root (the "hard case").
     tiny = jnp.finfo(s.dtype).eps * jnp.where(size > 0, size, 1.0)
     h1 = jnp.where(jnp.abs(h1) > tiny, h1, jnp.where(h1 < 0, -tiny, tiny))
     start = jnp.maximum(0.5 * jnp.abs(h1) - low, 0.5 * jnp.abs(h2) - high)

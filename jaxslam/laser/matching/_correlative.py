@@ -18,7 +18,7 @@ from jaxslam.laser.grids._distance import near_distances
 from jaxslam.laser.grids._grid import Field, Grid, interpolate, to_cells
 from jaxslam.laser.matching._field import field_cost
 from jaxslam.laser.matching._matcher import Match, Matcher
-from jaxslam.laser.matching._outcome import Limits, length_of, make_match
+from jaxslam.laser.matching._outcome import Limits, Pairs, SearchEnd, length_of, make_match
 from jaxslam.laser.matching._point_sets import Points, Prior, prior_cost
 from jaxslam.laser.matching._surfaces import surface, surface_information
 from jaxslam.math import se2
@@ -26,7 +26,7 @@ from jaxslam.math._arrays import Number, in_dtype
 from jaxslam.math.angles import wrap
 
 _CHUNK = 16
-"""Blocks that are divided in one step."""
+"""Blocks that are divided in a step; chosen for speed on processors."""
 
 
 class _Nodes(NamedTuple):
@@ -34,20 +34,20 @@ class _Nodes(NamedTuple):
 
     level: Int[Array, "n"]
     turn: Int[Array, "n"]
-    """number of the heading"""
+    """index of the heading"""
     shift: Int[Array, "n 2"]
-    """(rows, columns), the lower left one of the block"""
+    """(rows, columns) of the lower left shift of the block"""
 
 
 class _Best(NamedTuple):
-    """The best pose found."""
+    """The best pose so far."""
 
     value: Float[Array, ""]
-    """-inf of none"""
+    """its score; -inf without a pose"""
     turn: Int[Array, ""]
     shift: Int[Array, "2"]
     divided: Int[Array, ""]
-    """how many blocks were"""
+    """number of blocks that were divided"""
 
 
 def _best_shift(
@@ -66,30 +66,41 @@ def _best_shift(
     A block whose bound is not above the best value so far is skipped; others are divided into four
     (Hess et al. 2016, "Real-time loop closure in 2D LIDAR SLAM", ICRA).
 
+    | top `_CHUNK` blocks of the stack | the search |
+    |---|---|
+    | none | ends |
+    | roots, all bounds at most the best value | ends: roots are sorted, those below are no better |
+    | any other | divides the blocks with a better bound, and drops the others |
+
     Args:
         bound_of: an upper bound of the values in each block; at level 0 the value.
-        roots, bounds: of one level, `levels` at least 1.
-        shifts: those farther than this are outside the window.
+        roots, bounds: blocks of the same level, and their bounds.
+        levels: divisions from a root to a single shift, at least 1.
+        shifts: largest shift of the window [cells].
         above: only poses of a greater value count.
-        counts: which poses count, of nodes at level 0; default all.
-        first: whether the first pose that counts will do.
+        counts: the mask of poses that count, of nodes at level 0; default all.
+        first: end at the first pose that counts.
     """
     order = jnp.argsort(bounds)
     count = len(bounds)
+    # Children lie above their parents, so the blocks of a level are divided before the level gets
+    # others: at most 4 children of each of `_CHUNK` blocks at a time.
     room = 4 * _CHUNK * levels
-    # Deeper blocks lie above shallower ones, so that those of a level are divided before any more
-    # of it come: at most 4 · chunk of each at a time.
     value = jnp.concatenate([bounds[order], jnp.zeros(room, bounds.dtype)])
     stack = _Nodes(
-        *(jnp.concatenate([p[order], jnp.zeros((room, *p.shape[1:]), p.dtype)]) for p in roots)
+        *(
+            jnp.concatenate([part[order], jnp.zeros((room, *part.shape[1:]), part.dtype)])
+            for part in roots
+        )
     )
     corner = jnp.asarray(np.array([[0, 0], [0, 1], [1, 0], [1, 1]], np.int32))
 
     def unfinished(state: tuple[Array, _Nodes, Array, _Best]) -> Array:
         size, _, value, best = state
+        # With `count` blocks or fewer only roots are left, the best of them on top.
         rest_is_worse = (size <= count) & (value[jnp.maximum(size - 1, 0)] <= best.value)
-        more = (size > 0) & ~rest_is_worse
-        return jnp.asarray(more & (best.value <= above) if first else more)
+        goes_on = (size > 0) & ~rest_is_worse
+        return jnp.asarray(goes_on & (best.value <= above) if first else goes_on)
 
     def step(state: tuple[Array, _Nodes, Array, _Best]) -> tuple[Array, _Nodes, Array, _Best]:
         size, stack, value, best = state
@@ -113,29 +124,31 @@ def _best_shift(
             jnp.where(better, shift[top], best.shift),
             best.divided + live.sum(dtype=jnp.int32),
         )
-        kept = good & ~leaf & (bound > best.value)
-        rank = jnp.lexsort((bound, -level, ~kept))
+        pushed = good & ~leaf & (bound > best.value)
+        # Pushed children first, the shallow ones lowest, and of a level the best bound on top. The
+        # children that are not pushed follow, above the new size, where they are not read.
+        rank = jnp.lexsort((bound, -level, ~pushed))
         base = size - jnp.minimum(size, _CHUNK)
 
-        def pushed(onto: Array, these: Array) -> Array:
+        def push(onto: Array, children: Array) -> Array:
             begin = (base, *[jnp.zeros_like(base)] * (onto.ndim - 1))
-            return jax.lax.dynamic_update_slice(onto, these[rank], begin)
+            return jax.lax.dynamic_update_slice(onto, children[rank], begin)
 
-        stack = jax.tree.map(pushed, stack, child)
-        return base + kept.sum(dtype=jnp.int32), stack, pushed(value, bound), best
+        stack = jax.tree.map(push, stack, child)
+        return base + pushed.sum(dtype=jnp.int32), stack, push(value, bound), best
 
     zero = jnp.zeros((), jnp.int32)
-    none = _Best(jnp.asarray(above, bounds.dtype), zero, jnp.zeros(2, jnp.int32), zero)
+    nothing = _Best(jnp.asarray(above, bounds.dtype), zero, jnp.zeros(2, jnp.int32), zero)
     size = jnp.asarray(count, jnp.int32)
-    *_, best = jax.lax.while_loop(unfinished, step, (size, stack, value, none))
+    *_, best = jax.lax.while_loop(unfinished, step, (size, stack, value, nothing))
     return best
 
 
 class Scores(NamedTuple):
-    """What a point scores by its cell, with `block` cells of 0 around the map."""
+    """The score of a point by its cell, with `block` cells of 0 around the map."""
 
     table: Float[Array, "L H W"]
-    """first exp(-d²/2σ²), d the distance to the nearest occupied cell, 0 beyond `_REACH` σ; at
+    """at level 0 exp(-d²/2σ²), d the distance to the nearest occupied cell, 0 beyond `_REACH` σ; at
     level l, the largest of the 2^l × 2^l cells with this cell at the lower left"""
     field: Field
     """d [m], of the map alone, up to `_REACH` σ"""
@@ -221,6 +234,7 @@ class Correlative(Matcher):
         d = jnp.asarray(reference.resolution, dtype) * jnp.sqrt(squared.astype(dtype))
         score = jnp.where(squared <= reach**2, jnp.exp(-0.5 * (d / sigma) ** 2), 0.0)
         tables = [jnp.pad(score, block)]
+        # The largest of 2 × 2 cells that lie 2^level apart, each the largest of as many cells.
         for level in range(self._levels):
             right = jnp.maximum(tables[-1], jnp.roll(tables[-1], -(2**level), 1))
             tables.append(jnp.maximum(right, jnp.roll(right, -(2**level), 0)))
@@ -236,7 +250,9 @@ class Correlative(Matcher):
     ) -> Match:
         sigma, block, shifts, levels = self.sigma, self.block, self._shifts, self._levels
         ambiguous, apart = in_dtype((self.ambiguous, self.apart), start.dtype)
-        corners = _square(np.arange(-shifts, shifts + 1, block))
+        axis = np.arange(-shifts, shifts + 1, block)
+        corners = np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1)
+        corners = corners.reshape(-1, 2).astype(np.int32)  # (rows, columns) of the roots
         steps = int(np.ceil(self.turn_window / self.turn - 1e-9))
         turns = start[2] + jnp.asarray(self.turn * np.arange(-steps, steps + 1), start.dtype)
         count = jnp.maximum(points.valid.sum(dtype=start.dtype), 1)
@@ -245,25 +261,27 @@ class Correlative(Matcher):
         axes = cell_size * se2.rotation(prepared.field.origin[2])[:, ::-1]  # of a row, of a column
 
         def cells(turn: Array) -> Int[Array, "N 2"]:
-            """The cells (row, column) of the points at the start, turned so."""
+            """The cells (row, column) of the points at the start with a heading."""
             moved = points.position @ se2.rotation(turn).T + start[None, :2]
             at = to_cells(prepared.field.origin, prepared.field.resolution, moved)[:, ::-1]
             return jnp.floor(at).astype(jnp.int32) + block
 
-        here = jax.vmap(cells)(turns)
+        cells_at = jax.vmap(cells)(turns)
 
-        def seen(nodes: _Nodes) -> Float[Array, "n"]:
-            """The mean score of the points."""
-            at = here[nodes.turn] + nodes.shift[:, None, :]
+        def mean_score_of(nodes: _Nodes) -> Float[Array, "n"]:
+            """The mean score of the points, at most, within each block."""
+            at = cells_at[nodes.turn] + nodes.shift[:, None, :]
             row, column = jnp.clip(at[..., 0], 0, height - 1), jnp.clip(at[..., 1], 0, width - 1)
+            # A flat index into (level, row, column): one gather.
             flat = (nodes.level[:, None] * height + row) * width + column
             score = prepared.table.reshape(-1)[flat]
             return jnp.where(points.valid, score, 0.0).sum(axis=1) / count
 
-        def taken(nodes: _Nodes) -> Float[Array, "n"]:
-            """The score that a prior takes at least within each block.
+        def prior_share_of(nodes: _Nodes) -> Float[Array, "n"]:
+            """The score that a prior takes, at least, within each block.
 
-            At the middle it is √(eᵀ Λ e); at a corner it is less by √(uᵀ Λ u) at most."""
+            At the middle it is √(eᵀ Λ e); at a corner it is less by √(uᵀ Λ u) at most.
+            """
             if prior is None:
                 return jnp.zeros(len(nodes.turn), start.dtype)
             half = 0.5 * ((1 << nodes.level) - 1).astype(start.dtype)
@@ -278,61 +296,54 @@ class Correlative(Matcher):
             return least / (2 * sigma**2 * count)
 
         def bound_of(nodes: _Nodes) -> Float[Array, "n"]:
-            return seen(nodes) - taken(nodes)
+            return mean_score_of(nodes) - prior_share_of(nodes)
 
         def roots_of(turn: Array) -> _Nodes:
             full = jnp.full(len(corners), levels, jnp.int32)
             return _Nodes(full, jnp.broadcast_to(turn, full.shape), jnp.asarray(corners))
 
-        numbers = jnp.arange(len(turns), dtype=jnp.int32)
-        bounds = jax.lax.map(lambda turn: bound_of(roots_of(turn)), numbers).reshape(-1)
-        roots = jax.tree.map(lambda x: x.reshape(-1, *x.shape[2:]), jax.vmap(roots_of)(numbers))
+        headings = jnp.arange(len(turns), dtype=jnp.int32)
+        # One heading after another: the scores of all at once would need N times the memory.
+        bounds = jax.lax.map(lambda turn: bound_of(roots_of(turn)), headings).reshape(-1)
+        # (heading, corner) to a list of blocks.
+        roots = jax.tree.map(
+            lambda part: part.reshape(-1, *part.shape[2:]), jax.vmap(roots_of)(headings)
+        )
         best = _best_shift(bound_of, roots, bounds, levels, shifts)
-        elsewhere: Array | bool = False
+        is_ambiguous: Array | bool = False
         if ambiguous is not None:
             by_turn = length_of(points) * float(self.turn)
 
-            def far(nodes: _Nodes) -> Array:
+            def is_apart(nodes: _Nodes) -> Array:
                 way = cell_size * (nodes.shift - best.shift[None]).astype(start.dtype)
                 turned = jnp.abs(nodes.turn - best.turn).astype(start.dtype)
                 return jnp.hypot(*way.T) + by_turn * turned > apart
 
             limit = ambiguous * best.value
-            other = _best_shift(
-                bound_of, roots, bounds, levels, shifts, above=limit, counts=far, first=True
+            rival = _best_shift(
+                bound_of, roots, bounds, levels, shifts, above=limit, counts=is_apart, first=True
             )
-            elsewhere = other.value > limit
+            is_ambiguous = rival.value > limit
         pose = jnp.concatenate(
             [start[:2] + axes @ best.shift.astype(axes.dtype), wrap(turns[best.turn])[None]]
         )
         moved = points.position @ se2.rotation(pose[2]).T + pose[None, :2]
         residual = interpolate(prepared.field, moved)
         weight = (points.valid & (residual < 3 * sigma)).astype(residual.dtype)
-        only = _Nodes(jnp.zeros(1, jnp.int32), best.turn[None], best.shift[None])
+        leaf = _Nodes(jnp.zeros(1, jnp.int32), best.turn[None], best.shift[None])
         return make_match(
-            start,
-            pose,
             points,
-            residual=residual,
-            weight=weight,
-            pair=jnp.zeros(weight.shape, jnp.int32),
-            information=surface_information(surface(points), pose, weight),
-            spread=sigma,
-            iterations=best.divided,
-            converged=jnp.ones((), bool),
-            limits=Limits(),
-            ambiguous=elsewhere,
-            score=seen(only)[0],
-            prior=prior,
+            start,
+            prior,
+            SearchEnd(pose, best.divided, True, is_ambiguous),
+            Pairs(residual, weight),
+            mean_score_of(leaf)[0],
+            surface_information(surface(points), pose, weight),
+            Limits(),
         )
 
     def cost(
         self, prepared: Scores, points: Points, pose: Float[Array, "3"], match: Match
     ) -> Float[Array, ""]:
-        of_points = field_cost(prepared.field, points, pose, match.weight)
-        return of_points + prior_cost(match.prior, pose)
-
-
-def _square(axis: Int[np.ndarray, "n"]) -> Int[np.ndarray, "n*n 2"]:
-    """All pairs of the entries, (n², 2)."""
-    return np.stack(np.meshgrid(axis, axis, indexing="ij"), axis=-1).reshape(-1, 2).astype(np.int32)
+        points_cost = field_cost(prepared.field, points, pose, match.weight)
+        return points_cost + prior_cost(match.prior, pose)

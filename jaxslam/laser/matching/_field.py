@@ -15,11 +15,14 @@ from jaxslam.laser.grids._grid import Field, Grid, interpolate, to_cells
 from jaxslam.laser.matching._matcher import Match, Matcher
 from jaxslam.laser.matching._outcome import (
     Limits,
+    Pairs,
+    SearchEnd,
     determined,
-    fused,
+    fuse_prior,
     information_of,
     length_of,
     make_match,
+    mean_score,
 )
 from jaxslam.laser.matching._point_sets import Points, Prior, prior_cost, prior_terms
 from jaxslam.laser.matching._surfaces import surface, surface_information, weights
@@ -29,11 +32,14 @@ from jaxslam.math._arrays import Number, in_dtype
 from jaxslam.math.angles import wrap
 
 _DAMPING = (1e-3, 1e-9, 1e9)
-"""At first, at least, at most; relative to the diagonal of the information."""
+"""Damping μ at first, at least and at most, relative to the diagonal of the information."""
+_LEAST_DIAGONAL = 1e-9
+"""Least entry of the damped diagonal, relative to the largest entry and absolute, so that a
+direction without information is damped too."""
 
 
-class _At(NamedTuple):
-    """The linearization at a pose."""
+class _Linearization(NamedTuple):
+    """The cost and its derivatives at a pose."""
 
     cost: Float[Array, ""]
     residual: Float[Array, "N"]
@@ -41,11 +47,11 @@ class _At(NamedTuple):
     curvature: Float[Array, "3 3"]
     """A, of the scan"""
     slope: Float[Array, "3"]
-    """half of that of the scan's cost"""
+    """half of the slope of the scan's cost"""
 
 
-_State: TypeAlias = tuple[Array, Array, _At, Array, Array]
-"""iterations, pose, linearization there, damping, whether the last step was small"""
+_State: TypeAlias = tuple[Array, Array, _Linearization, Array, Array]
+"""Iterations, pose, linearization there, damping, whether the last step was small."""
 
 
 @record
@@ -81,7 +87,7 @@ class FieldMatcher(Matcher):
     least_score: Number = 0.5
     """`Match.score` below which the status is UNLIKE"""
     least_condition: Number | None = 0.01
-    """`Match.condition` below which it is DEGENERATE; None: never"""
+    """`Match.condition` below which the status is DEGENERATE; None: never"""
     name = "field"
     of_grid = True
 
@@ -110,7 +116,7 @@ class FieldMatcher(Matcher):
         def unfinished(state: _State) -> Array:
             return jnp.asarray((state[0] < self.iterations) & ~state[4])
 
-        def onto_of(pose: Array, at: _At) -> Array:
+        def onto_of(pose: Array, at: _Linearization) -> Array:
             information = surface_information(lines, pose, at.weight)
             return determined(information, length, matcher.least_condition)
 
@@ -120,13 +126,15 @@ class FieldMatcher(Matcher):
         def step(state: _State) -> _State:
             k, pose, at, damping, _ = state
             diagonal = jnp.diagonal(at.curvature)
-            diagonal = jnp.maximum(diagonal, 1e-9 * jnp.maximum(diagonal.max(), 1e-9))
+            diagonal = jnp.maximum(
+                diagonal, _LEAST_DIAGONAL * jnp.maximum(diagonal.max(), _LEAST_DIAGONAL)
+            )
             damped = at.curvature + damping * jnp.diag(diagonal)
             onto = onto_of(pose, at)
-            curvature, slope = fused(damped, at.slope, prior_terms(prior, pose), onto, length)
+            curvature, slope = fuse_prior(damped, at.slope, prior_terms(prior, pose), onto, length)
             move, _ = linalg.solve_psd(curvature, -slope)
             tried = moved(pose, move)
-            trial = matcher._at(prepared, points, tried, prior)
+            trial = matcher._linearize(prepared, points, tried, prior)
             better = trial.cost < at.cost
             small = jnp.hypot(move[0], move[1]) + length * jnp.abs(move[2]) <= matcher.tolerance
             pose = jnp.where(better, tried, pose)
@@ -138,35 +146,32 @@ class FieldMatcher(Matcher):
         if prior is not None:
             # Along directions that the scan does not determine it begins at the prior: a step that
             # the roughness of a field of cells might refuse.
-            onto = onto_of(start, matcher._at(prepared, points, start, prior))
+            onto = onto_of(start, matcher._linearize(prepared, points, start, prior))
             free = jnp.eye(3, dtype=start.dtype) - onto
-            known, slope = prior_terms(prior, start)
+            information, slope = prior_terms(prior, start)
+            # Determined directions are held at the start by a curvature of 1 and no slope.
             held = jnp.diag(jnp.stack([jnp.ones_like(length), jnp.ones_like(length), length**2]))
-            curvature, slope = fused(
-                held, 0 * slope, (free.T @ known @ free, free.T @ slope), onto, length
-            )
+            terms = free.T @ information @ free, free.T @ slope
+            curvature, slope = fuse_prior(held, 0 * slope, terms, onto, length)
             begin = moved(start, linalg.solve_psd(curvature, -slope)[0])
         first = (
             jnp.zeros((), jnp.int32),
             begin,
-            matcher._at(prepared, points, begin, prior),
+            matcher._linearize(prepared, points, begin, prior),
             jnp.asarray(_DAMPING[0], start.dtype),
             jnp.zeros((), bool),
         )
         k, pose, at, _, small = jax.lax.while_loop(unfinished, step, first)
+        pairs = Pairs(at.residual, at.weight)
         return make_match(
-            start,
-            pose,
             points,
-            residual=at.residual,
-            weight=at.weight,
-            pair=jnp.zeros(at.weight.shape, jnp.int32),
-            information=surface_information(lines, pose, at.weight),
-            spread=matcher.scale,
-            iterations=k,
-            converged=small,
-            limits=Limits(score=matcher.least_score, condition=matcher.least_condition),
-            prior=prior,
+            start,
+            prior,
+            SearchEnd(pose, k, small),
+            pairs,
+            mean_score(points, pairs, matcher.scale),
+            surface_information(lines, pose, at.weight),
+            Limits(score=matcher.least_score, condition=matcher.least_condition),
         )
 
     def cost(
@@ -174,13 +179,15 @@ class FieldMatcher(Matcher):
     ) -> Float[Array, ""]:
         return field_cost(prepared, points, pose, match.weight) + prior_cost(match.prior, pose)
 
-    def _at(self, of: Field, points: Points, pose: Array, prior: Prior | None) -> _At:
+    def _linearize(
+        self, of: Field, points: Points, pose: Array, prior: Prior | None
+    ) -> _Linearization:
         residual, jacobian = field_residuals(of, points, pose)
         used = points.valid & _on_map(of, points, pose) & (residual < self.reach)
         weight = weights(residual, used, self.kernel, self.scale)
         curvature, slope = information_of(jacobian, weight), (weight * residual) @ jacobian
         cost = self._robust_cost(residual, points) + 2 * prior_cost(prior, pose)
-        return _At(cost, residual, weight, curvature, slope)
+        return _Linearization(cost, residual, weight, curvature, slope)
 
     def _robust_cost(self, residual: Array, points: Points) -> Float[Array, ""]:
         """The sum of ρ over the valid points, also beyond reach, so that leaving has no gain."""
@@ -191,7 +198,7 @@ class FieldMatcher(Matcher):
 
 
 def _on_map(of: Field, points: Points, pose: Float[Array, "3"]) -> Bool[Array, "N"]:
-    """Which points lie on the grid; beyond, the field is that at the border."""
+    """The mask of the points on the grid; beyond, the field has the values of the border."""
     moved = points.position @ se2.rotation(pose[2]).T + pose[None, :2]
     cell = to_cells(of.origin, of.resolution, moved)
     size = jnp.asarray(of.values.shape[::-1], cell.dtype)

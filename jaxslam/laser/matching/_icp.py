@@ -24,11 +24,14 @@ from jaxslam.laser.matching._closed_form import (
 from jaxslam.laser.matching._matcher import Match, Matcher
 from jaxslam.laser.matching._outcome import (
     Limits,
+    Pairs,
+    SearchEnd,
     determined,
-    fused,
+    fuse_prior,
     information_along,
     length_of,
     make_match,
+    mean_score,
 )
 from jaxslam.laser.matching._point_sets import Points, Prior, prior_cost, prior_terms
 from jaxslam.laser.matching._surfaces import GAP, SPAN, Surface, nearest_points, surface, weights
@@ -65,9 +68,9 @@ class IcpSettings:
     fewest: int = static(default=10)
     """pairs below which the status is TOO_FEW"""
     least_score: Number = 0.5
-    """`Match.score` below which it is UNLIKE"""
+    """`Match.score` below which the status is UNLIKE"""
     least_condition: Number | None = 0.01
-    """`Match.condition` below which it is DEGENERATE; None: never"""
+    """`Match.condition` below which the status is DEGENERATE; None: never"""
 
     def __post_init__(self) -> None:
         name, trim = "IcpSettings", self.trim
@@ -84,18 +87,20 @@ class IcpSettings:
 
 
 class _PairedPoints(NamedTuple):
-    """A scan at a pose, and its partners."""
+    """The points of a scan at a pose, with their partners."""
 
     moved: Float[Array, "N 2"]
     """the points of the scan in the frame of the reference"""
     partner: Int[Array, "N"]
+    """index of the nearest point of the reference"""
     residual: Float[Array, "N"]
-    """not below 0 for point-to-point [m]"""
+    """[m], not below 0 for point-to-point"""
     weight: Float[Array, "N"]
+    """0 for rejected pairs"""
 
 
 _State: TypeAlias = tuple[Array, Array, Array, Array]
-"""iterations, pose, the pose before, how far the last step went"""
+"""Iterations, pose, the pose before, change of the last step [m]."""
 
 
 class Icp(Matcher):
@@ -110,15 +115,15 @@ class Icp(Matcher):
             raise ValueError(f"{type(self).__name__}: expected settings of IcpSettings, got {got}")
 
     def residual(self, of: Surface, moved: Array, partner: Array) -> Float[Array, "N"]:
-        """The residual [m] of each point of a scan and its partner."""
+        """The residual [m] between each point of a scan and its partner."""
         raise NotImplementedError
 
     def usable(self, of: Surface) -> Bool[Array, "M"]:
-        """Which points of the reference may be partners."""
+        """The mask of the points of the reference that may be partners."""
         return jnp.ones_like(of.straight)
 
     def quadratic(self, of: Surface, pairs: _PairedPoints, middle: Array) -> Quadratic:
-        """The cost Σ w e² of a motion about a middle (2,)."""
+        """The cost Σ w e² of a motion (t, r) about a middle (2,), for fixed pairs."""
         raise NotImplementedError
 
     def cost_of_pairs(
@@ -141,12 +146,16 @@ class Icp(Matcher):
         settings, length = icp.settings, length_of(points)
         limits = Limits(settings.fewest, settings.least_score, settings.least_condition)
 
-        def within(of: Quadratic, middle: Array, onto: Array, pose: Array) -> Array:
+        def step_within(of: Quadratic, middle: Array, onto: Array, pose: Array) -> Array:
+            """The step of Gauss and Newton without what the scans do not determine."""
+            # `onto` and the prior are of motions about the pose, the quadratic of motions about
+            # the middle.
             arm = middle - pose[:2]
             to_middle = jnp.eye(3, dtype=pose.dtype).at[:2, 2].set(jnp.stack([-arm[1], arm[0]]))
             curvature, slope = linearized(of)
             curvature, slope = to_middle.T @ curvature @ to_middle, to_middle.T @ slope
-            curvature, slope = fused(curvature, slope, prior_terms(prior, pose), onto, length)
+            terms = prior_terms(prior, pose)
+            curvature, slope = fuse_prior(curvature, slope, terms, onto, length)
             return to_middle @ linalg.solve_psd(curvature, -slope)[0]
 
         # The rounding of a step is some ulp of the coordinates: 1e-5 m in float32 at 10 m.
@@ -163,40 +172,40 @@ class Icp(Matcher):
             total = pairs.weight.sum()
             middle = pairs.weight @ pairs.moved / jnp.where(total > 0, total, 1.0)
             quadratic = icp.quadratic(prepared, pairs, middle)
-            both = quadratic
+            with_prior = quadratic
             if prior is not None:
-                both = added(quadratic, of_prior(prior, pose, middle))
+                with_prior = added(quadratic, of_prior(prior, pose, middle))
             information = _information(prepared, pairs, pose[:2], settings.lone)
             onto = determined(information, length, limits.condition)
             # The exact step where the scans determine all of it, else that of Gauss and Newton.
             moved = jnp.where(
                 (onto == jnp.eye(3, dtype=onto.dtype)).all(),
-                least(both),
-                within(quadratic, middle, onto, pose),
+                least(with_prior),
+                step_within(quadratic, middle, onto, pose),
             )
             pivot = se2.from_frame(moved, pose[:2] - middle) + middle
             after = jnp.concatenate([pivot, wrap(pose[2] + moved[2])[None]])
             # A limit cycle of two steps, where pairs alternate, has ended as well.
-            change = jnp.minimum(_size(after, pose, length), _size(after, before, length))
+            change = jnp.minimum(
+                _pose_distance(after, pose, length), _pose_distance(after, before, length)
+            )
             return k + 1, after, pose, change
 
-        none = jnp.full(3, jnp.inf, start.dtype).at[2].set(0.0)
-        first = jnp.zeros((), jnp.int32), start, none, jnp.asarray(jnp.inf, start.dtype)
+        # No pose before the first: infinitely far away, with an angle that can be wrapped.
+        before = jnp.full(3, jnp.inf, start.dtype).at[2].set(0.0)
+        first = jnp.zeros((), jnp.int32), start, before, jnp.asarray(jnp.inf, start.dtype)
         k, pose, _, change = jax.lax.while_loop(unfinished, step, first)
         at = icp._pairs(prepared, points, pose)
+        pairs = Pairs(at.residual, at.weight, at.partner)
         return make_match(
-            start,
-            pose,
             points,
-            residual=at.residual,
-            weight=at.weight,
-            pair=at.partner,
-            information=_information(prepared, at, pose[:2], settings.lone),
-            spread=settings.scale,
-            iterations=k,
-            converged=change <= tolerance,
-            limits=limits,
-            prior=prior,
+            start,
+            prior,
+            SearchEnd(pose, k, change <= tolerance),
+            pairs,
+            mean_score(points, pairs, settings.scale),
+            _information(prepared, at, pose[:2], settings.lone),
+            limits,
         )
 
     def cost(
@@ -205,8 +214,8 @@ class Icp(Matcher):
         icp = in_dtype(self, pose.dtype)
         moved = points.position @ se2.rotation(pose[2]).T + pose[None, :2]
         partner = jnp.maximum(match.pair, 0)
-        of_pairs = icp.cost_of_pairs(prepared, moved, partner, match.weight)
-        return of_pairs + prior_cost(match.prior, pose)
+        pairs_cost = icp.cost_of_pairs(prepared, moved, partner, match.weight)
+        return pairs_cost + prior_cost(match.prior, pose)
 
     def _pairs(self, of: Surface, points: Points, pose: Array) -> _PairedPoints:
         settings = self.settings
@@ -219,15 +228,18 @@ class Icp(Matcher):
         return _PairedPoints(moved, partner, residual, weight)
 
 
-def _size(a: Array, b: Array, length: Array) -> Array:
-    """How far two poses are apart [m]."""
+def _pose_distance(a: Array, b: Array, length: Array) -> Array:
+    """The distance between two poses [m], angles times a length."""
     return jnp.hypot(a[0] - b[0], a[1] - b[1]) + length * jnp.abs(wrap(a[2] - b[2]))
 
 
 def _information(
     of: Surface, at: _PairedPoints, pivot: Float[Array, "2"], lone: Number | None
 ) -> Float[Array, "3 3"]:
-    """The information Σ w J Jᵀ about the pivot, of partners with a line and of those without."""
+    """The information Σ w J Jᵀ about the pivot, of partners with a line and partners without.
+
+    A partner without a line has information in all directions: of lines along both axes.
+    """
     j, arm = at.partner, at.moved - pivot[None]
     straight = of.straight[j]
     by_lines = information_along(of.normal[j], of.tilt[j], arm, jnp.where(straight, at.weight, 0.0))
@@ -235,11 +247,11 @@ def _information(
         return by_lines
     weight = lone**2 * jnp.where(straight, 0.0, at.weight)
     axis = jnp.zeros_like(arm).at[:, 0].set(1.0)
-    none = jnp.zeros_like(weight)
+    tilt = jnp.zeros_like(weight)
     return (
         by_lines
-        + information_along(axis, none, arm, weight)
-        + information_along(axis[:, ::-1], none, arm, weight)
+        + information_along(axis, tilt, arm, weight)
+        + information_along(axis[:, ::-1], tilt, arm, weight)
     )
 
 

@@ -1,4 +1,4 @@
-"""The base class of matchers, and what they find; `match` calls one outside traces."""
+"""The base class of matchers and its result; `match` calls a matcher outside traces."""
 
 from enum import IntEnum
 from functools import partial
@@ -38,12 +38,12 @@ class MatchStatus(IntEnum):
 
 
 class Match(NamedTuple):
-    """Where a scan lies in the frame of its reference."""
+    """The pose of a scan in the frame of its reference, and how well it is determined."""
 
     pose: Float[Array, "3"]
     """T of the scan's frame in the reference's frame, so that T ∘ p lies on the reference"""
     status: Int[Array, ""]
-    """see `MatchStatus`"""
+    """a `MatchStatus`"""
     iterations: Int[Array, ""]
     """steps taken; of `Correlative` the blocks of the lattice that were divided"""
     residual: Float[Array, ""]
@@ -58,16 +58,16 @@ class Match(NamedTuple):
     """(dx, dy, dθ), of unit length where dθ is times the RMS range: the least eigenvector of the
     information"""
     condition: Float[Array, ""]
-    """its eigenvalue over the largest, lengths in RMS ranges"""
+    """least eigenvalue of the information over the largest, lengths in RMS ranges"""
     determined: Float[Array, "3 3"]
     """projection of a motion (dx, dy, dθ) onto the determined directions: the identity, unless the
     match is DEGENERATE"""
     pair: Int[Array, "N"]
-    """the partner of each point in the reference, -1 without; in a grid 0 where it took part"""
+    """index of the partner of each point in the reference, -1 without; in a grid 0 for inliers"""
     weight: Float[Array, "N"]
-    """of each pair, 0 where it took no part"""
+    """weight of each point; 0 for rejected points"""
     prior: Prior | None = None
-    """with which it was found"""
+    """prior of the search"""
 
 
 class Matcher(Component):
@@ -85,7 +85,7 @@ class Matcher(Component):
         self._check(Matcher, methods | {"cost": f"{prepared}, pose, match"})
 
     def prepare(self, reference: PyTree) -> PyTree:
-        """What the matcher needs of a reference, once for all scans: a pytree of arrays."""
+        """The pytree of arrays that `match` needs of a reference, once for all scans."""
         raise NotImplementedError
 
     def match(
@@ -95,7 +95,7 @@ class Matcher(Component):
         start: Float[Array, "3"],
         prior: Prior | None = None,
     ) -> Match:
-        """The match of a scan, by while loops, which have only forward derivatives."""
+        """The match of a scan; its while loops have forward derivatives only."""
         raise NotImplementedError
 
     def cost(
@@ -129,15 +129,15 @@ def match(
         ValueError: a reference of another kind, arrays that do not fit each other, numbers that
             are not finite. A scan without points is a status.
     """
-    batch = _checked(matcher, reference, points, start)
+    batch = _batch_of(matcher, reference, points, start)
     if prior is not None:
         _check_prior(prior, batch)
     with jax.numpy_dtype_promotion("standard"):  # the user may have refused promotion: "strict"
         dtype = jnp.result_type(points.position, *floats(reference), jnp.float32)
     start = jnp.asarray(start, dtype)
     reference, points, prior = in_dtype((reference, points, prior), dtype)
-    found: Match = (_many if batch else _one)(matcher, reference, points, start, prior)
-    return found
+    result: Match = (_match_many if batch else _match)(matcher, reference, points, start, prior)
+    return result
 
 
 def floats(tree: PyTree) -> list[Array]:
@@ -147,31 +147,27 @@ def floats(tree: PyTree) -> list[Array]:
 
 
 @partial(jax.jit, inline=True)
-def _one(
+def _match(
     matcher: Matcher, reference: Reference, points: Points, start: Array, prior: Prior | None
 ) -> Match:
     return matcher.match(matcher.prepare(reference), points, start, prior)
 
 
 @partial(jax.jit, inline=True)
-def _many(
+def _match_many(
     matcher: Matcher, reference: Reference, points: Points, start: Array, prior: Prior | None
 ) -> Match:
-    return jax.vmap(matcher.match)(_prepared_all(matcher, reference), points, start, prior)
+    # Grids one after another: loops over cells are slow side by side.
+    prepare_all = (
+        partial(jax.lax.map, matcher.prepare) if matcher.of_grid else jax.vmap(matcher.prepare)
+    )
+    return jax.vmap(matcher.match)(prepare_all(reference), points, start, prior)
 
 
-def _prepared_all(matcher: Matcher, references: Reference) -> PyTree:
-    """What the matcher needs of each reference; grids one after another, as loops over cells go
-    slowly side by side."""
-    if matcher.of_grid:
-        return jax.lax.map(matcher.prepare, references)
-    return jax.vmap(matcher.prepare)(references)
-
-
-def _checked(
+def _batch_of(
     matcher: object, reference: object, points: object, start: ArrayLike
 ) -> tuple[int, ...]:
-    """The leading axis, () of one pair; raises ValueError on what `match` refuses."""
+    """The leading axis of the arguments, () of a pair; ValueError on what `match` refuses."""
     if not isinstance(matcher, Matcher):
         raise ValueError(f"match: expected a Matcher, got {type(matcher).__name__}")
     kind = Grid if matcher.of_grid else Points
@@ -203,16 +199,16 @@ def _check_prior(prior: object, batch: tuple[int, ...]) -> None:
     if not isinstance(prior, Prior):
         raise ValueError(f"match: expected a Prior, got {type(prior).__name__}")
     if np.shape(prior.pose) != (*batch, 3) or np.shape(prior.information) != (*batch, 3, 3):
-        whole = " x ".join(str(size) for size in (*batch, 3))
+        shape = " x ".join(str(size) for size in (*batch, 3))
         raise ValueError(
-            f"match: expected a prior of a pose {whole} and an information {whole} x 3, got "
+            f"match: expected a prior of a pose {shape} and an information {shape} x 3, got "
             f"{shape_text(prior.pose)} and {shape_text(prior.information)}"
         )
     if is_concrete(prior):
         information = np.asarray(prior.information)
         if not (np.all(np.isfinite(np.asarray(prior.pose))) and np.all(np.isfinite(information))):
             raise ValueError("match: expected a finite prior")
-        # By the inverse of a covariance in float32, which may have few digits.
+        # 1e-4: the inverse of a covariance in float32 may have few digits.
         if asymmetric(information, 1e-4).any() or indefinite(information, 1e-4).any():
             raise ValueError(
                 "match: expected a symmetric information of the prior, positive semi-definite"
@@ -230,7 +226,7 @@ def _check_points(name: str, of: object, batch: tuple[int, ...] = ()) -> None:
         or any(np.shape(part) != (*shape, 2) for part in of[:2])
     ):
         shapes = ", ".join(shape_text(part) for part in of)
-        whole = " x ".join(str(size) for size in (*batch, "N"))
-        raise ValueError(f"{name}: expected {whole} positions, rays and masks, got {shapes}")
+        expected = " x ".join(str(size) for size in (*batch, "N"))
+        raise ValueError(f"{name}: expected {expected} positions, rays and masks, got {shapes}")
     if is_concrete(of) and not all(np.all(np.isfinite(np.asarray(part))) for part in of[:2]):
         raise ValueError(f"{name}: expected finite points; those that are not valid, too")

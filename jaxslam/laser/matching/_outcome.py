@@ -1,11 +1,11 @@
-"""Common results of all matchers: the weakest direction, the score, the status."""
+"""The common end of all matchers: the score, what the scans determine, the status."""
 
 from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.laser.matching._matcher import Match, MatchStatus
 from jaxslam.laser.matching._point_sets import Points, Prior
@@ -24,61 +24,81 @@ class Limits(NamedTuple):
     """of `Match.condition`; None: no match is DEGENERATE"""
 
 
-def make_match(
-    start: Float[Array, "3"],
-    pose: Float[Array, "3"],
-    points: Points,
-    *,
-    residual: Float[Array, "N"],
-    weight: Float[Array, "N"],
-    pair: Array,
-    information: Float[Array, "3 3"],
-    spread: Number,
-    iterations: Array,
-    converged: Array,
-    limits: Limits,
-    ambiguous: Array | bool = False,
-    score: Array | None = None,
-    prior: Prior | None = None,
-) -> Match:
-    """The `Match` of a pose that a search ended at, with its status.
+class Pairs(NamedTuple):
+    """The points of a scan and their partners in the reference."""
 
-    The score is that of the residuals over `spread`, unless given. Along a degenerate direction
-    other poses fit as well, so that a match is only called ambiguous where it is not degenerate.
+    residual: Float[Array, "N"]
+    """[m]"""
+    weight: Float[Array, "N"]
+    """0 for points without a part"""
+    partner: Int[Array, "N"] | int = 0
+    """index of a reference point; 0 in a grid"""
+
+
+class SearchEnd(NamedTuple):
+    """Where a search ended, and how."""
+
+    pose: Float[Array, "3"]
+    iterations: Int[Array, ""]
+    converged: Bool[Array, ""] | bool
+    ambiguous: Bool[Array, ""] | bool = False
+    """another pose is nearly as good"""
+
+
+def make_match(
+    points: Points,
+    start: Float[Array, "3"],
+    prior: Prior | None,
+    end: SearchEnd,
+    pairs: Pairs,
+    score: Float[Array, ""],
+    information: Float[Array, "3 3"],
+    limits: Limits,
+) -> Match:
+    """The `Match` of a scan whose search has ended, with its status.
+
+    Of the statuses that apply the last of `MatchStatus` counts: along a degenerate direction other
+    poses fit as well, so a match is called ambiguous only where it is not degenerate. With too few
+    partners the pose is the start.
     """
-    took_part = weight > 0
-    total = jnp.maximum(weight.sum(), jnp.finfo(weight.dtype).tiny)
+    took_part = pairs.weight > 0
+    total = jnp.maximum(pairs.weight.sum(), jnp.finfo(pairs.weight.dtype).tiny)
     count = jnp.maximum(points.valid.sum(), 1)
-    if score is None:
-        closeness = jnp.where(took_part, jnp.exp(-0.5 * (residual / spread) ** 2), 0.0)
-        score = closeness.sum() / count
     length = length_of(points)
     condition, weakest = _weakest_direction(information, length)
     few = took_part.sum() < limits.fewest
     status = jnp.asarray(MatchStatus.CONVERGED, jnp.int32)
     for applies, value in (
-        (~converged, MatchStatus.NOT_CONVERGED),
-        (ambiguous, MatchStatus.AMBIGUOUS),
+        (~jnp.asarray(end.converged), MatchStatus.NOT_CONVERGED),
+        (end.ambiguous, MatchStatus.AMBIGUOUS),
         (limits.condition is not None and condition < limits.condition, MatchStatus.DEGENERATE),
         (score < limits.score, MatchStatus.UNLIKE),
         (few, MatchStatus.TOO_FEW),
     ):
         status = jnp.where(applies, jnp.asarray(value, jnp.int32), status)
+    inliers = took_part.sum(dtype=pairs.weight.dtype) / count.astype(pairs.weight.dtype)
     return Match(
-        pose=jnp.where(few, start, pose),
+        pose=jnp.where(few, start, end.pose),
         status=status,
-        iterations=iterations,
-        residual=jnp.sqrt((weight * residual**2).sum() / total),
-        inliers=took_part.sum(dtype=weight.dtype) / count.astype(weight.dtype),
+        iterations=end.iterations,
+        residual=jnp.sqrt((pairs.weight * pairs.residual**2).sum() / total),
+        inliers=inliers,
         score=score,
         information=information,
         weakest=weakest,
         condition=condition,
         determined=determined(information, length, limits.condition),
-        pair=jnp.where(took_part, pair, -1),
-        weight=weight,
+        pair=jnp.where(took_part, jnp.asarray(pairs.partner, jnp.int32), -1),
+        weight=pairs.weight,
         prior=prior,
     )
+
+
+def mean_score(points: Points, pairs: Pairs, scale: Number) -> Float[Array, ""]:
+    """The mean of exp(-½ (e/s)²) over the valid points of a scan, 0 for points without a part."""
+    closeness = jnp.exp(-0.5 * (pairs.residual / scale) ** 2)
+    closeness = jnp.where(pairs.weight > 0, closeness, 0.0)
+    return closeness.sum() / jnp.maximum(points.valid.sum(), 1)
 
 
 def length_of(points: Points) -> Float[Array, ""]:
@@ -113,8 +133,8 @@ def information_along(
         turn = v[:, 1] * arm[:, 0] - v[:, 0] * arm[:, 1]
         return jnp.concatenate([v, turn[:, None]], axis=1)
 
-    both = information_of(by_motion(normal), weight * (1 + tilt))
-    return both - information_of(by_motion(along), weight * tilt)
+    across = information_of(by_motion(normal), weight * (1 + tilt))
+    return across - information_of(by_motion(along), weight * tilt)
 
 
 def _weakest_direction(
@@ -122,7 +142,7 @@ def _weakest_direction(
 ) -> tuple[Float[Array, ""], Float[Array, "3"]]:
     """The least over the largest eigenvalue, in [0, 1], and the eigenvector of the least.
 
-    The third coordinate is an angle, multiplied by a length [m]. Both are constants for
+    The angle is measured in lengths [m], so that the eigenvalues compare. Both are constants for
     derivatives.
     """
     scale = jnp.stack([jnp.ones_like(length), jnp.ones_like(length), 1 / length])
@@ -136,12 +156,18 @@ def _weakest_direction(
 def determined(
     information: Float[Array, "3 3"], length: Float[Array, ""], least: Number | None
 ) -> Float[Array, "3 3"]:
-    """The projection D of a motion onto the determined directions; the identity for all directions,
-    or `least` is None.
+    """The projection D of a motion onto the determined directions; the identity if `least` is None.
 
-    With lengths in RMS ranges, the directions of the eigenvectors whose eigenvalue is at least
-    `least` of the largest are kept (Zhang, Kaess & Singh 2016, "On degeneracy of optimization-based
-    state estimation problems", ICRA). A constant for derivatives.
+    With lengths in RMS ranges, a direction is determined if it is an eigenvector whose eigenvalue
+    is at least `least` of the largest (Zhang, Kaess & Singh 2016, "On degeneracy of
+    optimization-based state estimation problems", ICRA). A constant for derivatives.
+
+    | eigenvalues below `least` | D, with unit eigenvectors v₁ (least) and v₃ (largest) |
+    |---|---|
+    | none | I |
+    | one | I - v₁ v₁ᵀ |
+    | two | v₃ v₃ᵀ |
+    | all, the matrix being zero | 0 |
     """
     eye = jnp.eye(3, dtype=information.dtype)
     if least is None:
@@ -149,34 +175,42 @@ def determined(
     scale = jnp.stack([jnp.ones_like(length), jnp.ones_like(length), 1 / length])
     a = jax.lax.stop_gradient(scale[:, None] * information * scale[None, :])
     low, high = _extreme_eigenvalues(a)
-    some = high > 0
+    positive = high > 0
 
-    def below(value: Array) -> Array:
-        return jnp.clip(value / jnp.where(some, high, 1.0), 0.0, 1.0) < least
+    def is_below(value: Array) -> Array:
+        return jnp.clip(value / jnp.where(positive, high, 1.0), 0.0, 1.0) < least
 
     weak, strong = eigenvector(a, low), eigenvector(a, high)
     across = eye - weak[:, None] * weak[None, :]
-    along = jnp.where(some, strong[:, None] * strong[None, :], 0.0)
-    two = below(jnp.trace(a) - low - high) | ~some
-    kept = jnp.where(two, along, jnp.where(below(low), across, eye))
-    return scale[:, None] * kept / scale[None, :]
+    along = jnp.where(positive, strong[:, None] * strong[None, :], 0.0)
+    two = is_below(jnp.trace(a) - low - high) | ~positive  # the middle one is the rest of the trace
+    projection = jnp.where(two, along, jnp.where(is_below(low), across, eye))
+    return scale[:, None] * projection / scale[None, :]
 
 
-def fused(
+def fuse_prior(
     curvature: Float[Array, "3 3"],
     slope: Float[Array, "3"],
     prior: tuple[Float[Array, "3 3"], Float[Array, "3"]],
     onto: Float[Array, "3 3"],
     length: Float[Array, ""],
 ) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
-    """Curvature Dᵀ A D + Λ and slope Dᵀ g + Λ e of a step: what the scans do not determine (D of
-    `determined`) is the prior's alone, however little it says.
+    """The curvature Dᵀ A D + Λ and the slope Dᵀ g + Λ e of a step with a prior.
 
-    A small share of Λ, and where it is zero of A, keeps a motion at zero that neither determines.
+    What the scans do not determine (D of `determined`) is the prior's alone, however little it
+    says.
+
+    Args:
+        curvature, slope: A and g, of the scans.
+        prior: Λ and Λ e (`prior_terms`).
+        onto: D.
+        length: [m] factor of an angle beside lengths.
     """
     scale = jnp.stack([jnp.ones_like(length), jnp.ones_like(length), length])
     eye = jnp.eye(3, dtype=curvature.dtype)
     free = scale[:, None] * (eye - onto)
+    # A share ε^¾ of the trace of Λ, or of A if Λ is zero, keeps the matrix regular: a motion that
+    # neither determines stays at zero. It is small beside all else, and large beside rounding.
     of_prior, of_scans = jnp.trace(prior[0]), jnp.trace(curvature)
     size = jnp.where(of_prior > 0, of_prior, jnp.where(of_scans > 0, of_scans, 1.0))
     keep = float(jnp.finfo(curvature.dtype).eps) ** 0.75 * size / length**2
@@ -201,19 +235,20 @@ def _extreme_eigenvalues(a: Float[Array, "3 3"]) -> tuple[Float[Array, ""], Floa
 
 
 def eigenvector(a: Float[Array, "3 3"], value: Float[Array, ""]) -> Float[Array, "3"]:
-    """A unit eigenvector of a symmetric matrix: across two rows of A - λI, the largest product.
+    """A unit eigenvector of a symmetric matrix: the largest cross product of two rows of A - λI.
 
-    Where λ is a double eigenvalue, any vector across one row; of a multiple of I, (1, 0, 0).
+    If λ is a double eigenvalue, any vector across a row; of a multiple of I, (1, 0, 0).
     """
     rows = a - value * jnp.eye(3, dtype=a.dtype)
     across = jnp.stack([jnp.cross(rows[i], rows[j]) for i, j in ((0, 1), (1, 2), (2, 0))])
     size = (across**2).sum(axis=1)
     row = rows[jnp.argmax((rows**2).sum(axis=1))]
+    # Rows are parallel to some hundred ulp where λ is double: its rounding is that of the largest.
     tiny = 100 * jnp.finfo(a.dtype).eps
     norm = (row**2).sum()
-    # Across one row: with the axis of its least entry.
+    # Across a row: its product with the axis of its least entry, which is farthest from parallel.
     axis = jnp.eye(3, dtype=a.dtype)[jnp.argmin(jnp.abs(row))]
-    lone = jnp.where(norm > 0, jnp.cross(row, axis), jnp.eye(3, dtype=a.dtype)[0])
-    double = size.max() <= (tiny * norm) ** 2
-    vector = jnp.where(double, lone, across[jnp.argmax(size)])
+    across_row = jnp.where(norm > 0, jnp.cross(row, axis), jnp.eye(3, dtype=a.dtype)[0])
+    is_double = size.max() <= (tiny * norm) ** 2
+    vector = jnp.where(is_double, across_row, across[jnp.argmax(size)])
     return vector / jnp.sqrt((vector**2).sum())

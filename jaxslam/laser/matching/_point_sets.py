@@ -62,13 +62,13 @@ def points(
 
 
 def transformed(of: Points, pose: Float[Array, "3"]) -> Points:
-    """The points of the frame of a pose, in the coordinates of the frame of that pose."""
+    """The points, given in the frame of a pose, in the frame in which the pose is given."""
     turn = se2.rotation(pose[2]).T
     return Points(of.position @ turn + pose[None, :2], of.ray @ turn, of.valid)
 
 
-def moved_along_rays(of: Points, by: Float[Array, "N"]) -> Points:
-    """The points with their ranges changed by d [m]."""
+def move_along_rays(of: Points, by: Float[Array, "N"]) -> Points:
+    """The points with a change [m] of their ranges."""
     return of._replace(position=of.position + by[:, None] * of.ray)
 
 

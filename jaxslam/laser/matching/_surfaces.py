@@ -1,6 +1,6 @@
 """The surface that a scan samples, a line through the neighbours of each point; pairs of points.
 
-Each point of a scan has its nearest point of a reference; some of these pairs count.
+Each point of a scan is paired with its nearest point of a reference; `weights` rejects pairs.
 """
 
 from typing import NamedTuple
@@ -22,10 +22,15 @@ GAP = 0.5
 """[m] between points beyond which they are not neighbours."""
 
 _BENT = 4.0
-"""A line whose points scatter by more than this times the median variance goes round a corner."""
+"""Times the median variance of the points across a line above which it goes round a corner
+(chosen: twice their scatter)."""
 
 _FLAT = 1e-3
-"""[m] Points that scatter less than this form a line."""
+"""[m] Points that scatter less than this form a line: in a scan without noise, where the median
+variance is 0."""
+
+_LONG = 0.1
+"""Largest variance across a line relative to the variance along it."""
 
 
 class Surface(NamedTuple):
@@ -75,26 +80,28 @@ def surface(
     xx, yy, xy = (d[..., 0] ** 2).sum(0), (d[..., 1] ** 2).sum(0), (d[..., 0] * d[..., 1]).sum(0)
     flat, cross = xx - yy, 2 * xy
     size = flat**2 + cross**2
-    round_ = ~((n >= 3) & (size > 0))
+    # Too few points, or a round cloud, have no direction; any, with finite derivatives.
+    has_no_line = ~((n >= 3) & (size > 0))
     flat, cross, size = (
-        jnp.where(round_, one, x) for x, one in ((flat, 1.0), (cross, 0.0), (size, 1.0))
+        jnp.where(has_no_line, safe, value)
+        for value, safe in ((flat, 1.0), (cross, 0.0), (size, 1.0))
     )
     root = jnp.sqrt(size)
     direction = 0.5 * jnp.arctan2(cross, flat)
     largest, least = 0.5 * (xx + yy + root), jnp.maximum(0.5 * (xx + yy - root), 0.0)
     variance = least / jnp.maximum(n - 2, 1)
-    usual = jax.lax.stop_gradient(_median(variance, ~round_))
+    usual = jax.lax.stop_gradient(_median(variance, ~has_no_line))
     return Surface(
         position=jnp.where(valid[:, None], p, _FAR),
-        middle=jnp.where(round_[:, None], p, middle),
+        middle=jnp.where(has_no_line[:, None], p, middle),
         normal=jnp.stack([-jnp.sin(direction), jnp.cos(direction)], axis=-1),
-        tilt=variance / jnp.where(round_, 1.0, largest),
-        straight=~round_ & (least < 0.1 * largest) & (variance < _BENT * usual + _FLAT**2),
+        tilt=variance / jnp.where(has_no_line, 1.0, largest),
+        straight=~has_no_line & (least < _LONG * largest) & (variance < _BENT * usual + _FLAT**2),
     )
 
 
 def surface_at(of: Surface, pose: Float[Array, "3"]) -> Surface:
-    """A surface that is given in the frame of a pose, in the coordinates of the pose's frame."""
+    """The surface, given in the frame of a pose, in the frame in which the pose is given."""
     turn = se2.rotation(pose[2]).T
     return of._replace(
         position=of.position @ turn + pose[None, :2],

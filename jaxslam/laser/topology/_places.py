@@ -1,7 +1,7 @@
 """Places and doors of a grid, and places of a path.
 
-Of a grid, parts of the skeleton of free space, divided at narrowings; of a path or a pose graph,
-poses in groups, adjacent where the robot went between them.
+Places of a grid are parts of the skeleton of free space, divided at narrowings; places of a path or
+a pose graph are groups of poses, adjacent where the robot went between them.
 """
 
 from typing import NamedTuple
@@ -29,6 +29,7 @@ class Door(NamedTuple):
     width: float
     """[m], to about a cell"""
     places: tuple[int, int]
+    """the two places, in ascending order"""
     cell: tuple[int, int]
     """row and column"""
 
@@ -39,7 +40,7 @@ class TopologicalMap(NamedTuple):
     label: Int[np.ndarray, "H W"]
     """place of each free cell that a place reaches, -1 elsewhere"""
     center: Float[np.ndarray, "P 2"]
-    """of each place: the cell of its skeleton nearest to the mean of them [m]"""
+    """cell of the skeleton of a place that is nearest to their mean [m]"""
     area: Float[np.ndarray, "P"]
     """[m²]"""
     doors: tuple[Door, ...]
@@ -48,7 +49,7 @@ class TopologicalMap(NamedTuple):
 
     @property
     def adjacent(self) -> Bool[np.ndarray, "P P"]:
-        """Whether a door leads from one place to another."""
+        """Mask of the pairs of places with a door between them."""
         out = np.zeros((len(self.center),) * 2, bool)
         for door in self.doors:
             out[door.places] = out[door.places[::-1]] = True
@@ -60,10 +61,16 @@ def topological_map(
 ) -> TopologicalMap:
     """The places of a map and the doors between them.
 
-    Cells of the `skeleton` are joined from the widest down. One that joins two parts is a door, and
-    stays apart, if it is narrower than max_width and each part has somewhere a clearance that is
-    `prominence` more; otherwise the parts are one. What is left are the places. A free cell belongs
-    to the place whose skeleton is nearest on a way through free cells.
+    Cells of the `skeleton` are joined in the order of their width, the widest first:
+
+    | parts beside the cell | the cell |
+    |---|---|
+    | none | begins a part |
+    | two or more that are wider by `prominence`, and it is at most max_width wide | is a door |
+    | otherwise | joins the parts |
+
+    The parts in the end are the places. A free cell belongs to the place whose skeleton is nearest
+    on a way through free cells.
 
     Args:
         clearance: radius of the robot [m]; narrower passages do not connect.
@@ -76,11 +83,12 @@ def topological_map(
         raise ValueError(
             f"topological_map: expected numbers above 0, got {max_width} and {prominence}"
         )
-    found = skeleton(grid, clearance=clearance)
-    height, width = found.cells.shape
-    away = found.clearance.reshape(-1)
-    cells = np.flatnonzero(found.cells)
+    ridge = skeleton(grid, clearance=clearance)
+    height, width = ridge.cells.shape
+    away = ridge.clearance.reshape(-1)
+    cells = np.flatnonzero(ridge.cells)
     order = cells[np.argsort(-away[cells], kind="stable")]
+    # Parts as trees of cells: the root of a part is its widest cell.
     parent: dict[int, int] = {}
     gates: list[tuple[int, int, int]] = []
 
@@ -98,62 +106,62 @@ def topological_map(
             for b in (-1, 0, 1)
             if 0 <= i + a < height and 0 <= j + b < width
         ]
-        # Parts around, the widest first: the root of a part is its widest cell.
         parts = sorted({root(c) for c in near if c in parent}, key=lambda c: (-away[c], c))
         high = [c for c in parts if away[c] >= away[at] + prominence]
         if len(high) > 1 and 2 * away[at] <= max_width:
             gates.append((at, high[0], high[1]))
-            for low in set(parts) - set(high):
+            for low in set(parts) - set(high):  # no places of their own: recesses of the door
                 parent[low] = high[0]
             continue
         parent[at] = at
         for part in parts:
             parent[root(at)] = part if away[part] >= away[root(at)] else root(at)
             parent[part] = root(at)
-    return _label(grid, found, {c: root(c) for c in parent}, gates)
+    return _label(grid, ridge, {c: root(c) for c in parent}, gates)
 
 
 def _label(
-    grid: Grid, found: Skeleton, part: dict[int, int], gates: list[tuple[int, int, int]]
+    grid: Grid, ridge: Skeleton, part: dict[int, int], gates: list[tuple[int, int, int]]
 ) -> TopologicalMap:
-    """The map from the part of each cell of the skeleton, named by one of its cells."""
-    shape = found.cells.shape
-    where = cell_centers(grid)
-    away = found.clearance.reshape(-1)
-    names = sorted(set(part.values()))
-    index = {name: k for k, name in enumerate(names)}
+    """The map by the part of each cell of the skeleton.
+
+    Args:
+        part: root of each cell.
+        gates: doors: a cell, and the roots of the parts on both sides.
+    """
+    shape = ridge.cells.shape
+    center = cell_centers(grid)
+    away = ridge.clearance.reshape(-1)
+    roots = sorted(set(part.values()))
+    index = {root: k for k, root in enumerate(roots)}
     starts = np.array(list(part), int)
-    of_start = np.array([index[name] for name in part.values()], int)
-    free = away > 0
-    weights = neighbours(free.reshape(shape))
+    place_of_start = np.array([index[root] for root in part.values()], int)
+    weights = neighbours((away > 0).reshape(shape))
     size = float(np.asarray(grid.resolution))
     _, _, source = scipy.sparse.csgraph.dijkstra(
         weights, directed=False, indices=starts, min_only=True, return_predecessors=True
     )
     place = np.full(len(away), -1)
-    place[starts] = of_start
+    place[starts] = place_of_start
     reached = source >= 0
     place[reached] = place[source[reached]]
     doors = []
-    for at, one, other in gates:
-        ends = tuple(sorted((index[part[one]], index[part[other]])))
-        if ends[0] != ends[1]:
-            cell = divmod(at, shape[1])
-            doors.append(Door(where[at], 2 * float(away[at]), (ends[0], ends[1]), cell))
+    for at, *sides in gates:
+        low, high = sorted(index[part[side]] for side in sides)
+        if low != high:  # the parts were joined elsewhere
+            doors.append(Door(center[at], 2 * float(away[at]), (low, high), divmod(at, shape[1])))
+    middles = []
+    for k in range(len(roots)):
+        points = center[starts[place_of_start == k]]
+        middles.append(points[((points - points.mean(axis=0)) ** 2).sum(axis=1).argmin()])
     return TopologicalMap(
         label=place.reshape(shape),
-        center=np.array([_middle(where[starts[of_start == k]]) for k in range(len(names))]),
-        area=np.bincount(place[place >= 0], minlength=len(names)) * size**2,
+        center=np.array(middles),
+        area=np.bincount(place[place >= 0], minlength=len(roots)) * size**2,
         doors=tuple(doors),
-        skeleton=found,
+        skeleton=ridge,
         grid=grid,
     )
-
-
-def _middle(points: Float[np.ndarray, "n 2"]) -> Float[np.ndarray, "2"]:
-    """The point, of some, that is nearest to their mean."""
-    off = points - points.mean(axis=0)
-    return np.asarray(points[np.argmin((off**2).sum(axis=1))])
 
 
 def cell_centers(grid: Grid) -> Float[np.ndarray, "n 2"]:
@@ -167,10 +175,10 @@ def neighbours(cells: Bool[np.ndarray, "H W"]) -> "scipy.sparse.csr_matrix":
     index = np.arange(height * width).reshape(height, width)
     rows, columns, weights = [], [], []
     for i, j in _HALF:
-        here = index[: height - i, max(0, -j) : width - max(0, j)]
+        cell = index[: height - i, max(0, -j) : width - max(0, j)]
         shifted = index[i:, max(0, j) : width - max(0, -j)]
-        both = cells.reshape(-1)[here] & cells.reshape(-1)[shifted]
-        rows.append(here[both])
+        both = cells.reshape(-1)[cell] & cells.reshape(-1)[shifted]
+        rows.append(cell[both])
         columns.append(shifted[both])
         weights.append(np.full(int(both.sum()), np.hypot(i, j)))
     pairs = np.concatenate(rows), np.concatenate(columns)
@@ -181,17 +189,17 @@ class PathPlaces(NamedTuple):
     """Places that cover the poses of a path."""
 
     center: Int[np.ndarray, "P"]
-    """the pose that represents each place"""
+    """pose that represents a place"""
     place: Int[np.ndarray, "N"]
-    """of each pose: that of the nearest center"""
+    """place of each pose, by the nearest center"""
     adjacent: Bool[np.ndarray, "P P"]
 
 
 def path_places(poses: ArrayLike, pairs: ArrayLike, *, radius: float) -> PathPlaces:
     """The places of a pose graph: no pose is further than `radius` [m] from its place's center.
 
-    In the order of the poses, one that is further from all centers so far becomes a center. Two
-    places are adjacent if an edge of the graph leads from one to the other.
+    In the order of the poses, a pose that is further from all centers so far becomes a center. Two
+    places are adjacent if an edge of the graph joins them.
 
     Args:
         poses: (N, 2 or 3). pairs: (E, 2) of poses that an edge connects, loops included; for a path
@@ -216,7 +224,7 @@ def path_places(poses: ArrayLike, pairs: ArrayLike, *, radius: float) -> PathPla
     gap = np.linalg.norm(points[:, None, :2] - points[None, centers, :2], axis=2)
     place = gap.argmin(axis=1)
     adjacent = np.zeros((len(centers),) * 2, bool)
-    one, other = place[edges].T
-    adjacent[one, other] = adjacent[other, one] = True
+    first, second = place[edges].T
+    adjacent[first, second] = adjacent[second, first] = True
     np.fill_diagonal(adjacent, False)
     return PathPlaces(np.array(centers), place, adjacent)

@@ -26,11 +26,11 @@ class Route(NamedTuple):
 
 
 def route(places: TopologicalMap, start: ArrayLike, goal: ArrayLike) -> Route:
-    """The shortest way from a point to another along the skeleton of a map (Dijkstra).
+    """The shortest way from a point to a goal along the skeleton of a map (Dijkstra).
 
     From the start to the nearest cell of the skeleton of its place, along the skeleton, and from
-    there to the goal; straight where the line between them stays in one place. Raises ValueError on
-    a point that is not finite or in no place, and where no way leads from one to the other.
+    there to the goal; straight if the line between them stays in the place of the start. Raises
+    ValueError on a point that is not finite or in no place, and if no way leads to the goal.
     """
     ends = np.stack([np.asarray(start, np.float64)[:2], np.asarray(goal, np.float64)[:2]])
     if not np.isfinite(ends).all():
@@ -77,8 +77,8 @@ def place_of(places: TopologicalMap, points: ArrayLike) -> Int[np.ndarray, "n"]:
     """The place of each point or pose (n, 2 or 3); -1 in a wall, off the map or in no place."""
     table = np.atleast_2d(np.asarray(points, np.float64))
     grid = places.grid
-    found = np.asarray(_to_cells(grid.origin, grid.resolution, table[:, :2]))
-    j, i = np.floor(found).astype(int).T
+    cell = np.asarray(_to_cells(grid.origin, grid.resolution, table[:, :2]))
+    j, i = np.floor(cell).astype(int).T
     height, width = places.label.shape
     inside = (i >= 0) & (j >= 0) & (i < height) & (j < width)
     return np.where(inside, places.label[np.clip(i, 0, height - 1), np.clip(j, 0, width - 1)], -1)
@@ -87,7 +87,7 @@ def place_of(places: TopologicalMap, points: ArrayLike) -> Int[np.ndarray, "n"]:
 def place_weights(
     places: TopologicalMap, poses: ArrayLike, log_weight: ArrayLike
 ) -> tuple[Float[np.ndarray, "P"], float]:
-    """The probability of each place, the particles' weights summed up, and that of none.
+    """The probability of each place, the sum of its particles' weights, and of being in no place.
 
     Args:
         poses: (n, 3) particles. log_weight: (n,) of any scale; -inf for none.

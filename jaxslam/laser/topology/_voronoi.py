@@ -10,7 +10,8 @@ from jaxslam.laser.grids._grid import check_grid
 
 _RIDGE = 0.6
 """Slope of the distance field below which a cell is on a ridge. A point whose nearest walls are in
-directions 2β apart has slope cos β: 0 between parallel walls, 0.71 on the bisector of a corner."""
+directions 2β apart has slope cos β: 0 between parallel walls, 0.71 on the bisector of a right
+angle, which is no ridge."""
 
 _AROUND = ((0, 1), (-1, 1), (-1, 0), (-1, -1), (0, -1), (1, -1), (1, 0), (1, 1))
 """(row, column) steps to the eight neighbours, in order around."""
@@ -27,7 +28,7 @@ class Skeleton(NamedTuple):
 
 
 def skeleton(grid: Grid, *, clearance: float = 0.2) -> Skeleton:
-    """The skeleton of where a robot of radius `clearance` [m] fits: a cell wide, connected as that.
+    """The skeleton, a cell wide, of the cells where a robot of radius `clearance` [m] fits.
 
     Cells are removed in the order of their distance to the walls, as long as that changes neither
     connections nor holes (8-connected, by Yokoi's number), except ridges of the distance field:
@@ -74,10 +75,11 @@ def _thin(
     steps = [i * width + j for i, j in _AROUND]
     candidates = np.flatnonzero(cells & ~kept)
     candidates = candidates[np.argsort(away.reshape(-1)[candidates], kind="stable")]
+    # Python's integers and bytes: reading NumPy arrays entry by entry is slow.
     left = candidates.tolist()
     present = bytearray(flat.astype(np.uint8).tobytes())
     while True:
-        still = []
+        remaining = []
         for at in left:
             code = 0
             for k, step in enumerate(steps):
@@ -85,18 +87,18 @@ def _thin(
             if table[code]:
                 present[at] = 0
             else:
-                still.append(at)
-        if len(still) == len(left):
+                remaining.append(at)
+        if len(remaining) == len(left):
             break
-        left = still
+        left = remaining
     flat[:] = np.frombuffer(bytes(present), np.uint8) > 0
 
 
 def _removable(ends: bool) -> list[bool]:
-    """By the code of the eight neighbours: whether a cell can go without a change of topology.
+    """Whether a cell can go without a change of topology, by the code of its eight neighbours.
 
-    Yokoi's number for 8-connected cells, Σ over the four edges of x̄_k - x̄_k x̄_k+1 x̄_k+2 with
-    x̄ = 1 - x, is then 1.
+    Bit k of the code is neighbour k of `_AROUND`. It can if Yokoi's number for 8-connected cells is
+    1: Σ over the four edges of x̄_k - x̄_k x̄_k+1 x̄_k+2 with x̄ = 1 - x.
     """
     out = []
     for code in range(256):

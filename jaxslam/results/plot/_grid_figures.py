@@ -12,7 +12,7 @@ from matplotlib.patches import Patch
 from numpy.typing import ArrayLike
 
 from jaxslam.consistency.metrics import ate
-from jaxslam.consistency.metrics._paths import carried
+from jaxslam.consistency.metrics._paths import transform
 from jaxslam.core.types import Beams
 from jaxslam.laser.grids import Field, Grid
 from jaxslam.laser.laser_slam import LoopOutcome, Solved
@@ -231,7 +231,7 @@ def loops_figure(
     for axes, (path, text) in zip(panels, paths, strict=True):
         known = None
         if reference is not None:
-            known = carried(ate(path, np.asarray(reference)).frame, np.asarray(reference))
+            known = transform(ate(path, np.asarray(reference)).frame, np.asarray(reference))
         _draw_loops(axes, path[:, :2], ends, known)
         titled(axes, text)
         axes.set_xlabel("x [m]")
@@ -258,7 +258,7 @@ def _draw_loops(
 @own_settings()
 def maps_before_after(solved: Solved, *, title: str = "", width: float = PAGE) -> Figure:
     """The maps of laser odometry alone and after closing, side by side. width: [in]."""
-    known = np.argwhere(np.asarray(solved.map.known) | np.asarray(solved.map_before.known))
+    known = np.argwhere(np.asarray(solved.map.observed) | np.asarray(solved.map_before.observed))
     if not len(known):
         known = np.array([[0, 0]])
     low, high = known.min(axis=0), known.max(axis=0) + 1

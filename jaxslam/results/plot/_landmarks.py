@@ -30,7 +30,7 @@ from jaxslam.results.plot._style import (
     plain,
     titled,
 )
-from jaxslam.simulation._walls import Walls, wall_lines
+from jaxslam.simulation._wall_geometry import Walls, wall_lines
 
 Limits = tuple[tuple[float, float], tuple[float, float]]
 """of x and of y"""

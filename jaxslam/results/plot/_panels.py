@@ -11,7 +11,7 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.ticker import LogLocator, NullLocator
 
-from jaxslam._catalog import KINDS
+from jaxslam.catalog import KINDS
 from jaxslam.consistency._measures.nees import DOF
 from jaxslam.consistency.campaign import Campaign
 from jaxslam.core._validation import check_record
@@ -42,7 +42,7 @@ class Row(NamedTuple):
 
 
 def kinds_of(names: Sequence[str]) -> list[tuple[str, list[str]]]:
-    """Groups (kind, names) of at most five filters: those of `_catalog.KINDS`, then others."""
+    """Groups (kind, names) of at most five filters: those of `catalog.KINDS`, then others."""
     known = {name: kind for kind, members in KINDS.items() for name in members}
     found = []
     for kind in [*KINDS, "others"]:

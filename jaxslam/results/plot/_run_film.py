@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Int, PyTree
 from numpy.typing import ArrayLike
 
 from jaxslam._driver import run
-from jaxslam.consistency.campaign._candidates import method_of, rounded
+from jaxslam.consistency.campaign._candidates import cast_floats, method_of
 from jaxslam.core._numbers import check_count
 from jaxslam.core._validation import check_record
 from jaxslam.core.protocols import Candidate, Filter
@@ -564,7 +564,7 @@ def animate_world(
         options: of `animate`.
     """
     check_record("animate_world", "scenario", scenario, World)
-    truth, log = rounded(world_of_run(scenario, key, number), dtype)
+    truth, log = cast_floats(world_of_run(scenario, key, number), dtype)
     of_filter = run_keys(key, number)[1]
     method = method_of(candidate, truth)
     if isinstance(method, Filter):

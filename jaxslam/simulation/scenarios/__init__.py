@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+from jaxslam._public import publish
 from jaxslam.simulation._scans import BetweenRanges
 from jaxslam.simulation._worlds import Scenario
 from jaxslam.simulation.scenarios._drives import explore, webmap
@@ -36,7 +37,7 @@ SCENARIOS: dict[str, Callable[..., Scenario]] = {
     "stationary": stationary,
     "webmap": webmap,
 }
-"""By name; each takes the number of steps, by default that of the publication."""
+"""Scenarios by name; each takes the number of steps, by default the publication's."""
 
 __all__ = [
     "ROOMS",
@@ -58,3 +59,5 @@ __all__ = [
     "stationary",
     "webmap",
 ]
+
+publish(__name__)

@@ -11,9 +11,10 @@ from jaxslam.core._record import record
 from jaxslam.math._arrays import Landmark, Number, Pose
 from jaxslam.motion._unicycle import Unicycle
 from jaxslam.sensors._line import Line
-from jaxslam.simulation._laser import Laser, LaserWorld
-from jaxslam.simulation._walls import Walls, exact_ranges, make_walls, wall_lines
+from jaxslam.simulation._wall_geometry import Walls, exact_ranges, wall_lines
 from jaxslam.simulation._worlds import Scenario
+from jaxslam.simulation.laser import Laser, LaserWorld
+from jaxslam.simulation.walls import make_walls
 
 _SPEED, TURN, _STEP = 0.5, np.deg2rad(45.0), 0.25
 """Speed [m/s], rate of turn [rad/s] and interval [s] of the robot in these worlds."""
@@ -43,8 +44,8 @@ def office(beams: int = 180, glass: float = 0.0) -> LaserWorld:
     cabinets = [_box(6.6, 0.6, 7.4, 1.4), _box(0.6, 6.9, 1.5, 7.4)]
     stops = [(0.8, 4.1), (1.8, 4.1), (1.8, 1.5), (1.8, 4.1), (7.2, 4.1), (7.2, 6.6), (7.2, 4.1)]
     stops += [(10.2, 4.1), (10.2, 1.5), (10.2, 4.1), (0.8, 4.1)]
-    made = make_walls(outline, *cabinets, glass={(0, east): glass} if glass else None)
-    return _world("office", made, stops, beams, 8.0)
+    walls = make_walls(outline, *cabinets, glass={(0, east): glass} if glass else None)
+    return _world("office", walls, stops, beams, 8.0)
 
 
 def corridor(beams: int = 180) -> LaserWorld:
@@ -75,7 +76,7 @@ ROOMS: dict[str, Callable[..., LaserWorld]] = {
     "office": office,
     "square": square,
 }
-"""By name; each takes the number of beams."""
+"""Rooms by name; each takes the number of beams."""
 
 
 def _box(left: float, low: float, right: float, high: float) -> list[tuple[float, float]]:
@@ -83,13 +84,13 @@ def _box(left: float, low: float, right: float, high: float) -> list[tuple[float
 
 
 def _world(
-    name: str, of: Walls, stops: Sequence[tuple[float, float]], beams: int, max_range: float
+    name: str, walls: Walls, stops: Sequence[tuple[float, float]], beams: int, max_range: float
 ) -> LaserWorld:
     turns = 2 * np.pi * np.arange(beams) / beams - np.pi
-    pose, controls = _between(stops)
+    pose, controls = _drive_to(stops)
     return LaserWorld(
         name=name,
-        walls=of,
+        walls=walls,
         laser=Laser(turns, sigma=0.02, max_range=max_range, dropout=0.02),
         motion=Unicycle(np.diag([0.05, np.deg2rad(3.0)]) ** 2),
         controls=controls,
@@ -97,7 +98,7 @@ def _world(
     )
 
 
-def _between(stops: Sequence[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:
+def _drive_to(stops: Sequence[tuple[float, float]]) -> tuple[np.ndarray, np.ndarray]:
     """The pose at the first stop, and controls (v, ω, Δt) that turn and drive to the others."""
     places = np.asarray(stops, float)
     legs = np.diff(places, axis=0)

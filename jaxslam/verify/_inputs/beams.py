@@ -19,6 +19,7 @@ FAR = 40.0
 _ANGLES = np.array([-2.7, -1.9, -1.1, -0.3, 0.5, 1.3, 2.1, 2.9])
 _CELL, _ORIGIN = 0.5, (-17.03, -14.11, 0.2)
 _WIDTH = 6.0
+"""Width [m] of the strip at a wall over which the solid share rises from 0 to 1."""
 _HEADINGS = (0.0, 1e-9, -1e-9, np.pi, np.pi - 1e-9, 1e-9 - np.pi, np.pi / 2)
 _CORNER = 2.0
 """Least distance of a trial beam's end from a corner [m], and from another wall's line."""
@@ -38,18 +39,18 @@ def beam_function(model: BeamModel) -> Function:
         angles = jnp.asarray(_ANGLES, ranges.dtype)
         return Beams(ranges, angles, jnp.ones(len(_ANGLES), bool))
 
-    def own(like: jax.Array) -> object:
+    def map_like(like: jax.Array) -> object:
         return jax.tree.map(
             lambda x: x.astype(like.dtype) if jnp.issubdtype(x.dtype, jnp.floating) else x,
             prepared,
         )
 
     def log_density(pose: jax.Array, ranges: jax.Array) -> jax.Array:
-        return model.each(own(pose), pose, beams_of(ranges))
+        return model.log_likelihoods(map_like(pose), pose, beams_of(ranges))
 
     def claim(pose: jax.Array, ranges: jax.Array) -> tuple[jax.Array, None]:
         assert model.jacobian is not None
-        return model.jacobian(own(pose), pose, beams_of(ranges)), None
+        return model.jacobian(map_like(pose), pose, beams_of(ranges)), None
 
     names = tuple(f"range {k + 1} [m]" for k in range(len(_ANGLES)))
     return Function(

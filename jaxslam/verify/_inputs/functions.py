@@ -152,9 +152,11 @@ def with_signature_errors(model: Motion | Sensor) -> Motion | Sensor:
         return refuse
 
     renamed = copy.copy(model)
-    for field, taken in names.items():
-        if (got := unfit_signature(getattr(model, field), taken.count(",") + 1)) is not None:
-            set_field(renamed, field, refusing(f"{field} takes ({taken}), got a function of {got}"))
+    for field, parameters in names.items():
+        if (got := unfit_signature(getattr(model, field), parameters.count(",") + 1)) is not None:
+            set_field(
+                renamed, field, refusing(f"{field} takes ({parameters}), got a function of {got}")
+            )
     return renamed
 
 
@@ -180,10 +182,10 @@ def factor_function(factor: Factor) -> Function:
 
     A point has two coordinates.
     """
-    known = {"pose": POSE, "point": _POINT}
-    counts = {kind: factor.variables.count(kind) for kind in known}
+    entries = {"pose": POSE, "point": _POINT}
+    counts = {kind: factor.variables.count(kind) for kind in entries}
     arguments = [
-        Argument(kind if counts[kind] == 1 else f"{kind} {k + 1}", known[kind])
+        Argument(kind if counts[kind] == 1 else f"{kind} {k + 1}", entries[kind])
         for k, kind in enumerate(factor.variables)
     ]
     hand = factor.jacobians
@@ -212,9 +214,9 @@ def plain_function(
     name: str | None = None,
     states: Sequence[ArrayLike] | None = None,
 ) -> Function:
-    """A function of vectors, whose arguments are known by the names of its parameters.
+    """A function of vectors, whose arguments have the names of its parameters.
 
-    Lengths that are neither given nor follow from a parameter's name are those of the states.
+    Lengths that neither `arguments` nor a parameter's name states are taken from the states.
     Raises ValueError where the length of an argument is not known.
     """
     name = name or str(getattr(call, "__name__", type(call).__name__))
@@ -222,9 +224,9 @@ def plain_function(
         raise ValueError(f"{name}: expected its arguments as {{name: entries}}, got {arguments!r}")
     if isinstance(outputs, str):
         raise ValueError(f"{name}: expected its outputs as a tuple of names, got {outputs!r}")
-    given = dict(arguments or {})
-    parameters = _parameters(call, given)
-    if unknown := [key for key in given if key not in parameters]:
+    lengths = dict(arguments or {})
+    parameters = _parameters(call, lengths)
+    if unknown := [key for key in lengths if key not in parameters]:
         raise ValueError(
             f"{name}: expected arguments of {', '.join(parameters) or 'no parameter'}, got "
             f"{', '.join(unknown)}"
@@ -233,28 +235,32 @@ def plain_function(
         raise ValueError(
             f"{name}: expected a function with a parameter to differentiate by, got none"
         )
-    named = {p: _entries(name, p, given.get(p, _GLOSSARY.get(p))) for p in parameters}
+    named = {p: _entries(name, p, lengths.get(p, _GLOSSARY.get(p))) for p in parameters}
     shapes = [np.shape(table) for table in (() if states is None else states)]
     if len(shapes) == len(parameters) and all(len(shape) == 2 for shape in shapes):
         pairs = zip(parameters, shapes, strict=True)
         named |= {p: _number_names(p, shape[1]) for p, shape in pairs if named[p] is None}
-    known = {p: entries for p, entries in named.items() if entries is not None}
-    if missing := [p for p in named if p not in known]:
+    complete = {p: entries for p, entries in named.items() if entries is not None}
+    if missing := [p for p in named if p not in complete]:
         raise ValueError(
             f"{name}: the length of {', '.join(map(repr, missing))} is not known. Name the "
             f"entries, each with its unit: {_example(name, missing)}"
         )
-    arguments_of = tuple(Argument(p, entries) for p, entries in known.items())
+    arguments_of = tuple(Argument(p, entries) for p, entries in complete.items())
     return Function(name, call, arguments_of, tuple(outputs or ()), jacobian)
 
 
-def _parameters(call: Callable[..., object], given: dict[str, Sequence[str] | int]) -> list[str]:
-    """The names of a function's required parameters, or those given where Python has none."""
-    if given and not _has_signature(call):
-        return list(given)
+def _parameters(call: Callable[..., object], lengths: dict[str, Sequence[str] | int]) -> list[str]:
+    """The names of a function's required parameters, or of `lengths` where Python has none."""
+    try:
+        signature = inspect.signature(call)
+    except (TypeError, ValueError):
+        if lengths:
+            return list(lengths)
+        raise
     return [
         p.name
-        for p in inspect.signature(call).parameters.values()
+        for p in signature.parameters.values()
         if p.default is p.empty and p.kind in (p.POSITIONAL_ONLY, p.POSITIONAL_OR_KEYWORD)
     ]
 
@@ -284,19 +290,10 @@ def _number_names(parameter: str, count: int) -> tuple[str, ...]:
 
 def _example(name: str, parameters: Sequence[str]) -> str:
     """Where a user names the entries of a function's arguments, of two entries each."""
-    line = ", ".join(f'"{one}": ("v [m/s]", "omega [rad/s]")' for one in parameters)
+    line = ", ".join(f'"{parameter}": ("v [m/s]", "omega [rad/s]")' for parameter in parameters)
     if name.isidentifier():
         return f"{name}_arguments = {{{line}}} in the file, or arguments= in Python"
     return f"arguments={{{line}}} in Python; in a file define a function, which has a name"
-
-
-def _has_signature(call: Callable[..., object]) -> bool:
-    """Whether Python knows the parameters of a callable."""
-    try:
-        inspect.signature(call)
-    except (TypeError, ValueError):
-        return False
-    return True
 
 
 def makes_a_model(factory: Callable[..., object]) -> bool:

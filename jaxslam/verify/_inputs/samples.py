@@ -25,6 +25,7 @@ NOMINAL = ("random", "given")
 LARGE = "large coordinates"
 """Label of the states `FAR` from the origin."""
 _SEAM = 1e-9
+"""Distance from the seam of an angle, and from 0 of a rate; well above the rounding of π."""
 
 # One coordinate at a time takes these values while the others are random. Between 0.499 and 0.501
 # `angles.sinc` changes from its series to the closed form.
@@ -63,8 +64,11 @@ def argument_samples(arguments: tuple[Argument, ...], count: int, seed: int) -> 
         groups.append((f"zero {' and '.join(arguments[k].name for k in others)}", still))
     places = [k for k, argument in enumerate(arguments) if _is_place(argument)]
     if places:
-        shift = np.zeros((2, 2)) + [[FAR, -FAR], [-FAR, FAR]]
-        groups.append((LARGE, tuple(_shift(base, places, shift))))
+        shift = np.array([[FAR, -FAR], [-FAR, FAR]])
+        far = [table[:2].copy() for table in base]
+        for k in places:
+            far[k][:, :2] += shift
+        groups.append((LARGE, tuple(far)))
     for k in places[1:]:
         for distance in (_NEAR, 2.0**-4):
             close = base[k][:2].copy()
@@ -73,7 +77,7 @@ def argument_samples(arguments: tuple[Argument, ...], count: int, seed: int) -> 
     return _concatenate(groups)
 
 
-def coincident(
+def coincident_states(
     arguments: tuple[Argument, ...], samples: Samples
 ) -> Iterable[tuple[str, tuple[np.ndarray, ...]]]:
     """States where distances vanish, with a label: each place at the origin, or at the first."""
@@ -152,14 +156,14 @@ def sensor_samples(sensor: Sensor, count: int, seed: int) -> tuple[Samples, Samp
     return observed, _concatenate(back)
 
 
-def given_inverse(sensor: Sensor, given: Samples, drawn: Samples) -> Samples:
-    """Samples (pose, measurement, free) for `invert`: what `observe` returns at given states.
+def inverse_samples(sensor: Sensor, states: Samples, sampled: Samples) -> Samples:
+    """Samples (pose, measurement, free) for `invert`: what `observe` returns at a user's states.
 
-    The free coordinates are those of drawn samples.
+    sampled: samples of `invert`, whose free coordinates are used.
     """
-    z = np.asarray(quick_jit(jax.vmap(sensor.observe))(*given.values), np.float64)
-    s = np.resize(drawn.values[2], (len(z), drawn.values[2].shape[1]))
-    return Samples((given.values[0], z, s), given.labels)
+    z = np.asarray(quick_jit(jax.vmap(sensor.observe))(*states.values), np.float64)
+    s = np.resize(sampled.values[2], (len(z), sampled.values[2].shape[1]))
+    return Samples((states.values[0], z, s), states.labels)
 
 
 def _reach(seen: Values, sensor: Sensor) -> Callable[[Values], np.ndarray]:
@@ -206,7 +210,7 @@ def _is_place(argument: Argument) -> bool:
     return argument.entries[:2] == POSE[:2]
 
 
-def _one_at_a_time(base: tuple[Values, ...], which: int, argument: Argument) -> Iterable[_Group]:
+def _one_at_a_time(base: tuple[Values, ...], k: int, argument: Argument) -> Iterable[_Group]:
     """States in which one entry of an argument has a difficult value."""
     for column, name in enumerate(argument.entries):
         hard = np.array(_HARD.get(name.split(" ")[-1], ()))
@@ -214,27 +218,18 @@ def _one_at_a_time(base: tuple[Values, ...], which: int, argument: Argument) -> 
             hard = hard[np.abs(hard) < 1]
         if len(hard) and argument.scale == 1:
             count = len(hard)
-            rows = np.arange(count) % len(base[which])
-            moved = base[which][rows].copy()
+            rows = np.arange(count) % len(base[k])
+            moved = base[k][rows].copy()
             moved[:, column] = hard
             for i, value in enumerate(hard):
-                here = tuple(a[rows[i : i + 1]] for a in base)
+                state = tuple(a[rows[i : i + 1]] for a in base)
                 label = f"{argument.name} {name.split(' ')[0]} = {value:.4g}"
-                yield label, _replace(here, which, moved[i : i + 1], 1)
+                yield label, _replace(state, k, moved[i : i + 1], 1)
 
 
-def _replace(base: tuple[Values, ...], which: int, new: Values, count: int) -> tuple[Values, ...]:
+def _replace(base: tuple[Values, ...], k: int, new: Values, count: int) -> tuple[Values, ...]:
     """The first states, with another value of one argument."""
-    return tuple(new[:count] if k == which else a[:count] for k, a in enumerate(base))
-
-
-def _shift(base: tuple[Values, ...], places: list[int], shift: Values) -> Iterable[Values]:
-    """The first states, with all poses and points shifted."""
-    for k, a in enumerate(base):
-        rows = a[: len(shift)].copy()
-        if k in places:
-            rows[:, :2] += shift
-        yield rows
+    return tuple(new[:count] if i == k else a[:count] for i, a in enumerate(base))
 
 
 def _concatenate(groups: list[_Group]) -> Samples:

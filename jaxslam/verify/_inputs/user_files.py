@@ -90,27 +90,27 @@ def load(target: str) -> list[_Target]:
     path, name = split_target(target)
     module = import_file(path)
     keys = [key for key in vars(module) if name in ("", key)]
-    found = [t for key in keys if (t := _target(module, key)) is not None]
+    targets = [t for key in keys if (t := _target(module, key)) is not None]
     skipped = [key for key in keys if isinstance(vars(module)[key], Chart | Linearizer)]
-    if found and skipped:
+    if targets and skipped:
         note = f"not verified: {', '.join(skipped)} (no chart and no linearizer is)"
-        found[0] = dataclasses.replace(found[0], notes=(*found[0].notes, note))
+        targets[0] = dataclasses.replace(targets[0], notes=(*targets[0].notes, note))
     if name:
-        if not found and keys:
+        if not targets and keys:
             raise UnusableFile(
                 f"{path.name}: expected {name} to be a Motion, a Sensor, a class of one whose only "
                 "required field is noise_cov, a factory of one, a Factor, a BeamModel, or a "
                 f"function with its Jacobian{_without_claim(name, vars(module)[name])}"
             )
-        if not found:
+        if not targets:
             raise UnusableFile(f"{path.name}: there is no {name!r} to verify{names_in(module)}")
-    if not found:
+    if not targets:
         raise UnusableFile(
             f"{path.name}: defines nothing to verify: no Motion, no Sensor, no class of one whose "
             "only required field is noise_cov, no Factor, no BeamModel, no function f with an "
             "f_jacobian, no factory whose result is annotated as -> Motion, -> Sensor or -> Factor"
         )
-    return found
+    return targets
 
 
 def verify_file(target: str, verify_one: Callable[..., Report]) -> list[Report]:
@@ -124,13 +124,13 @@ def verify_file(target: str, verify_one: Callable[..., Report]) -> list[Report]:
         targets = load(target)
     notes = tuple(f"{line} prints when the file is loaded" for line in printed.lines)
     reports, unusable = [], []
-    for one in targets:
+    for candidate in targets:
         try:
-            reports.append(_verify(one, verify_one))
+            reports.append(_verify(candidate, verify_one))
         except ValueError as error:
             unusable.append(str(error))
             check = Check("can be verified", False, str(error))
-            reports.append(Report(one.name, "function", checks=(check,)))
+            reports.append(Report(candidate.name, "function", checks=(check,)))
     if len(unusable) == len(targets):
         raise UnusableFile("; ".join(unusable))
     return [dataclasses.replace(reports[0], notes=(*notes, *reports[0].notes)), *reports[1:]]
@@ -199,7 +199,7 @@ def import_file(path: Path) -> ModuleType:
 
 def names_in(module: ModuleType) -> str:
     """The functions, models, filters and scenarios that a user's file defines, to end a message."""
-    found = [
+    names = [
         name
         for name, value in vars(module).items()
         if not name.startswith("_")
@@ -209,7 +209,7 @@ def names_in(module: ModuleType) -> str:
             or (callable(value) and getattr(value, "__module__", "") == module.__name__)
         )
     ]
-    return f"; it defines: {', '.join(found)}" if found else "; it defines nothing"
+    return f"; it defines: {', '.join(names)}" if names else "; it defines nothing"
 
 
 def _without_claim(name: str, value: object) -> str:
@@ -225,7 +225,7 @@ def _without_claim(name: str, value: object) -> str:
 def _target(module: ModuleType, name: str) -> _Target | None:
     """The object to verify under a name of the module, or None."""
     value = getattr(module, name)
-    about: dict[str, Any] = {what: getattr(module, f"{name}_{what}", None) for what in _ABOUT}
+    about: dict[str, Any] = {ending: getattr(module, f"{name}_{ending}", None) for ending in _ABOUT}
     if isinstance(value, Motion | Sensor | Factor | BeamModel):
         return _model_target(name, value, about)
     if not callable(value):
@@ -239,8 +239,8 @@ def _target(module: ModuleType, name: str) -> _Target | None:
         try:
             return _model_target(name, build(value), about)
         except Exception as error:
-            what = "class" if isinstance(value, type) else "factory"
-            raise UnusableFile(f"the {what} {name}: {describe_error(error)}") from error
+            kind = "class" if isinstance(value, type) else "factory"
+            raise UnusableFile(f"the {kind} {name}: {describe_error(error)}") from error
     return None
 
 
@@ -248,6 +248,6 @@ def _model_target(
     name: str, model: Motion | Sensor | Factor | BeamModel, about: Mapping[str, Any]
 ) -> _Target:
     """A model with the states beside it; it names its entries and has its claims itself."""
-    unused = [f"{name}_{what}" for what in ("arguments", "outputs") if about[what] is not None]
+    unused = [f"{name}_{end}" for end in ("arguments", "outputs") if about[end] is not None]
     notes = (f"not used: {', '.join(unused)} (a model names its entries)",) if unused else ()
     return _Target(name, model, states=about["states"], notes=notes)

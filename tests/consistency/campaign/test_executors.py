@@ -35,7 +35,7 @@ from jaxslam.consistency.campaign import (
     _remote as remote,
 )
 from jaxslam.consistency.campaign._block import CampaignPlan
-from jaxslam.consistency.campaign._remote import Processes, compute_block, packed
+from jaxslam.consistency.campaign._remote import Processes, compute_block, pack
 from jaxslam.core.record import record
 
 WORLD = worlds.ring(20)
@@ -206,7 +206,7 @@ def test_a_class_of_a_script_is_a_record_in_another_process(tmp_path):
 
 def test_a_block_is_small_on_its_way():
     device = jax.devices()[:1]
-    content = packed(CampaignPlan(WORLD, {"reckoning": RECKONING}, worlds.key(), device, 4))
+    content = pack(CampaignPlan(WORLD, {"reckoning": RECKONING}, worlds.key(), device, 4))
     assert len(content) < 8000
     result = compute_block(content, 0, 4)
     assert len(pickle.dumps(result._replace(first={}))) < 20_000

@@ -1,6 +1,7 @@
 """Campaigns: blocks, workers and loops agree; draws are shared; wrong filters are found out."""
 
 import dataclasses
+from pathlib import Path
 from types import SimpleNamespace
 
 import jax
@@ -10,13 +11,14 @@ import pytest
 import worlds
 from cases import refused, swept
 
-from jaxslam import Scenario, filters, grids, motion, run, sensors, simulate, store
-from jaxslam import _catalog as catalog
+import jaxslam
+from jaxslam import Scenario, catalog, filters, grids, motion, run, sensors, simulate, store
 from jaxslam.consistency._measures.counts import DROPS, KEPT
 from jaxslam.consistency.campaign import Interrupted, monte_carlo
 from jaxslam.consistency.campaign import _work as work
-from jaxslam.consistency.campaign._candidates import fitting_block, without_noise
-from jaxslam.consistency.campaign._pieces import missing
+from jaxslam.consistency.campaign._block_programs import fitting_block
+from jaxslam.consistency.campaign._candidates import without_noise
+from jaxslam.consistency.campaign._pieces import missing_pieces
 from jaxslam.core.record import record
 from jaxslam.core.types import Status, Truth
 from jaxslam.filters import _reporting as reporting
@@ -88,10 +90,10 @@ def test_other_blocks_change_what_rounding_does(in_fours, block):
 
 
 def test_pieces_lie_within_the_blocks_of_their_numbers():
-    assert missing([], 10, 4) == [(0, 4), (4, 4), (8, 2)]
-    assert missing([(0, 3), (6, 1)], 10, 4) == [(3, 1), (4, 2), (7, 1), (8, 2)]
-    assert missing([(0, 20)], 10, 4) == []
-    assert missing([(0, 10)], 13, 8) == [(10, 3)]
+    assert missing_pieces([], 10, 4) == [(0, 4), (4, 4), (8, 2)]
+    assert missing_pieces([(0, 3), (6, 1)], 10, 4) == [(3, 1), (4, 2), (7, 1), (8, 2)]
+    assert missing_pieces([(0, 20)], 10, 4) == []
+    assert missing_pieces([(0, 10)], 13, 8) == [(10, 3)]
 
 
 class Spy:
@@ -188,6 +190,20 @@ def test_other_errors_of_the_runtime_are_not_taken_for_memory(monkeypatch):
     monkeypatch.setattr(work, "BlockRunner", broken)
     with pytest.raises(jax.errors.JaxRuntimeError, match="something else"):
         campaign_of()
+
+
+def test_a_traceback_in_a_filter_has_few_frames_of_the_package():
+    @record
+    class Faulty(filters.EkfSlam):
+        def update(self, state, scan, key):
+            raise KeyError("landmark")
+
+    with pytest.raises(KeyError) as failed:
+        campaign_of({"ekf": Faulty(WORLD.motion, WORLD.sensor, 6)})
+    package = Path(jaxslam.__file__).parent
+    frames = [at for at in failed.traceback if Path(at.path).is_relative_to(package)]
+    assert [at.name for at in frames][-4:] == ["drive_run", "run", "_drive", "step"]
+    assert len(frames) <= 7
 
 
 def test_a_model_that_cannot_be_traced_stops_the_campaign_whatever_waits_for_it():

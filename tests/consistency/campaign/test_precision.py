@@ -8,11 +8,10 @@ import numpy as np
 import pytest
 
 import jaxslam
-from jaxslam import _origin, charts, filters, motion, sensors, simulation
+from jaxslam import Scenario, _origin, charts, filters, motion, sensors, simulate, simulation
 from jaxslam.core.protocols import Sensor
 from jaxslam.core.record import record
 from jaxslam.core.types import Status
-from jaxslam.simulation._worlds import Scenario, simulate
 
 KEY = jax.random.key(0)
 UTM = np.array([5e5, 5e6])

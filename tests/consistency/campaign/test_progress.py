@@ -83,7 +83,7 @@ def test_a_campaign_has_a_bar_by_default_where_it_can_be_seen(capsys, monkeypatc
             self.progress(3, 10)
         raise Begun
 
-    monkeypatch.setattr(Work, "in_blocks_that_fit", begun)
+    monkeypatch.setattr(Work, "compute", begun)
     monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal, raising=False)
     world, mine = worlds.ring(5), []
 

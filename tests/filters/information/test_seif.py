@@ -10,8 +10,7 @@ import pytest
 from cases import refused
 from worlds import draw, narrow
 
-from jaxslam import _catalog as catalog
-from jaxslam import filters, scenarios, sensors
+from jaxslam import catalog, filters, scenarios, sensors
 from jaxslam._driver import run
 from jaxslam.charts import Euclidean
 from jaxslam.core.protocols import Filter
@@ -441,7 +440,7 @@ def test_an_area_smaller_than_a_scan_is_refused():
 def test_fewer_landmarks_are_active_than_the_map_has(scenario, active):
     world = scenarios.SCENARIOS[scenario](20)
     count = len(world.landmarks)
-    filter = catalog.CANONICAL["seif"](world)
+    filter = catalog.ALL["seif"](world)
     pose, cov = jnp.zeros(3), jnp.eye(3)
     state = jax.eval_shape(filter.init, pose, cov)
     assert state.active.shape == (active,) and active < count

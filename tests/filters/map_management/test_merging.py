@@ -337,6 +337,7 @@ def test_closing_takes_times():
 @pytest.mark.parametrize("name", MANAGERS)
 def test_a_class_is_no_filter(name):
     with pytest.raises(
-        ValueError, match=rf"^{name.title()}: expected a filter, got the class EkfSlam: call it"
+        ValueError,
+        match=rf"^{name.title()}: filter: expected a Filter, got the class EkfSlam: call it",
     ):
         MANAGERS[name](EkfSlam)

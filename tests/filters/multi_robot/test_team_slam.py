@@ -37,9 +37,9 @@ def crew(count=2, mutual=True, reach=3.2):
     back = sensors.RangeBearing(R2, mount=(0.0, 0.0, 3.0))
     parts = [Part(eyes, 4, visible=BetweenRanges(0.0, reach))]
     if count < 3:  # three robots of three sensors would compile for long
-        parts.append(Part(back, 2, every=3))
+        parts.append(Part(back, 2, interval=3))
     if mutual and count > 1:
-        parts.append(Part(eyes, count - 1, every=2, sees="robots"))
+        parts.append(Part(eyes, count - 1, interval=2, sees="robots"))
     return [team.Robot(motion.Increment(Q), Suite((*parts,)), start) for start in STARTS[:count]]
 
 
@@ -262,7 +262,7 @@ def hundred(report, first):
     """Truth of one of two robots and logs of 100 runs; robot 1 sees landmarks from a step on."""
     eyes = sensors.RangeBearing(R1, mount=MOUNT)
     sight = BetweenRanges(0.0, 3.2)
-    other = Part(eyes, 1, every=2, sees="robots")
+    other = Part(eyes, 1, interval=2, sees="robots")
     robots = [
         team.Robot(
             motion.Increment(Q), Suite((Part(eyes, 6, start=start, visible=sight), other)), at
@@ -399,7 +399,7 @@ def signs():
     (lambda: TeamSlam(crew(2), 3, tags=(7, -1)), "integers >= 0"),
     (lambda: TeamSlam(crew(2), 0), "capacity"),
     (lambda: TeamSlam(crew(2), 3, report=2), "expected report from 0 to"),
-    (lambda: TeamSlam(crew(2), 3, gate=0.0), "above 0 and below 1 as gate"),
+    (lambda: TeamSlam(crew(2), 3, gate=0.0), "gate: expected a probability above 0 and below 1"),
     (lambda: TeamSlam(crew(2), 3, correction="at once"), "expected correction"),
     (lambda: TeamSlam([signs()], 3), "expected landmarks \\(x, y\\)"),
     (lambda: TeamSlam([crew(1)[0], compass_only()], 3), "robot 1 needs a start"),

@@ -14,7 +14,7 @@ from reference.plane import from_frame
 
 from jaxslam import association, life, motion, resampling, sensors
 from jaxslam._driver import run
-from jaxslam.consistency._measures.counts import counted
+from jaxslam.consistency._measures.counts import counts_of
 from jaxslam.core.types import Scan, Status
 from jaxslam.filters import FastSlam
 from jaxslam.filters._particles import pose_particles, slam_particles
@@ -382,7 +382,7 @@ def test_it_resamples_where_the_threshold_says_and_it_is_counted():
     assert np.all((told.ess > 1 - 1e-9) & (told.ess < COUNT + 1e-9))
     assert of_never.ess[-1] < told.ess[-1]
     assert np.ptp(often.final.log_weight) == 0 or not told.resampled[-1]
-    counts = counted(jax.tree.map(lambda leaf: leaf[None], often.info))  # of one run
+    counts = counts_of(jax.tree.map(lambda leaf: leaf[None], often.info))  # of one run
     assert (counts["resampled"], counts["underflow"]) == (told.resampled.sum(), 0)
 
 
@@ -483,9 +483,9 @@ def test_gradients_are_finite_where_the_pose_is_known_exactly(proposal):
     ({"proposal": "optimal"}, 'expected proposal "motion" or "measurement"'),
     ({"threshold": 1.5}, "threshold from 0 to 1"),
     ({"threshold": np.nan}, "threshold from 0 to 1"),
-    ({"gate": 0.0}, "above 0 and below 1 as gate"),
-    ({"resample": "systematic"}, "resample to be a function"),
-    ({"life": "existence"}, "life to be a Life"),
+    ({"gate": 0.0}, "gate: expected a probability above 0 and below 1"),
+    ({"resample": "systematic"}, "resample: expected a function"),
+    ({"life": "existence"}, "life: expected a Life"),
     ({"sensor": sensors.Compass(np.eye(1))}, "not a suite"),
     (
         {"sensor": sensors.BearingInverseDepth(np.eye(1), min_distance=1.0, to_point=0.1)},

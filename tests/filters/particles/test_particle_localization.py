@@ -366,9 +366,9 @@ def test_gradients_are_finite_from_a_start_that_is_known_exactly():
     ({"box": [[0, 0, 0], [1, 1, 1]]}, r"a box of shape \(2, 2\)"),
     ({"box": [[1, 1], [0, 2]]}, "a box of"),
     ({"threshold": 1.5}, "threshold from 0 to 1"),
-    ({"gate": 0.0}, "above 0 and below 1 as gate"),
+    ({"gate": 0.0}, "gate: expected a probability above 0 and below 1"),
     ({"forget": (0.2, 0.1)}, "0 < slow <= fast <= 1"),
-    ({"resample": "systematic"}, "resample to be a function"),
+    ({"resample": "systematic"}, "resample: expected a function"),
 )
 def test_bad_input_is_refused(change):
     given = {"landmarks": WORLD.landmarks, "particles": 5} | change

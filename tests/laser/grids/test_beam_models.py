@@ -104,7 +104,7 @@ def test_gradients_are_finite_at_walls_in_obstacles_and_off_the_map(room, make):
     both = jax.jit(jax.vmap(jax.value_and_grad(lambda p: log_likelihood(model, prepared, p, scan))))
     values, slopes = both(poses)
     assert np.all(np.isfinite(values)) and np.all(np.isfinite(slopes))
-    half = jax.jit(lambda p: log_likelihood(model, prepared, p, scan, every=2))(poses[0])
+    half = jax.jit(lambda p: log_likelihood(model, prepared, p, scan, stride=2))(poses[0])
     taken = Beams(*(np.asarray(part)[::2] for part in scan))
     whole = jax.jit(lambda p: log_likelihood(model, prepared, p, taken))(poses[0])
     assert float(half) == pytest.approx(float(whole))
@@ -191,7 +191,7 @@ ONES = np.ones(3)
         r"as many ranges, angles and masks, got \(24,\), \(5,\), \(24,\)",
     ),
     (lambda: likelihood("scan"), "expected Beams"),
-    (lambda: likelihood(every=0), "every: expected an integer"),
+    (lambda: likelihood(stride=0), "stride: expected an integer"),
     (lambda: likelihood(pose=(0.0, 0.0)), "log_likelihood: expected a pose"),
     (lambda: likelihood(exponent=-1.0), "log_likelihood: expected an exponent >= 0"),
     (lambda: likelihood(prepared=grids.Grid), "expected what model.prepare makes of the grid"),

@@ -9,7 +9,7 @@ from cases import refused, swept
 from reference.plane import from_frame
 
 from jaxslam import grids
-from jaxslam.simulation._walls import exact_ranges, is_free
+from jaxslam.simulation._wall_geometry import exact_ranges, is_free
 from jaxslam.simulation.walls import make_walls, rasterize
 
 ANGLES = np.linspace(-np.pi, np.pi, 37)[:-1] + 0.05

@@ -8,7 +8,6 @@ from scipy import ndimage
 
 from jaxslam import grids, se2
 from jaxslam.laser.grids._distance import near_distances, squared_distances
-from jaxslam.laser.grids._grid import Field
 
 
 def grid_of(log_odds, origin=(0.0, 0.0, 0.0), resolution=0.1):
@@ -82,7 +81,7 @@ def test_interpolation_is_bilinear_and_its_gradient_finite_everywhere(difference
     values, origin, resolution = rng.normal(size=(5, 7)), np.array([1.0, -2.0, 0.7]), 0.2
     local = np.concatenate([rng.uniform(-2, 9, (60, 2)), [[0.5, 0.5], [3.5, 2.5], [7, 5], [0, 0]]])
     points = np.stack([se2.from_frame(origin, resolution * p) for p in local])
-    field = Field(values, origin, np.float64(resolution))
+    field = grids.Field(values, origin, np.float64(resolution))
     one = jax.jit(jax.vmap(lambda p: jax.value_and_grad(grids.interpolate, argnums=1)(field, p)))
     found, slopes = one(points)
     np.testing.assert_allclose(
@@ -101,7 +100,7 @@ def test_resampling_keeps_the_integral_and_the_unknown():
     halved = grids.resample(grid, 0.2)
     blocks = log_odds.reshape(4, 2, 6, 2).mean(axis=(1, 3))
     np.testing.assert_allclose(halved.log_odds, blocks, atol=1e-12)
-    assert not np.any(np.asarray(halved.known)[:2, :3])
+    assert not np.any(np.asarray(halved.observed)[:2, :3])
     assert grids.resample(jax.tree.map(np.float32, grid), 0.2).log_odds.dtype == np.float32
     odd = grids.resample(grid, 0.13)
     assert odd.log_odds.shape == (7, 10)

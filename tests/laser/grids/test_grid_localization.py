@@ -108,7 +108,7 @@ def test_one_update_weighs_the_particles_as_numpy_does(history):
 
 def test_a_scan_without_a_beam_changes_no_weight_and_every_takes_each_nth(history):
     _, log = history
-    filter = of(4, every=5, least=4)
+    filter = of(4, stride=5, least=4)
     start = filter.init(np.array([1.5, 1.2, 0.0]), 0.01 * np.eye(3))
     update = jax.jit(filter.update)
     scan = Scan(*(part[0].copy() for part in log.scan))
@@ -158,7 +158,7 @@ def test_the_ray_cast_model_keeps_the_robot_on_the_draws_that_both_models_get():
     for model, count in ((MODEL, 200), (ray_cast, 150)):
         filter = grids.GridLocalization(GRID, model, MOVE, count, exponent=0.2)
         scores = consistency.judge_localization(
-            world, filter, 2, KEY, start_cov=np.diag([0.1, 0.1, 0.05]) ** 2, every=5
+            world, filter, 2, KEY, start_cov=np.diag([0.1, 0.1, 0.05]) ** 2, stride=5
         )
         error = np.asarray(scores.pose - scores.truth)[:, 1:]
         assert np.hypot(error[..., 0], error[..., 1]).max() < 0.15
@@ -248,14 +248,14 @@ def test_a_log_of_beams_drops_what_says_nothing():
     ),
     (lambda: of(box=[[1, 1], [0, 0]]), "GridLocalization: expected a box"),
     (lambda: of(exponent=0.0), "GridLocalization: expected exponent above 0"),
-    (lambda: of(every=0), "GridLocalization: every"),
+    (lambda: of(stride=0), "GridLocalization: stride"),
     (lambda: of(0), "GridLocalization: particles"),
     (lambda: of(start="somewhere"), "GridLocalization: expected start"),
     (lambda: of(forget=(1, 0.1)), "GridLocalization: expected forget"),
     (lambda: grids.GridLocalization(3, MODEL, MOVE, 9), "GridLocalization: expected a Grid"),
     (
         lambda: grids.GridLocalization(GRID, MOVE, MODEL, 9),
-        "GridLocalization: expected model to be a BeamModel",
+        "GridLocalization: model: expected a BeamModel",
     ),
     (
         lambda: grids.beam_log(
@@ -275,11 +275,14 @@ def test_a_log_of_beams_drops_what_says_nothing():
     ),
     (lambda: grids.clusters(np.zeros((3, 3)), np.full(3, -np.inf)), "clusters: no particle"),
     (lambda: grids.clusters(np.zeros((3, 2)), np.zeros(3)), "clusters: expected poses"),
-    (lambda: motion.odometry_controls(np.zeros(3)), "odometry_controls: expected finite poses"),
+    (
+        lambda: motion.odometry_controls(np.zeros(3)),
+        "odometry_controls: path: expected finite poses",
+    ),
     (lambda: consistency.judge_localization(WORLD, of(), 0, KEY), "judge_localization: runs"),
     (
-        lambda: consistency.judge_localization(WORLD, of(), 1, KEY, every=61),
-        "judge_localization: expected every <= 60 steps, got 61",
+        lambda: consistency.judge_localization(WORLD, of(), 1, KEY, stride=61),
+        "judge_localization: expected stride <= 60 steps, got 61",
     ),
     (lambda: consistency.judge_localization(WORLD, 3, 1, KEY), "expected a Filter, got int"),
     (lambda: consistency.judge_localization(3, of(), 1, KEY), "localization: expected a Laser"),

@@ -113,7 +113,7 @@ def test_a_map_of_a_square_room_is_that_room():
         truth.log_odds.shape, truth.origin, 0.1, log.pose, log.beams, max_range=10.0
     )
     grid = grids.occupancy(found)
-    known = np.asarray(grid.known)
+    known = np.asarray(grid.observed)
     solid, said = np.asarray(truth.log_odds) > 0, np.asarray(grid.log_odds) > 0
     assert known[~solid].mean() > 0.98
     inner = np.zeros_like(solid)

@@ -46,7 +46,7 @@ def test_a_trinary_map_by_hand(tmp_path):
     np.testing.assert_array_equal(grid.log_odds, [[0, -o, o], [o, -o, 0]])  # the last row first
     np.testing.assert_array_equal(grid.origin, [-1.5, 2.0, 0.25])
     assert grid.resolution == 0.05
-    np.testing.assert_array_equal(grid.known, [[False, True, True], [True, True, False]])
+    np.testing.assert_array_equal(grid.observed, [[False, True, True], [True, True, False]])
     assert logit(1 - 0.5 / 255) == pytest.approx(CERTAIN)
 
 
@@ -124,7 +124,7 @@ def test_every_level_of_a_scaled_map_survives(tmp_path, top):
     image = f"P5 {top + 1} 1 {top}\n".encode() + bytes(range(top + 1))
     yaml = YAML.replace("0.65", "1").replace("0.196", "0").replace("negate", "mode: scale\nnegate")
     grid = grids.read_map(made(tmp_path, yaml, image))
-    assert np.sum(~grid.known) == (top == 254)
+    assert np.sum(~grid.observed) == (top == 254)
     assert len(np.unique(grid.log_odds)) == top + 1
     _, pgm = grids.write_map(tmp_path / "b.yaml", grid, mode="scale")
     assert pgm.read_bytes() == f"P5\n{top + 1} 1\n{top}\n".encode() + bytes(range(top + 1))

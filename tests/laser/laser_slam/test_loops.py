@@ -7,12 +7,11 @@ import pytest
 from ring_of_rooms import SETTINGS, driven
 
 from jaxslam import graphs, laser_slam, metrics
-from jaxslam.consistency.metrics._relative_poses import joined
 from jaxslam.laser.laser_slam import _end_covariances as end_covariances
 from jaxslam.laser.laser_slam import _score as module
 from jaxslam.laser.laser_slam._assembly import ROOM, graph_of, relative_covs, table_of
 from jaxslam.laser.laser_slam._loops.loop_candidates import SECTORS, descriptors
-from jaxslam.laser.laser_slam._loops.pairwise import clique, consistent
+from jaxslam.laser.laser_slam._loops.pairwise import clique, pairwise_consistency
 from jaxslam.math import numpy_poses as poses
 
 
@@ -37,7 +36,7 @@ def test_covariance_along_a_chain_step_by_step(chain):
     )
     z = poses.between(path[4], path[9])
     back = end_covariances.relative_cov(total, path, np.array(9), np.array(4))
-    np.testing.assert_allclose(end_covariances.moved(cov, poses.inverse(z)), back, rtol=1e-9)
+    np.testing.assert_allclose(end_covariances.move(cov, poses.inverse(z)), back, rtol=1e-9)
     np.testing.assert_allclose(
         end_covariances.at_end(end_covariances.of_coordinates(cov, z), z), cov, rtol=1e-9
     )
@@ -63,7 +62,7 @@ def test_a_false_loop_agrees_with_no_true_one(chain):
     cov = np.broadcast_to(1e-4 * np.eye(3), (5, 3, 3))
     z = poses.between(path[first], path[second]) + 0.01 * random.normal(size=(5, 3))
     z[4] += [3.0, -3.0, 0.8]
-    agree = consistent(path, total, first, second, z, cov, 0.999)
+    agree = pairwise_consistency(path, total, first, second, z, cov, 0.999)
     assert agree[:4, :4].all() and not agree[4, :4].any()
     assert (agree == agree.T).all()
     np.testing.assert_array_equal(clique(agree, np.ones(5)), [1, 1, 1, 1, 0])
@@ -83,7 +82,7 @@ def test_true_loops_agree_as_often_as_their_probability_says(chain):
         drawn = poses.chain(path[0], poses.compose(steps, error))
         z = poses.compose(true, 1e-3 * random.normal(size=(2, 3)))
         total = end_covariances.along(drawn, 1e-3 * covs)
-        agreed += consistent(drawn, total, first, second, z, cov, 0.9)[0, 1]
+        agreed += pairwise_consistency(drawn, total, first, second, z, cov, 0.9)[0, 1]
     assert abs(agreed / 300 - 0.9) < 3 * np.sqrt(0.9 * 0.1 / 300)
 
 
@@ -193,7 +192,8 @@ def test_the_covariances_are_those_of_the_dense_inverse(drive, monkeypatch):
 
 def test_the_error_of_a_relation_by_its_covariance(drive):
     true, found = drive
-    made = joined(*(metrics.relations(true, rows=rows) for rows in (1, 3, 7, 24)))
+    parts = [metrics.relations(true, rows=rows) for rows in (1, 3, 7, 24)]
+    made = metrics.Relations(*map(np.concatenate, zip(*parts, strict=True)))
     nees = laser_slam.relation_nees(found, *made)
     assert (nees < 7.81).mean() > 0.9 and 0.3 < nees.mean() < 6
     k = 40

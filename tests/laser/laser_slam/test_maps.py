@@ -11,7 +11,6 @@ from jaxslam import grids, laser_slam
 from jaxslam.core.types import Beams
 from jaxslam.laser.laser_slam import ScanLog
 from jaxslam.laser.laser_slam import _log_map as log_map
-from jaxslam.laser.laser_slam._log_map import map_of
 from jaxslam.laser.laser_slam._odometry.log_odometry import laser_odometry
 from jaxslam.laser.laser_slam._odometry.raw import steps_of
 from jaxslam.laser.laser_slam._scan_points import check_laser_log, scans_of
@@ -37,7 +36,7 @@ def both(log, monkeypatch, window, settings=SETTINGS):
     """(hits, misses), counted in windows and at once; and the shapes of the windows."""
     monkeypatch.setattr(log_map, "WINDOW", window)
     shape, origin, resolution = log_map.frame_of(log, [log.raw], settings)
-    beams = log_map._used(log, settings, np.ones(len(log.time), bool), slice(None))
+    beams = log_map._used_beams(log, settings, np.ones(len(log.time), bool), slice(None))
     laser = poses.compose(log.raw, np.array(log.mount))
     whole = grids.count(shape, origin, resolution, laser, beams, max_range=settings.max_range)
     calls = []
@@ -151,7 +150,9 @@ def test_the_path_is_the_robots_and_the_map_is_of_the_walls(k):
     # In a map that is drawn as if the laser were the robot's middle the walls are elsewhere.
     frame = grid.log_odds.shape, grid.origin, float(grid.resolution)
     usable = np.ones(len(true), bool)
-    wrong = map_of(log._replace(mount=(0.0, 0.0, 0.0)), found.poses, usable, frame, SETTINGS)
+    wrong = log_map.map_of(
+        log._replace(mount=(0.0, 0.0, 0.0)), found.poses, usable, frame, SETTINGS
+    )
     off = np.argwhere(wrong.log_odds > 0)[:, ::-1] * 0.1 + 0.05 + grid.origin[:2]
     assert np.quantile(distance_from_walls(off), 0.95) > 0.25
 

@@ -221,14 +221,14 @@ def test_a_scan_that_matches_nothing_before_is_placed_by_what_comes_after(drive,
     raw = log.raw.copy()
     raw[k] = poses.compose(raw[k], np.array([-0.4, 0.5, 0.3]))
     refused = np.asarray(every.points.position)[k]
-    match = tracking._matched
+    match = tracking._match_about
 
     def refusing(reference, points, *rest):
         found = match(reference, points, *rest)
         same = np.array_equal(points.position, refused)
         return found._replace(accepted=found.accepted and not same)
 
-    monkeypatch.setattr(tracking, "_matched", refusing)
+    monkeypatch.setattr(tracking, "_match_about", refusing)
     _, found = solved(drive, raw)
     assert k not in found.keyframe and found.matched[k]
     assert np.linalg.norm(poses.between(raw[k - 1], raw[k]) - [1.0, 0.0, 0.0]) > 0.4

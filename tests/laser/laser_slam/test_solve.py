@@ -13,7 +13,6 @@ from worlds import nothing_compiled
 from jaxslam import filters, laser_slam, metrics, run, sensors
 from jaxslam._cli import main
 from jaxslam._cli.recorded import slam as results
-from jaxslam.consistency.metrics._relative_poses import joined
 from jaxslam.core.types import Beams, Log, Scan
 from jaxslam.laser.laser_slam import LoopOutcome
 from jaxslam.laser.laser_slam import _end_covariances as end_covariances
@@ -303,7 +302,8 @@ def test_the_command_scores_it_by_relations(drive, monkeypatch, tmp_path, capsys
         for k, line in enumerate(carmen_lines(true, log))
     ]
     (tmp_path / "ring.log").write_text("\n".join(lines))
-    made = joined(*(metrics.relations(true, rows=rows) for rows in (1, 3, 30, 31)))
+    parts = [metrics.relations(true, rows=rows) for rows in (1, 3, 30, 31)]
+    made = metrics.Relations(*map(np.concatenate, zip(*parts, strict=True)))
     far = int((made.second - made.first == 31).sum())
     text = relation_text(made, time) + "5 6 0 0 0 0 0 0\n"
     (tmp_path / "ring.relations").write_text(text)

@@ -237,7 +237,7 @@ def test_trimming_and_a_kernel_bear_outliers_and_forward_derivatives_are_finite(
     pose, slope = jax.jit(
         lambda by: jax.jvp(
             lambda d: matcher.match(
-                matcher.prepare(of), _point_sets.moved_along_rays(scan, d), STARTS[0]
+                matcher.prepare(of), _point_sets.move_along_rays(scan, d), STARTS[0]
             ).pose,
             (0 * by,), (by,),
         )

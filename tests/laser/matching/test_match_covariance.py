@@ -13,7 +13,6 @@ from jaxslam.core.record import record
 from jaxslam.laser.grids import Field
 from jaxslam.laser.matching import IcpSettings, MatchStatus, Prior, covariance
 from jaxslam.laser.matching._field import field_residuals
-from jaxslam.laser.matching._point_sets import Points
 from jaxslam.math.stats import chi2_band
 
 SIGMA, RUNS = 0.03, 60
@@ -198,7 +197,7 @@ def test_the_jacobian_of_the_field_is_that_of_autodiff():
     rng = np.random.default_rng(0)
     field = Field(rng.uniform(0, 1, (9, 9)), np.array([-2.0, -2.0, 0.3]), np.float64(0.7))
     position = rng.uniform(-1, 1, (3, 2))
-    scan = Points(position, np.ones((3, 2)), np.ones(3, bool))
+    scan = matching.Points(position, np.ones((3, 2)), np.ones(3, bool))
     report = verify_jacobians(
         lambda pose: field_residuals(field, scan, pose)[0],
         lambda pose: field_residuals(field, scan, pose)[1],

@@ -7,8 +7,8 @@ import pytest
 from cases import refused
 
 from jaxslam import grids, topology
-from jaxslam.laser.topology._places import cell_centers
-from jaxslam.simulation import _walls as walls
+from jaxslam.simulation import walls
+from jaxslam.simulation._wall_geometry import is_free
 from jaxslam.simulation.scenarios import office
 
 ROOMS = np.array(
@@ -61,11 +61,12 @@ def test_the_skeleton_is_thin_connected_and_far_from_walls():
     assert squares.sum() <= 2
     assert (skeleton.clearance[skeleton.cells] >= 0.2).all()
     # The corridor of 1.8 m: its middle line.
-    middle = cell_centers(places().grid)[skeleton.cells.reshape(-1)]
+    centers = np.asarray(grids.centers(places().grid))
+    middle = centers[skeleton.cells]
     inside = middle[(middle[:, 0] > 3.2) & (middle[:, 0] < 4.6) & (abs(middle[:, 1] - 4.1) < 0.8)]
     assert len(inside) >= 13 and np.abs(inside[:, 1] - 4.1).max() <= 0.11
     # Each door of the corridor is a branch.
-    where = cell_centers(places().grid)[skeleton.junctions.reshape(-1)]
+    where = centers[skeleton.junctions]
     for x in DOORS[:, 0]:
         assert np.abs(where - [x, 4.1]).max(axis=1).min() < 0.4
 
@@ -81,7 +82,7 @@ def test_the_shortest_way_goes_through_the_doors():
     corners = np.stack([ROOMS[0], DOORS[0], DOORS[5], ROOMS[5]])
     least = np.linalg.norm(np.diff(corners, axis=0), axis=1).sum()
     assert least - 0.2 < way.length < 1.25 * least
-    assert walls.is_free(office().walls, way.path).all()
+    assert is_free(office().walls, way.path).all()
     assert topology.route(found, ROOMS[0], ROOMS[0] + 0.1).places == (own[0],)
 
 

@@ -10,8 +10,7 @@ from cases import swept
 from matplotlib.colors import to_rgb
 
 from jaxslam import plot
-from jaxslam._catalog import KINDS
-from jaxslam.catalog import ALL
+from jaxslam.catalog import ALL, KINDS
 from jaxslam.consistency import Average
 from jaxslam.consistency._measures.coverage import LEVELS
 from jaxslam.consistency._measures.nees import DOF

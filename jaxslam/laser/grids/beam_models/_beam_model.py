@@ -20,19 +20,19 @@ class BeamModel(Component):
     """A density of the range of each beam, given pose and map; a subclass is a record."""
 
     jacobian: Any = None
-    """(prepared, pose, beams) -> (B, 3), their derivatives by the pose, derived by hand: `verify`
-    compares them with automatic differentiation and differences"""
+    """(prepared, pose, beams) -> (B, 3), derivatives of `log_likelihoods` by the pose, derived by
+    hand: `verify` compares them with automatic differentiation and differences"""
     mount: ArrayLike | None = None
-    """(3,) pose of the laser on the robot, which `each` takes into account"""
+    """(3,) pose of the laser on the robot, which `log_likelihoods` takes into account"""
 
     def __post_init__(self) -> None:
-        self._check(BeamModel, {"prepare": "grid", "each": "prepared, pose, beams"})
+        self._check(BeamModel, {"prepare": "grid", "log_likelihoods": "prepared, pose, beams"})
 
     def prepare(self, grid: Grid) -> PyTree:
-        """What the model needs of the map, once for all scans: a pytree of arrays."""
+        """The pytree of arrays that the model needs of the map, once for all scans."""
         raise NotImplementedError
 
-    def each(self, prepared: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
+    def log_likelihoods(self, prepared: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
         """The log-densities of the beams, finite also where a beam is not valid."""
         raise NotImplementedError
 
@@ -56,18 +56,18 @@ def log_likelihood(
     pose: ArrayLike,
     beams: Beams,
     *,
-    every: int = 1,
+    stride: int = 1,
     exponent: Number = 1.0,
 ) -> Float[Array, ""]:
     """The log-likelihood of a scan at a pose (3,): exponent · Σ log p(z_k) over its valid beams.
 
-    Beams without information (`Beams`) add nothing. The beams of a scan are
-    assumed independent given the pose, which they are not: what the map lacks, or a pose
-    between two cells, spoils many of them in the same way. `every` takes each n-th beam alone, and
-    an exponent below 1 tempers the likelihood; both make it wider. Differentiable by pose and
-    exponent; `jax.vmap` it over poses.
+    Beams without information (`Beams`) add nothing. The beams of a scan are assumed independent
+    given the pose, which they are not: what the map lacks, or a pose between two cells, spoils many
+    of them in the same way. A `stride` n takes each n-th beam only, and an exponent below 1 tempers
+    the likelihood; both make it wider. Differentiable by pose and exponent; `jax.vmap` it over
+    poses.
 
-    Raises ValueError on beams that `_check_beams` refuses, a pose that is not (3,), every below 1,
+    Raises ValueError on beams that `_check_beams` refuses, a pose that is not (3,), stride below 1,
     an exponent below 0, and a grid in place of the result of `model.prepare`.
     """
     _check_beams("log_likelihood", beams)
@@ -77,18 +77,19 @@ def log_likelihood(
         raise ValueError(f"log_likelihood: expected a finite pose, got {pose!r}")
     if is_concrete(exponent) and not np.all(np.asarray(exponent) >= 0):
         raise ValueError(f"log_likelihood: expected an exponent >= 0, got {exponent!r}")
-    check_count("log_likelihood: every", every)
+    check_count("log_likelihood: stride", stride)
     if isinstance(prepared, Grid):
         raise ValueError(
             "log_likelihood: expected what model.prepare makes of the grid, got the Grid itself"
         )
-    taken = Beams(*(jnp.asarray(part)[::every] for part in beams))
-    usable = usable_beams(taken)
-    ranges, angles = jnp.where(usable, taken.range, 1.0), jnp.where(usable, taken.angle, 0.0)
+    beams = Beams(*(jnp.asarray(part)[::stride] for part in beams))
+    usable = usable_beams(beams)
+    # A harmless range and angle where a beam has no information: its derivative must be finite.
+    ranges, angles = jnp.where(usable, beams.range, 1.0), jnp.where(usable, beams.angle, 0.0)
     clean = Beams(ranges, angles, usable)
     at = jnp.asarray(pose)
-    each = model.each(prepared, at.astype(jnp.result_type(at, 0.0)), clean)
-    return jnp.asarray(exponent) * jnp.where(usable, each, 0.0).sum()
+    log_p = model.log_likelihoods(prepared, at.astype(jnp.result_type(at, 0.0)), clean)
+    return jnp.asarray(exponent) * jnp.where(usable, log_p, 0.0).sum()
 
 
 def usable_beams(beams: Beams) -> Bool[JaxOrNumPy, "*n"]:
@@ -100,8 +101,8 @@ def usable_beams(beams: Beams) -> Bool[JaxOrNumPy, "*n"]:
 def _check_beams(name: str, beams: object) -> None:
     """Raise ValueError, which begins with a caller's name, unless beams are one scan.
 
-    Ranges, angles and masks must be as many, and outside a trace at least one beam must be usable,
-    and the angles of valid beams finite.
+    Ranges, angles and masks must have the same length; outside a trace at least one beam must be
+    usable, and the angles of valid beams finite.
     """
     if not isinstance(beams, Beams):
         raise ValueError(f"{name}: expected Beams, got {type(beams).__name__}")

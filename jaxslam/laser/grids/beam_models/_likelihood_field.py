@@ -38,9 +38,11 @@ class LikelihoodField(BeamModel):
     max_range: Number
     """[m]"""
     hit: Number = 0.9
+    """weight of beams that end near an obstacle of the map"""
     random: Number = 0.1
+    """weight of beams that end anywhere"""
     maximum: Number = 0.0
-    """weights, of sum 1"""
+    """weight of beams of max_range; the three have sum 1"""
     truncate: float | None = static(default=2.0)
     """largest distance [m], None for no limit"""
     mount: ArrayLike | None = None
@@ -57,7 +59,7 @@ class LikelihoodField(BeamModel):
     def prepare(self, grid: Grid) -> Field:
         return distance_field(grid, truncate=self.truncate)
 
-    def each(self, prepared: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
+    def log_likelihoods(self, prepared: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
         far, ends = self._ends(pose, beams)
         log_near = jnp.log(self._total(self._near(interpolate(prepared, ends))))
         maximum = jnp.asarray(self.maximum)
@@ -76,7 +78,7 @@ class LikelihoodField(BeamModel):
         return jnp.where(far[:, None], 0.0, jnp.concatenate([by_end, turning[:, None]], axis=1))
 
     def _ends(self, pose: Array, beams: Beams) -> tuple[Bool[JaxOrNumPy, "B"], Float[Array, "B 2"]]:
-        """Which beams have max_range, and the ends of the others."""
+        """The mask of the beams of max_range, and the ends of all; those end at the laser."""
         eye = self.frame(pose)
         _, far = beams.returns(self.max_range)
         ranges = jnp.where(far, 0.0, beams.range)
@@ -87,9 +89,11 @@ class LikelihoodField(BeamModel):
         return far, ends
 
     def _near(self, d: Float[Array, "B"]) -> Float[Array, "B"]:
+        """hit · N(d; 0, σ²)."""
         hit, sigma = jnp.asarray(self.hit, d.dtype), jnp.asarray(self.sigma, d.dtype)
         return hit * jnp.exp(-0.5 * (d / sigma) ** 2) / (sigma * math.sqrt(2 * math.pi))
 
     def _total(self, near: Float[Array, "B"]) -> Float[Array, "B"]:
+        """The density with random/max_range; never 0, so that its logarithm is finite."""
         anywhere = jnp.asarray(self.random, near.dtype) / jnp.asarray(self.max_range, near.dtype)
         return jnp.maximum(near + anywhere, jnp.finfo(near.dtype).tiny)

@@ -40,7 +40,9 @@ class Mixture(NamedTuple):
 
 
 _USUAL = Mixture(0.75, 0.1, 0.05, 0.1, 0.1, 0.5)
-"""Parameters of a laser in a building whose map is good."""
+"""Parameters of a laser in a building whose map is good (chosen)."""
+_LEAST_RANGE = 1e-6
+"""[m] least expected range: of 0 the density of short ranges has no limit."""
 
 
 def mixture_log_density(
@@ -57,11 +59,11 @@ def mixture_log_density(
     """
     hit, short, maximum, random, sigma, rate = (jnp.asarray(value) for value in mixture)
     nothing = expected >= max_range
-    star = jnp.where(nothing, 0.5 * max_range, expected)
+    star = jnp.where(nothing, 0.5 * max_range, expected)  # any: its mass must not vanish
     mass = ndtr((max_range - star) / sigma) - ndtr(-star / sigma)
     normal = jnp.exp(-0.5 * ((z - star) / sigma) ** 2) / (sigma * math.sqrt(2 * math.pi) * mass)
     # Where max_range is expected, short ones are spread over all of it.
-    end = jnp.where(nothing, max_range, jnp.maximum(expected, 1e-6))
+    end = jnp.where(nothing, max_range, jnp.maximum(expected, _LEAST_RANGE))
     early = jnp.where(z <= end, rate * jnp.exp(-rate * z) / -jnp.expm1(-rate * end), 0.0)
     near = jnp.where(nothing, 0.0, hit * normal) + short * early + random / max_range
     far = maximum + jnp.where(nothing, hit, 0.0)
@@ -79,18 +81,18 @@ def _density_slope(
     ∂E = -E λ exp(-λ z*)/(1 - exp(-λ z*)). 0 at max_range, and where max_range is expected.
     """
     hit, short, _, random, sigma, rate = (jnp.asarray(value) for value in mixture)
-    star = jnp.minimum(jnp.maximum(expected, 1e-6), max_range)
+    star = jnp.minimum(jnp.maximum(expected, _LEAST_RANGE), max_range)
     low, high = -star / sigma, (max_range - star) / sigma
     mass = ndtr(high) - ndtr(low)
     by_mass = (jnp.exp(-0.5 * low**2) - jnp.exp(-0.5 * high**2)) / (sigma * math.sqrt(2 * math.pi))
     normal = jnp.exp(-0.5 * ((z - star) / sigma) ** 2) / (sigma * math.sqrt(2 * math.pi) * mass)
-    rest = -jnp.expm1(-rate * star)
-    early = jnp.where(z <= star, rate * jnp.exp(-rate * z) / rest, 0.0)
+    short_mass = -jnp.expm1(-rate * star)
+    early = jnp.where(z <= star, rate * jnp.exp(-rate * z) / short_mass, 0.0)
     near = hit * normal + short * early + random / max_range
     rise = hit * normal * ((z - star) / sigma**2 - by_mass / mass)
-    rise = rise - short * early * rate * jnp.exp(-rate * star) / rest
-    known = (z < max_range) & (expected < max_range) & (near > 0)
-    return jnp.where(known, rise / jnp.where(near > 0, near, 1.0), 0.0)
+    rise = rise - short * early * rate * jnp.exp(-rate * star) / short_mass
+    has_slope = (z < max_range) & (expected < max_range) & (near > 0)
+    return jnp.where(has_slope, rise / jnp.where(near > 0, near, 1.0), 0.0)
 
 
 @record
@@ -124,14 +126,14 @@ class RayCast(BeamModel):
     def prepare(self, grid: Grid) -> RayMap:
         return ray_map(grid, method=self.method)
 
-    def each(self, prepared: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
+    def log_likelihoods(self, prepared: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
         expected = self._expected_range(prepared, pose, beams)
         far = jnp.asarray(self.max_range, expected.dtype)
         z = jnp.where(beams.returns(far)[1], far, beams.range)
         return mixture_log_density(self.mixture, z, expected, far)
 
     def jacobian(self, prepared: PyTree, pose: Array, beams: Beams) -> Float[Array, "B 3"]:
-        """The derivative by z*, times that of z*, for which `cast` has a custom rule."""
+        """The derivative by z* times the derivative of z*, for which `cast` has a custom rule."""
         expected = self._expected_range(prepared, pose, beams)
         by_pose = jax.jacfwd(lambda pose: self._expected_range(prepared, pose, beams))(pose)
         far = jnp.asarray(self.max_range, expected.dtype)
@@ -154,9 +156,9 @@ def check_weights(name: str, weights: dict[str, ArrayLike]) -> None:
 
 
 START = Mixture(0.6, 0.15, 0.1, 0.15, 0.2, 0.5)
-"""Where the search begins."""
+"""Parameters where the search begins (chosen: each component has a share)."""
 _LEAST = 1e-6
-"""The least σ [m], where ranges are as expected, and length 1/λ."""
+"""Least σ [m] and length 1/λ [m]: exact ranges have a σ of 0, whose density has no limit."""
 
 
 def fit(
@@ -212,11 +214,12 @@ def fit(
         return float(value), np.asarray(slope, np.float64)
 
     first = np.log(np.maximum([float(np.asarray(value)) for value in start], 1e-6))
-    found = minimize(cost, first, jac=True, method="BFGS", options={"maxiter": iterations})
-    return Mixture(*(float(np.asarray(value)) for value in _mixture(jnp.asarray(found.x))))
+    optimum = minimize(cost, first, jac=True, method="BFGS", options={"maxiter": iterations})
+    return Mixture(*(float(np.asarray(value)) for value in _mixture(jnp.asarray(optimum.x))))
 
 
 def _mixture(x: Float[Array, "6"]) -> Mixture:
+    """The mixture of logarithms of shares, up to a constant, and of σ and λ."""
     shares, scales = jax.nn.softmax(x[:4]), _LEAST + jnp.exp(x[4:])
     return Mixture(shares[0], shares[1], shares[2], shares[3], scales[0], scales[1])
 
@@ -230,13 +233,13 @@ def _cost_and_slope(x: Array, z: Array, stars: Array, max_range: Array) -> tuple
 
 
 def _em_step(mixture: Mixture, z: np.ndarray, stars: np.ndarray, max_range: float) -> Mixture:
-    """The shares of the four components in each range, and from these the parameters."""
+    """The mixture by the responsibilities of its four components for each range."""
     hit, short, maximum, random, sigma, rate = (float(np.asarray(value)) for value in mixture)
     far, nothing = z >= max_range, stars >= max_range
     normal = np.exp(-0.5 * ((z - stars) / sigma) ** 2) / (sigma * np.sqrt(2 * np.pi))
-    end = np.maximum(stars, 1e-6)
+    end = np.maximum(stars, _LEAST_RANGE)
     early = np.where(z <= end, rate * np.exp(-rate * z) / -np.expm1(-rate * end), 0.0)
-    parts = np.stack(
+    densities = np.stack(
         [
             hit * np.where(nothing, far, np.where(far, 0.0, normal)),
             short * np.where(far, 0.0, early),
@@ -244,8 +247,8 @@ def _em_step(mixture: Mixture, z: np.ndarray, stars: np.ndarray, max_range: floa
             random * np.where(far, 0.0, 1 / max_range),
         ]
     )
-    total = parts.sum(axis=0)
-    share = parts / np.where(total > 0, total, 1.0)
+    total = densities.sum(axis=0)
+    share = densities / np.where(total > 0, total, 1.0)
     at = share[0] * ~nothing
     variance = (at * (z - stars) ** 2).sum() / max(at.sum(), 1e-12)
     weights = share.mean(axis=1) / max(share.mean(axis=1).sum(), 1e-12)

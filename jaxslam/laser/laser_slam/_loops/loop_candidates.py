@@ -8,35 +8,14 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.laser.laser_slam._records import Settings
 from jaxslam.math import numpy_poses as poses
 
 _RINGS, SECTORS = 12, 60
-
-
-def descriptors(
-    points: Float[np.ndarray, "n B 2"], valid: Bool[np.ndarray, "n B"], *, reach: float = 12.0
-) -> Float[np.ndarray, "n D"]:
-    """The descriptors of n scans, of length one (zero for a scan without points).
-
-    Points are counted in rings and sectors about the robot, and a turn of the robot shifts the
-    sectors: the sizes of the Fourier coefficients along them stay, up to the size of a sector. The
-    table is that of Kim & Kim 2018, "Scan context", IROS, which compares shifts instead.
-    """
-    far = np.hypot(points[..., 0], points[..., 1])
-    turn = np.arctan2(points[..., 1], points[..., 0]) / (2 * np.pi) % 1.0
-    ring = np.minimum((_RINGS * np.sqrt(far / reach)).astype(int), _RINGS - 1)
-    sector = np.minimum((SECTORS * turn).astype(int), SECTORS - 1)
-    table = np.zeros((len(points), _RINGS, SECTORS))
-    which = np.broadcast_to(np.arange(len(points))[:, None], valid.shape)
-    np.add.at(table, (which[valid], ring[valid], sector[valid]), 1.0)
-    sizes = np.abs(np.fft.rfft(np.sqrt(table), axis=2))[:, :, : SECTORS // 4]
-    sizes[:, :, 0] *= 0.5
-    flat = sizes.reshape(len(points), -1)
-    length = np.linalg.norm(flat, axis=1, keepdims=True)
-    return np.divide(flat, length, out=np.zeros_like(flat), where=length > 0)
-
-
+"""Rings and sectors of the descriptor."""
+_LOOKS_AT_ONCE = 256
+"""Keyframes compared with all before them at once: 256 x N floats of memory."""
+_LEAST_LIKENESS = 0.9
+"""Cosine between the descriptors of two scans above which these look alike."""
 MOST = 2_500
 """Candidates that are matched in a round, and keyframes that are tried, at most: a log with more
 of them has more loops than its graph needs."""
@@ -47,24 +26,56 @@ CANDIDATES = 3
 REACH = 3.0
 """Distance [m] between two places that share walls."""
 _PROBABILITY = 0.999
-"""Of the search ellipse of a place."""
+"""Probability of the ellipse that is searched for a place."""
 _MIN_SEPARATION = 15
-"""Keyframes between submaps that count as one place."""
+"""Keyframes between submaps below which they count as one place."""
 
 
 class Candidates(NamedTuple):
-    """Pairs of a submap, by the keyframe in its middle, and a keyframe; where the latter may be."""
+    """Pairs of a submap, by the keyframe in its middle, and a keyframe that may be in it."""
 
     first: Int[np.ndarray, "M"]
+    """row of the keyframe in the middle of the submap"""
     second: Int[np.ndarray, "M"]
+    """row of the keyframe"""
     z: Float[np.ndarray, "M 3"]
     """expected pose of the second in the frame of the first"""
     wide: Bool[np.ndarray, "M"]
     """whether the wide window is needed"""
     appearance: Bool[np.ndarray, "M"]
+    """whether the pair looks alike, rather than being near"""
 
 
-def near(
+def descriptors(
+    points: Float[np.ndarray, "n B 2"], valid: Bool[np.ndarray, "n B"], *, reach: float = 12.0
+) -> Float[np.ndarray, "n D"]:
+    """The descriptors of n scans, of length one (zero for a scan without points).
+
+    Points are counted in rings and sectors about the robot. A turn of the robot shifts the sectors
+    and leaves the absolute values of the Fourier coefficients along them, up to the size of a
+    sector. The table is that of Kim & Kim 2018, "Scan context", IROS, which compares shifts
+    instead.
+
+    Args:
+        reach: [m] outer border of the rings; points beyond it count in the last.
+    """
+    far = np.hypot(points[..., 0], points[..., 1])
+    turn = np.arctan2(points[..., 1], points[..., 0]) / (2 * np.pi) % 1.0
+    # By the root of the distance, so that near rings are narrow: there points are dense.
+    ring = np.minimum((_RINGS * np.sqrt(far / reach)).astype(int), _RINGS - 1)
+    sector = np.minimum((SECTORS * turn).astype(int), SECTORS - 1)
+    table = np.zeros((len(points), _RINGS, SECTORS))
+    scan = np.broadcast_to(np.arange(len(points))[:, None], valid.shape)
+    np.add.at(table, (scan[valid], ring[valid], sector[valid]), 1.0)
+    # Chosen: the root of the counts, the lower half of the coefficients, the mean at half weight.
+    coefficients = np.abs(np.fft.rfft(np.sqrt(table), axis=2))[:, :, : SECTORS // 4]
+    coefficients[:, :, 0] *= 0.5
+    flat = coefficients.reshape(len(points), -1)
+    length = np.linalg.norm(flat, axis=1, keepdims=True)
+    return np.divide(flat, length, out=np.zeros_like(flat), where=length > 0)
+
+
+def nearby_pairs(
     path: Float[np.ndarray, "N 3"],
     middle: Int[np.ndarray, "S"],
     usable: Bool[np.ndarray, "N"],
@@ -76,33 +87,36 @@ def near(
     """Pairs (middle of a submap, keyframe) that are near by the path, and not near in the log.
 
     Of each keyframe those with the nearest submaps, `most` places at most: submaps that follow each
-    other in the log are one place, and those of `closed` count. Of more than `MOST` keyframes so
-    many are tried, spread evenly over the log.
+    other in the log are one place. If more than `MOST` keyframes are usable, only `MOST` are tried,
+    spread evenly over the log.
 
-    closed: pairs that matched.
+    Args:
+        closed: pairs that matched, whose places count among `most`.
+        reach: [m] largest distance of a pair.
+        gap: keyframes between the two, at least.
     """
     pairs = []
-    known: dict[int, list[int]] = {}
+    closed_places: dict[int, list[int]] = {}
     for first, second in closed:
-        known.setdefault(second, []).append(first)
-    tried = np.flatnonzero(usable)
-    if len(tried) > MOST:
-        tried = tried[np.linspace(0, len(tried) - 1, MOST).astype(int)]
-    for keyframe in tried.tolist():
-        places = known.get(keyframe, [])
-        rest = middle[: np.searchsorted(middle, keyframe - gap, side="right")]
-        far = np.hypot(*(path[rest, :2] - path[keyframe, :2]).T)
-        rest, far = rest[far < reach], far[far < reach]
+        closed_places.setdefault(second, []).append(first)
+    rows = np.flatnonzero(usable)
+    if len(rows) > MOST:
+        rows = rows[np.linspace(0, len(rows) - 1, MOST).astype(int)]
+    for keyframe in rows.tolist():
+        places = closed_places.get(keyframe, [])
+        submaps = middle[: np.searchsorted(middle, keyframe - gap, side="right")]
+        far = np.hypot(*(path[submaps, :2] - path[keyframe, :2]).T)
+        submaps, far = submaps[far < reach], far[far < reach]
         for place in places:
-            apart = np.abs(rest - place) >= _MIN_SEPARATION
-            rest, far = rest[apart], far[apart]
+            apart = np.abs(submaps - place) >= _MIN_SEPARATION
+            submaps, far = submaps[apart], far[apart]
         for _ in range(len(places), most):
-            if not len(rest):
+            if not len(submaps):
                 break
-            nearest = rest[far.argmin()]
+            nearest = submaps[far.argmin()]
             pairs.append((nearest, keyframe))
-            apart = np.abs(rest - nearest) >= _MIN_SEPARATION
-            rest, far = rest[apart], far[apart]
+            apart = np.abs(submaps - nearest) >= _MIN_SEPARATION
+            submaps, far = submaps[apart], far[apart]
     return np.array(pairs, int).reshape(-1, 2)
 
 
@@ -111,21 +125,21 @@ def by_place(
     pairs: Int[np.ndarray, "Q 2"],
     cov: Float[np.ndarray, "Q 3 3"],
     tried: set[tuple[int, int, bool]],
-    settings: Settings,
     narrow: tuple[float, float],
     wide: tuple[float, float],
 ) -> Candidates:
-    """The pairs whose ellipse of uncertainty fits into a window, at most some for each keyframe.
+    """The pairs whose ellipse of uncertainty fits into a window, `CANDIDATES` for each keyframe.
 
     A place is sought where it is within `REACH` of the keyframe, by the ellipse of
     `_PROBABILITY`.
 
     Args:
-        pairs: `near`, of each keyframe the nearest first.
+        pairs: `nearby_pairs`, of each keyframe the nearest first.
         cov: of the end of the relative pose of each pair.
         tried: (first, second, wide) of rounds before.
         narrow, wide: windows, [m] and [rad] to either side.
     """
+    # Radius of an ellipse in two dimensions, in σ: P(χ²₂ <= r²) = 1 - exp(-r²/2).
     sigmas = np.sqrt(-2 * np.log(1 - _PROBABILITY))
     z = poses.between(path[pairs[:, 0]], path[pairs[:, 1]])
     position = sigmas * np.sqrt(np.linalg.eigvalsh(cov[:, :2, :2])[:, 1])
@@ -138,39 +152,50 @@ def by_place(
     rank = np.arange(len(rows)) - np.searchsorted(pairs[rows, 1], pairs[rows, 1])
     rows = rows[rank < CANDIDATES]
     new = [(*pairs[row].tolist(), not small[row]) not in tried for row in rows]
-    take = rows[np.array(new, bool)]
+    rows = rows[np.array(new, bool)]
     return Candidates(
-        pairs[take, 0], pairs[take, 1], z[take], ~small[take], np.zeros(len(take), bool)
+        pairs[rows, 0], pairs[rows, 1], z[rows], ~small[rows], np.zeros(len(rows), bool)
     )
-
-
-def thinned(of: Candidates) -> tuple[Candidates, int]:
-    """At most `MOST` of the candidates, spread evenly over the log, and how many are left out."""
-    count = len(of.first)
-    if count <= MOST:
-        return of, 0
-    kept = np.argsort(of.second, kind="stable")[np.linspace(0, count - 1, MOST).astype(int)]
-    return Candidates(*(part[kept] for part in of)), count - MOST
 
 
 def by_appearance(
     descriptors: Float[np.ndarray, "N D"],
     middle: Int[np.ndarray, "S"],
     usable: Bool[np.ndarray, "N"],
-    settings: Settings,
-    *,
-    alike: float = 0.9,
-) -> Int[np.ndarray, "M 2"]:
-    """Pairs (keyframe, later keyframe) whose descriptors are most alike, one for each keyframe."""
+    gap: int,
+    near: Candidates,
+) -> Candidates:
+    """The earlier keyframe most like each keyframe, if it is alike, by the nearest submap.
+
+    The pose is assumed to be that of the submap, and searched in the wide window.
+
+    Args:
+        gap: keyframes between the two, at least.
+        near: candidates by place; their pairs are left out.
+    """
     rows = np.flatnonzero(usable)
-    known = descriptors[rows].astype(np.float32)
+    looks = descriptors[rows].astype(np.float32)
     pairs = []
-    for begin in range(0, len(rows), 256):
-        part = slice(begin, begin + 256)
-        before = rows[None, : part.stop] <= rows[part, None] - settings.loop_gap
-        score = np.where(before, known[part] @ known[: part.stop].T, -1.0)
-        best = score.argmax(axis=1)
-        for row in np.flatnonzero(score.max(axis=1) > alike):
+    for begin in range(0, len(rows), _LOOKS_AT_ONCE):
+        part = slice(begin, begin + _LOOKS_AT_ONCE)
+        before = rows[None, : part.stop] <= rows[part, None] - gap
+        likeness = np.where(before, looks[part] @ looks[: part.stop].T, -1.0)
+        best = likeness.argmax(axis=1)
+        for row in np.flatnonzero(likeness.max(axis=1) > _LEAST_LIKENESS):
             nearest = middle[np.abs(middle - rows[best[row]]).argmin()]
             pairs.append((nearest, rows[begin + row]))
-    return np.array(pairs, int).reshape(-1, 2)
+    near_pairs = set(zip(near.first.tolist(), near.second.tolist(), strict=True))
+    pairs = [pair for pair in pairs if pair not in near_pairs]
+    first, second = np.array(pairs, int).reshape(-1, 2).T
+    flag = np.ones(len(pairs), bool)
+    return Candidates(first, second, np.zeros((len(pairs), 3)), flag, flag)
+
+
+def thin(candidates: Candidates) -> tuple[Candidates, int]:
+    """At most `MOST` of the candidates, spread evenly over the log, and how many are left out."""
+    count = len(candidates.first)
+    if count <= MOST:
+        return candidates, 0
+    order = np.argsort(candidates.second, kind="stable")
+    rows = order[np.linspace(0, count - 1, MOST).astype(int)]
+    return Candidates(*(column[rows] for column in candidates)), count - MOST

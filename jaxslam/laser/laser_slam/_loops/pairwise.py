@@ -19,9 +19,11 @@ _TILE = 256
 
 STARTS = 10
 """Loops from which a clique is grown."""
+_TIE = 1e-3
+"""Share of a loop's own weight in the choice: of loops that agree with the same, the heavier."""
 
 
-def consistent(
+def pairwise_consistency(
     path: Float[np.ndarray, "N 3"],
     total: Float[np.ndarray, "N 3 3"],
     first: Int[np.ndarray, "M"],
@@ -30,7 +32,7 @@ def consistent(
     cov: Float[np.ndarray, "M 3 3"],
     probability: float,
 ) -> Bool[np.ndarray, "M M"]:
-    """Whether each two loops agree with the odometry between their ends.
+    """The mask of the pairs of loops that agree with the odometry between their ends.
 
     The loops a: i → j and b: k → l close a cycle with the odometry i → k and l → j. Its error is
     e = (x_ij)⁻¹ ∘ x_ik ∘ x_kl ∘ x_lj = (x_i ∘ z_a)⁻¹ ∘ g_b ∘ x_j, where g_b = x_k ∘ z_b ∘ x_l⁻¹
@@ -49,14 +51,17 @@ def consistent(
     """
     limit = chi2_quantile(probability, 3)
     count = len(z)
-    out = np.zeros((count, count), bool)
+    agree = np.zeros((count, count), bool)
     end = poses.compose(path[first], z)
     moved = poses.compose(end, poses.inverse(path[second]))
-    loop_cov = end_covariances.propagated(poses.adjoint(end), cov)
+    loop_cov = end_covariances.propagate(poses.adjoint(end), cov)
     parts = path[second], end, moved, loop_cov, total[first], total[second], first, second
     with float64():
+        # The last loop is repeated up to the size of a tile.
+        fill = -(-count // _TILE) * _TILE - count
+        padded = [np.concatenate([part, np.repeat(part[-1:], fill, axis=0)]) for part in parts]
         tiles = [
-            _Loop(*(jnp.asarray(_fill(part[begin : begin + _TILE])) for part in parts))
+            _Loop(*(jnp.asarray(part[begin : begin + _TILE]) for part in padded))
             for begin in range(0, count, _TILE)
         ]
         for i, a in enumerate(tiles):
@@ -64,13 +69,14 @@ def consistent(
                 rows, columns = (slice(k * _TILE, min((k + 1) * _TILE, count)) for k in (i, j))
                 square = np.asarray(_squared_distances(a, b))
                 square = square[: rows.stop - rows.start, : columns.stop - columns.start]
-                out[rows, columns] = square < limit
-    earlier = np.triu(out, 1)
+                agree[rows, columns] = square < limit
+    # Tiles are computed above the diagonal only, and a pair of loops once.
+    earlier = np.triu(agree, 1)
     return np.asarray(earlier | earlier.T | np.eye(count, dtype=bool))
 
 
 class _Loop(NamedTuple):
-    """The data of loops for their agreement, in the world's frame; see `consistent`."""
+    """The loops of a tile, in the world's frame; symbols as in `pairwise_consistency`."""
 
     at: Array
     """x_j, by odometry"""
@@ -83,59 +89,52 @@ class _Loop(NamedTuple):
     total_first: Array
     """S_i"""
     total_second: Array
+    """S_j"""
     first: Array
     second: Array
 
 
-def _fill(part: np.ndarray) -> np.ndarray:
-    """A part of the loops, its last one repeated up to the size of a tile."""
-    return np.concatenate([part, np.repeat(part[-1:], _TILE - len(part), axis=0)])
-
-
 @jax.jit
 def _squared_distances(a: _Loop, b: _Loop) -> Float[Array, "tile tile"]:
-    """eᵀ Σ⁻¹ e of each loop of one tile with each of another, the first of them the earlier; ∞
-    where Σ is not positive definite."""
-    return jax.vmap(lambda one: jax.vmap(lambda other: _of_pair(one, other))(b))(a)
+    """eᵀ Σ⁻¹ e of each loop of tile a with each of tile b; ∞ where Σ is not positive definite."""
 
+    def squared_distance(a: _Loop, b: _Loop) -> Float[Array, ""]:
+        error = se2.adjoint(a.end) @ se2.between(a.end, se2.compose(b.moved, a.at))
+        ad = se2.adjoint(b.moved)
+        # |S_k - S_i| and |S_j - S_l|: S grows along the path.
+        forward = jnp.where(a.first <= b.first, 1.0, -1.0)
+        backward = jnp.where(a.second <= b.second, 1.0, -1.0)
+        first = forward * (b.total_first - a.total_first)
+        second = backward * (b.total_second - a.total_second)
+        cov = a.cov + b.cov + first + ad @ second @ ad.T
+        white, regular = linalg.whitener(cov)
+        return jnp.where(regular, ((white @ error) ** 2).sum(), jnp.inf)
 
-def _of_pair(a: _Loop, b: _Loop) -> Float[Array, ""]:
-    error = se2.adjoint(a.end) @ se2.between(a.end, se2.compose(b.moved, a.at))
-    ad = se2.adjoint(b.moved)
-    forward = jnp.where(a.first <= b.first, 1.0, -1.0)
-    backward = jnp.where(a.second <= b.second, 1.0, -1.0)
-    first = forward * (b.total_first - a.total_first)
-    second = backward * (b.total_second - a.total_second)
-    cov = a.cov + b.cov + first + ad @ second @ ad.T
-    white, regular = linalg.whitener(cov)
-    return jnp.where(regular, ((white @ error) ** 2).sum(), jnp.inf)
+    return jax.vmap(lambda row: jax.vmap(lambda column: squared_distance(row, column))(b))(a)
 
 
 def clique(agree: Bool[np.ndarray, "M M"], weight: Float[np.ndarray, "M"]) -> Bool[np.ndarray, "M"]:
-    """A large set of loops that all agree with each other, by a greedy search.
+    """The mask of a large set of loops that all agree with each other, by a greedy search.
 
-    From each of the loops of the most agreement the one is added that agrees with the most of those
-    left, until none is left; the heaviest set counts (Pattabiraman et al. 2015, "Fast algorithms
-    for the maximum clique problem on massive graphs", Internet Mathematics 11). The largest clique
-    may be larger.
+    Each of the `STARTS` loops with the most agreement begins a set. The loop that agrees with the
+    most of the candidates joins it, and candidates that disagree with it leave, until no candidate
+    is left. The heaviest set counts (Pattabiraman et al. 2015, "Fast algorithms for the maximum
+    clique problem on massive graphs", Internet Mathematics 11). The largest clique may be larger.
     """
-    none = np.zeros(len(agree), bool)
-    if not len(agree):
-        return none
+    best, most = np.zeros(len(agree), bool), -1.0
     joined = agree.astype(np.float32)
     np.fill_diagonal(joined, 0)
     weight = weight.astype(np.float32)
-    best, most = none, -1.0
     for start in np.argsort(-(joined @ weight), kind="stable")[:STARTS]:
-        chosen, left = none.copy(), joined[start] > 0
+        chosen, left = np.zeros(len(agree), bool), joined[start] > 0
         chosen[start] = True
-        inside = joined @ (weight * left)  # weight of those left that each agrees with
+        inside = joined @ (weight * left)  # weight of the candidates that each loop agrees with
         while left.any():
-            take = int(np.where(left, inside + 1e-3 * weight, -1.0).argmax())
+            take = int(np.where(left, inside + _TIE * weight, -1.0).argmax())
             chosen[take] = True
             gone = np.flatnonzero(left & ~(joined[take] > 0))
             inside -= weight[gone] @ joined[gone]
             left[gone] = False
-        if (sum_of := float(weight[chosen].sum())) > most:
-            best, most = chosen, sum_of
+        if (total := float(weight[chosen].sum())) > most:
+            best, most = chosen, total
     return best

@@ -1,7 +1,4 @@
-"""Laser odometry of a log, tracked in pieces side by side; and as the input of a filter.
-
-The input is the pose of each keyframe relative to the previous one.
-"""
+"""Laser odometry of a log in pieces side by side, and its matches as the controls of a filter."""
 
 import itertools
 import os
@@ -16,7 +13,7 @@ from jaxtyping import Float, Int
 from jaxslam.core._record import record
 from jaxslam.core.protocols import Motion
 from jaxslam.laser.laser_slam._odometry.raw import Steps
-from jaxslam.laser.laser_slam._odometry.reference import match, reference_of, taken
+from jaxslam.laser.laser_slam._odometry.reference import match, reference_of, rows_of
 from jaxslam.laser.laser_slam._odometry.tracking import (
     FAR,
     NEAR,
@@ -39,9 +36,9 @@ _ROOTS = ("Lxx [m]", "Lyx [m]", "Lyy [m]", "Lθx [rad]", "Lθy [rad]", "Lθθ [r
 class MatchMotion(Motion):
     """The motion model of a relative pose whose covariance is part of the control: pose ∘ z ∘ w.
 
-    u = (z, L): z = (x [m], y [m], θ [rad]) in the robot's frame, and by rows the lower triangular
-    root of the covariance of its end. w ~ N(0, L Lᵀ), (x [m], y [m], θ [rad]) in the frame of the
-    robot after z. `match_controls` makes u of the matches of laser odometry.
+    u = (z, L): z = (x [m], y [m], θ [rad]) in the robot's frame, and the rows of L, the lower
+    triangular root of the covariance of the end of z. w ~ N(0, L Lᵀ), (x [m], y [m], θ [rad]) in
+    the frame of the robot after z. `match_controls` makes u of the matches of laser odometry.
     """
 
     controls = (*_ENDS, *_ROOTS)
@@ -66,7 +63,7 @@ def match_controls(of: Odometry | Solved) -> Float[np.ndarray, "N 9"]:
     that share scans are not.
 
     Args:
-        of: what `laser_odometry` or `solve` found.
+        of: a result of `laser_odometry` or `solve`.
     Raises:
         ValueError: on anything else.
     """
@@ -85,9 +82,9 @@ def match_controls(of: Odometry | Solved) -> Float[np.ndarray, "N 9"]:
 
 
 PIECE = 400
-"""Scans of a piece of a log, at least."""
+"""Scans of a piece of a log, at least; chosen: a log of 800 scans fills two cores."""
 _MARGIN = 5
-"""Scans to either side of the first of a piece in which raw odometry is right."""
+"""Scans to either side of the first scan of a piece in which raw odometry is right."""
 
 
 def laser_odometry(
@@ -101,14 +98,14 @@ def laser_odometry(
 
     The pose in the frame of the last keyframe minimizes the squared distances of the points from
     the lines of the reference, and the error of raw odometry from the scan before, by their
-    covariances; its covariance is (H/σ² + P⁻¹)⁻¹ + floor², H the information of the lines divided
-    by 2, for beams that err together.
+    covariances. Its covariance is (H/(2 σ²) + P⁻¹)⁻¹ + floor², with H the information of the lines
+    and 2 the number of beams with a common error.
 
-    If fewer than 0.6 of the points meet a wall, or raw odometry is unusable (a jump, a
-    frozen step, one that lags), all poses are searched that the robot can have reached in that time
-    (`Steps.reach`). Such a match counts if it is as good as that of a loop, no other pose is nearly
-    as good, and few beams pass through the reference; about raw odometry also if it is better by
-    0.2 than the match there.
+    If fewer than 0.6 of the points meet a wall, or raw odometry is unusable (a jump, a frozen step,
+    a step that lags), all poses are searched that the robot can have reached in that time
+    (`Steps.reach`). Such a match counts if it is as good as the match of a loop, no other pose is
+    nearly as good, and few beams pass through the reference; about raw odometry also if it is
+    better by 0.2 than the match there.
 
     Where raw odometry was frozen, or a match contradicts it, the next step may make up for that, or
     not: the scan is matched from the match before and from raw odometry before, and the better of
@@ -116,15 +113,15 @@ def laser_odometry(
 
     A scan without a match has the pose of raw odometry, is not a keyframe, and is matched again at
     the end, with the keyframes before and after it, from the path between its neighbours. After
-    `LOST` such scans in a row the next one is a keyframe, and only keyframes since then are matched
-    with; so is the first where raw odometry is frozen, but there matches that are less good count,
-    too, and are in doubt.
+    `LOST_AFTER` such scans in a row the next scan is a keyframe, and only keyframes since then are
+    matched with. While raw odometry is frozen, the first scan without a match is such a keyframe,
+    but less good matches count too, in doubt. The table in `tracking.step` has all cases.
 
     A match is in doubt that has few points on walls, or that raw odometry contradicts: it may be of
     another place that looks the same. It stays, and is assumed wrong with probability p = 0.1:
     its covariance is about that of the mixture with raw odometry, C + p (P + diag(d², d², t²)),
-    where d is the distance and t the turn from one to the other. So are those of the scans after
-    it until the next keyframe.
+    where d is the distance and t the turn from the match to raw odometry. The same term is added to
+    the scans after it until the next keyframe.
 
     A log of twice `PIECE` scans or more is tracked in pieces, side by side on every core. The first
     scan of a piece is a keyframe, and its scans are not matched with keyframes of the previous
@@ -143,23 +140,26 @@ def laser_odometry(
             with lock:
                 progress(next(progress_count), count)
 
-    def piece(begin: int, end: int) -> Odometry:
+    def track_piece(begin: int, end: int) -> Odometry:
         rows = slice(begin, end)
-        return match_to_keyframes(taken(scans, rows), taken(steps, rows), settings, advance)
+        return match_to_keyframes(rows_of(scans, rows), rows_of(steps, rows), settings, advance)
 
     # The last scan of a piece is the first of the next.
     ends = [*(borders[1:-1] + 1).tolist(), count]
     with ThreadPoolExecutor(os.cpu_count()) as pool:
-        pieces = [pool.submit(piece, *rows) for rows in zip(borders.tolist(), ends, strict=False)]
+        pieces = [
+            pool.submit(track_piece, begin, end)
+            for begin, end in zip(borders.tolist(), ends, strict=False)
+        ]
         try:
-            for one in as_completed(pieces):
-                one.result()
+            for piece in as_completed(pieces):
+                piece.result()
         except BaseException:
             stopped.set()
             raise
-    result = _joined([one.result() for one in pieces], borders, first)
-    place_unmatched(result, scans, steps, settings)
-    return result
+    odometry = _join([piece.result() for piece in pieces], borders, first)
+    place_unmatched(odometry, scans, steps, settings)
+    return odometry
 
 
 def _borders(scans: Scans, steps: Steps) -> Int[np.ndarray, "n"]:
@@ -171,15 +171,15 @@ def _borders(scans: Scans, steps: Steps) -> Int[np.ndarray, "n"]:
     odd = ~scans.usable | steps.unknown | steps.lags | steps.gap
     odd = np.convolve(odd, np.ones(2 * _MARGIN + 1), "same") > 0
     borders = [0]
-    for wanted in np.linspace(0, count, max(count // PIECE, 1) + 1)[1:-1].astype(int):
-        near = np.arange(wanted - PIECE // 4, wanted + PIECE // 4)
+    for even in np.linspace(0, count, max(count // PIECE, 1) + 1)[1:-1].astype(int):
+        near = np.arange(even - PIECE // 4, even + PIECE // 4)
         near = near[~odd[near]]
         if len(near):
-            borders.append(int(near[np.abs(near - wanted).argmin()]))
+            borders.append(int(near[np.abs(near - even).argmin()]))
     return np.array([*borders, count])
 
 
-def _joined(
+def _join(
     pieces: list[Odometry], borders: Int[np.ndarray, "n"], first: Float[np.ndarray, "3"]
 ) -> Odometry:
     """The odometry of all scans from pieces; each piece ends where the next begins."""
@@ -187,20 +187,21 @@ def _joined(
     for piece, begin in zip(pieces, borders[:-1].tolist(), strict=True):
         path = poses.compose(first, piece.poses)
         first = path[-1]
-        moved = piece._replace(poses=path, base=piece.base + begin)
-        # What the piece before knows of the first scan counts.
-        kept = Odometry(*(part[bool(begin) :] for part in moved))
-        parts.append(kept._replace(keyframe=piece.keyframe + begin))
-    whole = Odometry(*(np.concatenate(part) for part in zip(*parts, strict=True)))
-    return whole._replace(keyframe=np.unique(whole.keyframe))
+        part = piece._replace(poses=path, base=piece.base + begin)
+        if begin:  # its first row is the last row of the piece before, which matched the scan
+            part = Odometry(*(column[1:] for column in part))
+        parts.append(part._replace(keyframe=piece.keyframe + begin))
+    odometry = Odometry(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
+    return odometry._replace(keyframe=np.unique(odometry.keyframe))
 
 
 def _compile(scans: Scans, settings: Settings) -> None:
     """Compile the programs of the pieces, and in parallel the wider search."""
     row, start = np.zeros(1, int), np.zeros((1, 3))
     reference = reference_of(scans, row, start, start[0], settings.scans_of_reference)
-    rest = reference, taken(scans.points, 0), start[0], np.eye(3), NO_FLOOR, settings
-    match(NEAR, *rest)
+    arguments = reference, rows_of(scans.points, 0), start[0], np.eye(3), NO_FLOOR, settings
+    match(NEAR, *arguments)
+    # The wider search is needed later, if at all: nobody waits for it.
     pool = ThreadPoolExecutor(1)
-    pool.submit(match, FAR, *rest)
+    pool.submit(match, FAR, *arguments)
     pool.shutdown(wait=False)

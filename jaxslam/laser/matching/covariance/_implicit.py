@@ -1,8 +1,8 @@
 """Covariances of a match from derivatives of its cost at the minimum.
 
-The noise of the ranges through the condition that the match is a minimum (Censi 2007); that of a
-quadratic cost, its inverse second derivative; and the closed form with residuals across the surface
-alone (Bonnabel, Barczyk & Goulette 2016).
+`Implicit` carries the noise of the ranges through the condition that the match is a minimum (Censi
+2007), `Hessian` is the inverse second derivative, and `AlongNormals` the closed form with residuals
+across the surface alone (Bonnabel, Barczyk & Goulette 2016).
 """
 
 import dataclasses
@@ -16,17 +16,17 @@ from jaxslam.core._numbers import check_count, check_positive
 from jaxslam.core._record import record, static
 from jaxslam.laser.matching._matcher import Matcher
 from jaxslam.laser.matching._outcome import information_of
-from jaxslam.laser.matching._point_sets import Points, moved_along_rays
+from jaxslam.laser.matching._point_sets import Points, move_along_rays
 from jaxslam.laser.matching._surfaces import GAP, SPAN, surface
 from jaxslam.laser.matching.covariance._match_covariance import (
     MatchCovariance,
     MatchedScans,
-    beside_prior,
+    add_prior,
+    change_ranges,
     curvature,
     inverse_of,
-    propagated,
+    noise_cov,
     range_count,
-    with_ranges,
 )
 from jaxslam.math import se2
 from jaxslam.math._arrays import Number
@@ -50,25 +50,26 @@ class Implicit(MatchCovariance):
     """standard deviation of a range [m]"""
 
     def of_usable(self, matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
-        reference, points, found, *_ = scans
+        reference, points, match, *_ = scans
         prepared = matcher.prepare(reference)
 
-        def slope(of_reference: Array, of_scan: Array) -> Array:
-            changed = with_ranges(reference, of_reference)
+        def slope(reference_change: Array, scan_change: Array) -> Array:
+            """∂E/∂x as a function of changes of the ranges."""
+            changed = change_ranges(reference, reference_change)
             changed_prepared = (
                 matcher.prepare(changed) if isinstance(reference, Points) else prepared
             )
-            moved = moved_along_rays(points, of_scan)
+            moved = move_along_rays(points, scan_change)
             by_pose: Array = jax.grad(
-                lambda pose: matcher.cost(changed_prepared, moved, pose, found)
-            )(found.pose)
+                lambda pose: matcher.cost(changed_prepared, moved, pose, match)
+            )(match.pose)
             return by_pose
 
         dtype = points.position.dtype
         zeros = jnp.zeros(range_count(reference), dtype), jnp.zeros(len(points.valid), dtype)
         by_ranges = jnp.concatenate(jax.jacrev(slope, argnums=(0, 1))(*zeros), axis=1)
-        shape = curvature(matcher, prepared, points, found)
-        return propagated(found, shape, by_ranges @ by_ranges.T, self.sigma)
+        shape = curvature(matcher, prepared, points, match)
+        return noise_cov(match, shape, by_ranges @ by_ranges.T, self.sigma)
 
 
 @record
@@ -82,12 +83,12 @@ class Hessian(MatchCovariance):
     """
 
     def of_usable(self, matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
-        reference, points, found, *_ = scans
+        reference, points, match, *_ = scans
         prepared = matcher.prepare(reference)
-        free = (found.weight > 0).sum() - (3 if found.prior is None else 0)
-        least = 2 * matcher.cost(prepared, points, found.pose, found) / jnp.maximum(free, 1)
-        shape = curvature(matcher, prepared, points, found)
-        return least * inverse_of(shape, beside_prior(found, found.information))
+        free = (match.weight > 0).sum() - (3 if match.prior is None else 0)
+        least = 2 * matcher.cost(prepared, points, match.pose, match) / jnp.maximum(free, 1)
+        shape = curvature(matcher, prepared, points, match)
+        return least * inverse_of(shape, add_prior(match, match.information))
 
 
 @record
@@ -112,8 +113,9 @@ class AlongNormals(MatchCovariance):
     """standard deviation of a range [m]"""
     _: dataclasses.KW_ONLY
     span: int = static(default=SPAN)
+    """see `IcpSettings.span`"""
     gap: Number = GAP
-    """of the lines, as in `IcpSettings`"""
+    """see `IcpSettings.gap`"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -121,15 +123,15 @@ class AlongNormals(MatchCovariance):
         check_positive("AlongNormals", gap=self.gap)
 
     def of_usable(self, matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
-        reference, points, found, *_ = scans
+        reference, points, match, *_ = scans
         if not isinstance(reference, Points):
             raise ValueError(
                 f"AlongNormals: takes a reference of Points, got {type(reference).__name__}"
             )
         lines = surface(reference, self.span, self.gap)
-        j = jnp.maximum(found.pair, 0)
-        weight = jnp.where(lines.straight[j], found.weight, 0.0)
-        turn = se2.rotation(found.pose[2]).T
+        j = jnp.maximum(match.pair, 0)
+        weight = jnp.where(lines.straight[j], match.weight, 0.0)
+        turn = se2.rotation(match.pose[2]).T
         arm, ray, n = points.position @ turn, points.ray @ turn, lines.normal[j]
         jacobian = jnp.concatenate(
             [n, (n[:, 1] * arm[:, 0] - n[:, 0] * arm[:, 1])[:, None]], axis=1
@@ -139,4 +141,4 @@ class AlongNormals(MatchCovariance):
         of_partner = jax.ops.segment_sum(weight[:, None] * jacobian, j, len(reference.valid))
         by_reference = (lines.normal * reference.ray).sum(axis=1)[:, None] * of_partner
         noise = by_scan.T @ by_scan + by_reference.T @ by_reference
-        return propagated(found, beside_prior(found, shape), noise, self.sigma)
+        return noise_cov(match, add_prior(match, shape), noise, self.sigma)

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, PyTree
 from jaxslam.core._numbers import check_positive
 from jaxslam.core.protocols import Component
 from jaxslam.laser.matching._matcher import Match, Matcher, MatchStatus, Reference
-from jaxslam.laser.matching._point_sets import Points, moved_along_rays, prior_terms
+from jaxslam.laser.matching._point_sets import Points, move_along_rays, prior_terms
 from jaxslam.math import _linalg as linalg
 
 
@@ -19,10 +19,12 @@ class MatchedScans(NamedTuple):
     """A match with its inputs."""
 
     reference: Reference
-    """the argument of `matcher.prepare`"""
+    """argument of `matcher.prepare`"""
     points: Points
-    found: Match
+    """of the scan"""
+    match: Match
     start: Float[Array, "3"]
+    """pose where the search began"""
     key: Array
     """for covariances that draw"""
 
@@ -39,25 +41,25 @@ class MatchCovariance(Component):
             check_positive(type(self).__name__, sigma=self.sigma)
 
     def of_usable(self, matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
-        """The covariance of a match that did not fail; finite of any. Of one pair: vmap it."""
+        """The covariance of a match that did not fail, and finite if it did. Of a pair: vmap it."""
         raise NotImplementedError
 
     def of(self, matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
         """The covariance of a match; after a failure, that of the prior alone.
 
-        That is σ² Λ⁻¹ with the σ of a residual, if that is known; what no prior tells, or all
-        without one, is known to a kilometre or a thousand radians. A match failed if its status is
-        UNLIKE or TOO_FEW.
+        That is σ² Λ⁻¹ with the σ of a residual, if the class has it; a direction without a prior is
+        known to a kilometre or a thousand radians. A match failed if its status is UNLIKE or
+        TOO_FEW.
         """
-        found = scans.found
-        nothing = known = jnp.zeros_like(found.information)
-        scale = jnp.ones((), known.dtype)
+        match = scans.match
+        zero = information = jnp.zeros_like(match.information)
+        scale = jnp.ones((), information.dtype)
         if hasattr(self, "sigma"):
-            scale = jnp.asarray(self.sigma, known.dtype)
-            known = prior_terms(found.prior, found.pose)[0]
-        unknown = scale**2 * inverse_of(known, nothing, sigma=scale)
+            scale = jnp.asarray(self.sigma, information.dtype)
+            information = prior_terms(match.prior, match.pose)[0]
+        prior_cov = scale**2 * inverse_of(information, zero, sigma=scale)
         usable = self.of_usable(matcher, scans)
-        return jnp.where(found.status >= MatchStatus.UNLIKE, unknown, usable)
+        return jnp.where(match.status >= MatchStatus.UNLIKE, prior_cov, usable)
 
 
 def covariance(
@@ -65,41 +67,41 @@ def covariance(
     matcher: Matcher,
     reference: Reference,
     points: Points,
-    found: Match,
+    match: Match,
     start: ArrayLike,
     key: Array,
 ) -> Array:
     """The covariance (3, 3) of a match.
 
-    With a leading axis on the start, and so on all arrays but the key, (B, 3, 3). Of a match
-    that is UNLIKE or TOO_FEW it is that of the prior, and otherwise (1 km)² and (1000 rad)². Along
-    `found.weakest` of a DEGENERATE match add the variance of the start.
+    With a leading axis on the start, and so on all arrays but the key, (B, 3, 3). For a match that
+    is UNLIKE or TOO_FEW it is the covariance of the prior, and without a prior (1 km)² and
+    (1000 rad)². Along `match.weakest` of a DEGENERATE match add the variance of the start.
     """
     begin = jnp.asarray(start)
     many = begin.ndim == 2
     keys = jax.random.split(key, len(begin)) if many else key
-    scans = MatchedScans(reference, points, found, begin, keys)
-    cov: Array = (_many if many else _one)(way, matcher, scans)
+    scans = MatchedScans(reference, points, match, begin, keys)
+    cov: Array = (_covariances if many else _covariance)(way, matcher, scans)
     return cov
 
 
 @partial(jax.jit, inline=True)
-def _one(way: MatchCovariance, matcher: Matcher, scans: MatchedScans) -> Array:
+def _covariance(way: MatchCovariance, matcher: Matcher, scans: MatchedScans) -> Array:
     return way.of(matcher, scans)
 
 
 @partial(jax.jit, inline=True)
-def _many(way: MatchCovariance, matcher: Matcher, scans: MatchedScans) -> Array:
+def _covariances(way: MatchCovariance, matcher: Matcher, scans: MatchedScans) -> Array:
     return jax.vmap(partial(way.of, matcher))(scans)
 
 
 def inverse_of(
     curvature: Float[Array, "3 3"], otherwise: Float[Array, "3 3"], *, sigma: ArrayLike = 1.0
 ) -> Float[Array, "3 3"]:
-    """The inverse of a cost's second derivative; where that is not positive definite, of another.
+    """The inverse of a curvature, or of `otherwise` if the curvature is not positive definite.
 
-    What neither determines is known to a kilometre or a thousand radians, so that it is finite:
-    (σ/1000)² is added to the diagonal, the curvature being σ² times an information.
+    The inverse is finite: (σ/1000)² is added to the diagonal, the curvature being σ² times an
+    information, so that an undetermined direction is known to a kilometre or a thousand radians.
     """
     floor = (sigma * 1e-3) ** 2 * jnp.eye(3, dtype=curvature.dtype)
     first, positive = linalg.whitener(linalg.symmetrize(curvature) + floor)
@@ -108,44 +110,43 @@ def inverse_of(
     return linalg.self_gram(jnp.where(positive, first, jnp.where(usable, second, last)))
 
 
-def propagated(
-    found: Match, shape: Float[Array, "3 3"], noise: Float[Array, "3 3"], sigma: ArrayLike
+def noise_cov(
+    match: Match, shape: Float[Array, "3 3"], noise: Float[Array, "3 3"], sigma: ArrayLike
 ) -> Float[Array, "3 3"]:
-    """The covariance σ² A⁻¹ B A⁻¹ of a curvature A, with a prior's, and the scans' noise σ² B.
+    """The covariance σ² A⁻¹ B A⁻¹ by the curvature A, prior included, and the scans' noise σ² B.
 
-    What neither scans nor prior determine has the noise of `inverse_of`'s floor: a kilometre.
+    The floor of `inverse_of` is added to B too: an undetermined direction has a kilometre.
     """
     sigma = jnp.asarray(sigma, noise.dtype)
-    gain = inverse_of(shape, beside_prior(found, found.information), sigma=sigma)
+    gain = inverse_of(shape, add_prior(match, match.information), sigma=sigma)
     floor = (sigma * 1e-3) ** 2 * jnp.eye(3, dtype=noise.dtype)
-    return sigma**2 * gain @ (beside_prior(found, noise) + floor) @ gain.T
+    return sigma**2 * gain @ (add_prior(match, noise) + floor) @ gain.T
 
 
-def curvature(matcher: Matcher, prepared: PyTree, points: Points, found: Match) -> Array:
+def curvature(matcher: Matcher, prepared: PyTree, points: Points, match: Match) -> Array:
     """The curvature ∂²E/∂x² (3, 3) of the matcher's cost at the pose, pairs and weights kept."""
-    alone = found._replace(prior=None)
+    alone = match._replace(prior=None)
     by_pose = jax.hessian(lambda pose: matcher.cost(prepared, points, pose, alone))
-    return beside_prior(found, jnp.asarray(by_pose(found.pose)))
+    return add_prior(match, jnp.asarray(by_pose(match.pose)))
 
 
-def beside_prior(found: Match, of_scans: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """Curvature, information or noise DᵀAD + Λ, of which the scans have A and a prior Λ; A alone
-    without a prior.
+def add_prior(match: Match, of_scans: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
+    """The curvature, information or noise DᵀAD + Λ of scans (A) and prior (Λ); without prior A.
 
-    D leaves what the scans determine (`Match.determined`), as the match does: along a corridor the
+    D keeps what the scans determine (`Match.determined`), as the match does: along a corridor the
     noise of normals adds spurious information, which exceeds a realistic prior.
     """
-    if found.prior is None:
+    if match.prior is None:
         return of_scans
-    onto = found.determined
-    return onto.T @ of_scans @ onto + found.prior.information
+    onto = match.determined
+    return onto.T @ of_scans @ onto + match.prior.information
 
 
-def with_ranges(reference: Reference, by: Float[Array, "M"]) -> Reference:
-    """The reference with its ranges changed [m], if it is of points; a grid is unchanged."""
-    return moved_along_rays(reference, by) if isinstance(reference, Points) else reference
+def change_ranges(reference: Reference, by: Float[Array, "M"]) -> Reference:
+    """The reference with changed ranges [m]; a grid is unchanged."""
+    return move_along_rays(reference, by) if isinstance(reference, Points) else reference
 
 
 def range_count(reference: Reference) -> int:
-    """How many ranges a reference is made of; 0 of a grid."""
+    """The number of ranges of a reference; 0 of a grid."""
     return len(reference.valid) if isinstance(reference, Points) else 0

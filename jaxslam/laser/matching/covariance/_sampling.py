@@ -1,7 +1,7 @@
-"""Covariances of a match from its cost at many poses, or from matching again.
+"""Covariances of a match from its cost at many poses, or from further matches.
 
-The covariance of the likelihood over a lattice of poses (Olson 2009); and that of matches from
-other starts and with other noise.
+`Lattice` takes the likelihood over a lattice of poses (Olson 2009), `Unscented` and `Sampling`
+match again from other starts and with other noise.
 """
 
 import dataclasses
@@ -15,16 +15,16 @@ from jaxtyping import Array, Float
 from jaxslam.core._numbers import check_count, check_covariance, check_positive, held_array
 from jaxslam.core._record import record, set_field, static
 from jaxslam.laser.matching._matcher import Matcher
-from jaxslam.laser.matching._point_sets import Points, moved_along_rays, prior_cost
+from jaxslam.laser.matching._point_sets import Points, move_along_rays, prior_cost
 from jaxslam.laser.matching.covariance._implicit import Implicit
 from jaxslam.laser.matching.covariance._match_covariance import (
     MatchCovariance,
     MatchedScans,
-    beside_prior,
+    add_prior,
+    change_ranges,
     curvature,
     inverse_of,
     range_count,
-    with_ranges,
 )
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import Number
@@ -47,11 +47,11 @@ class Lattice(MatchCovariance):
     """standard deviation of a residual [m]"""
     _: dataclasses.KW_ONLY
     window: Number = 0.3
-    """[m] and"""
+    """[m] standard deviation of x and y in a window, which acts as a further prior"""
     turn_window: Number = 0.3
-    """[rad]: standard deviations of a prior, in addition to that of the match"""
+    """[rad] standard deviation of the heading in the window"""
     steps: int = static(default=13)
-    """along each axis"""
+    """poses along each axis"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -61,27 +61,28 @@ class Lattice(MatchCovariance):
     def of_usable(self, matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
         axis = np.linspace(-4.0, 4.0, self.steps)
         grid = np.stack(np.meshgrid(axis, axis, axis), axis=-1).reshape(-1, 3)
-        reference, points, found, *_ = scans
+        reference, points, match, *_ = scans
         prepared = matcher.prepare(reference)
-        dtype = found.pose.dtype
-        alone = found._replace(prior=None)
+        dtype = match.pose.dtype
+        alone = match._replace(prior=None)
         windows = jnp.asarray([self.window, self.window, self.turn_window], dtype)
         bound = jnp.diag(windows**-2.0)
         variance = jnp.asarray(self.sigma, dtype) ** 2
-        shape = curvature(matcher, prepared, points, found) / variance + bound
-        peak = inverse_of(shape, beside_prior(found, found.information) / variance + bound)
+        shape = curvature(matcher, prepared, points, match) / variance + bound
+        peak = inverse_of(shape, add_prior(match, match.information) / variance + bound)
         root = linalg.cholesky(peak)[0]
         offset = jnp.asarray(grid, dtype) @ root.T
 
-        def one(shift: Array) -> Array:
+        def log_likelihood(shift: Array) -> Array:
             far = (shift * (bound @ shift)).sum()
-            here = prior_cost(found.prior, found.pose + shift)
-            if found.prior is not None:
-                shift = found.determined @ shift
-            here = here + matcher.cost(prepared, points, found.pose + shift, alone)
-            return -here / variance - 0.5 * far
+            cost = prior_cost(match.prior, match.pose + shift)
+            if match.prior is not None:
+                shift = match.determined @ shift
+            cost = cost + matcher.cost(prepared, points, match.pose + shift, alone)
+            return -cost / variance - 0.5 * far
 
-        weight = jax.nn.softmax(jax.lax.map(one, offset, batch_size=64))
+        # 64 poses at once: all of them would need memory for steps³ scans.
+        weight = jax.nn.softmax(jax.lax.map(log_likelihood, offset, batch_size=64))
         mean = weight @ offset
         apart = offset - mean[None]
         return (weight[:, None] * apart).T @ apart
@@ -107,14 +108,14 @@ class Unscented(MatchCovariance):
         _hold_start_cov(self)
 
     def of_usable(self, matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
-        reference, points, found, start, _ = scans
+        reference, points, match, start, _ = scans
         root = linalg.root_psd(jnp.asarray(self.start_cov, start.dtype))
         sides = jnp.sqrt(3.0).astype(start.dtype) * jnp.concatenate([root.T, -root.T])
         prepared = matcher.prepare(reference)
-        ends = jax.vmap(lambda off: matcher.match(prepared, points, start + off, found.prior).pose)(
+        ends = jax.vmap(lambda off: matcher.match(prepared, points, start + off, match.prior).pose)(
             sides
         )
-        apart = _apart(ends, found.pose)
+        apart = _pose_differences(ends, match.pose)
         return apart.T @ apart / 6 + Implicit(self.sigma).of(matcher, scans)
 
 
@@ -140,30 +141,30 @@ class Sampling(MatchCovariance):
         check_count("Sampling: samples", self.samples)
 
     def of_usable(self, matcher: Matcher, scans: MatchedScans) -> Float[Array, "3 3"]:
-        reference, points, found, start, key = scans
+        reference, points, match, start, key = scans
         root = linalg.root_psd(jnp.asarray(self.start_cov, start.dtype))
         sigma = jnp.asarray(self.sigma, start.dtype)
 
-        def one(key: Array) -> Array:
+        def match_with_noise(key: Array) -> Array:
             key_reference, key_scan, key_start, key_prior = jax.random.split(key, 4)
             dtype = start.dtype
-            other = reference
+            noisy = reference
             if isinstance(reference, Points):
                 noise = jax.random.normal(key_reference, (range_count(reference),), dtype)
-                other = with_ranges(reference, sigma * noise)
-            scan = moved_along_rays(
+                noisy = change_ranges(reference, sigma * noise)
+            scan = move_along_rays(
                 points, sigma * jax.random.normal(key_scan, points.valid.shape, dtype)
             )
             begin = start + root @ jax.random.normal(key_start, (3,), dtype)
-            prior = found.prior
+            prior = match.prior
             if prior is not None:
                 spread = sigma * _inverse_root(prior.information)
                 drawn = spread @ jax.random.normal(key_prior, (3,), dtype)
                 prior = prior._replace(pose=prior.pose + drawn)
-            return matcher.match(matcher.prepare(other), scan, begin, prior).pose
+            return matcher.match(matcher.prepare(noisy), scan, begin, prior).pose
 
-        ends = jax.vmap(one)(jax.random.split(key, self.samples))
-        apart = _apart(ends, found.pose)
+        ends = jax.vmap(match_with_noise)(jax.random.split(key, self.samples))
+        apart = _pose_differences(ends, match.pose)
         return apart.T @ apart / self.samples
 
 
@@ -173,12 +174,13 @@ def _hold_start_cov(of: Unscented | Sampling) -> None:
 
 
 def _inverse_root(information: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """The root Wᵀ with WᵀW = Λ⁻¹; of a share 1e-6 of the trace along what Λ does not determine."""
+    """The root Wᵀ with WᵀW = (Λ + 1e-6 tr(Λ) I)⁻¹, which is finite if Λ is singular."""
     floor = 1e-6 * jnp.trace(information)
     floor = jnp.where(floor > 0, floor, 1.0) * jnp.eye(3, dtype=information.dtype)
     return linalg.whitener(linalg.symmetrize(information) + floor)[0].T
 
 
-def _apart(poses: Float[Array, "S 3"], middle: Float[Array, "3"]) -> Float[Array, "S 3"]:
+def _pose_differences(poses: Float[Array, "S 3"], middle: Float[Array, "3"]) -> Float[Array, "S 3"]:
+    """The differences of poses from a pose, with angles in (-π, π]."""
     off = poses - middle[None]
     return off.at[:, 2].set(wrap(off[:, 2]))
