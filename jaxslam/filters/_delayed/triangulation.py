@@ -77,7 +77,7 @@ class Rays(Triangulation):
         super().__post_init__()
 
     def store(self, sensor: Sensor, pose: Float[Array, "3"], z: Float[Array, "1"]) -> Stored:
-        # Two points of the ray, for the ranges (or priors of them) 0 and 1.
+        # Two points of the ray: of the unmeasured numbers s = 0 and 1.
         start = sensor.invert(pose, z, jnp.zeros(1, z.dtype))[:2]
         ahead = sensor.invert(pose, z, jnp.ones(1, z.dtype))[:2] - start
         return jnp.concatenate([start, jnp.arctan2(ahead[1], ahead[0])[None]])

@@ -152,7 +152,12 @@ class FastSlam(ParticleMapFilter):
             self.resample,
             key_resample,
         )
-        state = _draw(state._replace(log_weight=log_weight), key_draw)
+        state = state._replace(
+            pose=draw_poses(state, key_draw),
+            pose_cov=jnp.zeros_like(state.pose_cov),
+            log_weight=log_weight,
+            invalid=jnp.zeros_like(state.invalid),
+        )
         state, infos = jax.vmap(partial(update_map, self, scan=scan))(
             state, association, innovations
         )
@@ -173,15 +178,6 @@ def _weigh(
     log_matched = state.log_weight + proposal.log_matched
     log_weight, _, some = normalized(log_matched + proposal.log_unmatched)
     return log_weight, normalized(log_matched)[1], ~some
-
-
-def _draw(state: SlamParticles, key: Array) -> SlamParticles:
-    """The state with each pose drawn from its Gaussian, all finite."""
-    return state._replace(
-        pose=draw_poses(state, key),
-        pose_cov=jnp.zeros_like(state.pose_cov),
-        invalid=jnp.zeros_like(state.invalid),
-    )
 
 
 def _report(

@@ -57,10 +57,10 @@ class ParticleLocalization(MonteCarloFilter):
     does not depend on how many landmarks are in view; the first scan sets both averages; scans
     without a measurement change nothing.
 
-    The estimate is that of the weighted particles after a scan, before resampling:
+    The estimate has the moments of the weighted particles after a scan, before resampling:
     `weighted_pose_moments`, a single mean and covariance even if the particles form several modes.
-    Where all weights underflow, all in use become equal (`underflow`). A motion
-    that leaves a non-finite pose is undone, and the particle gets weight zero (`invalid`).
+    Where all weights underflow, the weights of the particles in use become equal (`underflow`). A
+    motion that leaves a non-finite pose is undone, and the particle gets weight zero (`invalid`).
     An `Info` reports the measurements of the most likely particle; nis is the mean over the
     particles by weight, as in `FastSlam`; log_likelihood is log Σ w p(scan | x) of the measurements
     matched to a landmark.

@@ -69,7 +69,7 @@ class Closing(Managed):
 
     def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:
         joint = super().init(pose, pose_cov)
-        check_recency("Closing", joint, self.chart)
+        check_recency("Closing", joint)
         return joint
 
     def manage(self, joint: Joint, scan: Scan, info: Info) -> tuple[Joint, Info]:

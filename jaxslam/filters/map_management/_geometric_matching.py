@@ -13,6 +13,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.core._numbers import check_count
+from jaxslam.core.slots import Joint
 from jaxslam.filters.map_management._point_pairs import (
     PointSets,
     equal_lengths,
@@ -164,6 +165,24 @@ class _SearchLimits(NamedTuple):
     """(M + 1,) χ² of 2n - 3 degrees of freedom, for n pairs"""
     pairs: int
     candidates: int
+
+
+def check_point_map(caller: str, joint: Joint) -> None:
+    """Raise ValueError unless landmarks are points and the state keeps no earlier poses."""
+    if joint.landmarks.shape[1] != 2:
+        raise ValueError(
+            f"{caller}: expected landmarks (x, y), got {joint.landmarks.shape[1]} parameters each"
+        )
+    if jax.tree.leaves(joint.lin):
+        raise ValueError(f"{caller}: a linearizer that keeps former estimates is not supported")
+
+
+def check_policy(caller: str, least: int, margin: int) -> None:
+    """Raise ValueError unless least >= 3 and margin >= 1: two points fit too often by chance."""
+    check_count(f"{caller}: least", least)
+    check_count(f"{caller}: margin", margin)
+    if least < 3:
+        raise ValueError(f"{caller}: expected least >= 3, got {least}")
 
 
 def check_search(caller: str, probability: float, pairs: int, candidates: int) -> None:

@@ -15,6 +15,8 @@ from jaxslam.core.slots import Joint
 from jaxslam.filters._ekf.map_coordinates import cov_of_coordinates
 from jaxslam.filters.map_management._geometric_matching import (
     GeometricMatch,
+    check_point_map,
+    check_policy,
     check_search,
     match_points,
     search_limits,
@@ -22,7 +24,6 @@ from jaxslam.filters.map_management._geometric_matching import (
 )
 from jaxslam.filters.map_management._merging import closest_pair, merge_landmarks, squared_distance
 from jaxslam.filters.map_management._point_pairs import PointSets, difference_covs
-from jaxslam.filters.map_management.relocalization import check_point_map, check_policy
 from jaxslam.life import Times
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import Number
@@ -137,9 +138,9 @@ class LoopSettings:
         check_search("LoopSettings", self.probability, self.pairs, self.candidates)
 
 
-def check_recency(caller: str, joint: Joint, chart: Chart) -> None:
+def check_recency(caller: str, joint: Joint) -> None:
     """Raise ValueError unless landmarks are points and their times are kept (`life.Recency`)."""
-    check_point_map(caller, joint, chart)
+    check_point_map(caller, joint)
     if not isinstance(joint.life, Times):
         raise ValueError(
             f"{caller}: expected a filter that keeps times of landmarks, as EkfSlam(…, "
@@ -168,7 +169,7 @@ def close_loop(joint: Joint, chart: Chart, settings: LoopSettings) -> tuple[Join
         ValueError: on a life that is not recency, or landmarks or a linearizer that `lost`
             refuses.
     """
-    check_recency("close_loop", joint, chart)
+    check_recency("close_loop", joint)
     recent, candidates = _recent_cluster(joint, settings)
     # Each test before the search costs less than the search: most scans end here.
     old, report = change_where(

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, ArrayLike, Bool, Float, Int
 
-from jaxslam.core._numbers import check_count, check_covariance
+from jaxslam.core._numbers import check_covariance
 from jaxslam.core.protocols import Chart, Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Scan
@@ -15,6 +15,8 @@ from jaxslam.filters._ekf.map_coordinates import cov_of_coordinates, with_cov_of
 from jaxslam.filters.map_management._geometric_matching import (
     GeometricMatch,
     align_points,
+    check_point_map,
+    check_policy,
     check_search,
     match_points,
     search_limits,
@@ -135,14 +137,6 @@ def relocalize(
     return _Relocalization(ok=ok, **match._asdict())
 
 
-def check_policy(caller: str, least: int, margin: int) -> None:
-    """Raise ValueError unless least >= 3 and margin >= 1: two points fit too often by chance."""
-    check_count(f"{caller}: least", least)
-    check_count(f"{caller}: margin", margin)
-    if least < 3:
-        raise ValueError(f"{caller}: expected least >= 3, got {least}")
-
-
 def points_of_map(
     joint: Joint, chart: Chart, *, square_root: bool = False
 ) -> tuple[Float[Array, "N 2"], Float[Array, "2*N 2*N"], Bool[Array, "N"]]:
@@ -150,7 +144,7 @@ def points_of_map(
 
     Raises ValueError unless the landmarks are points.
     """
-    check_point_map("points_of_map", joint, chart)
+    check_point_map("points_of_map", joint)
     cov = cov_of_coordinates(joint, chart, square_root=square_root)
     return joint.landmarks, cov[3:, 3:], joint.alive
 
@@ -164,7 +158,7 @@ def lost(joint: Joint, chart: Chart, pose_cov: ArrayLike, *, square_root: bool =
     Raises ValueError on landmarks other than points, a linearizer with a memory, or a pose_cov
     that is no covariance.
     """
-    check_point_map("lost", joint, chart)
+    check_point_map("lost", joint)
     check_covariance("lost: pose_cov", pose_cov, 3)
     cov = cov_of_coordinates(joint, chart, square_root=square_root)
     cov = cov.at[:3].set(0.0).at[:, :3].set(0.0)
@@ -195,7 +189,7 @@ def relocated(
     Raises:
         ValueError: as `lost`, or on shapes that do not fit.
     """
-    check_point_map("relocated", joint, chart)
+    check_point_map("relocated", joint)
     m, capacity = np.shape(slot)[0], joint.landmarks.shape[0]
     if np.shape(seen) != (m, 2) or np.shape(seen_covs) != (m, 2, 2):
         raise ValueError(
@@ -233,13 +227,3 @@ def relocated(
     moved = with_cov_of_coordinates(moved, chart, after, square_root=square_root)
     aligned: Joint = jax.tree.map(lambda a, b: jnp.where(ok, a, b), moved, joint)
     return aligned
-
-
-def check_point_map(caller: str, joint: Joint, chart: Chart) -> None:
-    """Raise ValueError unless landmarks are points and the state keeps no earlier poses."""
-    if joint.landmarks.shape[1] != 2:
-        raise ValueError(
-            f"{caller}: expected landmarks (x, y), got {joint.landmarks.shape[1]} parameters each"
-        )
-    if jax.tree.leaves(joint.lin):
-        raise ValueError(f"{caller}: a linearizer that keeps former estimates is not supported")
