@@ -18,7 +18,9 @@ from jaxslam.core._validation.models import (
     check_record,
     check_sensor,
     checked_estimate,
+    motion_model,
     same_state,
+    sensor_model,
     state_and_info,
 )
 
@@ -37,7 +39,9 @@ __all__ = [
     "check_sensor",
     "checked_estimate",
     "is_concrete",
+    "motion_model",
     "same_state",
+    "sensor_model",
     "shape_text",
     "state_and_info",
 ]

@@ -8,7 +8,7 @@ import traceback
 import weakref
 from collections.abc import Callable
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -112,6 +112,27 @@ def check_sensor(name: str, sensor: object) -> None:
     _check_size(name, sensor, "invert", {"pose": pose, "z": z, "s": _numbers(*free)}, (size_l,))
     _check_size(name, sensor, "position", {"l": landmark}, (2,))
     _SOUND.add(sensor)
+
+
+def motion_model(value: object) -> Motion:
+    """The check of a field: a Motion whose functions return the sizes of its names."""
+    if isinstance(value, Sensor):
+        raise ValueError(f"expected a Motion, got the sensor {value.name}: a motion comes first")
+    return _sound(value, check_motion)
+
+
+def sensor_model(value: object) -> Sensor:
+    """The check of a field: a Sensor, or a suite, whose functions return the sizes of its names."""
+    return _sound(value, check_sensor)
+
+
+def _sound(value: Any, check: Callable[[str, object], None]) -> Any:
+    """The value, if a check by the caller's name accepts it; ValueError with its reason if not."""
+    try:
+        check("", value)
+    except InvalidField as error:
+        raise ValueError(error.reason) from None
+    return value
 
 
 def check_parts(
