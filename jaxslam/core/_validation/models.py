@@ -118,12 +118,14 @@ def motion_model(value: object) -> Motion:
     """The check of a field: a Motion whose functions return the sizes of its names."""
     if isinstance(value, Sensor):
         raise ValueError(f"expected a Motion, got the sensor {value.name}: a motion comes first")
-    return _sound(value, check_motion)
+    motion: Motion = _sound(value, check_motion)
+    return motion
 
 
 def sensor_model(value: object) -> Sensor:
     """The check of a field: a Sensor, or a suite, whose functions return the sizes of its names."""
-    return _sound(value, check_sensor)
+    sensor: Sensor = _sound(value, check_sensor)
+    return sensor
 
 
 def _sound(value: Any, check: Callable[[str, object], None]) -> Any:
