@@ -18,7 +18,7 @@ from jaxslam._cli.campaigns import consistency
 from jaxslam._cli.common import INTERRUPTED, CompileClock, as_folders, set_device_count
 from jaxslam._cli.environment import environment_text
 from jaxslam._cli.recorded import fit, laser_log, localize, make_map, run, slam
-from jaxslam.core._names import meant
+from jaxslam.core._names import closest_name
 from jaxslam.core._optional import first_line
 
 __all__ = ["main"]
@@ -103,7 +103,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(environment_text("--verbose" in arguments))
         return 0
     if arguments and arguments[0][:1] != "-" and arguments[0] not in COMMANDS:
-        hint = f"{meant(arguments[0], COMMANDS)}; jaxslam --help lists the commands"
+        hint = f"{closest_name(arguments[0], COMMANDS)}; jaxslam --help lists the commands"
         print(f"jaxslam: unknown command {arguments[0]!r}{hint}", file=sys.stderr)
         return USAGE_ERROR
     try:
@@ -176,7 +176,7 @@ class _Parser(argparse.ArgumentParser):
         """As in argparse; unknown arguments are an error, reported with the name of the command."""
         found, unknown = super().parse_known_args(args, namespace)
         if unknown:
-            hint = meant(unknown[0], self._option_string_actions)
+            hint = closest_name(unknown[0], self._option_string_actions)
             self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
         return found, unknown
 

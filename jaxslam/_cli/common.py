@@ -16,7 +16,7 @@ import jax
 from jaxslam.consistency._measures.counts import count_label
 from jaxslam.consistency.campaign._pieces import cores
 from jaxslam.consistency.campaign._progress import Progress
-from jaxslam.core._names import meant
+from jaxslam.core._names import closest_name
 from jaxslam.core._optional import loading
 from jaxslam.results._campaign_files import FORMATS, RESULT
 from jaxslam.results._files import Files, check_writable, write_files
@@ -51,7 +51,7 @@ def pick(option: str, name: str, known: Mapping[str, _T], more: str = "") -> _T:
     Raises ValueError with the known names and `more`.
     """
     if name not in known:
-        unknown = f"unknown {option.removesuffix('s')} {name!r}{meant(name, known)}"
+        unknown = f"unknown {option.removesuffix('s')} {name!r}{closest_name(name, known)}"
         raise ValueError(f"--{option}: {unknown}; known: {', '.join(known)}{more}")
     return known[name]
 

@@ -21,10 +21,10 @@ class Named(dict[str, _V]):
     def __missing__(self, name: object) -> NoReturn:
         """Refuse a name."""
         names = ", ".join(self)
-        raise _UnknownName(f"expected one of {names}, got {name!r}{meant(name, self)}")
+        raise _UnknownName(f"expected one of {names}, got {name!r}{closest_name(name, self)}")
 
 
-def meant(name: object, names: Iterable[str]) -> str:
+def closest_name(name: object, names: Iterable[str]) -> str:
     """The closest of several names, as a question in brackets, or ""."""
     closest = difflib.get_close_matches(str(name), names, 1)
     return "".join(f" (did you mean {match}?)" for match in closest)

@@ -130,11 +130,6 @@ def local_cov(joint: Joint, slot: Int[Array, ""], square_root: bool = False) -> 
     rows = jnp.concatenate([joint.cov[:3], gather(joint, slot)[1]])
     if square_root:
         return rows @ rows.T
-    return _local_block(rows, slot, size)
-
-
-def _local_block(rows: Float[Array, "k D"], slot: Int[Array, ""], size: int) -> Float[Array, "k K"]:
-    """The columns of the robot and of the landmark (size L) of a slot (), of rows (k, D)."""
     landmark = jax.lax.dynamic_slice_in_dim(rows, 3 + slot * size, size, axis=1)
     return jnp.concatenate([rows[:, :3], landmark], axis=1)
 

@@ -72,6 +72,7 @@ def mahalanobis_squared(
     factor = linalg.cholesky(cov * unit[:, None] * unit[None, :])[0]
     is_finite = jnp.isfinite(error)
     squares = linalg.solve_lower(factor, jnp.where(is_finite, error, 0.0) * unit) ** 2
+    # Pivots of a matrix with a unit diagonal: `cholesky` accepts n·eps, of which no digit is right.
     regular = jnp.all(jnp.diagonal(factor) ** 2 > 100 * n * jnp.finfo(cov.dtype).eps)
     regular = regular & jnp.all(is_finite)
     return jnp.where(regular, jnp.sum(squares), 0.0), regular

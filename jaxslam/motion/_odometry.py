@@ -112,9 +112,10 @@ def odometry_controls(path: ArrayLike) -> Float[np.ndarray, "T 3"]:
     moved = np.diff(poses, axis=0)
     c, s = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
     ahead, left = c * moved[:, 0] + s * moved[:, 1], c * moved[:, 1] - s * moved[:, 0]
-    way = np.where(ahead < 0, -1.0, 1.0)
+    way = np.where(ahead < 0, -1.0, 1.0)  # -1: backward, with no turn by π
     rot1 = np.arctan2(way * left, way * ahead)
     rot2 = moved[:, 2] - rot1
+    # To (-π, π], as `wrap` does.
     rot2 = rot2 - 2 * np.pi * np.ceil((rot2 - np.pi) / (2 * np.pi))
     controls = np.zeros_like(poses)
     controls[1:] = np.column_stack([rot1, way * np.hypot(ahead, left), rot2])

@@ -82,7 +82,7 @@ class Corrected(Motion):
         names = [name.split(" ")[0] for name in self.motion.controls]
         along, turn = (next(k for k, n in enumerate(names) if n in of) for of in (_TRAVEL, _TURN))
         scale, wheels = (jnp.asarray(pair, u.dtype) for pair in (self.scale, self.wheels))
-        corrected = list(u)
+        corrected = list(u)  # other entries, as the interval, stay
         corrected[along] = scale[0] * u[along] - wheels[0] * jnp.abs(u[turn])
         corrected[turn] = scale[1] * u[turn] + wheels[1] * u[along]
         for k, name in enumerate(names):

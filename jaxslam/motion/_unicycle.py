@@ -65,6 +65,6 @@ class WhiteNoise:
         travel, turn, share = (
             jnp.asarray(value, u.dtype) for value in (self.travel, self.turn, self.turn_share)
         )
-        moving = u[2] > 0
+        moving = u[2] > 0  # else 1/Δt, and its gradient, would be infinite
         density = jnp.diag(jnp.stack([travel**2, turn**2 + (share * u[1]) ** 2]))
         return density * jnp.where(moving, 1 / jnp.where(moving, u[2], 1.0), 0.0)

@@ -48,6 +48,7 @@ class Velocity(Motion):
         by_pose, by_move = se2.compose_jacobians(pose, se2.exp(twist))
         (by_twist,) = se2.exp_jacobians(twist)
         by_v, by_omega = by_move @ by_twist[:, 0] * dt, by_move @ by_twist[:, 2] * dt
+        # The twist is Δt times the rates, and the final rotation w_γ Δt.
         rates = jnp.stack([u[0] + w[0], zero, u[1] + w[1]])
         by_dt = (by_move @ (by_twist @ rates)).at[2].add(w[2])
         by_gamma = jnp.stack([zero, zero, dt])

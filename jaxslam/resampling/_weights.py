@@ -33,8 +33,8 @@ def normalized(
     safe = jnp.where(finite, log_weights - highest, 0.0)
     total = jnp.where(finite, jnp.exp(safe), 0.0).sum()
     log_total = jnp.where(some, jnp.log(jnp.where(some, total, 1.0)), 0.0)
-    out = jnp.where(finite, safe - log_total, -jnp.inf)
-    return jnp.where(some, out, even(log_weights)), highest + log_total, some
+    log_w = jnp.where(finite, safe - log_total, -jnp.inf)
+    return jnp.where(some, log_w, even(log_weights)), highest + log_total, some
 
 
 def even(log_weights: Float[Array, "P"]) -> Float[Array, ""]:
@@ -94,5 +94,6 @@ def at_points(weights: Float[Array, "P"], points: Float[Array, "K"]) -> Int[Arra
     """
     above = jnp.cumsum(weights)
     index = jnp.searchsorted(above, points * above[-1], side="right")
+    # The last index with a weight: a point rounded up to 1 would be beyond it.
     last = weights.shape[0] - 1 - jnp.argmax((weights > 0)[::-1])
     return jnp.minimum(index.astype(jnp.int32), last.astype(jnp.int32))

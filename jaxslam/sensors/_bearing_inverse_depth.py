@@ -138,6 +138,7 @@ class BearingInverseDepth(Sensor):
         by_axes, by_v = se2.to_frame_jacobians(axes, v)
         outer = se2.polar_jacobians(se2.to_frame(axes, v))[0][1:]
         c, s = _direction(landmark[2])
+        # ∂/∂(x, y, θ) of the direction in the sensor's frame, as rows: v = ρ(p0 - t) + …
         by_frame = jnp.stack([-landmark[3] * by_v[:, 0], -landmark[3] * by_v[:, 1], by_axes[:, 2]])
         by_alpha = by_v @ jnp.stack([-s, c])
         by_inverse = by_v @ (landmark[:2] - frame[:2])

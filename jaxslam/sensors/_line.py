@@ -61,14 +61,15 @@ class Line(Sensor):
     def observe_jacobians(self, pose: Pose, landmark: Landmark) -> ObserveJacobians:
         frame = self.frame(pose)
         c, s, across = _normal(landmark[1], frame)
+        # By (x, y, θ): rows of distance and direction; 0 * c is a zero of the dtype of c.
         by_frame = jnp.stack([-c, -s, 0 * c, 0 * c, 0 * c, -jnp.ones_like(c)]).reshape(2, 3)
         by_line = jnp.eye(2, dtype=across.dtype).at[0, 1].set(-across)
         return by_frame @ self.frame_jacobian(pose), by_line
 
     def invert_jacobians(self, pose: Pose, z: Measurement, s: Unmeasured) -> InvertJacobians:
         frame = self.frame(pose)
-        c, s_, across = _normal(z[1] + frame[2], frame)
-        by_frame = jnp.stack([c, s_, across, 0 * c, 0 * c, jnp.ones_like(c)]).reshape(2, 3)
+        c, sine, across = _normal(z[1] + frame[2], frame)
+        by_frame = jnp.stack([c, sine, across, 0 * c, 0 * c, jnp.ones_like(c)]).reshape(2, 3)
         by_z = jnp.eye(2, dtype=across.dtype).at[0, 1].set(across)
         return by_frame @ self.frame_jacobian(pose), by_z, jnp.zeros((2, 0), pose.dtype)
 

@@ -74,6 +74,7 @@ class _PolarCoordinate(Sensor):
     _other: slice
 
     def _polar(self, z: Measurement, s: Unmeasured) -> Array:
+        # (range, bearing): the measured row is the second one of a bearing-only sensor.
         return jnp.concatenate([s, z] if self._own.start else [z, s])
 
     def observe(self, pose: Pose, landmark: Landmark) -> Measurement:

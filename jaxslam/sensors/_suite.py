@@ -195,6 +195,7 @@ class Suite(Sensor):
         reason = "a suite has no model of its own: call those of its parts"
         raise InvalidField(type(self).__name__, "", reason)
 
+    # The other functions of a model are refused by `observe`, whatever it is given.
     def residual(self, z: Measurement, z_hat: Measurement) -> Measurement:
         return self.observe(z, z_hat)
 
@@ -254,6 +255,7 @@ class _OnGround(Wrapped):
         prior, spare = self.sensor.free, self.size - len(self.sensor.landmark)
         mean = jnp.asarray(prior.mean)
         kept = mean.shape[0]
+        # The numbers that the sensor does not use: zero mean, unit variance, as padding.
         cov = jnp.eye(kept + spare, dtype=mean.dtype).at[:kept, :kept].set(prior.cov)
         return Free(jnp.concatenate([mean, jnp.zeros(spare, mean.dtype)]), cov)
 

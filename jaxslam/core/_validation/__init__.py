@@ -17,8 +17,10 @@ from jaxslam.core._validation.models import (
     check_record,
     check_sensor,
     checked_estimate,
+    motion_model,
     reworded_tracer_errors,
     same_state,
+    sensor_model,
     state_and_info,
 )
 
@@ -36,8 +38,10 @@ __all__ = [
     "check_sensor",
     "checked_estimate",
     "is_concrete",
+    "motion_model",
     "reworded_tracer_errors",
     "same_state",
+    "sensor_model",
     "shape_text",
     "state_and_info",
 ]

@@ -9,7 +9,7 @@ import traceback
 import weakref
 from collections.abc import Callable, Iterator
 from pathlib import Path
-from typing import TypeVar
+from typing import Any, TypeVar
 
 import jax
 import jax.numpy as jnp
@@ -124,6 +124,29 @@ def check_sensor(name: str, sensor: object) -> None:
     _check_size(name, sensor, "invert", {"pose": pose, "z": z, "s": _numbers(*free)}, (size_l,))
     _check_size(name, sensor, "position", {"l": landmark}, (2,))
     _SOUND.add(sensor)
+
+
+def motion_model(value: object) -> Motion:
+    """The check of a field: a Motion whose functions return the sizes of its names."""
+    if isinstance(value, Sensor):
+        raise ValueError(f"expected a Motion, got the sensor {value.name}: a motion comes first")
+    motion: Motion = _sound(value, check_motion)
+    return motion
+
+
+def sensor_model(value: object) -> Sensor:
+    """The check of a field: a Sensor, or a suite, whose functions return the sizes of its names."""
+    sensor: Sensor = _sound(value, check_sensor)
+    return sensor
+
+
+def _sound(value: Any, check: Callable[[str, object], None]) -> Any:
+    """The value, if a check by the caller's name accepts it; ValueError with its reason if not."""
+    try:
+        check("", value)
+    except InvalidField as error:
+        raise ValueError(error.reason) from None
+    return value
 
 
 def check_parts(

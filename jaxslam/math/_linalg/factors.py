@@ -53,7 +53,10 @@ def cholesky(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Arr
     n = matrix.shape[-1]
     if n == 0:
         return matrix, jnp.asarray(True)
-    return _cholesky_beyond(matrix) if n > UNROLLED else _cholesky(matrix)
+    if n > UNROLLED:
+        factor = _factor(mirrored(matrix))
+        return factor, factor[0, 0] > 0
+    return _cholesky(matrix)
 
 
 @jax.custom_jvp
@@ -63,7 +66,7 @@ def _cholesky(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Ar
     zero = jnp.zeros((), matrix.dtype)
     rows: list[list[jax.Array]] = [[zero] * n for _ in range(n)]
     positive = jnp.asarray(True)
-    ratios: list[jax.Array] = []  # s_k / p_k of `_sizes`
+    ratios: list[jax.Array] = []  # s_k / p_k of `_sizes`, exactly, since the loop has them in order
     for j in range(n):
         squares = [rows[j][k] ** 2 for k in range(j)]
         pivot = matrix[j, j] - sum(squares, zero)
@@ -72,6 +75,7 @@ def _cholesky(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Ar
         good = pivot > tolerance * size
         positive = positive & good
         ratios.append(jnp.where(good, size / jnp.where(good, pivot, 1.0), 0.0))
+        # 1 in place of a bad pivot: √ and division keep finite derivatives in the unused branch.
         root = jnp.sqrt(jnp.where(good, pivot, 1.0))
         rows[j][j] = jnp.where(good, root, 0.0)
         for i in range(j + 1, n):
@@ -85,6 +89,7 @@ def _cholesky_slope(primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
     """dL = L Φ(L⁻¹ dA L⁻ᵀ); the column of a zero pivot stays zero, with 1 used in its place."""
     factor, positive = _cholesky(*primals)
     good = jnp.diagonal(factor) > 0
+    # 1 on the diagonal of a zero column, so that L is regular; its slope is masked below.
     regular = factor + jnp.diag((~good).astype(factor.dtype))
     inner = solve_lower(regular, solve_lower(regular, mirrored(tangents[0])).T)
     slope = regular @ jnp.where(good, lower_half(inner), 0.0)
@@ -99,11 +104,6 @@ def mirrored(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
 def lower_half(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
     """Φ(A): the lower triangle of A with half of the diagonal."""
     return jnp.tril(matrix) - 0.5 * jnp.diag(jnp.diagonal(matrix))
-
-
-def _cholesky_beyond(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Array, ""]]:
-    factor = _factor(mirrored(matrix))
-    return factor, factor[0, 0] > 0
 
 
 @jax.custom_jvp
@@ -138,6 +138,7 @@ def solve_lower(
         out = batched.solve_lower(safe, rhs.reshape(n, -1))
         return jnp.where(singular[:, None], 0.0, out).reshape(rhs.shape)
 
+    # Substitution is unrolled; the derivative is one more solution, not that of each of its steps.
     def lower(x: jax.Array) -> jax.Array:
         return jnp.tensordot(jnp.tril(factor), x, 1)
 
@@ -182,6 +183,7 @@ def root_psd(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
     n = matrix.shape[-1]
     if n == 0:
         return matrix
+    # n·eps of the diagonal entry: the rounding of the n subtractions that lead to a pivot.
     floor = n * float(jnp.finfo(matrix.dtype).eps) * jnp.abs(jnp.diagonal(matrix))
 
     def column(rest: jax.Array, j: jax.Array) -> tuple[jax.Array, jax.Array]:
