@@ -29,6 +29,8 @@ from jaxslam.math._arrays import Number
 from jaxslam.math._gaussians import log_density
 from jaxslam.math._xla import CACHED, materialize, no_inline, where_any
 
+CorrectionOrder = Literal["sequential", "joint"]
+
 Covariance = Literal["plain", "joseph", "square_root"]
 """P ← P - Vᵀ V; Joseph's (I-KH) P (I-KH)ᵀ + K R Kᵀ; or the update of a root X of P = X Xᵀ"""
 

@@ -10,7 +10,7 @@ that compare a measurement with every landmark.
 import dataclasses
 from collections.abc import Callable
 from functools import partial
-from typing import Literal, get_args
+from typing import get_args
 
 import jax
 import jax.numpy as jnp
@@ -20,7 +20,7 @@ from jaxslam.association._rules import Known
 from jaxslam.charts import Euclidean
 from jaxslam.core import slots
 from jaxslam.core._record import field, function_of, record, static
-from jaxslam.core._validation import check_models
+from jaxslam.core._validation import motion_model, sensor_model
 from jaxslam.core.protocols import (
     Associate,
     Association,
@@ -38,7 +38,12 @@ from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.core.validation import at_least, instance_of, one_of, or_none, probability
 from jaxslam.filters._ekf import map_coordinates
 from jaxslam.filters._ekf.checks import check_fit
-from jaxslam.filters._ekf.correction import Covariance, correct, correct_in_turn
+from jaxslam.filters._ekf.correction import (
+    CorrectionOrder,
+    Covariance,
+    correct,
+    correct_in_turn,
+)
 from jaxslam.filters._ekf.linear_system import (
     LinearizedSteps,
     LinearLandmarks,
@@ -63,8 +68,6 @@ from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import Number
 from jaxslam.math._xla import change_where, last_true_column, materialize, where_any
 
-CorrectionOrder = Literal["sequential", "joint"]
-
 
 @record
 class EkfSlam(Filter):
@@ -85,8 +88,8 @@ class EkfSlam(Filter):
     a suite with an absolute sensor.
     """
 
-    motion: Motion
-    sensor: Sensor
+    motion: Motion = field(check=motion_model)
+    sensor: Sensor = field(check=sensor_model)
     """the models; Jacobians come from `jax.jacfwd`"""
     capacity: int = static(check=at_least(1))
     """landmark slots N. A new landmark that finds the map full is dropped and marked
@@ -122,9 +125,7 @@ class EkfSlam(Filter):
     `Joint.life`; `info.extra["pruning"].removed` (N,) bool marks the slots"""
 
     def __post_init__(self) -> None:
-        name = type(self).__name__
-        check_models(name, self.motion, self.sensor)
-        check_fit(name, self.sensor, self.chart, self.linearize, self.iterations)
+        check_fit(type(self).__name__, self.sensor, self.chart, self.linearize, self.iterations)
         super().__post_init__()
 
     @property

@@ -6,7 +6,7 @@ from jaxtyping import Array, Float
 
 from jaxslam.charts import Euclidean
 from jaxslam.core._record import field, record
-from jaxslam.core._validation import check_models
+from jaxslam.core._validation import motion_model, sensor_model
 from jaxslam.core.protocols import Chart, Filter, Linearizer, Motion, Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan
@@ -25,14 +25,13 @@ class DeadReckoning(Filter):
     of measurements; chart and linearize are those of `EkfSlam`, with the same errors.
     """
 
-    motion: Motion
-    sensor: Sensor
+    motion: Motion = field(check=motion_model)
+    sensor: Sensor = field(check=sensor_model)
     _: dataclasses.KW_ONLY
     chart: Chart = field(default=Euclidean(), check=instance_of(Chart))
     linearize: Linearizer = field(default=AtEstimate(), check=instance_of(Linearizer))
 
     def __post_init__(self) -> None:
-        check_models("DeadReckoning", self.motion, self.sensor)
         check_fit("DeadReckoning", self.sensor, self.chart, self.linearize)
         super().__post_init__()
 

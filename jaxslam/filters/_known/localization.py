@@ -14,7 +14,7 @@ from jaxslam.association._rules import Known, predicted
 from jaxslam.charts import Euclidean
 from jaxslam.core._numbers import gate_quantile
 from jaxslam.core._record import field, function_of, record, static
-from jaxslam.core._validation import check_models
+from jaxslam.core._validation import motion_model, sensor_model
 from jaxslam.core.protocols import (
     Associate,
     Chart,
@@ -29,8 +29,8 @@ from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.core.validation import at_least, instance_of, one_of, or_none, probability
 from jaxslam.filters._ekf.checks import check_iterations
-from jaxslam.filters._ekf.correction import Correction, in_groups, no_correction
-from jaxslam.filters._ekf.ekf_slam import CorrectionOrder, associate_scan
+from jaxslam.filters._ekf.correction import Correction, CorrectionOrder, in_groups, no_correction
+from jaxslam.filters._ekf.ekf_slam import associate_scan
 from jaxslam.filters._gaussian_correction import correct_gaussian
 from jaxslam.filters._known_map import hold_map, map_tags
 from jaxslam.filters._reporting import joined_info, nothing_of, report_scan
@@ -56,8 +56,8 @@ class Localization(Filter):
     0 on, a chart or linearizer that needs the landmarks' errors, and as `EkfSlam` does.
     """
 
-    motion: Motion
-    sensor: Sensor
+    motion: Motion = field(check=motion_model)
+    sensor: Sensor = field(check=sensor_model)
     landmarks: ArrayLike
     """(N, L) the map, in the sensor's parameters"""
     _: dataclasses.KW_ONLY
@@ -84,7 +84,6 @@ class Localization(Filter):
 
     def __post_init__(self) -> None:
         name, linearize = "Localization", self.linearize
-        check_models(name, self.motion, self.sensor)
         hold_map(self)
         if linearize.own_landmarks:
             raise ValueError(

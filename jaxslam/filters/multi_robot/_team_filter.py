@@ -13,8 +13,7 @@ from jaxslam.core._numbers import check_count
 from jaxslam.core._record import hold_function, record, set_field, static
 from jaxslam.core.protocols import Associate, Filter, Sensor
 from jaxslam.filters._ekf.checks import check_choice, check_map_options
-from jaxslam.filters._ekf.correction import Covariance
-from jaxslam.filters._ekf.ekf_slam import CorrectionOrder
+from jaxslam.filters._ekf.correction import CorrectionOrder, Covariance
 from jaxslam.filters.multi_robot._team import check_team, sizes
 from jaxslam.filters.multi_robot.team import Robot
 from jaxslam.math._arrays import Number
