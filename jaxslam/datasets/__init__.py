@@ -1,7 +1,7 @@
 """Readers of public data sets, and of your data in CSV files (`table`); they return a `Dataset`.
 
-`READERS` has them by name, for the command line; each takes a path, and, for a data set of several
-robots, the number of one.
+`READERS` has the readers by name, for the command line; each takes a path and, for a data set of
+several robots, the number of a robot.
 """
 
 from collections.abc import Callable
@@ -19,7 +19,7 @@ from jaxslam.datasets._laser_logs.carmen_reader import StampedRelations, carmen,
 from jaxslam.datasets._laser_logs.laser_record import LaserLog
 from jaxslam.datasets._laser_logs.rosbag_reader import BagContents, rosbag, rosbag_contents
 from jaxslam.datasets._noise_fit import DatasetFit, fit
-from jaxslam.datasets._uncertain_constants import Added, considered
+from jaxslam.datasets._uncertain_constants import AddedCov, consider_constants
 
 READERS: dict[str, Callable[..., Dataset]] = Named(
     {
@@ -35,7 +35,7 @@ READERS: dict[str, Callable[..., Dataset]] = Named(
 __all__ = [
     "MRCLAM_CALIBRATION",
     "READERS",
-    "Added",
+    "AddedCov",
     "Adjustable",
     "BagContents",
     "Dataset",
@@ -49,7 +49,7 @@ __all__ = [
     "Topic",
     "bonn",
     "carmen",
-    "considered",
+    "consider_constants",
     "evaluate",
     "fit",
     "mrclam",

@@ -9,7 +9,8 @@ import pytest
 from matplotlib.animation import FFMpegWriter
 
 from jaxslam import _cli as cli
-from jaxslam._cli.recorded.run import NAMES, positive_definite, suspicions
+from jaxslam._cli.recorded.filter_choice import NAMES
+from jaxslam._cli.recorded.filter_run import positive_definite, suspicions
 from jaxslam.results import plot
 
 
