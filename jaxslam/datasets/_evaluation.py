@@ -221,7 +221,7 @@ def _path_errors(
 
 def _map_errors(
     data: Dataset, last: Estimate, map_cov: Float[np.ndarray, "N 2 N 2"] | None
-) -> tuple[dict[str, float], Float[np.ndarray, "N 2"] | None, MapTest | None]:
+) -> tuple[dict[str, float], Float[np.ndarray, "L 2"] | None, MapTest | None]:
     """The errors of a map, the survey in the frame of the map, and the test of the map."""
     named = np.asarray(last.alive) & (np.asarray(last.tag) >= 0)
     if data.landmarks is None or not named.any():
