@@ -15,8 +15,8 @@ from jaxslam.consistency import Average, Summary
 from jaxslam.consistency._intervals import EACH, LEVEL, percentage
 from jaxslam.consistency._verdict import TESTS
 from jaxslam.consistency.campaign import Campaign
-from jaxslam.results import _report as report
 from jaxslam.results import _table as table
+from jaxslam.results import report
 from jaxslam.results._table import VERDICTS, cell_text, short
 from jaxslam.results.plot import Figure
 from jaxslam.results.plot._style import describe, png
@@ -46,7 +46,7 @@ figure {{ margin: 1rem 0; }} }}"""
 
 
 _UPRIGHT = 5
-"""With more filters, the table is printed on a separate landscape page."""
+"""Largest number of filters whose table is printed upright; with more it has a landscape page."""
 
 
 def campaign_page(
@@ -61,9 +61,10 @@ def campaign_page(
 
     Args:
         campaign: the campaign.
-        command, seed: those of the campaign; None without a seed.
-        versions: of the software, by name.
-        figures: in order, by name, each with its caption.
+        command: the command of the campaign.
+        seed: the seed of the campaign; None if unknown.
+        versions: versions of the software, by name.
+        figures: caption and figure by name, in order.
         draw: returns a figure as a PNG file; a cached function if the files are needed elsewhere.
     """
     heading = f"{campaign.scenario}: consistency of {with_noun(len(campaign.filters), 'filter')}"
@@ -112,7 +113,8 @@ def fragment(
 ) -> str:
     """The campaign as HTML for a notebook: verdicts, these figures, and the measures folded.
 
-    Arguments as for `campaign_page`. Its style does not apply to the rest of the page.
+    See `campaign_page` for the arguments. The style of the fragment does not apply to the rest of
+    the notebook.
     """
     return f"""<div class="jaxslam">
 <style>{FRAGMENT_CSS}</style>
@@ -149,7 +151,7 @@ def _figures(figures: Mapping[str, tuple[str, Figure]], draw: Callable[[Figure],
 
 def _conventions(campaign: Campaign) -> str:
     """The definitions of measures and verdicts as HTML."""
-    level, rest = _unbroken(percentage(EACH, 1)), _unbroken(percentage(1 - LEVEL))
+    level, rejected = _without_breaks(percentage(EACH, 1)), _without_breaks(percentage(1 - LEVEL))
     meanings = "\n".join(
         f"<dt>{badge(verdict)}</dt><dd>{escape(meaning)}.</dd>"
         for verdict, (_, meaning) in VERDICTS.items()
@@ -160,7 +162,7 @@ over independent runs. A run is <strong>inaccurate</strong> when its final posit
 {campaign.divergence_limit:.3g} m, 5 σ of the EKF with Jacobians at the truth, and
 <strong>divergent</strong> when it also exceeds 5 σ of what the filter claims.</p>
 <p>The <strong>verdict</strong> goes by the intervals of the pose NEES and of NIS / dof, averaged
-over time: together they reject an honest filter of a linear problem in {rest}
+over time: together they reject an honest filter of a linear problem in {rejected}
 of campaigns. An asterisk marks a verdict with a doubt:</p>
 <dl class="meanings">
 {meanings}
@@ -200,7 +202,7 @@ def verdict_list(campaign: Campaign) -> str:
         label = f'<span class="name">{breakable(name)}</span>'
         items.append(f"<li>{label}{badge(summary.verdict, summary)}{lines}</li>")
     lost = (f"{name} {phrase}" for name, phrase in table.lost_runs(campaign))
-    sentences = [*report.qualified(campaign), *lost]
+    sentences = [*report.sentences_on_verdicts(campaign), *lost]
     notes = (f'<p class="note">{escape(sentence)}.</p>' for sentence in sentences)
     return "\n".join(['<ul class="verdicts">', *items, "</ul>", *notes])
 
@@ -242,25 +244,25 @@ def _row(row: table.Row) -> str:
     cells = (_cell(cell, value) for cell, value in zip(row.cells, published, strict=True))
     return (
         f'<tr><th scope="row"{kind}>{escape(row.label.strip())}</th>'
-        f'<td class="honest">{escape(_unbroken(row.honest))}</td>{"".join(cells)}</tr>'
+        f'<td class="honest">{escape(_without_breaks(row.honest))}</td>{"".join(cells)}</tr>'
     )
 
 
 def _cell(cell: table.Cell, published: float | None) -> str:
     """A cell of the table as HTML; the pointer on a measure shows its interval."""
-    title, text = "", escape(_unbroken(cell_text(cell)))
+    title, text = "", escape(_without_breaks(cell_text(cell)))
     if isinstance(cell, Summary):
         text = badge(cell.verdict, cell)
     elif isinstance(cell, Average) and np.isfinite(cell.high):
         ends = f"{cell.low:.5g} to {cell.high:.5g}"
-        title = f' title="{_unbroken(percentage(EACH, 1))} interval {ends}"'
+        title = f' title="{_without_breaks(percentage(EACH, 1))} interval {ends}"'
     if published is not None:
         text += f'<span class="published">published {short(published)}</span>'
     return f"<td{title}>{text}</td>"
 
 
-def _unbroken(text: str) -> str:
-    """A text whose percentages do not break."""
+def _without_breaks(text: str) -> str:
+    """A text with no line break before a percent sign."""
     return text.replace(" %", "\N{NO-BREAK SPACE}%")
 
 

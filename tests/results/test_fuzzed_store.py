@@ -12,8 +12,8 @@ from hypothesis import given
 from stored import SETTINGS, assert_same
 
 import jaxslam
-from jaxslam.results import _store as store
-from jaxslam.results._store import MANIFEST
+from jaxslam.results import store
+from jaxslam.results.store import MANIFEST
 
 ARRAYS = {"ekf/nees": np.arange(96.0).reshape(32, 3), "finite": np.ones(32, bool)}
 

@@ -14,7 +14,7 @@ from jaxslam.consistency import Average
 from jaxslam.consistency._measures import BUILT_IN
 from jaxslam.core.types import Estimate
 from jaxslam.results import _files as files
-from jaxslam.results import _report as report
+from jaxslam.results import report
 
 WORLD = worlds.ring()
 
@@ -73,7 +73,7 @@ def test_filters_of_which_the_same_is_said_share_a_sentence(campaign):
     other = dataclasses.replace(one, noticed={"nees_pose": (0.0, 6.0)})
     both = dataclasses.replace(campaign, filters={"a": one, "b": one, "c": other})
     power = "not rejected, with 90 % power to reject a pose NEES"
-    assert report.qualified(both) == [
+    assert report.sentences_on_verdicts(both) == [
         f"{power} and a NIS / dof outside: a [1, 5] and [0.9, inf]; b [1, 5] and [0.9, inf]",
         f"{power} outside: c [0, 6]",
         "a, b, c*: a doubt",

@@ -15,7 +15,7 @@ from jaxslam._cli.common import OUT, check_out, chosen_devices
 from jaxslam.consistency.campaign._pieces import missing
 from jaxslam.core._numbers import check_count
 from jaxslam.results import _campaign_files as campaign_files
-from jaxslam.results import _store as store
+from jaxslam.results import store
 from jaxslam.results._campaign_files import BLOCKS, RESULT
 from jaxslam.results._files import Json
 

@@ -39,7 +39,7 @@ from jaxslam.core.protocols import Candidate
 from jaxslam.results import _campaign_files as campaign_files
 from jaxslam.results._campaign_files import FORMATS
 from jaxslam.results._files import Files, Json
-from jaxslam.results._store import Store
+from jaxslam.results.store import Store
 from jaxslam.simulation._worlds import World, run_keys, world_of_run
 from jaxslam.simulation.scenarios import SCENARIOS
 

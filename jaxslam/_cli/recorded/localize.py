@@ -19,7 +19,7 @@ from jaxslam.laser import grids, laser_slam
 from jaxslam.laser.grids import Grid
 from jaxslam.math._odometry_jumps import odometry_jumps
 from jaxslam.math.numpy_poses import compose
-from jaxslam.results import _report as report
+from jaxslam.results import report
 from jaxslam.results._files import Files, Json
 
 START_DEVIATION = np.array([0.2, 0.2, np.deg2rad(10.0)])

@@ -16,7 +16,7 @@ from jaxslam.datasets import _ros_map as ros_map
 from jaxslam.laser import grids
 from jaxslam.laser.grids import Counts
 from jaxslam.math import numpy_poses as poses
-from jaxslam.results import _report as report
+from jaxslam.results import report
 from jaxslam.results._files import Files
 
 SCANS_AT_ONCE = 64

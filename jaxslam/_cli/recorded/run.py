@@ -35,7 +35,7 @@ from jaxslam.core.types import Estimate
 from jaxslam.datasets import READERS, Dataset
 from jaxslam.datasets._evaluation import Evaluation
 from jaxslam.datasets._landmark_logs.table_settings import METHODS
-from jaxslam.results import _report as report
+from jaxslam.results import report
 from jaxslam.results._campaign_files import FORMATS, check_figure_formats
 from jaxslam.results._files import Files, Json, json_text, versions
 

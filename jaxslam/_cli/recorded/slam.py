@@ -20,7 +20,7 @@ from jaxslam.laser import laser_slam
 from jaxslam.laser.laser_slam import LoopOutcome, Settings, Solved
 from jaxslam.laser.laser_slam._log_map import growing_maps
 from jaxslam.math.stats import chi2_quantile
-from jaxslam.results import _report as report
+from jaxslam.results import report
 from jaxslam.results._files import Files, Json, csv_text
 
 if TYPE_CHECKING:  # Matplotlib is slow to load

@@ -90,20 +90,19 @@ def rmse_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     Other measures with the figure "rmse" have a panel, too.
 
     More than five filters are drawn by kind. Filters that fuse no measurement, that are inaccurate,
-    or
-    whose error is over three times the median of the others do not set the scale: larger
-    values have marks at the edge, and the largest one is written above. width [in].
+    or whose error is over three times the median do not set the scale: larger values have marks at
+    the edge, and the largest value is written above. width [in].
     """
-    every = list(campaign.filters.values())
-    shown = [one for one in in_figure("rmse") if any(one.key in s.curves for s in every)]
-    figure, rows = sheet(campaign, [one.axis for one in shown], width=width)
+    summaries = list(campaign.filters.values())
+    measures = [m for m in in_figure("rmse") if any(m.key in s.curves for s in summaries)]
+    figure, rows = sheet(campaign, [measure.axis for measure in measures], width=width)
     step = np.arange(1, campaign.steps + 1)
     setters = scale_setters(campaign)
     nothing = np.full(campaign.steps, np.nan)
-    for j, measure in enumerate(shown):
+    for j, measure in enumerate(measures):
         curves = {n: s.curves.get(measure.key, nothing) for n, s in campaign.filters.items()}
         key = bound_curve(measure)
-        bounds = [s.curves[key] for s in every if key in s.curves][:1]
+        bounds = [s.curves[key] for s in summaries if key in s.curves][:1]
         top = common_top({name: _peak(values) for name, values in curves.items()}, setters)
         top = max(top, *map(_peak, bounds), 0.0)
         for row in rows:
@@ -112,10 +111,10 @@ def rmse_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
             for name, i in row.names.items():
                 curve(axes, i, step, curves[name], name)
             for bound in bounds:
-                label = "conditional Cramér-Rao bound"
-                axes.plot(
-                    step, bound, color=INK, lw=2.0, label=label, zorder=2.5, marker=_lone(bound)
-                )
+                # A single value would be no line.
+                marker = "o" if np.isfinite(bound).sum() == 1 else ""
+                style: Look = {"color": INK, "lw": 2.0, "zorder": 2.5, "marker": marker}
+                axes.plot(step, bound, label="conditional Cramér-Rao bound", **style)
             mark_beyond(axes)
     add_legends(figure, rows, title_of(campaign, "error, average over"), "step")
     return figure
@@ -163,10 +162,11 @@ def whiteness_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     More than five filters are drawn by kind. width [in].
     """
     figure, rows = sheet(campaign, ["autocorrelation"], width=width, height=2.4)
-    every = campaign.filters.values()
-    widest = max(every, key=lambda s: np.nan_to_num(s.autocorrelation_band[0])).autocorrelation_band
-    inner = 1.5 * _peak(widest) or 0.1
-    extreme = max(inner, *(_peak(np.abs(s.autocorrelation)) for s in every))
+    summaries = campaign.filters.values()
+    bands = (s.autocorrelation_band for s in summaries)
+    widest = max(bands, key=lambda half_width: np.nan_to_num(half_width[0]))
+    least = 1.5 * _peak(widest) or 0.1  # the band is seen
+    extreme = max(least, *(_peak(np.abs(s.autocorrelation)) for s in summaries))
     for row in rows:
         (axes,) = row.panels
         axes.axhline(0.0, color=INK, lw=0.8, zorder=1.5)
@@ -197,10 +197,10 @@ def gained_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     kind. width [in].
     """
     check_record("gained_figure", "the first argument", campaign, Campaign)
-    key, what = "rotation_information", REGISTRY["rotation_information"].axis
+    key = "rotation_information"
     curves = {name: s.curves[key] for name, s in campaign.filters.items() if key in s.curves}
     others = [name for name in campaign.filters if name not in curves]
-    figure, rows = sheet(campaign, [what], width=width, height=2.6, only=curves)
+    figure, rows = sheet(campaign, [REGISTRY[key].axis], width=width, height=2.6, only=curves)
     top = 3 * max([1.0, *(_peak(values) for values in curves.values())])
     decades = np.log10(top / _NOTHING)
     strip = decades * _STRIP / (1 - _STRIP)
@@ -226,9 +226,9 @@ def gained_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
 
 def _draw_band(axes: Axes, campaign: Campaign, block: str) -> None:
     """Draw the 95 % band of the NEES, and its dof."""
-    most = max(campaign.filters.values(), key=lambda summary: summary.counts["runs"]).curves
+    curves = max(campaign.filters.values(), key=lambda summary: summary.counts["runs"]).curves
     step = np.arange(1, campaign.steps + 1)
-    band(axes, step, most[f"nees_{block}_low"], most[f"nees_{block}_high"], "95 % band")
+    band(axes, step, curves[f"nees_{block}_low"], curves[f"nees_{block}_high"], "95 % band")
     axes.axhline(DOF[block], color=INK, lw=0.8, zorder=1.5, label="honest")
 
 
@@ -246,11 +246,6 @@ def _label_powers(axes: Axes, strip: float, decades: float) -> None:
 def _peak(values: np.ndarray) -> float:
     """The largest finite value that is not negative, or 0."""
     return float(np.max(values, initial=0.0, where=np.isfinite(values)))
-
-
-def _lone(values: np.ndarray) -> str:
-    """The marker of a line, if a single value is finite; else none."""
-    return "o" if np.isfinite(values).sum() == 1 else ""
 
 
 _ERROR, _NEES = "rmse_position", "nees_pose"
@@ -281,7 +276,7 @@ def cost_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     times = {name: 1e6 * campaign.step_seconds.get(name, np.nan) for name in campaign.filters}
     numbers, few = numbers_of(list(times)), len(times) <= TOGETHER
     groups = [("", list(times))] if few else kinds_of(list(times))
-    rows = len(times) + len(groups) - 1  # an empty one between two kinds
+    rows = len(times) + len(groups) - 1  # an empty row between two kinds
     width = width if few else max(width, PAGE)
     figure, panels = panels_of(width, 0.145 * rows + 0.9, 1, 3, share=(False, True))
     for axes in panels:
@@ -314,8 +309,8 @@ def cost_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     for axes, text in zip(panels, titles, strict=True):
         axes.set_xlabel(text if width >= PAGE else text.replace(" [", "\n[").replace(" (", "\n("))
     honest = panels[2].axvline(DOF["pose"], color=INK, lw=0.8, zorder=1.5, label="honest")
-    what = f"error and NEES, with {percentage(EACH, 1)} intervals, and the time of a step,"
-    caption(figure, title_of(campaign, what), [honest])
+    subject = f"error and NEES, with {percentage(EACH, 1)} intervals, and the time of a step,"
+    caption(figure, title_of(campaign, subject), [honest])
     return figure
 
 
@@ -360,13 +355,14 @@ def _interval(axes: Axes, at: float, measure: Average, color: str) -> None:
 
 def _values(campaign: Campaign, key: str) -> np.ndarray:
     """The numbers that set the scale of a measure: values, and ends of intervals."""
-    found = np.array([s.measures.get(key, _NONE) for s in campaign.filters.values()])
-    if key == _NEES:
-        found = np.minimum([*found, [DOF["pose"]] * 3], _CAP * DOF["pose"])
-    values: np.ndarray = found[np.isfinite(found[:, 0]) & (found[:, 0] > 0), 0]
+    # Rows (value, low, high).
+    averages = np.array([s.measures.get(key, _NONE) for s in campaign.filters.values()])
+    if key == _NEES:  # the honest value is on the scale, too
+        averages = np.minimum([*averages, [DOF["pose"]] * 3], _CAP * DOF["pose"])
+    values: np.ndarray = averages[np.isfinite(averages[:, 0]) & (averages[:, 0] > 0), 0]
     if not values.size:
         return values
-    ends = found[:, 1:][np.isfinite(found[:, 1:])]
+    ends = averages[:, 1:][np.isfinite(averages[:, 1:])]
     return np.concatenate([values, ends.clip(values.min() / _WIDE, _WIDE * values.max())])
 
 
