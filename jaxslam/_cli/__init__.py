@@ -86,7 +86,7 @@ COMMANDS = {
         "1 if anything fails, 2 if the file cannot be used.",
     ),
 }
-"""By command: its module, its line of help and its description."""
+"""Module, line of help and description of each command."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -148,8 +148,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
 
 
 def _laser_command(arguments: list[str]) -> list[str]:
-    """Replace `run --dataset carmen …`, or `rosbag`, by the command on a laser log: `localize MAP`
-    with `--localize MAP`, `map` with `--map known`, else `slam`."""
+    """Replace `run --dataset carmen …`, or `rosbag`, by the command on a laser log.
+
+    It is `localize MAP` with `--localize MAP`, `map` with `--map known`, else `slam`.
+    """
     parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
     parser.add_argument("--dataset")
     parser.add_argument("--localize", metavar="MAP")
@@ -174,7 +176,7 @@ class _Parser(argparse.ArgumentParser):
         self._negative_number_matcher = _POSITIONAL
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """As in argparse; unknown arguments are an error, reported with the name of the command."""
+        """Parse as argparse does; unknown arguments are an error with the name of the command."""
         options, unknown = super().parse_known_args(args, namespace)
         if unknown:
             hint = meant(unknown[0], self._option_string_actions)

@@ -33,13 +33,13 @@ INTERRUPTED = 130
 """Exit status after Ctrl-C."""
 
 SUMMARY = "summary.json"
-"""The file with the summary of a command."""
+"""Name of the file with the summary of a command."""
 
 COUNT = "measurements "
 """Prefix of the rows of a summary that count measurements by status."""
 
 FILMS = ("film.gif", "film.mp4", "film.html", "film-*.gif", "film-*.mp4", "film-*.html")
-"""Names of films; those of an earlier command are deleted."""
+"""Patterns of the names of films; films of an earlier command are deleted."""
 
 OUT = Path("out")
 """Default folder of results."""

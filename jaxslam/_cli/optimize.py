@@ -101,7 +101,7 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 @dataclasses.dataclass(frozen=True)
 class OptimizePlan:
-    """What `jaxslam optimize` is to do; the fields are the options of the same name."""
+    """Plan of `jaxslam optimize`; the fields are the options of the same name."""
 
     path: str
     error: str = "pose"
@@ -143,11 +143,11 @@ class Problem(NamedTuple):
     loaded: g2o.Loaded
     """the file as it was read"""
     graph: Graph
-    """with a gauge; with a kernel, loops have a table of their own"""
+    """the graph with a gauge; with a kernel, loops are a separate table"""
     factors: dict[str, Factor]
-    """by table"""
+    """factor of each table"""
     kernels: dict[str, graphs.Kernel] | None
-    """by table, of those that may hold outliers; None without a kernel"""
+    """kernel of each table that may hold outliers; None without a kernel"""
 
 
 class Optimum(NamedTuple):
@@ -169,7 +169,7 @@ class Optimum(NamedTuple):
     chi2_of_file: float
     chi2_at_start: float
     cost_at_start: float
-    """as it is minimized: χ², or with kernels the robust cost"""
+    """the minimized cost: χ², or with kernels the robust cost"""
     certificate: Json
     """entries of the summary on global optimality"""
     seconds: float
@@ -395,7 +395,7 @@ def _gauge(problem: Problem) -> str:
 
 
 def _advice(optimum: Optimum) -> str:
-    """What to try if no minimum was reached; empty for a singular graph, whose status is enough."""
+    """Advice if no minimum was reached; empty for a singular graph, whose status is enough."""
     status = int(optimum.solution.status)
     if status == Ending.SINGULAR:
         return ""
@@ -436,11 +436,11 @@ def write_optimum(folder: Path, plan: OptimizePlan, optimum: Optimum, summary: J
     graph, file_graph = optimum.graph, optimum.problem.loaded.graph
     worst = worst_rows(graph, optimum.squared, optimum.problem.factors)
     # The pose that only this command fixed is free in the file that is written, as it was read.
-    gauge = {"fixed_pose": file_graph.fixed_pose, "fixed_point": file_graph.fixed_point}
+    as_read = graph._replace(fixed_pose=file_graph.fixed_pose, fixed_point=file_graph.fixed_point)
     files: Files = {
         SUMMARY: json_text(summary | {"worst residuals": worst, "versions": versions()}),
         "poses.csv": _csv(("x", "y", "theta"), graph.pose_id, graph.poses, graph.fixed_pose),
-        "optimized.g2o": g2o.text_of(graph._replace(**gauge)),
+        "optimized.g2o": g2o.text_of(as_read),
     }
     if len(graph.points):
         files["points.csv"] = _csv(("x", "y"), graph.point_id, graph.points, graph.fixed_point)

@@ -32,7 +32,7 @@ class MapTest(NamedTuple):
     """The NEES of a map, the band of an honest one, and the verdict."""
 
     nees: float
-    """of all landmarks together, or the largest of a single one"""
+    """the NEES of all landmarks together, or the largest NEES of a single landmark"""
     dof: int
     band: tuple[float, float]
     """the interval of 95 % of honest maps; (0, high) for the largest"""

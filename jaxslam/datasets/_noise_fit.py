@@ -106,7 +106,7 @@ def fit(
     replaying = selecting | {"gate": None, "associate": Known()}
 
     def run_with(parameters: jax.Array, options: EkfOptions, used: Scan | None) -> Info:
-        """used: a scan with the tags and measurements to use; None for those of the log."""
+        """Run the filter over the log. used: the tags and measurements to use; None for all."""
         log, motion, sensor = models.at(parameters)
         if used is not None:
             log = log._replace(scan=log.scan._replace(tag=used.tag, valid=used.valid))
@@ -202,7 +202,7 @@ def autocorrelation(info: Info) -> tuple[float, float]:
 
 
 def _as_fit(calibrated: Calibration, names: list[str], before: Info, after: Info) -> NoiseFit:
-    """The result of `calibrate` in the form of that of `fit_noise`.
+    """The result of `calibrate` as a `NoiseFit`.
 
     before, after: infos of the runs with the parameters at the start and with the calibrated ones.
     """

@@ -1,4 +1,4 @@
-"""What the uncertainty of calibrated constants adds to the results of a filter on a data set."""
+"""The covariance that uncertain calibrated constants add to the results of a filter."""
 
 from collections.abc import Callable
 from typing import NamedTuple
@@ -18,9 +18,9 @@ class AddedCov(NamedTuple):
     """Covariances to add to the covariances of a filter."""
 
     pose: Float[np.ndarray, "T 3 3"]
-    """of the poses along the path"""
+    """covariance added to each pose of the path"""
     points: Float[np.ndarray, "N 2 N 2"]
-    """of all landmarks of the last map together, by slots"""
+    """covariance added to all landmarks of the last map together, by slots"""
 
 
 def consider_constants(

@@ -17,7 +17,8 @@ from jaxslam.consistency.campaign._harness import summaries_of
 from jaxslam.consistency.campaign._kept import add_kept
 from jaxslam.consistency.campaign._pieces import missing
 from jaxslam.core._numbers import is_number
-from jaxslam.results import report, store
+from jaxslam.results import _report as report
+from jaxslam.results import store
 from jaxslam.results._files import Files, check_formats, check_writable, versions, write_files
 from jaxslam.verify._user_errors import describe_error
 
@@ -46,7 +47,7 @@ _IN_NOTEBOOK = ("nees", "rmse")
 
 
 def file_names(formats: Iterable[str], figures: Iterable[str] = FIGURES) -> list[str]:
-    """The names of the files of a campaign's report, with figures of these formats."""
+    """The names of the files of a campaign's report, with figures in the formats."""
     kinds = list(formats)
     return [PAGE, RESULT, CURVES, TABLE, *(f"{name}.{kind}" for name in figures for kind in kinds)]
 

@@ -15,8 +15,8 @@ from jaxslam.consistency import Average, Summary
 from jaxslam.consistency._intervals import EACH, LEVEL, percentage
 from jaxslam.consistency._verdict import TESTS
 from jaxslam.consistency.campaign import Campaign
+from jaxslam.results import _report as report
 from jaxslam.results import _table as table
-from jaxslam.results import report
 from jaxslam.results._table import VERDICTS, cell_text, short
 from jaxslam.results.plot import Figure
 from jaxslam.results.plot._style import describe, png
@@ -111,7 +111,7 @@ def fragment(
     figures: Mapping[str, tuple[str, Figure]],
     draw: Callable[[Figure], bytes] = png,
 ) -> str:
-    """The campaign as HTML for a notebook: verdicts, these figures, and the measures folded.
+    """The campaign as HTML for a notebook: verdicts, figures, and the measures folded.
 
     See `campaign_page` for the arguments. The style of the fragment does not apply to the rest of
     the notebook.

@@ -52,7 +52,7 @@ class Figure(NamedTuple):
 
     text: str
     value: float | None = None
-    """in CSV"""
+    """the number in CSV, where the text is not written"""
 
 
 Cell: TypeAlias = Summary | Average | Figure | None

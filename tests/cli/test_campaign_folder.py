@@ -13,7 +13,7 @@ from jaxslam import _cli as cli
 from jaxslam import plot, store
 from jaxslam._cli.common import check_out
 from jaxslam.consistency.campaign import Interrupted
-from jaxslam.results import report
+from jaxslam.results import _report as report
 
 QUICK = ["consistency", "--scenario", "circle", "--steps", "8", "--runs", "3"]
 

@@ -15,7 +15,7 @@ import jaxslam
 from jaxslam import filters, plot, store
 from jaxslam.consistency import Measure, register
 from jaxslam.consistency._measures import REGISTRY
-from jaxslam.results import report
+from jaxslam.results import _report as report
 from jaxslam.results._page import campaign_page
 
 WORLD = worlds.ring()

@@ -18,7 +18,7 @@ from jaxslam import plot
 from jaxslam.consistency import Average
 from jaxslam.core.types import Estimate, Truth
 from jaxslam.results import _campaign_files as campaign_files
-from jaxslam.results import report
+from jaxslam.results import _report as report
 from jaxslam.results.plot import _style
 from jaxslam.results.plot._style import encode
 

@@ -12,8 +12,8 @@ from hypothesis import given
 from stored import SETTINGS, assert_same
 
 import jaxslam
-from jaxslam.results import store
-from jaxslam.results.store import MANIFEST
+from jaxslam import store
+from jaxslam.results._block_files import MANIFEST, as_stored
 
 ARRAYS = {"ekf/nees": np.arange(96.0).reshape(32, 3), "finite": np.ones(32, bool)}
 
@@ -113,7 +113,7 @@ def test_odd_manifests(data, kept):
     except ValueError as error:
         assert_told(error, where / MANIFEST)
     else:
-        assert (found.settings, found.campaign) == (store.as_stored(SETTINGS), made.campaign)
+        assert (found.settings, found.campaign) == (as_stored(SETTINGS), made.campaign)
 
 
 @pytest.fixture(scope="module")

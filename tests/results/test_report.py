@@ -14,7 +14,8 @@ from jaxslam.consistency import Average
 from jaxslam.consistency._measures import BUILT_IN
 from jaxslam.core.types import Estimate
 from jaxslam.results import _files as files
-from jaxslam.results import report
+from jaxslam.results import _report as report
+from jaxslam.results.report import trajectory_tum
 
 WORLD = worlds.ring()
 
@@ -147,9 +148,7 @@ def test_an_unwritable_folder_is_refused_beforehand(tmp_path):
 def test_a_path_in_the_format_of_tum():
     pose = np.array([[1.0, -2.0, np.pi / 2], [0.25, 0.0, -3.0]])
     nothing = np.zeros((2, 0))
-    text = report.trajectory_tum(
-        np.array([1248272273.125, 1248272274.0]), Estimate(pose, *[nothing] * 5)
-    )
+    text = trajectory_tum(np.array([1248272273.125, 1248272274.0]), Estimate(pose, *[nothing] * 5))
     rows = np.array([line.split() for line in text.splitlines()], float)
     assert text.startswith("1248272273.125 1 -2 0 0 0 ")
     np.testing.assert_allclose(np.linalg.norm(rows[:, 4:], axis=1), 1, rtol=1e-8)

@@ -16,6 +16,7 @@ from jaxslam.consistency.campaign._pieces import missing
 from jaxslam.core._numbers import check_count
 from jaxslam.results import _campaign_files as campaign_files
 from jaxslam.results import store
+from jaxslam.results._block_files import MANIFEST, is_unfinished, read_manifest
 from jaxslam.results._campaign_files import BLOCKS, RESULT
 from jaxslam.results._files import Json
 
@@ -94,7 +95,7 @@ def _campaign(
     folder = options.resume or options.out or OUT
     if options.resume is None:
         chosen = CampaignOptions(**chosen)._asdict()
-        if options.overwrite or not (folder / BLOCKS / store.MANIFEST).exists():
+        if options.overwrite or not (folder / BLOCKS / MANIFEST).exists():
             return CampaignOptions(**chosen), {}, options.block
     elif options.out is not None and options.out.resolve() != folder.resolve():
         raise ValueError(
@@ -155,14 +156,14 @@ def _as_option(value: object) -> str:
 
 
 def open_store(spec: Spec) -> store.Store:
-    """The store of the campaign's blocks, in a new folder or in that of the campaign continued."""
+    """The store of the campaign's blocks, in a new folder or in the folder that is continued."""
     out, folder = spec.out, spec.out / BLOCKS
     settings: Mapping[str, object] = spec.settings
-    if spec.overwrite and (folder / store.MANIFEST).exists():
-        store.read_manifest(folder)  # raises where the folder is not a campaign's
+    if spec.overwrite and (folder / MANIFEST).exists():
+        read_manifest(folder)  # raises where the folder is not a campaign's
         shutil.rmtree(folder)
     if not settings:
-        if folder.exists() and not all(map(store.is_unfinished, folder.iterdir())):
+        if folder.exists() and not all(map(is_unfinished, folder.iterdir())):
             raise ValueError(
                 f"--out: {folder} holds files that are no campaign's: choose another folder"
             )

@@ -1,4 +1,4 @@
-"""The filters of `jaxslam run`: those of the catalog that a data set has the data for."""
+"""The filters of `jaxslam run`: filters of the catalog for which a data set has the data."""
 
 import argparse
 import dataclasses

@@ -203,7 +203,7 @@ def read_log(options: argparse.Namespace) -> tuple[LaserLog, dict[str, int]]:
 def bag_text(path: str) -> str:
     """The contents of a ROS bag: topics, time of the recording, mounts."""
     bag = datasets.rosbag_contents(path)
-    columns = {
+    columns: dict[str, Json] = {
         "type": {topic.name: topic.type for topic in bag.topics},
         "messages": {topic.name: topic.count for topic in bag.topics},
     }

@@ -44,12 +44,12 @@ class Tuning(NamedTuple):
 
 
 TRACKING = Tuning(exponent=0.2, forget=None, sigma=0.1)
-"""For a start at a known pose: without recovery, which takes scans that the map does not explain
-for a lost robot."""
+"""Tuning for a start at a known pose: without recovery, which takes scans that the map does not
+explain for a lost robot."""
 
 ANYWHERE = Tuning(exponent=0.1, forget=(0.05, 0.5), sigma=0.2)
-"""For a start anywhere, with few particles near the truth: a flatter likelihood keeps particles
-that are only roughly right."""
+"""Tuning for a start anywhere, with few particles near the truth: a flatter likelihood keeps
+particles that are only roughly right."""
 
 BEAMS = 60
 """Approximate number of beams of a scan that enter the weights."""
@@ -101,12 +101,14 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> laser_log.Jo
         raise ValueError(f"{options.map}: the map has no free cell")
     start = options.start or ("file" if log.placed else "global")
     pose = _start(start, log)
-    if pose is not None and not _is_on_map(grid, pose):
+    if pose is not None:
         x, y, heading = pose
-        raise ValueError(
-            f"--start: the pose ({x:g} m, {y:g} m, {np.rad2deg(heading):g}°) is off the map "
-            f"{options.map}"
-        )
+        cell = grids.to_cells(jnp.asarray(grid.origin), grid.resolution, jnp.asarray(pose[:2]))
+        if not np.all((np.asarray(cell) >= 0) & (np.asarray(cell) <= grid.log_odds.shape[::-1])):
+            raise ValueError(
+                f"--start: the pose ({x:g} m, {y:g} m, {np.rad2deg(heading):g}°) is off the map "
+                f"{options.map}"
+            )
     raw, odometry = _odometry(log)
     result = _run_particles(log, grid, pose, raw, options)
     path = result.path
@@ -157,7 +159,10 @@ def _run_particles(
     odometry: Float[np.ndarray, "K 3"],
     options: argparse.Namespace,
 ) -> PiecewiseRun:
-    """Run the particle filter over the log. pose: at the start; None for anywhere."""
+    """Run the particle filter over the log.
+
+    pose: pose at the start; None for anywhere.
+    """
     tuning = ANYWHERE if pose is None else TRACKING
     filter = grids.GridLocalization(
         grid,
@@ -241,15 +246,6 @@ def share_as_predicted(grid: Grid, poses: Float[np.ndarray, "n 3"], log: LaserLo
     met, _ = scans.returns(log.max_range)
     fits = met & (np.abs(predicted - scans.range) < MAX_RANGE_ERROR)
     return float(fits.sum() / max(met.sum(), 1))
-
-
-def _is_on_map(grid: Grid, pose: Float[np.ndarray, "3"]) -> bool:
-    """Whether a pose is on the map."""
-    cell = np.asarray(
-        grids.to_cells(jnp.asarray(grid.origin), grid.resolution, jnp.asarray(pose[:2]))
-    )
-    height, width = grid.log_odds.shape
-    return bool(np.all((cell >= 0) & (cell <= [width, height])))
 
 
 def scores(pose: Float[np.ndarray, "K 3"], reference: Float[np.ndarray, "K 3"]) -> Json:

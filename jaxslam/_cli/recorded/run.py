@@ -80,11 +80,10 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class RunPlan:
-    """What `jaxslam run` is to do: filters over a data set."""
+    """Plan of `jaxslam run`: the filters to run over a data set."""
 
     data: Dataset
     filters: Mapping[str, Filter]
-    """by name"""
     animate: bool = False
     """whether whole estimates are kept for films"""
 

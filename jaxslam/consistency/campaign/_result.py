@@ -71,7 +71,7 @@ class Campaign:
         return textwrap.fill(text, 100, subsequent_indent="    ", break_long_words=False)
 
     def __str__(self) -> str:
-        from jaxslam.results import report
+        from jaxslam.results import _report as report
 
         return report.campaign_table(self)
 
@@ -122,7 +122,7 @@ class Campaign:
         """
         with loading("Campaign.to_dataframe", "pandas"):
             import pandas
-        from jaxslam.results import report
+        from jaxslam.results import _report as report
 
         return pandas.DataFrame(report.run_columns(self))
 

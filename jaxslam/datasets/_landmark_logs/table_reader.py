@@ -144,7 +144,7 @@ class CsvTable:
     def table(
         self, wanted: Sequence[str], why: str, optional: Sequence[str] = ()
     ) -> Columns[int | str]:
-        """The columns of the names `wanted` ("v [m/s]"), in the units of these names.
+        """The columns `wanted`, as "v [m/s]", in the units of their names.
 
         Raises ValueError on a column that is missing, or without a known unit, a cell that is not a
         finite number, and a tag that is a number, but not a whole one >= 0. A tag is unknown in a

@@ -121,7 +121,7 @@ def association_options(method: object, gate: Any) -> EkfOptions:
 
 
 FITTED = "fit.toml"
-"""The file of fitted numbers, which replace those of `dataset.toml`."""
+"""Name of the file of fitted numbers, which replace the numbers of `dataset.toml`."""
 
 
 def fitted_text(parameters: Sequence[Parameter], cov: np.ndarray) -> str:
@@ -194,7 +194,7 @@ class _TableNoise:
     per_time: bool = static()
     """whether the last control is Δt"""
     of_increments: bool = static()
-    """whether the covariance grows with Δt, as of increments; that of velocities shrinks"""
+    """whether the covariance grows with Δt, as of increments; else it shrinks, as of velocities"""
 
     def __call__(self, pose: jax.Array, u: jax.Array) -> jax.Array:
         cov = jnp.diag(jnp.asarray(self.deviations, u.dtype) ** 2)
@@ -283,7 +283,7 @@ class TableSettings:
         return str(self.content.get(name, default))
 
     def motion(self, header: Sequence[str], interval: float) -> Parametric[Motion]:
-        """The motion model; its noise is that of a line of odometry, however rows divide it.
+        """The motion model; its noise is the noise of a line of odometry, however rows divide it.
 
         Velocities have the covariance σ² interval/Δt over Δt, white noise. Poses give increments
         with covariance σ² Δt/interval, and Δt as a last control. Other increments have σ².

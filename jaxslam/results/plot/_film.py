@@ -90,7 +90,7 @@ class Scene:
     frames: int
     main: Panel
     beside: Panel | None = None
-    """in the upper right corner, above the legend"""
+    """a panel in the upper right corner, above the legend"""
     caption: Callable[[int], str] = lambda k: f"frame {k + 1}"
     """the text above frame k"""
     title: str = ""

@@ -73,8 +73,13 @@ def graph_figure(
     for axes, graph, text in zip(panels, (before, after), subtitles, strict=True):
         _draw(axes, graph, factors)
         if largest:
-            ends = [_ends(graph, factors[key], key)[row] for _, key, row in largest]
-            _mark(axes, np.array(ends))
+            ends = np.array([_ends(graph, factors[key], key)[row] for _, key, row in largest])
+            axes.add_collection(
+                LineCollection(list(ends), colors=COLORS[1], linewidths=1.4, zorder=5)
+            )
+            ring: Look = {"ls": "none", "mfc": "none", "mec": COLORS[1], "mew": 0.9, "ms": 5}
+            label = f"{len(ends)} largest residuals"
+            axes.plot(*ends.mean(axis=1).T, marker="o", label=label, zorder=5, **ring)
         titled(axes, text)
         axes.set_xlabel("x [m]")
     panels[0].set_ylabel("y [m]")
@@ -122,14 +127,6 @@ def _draw(axes: Axes, graph: Graph, factors: Mapping[str, Factor]) -> None:
     axes.plot(*np.asarray(graph.poses)[0, :2], marker="o", label="first pose", **start)
     axes.set_aspect("equal", adjustable="datalim")
     axes.margins(0.04)
-
-
-def _mark(axes: Axes, ends: Float[np.ndarray, "E 2 2"]) -> None:
-    """Mark edges with large residuals."""
-    axes.add_collection(LineCollection(list(ends), colors=COLORS[1], linewidths=1.4, zorder=5))
-    ring: Look = {"ls": "none", "mfc": "none", "mec": COLORS[1], "mew": 0.9, "ms": 5, "zorder": 5}
-    label = f"{len(ends)} largest residuals"
-    axes.plot(*ends.mean(axis=1).T, marker="o", label=label, **ring)
 
 
 def graph_scene(

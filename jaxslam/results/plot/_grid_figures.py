@@ -151,10 +151,10 @@ def topology_figure(
     """Places in colours, the skeleton with its junctions, doors, and the graph of places.
 
     Args:
-        places: of `topology.topological_map`.
+        places: result of `topology.topological_map`.
         route: drawn along the skeleton.
         weights: (P,) probability of each place, written beside its number.
-        width: [in].
+        width: width of the figure [in].
     """
     grid = places.grid
     label = places.label
@@ -224,7 +224,10 @@ def loops_figure(
 ) -> Figure:
     """The paths of laser odometry and after closing, side by side, with the loops that were kept.
 
-    reference: (K, 3) poses, drawn in grey, aligned with each path. width: [in].
+    Args:
+        solved: result of `laser_slam.solve`.
+        reference: (K, 3) poses, drawn in grey, aligned with each path.
+        width: width of the figure [in].
     """
     across, up = np.ptp(solved.poses[:, :2], axis=0) + 1e-6
     height = 0.46 * width * float(np.clip(up / across, 0.4, 1.5)) + 0.9
@@ -233,30 +236,21 @@ def loops_figure(
     ends = np.stack([solved.loops.first[kept], solved.loops.second[kept]], axis=1)
     paths = (solved.odometry, "laser odometry"), (solved.poses, "after closing")
     for axes, (path, text) in zip(panels, paths, strict=True):
-        aligned = None
+        points = path[:, :2]
         if reference is not None:
             aligned = carried(ate(path, np.asarray(reference)).frame, np.asarray(reference))
-        _draw_loops(axes, path[:, :2], ends, aligned)
+            axes.plot(*aligned[:, :2].T, color=FAINT, lw=1.6, label="reference", zorder=1)
+        lines: Look = {"colors": COLORS[1], "linewidths": 1.2, "alpha": 0.8, "zorder": 3.5}
+        axes.add_collection(LineCollection(list(points[ends]), label="loops", **lines))
+        axes.plot(*points.T, color=COLORS[0], lw=0.8, label="path", zorder=3)
+        start: Look = {"ls": "none", "color": INK, "mfc": "white", "mew": 1.2, "ms": 5}
+        axes.plot(*points[0], marker="o", label="first pose", zorder=4, **start)
+        axes.set_aspect("equal", adjustable="datalim")
         titled(axes, text)
         axes.set_xlabel("x [m]")
     panels[0].set_ylabel("y [m]")
     caption(figure, title, every_handle(panels))
     return figure
-
-
-def _draw_loops(
-    axes: Axes, path: np.ndarray, ends: np.ndarray, reference: np.ndarray | None
-) -> None:
-    if reference is not None:
-        axes.plot(*reference[:, :2].T, color=FAINT, lw=1.6, label="reference", zorder=1)
-    lines = LineCollection(
-        list(path[ends]), colors=COLORS[1], linewidths=1.2, alpha=0.8, label="loops", zorder=3.5
-    )
-    axes.add_collection(lines)
-    axes.plot(*path.T, color=COLORS[0], lw=0.8, label="path", zorder=3)
-    start: Look = {"ls": "none", "color": INK, "mfc": "white", "mew": 1.2, "ms": 5}
-    axes.plot(*path[0], marker="o", label="first pose", zorder=4, **start)
-    axes.set_aspect("equal", adjustable="datalim")
 
 
 @own_settings()
@@ -309,9 +303,11 @@ def map_scene(
     """The scene of F maps of one frame, each with the path that made it; the robot is at its end.
 
     Args:
-        log_odds: of each map; 0 is unknown.
-        origin: of the maps, without yaw. resolution: [m].
-        paths: of each map, in the same order. captions: the text of each.
+        log_odds: cells of each map; 0 is unknown.
+        origin: origin of the maps, without yaw.
+        resolution: side of a cell [m].
+        paths: the path of each map.
+        captions: the text of each map.
     Raises:
         ValueError: without maps, other numbers of paths or captions, or a rotated frame.
     """
@@ -330,18 +326,12 @@ def map_scene(
     size = 0.03 * max(x[1] - x[0], y[1] - y[0])
     robot = triangle(ends, size, fc=COLORS[0], ec="white", lw=0.6, zorder=5)
     path = line_of(lambda k: paths[k][:, :2], color=COLORS[0], lw=1.0, label="path", zorder=3)
-    layers = [_image(log_odds, (*x, *y)), path, robot]
-    return Scene(count, Panel(layers, x, y), None, lambda k: captions[k], title)
 
-
-def _image(
-    log_odds: Sequence[Float[np.ndarray, "H W"]], extent: tuple[float, float, float, float]
-) -> Layer:
-    def layer(axes: Axes) -> Draw:
+    def image(axes: Axes) -> Draw:
         axes.grid(visible=False)
-        image = axes.imshow(
+        cells = axes.imshow(
             shown_occupancy(log_odds[0]),
-            extent=extent,
+            extent=(*x, *y),
             origin="lower",
             interpolation="nearest",
             zorder=1,
@@ -349,6 +339,7 @@ def _image(
             vmin=0,
             vmax=1,
         )
-        return lambda k: image.set_data(shown_occupancy(log_odds[k]))
+        return lambda k: cells.set_data(shown_occupancy(log_odds[k]))
 
-    return layer
+    layers: list[Layer] = [image, path, robot]
+    return Scene(count, Panel(layers, x, y), None, lambda k: captions[k], title)

@@ -68,11 +68,14 @@ def nees_figure(
     titles = [REGISTRY[f"nees_{block}"].axis for block in blocks]
     figure, rows = sheet(campaign, titles, width=width)
     step = np.arange(1, campaign.steps + 1)
+    most_runs = max(campaign.filters.values(), key=lambda summary: summary.counts["runs"])
     for axes, block in zip(rows[0].panels, blocks, strict=True):
         nees_scale(axes, campaign, block)
     for row in rows:
         for axes, block in zip(row.panels, blocks, strict=True):
-            _draw_band(axes, campaign, block)
+            low, high = (most_runs.curves[f"nees_{block}_{end}"] for end in ("low", "high"))
+            band(axes, step, low, high, "95 % band")
+            axes.axhline(DOF[block], color=INK, lw=0.8, zorder=1.5, label="honest")
             for name, i in row.names.items():
                 summary = campaign.filters[name]
                 label = f"{name} ({summary.verdict}{'*' * bool(summary.doubts)})"
@@ -155,7 +158,7 @@ def coverage_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
 
 @own_settings()
 def whiteness_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
-    """Autocorrelation of normalized innovations against the lag; that of a consistent filter is 0.
+    """Autocorrelation of normalized innovations against the lag; 0 for a consistent filter.
 
     The band is that of white innovations, the widest of the filters. A filter without innovations
     is named, without a curve. Curves are shifted a little sideways, so that none hides another.
@@ -222,14 +225,6 @@ def gained_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     title += f". Not monitored: {', '.join(map(plain, others))}" * bool(others and curves)
     add_legends(figure, rows, title, "step")
     return figure
-
-
-def _draw_band(axes: Axes, campaign: Campaign, block: str) -> None:
-    """Draw the 95 % band of the NEES, and its dof."""
-    curves = max(campaign.filters.values(), key=lambda summary: summary.counts["runs"]).curves
-    step = np.arange(1, campaign.steps + 1)
-    band(axes, step, curves[f"nees_{block}_low"], curves[f"nees_{block}_high"], "95 % band")
-    axes.axhline(DOF[block], color=INK, lw=0.8, zorder=1.5, label="honest")
 
 
 def _label_powers(axes: Axes, strip: float, decades: float) -> None:
@@ -315,7 +310,7 @@ def cost_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
 
 
 def _point(axes: Axes, i: int, at: float, name: str, measure: Average) -> None:
-    """Draw a measure with its interval at a height; beyond the scale a triangle with its value."""
+    """Draw a measure with its interval at a height; a triangle with its value beyond the scale."""
     value = measure.value
     if not np.isfinite(value):
         return

@@ -42,7 +42,7 @@ class Row(NamedTuple):
 
 
 def kinds_of(names: Sequence[str]) -> list[tuple[str, list[str]]]:
-    """Groups (kind, names) of at most five filters: those of `_catalog.KINDS`, then others."""
+    """Groups (kind, names) of at most five filters: the kinds of `_catalog.KINDS`, then others."""
     kind_of = {name: kind for kind, members in KINDS.items() for name in members}
     groups = []
     for kind in [*KINDS, "others"]:

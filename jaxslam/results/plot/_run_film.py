@@ -216,7 +216,7 @@ class History(NamedTuple):
     step: Int[np.ndarray, "F"]
     """the step of each frame, from 0"""
     estimate: Estimate
-    """with leading F"""
+    """the whole estimate, with leading F"""
     tag: Int[np.ndarray, "T M"]
     """tag of each measurement"""
     status: Int[np.ndarray, "T M"]
@@ -255,7 +255,7 @@ class FrameBeams(NamedTuple):
     """The measurements since the previous frame, for each of F frames."""
 
     beams: dict[str, list[Float[np.ndarray, "E 2 2"]]]
-    """by outcome: from the robot to the landmark, if the landmark is in the map"""
+    """ends by outcome: the robot, and the landmark if it is in the map"""
     counts: dict[str, Int[np.ndarray, "F"]]
     """number of measurements, by outcome"""
 
@@ -368,7 +368,7 @@ def run_scene(
 
 
 def _limits(history: History, points: np.ndarray | None, path: np.ndarray | None) -> Limits:
-    """The limits of the map: those of the truth, or else the estimate, extended by near points."""
+    """The limits of the map: the truth, or else the estimate, extended by near points."""
     alive = history.estimate.alive
     mapped = np.asarray(history.estimate.points)[alive]
     covs = np.asarray(history.estimate.point_covs)[alive]

@@ -19,7 +19,7 @@ from jaxslam.core._optional import loading
 Share: TypeAlias = bool | Literal["none", "all", "row", "col"]
 
 Look: TypeAlias = dict[str, Any]
-"""How an artist looks: Matplotlib's properties by name, whose types it does not declare."""
+"""Look of an artist: Matplotlib's properties by name, whose types Matplotlib does not declare."""
 
 PAGE, COLUMN = 7.16, 3.5
 """Widths [in] of the text and of a column of a two-column paper."""
@@ -188,7 +188,7 @@ def titled(axes: Axes, text: str) -> None:
 def curve(
     axes: Axes, i: int, x: np.ndarray, y: np.ndarray, label: str, *, absent: str = "no values"
 ) -> None:
-    """Draw the curve of filter number i with marks, shifted against those of its neighbours.
+    """Draw the curve of filter number i with marks, shifted against the marks of its neighbours.
 
     absent: the entry in the legend of a curve without a finite value.
     """

@@ -1,0 +1,206 @@
+"""A campaign as text: its table, JSON and CSV."""
+
+import math
+import textwrap
+from collections.abc import Iterable
+
+import numpy as np
+
+from jaxslam.consistency import Average, Summary
+from jaxslam.consistency._intervals import EACH, LEVEL, percentage
+from jaxslam.consistency._measures.coverage import LEVELS
+from jaxslam.consistency._verdict import POWER, TESTS, TOLERANCE, honest_values
+from jaxslam.consistency.campaign import Campaign
+from jaxslam.results._files import csv_text, json_number, json_text, text_table, versions
+from jaxslam.results._table import VERDICTS, Cell, cell_text, lost_runs, notes_on, rows_of, short
+
+_COLUMNS = 5
+"""Largest number of filters beside each other."""
+
+_WIDTH = 88
+"""Characters of a line of the notes; the narrowest table has some 80."""
+
+
+def campaign_table(campaign: Campaign) -> str:
+    """The campaign as text tables of at most five filters, one column each, with notes below."""
+    names = list(campaign.filters)
+    parts = [names[i : i + _COLUMNS] for i in range(0, len(names), _COLUMNS)]
+    text = "\n\n".join(_columns(campaign, part) for part in parts)
+    title = f"{campaign.scenario}: {campaign.size}"
+    verdicts = {summary.verdict for summary in campaign.filters.values()}
+    notes = [
+        "honest: the average of a consistent filter; NEES is not divided by its dof.",
+        f"± or [low, high]: {percentage(EACH, 1)} interval over the runs.",
+        "verdict: by two tests, whether 3 lies in the interval of the pose NEES, and 1 in that of "
+        "NIS / dof, with the one that rejects. Together they reject "
+        f"{percentage(1 - LEVEL)} of honest filters of a linear problem.",
+        *(f"{word}: {meaning}." for word, (_, meaning) in VERDICTS.items() if word in verdicts),
+        f"inaccurate: final position error over {campaign.divergence_limit:.3g} m, 5 σ of the "
+        "ideal EKF; divergent: also over 5 σ of what the filter claims.",
+    ]
+    notes += [f"{term}: {sentence}." for term, sentence in notes_on(campaign)]
+    notes += sentences_on_verdicts(campaign)
+    notes += [f"{name} {phrase}" for name, phrase in lost_runs(campaign)]
+    if campaign.dtype == "float32":
+        notes.append(
+            "The filters ran in float32: for float64, set jax_enable_x64 in Python, or leave out "
+            "--dtype in the command."
+        )
+    if campaign.published:
+        notes.append(
+            f"published: {campaign.source}; for the scenario and the filters as in the catalog"
+        )
+    lines = (line for note in notes for line in textwrap.wrap(note, _WIDTH))
+    return "\n".join([title, "", text, "", *lines])
+
+
+def sentences_on_verdicts(campaign: Campaign) -> list[str]:
+    """Sentences on the power of the tests of filters that are not rejected, and on doubts.
+
+    Filters with the same sentence share it. A verdict with a doubt has an asterisk in the table.
+    """
+    powers: dict[str, list[str]] = {}
+    doubts: dict[str, list[str]] = {}
+    close: list[str] = []
+    for name, summary in campaign.filters.items():
+        for test, (low, high) in honest_values(summary.honest_nis).items():
+            average = summary.measures.get(test)
+            if (
+                average is not None
+                and (average.low > high or average.high < low)
+                and test not in summary.by
+                and summary.verdict != "diverged"
+            ):
+                close.append(
+                    f"{name}: the {TESTS[test]} is not rejected, as its whole interval lies within "
+                    f"{percentage(TOLERANCE)} of the honest value"
+                )
+        ends = {test: pair for test, pair in summary.noticed.items() if pair != (0.0, np.inf)}
+        if ends and not summary.by and summary.verdict != "diverged":
+            limits = " and ".join(f"[{low:.3g}, {high:.3g}]" for low, high in ends.values())
+            tests = " and ".join(f"a {TESTS[test]}" for test in ends)
+            powers.setdefault(tests, []).append(f"{name} {limits}")
+        for doubt in summary.doubts:
+            doubts.setdefault(doubt, []).append(name)
+    power = f"not rejected, with {percentage(POWER)} power to reject"
+    return [
+        *(f"{power} {tests} outside: {'; '.join(limits)}" for tests, limits in powers.items()),
+        *close,
+        *(f"{', '.join(names)}*: {doubt}" for doubt, names in doubts.items()),
+    ]
+
+
+def as_json(campaign: Campaign, command: str = "", seed: int | None = None) -> str:
+    """The campaign without curves as JSON, with versions, seed and command; NaN is null."""
+    filters = {
+        name: {
+            "verdict": s.verdict,
+            "rejected_by": s.by,
+            "noticed": {key: _finite_or_none(np.asarray(ends)) for key, ends in s.noticed.items()},
+            "doubts": s.doubts,
+            "measures": {
+                key: dict(zip(Average._fields, _finite_or_none(average), strict=True))
+                for key, average in s.measures.items()
+            },
+            "nis_band": s.nis_band,
+            "honest_nis": s.honest_nis,
+            "steps_inside_band": s.inside,
+            "coverage": {block: _finite_or_none(share) for block, share in s.coverage.items()},
+            "autocorrelation": _finite_or_none(s.autocorrelation),
+            "autocorrelation_band": _finite_or_none(s.autocorrelation_band),
+            "not_finite_runs": s.not_finite_runs,
+            "counts": s.counts,
+        }
+        for name, s in campaign.filters.items()
+    }
+    head = {
+        "scenario": campaign.scenario,
+        "source": campaign.source,
+        "published": campaign.published,
+        "runs": campaign.runs,
+        "steps": campaign.steps,
+        "dtype": campaign.dtype,
+        "seed": seed,
+        "command": command,
+        "nees_convention": "not divided by dof",
+        "coverage_levels": LEVELS,
+        "level": EACH,
+        "divergence_limit_m": campaign.divergence_limit,
+        "seconds": round(campaign.seconds, 3),
+        "compile_seconds": round(campaign.compile_seconds, 3),
+        "step_seconds": campaign.step_seconds,
+        "versions": versions(),
+    }
+    return json_text(head | {"filters": filters})
+
+
+def table_csv(campaign: Campaign) -> str:
+    """The table as CSV: a row per measure; for each filter the value and the ends of its interval.
+
+    Verdicts and bands are text; cells without a number are empty.
+    """
+    names = list(campaign.filters)
+    ends = [f"{name}{end}" for name in names for end in ("", " low", " high")]
+    rows = [
+        [row.label.strip(), row.honest, *(text for cell in row.cells for text in _csv_cells(cell))]
+        for row in rows_of(campaign, names)
+    ]
+    return csv_text(["measure", "honest", *ends], rows)
+
+
+def _csv_cells(cell: Cell) -> list[str]:
+    """A cell as three columns of CSV: the value and the ends of its interval."""
+    if isinstance(cell, Average):
+        return [_blank(value) for value in cell]
+    if cell is None or isinstance(cell, Summary):
+        return [cell.verdict if cell else "", "", ""]
+    return [cell.text if cell.value is None else _blank(cell.value), "", ""]
+
+
+def as_csv(campaign: Campaign) -> str:
+    """The curves as CSV: a row for each filter and step; cells without a number are empty."""
+    keys = list(dict.fromkeys(key for s in campaign.filters.values() for key in s.curves))
+    nothing = np.full(campaign.steps, np.nan)  # some filters lack a curve, as of landmarks
+    rows: list[list[str]] = []
+    for name, s in campaign.filters.items():
+        columns = [map(_blank, s.curves.get(key, nothing).tolist()) for key in keys]
+        rows += [[name, str(step + 1), *row] for step, row in enumerate(zip(*columns, strict=True))]
+    return csv_text(["filter", "step", *keys], rows)
+
+
+def run_columns(campaign: Campaign) -> dict[str, np.ndarray]:
+    """The columns of `Campaign.to_dataframe`, which has a row for each run of each filter."""
+    numbers, filters = campaign.run_numbers, campaign.filters
+    none = np.full(len(numbers), np.nan)
+    names = dict.fromkeys(name for s in filters.values() for name in s.per_run)
+    columns: dict[str, np.ndarray] = {
+        "filter": np.repeat(np.array(list(filters), object), len(numbers)),
+        "run": np.tile(numbers, len(filters)),
+        "finite": np.concatenate([~np.isin(numbers, s.not_finite_runs) for s in filters.values()]),
+    }
+    for name in names:
+        columns[name] = np.concatenate([s.per_run.get(name, none) for s in filters.values()])
+    return columns
+
+
+def _columns(campaign: Campaign, names: list[str]) -> str:
+    """The table of some filters."""
+    lines = [["", "honest", *names]]
+    for row in rows_of(campaign, names):
+        lines.append([row.label, row.honest, *map(cell_text, row.cells)])
+        if row.published:
+            values = ("" if value is None else short(value) for value in row.published)
+            lines.append(["  published", "", *values])
+    text = text_table(lines)
+    text.insert(1, "-" * len(text[0]))
+    return "\n".join(text)
+
+
+def _finite_or_none(values: Iterable[float]) -> list[float | None]:
+    """The values, with None for those that are not finite."""
+    return [json_number(value) for value in values]
+
+
+def _blank(value: float) -> str:
+    """A number as a cell of CSV, empty if it is not finite."""
+    return f"{value:.9g}" if math.isfinite(value) else ""
