@@ -6,8 +6,7 @@ import worlds
 from matplotlib.animation import FFMpegWriter
 from PIL import Image, ImageChops
 
-from jaxslam import _catalog as catalog
-from jaxslam import plot
+from jaxslam import catalog, plot
 from jaxslam._cli.campaigns.consistency import _write_films as write_films
 
 
@@ -15,7 +14,7 @@ from jaxslam._cli.campaigns.consistency import _write_films as write_films
 def test_every_filter_is_filmed_in_run_0(tmp_path, capsys, monkeypatch):
     monkeypatch.setattr(FFMpegWriter, "isAvailable", lambda: False)
     world = worlds.ring(3)
-    filters = {"dead_reckoning": catalog.BASELINES["dead_reckoning"](world)}
+    filters = {"dead_reckoning": catalog.ALL["dead_reckoning"](world)}
     write_films(tmp_path / "out", world, filters, 5, "float64")
     printed = capsys.readouterr().out
     assert "\nfilm: ffmpeg is not installed: GIF instead of MP4\n" in printed

@@ -9,7 +9,7 @@ import pytest
 from matplotlib.animation import FFMpegWriter
 
 from jaxslam import _cli as cli
-from jaxslam._cli.recorded.filter_choice import NAMES
+from jaxslam import catalog
 from jaxslam._cli.recorded.filter_run import positive_definite, suspicions
 from jaxslam.results import plot
 
@@ -105,7 +105,9 @@ def test_the_help_names_whole_filters_and_only_those_of_a_data_set(monkeypatch, 
     monkeypatch.setenv("COLUMNS", "80")
     assert cli.main(["run", "--help"]) == 0
     words = capsys.readouterr().out.replace(",", " ").split()
-    assert {*NAMES} <= {word.strip(";") for word in words} and not {"ideal", "batch_map"} & {*words}
+    of_simulations = {"ideal", "batch_map"}
+    assert {*catalog.ALL} - of_simulations <= {word.strip(";") for word in words}
+    assert not of_simulations & {*words}
 
 
 def test_a_covariance_is_judged_on_the_host():

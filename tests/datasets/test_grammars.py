@@ -10,8 +10,7 @@ from recordings import BONN, MRCLAM, TEAM
 from test_mutated import YAML, assert_map, assert_whole
 from test_table import OWN, SETTINGS, TRUTH
 
-from jaxslam import datasets, grids
-from jaxslam.datasets import _g2o as g2o
+from jaxslam import datasets, graphs, grids
 from jaxslam.datasets._laser_logs.carmen_odometry import odometry_of_file
 
 COV = "0.01 0 0 0.04 0.001 0.09"
@@ -64,9 +63,9 @@ def assert_laser(log):
     chex.assert_tree_all_finite((log.time, log.beams, log.corrected, log.raw, log.odometry))
 
 
-def assert_graph(loaded):
+def assert_graph(graph):
     """Finite numbers."""
-    chex.assert_tree_all_finite((loaded.graph.poses, loaded.graph.points))
+    chex.assert_tree_all_finite((graph.poses, graph.points))
 
 
 def read_odometry(path):
@@ -104,7 +103,7 @@ TABLES = {
     "landmarks.csv": records("tag,x [m],y [m]", "i", "x", "x"),
 }
 GRAMMARS = {
-    "graphs": ({"graph.g2o": GRAPHS}, lambda path: g2o.load(path / "graph.g2o"), assert_graph),
+    "graphs": ({"graph.g2o": GRAPHS}, lambda path: graphs.read(path / "graph.g2o"), assert_graph),
     "carmen": (
         {
             "room.log": lines(

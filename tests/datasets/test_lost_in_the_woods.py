@@ -10,7 +10,7 @@ import pytest
 import jaxslam
 from examples.lost_in_the_woods import write_tables
 from jaxslam import charts, datasets
-from jaxslam.consistency._measures.nees import block_nees, pose_error
+from jaxslam.consistency import block_nees, pose_error
 from jaxslam.core.types import Status
 from jaxslam.datasets._landmark_logs.table_settings import fitted_text
 from jaxslam.datasets._noise_fit import autocorrelation

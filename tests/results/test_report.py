@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import worlds
 
-from jaxslam._catalog import BASELINES
+from jaxslam import catalog
 from jaxslam.consistency import Average
 from jaxslam.consistency._measures import BUILT_IN
 from jaxslam.core.types import Estimate
@@ -83,7 +83,7 @@ def test_filters_of_which_the_same_is_said_share_a_sentence(campaign):
 
 def test_what_a_filter_does_not_estimate_has_no_number():
     """The log-likelihood of dead reckoning, the map of localization."""
-    filters = {name: BASELINES[name](WORLD) for name in ("dead_reckoning", "localization")}
+    filters = {name: catalog.ALL[name](WORLD) for name in ("dead_reckoning", "localization")}
     reckoned, localized = worlds.campaign(WORLD, filters, 2).filters.values()
     assert "log_likelihood" not in reckoned.measures and "rmse_landmarks" not in localized.measures
     assert "log_likelihood" in localized.measures

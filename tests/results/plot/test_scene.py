@@ -10,8 +10,7 @@ import pytest
 import worlds
 
 import jaxslam
-from jaxslam import _catalog as catalog
-from jaxslam import filters, plot
+from jaxslam import catalog, filters, plot
 from jaxslam.core.types import Info, Log, Scan, Status, Trace
 from jaxslam.filters._delayed.state import TableLayout, empty_state
 from jaxslam.filters._information.eif_slam import CanonicalState
@@ -20,7 +19,6 @@ from jaxslam.filters._particles.slam_particles import initial_slam_particles
 from jaxslam.results.plot._film import still
 from jaxslam.results.plot._grid_figures import map_scene
 from jaxslam.results.plot._run_film import MOST, Cloud, Hypotheses, Links, history_of, run_scene
-from jaxslam.results.plot._style import panels_of
 
 STEPS = 3
 # Landmark 2 is new in the last step; a measurement of landmark 1 fails the gate there.
@@ -54,7 +52,7 @@ def scene_of(steps=STEPS, seen=None, frames=MOST, **more):
 
 def staged(panel):
     """The axes of a panel, and what sets them to frame k."""
-    _, (axes,) = panels_of(4.0, 4.0, 1)
+    _, (axes,) = plot.panels_of(4.0, 4.0, 1)
     draws = [layer(axes) for layer in panel.layers]
     return axes, lambda k: [draw(k) for draw in draws]
 
@@ -374,7 +372,7 @@ def test_of_delayed_initialization_the_hypotheses_are_seen():
 
 def test_a_filter_is_filmed_in_a_world_by_itself():
     world = worlds.ring(4)
-    film = plot.animate_world(world, catalog.BASELINES["dead_reckoning"](world), jax.random.key(0))
+    film = plot.animate_world(world, catalog.ALL["dead_reckoning"](world), jax.random.key(0))
     assert len({picture.tobytes() for picture in pictures(film)}) == 4
     assert film.scene.title == "ring"
     assert film.scene.caption(0) == "step 1 of 4 · 6 measurements: 0 fused, 0 new, 6 dropped"
