@@ -159,7 +159,7 @@ def summary_table(columns: Mapping[str, Mapping[str, object]]) -> str:
     lines = [["", *columns]] if len(columns) > 1 else []
     for row in rows:
         missing = 0 if row.startswith(COUNT) else "-"
-        lines.append([row, *(_shown(column.get(row, missing)) for column in columns.values())])
+        lines.append([row, *(_cell_text(column.get(row, missing)) for column in columns.values())])
     # The last column is not padded.
     widths = [max(len(line[i]) for line in lines) for i in range(len(columns))]
     indent = "\n" + " " * (widths[0] + 2)  # of a cell of several lines
@@ -171,13 +171,13 @@ def summary_table(columns: Mapping[str, Mapping[str, object]]) -> str:
     )
 
 
-def _shown(value: object) -> str:
+def _cell_text(value: object) -> str:
     """A value of the summary as it is printed."""
     if isinstance(value, dict):
         return ", ".join(f"{count_label(key)} {count:,}" for key, count in value.items()) or "-"
     if isinstance(value, list):
         lines = all(isinstance(part, str) for part in value)
-        return ("\n" if lines else "; ").join(_shown(part) for part in value) or "-"
+        return ("\n" if lines else "; ").join(_cell_text(part) for part in value) or "-"
     return f"{value:.6g}" if isinstance(value, float) else str(value) or "-"
 
 

@@ -256,7 +256,7 @@ def solve(plan: OptimizePlan, problem: Problem) -> Optimum:
     start = min(cost_by_start, key=cost_by_start.__getitem__)
     start_graph, solution = start_graphs[start], solutions[start]
     final = jax.tree.map(np.asarray, solution.graph)
-    chi2_at_start = _sum(_squared(start_graph, factors))
+    chi2_at_start = _sum(_squared_residuals(start_graph, factors))
     certificate: Json = {}
     if plan.certificate:
         converged = int(solution.status) == Ending.CONVERGED
@@ -269,8 +269,10 @@ def solve(plan: OptimizePlan, problem: Problem) -> Optimum:
         graph=final,
         cost_by_start=cost_by_start,
         impossible=impossible,
-        squared=_squared(final, factors),
-        chi2_of_file=chi2_at_start if start_graph is graph else _sum(_squared(graph, factors)),
+        squared=_squared_residuals(final, factors),
+        chi2_of_file=chi2_at_start
+        if start_graph is graph
+        else _sum(_squared_residuals(graph, factors)),
         chi2_at_start=chi2_at_start,
         cost_at_start=float(graphs.chi2(start_graph, factors, kernel=kernels))
         if kernels
@@ -281,7 +283,7 @@ def solve(plan: OptimizePlan, problem: Problem) -> Optimum:
     )
 
 
-def _squared(graph: Graph, factors: Mapping[str, Factor]) -> dict[str, np.ndarray]:
+def _squared_residuals(graph: Graph, factors: Mapping[str, Factor]) -> dict[str, np.ndarray]:
     """eᵀ Ω e of each row; one program for the file, the start and the optimum."""
     return {k: np.asarray(s) for k, s in graphs.squared_residuals(graph, factors).items()}
 
@@ -347,7 +349,7 @@ def summarize(plan: OptimizePlan, optimum: Optimum, command: str) -> Json:
         "gauge": _gauge(problem),
         "start": optimum.start,
         "kernel": plan.kernel or "none",
-        **(_robust(optimum, problem.kernels) if problem.kernels else {}),
+        **(_robust_entries(optimum, problem.kernels) if problem.kernels else {}),
         f"chi2 of the file{plain}": json_number(optimum.chi2_of_file),
         f"chi2 at the start{plain}": json_number(optimum.chi2_at_start),
         f"chi2{plain}": json_number(optimum.chi2),
@@ -363,7 +365,7 @@ def summarize(plan: OptimizePlan, optimum: Optimum, command: str) -> Json:
     }
 
 
-def _robust(optimum: Optimum, kernels: Mapping[str, graphs.Kernel]) -> Json:
+def _robust_entries(optimum: Optimum, kernels: Mapping[str, graphs.Kernel]) -> Json:
     """Entries of the summary on a robust kernel: costs, and the number of rows it keeps."""
     solution = optimum.solution
     kept, left_out = {}, {}

@@ -50,7 +50,7 @@ class UserObjects:
         if not isinstance(world, World):
             raise ValueError(
                 f"{entry}: expected a Scenario, or a function that returns one, "
-                f"{_got(value, world)}"
+                f"{_mismatch(value, world)}"
             )
         check_noise(world)
         return world
@@ -111,7 +111,7 @@ class UserObjects:
         if not isinstance(candidate, Filter) and not callable(candidate):
             raise ValueError(
                 f"{entry}: expected a Filter, or a function of the scenario that returns one, "
-                f"{_got(value, candidate)}"
+                f"{_mismatch(value, candidate)}"
             )
         check_fits(name, candidate, scenario)
         return name, candidate
@@ -133,7 +133,7 @@ class UserObjects:
             ) from error
 
 
-def _got(value: object, result: object) -> str:
+def _mismatch(value: object, result: object) -> str:
     """A phrase on the object in the file, or on the result of the function in the file."""
     source = "got" if result is value else "got a function that returned"
     return f"{source} {result!r:.60}"

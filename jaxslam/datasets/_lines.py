@@ -13,8 +13,8 @@ LARGEST = 1e60
 """Largest number that is read: products of five such numbers are finite in float64."""
 
 
-def stored(path: str | Path) -> Path | None:
-    """The file NAME, else NAME.gz beside it, else None."""
+def stored_file(path: str | Path) -> Path | None:
+    """The path of the file NAME, else of NAME.gz beside it, else None."""
     path = Path(path)
     return next((file for file in (path, Path(f"{path}.gz")) if file.exists()), None)
 
@@ -25,7 +25,7 @@ def read_bytes(path: str | Path) -> tuple[Path, bytes]:
     Raises ValueError, `path: cannot be read: reason`, if neither can be read, or a packed file is
     damaged or ends early.
     """
-    file = stored(path) or Path(path)
+    file = stored_file(path) or Path(path)
     try:
         data = file.read_bytes()
         return file, gzip.decompress(data) if file.suffix == ".gz" else data

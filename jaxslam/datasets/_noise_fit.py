@@ -97,7 +97,7 @@ def fit(
     if models is None:
         raise ValueError(f"fit: expected a data set with adjustable noises, got {data.name}")
     groups = tuple(calibrate)
-    free = _free(models.parameters, groups, tuple(fixed))
+    free = _free_indices(models.parameters, groups, tuple(fixed))
     start, key = models.values, jax.random.key(0)
     names = [parameter.name for parameter in models.parameters]
     is_noise = np.array([parameter.group == "noise" for parameter in models.parameters])
@@ -230,7 +230,7 @@ def _as_fit(calibrated: Calibration, names: list[str], before: Info, after: Info
     )
 
 
-def _free(
+def _free_indices(
     parameters: tuple[Parameter, ...], calibrate: tuple[str, ...], fixed: tuple[str, ...]
 ) -> np.ndarray:
     """The indices of the parameters to fit."""

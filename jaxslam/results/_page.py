@@ -199,7 +199,7 @@ def verdict_list(campaign: Campaign) -> str:
         if tested and summary.not_finite_runs:
             values.append(f"averages of the {summary.counts['runs']:,} finite runs")
         lines = "".join(f'<span class="why">{line}</span>' for line in values or ["no pose NEES"])
-        label = f'<span class="name">{breakable(name)}</span>'
+        label = f'<span class="name">{with_word_breaks(name)}</span>'
         items.append(f"<li>{label}{badge(summary.verdict, summary)}{lines}</li>")
     lost = (f"{name} {phrase}" for name, phrase in table.lost_runs(campaign))
     sentences = [*report.sentences_on_verdicts(campaign), *lost]
@@ -223,7 +223,7 @@ def badge(verdict: str, summary: Summary | None = None) -> str:
 def measures_table(campaign: Campaign) -> str:
     """The table of measures × filters as HTML; published values below them."""
     names = list(campaign.filters)
-    head = "".join(f'<th scope="col">{breakable(name)}</th>' for name in names)
+    head = "".join(f'<th scope="col">{with_word_breaks(name)}</th>' for name in names)
     parts = []
     for group, rows in groupby(table.rows_of(campaign, names), lambda row: row.group):
         title = f'<th colspan="{len(names) + 2}" scope="rowgroup">{group}</th>'
@@ -287,6 +287,6 @@ def duration(seconds: float) -> str:
     return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
 
 
-def breakable(name: str) -> str:
+def with_word_breaks(name: str) -> str:
     """A name escaped for HTML, with places where it may break."""
     return escape(name).replace("_", "_<wbr>")

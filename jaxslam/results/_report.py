@@ -151,10 +151,10 @@ def table_csv(campaign: Campaign) -> str:
 def _csv_cells(cell: Cell) -> list[str]:
     """A cell as three columns of CSV: the value and the ends of its interval."""
     if isinstance(cell, Average):
-        return [_blank(value) for value in cell]
+        return [_csv_number(value) for value in cell]
     if cell is None or isinstance(cell, Summary):
         return [cell.verdict if cell else "", "", ""]
-    return [cell.text if cell.value is None else _blank(cell.value), "", ""]
+    return [cell.text if cell.value is None else _csv_number(cell.value), "", ""]
 
 
 def as_csv(campaign: Campaign) -> str:
@@ -163,7 +163,7 @@ def as_csv(campaign: Campaign) -> str:
     nothing = np.full(campaign.steps, np.nan)  # some filters lack a curve, as of landmarks
     rows: list[list[str]] = []
     for name, s in campaign.filters.items():
-        columns = [map(_blank, s.curves.get(key, nothing).tolist()) for key in keys]
+        columns = [map(_csv_number, s.curves.get(key, nothing).tolist()) for key in keys]
         rows += [[name, str(step + 1), *row] for step, row in enumerate(zip(*columns, strict=True))]
     return csv_text(["filter", "step", *keys], rows)
 
@@ -201,6 +201,6 @@ def _finite_or_none(values: Iterable[float]) -> list[float | None]:
     return [json_number(value) for value in values]
 
 
-def _blank(value: float) -> str:
+def _csv_number(value: float) -> str:
     """A number as a cell of CSV, empty if it is not finite."""
     return f"{value:.9g}" if math.isfinite(value) else ""

@@ -10,7 +10,7 @@ from matplotlib.animation import FFMpegWriter
 
 from jaxslam import _cli as cli
 from jaxslam import catalog
-from jaxslam._cli.recorded.filter_run import positive_definite, suspicions
+from jaxslam._cli.recorded.filter_run import is_positive_definite, suspicions
 from jaxslam.results import plot
 
 
@@ -111,9 +111,9 @@ def test_the_help_names_whole_filters_and_only_those_of_a_data_set(monkeypatch, 
 
 
 def test_a_covariance_is_judged_on_the_host():
-    assert positive_definite(np.diag([1.0, 1e-12]))
-    assert not positive_definite(np.diag([1.0, -1e-12]))
-    assert not positive_definite(np.array([[1.0, np.nan], [np.nan, 1.0]]))
+    assert is_positive_definite(np.diag([1.0, 1e-12]))
+    assert not is_positive_definite(np.diag([1.0, -1e-12]))
+    assert not is_positive_definite(np.array([[1.0, np.nan], [np.nan, 1.0]]))
 
 
 def write_table(tmp_path):

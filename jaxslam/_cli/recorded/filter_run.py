@@ -16,7 +16,7 @@ from jaxslam.core.slots import Joint
 from jaxslam.core.types import Log, Status
 from jaxslam.datasets import Dataset
 from jaxslam.datasets._evaluation import Evaluation, evaluate, joint_map_cov
-from jaxslam.datasets._uncertain_constants import consider_constants
+from jaxslam.datasets._uncertain_constants import AddedCov, consider_constants
 from jaxslam.math._definite import indefinite
 from jaxslam.results._files import Json
 
@@ -61,7 +61,7 @@ def run_filter(
             pose,
             pose_cov,
             progress=progress,
-            check=(lambda state: positive_definite(np.asarray(state.cov)))
+            check=(lambda state: is_positive_definite(np.asarray(state.cov)))
             if has_covariance
             else None,
             at=film_steps,
@@ -71,28 +71,31 @@ def run_filter(
     map_cov, constants = joint_map_cov(filter, result.final), ""
     if data.adjustable is not None and data.adjustable.cov is not None:
         constants = "left out"
-    added = None
     if has_covariance:
         added = consider_constants(data, lambda *models: chosen_filters(data, name, models)[name])
-    if added is not None:
-        constants = "added"
-        # (N, 2, N, 2) -> (N, 2, 2): the blocks of each landmark with itself.
-        point_covs = np.moveaxis(np.diagonal(added.points, axis1=0, axis2=2), -1, 0)
-        path, last = result.path, result.last
-        result = result._replace(
-            path=path._replace(pose_cov=path.pose_cov + added.pose),
-            last=last._replace(
-                pose_cov=last.pose_cov + added.pose[-1],
-                point_covs=last.point_covs + point_covs,
-            ),
-        )
-        map_cov = None if map_cov is None else map_cov + added.points
+        if added is not None:
+            constants = "added"
+            result = _add_cov(result, added)
+            map_cov = None if map_cov is None else map_cov + added.points
     evaluation = evaluate(data, result.path, result.last, map_cov)
     summary = _summary(result, unplaced, constants, seconds) | evaluation.errors
     if evaluation.map_test is not None:
         summary |= evaluation.map_test.rows()
     notes = suspicions(summary)
     return FilterRun(result, evaluation, summary | ({"notes": notes} if notes else {}))
+
+
+def _add_cov(result: PiecewiseRun, added: AddedCov) -> PiecewiseRun:
+    """The run with the covariances that uncertain constants add to its path and its last map."""
+    # (N, 2, N, 2) -> (N, 2, 2): the blocks of each landmark with itself.
+    point_covs = np.moveaxis(np.diagonal(added.points, axis1=0, axis2=2), -1, 0)
+    path, last = result.path, result.last
+    return result._replace(
+        path=path._replace(pose_cov=path.pose_cov + added.pose),
+        last=last._replace(
+            pose_cov=last.pose_cov + added.pose[-1], point_covs=last.point_covs + point_covs
+        ),
+    )
 
 
 def on_true_poses(data: Dataset) -> tuple[Log, int]:
@@ -111,7 +114,7 @@ def on_true_poses(data: Dataset) -> tuple[Log, int]:
     return Log(jnp.asarray(data.true_path[latest]), scan._replace(valid=valid)), left_out
 
 
-def positive_definite(cov: Float[np.ndarray, "D D"]) -> bool:
+def is_positive_definite(cov: Float[np.ndarray, "D D"]) -> bool:
     """Whether a covariance is finite and has no negative eigenvalue; 0 may be one."""
     return bool(np.isfinite(cov).all()) and not indefinite(cov)
 

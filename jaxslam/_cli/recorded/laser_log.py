@@ -250,7 +250,7 @@ def pose_of(option: str, text: str, others: str = "") -> Float[np.ndarray, "3"]:
     return pose
 
 
-def scored(log: LaserLog, score: Callable[[], Json]) -> Json:
+def score_or_reason(log: LaserLog, score: Callable[[], Json]) -> Json:
     """The score by the poses in the file; without poses, or equal ones, the reason for none."""
     if not log.placed:
         return {"score": "none: the file has no poses"}

@@ -115,7 +115,7 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> laser_log.Jo
     fit = share_as_predicted(grid, np.asarray(path.pose)[-LAST_SCANS:], log)
     head = {"job": "localization", "map": str(options.map), "start": start, "odometry": odometry}
     summary = head | _summary(result, options.particles, fit)
-    summary |= laser_log.scored(log, lambda: scores(np.asarray(path.pose), log.corrected))
+    summary |= laser_log.score_or_reason(log, lambda: scores(np.asarray(path.pose), log.corrected))
 
     def draw() -> Files:
         from jaxslam.results import plot  # matplotlib is slow to load

@@ -69,7 +69,7 @@ def run_slam(log: LaserLog, options: argparse.Namespace) -> laser_log.Job:
     files, drawings = result_files(solved), figures(solved, options.figures, reference)
     if options.animate:
         drawings["film"] = lambda: film_files({"slam": film(log, solved, settings)}, suffixed=False)
-    summary = result_summary(solved) | laser_log.scored(log, lambda: _scores(log, solved))
+    summary = result_summary(solved) | laser_log.score_or_reason(log, lambda: _scores(log, solved))
     if coarser:
         summary["requested resolution, of too many cells [m]"] = settings.resolution
     if relations_of_log is None:

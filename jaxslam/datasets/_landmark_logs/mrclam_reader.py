@@ -25,7 +25,7 @@ from jaxslam.datasets._landmark_logs.mrclam_robot import (
     read_lines,
     true_fields,
 )
-from jaxslam.datasets._lines import none_left, stored
+from jaxslam.datasets._lines import none_left, stored_file
 from jaxslam.filters.multi_robot._team import Robot, TeamMotion, sensors_of
 from jaxslam.sensors import Part, Suite
 
@@ -96,7 +96,7 @@ def mrclam(
     time = np.unique(np.concatenate([lines.odometry[:, 0], lines.measurements[:, 0]]))
     row, tag, kept, dropped = associate(lines.measurements, time, subject_of, names)
     if not tag:
-        raise none_left(f"{stored(Path(folder) / f'Robot{robot}_Measurement.dat')}:1", dropped)
+        raise none_left(f"{stored_file(Path(folder) / f'Robot{robot}_Measurement.dat')}:1", dropped)
     motion, sensor = models_of(calibration)
     log = log_of(lines.odometry, time, row, tag, lines.measurements[kept, 2:])
     return Dataset(
@@ -187,7 +187,7 @@ def mrclam_team(
         if not tag:
             path = Path(folder) / f"Robot{robot}_Measurement.dat"
             raise ValueError(
-                f"{stored(path)}:1: no measurement of a landmark, or of a robot in {numbers}"
+                f"{stored_file(path)}:1: no measurement of a landmark, or of a robot in {numbers}"
             )
         tags, rows = np.array(tag), np.array(row)
         controls.append(hold(lines.odometry[:, 0], lines.odometry[:, 1:], time))

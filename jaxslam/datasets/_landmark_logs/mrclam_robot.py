@@ -17,7 +17,7 @@ from jaxslam.core.logs._streams import hold, known_poses
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import JaxOrNumPy, Log
 from jaxslam.datasets._dataset import Adjustable, Parameter
-from jaxslam.datasets._lines import TextFile, stored
+from jaxslam.datasets._lines import TextFile, stored_file
 from jaxslam.motion import Unicycle, WhiteNoise
 from jaxslam.sensors import RangeBearing, RangeBearingNoise
 
@@ -63,7 +63,7 @@ def read_robot(
 def read_truth(folder: Path, robot: int) -> Float[np.ndarray, "K 4"] | None:
     """The true poses (t, x, y, θ) of one robot; None without a file."""
     path = folder / f"Robot{robot}_Groundtruth.dat"
-    if stored(path) is None:
+    if stored_file(path) is None:
         return None
     return _read_in_time(TextFile(path, "#"), ("time", "x", "y", "theta"))
 
@@ -162,14 +162,14 @@ class RobotCalibration(NamedTuple):
     def motion(self) -> Motion:
         """The motion of the robot by its recorded velocities."""
         noise = WhiteNoise(self.forward_noise, self.turn_noise, self.turn_share)
-        scale, wheels = _stacked(self.forward, self.turn), _stacked(self.outer, self.curvature)
+        scale, wheels = _stack(self.forward, self.turn), _stack(self.outer, self.curvature)
         return motion.Corrected(Unicycle(noise), scale, wheels)
 
     @property
     def sensor(self) -> Sensor:
         """The camera, of corrected ranges."""
         noise = RangeBearingNoise(0.0, self.bearing_noise, share=self.range_share)
-        return RangeBearing(noise, mount=_stacked(self.ahead, 0.0, self.yaw))
+        return RangeBearing(noise, mount=_stack(self.ahead, 0.0, self.yaw))
 
     def range_factor(self, bearing: JaxOrNumPy) -> JaxOrNumPy:
         """Recorded over corrected range at a bearing, depth cos(φ - axis)."""
@@ -177,7 +177,7 @@ class RobotCalibration(NamedTuple):
         return self.depth * cos(bearing - self.axis)
 
 
-def _stacked(*numbers: float) -> ArrayLike:
+def _stack(*numbers: float) -> ArrayLike:
     """Numbers as a vector: NumPy's, unless one is traced."""
     return (
         np.array(numbers)

@@ -24,7 +24,7 @@ from jaxslam.datasets._landmark_logs.table_settings import (
     Parametric,
     TableSettings,
 )
-from jaxslam.datasets._lines import DIGITS, LARGEST, none_left, read_bytes, stored
+from jaxslam.datasets._lines import DIGITS, LARGEST, none_left, read_bytes, stored_file
 from jaxslam.math._odometry_jumps import odometry_jumps, step_sizes, without_jumps
 
 MISSING = frozenset(
@@ -438,7 +438,7 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
         true_at=true_at,
         one_frame=one_frame,
         slots=capacity,
-        adjustable=adjustable._replace(cov=settings.uncertain(adjustable.parameters)),
+        adjustable=adjustable._replace(cov=settings.calibration_cov(adjustable.parameters)),
         dropped=dropped,
         assumed=tuple(settings.assumed + notes),
         source=settings.text("source", ""),
@@ -532,7 +532,7 @@ def _beyond_a_turn(table: Columns[int | str]) -> str:
 
 def _survey(path: Path, notes: list[str]) -> dict[int | str, tuple[float, float]] | None:
     """The position of each tag, and notes added; None without a file."""
-    if stored(path) is None:
+    if stored_file(path) is None:
         return None
     file = CsvTable(path)
     notes += [file.dialect] if file.dialect else []
@@ -550,7 +550,7 @@ def _survey(path: Path, notes: list[str]) -> dict[int | str, tuple[float, float]
 
 def _truth(path: Path, time: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None, list[str]]:
     """The true pose at each row (T, 3), a mask of the rows that have one (T,), and notes."""
-    if stored(path) is None:
+    if stored_file(path) is None:
         return None, None, []
     file = CsvTable(path)
     columns = file.table((TIME, *POSE), "of a true path", optional=POSE)

@@ -294,7 +294,7 @@ class TableSettings:
         """
         factory, options = self._model("motion", motion.REGISTRY, header, (*_ODOMETRY_ERRORS,))
         errors = {key: options.pop(key) for key in _ODOMETRY_ERRORS if key in options}
-        bare = self._built("motion", factory, options, of_no_noise)
+        bare = self._build("motion", factory, options, of_no_noise)
         from_poses = odometry_columns(bare.controls, header) == POSE
         with_interval = INTERVAL in bare.controls
         count, correctable = len(bare.noises), odometry_errors.can_correct(bare)
@@ -302,19 +302,19 @@ class TableSettings:
         parameters += self._errors("motion", _ODOMETRY_ERRORS if correctable else {}, errors)
 
         # p is the noise (count,), then scale (2,), wheels (2,) and heading if correctable.
-        def plain(p: JaxOrNumPy) -> Motion:
+        def uncorrected(p: JaxOrNumPy) -> Motion:
             noise = _TableNoise(p[:count], interval, from_poses or with_interval, from_poses)
-            model = self._built("motion", factory, options, noise)
+            model = self._build("motion", factory, options, noise)
             return _WithInterval(model, noise) if from_poses else model
 
-        def model(p: JaxOrNumPy) -> Motion:
+        def corrected(p: JaxOrNumPy) -> Motion:
             if not correctable:
-                return plain(p)
+                return uncorrected(p)
             scale, wheels = p[count : count + 2], p[count + 2 : count + 4]
-            return motion.Corrected(plain(p), scale, wheels, p[count + 4])
+            return motion.Corrected(uncorrected(p), scale, wheels, p[count + 4])
 
         values = np.array([parameter.value for parameter in parameters])
-        return Parametric(parameters, model, (model if errors else plain)(values))
+        return Parametric(parameters, corrected, (corrected if errors else uncorrected)(values))
 
     def sensor(self, header: Sequence[str]) -> Parametric[Sensor]:
         """The sensor. header: the columns of the measurements."""
@@ -327,7 +327,7 @@ class TableSettings:
         mount, has_mount = None, "mount" in inspect.signature(factory).parameters
         if "mount" in options:
             mount = self._numbers("sensor", "mount", options.pop("mount"), POSE)
-        bare = self._built("sensor", factory, options, of_no_noise)
+        bare = self._build("sensor", factory, options, of_no_noise)
         names = bare.measurements
         parameters = self._noise("sensor", names, _MEASUREMENT_NOISE)
         if not all(parameter.value for parameter in parameters):
@@ -350,25 +350,25 @@ class TableSettings:
         parameters += self._errors("sensor", adjustable if correctable else {}, errors)
 
         # p is the noise (m,), across, mount (3,), range (2,) and axis, each if there is one.
-        def plain(p: JaxOrNumPy) -> Sensor:
+        def uncorrected(p: JaxOrNumPy) -> Sensor:
             # NumPy for plain numbers, so that nothing is compiled.
             noise: NoiseCov = p[: len(names), None] ** 2 * np.eye(len(names))
             if across is not None:
                 noise = sensors.RangeBearingNoise(p[0], p[1], across=p[2])
             place = {"mount": p[before_mount : before_mount + 3]} if has_mount else {}
-            return self._built("sensor", factory, options | place, noise)
+            return self._build("sensor", factory, options | place, noise)
 
-        def model(p: JaxOrNumPy) -> Sensor:
+        def corrected(p: JaxOrNumPy) -> Sensor:
             if not correctable:
-                return plain(p)
+                return uncorrected(p)
             axis = p[before_errors + 2] if "axis" in errors else None
             try:
-                return sensors.Corrected(plain(p), p[before_errors : before_errors + 2], axis)
+                return sensors.Corrected(uncorrected(p), p[before_errors : before_errors + 2], axis)
             except ValueError as problem:
                 raise ValueError(f"{self.path}: [sensor] {problem}") from problem
 
         values = np.array([parameter.value for parameter in parameters])
-        return Parametric(parameters, model, (model if errors else plain)(values))
+        return Parametric(parameters, corrected, (corrected if errors else uncorrected)(values))
 
     def _across(self, across: object, measurements: tuple[str, ...]) -> Parameter:
         """The standard deviation across the line of sight, which range and bearing share."""
@@ -392,7 +392,7 @@ class TableSettings:
         """The least time between two measurements of a landmark that are used [s]."""
         return self._positive("filter", "spacing", 0.0)
 
-    def uncertain(self, parameters: tuple[Parameter, ...]) -> np.ndarray | None:
+    def calibration_cov(self, parameters: tuple[Parameter, ...]) -> np.ndarray | None:
         """The covariance of the parameters in [calibration] (P, P), 0 of others; None without."""
         section = self.content.get("calibration")
         if section is None:
@@ -589,7 +589,7 @@ class TableSettings:
                 )
         return numbers
 
-    def _built(
+    def _build(
         self,
         section: str,
         factory: Callable[..., _Model],

@@ -24,10 +24,10 @@ from jaxslam.results.plot._style import (
     SHADE,
     Look,
     caption,
+    escape_name,
     every_handle,
     own_settings,
     panels_of,
-    plain,
     titled,
 )
 from jaxslam.simulation._walls import Walls, wall_lines
@@ -87,18 +87,18 @@ def ellipse(
 
 def extent(clouds: Sequence[np.ndarray]) -> float:
     """The larger side of the bounding box of some points, or 1 if it is 0."""
-    return float(np.nanmax(np.ptp(_finite(clouds), axis=0))) or 1.0
+    return float(np.nanmax(np.ptp(_finite_points(clouds), axis=0))) or 1.0
 
 
 def square_limits(clouds: Sequence[np.ndarray]) -> Limits:
     """The limits of a square panel about some points, with a margin."""
-    points = _finite(clouds)
+    points = _finite_points(clouds)
     x, y = (points.min(axis=0) + points.max(axis=0)) / 2
     half = 0.56 * extent(clouds)  # a margin of 6 % on each side
     return (x - half, x + half), (y - half, y + half)
 
 
-def _finite(clouds: Sequence[np.ndarray]) -> np.ndarray:
+def _finite_points(clouds: Sequence[np.ndarray]) -> np.ndarray:
     """The finite points, or else the origin."""
     points = np.concatenate(clouds)
     points = points[np.isfinite(points).all(axis=1)]
@@ -166,7 +166,7 @@ def map_figure(
     for i, (name, other_estimate) in enumerate((others or {}).items()):
         color, dashes = _OTHERS[i % len(_OTHERS)], _DASHES[i % len(_DASHES)]
         path = np.asarray(other_estimate.pose)[:, :2]
-        axes.plot(*path.T, lw=1.3, label=plain(name), zorder=3.6, color=color, ls=dashes)
+        axes.plot(*path.T, lw=1.3, label=escape_name(name), zorder=3.6, color=color, ls=dashes)
         points = np.asarray(other_estimate.points[-1])[np.asarray(other_estimate.alive[-1])]
         axes.plot(*points.T, ".", color=color, ms=3, zorder=5.2)
     _limit(axes, shown)
@@ -201,7 +201,7 @@ def run_map_figure(campaign: Campaign, *, title: str = "", width: float = PAGE) 
         shown = _draw_truth(axes, np.asarray(truth.pose), np.asarray(truth.landmarks)[:, :2])
         _draw_estimate(axes, estimate)
         _limit(axes, shown)
-        titled(axes, plain(name))
+        titled(axes, escape_name(name))
     for axes in panels[len(campaign.first) :]:
         axes.set_axis_off()
     for i, axes in enumerate(panels[: len(campaign.first)]):
@@ -286,7 +286,7 @@ def _draw_residuals(
     claimed = "3 σ claimed in its direction"
     axes.bar(at, claim, 0.7, color=SHADE, label=claimed)
     axes.plot(at, far, "D", color=COLORS[2], ms=4.5, mec="white", mew=0.4, label=label)
-    axes.set_xticks(at, [plain(str(names[tag[i]])) for i in tagged])
+    axes.set_xticks(at, [escape_name(str(names[tag[i]])) for i in tagged])
     if len(tagged) > _UPRIGHT:
         axes.tick_params(axis="x", rotation=90)
     axes.grid(axis="x", visible=False)

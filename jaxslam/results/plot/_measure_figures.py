@@ -37,10 +37,10 @@ from jaxslam.results.plot._style import (
     band,
     caption,
     curve,
+    escape_name,
     look,
     own_settings,
     panels_of,
-    plain,
     step_limits,
 )
 
@@ -222,7 +222,7 @@ def gained_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
         text = "no filter has an observability monitor (filters.Monitored)"
         axes.text(0.5, 0.6, text, transform=axes.transAxes, ha="center", fontsize=8)
     title = title_of(campaign, "information gained on a turn of the whole frame,")
-    title += f". Not monitored: {', '.join(map(plain, others))}" * bool(others and curves)
+    title += f". Not monitored: {', '.join(map(escape_name, others))}" * bool(others and curves)
     add_legends(figure, rows, title, "step")
     return figure
 
@@ -288,7 +288,7 @@ def cost_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
             _point(panels[0], i, at, name, Average(times[name], np.nan, np.nan))
             for axes, key in zip(panels[1:], _LABELS, strict=True):
                 _point(axes, i, at, name, measures.get(key, _NONE))
-            names.append(plain(name))
+            names.append(escape_name(name))
             heights.append(at)
             at += 1
         at += 1
@@ -332,7 +332,7 @@ def _point(axes: Axes, i: int, at: float, name: str, measure: Average) -> None:
         )
         return
     mark: Look = {key: style[key] for key in ("color", "marker", "mec", "mew")}
-    axes.plot(value, at, ms=5.0, label=plain(name), **mark)
+    axes.plot(value, at, ms=5.0, label=escape_name(name), **mark)
 
 
 def _interval(axes: Axes, at: float, measure: Average, color: str) -> None:

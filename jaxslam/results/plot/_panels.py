@@ -21,9 +21,9 @@ from jaxslam.results.plot._style import (
     TEXT,
     caption,
     curves_of,
+    escape_name,
     ordinate,
     panels_of,
-    plain,
     titled,
 )
 
@@ -147,7 +147,7 @@ def add_legends(figure: Figure, rows: Sequence[Row], title: str, across: str) ->
 def title_of(campaign: Campaign, subject: str) -> str:
     """The title of a figure: the scenario, the subject, and the number of runs."""
     runs = f"{campaign.runs:,} run{'s' if campaign.runs != 1 else ''}"
-    return f"{plain(campaign.scenario)}: {subject} {runs}"
+    return f"{escape_name(campaign.scenario)}: {subject} {runs}"
 
 
 _FAR = 3.0
@@ -208,12 +208,12 @@ def nees_scale(axes: Axes, campaign: Campaign, block: str) -> None:
     """
     dof = DOF[block]
 
-    def positive(end: str) -> np.ndarray:
+    def positive_values(end: str) -> np.ndarray:
         curves = (summary.curves[f"nees_{block}{end}"] for summary in campaign.filters.values())
         values = np.concatenate([np.ravel(curve) for curve in curves])
         return values[np.isfinite(values) & (values > 0)]
 
-    values, below, above = positive(""), positive("_low"), positive("_high")
+    values, below, above = positive_values(""), positive_values("_low"), positive_values("_high")
     shown = np.concatenate([values, below, above, [dof / 1.5, dof * 1.5]])
     low = max(shown.min(), _NEES_ENDS[0] * dof)
     # The length of the axis, as a logarithm, over which the band fills the share `_BAND`. At most
@@ -249,16 +249,16 @@ def set_positive(
     length, label = (axes.bbox.height, 11) if which == "y" else (axes.bbox.width, 28)  # [pt]
     length *= 72 / axes.figure.dpi
     axis.set_major_locator(LogLocator(numticks=int(np.clip(length / label, 2, _POWERS))))
-    axis.set_major_formatter(_short)
+    axis.set_major_formatter(_tick_label)
     decade = length / np.log10(high / low)
     digits = next((d for d in ("25", "3") if np.log10(int(d[0])) * decade > label), "")
     if digits:
-        axis.set_minor_formatter(lambda x, _: _short(x) if f"{x:.0e}"[0] in digits else "")
+        axis.set_minor_formatter(lambda x, _: _tick_label(x) if f"{x:.0e}"[0] in digits else "")
     else:
         axis.set_minor_locator(NullLocator())
 
 
-def _short(x: float, _: float = 0.0) -> str:
+def _tick_label(x: float, _: float = 0.0) -> str:
     return f"{x:g}" if 1e-3 <= abs(x) < 1e5 else power(x)
 
 

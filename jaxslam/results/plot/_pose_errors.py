@@ -16,10 +16,10 @@ from jaxslam.results.plot._style import (
     INK,
     PAGE,
     caption,
+    escape_name,
     ordinate,
     own_settings,
     panels_of,
-    plain,
     step_limits,
     titled,
 )
@@ -89,7 +89,7 @@ def run_errors_figure(campaign: Campaign, *, title: str = "", width: float = PAG
                 axes.set_yticks([-top, 0.0, top], [f"−{top:.2g}", "0", f"{top:.2g}"], weight="bold")
             _draw(axes, error[:, i], bound[:, i])
             mark_beyond(axes)
-        words = plain(name).replace("_", "_ ")  # a name may break after _
+        words = escape_name(name).replace("_", "_ ")  # a name may break after _
         wrapped = textwrap.wrap(words, 12, break_long_words=False)
         lines = [line.replace("_ ", "_") for line in wrapped]
         panels[3 * j].set_ylabel("\n".join(lines), rotation=0, ha="right", va="center")

@@ -359,7 +359,7 @@ def run_scene(
     return Scene(
         len(history.step),
         Panel(layers, *limits),
-        _nearby(history, true),
+        _error_panel(history, true),
         _text(history, beams),
         title,
         f"{len(history.step):,} of {steps:,} steps are shown, evenly in time"
@@ -439,7 +439,7 @@ def _robot(history: History, size: float) -> list[Layer]:
     ]
 
 
-def _nearby(history: History, path: np.ndarray | None) -> Panel:
+def _error_panel(history: History, path: np.ndarray | None) -> Panel:
     """The robot's position as seen from its estimate: the ellipse, the truth, particles."""
     pose, cov = (np.asarray(part) for part in history.estimate[:2])
     cov = cov[:, None, :2, :2]

@@ -192,7 +192,7 @@ def curve(
 
     absent: the entry in the legend of a curve without a finite value.
     """
-    label, finite = plain(label), np.isfinite(x) & np.isfinite(y)
+    label, finite = escape_name(label), np.isfinite(x) & np.isfinite(y)
     if not finite.any():
         axes.plot([], [], ls="none", label=f"{label}: {absent}", gid=CURVE)
         return
@@ -225,7 +225,7 @@ def band(axes: Axes, x: np.ndarray, low: np.ndarray, high: np.ndarray, label: st
     axes.fill_between(x, low, high, label=label, zorder=1, **look)
 
 
-def plain(name: str) -> str:
+def escape_name(name: str) -> str:
     """A name escaped for Matplotlib: without formulas, and not hidden from the legend."""
     name = name.replace("$", r"\$")
     return f" {name}" if name.startswith("_") else name
