@@ -184,6 +184,7 @@ def canonical_json(value: object) -> str:
 
 def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
     """The bytes that `np.savez` writes, for any names, without pickle and without dates."""
+    # `np.savez` takes names as keyword arguments, and has some of its own, as `file`.
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as npz:
         for name, array in arrays.items():

@@ -9,8 +9,9 @@ import pytest
 from matplotlib.animation import FFMpegWriter
 
 from jaxslam import _cli as cli
-from jaxslam import catalog
+from jaxslam import catalog, datasets, filters
 from jaxslam._cli.recorded.filter_run import is_positive_definite, suspicions
+from jaxslam._cli.recorded.run import RunPlan, run_filters
 from jaxslam.results import plot
 
 
@@ -56,6 +57,17 @@ def test_run_filters_a_data_set_and_writes_its_results(tmp_path, capsys, monkeyp
     headings = 0.1 * np.arange(3)
     path = 0.1 * np.cumsum([np.cos(headings), np.sin(headings)], axis=1)
     np.testing.assert_allclose(drawn["dead_reckoning"][:, :2], path.T, atol=1e-12)
+
+
+def test_a_plan_of_python_runs_as_the_command_does(tmp_path, undrawn):
+    folder, out = write_bonn(tmp_path / "bonn"), tmp_path / "out"
+    assert cli.main(["run", "--dataset", "bonn", str(folder), "--out", str(out)]) == 0
+    data = datasets.bonn(folder)
+    ekf = filters.EkfSlam(data.motion, data.sensor, data.capacity, **data.filter_options)
+    (run,) = run_filters(RunPlan(data, {"ekf": ekf})).values()
+    summary = json.loads((out / "summary.json").read_text())
+    same = {key: value for key, value in run.summary.items() if key != "seconds"}
+    assert same == {key: summary[key] for key in same}
 
 
 def test_run_writes_films_and_says_what_is_missing(tmp_path, capsys, monkeypatch):

@@ -34,12 +34,10 @@ from jaxslam._cli.user_objects import UserObjects
 from jaxslam.consistency._verdict import is_faulty
 from jaxslam.consistency.campaign import Campaign, Incomplete, Interrupted, monte_carlo
 from jaxslam.consistency.campaign._candidates import estimator_of, fitting_block, rounded
-from jaxslam.consistency.campaign._remote import Executor
 from jaxslam.core.protocols import Candidate
 from jaxslam.results import _campaign_files as campaign_files
 from jaxslam.results._campaign_files import FORMATS
 from jaxslam.results._files import Files, Json
-from jaxslam.results.store import Store
 from jaxslam.simulation._worlds import World, run_keys, world_of_run
 from jaxslam.simulation.scenarios import SCENARIOS
 
@@ -139,7 +137,20 @@ def run_campaign(options: argparse.Namespace, command: str) -> int:
     earlier = None if part else earlier_results(spec.out, keep)
     try:
         with user.located_errors(), engine(options.executor) as (executor, workers):
-            campaign = _compute(spec, scenario, filters, keep, executor, workers)
+            campaign = monte_carlo(
+                scenario,
+                filters,
+                runs,
+                jax.random.key(spec.campaign.seed),
+                block=spec.block,
+                devices=None if executor else spec.devices,
+                workers=workers,
+                bound=spec.campaign.bound,
+                dtype=spec.campaign.dtype,
+                keep=keep,
+                part=part,
+                executor=executor,
+            )
     except BaseException as stop:
         if part is None and not keep.spans():  # other jobs may save some
             shutil.rmtree(keep.folder, ignore_errors=True)
@@ -171,31 +182,6 @@ def run_campaign(options: argparse.Namespace, command: str) -> int:
     status = _write(spec, scenario, filters, campaign, earlier, command)
     is_wrong = any(is_faulty(summary.counts) for summary in campaign.filters.values())
     return FAILED if is_wrong else status
-
-
-def _compute(
-    spec: Spec,
-    scenario: World,
-    filters: Mapping[str, Candidate],
-    keep: Store,
-    executor: Executor | None,
-    workers: int | None,
-) -> Campaign:
-    """The campaign of a spec, by the blocks that the store has and those that are missing."""
-    return monte_carlo(
-        scenario,
-        filters,
-        spec.campaign.runs,
-        jax.random.key(spec.campaign.seed),
-        block=spec.block,
-        devices=None if executor else spec.devices,
-        workers=workers,
-        bound=spec.campaign.bound,
-        dtype=spec.campaign.dtype,
-        keep=keep,
-        part=spec.part,
-        executor=executor,
-    )
 
 
 def _write(

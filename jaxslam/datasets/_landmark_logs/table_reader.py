@@ -57,6 +57,35 @@ class CsvTable:
 
     def __init__(self, path: str | Path) -> None:
         self.path, data = read_bytes(path)
+        lines = self._split(self._decode(data))
+        if not lines:
+            raise ValueError(f"{self.path}:1: expected a header, as 't [s],v [m/s]', got no text")
+        self.head_line, header = lines[0]
+        self.lines = [number for number, _ in lines[1:]]
+        self.cells = [cells for _, cells in lines[1:]]
+        self.header = [" ".join(name.split()) for name in header]  # messages quote it
+        self.names = [split_unit(name)[0] for name in self.header]
+        if all(math.isfinite(_number(cell.replace(",", "."))) for cell in header):
+            raise self._error(
+                self.head_line, f"expected a header, as 't [s],v [m/s]', got {header[0]!r}"
+            )
+        if not self.cells:
+            raise self._error(self.head_line, "expected lines below the header, got none")
+        for place, name in enumerate(self.names):
+            if name in self.names[:place]:
+                raise self._error(self.head_line, f"the column {name!r} occurs twice", place)
+        for number, cells in zip(self.lines, self.cells, strict=True):
+            if len(cells) != len(self.header):
+                raise self._count_error(number, cells)
+        signs = {"," if "," in cell else "." for cell in self._decimals()}
+        self.decimal = "," if signs == {","} else "."
+        # A point is a decimal point, but not surely beside semicolons: where a comma is the decimal
+        # sign, Excel writes semicolons between cells and a point between thousands.
+        self._ambiguous = (self.decimal == "," or self.separator == ";") and all(
+            _GROUPED.fullmatch(cell) for cell in self._decimals()
+        )
+
+    def _decode(self, data: bytes) -> str:
         try:
             text = data.decode("utf-8-sig")
         except UnicodeDecodeError as problem:
@@ -66,6 +95,10 @@ class CsvTable:
             raise self._error(
                 text.count("\n", 0, text.index("\0")) + 1, "expected text, got a zero byte"
             )
+        return text
+
+    def _split(self, text: str) -> list[tuple[int, list[str]]]:
+        """The cells of each line that has some, with its number; sets `separator`."""
         above = 0  # number of lines above `text`
         # Comments are cut off first: `csv` would pair a quotation mark in them with a later one.
         while text.lstrip(" \t\r\n").startswith("#"):
@@ -95,43 +128,17 @@ class CsvTable:
         except csv.Error as problem:
             reason = f"expected cells separated by {_SEPARATORS[self.separator]}: {problem}"
             raise self._error(begins, reason) from problem
-        lines = [(number, cells) for number, cells in lines if any(cells)]
-        if not lines:
-            raise ValueError(f"{self.path}:1: expected a header, as 't [s],v [m/s]', got no text")
-        self.head_line, self.header = lines[0]
-        self.lines = [number for number, _ in lines[1:]]
-        self.cells = [cells for _, cells in lines[1:]]
-        if all(math.isfinite(_number(cell.replace(",", "."))) for cell in self.header):
-            raise self._error(
-                self.head_line, f"expected a header, as 't [s],v [m/s]', got {self.header[0]!r}"
-            )
-        if not self.cells:
-            raise self._error(self.head_line, "expected lines below the header, got none")
-        self.header = [" ".join(name.split()) for name in self.header]  # messages quote it
-        self.names = [split_unit(name)[0] for name in self.header]
-        for place, name in enumerate(self.names):
-            if name in self.names[:place]:
-                raise self._error(self.head_line, f"the column {name!r} occurs twice", place)
-        for number, cells in zip(self.lines, self.cells, strict=True):
-            if len(cells) != len(self.header):
-                expected, hint = len(self.header), ""
-                if "\n" in "".join(cells):
-                    hint = "; a quotation mark is not closed on its line"
-                elif len(cells) > expected and self.separator == ",":
-                    hint = "; write a number with a point: 0.5"
-                raise self._error(
-                    number,
-                    f"expected {expected} cells, as in line {self.head_line}, "
-                    f"got {len(cells)}{hint}",
-                )
+        return [(number, cells) for number, cells in lines if any(cells)]
 
-        signs = {"," if "," in cell else "." for cell in self._decimals()}
-        self.decimal = "," if signs == {","} else "."
-        # A point is a decimal point, but not surely beside semicolons: Excel writes both where a
-        # comma is the decimal sign, and a point is that of thousands.
-        self._ambiguous = (self.decimal == "," or self.separator == ";") and all(
-            _GROUPED.fullmatch(cell) for cell in self._decimals()
-        )
+    def _count_error(self, line: int, cells: list[str]) -> ValueError:
+        """The error about a line with another number of cells than the header."""
+        expected, hint = len(self.header), ""
+        if "\n" in "".join(cells):
+            hint = "; a quotation mark is not closed on its line"
+        elif len(cells) > expected and self.separator == ",":
+            hint = "; write a number with a point: 0.5"
+        reason = f"expected {expected} cells, as in line {self.head_line}, got {len(cells)}{hint}"
+        return self._error(line, reason)
 
     @property
     def dialect(self) -> str:

@@ -49,6 +49,9 @@ def ellipses(
     """
     covs = np.asarray(covs, np.float64)
     finite = np.isfinite(covs).all(axis=(1, 2))
+    # L of all P = [[a, b], [b, c]] at once: [[first, 0], [below, second]]. `np.linalg.cholesky`
+    # refuses the whole batch for one singular P. The tolerance is the rounding of a filter in
+    # float32.
     a, b, c = (np.where(finite, covs[:, i, j], 0.0) for i, j in ((0, 0), (1, 0), (1, 1)))
     tolerance = 1e-6 * np.maximum(np.abs(a), np.abs(c))
     first = np.sqrt(np.maximum(a, 0.0))

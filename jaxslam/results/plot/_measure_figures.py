@@ -174,6 +174,7 @@ def whiteness_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
         (axes,) = row.panels
         axes.axhline(0.0, color=INK, lw=0.8, zorder=1.5)
         lags = np.arange(1, len(widest) + 1)
+        # The band ends half a lag beside the first and the last one, so that one lag has a band.
         ends = np.concatenate([[lags[0] - 0.5], lags, [lags[-1] + 0.5]])
         wide = np.interp(ends, lags, widest)
         band(axes, ends, -wide, wide, "95 % band")

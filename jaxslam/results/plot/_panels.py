@@ -151,7 +151,7 @@ def title_of(campaign: Campaign, subject: str) -> str:
 
 
 _FAR = 3.0
-"""A filter whose curve exceeds this multiple of the median does not set a scale."""
+"""Multiple of the median beyond which the curve of a filter does not set a scale."""
 
 _NEES_ENDS = (1 / 10, 10.0, 100.0)
 """Lowest lower end of a scale of NEES, and lowest and highest upper end, in multiples of dof."""
@@ -251,6 +251,7 @@ def set_positive(
     axis.set_major_locator(LogLocator(numticks=int(np.clip(length / label, 2, _POWERS))))
     axis.set_major_formatter(_tick_label)
     decade = length / np.log10(high / low)
+    # Labels at 2 and 5, or at 3, where they are farther apart than a label is long.
     digits = next((d for d in ("25", "3") if np.log10(int(d[0])) * decade > label), "")
     if digits:
         axis.set_minor_formatter(lambda x, _: _tick_label(x) if f"{x:.0e}"[0] in digits else "")

@@ -102,7 +102,7 @@ def run_errors_figure(campaign: Campaign, *, title: str = "", width: float = PAG
 def _errors(estimate: Estimate, truth: Truth) -> tuple[np.ndarray, np.ndarray]:
     """The errors (T, 3), truth minus estimate, and 3 σ, in metres and degrees."""
     error = np.asarray(truth.pose) - np.asarray(estimate.pose)
-    error[:, 2] = np.mod(error[:, 2] + np.pi, 2 * np.pi) - np.pi
+    error[:, 2] = np.mod(error[:, 2] + np.pi, 2 * np.pi) - np.pi  # in [-π, π)
     variance = np.diagonal(np.asarray(estimate.pose_cov), axis1=1, axis2=2)
     scale = np.array([1.0, 1.0, np.rad2deg(1.0)])
     return scale * error, 3 * scale * np.sqrt(np.maximum(variance, 0.0))
