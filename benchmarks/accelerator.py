@@ -104,11 +104,11 @@ def rays(poses):
 
 def pose_graphs(count):
     """Graphs a second of a batch and the greatest χ² of it; seconds of a large graph and its χ²."""
-    from jaxslam import graphs
+    from jaxslam import datasets, graphs
 
     factors = {"relative_pose": graphs.RelativePoseLog()}
-    graph = graphs.with_gauge(graphs.read(DATA / "graphs" / "ring.g2o"))
-    truth = graphs.read(DATA / "graphs" / "ring_groundTruth.g2o")
+    graph = graphs.with_gauge(datasets.read_graph(DATA / "graphs" / "ring.g2o"))
+    truth = datasets.read_graph(DATA / "graphs" / "ring_groundTruth.g2o")
     rows, count = graph.tables["relative_pose"], int(count)
     root = np.linalg.cholesky(np.linalg.inv(rows.information))
     exact, rng = np.asarray(truth.tables["relative_pose"].z), np.random.default_rng(0)
@@ -120,7 +120,7 @@ def pose_graphs(count):
         return graphs.optimize(one, factors, plan=plan, tolerance=5e-7).chi2
 
     seconds, chi2 = fastest(shared_out(jax.vmap(solve)), jnp.asarray(z))
-    large = graphs.with_gauge(graphs.read(DATA / "graphs" / "input_M3500_g2o.g2o"))
+    large = graphs.with_gauge(datasets.read_graph(DATA / "graphs" / "input_M3500_g2o.g2o"))
     of_large = graphs.plan(large, factors)
     go = jax.jit(partial(graphs.optimize, factors=factors, plan=of_large, tolerance=5e-7))
     large_seconds, found = fastest(go, jax.device_put(large))

@@ -60,7 +60,7 @@ def world(scale: float) -> Scenario:
 
 def crew(scale: float) -> tuple[World, Filter]:
     eyes = sensors.RangeBearing(np.diag([0.05, 0.02]) ** 2 * scale)
-    sees = Suite((Part(eyes, 4), Part(eyes, 1, every=2, sees="robots")))
+    sees = Suite((Part(eyes, 4), Part(eyes, 1, interval=2, sees="robots")))
     moves = motion.Increment(np.diag([0.01, 0.01]) ** 2 * scale)
     second = (0.8, 0.6, 1.0), np.diag([0.05, 0.05, 0.05]) ** 2
     robots = [team.Robot(moves, sees), team.Robot(moves, sees, second)]

@@ -25,7 +25,7 @@ def cases() -> dict[str, tuple[Any, Any]]:
     """A world and a filter, by name."""
     cloister, noisy = scenarios.cloister(250), scenarios.cloister_noisy(250)
     loop = scenarios.loop(800)
-    seif = filters.Seif(loop.motion, loop.sensor, 20, active=8, links=6, whole=True)
+    seif = filters.Seif(loop.motion, loop.sensor, 20, active=8, links=6, exact_marginals=True)
     return {
         "ekf": (cloister, catalog.variant(cloister)),
         "fastslam": (noisy, filters.FastSlam(noisy.motion, noisy.sensor, 36, 100)),

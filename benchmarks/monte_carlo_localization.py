@@ -46,7 +46,7 @@ def carried(world, key):
 def filters_of(world):
     """Filter, and what it is told of the start, by name."""
     blunt = sensors.RelativePosition(0.5**2 * np.eye(2))
-    anywhere = pose_particles.uniform_pose_moments(jnp.asarray(BOX))
+    anywhere = pose_particles.Box(BOX).moments(jnp.zeros(0).dtype)
     known = jnp.array([0.0, 0.5 / np.deg2rad(1.5), np.pi]), jnp.zeros((3, 3))
     models = world.motion, world.sensor, world.landmarks
     return {

@@ -150,9 +150,6 @@ def __getattr__(name: str) -> object:
         value = importlib.import_module(_MODULES.get(name, f"jaxslam.{name}"))
     else:
         raise AttributeError(f"module 'jaxslam' has no attribute {name!r}")
-    from jaxslam.core._field_docs import attach_field_docs
-
-    attach_field_docs()
     globals()[name] = value
     return value
 

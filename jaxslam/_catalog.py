@@ -213,7 +213,7 @@ def _sparse_in_canonical_form(scenario: World, **options: Unpack[EkfOptions]) ->
         count,
         active=active,
         links=max(1, count - 1),
-        whole=True,
+        exact_marginals=True,
         **_options(scenario, options, "gate"),
     )
     return filter if active == count else InPieces(filter, active // 2)

@@ -11,6 +11,7 @@ from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
 from jaxslam._origin import FAR, far_origin, holds_far_numbers, moved, returned, shifted
+from jaxslam._public import publish
 from jaxslam._rounding import doubt_on_run
 from jaxslam.association._rules import Known
 from jaxslam.core._numbers import check_covariance, check_key, is_concrete, largest, shape_text
@@ -188,3 +189,6 @@ def _drive(
     body = jax.checkpoint(step, prevent_cse=False)
     final, (estimate, info, probed) = jax.lax.scan(body, start, (log, keys))
     return Trace(estimate, info, final, probed)
+
+
+publish("jaxslam", run)

@@ -61,8 +61,8 @@ def moved(of: _T, origin: Origin, controls: ArrayLike | None = None) -> _T | Non
     """
     if not _is_ours(of, []):
         return None
-    there: _T = _relative(of, origin)
-    return there if may_move(there, origin, controls) else None
+    near: _T = _relative(of, origin)
+    return near if may_move(near, origin, controls) else None
 
 
 def may_move(near: PyTree, origin: Origin, controls: ArrayLike | None = None) -> bool:
@@ -92,10 +92,10 @@ def _is_ours(of: Any, models: list[PyTree]) -> bool:
         models.append(of)
         return getattr(of, "carry", None) is None  # else landmarks do not begin with a position
     if isinstance(of, tuple):
-        return all(_is_ours(each, models) for each in of)
+        return all(_is_ours(entry, models) for entry in of)
     if not is_record(of):
         return True
-    if not type(of).__module__.startswith("jaxslam."):
+    if type(of).__module__.partition(".")[0] != "jaxslam":
         return False
     for field in dataclasses.fields(of):
         value = getattr(of, field.name)
@@ -139,7 +139,7 @@ def _change(
     origin: Float[Array, "2"],
 ) -> Float[Array, ""]:
     """The largest change of what a model gives, as poses and points move by an origin."""
-    far_poses, far_points = (each.at[:, :2].add(origin) for each in (poses, points))
+    far_poses, far_points = (places.at[:, :2].add(origin) for places in (poses, points))
     if isinstance(model, Motion):
         noise = jnp.full((len(poses), len(model.noises)), 0.01)
         near, far = (jax.vmap(model.step)(at, controls, noise) for at in (poses, far_poses))
@@ -148,8 +148,8 @@ def _change(
     elif isinstance(model, Sensor):
         size = len(model.landmark)
         near, far = (
-            jax.vmap(model.observe)(at, there[:, :size])
-            for at, there in ((poses, points), (far_poses, far_points))
+            jax.vmap(model.observe)(at, landmarks[:, :size])
+            for at, landmarks in ((poses, points), (far_poses, far_points))
         )
         pairs = [(jnp.zeros_like(near), jax.vmap(model.residual)(far, near))]
     else:
@@ -162,7 +162,7 @@ def _relative(of: Any, origin: Origin) -> Any:
     """The record, or the truth, with the positions among its fields relative to an origin."""
     if isinstance(of, Truth):
         places = of.pose, of.landmarks, of.start
-        pose, landmarks, start = (shifted(each, -origin) for each in places)
+        pose, landmarks, start = (shifted(place, -origin) for place in places)
         return of._replace(pose=pose, landmarks=landmarks, start=start)
     names = {field.name for field in dataclasses.fields(of)}
     changed: dict[str, Any] = {

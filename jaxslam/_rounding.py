@@ -83,10 +83,12 @@ class Rounding(NamedTuple):
     @property
     def remedy(self) -> str:
         """What to do about it."""
-        more = "set jax_enable_x64" if self.dtype == np.float32 else "begin with less variance"
+        advice = "set jax_enable_x64" if self.dtype == np.float32 else "begin with less variance"
         if self.square_root:
-            return more
-        return f'{more}, or give the filter covariance="square_root", which keeps twice the digits'
+            return advice
+        return (
+            f'{advice}, or give the filter covariance="square_root", which keeps twice the digits'
+        )
 
     @property
     def _eps(self) -> float:
@@ -110,7 +112,7 @@ def rounding_of(
         places: positions, that of the start first.
         least: the least eigenvalue of R or S.
     """
-    reach, size = (float(np.abs(each).max()) for each in (places, places - places[0]))
+    reach, size = (float(np.abs(offset).max()) for offset in (places, places - places[0]))
     turns = not isinstance(getattr(method, "chart", Euclidean()), Euclidean)
     lever = reach if turns else size
     covs = np.asarray(covs, np.float64)
@@ -124,7 +126,7 @@ def rounding_of(
         reach=reach,
         least=least,
         square_root=bool(getattr(method, "square_root", False)),
-        first_order=by_jacobians and type(method).__module__.startswith("jaxslam."),
+        first_order=by_jacobians and type(method).__module__.partition(".")[0] == "jaxslam",
     )
 
 
@@ -198,11 +200,11 @@ def _on_host(trace: Trace) -> _HostTrace:
 def _difference(single: _HostTrace, double: _HostTrace) -> str:
     """How a run in float32 differs from that in float64, with numbers; "" within rounding."""
     both = single, double
-    fused = [each.status == Status.FUSED for each in both]
-    used = [int(each.sum()) for each in fused]
+    fused = [run.status == Status.FUSED for run in both]
+    used = [int(mask.sum()) for mask in fused]
     nis = [
-        np.where(mask, each.nis, 0.0).sum(dtype=np.float64) / max(each.dof.sum(), 1)
-        for mask, each in zip(fused, both, strict=True)
+        np.where(mask, run.nis, 0.0).sum(dtype=np.float64) / max(run.dof.sum(), 1)
+        for mask, run in zip(fused, both, strict=True)
     ]
     error = single.pose.astype(np.float64) - double.pose
     error[:, 2] = wrapped(error[:, 2])

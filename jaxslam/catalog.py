@@ -8,5 +8,8 @@ Looked up by name; the error of an unknown one has suggestions for typos.
 """
 
 from jaxslam._catalog import ALL, FILTERS, SMOOTHERS, ideal, variant
+from jaxslam._public import publish
 
 __all__ = ["ALL", "FILTERS", "SMOOTHERS", "ideal", "variant"]
+
+publish(__name__)

@@ -8,8 +8,10 @@ robot and map is one constant direction.
 import jax.numpy as jnp
 from jax import Array
 
+from jaxslam.core._names import Named
 from jaxslam.core._record import record, static
 from jaxslam.core.protocols import Basis, Chart
+from jaxslam.core.validation import InvalidField
 from jaxslam.math import se2
 from jaxslam.math._arrays import Landmark, Pose
 from jaxslam.math.angles import wrap
@@ -94,10 +96,8 @@ class RightInvariant(Chart):
         self, pose: Pose, landmark: Landmark, dx: Pose, dl: Landmark
     ) -> tuple[Pose, Landmark]:
         if landmark.shape != (self.landmark_size,):
-            raise ValueError(
-                f"RightInvariant(rays={self.rays}): expected a landmark of shape "
-                f"({self.landmark_size},), got {landmark.shape}"
-            )
+            reason = f"expected shape ({self.landmark_size},), got {landmark.shape}"
+            raise InvalidField(f"RightInvariant(rays={self.rays})", "landmark", reason)
         moved = se2.exp(dx)
         shift = se2.exp(jnp.concatenate([dl[:2], dx[2:]]))
         point = se2.from_frame(shift, landmark[:2])
@@ -129,8 +129,10 @@ class RightInvariant(Chart):
         )
 
 
-REGISTRY: dict[str, type[Chart]] = {
-    "euclidean": Euclidean,
-    "left_invariant": LeftInvariant,
-    "right_invariant": RightInvariant,
-}
+REGISTRY: dict[str, type[Chart]] = Named(
+    {
+        "euclidean": Euclidean,
+        "left_invariant": LeftInvariant,
+        "right_invariant": RightInvariant,
+    }
+)

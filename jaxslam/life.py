@@ -12,12 +12,12 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.core import slots
-from jaxslam.core._numbers import check_count, is_concrete
-from jaxslam.core._record import hold_function, record, static
+from jaxslam.core._record import field, function_of, record, static
 from jaxslam.core.protocols import Life
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Status
-from jaxslam.math._arrays import Number
+from jaxslam.core.validation import InvalidField, at_least, or_none, positive
+from jaxslam.math._arrays import Number, is_concrete
 
 __all__ = ["Evidence", "Existence", "Recency", "Times"]
 
@@ -42,14 +42,9 @@ class Recency(Life):
     Raises ValueError on a patience below 1.
     """
 
-    patience: int | None = static(default=None)
+    patience: int | None = static(default=None, check=or_none(at_least(1)))
     """a landmark not measured for this many scans, empty ones too, is removed, which leaves a local
     map. None removes no landmark."""
-
-    def __post_init__(self) -> None:
-        if self.patience is not None:
-            check_count("Recency: patience", self.patience)
-        super().__post_init__()
 
     def init(self, pose: Float[Array, "3"], landmarks: Float[Array, "N L"]) -> Times:
         none = jnp.zeros(landmarks.shape[0], jnp.int32)
@@ -58,17 +53,17 @@ class Recency(Life):
     def after(
         self, joint: Joint, info: Info, estimate: Callable[[], Estimate]
     ) -> tuple[Times, Bool[Array, "N"]]:
-        known: Times = joint.life
-        now = known.now + 1
+        times: Times = joint.life
+        now = times.now + 1
         count = len(joint.alive)
         born = slots.slot_mask(info.slot, info.status == Status.BORN, count)
         hit = born | slots.slot_mask(info.slot, info.status == Status.FUSED, count)
-        zero = jnp.zeros_like(known.last)
+        zero = jnp.zeros_like(times.last)
         memory = Times(
             now,
-            jnp.where(born, now, jnp.where(joint.alive, known.born, zero)),
-            jnp.where(hit, now, jnp.where(joint.alive, known.last, zero)),
-            jnp.where(born, 1, jnp.where(joint.alive, known.seen + hit, zero)),
+            jnp.where(born, now, jnp.where(joint.alive, times.born, zero)),
+            jnp.where(hit, now, jnp.where(joint.alive, times.last, zero)),
+            jnp.where(born, 1, jnp.where(joint.alive, times.seen + hit, zero)),
         )
         if self.patience is None:
             return memory, jnp.zeros_like(joint.alive)
@@ -85,7 +80,7 @@ class Evidence(NamedTuple):
     log_odds: Float[Array, "N"]
     """log-odds that it exists"""
     confirmed: Bool[Array, "N"]
-    """its probability has reached `confirm`; before that it is provisional"""
+    """whether its probability has reached `confirm`; before that it is provisional"""
     seen: Int[Array, "N"]
     """scans that measured it"""
     missed: Int[Array, "N"]
@@ -110,21 +105,21 @@ class Existence(Life):
     0 < remove < 1/2 < confirm < 1; on a patience below 1 or a spread not above 0.
     """
 
-    visible: Callable[[Array, Array], Array]
+    visible: Callable[[Array, Array], Array] = field(check=function_of("pose", "l"))
     """(pose, l) -> () bool: whether a scan from there should measure the landmark. Prefer a strict
     one: a sensor misses many landmarks near the edge of its view."""
     _: dataclasses.KW_ONLY
     detected: Number = 0.9
-    """probability that it then does, P(seen | there)"""
+    """probability that a scan measures a visible landmark, P(seen | there)"""
     false: Number = 0.1
-    """probability of a false detection, P(seen | not there)"""
+    """probability that a scan measures a landmark that is not there, P(seen | not there)"""
     confirm: Number = 0.95
-    """probability"""
+    """probability from which a landmark is confirmed"""
     remove: Number = 0.05
-    """probability"""
-    patience: int | None = static(default=None)
+    """probability down to which a landmark is kept"""
+    patience: int | None = static(default=None, check=or_none(at_least(1)))
     """a provisional landmark not measured for this many scans is removed"""
-    spread: Number | None = None
+    spread: Number | None = field(default=None, check=or_none(positive))
     """[m] a landmark with a larger standard deviation, √(tr P/2), is removed"""
     replace: bool = static(default=False)
     """in a full map, new landmarks take the place of those least likely to exist among the
@@ -132,20 +127,13 @@ class Existence(Life):
     (`Status.OVERFLOW`)"""
 
     def __post_init__(self) -> None:
-        hold_function(self, "visible", "pose, l")
         false, detected, remove, confirm = self.false, self.detected, self.remove, self.confirm
         if is_concrete(false, detected) and not 0 < false < detected < 1:
-            raise ValueError(
-                f"Existence: expected 0 < false < detected < 1, got {false}, {detected}"
-            )
+            reason = f"expected 0 < false < detected < 1, got {false}, {detected}"
+            raise InvalidField(type(self).__name__, "", reason)
         if is_concrete(remove, confirm) and not 0 < remove < 0.5 < confirm < 1:
-            raise ValueError(
-                f"Existence: expected 0 < remove < 1/2 < confirm < 1, got {remove}, {confirm}"
-            )
-        if self.patience is not None:
-            check_count("Existence: patience", self.patience)
-        if self.spread is not None and is_concrete(self.spread) and not self.spread > 0:
-            raise ValueError(f"Existence: expected a spread above 0, got {self.spread}")
+            reason = f"expected 0 < remove < 1/2 < confirm < 1, got {remove}, {confirm}"
+            raise InvalidField(type(self).__name__, "", reason)
         super().__post_init__()
 
     def init(self, pose: Float[Array, "3"], landmarks: Float[Array, "N L"]) -> Evidence:
@@ -161,8 +149,8 @@ class Existence(Life):
         count = len(joint.alive)
         born = slots.slot_mask(info.slot, info.status == Status.BORN, count)
         hit = born | slots.slot_mask(info.slot, info.status == Status.FUSED, count)
-        known: Evidence = joint.life
-        old = jax.tree.map(lambda x: jnp.where(born | ~joint.alive, jnp.zeros_like(x), x), known)
+        evidence: Evidence = joint.life
+        old = jax.tree.map(lambda x: jnp.where(born | ~joint.alive, jnp.zeros_like(x), x), evidence)
         view = jax.vmap(self.visible, (None, 0))(joint.pose, joint.landmarks)
         expected = joint.alive & ~hit & view
         dtype = old.log_odds.dtype
@@ -192,7 +180,7 @@ class Existence(Life):
     ) -> Bool[Array, "N"]:
         provisional = joint.alive & ~joint.life.confirmed & ~measured
         odds = jnp.where(provisional, joint.life.log_odds, jnp.inf)
-        rank = jnp.argsort(jnp.argsort(odds))
+        rank = jnp.argsort(jnp.argsort(odds))  # of each slot, 0 for the least likely
         evicted: Array = provisional & (rank < needed)
         return evicted
 

@@ -6,6 +6,7 @@ Imports go downward only (the figure in CONTRIBUTING.md); within a floor they ma
 import ast
 import graphlib
 import importlib
+import pickle
 import re
 import subprocess
 import sys
@@ -16,13 +17,14 @@ import numpy as np
 import pytest
 
 import jaxslam
+from jaxslam.core.validation import InvalidField
 from jaxslam.math import _linalg as linalg
 from jaxslam.math import _series
 
 PACKAGE = Path(jaxslam.__file__).parent
 
 FLOORS = [
-    "math",
+    "_public math",
     "core",
     "motion sensors charts linearize association resampling life",
     "_driver _origin _rounding filters graphs laser simulation",
@@ -34,9 +36,8 @@ FLOOR[""] = len(FLOORS)  # jaxslam/__init__.py sees everything, and nothing sees
 
 # Methods of these modules may import what is above, when they are called: `print(campaign)` and
 # `campaign.save(folder)` are where a user looks for them, and results are drawn and written above;
-# so are `graphs.read(path)` and `grids.read_map(path)`, and files are read above.
+# so is `grids.read_map(path)`, and files are read above.
 WITHIN_CALLS = {
-    "graphs._graph": "datasets",
     "laser.grids._grid": "datasets",
     "consistency.campaign._result": "results",
 }
@@ -214,7 +215,6 @@ def test_names_are_imported_on_demand_from_where_type_checkers_read_them():
         if isinstance(node, ast.ImportFrom) and node.module.partition(".")[0] == "jaxslam"
         for alias in node.names
     }
-    del homes["attach_field_docs"]
     assert set(homes) == set(jaxslam.__all__)
     for name, home in homes.items():
         value = getattr(jaxslam, name)
@@ -228,6 +228,52 @@ def test_the_import_alone_loads_no_module_of_the_package():
     script = "import sys, jaxslam; print(sum(name.startswith('jaxslam.') for name in sys.modules))"
     done = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True)
     assert done.stdout == "0\n", done.stderr
+
+
+def public_values():
+    """(public module, name, value) of all classes and functions that the package lists."""
+    for name in read(PACKAGE):
+        if not any(part.startswith("_") for part in name.split(".")):
+            module = importlib.import_module(f"jaxslam.{name}" if name else "jaxslam")
+            for listed in getattr(module, "__all__", []):
+                value = getattr(module, listed)
+                if hasattr(value, "__qualname__") and value.__module__.startswith("jaxslam"):
+                    yield module.__name__, listed, value
+
+
+def test_what_is_public_says_so():
+    """`help`, tracebacks, `repr` and pickles show the path that stays."""
+    count = 0
+    for module, name, value in public_values():
+        assert "._" not in value.__module__, (module, name, value.__module__)
+        home = importlib.import_module(value.__module__)
+        assert getattr(home, value.__name__) is value, (module, name)
+        source = getattr(value, "__source_module__", value.__module__)
+        assert hasattr(importlib.import_module(source), value.__name__), (module, name)
+        count += 1
+    assert count > 400
+    assert repr(jaxslam.filters.EkfSlam) == "<class 'jaxslam.filters.EkfSlam'>"
+    assert repr(jaxslam.Scenario) == "<class 'jaxslam.Scenario'>"
+
+
+def test_pickles_have_public_paths_and_load_in_a_fresh_process():
+    model = jaxslam.motion.Unicycle(np.eye(2))
+    values = (
+        jaxslam.filters.EkfSlam(model, jaxslam.sensors.RangeBearing(np.eye(2)), 3),
+        jaxslam.scenarios.circle(steps=3).sensor,
+        jaxslam.run,
+        InvalidField("Own", "gate", "expected a number, got None"),
+    )
+    data = pickle.dumps(values)
+    for path in re.findall(rb"jaxslam[.\w]*", data):
+        assert b"._" not in path, path
+    script = (
+        "import pickle, sys; values = pickle.load(sys.stdin.buffer); "
+        "print(*(type(value).__name__ for value in values), values[3])"
+    )
+    done = subprocess.run([sys.executable, "-c", script], input=data, capture_output=True)
+    text = "EkfSlam RelativePosition function InvalidField Own: gate: expected a number, got None\n"
+    assert done.stdout.decode() == text, done.stderr.decode()
 
 
 def test_shapes_in_signatures_are_checked_in_the_package():

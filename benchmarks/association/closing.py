@@ -71,7 +71,7 @@ def methods(scenario):
         "nearest": make(associate=association.Nearest(GATE)),
         "joint": make(associate=association.JointCompatibility(0.99, budget=500)),
         "cluster": Closing(
-            make(associate=near, life=Recency()), every=4, reach=2.0, settings=SEARCH
+            make(associate=near, life=Recency()), period=4, reach=2.0, settings=SEARCH
         ),
     }
 

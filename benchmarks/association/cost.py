@@ -17,13 +17,12 @@ from jaxslam import life, run
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Log, Scan
 from jaxslam.filters import EkfSlam, Merging
-from jaxslam.filters._ekf.ekf_settings import EkfSettings
+from jaxslam.filters._ekf.correction import correct_in_turn
 from jaxslam.filters._ekf.predicted_measurements import prediction_of
-from jaxslam.filters._ekf.update import correct_in_turn
 from jaxslam.simulation.scenarios import cloister
 
 COUNT, SEEN, RUNS = 200, 20, 16
-METHODS = rules(9.21)
+METHODS = rules(0.99)
 
 
 def problem(sensor, seed):
@@ -51,13 +50,13 @@ def measure():
     joint, scan = jax.tree.map(
         lambda *leaves: jnp.stack(leaves), *(problem(sensor, seed) for seed in range(RUNS))
     )
-    settings = EkfSettings(sensor)
+    ekf = EkfSlam(cloister().motion, sensor, COUNT)
 
     def correct(joint, scan):
-        return correct_in_turn(joint, scan.z, scan.tag, scan.valid, settings)[0]
+        return correct_in_turn(ekf, sensor, joint, scan.z, scan.tag, scan.valid)[0]
 
     def find(method):
-        return lambda joint, scan: tuple(method(prediction_of(joint, settings), scan))
+        return lambda joint, scan: tuple(method(prediction_of(ekf, sensor, joint), scan))
 
     programs = {"correction": correct} | {name: find(method) for name, method in METHODS.items()}
     actions = {}

@@ -14,10 +14,11 @@ import numpy as np
 from benchmarks.association import rules
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Scan
-from jaxslam.filters._ekf.ekf_settings import EkfSettings
+from jaxslam.filters import EkfSlam
 from jaxslam.filters._ekf.predicted_measurements import prediction_of
 from jaxslam.math.angles import wrap
 from jaxslam.math.linalg import root_psd
+from jaxslam.motion import Increment
 from jaxslam.results.plot import PAGE, caption, curve, panels_of, titled
 from jaxslam.sensors import RangeBearing
 
@@ -50,7 +51,8 @@ def decide(method, sigma, key):
     noise = jax.vmap(lambda z, n: root_psd(SENSOR.noise_cov(z)) @ n)(exact, normals)
     z = jax.vmap(SENSOR.residual)(exact + noise, jnp.zeros_like(exact))
     scan = Scan(z, jnp.full(SEEN, -1), jnp.ones(SEEN, bool))
-    found = method(prediction_of(joint, EkfSettings(SENSOR)), scan)
+    ekf = EkfSlam(Increment(np.eye(2)), SENSOR, COUNT)
+    found = method(prediction_of(ekf, SENSOR, joint), scan)
     right = found.slot == jnp.arange(SEEN)
     return right.mean(), (~right & (found.slot >= 0)).mean()
 

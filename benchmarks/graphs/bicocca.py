@@ -21,7 +21,7 @@ from benchmarks.gate import Metric, show
 from benchmarks.graphs import peer
 from benchmarks.graphs.worlds import with_false_closures
 from benchmarks.real_data import DATA
-from jaxslam import graphs, metrics
+from jaxslam import datasets, graphs, metrics
 from jaxslam.graphs._graph import LOOPS
 from jaxslam.math import numpy_poses
 
@@ -52,7 +52,7 @@ def measure(quick: bool = False) -> list[Metric]:
 def compare(share: float) -> dict[str, dict[str, float]]:
     """Figures of merit by kernel, without one first, then GTSAM's, and the odometry last; a share
     of the loops is added and false."""
-    graph = graphs.starts.odometry(graphs.with_gauge(graphs.read(GRAPH)))
+    graph = graphs.starts.odometry(graphs.with_gauge(datasets.read_graph(GRAPH)))
     apart, added = with_false_closures(graph, share)
     truth, seen = true_poses(len(graph.poses))
     table = apart.tables[LOOPS]

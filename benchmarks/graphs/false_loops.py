@@ -19,7 +19,7 @@ from benchmarks.gate import Metric, show
 from benchmarks.graphs import peer
 from benchmarks.graphs.worlds import with_false_loops
 from benchmarks.real_data import DATA
-from jaxslam import graphs
+from jaxslam import datasets, graphs
 from jaxslam._cli.optimize import ROBUST_STARTS
 from jaxslam.graphs import starts
 from jaxslam.graphs._graph import LOOPS
@@ -47,7 +47,7 @@ def measure(quick: bool = False) -> list[Metric]:
         path = DATA / "graphs" / file
         if not path.exists() or (quick and name != "MIT"):
             continue
-        clean = graphs.with_loops_apart(graphs.with_gauge(graphs.read(path)))
+        clean = graphs.with_loops_apart(graphs.with_gauge(datasets.read_graph(path)))
         best, best_of_log = (optimum(clean, factors) for factors in (None, LOG))
         for share in SHARES:
             count = 1 if quick or share == 0 else draws

@@ -12,7 +12,7 @@ import numpy as np
 
 from benchmarks.gate import Metric, show
 from benchmarks.real_data import DATA
-from jaxslam import graphs
+from jaxslam import datasets, graphs
 from jaxslam.consistency import pose_error
 from jaxslam.graphs import Ending, Solution, starts
 
@@ -32,7 +32,7 @@ KNOWN = {
 """χ² of the logarithm by GTSAM 4.3; of the last one it finds 35,006 from the file's start."""
 
 TRUE = {
-    "ring": lambda: graphs.read(FOLDER / "ring_groundTruth.g2o").poses,
+    "ring": lambda: datasets.read_graph(FOLDER / "ring_groundTruth.g2o").poses,
     "manhattanOlson3500": lambda: np.loadtxt(FOLDER / "manhattanOlson3500_nodes_groundTruth.dat"),
 }
 """True poses, (N, 3), in the order of the file and in the frame of its first pose."""
@@ -50,7 +50,7 @@ def measure(quick: bool = False) -> list[Metric]:
         path = FOLDER / f"{name}.g2o"
         if not path.exists():
             continue
-        read = graphs.with_gauge(graphs.read(path))
+        read = graphs.with_gauge(datasets.read_graph(path))
         for error, factor in ERRORS.items():
             solutions = {}
             for start, place in starts.STARTS.items():

@@ -30,7 +30,7 @@ from benchmarks.gate import Metric, show
 from benchmarks.graphs import peer
 from benchmarks.graphs.worlds import at
 from benchmarks.real_data import DATA
-from jaxslam import graphs
+from jaxslam import datasets, graphs
 from jaxslam.math import numpy_poses
 
 FACTORS = {"relative_pose": graphs.RelativePoseLog()}
@@ -60,7 +60,7 @@ def of_gtsam(graph, kind="GaussNewton"):
 
 
 def one_graph(name: str, high: float, repeats: int) -> list[Metric]:
-    graph = graphs.with_gauge(graphs.read(DATA / "graphs" / f"{name}.g2o"))
+    graph = graphs.with_gauge(datasets.read_graph(DATA / "graphs" / f"{name}.g2o"))
     plan = graphs.plan(graph, FACTORS)
 
     def ours():
@@ -94,8 +94,8 @@ def one_graph(name: str, high: float, repeats: int) -> list[Metric]:
 
 
 def many_graphs(repeats: int) -> list[Metric]:
-    graph = graphs.with_gauge(graphs.read(DATA / "graphs" / "ring.g2o"))
-    truth = graphs.read(DATA / "graphs" / "ring_groundTruth.g2o")
+    graph = graphs.with_gauge(datasets.read_graph(DATA / "graphs" / "ring.g2o"))
+    truth = datasets.read_graph(DATA / "graphs" / "ring_groundTruth.g2o")
     table, random = graph.tables["relative_pose"], np.random.default_rng(0)
     root = np.linalg.cholesky(np.linalg.inv(table.information))
     exact = np.asarray(truth.tables["relative_pose"].z)
@@ -194,7 +194,7 @@ def measure(quick: bool = False) -> list[Metric]:
     print("a step in lanes, of fixed connectivity:")
     metrics.append(growth("lanes", lanes, repeats, high=1.2))
     print("a step over the first poses of city10000, whose connectivity grows:")
-    whole = graphs.with_gauge(graphs.read(DATA / "graphs" / "city10000.g2o"))
+    whole = graphs.with_gauge(datasets.read_graph(DATA / "graphs" / "city10000.g2o"))
     metrics.append(growth("city10000", partial(first_poses, whole), repeats))
     peak = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1e6
     return [*metrics, Metric("peak memory of the process [GB]", peak)]

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from benchmarks.real_data import DATA
-from jaxslam import graphs
+from jaxslam import datasets, graphs
 from jaxslam.graphs import Graph, Table
 from jaxslam.graphs._graph import LOOPS
 from jaxslam.math import se2
@@ -16,7 +16,7 @@ TRUTH = DATA / "graphs" / "manhattanOlson3500_nodes_groundTruth.dat"
 
 def manhattan():
     """The Manhattan world at its true poses."""
-    graph = graphs.read(MANHATTAN)
+    graph = datasets.read_graph(MANHATTAN)
     return at(np.loadtxt(TRUTH)[: len(graph.poses)], jax.tree.map(np.asarray, graph.tables))
 
 

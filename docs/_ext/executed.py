@@ -117,7 +117,8 @@ def home(name: str) -> Path:
         if not inspect.ismodule(value):
             break
         module = value
-    owner = getattr(value, "__module__", None) or ""
+    # A public name says that it is of a public module; its source is in a private one.
+    owner = getattr(value, "__source_module__", None) or getattr(value, "__module__", None) or ""
     if not inspect.ismodule(value) and owner.split(".")[0] == PACKAGE:
         module = sys.modules[owner]
     return Path(module.__file__ or "")

@@ -49,7 +49,7 @@ INTRODUCED = {
     "jaxslam.math": "Mathematics",
     "jaxslam.core.noise": "Noise models",
     "jaxslam.core.slots": "The table of landmarks",
-    "jaxslam.core.validation": "What is refused",
+    "jaxslam.core.validation": "Checks, and the errors of bad input",
 }
 """Title of each page, in the order of the contents; a module that is not listed comes after."""
 
@@ -180,6 +180,34 @@ def as_markup(app: Any, what: str, name: str, obj: Any, options: Any, lines: lis
     lines[:] = napoleon.GoogleDocstring(plain, settings, app, kind, name, obj).lines()
 
 
+def read_private_sources() -> None:
+    """Let Sphinx find the docstrings of fields, which it reads from the file of `__module__`: the
+    source of a public name is in the file of `__source_module__` (`jaxslam/_public.py`)."""
+    from sphinx.pycode import ModuleAnalyzer
+
+    analyze = ModuleAnalyzer.analyze
+
+    def analyze_with_sources(self: ModuleAnalyzer) -> None:
+        if self._analyzed:
+            return
+        analyze(self)
+        module = sys.modules.get(self.modname)
+        values = [getattr(module, name) for name in getattr(module, "__all__", ())]
+        sources = {
+            value.__source_module__
+            for value in values
+            if "__source_module__" in getattr(value, "__dict__", {})
+            and value.__module__ == self.modname
+        }
+        for source in sorted(sources):
+            private = ModuleAnalyzer.for_module(source)
+            private.analyze()
+            for table in ("attr_docs", "annotations", "tags", "tagorder", "overloads"):
+                setattr(self, table, {**getattr(private, table), **getattr(self, table)})
+
+    ModuleAnalyzer.analyze = analyze_with_sources
+
+
 def missing(app: Any, exception: Exception | None) -> None:
     """After the build: a public name that no page shows is an error."""
     if exception is not None or app.builder.name != "html":
@@ -192,6 +220,7 @@ def missing(app: Any, exception: Exception | None) -> None:
 
 def setup(app: Any) -> dict[str, bool]:
     """Connect to Sphinx."""
+    read_private_sources()
     app.connect("builder-inited", write_pages)
     app.connect("autodoc-process-docstring", as_markup)
     app.connect("build-finished", missing)

@@ -1,5 +1,6 @@
 """Data association: methods that match measurements with landmarks."""
 
+from jaxslam._public import publish
 from jaxslam.association._joint_compatibility import JointCompatibility
 from jaxslam.association._rules import Certain, GlobalNearest, Known, MaximumLikelihood, Nearest
 
@@ -11,3 +12,5 @@ __all__ = [
     "MaximumLikelihood",
     "Nearest",
 ]
+
+publish(__name__)

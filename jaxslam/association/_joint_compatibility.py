@@ -7,11 +7,11 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.association._rules import check_gates, far_from_all
-from jaxslam.core._numbers import check_count
-from jaxslam.core._record import record, static
+from jaxslam.association._rules import check_new_gate, far_from_all, gate_probability
+from jaxslam.core._record import field, record, static
 from jaxslam.core.protocols import Association, Pairs, Prediction
 from jaxslam.core.types import Scan
+from jaxslam.core.validation import at_least, probability
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import Number
 from jaxslam.math.stats import chi2_quantile
@@ -35,22 +35,19 @@ class JointCompatibility:
     candidates below 1.
     """
 
-    probability: float = static(default=0.99)
+    probability: float = static(default=0.99, check=probability)
     """p of both tests"""
-    new_gate: Number | None = None
-    """another probability, at least the first; the same by default"""
-    budget: int = static(default=2000, kw_only=True)
+    new_gate: Number | None = field(default=None, check=gate_probability)
+    """probability of the gate of new landmarks, at least `probability`; default `probability`"""
+    budget: int = static(default=2000, kw_only=True, check=at_least(1))
     """largest number of nodes of the search. At this limit the best result is returned, and
     `Association.exhausted` is set"""
-    candidates: int = static(default=8, kw_only=True)
+    candidates: int = static(default=8, kw_only=True, check=at_least(1))
     """number of nearest compatible landmarks tried for a measurement; if there are more,
     `exhausted` is set"""
 
     def __post_init__(self) -> None:
-        what = "JointCompatibility"
-        check_gates(what, self.probability, self.new_gate)
-        check_count(f"{what}: budget", self.budget)
-        check_count(f"{what}: candidates", self.candidates)
+        check_new_gate("JointCompatibility", self.probability, self.new_gate)
 
     def __call__(self, prediction: Prediction, scan: Scan) -> Association:
         pairs: Pairs = jax.lax.stop_gradient(prediction.pairs(scan))
@@ -61,26 +58,28 @@ class JointCompatibility:
         levels = jnp.asarray([0.0, *quantiles], pairs.distance.dtype)
         cross = jax.lax.stop_gradient(prediction.cross())
         problem = _problem(pairs, cross, levels, self.candidates)
-        found = _search(problem, self.budget)
-        exhausted = (found.level >= 0) | problem.cut
-        slot = found.best
+        search = _search(problem, self.budget)
+        exhausted = (search.level >= 0) | problem.cut
         far = far_from_all(pairs, scan, self.probability, self.new_gate)
-        return Association(slot, far & (slot < 0), exhausted)
+        return Association(search.best, far & (search.best < 0), exhausted)
 
 
 class _Problem(NamedTuple):
+    """The M measurements with their K nearest compatible landmarks each."""
+
     slot: Int[Array, "M K"]
     """candidates, the nearest first"""
-    fits: Bool[Array, "M K"]
+    is_compatible: Bool[Array, "M K"]
+    """false for the landmarks with which a row is padded to K"""
     innovation: Float[Array, "M K Z"]
     cov: Float[Array, "M K Z Z"]
     cross: Float[Array, "N Z N Z"]
     levels: Float[Array, "M+1"]
     """χ²(k·Z, p), the largest D² of k pairs"""
     left: Int[Array, "M+1"]
-    """how many measurements from the i-th on have candidates"""
+    """number of measurements from the i-th on that have candidates"""
     cut: Bool[Array, ""]
-    """there were more candidates than K"""
+    """whether a measurement had more than K candidates"""
 
 
 def _problem(
@@ -95,7 +94,7 @@ def _problem(
     left = jnp.append(jnp.cumsum(some[::-1])[::-1], 0)
     return _Problem(
         slot=slot,
-        fits=compatible[at],
+        is_compatible=compatible[at],
         innovation=pairs.innovation[at],
         cov=pairs.cov[at],
         cross=cross,
@@ -106,16 +105,19 @@ def _problem(
 
 
 class _Search(NamedTuple):
+    """The state of the depth-first search: the branch it is on, and the best leaf so far."""
+
     level: Int[Array, ""]
     """the measurement to decide on; -1 when all is searched"""
     option: Int[Array, "M"]
-    """which of its candidates comes next; K is none"""
+    """the next candidate of each measurement to try; K leaves it without a landmark, K + 1 ends
+    its level"""
     chosen: Int[Array, "M"]
     """slot of each measurement decided on, -1 for none"""
     pairs: Int[Array, "M+1"]
-    """how many there are among the first k"""
+    """number of pairs among the first k measurements"""
     distance: Float[Array, "M+1"]
-    """D² of the first k"""
+    """D² of the pairs among the first k measurements"""
     inverse: Float[Array, "M*Z M*Z"]
     """L⁻¹, rows of zeros without a pair"""
     whitened: Float[Array, "M*Z"]
@@ -146,26 +148,28 @@ def _search(problem: _Problem, budget: int) -> _Search:
 
     def visit(at: _Search) -> _Search:
         i, option = at.level, at.option[at.level]
-        which = jnp.minimum(option, k - 1)
-        slot = jnp.where(option < k, problem.slot[i, which], -1)
-        rows, white, more, regular = _block_row(problem, at, which)
-        taken = (jnp.arange(m) < i) & (at.chosen == slot)
-        fits = (option == k) | (problem.fits[i, which] & regular & ~taken.any())
+        candidate = jnp.minimum(option, k - 1)
+        slot = jnp.where(option < k, problem.slot[i, candidate], -1)
+        rows, white, distance_term, regular = _block_row(problem, at, candidate)
+        is_used = ((jnp.arange(m) < i) & (at.chosen == slot)).any()
+        fits = (option == k) | (problem.is_compatible[i, candidate] & regular & ~is_used)
         pair = (option < k).astype(jnp.int32)
-        count, distance = at.pairs[i] + pair, at.distance[i] + pair * more
+        count, distance = at.pairs[i] + pair, at.distance[i] + pair * distance_term
+        # The bound: as many pairs as the branch can still have, at no more than its D² so far.
         most = count + problem.left[i + 1]
         better = (most > at.best_count) | ((most == at.best_count) & (distance < at.best_distance))
         go = (option <= k) & fits & better & (distance <= problem.levels[most])
         leaf = go & (i == m - 1)
         deeper = go & ~leaf
         chosen = at.chosen.at[i].set(slot)
-        start_row = i * size_z
+        start_row = i * size_z  # of measurement i in L⁻¹ and L⁻¹ ν; zeros without a pair
         keep = (deeper & (option < k)).astype(dtype)
         inverse = jax.lax.dynamic_update_slice(at.inverse, keep * rows, (start_row, 0 * start_row))
         whitened = jax.lax.dynamic_update_slice(at.whitened, keep * white, (start_row,))
         following = jnp.minimum(i + 1, m - 1)
         options = at.option.at[i].add(1)
         options = options.at[following].set(jnp.where(deeper, 0, options[following]))
+        # Down after a choice; up after the last option; else the next option of this level.
         level = jnp.where(deeper, i + 1, jnp.where(option >= k, i - 1, i))
         return _Search(
             level=level,
@@ -185,7 +189,7 @@ def _search(problem: _Problem, budget: int) -> _Search:
 
 
 def _block_row(
-    problem: _Problem, at: _Search, which: Int[Array, ""]
+    problem: _Problem, at: _Search, candidate: Int[Array, ""]
 ) -> tuple[Float[Array, "Z MZ"], Float[Array, "Z"], Float[Array, ""], Bool[Array, ""]]:
     """The next pair's rows of L⁻¹ and L⁻¹ ν, its term of D², and whether S is positive definite.
 
@@ -194,16 +198,17 @@ def _block_row(
     """
     m, _, size_z = problem.innovation.shape
     i = at.level
-    slot = problem.slot[i, which]
+    slot = problem.slot[i, candidate]
     before = (jnp.arange(m) < i) & (at.chosen >= 0)
     shared = problem.cross[jnp.maximum(at.chosen, 0), :, slot]
+    # (measurement, entry, entry) -> the rows of C: one block of Z rows a measurement.
     shared = jnp.where(before[:, None, None], shared, 0.0).reshape(m * size_z, size_z)
     joined = jnp.repeat(before, size_z)
     inverse = jnp.where(joined[:, None], at.inverse, 0.0)
     whitened = jnp.where(joined, at.whitened, 0.0)
     w = inverse @ shared
-    factor, regular = linalg.cholesky(problem.cov[i, which] - w.T @ w)
+    factor, regular = linalg.cholesky(problem.cov[i, candidate] - w.T @ w)
     diagonal = jnp.arange(m * size_z)[None, :] == i * size_z + jnp.arange(size_z)[:, None]
     rows = linalg.solve_lower(factor, diagonal.astype(w.dtype) - w.T @ inverse)
-    white = linalg.solve_lower(factor, problem.innovation[i, which] - w.T @ whitened)
+    white = linalg.solve_lower(factor, problem.innovation[i, candidate] - w.T @ whitened)
     return rows, white, (white**2).sum(), regular

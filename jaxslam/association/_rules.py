@@ -2,39 +2,45 @@
 
 import dataclasses
 from collections.abc import Callable
-from numbers import Real
 from typing import Literal
 
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.core import slots
-from jaxslam.core._numbers import check_gate, check_positive, gate_quantile, is_concrete
-from jaxslam.core._record import hold_function, record, static
+from jaxslam.core._numbers import gate_quantile
+from jaxslam.core._record import field, function_of, record, static
+from jaxslam.core._reprs import describe
 from jaxslam.core.protocols import Associate, Association, Pairs, Prediction, Sensor
 from jaxslam.core.types import Scan
-from jaxslam.math._arrays import Number
+from jaxslam.core.validation import InvalidField, one_of, or_none, positive, probability
+from jaxslam.math._arrays import Number, is_concrete
 from jaxslam.math._assignment import assign
 from jaxslam.math._gaussians import gaussian_terms
 
 
-def check_gates(name: str, gate: Number | None, new_gate: Number | None) -> None:
-    """Raise ValueError on a gate that is no probability, and on a new_gate below it."""
-    for each in (gate, new_gate):
-        if each is not None and not isinstance(each, Real | np.ndarray | jax.Array):
-            called = isinstance(each, Prediction | Scan)
-            again = f": as associate, give {name}(gate), not {name}" if called else ""
-            raise ValueError(f"{name}: expected a number as gate, got {type(each).__name__}{again}")
-        check_gate(name, each)
+def gate_probability(value: Number | None) -> Number | None:
+    """The check of a gate, a probability or None."""
+    if isinstance(value, Prediction | Scan):  # the class was given as the method, and is called
+        raise ValueError(
+            f"expected a probability, got {describe(value)}: as associate, give a rule "
+            "with its gate, not its class"
+        )
+    gate: Number | None = or_none(probability)(value)
+    return gate
+
+
+def check_new_gate(owner: str, gate: Number | None, new_gate: Number | None) -> None:
+    """Raise InvalidField on a new_gate that is not at least the gate."""
     if new_gate is None:
         return
     if gate is None:
-        raise ValueError(f"{name}: expected no new_gate without a gate, got {new_gate}")
+        raise InvalidField(owner, "new_gate", f"expected None without a gate, got {new_gate}")
     if is_concrete((gate, new_gate)) and not new_gate >= gate:
-        raise ValueError(f"{name}: expected new_gate >= gate = {gate}, got {new_gate}")
+        reason = f"expected new_gate >= gate = {gate}, got {new_gate}"
+        raise InvalidField(owner, "new_gate", reason)
 
 
 def within_gate(pairs: Pairs, gate: Number | None) -> Bool[Array, "M N"]:
@@ -71,10 +77,10 @@ class Known:
     """
 
     def __call__(self, prediction: Prediction, scan: Scan) -> Association:
-        slot, found = slots.find(prediction.tag, prediction.alive, scan.tag)
+        slot, in_map = slots.find(prediction.tag, prediction.alive, scan.tag)
         tagged = scan.valid & (scan.tag >= 0)
-        found = found & tagged
-        return Association(jnp.where(found, slot, -1), tagged & ~found)
+        in_map = in_map & tagged
+        return Association(jnp.where(in_map, slot, -1), tagged & ~in_map)
 
 
 @record
@@ -91,21 +97,19 @@ class Nearest:
     Raises ValueError on a gate that is no probability, a new_gate below it, or an unknown policy.
     """
 
-    gate: Number | None
+    gate: Number | None = field(check=gate_probability)
     """probability that a measurement is compatible with its own landmark, above 0 and below 1;
     None: all pairs are compatible"""
-    new_gate: Number | None = None
-    """another probability, at least the gate; the same by default"""
-    ambiguous: Literal["nearest", "leave"] = static(default="nearest", kw_only=True)
+    new_gate: Number | None = field(default=None, check=gate_probability)
+    """probability of the gate of new landmarks, at least the gate; default the gate"""
+    ambiguous: Literal["nearest", "leave"] = static(
+        default="nearest", kw_only=True, check=one_of("nearest", "leave")
+    )
     """"leave" ignores a measurement that is compatible with several landmarks, and several that are
     compatible with one"""
 
     def __post_init__(self) -> None:
-        check_gates("Nearest", self.gate, self.new_gate)
-        if self.ambiguous not in ("nearest", "leave"):
-            raise ValueError(
-                f'Nearest: expected ambiguous "nearest" or "leave", got {self.ambiguous!r}'
-            )
+        check_new_gate("Nearest", self.gate, self.new_gate)
 
     def __call__(self, prediction: Prediction, scan: Scan) -> Association:
         pairs = prediction.pairs(scan)
@@ -119,7 +123,7 @@ class Nearest:
 
 @record
 class MaximumLikelihood:
-    """Maximum-likelihood association: as `nearest`, by the least d² + log |S|.
+    """Maximum-likelihood association: as `Nearest`, by the least d² + log |S|.
 
     d² + log |S| is -2 log N(ν; 0, S) up to a constant. The determinant matters: a landmark of large
     covariance has small d² to all measurements, but a low likelihood (Thrun, Burgard &
@@ -129,11 +133,11 @@ class MaximumLikelihood:
         ValueError: on a gate that is no probability, or a new_gate below it.
     """
 
-    gate: Number | None
-    new_gate: Number | None = None
+    gate: Number | None = field(check=gate_probability)
+    new_gate: Number | None = field(default=None, check=gate_probability)
 
     def __post_init__(self) -> None:
-        check_gates("MaximumLikelihood", self.gate, self.new_gate)
+        check_new_gate("MaximumLikelihood", self.gate, self.new_gate)
 
     def __call__(self, prediction: Prediction, scan: Scan) -> Association:
         pairs = prediction.pairs(scan)
@@ -155,20 +159,23 @@ class GlobalNearest:
         ValueError: on a gate that is no probability, or a new_gate below it.
     """
 
-    gate: Number | None
-    new_gate: Number | None = None
+    gate: Number | None = field(check=gate_probability)
+    new_gate: Number | None = field(default=None, check=gate_probability)
 
     def __post_init__(self) -> None:
-        check_gates("GlobalNearest", self.gate, self.new_gate)
+        check_new_gate("GlobalNearest", self.gate, self.new_gate)
 
     def __call__(self, prediction: Prediction, scan: Scan) -> Association:
         pairs = prediction.pairs(scan)
         m, n, size_z = pairs.innovation.shape
         compatible = within_gate(pairs, self.gate)
+        # Without a gate, more than all distances together: every possible pair is worth making.
         alone = 1 + jnp.where(compatible, pairs.distance, 0.0).sum()
         gamma = gate_quantile(self.gate, size_z)
         if gamma is not None:
             alone = jnp.minimum(gamma, alone)
+        # A pair that is not compatible costs more than two measurements without a landmark, so it
+        # is never part of the minimum.
         cost = jnp.where(compatible, pairs.distance, 2 * alone + 1)
         # One more column for each measurement, for no landmark.
         cost = jnp.concatenate([cost, jnp.broadcast_to(alone, (m, m))], axis=1)
@@ -181,7 +188,7 @@ class GlobalNearest:
 class Certain:
     """An association method restricted to landmarks with √(tr S/Z) <= spread.
 
-    S is the covariance of the innovation. After a long loop that of the first landmarks exceeds the
+    S is the covariance of the innovation. After a long loop S of the first landmarks exceeds the
     distances between landmarks, and single measurements may be associated wrongly. Landmarks
     measured there become new ones at first; `filters.Closing` then associates them
     jointly with the old ones.
@@ -189,22 +196,19 @@ class Certain:
     Raises ValueError on a spread not above 0.
     """
 
-    associate: Associate
+    associate: Associate = field(check=function_of("prediction", "scan"))
     """the method; one that uses tags alone, as `Known`, is not restricted"""
-    spread: Number
+    spread: Number = field(check=positive)
     """in units of the measurement, which should all be of one kind"""
 
-    def __post_init__(self) -> None:
-        hold_function(self, "associate", "prediction, scan")
-        check_positive("Certain", spread=self.spread)
-
     def __call__(self, prediction: Prediction, scan: Scan) -> Association:
-        def pairs(scan: Scan) -> Pairs:
-            found = prediction.pairs(scan)
-            variance = jnp.trace(found.cov, axis1=2, axis2=3) / found.cov.shape[-1]
-            return found._replace(possible=found.possible & (variance <= self.spread**2))
+        def certain_pairs(scan: Scan) -> Pairs:
+            pairs = prediction.pairs(scan)
+            variance = jnp.trace(pairs.cov, axis1=2, axis2=3) / pairs.cov.shape[-1]
+            return pairs._replace(possible=pairs.possible & (variance <= self.spread**2))
 
-        return Association(*self.associate(dataclasses.replace(prediction, pairs=pairs), scan))
+        certain = dataclasses.replace(prediction, pairs=certain_pairs)
+        return Association(*self.associate(certain, scan))
 
 
 def predicted(

@@ -36,8 +36,9 @@ def delayed(
     rates = np.array([(split_unit(name)[1] or "").endswith("/s") for name in controls[:-1]])
     moved = jnp.where(rates, u[:, :-1] * dt, u[:, :-1])
     total = jnp.cumsum(moved, axis=0)
+    # Linear between rows: exact for velocities that are constant over a row.
     at = jax.vmap(lambda column: jnp.interp(t - delay, t, column), 1, 1)(total)
     moved = jnp.diff(at, axis=0, prepend=at[:1])
-    known = dt > 0
-    velocities = jnp.where(known, moved / jnp.where(known, dt, 1.0), 0.0)
+    has_interval = dt > 0
+    velocities = jnp.where(has_interval, moved / jnp.where(has_interval, dt, 1.0), 0.0)
     return log._replace(control=jnp.concatenate([jnp.where(rates, velocities, moved), dt], axis=1))

@@ -18,7 +18,7 @@ from jaxslam.core._record import as_record
 from jaxslam.core.types import Info, Log, Status
 
 _BOUND = 1.35
-"""By how much log L falls at the 95 % upper limit of a parameter whose estimate is 0: half the 0.90
+"""The fall of log L at the 95 % upper limit of a parameter whose estimate is 0: half the 0.90
 quantile of χ² with one degree of freedom, since half of the estimates are 0 where the truth is."""
 
 _CONFOUNDED = 0.9
@@ -51,20 +51,21 @@ class _LikelihoodPoint(NamedTuple):
     """in which the run was"""
 
 
-def _without_information(here: _LikelihoodPoint) -> np.ndarray:
+def _directions_without_information(point: _LikelihoodPoint) -> np.ndarray:
     """An orthonormal basis (P, K) of the directions without information, by q √diag F.
 
     In these coordinates it does not depend on units. Along such a direction no innovation and no S
     has a derivative: nothing is to be gained, and the gradient and the observed information along
     it are rounding.
     """
-    expected = here.expected
-    unit, there = _units(expected), np.flatnonzero(np.diag(expected) > 0)
-    values, vectors = np.linalg.eigh((expected / np.outer(unit, unit))[np.ix_(there, there)])
+    expected = point.expected
+    unit, informed = _units(expected), np.flatnonzero(np.diag(expected) > 0)
+    scaled = (expected / np.outer(unit, unit))[np.ix_(informed, informed)]
+    values, vectors = np.linalg.eigh(scaled)
     # A sum over T rows leaves T eps of 1 where it should be 0, and with derivatives handed on by a
     # run some thousand times that; above 1/400 = 1/_INFLATED² a direction is determined.
-    none = values < np.sqrt(np.finfo(here.dtype).eps)
-    return np.asarray(np.eye(len(expected))[:, there] @ vectors[:, none])
+    none = values < np.sqrt(np.finfo(point.dtype).eps)
+    return np.asarray(np.eye(len(expected))[:, informed] @ vectors[:, none])
 
 
 def _units(information: np.ndarray) -> np.ndarray:
@@ -74,21 +75,21 @@ def _units(information: np.ndarray) -> np.ndarray:
 
 
 def _newton_step(
-    information: np.ndarray, here: _LikelihoodPoint, logged: np.ndarray
+    information: np.ndarray, point: _LikelihoodPoint, logged: np.ndarray
 ) -> tuple[np.ndarray, float]:
     """Newton's step where there is information, and the gain of log L that it promises.
 
     In each direction a log σ moves by at most 1. Where log L is convex the step goes uphill by as
     much as it would where it is concave.
     """
-    of_all = _units(here.expected)
+    of_all = _units(point.expected)
     # Others than log σ in units in which they have the information of the best known log σ.
     unit = np.where(logged, 1.0, of_all / of_all[logged].max(initial=1.0))
-    none = (unit / of_all)[:, None] * _without_information(here)
+    none = (unit / of_all)[:, None] * _directions_without_information(point)
     seen = np.linalg.svd(none.T)[2][none.shape[1] :].T
     values, vectors = np.linalg.eigh(seen.T @ (information / np.outer(unit, unit)) @ seen)
     vectors = seen @ vectors / unit[:, None]
-    along = vectors.T @ here.gradient
+    along = vectors.T @ point.gradient
     step = along / np.maximum(np.abs(values), np.finfo(float).tiny)
     moves = np.abs(vectors * step)[logged].max(axis=0, initial=0.0)
     step /= np.maximum(moves, 1.0)
@@ -96,31 +97,32 @@ def _newton_step(
 
 
 def _observed_information(
-    at: Callable[[np.ndarray], _LikelihoodPoint], here: _LikelihoodPoint, logged: np.ndarray
+    evaluate: Callable[[np.ndarray], _LikelihoodPoint], point: _LikelihoodPoint, logged: np.ndarray
 ) -> Float[np.ndarray, "P P"]:
     """The observed information -∂²log L/∂q², from differences of the gradient over part of a σ."""
     rows = []
-    for i, scale in enumerate(np.diag(here.spread)):
+    for i, scale in enumerate(np.diag(point.spread)):
         h = 0.05 / np.sqrt(scale) if scale > 0 else 1e-3
-        move = (min(h, _STEP) if logged[i] else h) * np.eye(len(here.q))[i]
-        below, above = (at((here.q + sign * move).astype(here.dtype)) for sign in (-1, 1))
+        # A twentieth of a σ by Σ g gᵀ; where the gradient is zero in all rows any step is as good.
+        move = (min(h, _STEP) if logged[i] else h) * np.eye(len(point.q))[i]
+        below, above = (evaluate((point.q + sign * move).astype(point.dtype)) for sign in (-1, 1))
         rows.append((below.gradient - above.gradient) / (above.q - below.q)[i])
-    found: np.ndarray = np.array(rows)
-    return np.asarray((found + found.T) / 2)
+    information: np.ndarray = np.array(rows)
+    return np.asarray((information + information.T) / 2)
 
 
 def _upper_limit(
-    at: Callable[[np.ndarray], _LikelihoodPoint], here: _LikelihoodPoint, i: int
+    evaluate: Callable[[np.ndarray], _LikelihoodPoint], point: _LikelihoodPoint, i: int
 ) -> float:
-    """The deviation, above that of parameter i, at which log L is lower by `_BOUND`; to 2 %."""
-    unit, low, high = np.eye(len(here.q))[i], 0.0, np.log(2.0)
-    while at(here.q + high * unit).value > here.value - _BOUND and high < 20:
+    """The deviation i, above its estimate, at which log L is lower by `_BOUND`; to 2 %."""
+    unit, low, high = np.eye(len(point.q))[i], 0.0, np.log(2.0)
+    while evaluate(point.q + high * unit).value > point.value - _BOUND and high < 20:
         low, high = high, high + np.log(2.0)
     for _ in range(5):
         middle = (low + high) / 2
-        inside = at(here.q + middle * unit).value > here.value - _BOUND
+        inside = evaluate(point.q + middle * unit).value > point.value - _BOUND
         low, high = (middle, high) if inside else (low, middle)
-    return float(np.exp(here.q[i] + (low + high) / 2))
+    return float(np.exp(point.q[i] + (low + high) / 2))
 
 
 def _standard_errors(
@@ -132,7 +134,7 @@ def _standard_errors(
     that which they have when it is known.
 
     Args:
-        without: basis of the directions without, of `_without_information`.
+        without: basis of the directions without, of `_directions_without_information`.
     """
     without = without @ without.T
     lost = (np.diag(observed) <= 0) | (np.diag(without) > _PART)
@@ -164,12 +166,13 @@ parameter only together with others."""
 
 
 _POLISH = 5
-"""Newton's steps with the observed information at most."""
+"""The largest number of Newton's steps with the observed information."""
 _HALVINGS = 8
+"""The largest number of halvings of a step: to a 256th."""
 
 
 class NoiseFit(NamedTuple):
-    """The parameters that `fit_noise` found, and what they rest on."""
+    """The result of `fit_noise`: parameters, their errors, and the likelihood."""
 
     names: tuple[str, ...]
     start: Float[np.ndarray, "P"]
@@ -185,7 +188,7 @@ class NoiseFit(NamedTuple):
     log_likelihood: tuple[float, float]
     """at the start, and at the parameters"""
     nis_per_dof: tuple[float, float]
-    """the same; 1 is honest"""
+    """at the start, and at the parameters; 1 where S is as large as the innovations are"""
     dof: int
     """components of the fused measurements"""
     path: Float[np.ndarray, "iterations+1 P"]
@@ -193,8 +196,8 @@ class NoiseFit(NamedTuple):
     converged: bool
     """whether no step of at most a factor e is left by which log L would gain over `tolerance`"""
     upper: dict[str, float]
-    """standard deviations of which the log does not say that they are above 0, and the value up to
-    which it allows them (95 %), the other parameters held"""
+    """95 % upper limits of standard deviations that may be 0 for all the log says, with the other
+    parameters held"""
     loose: dict[str, tuple[str, ...]]
     """parameters that the log does not determine, and those that they are confounded with"""
 
@@ -215,7 +218,7 @@ def fit_noise(
 
     Fisher scoring in the coordinates q = log p of standard deviations and q = p of others, then
     Newton's steps. The gradient is exact, from one run in forward mode, which also gives the
-    expected information Σ ∂νᵀS⁻¹∂ν + ½ tr(S⁻¹∂S S⁻¹∂S), that of a scan being the sum over its
+    expected information Σ ∂νᵀS⁻¹∂ν + ½ tr(S⁻¹∂S S⁻¹∂S), for a scan the sum over its
     measurements. The observed information H = -∂²log L/∂q² comes from central differences of the
     gradient. Maximum likelihood by the prediction-error decomposition: Schweppe, IEEE Trans.
     Information Theory 11(1), 1965; scoring: Harvey, "Forecasting, structural time series models
@@ -249,90 +252,95 @@ def fit_noise(
 
     of_run = as_record(info)
 
-    def tried(q: np.ndarray) -> _LikelihoodPoint:
-        found = jax.device_get(_evaluate(of_run, q, logged, data))
-        value, gradient, spread, expected, nis, dof = (np.asarray(x, np.float64) for x in found)
+    def try_point(q: np.ndarray) -> _LikelihoodPoint:
+        results = jax.device_get(_evaluate(of_run, q, logged, data))
+        value, gradient, spread, expected, nis, dof = (np.asarray(x, np.float64) for x in results)
+        dtype = results[1].dtype
         return _LikelihoodPoint(
-            q, float(value), gradient, spread, expected, float(nis), int(dof), found[1].dtype
+            q, float(value), gradient, spread, expected, float(nis), int(dof), dtype
         )
 
-    def at(q: np.ndarray) -> _LikelihoodPoint:
-        point = tried(q)
-        _check_point(point, logged)
+    def evaluate(q: np.ndarray) -> _LikelihoodPoint:
+        point = try_point(q)
+        where = f"at parameters {_parameters(q, logged)}"
+        if not point.dof:
+            raise ValueError(f"fit_noise: expected fused measurements, got none {where}")
+        if not (np.isfinite(point.value) and np.isfinite(point.gradient).all()):
+            raise ValueError(f"fit_noise: the likelihood or its gradient is not finite {where}")
         return point
 
-    before = at(_coordinates(first, logged))
-    here = before if guess is None else at(_coordinates(begin, logged))
-    _check_same(before, here, logged)
-    path = [here.q]
+    before = evaluate(_coordinates(first, logged))
+    point = before if guess is None else evaluate(_coordinates(begin, logged))
+    _check_same(before, point, logged)
+    path = [point.q]
 
-    def better(step: np.ndarray) -> _LikelihoodPoint | None:
+    def line_search(step: np.ndarray) -> _LikelihoodPoint | None:
         """The first point above the present one on a step halved up to `_HALVINGS` times."""
         for halving in range(_HALVINGS + 1):
-            trial = tried(here.q + step / 2**halving)
+            trial = try_point(point.q + step / 2**halving)
             if np.isfinite([trial.value, *trial.gradient]).all():  # else a step too far
                 _check_same(before, trial, logged)
-                if trial.value > here.value:
+                if trial.value > point.value:
                     return trial
         return None
 
     for _ in range(iterations):
-        step, gain = _newton_step(here.expected, here, logged)
-        higher = better(step)
+        step, gain = _newton_step(point.expected, point, logged)
+        higher = line_search(step)
         if higher is None:
             break
-        here = higher
-        path.append(here.q)
+        point = higher
+        path.append(point.q)
         if gain <= tolerance:
             break
-    observed = _observed_information(at, here, logged)
+    observed = _observed_information(evaluate, point, logged)
     for _ in range(_POLISH):
-        step, gain = _newton_step(observed, here, logged)
+        step, gain = _newton_step(observed, point, logged)
         if gain <= tolerance:
             break
-        higher = better(step)
+        higher = line_search(step)
         if higher is None:
             break
-        here = higher
-        path.append(here.q)
-        observed = _observed_information(at, here, logged)
-    without = _without_information(here)
+        point = higher
+        path.append(point.q)
+        observed = _observed_information(evaluate, point, logged)
+    without = _directions_without_information(point)
 
     def may_be_none(i: int) -> bool:
-        """Whether log L at a deviation of 0 is not lower than here by `_BOUND`."""
-        at_none = tried(here.q + np.log(_NONE) * np.eye(len(here.q))[i])
-        return at_none.dof == here.dof and bool(at_none.value > here.value - _BOUND)
+        """Whether log L at a deviation of 0 is at most `_BOUND` below the present one."""
+        at_none = try_point(point.q + np.log(_NONE) * np.eye(len(point.q))[i])
+        return at_none.dof == point.dof and bool(at_none.value > point.value - _BOUND)
 
     # A deviation that may be 0, of which little is known and less the smaller it is, has no error,
     # and the others have that which they have without it.
-    little = logged & (np.diag(observed) < 1 / _LOOSE**2) & (np.diag(here.expected) > 0)
-    falling = np.array([bool(little[i]) and may_be_none(i) for i in range(len(here.q))])
-    falling &= (without**2).sum(axis=1) <= _PART
-    kept = np.where(falling | falling[:, None], 0.0, observed)
-    cov, robust, related = _standard_errors(kept, here.spread, without)
-    deviations = np.where(logged, _parameters(here.q, logged), 1.0)
+    little = logged & (np.diag(observed) < 1 / _LOOSE**2) & (np.diag(point.expected) > 0)
+    vanishing = np.array([bool(little[i]) and may_be_none(i) for i in range(len(point.q))])
+    vanishing &= (without**2).sum(axis=1) <= _PART
+    kept = np.where(vanishing | vanishing[:, None], 0.0, observed)
+    cov, robust, related = _standard_errors(kept, point.spread, without)
+    deviations = np.where(logged, _parameters(point.q, logged), 1.0)
     error = np.sqrt(np.diag(cov))
     alone = np.sqrt(np.maximum(np.diag(kept), 0.0))  # 1 / the error with the others known
     wide = ~np.isfinite(error) | (logged & (error > _LOOSE))
     wide |= np.where(alone > 0, error, 0.0) * alone > _INFLATED
-    loose = set(np.flatnonzero(wide & ~falling).tolist())
+    loose = set(np.flatnonzero(wide & ~vanishing).tolist())
     return NoiseFit(
         names=labels,
         start=first,
-        parameters=_parameters(here.q, logged),
+        parameters=_parameters(point.q, logged),
         error=deviations * error,
         robust_error=deviations * robust,
         cov=cov,
-        log_likelihood=(before.value, here.value),
-        nis_per_dof=(before.nis / before.dof, here.nis / here.dof),
-        dof=here.dof,
+        log_likelihood=(before.value, point.value),
+        nis_per_dof=(before.nis / before.dof, point.nis / point.dof),
+        dof=point.dof,
         path=_parameters(np.array(path), logged),
-        converged=_newton_step(observed, here, logged)[1] <= tolerance,
-        upper={labels[i]: _upper_limit(at, here, int(i)) for i in np.flatnonzero(falling)},
+        converged=_newton_step(observed, point, logged)[1] <= tolerance,
+        upper={labels[i]: _upper_limit(evaluate, point, int(i)) for i in np.flatnonzero(vanishing)},
         loose={
             labels[i]: tuple(labels[j] for j in related[i])
             for i in range(len(labels))
-            if {i, *related[i]} & loose and not falling[i]
+            if {i, *related[i]} & loose and not vanishing[i]
         },
     )
 
@@ -340,16 +348,16 @@ def fit_noise(
 def as_associated(log: Log, info: Info) -> Log:
     """The log with the decisions of a run in it, for a filter with known identities and no gate.
 
-    The tag of a fused or born measurement is its landmark's slot, and others are not valid. The run
-    must not have removed landmarks, or slots are of several.
+    The tag of a fused or born measurement is its landmark's slot; others are not valid. The run
+    must not have removed landmarks, or a slot is of several.
 
     Args:
         log, info: of the run, (T, M) measurements.
     """
     status = np.asarray(info.status)
     used = (status == Status.FUSED) | (status == Status.BORN)
-    held: PyTree = np.where(used, np.asarray(info.slot), -1).astype(np.int32)
-    return log._replace(scan=log.scan._replace(tag=held, valid=used))
+    tag: PyTree = np.where(used, np.asarray(info.slot), -1).astype(np.int32)
+    return log._replace(scan=log.scan._replace(tag=tag, valid=used))
 
 
 @partial(jax.jit, inline=True)
@@ -362,36 +370,39 @@ def _evaluate(
     """log L, its gradient, Σ g gᵀ over the rows, the expected information, NIS and dof."""
 
     def rows(q: Float[Array, "P"]) -> PyTree:
-        found = info(jnp.where(logged, jnp.exp(jnp.where(logged, q, 0.0)), q), *data)
-        fused = found.status == Status.FUSED
-        nis = jnp.where(fused, found.nis, 0.0).sum()
-        dof = jnp.where(fused, found.dof, 0).sum()
-        size = found.innovation.shape[-1]
-        innovation = jnp.where(fused[..., None], found.innovation, 0.0).reshape(-1, size)
-        cov = jnp.where(fused[..., None, None], found.innovation_cov, 0.0).reshape(-1, size, size)
-        differentiated = found.log_likelihood, innovation, cov
-        return differentiated, (found.log_likelihood.sum(), cov, nis, dof)
+        run = info(jnp.where(logged, jnp.exp(jnp.where(logged, q, 0.0)), q), *data)
+        fused = run.status == Status.FUSED
+        nis = jnp.where(fused, run.nis, 0.0).sum()
+        dof = jnp.where(fused, run.dof, 0).sum()
+        size = run.innovation.shape[-1]
+        innovation = jnp.where(fused[..., None], run.innovation, 0.0).reshape(-1, size)
+        cov = jnp.where(fused[..., None, None], run.innovation_cov, 0.0).reshape(-1, size, size)
+        differentiated = run.log_likelihood, innovation, cov
+        return differentiated, (run.log_likelihood.sum(), cov, nis, dof)
 
     (by_row, by_mean, by_cov), (value, cov, nis, dof) = jax.jacfwd(rows, has_aux=True)(q)
     by_row = by_row.reshape(-1, q.shape[0])
 
-    def expected(cov: Array, by_mean: Array, by_cov: Array) -> Array:
+    def expected_information(cov: Array, by_mean: Array, by_cov: Array) -> Array:
         # The identity where nothing is fused, and in the unused rows of a smaller part of a suite.
         cov = cov + jnp.diag((jnp.diag(cov) == 0).astype(cov.dtype))
+        # S⁻¹ ∂S for all parameters at once: (Z, Z, P) as one right-hand side (Z, Z P).
         relative = jnp.linalg.solve(cov, by_cov.reshape(cov.shape[0], -1)).reshape(by_cov.shape)
-        shape = jnp.einsum("ijp,jiq->pq", relative, relative) / 2
-        found: Array = by_mean.T @ jnp.linalg.solve(cov, by_mean) + shape
-        return found
+        of_cov = jnp.einsum("ijp,jiq->pq", relative, relative) / 2
+        of_mean: Array = by_mean.T @ jnp.linalg.solve(cov, by_mean)
+        return of_mean + of_cov
 
-    information = jax.vmap(expected)(cov, by_mean, by_cov).sum(axis=0)
+    information = jax.vmap(expected_information)(cov, by_mean, by_cov).sum(axis=0)
     return value, by_row.sum(axis=0), by_row.T @ by_row, information, nis, dof
 
 
 def _coordinates(p: np.ndarray, logged: np.ndarray) -> np.ndarray:
+    """The coordinates q: log p of deviations, others as they are."""
     return np.where(logged, np.log(np.where(logged, p, 1.0)), p)
 
 
 def _parameters(q: np.ndarray, logged: np.ndarray) -> np.ndarray:
+    """The parameters p at coordinates q."""
     return np.where(logged, np.exp(np.where(logged, q, 0.0)), q)
 
 
@@ -403,14 +414,14 @@ def _check_start(
     iterations: int,
     tolerance: float,
 ) -> tuple[np.ndarray, np.ndarray, np.ndarray, tuple[str, ...]]:
-    """Start, guess, which parameters are deviations, and names; ValueError on what is none."""
+    """Start, guess, which parameters are deviations, and names; ValueError on invalid ones."""
     first = np.atleast_1d(np.asarray(start, np.float64))
     begin = first if guess is None else np.atleast_1d(np.asarray(guess, np.float64))
     logged = np.ones(first.shape, bool) if deviation is None else np.asarray(deviation, bool)
     labels = tuple(names or (f"p{i}" for i in range(first.size)))
-    for what, p in (("start", first), ("guess", begin)):
+    for argument, p in (("start", first), ("guess", begin)):
         if p.ndim != 1 or not p.size or not np.isfinite(p).all() or p.shape != first.shape:
-            raise ValueError(f"fit_noise: expected a {what} of shape (P,), finite, got {p}")
+            raise ValueError(f"fit_noise: expected a {argument} of shape (P,), finite, got {p}")
         if logged.shape != p.shape or len(labels) != p.size:
             raise ValueError(f"fit_noise: expected {p.size} names and deviations, as the start")
         if (p[logged] <= 0).any():
@@ -421,19 +432,12 @@ def _check_start(
     return first, begin, logged, labels
 
 
-def _check_point(point: _LikelihoodPoint, logged: np.ndarray) -> None:
-    where = f"at parameters {_parameters(point.q, logged)}"
-    if not point.dof:
-        raise ValueError(f"fit_noise: expected fused measurements, got none {where}")
-    if not (np.isfinite(point.value) and np.isfinite(point.gradient).all()):
-        raise ValueError(f"fit_noise: the likelihood or its gradient is not finite {where}")
-
-
-def _check_same(one: _LikelihoodPoint, other: _LikelihoodPoint, logged: np.ndarray) -> None:
-    if one.dof != other.dof:
-        p, q = (_parameters(point.q, logged) for point in (one, other))
+def _check_same(before: _LikelihoodPoint, after: _LikelihoodPoint, logged: np.ndarray) -> None:
+    """Raise ValueError where other measurements are fused at one point than at another."""
+    if before.dof != after.dof:
+        p, q = (_parameters(point.q, logged) for point in (before, after))
         raise ValueError(
-            f"fit_noise: expected the same measurements at all parameters, got {one.dof} fused "
-            f"components at {p} and {other.dof} at {q}: take a filter without a gate and with "
+            f"fit_noise: expected the same measurements at all parameters, got {before.dof} fused "
+            f"components at {p} and {after.dof} at {q}: take a filter without a gate and with "
             "known identities (as_associated)"
         )

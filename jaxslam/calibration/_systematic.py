@@ -1,7 +1,5 @@
-"""Systematic errors: parameters from a filter's innovations, and their effect on the covariance.
-
-What is added is to the covariance of a result, by the uncertainty of the parameters.
-"""
+"""Systematic errors: parameters from a filter's innovations, and what their uncertainty adds to the
+covariance of a result."""
 
 from collections.abc import Callable
 from functools import partial
@@ -21,7 +19,7 @@ from jaxslam.math._definite import asymmetric, indefinite
 
 
 class Calibration(NamedTuple):
-    """The parameters that `calibrate` found, their covariance, and its iterates."""
+    """The result of `calibrate`: parameters, their covariance, and the iterates."""
 
     parameters: Float[np.ndarray, "P"]
     cov: Float[np.ndarray, "P P"]
@@ -58,8 +56,8 @@ def calibrate(
     with `association.Nearest` and `life.Recency(patience=…)` keeps a local map, in which landmarks
     seen close in time are associated whatever the drift, and no loop is closed.
 
-    Each measurement of a scan is whitened by its S; the correlation between those of one joint
-    update is ignored, which costs a little precision.
+    Each measurement of a scan is whitened by its S; the correlation between the measurements of
+    one joint update is ignored, which costs a little precision.
 
     Args:
         info: p (P,) -> the `Info` of a run, `lambda p: jaxslam.run(…).info`, where p may enter the
@@ -88,6 +86,7 @@ def calibrate(
     path, misfit, dofs, converged = [p], [], [], False
     for _ in range(iterations):
         jacobian, (w, dof) = jax.device_get(_step(of_run, p))
+        # A run hands derivatives on from step to step, which leaves half of the digits.
         rounding = np.sqrt(np.finfo(jacobian.dtype).eps)
         jacobian, w, dof = np.asarray(jacobian, np.float64), np.asarray(w, np.float64), int(dof)
         if not dof:
@@ -107,6 +106,7 @@ def calibrate(
                 f"calibrate: the log does not determine all parameters at {p}: fix one, or use a "
                 "log with more motion"
             )
+        # J⁺ = V Σ⁻¹ Uᵀ without Uᵀ, in the units of the parameters; (JᵀJ)⁻¹ is its square.
         inverse = right.T / values / length[:, None]
         cov = inverse @ inverse.T
         move = -inverse @ (left.T @ w)
@@ -126,29 +126,30 @@ def _step(
 ) -> tuple[Float[Array, "K P"], tuple[Float[Array, "K"], Int[Array, ""]]]:
     """The derivative of the whitened innovations, these, and their degrees of freedom."""
 
-    def whitened(
+    def whiten(
         p: Float[Array, "P"],
     ) -> tuple[Float[Array, "K"], tuple[Float[Array, "K"], Int[Array, ""]]]:
         """The whitened innovations, twice (one for `jacfwd`), and their degrees of freedom."""
-        found = info(p)
-        if not isinstance(found, Info):
+        run = info(p)
+        if not isinstance(run, Info):
             raise ValueError(
                 "calibrate: expected info to return the Info of a run, `run(…).info`, got "
-                f"{type(found).__name__}"
+                f"{type(run).__name__}"
             )
-        fused = found.status == Status.FUSED
-        count, size = fused.size, found.innovation.shape[-1]
+        fused = run.status == Status.FUSED
+        # T·M measurements: (T, M, Z, Z) becomes (T·M, Z, Z).
+        count, size = fused.size, run.innovation.shape[-1]
         used = fused.reshape(count)
-        cov = jax.lax.stop_gradient(found.innovation_cov).reshape(count, size, size)
+        cov = jax.lax.stop_gradient(run.innovation_cov).reshape(count, size, size)
         # Masked before and after the factor: an empty slot then has no effect on derivatives.
         cov = jnp.where(used[:, None, None], cov, jnp.eye(size, dtype=cov.dtype))
         factor = jax.vmap(lambda s: linalg.cholesky(s)[0])(cov)
-        residual = jnp.where(used[:, None], found.innovation.reshape(count, size), 0.0)
+        residual = jnp.where(used[:, None], run.innovation.reshape(count, size), 0.0)
         w = jax.vmap(linalg.solve_lower)(factor, residual).reshape(-1)
-        return w, (w, jnp.where(fused, found.dof, 0).sum())
+        return w, (w, jnp.where(fused, run.dof, 0).sum())
 
-    found: tuple[Array, tuple[Array, Array]] = jax.jacfwd(whitened, has_aux=True)(p)
-    return found
+    derivative: tuple[Array, tuple[Array, Array]] = jax.jacfwd(whiten, has_aux=True)(p)
+    return derivative
 
 
 def consider_cov(
@@ -200,11 +201,11 @@ def consider_cov(
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((jacobians, values))):
         raise ValueError(f"consider_cov: the result or its derivatives at {p} are not finite")
 
-    def added(jacobian: np.ndarray) -> np.ndarray:
+    def propagate(jacobian: np.ndarray) -> np.ndarray:
         jacobian = np.asarray(jacobian, np.float64)
         return np.asarray(jacobian @ c @ np.swapaxes(jacobian, -1, -2))
 
-    return jax.tree.map(added, jacobians)
+    return jax.tree.map(propagate, jacobians)
 
 
 @partial(jax.jit, inline=True)
@@ -218,19 +219,19 @@ def _differentiate(
         for leaf in jax.tree.leaves(value) or [None]:
             array = isinstance(leaf, jax.Array)
             if not array or not leaf.shape or not jnp.issubdtype(leaf.dtype, jnp.floating):
-                what = f"{leaf.shape} {leaf.dtype}" if array else type(leaf).__name__
+                got = f"{leaf.shape} {leaf.dtype}" if array else type(leaf).__name__
                 raise ValueError(
                     "consider_cov: expected result to return an array (*shape, n) of real numbers, "
-                    f"as trace.estimate.pose, got {what}"
+                    f"as trace.estimate.pose, got {got}"
                 )
         return value, value
 
-    found: tuple[PyTree, PyTree] = jax.jacfwd(both, has_aux=True)(p)
-    return found
+    derivative: tuple[PyTree, PyTree] = jax.jacfwd(both, has_aux=True)(p)
+    return derivative
 
 
 def _covariance(cov: ArrayLike, size: int) -> Float[np.ndarray, "P P"]:
-    """A covariance of so many parameters; raises ValueError on what is none, in any units."""
+    """The covariance of so many parameters, as an array; raises ValueError on an invalid one."""
     c = np.asarray(cov, np.float64)
     c = c.reshape(1, 1) if c.ndim == 0 and size == 1 else c
     if c.shape != (size, size):

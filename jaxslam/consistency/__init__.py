@@ -1,5 +1,6 @@
 """Is a filter honest? Scores of runs, their averages with bands and intervals, and a verdict."""
 
+from jaxslam._public import publish
 from jaxslam.consistency._bound import conditional_bound, posterior_bound
 from jaxslam.consistency._intervals import Average
 from jaxslam.consistency._localization_scores import (
@@ -41,3 +42,5 @@ __all__ = [
     "score",
     "summarize_localization",
 ]
+
+publish(__name__)

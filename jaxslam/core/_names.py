@@ -9,25 +9,25 @@ _V = TypeVar("_V")
 
 
 class _UnknownName(KeyError):
-    """A name that is none of those known."""
+    """A name that a dict does not have."""
 
     def __str__(self) -> str:
         return str(self.args[0])  # a KeyError shows it in quotes
 
 
 class Named(dict[str, _V]):
-    """A dict whose lookup error lists the known names and the closest match."""
+    """A dict whose lookup error lists its names and the closest match."""
 
     def __missing__(self, name: object) -> NoReturn:
         """Refuse a name."""
-        known = ", ".join(self)
-        raise _UnknownName(f"expected one of {known}, got {name!r}{meant(name, self)}")
+        names = ", ".join(self)
+        raise _UnknownName(f"expected one of {names}, got {name!r}{meant(name, self)}")
 
 
-def meant(name: object, known: Iterable[str]) -> str:
-    """The closest known name, as a question in brackets, or ""."""
-    alike = difflib.get_close_matches(str(name), known, 1)
-    return "".join(f" (did you mean {each}?)" for each in alike)
+def meant(name: object, names: Iterable[str]) -> str:
+    """The closest of several names, as a question in brackets, or ""."""
+    closest = difflib.get_close_matches(str(name), names, 1)
+    return "".join(f" (did you mean {match}?)" for match in closest)
 
 
 def unfit_signature(function: Callable[..., object], count: int) -> str | None:

@@ -16,7 +16,7 @@ class _Library(NamedTuple):
     lowest: str = ""
     """version, as in pyproject.toml; "" for any"""
     needs: str = ""
-    """what it needs beside itself, where that often lacks"""
+    """what else to install, where that is often missing"""
 
 
 LIBRARIES = {
@@ -44,12 +44,12 @@ def loading(caller: str, name: str) -> Iterator[None]:
 
     Whatever the library raises becomes `Unusable`; a version below the lowest is not tried.
     """
-    library, there = LIBRARIES[name], ""
+    library, installed = LIBRARIES[name], ""
     with suppress(PackageNotFoundError):  # a copy without metadata may serve
-        there = version(name)
-    if () < _numbers(there) < _numbers(library.lowest):
+        installed = version(name)
+    if () < _numbers(installed) < _numbers(library.lowest):
         raise Unusable(
-            f"{caller}: {name} {there} is too old, expected {library.lowest} or later: "
+            f"{caller}: {name} {installed} is too old, expected {library.lowest} or later: "
             f"{library.install}"
         )
     try:
@@ -59,7 +59,7 @@ def loading(caller: str, name: str) -> Iterator[None]:
             raise Unusable(f"{caller}: {name} is not installed: {library.install}") from error
         mend = library.needs or f"pip install --force-reinstall {name}"
         raise Unusable(
-            f"{caller}: {' '.join([name, *there.split()])} is installed, but cannot be used "
+            f"{caller}: {' '.join([name, *installed.split()])} is installed, but cannot be used "
             f"({first_line(error)}): {mend}"
         ) from error
 

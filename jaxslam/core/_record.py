@@ -1,4 +1,8 @@
-"""Records: frozen dataclasses that JAX knows as pytrees."""
+"""Records: frozen dataclasses whose numbers are leaves of a pytree.
+
+A field of a record is a number, an array, None, another record, or a tuple of these; one that is
+declared by `static` is part of the program instead.
+"""
 
 import dataclasses
 from collections.abc import Callable, Iterable, Mapping, Sequence
@@ -7,93 +11,234 @@ from typing import Any, TypeVar, dataclass_transform
 import jax
 import numpy as np
 
+from jaxslam.core._names import unfit_signature
+from jaxslam.core._reprs import describe, with_article
+from jaxslam.core.validation import Check, InvalidField, require
+
 _T = TypeVar("_T")
 
 
-def static(**options: Any) -> Any:
-    """A field of a record that is part of the program: a size, a name, a choice, a function.
+def field(*, check: Check | None = None, **options: Any) -> Any:
+    """A field of data, whose numbers are leaves.
 
-    Two records whose static fields differ are compiled apart, so a value is hashable and compared
-    by ==, a function by identity. options: those of `dataclasses.field`.
+    check: of `core.validation`, or a function of the value that returns it, converted or not, and
+    raises ValueError with the reason alone. options: those of `dataclasses.field`.
     """
-    return dataclasses.field(**options, metadata={"static": True})
+    return dataclasses.field(**options, metadata={"check": check})
 
 
-@dataclass_transform(frozen_default=True, field_specifiers=(static, dataclasses.field))
+def static(*, check: Check | None = None, **options: Any) -> Any:
+    """A field that is part of the program: a size, a name, a choice, a function.
+
+    Records whose static fields differ are compiled apart, so a value is hashable and compared by
+    ==, a function by identity. check, options: as of `field`.
+    """
+    return dataclasses.field(**options, metadata={"check": check, "static": True})
+
+
+@dataclass_transform(frozen_default=True, field_specifiers=(field, static, dataclasses.field))
 def record(cls: type[_T]) -> type[_T]:
     """The class as a frozen dataclass and a pytree, whose fields are its children.
 
-    A field is a number, an array, None, another record, or a tuple of these; one that is declared
-    by `static()` is part of the structure instead. What `jax.grad`, `jax.vmap` and `jax.tree.map`
-    return of a record is one of its class. `dataclasses.replace` changes fields.
+    What `jax.grad`, `jax.vmap` and `jax.tree.map` return of a record is one of its class.
+    `dataclasses.replace` changes fields, and checks them again.
 
-    Fields are checked where a record is made by its class: values in a method `__post_init__`,
-    where the class has one, and then kinds here. JAX rebuilds records without any check, since it
-    fills them with the values of a transformation: tracers, stacks, derivatives.
+    A record that is made by its class first checks each field by the field's `check`, then runs
+    `__post_init__`, for what is between fields, then refuses fields of another kind. JAX rebuilds
+    records without any check, since it fills them with tracers, stacks and derivatives.
 
-    Raises ValueError, at construction, on a field of another kind.
+    Raises InvalidField, a ValueError, at construction.
     """
-    given = cls.__dict__.get("__post_init__") or getattr(cls, "__post_init__", None)
+    between_fields = getattr(cls, "__post_init__", None)
 
     def __post_init__(self: Any) -> None:
-        for field in dataclasses.fields(self):
-            if field.metadata.get("static") and _is_array(value := getattr(self, field.name)):
-                _check_static(f"{type(self).__name__}: {field.name}", value)
-        try:
-            if given is not None:
-                given(self)
-        except TypeError:  # arithmetic with text, say: a field of another kind says more
+        checked = type(self) is cls  # not where a subclass calls super().__post_init__()
+        if checked:
+            _check_declared(self, checks)
+        elif "__dataclass_fields__" not in type(self).__dict__:
+            raise InvalidField(type(self).__name__, "", "expected @record above the class")
+        if between_fields is not None:
+            between_fields(self)
+        if checked:
             _check_kinds(self)
-            raise
-        _check_kinds(self)
 
     cls.__post_init__ = __post_init__  # type: ignore[attr-defined]
-    # A custom repr is kept by subclasses; that of the fields is made for each class.
-    of_fields = cls.__repr__ in (object.__repr__, getattr(cls, "_repr_of_fields", None))
-    made = dataclasses.dataclass(frozen=True, eq=False, repr=of_fields)(cls)
-    if of_fields:
-        made._repr_of_fields = made.__repr__  # type: ignore[attr-defined]
-    made.__reduce__ = lambda self: (_unpickled, (type(self), self.__dict__))  # type: ignore[method-assign]
-    _register(made)
-    return made
+    cls.__setstate__ = _set_state  # type: ignore[attr-defined]
+    if cls.__repr__ is object.__repr__:  # else the class, or one above it, has a repr of its own
+        cls.__repr__ = _repr_of_fields  # type: ignore[method-assign]
+    dataclasses.dataclass(frozen=True, eq=False, repr=False)(cls)
+    # A field that is declared again, with another default say, keeps the check from above.
+    checks = {
+        name: inherited.metadata["check"]
+        for base in reversed(cls.__mro__)
+        for name, inherited in base.__dict__.get("__dataclass_fields__", {}).items()
+        if inherited.metadata.get("check") is not None
+    }
+    _register(cls)
+    return cls
 
 
-def _unpickled(cls: type, values: dict[str, Any]) -> Any:
-    """The record of a class, which a pickle by value, as cloudpickle's, has made anew."""
-    made: Any = object.__new__(cls)
-    made.__dict__.update(values)
-    if jax.tree_util.all_leaves([made]):
-        _register(cls)
-    return made
+def _register(cls: type) -> None:
+    """Make a class of records known to JAX.
 
+    `jax.tree_util.register_dataclass` is of no use: it rebuilds by the constructor, with its
+    checks.
+    """
+    fields = dataclasses.fields(cls)
+    data = tuple(field.name for field in fields if not field.metadata.get("static"))
+    program = tuple(field.name for field in fields if field.metadata.get("static"))
+    keys = tuple(jax.tree_util.GetAttrKey(name) for name in data)
 
-def _register(made: type) -> None:
-    """Make a class of records known to JAX."""
-    fields = dataclasses.fields(made)
-    leaves = tuple(field.name for field in fields if not field.metadata.get("static"))
-    statics = tuple(field.name for field in fields if field.metadata.get("static"))
-    keys = tuple(jax.tree_util.GetAttrKey(name) for name in leaves)
+    def flatten(self: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
+        values = self.__dict__
+        return tuple([values[name] for name in data]), tuple([values[name] for name in program])
 
-    def flatten(of: Any) -> tuple[tuple[Any, ...], tuple[Any, ...]]:
-        held = of.__dict__
-        return tuple([held[name] for name in leaves]), tuple([held[name] for name in statics])
-
-    def flatten_with_keys(of: Any) -> tuple[Iterable[tuple[Any, Any]], tuple[Any, ...]]:
-        children, structure = flatten(of)
+    def flatten_with_keys(self: Any) -> tuple[Iterable[tuple[Any, Any]], tuple[Any, ...]]:
+        children, structure = flatten(self)
         return zip(keys, children, strict=True), structure
 
     def unflatten(structure: tuple[Any, ...], children: Iterable[Any]) -> Any:
-        rebuilt: Any = object.__new__(made)
-        rebuilt.__dict__.update(zip(leaves, children, strict=True))
-        rebuilt.__dict__.update(zip(statics, structure, strict=True))
-        return rebuilt
+        self: Any = object.__new__(cls)
+        self.__dict__.update(zip(data, children, strict=True))
+        self.__dict__.update(zip(program, structure, strict=True))
+        return self
 
-    jax.tree_util.register_pytree_with_keys(made, flatten_with_keys, unflatten, flatten)
+    jax.tree_util.register_pytree_with_keys(cls, flatten_with_keys, unflatten, flatten)
+
+
+def _set_state(self: Any, state: dict[str, Any]) -> None:
+    """Fill the record of a pickle, whose class may be unknown to JAX.
+
+    cloudpickle makes the class of a script anew in the process that reads, without its decorator.
+    """
+    self.__dict__.update(state)
+    if jax.tree_util.all_leaves([self]):
+        _register(type(self))
+
+
+def _repr_of_fields(self: Any) -> str:
+    values = [f"{f.name}={getattr(self, f.name)!r}" for f in dataclasses.fields(self) if f.repr]
+    return f"{type(self).__qualname__}({', '.join(values)})"
 
 
 def is_record(value: object) -> bool:
     """Whether a value is a record."""
     return dataclasses.is_dataclass(value) and not jax.tree_util.all_leaves([value])
+
+
+def set_field(record: Any, name: str, value: Any) -> None:
+    """Set a field in `__post_init__`, where its value follows from other fields."""
+    object.__setattr__(record, name, value)
+
+
+def check_field(record: Any, name: str, check: Check) -> None:
+    """Check a field in `__post_init__`: where the check follows from other fields, or the field is
+    declared by subclasses, None without one."""
+    value = getattr(record, name, None)
+    result = require(type(record).__name__, name, value, check)
+    if result is not value:
+        set_field(record, name, result)
+
+
+@record
+class Function:
+    """A plain function as a record without numbers, compared by identity."""
+
+    function: Callable[..., Any] = static()
+
+    def __call__(self, *arguments: Any) -> Any:
+        return self.function(*arguments)
+
+
+def as_record(value: Any) -> Any:
+    """The value if it is a record, else its `Function`."""
+    return value if is_record(value) else Function(value)
+
+
+def function_of(*parameters: str) -> Check:
+    """The check of a function of these parameters; a plain one becomes a `Function`."""
+    expected = f"expected a function of ({', '.join(parameters)})"
+
+    def check(value: Any) -> Any:
+        if not callable(value) or isinstance(value, type):
+            raise ValueError(f"{expected}, got {describe(value)}")
+        if (signature := unfit_signature(value, len(parameters))) is not None:
+            raise ValueError(f"{expected}, got one of {signature}")
+        return as_record(value)
+
+    return check
+
+
+# --- kinds of fields ----------------------------------------------------------------------------
+
+_DATA = "a number, an array or a record (a choice or a function is a static() field)"
+
+
+def _check_declared(self: Any, checks: dict[str, Check]) -> None:
+    """Check each field by the check of its name, in the order of the fields."""
+    for field in dataclasses.fields(self):
+        if field.metadata.get("static") and _is_array(getattr(self, field.name)):
+            # Before its check, in which == of an array would be an array.
+            raise InvalidField(type(self).__name__, field.name, _ARRAY)
+        if field.name in checks:
+            check_field(self, field.name, checks[field.name])
+
+
+def _check_kinds(self: Any) -> None:
+    """Refuse a field that JAX could not take as data, or as a part of the program."""
+    for field in dataclasses.fields(self):
+        value = getattr(self, field.name)
+        check = _check_static if field.metadata.get("static") else _check_data
+        check(type(self).__name__, field.name, value)
+
+
+_ARRAY = "expected a value that is compared by ==, got an array"
+
+
+def _check_static(owner: str, name: str, value: Any) -> None:
+    """Refuse a value that may change, or holds numbers to differentiate by."""
+    if isinstance(value, tuple | frozenset):
+        for entry in value:
+            _check_static(owner, name, entry)
+    elif _is_array(value):
+        raise InvalidField(owner, name, _ARRAY)
+    elif is_record(value) and jax.tree.leaves(value):
+        got = f"the record {type(value).__name__}, whose numbers belong in a field of data"
+        raise InvalidField(owner, name, f"expected a choice, a size or a function, got {got}")
+    elif type(value).__hash__ is None:
+        got = with_article(type(value).__name__)
+        reason = f"expected a value that cannot change, as a tuple, got {got}"
+        raise InvalidField(owner, name, reason)
+
+
+def _check_data(owner: str, name: str, value: Any) -> None:
+    """Refuse text, lists, functions and classes."""
+    if type(value) is tuple:
+        for k, entry in enumerate(value):
+            _check_data(owner, f"{name}[{k}]", entry)
+    elif isinstance(value, list):
+        reason = "expected an array, as of numpy.asarray, got a list"
+        raise InvalidField(owner, name, reason)
+    elif isinstance(value, str | Sequence | set | type) and not isinstance(value, tuple):
+        raise InvalidField(owner, name, f"expected {_DATA}, got {describe(value)}")
+    elif jax.tree_util.all_leaves([value]) and not _is_number(value):
+        raise InvalidField(
+            owner, name, f"expected {_DATA}, got {with_article(type(value).__name__)}"
+        )
+
+
+def _is_array(value: Any) -> bool:
+    return isinstance(value, np.ndarray | jax.Array)
+
+
+def _is_number(value: Any) -> bool:
+    """Whether a leaf is a number or an array of numbers (kind V: those of ml_dtypes)."""
+    if isinstance(value, bool | int | float | complex | np.generic | jax.Array):
+        return True
+    return isinstance(value, np.ndarray) and value.dtype.kind in "biufcV"
+
+
+# --- for worlds and filters that do not declare their checks yet ---------------------------------
 
 
 class FrozenDict(dict[Any, Any]):
@@ -112,85 +257,6 @@ class FrozenDict(dict[Any, Any]):
         return hash(frozenset(self.items()))
 
 
-def set_field(of: Any, name: str, value: Any) -> None:
-    """Set a field in `__post_init__`, for one that is given in another form."""
-    object.__setattr__(of, name, value)
-
-
-@record
-class Function:
-    """A plain function as a record without numbers, compared by identity."""
-
-    function: Callable[..., Any] = static()
-
-    def __call__(self, *arguments: Any) -> Any:
-        return self.function(*arguments)
-
-
-def as_record(value: Any) -> Any:
-    """The value if it is a record, else its `Function`."""
-    return value if is_record(value) else Function(value)
-
-
 def hold_function(of: Any, name: str, parameters: str) -> None:
-    """Make a field that is a plain function a record, in `__post_init__`.
-
-    Raises ValueError unless it is a function, or a record with `__call__`.
-    """
-    value = getattr(of, name)
-    if not callable(value) or isinstance(value, type):
-        got = f"the class {value.__name__}: call it" if callable(value) else type(value).__name__
-        what = f"{type(of).__name__}: expected {name} to be a function of ({parameters})"
-        raise ValueError(f"{what}, got {got}")
-    set_field(of, name, as_record(value))
-
-
-def _check_kinds(of: Any) -> None:
-    for field in dataclasses.fields(of):
-        value, where = getattr(of, field.name), f"{type(of).__name__}: {field.name}"
-        if field.metadata.get("static"):
-            _check_static(where, value)
-        else:
-            _check_child(where, value)
-
-
-def _check_static(where: str, value: Any) -> None:
-    """Check that a value cannot change and holds no numbers to differentiate by."""
-    if isinstance(value, tuple | frozenset):
-        for each in value:
-            _check_static(where, each)
-    elif _is_array(value):
-        raise ValueError(f"{where}: expected a value that is compared by ==, got an array")
-    elif is_record(value) and jax.tree.leaves(value):
-        got = f"the record {type(value).__name__}, whose numbers belong in a field of data"
-        raise ValueError(f"{where}: expected a choice, a size or a function, got {got}")
-    elif isinstance(value, dict | list | set) and not isinstance(value, FrozenDict):
-        got = type(value).__name__
-        raise ValueError(f"{where}: expected a value that cannot change, as a tuple, got a {got}")
-
-
-def _check_child(where: str, value: Any) -> None:
-    if isinstance(value, tuple) and type(value) is tuple:
-        for k, each in enumerate(value):
-            _check_child(f"{where}[{k}]", each)
-    elif isinstance(value, str | Sequence | set) and not isinstance(value, tuple):
-        wanted = "an array, as of numpy.asarray" if isinstance(value, list) else _WANTED
-        got = repr(value) if isinstance(value, str) else f"a {type(value).__name__}"
-        raise ValueError(f"{where}: expected {wanted}, got {got}")
-    elif isinstance(value, type):
-        raise ValueError(f"{where}: expected {_WANTED}, got the class {value.__name__}: call it")
-    elif jax.tree_util.all_leaves([value]) and not _is_number(value):
-        raise ValueError(f"{where}: expected {_WANTED}, got {type(value).__name__}")
-
-
-_WANTED = "a number, an array or a record (a choice or a function is a static() field)"
-
-
-def _is_array(value: Any) -> bool:
-    return isinstance(value, np.ndarray | jax.Array)
-
-
-def _is_number(value: Any) -> bool:
-    if isinstance(value, bool | int | float | complex | np.generic | jax.Array):
-        return True
-    return isinstance(value, np.ndarray) and value.dtype.kind in "biufcV"
+    """Check a function in `__post_init__`; in its place `field(check=function_of(...))`."""
+    check_field(of, name, function_of(*parameters.split(", ")))

@@ -1,13 +1,14 @@
-"""Short texts of records of arrays: kinds and shapes in place of numbers."""
+"""Short texts: of records of arrays, by kinds and shapes in place of numbers; of what was got."""
 
 from collections.abc import Mapping
+from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PyTree
 
-from jaxslam.core._numbers import is_concrete
+from jaxslam.math._arrays import is_concrete
 
 _LONGEST = 60
 """characters of a value that is no array"""
@@ -28,7 +29,7 @@ def text_of(value: PyTree) -> str:
     if hasattr(value, "_fields"):
         return short_repr(value)
     if isinstance(value, Mapping):
-        return f"{{{', '.join(f'{key!r}: {text_of(one)}' for key, one in value.items())}}}"
+        return f"{{{', '.join(f'{key!r}: {text_of(entry)}' for key, entry in value.items())}}}"
     if isinstance(value, tuple | list) and len(value) <= _LONGEST:
         within = ", ".join(map(text_of, value))
         return f"[{within}]" if isinstance(value, list) else f"({within})"
@@ -41,3 +42,38 @@ def _is_number(value: PyTree) -> bool:
     array = isinstance(value, np.ndarray | np.generic | jax.Array) and is_concrete(value)
     deleted = isinstance(value, jax.Array) and array and value.is_deleted()
     return array and not deleted and value.shape == () and jnp.issubdtype(value.dtype, np.number)
+
+
+def describe(value: object) -> str:
+    """What was got, in a few words: a number or text as it is, the shape of an array, a kind."""
+    if value is None or isinstance(value, str | int | float | complex):
+        return repr(value)
+    if isinstance(value, type):
+        return f"the class {value.__name__}: call it, {value.__name__}(…)"
+    shape = getattr(value, "shape", None)
+    if shape == () and is_concrete(value) and real_array(value) is not None:
+        return str(value)
+    if isinstance(shape, tuple):
+        dtype = getattr(value, "dtype", None)
+        key = dtype is not None and jnp.issubdtype(dtype, jax.dtypes.prng_key)
+        return f"{'PRNG keys' if key else 'an array'} of shape {shape}"
+    if type(value) in (list, tuple) and (array := real_array(value)) is not None:
+        return f"{with_article(type(value).__name__)} of shape {array.shape}"
+    return with_article(type(value).__name__)
+
+
+def with_article(noun: str) -> str:
+    """The noun with its article: "an EkfSlam", "a Motion", "a Unicycle", "an Unscented"."""
+    vowel = noun[:1] in "AEIOaeio" or (noun[:2] in ("Un", "un") and noun[2:3] != "i")
+    return f"{'an' if vowel or noun == 'ndarray' else 'a'} {noun}"
+
+
+def real_array(value: Any) -> Any:
+    """Real numbers as an array of their dtype; None of anything else."""
+    try:
+        if not hasattr(value, "dtype"):
+            value = np.asarray(value) if is_concrete(value) else jnp.asarray(value)
+    except (TypeError, ValueError):  # rows of unlike lengths, tracers beside text
+        return None
+    real = any(jnp.issubdtype(value.dtype, kind) for kind in (np.integer, np.floating))
+    return value if real else None

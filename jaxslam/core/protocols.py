@@ -19,11 +19,20 @@ from jax import Array
 from jaxtyping import Bool, Float, Int, PyTree
 
 from jaxslam.core._names import unfit_signature
-from jaxslam.core._noise import hold_noise
-from jaxslam.core._numbers import check_mount, held_array
-from jaxslam.core._record import record, set_field
+from jaxslam.core._record import Function, check_field, field, is_record, record, static
+from jaxslam.core.noise import Constant, NoiseCov
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, JaxOrNumPy, Log, Scan, Trace
+from jaxslam.core.validation import (
+    Check,
+    InvalidField,
+    covariance,
+    instance_of,
+    mounting_pose,
+    names,
+    or_none,
+    require,
+)
 from jaxslam.math import se2
 from jaxslam.math._arrays import (
     Control,
@@ -48,8 +57,8 @@ __all__ = [
     "Estimator",
     "Filter",
     "Free",
-    "Here",
     "Life",
+    "LinearizationPoint",
     "Linearizer",
     "Model",
     "Motion",
@@ -79,49 +88,73 @@ class Component:
         if "name" not in cls.__dict__ and not isinstance(getattr(cls, "name", None), property):
             cls.name = _lower(cls)
 
-    def __init__(self, *_: object, **__: object) -> None:  # a record has its own
-        raise ValueError(
-            f"{type(self).__name__}: expected @record above the class, of jaxslam.core.record"
+    def __init__(self, *_: object, **__: object) -> None:  # a record has a constructor of its own
+        raise InvalidField(
+            type(self).__name__, "", "expected @record above the class, of jaxslam.core.record"
         )
 
     def _check(self, base: type, methods: Mapping[str, str]) -> None:
-        """Check that a subclass of `base` is a record and defines methods of these parameters.
+        """Check that a subclass of `base` defines methods of these parameters.
 
         methods: the parameters of each by its name, "" where `verify` reports other ones.
         """
-        what = type(self).__name__
-        if "__dataclass_fields__" not in type(self).__dict__:
-            Component.__init__(self)
-        for name, taken in methods.items():
+        for name, parameters in methods.items():
             if getattr(type(self), name) is getattr(base, name):
-                raise ValueError(f"{what}: expected a method {name}")
-            got = unfit_signature(getattr(self, name), taken.count(",") + 1) if taken else None
-            if got is not None:
-                raise ValueError(f"{what}: expected {name} to take ({taken}), got {got}")
+                raise InvalidField(type(self).__name__, name, "expected a method, got none")
+            if not parameters:
+                continue
+            signature = unfit_signature(getattr(self, name), parameters.count(",") + 1)
+            if signature is not None:
+                reason = f"expected a method of ({parameters}), got one of {signature}"
+                raise InvalidField(type(self).__name__, name, reason)
 
     def _check_names(self, *fields: str) -> None:
-        """Check that these are tuples of names."""
+        """Check that fields are tuples of names."""
         for name in fields:
-            value = getattr(self, name, None)
-            if not isinstance(value, tuple) or not all(isinstance(one, str) for one in value):
-                raise ValueError(
-                    f'{type(self).__name__}: expected {name} to be a tuple of names as ("x [m]",), '
-                    f"got {value!r}"
-                )
+            check_field(self, name, names)
+
+
+@record
+class _CovarianceFunction(Function):
+    """A plain function that returns a covariance, which is checked where its numbers are known."""
+
+    owner: str = static()
+    """the class of the model"""
+    size: int = static()
+
+    def __call__(self, *arguments: Array) -> Array:
+        cov = require(self.owner, "noise_cov", self.function(*arguments), covariance(self.size))
+        return jnp.asarray(cov, arguments[0].dtype)
+
+
+def _noise_of(owner: str, size: int) -> Check:
+    """The check of a model's noise_cov (size, size), which it makes a record that can be called."""
+
+    def check(value: NoiseCov) -> object:
+        if is_record(value):
+            return value
+        if callable(value):
+            return _CovarianceFunction(value, owner, size)
+        return Constant(covariance(size)(value))
+
+    return check
 
 
 class Model(Component):
     """What motion models and sensors share: noise."""
 
-    def _check_model(self, base: type, methods: tuple[str, ...], names: tuple[str, ...]) -> None:
-        """Check a subclass of `base`, and make its noise_cov what can be called; the last of the
-        names is of what has noise."""
+    def _check_model(self, base: type, methods: tuple[str, ...], named: tuple[str, ...]) -> None:
+        """Check a subclass of `base`, and make its noise_cov a record that can be called.
+
+        named: the fields that are names of numbers; the last one names those that have noise.
+        """
         self._check(base, dict.fromkeys(methods, ""))
-        self._check_names(*names)
+        self._check_names(*named)
         if not hasattr(self, "noise_cov"):
-            raise ValueError(f"{type(self).__name__}: expected a field or a method noise_cov")
+            raise InvalidField(type(self).__name__, "noise_cov", "expected a field or a method")
         if "noise_cov" in self.__dict__:
-            hold_noise(self, len(getattr(self, names[-1])))
+            size = len(getattr(self, named[-1]))
+            check_field(self, "noise_cov", _noise_of(type(self).__name__, size))
 
 
 class Motion(Model):
@@ -213,20 +246,21 @@ class Sensor(Model):
 
     def __post_init__(self) -> None:
         self._check_model(Sensor, ("observe", "invert"), ("landmark", "measurements"))
-        for entry, limits in self.support.items():
+        check_field(self, "support", self._check_support)
+        if not isinstance(getattr(type(self), "free", None), property):
+            check_field(self, "free", instance_of(Free))
+        if "mount" in self.__dict__:
+            check_field(self, "mount", or_none(mounting_pose))
+
+    def _check_support(self, support: Mapping[str, tuple[float, float]]) -> Mapping[str, Any]:
+        for entry, limits in support.items():
             low, high = limits if np.shape(limits) == (2,) else (np.nan, np.nan)
             if entry not in self.measurements or not low < high:
                 raise ValueError(
-                    f"{type(self).__name__}: expected support as {{entry: (low, high)}} of "
-                    f"{', '.join(self.measurements)}, got {entry!r}: {limits!r}"
+                    f"expected {{entry: (low, high)}} of {', '.join(self.measurements)}, got "
+                    f"{entry!r}: {limits!r}"
                 )
-        free = self.__dict__.get("free", type(self).free)
-        if not isinstance(free, Free | property):
-            what = f"{type(self).__name__}: expected free to be a Free(mean, cov)"
-            raise ValueError(f"{what}, got {type(free).__name__}")
-        if self.mount is not None and "mount" in self.__dict__:
-            check_mount(type(self).__name__, self.mount)
-            set_field(self, "mount", held_array(self.mount))
+        return support
 
     def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
         """The measurement z of a landmark."""
@@ -262,6 +296,19 @@ class Sensor(Model):
 
     def _mount(self, pose: Pose) -> Pose:
         return jnp.asarray(self.mount, pose.dtype)
+
+    def scans(self, scan: Scan) -> "list[tuple[Sensor | None, Scan]]":
+        """The sensors of a suite in order, each with its scan; here this sensor with the scan.
+
+        Those of a suite are of landmarks of one size; None measures other robots. Raises ValueError
+        unless the scan has as many slots as the sensors together.
+        """
+        return [(self, scan)]
+
+    @property
+    def absolute(self) -> bool:
+        """Whether it measures the robot and no landmark (L = 0), as a compass."""
+        return not self.landmark
 
     @property
     def of_points(self) -> bool:
@@ -318,8 +365,28 @@ class Chart(Component):
         """The errors (dx, dl) with retract(pose0, l0, dx, dl) = (pose, l)."""
         raise NotImplementedError
 
+    def retract_pose(self, pose: Pose, dx: Pose) -> Pose:
+        """(3,) pose moved by errors dx (3,), which no landmark changes."""
+        ground = self._ground(pose)
+        return self.retract(pose, ground, dx, ground)[0]
 
-class Here(NamedTuple):
+    def local_pose(self, pose0: Pose, pose: Pose) -> Pose:
+        """The errors dx (3,) with retract_pose(pose0, dx) = pose."""
+        ground = self._ground(pose)
+        return self.local(pose0, ground, pose, ground)[0]
+
+    def pose_basis(self, pose: Pose) -> Float[Array, "3 3"]:
+        """The derivative of `retract_pose` at zero, of a chart with a `basis`."""
+        basis: Basis = self.basis(pose, self._ground(pose))
+        return basis.pose
+
+    def _ground(self, pose: Pose) -> Array:
+        """A landmark of zeros."""
+        size = 2 if self.landmark_size is None else self.landmark_size
+        return jnp.zeros(size, pose.dtype)
+
+
+class LinearizationPoint(NamedTuple):
     """The state at which a model is linearized, the input of a linearizer."""
 
     joint: Joint
@@ -328,7 +395,8 @@ class Here(NamedTuple):
     pose: Float[Array, "3"]
     """estimate of the robot"""
     cov: Array
-    """P in the chart: of the robot (3, 3), or for `observe` of robot and landmark (3+L, 3+L)"""
+    """P in the chart: of the robot (3, 3); for `observe` of robot and landmark (3+L, 3+L), or of
+    the robot alone where the landmark is known without an error"""
     slot: PyTree = None
     """() of the landmark, for `observe`"""
     landmark: PyTree = None
@@ -354,25 +422,33 @@ class Linearizer(Component):
     def __post_init__(self) -> None:
         self._check(
             Linearizer,
-            {"motion": "motion, u, here", "observe": "sensor, here", "invert": "s, z, tag, here"},
+            {
+                "motion": "motion, u, point",
+                "observe": "sensor, point",
+                "invert": "s, z, tag, point",
+            },
         )
 
     def init(self, pose: Pose, landmarks: Float[Array, "N L"]) -> PyTree:
         """The first memory, of a start with landmarks (N, L) zeros: arrays of fixed shape."""
         return ()
 
-    def motion(self, motion: Motion, u: Control, here: Here) -> tuple[Array, Array, Array, PyTree]:
+    def motion(
+        self, motion: Motion, u: Control, point: LinearizationPoint
+    ) -> tuple[Array, Array, Array, PyTree]:
         """The new pose, its derivative by the old one (3, 3), the covariance that the noise adds to
         it (3, 3), and the memory."""
         raise NotImplementedError
 
-    def observe(self, sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
+    def observe(
+        self, sensor: Sensor, point: LinearizationPoint
+    ) -> tuple[Array, Array, Array, Array]:
         """The predicted z, its derivatives by pose (Z, 3) and by l (Z, L), and a covariance (Z, Z)
         to add to that of the measurement noise."""
         raise NotImplementedError
 
     def invert(
-        self, sensor: Sensor, z: Measurement, tag: Int[Array, ""], here: Here
+        self, sensor: Sensor, z: Measurement, tag: Int[Array, ""], point: LinearizationPoint
     ) -> tuple[Array, Array, Array]:
         """The new l, its derivative by the pose (L, 3), its covariance for a known pose (L, L)."""
         raise NotImplementedError
@@ -538,16 +614,7 @@ class Filter(Component):
 class Wrapper(Filter):
     """A filter that holds another, and does as that one does unless it defines a method itself."""
 
-    filter: Filter
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.filter, Filter):
-            made = isinstance(self.filter, type)
-            got = (
-                f"the class {self.filter.__name__}: call it" if made else type(self.filter).__name__
-            )
-            raise ValueError(f"{type(self).__name__}: expected a filter, got {got}")
-        super().__post_init__()
+    filter: Filter = field(check=instance_of(Filter))
 
     @property
     def name(self) -> str:  # type: ignore[override]

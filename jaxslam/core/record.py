@@ -1,5 +1,16 @@
 """Records: frozen dataclasses whose numbers are leaves of a pytree."""
 
-from jaxslam.core._record import record, set_field, static
+from jaxslam._public import publish
+from jaxslam.core._record import (
+    Function,
+    check_field,
+    field,
+    function_of,
+    record,
+    set_field,
+    static,
+)
 
-__all__ = ["record", "set_field", "static"]
+__all__ = ["Function", "check_field", "field", "function_of", "record", "set_field", "static"]
+
+publish(__name__)

@@ -13,6 +13,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int, PyTree
 
 from jaxslam.core._reprs import short_repr
+from jaxslam.core.validation import InvalidField
 from jaxslam.math._linalg import cholesky, matmul, symmetrize, total, triangular_root
 from jaxslam.math._xla import CACHED, last_true_column, materialize, where_any
 
@@ -26,6 +27,7 @@ __all__ = [
     "remove",
     "robot_cov",
     "scatter",
+    "seen_before",
     "slot_mask",
 ]
 
@@ -98,6 +100,13 @@ def allocate(
     return last_true_column(rank_of_wish[:, None] == rank_of_slot[None, :])
 
 
+def seen_before(tag: Int[Array, "M"], among: Bool[Array, "M"]) -> Bool[Array, "M"]:
+    """Whether a tag (M,), if not negative, occurs earlier in the scan among the tags (M,)."""
+    earlier = jnp.tril(jnp.ones((tag.shape[0], tag.shape[0]), bool), -1)
+    same = (tag[:, None] == tag[None, :]) & (tag >= 0)[:, None] & among[None, :]
+    return (same & earlier).any(axis=1)
+
+
 def slot_mask(slot: Int[Array, "M"], on: Bool[Array, "M"], count: int) -> Bool[Array, "N"]:
     """Mask (count,) of the slots that occur in slot (M,) where on (M,)."""
     return jnp.zeros(count, bool).at[jnp.where(on, slot, count)].set(True, mode="drop")
@@ -158,6 +167,8 @@ def scatter(
     capacity = joint.landmarks.shape[0]
     if m == 0:
         return joint
+    # Stored: each of them is in many of the D² entries of P, and would be computed again for each.
+    landmarks, by_pose, own_cov = materialize((landmarks, by_pose, own_cov))
     # By slot: the index it is filled from.
     place, born = last_true_column(
         granted[None, :] & (slot[None, :] == jnp.arange(capacity, dtype=slot.dtype)[:, None])
@@ -168,13 +179,13 @@ def scatter(
         return jnp.where(mask, values[place], jnp.zeros_like(values[:1]))
 
     gain = of_slots(by_pose).reshape(capacity * size, 3)
-    own = of_slots(symmetrize(own_cov))
+    landmark_cov = of_slots(symmetrize(own_cov))
     if square_root:
-        own = jax.vmap(lambda cov: cholesky(cov)[0])(own)
+        landmark_cov = jax.vmap(lambda cov: cholesky(cov)[0])(landmark_cov)
     if len(joint.cov) <= CACHED:
-        cov = _add_in_one_pass(joint.cov, born, gain, own, square_root)
+        cov = _add_in_one_pass(joint.cov, born, gain, landmark_cov, square_root)
     else:
-        cov = _write_in_place(joint.cov, slot, granted, gain, own, square_root)
+        cov = _write_in_place(joint.cov, slot, granted, gain, landmark_cov, square_root)
     return joint._replace(
         landmarks=joint.landmarks + of_slots(landmarks),
         cov=cov,
@@ -196,19 +207,20 @@ def _add_in_one_pass(
     cov: Float[Array, "D D"],
     born: Bool[Array, "N"],
     gain: Float[Array, "E 3"],
-    own: Float[Array, "N L L"],
+    landmark_cov: Float[Array, "N L L"],
     square_root: bool,
 ) -> Float[Array, "D D"]:
     """The covariance with G P and blocks on the diagonal added to the zeros of padding."""
     # Padding's unit variance goes first, to an exact zero: a small covariance plus 1 would lose it.
-    filled = jnp.concatenate([jnp.zeros(3, bool), jnp.repeat(born, own.shape[1])])
+    filled = jnp.concatenate([jnp.zeros(3, bool), jnp.repeat(born, landmark_cov.shape[1])])
     half = cov[:3] if square_root else _half_of(cov, gain)
     cov = jnp.where(filled[:, None], 0.0, cov)
     cross = total(gain[:, k, None] * half[k, None, :] for k in range(3))
     if square_root:
-        return _add_blocks(cov.at[3:].add(cross), own)
+        return _add_blocks(cov.at[3:].add(cross), landmark_cov)
+    # Stored once: XLA would compute it again for its transpose, at each of the D² entries.
     cross = materialize(jnp.pad(cross, [(3, 0), (0, 0)]))
-    return _add_blocks(cov + (cross + cross.T), own)
+    return _add_blocks(cov + (cross + cross.T), landmark_cov)
 
 
 def _write_in_place(
@@ -216,31 +228,36 @@ def _write_in_place(
     slot: Int[Array, "m"],
     granted: Bool[Array, "m"],
     gain: Float[Array, "E 3"],
-    own: Float[Array, "N L L"],
+    landmark_cov: Float[Array, "N L L"],
     square_root: bool,
 ) -> Float[Array, "D D"]:
     """The same covariance, with the rows and columns of one new landmark after the other."""
-    size = own.shape[1]
+    size = landmark_cov.shape[1]
+    # Before the loop: the rows of the robot change as landmarks are written.
     half = materialize(cov[:3] if square_root else _half_of(cov, gain))
 
     def write(cov: jax.Array, slot: jax.Array, granted: jax.Array) -> jax.Array:
         first = 3 + slot * size
-        mine = jax.lax.dynamic_slice_in_dim(gain, slot * size, size)
-        rows = total(mine[:, k, None] * half[k, None, :] for k in range(3))
+        by_pose = jax.lax.dynamic_slice_in_dim(gain, slot * size, size)
+        rows = total(by_pose[:, k, None] * half[k, None, :] for k in range(3))
         if not square_root:
-            there = jax.lax.dynamic_slice_in_dim(half, first, size, axis=1)
-            rows = rows.at[:, 3:].add(total(there[k, :, None] * gain[None, :, k] for k in range(3)))
-        block = jax.lax.dynamic_slice_in_dim(rows, first, size, axis=1) + own[slot]
+            columns = jax.lax.dynamic_slice_in_dim(half, first, size, axis=1)
+            rows = rows.at[:, 3:].add(
+                total(columns[k, :, None] * gain[None, :, k] for k in range(3))
+            )
+        block = jax.lax.dynamic_slice_in_dim(rows, first, size, axis=1) + landmark_cov[slot]
+        # Stored, since the rows are written twice: as rows, and transposed as columns.
         rows = materialize(jax.lax.dynamic_update_slice_in_dim(rows, block, first, axis=1))
         for values, axis in ((rows, 0),) if square_root else ((rows, 0), (rows.T, 1)):
-            # A run of a batch in which this one is not granted gets back what it had.
-            was = jax.lax.dynamic_slice_in_dim(cov, first, size, axis)
-            values = jnp.where(granted, values, was)
+            # A run of a batch in which this landmark is not granted gets back what it had.
+            before = jax.lax.dynamic_slice_in_dim(cov, first, size, axis)
+            values = jnp.where(granted, values, before)
             cov = jax.lax.dynamic_update_slice_in_dim(cov, values, first, axis)
         return cov
 
-    def step(cov: jax.Array, one: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
-        return where_any(one[1], lambda cov: write(cov, *one), lambda cov: cov, cov), None
+    def step(cov: jax.Array, landmark: tuple[jax.Array, jax.Array]) -> tuple[jax.Array, None]:
+        _, granted = landmark
+        return where_any(granted, lambda cov: write(cov, *landmark), lambda cov: cov, cov), None
 
     return jax.lax.scan(step, cov, (slot, granted))[0]
 
@@ -262,10 +279,9 @@ def remove(joint: Joint, dead: Array, *, square_root: bool = False) -> Joint:
     Raises ValueError unless dead is bool, one for each slot.
     """
     if jnp.shape(dead) != joint.alive.shape or jnp.result_type(dead) != jnp.bool_:
-        raise ValueError(
-            f"remove: expected bool of shape {joint.alive.shape}, got {jnp.result_type(dead)} of "
-            f"{jnp.shape(dead)}"
-        )
+        got = f"{jnp.result_type(dead)} of {jnp.shape(dead)}"
+        reason = f"expected bool of shape {joint.alive.shape}, got {got}"
+        raise InvalidField("remove", "dead", reason)
     size = joint.landmarks.shape[1]
     keep = jnp.concatenate([jnp.ones(3, bool), jnp.repeat(~dead, size)])
     eye = jnp.eye(joint.cov.shape[0], dtype=joint.cov.dtype)
@@ -279,8 +295,8 @@ def remove(joint: Joint, dead: Array, *, square_root: bool = False) -> Joint:
         cov=cov,
         alive=joint.alive & ~dead,
         tag=jnp.where(dead, -1, joint.tag),
-        reduced=jax.tree.map(lambda was: was & ~dead, joint.reduced),
+        reduced=jax.tree.map(lambda is_point: is_point & ~dead, joint.reduced),
         co_observed=jax.tree.map(
-            lambda was: was & ~dead[:, None] & ~dead[None, :], joint.co_observed
+            lambda pairs: pairs & ~dead[:, None] & ~dead[None, :], joint.co_observed
         ),
     )

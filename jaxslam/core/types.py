@@ -15,10 +15,11 @@ from jax import Array
 from jaxtyping import Bool, Float, Int, PyTree
 from numpy.typing import ArrayLike
 
-from jaxslam.core._numbers import is_concrete
-from jaxslam.core._reprs import short_repr, text_of
+from jaxslam.core._reprs import describe, short_repr, text_of
 from jaxslam.core.logs import _streams as streams
 from jaxslam.core.logs import _tables as tables
+from jaxslam.core.validation import InvalidField
+from jaxslam.math._arrays import is_concrete
 from jaxslam.math._pose_covariances import covariance_faults
 
 __all__ = [
@@ -156,25 +157,29 @@ class Log(NamedTuple):
         moved = tables.columns_of(
             f"{name}: odometry",
             odometry,
-            lambda given: (tables.TIME, *tables.odometry_columns(controls, given)),
+            lambda columns: (tables.TIME, *tables.odometry_columns(controls, columns)),
         )
         parts = getattr(sensor, "parts", None)  # of a suite
-        given: list[tuple[str, PyTree, PyTree, int | None]] = []
+        sources: list[tuple[str, PyTree, PyTree, int | None]] = []
         if parts is None:
-            given = [(f"{name}: measurements", sensor, measurements, None)]
+            sources = [(f"{name}: measurements", sensor, measurements, None)]
         else:
             if not isinstance(measurements, Sequence) or len(measurements) != len(parts):
-                each = ", ".join(part.sensor.name for part in parts)
-                raise ValueError(
-                    f"{name}: measurements: expected a table for each of the {len(parts)} sensors "
-                    f"of the suite, ({each}), got {type(measurements).__name__}"
+                parts_text = ", ".join(part.sensor.name for part in parts)
+                raise InvalidField(
+                    name,
+                    "measurements",
+                    f"expected a table for each of the {len(parts)} sensors of the suite, "
+                    f"({parts_text}), got {describe(measurements)}",
                 )
             if any(part.sees == "robots" for part in parts):
-                raise ValueError(
-                    f"{name}: expected sensors of landmarks; of a team make the log of each robot "
-                    "by Log.from_streams, with the rows of all, and put them side by side"
+                raise InvalidField(
+                    name,
+                    "sensor",
+                    "expected sensors of landmarks; of a team make the log of each robot by "
+                    "Log.from_streams, with the rows of all, and put them side by side",
                 )
-            given = [
+            sources = [
                 (
                     f"{name}: measurements[{i}] of {part.sensor.name}",
                     part.sensor,
@@ -184,10 +189,10 @@ class Log(NamedTuple):
                 for i, (part, table) in enumerate(zip(parts, measurements, strict=True))
             ]
         seen = []
-        for what, model, table, places in given:
-            columns = tables.measurement_columns(model.measurements, model.landmark)
-            made = tables.columns_of(what, table, lambda _, columns=columns: columns)  # type: ignore[misc]
-            seen.append(tables.Seen(made, model.measurements, places))
+        for argument, model, source, places in sources:
+            names = tables.measurement_columns(model.measurements, model.landmark)
+            table = tables.columns_of(argument, source, lambda _, names=names: names)  # type: ignore[misc]
+            seen.append(tables.Seen(table, model.measurements, places))
         rows, tags, dropped = tables.align_tables(moved, seen, controls)
         return Recording(cls.from_rows(rows), rows.time, tags, dropped)
 
@@ -319,8 +324,8 @@ class Trace(NamedTuple):
             "pose_cov is not positive definite": faults.indefinite,
         }
         return tuple(
-            f"{what} in {int(bad.sum()):,} of {steps:,} steps"
-            for what, bad in counts.items()
+            f"{fault} in {int(bad.sum()):,} of {steps:,} steps"
+            for fault, bad in counts.items()
             if bad.any()
         )
 

@@ -1,14 +1,16 @@
 """Readers of public data sets, and of your data in CSV files (`table`); they return a `Dataset`.
 
 `READERS` has the readers by name, for the command line; each takes a path and, for a data set of
-several robots, the number of a robot.
+several robots, the number of a robot. `read_graph` and `write_graph` are for files of pose graphs.
 """
 
 from collections.abc import Callable
 
+from jaxslam._public import publish
 from jaxslam.core._names import Named
 from jaxslam.datasets._dataset import Adjustable, Dataset, Parameter
 from jaxslam.datasets._evaluation import Evaluation, MapTest, evaluate
+from jaxslam.datasets._g2o import read_graph, write_graph
 from jaxslam.datasets._landmark_logs.line_readers import bonn, victoria_park
 from jaxslam.datasets._landmark_logs.mrclam_reader import mrclam, mrclam_team
 from jaxslam.datasets._landmark_logs.mrclam_robot import MRCLAM_CALIBRATION, RobotCalibration
@@ -55,9 +57,13 @@ __all__ = [
     "mrclam",
     "mrclam_team",
     "plaza",
+    "read_graph",
     "relation_file",
     "rosbag",
     "rosbag_contents",
     "table",
     "victoria_park",
+    "write_graph",
 ]
+
+publish(__name__)

@@ -12,7 +12,7 @@ from jaxslam.core._validation import check_log
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import Log
 from jaxslam.filters._ekf.ekf_settings import EkfOptions
-from jaxslam.filters.multi_robot._team import Robot
+from jaxslam.filters.multi_robot.team import Robot
 from jaxslam.sensors._suite import Suite
 
 

@@ -1,4 +1,4 @@
-"""Reader and writer of graphs as files of g2o and TORO; see `graphs.read`, `graphs.write`."""
+"""Reader and writer of graphs as files of g2o and TORO."""
 
 import gzip
 from collections.abc import Sequence
@@ -8,7 +8,7 @@ from typing import NamedTuple
 import numpy as np
 
 from jaxslam.datasets._lines import TextFile
-from jaxslam.graphs._checks import check_numbers, indefinite
+from jaxslam.graphs._checks import check_numbers, is_indefinite
 from jaxslam.graphs._factor import REGISTRY
 from jaxslam.graphs._graph import Graph, Table
 from jaxslam.graphs.starts import odometry
@@ -26,6 +26,7 @@ class _Edge(NamedTuple):
     """row and column in Ω of each number"""
 
 
+# The order in which the formats write the entries of Ω.
 _BY_ROWS = ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2))
 _TORO_ORDER = ((0, 0), (0, 1), (1, 1), (2, 2), (0, 2), (1, 2))
 _POSE = ("x", "y", "theta")
@@ -59,9 +60,9 @@ class Format(NamedTuple):
 
     name: str
     vertices: dict[str, str]
-    """of "pose" and "point" """
+    """the kind of line of "pose" and "point" """
     edges: dict[str, str]
-    """by table"""
+    """the kind of line of each table"""
     fix: bool
     """whether a variable can be fixed"""
 
@@ -78,6 +79,7 @@ _ENDINGS = {".toro": TORO, ".graph": TORO}
 
 
 _LARGEST = 2**31 - 1
+"""The largest id: ids are int32."""
 
 
 class Loaded(NamedTuple):
@@ -99,8 +101,44 @@ class _Row(NamedTuple):
     numbers: list[float]
 
 
+def read_graph(path: str | Path) -> Graph:
+    """The graph in a file of g2o or TORO, packed by gzip or not; arrays are NumPy's, of float64.
+
+    The lines, their fields, and where they are in the graph:
+
+        VERTEX_SE2           id x y θ                                  poses
+        VERTEX2, VERTEX      id x y θ                                  poses (TORO)
+        VERTEX_XY            id x y                                    points
+        FIX                  ids                                       fixed_pose, fixed_point
+        EDGE_SE2             i j x y θ I11 I12 I13 I22 I23 I33         relative_pose
+        EDGE2, EDGE          a b f s r I_ff I_fs I_ss I_rr I_fr I_sr   relative_pose (TORO)
+        EDGE_PRIOR_SE2       i x y θ, and Ω as EDGE_SE2 has it         prior
+        EDGE_SE2_XY          i l x y I11 I12 I22                       relative_position
+        EDGE_BEARING_SE2_XY  i l bearing I11                           bearing
+
+    Poses and points are in the order of the file; the last five name tables. A line `EQUIV i j` of
+    TORO makes two vertices one: that of the smaller id stays with its pose and has the edges of
+    both, but for edges between them, which are left out.
+    Numbers are those of the file. Comments (`#`), scans (`ROBOTLASER1`), notes (`VERTEX_TAG`,
+    `VERTEX_ELLIPSE`) and offsets of sensors (`PARAMS_SE2OFFSET`, to which no edge that is read
+    refers) are skipped; the command `jaxslam optimize` counts them. In a file without vertices,
+    poses and points have the order of their ids and are placed along the edges, `starts.odometry`.
+    The cost of the graph is χ² = Σ eᵀ Ω e, with e from `graphs.REGISTRY` and without a factor ½.
+
+    Kümmerle et al. 2011, "g2o: A general framework for graph optimization", ICRA; Grisetti et al.
+    2007, "A tree parameterization for efficiently computing maximum likelihood maps using gradient
+    descent", RSS (TORO).
+
+    Raises:
+        ValueError: `path:line: reason` for an unknown or malformed line, a vertex that occurs
+            twice, an edge to a missing vertex or from one to itself, an information that is not
+            positive semidefinite, and equal vertices that are missing, or a pose and a point.
+    """
+    return load(path).graph
+
+
 def load(path: str | Path) -> Loaded:
-    """The graph in a file; see `graphs.read`."""
+    """The graph in a file, as of `read_graph`, and the changes made to it."""
     file = TextFile(path)
     vertices: dict[str, dict[int, list[float]]] = {"pose": {}, "point": {}}
     rows: dict[str, list[_Row]] = {}
@@ -114,7 +152,7 @@ def load(path: str | Path) -> Loaded:
             variable, names = _VERTICES[kind]
             file.expect(line, fields, ("id", *names))
             vertex = _identity(file, line, fields[0], "id")
-            if any(vertex in known for known in vertices.values()):
+            if any(vertex in named for named in vertices.values()):
                 raise file.error(line, f"vertex {vertex} occurs twice")
             vertices[variable][vertex] = file.numbers(line, fields[1:], names)
         elif kind == "FIX":
@@ -125,40 +163,40 @@ def load(path: str | Path) -> Loaded:
             file.expect(line, fields, ("i", "j"))
             equal.append((line, *(_identity(file, line, field, "id") for field in fields)))
         elif kind in _SKIPPED or kind.startswith("#"):
-            what = _SKIPPED.get(kind, "comments")
-            skipped[what] = skipped.get(what, 0) + 1
+            label = _SKIPPED.get(kind, "comments")
+            skipped[label] = skipped.get(label, 0) + 1
         else:
-            known = ", ".join([*_VERTICES, "FIX", "EQUIV", *EDGES])
-            raise file.error(line, f"unknown kind {kind!r}; known: {known}")
+            kinds = ", ".join([*_VERTICES, "FIX", "EQUIV", *EDGES])
+            raise file.error(line, f"unknown kind {kind!r}; known: {kinds}")
     if not rows:
         raise file.end_error("no edge in the file")
     if equal:
-        rows, fixed, merged = _merged(file, vertices, rows, fixed, equal)
+        rows, fixed, merged = _merge(file, vertices, rows, fixed, equal)
         skipped |= merged
         if not rows:
             raise file.end_error("no edge is left: all are within vertices that EQUIV merges")
     unplaced = not any(vertices.values())
     if unplaced:
-        vertices = _named_by_edges(file, rows)
-    graph = _assembled(file, vertices, rows, fixed)
+        vertices = _vertices_of_edges(file, rows)
+    graph = _assemble(file, vertices, rows, fixed)
     if not unplaced:
         return Loaded(graph, skipped, 0)
     try:
         return Loaded(odometry(graph), skipped, len(graph.poses) + len(graph.points))
     except ValueError as problem:
-        why = str(problem).removeprefix("odometry: ")
-        raise file.end_error(f"no vertices in the file to start from, and {why}") from problem
+        raise file.end_error(f"no vertices in the file to start from: {problem}") from problem
 
 
 def _identity(file: TextFile, line: int, field: str, name: str) -> int:
-    found = file.identity(line, field, name)
-    if found > _LARGEST:
+    """A field as an id; raises ValueError on another text, and on one above `_LARGEST`."""
+    identity = file.identity(line, field, name)
+    if identity > _LARGEST:
         raise file.error(line, f"{name} is above {_LARGEST}: {field}")
-    return found
+    return identity
 
 
 def _row(file: TextFile, line: int, edge: _Edge, fields: list[str]) -> _Row:
-    """The line of an edge; raises ValueError on a malformed one."""
+    """The row of an edge; raises ValueError on a malformed line."""
     names = (*"ij"[: len(edge.who)], *edge.measured, *(f"I{i + 1}{j + 1}" for i, j in edge.entries))
     file.expect(line, fields, names)
     count = len(edge.who)
@@ -168,7 +206,7 @@ def _row(file: TextFile, line: int, edge: _Edge, fields: list[str]) -> _Row:
     return _Row(line, edge, ids, file.numbers(line, fields[count:], names[count:]))
 
 
-def _merged(
+def _merge(
     file: TextFile,
     vertices: dict[str, dict[int, list[float]]],
     rows: dict[str, list[_Row]],
@@ -186,6 +224,7 @@ def _merged(
     parent: dict[int, int] = {}
 
     def smallest(vertex: int) -> int:
+        """The root of a vertex in the union-find forest, whose paths are halved on the way."""
         while (above := parent.get(vertex, vertex)) != vertex:
             parent[vertex] = vertex = parent.get(above, above)
         return vertex
@@ -216,11 +255,11 @@ def _merged(
     return (
         {key: table for key, table in kept.items() if table},
         [(line, smallest(vertex)) for line, vertex in fixed],
-        {what: count for what, count in counts.items() if count},
+        {label: count for label, count in counts.items() if count},
     )
 
 
-def _named_by_edges(
+def _vertices_of_edges(
     file: TextFile, rows: dict[str, list[_Row]]
 ) -> dict[str, dict[int, list[float]]]:
     """The vertices that edges name, at the origin, in the order of their ids."""
@@ -237,7 +276,7 @@ def _named_by_edges(
     }
 
 
-def _assembled(
+def _assemble(
     file: TextFile,
     vertices: dict[str, dict[int, list[float]]],
     rows: dict[str, list[_Row]],
@@ -249,10 +288,10 @@ def _assembled(
     }
     held = {kind: np.zeros(len(named), bool) for kind, named in vertices.items()}
     for line, vertex in fixed:
-        kinds = [kind for kind, known in index.items() if vertex in known]
-        if not kinds:
+        kind = next((kind for kind, named in index.items() if vertex in named), None)
+        if kind is None:
             raise file.error(line, f"vertex {vertex} is not defined in the file")
-        held[kinds[0]][index[kinds[0]][vertex]] = True
+        held[kind][index[kind][vertex]] = True
     return Graph(
         poses=np.array(list(vertices["pose"].values())).reshape(-1, 3),
         points=np.array(list(vertices["point"].values())).reshape(-1, 2),
@@ -271,13 +310,13 @@ def _table(file: TextFile, rows: list[_Row], index: dict[str, dict[int, int]]) -
     for row, matrix in zip(rows, information, strict=True):
         for vertex, kind in zip(row.ids, row.edge.who, strict=True):
             if vertex not in index[kind]:
-                elsewhere = any(vertex in known for known in index.values())
+                elsewhere = any(vertex in named for named in index.values())
                 why = f"is not a {kind}" if elsewhere else "is not defined in the file"
                 raise file.error(row.line, f"vertex {vertex} {why}")
         who.append([index[kind][v] for v, kind in zip(row.ids, row.edge.who, strict=True)])
         for (i, j), entry in zip(row.edge.entries, row.numbers[size:], strict=True):
             matrix[i, j] = matrix[j, i] = entry
-    bad = indefinite(information)
+    bad = is_indefinite(information)
     if bad.any():
         why = "the information is not positive semidefinite"
         if size == 3:
@@ -287,30 +326,51 @@ def _table(file: TextFile, rows: list[_Row], index: dict[str, dict[int, int]]) -
     return Table(np.array(who, np.int32), z, information, np.ones(len(rows), bool))
 
 
-def save(path: str | Path, graph: Graph) -> None:
-    """Write a graph as a file of g2o, or TORO by the file's ending; see `graphs.write`."""
+def write_graph(path: str | Path, graph: Graph) -> None:
+    """Write a graph as a file that `read_graph` reads as the same graph, number by number.
+
+    The format is g2o; in a file that ends in .toro or .graph it is TORO, which has lines for poses
+    and relative poses. A file that ends in .gz, after that, is packed by gzip.
+
+    Poses, points, the tables in their order, then `FIX`, at which GTSAM's reader stops. Rows that
+    are not valid are left out. A table "name/part" is written as the table "name", and read as
+    part of it.
+
+    Raises:
+        ValueError: before anything is written, on data without a line in the format: in TORO
+            points, fixed poses, and tables other than relative poses; in g2o tables that
+            `read_graph` does not name and points of other than two numbers. In both on an id of
+            both a pose and a point, and on what `read_graph` refuses: ids twice or below zero,
+            numbers that are not finite, and informations that are not symmetric and positive
+            semidefinite.
+    """
     if not isinstance(graph, Graph):
-        raise ValueError(f"write: expected a path and a Graph, got a {type(graph).__name__}")
+        raise ValueError(f"write_graph: expected a path and a Graph, got a {type(graph).__name__}")
     path = Path(path)
     packed = path.suffix == ".gz"
     ending = path.with_suffix("").suffix if packed else path.suffix
     text = text_of(graph, _ENDINGS.get(ending, _G2O))
-    _check_readable(graph)
+    ids = np.concatenate([np.asarray(graph.pose_id), np.asarray(graph.point_id)])
+    if (ids < 0).any():
+        raise ValueError(f"write_graph: expected ids >= 0, got {ids.min()}")
+    factors = {key: REGISTRY[key.split("/")[0]] for key in graph.tables}
+    check_numbers("write_graph", graph, factors)
 
+    # Without the time, so that equal graphs give equal files.
     content = gzip.compress(text.encode("utf-8"), mtime=0) if packed else text
     write_files(path.parent, {path.name: content})
 
 
 def text_of(graph: Graph, form: Format = _G2O) -> str:
-    """The graph in a format; raises ValueError as `graphs.write` does."""
+    """The text of a graph in a format; raises ValueError as `write_graph` does."""
     _check_writable(graph, form)
     ids = {"pose": np.asarray(graph.pose_id), "point": np.asarray(graph.point_id)}
     values = {"pose": np.asarray(graph.poses), "point": np.asarray(graph.points)}
     held = {"pose": np.asarray(graph.fixed_pose), "point": np.asarray(graph.fixed_point)}
     lines = [
-        _line(name, [one], row)
+        _line(name, [vertex], row)
         for kind, name in form.vertices.items()
-        for one, row in zip(ids[kind], values[kind], strict=True)
+        for vertex, row in zip(ids[kind], values[kind], strict=True)
     ]
     for key, table in graph.tables.items():
         name = form.edges[key.split("/")[0]]
@@ -323,47 +383,39 @@ def text_of(graph: Graph, form: Format = _G2O) -> str:
         names = np.stack([ids[kind][who[:, k]] for k, kind in enumerate(edge.who)], axis=1)
         lines += [_line(name, *row) for row in zip(names, numbers, strict=True)]
     # Last: GTSAM's readG2o stops at a line that does not begin with two numbers, as `FIX 0` does.
-    lines += [f"FIX {one}" for kind in form.vertices for one in ids[kind][held[kind]]]
+    lines += [f"FIX {vertex}" for kind in form.vertices for vertex in ids[kind][held[kind]]]
     return "\n".join(lines) + "\n"
-
-
-def _check_readable(graph: Graph) -> None:
-    """Raise ValueError on a graph that `read` refuses."""
-    ids = np.concatenate([np.asarray(graph.pose_id), np.asarray(graph.point_id)])
-    if (ids < 0).any():
-        raise ValueError(f"graphs.write: expected ids >= 0, got {ids.min()}")
-    known = {key: REGISTRY[key.split("/")[0]] for key in graph.tables}
-    check_numbers("graphs.write", graph, known)
 
 
 def _check_writable(graph: Graph, form: Format) -> None:
     """Raise ValueError on a graph that the format cannot represent."""
     if len(both := np.intersect1d(graph.pose_id, graph.point_id)):
         raise ValueError(
-            f"graphs.write: {both[0]} is the id of a pose and of a point, which {form.name} does "
+            f"write_graph: {both[0]} is the id of a pose and of a point, which {form.name} does "
             "not allow"
         )
     if len(graph.points) and "point" not in form.vertices:
         raise ValueError(
-            f"graphs.write: {form.name} has no line for points, and the graph has "
+            f"write_graph: {form.name} has no line for points, and the graph has "
             f"{len(graph.points)}"
         )
     if len(graph.points) and graph.points.shape[1] != 2:
         raise ValueError(
-            f"graphs.write: expected points (x, y), got {graph.points.shape[1]} numbers"
+            f"write_graph: expected points (x, y), got {graph.points.shape[1]} numbers"
         )
     held = np.asarray(graph.pose_id)[np.asarray(graph.fixed_pose)]
     if len(held) and not form.fix:
         raise ValueError(
-            f"graphs.write: {form.name} has no line for fixed poses, and pose {held[0]} is fixed"
+            f"write_graph: {form.name} has no line for fixed poses, and pose {held[0]} is fixed"
         )
     for key in graph.tables:
         if key.split("/")[0] not in form.edges:
             raise ValueError(
-                f"graphs.write: {form.name} has no line for table {key!r}; it has some for "
+                f"write_graph: {form.name} has no line for table {key!r}; it has some for "
                 f"{', '.join(form.edges)}"
             )
 
 
 def _line(kind: str, ids: Sequence[int], numbers: np.ndarray) -> str:
+    """A line of a file; `repr` of a float64 is read as the same number."""
     return " ".join([kind, *map(str, ids), *map(repr, np.asarray(numbers, float).tolist())])

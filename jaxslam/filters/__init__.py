@@ -1,7 +1,8 @@
 """Filters: recursive estimators, all of type `Filter`."""
 
+from jaxslam._public import publish
 from jaxslam.core.protocols import Filter, Wrapper
-from jaxslam.filters._delayed.delayed_settings import Hypotheses, Promotion, StoredMeasurements
+from jaxslam.filters._delayed.delayed_filter import Hypotheses, Promotion, StoredMeasurements
 from jaxslam.filters._delayed.delayed_slam import DelayedSlam
 from jaxslam.filters._ekf.compressed_ekf_slam import CompressedEkfSlam
 from jaxslam.filters._ekf.ekf_settings import EkfOptions
@@ -66,3 +67,5 @@ __all__ = [
     "whole_information",
     "with_extra",
 ]
+
+publish(__name__)

@@ -1,11 +1,12 @@
 """`Status` and `Info` of the measurements of a scan, for all filters."""
 
-from typing import NamedTuple
+from typing import NamedTuple, Protocol
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import PyTree
 
+from jaxslam.core.protocols import Association
 from jaxslam.core.types import Info, Scan, Status
 
 Mask = jax.Array | None
@@ -42,18 +43,18 @@ def status_of(
     | new, none of these: no slot is free | OVERFLOW |
     | neither matched nor new | UNMATCHED |
 
-    A singular S is SINGULAR whatever the gate, since d² = νᵀ S⁻¹ ν needs S⁻¹. A measurement
-    without a finite value is REJECTED by `run` before a filter
-    sees it, and one that concerns a robot without a pose in the map is UNMATCHED (`TeamSlam`).
+    A singular S is SINGULAR for any gate, since d² = νᵀ S⁻¹ ν needs S⁻¹. A measurement without a
+    finite value is REJECTED by `run` before a filter processes it, and one that concerns a robot
+    without a pose in the map is UNMATCHED (`TeamSlam`).
 
     Args:
         valid: mask of the measurements of the scan.
-        matched: association found its landmark (or it is of an absolute sensor); wins over new.
-        positive: S is positive definite, alone and with those of the scan that are fused with it,
-            and so is whatever the filter needs to compute S.
+        matched: the measurement has a landmark (or is of an absolute sensor); wins over new.
+        positive: S is positive definite, alone and together with all that are fused at once, and
+            so is every matrix from which the filter computes S.
         inside: d² is finite and at most the gate. Any value where S is not positive definite.
-        new: association found it to be of no landmark.
-        repeated, granted, deferred, stored, singular: outcomes of a new one.
+        new: the measurement has no landmark in the map.
+        repeated, granted, deferred, stored, singular: outcomes of a new measurement.
     """
     no = jnp.zeros_like(valid)
     matched, new = no if matched is None else matched, no if new is None else new
@@ -63,17 +64,17 @@ def status_of(
     if inside is not None:
         cases.append((matched & ~inside, Status.REJECTED))
     cases.append((matched, Status.FUSED))
-    fates = (
+    outcomes = (
         (repeated, Status.REPEATED),
         (granted, Status.BORN),
         (deferred, Status.DEFERRED),
         (stored, Status.SIGHTED),
         (singular, Status.SINGULAR),
     )
-    cases += [(new & mask, status) for mask, status in fates if mask is not None]
+    cases += [(new & mask, status) for mask, status in outcomes if mask is not None]
     cases.append((new, Status.OVERFLOW))
-    where, status = zip(*cases, strict=True)
-    return jnp.select(list(where), list(status), Status.UNMATCHED).astype(jnp.int32)
+    masks, statuses = zip(*cases, strict=True)
+    return jnp.select(list(masks), list(statuses), Status.UNMATCHED).astype(jnp.int32)
 
 
 def info_of(
@@ -93,25 +94,25 @@ def info_of(
     """The `Info` of M measurements with these statuses, zeros where a number does not apply.
 
     Args:
-        status: (M,) as of `status_of`.
+        status: (M,), from `status_of`.
         matched: (M,) bool: measurements that were compared with their landmark.
-        size: Z, or (M,) int, which dof is where fused.
-        slot: (M,) of the landmark matched.
-        born: (M,) of the landmark started; default none is.
-        nis, innovation, innovation_cov: (M,), (M, Z), (M, Z, Z) of those matched; nis counts
-            where `has_distance`.
-        log_likelihood: () of the scan.
+        size: Z, the dof of a fused measurement, or (M,) int.
+        slot: (M,), slot of the matched landmark.
+        born: (M,), slot of the new landmark; default: there is none.
+        nis, innovation, innovation_cov: (M,), (M, Z), (M, Z, Z) of the matched measurements; nis
+            counts where `has_distance`.
+        log_likelihood: (), of the scan.
         exhausted, extra: as in `Info`.
     """
     fused = status == Status.FUSED
     none = jnp.full_like(status, -1)
-    started = none if born is None else jnp.where(status == Status.BORN, born, none)
+    initialized = none if born is None else jnp.where(status == Status.BORN, born, none)
     return Info(
         nis=jnp.where(has_distance(status), nis, 0.0),
         dof=jnp.where(fused, size, 0).astype(jnp.int32),
         innovation=jnp.where(matched[:, None], innovation, 0.0),
         innovation_cov=jnp.where(matched[:, None, None], innovation_cov, 0.0),
-        slot=jnp.where(fused, slot, started).astype(jnp.int32),
+        slot=jnp.where(fused, slot, initialized).astype(jnp.int32),
         status=status,
         log_likelihood=log_likelihood,
         exhausted=exhausted,
@@ -119,8 +120,69 @@ def info_of(
     )
 
 
+class NewLandmarks(NamedTuple):
+    """The outcome of the measurements without a landmark in the map, (M,) each."""
+
+    slot: jax.Array
+    """of the landmark, where granted"""
+    granted: jax.Array
+    """a landmark was started"""
+    deferred: jax.Array
+    """beyond `births`"""
+    repeated: jax.Array
+    """of a tag that occurs earlier in the scan"""
+
+
+class Innovations(Protocol):
+    """The innovations of M measurements against the prior, (M,) and more axes."""
+
+    @property
+    def innovation(self) -> jax.Array: ...
+    @property
+    def innovation_cov(self) -> jax.Array: ...
+    @property
+    def nis(self) -> jax.Array: ...
+    @property
+    def log_likelihood(self) -> jax.Array: ...
+    @property
+    def inside(self) -> jax.Array: ...
+    @property
+    def positive(self) -> jax.Array: ...
+
+
+def report_scan(
+    scan: Scan,
+    association: Association,
+    matched: jax.Array,
+    innovations: Innovations,
+    new: NewLandmarks | None = None,
+) -> Info:
+    """The `Info` of the measurements of one sensor; new is None where no landmark starts."""
+    outcome = {} if new is None else {"new": association.is_new, **new._asdict()}
+    born = outcome.pop("slot", None)
+    status = status_of(
+        scan.valid,
+        matched=matched,
+        positive=innovations.positive,
+        inside=innovations.inside,
+        **outcome,
+    )
+    return info_of(
+        status,
+        matched,
+        size=scan.z.shape[1],
+        slot=association.slot,
+        born=born,
+        nis=innovations.nis,
+        innovation=innovations.innovation,
+        innovation_cov=innovations.innovation_cov,
+        log_likelihood=innovations.log_likelihood.sum(),
+        exhausted=jnp.asarray(association.exhausted),
+    )
+
+
 def has_distance(status: jax.Array) -> jax.Array:
-    """Whether a measurement was fused or rejected, and so has a squared distance, (M,) bool."""
+    """Mask (M,) of the measurements with a squared distance: those fused or rejected."""
     return (status == Status.FUSED) | (status == Status.REJECTED)
 
 
@@ -141,9 +203,11 @@ def nothing_of(scan: Scan) -> Info:
 
 
 def joined_info(infos: list[Info], size_z: int) -> Info:
-    """The `Info` of several scans joined; innovations and covariances zero-padded to size_z."""
+    """The `Info` of the scans of several sensors, padded with zeros to innovations of size_z."""
+    if len(infos) == 1:
+        return infos[0]
 
-    def together(name: str, padded_axes: int = 0) -> jax.Array:
+    def join(name: str, padded_axes: int = 0) -> jax.Array:
         values = [getattr(info, name) for info in infos]
         wide = [
             jnp.pad(value, [(0, 0)] + [(0, size_z - value.shape[-1])] * padded_axes)
@@ -152,22 +216,15 @@ def joined_info(infos: list[Info], size_z: int) -> Info:
         return jnp.concatenate(wide)
 
     return Info(
-        nis=together("nis"),
-        dof=together("dof"),
-        innovation=together("innovation", 1),
-        innovation_cov=together("innovation_cov", 2),
-        slot=together("slot"),
-        status=together("status"),
+        nis=join("nis"),
+        dof=join("dof"),
+        innovation=join("innovation", 1),
+        innovation_cov=join("innovation_cov", 2),
+        slot=join("slot"),
+        status=join("status"),
         log_likelihood=jnp.stack([info.log_likelihood for info in infos]).sum(),
         exhausted=jnp.stack([jnp.asarray(info.exhausted) for info in infos]).any(),
     )
-
-
-def seen_before(tag: jax.Array, among: jax.Array) -> jax.Array:
-    """Whether the same non-negative tag occurs earlier in the scan, (M,)."""
-    earlier = jnp.tril(jnp.ones((tag.shape[0], tag.shape[0]), bool), -1)
-    same = (tag[:, None] == tag[None, :]) & (tag >= 0)[:, None] & among[None, :]
-    return (same & earlier).any(axis=1)
 
 
 def with_extra(info: Info, name: str, record: PyTree) -> Info:
@@ -186,11 +243,11 @@ class Pruned(NamedTuple):
     """(N,) bool: slots whose landmark was removed in this step"""
 
     def counts(self) -> dict[str, jax.Array]:
-        """What a campaign counts."""
+        """The counts of a campaign."""
         return {"removed": self.removed}
 
 
 def with_removed(info: Info, removed: jax.Array) -> Info:
-    """The `Info` with slots removed (N,) bool added to those it marks already."""
+    """The `Info` with the slots removed (N,) bool added to those marked before."""
     before = (info.extra or {}).get("pruning", Pruned(jnp.zeros_like(removed)))
     return with_extra(info, "pruning", Pruned(before.removed | removed))

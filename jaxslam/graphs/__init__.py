@@ -4,6 +4,7 @@ The cost of a graph is χ² = Σ eᵀ Ω e over the valid rows of its tables, wi
 relative pose e = Z⁻¹ ∘ (Xᵢ⁻¹ ∘ Xⱼ) as (x, y, θ wrapped), without a logarithm.
 """
 
+from jaxslam._public import publish
 from jaxslam.graphs import starts
 from jaxslam.graphs._checks import check_graph, with_gauge
 from jaxslam.graphs._covariances import Marginals, marginals
@@ -18,7 +19,7 @@ from jaxslam.graphs._factor import (
     RelativePoseLog,
     RelativePosition,
 )
-from jaxslam.graphs._graph import Graph, Table, read, with_loops_apart, write
+from jaxslam.graphs._graph import Graph, Table, with_loops_apart
 from jaxslam.graphs._log import of_log
 from jaxslam.graphs._optimality import Certificate, certificate
 from jaxslam.graphs._optimizer import chi2, degrees_of_freedom, optimize, squared_residuals
@@ -64,10 +65,10 @@ __all__ = [
     "of_log",
     "optimize",
     "plan",
-    "read",
     "squared_residuals",
     "starts",
     "with_gauge",
     "with_loops_apart",
-    "write",
 ]
+
+publish(__name__)

@@ -1,4 +1,4 @@
-"""What a graph must be before it is solved; each error is a line that names row or variable."""
+"""Checks of a graph before it is solved; each error is a line that names the row or variable."""
 
 from collections.abc import Mapping
 from typing import NamedTuple
@@ -24,24 +24,23 @@ class Parts(NamedTuple):
     """The connected parts of a graph; variables are the N poses, then the P points."""
 
     part: Int[np.ndarray, "V"]
-    """of each variable, from 0"""
+    """the part of each variable, from 0"""
     anchored: Bool[np.ndarray, "parts"]
     """whether a part has a gauge: a fixed pose, two fixed points or a measurement of one pose
     alone"""
     free: Bool[np.ndarray, "parts"]
-    """whether a part has a variable that is not fixed: only then it needs a gauge"""
+    """whether a part has a variable that is not fixed, and so needs a gauge"""
 
 
 def check_graph(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None:
     """Raise ValueError, which begins with a caller's name, unless a graph can be solved.
 
     Refused are tables without a factor or of other sizes than their factor's, arrays of another
-    kind than `Graph` and `Table` say, numbers that are not
-    finite, an id twice, a measurement of a variable out of range or of one variable twice, an
-    information that is not symmetric or not positive semidefinite, no measurement at all, and parts
-    that neither a fixed variable nor a measurement of one pose holds in place: a disconnected
-    graph, or no gauge. A measurement of zero information joins nothing. Within a trace only what
-    shapes tell is checked.
+    kind than `Graph` and `Table` say, numbers that are not finite, an id twice, a measurement of a
+    variable out of range or of one variable twice, an information that is not symmetric or not
+    positive semidefinite, no measurement at all, and parts that neither a fixed variable nor a
+    measurement of one pose holds in place: a disconnected graph, or no gauge. A measurement of zero
+    information joins nothing. Within a trace only shapes are checked.
     """
     _check_shapes(name, graph)
     for key, table in graph.tables.items():
@@ -59,15 +58,25 @@ def check_graph(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None:
 
 
 def check_numbers(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None:
-    """Raise ValueError on what `check_graph` refuses of the variables and rows of a concrete graph,
-    whatever holds it in place."""
-    _check_variables(name, graph)
+    """Raise ValueError on variables and rows of a concrete graph that `check_graph` refuses.
+
+    The gauge is not checked.
+    """
+    kinds = (("pose", graph.poses, graph.pose_id), ("point", graph.points, graph.point_id))
+    for kind, values, ids in kinds:
+        ids = np.asarray(ids)
+        bad = ~np.isfinite(np.asarray(values)).all(axis=1)
+        if bad.any():
+            raise ValueError(f"{name}: {kind} {ids[bad.argmax()]} is not finite")
+        unique, count = np.unique(ids, return_counts=True)
+        if (count > 1).any():
+            raise ValueError(f"{name}: {kind} {unique[count.argmax()]} occurs twice")
     for key, table in graph.tables.items():
         _check_rows(name, graph, key, table, factors[key])
 
 
 def _parts_of(graph: Graph, factors: Mapping[str, Factor]) -> Parts:
-    """The connected parts of a graph, and which have a gauge.
+    """The connected parts of a graph, and whether each has a gauge.
 
     A row whose information is zero neither joins its variables nor holds one.
     """
@@ -98,40 +107,47 @@ def variables_in(graph: Graph, table: Table, factor: Factor) -> Int[np.ndarray, 
     return np.asarray(np.asarray(table.who)[np.asarray(table.valid)] + np.array(shift, int))
 
 
-def indefinite(information: Float[np.ndarray, "E R R"]) -> Bool[np.ndarray, "E"]:
-    """Which informations are not positive semidefinite, beyond the rounding of a file."""
+def is_indefinite(information: Float[np.ndarray, "E R R"]) -> Bool[np.ndarray, "E"]:
+    """Whether each information is not positive semidefinite, beyond the rounding of a file."""
     return definite.indefinite(information, _DIGITS, _DIGITS)
 
 
 def label(graph: Graph, variable: int) -> str:
-    """A variable, counted as in `Parts`, by its kind and id."""
+    """The kind and id of a variable, counted as in `Parts`: "pose 7"."""
     poses = len(graph.poses)
     if variable < poses:
         return f"pose {int(graph.pose_id[variable])}"
     return f"point {int(graph.point_id[variable - poses])}"
 
 
-def _check_sizes(what: str, table: Table, factor: Factor) -> None:
+def _check_sizes(prefix: str, table: Table, factor: Factor) -> None:
+    """Raise ValueError, which begins with a prefix, on arrays of other sizes than the factor's."""
     rows = np.shape(table.who)[0]
     k, z, r = (len(part) for part in (factor.variables, factor.measurements, factor.errors))
     wanted = {"who": (rows, k), "z": (rows, z), "information": (rows, r, r), "valid": (rows,)}
     for field, shape in wanted.items():
         if (got := np.shape(getattr(table, field))) != shape:
-            raise ValueError(f"{what}: expected {field} of shape {shape}, got {got}")
-    _check_kind(what, who=(table.who, np.integer), valid=(table.valid, np.bool_))
+            raise ValueError(f"{prefix}: expected {field} of shape {shape}, got {got}")
+    _check_kind(prefix, who=(table.who, np.integer), valid=(table.valid, np.bool_))
 
 
-def _check_kind(what: str, **values: tuple[JaxOrNumPy, type]) -> None:
-    """Raise ValueError on arrays of another kind of number; those without entries are as good."""
+def _check_kind(prefix: str, **values: tuple[JaxOrNumPy, type]) -> None:
+    """Raise ValueError, which begins with a prefix, on arrays of another kind of number.
+
+    An array without entries may be of any kind.
+    """
     for field, (value, kind) in values.items():
         if not hasattr(value, "dtype"):
-            raise ValueError(f"{what}: expected {field} to be an array, got {type(value).__name__}")
+            raise ValueError(
+                f"{prefix}: expected {field} to be an array, got {type(value).__name__}"
+            )
         if np.size(value) and not jnp.issubdtype(value.dtype, kind):
             expected = "bool" if kind is np.bool_ else "integers"
-            raise ValueError(f"{what}: expected {field} of {expected}, got {value.dtype}")
+            raise ValueError(f"{prefix}: expected {field} of {expected}, got {value.dtype}")
 
 
 def _check_shapes(name: str, graph: Graph) -> None:
+    """Raise ValueError on poses and points of other shapes and kinds than `Graph` says."""
     poses, points = np.shape(graph.poses), np.shape(graph.points)
     if len(poses) != 2 or poses[1] != 3 or len(points) != 2:
         raise ValueError(f"{name}: expected poses (N, 3) and points (P, L), got {poses}, {points}")
@@ -152,19 +168,8 @@ def _check_shapes(name: str, graph: Graph) -> None:
     )
 
 
-def _check_variables(name: str, graph: Graph) -> None:
-    kinds = (("pose", graph.poses, graph.pose_id), ("point", graph.points, graph.point_id))
-    for kind, values, ids in kinds:
-        names = np.asarray(ids)
-        bad = ~np.isfinite(np.asarray(values)).all(axis=1)
-        if bad.any():
-            raise ValueError(f"{name}: {kind} {names[bad.argmax()]} is not finite")
-        found, count = np.unique(names, return_counts=True)
-        if (count > 1).any():
-            raise ValueError(f"{name}: {kind} {found[count.argmax()]} occurs twice")
-
-
 def _check_rows(name: str, graph: Graph, key: str, table: Table, factor: Factor) -> None:
+    """Raise ValueError on the first bad row of a table."""
     valid, who = np.asarray(table.valid), np.asarray(table.who)
     z, information = np.asarray(table.z), np.asarray(table.information)
     for k, kind in enumerate(factor.variables):
@@ -176,9 +181,9 @@ def _check_rows(name: str, graph: Graph, key: str, table: Table, factor: Factor)
                 f"{name}: {key}, row {row}: {kind} index {who[row, k]} is out of "
                 f"range: the graph has {count} {kind}s"
             )
-    of = variables_in(graph, table, factor)
+    variables = np.sort(variables_in(graph, table, factor), axis=1)
     twice = np.zeros(len(valid), bool)
-    twice[valid] = (np.sort(of, axis=1)[:, 1:] == np.sort(of, axis=1)[:, :-1]).any(axis=1)
+    twice[valid] = (variables[:, 1:] == variables[:, :-1]).any(axis=1)
     finite = np.isfinite(information).all(axis=(1, 2))
     clean = np.where(finite[:, None, None], information, 0.0)
     for bad, why in (
@@ -186,16 +191,18 @@ def _check_rows(name: str, graph: Graph, key: str, table: Table, factor: Factor)
         (~np.isfinite(z).all(axis=1), "z is not finite"),
         (~finite, "the information is not finite"),
         (definite.asymmetric(clean, _DIGITS), "the information is not symmetric"),
-        (indefinite(clean), "the information is not positive semidefinite"),
+        (is_indefinite(clean), "the information is not positive semidefinite"),
     ):
         if (bad & valid).any():
             row = int((bad & valid).argmax())
-            here = variables_in(graph, table._replace(valid=np.arange(len(valid)) == row), factor)
-            between = ", ".join(label(graph, int(variable)) for variable in here[0])
+            alone = table._replace(valid=np.arange(len(valid)) == row)
+            involved = variables_in(graph, alone, factor)[0]
+            between = ", ".join(label(graph, int(variable)) for variable in involved)
             raise ValueError(f"{name}: {key}, row {row} ({between}): {why}")
 
 
 def _check_gauge(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None:
+    """Raise ValueError on a part of a graph that nothing holds in place."""
     parts = _parts_of(graph, factors)
     loose = np.flatnonzero(~parts.anchored & parts.free)
     if not len(loose):
@@ -218,11 +225,10 @@ def _check_gauge(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None
 def with_gauge(graph: Graph, factors: Mapping[str, Factor] | None = None) -> Graph:
     """The graph with a pose fixed, if no variable is and no measurement is of one pose alone.
 
-    It is the pose of the lowest id, of the largest part where the graph is disconnected. A graph
+    It is the pose of the lowest id, in the largest part where the graph is disconnected. A graph
     that has a gauge is returned as it is: the same object.
     """
-    known = factors_of("graphs.with_gauge", graph, factors)
-    parts = _parts_of(graph, known)
+    parts = _parts_of(graph, factors_of("graphs.with_gauge", graph, factors))
     if not len(graph.poses) or parts.anchored.any():
         return graph
     fixed = np.asarray(graph.fixed_pose).copy()

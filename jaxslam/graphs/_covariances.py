@@ -18,8 +18,8 @@ from jaxslam.graphs._solver.batch import (
     LEAST,
     cut,
     graph_in_one_dtype,
+    original_number,
     over_batch,
-    own_number,
     padded_graph,
     padded_number,
 )
@@ -35,7 +35,7 @@ class Marginals(NamedTuple):
     """Covariances of a graph's variables, zero for fixed ones; leading axes by `vmap`."""
 
     poses: Float[Array, "N 3 3"]
-    """of (x, y, θ), in world coordinates as the poses themselves"""
+    """covariance of (x, y, θ), in world coordinates like the poses"""
     points: Float[Array, "P L L"]
     pairs: Float[Array, "Q 2 2 d d"]
     """the joint covariance of each pair by its two variables, d = max(3, L); rows and columns that
@@ -55,9 +55,9 @@ def marginals(
 ) -> Marginals:
     """The covariances (Σ Jᵀ ρ' Ω J)⁻¹ of all poses and points of a graph, and of pairs of them.
 
-    J and the weights ρ' of robust kernels are those of the solution: a row that a kernel leaves out
-    does not count. The inverse is computed where the Cholesky factor has blocks (`sparse.inverse`),
-    and at the pairs.
+    J and the weights ρ' of robust kernels are taken from the solution: a row that a kernel leaves
+    out does not count. The inverse is computed where the Cholesky factor has blocks
+    (`selected_inverse`), and at the pairs.
 
     Args:
         solution: of `optimize`. Outside of a trace its graph is checked. Of a graph as it is:
@@ -80,28 +80,6 @@ def marginals(
         )
     model = model_of(caller, solution.graph, factors)
     check_graph(caller, solution.graph, model.factors)
-    graph = _weighted_tables(solution)
-    wanted = checked_pairs(caller, pairs, len(graph.poses) + len(graph.points))
-    if plan is None and is_concrete(graph):
-        more = padded_graph(graph, room)
-        rows = np.zeros((padded_size(max(len(wanted), 4 * room), LEAST), 2), int)
-        rows[: len(wanted)] = padded_number(wanted, graph, more)
-        plan = plan_for(caller, more, model.factors, None, marginals=True, pairs=rows, room=room)
-        whole: Marginals = _marginals(model, more, plan)
-        poses, points, pairs = cut(whole[:3], (graph.poses, graph.points, wanted))
-        found = Marginals(poses, points, pairs, own_number(whole.singular, graph, more))
-    else:
-        plan = plan_for(caller, graph, model.factors, plan, marginals=True, pairs=wanted)
-        found = _marginals(model, graph, plan)
-    if is_concrete(found.singular) and np.ndim(found.singular) == 0 and found.singular >= 0:
-        raise ValueError(
-            f"{caller}: the measurements do not determine {label(graph, int(found.singular))}"
-        )
-    return found
-
-
-def _weighted_tables(solution: Solution) -> Graph:
-    """The graph of a solution, each information multiplied by the weight of its row."""
     array = np.asarray if is_concrete(solution) else jnp.asarray  # no program for each shape
     tables = {
         name: table._replace(
@@ -109,7 +87,27 @@ def _weighted_tables(solution: Solution) -> Graph:
         )
         for name, table in solution.graph.tables.items()
     }
-    return solution.graph._replace(tables=tables)
+    graph = solution.graph._replace(tables=tables)
+    wanted = checked_pairs(caller, pairs, len(graph.poses) + len(graph.points))
+    covariances: Marginals
+    if plan is None and is_concrete(graph):
+        padded = padded_graph(graph, room)
+        rows = np.zeros((padded_size(max(len(wanted), 4 * room), LEAST), 2), int)
+        rows[: len(wanted)] = padded_number(wanted, graph, padded)
+        plan = plan_for(caller, padded, model.factors, None, marginals=True, pairs=rows, room=room)
+        covariances = _marginals(model, padded, plan)
+        poses, points, blocks = cut(covariances[:3], (graph.poses, graph.points, wanted))
+        singular = original_number(covariances.singular, graph, padded)
+        covariances = Marginals(poses, points, blocks, singular)
+    else:
+        plan = plan_for(caller, graph, model.factors, plan, marginals=True, pairs=wanted)
+        covariances = _marginals(model, graph, plan)
+    singular = covariances.singular
+    if is_concrete(singular) and np.ndim(singular) == 0 and singular >= 0:
+        raise ValueError(
+            f"{caller}: the measurements do not determine {label(graph, int(singular))}"
+        )
+    return covariances
 
 
 @partial(jax.jit, inline=True)
@@ -118,7 +116,7 @@ def _marginals(model: Model, graph: Graph, plan: Plan) -> Marginals:
 
 
 def _invert(model: Model, plan: Plan, graph: Graph) -> Marginals:
-    """Of graphs with a last axis B."""
+    """The covariances of graphs with a last axis B."""
     assert plan.inverse is not None
     data, variables = data_of(graph, plan.column), variables_of(graph)
     system = linearize(model, plan, variables, data)
@@ -127,8 +125,8 @@ def _invert(model: Model, plan: Plan, graph: Graph) -> Marginals:
     diagonal = blocks[plan.inverse.diagonal[plan.column]]  # by variable
     diagonal = _mask(diagonal, *[data.free[plan.column]] * 2)
     poses, size = len(graph.poses), graph.points.shape[1]
-    width = data.free.shape[1]
-    turn = _turns(graph, width)
+    # From increments in the frame of a pose to world coordinates.
+    turn = _turns(graph, data.free.shape[1])
     diagonal = by_transposed(by(turn, diagonal), turn)
     first, second = plan.pairs[:, 0], plan.pairs[:, 1]
     cross = blocks[plan.inverse.pairs]
@@ -136,6 +134,7 @@ def _invert(model: Model, plan: Plan, graph: Graph) -> Marginals:
     cross = jnp.where(turned, jnp.swapaxes(cross, 1, 2), cross)
     cross = _mask(cross, data.free[plan.column[first]], data.free[plan.column[second]])
     cross = by_transposed(by(turn[first], cross), turn[second])
+    # (Q, 2, 2, d, d, B)
     joint = jnp.stack(
         [
             jnp.stack([diagonal[first], cross], axis=1),
@@ -156,6 +155,7 @@ def _invert(model: Model, plan: Plan, graph: Graph) -> Marginals:
 def _mask(
     blocks: Float[Array, "k d d B"], rows: Bool[Array, "k d B"], columns: Bool[Array, "k d B"]
 ) -> Float[Array, "k d d B"]:
+    """The blocks, zero where a row or a column is not estimated."""
     return jnp.where(rows[:, :, None] & columns[:, None], blocks, 0.0)
 
 
@@ -163,7 +163,7 @@ def _turns(graph: Graph, width: int) -> Float[Array, "n d d B"]:
     """The derivative of each variable by its increments: R(θ) for the position of a pose."""
     poses, points, batch = len(graph.poses), len(graph.points), graph.poses.shape[-1]
     unit = jnp.eye(width, dtype=graph.poses.dtype)[None, ..., None]
-    every = jnp.broadcast_to(unit, (poses + points, width, width, batch))
+    units = jnp.broadcast_to(unit, (poses + points, width, width, batch))
     cos, sin = jnp.cos(graph.poses[:, 2]), jnp.sin(graph.poses[:, 2])
-    turn = jnp.stack([jnp.stack([cos, -sin], axis=1), jnp.stack([sin, cos], axis=1)], axis=1)
-    return every.at[:poses, :2, :2].set(turn)
+    rotation = jnp.stack([jnp.stack([cos, -sin], axis=1), jnp.stack([sin, cos], axis=1)], axis=1)
+    return units.at[:poses, :2, :2].set(rotation)

@@ -1,6 +1,6 @@
 """Factors: the residual of a measurement between variables of a graph.
 
-And the chordal residuals of some, where a heading is cosine and sine, not an angle.
+Some have chordal residuals besides, where a heading is cosine and sine, not an angle.
 """
 
 from collections.abc import Callable
@@ -17,6 +17,7 @@ from jaxslam.math import se2
 from jaxslam.math.angles import sin_cos, wrap
 
 Rows = list[list[list[Array]]]
+"""∂r/∂(p, u) of each variable as lists [variable][residual][number] of arrays (E, B)."""
 
 
 class Chordal(NamedTuple):
@@ -25,30 +26,37 @@ class Chordal(NamedTuple):
     residual: Callable[[tuple[Array, ...], Array], Array]
     """(variables, z) -> r (S,), on one row"""
     size: int
-    """S: two of the position, then those of the heading"""
+    """S: two residuals of the position, then two or none of the heading"""
     rows: Callable[[Array], Rows] | None
     """(z) -> ∂r/∂(p, u) of each variable; None of a prior, which is left out of the cost"""
 
 
-def _pose_error(variables: tuple[Array, ...], z: Array) -> Array:
+def _chordal_pose(variables: tuple[Array, ...], z: Array) -> Array:
+    """The error of position in the frame of z, and exp(iθ) - 1 of its angle θ."""
     e = se2.between(z, se2.between(*variables))
     return jnp.stack([e[0], e[1], jnp.cos(e[2]) - 1.0, jnp.sin(e[2])])
 
 
-def _point_error(variables: tuple[Array, ...], z: Array) -> Array:
+def _chordal_point(variables: tuple[Array, ...], z: Array) -> Array:
+    """The error of position in the frame of the pose."""
     return se2.to_frame(variables[0], variables[1][:2]) - z
 
 
-def _no_error(variables: tuple[Array, ...], z: Array) -> Array:
+def _chordal_prior(variables: tuple[Array, ...], z: Array) -> Array:
+    """Zero: the chordal cost is without priors."""
     return jnp.zeros(1, z.dtype)
 
 
 def _pose_rows(z: Array) -> Rows:
-    """The ∂r/∂(p, u) of both poses, r = (p_j - p_i - t u_i, u_j - exp(iφ) u_i), (4, 4) each."""
+    """The derivatives ∂r/∂(p, u) of both poses, r = (p_j - p_i - t u_i, u_j - exp(iφ) u_i).
+
+    Products are of complex numbers: t = x + iy of z, φ its angle.
+    """
     o, i = jnp.zeros_like(z[:, 0]), jnp.ones_like(z[:, 0])
     x, y, c, s = z[:, 0], z[:, 1], jnp.cos(z[:, 2]), jnp.sin(z[:, 2])
-    one = [[-i, o, -x, y], [o, -i, -y, -x], [o, o, -c, s], [o, o, -s, -c]]
-    return [one, [[i, o, o, o], [o, i, o, o], [o, o, i, o], [o, o, o, i]]]
+    by_first = [[-i, o, -x, y], [o, -i, -y, -x], [o, o, -c, s], [o, o, -s, -c]]
+    by_second = [[i, o, o, o], [o, i, o, o], [o, o, i, o], [o, o, o, i]]
+    return [by_first, by_second]
 
 
 def _point_rows(z: Array) -> Rows:
@@ -56,9 +64,9 @@ def _point_rows(z: Array) -> Rows:
     return [rows[:2] for rows in _pose_rows(jnp.concatenate([z, jnp.zeros_like(z[:, :1])], axis=1))]
 
 
-_RELATIVE_POSE = Chordal(_pose_error, 4, _pose_rows)
-_RELATIVE_POSITION = Chordal(_point_error, 2, _point_rows)
-PRIOR = Chordal(_no_error, 1, None)
+_RELATIVE_POSE = Chordal(_chordal_pose, 4, _pose_rows)
+_RELATIVE_POSITION = Chordal(_chordal_point, 2, _point_rows)
+PRIOR = Chordal(_chordal_prior, 1, None)
 
 
 POSE = ("x [m]", "y [m]", "theta [rad]")
@@ -75,19 +83,19 @@ class Factor(Component):
     variables: tuple[str, ...]
     """the kind of each variable, "pose" or "point", in the order of `Table.who`; its length is K"""
     measurements: tuple[str, ...]
-    """what z holds, with units; its length is Z"""
+    """the entries of z, with units; its length is Z"""
     errors: tuple[str, ...]
     """the entries of the residual, with units; its length is R"""
     jacobians: Any = None
     """(variables, z) -> by the coordinates of each variable, (R, 3) or (R, L); hand-derived, to
     verify against"""
     predict: Any = None
-    """(first variable, z) -> the second of two, where the residual is zero: what `starts` places
-    variables with; None where z does not tell it"""
+    """(first variable, z) -> the second, where the residual is zero, for `starts`; None where z
+    does not determine it"""
     whiten: Any = None
     """(variables, z) -> W (R, R), for noise that depends on the variables: taken at each iterate,
-    and held while its step is computed and judged. The information of the table is then that of
-    W e; None where it is that of e"""
+    and held while its step is computed and judged. The information of the table is then the inverse
+    covariance of W e; None where it is the inverse covariance of e"""
     chordal: Chordal | None = None
     """the residual where a heading is cosine and sine, by which `certificate` bounds the cost; None
     where there is none"""
@@ -113,7 +121,7 @@ def _between(a: Array, b: Array) -> Array:
 
 
 class BetweenPoses(Factor):
-    """What factors of a relative pose share: z is the second pose in the frame of the first."""
+    """The base of factors of a relative pose: z is the second pose in the frame of the first."""
 
     variables = ("pose", "pose")
     measurements = errors = POSE
@@ -208,8 +216,8 @@ class Bearing(Factor):
 class FromSensor(Factor):
     """The factor of a sensor: e = z ⊖ h(x, l), `sensor.residual(z, sensor.observe(x, l))`.
 
-    With an absolute sensor (L = 0) the pose is the only variable. What z does not determine of a
-    landmark, `predict` takes from the mean of `sensor.free`. The name is that of the sensor.
+    With an absolute sensor (L = 0) the pose is the only variable. `predict` takes parameters of a
+    landmark that z does not determine from the mean of `sensor.free`. The name is the sensor's.
 
     With own_noise the noise of a row is R(ẑ) of the sensor at the prediction ẑ of each iterate,
     held: the optimum is where the sum of Hᵀ R(ẑ)⁻¹ (z ⊖ ẑ) and of the other rows' terms is zero. At
@@ -221,7 +229,7 @@ class FromSensor(Factor):
 
     sensor: Sensor
     own_noise: bool = static(default=False, kw_only=True)
-    """the information of the table is that of R(ẑ)^{-1/2} e, the identity, and not that of e"""
+    """the information of the table is for R(ẑ)^{-1/2} e, the identity, and not for e"""
 
     def __post_init__(self) -> None:
         _check_model("FromSensor", "sensor", self.sensor, Sensor)
@@ -265,8 +273,8 @@ class FromSensor(Factor):
         return self.sensor.invert(pose, z, jnp.asarray(self.sensor.free.mean, z.dtype))
 
 
-class _OfMotion(Factor):
-    """What factors of a motion model between two poses share: z is the control."""
+class _MotionFactor(Factor):
+    """The base of factors of a motion model between two poses: z is the control."""
 
     variables = ("pose", "pose")
     motion: Motion
@@ -288,16 +296,16 @@ class _OfMotion(Factor):
 
 
 @record
-class FromMotion(_OfMotion):
+class FromMotion(_MotionFactor):
     """The factor of a motion model between two poses: the noise w that leads from one to the other.
 
         e = w with step(x, u, w) = x', z = u
 
-    The cost wᵀ Q⁻¹ w is that of `smoothing.BatchMap`. The pose error of the nominal motion with
-    the covariance G Q Gᵀ, G = ∂step/∂w at w = 0, is the same to first order in w, and exactly
-    where step is affine in w; its optimum is another elsewhere. w is found by Newton's method from
+    `smoothing.BatchMap` has the same cost wᵀ Q⁻¹ w. The pose error of the nominal motion, with the
+    covariance G Q Gᵀ, G = ∂step/∂w at w = 0, is equal to it to first order in w, and exactly where
+    step is affine in w; elsewhere its optimum is another. w is found by Newton's method from
     w = 0: ten steps without derivatives, then two with them, whose error is of the fourth order in
-    a change of the poses, so derivatives up to the third are those of w. Where ∂step/∂w is
+    a change of the poses, so derivatives up to the third are exact. Where ∂step/∂w is
     singular (a robot at rest, with `Odometry`) no step is made.
 
     Raises ValueError unless the noise has three components, which the two poses determine; see
@@ -321,16 +329,18 @@ class FromMotion(_OfMotion):
     def residual(self, variables: tuple[Array, ...], z: Array) -> Array:
         first, second = variables
         held, *still = jax.lax.stop_gradient((self, first, second, z))
+        # The ten steps have no derivatives, which two further ones from their end have.
         w = jax.lax.fori_loop(0, 10, lambda _, w: held._newton(w, *still), jnp.zeros(3, z.dtype))
         w = jax.lax.stop_gradient(w)
         return self._newton(self._newton(w, first, second, z), first, second, z)
 
     def _newton(self, w: Array, first: Array, second: Array, u: Array) -> Array:
-        """A step of Newton's method."""
+        """The noise after a step of Newton's method on miss(w) = 0."""
 
         def miss(w: Array) -> Array:
             return se2.between(second, self.motion.step(first, u, w))
 
+        # M⁻¹ miss by the adjugate of M, whose rows are a, b, c: its determinant is a · (b × c).
         a, b, c = jax.jacfwd(miss)(w)
         adjugate = jnp.stack([jnp.cross(b, c), jnp.cross(c, a), jnp.cross(a, b)], axis=1)
         volume = a @ adjugate[:, 0]
@@ -340,7 +350,7 @@ class FromMotion(_OfMotion):
 
 
 @record
-class NominalMotion(_OfMotion):
+class NominalMotion(_MotionFactor):
     """The factor of a motion model between two poses: the error of the motion without noise.
 
         e = step(x, u, 0)⁻¹ ∘ x', z = u
@@ -358,6 +368,7 @@ class NominalMotion(_OfMotion):
 
 
 def _check_model(name: str, field: str, value: object, kind: type) -> None:
+    """Raise ValueError unless a field of a factor is a model, e.g. on a class of models."""
     if not isinstance(value, kind):
         got = type(value).__name__
         if isinstance(value, type):

@@ -22,8 +22,8 @@ from jaxslam.math import se2
 from jaxslam.sensors._suite import Suite, Wrapped
 
 _STILL = 1e-9
-"""∂step/∂w with columns of length one and a determinant below this, or below its rounding in
-float32, is singular."""
+"""The determinant of ∂step/∂w, with columns of length one, below which it is singular; in float32
+ten eps, its rounding."""
 
 
 def of_log(
@@ -37,7 +37,7 @@ def of_log(
     tags: ArrayLike | None = None,
     capacity: int | None = None,
 ) -> tuple[Graph, dict[str, Factor]]:
-    """The graph of a log of T steps, and its factors: its optimum is that of `BatchMap`.
+    """The graph of a log of T steps, and its factors: `BatchMap` has the same optimum.
 
     Its tables, their factors, and the number of their rows:
 
@@ -53,8 +53,8 @@ def of_log(
     A noise of other than three components is not determined by two poses. Then, and where `slack` s
     is given, the factor of the motion is `NominalMotion` with Ω = (G Q Gᵀ + s² I)⁻¹. With fewer
     components (`Unicycle`, `Increment`, `Ackermann`) the motion is a constraint, which s > 0, the
-    standard deviation of each coordinate [m, m, rad], makes soft: the optimum differs from that of
-    `BatchMap` by the order of s², and the condition of the problem is worse by s⁻².
+    standard deviation of each coordinate [m, m, rad], makes soft: its optimum and the one of
+    `BatchMap` differ by the order of s², and the condition of the problem is worse by s⁻².
 
     With `capacity` a tag is the number of its point, and all shapes are known, so that logs may be
     traced and batched; points that no scan saw are fixed at the origin. Without, the points are the
@@ -69,7 +69,7 @@ def of_log(
         pose, pose_cov: (3,) and (3, 3) of the robot before the first control; zero fixes it.
         slack: see above.
         tags: (T, M) identities from an association, -1 where a measurement is left out; by default
-            those of the scans, which must be known.
+            the tags of the scans, which must be known.
         capacity: number of points.
     Raises:
         ValueError: on models, a log or a covariance that do not fit, and at the row where a motion
@@ -82,12 +82,17 @@ def of_log(
         raise ValueError(
             f"{name}: expected one sensor of landmarks that stay what they are, got {sensor.name}"
         )
+    if slack is not None and not 0 <= slack < np.inf:
+        raise ValueError(f"{name}: expected slack to be a finite number >= 0, got {slack}")
+    if not slack and len(motion.noises) < 3:
+        raise ValueError(
+            f"{name}: {motion.name} has {len(motion.noises)} noises, which do not move the pose in "
+            "all directions: give slack, the standard deviation of a soft constraint, as slack=1e-3"
+        )
     exact = len(motion.noises) == 3 and slack is None
-    _check_slack(name, motion, slack)
-    of_motion = FromMotion(motion) if exact else NominalMotion(motion)
-    varies = _noise_varies(sensor)
-    of_sensor = FromSensor(sensor, own_noise=varies)
-    factors: dict[str, Factor] = {"motion": of_motion, "sensor": of_sensor}
+    motion_factor = FromMotion(motion) if exact else NominalMotion(motion)
+    sensor_factor = FromSensor(sensor, own_noise=_has_varying_noise(sensor))
+    factors: dict[str, Factor] = {"motion": motion_factor, "sensor": sensor_factor}
     validation.check_covariance(f"{name}: pose_cov", pose_cov, 3)
     size_u, size_z = len(motion.controls), len(sensor.measurements)
     validation.check_log(name, log, control_size=size_u, measurement_size=size_z)
@@ -95,19 +100,19 @@ def of_log(
         raise ValueError(f"{name}: expected a pose of shape (3,), got {np.shape(pose)}")
     if is_concrete(pose) and not np.isfinite(np.asarray(pose)).all():
         raise ValueError(f"{name}: the pose is not finite")
-    known = is_concrete(pose_cov) and not np.any(np.asarray(pose_cov))
+    fixed = is_concrete(pose_cov) and not np.any(np.asarray(pose_cov))
     index, valid, ids = _points_of(name, log, sensor, tags, capacity)
     arguments = jnp.asarray(pose), jnp.asarray(pose_cov), index, valid, ids
     soft = None if exact else np.asarray(slack or 0.0)
-    graph, noise = _graph_of(motion, of_sensor, known, log, *arguments, soft)
-    _check_noise(name, noise, motion, sensor, valid, known)
-    if not known:
+    graph, regular = _graph_of(motion, sensor_factor, fixed, log, *arguments, soft)
+    _check_noise(name, regular, motion, sensor, valid, fixed)
+    if not fixed:
         factors["prior"] = Prior()
     return graph, factors
 
 
-class _Noise(NamedTuple):
-    """Which covariances can be inverted."""
+class _Regular(NamedTuple):
+    """Whether each covariance can be inverted."""
 
     prior: Bool[Array, ""]
     motion: Bool[Array, "T"]
@@ -116,30 +121,19 @@ class _Noise(NamedTuple):
     """whether the noise moves the pose in all directions"""
 
 
-def _noise_varies(sensor: Sensor) -> bool:
-    """Whether R may depend on z."""
+def _has_varying_noise(sensor: Sensor) -> bool:
+    """Whether R may depend on z: the noise of the innermost sensor is no constant."""
     while isinstance(sensor, Wrapped) and type(sensor).noise_cov is Wrapped.noise_cov:
         sensor = sensor.sensor
     return not isinstance(sensor.noise_cov, Constant)
-
-
-def _check_slack(name: str, motion: Motion, slack: float | None) -> None:
-    """Raise ValueError on a slack that is negative or lacking."""
-    if slack is not None and not 0 <= slack < np.inf:
-        raise ValueError(f"{name}: expected slack to be a finite number >= 0, got {slack}")
-    if not slack and len(motion.noises) < 3:
-        raise ValueError(
-            f"{name}: {motion.name} has {len(motion.noises)} noises, which do not move the pose in "
-            "all directions: give slack, the standard deviation of a soft constraint, as slack=1e-3"
-        )
 
 
 def _points_of(
     name: str, log: Log, sensor: Sensor, tags: ArrayLike | None, capacity: int | None
 ) -> tuple[JaxOrNumPy, JaxOrNumPy, Int[np.ndarray, "P"]]:
     """The point of each measurement, whether it is used, and the tags of the points."""
-    given = log.scan.tag if tags is None else tags
-    array: JaxOrNumPy = given if isinstance(given, Array) else np.asarray(given)
+    tag = log.scan.tag if tags is None else tags
+    array: JaxOrNumPy = tag if isinstance(tag, Array) else np.asarray(tag)
     valid = log.scan.valid
     if not sensor.landmark:
         return log.scan.tag * 0, valid, np.zeros(0, np.int32)
@@ -167,18 +161,18 @@ def _points_of(
         validation.check_count(f"{name}: capacity", capacity)
         used = valid & (array >= 0)
         return array * used, used, np.arange(capacity, dtype=np.int32)
-    here = np.asarray(valid) & (np.asarray(array) >= 0)
-    ids = np.unique(np.asarray(array)[here]).astype(np.int32)
+    tagged = np.asarray(valid) & (np.asarray(array) >= 0)
+    ids = np.unique(np.asarray(array)[tagged]).astype(np.int32)
     if not len(ids):
         raise ValueError(f"{name}: the log has no measurement of a landmark")
-    return np.where(here, np.searchsorted(ids, array), 0).astype(np.int32), here, ids
+    return np.where(tagged, np.searchsorted(ids, array), 0).astype(np.int32), tagged, ids
 
 
-@partial(jax.jit, static_argnames="known", inline=True)
+@partial(jax.jit, static_argnames="fixed", inline=True)
 def _graph_of(
     motion: Motion,
     factor: FromSensor,
-    known: bool,
+    fixed: bool,
     log: Log,
     pose: Float[Array, "3"],
     pose_cov: Float[Array, "3 3"],
@@ -186,10 +180,14 @@ def _graph_of(
     valid: Bool[Array, "T M"],
     ids: Int[Array, "P"],
     slack: Float[Array, ""] | None,
-) -> tuple[Graph, _Noise]:
-    """The graph, each measurement at the point of its index. known: the first pose is fixed.
+) -> tuple[Graph, _Regular]:
+    """The graph, each measurement at the point of its index.
 
-    slack: None for the exact factor of the motion.
+    Args:
+        motion, factor, log, pose, pose_cov: the models and the data, as of `of_log`.
+        fixed: the first pose is fixed, and has no prior.
+        index, valid, ids: of `_points_of`.
+        slack: None for the exact factor of the motion.
     """
     sensor, kind = factor.sensor, jnp.result_type(log.control, log.scan.z)
     control, pose = log.control.astype(kind), pose.astype(kind)
@@ -201,25 +199,27 @@ def _graph_of(
         return after, after
 
     path = jnp.concatenate([pose[None], jax.lax.scan(move, pose, control)[1]])
-    of_motion = jax.vmap(motion.noise_cov)(path[:-1], control)
+    motion_cov = jax.vmap(motion.noise_cov)(path[:-1], control)
     by_noise = jax.vmap(lambda x, u: motion_jacobians(motion, x, u)[1])(path[:-1], control)
     moving = jnp.ones(len(control), bool)
     if slack is None:
-        moving = _moving(by_noise)
+        moving = _has_full_rank(by_noise)
     else:
-        of_motion = jax.vmap(_local, (0, 0, 0, None))(path[1:], by_noise, of_motion, slack)
-    of_sensor = jax.vmap(jax.vmap(sensor.noise_cov))(z)
+        over_steps = jax.vmap(_pose_noise, (0, 0, 0, None))
+        motion_cov = over_steps(path[1:], by_noise, motion_cov, slack)
+    sensor_cov = jax.vmap(jax.vmap(sensor.noise_cov))(z)
     # The prior's error is rotated into the frame of its mean, as the factor needs it.
     turned = jnp.eye(3, dtype=kind).at[:2, :2].set(se2.rotation(pose[2]))
-    q, q_regular = jax.vmap(_information)(of_motion)
-    r, r_regular = jax.vmap(jax.vmap(_information))(of_sensor)
+    q, q_regular = jax.vmap(_information)(motion_cov)
+    r, r_regular = jax.vmap(jax.vmap(_information))(sensor_cov)
     if factor.own_noise:
         r = jnp.broadcast_to(jnp.eye(r.shape[-1], dtype=kind), r.shape)
     p, p_regular = _information(turned.T @ pose_cov.astype(kind) @ turned)
-    points, seen = _place_poses(sensor, path[1:], z, index, valid, ids.shape[0])
+    points, seen = _place_points(sensor, path[1:], z, index, valid, ids.shape[0])
 
     count = jnp.arange(path.shape[0], dtype=jnp.int32)
     rows = jnp.repeat(count[1:], valid.shape[1])
+    # T·M rows: (T, M, …) becomes (T·M, …).
     who = [rows, index.reshape(-1).astype(rows.dtype)] if sensor.landmark else [rows]
     size = z.shape[2]
     tables = {
@@ -233,14 +233,14 @@ def _graph_of(
             valid.reshape(-1),
         ),
     }
-    if not known:
+    if not fixed:
         first = jnp.zeros((1, 1), count.dtype)
         tables["prior"] = Table(first, path[:1], p[None], jnp.ones(1, bool))
-    graph = Graph(path, points, tables, (count == 0) & known, ~seen, count, ids)
-    return graph, _Noise(p_regular, q_regular, r_regular, moving)
+    graph = Graph(path, points, tables, (count == 0) & fixed, ~seen, count, ids)
+    return graph, _Regular(p_regular, q_regular, r_regular, moving)
 
 
-def _local(
+def _pose_noise(
     pose: Float[Array, "3"],
     by_noise: Float[Array, "3 W"],
     noise_cov: Float[Array, "W W"],
@@ -249,12 +249,11 @@ def _local(
     """The noise covariance G Q Gᵀ + s² I of a motion, in the frame of the pose that it led to."""
     turned = jnp.eye(3, dtype=pose.dtype).at[:2, :2].set(se2.rotation(pose[2]))
     local = turned.T @ by_noise
-    return local @ noise_cov @ local.T + slack.astype(pose.dtype) ** 2 * jnp.eye(
-        3, dtype=pose.dtype
-    )
+    soft = slack.astype(pose.dtype) ** 2 * jnp.eye(3, dtype=pose.dtype)
+    return local @ noise_cov @ local.T + soft
 
 
-def _moving(by_noise: Float[Array, "T 3 3"]) -> Bool[Array, "T"]:
+def _has_full_rank(by_noise: Float[Array, "T 3 3"]) -> Bool[Array, "T"]:
     """Whether matrices are regular, for any lengths of their columns."""
     length = jnp.linalg.norm(by_noise, axis=1, keepdims=True)
     a, b, c = jnp.moveaxis(by_noise / jnp.where(length > 0, length, 1.0), 2, 0)
@@ -268,7 +267,7 @@ def _information(cov: Float[Array, "R R"]) -> tuple[Float[Array, "R R"], Bool[Ar
     return linalg.symmetrize(inverse), regular
 
 
-def _place_poses(
+def _place_points(
     sensor: Sensor,
     path: Float[Array, "T 3"],
     z: Float[Array, "T M Z"],
@@ -276,44 +275,45 @@ def _place_poses(
     valid: Bool[Array, "T M"],
     count: int,
 ) -> tuple[Float[Array, "P L"], Bool[Array, "P"]]:
-    """Each point by its first measurement, and whether it has one."""
+    """The place of each point by its first measurement, and whether it has one."""
     size = len(sensor.landmark)
     if count == 0:
         return jnp.zeros((0, size), z.dtype), jnp.zeros(0, bool)
     mean = jnp.asarray(sensor.free.mean, z.dtype)
-    places, total = index.shape[1], index.size
+    # The first measurement of each point, as a number in (T, M) flattened; `total` without one.
+    slots, total = index.shape[1], index.size
     order = jnp.where(valid, jnp.arange(total).reshape(index.shape), total).reshape(-1)
     first = jnp.full(count, total).at[index.reshape(-1)].min(order)
     seen = first < total
     row = jnp.where(seen, first, 0)
     flat = z.reshape(total, -1)
-    found = jax.vmap(lambda x, one: sensor.invert(x, one, mean))(path[row // places], flat[row])
-    return jnp.where(seen[:, None], found, 0.0), seen
+    places = jax.vmap(lambda x, z: sensor.invert(x, z, mean))(path[row // slots], flat[row])
+    return jnp.where(seen[:, None], places, 0.0), seen
 
 
 def _check_noise(
-    name: str, noise: _Noise, motion: Motion, sensor: Sensor, valid: JaxOrNumPy, known: bool
+    name: str, regular: _Regular, motion: Motion, sensor: Sensor, valid: JaxOrNumPy, fixed: bool
 ) -> None:
     """Raise ValueError where a covariance has no inverse, if the values are concrete."""
-    if not is_concrete((noise, valid)):
+    if not is_concrete((regular, valid)):
         return
-    prior, moved, measured, moving = (np.asarray(part) for part in noise)
-    if not known and not prior:
+    prior, of_motion, of_sensor, moving = (np.asarray(part) for part in regular)
+    if not fixed and not prior:
         raise ValueError(
             f"{name}: pose_cov is singular; expected zero, which fixes the first pose, or a "
             "positive definite covariance"
         )
-    for good, what in (
-        (moved, f"the noise covariance of {motion.name} is singular"),
+    for good, reason in (
+        (of_motion, f"the noise covariance of {motion.name} is singular"),
         (
             moving,
             f"the noise of {motion.name} does not move the pose in all directions",
         ),
         (
-            (measured | ~np.asarray(valid)).all(axis=1),
+            (of_sensor | ~np.asarray(valid)).all(axis=1),
             f"the noise covariance of {sensor.name} is singular",
         ),
     ):
         if not good.all():
             row = int(good.argmin())
-            raise ValueError(f"{name}: {what} at row {row}, so that it has no information")
+            raise ValueError(f"{name}: {reason} at row {row}, so that it has no information")

@@ -23,6 +23,9 @@ from jaxslam.graphs._solver.linearized import (
     Data,
     Variables,
     data_of,
+    diagonal_of,
+    dot,
+    outer,
     variable_numbers,
     variables_of,
 )
@@ -30,13 +33,13 @@ from jaxslam.graphs._solver.model import Model, model_of
 from jaxslam.graphs._solver.plans import Plan, plan_for
 from jaxslam.graphs._solver.search import minimize
 from jaxslam.graphs._sparse.cholesky import factorize, substitute
-from jaxslam.graphs._sparse.sweeps import summed
+from jaxslam.graphs._sparse.sweeps import sum_rows
 from jaxslam.math._linalg import total
 
 
 @record
 class _Relaxed(Factor):
-    """The factor of the same measurement with chordal residuals, `Factor.chordal`."""
+    """The factor of a factor's measurement with chordal residuals, `Factor.chordal`."""
 
     factor: Factor
 
@@ -65,77 +68,118 @@ def _chordal_weights(
     form: Chordal, information: Float[JaxOrNumPy, "E R R B"]
 ) -> Float[Array, "E S B"]:
     """The weights τ, τ, κ, κ or τ, τ of the chordal residuals; zero for a prior."""
-    near = 0.5 * (information[:, 0, 0] + information[:, 1, 1])
+    tau = 0.5 * (information[:, 0, 0] + information[:, 1, 1])
     if form.rows is None:
-        return jnp.zeros_like(near)[:, None]
-    turn = [information[:, 2, 2]] * (form.size - 2)
-    return jnp.stack([near, near, *turn], axis=1)
+        return jnp.zeros_like(tau)[:, None]
+    kappa = [information[:, 2, 2]] * (form.size - 2)
+    return jnp.stack([tau, tau, *kappa], axis=1)
 
 
 def dual(
     chordal: Model, plan: Plan, variables: Variables, data: Data
 ) -> tuple[Float[Array, "M 4 4 B"], Float[Array, "N B"], Float[Array, "M 4 4 1"]]:
-    """The blocks of M - diag(0, λ), with the position of the held pose removed; λ of each pose; and
-    where the blocks have the diagonal of a u."""
+    """The dual matrix M - Λ of the chordal cost at some variables, of graphs with a last axis B.
+
+    A pose has v = (x, y, u) with u = (cos θ, sin θ), a point v = (x, y). The chordal cost is
+
+        vᵀ M v = Σ w (Σ_k J_k v_k)²,    M_kl = Σ J_kᵀ w J_l
+
+    over the residuals of all rows, each of which has variables k and J_k = ∂r/∂v_k
+    (`Chordal.rows`). With λ_i, the multiplier of |u_i|² = 1 at a stationary point,
+
+        Λ_ii = diag(0, 0, λ_i, λ_i),    λ_i = u_i · (M v)_i
+
+    Rows and columns of the position of the held pose, and of the two numbers of four that a point
+    does not have, are those of the identity.
+
+    Returns:
+        The blocks of M - Λ at their places in the plan; λ; the blocks of Λ for λ = 1.
+    """
     poses, dtype = len(variables.poses), variables.poses.dtype
     count, batch = len(plan.order), variables.poses.shape[-1]
-    angle = variables.poses[:, 2]
-    z = jnp.zeros((count, 4, batch), dtype)
-    z = z.at[:poses, :2].set(variables.poses[:, :2] - variables.poses[:1, :2])
-    z = z.at[:poses, 2:].set(jnp.stack([jnp.cos(angle), jnp.sin(angle)], axis=1))
-    z = z.at[poses:, :2].set(variables.points[:, :2] - variables.poses[:1, :2])
+    v = _chordal_variables(variables)
     is_pose = jnp.arange(count) < poses
+    # Which of the four numbers of each column are free, (n, 4, B): those of a position as in the
+    # graph, u of every pose, the held one included.
     free = jnp.concatenate([data.free[:, :2], jnp.ones_like(data.free[:, :2])], axis=1)
-    free = free & (
-        jnp.array([True, True, False, False])[None, :, None] | is_pose[plan.order][:, None, None]
-    )
+    is_position = jnp.array([True, True, False, False])
+    free = free & (is_position[None, :, None] | is_pose[plan.order][:, None, None])
     blocks, gradients = [], []
     for name, factor in chordal.factors.items():
-        who, valid, k = plan.who[name], data.valid[name], len(factor.variables)
-        rows, size = len(who), len(factor.errors)
+        who, valid, size_k = plan.who[name], data.valid[name], len(factor.variables)
+        rows, size_s = len(who), len(factor.errors)
         if factor.chordal is None or factor.chordal.rows is None:
             blocks.append(jnp.zeros((rows, 4, 4, batch), dtype))
             gradients.append(jnp.zeros((rows, 4, batch), dtype))
             continue
-        parts = factor.chordal.rows(data.z[name])
+        # The lists are [variable k][residual s][number of v]; together (E, S, K, 4, B).
+        lists = factor.chordal.rows(data.z[name])
         jacobian = jnp.stack(
-            [jnp.stack([jnp.stack(row, axis=1) for row in part], axis=1) for part in parts], axis=2
-        )  # (E, S, K, 4, B)
-        jacobian = jnp.where(valid[:, None, None, None], jacobian, 0.0)
-        weight = jnp.stack([data.information[name][:, i, i] for i in range(size)], axis=1)
-        of = variable_numbers(factor, who, poses)
-        near = z[of]
-        r = total(jacobian[:, :, a, c] * near[:, a, None, c] for a in range(k) for c in range(4))
-        gradient = total(jacobian[:, i] * (weight * r)[:, i, None, None] for i in range(size))
-        gradients.append(gradient.reshape(rows * k, 4, batch))
-        jacobian = jnp.where(free[plan.column[of]][:, None], jacobian, 0.0)
-        product = total(
-            jacobian[:, i, :, None, :, None]
-            * (weight[:, i, None, None] * jacobian[:, i])[:, None, :, None, :]
-            for i in range(size)
+            [jnp.stack([jnp.stack(row, axis=1) for row in by_k], axis=1) for by_k in lists], axis=2
         )
-        blocks.append(product.reshape(rows * k * k, 4, 4, batch))
-    by_variable = summed(plan.gradient, jnp.concatenate(gradients))[plan.column]
-    multipliers = (by_variable[:poses, 2:] * z[:poses, 2:]).sum(axis=1)
-    every = jnp.concatenate([multipliers, jnp.zeros((count - poses, batch), dtype)])
+        jacobian = jnp.where(valid[:, None, None, None], jacobian, 0.0)
+        weight = jnp.stack([data.information[name][:, s, s] for s in range(size_s)], axis=1)
+        numbers = variable_numbers(factor, who, poses)
+        v_k = v[numbers]  # (E, K, 4, B)
+        r = total(
+            jacobian[:, :, k, c] * v_k[:, k, None, c] for k in range(size_k) for c in range(4)
+        )
+        # J_kᵀ w r, the share of a row in (M v)_k.
+        gradient = total(jacobian[:, s] * (weight * r)[:, s, None, None] for s in range(size_s))
+        gradients.append(gradient.reshape(rows * size_k, 4, batch))
+        jacobian = jnp.where(free[plan.column[numbers]][:, None], jacobian, 0.0)
+        product = total(
+            outer(jacobian[:, s], weight[:, s, None, None] * jacobian[:, s]) for s in range(size_s)
+        )
+        # (E, K, K, 4, 4, B): a block for each two variables of a row.
+        blocks.append(product.reshape(rows * size_k * size_k, 4, 4, batch))
+    m_v = sum_rows(plan.gradient, jnp.concatenate(gradients))[plan.column]
+    multipliers = (m_v[:poses, 2:] * v[:poses, 2:]).sum(axis=1)
+    by_variable = jnp.concatenate([multipliers, jnp.zeros((count - poses, batch), dtype)])
+    # The blocks of Λ for λ = 1: diag(0, 0, 1, 1) on the diagonal where the column is a pose.
     unit = jnp.eye(4, dtype=dtype)[None, ..., None]
-    turn = unit * jnp.array([0.0, 0.0, 1.0, 1.0], dtype)[None, None, :, None]
-    at = plan.on_diagonal[:, None, None, None]
-    turns = jnp.where(at & is_pose[plan.order][plan.block_column][:, None, None, None], turn, 0.0)
-    out = summed(plan.information, jnp.concatenate(blocks))
-    out = out + jnp.where(at & ~free[plan.block_column][:, None], unit, 0.0)
-    return out - turns * every[plan.order][plan.block_column][:, None, None], multipliers, turns
+    unit_of_u = unit * jnp.array([0.0, 0.0, 1.0, 1.0], dtype)[None, None, :, None]
+    on_diagonal = plan.on_diagonal[:, None, None, None]
+    of_pose = is_pose[plan.order][plan.block_column][:, None, None, None]
+    unit_lambda = jnp.where(on_diagonal & of_pose, unit_of_u, 0.0)
+    m = sum_rows(plan.information, jnp.concatenate(blocks))
+    m = m + jnp.where(on_diagonal & ~free[plan.block_column][:, None], unit, 0.0)
+    by_block = by_variable[plan.order][plan.block_column][:, None, None]
+    return m - unit_lambda * by_block, multipliers, unit_lambda
+
+
+def _chordal_variables(variables: Variables) -> Float[Array, "n 4 B"]:
+    """The numbers v of each variable, poses before points; zeros for u of a point.
+
+    The first pose is the origin: the cost does not depend on it, and smaller numbers round less.
+    """
+    poses, points = variables
+    count = len(poses)
+    v = jnp.zeros((count + len(points), 4, poses.shape[-1]), poses.dtype)
+    v = v.at[:count, :2].set(poses[:, :2] - poses[:1, :2])
+    v = v.at[:count, 2:].set(jnp.stack([jnp.cos(poses[:, 2]), jnp.sin(poses[:, 2])], axis=1))
+    return v.at[count:, :2].set(points[:, :2] - poses[:1, :2])
 
 
 _FIRST_GAP = 1e-6
-"""The first gap, relative to χ² + 1."""
+"""The first gap that is tried, relative to χ² + 1."""
 
 _NEGLIGIBLE_GAP = 3e-5
 """The gap that counts as zero, relative to χ² + 1: between two of those that are tried, each ten
 times the last."""
 
+_DIAGONAL_ROUNDING = 16
+"""The least shift, in eps of the largest diagonal entry, for a Cholesky factor to resolve it."""
+
+_SHIFTS = 40
+"""The largest number of shifts that are tried, each ten times the last."""
+
 _POWERS = 100
-"""iterations for the smallest eigenvalue"""
+"""Iterations for the smallest eigenvalue."""
+
+_SURROGATE_STEPS = 100
+_SURROGATE_TOLERANCE = 1e-13
+"""Of `minimize` on the chordal cost; the bound is tight only at a stationary point."""
 
 
 class Certificate(NamedTuple):
@@ -148,7 +192,7 @@ class Certificate(NamedTuple):
     """
 
     certified: Bool[Array, ""]
-    """the optimum of the surrogate that was found is its global one, up to `gap`"""
+    """the optimum of the surrogate next to the graph is its global one, up to `gap`"""
     gap: Float[Array, ""]
     """proved: no poses have a chordal cost below `chi2 - gap`"""
     smallest: Float[Array, ""]
@@ -157,11 +201,11 @@ class Certificate(NamedTuple):
     chi2: Float[Array, ""]
     """chordal cost at the optimum of the surrogate next to the graph"""
     graph: Graph
-    """with the poses of that optimum"""
+    """the graph at the optimum of the surrogate"""
     position: Float[Array, ""]
     """[m], root mean square distance of the poses of both optima"""
     heading: Float[Array, ""]
-    """[rad], the same of their headings"""
+    """[rad], root mean square difference of the headings of both optima"""
 
 
 def certificate(
@@ -205,25 +249,15 @@ def certificate(
         held = np.array(graph.fixed_pose)
         for name, factor in model.factors.items():
             if factor.chordal is PRIOR:
-                held[
-                    np.asarray(graph.tables[name].who)[np.asarray(graph.tables[name].valid), 0]
-                ] = True
+                table = graph.tables[name]
+                held[np.asarray(table.who)[np.asarray(table.valid), 0]] = True
         if held.sum() != 1:
             raise ValueError(
                 f"{caller}: expected one pose that is fixed or has a prior, got {held.sum()}; the "
                 "dual is of a graph that is free but for that"
             )
-    proved: Certificate = _certificate(model, graph, plan)
-    return proved
-
-
-def _hold(model: Model, plan: Plan, graph: Graph) -> Bool[Array, "N *B"]:
-    """The poses that are fixed or have a prior."""
-    held = jnp.asarray(graph.fixed_pose)
-    for name, factor in model.factors.items():
-        if factor.chordal is PRIOR:
-            held = held.at[plan.who[name][:, 0]].max(graph.tables[name].valid)
-    return held
+    proof: Certificate = _certificate(model, graph, plan)
+    return proof
 
 
 @partial(jax.jit, inline=True)
@@ -232,72 +266,111 @@ def _certificate(model: Model, graph: Graph, plan: Plan) -> Certificate:
 
 
 def _prove(model: Model, plan: Plan, graph: Graph) -> Certificate:
-    """Of graphs with a last axis B."""
-    poses, dtype = len(graph.poses), graph.poses.dtype
-    held = _hold(model, plan, graph)
+    """The certificates of graphs with a last axis B."""
+    poses = len(graph.poses)
+    chordal, surrogate = _chordal_problem(model, plan, graph)
+    tolerance = jnp.asarray(_SURROGATE_TOLERANCE, graph.poses.dtype)
+    solution = minimize(chordal, plan, jnp.asarray(_SURROGATE_STEPS), tolerance, surrogate)
+    variables, data = variables_of(solution.graph), data_of(surrogate, plan.column)
+    blocks, multipliers, unit_lambda = dual(chordal, plan, variables, data)
+    shift, proved = _proved_shift(plan, blocks, unit_lambda, solution.chi2, poses)
+    gap = solution.chi2 - multipliers.sum(axis=0) + poses * shift
+    away = solution.graph.poses - graph.poses
+    turned = jnp.arctan2(jnp.sin(away[:, 2]), jnp.cos(away[:, 2]))
+    return Certificate(
+        certified=proved & (gap <= _NEGLIGIBLE_GAP * (solution.chi2 + 1.0)),
+        gap=jnp.where(proved, gap, jnp.inf),
+        smallest=_smallest_eigenvalue(plan, blocks, unit_lambda, shift),
+        chi2=solution.chi2,
+        graph=graph._replace(poses=solution.graph.poses, points=solution.graph.points),
+        position=jnp.sqrt((away[:, :2] ** 2).sum(1).mean(axis=0)),
+        heading=jnp.sqrt((turned**2).mean(axis=0)),
+    )
+
+
+def _chordal_problem(model: Model, plan: Plan, graph: Graph) -> tuple[Model, Graph]:
+    """The model and the graph whose χ² is the chordal cost, without priors.
+
+    A pose that a prior holds is fixed.
+    """
+    held = jnp.asarray(graph.fixed_pose)
     tables = {}
     for name, factor in model.factors.items():
         table = graph.tables[name]
         assert factor.chordal is not None
+        if factor.chordal is PRIOR:
+            held = held.at[plan.who[name][:, 0]].max(table.valid)
         weights = _chordal_weights(factor.chordal, table.information)
-        unit = jnp.eye(weights.shape[1], dtype=dtype)[None, ..., None]
+        unit = jnp.eye(weights.shape[1], dtype=graph.poses.dtype)[None, ..., None]
         tables[name] = table._replace(information=unit * weights[:, None])
     chordal = Model({name: _Relaxed(factor) for name, factor in model.factors.items()}, {})
-    surrogate = graph._replace(tables=tables, fixed_pose=held)
-    tolerance = jnp.asarray(1e-13, dtype)
-    found = minimize(chordal, plan, jnp.asarray(100), tolerance, surrogate)
-    variables, data = variables_of(found.graph), data_of(surrogate, plan.column)
-    blocks, multipliers, turns = dual(chordal, plan, variables, data)
-    value = found.chi2
-    bound = multipliers.sum(axis=0)
-    margin = jnp.maximum(
-        _FIRST_GAP * (value + 1.0) / poses,
-        16 * jnp.finfo(dtype).eps * (blocks * turns).max((0, 1, 2)),
+    return chordal, graph._replace(tables=tables, fixed_pose=held)
+
+
+def _proved_shift(
+    plan: Plan,
+    blocks: Float[Array, "M 4 4 B"],
+    unit_lambda: Float[Array, "M 4 4 1"],
+    chi2: Float[Array, "B"],
+    poses: int,
+) -> tuple[Float[Array, "B"], Bool[Array, "B"]]:
+    """The first η of a series by tens for which M - Λ + η has a Cholesky factor, η added to the
+    diagonal of u, and whether there is such an η."""
+    least = jnp.maximum(
+        _FIRST_GAP * (chi2 + 1.0) / poses,
+        _DIAGONAL_ROUNDING * jnp.finfo(blocks.dtype).eps * (blocks * unit_lambda).max((0, 1, 2)),
     )
 
-    def shifted(shift: Array) -> Array:
-        return blocks + shift[None, None, None] * turns
-
-    def proof(shift: Array) -> Array:
+    def larger(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
+        shift, proved, count = carry
+        shift = jnp.where(proved, shift, 10 * shift)
         # A pivot with an error below a thirtieth of itself is positive.
-        return factorize(plan.cholesky, shifted(shift), uncertain=1 / 32).regular.all(axis=0)
+        factored = factorize(
+            plan.cholesky, _shift_diagonal(blocks, unit_lambda, shift), uncertain=1 / 32
+        )
+        return shift, factored.regular.all(axis=0), count + 1
 
-    def wider(carry: tuple[Array, Array, Array]) -> tuple[Array, Array, Array]:
-        shift, good, count = carry
-        shift = jnp.where(good, shift, 10 * shift)
-        return shift, proof(shift), count + 1
-
-    shift, good, _ = jax.lax.while_loop(
-        lambda carry: ~carry[1].all() & (carry[2] < 40),
-        wider,
-        (margin / 10, jnp.zeros(margin.shape, bool), jnp.zeros((), jnp.int32)),
+    shift, proved, _ = jax.lax.while_loop(
+        lambda carry: ~carry[1].all() & (carry[2] < _SHIFTS),
+        larger,
+        (least / 10, jnp.zeros(least.shape, bool), jnp.zeros((), jnp.int32)),
     )
-    factored = factorize(plan.cholesky, shifted(shift))
-    of_turns = jnp.diagonal(turns[plan.cholesky.diagonal], axis1=1, axis2=2)
-    of_turns = jnp.moveaxis(of_turns, 2, 1)
+    return shift, proved
+
+
+def _smallest_eigenvalue(
+    plan: Plan,
+    blocks: Float[Array, "M 4 4 B"],
+    unit_lambda: Float[Array, "M 4 4 1"],
+    shift: Float[Array, "B"],
+) -> Float[Array, "B"]:
+    """The smallest eigenvalue μ of M - Λ with positions eliminated, by inverse iteration.
+
+    With P the selection of u and S the Schur complement of the positions,
+    (S + η)⁻¹ = P (M - Λ + η P)⁻¹ P, whose largest eigenvalue is 1/(μ + η).
+    """
+    factored = factorize(plan.cholesky, _shift_diagonal(blocks, unit_lambda, shift))
+    of_u = diagonal_of(plan, unit_lambda)  # (n, 4, 1), the diagonal of P
 
     def power(i: Array, carry: tuple[Array, Array]) -> tuple[Array, Array]:
-        v, _ = carry
-        w = of_turns * substitute(plan.cholesky, factored, v)
-        inverse = (v * w).sum((0, 1))
-        norm = jnp.sqrt((w * w).sum((0, 1)))
-        return w / jnp.where(norm > 0, norm, 1.0)[None, None], 1.0 / inverse - shift
+        vector, _ = carry
+        image = of_u * substitute(plan.cholesky, factored, vector)
+        quotient = dot(vector, image)
+        norm = jnp.sqrt(dot(image, image))
+        return image / jnp.where(norm > 0, norm, 1.0)[None, None], 1.0 / quotient - shift
 
-    angle = jnp.arange(len(plan.order), dtype=dtype) ** 2
-    first = jnp.stack([jnp.zeros_like(angle)] * 2 + [jnp.cos(angle), jnp.sin(angle)], axis=1)
-    first = jnp.broadcast_to(of_turns * first[..., None], (*first.shape, *value.shape))
-    first = first / jnp.sqrt((first * first).sum((0, 1)))[None, None]
-    first = jnp.broadcast_to(first, (*first.shape[:2], *shift.shape))
-    smallest = jax.lax.fori_loop(0, _POWERS, power, (first, jnp.zeros_like(shift)))[1]
-    gap = value - bound + poses * shift
-    away = found.graph.poses - graph.poses
-    turned = jnp.arctan2(jnp.sin(away[:, 2]), jnp.cos(away[:, 2]))
-    return Certificate(
-        certified=good & (gap <= _NEGLIGIBLE_GAP * (value + 1.0)),
-        gap=jnp.where(good, gap, jnp.inf),
-        smallest=smallest,
-        chi2=value,
-        graph=graph._replace(poses=found.graph.poses, points=found.graph.points),
-        position=jnp.sqrt((away[:, :2] ** 2).sum(1).mean(axis=0)),
-        heading=jnp.sqrt((turned**2).mean(axis=0)),
-    )
+    # The headings n² [rad] of variable n: not smooth along a path, so that the start is hardly
+    # orthogonal to an eigenvector.
+    angle = jnp.arange(len(plan.order), dtype=blocks.dtype) ** 2
+    start = jnp.stack([jnp.zeros_like(angle)] * 2 + [jnp.cos(angle), jnp.sin(angle)], axis=1)
+    start = jnp.broadcast_to(of_u * start[..., None], (*start.shape, *shift.shape))
+    start = start / jnp.sqrt(dot(start, start))[None, None]
+    smallest: Array = jax.lax.fori_loop(0, _POWERS, power, (start, jnp.zeros_like(shift)))[1]
+    return smallest
+
+
+def _shift_diagonal(
+    blocks: Float[Array, "M 4 4 B"], unit_lambda: Float[Array, "M 4 4 1"], shift: Float[Array, "B"]
+) -> Float[Array, "M 4 4 B"]:
+    """The blocks of M - Λ + η, with η on the diagonal of u."""
+    return blocks + shift[None, None, None] * unit_lambda

@@ -18,12 +18,12 @@ from jaxslam.graphs._graph import Graph
 from jaxslam.graphs._solver.batch import (
     cut,
     graph_in_one_dtype,
+    original_number,
     over_batch,
-    own_number,
     padded_graph,
     with_batch,
 )
-from jaxslam.graphs._solver.gnc import graduated
+from jaxslam.graphs._solver.gnc import minimize_truncated
 from jaxslam.graphs._solver.kernels import Kernel, Truncated
 from jaxslam.graphs._solver.linearized import (
     Variables,
@@ -47,11 +47,11 @@ def squared_residuals(
     """The squared residual eᵀ Ω e of every row of every table, 0 where not valid; their sum is χ².
 
     Of a row with R residuals, at the truth and with the right Ω, it is χ² distributed with R
-    degrees of freedom. factors, room: as for `optimize`.
+    degrees of freedom. factors, room: see `optimize`.
     """
     factors = factors_of("graphs.squared_residuals", graph, factors)
-    found = _squared_of(factors, padded_graph(graph, room) if is_concrete(graph) else graph)
-    return {key: cut(square, graph.tables[key].valid) for key, square in found.items()}
+    squares = _squares_of(factors, padded_graph(graph, room) if is_concrete(graph) else graph)
+    return {key: cut(square, graph.tables[key].valid) for key, square in squares.items()}
 
 
 def degrees_of_freedom(graph: Graph, factors: Mapping[str, Factor] | None = None) -> int:
@@ -65,8 +65,8 @@ def degrees_of_freedom(graph: Graph, factors: Mapping[str, Factor] | None = None
 
 
 @partial(jax.jit, inline=True)
-def _squared_of(factors: dict[str, Factor], graph: Graph) -> dict[str, Float[Array, "E"]]:
-    found = {}
+def _squares_of(factors: dict[str, Factor], graph: Graph) -> dict[str, Float[Array, "E"]]:
+    squares = {}
     for key, factor in factors.items():
         table = graph.tables[key]
 
@@ -81,17 +81,17 @@ def _squared_of(factors: dict[str, Factor], graph: Graph) -> dict[str, Float[Arr
             return e @ information @ e
 
         who, z, information = (jnp.asarray(part) for part in table[:3])
-        found[key] = jnp.where(table.valid, jax.vmap(square)(who, z, information), 0.0)
-    return found
+        squares[key] = jnp.where(table.valid, jax.vmap(square)(who, z, information), 0.0)
+    return squares
 
 
 _HELD_STEPS = 20
-"""Steps of `followed` where factors whiten. With σ a share a of the range, the error falls by some
-2a a step."""
+"""Steps of `attach_derivatives` where factors whiten. With σ a share a of the range, each leaves
+some 2a of the error."""
 
 
-def followed(model: Model, plan: Plan, graph: Graph, found: Solution) -> Solution:
-    """The solution as a function of graph and model: the same numbers, with derivatives.
+def attach_derivatives(model: Model, plan: Plan, graph: Graph, solution: Solution) -> Solution:
+    """The solution, with derivatives by graph and model.
 
     At the optimum F(δ; θ) = ½ ∂χ²/∂δ = 0, so that dδ = -(∂F/∂δ)⁻¹ (∂F/∂θ) dθ: a Newton step from
     the optimum, of which only F is differentiated. ∂F/∂δ is half the Hessian of χ² with its second
@@ -102,55 +102,57 @@ def followed(model: Model, plan: Plan, graph: Graph, found: Solution) -> Solutio
     Several steps then have H, ∂F/∂δ for a fixed W, in its place:
     dδ ← dδ - H⁻¹ (∂F/∂δ dδ + ∂F/∂θ dθ), whose fixed point is the same.
     """
-    still = jax.lax.stop_gradient((found.graph.poses, found.graph.points))
-    poses = jnp.where(graph.fixed_pose[:, None], graph.poses, still[0])
-    points = jnp.where(graph.fixed_point[:, None], graph.points, still[1])
+    optimum = jax.lax.stop_gradient((solution.graph.poses, solution.graph.points))
+    poses = jnp.where(graph.fixed_pose[:, None], graph.poses, optimum[0])
+    points = jnp.where(graph.fixed_point[:, None], graph.points, optimum[1])
     trial = with_batch(graph._replace(poses=poses, points=points))
     variables, data = variables_of(trial), data_of(trial, plan.column)
     blocks = half_hessian(*jax.lax.stop_gradient((model, plan, variables, data)))
 
     def newton(at: Variables) -> Variables:
         gradient = linearize(model, plan, at, data).gradient
-        step = _solve_by_factor(plan, blocks[..., 0], gradient[..., 0])
+        step = _solve(plan, blocks[..., 0], gradient[..., 0])
         return retract(at, -step[..., None], plan)
 
     end = newton(variables)
     if model.holds:
         end = jax.lax.fori_loop(1, _HELD_STEPS, lambda _, at: newton(at), end)
-    return jax.lax.stop_gradient(found)._replace(
+    weights = row_weights(model, plan.who, end, data)
+    return jax.lax.stop_gradient(solution)._replace(
         graph=graph._replace(poses=end.poses[..., 0], points=end.points[..., 0]),
+        # Where W is held, χ² is not stationary at the optimum: its derivative needs that of `end`.
         chi2=chi2_of(model, plan.who, end if model.holds else variables, data)[0],
-        weights={
-            name: weight[..., 0] for name, weight in row_weights(model, plan.who, end, data).items()
-        },
+        weights={name: weight[..., 0] for name, weight in weights.items()},
     )
 
 
-def _solve_by_factor(
+def _solve(
     plan: Plan, blocks: Float[Array, "M d d"], rhs: Float[Array, "n d"]
 ) -> Float[Array, "n d"]:
     """The solution A⁻¹ b, with derivatives by b."""
 
-    def times(x: Float[Array, "n d"]) -> Float[Array, "n d"]:
-        below = jnp.einsum("mij,mj->mi", blocks, x[plan.block_column])
-        above = jnp.einsum("mji,mj->mi", blocks, x[plan.block_row])
-        above = jnp.where(plan.on_diagonal[:, None], 0.0, above)
-        y = jnp.zeros_like(x).at[plan.block_row].add(below)
-        return y.at[plan.block_column].add(above)
+    def multiply(x: Float[Array, "n d"]) -> Float[Array, "n d"]:
+        # Blocks are stored for the lower triangle; the upper one has their transposes.
+        lower = jnp.einsum("mij,mj->mi", blocks, x[plan.block_column])
+        upper = jnp.einsum("mji,mj->mi", blocks, x[plan.block_row])
+        upper = jnp.where(plan.on_diagonal[:, None], 0.0, upper)
+        y = jnp.zeros_like(x).at[plan.block_row].add(lower)
+        return y.at[plan.block_column].add(upper)
 
     def solve(_: object, b: Float[Array, "n d"]) -> Float[Array, "n d"]:
-        return _by_factor((plan,), (blocks, b))
+        return _solve_by_factor((plan,), (blocks, b))
 
-    out: Array = jax.lax.custom_linear_solve(times, rhs, solve, symmetric=True)
-    return out
+    x: Array = jax.lax.custom_linear_solve(multiply, rhs, solve, symmetric=True)
+    return x
 
 
 def _factor_and_solve(plan: Plan, system: tuple[Array, Array]) -> Array:
+    """The solutions A⁻¹ b of graphs with a last axis B, (blocks of A, b)."""
     blocks, rhs = system
     return substitute(plan.cholesky, factorize(plan.cholesky, blocks), rhs)
 
 
-_by_factor = over_batch("graphs.optimize", _factor_and_solve)
+_solve_by_factor = over_batch("graphs.optimize", _factor_and_solve)
 
 
 def optimize(
@@ -179,7 +181,7 @@ def optimize(
         tolerance: done when a step lowers χ² by less than this share of it, as the quadratic model
             predicts, and at least by rounding.
         plan: of `plan`; needed under `jit` and `vmap`, where `who` is traced. Without one, graphs
-            of about the same size share a compiled program (`solver.padding`).
+            of about the same size share a compiled program (`padded_graph`).
         room: without a plan, graphs of up to about this number of variables share one.
     Raises:
         ValueError: on what `check_graph` refuses, and on unknown tables.
@@ -192,16 +194,18 @@ def optimize(
         )
     model = model_of(caller, graph, factors, kernel)
     check_graph(caller, graph, model.factors)
-    original, fill = graph, plan is None and is_concrete(graph)
-    graph = padded_graph(graph, room) if fill else graph
-    plan = plan_for(caller, graph, model.factors, plan, room=room)
-    found: Solution = _optimize(model, graph, plan, iterations, tolerance)
-    if not fill:
-        return found
-    singular = own_number(found.singular, original, graph)
-    rows = {name: table.valid for name, table in original.tables.items()}
-    return found._replace(
-        graph=cut(found.graph, original), singular=singular, weights=cut(found.weights, rows)
+    if plan is not None or not is_concrete(graph):
+        plan = plan_for(caller, graph, model.factors, plan, room=room)
+        exact: Solution = _optimize(model, graph, plan, iterations, tolerance)
+        return exact
+    padded = padded_graph(graph, room)
+    plan = plan_for(caller, padded, model.factors, None, room=room)
+    solution: Solution = _optimize(model, padded, plan, iterations, tolerance)
+    rows = {name: table.valid for name, table in graph.tables.items()}
+    return solution._replace(
+        graph=cut(solution.graph, graph),
+        singular=original_number(solution.singular, graph, padded),
+        weights=cut(solution.weights, rows),
     )
 
 
@@ -221,8 +225,8 @@ def _chi2(model: Model, graph: Graph) -> Float[Array, ""]:
     graph = graph_in_one_dtype(graph)
     who = {name: jnp.asarray(table.who) for name, table in graph.tables.items()}
     batch = with_batch(graph)
-    none = jnp.arange(len(graph.poses) + len(graph.points))
-    return chi2_of(model, who, variables_of(batch), data_of(batch, none))[0]
+    in_order = jnp.arange(len(graph.poses) + len(graph.points))  # without a plan
+    return chi2_of(model, who, variables_of(batch), data_of(batch, in_order))[0]
 
 
 @partial(jax.jit, inline=True)
@@ -230,7 +234,8 @@ def _optimize(
     model: Model, graph: Graph, plan: Plan, iterations: Array, tolerance: Array
 ) -> Solution:
     graph = graph_in_one_dtype(graph)
-    return _solved(model, graph, plan, iterations, jnp.asarray(tolerance, graph.poses.dtype))
+    tolerance = jnp.asarray(tolerance, graph.poses.dtype)
+    return _differentiable_search(model, graph, plan, iterations, tolerance)
 
 
 def _search(
@@ -238,26 +243,27 @@ def _search(
 ) -> Solution:
     """The solutions of graphs with a last axis B."""
     rounds = any(isinstance(kernel, Truncated) for kernel in model.kernels.values())
-    return (graduated if rounds else minimize)(model, plan, iterations, tolerance, graph)
+    search = minimize_truncated if rounds else minimize
+    return search(model, plan, iterations, tolerance, graph)
 
 
-_solve = over_batch("graphs.optimize", _search)
+_search_batch = over_batch("graphs.optimize", _search)
 
 
 @jax.custom_jvp
-def _solved(
+def _differentiable_search(
     model: Model, graph: Graph, plan: Plan, iterations: Array, tolerance: Array
 ) -> Solution:
     """The solution of one graph, with derivatives by the graph and by the numbers of the model."""
-    return _solve((model, plan, iterations, tolerance), graph)
+    return _search_batch((model, plan, iterations, tolerance), graph)
 
 
-@_solved.defjvp
+@_differentiable_search.defjvp
 def _slope(primals: PyTree, tangents: PyTree) -> tuple[Solution, PyTree]:
     model, graph, plan, *_ = primals
-    found = _solved(*primals)
+    solution = _differentiable_search(*primals)
 
     def near(model: Model, graph: Graph) -> Solution:
-        return followed(model, plan, graph, found)
+        return attach_derivatives(model, plan, graph, solution)
 
-    return found, jax.jvp(near, (model, graph), tangents[:2])[1]
+    return solution, jax.jvp(near, (model, graph), tangents[:2])[1]

@@ -1,5 +1,6 @@
 """Linearizers: affine approximations of the models, one a file."""
 
+from jaxslam._public import publish
 from jaxslam.linearize._first_order import (
     AtEstimate,
     invert_jacobians,
@@ -19,3 +20,5 @@ __all__ = [
     "motion_jacobians",
     "observe_jacobians",
 ]
+
+publish(__name__)

@@ -10,7 +10,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxslam.core._record import record
-from jaxslam.core.protocols import Here, Linearizer, Motion, Sensor
+from jaxslam.core.protocols import LinearizationPoint, Linearizer, Motion, Sensor
 from jaxslam.math._arrays import (
     Control,
     InvertJacobians,
@@ -46,15 +46,15 @@ def invert_jacobians(sensor: Sensor, pose: Pose, z: Measurement, s: Unmeasured) 
 
 
 def predicted_noise(
-    sensor: Sensor, z_hat: Measurement, z: Measurement, known: Bool[Array, ""]
+    sensor: Sensor, z_hat: Measurement, z: Measurement, has_prediction: Bool[Array, ""]
 ) -> Float[Array, "Z Z"]:
-    """The measurement noise R(ẑ) of a known landmark, and R(z) where there is no prediction.
+    """The measurement noise R(ẑ), and R(z) where there is no prediction.
 
     N(z; ẑ, H P Hᵀ + R(z)) is no density of z: where σ grows with the range, a range that came out
     short is trusted too much, the estimate is biased, and NIS exceeds its degrees of freedom. R(ẑ)
     does not depend on the noise of z.
     """
-    cov: Array = sensor.noise_cov(jnp.where(known, z_hat, z))
+    cov: Array = sensor.noise_cov(jnp.where(has_prediction, z_hat, z))
     return cov
 
 
@@ -69,11 +69,11 @@ def motion_at(
 
 
 def observe_at(
-    sensor: Sensor, here: Here, at_pose: Pose, at_landmark: Landmark
+    sensor: Sensor, point: LinearizationPoint, at_pose: Pose, at_landmark: Landmark
 ) -> tuple[Measurement, Float[Array, "Z 3"], Float[Array, "Z L"], Float[Array, "Z Z"]]:
     """The measurement h(pose, l), Jacobians at another pose and landmark, and no added noise."""
     by_pose, by_landmark = observe_jacobians(sensor, at_pose, at_landmark)
-    expected = sensor.observe(here.pose, here.landmark)
+    expected = sensor.observe(point.pose, point.landmark)
     return expected, by_pose, by_landmark, jnp.zeros((expected.shape[0],) * 2, expected.dtype)
 
 
@@ -100,13 +100,17 @@ def with_lever_arm(by_pose: Float[Array, "L 3"], offset: Float[Array, "2"]) -> F
 class AtEstimate(Linearizer):
     """The EKF linearizer: Jacobians at the current estimate (Solà (13), (25), (33)); no memory."""
 
-    def motion(self, motion: Motion, u: Array, here: Here) -> tuple[Array, Array, Array, tuple[()]]:
-        return (*motion_at(motion, here.pose, u, here.pose), ())
+    def motion(
+        self, motion: Motion, u: Array, point: LinearizationPoint
+    ) -> tuple[Array, Array, Array, tuple[()]]:
+        return (*motion_at(motion, point.pose, u, point.pose), ())
 
-    def observe(self, sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
-        return observe_at(sensor, here, here.pose, here.landmark)
+    def observe(
+        self, sensor: Sensor, point: LinearizationPoint
+    ) -> tuple[Array, Array, Array, Array]:
+        return observe_at(sensor, point, point.pose, point.landmark)
 
     def invert(
-        self, sensor: Sensor, z: Array, tag: Array, here: Here
+        self, sensor: Sensor, z: Array, tag: Array, point: LinearizationPoint
     ) -> tuple[Array, Array, Array]:
-        return invert_at(sensor, here.pose, z, here.pose, z)
+        return invert_at(sensor, point.pose, z, point.pose, z)

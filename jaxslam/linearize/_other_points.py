@@ -11,7 +11,7 @@ from jax import Array
 
 from jaxslam.core._numbers import largest
 from jaxslam.core._record import record
-from jaxslam.core.protocols import Here, Linearizer, Motion, Sensor
+from jaxslam.core.protocols import LinearizationPoint, Linearizer, Motion, Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Truth
 from jaxslam.linearize import _first_order as first_order
@@ -35,32 +35,36 @@ class AtTruth(Linearizer):
     def init(self, pose: Array, landmarks: Array) -> Array:
         return jnp.zeros((), jnp.int32)
 
-    def motion(self, motion: Motion, u: Array, here: Here) -> tuple[Array, Array, Array, Array]:
-        old, new = self._pose(here.joint.lin, here), self._pose(here.joint.lin + 1, here)
-        moved, by_pose, noise = first_order.motion_at(motion, here.pose, u, old)
+    def motion(
+        self, motion: Motion, u: Array, point: LinearizationPoint
+    ) -> tuple[Array, Array, Array, Array]:
+        old, new = self._pose(point.joint.lin, point), self._pose(point.joint.lin + 1, point)
+        moved, by_pose, noise = first_order.motion_at(motion, point.pose, u, old)
         ahead = motion.step(old, u, jnp.zeros(len(motion.noises), old.dtype))
-        return moved, with_lever_arm(by_pose, new[:2] - ahead[:2]), noise, here.joint.lin + 1
+        return moved, with_lever_arm(by_pose, new[:2] - ahead[:2]), noise, point.joint.lin + 1
 
-    def observe(self, sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
-        landmark = self._landmark(here.joint.tag[here.slot], here)
-        return first_order.observe_at(sensor, here, self._pose(here.joint.lin, here), landmark)
+    def observe(
+        self, sensor: Sensor, point: LinearizationPoint
+    ) -> tuple[Array, Array, Array, Array]:
+        landmark = self._landmark(point.joint.tag[point.slot], point)
+        return first_order.observe_at(sensor, point, self._pose(point.joint.lin, point), landmark)
 
     def invert(
-        self, sensor: Sensor, z: Array, tag: Array, here: Here
+        self, sensor: Sensor, z: Array, tag: Array, point: LinearizationPoint
     ) -> tuple[Array, Array, Array]:
-        pose = self._pose(here.joint.lin, here)
-        true_z = sensor.observe(pose, self._landmark(tag, here))
-        return first_order.invert_at(sensor, here.pose, z, pose, true_z)
+        pose = self._pose(point.joint.lin, point)
+        true_z = sensor.observe(pose, self._landmark(tag, point))
+        return first_order.invert_at(sensor, point.pose, z, pose, true_z)
 
-    def _pose(self, step: Array, here: Here) -> Array:
+    def _pose(self, step: Array, point: LinearizationPoint) -> Array:
         """The true pose (3,) after a number of steps, in the dtype of the run."""
         after = jnp.asarray(self.truth.pose)[jnp.maximum(step - 1, 0)]
         pose = jnp.where(step > 0, after, jnp.asarray(self.truth.start))
-        return pose.astype(here.pose.dtype)
+        return pose.astype(point.pose.dtype)
 
-    def _landmark(self, tag: Array, here: Here) -> Array:
+    def _landmark(self, tag: Array, point: LinearizationPoint) -> Array:
         """The true landmark (L,) of a tag, likewise."""
-        return jnp.asarray(self.truth.landmarks)[jnp.maximum(tag, 0)].astype(here.pose.dtype)
+        return jnp.asarray(self.truth.landmarks)[jnp.maximum(tag, 0)].astype(point.pose.dtype)
 
 
 class First(NamedTuple):
@@ -96,21 +100,25 @@ class FirstEstimate(Linearizer):
     def init(self, pose: Array, landmarks: Array) -> First:
         return First(pose, landmarks)
 
-    def motion(self, motion: Motion, u: Array, here: Here) -> tuple[Array, Array, Array, First]:
-        first = here.joint.lin
-        moved, by_pose, noise = first_order.motion_at(motion, here.pose, u, here.pose)
-        by_pose = with_lever_arm(by_pose, here.pose[:2] - first.pose[:2])
+    def motion(
+        self, motion: Motion, u: Array, point: LinearizationPoint
+    ) -> tuple[Array, Array, Array, First]:
+        first = point.joint.lin
+        moved, by_pose, noise = first_order.motion_at(motion, point.pose, u, point.pose)
+        by_pose = with_lever_arm(by_pose, point.pose[:2] - first.pose[:2])
         return moved, by_pose, noise, first._replace(pose=moved)
 
-    def observe(self, sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
-        first = here.joint.lin
-        return first_order.observe_at(sensor, here, first.pose, first.landmarks[here.slot])
+    def observe(
+        self, sensor: Sensor, point: LinearizationPoint
+    ) -> tuple[Array, Array, Array, Array]:
+        first = point.joint.lin
+        return first_order.observe_at(sensor, point, first.pose, first.landmarks[point.slot])
 
     def invert(
-        self, sensor: Sensor, z: Array, tag: Array, here: Here
+        self, sensor: Sensor, z: Array, tag: Array, point: LinearizationPoint
     ) -> tuple[Array, Array, Array]:
-        landmark, by_pose, cov = first_order.invert_at(sensor, here.pose, z, here.pose, z)
-        return landmark, with_lever_arm(by_pose, here.pose[:2] - here.joint.lin.pose[:2]), cov
+        landmark, by_pose, cov = first_order.invert_at(sensor, point.pose, z, point.pose, z)
+        return landmark, with_lever_arm(by_pose, point.pose[:2] - point.joint.lin.pose[:2]), cov
 
     def born(self, joint: Joint, born: Array) -> First:
         landmarks = jnp.where(born[:, None], joint.landmarks, joint.lin.landmarks)
@@ -152,10 +160,10 @@ class Observability(Linearizer):
         return _Constraint(pose, pose[:2], landmarks)
 
     def motion(
-        self, motion: Motion, u: Array, here: Here
+        self, motion: Motion, u: Array, point: LinearizationPoint
     ) -> tuple[Array, Array, Array, _Constraint]:
-        joint, old = here.joint, here.joint.lin
-        moved, by_pose, noise = first_order.motion_at(motion, here.pose, u, here.pose)
+        joint, old = point.joint, point.joint.lin
+        moved, by_pose, noise = first_order.motion_at(motion, point.pose, u, point.pose)
         arms = joint.landmarks - joint.pose[None, :2] - old.landmarks + old.robot[None]
         arms = jnp.where(joint.alive[:, None], arms, 0.0)
         shift = arms.sum(axis=0) / (1 + joint.alive.sum(dtype=arms.dtype))
@@ -164,15 +172,17 @@ class Observability(Linearizer):
         robot = old.robot + moved[:2] - joint.pose[:2] - shift
         return moved, with_lever_arm(by_pose, -shift), noise, old._replace(pose=moved, robot=robot)
 
-    def observe(self, sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
-        points = here.joint.lin
-        at_landmark = points.pose[:2] + points.landmarks[here.slot] - points.robot
-        return first_order.observe_at(sensor, here, points.pose, at_landmark)
+    def observe(
+        self, sensor: Sensor, point: LinearizationPoint
+    ) -> tuple[Array, Array, Array, Array]:
+        points = point.joint.lin
+        at_landmark = points.pose[:2] + points.landmarks[point.slot] - points.robot
+        return first_order.observe_at(sensor, point, points.pose, at_landmark)
 
     def invert(
-        self, sensor: Sensor, z: Array, tag: Array, here: Here
+        self, sensor: Sensor, z: Array, tag: Array, point: LinearizationPoint
     ) -> tuple[Array, Array, Array]:
-        return first_order.invert_at(sensor, here.pose, z, here.pose, z)
+        return first_order.invert_at(sensor, point.pose, z, point.pose, z)
 
     def born(self, joint: Joint, born: Array) -> _Constraint:
         arms = joint.lin.robot[None] + joint.landmarks - joint.pose[None, :2]

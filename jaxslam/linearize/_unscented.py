@@ -7,9 +7,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxslam.core._numbers import is_concrete
-from jaxslam.core._record import record
-from jaxslam.core.protocols import Here, Linearizer, Motion, Sensor
+from jaxslam.core._record import field, record
+from jaxslam.core.protocols import LinearizationPoint, Linearizer, Motion, Sensor
+from jaxslam.core.validation import in_range, or_none, positive
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import Number
 
@@ -43,74 +43,82 @@ class Unscented(Linearizer):
     Raises ValueError unless 0 < alpha <= 1.
     """
 
-    alpha: Number | None = None
+    alpha: Number | None = field(
+        default=None, check=or_none(lambda alpha: in_range(0.0, 1.0)(positive(alpha)))
+    )
     """spread of the sigma points; default 1e-3 in float64, as theirs, with which the UKF equals an
     EKF to rounding, and 0.1 in float32, because of rounding. 1 reaches √n σ."""
     iterates = False
 
-    def __post_init__(self) -> None:
-        if self.alpha is not None and is_concrete(self.alpha) and not 0 < self.alpha <= 1:
-            raise ValueError(f"Unscented: expected alpha in (0, 1], got {self.alpha}")
-        super().__post_init__()
-
-    def motion(self, motion: Motion, u: Array, here: Here) -> tuple[Array, Array, Array, tuple[()]]:
-        pose, chart, width = here.pose, here.chart, len(motion.noises)
-        ground = jnp.zeros(here.joint.landmarks.shape[1], pose.dtype)
+    def motion(
+        self, motion: Motion, u: Array, point: LinearizationPoint
+    ) -> tuple[Array, Array, Array, tuple[()]]:
+        pose, chart, width = point.pose, point.chart, len(motion.noises)
         moved = motion.step(pose, u, jnp.zeros(width, pose.dtype))
-        root = _root(here.cov)
+        root = _root(point.cov)
         root_noise = linalg.root_psd(motion.noise_cov(pose, u))
 
         def f(xi: Array) -> Array:
-            start, _ = chart.retract(pose, ground, xi[:3], ground)
-            return chart.local(moved, ground, motion.step(start, u, xi[3:]), ground)[0]
+            start = chart.retract_pose(pose, xi[:3])
+            return chart.local_pose(moved, motion.step(start, u, xi[3:]))
 
-        by = self._fit(f, jax.scipy.linalg.block_diag(root, root_noise))
-        by_pose = by_variables(by.slope[:, :3], root)
-        noise = linalg.matmul(by.slope[:, 3:], by.slope[:, 3:].T) + by.rest
+        fit = self._fit(f, jax.scipy.linalg.block_diag(root, root_noise))
+        by_pose = by_variables(fit.slope[:, :3], root)
+        noise = linalg.matmul(fit.slope[:, 3:], fit.slope[:, 3:].T) + fit.rest
         if chart.basis is not None:
-            after = chart.basis(moved, ground).pose
-            by_pose = after @ by_pose @ linalg.inverse(chart.basis(pose, ground).pose)
-            noise = after @ noise @ after.T
+            # From errors in the chart to differences of coordinates, after and before the motion.
+            basis = chart.pose_basis(moved)
+            by_pose = basis @ by_pose @ linalg.inverse(chart.pose_basis(pose))
+            noise = basis @ noise @ basis.T
         return moved, by_pose, noise, ()
 
-    def observe(self, sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
-        pose, landmark, chart = here.pose, here.landmark, here.chart
-        root = _root(here.cov)
+    def observe(
+        self, sensor: Sensor, point: LinearizationPoint
+    ) -> tuple[Array, Array, Array, Array]:
+        pose, landmark, chart = point.pose, point.landmark, point.chart
+        root = _root(point.cov)
         centre = sensor.observe(pose, landmark)
+        is_known = len(point.cov) == 3  # P is that of the robot alone
 
         def h(xi: Array) -> Array:
-            return sensor.residual(
-                sensor.observe(*chart.retract(pose, landmark, xi[:3], xi[3:])), centre
-            )
+            if is_known:
+                seen_from, seen = chart.retract_pose(pose, xi), landmark
+            else:
+                seen_from, seen = chart.retract(pose, landmark, xi[:3], xi[3:])
+            return sensor.residual(sensor.observe(seen_from, seen), centre)
 
-        by = self._fit(h, root)
-        slope = by_variables(by.slope, root)
+        fit = self._fit(h, root)
+        slope = by_variables(fit.slope, root)
         by_pose, by_landmark = slope[:, :3], slope[:, 3:]
-        if chart.basis is not None:
+        if is_known:
+            by_landmark = jnp.zeros((len(centre), len(landmark)), centre.dtype)
+        if chart.basis is not None and is_known:
+            by_pose = by_pose @ linalg.inverse(chart.pose_basis(pose))
+        elif chart.basis is not None:
             basis = chart.basis(pose, landmark)
             if basis.landmark is not None:
                 by_landmark = by_landmark @ linalg.inverse(basis.landmark)
             by_pose = (by_pose - by_landmark @ basis.cross) @ linalg.inverse(basis.pose)
-        return centre + by.mean, by_pose, by_landmark, by.rest
+        return centre + fit.mean, by_pose, by_landmark, fit.rest
 
     def invert(
-        self, sensor: Sensor, z: Array, tag: Array, here: Here
+        self, sensor: Sensor, z: Array, tag: Array, point: LinearizationPoint
     ) -> tuple[Array, Array, Array]:
-        pose, chart, size_z = here.pose, here.chart, z.shape[0]
+        pose, chart, size_z = point.pose, point.chart, z.shape[0]
         mean, cov_s = (jnp.asarray(part, z.dtype) for part in sensor.free)
         centre = sensor.invert(pose, z, mean)
-        still = jnp.zeros_like(centre)
-        root = _root(here.cov)
-        own_roots = [linalg.root_psd(sensor.noise_cov(z)), linalg.root_psd(cov_s)]
+        zero = jnp.zeros_like(centre)
+        root = _root(point.cov)
+        noise_roots = [linalg.root_psd(sensor.noise_cov(z)), linalg.root_psd(cov_s)]
 
         def g(xi: Array) -> Array:
-            seen_from, _ = chart.retract(pose, still, xi[:3], still)
-            landmark = sensor.invert(seen_from, z + xi[3 : 3 + size_z], mean + xi[3 + size_z :])
-            return chart.local(pose, centre, seen_from, landmark)[1]
+            start, _ = chart.retract(pose, zero, xi[:3], zero)
+            landmark = sensor.invert(start, z + xi[3 : 3 + size_z], mean + xi[3 + size_z :])
+            return chart.local(pose, centre, start, landmark)[1]
 
-        by = self._fit(g, jax.scipy.linalg.block_diag(root, *own_roots))
-        by_pose = by_variables(by.slope[:, :3], root)
-        cov = linalg.matmul(by.slope[:, 3:], by.slope[:, 3:].T) + by.rest
+        fit = self._fit(g, jax.scipy.linalg.block_diag(root, *noise_roots))
+        by_pose = by_variables(fit.slope[:, :3], root)
+        cov = linalg.matmul(fit.slope[:, 3:], fit.slope[:, 3:].T) + fit.rest
         if chart.basis is not None:
             basis = chart.basis(pose, centre)
             if basis.landmark is not None:
@@ -141,6 +149,7 @@ def regress(f: Callable[[Array], Array], root: Array, alpha: float | Array) -> _
 
 def by_variables(slope: Array, root: Array) -> Array:
     """The Jacobian H with H L = slope (m, n), for a regular lower L (n, n)."""
+    # H = slope L⁻¹ is (L⁻ᵀ slopeᵀ)ᵀ; Lᵀ is lower with its rows and columns reversed.
     return linalg.solve_lower(root.T[::-1, ::-1], slope.T[::-1])[::-1].T
 
 
@@ -151,10 +160,12 @@ def _root(cov: Array) -> Array:
     undetermined.
     """
     root = linalg.cholesky(cov)[0]
+    # √eps: variances of eps add nothing to P, and a quotient over √eps keeps half of the digits.
     floor = float(jnp.finfo(cov.dtype).eps) ** 0.5
     pivots = jnp.diagonal(root)
     return root + jnp.diag(jnp.where(pivots > floor, 0.0, floor))
 
 
 def _spread(root: Array) -> float:
+    """The default of alpha, by the dtype of a root of P."""
     return 1e-3 if root.dtype == jnp.float64 else 0.1

@@ -1,5 +1,6 @@
 """General mathematics: angles, SE(2), linear algebra, statistics, array types."""
 
+from jaxslam._public import publish
 from jaxslam.math import angles, linalg, numpy_poses, se2, stats, uncertain_poses
 from jaxslam.math._gaussians import GaussianTerms, gaussian_terms
 
@@ -13,3 +14,5 @@ __all__ = [
     "stats",
     "uncertain_poses",
 ]
+
+publish(__name__)

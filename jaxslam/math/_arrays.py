@@ -8,9 +8,11 @@ from typing import TypeVar, cast
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jax import Array
 from jax.typing import DTypeLike
 from jaxtyping import Float, PyTree
+from numpy.typing import ArrayLike
 
 _T = TypeVar("_T")
 
@@ -42,15 +44,30 @@ InvertJacobians = tuple[Float[Array, "L 3"], Float[Array, "L Z"], Float[Array, "
 """∂l/∂(pose, z, s)"""
 
 
+def is_concrete(*values: object) -> bool:
+    """Whether no leaf of the values is a tracer, whose number is not known."""
+    return not any(isinstance(leaf, jax.core.Tracer) for leaf in jax.tree.leaves(values))
+
+
+def held_array(values: ArrayLike) -> ArrayLike:
+    """An array unchanged; numbers in lists or tuples as an array of float64 on the host."""
+    if hasattr(values, "dtype"):
+        return values
+    if not is_concrete(values):
+        return jnp.asarray(values)
+    # NumPy, since jnp.asarray would round to float32 unless the user has 64-bit types on.
+    return np.asarray(values, np.float64)
+
+
 def in_dtype(tree: _T, dtype: DTypeLike) -> _T:
     """The tree with its real numbers in one precision; arrays of it stay as they are."""
 
-    def one(leaf: PyTree) -> PyTree:
+    def convert(leaf: PyTree) -> PyTree:
         kind = jnp.result_type(leaf)
-        other = jnp.issubdtype(kind, jnp.floating) and kind != dtype
-        return jnp.asarray(leaf, dtype) if other else leaf
+        differs = jnp.issubdtype(kind, jnp.floating) and kind != dtype
+        return jnp.asarray(leaf, dtype) if differs else leaf
 
-    return cast(_T, jax.tree.map(one, tree))
+    return cast(_T, jax.tree.map(convert, tree))
 
 
 def float64() -> AbstractContextManager[object]:

@@ -9,14 +9,16 @@ Array = jax.Array
 
 
 class _Matching(NamedTuple):
+    """The assignment of the rows so far, with the dual variables that prove it least."""
+
     by_row: Array
     """(m,) the dual variable of each row"""
     by_column: Array
-    """(n,) and of each column"""
+    """(n,) the dual variable of each column"""
     column_of: Array
-    """(m,) -1 where not yet assigned"""
+    """(m,) column of each row, -1 where not yet assigned"""
     row_of: Array
-    """(n,) -1 where free"""
+    """(n,) row of each column, -1 where free"""
 
 
 def assign(cost: Array) -> Array:
@@ -36,7 +38,7 @@ def assign(cost: Array) -> Array:
     if m == 0:
         return jnp.zeros(0, jnp.int32)
     cost = jax.lax.stop_gradient(cost)
-    nobody = jnp.full(n, -1, jnp.int32)
+    unassigned, dual = jnp.full(n, -1, jnp.int32), jnp.zeros(n, cost.dtype)
 
     def add_row(matching: _Matching, row: Array) -> tuple[_Matching, None]:
         path = _shortest_path(cost, matching, row)
@@ -49,25 +51,27 @@ def assign(cost: Array) -> Array:
         column_of, row_of = _augment(matching, path, row)
         return _Matching(by_row, matching.by_column - shorter, column_of, row_of), None
 
-    start = _Matching(jnp.zeros(m, cost.dtype), jnp.zeros(n, cost.dtype), nobody[:m], nobody)
+    start = _Matching(dual[:m], dual, unassigned[:m], unassigned)
     return jax.lax.scan(add_row, start, jnp.arange(m, dtype=jnp.int32))[0].column_of
 
 
 class _Path(NamedTuple):
+    """The tree of shortest paths from one row, as far as Dijkstra's algorithm has grown it."""
+
     row: Array
     """() the row from which the search continues"""
     least: Array
-    """() length of the path there"""
+    """() length of the path to that row"""
     length: Array
-    """(n,) of the shortest path to each column"""
+    """(n,) length of the shortest path to each column"""
     before: Array
-    """(n,) the row before a column on it"""
+    """(n,) the row before each column on its path"""
     rows: Array
-    """(m,) bool: in the tree"""
+    """(m,) bool: rows in the tree"""
     columns: Array
-    """(n,) bool"""
+    """(n,) bool: columns in the tree"""
     free: Array
-    """() the free column it ends in, -1 before that"""
+    """() the free column that ends the search, -1 before that"""
 
 
 def _shortest_path(cost: Array, matching: _Matching, row: Array) -> _Path:

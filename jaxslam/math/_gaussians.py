@@ -63,15 +63,15 @@ def mahalanobis_squared(
     """The distance eᵀ P⁻¹ e, and whether P (n, n) is numerically regular; 0 and False if not.
 
     P is scaled by each coordinate's standard deviation, so that the test does not depend on units.
-    Regular means that each Cholesky pivot exceeds 100 n·eps, i.e. no direction is known exactly,
-    and that e is finite.
+    Regular means that each Cholesky pivot exceeds 100 n·eps, so no direction is known exactly, and
+    that e is finite.
     """
     n, variance = cov.shape[-1], jnp.diagonal(cov)
     spread = variance > 0  # √ has an infinite derivative at zero, hence the 1.0
     unit = jnp.where(spread, 1.0 / jnp.sqrt(jnp.where(spread, variance, 1.0)), 0.0)
     factor = linalg.cholesky(cov * unit[:, None] * unit[None, :])[0]
-    known = jnp.isfinite(error)
-    squares = linalg.solve_lower(factor, jnp.where(known, error, 0.0) * unit) ** 2
+    is_finite = jnp.isfinite(error)
+    squares = linalg.solve_lower(factor, jnp.where(is_finite, error, 0.0) * unit) ** 2
     regular = jnp.all(jnp.diagonal(factor) ** 2 > 100 * n * jnp.finfo(cov.dtype).eps)
-    regular = regular & jnp.all(known)
+    regular = regular & jnp.all(is_finite)
     return jnp.where(regular, jnp.sum(squares), 0.0), regular

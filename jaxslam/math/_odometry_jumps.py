@@ -7,7 +7,7 @@ from jaxslam.math import numpy_poses as poses
 
 _POSSIBLE = np.array([3.0, np.pi])
 """Speed [m/s] and turn rate [rad/s] up to which any step may be motion."""
-_LEAST = np.array([0.3, 0.35])
+_LEAST = np.array([0.3, 0.35])  # 0.35 rad is 20°
 """Step [m] and turn [rad] up to which the timing of messages is too coarse to tell a speed."""
 _TIMES_USUAL = 8.0
 """Times the usual largest speed above which a step is no motion. MIT CSAIL, with rough stamps and
@@ -46,12 +46,12 @@ def odometry_jumps(
     speed = size / np.maximum(interval, median)[:, None]
     limit = _POSSIBLE if timed else np.zeros(2)
     usual = np.array([_usual(speed[:, k], _POSSIBLE[k] if timed else np.inf) for k in range(2)])
-    judged = size > _LEAST
-    jump[1:] = (judged & (speed > np.maximum(limit, _TIMES_USUAL * usual))).any(axis=1)
+    is_large = size > _LEAST
+    jump[1:] = (is_large & (speed > np.maximum(limit, _TIMES_USUAL * usual))).any(axis=1)
     at_zero = np.stack([np.hypot(path[:, 0], path[:, 1]), np.abs(poses.wrapped(path[:, 2]))], 1)
     zero = (at_zero <= np.minimum(2 * usual * median, _LEAST) + 1e-9).all(axis=1)
     fast = (speed > _TIMES_USUAL_TO_ZERO * usual) | (interval > LONG * median)[:, None]
-    jump[1:] |= zero[1:] & ~zero[:-1] & (judged & fast).any(axis=1)
+    jump[1:] |= zero[1:] & ~zero[:-1] & (is_large & fast).any(axis=1)
     return jump
 
 

@@ -35,12 +35,12 @@ def no_inline(function: Callable[..., _T], *arguments: PyTree) -> _T:
     """
 
     @functools.wraps(function)
-    def whole(*arguments: PyTree) -> _T:
+    def body(*arguments: PyTree) -> _T:
         with set_xla_metadata(inlineable="true"):  # functions that it calls
             return function(*arguments)
 
     with set_xla_metadata(inlineable="false"):
-        return cast(_T, jax.jit(whole)(*arguments))
+        return cast(_T, jax.jit(body)(*arguments))
 
 
 def one_kernel(function: Callable[..., _T], *arguments: PyTree) -> _T:
@@ -59,14 +59,14 @@ def one_kernel(function: Callable[..., _T], *arguments: PyTree) -> _T:
         return function(*jax.tree.map(jnp.asarray, arguments))
 
     @functools.wraps(function)
-    def whole(*arguments: PyTree) -> _T:
+    def body(*arguments: PyTree) -> _T:
         with set_xla_metadata(inlineable="true", xla_cpu_small_call="false"):  # functions it calls
             return function(*arguments)
 
     # A constant would be moved into the function, and leave an argument that is not used.
     arguments = jax.lax.optimization_barrier(arguments)
     with set_xla_metadata(inlineable="false", xla_cpu_small_call="true"):
-        return cast(_T, jax.jit(whole)(*arguments))
+        return cast(_T, jax.jit(body)(*arguments))
 
 
 def quick_options(platform: str) -> dict[str, int] | None:
@@ -166,8 +166,8 @@ def hot_jit(
     @functools.cache  # at the first call, since to ask for the backend starts it
     def alone() -> Callable[..., _T]:
         options = hot_options(jax.default_backend())
-        made = jax.jit(function, static_argnames=static_argnames, compiler_options=options)
-        return cast(Callable[..., _T], made)
+        compiled = jax.jit(function, static_argnames=static_argnames, compiler_options=options)
+        return cast(Callable[..., _T], compiled)
 
     @functools.wraps(function)
     def call(*arguments: PyTree) -> _T:

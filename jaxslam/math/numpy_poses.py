@@ -58,6 +58,6 @@ def part(step: Poses, share: Float[np.ndarray, "..."]) -> Poses:
 def adjoint(pose: Poses) -> Float[np.ndarray, "... 3 3"]:
     """The adjoint of each pose: pose ∘ e = (Ad e) ∘ pose to first order in a small pose e."""
     c, s = np.cos(pose[..., 2]), np.sin(pose[..., 2])
-    zero, one = np.zeros_like(c), np.ones_like(c)
-    rows = [[c, -s, pose[..., 1]], [s, c, -pose[..., 0]], [zero, zero, one]]
+    zero, unit = np.zeros_like(c), np.ones_like(c)
+    rows = [[c, -s, pose[..., 1]], [s, c, -pose[..., 0]], [zero, zero, unit]]
     return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)

@@ -37,9 +37,9 @@ def compound(a: Frame, b: Frame, cross: Array | None = None) -> Frame:
     cross: C = cov(a, b) (3, 3), zero by default. (To first order; not the sum of the two, as Tacher
     has it.)
     """
-    for what, value in (("a.cov", a.cov), ("b.cov", b.cov), ("cross", cross)):
+    for name, value in (("a.cov", a.cov), ("b.cov", b.cov), ("cross", cross)):
         if value is not None and jnp.shape(value) != (3, 3):
-            raise ValueError(f"compound: expected {what} of shape (3, 3), got {jnp.shape(value)}")
+            raise ValueError(f"compound: expected {name} of shape (3, 3), got {jnp.shape(value)}")
     by_a, by_b = se2.compose_jacobians(a.pose, b.pose)
     cov = by_a @ a.cov @ by_a.T + by_b @ b.cov @ by_b.T
     if cross is not None:

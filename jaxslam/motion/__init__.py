@@ -2,6 +2,8 @@
 
 from collections.abc import Callable
 
+from jaxslam._public import publish
+from jaxslam.core._names import Named
 from jaxslam.core.protocols import Motion
 from jaxslam.motion._ackermann import Ackermann
 from jaxslam.motion._increments import Increment, PoseIncrement
@@ -11,14 +13,16 @@ from jaxslam.motion._substeps import Substeps
 from jaxslam.motion._unicycle import Unicycle, WhiteNoise
 from jaxslam.motion._velocity import Velocity, VelocityNoise
 
-REGISTRY: dict[str, Callable[..., Motion]] = {
-    "ackermann": Ackermann,
-    "increment": Increment,
-    "odometry": Odometry,
-    "pose_increment": PoseIncrement,
-    "unicycle": Unicycle,
-    "velocity": Velocity,
-}
+REGISTRY: dict[str, Callable[..., Motion]] = Named(
+    {
+        "ackermann": Ackermann,
+        "increment": Increment,
+        "odometry": Odometry,
+        "pose_increment": PoseIncrement,
+        "unicycle": Unicycle,
+        "velocity": Velocity,
+    }
+)
 
 __all__ = [
     "REGISTRY",
@@ -36,3 +40,5 @@ __all__ = [
     "odometry_control",
     "odometry_controls",
 ]
+
+publish(__name__)

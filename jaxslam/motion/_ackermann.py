@@ -1,16 +1,15 @@
 """The Ackermann model of a car steered at its front wheels; the pose is that of its laser."""
 
 import jax.numpy as jnp
-import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from jaxslam.core._noise import NoiseCov
-from jaxslam.core._numbers import held_array, is_concrete
-from jaxslam.core._record import record, set_field
+from jaxslam.core._record import field, record
+from jaxslam.core.noise import NoiseCov
 from jaxslam.core.protocols import Motion
+from jaxslam.core.validation import finite, positive
 from jaxslam.math import se2
-from jaxslam.math._arrays import Control, Pose, ProcessNoise, StepJacobians
+from jaxslam.math._arrays import Control, Pose, ProcessNoise, StepJacobians, held_array
 
 
 @record
@@ -41,20 +40,14 @@ class Ackermann(Motion):
 
     noise_cov: NoiseCov
     """(2, 2) covariance of w on (v_e, α), or a function of (pose, u)."""
-    wheelbase: ArrayLike = 2.83
+    wheelbase: ArrayLike = field(default=2.83, check=lambda length: held_array(positive(length)))
     """L [m], from the rear to the front axle; positive."""
-    sensor: ArrayLike = (3.78, 0.5)
+    sensor: ArrayLike = field(default=(3.78, 0.5), check=finite(2))
     """(2,) = (a, b) [m]."""
-    encoder: ArrayLike = 0.76
+    encoder: ArrayLike = field(default=0.76, check=finite())
     """H [m]; negative on the right, 0 where v_e is the centre's speed."""
     controls = ("v_e [m/s]", "steering [rad]", "dt [s]")
     noises = ("v_e [m/s]", "steering [rad]")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        _check_lengths(self.wheelbase, self.sensor, self.encoder)
-        for name in ("wheelbase", "sensor", "encoder"):
-            set_field(self, name, held_array(getattr(self, name)))
 
     def _rates(self, u: Control) -> tuple[Array, Array, Array]:
         """Speed v, gain v/v_e and the sensor's twist over v (3,), from curvature κ = tan α/L."""
@@ -84,23 +77,3 @@ class Ackermann(Motion):
         by_rates = jnp.stack([dt * gain * direction, dt * by_alpha, v * direction], axis=1)
         by_control = by_move @ by_twist @ by_rates
         return by_pose, by_control, by_control[:, :2]
-
-
-def _check_lengths(wheelbase: ArrayLike, sensor: ArrayLike, encoder: ArrayLike) -> None:
-    for what, value, shape in (
-        ("wheelbase", wheelbase, ()),
-        ("sensor", sensor, (2,)),
-        ("encoder", encoder, ()),
-    ):
-        concrete = is_concrete(value)
-        given = np.shape(value) if concrete else jnp.asarray(value).shape
-        if given != shape:
-            raise ValueError(f"Ackermann: expected {what} of shape {shape}, got {given}")
-        if concrete:
-            values = np.asarray(value)
-            if not np.issubdtype(values.dtype, np.number) or np.iscomplexobj(values):
-                raise ValueError(f"Ackermann: {what} is not a real number, but {values.dtype}")
-            if not np.all(np.isfinite(values)):
-                raise ValueError(f"Ackermann: {what} is not finite")
-    if is_concrete(wheelbase) and not np.asarray(wheelbase) > 0:
-        raise ValueError(f"Ackermann: expected a positive wheelbase, got {wheelbase!r}")

@@ -2,8 +2,8 @@
 
 import jax.numpy as jnp
 
-from jaxslam.core._noise import NoiseCov
 from jaxslam.core._record import record
+from jaxslam.core.noise import NoiseCov
 from jaxslam.core.protocols import Motion
 from jaxslam.math import se2
 from jaxslam.math._arrays import Control, Pose, ProcessNoise, StepJacobians

@@ -6,10 +6,10 @@ from jax import Array
 from jaxtyping import Float
 from numpy.typing import ArrayLike
 
-from jaxslam.core._noise import NoiseCov
-from jaxslam.core._numbers import check_alpha, held_array
-from jaxslam.core._record import record, set_field
+from jaxslam.core._record import field, record
+from jaxslam.core.noise import NoiseCov
 from jaxslam.core.protocols import Motion
+from jaxslam.core.validation import InvalidField, finite
 from jaxslam.math import se2
 from jaxslam.math._arrays import Control, Pose, ProcessNoise, ProcessNoiseCov, StepJacobians
 from jaxslam.math.angles import wrap
@@ -65,12 +65,8 @@ class OdometryNoise:
     turning; (0, -d, 0) does not.
     """
 
-    alpha: ArrayLike
+    alpha: ArrayLike = field(check=finite(4, least=0.0))
     """(4,) α1, α3 [1], α2 [rad²/m²], α4 [m²/rad²], not negative"""
-
-    def __post_init__(self) -> None:
-        check_alpha("OdometryNoise", self.alpha, 4)
-        set_field(self, "alpha", held_array(self.alpha))
 
     def __call__(self, pose: Pose, u: Control) -> ProcessNoiseCov:
         a1, a2, a3, a4 = jnp.asarray(self.alpha, pose.dtype)
@@ -111,7 +107,8 @@ def odometry_controls(path: ArrayLike) -> Float[np.ndarray, "T 3"]:
     """
     poses = np.asarray(path, np.float64)
     if poses.ndim != 2 or poses.shape[1] != 3 or not np.isfinite(poses).all():
-        raise ValueError(f"odometry_controls: expected finite poses (T, 3), got {poses.shape}")
+        reason = f"expected finite poses (T, 3), got {poses.shape}"
+        raise InvalidField("odometry_controls", "path", reason)
     moved = np.diff(poses, axis=0)
     c, s = np.cos(poses[:-1, 2]), np.sin(poses[:-1, 2])
     ahead, left = c * moved[:, 0] + s * moved[:, 1], c * moved[:, 1] - s * moved[:, 0]

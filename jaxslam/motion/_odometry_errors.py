@@ -4,13 +4,30 @@ import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
 
-from jaxslam.core._record import record
+from jaxslam.core._record import field, record
 from jaxslam.core.protocols import Motion
+from jaxslam.core.validation import instance_of
 from jaxslam.math import se2
 from jaxslam.math._arrays import Control, Pose, ProcessNoise
 
 _TRAVEL, _ACROSS, _TURN = ("v", "forward"), ("left",), ("omega", "turn")
 """Names of the controls, velocities or increments, that are corrected."""
+
+
+def can_correct(motion: Motion) -> bool:
+    """Whether a motion model has the controls, travel and turn, that `Corrected` corrects."""
+    names = {name.split(" ")[0] for name in motion.controls}
+    return bool(names & set(_TRAVEL)) and bool(names & set(_TURN))
+
+
+def _check_correctable(motion: Motion) -> Motion:
+    instance_of(Motion)(motion)
+    if not can_correct(motion):
+        raise ValueError(
+            "expected a motion model with controls v and omega, or forward and turn, got "
+            f"{', '.join(motion.controls)}"
+        )
+    return motion
 
 
 @record
@@ -31,22 +48,14 @@ class Corrected(Motion):
     Raises ValueError on a model without travel and turn among its controls.
     """
 
-    motion: Motion
-    """of the recorded controls without errors"""
+    motion: Motion = field(check=_check_correctable)
+    """the model of the recorded controls without errors"""
     scale: ArrayLike = (1.0, 1.0)
     """(travel, turn)"""
     wheels: ArrayLike = (0.0, 0.0)
     """(outer [m], curvature [rad/m])"""
     heading: ArrayLike = 0.0
     """[rad]"""
-
-    def __post_init__(self) -> None:
-        if not can_correct(self.motion):
-            raise ValueError(
-                "Corrected: expected a motion model with controls v and omega, or forward and "
-                f"turn, got {', '.join(self.motion.controls)}"
-            )
-        super().__post_init__()
 
     @property
     def name(self) -> str:  # type: ignore[override]
@@ -72,7 +81,7 @@ class Corrected(Motion):
         """The control (U,) without its systematic errors."""
         names = [name.split(" ")[0] for name in self.motion.controls]
         along, turn = (next(k for k, n in enumerate(names) if n in of) for of in (_TRAVEL, _TURN))
-        scale, wheels = (jnp.asarray(given, u.dtype) for given in (self.scale, self.wheels))
+        scale, wheels = (jnp.asarray(pair, u.dtype) for pair in (self.scale, self.wheels))
         corrected = list(u)
         corrected[along] = scale[0] * u[along] - wheels[0] * jnp.abs(u[turn])
         corrected[turn] = scale[1] * u[turn] + wheels[1] * u[along]
@@ -84,9 +93,3 @@ class Corrected(Motion):
     def _turned(self, pose: Pose, sign: float) -> Pose:
         heading = sign * jnp.asarray(self.heading, pose.dtype)
         return se2.compose(pose, jnp.stack([0.0 * heading, 0.0 * heading, heading]))
-
-
-def can_correct(motion: Motion) -> bool:
-    """Whether a motion model has the controls, travel and turn, that `Corrected` corrects."""
-    names = {name.split(" ")[0] for name in motion.controls}
-    return bool(names & set(_TRAVEL)) and bool(names & set(_TURN))

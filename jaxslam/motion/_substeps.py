@@ -6,9 +6,9 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxslam.core._numbers import check_count
-from jaxslam.core._record import record, static
+from jaxslam.core._record import field, record, static
 from jaxslam.core.protocols import Motion
+from jaxslam.core.validation import at_least, instance_of
 from jaxslam.math._arrays import Control, Pose, ProcessNoise, StepJacobians
 
 _Rows = tuple[Array, Array]
@@ -34,14 +34,10 @@ class Substeps(Motion):
     the unit. It perturbs controls, and has hand-derived Jacobians, where the model does.
     """
 
-    motion: Motion
+    motion: Motion = field(check=instance_of(Motion))
     """the model, with U controls and W noises"""
-    count: int = static()
-    """n; ValueError unless it is an integer >= 1"""
-
-    def __post_init__(self) -> None:
-        check_count("Substeps: count", self.count)
-        super().__post_init__()
+    count: int = static(check=at_least(1))
+    """n"""
 
     @property
     def name(self) -> str:  # type: ignore[override]
@@ -56,19 +52,20 @@ class Substeps(Motion):
         return _number_names(self.motion.noises, self.count)
 
     def step(self, pose: Pose, u: Control, w: ProcessNoise) -> Pose:
-        def one(pose: Pose, row: _Rows) -> tuple[Array, None]:
+        def substep(pose: Pose, row: _Rows) -> tuple[Array, None]:
             return self.motion.step(pose, *row), None
 
-        return jax.lax.scan(one, pose, self._rows(u, w))[0]
+        return jax.lax.scan(substep, pose, self._rows(u, w))[0]
 
     def noise_cov(self, pose: Pose, u: Control) -> Array:
         size = self.count * len(self.motion.noises)
 
-        def one(pose: Pose, row: _Rows) -> _Rows:
-            u_k, none = row
-            return self.motion.step(pose, u_k, none), self.motion.noise_cov(pose, u_k)
+        def substep(pose: Pose, row: _Rows) -> _Rows:
+            u_k, no_noise = row
+            return self.motion.step(pose, u_k, no_noise), self.motion.noise_cov(pose, u_k)
 
-        _, blocks = jax.lax.scan(one, pose, self._rows(u, jnp.zeros(size, pose.dtype)))
+        _, blocks = jax.lax.scan(substep, pose, self._rows(u, jnp.zeros(size, pose.dtype)))
+        # Axes (substep, noise, substep, noise): Q_k where the substeps are the same, else zero.
         identity = jnp.eye(self.count, dtype=blocks.dtype)[:, None, :, None]
         return (identity * blocks[:, :, None, :]).reshape(size, size)
 
@@ -104,4 +101,6 @@ class Substeps(Motion):
 def _number_names(names: tuple[str, ...], count: int) -> tuple[str, ...]:
     """Numbered names: ("v [m/s]",) twice is ("v 1 [m/s]", "v 2 [m/s]"), units last for `verify`."""
     parts = [name.partition(" [") for name in names]
-    return tuple(f"{a} {k + 1}{space}{unit}" for k in range(count) for a, space, unit in parts)
+    return tuple(
+        f"{bare} {k + 1}{bracket}{unit}" for k in range(count) for bare, bracket, unit in parts
+    )

@@ -3,8 +3,8 @@
 import jax.numpy as jnp
 from numpy.typing import ArrayLike
 
-from jaxslam.core._noise import NoiseCov
 from jaxslam.core._record import record
+from jaxslam.core.noise import NoiseCov
 from jaxslam.core.protocols import Motion
 from jaxslam.math import se2
 from jaxslam.math._arrays import Control, Pose, ProcessNoise, ProcessNoiseCov, StepJacobians
@@ -57,13 +57,13 @@ class WhiteNoise:
     travel: ArrayLike
     """[m/√s] standard deviation of the travel in a second"""
     turn: ArrayLike
-    """[rad/√s] of the heading in a second"""
+    """[rad/√s] standard deviation of the heading in a second"""
     turn_share: ArrayLike = 0.0
-    """[√s] of the heading in a second, as a share of ω"""
+    """[√s] standard deviation of the heading in a second, as a share of ω"""
 
     def __call__(self, pose: Pose, u: Control) -> ProcessNoiseCov:
         travel, turn, share = (
-            jnp.asarray(given, u.dtype) for given in (self.travel, self.turn, self.turn_share)
+            jnp.asarray(value, u.dtype) for value in (self.travel, self.turn, self.turn_share)
         )
         moving = u[2] > 0
         density = jnp.diag(jnp.stack([travel**2, turn**2 + (share * u[1]) ** 2]))

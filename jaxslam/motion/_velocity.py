@@ -4,10 +4,10 @@ import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
 
-from jaxslam.core._noise import NoiseCov
-from jaxslam.core._numbers import check_alpha, held_array
-from jaxslam.core._record import record, set_field
+from jaxslam.core._record import field, record
+from jaxslam.core.noise import NoiseCov
 from jaxslam.core.protocols import Motion
+from jaxslam.core.validation import finite
 from jaxslam.math import se2
 from jaxslam.math._arrays import Control, Pose, ProcessNoise, ProcessNoiseCov, StepJacobians
 
@@ -64,12 +64,8 @@ class VelocityNoise:
     Variances, as in Probabilistic Robotics, Table 5.3; they do not depend on Δt.
     """
 
-    alpha: ArrayLike
+    alpha: ArrayLike = field(check=finite(6, least=0.0))
     """(6,) α1, α4, α6 [1], α2 [m²/rad²], α3, α5 [rad²/m²], not negative"""
-
-    def __post_init__(self) -> None:
-        check_alpha("VelocityNoise", self.alpha, 6)
-        set_field(self, "alpha", held_array(self.alpha))
 
     def __call__(self, pose: Pose, u: Control) -> ProcessNoiseCov:
         a1, a2, a3, a4, a5, a6 = jnp.asarray(self.alpha, pose.dtype)

@@ -4,6 +4,8 @@
 particles.
 """
 
+from jaxslam._public import publish
+from jaxslam.core._names import Named
 from jaxslam.core.protocols import Resample
 from jaxslam.resampling._kld import kld_bound
 from jaxslam.resampling._methods import (
@@ -15,12 +17,14 @@ from jaxslam.resampling._methods import (
     systematic,
 )
 
-REGISTRY: dict[str, Resample] = {
-    "multinomial": multinomial,
-    "residual": residual,
-    "stratified": stratified,
-    "systematic": systematic,
-}
+REGISTRY: dict[str, Resample] = Named(
+    {
+        "multinomial": multinomial,
+        "residual": residual,
+        "stratified": stratified,
+        "systematic": systematic,
+    }
+)
 
 __all__ = [
     "REGISTRY",
@@ -32,3 +36,5 @@ __all__ = [
     "stratified",
     "systematic",
 ]
+
+publish(__name__)

@@ -7,7 +7,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.core._numbers import is_concrete
+from jaxslam.core.validation import positive, require
 from jaxslam.math._arrays import Number
 from jaxslam.math.stats import normal_quantile
 
@@ -27,8 +27,7 @@ def kld_bound(bins: Int[Array, "*K"], error: Number, confidence: float) -> Float
 
     Raises ValueError on a concrete error not above 0.
     """
-    if is_concrete(error) and not error > 0:
-        raise ValueError(f"kld_bound: expected an error above 0, got {error}")
+    require("kld_bound", "error", error, positive)
     z = normal_quantile(confidence)
     many = bins > 1
     dof = jnp.where(many, bins - 1, 1).astype(jnp.result_type(float))

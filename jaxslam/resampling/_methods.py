@@ -9,9 +9,9 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Float, Int
 
-from jaxslam.core._numbers import is_concrete
-from jaxslam.core._record import hold_function, record
+from jaxslam.core._record import field, function_of, record
 from jaxslam.core.protocols import Resample
+from jaxslam.core.validation import in_range
 from jaxslam.math._arrays import Number
 from jaxslam.resampling._weights import at_points, even, normalized, weights_of
 
@@ -110,15 +110,10 @@ class Soft:
     Raises ValueError on a share outside [0, 1].
     """
 
-    share: Number
-    """of the weights in the mixture, 0 to 1"""
-    resample: Resample = systematic
-    """how indices are drawn from q"""
-
-    def __post_init__(self) -> None:
-        hold_function(self, "resample", "log_weights, key")
-        if is_concrete(self.share) and not 0 <= self.share <= 1:
-            raise ValueError(f"Soft: expected a share from 0 to 1, got {self.share}")
+    share: Number = field(check=in_range(0.0, 1.0))
+    """share of the weights in the mixture, 0 to 1"""
+    resample: Resample = field(default=systematic, check=function_of("log_weights", "key"))
+    """method that draws the indices from q"""
 
     def __call__(
         self, log_weights: Float[Array, "P"], key: Array
@@ -158,11 +153,8 @@ class StopGradient:
     A caller must not normalize these weights again: their sum is 1, but its gradient is not 0.
     """
 
-    resample: Resample = systematic
-    """how indices are drawn; unbiased, as those of `jaxslam.resampling` are"""
-
-    def __post_init__(self) -> None:
-        hold_function(self, "resample", "log_weights, key")
+    resample: Resample = field(default=systematic, check=function_of("log_weights", "key"))
+    """method that draws the indices; unbiased, as those of `jaxslam.resampling` are"""
 
     def __call__(
         self, log_weights: Float[Array, "P"], key: Array

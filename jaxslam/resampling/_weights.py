@@ -8,6 +8,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.core.protocols import Differentiable, Resample
+from jaxslam.core.validation import InvalidField
 from jaxslam.math._xla import where_any
 
 _T = TypeVar("_T")
@@ -24,9 +25,8 @@ def normalized(
     Raises ValueError unless log_weights has shape (P,), P at least 1.
     """
     if jnp.ndim(log_weights) != 1 or jnp.shape(log_weights)[0] == 0:
-        raise ValueError(
-            f"normalized: expected log-weights of shape (P,), got {jnp.shape(log_weights)}"
-        )
+        reason = f"expected shape (P,), P at least 1, got {jnp.shape(log_weights)}"
+        raise InvalidField("normalized", "log_weights", reason)
     finite = jnp.isfinite(log_weights)
     some = finite.any()
     highest = jnp.where(some, jnp.max(jnp.where(finite, log_weights, -jnp.inf)), 0.0)
@@ -47,10 +47,10 @@ def survivors(
 ) -> tuple[Int[Array, "P"], Float[Array, "P"]]:
     """The ancestors and their log-weights: log 1/P unless the method is a `Differentiable`, which
     returns its own."""
-    found = resample(log_weights, key)
-    if isinstance(found, tuple):
-        return found
-    return found, jnp.broadcast_to(even(log_weights), log_weights.shape)
+    result = resample(log_weights, key)
+    if isinstance(result, tuple):
+        return result
+    return result, jnp.broadcast_to(even(log_weights), log_weights.shape)
 
 
 def resampled_where(

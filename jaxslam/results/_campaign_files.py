@@ -10,6 +10,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 from warnings import warn
 
+from jaxslam._public import publish
 from jaxslam.consistency._tally import Tally
 from jaxslam.consistency.campaign import Campaign
 from jaxslam.consistency.campaign._block import BOUND
@@ -243,3 +244,6 @@ def _drawings(
             "map": (f"Maps: {title}", partial(run_map_figure, campaign, title=title)),
         }
     return drawings
+
+
+publish("jaxslam", load)

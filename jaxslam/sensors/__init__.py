@@ -4,6 +4,8 @@ The conformance tests run over `REGISTRY`."""
 
 from collections.abc import Callable
 
+from jaxslam._public import publish
+from jaxslam.core._names import Named
 from jaxslam.core.protocols import Sensor
 from jaxslam.sensors._absolute import Absolute, Compass, PositionFix
 from jaxslam.sensors._bearing_inverse_depth import BearingInverseDepth
@@ -15,17 +17,19 @@ from jaxslam.sensors._range_errors import Corrected
 from jaxslam.sensors._relative_position import RelativePosition
 from jaxslam.sensors._suite import Part, Suite
 
-REGISTRY: dict[str, Callable[..., Sensor]] = {
-    "bearing_inverse_depth": BearingInverseDepth,
-    "bearing_only": BearingOnly,
-    "compass": Compass,
-    "line": Line,
-    "position_fix": PositionFix,
-    "range_bearing": RangeBearing,
-    "range_bearing_signature": RangeBearingSignature,
-    "range_only": RangeOnly,
-    "relative_position": RelativePosition,
-}
+REGISTRY: dict[str, Callable[..., Sensor]] = Named(
+    {
+        "bearing_inverse_depth": BearingInverseDepth,
+        "bearing_only": BearingOnly,
+        "compass": Compass,
+        "line": Line,
+        "position_fix": PositionFix,
+        "range_bearing": RangeBearing,
+        "range_bearing_signature": RangeBearingSignature,
+        "range_only": RangeOnly,
+        "relative_position": RelativePosition,
+    }
+)
 
 __all__ = [
     "REGISTRY",
@@ -44,3 +48,5 @@ __all__ = [
     "RelativePosition",
     "Suite",
 ]
+
+publish(__name__)

@@ -6,10 +6,10 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from jaxslam.core._noise import NoiseCov
-from jaxslam.core._numbers import is_concrete
-from jaxslam.core._record import record, set_field
+from jaxslam.core._record import field, record
+from jaxslam.core.noise import NoiseCov
 from jaxslam.core.protocols import Free, Reduced, Sensor
+from jaxslam.core.validation import or_none, positive
 from jaxslam.math import se2
 from jaxslam.math._arrays import (
     InvertJacobians,
@@ -19,15 +19,25 @@ from jaxslam.math._arrays import (
     Point,
     Pose,
     Unmeasured,
+    is_concrete,
 )
 from jaxslam.math.angles import wrap
-from jaxslam.sensors._partial import BearingOnly, FreeLike, free_parameters
+from jaxslam.sensors._partial import BearingOnly, FreeLike, prior
 
 _FAR = 1e-6
 """[1/m] least inverse distance that `position` uses."""
 
 _NEAR = 1e-6
 """[m] least distance with which `embed` starts a landmark."""
+
+
+def _check_distance(min_distance: ArrayLike) -> ArrayLike:
+    positive(min_distance)
+    if is_concrete(min_distance):
+        with np.errstate(all="ignore"):  # the square of 1/min_distance may be 0 or infinite
+            sigma = 0.25 / np.asarray(min_distance, np.float64)
+            prior(1)(([2 * sigma], [[sigma**2]]))
+    return min_distance
 
 
 @record
@@ -69,25 +79,15 @@ class BearingInverseDepth(Sensor):
     """(1, 1) covariance of the bearing, or a function of z."""
     mount: ArrayLike | None = None
     """(3,) pose of the sensor on the robot, Solà's S"""
-    min_distance: ArrayLike = 1.0
+    min_distance: ArrayLike = field(default=1.0, check=_check_distance)
     """[m] the least distance of a landmark, Solà's d_min (47)"""
-    inverse_distance: FreeLike | None = None
+    inverse_distance: FreeLike | None = field(default=None, check=or_none(prior(1)))
     """mean (1,) and covariance (1, 1) of s. By default mean 1/(2 d_min) and σ 1/(4 d_min), so that
     2 σ span 0 to 1/d_min."""
-    to_point: ArrayLike | None = None
+    to_point: ArrayLike | None = field(default=None, check=or_none(positive))
     """L_d below which landmarks become points; None: never"""
     measurements = ("bearing [rad]",)
     landmark = ("x0 [m]", "y0 [m]", "alpha [rad]", "rho [1/m]")
-
-    def __post_init__(self) -> None:
-        super().__post_init__()
-        name, to_point = type(self).__name__, self.to_point
-        _check_distance(name, self.min_distance)
-        if to_point is not None and is_concrete(to_point) and not np.asarray(to_point) > 0:
-            raise ValueError(f"{name}: expected to_point above 0, got {to_point}")
-        if self.inverse_distance is not None:
-            given = free_parameters(name, self.inverse_distance, 1)
-            set_field(self, "inverse_distance", given)
 
     @property
     def free(self) -> Free:  # type: ignore[override]
@@ -162,16 +162,3 @@ class BearingInverseDepth(Sensor):
 
 def _direction(alpha: Array) -> Array:
     return jnp.stack([jnp.cos(alpha), jnp.sin(alpha)])
-
-
-def _check_distance(name: str, min_distance: ArrayLike) -> None:
-    if np.ndim(min_distance) != 0:
-        raise ValueError(f"{name}: expected one min_distance, got an array")
-    if is_concrete(min_distance):
-        value = np.asarray(min_distance)
-        real = np.issubdtype(value.dtype, np.integer) or np.issubdtype(value.dtype, np.floating)
-        if not (real and np.isfinite(value) and value > 0):
-            raise ValueError(f"{name}: expected 0 < min_distance < inf, got {min_distance!r}")
-        with np.errstate(all="ignore"):  # the square of 1/min_distance may be 0 or infinite
-            sigma = 0.25 / value.astype(np.float64)
-            free_parameters(name, ([2 * sigma], [[sigma**2]]), 1)

@@ -8,11 +8,11 @@ import numpy as np
 from jax import Array
 from numpy.typing import ArrayLike
 
-from jaxslam.core._noise import NoiseCov
-from jaxslam.core._numbers import check_covariance, is_concrete
-from jaxslam.core._record import record, set_field
+from jaxslam.core._record import field, record
+from jaxslam.core.noise import NoiseCov
 from jaxslam.core.protocols import Free, Sensor
 from jaxslam.core.types import JaxOrNumPy
+from jaxslam.core.validation import Check, covariance
 from jaxslam.math import se2
 from jaxslam.math._arrays import (
     InvertJacobians,
@@ -21,31 +21,35 @@ from jaxslam.math._arrays import (
     ObserveJacobians,
     Pose,
     Unmeasured,
+    is_concrete,
 )
 from jaxslam.math._definite import invertible
 
 FreeLike = Free | tuple[ArrayLike, ArrayLike]
 
 
-def free_parameters(name: str, free: FreeLike, size: int) -> Free:
-    """The `Free` of free = (mean (size,), cov (size, size)), in float64 on the host unless traced.
+def prior(size: int) -> Check:
+    """The check of free = (mean (size,), cov (size, size)), which becomes a `Free`.
 
-    Raises ValueError unless the mean is finite and the covariance positive definite; a traced part
-    is checked for its shape alone.
+    In float64 on the host unless traced; the mean finite, the covariance positive definite.
     """
-    try:
-        mean, cov = free
-    except (TypeError, ValueError):
-        raise ValueError(f"{name}: expected free = (mean, covariance), got {free!r}") from None
-    mean, cov = _host_array(mean), _host_array(cov)
-    if mean.shape != (size,):
-        raise ValueError(f"{name}: expected a prior mean of shape ({size},), got {mean.shape}")
-    if is_concrete(mean) and not (_is_real(mean) and np.all(np.isfinite(mean))):
-        raise ValueError(f"{name}: expected a finite prior mean, got {mean}")
-    check_covariance(f"{name}: prior", cov, size)
-    if is_concrete(cov) and not invertible(np.asarray(cov)):
-        raise ValueError(f"{name}: expected a positive definite prior covariance")
-    return Free(mean, cov)
+
+    def check(value: FreeLike) -> Free:
+        try:
+            mean, cov = value
+        except (TypeError, ValueError):
+            raise ValueError(f"expected (mean, covariance), got {value!r}") from None
+        mean, cov = _host_array(mean), _host_array(cov)
+        if mean.shape != (size,):
+            raise ValueError(f"expected a prior mean of shape ({size},), got {mean.shape}")
+        if is_concrete(mean) and not (_is_real(mean) and np.all(np.isfinite(mean))):
+            raise ValueError(f"expected a finite prior mean, got {mean}")
+        covariance(size)(cov)
+        if is_concrete(cov) and not invertible(np.asarray(cov)):
+            raise ValueError("expected a positive definite prior covariance")
+        return Free(mean, cov)
+
+    return check
 
 
 def _host_array(values: ArrayLike) -> JaxOrNumPy:
@@ -68,10 +72,6 @@ class _PolarCoordinate(Sensor):
 
     _own: slice
     _other: slice
-
-    def __post_init__(self) -> None:
-        set_field(self, "free", free_parameters(type(self).__name__, self.free, 1))
-        super().__post_init__()
 
     def _polar(self, z: Measurement, s: Unmeasured) -> Array:
         return jnp.concatenate([s, z] if self._own.start else [z, s])
@@ -123,7 +123,7 @@ class BearingOnly(_PolarCoordinate):
     """(1, 1) covariance of the bearing, or a function of z."""
     mount: ArrayLike | None = None
     """(3,) pose of the sensor on the robot, Solà's S"""
-    free: FreeLike = _TEN_METRES  # type: ignore[assignment]
+    free: FreeLike = field(default=_TEN_METRES, check=prior(1))  # type: ignore[assignment]
     """mean (1,) and covariance (1, 1) of the range [m], Solà (39)"""
     measurements = ("bearing [rad]",)
     _own, _other = slice(1, 2), slice(0, 1)
@@ -152,7 +152,7 @@ class RangeOnly(_PolarCoordinate):
     """(1, 1) covariance of the range, or a function of z."""
     mount: ArrayLike | None = None
     """(3,) pose of the sensor on the robot, Solà's S"""
-    free: FreeLike = _ANY_DIRECTION  # type: ignore[assignment]
+    free: FreeLike = field(default=_ANY_DIRECTION, check=prior(1))  # type: ignore[assignment]
     """mean (1,) and covariance (1, 1) of the bearing [rad], Solà (39)"""
     measurements = ("range [m]",)
     _own, _other = slice(0, 1), slice(1, 2)

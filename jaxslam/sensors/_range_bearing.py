@@ -4,8 +4,8 @@ import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
 
-from jaxslam.core._noise import NoiseCov
 from jaxslam.core._record import record
+from jaxslam.core.noise import NoiseCov
 from jaxslam.core.protocols import Sensor
 from jaxslam.math import se2
 from jaxslam.math._arrays import (
@@ -65,18 +65,18 @@ class RangeBearingNoise:
     """
 
     range: ArrayLike
-    """[m]"""
+    """[m] standard deviation"""
     bearing: ArrayLike
-    """[rad]"""
+    """[rad] standard deviation"""
     share: ArrayLike = 0.0
-    """of the range [1]"""
+    """[1] standard deviation of the range, as a share of the range"""
     across: ArrayLike = 0.0
-    """[m]"""
+    """[m] standard deviation of the place across the line of sight"""
 
     def __call__(self, z: Measurement) -> Array:
         range, bearing, share, across = (
-            jnp.asarray(given, z.dtype)
-            for given in (self.range, self.bearing, self.share, self.across)
+            jnp.asarray(value, z.dtype)
+            for value in (self.range, self.bearing, self.share, self.across)
         )
         square = z[0] ** 2 + across**2
         apart = jnp.where(square > 0, across**2 / jnp.where(square > 0, square, 1.0), 0.0)

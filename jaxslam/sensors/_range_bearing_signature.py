@@ -4,8 +4,8 @@ import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
 
-from jaxslam.core._noise import NoiseCov
 from jaxslam.core._record import record
+from jaxslam.core.noise import NoiseCov
 from jaxslam.core.protocols import Sensor
 from jaxslam.math import se2
 from jaxslam.math._arrays import (

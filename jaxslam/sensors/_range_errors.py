@@ -4,8 +4,9 @@ import jax.numpy as jnp
 from jax import Array
 from numpy.typing import ArrayLike
 
-from jaxslam.core._record import record
+from jaxslam.core._record import field, record
 from jaxslam.core.protocols import Sensor
+from jaxslam.core.validation import InvalidField, instance_of
 from jaxslam.math._arrays import Landmark, Measurement, Pose, Unmeasured
 from jaxslam.sensors._suite import Wrapped
 
@@ -23,7 +24,7 @@ class Corrected(Wrapped):
     Raises ValueError on a sensor that measures no range first, or with an axis no bearing second.
     """
 
-    sensor: Sensor
+    sensor: Sensor = field(check=instance_of(Sensor))
     range: ArrayLike = (1.0, 0.0)
     """(scale, offset [m])"""
     axis: ArrayLike | None = None
@@ -32,10 +33,9 @@ class Corrected(Wrapped):
     def __post_init__(self) -> None:
         names = self.sensor.measurements
         if not can_correct(self.sensor) or (self.axis is not None and "bearing [rad]" not in names):
-            wanted = "a range" if self.axis is None else "a range and a bearing"
-            raise ValueError(
-                f"Corrected: expected a sensor of {wanted}, got one of {', '.join(names)}"
-            )
+            entries = "a range" if self.axis is None else "a range and a bearing"
+            reason = f"expected a sensor of {entries}, got one of {', '.join(names)}"
+            raise InvalidField(type(self).__name__, "sensor", reason)
         super().__post_init__()
 
     def observe(self, pose: Pose, landmark: Landmark) -> Measurement:

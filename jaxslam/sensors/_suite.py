@@ -11,10 +11,11 @@ import jax
 import jax.numpy as jnp
 from jax import Array
 
-from jaxslam.core._numbers import check_count
-from jaxslam.core._record import hold_function, record, set_field, static
+from jaxslam.core._record import field, function_of, record, static
+from jaxslam.core._reprs import describe
 from jaxslam.core.protocols import Free, Reduced, Sensor
 from jaxslam.core.types import Scan
+from jaxslam.core.validation import InvalidField, at_least, instance_of, one_of, or_none
 from jaxslam.math._arrays import Landmark, Measurement, Point, Pose, Unmeasured
 
 
@@ -59,44 +60,63 @@ class Wrapped(Sensor):
         return self.sensor.embed(pose, point)
 
 
+def _check_single(sensor: Sensor) -> Sensor:
+    if isinstance(sensor, Suite):
+        raise ValueError("expected one Sensor, got a Suite")
+    single: Sensor = instance_of(Sensor)(sensor)
+    return single
+
+
 @record
 class Part:
-    """One sensor of a suite. Raises ValueError on places or every below 1, or an invalid start."""
+    """One sensor of a suite. Raises InvalidField on places or an interval below 1."""
 
-    sensor: Sensor
-    places: int = static()
+    sensor: Sensor = field(check=_check_single)
+    places: int = static(check=at_least(1))
     """its measurement slots in a scan; 1 of an absolute sensor"""
-    every: int = static(default=1)
-    """interval of its measurements in a simulation, in steps,"""
-    start: int = static(default=0)
-    """and first step; a filter uses only `Scan.valid`"""
-    visible: Callable[[Array, Array], Array] | None = None
+    interval: int = static(default=1, check=at_least(1))
+    """interval of its measurements in a simulation [steps]; a filter uses only `Scan.valid`"""
+    start: int = static(default=0, check=at_least(0))
+    """step of its first measurement in a simulation"""
+    visible: Callable[[Array, Array], Array] | None = field(
+        default=None, check=or_none(function_of("pose", "l"))
+    )
     """(pose, l) -> (): its field of view in a simulation; None for that of the scenario"""
-    sees: Literal["landmarks", "robots"] = static(default="landmarks")
+    sees: Literal["landmarks", "robots"] = static(
+        default="landmarks", check=one_of("landmarks", "robots")
+    )
     """what its slots measure in a simulation. A filter of one robot ignores measurements of
     robots (`Status.UNMATCHED`); that of a team uses the tags, and starts no landmark there."""
 
     def __post_init__(self) -> None:
-        if not isinstance(self.sensor, Sensor) or isinstance(self.sensor, Suite):
-            raise ValueError(f"Part: expected one Sensor, got {type(self.sensor).__name__}")
-        check_count(f"Part: places of {self.sensor.name}", self.places)
-        check_count(f"Part: every of {self.sensor.name}", self.every)
-        if type(self.start) is not int or self.start < 0:
-            raise ValueError(f"Part: expected a start of at least 0, got {self.start!r}")
-        if self.sees not in ("landmarks", "robots"):
-            raise ValueError(f'Part: expected sees "landmarks" or "robots", got {self.sees!r}')
-        if self.visible is not None:
-            hold_function(self, "visible", "pose, l")
         if not self.sensor.landmark and self.places != 1:
-            raise ValueError(
-                f"Part: expected places=1 of the absolute sensor {self.sensor.name}, got "
-                f"{self.places}"
-            )
+            reason = f"expected 1 of the absolute sensor {self.sensor.name}, got {self.places}"
+            raise InvalidField(type(self).__name__, "places", reason)
 
     @property
     def absolute(self) -> bool:
         """Whether it is an absolute sensor, which measures the robot and no landmark."""
-        return not self.sensor.landmark
+        return self.sensor.absolute
+
+
+def _parts(parts: Sequence[Part | tuple[Sensor, int]]) -> tuple[Part, ...]:
+    """The check of the parts of a suite: at least one, whose sensors share landmarks."""
+    if not isinstance(parts, Sequence):
+        raise ValueError(f"expected a list or a tuple, got {describe(parts)}")
+    for part in parts:
+        if not isinstance(part, Part) and not (isinstance(part, tuple) and len(part) == 2):
+            raise ValueError(f"expected a Part or (sensor, places), got {describe(part)}")
+    result = tuple(part if isinstance(part, Part) else Part(*part) for part in parts)
+    if not result:
+        raise ValueError("expected at least one sensor, got none")
+    sensors = [part.sensor for part in result if not part.absolute]
+    for sensor in sensors[1:]:
+        if sensor.landmark != sensors[0].landmark or not sensor.of_points:
+            raise ValueError(
+                f"expected sensors that share landmarks (x, y), got {sensors[0].landmark} of "
+                f"{sensors[0].name} and {sensor.landmark} of {sensor.name}"
+            )
+    return result
 
 
 @record
@@ -107,7 +127,7 @@ class Suite(Sensor):
     landmarks, then starts its new ones, which the next part may correct in the same scan.
     A tag may occur once a part. Absent measurements are slots that are not valid.
 
-        eyes = Suite([(RangeBearing(R, mount=front), 8), Part(Compass(S), 1, every=10)])
+        eyes = Suite([(RangeBearing(R, mount=front), 8), Part(Compass(S), 1, interval=10)])
         filter = EkfSlam(motion, eyes, capacity)
 
     The first slots of a scan are the first part's, the next ones the second's, and so on. Rows of
@@ -118,25 +138,8 @@ class Suite(Sensor):
     do not share landmarks (x, y): only a single one may have others.
     """
 
-    parts: tuple[Part, ...]
+    parts: tuple[Part, ...] = field(check=_parts)
     """each given as a `Part` or (sensor, places)"""
-
-    def __post_init__(self) -> None:
-        if not isinstance(self.parts, Sequence):
-            got = type(self.parts).__name__
-            raise ValueError(f"Suite: expected parts in a list or a tuple, got {got}")
-        made = tuple(part if isinstance(part, Part) else _part(part) for part in self.parts)
-        if not made:
-            raise ValueError("Suite: expected at least one sensor")
-        grounded = [part.sensor for part in made if not part.absolute]
-        for sensor in grounded[1:]:
-            if sensor.landmark != grounded[0].landmark or not sensor.of_points:
-                raise ValueError(
-                    f"Suite: expected sensors that share landmarks (x, y), got "
-                    f"{grounded[0].landmark} of {grounded[0].name} and {sensor.landmark} of "
-                    f"{sensor.name}"
-                )
-        set_field(self, "parts", made)
 
     @property
     def first(self) -> Sensor:
@@ -171,6 +174,17 @@ class Suite(Sensor):
     def reduced(self) -> Reduced | None:  # type: ignore[override]
         return self.first.reduced
 
+    def scans(self, scan: Scan) -> list[tuple[Sensor | None, Scan]]:
+        size = len(self.landmark)
+        pairs: list[tuple[Sensor | None, Scan]] = []
+        for part, part_scan in zip(self.parts, split_scan(scan, self.places), strict=True):
+            if part.sees == "robots":
+                pairs.append((None, part_scan))
+            else:
+                z = part_scan.z[:, : len(part.sensor.measurements)]
+                pairs.append((on_ground(part.sensor, size), part_scan._replace(z=z)))
+        return pairs
+
     def position(self, landmark: Landmark) -> Point:
         return self.first.position(landmark)
 
@@ -178,7 +192,8 @@ class Suite(Sensor):
         return self.first.embed(pose, point)
 
     def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
-        raise ValueError("Suite: a suite has no model of its own: call those of its parts")
+        reason = "a suite has no model of its own: call those of its parts"
+        raise InvalidField(type(self).__name__, "", reason)
 
     def residual(self, z: Measurement, z_hat: Measurement) -> Measurement:
         return self.observe(z, z_hat)
@@ -190,21 +205,17 @@ class Suite(Sensor):
         return self.observe(pose, z)
 
 
-def _part(given: object) -> Part:
-    if not isinstance(given, tuple) or len(given) != 2:
-        raise ValueError(f"Suite: expected a Part or (sensor, places), got {type(given).__name__}")
-    return Part(*given)
-
-
 def split_scan(scan: Scan, places: Sequence[int]) -> list[Scan]:
     """The scan (M,) divided into the scans of the sensors, in order.
 
     Raises ValueError unless the scan has as many slots as the sensors together.
     """
     if sum(places) != scan.tag.shape[0]:
-        raise ValueError(
-            f"suite: expected {sum(places)} measurement slots in a scan, {tuple(places)} by "
-            f"sensor, got {scan.tag.shape[0]}"
+        raise InvalidField(
+            "Suite",
+            "places",
+            f"expected {sum(places)} measurement slots in a scan, {tuple(places)} by sensor, got "
+            f"{scan.tag.shape[0]}",
         )
     ends = list(itertools.accumulate(places))
     return [
@@ -233,6 +244,10 @@ class _OnGround(Wrapped):
     def landmark(self) -> tuple[str, ...]:  # type: ignore[override]
         entries = self.sensor.landmark
         return (*entries, *("-",) * (self.size - len(entries)))
+
+    @property
+    def absolute(self) -> bool:
+        return self.sensor.absolute
 
     @property
     def free(self) -> Free:  # type: ignore[override]

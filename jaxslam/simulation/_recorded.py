@@ -10,6 +10,7 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import ArrayLike
 
+from jaxslam._public import publish
 from jaxslam.core._numbers import check_array
 from jaxslam.core._record import FrozenDict, record, static
 from jaxslam.core._units import are_headings_in_degrees
@@ -173,3 +174,6 @@ def recorded_world(
         published=published or {},
         source=source,
     )
+
+
+publish("jaxslam", RecordedWorld, recorded_world)

@@ -112,7 +112,7 @@ def part_scan(
         z = jnp.zeros((len(poses), part.places, len(part.sensor.measurements)), poses.dtype)
         none = jnp.zeros(z.shape[:2], bool)
         return Scan(z, jnp.full(none.shape, -1, jnp.int32), none), jnp.zeros_like(step)
-    on = (step >= part.start) & ((step - part.start) % part.every == 0)
+    on = (step >= part.start) & ((step - part.start) % part.interval == 0)
     if part.absolute:
         nothing = jnp.zeros((1, 0), poses.dtype)
         scan, missed = sensor_scans(part.sensor, everywhere, 1, poses, nothing, on, key)

@@ -9,10 +9,11 @@ import numpy as np
 from jaxtyping import Array, Float
 from numpy.typing import ArrayLike
 
+from jaxslam._public import publish
 from jaxslam.core._record import FrozenDict, hold_function, record, set_field, static
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import Log, Scan, Truth
-from jaxslam.filters.multi_robot._team import Robot, TeamMotion, check_team, sensors_of, sizes
+from jaxslam.filters.multi_robot.team import Robot, TeamMotion, check_team, sensors_of, sizes
 from jaxslam.math import se2
 from jaxslam.simulation._scans import Visible, everywhere, part_scan, side_by_side
 from jaxslam.simulation._worlds import World, drawn_near, drive
@@ -135,3 +136,6 @@ class TeamWorld(World):
         mine = jnp.stack(missed).sum(axis=0)
         truth = Truth(poses[self.report], landmarks, mine, starts[self.report])
         return truth, Log(controls, scan)
+
+
+publish("jaxslam", TeamWorld)

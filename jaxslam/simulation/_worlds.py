@@ -13,6 +13,7 @@ from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam._origin import FAR, far_origin, moved, returned
+from jaxslam._public import publish
 from jaxslam.core._numbers import check_covariance, check_key, held_array, is_concrete
 from jaxslam.core._record import FrozenDict, hold_function, record, set_field, static
 from jaxslam.core._validation import call_traced, check_record
@@ -311,3 +312,6 @@ def _check_table(name: str, values: ArrayLike, columns: int) -> None:
         raise ValueError(f"{name}: expected shape (N, {columns}) with N >= 1, got {table.shape}")
     if not np.issubdtype(table.dtype, np.number) or not np.all(np.isfinite(table)):
         raise ValueError(f"{name}: expected finite numbers")
+
+
+publish("jaxslam", World, Scenario, simulate)

@@ -1,5 +1,6 @@
 """A laser scanner in a world of exact walls, and the information of its scan on the pose."""
 
+from jaxslam._public import publish
 from jaxslam.simulation._laser import (
     Laser,
     LaserHistory,
@@ -21,3 +22,5 @@ __all__ = [
     "scan_world",
     "true_ranges",
 ]
+
+publish(__name__)

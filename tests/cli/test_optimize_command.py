@@ -11,7 +11,7 @@ import small_graphs
 from reference import graph as plain
 
 from jaxslam import _cli as cli
-from jaxslam import graphs
+from jaxslam import datasets, graphs
 from jaxslam._cli import optimize
 from jaxslam.results import plot
 from jaxslam.results.plot import _film
@@ -37,7 +37,7 @@ def small():
 @pytest.fixture(scope="module")
 def file(tmp_path_factory):
     path = tmp_path_factory.mktemp("graphs") / "small.g2o"
-    graphs.write(path, small())
+    datasets.write_graph(path, small())
     path.write_text("# by hand\n" + path.read_text())
     return path
 
@@ -87,7 +87,7 @@ def test_it_writes_the_optimum(file, tmp_path, capsys, monkeypatch):
     found = np.array([[float(r[k]) for k in ("x [m]", "y [m]", "theta [rad]")] for r in rows])
     np.testing.assert_allclose(found[:, :2], poses[:, :2], atol=1e-6)
     np.testing.assert_allclose(plain.wrap(found[:, 2] - poses[:, 2]), 0, atol=1e-6)
-    again = graphs.read(out / "optimized.g2o")
+    again = datasets.read_graph(out / "optimized.g2o")
     np.testing.assert_array_equal(again.poses, found)
     np.testing.assert_allclose(again.points, points, atol=1e-6)
     np.testing.assert_array_equal(drawn["after"].poses, found)
@@ -127,11 +127,11 @@ def test_a_file_of_toro_is_optimized_and_written_as_g2o(tmp_path, capsys, undraw
     graph = small_graphs.only(small(), "relative_pose")
     none = np.zeros(0, int)
     graph = graph._replace(points=np.zeros((0, 2)), point_id=none, fixed_point=none > 0)
-    graphs.write(tmp_path / "small.toro", graph)
+    datasets.write_graph(tmp_path / "small.toro", graph)
     run = ["optimize", str(tmp_path / "small.toro"), "--out", str(tmp_path)]
     assert cli.main(run) == 0
     assert "optimized.g2o" in capsys.readouterr().out
-    again = graphs.read(tmp_path / "optimized.g2o")
+    again = datasets.read_graph(tmp_path / "optimized.g2o")
     assert not again.fixed_pose.any()
     chi2 = json.loads((tmp_path / "summary.json").read_text())["chi2"]
     fixed = np.arange(8) == 0
@@ -160,7 +160,7 @@ def test_gtsam_reads_what_is_written(tmp_path, undrawn, fixed):
     written = list((tmp_path / "o").glob("*.g2o"))
     assert len(written) == 1
     assert written[0].read_text().count("FIX") == bool(fixed)
-    again = graphs.read(written[0])
+    again = datasets.read_graph(written[0])
     factors, values = gtsam.readG2o(str(written[0]), False)
     table = again.tables["relative_pose"]
     assert factors.size() == len(table.z) == 3
@@ -215,10 +215,10 @@ def test_a_kernel_doubts_loops_and_points_but_not_the_path(file, tmp_path, monke
         and sum(summary["of weight 1/2 or less"].values()) == 0
     )
     assert summary["certificate"].startswith("none: not for a robust cost")
-    assert len(graphs.read(tmp_path / "optimized.g2o").tables["relative_pose"].z) == 10
+    assert len(datasets.read_graph(tmp_path / "optimized.g2o").tables["relative_pose"].z) == 10
     apart = graphs.with_loops_apart(small())
     assert apart.tables["relative_pose/loops"].who.tolist() == [[7, 0], [2, 6], [5, 1]]
-    np.testing.assert_allclose(plain.chi2(graphs.read(file)), small_chi2(apart), rtol=1e-14)
+    np.testing.assert_allclose(plain.chi2(datasets.read_graph(file)), small_chi2(apart), rtol=1e-14)
 
 
 def small_chi2(graph):

@@ -35,7 +35,7 @@ def test_it_is_generalized_least_squares_where_all_is_linear():
         scaled = control * jnp.concatenate([1 + p, jnp.ones(1)])[None]
         return run(filter, Log(scaled, scan), np.zeros(3), np.zeros((3, 3)), KEY).info
 
-    found = calibrate(info, np.zeros(2))
+    result = calibrate(info, np.zeros(2))
     shared = np.minimum(*np.indices((steps, steps))) + 1
     for axis in range(2):
         # Unknowns l and p; the first has no prior.
@@ -43,11 +43,11 @@ def test_it_is_generalized_least_squares_where_all_is_linear():
         weight = np.linalg.inv(Q[axis, axis] * shared + 0.1**2 * np.eye(steps))
         cov = np.linalg.inv(slope.T @ weight @ slope)
         best = cov @ slope.T @ weight @ (z[:, axis] + np.cumsum(control[:, axis]))
-        np.testing.assert_allclose(found.parameters[axis], best[1], rtol=1e-8)
-        np.testing.assert_allclose(found.cov[axis, axis], cov[1, 1], rtol=1e-8)
-    assert abs(found.cov[0, 1]) < 1e-12
-    assert found.converged and len(found.misfit) == 2 and found.path.shape == (3, 2)
-    np.testing.assert_array_equal(found.dof, 2 * (steps - 1))
+        np.testing.assert_allclose(result.parameters[axis], best[1], rtol=1e-8)
+        np.testing.assert_allclose(result.cov[axis, axis], cov[1, 1], rtol=1e-8)
+    assert abs(result.cov[0, 1]) < 1e-12
+    assert result.converged and len(result.misfit) == 2 and result.path.shape == (3, 2)
+    np.testing.assert_array_equal(result.dof, 2 * (steps - 1))
 
 
 @pytest.mark.sweep
@@ -66,10 +66,10 @@ def test_a_pose_covariance_with_what_parameters_add_is_that_of_the_joint_estimat
         known = np.diag([start, start, 0.0])
         return run(filter, Log(scaled, scan), np.zeros(3), known, KEY)
 
-    found = calibrate(lambda p: trace(p).info, np.zeros(2))
-    added = consider_cov(lambda p: trace(p).estimate.pose, found.parameters, found.cov)
+    result = calibrate(lambda p: trace(p).info, np.zeros(2))
+    added = consider_cov(lambda p: trace(p).estimate.pose, result.parameters, result.cov)
     assert added.shape == (steps, 3, 3)
-    total = trace(jnp.asarray(found.parameters)).estimate.pose_cov[-1] + added[-1]
+    total = trace(jnp.asarray(result.parameters)).estimate.pose_cov[-1] + added[-1]
     for axis in range(2):
         # Unknowns: start, positions 1 to T, landmark, scale.
         size = steps + 3
@@ -156,12 +156,12 @@ def test_odometry_is_calibrated_without_identities():
 
         return jax.vmap(one)(together)
 
-    found = calibrate(info, np.zeros(2))
-    off = found.parameters - [0.02, 0.1]
-    assert found.converged
-    assert off @ np.linalg.solve(found.cov, off) < 13.8  # 99.9 % of χ²(2)
-    assert (np.sqrt(np.diag(found.cov)) < [0.003, 0.015]).all()  # and that says something
-    assert found.misfit[-1] < found.misfit[0] and abs(found.misfit[-1] - 1) < 0.2
+    result = calibrate(info, np.zeros(2))
+    off = result.parameters - [0.02, 0.1]
+    assert result.converged
+    assert off @ np.linalg.solve(result.cov, off) < 13.8  # 99.9 % of χ²(2)
+    assert (np.sqrt(np.diag(result.cov)) < [0.003, 0.015]).all()  # and that says something
+    assert result.misfit[-1] < result.misfit[0] and abs(result.misfit[-1] - 1) < 0.2
 
 
 def plain(innovation, status=1):
@@ -204,9 +204,9 @@ class Run:
 
 def test_other_numbers_of_a_record_cost_no_trace_and_no_program():
     def both(y):
-        found = calibrate(Run(Parabola(y)), 1.5)
-        added = consider_cov(Parabola(y), found.parameters, 1.0)
-        return found.parameters[0], added[0, 0]
+        result = calibrate(Run(Parabola(y)), 1.5)
+        added = consider_cov(Parabola(y), result.parameters, 1.0)
+        return result.parameters[0], added[0, 0]
 
     both(3.0)
     with worlds.nothing_compiled(TRACED):
@@ -223,10 +223,10 @@ def test_results_may_be_a_tree():
 
 
 def test_what_is_empty_does_not_count_and_a_number_will_do():
-    found = calibrate(lambda p: plain(p[0] ** 2 - 4.0), 1.0)  # Newton's √4
-    np.testing.assert_allclose(found.parameters, [2.0], atol=1e-3)
-    np.testing.assert_allclose(found.path[1], [2.5])
-    assert found.converged
+    result = calibrate(lambda p: plain(p[0] ** 2 - 4.0), 1.0)  # Newton's √4
+    np.testing.assert_allclose(result.parameters, [2.0], atol=1e-3)
+    np.testing.assert_allclose(result.path[1], [2.5])
+    assert result.converged
     assert not calibrate(lambda p: plain(p[0] ** 2 - 4.0), 1.0, iterations=1).converged
 
     def wider(p):
@@ -238,9 +238,9 @@ def test_what_is_empty_does_not_count_and_a_number_will_do():
         )
 
     again = calibrate(wider, 1.0)
-    np.testing.assert_array_equal(again.dof, found.dof)
-    np.testing.assert_allclose(again.misfit, found.misfit, rtol=1e-12)
-    np.testing.assert_allclose(again.parameters, found.parameters, rtol=1e-12)
+    np.testing.assert_array_equal(again.dof, result.dof)
+    np.testing.assert_allclose(again.misfit, result.misfit, rtol=1e-12)
+    np.testing.assert_allclose(again.parameters, result.parameters, rtol=1e-12)
 
 
 @refused(

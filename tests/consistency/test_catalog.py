@@ -14,7 +14,7 @@ from layouts import kept_programs, wrong_layouts
 from jaxslam import _catalog as catalog
 from jaxslam import charts, linearize, motion, sensors
 from jaxslam._driver import run
-from jaxslam.core.protocols import Filter, Here
+from jaxslam.core.protocols import Filter, LinearizationPoint
 from jaxslam.core.types import Status
 from jaxslam.filters import EkfSlam
 from jaxslam.graphs.smoothing._forward_pass import LogEstimator
@@ -241,7 +241,7 @@ def test_linearization_points_solve_the_constrained_least_squares():
     u = np.array([0.25, 0.025, 1.0])
     moved, by_pose, _, after = jax.jit(
         lambda joint: oc.motion(
-            world.motion, u, Here(joint, charts.Euclidean(), joint.pose, jnp.eye(3))
+            world.motion, u, LinearizationPoint(joint, charts.Euclidean(), joint.pose, jnp.eye(3))
         )
     )(joint)
     # Unknown p*; l*_i = p* + d_i: stacked, each coordinate is a mean of p̂ and the l̂_i - d_i.
@@ -264,8 +264,8 @@ def test_all_variants_have_the_process_noise_of_the_standard_filter():
 
         def noise(pose, filter=filter, linearizer=linearizer):
             joint = filter.init(pose, jnp.eye(3) * 0.01)
-            here = Here(joint, charts.Euclidean(), joint.pose, jnp.eye(3))
-            return linearizer.motion(world.motion, u, here)[2]
+            point = LinearizationPoint(joint, charts.Euclidean(), joint.pose, jnp.eye(3))
+            return linearizer.motion(world.motion, u, point)[2]
 
         noises.append(jax.jit(noise)(np.array([1.0, 2.0, 0.3])))
     np.testing.assert_array_equal(noises[0], noises[1])

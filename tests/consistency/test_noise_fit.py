@@ -35,31 +35,31 @@ def scatter(p, x):
 
 def test_mean_and_deviation_of_a_sample_with_their_errors():
     """σ̂² is the mean square about the mean; by log σ the information is 2n, by the mean n/σ²."""
-    found = fit_noise(
+    fit = fit_noise(
         scatter, [0.5, 0.0], X, names=("sigma", "mean"), deviation=(True, False), tolerance=1e-6
     )
     n, sigma = len(X), X.std()
-    np.testing.assert_allclose(found.parameters, [sigma, X.mean()], rtol=1e-4)
-    np.testing.assert_allclose(found.error, sigma / np.sqrt([2 * n, n]), rtol=2e-3)
-    np.testing.assert_allclose(found.nis_per_dof[1], 1, rtol=1e-4)
-    np.testing.assert_allclose(found.nis_per_dof[0], np.mean(X**2) / 0.25)
+    np.testing.assert_allclose(fit.parameters, [sigma, X.mean()], rtol=1e-4)
+    np.testing.assert_allclose(fit.error, sigma / np.sqrt([2 * n, n]), rtol=2e-3)
+    np.testing.assert_allclose(fit.nis_per_dof[1], 1, rtol=1e-4)
+    np.testing.assert_allclose(fit.nis_per_dof[0], np.mean(X**2) / 0.25)
     best = -0.5 * n * (1 + np.log(2 * np.pi * sigma**2))
-    np.testing.assert_allclose(found.log_likelihood[1], best, rtol=1e-6)
+    np.testing.assert_allclose(fit.log_likelihood[1], best, rtol=1e-6)
     z = (X - X.mean()) / sigma
     slopes = np.stack([z**2 - 1, z / sigma])  # by log σ and by the mean
     bread = np.diag([1 / (2 * n), sigma**2 / n])
     robust = np.sqrt(np.diag(bread @ slopes @ slopes.T @ bread)) * [sigma, 1]
-    np.testing.assert_allclose(found.robust_error, robust, rtol=5e-3)
-    assert found.converged and not found.loose and not found.upper
-    assert (found.dof, found.names) == (n, ("sigma", "mean"))
+    np.testing.assert_allclose(fit.robust_error, robust, rtol=5e-3)
+    assert fit.converged and not fit.loose and not fit.upper
+    assert (fit.dof, fit.names) == (n, ("sigma", "mean"))
 
 
 def test_a_search_from_elsewhere_ends_there_and_is_compared_with_the_start():
     options = {"deviation": (True, False), "tolerance": 1e-6}
-    found = fit_noise(scatter, [0.5, 0.0], X, guess=[5.0, -1.0], **options)
-    np.testing.assert_allclose(found.path[0], [5, -1])
-    np.testing.assert_allclose(found.nis_per_dof[0], np.mean(X**2) / 0.25)
-    np.testing.assert_allclose(found.parameters, [X.std(), X.mean()], rtol=1e-4)
+    fit = fit_noise(scatter, [0.5, 0.0], X, guess=[5.0, -1.0], **options)
+    np.testing.assert_allclose(fit.path[0], [5, -1])
+    np.testing.assert_allclose(fit.nis_per_dof[0], np.mean(X**2) / 0.25)
+    np.testing.assert_allclose(fit.parameters, [X.std(), X.mean()], rtol=1e-4)
 
 
 def fenced(p, x):
@@ -68,9 +68,9 @@ def fenced(p, x):
 
 
 def test_a_step_to_where_the_likelihood_is_not_finite_is_taken_back():
-    found = fit_noise(fenced, [0.1], X - X.mean(), tolerance=1e-6)
-    np.testing.assert_allclose(found.parameters, X.std(), rtol=1e-4)
-    assert found.converged
+    fit = fit_noise(fenced, [0.1], X - X.mean(), tolerance=1e-6)
+    np.testing.assert_allclose(fit.parameters, X.std(), rtol=1e-4)
+    assert fit.converged
 
 
 def added(p, x):
@@ -80,10 +80,10 @@ def added(p, x):
 
 def test_a_noise_that_goes_to_zero_has_an_upper_limit():
     x = X - X.mean()
-    found = fit_noise(added, [1.0], x, names=["more"])
-    assert found.converged and found.parameters[0] < 0.1
-    (limit,) = found.upper.values()
-    assert not found.loose
+    fit = fit_noise(added, [1.0], x, names=["more"])
+    assert fit.converged and fit.parameters[0] < 0.1
+    (limit,) = fit.upper.values()
+    assert not fit.loose
 
     def value(variance):
         return -0.5 * np.sum(x**2 / variance + np.log(2 * np.pi * variance))
@@ -101,9 +101,9 @@ def summed(p, x):
 
 
 def test_parameters_of_which_only_a_sum_is_seen_are_named_together():
-    found = fit_noise(summed, [1.0, 0.1, 0.2], X, names=("s", "b", "c"), deviation=[1, 0, 0])
-    assert found.loose == {"b": ("c",), "c": ("b",)}
-    np.testing.assert_allclose(found.parameters[1:].sum(), X.mean(), atol=1e-3)
+    fit = fit_noise(summed, [1.0, 0.1, 0.2], X, names=("s", "b", "c"), deviation=[1, 0, 0])
+    assert fit.loose == {"b": ("c",), "c": ("b",)}
+    np.testing.assert_allclose(fit.parameters[1:].sum(), X.mean(), atol=1e-3)
 
 
 SAMPLES = {
@@ -121,12 +121,12 @@ def test_noises_that_are_told_apart_by_nothing_are_named_together(sample, start)
     x = SAMPLES[sample]
     unit = x.std() / X.std()
     start = np.array([*start, 1.0]) * unit
-    found = fit_noise(confounded, start, x, names=("a", "b", "c"), deviation=[1, 1, 0])
-    assert found.converged and not found.upper
-    assert found.loose == {"a": ("b",), "b": ("a",)}
-    assert np.isinf(found.error[:2]).all()
-    np.testing.assert_allclose(found.error[2], x.std() / np.sqrt(len(x)), rtol=1e-2)
-    np.testing.assert_allclose(np.hypot(*found.parameters[:2]), x.std(), rtol=1e-2)
+    fit = fit_noise(confounded, start, x, names=("a", "b", "c"), deviation=[1, 1, 0])
+    assert fit.converged and not fit.upper
+    assert fit.loose == {"a": ("b",), "b": ("a",)}
+    assert np.isinf(fit.error[:2]).all()
+    np.testing.assert_allclose(fit.error[2], x.std() / np.sqrt(len(x)), rtol=1e-2)
+    np.testing.assert_allclose(np.hypot(*fit.parameters[:2]), x.std(), rtol=1e-2)
 
 
 def told_apart(p, x):
@@ -141,15 +141,15 @@ def test_noises_that_are_told_apart_have_errors_in_any_unit(sample):
     x = draws * SAMPLES[sample].std() / X.std() * (1 + 1e-15 * (sample == "a rounding off"))
     unit = x.std() / draws.std()
     start = np.array([0.3, 3.0, -1.0]) * unit
-    found = fit_noise(told_apart, start, x, names=("a", "b", "c"), deviation=[1, 1, 0])
-    assert found.converged and not found.loose and not found.upper
-    np.testing.assert_allclose(found.parameters / unit, [1, np.sqrt(3), 0], atol=0.3)
-    a, b = found.parameters[:2]
+    fit = fit_noise(told_apart, start, x, names=("a", "b", "c"), deviation=[1, 1, 0])
+    assert fit.converged and not fit.loose and not fit.upper
+    np.testing.assert_allclose(fit.parameters / unit, [1, np.sqrt(3), 0], atol=0.3)
+    a, b = fit.parameters[:2]
     variance = np.array([a**2, a**2 + b**2])
     by_log = np.array([[2 * a**2, 0], [2 * a**2, 2 * b**2]]) / variance[:, None]
     information = len(x) / 4 * by_log.T @ by_log
     error = np.sqrt(np.diag(np.linalg.inv(information))) * [a, b]
-    np.testing.assert_allclose(found.error[:2], error, rtol=0.05)
+    np.testing.assert_allclose(fit.error[:2], error, rtol=0.05)
 
 
 def in_pairs(p, x):
@@ -159,8 +159,8 @@ def in_pairs(p, x):
 
 
 def test_what_is_confounded_within_pairs_is_named_by_pairs():
-    found = fit_noise(in_pairs, [1.0, 0.8, 0.9, 1.1], X)
-    assert found.loose == {"p0": ("p1",), "p1": ("p0",), "p2": ("p3",), "p3": ("p2",)}
+    fit = fit_noise(in_pairs, [1.0, 0.8, 0.9, 1.1], X)
+    assert fit.loose == {"p0": ("p1",), "p1": ("p0",), "p2": ("p3",), "p3": ("p2",)}
 
 
 def of_a_sum(p, x):
@@ -168,19 +168,19 @@ def of_a_sum(p, x):
 
 
 def test_of_many_that_are_seen_as_a_sum_all_are_named():
-    found = fit_noise(of_a_sum, [1.0, *np.arange(12.0)], X, deviation=[1] + [0] * 12)
-    assert list(found.loose) == [f"p{i}" for i in range(1, 13)]
-    assert all(len(others) == 11 for others in found.loose.values())
-    np.testing.assert_allclose(found.error[0], found.parameters[0] / np.sqrt(2 * len(X)), rtol=1e-2)
+    fit = fit_noise(of_a_sum, [1.0, *np.arange(12.0)], X, deviation=[1] + [0] * 12)
+    assert list(fit.loose) == [f"p{i}" for i in range(1, 13)]
+    assert all(len(others) == 11 for others in fit.loose.values())
+    np.testing.assert_allclose(fit.error[0], fit.parameters[0] / np.sqrt(2 * len(X)), rtol=1e-2)
 
 
 def test_the_decisions_hold_in_float32(float32_alone):
     x = X.astype(np.float32)
     options = {"names": ("a", "b", "c"), "deviation": [1, 1, 0]}
-    found = fit_noise(confounded, [0.5, 0.7, 1.0], x, **options)
-    assert found.converged and found.loose == {"a": ("b",), "b": ("a",)}
-    found = fit_noise(told_apart, [0.5, 0.7, 1.0], x * (1 + np.arange(x.size) % 2), **options)
-    assert found.converged and not found.loose
+    fit = fit_noise(confounded, [0.5, 0.7, 1.0], x, **options)
+    assert fit.converged and fit.loose == {"a": ("b",), "b": ("a",)}
+    fit = fit_noise(told_apart, [0.5, 0.7, 1.0], x * (1 + np.arange(x.size) % 2), **options)
+    assert fit.converged and not fit.loose
 
 
 def gated(p, x):
@@ -235,12 +235,12 @@ def test_the_noises_of_simulated_logs_are_found_and_errors_are_their_spread():
     place, count, z = world(), 24, []
     for seed in range(count):
         _, log = jaxslam.simulate(place, jax.random.key(seed))
-        found = fit_noise(followed, TRUE * [3, 1 / 3, 3, 1 / 3], log)
-        assert found.converged and not found.loose and not found.upper
-        assert found.log_likelihood[1] > found.log_likelihood[0] + 50
-        assert abs(found.nis_per_dof[1] - 1) < 1e-3
-        assert (np.abs(np.log(found.robust_error / found.error)) < np.log(1.6)).all()
-        z.append(np.log(found.parameters / TRUE) / (found.error / found.parameters))
+        fit = fit_noise(followed, TRUE * [3, 1 / 3, 3, 1 / 3], log)
+        assert fit.converged and not fit.loose and not fit.upper
+        assert fit.log_likelihood[1] > fit.log_likelihood[0] + 50
+        assert abs(fit.nis_per_dof[1] - 1) < 1e-3
+        assert (np.abs(np.log(fit.robust_error / fit.error)) < np.log(1.6)).all()
+        z.append(np.log(fit.parameters / TRUE) / (fit.error / fit.parameters))
     z = np.array(z)
     low, high = stats.chi2_band(count, 1, 0.999)
     assert ((z**2).sum(axis=0) > low).all() and ((z**2).sum(axis=0) < high).all(), z

@@ -1,6 +1,5 @@
 """Logs: what `check_log` refuses, and naming the row; `Log.from_records`; the counts of `Info`."""
 
-import pydoc
 from types import SimpleNamespace
 
 import chex
@@ -12,7 +11,7 @@ from cases import refused
 from reference.plane import compose
 from worlds import narrow
 
-from jaxslam import graphs, run
+from jaxslam import run
 from jaxslam.core._validation import check_log
 from jaxslam.core.logs import _streams as streams
 from jaxslam.core.types import Estimate, Info, Log, Scan, Status, Trace, Truth
@@ -59,9 +58,12 @@ NO_Z = "log.scan.z: a valid measurement is"
 BAD_VALUES = {
     "control nan": (
         changed("control", (2, 1), np.nan),
-        r"log.control is not finite \(row 2\): correct or leave out",
+        r"log.control: a control is not finite \(row 2\): correct or omit",
     ),
-    "control inf": (changed("control", (3, 0), np.inf), r"log.control is not finite \(row 3\)"),
+    "control inf": (
+        changed("control", (3, 0), np.inf),
+        r"log.control: a control is not finite \(row 3\)",
+    ),
     "z nan": (changed("z", (1, 2, 0), np.nan), rf"{NO_Z} not finite \(row 1, slot 2\)"),
     "z inf": (changed("z", (0, 0, 1), -np.inf), rf"{NO_Z} not finite \(row 0, slot 0\)"),
     "control beyond": (changed("control", (2, 0), -5e61), r"control is beyond ±4.5e\+61 \(row 2\)"),
@@ -166,14 +168,6 @@ def test_info_counts_statuses_of_a_step_and_of_a_trace():
 def test_status_codes_are_distinct_and_empty_is_zero():
     assert Status.EMPTY == 0
     assert len({int(s) for s in Status}) == len(Status)
-
-
-def test_help_shows_the_docstrings_of_fields():
-    """Of named tuples, whose fields Python calls "Alias for field number 0"."""
-    text = pydoc.plain(pydoc.render_doc(graphs.Marginals))
-    assert "of (x, y, θ), in world coordinates as the poses themselves" in text
-    assert "a variable does not have are zero" in text and "Alias for field" not in text
-    assert Truth.origin.__doc__.startswith("the tag of the landmark each measurement is")
 
 
 # --- `Log.from_records` and the alignment of streams below it: by hand, every kind of table, bad --
@@ -396,7 +390,7 @@ def test_tables_that_are_not_those_of_the_suite_are_refused():
     for seen, message in (
         (
             SEEN,
-            r"a table for each of the 2 sensors of the suite, \(range_bearing, compass\), got list",
+            r"a table for each of the 2 sensors of the suite, \(range_bearing, compass\), got a list",
         ),
         (
             (SEEN, [(1.5, 0.3)] * 2),

@@ -19,8 +19,18 @@ from jaxslam import _catalog as catalog
 from jaxslam import filters, motion, run, sensors, simulate, smoothing
 from jaxslam.core._record import is_record
 from jaxslam.core.protocols import Filter, Motion
-from jaxslam.core.record import record, static
+from jaxslam.core.record import field, function_of, record, static
 from jaxslam.core.types import Log, Scan, Status
+from jaxslam.core.validation import (
+    InvalidField,
+    InvalidFile,
+    at_least,
+    finite,
+    is_concrete,
+    one_of,
+    or_none,
+    positive,
+)
 from jaxslam.motion import OdometryNoise
 from jaxslam.simulation._worlds import World
 
@@ -112,7 +122,7 @@ class Still(World):
     (lambda: Pair("near"), "Pair: first: expected a number, an array or a record .* got 'near'"),
     (lambda: Pair([1.0, 2.0]), "Pair: first: expected an array, as of numpy.asarray, got a list"),
     (lambda: Pair((1.0, jnp.sin)), r"Pair: first\[1\]: expected a number, .* static\(\) field"),
-    (lambda: Pair(np.array(["a"])), "Pair: first: expected a number, .* got ndarray"),
+    (lambda: Pair(np.array(["a"])), "Pair: first: expected a number, .* got an ndarray"),
     (lambda: Pair(1, count=R), "Pair: count: expected a value that is compared by ==, got an"),
     (lambda: sensors.RangeBearing(np.eye(3)), r"RangeBearing: noise_cov: .* \(2, 2\), got \(3, 3\)"),
     (lambda: sensors.RangeBearing(-R), "RangeBearing: noise_cov: .* not positive semi-definite"),
@@ -120,17 +130,95 @@ class Still(World):
     (lambda: motion.Unicycle(None), "Unicycle: noise_cov: expected a covariance .* got None"),
     (lambda: sensors.RangeBearing(R, MOUNT[:2]), r"RangeBearing: .* of shape \(3,\), got \(2,\)"),
     (lambda: sensors.RangeBearing(R, np.nan * MOUNT), "RangeBearing: .* not finite"),
-    (lambda: sensor_of(noise_cov=R, measurements=("x [m]",)), "Own: expected a method observe"),
-    (lambda: motion_of(step=min, controls=("x",), noises="w"), "Own: expected noises to be a tup"),
-    (lambda: sensors.Suite(sensors.RangeBearing(R)), "Suite: expected parts in a list or a tuple"),
-    (lambda: sensors.Suite([sensors.RangeBearing(R)]), "Suite: expected a Part or .* got RangeB"),
+    (lambda: sensor_of(noise_cov=R, measurements=("x [m]",)), "Own: observe: expected a method, got none"),
+    (lambda: motion_of(step=min, controls=("x",), noises="w"), "Own: noises: expected a tuple of names .* got 'w'"),
+    (lambda: sensors.Suite(sensors.RangeBearing(R)), "Suite: parts: expected a list or a tuple, got a Ra"),
+    (lambda: sensors.Suite([sensors.RangeBearing(R)]), "Suite: parts: expected a Part or .* got a RangeB"),
     (Bare, "Bare: expected @record above the class"),
     (lambda: Later(R), "Later: expected @record above the class"),
-    (Still, "Still: expected a method draw"),
+    (Still, "Still: draw: expected a method, got none"),
     told="^",
 )  # fmt: skip
 def test_bad_input_is_one_line_that_names_the_class(make):
     make()
+
+
+@record
+class Checked:
+    """A record whose checks stand beside its fields."""
+
+    width: object = field(check=positive)
+    count: object = static(default=1, check=at_least(1))
+    mount: object = field(default=None, check=or_none(finite(3)))
+    rule: object = field(default=None, check=or_none(function_of("z", "tag")))
+    kind: object = static(default="plain", check=one_of("plain", "robust"))
+
+    def __post_init__(self):
+        if is_concrete(self.width) and self.count > self.width:  # numbers, by their checks
+            raise InvalidField("Checked", "", "expected count <= width")
+
+
+@record
+class Below(Checked):
+    """A record that declares a field again, with another default."""
+
+    width: object = 7.0
+    extra: object = None
+
+    def __post_init__(self):
+        super().__post_init__()
+        if self.extra == 3:
+            raise InvalidField("Below", "extra", "expected no 3")
+
+
+@pytest.mark.parametrize(
+    ("make", "owner", "name", "reason"),
+    [
+        (lambda: Checked(-1.0), "Checked", "width", "expected a number above 0, got -1.0"),
+        (lambda: Checked("a"), "Checked", "width", "expected a number above 0, got 'a'"),
+        (lambda: Checked(None), "Checked", "width", "expected a number above 0, got None"),
+        (lambda: Checked(R), "Checked", "width", "expected a number above 0, got an array of shape (2, 2)"),
+        (lambda: Checked(2.0, True), "Checked", "count", "expected an integer >= 1, got True"),
+        (lambda: Checked(2.0, R), "Checked", "count", "expected a value that is compared by ==, got an array"),
+        (lambda: Checked(2.0, mount=(1, 2)), "Checked", "mount", "expected finite numbers of shape (3,), got a tuple of shape (2,)"),
+        (lambda: Checked(2.0, mount=(1, 2, np.inf)), "Checked", "mount", "expected finite numbers of shape (3,), got [ 1. 2. inf]"),
+        (lambda: Checked(2.0, rule=lambda z: z), "Checked", "rule", "expected a function of (z, tag), got one of (z)"),
+        (lambda: Checked(2.0, rule=Pair), "Checked", "rule", "expected a function of (z, tag), got the class Pair: call it, Pair(…)"),
+        (lambda: Checked(2.0, kind=R[0]), "Checked", "kind", "expected a value that is compared by ==, got an array"),
+        (lambda: Checked(2.0, kind=0), "Checked", "kind", 'expected "plain" or "robust", got 0'),
+        (lambda: Checked(2.0, 3), "Checked", "", "expected count <= width"),
+        (lambda: Below(-1.0), "Below", "width", "expected a number above 0, got -1.0"),
+        (lambda: Below(extra=3), "Below", "extra", "expected no 3"),
+        (lambda: dataclasses.replace(Below(), count=0), "Below", "count", "expected an integer >= 1, got 0"),
+        (lambda: filters.Wrapper(sensors.Compass([[1.0]])), "Wrapper", "filter", "expected a Filter, got a Compass"),
+        (lambda: filters.Wrapper(filters.EkfSlam), "Wrapper", "filter", "expected a Filter, got the class EkfSlam: call it, EkfSlam(…)"),
+    ],
+)  # fmt: skip
+def test_a_refusal_says_owner_field_and_reason(make, owner, name, reason):
+    with pytest.raises(InvalidField) as caught:
+        make()
+    error = caught.value
+    assert (error.owner, error.field, error.reason) == (owner, name, reason)
+    assert str(error) == ": ".join(part for part in (owner, name, reason) if part)
+    assert str(pickle.loads(pickle.dumps(error))) == str(error)
+
+
+def test_a_check_converts_and_is_not_run_where_jax_rebuilds():
+    made = Checked(2.0, mount=[1, 2, 3], rule=lambda z, tag: z)
+    assert made.mount.dtype == np.float64 and is_record(made.rule) and made.rule(1, 2) == 1
+    again = dataclasses.replace(made, width=3.0)
+    assert again.mount is made.mount and again.rule is made.rule
+    assert jax.tree.map(lambda leaf: -leaf, made).width == -2.0
+    assert jax.jit(lambda width: Checked(width, count=1).width)(2.0) == 2.0
+
+
+def test_an_error_of_a_file_says_the_place():
+    error = InvalidFile("log.csv", "expected a number, got 'x'", 3, "v [m/s]")
+    assert (error.path, error.line, error.column) == ("log.csv", 3, "v [m/s]")
+    assert str(pickle.loads(pickle.dumps(error))) == (
+        "log.csv:3: v [m/s]: expected a number, got 'x'"
+    )
+    assert str(InvalidFile("log.csv", "cannot be read")) == "log.csv: cannot be read"
 
 
 def test_a_missing_field_is_named():
@@ -328,7 +416,7 @@ def test_a_gradient_of_a_world_is_a_world():
 @refused(
     ({"landmarks": np.zeros((2, 3))}, r"Scenario 'ring': landmarks: expected shape \(N, 2\)"),
     ({"pose_cov": -np.eye(3)}, "Scenario 'ring': pose_cov"),
-    ({"visible": 3.0}, r"Scenario: expected visible to be a function of \(pose, l\), got float"),
+    ({"visible": 3.0}, r"Scenario: visible: expected a function of \(pose, l\), got 3.0"),
     ({"filter_options": {"gate": np.ones(2)}}, "filter_options: gate: expected a value"),
     ({"noise_on": "wheels"}, "expected noise_on"),
 )

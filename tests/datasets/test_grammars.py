@@ -10,7 +10,7 @@ from recordings import BONN, MRCLAM, TEAM
 from test_mutated import YAML, assert_map, assert_whole
 from test_table import OWN, SETTINGS, TRUTH
 
-from jaxslam import datasets, graphs, grids
+from jaxslam import datasets, grids
 from jaxslam.datasets._laser_logs.carmen_odometry import odometry_of_file
 
 COV = "0.01 0 0 0.04 0.001 0.09"
@@ -103,7 +103,7 @@ TABLES = {
     "landmarks.csv": records("tag,x [m],y [m]", "i", "x", "x"),
 }
 GRAMMARS = {
-    "graphs": ({"graph.g2o": GRAPHS}, lambda path: graphs.read(path / "graph.g2o"), assert_graph),
+    "graphs": ({"graph.g2o": GRAPHS}, lambda path: datasets.read_graph(path / "graph.g2o"), assert_graph),
     "carmen": (
         {
             "room.log": lines(

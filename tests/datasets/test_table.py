@@ -286,7 +286,7 @@ def test_a_file_that_is_missing_or_no_text_is_named(tmp_path, name):
         ("[sensor]\nnoise = [0.1, nan]", "[sensor] noise: expected 2 numbers"),
         ("[sensor]\nmount = [1, 2]", "[sensor] mount: expected 3 numbers (x [m], y [m], theta [rad])"),
         ("[sensor]\nheight = 2", "[sensor] height: expected one of model, noise, mount"),
-        ("[filter]\ngate = 9.2", "[filter] gate: expected a probability above 0 and below 1 as gate, as 0.999, got 9.2 "),
+        ("[filter]\ngate = 9.2", "[filter] gate: expected a probability above 0 and below 1, as 0.999, got 9.2 "),
         ("[filter]\ncapacity = 1", "[filter] capacity: expected a whole number of at least 2"),
         ("[filter]\nstart = [0, 0]", "[filter] start: expected 3 numbers (x [m], y [m], theta [rad])"),
         ("[filter]\nstart_noise = [0, 0, -1]", "[filter] start_noise: expected numbers of at least"),

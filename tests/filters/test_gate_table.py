@@ -13,8 +13,8 @@ from own_models import changed
 
 from jaxslam import filters, motion, sensors
 from jaxslam.core.types import Scan, Status
-from jaxslam.filters._delayed.delayed_settings import Hypotheses, StoredMeasurements
-from jaxslam.filters._reporting import info_of, nothing_of, status_of
+from jaxslam.filters import Hypotheses, StoredMeasurements, info_of, status_of
+from jaxslam.filters._reporting import nothing_of
 
 MASKS = (
     "valid", "matched", "positive", "inside",

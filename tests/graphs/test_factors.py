@@ -28,11 +28,11 @@ def test_the_factors_of_files_are_their_equations():
             (graph.poses if of == "pose" else graph.points)[table.who[:, k]]
             for k, of in enumerate(factor.variables)
         ]
-        found = jax.jit(jax.vmap(lambda z, *v, f=factor: f.residual(v, z)))(table.z, *values)
+        residuals = jax.jit(jax.vmap(lambda z, *v, f=factor: f.residual(v, z)))(table.z, *values)
         expected = [plain.error(kind, row, z) for *row, z in zip(*values, table.z, strict=True)]
         sign = -1 if kind in ("relative_position", "bearing") else 1  # z - h, which χ² does not see
-        np.testing.assert_allclose(found, sign * np.array(expected), atol=1e-12)
-        assert found.shape == (len(table.z), len(factor.errors))
+        np.testing.assert_allclose(residuals, sign * np.array(expected), atol=1e-12)
+        assert residuals.shape == (len(table.z), len(factor.errors))
 
 
 @pytest.mark.parametrize("kind", ["relative_pose", "prior"])
@@ -125,7 +125,7 @@ def test_a_variable_is_a_pose_or_a_point():
     names = {"measurements": ("x [m]",), "errors": ("x [m]",)}
     with pytest.raises(ValueError, match="Own: expected variables 'pose' and 'point', got 'place'"):
         made(graphs.Factor, variables=("place",), residual=lambda v, z: z, **names)
-    with pytest.raises(ValueError, match="Own: expected a method residual"):
+    with pytest.raises(ValueError, match="Own: residual: expected a method"):
         made(graphs.Factor, variables=("pose",), **names)
     with pytest.raises(
         ValueError, match="FromSensor: expected sensor to be a Sensor, got the class"
@@ -199,8 +199,8 @@ def test_derivatives_by_mount_and_width_are_differences():
     """Of a graph that is no tracer itself, so that it is planned and padded as outside a trace."""
 
     def seen(mount, width):
-        found = optimum(mount, width)
-        return found.graph.poses[:, :2].sum() + found.graph.points[0, 1] + 0.1 * found.chi2
+        solution = optimum(mount, width)
+        return solution.graph.poses[:, :2].sum() + solution.graph.points[0, 1] + 0.1 * solution.chi2
 
     by_mount, by_width = jax.jit(jax.grad(seen, (0, 1)))(MOUNT, 20.0)
     h = 1e-5
@@ -217,8 +217,8 @@ def test_a_gradient_by_a_factor_is_a_factor():
     slope = jax.jit(jax.grad(lambda f: (f.residual((pose, point), z) ** 2).sum()))(factor)
     assert type(slope) is graphs.FromSensor and type(slope.sensor) is sensors.RelativePosition
     assert np.all(slope.sensor.mount != 0) and np.all(slope.sensor.noise_cov.cov == 0)
-    found = jax.grad(lambda kernel: kernel.cost(jnp.asarray(9.0)))(graphs.Huber(2.0))
-    np.testing.assert_allclose(found.width, 2 * 3 - 2 * 2)  # of 2 k √s - k²
+    slope_of_kernel = jax.grad(lambda kernel: kernel.cost(jnp.asarray(9.0)))(graphs.Huber(2.0))
+    np.testing.assert_allclose(slope_of_kernel.width, 2 * 3 - 2 * 2)  # of 2 k √s - k²
 
 
 @pytest.mark.sweep
@@ -228,14 +228,14 @@ def test_a_graph_within_a_trace_is_solved_as_outside():
 
     @jax.jit
     def within():
-        found = graphs.optimize(graph)
-        return found, graphs.squared_residuals(found.graph), graphs.squared_residuals(graph)
+        solution = graphs.optimize(graph)
+        return solution, graphs.squared_residuals(solution.graph), graphs.squared_residuals(graph)
 
-    found, squared, before = within()
-    np.testing.assert_allclose(found.graph.poses, outside.graph.poses, atol=1e-9)
+    solution, squared, before = within()
+    np.testing.assert_allclose(solution.graph.poses, outside.graph.poses, atol=1e-9)
     np.testing.assert_allclose(squared["relative_pose"].sum(), outside.chi2, rtol=1e-9)
     np.testing.assert_allclose(before["relative_pose"].sum(), graphs.chi2(graph), rtol=1e-9)
-    assert found.singular == -1 and found.graph.poses.shape == graph.poses.shape
+    assert solution.singular == -1 and solution.graph.poses.shape == graph.poses.shape
 
 
 def test_one_model_for_a_batch():
@@ -252,12 +252,12 @@ def test_numbers_in_float64_leave_a_graph_in_float32():
     for name in ("cauchy", "truncated"):
         kernel = dataclasses.replace(graphs.KERNELS[name](), width=np.float64(3.0))
         plan = graphs.plan(GRAPH)
-        found = jax.eval_shape(
+        solution = jax.eval_shape(
             lambda graph, kernel, plan=plan: graphs.optimize(graph, kernel=kernel, plan=plan),
             numbers,
             kernel,
         )
-        assert {leaf.dtype for leaf in jax.tree.leaves(found)}.isdisjoint({np.dtype("f8")})
+        assert {leaf.dtype for leaf in jax.tree.leaves(solution)}.isdisjoint({np.dtype("f8")})
 
 
 # --- Robust kernels: their own equations, and what they leave out ---------------------------------
@@ -286,20 +286,20 @@ def test_a_redescending_kernel_leaves_false_loop_closures_out(name):
     graph, clean = falsified(ring())
     poses, _, information, _ = dense(clean)
     kernel = graphs.KERNELS[name]()
-    found = graphs.optimize(graph, kernel={"relative_pose/loops": kernel})
-    s = graphs.squared_residuals(found.graph)["relative_pose/loops"]
-    weights = np.asarray(found.weights["relative_pose/loops"])
+    solution = graphs.optimize(graph, kernel={"relative_pose/loops": kernel})
+    s = graphs.squared_residuals(solution.graph)["relative_pose/loops"]
+    weights = np.asarray(solution.weights["relative_pose/loops"])
     np.testing.assert_allclose(weights, kernel.weight(s), rtol=1e-9)
-    assert found.status == Ending.CONVERGED
-    assert (weights[:2] < 1e-3).all() and (found.weights["relative_pose"] == 1).all()
+    assert solution.status == Ending.CONVERGED
+    assert (weights[:2] < 1e-3).all() and (solution.weights["relative_pose"] == 1).all()
     if name == "truncated":  # binary: the others' own optimum
         assert (weights[2:] == 1).all()
-        np.testing.assert_allclose(found.graph.poses[:, :2], poses[:, :2], atol=1e-6)
+        np.testing.assert_allclose(solution.graph.poses[:, :2], poses[:, :2], atol=1e-6)
         # The covariance is that without the false ones; they would make it smaller.
         cov = np.linalg.inv(information)[-3:, -3:]
-        np.testing.assert_allclose(graphs.marginals(found).poses[-1], cov, rtol=1e-5, atol=1e-9)
+        np.testing.assert_allclose(graphs.marginals(solution).poses[-1], cov, rtol=1e-5, atol=1e-9)
         with pytest.raises(ValueError, match=r"expected a Solution.* got a Graph; of a graph as"):
-            graphs.marginals(found.graph)
+            graphs.marginals(solution.graph)
 
 
 def test_the_robust_start_is_good_and_is_kept():
@@ -310,9 +310,9 @@ def test_the_robust_start_is_good_and_is_kept():
     off = np.asarray(graphs.starts.odometry(graph).poses)[:, :2] - poses[:, :2]
     left = start.poses[:, :2] - poses[:, :2]
     assert np.abs(left).max() < 0.2 * np.abs(off).max() and start.tables is graph.tables
-    found = graphs.optimize(start, kernel={"relative_pose/loops": graphs.Truncated()})
-    np.testing.assert_allclose(found.graph.poses[:, :2], poses[:, :2], atol=1e-6)
-    assert found.iterations < 10  # weights of zero and one at once, without rounds
+    solution = graphs.optimize(start, kernel={"relative_pose/loops": graphs.Truncated()})
+    np.testing.assert_allclose(solution.graph.poses[:, :2], poses[:, :2], atol=1e-6)
+    assert solution.iterations < 10  # weights of zero and one at once, without rounds
 
 
 @pytest.mark.sweep
@@ -322,12 +322,12 @@ def test_other_kernels_reduce_the_pull_of_false_loop_closures(name, share):
     graph, clean = falsified(ring())
     both = Table(*map(np.concatenate, zip(*graph.tables.values(), strict=True)))
     plain = dense(clean._replace(tables={"relative_pose": both}))[0]
-    found = graphs.optimize(graph, kernel={"relative_pose/loops": graphs.KERNELS[name]()})
+    solution = graphs.optimize(graph, kernel={"relative_pose/loops": graphs.KERNELS[name]()})
     best = dense(clean)[0]
-    assert found.status == Ending.CONVERGED
+    assert solution.status == Ending.CONVERGED
     pulled, free = (
         np.sqrt(((poses[:, :2] - best[:, :2]) ** 2).sum(axis=1).mean())
-        for poses in (plain, np.asarray(found.graph.poses))
+        for poses in (plain, np.asarray(solution.graph.poses))
     )
     assert pulled > 0.4
     assert free < share * pulled

@@ -25,7 +25,7 @@ START, START_COV = (
 )
 
 
-def world():
+def small_world():
     """Turning robot among six posts; a noise that bends (odometry), and P0 that is not diagonal."""
     return dataclasses.replace(
         worlds.ring(),
@@ -40,17 +40,17 @@ def world():
 @cache
 def drawn():
     """The world and a log of it."""
-    return world(), jax.device_get(simulate(world(), KEY)[1])
+    return small_world(), jax.device_get(simulate(small_world(), KEY)[1])
 
 
 @cache
 def solved(known=False):
     """World, log, graph, factors and solution; known: the start is."""
-    here, log = drawn()
+    world, log = drawn()
     cov = np.zeros((3, 3)) if known else START_COV
-    graph, factors = graphs.of_log(log, here.motion, here.sensor, START, cov)
+    graph, factors = graphs.of_log(log, world.motion, world.sensor, START, cov)
     solution = graphs.optimize(graph, factors, tolerance=1e-16)
-    return here, log, jax.device_get(graph), factors, solution
+    return world, log, jax.device_get(graph), factors, solution
 
 
 def turned(pose, u):
@@ -75,8 +75,8 @@ def optimum(log, points, step, sigma_w, start, root=None, sigma_z=lambda z: SIGM
     def predictions(x):
         points = x[ends[1] :].reshape(-1, 2)
         for pose, *scan in zip(path(x)[1:], *log.scan, strict=True):
-            for z, tag, there in zip(*scan, strict=True):
-                if there:
+            for z, tag, is_valid in zip(*scan, strict=True):
+                if is_valid:
                     yield z, ekf_slam.range_bearing(pose, points[tag])[0]
 
     def residuals(x, sigmas):
@@ -90,10 +90,10 @@ def optimum(log, points, step, sigma_w, start, root=None, sigma_z=lambda z: SIGM
     ending = {"ftol": 1e-15, "xtol": 1e-15, "gtol": 1e-12}
     sigmas, before = [sigma_z(z_hat) for _, z_hat in predictions(at)], None
     while before is None or np.abs(np.subtract(sigmas, before)).max() > 1e-10:
-        found = scipy.optimize.least_squares(residuals, at, "3-point", args=(sigmas,), **ending)
-        at, before = found.x, sigmas
+        fit = scipy.optimize.least_squares(residuals, at, "3-point", args=(sigmas,), **ending)
+        at, before = fit.x, sigmas
         sigmas = [sigma_z(z_hat) for _, z_hat in predictions(at)]
-    return found.cost, np.array(path(found.x)), found.x[ends[1] :].reshape(-1, 2)
+    return fit.cost, np.array(path(fit.x)), fit.x[ends[1] :].reshape(-1, 2)
 
 
 @pytest.mark.parametrize("known", swept([False, True], False))
@@ -115,9 +115,9 @@ def test_it_has_the_optimum_of_scipy(known):
 @pytest.mark.sweep
 @pytest.mark.parametrize("known", [False, True])
 def test_it_has_the_optimum_of_batch_map(known):
-    here, log, graph, _, solution = solved(known)
+    world, log, graph, _, solution = solved(known)
     cov = np.zeros((3, 3)) if known else START_COV
-    trace = BatchMap(here.motion, here.sensor, 6, START, cov, tolerance=1e-9)(log, KEY)
+    trace = BatchMap(world.motion, world.sensor, 6, START, cov, tolerance=1e-9)(log, KEY)
     batch = trace.final
     assert batch.ending == Ending.CONVERGED
     np.testing.assert_allclose(solution.chi2, 2 * batch.cost, rtol=1e-8)
@@ -136,16 +136,16 @@ GROWING = {"range": 0.02, "bearing": 0.02, "share": 0.15}
 def grown():
     """World, log, graph, factors and solution, with a noise that grows with the range."""
     noise = sensors.RangeBearingNoise(**GROWING)
-    here = dataclasses.replace(world(), sensor=sensors.RangeBearing(noise))
-    log = jax.device_get(simulate(here, KEY)[1])
-    graph, factors = graphs.of_log(log, here.motion, here.sensor, START, START_COV)
-    return here, log, graph, factors, graphs.optimize(graph, factors, tolerance=1e-16)
+    world = dataclasses.replace(small_world(), sensor=sensors.RangeBearing(noise))
+    log = jax.device_get(simulate(world, KEY)[1])
+    graph, factors = graphs.of_log(log, world.motion, world.sensor, START, START_COV)
+    return world, log, graph, factors, graphs.optimize(graph, factors, tolerance=1e-16)
 
 
 def test_a_noise_that_grows_is_that_of_the_predictions():
     """The optimum by SciPy with R of the predictions held, and repeated until it stays. χ² of the
     batch and its path are the same; R at the measurements has another optimum."""
-    here, log, graph, factors, solution = grown()
+    world, log, graph, factors, solution = grown()
     assert solution.status == Ending.CONVERGED
 
     def sigma_z(z):
@@ -162,7 +162,7 @@ def test_a_noise_that_grows_is_that_of_the_predictions():
     squares = graphs.squared_residuals(solution.graph, factors)
     np.testing.assert_allclose(sum(map(np.sum, squares.values())), 2 * cost, rtol=1e-8)
 
-    trace = BatchMap(here.motion, here.sensor, 6, START, START_COV, tolerance=1e-9)(log, KEY)
+    trace = BatchMap(world.motion, world.sensor, 6, START, START_COV, tolerance=1e-9)(log, KEY)
     assert trace.final.ending == Ending.CONVERGED
     np.testing.assert_allclose(2 * trace.final.cost, solution.chi2, rtol=1e-8)
     np.testing.assert_allclose(trace.estimate.pose[:, :2], poses[1:, :2], atol=1e-6)
@@ -172,17 +172,17 @@ def test_a_noise_that_grows_is_that_of_the_predictions():
 
 @pytest.mark.sweep
 def test_derivatives_where_the_noise_grows_are_differences():
-    here, log, graph, factors, _ = grown()
+    world, log, graph, factors, _ = grown()
     plan, random = graphs.plan(graph, factors), np.random.default_rng(2)
     look = random.normal(size=graph.points.shape), random.normal(size=graph.poses.shape)
 
     def seen(share):
         noise = sensors.RangeBearingNoise(**(GROWING | {"share": share}))
-        models = here.motion, sensors.RangeBearing(noise)
+        models = world.motion, sensors.RangeBearing(noise)
         made, by_table = graphs.of_log(log, *models, START, START_COV)
-        found = graphs.optimize(made, by_table, plan=plan, tolerance=1e-16)
-        poses, points = found.graph.poses, found.graph.points
-        return (points * look[0]).sum() + (poses * look[1]).sum() + found.chi2
+        solution = graphs.optimize(made, by_table, plan=plan, tolerance=1e-16)
+        poses, points = solution.graph.poses, solution.graph.points
+        return (points * look[0]).sum() + (poses * look[1]).sum() + solution.chi2
 
     both = jax.jit(jax.value_and_grad(seen))
     ends = [both(0.15 + step)[0] for step in (1e-5, -1e-5)]
@@ -204,9 +204,9 @@ def test_derivatives_of_the_optimum_by_the_noises_are_differences():
     def seen(q, r):
         models = motion.Odometry(q), sensors.RangeBearing(r)
         made, by_table = graphs.of_log(log, *models, START, START_COV)
-        found = graphs.optimize(made, by_table, plan=plan, tolerance=1e-16)
-        poses, points = found.graph.poses, found.graph.points
-        return (points * look[0]).sum() + (poses * look[1]).sum() + found.chi2
+        solution = graphs.optimize(made, by_table, plan=plan, tolerance=1e-16)
+        poses, points = solution.graph.poses, solution.graph.points
+        return (points * look[0]).sum() + (poses * look[1]).sum() + solution.chi2
 
     both = jax.jit(jax.value_and_grad(seen, (0, 1)))
     gradient = both(*covs)[1]
@@ -223,11 +223,11 @@ def test_derivatives_of_the_optimum_by_the_noises_are_differences():
 @pytest.mark.sweep
 def test_a_motion_of_two_noises_is_a_soft_constraint():
     """The optimum comes to that of the constraint by the square of the slack."""
-    here = dataclasses.replace(worlds.ring(STEPS), sensor=world().sensor)
-    log = jax.device_get(simulate(here, KEY)[1])
+    world = dataclasses.replace(worlds.ring(STEPS), sensor=small_world().sensor)
+    log = jax.device_get(simulate(world, KEY)[1])
     off = []
     for slack in (1e-3, 1e-4):
-        models = here.motion, here.sensor, here.pose, np.zeros((3, 3))
+        models = world.motion, world.sensor, world.pose, np.zeros((3, 3))
         graph, factors = graphs.of_log(log, *models, slack=slack)
         solution = graphs.optimize(graph, factors, tolerance=1e-16)
         if not off:
@@ -258,7 +258,7 @@ def test_more_noises_than_three_are_those_of_their_sum():
 
 
 def test_its_shapes_and_names():
-    here, log, graph, factors, _ = solved()
+    world, log, graph, factors, _ = solved()
     assert list(graph.tables) == ["motion", "prior", "sensor"]
     np.testing.assert_array_equal(graph.pose_id, np.arange(STEPS + 1))
     np.testing.assert_array_equal(graph.point_id, np.unique(log.scan.tag[log.scan.valid]))
@@ -277,11 +277,11 @@ def test_its_shapes_and_names():
 
 
 def test_logs_are_batched_with_a_capacity():
-    here, log, graph, _, _ = solved()
+    world, log, graph, _, _ = solved()
 
     def poses_and_points(z):
         moved = Log(log.control, log.scan._replace(z=z))
-        made = graphs.of_log(moved, here.motion, here.sensor, START, START_COV, capacity=7)[0]
+        made = graphs.of_log(moved, world.motion, world.sensor, START, START_COV, capacity=7)[0]
         return made.poses, made.points, made.fixed_point
 
     z = np.stack([log.scan.z, log.scan.z + 0.1])
@@ -294,16 +294,16 @@ def test_logs_are_batched_with_a_capacity():
 
 @pytest.mark.sweep
 def test_points_of_a_capacity_that_no_scan_saw_are_no_hindrance():
-    here, log, _, _, solution = solved()
-    made = graphs.of_log(log, here.motion, here.sensor, START, START_COV, capacity=9)
+    world, log, _, _, solution = solved()
+    made = graphs.of_log(log, world.motion, world.sensor, START, START_COV, capacity=9)
     np.testing.assert_allclose(graphs.optimize(*made).chi2, solution.chi2, rtol=1e-9)
 
 
 def test_an_association_stands_in_for_tags():
-    here, log, graph, _, _ = solved()
+    world, log, graph, _, _ = solved()
     unknown = Log(log.control, log.scan._replace(tag=np.full_like(log.scan.tag, -1)))
     tags = np.where(log.scan.tag == 2, -1, log.scan.tag + 10)
-    made, _ = graphs.of_log(unknown, here.motion, here.sensor, START, START_COV, tags=tags)
+    made, _ = graphs.of_log(unknown, world.motion, world.sensor, START, START_COV, tags=tags)
     expected = [tag + 10 for tag in graph.point_id if tag != 2]
     np.testing.assert_array_equal(made.point_id, expected)
     used = log.scan.valid & (log.scan.tag != 2)
@@ -342,8 +342,8 @@ def _log(**change):
     ({}, {"sensor": sensors.Suite(((sensors.RangeBearing(np.eye(2)), 6),))}, "expected one sensor"),
 )
 def test_bad_input_is_refused(change, options):
-    here = world()
-    given = {"motion": here.motion, "sensor": here.sensor, "pose": START, "pose_cov": START_COV}
+    world = small_world()
+    given = {"motion": world.motion, "sensor": world.sensor, "pose": START, "pose_cov": START_COV}
     given |= options
     models = [given.pop(key) for key in ("motion", "sensor", "pose", "pose_cov")]
     graphs.of_log(_log(**change), *models, **given)

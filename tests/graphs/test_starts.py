@@ -8,7 +8,7 @@ from reference import graph as plain
 from reference import plane
 from worlds import narrow
 
-from jaxslam import graphs, motion, sensors
+from jaxslam import datasets, graphs, motion, sensors
 from jaxslam.graphs import starts
 
 PLACING = ("odometry", "spanning_tree", "chordal")
@@ -32,13 +32,13 @@ def assert_close(graph, truth, atol=1e-12):
 @pytest.mark.parametrize("name", PLACING)
 def test_without_noise_every_start_is_the_truth(name):
     truth = small_graphs.drawn()
-    found = starts.STARTS[name](scattered(truth))
-    assert_close(found, truth)
-    np.testing.assert_allclose(found.points, truth.points, atol=1e-12)
-    np.testing.assert_array_equal(found.poses[0], truth.poses[0])
-    found = starts.STARTS[name](narrow(scattered(truth)))
-    assert found.poses.dtype == found.points.dtype == np.float32
-    assert_close(found, truth, atol=2e-6)
+    start = starts.STARTS[name](scattered(truth))
+    assert_close(start, truth)
+    np.testing.assert_allclose(start.points, truth.points, atol=1e-12)
+    np.testing.assert_array_equal(start.poses[0], truth.poses[0])
+    start = starts.STARTS[name](narrow(scattered(truth)))
+    assert start.poses.dtype == start.points.dtype == np.float32
+    assert_close(start, truth, atol=2e-6)
 
 
 @pytest.mark.parametrize("name", PLACING)
@@ -49,7 +49,7 @@ def test_a_prior_holds_where_no_pose_is_fixed(name):
 
 def test_given_is_the_graph():
     graph = small_graphs.drawn()
-    assert starts.given(graph) is graph
+    assert starts.identity(graph) is graph
 
 
 def test_odometry_follows_the_path_and_the_tree_the_fewest_edges():
@@ -62,14 +62,14 @@ def test_odometry_follows_the_path_and_the_tree_the_fewest_edges():
     backwards = plane.between(z[7], [0.0, 0.0, 0.0])
     tree[7] = plane.compose(graph.poses[0], backwards)
     tree[6] = plane.compose(tree[7], plane.between(z[6], [0.0, 0.0, 0.0]))
-    found = starts.spanning_tree(graph).poses
-    np.testing.assert_allclose(found[[7, 6]], [tree[7], tree[6]], atol=1e-12)
+    poses = starts.spanning_tree(graph).poses
+    np.testing.assert_allclose(poses[[7, 6]], [tree[7], tree[6]], atol=1e-12)
 
 
 def test_chordal_is_two_linear_problems():
     """Headings by dense complex least squares; at them χ² has no slope by any position."""
     graph = small_graphs.only(small_graphs.drawn(noise=0.3), "relative_pose", "relative_position")
-    found = starts.chordal(graph)
+    start = starts.chordal(graph)
     table = graph.tables["relative_pose"]
     root = np.sqrt(table.information[:, 2, 2])
     rows = np.zeros((len(root), 8), complex)
@@ -77,14 +77,14 @@ def test_chordal_is_two_linear_problems():
         rows[k, j], rows[k, i] = root[k], -root[k] * np.exp(1j * table.z[k, 2])
     held = np.exp(1j * graph.poses[0, 2])
     rest = np.linalg.lstsq(rows[:, 1:], -rows[:, 0] * held, rcond=None)[0]
-    np.testing.assert_allclose(found.poses[1:, 2], np.angle(rest), atol=1e-12)
+    np.testing.assert_allclose(start.poses[1:, 2], np.angle(rest), atol=1e-12)
 
     def cost(x):
-        poses, points = found.poses.copy(), x[14:].reshape(3, 2)
+        poses, points = start.poses.copy(), x[14:].reshape(3, 2)
         poses[1:, :2] = x[:14].reshape(7, 2)
-        return plain.chi2(found._replace(poses=poses, points=points))
+        return plain.chi2(start._replace(poses=poses, points=points))
 
-    best = np.concatenate([found.poses[1:, :2].ravel(), found.points.ravel()])
+    best = np.concatenate([start.poses[1:, :2].ravel(), start.points.ravel()])
     slope = [
         (cost(best + step) - cost(best - step)) / 2e-3 for step in 1e-3 * np.eye(len(best))
     ]  # exact for a quadratic
@@ -127,8 +127,8 @@ def test_chordal_lies_close_to_the_optimum_of_real_graphs(name, best, share):
     path = DATA / "graphs" / f"{name}.g2o"
     if not path.exists():
         pytest.skip(f"{path} is not there")
-    found = plain.chi2(starts.chordal(graphs.read(path)))
-    assert best < found < share * best
+    chi2 = plain.chi2(starts.chordal(datasets.read_graph(path)))
+    assert best < chi2 < share * best
 
 
 @pytest.mark.parametrize("name", PLACING)

@@ -111,9 +111,9 @@ def a_dictionary_without_annotation() -> jaxslam.Campaign:
 
 
 def a_graph(path: Path) -> np.ndarray:
-    graph = graphs.read(path)
+    graph = datasets.read_graph(path)
     solution = graphs.optimize(graph, kernel=graphs.Huber(1.0))
-    graphs.write(path.with_suffix(".toro"), solution.graph)
+    datasets.write_graph(path.with_suffix(".toro"), solution.graph)
     print(solution.chi2, graphs.Ending(int(solution.status)))
     world = own_world()
     _, log = jaxslam.simulate(world, jax.random.key(0))

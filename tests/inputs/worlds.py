@@ -94,8 +94,8 @@ def ekf(scenario, **options):
 class Transposed(linearize.AtEstimate):
     """Returns Fᵀ in place of F."""
 
-    def motion(self, motion, u, here):
-        moved, by_pose, noise, memory = super().motion(motion, u, here)
+    def motion(self, motion, u, point):
+        moved, by_pose, noise, memory = super().motion(motion, u, point)
         return moved, by_pose.T, noise, memory
 
 

@@ -312,24 +312,30 @@ def test_a_gate_is_a_probability_for_a_measurement_of_any_size(size):
 
 
 @refused(
-    (lambda: association.Nearest(-1.0), "Nearest: .*above 0 and below 1 as gate"),
-    (lambda: association.Nearest(np.nan), "above 0 and below 1 as gate"),
+    (
+        lambda: association.Nearest(-1.0),
+        "Nearest: gate: expected a probability above 0 and below 1",
+    ),
+    (lambda: association.Nearest(np.nan), "gate: expected a probability above 0 and below 1"),
     (
         lambda: association.Nearest(9.21),
         r"as 0.999, got 9.21 \(the χ² quantile 9.21 of 2 degrees of freedom is that of 0.99\)$",
     ),
     (lambda: association.MaximumLikelihood(1.0), r"got 1.0 \(None for no gate\)$"),
-    (lambda: association.Nearest(0.99, 13.8), "below 1 as gate.* 13.8 of .* that of 0.999"),
-    (lambda: association.Nearest(None, 0.99), "no new_gate without a gate"),
-    (lambda: association.Nearest("9"), "Nearest: .*gate.* got str$"),
+    (lambda: association.Nearest(0.99, 13.8), "below 1, .* 13.8 of .* that of 0.999"),
+    (lambda: association.Nearest(None, 0.99), "new_gate: expected None without a gate"),
+    (lambda: association.Nearest("9"), "Nearest: gate: expected a probability .*, got '9'$"),
     (
         lambda: plainly(association.Nearest, *posed(*problem(np.random.default_rng(1), 3, 5))),
-        r"expected a number .*: as associate, give Nearest\(gate\), not Nearest$",
+        "got a Prediction: as associate, give a rule with its gate, not its class$",
     ),
     (lambda: association.MaximumLikelihood(0.99, 0.9), "new_gate >= gate"),
     (lambda: association.GlobalNearest(0.99, 0.9), "new_gate >= gate"),
     (lambda: association.Nearest(0.99, ambiguous="guess"), "guess"),
-    (lambda: association.JointCompatibility(1.5), "JointCompatibility: expected a probability"),
+    (
+        lambda: association.JointCompatibility(1.5),
+        "JointCompatibility: probability: expected a probability",
+    ),
     (lambda: association.JointCompatibility(0.99, 0.9), "new_gate >= gate"),
     (lambda: association.JointCompatibility(budget=0), "budget"),
     (lambda: association.JointCompatibility(candidates=0), "candidates"),

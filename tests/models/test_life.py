@@ -236,7 +236,7 @@ def test_a_landmark_that_the_scan_measured_stays_in_a_full_map():
 def test_what_is_no_manager_is_refused():
     with pytest.raises(ValueError, match="function"):
         life.Existence(None)
-    with pytest.raises(ValueError, match="EkfSlam: expected life to be a Life, got the class Exi"):
+    with pytest.raises(ValueError, match="EkfSlam: life: expected a Life, got the class Exi"):
         EkfSlam(MOTION, SENSOR, 3, life=life.Existence)
 
 

@@ -251,7 +251,7 @@ def test_gradients_stay_finite_and_the_sum_is_one(method, log_w):
 
 def test_bad_shares_are_refused():
     for share in (-0.1, 1.1, np.nan):
-        with pytest.raises(ValueError, match="share from 0 to 1"):
+        with pytest.raises(ValueError, match="share: expected a number from 0 to 1"):
             Soft(share)
 
 

@@ -32,8 +32,8 @@ def of_all(compass):
     return Suite(
         (
             Part(EYES, 4, visible=BetweenRanges(0.0, 4.0)),
-            Part(LASER, 6, every=3, start=1),
-            Part(compass, 1, every=5),
+            Part(LASER, 6, interval=3, start=1),
+            Part(compass, 1, interval=5),
             Part(EYES, 2, sees="robots"),
         )
     )
@@ -241,12 +241,12 @@ def signature():
 @refused(
     (lambda: Suite(()), "at least one sensor"),
     (lambda: Suite((EYES,)), "expected a Part or"),
-    (lambda: Suite(((EYES, 0),)), "places of range_bearing"),
-    (lambda: Suite((Part(EYES, 1, every=0),)), "every of range_bearing"),
-    (lambda: Suite((Part(EYES, 1, start=-1),)), "a start of at least 0"),
-    (lambda: Suite((Part(EYES, 1, sees="birds"),)), 'sees "landmarks"'),
-    (lambda: Suite(((COMPASS, 2),)), "expected places=1 of the absolute sensor compass, got 2"),
-    (lambda: Suite(((Suite(((EYES, 1),)), 1),)), "Part: expected one Sensor, got Suite"),
+    (lambda: Suite(((EYES, 0),)), "Part: places: expected an integer >= 1"),
+    (lambda: Suite((Part(EYES, 1, interval=0),)), "Part: interval: expected an integer >= 1"),
+    (lambda: Suite((Part(EYES, 1, start=-1),)), "Part: start: expected an integer >= 0"),
+    (lambda: Suite((Part(EYES, 1, sees="birds"),)), 'Part: sees: expected "landmarks"'),
+    (lambda: Suite(((COMPASS, 2),)), "places: expected 1 of the absolute sensor compass, got 2"),
+    (lambda: Suite(((Suite(((EYES, 1),)), 1),)), "Part: sensor: expected one Sensor, got a Suite"),
     (lambda: Suite(((EYES, 1), (signature(), 1))), "expected sensors that share landmarks"),
     (lambda: world(places=3), "each Part has its own places"),
     (lambda: world(spurious=Spurious()), "each Part has its own places"),

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from jaxslam import motion, sensors
-from jaxslam.calibration._delay import delayed
+from jaxslam.calibration import delayed
 from jaxslam.core.types import Log
 from jaxslam.motion import WhiteNoise
 from jaxslam.sensors import RangeBearingNoise
@@ -76,11 +76,17 @@ def test_a_recorded_depth_is_observed_and_inverted():
 
 
 def test_models_that_cannot_be_corrected_are_refused():
-    with pytest.raises(ValueError, match="Corrected: expected a motion model with controls v and"):
+    with pytest.raises(
+        ValueError, match="Corrected: motion: expected a motion model with controls v and"
+    ):
         motion.Corrected(motion.Odometry(np.eye(3)))
-    with pytest.raises(ValueError, match="Corrected: expected a sensor of a range, got one of bea"):
+    with pytest.raises(
+        ValueError, match="Corrected: sensor: expected a sensor of a range, got one of bea"
+    ):
         sensors.Corrected(sensors.BearingOnly(np.eye(1)))
-    with pytest.raises(ValueError, match="Corrected: expected a sensor of a range and a bearing"):
+    with pytest.raises(
+        ValueError, match="Corrected: sensor: expected a sensor of a range and a bearing"
+    ):
         sensors.Corrected(sensors.RangeOnly(np.eye(1)), axis=0.0)
 
 

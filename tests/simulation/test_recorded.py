@@ -95,7 +95,7 @@ def unlike(**fields):
 @refused(
     ({"logs": []}, "logs as a list of Log, one a run, got an empty list"),
     ({"logs": Log(np.zeros((2, 3)), Scan(*[np.zeros((2, 1))] * 3))}, "logs as a list"),
-    ({"logs": [None]}, r"expected logs\[0\] to be a Log, got NoneType"),
+    ({"logs": [None]}, r"logs\[0\]: expected a Log, got None"),
     ({"logs": ragged()}, r"got \(6, 2\) in run 0 and \(5, 2\) in run 4"),
     ({"logs": unlike(z=np.full((6, 2, 2), np.nan))}, "run 1: .* is not finite"),
     ({"logs": unlike(tag=np.tile([0, 2], (6, 1)))}, r"below 2, .* got 2 \(run 1, row 0\)"),

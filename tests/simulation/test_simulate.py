@@ -303,7 +303,7 @@ BLIND = changed(motion.Increment(Q), perturb=None)
     ({"pose_cov": np.eye(2)}, "pose_cov: expected a covariance"),
     ({"pose_cov": -np.eye(3)}, "pose_cov: .*positive semi-definite"),
     ({"noise_on": "map"}, "expected noise_on"),
-    ({"motion": sensors.RangeBearing(R)}, "expected motion to be a Motion"),
+    ({"motion": sensors.RangeBearing(R)}, "motion: expected a Motion"),
     ({"motion": BLIND, "noise_on": "odometry"}, "expected a motion with `perturb`"),
     ({"places": 0}, "places >= 1"),
     ({"places": -2}, "places >= 1"),

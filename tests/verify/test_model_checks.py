@@ -280,7 +280,7 @@ def test_a_measurement_outside_its_support_is_not_tried():
 
 
 @refused(
-    ({"range [m]": (0, 1)}, "expected support as .* of bearing .*, got 'range"),
+    ({"range [m]": (0, 1)}, "support: expected .* of bearing .*, got 'range"),
     ({"bearing [rad]": (1, 0)}, "got 'bearing .*: .1, 0."),
     ({"bearing [rad]": 3.0}, "got 'bearing .*: 3.0"),
 )

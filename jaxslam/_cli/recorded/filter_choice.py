@@ -10,6 +10,7 @@ from jaxslam._cli.common import pick
 from jaxslam.association._rules import Known
 from jaxslam.core.protocols import Candidate, Filter, Motion, Sensor
 from jaxslam.core.types import Truth
+from jaxslam.core.validation import InvalidField
 from jaxslam.datasets import Dataset
 from jaxslam.datasets._landmark_logs.table_settings import association_options
 from jaxslam.filters._ekf.ekf_settings import EkfOptions
@@ -27,8 +28,8 @@ def with_options(data: Dataset, options: argparse.Namespace) -> Dataset:
         raise ValueError("--gate: expected --associate, too, since the tags are not used")
     try:
         association = association_options(options.associate or "known", options.gate)
-    except ValueError as problem:
-        raise ValueError(f"--{problem}") from problem
+    except InvalidField as problem:
+        raise ValueError(f"--{problem.field}: {problem.reason}") from problem
     # A default that an option replaces is not reported as taken.
     replaced = tuple(
         f"[filter] {name}" for name in ("gate", "associate") if getattr(options, name) is not None

@@ -18,6 +18,7 @@ from jaxslam.core._numbers import check_covariance, is_concrete
 from jaxslam.core.logs._tables import split_unit
 from jaxslam.core.protocols import Candidate, Chart, Estimator, Filter, Motion, Sensor
 from jaxslam.core.types import Log, Trace, Truth
+from jaxslam.core.validation import InvalidField
 from jaxslam.graphs.smoothing._forward_pass import LogEstimator
 from jaxslam.math._definite import invertible
 from jaxslam.sensors._suite import Suite
@@ -163,9 +164,8 @@ def _number(values: ArrayLike) -> np.ndarray:
 def _check_stated(name: str, size: int, model: Motion | Sensor, *at: PyTree) -> None:
     try:
         check_covariance(name, _noise_cov(model, *at), size)
-    except ValueError as error:
-        message = str(error).removeprefix(f"{name}: ")
-        raise ValueError(f"monte_carlo: noise_cov of {name}: {message}") from None
+    except InvalidField as error:
+        raise InvalidField("monte_carlo", f"noise_cov of {name}", error.reason) from None
 
 
 def check_fits(name: str, candidate: Candidate, scenario: World) -> None:
@@ -224,7 +224,7 @@ def check_called(name: str, candidate: Callable[..., object]) -> None:
     first = next(iter(inspect.signature(candidate).parameters.values()), None)
     if first is None:
         return
-    ours = (getattr(candidate, "__module__", None) or "").startswith("jaxslam.")
+    ours = (getattr(candidate, "__module__", None) or "").partition(".")[0] == "jaxslam"
     named = first.name in ("motion", "sensor", "robots", "scenario", "world")
     if (ours and named) or first.annotation in (Motion, Sensor, World):
         raise ValueError(f"monte_carlo: {name!r} is a factory: call it, {name}({first.name}, …)")

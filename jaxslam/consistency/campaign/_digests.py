@@ -127,7 +127,7 @@ def _text_of_class(cls: type, within: tuple[object, ...]) -> str:
         for name, part in parts.items()
         if isinstance(part, FunctionType) and _of_user(part) and name not in _BY_DATACLASS
     }
-    if not methods or cls in within or cls.__module__.startswith("jaxslam."):
+    if not methods or cls in within or cls.__module__.partition(".")[0] == "jaxslam":
         return _name(cls)
     constants = {
         name: part

@@ -3,6 +3,7 @@ estimator: absolute and relative errors of a path, errors of relations, alignmen
 correlation. On the host, by NumPy in float64.
 """
 
+from jaxslam._public import publish
 from jaxslam.consistency.metrics._paths import PathErrors, align_map, alignment, ate, map_entropy
 from jaxslam.consistency.metrics._relative_poses import (
     Errors,
@@ -38,3 +39,5 @@ __all__ = [
     "statistics",
     "summary",
 ]
+
+publish(__name__)

@@ -1,7 +1,6 @@
 """Checks of arguments before tracing; each error is one line that states what was expected."""
 
 from jaxslam.core._numbers import (
-    check_alpha,
     check_count,
     check_covariance,
     check_gate,
@@ -25,7 +24,6 @@ from jaxslam.core._validation.models import (
 
 __all__ = [
     "call_traced",
-    "check_alpha",
     "check_associate",
     "check_count",
     "check_covariance",

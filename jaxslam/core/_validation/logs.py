@@ -5,6 +5,7 @@ import numpy as np
 
 from jaxslam.core._numbers import check_array, is_concrete, largest
 from jaxslam.core.types import Log, Scan
+from jaxslam.core.validation import InvalidField
 
 
 def check_log(
@@ -24,9 +25,8 @@ def check_log(
     """
     control, scan = log.control, log.scan
     if not isinstance(scan, Scan):
-        raise ValueError(
-            f"{name}: log.scan: expected a Scan(z, tag, valid), got {type(scan).__name__}"
-        )
+        got = type(scan).__name__
+        raise InvalidField(name, "log.scan", f"expected a Scan(z, tag, valid), got {got}")
     z, tag, valid = scan
     check_array(f"{name}: log.control", control, ("T", control_size), np.floating)
     steps = np.shape(control)[0]
@@ -37,42 +37,47 @@ def check_log(
     check_array(f"{name}: log.scan.tag", tag, (steps, places), np.integer)
     check_array(f"{name}: log.scan.valid", valid, (steps, places), np.bool_)
     if parts and places != sum(parts):
-        raise ValueError(
-            f"{name}: log.scan: expected {sum(parts)} measurement slots, "
-            f"{' + '.join(map(str, parts))} of the sensors, got {places}: log.scan.z of shape "
-            f"{np.shape(z)}"
+        raise InvalidField(
+            name,
+            "log.scan",
+            f"expected {sum(parts)} measurement slots, {' + '.join(map(str, parts))} of the "
+            f"sensors, got {places}: log.scan.z of shape {np.shape(z)}",
         )
     dtype = jnp.promote_types(jnp.result_type(control), jnp.result_type(z))
     if dtype not in (jnp.float32, jnp.float64):
-        raise ValueError(
-            f"{name}: log.control, log.scan.z: expected float32 or float64, got {dtype}"
-        )
+        reason = f"expected float32 or float64, got {dtype}"
+        raise InvalidField(name, "log.control, log.scan.z", reason)
     if not is_concrete(log):
         return
     mask, tags = np.asarray(valid), np.asarray(tag)
     most = largest(control, z)
-    for what, values, used, then in (
-        ("log.control", control, np.ones(steps, bool), "correct or leave out this row"),
-        ("log.scan.z: a valid measurement", z, mask, "set log.scan.valid to False there"),
+    for field, noun, values, used, advice in (
+        (
+            "log.control",
+            "a control",
+            control,
+            np.ones(steps, bool),
+            "correct or omit the row",
+        ),
+        ("log.scan.z", "a valid measurement", z, mask, "set log.scan.valid to False there"),
     ):
         size = np.abs(np.asarray(values, np.float64)).max(axis=-1, initial=0.0)
-        _refuse(name, used & ~np.isfinite(size), f"{what} is not finite", then)
-        _refuse(name, used & (size > most), f"{what} is beyond ±{most:.2g}", then)
-    _refuse(name, mask & (tags < -1), "log.scan.tag: a tag is below -1")
-    _refuse(name, mask & (tags > np.iinfo(np.int32).max), "log.scan.tag: a tag is beyond int32")
+        _refuse(name, field, used & ~np.isfinite(size), f"{noun} is not finite", advice)
+        _refuse(name, field, used & (size > most), f"{noun} is beyond ±{most:.2g}", advice)
+    _refuse(name, "log.scan.tag", mask & (tags < -1), "a tag is below -1")
+    beyond = mask & (tags > np.iinfo(np.int32).max)
+    _refuse(name, "log.scan.tag", beyond, "a tag is beyond int32")
+    # Unknown tags become -1, -2, … of each row, so that they repeat nothing.
     named = np.where(mask & (tags >= 0), tags, -1 - np.arange(places))
     for part in np.split(named, np.cumsum(parts)[:-1].astype(int), axis=1) if parts else (named,):
         ordered = np.sort(part, axis=1)
         repeats = (ordered[:, 1:] == ordered[:, :-1]).any(axis=1)
-        _refuse(name, repeats, "log.scan.tag: a tag repeats within the scan")
+        _refuse(name, "log.scan.tag", repeats, "a tag repeats within the scan")
 
 
-def _refuse(name: str, bad: np.ndarray, why: str, then: str = "") -> None:
-    """Raise ValueError if an entry of `bad` is set, by row or by row and measurement slot.
-
-    then: the next step.
-    """
+def _refuse(name: str, field: str, bad: np.ndarray, fault: str, advice: str = "") -> None:
+    """Raise InvalidField if an entry of `bad` is set, by row or by row and measurement slot."""
     if bad.any():
         at = zip(("row", "slot"), np.argwhere(bad)[0], strict=False)
-        where = ", ".join(f"{what} {i}" for what, i in at)
-        raise ValueError(f"{name}: {why} ({where})" + f": {then}" * bool(then))
+        where = ", ".join(f"{axis} {i}" for axis, i in at)
+        raise InvalidField(name, field, f"{fault} ({where})" + f": {advice}" * bool(advice))

@@ -4,7 +4,6 @@ Types of records, arguments of functions, sizes of results. Each error is one li
 was expected.
 """
 
-import inspect
 import traceback
 import weakref
 from collections.abc import Callable
@@ -19,12 +18,16 @@ from numpy.typing import ArrayLike
 
 from jaxslam.core._names import unfit_signature
 from jaxslam.core._numbers import check_array, shape_text
+from jaxslam.core._record import function_of
+from jaxslam.core._reprs import with_article
 from jaxslam.core.protocols import Chart, Life, Linearizer, Motion, Sensor
 from jaxslam.core.types import Estimate, Info, Scan
+from jaxslam.core.validation import InvalidField, instance_of, require
 
 _Shape = tuple[int, ...]
 _Record = TypeVar("_Record")
 _Result = TypeVar("_Result")
+_S = TypeVar("_S")
 
 _SOUND: weakref.WeakSet[Motion | Sensor] = weakref.WeakSet()
 """Models whose sizes have been checked."""
@@ -47,10 +50,12 @@ def call_traced(name: str, function: Callable[..., _Result], *arguments: PyTree)
     except _NEEDS_VALUES as error:
         frames = traceback.extract_tb(error.__traceback__)
         at = [frame for frame in frames if "site-packages" not in frame.filename][-1]
-        raise ValueError(
-            f"{name}: {Path(at.filename).name}:{at.lineno} needs the value of an array, which is "
-            "not known while JAX traces: write jnp.where or lax.cond in place of `if`, jax.numpy "
-            "in place of NumPy, and no float(…)"
+        raise InvalidField(
+            name,
+            "",
+            f"{Path(at.filename).name}:{at.lineno} needs the value of an array, which is not known "
+            "while JAX traces: write jnp.where or lax.cond in place of `if`, jax.numpy in place of "
+            "NumPy, and no float(…)",
         ) from error
 
 
@@ -61,9 +66,11 @@ def check_models(name: str, motion: object, sensor: object) -> None:
     of `protocols` and return arrays of the sizes of their names.
     """
     if isinstance(motion, Sensor) and isinstance(sensor, Motion):
-        raise ValueError(
-            f"{name}: expected a Motion, then a Sensor, got the sensor {motion.name} and "
-            f"the motion {sensor.name}: they are swapped"
+        raise InvalidField(
+            name,
+            "",
+            f"expected a Motion, then a Sensor, got the sensor {motion.name} and the motion "
+            f"{sensor.name}: they are swapped",
         )
     check_motion(name, motion)
     check_sensor(name, sensor)
@@ -93,9 +100,11 @@ def check_sensor(name: str, sensor: object) -> None:
     pose, z, landmark = _numbers(3), _numbers(size_z), _numbers(size_l)
     free = np.shape(sensor.free.mean)
     if len(free) != 1 or np.shape(sensor.free.cov) != free * 2:
-        raise ValueError(
-            f"{name}: expected {sensor.name}.free of shapes (K,) and (K, K), got {free} and "
-            f"{np.shape(sensor.free.cov)}"
+        raise InvalidField(
+            name,
+            "",
+            f"expected {sensor.name}.free of shapes (K,) and (K, K), got {free} and "
+            f"{np.shape(sensor.free.cov)}",
         )
     _check_size(name, sensor, "observe", {"pose": pose, "l": landmark}, (size_z,))
     _check_size(name, sensor, "residual", {"z": z, "z_hat": z}, (size_z,))
@@ -123,45 +132,15 @@ def check_parts(
         check_record(name, "life", life, Life)
 
 
-def check_record(name: str, what: str, value: object, kind: type[_Record]) -> _Record:
-    """The value, if it is such a record; ValueError if not, as on a class that was not called."""
-    if isinstance(value, kind):
-        return value
-    what = f"{what} to be {'an' if kind.__name__[0] in 'AEIO' else 'a'} {kind.__name__}"
-    if callable(value):
-        factory = getattr(value, "__name__", repr(value))
-        is_a = "class" if isinstance(value, type) else "function"
-        raise ValueError(
-            f"{name}: expected {what}, got the {is_a} {factory}: call it, {factory}(…)"
-        )
-    fields = getattr(value, "_fields", ())
-    held = next((field for field in fields if isinstance(getattr(value, field), kind)), None)
-    raise ValueError(
-        f"{name}: expected {what}, got {type(value).__name__}"
-        + f"; give its field {held}" * bool(held)
-    )
+def check_record(name: str, field: str, value: object, kind: type[_Record]) -> _Record:
+    """The value, if it is such a record; InvalidField if not, as on a class that was not called."""
+    record: _Record = require(name, field, value, instance_of(kind))
+    return record
 
 
 def check_associate(name: str, associate: object) -> None:
-    """Raise ValueError unless this is a function of (prediction, scan)."""
-    if not callable(associate):
-        raise ValueError(
-            f"{name}: expected associate to be a function of (prediction, scan), got "
-            f"{type(associate).__name__}"
-        )
-    if isinstance(associate, type):
-        raise ValueError(
-            f"{name}: expected associate to be a function of (prediction, scan), got the class "
-            f"{associate.__name__}: call it, {associate.__name__}(…)"
-        )
-    try:
-        inspect.signature(associate).bind(None, None)
-    except TypeError as error:
-        raise ValueError(
-            f"{name}: expected associate to be a function of (prediction, scan): {error}"
-        ) from None
-    except ValueError:  # a builtin, which has no signature
-        return
+    """Raise InvalidField unless this is a function of (prediction, scan)."""
+    require(name, "associate", associate, function_of("prediction", "scan"))
 
 
 def _numbers(*shape: int) -> jax.ShapeDtypeStruct:
@@ -177,36 +156,37 @@ def _check_size(
 ) -> None:
     """Raise ValueError unless the model's function returns this shape for these arguments."""
     function: Callable[..., object] = getattr(model, field)
-    if (got := unfit_signature(function, len(arguments))) is not None:
-        wanted = f"{model.name}.{field} to take ({', '.join(arguments)})"
-        raise ValueError(f"{name}: expected {wanted}, got {got}")
+    if (signature := unfit_signature(function, len(arguments))) is not None:
+        reason = f"expected {model.name}.{field} to take ({', '.join(arguments)}), got {signature}"
+        raise InvalidField(name, "", reason)
     sizes = ", ".join(f"{key} {_shape_text(value.shape)}" for key, value in arguments.items())
     call = f"{model.name}.{field}({sizes})"
     try:
-        found = jax.eval_shape(function, *arguments.values())
+        result = jax.eval_shape(function, *arguments.values())
     except Exception as error:
-        why = next(iter(str(error).strip().splitlines()), "")
-        raise ValueError(f"{name}: {call} fails: {type(error).__name__}: {why}") from error
-    got = getattr(found, "shape", None)
-    if got != shape:
-        what = f"a {type(found).__name__}" if got is None else f"shape {_shape_text(got)}"
-        raise ValueError(
-            f"{name}: expected {call} to return shape {_shape_text(shape)}, got {what}"
-        )
-    if not jnp.issubdtype(getattr(found, "dtype", np.dtype(object)), jnp.floating):
-        raise ValueError(f"{name}: expected {call} to return real numbers, got {found.dtype}")
-    given = next(iter(arguments.values())).dtype
-    if field != "noise_cov" and found.dtype != given:
-        raise ValueError(
-            f"{name}: expected {call} to return {given}, as its arguments are, got {found.dtype}"
-        )
+        line = next(iter(str(error).strip().splitlines()), "")
+        reason = f"{call} fails: {type(error).__name__}: {line}"
+        raise InvalidField(name, "", reason) from error
+    result_shape = getattr(result, "shape", None)
+    if result_shape != shape:
+        got = with_article(type(result).__name__)
+        if result_shape is not None:
+            got = f"shape {_shape_text(result_shape)}"
+        reason = f"expected {call} to return shape {_shape_text(shape)}, got {got}"
+        raise InvalidField(name, "", reason)
+    if not jnp.issubdtype(getattr(result, "dtype", np.dtype(object)), jnp.floating):
+        reason = f"expected {call} to return real numbers, got {result.dtype}"
+        raise InvalidField(name, "", reason)
+    dtype = next(iter(arguments.values())).dtype
+    # A covariance is converted where it is used: it may be a constant of NumPy.
+    if field != "noise_cov" and result.dtype != dtype:
+        reason = f"expected {call} to return {dtype}, as its arguments are, got {result.dtype}"
+        raise InvalidField(name, "", reason)
 
 
 def _shape_text(shape: _Shape) -> str:
     return "(" + ", ".join(map(str, shape)) + ("," if len(shape) == 1 else "") + ")"
 
-
-_S = TypeVar("_S")
 
 _REAL = ("nis", "innovation", "innovation_cov", "log_likelihood")
 """Fields of `Info` in the dtype of the measurements."""
@@ -219,8 +199,8 @@ def same_state(name: str, before: _S, after: PyTree) -> _S:
     """
     old: PyTree = jax.tree.structure(before)
     if old != jax.tree.structure(after):
-        message = f"expected a state as before, {_kind(before)}, got {_kind(after)}"
-        raise ValueError(f"{name}: {message}")
+        reason = f"expected a state as before, {_kind(before)}, got {_kind(after)}"
+        raise InvalidField(name, "", reason)
     pairs = zip(jax.tree.leaves_with_path(before), jax.tree.leaves(after), strict=True)
     unlike = [
         f"state{jax.tree_util.keystr(path)}: expected {_array(old)}, got {_array(new)}"
@@ -228,7 +208,7 @@ def same_state(name: str, before: _S, after: PyTree) -> _S:
         if _array(old) != _array(new)
     ]
     if unlike:
-        raise ValueError(f"{name}: {'; '.join(unlike)}")
+        raise InvalidField(name, "", "; ".join(unlike))
     state: _S = after
     return state
 
@@ -243,14 +223,14 @@ def _array(leaf: ArrayLike) -> str:
     return f"{jnp.result_type(leaf)} {shape_text(leaf)}"
 
 
-def state_and_info(name: str, state: _S, scan: Scan, found: object) -> tuple[_S, Info]:
+def state_and_info(name: str, state: _S, scan: Scan, result: object) -> tuple[_S, Info]:
     """The result of a filter's update; ValueError unless it is a state as before, and an `Info`."""
-    if not (isinstance(found, tuple) and len(found) == 2 and isinstance(found[1], Info)):
-        got = type(found).__name__
-        if isinstance(found, tuple) and not hasattr(found, "_fields"):
-            got = "(" + ", ".join(type(part).__name__ for part in found) + ")"
-        raise ValueError(f"{name}: expected update to return (state, Info), got {got}")
-    info: Info = found[1]
+    if not (isinstance(result, tuple) and len(result) == 2 and isinstance(result[1], Info)):
+        got = with_article(type(result).__name__)
+        if isinstance(result, tuple) and not hasattr(result, "_fields"):
+            got = "(" + ", ".join(type(part).__name__ for part in result) + ")"
+        raise InvalidField(name, "", f"expected update to return (state, Info), got {got}")
+    info: Info = result[1]
     m, real = scan.tag.shape[0], scan.z.dtype.type
     for field, shape in {
         "nis": (m,),
@@ -263,16 +243,15 @@ def state_and_info(name: str, state: _S, scan: Scan, found: object) -> tuple[_S,
     }.items():
         kind = real if field in _REAL else np.integer if field == "status" else np.generic
         check_array(f"{name}: update: Info.{field}", getattr(info, field), shape, kind)
-    return same_state(f"{name}: update", state, found[0]), info
+    return same_state(f"{name}: update", state, result[0]), info
 
 
 def checked_estimate(name: str, estimate: object, dtype: np.dtype) -> Estimate:
     """The result of a filter's estimate; ValueError unless it is an `Estimate` of N landmarks, with
     numbers of this dtype."""
     if not isinstance(estimate, Estimate):
-        raise ValueError(
-            f"{name}: expected estimate to return an Estimate, got {type(estimate).__name__}"
-        )
+        got = with_article(type(estimate).__name__)
+        raise InvalidField(name, "", f"expected estimate to return an Estimate, got {got}")
     n = np.shape(estimate.alive)[0] if np.ndim(estimate.alive) == 1 else -1
     shapes = {"pose": (3,), "pose_cov": (3, 3), "points": (n, 2), "point_covs": (n, 2, 2)}
     for field, shape in (shapes | {"alive": (n,), "tag": (n,)}).items():

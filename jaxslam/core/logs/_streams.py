@@ -181,10 +181,12 @@ def known_poses(
         return np.zeros((len(rows), 3)), np.zeros(len(rows), bool)
     joined = ~is_gap(clock, longest) & finite[:-1] & finite[1:]
     unusable = clock[~finite]
-    known = between_lines(clock, rows, joined) & ~np.isin(rows, unusable)
+    is_known = between_lines(clock, rows, joined) & ~np.isin(rows, unusable)
     path = interpolate_poses(clock[finite], pose[finite], rows)
-    latest = np.maximum.accumulate(np.where(known, np.arange(len(rows)), int(np.argmax(known))))
-    return path[latest], known
+    latest = np.maximum.accumulate(
+        np.where(is_known, np.arange(len(rows)), int(np.argmax(is_known)))
+    )
+    return path[latest], is_known
 
 
 def relative(

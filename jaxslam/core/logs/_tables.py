@@ -8,8 +8,9 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.core._numbers import is_concrete
 from jaxslam.core.logs import _streams as streams
+from jaxslam.core.validation import InvalidField
+from jaxslam.math._arrays import is_concrete
 
 UNITS: dict[str, dict[str, float]] = {
     "rad": {"deg": 180 / math.pi},
@@ -92,10 +93,10 @@ def unit_divisor(unit: str | None, wanted: str) -> float | None:
     return UNITS.get(target, {}).get(unit.replace("µ", "u").replace("μ", "u"))
 
 
-def odometry_columns(controls: tuple[str, ...], given: Sequence[str]) -> tuple[str, ...]:
-    """The columns for a model's controls, without the time, among the given ones."""
+def odometry_columns(controls: tuple[str, ...], names: Sequence[str]) -> tuple[str, ...]:
+    """The columns for a model's controls, without the time, among those that a table has."""
     measured = tuple(name for name in controls if name != INTERVAL)
-    poses = {split_unit(name)[0] for name in POSE} <= {split_unit(name)[0] for name in given}
+    poses = {split_unit(name)[0] for name in POSE} <= {split_unit(name)[0] for name in names}
     return POSE if poses and measured == _INCREMENT else measured
 
 
@@ -166,10 +167,10 @@ def align_tables(
         ranges = [k for k, name in enumerate(seen.measured) if split_unit(name)[0] == "range"]
         no_echo = inside & (values[:, ranges] < 0).any(axis=1)
         far = inside & (values[:, ranges] >= seen.max_range).any(axis=1)
-        taken = inside & ~no_echo & ~far
-        early = taken & _too_soon(seen, tag, taken)
-        taken &= ~early
-        kept.append((when[taken], tag[taken], values[taken]))
+        used = inside & ~no_echo & ~far
+        early = used & _too_soon(seen, tag, used)
+        used &= ~early
+        kept.append((when[used], tag[used], values[used]))
         outside += int((~inside).sum())
         negative += int(no_echo.sum())
         beyond += int(far.sum())
@@ -177,7 +178,9 @@ def align_tables(
     times = np.unique(np.concatenate([clock, *(when for when, *_ in kept)]))
     moved = clock, odometry.values(columns)
     places = [seen.places for seen in sensors]
-    rows = _side_by_side([streams.align_streams(moved, one, rule, times) for one in kept], places)
+    rows = _side_by_side(
+        [streams.align_streams(moved, stream, rule, times) for stream in kept], places
+    )
     if INTERVAL in controls and rule is not streams.hold:
         interval = np.diff(rows.time, prepend=rows.time[:1])
         rows = rows._replace(control=np.column_stack([rows.control, interval]))
@@ -218,23 +221,23 @@ def _tags_in_scans(seen: Seen[_Name], tag_of: dict[_Name, int]) -> Int[np.ndarra
 
 
 def _too_soon(
-    seen: Seen[_Name], tag: Int[np.ndarray, "J"], taken: Bool[np.ndarray, "J"]
+    seen: Seen[_Name], tag: Int[np.ndarray, "J"], used: Bool[np.ndarray, "J"]
 ) -> Bool[np.ndarray, "J"]:
     """Which measurements come sooner after one of the same landmark than the spacing."""
-    found = np.zeros(len(tag), bool)
+    too_soon = np.zeros(len(tag), bool)
     if not seen.spacing:
-        return found
-    if unknown := np.flatnonzero(taken & (tag < 0)).tolist():
+        return too_soon
+    if unknown := np.flatnonzero(used & (tag < 0)).tolist():
         where = seen.table.at(unknown[0], TAG)
         raise ValueError(f"{where}: expected a tag, since a spacing is of one landmark, got none")
     when = seen.table.columns[TIME]
     last: dict[int, float] = {}
-    for row in np.flatnonzero(taken):
+    for row in np.flatnonzero(used):
         # A spacing of whole intervals is not to be missed by rounding of the stamps.
-        found[row] = when[row] - last.get(tag[row], -math.inf) < seen.spacing * (1 - 1e-6)
-        if not found[row]:
+        too_soon[row] = when[row] - last.get(tag[row], -math.inf) < seen.spacing * (1 - 1e-6)
+        if not too_soon[row]:
             last[tag[row]] = when[row]
-    return found
+    return too_soon
 
 
 def _side_by_side(scans: Sequence[streams.Rows], places: Sequence[int | None]) -> streams.Rows:
@@ -251,9 +254,9 @@ def _side_by_side(scans: Sequence[streams.Rows], places: Sequence[int | None]) -
             valid=np.pad(rows.valid, slots),
         )
 
-    each = [padded(*pair) for pair in zip(scans, places, strict=True)]
+    blocks = [padded(*pair) for pair in zip(scans, places, strict=True)]
     z, tag, valid = (
-        np.concatenate([getattr(rows, name) for rows in each], axis=1)
+        np.concatenate([getattr(rows, name) for rows in blocks], axis=1)
         for name in ("z", "tag", "valid")
     )
     return streams.Rows(scans[0].time, scans[0].control, z, tag, valid)
@@ -271,70 +274,74 @@ def check_times(table: Columns[_Name], *, strict: bool) -> None:
 
 def ordered(names: set[_Name | None]) -> list[_Name]:
     """The names of landmarks, whole numbers before text; None, the unknown one, is left out."""
-    known = (name for name in names if name is not None)
-    return sorted(known, key=lambda name: (isinstance(name, str), name))
+    named = (name for name in names if name is not None)
+    return sorted(named, key=lambda name: (isinstance(name, str), name))
 
 
 def columns_of(
-    what: str, given: Tabular, wanted: Callable[[Sequence[str]], Sequence[str]]
+    argument: str, table: Tabular, wanted: Callable[[Sequence[str]], Sequence[str]]
 ) -> Columns[int | str]:
     """The table of a data frame, a mapping of columns, a structured array, or a sequence of rows.
 
-    Columns with names are found by them; a name may have a unit ("bearing [deg]"). Without names
+    Columns with names are found by name; a name may have a unit ("bearing [deg]"). Without names
     the columns are in the order wanted. Other columns are left out.
 
     Args:
-        what: the name of the argument, for messages.
-        wanted: (names given) -> the columns needed, with units.
+        argument: the name of the argument, for messages.
+        wanted: (names of the table) -> the columns needed, with units.
     Raises:
         ValueError: on a column that is missing, in another unit, of another length, or with a value
             that is not a finite number.
     """
-    given = _held(given)
-    names = _names(given)
+    table = _held(table)
+    names = _names(table)
     needed = list(wanted(names or ()))
 
     def at(row: int, column: str) -> str:
-        return f"{what}, row {row}, column {split_unit(column)[0]}"
+        return f"{argument}, row {row}, column {split_unit(column)[0]}"
 
     if names is None:
-        without_axes = isinstance(given, np.ndarray) and given.ndim == 0
-        if without_axes or not isinstance(given, Sequence | np.ndarray):
-            raise ValueError(f"{what}: expected rows or columns, got {type(given).__name__}")
-        rows = [_held(row) for row in given]
+        without_axes = isinstance(table, np.ndarray) and table.ndim == 0
+        if without_axes or not isinstance(table, Sequence | np.ndarray):
+            raise InvalidField(
+                argument, "", f"expected rows or columns, got {type(table).__name__}"
+            )
+        rows = [_held(row) for row in table]
         for k, row in enumerate(rows):
             size = len(row) if isinstance(row, Sequence) or np.ndim(row) else 1
             if size != len(needed) or isinstance(row, str):
-                raise ValueError(
-                    f"{what}, row {k}: expected {len(needed)} values ({', '.join(needed)}), "
-                    f"got {size}"
-                )
-        found = {name: [row[i] for row in rows] for i, name in enumerate(needed)}
+                reason = f"expected {len(needed)} values ({', '.join(needed)}), got {size}"
+                raise InvalidField(f"{argument}, row {k}", "", reason)
+        cells = {name: [row[i] for row in rows] for i, name in enumerate(needed)}
         divisors: dict[str, float] = dict.fromkeys(needed, 1)
     else:
-        assert not isinstance(given, Sequence)  # which has no names
+        assert not isinstance(table, Sequence)  # which has no names
         header = {split_unit(name)[0]: name for name in names}
-        found, divisors = {}, {}
+        cells, divisors = {}, {}
         for name in needed:
             bare = split_unit(name)[0]
             if bare not in header:
-                raise ValueError(f"{what}: expected a column {name!r}, got {', '.join(names)}")
+                raise InvalidField(
+                    argument, "", f"expected a column {name!r}, got {', '.join(names)}"
+                )
             divisor = unit_divisor(split_unit(header[bare])[1], name)
             if divisor is None:
-                raise ValueError(f"{what}: expected the column {name!r}, got {header[bare]!r}")
-            column = _held(given[header[bare]])
+                raise InvalidField(
+                    argument, "", f"expected the column {name!r}, got {header[bare]!r}"
+                )
+            column = _held(table[header[bare]])
             if not isinstance(column, Iterable):
-                raise ValueError(f"{what}: expected a column {name!r}, got {column!r}")
-            found[name], divisors[name] = list(column), divisor
-        lengths = {name: len(column) for name, column in found.items()}
+                raise InvalidField(argument, "", f"expected a column {name!r}, got {column!r}")
+            cells[name], divisors[name] = list(column), divisor
+        lengths = {name: len(column) for name, column in cells.items()}
         if len(set(lengths.values())) > 1:
-            raise ValueError(f"{what}: expected columns of one length, got {lengths}")
+            raise InvalidField(argument, "", f"expected columns of one length, got {lengths}")
     tags = None
-    if TAG in found:
-        tags = [_landmark(at(k, TAG), value) for k, value in enumerate(found.pop(TAG))]
-    columns = {n: _numbers(at, n, column, divisors[n]) for n, column in found.items()}
+    if TAG in cells:
+        tags = [_landmark(at(k, TAG), value) for k, value in enumerate(cells.pop(TAG))]
+    columns = {n: _numbers(at, n, column, divisors[n]) for n, column in cells.items()}
     if not columns[TIME].size:
-        raise ValueError(f"{what}: expected at least one row, got none")
+        raise InvalidField(argument, "", "expected at least one row, got none")
     return Columns(columns, tags, at)
 
 
@@ -343,13 +350,13 @@ def _held(value: Any) -> Any:
     return np.asarray(value) if isinstance(value, jax.Array) and is_concrete(value) else value
 
 
-def _names(given: Tabular) -> tuple[str, ...] | None:
+def _names(table: Tabular) -> tuple[str, ...] | None:
     """The names of the columns, or None where they have none."""
-    if isinstance(given, Mapping):
-        return tuple(map(str, given))
-    if isinstance(given, np.ndarray):
-        return None if given.dtype.names is None else tuple(given.dtype.names)
-    columns = getattr(given, "columns", None)
+    if isinstance(table, Mapping):
+        return tuple(map(str, table))
+    if isinstance(table, np.ndarray):
+        return None if table.dtype.names is None else tuple(table.dtype.names)
+    columns = getattr(table, "columns", None)
     return None if columns is None else tuple(map(str, columns))
 
 
@@ -358,15 +365,15 @@ def _numbers(
 ) -> Float[np.ndarray, "K"]:
     """The column, divided, as float64 (K,); raises ValueError on anything but finite numbers."""
     numbers = np.empty(len(column))
-    for row, given in enumerate(column):
-        value = _scalar(given)
+    for row, cell in enumerate(column):
+        value = _scalar(cell)
         try:
             good = isinstance(value, int | float) and not isinstance(value, bool)
             quotient = value / divisor if good else math.nan  # type: ignore[operator]
         except OverflowError:  # a whole number that no float holds
             quotient = math.nan
         if not math.isfinite(quotient):
-            raise ValueError(f"{at(row, name)}: expected a finite number, got {given!r}")
+            raise ValueError(f"{at(row, name)}: expected a finite number, got {cell!r}")
         numbers[row] = quotient
     return numbers
 

@@ -27,6 +27,7 @@ from jaxslam.core._units import TURN
 from jaxslam.core.logs._tables import INTERVAL, POSE, odometry_columns, split_unit
 from jaxslam.core.protocols import Associate, Motion, Sensor
 from jaxslam.core.types import JaxOrNumPy
+from jaxslam.core.validation import InvalidField
 from jaxslam.datasets._dataset import Parameter
 from jaxslam.filters._ekf.ekf_settings import EkfOptions
 from jaxslam.math._definite import asymmetric, indefinite
@@ -104,16 +105,17 @@ METHODS: dict[str, Callable[..., Associate]] = {
 def association_options(method: object, gate: Any) -> EkfOptions:
     """Options of `EkfSlam` for a method by name and a gate.
 
-    Raises ValueError, "associate: …" or "gate: …", on an unknown name and a gate that is not a
+    Raises InvalidField, of associate or gate, on an unknown name and a gate that is not a
     probability. By default known identities have no gate, other methods `GATE`.
 
     Args:
         method: one of `METHODS`.
         gate: the probability that a correct measurement passes.
     """
-    check_gate("gate", gate)
+    check_gate("filter", gate)
     if not isinstance(method, str) or method not in METHODS:
-        raise ValueError(f"associate: expected one of {', '.join(METHODS)}, got {method!r}")
+        reason = f"expected one of {', '.join(METHODS)}, got {method!r}"
+        raise InvalidField("filter", "associate", reason)
     if method == "known":
         return {} if gate is None else {"gate": gate}
     probability = GATE if gate is None else gate
@@ -433,9 +435,8 @@ class TableSettings:
             method = self._default("filter", "associate", "nearest" if unknown else "known")
         try:
             options |= association_options(method, gate)
-        except ValueError as problem:
-            key, _, reason = str(problem).partition(": ")
-            raise ValueError(f"{self._at('filter', key)}: {reason}") from problem
+        except InvalidField as problem:
+            raise ValueError(f"{self._at('filter', problem.field)}: {problem.reason}") from problem
         if gate is None:
             self.assumed.append(f"[filter] gate{': none' if method == 'known' else f' = {GATE}'}")
         return options

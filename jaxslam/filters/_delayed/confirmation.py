@@ -7,16 +7,16 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.core.slots import Joint
-from jaxslam.filters._delayed.delayed_settings import DelayedSettings
+from jaxslam.filters._delayed.delayed_filter import DelayedFilter
 from jaxslam.filters._delayed.hypotheses import point_residuals
 from jaxslam.filters._delayed.state import (
     SIZE,
     DelayedState,
     NewMeasurements,
     TableLayout,
+    add_to,
     covariance_rows,
     delete_slots_if_any,
-    increased,
     slots_where,
 )
 from jaxslam.math import _linalg as linalg
@@ -24,7 +24,7 @@ from jaxslam.math._xla import materialize
 
 
 def confirm_hypotheses(
-    settings: DelayedSettings,
+    filter: DelayedFilter,
     state: DelayedState,
     new: NewMeasurements,
     slot: Int[Array, "M"],
@@ -36,48 +36,45 @@ def confirm_hypotheses(
     confirms it, if that is within the gate.
 
     Args:
-        slot: of the measurements in the table.
+        slot: slots of the measurements in the table.
         stored: mask of the measurements in the table.
     Returns:
-        The state; which measurements are within the gate of a hypothesis; and which measurement
-        confirmed each hypothesis, -1 where none did.
+        The state; the mask of the measurements within the gate of a hypothesis; and the
+        measurement that confirmed each hypothesis, -1 for none.
     """
-    layout, joint = settings.layout, state.joint
+    layout, joint = filter.layout, state.joint
     alive, tag = joint.alive[layout.of_hypotheses], joint.tag[layout.of_hypotheses]
     compared = alive[:, None] & stored[None, :] & (tag[:, None] == new.tag[None, :])
-    found = point_residuals(joint, settings.triangulation, layout.hypothesis_slots, slot)
-    squared = jnp.where(compared, found.squared_distance(), jnp.inf)
-    within = squared <= settings.gamma
+    residuals = point_residuals(joint, filter.triangulation, layout.hypothesis_slots, slot)
+    squared = jnp.where(compared, residuals.squared_distance(), jnp.inf)
+    within = squared <= filter.gamma
     best = jnp.argmin(squared, axis=1)
-    every = jnp.arange(layout.hypotheses)
-    confirmed = within[every, best]
-    joint = correct_hypotheses(
+    c = jnp.arange(layout.hypotheses)
+    confirmed = within[c, best]
+    constraints = constraints_of(
         joint,
-        layout,
-        constraints_of(
-            joint,
-            layout.hypothesis_slots,
-            slot[best],
-            found.value[every, best],
-            found.by_point[every, best],
-            found.by_stored[every, best],
-        ),
-        confirmed,
+        layout.hypothesis_slots,
+        slot[best],
+        residuals.value[c, best],
+        residuals.by_point[c, best],
+        residuals.by_stored[c, best],
     )
+    joint = correct_hypotheses(joint, layout, constraints, confirmed)
 
     contradicted = compared.any(axis=1) & ~confirmed
     lost = jnp.where(
-        contradicted, jnp.asarray(settings.hypotheses.decay, state.persistence.dtype), 0.0
+        contradicted, jnp.asarray(filter.hypotheses.decay, state.persistence.dtype), 0.0
     )
     persistence = state.persistence + jnp.where(confirmed, 1.0, 0.0) - lost
     confirmed_at = jnp.where(confirmed, state.clock, state.confirmed_at)
-    stale = (state.clock - confirmed_at > settings.hypotheses.patience) & new.wanted.any()
+    # Without a new measurement a hypothesis had no chance to be confirmed.
+    stale = (state.clock - confirmed_at > filter.hypotheses.patience) & new.wanted.any()
     vanished = alive & ((persistence <= 0) | stale)
     state = state._replace(
         joint=joint,
         persistence=persistence,
         confirmed_at=confirmed_at,
-        counts=state.counts._replace(vanished=increased(state.counts.vanished, vanished)),
+        counts=state.counts._replace(vanished=add_to(state.counts.vanished, vanished)),
     )
     state = delete_slots_if_any(layout, state, slots_where(layout, hypotheses=vanished))
     return state, within.any(axis=0), jnp.where(confirmed & ~vanished, best, -1)
@@ -102,7 +99,7 @@ def constraints_of(
     by_point: Float[Array, "m 2"],
     by_stored: Float[Array, "m 3"],
 ) -> _Constraints:
-    """The constraints between the points in these slots and the stored measurements in those."""
+    """The constraints between m points and m stored measurements, by their slots."""
     by_point = jnp.pad(by_point, [(0, 0), (0, SIZE - 2)])
     rows = covariance_rows(joint)
     hp = jnp.einsum("mi,mid->md", by_point, rows[points])
@@ -114,9 +111,9 @@ def constraints_of(
 
 
 def correct_hypotheses(
-    joint: Joint, layout: TableLayout, constraints: _Constraints, which: Bool[Array, "C"]
+    joint: Joint, layout: TableLayout, constraints: _Constraints, confirmed: Bool[Array, "C"]
 ) -> Joint:
-    """The joint with each hypothesis corrected by its constraint, and nothing else changed.
+    """The joint with each confirmed hypothesis corrected by its constraint, and nothing else.
 
     g = 0 is a measurement without noise (the noise of the stored measurement is in P). A
     hypothesis may be false, so of the optimal gain K = P Hᵀ/S only the rows of the hypothesis are
@@ -125,20 +122,24 @@ def correct_hypotheses(
 
         x ← x - K g,  P ← P - K HP - (K HP)ᵀ + K S Kᵀ
 
-    and robot, landmarks and stored measurements keep theirs.
+    and the covariances of robot, landmarks and stored measurements do not change.
     """
-    count, own_rows = layout.hypotheses, layout.hypothesis_rows
+    count, hypothesis_rows = layout.hypotheses, layout.hypothesis_rows
     rows = SIZE * count
-    every = jnp.arange(count)
-    own_hp = constraints.hp[:, own_rows].reshape(count, count, SIZE)[every, every]
+    c = jnp.arange(count)
+    # Column block c of row c: the covariance of constraint c with hypothesis c, P Hᵀ.
+    ph = constraints.hp[:, hypothesis_rows].reshape(count, count, SIZE)[c, c]
     variance = jnp.diagonal(constraints.cov)
-    which = which & (variance > 0)
-    gain = jnp.where(which[:, None], own_hp / jnp.where(which, variance, 1.0)[:, None], 0.0)
+    used = confirmed & (variance > 0)
+    gain = jnp.where(used[:, None], ph / jnp.where(used, variance, 1.0)[:, None], 0.0)
     k_hp = (gain[:, :, None] * constraints.hp[:, None, :]).reshape(rows, -1)
+    # Axes (hypothesis, parameter, hypothesis, parameter).
     k_s_k = gain[:, :, None, None] * constraints.cov[:, None, :, None] * gain[None, None]
-    half = -k_hp.at[:, own_rows].add(-0.5 * k_s_k.reshape(rows, rows))
+    # Added to the rows and, transposed, to the columns: half of K S Kᵀ each.
+    half = -k_hp.at[:, hypothesis_rows].add(-0.5 * k_s_k.reshape(rows, rows))
+    # Stored before it is transposed; otherwise each entry would be computed twice.
     half = materialize(half)
     return joint._replace(
         landmarks=joint.landmarks.at[layout.of_hypotheses].add(-gain * constraints.value[:, None]),
-        cov=joint.cov.at[own_rows].add(half).at[:, own_rows].add(half.T),
+        cov=joint.cov.at[hypothesis_rows].add(half).at[:, hypothesis_rows].add(half.T),
     )

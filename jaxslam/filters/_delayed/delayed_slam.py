@@ -1,95 +1,40 @@
 """EKF-SLAM with delayed initialization of landmarks, from intersections of measurements."""
 
-import dataclasses
 from functools import partial
-from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.association._rules import Known
-from jaxslam.charts import Euclidean
-from jaxslam.core import _validation as validation
 from jaxslam.core import slots
-from jaxslam.core._record import hold_function, record, set_field, static
-from jaxslam.core.protocols import Associate, Association, Filter, Motion, Sensor
+from jaxslam.core._record import record
+from jaxslam.core.protocols import Association
 from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.filters._delayed.confirmation import confirm_hypotheses
-from jaxslam.filters._delayed.delayed_settings import (
-    DelayedSettings,
-    Hypotheses,
-    Promotion,
-    StoredMeasurements,
-)
+from jaxslam.filters._delayed.delayed_filter import DelayedFilter
 from jaxslam.filters._delayed.intersection import intersect_measurements
 from jaxslam.filters._delayed.promotion import Promoted, promote_hypotheses
 from jaxslam.filters._delayed.state import (
     SIZE,
     DelayedState,
     NewMeasurements,
-    TableLayout,
+    add_to,
     delete_slots_if_any,
     empty_state,
-    increased,
     is_newer,
     slots_where,
 )
-from jaxslam.filters._delayed.triangulation import Triangulation, triangulation_of
-from jaxslam.filters._ekf.ekf_settings import EkfSettings
-from jaxslam.filters._ekf.innovation import Correction
+from jaxslam.filters._ekf.correction import Correction, correct_in_turn
+from jaxslam.filters._ekf.ekf_slam import EkfSlam, associate_scan
 from jaxslam.filters._ekf.map_coordinates import estimate_of
-from jaxslam.filters._ekf.predict import propagate
-from jaxslam.filters._ekf.scan import associate_scan
-from jaxslam.filters._ekf.update import correct_in_turn
-from jaxslam.filters._reporting import info_of, seen_before, status_of
-from jaxslam.math._arrays import Number
+from jaxslam.filters._ekf.predicted_measurements import prediction_of
+from jaxslam.filters._reporting import info_of, status_of
 from jaxslam.math._xla import where_any
-from jaxslam.math.stats import chi2_quantile
-from jaxslam.sensors._suite import on_ground
-
-
-def _store_measurements(
-    settings: DelayedSettings, state: DelayedState, new: NewMeasurements
-) -> tuple[DelayedState, Int[Array, "M"], Bool[Array, "M"]]:
-    """The state with new measurements stored; their slots, and which were stored.
-
-    One is stored if the sensor is far enough from its positions at other measurements of the same
-    tag. Where the table is full the oldest are marginalized out.
-    """
-    layout, joint = settings.layout, state.joint
-    store = partial(settings.triangulation.store, settings.sensor)
-    values = jax.vmap(store, (None, 0))(joint.pose, new.z)
-    by_pose, by_z = jax.vmap(jax.jacfwd(store, argnums=(0, 1)), (None, 0))(joint.pose, new.z)
-    alive, tag = joint.alive[layout.of_stored], joint.tag[layout.of_stored]
-    offset = values[:, None, :2] - joint.landmarks[None, layout.of_stored, :2]
-    close = ((offset**2).sum(axis=2) < settings.stored.spacing**2) & alive[None]
-    wanted = new.wanted & ~(close & (new.tag[:, None] == tag[None])).any(axis=1)
-
-    needed = wanted.sum() - (~alive).sum()
-    age = jnp.where(alive, state.taken_at, state.clock + 1)
-    evicted = alive & (is_newer(age).sum(axis=0) < needed)
-    state = delete_slots_if_any(layout, state, slots_where(layout, stored=evicted))
-
-    joint = state.joint
-    place, stored = slots.allocate(joint.alive[layout.of_stored], wanted)
-    noise_cov = jax.vmap(settings.sensor.noise_cov)(new.z)
-    own_cov = jnp.einsum("mij,mjk,mlk->mil", by_z, noise_cov, by_z)
-    slot = layout.first_stored + place
-    joint = slots.scatter(joint, slot, stored, values, by_pose, own_cov, new.tag)
-    at = jnp.where(stored, place, layout.stored)  # beyond the end: dropped
-    state = state._replace(
-        joint=joint,
-        taken_at=state.taken_at.at[at].set(state.clock, mode="drop"),
-        noise_var=state.noise_var.at[at].set(own_cov[:, 2, 2], mode="drop"),
-        counts=state.counts._replace(evicted=increased(state.counts.evicted, evicted)),
-    )
-    return state, slot, stored
 
 
 @record
-class DelayedSlam(Filter):
+class DelayedSlam(DelayedFilter):
     """EKF-SLAM with bearings only or ranges only, and delayed initialization of landmarks.
 
     After Costa, Kantor & Choset, "Bearing-only landmark initialization with unknown data
@@ -122,83 +67,37 @@ class DelayedSlam(Filter):
     or a sensor that does not fit.
     """
 
-    motion: Motion
-    sensor: Sensor
-    """of one bearing or one range of points"""
-    capacity: int = static()
-    """landmarks N"""
-    _: dataclasses.KW_ONLY
-    triangulation: Triangulation | None = None
-    """how stored measurements intersect; default the intersection of rays or of circles,
-    by what the sensor measures"""
-    stored: StoredMeasurements = StoredMeasurements()
-    hypotheses: Hypotheses = Hypotheses()
-    promotion: Promotion = Promotion()
-    gate: Number | None = None
-    """the probability that a correct comparison passes, by γ = χ²(1, gate); default 0.99"""
-    associate: Associate = Known()
-    """with `Known` only measurements of one tag intersect. With any other method, the measurements
-    it declares new intersect all others, and tags only name the landmarks"""
-    chart = Euclidean()
-
-    def __post_init__(self) -> None:
-        name, sensor = type(self).__name__, self.sensor
-        validation.check_models(name, self.motion, sensor)
-        validation.check_parts(name, associate=self.associate)
-        hold_function(self, "associate", "prediction, scan")
-        if len(sensor.measurements) != 1 or not sensor.of_points:
-            raise ValueError(
-                f"{name}: expected a sensor of one bearing or one range of points (x, y), got "
-                f"{sensor.name} with {sensor.measurements} of {sensor.landmark}"
-            )
-        validation.check_count(f"{name}: capacity", self.capacity)
-        validation.check_gate(name, self.gate)
-        triangulation = self.triangulation or triangulation_of(sensor)
-        set_field(self, "triangulation", triangulation)
-        kinds = {
-            "triangulation": Triangulation,
-            "stored": StoredMeasurements,
-            "hypotheses": Hypotheses,
-            "promotion": Promotion,
-        }
-        for field, kind in kinds.items():
-            validation.check_record(name, field, getattr(self, field), kind)
-        if sensor.measurements != (triangulation.measurement,):
-            raise ValueError(
-                f"{name}: expected a sensor of one {triangulation.measurement}, got "
-                f"{sensor.name} with {sensor.measurements}"
-            )
-        super().__post_init__()
-
     def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> DelayedState:
-        return empty_state(self._settings.layout, pose, pose_cov)
+        return empty_state(self.layout, pose, pose_cov)
 
     def predict(self, state: DelayedState, u: Float[Array, "U"], key: Array) -> DelayedState:
-        settings = _ekf_settings(self._settings)
-        return state._replace(joint=propagate(state.joint, u, self.motion, settings)[0])
+        return state._replace(joint=self._ekf.predict(state.joint, u, key))
 
     def update(self, state: DelayedState, scan: Scan, key: Array) -> tuple[DelayedState, Info]:
-        settings = self._settings
         # Padding may hold any number, and is multiplied by zero below.
         scan = scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
         state = state._replace(clock=state.clock + 1)
-        found, matched = _associate(settings, state, scan)
-        state, correction = _correct(settings, state, scan, found, matched)
-        new = _new_measurements(settings, scan, found)
+        association, matched = _associate(self, state, scan)
+        state, correction = _correct(self, state, scan, association, matched)
+        new = _new_measurements(self, scan, association)
 
-        def initialize(state: DelayedState) -> tuple[DelayedState, _Outcome]:
-            state, slot, stored = _store_measurements(settings, state, new)
-            state, explained, by = confirm_hypotheses(settings, state, new, slot, stored)
-            state = intersect_measurements(settings, state, new, slot, stored & ~explained)
-            state, promoted = promote_hypotheses(settings, state, new, by)
-            return state, _Outcome(stored, promoted)
+        def initialize(
+            state: DelayedState,
+        ) -> tuple[DelayedState, tuple[Bool[Array, "M"], Promoted]]:
+            # Only a measurement that no hypothesis explains may form one.
+            state, slot, stored = _store_measurements(self, state, new)
+            state, explained, confirmed_by = confirm_hypotheses(self, state, new, slot, stored)
+            state = intersect_measurements(self, state, new, slot, stored & ~explained)
+            state, promoted = promote_hypotheses(self, state, new, confirmed_by)
+            return state, (stored, promoted)
 
-        def leave(state: DelayedState) -> tuple[DelayedState, _Outcome]:
-            return state, _Outcome(jnp.zeros_like(new.is_new), Promoted.none(new))
+        def leave(state: DelayedState) -> tuple[DelayedState, tuple[Bool[Array, "M"], Promoted]]:
+            return state, (jnp.zeros_like(new.is_new), Promoted.none(new))
 
+        # The steps take an argmin over the measurements, of which there must be one.
         steps = initialize if len(scan.tag) > 0 else leave
-        state, outcome = where_any(new.wanted.any(), steps, leave, state)
-        return state, _report(scan, found, matched, correction, new, outcome)
+        state, (stored, promoted) = where_any(new.wanted.any(), steps, leave, state)
+        return state, _report(scan, association, matched, correction, new, stored, promoted)
 
     def estimate(self, state: DelayedState) -> Estimate:
         joint, capacity, size = state.joint, self.capacity, 3 + SIZE * self.capacity
@@ -208,83 +107,112 @@ class DelayedSlam(Filter):
             alive=joint.alive[:capacity],
             tag=joint.tag[:capacity],
         )
-        return estimate_of(landmarks, self._settings.sensor, self.chart)
+        return estimate_of(landmarks, self.sensor_of_table, self.chart)
 
     @property
-    def _settings(self) -> DelayedSettings:
-        capacities = self.hypotheses.capacity, self.stored.capacity
-        gate = 0.99 if self.gate is None else self.gate
-        assert self.triangulation is not None
-        return DelayedSettings(
-            sensor=on_ground(self.sensor, SIZE),
-            triangulation=self.triangulation,
-            layout=TableLayout(self.capacity, *capacities),
+    def _ekf(self) -> EkfSlam:
+        """The EKF-SLAM by which landmarks of the map are associated and corrected."""
+        return EkfSlam(
+            self.motion,
+            self.sensor,
+            self.capacity,
             associate=self.associate,
-            by_tag=isinstance(self.associate, Known),
-            gate=gate,
-            gamma=chi2_quantile(gate, 1),
-            stored=self.stored,
-            hypotheses=self.hypotheses,
-            promotion=self.promotion,
+            gate=self.probability,
         )
 
 
-class _Outcome(NamedTuple):
-    """The outcome of the new measurements of a scan."""
-
-    stored: Bool[Array, "M"]
-    promoted: Promoted
-
-
-def _ekf_settings(settings: DelayedSettings) -> EkfSettings:
-    """The settings of `EkfSlam`, by which landmarks of the map are associated and corrected."""
-    return EkfSettings(sensor=settings.sensor, associate=settings.associate, gate=settings.gate)
-
-
 def _associate(
-    settings: DelayedSettings, state: DelayedState, scan: Scan
+    filter: DelayedSlam, state: DelayedState, scan: Scan
 ) -> tuple[Association, Bool[Array, "M"]]:
-    """The landmark slot of each measurement, and which measurements have one.
+    """The landmark slot of each measurement, and the mask of the measurements that have one.
 
     Hypotheses and stored measurements are not landmarks.
     """
-    joint = state.joint
-    landmarks = joint.alive & (jnp.arange(settings.layout.slots) < settings.layout.landmarks)
-    return associate_scan(joint._replace(alive=landmarks), scan, _ekf_settings(settings))
+    is_landmark = jnp.arange(filter.layout.slots) < filter.capacity
+    landmarks = state.joint._replace(alive=state.joint.alive & is_landmark)
+    ekf, sensor = filter._ekf, filter.sensor_of_table
+    return associate_scan(
+        filter.associate, sensor, scan, lambda: prediction_of(ekf, sensor, landmarks)
+    )
 
 
 def _correct(
-    settings: DelayedSettings,
+    filter: DelayedSlam,
     state: DelayedState,
     scan: Scan,
-    found: Association,
+    association: Association,
     matched: Bool[Array, "M"],
 ) -> tuple[DelayedState, Correction]:
     """The state corrected by the measurements of landmarks of the map that are within the gate."""
-    slot = jnp.maximum(found.slot, 0)
-    joint, correction = correct_in_turn(state.joint, scan.z, slot, matched, _ekf_settings(settings))
+    slot = jnp.maximum(association.slot, 0)
+    joint, correction = correct_in_turn(
+        filter._ekf, filter.sensor_of_table, state.joint, scan.z, slot, matched
+    )
     return state._replace(joint=joint), correction
 
 
-def _new_measurements(settings: DelayedSettings, scan: Scan, found: Association) -> NewMeasurements:
+def _new_measurements(
+    filter: DelayedFilter, scan: Scan, association: Association
+) -> NewMeasurements:
     """The measurements of a scan that association declares new."""
-    is_new = scan.valid & found.is_new
-    if settings.by_tag:
-        return NewMeasurements(scan.z, scan.tag, scan.tag, is_new, seen_before(scan.tag, is_new))
+    is_new = scan.valid & association.is_new
+    if filter.by_tag:
+        return NewMeasurements(
+            scan.z, scan.tag, scan.tag, is_new, slots.seen_before(scan.tag, is_new)
+        )
     unknown = jnp.full_like(scan.tag, -1)
     return NewMeasurements(scan.z, unknown, scan.tag, is_new, jnp.zeros_like(is_new))
 
 
+def _store_measurements(
+    filter: DelayedFilter, state: DelayedState, new: NewMeasurements
+) -> tuple[DelayedState, Int[Array, "M"], Bool[Array, "M"]]:
+    """The state with new measurements stored, their slots, and the mask of those stored.
+
+    A measurement is stored if the sensor is far enough from its positions at the stored
+    measurements of the same tag. In a full table the oldest are marginalized out.
+    """
+    layout, joint = filter.layout, state.joint
+    store = partial(filter.triangulation.store, filter.sensor_of_table)
+    values = jax.vmap(store, (None, 0))(joint.pose, new.z)
+    by_pose, by_z = jax.vmap(jax.jacfwd(store, argnums=(0, 1)), (None, 0))(joint.pose, new.z)
+    alive, tag = joint.alive[layout.of_stored], joint.tag[layout.of_stored]
+    offset = values[:, None, :2] - joint.landmarks[None, layout.of_stored, :2]
+    close = ((offset**2).sum(axis=2) < filter.stored.spacing**2) & alive[None]
+    wanted = new.wanted & ~(close & (new.tag[:, None] == tag[None])).any(axis=1)
+
+    needed = wanted.sum() - (~alive).sum()
+    # The sum of a column of `is_newer` is the rank from the oldest; a free slot counts as newest.
+    age = jnp.where(alive, state.taken_at, state.clock + 1)
+    evicted = alive & (is_newer(age).sum(axis=0) < needed)
+    state = delete_slots_if_any(layout, state, slots_where(layout, stored=evicted))
+
+    joint = state.joint
+    place, stored = slots.allocate(joint.alive[layout.of_stored], wanted)
+    noise_cov = jax.vmap(filter.sensor_of_table.noise_cov)(new.z)
+    stored_cov = jnp.einsum("mij,mjk,mlk->mil", by_z, noise_cov, by_z)
+    slot = layout.first_stored + place
+    joint = slots.scatter(joint, slot, stored, values, by_pose, stored_cov, new.tag)
+    at = jnp.where(stored, place, layout.stored)  # beyond the end: dropped
+    state = state._replace(
+        joint=joint,
+        taken_at=state.taken_at.at[at].set(state.clock, mode="drop"),
+        noise_var=state.noise_var.at[at].set(stored_cov[:, 2, 2], mode="drop"),
+        counts=state.counts._replace(evicted=add_to(state.counts.evicted, evicted)),
+    )
+    return state, slot, stored
+
+
 def _report(
     scan: Scan,
-    found: Association,
+    association: Association,
     matched: Bool[Array, "M"],
     correction: Correction,
     new: NewMeasurements,
-    outcome: _Outcome,
+    stored: Bool[Array, "M"],
+    promoted: Promoted,
 ) -> Info:
     """The `Info` of a scan: what became of each of its measurements."""
-    slot, refused = outcome.promoted
     status = status_of(
         scan.valid,
         matched=matched,
@@ -292,19 +220,19 @@ def _report(
         inside=correction.inside,
         new=new.is_new,
         repeated=new.repeated,
-        granted=slot >= 0,
-        deferred=new.wanted & ~outcome.stored & ~refused,
-        stored=outcome.stored & ~refused,
+        granted=promoted.slot >= 0,
+        deferred=new.wanted & ~stored & ~promoted.refused,
+        stored=stored & ~promoted.refused,
     )
     return info_of(
         status,
         matched,
         size=1,
-        slot=found.slot,
-        born=slot,
+        slot=association.slot,
+        born=promoted.slot,
         nis=correction.nis,
         innovation=correction.innovation,
         innovation_cov=correction.innovation_cov,
         log_likelihood=correction.log_likelihood.sum(),
-        exhausted=jnp.asarray(found.exhausted),
+        exhausted=jnp.asarray(association.exhausted),
     )

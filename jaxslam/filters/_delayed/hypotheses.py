@@ -8,7 +8,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.core.slots import Joint
-from jaxslam.filters._delayed.delayed_settings import Distance
+from jaxslam.filters._delayed.delayed_filter import Distance
 from jaxslam.filters._delayed.state import SIZE, TableLayout, covariance_blocks
 from jaxslam.filters._delayed.triangulation import Triangulation
 from jaxslam.math import uncertain_poses
@@ -28,7 +28,7 @@ class _PointResiduals(NamedTuple):
     value: Float[Array, "p q"]
     """g at the estimate; its true value is 0 for the same landmark [rad or m]"""
     variance: Float[Array, "p q"]
-    """of g, with the correlation of the two"""
+    """var(g), with the correlation of x and s"""
     by_point: Float[Array, "p q 2"]
     """∂g/∂x"""
     by_stored: Float[Array, "p q 3"]
@@ -44,7 +44,7 @@ class _PointResiduals(NamedTuple):
 def point_residuals(
     joint: Joint, triangulation: Triangulation, points: Int[Array, "p"], stored: Int[Array, "q"]
 ) -> _PointResiduals:
-    """The residuals of the points in these slots against the stored measurements in those.
+    """The residuals of p points against q stored measurements, by their slots.
 
     With the Jacobians G_x, G_s: var(g) = G_x P_xx G_xᵀ + G_s P_ss G_sᵀ + 2 G_x P_xs G_sᵀ.
     """
@@ -54,7 +54,7 @@ def point_residuals(
     x, s = joint.landmarks[points, :2], joint.landmarks[stored]
     value, (by_point, by_stored) = of_pairs(s, x), jacobians(s, x)
     blocks = covariance_blocks(joint)
-    rows = blocks[points][:, :2]
+    rows = blocks[points][:, :2]  # (p, 2, S, 3)
     p_xx, p_xs = rows[jnp.arange(points.shape[0]), :, points, :2], rows[:, :, stored]
     p_ss = blocks[stored, :, stored]
     variance = jnp.einsum("pqi,pij,pqj->pq", by_point, p_xx, by_point)
@@ -95,24 +95,24 @@ def relative_spread(points: UncertainPoints) -> Float[Array, "*n"]:
 def closer_than(
     distance: Distance, limit: Number, points: UncertainPoints, others: UncertainPoints
 ) -> Bool[Array, "p q"]:
-    """Whether the distance of each of p points from each of q others is below a limit.
+    """Mask of the pairs of p points and q other ones whose distance is below a limit.
 
-    By `mahalanobis_squared` (of independent points) or `bhattacharyya` of `uncertain_poses`; never
-    where a covariance is singular.
+    The distance is `mahalanobis_squared` (of independent points) or `bhattacharyya` of
+    `uncertain_poses`; False where a covariance is singular.
     """
     measure = _DISTANCES[distance]
 
     def frame(point: UncertainPoints) -> Frame:
-        # Points as frames with equal headings and heading variances.
+        # Points as frames with equal headings and heading variances, which add nothing.
         inert = jnp.pad(point.cov, [(0, 1), (0, 1)]).at[2, 2].set(1.0)
         return Frame(jnp.pad(point.mean, [(0, 1)]), inert)
 
-    def one(point: UncertainPoints, other: UncertainPoints) -> Bool[Array, ""]:
-        how_far, regular = measure(frame(point), frame(other))
-        return regular & (how_far < limit)
+    def is_close(a: UncertainPoints, b: UncertainPoints) -> Bool[Array, ""]:
+        value, regular = measure(frame(a), frame(b))
+        return regular & (value < limit)
 
-    out: Array = jax.vmap(jax.vmap(one, (None, 0)), (0, None))(points, others)
-    return materialize(out)
+    close: Array = jax.vmap(jax.vmap(is_close, (None, 0)), (0, None))(points, others)
+    return materialize(close)
 
 
 def safe_root(square: Float[Array, "*n"]) -> Float[Array, "*n"]:

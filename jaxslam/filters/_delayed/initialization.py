@@ -15,7 +15,7 @@ from jaxslam.math import _linalg as linalg
 from jaxslam.math._xla import materialize
 from jaxslam.math.angles import wrap
 
-# The number of Gauss-Newton steps; the hypothesis is a good initial value.
+# The number of Gauss-Newton steps: few, because the hypothesis is a good initial value.
 _STEPS = 4
 
 
@@ -33,12 +33,12 @@ class InitialEstimate(NamedTuple):
     minus_r_inv: Float[Array, "2 2"]
     """-R⁻¹"""
     nis: Float[Array, ""]
-    """residual of the measurements: chi-square with m - 2 degrees of freedom"""
+    """squared residual of the measurements: chi-square with m - 2 degrees of freedom"""
     spread: Float[Array, ""]
-    """the largest standard deviation of the point, relative to the position of the first
-    measurement, over their distance"""
+    """largest standard deviation of the point relative to the position of the first measurement,
+    over their distance"""
     regular: Bool[Array, ""]
-    """the measurements determine it"""
+    """the measurements determine the point"""
 
 
 def initial_estimate(
@@ -58,16 +58,16 @@ def initial_estimate(
     - the first two, R δx = -(e₁ + G₁ δs), give the landmark: P_x· = -R⁻¹ G₁ P_s·, P_xx = (RᵀR)⁻¹;
     - the others, in which x does not occur, measure e₂ = -G₂ δs, and correct the whole map.
 
-    So each measurement is used once, and no prior of the landmark is needed. (The same is done with
-    feature tracks by A. I. Mourikis, S. I. Roumeliotis, "A multi-state constraint Kalman filter for
-    vision-aided inertial navigation", ICRA 2007, who keep the second part alone.) A hypothesis only
-    groups the measurements: it was corrected by them in turn, each linearized at another point, and
-    these inconsistent Jacobians would give the robot spurious information.
+    So each measurement is used once, and no prior of the landmark is needed. (A. I. Mourikis, S. I.
+    Roumeliotis, "A multi-state constraint Kalman filter for vision-aided inertial navigation", ICRA
+    2007, treat feature tracks in this way, and keep only the second part.) A hypothesis only groups
+    the measurements: it was corrected by them in turn, each linearized at another point, and these
+    inconsistent Jacobians would give the robot spurious information.
 
     Args:
-        start: where Gauss-Newton begins.
-        stored: the slots of the measurements, those to use first.
-        use: which to use.
+        start: initial value of Gauss-Newton.
+        stored: slots of the measurements, those to use first.
+        use: mask of the measurements to use.
     """
     m = len(stored)
     s = joint.landmarks[stored]
@@ -101,9 +101,9 @@ def initial_estimate(
     none = zeros[:, 0], zeros[:, :SIZE], zeros[:, :2], zeros[:, 6:], jnp.asarray(True)
     _, point, terms = jax.lax.scan(gauss_newton, (start, start, none), None, length=_STEPS + 1)[0]
     value, by_stored, by_point, inverse_root, positive = terms
-    q = materialize(_triangularizing(by_point))
+    q = materialize(_reflections(by_point))
     r, value, transform = (q @ by_point)[:2], q @ value, q @ inverse_root
-    # A product of m terms leaves m eps of a pivot of 0, as of parallel rays.
+    # A product of m terms leaves m eps of a pivot of 0, as of parallel rays; 8 is a margin.
     least = 8 * m * float(jnp.finfo(r.dtype).eps) * (r**2).sum()
     regular = (use.sum() >= 2) & (jnp.abs(r[0, 0] * r[1, 1]) > least)
     safe = jnp.where(regular, r, jnp.eye(2, dtype=r.dtype))
@@ -132,38 +132,40 @@ def add_landmark(
     """The joint with the landmark in a dead slot, corrected by its redundant measurements.
 
     Args:
-        estimate: as of `initial_estimate`, of the measurements in the slots `stored`.
+        estimate: the `initial_estimate` from the measurements in the slots `stored`.
     """
     capacity = joint.landmarks.shape[0]
     rows = covariance_rows(joint)[stored]
     hp = materialize(estimate.transform @ jnp.einsum("mi,mid->md", estimate.by_stored, rows))
-    mine = 3 + SIZE * slot + jnp.arange(2)
+    landmark_rows = 3 + SIZE * slot + jnp.arange(2)
+    # Added to rows and, transposed, to columns: half of P_xx each.
     half_cov = 0.5 * estimate.minus_r_inv @ estimate.minus_r_inv.T
-    half = (estimate.minus_r_inv @ hp[:2]).at[:, mine].add(half_cov)
+    half = (estimate.minus_r_inv @ hp[:2]).at[:, landmark_rows].add(half_cov)
     # Padding's unit variance goes first, to an exact zero.
-    cov = joint.cov.at[mine, mine].add(-1.0)
-    cov = cov.at[mine].add(half).at[:, mine].add(half.T)
-    # Unit covariance, uncorrelated with the landmark: S = I.
+    cov = joint.cov.at[landmark_rows, landmark_rows].add(-1.0)
+    cov = cov.at[landmark_rows].add(half).at[:, landmark_rows].add(half.T)
+    # The redundant rows have unit covariance, uncorrelated with the landmark: S = I.
     v, value = hp[2:], estimate.value[2:]
     moved = -linalg.gram(v, value[:, None])[:, 0]
     pose = joint.pose + moved[:3]
-    here = (jnp.arange(capacity) == slot)[:, None]
-    placed = jnp.where(here, jnp.pad(estimate.point, [(0, SIZE - 2)])[None], joint.landmarks)
+    is_slot = (jnp.arange(capacity) == slot)[:, None]
+    placed = jnp.where(is_slot, jnp.pad(estimate.point, [(0, SIZE - 2)])[None], joint.landmarks)
     return joint._replace(
         pose=jnp.concatenate([pose[:2], wrap(pose[2:])]),
         landmarks=placed + moved[3:].reshape(capacity, SIZE),
         cov=cov - linalg.gram(v, v),
-        alive=joint.alive | here[:, 0],
+        alive=joint.alive | is_slot[:, 0],
     )
 
 
-def _triangularizing(matrix: Float[Array, "m 2"]) -> Float[Array, "m m"]:
-    """Orthogonal Qᵀ, two Householder reflections, with Qᵀ A upper triangular; zero rows stay."""
+def _reflections(matrix: Float[Array, "m 2"]) -> Float[Array, "m m"]:
+    """The orthogonal Qᵀ, two Householder reflections, with Qᵀ A upper triangular; a zero row of A
+    stays zero."""
     m = matrix.shape[0]
     q = jnp.eye(m, dtype=matrix.dtype)
     for k in range(2):
         column = jnp.where(jnp.arange(m) >= k, (q @ matrix)[:, k], 0.0)
-        sign = jnp.where(column[k] >= 0, 1.0, -1.0)
+        sign = jnp.where(column[k] >= 0, 1.0, -1.0)  # no cancellation in the axis
         axis = column.at[k].add(sign * safe_root((column**2).sum()))
         square = (axis**2).sum()
         scale = jnp.where(square > 0, 2 / jnp.where(square > 0, square, 1.0), 0.0)

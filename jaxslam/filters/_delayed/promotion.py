@@ -3,7 +3,7 @@
 For the most persistent hypothesis that this scan confirmed, at most `per_scan` times:
 
 1. `_candidate`: it is persistent enough, more so than its alternatives, and its spread is small;
-2. `_measurements_of`: its stored measurements; `_outermost`: up to eight of them;
+2. `_measurements_of`: its stored measurements; `_outer_measurements`: up to eight of them;
 3. `_locate`: the maximum-likelihood position, and a decision: accept it, wait, or refuse it;
 4. `add_landmark` where accepted; its stored measurements and excluded hypotheses are deleted.
 """
@@ -16,7 +16,7 @@ import numpy as np
 from jax import Array
 from jaxtyping import Bool, Int, PyTree
 
-from jaxslam.filters._delayed.delayed_settings import DelayedSettings
+from jaxslam.filters._delayed.delayed_filter import DelayedFilter
 from jaxslam.filters._delayed.hypotheses import (
     closer_than,
     point_residuals,
@@ -27,22 +27,23 @@ from jaxslam.filters._delayed.initialization import InitialEstimate, add_landmar
 from jaxslam.filters._delayed.state import (
     DelayedState,
     NewMeasurements,
+    add_to,
     delete_slots,
-    increased,
     is_newer,
     slots_where,
 )
 from jaxslam.math._xla import materialize, where_any
 from jaxslam.math.stats import chi2_quantiles
 
-# The largest number of stored measurements of a landmark: two locate it, and the matrix of the
-# others is small enough for the unrolled factors of `linalg`.
+# The largest number of stored measurements of a landmark: two locate it, and the covariance of the
+# rest is small enough for the unrolled factors of `linalg`.
 _USED = 8
 
 # The significance level of the chi-square test that refuses a landmark.
 _UNLIKELY = 1e-3
 
-# The least difference of -2 log likelihood between a landmark's position and its mirror solution.
+# The least difference of -2 log likelihood between a landmark's position and its mirror solution:
+# that of 3 σ.
 _AMBIGUOUS = 9.0
 
 # Two estimates so close to each other, relative to the distance, are the same position.
@@ -50,12 +51,12 @@ _ONE_PLACE = 0.02
 
 
 class Promoted(NamedTuple):
-    """The outcome of the hypotheses that the measurements of a scan confirmed last."""
+    """The outcome of the measurements of a scan that confirmed a hypothesis last."""
 
     slot: Int[Array, "M"]
-    """of the landmark that one of them became, or -1"""
+    """slot of the landmark that was created; -1 if none"""
     refused: Bool[Array, "M"]
-    """one was ready, and the map is full"""
+    """a hypothesis was ready, and the map is full"""
 
     @classmethod
     def none(cls, new: NewMeasurements) -> Self:
@@ -63,59 +64,55 @@ class Promoted(NamedTuple):
         return cls(jnp.full(len(new.tag), -1, jnp.int32), jnp.zeros_like(new.is_new))
 
 
-class _Decision(NamedTuple):
-    """The decision on a hypothesis; if neither holds, its measurements contradict each other."""
-
-    accepted: Bool[Array, ""]
-    """it becomes a landmark"""
-    undecided: Bool[Array, ""]
-    """its covariance is still too large, or another position fits nearly as well"""
-
-
 def promote_hypotheses(
-    settings: DelayedSettings,
+    filter: DelayedFilter,
     state: DelayedState,
     new: NewMeasurements,
     confirmed_by: Int[Array, "C"],
 ) -> tuple[DelayedState, Promoted]:
     """The state with the most persistent confirmed hypotheses promoted, waiting, or deleted.
 
-    confirmed_by: the measurement that confirmed each, or -1.
+    confirmed_by: the measurement that confirmed each hypothesis, or -1.
     """
     measurements = jnp.arange(len(new.tag))
 
-    def once(carry: PyTree, _: None) -> tuple[PyTree, None]:
-        state, confirmed_by, finished = carry
-        ready, chosen = _candidate(settings, state, confirmed_by)
-        free = ~state.joint.alive[settings.layout.of_landmarks]
+    def promote_next(carry: PyTree, _: None) -> tuple[PyTree, None]:
+        state, confirmed_by, promoted = carry
+        ready, chosen = _candidate(filter, state, confirmed_by)
+        free = ~state.joint.alive[filter.layout.of_landmarks]
         room, slot = free.any(), jnp.argmax(free)
         by = jnp.where(ready, confirmed_by[chosen], -1)
         before = state.counts.promoted
-        go = ready & room
+        tried = ready & room
         state = where_any(
-            go, lambda s: _promote(settings, s, chosen, slot, new.name[by], go), lambda s: s, state
+            tried,
+            lambda s: _promote(filter, s, chosen, slot, new.landmark_tag[by], tried),
+            lambda s: s,
+            state,
         )
-        # Each is considered once a scan.
-        considered = ready & (jnp.arange(len(confirmed_by)) == chosen)
-        gone = ~state.joint.alive[settings.layout.of_hypotheses]
-        here = measurements == by
-        succeeded = go & (state.counts.promoted > before)
-        finished = Promoted(
-            jnp.where(here & succeeded, slot, finished.slot).astype(jnp.int32),
-            finished.refused | (here & ~room),
+        # A hypothesis is tried once a scan, and not after it was deleted.
+        done = ready & (jnp.arange(len(confirmed_by)) == chosen)
+        done = done | ~state.joint.alive[filter.layout.of_hypotheses]
+        is_last = measurements == by
+        succeeded = tried & (state.counts.promoted > before)
+        promoted = Promoted(
+            jnp.where(is_last & succeeded, slot, promoted.slot).astype(jnp.int32),
+            promoted.refused | (is_last & ~room),
         )
-        return (state, jnp.where(considered | gone, -1, confirmed_by), finished), None
+        return (state, jnp.where(done, -1, confirmed_by), promoted), None
 
     start = state, confirmed_by, Promoted.none(new)
-    (state, _, promoted), _ = jax.lax.scan(once, start, None, length=settings.promotion.per_scan)
+    (state, _, promoted), _ = jax.lax.scan(
+        promote_next, start, None, length=filter.promotion.per_scan
+    )
     return state, promoted._replace(refused=promoted.refused & (promoted.slot < 0))
 
 
 def _candidate(
-    settings: DelayedSettings, state: DelayedState, confirmed_by: Int[Array, "C"]
+    filter: DelayedFilter, state: DelayedState, confirmed_by: Int[Array, "C"]
 ) -> tuple[Bool[Array, ""], Int[Array, ""]]:
-    """Whether a confirmed hypothesis may be promoted, and which: the most persistent one."""
-    layout, promotion, level = settings.layout, settings.promotion, state.persistence
+    """Whether a confirmed hypothesis may be promoted, and the most persistent such hypothesis."""
+    layout, promotion, level = filter.layout, filter.promotion, state.persistence
     alive = state.joint.alive[layout.of_hypotheses]
     excluding = (state.group[:, None] == state.group[None, :]) & alive[None, :]
     excluding = excluding & ~jnp.eye(layout.hypotheses, dtype=bool)
@@ -126,85 +123,92 @@ def _candidate(
 
 
 def _promote(
-    settings: DelayedSettings,
+    filter: DelayedFilter,
     state: DelayedState,
     chosen: Int[Array, ""],
     slot: Int[Array, ""],
-    name: Int[Array, ""],
-    go: Bool[Array, ""],
+    tag: Int[Array, ""],
+    tried: Bool[Array, ""],
 ) -> DelayedState:
-    """The state after the decision on a hypothesis; exactly as before where not `go`.
+    """The state after the decision on a hypothesis; exactly as before where it is not tried.
 
-    slot, name: of the landmark that it may become.
+    slot, tag: of the landmark that it may become.
     """
-    layout, joint = settings.layout, state.joint
-    same_tag, stored = _measurements_of(settings, state, chosen)
-    used, use = _outermost(settings, state, stored)
-    estimate, decision = _locate(settings, state, chosen, used, use)
+    layout, joint = filter.layout, state.joint
+    same_tag, stored = _measurements_of(filter, state, chosen)
+    used, use = _outer_measurements(filter, state, stored)
+    estimate, accepted, undecided = _locate(filter, state, chosen, used, use)
     # In a batch, the runs without a promotion stay exactly as they are.
-    accepted, undecided = materialize(_Decision(decision.accepted & go, decision.undecided | ~go))
+    accepted, undecided = materialize((accepted & tried, undecided | ~tried))
 
     with_landmark = add_landmark(joint, estimate, slot, used)
     joint = jax.tree.map(lambda a, b: jnp.where(accepted, a, b), with_landmark, joint)
-    here = accepted & (jnp.arange(layout.slots) == slot)
-    joint = joint._replace(tag=jnp.where(here, name, joint.tag).astype(jnp.int32))
+    is_slot = accepted & (jnp.arange(layout.slots) == slot)
+    joint = joint._replace(tag=jnp.where(is_slot, tag, joint.tag).astype(jnp.int32))
     state = state._replace(joint=joint)
 
-    used_up = accepted & (same_tag if settings.by_tag else stored)
+    used_up = accepted & (same_tag if filter.by_tag else stored)
     itself = jnp.arange(layout.hypotheses) == chosen
-    rivals = _rivals(settings, state, chosen, slots_where(layout, stored=used_up))
+    rivals = _rivals(filter, state, chosen, slots_where(layout, stored=used_up))
     rivals = rivals & joint.alive[layout.of_hypotheses] & ~itself & accepted
     counts = state.counts._replace(
-        rivals=increased(state.counts.rivals, rivals),
-        promoted=increased(state.counts.promoted, accepted),
-        refuted=increased(state.counts.refuted, ~accepted & ~undecided),
+        rivals=add_to(state.counts.rivals, rivals),
+        promoted=add_to(state.counts.promoted, accepted),
+        refuted=add_to(state.counts.refuted, ~accepted & ~undecided),
     )
     dead = slots_where(layout, hypotheses=(rivals | itself) & ~undecided, stored=used_up)
     return delete_slots(layout, state._replace(counts=counts), dead)
 
 
 def _measurements_of(
-    settings: DelayedSettings, state: DelayedState, chosen: Int[Array, ""]
+    filter: DelayedFilter, state: DelayedState, chosen: Int[Array, ""]
 ) -> tuple[Bool[Array, "W"], Bool[Array, "W"]]:
-    """The stored measurements with the tag of a hypothesis, and which of them it explains."""
-    layout, joint = settings.layout, state.joint
+    """Masks of the stored measurements with the tag of a hypothesis, and of those it explains."""
+    layout, joint = filter.layout, state.joint
     hypothesis = layout.landmarks + chosen
     same_tag = joint.alive[layout.of_stored]
     same_tag = same_tag & (joint.tag[layout.of_stored] == joint.tag[hypothesis])
-    found = point_residuals(joint, settings.triangulation, hypothesis[None], layout.stored_slots)
+    residuals = point_residuals(joint, filter.triangulation, hypothesis[None], layout.stored_slots)
     # After the correction by its measurements g has almost no variance: that of the noise is
     # added, for rounding and curvature.
-    variance = found.variance[0] + state.noise_var
-    return same_tag, same_tag & (found.value[0] ** 2 <= settings.gamma * variance)
+    variance = residuals.variance[0] + state.noise_var
+    return same_tag, same_tag & (residuals.value[0] ** 2 <= filter.gamma * variance)
 
 
-def _outermost(
-    settings: DelayedSettings, state: DelayedState, stored: Bool[Array, "W"]
+def _outer_measurements(
+    filter: DelayedFilter, state: DelayedState, stored: Bool[Array, "W"]
 ) -> tuple[Int[Array, "m"], Bool[Array, "m"]]:
-    """The slots of the oldest and the newest of these stored measurements, and which of them exist.
+    """The slots of the oldest and the newest of some stored measurements, and the mask of the slots
+    in use.
 
     They were taken from the positions farthest apart.
     """
+    # Ranks from the oldest, 1 … n; the larger one of the ranks from both ends is outermost.
     rank = (stored[None, :] & ~is_newer(state.taken_at)).sum(axis=1)
     outer = jnp.where(stored, jnp.maximum(rank, stored.sum() + 1 - rank), 0)
-    best = jax.lax.top_k(outer, min(_USED, settings.layout.stored))[1]
-    return settings.layout.stored_slots[best], stored[best]
+    best = jax.lax.top_k(outer, min(_USED, filter.layout.stored))[1]
+    return filter.layout.stored_slots[best], stored[best]
 
 
 def _locate(
-    settings: DelayedSettings,
+    filter: DelayedFilter,
     state: DelayedState,
     chosen: Int[Array, ""],
     used: Int[Array, "m"],
     use: Bool[Array, "m"],
-) -> tuple[InitialEstimate, _Decision]:
+) -> tuple[InitialEstimate, Bool[Array, ""], Bool[Array, ""]]:
     """The maximum-likelihood position from m stored measurements, and the decision on it.
 
     Estimated from the hypothesis, and from its mirror solutions in two measurements that were taken
     far from each other.
+
+    Returns:
+        The estimate; whether it is accepted as a landmark; and whether that is undecided, since its
+        covariance is still too large, or another position fits nearly as well. If it is neither,
+        its measurements contradict each other.
     """
-    joint, triangulation = state.joint, settings.triangulation
-    start = joint.landmarks[settings.layout.landmarks + chosen, :2]
+    joint, triangulation = state.joint, filter.triangulation
+    start = joint.landmarks[filter.layout.landmarks + chosen, :2]
     s = joint.landmarks[used]
     reach = ((s[:, :2] - s[:1, :2]) ** 2).sum(axis=1)
     farthest = s[jnp.argmax(jnp.where(use, reach, -1.0))]
@@ -214,38 +218,38 @@ def _locate(
     )
     cost = jnp.where(estimates.regular, estimates.nis, jnp.inf)
     first = jnp.argmin(cost)
-    best = jax.tree.map(lambda part: part[first], estimates)
+    best = jax.tree.map(lambda leaf: leaf[first], estimates)
 
     far = ((estimates.point - best.point[None]) ** 2).sum(axis=1)
     scale = (_ONE_PLACE**2) * ((best.point - s[0, :2]) ** 2).sum()
     ambiguous = ((cost < best.nis + _AMBIGUOUS) & (far > scale)).any()
-    undecided = best.regular & (ambiguous | (best.spread > settings.promotion.spread))
+    undecided = best.regular & (ambiguous | (best.spread > filter.promotion.spread))
     # By degrees of freedom, from 1 on; constants, because the tail function is slow to compile.
     limits = jnp.asarray(chi2_quantiles(1 - _UNLIKELY, np.arange(1, _USED)), best.nis.dtype)
     dof = jnp.maximum(use.sum() - 2, 1)
     likely = best.nis <= limits[dof - 1]
-    return best, _Decision(best.regular & likely & ~undecided, undecided)
+    return best, best.regular & likely & ~undecided, undecided
 
 
 def _rivals(
-    settings: DelayedSettings,
+    filter: DelayedFilter,
     state: DelayedState,
     chosen: Int[Array, ""],
     used_up: Bool[Array, "S"],
 ) -> Bool[Array, "C"]:
-    """The hypotheses excluded by a landmark made of one, including that one.
+    """Mask of the hypotheses excluded by a landmark made of the chosen one, itself included.
 
-    used_up: the slots of the stored measurements that it is made of.
+    used_up: mask of the slots of the stored measurements that the landmark is made of.
     """
     rivals = state.group == state.group[chosen]
-    if settings.by_tag:
+    if filter.by_tag:
         return rivals
     # A measurement is of one landmark, so other hypotheses made of these measurements are wrong,
     # and so is a second hypothesis at the same position.
     parents = state.parents
     rivals = rivals | ((parents >= 0) & used_up[jnp.maximum(parents, 0)]).any(axis=1)
-    points = relative_to_robot(state.joint, settings.layout)
-    itself = jax.tree.map(lambda part: part[chosen][None], points)
-    limit = settings.hypotheses.same_below
-    same_place = closer_than(settings.hypotheses.distance, limit, points, itself)
+    points = relative_to_robot(state.joint, filter.layout)
+    itself = jax.tree.map(lambda leaf: leaf[chosen][None], points)
+    limit = filter.hypotheses.same_below
+    same_place = closer_than(filter.hypotheses.distance, limit, points, itself)
     return rivals | same_place[:, 0]

@@ -94,13 +94,13 @@ class DelayedCounts(NamedTuple):
     """Counts of deletions, refusals and promotions since the start, () int each."""
 
     evicted: Int[Array, ""]
-    """stored measurements that were marginalized as the oldest of a full table"""
+    """stored measurements that were marginalized out as the oldest of a full table"""
     refused: Int[Array, ""]
-    """intersections refused because all slots of hypotheses were taken"""
+    """intersections refused because all slots of hypotheses were in use"""
     vanished: Int[Array, ""]
     """hypotheses deleted because they were not confirmed often enough"""
     rivals: Int[Array, ""]
-    """hypotheses deleted because another that excludes them was promoted"""
+    """hypotheses deleted because a hypothesis that excludes them was promoted"""
     promoted: Int[Array, ""]
     """hypotheses that became landmarks"""
     refuted: Int[Array, ""]
@@ -115,17 +115,17 @@ class DelayedState(NamedTuple):
     clock: Int[Array, ""]
     """number of processed scans"""
     taken_at: Int[Array, "W"]
-    """the scan of each stored measurement"""
+    """the scan (`clock`) of each stored measurement"""
     noise_var: Float[Array, "W"]
     """the variance of each stored q [rad² or m²]"""
     persistence: Float[Array, "C"]
-    """of each hypothesis: 1, and 1 more for each confirmation, less the decay"""
+    """1 at the start of a hypothesis, plus 1 for each confirmation, less the decay"""
     confirmed_at: Int[Array, "C"]
     """the scan that formed each hypothesis or confirmed it last"""
     group: Int[Array, "C"]
-    """hypotheses of one group exclude each other"""
+    """number of a group of hypotheses that exclude each other"""
     parents: Int[Array, "C 2"]
-    """slots of the two stored measurements each was formed of, -1 for one that has left"""
+    """slots of the two stored measurements of each hypothesis, -1 for one that was deleted"""
     counts: DelayedCounts
 
 
@@ -135,12 +135,12 @@ class NewMeasurements(NamedTuple):
     z: Float[Array, "M 1"]
     tag: Int[Array, "M"]
     """only measurements of one tag intersect; -1 throughout where identities are unknown"""
-    name: Int[Array, "M"]
+    landmark_tag: Int[Array, "M"]
     """the tag that a landmark would get"""
     is_new: Bool[Array, "M"]
-    """of no landmark of the map"""
+    """the measurement has no landmark in the map"""
     repeated: Bool[Array, "M"]
-    """new, and its tag is that of an earlier new one of the scan"""
+    """the measurement is new, and an earlier new one of the scan has the same tag"""
 
     @property
     def wanted(self) -> Bool[Array, "M"]:
@@ -194,7 +194,7 @@ def slots_where(
 
 
 def delete_slots(layout: TableLayout, state: DelayedState, dead: Bool[Array, "S"]) -> DelayedState:
-    """The state with these slots marginalized out, also removed as parents of hypotheses."""
+    """The state with these slots marginalized out, and removed from the parents of hypotheses."""
     parents = state.parents
     orphaned = (parents >= 0) & dead[jnp.maximum(parents, 0)]
     persistence = jnp.where(dead[layout.of_hypotheses], 0.0, state.persistence)
@@ -208,20 +208,20 @@ def delete_slots(layout: TableLayout, state: DelayedState, dead: Bool[Array, "S"
 def delete_slots_if_any(
     layout: TableLayout, state: DelayedState, dead: Bool[Array, "S"]
 ) -> DelayedState:
-    """As `delete_slots`, skipped if no run of a batch deletes a slot."""
+    """`delete_slots`, skipped if no run of a batch deletes a slot."""
     return where_any(dead.any(), lambda s: delete_slots(layout, s, dead), lambda s: s, state)
 
 
 def is_newer(time: Int[Array, "W"]) -> Bool[Array, "W W"]:
-    """Whether stored measurement j was taken after i; at equal times, whether j > i.
+    """Mask [i, j]: stored measurement j is later than i; at equal times, j > i.
 
-    A rank is a row's sum, which compiles faster than two sorts.
+    The sum of a row is the rank of i from the newest, which compiles faster than two sorts.
     """
     place = jnp.arange(len(time))
     later = time[None, :] > time[:, None]
     return later | ((time[None, :] == time[:, None]) & (place[None, :] > place[:, None]))
 
 
-def increased(count: Int[Array, ""], by: Bool[Array, "..."]) -> Int[Array, ""]:
-    """A count, increased by the number of set entries of a mask."""
-    return count + by.sum(dtype=jnp.int32)
+def add_to(count: Int[Array, ""], mask: Bool[Array, "..."]) -> Int[Array, ""]:
+    """A count plus the number of set entries of a mask."""
+    return count + mask.sum(dtype=jnp.int32)

@@ -22,7 +22,7 @@ Stored = Float[Array, "3"]
 Point = Float[Array, "2"]
 """(x, y) [m]"""
 _Solutions = tuple[Float[Array, "A 2"], Bool[Array, "A"]]
-"""points, and whether each is one"""
+"""points, and the mask of those that exist"""
 
 
 class Triangulation(Component):
@@ -41,8 +41,8 @@ class Triangulation(Component):
         raise NotImplementedError
 
     def intersect(self, a: Stored, b: Stored) -> _Solutions:
-        """The A points in which two can intersect, and whether each is one: where it is not, or
-        badly conditioned, the point is finite and without meaning."""
+        """The A points in which two can intersect, and the mask of those that exist: without an
+        intersection, or where it is badly conditioned, the point is finite and has no meaning."""
         raise NotImplementedError
 
     def residual(self, s: Stored, point: Point) -> Float[Array, ""]:
@@ -51,7 +51,7 @@ class Triangulation(Component):
         raise NotImplementedError
 
     def mirror_solutions(self, a: Stored, b: Stored, point: Point) -> Float[Array, "B 2"]:
-        """The other A - 1 points that two measurements of a landmark there allow."""
+        """The A - 1 further points that two measurements of a landmark at a point allow."""
         raise NotImplementedError
 
 
@@ -77,6 +77,7 @@ class Rays(Triangulation):
         super().__post_init__()
 
     def store(self, sensor: Sensor, pose: Float[Array, "3"], z: Float[Array, "1"]) -> Stored:
+        # Two points of the ray, for the ranges (or priors of them) 0 and 1.
         start = sensor.invert(pose, z, jnp.zeros(1, z.dtype))[:2]
         ahead = sensor.invert(pose, z, jnp.ones(1, z.dtype))[:2] - start
         return jnp.concatenate([start, jnp.arctan2(ahead[1], ahead[0])[None]])
@@ -118,7 +119,7 @@ class Circles(Triangulation):
         super().__post_init__()
 
     def store(self, sensor: Sensor, pose: Float[Array, "3"], z: Float[Array, "1"]) -> Stored:
-        # The sensor is halfway between the ends of a diameter.
+        # The sensor, wherever it is mounted, is halfway between the ends of a diameter.
         ends = [sensor.invert(pose, z, jnp.full(1, s, z.dtype))[:2] for s in (0.0, np.pi)]
         return jnp.concatenate([0.5 * (ends[0] + ends[1]), z])
 
@@ -128,11 +129,11 @@ class Circles(Triangulation):
         apart = (square > 0) & (a[2] > 0) & (b[2] > 0)
         safe = jnp.where(apart, square, 1.0)
         share = 0.5 * (safe + a[2] ** 2 - b[2] ** 2) / safe  # a/d
-        rest = jnp.where(apart, a[2] ** 2 / safe - share**2, 0.0)  # h²/d²
+        height2 = jnp.where(apart, a[2] ** 2 / safe - share**2, 0.0)  # h²/d²
         # sin φ = d h/(q q'), compared by squares to avoid roots of negative numbers
         size = jnp.where(apart, (a[2] * b[2]) ** 2, 1.0)
-        crossing = apart & (rest > 0) & (safe**2 * rest >= jnp.sin(self.angle) ** 2 * size)
-        height = jnp.sqrt(jnp.where(crossing, rest, 1.0))
+        crossing = apart & (height2 > 0) & (safe**2 * height2 >= jnp.sin(self.angle) ** 2 * size)
+        height = jnp.sqrt(jnp.where(crossing, height2, 1.0))
         across = jnp.stack([-delta[1], delta[0]])
         points = (a[:2] + share * delta)[None] + jnp.stack([height * across, -height * across])
         return points, jnp.stack([crossing, crossing])

@@ -1,34 +1,69 @@
-"""EKF-SLAM; the published variants are fields of one filter."""
+"""EKF-SLAM in the order of Solà's guide; the published variants are fields of one filter.
+
+A step predicts, `propagate` (14)-(17), and updates by each sensor of the robot, `update_by_sensor`:
+associate, correct (`correction`, (26)-(30)), initialize (31)-(38), report. Beside this file, the
+plain filter needs `correction` and `kernels`; `linear_system` is for charts and the observability
+monitor, `map_coordinates` for charts and inverse depths, `predicted_measurements` for associations
+that compare a measurement with every landmark.
+"""
 
 import dataclasses
+from collections.abc import Callable
+from functools import partial
+from typing import Literal, get_args
 
+import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.association._rules import Known
 from jaxslam.charts import Euclidean
-from jaxslam.core import _validation as validation
 from jaxslam.core import slots
-from jaxslam.core._record import hold_function, record, static
-from jaxslam.core.protocols import Associate, Chart, Filter, Life, Linearizer, Motion, Sensor
+from jaxslam.core._record import field, function_of, record, static
+from jaxslam.core._validation import check_models
+from jaxslam.core.protocols import (
+    Associate,
+    Association,
+    Chart,
+    Filter,
+    Life,
+    LinearizationPoint,
+    Linearizer,
+    Motion,
+    Prediction,
+    Sensor,
+)
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan
+from jaxslam.core.validation import at_least, instance_of, one_of, or_none, probability
 from jaxslam.filters._ekf import map_coordinates
-from jaxslam.filters._ekf.ekf_settings import (
-    CorrectionOrder,
-    Covariance,
-    EkfSettings,
-    check_ekf_options,
-    check_settings,
+from jaxslam.filters._ekf.checks import check_fit
+from jaxslam.filters._ekf.correction import Covariance, correct, correct_in_turn
+from jaxslam.filters._ekf.linear_system import (
+    LinearizedSteps,
+    LinearLandmarks,
+    LinearMeasurements,
+    LinearSystem,
+    Transition,
+    landmark_errors_in_chart,
+    moved_cov,
+    transition_in_chart,
 )
-from jaxslam.filters._ekf.linear_system import LinearizedSteps, LinearSystem
-from jaxslam.filters._ekf.map_coordinates import estimate_of
-from jaxslam.filters._ekf.predict import propagate
-from jaxslam.filters._ekf.scan import stages_of, update_by_scan, without_landmarks
-from jaxslam.filters._reporting import with_extra, with_removed
-from jaxslam.linearize._first_order import AtEstimate
+from jaxslam.filters._ekf.predicted_measurements import prediction_of
+from jaxslam.filters._reporting import (
+    NewLandmarks,
+    joined_info,
+    nothing_of,
+    report_scan,
+    with_extra,
+    with_removed,
+)
+from jaxslam.linearize._first_order import AtEstimate, predicted_noise
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import Number
+from jaxslam.math._xla import change_where, last_true_column, materialize, where_any
+
+CorrectionOrder = Literal["sequential", "joint"]
 
 
 @record
@@ -53,52 +88,43 @@ class EkfSlam(Filter):
     motion: Motion
     sensor: Sensor
     """the models; Jacobians come from `jax.jacfwd`"""
-    capacity: int = static()
+    capacity: int = static(check=at_least(1))
     """landmark slots N. A new landmark that finds the map full is dropped and marked
     `Status.OVERFLOW`"""
     _: dataclasses.KW_ONLY
-    chart: Chart = Euclidean()
+    chart: Chart = field(default=Euclidean(), check=instance_of(Chart))
     """the error coordinates of P"""
-    linearize: Linearizer = AtEstimate()
+    linearize: Linearizer = field(default=AtEstimate(), check=instance_of(Linearizer))
     """where Jacobians are taken"""
-    associate: Associate = Known()
+    associate: Associate = field(default=Known(), check=function_of("prediction", "scan"))
     """the landmark of each measurement"""
-    correction: CorrectionOrder = static(default="sequential")
+    correction: CorrectionOrder = static(
+        default="sequential", check=one_of(*get_args(CorrectionOrder))
+    )
     """"sequential" corrects by one measurement after the other, relinearizing each time, as the
     guide does; "joint" corrects by the whole scan at once"""
-    gate: Number | None = None
+    gate: Number | None = field(default=None, check=or_none(probability))
     """the probability that a correct measurement passes, above 0 and below 1, as 0.999: one whose
     squared Mahalanobis distance d² exceeds the χ² quantile of its Z numbers is rejected; None: none
     is. The guide's 3 σ is `stats.sigma_gate(3, 2)`. float32 has no number between 1 - 6e-8
     (d² = 33 of Z = 2) and 1"""
-    iterations: int = static(default=1)
+    iterations: int = static(default=1, check=at_least(1))
     """passes of the iterated EKF, each from the same prior; 1 is the plain EKF"""
-    covariance: Covariance = static(default="plain")
+    covariance: Covariance = static(default="plain", check=one_of(*get_args(Covariance)))
     """"plain"; "joseph", Joseph's form of the update, which costs more, and in float32 fails where
     "plain" does; or "square_root", a root X of P = X Xᵀ instead of P, which holds twice the digits,
     at a higher cost (the prediction is O(N³))"""
-    births: int | None = static(default=None)
+    births: int | None = static(default=None, check=or_none(at_least(1)))
     """largest number of new landmarks a scan, the first in its order (that of tags in simulated
     scans), the rest `Status.DEFERRED`. The guide starts one, picked at random. None: no limit"""
-    life: Life | None = None
+    life: Life | None = field(default=None, check=or_none(instance_of(Life)))
     """a rule that removes landmarks after each scan, and may make room in a full map. Its memory is
     `Joint.life`; `info.extra["pruning"].removed` (N,) bool marks the slots"""
 
     def __post_init__(self) -> None:
         name = type(self).__name__
-        validation.check_models(name, self.motion, self.sensor)
-        validation.check_parts(name, self.chart, self.linearize, self.associate, self.life)
-        hold_function(self, "associate", "prediction, scan")
-        check_ekf_options(
-            name,
-            self.capacity,
-            self.correction,
-            self.gate,
-            self.iterations,
-            self.births,
-            self.covariance,
-        )
-        check_settings(name, self._settings)
+        check_models(name, self.motion, self.sensor)
+        check_fit(name, self.sensor, self.chart, self.linearize, self.iterations)
         super().__post_init__()
 
     @property
@@ -113,84 +139,242 @@ class EkfSlam(Filter):
     def linearized(self) -> LinearizedSteps | None:
         """The steps with their linear system; None of a class that overrides one."""
         plain = type(self).predict is EkfSlam.predict and type(self).update is EkfSlam.update
-        return LinearizedSteps(self._predict, self._update) if plain else None
+        return LinearizedSteps(partial(_predict, self), partial(_update, self)) if plain else None
 
     def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:
-        joint = initial_state(pose, pose_cov, self.capacity, self._settings)
-        if self.life is None:
-            return joint
-        return joint._replace(life=self.life.init(pose, joint.landmarks))
+        chart, size_l = self.chart, len(self.sensor.landmark)
+        ground = jnp.zeros((self.capacity, size_l), pose.dtype)
+        if chart.basis is not None:
+            undo = linalg.inverse(chart.pose_basis(pose))
+            pose_cov = undo @ pose_cov @ undo.T
+        lin = self.linearize.init(pose, ground)
+        joint = slots.empty(
+            pose, pose_cov, self.capacity, size_l, lin, square_root=self.square_root
+        )
+        if self.sensor.reduced is not None:
+            joint = joint._replace(reduced=jnp.zeros_like(joint.alive))
+        if self.life is not None:
+            joint = joint._replace(life=self.life.init(pose, joint.landmarks))
+        return joint
 
     def predict(self, state: Joint, u: Float[Array, "U"], key: Array) -> Joint:
-        return self._predict(state, u, key)[0]
+        return propagate(self, state, u)[0]
 
     def update(self, state: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
-        return self._update(state, scan, key)[:2]
+        return _update(self, state, scan, key)[:2]
 
     def estimate(self, state: Joint) -> Estimate:
-        return estimate_of(state, self.sensor, self.chart, square_root=self.square_root)
-
-    @property
-    def _settings(self) -> EkfSettings:
-        return EkfSettings(
-            sensor=self.sensor,
-            chart=self.chart,
-            linearize=self.linearize,
-            associate=self.associate,
-            correction=self.correction,
-            gate=self.gate,
-            iterations=self.iterations,
-            covariance=self.covariance,
-            births=self.births,
-            life=self.life,
+        return map_coordinates.estimate_of(
+            state, self.sensor, self.chart, square_root=self.square_root
         )
 
-    def _predict(
-        self, joint: Joint, u: Float[Array, "U"], key: Array
-    ) -> tuple[Joint, LinearSystem]:
-        joint, moved = propagate(joint, u, self.motion, self._settings)
-        return joint, (moved,)
 
-    def _update(self, joint: Joint, scan: Scan, key: Array) -> tuple[Joint, Info, LinearSystem]:
-        turns = stages_of(self.sensor, self._settings)
-        joint, info, evicted, system = update_by_scan(joint, scan, turns)
-        if self.sensor.reduced is not None:
-            joint, which, reduced = map_coordinates.reduced_where_ready(
-                joint, self.sensor, self.square_root
-            )
-            info = with_extra(info, "points", map_coordinates.ToPoints(which))
-            system = (*system, reduced)
-        if self.life is not None:
-            before = joint
-            memory, dead = self.life.after(before, info, lambda: self.estimate(before))
-            joint = without_landmarks(
-                joint._replace(life=memory), dead, square_root=self.square_root
-            )
-            info = with_removed(info, evicted | dead)
-        return joint, info, system
+def propagate(filter: EkfSlam, joint: Joint, u: Float[Array, "U"]) -> tuple[Joint, Transition]:
+    """The state after the robot's motion, and the transition of its errors: Solà (14)-(17).
+
+    R ← f(R, u, 0), P_RR ← F P_RR Fᵀ + N, N = W Q Wᵀ, P_RM ← F P_RM; O(N). In another chart the
+    errors of the landmarks change too (`moved_cov`, O(N²)). A square root X of P = X Xᵀ becomes the
+    triangular root of [A X, G √N], O(N³).
+    """
+    chart = filter.chart
+    point = LinearizationPoint(joint, chart, joint.pose, slots.robot_cov(joint, filter.square_root))
+    pose, f, noise, lin = filter.linearize.motion(filter.motion, u, point)
+    if chart.basis is None:
+        transition = Transition(f, None, None, jnp.eye(3, dtype=noise.dtype), None)
+    else:
+        pose = materialize(pose)
+        transition = transition_in_chart(chart, f, joint, pose)
+    if filter.square_root:
+        added = transition.lift(len(joint.cov)) @ linalg.cholesky(noise)[0]
+        root = jnp.concatenate([transition.times(joint.cov), added], axis=1)
+        cov = linalg.triangular_root(root)
+    elif chart.basis is None:
+        robot_rows = linalg.matmul(f, joint.cov[:3])
+        robot_cov = linalg.symmetrize(linalg.matmul(robot_rows[:, :3], f.T) + noise)
+        # Stored separately from P, from which it is computed, so that P is written in place.
+        rows = materialize(jnp.concatenate([robot_cov, robot_rows[:, 3:]], axis=1))
+        cov = jnp.asarray(joint.cov).at[:3].set(rows).at[:, :3].set(rows.T)
+    else:
+        cov = moved_cov(joint.cov, transition, noise)
+    return joint._replace(pose=pose, cov=cov, lin=lin), transition
 
 
-def initial_state(
-    pose: Float[Array, "3"],
-    pose_cov: Float[Array, "3 3"],
-    capacity: int,
-    settings: EkfSettings,
-) -> Joint:
-    """The initial state: a robot with covariance pose_cov in map coordinates, and no landmark."""
-    sensor, chart = settings.sensor, settings.chart
-    size_l = len(sensor.landmark)
-    ground = jnp.zeros((capacity, size_l), pose.dtype)
-    if chart.basis is not None:
-        undo = linalg.inverse(chart.basis(pose, ground[0]).pose)
-        pose_cov = undo @ pose_cov @ undo.T
-    joint = slots.empty(
-        pose,
-        pose_cov,
-        capacity,
-        size_l,
-        settings.linearize.init(pose, ground),
-        square_root=settings.square_root,
+def _predict(
+    filter: EkfSlam, joint: Joint, u: Float[Array, "U"], key: Array
+) -> tuple[Joint, LinearSystem]:
+    """`EkfSlam.predict` with its linear system."""
+    joint, transition = propagate(filter, joint, u)
+    return joint, (transition,)
+
+
+def _update(
+    filter: EkfSlam, joint: Joint, scan: Scan, key: Array
+) -> tuple[Joint, Info, LinearSystem]:
+    """`EkfSlam.update` with its linear system: by each sensor, then the life of landmarks."""
+    infos, evicted = [], jnp.zeros_like(joint.alive)
+    system: LinearSystem = ()
+    for sensor, sensor_scan in filter.sensor.scans(scan):
+        if sensor is None:
+            infos.append(nothing_of(sensor_scan))
+            continue
+        joint, info, removed, sensor_system = update_by_sensor(
+            filter, sensor, joint, sensor_scan, filter.births
+        )
+        infos.append(info)
+        evicted, system = evicted | removed, system + sensor_system
+    info = joined_info(infos, scan.z.shape[1])
+    if filter.sensor.reduced is not None:
+        joint, is_reduced, reduction = map_coordinates.reduced_where_ready(
+            joint, filter.sensor, filter.square_root
+        )
+        info = with_extra(info, "points", map_coordinates.ToPoints(is_reduced))
+        system = (*system, reduction)
+    if filter.life is not None:
+        memory, dead = filter.life.after(joint, info, partial(filter.estimate, joint))
+        joint = without_landmarks(filter, joint._replace(life=memory), dead)
+        info = with_removed(info, evicted | dead)
+    return joint, info, system
+
+
+def update_by_sensor(
+    filter: EkfSlam,
+    sensor: Sensor,
+    joint: Joint,
+    scan: Scan,
+    births: int | None,
+    reserved: Bool[Array, "N"] | None = None,
+) -> tuple[Joint, Info, Bool[Array, "N"], LinearSystem]:
+    """The update by the scan of one sensor: associate, correct, initialize, report.
+
+    reserved: slots that no new landmark may take. Returns also the slots that were emptied to make
+    room.
+    """
+    # Padding may hold any number, and is multiplied by zero below.
+    scan = scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
+    association, matched = associate_scan(
+        filter.associate, sensor, scan, lambda: prediction_of(filter, sensor, joint)
     )
-    if sensor.reduced is not None:
-        joint = joint._replace(reduced=jnp.zeros_like(joint.alive))
-    return joint
+    slot = jnp.maximum(association.slot, 0)
+    by_scan = filter.correction == "joint" and len(scan.tag) > 0
+    correct_by = correct if by_scan else correct_in_turn
+    joint, correction = correct_by(filter, sensor, joint, scan.z, slot, matched)
+    fused = matched & correction.inside & correction.positive
+    measured = slots.slot_mask(association.slot, fused, len(joint.alive))
+    joint, new, evicted, by_pose = initialize(
+        filter, sensor, joint, scan, association.is_new, measured, births, reserved
+    )
+    info = report_scan(scan, association, matched, correction, new)
+    noise = jax.vmap(partial(predicted_noise, sensor))(correction.z_hat, scan.z, fused)
+    system = (
+        LinearMeasurements(correction.jacobian, correction.basis, noise, slot, fused),
+        LinearLandmarks(new.slot, new.granted, by_pose),
+    )
+    return joint, info, evicted, system
+
+
+def associate_scan(
+    associate: Associate, sensor: Sensor, scan: Scan, predict: Callable[[], Prediction]
+) -> tuple[Association, Bool[Array, "M"]]:
+    """The association of a scan, and which measurements correct the state.
+
+    Measurements of an absolute sensor have no landmark, and all valid ones correct.
+    """
+    if sensor.absolute:
+        no_slot = jnp.full_like(scan.tag, -1)
+        return Association(no_slot, jnp.zeros_like(scan.valid), jnp.asarray(False)), scan.valid
+    association = Association(*associate(predict(), scan))
+    matched = scan.valid & (association.slot >= 0) & ~association.is_new
+    return association._replace(is_new=scan.valid & association.is_new), matched
+
+
+_Initialized = tuple[Joint, NewLandmarks, Bool[Array, "N"], Float[Array, "M L 3"]]
+
+
+def initialize(
+    filter: EkfSlam,
+    sensor: Sensor,
+    joint: Joint,
+    scan: Scan,
+    is_new: Bool[Array, "M"],
+    measured: Bool[Array, "N"],
+    births: int | None,
+    reserved: Bool[Array, "N"] | None,
+) -> _Initialized:
+    """The map with the new landmarks of a scan, up to `births` and the free slots: Solà (31)-(38).
+
+    measured: landmarks that the scan corrected, which do not make room for new ones. Returns also
+    the slots (N,) that were emptied to make room, and G_R (M, L, 3) of the new landmarks.
+    """
+    none = jnp.zeros_like(is_new)
+    nothing = NewLandmarks(jnp.zeros(is_new.shape, jnp.int32), none, none, none)
+    kept = jnp.zeros_like(joint.alive)
+    no_slope = jnp.zeros((len(none), joint.landmarks.shape[1], 3), joint.pose.dtype)
+    if births == 0:
+        return joint, nothing._replace(deferred=is_new), kept, no_slope
+
+    def start(joint: Joint) -> _Initialized:
+        repeated = is_new & slots.seen_before(scan.tag, is_new)
+        wanted = is_new & ~repeated
+        rank = jnp.cumsum(wanted)
+        deferred = none if births is None else wanted & (rank > births)
+        wanted = wanted & ~deferred
+        evicted = kept
+        if filter.life is not None and filter.life.make_room is not None:
+            needed = wanted.sum() - (~joint.alive).sum()
+            evicted = filter.life.make_room(joint, needed, measured)
+            joint = without_landmarks(filter, joint, evicted)
+        occupied = joint.alive if reserved is None else joint.alive | reserved
+        if births is None or births >= len(wanted):
+            slot, granted = slots.allocate(occupied, wanted)
+            joint, by_pose = augment(filter, sensor, joint, scan.z, scan.tag, slot, granted)
+        else:  # only as many landmarks are computed as may start
+            is_kth = wanted[None, :] & (rank[None, :] == 1 + jnp.arange(births)[:, None])
+            at, has_slot = last_true_column(is_kth)
+            slot, granted = slots.allocate(occupied, has_slot)
+            joint, by_pose = augment(filter, sensor, joint, scan.z[at], scan.tag[at], slot, granted)
+            k = jnp.clip(rank - 1, 0, births - 1)
+            slot, granted, by_pose = slot[k], wanted & granted[k], by_pose[k]
+        return joint, NewLandmarks(slot, granted, deferred, repeated), evicted, by_pose
+
+    return where_any(is_new.any(), start, lambda joint: (joint, nothing, kept, no_slope), joint)
+
+
+def augment(
+    filter: EkfSlam,
+    sensor: Sensor,
+    joint: Joint,
+    z: Float[Array, "m Z"],
+    tag: Int[Array, "m"],
+    slot: Int[Array, "m"],
+    granted: Bool[Array, "m"],
+) -> tuple[Joint, Float[Array, "m L 3"]]:
+    """The joint with new landmarks of measurements z (m, Z) in free slots (m,), where granted (m,);
+    and their G_R.
+
+    L = g(R, z, s̄), P_LL = G_R P_RR G_Rᵀ + G_z R G_zᵀ + G_s S G_sᵀ, P_Lx = G_R P_Rx: Solà (32)-(38),
+    with the prior's term of (44); several in one scan are correlated through the robot.
+    """
+    chart, square_root = filter.chart, filter.square_root
+    point = LinearizationPoint(joint, chart, joint.pose, slots.robot_cov(joint, square_root))
+
+    def invert(
+        z: Float[Array, "Z"], tag: Int[Array, ""]
+    ) -> tuple[Float[Array, "L"], Float[Array, "L 3"], Float[Array, "L L"]]:
+        landmark, by_pose, cov = filter.linearize.invert(sensor, z, tag, point)
+        return landmark, *landmark_errors_in_chart(chart, joint.pose, landmark, by_pose, cov)
+
+    landmark, by_pose, landmark_covs = jax.vmap(invert)(z, tag)
+    joint = slots.scatter(
+        joint, slot, granted, landmark, by_pose, landmark_covs, tag, square_root=square_root
+    )
+    new = jnp.zeros_like(joint.alive).at[slot].max(granted)
+    return joint._replace(lin=filter.linearize.born(joint, new)), by_pose
+
+
+def without_landmarks(filter: EkfSlam, joint: Joint, dead: Bool[Array, "N"]) -> Joint:
+    """The map without the landmarks of the slots `dead`; without such a slot unchanged to the bit.
+
+    A root is made triangular again; a run without a removal keeps its root to the bit.
+    """
+    remove = partial(slots.remove, dead=dead, square_root=filter.square_root)
+    return change_where(dead.any(), remove, joint)

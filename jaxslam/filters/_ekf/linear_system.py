@@ -1,7 +1,7 @@
-"""The linearized error system of a filter's steps, in the order in which a step applies it.
+"""The linearized error system of a filter's steps, and its errors in a chart.
 
-A step of a filter returns it with its result, as a tuple of the records below, and `monitored`
-takes it. Under `jit` what nobody takes costs nothing.
+A step of a filter returns its system with its result, as a tuple of the records below in the order
+in which the step applies them, and `Monitored` takes it. An unused system costs nothing in `jit`.
 """
 
 from collections.abc import Callable
@@ -12,9 +12,11 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, PyTree
 
-from jaxslam.core.protocols import Chart
+from jaxslam.core.protocols import Basis, Chart
+from jaxslam.core.slots import Joint
 from jaxslam.core.types import Info, Scan
 from jaxslam.math import _linalg as linalg
+from jaxslam.math._xla import materialize
 
 
 class Transition(NamedTuple):
@@ -97,16 +99,106 @@ class LinearizedSteps:
     """(S, scan, key) -> S, info, system."""
 
 
+def transition_in_chart(
+    chart: Chart, by_pose: Float[Array, "3 3"], joint: Joint, pose: Float[Array, "3"]
+) -> Transition:
+    """The transition of the errors in a chart, E(x')⁻¹ F E(x), and E(x')⁻¹, E the chart's basis.
+
+    F = by_pose is the derivative of the new pose by that of `joint`; the landmarks do not move. The
+    errors of dead slots do not change.
+    """
+    assert chart.basis is not None
+    over_map = jax.vmap(chart.basis, in_axes=(None, 0))
+    before: Basis = over_map(joint.pose, joint.landmarks)
+    after: Basis = over_map(pose, joint.landmarks)
+    times = jax.vmap(linalg.matmul, in_axes=(0, None))
+    products = jax.vmap(linalg.matmul)
+    alive = joint.alive[:, None, None]
+    undo = linalg.inverse(after.pose[0])
+    robot = linalg.matmul(linalg.matmul(undo, by_pose), before.pose[0])
+    cross = before.cross - times(after.cross, robot)
+    cross_noise = -times(after.cross, undo)
+    landmark = None
+    if before.landmark is not None and after.landmark is not None:
+        by_landmark = jax.vmap(linalg.inverse)(after.landmark)
+        unit = jnp.eye(by_landmark.shape[-1], dtype=by_landmark.dtype)
+        landmark = jnp.where(alive, products(by_landmark, before.landmark), unit)
+        cross, cross_noise = products(by_landmark, cross), products(by_landmark, cross_noise)
+    cross, cross_noise = (jnp.where(alive, block, 0.0) for block in (cross, cross_noise))
+    return materialize(Transition(robot, cross, landmark, undo, cross_noise))
+
+
+def moved_cov(
+    cov: Float[Array, "D D"], moved: Transition, noise: Float[Array, "3 3"] | None
+) -> Float[Array, "D D"]:
+    """The covariance A P Aᵀ + G N Gᵀ after a transition in a chart, O(N²), block by block."""
+    assert moved.cross is not None
+    if moved.landmark is not None:
+        # Stored before it is transposed; otherwise each entry would be computed twice.
+        cov = materialize(moved.turn(moved.turn(cov).T))
+    cov = linalg.symmetrize(cov)
+    # A = I + b e_Rᵀ, so with T = P_R + P_RR bᵀ/2 the change of P is b T + (b T)ᵀ.
+    b = jnp.concatenate([moved.robot - jnp.eye(3, dtype=cov.dtype), moved.cross.reshape(-1, 3)])
+    half = cov[:3] + 0.5 * linalg.matmul(cov[:3, :3], b.T)
+    change = linalg.gram_both(*materialize((b.T, half)))
+    if noise is not None:
+        added = linalg.matmul(moved.lift(cov.shape[0]), linalg.cholesky(noise)[0]).T
+        change = change + linalg.self_gram(materialize(added))
+    return cov + change
+
+
+def chart_jacobians(
+    chart: Chart,
+    pose: Float[Array, "3"],
+    landmarks: Float[Array, "m L"],
+    by_pose: Float[Array, "m Z 3"],
+    by_landmark: Float[Array, "m Z L"],
+    moved: tuple[Float[Array, "3"], Float[Array, "m L"]] | None = None,
+) -> tuple[Float[Array, "m Z 3"], Float[Array, "m Z L"]]:
+    """Jacobians by errors of the chart, chained with retract(pose, l, ·) at zero or moved."""
+    assert chart.basis is not None
+    if moved is None:
+        basis = jax.vmap(chart.basis, in_axes=(None, 0))(pose, landmarks)
+    else:
+        by_dx, by_dl = jax.vmap(
+            jax.jacfwd(chart.retract, argnums=(2, 3)), in_axes=(None, 0, None, 0)
+        )(pose, landmarks, *moved)
+        basis = Basis(by_dx[0], by_dl[0], by_dl[1])
+    products = jax.vmap(linalg.matmul)
+    by_chart = products(by_pose, basis.pose) + products(by_landmark, basis.cross)
+    if basis.landmark is None:
+        return by_chart, by_landmark
+    return by_chart, products(by_landmark, basis.landmark)
+
+
+def landmark_errors_in_chart(
+    chart: Chart,
+    pose: Float[Array, "3"],
+    landmark: Float[Array, "L"],
+    by_pose: Float[Array, "L 3"],
+    cov: Float[Array, "L L"],
+) -> tuple[Float[Array, "L 3"], Float[Array, "L L"]]:
+    """A new landmark's derivative by the pose and its own covariance, in errors of the chart."""
+    if chart.basis is None:
+        return by_pose, cov
+    basis = chart.basis(pose, landmark)
+    by_pose = by_pose @ basis.pose - basis.cross
+    if basis.landmark is None:
+        return by_pose, cov
+    undo = linalg.inverse(basis.landmark)
+    return undo @ by_pose, undo @ cov @ undo.T
+
+
 def basis_of_each(
     chart: Chart, pose: Float[Array, "3"], landmarks: Float[Array, "m L"]
 ) -> Float[Array, "m K K"] | None:
     """The matrix E from errors of pose and one landmark to their coordinates; None: identity."""
     if chart.basis is None:
         return None
-    (m, size), still = landmarks.shape, jnp.eye(landmarks.shape[1], dtype=pose.dtype)
+    m, size = landmarks.shape
     basis = jax.vmap(chart.basis, in_axes=(None, 0))(pose, landmarks)
-    landmark = (
-        jnp.broadcast_to(still, (m, size, size)) if basis.landmark is None else basis.landmark
-    )
+    landmark = basis.landmark
+    if landmark is None:
+        landmark = jnp.broadcast_to(jnp.eye(size, dtype=pose.dtype), (m, size, size))
     top = jnp.concatenate([basis.pose, jnp.zeros((m, 3, size), pose.dtype)], axis=2)
     return jnp.concatenate([top, jnp.concatenate([basis.cross, landmark], axis=2)], axis=1)

@@ -14,8 +14,7 @@ from jaxslam.core._record import record
 from jaxslam.core.protocols import Chart, Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate
-from jaxslam.filters._ekf.linear_system import Transition
-from jaxslam.filters._ekf.predict import moved_cov
+from jaxslam.filters._ekf.linear_system import Transition, moved_cov
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import Landmark, Measurement, Point, Pose
 from jaxslam.math._xla import where_any
@@ -152,8 +151,8 @@ def estimate_of(
 
     points, point_covs = jax.vmap(point)(joint.landmarks, own_covs, with_pose, joint.reduced)
     if chart.basis is not None:
-        basis = chart.basis(joint.pose, joint.landmarks[0])
-        pose_cov = basis.pose @ pose_cov @ basis.pose.T
+        basis = chart.pose_basis(joint.pose)
+        pose_cov = basis @ pose_cov @ basis.T
     # The position of a landmark of zeros may be anything (of an inverse depth, 1000 km away).
     unit = jnp.eye(2, dtype=point_covs.dtype)[None]
     return Estimate(

@@ -69,8 +69,7 @@ class Monitored(Wrapper):
         state, chart = self.filter.init(pose, pose_cov), self.chart
         turn = jnp.stack([-pose[1], pose[0], jnp.ones_like(pose[0])])
         if chart.basis is not None:
-            ground = jnp.zeros(len(self.filter.landmark), pose.dtype)
-            turn = linalg.inverse(chart.basis(pose, ground).pose) @ turn
+            turn = linalg.inverse(chart.pose_basis(pose)) @ turn
         nothing = jnp.zeros((3, 3), pose.dtype)
         directions = jnp.eye(state.cov.shape[0], 3, dtype=pose.dtype)
         return MonitoredState(state, Monitor(directions, nothing, nothing[0], turn))

@@ -2,20 +2,22 @@
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Float
 
 from jaxslam.association._rules import predicted
-from jaxslam.core.protocols import Basis, Chart, Here, Prediction
+from jaxslam.core.protocols import LinearizationPoint, Prediction, Sensor
 from jaxslam.core.slots import Joint
-from jaxslam.filters._ekf.ekf_settings import EkfSettings
+from jaxslam.filters._ekf.correction import KalmanFilter
+from jaxslam.filters._ekf.kernels import projected_cov
+from jaxslam.filters._ekf.linear_system import chart_jacobians
 from jaxslam.filters._ekf.map_coordinates import at_slot
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._xla import materialize
 
 
-def prediction_of(joint: Joint, settings: EkfSettings) -> Prediction:
+def prediction_of(filter: KalmanFilter, sensor: Sensor, joint: Joint) -> Prediction:
     """The `Prediction` of a map; only the parts that the association calls are computed."""
-    sensor, chart, square_root = settings.sensor, settings.chart, settings.square_root
+    chart, square_root = filter.chart, filter.covariance == "square_root"
     capacity, size = joint.landmarks.shape
 
     def jacobians() -> tuple[
@@ -28,12 +30,13 @@ def prediction_of(joint: Joint, settings: EkfSettings) -> Prediction:
         bottom = jnp.concatenate([cross.transpose(0, 2, 1), landmarks], axis=2)
         local = jnp.concatenate([top, bottom], axis=1)
         expected, by_pose, by_landmark, rest = jax.vmap(
-            lambda slot, landmark, cov: settings.linearize.observe(
-                at_slot(sensor, joint, slot), Here(joint, chart, joint.pose, cov, slot, landmark)
+            lambda slot, landmark, cov: filter.linearize.observe(
+                at_slot(sensor, joint, slot),
+                LinearizationPoint(joint, chart, joint.pose, cov, slot, landmark),
             )
         )(every, joint.landmarks, local)
         if chart.basis is not None:
-            by_pose, by_landmark = in_chart(
+            by_pose, by_landmark = chart_jacobians(
                 chart, joint.pose, joint.landmarks, by_pose, by_landmark
             )
         expected, by_pose, by_landmark, rest = materialize((expected, by_pose, by_landmark, rest))
@@ -73,46 +76,3 @@ def _blocks(
     landmark = joint.cov[3:, 3:].reshape(capacity, size, capacity, size)[every, :, every]
     cross = joint.cov[:3, 3:].reshape(3, capacity, size).transpose(1, 0, 2)
     return joint.cov[:3, :3], cross, landmark
-
-
-def in_chart(
-    chart: Chart,
-    pose: Float[Array, "3"],
-    landmarks: Float[Array, "m L"],
-    by_pose: Float[Array, "m Z 3"],
-    by_landmark: Float[Array, "m Z L"],
-    moved: tuple[Float[Array, "3"], Float[Array, "m L"]] | None = None,
-) -> tuple[Float[Array, "m Z 3"], Float[Array, "m Z L"]]:
-    """Jacobians by errors of the chart, chained with retract(pose, l, ·) at zero or moved."""
-    assert chart.basis is not None
-    if moved is None:
-        basis = jax.vmap(chart.basis, in_axes=(None, 0))(pose, landmarks)
-    else:
-        by_dx, by_dl = jax.vmap(
-            jax.jacfwd(chart.retract, argnums=(2, 3)), in_axes=(None, 0, None, 0)
-        )(pose, landmarks, *moved)
-        basis = Basis(by_dx[0], by_dl[0], by_dl[1])
-    each = jax.vmap(linalg.matmul)
-    by_chart = each(by_pose, basis.pose) + each(by_landmark, basis.cross)
-    return by_chart, by_landmark if basis.landmark is None else each(by_landmark, basis.landmark)
-
-
-def projected_cov(
-    hp: Float[Array, "m Z D"],
-    by_pose: Float[Array, "m Z 3"],
-    by_landmark: Float[Array, "m Z L"],
-    slot: Int[Array, "m"],
-    capacity: int,
-) -> Float[Array, "m Z m Z"]:
-    """The covariance H P Hᵀ of predicted measurements, from the columns of H P that H meets."""
-    m, size_z, size_l = by_landmark.shape
-    by_robot = linalg.total(
-        hp[:, :, k, None, None] * by_pose[None, None, :, :, k] for k in range(3)
-    )
-    if size_l == 0:
-        return by_robot
-    by_slot = hp[:, :, 3 : 3 + capacity * size_l].reshape(m, size_z, capacity, size_l)
-    at_landmark = by_slot[:, :, slot]
-    return by_robot + linalg.total(
-        at_landmark[..., k, None] * by_landmark[None, None, :, :, k] for k in range(size_l)
-    )

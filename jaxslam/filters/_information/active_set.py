@@ -28,37 +28,42 @@ def enter_link(
     on: Bool[Array, ""],
     conservative: bool = False,
 ) -> SparseState:
-    """The state with the link Ω_ij in the lists of landmarks i and j, where on and it is not 0.
+    """The state with the link Ω_ij in the lists of landmarks i and j, where on and Ω_ij is not 0.
 
-    A full list drops its weakest link (least |Ω_ij|), or the new one is not entered if that is the
-    weakest: `sparse_state.drop_link`. `diagonal` must be current for both landmarks.
+    A full list drops its weakest link (least |Ω_ij|), which may be the new link itself:
+    `sparse_state.drop_link`. `diagonal` must be current for both landmarks.
     """
     n = state.alive.shape[0]
     size = (link**2).sum()
     on = on & (size > 0)
     i, j = jnp.where(on, i, n), jnp.where(on, j, n)
 
-    def weakest(of: Array) -> tuple[Array, Array, Array, Array]:
-        row = state.neighbours.at[of].get(mode="fill", fill_value=n)
-        links = state.links.at[of].get(mode="fill", fill_value=0)
+    def weakest_link(landmark: Array) -> tuple[Array, Array, Array, Array]:
+        """Its entry in the list, the other end, the link, and |link|²; -1 for a free entry."""
+        row = state.neighbours.at[landmark].get(mode="fill", fill_value=n)
+        links = state.links.at[landmark].get(mode="fill", fill_value=0)
         weight = jnp.where(row < n, (links**2).sum(axis=(1, 2)), -1.0)
         at = jnp.argmin(weight)
         return at, row[at], links[at], weight[at]
 
     # Read before any write; otherwise XLA copies all N lists to read them later.
-    found = materialize((weakest(i), weakest(j)))
-    (at_i, p, link_p, least_i), (at_j, q, link_q, least_j) = found
+    weakest = materialize((weakest_link(i), weakest_link(j)))
+    (at_i, p, link_p, least_i), (at_j, q, link_q, least_j) = weakest
     keep = on & (size > least_i) & (size > least_j)
     index, links = state.neighbours, state.links
     diagonal, counts = drop_link(state.diagonal, state.counts, i, j, link, on & ~keep, conservative)
-    for mine, other, old, least in ((i, p, link_p, least_i), (j, q, link_q, least_j)):
+    for landmark, partner, dropped, least in ((i, p, link_p, least_i), (j, q, link_q, least_j)):
         full = keep & (least >= 0)
-        diagonal, counts = drop_link(diagonal, counts, mine, other, old, full, conservative)
-        row = index.at[jnp.where(full, other, n)].get(mode="fill", fill_value=n)
-        back = row == mine
-        gone = materialize((jnp.where(full & back.any(), other, n), jnp.argmax(back)))
-        index = index.at[gone].set(n, mode="drop")
-        links = links.at[gone].set(0.0, mode="drop")
+        diagonal, counts = drop_link(
+            diagonal, counts, landmark, partner, dropped, full, conservative
+        )
+        # The link is in the list of the partner too.
+        row = index.at[jnp.where(full, partner, n)].get(mode="fill", fill_value=n)
+        is_back = row == landmark
+        # Computed before the write, for which XLA would copy all N lists otherwise.
+        back = materialize((jnp.where(full & is_back.any(), partner, n), jnp.argmax(is_back)))
+        index = index.at[back].set(n, mode="drop")
+        links = links.at[back].set(0.0, mode="drop")
     i, j = jnp.where(keep, i, n), jnp.where(keep, j, n)
     index = index.at[i, at_i].set(j.astype(jnp.int32), mode="drop")
     index = index.at[j, at_j].set(i.astype(jnp.int32), mode="drop")
@@ -73,9 +78,9 @@ def _enter_links(
     links: Float[Array, "A 2 2"],
     on: Bool[Array, "A"],
 ) -> SparseState:
-    """`enter_link` of landmark i with each of j, where lists have room for all N - 1 others.
+    """`enter_link` of landmark i with all of j, where lists have room for all N - 1 landmarks.
 
-    Each link takes the first free entry of a list, as if they came one after the other.
+    A link takes the first free entry of a list, as if the links came one after the other.
     """
     n = state.alive.shape[0]
     on = on & ((links**2).sum(axis=(1, 2)) > 0)
@@ -87,9 +92,9 @@ def _enter_links(
     at_j = jnp.argmax(rows == n, axis=1)
     index = state.neighbours.at[i, at_i].set(j.astype(jnp.int32), mode="drop")
     index = index.at[j, at_j].set(i.astype(jnp.int32), mode="drop")
-    kept = state.links.at[i, at_i].set(links, mode="drop")
-    kept = kept.at[j, at_j].set(jnp.swapaxes(links, 1, 2), mode="drop")
-    return state._replace(neighbours=index, links=kept)
+    lists = state.links.at[i, at_i].set(links, mode="drop")
+    lists = lists.at[j, at_j].set(jnp.swapaxes(links, 1, 2), mode="drop")
+    return state._replace(neighbours=index, links=lists)
 
 
 def active_matches(state: SparseState, association: TagAssociation) -> Bool[Array, "M A"]:
@@ -104,10 +109,10 @@ def assign_indices(
     enters: Bool[Array, "M"],
     matches: Bool[Array, "M A"],
 ) -> tuple[Int[Array, "M"], Bool[Array, "A"]]:
-    """The index of each measured landmark in the active set, and which indices are newly assigned.
+    """The index of each measured landmark in the active set, and the mask of those newly assigned.
 
-    Landmarks that enter get the indices with the least `order`, by their `rank`; the others have
-    theirs (`active_matches`).
+    Landmarks that enter get the indices of least `order`, in the order of their `rank`; the other
+    ones keep the index at which they match (`active_matches`).
     """
     by_order = jnp.argsort(order, stable=True)
     entered = by_order[jnp.clip(rank, 0, len(by_order) - 1)]
@@ -125,38 +130,37 @@ def deactivate(
     n, count = state.alive.shape[0], leaving.shape[0]
     omega = state.omega
     blocks = landmark_blocks(omega)
-    every = jnp.arange(count)
-    state = state._replace(
-        diagonal=state.diagonal.at[state.active].set(blocks[every, every], mode="drop")
-    )
+    k = jnp.arange(count)
+    state = state._replace(diagonal=state.diagonal.at[state.active].set(blocks[k, k], mode="drop"))
     order = jnp.argsort(~leaving, stable=True)[:most]
-    # Each pair once: of two that leave, by the one that is processed first.
-    earlier = (order[:, None] == every[None, :])[None, :, :] & (
-        jnp.arange(len(order))[None, :] < jnp.arange(len(order))[:, None]
-    )[:, :, None]
+    # A pair of two that leave is entered once, by the one that is processed first: axes are
+    # (processed later, processed earlier, index in the active set).
+    is_earlier = jnp.arange(len(order))[None, :] < jnp.arange(len(order))[:, None]
+    earlier = (order[:, None] == k[None, :])[None, :, :] & is_earlier[:, :, None]
     entered = leaving[order][:, None] & (state.active < n)[None, :] & ~earlier.any(axis=1)
-    entered = entered & (order[:, None] != every[None, :])
+    entered = entered & (order[:, None] != k[None, :])
 
-    def enter_pair(state: SparseState, of: tuple[Array, ...]) -> tuple[SparseState, None]:
-        a, b, on = of
-        pair = state.active[a], state.active[b]
-        return enter_link(state, *pair, blocks[a, b], on, conservative), None
+    def enter_pair(state: SparseState, pair: tuple[Array, ...]) -> tuple[SparseState, None]:
+        a, b, on = pair
+        ends = state.active[a], state.active[b]
+        return enter_link(state, *ends, blocks[a, b], on, conservative), None
 
-    def enter_row(state: SparseState, of: tuple[Array, ...]) -> tuple[SparseState, None]:
-        a, on = of
+    def enter_row(state: SparseState, row: tuple[Array, ...]) -> tuple[SparseState, None]:
+        a, on = row
         return _enter_links(state, state.active[a], state.active, blocks[a], on), None
 
+    # Lists with room for all other landmarks are never full: a row is entered at once.
     if state.neighbours.shape[1] >= n - 1:
         state, _ = jax.lax.scan(enter_row, state, (order, entered))
     else:
-        pairs = jnp.repeat(order, count), jnp.tile(every, len(order)), entered.reshape(-1)
+        pairs = jnp.repeat(order, count), jnp.tile(k, len(order)), entered.reshape(-1)
         state, _ = jax.lax.scan(enter_pair, state, pairs)
     diagonal = state.diagonal.at[state.active].get(mode="fill", fill_value=0)
     unit = jnp.eye(2, dtype=omega.dtype)
     empty = leaving | (state.active >= n)
-    blocks = blocks.at[every, every].set(diagonal)
+    blocks = blocks.at[k, k].set(diagonal)
     blocks = jnp.where((leaving[:, None] | leaving[None, :])[:, :, None, None], 0.0, blocks)
-    blocks = blocks.at[every, every].set(jnp.where(empty[:, None, None], unit, diagonal))
+    blocks = blocks.at[k, k].set(jnp.where(empty[:, None, None], unit, diagonal))
     return state._replace(
         omega=with_landmark_blocks(omega, blocks),
         active=jnp.where(leaving, n, state.active).astype(jnp.int32),
@@ -179,14 +183,15 @@ def activate(
     entered = jnp.zeros(count, bool).at[at].set(True, mode="drop")
     rows = state.neighbours.at[active].get(mode="fill", fill_value=n)
     links = state.links.at[active].get(mode="fill", fill_value=0)
+    # Read before the lists are written, else XLA copies all N of them.
     rows, links = materialize((rows, links))
     match = (rows[:, :, None] == active[None, None, :]) & (active < n)[None, None, :]
-    found = jnp.einsum("akij,akb->abij", links, match.astype(links.dtype))
+    listed = jnp.einsum("akij,akb->abij", links, match.astype(links.dtype))
     diagonal = state.diagonal.at[jnp.where(entered, active, n)].get(mode="fill", fill_value=0)
-    blocks = landmark_blocks(state.omega) + found
-    every = jnp.arange(count)
-    before = blocks[every, every]
-    blocks = blocks.at[every, every].set(jnp.where(entered[:, None, None], diagonal, before))
+    blocks = landmark_blocks(state.omega) + listed
+    k = jnp.arange(count)
+    before = blocks[k, k]
+    blocks = blocks.at[k, k].set(jnp.where(entered[:, None, None], diagonal, before))
     moved = match.any(axis=2)
     left = jnp.where(moved[:, :, None, None], 0.0, links)
     return state._replace(

@@ -62,6 +62,7 @@ def motion_update(
     phi = omega.at[:3].set(back.T @ omega[:3])
     phi = phi.at[:, :3].set(phi[:, :3] @ back)
     residual = residual.at[:3].set(back.T @ residual[:3])
+    # Sᵀ Φ; the inner matrix I + Sᵀ Φ S is 3×3 and positive definite for any rank of S.
     by_noise = root.T @ phi[:3]
     inner = jnp.eye(3, dtype=omega.dtype) + by_noise[:, :3] @ root
     gain = (linalg.inverse(linalg.symmetrize(inner)) @ by_noise).T
@@ -71,18 +72,18 @@ def motion_update(
 
 
 def measurement_update(
-    omega: Float[Array, "D D"], residual: Float[Array, "D"], of: CanonicalInnovations
+    omega: Float[Array, "D D"], residual: Float[Array, "D"], innovations: CanonicalInnovations
 ) -> tuple[Float[Array, "D D"], Float[Array, "D"]]:
     """The update Ω ← Ω + Σ Hᵀ R⁻¹ H, ρ ← ρ + Σ Hᵀ R⁻¹ ν."""
-    rows = of.whitened_jacobian
-    return linalg.symmetrize(omega + rows.T @ rows), residual + rows.T @ of.whitened
+    rows = innovations.whitened_jacobian
+    return linalg.symmetrize(omega + rows.T @ rows), residual + rows.T @ innovations.whitened
 
 
 def mean_error(
     omega: Float[Array, "D D"], residual: Float[Array, "D"], omega_positive: Bool[Array, ""]
 ) -> tuple[Float[Array, "D"], Bool[Array, ""]]:
-    """The mean error Ω⁻¹ ρ, and whether it could be solved for: Ω is positive definite, as before
-    the scan (omega_positive). Zero where it could not."""
+    """The mean error Ω⁻¹ ρ, and whether Ω is positive definite, here and before the scan
+    (omega_positive); zero where it is not."""
     error, positive = linalg.solve_psd(omega, residual)
     solved = omega_positive & positive
     return jnp.where(solved, error, 0.0), solved
@@ -102,14 +103,16 @@ def initialize_landmarks(
     index: Int[Array, "M"],
     wanted: Bool[Array, "M"],
 ) -> tuple[Float[Array, "D D"], Float[Array, "M L"], Bool[Array, "M"]]:
-    """Ω with new landmarks at empty indices where wanted, the landmarks, and which were started.
+    """Ω with new landmarks at empty indices where wanted, the landmarks, and the mask of those
+    initialized.
 
-    l = g(x, z), with C = G_z R G_zᵀ + G_s S G_sᵀ: Ω ← Ω + Jᵀ C⁻¹ J, J = [-G_x, I], the same as
-    augmentation in covariance form (Solà (32)-(38)), and ρ as it is. A landmark whose C is not
+    l = g(x, z), with C = G_z R G_zᵀ + G_s S G_sᵀ: Ω ← Ω + Jᵀ C⁻¹ J, J = [-G_x, I]; ρ does not
+    change. This is the augmentation in covariance form, Solà (32)-(38). A landmark whose C is not
     positive definite is not initialized.
     """
     size = len(sensor.landmark)
     count = (omega.shape[0] - 3) // size
+    # Absent measurements are replaced by a value at which every model is smooth.
     z = jnp.where(wanted[:, None], z, 1.0)
     landmark, by_pose, cov = jax.vmap(lambda z: first_order.invert_at(sensor, pose, z, pose, z))(z)
     root, positive = jax.vmap(linalg.cholesky)(cov)
@@ -128,6 +131,7 @@ def initialize_landmarks(
 
 def diagonal_loading(omega: Float[Array, "D D"]) -> Float[Array, "D D"]:
     """The matrix Ω plus √eps of its diagonal, used where rounding made Ω indefinite."""
+    # Rounding errs by some eps of the diagonal; √eps exceeds that after many steps, and is small.
     share = math.sqrt(float(jnp.finfo(omega.dtype).eps))
     load: Array = share * jnp.diag(jnp.abs(jnp.diagonal(omega)))
     return omega + load
@@ -135,29 +139,29 @@ def diagonal_loading(omega: Float[Array, "D D"]) -> Float[Array, "D D"]:
 
 def report(
     scan: Scan,
-    measured: TagAssociation,
-    of: CanonicalInnovations,
+    association: TagAssociation,
+    innovations: CanonicalInnovations,
     initialized: Bool[Array, "M"],
 ) -> Info:
     """The `Info` of a scan."""
     status = status_of(
         scan.valid,
-        matched=measured.known,
-        positive=of.positive,
-        inside=of.inside,
-        new=measured.new,
-        repeated=measured.repeated,
+        matched=association.matched,
+        positive=innovations.positive,
+        inside=innovations.inside,
+        new=association.new,
+        repeated=association.repeated,
         granted=initialized,
-        singular=measured.has_slot,
+        singular=association.has_slot,
     )
     return info_of(
         status,
-        of.compared,
+        association.matched,
         size=scan.z.shape[1],
-        slot=measured.slot,
-        born=measured.slot,
-        nis=of.nis,
-        innovation=of.innovation,
-        innovation_cov=of.innovation_cov,
-        log_likelihood=of.log_likelihood.sum(),
+        slot=association.slot,
+        born=association.slot,
+        nis=innovations.nis,
+        innovation=innovations.innovation,
+        innovation_cov=innovations.innovation_cov,
+        log_likelihood=innovations.log_likelihood.sum(),
     )

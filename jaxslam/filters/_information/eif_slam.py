@@ -1,6 +1,6 @@
-"""EIF-SLAM: the extended Kalman filter in exact canonical (information) form.
+"""EIF-SLAM, the extended Kalman filter in exact canonical (information) form.
 
-And a wrapper that takes a scan in pieces, for filters with room for few measurements at once.
+`InPieces` divides a scan for filters with room for few measurements at once.
 """
 
 from typing import NamedTuple
@@ -33,7 +33,7 @@ class CanonicalState(NamedTuple):
     tag: Int[Array, "N"]
     """-1 where dead"""
     refused: Int[Array, ""]
-    """scans refused because Ω was not positive definite"""
+    """number of scans refused because Ω was not positive definite"""
 
     @property
     def xi(self) -> Float[Array, "D"]:
@@ -76,23 +76,24 @@ class EifSlam(InformationFilter):
         return state._replace(pose=pose, omega=omega, residual=residual)
 
     def update(self, state: CanonicalState, scan: Scan, key: Array) -> tuple[CanonicalState, Info]:
-        measured = associate_by_table(state.tag, state.alive, scan)
+        association = associate_by_table(state.tag, state.alive, scan)
+        slot = association.slot
         innovations = tag_innovation.innovations(
-            self, state.omega, state.pose, state.landmarks, scan, measured.slot, measured.known
+            self, state.omega, state.pose, state.landmarks, scan, slot, association.matched
         )
         omega, residual = canonical.measurement_update(state.omega, state.residual, innovations)
+        # The mean is corrected before new landmarks are linearized at it.
         error, solved = canonical.mean_error(omega, residual, innovations.omega_positive)
-        pose, landmarks = _corrected_means(state, error)
+        innovations = tag_innovation.refuse_unless(solved, innovations)
+        pose = canonical.correct_pose(state.pose, error[:3])
+        landmarks = state.landmarks + error[3:].reshape(state.landmarks.shape)
+        landmarks = jnp.where(state.alive[:, None], landmarks, 0.0)
+        wanted = association.new & association.has_slot & solved
         omega, new_landmarks, initialized = canonical.initialize_landmarks(
-            self.sensor,
-            omega,
-            pose,
-            scan.z,
-            measured.slot,
-            measured.new & measured.has_slot & solved,
+            self.sensor, omega, pose, scan.z, slot, wanted
         )
-        into = jnp.where(initialized, measured.slot, self.capacity)
-        after = state._replace(
+        into = jnp.where(initialized, slot, self.capacity)  # beyond the end: dropped
+        state = state._replace(
             pose=pose,
             landmarks=landmarks.at[into].set(new_landmarks, mode="drop"),
             omega=jnp.where(solved, omega, canonical.diagonal_loading(state.omega)),
@@ -101,8 +102,7 @@ class EifSlam(InformationFilter):
             tag=state.tag.at[into].set(scan.tag.astype(jnp.int32), mode="drop"),
             refused=state.refused + (scan.valid.any() & ~solved).astype(jnp.int32),
         )
-        innovations = tag_innovation.refuse_unless(solved, innovations)
-        return after, canonical.report(scan, measured, innovations, initialized)
+        return state, canonical.report(scan, association, innovations, initialized)
 
     def estimate(self, state: CanonicalState) -> Estimate:
         cov = linalg.inverse_psd(state.omega)
@@ -110,23 +110,12 @@ class EifSlam(InformationFilter):
         return estimate_of(joint, self.sensor, self.chart)
 
 
-def _corrected_means(
-    state: CanonicalState, error: Float[Array, "D"]
-) -> tuple[Float[Array, "3"], Float[Array, "N L"]]:
-    """Pose and landmarks corrected by the error of the mean."""
-    moved = state.landmarks + error[3:].reshape(state.landmarks.shape)
-    return (
-        canonical.correct_pose(state.pose, error[:3]),
-        jnp.where(state.alive[:, None], moved, 0.0),
-    )
-
-
 @record
 class InPieces(Wrapper):
-    """A filter applied in turn to pieces of a scan, each of `size` measurement slots.
+    """A filter applied in turn to pieces of a scan, of `size` measurement slots each.
 
-    Slot i is in piece i mod their number. Numbers that an `Info` has for a whole scan are summed
-    over the pieces, and flags are true where one of a piece is.
+    Slot i is in piece i mod the number of pieces. Numbers of an `Info` for the scan are summed over
+    the pieces; its flags are true if they are true for any piece.
     """
 
     filter: Filter
@@ -142,20 +131,20 @@ class InPieces(Wrapper):
             return self.filter.update(state, scan, key)
         pieces = -(-m // size)
 
-        def dealt(leaf: jax.Array) -> jax.Array:
+        def deal(leaf: jax.Array) -> jax.Array:
             wide = jnp.pad(leaf, [(0, pieces * size - m), *[(0, 0)] * (leaf.ndim - 1)])
             return wide.reshape(size, pieces, *leaf.shape[1:]).swapaxes(0, 1)
 
-        def one(state: PyTree, piece: tuple[Scan, jax.Array]) -> tuple[PyTree, Info]:
+        def update(state: PyTree, piece: tuple[Scan, jax.Array]) -> tuple[PyTree, Info]:
             return self.filter.update(state, *piece)
 
-        each = jax.tree.map(dealt, scan), jax.random.split(key, pieces)
-        state, infos = jax.lax.scan(one, state, each)
+        scans, keys = jax.tree.map(deal, scan), jax.random.split(key, pieces)
+        state, infos = jax.lax.scan(update, state, (scans, keys))
 
-        def whole(leaf: jax.Array) -> jax.Array:
+        def join(leaf: jax.Array) -> jax.Array:
             if leaf.ndim == 1:  # of a scan, not of its measurement slots
                 return leaf.any() if leaf.dtype == bool else leaf.sum()
             return leaf.swapaxes(0, 1).reshape(size * pieces, *leaf.shape[2:])[:m]
 
-        info: Info = jax.tree.map(whole, infos)
+        info: Info = jax.tree.map(join, infos)
         return state, info

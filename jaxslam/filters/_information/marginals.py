@@ -50,7 +50,7 @@ def recover_passive_means(state: SparseState, count: int) -> SparseState:
     """The state with the passive means among the next `count` landmarks recovered in turn."""
     n = state.alive.shape[0]
 
-    def recover_one(state: SparseState, i: Array) -> tuple[SparseState, None]:
+    def recover(state: SparseState, i: Array) -> tuple[SparseState, None]:
         slot = (state.next_recovered + i) % n
         step, positive = linalg.solve_psd(state.diagonal[slot], state.landmark_residual[slot])
         on = state.alive[slot] & positive & ~(state.active == slot).any()
@@ -59,7 +59,7 @@ def recover_passive_means(state: SparseState, count: int) -> SparseState:
         left = state.landmark_residual.at[jnp.where(on, slot, n)].set(0.0, mode="drop")
         return state._replace(landmark_residual=left), None
 
-    state, _ = jax.lax.scan(recover_one, state, jnp.arange(count, dtype=state.next_recovered.dtype))
+    state, _ = jax.lax.scan(recover, state, jnp.arange(count, dtype=state.next_recovered.dtype))
     return state._replace(next_recovered=((state.next_recovered + count) % n).astype(jnp.int32))
 
 
@@ -69,10 +69,9 @@ def recover_active_means(
     residual: Float[Array, "D"],
     omega_positive: Bool[Array, ""],
 ) -> tuple[SparseState, Bool[Array, ""]]:
-    """Robot and active landmarks moved by Ω⁻¹ ρ, and whether that could be solved for.
+    """The state with robot and active landmarks moved by Ω⁻¹ ρ, and whether it was solved for.
 
-    Where it could not (`canonical.mean_error`), means and ρ do not change. Ω of the state is not
-    changed.
+    If not (`canonical.mean_error`), means and ρ stay as they are. Ω of the state does not change.
     """
     error, solved = canonical.mean_error(omega, residual, omega_positive)
     state = with_active_residual(state, jnp.where(solved, 0.0, active_residual(state)))
@@ -87,7 +86,8 @@ def repeat_recovery(
     recovered: int,
     sweeps: int,
 ) -> SparseState:
-    """Mean recovery, the rounds after the first: passive landmarks, then the active block."""
+    """The state after the rounds of mean recovery that follow the first: passive landmarks, then
+    the active block."""
     for _ in range(sweeps - 1):
         state = recover_passive_means(state, recovered)
         state, _ = recover_active_means(state, omega, active_residual(state), solved)
@@ -95,7 +95,10 @@ def repeat_recovery(
 
 
 def local_information(state: SparseState, slot: Int[Array, "B"]) -> Float[Array, "D D"]:
-    """The information Ω of the robot and these slots, D = 3 + 2B; N for none, no slot twice."""
+    """The information Ω of the robot and these slots, D = 3 + 2B; slot N for none, no slot twice.
+
+    A block of two active landmarks comes from the dense block, any other one from the lists.
+    """
     n, count = state.alive.shape[0], slot.shape[0]
     present = slot < n
     rows = state.neighbours.at[slot].get(mode="fill", fill_value=n)
@@ -109,10 +112,11 @@ def local_information(state: SparseState, slot: Int[Array, "B"]) -> Float[Array,
     blocks = blocks + jnp.where(both[:, :, None, None], dense, 0.0)
     passive = state.diagonal.at[slot].get(mode="fill", fill_value=0)
     passive = jnp.where(present[:, None, None], passive, jnp.eye(2, dtype=passive.dtype)[None])
-    every = jnp.arange(count)
-    blocks = blocks.at[every, every].add(jnp.where(active[:, None, None], 0.0, passive))
+    k = jnp.arange(count)
+    blocks = blocks.at[k, k].add(jnp.where(active[:, None, None], 0.0, passive))
     robot = state.omega[:3, 3:].reshape(3, -1, 2)[:, index]
     robot = jnp.where(active[None, :, None], robot, 0.0).reshape(3, 2 * count)
+    # From (landmark, landmark, parameter, parameter) to rows and columns.
     flat = blocks.transpose(0, 2, 1, 3).reshape(2 * count, 2 * count)
     top = jnp.concatenate([state.omega[:3, :3], robot], axis=1)
     return jnp.concatenate([top, jnp.concatenate([robot.T, flat], axis=1)])
@@ -121,8 +125,8 @@ def local_information(state: SparseState, slot: Int[Array, "B"]) -> Float[Array,
 def blanket_cov(state: SparseState, slot: Int[Array, ""]) -> Float[Array, "5 5"]:
     """The covariance of the robot and a slot, given all landmarks outside their Markov blankets.
 
-    The blankets are the active landmarks and those of the landmark's list: a matrix of 3 + 2(1 + A
-    + K) is factored, whatever N.
+    The blankets are the active landmarks and the landmark's list: a matrix of 3 + 2(1 + A + K)
+    rows is factored, for any N.
     """
     n = state.alive.shape[0]
     row = state.neighbours[slot]
@@ -138,8 +142,8 @@ def blanket_marginals(state: SparseState) -> tuple[Float[Array, "3 3"], Float[Ar
     omega = state.omega
     eye = jnp.eye(omega.shape[0], 3, dtype=omega.dtype)
     pose_cov = linalg.symmetrize(linalg.solve_psd(omega, eye)[0][:3])
-    every = jnp.arange(state.alive.shape[0], dtype=jnp.int32)
-    return pose_cov, jax.lax.map(lambda slot: blanket_cov(state, slot)[3:, 3:], every)
+    slots = jnp.arange(state.alive.shape[0], dtype=jnp.int32)
+    return pose_cov, jax.lax.map(lambda slot: blanket_cov(state, slot)[3:, 3:], slots)
 
 
 def whole_marginals(state: SparseState) -> tuple[Float[Array, "3 3"], Float[Array, "N 2 2"]]:
@@ -147,8 +151,8 @@ def whole_marginals(state: SparseState) -> tuple[Float[Array, "3 3"], Float[Arra
     count = state.alive.shape[0]
     omega = local_information(state, jnp.arange(count, dtype=jnp.int32))
     cov = linalg.inverse_psd(omega)
-    every = jnp.arange(count)
-    points = cov[3:, 3:].reshape(count, 2, count, 2)[every, :, every]
+    k = jnp.arange(count)
+    points = cov[3:, 3:].reshape(count, 2, count, 2)[k, :, k]
     return cov[:3, :3], points
 
 
@@ -172,8 +176,8 @@ def whole_information(state: SparseState) -> "scipy.sparse.csc_array":
     first, column = np.nonzero(neighbours < n)
     add(first, neighbours[first, column], np.asarray(state.links)[first, column])
     dense = np.asarray(landmark_blocks(state.omega))[index][:, index]
-    one, two = (m.ravel() for m in np.meshgrid(slot, slot, indexing="ij"))
-    add(one, two, dense.reshape(-1, 2, 2))
+    first, second = (m.ravel() for m in np.meshgrid(slot, slot, indexing="ij"))
+    add(first, second, dense.reshape(-1, 2, 2))
     # The robot's rows and columns: its block, and its links to the active landmarks.
     own_rows, linked = (3 + (2 * k[:, None] + np.arange(2)).ravel() for k in (slot, index))
     i, j = (

@@ -57,14 +57,15 @@ class Seif(InformationFilter):
     measurement, and only makes the room that the scan needs, so that a scan without another
     landmark drops nothing.
 
-    With active = capacity it is `EifSlam`. `sparsification` documents the approximation, and
-    `SparseState.counts` counts it. NIS, gate and, unless `whole`, `estimate` use covariances of
-    Markov blankets (`marginals`), which hold all other landmarks at their means: less than the true
-    ones, by much in a map that has drifted as a whole. Sparsification is overconfident
-    too. Landmarks are points associated by their tags, and the tag of one is its slot.
+    With active = capacity it is `EifSlam`. `sparse_state` documents the approximation, and
+    `SparseState.counts` counts it. NIS and gate, and `estimate` unless `exact_marginals`, use
+    covariances of Markov blankets (`marginals`), which hold all other landmarks at their means:
+    less than the true ones, by much in a map that has drifted as a whole. Sparsification is
+    overconfident too. Landmarks are points associated by their tags; the slot of a landmark is its
+    tag.
 
-    An active block that is not positive definite: as in `EifSlam`, counted in
-    `ApproximationCounts.refused`.
+    Where the active block is not positive definite, the scan is refused as in `EifSlam`, and
+    counted in `ApproximationCounts.refused`.
 
     Raises ValueError as `EifSlam`; on an active, links, passive or sweeps below 1; on landmarks
     that are not points (x, y); and, from `update`, on a scan with more measurement slots than
@@ -85,8 +86,8 @@ class Seif(InformationFilter):
     """how a full list drops its weakest link. False: overconfidently, Ω
     stays positive definite. True: with loss of information; where a map needs many more links than
     it may have, Ω does not stay positive definite"""
-    whole: bool = static(default=False)
-    """`estimate` inverts Ω of all landmarks, O(N³): the filter's exact marginals"""
+    exact_marginals: bool = static(default=False)
+    """`estimate` inverts Ω of all landmarks, O(N³), instead of Markov blankets"""
 
     def __post_init__(self) -> None:
         for option in ("active", "links", "passive", "sweeps"):
@@ -124,22 +125,23 @@ class Seif(InformationFilter):
                 f"Seif: expected active >= {size}, the measurement slots of a scan, got "
                 f"{self.active}"
             )
+        # Means are recovered before they are linearized at, so that Jacobians are up to date.
         state = recover_passive_means(state, self.recovered)
-        measured = associate_by_index(state.alive, scan)
-        state, index = _sparsify_and_activate(self, state, measured)
+        association = associate_by_index(state.alive, scan)
+        state, index = _sparsify_and_activate(self, state, association)
         state, omega, innovations, solved = _correct_active(
-            self, state, scan, index, measured.known
+            self, state, scan, index, association.matched
         )
         state = repeat_recovery(state, omega, solved, self.recovered, self.sweeps)
-        room = measured.new & measured.has_slot & solved
+        wanted = association.new & association.has_slot & solved
         state, omega, initialized = _initialize_active(
-            self, state, omega, scan, measured.slot, index, room
+            self, state, omega, scan, association.slot, index, wanted
         )
-        state = _finish_scan(state, scan, index, measured.has_slot, omega, solved)
-        return state, canonical.report(scan, measured, innovations, initialized)
+        state = _finish_scan(state, scan, index, association.has_slot, omega, solved)
+        return state, canonical.report(scan, association, innovations, initialized)
 
     def estimate(self, state: SparseState) -> Estimate:
-        marginals = whole_marginals if self.whole else blanket_marginals
+        marginals = whole_marginals if self.exact_marginals else blanket_marginals
         pose_cov, point_covs = marginals(state)
         unit = jnp.eye(2, dtype=point_covs.dtype)[None]
         alive = state.alive
@@ -154,23 +156,30 @@ class Seif(InformationFilter):
 
 
 def _sparsify_and_activate(
-    filter: Seif, state: SparseState, measured: TagAssociation
+    filter: Seif, state: SparseState, association: TagAssociation
 ) -> tuple[SparseState, Int[Array, "M"]]:
     """The state with all measured landmarks active, and their indices in the active set.
 
     Empty indices are assigned first, then those of the least recently measured landmarks, which
     are sparsified and become passive.
     """
-    matches = active_matches(state, measured)
-    enters = measured.has_slot & ~matches.any(axis=1)
+    matches = active_matches(state, association)
+    enters = association.has_slot & ~matches.any(axis=1)
     empty = state.active >= filter.capacity
+    # A measured landmark never leaves; an empty index comes before all.
     order = jnp.where(matches.any(axis=0), jnp.iinfo(jnp.int32).max, state.last_measured)
     order = jnp.where(empty, -1, order)
-    index, given = assign_indices(order, jnp.cumsum(enters) - 1, enters, matches)
-    leaving, most = given & ~empty, min(matches.shape)
+    index, assigned = assign_indices(order, jnp.cumsum(enters) - 1, enters, matches)
+    leaving, most = assigned & ~empty, min(matches.shape)
+    # In this order Ω stays positive definite. The cut replaces Ω by the information of
+    # p(m) p(x | m+), a density whatever links there are to passive landmarks (`sparsify`). It comes
+    # first: the lists have no entry for a link to the robot, so that deactivation would lose that
+    # link without a change of the diagonal blocks. Deactivation then moves blocks to the lists,
+    # where only `drop_link` changes Ω; it frees the indices to which activation moves the blocks
+    # of the landmarks that enter.
     state = cut_robot_links(state, leaving)
     state = deactivate(state, leaving, most, filter.conservative)
-    return activate(state, index, measured.slot, enters), index
+    return activate(state, index, association.slot, enters), index
 
 
 def _correct_active(
@@ -178,16 +187,16 @@ def _correct_active(
     state: SparseState,
     scan: Scan,
     index: Int[Array, "M"],
-    known: Bool[Array, "M"],
+    matched: Bool[Array, "M"],
 ) -> tuple[SparseState, Float[Array, "D D"], CanonicalInnovations, Bool[Array, ""]]:
     """The state with its mean corrected by measurements of active landmarks, Ω after them, their
     innovations, and whether the mean could be solved for."""
-    found = tag_innovation.innovations(
-        filter, state.omega, state.pose, active_means(state), scan, index, known
+    innovations = tag_innovation.innovations(
+        filter, state.omega, state.pose, active_means(state), scan, index, matched
     )
-    omega, residual = canonical.measurement_update(state.omega, active_residual(state), found)
-    state, solved = recover_active_means(state, omega, residual, found.omega_positive)
-    return state, omega, tag_innovation.refuse_unless(solved, found), solved
+    omega, residual = canonical.measurement_update(state.omega, active_residual(state), innovations)
+    state, solved = recover_active_means(state, omega, residual, innovations.omega_positive)
+    return state, omega, tag_innovation.refuse_unless(solved, innovations), solved
 
 
 def _initialize_active(
@@ -199,12 +208,12 @@ def _initialize_active(
     index: Int[Array, "M"],
     wanted: Bool[Array, "M"],
 ) -> tuple[SparseState, Float[Array, "D D"], Bool[Array, "M"]]:
-    """The state with new landmarks in their slots where wanted, Ω with them, and which were
-    started."""
+    """The state with new landmarks in their slots where wanted, Ω with them, and the mask of those
+    initialized."""
     omega, landmarks, initialized = canonical.initialize_landmarks(
         filter.sensor, omega, state.pose, scan.z, index, wanted
     )
-    into = jnp.where(initialized, slot, state.alive.shape[0])
+    into = jnp.where(initialized, slot, state.alive.shape[0])  # beyond the end: dropped
     state = state._replace(
         landmarks=state.landmarks.at[into].set(landmarks, mode="drop"),
         alive=state.alive.at[into].set(True, mode="drop"),
@@ -222,7 +231,7 @@ def _finish_scan(
 ) -> SparseState:
     """The state with Ω of the active block, with diagonal loading if not solved; one more scan.
 
-    index: where the measured landmarks are in the active set.
+    index: index of each measured landmark in the active set.
     """
     at = jnp.where(has_slot, index, state.active.shape[0])
     refused = state.counts.refused + (scan.valid.any() & ~solved).astype(jnp.int32)

@@ -39,9 +39,9 @@ class ApproximationCounts(NamedTuple):
     dropped: Int[Array, ""]
     """links between landmarks dropped, their lists being full (`sparse_state.drop_link`)"""
     dropped_links: Float[Array, ""]
-    """Σ |Ω_ij| (Frobenius) of the same"""
+    """Σ |Ω_ij| (Frobenius) of the dropped links"""
     anchored: Int[Array, ""]
-    """number of them dropped overconfidently, so that Ω stays positive definite"""
+    """links dropped overconfidently, so that Ω stays positive definite"""
     refused: Int[Array, ""]
     """scans refused because Ω of the active block was not positive definite"""
 
@@ -59,18 +59,19 @@ class SparseState(NamedTuple):
     active: Int[Array, "A"]
     """slots of the active landmarks, by their index in the dense block; N for none"""
     last_measured: Int[Array, "A"]
-    """the scan in which each was last measured"""
+    """the scan in which each active landmark was last measured"""
     omega: Float[Array, "D D"]
     """Ω of the robot and the active landmarks, D = 3 + 2A; unit diagonal at unused indices"""
     diagonal: Float[Array, "N 2 2"]
-    """diagonal blocks of Ω; of an active landmark the block in `omega` counts instead"""
+    """diagonal blocks of Ω of the passive landmarks; those of active landmarks are in `omega`"""
     neighbours: Int[Array, "N K"]
-    """slots of the landmarks that each is linked to, N for none"""
+    """slots of the landmarks to which each landmark is linked, N for none"""
     links: Float[Array, "N K 2 2"]
-    """Ω_ij of the same"""
+    """Ω_ij of the landmark and its neighbours"""
     next_recovered: Int[Array, ""]
     """the passive landmark whose mean is recovered next"""
     scans: Int[Array, ""]
+    """number of processed scans"""
     counts: ApproximationCounts
 
 
@@ -122,7 +123,7 @@ def with_active_residual(state: SparseState, residual: Float[Array, "D"]) -> Spa
 
 
 def linked_to_robot(omega: Float[Array, "D D"]) -> Bool[Array, "A"]:
-    """Which active landmarks are linked to the robot."""
+    """Mask of the active landmarks that are linked to the robot."""
     linked: Array = (omega[:3, 3:] != 0).any(axis=0).reshape(-1, 2).any(axis=1)
     return linked
 
@@ -153,8 +154,13 @@ def sparsify(
         Ω̃ = Ω - Ω F_m0 (..)⁻¹ F_m0ᵀ Ω + Ω F_x,m0 (..)⁻¹ F_x,m0ᵀ Ω - Ω F_x (..)⁻¹ F_xᵀ Ω,
 
     (..) the block of Ω that F selects. With G = Ω F_x - Ω F_m0 Ω_m0⁻¹ Ω_m0,x (D, 3) and Σ = F_xᵀ G,
-    the information of x given m+ and not m0, that is Ω + G Σ⁻¹ Gᵀ - Ω F_x Ω_x⁻¹ F_xᵀ Ω. Positive
-    definite as Ω is; ρ stays. I(x; m0 | m+) = (log|Ω_x| - log|Σ|)/2 [nats] is dropped. Ω̃ contains
+    the information of x given m+ after m0 is marginalized out, that is
+
+        Ω̃ = (Ω - Ω F_x Ω_x⁻¹ F_xᵀ Ω) + G Σ⁻¹ Gᵀ,
+
+    the information of p(m) of the map, x marginalized out, and of p(x | m+). A product of densities
+    is one: Ω̃ of the whole map is positive definite if Ω is, for x has no link to a passive
+    landmark. ρ does not change. I(x; m0 | m+) = (log|Ω_x| - log|Σ|)/2 [nats] is dropped. Ω̃ contains
     more information than Ω in some directions (it is overconfident there).
     """
     leaves = jnp.concatenate([jnp.zeros(3, bool), jnp.repeat(leaving, 2)])
@@ -168,7 +174,7 @@ def sparsify(
     new = omega + linalg.self_gram(root_sigma @ g.T) - linalg.self_gram(root_x @ by_robot.T)
     robot = jnp.arange(len(omega)) < 3
     cut = (leaves[:, None] & robot[None, :]) | (leaves[None, :] & robot[:, None])
-    # Of the inverse factors, hence of Σ⁻¹ and Ω_x⁻¹.
+    # The roots are inverse factors, so these are log-determinants of Σ⁻¹ and Ω_x⁻¹.
     nats = jnp.maximum(0.5 * (log_det_of(root_sigma) - log_det_of(root_x)), 0.0)
     any_leaves = leaving.any()
     return (
@@ -194,6 +200,7 @@ def psd_completion(
 
     The square root of a 2×2 matrix M is (M + √|M| I)/√(tr M + 2 √|M|), and √|B Bᵀ| = |det B|.
     """
+    # `square` is tr M + 2 √|M| of M = B Bᵀ or Bᵀ B, which have the same trace and determinant.
     det = jnp.abs(link[0, 0] * link[1, 1] - link[0, 1] * link[1, 0])
     square = (link**2).sum() + 2 * det
     nonzero = square > 0
@@ -221,6 +228,7 @@ def drop_link(
     them would lose half of its information in some direction, the link is dropped overconfidently.
     """
     u, v = psd_completion(link)
+    # Slot n is beyond the end: reads give 0, writes are dropped.
     n = diagonal.shape[0]
     i, j = jnp.where(on, i, n), jnp.where(on, j, n)
     sign = jnp.ones((), diagonal.dtype)

@@ -1,7 +1,4 @@
-"""Innovations of the information filters, after association by tags and the gate.
-
-With what these filters share: their models and options, checked where a filter is made.
-"""
+"""The base of the information filters, their association by tags, and their gated innovations."""
 
 import dataclasses
 from functools import partial
@@ -19,7 +16,6 @@ from jaxslam.core._numbers import check_count, check_gate, check_positive, gate_
 from jaxslam.core._record import record, static
 from jaxslam.core.protocols import Filter, Motion, Sensor
 from jaxslam.core.types import Scan
-from jaxslam.filters._reporting import seen_before
 from jaxslam.linearize._first_order import observe_jacobians, predicted_noise
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import Number
@@ -42,7 +38,7 @@ class InformationFilter(Filter):
     """landmark slots N; a new landmark in a full map is `Status.OVERFLOW`"""
     _: dataclasses.KW_ONLY
     gate: Number | None = None
-    """as for `EkfSlam`"""
+    """See `EkfSlam.gate`."""
     floor: Number = 1e-4
     """standard deviation [m, rad] added to a singular pose_cov, which has no inverse"""
     chart = Euclidean()
@@ -68,44 +64,44 @@ class InformationFilter(Filter):
 class TagAssociation(NamedTuple):
     """The landmarks of the M measurements of a scan; measurements without a tag have none."""
 
-    known: Bool[Array, "M"]
+    matched: Bool[Array, "M"]
     """the landmark is in the map"""
     new: Bool[Array, "M"]
-    """it is not, or its tag occurs earlier in the scan"""
+    """the landmark is not in the map, or its tag occurs earlier in the scan"""
     repeated: Bool[Array, "M"]
-    """its tag occurs earlier in the scan"""
+    """the tag occurs earlier in the scan"""
     has_slot: Bool[Array, "M"]
     """the landmark has a slot, or a slot is free for a new landmark"""
     slot: Int[Array, "M"]
-    """this slot; any number without a landmark"""
+    """slot of the landmark; any number without a landmark"""
 
 
 def associate_by_table(tag: Int[Array, "N"], alive: Bool[Array, "N"], scan: Scan) -> TagAssociation:
     """Association by a table of tags; new landmarks get the free slots, lowest first.
 
-    A known landmark may be measured twice in a scan.
+    A landmark of the map may be measured twice in a scan.
     """
     tagged = scan.valid & (scan.tag >= 0)
-    found_slot, found = slots.find(tag, alive, scan.tag)
-    known, new = tagged & found, tagged & ~found
-    repeated = new & seen_before(scan.tag, new)
-    free_slot, free = slots.allocate(alive, new & ~repeated)
-    slot = jnp.where(new, free_slot, found_slot)
-    return TagAssociation(known, new, repeated, known | free, slot)
+    slot, in_map = slots.find(tag, alive, scan.tag)
+    matched, new = tagged & in_map, tagged & ~in_map
+    repeated = new & slots.seen_before(scan.tag, new)
+    free_slot, granted = slots.allocate(alive, new & ~repeated)
+    slot = jnp.where(new, free_slot, slot)
+    return TagAssociation(matched, new, repeated, matched | granted, slot)
 
 
 def associate_by_index(alive: Bool[Array, "N"], scan: Scan) -> TagAssociation:
     """Association where a landmark's slot is its tag; measurements without a tag get slot N.
 
-    Of several measurements of one landmark the first is used, the others are REPEATED.
+    Of several measurements of one landmark the first is used; the rest is `Status.REPEATED`.
     """
     capacity = alive.shape[0]
     tagged = scan.valid & (scan.tag >= 0)
-    repeated = tagged & seen_before(scan.tag, tagged)
+    repeated = tagged & slots.seen_before(scan.tag, tagged)
     has_slot = tagged & ~repeated & (scan.tag < capacity)
     slot = jnp.where(has_slot, scan.tag, capacity).astype(jnp.int32)
-    known = has_slot & alive.at[slot].get(mode="fill", fill_value=False)
-    return TagAssociation(known, tagged & ~known, repeated, has_slot, slot)
+    matched = has_slot & alive.at[slot].get(mode="fill", fill_value=False)
+    return TagAssociation(matched, tagged & ~matched, repeated, has_slot, slot)
 
 
 class CanonicalInnovations(NamedTuple):
@@ -114,19 +110,17 @@ class CanonicalInnovations(NamedTuple):
     whitened_jacobian: Float[Array, "MZ D"]
     """N⁻¹ H, R = N Nᵀ; zero where not fused"""
     whitened: Float[Array, "MZ"]
-    """N⁻¹ ν of the same"""
-    compared: Bool[Array, "M"]
-    """of a landmark of the map, and compared with it"""
+    """N⁻¹ ν; zero where not fused"""
     positive: Bool[Array, "M"]
     """S, R and Ω are positive definite"""
     inside: Bool[Array, "M"]
-    """within the gate"""
+    """d² is within the gate"""
     innovation: Float[Array, "M Z"]
     """ν"""
     innovation_cov: Float[Array, "M Z Z"]
     """S of each measurement"""
     nis: Float[Array, "M"]
-    """of fused measurements given the earlier ones, of the others without them"""
+    """d² of a fused measurement given those before it in the scan, of another one by itself"""
     log_likelihood: Float[Array, "M"]
     """0 where not fused"""
     omega_positive: Bool[Array, ""]
@@ -134,13 +128,13 @@ class CanonicalInnovations(NamedTuple):
 
 
 def innovations(
-    settings: InformationFilter,
+    filter: InformationFilter,
     omega: Float[Array, "D D"],
     pose: Float[Array, "3"],
     landmarks: Float[Array, "A L"],
     scan: Scan,
     index: Int[Array, "M"],
-    known: Bool[Array, "M"],
+    matched: Bool[Array, "M"],
 ) -> CanonicalInnovations:
     """Gated innovations ν = z ⊖ ẑ, ẑ = h(x, l), and S = H Ω⁻¹ Hᵀ + R(ẑ); Ω is factored once.
 
@@ -148,41 +142,42 @@ def innovations(
     are all where Ω is not.
 
     Args:
-        index: the landmark of each measurement, where known.
+        index: the landmark of each measurement, where matched.
     """
-    sensor = settings.sensor
+    sensor = filter.sensor
     m, size = scan.z.shape
-    gamma = gate_quantile(settings.gate, size)
+    gamma = gate_quantile(filter.gate, size)
     z = jnp.where(scan.valid[:, None], scan.z, 0.0)
-    measured = landmarks[index]
-    z_hat = jax.vmap(sensor.observe, (None, 0))(pose, measured)
-    by_pose, by_landmark = jax.vmap(lambda at: observe_jacobians(sensor, pose, at))(measured)
-    innovation = jax.vmap(sensor.residual)(z, z_hat)
-    noise = jax.vmap(partial(predicted_noise, sensor))(z_hat, z, known)
+    landmark = landmarks[index]
+    z_hat = jax.vmap(sensor.observe, (None, 0))(pose, landmark)
+    by_pose, by_landmark = jax.vmap(partial(observe_jacobians, sensor, pose))(landmark)
+    nu = jax.vmap(sensor.residual)(z, z_hat)
+    noise = jax.vmap(partial(predicted_noise, sensor))(z_hat, z, matched)
     jacobian = stack_jacobians(by_pose, by_landmark, index, landmarks.shape[0])
 
+    # With Ω = L Lᵀ, H Ω⁻¹ Hᵀ = (L⁻¹ Hᵀ)ᵀ L⁻¹ Hᵀ, by measurements: axes (m, Z, m, Z).
     factor, omega_positive = linalg.cholesky(omega)
     half = linalg.solve_lower(factor, jacobian.T)
     same = jnp.eye(m, dtype=z.dtype)[:, None, :, None]
     joint_cov = (half.T @ half).reshape(m, size, m, size) + same * noise[:, :, None]
-    innovation_cov = joint_cov[jnp.arange(m), :, jnp.arange(m)]
-    alone = jax.vmap(gaussian_terms)(innovation, innovation_cov)
+    s = joint_cov[jnp.arange(m), :, jnp.arange(m)]
+    alone = jax.vmap(gaussian_terms)(nu, s)
     noise_factor, noise_positive = jax.vmap(linalg.cholesky)(noise)
     positive = alone.positive & noise_positive & omega_positive
     inside = jnp.isfinite(alone.distance) if gamma is None else alone.distance <= gamma
-    fused = known & inside & positive
+    fused = matched & inside & positive
 
-    fused_innovation = jnp.where(fused[:, None], innovation, 0.0)
-    nis, log_likelihood = _densities_in_turn(fused_innovation, joint_cov, fused)
+    fused_nu = jnp.where(fused[:, None], nu, 0.0)
+    nis, log_likelihood = _densities_in_turn(fused_nu, joint_cov, fused)
+    # N⁻¹ H and N⁻¹ ν, whose products add Hᵀ R⁻¹ H to Ω without an inverse of R.
     rows = jax.vmap(linalg.solve_lower)(noise_factor, jacobian.reshape(m, size, jacobian.shape[1]))
     return CanonicalInnovations(
         whitened_jacobian=jnp.where(fused[:, None, None], rows, 0.0).reshape(jacobian.shape),
-        whitened=jax.vmap(linalg.solve_lower)(noise_factor, fused_innovation).reshape(-1),
-        compared=known,
+        whitened=jax.vmap(linalg.solve_lower)(noise_factor, fused_nu).reshape(-1),
         positive=positive,
         inside=inside,
-        innovation=innovation,
-        innovation_cov=innovation_cov,
+        innovation=nu,
+        innovation_cov=s,
         nis=jnp.where(fused, nis, alone.distance),
         log_likelihood=jnp.where(fused, log_likelihood, 0.0),
         omega_positive=omega_positive,
@@ -197,8 +192,9 @@ def stack_jacobians(
 ) -> Float[Array, "MZ D"]:
     """The Jacobian H of M functions of pose and a landmark, index of `count`; D = 3 + count·L."""
     m, rows, size = by_landmark.shape
-    slots = jnp.arange(count, dtype=index.dtype)
-    at = (index[:, None] == slots[None, :]).astype(by_landmark.dtype)
+    columns = jnp.arange(count, dtype=index.dtype)
+    at = (index[:, None] == columns[None, :]).astype(by_landmark.dtype)
+    # Axes (measurement, row, landmark, parameter); the last two are the columns of the map.
     wide = jnp.einsum("mkl,ma->mkal", by_landmark, at).reshape(m, rows, count * size)
     return jnp.concatenate([by_pose, wide], axis=2).reshape(m * rows, 3 + count * size)
 
@@ -208,7 +204,10 @@ def _densities_in_turn(
     joint_cov: Float[Array, "M Z M Z"],
     fused: Bool[Array, "M"],
 ) -> tuple[Float[Array, "M"], Float[Array, "M"]]:
-    """The distance d² and log-density of each fused innovation given those before it."""
+    """The distance d² and log-density of each fused innovation given those before it.
+
+    With S = L Lᵀ of all fused measurements, L⁻¹ ν whitens each by those before it.
+    """
     m, size = innovation.shape
     both = fused[:, None, None, None] & fused[None, None, :, None]
     eye = jnp.eye(m * size, dtype=innovation.dtype)
@@ -220,9 +219,11 @@ def _densities_in_turn(
     return nis, log_density(nis, log_det, size)
 
 
-def refuse_unless(solved: Bool[Array, ""], of: CanonicalInnovations) -> CanonicalInnovations:
+def refuse_unless(
+    solved: Bool[Array, ""], innovations: CanonicalInnovations
+) -> CanonicalInnovations:
     """The innovations, all marked singular if the mean could not be solved for."""
-    return of._replace(
-        positive=of.positive & solved,
-        log_likelihood=jnp.where(solved, of.log_likelihood, 0.0),
+    return innovations._replace(
+        positive=innovations.positive & solved,
+        log_likelihood=jnp.where(solved, innovations.log_likelihood, 0.0),
     )

@@ -5,15 +5,14 @@ import dataclasses
 from jaxtyping import Array, Float
 
 from jaxslam.charts import Euclidean
-from jaxslam.core import _validation as validation
-from jaxslam.core._record import record
+from jaxslam.core._record import field, record
+from jaxslam.core._validation import check_models
 from jaxslam.core.protocols import Chart, Filter, Linearizer, Motion, Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan
-from jaxslam.filters._ekf.ekf_settings import EkfSettings, check_settings
-from jaxslam.filters._ekf.ekf_slam import initial_state
-from jaxslam.filters._ekf.map_coordinates import estimate_of
-from jaxslam.filters._ekf.predict import propagate
+from jaxslam.core.validation import instance_of
+from jaxslam.filters._ekf.checks import check_fit
+from jaxslam.filters._ekf.ekf_slam import EkfSlam
 from jaxslam.filters._reporting import nothing_of
 from jaxslam.linearize._first_order import AtEstimate
 
@@ -29,27 +28,27 @@ class DeadReckoning(Filter):
     motion: Motion
     sensor: Sensor
     _: dataclasses.KW_ONLY
-    chart: Chart = Euclidean()
-    linearize: Linearizer = AtEstimate()
+    chart: Chart = field(default=Euclidean(), check=instance_of(Chart))
+    linearize: Linearizer = field(default=AtEstimate(), check=instance_of(Linearizer))
 
     def __post_init__(self) -> None:
-        validation.check_models("DeadReckoning", self.motion, self.sensor)
-        validation.check_parts("DeadReckoning", self.chart, self.linearize)
-        check_settings("DeadReckoning", self._settings)
+        check_models("DeadReckoning", self.motion, self.sensor)
+        check_fit("DeadReckoning", self.sensor, self.chart, self.linearize)
         super().__post_init__()
 
     def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:
-        return initial_state(pose, pose_cov, 1, self._settings)
+        return self._ekf.init(pose, pose_cov)
 
     def predict(self, state: Joint, u: Float[Array, "U"], key: Array) -> Joint:
-        return propagate(state, u, self.motion, self._settings)[0]
+        return self._ekf.predict(state, u, key)
 
     def update(self, state: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
         return state, nothing_of(scan)
 
     def estimate(self, state: Joint) -> Estimate:
-        return estimate_of(state, self.sensor, self.chart)
+        return self._ekf.estimate(state)
 
     @property
-    def _settings(self) -> EkfSettings:
-        return EkfSettings(self.sensor, self.chart, self.linearize)
+    def _ekf(self) -> EkfSlam:
+        """The EKF whose prediction it is; its map of one slot stays empty."""
+        return EkfSlam(self.motion, self.sensor, 1, chart=self.chart, linearize=self.linearize)

@@ -1,29 +1,25 @@
 """EKF localization: the robot's pose in a known map."""
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any
+from functools import partial
+from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Int, PyTree
+from jaxtyping import Array, Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from jaxslam.association._rules import Known
+from jaxslam.association._rules import Known, predicted
 from jaxslam.charts import Euclidean
-from jaxslam.core import _validation as validation
-from jaxslam.core import slots
-from jaxslam.core._numbers import held_array, is_concrete
-from jaxslam.core._record import hold_function, record, set_field, static
+from jaxslam.core._numbers import gate_quantile
+from jaxslam.core._record import field, function_of, record, static
+from jaxslam.core._validation import check_models
 from jaxslam.core.protocols import (
-    NOTHING_FREE,
     Associate,
-    Association,
-    Basis,
     Chart,
     Filter,
-    Here,
+    LinearizationPoint,
     Linearizer,
     Motion,
     Prediction,
@@ -31,22 +27,17 @@ from jaxslam.core.protocols import (
 )
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan
-from jaxslam.filters._ekf.ekf_settings import (
-    CorrectionOrder,
-    Covariance,
-    EkfSettings,
-    check_covariance_form,
-    check_ekf_options,
-    check_iterations,
-)
-from jaxslam.filters._ekf.predict import propagate
-from jaxslam.filters._ekf.scan import SensorStage, update_by_scan
-from jaxslam.linearize._first_order import AtEstimate
+from jaxslam.core.validation import at_least, instance_of, one_of, or_none, probability
+from jaxslam.filters._ekf.checks import check_iterations
+from jaxslam.filters._ekf.correction import Correction, in_groups, no_correction
+from jaxslam.filters._ekf.ekf_slam import CorrectionOrder, associate_scan
+from jaxslam.filters._gaussian_correction import correct_gaussian
+from jaxslam.filters._known_map import hold_map, map_tags
+from jaxslam.filters._reporting import joined_info, nothing_of, report_scan
+from jaxslam.linearize._first_order import AtEstimate, predicted_noise
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import Number
-from jaxslam.sensors._suite import Suite, Wrapped
-
-Array = jax.Array
+from jaxslam.math._gaussians import gaussian_terms, log_density, log_det_of_pivots
 
 
 @record
@@ -58,7 +49,7 @@ class Localization(Filter):
     than by tags compares all landmarks. With a `sensors.Suite`, absolute sensors (compass, position
     fix) correct in the same update.
 
-    The state is a `slots.Joint` whose landmarks have no parameters. A measurement without a
+    The state is a `slots.Joint` of the map, whose P (3, 3) is the robot's. A measurement without a
     landmark in the map is `Status.UNMATCHED`.
 
     Raises ValueError on a map that is not finite (N, L), tags that are not N different numbers from
@@ -72,26 +63,29 @@ class Localization(Filter):
     _: dataclasses.KW_ONLY
     tags: tuple[int, ...] | None = static(default=None)
     """N different ones, in any form, as of a map of some landmarks; default the row numbers"""
-    chart: Chart = Euclidean()
+    chart: Chart = field(default=Euclidean(), check=instance_of(Chart))
     """the error coordinates of P; its pose part"""
-    linearize: Linearizer = AtEstimate()
+    linearize: Linearizer = field(default=AtEstimate(), check=instance_of(Linearizer))
     """one without a memory of landmarks (AtEstimate, Unscented)"""
-    associate: Associate = Known()
-    correction: CorrectionOrder = static(default="sequential")
-    gate: Number | None = None
-    iterations: int = static(default=1)
-    """these four as for `EkfSlam`"""
-    covariance: Covariance = static(default="plain")
-    """"plain" or "joseph", as there"""
+    associate: Associate = field(default=Known(), check=function_of("prediction", "scan"))
+    """see `EkfSlam.associate`"""
+    correction: CorrectionOrder = static(
+        default="sequential", check=one_of(*get_args(CorrectionOrder))
+    )
+    """see `EkfSlam.correction`"""
+    gate: Number | None = field(default=None, check=or_none(probability))
+    """see `EkfSlam.gate`"""
+    iterations: int = static(default=1, check=at_least(1))
+    """see `EkfSlam.iterations`"""
+    covariance: Literal["plain", "joseph"] = static(
+        default="plain", check=one_of("plain", "joseph")
+    )
+    """see `EkfSlam.covariance`"""
 
     def __post_init__(self) -> None:
         name, linearize = "Localization", self.linearize
-        validation.check_models(name, self.motion, self.sensor)
-        validation.check_parts(name, self.chart, linearize, self.associate)
-        hold_function(self, "associate", "prediction, scan")
+        check_models(name, self.motion, self.sensor)
         hold_map(self)
-        check_ekf_options(name, 1, self.correction, self.gate, self.iterations, None)
-        check_covariance_form(name, self.covariance, ("plain", "joseph"))
         if linearize.own_landmarks:
             raise ValueError(
                 f"{name}: the linearizer {linearize.name} is for estimated maps, not for a known "
@@ -105,174 +99,184 @@ class Localization(Filter):
         is_whole = self.tags is None and self.sensor.landmark
         return np.shape(self.landmarks)[0] if is_whole else None
 
-    def init(self, pose: Array, pose_cov: Array) -> Joint:
-        chart, capacity = _OfPose(self.chart), np.shape(self.landmarks)[0]
-        ground = jnp.zeros((capacity, 0), pose.dtype)
-        if chart.basis is not None:
-            undo = linalg.inverse(chart.basis(pose, ground[0]).pose)
+    def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:
+        landmarks, tags = jnp.asarray(self.landmarks, pose.dtype), map_tags(self)
+        if self.chart.basis is not None:
+            undo = linalg.inverse(self.chart.pose_basis(pose))
             pose_cov = undo @ pose_cov @ undo.T
-        joint = slots.empty(pose, pose_cov, capacity, 0, self.linearize.init(pose, ground))
-        return joint._replace(alive=jnp.ones(capacity, bool), tag=map_tags(self))
+        lin = self.linearize.init(pose, landmarks)
+        return Joint(pose, landmarks, pose_cov, jnp.ones(len(tags), bool), tags, lin)
 
-    def predict(self, state: Joint, u: Array, key: Array) -> Joint:
-        return propagate(state, u, self.motion, self._settings(self.sensor))[0]
+    def predict(self, state: Joint, u: Float[Array, "U"], key: Array) -> Joint:
+        point = LinearizationPoint(state, self.chart, state.pose, state.cov)
+        pose, f, noise, lin = self.linearize.motion(self.motion, u, point)
+        if self.chart.basis is not None:
+            undo = linalg.inverse(self.chart.pose_basis(pose))
+            f = linalg.matmul(linalg.matmul(undo, f), self.chart.pose_basis(state.pose))
+            noise = linalg.matmul(linalg.matmul(undo, noise), undo.T)
+        cov = linalg.symmetrize(linalg.matmul(linalg.matmul(f, state.cov), f.T) + noise)
+        return state._replace(pose=pose, cov=cov, lin=lin)
 
     def update(self, state: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
-        stages = [SensorStage(None, self._settings(self.sensor))]
-        if isinstance(self.sensor, Suite):
-            stages = [
-                SensorStage(
-                    part.places, None if part.sees == "robots" else self._settings(part.sensor)
-                )
-                for part in self.sensor.parts
-            ]
-        return update_by_scan(state, scan, stages)[:2]
+        infos = []
+        for sensor, part in self.sensor.scans(scan):
+            if sensor is None:
+                infos.append(nothing_of(part))
+                continue
+            # Padding may hold any number, and is multiplied by zero below.
+            part = part._replace(z=jnp.where(part.valid[:, None], part.z, 0.0))
+            association, matched = associate_scan(
+                self.associate,
+                sensor,
+                part,
+                lambda: _predict_map(self, sensor, state),  # noqa: B023
+            )
+            # A landmark that is not in the map starts none.
+            association = association._replace(is_new=jnp.zeros_like(association.is_new))
+            slot = jnp.maximum(association.slot, 0)
+            state, correction = _correct(self, sensor, state, part.z, slot, matched)
+            infos.append(report_scan(part, association, matched, correction))
+        return state, joined_info(infos, scan.z.shape[1])
 
     def estimate(self, state: Joint) -> Estimate:
-        cov, chart = state.cov, _OfPose(self.chart)
-        if chart.basis is not None:
-            basis = chart.basis(state.pose, state.landmarks[0]).pose
+        cov = state.cov
+        if self.chart.basis is not None:
+            basis = self.chart.pose_basis(state.pose)
             cov = basis @ cov @ basis.T
-        points = jnp.asarray(self.landmarks, state.pose.dtype)
         return Estimate(
             pose=state.pose,
             pose_cov=cov,
-            points=jax.vmap(self.sensor.position)(points),
-            point_covs=jnp.zeros((len(points), 2, 2), cov.dtype),
+            points=jax.vmap(self.sensor.position)(state.landmarks),
+            point_covs=jnp.zeros((len(state.landmarks), 2, 2), cov.dtype),
             alive=state.alive,
             tag=state.tag,
         )
 
-    def _settings(self, sensor: Sensor) -> EkfSettings:
-        """The settings for one sensor of known landmarks, or for an absolute sensor."""
-        absolute = not sensor.landmark
-        linearize = self.linearize if absolute else _OnMap(self.linearize, self.landmarks)
-        return EkfSettings(
-            sensor=_OfRobot(sensor),
-            chart=_OfPose(self.chart),
-            linearize=linearize,
-            associate=_NeverNew(self.associate),
-            correction=self.correction,
-            gate=self.gate,
-            iterations=self.iterations,
-            covariance=self.covariance,
-            births=0,
-            absolute=absolute,
-        )
+
+def _predict_map(filter: Localization, sensor: Sensor, state: Joint) -> Prediction:
+    """The `Prediction` of the map, whose landmarks have no errors: H_i P H_jᵀ by the pose alone."""
+
+    def linearize() -> tuple[Float[Array, "N Z"], Float[Array, "N Z 3"], Float[Array, "N Z Z"]]:
+        every_slot = jnp.arange(len(state.tag))
+        z_hat, h, rest = _linearize(filter, sensor, state, every_slot, state.pose)
+        if filter.chart.basis is not None:
+            h = h @ filter.chart.pose_basis(state.pose)
+        return z_hat, h, rest
+
+    def measurements() -> tuple[Float[Array, "N Z"], Float[Array, "N Z Z"]]:
+        z_hat, h, rest = linearize()
+        return z_hat, linalg.symmetrize(h @ state.cov @ h.transpose(0, 2, 1)) + rest
+
+    def cross() -> Float[Array, "N Z N Z"]:
+        h = linearize()[1]
+        return jnp.einsum("izx,xy,jwy->izjw", h, state.cov, h)
+
+    return predicted(sensor, state.tag, state.alive, measurements, cross)
 
 
-@record
-class _OnMap(Linearizer):
-    """A linearizer with the landmark of a slot as a constant of the sensor."""
+def _linearize(
+    filter: Localization,
+    sensor: Sensor,
+    state: Joint,
+    slot: Int[Array, "m"],
+    pose: Float[Array, "3"],
+) -> tuple[Float[Array, "m Z"], Float[Array, "m Z 3"], Float[Array, "m Z Z"]]:
+    """The predicted measurements of landmarks (m,) from a pose, H by its coordinates, and the
+    linearizer's addition to R."""
 
-    linearize: Linearizer
-    points: PyTree
+    def observe(
+        slot: Int[Array, ""], landmark: Float[Array, "L"]
+    ) -> tuple[Float[Array, "Z"], Float[Array, "Z 3"], Float[Array, "Z Z"]]:
+        point = LinearizationPoint(state, filter.chart, pose, state.cov, slot, landmark)
+        z_hat, by_pose, _, rest = filter.linearize.observe(sensor, point)
+        return z_hat, by_pose, rest
 
-    def init(self, pose: Array, landmarks: Array) -> PyTree:
-        return self.linearize.init(pose, landmarks)
-
-    def motion(self, motion: Motion, u: Array, here: Here) -> tuple[Array, Array, Array, PyTree]:
-        return self.linearize.motion(motion, u, here)
-
-    def observe(self, sensor: Sensor, here: Here) -> tuple[Array, Array, Array, Array]:
-        landmark = jnp.asarray(self.points, here.pose.dtype)[here.slot]
-        return self.linearize.observe(dataclasses.replace(sensor, known=landmark), here)
-
-    def invert(
-        self, sensor: Sensor, z: Array, tag: Array, here: Here
-    ) -> tuple[Array, Array, Array]:
-        return self.linearize.invert(sensor, z, tag, here)
+    return jax.vmap(observe)(slot, state.landmarks[slot])
 
 
-@record
-class _OfRobot(Wrapped):
-    """A sensor of a known landmark, as a sensor of the robot alone."""
+def _correct(
+    filter: Localization,
+    sensor: Sensor,
+    state: Joint,
+    z: Float[Array, "M Z"],
+    slot: Int[Array, "M"],
+    matched: Bool[Array, "M"],
+) -> tuple[Joint, Correction]:
+    """The state corrected by the whole scan at once, or by one measurement after the other."""
+    gamma = gate_quantile(filter.gate, len(sensor.measurements))
 
-    sensor: Sensor
-    known: PyTree = None
-    """(L,) the landmark; None of an absolute sensor"""
-    landmark = ()
-    free = NOTHING_FREE
+    def correct(
+        state: Joint,
+        measurements: tuple[Float[Array, "m Z"], Int[Array, "m"], Bool[Array, "m"]],
+    ) -> tuple[Joint, Correction]:
+        return _correct_at_once(filter, sensor, state, *measurements, gamma)
 
-    def observe(self, pose: Array, landmark: Array) -> Array:
-        return self.sensor.observe(pose, landmark if self.known is None else self.known)
-
-    def invert(self, pose: Array, z: Array, s: Array) -> Array:
-        return jnp.zeros(0, pose.dtype)
-
-    def position(self, landmark: Array) -> Array:
-        return jnp.zeros(2, landmark.dtype)
-
-    def embed(self, pose: Array, point: Array) -> Array:
-        return jnp.zeros(0, pose.dtype)
-
-
-@record
-class _OfPose(Chart):
-    """A chart restricted to the pose, for landmarks without parameters."""
-
-    chart: Chart
-
-    def retract(self, pose: Array, landmark: Array, dx: Array, dl: Array) -> tuple[Array, Array]:
-        at = self._ground(landmark)
-        return self.chart.retract(pose, at, dx, at)[0], landmark
-
-    def local(
-        self, pose0: Array, landmark0: Array, pose: Array, landmark: Array
-    ) -> tuple[Array, Array]:
-        at = self._ground(landmark)
-        return self.chart.local(pose0, at, pose, at)[0], jnp.zeros(0, landmark.dtype)
-
-    @property
-    def basis(self) -> Callable[[Array, Array], Basis] | None:
-        return None if self.chart.basis is None else self._basis
-
-    def _basis(self, pose: Array, landmark: Array) -> Basis:
-        by_pose = self.chart.basis(pose, self._ground(landmark)).pose
-        return Basis(by_pose, jnp.zeros((0, 3), pose.dtype), None)
-
-    def _ground(self, landmark: Array) -> Array:
-        size = 2 if self.chart.landmark_size is None else self.chart.landmark_size
-        return jnp.zeros(size, landmark.dtype)
+    if filter.correction == "joint" and len(z) > 0:
+        return correct(state, (z, slot, matched))
+    nothing = partial(no_correction, state._replace(landmarks=state.landmarks[:, :0]))
+    return in_groups(correct, state, (z, slot, matched), 1, partial(nothing, chart=Euclidean()))
 
 
-@record
-class _NeverNew:
-    """An association method that starts no landmark."""
+def _correct_at_once(
+    filter: Localization,
+    sensor: Sensor,
+    state: Joint,
+    z: Float[Array, "m Z"],
+    slot: Int[Array, "m"],
+    matched: Bool[Array, "m"],
+    gamma: Number | None,
+) -> tuple[Joint, Correction]:
+    """The state corrected by m measurements at once, Solà (26)-(30) with H by the pose alone.
 
-    associate: Associate
-
-    def __call__(self, prediction: Prediction, scan: Scan) -> Association:
-        found = Association(*self.associate(prediction, scan))
-        return found._replace(is_new=jnp.zeros_like(found.is_new))
-
-
-def hold_map(filter: Any) -> None:
-    """Check and hold the fields landmarks (N, L) and tags of a filter, in `__post_init__`.
-
-    Raises ValueError, which begins with its class, on invalid ones.
+    The gate, R(ẑ) and the reported numbers are those of the first iteration; see
+    `correction.correct`.
     """
-    name, landmarks, tags = type(filter).__name__, held_array(filter.landmarks), filter.tags
-    set_field(filter, "landmarks", landmarks)
-    size, shape = len(filter.sensor.landmark), np.shape(landmarks)
-    if len(shape) != 2 or shape[1] != size or shape[0] == 0:
-        raise ValueError(f"{name}: expected landmarks of shape (at least 1, {size}), got {shape}")
-    if not np.issubdtype(jnp.result_type(landmarks), np.number) or jnp.iscomplexobj(landmarks):
-        raise ValueError(f"{name}: expected a map of real numbers")
-    if is_concrete(landmarks) and not np.isfinite(np.asarray(landmarks)).all():
-        raise ValueError(f"{name}: the map is not finite")
-    if tags is None:
-        return
-    most, values = np.iinfo(np.int32).max, np.asarray(tags)
-    good = values.shape == shape[:1] and np.issubdtype(values.dtype, np.integer)
-    if not good or len(np.unique(values)) != shape[0] or values.min() < 0 or values.max() > most:
-        raise ValueError(
-            f"{name}: expected {shape[0]} different tags from 0 to {most}, got {tags!r}"
+    chart, (m, size_z) = filter.chart, z.shape
+    pose, xi = state.pose, jnp.zeros_like(state.pose)
+    for i in range(filter.iterations):
+        z_hat, h, rest = _linearize(filter, sensor, state, slot, pose)
+        nu, jacobian = jax.vmap(sensor.residual)(z, z_hat), h
+        if chart.basis is not None:
+            h = h @ jax.jacfwd(chart.retract_pose, argnums=1)(state.pose, xi)
+        if i == 0:
+            noise = jax.vmap(partial(predicted_noise, sensor))(z_hat, z, matched) + rest
+            s_ii = linalg.symmetrize(h @ state.cov @ h.transpose(0, 2, 1) + noise)
+            alone = jax.vmap(gaussian_terms)(nu, s_ii)
+            # A finite measurement whose d² overflows is outside any gate.
+            inside = jnp.isfinite(alone.distance) if gamma is None else alone.distance <= gamma
+            fuse = matched & inside & alone.positive
+            prior_nu = nu
+            # R of the scan, block diagonal: (m, Z, m, Z) as a (K, K) matrix, K = m·Z. A measurement
+            # that is not fused has ν = 0, H = 0 and R = 1, and so no effect on the others.
+            blocks = jnp.where(fuse[:, None, None], noise, jnp.eye(size_z, dtype=noise.dtype))
+            diagonal = jnp.eye(m, dtype=noise.dtype)[:, None, :, None] * blocks[:, :, None]
+            scan_noise = diagonal.reshape(m * size_z, m * size_z)
+        else:
+            nu = nu + h @ xi
+        correction = correct_gaussian(
+            jnp.where(fuse[:, None], nu, 0.0).reshape(-1),
+            jnp.where(fuse[:, None, None], h, 0.0).reshape(-1, 3),
+            state.cov,
+            scan_noise,
+            joseph=filter.covariance == "joseph",
         )
-    set_field(filter, "tags", tuple(values.tolist()))
-
-
-def map_tags(filter: Any) -> Int[Array, "N"]:
-    """The tags (N,) int32 of the known map of a filter."""
-    count = np.shape(filter.landmarks)[0]
-    return jnp.asarray(range(count) if filter.tags is None else filter.tags, jnp.int32)
+        if i == 0:
+            # NIS of fused measurements from their joint S, of the others from S_ii.
+            nis = (correction.terms.whitened.reshape(m, size_z) ** 2).sum(axis=1)
+            pivots = jnp.diagonal(correction.terms.factor).reshape(m, size_z)
+            positive = alone.positive & (pivots > 0).all(axis=1)
+            density = log_density(nis, log_det_of_pivots(pivots), size_z)
+            report = Correction(
+                z_hat=z_hat,
+                innovation=prior_nu,
+                innovation_cov=s_ii,
+                nis=jnp.where(fuse, nis, alone.distance),
+                log_likelihood=jnp.where(fuse & positive, density, 0.0),
+                inside=inside,
+                positive=positive,
+                jacobian=jacobian,
+                basis=None,
+            )
+        xi = correction.xi
+        pose = chart.retract_pose(state.pose, xi)
+    return state._replace(pose=pose, cov=correction.cov), report

@@ -17,7 +17,7 @@ from jaxslam.core.protocols import Associate, Filter, Life, Sensor, Wrapper
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.filters._particles.landmark_ekf import update_map
-from jaxslam.filters._particles.particle_settings import check_particle_map, particle_map_settings
+from jaxslam.filters._particles.particle_map import ParticleMapFilter
 from jaxslam.filters._particles.proposal import associate_particle, propose_pose
 from jaxslam.filters._particles.scan_association import zero_padding
 from jaxslam.filters._particles.slam_particles import (
@@ -31,7 +31,7 @@ from jaxslam.math.angles import wrap
 
 
 @record
-class Mapping(Filter):
+class Mapping(ParticleMapFilter):
     """A filter of the map for known poses (Williams): the control *is* the pose.
 
     Given the path, landmarks are independent: each has a separate EKF, l ← l + C Hᵀ S⁻¹ ν with
@@ -60,7 +60,6 @@ class Mapping(Filter):
 
     def __post_init__(self) -> None:
         validation.check_sensor("Mapping", self.sensor)
-        check_particle_map(self)
         super().__post_init__()
 
     def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> SlamParticles:
@@ -75,11 +74,11 @@ class Mapping(Filter):
         return state._replace(pose=jnp.concatenate([u[:2], wrap(u[2:])]))
 
     def update(self, state: SlamParticles, scan: Scan, key: Array) -> tuple[SlamParticles, Info]:
-        scan, settings = zero_padding(scan), particle_map_settings(self)
-        association = associate_particle(state, scan, settings)
+        scan = zero_padding(scan)
+        association = associate_particle(self, state, scan)
         # The pose is known, so the proposal does not change it; the other results are used.
-        proposed, innovations = propose_pose(state, association, scan, settings)
-        state, info = update_map(state, association, innovations, scan, settings)
+        proposed, innovations = propose_pose(self, state, association, scan)
+        state, info = update_map(self, state, association, innovations, scan)
         return state, info._replace(log_likelihood=proposed.log_matched)
 
     def estimate(self, state: SlamParticles) -> Estimate:

@@ -1,29 +1,23 @@
 """FastSLAM 1.0 and 2.0: particles for the robot's path, and a small EKF for each landmark."""
 
 import dataclasses
-from collections.abc import Callable
 from functools import partial
-from typing import Literal, TypeVar
+from typing import Literal
 
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool, Float, Int, PyTree
+from jaxtyping import Bool, Float, Int
 
 from jaxslam.association._rules import Known
 from jaxslam.charts import Euclidean
 from jaxslam.core import _validation as validation
 from jaxslam.core._record import record, static
-from jaxslam.core.protocols import Associate, Differentiable, Filter, Life, Motion, Resample, Sensor
+from jaxslam.core.protocols import Associate, Differentiable, Life, Motion, Resample, Sensor
 from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.filters._particles.landmark_ekf import update_map
-from jaxslam.filters._particles.particle_settings import (
-    ParticleMapSettings,
-    check_particle_map,
-    check_resampling,
-    particle_map_settings,
-)
-from jaxslam.filters._particles.pose_particles import weighted_nis
+from jaxslam.filters._particles.particle_map import ParticleMapFilter
+from jaxslam.filters._particles.pose_particles import check_resampling, weighted_nis
 from jaxslam.filters._particles.proposal import (
     PoseProposal,
     associate_particle,
@@ -45,11 +39,9 @@ from jaxslam.math._arrays import Number
 from jaxslam.resampling._methods import systematic
 from jaxslam.resampling._weights import normalized, resampled_where
 
-_T = TypeVar("_T")
-
 
 @record
-class FastSlam(Filter):
+class FastSlam(ParticleMapFilter):
     """FastSLAM: weighted particles for the posterior of the path, and for each path independent
     landmark Gaussians (exact except for linearization). The state is a
     `SlamParticles`.
@@ -64,18 +56,18 @@ class FastSlam(Filter):
     get different poses.
 
     Resampling happens in steps with ESS = 1/Σ w² below threshold·P. Where all weights underflow,
-    all become 1/P and `ParticleInfo.underflow` is set; the log-likelihood, -∞, is then given as 0,
-    so `underflow` must be checked in a sum of log-likelihoods. A particle that a motion or a scan
+    all become 1/P and `ParticleInfo.underflow` is set; the log-likelihood, -∞, is then 0, so
+    `underflow` must be checked in a sum of log-likelihoods. A particle that a motion or a scan
     leaves without a finite pose keeps its previous pose, with weight zero (`ParticleInfo.invalid`).
 
-    The measurements in an `Info` are those of the most likely particle (by its weight before
-    resampling), whose slots are those of the estimate; its innovations are given its path, with the
-    covariance of a pose not drawn yet in 2.0. Only nis is the mean over the particles by their
-    weights after the scan: of a consistent filter that is dof, E_z Σ_p (w_p N_p(z)/p(z)) d²_p =
-    Σ_p w_p E_{N_p} d²_p, while that of the most likely particle is biased low by selection. Its
-    log_likelihood is that of the scan given all before, log Σ w p(scan | particle), of the
-    measurements that a particle has landmarks for. `info.extra["particles"]` is a `ParticleInfo`.
-    Estimates: `slam_estimate`.
+    An `Info` reports the measurements of the most likely particle (by its weight before
+    resampling), whose slots the estimate has. Innovations are conditional on the path of this
+    particle; in 2.0 their covariance includes that of the pose, which is not drawn yet. Only nis is
+    the mean over the particles by their weights after the scan: its expectation in a consistent
+    filter is dof, E_z Σ_p (w_p N_p(z)/p(z)) d²_p = Σ_p w_p E_{N_p} d²_p, while the nis of the most
+    likely particle is biased low by selection. log_likelihood is log Σ w p(scan | particle) given
+    all earlier scans, of the measurements that a particle has landmarks for.
+    `info.extra["particles"]` is a `ParticleInfo`. Estimates: `slam_estimate`.
 
     Raises ValueError on a capacity, particles or births below 1, a threshold outside [0, 1], a gate
     not above 0 and below 1, an unknown proposal, an invalid life or resample, or a
@@ -92,17 +84,19 @@ class FastSlam(Filter):
     """P, at least 1"""
     _: dataclasses.KW_ONLY
     proposal: Literal["motion", "measurement"] = static(default="measurement")
-    """what poses are drawn from"""
+    """distribution from which poses are drawn"""
     resample: Resample | Differentiable = systematic
     """one of `jaxslam.resampling`. Through `StopGradient` of one, the gradient of
     `Info.log_likelihood` is consistent; through `Soft` it is biased, and more so without either,
     since the effect of resampling is then ignored"""
     threshold: Number = 0.5
-    """of ESS, as a share of P; 0 never resamples, 1 in every step with unequal weights"""
+    """ESS below which to resample, as a share of P; 0 never resamples, 1 in every step with unequal
+    weights"""
     associate: Associate = Known()
-    """other methods associate by each particle's map"""
+    """the landmark of each measurement; a method other than `Known` decides by each particle's
+    map"""
     gate: Number | None = None
-    """as for `EkfSlam`"""
+    """See `EkfSlam.gate`."""
     births: int | None = static(default=None)
     """largest number of new landmarks a scan and particle, the rest `Status.DEFERRED`"""
     life: Life | None = None
@@ -114,12 +108,11 @@ class FastSlam(Filter):
     def __post_init__(self) -> None:
         validation.check_models("FastSlam", self.motion, self.sensor)
         validation.check_count("FastSlam: particles", self.particles)
+        check_resampling(self)
         if self.proposal not in ("motion", "measurement"):
             raise ValueError(
                 f'FastSlam: expected proposal "motion" or "measurement", got {self.proposal!r}'
             )
-        check_resampling(self)
-        check_particle_map(self)
         super().__post_init__()
 
     def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> SlamParticles:
@@ -139,38 +132,59 @@ class FastSlam(Filter):
         return with_finite_poses(state, moved, jnp.zeros_like(state.pose_cov))
 
     def update(self, state: SlamParticles, scan: Scan, key: Array) -> tuple[SlamParticles, Info]:
-        each = partial(_of_each_particle, zero_padding(scan), particle_map_settings(self))
+        scan = zero_padding(scan)
         key_resample, key_draw = jax.random.split(key)
-        state = state._replace(best=None)
-        association = each(associate_particle, state)
-        proposed, innovations = each(propose_pose, state, association)
-        state = with_finite_poses(state, proposed.pose, proposed.pose_cov)
-        weight, log_likelihood, some = _weight_particles(state, proposed)
-        nis = weighted_nis(innovations.nis, association.matched, weight)
-        ess = 1.0 / jnp.exp(2 * weight).sum()
-        due = ess < self.threshold * self.particles
-        found = ParticleInfo(ess, resampled=due, underflow=~some, invalid=state.invalid.sum())
-        (state, association, innovations, before), weight = resampled_where(
-            due, (state, association, innovations, weight), weight, self.resample, key_resample
+        state = state._replace(best=None)  # a number of the whole state: nothing to map over
+        association = jax.vmap(partial(associate_particle, self, scan=scan))(state)
+        proposal, innovations = jax.vmap(partial(propose_pose, self, scan=scan))(state, association)
+        state = with_finite_poses(state, proposal.pose, proposal.pose_cov)
+        log_weight, log_likelihood, underflow = _weigh(state, proposal)
+        nis = weighted_nis(innovations.nis, association.matched, log_weight)
+        ess = 1.0 / jnp.exp(2 * log_weight).sum()
+        resampled = ess < self.threshold * self.particles
+        particles = ParticleInfo(ess, resampled, underflow, invalid=state.invalid.sum())
+        # The weight is marginal over the pose, so resampling comes before the draw: copies of one
+        # particle get different poses. Association and innovations move with their particle.
+        (state, association, innovations, weight_before), log_weight = resampled_where(
+            resampled,
+            (state, association, innovations, log_weight),
+            log_weight,
+            self.resample,
+            key_resample,
         )
-        state = _with_drawn_poses(state._replace(log_weight=weight), key_draw)
-        state, infos = each(update_map, state, association, innovations)
-        best = jnp.argmax(before).astype(jnp.int32)
-        info = _report_best(infos, best, nis, log_likelihood, association.exhausted)
-        return state._replace(best=best), with_extra(info, "particles", found)
+        state = _draw(state._replace(log_weight=log_weight), key_draw)
+        state, infos = jax.vmap(partial(update_map, self, scan=scan))(
+            state, association, innovations
+        )
+        # After resampling all weights are equal.
+        best = jnp.argmax(weight_before).astype(jnp.int32)
+        info = _report(infos, best, nis, log_likelihood, association.exhausted)
+        return state._replace(best=best), with_extra(info, "particles", particles)
 
     def estimate(self, state: SlamParticles) -> Estimate:
         return slam_estimate(state, self.sensor)
 
 
-def _of_each_particle(
-    scan: Scan, settings: ParticleMapSettings, step: Callable[..., _T], *of_particles: PyTree
-) -> _T:
-    """The results of step(*of_particle, scan=…, settings=…) for every particle."""
-    return jax.vmap(partial(step, scan=scan, settings=settings))(*of_particles)
+def _weigh(
+    state: SlamParticles, proposal: PoseProposal
+) -> tuple[Float[Array, "P"], Float[Array, ""], Bool[Array, ""]]:
+    """Log-weights log w_p p(scan | particle) with Σ w = 1, the log-likelihood of the measurements
+    with landmarks, and whether all weights underflowed."""
+    log_matched = state.log_weight + proposal.log_matched
+    log_weight, _, some = normalized(log_matched + proposal.log_unmatched)
+    return log_weight, normalized(log_matched)[1], ~some
 
 
-def _report_best(
+def _draw(state: SlamParticles, key: Array) -> SlamParticles:
+    """The state with each pose drawn from its Gaussian, all finite."""
+    return state._replace(
+        pose=draw_poses(state, key),
+        pose_cov=jnp.zeros_like(state.pose_cov),
+        invalid=jnp.zeros_like(state.invalid),
+    )
+
+
+def _report(
     infos: Info,
     best: Int[Array, ""],
     nis: Float[Array, "M"],
@@ -178,28 +192,9 @@ def _report_best(
     exhausted: Bool[Array, "P"],
 ) -> Info:
     """The `Info` of the best particle of `infos`, with the numbers of all particles."""
-    info: Info = jax.tree.map(lambda of_all: of_all[best], infos)
+    info: Info = jax.tree.map(lambda leaf: leaf[best], infos)
     return info._replace(
         nis=jnp.where(has_distance(info.status), nis, 0.0),
         log_likelihood=log_likelihood,
         exhausted=exhausted.any(),
-    )
-
-
-def _weight_particles(
-    state: SlamParticles, proposed: PoseProposal
-) -> tuple[Float[Array, "P"], Float[Array, ""], Bool[Array, ""]]:
-    """Log-weights log w_p p(scan | particle) with Σ w = 1, the log-likelihood of measurements with
-    landmarks, and whether any weight was left."""
-    seen = state.log_weight + proposed.log_matched
-    weight, _, some = normalized(seen + proposed.log_unmatched)
-    return weight, normalized(seen)[1], some
-
-
-def _with_drawn_poses(state: SlamParticles, key: Array) -> SlamParticles:
-    """The state with each pose drawn from its Gaussian, all finite."""
-    return state._replace(
-        pose=draw_poses(state, key),
-        pose_cov=jnp.zeros_like(state.pose_cov),
-        invalid=jnp.zeros_like(state.invalid),
     )

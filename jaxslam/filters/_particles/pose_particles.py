@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam.core._numbers import held_array, is_concrete
-from jaxslam.core._record import record, set_field
+from jaxslam.core._record import hold_function, record, set_field
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._xla import change_where
 from jaxslam.math.angles import wrap
@@ -25,9 +25,9 @@ def weighted_nis(
     nis: Float[Array, "P M"], matched: Bool[Array, "P M"], log_weight: Float[Array, "P"]
 ) -> Float[Array, "M"]:
     """The weighted mean NIS of each measurement, over the particles that associate it."""
-    share = jnp.where(matched, jnp.exp(log_weight)[:, None], 0.0)
-    whole = share.sum(axis=0)
-    return (share * nis).sum(axis=0) / jnp.where(whole > 0, whole, 1.0)
+    weight = jnp.where(matched, jnp.exp(log_weight)[:, None], 0.0)
+    total = weight.sum(axis=0)
+    return (weight * nis).sum(axis=0) / jnp.where(total > 0, total, 1.0)
 
 
 def weighted_pose_moments(
@@ -53,7 +53,7 @@ def weighted_pose_moments(
     xy = (w[:, None] * pose[:, :2]).sum(axis=0)
     # Headings that cancel have no mean; then the heading of the most likely particle is used.
     sine, cosine = (w * jnp.sin(pose[:, 2])).sum(), (w * jnp.cos(pose[:, 2])).sum()
-    # Sums of P terms of random rounding; P headings at random leave 1/√P.
+    # Sums of P terms of random rounding, 8 standard deviations; P headings at random leave 1/√P.
     rounding = 8 * len(w) ** 0.5 * float(jnp.finfo(w.dtype).eps)
     cancel = sine**2 + cosine**2 < rounding**2
     heading = pose[best, 2]
@@ -66,6 +66,7 @@ def weighted_pose_moments(
     d = jnp.concatenate([d[:, :2], wrap(d[:, 2:])], axis=1)
     spread = (w[:, None, None] * d[:, :, None] * d[:, None, :]).sum(axis=0)
     complement = (w * (1 - w)).sum()  # 1 - Σw², without cancelling
+    # One particle leaves a few eps of rounding in Σ w = 1.
     several = complement > 8 * jnp.finfo(w.dtype).eps
     factor = (2 - complement) / jnp.where(several, complement, 1.0)
     return mean, jnp.where(several, factor, 1.0) * spread
@@ -79,7 +80,7 @@ class Region:
         raise NotImplementedError
 
     def moments(self, dtype: DTypeLike) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-        """The mean and the covariance of a pose drawn."""
+        """Mean and covariance of a drawn pose."""
         raise NotImplementedError
 
 
@@ -90,10 +91,17 @@ class Box(Region):
     ends: ArrayLike
 
     def draw(self, count: int, key: Array, dtype: DTypeLike) -> Float[Array, "P 3"]:
-        return draw_uniform_poses(jnp.asarray(self.ends, dtype), count, key)
+        low, high = jnp.asarray(self.ends, dtype)[:, None]
+        share = jax.random.uniform(key, (count, 3), dtype)
+        heading = wrap(2 * math.pi * share[:, 2:])
+        return jnp.concatenate([low + (high - low) * share[:, :2], heading], axis=1)
 
     def moments(self, dtype: DTypeLike) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-        return uniform_pose_moments(jnp.asarray(self.ends, dtype))
+        low, high = jnp.asarray(self.ends, dtype)
+        mean = jnp.concatenate([0.5 * (low + high), jnp.zeros(1, dtype)])
+        # A uniform variable has the variance width²/12, the heading (2π)²/12 about 0.
+        variance = jnp.concatenate([(high - low) ** 2, jnp.full(1, 4 * math.pi**2, dtype)]) / 12
+        return mean, jnp.diag(variance)
 
 
 def hold_box(filter: Any) -> None:
@@ -116,22 +124,13 @@ def hold_box(filter: Any) -> None:
     set_field(filter, "box", ends)
 
 
-def draw_uniform_poses(box: Float[Array, "2 2"], count: int, key: Array) -> Float[Array, "P 3"]:
-    """Poses drawn uniformly in a box, rows its lowest and highest (x, y), with any heading."""
-    share = jax.random.uniform(key, (count, 3), box.dtype)
-    low, high = box[0][None], box[1][None]
-    heading = wrap(2 * math.pi * share[:, 2:])
-    return jnp.concatenate([low + (high - low) * share[:, :2], heading], axis=1)
-
-
-def uniform_pose_moments(
-    box: Float[Array, "2 2"],
-) -> tuple[Float[Array, "3"], Float[Array, "3 3"]]:
-    """Mean and covariance of `draw_uniform_poses`; the heading, uniform, gets 0 ± π/√3."""
-    width = box[1] - box[0]
-    mean = jnp.concatenate([0.5 * (box[0] + box[1]), jnp.zeros(1, box.dtype)])
-    variance = jnp.concatenate([width**2, jnp.full(1, 4 * math.pi**2, box.dtype)]) / 12
-    return mean, jnp.diag(variance)
+def check_resampling(filter: Any) -> None:
+    """Check the fields resample and threshold in a filter's `__post_init__`."""
+    hold_function(filter, "resample", "log_weights, key")
+    threshold = filter.threshold
+    if is_concrete(threshold) and not 0 <= threshold <= 1:
+        name = type(filter).__name__
+        raise ValueError(f"{name}: expected a threshold from 0 to 1, got {threshold}")
 
 
 class ParticleEvents(NamedTuple):
@@ -139,11 +138,11 @@ class ParticleEvents(NamedTuple):
 
     resampled: Bool[Array, ""]
     injected: Int[Array, ""]
-    """drawn from the whole region"""
+    """particles drawn from the whole region"""
     invalid: Int[Array, ""]
-    """with a non-finite pose after the motion"""
+    """particles with a non-finite pose after the motion"""
     capped: Bool[Array, ""]
-    """more particles were wanted than there may be"""
+    """the wanted number of particles was above the capacity"""
 
 
 class PoseParticles(NamedTuple):
@@ -155,24 +154,24 @@ class PoseParticles(NamedTuple):
     """Σ exp = 1, -inf where not in use"""
     active: Int[Array, ""]
     best: Int[Array, ""]
-    """the most likely particle"""
+    """index of the most likely particle"""
     fresh: Bool[Array, ""]
-    """nothing was drawn yet"""
+    """the start is not drawn yet"""
     start_cov: Float[Array, "3 3"]
-    """of the start while it is not drawn yet, then zero"""
+    """covariance of the start while it is not drawn yet, then zero"""
     fast: Float[Array, ""]
     """short-term average of the scans' likelihood, in units of its peak"""
     slow: Float[Array, ""]
-    """long-term average of the same; both 0 before the first scan"""
+    """long-term average of the likelihood; both averages are 0 before the first scan"""
     due: Bool[Array, ""]
-    """to be resampled before the next motion"""
+    """the particles are to be resampled before the next motion"""
     injection: Float[Array, ""]
-    """the probability of each particle to be drawn from the whole region then"""
+    """probability that resampling draws a particle from the whole region"""
     events: ParticleEvents
 
 
 def no_events() -> ParticleEvents:
-    """The record of no events."""
+    """`ParticleEvents` of a step without any."""
     no, none = jnp.asarray(False), jnp.zeros((), jnp.int32)
     return ParticleEvents(resampled=no, injected=none, invalid=none, capped=no)
 
@@ -207,20 +206,21 @@ def initial_pose_particles(
 def draw_start(state: PoseParticles, key: Array, region: Region | None) -> PoseParticles:
     """The state with its initial poses drawn, if not done before; from a region, where given."""
 
-    def drawn(poses: Float[Array, "P 3"]) -> Float[Array, "P 3"]:
+    def draw(poses: Float[Array, "P 3"]) -> Float[Array, "P 3"]:
         if region is not None:
             return region.draw(len(poses), key, poses.dtype)
-        return _draw_gaussian_poses(poses, state.start_cov, key)
+        normals = jax.random.normal(key, poses.shape, poses.dtype)
+        return jax.vmap(draw_pose, (0, None, 0))(poses, state.start_cov, normals)
 
     return state._replace(
-        pose=change_where(state.fresh, drawn, state.pose),
+        pose=change_where(state.fresh, draw, state.pose),
         start_cov=jnp.zeros_like(state.start_cov),
         fresh=jnp.asarray(False),
     )
 
 
 def active_mask(state: PoseParticles) -> Bool[Array, "P"]:
-    """Which particles are in use."""
+    """Mask of the particles in use."""
     return jnp.arange(state.pose.shape[0], dtype=state.active.dtype) < state.active
 
 
@@ -230,14 +230,6 @@ def pose_particle_moments(
     """Mean and covariance of the pose: `weighted_pose_moments`, or those of the undrawn start."""
     mean, spread = weighted_pose_moments(state.pose, state.log_weight, state.best)
     return mean, spread + state.start_cov
-
-
-def _draw_gaussian_poses(
-    pose: Float[Array, "P 3"], cov: Float[Array, "3 3"], key: Array
-) -> Float[Array, "P 3"]:
-    """Poses drawn from N(pose_p, cov); cov may be singular or zero."""
-    normals = jax.random.normal(key, pose.shape, pose.dtype)
-    return jax.vmap(draw_pose, (0, None, 0))(pose, cov, normals)
 
 
 def draw_pose(

@@ -5,7 +5,7 @@ Recovery: Thrun, Burgard & Fox, "Probabilistic Robotics", table 8.3, augmented M
 
 import dataclasses
 import math
-from typing import Any, Literal, NamedTuple
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -19,12 +19,12 @@ from jaxslam.core._numbers import is_concrete
 from jaxslam.core._record import record, static
 from jaxslam.core.protocols import Differentiable, Filter, Motion, Resample
 from jaxslam.core.types import Estimate
-from jaxslam.filters._particles.particle_settings import check_resampling
 from jaxslam.filters._particles.pose_particles import (
     ParticleEvents,
     PoseParticles,
     Region,
     active_mask,
+    check_resampling,
     draw_start,
     hold_box,
     initial_pose_particles,
@@ -50,17 +50,18 @@ def update_averages(
     While no particle has had a weight, there is no average, and all particles are drawn again.
 
     Args:
-        misfit: of each particle: Σ d²/2, or the negative log-likelihood of the scan; a constant
+        misfit: Σ d²/2 of each particle, or the negative log-likelihood of the scan; a constant
             does not matter, since only the ratio of the averages does.
-        measured: how many measurements the scan has.
-        rates: of the long-term and of the short-term average; None injects nothing.
+        measured: number of measurements of the scan.
+        rates: α_slow and α_fast of the averages; None injects nothing.
     """
     if rates is None:
         return state._replace(injection=jnp.zeros_like(state.fast))
     finite = jnp.isfinite(misfit)
     exponent = -jnp.where(finite, misfit, 0.0) / jnp.maximum(measured, 1).astype(misfit.dtype)
-    each = jnp.where(finite, jnp.exp(exponent), 0.0)
-    fit = jax.lax.stop_gradient((jnp.exp(state.log_weight) * each).sum())
+    likelihood = jnp.where(finite, jnp.exp(exponent), 0.0)
+    # A random choice, injection, follows from the averages: it has no derivative.
+    fit = jax.lax.stop_gradient((jnp.exp(state.log_weight) * likelihood).sum())
     first = state.slow <= 0
     slow, fast = (
         jnp.where(first, fit, before + jnp.asarray(rate, fit.dtype) * (fit - before))
@@ -77,23 +78,17 @@ def update_averages(
     )
 
 
-class _DrawnPoses(NamedTuple):
-    """P resampled or injected poses, in random order."""
-
-    pose: Float[Array, "P 3"]
-    log_weight: Float[Array, "P"]
-    injected: Bool[Array, "P"]
-    """drawn from the whole region"""
-
-
 def resample_and_inject(
     state: PoseParticles,
     key: Array,
     resample: Resample | Differentiable,
     region: Region | None,
-) -> _DrawnPoses:
-    """Poses resampled by weight or, with the state's injection probability, drawn from a
-    region."""
+) -> tuple[Float[Array, "P 3"], Float[Array, "P"], Bool[Array, "P"]]:
+    """Poses resampled by weight or, with the state's injection probability, drawn from a region.
+
+    Returns:
+        P poses in random order, their log-weights, and the mask of those drawn from the region.
+    """
     particles = len(state.pose)
     key_resample, key_order, key_which, key_anywhere = jax.random.split(key, 4)
     ancestor, log_weight = survivors(resample, state.log_weight, key_resample)
@@ -101,10 +96,10 @@ def resample_and_inject(
     order = jax.random.permutation(key_order, particles)
     pose, log_weight = state.pose[ancestor[order]], log_weight[order]
     if region is None:
-        return _DrawnPoses(pose, log_weight, jnp.zeros(particles, bool))
+        return pose, log_weight, jnp.zeros(particles, bool)
     injected = jax.random.uniform(key_which, (particles,), pose.dtype) < state.injection
     anywhere = region.draw(particles, key_anywhere, pose.dtype)
-    return _DrawnPoses(
+    return (
         jnp.where(injected[:, None], anywhere, pose),
         jnp.where(injected, -math.log(particles), log_weight),
         injected,
@@ -114,14 +109,14 @@ def resample_and_inject(
 # The default least number of particles.
 _LEAST = 50
 
-# The bound on their number: with this confidence the Kullback-Leibler divergence is below the
-# error, by bins of these sizes in x [m], y [m], θ [rad] (Fox 2003).
+# The bound on the number of particles: with this confidence the Kullback-Leibler divergence is
+# below the error, by bins of these sizes in x [m], y [m], θ [rad] (Fox 2003).
 _BINS = (0.5, 0.5, math.radians(15))
 _ERROR, _CONFIDENCE = 0.05, 0.99
 
 
 class _Particles(Filter):
-    """What a subclass of `MonteCarloFilter` declares."""
+    """The declarations of a subclass of `MonteCarloFilter`."""
 
     motion: Motion
     particles: int
@@ -132,7 +127,7 @@ class _Particles(Filter):
 
 @record
 class MonteCarloFilter(_Particles):
-    """What particle filters in a known map share: start, number, resampling and recovery.
+    """A particle filter in a known map: start, number of particles, resampling and recovery.
 
     Raises ValueError on counts below 1 or least above particles, a box that is not finite or has no
     inside, start "uniform" without a region, a threshold outside [0, 1], or invalid rates.
@@ -147,12 +142,13 @@ class MonteCarloFilter(_Particles):
     resample: Resample | Differentiable = systematic
     """one of `jaxslam.resampling`; also `Soft` or `StopGradient` of one"""
     threshold: Number = 1.0
-    """of ESS, as a share; 1 resamples (and chooses the number) in every step with unequal weights,
-    0 only to inject. If odometry is more precise than the scans, copies stay together, and a lower
-    threshold gives a more consistent covariance"""
+    """ESS below which to resample, as a share of the particles in use; 1 resamples (and chooses
+    their number) in every step with unequal weights, 0 only to inject. If odometry is more precise
+    than the scans, copies stay together, and a lower threshold makes the covariance more
+    consistent"""
     least: int | None = static(default=None)
-    """never fewer particles; default 50, or the capacity if that is less. As many as the capacity:
-    a fixed number"""
+    """least number of particles in use; default 50, or the capacity if that is less. With
+    least = particles their number is fixed"""
     forget: tuple[Number, Number] | None = (0.01, 0.1)
     """α_slow, α_fast with 0 < α_slow <= α_fast <= 1; None injects nothing"""
     chart = Euclidean()
@@ -191,17 +187,19 @@ class MonteCarloFilter(_Particles):
         key_start, key_renew, key_noise = jax.random.split(key, 3)
         state = draw_start(state, key_start, self._start_region)
         due = state.due
-        drawn = resample_and_inject(
+        resampled, weight_resampled, injected = resample_and_inject(
             state, key_renew, self.resample, None if self.forget is None else self.region
         )
-        old = jnp.where(due, drawn.pose, state.pose)
+        # Copies of one particle are separated by the noise of the motion.
+        old = jnp.where(due, resampled, state.pose)
         moved = sample_motion(self.motion, old, u, key_noise)
         good = jnp.isfinite(moved).all(axis=1)
         pose = jnp.where(good[:, None], moved, old)
+        # The number of particles follows from the bins that they occupy after the motion.
         count, few = enough(bins_of(pose, _BINS), self.fewest, _ERROR, _CONFIDENCE)
         active = jnp.where(due, count, state.active)
         used = jnp.arange(self.particles, dtype=active.dtype) < active
-        log_weight = jnp.where(used, drawn.log_weight, -jnp.inf)
+        log_weight = jnp.where(used, weight_resampled, -jnp.inf)
         # The sum becomes 1; its gradient is the resampling method's.
         log_weight = log_weight - normalized(jax.lax.stop_gradient(log_weight))[1]
         log_weight = jnp.where(due, log_weight, state.log_weight)
@@ -214,7 +212,7 @@ class MonteCarloFilter(_Particles):
             injection=jnp.zeros_like(state.injection),
             events=ParticleEvents(
                 resampled=before.resampled | due,
-                injected=before.injected + (due & drawn.injected & used).sum().astype(jnp.int32),
+                injected=before.injected + (due & injected & used).sum().astype(jnp.int32),
                 invalid=before.invalid + (used & ~good).sum().astype(jnp.int32),
                 capped=before.capped | (due & few),
             ),
@@ -230,13 +228,15 @@ class MonteCarloFilter(_Particles):
         """The particles weighted by exp(-misfit), with the decisions for the next motion.
 
         Args:
-            misfit: the negative log-likelihood of the scan at each particle, up to a constant.
-            fit: what recovery compares with other scans, as `update_averages` takes it.
-            measured: how many measurements the scan has.
+            misfit: negative log-likelihood of the scan at each particle, up to a constant.
+            fit: the misfit that recovery compares with other scans (`update_averages`).
+            measured: number of measurements of the scan.
         """
-        weight, some = _weight_poses(state, misfit)
+        weight, _, some = normalized(state.log_weight - misfit)
+        even = jnp.where(active_mask(state), -jnp.log(state.active.astype(weight.dtype)), -jnp.inf)
+        weight = jnp.where(some, weight, even)
         ess = effective_size(weight)
-        found = ParticleInfo(
+        particles = ParticleInfo(
             ess=ess, underflow=~some, active=state.active, **state.events._asdict()
         )
         state = update_averages(state, fit, measured, self.forget)
@@ -248,7 +248,7 @@ class MonteCarloFilter(_Particles):
             due=(ess < self.threshold * state.active.astype(ess.dtype)) | lost,
             events=no_events(),
         )
-        return state, found
+        return state, particles
 
     def pose_estimate(
         self, state: PoseParticles, points: Float[Array, "N 2"], tags: Int[Array, "N"]
@@ -267,13 +267,3 @@ class MonteCarloFilter(_Particles):
     @property
     def _start_region(self) -> Region | None:
         return self.region if self.start == "uniform" else None
-
-
-def _weight_poses(
-    state: PoseParticles, misfit: Float[Array, "P"]
-) -> tuple[Float[Array, "P"], Bool[Array, ""]]:
-    """Log-weights log w exp(-misfit) with Σ w = 1, equal where all underflow, and whether any
-    weight was left."""
-    weight, _, some = normalized(state.log_weight - misfit)
-    even = jnp.where(active_mask(state), -jnp.log(state.active.astype(weight.dtype)), -jnp.inf)
-    return jnp.where(some, weight, even), some

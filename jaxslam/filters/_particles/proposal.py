@@ -11,13 +11,15 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxslam.association._rules import predicted
+from jaxslam.core._numbers import gate_quantile
 from jaxslam.core.protocols import Motion, Prediction, Sensor
 from jaxslam.core.types import Scan
-from jaxslam.filters._particles.particle_settings import ParticleMapSettings
+from jaxslam.filters._particles.particle_map import ParticleMapFilter
 from jaxslam.filters._particles.scan_association import (
     ParticleAssociation,
     gate_distance,
     particle_association,
+    unmatched_distance,
 )
 from jaxslam.filters._particles.slam_particles import SlamParticles
 from jaxslam.linearize import _first_order as first_order
@@ -47,11 +49,11 @@ def predict_pose(
 
 
 def associate_particle(
-    particle: SlamParticles, scan: Scan, settings: ParticleMapSettings
+    filter: ParticleMapFilter, particle: SlamParticles, scan: Scan
 ) -> ParticleAssociation:
     """The association of a scan with the map of one particle, before the scan corrects its pose."""
-    prediction = _predict_measurements(particle, settings.sensor)
-    return particle_association(prediction, scan, settings.associate)
+    prediction = _predict_measurements(particle, filter.sensor)
+    return particle_association(prediction, scan, filter.associate)
 
 
 class PoseProposal(NamedTuple):
@@ -71,7 +73,7 @@ class ParticleInnovations(NamedTuple):
     positive: Bool[Array, "*P M"]
     """S is positive definite"""
     inside: Bool[Array, "*P M"]
-    """in the gate; without one, of a d² that did not overflow"""
+    """d² is within the gate; without a gate, finite"""
     used: Bool[Array, "*P M"]
     """matched, inside, and positive"""
     innovation: Float[Array, "*P M Z"]
@@ -80,10 +82,10 @@ class ParticleInnovations(NamedTuple):
 
 
 def propose_pose(
+    filter: ParticleMapFilter,
     particle: SlamParticles,
     association: ParticleAssociation,
     scan: Scan,
-    settings: ParticleMapSettings,
 ) -> tuple[PoseProposal, ParticleInnovations]:
     """The Gaussian of the pose given the scan, and the scan's likelihood marginal over the pose.
 
@@ -96,13 +98,14 @@ def propose_pose(
 
     whose product is the density of the scan given the path. P = 0 (a pose that is drawn
     already) is not changed, and gives the weights of FastSLAM 1.0. P is not inverted, so it may be
-    singular. A measurement outside the gate gets d² = γ of the gate, and one without a landmark
-    d² = `unmatched_distance` of a landmark known exactly, log N = -(d² + log |2πR(z)|)/2, so that a
-    particle with fewer associations is not preferred.
+    singular. A measurement outside the gate gets d² = γ of the gate. One without a landmark gets
+    the d² of `unmatched_distance` and the determinant of a landmark without error,
+    log N = -(d² + log |2πR(z)|)/2, so that a particle with fewer associations is not preferred.
     """
-    sensor, gamma = settings.sensor, settings.gamma
+    sensor = filter.sensor
     size_z = len(sensor.measurements)
-    unmatched = jnp.asarray(settings.unmatched_distance, particle.pose.dtype)
+    gamma = gate_quantile(filter.gate, size_z)
+    d2_unmatched = jnp.asarray(unmatched_distance(filter.gate, size_z), particle.pose.dtype)
 
     def correct_by(
         carry: tuple[Array, Array, Array, Array], row: tuple[Array, ...]
@@ -117,25 +120,26 @@ def propose_pose(
         s = linalg.matmul(hp, by_pose.T) + noise
         s = linalg.symmetrize(s + linalg.matmul(linalg.matmul(by_landmark, cov), by_landmark.T))
         terms = gaussian_terms(nu, s)
-        gated = gate_distance(terms.distance, gamma)
+        inside, counted, nis = gate_distance(terms.distance, gamma)
         of_map = matched & terms.positive
-        used = of_map & gated.inside
+        used = of_map & inside
+        # With S = L Lᵀ and V = L⁻¹ H_x P: x ← x + Vᵀ L⁻¹ ν, P ← P - Vᵀ V. Without use V = 0.
         v = jnp.where(used, linalg.solve_lower(terms.factor, hp), 0.0)
         x = x + linalg.matmul(jnp.where(used, terms.whitened, 0.0)[None], v)[0]
         x = jnp.concatenate([x[:2], wrap(x[2:])])
         p = p - linalg.gram(v, v)
-        seen = log_density(gated.counted, terms.log_det, size_z)
+        log_density_matched = log_density(counted, terms.log_det, size_z)
         log_det_noise = log_det_of(linalg.cholesky(noise)[0])
-        other = log_density(unmatched, log_det_noise, size_z)
-        log_matched = log_matched + jnp.where(of_map, seen, 0.0)
-        log_unmatched = log_unmatched + jnp.where(valid & ~of_map, other, 0.0)
+        log_density_unmatched = log_density(d2_unmatched, log_det_noise, size_z)
+        log_matched = log_matched + jnp.where(of_map, log_density_matched, 0.0)
+        log_unmatched = log_unmatched + jnp.where(valid & ~of_map, log_density_unmatched, 0.0)
         return (x, p, log_matched, log_unmatched), ParticleInnovations(
             positive=terms.positive,
-            inside=gated.inside,
+            inside=inside,
             used=used,
             innovation=jnp.where(matched, nu, 0.0),
             innovation_cov=jnp.where(matched, s, 0.0),
-            nis=jnp.where(matched, gated.reported, 0.0),
+            nis=jnp.where(matched, nis, 0.0),
         )
 
     slot, zero = association.slot, jnp.zeros((), particle.pose.dtype)
@@ -151,12 +155,12 @@ def _predict_measurements(particle: SlamParticles, sensor: Sensor) -> Prediction
     def linearized() -> tuple[Float[Array, "N Z"], Float[Array, "N Z 3"], Float[Array, "N Z Z"]]:
         """The prediction ẑ, H_x and H_l C H_lᵀ of each landmark."""
 
-        def one(landmark: Array, cov: Array) -> tuple[Array, Array, Array]:
+        def linearize(landmark: Array, cov: Array) -> tuple[Array, Array, Array]:
             by_pose, by_landmark = first_order.observe_jacobians(sensor, particle.pose, landmark)
             landmark_cov = linalg.matmul(linalg.matmul(by_landmark, cov), by_landmark.T)
             return sensor.observe(particle.pose, landmark), by_pose, landmark_cov
 
-        return jax.vmap(one)(particle.landmarks, particle.covs)
+        return jax.vmap(linearize)(particle.landmarks, particle.covs)
 
     def measurements() -> tuple[Float[Array, "N Z"], Float[Array, "N Z Z"]]:
         expected, by_pose, landmark_cov = linearized()
@@ -165,8 +169,9 @@ def _predict_measurements(particle: SlamParticles, sensor: Sensor) -> Prediction
 
     def cross() -> Float[Array, "N Z N Z"]:
         _, by_pose, landmark_cov = linearized()
+        # Landmarks i and j are correlated by the pose: H_i P H_jᵀ, and H_l C H_lᵀ where i = j.
         shared = jnp.einsum("izx,xy,jwy->izjw", by_pose, particle.pose_cov, by_pose)
-        every = jnp.arange(particle.alive.shape[0])
-        return shared.at[every, :, every, :].add(landmark_cov)
+        j = jnp.arange(particle.alive.shape[0])
+        return shared.at[j, :, j, :].add(landmark_cov)
 
     return predicted(sensor, particle.tag, particle.alive, measurements, cross)

@@ -9,13 +9,17 @@ from jaxtyping import Bool, Float, Int
 from jaxslam.core.protocols import Associate, Association, Prediction
 from jaxslam.core.types import Scan
 from jaxslam.math._arrays import Number
+from jaxslam.math.stats import chi2_quantile
+
+# The probability that a measurement of a landmark lies within d², without a gate.
+_NEAR = 0.99
 
 
 class ParticleAssociation(NamedTuple):
     """The association of M measurements with the map of one particle."""
 
     slot: Int[Array, "*P M"]
-    """of the measured landmark, 0 without one"""
+    """slot of the measured landmark, 0 without one"""
     matched: Bool[Array, "*P M"]
     is_new: Bool[Array, "*P M"]
     exhausted: Bool[Array, "*P"]
@@ -26,12 +30,12 @@ def particle_association(
     prediction: Prediction, scan: Scan, associate: Associate
 ) -> ParticleAssociation:
     """The association of the valid measurements of a scan."""
-    found = Association(*associate(prediction, scan))
+    association = Association(*associate(prediction, scan))
     return ParticleAssociation(
-        slot=jnp.maximum(found.slot, 0),
-        matched=scan.valid & (found.slot >= 0) & ~found.is_new,
-        is_new=scan.valid & found.is_new,
-        exhausted=jnp.asarray(found.exhausted),
+        slot=jnp.maximum(association.slot, 0),
+        matched=scan.valid & (association.slot >= 0) & ~association.is_new,
+        is_new=scan.valid & association.is_new,
+        exhausted=jnp.asarray(association.exhausted),
     )
 
 
@@ -40,26 +44,30 @@ def zero_padding(scan: Scan) -> Scan:
     return scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
 
 
-class _GatedDistance(NamedTuple):
-    """A squared Mahalanobis distance d² after the gate, of any shape."""
+def unmatched_distance(gate: Number | None, size: int) -> Number:
+    """The d² in a weight of a measurement without a landmark: γ, without a gate that of `_NEAR`.
 
-    inside: Bool[Array, "..."]
-    """within the gate; without one, d² is finite"""
-    counted: Float[Array, "..."]
-    """d² in the weight, at most γ"""
-    reported: Float[Array, "..."]
-    """d², a large number where it is not finite"""
+    size: numbers Z of a measurement.
+    """
+    return chi2_quantile(_NEAR if gate is None else gate, size)
 
 
-def gate_distance(distance: Float[Array, "*M"], gamma: Number | None) -> _GatedDistance:
-    """The gated distance: whether d² passes, and its values for weights and for `Info`.
+def gate_distance(
+    distance: Float[Array, "*M"], gamma: Number | None
+) -> tuple[Bool[Array, "*M"], Float[Array, "*M"], Float[Array, "*M"]]:
+    """The gate on squared Mahalanobis distances d².
 
     gamma: the largest d² within the gate; None without one.
+
+    Returns:
+        Mask of the distances within the gate (without one, of those that are finite); d² in the
+        weight, at most γ; and d² in `Info`, half the largest float where it is not finite.
     """
     finite = jnp.isfinite(distance)
     if gamma is not None:
         gamma = jnp.asarray(gamma, distance.dtype)
     inside = finite if gamma is None else finite & (distance <= gamma)
     counted = distance if gamma is None else jnp.where(inside, distance, gamma)
+    # Half of it, so that a mean over particles with weights that sum to 1 + eps stays finite.
     largest = 0.5 * float(jnp.finfo(distance.dtype).max)
-    return _GatedDistance(inside, counted, jnp.where(finite, distance, largest))
+    return inside, counted, jnp.where(finite, distance, largest)

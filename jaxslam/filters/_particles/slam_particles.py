@@ -120,7 +120,7 @@ class ParticleInfo(NamedTuple):
     have weight zero"""
 
     def counts(self) -> dict[str, Array]:
-        """What a campaign counts: of the fields that the filter has."""
+        """The counts of a campaign, of the fields that the filter has."""
         names = ("resampled", "underflow", "invalid", "injected", "capped")
         events = {name: getattr(self, name) for name in names}
         return {name: happened for name, happened in events.items() if happened is not None}

@@ -13,7 +13,6 @@ from jaxslam.core.slots import Joint
 from jaxslam.core.types import Info, Scan
 from jaxslam.filters._reporting import with_extra, with_removed
 from jaxslam.filters.map_management._loop_closure import (
-    LoopReport,
     LoopSettings,
     check_recency,
     close_loop,
@@ -34,30 +33,31 @@ class Closing(Managed):
     `info.extra["closing"]` is the `LoopReport` of the step; a landmark merged into an older one
     counts as removed (`info.extra["pruning"]`).
 
-    Raises ValueError on no filter or a square-root filter, on every below 1, a reach or spread not
-    above 0, settings that are none; from `init`, on a state that is no `slots.Joint` or keeps no
-    times.
+    Raises ValueError on no filter or a square-root filter, a period below 1, a reach or spread not
+    above 0, or settings of another class; from `init`, on a state that is no `slots.Joint` or keeps
+    no times.
     """
 
     filter: Filter
-    """one that keeps times and associates without tags, as
+    """a filter that keeps times and associates without tags, as
     `EkfSlam(…, associate=association.Certain(…), life=life.Recency())`"""
     _: dataclasses.KW_ONLY
-    every: int = static(default=1)
-    """scans from one search to the next"""
+    period: int = static(default=1)
+    """number of scans from one search to the next"""
     reach: Number | None = None
-    """[m] where given, two landmarks closer than that, of which one was initialized after the other
-    was last measured, are merged if δ = 0 is within 99 % and √(tr cov(δ)/2) is at most spread, one
-    pair a scan: so duplicates that were initialized before the loop closed are merged too"""
+    """[m] distance below which two landmarks, one of which was initialized after the last
+    measurement of the second, are merged if δ = 0 is within 99 % and √(tr cov(δ)/2) is at most
+    spread, one pair a scan: so duplicates that were initialized before the loop closed are merged
+    too. None merges none"""
     spread: Number = 0.5
-    """[m]"""
+    """[m] see reach"""
     settings: LoopSettings = static(default=LoopSettings())
-    """of the search"""
+    """settings of the search"""
 
     def __post_init__(self) -> None:
         validation.check_record("Closing", "settings", self.settings, LoopSettings)
         super().__post_init__()
-        check_count("Closing: every", self.every)
+        check_count("Closing: period", self.period)
         check_positive("Closing", spread=self.spread)
         if self.reach is not None:
             check_positive("Closing", reach=self.reach)
@@ -73,23 +73,21 @@ class Closing(Managed):
         return joint
 
     def manage(self, joint: Joint, scan: Scan, info: Info) -> tuple[Joint, Info]:
+        # A merged landmark counts as removed, whichever way it was merged.
         before = joint.alive
         joint, report = change_where(
-            (joint.life.now % self.every == 0) & scan.valid.any(),
+            (joint.life.now % self.period == 0) & scan.valid.any(),
             lambda state: close_loop(state[0], self.chart, self.settings),
             (joint, no_closing()),
         )
         if self.reach is not None:
-            joint, report = self._merge_successive(joint, report, self.reach)
+            older, younger, distance = successive_duplicate(
+                joint, self.chart, self.reach, self.spread
+            )
+            same = distance <= chi2_quantile(0.99, 2)
+            joint = change_where(
+                same, lambda joint: merge_histories(joint, self.chart, older, younger), joint
+            )
+            report = report._replace(duplicates=same.astype(jnp.int32))
         info = with_removed(info, before & ~joint.alive)
         return joint, with_extra(info, "closing", report)
-
-    def _merge_successive(
-        self, joint: Joint, report: LoopReport, reach: Number
-    ) -> tuple[Joint, LoopReport]:
-        older, younger, distance = successive_duplicate(joint, self.chart, reach, self.spread)
-        same = distance <= chi2_quantile(0.99, 2)
-        joint = change_where(
-            same, lambda joint: merge_histories(joint, self.chart, older, younger), joint
-        )
-        return joint, report._replace(duplicates=same.astype(jnp.int32))

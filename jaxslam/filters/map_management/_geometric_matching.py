@@ -33,7 +33,7 @@ class _Alignment(NamedTuple):
     """T with map = T ∘ cluster"""
     distance: Float[Array, ""]
     """D² = rᵀ Σ⁻¹ r"""
-    each: Float[Array, "M"]
+    distances: Float[Array, "M"]
     """r_iᵀ Σ_ii⁻¹ r_i of the pairs, else 0"""
     regular: Bool[Array, ""]
     """Σ is positive definite, and the pose is determined"""
@@ -43,17 +43,6 @@ class _Alignment(NamedTuple):
     """∂r/∂T"""
     factor: Float[Array, "2*M 2*M"]
     """Cholesky factor of Σ; the identity without a pair"""
-
-
-class _Residuals(NamedTuple):
-    """The residuals r_i = T z_i - m_i about the centroids, their covariance and derivative."""
-
-    error: Float[Array, "2*M"]
-    jacobian: Float[Array, "2*M 3"]
-    covs: Float[Array, "M 2 2"]
-    """of each alone"""
-    factor: Float[Array, "2*M 2*M"]
-    positive: Bool[Array, ""]
 
 
 def align_points(points: PointSets, slot: Int[Array, "M"]) -> _Alignment:
@@ -75,12 +64,12 @@ def align_points(points: PointSets, slot: Int[Array, "M"]) -> _Alignment:
     cross = (weight * (z[:, 0] * goal[:, 1] - z[:, 1] * goal[:, 0])).sum()
     start = jnp.concatenate([jnp.zeros(2, z.dtype), se2.polar(jnp.stack([dot, cross]))[1:]])
 
-    r = _residuals(points, slot, z, goal, start)
-    whitened = linalg.solve_lower(r.factor, r.error)
-    by_pose = linalg.solve_lower(r.factor, r.jacobian)
+    r, jacobian, covs, factor, positive = _residuals(points, slot, z, goal, start)
+    whitened = linalg.solve_lower(factor, r)
+    by_pose = linalg.solve_lower(factor, jacobian)
     step, solvable = linalg.solve_psd(by_pose.T @ by_pose, by_pose.T @ whitened)
-    left = r.error - r.jacobian @ step
-    each, _ = mahalanobis_of_pairs(left.reshape(-1, 2), r.covs)
+    left = r - jacobian @ step
+    distances, _ = mahalanobis_of_pairs(left.reshape(-1, 2), covs)
     # About the centroids the numbers are small; the pose is that of the frames themselves.
     centred = start - step
     shift = map_centroid + centred[:2] - se2.rotation(centred[2]) @ centroid
@@ -89,11 +78,11 @@ def align_points(points: PointSets, slot: Int[Array, "M"]) -> _Alignment:
     return _Alignment(
         pose=jnp.concatenate([shift, heading]),
         distance=((whitened - by_pose @ step) ** 2).sum(),
-        each=jnp.where(paired, each, 0.0),
-        regular=r.positive & solvable,
+        distances=jnp.where(paired, distances, 0.0),
+        regular=positive & solvable,
         residual=left,
-        jacobian=r.jacobian.at[:, 2].set(by_turn.reshape(-1)),
-        factor=r.factor,
+        jacobian=jacobian.at[:, 2].set(by_turn.reshape(-1)),
+        factor=factor,
     )
 
 
@@ -103,11 +92,23 @@ def _residuals(
     z: Float[Array, "M 2"],
     goal: Float[Array, "M 2"],
     pose: Float[Array, "3"],
-) -> _Residuals:
-    """The residuals of points z and goals about their centroids; 0 and identity without a pair."""
+) -> tuple[
+    Float[Array, "2*M"],
+    Float[Array, "2*M 3"],
+    Float[Array, "M 2 2"],
+    Float[Array, "2*M 2*M"],
+    Bool[Array, ""],
+]:
+    """The residuals r_i = T z_i - m_i of points z and goals m about their centroids.
+
+    Returns:
+        r, ∂r/∂T, Σ_ii of each pair, the factor of Σ, and whether Σ is positive definite. Without a
+        pair r is 0 and Σ_ii the identity.
+    """
     m, paired, at = slot.shape[0], slot >= 0, jnp.maximum(slot, 0)
     rotation = se2.rotation(pose[2])
     mixed = jnp.einsum("xy,iyjw->ixjw", rotation, points.cross_cov[:, :, at])
+    # cov(r) = R Z Rᵀ + P_mm - R Z_m - (R Z_m)ᵀ, axes (i, xy of i, j, xy of j).
     cov = jnp.einsum("xy,iyjw,vw->ixjv", rotation, points.cluster_cov, rotation)
     cov = cov + points.map_cov[at][:, :, at] - mixed - mixed.transpose(2, 3, 0, 1)
     cov = with_unit_blocks(cov, paired)
@@ -117,7 +118,7 @@ def _residuals(
     by_turn = quarter_turned(goal - pose[None, :2])[:, :, None]
     jacobian = jnp.where(paired[:, None, None], jnp.concatenate([eye, by_turn], 2), 0.0)
     blocks = cov[jnp.arange(m), :, jnp.arange(m)]
-    return _Residuals(error.reshape(-1), jacobian.reshape(2 * m, 3), blocks, factor, positive)
+    return error.reshape(-1), jacobian.reshape(2 * m, 3), blocks, factor, positive
 
 
 def with_unit_blocks(
@@ -129,8 +130,12 @@ def with_unit_blocks(
     return jnp.where(both, cov, jnp.eye(2 * m, dtype=cov.dtype).reshape(m, 2, m, 2))
 
 
-_BLOCK = 32  # candidates that are scored together; more cost memory
-_FINALISTS = 8  # hypotheses that are tried jointly
+# Candidates that are scored together: more cost memory, in proportion.
+_BLOCK = 32
+
+# Hypotheses that are fitted as a whole, besides the best of each pair: the merit of a hypothesis
+# ignores correlations, so its order is only approximate.
+_FINALISTS = 8
 
 
 class GeometricMatch(NamedTuple):
@@ -141,22 +146,22 @@ class GeometricMatch(NamedTuple):
     slot: Int[Array, "M"]
     """the map point of each cluster point, -1 for none"""
     explained: Int[Array, ""]
-    """pairs that fit jointly"""
+    """number of pairs that fit jointly"""
     distance: Float[Array, ""]
-    """D² of these, χ² of 2·explained - 3 degrees of freedom"""
+    """D² of these pairs, χ² of 2·explained - 3 degrees of freedom"""
     runner_up: Int[Array, ""]
-    """most pairs of any other hypothesis, one that shares fewer than two pairs"""
+    """number of pairs of the second-best hypothesis, which shares fewer than two pairs"""
     exhausted: Bool[Array, ""]
     """more pairs of points agreed than there was room for"""
 
 
 class _SearchLimits(NamedTuple):
-    """The limits of a search; made by `search_limits`."""
+    """The limits of a search; `search_limits` computes them."""
 
     single: tuple[float, float]
     """χ² of one and of two degrees of freedom"""
     joint: np.ndarray
-    """(M + 1,) χ² of 2n - 3, for n pairs"""
+    """(M + 1,) χ² of 2n - 3 degrees of freedom, for n pairs"""
     pairs: int
     candidates: int
 
@@ -171,6 +176,7 @@ def check_search(caller: str, probability: float, pairs: int, candidates: int) -
 
 def search_limits(size: int, probability: float, pairs: int, candidates: int) -> _SearchLimits:
     """The limits of a search over M = size cluster points."""
+    # n pairs have 2n coordinates, three of which fix the frame.
     joint = [chi2_quantile(probability, max(2 * n - 3, 1)) for n in range(size + 1)]
     single = chi2_quantile(probability, 1), chi2_quantile(probability, 2)
     return _SearchLimits(single, np.asarray(joint), pairs, candidates)
@@ -191,23 +197,25 @@ class _Hypotheses(NamedTuple):
 def match_points(points: PointSets, limits: _SearchLimits) -> GeometricMatch:
     """The match with the most cluster points; among equals, that of least D².
 
-    Each of a few pairs (a, b) of cluster points, the longest, is compared with all pairs (j, k) of
-    the map: with s and r the two distances, (s - r)²/var(s - r) <= χ²(1). Each agreement fixes the
-    frame T, in which the rest of the cluster is tested: δ_ik = T z_i - m_k, linear in the errors
-    of z_a, z_b, z_i, m_j, m_k and m_l, with d² <= χ²(2) and no point twice. The best hypotheses are
-    then fitted as a whole, and lose their worst pair until D² <= χ²(2n - 3).
+    Each of the longest pairs (a, b) of cluster points is compared with all pairs (j, k) of the map:
+    with s and r the two distances, (s - r)²/var(s - r) <= χ²(1). Each agreement fixes the frame T,
+    in which the rest of the cluster is tested: δ_il = T z_i - m_l, linear in the errors of z_a,
+    z_b, z_i, m_j, m_k and m_l, with d² <= χ²(2) and no point twice. The best hypotheses are then
+    fitted as a whole, and lose their worst pair until D² <= χ²(2n - 3).
 
     No hypothesis (explained = 0, slots -1, the identity) where no two distances agree.
     """
-    found = _hypotheses(points, limits)
-    finalists = found.slot.reshape(-1, len(points.cluster))[_finalists(found)]
+    hypotheses = _hypotheses(points, limits)
+    finalists = hypotheses.slot.reshape(-1, len(points.cluster))[_finalists(hypotheses)]
     fits = jax.vmap(lambda slot: _fit_hypothesis(points, slot, limits))(finalists)
     best: GeometricMatch = jax.tree.map(
         lambda leaf: leaf[jnp.argmax(_merit(fits.explained, fits.distance))], fits
     )
-    same = ((found.slot == best.slot[None, None]) & (found.slot >= 0)).sum(axis=-1)
-    other = jnp.where(same < 2, found.explained, 0).max()
-    return best._replace(runner_up=other.astype(jnp.int32), exhausted=found.exhausted.any())
+    same = ((hypotheses.slot == best.slot[None, None]) & (hypotheses.slot >= 0)).sum(axis=-1)
+    runner_up = jnp.where(same < 2, hypotheses.explained, 0).max()
+    return best._replace(
+        runner_up=runner_up.astype(jnp.int32), exhausted=hypotheses.exhausted.any()
+    )
 
 
 def _hypotheses(points: PointSets, limits: _SearchLimits) -> _Hypotheses:
@@ -219,31 +227,33 @@ def _hypotheses(points: PointSets, limits: _SearchLimits) -> _Hypotheses:
         test, agree = equal_lengths(points, *ends, limits.single[0])
         least, best = jax.lax.top_k(-jnp.where(agree, test, jnp.inf).reshape(-1), room)
 
-        def extend(one: tuple[Array, Array]) -> tuple[Array, Array, Array]:
-            slots = jnp.stack([one[0] // n, one[0] % n])
-            return extend_pair(points, jnp.stack(ends), slots, one[1], limits.single[1])
+        def extend(candidate: tuple[Array, Array]) -> tuple[Array, Array, Array]:
+            index, test = candidate
+            slots = jnp.stack(jnp.unravel_index(index, (n, n)))
+            return extend_pair(points, jnp.stack(ends), slots, test, limits.single[1])
 
         slot, count, distance = jax.lax.map(extend, (best, -least), batch_size=min(_BLOCK, room))
         return _Hypotheses(slot, count, distance, agree.sum() > room)
 
-    found: _Hypotheses = jax.lax.map(of_pair, longest_pairs(points, limits.pairs))
-    return found
+    hypotheses: _Hypotheses = jax.lax.map(of_pair, longest_pairs(points, limits.pairs))
+    return hypotheses
 
 
 def _merit(count: Int[Array, "*batch"], distance: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
-    """The score of a match: the number of pairs first, then the distance."""
+    """The score of a match: the number of pairs first, then the distance, mapped to 0 … 1."""
     return count - distance / (1 + distance)
 
 
-def _finalists(found: _Hypotheses) -> Int[Array, "K"]:
-    """The hypotheses to fit: the best of each cluster pair, then the best of all.
+def _finalists(hypotheses: _Hypotheses) -> Int[Array, "K"]:
+    """The flat indices (P·C) of the hypotheses to fit: the best of each cluster pair, then the best
+    of all.
 
-    The best of all alone may be one hypothesis, found from each of its pairs.
+    The best of all alone may be one hypothesis, which each of its pairs leads to.
     """
-    merit = _merit(found.explained, found.distance)
+    merit = _merit(hypotheses.explained, hypotheses.distance)
     heads = merit.argmax(axis=1) + jnp.arange(merit.shape[0]) * merit.shape[1]
-    every = merit.reshape(-1)
-    return jnp.concatenate([heads, jax.lax.top_k(every, min(_FINALISTS, len(every)))[1]])
+    merit = merit.reshape(-1)
+    return jnp.concatenate([heads, jax.lax.top_k(merit, min(_FINALISTS, len(merit)))[1]])
 
 
 def _fit_hypothesis(
@@ -257,24 +267,25 @@ def _fit_hypothesis(
     m = points.cluster.shape[0]
     levels = jnp.asarray(limits.joint, points.cluster.dtype)
 
+    # Each pass drops at most one pair, so m - 2 passes reach two pairs.
     def drop(_: int, slot: Array) -> Array:
-        aligned = align_points(points, slot)
+        alignment = align_points(points, slot)
         count = (slot >= 0).sum()
-        over = (aligned.distance > levels[count]) & (count > 2)
-        worst = jnp.argmax(aligned.each)
+        over = (alignment.distance > levels[count]) & (count > 2)
+        worst = jnp.argmax(alignment.distances)
         return jnp.where(over & (jnp.arange(m) == worst), -1, slot)
 
     # Two pairs always have one degree of freedom, which the agreement of distances has tested.
     slot = jax.lax.fori_loop(0, max(m - 2, 0), drop, slot)
-    aligned = align_points(points, slot)
+    alignment = align_points(points, slot)
     count = (slot >= 0).sum()
-    ok = (count >= 2) & aligned.regular & (aligned.distance <= levels[count])
+    ok = (count >= 2) & alignment.regular & (alignment.distance <= levels[count])
     none = jnp.zeros((), jnp.int32)
     return GeometricMatch(
-        pose=jnp.where(ok, aligned.pose, 0.0),
+        pose=jnp.where(ok, alignment.pose, 0.0),
         slot=jnp.where(ok, slot, -1),
         explained=jnp.where(ok, count, 0).astype(jnp.int32),
-        distance=jnp.where(ok, aligned.distance, 0.0),
+        distance=jnp.where(ok, alignment.distance, 0.0),
         runner_up=none,
         exhausted=jnp.asarray(False),
     )

@@ -1,6 +1,7 @@
-"""Duplicate landmarks: found by a joint chi-square test, and merged by an exact constraint.
+"""Duplicate landmarks, detected by a joint chi-square test and merged by an exact constraint.
 
-With what map managers share: the check of the filter's state, and the step after each update.
+`Managed` is the base of all map managers: the check of the filter's state, and the step after each
+update.
 """
 
 from typing import NamedTuple
@@ -29,8 +30,8 @@ from jaxslam.math.stats import chi2_quantile
 class Managed(Wrapper):
     """A filter on a `slots.Joint`, each of whose updates is followed by `manage`.
 
-    It returns its linear system (`Monitored`) if the filter does, without the change
-    by `manage`. A subclass defines `manage`, and may extend `init`.
+    It returns its linear system (`Monitored`) if the filter does, without the change by `manage`. A
+    subclass defines `manage`, and may extend `init`.
     """
 
     def __post_init__(self) -> None:
@@ -65,10 +66,10 @@ class Managed(Wrapper):
 
         return LinearizedSteps(steps.predict, update)
 
-    def _manage(self, joint: Joint, scan: Scan, found: PyTree) -> tuple[Joint, Info]:
+    def _manage(self, joint: Joint, scan: Scan, result: PyTree) -> tuple[Joint, Info]:
         name = f"{type(self).__name__}: {self.filter.name}"
-        found = validation.state_and_info(name, joint, scan, found)
-        return self.manage(found[0], scan, found[1])
+        joint, info = validation.state_and_info(name, joint, scan, result)
+        return self.manage(joint, scan, info)
 
 
 class Merged(NamedTuple):
@@ -78,7 +79,7 @@ class Merged(NamedTuple):
     """the slot of the landmark kept and the slot freed, or -1, -1 where none were merged"""
 
     def counts(self) -> dict[str, Array]:
-        """What a campaign counts."""
+        """The counts of a campaign."""
         return {"merged": self.pair[..., 0] >= 0}
 
 
@@ -97,12 +98,12 @@ class Merging(Managed):
     """
 
     filter: Filter
-    """whose state is a `slots.Joint`"""
+    """a filter whose state is a `slots.Joint`"""
     reach: Number
-    """[m] below the distance of any two true landmarks. The test alone cannot separate two
-    landmarks from one where their difference is less certain than that."""
+    """[m] less than the distance of any two true landmarks. The test alone cannot separate two
+    landmarks whose difference is less certain than their distance"""
     probability: float = static(default=0.95)
-    """of the test, that two estimates of one landmark are merged"""
+    """probability that two estimates of one landmark pass the test"""
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -142,7 +143,7 @@ class Merging(Managed):
 def co_observed(joint: Joint, info: Info, places: tuple[int, ...] = ()) -> Bool[Array, "N N"]:
     """Mask of the pairs of landmarks that one sensor measured in one scan, up to this one.
 
-    places: number of measurement slots of each sensor; () where all are of one.
+    places: number of measurement slots of each sensor; () of a single sensor.
     """
     capacity = joint.alive.shape[0]
     before = joint.co_observed
@@ -151,8 +152,8 @@ def co_observed(joint: Joint, info: Info, places: tuple[int, ...] = ()) -> Bool[
     end = 0
     for count in places or info.status.shape:
         begin, end = end, end + count
-        here = slots.slot_mask(info.slot[begin:end], measured[begin:end], capacity)
-        pairs = pairs | (here[:, None] & here[None, :])
+        mask = slots.slot_mask(info.slot[begin:end], measured[begin:end], capacity)
+        pairs = pairs | (mask[:, None] & mask[None, :])
     return pairs
 
 
@@ -168,7 +169,7 @@ def closest_pair(
 
     d² = δᵀ C⁻¹ δ with δ = l_i - l_j and C = cov(δ), including the correlation of the two: for
     landmarks with large covariances but a certain difference d² is large. i = j = 0 and d² infinite
-    where no pair is within reach [m] of another and allowed (N, N). square_root: as in
+    where no pair (i, j) is allowed (N, N) and within reach [m]. square_root: as in
     `merge_landmarks`.
 
     Raises ValueError on a reach not above 0, or allowed of another shape.
@@ -183,14 +184,15 @@ def closest_pair(
         )
     delta = joint.landmarks[:, None] - joint.landmarks[None, :]
     by_robot, by_landmark = _derivatives(joint, chart)
-    whole = joint.cov @ joint.cov.T if square_root else joint.cov
-    robot = whole[:3, :3]
-    cross = whole[:3, 3:].reshape(3, capacity, size)
-    blocks = whole[3:, 3:].reshape(capacity, size, capacity, size)
-    # Of coordinates: l_i = A_i dx + B_i dl_i, so cov(l_i, l_j) has four terms.
+    p = joint.cov @ joint.cov.T if square_root else joint.cov
+    robot = p[:3, :3]
+    cross = p[:3, 3:].reshape(3, capacity, size)
+    blocks = p[3:, 3:].reshape(capacity, size, capacity, size)
+    # Errors of coordinates are A_i dx + B_i dl_i, so cov(l_i, l_j) has four terms; axes are
+    # (landmark i, landmark j, parameter of i, parameter of j).
     with_robot = jnp.einsum("nij,jmk,mlk->nmil", by_robot, cross, by_landmark)
-    own_errors = jnp.einsum("nij,njmk,mlk->nmil", by_landmark, blocks, by_landmark)
-    cov = own_errors + with_robot + with_robot.transpose(1, 0, 3, 2)
+    of_landmarks = jnp.einsum("nij,njmk,mlk->nmil", by_landmark, blocks, by_landmark)
+    cov = of_landmarks + with_robot + with_robot.transpose(1, 0, 3, 2)
     cov = cov + jnp.einsum("nij,jk,mlk->nmil", by_robot, robot, by_robot)
     diagonal = cov[jnp.arange(capacity), jnp.arange(capacity)]
     delta_covs = diagonal[:, None] + diagonal[None, :] - cov - cov.transpose(1, 0, 2, 3)
@@ -199,9 +201,10 @@ def closest_pair(
     pairs = pairs & ((delta**2).sum(axis=2) <= reach**2)
     if allowed is not None:
         pairs = pairs & allowed
-    each = jnp.where(pairs, jax.vmap(jax.vmap(squared_distance))(delta, delta_covs), jnp.inf)
-    best = jnp.argmin(each)
-    return best // capacity, best % capacity, each.reshape(-1)[best]
+    d2 = jnp.where(pairs, jax.vmap(jax.vmap(squared_distance))(delta, delta_covs), jnp.inf)
+    best = jnp.argmin(d2)
+    i, j = jnp.unravel_index(best, d2.shape)
+    return i, j, d2.reshape(-1)[best]
 
 
 def squared_distance(error: Float[Array, "n"], cov: Float[Array, "n n"]) -> Float[Array, ""]:
@@ -218,19 +221,23 @@ def merge_landmarks(
     The constraint l_i = l_j is a measurement of δ = l_i - l_j = 0 without noise: with
     S = cov(δ) = L Lᵀ and V = L⁻¹ cov(δ, ·), x ← x ⊞ -Vᵀ L⁻¹ δ and P ← P - Vᵀ V, for points exact.
     Slot j, now the same, is removed. Nothing happens where i = j or S is singular. square_root: the
-    state holds a root of P, as that of a filter with covariance="square_root" does.
+    state holds a root of P, as in a filter with covariance="square_root".
     """
     size = joint.landmarks.shape[1]
     by_robot, by_landmark = (part[jnp.stack([i, j])] for part in _derivatives(joint, chart))
     rows = joint.cov @ joint.cov.T if square_root else joint.cov
     rows_of = [jax.lax.dynamic_slice_in_dim(rows, 3 + slot * size, size) for slot in (i, j)]
+    # cov(δ, ·), δ = l_i - l_j, of which each coordinate depends on pose and landmark.
     with_all = (by_robot[0] - by_robot[1]) @ rows[:3]
     with_all = with_all + by_landmark[0] @ rows_of[0] - by_landmark[1] @ rows_of[1]
-    mine = [jax.lax.dynamic_slice_in_dim(with_all, 3 + s * size, size, axis=1) for s in (i, j)]
+    columns_of = [
+        jax.lax.dynamic_slice_in_dim(with_all, 3 + slot * size, size, axis=1) for slot in (i, j)
+    ]
     s = with_all[:, :3] @ (by_robot[0] - by_robot[1]).T
-    s = s + mine[0] @ by_landmark[0].T - mine[1] @ by_landmark[1].T
+    s = s + columns_of[0] @ by_landmark[0].T - columns_of[1] @ by_landmark[1].T
     factor, positive = linalg.cholesky(linalg.symmetrize(s))
     ok = positive & (i != j)
+    # A factor of zero gives V = 0, which changes nothing.
     factor = jnp.where(ok, factor, 0.0)
     v = linalg.solve_lower(factor, with_all)
     white = linalg.solve_lower(factor, joint.landmarks[j] - joint.landmarks[i])
@@ -241,8 +248,8 @@ def merge_landmarks(
         cov = linalg.root_psd(cov)
     together = joint.co_observed
     if together is not None:  # the landmark kept takes over the co-observations of both
-        with_one = together[i] | (ok & (together[i] | together[j]))
-        together = together.at[i].set(with_one).at[:, i].set(with_one)
+        row = together[i] | (ok & (together[i] | together[j]))
+        together = together.at[i].set(row).at[:, i].set(row)
     merged = joint._replace(
         pose=pose,
         landmarks=landmarks,

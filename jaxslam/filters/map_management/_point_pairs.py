@@ -17,9 +17,9 @@ class PointSets(NamedTuple):
     cluster_cov: Float[Array, "M 2 M 2"]
     map_cov: Float[Array, "N 2 N 2"]
     cross_cov: Float[Array, "M 2 N 2"]
-    """of cluster with map"""
+    """covariance of cluster points with map points"""
     allowed: Bool[Array, "M N"]
-    """the candidate map points of each cluster point"""
+    """mask of the candidate map points of each cluster point"""
 
 
 def longest_pairs(points: PointSets, count: int) -> tuple[Int[Array, "P"], Int[Array, "P"]]:
@@ -31,36 +31,38 @@ def longest_pairs(points: PointSets, count: int) -> tuple[Int[Array, "P"], Int[A
     m = points.cluster.shape[0]
     allowed = points.allowed.any(axis=1)
     delta = points.cluster[:, None] - points.cluster[None, :]
+    # The root of zero has no derivative.
     length = jnp.sqrt((delta**2).sum(axis=2) + jnp.finfo(delta.dtype).tiny)
     usable = allowed[:, None] & allowed[None, :] & (jnp.arange(m)[:, None] < jnp.arange(m)[None, :])
     length = jnp.where(usable, length, 0.0)
 
-    def take(used: tuple[Array, Array], _: None) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
-        taken, uses = used
-        worth = jnp.where(taken, 0.0, length) * 0.5 ** (uses[:, None] + uses[None, :])
-        best = jnp.argmax(worth)
-        a, b = best // m, best % m
-        return (taken.at[a, b].set(True), uses.at[a].add(1).at[b].add(1)), (a, b)
+    def choose(
+        carry: tuple[Array, Array], _: None
+    ) -> tuple[tuple[Array, Array], tuple[Array, Array]]:
+        chosen, uses = carry
+        worth = jnp.where(chosen, 0.0, length) * 0.5 ** (uses[:, None] + uses[None, :])
+        a, b = jnp.unravel_index(jnp.argmax(worth), (m, m))
+        return (chosen.at[a, b].set(True), uses.at[a].add(1).at[b].add(1)), (a, b)
 
     start = jnp.zeros((m, m), bool), jnp.zeros(m, length.dtype)
     count = min(count, max(m * (m - 1) // 2, 1))
-    return jax.lax.scan(take, start, None, length=count)[1]
+    return jax.lax.scan(choose, start, None, length=count)[1]
 
 
 def equal_lengths(
     points: PointSets, a: Int[Array, ""], b: Int[Array, ""], gate: float
 ) -> tuple[Float[Array, "N N"], Bool[Array, "N N"]]:
-    """The squared distances of the lengths of all map pairs (j, k) to that of cluster pair (a, b).
+    """The squared distances of the lengths of all map pairs (j, k) from a cluster pair's length.
 
-    With s = |z_b - z_a| and r = |m_k - m_j|: (s - r)²/var(s - r), and whether it is within the gate
-    of an allowed pair whose direction is determined.
+    With s = |z_b - z_a| and r = |m_k - m_j|: (s - r)²/var(s - r), and the mask of the allowed pairs
+    with a determined direction for which it is within the gate.
     """
     eps = jnp.finfo(points.map.dtype).eps
     n = points.map.shape[0]
-    every, ends = jnp.arange(n), jnp.stack([a, b])
+    j, ends = jnp.arange(n), jnp.stack([a, b])
     s, u = _length_and_direction(points.cluster[b] - points.cluster[a])
     r, v = _length_and_direction(points.map[None, :] - points.map[:, None])
-    diagonal = points.map_cov[every, :, every]
+    diagonal = points.map_cov[j, :, j]
     map_covs = difference_covs(diagonal, diagonal, points.map_cov.transpose(0, 2, 1, 3))
     variance = jnp.einsum("jlx,jlxy,jly->jl", v, map_covs, v)
     blocks = points.cluster_cov[ends][:, :, ends]
@@ -68,12 +70,12 @@ def equal_lengths(
     cross = u @ (points.cross_cov[b] - points.cross_cov[a]).reshape(2, -1)
     cross = cross.reshape(n, 2)
     both = (v * (cross[None, :] - cross[:, None])).sum(axis=2)
-    # Lengths between exact points may differ by rounding.
+    # Lengths between exact points may differ by rounding: a few eps, and a margin.
     variance = variance + u @ cluster_cov @ u - 2 * both + (8 * eps * (s + r)) ** 2
     test = (s - r) ** 2 / jnp.maximum(variance, jnp.finfo(s.dtype).tiny)
     possible = points.allowed[a][:, None] & points.allowed[b][None, :]
-    possible = possible & (every[:, None] != every[None, :]) & (a != b)
-    # The direction of a pair shorter than its uncertainty is undetermined.
+    possible = possible & (j[:, None] != j[None, :]) & (a != b)
+    # The direction of a pair shorter than its uncertainty, 3 σ of its length, is undetermined.
     directed = (s**2 > 9 * u @ cluster_cov @ u) & (s > 0)
     return test, possible & directed & (variance > 0) & (test <= gate)
 
@@ -87,27 +89,27 @@ def extend_pair(
 ) -> tuple[Int[Array, "M"], Int[Array, ""], Float[Array, ""]]:
     """The map points of all cluster points, if those of the ends a, b are the slots j, k.
 
-    Each other cluster point is the map point that is nearest to T z_i, and to which it is the
-    nearest, where d² of δ = T z_i - m is within the gate.
+    A further cluster point is matched with the map point nearest to T z_i, if T z_i is also the
+    nearest to that map point, and d² of δ = T z_i - m is within the gate.
 
     Args:
         ends, slots: a, b and j, k.
-        test: () of the lengths, as of `equal_lengths`; infinite where they do not agree.
-        gate: of d², χ² of two degrees of freedom.
+        test: () squared distance of the lengths (`equal_lengths`); infinite where they disagree.
+        gate: largest d², χ² of two degrees of freedom.
     Returns:
-        The map point (M,) of each cluster point, -1 for none; how many; Σ d² with the test.
+        The map point (M,) of each cluster point, -1 for none; their number; Σ d² with the test.
     """
     frame = _frame_of_pair(points, ends, slots)
     covs, cross_covs = _moved_covs(points, ends, slots, frame)
-    every, at = jnp.arange(len(points.cluster)), jnp.arange(len(points.map))
-    error_covs = difference_covs(covs, points.map_cov[at, :, at], cross_covs)
+    i, m = jnp.arange(len(points.cluster)), jnp.arange(len(points.map))
+    error_covs = difference_covs(covs, points.map_cov[m, :, m], cross_covs)
     error = frame.moved[:, None] - points.map[None, :]
     distance, regular = mahalanobis_of_pairs(error, error_covs)
-    free = (every != ends[0]) & (every != ends[1])
-    left = (at != slots[0]) & (at != slots[1])
+    free = (i != ends[0]) & (i != ends[1])
+    left = (m != slots[0]) & (m != slots[1])
     fits = points.allowed & regular & (distance <= gate) & free[:, None] & left[None, :]
     slot = mutual(distance, fits)
-    total = jnp.where(slot >= 0, distance[every, jnp.maximum(slot, 0)], 0.0).sum()
+    total = jnp.where(slot >= 0, distance[i, jnp.maximum(slot, 0)], 0.0).sum()
     slot = slot.at[ends].set(slots.astype(jnp.int32))
     agreed = jnp.isfinite(test)
     slot = jnp.where(agreed, slot, -1)
@@ -151,21 +153,23 @@ def _frame_of_pair(points: PointSets, ends: Int[Array, "2"], slots: Int[Array, "
 def _moved_covs(
     points: PointSets, ends: Int[Array, "2"], slots: Int[Array, "2"], frame: _PairFrame
 ) -> tuple[Float[Array, "M 2 2"], Float[Array, "M N 2 2"]]:
-    """Covariances of T z_i, and with the map: errors are G of z_a, z_b, m_j, m_k, and R of z_i."""
+    """Covariances of T z_i, and of T z_i with the map; the error is G (δz_a, δz_b, δm_j, δm_k) +
+    R δz_i."""
     (m, n), g, rotation = points.allowed.shape, frame.jacobians, frame.rotation
     cluster, cross, of_map = points.cluster_cov, points.cross_cov, points.map_cov
-    # Of the four points that fix T: with one another (8, 8), with each z_i, with the map.
+    # The covariances of the four points that fix T, from axes (point, xy, point, xy): with one
+    # another (8, 8), with each z_i, with the map.
     mixed = cross[ends][:, :, slots].reshape(4, 4)
     top = jnp.concatenate([cluster[ends][:, :, ends].reshape(4, 4), mixed], axis=1)
     low = jnp.concatenate([mixed.T, of_map[slots][:, :, slots].reshape(4, 4)], axis=1)
     base = jnp.concatenate([top, low])
-    base_own = jnp.concatenate(
+    base_cluster = jnp.concatenate(
         [cluster[ends].reshape(4, m, 2), cross[:, :, slots].reshape(m, 2, 4).transpose(2, 0, 1)]
     )
     base_map = jnp.concatenate([cross[ends].reshape(4, n * 2), of_map[slots].reshape(4, -1)])
-    every = jnp.arange(m)
-    alone = rotation @ cluster[every, :, every] @ rotation.T
-    crossed = g @ base_own.transpose(1, 0, 2) @ rotation.T
+    i = jnp.arange(m)
+    alone = rotation @ cluster[i, :, i] @ rotation.T
+    crossed = g @ base_cluster.transpose(1, 0, 2) @ rotation.T
     covs = g @ base @ g.transpose(0, 2, 1) + alone + crossed + crossed.transpose(0, 2, 1)
     with_map = (g.reshape(2 * m, 8) @ base_map).reshape(m, 2, n, 2)
     with_map = with_map + jnp.einsum("xy,iynw->ixnw", rotation, cross)
@@ -193,7 +197,10 @@ def mahalanobis_of_pairs(
 def difference_covs(
     a: Float[Array, "M 2 2"], b: Float[Array, "N 2 2"], cross: Float[Array, "M N 2 2"]
 ) -> Float[Array, "M N 2 2"]:
-    """The covariances of x_i - y_j of all pairs, by those of x, of y and of x_i with y_j."""
+    """The covariances of x_i - y_j for all pairs.
+
+    a: covariances of x. b: covariances of y. cross: covariances of x_i with y_j.
+    """
     return a[:, None] + b[None] - cross - cross.transpose(0, 1, 3, 2)
 
 

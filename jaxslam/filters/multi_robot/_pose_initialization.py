@@ -1,6 +1,6 @@
 """Initialization of a robot's pose in the map from one scan.
 
-Its pose x_b is a function g(y, q) of variables y of the map and of measurements q, so its
+The pose x_b is a function g(y, q) of variables y of the map and of measurements q, so its
 covariances are P_bM = G_y P_yM and P_bb = G_y P_yy G_yᵀ + G_q C G_qᵀ (as Solà (32)-(38) for a
 landmark): correlated with the whole joint state. Every measurement is converted to a point in the
 frame of its robot, for any sensor.
@@ -16,14 +16,8 @@ from jaxslam.core import slots
 from jaxslam.core.protocols import Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Scan
-from jaxslam.filters.multi_robot._team_state import (
-    SIZE,
-    InitialPose,
-    TeamSettings,
-    measures_points,
-    pose_of,
-    rows_of,
-)
+from jaxslam.filters.multi_robot._team_filter import SIZE, TeamFilter, measures_points
+from jaxslam.filters.multi_robot._team_state import InitialPose, pose_of
 from jaxslam.linearize import _first_order as first_order
 from jaxslam.math import se2
 from jaxslam.math._linalg import symmetrize
@@ -43,27 +37,29 @@ class _ObservedPoints(NamedTuple):
 
 
 Candidate = tuple[InitialPose, list[Bool[Array, "M"]]]
-"""A pose for a robot, and which measurements of each robot of the team it is made of."""
+"""A pose for a robot, and masks of the measurements of each robot of the team it is made of."""
 
 
 def best_initialization(
+    filter: TeamFilter,
     joint: Joint,
     robot: int,
     observed: list[_ObservedPoints],
     in_map: Bool[Array, "R"],
-    settings: TeamSettings,
 ) -> Candidate:
     """The candidate pose of a robot whose heading has the least variance.
 
-    observed: by each robot. there: which robots are in the map.
+    Args:
+        observed: points observed by each robot.
+        in_map: mask of the robots in the map.
     """
     candidates = [
-        _mutual_candidate(joint, robot, other, observed, in_map[other], settings)
-        for other in range(len(observed))
-        if other != robot
+        _mutual_candidate(filter, joint, robot, partner, observed, in_map[partner])
+        for partner in range(len(observed))
+        if partner != robot
     ]
     if len(observed[robot].tag) > 1:
-        candidates.append(_landmark_candidate(joint, robot, observed, settings))
+        candidates.append(_landmark_candidate(filter, joint, robot, observed))
     heading = [jnp.where(new.possible, new.cov[2, 2], jnp.inf) for new, _ in candidates]
     best = jnp.argmin(jnp.stack(heading))
     chosen: Candidate = jax.tree.map(lambda *leaves: jnp.stack(leaves)[best], *candidates)
@@ -71,50 +67,57 @@ def best_initialization(
 
 
 def _mutual_candidate(
+    filter: TeamFilter,
     joint: Joint,
     robot: int,
-    other: int,
+    partner: int,
     observed: list[_ObservedPoints],
     in_map: Bool[Array, ""],
-    settings: TeamSettings,
 ) -> Candidate:
-    """The pose from another robot in the map, if the two measure each other."""
-    mine, theirs, rows = observed[robot], observed[other], rows_of(other, settings)
-    i, sees = _first(theirs, settings.tags[robot])
-    j, sees_back = _first(mine, settings.tags[other])
-    found = by_mutual_sight(
-        pose_of(joint, other, settings),
+    """The pose from a second robot in the map, if the two measure each other."""
+    by_robot, by_partner = observed[robot], observed[partner]
+    i, sees = _first(by_partner, filter.robot_tags[robot])
+    j, sees_back = _first(by_robot, filter.robot_tags[partner])
+    rows = filter.rows_of(partner)
+    pose, pose_rows, pose_cov = by_mutual_sight(
+        pose_of(filter, joint, partner),
         joint.cov[rows],
         joint.cov[rows, rows],
-        (theirs.point[i], theirs.cov[i]),
-        (mine.point[j], mine.cov[j]),
+        (by_partner.point[i], by_partner.cov[i]),
+        (by_robot.point[j], by_robot.cov[j]),
     )
-    used = _none_of(observed)
-    used[other] = jnp.arange(len(used[other])) == i
+    used = _no_measurements(observed)
+    used[partner] = jnp.arange(len(used[partner])) == i
     used[robot] = jnp.arange(len(used[robot])) == j
-    return InitialPose(*found, in_map & sees & sees_back), used
+    return InitialPose(pose, pose_rows, pose_cov, in_map & sees & sees_back), used
 
 
 def _landmark_candidate(
-    joint: Joint, robot: int, observed: list[_ObservedPoints], settings: TeamSettings
+    filter: TeamFilter, joint: Joint, robot: int, observed: list[_ObservedPoints]
 ) -> Candidate:
     """The pose from the two measured landmarks of the map that are farthest apart."""
-    mine, capacity = observed[robot], settings.capacity
-    slot, known = slots.find(joint.tag[:capacity], joint.alive[:capacity], mine.tag)
-    i, j, two = _farthest_pair(mine.point, known & mine.valid)
-    pair, which = jnp.stack([i, j]), jnp.stack([slot[i], slot[j]])
-    at_pair = (3 + which[:, None] * SIZE + jnp.arange(2)[None, :]).reshape(-1)
-    rows = joint.cov[at_pair]
-    found = by_two_landmarks(
-        joint.landmarks[which, :2], rows, rows[:, at_pair], mine.point[pair], mine.cov[pair]
+    points, capacity = observed[robot], filter.capacity
+    slot, in_map = slots.find(joint.tag[:capacity], joint.alive[:capacity], points.tag)
+    i, j, two = _farthest_pair(points.point, in_map & points.valid)
+    measured, landmarks = jnp.stack([i, j]), jnp.stack([slot[i], slot[j]])
+    # The rows x, y of both landmarks.
+    at = (3 + landmarks[:, None] * SIZE + jnp.arange(2)[None, :]).reshape(-1)
+    rows = joint.cov[at]
+    pose, pose_rows, pose_cov = by_two_landmarks(
+        joint.landmarks[landmarks, :2],
+        rows,
+        rows[:, at],
+        points.point[measured],
+        points.cov[measured],
     )
-    used, at = _none_of(observed), jnp.arange(len(mine.tag))
-    used[robot] = (at == i) | (at == j)
-    return InitialPose(*found, two & (which[0] != which[1])), used
+    used, m = _no_measurements(observed), jnp.arange(len(points.tag))
+    used[robot] = (m == i) | (m == j)
+    return InitialPose(pose, pose_rows, pose_cov, two & (landmarks[0] != landmarks[1])), used
 
 
-def _none_of(observed: list[_ObservedPoints]) -> list[Array]:
-    return [jnp.zeros_like(each.valid) for each in observed]
+def _no_measurements(observed: list[_ObservedPoints]) -> list[Array]:
+    """Masks of no measurement of any robot."""
+    return [jnp.zeros_like(points.valid) for points in observed]
 
 
 def _first(observed: _ObservedPoints, tag: int) -> tuple[Int[Array, ""], Bool[Array, ""]]:
@@ -125,18 +128,17 @@ def _first(observed: _ObservedPoints, tag: int) -> tuple[Int[Array, ""], Bool[Ar
 
 def observed_points(sensors: Suite, scan: Scan) -> _ObservedPoints:
     """A robot's scan as points; valid if a measurement has a tag and determines a point."""
-    found = []
+    observed = []
     for part, part_scan in zip(sensors.parts, split_scan(scan, sensors.places), strict=True):
         if measures_points(part.sensor):
             points, covs = _points_of(part.sensor, part_scan)
-            found.append(
-                _ObservedPoints(points, covs, part_scan.tag, part_scan.valid & (part_scan.tag >= 0))
-            )
+            valid = part_scan.valid & (part_scan.tag >= 0)
         else:
             m, dtype = part.places, scan.z.dtype
-            nothing = jnp.zeros((m, 2), dtype), jnp.zeros((m, 2, 2), dtype)
-            found.append(_ObservedPoints(*nothing, part_scan.tag, jnp.zeros(m, bool)))
-    return _ObservedPoints(*(jnp.concatenate(leaves) for leaves in zip(*found, strict=True)))
+            points, covs = jnp.zeros((m, 2), dtype), jnp.zeros((m, 2, 2), dtype)
+            valid = jnp.zeros(m, bool)
+        observed.append(_ObservedPoints(points, covs, part_scan.tag, valid))
+    return _ObservedPoints(*(jnp.concatenate(leaves) for leaves in zip(*observed, strict=True)))
 
 
 def _points_of(sensor: Sensor, scan: Scan) -> tuple[Float[Array, "M 2"], Float[Array, "M 2 2"]]:
@@ -144,17 +146,17 @@ def _points_of(sensor: Sensor, scan: Scan) -> tuple[Float[Array, "M 2"], Float[A
     z = scan.z[:, : len(sensor.measurements)]
     origin = jnp.zeros(3, z.dtype)
 
-    def one(z: Array) -> tuple[Array, Array]:
+    def invert(z: Array) -> tuple[Array, Array]:
         point, _, cov = first_order.invert_at(sensor, origin, z, origin, z)
         return point, cov
 
     # Absent measurements are replaced by a value at which every model is smooth.
-    points: tuple[Array, Array] = jax.vmap(one)(jnp.where(scan.valid[:, None], z, 1.0))
+    points: tuple[Array, Array] = jax.vmap(invert)(jnp.where(scan.valid[:, None], z, 1.0))
     return points
 
 
 def by_mutual_sight(
-    other: Float[Array, "3"],
+    pose_a: Float[Array, "3"],
     rows: Float[Array, "3 D"],
     cov: Float[Array, "3 3"],
     seen: tuple[Float[Array, "2"], Float[Array, "2 2"]],
@@ -162,28 +164,30 @@ def by_mutual_sight(
 ) -> tuple[Float[Array, "3"], Float[Array, "3 D"], Float[Array, "3 3"]]:
     """The pose of a robot b that robot a measures and that measures a: mean, rows, covariance.
 
-    With v the position of b measured by a, and w that of a measured by b, r is the mean of |v| and
-    |w| weighted by their inverse variances. In the frame of a, b is at r v/|v| with heading
+    With v the position of b measured by a, and w the position of a measured by b, r is the mean of
+    |v| and |w| weighted by their inverse variances. In the frame of a, b is at r v/|v| with heading
     atan2(-v) - atan2(w); then x_b = x_a ∘ that pose.
 
     Args:
-        other, rows, cov: x_a, its covariance with all errors, and its covariance.
+        pose_a, rows, cov: x_a, its covariance with all errors, and its covariance.
         seen, back: v and w, each with its covariance.
     """
     (v, cov_v), (w, cov_w) = seen, back
+    # A weight is no variable of the estimate: its derivative is not part of the errors.
     share = jax.lax.stop_gradient(_distance_variance(w, cov_w))
     share = share / (share + jax.lax.stop_gradient(_distance_variance(v, cov_v)))
 
-    def pose(other: Array, v: Array, w: Array) -> Array:
-        (far, at_v), (back, at_w) = se2.polar(v), se2.polar(w)
-        position = se2.rectangular(jnp.stack([share * far + (1 - share) * back, at_v]))
-        turn = at_v + jnp.pi - at_w
-        return se2.compose(other, jnp.stack([position[0], position[1], turn]))
+    def pose_b(pose_a: Array, v: Array, w: Array) -> Array:
+        (range_v, bearing_v), (range_w, bearing_w) = se2.polar(v), se2.polar(w)
+        r = share * range_v + (1 - share) * range_w
+        position = se2.rectangular(jnp.stack([r, bearing_v]))
+        turn = bearing_v + jnp.pi - bearing_w
+        return se2.compose(pose_a, jnp.stack([position[0], position[1], turn]))
 
-    by_other, by_v, by_w = jax.jacfwd(pose, argnums=(0, 1, 2))(other, v, w)
+    by_a, by_v, by_w = jax.jacfwd(pose_b, argnums=(0, 1, 2))(pose_a, v, w)
     noise = by_v @ cov_v @ by_v.T + by_w @ cov_w @ by_w.T
-    noise = symmetrize(by_other @ cov @ by_other.T + noise)
-    return _wrap_heading(pose(other, v, w)), by_other @ rows, noise
+    noise = symmetrize(by_a @ cov @ by_a.T + noise)
+    return _wrap_heading(pose_b(pose_a, v, w)), by_a @ rows, noise
 
 
 def by_two_landmarks(
@@ -220,8 +224,7 @@ def _farthest_pair(
     m = points.shape[0]
     between = ((points[:, None] - points[None, :]) ** 2).sum(-1)
     both = usable[:, None] & usable[None, :] & jnp.triu(jnp.ones((m, m), bool), 1)
-    best = jnp.argmax(jnp.where(both, between, -1.0))
-    i, j = best // m, best % m
+    i, j = jnp.unravel_index(jnp.argmax(jnp.where(both, between, -1.0)), (m, m))
     return i, j, both[i, j] & (between[i, j] > 0)
 
 

@@ -1,52 +1,34 @@
 """EKF-SLAM of several robots in one joint state (Solà's loop over robots, sensors, landmarks)."""
 
-import dataclasses
-
 import jax
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Bool, Float
 
-from jaxslam.association._rules import Known
 from jaxslam.charts import Euclidean
-from jaxslam.core import _validation as validation
 from jaxslam.core import slots
-from jaxslam.core._numbers import check_count
-from jaxslam.core._record import hold_function, record, set_field, static
-from jaxslam.core.protocols import Associate, Filter
+from jaxslam.core._record import record
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan, Status
-from jaxslam.filters._ekf.ekf_settings import (
-    CorrectionOrder,
-    Covariance,
-    EkfSettings,
-    check_covariance_form,
-    check_ekf_options,
-)
-from jaxslam.filters._ekf.predict import propagate
-from jaxslam.filters._ekf.scan import SensorStage, stage_of, update_by_scan
+from jaxslam.filters._ekf.ekf_slam import EkfSlam, update_by_sensor
 from jaxslam.filters._reporting import joined_info
 from jaxslam.filters.multi_robot._pose_initialization import best_initialization, observed_points
-from jaxslam.filters.multi_robot._team import Robot, check_team, poses, sizes
+from jaxslam.filters.multi_robot._team_filter import SIZE, TeamFilter
 from jaxslam.filters.multi_robot._team_state import (
-    SIZE,
     InitialPose,
-    TeamSettings,
-    check_sensors,
     robots_in_map,
     seen_from,
     seen_from_first,
     with_robot,
 )
+from jaxslam.filters.multi_robot.team import poses, sizes
 from jaxslam.math import se2
-from jaxslam.math._arrays import Number
 from jaxslam.math._xla import where_any
 from jaxslam.math.angles import wrap
-from jaxslam.sensors._suite import Part, split_scan
+from jaxslam.sensors._suite import on_ground, split_scan
 
 
 @record
-class TeamSlam(Filter):
+class TeamSlam(TeamFilter):
     """EKF-SLAM of R robots and one map, with all their cross-covariances.
 
     The state is a `slots.Joint`: robot 0 is its pose, slots 0 … N-1 hold landmarks (x, y, padding),
@@ -75,133 +57,82 @@ class TeamSlam(Filter):
     does.
     """
 
-    robots: tuple[Robot, ...]
-    """`team.Robot`s, in a list or tuple; robot 0 starts where the run does, the others relative to
-    it"""
-    capacity: int = static()
-    """landmark slots N"""
-    _: dataclasses.KW_ONLY
-    tags: tuple[int, ...] | None = static(default=None)
-    """R that mean robots; default N, N + 1, …"""
-    report: int = static(default=0)
-    """the robot of `estimate`; `team.poses` has all"""
-    associate: Associate = Known()
-    correction: CorrectionOrder = static(default="sequential")
-    gate: Number | None = None
-    iterations: int = static(default=1)
-    """these four as for `EkfSlam`"""
-    covariance: Covariance = static(default="plain")
-    """"plain" or "joseph", as there"""
-    births: int | None = static(default=None)
-    """as there, a limit for each sensor"""
-    chart = Euclidean()
-
-    def __post_init__(self) -> None:
-        name, robots = "TeamSlam", self.robots
-        check_count(f"{name}: capacity", self.capacity)
-        tags = check_team(name, robots, self.tags, self.capacity)
-        set_field(self, "robots", tuple(robots))
-        if self.tags is not None:
-            set_field(self, "tags", tags)
-        for robot in robots:
-            validation.check_models(name, robot.motion, robot.sensors)
-        validation.check_parts(name, associate=self.associate)
-        hold_function(self, "associate", "prediction, scan")
-        check_ekf_options(
-            name, self.capacity, self.correction, self.gate, self.iterations, self.births
-        )
-        check_covariance_form(name, self.covariance, ("plain", "joseph"))
-        if type(self.report) is not int or not 0 <= self.report < len(robots):
-            raise ValueError(
-                f"{name}: expected report from 0 to {len(robots) - 1}, got {self.report!r}"
-            )
-        check_sensors(robots)
-        super().__post_init__()
-
-    @property
-    def controls(self) -> tuple[str, ...]:
-        return tuple(name for robot in self.robots for name in robot.motion.controls)
-
-    @property
-    def measurements(self) -> tuple[str, ...]:
-        return tuple(f"entry {i} of its sensor" for i in range(sizes(self.robots)[2]))
-
-    @property
-    def places(self) -> tuple[int, ...]:
-        return tuple(places for robot in self.robots for places in robot.sensors.places)
-
     def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:
-        return _initial_team_state(pose, pose_cov, self._settings)
+        joint = slots.empty(pose, pose_cov, self.capacity + len(self.robots) - 1, SIZE)
+        for b, robot in enumerate(self.robots):
+            if robot.start is None:
+                continue
+            # x_b = x_0 ∘ start_b
+            mean, robot_cov = (jnp.asarray(part, pose.dtype) for part in robot.start)
+            by_first, by_start = jax.jacfwd(se2.compose, argnums=(0, 1))(pose, mean)
+            cov = by_first @ pose_cov @ by_first.T + by_start @ robot_cov @ by_start.T
+            rows = by_first @ joint.cov[:3]
+            new = InitialPose(se2.compose(pose, mean), rows, cov, jnp.asarray(True))
+            joint = with_robot(self, joint, b, new)
+        return joint
 
     def predict(self, state: Joint, u: Float[Array, "U"], key: Array) -> Joint:
         for b, control in enumerate(jnp.split(u, sizes(self.robots)[0][:-1])):
-            state = _predicted_robot(state, b, control, self._settings)
+            state = _predict_robot(self, state, b, control, key)
         return state
 
     def update(self, state: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
-        settings, (_, place_ends, size_z) = self._settings, sizes(self.robots)
+        _, place_ends, size_z = sizes(self.robots)
         if scan.tag.shape[0] != place_ends[-1]:
             raise ValueError(
                 f"TeamSlam: expected {place_ends[-1]} measurement slots in a scan, got "
                 f"{scan.tag.shape[0]}"
             )
-        scans = split_scan(scan, settings.places)
+        scans = split_scan(scan, self.places_by_robot)
         infos: dict[int, Info] = {}
         used: dict[int, list[Array]] = {}
-        for b in settings.started + settings.unstarted:
-            if b in settings.unstarted:
-                state, used[b] = initialized(state, b, scans, settings)
+        # Robots with a start come first, so that they are corrected before one is initialized
+        # from them.
+        for b in self.started + self.unstarted:
+            if b in self.unstarted:
+                state, used[b] = _initialize_robot(self, state, b, scans)
                 scans = [
                     robot_scan._replace(valid=robot_scan.valid & ~mask)
                     for robot_scan, mask in zip(scans, used[b], strict=True)
                 ]
-            state, infos[b] = corrected(state, b, scans[b], settings)
+            state, infos[b] = _correct_by_robot(self, state, b, scans[b])
         for b, masks in used.items():
             for a, mask in enumerate(masks):
-                infos[a] = _reported_initialized(infos[a], mask, settings.slot_of(b))
+                infos[a] = _mark_born(infos[a], mask, self.slot_of(b))
         return state, joined_info([infos[b] for b in range(len(self.robots))], size_z)
 
     def estimate(self, state: Joint) -> Estimate:
         capacity, report = self.capacity, self.report
         means, covs, _ = poses(state, len(self.robots))
-        every = jnp.arange(capacity)
+        k = jnp.arange(capacity)
         blocks = state.cov[3 : 3 + capacity * SIZE, 3 : 3 + capacity * SIZE]
         return Estimate(
             pose=means[report],
             pose_cov=covs[report],
             points=state.landmarks[:capacity, :2],
-            point_covs=blocks.reshape(capacity, SIZE, capacity, SIZE)[every, :2, every, :2],
+            point_covs=blocks.reshape(capacity, SIZE, capacity, SIZE)[k, :2, k, :2],
             alive=state.alive[:capacity],
             tag=state.tag[:capacity],
         )
 
-    @property
-    def _settings(self) -> TeamSettings:
-        capacity, robots = self.capacity, self.robots
-        ekf = EkfSettings(
-            sensor=robots[0].sensors,
-            chart=_HeadingsWrapped(),
+    def ekf_of(self, robot: int) -> EkfSlam:
+        """The EKF-SLAM by which a robot moves and corrects the map."""
+        return EkfSlam(
+            self.robots[robot].motion,
+            self.robots[robot].sensors,
+            self.capacity + len(self.robots) - 1,
+            chart=_WrappedHeadings(),
             associate=self.associate,
             correction=self.correction,
             gate=self.gate,
             iterations=self.iterations,
             covariance=self.covariance,
             births=self.births,
-            reserved=np.arange(capacity + len(robots) - 1) >= capacity,
         )
-        stages = tuple([_stage_of(part, ekf) for part in robot.sensors.parts] for robot in robots)
-        tags = self.tags or tuple(range(capacity, capacity + len(robots)))
-        return TeamSettings(robots, capacity, tags, ekf, stages)
-
-
-def _stage_of(part: Part, ekf: EkfSettings) -> SensorStage:
-    """The stage of one sensor in a scan; sensors of robots initialize no landmarks."""
-    births = 0 if part.sees == "robots" else ekf.births
-    return stage_of(part, SIZE, dataclasses.replace(ekf, births=births))
 
 
 @record
-class _HeadingsWrapped(Euclidean):
+class _WrappedHeadings(Euclidean):
     """The Euclidean chart of landmarks that are robots, (x, y, θ)."""
 
     def retract(self, pose: Array, landmark: Array, dx: Array, dl: Array) -> tuple[Array, Array]:
@@ -209,56 +140,35 @@ class _HeadingsWrapped(Euclidean):
         return pose, jnp.concatenate([landmark[:2], wrap(landmark[2:])])
 
 
-def _initial_team_state(
-    pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"], settings: TeamSettings
-) -> Joint:
-    """The initial state: robot 0 at a pose, the others relative to it, x_b = x_0 ∘ start_b."""
-    slots_in_all = settings.capacity + len(settings.robots) - 1
-    joint = slots.empty(pose, pose_cov, slots_in_all, SIZE)
-    for b, robot in enumerate(settings.robots):
-        if robot.start is None:
-            continue
-        mean, robot_cov = (jnp.asarray(part, pose.dtype) for part in robot.start)
-        by_first, by_start = jax.jacfwd(se2.compose, argnums=(0, 1))(pose, mean)
-        cov = by_first @ pose_cov @ by_first.T + by_start @ robot_cov @ by_start.T
-        rows = by_first @ joint.cov[:3]
-        new = InitialPose(se2.compose(pose, mean), rows, cov, jnp.asarray(True))
-        joint = with_robot(joint, b, new, settings)
-    return joint
-
-
-def _predicted_robot(
-    joint: Joint, robot: int, u: Float[Array, "U"], settings: TeamSettings
+def _predict_robot(
+    filter: TeamSlam, joint: Joint, robot: int, u: Float[Array, "U"], key: Array
 ) -> Joint:
     """The state after the prediction of one robot, if it is in the map."""
-    after, _ = propagate(
-        seen_from(joint, robot, settings), u, settings.robots[robot].motion, settings.ekf
-    )
-    after = seen_from_first(after, robot, joint, settings)
-    if robot in settings.started:
+    after = filter.ekf_of(robot).predict(seen_from(filter, joint, robot), u, key)
+    after = seen_from_first(filter, after, robot, joint)
+    if robot in filter.started:  # always in the map
         return after
-    in_map = joint.alive[settings.slot_of(robot)]
-    same: Joint = jax.tree.map(lambda new, old: jnp.where(in_map, new, old), after, joint)
-    return same
+    in_map = joint.alive[filter.slot_of(robot)]
+    moved: Joint = jax.tree.map(lambda new, old: jnp.where(in_map, new, old), after, joint)
+    return moved
 
 
-def initialized(
-    joint: Joint, robot: int, scans: list[Scan], settings: TeamSettings
+def _initialize_robot(
+    filter: TeamSlam, joint: Joint, robot: int, scans: list[Scan]
 ) -> tuple[Joint, list[Bool[Array, "M"]]]:
     """The state with a robot's pose initialized, if possible, and the measurements used for it."""
-
-    absent = ~joint.alive[settings.slot_of(robot)]
+    absent = ~joint.alive[filter.slot_of(robot)]
 
     def initialize(joint: Joint) -> tuple[Joint, list[Array]]:
         observed = [
-            observed_points(one.sensors, robot_scan)
-            for one, robot_scan in zip(settings.robots, scans, strict=True)
+            observed_points(member.sensors, robot_scan)
+            for member, robot_scan in zip(filter.robots, scans, strict=True)
         ]
-        in_map = robots_in_map(joint, settings)
-        new, used = best_initialization(joint, robot, observed, in_map, settings)
+        in_map = robots_in_map(filter, joint)
+        new, used = best_initialization(filter, joint, robot, observed, in_map)
         ok = new.possible & absent
-        after = with_robot(joint, robot, new, settings)
-        after = jax.tree.map(lambda x, y: jnp.where(ok, x, y), after, joint)
+        after = with_robot(filter, joint, robot, new)
+        after = jax.tree.map(lambda new, old: jnp.where(ok, new, old), after, joint)
         return after, [mask & ok for mask in used]
 
     def leave(joint: Joint) -> tuple[Joint, list[Array]]:
@@ -267,23 +177,33 @@ def initialized(
     return where_any(absent, initialize, leave, joint)
 
 
-def corrected(joint: Joint, robot: int, scan: Scan, settings: TeamSettings) -> tuple[Joint, Info]:
+def _correct_by_robot(filter: TeamSlam, joint: Joint, robot: int, scan: Scan) -> tuple[Joint, Info]:
     """The state corrected by one robot's scan, by measurements whose robots are all in the map."""
-    in_map = robots_in_map(joint, settings)
-    of_robot = scan.tag[:, None] == jnp.asarray(settings.tags, jnp.int32)[None, :]
+    in_map = robots_in_map(filter, joint)
+    of_robot = scan.tag[:, None] == jnp.asarray(filter.robot_tags, jnp.int32)[None, :]
     others = jnp.where(jnp.arange(len(in_map)) == robot, False, in_map)
+    # Measurements of a robot without a pose in the map, and all by one, cannot correct.
     unknown = (of_robot & ~others[None, :]).any(axis=1) | ~in_map[robot]
-    part_scan = scan._replace(valid=scan.valid & ~unknown)
-    after, info = update_by_scan(
-        seen_from(joint, robot, settings), part_scan, settings.stages[robot]
-    )[:2]
+    after = seen_from(filter, joint, robot)
+    ekf, sensors, infos = filter.ekf_of(robot), filter.robots[robot].sensors, []
+    is_robot = jnp.arange(len(joint.alive)) >= filter.capacity
+    scans = split_scan(scan._replace(valid=scan.valid & ~unknown), sensors.places)
+    for part, part_scan in zip(sensors.parts, scans, strict=True):
+        sensor = on_ground(part.sensor, SIZE)
+        part_scan = part_scan._replace(z=part_scan.z[:, : len(sensor.measurements)])
+        births = 0 if part.sees == "robots" else filter.births  # a robot is no new landmark
+        after, info, _, _ = update_by_sensor(
+            ekf, sensor, after, part_scan, births, reserved=is_robot
+        )
+        infos.append(info)
+    info = joined_info(infos, scan.z.shape[1])
     status = jnp.where(scan.valid & unknown, Status.UNMATCHED, info.status)
     info = info._replace(status=status.astype(jnp.int32))
-    return seen_from_first(after, robot, joint, settings), info
+    return seen_from_first(filter, after, robot, joint), info
 
 
-def _reported_initialized(info: Info, used: Bool[Array, "M"], slot: int) -> Info:
-    """The `Info` with these measurements marked as having initialized a robot."""
+def _mark_born(info: Info, used: Bool[Array, "M"], slot: int) -> Info:
+    """The `Info` with these measurements marked as having initialized the robot in a slot."""
     return info._replace(
         status=jnp.where(used, Status.BORN, info.status).astype(jnp.int32),
         slot=jnp.where(used, slot, info.slot).astype(info.slot.dtype),

@@ -40,7 +40,7 @@ def whitened_rows(
 ) -> Rows:
     """The rows of a measurement: R(ẑ)^{-1/2} times H_pose, H_l and z ⊖ ẑ.
 
-    used: whether it is one of this landmark. at_landmark: where H is taken, if elsewhere.
+    used: whether the measurement is of this landmark. at_landmark: where H is taken, if elsewhere.
     """
     at_landmark = landmark if at_landmark is None else at_landmark
     by_pose, by_landmark = first_order.observe_jacobians(sensor, pose, at_landmark)
@@ -54,8 +54,8 @@ def whitened_rows(
 
 def pose_difference(a: Float[Array, "3"], b: Float[Array, "3"]) -> Float[Array, "3"]:
     """The difference a - b of two poses by coordinates, with the angle wrapped."""
-    off = a - b
-    return off.at[2].set(wrap(off[2]))
+    difference = a - b
+    return difference.at[2].set(wrap(difference[2]))
 
 
 class Start(NamedTuple):
@@ -86,7 +86,7 @@ class LinearizedStep(NamedTuple):
     noise: Float[Array, "W"]
     """η̄"""
     slot: Int[Array, "M"]
-    """of the landmark measured; any number where the rows are zeros"""
+    """slot of the landmark measured; any number where the rows are zeros"""
     pose_rows: Float[Array, "M Z 3"]
     """A"""
     landmark_rows: Float[Array, "M Z L"]
@@ -120,9 +120,9 @@ class Policy(NamedTuple):
     """The solution of a chain: the gains of all noises, and the map."""
 
     start: Gain
-    """of d_0, where a = 0"""
+    """gain of d_0, where a = 0"""
     steps: Gain
-    """with leading T"""
+    """gains of the motions' noises, with leading T"""
     landmarks: Float[Array, "N L"]
     """δm"""
     map_factor: Float[Array, "NL NL"]
@@ -138,11 +138,11 @@ class CostToGo(NamedTuple):
     """The cost to go ½ aᵀ Λ a - aᵀ y + constant, with a = (δpose, δmap)."""
 
     pose: Float[Array, "3 3"]
-    """of Λ"""
+    """block of Λ; so are the next two"""
     cross: Float[Array, "3 NL"]
     map: Float[Array, "NL NL"]
     pose_y: Float[Array, "3"]
-    """of y"""
+    """part of y; so is the next one"""
     map_y: Float[Array, "NL"]
 
 
@@ -183,14 +183,14 @@ def eliminate_steps(
         after, gain, gained = _eliminate_noise(after, step.by_noise, step.noise)
         return (_by_pose_before(after, step), decrement + gained), gain
 
-    nothing = CostToGo(
+    no_cost = CostToGo(
         pose=jnp.zeros((3, 3), kind),
         cross=jnp.zeros((3, wide), kind),
         map=jnp.zeros((wide, wide), kind),
         pose_y=jnp.zeros(3, kind),
         map_y=jnp.zeros(wide, kind),
     )
-    end = nothing, jnp.zeros((), kind)
+    end = no_cost, jnp.zeros((), kind)
     (to_go, decrement), gains = jax.lax.scan(back, end, steps, reverse=True)
     return to_go, gains, decrement
 
@@ -211,19 +211,20 @@ def _add_measurements(to_go: CostToGo, step: LinearizedStep, capacity: int) -> C
     a, b, r = step.pose_rows, step.landmark_rows, step.residual
     size = b.shape[2]
 
-    def by_slot(each: Array) -> Array:
+    def sum_by_slot(values: Array) -> Array:
         """Values (M, …) summed by the slots seen, (N, …)."""
-        return jnp.zeros((capacity, *each.shape[1:]), r.dtype).at[step.slot].add(each)
+        return jnp.zeros((capacity, *values.shape[1:]), r.dtype).at[step.slot].add(values)
 
-    cross = by_slot(jnp.einsum("mzi,mzl->mil", a, b)).transpose(1, 0, 2).reshape(3, -1)
+    # AᵀB: (N, 3, L) to (3, NL). BᵀB: a block (L, L) for each slot, at rows and columns of its own.
+    cross = sum_by_slot(jnp.einsum("mzi,mzl->mil", a, b)).transpose(1, 0, 2).reshape(3, -1)
     rows = jnp.arange(capacity)[:, None] * size + jnp.arange(size)[None, :]
-    diagonal = by_slot(jnp.einsum("mzk,mzl->mkl", b, b))
+    diagonal = sum_by_slot(jnp.einsum("mzk,mzl->mkl", b, b))
     return CostToGo(
         pose=to_go.pose + jnp.einsum("mzi,mzj->ij", a, a),
         cross=to_go.cross + cross,
         map=to_go.map.at[rows[:, :, None], rows[:, None, :]].add(diagonal),
         pose_y=to_go.pose_y + jnp.einsum("mzi,mz->i", a, r),
-        map_y=to_go.map_y + by_slot(jnp.einsum("mzl,mz->ml", b, r)).reshape(-1),
+        map_y=to_go.map_y + sum_by_slot(jnp.einsum("mzl,mz->ml", b, r)).reshape(-1),
     )
 
 
@@ -231,13 +232,14 @@ def _eliminate_noise(
     to_go: CostToGo, by_noise: Float[Array, "3 W"], noise: Float[Array, "W"]
 ) -> tuple[CostToGo, Gain, Float[Array, ""]]:
     """The cost to go at a + G d minimized over d; the gain of the best d, and its term of λ²."""
-    seen = linalg.gram(by_noise, to_go.pose)
-    square = linalg.symmetrize(seen @ by_noise)
+    g_lambda = linalg.gram(by_noise, to_go.pose)  # Gᵀ Λ
+    square = linalg.symmetrize(g_lambda @ by_noise)
     factor, _ = linalg.cholesky(square + jnp.eye(noise.shape[0], dtype=noise.dtype))
     pull = linalg.solve_lower(factor, by_noise.T @ to_go.pose_y - noise)
-    by_pose = linalg.solve_lower(factor, seen)
+    by_pose = linalg.solve_lower(factor, g_lambda)
     by_map = linalg.solve_lower(factor, linalg.gram(by_noise, to_go.cross))
-    left = CostToGo(
+    # Squares of L⁻¹ times a term, so that what is subtracted is symmetric.
+    eliminated = CostToGo(
         pose=to_go.pose - linalg.gram(by_pose, by_pose),
         cross=to_go.cross - linalg.gram(by_pose, by_map),
         map=to_go.map - linalg.gram(by_map, by_map),
@@ -245,7 +247,7 @@ def _eliminate_noise(
         map_y=to_go.map_y - pull @ by_map,
     )
     constant, by_pose, by_map = (_solve_upper(factor, part) for part in (pull, by_pose, by_map))
-    return left, Gain(constant, by_pose, by_map, factor), (pull**2).sum()
+    return eliminated, Gain(constant, by_pose, by_map, factor), (pull**2).sum()
 
 
 def _solve_upper(factor: Array, rhs: Array) -> Array:
@@ -253,30 +255,26 @@ def _solve_upper(factor: Array, rhs: Array) -> Array:
     return linalg.solve_lower(factor[::-1, ::-1].T, rhs[::-1])[::-1]
 
 
-class _ChainMarginals(NamedTuple):
-    """The marginals of the Gaussian of a chain: of each pose, and of the last pose with the map."""
-
-    path: Float[Array, "T+1 3"]
-    """δx, from the start on"""
-    covs: Float[Array, "T+1 3 3"]
-    cov: Float[Array, "D D"]
-    """of the last pose and the map, D = 3 + NL; unit variance at dead slots"""
-
-
-def chain_marginals(chain: Chain, policy: Policy) -> _ChainMarginals:
+def chain_marginals(
+    chain: Chain, policy: Policy
+) -> tuple[Float[Array, "T+1 3"], Float[Array, "T+1 3 3"], Float[Array, "D D"]]:
     """The marginals of a chain, in O(T N) plus one triangular system of 3T columns.
+
+    They are δx from the start on, the covariance of each pose, and the joint covariance of the last
+    pose and the map, D = 3 + NL, with unit variance at dead slots.
 
     With n standard normal and M = R Rᵀ the matrix of the gain,
 
         δx_t = (I - G J)(F δx_{t-1} + c) + G (k - K δm + R⁻ᵀ n):
 
     for a given map δx_t has covariance S_t and depends on the map by T_t δm. Its covariance is
-    S_t + T_t Σ T_tᵀ, where Σ is that of the map.
+    S_t + T_t Σ T_tᵀ, where Σ is the covariance of the map.
     """
     delta = policy.landmarks.reshape(-1)
     wide = delta.shape[0]
 
-    def own_cov(by_noise: Array, gain: Gain) -> Array:
+    def noise_spread(by_noise: Array, gain: Gain) -> Array:
+        """G M⁻¹ Gᵀ, the covariance of G R⁻ᵀ n."""
         spread = linalg.solve_lower(gain.factor, by_noise.T)
         return linalg.gram(spread, spread)
 
@@ -290,7 +288,7 @@ def chain_marginals(chain: Chain, policy: Policy) -> _ChainMarginals:
         closed = step.by_pose - step.by_noise @ (gain.by_pose @ step.by_pose)
         after = (
             ahead + step.by_noise @ noise,
-            linalg.symmetrize(closed @ pose_cov @ closed.T + own_cov(step.by_noise, gain)),
+            linalg.symmetrize(closed @ pose_cov @ closed.T + noise_spread(step.by_noise, gain)),
             linalg.matmul(closed, by_map) - linalg.matmul(step.by_noise, gain.by_map),
         )
         return after, after
@@ -298,15 +296,17 @@ def chain_marginals(chain: Chain, policy: Policy) -> _ChainMarginals:
     root, gain = chain.start.root, policy.start
     start = (
         root @ (gain.constant - gain.by_map @ delta),
-        own_cov(root, gain),
+        noise_spread(root, gain),
         -linalg.matmul(root, gain.by_map),
     )
     _, rest = jax.lax.scan(forward, start, (chain.steps, policy.steps))
     path, pose_covs, by_map = (
-        jnp.concatenate([one[None], more]) for one, more in zip(start, rest, strict=True)
+        jnp.concatenate([first[None], later]) for first, later in zip(start, rest, strict=True)
     )
     if wide == 0:
-        return _ChainMarginals(path, pose_covs, pose_covs[-1])
+        return path, pose_covs, pose_covs[-1]
+    # Σ = L⁻ᵀ L⁻¹ with the factor L of the map: T_t Σ T_tᵀ is the square of L⁻¹ T_tᵀ. All T_t
+    # together are one right-hand side of 3T columns.
     poses = path.shape[0]
     spread = linalg.solve_lower(policy.map_factor, by_map.reshape(poses * 3, wide).T)
     spread = spread.reshape(wide, poses, 3)
@@ -315,4 +315,4 @@ def chain_marginals(chain: Chain, policy: Policy) -> _ChainMarginals:
     of_map = unit.T @ unit
     cross = by_map[-1] @ of_map
     cov = jnp.block([[covs[-1], cross], [cross.T, of_map]])
-    return _ChainMarginals(path, covs, cov)
+    return path, covs, cov

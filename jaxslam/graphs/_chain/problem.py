@@ -33,10 +33,10 @@ class Problem(NamedTuple):
     pose: Float[Array, "3"]
     """mean of the start"""
     root: Float[Array, "3 3"]
-    """of its covariance"""
+    """L, with L Lᵀ the covariance of the start"""
     control: Float[Array, "T U"]
     roots: Float[Array, "T W W"]
-    """of the covariances of the motions' noises"""
+    """square roots of the noise covariances of the motions"""
     z: Float[Array, "T M Z"]
     slot: Int[Array, "T M"]
     used: Bool[Array, "T M"]
@@ -57,9 +57,9 @@ class Iterate(NamedTuple):
 def cost(sensor: Sensor, problem: Problem, at: Iterate, held: Iterate) -> Float[Array, ""]:
     """The cost ½ |ξ|² + ½ Σ |η_t|² + ½ Σ |R^{-1/2} (z ⊖ h(x_t, l))|² of an iterate.
 
-    Minus the log posterior density, up to a constant, for fixed noise covariances: R is that of the
-    predictions of another iterate, `held`. A cost with R at its own predictions would fall where R
-    grows, and so prefer long ranges. The path is that of the iterate.
+    Minus the log posterior density, up to a constant, for fixed noise covariances: R is taken at
+    the predictions of another iterate, `held`. A cost with R at its own predictions would fall
+    where R grows, and so prefer long ranges.
     """
 
     def square(z: Array, slot: Array, used: Array, pose: Array, held_pose: Array) -> Array:
@@ -72,30 +72,34 @@ def cost(sensor: Sensor, problem: Problem, at: Iterate, held: Iterate) -> Float[
 
     over_slots = jax.vmap(square, (0, 0, 0, None, None))
     data = problem.z, problem.slot, problem.used
-    each = jax.vmap(over_slots)(*data, at.path[1:], held.path[1:])
-    return 0.5 * ((at.start**2).sum() + (at.noise**2).sum() + each.sum())
+    squares = jax.vmap(over_slots)(*data, at.path[1:], held.path[1:])
+    return 0.5 * ((at.start**2).sum() + (at.noise**2).sum() + squares.sum())
 
 
 def _linearize_at(motion: Motion, sensor: Sensor, problem: Problem, at: Iterate) -> Chain:
     """The chain of the Gauss-Newton step: the models linearized at an iterate.
 
-    It has as many rows a measurement as the chain of a filter (`smoothing.linearization`).
+    It has as many rows a measurement as the chain of a filter (`smoothing._smoother.chain_of`).
     """
     spare = max(0, len(sensor.landmark) - len(sensor.measurements))
 
-    def moved(pose: Array, u: Array, root: Array, noise: Array) -> tuple[Array, Array]:
+    def linearize_motion(pose: Array, u: Array, root: Array, noise: Array) -> tuple[Array, Array]:
         by_pose, by_noise = jax.jacfwd(motion.step, argnums=(0, 2))(pose, u, root @ noise)
         return by_pose, by_noise @ root
 
-    by_pose, by_noise = jax.vmap(moved)(at.path[:-1], problem.control, problem.roots, at.noise)
+    by_pose, by_noise = jax.vmap(linearize_motion)(
+        at.path[:-1], problem.control, problem.roots, at.noise
+    )
 
-    def measured(z: Array, slot: Array, used: Array, pose: Array) -> tuple[Array, Array, Array]:
+    def linearize_measurement(
+        z: Array, slot: Array, used: Array, pose: Array
+    ) -> tuple[Array, Array, Array]:
         *rows, positive = whitened_rows(sensor, z, pose, at.landmarks[slot], used)
         rows = [jnp.where(used & positive, row, 0.0) for row in rows]
         a, b, r = (jnp.pad(row, [(0, spare)] + [(0, 0)] * (row.ndim - 1)) for row in rows)
         return a, b, r
 
-    over_slots = jax.vmap(measured, (0, 0, 0, None))
+    over_slots = jax.vmap(linearize_measurement, (0, 0, 0, None))
     a, b, r = jax.vmap(over_slots)(problem.z, problem.slot, problem.used, at.path[1:])
     no_drift = jnp.zeros_like(at.path[1:])
     steps = LinearizedStep(by_pose, by_noise, no_drift, at.noise, problem.slot, a, b, r)
@@ -111,7 +115,7 @@ def roll_out(
     path: later noises react to the nonlinear effect of earlier ones, as in differential dynamic
     programming (Jacobson & Mayne 1970). Otherwise a small early rotation would move the whole later
     path. To first order it is share times the Gauss-Newton step. The path of the initial iterate
-    (x̄) need not satisfy the models; that of the result does.
+    (x̄) need not satisfy the models; the path of the result does.
     """
     shift = share * policy.landmarks
     delta = shift.reshape(-1)
@@ -134,10 +138,17 @@ def roll_out(
 
 
 _SHARES = (1.0, 0.5, 0.25, 0.1, 0.03, 0.01, 0.001)
-"""of the Gauss-Newton step, tried all at once; the first that lowers the cost is used."""
+"""Shares of the Gauss-Newton step, tried all at once; the first that lowers the cost is made."""
 
 _ARMIJO = 1e-4
-"""least share of the decrease predicted by the gradient (Armijo)."""
+"""The least share of the decrease that the gradient predicts (Armijo); Nocedal and Wright 2006,
+section 3.1, take this one."""
+
+_IDLE = 0.8
+"""A step whose decrement is above this share of the last one's does not get shorter."""
+
+_RESOLVED = 0.01
+"""The largest change of the cost by rounding that counts as such: a step of a tenth of a σ."""
 
 
 class Iterations(NamedTuple):
@@ -149,11 +160,11 @@ class Iterations(NamedTuple):
     policy: Policy
     """the chain's solution"""
     cost: Float[Array, ""]
-    """of the iterate, R at its own predictions"""
+    """cost of the iterate, R at its own predictions"""
     costs: Float[Array, "iterations"]
-    """after each step, that of the last repeated"""
-    taken: Int[Array, ""]
-    """steps"""
+    """cost after each step, the last one repeated"""
+    steps: Int[Array, ""]
+    """steps made"""
     ending: Int[Array, ""]
     """EXHAUSTED while the iterations continue"""
 
@@ -169,10 +180,22 @@ def optimize_chain(
     iterations: int,
     tolerance: float | None,
 ) -> Iterations:
-    """The result of the iterations from a start; the first step is by the given chain, so the start
-    need not satisfy the models.
+    """The result of the iterations from a start.
 
-    Without tolerance all iterations are made, in a loop of fixed length.
+    chain: the chain of the first step, so that the start need not satisfy the models.
+
+    Without tolerance all iterations are made, in a loop of fixed length. With one the search ends
+    where it makes no step:
+
+    | next step below the tolerance | steps left | a share lowers the cost | ending    |
+    |-------------------------------|------------|-------------------------|-----------|
+    | yes                           |            |                         | CONVERGED |
+    | no                            | no         |                         | EXHAUSTED |
+    | no                            | yes        | yes                     | goes on   |
+    | no                            | yes        | no                      | STALLED   |
+
+    EXHAUSTED and STALLED become CONVERGED where the decrease that the step promises is below the
+    rounding of the cost.
     """
 
     def step(search: Iterations) -> tuple[Iterations, Bool[Array, ""]]:
@@ -181,45 +204,45 @@ def optimize_chain(
         converged = jnp.asarray(False)
         if tolerance is not None:
             converged = _has_converged(search, policy, tolerance)
-        may = (search.taken < iterations) & ~converged
+        may_step = (search.steps < iterations) & ~converged
         after, lower = _line_search(motion, sensor, problem, search, policy)
-        moved = may & lower
+        moved = may_step & lower
         chain = _linearize_at(motion, sensor, problem, after)
         squares = [(part**2).sum() for part in (after.start, after.noise, chain.steps.residual)]
         trial = after, chain, 0.5 * linalg.total(squares)
-        here = search.at, search.chain, search.cost
-        at, chain, value = jax.tree.map(lambda a, b: jnp.where(moved, a, b), trial, here)
+        iterate = search.at, search.chain, search.cost
+        at, chain, value = jax.tree.map(lambda a, b: jnp.where(moved, a, b), trial, iterate)
         ending = jnp.where(converged, Ending.CONVERGED, Ending.EXHAUSTED)
-        ending = jnp.where(may & ~lower, Ending.STALLED, ending)
+        ending = jnp.where(may_step & ~lower, Ending.STALLED, ending)
         if tolerance is not None:
             hidden = ~moved & (policy.decrement <= _rounding_of_cost(search))
             ending = jnp.where(hidden, Ending.CONVERGED, ending)
-        late = jnp.arange(iterations, dtype=search.taken.dtype) >= search.taken
-        found = Iterations(
+        later = jnp.arange(iterations, dtype=search.steps.dtype) >= search.steps
+        after_step = Iterations(
             at=at,
             chain=chain,
             policy=policy,
             cost=value,
-            costs=jnp.where(late, value, search.costs),
-            taken=search.taken + moved.astype(search.taken.dtype),
+            costs=jnp.where(later, value, search.costs),
+            steps=search.steps + moved.astype(search.steps.dtype),
             ending=ending.astype(jnp.int32),
         )
-        return found, moved
+        return after_step, moved
 
-    begin = _initial_noise(start, chain, alive, iterations)
+    begin = _before_first_step(start, chain, alive, iterations)
     # One iteration more than steps: the last solves the chain at the final iterate.
     if tolerance is None:
         fixed: Iterations = jax.lax.fori_loop(
             0, iterations + 1, lambda _, search: step(search)[0], begin
         )
         return fixed
-    out: tuple[Iterations, Array] = jax.lax.while_loop(
+    end: Iterations = jax.lax.while_loop(
         lambda carry: carry[1], lambda carry: step(carry[0]), (begin, jnp.asarray(True))
-    )
-    return out[0]
+    )[0]
+    return end
 
 
-def _initial_noise(
+def _before_first_step(
     start: Iterate, chain: Chain, alive: Bool[Array, "N"], iterations: int
 ) -> Iterations:
     """The search before the first step: no chain solved, and infinite cost."""
@@ -240,38 +263,37 @@ def _has_converged(search: Iterations, policy: Policy, tolerance: float) -> Bool
     """
     eps = float(jnp.finfo(search.cost.dtype).eps)
     least = jnp.maximum(tolerance, eps**0.5)
-    idle = policy.decrement > 0.8 * search.policy.decrement
+    idle = policy.decrement > _IDLE * search.policy.decrement
     idle = idle & (policy.decrement <= eps * search.cost)
-    return (search.taken > 0) & ((policy.decrement <= least**2) | idle)
+    return (search.steps > 0) & ((policy.decrement <= least**2) | idle)
 
 
 def _rounding_of_cost(search: Iterations) -> Float[Array, ""]:
-    """What rounding of the coordinates changes of the cost, |r| |δr|; at most 0.01, a step of a
-    tenth of a standard deviation.
+    """The change of the cost by rounding of the coordinates, |r| |δr|, at most `_RESOLVED`.
 
-    δr is by two ulp of the largest coordinate of a position, and of π.
+    δr is the change of the residuals by two ulp of the largest coordinate of a position, and of π.
     """
     at, steps = search.at, search.chain.steps
     far = jnp.abs(jnp.concatenate([at.path[:, :2].ravel(), at.landmarks.ravel()])).max(initial=0.0)
     by_pose, by_map = jnp.abs(steps.pose_rows), jnp.abs(steps.landmark_rows)
     change = far * (by_pose[..., :2].sum(-1) + by_map.sum(-1)) + jnp.pi * by_pose[..., 2]
     change = 2 * float(jnp.finfo(search.cost.dtype).eps) * jnp.sqrt((change**2).sum())
-    return jnp.minimum(jnp.sqrt(2 * search.cost) * change, 0.01)
+    return jnp.minimum(jnp.sqrt(2 * search.cost) * change, _RESOLVED)
 
 
 def _line_search(
     motion: Motion, sensor: Sensor, problem: Problem, search: Iterations, policy: Policy
 ) -> tuple[Iterate, Bool[Array, ""]]:
     """The iterate at the first share of the step that lowers the cost enough, R held, and whether
-    there is such a share. The first step may raise the cost, if it stays finite."""
+    there is such a share. The first step may raise the cost, as long as it is finite."""
     kind = search.cost.dtype
     shares, eps = jnp.asarray(_SHARES, kind), float(jnp.finfo(kind).eps)
     tried = jax.vmap(lambda share: roll_out(motion, problem, search.at, policy, share))(shares)
     costs = jax.vmap(lambda at: cost(sensor, problem, at, search.at))(tried)
     # To first order a step lowers the cost by share · λ²; the margin is the rounding of sums.
-    first = search.taken == 0
-    known = jnp.where(first, 0.0, search.cost)
-    enough = known * (1 + 10 * eps) - _ARMIJO * shares * policy.decrement
+    first = search.steps == 0
+    before = jnp.where(first, 0.0, search.cost)  # of the first step infinite
+    enough = before * (1 + 10 * eps) - _ARMIJO * shares * policy.decrement
     good = jnp.isfinite(costs) & (first | (costs <= enough))
     chosen = jnp.argmax(good)
     after: Iterate = jax.tree.map(lambda leaf: leaf[chosen], tried)

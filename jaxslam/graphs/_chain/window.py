@@ -18,7 +18,6 @@ from jaxslam.core import slots
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.graphs._chain.elimination import (
-    CostToGo,
     Gain,
     LinearizedStep,
     eliminate_steps,
@@ -45,7 +44,7 @@ class WindowSteps(NamedTuple):
     present: Bool[Array, "W"]
     control: Float[Array, "W U"]
     root: Float[Array, "W Q Q"]
-    """of the covariances of the motions' noises"""
+    """square roots of the noise covariances of the motions"""
     z: Float[Array, "W M Z"]
     slot: Int[Array, "W M"]
     used: Bool[Array, "W M"]
@@ -65,12 +64,12 @@ class _WindowSolution(NamedTuple):
     """The deviations from an iterate that solve its linearized problem."""
 
     pose: Float[Array, "3"]
-    """of the oldest pose"""
+    """deviation of the oldest pose"""
     landmarks: Float[Array, "N L"]
     gains: Gain
-    """of the noises, with leading W"""
+    """gains of the noises, with leading W"""
     cov: Float[Array, "D D"]
-    """of the oldest pose and the map; zero at dead slots"""
+    """joint covariance of the oldest pose and the map; zero at dead slots"""
 
 
 def linearize_window(
@@ -92,17 +91,19 @@ def linearize_window(
     """
     landmark_points = at.landmarks
     if first:
-        known = prior.joint.alive[:, None]
-        landmark_points = jnp.where(known, prior.points[1], at.landmarks)
+        has_prior = prior.joint.alive[:, None]
+        landmark_points = jnp.where(has_prior, prior.points[1], at.landmarks)
 
-    def moved(
+    def linearize_motion(
         pose: Array, u: Array, root: Array, noise: Array, present: Array
     ) -> tuple[Array, Array]:
         by_pose, by_noise = jax.jacfwd(motion.step, argnums=(0, 2))(pose, u, root @ noise)
         by_pose = jnp.where(present, by_pose, jnp.eye(3, dtype=pose.dtype))
         return by_pose, jnp.where(present, by_noise @ root, 0.0)
 
-    def measured(z: Array, slot: Array, used: Array, pose: Array) -> tuple[Array, Array, Array]:
+    def linearize_measurement(
+        z: Array, slot: Array, used: Array, pose: Array
+    ) -> tuple[Array, Array, Array]:
         *rows, positive = whitened_rows(
             sensor, z, pose, at.landmarks[slot], used, landmark_points[slot]
         )
@@ -110,11 +111,11 @@ def linearize_window(
         return a, b, r
 
     data = steps.control, steps.root, at.noise, steps.present
-    by_pose, by_noise = jax.vmap(moved)(at.path[:-1], *data)
+    by_pose, by_noise = jax.vmap(linearize_motion)(at.path[:-1], *data)
     if first:
         offset = jnp.where(steps.present[0], at.path[0, :2] - prior.points[0][:2], 0.0)
         by_pose = by_pose.at[0].set(with_lever_arm(by_pose[0], offset))
-    over_slots = jax.vmap(measured, (0, 0, 0, None))
+    over_slots = jax.vmap(linearize_measurement, (0, 0, 0, None))
     a, b, r = jax.vmap(over_slots)(steps.z, steps.slot, steps.used, at.path[1:])
     no_drift = jnp.zeros_like(at.path[1:])
     return LinearizedStep(by_pose, by_noise, no_drift, at.noise, steps.slot, a, b, r)
@@ -126,34 +127,32 @@ def solve_window(
     """The solution of a linearized window. alive: the landmarks of the map.
 
     With Λ and y of all steps (`eliminate_steps`) and e = (x_0, m) - μ at the iterate, the
-    deviation δ has (I + P Λ) δ = P y - e in the rows of the prior, Λ δ = y in those of landmarks
-    without one; its covariance is the inverse of that matrix times P, or I.
+    deviation δ has (I + P Λ) δ = P y - e in the rows of the prior, Λ δ = y in the rows of
+    landmarks without one; its covariance is the inverse of that matrix times P, or I.
     """
     joint, (capacity, size) = prior.joint, at.landmarks.shape
     cost, gains, _ = eliminate_steps(system, capacity)
-    information, y = _join(cost)
-    known = jnp.concatenate([jnp.ones(3, bool), jnp.repeat(joint.alive, size)])
-    new = jnp.concatenate([jnp.zeros(3, bool), jnp.repeat(alive & ~joint.alive, size)])
+    information = jnp.block([[cost.pose, cost.cross], [cost.cross.T, cost.map]])
+    information = linalg.symmetrize(information)
+    y = jnp.concatenate([cost.pose_y, cost.map_y])
+    # Rows of the prior, and of landmarks without one; those of dead slots are of the identity.
+    in_prior = jnp.concatenate([jnp.ones(3, bool), jnp.repeat(joint.alive, size)])
+    is_new = jnp.concatenate([jnp.zeros(3, bool), jnp.repeat(alive & ~joint.alive, size)])
     off = jnp.where(joint.alive[:, None], at.landmarks - joint.landmarks, 0.0)
     error = jnp.concatenate([pose_difference(at.path[0], joint.pose), off.reshape(-1)])
-    cov = jnp.where(known[:, None] & known[None], joint.cov, 0.0)
+    cov = jnp.where(in_prior[:, None] & in_prior[None], joint.cov, 0.0)
     eye = jnp.eye(len(y), dtype=y.dtype)
     matrix = jnp.where(
-        known[:, None], eye + cov @ information, jnp.where(new[:, None], information, eye)
+        in_prior[:, None], eye + cov @ information, jnp.where(is_new[:, None], information, eye)
     )
-    right = jnp.where(known, cov @ y - error, jnp.where(new, y, 0.0))
-    rows = jnp.where(known[:, None], cov, jnp.diag(new.astype(y.dtype)))
+    right = jnp.where(in_prior, cov @ y - error, jnp.where(is_new, y, 0.0))
+    rows = jnp.where(in_prior[:, None], cov, jnp.diag(is_new.astype(y.dtype)))
     delta, of_delta = jnp.linalg.solve(matrix, right), jnp.linalg.solve(matrix, rows)
     landmarks = delta[3:].reshape(capacity, size)
     return _WindowSolution(delta[:3], landmarks, gains, linalg.symmetrize(of_delta))
 
 
-def _join(cost: CostToGo) -> tuple[Float[Array, "D D"], Float[Array, "D"]]:
-    information = jnp.block([[cost.pose, cost.cross], [cost.cross.T, cost.map]])
-    return linalg.symmetrize(information), jnp.concatenate([cost.pose_y, cost.map_y])
-
-
-def moved_by(
+def step_window(
     motion: Motion, steps: WindowSteps, at: WindowIterate, solved: _WindowSolution
 ) -> WindowIterate:
     """The iterate after the Gauss-Newton step, by the nonlinear models (see `problem.roll_out`)."""
@@ -218,8 +217,8 @@ def marginalize_oldest(
     scan, and new landmarks l = l̂ + B⁻¹ (b - A (x_1 - x̂_1) - v). They and x_1 get their points
     here. tag: of the map's slots. The prior itself if there is no first step.
     """
-    one = jax.tree.map(lambda leaf: leaf[0], (system, steps))
-    step, (present, _, _, _, slot, used) = one
+    step, oldest = jax.tree.map(lambda leaf: leaf[0], (system, steps))
+    present, slot, used = oldest.present, oldest.slot, oldest.used
     joint, (capacity, size) = prior.joint, at.landmarks.shape
     # Prediction: x_1 = x̂_1 + F (x_0 - x̂_0) + G (η - η̄).
     mean = step.by_pose @ pose_difference(joint.pose, at.path[0]) - step.by_noise @ step.noise
@@ -228,11 +227,12 @@ def marginalize_oldest(
     corner = rows[:, :3] @ step.by_pose.T + step.by_noise @ step.by_noise.T
     cov = cov.at[:3, :3].set(linalg.symmetrize(corner))
     # Correction: b = A (x_1 - x̂_1) + B (l - l̂) + v.
-    known = used & joint.alive[slot]
+    seen_before = used & joint.alive[slot]
     a, b, r = (
-        jnp.where(known.reshape(-1, *[1] * (part.ndim - 1)), part, 0.0)
+        jnp.where(seen_before.reshape(-1, *[1] * (part.ndim - 1)), part, 0.0)
         for part in (step.pose_rows, step.landmark_rows, step.residual)
     )
+    # B of the whole map: (M, Z, N, L) to (M Z, N L).
     wide = jnp.zeros((*b.shape[:2], capacity, size), b.dtype)
     by_map = wide.at[jnp.arange(len(slot)), :, slot].set(b).reshape(r.size, -1)
     jacobian = jnp.concatenate([a.reshape(r.size, 3), by_map], axis=1)
@@ -269,7 +269,5 @@ def marginalize_oldest(
     )
     points = at.path[1], jnp.where(joint.alive[:, None], prior.points[1], at.landmarks)
     moved = WindowPrior(after, points)
-    chosen: WindowPrior = jax.tree.map(
-        lambda then, now: jnp.where(present, then, now), moved, prior
-    )
+    chosen: WindowPrior = jax.tree.map(lambda a, b: jnp.where(present, a, b), moved, prior)
     return chosen

@@ -1,7 +1,7 @@
 """Programs that many graphs share: of one pattern in a batch, or padded to sizes that recur.
 
-A program is compiled for the sizes of its arrays. Those of a graph are the numbers of poses, points
-and rows, which differ from log to log and from round to round of loop closing.
+A program is compiled for the sizes of its arrays: of a graph the numbers of poses, points and rows,
+which differ from log to log and from round to round of loop closing.
 """
 
 from collections.abc import Callable
@@ -25,7 +25,7 @@ LEAST = 16
 
 
 def padded_graph(graph: Graph, room: int = 0) -> Graph:
-    """The graph with more poses and points, which are fixed, and rows, which are not valid.
+    """The graph with further poses and points, which are fixed, and rows, which are not valid.
 
     With room for n variables there are n poses, and two rows a pose.
 
@@ -33,51 +33,51 @@ def padded_graph(graph: Graph, room: int = 0) -> Graph:
     so that a plan leaves them out.
     """
 
-    def more(x: PyTree, value: float = 0, least: int = 0) -> np.ndarray:
+    def pad(x: PyTree, value: float = 0, least: int = 0) -> np.ndarray:
         x = np.asarray(x)
         rows = [(0, padded_size(max(len(x), least), LEAST) - len(x))] + [(0, 0)] * (x.ndim - 1)
         return np.pad(x, rows, constant_values=value)
 
     return Graph(
-        poses=more(graph.poses, 0, room),
-        points=more(graph.points),
+        poses=pad(graph.poses, 0, room),
+        points=pad(graph.points),
         tables={
             name: Table(
-                more(t.who, -1, 2 * room),
-                more(t.z, 0, 2 * room),
-                more(t.information, 0, 2 * room),
-                more(t.valid, False, 2 * room),
+                pad(table.who, -1, 2 * room),
+                pad(table.z, 0, 2 * room),
+                pad(table.information, 0, 2 * room),
+                pad(table.valid, False, 2 * room),
             )
-            for name, t in graph.tables.items()
+            for name, table in graph.tables.items()
         },
-        fixed_pose=more(graph.fixed_pose, True, room),
-        fixed_point=more(graph.fixed_point, True),
-        pose_id=more(graph.pose_id, -1, room),
-        point_id=more(graph.point_id, -1),
+        fixed_pose=pad(graph.fixed_pose, True, room),
+        fixed_point=pad(graph.fixed_point, True),
+        pose_id=pad(graph.pose_id, -1, room),
+        point_id=pad(graph.point_id, -1),
     )
 
 
 def padded_number(
-    variables: Int[np.ndarray, "*shape"], graph: Graph, more: Graph
+    variables: Int[np.ndarray, "*shape"], graph: Graph, padded: Graph
 ) -> Int[np.ndarray, "*shape"]:
     """The numbers in the padded graph of a graph's variables, points counted on from the poses."""
-    shift = len(more.poses) - len(graph.poses)
+    shift = len(padded.poses) - len(graph.poses)
     return np.where(variables >= len(graph.poses), variables + shift, variables)
 
 
-def own_number(variable: jax.Array, graph: Graph, more: Graph) -> jax.Array:
-    """The number of a variable in the graph, by that in the padded one."""
-    count, shift = len(more.poses), len(more.poses) - len(graph.poses)
+def original_number(variable: jax.Array, graph: Graph, padded: Graph) -> jax.Array:
+    """The number in the graph of a variable of the padded graph."""
+    count, shift = len(padded.poses), len(padded.poses) - len(graph.poses)
     return _by_numpy(lambda number: number - shift * (number >= count), variable)
 
 
-def cut(found: _T, like: PyTree) -> _T:
-    """The arrays without the rows that are beyond those of others."""
+def cut(arrays: _T, like: PyTree) -> _T:
+    """The arrays, each cut to as many rows as the array in its place has in `like`."""
 
-    def one(x: jax.Array, other: PyTree) -> jax.Array:
-        return x if len(x) == len(other) else _by_numpy(lambda x: x[: len(other)], x)
+    def cut_rows(x: jax.Array, example: PyTree) -> jax.Array:
+        return x if len(x) == len(example) else _by_numpy(lambda x: x[: len(example)], x)
 
-    return cast(_T, jax.tree.map(one, found, like))
+    return cast(_T, jax.tree.map(cut_rows, arrays, like))
 
 
 def _by_numpy(change: Callable[[PyTree], PyTree], x: jax.Array) -> jax.Array:
@@ -109,10 +109,10 @@ def over_batch(name: str, function: Callable[..., _T]) -> Callable[[PyTree, PyTr
     """
 
     @jax.custom_batching.custom_vmap
-    def whole(shared: PyTree, graphs: PyTree) -> _T:
+    def batched_call(shared: PyTree, graphs: PyTree) -> _T:
         return function(*shared, graphs)
 
-    @whole.def_vmap
+    @batched_call.def_vmap
     def rule(size: int, batched: PyTree, shared: PyTree, graphs: PyTree) -> tuple[_T, PyTree]:
         if any(jax.tree.leaves(batched[0])):
             raise ValueError(
@@ -124,45 +124,53 @@ def over_batch(name: str, function: Callable[..., _T]) -> Callable[[PyTree, PyTr
             groups = -(-size // _GROUP)
             rows = np.arange(groups * _GROUP) % size  # the last group is filled up with the first
 
-            def parted(x: Array, one: bool) -> Array:
-                x = x if one else jnp.broadcast_to(x[None], (size, *x.shape))
+            def to_groups(x: Array, is_batched: bool) -> Array:
+                x = x if is_batched else jnp.broadcast_to(x[None], (size, *x.shape))
                 return x[rows].reshape(groups, _GROUP, *x.shape[1:])
 
-            together = jax.vmap(lambda group: whole(shared, group))
-            out = jax.lax.map(together, jax.tree.map(parted, graphs, batched[1]))
-            out = jax.tree.map(lambda x: x.reshape(groups * _GROUP, *x.shape[2:])[:size], out)
-            return out, jax.tree.map(lambda _: True, out)
+            together = jax.vmap(lambda group: batched_call(shared, group))
+            results = jax.lax.map(together, jax.tree.map(to_groups, graphs, batched[1]))
+            results = jax.tree.map(
+                lambda x: x.reshape(groups * _GROUP, *x.shape[2:])[:size], results
+            )
+            return results, jax.tree.map(lambda _: True, results)
 
-        def fold(x: Array, one: bool) -> Array:
+        # The new axis, of `size`, is first; it is folded into the last, (size, …, B) to
+        # (…, size B), and the results are unfolded.
+        def fold(x: Array, is_batched: bool) -> Array:
             wide = jnp.broadcast_to(x[..., None, :], (*x.shape[:-1], size, x.shape[-1]))
-            x = jnp.moveaxis(x, 0, -2) if one else wide
+            x = jnp.moveaxis(x, 0, -2) if is_batched else wide
             return x.reshape(*x.shape[:-2], size * x.shape[-1])
 
         def unfold(x: Array) -> Array:
             return jnp.moveaxis(x.reshape(*x.shape[:-1], size, x.shape[-1] // size), -2, 0)
 
-        out = jax.tree.map(unfold, whole(shared, jax.tree.map(fold, graphs, batched[1])))
-        return out, jax.tree.map(lambda _: True, out)
+        folded = jax.tree.map(fold, graphs, batched[1])
+        results = jax.tree.map(unfold, batched_call(shared, folded))
+        return results, jax.tree.map(lambda _: True, results)
 
-    def single(shared: PyTree, graphs: PyTree) -> _T:
-        return cast(_T, jax.tree.map(lambda x: x[..., 0], whole(shared, with_batch(graphs))))
+    def single_call(shared: PyTree, graphs: PyTree) -> _T:
+        result = batched_call(shared, with_batch(graphs))
+        return cast(_T, jax.tree.map(lambda x: x[..., 0], result))
 
-    return single
+    return single_call
 
 
 def graph_in_one_dtype(graph: Graph) -> Graph:
-    """The graph with its numbers in one precision, the highest of them; whole numbers become real
-    ones."""
+    """The graph with its numbers in one precision, the highest among them; integers become
+    floats."""
     numbers = [graph.poses, graph.points]
     numbers += [x for table in graph.tables.values() for x in (table.z, table.information)]
     dtype = jnp.result_type(*numbers, float)
 
-    def real(x: JaxOrNumPy) -> JaxOrNumPy:
+    def as_float(x: JaxOrNumPy) -> JaxOrNumPy:
         return x if jnp.issubdtype(x.dtype, jnp.floating) else jnp.asarray(x, dtype)
 
     tables = {
-        key: table._replace(z=real(table.z), information=real(table.information))
+        key: table._replace(z=as_float(table.z), information=as_float(table.information))
         for key, table in graph.tables.items()
     }
-    graph = graph._replace(poses=real(graph.poses), points=real(graph.points), tables=tables)
+    graph = graph._replace(
+        poses=as_float(graph.poses), points=as_float(graph.points), tables=tables
+    )
     return in_dtype(graph, dtype)

@@ -25,12 +25,12 @@ class Kernel(Component):
         raise NotImplementedError
 
     def weight(self, s: Array) -> Array:
-        """ρ'(s), what multiplies the information in a Gauss-Newton step."""
+        """ρ'(s), the factor of the information in a Gauss-Newton step."""
         raise NotImplementedError
 
 
 class _OfWidth(Kernel):
-    """What kernels of one number share. Raises ValueError on a width not above 0."""
+    """The base of kernels of one number. Raises ValueError on a width not above 0."""
 
     width: Number
 
@@ -104,8 +104,8 @@ class DynamicCovarianceScaling(_OfWidth):
 class Truncated(_OfWidth):
     """Truncated least squares: min(s, c²), so that a measurement is kept or costs c².
 
-    c² should be a quantile of χ² with as many degrees of freedom as residuals: c = 3.37 is that of
-    99 % for three. `optimize` finds its minimum by graduated non-convexity (`gnc`).
+    c² should be a quantile of χ² with as many degrees of freedom as residuals: c = 3.37 is for
+    99 % and three. `optimize` finds its minimum by graduated non-convexity (`gnc`).
     """
 
     width: Number = 3.37

@@ -1,7 +1,7 @@
 """A graph about its variables: residuals, gradient, and the blocks of the information matrix.
 
-Arrays have a batch B as their last axis, as those of `sparse.cholesky`. Increments are local, in
-the frame of a pose, X ∘ exp(δ) (`se2.boxplus`); those of a point are added.
+Arrays have a batch B as their last axis, as in `_sparse/cholesky.py`. Increments of a pose are
+local, in its frame, X ∘ exp(δ) (`se2.boxplus`); increments of a point are added.
 """
 
 from collections.abc import Callable, Mapping
@@ -17,7 +17,7 @@ from jaxslam.graphs._graph import Graph
 from jaxslam.graphs._solver.kernels import Kernel
 from jaxslam.graphs._solver.model import Model
 from jaxslam.graphs._solver.plans import Plan
-from jaxslam.graphs._sparse.sweeps import summed
+from jaxslam.graphs._sparse.sweeps import sum_rows
 from jaxslam.math import se2
 from jaxslam.math._linalg import total
 from jaxslam.math.angles import sin_cos
@@ -31,13 +31,13 @@ class Variables(NamedTuple):
 
 
 class Data(NamedTuple):
-    """Measurements and fixed variables; numbers of rows that are not valid are zero."""
+    """The measurements by table, and the fixed variables; rows that are not valid are zero."""
 
     z: dict[str, Float[Array, "_ _ B"]]
     information: dict[str, Float[Array, "_ _ _ B"]]
     valid: dict[str, Bool[Array, "_ B"]]
     free: Bool[Array, "n d B"]
-    """which entries of the increments are estimated, by column"""
+    """whether each entry of the increments is estimated, by column"""
 
 
 class System(NamedTuple):
@@ -48,6 +48,23 @@ class System(NamedTuple):
     """Σ Jᵀ ρ' Ω e, by column: half the derivative of χ² by the increments"""
     blocks: Float[Array, "M d d B"]
     """Σ Jᵀ ρ' Ω J; one on the diagonal of fixed variables"""
+
+
+def diagonal_of(plan: Plan, blocks: Float[Array, "M d d *B"]) -> Float[Array, "n d *B"]:
+    """The diagonal of a matrix of the plan's pattern, by column."""
+    diagonal = jnp.diagonal(blocks[plan.cholesky.diagonal], axis1=1, axis2=2)  # (n, B, d)
+    return jnp.moveaxis(diagonal, 2, 1)
+
+
+def dot(a: Float[Array, "n d B"], b: Float[Array, "n d B"]) -> Float[Array, "B"]:
+    """The inner product Σ a b over all variables."""
+    return (a * b).sum(axis=(0, 1))
+
+
+def outer(a: Float[Array, "E K d B"], b: Float[Array, "E K d B"]) -> Float[Array, "E K K d d B"]:
+    """The products a_k b_lᵀ of each two variables k and l of a row."""
+    # a: (E, K, 1, d, 1, B), b: (E, 1, K, 1, d, B)
+    return a[:, :, None, :, None] * b[:, None, :, None]
 
 
 def retract(variables: Variables, increments: Float[Array, "n d B"], plan: Plan) -> Variables:
@@ -61,7 +78,8 @@ def retract(variables: Variables, increments: Float[Array, "n d B"], plan: Plan)
     )
 
 
-def _taken(factor: Factor, who: Array, variables: Variables) -> tuple[Array, ...]:
+def _select(factor: Factor, who: Array, variables: Variables) -> tuple[Array, ...]:
+    """The variables of the rows of a table, (E, 3, B) or (E, L, B) each."""
     return tuple(
         (variables.poses if kind == "pose" else variables.points)[who[:, k]]
         for k, kind in enumerate(factor.variables)
@@ -73,7 +91,7 @@ def _over_rows(function: Callable[..., PyTree], *arguments: PyTree) -> PyTree:
     return jax.vmap(jax.vmap(function, -1, -1))(*arguments)
 
 
-def squared(information: Float[Array, "E R R B"], e: Float[Array, "E R B"]) -> Float[Array, "E B"]:
+def squares(information: Float[Array, "E R R B"], e: Float[Array, "E R B"]) -> Float[Array, "E B"]:
     """The squared residual s = eᵀ Ω e of each row."""
     size = e.shape[1]
     return total(e[:, i] * information[:, i, j] * e[:, j] for i in range(size) for j in range(size))
@@ -83,8 +101,8 @@ def row_costs(
     factor: Factor, kernel: Kernel | None, who: Array, variables: Variables, z: Array, info: Array
 ) -> tuple[Float[Array, "E R B"], Float[Array, "E B"], Float[Array, "E B"]]:
     """Residuals, squared residuals s, and costs ρ(s) of the rows of a table."""
-    e = _over_rows(factor.residual, _taken(factor, who, variables), z)
-    s = squared(info, e)
+    e = _over_rows(factor.residual, _select(factor, who, variables), z)
+    s = squares(info, e)
     return e, s, s if kernel is None else kernel.cost(s)
 
 
@@ -94,7 +112,7 @@ def held_data(model: Model, who: Mapping[str, Array], at: Variables, data: Data)
     for name, factor in model.factors.items():
         if factor.whiten is None:
             continue
-        w = _over_rows(factor.whiten, _taken(factor, who[name], at), data.z[name])
+        w = _over_rows(factor.whiten, _select(factor, who[name], at), data.z[name])
         information[name] = jnp.einsum("erib,ersb,esjb->eijb", w, information[name], w)
     return data._replace(information=information)
 
@@ -106,19 +124,16 @@ def chi2_of(
     data: Data,
     held: Variables | None = None,
 ) -> Float[Array, "B"]:
-    """The cost χ² of the graph at some variables; held: where factors whiten, if elsewhere."""
+    """The cost χ² of the graph at some variables.
+
+    held: the variables at which factors whiten, if others.
+    """
     data = held_data(model, who, variables if held is None else held, data)
     parts = []
     for name, factor in model.factors.items():
-        rows = row_costs(
-            factor,
-            model.kernels.get(name),
-            who[name],
-            variables,
-            data.z[name],
-            data.information[name],
-        )
-        parts.append(jnp.where(data.valid[name], rows[2], 0.0).sum(axis=0))
+        z, information, kernel = data.z[name], data.information[name], model.kernels.get(name)
+        cost = row_costs(factor, kernel, who[name], variables, z, information)[2]
+        parts.append(jnp.where(data.valid[name], cost, 0.0).sum(axis=0))
     return total(parts)
 
 
@@ -146,7 +161,7 @@ def linearize(model: Model, plan: Plan, variables: Variables, data: Data) -> Sys
     for name, factor in model.factors.items():
         e, jacobian = _jacobians(factor, plan.who[name], variables, data.z[name], width)
         info, valid = data.information[name], data.valid[name]
-        s, kernel = squared(info, e), model.kernels.get(name)
+        s, kernel = squares(info, e), model.kernels.get(name)
         chi2.append(jnp.where(valid, s if kernel is None else kernel.cost(s), 0.0).sum(axis=0))
         weight = 1.0 if kernel is None else kernel.weight(s)
         info = info * jnp.where(valid, weight, 0.0)[:, None, None]
@@ -154,27 +169,26 @@ def linearize(model: Model, plan: Plan, variables: Variables, data: Data) -> Sys
         keep = valid[:, None, None, None] & free[:, None]  # (E, 1, K, d, B)
         jacobian = jnp.where(keep, jacobian, 0.0)
         rows, size = e.shape[0], e.shape[1]
+        # ρ' Ω J, (E, R, K, d, B)
         weighted = total(info[:, :, r, None, None] * jacobian[:, r, None] for r in range(size))
         e = jnp.where(valid[:, None], e, 0.0)
         gradient = total(weighted[:, r] * e[:, r, None, None] for r in range(size))
         gradients.append(gradient.reshape(-1, *gradient.shape[2:]))
-        product = total(
-            jacobian[:, r, :, None, :, None] * weighted[:, r, None, :, None, :] for r in range(size)
-        )
+        product = total(outer(jacobian[:, r], weighted[:, r]) for r in range(size))
         blocks.append(product.reshape(rows * len(factor.variables) ** 2, *product.shape[3:]))
     return System(
         total(chi2),
-        summed(plan.gradient, jnp.concatenate(gradients)),
+        sum_rows(plan.gradient, jnp.concatenate(gradients)),
         _assemble(plan, blocks, data),
     )
 
 
 def _assemble(plan: Plan, blocks: list[Array], data: Data) -> Float[Array, "M d d B"]:
-    """The blocks of the matrix from those of the rows of each table, (E K K, d, d, B)."""
-    out = summed(plan.information, jnp.concatenate(blocks))
+    """The blocks of the matrix, from those of the rows of each table, (E K K, d, d, B)."""
+    matrix = sum_rows(plan.information, jnp.concatenate(blocks))
     held = plan.on_diagonal[:, None, None] & ~data.free[plan.block_column]
-    unit = jnp.eye(out.shape[1], dtype=out.dtype)[None, ..., None]
-    return out + jnp.where(held[:, None], unit, 0.0)
+    unit = jnp.eye(matrix.shape[1], dtype=matrix.dtype)[None, ..., None]
+    return matrix + jnp.where(held[:, None], unit, 0.0)
 
 
 def half_hessian(
@@ -187,26 +201,27 @@ def half_hessian(
     for name, factor in model.factors.items():
         kernel, count = model.kernels.get(name), len(factor.variables)
 
-        def half(steps: Array, involved: tuple[Array, ...], z: Array, info: Array) -> Array:
+        def half_cost(steps: Array, involved: tuple[Array, ...], z: Array, info: Array) -> Array:
             e = factor.residual(_move(factor, steps, involved), z)  # noqa: B023
             s = e @ info @ e
             return 0.5 * (s if kernel is None else kernel.cost(s))  # noqa: B023
 
-        values = _taken(factor, plan.who[name], variables)
+        values = _select(factor, plan.who[name], variables)
         still = jnp.zeros((count, width), variables.poses.dtype)
+        # Over the rows, the first axis, and the graphs, the last.
         second: Array = jax.vmap(
-            jax.vmap(jax.jacfwd(jax.grad(half)), (None, -1, -1, -1), -1), (None, 0, 0, 0)
+            jax.vmap(jax.jacfwd(jax.grad(half_cost)), (None, -1, -1, -1), -1), (None, 0, 0, 0)
         )(still, values, data.z[name], data.information[name])  # (E, K, d, K, d, B)
         free = data.free[plan.column[variable_numbers(factor, plan.who[name], poses)]]
         keep = free[:, :, :, None, None] & free[:, None, None]
         keep = keep & data.valid[name][:, None, None, None, None]
-        second = jnp.moveaxis(jnp.where(keep, second, 0.0), 3, 2)
+        second = jnp.moveaxis(jnp.where(keep, second, 0.0), 3, 2)  # (E, K, K, d, d, B)
         blocks.append(second.reshape(-1, *second.shape[3:]))
     return _assemble(plan, blocks, data)
 
 
 def variable_numbers(factor: Factor, who: Array, poses: int) -> Array:
-    """The variables of rows; points are numbered after the poses."""
+    """The numbers of the variables of rows (E, K); points are counted on from the poses."""
     shift = np.array([[poses * (kind == "point") for kind in factor.variables]], np.int32)
     return who + shift
 
@@ -238,37 +253,37 @@ def _jacobians(
 ) -> tuple[Float[Array, "E R B"], Float[Array, "E R K d B"]]:
     """Residuals of rows, and their derivatives by the increments of each variable.
 
-    Those by coordinates, whose first two are turned into the frame of a pose; by the increments
-    themselves they take two to five times as long. What the derivatives have in common is computed
-    once: without the barrier XLA would compute it again for each of their entries.
+    They are derivatives by coordinates, the first two of a pose turned into its frame; derivatives
+    by the increments themselves take two to five times as long. Common parts of the derivatives
+    are computed once: without the barrier XLA would compute it again for each of their entries.
     """
-    involved = _taken(factor, who, variables)
+    involved = _select(factor, who, variables)
     e, slope = jax.linearize(lambda *involved: _over_rows(factor.residual, involved, z), *involved)
     slope, common = jax.closure_convert(slope, *involved)
     e, common = _barrier((e, common))
 
     def by_coordinate(k: int) -> Array:
-        """(size, E, R, B)"""
+        """The derivatives by the coordinates of variable k, (size, E, R, B)."""
         still = [jnp.zeros_like(x) for x in involved]
 
         def along(unit: Array) -> Array:
             still[k] = jnp.broadcast_to(unit[:, None], involved[k].shape)
-            out: Array = slope(*still, *common)
-            return out
+            derivative: Array = slope(*still, *common)
+            return derivative
 
         return jax.vmap(along)(jnp.eye(involved[k].shape[1], dtype=e.dtype))
 
-    out = []
+    jacobians = []
     for k, (kind, x) in enumerate(zip(factor.variables, involved, strict=True)):
-        part = by_coordinate(k)
+        by = by_coordinate(k)
         if kind == "pose":
             sin, cos = (y[:, None] for y in sin_cos(x[:, 2]))
-            turned = [cos * part[0] + sin * part[1], cos * part[1] - sin * part[0], part[2]]
+            by_increment = [cos * by[0] + sin * by[1], cos * by[1] - sin * by[0], by[2]]
         else:
-            turned = list(part)
-        turned += [jnp.zeros_like(e)] * (width - len(turned))
-        out.append(jnp.stack(turned, axis=2))
-    return e, jnp.stack(out, axis=2)
+            by_increment = list(by)
+        by_increment += [jnp.zeros_like(e)] * (width - len(by_increment))
+        jacobians.append(jnp.stack(by_increment, axis=2))  # (E, R, d, B)
+    return e, jnp.stack(jacobians, axis=2)
 
 
 def variables_of(graph: Graph) -> Variables:
@@ -277,7 +292,7 @@ def variables_of(graph: Graph) -> Variables:
 
 
 def data_of(graph: Graph, column: Array) -> Data:
-    """The data of graphs with a last axis B; column: of each variable."""
+    """The data of graphs with a last axis B. column: the column of each variable."""
     size = graph.points.shape[1] if len(graph.points) else 0
     width = max(3, size)
     fixed = jnp.concatenate([graph.fixed_pose, graph.fixed_point])

@@ -21,7 +21,7 @@ class Model:
     factors: dict[str, Factor]
     """in the order of the names"""
     kernels: dict[str, Kernel]
-    """of the tables that have one"""
+    """kernels of the tables that have one"""
 
     @property
     def holds(self) -> bool:
@@ -36,57 +36,59 @@ def model_of(
     kernel: Kernel | Mapping[str, Kernel] | None = None,
 ) -> Model:
     """The model of a graph's tables. Raises ValueError, which begins with a caller's name."""
-    known = factors_of(name, graph, factors)
+    by_table = factors_of(name, graph, factors)
     if kernel is not None and not isinstance(kernel, Mapping):
         kernel = dict.fromkeys(graph.tables, kernel)
-    for each in (kernel or {}).values():
-        _check_made(name, each, Kernel, "graphs.Huber()")
+    for value in (kernel or {}).values():
+        _check_instance(name, value, Kernel, "graphs.Huber()")
     if lost := sorted(set(kernel or ()) - set(graph.tables)):
         raise ValueError(
             f"{name}: kernels of tables that are not in the graph: {', '.join(lost)}; "
             f"there are: {', '.join(graph.tables)}"
         )
-    return Model(known, dict(kernel or {}))
+    return Model(by_table, dict(kernel or {}))
 
 
 def factors_of(name: str, graph: Graph, factors: Mapping[str, Factor] | None) -> dict[str, Factor]:
-    """The factor of each table: of the same name, or of the part before a slash.
+    """The factor of each table, by its name or by the part of the name before a slash.
 
-    They are in the order of the names, as in a graph that has been through `jax.tree.map`. Without
-    factors they are those of files. Raises ValueError, which begins with a caller's name, also on a
-    factor whose residual has another shape than its `errors` tell.
+    The tables are in the order of their names, as in a graph that has been through `jax.tree.map`.
+    By default the factors are `REGISTRY`. Raises ValueError, which begins with a caller's name,
+    also on a factor whose residual has another shape than its `errors` tell.
     """
     if not isinstance(graph, Graph):
         got = repr(graph) if isinstance(graph, str) else f"a {type(graph).__name__}"
         raise ValueError(
-            f"{name}: expected a Graph, as graphs.read(path) or the graph of a solution, got {got}"
+            f"{name}: expected a Graph, as datasets.read_graph(path) or the graph of a solution, "
+            f"got {got}"
         )
-    known = REGISTRY if factors is None else factors
-    if not isinstance(known, Mapping):
-        got = type(known).__name__
+    by_name = REGISTRY if factors is None else factors
+    if not isinstance(by_name, Mapping):
+        got = type(by_name).__name__
         raise ValueError(f"{name}: expected factors as a dict by table, got a {got}")
-    for each in known.values():
-        _check_made(name, each, Factor, "graphs.RelativePose()")
-    out = {}
+    for value in by_name.values():
+        _check_instance(name, value, Factor, "graphs.RelativePose()")
+    by_table = {}
     for key in sorted(graph.tables):
-        found = known.get(key, known.get(key.split("/")[0]))
-        if found is None:
+        factor = by_name.get(key, by_name.get(key.split("/")[0]))
+        if factor is None:
             raise ValueError(
-                f"{name}: table {key!r} has no factor; there are: {', '.join(known) or 'none'}"
+                f"{name}: table {key!r} has no factor; there are: {', '.join(by_name) or 'none'}"
             )
-        if (got := _residual_shape(found, np.shape(graph.points)[-1])) != (len(found.errors),):
+        if (got := _residual_shape(factor, np.shape(graph.points)[-1])) != (len(factor.errors),):
             raise ValueError(
-                f"{name}: the factor {found.name!r} of table {key!r}: expected a residual of shape "
-                f"({len(found.errors)},), as its errors tell ({', '.join(found.errors)}), got {got}"
+                f"{name}: the factor {factor.name!r} of table {key!r}: expected a residual of "
+                f"shape ({len(factor.errors)},), as its errors tell "
+                f"({', '.join(factor.errors)}), got {got}"
             )
-        out[key] = found
-    if not out:
+        by_table[key] = factor
+    if not by_table:
         raise ValueError(f"{name}: the graph has no tables")
-    return out
+    return by_table
 
 
-def _check_made(name: str, value: object, kind: type, example: str) -> None:
-    """Raise ValueError unless a value is of a kind, e.g. on the class of one."""
+def _check_instance(name: str, value: object, kind: type, example: str) -> None:
+    """Raise ValueError unless a value is an instance of a class; on the class itself, too."""
     if not isinstance(value, kind):
         got = f"the class {value.__name__}" if isinstance(value, type) else repr(value)
         raise ValueError(f"{name}: expected a {kind.__name__}, as {example}, got {got}")
@@ -97,11 +99,11 @@ def _residual_shape(factor: Factor, point_size: int) -> object:
     sizes, number = {"pose": 3, "point": point_size}, jnp.result_type(float)
     involved = tuple(jax.ShapeDtypeStruct((sizes[kind],), number) for kind in factor.variables)
     z = jax.ShapeDtypeStruct((len(factor.measurements),), number)
-    found = jax.eval_shape(_residual, factor, involved, z)
-    return getattr(found, "shape", type(found).__name__)
+    residual = jax.eval_shape(_residual, factor, involved, z)
+    return getattr(residual, "shape", type(residual).__name__)
 
 
 @partial(jax.jit, inline=True)
 def _residual(factor: Factor, variables: tuple[jax.Array, ...], z: jax.Array) -> PyTree:
-    """The residual, jitted so that its shape is found by one trace for all factors of a kind."""
+    """The residual, jitted: factors of one class share the trace that tells its shape."""
     return factor.residual(variables, z)

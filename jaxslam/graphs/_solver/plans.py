@@ -35,11 +35,12 @@ class Plan(NamedTuple):
     column: Int[Array, "n"]
     """the column of each variable"""
     information: Stages
-    """from blocks (row, one variable, other variable) of all tables to those of the matrix"""
+    """sums of blocks (row, variable, variable) of all tables to the blocks of the matrix"""
     gradient: Stages
-    """from (row, variable) of all tables to columns"""
+    """sums of vectors (row, variable) of all tables to columns"""
     block_column: Int[Array, "padded"]
-    """of the M blocks of the factor; rows beyond are of no block (`sweeps.padded_size`)"""
+    """column of each of the M blocks of the factor; rows beyond M are of no block
+    (`sweeps.padded_size`)"""
     block_row: Int[Array, "padded"]
     on_diagonal: Bool[Array, "padded"]
     cholesky: CholeskyTables
@@ -63,8 +64,8 @@ def plan(
         plan = graphs.plan(graph)
         jax.vmap(lambda g: graphs.optimize(g, plan=plan))(many)
 
-    Rows that are not valid are in the pattern all the same, since which are may differ from graph
-    to graph; but rows of a variable out of range, as -1, are not.
+    Rows that are not valid are in the pattern as well, since another graph may have other valid
+    rows; rows of a variable out of range, as -1, are not.
 
     Args:
         graph: only its `who` and the numbers of poses and points are read.
@@ -82,29 +83,30 @@ def plan(
     size = poses + points
     who, rows = {}, []
     for name in factors:
-        its = graph.tables[name]
-        if not is_concrete(its.who):
+        table = graph.tables[name]
+        if not is_concrete(table.who):
             raise ValueError(
                 f"graphs.plan: `who` of the table {name!r} is traced: make the plan of one graph "
                 "outside, and give it as `plan`"
             )
-        who[name] = np.asarray(its.who, np.int32)
+        who[name] = np.asarray(table.who, np.int32)
         count = np.array([poses if kind == "pose" else points for kind in factors[name].variables])
         lost = ((who[name] < 0) | (who[name] >= count)).any(axis=1)
-        bad = lost & np.asarray(its.valid) if is_concrete(its.valid) else lost
+        bad = lost & np.asarray(table.valid) if is_concrete(table.valid) else lost
         if bad.any():
             raise ValueError(
                 f"graphs.plan: row {bad.argmax()} of the table {name!r} has a variable out of "
-                f"range: {np.asarray(its.who)[bad.argmax()].tolist()}"
+                f"range: {np.asarray(table.who)[bad.argmax()].tolist()}"
             )
         who[name] = np.where(lost[:, None], 0, who[name])
         shift = np.array([poses * (kind == "point") for kind in factors[name].variables])
         rows.append((who[name] + shift, lost))
+    # Each two variables of a row have a block, and so have the pairs of `marginals`.
     joined = [
-        np.stack([r[~lost, a], r[~lost, b]])
-        for r, lost in rows
-        for a in range(r.shape[1])
-        for b in range(a)
+        np.stack([variables[~lost, k], variables[~lost, j]])
+        for variables, lost in rows
+        for k in range(variables.shape[1])
+        for j in range(k)
     ]
     wanted = checked_pairs("graphs.plan", pairs, size)
     first, second = np.concatenate([wanted.T, *joined], axis=1)
@@ -112,12 +114,13 @@ def plan(
     cholesky, place = cholesky_tables(pattern, room)
     order = np.argsort(place[:-1])
     blocks, columns = [], []
-    for its, lost in rows:
-        column = pattern.position[its]
-        one, other = np.broadcast_arrays(column[:, :, None], column[:, None, :])
-        lower = (one >= other) & ~lost[:, None, None]
-        target = np.full(one.shape, -1)
-        target[lower] = place[pattern.find(one[lower], other[lower])]
+    for variables, lost in rows:
+        column = pattern.position[variables]
+        # The block of each two variables (rows, K, K), of the lower triangle; -1 drops a row's.
+        i, j = np.broadcast_arrays(column[:, :, None], column[:, None, :])
+        lower = (i >= j) & ~lost[:, None, None]
+        target = np.full(i.shape, -1)
+        target[lower] = place[pattern.find(i[lower], j[lower])]
         blocks.append(target.ravel())
         columns.append(np.where(lost[:, None], -1, column).ravel())
     block_column, block_row = pattern.columns[order], pattern.rows[order]
@@ -126,6 +129,7 @@ def plan(
         who={name: index_table(rows) for name, rows in who.items()},
         order=index_table(pattern.order),
         column=index_table(pattern.position),
+        # With room for two rows of two variables a pose: eight blocks, and four gradients.
         information=stages(np.concatenate(blocks), width, 8 * room),
         gradient=stages(np.concatenate(columns), size, 4 * room),
         block_column=index_table(block_column, width),
@@ -142,15 +146,15 @@ def plan(
 def checked_pairs(name: str, pairs: ArrayLike, size: int) -> Int[np.ndarray, "Q 2"]:
     """Pairs of variables, (Q, 2); raises ValueError, which begins with a caller's name, on another
     shape, on numbers that are not whole, and on one out of range."""
-    given = np.asarray(pairs)
-    if given.size == 0:
+    numbers = np.asarray(pairs)
+    if numbers.size == 0:
         return np.zeros((0, 2), int)
-    if given.ndim != 2 or given.shape[1] != 2 or not np.issubdtype(given.dtype, np.integer):
+    if numbers.ndim != 2 or numbers.shape[1] != 2 or not np.issubdtype(numbers.dtype, np.integer):
         raise ValueError(
-            f"{name}: expected pairs of whole numbers, (Q, 2), got {given.dtype} of shape "
-            f"{given.shape}"
+            f"{name}: expected pairs of whole numbers, (Q, 2), got {numbers.dtype} of shape "
+            f"{numbers.shape}"
         )
-    wanted = given.astype(int)
+    wanted = numbers.astype(int)
     if ((wanted < 0) | (wanted >= size)).any():
         raise ValueError(
             f"{name}: expected pairs of variables from 0 to {size - 1}, got {wanted.tolist()}"
@@ -162,30 +166,30 @@ def plan_for(
     name: str,
     graph: Graph,
     factors: Mapping[str, Factor],
-    given: Plan | None,
+    existing: Plan | None,
     *,
     marginals: bool = False,
     pairs: Int[np.ndarray, "Q 2"] | None = None,
     room: int = 0,
 ) -> Plan:
-    """The given plan, checked against the graph as far as that is concrete, or a new one."""
-    if given is None:
+    """The existing plan, checked against the graph as far as that is concrete, or a new one."""
+    if existing is None:
         wanted = () if pairs is None else pairs
         return plan(graph, factors, marginals=marginals, pairs=wanted, room=room)
     size = len(graph.poses) + len(graph.points)
-    same = given.order.shape == (size,) and set(given.who) == set(graph.tables)
-    for key, who in given.who.items():
+    same = existing.order.shape == (size,) and set(existing.who) == set(graph.tables)
+    for key, who in existing.who.items():
         same = same and np.shape(graph.tables[key].who) == np.shape(who)
         if same and is_concrete(graph.tables[key].who) and is_concrete(who):
             same = bool(np.array_equal(graph.tables[key].who, who))
     if not same:
         raise ValueError(f"{name}: the plan is of another graph: variables or `who` differ")
-    if marginals and given.inverse is None:
+    if marginals and existing.inverse is None:
         raise ValueError(f"{name}: the plan is without marginals: `plan(graph, marginals=True)`")
     if (
         pairs is not None
         and len(pairs)
-        and not (is_concrete(given.pairs) and np.array_equal(given.pairs, pairs))
+        and not (is_concrete(existing.pairs) and np.array_equal(existing.pairs, pairs))
     ):
         raise ValueError(f"{name}: the plan is of other pairs: `plan(graph, pairs=…)`")
-    return given
+    return existing

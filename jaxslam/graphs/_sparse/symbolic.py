@@ -16,7 +16,7 @@ from jaxtyping import Int
 def _minimum_degree(
     size: int, first: Int[np.ndarray, "E"], second: Int[np.ndarray, "E"]
 ) -> Int[np.ndarray, "size"]:
-    """The variables in a minimum-degree order, for a graph with edges first-second.
+    """The variables in a minimum-degree order, for a graph with edges between first and second.
 
     SuperLU's multiple minimum degree (Liu 1985, "Modification of the minimum-degree algorithm by
     multiple elimination", ACM TOMS 11(2)) on the pattern of A + Aᵀ. SciPy gives it only with a
@@ -46,48 +46,48 @@ class Pattern:
     order: Ints
     """the variable of each column, (n,)"""
     heights: Ints
-    """(n,), of the columns, ascending"""
+    """height of each column, (n,), ascending"""
     rows: Ints
     columns: Ints
-    """of each block (B,), rows >= columns; sorted by column, then row"""
+    """row and column of each block (B,), rows >= columns; sorted by column, then row"""
 
     @cached_property
     def position(self) -> Ints:
         """The column of each variable, (n,)."""
-        out = np.empty(len(self.order), int)
-        out[self.order] = np.arange(len(self.order))
-        return out
+        column = np.empty(len(self.order), int)
+        column[self.order] = np.arange(len(self.order))
+        return column
 
     @cached_property
     def first(self) -> Ints:
         """The first block of each column, its diagonal one, (n+1,); the last is B."""
-        out: Ints = np.searchsorted(self.columns, np.arange(len(self.order) + 1))
-        return out
+        first: Ints = np.searchsorted(self.columns, np.arange(len(self.order) + 1))
+        return first
 
     def find(self, rows: Ints, columns: Ints) -> Ints:
-        """The blocks at these places, which must exist."""
+        """The blocks at rows and columns; raises ValueError where there is none."""
         size = len(self.order)
         keys = self.columns * size + self.rows
         wanted = columns * size + rows
-        found: Ints = np.searchsorted(keys, wanted).astype(np.int32)  # half the memory
-        if len(wanted) and (found.max() >= len(keys) or (keys[found] != wanted).any()):
+        blocks: Ints = np.searchsorted(keys, wanted).astype(np.int32)  # half the memory
+        if len(wanted) and (blocks.max() >= len(keys) or (keys[blocks] != wanted).any()):
             raise ValueError("graphs: a block is not in the pattern of the plan")
-        return found
+        return blocks
 
     def below(self) -> list[tuple[Ints, Ints]]:
-        """For each number m of blocks below a diagonal: the columns that have m, (C,), and those
-        blocks, (C, m)."""
+        """The columns with m blocks below the diagonal, (C,), and these blocks, (C, m), for each
+        m."""
         counts = np.diff(self.first) - 1
-        out = []
+        groups = []
         for m in np.unique(counts):
             columns = np.flatnonzero(counts == m)
             blocks = self.first[columns][:, None] + 1 + np.arange(m)
-            out.append((columns, blocks.astype(np.int32)))
-        return out
+            groups.append((columns, blocks.astype(np.int32)))
+        return groups
 
 
 def factor_pattern(size: int, first: Ints, second: Ints) -> Pattern:
-    """The pattern of L for an A with blocks on the diagonal and at first-second.
+    """The pattern of L for an A with blocks on the diagonal and between first and second.
 
     The rows below the diagonal of a column are those of A and of the columns whose parent it is in
     the elimination tree (Davis 2006, "Direct methods for sparse linear systems", chapter 4).
@@ -95,29 +95,28 @@ def factor_pattern(size: int, first: Ints, second: Ints) -> Pattern:
     order = _minimum_degree(size, first, second)
     position = np.empty(size, int)
     position[order] = np.arange(size)
-    one, other = position[first], position[second]
+    low, high = np.sort([position[first], position[second]], axis=0)
     below: list[set[int]] = [set() for _ in range(size)]
-    for low, high in zip(
-        np.minimum(one, other).tolist(), np.maximum(one, other).tolist(), strict=True
-    ):
-        if low != high:
-            below[low].add(high)
+    for column, row in zip(low.tolist(), high.tolist(), strict=True):
+        if column != row:
+            below[column].add(row)
+    # The parent of a column is its first row below the diagonal; it inherits the other rows.
     height = [0] * size
-    for column, under_it in enumerate(below):
-        if under_it:
-            parent = min(under_it)
-            below[parent] |= under_it
+    for column, rows_below in enumerate(below):
+        if rows_below:
+            parent = min(rows_below)
+            below[parent] |= rows_below
             below[parent].discard(parent)
             height[parent] = max(height[parent], height[column] + 1)
     heights = np.array(height)
     # A parent is higher than its children, so this is an order of elimination of the same fill.
-    again = np.argsort(heights, kind="stable")
+    by_height = np.argsort(heights, kind="stable")
     column_of = np.empty(size, int)
-    column_of[again] = np.arange(size)
-    counts = [len(rows) for rows in below]
-    every = np.arange(size)
+    column_of[by_height] = np.arange(size)
+    counts = [len(rows_below) for rows_below in below]
+    diagonal = np.arange(size)
     under = np.fromiter(itertools.chain.from_iterable(below), int, sum(counts))
-    columns = column_of[np.concatenate([every, np.repeat(every, counts)])]
-    rows = column_of[np.concatenate([every, under])]
+    columns = column_of[np.concatenate([diagonal, np.repeat(diagonal, counts)])]
+    rows = column_of[np.concatenate([diagonal, under])]
     blocks = np.lexsort((rows, columns))
-    return Pattern(order[again], heights[again], rows[blocks], columns[blocks])
+    return Pattern(order[by_height], heights[by_height], rows[blocks], columns[blocks])

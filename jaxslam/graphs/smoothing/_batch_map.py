@@ -13,7 +13,7 @@ from jaxslam.core._numbers import check_count
 from jaxslam.core._record import record, static
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.slots import Joint
-from jaxslam.core.types import Estimate, Info, Log, Trace
+from jaxslam.core.types import Estimate, Log, Trace
 from jaxslam.graphs._chain.elimination import Chain
 from jaxslam.graphs._chain.problem import Iterate, Iterations, Problem, optimize_chain
 from jaxslam.graphs._solver.search import Ending
@@ -38,18 +38,18 @@ class BatchSolution(NamedTuple):
     regular: Bool[Array, ""]
     """the information on the map is positive definite; otherwise covariances are invalid"""
     filtered: Estimate
-    """with leading T, of the filter that gave the initial path"""
+    """estimates of the filter that gave the initial path, with leading T"""
     start_noise: Float[Array, "3"]
     """ξ, the start's error in standard deviations: start = pose + P0^{1/2} ξ"""
     noise: Float[Array, "T W"]
-    """η, the same of the motions: w = Q^{1/2} η"""
+    """η, the noises of the motions in standard deviations: w = Q^{1/2} η"""
     cost: Float[Array, ""]
     """½ Σ of the squared, whitened residuals"""
     costs: Float[Array, "iterations"]
-    """after each step, that of the last repeated, falling where R is constant; infinite where
-    not even the first, to the smoother's path, has a finite cost"""
+    """cost after each step, the last one repeated; it falls where R is constant, and is infinite
+    where not even the first step, to the smoother's path, has a finite cost"""
     iterations: Int[Array, ""]
-    """steps taken"""
+    """steps made"""
     step: Float[Array, ""]
     """length of the next step, in posterior standard deviations"""
     ending: Int[Array, ""]
@@ -68,8 +68,8 @@ class BatchMap(LogEstimator):
     solves for all unknowns (`eliminate`): a Gauss-Newton step is a smoother, and
     iterating the smoother is Gauss-Newton (Bell 1994, "The iterated Kalman smoother as a
     Gauss-Newton method", SIAM J. Optimization 4(3)). A step is shortened until the cost falls
-    (Armijo). P0 and Q may be singular; O(T N²) a step. R is that of the predictions of an iterate,
-    held while its step is computed and judged (`graphs.FromSensor`).
+    (Armijo). P0 and Q may be singular; O(T N²) a step. R is taken at the predictions of an
+    iterate, and held while its step is computed and judged (`graphs.FromSensor`).
 
     It maps (log, key) to a `Trace`: estimates with leading T, the poses at the optimum
     with their covariances there (Laplace's), the map the same at every step; the infos of the
@@ -122,9 +122,11 @@ class BatchMap(LogEstimator):
             iterations=self.iterations,
             tolerance=self.tolerance,
         )
-        estimate, solved = _solve(sensor, search, passed)
+        estimate, solved = _at_end(sensor, search, passed)
         info = with_singular(passed.trace.info, problem.used)
-        info = info if self.tolerance is None else _with_exhausted(info, search.ending)
+        if self.tolerance is not None and info.exhausted is not None and len(info.exhausted):
+            exhausted = info.exhausted.at[-1].max(search.ending != Ending.CONVERGED)
+            info = info._replace(exhausted=exhausted)
         return Trace(estimate, info, solved, None)
 
 
@@ -136,7 +138,7 @@ def _problem_of(
     pose: ArrayLike,
     pose_cov: ArrayLike,
 ) -> tuple[Problem, Iterate, Chain]:
-    """The problem of a log, and the initial iterate: the filter's path and its chain."""
+    """The problem of a log, and the initial iterate: the filter's path, with its chain."""
     kind = log.control.dtype
     mean, cov = jnp.asarray(pose, kind), jnp.asarray(pose_cov, kind)
     # The optimum does not depend on the initial iterate, so it has no derivative by it.
@@ -151,20 +153,21 @@ def _problem_of(
     return problem, Iterate(chain.start.noise, chain.steps.noise, path, landmarks), chain
 
 
-def _solve(
+def _at_end(
     sensor: Sensor, search: Iterations, passed: ForwardPass
 ) -> tuple[Estimate, BatchSolution]:
-    """The estimates at the end of a search."""
+    """The estimates at the end of a search, and the `final` of the trace."""
     at, policy = search.at, search.policy
     joint = jax.lax.stop_gradient(passed.trace.final)._replace(landmarks=at.landmarks)
-    # The last step computed is shorter than the tolerance, and is not taken.
+    # The last step computed is shorter than the tolerance, and is not made.
     no_step = policy._replace(
         start=policy.start._replace(constant=jnp.zeros_like(at.start)),
         steps=policy.steps._replace(constant=jnp.zeros_like(at.noise)),
         landmarks=jnp.zeros_like(at.landmarks),
     )
-    left = policy.decrement > 0
-    step = jnp.sqrt(jnp.where(left, policy.decrement, 1.0))
+    # Gradients are finite where the decrement is zero, whose root has none.
+    positive = policy.decrement > 0
+    step = jnp.sqrt(jnp.where(positive, policy.decrement, 1.0))
     estimate, smoothed = solution(sensor, search.chain, no_step, at.path, joint, passed)
     solved = BatchSolution(
         *smoothed,
@@ -172,16 +175,8 @@ def _solve(
         noise=at.noise,
         cost=search.cost,
         costs=search.costs,
-        iterations=search.taken,
-        step=jnp.where(left, step, 0.0),
+        iterations=search.steps,
+        step=jnp.where(positive, step, 0.0),
         ending=search.ending,
     )
     return estimate, solved
-
-
-def _with_exhausted(info: Info, ending: Array) -> Info:
-    """The infos, with `exhausted` set in the last where the iterations did not converge."""
-    if info.exhausted is None or info.exhausted.shape[0] == 0:
-        return info
-    cut_short = info.exhausted.at[-1].max(ending != Ending.CONVERGED)
-    return info._replace(exhausted=cut_short)

@@ -15,7 +15,7 @@ from jaxslam.core._record import hold_function, record, static
 from jaxslam.core.protocols import Associate, Filter, Motion, Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan, Status
-from jaxslam.filters._ekf.ekf_settings import check_ekf_options
+from jaxslam.filters._ekf.checks import check_map_options
 from jaxslam.filters._ekf.ekf_slam import EkfSlam
 from jaxslam.graphs._chain.window import (
     WindowIterate,
@@ -23,9 +23,9 @@ from jaxslam.graphs._chain.window import (
     WindowSteps,
     linearize_window,
     marginalize_oldest,
-    moved_by,
     newest_cov,
     solve_window,
+    step_window,
 )
 from jaxslam.graphs.smoothing._forward_pass import joint_ekf
 from jaxslam.math import _linalg as linalg
@@ -41,7 +41,7 @@ class _WindowState(NamedTuple):
     joint: Joint
     """the newest pose and the map"""
     prior: WindowPrior
-    """of the oldest pose of the window, and of the map before it"""
+    """prior of the oldest pose of the window, and of the map before it"""
     steps: WindowSteps
     at: WindowIterate
     """the path in the window, and the map"""
@@ -85,13 +85,14 @@ class FixedLag(Filter):
     window: int = static(default=5)
     """motions and scans W that are optimized"""
     first_estimates: bool = static(default=False)
-    """as above; for landmarks that are points (x, y)"""
+    """whether Jacobians by a variable of the prior are taken where that was linearized; needs
+    landmarks (x, y)"""
     iterations: int = static(default=2)
     """Gauss-Newton steps at each scan"""
     associate: Associate = Known()
     gate: Number | None = None
     births: int | None = static(default=None)
-    """these three of the EKF-SLAM, as for `EkfSlam`. NIS is that of its innovations"""
+    """these three as the fields of `EkfSlam`. NIS is that of the innovations of EKF-SLAM"""
     chart = Euclidean()
 
     def __post_init__(self) -> None:
@@ -99,7 +100,8 @@ class FixedLag(Filter):
         validation.check_models(name, self.motion, sensor)
         validation.check_parts(name, associate=self.associate)
         hold_function(self, "associate", "prediction, scan")
-        check_ekf_options(name, self.capacity, "joint", self.gate, self.iterations, self.births)
+        check_map_options(name, self.capacity, self.gate, self.births)
+        validation.check_count(f"{name}: iterations", self.iterations)
         same = len(sensor.measurements) == len(sensor.landmark)
         several = isinstance(sensor, Suite) or sensor.reduced is not None
         if several or sensor.free.mean.shape[0] or not same:
@@ -120,7 +122,7 @@ class FixedLag(Filter):
         return self.sensor.landmark
 
     def init(self, pose: Array, pose_cov: Array) -> _WindowState:
-        return self._begun(self._ekf.init(pose, pose_cov))
+        return self._started_at(self._ekf.init(pose, pose_cov))
 
     def predict(self, state: _WindowState, u: Array, key: Array) -> _WindowState:
         motion, joint = self.motion, self._ekf.predict(state.joint, u, key)
@@ -128,7 +130,7 @@ class FixedLag(Filter):
             motion, self.sensor, state.prior, state.steps, state.at, self.first_estimates
         )
         prior = marginalize_oldest(state.prior, system, state.steps, state.at, joint.tag)
-        state = _finite_or(state._replace(prior=prior), self._begun(state.joint))
+        state = _finite_or(state._replace(prior=prior), self._started_at(state.joint))
         root = linalg.root_psd(motion.noise_cov(state.joint.pose, u))
         steps, at = shift(state.steps, state.at, u, root, joint.pose)
         return _WindowState(joint, state.prior, steps, at)
@@ -154,11 +156,11 @@ class FixedLag(Filter):
         for _ in range(self.iterations):
             system = linearize_window(motion, sensor, state.prior, steps, at, self.first_estimates)
             solved = solve_window(state.prior, system, at, joint.alive)
-            at = moved_by(motion, steps, at, solved)
+            at = step_window(motion, steps, at, solved)
         newest = _with_newest(joint, at, newest_cov(system, solved))
         after = _WindowState(newest, state.prior, steps, at)
         exhausted = jnp.asarray(info.exhausted) | ~_is_finite(after)
-        return _finite_or(after, self._begun(joint)), info._replace(exhausted=exhausted)
+        return _finite_or(after, self._started_at(joint)), info._replace(exhausted=exhausted)
 
     def estimate(self, state: _WindowState) -> Estimate:
         return self._ekf.estimate(state.joint)
@@ -167,25 +169,21 @@ class FixedLag(Filter):
     def _ekf(self) -> EkfSlam:
         return joint_ekf(self)
 
-    def _begun(self, joint: Joint) -> _WindowState:
-        sizes = len(self.motion.controls), len(self.motion.noises)
-        return _empty_window(joint, sizes, (self.window, self.slots))
-
-
-def _empty_window(joint: Joint, sizes: tuple[int, int], shape: tuple[int, int]) -> _WindowState:
-    """The state before the first step. sizes: of a control and its noise; shape: W and M."""
-    (control, noise), (window, places), kind = sizes, shape, joint.pose.dtype
-    steps = WindowSteps(
-        present=jnp.zeros(window, bool),
-        control=jnp.zeros((window, control), kind),
-        root=jnp.zeros((window, noise, noise), kind),
-        z=jnp.zeros((window, places, joint.landmarks.shape[1]), kind),
-        slot=jnp.zeros((window, places), jnp.int32),
-        used=jnp.zeros((window, places), bool),
-    )
-    path = jnp.tile(joint.pose, (window + 1, 1))
-    at = WindowIterate(path, jnp.zeros((window, noise), kind), joint.landmarks)
-    return _WindowState(joint, WindowPrior(joint, (joint.pose, joint.landmarks)), steps, at)
+    def _started_at(self, joint: Joint) -> _WindowState:
+        """The state at a joint, with a window of absent steps."""
+        window, dtype = self.window, joint.pose.dtype
+        controls, noises = len(self.motion.controls), len(self.motion.noises)
+        steps = WindowSteps(
+            present=jnp.zeros(window, bool),
+            control=jnp.zeros((window, controls), dtype),
+            root=jnp.zeros((window, noises, noises), dtype),
+            z=jnp.zeros((window, self.slots, joint.landmarks.shape[1]), dtype),
+            slot=jnp.zeros((window, self.slots), jnp.int32),
+            used=jnp.zeros((window, self.slots), bool),
+        )
+        path = jnp.tile(joint.pose, (window + 1, 1))
+        at = WindowIterate(path, jnp.zeros((window, noises), dtype), joint.landmarks)
+        return _WindowState(joint, WindowPrior(joint, (joint.pose, joint.landmarks)), steps, at)
 
 
 def _is_finite(state: _WindowState) -> Bool[Array, ""]:
@@ -193,10 +191,10 @@ def _is_finite(state: _WindowState) -> Bool[Array, ""]:
     return jnp.stack([jnp.isfinite(leaf).all() for leaf in jax.tree.leaves(state)]).all()
 
 
-def _finite_or(state: _WindowState, other: _WindowState) -> _WindowState:
-    """The state if all its numbers are finite, else the other state."""
+def _finite_or(state: _WindowState, restart: _WindowState) -> _WindowState:
+    """The state if all its numbers are finite, else the restart."""
     finite = _is_finite(state)
-    chosen: _WindowState = jax.tree.map(lambda a, b: jnp.where(finite, a, b), state, other)
+    chosen: _WindowState = jax.tree.map(lambda a, b: jnp.where(finite, a, b), state, restart)
     return chosen
 
 

@@ -16,7 +16,7 @@ from jaxslam.core._record import hold_function, record, set_field, static
 from jaxslam.core.protocols import Associate, Component, Filter, Motion, Sensor, Wrapper
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Log, Scan, Trace
-from jaxslam.filters._ekf.ekf_settings import check_ekf_options
+from jaxslam.filters._ekf.checks import check_map_options
 from jaxslam.filters._ekf.ekf_slam import EkfSlam
 from jaxslam.math._arrays import Number
 from jaxslam.math._xla import hot_jit
@@ -31,12 +31,13 @@ class ForwardPass(NamedTuple):
     before: Float[Array, "T 3"]
     """the pose from which each motion was linearized"""
     predicted: Float[Array, "T 3"]
-    """the pose after it, at which known landmarks were linearized"""
+    """the pose after the motion, at which measurements of the map were linearized"""
     predicted_map: Float[Array, "T N L"]
-    """the map there"""
+    """the map before the scan"""
     corrected: Float[Array, "T 3"]
     """the pose after the scan, where new landmarks were linearized"""
     corrected_map: Float[Array, "T N L"]
+    """the map after the scan"""
 
 
 class _State(NamedTuple):
@@ -85,7 +86,7 @@ def joint_ekf(of: Any) -> EkfSlam:
 
 @record
 class LogEstimator(Component):
-    """What estimators of a whole log share: models, start, and the EKF-SLAM of the forward pass.
+    """The base of estimators of a whole log: models, start, and the EKF-SLAM of the forward pass.
 
     A subclass is a record that defines `solve`. Called with (log, key) it gives a `Trace`. Raises
     ValueError as `EkfSlam` does, and for sensors that it does not support: a suite, landmarks that
@@ -106,7 +107,7 @@ class LogEstimator(Component):
     associate: Associate = Known()
     gate: Number | None = None
     births: int | None = static(default=None)
-    """these three of the filter, as for `EkfSlam`"""
+    """these three as the fields of `EkfSlam`"""
 
     def __post_init__(self) -> None:
         name, sensor = type(self).__name__, self.sensor
@@ -125,7 +126,7 @@ class LogEstimator(Component):
             )
         for field in ("pose", "pose_cov"):
             set_field(self, field, held_array(getattr(self, field)))
-        check_ekf_options(name, self.capacity, "joint", self.gate, 1, self.births)
+        check_map_options(name, self.capacity, self.gate, self.births)
         self._check(LogEstimator, {"solve": "log, key"})
 
     def solve(self, log: Log, key: Array) -> Trace:
@@ -141,7 +142,7 @@ class LogEstimator(Component):
         return _Forward(joint_ekf(self))
 
     def _forward(self, log: Log, key: Array) -> ForwardPass:
-        """The forward pass; arguments and errors are those of `run`."""
+        """The forward pass; arguments and errors as in `run`."""
 
         def linearized_at(state: _State) -> tuple[Array, ...]:
             joint = state.joint

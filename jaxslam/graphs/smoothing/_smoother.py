@@ -61,50 +61,44 @@ def chain_of(
     A measurement is used where the filter fused it or initialized a landmark with it, and its
     noise is regular.
     """
-    by_pose, by_noise, drift = _motions(motion, passed, log.control, roots)
-    slot, a, b, r, used = _measurements(sensor, passed, log)
-    noise = jnp.zeros((len(drift), len(motion.noises)), r.dtype)
-    steps = LinearizedStep(by_pose, by_noise, drift, noise, slot, a, b, r)
-    return Chain(start_of(pose_cov), steps), used
 
-
-def _motions(
-    motion: Motion, passed: ForwardPass, control: Float[Array, "T U"], roots: Float[Array, "T W W"]
-) -> tuple[Float[Array, "T 3 3"], Float[Array, "T 3 W"], Float[Array, "T 3"]]:
-    """The matrices F, G and the offset c of `LinearizedStep` for each motion."""
-
-    def one(
+    def linearize_motion(
         before: Array, predicted: Array, corrected: Array, u: Array, root: Array
     ) -> tuple[Array, Array, Array]:
         by_pose, by_noise = first_order.motion_jacobians(motion, before, u)
         return by_pose, by_noise @ root, pose_difference(predicted, corrected)
 
-    return jax.vmap(one)(passed.before, passed.predicted, passed.corrected, control, roots)
+    by_pose, by_noise, drift = jax.vmap(linearize_motion)(
+        passed.before, passed.predicted, passed.corrected, log.control, roots
+    )
+    slot, a, b, r, used = _linearize_measurements(sensor, passed, log)
+    noise = jnp.zeros((len(drift), len(motion.noises)), r.dtype)
+    steps = LinearizedStep(by_pose, by_noise, drift, noise, slot, a, b, r)
+    return Chain(start_of(pose_cov), steps), used
 
 
-def _measurements(
+def _linearize_measurements(
     sensor: Sensor, passed: ForwardPass, log: Log
 ) -> tuple[Int[Array, "T M"], Array, Array, Array, Bool[Array, "T M"]]:
     """The slot of each measurement, A, B and b of `LinearizedStep`, and whether it is used."""
     size_l, size_z = len(sensor.landmark), len(sensor.measurements)
     info, final = passed.trace.info, passed.trace.final
 
-    def padded(part: Array) -> Array:
+    def pad(part: Array) -> Array:
+        # A fused measurement has Z rows, a new landmark L.
         spare = max(size_l, size_z) - part.shape[0]
         return jnp.pad(part, [(0, spare)] + [(0, 0)] * (part.ndim - 1))
 
-    def one(
+    def linearize_measurement(
         z: Array, slot: Array, fused: Array, new: Array, at: tuple[Array, ...]
     ) -> tuple[Array, Array, Array, Array]:
         predicted, predicted_map, corrected, corrected_map = at
         *parts, positive = whitened_rows(sensor, z, predicted, predicted_map[slot], fused)
-        rows = [padded(part) for part in parts]
+        rows = [pad(part) for part in parts]
         pose, landmark = predicted, predicted_map[slot]
         if size_l > 0:
             *parts, regular = _new_landmark_rows(sensor, z, corrected)
-            rows = [
-                jnp.where(new, padded(part), row) for part, row in zip(parts, rows, strict=True)
-            ]
+            rows = [jnp.where(new, pad(part), row) for part, row in zip(parts, rows, strict=True)]
             positive = jnp.where(new, regular, positive)
             pose = jnp.where(new, corrected, pose)
             landmark = jnp.where(new, corrected_map[slot], landmark)
@@ -118,7 +112,7 @@ def _measurements(
     slot = jnp.maximum(info.slot, 0)
     fused, new = info.status == Status.FUSED, info.status == Status.BORN
     at = passed.predicted, passed.predicted_map, passed.corrected, passed.corrected_map
-    over_slots = jax.vmap(one, (0, 0, 0, 0, None))
+    over_slots = jax.vmap(linearize_measurement, (0, 0, 0, 0, None))
     return slot, *jax.vmap(over_slots)(z, slot, fused, new, at)
 
 
@@ -145,7 +139,7 @@ class Smoothed(NamedTuple):
     regular: Bool[Array, ""]
     """the information on the map is positive definite; otherwise covariances are invalid"""
     filtered: Estimate
-    """with leading T, of the filter"""
+    """estimates of the filter, with leading T"""
 
 
 @record
@@ -193,24 +187,24 @@ def solution(
     passed: ForwardPass,
 ) -> tuple[Estimate, Smoothed]:
     """The estimates at the optimum of a chain about a path and the map of a joint."""
-    found = chain_marginals(chain, policy)
-    poses = path + found.path
+    deviation, covs, last_cov = chain_marginals(chain, policy)
+    poses = path + deviation
     poses = poses.at[:, 2].set(wrap(poses[:, 2]))
     landmarks = jnp.where(joint.alive[:, None], joint.landmarks + policy.landmarks, 0.0)
-    last = joint._replace(pose=poses[-1], landmarks=landmarks, cov=found.cov)
+    last = joint._replace(pose=poses[-1], landmarks=landmarks, cov=last_cov)
     at_end = estimate_of(last, sensor, Euclidean())
     steps = path.shape[0] - 1
     always = jax.tree.map(lambda leaf: jnp.broadcast_to(leaf, (steps, *leaf.shape)), at_end)
-    estimate = always._replace(pose=poses[1:], pose_cov=found.covs[1:])
+    estimate = always._replace(pose=poses[1:], pose_cov=covs[1:])
     filtered = passed.trace.estimate
-    return estimate, Smoothed(poses[0], found.covs[0], last, policy.regular, filtered)
+    return estimate, Smoothed(poses[0], covs[0], last, policy.regular, filtered)
 
 
 def with_singular(info: Info, used: Bool[Array, "T M"]) -> Info:
-    """The filter's infos, with SINGULAR for measurements that the smoother cannot use: they have no
-    landmark, distance or degrees of freedom."""
-    taken = (info.status == Status.FUSED) | (info.status == Status.BORN)
-    singular = taken & ~used
+    """The filter's infos, with SINGULAR for measurements that the smoother cannot use; these have
+    no landmark, distance or degrees of freedom."""
+    in_filter = (info.status == Status.FUSED) | (info.status == Status.BORN)
+    singular = in_filter & ~used
     return info._replace(
         status=jnp.where(singular, Status.SINGULAR, info.status).astype(info.status.dtype),
         slot=jnp.where(singular, -1, info.slot),

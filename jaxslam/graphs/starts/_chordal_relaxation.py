@@ -44,7 +44,7 @@ def chordal(graph: Graph, factors: Factors | None = None) -> Graph:
 def _headings(
     relative: Relative, anchors: Bool[np.ndarray, "N"], held: Float[np.ndarray, "N"]
 ) -> Float[np.ndarray, "N"]:
-    """The headings of the chordal relaxation: the anchors' own, and those of all other poses."""
+    """The headings of the chordal relaxation; anchors keep theirs."""
     i, j, rows = relative.first, relative.second, np.arange(len(relative.first))
     root = np.sqrt(np.maximum(relative.information[:, 2, 2], 0.0))
     turn = np.exp(1j * relative.pose[:, 2])
@@ -53,7 +53,9 @@ def _headings(
         shape=(len(rows), len(anchors)),
     ).tocsc()
     c = np.exp(1j * held)
-    c[~anchors] = _least_squares(system[:, ~anchors], -(system[:, anchors] @ c[anchors]))
+    # The c that minimize |a c - b|², with those of the anchors on the right-hand side.
+    a, b = system[:, ~anchors], -(system[:, anchors] @ c[anchors])
+    c[~anchors] = _solve(a.conj().T @ a, a.conj().T @ b)
     return np.where(anchors, held, np.angle(c))
 
 
@@ -76,6 +78,7 @@ def _positions(
     free = ~held & named
     values = np.concatenate([poses[:, :2], points[:, :2].reshape(-1, 2)])
     # e = A t - b with A = turn at the second and -turn at the first: Aᵀ (Ω (A t - b) + s) = 0.
+    # Row 2r + i and column 2v + j of A have the entry (i, j) of row r and variable v.
     rows = 2 * np.arange(len(first))[:, None, None] + np.arange(2)[None, :, None]
     rows = np.broadcast_to(rows, turn.shape)
     columns = [
@@ -94,8 +97,8 @@ def _positions(
         (information.ravel(), tuple(part.ravel() for part in within)), shape=(2 * len(first),) * 2
     ).tocsc()
     of_free = np.repeat(free, 2)
-    away = system[:, ~of_free] @ values[~free].ravel() - target.ravel()
     a = system[:, of_free]
+    away = system[:, ~of_free] @ values[~free].ravel() - target.ravel()
     solved = _solve(a.T @ weight @ a, -(a.T @ (weight @ away + shift.ravel())))
     values[free] = solved.reshape(-1, 2)
     poses[:, :2] = values[:count]
@@ -118,7 +121,10 @@ def _relative_rows(relative: Relative, headings: Float[np.ndarray, "N"]) -> tupl
 def _point_rows(
     table: Table, headings: Float[np.ndarray, "N"], count: int
 ) -> tuple[np.ndarray, ...]:
-    """The same of relative positions, e = R_iᵀ (l - t_i) - z; points are counted from the poses."""
+    """The terms of relative positions, as of `_relative_rows`: e = R_iᵀ (l - t_i) - z, s = 0.
+
+    Points are counted on from the poses.
+    """
     valid = np.asarray(table.valid)
     who, z = np.asarray(table.who)[valid], np.asarray(table.z, float)[valid]
     turn = np.swapaxes(_rotations(headings[who[:, 0]]), 1, 2)
@@ -127,13 +133,9 @@ def _point_rows(
 
 
 def _rotations(angles: Float[np.ndarray, "E"]) -> Float[np.ndarray, "E 2 2"]:
+    """The rotation matrices of angles."""
     c, s = np.cos(angles), np.sin(angles)
     return np.stack([np.stack([c, -s], axis=1), np.stack([s, c], axis=1)], axis=1)
-
-
-def _least_squares(a: "scipy.sparse.csc_array", b: np.ndarray) -> np.ndarray:
-    """The x that minimizes |a x - b|²."""
-    return _solve(a.conj().T @ a, a.conj().T @ b)
 
 
 def _solve(matrix: "scipy.sparse.csc_array", right: np.ndarray) -> np.ndarray:

@@ -1,4 +1,4 @@
-"""What all starts share: relative poses of all tables, anchors, and the placing of points."""
+"""The relative poses of all tables, the anchors of a graph, and the placing of its points."""
 
 from collections.abc import Mapping
 from functools import partial
@@ -20,14 +20,14 @@ Factors = Mapping[str, Factor]
 
 
 class Relative(NamedTuple):
-    """The relative poses of all tables between two poses, E of them."""
+    """The E relative poses that the tables of a graph measure."""
 
     first: Int[np.ndarray, "E"]
     second: Int[np.ndarray, "E"]
     pose: Float[np.ndarray, "E 3"]
     """the second in the frame of the first"""
     information: Float[np.ndarray, "E 3 3"]
-    """of e = pose⁻¹ ∘ (xᵢ⁻¹ ∘ xⱼ), to first order"""
+    """Ω of the error e = pose⁻¹ ∘ (xᵢ⁻¹ ∘ xⱼ), to first order"""
 
 
 def measured_relative_poses(graph: Graph, factors: Factors | None) -> Relative:
@@ -35,9 +35,9 @@ def measured_relative_poses(graph: Graph, factors: Factors | None) -> Relative:
 
     A row of zero information measures none.
     """
-    found, known = [], factors_of("graphs.starts", graph, factors)
+    parts, by_table = [], factors_of("graphs.starts", graph, factors)
     for key, table in graph.tables.items():
-        factor = known[key]
+        factor = by_table[key]
         if factor.variables != ("pose", "pose") or factor.predict is None:
             continue
         valid = np.asarray(table.valid) & np.asarray(table.information).any(axis=(1, 2))
@@ -47,30 +47,31 @@ def measured_relative_poses(graph: Graph, factors: Factors | None) -> Relative:
         if not isinstance(factor, BetweenPoses):
             z, by_error = map(np.asarray, _measured_poses(factor, z))
             information = np.einsum("eri,ers,esj->eij", by_error, information, by_error)
-        found.append(
+        parts.append(
             Relative(who[:, 0], who[:, 1], np.asarray(z, float), np.asarray(information, float))
         )
-    nothing = Relative(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3, 3)))
-    if not found:
-        return nothing
-    every = Relative(*map(np.concatenate, zip(*found, strict=True)))
-    rows = _by_id(graph, np.stack(every[:2], axis=1), every.pose)
-    return Relative(*(part[rows] for part in every))
+    if not parts:
+        return Relative(np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)), np.zeros((0, 3, 3)))
+    joined = Relative(*map(np.concatenate, zip(*parts, strict=True)))
+    rows = _order_by_id(graph, np.stack(joined[:2], axis=1), joined.pose)
+    return Relative(*(part[rows] for part in joined))
 
 
-def _by_id(graph: Graph, who: Int[np.ndarray, "E K"], z: Float[np.ndarray, "E Z"]) -> np.ndarray:
-    """The rows in the order of the ids of their poses, then of the size of what they measured.
+def _order_by_id(
+    graph: Graph, who: Int[np.ndarray, "E K"], z: Float[np.ndarray, "E Z"]
+) -> Int[np.ndarray, "E"]:
+    """The rows in the order of the ids of their poses, then of |z|, then of z.
 
-    The first row for a variable places it; in this order that row does not depend on a file's.
+    The first row for a variable places it; so the place does not depend on the order in a file.
     """
     return np.lexsort((*z.T, np.linalg.norm(z, axis=1), *ranks(graph)[who].T[::-1]))
 
 
 @partial(jax.jit, inline=True)
 def _measured_poses(factor: Factor, z: jax.Array) -> tuple[jax.Array, jax.Array]:
-    """The relative poses of rows, and the derivatives of the residual by an error of them."""
+    """The relative poses of rows, and the derivatives of the residuals by their errors."""
 
-    def one(z: jax.Array) -> tuple[jax.Array, jax.Array]:
+    def measured_pose(z: jax.Array) -> tuple[jax.Array, jax.Array]:
         origin = jnp.zeros(3, z.dtype)
         assert factor.predict is not None
         relative = factor.predict(origin, z)
@@ -80,15 +81,16 @@ def _measured_poses(factor: Factor, z: jax.Array) -> tuple[jax.Array, jax.Array]
 
         return relative, jax.jacfwd(residual)(origin)
 
-    return jax.vmap(one)(z)
+    return jax.vmap(measured_pose)(z)
 
 
 def anchors_of(
     name: str, graph: Graph, relative: Relative
 ) -> tuple[Bool[np.ndarray, "N"], Float[np.ndarray, "N 3"]]:
-    """Which poses hold their part of the graph, and all poses, with those where they are held.
+    """Whether each pose is an anchor, which holds its part of the graph, and all poses, with the
+    anchors where they are held.
 
-    Raises ValueError, which begins with the name of the start, if a part has none.
+    Raises ValueError, which begins with the name of the start, if a part has no anchor.
     """
     poses = np.array(graph.poses, np.float64)
     anchors = np.asarray(graph.fixed_pose).copy()
@@ -101,7 +103,7 @@ def anchors_of(
     if "prior" in graph.tables:
         table = graph.tables["prior"]
         who, priors = (np.asarray(part)[np.asarray(table.valid)] for part in (table.who, table.z))
-        rows = _by_id(graph, who, priors)
+        rows = _order_by_id(graph, who, priors)
         for (pose,), z in zip(who[rows], priors[rows], strict=True):
             if not held[part[pose]]:
                 anchors[pose] = held[part[pose]] = True
@@ -126,7 +128,7 @@ def with_poses(graph: Graph, poses: Float[np.ndarray, "N 3"]) -> Graph:
 
 
 def as_before(before: JaxOrNumPy, values: np.ndarray) -> np.ndarray:
-    """The values in the dtype of the previous ones, unless that is an integer dtype."""
+    """The values in the dtype of the former ones, unless that is an integer dtype."""
     dtype = np.asarray(before).dtype
     return values.astype(dtype) if np.issubdtype(dtype, np.floating) else values
 
@@ -134,32 +136,33 @@ def as_before(before: JaxOrNumPy, values: np.ndarray) -> np.ndarray:
 def with_points(
     graph: Graph, factors: Factors | None, placed: Bool[np.ndarray, "P"] | None = None
 ) -> Graph:
-    """The graph with each point placed by a measurement from the pose of the lowest id that can.
+    """The graph with each point placed by a measurement, from the pose of the lowest id with one.
 
-    Points that are fixed or placed already stay, and those without such a measurement.
+    Points that are fixed or placed already stay, and so do points without a measurement that
+    places them.
     """
     points = np.array(graph.points, np.float64)
-    known = factors_of("graphs.starts", graph, factors)
+    by_table = factors_of("graphs.starts", graph, factors)
     placed_already = np.asarray(graph.fixed_point) | (False if placed is None else placed)
     for key, table in graph.tables.items():
-        factor = known[key]
+        factor = by_table[key]
         if factor.variables != ("pose", "point") or factor.predict is None:
             continue
         who, z = (np.asarray(part)[np.asarray(table.valid)] for part in (table.who, table.z))
-        rows = _by_id(graph, who[:, :1], z)
+        rows = _order_by_id(graph, who[:, :1], z)
         who, z = who[rows], z[rows]
-        found, at = np.unique(who[:, 1], return_index=True)
-        at = at[~placed_already[found]]
-        if len(at):
-            poses = np.asarray(graph.poses)[who[at, 0]]
-            points[who[at, 1]] = _predicted_poses(factor, poses, z[at])
-            placed_already[who[at, 1]] = True
+        point, first = np.unique(who[:, 1], return_index=True)
+        first = first[~placed_already[point]]
+        if len(first):
+            poses = np.asarray(graph.poses)[who[first, 0]]
+            points[who[first, 1]] = _predicted_points(factor, poses, z[first])
+            placed_already[who[first, 1]] = True
     return graph._replace(points=as_before(graph.points, points))
 
 
 @partial(jax.jit, inline=True)
-def _predicted_poses(factor: Factor, poses: jax.Array, z: jax.Array) -> jax.Array:
-    """The second variables that rows measure."""
+def _predicted_points(factor: Factor, poses: jax.Array, z: jax.Array) -> jax.Array:
+    """The points that rows measure from poses."""
     assert factor.predict is not None
-    second: jax.Array = jax.vmap(factor.predict)(poses, z)
-    return second
+    points: jax.Array = jax.vmap(factor.predict)(poses, z)
+    return points

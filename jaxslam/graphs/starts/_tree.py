@@ -1,6 +1,6 @@
 """Starts along a tree of relative poses: the path of the odometry, or the fewest edges.
 
-And the robust start: the odometry, drawn by the loops that agree with it.
+The robust start is the odometry, drawn by the loops that agree with it.
 """
 
 import math
@@ -25,13 +25,13 @@ from jaxslam.graphs.starts._relative import (
 def odometry(graph: Graph, factors: Factors | None = None) -> Graph:
     """The graph with its poses placed along consecutive edges, the path of the odometry.
 
-    The tree that is followed prefers the edges between poses of the nearest ids: it is the minimum
+    The tree that is followed prefers edges between poses of the nearest ids: it is the minimum
     spanning tree by |i - j|, i and j being places in the order of the ids. Of several edges between
-    two poses the shortest is followed. Points are placed by a measurement of each from the first
-    pose that locates it. The order of poses and rows has no influence.
+    two poses the shortest is followed. Each point is placed by a measurement from the first pose
+    that locates it. The order of poses and rows has no influence.
 
     Args:
-        factors: as for `optimize`; by default those of the tables of files.
+        factors: see `optimize`; by default `graphs.REGISTRY`.
     Raises:
         ValueError: if some pose is not connected to an anchor by relative poses.
     """
@@ -54,15 +54,16 @@ def _along_a_tree(name: str, graph: Graph, relative: Relative, nearest: bool) ->
     nearest: whether the tree has the least sum of |i - j|; otherwise the fewest edges to each pose.
     """
     anchors, poses = anchors_of(name, graph, relative)
-    # Nodes are counted in the order of the ids, which decides where trees are as good.
+    # Nodes are counted in the order of the ids, which decides between trees of equal cost.
     rank = ranks(graph)
     count, first, second = len(poses), rank[relative.first], rank[relative.second]
     anchors, poses = anchors[by_id := np.argsort(rank)], poses[by_id]
-    # A node more, from which every anchor is reached.
+    # A root besides the poses, with an edge to every anchor, makes one tree of all parts.
     roots = np.flatnonzero(anchors)
     ends = np.concatenate([first, np.full(len(roots), count)]), np.concatenate([second, roots])
     low, high = np.minimum(*ends), np.maximum(*ends)
     edges, at = np.unique(np.stack([low, high], axis=1), axis=0, return_index=True)
+    # Never zero, which a sparse matrix takes for no edge.
     cost = np.ones(len(ends[0]))
     if nearest:
         cost[: len(first)] += np.abs(second - first)
@@ -71,6 +72,7 @@ def _along_a_tree(name: str, graph: Graph, relative: Relative, nearest: bool) ->
         tree = scipy.sparse.csgraph.minimum_spanning_tree(tree)
     order, before = scipy.sparse.csgraph.breadth_first_order(tree, count, directed=False)
     row_of = {(int(i), int(j)): int(row) for (i, j), row in zip(edges, at, strict=True)}
+    # Python numbers: a loop over arrays of three takes many times as long.
     rows = relative.pose.tolist()
     placed = poses.tolist()
     for node in order.tolist():
@@ -85,11 +87,13 @@ def _along_a_tree(name: str, graph: Graph, relative: Relative, nearest: bool) ->
 
 
 def _compose(a: list[float], b: list[float]) -> list[float]:
+    """The pose a ∘ b."""
     c, s = math.cos(a[2]), math.sin(a[2])
     return [a[0] + c * b[0] - s * b[1], a[1] + s * b[0] + c * b[1], a[2] + b[2]]
 
 
 def _inverse(a: list[float]) -> list[float]:
+    """The pose a⁻¹."""
     c, s = math.cos(a[2]), math.sin(a[2])
     return [-c * a[0] - s * a[1], s * a[0] - c * a[1], -a[2]]
 
@@ -106,6 +110,6 @@ def robust(graph: Graph, factors: Factors | None = None) -> Graph:
     """
     apart = with_loops_apart(odometry(graph, factors))
     doubted = {key: DynamicCovarianceScaling() for key in apart.tables if key not in TRUSTED}
-    found = optimize(apart, factors, kernel=doubted).graph
-    points = as_before(graph.points, np.asarray(found.points))
-    return with_poses(graph, np.array(found.poses))._replace(points=points)
+    optimum = optimize(apart, factors, kernel=doubted).graph
+    points = as_before(graph.points, np.asarray(optimum.points))
+    return with_poses(graph, np.array(optimum.poses))._replace(points=points)

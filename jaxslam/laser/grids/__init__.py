@@ -1,5 +1,6 @@
 """Occupancy grids: maps, files, distances, rays, beam models, mapping, localization."""
 
+from jaxslam._public import publish
 from jaxslam.laser.grids._cell_counts import Counts, count, entropy, occupancy, reflection
 from jaxslam.laser.grids._distance import distance_field, gradient
 from jaxslam.laser.grids._grid import (
@@ -56,3 +57,5 @@ __all__ = [
     "to_cells",
     "write_map",
 ]
+
+publish(__name__)

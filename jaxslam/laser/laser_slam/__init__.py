@@ -1,5 +1,6 @@
 """Laser SLAM: from the raw odometry and scans of a log to a path, a pose graph and a map."""
 
+from jaxslam._public import publish
 from jaxslam.laser.laser_slam._odometry.log_odometry import MatchMotion, match_controls
 from jaxslam.laser.laser_slam._odometry.tracking import Odometry
 from jaxslam.laser.laser_slam._records import LoopOutcome, Loops, ScanLog, Settings, Solved
@@ -26,3 +27,5 @@ __all__ = [
     "relation_nees",
     "solve",
 ]
+
+publish(__name__)

@@ -1,5 +1,6 @@
 """Scan matching: where a scan lies on another or on a map, and how well that is known."""
 
+from jaxslam._public import publish
 from jaxslam.laser.matching import covariance
 from jaxslam.laser.matching._correlative import Correlative
 from jaxslam.laser.matching._field import FieldMatcher
@@ -24,3 +25,5 @@ __all__ = [
     "raster",
     "transformed",
 ]
+
+publish(__name__)

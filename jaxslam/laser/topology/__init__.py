@@ -1,5 +1,6 @@
 """Topological maps: places and doors from a grid, routes, and the place of a particle set."""
 
+from jaxslam._public import publish
 from jaxslam.laser.topology._places import (
     Door,
     PathPlaces,
@@ -23,3 +24,5 @@ __all__ = [
     "skeleton",
     "topological_map",
 ]
+
+publish(__name__)

@@ -20,14 +20,14 @@ def _one_by_one_on_cpu(library: Callable[..., jax.Array]) -> Callable[..., jax.A
 
     @either.def_vmap
     def rule(size: int, batched: PyTree, *arguments: jax.Array) -> tuple[jax.Array, bool]:
-        axes = tuple(0 if one else None for one in batched)
+        axes = tuple(0 if has_batch else None for has_batch in batched)
 
         def loop(*arguments: jax.Array) -> jax.Array:
-            whole = [
-                x if one else jnp.broadcast_to(x[None], (size, *x.shape))
-                for x, one in zip(arguments, batched, strict=True)
-            ]
-            out: jax.Array = jax.lax.map(lambda rows: either(*rows), tuple(whole))
+            stacks = tuple(
+                array if has_batch else jnp.broadcast_to(array[None], (size, *array.shape))
+                for array, has_batch in zip(arguments, batched, strict=True)
+            )
+            out: jax.Array = jax.lax.map(lambda rows: either(*rows), stacks)
             return out
 
         out = jax.lax.platform_dependent(*arguments, cpu=loop, default=jax.vmap(library, axes))
@@ -61,8 +61,8 @@ def solve_lower(factor: jax.Array, rhs: jax.Array) -> jax.Array:
 @jax.custom_jvp
 def inverse(matrix: jax.Array) -> jax.Array:
     """The inverse of a regular (n, n) matrix."""
-    one = jax.custom_batching.sequential_vmap(lambda matrix: jnp.linalg.inv(matrix))
-    return jnp.asarray(one(matrix))
+    library = jax.custom_batching.sequential_vmap(lambda matrix: jnp.linalg.inv(matrix))
+    return jnp.asarray(library(matrix))
 
 
 @inverse.defjvp

@@ -69,14 +69,14 @@ def whitener_by_rows(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], 
     if n > UNROLLED:
         factor, positive = cholesky(matrix)
         return solve_lower(factor, jnp.eye(n, dtype=matrix.dtype)), positive
-    every = jnp.arange(n)
+    index = jnp.arange(n)
 
     def row(carry: PyTree, j: jax.Array) -> tuple[PyTree, PyTree]:
         rest, ahead, size = carry
         pivot = rest[j, j]
         good = pivot > tolerance * size[j]
         scale = jnp.where(good, jax.lax.rsqrt(jnp.where(good, pivot, 1.0)), 0.0)
-        below, scaled = jnp.where(every > j, rest[:, j] * scale, 0.0), ahead[j] * scale
+        below, scaled = jnp.where(index > j, rest[:, j] * scale, 0.0), ahead[j] * scale
         return (
             rest - below[:, None] * below[None, :],
             ahead - below[:, None] * scaled[None, :],
@@ -84,7 +84,7 @@ def whitener_by_rows(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], 
         ), (scaled, good)
 
     eye, size = jnp.eye(n, dtype=matrix.dtype), jax.lax.stop_gradient(jnp.abs(jnp.diag(matrix)))
-    rows, good = jax.lax.scan(row, (matrix, eye, size), every)[1]
+    rows, good = jax.lax.scan(row, (matrix, eye, size), index)[1]
     return rows, good.all()
 
 

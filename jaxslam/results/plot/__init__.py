@@ -19,6 +19,7 @@ except (ValueError, locale.Error):  # the user's backend, or locale, is not inst
     with mock.patch.dict(os.environ, {"MPLBACKEND": "agg", "LC_ALL": "C"}):
         import matplotlib  # noqa: F401
 
+from jaxslam._public import publish
 from jaxslam.results.plot._film import Film, Layer, Panel, Scene
 from jaxslam.results.plot._graph_figures import graph_figure
 from jaxslam.results.plot._grid_figures import (
@@ -95,3 +96,5 @@ __all__ = [
     "walls_figure",
     "whiteness_figure",
 ]
+
+publish(__name__)

@@ -10,7 +10,7 @@ from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
 from jaxslam.graphs import Factor, Graph
-from jaxslam.graphs._graph import successive
+from jaxslam.graphs._graph import is_successive
 from jaxslam.graphs._solver.model import factors_of
 from jaxslam.results.plot._film import Layer, Panel, Scene, lines_between, marks, still
 from jaxslam.results.plot._style import (
@@ -106,7 +106,7 @@ def _edges(graph: Graph, factors: Mapping[str, Factor]) -> dict[str, Float[np.nd
         table, ends = graph.tables[key], _ends(graph, factors[key], key)
         valid = np.asarray(table.valid)
         if factors[key].variables == ("pose", "pose"):
-            along = successive(graph, np.asarray(table.who))
+            along = is_successive(graph, np.asarray(table.who))
             ends_by_name["path"].append(ends[valid & along])
             ends_by_name["loop edges"].append(ends[valid & ~along])
         else:

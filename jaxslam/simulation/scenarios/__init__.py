@@ -2,6 +2,7 @@
 
 from collections.abc import Callable
 
+from jaxslam._public import publish
 from jaxslam.simulation._scans import BetweenRanges
 from jaxslam.simulation._worlds import Scenario
 from jaxslam.simulation.scenarios._drives import explore, webmap
@@ -58,3 +59,5 @@ __all__ = [
     "stationary",
     "webmap",
 ]
+
+publish(__name__)

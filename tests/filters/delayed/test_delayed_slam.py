@@ -16,9 +16,14 @@ import jaxslam
 from jaxslam import Scenario, motion, sensors
 from jaxslam.association import Nearest
 from jaxslam.core.types import Status
-from jaxslam.filters import DeadReckoning, DelayedSlam
+from jaxslam.filters import (
+    DeadReckoning,
+    DelayedSlam,
+    Hypotheses,
+    Promotion,
+    StoredMeasurements,
+)
 from jaxslam.filters._delayed.confirmation import constraints_of, correct_hypotheses
-from jaxslam.filters._delayed.delayed_settings import Hypotheses, Promotion, StoredMeasurements
 from jaxslam.filters._delayed.hypotheses import UncertainPoints, closer_than, point_residuals
 from jaxslam.filters._delayed.initialization import add_landmark, initial_estimate
 from jaxslam.filters._delayed.intersection import add_hypotheses
@@ -561,12 +566,12 @@ def test_without_names_intersections_find_the_landmarks():
 @refused(
     (lambda: slam(sensors.RangeBearing(np.eye(2))), "one bearing or one range"),
     (lambda: slam(capacity=0), "DelayedSlam: capacity"),
-    (lambda: slam(gate=0), "DelayedSlam: expected a probability above 0 and below 1 as gate"),
-    (lambda: slam(triangulation=3), "DelayedSlam: expected triangulation to be a Triangulation"),
+    (lambda: slam(gate=0), "DelayedSlam: gate: expected a probability above 0 and below 1"),
+    (lambda: slam(triangulation=3), "DelayedSlam: triangulation: expected a Triangulation"),
     (lambda: slam(triangulation=Rays), "got the class Rays: call it"),
-    (lambda: slam(stored=32), "DelayedSlam: expected stored to be a StoredMeasurements, got int"),
-    (lambda: slam(hypotheses=16), "DelayedSlam: expected hypotheses to be a Hypotheses, got int"),
-    (lambda: slam(promotion=2), "DelayedSlam: expected promotion to be a Promotion, got int"),
+    (lambda: slam(stored=32), "DelayedSlam: stored: expected a StoredMeasurements, got 32"),
+    (lambda: slam(hypotheses=16), "DelayedSlam: hypotheses: expected a Hypotheses, got 16"),
+    (lambda: slam(promotion=2), "DelayedSlam: promotion: expected a Promotion, got 2"),
     (lambda: slam(BEACON, triangulation=Rays()), "one bearing"),
     (lambda: slam(triangulation=Circles()), "one range"),
     (lambda: Rays(parallax=2.0), "^Rays: expected parallax in"),

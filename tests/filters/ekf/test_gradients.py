@@ -15,9 +15,7 @@ from jaxslam._driver import run
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Status
 from jaxslam.filters import EkfSlam
-from jaxslam.filters._ekf.ekf_settings import EkfSettings
-from jaxslam.filters._ekf.predict import propagate
-from jaxslam.filters._ekf.update import correct_in_turn
+from jaxslam.filters._ekf.correction import correct_in_turn
 from jaxslam.math.stats import sigma_gate
 from jaxslam.simulation._worlds import simulate
 from jaxslam.simulation.scenarios import circle, cloister
@@ -156,10 +154,10 @@ def test_in_reverse_through_a_motion_and_corrections_in_turn(name):
 
     def cost(sigma, joint):
         sensor = sensors.RangeBearing(jnp.diag(sigma[2:]) ** 2)
-        settings = EkfSettings(sensor, **FORMS[name])
         robot = motion.Increment(jnp.diag(sigma[:2]) ** 2)
-        joint, _ = propagate(joint, jnp.array([0.2, 0.1]), robot, settings)
-        joint, done = correct_in_turn(joint, z, slot, np.ones(3, bool), settings)
+        ekf = EkfSlam(robot, sensor, 2, **FORMS[name])
+        joint = ekf.predict(joint, jnp.array([0.2, 0.1]), jax.random.key(0))
+        joint, done = correct_in_turn(ekf, sensor, joint, z, slot, np.ones(3, bool))
         return done.log_likelihood.sum() + joint.pose.sum() + (joint.cov**2).sum()
 
     at = np.array([0.01, 0.04, 0.05, 0.02])

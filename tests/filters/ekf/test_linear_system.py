@@ -17,9 +17,8 @@ from jaxslam.core.record import record
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Scan
 from jaxslam.filters import Closing, EkfSlam, Filter, Monitored, Wrapper
-from jaxslam.filters._ekf.ekf_settings import EkfSettings
+from jaxslam.filters._ekf.correction import correct
 from jaxslam.filters._ekf.predicted_measurements import prediction_of
-from jaxslam.filters._ekf.update import correct
 from jaxslam.linearize import FirstEstimate
 
 SENSOR = sensors.RangeBearing(np.diag([0.1, 0.02]) ** 2, mount=(0.2, -0.1, 0.4))
@@ -73,11 +72,11 @@ def test_pairs_and_cross_covariances_are_those_of_dense_algebra(name, square_roo
     scan = some_scan(joint)
     held = joint._replace(cov=np.linalg.cholesky(joint.cov)) if square_root else joint
     covariance = "square_root" if square_root else "plain"
-    settings = EkfSettings(SENSOR, chart, covariance=covariance)
+    ekf = EkfSlam(WORLD.motion, SENSOR, COUNT, chart=chart, covariance=covariance)
 
     @jax.jit
     def look(held, scan):
-        prediction = prediction_of(held, settings)
+        prediction = prediction_of(ekf, SENSOR, held)
         return prediction.pairs(scan), prediction.cross()
 
     pairs, cross = jax.device_get(look(held, scan))
@@ -99,13 +98,13 @@ def test_pairs_and_cross_covariances_are_those_of_dense_algebra(name, square_roo
 def test_a_scan_judged_for_association_is_judged_alike_in_the_correction():
     joint = some_joint()
     scan = some_scan(joint)
-    settings = EkfSettings(SENSOR, linearize=linearize.Unscented())
+    ekf = EkfSlam(WORLD.motion, SENSOR, COUNT, linearize=linearize.Unscented())
     slot, each = np.array([3, 0, 1]), np.arange(3)
 
     @jax.jit
     def judged(joint, scan):
-        pairs = prediction_of(joint, settings).pairs(scan)
-        return pairs, correct(joint, scan.z, slot, scan.valid, settings)[1]
+        pairs = prediction_of(ekf, SENSOR, joint).pairs(scan)
+        return pairs, correct(ekf, SENSOR, joint, scan.z, slot, scan.valid)[1]
 
     pairs, done = jax.device_get(judged(joint, scan))
     np.testing.assert_allclose(pairs.innovation[each, slot], done.innovation, atol=1e-12)
@@ -162,7 +161,7 @@ def test_landmarks_that_leave_the_map_and_come_back_tell_nothing_of_a_turn():
     (filters.EifSlam(WORLD.motion, WORLD.sensor, 4), "eif_slam do not return"),
     (Wrapped(FEJ), "wrapped ekf_slam do not return"),
     (Corrected(WORLD.motion, WORLD.sensor, 4), "corrected do not return"),
-    (filters.EkfSlam, "expected a filter, got the class EkfSlam: call it"),
+    (filters.EkfSlam, "filter: expected a Filter, got the class EkfSlam: call it"),
     told="^Monitored: .*",
 )
 def test_a_filter_without_a_linear_system_is_refused(filter):

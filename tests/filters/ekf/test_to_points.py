@@ -252,7 +252,7 @@ POINT_SENSOR = sensors.RangeBearing(np.eye(2))
 
 
 @refused(
-    (lambda: camera(to_point=0.0), "to_point above 0"),
+    (lambda: camera(to_point=0.0), "to_point: expected a number above 0"),
     (lambda: EkfSlam(MOTION, SENSOR, 4, chart=TURNING), "turn with the robot"),
     (
         lambda: EkfSlam(MOTION, camera(), 4, chart=RightInvariant()),

@@ -11,8 +11,7 @@ from cases import swept
 
 from jaxslam import association, life, motion, run, sensors
 from jaxslam.core.types import Log, Scan, Status
-from jaxslam.filters import EkfSlam
-from jaxslam.filters.map_management._merging import Merging
+from jaxslam.filters import EkfSlam, Merging
 
 STEPS, PLACES = 400, 4
 MOTION = motion.Increment(np.diag([0.01, 0.01]) ** 2)

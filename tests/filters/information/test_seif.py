@@ -24,7 +24,6 @@ from jaxslam.filters._information.marginals import (
     blanket_marginals,
     local_information,
     recover_passive_means,
-    whole_information,
 )
 from jaxslam.filters._reporting import nothing_of
 from jaxslam.simulation.scenarios import BetweenRanges, cloister
@@ -215,7 +214,7 @@ def test_every_step_is_the_dense_formula():
 def test_mean_recovery_converges_to_the_whole_mean():
     state = driven(**FEW)
     residual = np.concatenate([state.pose_residual, np.ravel(state.landmark_residual)])
-    step = np.linalg.solve(whole_information(state).toarray(), residual)
+    step = np.linalg.solve(filters.whole_information(state).toarray(), residual)
     pose, landmarks = state.pose + step[:3], state.landmarks + step[3:].reshape(-1, 2)
     f, _, update = made(**FEW)
     _, scan = next(rows(1))
@@ -230,7 +229,7 @@ def test_mean_recovery_converges_to_the_whole_mean():
 
 def test_whole_map_and_markov_blankets():
     state = driven()
-    omega = whole_information(state).toarray()
+    omega = filters.whole_information(state).toarray()
     np.testing.assert_allclose(omega, dense(state), atol=1e-12 * np.abs(omega).max())
     cov = np.linalg.inv(omega)
     found = np.asarray(jax.jit(blanket_marginals)(state)[1])
@@ -347,7 +346,7 @@ def test_few_links_stay_definite_and_are_counted():
     state = driven(**FEW)
     assert int(state.counts.dropped) > 0
     assert int(state.counts.refused) == 0
-    omega = whole_information(state).toarray()
+    omega = filters.whole_information(state).toarray()
     np.testing.assert_array_equal(omega, omega.T)
     assert np.linalg.eigvalsh(omega)[0] > 0
 

@@ -120,7 +120,7 @@ def prior(pose=(0.0, 0.0, 0.0), **options):
 
 @refused(
     (lambda: Mapping(ring(3).sensor, 0), "Mapping: .*capacity"),
-    (lambda: Mapping(ring(3).sensor, 3, gate=0.0), "Mapping: .*above 0 and below 1 as gate"),
+    (lambda: Mapping(ring(3).sensor, 3, gate=0.0), "Mapping: gate: expected a probability above 0"),
     (lambda: Mapping(sensors.Compass(np.eye(1)), 3), "absolute"),
     (lambda: prior((0.0, 0.0)), r"pose \(3,\)"),
     (lambda: prior(capacity=3), "a filter of 2 landmarks"),

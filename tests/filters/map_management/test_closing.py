@@ -14,9 +14,8 @@ from jaxslam import association, charts, motion, sensors, slots
 from jaxslam.core.protocols import Pairs, Prediction
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Info, Scan
-from jaxslam.filters import EifSlam, EkfSlam
-from jaxslam.filters.map_management._closing import Closing
-from jaxslam.filters.map_management._loop_closure import LoopSettings, close_loop
+from jaxslam.filters import Closing, EifSlam, EkfSlam, LoopSettings
+from jaxslam.filters.map_management._loop_closure import close_loop
 from jaxslam.filters.map_management._merging import merge_landmarks
 from jaxslam.life import Recency, Times
 
@@ -212,7 +211,7 @@ MODELS = motion.PoseIncrement(np.eye(3)), sensors.RelativePosition(np.eye(2)), 3
     (lambda: LoopSettings(probability=0.0), "probability"),
     (lambda: look(two_visits()[0]._replace(life=None)), "keeps times"),
     (lambda: association.Certain(association.Nearest(0.99), 0.0), "spread"),
-    (lambda: Closing(EkfSlam(*MODELS), every=0), "every"),
+    (lambda: Closing(EkfSlam(*MODELS), period=0), "period"),
     (lambda: Closing(EkfSlam(*MODELS), reach=-1.0), "reach"),
     (lambda: Closing(EkfSlam(*MODELS)).init(jnp.zeros(3), jnp.eye(3)), "keeps times"),
     (lambda: Closing(EkfSlam(*MODELS, covariance="square_root", life=Recency())), "root"),

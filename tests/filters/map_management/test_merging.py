@@ -14,9 +14,8 @@ from jaxslam import charts, motion, run, sensors, slots
 from jaxslam.core.record import record
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Log, Scan
-from jaxslam.filters import EkfSlam
-from jaxslam.filters.map_management._closing import Closing
-from jaxslam.filters.map_management._merging import Merging, closest_pair, merge_landmarks
+from jaxslam.filters import Closing, EkfSlam, Merging
+from jaxslam.filters.map_management._merging import closest_pair, merge_landmarks
 from jaxslam.life import Existence, Recency
 
 EUCLIDEAN = charts.Euclidean()
@@ -338,6 +337,7 @@ def test_closing_takes_times():
 @pytest.mark.parametrize("name", MANAGERS)
 def test_a_class_is_no_filter(name):
     with pytest.raises(
-        ValueError, match=rf"^{name.title()}: expected a filter, got the class EkfSlam: call it"
+        ValueError,
+        match=rf"^{name.title()}: filter: expected a Filter, got the class EkfSlam: call it",
     ):
         MANAGERS[name](EkfSlam)

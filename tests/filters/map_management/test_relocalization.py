@@ -15,8 +15,7 @@ from jaxslam import charts, motion, se2, sensors
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Scan, Status
 from jaxslam.filters import EkfSlam
-from jaxslam.filters._ekf.ekf_settings import EkfSettings
-from jaxslam.filters._ekf.update import correct
+from jaxslam.filters._ekf.correction import correct
 from jaxslam.filters.map_management.relocalization import (
     lost,
     points_of_map,
@@ -302,8 +301,8 @@ def test_relocated_is_the_limit_of_an_update_from_a_large_covariance(name):
     found = RELOCATED(joint, chart, slot, seen, covs)
     # Linearized at the answer, the same update from a large covariance hardly moves the pose.
     wide = LOST(joint._replace(pose=found.pose), chart, 1e7 * np.eye(3))
-    settings = EkfSettings(sensor, chart)
-    correction = jax.jit(lambda *given: correct(*given, settings))
+    ekf = EkfSlam(motion.Increment(np.eye(2)), sensor, len(joint.tag), chart=chart)
+    correction = jax.jit(lambda *scan: correct(ekf, sensor, *scan))
     limit, _ = correction(wide, seen, np.maximum(slot, 0), slot >= 0)
     tolerance = 1e-5 if name == "euclidean" else 1e-3  # basis at the answer, or before it
     np.testing.assert_allclose(found.pose, limit.pose, atol=tolerance)

@@ -19,8 +19,6 @@ from jaxslam.core.types import Log, Scan, Status
 from jaxslam.filters import EkfSlam, TeamSlam
 from jaxslam.filters.multi_robot import _pose_initialization as pose_initialization
 from jaxslam.sensors import Part, Suite
-from jaxslam.simulation._team_world import TeamWorld
-from jaxslam.simulation._worlds import simulate
 from jaxslam.simulation.scenarios import BetweenRanges
 
 Q = np.diag([0.01, 0.01]) ** 2
@@ -39,9 +37,9 @@ def crew(count=2, mutual=True, reach=3.2):
     back = sensors.RangeBearing(R2, mount=(0.0, 0.0, 3.0))
     parts = [Part(eyes, 4, visible=BetweenRanges(0.0, reach))]
     if count < 3:  # three robots of three sensors would compile for long
-        parts.append(Part(back, 2, every=3))
+        parts.append(Part(back, 2, interval=3))
     if mutual and count > 1:
-        parts.append(Part(eyes, count - 1, every=2, sees="robots"))
+        parts.append(Part(eyes, count - 1, interval=2, sees="robots"))
     return [team.Robot(motion.Increment(Q), Suite((*parts,)), start) for start in STARTS[:count]]
 
 
@@ -56,7 +54,7 @@ def world(robots, steps=40, **options):
     points = np.stack([radius * np.cos(around), 1.0 + radius * np.sin(around)], axis=1)
     turns = [4 * np.pi / 100, -0.1, 0.15][: len(robots)]
     controls = np.tile(np.ravel([(0.12, turn) for turn in turns]), (steps, 1))
-    return TeamWorld(robots, points, controls, **options)
+    return jaxslam.TeamWorld(robots, points, controls, **options)
 
 
 @cache
@@ -264,7 +262,7 @@ def hundred(report, first):
     """Truth of one of two robots and logs of 100 runs; robot 1 sees landmarks from a step on."""
     eyes = sensors.RangeBearing(R1, mount=MOUNT)
     sight = BetweenRanges(0.0, 3.2)
-    other = Part(eyes, 1, every=2, sees="robots")
+    other = Part(eyes, 1, interval=2, sees="robots")
     robots = [
         team.Robot(
             motion.Increment(Q), Suite((Part(eyes, 6, start=start, visible=sight), other)), at
@@ -273,7 +271,11 @@ def hundred(report, first):
     ]
     scenario = world(robots, 30, report=report)
     keys = jax.random.split(jax.random.key(2), RUNS)
-    return robots, scenario, *jax.device_get(jax.jit(jax.vmap(partial(simulate, scenario)))(keys))
+    return (
+        robots,
+        scenario,
+        *jax.device_get(jax.jit(jax.vmap(partial(jaxslam.simulate, scenario)))(keys)),
+    )
 
 
 @cache
@@ -336,7 +338,9 @@ def test_a_world_is_the_same_whatever_is_reported():
 
     @jax.jit
     def all_of_them(key):
-        truths, logs = zip(*(simulate(scenario, key) for scenario in scenarios), strict=True)
+        truths, logs = zip(
+            *(jaxslam.simulate(scenario, key) for scenario in scenarios), strict=True
+        )
         return truths, logs, scenarios[0].histories(key)
 
     truths, logs, (starts, paths, _) = all_of_them(jax.random.key(0))
@@ -395,7 +399,7 @@ def signs():
     (lambda: TeamSlam(crew(2), 3, tags=(7, -1)), "integers >= 0"),
     (lambda: TeamSlam(crew(2), 0), "capacity"),
     (lambda: TeamSlam(crew(2), 3, report=2), "expected report from 0 to"),
-    (lambda: TeamSlam(crew(2), 3, gate=0.0), "above 0 and below 1 as gate"),
+    (lambda: TeamSlam(crew(2), 3, gate=0.0), "gate: expected a probability above 0 and below 1"),
     (lambda: TeamSlam(crew(2), 3, correction="at once"), "expected correction"),
     (lambda: TeamSlam([signs()], 3), "expected landmarks \\(x, y\\)"),
     (lambda: TeamSlam([crew(1)[0], compass_only()], 3), "robot 1 needs a start"),

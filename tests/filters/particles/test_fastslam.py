@@ -18,7 +18,6 @@ from jaxslam.consistency._measures.counts import counted
 from jaxslam.core.types import Scan, Status
 from jaxslam.filters import FastSlam
 from jaxslam.filters._particles import pose_particles, slam_particles
-from jaxslam.filters._particles.slam_particles import SlamParticles
 from jaxslam.math.stats import sigma_gate
 
 KEY = jax.random.key(5)
@@ -116,7 +115,7 @@ def weighted(**fields):
     """A state in which no particle has lost anything."""
     count = len(fields["pose"])
     zero = np.zeros(count, np.int32)
-    return SlamParticles(**fields, lost=zero, invalid=zero.astype(bool))
+    return slam_particles.SlamParticles(**fields, lost=zero, invalid=zero.astype(bool))
 
 
 def random_particles(rng, count=7, capacity=3):
@@ -484,9 +483,9 @@ def test_gradients_are_finite_where_the_pose_is_known_exactly(proposal):
     ({"proposal": "optimal"}, 'expected proposal "motion" or "measurement"'),
     ({"threshold": 1.5}, "threshold from 0 to 1"),
     ({"threshold": np.nan}, "threshold from 0 to 1"),
-    ({"gate": 0.0}, "above 0 and below 1 as gate"),
-    ({"resample": "systematic"}, "resample to be a function"),
-    ({"life": "existence"}, "life to be a Life"),
+    ({"gate": 0.0}, "gate: expected a probability above 0 and below 1"),
+    ({"resample": "systematic"}, "resample: expected a function"),
+    ({"life": "existence"}, "life: expected a Life"),
     ({"sensor": sensors.Compass(np.eye(1))}, "not a suite"),
     (
         {"sensor": sensors.BearingInverseDepth(np.eye(1), min_distance=1.0, to_point=0.1)},

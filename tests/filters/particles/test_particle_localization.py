@@ -317,7 +317,7 @@ def test_the_start_is_reported_before_anything_is_drawn():
     out = jax.jit(lambda *at: anywhere.estimate(anywhere.init(*at)))(np.ones(3), np.zeros((3, 3)))
     np.testing.assert_allclose(out.pose, [0, 1, 0], atol=1e-12)
     np.testing.assert_allclose(out.pose_cov, np.diag([64, 64, 4 * np.pi**2]) / 12, rtol=1e-12)
-    uniform = jax.jit(lambda key: pose_particles.draw_uniform_poses(jnp.asarray(BOX), 20000, key))
+    uniform = jax.jit(lambda key: pose_particles.Box(BOX).draw(20000, key, float))
     draws = np.asarray(uniform(KEY))
     assert (draws[:, :2] > BOX[0]).all() and (draws[:, :2] < BOX[1]).all()
     np.testing.assert_allclose(np.cov(draws.T), out.pose_cov, atol=0.15)
@@ -366,9 +366,9 @@ def test_gradients_are_finite_from_a_start_that_is_known_exactly():
     ({"box": [[0, 0, 0], [1, 1, 1]]}, r"a box of shape \(2, 2\)"),
     ({"box": [[1, 1], [0, 2]]}, "a box of"),
     ({"threshold": 1.5}, "threshold from 0 to 1"),
-    ({"gate": 0.0}, "above 0 and below 1 as gate"),
+    ({"gate": 0.0}, "gate: expected a probability above 0 and below 1"),
     ({"forget": (0.2, 0.1)}, "0 < slow <= fast <= 1"),
-    ({"resample": "systematic"}, "resample to be a function"),
+    ({"resample": "systematic"}, "resample: expected a function"),
 )
 def test_bad_input_is_refused(change):
     given = {"landmarks": WORLD.landmarks, "particles": 5} | change

@@ -384,18 +384,18 @@ def test_the_batch_is_scipys_optimum():
     def weighted(x):
         return residuals(x, log, world)[0]
 
-    found = scipy.optimize.least_squares(
+    fit = scipy.optimize.least_squares(
         weighted, start, "3-point", xtol=1e-15, ftol=1e-15, gtol=1e-12
     )
-    best = found.x
+    best = fit.x
     # SciPy ends where the cost rounds, some 1e-8 σ away: the rest by Gauss-Newton, which looks at
     # the slope alone.
     for _ in range(3):
         best = best - np.linalg.lstsq(slopes(weighted, best), weighted(best), rcond=None)[0]
     # In standard deviations, as far as difference quotients go.
-    np.testing.assert_allclose(best, found.x, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(best, fit.x, rtol=0, atol=1e-6)
     np.testing.assert_allclose(unknowns, best, rtol=0, atol=1e-7)
-    np.testing.assert_allclose(trace.final.cost, found.cost, rtol=1e-12)
+    np.testing.assert_allclose(trace.final.cost, fit.cost, rtol=1e-12)
     path = residuals(best, log, world)[1]
     np.testing.assert_allclose(trace.estimate.pose, path, rtol=0, atol=1e-8)
     assert trace.final.ending == Ending.CONVERGED

@@ -61,19 +61,19 @@ def smallest(graph):
 def test_it_tells_the_global_optimum_from_another(wrong):
     graph = isotropic()
     solution = graphs.optimize(folded(graph) if wrong else graph)
-    found = graphs.certificate(solution.graph)
-    chi2, bound, least = smallest(found.graph)
-    np.testing.assert_allclose(found.chi2, chi2, rtol=1e-9)
-    assert bool(found.certified) is not wrong
+    proof = graphs.certificate(solution.graph)
+    chi2, bound, least = smallest(proof.graph)
+    np.testing.assert_allclose(proof.chi2, chi2, rtol=1e-9)
+    assert bool(proof.certified) is not wrong
     # The matrix has numbers of some thousands.
-    np.testing.assert_allclose(found.smallest, least, rtol=1e-4, atol=1e-7)
-    assert found.gap >= chi2 - bound - SIZE * min(least, 0) - 1e-9
+    np.testing.assert_allclose(proof.smallest, least, rtol=1e-4, atol=1e-7)
+    assert proof.gap >= chi2 - bound - SIZE * min(least, 0) - 1e-9
     if not wrong:
-        assert found.position < 0.1 and found.heading < 0.1
+        assert proof.position < 0.1 and proof.heading < 0.1
     else:
         best = graphs.certificate(graphs.optimize(graph).graph)
-        assert found.chi2 > 2 * best.chi2
-        assert found.chi2 - found.gap <= best.chi2
+        assert proof.chi2 > 2 * best.chi2
+        assert proof.chi2 - proof.gap <= best.chi2
 
 
 @pytest.mark.sweep
@@ -83,10 +83,10 @@ def test_a_prior_is_a_gauge_and_two_are_refused():
         np.array([[4]], np.int32), graph.poses[4:5], np.eye(3)[None], np.ones(1, bool)
     )
     free = graph._replace(fixed_pose=np.zeros(SIZE, bool), tables={**graph.tables, "prior": prior})
-    found = graphs.certificate(graphs.optimize(free).graph)
+    proof = graphs.certificate(graphs.optimize(free).graph)
     held = graphs.certificate(graphs.optimize(graph).graph)
-    assert found.certified
-    np.testing.assert_allclose(found.chi2, held.chi2, rtol=1e-9)
+    assert proof.certified
+    np.testing.assert_allclose(proof.chi2, held.chi2, rtol=1e-9)
     with pytest.raises(ValueError, match="expected one pose that is fixed or has a prior, got 2"):
         graphs.certificate(free._replace(fixed_pose=graph.fixed_pose))
 
@@ -133,16 +133,16 @@ def test_marginals_are_the_blocks_of_the_dense_inverse():
     graph = ring()
     pairs = [[3, 4], [9, 2], [7, 19]]  # along an edge, none, none and turned round
     poses, _, information, _ = dense(graph)
-    found = graphs.marginals(as_it_is(graph._replace(poses=poses)), pairs=pairs)
+    covariances = graphs.marginals(as_it_is(graph._replace(poses=poses)), pairs=pairs)
     cov = np.zeros((SIZE, 3, SIZE, 3))
     cov[1:, :, 1:] = np.linalg.inv(information).reshape(SIZE - 1, 3, SIZE - 1, 3)
     scale = np.abs(cov).max()
     for k in range(SIZE):
-        np.testing.assert_allclose(found.poses[k], cov[k, :, k], atol=1e-9 * scale)
-    for joint, (a, b) in zip(found.pairs, pairs, strict=True):
+        np.testing.assert_allclose(covariances.poses[k], cov[k, :, k], atol=1e-9 * scale)
+    for joint, (a, b) in zip(covariances.pairs, pairs, strict=True):
         both = [[cov[a, :, a], cov[a, :, b]], [cov[b, :, a], cov[b, :, b]]]
         np.testing.assert_allclose(joint, np.array(both), atol=1e-9 * scale)
-    assert found.singular == -1
+    assert covariances.singular == -1
 
 
 def test_those_of_points_and_of_poses_with_points_are_too():
@@ -168,12 +168,14 @@ def test_those_of_points_and_of_poses_with_points_are_too():
         graphs.marginals(
             as_it_is(graph), pairs=[[0, count]]
         )  # of the padded graph it is a variable
-    found = graphs.marginals(as_it_is(graph), pairs=pairs)
+    covariances = graphs.marginals(as_it_is(graph), pairs=pairs)
     atol = 1e-9 * np.abs(inverse).max()
     for k in range(POINTS):
-        np.testing.assert_allclose(found.points[k], cov[POSES + k, :2, POSES + k, :2], atol=atol)
+        np.testing.assert_allclose(
+            covariances.points[k], cov[POSES + k, :2, POSES + k, :2], atol=atol
+        )
     assert np.abs(inverse[:free, free:]).max() > 1e3 * atol
-    for joint, (a, b) in zip(found.pairs, pairs, strict=True):
+    for joint, (a, b) in zip(covariances.pairs, pairs, strict=True):
         both = [[cov[a, :, a], cov[a, :, b]], [cov[b, :, a], cov[b, :, b]]]
         np.testing.assert_allclose(joint, np.array(both), atol=atol)
 

@@ -12,9 +12,8 @@ from reference import graph as plain
 from reference.plane import between, wrap
 from worlds import nothing_compiled
 
-from jaxslam import graphs
+from jaxslam import datasets, graphs
 from jaxslam.graphs import Ending, starts
-from jaxslam.graphs._graph import LOOPS
 
 pytestmark = pytest.mark.decision
 
@@ -22,14 +21,14 @@ pytestmark = pytest.mark.decision
 def test_the_optimum_is_that_of_dense_gauss_newton():
     graph = ring()
     poses, chi2, _, _ = dense(graph)
-    found = graphs.optimize(graph)
-    assert found.status == Ending.CONVERGED
-    np.testing.assert_allclose(found.chi2, chi2, rtol=1e-10)
-    np.testing.assert_allclose(found.graph.poses[:, :2], poses[:, :2], atol=1e-6)
-    np.testing.assert_allclose(wrap(found.graph.poses[:, 2] - poses[:, 2]), 0, atol=1e-7)
-    np.testing.assert_allclose(graphs.chi2(found.graph), chi2, rtol=1e-10)
-    assert found.gradient < 1e-6 * found.gradient_start
-    assert found.singular == -1
+    solution = graphs.optimize(graph)
+    assert solution.status == Ending.CONVERGED
+    np.testing.assert_allclose(solution.chi2, chi2, rtol=1e-10)
+    np.testing.assert_allclose(solution.graph.poses[:, :2], poses[:, :2], atol=1e-6)
+    np.testing.assert_allclose(wrap(solution.graph.poses[:, 2] - poses[:, 2]), 0, atol=1e-7)
+    np.testing.assert_allclose(graphs.chi2(solution.graph), chi2, rtol=1e-10)
+    assert solution.gradient < 1e-6 * solution.gradient_start
+    assert solution.singular == -1
 
 
 @pytest.mark.parametrize("dtype", swept([np.float64, np.float32], np.float64))
@@ -38,13 +37,13 @@ def test_poses_and_points_are_those_of_scipy(dtype):
     graph = small_graphs.drawn(noise=0.1)
     poses, points, chi2 = plain.optimum(graph)
     numbers = jax.tree.map(lambda x: x.astype(dtype) if x.dtype == np.float64 else x, graph)
-    found = graphs.optimize(numbers)
-    assert found.status == Ending.CONVERGED and found.chi2.dtype == dtype
+    solution = graphs.optimize(numbers)
+    assert solution.status == Ending.CONVERGED and solution.chi2.dtype == dtype
     near = 1e-6 if dtype == np.float64 else 1e-3
-    np.testing.assert_allclose(found.chi2, chi2, rtol=near)
-    np.testing.assert_allclose(found.graph.poses[:, :2], poses[:, :2], atol=near)
-    np.testing.assert_allclose(wrap(found.graph.poses[:, 2] - poses[:, 2]), 0, atol=near)
-    np.testing.assert_allclose(found.graph.points, points, atol=near)
+    np.testing.assert_allclose(solution.chi2, chi2, rtol=near)
+    np.testing.assert_allclose(solution.graph.poses[:, :2], poses[:, :2], atol=near)
+    np.testing.assert_allclose(wrap(solution.graph.poses[:, 2] - poses[:, 2]), 0, atol=near)
+    np.testing.assert_allclose(solution.graph.points, points, atol=near)
 
 
 def test_endings():
@@ -53,9 +52,9 @@ def test_endings():
     table, factor = graph.tables["relative_pose"], graphs.RelativePose()
 
     def ended(of, **options):
-        found = graphs.optimize(of, **options)
-        assert np.isfinite(found.graph.poses).all()
-        return Ending(int(found.status)), int(found.singular)
+        solution = graphs.optimize(of, **options)
+        assert np.isfinite(solution.graph.poses).all()
+        return Ending(int(solution.status)), int(solution.singular)
 
     def changed(field, rows, value):
         numbers = np.array(getattr(table, field))
@@ -83,16 +82,16 @@ def test_graphs_of_about_the_same_size_share_their_programs():
     smaller.tables["relative_pose"] = jax.tree.map(lambda x: x[rows], table)
 
     def solved(graph, pairs):
-        found = graphs.optimize(graph)
-        return found, graphs.marginals(found, pairs=pairs)
+        solution = graphs.optimize(graph)
+        return solution, graphs.marginals(solution, pairs=pairs)
 
     solved(ring(), [[3, 4]])
     with nothing_compiled():
-        found, marginals = solved(smaller, [[2, 7], [1, 18], [3, 3]])
-    assert jax.tree.map(np.shape, found.graph) == jax.tree.map(np.shape, smaller)
+        solution, marginals = solved(smaller, [[2, 7], [1, 18], [3, 3]])
+    assert jax.tree.map(np.shape, solution.graph) == jax.tree.map(np.shape, smaller)
     assert marginals.poses.shape == (19, 3, 3) and marginals.pairs.shape == (3, 2, 2, 3, 3)
     _, chi2, information, _ = dense(smaller)
-    np.testing.assert_allclose(found.chi2, chi2, rtol=1e-10)
+    np.testing.assert_allclose(solution.chi2, chi2, rtol=1e-10)
 
 
 def split(graph):
@@ -115,15 +114,15 @@ def test_a_batch_has_the_optimum_of_each_graph():
     @jax.jit
     @jax.vmap
     def solved(graph):
-        found = graphs.optimize(graph, plan=plan)
-        return found, graphs.certificate(found.graph, plan=plan)
+        solution = graphs.optimize(graph, plan=plan)
+        return solution, graphs.certificate(solution.graph, plan=plan)
 
-    found, proof = solved(batch)
+    solution, proof = solved(batch)
     for k in (0, 3, 17):
-        np.testing.assert_allclose(found.chi2[k], dense(many[k])[1], rtol=1e-10)
+        np.testing.assert_allclose(solution.chi2[k], dense(many[k])[1], rtol=1e-10)
         alone = graphs.certificate(graphs.optimize(many[k]).graph)
         np.testing.assert_allclose(proof.chi2[k], alone.chi2, rtol=1e-9)
-    assert (found.status == Ending.CONVERGED).all()
+    assert (solution.status == Ending.CONVERGED).all()
     assert proof.certified.all()
 
 
@@ -146,10 +145,10 @@ def test_derivatives_of_the_optimum_are_differences():
     def seen(z, information, first):
         tables = {"relative_pose": table._replace(z=z, information=information)}
         moved = graph._replace(poses=start.at[0].set(first), tables=tables)
-        found = graphs.optimize(moved, plan=plan, kernel=kernel, tolerance=0.0)
-        poses, weights = found.graph.poses, found.weights["relative_pose"]
+        solution = graphs.optimize(moved, plan=plan, kernel=kernel, tolerance=0.0)
+        poses, weights = solution.graph.poses, solution.weights["relative_pose"]
         by_poses = (poses[:, :2] * look[:, :2]).sum() + jax.numpy.sin(poses[:, 2]).sum()
-        return by_poses + found.chi2 + weights @ look.ravel()[: len(weights)]
+        return by_poses + solution.chi2 + weights @ look.ravel()[: len(weights)]
 
     at = table.z, table.information, graph.poses[0]
     gradient = jax.jit(jax.grad(seen, (0, 1, 2)))(*at)
@@ -173,9 +172,9 @@ def test_priors_alone_and_what_is_not_determined():
         fixed_point=np.zeros(0, bool),
         tables={"prior": prior},
     )
-    found = graphs.optimize(alone)
-    assert found.status == Ending.CONVERGED
-    np.testing.assert_allclose(found.graph.poses, 1.0, atol=1e-9)
+    solution = graphs.optimize(alone)
+    assert solution.status == Ending.CONVERGED
+    np.testing.assert_allclose(solution.graph.poses, 1.0, atol=1e-9)
 
     def at(value, z):
         return z - value[0][:2]
@@ -205,10 +204,10 @@ def test_priors_alone_and_what_is_not_determined():
         fixed_pose=np.zeros(3, bool),
         tables={"place": places, "relative_pose": steps},
     )
-    found = graphs.optimize(graph, factors)
-    assert found.status == Ending.CONVERGED and found.singular == -1
-    again = graphs.optimize(found.graph, factors)
-    np.testing.assert_allclose(found.chi2, again.chi2, rtol=1e-9)
+    solution = graphs.optimize(graph, factors)
+    assert solution.status == Ending.CONVERGED and solution.singular == -1
+    again = graphs.optimize(solution.graph, factors)
+    np.testing.assert_allclose(solution.chi2, again.chi2, rtol=1e-9)
 
     nothing = steps._replace(information=np.tile(np.diag([0.0, 0.0, 1.0]), (2, 1, 1)))
     loose = graph._replace(tables={"prior": prior, "relative_pose": nothing})
@@ -227,12 +226,12 @@ def test_squared_residuals_are_those_of_the_equations():
     graph = small_graphs.drawn(noise=0.5)
     table = graph.tables["relative_pose"]._replace(valid=np.arange(10) != 4)
     graph = graph._replace(tables=graph.tables | {"relative_pose": table})
-    found = graphs.squared_residuals(graph)
-    assert {key: len(rows) for key, rows in found.items()} == {
+    squares = graphs.squared_residuals(graph)
+    assert {key: len(rows) for key, rows in squares.items()} == {
         key: len(table.z) for key, table in graph.tables.items()
     }
-    assert found["relative_pose"][4] == 0
-    total = sum(np.asarray(rows).sum() for rows in found.values())
+    assert squares["relative_pose"][4] == 0
+    total = sum(np.asarray(rows).sum() for rows in squares.values())
     np.testing.assert_allclose(total, plain.chi2(graph), rtol=1e-13)
 
 
@@ -257,14 +256,14 @@ def test_they_are_gtsams(name, start, best):
     path = DATA / "graphs" / f"{name}.g2o"
     if not path.exists():
         pytest.skip(f"{path} is not there")
-    graph = graphs.with_gauge(graphs.read(path))
+    graph = graphs.with_gauge(datasets.read_graph(path))
     begun = starts.STARTS[start](graph)
-    found = graphs.optimize(begun, {"relative_pose": graphs.RelativePoseLog()})
-    assert found.status == Ending.CONVERGED
-    np.testing.assert_allclose(found.chi2, best, rtol=1e-6)
-    assert found.gradient < 1e-6 * found.gradient_start
+    solution = graphs.optimize(begun, {"relative_pose": graphs.RelativePoseLog()})
+    assert solution.status == Ending.CONVERGED
+    np.testing.assert_allclose(solution.chi2, best, rtol=1e-6)
+    assert solution.gradient < 1e-6 * solution.gradient_start
     # That of the error itself lies close by, where it is not yet a minimum.
-    near = plain.chi2(graph._replace(poses=np.asarray(found.graph.poses)))
+    near = plain.chi2(graph._replace(poses=np.asarray(solution.graph.poses)))
     np.testing.assert_allclose(near, best, rtol=1e-3)
 
 
@@ -272,6 +271,7 @@ def test_they_are_gtsams(name, start, best):
 
 
 ROOM = 64
+LOOPS = "relative_pose/loops"
 KERNEL = {LOOPS: graphs.Cauchy()}
 PAIRS = np.array([[3, 4], [9, 2], [7, 19], [0, 11]])
 
@@ -333,11 +333,11 @@ def test_graphs_of_other_sizes_share_a_program():
     assert len(large.poses) > 1.5 * len(small.poses)
 
     def all_of(graph, pairs):
-        found = graphs.optimize(graph, room=ROOM)
-        at = found.graph
+        solution = graphs.optimize(graph, room=ROOM)
+        at = solution.graph
         robust = graphs.optimize(graph, kernel=KERNEL, room=ROOM).graph
-        covs = graphs.marginals(found, pairs=pairs, room=ROOM)
-        covs_alone = graphs.marginals(found, room=ROOM)
+        covs = graphs.marginals(solution, pairs=pairs, room=ROOM)
+        covs_alone = graphs.marginals(solution, room=ROOM)
         np.testing.assert_allclose(covs.poses, covs_alone.poses, rtol=1e-9, atol=1e-15)
         return at, robust, covs, graphs.squared_residuals(at, room=ROOM)
 
@@ -355,8 +355,10 @@ def test_a_plan_with_room_is_shared_too():
     """One plan a graph, given, as it must be where the graph is traced."""
     graph = with_loops(ring())
     alone, room = graphs.plan(graph), graphs.plan(graph, room=ROOM)
-    found = [graphs.optimize(graph, plan=plan) for plan in (alone, room)]
-    np.testing.assert_allclose(found[1].graph.poses, found[0].graph.poses, rtol=0, atol=1e-9)
+    solutions = [graphs.optimize(graph, plan=plan) for plan in (alone, room)]
+    np.testing.assert_allclose(
+        solutions[1].graph.poses, solutions[0].graph.poses, rtol=0, atol=1e-9
+    )
 
 
 @pytest.mark.sweep

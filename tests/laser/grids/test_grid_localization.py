@@ -255,7 +255,7 @@ def test_a_log_of_beams_drops_what_says_nothing():
     (lambda: grids.GridLocalization(3, MODEL, MOVE, 9), "GridLocalization: expected a Grid"),
     (
         lambda: grids.GridLocalization(GRID, MOVE, MODEL, 9),
-        "GridLocalization: expected model to be a BeamModel",
+        "GridLocalization: model: expected a BeamModel",
     ),
     (
         lambda: grids.beam_log(
@@ -275,7 +275,10 @@ def test_a_log_of_beams_drops_what_says_nothing():
     ),
     (lambda: grids.clusters(np.zeros((3, 3)), np.full(3, -np.inf)), "clusters: no particle"),
     (lambda: grids.clusters(np.zeros((3, 2)), np.zeros(3)), "clusters: expected poses"),
-    (lambda: motion.odometry_controls(np.zeros(3)), "odometry_controls: expected finite poses"),
+    (
+        lambda: motion.odometry_controls(np.zeros(3)),
+        "odometry_controls: path: expected finite poses",
+    ),
     (lambda: consistency.judge_localization(WORLD, of(), 0, KEY), "judge_localization: runs"),
     (
         lambda: consistency.judge_localization(WORLD, of(), 1, KEY, every=61),

@@ -140,8 +140,8 @@ class Silent(covariance.MatchCovariance):
     (lambda: matching.Correlative(apart=0), "Correlative: expected apart above 0, got 0"),
     (lambda: covariance.AlongNormals(SIGMA, span=0), "AlongNormals: span: expected an integer"),
     (lambda: covariance.Lattice(SIGMA, window=0), "Lattice: expected window above 0, got 0"),
-    (lambda: Lost(), "Lost: expected a method match"),
-    (lambda: Silent(), "Silent: expected a method of_usable"),
+    (lambda: Lost(), "Lost: match: expected a method"),
+    (lambda: Silent(), "Silent: of_usable: expected a method"),
     told="^",
 )  # fmt: skip
 def test_bad_numbers_are_one_line_that_names_the_class(make):

@@ -194,7 +194,9 @@ def test_a_run_of_one_filter_has_the_figure_of_one_and_none_is_refused():
     for draw in (run_errors_figure, run_map_figure):
         with pytest.raises(ValueError, match=f"{draw.__name__}: the campaign holds no run 0"):
             draw(nothing)
-        with pytest.raises(ValueError, match="expected the first argument to be a Campaign, got"):
+        with pytest.raises(ValueError, match="the first argument: expected a Campaign, got"):
             draw(found.first["ekf"])
-    with pytest.raises(ValueError, match="to be an Estimate, got Trace; give its field estimate"):
+    with pytest.raises(
+        ValueError, match="expected an Estimate, got a Trace; give its field estimate"
+    ):
         plot.map_figure(Trace(found.first["ekf"][1], None, None, None))

@@ -279,9 +279,9 @@ def test_arrays_that_do_not_belong_together_are_refused():
         ((trace, log), {"true_path": np.zeros((3, 2))}, r"path of shape \(3, 3\), got \(3, 2\)"),
         ((trace, log), {"true_points": np.zeros(2)}, r"points of shape \(N, 2\), got \(2,\)"),
         ((trace, log), {"frames": 0}, "frames: expected an integer >= 1, got 0"),
-        ((trace.estimate, log), {}, "animate: expected .*Trace"),
-        ((trace, truth), {}, "animate: expected .*Log"),
-        ((trace, log, log), {}, "animate: expected .*Truth"),
+        ((trace.estimate, log), {}, "animate: .*expected a.* Trace"),
+        ((trace, truth), {}, "animate: .*expected a.* Log"),
+        ((trace, log, log), {}, "animate: .*expected a.* Truth"),
     ):
         with pytest.raises(ValueError, match=message):
             plot.animate(*arguments, **more)

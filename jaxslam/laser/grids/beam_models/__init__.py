@@ -1,5 +1,6 @@
 """How likely the ranges of a laser are at a pose in a grid."""
 
+from jaxslam._public import publish
 from jaxslam.laser.grids.beam_models._beam_model import BeamModel, log_likelihood
 from jaxslam.laser.grids.beam_models._likelihood_field import LikelihoodField
 from jaxslam.laser.grids.beam_models._ray_cast import Mixture, RayCast, fit, mixture_log_density
@@ -20,3 +21,5 @@ __all__ = [
     "log_likelihood",
     "mixture_log_density",
 ]
+
+publish(__name__)

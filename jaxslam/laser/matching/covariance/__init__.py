@@ -1,5 +1,6 @@
 """Covariances of a match, by the published methods."""
 
+from jaxslam._public import publish
 from jaxslam.laser.matching.covariance._implicit import AlongNormals, Hessian, Implicit
 from jaxslam.laser.matching.covariance._match_covariance import (
     MatchCovariance,
@@ -19,3 +20,5 @@ __all__ = [
     "Unscented",
     "covariance",
 ]
+
+publish(__name__)

@@ -1,0 +1,499 @@
+"""The correction of EKF-SLAM, Solà (26)-(30): by m measurements at once, or one after the other.
+
+    ν = z ⊖ h(R, l)    S = H P Hᵀ + R(ẑ) = L Lᵀ    V = L⁻¹ H P    x ← x ⊞ Vᵀ L⁻¹ ν    P ← P - Vᵀ V
+
+With the gain K = P Hᵀ S⁻¹ = Vᵀ L⁻ᵀ this is x ← x ⊞ K ν and P ← P - K S Kᵀ, symmetric as it stands.
+`correct` does this for a whole scan, `correct_in_turn` for each measurement at the estimate that
+those before it left. Both use the sparsity of H, which involves the robot and one landmark
+(`kernels`).
+"""
+
+from collections.abc import Callable
+from functools import partial
+from typing import Literal, NamedTuple, Protocol, TypeVar
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int, PyTree
+
+from jaxslam.core import slots
+from jaxslam.core._numbers import gate_quantile
+from jaxslam.core.protocols import Chart, LinearizationPoint, Linearizer, Sensor
+from jaxslam.core.slots import Joint
+from jaxslam.filters._ekf.kernels import factor_of, project, projected_cov, whiten, whitened_by
+from jaxslam.filters._ekf.linear_system import basis_of_each, chart_jacobians
+from jaxslam.filters._ekf.map_coordinates import at_slot, retracted
+from jaxslam.linearize._first_order import predicted_noise
+from jaxslam.math import _linalg as linalg
+from jaxslam.math._arrays import Number
+from jaxslam.math._gaussians import log_density
+from jaxslam.math._xla import CACHED, materialize, no_inline, where_any
+
+Covariance = Literal["plain", "joseph", "square_root"]
+"""P ← P - Vᵀ V; Joseph's (I-KH) P (I-KH)ᵀ + K R Kᵀ; or the update of a root X of P = X Xᵀ"""
+
+
+class KalmanFilter(Protocol):
+    """The fields of `EkfSlam` that a correction uses."""
+
+    @property
+    def chart(self) -> Chart: ...
+    @property
+    def linearize(self) -> Linearizer: ...
+    @property
+    def gate(self) -> Number | None: ...
+    @property
+    def iterations(self) -> int: ...
+    @property
+    def covariance(self) -> Covariance: ...
+
+
+class Correction(NamedTuple):
+    """The reported results of a correction by m measurements; finite for all of them.
+
+    All but NIS and log-likelihood are against the prior.
+    """
+
+    z_hat: Float[Array, "m Z"]
+    """the predicted measurement ẑ"""
+    innovation: Float[Array, "m Z"]
+    innovation_cov: Float[Array, "m Z Z"]
+    """S_ii of each measurement alone"""
+    nis: Float[Array, "m"]
+    log_likelihood: Float[Array, "m"]
+    inside: Bool[Array, "m"]
+    """passed the gate"""
+    positive: Bool[Array, "m"]
+    """S is positive definite, alone and with the other measurements"""
+    jacobian: Float[Array, "m Z 3+L"]
+    """H by coordinates"""
+    basis: Float[Array, "m 3+L 3+L"] | None
+    """the coordinates by the errors in the chart; None is the identity"""
+
+
+def correct(
+    filter: KalmanFilter,
+    sensor: Sensor,
+    joint: Joint,
+    z: Float[Array, "m Z"],
+    slot: Int[Array, "m"],
+    matched: Bool[Array, "m"],
+) -> tuple[Joint, Correction]:
+    """The joint corrected by m measurements z (m, Z) of the landmarks in slot (m,) at once.
+
+    Measurements that are not matched (m,), outside the gate (ν_iᵀ S_ii⁻¹ ν_i above it, each against
+    the prior) or with a singular S have no effect. Where L = 0 (an absolute sensor) slot is not
+    used.
+
+    Each further iteration linearizes at the newest estimate x_i = x ⊞ ξ_i but starts again from the
+    prior: ξ_{i+1} = K (z - h(x_i) + H ξ_i) (Bell & Cathey 1993).
+    """
+    gamma = gate_quantile(filter.gate, len(sensor.measurements))
+    return _correct(filter, sensor, joint, z, slot, matched, gamma)
+
+
+def _correct(
+    filter: KalmanFilter,
+    sensor: Sensor,
+    joint: Joint,
+    z: Float[Array, "m Z"],
+    slot: Int[Array, "m"],
+    matched: Bool[Array, "m"],
+    gamma: Number | None,
+) -> tuple[Joint, Correction]:
+    """The joint corrected at once, with the largest d² within the gate at hand."""
+    rows = _rows_of(joint, slot, filter.covariance == "square_root")
+    innovation = _innovate(filter, sensor, joint, slot, rows, z, matched, (joint, slot), gamma)
+    cov = _corrected_cov(joint.cov, innovation, filter.covariance)
+    pose, landmarks = retracted(filter.chart, joint, innovation.xi)
+    return joint._replace(pose=pose, landmarks=landmarks, cov=cov), innovation.correction
+
+
+class _Rows(NamedTuple):
+    """The rows of P, or of its square root, that m measurements involve."""
+
+    robot: Float[Array, "3 D"]
+    landmark: Float[Array, "m L D"]
+    local: Float[Array, "m 3+L 3+L"]
+    """P of the robot and the landmark"""
+
+
+def _rows_of(joint: Joint, slot: Int[Array, "m"], square_root: bool = False) -> _Rows:
+    """The rows of measurements of the landmarks in slot (m,)."""
+    landmark = jax.vmap(slots.gather, in_axes=(None, 0))(joint, slot)[1]
+    local = jax.vmap(partial(slots.local_cov, joint, square_root=square_root))(slot)
+    return _Rows(joint.cov[:3], landmark, local)
+
+
+class _Innovation(NamedTuple):
+    """The whitened innovations of m measurements, for all forms of the covariance."""
+
+    xi: Float[Array, "D"]
+    """the correction ξ = Vᵀ L⁻¹ ν in the chart"""
+    v: Float[Array, "m*Z D"]
+    """V = L⁻¹ H P"""
+    whitened: Float[Array, "m*Z"]
+    """L⁻¹ ν"""
+    factor: Float[Array, "m*Z m*Z"]
+    """L, with rows of zeros for measurements that are not fused"""
+    s: Float[Array, "m Z m Z"]
+    """S, the identity where not fused"""
+    hp: Float[Array, "m*Z D"]
+    """H P"""
+    hx: Float[Array, "m Z D"]
+    """H X of a square-root filter, else H P"""
+    noise: Float[Array, "m Z Z"]
+    """R(ẑ) with the linearizer's addition"""
+    fuse: Bool[Array, "m"]
+    """matched, inside the gate, and with a positive definite S_ii"""
+    correction: Correction
+
+
+def _innovate(
+    filter: KalmanFilter,
+    sensor: Sensor,
+    joint: Joint,
+    slot: Int[Array, "m"],
+    rows: _Rows,
+    z: Float[Array, "m Z"],
+    matched: Bool[Array, "m"],
+    memory: tuple[Joint, Int[Array, "m"]],
+    gamma: Number | None,
+) -> _Innovation:
+    """The innovation of m measurements at once, from the rows of P that H meets: Solà (26)-(28).
+
+        rows of P            H                       H P          S = H P Hᵀ + R
+        robot (3, D)         by pose (m, Z, 3)       (m·Z, D)     (m, Z, m, Z) = L Lᵀ
+        landmark (m, L, D)   by landmark (m, Z, L)   V = L⁻¹ H P  ξ = Vᵀ L⁻¹ ν (D,)
+
+    Gate, reported numbers and R(ẑ) are those of the first iteration. ẑ of a later one depends on
+    the noise of z, as z itself does (`predicted_noise`), by the share of the gain.
+
+    memory: the state with the linearizer's memory, and the landmarks' slots (m,) there. P may have
+    further columns, of other errors.
+    """
+    m, size_z = z.shape
+    same = jnp.eye(m, dtype=z.dtype)[:, None, :, None]
+    xi: jax.Array | None = None
+    for i in range(filter.iterations):
+        h_nu, z_hat, rest, jacobian = _linearize(
+            filter, sensor, joint, slot, rows.local, z, memory, xi
+        )
+        by_pose, by_landmark, nu = h_nu[:, :, :3], h_nu[:, :, 3:-1], h_nu[:, :, -1]
+        if i == 0:
+            noise = jax.vmap(partial(predicted_noise, sensor))(z_hat, z, matched) + rest
+        # (m·Z) D entries, each of which P - Vᵀ V needs D times.
+        hp = hx = no_inline(project, h_nu, rows.robot, rows.landmark)
+        if filter.covariance == "square_root":
+            hp = materialize((hx.reshape(m * size_z, -1) @ joint.cov.T).reshape(hx.shape))
+        s = projected_cov(hp, by_pose, by_landmark, slot, joint.landmarks.shape[0])
+        s = s + same * noise[:, :, None]
+        s_ii = s[jnp.arange(m), :, jnp.arange(m)]
+        inverse, definite = no_inline(jax.vmap(linalg.whitener), s_ii)
+        if i == 0:
+            prior_nu, prior_s, prior_definite = nu, s_ii, definite
+            distance = (whitened_by(inverse, nu[:, :, None]) ** 2).sum(axis=(1, 2))
+            # A finite measurement whose d² overflows is outside any gate.
+            inside = jnp.isfinite(distance) if gamma is None else distance <= gamma
+            fuse = matched & inside & definite
+        hp = hp.reshape(m * size_z, -1)
+        factored = factor_of(s, inverse, definite, fuse)
+        v, whitened = whiten(factored, fuse, hp, nu)
+        xi = linalg.gram(v, whitened[:, None])[:, 0]
+        if i == 0:
+            # NIS of fused measurements from their joint S, of the others from S_ii.
+            nis = (whitened.reshape(m, size_z) ** 2).sum(axis=1)
+            positive = prior_definite & factored.regular
+            density = log_density(nis, factored.log_det, size_z)
+            correction = Correction(
+                z_hat=z_hat,
+                innovation=prior_nu,
+                innovation_cov=prior_s,
+                nis=jnp.where(fuse, nis, distance),
+                log_likelihood=jnp.where(fuse & positive, density, 0.0),
+                inside=inside,
+                positive=positive,
+                jacobian=jnp.concatenate(jacobian, axis=2),
+                basis=basis_of_each(filter.chart, joint.pose, joint.landmarks[slot]),
+            )
+    assert xi is not None
+    return _Innovation(
+        xi=xi,
+        v=v,
+        whitened=whitened,
+        factor=factored.factor,
+        s=factored.s,
+        hp=hp,
+        hx=hx,
+        noise=noise,
+        fuse=fuse,
+        correction=correction,
+    )
+
+
+def _linearize(
+    filter: KalmanFilter,
+    sensor: Sensor,
+    joint: Joint,
+    slot: Int[Array, "m"],
+    local_cov: Float[Array, "m W W"],
+    z: Float[Array, "m Z"],
+    memory: tuple[Joint, Int[Array, "m"]],
+    xi: Float[Array, "D"] | None,
+) -> tuple[
+    Float[Array, "m Z C"],
+    Float[Array, "m Z"],
+    Float[Array, "m Z Z"],
+    tuple[Float[Array, "m Z 3"], Float[Array, "m Z L"]],
+]:
+    """The linearization z ≈ ẑ + H (ξ - ξ_i) at the prior retracted by ξ_i; None: at the prior.
+
+    Returns H by the errors with ν = z - ẑ + H ξ_i beside it, so that the solution is ξ, relative to
+    the prior; ẑ; the linearizer's addition to R; and H by the coordinates of pose and landmark.
+    """
+    state, slot_in_state = memory
+    chart, prior = filter.chart, joint.landmarks[slot]
+    pose, landmark, moved = joint.pose, prior, None
+    if xi is not None:
+        capacity, size_l = joint.landmarks.shape
+        moved = xi[:3], xi[3 : 3 + capacity * size_l].reshape(capacity, size_l)[slot]
+        over_landmarks = jax.vmap(chart.retract, in_axes=(None, 0, None, 0))
+        poses, landmark = over_landmarks(joint.pose, prior, *moved)
+        pose = poses[0]
+
+    def observe(
+        at: Int[Array, ""], landmark: Float[Array, "L"], cov: Float[Array, "3+L 3+L"]
+    ) -> PyTree:
+        point = LinearizationPoint(state, chart, pose, cov, at, landmark)
+        return filter.linearize.observe(at_slot(sensor, state, at), point)
+
+    z_hat, by_pose, by_landmark, rest = jax.vmap(observe)(slot_in_state, landmark, local_cov)
+    nu = jax.vmap(sensor.residual)(z, z_hat)
+    jacobian = by_pose, by_landmark
+    if chart.basis is not None:
+        by_pose, by_landmark = chart_jacobians(
+            chart, joint.pose, prior, by_pose, by_landmark, moved
+        )
+    if moved is not None:
+        nu = nu + jnp.einsum("mzi,i->mz", by_pose, moved[0])
+        nu = nu + jnp.einsum("mzi,mi->mz", by_landmark, moved[1])
+    # One array, and so one kernel and not three.
+    h_nu = materialize(jnp.concatenate([by_pose, by_landmark, nu[:, :, None]], axis=2))
+    return h_nu, z_hat, rest, jacobian
+
+
+def _corrected_cov(
+    cov: Float[Array, "D D"], innovation: _Innovation, form: Covariance
+) -> Float[Array, "D D"]:
+    """The covariance P, or its root X, after the correction.
+
+    "plain": P - Vᵀ V. "joseph": (I-KH) P (I-KH)ᵀ + K R Kᵀ. "square_root", of P = X Xᵀ and
+    R = N Nᵀ: X - Vᵀ (L + N)⁻¹ H X (Andrews 1968, "A square root formulation of the Kalman
+    covariance equations", AIAA Journal 6(6)).
+    """
+    v, factor, noise, fuse = innovation.v, innovation.factor, innovation.noise, innovation.fuse
+    if form == "plain":
+        return cov - linalg.self_gram(v)
+    m, size_z = noise.shape[:2]
+    rows = m * size_z
+    same = jnp.eye(m, dtype=noise.dtype)[:, None, :, None]  # (m, 1, m, 1): block diagonal
+    if form == "joseph":
+        # In O(D²): first the factor on the left, then that on the right.
+        fused_noise = jnp.where(fuse[:, None, None, None], same * noise[:, :, None], 0.0)
+        gain = linalg.solve_lower(factor[::-1, ::-1].T, v[::-1])[::-1].T
+        noise = fused_noise.reshape(rows, rows)
+        left = cov - gain @ innovation.hp
+        left_h = innovation.hp.T - gain @ (innovation.s.reshape(rows, rows) - noise)
+        return linalg.symmetrize(left - left_h @ gain.T + gain @ noise @ gain.T)
+    root = jax.vmap(lambda cov: linalg.cholesky(cov)[0])(noise)
+    unit = jnp.eye(size_z, dtype=noise.dtype)
+    root = same * jnp.where(fuse[:, None, None], root, unit)[:, :, None]
+    root = factor + root.reshape(rows, rows)
+    hx = innovation.hx.reshape(rows, -1)
+    return cov - linalg.gram(v, materialize(linalg.solve_lower(root, hx)))
+
+
+# A pass over a P in the cache is bound by arithmetic, on vectors of this many entries (512 bits of
+# float32), and the rest of a row costs as much as a whole vector.
+_LANES = 16
+
+# Measurements a pass over P, where P is cached and where it is not: the fastest by measurement.
+# More of them cost more loads of P_I, fewer cost more loads of P.
+_GROUP, _GROUP_BEYOND = 3, 4
+
+_State = TypeVar("_State")
+
+Measurements = tuple[Float[Array, "m Z"], Int[Array, "m"], Bool[Array, "m"]]
+"""z, the slot of the landmark of each, and whether it is matched"""
+
+
+def correct_in_turn(
+    filter: KalmanFilter,
+    sensor: Sensor,
+    joint: Joint,
+    z: Float[Array, "m Z"],
+    slot: Int[Array, "m"],
+    matched: Bool[Array, "m"],
+) -> tuple[Joint, Correction]:
+    """The joint corrected by m measurements in turn, each linearized at the estimate before it.
+
+    The same numbers as `correct` on each alone, with P read and written once a group of them:
+
+        for each group (g measurements, W = 3 + g·L):
+            P_I (W, D)  <-  rows of the robot and of the group's landmarks, of P (D, D)
+            for each measurement: means and P_I corrected, P_I ← P_I - V_Iᵀ V; V (Z, D) is left
+            P (D, D)    <-  P - Σ Vᵀ V over the group
+
+    This is the postponed update of Guivant & Nebot 2001 ("Optimization of the simultaneous
+    localization and map-building algorithm for real-time implementation", IEEE T-RA 17(3)), over
+    one scan. A group without a matched measurement in any run of a batch costs nothing.
+
+    A form of the covariance that needs all of P is corrected by `correct`, one measurement at a
+    time.
+    """
+    gamma = gate_quantile(filter.gate, len(sensor.measurements))
+    measurements = z, slot, matched
+    nothing = partial(no_correction, joint, chart=filter.chart)
+    if filter.covariance != "plain":
+
+        def correct_one(joint: Joint, measurement: Measurements) -> tuple[Joint, Correction]:
+            return _correct(filter, sensor, joint, *measurement, gamma)
+
+        return in_groups(correct_one, joint, measurements, 1, nothing)
+
+    def correct_group(joint: Joint, group: Measurements) -> tuple[Joint, Correction]:
+        return _correct_group(filter, sensor, joint, group, gamma)
+
+    size = joint.cov.shape[1]
+    cached = size <= CACHED
+    group_size = max(1, min(_GROUP if cached else _GROUP_BEYOND, z.shape[0]))
+    if cached:
+        joint = joint._replace(cov=jnp.pad(joint.cov, ((0, 0), (0, -size % _LANES))))
+    joint, corrections = in_groups(correct_group, joint, measurements, group_size, nothing)
+    return joint._replace(cov=joint.cov[:, :size]), corrections
+
+
+def in_groups(
+    work: Callable[[_State, Measurements], tuple[_State, Correction]],
+    state: _State,
+    measurements: Measurements,
+    group_size: int,
+    nothing: Callable[[Measurements], Correction],
+) -> tuple[_State, Correction]:
+    """The state after work(state, g measurements) on each group of m, and the m corrections.
+
+    nothing: the `Correction` of measurements without a match.
+    """
+    m = len(measurements[0])
+    groups = -(-m // group_size)
+
+    def padded(values: jax.Array) -> jax.Array:
+        """The values in groups, (⌈m/g⌉, g, …), with zeros (not matched) at the end."""
+        full = jnp.pad(values, [(0, groups * group_size - m), *[(0, 0)] * (values.ndim - 1)])
+        return full.reshape(groups, group_size, *values.shape[1:])
+
+    def step(state: _State, group: Measurements) -> tuple[_State, Correction]:
+        unused, matched = nothing(group), group[2]
+        return where_any(matched.any(), lambda s: work(s, group), lambda s: (s, unused), state)
+
+    state, corrections = jax.lax.scan(step, state, jax.tree.map(padded, measurements))
+
+    def joined(values: jax.Array) -> jax.Array:
+        return values.reshape(groups * group_size, *values.shape[2:])[:m]
+
+    return state, jax.tree.map(joined, corrections)
+
+
+def _correct_group(
+    filter: KalmanFilter,
+    sensor: Sensor,
+    joint: Joint,
+    group: Measurements,
+    gamma: Number | None,
+) -> tuple[Joint, Correction]:
+    """The joint corrected by g measurements in turn: local states by each, then P by all at once.
+
+        local P (W, W) | M (W, W)    P_I of now = M P_I of before, W = 3 + g·L
+        V (g·Z, D) = reach (g·Z, W) P_I of before
+
+    P may have columns of zeros beyond its own.
+    """
+    slot = group[1]
+    size_l, size = joint.landmarks.shape[1], joint.cov.shape[0]
+    of_landmarks = 3 + slot[:, None] * size_l + jnp.arange(size_l, dtype=slot.dtype)[None, :]
+    at = jnp.concatenate([jnp.arange(3), of_landmarks.reshape(-1)])
+    rows = joint.cov[at]
+    local = joint._replace(
+        landmarks=joint.landmarks[slot],
+        cov=jnp.concatenate([rows[:, at], jnp.eye(len(at), dtype=rows.dtype)], axis=1),
+        alive=joint.alive[slot],
+        tag=joint.tag[slot],
+    )
+
+    def correct_local(
+        local: Joint, measurement: tuple[jax.Array, PyTree]
+    ) -> tuple[Joint, tuple[jax.Array, jax.Array, Correction]]:
+        """The local map corrected by one measurement; reach (Z, W), L⁻¹ ν (Z,).
+
+        P of the local map and the matrix M beside it are corrected as one:
+        [P M] ← [P M] - Vᵀ [V reach].
+        """
+        i, (z, slot, matched) = jax.tree.map(lambda leaf: leaf[None], measurement)
+        width = local.cov.shape[0]
+        memory = joint._replace(pose=local.pose), slot
+        innovation = _innovate(
+            filter, sensor, local, i, _rows_of(local, i), z, matched, memory, gamma
+        )
+        v, reach = innovation.v[:, :width], innovation.v[:, width:]
+        pose, landmarks = retracted(filter.chart, local, innovation.xi[:width])
+        cov = local.cov - linalg.gram(v, innovation.v)
+        correction = jax.tree.map(lambda leaf: leaf[0], innovation.correction)
+        local = local._replace(pose=pose, landmarks=landmarks, cov=cov)
+        return local, (reach, innovation.whitened, correction)
+
+    # A gradient stores the input of each step, and recomputes the rest.
+    local, (reach, whitened, corrections) = jax.lax.scan(
+        jax.checkpoint(correct_local, prevent_cse=False),
+        local,
+        (jnp.arange(len(slot)), group),
+    )
+    v = no_inline(linalg.matmul, reach.reshape(-1, len(at)), rows)
+    landmarks = _moved_map(joint, v[:, :size], whitened, filter.chart)
+    cov = joint.cov - linalg.gram(v[:, :size], v)
+    return joint._replace(pose=local.pose, landmarks=landmarks, cov=cov), corrections
+
+
+def _moved_map(
+    joint: Joint, v: Float[Array, "K D"], whitened: Float[Array, "g Z"], chart: Chart
+) -> Float[Array, "N L"]:
+    """The landmarks after corrections V (g·Z, D), L⁻¹ ν, one after the other."""
+    if chart.basis is None:  # retractions are additive
+        xi = linalg.gram(v, whitened.reshape(-1, 1))[:, 0]
+        return retracted(chart, joint, xi)[1]
+
+    def move(joint: Joint, correction: tuple[jax.Array, jax.Array]) -> tuple[Joint, None]:
+        v, whitened = correction
+        pose, landmarks = retracted(chart, joint, linalg.gram(v, whitened[:, None])[:, 0])
+        return joint._replace(pose=pose, landmarks=landmarks), None
+
+    by_measurement = v.reshape(*whitened.shape, -1)
+    return jax.lax.scan(move, joint, (by_measurement, whitened))[0].landmarks
+
+
+def no_correction(joint: Joint, measurements: Measurements, chart: Chart) -> Correction:
+    """The `Correction` of m measurements without a match, all zero; the map is unchanged."""
+    z = measurements[0]
+    (m, size), width = z.shape, 3 + joint.landmarks.shape[1]
+    dtype = jnp.result_type(z, joint.pose, joint.cov)
+    numbers, flags = jnp.zeros(m, dtype), jnp.zeros(m, bool)
+    return Correction(
+        z_hat=jnp.zeros((m, size), dtype),
+        innovation=jnp.zeros((m, size), dtype),
+        innovation_cov=jnp.zeros((m, size, size), dtype),
+        nis=numbers,
+        log_likelihood=numbers,
+        inside=flags,
+        positive=flags,
+        jacobian=jnp.zeros((m, size, width), dtype),
+        basis=None if chart.basis is None else jnp.zeros((m, width, width), dtype),
+    )
