@@ -56,7 +56,7 @@ def filtered(data, chart):
     filter = filter_of(data.motion, data.sensor)
     log = jax.tree.map(np.asarray, data.log)
     trace = jax.device_get(jaxslam.run(filter, log, data.pose, data.pose_cov, jax.random.key(0)))
-    added = datasets.considered(data, filter_of)
+    added = datasets.consider_constants(data, filter_of)
     cov = trace.estimate.pose_cov + (0.0 if added is None else added.pose)
     error = pose_error(data.true_path, trace.estimate.pose)
     nees, regular = block_nees(trace.estimate.pose, error, error, cov)["pose"]
@@ -123,7 +123,7 @@ def measure(quick: bool = False) -> list[Metric]:
         began = time.perf_counter()
         fitted = datasets.fit(data, calibrate=CALIBRATED, fixed=("range scale",))
         took = time.perf_counter() - began
-        found = fitted.found
+        found = fitted.noise_fit
         shown = zip(found.names, found.parameters, found.error, found.robust_error, strict=True)
         show(
             f"What the log tells ({took:.0f} s)",

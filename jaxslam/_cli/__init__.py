@@ -86,7 +86,7 @@ COMMANDS = {
         "1 if anything fails, 2 if the file cannot be used.",
     ),
 }
-"""By command: its module, its line of help and its description."""
+"""Module, line of help and description of each command."""
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -141,22 +141,25 @@ def main(arguments: Sequence[str] | None = None) -> int:
         print(f"jaxslam: {error}", file=sys.stderr)
         return USAGE_ERROR
     except KeyboardInterrupt as stop:
-        told = str(stop) if type(stop) is KeyboardInterrupt else ""  # by `write_results`
-        print(f"\njaxslam: interrupted; {told or 'nothing was written'}", file=sys.stderr)
+        # `write_results` says in the text which files it has written.
+        files = str(stop) if type(stop) is KeyboardInterrupt else ""
+        print(f"\njaxslam: interrupted; {files or 'nothing was written'}", file=sys.stderr)
         return INTERRUPTED
 
 
 def _laser_command(arguments: list[str]) -> list[str]:
-    """Replace `run --dataset carmen …`, or `rosbag`, by the command on a laser log: `localize MAP`
-    with `--localize MAP`, `map` with `--map known`, else `slam`."""
-    of = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
-    of.add_argument("--dataset")
-    of.add_argument("--localize", metavar="MAP")
-    of.add_argument("--map", choices=("known",))
+    """Replace `run --dataset carmen …`, or `rosbag`, by the command on a laser log.
+
+    It is `localize MAP` with `--localize MAP`, `map` with `--map known`, else `slam`.
+    """
+    parser = argparse.ArgumentParser(add_help=False, allow_abbrev=False)
+    parser.add_argument("--dataset")
+    parser.add_argument("--localize", metavar="MAP")
+    parser.add_argument("--map", choices=("known",))
     words = set(" ".join(arguments).replace("=", " ").split())
     if arguments[:1] != ["run"] or not words & set(laser_log.READERS):
         return arguments
-    chosen, others = of.parse_known_args(arguments[1:])
+    chosen, others = parser.parse_known_args(arguments[1:])
     if chosen.dataset not in laser_log.READERS:
         return arguments
     others += ["--dataset", chosen.dataset]
@@ -173,12 +176,12 @@ class _Parser(argparse.ArgumentParser):
         self._negative_number_matcher = _POSITIONAL
 
     def parse_known_args(self, args: Any = None, namespace: Any = None) -> Any:
-        """As in argparse; unknown arguments are an error, reported with the name of the command."""
-        found, unknown = super().parse_known_args(args, namespace)
+        """Parse as argparse does; unknown arguments are an error with the name of the command."""
+        options, unknown = super().parse_known_args(args, namespace)
         if unknown:
             hint = closest_name(unknown[0], self._option_string_actions)
             self.error(f"unrecognized arguments: {' '.join(unknown)}{hint}")
-        return found, unknown
+        return options, unknown
 
     def error(self, message: str) -> NoReturn:
         """Exit with the error and a reference to the help."""

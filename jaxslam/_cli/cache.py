@@ -25,7 +25,8 @@ import jax
 from jax.experimental.compilation_cache.compilation_cache import reset_cache
 
 BOUND = 1 << 29
-"""Largest size of the folder after a command [bytes]; the least recently used files are deleted."""
+"""Largest size of the folder after a command, 512 MiB [bytes]; the least recently used files are
+deleted."""
 
 _CACHE_WARNING = re.compile(
     r"Error (reading|writing) persistent compilation cache entry for '(.*?)': "
@@ -34,15 +35,15 @@ _CACHE_WARNING = re.compile(
 
 def add_options(parser: argparse.ArgumentParser) -> None:
     """Add `--cache` and `--no-cache` to a command."""
-    where = parser.add_mutually_exclusive_group()
-    where.add_argument(
+    group = parser.add_mutually_exclusive_group()
+    group.add_argument(
         "--cache",
         metavar="DIR",
         default=argparse.SUPPRESS,  # a formatter that adds defaults would print None
         help="folder in which compiled programs are kept for later commands "
         "(default: the user's cache folder, as ~/.cache/jaxslam)",
     )
-    where.add_argument(
+    group.add_argument(
         "--no-cache",
         action="store_true",
         default=argparse.SUPPRESS,
@@ -72,26 +73,25 @@ def from_options(options: argparse.Namespace) -> contextlib.AbstractContextManag
 
 
 @contextlib.contextmanager
-def program_cache(given: Path | None, none: bool = False, bound: int = BOUND) -> Iterator[None]:
+def program_cache(root: Path | None, off: bool = False, bound: int = BOUND) -> Iterator[None]:
     """A block in which JAX writes compiled programs to a folder and reads them from it.
 
     The configuration of JAX is restored at the end.
 
     Args:
-        given: the folder; None for the one that JAX is configured with, as by the environment
+        root: the folder; None for the one that JAX is configured with, as by the environment
             variable JAX_COMPILATION_CACHE_DIR, or else `user_folder`.
-        none: keep and read no programs.
+        off: keep and read no programs.
         bound: largest size of the folder after the block [bytes].
     """
-    if none:
+    if off:
         with jax_settings(jax_compilation_cache_dir=None):
             yield
         return
-    if given is None and (configured := jax.config.jax_compilation_cache_dir):
+    if root is None and (configured := jax.config.jax_compilation_cache_dir):
         with _one_warning(Path(configured), ours=False):
             yield
         return
-    root = given
     try:
         root = root or user_folder()
         folder = root / processor_kind()
@@ -99,8 +99,9 @@ def program_cache(given: Path | None, none: bool = False, bound: int = BOUND) ->
         with tempfile.TemporaryFile(dir=folder):
             pass
     except (OSError, RuntimeError) as error:
-        where = root or "the user's cache folder"
-        warn(f"compiled programs cannot be kept in {where} ({_reason(error)}); continuing without")
+        place = root or "the user's cache folder"
+        reason = getattr(error, "strerror", None) or str(error)
+        warn(f"compiled programs cannot be kept in {place} ({reason}); continuing without")
         with jax_settings(jax_compilation_cache_dir=None):
             yield
         return
@@ -149,12 +150,12 @@ def processor_kind() -> str:
 
 @contextlib.contextmanager
 def jax_settings(**values: str | float | None) -> Iterator[None]:
-    """A block with other settings of JAX; `reset_cache`, since JAX opens its cache only once."""
+    """A block with these settings of JAX, which are restored at its end."""
     before = {name: getattr(jax.config, name) for name in values}
     try:
         for name, value in values.items():
             jax.config.update(name, value)
-        reset_cache()
+        reset_cache()  # JAX opens its cache once, and would keep the folder of before
         yield
     finally:
         for name, value in before.items():
@@ -186,18 +187,14 @@ def _one_warning(folder: Path, ours: bool) -> Iterator[None]:
             with contextlib.suppress(OSError):
                 path.unlink()
         if once.acquire(blocking=False):
-            what = "is damaged" if match[1] == "reading" else "cannot be written"
+            problem = "is damaged" if match[1] == "reading" else "cannot be written"
             reason = " ".join(str(message)[match.end() :].split())[:200]
-            warn(f"a compiled program in {folder} {what} ({reason}); continuing without it")
+            warn(f"a compiled program in {folder} {problem} ({reason}); continuing without it")
 
     with warnings.catch_warnings():
         warnings.filterwarnings("always", message=_CACHE_WARNING.pattern)
         plain, warnings.showwarning = warnings.showwarning, show
         yield
-
-
-def _reason(error: Exception) -> str:
-    return getattr(error, "strerror", None) or str(error)
 
 
 def warn(sentence: str) -> None:

@@ -33,27 +33,27 @@ INTERRUPTED = 130
 """Exit status after Ctrl-C."""
 
 SUMMARY = "summary.json"
-"""The file with the summary of a command."""
+"""Name of the file with the summary of a command."""
 
 COUNT = "measurements "
 """Prefix of the rows of a summary that count measurements by status."""
 
 FILMS = ("film.gif", "film.mp4", "film.html", "film-*.gif", "film-*.mp4", "film-*.html")
-"""Names of films; those of an earlier command are deleted."""
+"""Patterns of the names of films; films of an earlier command are deleted."""
 
 OUT = Path("out")
 """Default folder of results."""
 
 
-def pick(option: str, name: str, known: Mapping[str, _T], more: str = "") -> _T:
-    """The entry of `known` under a name given by an option, as `filters`.
+def pick(option: str, name: str, registry: Mapping[str, _T], hint: str = "") -> _T:
+    """The entry of a registry under the name in an option, as `filters`.
 
-    Raises ValueError with the known names and `more`.
+    Raises ValueError with the names of the registry and the hint.
     """
-    if name not in known:
-        unknown = f"unknown {option.removesuffix('s')} {name!r}{closest_name(name, known)}"
-        raise ValueError(f"--{option}: {unknown}; known: {', '.join(known)}{more}")
-    return known[name]
+    if name not in registry:
+        unknown = f"unknown {option.removesuffix('s')} {name!r}{closest_name(name, registry)}"
+        raise ValueError(f"--{option}: {unknown}; known: {', '.join(registry)}{hint}")
+    return registry[name]
 
 
 def as_folders(options: argparse.Namespace) -> None:
@@ -96,10 +96,10 @@ def check_out(folder: Path, name: str, *, draws: bool = True) -> None:
             command = str(json.loads((folder / file).read_text(encoding="utf-8"))["command"])
         except (OSError, ValueError, LookupError, TypeError):
             continue
-        if (other := " ".join(command.split()[:2])) not in ("", f"jaxslam {name}"):
+        if (earlier := " ".join(command.split()[:2])) not in ("", f"jaxslam {name}"):
             raise ValueError(
-                f"--out: {folder} holds the results of {other}: choose another folder for those of "
-                f"jaxslam {name}"
+                f"--out: {folder} holds the results of {earlier}: choose another folder for those "
+                f"of jaxslam {name}"
             )
 
 
@@ -112,8 +112,9 @@ def write_results(
 ) -> int:
     """Write the numbers, then draw and write each figure; returns the exit status.
 
-    Prints what was written. A figure that fails is named in one line, with the status `FAILED`;
-    nothing else is lost. Figures of an earlier command are deleted, as are files that `replaces`.
+    Prints the names of the files. A figure that fails is named in one line, with the status
+    `FAILED`; nothing else is lost. Figures of an earlier command are deleted, as are files whose
+    names match a pattern of `replaces`.
     """
     earlier = [f"{glob.escape(name)}.{kind}" for name in drawings for kind in FORMATS]
     written = write_files(folder, files, replaces=(*replaces, *earlier))
@@ -142,59 +143,53 @@ def add_dtype(parser: argparse.ArgumentParser, of: str = "") -> None:
     )
 
 
-def add_figures(parser: argparse.ArgumentParser, formats: Collection[str], more: str = "") -> None:
-    """Add the option of the formats of figures; `more` follows the default in the help."""
+def add_figures(parser: argparse.ArgumentParser, formats: Collection[str], note: str = "") -> None:
+    """Add the option of the formats of figures; the note follows the default in the help."""
     parser.add_argument(
         "--figures",
         metavar="FORMATS",
         default="png",
-        help=f"formats of figures, of {', '.join(formats)}; comma-separated (default: png{more})",
+        help=f"formats of figures, of {', '.join(formats)}; comma-separated (default: png{note})",
     )
 
 
 def summary_table(columns: Mapping[str, Mapping[str, object]]) -> str:
     """Summaries side by side, one row per entry; several have their names above them."""
     rows = list(dict.fromkeys(key for column in columns.values() for key in column))
-    head = [["", *columns]] if len(columns) > 1 else []
-    lines = head + [
-        [
-            row,
-            *(
-                _shown(column.get(row, 0 if row.startswith(COUNT) else "-"))
-                for column in columns.values()
-            ),
-        ]
-        for row in rows
-    ]
+    lines = [["", *columns]] if len(columns) > 1 else []
+    for row in rows:
+        missing = 0 if row.startswith(COUNT) else "-"
+        lines.append([row, *(_cell_text(column.get(row, missing)) for column in columns.values())])
+    # The last column is not padded.
     widths = [max(len(line[i]) for line in lines) for i in range(len(columns))]
+    indent = "\n" + " " * (widths[0] + 2)  # of a cell of several lines
     return "\n".join(
         "  ".join(
             [*(cell.ljust(w) for cell, w in zip(line, widths, strict=False)), line[-1]]
-        ).replace("\n", "\n" + " " * (widths[0] + 2))
+        ).replace("\n", indent)
         for line in lines
     )
 
 
-def _shown(value: object) -> str:
+def _cell_text(value: object) -> str:
     """A value of the summary as it is printed."""
     if isinstance(value, dict):
         return ", ".join(f"{count_label(key)} {count:,}" for key, count in value.items()) or "-"
     if isinstance(value, list):
         lines = all(isinstance(part, str) for part in value)
-        return ("\n" if lines else "; ").join(_shown(part) for part in value) or "-"
+        return ("\n" if lines else "; ").join(_cell_text(part) for part in value) or "-"
     return f"{value:.6g}" if isinstance(value, float) else str(value) or "-"
 
 
 def film_files(films: Mapping[str, "Film"], *, suffixed: bool) -> Files:
-    """The functions that write each film as MP4, or GIF without it, and as a page, by name.
+    """The functions that write each film as MP4, or GIF without ffmpeg, and as a page, by name.
 
-    Prints one line: how many steps are shown, and why there is no MP4.
+    Prints one line: the number of steps shown, and the reason why there is no MP4.
 
     Args:
         films: by the name of the filter.
         suffixed: whether file names contain the name of the filter.
     """
-
     from jaxslam.results.plot._film import mp4_problem  # matplotlib is slow to load
 
     notes = dict.fromkeys(film.scene.note for film in films.values() if film.scene.note)
@@ -236,12 +231,16 @@ def set_device_count(devices: str) -> None:
 
     At most the number of cores; `chosen_devices` then refuses a larger request.
     """
-    count = cores() if devices in ("all", "cpu") else int(devices) if devices.isdecimal() else None
-    if count is not None and count < 1:
+    if devices in ("all", "cpu"):
+        count = cores()
+    elif devices.isdecimal():
+        count = int(devices)
+    else:
+        return
+    if count < 1:
         raise ValueError(f"--devices: expected at least 1, got {devices}")
-    if count is not None:
-        with contextlib.suppress(RuntimeError):  # JAX is already in use, as in a notebook
-            jax.config.update("jax_num_cpu_devices", min(count, cores()))
+    with contextlib.suppress(RuntimeError):  # JAX is already in use, as in a notebook
+        jax.config.update("jax_num_cpu_devices", min(count, cores()))
 
 
 def chosen_devices(devices: str, most: int | None = None) -> list[jax.Device]:
@@ -263,17 +262,18 @@ def chosen_devices(devices: str, most: int | None = None) -> list[jax.Device]:
     try:
         return list(jax.local_devices(backend=devices))
     except RuntimeError as error:
-        known = sorted({device.platform for device in jax.local_devices()} | {"cpu"})
+        platforms = sorted({device.platform for device in jax.local_devices()} | {"cpu"})
         raise ValueError(
-            f"--devices: expected all, a number, or one of {', '.join(known)}, got {devices!r}"
+            f"--devices: expected all, a number, or one of {', '.join(platforms)}, got {devices!r}"
         ) from error
 
 
-_PARTS = (
+_COMPILATION = (
     "/jax/core/compile/jaxpr_trace_duration",
     "/jax/core/compile/jaxpr_to_mlir_module_duration",
     "/jax/core/compile/backend_compile_duration",
 )
+"""Events of JAX with a duration: tracing, lowering and compilation of a program, in that order."""
 
 
 class CompileClock:
@@ -294,13 +294,13 @@ class CompileClock:
 
     def __enter__(self) -> "CompileClock":
         self._began = time.perf_counter()
-        jax.monitoring.register_event_duration_secs_listener(self._took)
-        jax.monitoring.register_event_listener(self._happened)
+        jax.monitoring.register_event_duration_secs_listener(self._record_span)
+        jax.monitoring.register_event_listener(self._count_hit)
         return self
 
     def __exit__(self, *_: object) -> None:
-        jax.monitoring.unregister_event_duration_listener(self._took)
-        jax.monitoring.unregister_event_listener(self._happened)
+        jax.monitoring.unregister_event_duration_listener(self._record_span)
+        jax.monitoring.unregister_event_listener(self._count_hit)
 
     @property
     def seconds(self) -> float:
@@ -310,30 +310,32 @@ class CompileClock:
     @property
     def compiling(self) -> float:
         """Wall time during which a program was traced, lowered or compiled [s]."""
-        total, at = 0.0, self._began
+        # The length of the union of the spans: `until` is the end of what has been counted.
+        total, until = 0.0, self._began
         with self._lock:
             spans = sorted(self._spans)
         for begin, end in spans:
-            total += max(end - max(begin, at), 0.0)
-            at = max(at, end)
+            total += max(end - max(begin, until), 0.0)
+            until = max(until, end)
         return total
 
     def __str__(self) -> str:
-        made = f"{self.programs} programs" if self.programs != 1 else "1 program"
+        programs = f"{self.programs} programs" if self.programs != 1 else "1 program"
         return (
             f"{self.seconds:.1f} s in all, {self.compiling:.1f} s of them to compile or load "
-            f"{made}: {self.programs - self.cached} compiled, {self.cached} loaded from the cache"
+            f"{programs}: {self.programs - self.cached} compiled, "
+            f"{self.cached} loaded from the cache"
         )
 
-    def _took(self, event: str, duration_secs: float, **_: str | int) -> None:
-        if event in _PARTS:
+    def _record_span(self, event: str, duration_secs: float, **_: str | int) -> None:
+        if event in _COMPILATION:
             now = time.perf_counter()
             with self._lock:
                 self._spans.append((now - duration_secs, now))
                 # JAX reports a cached program as compiled, too.
-                self.programs += event == _PARTS[-1]
+                self.programs += event == _COMPILATION[-1]
 
-    def _happened(self, event: str, **_: str | int) -> None:
+    def _count_hit(self, event: str, **_: str | int) -> None:
         if event == "/jax/compilation_cache/cache_hits":
             with self._lock:
                 self.cached += 1

@@ -1,4 +1,4 @@
-"""What a report of a problem needs: versions, devices, and settings of JAX."""
+"""Text for the report of a problem: versions, devices, and settings of JAX."""
 
 import os
 import platform
@@ -23,8 +23,11 @@ _PACKAGES = (
 
 
 def environment_text(verbose: bool) -> str:
-    """The line of versions; verbose: with other packages, the machine, JAX's devices, and the
-    environment variables that change it."""
+    """The line of versions.
+
+    verbose: also other packages, the machine, JAX's devices, and the environment variables that
+    change JAX.
+    """
     first = (
         f"jaxslam {version('jaxslam')} (jax {jax.__version__}, Python {platform.python_version()})"
     )

@@ -38,21 +38,22 @@ class UserObjects:
         if not _in_file(entry):
             return pick("scenario", entry, SCENARIOS, _FROM_FILE)(*arguments)
         _, value = self._find("--scenario", entry)
-        made = value
-        if isinstance(made, World) and steps is not None:
+        if isinstance(value, World) and steps is not None:
             raise ValueError(
-                f"--steps: {entry} is a Scenario, which has {made.steps}; "
+                f"--steps: {entry} is a Scenario, which has {value.steps}; "
                 "expected a function of the number of steps"
             )
-        if not isinstance(made, World) and callable(made):
-            given = "the number of steps" if arguments else "nothing"
-            made = self._call(entry, given, made, *arguments)
-        if not isinstance(made, World):
+        world = value
+        if not isinstance(value, World) and callable(value):
+            words = "the number of steps" if arguments else "nothing"
+            world = self._call(entry, words, value, *arguments)
+        if not isinstance(world, World):
             raise ValueError(
-                f"{entry}: expected a Scenario, or a function that returns one, {_got(value, made)}"
+                f"{entry}: expected a Scenario, or a function that returns one, "
+                f"{_mismatch(value, world)}"
             )
-        check_noise(made)
-        return made
+        check_noise(world)
+        return world
 
     def filters(self, names: str, scenario: World) -> dict[str, Candidate]:
         """The filters of a comma-separated list, or all of the catalog, by name.
@@ -67,15 +68,15 @@ class UserObjects:
                 "--filters: expected names of filters, or FILE.py:NAME, with commas between them, "
                 f"or all, got {names!r}"
             )
-        found: dict[str, Candidate] = {}
+        candidates: dict[str, Candidate] = {}
         for entry in entries:
             name, candidate = (self._from_file if _in_file(entry) else _from_catalog)(
                 entry, scenario
             )
-            if name in found:
+            if name in candidates:
                 raise ValueError(f"--filters: expected each name once, got {name} twice")
-            found[name] = candidate
-        return found
+            candidates[name] = candidate
+        return candidates
 
     @contextlib.contextmanager
     def located_errors(self) -> Iterator[None]:
@@ -104,21 +105,21 @@ class UserObjects:
     def _from_file(self, entry: str, scenario: World) -> tuple[str, Candidate]:
         """NAME of a user's file, and the filter for the scenario."""
         name, value = self._find("--filters", entry)
-        made = value
-        if not isinstance(made, Filter) and callable(made):
-            made = self._call(entry, "the scenario", made, scenario)
-        if not isinstance(made, Filter) and not callable(made):
+        candidate = value
+        if not isinstance(value, Filter) and callable(value):
+            candidate = self._call(entry, "the scenario", value, scenario)
+        if not isinstance(candidate, Filter) and not callable(candidate):
             raise ValueError(
                 f"{entry}: expected a Filter, or a function of the scenario that returns one, "
-                f"{_got(value, made)}"
+                f"{_mismatch(value, candidate)}"
             )
-        check_fits(name, made, scenario)
-        return name, made
+        check_fits(name, candidate, scenario)
+        return name, candidate
 
     def _call(
-        self, entry: str, given: str, function: Callable[..., object], *arguments: object
+        self, entry: str, words: str, function: Callable[..., object], *arguments: object
     ) -> object:
-        """The result of a user's function; given: its argument in words."""
+        """The result of a user's function; words: a description of its argument."""
         count = "one argument" if arguments else "no argument"
         try:
             inspect.signature(function).bind(*arguments)
@@ -128,13 +129,14 @@ class UserObjects:
             return function(*arguments)
         except Exception as error:
             raise ValueError(
-                f"{entry}: called with {given}, it fails: {describe_error(error)}"
+                f"{entry}: called with {words}, it fails: {describe_error(error)}"
             ) from error
 
 
-def _got(value: object, made: object) -> str:
-    """The object in the file that is not as expected, or the result of its function."""
-    return f"got {made!r:.60}" if made is value else f"got a function that returned {made!r:.60}"
+def _mismatch(value: object, result: object) -> str:
+    """A phrase on the object in the file, or on the result of the function in the file."""
+    source = "got" if result is value else "got a function that returned"
+    return f"{source} {result!r:.60}"
 
 
 def _in_file(entry: str) -> bool:
@@ -144,21 +146,16 @@ def _in_file(entry: str) -> bool:
 
 def _from_catalog(name: str, scenario: World) -> tuple[str, Candidate]:
     """The name and a filter of the catalog; ValueError if it cannot run the scenario."""
-    make = pick("filters", name, ALL, _FROM_FILE)
+    build = pick("filters", name, ALL, _FROM_FILE)
     try:
-        return name, make(scenario, watch=True)
+        return name, build(scenario, watch=True)
     except ValueError as error:
-        fit = ",".join(other for other in ALL if _can_run(other, scenario))
+        possible = []
+        for candidate in ALL:
+            with contextlib.suppress(ValueError):
+                ALL[candidate](scenario)
+                possible.append(candidate)
         raise ValueError(
             f"--filters: {name} cannot run scenario {scenario.name!r}: {error}"
-            + f"; those of the catalog that can: --filters {fit}" * bool(fit)
+            + f"; those of the catalog that can: --filters {','.join(possible)}" * bool(possible)
         ) from error
-
-
-def _can_run(name: str, scenario: World) -> bool:
-    """Whether a filter of the catalog can be made for the scenario."""
-    try:
-        ALL[name](scenario)
-    except ValueError:
-        return False
-    return True

@@ -1,7 +1,7 @@
 """Readers of public data sets, and of your data in CSV files (`table`); they return a `Dataset`.
 
-`READERS` has them by name, for the command line; each takes a path, and, for a data set of several
-robots, the number of one. `read_graph` and `write_graph` are for files of pose graphs.
+`READERS` has the readers by name, for the command line; each takes a path and, for a data set of
+several robots, the number of a robot. `read_graph` and `write_graph` are for files of pose graphs.
 """
 
 from collections.abc import Callable
@@ -21,7 +21,7 @@ from jaxslam.datasets._laser_logs.carmen_reader import StampedRelations, carmen,
 from jaxslam.datasets._laser_logs.laser_record import LaserLog
 from jaxslam.datasets._laser_logs.rosbag_reader import BagContents, rosbag, rosbag_contents
 from jaxslam.datasets._noise_fit import DatasetFit, fit
-from jaxslam.datasets._uncertain_constants import Added, considered
+from jaxslam.datasets._uncertain_constants import AddedCov, consider_constants
 
 READERS: dict[str, Callable[..., Dataset]] = Named(
     {
@@ -37,7 +37,7 @@ READERS: dict[str, Callable[..., Dataset]] = Named(
 __all__ = [
     "MRCLAM_CALIBRATION",
     "READERS",
-    "Added",
+    "AddedCov",
     "Adjustable",
     "BagContents",
     "Dataset",
@@ -51,7 +51,7 @@ __all__ = [
     "Topic",
     "bonn",
     "carmen",
-    "considered",
+    "consider_constants",
     "evaluate",
     "fit",
     "mrclam",

@@ -19,10 +19,10 @@ class Parameter(NamedTuple):
     """A number of a data set's models that `fit` can estimate."""
 
     name: str
-    """with its unit, as "motion v [m/s]" or "scale turn" """
+    """name with unit, as "motion v [m/s]" or "scale turn" """
     value: float
     group: str
-    """"noise" of a standard deviation, else what `calibrate` names: "mount", "scale", …"""
+    """"noise" for a standard deviation, else a group of `calibrate`: "mount", "scale", …"""
     place: tuple[str, str]
     """section and key of the settings, whose list holds the parameters of one place in order"""
 
@@ -34,7 +34,7 @@ class Adjustable(NamedTuple):
     at: Callable[[Float[jax.Array, "P"]], tuple[Log, Motion, Sensor]]
     """values, which may be traced -> log, motion and sensor"""
     cov: Float[np.ndarray, "P P"] | None = None
-    """of the values as they were fitted, 0 for others; None if nothing is known of it"""
+    """covariance of the fitted values, 0 for others; None if unknown"""
 
     @property
     def values(self) -> Float[np.ndarray, "P"]:
@@ -65,20 +65,20 @@ class Dataset:
     pose: Float[np.ndarray, "3"] = field(default_factory=lambda: np.zeros(3))
     """pose of the robot before the first control, the frame of the map"""
     pose_cov: Float[np.ndarray, "3 3"] = field(default_factory=lambda: np.zeros((3, 3)))
-    """zero, since the first pose defines the frame"""
+    """covariance of `pose`; zero if the first pose defines the frame"""
     filter_options: dict[str, Any] = field(default_factory=dict)
     """keyword arguments of `filters.EkfSlam` for this data set (update, gate)"""
     landmarks: Float[np.ndarray, "N 2"] | None = None
-    """surveyed positions [m] by tag, in their frame (see `one_frame`); None if unknown"""
+    """surveyed positions [m] by tag, in the frame of the survey (`one_frame`); None if unknown"""
     true_path: Float[np.ndarray, "T 3"] | None = None
-    """true pose at each row [m, m, rad], in the frame of `landmarks`; None if unknown. Where it is
-    not known (`true_at`), the last known one, and before it the first"""
+    """true pose at each row [m, m, rad], in the frame of `landmarks`; None if unknown. A row
+    without a true pose (`true_at`) has the last known pose, or the first known one"""
     true_at: Bool[np.ndarray, "T"] | None = None
-    """in which rows the true pose is known; None if in all"""
+    """mask of the rows with a true pose; None if all have one"""
     true_paths: Float[np.ndarray, "R T 3"] | None = None
-    """true poses of all robots of a log of several, if known; `true_path` is that of the first"""
+    """true poses of the R robots of a log of several, if known; `true_path` is the first of them"""
     true_paths_at: Bool[np.ndarray, "R T"] | None = None
-    """in which rows those are known; None if in all"""
+    """mask of the rows with a true pose by robot; None if all have one"""
     one_frame: bool = False
     """whether `pose`, `landmarks` and `true_path` are in one frame; if not, compare after an
     alignment"""
@@ -129,7 +129,7 @@ class Dataset:
 
     @property
     def capacity(self) -> int:
-        """The number of landmark slots of a filter, that of tags N or `slots`."""
+        """The number of landmark slots of a filter: `slots`, or else the number of tags N."""
         return len(self.tags) if self.slots is None else self.slots
 
     @property

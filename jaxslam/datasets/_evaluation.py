@@ -24,14 +24,15 @@ from jaxslam.math.stats import chi2_band, chi2_quantile
 _in_coordinates = jax.jit(cov_of_coordinates, static_argnames="square_root", inline=True)
 
 _POINT = ("x [m]", "y [m]")
-_ITERATIONS = 20
+_MAX_ITERATIONS = 20
+"""Largest number of Gauss-Newton steps of `_best_frame`."""
 
 
 class MapTest(NamedTuple):
     """The NEES of a map, the band of an honest one, and the verdict."""
 
     nees: float
-    """of all landmarks together, or the largest of a single one"""
+    """the NEES of all landmarks together, or the largest NEES of a single landmark"""
     dof: int
     band: tuple[float, float]
     """the interval of 95 % of honest maps; (0, high) for the largest"""
@@ -48,11 +49,12 @@ class MapTest(NamedTuple):
 
     def rows(self) -> dict[str, object]:
         """The test as rows of a summary."""
-        what = f"all landmarks, {self.dof} dof" if self.joint else "the worst landmark"
         band = [float(f"{end:.4g}") for end in self.band]
         return {
             "map NEES": self.nees,
-            "map NEES of": what,
+            "map NEES of": (
+                f"all landmarks, {self.dof} dof" if self.joint else "the worst landmark"
+            ),
             f"map NEES, {percentage(LEVEL)} of honest maps": band,
             "map verdict": self.verdict,
         }
@@ -92,7 +94,10 @@ def judge_map(
     one number: an inconsistent filter may pass.
 
     Args:
-        points, covs: of the filter; covs without correlations between landmarks.
+        points: estimated positions.
+        survey: surveyed positions.
+        covs: covariance of each position.
+        joint_cov: covariance of all positions together; None if unknown.
         one_frame: whether the survey is in the filter's frame.
     Returns:
         None if the covariance is singular, or the landmarks are too few to find the frame.
@@ -104,38 +109,40 @@ def judge_map(
     joint = joint_cov is not None
     separate = np.zeros((count, 2, count, 2))
     separate[np.arange(count), :, np.arange(count)] = covs
-    of_filter = np.asarray(covs if joint_cov is None else joint_cov)
+    dtype = np.asarray(covs if joint_cov is None else joint_cov).dtype
     cov = np.asarray(separate if joint_cov is None else joint_cov, np.float64)
-    cov = cov.reshape(2 * count, 2 * count)
+    cov = cov.reshape(2 * count, 2 * count)  # rows and columns by landmark, then by coordinate
     values, vectors = np.linalg.eigh((cov + cov.T) / 2)
-    # Rounding of the filter leaves n eps of the largest of a singular one, and a margin of ten.
-    if not values[0] > 20 * count * np.finfo(of_filter.dtype).eps * values[-1]:
+    # In the precision of the filter an eigenvalue 0 of an n × n matrix comes out as up to n eps of
+    # the largest one, here n = 2 count; the factor 10 is a margin.
+    if not values[0] > 20 * count * np.finfo(dtype).eps * values[-1]:
         return None
-    white = vectors.T / np.sqrt(values)[:, None]
+    white = vectors.T / np.sqrt(values)[:, None]  # white P whiteᵀ = 1
     error = points - (
         survey if one_frame else transform(_best_frame(points, survey, white), survey)
     )
     if joint:
         nees = float(np.sum((white @ error.reshape(-1)) ** 2))
         return MapTest(nees, size, chi2_band(size, 1, LEVEL), True)
-    each = np.einsum("ni,nij,nj->n", error, np.linalg.inv(covs), error)
-    return MapTest(float(each.max()), 2, (0.0, chi2_quantile(1 - (1 - LEVEL) / count, 2)), False)
+    nees_of_each = np.einsum("ni,nij,nj->n", error, np.linalg.inv(covs), error)
+    bound = chi2_quantile(1 - (1 - LEVEL) / count, 2)
+    return MapTest(float(nees_of_each.max()), 2, (0.0, bound), False)
 
 
 def _best_frame(points: np.ndarray, survey: np.ndarray, white: np.ndarray) -> np.ndarray:
-    """The pose (3,) of the survey's frame that makes ‖L⁻¹ (points - moved survey)‖ smallest.
+    """The pose (3,) of the survey's frame that minimizes ‖L⁻¹ (points - moved survey)‖, P = L Lᵀ.
 
     Gauss-Newton from the unweighted alignment; points may be far from the origin.
     """
     pose = alignment(survey, points)
-    for _ in range(_ITERATIONS):
-        at = transform(pose, survey)
-        lever = at - pose[:2]
-        slope = np.zeros((len(points), 2, 3))
-        slope[:, 0, 0] = slope[:, 1, 1] = 1.0
-        slope[:, 0, 2], slope[:, 1, 2] = -lever[:, 1], lever[:, 0]
+    for _ in range(_MAX_ITERATIONS):
+        moved = transform(pose, survey)
+        lever = moved - pose[:2]
+        jacobian = np.zeros((len(points), 2, 3))
+        jacobian[:, 0, 0] = jacobian[:, 1, 1] = 1.0
+        jacobian[:, 0, 2], jacobian[:, 1, 2] = -lever[:, 1], lever[:, 0]
         step = np.linalg.lstsq(
-            white @ slope.reshape(-1, 3), white @ (points - at).reshape(-1), rcond=None
+            white @ jacobian.reshape(-1, 3), white @ (points - moved).reshape(-1), rcond=None
         )[0]
         pose = pose + step
         if np.abs(step).max() < 1e-12:
@@ -144,18 +151,18 @@ def _best_frame(points: np.ndarray, survey: np.ndarray, white: np.ndarray) -> np
 
 
 SPAN = 1.0
-"""Time over which relative errors of a path are taken [s]."""
+"""Time over which relative errors of a path are measured [s]."""
 
 
 class Evaluation(NamedTuple):
-    """The errors of a filter, as far as they are known, and the truth in the frame of its map."""
+    """The errors of a filter as far as they are known, and the truth in the frame of the map."""
 
     errors: dict[str, float]
-    """by name with unit, as printed"""
+    """errors by name with unit, as printed"""
     points: Float[np.ndarray, "N 2"] | None
     """surveyed landmarks [m]"""
     path: Float[np.ndarray, "K 3"] | None
-    """true poses, of the rows with a known one"""
+    """true poses of the K rows that have one"""
     map_test: MapTest | None
     """the test of the map by the survey; None without a survey or a regular covariance"""
 
@@ -176,57 +183,75 @@ def evaluate(
     the map.
 
     Args:
-        path: pose (T, 3) and pose_cov (T, 3, 3).
-        last: the map.
-        map_cov: the joint covariance of its landmarks, as of `joint_map_cov`.
+        path: estimate of every row, pose (T, 3) and pose_cov (T, 3, 3).
+        last: estimate after the last row, with the map.
+        map_cov: joint covariance of the landmarks of `last`, as from `joint_map_cov`.
     """
-    errors: dict[str, float] = {}
+    errors, true_path = _path_errors(data, path)
+    map_errors, points, map_test = _map_errors(data, last, map_cov)
+    return Evaluation(errors | map_errors, points, true_path, map_test)
+
+
+def _path_errors(
+    data: Dataset, path: Estimate
+) -> tuple[dict[str, float], Float[np.ndarray, "K 3"] | None]:
+    """The errors of a path, and the true path in the frame of the map, if it is known."""
+    is_known = np.ones(data.steps, bool) if data.true_at is None else np.asarray(data.true_at)
+    if data.true_path is None or not is_known.any():
+        return {}, None
     after = "" if data.one_frame else " after alignment"
-    true = points = test = None
-    known = np.ones(data.steps, bool) if data.true_at is None else np.asarray(data.true_at)
-    if data.true_path is not None and known.any():
-        pose, cov = np.asarray(path.pose)[known], np.asarray(path.pose_cov)[known]
-        true = np.asarray(data.true_path)[known]
-    if true is not None and not np.isfinite(pose).all():  # the filter failed
-        errors |= {f"ATE{after} [m]": np.nan, f"heading RMSE{after} [°]": np.nan}
-    elif true is not None:
-        of_path = metrics.ate(pose, true, align=not data.one_frame)
-        true = transform(of_path.frame, true)
-        errors[f"ATE{after} [m]"] = metrics.statistics(of_path.translation).rmse
-        turn = np.rad2deg(of_path.rotation)
-        errors[f"heading RMSE{after} [°]"] = metrics.statistics(turn).rmse
-        of_steps = metrics.rpe(true, pose, seconds=SPAN, time=np.asarray(data.time)[known])
-        if len(of_steps.translation):
-            errors[f"RPE over {SPAN:g} s [m]"] = metrics.statistics(of_steps.translation).rmse
-        error = pose_error(true, pose)
-        nees, regular = block_nees(pose, error, error, cov)["pose"]
-        if data.one_frame and regular.any():
-            errors["pose NEES, mean (3 is honest)"] = float(nees[regular].mean())
-            errors["pose NEES, median (2.37 is honest)"] = float(np.median(nees[regular]))
+    pose, cov = np.asarray(path.pose)[is_known], np.asarray(path.pose_cov)[is_known]
+    true_path = np.asarray(data.true_path)[is_known]
+    if not np.isfinite(pose).all():  # the filter failed
+        return {f"ATE{after} [m]": np.nan, f"heading RMSE{after} [°]": np.nan}, true_path
+    ate = metrics.ate(pose, true_path, align=not data.one_frame)
+    true_path = transform(ate.frame, true_path)
+    errors = {
+        f"ATE{after} [m]": metrics.statistics(ate.translation).rmse,
+        f"heading RMSE{after} [°]": metrics.statistics(np.rad2deg(ate.rotation)).rmse,
+    }
+    rpe = metrics.rpe(true_path, pose, seconds=SPAN, time=np.asarray(data.time)[is_known])
+    if len(rpe.translation):
+        errors[f"RPE over {SPAN:g} s [m]"] = metrics.statistics(rpe.translation).rmse
+    error = pose_error(true_path, pose)
+    nees, regular = block_nees(pose, error, error, cov)["pose"]
+    if data.one_frame and regular.any():
+        errors["pose NEES, mean (3 is honest)"] = float(nees[regular].mean())
+        errors["pose NEES, median (2.37 is honest)"] = float(np.median(nees[regular]))
+    return errors, true_path
+
+
+def _map_errors(
+    data: Dataset, last: Estimate, map_cov: Float[np.ndarray, "N 2 N 2"] | None
+) -> tuple[dict[str, float], Float[np.ndarray, "L 2"] | None, MapTest | None]:
+    """The errors of a map, the survey in the frame of the map, and the test of the map."""
     named = np.asarray(last.alive) & (np.asarray(last.tag) >= 0)
-    if data.landmarks is not None and named.any():
-        points = np.asarray(data.landmarks, np.asarray(last.points).dtype)
-        tag, found = np.asarray(last.tag)[named], np.asarray(last.points)[named]
-        if not np.isfinite(found).all():
-            rmse = np.nan
-        elif data.one_frame:
-            rmse = metrics.statistics(np.linalg.norm(found - points[tag], axis=1)).rmse
-        else:
-            rmse = metrics.align_map(last, data.landmarks)[1]
-            frame = metrics.alignment(points[tag], found)
-            points = transform(frame, points)
-        errors[f"map RMSE{after} [m]"] = rmse
-        gap = (points[tag] - found)[:, :, None]
-        covs = np.asarray(last.point_covs)[named]
-        finite = np.isfinite(covs).all(axis=(1, 2)) & np.isfinite(found).all(axis=1)
-        regular = finite & invertible(np.where(finite[:, None, None], covs, 0))
-        if regular.all():
-            survey, among = np.asarray(data.landmarks)[tag], np.flatnonzero(named)
-            joint = None if map_cov is None else map_cov[among][:, :, among]
-            test = judge_map(found.astype(np.float64), survey, covs, joint, data.one_frame)
-        if regular.any():
-            gap, covs = gap[regular], covs[regular]
-            square = np.swapaxes(gap, 1, 2) @ np.linalg.solve(covs, gap)
-            honest = "(2 is honest)" if data.one_frame else "(honest: below 2)"
-            errors[f"landmark NEES{after} {honest}"] = float(square.mean())
-    return Evaluation(errors, points, true, test)
+    if data.landmarks is None or not named.any():
+        return {}, None, None
+    after = "" if data.one_frame else " after alignment"
+    survey = np.asarray(data.landmarks, np.asarray(last.points).dtype)
+    tag, points = np.asarray(last.tag)[named], np.asarray(last.points)[named]
+    if not np.isfinite(points).all():
+        rmse = np.nan
+    elif data.one_frame:
+        rmse = metrics.statistics(np.linalg.norm(points - survey[tag], axis=1)).rmse
+    else:
+        rmse = metrics.align_map(last, data.landmarks)[1]
+        survey = transform(metrics.alignment(survey[tag], points), survey)
+    errors = {f"map RMSE{after} [m]": rmse}
+    gap = (survey[tag] - points)[:, :, None]
+    covs = np.asarray(last.point_covs)[named]
+    finite = np.isfinite(covs).all(axis=(1, 2)) & np.isfinite(points).all(axis=1)
+    regular = finite & invertible(np.where(finite[:, None, None], covs, 0))
+    map_test = None
+    if regular.all():
+        slots = np.flatnonzero(named)
+        joint_cov = None if map_cov is None else map_cov[slots][:, :, slots]
+        surveyed = np.asarray(data.landmarks)[tag]  # `judge_map` finds the frame by P
+        map_test = judge_map(points.astype(np.float64), surveyed, covs, joint_cov, data.one_frame)
+    if regular.any():
+        gap, covs = gap[regular], covs[regular]
+        square = np.swapaxes(gap, 1, 2) @ np.linalg.solve(covs, gap)
+        honest = "(2 is honest)" if data.one_frame else "(honest: below 2)"
+        errors[f"landmark NEES{after} {honest}"] = float(square.mean())
+    return errors, survey, map_test

@@ -10,13 +10,13 @@ DIGITS = 18
 """Digits of the largest whole number that is read; it fits 64 bits."""
 
 LARGEST = 1e60
-"""Of a number that is read; products of five such numbers are finite in float64."""
+"""Largest number that is read: products of five such numbers are finite in float64."""
 
 
-def stored(path: str | Path) -> Path | None:
-    """The file NAME, else NAME.gz beside it, else None."""
+def stored_file(path: str | Path) -> Path | None:
+    """The path of the file NAME, else of NAME.gz beside it, else None."""
     path = Path(path)
-    return next((one for one in (path, Path(f"{path}.gz")) if one.exists()), None)
+    return next((file for file in (path, Path(f"{path}.gz")) if file.exists()), None)
 
 
 def read_bytes(path: str | Path) -> tuple[Path, bytes]:
@@ -25,13 +25,13 @@ def read_bytes(path: str | Path) -> tuple[Path, bytes]:
     Raises ValueError, `path: cannot be read: reason`, if neither can be read, or a packed file is
     damaged or ends early.
     """
-    found = stored(path) or Path(path)
+    file = stored_file(path) or Path(path)
     try:
-        data = found.read_bytes()
-        return found, gzip.decompress(data) if found.suffix == ".gz" else data
+        data = file.read_bytes()
+        return file, gzip.decompress(data) if file.suffix == ".gz" else data
     except (OSError, EOFError, zlib.error) as problem:
         reason = getattr(problem, "strerror", None) or f"expected a gzip file, but {problem}"
-        raise ValueError(f"{found}: cannot be read: {reason}") from problem
+        raise ValueError(f"{file}: cannot be read: {reason}") from problem
 
 
 def none_left(place: object, dropped: Mapping[str, int]) -> ValueError:
@@ -77,6 +77,7 @@ class TextFile:
             values = [float(field) for field in fields]
         except ValueError:
             values = []
+        # All fields at once, since files are long; one by one only to name the wrong one.
         # float() also accepts 1_000.
         finite = values and all(map(math.isfinite, values))
         if not finite or max(map(abs, values)) > LARGEST or "_" in "".join(fields):
@@ -98,8 +99,8 @@ class TextFile:
     def expect(self, line: int, fields: Sequence[str], names: Sequence[str]) -> None:
         """Raise ValueError unless a line has one field for each name."""
         if len(fields) != len(names):
-            wanted = f"{len(names)} fields ({' '.join(names)})"
-            raise self.error(line, f"expected {wanted}, got {len(fields)}")
+            expected = f"{len(names)} fields ({' '.join(names)})"
+            raise self.error(line, f"expected {expected}, got {len(fields)}")
 
 
 def _is_finite(field: str) -> bool:

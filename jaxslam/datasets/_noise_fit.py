@@ -23,25 +23,27 @@ from jaxslam.math.stats import normal_quantile
 class DatasetFit(NamedTuple):
     """The parameters that `fit` found for a data set."""
 
-    found: NoiseFit
+    noise_fit: NoiseFit
+    """the fitted parameters with their errors, and the likelihood"""
     parameters: tuple[Parameter, ...]
-    """all of them, fitted and held, in the order of `Dataset.adjustable`"""
+    """all parameters, fitted and held, in the order of `Dataset.adjustable`"""
     cov: Float[np.ndarray, "P P"]
-    """of the fitted systematic errors among them, and of held ones as known beforehand; 0 of
-    noises, and of those that the log does not determine"""
+    """covariance of the parameters: of fitted systematic errors from the fit, of held ones from
+    `Dataset.adjustable`; 0 of noises and of parameters that the log does not determine"""
     held: dict[str, float]
-    """the parameters that were not fitted, by name, with their values"""
+    """values by name of the parameters that were not fitted"""
     used: int
-    """measurements fused or born, over which the likelihood is"""
+    """number of measurements in the likelihood: those fused or born"""
     left_out: dict[str, int]
-    """others, by status with the fitted noises"""
+    """number of other measurements by status, with the fitted noises"""
     rounds: int
-    """how often the filter decided what to use"""
+    """number of passes that selected the measurements anew"""
     settled: bool
-    """whether it decides with the parameters found as it did before"""
+    """whether a pass with the fitted parameters selects the same measurements as before"""
     autocorrelation: tuple[float, float]
-    """of successive whitened innovations of a landmark, and the half width of its 95 % band about
-    0; NaN if none is seen twice. Outside of it errors persist, and standard errors are too small"""
+    """correlation of successive whitened innovations of a landmark, and the half width of its 95 %
+    band about 0; NaN if no landmark is seen twice. Outside the band errors persist, and standard
+    errors are too small"""
 
     @property
     def values(self) -> Float[np.ndarray, "P"]:
@@ -50,8 +52,8 @@ class DatasetFit(NamedTuple):
 
     @property
     def by_name(self) -> dict[str, float]:
-        """The same by their names without units."""
-        return {split_unit(name)[0]: value for name, value, *_ in self.parameters}
+        """The numbers of all parameters by name without unit."""
+        return {split_unit(parameter.name)[0]: parameter.value for parameter in self.parameters}
 
 
 _ROUNDS = 5
@@ -94,82 +96,86 @@ def fit(
     if models is None:
         raise ValueError(f"fit: expected a data set with adjustable noises, got {data.name}")
     groups = tuple(calibrate)
-    free = _free(models.parameters, groups, tuple(fixed))
+    free = _free_indices(models.parameters, groups, tuple(fixed))
     start, key = models.values, jax.random.key(0)
     names = [parameter.name for parameter in models.parameters]
-    noise = np.array([parameter.group == "noise" for parameter in models.parameters])
+    is_noise = np.array([parameter.group == "noise" for parameter in models.parameters])
     chart: dict[str, Any] = {"chart": RightInvariant()} if data.sensor.of_points else {}
-    chosen = chart | data.filter_options | (options or {})
-    decided = chosen | {"gate": None, "associate": Known()}
+    selecting = chart | data.filter_options | (options or {})
+    replaying = selecting | {"gate": None, "associate": Known()}
 
     def run_with(parameters: jax.Array, options: dict[str, Any], used: Scan | None) -> Info:
-        """used: a scan with the tags and measurements to use; None for those of the log."""
+        """Run the filter over the log. used: the tags and measurements to use; None for all."""
         log, motion, sensor = models.at(parameters)
         if used is not None:
             log = log._replace(scan=log.scan._replace(tag=used.tag, valid=used.valid))
         method = EkfSlam(motion, sensor, data.capacity, **options)
         return run(method, log, data.pose, data.pose_cov, key).info
 
-    def info(p: jax.Array, scan: Scan) -> Info:
-        return run_with(jnp.asarray(start, p.dtype).at[free].set(p), decided, scan)
+    def all_parameters(p: jax.Array) -> jax.Array:
+        """The free parameters p among those that are held."""
+        return jnp.asarray(start, p.dtype).at[free].set(p)
 
-    def decide(parameters: np.ndarray) -> Info:
-        # In the precision of the log, whatever that of the parameters.
-        held = jnp.asarray(parameters, jnp.asarray(data.log.control).dtype)
-        found: Info = jax.device_get(run_with(held, chosen, None))
-        return found
+    def replay(p: jax.Array, scan: Scan) -> Info:
+        return run_with(all_parameters(p), replaying, scan)
+
+    def select(parameters: np.ndarray) -> Info:
+        """Run the filter that associates and gates, in the precision of the log."""
+        cast = jnp.asarray(parameters, jnp.asarray(data.log.control).dtype)
+        info: Info = jax.device_get(run_with(cast, selecting, None))
+        return info
 
     parameters = start.copy()
-    info_of_log = before_fit = decide(parameters)
-    settled, taken = not noise[free].any(), 0
-    if settled:
-
-        def decided_anew(p: jax.Array) -> Info:
-            held = jnp.asarray(start, p.dtype).at[free].set(p)
-            return run_with(held, chosen, None)
-
-        calibrated = calibration.calibrate(decided_anew, start[free])
+    info = info_at_start = select(parameters)
+    settled, rounds = not is_noise[free].any(), 0
+    if settled:  # no noise is free
+        calibrated = calibration.calibrate(
+            lambda p: run_with(all_parameters(p), selecting, None), start[free]
+        )
         parameters[free] = calibrated.parameters
-        info_of_log = decide(parameters)
-        found = _as_fit(calibrated, [names[i] for i in free], before_fit, info_of_log)
-    while taken < _ROUNDS and not settled:
-        taken += 1
-        scan = as_associated(data.log, info_of_log).scan
-        found = fit_noise(
-            info,
+        info = select(parameters)
+        result = _as_fit(calibrated, [names[i] for i in free], info_at_start, info)
+    while rounds < _ROUNDS and not settled:
+        rounds += 1
+        scan = as_associated(data.log, info).scan
+        result = fit_noise(
+            replay,
             start[free],
             scan,
             names=[names[i] for i in free],
-            deviation=noise[free].tolist(),
+            deviation=is_noise[free].tolist(),
             guess=parameters[free],
         )
-        parameters[free] = found.parameters
-        info_of_log = decide(parameters)
-        settled = _same(scan, as_associated(data.log, info_of_log).scan)
-    outcome = {s.name.lower(): int((np.asarray(info_of_log.status) == s).sum()) for s in Status}
-    kept = ("empty", "fused", "born")
-    fitted = np.isin(np.arange(len(start)), free)
-    before = np.zeros((len(start), len(start))) if models.cov is None else models.cov
-    cov = np.where(fitted | fitted[:, None], 0.0, before)
-    cov[np.ix_(free, free)] = found.cov
-    known = ~noise & np.isfinite(np.diag(cov))
+        parameters[free] = result.parameters
+        info = select(parameters)
+        next_scan = as_associated(data.log, info).scan
+        settled = np.array_equal(scan.tag, next_scan.tag) and np.array_equal(
+            scan.valid, next_scan.valid
+        )
+    outcome = {s.name.lower(): int((np.asarray(info.status) == s).sum()) for s in Status}
+    used_or_empty = ("empty", "fused", "born")
+    is_free = np.isin(np.arange(len(start)), free)
+    prior = np.zeros((len(start), len(start))) if models.cov is None else models.cov
+    cov = np.where(is_free | is_free[:, None], 0.0, prior)
+    cov[np.ix_(free, free)] = result.cov
+    is_determined = ~is_noise & np.isfinite(np.diag(cov))
     return DatasetFit(
-        found=found,
+        noise_fit=result,
         parameters=tuple(
             parameter._replace(value=float(value))
             for parameter, value in zip(models.parameters, parameters, strict=True)
         ),
-        cov=np.where(np.outer(known, known), cov, 0.0),
+        cov=np.where(np.outer(is_determined, is_determined), cov, 0.0),
         held={
             names[i]: float(start[i])
-            for i in np.flatnonzero(~fitted)
-            if noise[i] or models.parameters[i].group in groups
+            for i in np.flatnonzero(~is_free)
+            if is_noise[i] or models.parameters[i].group in groups
         },
         used=outcome["fused"] + outcome["born"],
-        left_out={name: n for name, n in outcome.items() if n and name not in kept},
-        rounds=taken,
+        left_out={name: n for name, n in outcome.items() if n and name not in used_or_empty},
+        rounds=rounds,
         settled=settled,
-        autocorrelation=autocorrelation(info_of_log),
+        autocorrelation=autocorrelation(info),
     )
 
 
@@ -181,51 +187,54 @@ def autocorrelation(info: Info) -> tuple[float, float]:
     fused = np.asarray(info.status) == Status.FUSED
     nu, cov = np.asarray(info.innovation)[fused], np.asarray(info.innovation_cov)[fused]
     slot = np.asarray(info.slot)[fused]
-    # A part of a suite may have fewer numbers than another.
+    # A sensor of a suite may have fewer numbers than another; the rest of its rows is zero.
     unused = np.diagonal(cov, axis1=1, axis2=2) == 0
     cov = cov + unused[:, None, :] * np.eye(nu.shape[1])
     white = np.linalg.solve(np.linalg.cholesky(cov), nu[..., None])[..., 0]
     order = np.argsort(slot, kind="stable")  # by landmark, in order of time
     pair = slot[order][1:] == slot[order][:-1]
-    one, other = white[order][:-1][pair], white[order][1:][pair]
-    if not one.size:
+    first, second = white[order][:-1][pair], white[order][1:][pair]
+    if not first.size:
         return np.nan, np.nan
-    found = np.sum(one * other) / np.sqrt(np.sum(one**2) * np.sum(other**2))
-    return float(found), normal_quantile(0.975) / float(np.sqrt(one.size))
+    correlation = np.sum(first * second) / np.sqrt(np.sum(first**2) * np.sum(second**2))
+    return float(correlation), normal_quantile(0.975) / float(np.sqrt(first.size))
 
 
-def _as_fit(found: Calibration, names: list[str], before: Info, after: Info) -> NoiseFit:
-    """The result of `calibrate` in the form of `fit_noise`, with what it found both runs to be."""
+def _as_fit(calibrated: Calibration, names: list[str], before: Info, after: Info) -> NoiseFit:
+    """The result of `calibrate` as a `NoiseFit`.
+
+    before, after: infos of the runs with the parameters at the start and with the calibrated ones.
+    """
 
     def nis_per_dof(info: Info) -> tuple[float, int]:
         fused = np.asarray(info.status) == Status.FUSED
         dof = int(np.asarray(info.dof)[fused].sum())
         return float(np.asarray(info.nis)[fused].sum() / max(dof, 1)), dof
 
-    error = np.sqrt(np.diag(found.cov))
+    error = np.sqrt(np.diag(calibrated.cov))
     return NoiseFit(
         names=tuple(names),
-        start=found.path[0],
-        parameters=found.parameters,
+        start=calibrated.path[0],
+        parameters=calibrated.parameters,
         error=error,
         robust_error=error,
-        cov=found.cov,
+        cov=calibrated.cov,
         log_likelihood=(float(before.log_likelihood.sum()), float(after.log_likelihood.sum())),
         nis_per_dof=(nis_per_dof(before)[0], nis_per_dof(after)[0]),
         dof=nis_per_dof(after)[1],
-        path=found.path,
-        converged=found.converged,
+        path=calibrated.path,
+        converged=calibrated.converged,
         upper={},
         loose={},
     )
 
 
-def _free(
+def _free_indices(
     parameters: tuple[Parameter, ...], calibrate: tuple[str, ...], fixed: tuple[str, ...]
 ) -> np.ndarray:
     """The indices of the parameters to fit."""
     groups = [parameter.group for parameter in parameters]
-    plain = [split_unit(parameter.name)[0] for parameter in parameters]
+    names = [split_unit(parameter.name)[0] for parameter in parameters]
     errors = dict.fromkeys(group for group in groups if group != "noise")
     for group in calibrate:
         if group not in errors:
@@ -234,20 +243,15 @@ def _free(
                 f"this data set can adjust, got {group!r}"
             )
     held = {split_unit(name)[0] for name in fixed}
-    known = dict.fromkeys([*plain, *groups])
-    for name in sorted(held - set(known)):
-        raise ValueError(f"fit: expected fixed parameters of {', '.join(known)}, got {name!r}")
+    allowed = dict.fromkeys([*names, *groups])
+    for name in sorted(held - set(allowed)):
+        raise ValueError(f"fit: expected fixed parameters of {', '.join(allowed)}, got {name!r}")
     free = [
         i
-        for i, (name, group) in enumerate(zip(plain, groups, strict=True))
+        for i, (name, group) in enumerate(zip(names, groups, strict=True))
         if not held & {name, group}
         and (group in calibrate or (group == "noise" and parameters[i].value > 0))
     ]
     if not free:
         raise ValueError("fit: expected a parameter to fit, got all held")
     return np.array(free)
-
-
-def _same(a: Scan, b: Scan) -> bool:
-    """Whether two logs use the same measurements for the same landmarks."""
-    return np.array_equal(a.tag, b.tag) and np.array_equal(a.valid, b.valid)

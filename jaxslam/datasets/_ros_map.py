@@ -41,7 +41,7 @@ def _read_shades(path: Path) -> NDArray[np.float64]:
     head = _PGM.match(data)
     if head is None:
         raise ValueError(f"{path}: expected an image in PGM (P5 or P2), PNG or BMP")
-    width, height, top = _whole(path, head.groups()[1:])
+    width, height, top = _integers(path, head.groups()[1:])
     if width < 1 or height < 1 or not 1 <= top <= 65535:
         raise ValueError(
             f"{path}: expected an image of at least 1 × 1 with a largest shade of 1 to 65535, "
@@ -52,20 +52,20 @@ def _read_shades(path: Path) -> NDArray[np.float64]:
         words = re.sub(rb"#[^\n]*", b"", body).split()[:count]
         if len(words) < count:
             raise ValueError(f"{path}: the image ends after {len(words)} of {count} numbers")
-        found = np.array(_whole(path, words))
+        levels = np.array(_integers(path, words))
     else:
-        shades = np.dtype(np.uint8 if top < 256 else ">u2")
-        size = count * shades.itemsize
+        kind = np.dtype(np.uint8 if top < 256 else ">u2")  # two bytes, the high one first
+        size = count * kind.itemsize
         if len(body) < size:
             raise ValueError(f"{path}: the image ends after {len(body)} of {size} bytes")
-        found = np.frombuffer(body[:size], shades)
-    if found.max() > top:
-        raise ValueError(f"{path}: a shade of {found.max()} is above the largest, {top}")
-    return np.asarray(found.reshape(height, width) / top, np.float64)
+        levels = np.frombuffer(body[:size], kind)
+    if levels.max() > top:
+        raise ValueError(f"{path}: a shade of {levels.max()} is above the largest, {top}")
+    return np.asarray(levels.reshape(height, width) / top, np.float64)
 
 
-def _whole(path: Path, words: Sequence[bytes]) -> list[int]:
-    """Words as whole numbers; ValueError on any other."""
+def _integers(path: Path, words: Sequence[bytes]) -> list[int]:
+    """The whole numbers of words; ValueError on any other word."""
     for word in words:
         if not word.isdigit() or len(word) > DIGITS:
             shown = word[: DIGITS + 1].decode("latin-1")
@@ -74,6 +74,7 @@ def _whole(path: Path, words: Sequence[bytes]) -> list[int]:
 
 
 def _by_matplotlib(path: Path, data: bytes, form: str) -> NDArray[np.float64]:
+    """The shades of a PNG or BMP image, as of `_read_shades`."""
     # Slow to load, and most commands read no image; `plot` loads it whatever the user's backend is.
     import jaxslam.results.plot  # noqa: F401
 
@@ -87,6 +88,7 @@ def _by_matplotlib(path: Path, data: bytes, form: str) -> NDArray[np.float64]:
     if np.issubdtype(image.dtype, np.integer):
         image = image / np.iinfo(image.dtype).max
     image = image.astype(np.float64).reshape(*image.shape[:2], -1)
+    # Grey, grey and opacity, three colours, or three colours and opacity.
     colours = image.shape[2] - (image.shape[2] in (2, 4))
     if np.any(image[..., colours:] < 1):
         raise ValueError(f"{path}: expected an image that is opaque everywhere")
@@ -143,7 +145,7 @@ def map_files(stem: str, grid: Grid, mode: str = "trinary") -> Files:
         raise ValueError(f'write_map: expected mode "trinary" or "scale", got {mode!r}')
     log_odds = np.asarray(grid.log_odds, np.float64)[::-1]
     if mode == "trinary":
-        occupied, free = 0.65, 0.196
+        occupied, free = 0.65, 0.196  # as `map_saver` of ROS writes them
         image = np.where(log_odds > 0, 0, np.where(log_odds < 0, 254, _UNKNOWN))
         levels = 255
     else:
@@ -162,9 +164,9 @@ def map_files(stem: str, grid: Grid, mode: str = "trinary") -> Files:
 def _log_odds(p: NDArray[np.float64]) -> NDArray[np.float64]:
     """The log-odds log p/(1-p), within ±CERTAIN; exactly 0 at ½."""
     within = np.clip(p, 0.5 / 255, 1.0 - 0.5 / 255)
-    found = np.where(p == 0.5, 0.0, np.log(within) - np.log1p(-within))
-    found = np.where(within > p, -CERTAIN, np.where(within < p, CERTAIN, found))
-    return np.asarray(found)
+    # The two logarithms of a library need not cancel exactly at ½.
+    log_odds = np.where(p == 0.5, 0.0, np.log(within) - np.log1p(-within))
+    return np.where(within > p, -CERTAIN, np.where(within < p, CERTAIN, log_odds))
 
 
 def _levels(log_odds: NDArray[np.float64]) -> tuple[NDArray[np.int64], int]:
@@ -192,8 +194,8 @@ class _Header:
             root = yaml.compose(text, yaml.SafeLoader)
         except yaml.MarkedYAMLError as problem:
             mark = problem.context_mark or problem.problem_mark  # where it begins
-            what = str(problem.problem).removeprefix("but ")
-            raise self.file.error(mark.line + 1, f"expected YAML, but {what}") from problem
+            reason = str(problem.problem).removeprefix("but ")
+            raise self.file.error(mark.line + 1, f"expected YAML, but {reason}") from problem
         except yaml.reader.ReaderError as problem:
             line = text.count("\n", 0, problem.position) + 1
             raise self.file.error(line, f"expected YAML, but {problem.reason}") from problem
@@ -201,42 +203,42 @@ class _Header:
             raise self.file.error(1, "expected `key: value`, got brackets in brackets") from problem
         if not isinstance(root, yaml.MappingNode):
             raise self.file.error(1, "expected `key: value`")
-        self.found: dict[str, yaml.Node] = {}
+        self.nodes: dict[str, yaml.Node] = {}
         for name, value in root.value:
             line = name.start_mark.line + 1
             if not isinstance(name, yaml.ScalarNode):
                 raise self.file.error(line, "expected `key: value`")
-            if name.value in self.found:
+            if name.value in self.nodes:
                 raise self.file.error(line, f"{name.value} occurs twice")
             if name.value in (*_REQUIRED, "mode"):
-                self.found[name.value] = value
+                self.nodes[name.value] = value
             else:
                 unknown = f"{self.file.path}:{line}: key {name.value!r} is not read"
                 warnings.warn(unknown, stacklevel=4)
         for key in _REQUIRED:
-            if key not in self.found:
+            if key not in self.nodes:
                 raise self.file.end_error(f"{key} is missing")
 
     def error(self, key: str, reason: str) -> ValueError:
         """A ValueError about the line of a value, for the caller to raise."""
-        line = self.found[key].start_mark.line + 1
+        line = self.nodes[key].start_mark.line + 1
         return self.file.error(line, " ".join(reason.split()))  # a value may go over lines
 
     def text(self, key: str) -> str:
         """The value of a key as written in the file, without quotes."""
-        value = self.found[key].value
+        value = self.nodes[key].value
         if not isinstance(value, str) or not value:
             raise self.error(key, f"expected one value of {key}")
         return value
 
     def number(self, key: str) -> float:
         """The value of a key as a finite number."""
-        line = self.found[key].start_mark.line + 1
+        line = self.nodes[key].start_mark.line + 1
         return self.file.numbers(line, [self.text(key)], [key])[0]
 
     def numbers(self, key: str, names: tuple[str, ...]) -> list[float]:
         """The value of a key as a list of finite numbers, one per name."""
-        node = self.found[key]
+        node = self.nodes[key]
         items = node.value if isinstance(node, yaml.SequenceNode) else [node]
         fields = [item.value if isinstance(item, yaml.ScalarNode) else "" for item in items]
         line = node.start_mark.line + 1
@@ -244,12 +246,12 @@ class _Header:
             return self.file.numbers(line, fields, names)
         except ValueError as problem:
             reason = str(problem).removeprefix(f"{self.file.path}:{line}: ")
-            wanted = f"expected {key}: [{', '.join(names)}], got [{', '.join(fields)}]"
-            raise self.error(key, f"{wanted}: {reason}") from problem
+            expected = f"expected {key}: [{', '.join(names)}], got [{', '.join(fields)}]"
+            raise self.error(key, f"{expected}: {reason}") from problem
 
     def choice(self, key: str, choices: dict[str, _Value], default: str | None = None) -> _Value:
         """The meaning of the value of a key."""
-        if key not in self.found and default is not None:
+        if key not in self.nodes and default is not None:
             return choices[default]
         value = self.text(key).lower()
         if value not in choices:
@@ -258,6 +260,6 @@ class _Header:
 
 
 def _scalar(text: str) -> str:
-    """A text as YAML has it: in quotes unless letters, digits and a few signs are all it has."""
+    """A text in YAML: in quotes unless it has letters, digits and a few signs alone."""
     plain = text[0].isalnum() and all(letter.isalnum() or letter in " ._-/" for letter in text)
     return text if plain else "'" + text.replace("'", "''") + "'"

@@ -1,5 +1,6 @@
 """The report of a campaign: its files, written all or none, and a fragment for notebooks."""
 
+import contextlib
 import json
 import os
 from collections.abc import Callable, Iterable, Mapping
@@ -18,7 +19,7 @@ from jaxslam.consistency.campaign._kept import add_kept
 from jaxslam.consistency.campaign._pieces import missing_pieces
 from jaxslam.core._numbers import is_number
 from jaxslam.results import _report as report
-from jaxslam.results import _store as store
+from jaxslam.results import store
 from jaxslam.results._files import Files, check_formats, check_writable, versions, write_files
 from jaxslam.verify._user_errors import describe_error
 
@@ -47,14 +48,14 @@ _IN_NOTEBOOK = ("nees", "rmse")
 
 
 def file_names(formats: Iterable[str], figures: Iterable[str] = FIGURES) -> list[str]:
-    """The names of the files of a campaign's report, with figures of these formats."""
+    """The names of the files of a campaign's report, with figures in the formats."""
     kinds = list(formats)
     return [PAGE, RESULT, CURVES, TABLE, *(f"{name}.{kind}" for name in figures for kind in kinds)]
 
 
-def check_figure_formats(caller: str, given: str | Iterable[str]) -> tuple[str, ...]:
+def check_figure_formats(caller: str, formats: str | Iterable[str]) -> tuple[str, ...]:
     """The formats of figures, each once; ValueError on an unknown one."""
-    return check_formats(caller, given, FORMATS)
+    return check_formats(caller, formats, FORMATS)
 
 
 def save_campaign(
@@ -68,10 +69,11 @@ def save_campaign(
 ) -> list[Path]:
     """Write the files of a campaign's report, and return their paths; see `Campaign.save`.
 
-    The numbers are written before a figure is drawn, and one that fails is left out.
+    The numbers are written before a figure is drawn, and a figure that fails is left out.
 
     Args:
-        command, seed: those of the campaign, for the page and the JSON; "" and None if unknown.
+        command: the command of the campaign, for the page and the JSON; "" if unknown.
+        seed: the seed of the campaign; None if unknown.
         tell: called with a line on a figure that could not be drawn.
     """
     formats = check_figure_formats("Campaign.save", figures)
@@ -94,25 +96,34 @@ def save_campaign(
         CURVES: report.as_csv(campaign),
         TABLE: report.table_csv(campaign),
     }
-    stale = () if _holds(folder / RESULT, numbers[RESULT]) else file_names(FORMATS)
-    write_files(folder, numbers, replaces=stale)
-    drawn_once = cache(encode)  # the page and a file have the same picture
-    drawn: dict[str, tuple[str, Figure]] = {}
+    # Figures of other numbers are deleted; of the same numbers they stay until they are replaced.
+    stale: Iterable[str] = file_names(FORMATS)
+    with contextlib.suppress(OSError, ValueError):
+        if (folder / RESULT).read_text(encoding="utf-8") == numbers[RESULT]:
+            stale = ()
+    write_files(folder, numbers, replaces=tuple(stale))
+    encode_once = cache(encode)  # the page and a file have the same picture
+    figures_of_page: dict[str, tuple[str, Figure]] = {}
     pictures: Files = {}
-    for name, (caption, make) in drawings.items():
+    for name, (caption, draw) in drawings.items():
         try:
-            figure = make()
-            drawn_once(figure, "png")
-            files = {f"{name}.{kind}": drawn_once(figure, kind) for kind in formats}
+            figure = draw()
+            encode_once(figure, "png")
+            files = {f"{name}.{kind}": encode_once(figure, kind) for kind in formats}
         except KeyboardInterrupt:
             raise KeyboardInterrupt(f"{folder} has the numbers, and no figures") from None
         except Exception as error:
             tell(f"{name} was not drawn: {describe_error(error)}")
         else:
-            drawn[name] = caption, figure
+            figures_of_page[name] = caption, figure
             pictures |= files
     html = page.campaign_page(
-        campaign, command, seed, versions(), drawn, lambda figure: drawn_once(figure, "png")
+        campaign,
+        command,
+        seed,
+        versions(),
+        figures_of_page,
+        lambda figure: encode_once(figure, "png"),
     )
     page_and_figures = write_files(folder, {PAGE: html, **pictures})
     return [page_and_figures[0], *(folder / name for name in numbers), *page_and_figures[1:]]
@@ -137,14 +148,14 @@ def load(folder: str | Path) -> Campaign:
         )
     kept, path = store.resume(folder / BLOCKS), folder / RESULT
     try:
-        found = json.loads(path.read_text(encoding="utf-8"))
-        doubts = _checked(found, kept.campaign)
+        result = json.loads(path.read_text(encoding="utf-8"))
+        doubts = _doubts_of(result, kept.campaign)
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(
             f"{path}: expected the results of a campaign: jaxslam consistency --resume {folder} "
             "writes them"
         ) from error
-    runs, tallies = found["runs"], {name: Tally() for name in (*doubts, BOUND)}
+    runs, tallies = result["runs"], {name: Tally() for name in (*doubts, BOUND)}
     if missing_pieces(add_kept(tallies, kept, runs, lambda first: True), runs, runs):
         raise ValueError(
             f"{folder}: the campaign is not finished: jaxslam consistency --resume {folder}"
@@ -152,43 +163,37 @@ def load(folder: str | Path) -> Campaign:
     _, limit, summaries = summaries_of(tallies)
     entries = ("scenario", "source", "published", "steps", "dtype")
     return Campaign(
-        **{name: found[name] for name in (*entries, *TIMES)},
+        **{name: result[name] for name in (*entries, *TIMES)},
         runs=runs,
         divergence_limit=float(limit),
-        filters={name: replace(one, doubts=doubts[name]) for name, one in summaries.items()},
+        filters={
+            name: replace(summary, doubts=doubts[name]) for name, summary in summaries.items()
+        },
         run_numbers=tallies[BOUND].numbers(),
     )
 
 
-def _checked(found: Any, campaign: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
+def _doubts_of(result: Any, campaign: Mapping[str, str]) -> dict[str, tuple[str, ...]]:
     """The doubts of each filter in the JSON of a report.
 
-    Raises one of several errors if it is not that of a campaign of this identity.
+    Raises one of several errors if the JSON is not of a campaign of this identity.
     """
-    filters, published, step_seconds = (found[key] for key in ("filters", "published", TIMES[2]))
-    texts = [found[name] for name in ("scenario", "source", "dtype")]
-    numbers = [*(found[name] for name in TIMES[:2]), *step_seconds.values()]
+    filters, published, step_seconds = (result[key] for key in ("filters", "published", TIMES[2]))
+    texts = [result[name] for name in ("scenario", "source", "dtype")]
+    numbers = [*(result[name] for name in TIMES[:2]), *step_seconds.values()]
     numbers += [value for row in published.values() for value in row.values()]
     doubts = {name: tuple(entry["doubts"]) for name, entry in filters.items()}
-    texts += [text for each in doubts.values() for text in each]
+    texts += [doubt for doubts_of_filter in doubts.values() for doubt in doubts_of_filter]
     if (
         not all(isinstance(text, str) for text in texts)
         or not all(isinstance(entry["doubts"], list) for entry in filters.values())
         or not all(map(is_number, numbers))
-        or not all(type(found[name]) is int and found[name] >= 1 for name in ("runs", "steps"))
+        or not all(type(result[name]) is int and result[name] >= 1 for name in ("runs", "steps"))
         or ", ".join(doubts) != campaign.get("filters", ", ".join(doubts))
-        or str(found["steps"]) != campaign.get("steps", str(found["steps"]))
+        or str(result["steps"]) != campaign.get("steps", str(result["steps"]))
     ):
         raise ValueError("not the results of this campaign")
     return doubts
-
-
-def _holds(path: Path, text: object) -> bool:
-    """Whether a file has this text."""
-    try:
-        return path.read_text(encoding="utf-8") == text
-    except (OSError, ValueError):
-        return False
 
 
 def notebook(campaign: Campaign) -> str:
@@ -197,8 +202,10 @@ def notebook(campaign: Campaign) -> str:
     from jaxslam.results.plot._style import png
 
     drawings = _drawings(campaign, None)
-    shown = ((name, *drawings[name]) for name in _IN_NOTEBOOK)
-    figures = {name: (caption, make()) for name, caption, make in shown}
+    figures = {}
+    for name in _IN_NOTEBOOK:
+        caption, draw = drawings[name]
+        figures[name] = caption, draw()
     return page.fragment(campaign, figures, partial(png, dpi=110))
 
 
@@ -210,8 +217,8 @@ def _drawings(
     from jaxslam.results.plot._landmarks import run_map_figure
     from jaxslam.results.plot._pose_errors import run_errors_figure
 
-    bound = any("bound_position" in found.curves for found in campaign.filters.values())
-    found = {
+    bound = any("bound_position" in summary.curves for summary in campaign.filters.values())
+    drawings = {
         "nees": ("NEES against time, with its 95 % band", partial(plot.nees_figure, campaign)),
         "rmse": (
             "RMSE, and the conditional Cramér-Rao bound" if bound else "RMSE",
@@ -232,11 +239,11 @@ def _drawings(
         title = f"{campaign.scenario}, run 0" + ("" if seed is None else f" of seed {seed}")
         if len(campaign.first) == 1 < len(campaign.filters):
             title += f", {next(iter(campaign.first))}"
-        found |= {
+        drawings |= {
             "errors": (f"Errors: {title}", partial(run_errors_figure, campaign, title=title)),
             "map": (f"Maps: {title}", partial(run_map_figure, campaign, title=title)),
         }
-    return found
+    return drawings
 
 
 publish("jaxslam", load)

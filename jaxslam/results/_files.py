@@ -59,15 +59,17 @@ def versions() -> dict[str, str]:
     }
 
 
-def check_formats(caller: str, given: str | Iterable[str], known: Sequence[str]) -> tuple[str, ...]:
-    """The given formats, each once; ValueError on an unknown one."""
-    expected = f"{caller}: expected formats of {', '.join(known)}"
+def check_formats(
+    caller: str, formats: str | Iterable[str], allowed: Sequence[str]
+) -> tuple[str, ...]:
+    """The formats, each once; ValueError on one that is not allowed."""
+    expected = f"{caller}: expected formats of {', '.join(allowed)}"
     try:
-        kinds = tuple(dict.fromkeys([given] if isinstance(given, str) else given))
+        kinds = tuple(dict.fromkeys([formats] if isinstance(formats, str) else formats))
     except TypeError:
-        raise ValueError(f"{expected}, or () for none, got {given!r}") from None
+        raise ValueError(f"{expected}, or () for none, got {formats!r}") from None
     for kind in kinds:
-        if kind not in known:
+        if kind not in allowed:
             raise ValueError(f"{expected}, got {kind!r}")
     return kinds
 
@@ -98,16 +100,16 @@ def write_files(
 ) -> list[Path]:
     """Write all files or, after any error or interrupt, none; returns their paths.
 
-    They are written to a hidden folder in the target and moved into place when all are complete.
-    After an error, folders created for them are removed.
+    The files are written to a hidden folder in the target and moved into place when all are
+    complete. After an error, folders that were created for them are removed.
 
     Args:
         folder: the target, which is created if needed.
-        files: by name.
+        files: contents by name.
         replaces: patterns of names of earlier results; matching files that are not written now
             are deleted at the end.
     """
-    created = [each for each in (folder, *folder.parents) if not each.exists()]
+    created = [path for path in (folder, *folder.parents) if not path.exists()]
     for name in files:
         if (folder / name).is_dir():
             raise IsADirectoryError(f"{folder / name} cannot be written: it is a folder")
@@ -125,9 +127,9 @@ def write_files(
             for name in files:
                 os.replace(Path(hidden) / name, folder / name)
     except BaseException:
-        for each in created:
+        for path in created:
             with contextlib.suppress(OSError):  # not empty, or never created
-                each.rmdir()
+                path.rmdir()
         raise
     for pattern in replaces:
         for old in folder.glob(pattern):

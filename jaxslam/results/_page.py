@@ -46,7 +46,7 @@ figure {{ margin: 1rem 0; }} }}"""
 
 
 _UPRIGHT = 5
-"""With more filters, the table is printed on a separate landscape page."""
+"""Largest number of filters whose table is printed upright; with more it has a landscape page."""
 
 
 def campaign_page(
@@ -61,9 +61,10 @@ def campaign_page(
 
     Args:
         campaign: the campaign.
-        command, seed: those of the campaign; None without a seed.
-        versions: of the software, by name.
-        figures: in order, by name, each with its caption.
+        command: the command of the campaign.
+        seed: the seed of the campaign; None if unknown.
+        versions: versions of the software, by name.
+        figures: caption and figure by name, in order.
         draw: returns a figure as a PNG file; a cached function if the files are needed elsewhere.
     """
     heading = f"{campaign.scenario}: consistency of {with_noun(len(campaign.filters), 'filter')}"
@@ -110,9 +111,10 @@ def fragment(
     figures: Mapping[str, tuple[str, Figure]],
     draw: Callable[[Figure], bytes] = png,
 ) -> str:
-    """The campaign as HTML for a notebook: verdicts, these figures, and the measures folded.
+    """The campaign as HTML for a notebook: verdicts, figures, and the measures folded.
 
-    Arguments as for `campaign_page`. Its style does not apply to the rest of the page.
+    See `campaign_page` for the arguments. The style of the fragment does not apply to the rest of
+    the notebook.
     """
     return f"""<div class="jaxslam">
 <style>{FRAGMENT_CSS}</style>
@@ -149,7 +151,7 @@ def _figures(figures: Mapping[str, tuple[str, Figure]], draw: Callable[[Figure],
 
 def _conventions(campaign: Campaign) -> str:
     """The definitions of measures and verdicts as HTML."""
-    level, rest = _unbroken(percentage(EACH, 1)), _unbroken(percentage(1 - LEVEL))
+    level, rejected = _without_breaks(percentage(EACH, 1)), _without_breaks(percentage(1 - LEVEL))
     meanings = "\n".join(
         f"<dt>{badge(verdict)}</dt><dd>{escape(meaning)}.</dd>"
         for verdict, (_, meaning) in VERDICTS.items()
@@ -160,7 +162,7 @@ over independent runs. A run is <strong>inaccurate</strong> when its final posit
 {campaign.divergence_limit:.3g} m, 5 σ of the EKF with Jacobians at the truth, and
 <strong>divergent</strong> when it also exceeds 5 σ of what the filter claims.</p>
 <p>The <strong>verdict</strong> goes by the intervals of the pose NEES and of NIS / dof, averaged
-over time: together they reject an honest filter of a linear problem in {rest}
+over time: together they reject an honest filter of a linear problem in {rejected}
 of campaigns. An asterisk marks a verdict with a doubt:</p>
 <dl class="meanings">
 {meanings}
@@ -197,10 +199,10 @@ def verdict_list(campaign: Campaign) -> str:
         if tested and summary.not_finite_runs:
             values.append(f"averages of the {summary.counts['runs']:,} finite runs")
         lines = "".join(f'<span class="why">{line}</span>' for line in values or ["no pose NEES"])
-        label = f'<span class="name">{breakable(name)}</span>'
+        label = f'<span class="name">{with_word_breaks(name)}</span>'
         items.append(f"<li>{label}{badge(summary.verdict, summary)}{lines}</li>")
     lost = (f"{name} {phrase}" for name, phrase in table.lost_runs(campaign))
-    sentences = [*report.qualified(campaign), *lost]
+    sentences = [*report.sentences_on_verdicts(campaign), *lost]
     notes = (f'<p class="note">{escape(sentence)}.</p>' for sentence in sentences)
     return "\n".join(['<ul class="verdicts">', *items, "</ul>", *notes])
 
@@ -221,7 +223,7 @@ def badge(verdict: str, summary: Summary | None = None) -> str:
 def measures_table(campaign: Campaign) -> str:
     """The table of measures × filters as HTML; published values below them."""
     names = list(campaign.filters)
-    head = "".join(f'<th scope="col">{breakable(name)}</th>' for name in names)
+    head = "".join(f'<th scope="col">{with_word_breaks(name)}</th>' for name in names)
     parts = []
     for group, rows in groupby(table.rows_of(campaign, names), lambda row: row.group):
         title = f'<th colspan="{len(names) + 2}" scope="rowgroup">{group}</th>'
@@ -242,25 +244,25 @@ def _row(row: table.Row) -> str:
     cells = (_cell(cell, value) for cell, value in zip(row.cells, published, strict=True))
     return (
         f'<tr><th scope="row"{kind}>{escape(row.label.strip())}</th>'
-        f'<td class="honest">{escape(_unbroken(row.honest))}</td>{"".join(cells)}</tr>'
+        f'<td class="honest">{escape(_without_breaks(row.honest))}</td>{"".join(cells)}</tr>'
     )
 
 
 def _cell(cell: table.Cell, published: float | None) -> str:
     """A cell of the table as HTML; the pointer on a measure shows its interval."""
-    title, text = "", escape(_unbroken(cell_text(cell)))
+    title, text = "", escape(_without_breaks(cell_text(cell)))
     if isinstance(cell, Summary):
         text = badge(cell.verdict, cell)
     elif isinstance(cell, Average) and np.isfinite(cell.high):
         ends = f"{cell.low:.5g} to {cell.high:.5g}"
-        title = f' title="{_unbroken(percentage(EACH, 1))} interval {ends}"'
+        title = f' title="{_without_breaks(percentage(EACH, 1))} interval {ends}"'
     if published is not None:
         text += f'<span class="published">published {short(published)}</span>'
     return f"<td{title}>{text}</td>"
 
 
-def _unbroken(text: str) -> str:
-    """A text whose percentages do not break."""
+def _without_breaks(text: str) -> str:
+    """A text with no line break before a percent sign."""
     return text.replace(" %", "\N{NO-BREAK SPACE}%")
 
 
@@ -285,6 +287,6 @@ def duration(seconds: float) -> str:
     return f"{minutes} min" if minutes < 120 else f"{minutes // 60} h {minutes % 60} min"
 
 
-def breakable(name: str) -> str:
+def with_word_breaks(name: str) -> str:
     """A name escaped for HTML, with places where it may break."""
     return escape(name).replace("_", "_<wbr>")

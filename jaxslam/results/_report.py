@@ -1,8 +1,8 @@
-"""Results as text: a campaign's table, JSON and CSV; CSV of one run."""
+"""A campaign as text: its table, JSON and CSV."""
 
 import math
 import textwrap
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable
 
 import numpy as np
 
@@ -11,11 +11,11 @@ from jaxslam.consistency._intervals import EACH, LEVEL, percentage
 from jaxslam.consistency._measures.coverage import LEVELS
 from jaxslam.consistency._verdict import POWER, TESTS, TOLERANCE, honest_values
 from jaxslam.consistency.campaign import Campaign
-from jaxslam.core.types import Estimate
 from jaxslam.results._files import csv_text, json_number, json_text, text_table, versions
 from jaxslam.results._table import VERDICTS, Cell, cell_text, lost_runs, notes_on, rows_of, short
 
 _COLUMNS = 5
+"""Largest number of filters beside each other."""
 
 _WIDTH = 88
 """Characters of a line of the notes; the narrowest table has some 80."""
@@ -27,18 +27,19 @@ def campaign_table(campaign: Campaign) -> str:
     parts = [names[i : i + _COLUMNS] for i in range(0, len(names), _COLUMNS)]
     text = "\n\n".join(_columns(campaign, part) for part in parts)
     title = f"{campaign.scenario}: {campaign.size}"
+    verdicts = {summary.verdict for summary in campaign.filters.values()}
     notes = [
         "honest: the average of a consistent filter; NEES is not divided by its dof.",
         f"± or [low, high]: {percentage(EACH, 1)} interval over the runs.",
         "verdict: by two tests, whether 3 lies in the interval of the pose NEES, and 1 in that of "
         "NIS / dof, with the one that rejects. Together they reject "
         f"{percentage(1 - LEVEL)} of honest filters of a linear problem.",
-        *_explained(campaign),
+        *(f"{word}: {meaning}." for word, (_, meaning) in VERDICTS.items() if word in verdicts),
         f"inaccurate: final position error over {campaign.divergence_limit:.3g} m, 5 σ of the "
         "ideal EKF; divergent: also over 5 σ of what the filter claims.",
     ]
     notes += [f"{term}: {sentence}." for term, sentence in notes_on(campaign)]
-    notes += qualified(campaign)
+    notes += sentences_on_verdicts(campaign)
     notes += [f"{name} {phrase}" for name, phrase in lost_runs(campaign)]
     if campaign.dtype == "float32":
         notes.append(
@@ -53,13 +54,7 @@ def campaign_table(campaign: Campaign) -> str:
     return "\n".join([title, "", text, "", *lines])
 
 
-def _explained(campaign: Campaign) -> list[str]:
-    """The meanings of the verdicts in this campaign."""
-    found = {summary.verdict for summary in campaign.filters.values()}
-    return [f"{word}: {meaning}." for word, (_, meaning) in VERDICTS.items() if word in found]
-
-
-def qualified(campaign: Campaign) -> list[str]:
+def sentences_on_verdicts(campaign: Campaign) -> list[str]:
     """Sentences on the power of the tests of filters that are not rejected, and on doubts.
 
     Filters with the same sentence share it. A verdict with a doubt has an asterisk in the table.
@@ -147,19 +142,19 @@ def table_csv(campaign: Campaign) -> str:
     names = list(campaign.filters)
     ends = [f"{name}{end}" for name in names for end in ("", " low", " high")]
     rows = [
-        [row.label.strip(), row.honest, *(text for cell in row.cells for text in _three(cell))]
+        [row.label.strip(), row.honest, *(text for cell in row.cells for text in _csv_cells(cell))]
         for row in rows_of(campaign, names)
     ]
     return csv_text(["measure", "honest", *ends], rows)
 
 
-def _three(cell: Cell) -> list[str]:
+def _csv_cells(cell: Cell) -> list[str]:
     """A cell as three columns of CSV: the value and the ends of its interval."""
     if isinstance(cell, Average):
-        return [_blank(value) for value in cell]
+        return [_csv_number(value) for value in cell]
     if cell is None or isinstance(cell, Summary):
         return [cell.verdict if cell else "", "", ""]
-    return [cell.text if cell.value is None else _blank(cell.value), "", ""]
+    return [cell.text if cell.value is None else _csv_number(cell.value), "", ""]
 
 
 def as_csv(campaign: Campaign) -> str:
@@ -168,47 +163,9 @@ def as_csv(campaign: Campaign) -> str:
     nothing = np.full(campaign.steps, np.nan)  # some filters lack a curve, as of landmarks
     rows: list[list[str]] = []
     for name, s in campaign.filters.items():
-        columns = [map(_blank, s.curves.get(key, nothing).tolist()) for key in keys]
+        columns = [map(_csv_number, s.curves.get(key, nothing).tolist()) for key in keys]
         rows += [[name, str(step + 1), *row] for step, row in enumerate(zip(*columns, strict=True))]
     return csv_text(["filter", "step", *keys], rows)
-
-
-def trajectory_csv(time: np.ndarray, estimate: Estimate) -> str:
-    """A path as CSV: per step time, pose and the upper triangle of its covariance."""
-    header = ["time", "x", "y", "theta", "c_xx", "c_xy", "c_xt", "c_yy", "c_yt", "c_tt"]
-    rows, columns = np.triu_indices(3)
-    triangle = np.asarray(estimate.pose_cov)[:, rows, columns]
-    values = np.concatenate(
-        [np.asarray(time)[:, None], np.asarray(estimate.pose), triangle], axis=1
-    )
-    # Time may be an epoch, which needs 17 digits; nine suffice for the rest.
-    return csv_text(
-        header, [[f"{row[0]:.17g}", *(f"{value:.9g}" for value in row[1:])] for row in values]
-    )
-
-
-def trajectory_tum(time: np.ndarray, estimate: Estimate) -> str:
-    """A path in the format of the TUM RGB-D benchmark: lines `t x y z qx qy qz qw`, no header.
-
-    z = 0, and the quaternion (0, 0, sin θ/2, cos θ/2) turns about z.
-    """
-    lines = []
-    for t, (x, y, theta) in zip(np.asarray(time), np.asarray(estimate.pose, float), strict=True):
-        turn = f"{np.sin(theta / 2):.9g} {np.cos(theta / 2):.9g}"
-        lines.append(f"{t:.17g} {x:.9g} {y:.9g} 0 0 0 {turn}\n")
-    return "".join(lines)
-
-
-def map_csv(estimate: Estimate, names: Sequence[int | str]) -> str:
-    """A map as CSV: per landmark its name in the data set, position and covariance."""
-    rows = []
-    for i in np.flatnonzero(np.asarray(estimate.alive)):
-        cov = np.asarray(estimate.point_covs[i])
-        values = [*np.asarray(estimate.points[i]), cov[0, 0], cov[0, 1], cov[1, 1]]
-        tag = int(estimate.tag[i])
-        name = str(names[tag]) if tag >= 0 else ""  # without a tag it has no name
-        rows.append([name, *(f"{value:.9g}" for value in values)])
-    return csv_text(["landmark", "x", "y", "c_xx", "c_xy", "c_yy"], rows)
 
 
 def _columns(campaign: Campaign, names: list[str]) -> str:
@@ -229,6 +186,6 @@ def _finite_or_none(values: Iterable[float]) -> list[float | None]:
     return [json_number(value) for value in values]
 
 
-def _blank(value: float) -> str:
+def _csv_number(value: float) -> str:
     """A number as a cell of CSV, empty if it is not finite."""
     return f"{value:.9g}" if math.isfinite(value) else ""

@@ -7,7 +7,7 @@ import numpy as np
 
 from jaxslam.consistency import Average, Summary
 from jaxslam.consistency._intervals import LEVEL, is_lopsided, percentage
-from jaxslam.consistency._measures import Measure, measures_of
+from jaxslam.consistency._measures import measures_of
 from jaxslam.consistency._measures.counts import MEANINGS, count_label
 from jaxslam.consistency._measures.nees import DOF
 from jaxslam.consistency._verdict import TESTS
@@ -38,7 +38,7 @@ VERDICTS = {
         "6: take more runs, unless a doubt says that the pose has no NEES",
     ),
 }
-"""Verdicts, each with its sign and its meaning."""
+"""The sign and the meaning of each verdict."""
 
 _ALWAYS = ("runs", "not_finite", "divergent")
 """Counts that are shown even if they are 0."""
@@ -52,7 +52,7 @@ class Figure(NamedTuple):
 
     text: str
     value: float | None = None
-    """in CSV"""
+    """the number in CSV, where the text is not written"""
 
 
 Cell: TypeAlias = Summary | Average | Figure | None
@@ -63,12 +63,12 @@ class Row(NamedTuple):
     """A row of the table, with a cell per filter."""
 
     label: str
-    """one that starts with a space belongs to the row above"""
+    """a label that starts with a space belongs to the row above"""
     honest: str
     """the value of a consistent filter, if known"""
     cells: Sequence[Cell]
     published: Sequence[float | None] = ()
-    """of each filter, if any has one"""
+    """published value of each filter; empty if no filter has one"""
     group: str = ""
     """heading above the rows, on a page"""
 
@@ -100,7 +100,9 @@ def rows_of(campaign: Campaign, names: Sequence[str]) -> list[Row]:
     """The rows of the table of some filters, without measures that none of them has."""
     summaries = [campaign.filters[name] for name in names]
     rows = [Row("verdict", "consistent", summaries)]
-    for measure in _shown(summaries):
+    for measure in measures_of(key for s in summaries for key in s.measures):
+        if not measure.row:
+            continue
         cells = [s.measures.get(measure.key) for s in summaries]
         published = [campaign.published.get(name, {}).get(measure.key) for name in names]
         has_published = any(value is not None for value in published)
@@ -110,23 +112,18 @@ def rows_of(campaign: Campaign, names: Sequence[str]) -> list[Row]:
     return rows + _bands(summaries) + _counts(campaign, names)
 
 
-def _shown(summaries: Sequence[Summary]) -> list[Measure]:
-    """The measures that tables show."""
-    return [one for one in measures_of(key for s in summaries for key in s.measures) if one.row]
-
-
 def _bands(summaries: Sequence[Summary]) -> list[Row]:
     """The rows of the bands of honest filters, and of the share of steps within them."""
     nis = [s.nis_band and Figure("[{:.4f}, {:.4f}]".format(*s.nis_band)) for s in summaries]
-    half = [s.autocorrelation_band[0] for s in summaries]
-    white = [Figure(f"± {width:.4f}") if np.isfinite(width) else None for width in half]
+    half_widths = [s.autocorrelation_band[0] for s in summaries]
+    white = [Figure(f"± {half:.4f}") if np.isfinite(half) else None for half in half_widths]
     rows = [
         Row(f"NIS / dof, {percentage(LEVEL)} band", "", nis, group="Bands"),
         Row(f"autocorrelation, {percentage(LEVEL)} band", "", white, group="Bands"),
     ]
     for block in DOF:
         shares = [s.inside.get(block) for s in summaries]
-        cells = [None if one is None else Figure(percentage(one, 1), one) for one in shares]
+        cells = [None if share is None else Figure(percentage(share, 1), share) for share in shares]
         rows.append(Row(f"steps in {block} band", percentage(LEVEL, 1), cells, group="Bands"))
     return rows
 
@@ -136,13 +133,16 @@ def _counts(campaign: Campaign, names: Sequence[str]) -> list[Row]:
     rows = []
     times = [campaign.step_seconds.get(name) for name in names]
     if any(times):
-        took = [None if one is None else Figure(f"{1e6 * one:.3g}", 1e6 * one) for one in times]
-        rows.append(Row("time of a step [µs]", "", took, group="Time and counts"))
-    every = [campaign.filters[name].counts for name in names]
-    for key in dict.fromkeys(key for counts in every for key in counts):
-        found = [counts.get(key) for counts in every]
-        if key not in _NEVER and (key in _ALWAYS or any(found)):
-            cells = [None if one is None else Figure(f"{one:,}", one) for one in found]
+        cells = [
+            None if seconds is None else Figure(f"{1e6 * seconds:.3g}", 1e6 * seconds)
+            for seconds in times
+        ]
+        rows.append(Row("time of a step [µs]", "", cells, group="Time and counts"))
+    counts_of_filters = [campaign.filters[name].counts for name in names]
+    for key in dict.fromkeys(key for counts in counts_of_filters for key in counts):
+        numbers = [counts.get(key) for counts in counts_of_filters]
+        if key not in _NEVER and (key in _ALWAYS or any(numbers)):
+            cells = [None if n is None else Figure(f"{n:,}", n) for n in numbers]
             rows.append(Row(count_label(key), "", cells, group="Time and counts"))
     return rows
 
@@ -150,15 +150,15 @@ def _counts(campaign: Campaign, names: Sequence[str]) -> list[Row]:
 def notes_on(campaign: Campaign) -> list[tuple[str, str]]:
     """Notes on the measures of this campaign: terms, each with a sentence."""
     summaries = campaign.filters
-    known = {key for summary in summaries.values() for key in summary.measures}
-    out = [one.note for one in measures_of(known) if one.note and one.key in known]
+    keys = {key for summary in summaries.values() for key in summary.measures}
+    notes = [measure.note for measure in measures_of(keys) if measure.note and measure.key in keys]
     lowest: dict[str, list[str]] = {}
     for name, summary in summaries.items():
         if summary.honest_nis < 1:
             lowest.setdefault(f"{summary.honest_nis:.3f}", []).append(name)
     if lowest:
         limits = [f"{least} ({', '.join(names)})" for least, names in lowest.items()]
-        out.append(
+        notes.append(
             (
                 "gate",
                 "a gate drops the largest innovations: an honest NIS / dof lies between "
@@ -167,24 +167,26 @@ def notes_on(campaign: Campaign) -> list[tuple[str, str]]:
         )
     likely = [s for s in summaries.values() if "log_likelihood" in s.measures]
     if len({s.counts.get("fused") for s in likely}) > 1:
-        out.append(
+        notes.append(
             (
                 "log-likelihood",
                 "comparable only between filters that fused the same measurements; their numbers "
                 "differ here",
             )
         )
-    counted = {name for s in summaries.values() for name, count in s.counts.items() if count}
-    terms = [f"{count_label(name)}, {what}" for name, what in MEANINGS.items() if name in counted]
-    return out + [("counts, over all runs", "; ".join(terms))] * bool(terms)
+    occurring = {name for s in summaries.values() for name, count in s.counts.items() if count}
+    terms = [
+        f"{count_label(name)}, {meaning}" for name, meaning in MEANINGS.items() if name in occurring
+    ]
+    return notes + [("counts, over all runs", "; ".join(terms))] * bool(terms)
 
 
 def lost_runs(campaign: Campaign) -> list[tuple[str, str]]:
     """The filters that were not finite in some runs, each with a phrase that lists the runs."""
-    out = []
+    phrases = []
     for name, summary in campaign.filters.items():
         lost = summary.not_finite_runs
         if lost:
             numbers = ", ".join(map(str, lost[:20])) + (", …" if len(lost) > 20 else "")
-            out.append((name, f"was not finite in runs {numbers}"))
-    return out
+            phrases.append((name, f"was not finite in runs {numbers}"))
+    return phrases

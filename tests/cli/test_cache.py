@@ -72,7 +72,7 @@ def test_by_default_they_are_kept_in_the_users_folder_or_where_jax_was_told(tmp_
         with cache.program_cache(None):
             one_program()
         assert len(entries(tmp_path / "told")) == 1
-        with cache.program_cache(None, none=True):
+        with cache.program_cache(None, off=True):
             assert one_program() == 0
             assert one_program(2.0) == 0
         assert len(entries(tmp_path / "told")) == 1

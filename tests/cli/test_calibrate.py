@@ -205,4 +205,4 @@ def test_constants_that_are_certain_add_nothing(tmp_path):
     folder = write(tmp_path, 10)
     known = '[calibration]\nparameters = ["scale turn"]\ncovariance = [[0.0]]\n'
     (folder / "dataset.toml").write_text(SETTINGS + known)
-    assert datasets.considered(datasets.table(folder), lambda *models: None) is None
+    assert datasets.consider_constants(datasets.table(folder), lambda *models: None) is None

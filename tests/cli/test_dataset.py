@@ -9,7 +9,9 @@ import pytest
 from matplotlib.animation import FFMpegWriter
 
 from jaxslam import _cli as cli
-from jaxslam._cli.recorded.run import NAMES, positive_definite, suspicions
+from jaxslam import catalog, datasets, filters
+from jaxslam._cli.recorded.filter_run import is_positive_definite, suspicions
+from jaxslam._cli.recorded.run import RunPlan, run_filters
 from jaxslam.results import plot
 
 
@@ -55,6 +57,17 @@ def test_run_filters_a_data_set_and_writes_its_results(tmp_path, capsys, monkeyp
     headings = 0.1 * np.arange(3)
     path = 0.1 * np.cumsum([np.cos(headings), np.sin(headings)], axis=1)
     np.testing.assert_allclose(drawn["dead_reckoning"][:, :2], path.T, atol=1e-12)
+
+
+def test_a_plan_of_python_runs_as_the_command_does(tmp_path, undrawn):
+    folder, out = write_bonn(tmp_path / "bonn"), tmp_path / "out"
+    assert cli.main(["run", "--dataset", "bonn", str(folder), "--out", str(out)]) == 0
+    data = datasets.bonn(folder)
+    ekf = filters.EkfSlam(data.motion, data.sensor, data.capacity, **data.filter_options)
+    (run,) = run_filters(RunPlan(data, {"ekf": ekf})).values()
+    summary = json.loads((out / "summary.json").read_text())
+    same = {key: value for key, value in run.summary.items() if key != "seconds"}
+    assert same == {key: summary[key] for key in same}
 
 
 def test_run_writes_films_and_says_what_is_missing(tmp_path, capsys, monkeypatch):
@@ -104,13 +117,15 @@ def test_the_help_names_whole_filters_and_only_those_of_a_data_set(monkeypatch, 
     monkeypatch.setenv("COLUMNS", "80")
     assert cli.main(["run", "--help"]) == 0
     words = capsys.readouterr().out.replace(",", " ").split()
-    assert {*NAMES} <= {word.strip(";") for word in words} and not {"ideal", "batch_map"} & {*words}
+    of_simulations = {"ideal", "batch_map"}
+    assert {*catalog.ALL} - of_simulations <= {word.strip(";") for word in words}
+    assert not of_simulations & {*words}
 
 
 def test_a_covariance_is_judged_on_the_host():
-    assert positive_definite(np.diag([1.0, 1e-12]))
-    assert not positive_definite(np.diag([1.0, -1e-12]))
-    assert not positive_definite(np.array([[1.0, np.nan], [np.nan, 1.0]]))
+    assert is_positive_definite(np.diag([1.0, 1e-12]))
+    assert not is_positive_definite(np.diag([1.0, -1e-12]))
+    assert not is_positive_definite(np.array([[1.0, np.nan], [np.nan, 1.0]]))
 
 
 def write_table(tmp_path):

@@ -9,8 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxslam import filters, motion, sensors
-from jaxslam._driver import run
+from jaxslam import filters, motion, run, sensors
 
 EXAMPLE = Path(__file__).parents[2] / "examples" / "learned_noise.py"
 SIGMA = np.array([0.03, 0.06, 0.1, 0.02])

@@ -21,8 +21,7 @@ from jaxslam._cli.recorded.laser_log import read_log
 from jaxslam._cli.recorded.make_map import SCANS_AT_ONCE
 from jaxslam.core.types import Estimate
 from jaxslam.math import numpy_poses as poses
-from jaxslam.results import _report as report
-from jaxslam.results import plot
+from jaxslam.results import plot, report
 from jaxslam.simulation._wall_geometry import is_free
 from jaxslam.simulation.laser import scan_world
 from jaxslam.simulation.scenarios import square

@@ -108,6 +108,20 @@ def test_it_writes_the_optimum(file, tmp_path, capsys, monkeypatch):
         assert part in printed
 
 
+def test_a_plan_of_python_is_solved_as_the_command_solves_it(file):
+    """By the program of the test above."""
+    plan = optimize.OptimizePlan(str(file), start="chordal")
+    optimum = optimize.solve(plan, optimize.read_problem(plan))
+    chi2 = plain.optimum(small()._replace(fixed_pose=np.arange(8) == 0))[2]
+    assert optimum.converged and list(optimum.cost_by_start) == ["chordal"]
+    np.testing.assert_allclose([optimum.chi2, optimum.cost], chi2, rtol=1e-9)
+
+
+def test_a_film_shows_the_iterations_of_one_solution():
+    with pytest.raises(ValueError, match="--animate: the kernel truncated is solved in rounds"):
+        optimize.OptimizePlan("graph.g2o", kernel="truncated", animate=True)
+
+
 @pytest.mark.sweep
 def test_a_file_of_toro_is_optimized_and_written_as_g2o(tmp_path, capsys, undrawn):
     graph = small_graphs.only(small(), "relative_pose")

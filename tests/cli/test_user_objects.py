@@ -7,11 +7,10 @@ import pytest
 from own_models import changed
 
 import jaxslam
+from jaxslam import Scenario, catalog, scenarios
 from jaxslam import _cli as cli
-from jaxslam import catalog, scenarios
 from jaxslam._cli.user_objects import UserObjects
 from jaxslam.core.protocols import Filter
-from jaxslam.simulation._worlds import Scenario
 
 MINE = """
 import dataclasses

@@ -5,7 +5,7 @@ import gzip
 import pytest
 from recordings import assert_error
 
-from jaxslam.datasets._lines import TextFile, read_bytes, stored
+from jaxslam.datasets._lines import TextFile, read_bytes, stored_file
 
 
 def text_file(path, text, *options):
@@ -59,7 +59,7 @@ def test_a_file_that_cannot_be_read_is_named(tmp_path):
 
 def test_a_packed_file_is_read_as_it_is_and_errors_name_it(tmp_path):
     (tmp_path / "f.gz").write_bytes(gzip.compress(b"1 2\n3 x\n"))
-    assert stored(tmp_path / "f") == tmp_path / "f.gz"
+    assert stored_file(tmp_path / "f") == tmp_path / "f.gz"
     for name in ("f", "f.gz"):
         file = TextFile(tmp_path / name)
         assert list(file) == [(1, ["1", "2"]), (2, ["3", "x"])]
@@ -68,7 +68,7 @@ def test_a_packed_file_is_read_as_it_is_and_errors_name_it(tmp_path):
         assert_error(tmp_path / "f.gz", 2, reason, read)
     (tmp_path / "f").write_bytes(b"plain")
     assert read_bytes(tmp_path / "f") == (tmp_path / "f", b"plain")
-    assert stored(tmp_path / "g") is None
+    assert stored_file(tmp_path / "g") is None
 
 
 PACKED = gzip.compress(b"1 2\n" * 100, mtime=0)  # workers must collect the same names

@@ -86,18 +86,22 @@ GROUPS = ("scale", "wheels", "mount", "axis")
 def test_the_constants_of_a_simulated_robot_are_found(tmp_path):
     data = datasets.mrclam(write(tmp_path, recorded()), 1, calibration=KNOWN)
     own = datasets.fit(data, calibrate=GROUPS)
-    assert own.found.converged and own.settled
-    assert own.found.names == ("forward", "outer", "turn", "curvature", "ahead", "yaw", "axis")
-    true = np.array([getattr(TRUE, name) for name in own.found.names])
-    error = own.found.parameters - true
-    assert error @ np.linalg.solve(own.found.cov, error) < 20.0  # 7 degrees of freedom: p = 0.006
-    assert (np.abs(own.found.start - true) > 4 * own.found.error).all()  # something to find
+    assert own.noise_fit.converged and own.settled
+    assert own.noise_fit.names == ("forward", "outer", "turn", "curvature", "ahead", "yaw", "axis")
+    true = np.array([getattr(TRUE, name) for name in own.noise_fit.names])
+    error = own.noise_fit.parameters - true
+    assert (
+        error @ np.linalg.solve(own.noise_fit.cov, error) < 20.0
+    )  # 7 degrees of freedom: p = 0.006
+    assert (np.abs(own.noise_fit.start - true) > 4 * own.noise_fit.error).all()  # something to find
     robot = KNOWN._replace(**own.by_name)
-    assert [getattr(robot, name) for name in own.found.names] == own.found.parameters.tolist()
+    assert [
+        getattr(robot, name) for name in own.noise_fit.names
+    ] == own.noise_fit.parameters.tolist()
     assert robot.depth == KNOWN.depth and robot.delay == KNOWN.delay
-    np.testing.assert_array_equal(own.cov[1:5, 1:5], own.found.cov[:4, :4])
+    np.testing.assert_array_equal(own.cov[1:5, 1:5], own.noise_fit.cov[:4, :4])
     assert (own.cov[5] == 0).all()  # of depth, which is held
-    assert own.found.nis_per_dof[1] == pytest.approx(1.0, abs=0.15)
+    assert own.noise_fit.nis_per_dof[1] == pytest.approx(1.0, abs=0.15)
     # The reader with these constants gives the log and the models of the fit.
     again = datasets.mrclam(tmp_path, 1, calibration=robot)
     log, motion, sensor = data.adjustable.at(jnp.asarray(own.values))

@@ -11,7 +11,7 @@ from recordings import write
 
 from jaxslam import datasets
 from jaxslam.core.types import Estimate
-from jaxslam.datasets._evaluation import evaluate
+from jaxslam.datasets import evaluate
 from jaxslam.math.numpy_poses import compose
 
 OWN = {

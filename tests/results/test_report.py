@@ -9,12 +9,13 @@ import numpy as np
 import pytest
 import worlds
 
-from jaxslam.catalog import ALL
+from jaxslam import catalog
 from jaxslam.consistency import Average
 from jaxslam.consistency._measures import BUILT_IN
 from jaxslam.core.types import Estimate
 from jaxslam.results import _files as files
 from jaxslam.results import _report as report
+from jaxslam.results.report import trajectory_tum
 
 WORLD = worlds.ring()
 
@@ -73,7 +74,7 @@ def test_filters_of_which_the_same_is_said_share_a_sentence(campaign):
     other = dataclasses.replace(one, noticed={"nees_pose": (0.0, 6.0)})
     both = dataclasses.replace(campaign, filters={"a": one, "b": one, "c": other})
     power = "not rejected, with 90 % power to reject a pose NEES"
-    assert report.qualified(both) == [
+    assert report.sentences_on_verdicts(both) == [
         f"{power} and a NIS / dof outside: a [1, 5] and [0.9, inf]; b [1, 5] and [0.9, inf]",
         f"{power} outside: c [0, 6]",
         "a, b, c*: a doubt",
@@ -82,7 +83,7 @@ def test_filters_of_which_the_same_is_said_share_a_sentence(campaign):
 
 def test_what_a_filter_does_not_estimate_has_no_number():
     """The log-likelihood of dead reckoning, the map of localization."""
-    filters = {name: ALL[name](WORLD) for name in ("dead_reckoning", "localization")}
+    filters = {name: catalog.ALL[name](WORLD) for name in ("dead_reckoning", "localization")}
     reckoned, localized = worlds.campaign(WORLD, filters, 2).filters.values()
     assert "log_likelihood" not in reckoned.measures and "rmse_landmarks" not in localized.measures
     assert "log_likelihood" in localized.measures
@@ -147,9 +148,7 @@ def test_an_unwritable_folder_is_refused_beforehand(tmp_path):
 def test_a_path_in_the_format_of_tum():
     pose = np.array([[1.0, -2.0, np.pi / 2], [0.25, 0.0, -3.0]])
     nothing = np.zeros((2, 0))
-    text = report.trajectory_tum(
-        np.array([1248272273.125, 1248272274.0]), Estimate(pose, *[nothing] * 5)
-    )
+    text = trajectory_tum(np.array([1248272273.125, 1248272274.0]), Estimate(pose, *[nothing] * 5))
     rows = np.array([line.split() for line in text.splitlines()], float)
     assert text.startswith("1248272273.125 1 -2 0 0 0 ")
     np.testing.assert_allclose(np.linalg.norm(rows[:, 4:], axis=1), 1, rtol=1e-8)

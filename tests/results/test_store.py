@@ -10,7 +10,7 @@ import signal
 import pytest
 from stored import SETTINGS, files, fill, spans
 
-from jaxslam.results import _store as store
+from jaxslam import store
 
 
 def test_a_renamed_or_foreign_block_is_set_aside(made, tmp_path):

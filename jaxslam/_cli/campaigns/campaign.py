@@ -1,4 +1,4 @@
-"""What a call of `jaxslam consistency` asks for, and the folder of its results."""
+"""The checked options of `jaxslam consistency`, and the folder of its results."""
 
 import argparse
 import json
@@ -15,7 +15,8 @@ from jaxslam._cli.common import OUT, check_out, chosen_devices
 from jaxslam.consistency.campaign._pieces import missing_pieces
 from jaxslam.core._numbers import check_count
 from jaxslam.results import _campaign_files as campaign_files
-from jaxslam.results import _store as store
+from jaxslam.results import store
+from jaxslam.results._block_files import MANIFEST, is_unfinished, read_manifest
 from jaxslam.results._campaign_files import BLOCKS, RESULT
 from jaxslam.results._files import Json
 
@@ -48,11 +49,11 @@ class Spec:
     animate: bool
     overwrite: bool
     settings: Mapping[str, object] = field(default_factory=dict)
-    """those that a campaign began with which is continued"""
+    """settings stored by the campaign that is continued; empty for a new one"""
 
 
 def spec_of(options: argparse.Namespace) -> Spec:
-    """The checked options; a campaign that is continued supplies those that are not given.
+    """The checked options; a campaign that is continued supplies the options left out.
 
     Raises ValueError that names the option, and OSError where no file can be written.
     """
@@ -84,17 +85,18 @@ def spec_of(options: argparse.Namespace) -> Spec:
 def _campaign(
     options: argparse.Namespace,
 ) -> tuple[CampaignOptions, Mapping[str, object], int | None]:
-    """The campaign, the settings that one began with which is continued, and its size of blocks.
+    """The options of the campaign, the settings stored by a campaign that is continued, and the
+    size of its blocks.
 
-    A folder that holds a campaign of the same options is continued. With --resume its options are
-    taken where the command does not give them, else the defaults.
+    A folder that holds a campaign of the same options is continued. With --resume the options of
+    that campaign replace those left out, else the defaults do.
     """
-    given = {n: value for n, value in vars(options).items() if n in CampaignOptions._fields}
+    chosen = {n: value for n, value in vars(options).items() if n in CampaignOptions._fields}
     folder = options.resume or options.out or OUT
     if options.resume is None:
-        given = CampaignOptions(**given)._asdict()
-        if options.overwrite or not (folder / BLOCKS / store.MANIFEST).exists():
-            return CampaignOptions(**given), {}, options.block
+        chosen = CampaignOptions(**chosen)._asdict()
+        if options.overwrite or not (folder / BLOCKS / MANIFEST).exists():
+            return CampaignOptions(**chosen), {}, options.block
     elif options.out is not None and options.out.resolve() != folder.resolve():
         raise ValueError(
             f"--resume: its results go to {folder}: expected no --out, got {options.out}"
@@ -106,14 +108,14 @@ def _campaign(
             f"--resume: {folder} holds a campaign that was begun from Python; continue it there, "
             "with monte_carlo(keep=jaxslam.store.resume(folder))"
         )
-    if different := _differences(stored, given):
+    if different := _differences(stored, chosen):
         option = "--out" if options.resume is None else "--resume"
         raise ValueError(
             f"{option}: {folder} holds another campaign: {different}: choose another folder with "
             "--out, or continue it with --resume and without these options, or replace it with "
             "--overwrite"
         )
-    if (runs := given.get("runs")) is not None and runs < (kept.runs or 0):
+    if (runs := chosen.get("runs")) is not None and runs < (kept.runs or 0):
         raise ValueError(
             f"--runs: the campaign in {folder} is to have {kept.runs} runs: expected at least as "
             f"many, got {runs}; --resume {folder} without --runs has all of them; or choose "
@@ -122,26 +124,26 @@ def _campaign(
     # Blocks of another size would round differently.
     block = kept.settings.get("block") if options.block is None else options.block
     assert isinstance(block, int | None)
-    return CampaignOptions(**(stored | {"runs": kept.runs} | given)), kept.settings, block
+    return CampaignOptions(**(stored | {"runs": kept.runs} | chosen)), kept.settings, block
 
 
 def _part(options: argparse.Namespace) -> tuple[int, int] | None:
-    """The part (i, n) of the runs that --part names; ValueError where it is none."""
+    """The part (i, n) of the runs that --part names; ValueError on other text."""
     if options.part is None:
         return None
-    found = re.fullmatch(r"(\d+)/(\d+)", options.part, re.ASCII)
-    if found is None or not 1 <= int(found[1]) <= int(found[2]):
+    match = re.fullmatch(r"(\d+)/(\d+)", options.part, re.ASCII)
+    if match is None or not 1 <= int(match[1]) <= int(match[2]):
         raise ValueError(f"--part: expected I/N with 1 <= I <= N, as 3/16, got {options.part!r}")
     if options.overwrite:
         raise ValueError("--part: expected no --overwrite with it")
-    return int(found[1]), int(found[2])
+    return int(match[1]), int(match[2])
 
 
-def _differences(stored: Mapping[str, object], given: Mapping[str, object]) -> str:
-    """A phrase on every option whose stored value is another; "" where all agree."""
+def _differences(stored: Mapping[str, object], options: Mapping[str, object]) -> str:
+    """A phrase on each option whose stored value differs; "" if all agree."""
     return "; ".join(
         f"--{name} is {_as_option(stored[name])} there, {_as_option(value)} here"
-        for name, value in given.items()
+        for name, value in options.items()
         if name in stored and stored[name] != value
     )
 
@@ -154,14 +156,14 @@ def _as_option(value: object) -> str:
 
 
 def open_store(spec: Spec) -> store.Store:
-    """The store of the campaign's blocks, in a new folder or in that of the campaign continued."""
+    """The store of the campaign's blocks, in a new folder or in the folder that is continued."""
     out, folder = spec.out, spec.out / BLOCKS
     settings: Mapping[str, object] = spec.settings
-    if spec.overwrite and (folder / store.MANIFEST).exists():
-        store.read_manifest(folder)  # raises where the folder is not a campaign's
+    if spec.overwrite and (folder / MANIFEST).exists():
+        read_manifest(folder)  # raises where the folder is not a campaign's
         shutil.rmtree(folder)
     if not settings:
-        if folder.exists() and not all(map(store.is_unfinished, folder.iterdir())):
+        if folder.exists() and not all(map(is_unfinished, folder.iterdir())):
             raise ValueError(
                 f"--out: {folder} holds files that are no campaign's: choose another folder"
             )
@@ -170,13 +172,15 @@ def open_store(spec: Spec) -> store.Store:
                 f"--out: {out} holds the results of a campaign: add --overwrite to replace them, "
                 "or choose another folder"
             )
-        asked = {name: v for name, v in spec.campaign._asdict().items() if name != "runs"}
-        settings = {"asked": asked, "block": spec.block}
+        # Without the number of runs, which --resume may raise.
+        campaign = {name: v for name, v in spec.campaign._asdict().items() if name != "runs"}
+        settings = {"asked": campaign, "block": spec.block}
         if spec.part is not None:
             settings = {"devices": len(spec.devices), **settings}
     elif spec.part is not None:
-        mine = {"block": spec.block, "devices": len(spec.devices)}
-        if different := _differences({"devices": None, **settings}, mine):
+        # All parts must divide the runs into the same blocks.
+        division = {"block": spec.block, "devices": len(spec.devices)}
+        if different := _differences({"devices": None, **settings}, division):
             raise ValueError(
                 f"--part: {out} holds another campaign: {different}: give all parts the same "
                 "options, or begin another campaign with --out in another folder"
@@ -185,12 +189,12 @@ def open_store(spec: Spec) -> store.Store:
 
 
 def earlier_results(out: Path, keep: store.Store) -> Json | None:
-    """The results of a finished campaign in a folder; None without them or where runs miss."""
+    """The results of a finished campaign in a folder; None without one, or if runs are missing."""
     assert keep.runs is not None
     if missing_pieces(keep.spans(), keep.runs, keep.runs):
         return None
     try:
-        found: Json = json.loads((out / RESULT).read_text(encoding="utf-8"))
-        return found if found["runs"] == keep.runs else None
+        result: Json = json.loads((out / RESULT).read_text(encoding="utf-8"))
+        return result if result["runs"] == keep.runs else None
     except (OSError, ValueError, LookupError, TypeError):
         return None

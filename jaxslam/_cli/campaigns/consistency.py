@@ -124,15 +124,15 @@ def run_campaign(options: argparse.Namespace, command: str) -> int:
     jax.config.update("jax_enable_x64", True)
     if options.executor is not None and options.devices != "all":
         raise ValueError("--executor: each worker has one device: expected no --devices with it")
-    spec = spec_of(options)
-    asked, part, user = spec.campaign, spec.part, UserObjects()
-    scenario = user.scenario(asked.scenario, asked.steps)
-    filters = user.filters(asked.filters, scenario)
+    spec, user = spec_of(options), UserObjects()
+    scenario = user.scenario(spec.campaign.scenario, spec.campaign.steps)
+    filters = user.filters(spec.campaign.filters, scenario)
+    runs, part = spec.campaign.runs, spec.part
     if part is not None:
         block = spec.block or fitting_block(scenario, filters, spec.devices[0])
         spec = replace(spec, block=block)
-        if (part[0] - 1) * block * len(spec.devices) >= asked.runs:
-            print(f"part {part[0]} of {part[1]} has no block of the {asked.runs:,} runs")
+        if (part[0] - 1) * block * len(spec.devices) >= runs:
+            print(f"part {part[0]} of {part[1]} has no block of the {runs:,} runs")
             return 0
     keep = open_store(spec)
     earlier = None if part else earlier_results(spec.out, keep)
@@ -141,13 +141,13 @@ def run_campaign(options: argparse.Namespace, command: str) -> int:
             campaign = monte_carlo(
                 scenario,
                 filters,
-                asked.runs,
-                jax.random.key(asked.seed),
+                runs,
+                jax.random.key(spec.campaign.seed),
                 block=spec.block,
                 devices=None if executor else spec.devices,
                 workers=workers,
-                bound=asked.bound,
-                dtype=asked.dtype,
+                bound=spec.campaign.bound,
+                dtype=spec.campaign.dtype,
                 keep=keep,
                 part=part,
                 executor=executor,
@@ -162,24 +162,27 @@ def run_campaign(options: argparse.Namespace, command: str) -> int:
         if not isinstance(stop, Interrupted | Incomplete) or stop.campaign is None:
             raise
         print(stop.campaign)
-        what = "interrupted, " if isinstance(stop, Interrupted) else ""
-        print(f"\njaxslam: {what}{stop}; --resume {spec.out} continues it", file=sys.stderr)
-        return INTERRUPTED if what else FAILED
+        is_interrupted = isinstance(stop, Interrupted)
+        print(
+            f"\njaxslam: {'interrupted, ' * is_interrupted}{stop}; --resume {spec.out} "
+            "continues it",
+            file=sys.stderr,
+        )
+        return INTERRUPTED if is_interrupted else FAILED
     for sentence in keep.set_aside:
         print(f"jaxslam: {sentence}", file=sys.stderr)
     if part is not None:
         print(
             f"part {part[0]} of {part[1]} is done, {campaign.runs:,} runs; {keep.folder} holds "
-            f"{keep.done():,} of {asked.runs:,}; jaxslam consistency --resume {spec.out} computes "
+            f"{keep.done():,} of {runs:,}; jaxslam consistency --resume {spec.out} computes "
             "what is missing, and sums up"
         )
-    else:
-        if keep.set_aside:  # some runs were computed again
-            earlier = None
-        status = _write(spec, scenario, filters, campaign, earlier, command)
-        is_wrong = any(is_faulty(summary.counts) for summary in campaign.filters.values())
-        return FAILED if is_wrong else status
-    return 0
+        return 0
+    if keep.set_aside:  # some runs were computed again
+        earlier = None
+    status = _write(spec, scenario, filters, campaign, earlier, command)
+    is_wrong = any(is_faulty(summary.counts) for summary in campaign.filters.values())
+    return FAILED if is_wrong else status
 
 
 def _write(
@@ -190,9 +193,9 @@ def _write(
     earlier: Json | None,
     command: str,
 ) -> int:
-    """Print a campaign and write its files; those of a finished one stay as they are.
+    """Print a campaign and write its files; returns the exit status.
 
-    Returns the exit status.
+    The files of a campaign that was finished earlier stay as they are.
     """
     out, seed = spec.out, spec.campaign.seed
     names = campaign_files.file_names(spec.figures)
@@ -208,14 +211,15 @@ def _write(
         return _write_films(out, scenario, filters, seed, campaign.dtype)
 
     if earlier is not None and all((out / name).exists() for name in names):
-        more = "but films" if spec.animate else "and nothing written"
+        written = "but films" if spec.animate else "and nothing written"
         print(
-            f"\n{out} holds this campaign, finished: nothing was run {more}; "
+            f"\n{out} holds this campaign, finished: nothing was run {written}; "
             f"--runs above {campaign.runs} extends it"
         )
         return film()
     if not campaign.first:
-        # Run 0 was computed by an earlier command: once more, of the first filter with a map.
+        # An earlier command computed run 0, which the figure of a run needs: run the first filter
+        # with a map over it once more.
         mapping = [n for n, s in campaign.filters.items() if "rmse_landmarks" in s.measures]
         name = next(iter(mapping or campaign.filters))
         key = jax.random.key(seed)

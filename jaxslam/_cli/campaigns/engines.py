@@ -12,7 +12,7 @@ from jaxslam.core._optional import first_line, loading
 
 _MPI = "mpiexec -n 4 python -m mpi4py.futures -m jaxslam consistency --executor mpi …"
 _TIMEOUT = 10
-"""for an address that does not answer [s]"""
+"""Time to wait for an address that does not answer [s]."""
 
 
 @contextlib.contextmanager
@@ -24,17 +24,18 @@ def engine(value: str | None) -> Iterator[tuple[Executor | None, int | None]]:
     """
     if value is None:
         yield None, None
-    elif found := re.fullmatch(r"processes:([1-9]\d*)", value, re.ASCII):
-        pool = Processes(int(found[1]))
+    elif match := re.fullmatch(r"processes:([1-9]\d*)", value, re.ASCII):
+        pool = Processes(int(match[1]))
         try:
-            yield pool, 2 * int(found[1])
+            # Two blocks for each worker: the second waits while the first is computed.
+            yield pool, 2 * int(match[1])
         finally:
             pool.shutdown()
     elif value == "mpi":
-        with _of_mpi() as pool:
+        with _mpi_pool() as pool:
             yield pool, 2 * pool.num_workers
-    elif found := re.fullmatch(r"dask://(.+:\d+)", value, re.ASCII):
-        with _client(found[1]) as client:
+    elif match := re.fullmatch(r"dask://(.+:\d+)", value, re.ASCII):
+        with _dask_client(match[1]) as client:
             yield client.get_executor(pure=False), 2 * sum(client.nthreads().values())
     else:
         raise ValueError(
@@ -42,7 +43,8 @@ def engine(value: str | None) -> Iterator[tuple[Executor | None, int | None]]:
         )
 
 
-def _of_mpi() -> Any:
+def _mpi_pool() -> Any:
+    """The pool of the ranks of mpiexec."""
     with loading("--executor", "mpi4py"):
         from mpi4py import MPI
         from mpi4py.futures import MPIPoolExecutor
@@ -53,7 +55,8 @@ def _of_mpi() -> Any:
     return MPIPoolExecutor()
 
 
-def _client(address: str) -> Any:
+def _dask_client(address: str) -> Any:
+    """The client of a Dask scheduler that has a worker."""
     with loading("--executor", "distributed"):
         from distributed import Client
     connected: Future[Any] = Future()
@@ -64,7 +67,7 @@ def _client(address: str) -> Any:
         except BaseException as error:
             connected.set_exception(error)
 
-    # In a thread, since Dask waits for ever for a service that is not its own, as of HTTP.
+    # In a thread, since Dask waits for ever for a service of another kind, as of HTTP.
     Thread(target=connect, daemon=True).start()
     try:
         client = connected.result(timeout=1.5 * _TIMEOUT)

@@ -18,9 +18,9 @@ Rows: TypeAlias = tuple[tuple[PyTree, ...], PyTree]
 """Results of each step, and of the watched steps: arrays with leading T."""
 
 PIECES = 20
-"""Number of pieces of a log, unless they exceed `MAX_STEPS`."""
+"""Number of pieces of a log, unless they exceed `MAX_STEPS`: the progress moves by 5 %."""
 MAX_STEPS = 500
-"""Largest number of steps of a piece."""
+"""Largest number of steps of a piece, after which the state is checked."""
 
 
 class PiecewiseRun(NamedTuple):
@@ -36,15 +36,15 @@ class PiecewiseRun(NamedTuple):
     last: Estimate
     """the estimate after the last step"""
     final: State
-    """the state of the filter after it"""
+    """the state of the filter after the last step"""
     checked: list[int]
     """the steps, from 1, after which the state was checked"""
     passed: list[bool]
-    """the results of these checks"""
+    """the result of each check"""
     estimates: Estimate | None = None
     """the whole estimates (F, …) after the watched steps, if any"""
     watched: PyTree = None
-    """the results of `watch` after the same steps"""
+    """the results of `watch` after the watched steps"""
     kept: PyTree = None
     """the results of `keep`, leading T"""
 
@@ -68,11 +68,11 @@ def run_in_pieces(
 
     Args:
         log: T rows of arrays in the dtype of the arithmetic.
-        progress: called after each piece with the steps done and their total.
+        progress: called after each piece with the number of steps done and of all steps.
         check: called after each piece with the state of the filter.
-        seed: of the random numbers of a particle filter.
-        at: the watched steps, counted from 0, in order: the whole estimate after each is kept, and
-            `watch` of the state. Default none.
+        seed: seed of the random numbers of a particle filter.
+        at: the watched steps, counted from 0, in order: the whole estimate after each of them is
+            kept, and `watch` of the state. Default none.
         keep: called with the info of each step.
     """
     total = log.control.shape[0]
@@ -83,41 +83,53 @@ def run_in_pieces(
         to_predict, to_update = jax.random.split(jax.random.fold_in(key, number))
         state = filter.predict(state, row.control, to_predict)
         state, info = filter.update(state, row.scan, to_update)
-        now = filter.estimate(state)
-        kept = info.status, info.slot, info.nis, info.dof, info.log_likelihood, keep(info)
-        return state, ((now.pose, now.pose_cov, *kept), None if at is None else (now, watch(state)))
+        estimate = filter.estimate(state)
+        row_results = (
+            estimate.pose,
+            estimate.pose_cov,
+            info.status,
+            info.slot,
+            info.nis,
+            info.dof,
+            info.log_likelihood,
+            keep(info),
+        )
+        return state, (row_results, None if at is None else (estimate, watch(state)))
 
     @jax.jit
     def piece(
         state: State, rows: Log, count: jax.Array, before: jax.Array
     ) -> tuple[State, Rows, Estimate]:
-        def one(i: jax.Array, carry: tuple[State, Rows]) -> tuple[State, Rows]:
-            state, kept = carry
-            state, new = step(state, jax.tree.map(lambda leaf: leaf[i], rows), before + i)
-            return state, jax.tree.map(lambda all, one: all.at[i].set(one), kept, new)
+        def add_step(i: jax.Array, carry: tuple[State, Rows]) -> tuple[State, Rows]:
+            state, results = carry
+            state, row = step(state, jax.tree.map(lambda leaf: leaf[i], rows), before + i)
+            return state, jax.tree.map(lambda leaf, value: leaf.at[i].set(value), results, row)
 
+        # A loop of `count` steps, not a scan of `size`: padding rows do not change the state.
         first = jax.tree.map(lambda leaf: leaf[0], rows)
         shapes = jax.eval_shape(step, state, first, before)[1]
-        kept = jax.tree.map(lambda leaf: jnp.zeros((size, *leaf.shape), leaf.dtype), shapes)
-        state, kept = jax.lax.fori_loop(0, count, one, (state, kept))
-        return state, kept, filter.estimate(state)
+        results = jax.tree.map(lambda leaf: jnp.zeros((size, *leaf.shape), leaf.dtype), shapes)
+        state, results = jax.lax.fori_loop(0, count, add_step, (state, results))
+        return state, results, filter.estimate(state)
 
-    kind = log.control.dtype
-    state = jax.jit(filter.init)(pose.astype(kind), pose_cov.astype(kind))
+    dtype = log.control.dtype
+    state = jax.jit(filter.init)(pose.astype(dtype), pose_cov.astype(dtype))
     pieces, films, checked, passed = [], [], [], []
     for begin in range(0, total, size):
         end = min(begin + size, total)
         rows = jax.tree.map(lambda leaf, a=begin, b=end: padded_rows(leaf[a:b], size), log)
-        state, kept, last = piece(state, rows, jnp.asarray(end - begin), jnp.asarray(begin))
-        pieces.append(jax.tree.map(lambda leaf, n=end - begin: np.asarray(leaf)[:n], kept[0]))
+        state, (of_steps, of_film), last = piece(
+            state, rows, jnp.asarray(end - begin), jnp.asarray(begin)
+        )
+        pieces.append(jax.tree.map(lambda leaf, n=end - begin: np.asarray(leaf)[:n], of_steps))
         if at is not None:
             chosen = at[(at >= begin) & (at < end)] - begin
-            films.append(jax.tree.map(lambda leaf, a=chosen: np.asarray(leaf)[a], kept[1]))
+            films.append(jax.tree.map(lambda leaf, a=chosen: np.asarray(leaf)[a], of_film))
         progress(end, total)
         if check is not None:
             checked.append(end)
             passed.append(check(state))
-    pose, cov, status, slot, nis, dof, log_likelihood, info = jax.tree.map(
+    pose, cov, status, slot, nis, dof, log_likelihood, kept = jax.tree.map(
         lambda *parts: np.concatenate(parts), *pieces
     )
     path = last._replace(pose=pose, pose_cov=cov, points=(), point_covs=(), alive=(), tag=())
@@ -137,11 +149,11 @@ def run_in_pieces(
         passed=passed,
         estimates=estimates,
         watched=watched,
-        kept=info,
+        kept=kept,
     )
 
 
 def padded_rows(rows: JaxOrNumPy, size: int) -> np.ndarray:
-    """The rows with zeros appended up to `size` of them."""
+    """The rows, padded with zeros to `size` rows."""
     rows = np.asarray(rows)
     return np.pad(rows, [(0, size - len(rows)), *[(0, 0)] * (rows.ndim - 1)])

@@ -58,6 +58,7 @@ def fit_folder(options: argparse.Namespace, command: str) -> int:
     result = fit(data, calibrate=calibrated, fixed=fixed)
     print(_table(data, result))
     groups = [parameter.group for parameter in result.parameters]
+    # fit.toml replaces the numbers of the groups that were to be fitted, held ones among them too.
     kept = np.flatnonzero([group in ("noise", *calibrated) for group in groups])
     fitted = fitted_text([result.parameters[i] for i in kept], result.cov[np.ix_(kept, kept)])
     files: Files = {
@@ -67,9 +68,12 @@ def fit_folder(options: argparse.Namespace, command: str) -> int:
         FITTED: fitted,
     }
     written = write_files(options.out, files)
-    confounded = [one.name for one in result.parameters if one.group != "noise"]
-    confounded = [name for name in confounded if name in result.found.loose]
-    good = result.found.converged and result.settled and not confounded
+    confounded = [
+        parameter.name
+        for parameter in result.parameters
+        if parameter.group != "noise" and parameter.name in result.noise_fit.loose
+    ]
+    good = result.noise_fit.converged and result.settled and not confounded
     if options.write and good:
         written += write_files(Path(options.path), {FITTED: fitted})
     print("\nwrote " + ", ".join(map(str, written)))
@@ -86,9 +90,14 @@ def fit_folder(options: argparse.Namespace, command: str) -> int:
 
 def _summary(data: Dataset, result: DatasetFit) -> Json:
     """The content of `fit.json`; infinite numbers are null."""
-    found = result.found
+    estimate = result.noise_fit
     rows = zip(
-        found.names, found.start, found.parameters, found.error, found.robust_error, strict=True
+        estimate.names,
+        estimate.start,
+        estimate.parameters,
+        estimate.error,
+        estimate.robust_error,
+        strict=True,
     )
     return {
         "dataset": data.name,
@@ -101,21 +110,21 @@ def _summary(data: Dataset, result: DatasetFit) -> Json:
                 "after": float(after),
                 "standard error": json_number(error),
                 "robust error": json_number(robust),
-                "upper limit, 95 %": found.upper.get(name),
+                "upper limit, 95 %": estimate.upper.get(name),
                 "not determined, confounded with": (
-                    list(found.loose[name]) if name in found.loose else None
+                    list(estimate.loose[name]) if name in estimate.loose else None
                 ),
             }
             for name, before, after, error, robust in rows
         },
         "held fixed": result.held,
-        "log-likelihood": list(found.log_likelihood),
-        "NIS / dof": list(found.nis_per_dof),
-        "dof": found.dof,
+        "log-likelihood": list(estimate.log_likelihood),
+        "NIS / dof": list(estimate.nis_per_dof),
+        "dof": estimate.dof,
         "innovation autocorrelation": json_number(result.autocorrelation[0]),
         "innovation autocorrelation, 95 % band": json_number(result.autocorrelation[1]),
-        "steps": len(found.path) - 1,
-        "converged": found.converged,
+        "steps": len(estimate.path) - 1,
+        "converged": estimate.converged,
         "rounds of association and gate": result.rounds,
         "associations settled": result.settled,
         "defaults taken": list(data.assumed),
@@ -124,39 +133,40 @@ def _summary(data: Dataset, result: DatasetFit) -> Json:
 
 def _table(data: Dataset, result: DatasetFit) -> str:
     """The parameters before and after with their errors, the likelihood, and notes."""
-    found = result.found
+    estimate = result.noise_fit
     lines = [["", "before", "after", "std. error", "robust"]]
-    for i, name in enumerate(found.names):
-        errors = found.error[i], found.robust_error[i]
-        shown = [f"{e:.2g}" if np.isfinite(e) and name not in found.upper else "-" for e in errors]
+    for i, name in enumerate(estimate.names):
+        errors = estimate.error[i], estimate.robust_error[i]
+        shown = [
+            f"{e:.2g}" if np.isfinite(e) and name not in estimate.upper else "-" for e in errors
+        ]
         value = (
-            f"< {found.upper[name]:.2g}" if name in found.upper else f"{found.parameters[i]:.4g}"
+            f"< {estimate.upper[name]:.2g}"
+            if name in estimate.upper
+            else f"{estimate.parameters[i]:.4g}"
         )
-        lines.append([name, f"{found.start[i]:.4g}", value, *shown])
-    before, after = found.log_likelihood
+        lines.append([name, f"{estimate.start[i]:.4g}", value, *shown])
+    before, after = estimate.log_likelihood
     lines.append(["log-likelihood", f"{before:.1f}", f"{after:.1f}", "", ""])
-    before, after = found.nis_per_dof
+    before, after = estimate.nis_per_dof
     lines.append(["NIS / dof", f"{before:.3f}", f"{after:.3f}", "", ""])
     lag, band = result.autocorrelation
     if np.isfinite(lag):
         lines.append(["autocorrelation", "", f"{lag:.3f}", f"(± {band:.2g})", ""])
-    text = text_table(lines)
-    out = ", ".join(f"{count:,} {name}" for name, count in result.left_out.items())
-    text.insert(
-        0,
-        f"{data.name}: {data.steps:,} rows, {result.used:,} measurements used"
-        + (f", others: {out}" if out else ""),
-    )
-    return "\n".join([*(line.rstrip() for line in text), "", *_notes(result)])
+    head = f"{data.name}: {data.steps:,} rows, {result.used:,} measurements used"
+    if result.left_out:
+        counts = (f"{count:,} {name}" for name, count in result.left_out.items())
+        head += f", others: {', '.join(counts)}"
+    return "\n".join([head, *map(str.rstrip, text_table(lines)), "", *_notes(result)])
 
 
 def _notes(result: DatasetFit) -> list[str]:
     """Sentences on convergence, parameters held and parameters that the log does not determine."""
-    found = result.found
-    steps = len(found.path) - 1
+    estimate = result.noise_fit
+    steps = len(estimate.path) - 1
     notes = [
         f"converged after {steps} steps"
-        if found.converged
+        if estimate.converged
         else f"NOT converged after {steps} steps: start closer, or hold a parameter (--fix)"
     ]
     if not result.settled:
@@ -165,27 +175,30 @@ def _notes(result: DatasetFit) -> list[str]:
             "or gated"
         )
     notes += [f"{name} = {value:g} was held" for name, value in result.held.items()]
-    for name, limit in found.upper.items():
+    for name, limit in estimate.upper.items():
         notes.append(
             f"{name}: this log does not distinguish it from 0; above {limit:.2g} it is unlikely "
             "(95 %, the others held)"
         )
-    for name, others in found.loose.items():
+    for name, others in estimate.loose.items():
         reason = (
             f"only together with {', '.join(others)}" if others else "its error is over a factor e"
         )
         notes.append(f"{name}: the log does not determine it ({reason}); hold it by --fix")
-    off = [
+    # If the models fit, the two kinds of errors agree.
+    contradictory = [
         name
-        for name, one, other in zip(found.names, found.error, found.robust_error, strict=True)
-        if np.isfinite(one)
-        and not 0.5 <= other / one <= 2
-        and name not in (*found.upper, *found.loose)
+        for name, error, robust in zip(
+            estimate.names, estimate.error, estimate.robust_error, strict=True
+        )
+        if np.isfinite(error)
+        and not 0.5 <= robust / error <= 2
+        and name not in (*estimate.upper, *estimate.loose)
     ]
-    if off:
+    if contradictory:
         notes.append(
-            f"{', '.join(off)}: robust and standard errors differ by over a factor 2, so the "
-            "models do not fit"
+            f"{', '.join(contradictory)}: robust and standard errors differ by over a factor 2, "
+            "so the models do not fit"
         )
     value, band = result.autocorrelation
     if abs(value) > max(band, 0.1):
@@ -193,7 +206,7 @@ def _notes(result: DatasetFit) -> list[str]:
             "successive innovations of a landmark are correlated: errors last, so standard errors "
             "are too small"
         )
-    if any(name.startswith(("motion ", "sensor ")) for name in found.names):
+    if any(name.startswith(("motion ", "sensor ")) for name in estimate.names):
         notes.append(
             "NIS / dof is near 1 after any fit of all noises; test them on another log (jaxslam "
             "run)"

@@ -180,14 +180,14 @@ def read_log(options: argparse.Namespace) -> tuple[LaserLog, dict[str, int]]:
     if not len(keep):
         raise ValueError(f"--scans: {options.scans} has none of the {total} scans of {log.source}")
     # Odometry between two selected scans is known if that of any step between them is, and none
-    # is a jump.
-    known = np.diff(np.cumsum(log.odometry_known)[keep], prepend=-1) > 0
+    # is a jump. Differences of running sums count the steps between two scans.
+    odometry_known = np.diff(np.cumsum(log.odometry_known)[keep], prepend=-1) > 0
     jumps = np.cumsum(odometry_jumps(log.raw, log.time))[keep]
-    known &= np.diff(jumps, prepend=jumps[:1]) == 0
+    odometry_known &= np.diff(jumps, prepend=jumps[:1]) == 0
     log = dataclasses.replace(
         log,
         **{name: getattr(log, name)[keep] for name in ("time", "corrected", "raw", "row")},
-        odometry_known=known,
+        odometry_known=odometry_known,
         beams=type(log.beams)(*(part[keep] for part in log.beams)),
     )
     blind = int((~np.asarray(log.beams.valid).any(axis=1)).sum())
@@ -202,21 +202,20 @@ def read_log(options: argparse.Namespace) -> tuple[LaserLog, dict[str, int]]:
 
 def bag_text(path: str) -> str:
     """The contents of a ROS bag: topics, time of the recording, mounts."""
-    found = datasets.rosbag_contents(path)
-    rows = {topic.name: {"type": topic.type, "messages": topic.count} for topic in found.topics}
-    columns = {
-        what: {name: row[what] for name, row in rows.items()} for what in ("type", "messages")
+    bag = datasets.rosbag_contents(path)
+    columns: dict[str, Json] = {
+        "type": {topic.name: topic.type for topic in bag.topics},
+        "messages": {topic.name: topic.count for topic in bag.topics},
     }
     lines = [summary_table(columns)]
-    if found.start < found.end:
+    if bag.start < bag.end:
         lines.append(
-            f"recorded from {found.start:.3f} s to {found.end:.3f} s: "
-            f"{found.end - found.start:.3f} s"
+            f"recorded from {bag.start:.3f} s to {bag.end:.3f} s: {bag.end - bag.start:.3f} s"
         )
-    lines += [f"mount of {topic}: {mount}" for topic, mount in found.lasers.items()]
-    lines += [f"odometry {pair}: {count:,} transforms" for pair, count in found.odometry.items()]
-    lines += [f"frames {pair}: {text}" for pair, text in found.frames.items()]
-    lines += found.notes
+    lines += [f"mount of {topic}: {mount}" for topic, mount in bag.lasers.items()]
+    lines += [f"odometry {pair}: {count:,} transforms" for pair, count in bag.odometry.items()]
+    lines += [f"frames {pair}: {text}" for pair, text in bag.frames.items()]
+    lines += bag.notes
     return "\n".join(lines)
 
 
@@ -251,7 +250,7 @@ def pose_of(option: str, text: str, others: str = "") -> Float[np.ndarray, "3"]:
     return pose
 
 
-def scored(log: LaserLog, score: Callable[[], Json]) -> Json:
+def score_or_reason(log: LaserLog, score: Callable[[], Json]) -> Json:
     """The score by the poses in the file; without poses, or equal ones, the reason for none."""
     if not log.placed:
         return {"score": "none: the file has no poses"}

@@ -16,11 +16,11 @@ from jaxslam.datasets import _ros_map as ros_map
 from jaxslam.laser import grids
 from jaxslam.laser.grids import Counts
 from jaxslam.math import numpy_poses as poses
-from jaxslam.results import _report as report
+from jaxslam.results import report
 from jaxslam.results._files import Files
 
 SCANS_AT_ONCE = 64
-"""Scans between two updates of the progress."""
+"""Number of scans that one call of the compiled program counts, between updates of the progress."""
 
 MARGIN = 1.0
 """Distance from the outermost hit to the border of the map [m]."""
@@ -45,7 +45,7 @@ def run_mapping(log: LaserLog, options: argparse.Namespace) -> laser_log.Job:
     laser_log.check_poses(log)
     shape, origin = map_frame(log, options.resolution)
     with Progress(f"{log.name}, map", "scans") as progress:
-        counts = counted(log, shape, origin, options.resolution, progress)
+        counts = count_beams(log, shape, origin, options.resolution, progress)
     grid = jax.device_get(grids.occupancy(counts))
     zero = np.zeros((len(log.time), 3, 3))
     path = Estimate(log.corrected, zero, *[np.zeros(0)] * 4)
@@ -60,8 +60,8 @@ def run_mapping(log: LaserLog, options: argparse.Namespace) -> laser_log.Job:
         "trajectory.csv": report.trajectory_csv(log.time, path),
         "trajectory.tum": report.trajectory_tum(log.time, path),
     }
-    known = np.asarray(grid.observed)
-    bits = np.asarray(grids.entropy(grid))[known]
+    is_known = np.asarray(grid.observed)
+    bits = np.asarray(grids.entropy(grid))[is_known]
     summary = {
         "job": "map from the poses in the file",
         "beams": {
@@ -70,10 +70,10 @@ def run_mapping(log: LaserLog, options: argparse.Namespace) -> laser_log.Job:
             "without a range, or padding": int(counts.unusable),
         },
         **laser_log.map_size(grid),
-        "cells known": int(known.sum()),
+        "cells known": int(is_known.sum()),
         "cells occupied": int((np.asarray(grid.log_odds) > 0).sum()),
         "mean entropy of a known cell [bit]": float(bits.mean()),
-        "entropy of the map [bit]": float(bits.sum() + (~known).sum()),
+        "entropy of the map [bit]": float(bits.sum() + (~is_known).sum()),
     }
     return laser_log.Job(summary, files, drawings={"map": draw})
 
@@ -104,7 +104,7 @@ def map_frame(log: LaserLog, resolution: float) -> tuple[tuple[int, int], Float[
     return (int(size[1]), int(size[0])), np.array([*low, 0.0])
 
 
-def counted(
+def count_beams(
     log: LaserLog,
     shape: tuple[int, int],
     origin: Float[np.ndarray, "3"],
@@ -121,11 +121,10 @@ def counted(
     for begin in range(0, total, SCANS_AT_ONCE):
         rows = slice(begin, begin + SCANS_AT_ONCE)
         beams = Beams(*(padded_rows(part[rows], SCANS_AT_ONCE) for part in log.beams))
-        unusable += int((~np.asarray(beams.valid)).sum()) - width * (
-            SCANS_AT_ONCE - len(log.time[rows])
-        )
+        padding = width * (SCANS_AT_ONCE - len(log.time[rows]))
+        unusable += int((~np.asarray(beams.valid)).sum()) - padding
         if beams.valid.any():
-            found = grids.count(
+            counts = grids.count(
                 shape,
                 origin,
                 resolution,
@@ -135,9 +134,9 @@ def counted(
                 no_return=0.0,
                 mount=log.mount,
             )
-            hits += np.asarray(found.hits)
-            misses += np.asarray(found.misses)
-            outside += int(found.outside)
+            hits += np.asarray(counts.hits)
+            misses += np.asarray(counts.misses)
+            outside += int(counts.outside)
         progress(min(begin + SCANS_AT_ONCE, total), total)
     sums = np.array(outside), np.array(unusable)
     return Counts(hits, misses, origin, np.array(resolution), *sums)

@@ -21,7 +21,7 @@ from jaxslam.laser import laser_slam
 from jaxslam.laser.laser_slam import LoopOutcome, Settings, Solved
 from jaxslam.laser.laser_slam._log_map import growing_maps
 from jaxslam.math.stats import chi2_quantile
-from jaxslam.results import _report as report
+from jaxslam.results import report
 from jaxslam.results._files import Files, Json, csv_text
 
 if TYPE_CHECKING:  # Matplotlib is slow to load
@@ -57,22 +57,25 @@ def add_options(parser: argparse.ArgumentParser) -> None:
 
 
 def run_slam(log: LaserLog, options: argparse.Namespace) -> laser_log.Job:
-    """Path, graph, loops and map from raw odometry and scans, scored by the poses in the file and
-    the relations of another file."""
-    given = None if options.relations is None else given_relations(options.relations, log)
+    """Compute path, graph, loops and map from raw odometry and scans.
+
+    The poses in the file, and the relations of another file, score the result.
+    """
+    # Before the work, so that a wrong file is refused at once.
+    relations_of_log = None if options.relations is None else read_relations(options.relations, log)
     settings = Settings(resolution=options.resolution)
-    solved = _solved(log, settings)
+    solved = _solve(log, settings)
     coarser = float(solved.map.resolution) > 1.001 * settings.resolution
     reference = log.corrected if log.placed else None
     files, drawings = result_files(solved), figures(solved, options.figures, reference)
     if options.animate:
         drawings["film"] = lambda: film_files({"slam": film(log, solved, settings)}, suffixed=False)
-    summary = result_summary(solved) | laser_log.scored(log, lambda: _scores(log, solved))
+    summary = result_summary(solved) | laser_log.score_or_reason(log, lambda: _scores(log, solved))
     if coarser:
         summary["requested resolution, of too many cells [m]"] = settings.resolution
-    if given is None:
+    if relations_of_log is None:
         return laser_log.Job(summary, files, drawings=drawings)
-    relations, dropped = given
+    relations, dropped = relations_of_log
     joined, scores = len(relations.first), relation_scores(relations, log, solved)
     text = (
         f"relations of {options.relations}: {joined:,} of {joined + dropped:,} join the scans, "
@@ -94,8 +97,8 @@ def run_slam(log: LaserLog, options: argparse.Namespace) -> laser_log.Job:
     return laser_log.Job(summary, files, text, {"relations": entry}, drawings)
 
 
-def _solved(log: LaserLog, settings: Settings) -> Solved:
-    """The result, with a bar of progress for each stage."""
+def _solve(log: LaserLog, settings: Settings) -> Solved:
+    """Solve, with a progress bar for each stage."""
     with memory_returned(), Progress(f"{log.name}, reading", "scans") as first:
         bars = {"": first}
 
@@ -179,7 +182,7 @@ def film(log: LaserLog, solved: Solved, settings: Settings) -> "Film":
     captions = [f"laser odometry, scan {end:,} of {until[-1]:,}" for end in until]
     captions += [f"after closing by {kept:,} loops"] * FINAL_FRAMES
     scene = map_scene(
-        [np.asarray(one.log_odds) for one in (*maps, *last)],
+        [np.asarray(grid.log_odds) for grid in (*maps, *last)],
         np.asarray(maps[0].origin),
         float(maps[0].resolution),
         paths,
@@ -207,8 +210,8 @@ def _residuals(solved: Solved) -> str:
     if solved.dof <= 0:
         return "none: without a loop nothing contradicts the matches"
     ratio = float(np.sqrt(solved.chi2 / solved.dof))
-    times, what = (ratio, "larger") if ratio > 1 else (1 / max(ratio, 1e-9), "smaller")
-    size = f"{times:.1f} times {what} than" if times > 1.05 else "as large as"
+    times, relation = (ratio, "larger") if ratio > 1 else (1 / max(ratio, 1e-9), "smaller")
+    size = f"{times:.1f} times {relation} than" if times > 1.05 else "as large as"
     return f"{size} the σ of its edges; the covariance of the path is tested by a true path only"
 
 
@@ -233,27 +236,28 @@ def _loops_csv(solved: Solved) -> str:
 def _scores(log: LaserLog, solved: laser_slam.Solved) -> dict[str, object]:
     """Errors of relations, ATE, and the number of correct loops, by the poses in the file."""
     paths = {"raw odometry": solved.raw, "laser odometry": solved.odometry, "": solved.poses}
-    out: dict[str, object] = {}
+    scores: dict[str, object] = {}
     try:
         for name, path in paths.items():
-            found = [metrics.rpe(log.corrected, path, metres=m) for m in METRES]
-            every = np.concatenate([each.translation for each in found])
-            if not len(every):
+            errors = np.concatenate(
+                [metrics.rpe(log.corrected, path, metres=m).translation for m in METRES]
+            )
+            if not len(errors):
                 raise ValueError(f"the path is shorter than {METRES[0]:g} m")
-            what = "mean relation error to 10 m [m]" + (f", {name}" if name else "")
-            out[what] = float(every.mean())
+            suffix = f", {name}" if name else ""
+            scores[f"mean relation error to 10 m [m]{suffix}"] = float(errors.mean())
         ate = metrics.ate(log.corrected, solved.poses).translation
     except ValueError as problem:
         return {"score": f"none: {problem}"}
-    score = laser_slam.closure_score(solved, log.corrected)
-    out["ATE, RMSE [m]"] = float(np.sqrt((ate**2).mean()))
-    out["loops kept that agree with the poses in the file"] = score.correct
-    if score.revisits:
-        out["recall of revisits"] = score.recall
-    return out
+    closure = laser_slam.closure_score(solved, log.corrected)
+    scores["ATE, RMSE [m]"] = float(np.sqrt((ate**2).mean()))
+    scores["loops kept that agree with the poses in the file"] = closure.correct
+    if closure.revisits:
+        scores["recall of revisits"] = closure.recall
+    return scores
 
 
-def given_relations(path: str, log: LaserLog) -> tuple[metrics.Relations, int]:
+def read_relations(path: str, log: LaserLog) -> tuple[metrics.Relations, int]:
     """The relations of a file by rows of the log, and the number without a scan at a stamp.
 
     Raises ValueError, with the file, if `relation_file` does or if no relation has its scans.
@@ -277,25 +281,25 @@ def relation_scores(relations: metrics.Relations, log: LaserLog, solved: Solved)
         "laser odometry": solved.odometry,
         "raw odometry": solved.raw,
     }
-    out: dict[str, Json] = {}
+    scores: dict[str, Json] = {}
     for name, chosen in (("all", apart >= 0), (f"over {FAR_APART:g} s apart", apart > FAR_APART)):
-        some = metrics.Relations(*(field[chosen] for field in relations))
-        count, unknown = len(some.first), int(np.isnan(nees[chosen]).sum())
+        subset = metrics.Relations(*(field[chosen] for field in relations))
+        count, unknown = len(subset.first), int(np.isnan(nees[chosen]).sum())
         inside = int((nees[chosen] <= chi2_quantile(ELLIPSE_SHARE, 3)).sum())
-        errors = {path: metrics.relation_errors(some, at) for path, at in paths.items()}
-        figures = {
-            path: {what: of._asdict() for what, of in metrics.benchmark_figures(of).items()}
-            for path, of in errors.items()
-            if count
-        }
-        out[name] = {
+        figures: Json = {}
+        for path_name, path in paths.items() if count else ():
+            by_quantity = metrics.benchmark_figures(metrics.relation_errors(subset, path))
+            figures[path_name] = {
+                quantity: figure._asdict() for quantity, figure in by_quantity.items()
+            }
+        scores[name] = {
             "relations": count,
             **figures,
             "in the 95 % ellipse": inside,
             "without a covariance": unknown,  # of a scan and itself
             "share in the 95 % ellipse": inside / (count - unknown) if count > unknown else None,
         }
-    return out
+    return scores
 
 
 def _score_text(scores: Mapping[str, Json]) -> str:
@@ -304,13 +308,11 @@ def _score_text(scores: Mapping[str, Json]) -> str:
     lines = []
     for name, score in scores.items():
         for path, figures in score.items():
-            for quantity, of in figures.items() if isinstance(figures, dict) else ():
-                cell = f"{_shown(of['mean'])} ± {_shown(of['std'])}"
+            for quantity, figure in figures.items() if isinstance(figures, dict) else ():
+                cell = f"{_decimals(figure['mean'])} ± {_decimals(figure['std'])}"
                 columns.setdefault(quantity, {})[f"{name}, {path}"] = cell
-        line, share = (
-            f"{name}: {score['relations']:,} relations",
-            score["share in the 95 % ellipse"],
-        )
+        line = f"{name}: {score['relations']:,} relations"
+        share = score["share in the 95 % ellipse"]
         if isinstance(share, float):
             line += f", {100 * share:.1f} % in the 95 % ellipse of the graph's covariance"
             if unknown := score["without a covariance"]:
@@ -319,6 +321,6 @@ def _score_text(scores: Mapping[str, Json]) -> str:
     return "\n".join([summary_table(columns), *lines])
 
 
-def _shown(value: float) -> str:
-    """Four decimals, one of numbers from 10 on."""
+def _decimals(value: float) -> str:
+    """A number with four decimals, from 10 on with one."""
     return f"{value:.4f}" if value < 10 else f"{value:,.1f}"

@@ -19,6 +19,7 @@ from jaxslam.sensors import RangeBearing, RelativePosition
 _BONN_SOURCE = (
     "C. Stachniss, Robot Mapping, course exercises, University of Freiburg and University of Bonn"
 )
+# By maximum likelihood, see `bonn`.
 _BONN_ODOMETRY_COV = np.diag([0.001, 0.001, 0.001]) ** 2
 _BONN_MEASUREMENT_COV = np.diag([0.1, 0.05]) ** 2
 
@@ -26,8 +27,8 @@ _BONN_MEASUREMENT_COV = np.diag([0.1, 0.05]) ** 2
 def bonn(folder: str | Path) -> Dataset:
     """The data set in the files `world.dat` (landmarks: id x y) and `sensor_data.dat` of a folder.
 
-    The latter has a line `ODOMETRY rot1 trans rot2` for each step, followed by lines `SENSOR id
-    range bearing` of that step. The motion is the pose increment
+    `sensor_data.dat` has a line `ODOMETRY rot1 trans rot2` for each step, followed by lines
+    `SENSOR id range bearing` of that step. The motion is the pose increment
     (trans cos rot1, trans sin rot1, rot1 + rot2). Next to a landmark the simulated noise can make a
     range negative; such a measurement has no direction, and is dropped and counted.
 
@@ -140,10 +141,10 @@ def victoria_park(path: str | Path) -> Dataset:
     """
     file = TextFile(path)
     controls: list[list[float]] = []
-    poses: dict[int, int] = {}
+    poses: dict[int, int] = {}  # index of each pose by its number in the file
     landmark_lines: list[tuple[int, int, int, list[float]]] = []
-    odometry_noise = _Constant(file, 3)
-    landmark_noise = _Constant(file, 2)
+    odometry_noise = _RepeatedCov(file, 3)
+    landmark_noise = _RepeatedCov(file, 2)
     last = -1
     for line, (keyword, *fields) in file:
         if keyword == "ODOMETRY":
@@ -175,18 +176,18 @@ def victoria_park(path: str | Path) -> Dataset:
     names = tuple(sorted({j for _, _, j, _ in landmark_lines}))
     tag_of = {name: tag for tag, name in enumerate(names)}
     first = 0 if at_start else 1
-    odometry_file = _unless_still(odometry_noise.cov) if at_start else odometry_noise.cov
+    noise = _zero_at_rest(odometry_noise.cov) if at_start else odometry_noise.cov
     time = np.arange(first, first + len(controls), dtype=np.float64)
-    seen = (
+    measurements = (
         [poses[i] for _, i, _, _ in landmark_lines],
         [tag_of[j] for _, _, j, _ in landmark_lines],
         [z for _, _, _, z in landmark_lines],
     )
     return Dataset(
         name="victoria_park",
-        log=Log.from_streams((time, controls), seen, as_recorded, time),
+        log=Log.from_streams((time, controls), measurements, as_recorded, time),
         time=time,
-        motion=PoseIncrement(odometry_file),
+        motion=PoseIncrement(noise),
         sensor=RelativePosition(landmark_noise.cov),
         tags=names,
         filter_options={"correction": "joint"},
@@ -194,7 +195,7 @@ def victoria_park(path: str | Path) -> Dataset:
     )
 
 
-class _Constant:
+class _RepeatedCov:
     """A covariance that each line repeats as its upper triangle."""
 
     def __init__(self, file: TextFile, size: int) -> None:
@@ -232,7 +233,7 @@ def _check_landmark_lines(
         seen.add((i, j))
 
 
-def _unless_still(cov: ArrayLike) -> NoiseCov:
+def _zero_at_rest(cov: ArrayLike) -> NoiseCov:
     """A noise covariance that is zero where the control is."""
 
     def noise(pose: jax.Array, u: jax.Array) -> jax.Array:

@@ -16,8 +16,8 @@ from jaxslam.datasets._landmark_logs.mrclam_robot import (
     ROBOTS,
     SOURCE,
     RobotCalibration,
-    adjustable,
-    associated,
+    adjustable_of,
+    associate,
     check_calibration,
     log_of,
     models_of,
@@ -25,7 +25,7 @@ from jaxslam.datasets._landmark_logs.mrclam_robot import (
     read_lines,
     true_fields,
 )
-from jaxslam.datasets._lines import none_left, stored
+from jaxslam.datasets._lines import none_left, stored_file
 from jaxslam.filters.multi_robot._team import TeamMotion, sensors_of
 from jaxslam.filters.multi_robot.team import Robot
 from jaxslam.sensors import Part, Suite
@@ -94,12 +94,12 @@ def mrclam(
         check_calibration("mrclam", calibration)
     subject_of, names, points, corrections = read_landmarks(Path(folder), errata)
     lines = read_lines(Path(folder), robot, calibration)
-    time = np.unique(np.concatenate([lines.odometry[:, 0], lines.seen[:, 0]]))
-    row, tag, kept, dropped = associated(lines.seen, time, subject_of, names)
+    time = np.unique(np.concatenate([lines.odometry[:, 0], lines.measurements[:, 0]]))
+    row, tag, kept, dropped = associate(lines.measurements, time, subject_of, names)
     if not tag:
-        raise none_left(f"{stored(Path(folder) / f'Robot{robot}_Measurement.dat')}:1", dropped)
+        raise none_left(f"{stored_file(Path(folder) / f'Robot{robot}_Measurement.dat')}:1", dropped)
     motion, sensor = models_of(calibration)
-    log = log_of(lines.odometry, time, row, tag, lines.seen[kept, 2:])
+    log = log_of(lines.odometry, time, row, tag, lines.measurements[kept, 2:])
     return Dataset(
         name=f"mrclam robot {robot}",
         log=log,
@@ -109,7 +109,7 @@ def mrclam(
         tags=names,
         filter_options={"correction": "sequential"},
         landmarks=points,
-        adjustable=None if calibration is None else adjustable(calibration, log, time),
+        adjustable=None if calibration is None else adjustable_of(calibration, log, time),
         dropped=dropped,
         corrections=(*corrections, *lines.corrections),
         source=SOURCE,
@@ -156,45 +156,55 @@ def mrclam_team(
     if not numbers or not good or len(set(numbers)) != len(numbers):
         raise ValueError(f"mrclam_team: expected different robots from 1 to 5, got {robots!r}")
     subject_of, names, points, corrections = read_landmarks(Path(folder), errata)
-    each: list[RobotCalibration | None] = [None] * len(numbers)
+    calibrations: list[RobotCalibration | None] = [None] * len(numbers)
     if isinstance(calibration, Mapping):
         if missing := [robot for robot in numbers if robot not in calibration]:
             raise ValueError(f"mrclam_team: robot {missing[0]} has no calibration")
-        each = [calibration[robot] for robot in numbers]
+        calibrations = [calibration[robot] for robot in numbers]
     elif calibration is not None:
-        each = [calibration] * len(numbers)
-    for constants in each:
+        calibrations = [calibration] * len(numbers)
+    for constants in calibrations:
         if constants is not None:
             check_calibration("mrclam_team", constants)
-    files = [read_lines(Path(folder), *one) for one in zip(numbers, each, strict=True)]
-    time = np.unique(np.concatenate([t[:, 0] for one in files for t in (one.odometry, one.seen)]))
+    files = [
+        read_lines(Path(folder), robot, constants)
+        for robot, constants in zip(numbers, calibrations, strict=True)
+    ]
+    clocks = [table[:, 0] for lines in files for table in (lines.odometry, lines.measurements)]
+    time = np.unique(np.concatenate(clocks))
     team, scans, controls, dropped = [], [], [], dict.fromkeys(DROP_REASONS, 0)
-    models = {one: models_of(one) for one in set(each)}
-    sights = {one: eye for one, (_, eye) in models.items()}
+    # Robots of equal constants share their models.
+    models = {constants: models_of(constants) for constants in set(calibrations)}
+    sighting_sensors = {constants: sensor for constants, (_, sensor) in models.items()}
     if sighting_cov is not None:
-        sights = {one: replace(eye, noise_cov=sighting_cov) for one, eye in sights.items()}
-    for robot, lines, constants in zip(numbers, files, each, strict=True):
-        (model, eye), sight = models[constants], sights[constants]
-        row, tag, kept, lost = associated(lines.seen, time, subject_of, names + numbers)
-        dropped = {why: dropped[why] + lost[why] for why in dropped}
+        sighting_sensors = {
+            constants: replace(sensor, noise_cov=sighting_cov)
+            for constants, sensor in sighting_sensors.items()
+        }
+    for robot, lines, constants in zip(numbers, files, calibrations, strict=True):
+        motion, sensor = models[constants]
+        row, tag, kept, lost = associate(lines.measurements, time, subject_of, names + numbers)
+        dropped = {reason: dropped[reason] + lost[reason] for reason in dropped}
         if not tag:
-            seen = Path(folder) / f"Robot{robot}_Measurement.dat"
+            path = Path(folder) / f"Robot{robot}_Measurement.dat"
             raise ValueError(
-                f"{stored(seen)}:1: no measurement of a landmark, or of a robot in {numbers}"
+                f"{stored_file(path)}:1: no measurement of a landmark, or of a robot in {numbers}"
             )
         tags, rows = np.array(tag), np.array(row)
         controls.append(hold(lines.odometry[:, 0], lines.odometry[:, 1:], time))
         parts = []
-        for robots_seen in (False, True):
-            chosen = (tags >= len(names)) == robots_seen
+        of_robots = tags >= len(names)
+        sees: Literal["landmarks", "robots"]
+        for sees, part_sensor, chosen in (
+            ("landmarks", sensor, ~of_robots),
+            ("robots", sighting_sensors[constants], of_robots),
+        ):
             if chosen.any():
-                z = lines.seen[kept, 2:][chosen]
+                z = lines.measurements[kept, 2:][chosen]
                 scan = log_of(lines.odometry, time, rows[chosen], tags[chosen], z).scan
-                sees: Literal["landmarks", "robots"] = "robots" if robots_seen else "landmarks"
-                sensor = sight if robots_seen else eye
-                parts.append(Part(sensor, scan.tag.shape[1], sees=sees))
+                parts.append(Part(part_sensor, scan.tag.shape[1], sees=sees))
                 scans.append(scan)
-        team.append(Robot(model, Suite((*parts,))))
+        team.append(Robot(motion, Suite((*parts,))))
     return Dataset(
         name=f"mrclam robots {', '.join(map(str, numbers))}",
         log=Log.from_rows(

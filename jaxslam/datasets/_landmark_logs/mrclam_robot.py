@@ -17,7 +17,7 @@ from jaxslam.core.logs._streams import hold, known_poses
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import JaxOrNumPy, Log
 from jaxslam.datasets._dataset import Adjustable, Parameter
-from jaxslam.datasets._lines import TextFile, stored
+from jaxslam.datasets._lines import TextFile, stored_file
 from jaxslam.motion import Unicycle, WhiteNoise
 from jaxslam.sensors import RangeBearing, RangeBearingNoise
 
@@ -32,14 +32,17 @@ the exchange."""
 def read_landmarks(
     folder: Path, errata: bool
 ) -> tuple[dict[int, int], tuple[int, ...], Float[np.ndarray, "N 2"], tuple[str, ...]]:
-    """The subject of each barcode, the landmarks' subjects, positions, and corrections of these."""
+    """The subject of each barcode, the subjects and positions of the landmarks, and corrections.
+
+    errata: exchange the positions of `EXCHANGED`, if they are those of the file.
+    """
     subject_of, names = _read_barcodes(TextFile(folder / "Barcodes.dat", "#"))
     points = _read_survey(TextFile(folder / "Landmark_Groundtruth.dat", "#"), names)
     corrections: tuple[str, ...] = ()
     if errata and all(points.get(subject) == at for subject, at in EXCHANGED.items()):
-        one, other = EXCHANGED
-        points[one], points[other] = points[other], points[one]
-        corrections = (f"the surveyed positions of subjects {one} and {other} were exchanged",)
+        first, second = EXCHANGED
+        points[first], points[second] = points[second], points[first]
+        corrections = (f"the surveyed positions of subjects {first} and {second} were exchanged",)
     return subject_of, names, np.array([points[name] for name in names]), corrections
 
 
@@ -50,17 +53,17 @@ def read_robot(
     odometry = _read_in_time(
         TextFile(folder / f"Robot{robot}_Odometry.dat", "#"), ("time", "v", "omega")
     )
-    seen = _read_in_time(
+    measurements = _read_in_time(
         TextFile(folder / f"Robot{robot}_Measurement.dat", "#"),
         ("time", "barcode", "range", "bearing"),
     )
-    return odometry, seen
+    return odometry, measurements
 
 
 def read_truth(folder: Path, robot: int) -> Float[np.ndarray, "K 4"] | None:
     """The true poses (t, x, y, θ) of one robot; None without a file."""
     path = folder / f"Robot{robot}_Groundtruth.dat"
-    if stored(path) is None:
+    if stored_file(path) is None:
         return None
     return _read_in_time(TextFile(path, "#"), ("time", "x", "y", "theta"))
 
@@ -159,14 +162,14 @@ class RobotCalibration(NamedTuple):
     def motion(self) -> Motion:
         """The motion of the robot by its recorded velocities."""
         noise = WhiteNoise(self.forward_noise, self.turn_noise, self.turn_share)
-        scale, wheels = _stacked(self.forward, self.turn), _stacked(self.outer, self.curvature)
+        scale, wheels = _stack(self.forward, self.turn), _stack(self.outer, self.curvature)
         return motion.Corrected(Unicycle(noise), scale, wheels)
 
     @property
     def sensor(self) -> Sensor:
         """The camera, of corrected ranges."""
         noise = RangeBearingNoise(0.0, self.bearing_noise, share=self.range_share)
-        return RangeBearing(noise, mount=_stacked(self.ahead, 0.0, self.yaw))
+        return RangeBearing(noise, mount=_stack(self.ahead, 0.0, self.yaw))
 
     def range_factor(self, bearing: JaxOrNumPy) -> JaxOrNumPy:
         """Recorded over corrected range at a bearing, depth cos(φ - axis)."""
@@ -174,7 +177,7 @@ class RobotCalibration(NamedTuple):
         return self.depth * cos(bearing - self.axis)
 
 
-def _stacked(*numbers: float) -> ArrayLike:
+def _stack(*numbers: float) -> ArrayLike:
     """Numbers as a vector: NumPy's, unless one is traced."""
     return (
         np.array(numbers)
@@ -194,11 +197,14 @@ GROUPS = {
     "yaw": "mount",
     "axis": "axis",
 }
-"""What a field is for `fit`. Noises are held: a likelihood of ranges that depend on constants is
-of other data for each, and innovations weighted by a given noise are not."""
+"""Group of each field that `fit` can calibrate. Noises are held: the constants change the ranges,
+so likelihoods of different constants would be of different data; innovations weighted by a fixed
+noise can be compared."""
 
 
-def adjustable(calibration: RobotCalibration, log: Log, time: Float[np.ndarray, "T"]) -> Adjustable:
+def adjustable_of(
+    calibration: RobotCalibration, log: Log, time: Float[np.ndarray, "T"]
+) -> Adjustable:
     """Log and models as functions of the systematic errors of a calibration, in its order."""
     controls = calibration.motion.controls
     parameters = tuple(
@@ -210,12 +216,13 @@ def adjustable(calibration: RobotCalibration, log: Log, time: Float[np.ndarray, 
     recorded = np.asarray(log.scan.z[..., 0]) * calibration.range_factor(bearing)
 
     def at(p: jax.Array) -> tuple[Log, Motion, Sensor]:
-        found = RobotCalibration(*p, *calibration[len(GROUPS) :])
-        # Odometry is moved by the delay of the reader; what is left is of measurements before it.
-        moved = delayed(log, time, controls, found.delay - calibration.delay)
-        ranges = jnp.asarray(recorded) / found.range_factor(jnp.asarray(bearing))
+        # The groups name the first fields of a calibration, in order; the noises follow.
+        adjusted = RobotCalibration(*p, *calibration[len(GROUPS) :])
+        # The reader has shifted the odometry by the delay of `calibration`.
+        shifted = delayed(log, time, controls, adjusted.delay - calibration.delay)
+        ranges = jnp.asarray(recorded) / adjusted.range_factor(jnp.asarray(bearing))
         z = jnp.stack([ranges, jnp.asarray(bearing)], axis=-1)
-        return moved._replace(scan=log.scan._replace(z=z)), found.motion, found.sensor
+        return shifted._replace(scan=log.scan._replace(z=z)), adjusted.motion, adjusted.sensor
 
     return Adjustable(parameters, at)
 
@@ -256,14 +263,14 @@ def check_calibration(name: str, calibration: object) -> None:
             number = float(value)
         except (TypeError, ValueError):
             number = np.nan
-        good, wanted = np.isfinite(number), "a finite number"
+        good, expected = np.isfinite(number), "a finite number"
         if field == "depth":
-            good, wanted = good and number > 0, f"{wanted} above 0"
+            good, expected = good and number > 0, f"{expected} above 0"
         elif field.endswith(("_noise", "_share")):
-            good, wanted = good and number >= 0, f"{wanted} >= 0"
+            good, expected = good and number >= 0, f"{expected} >= 0"
         if not good:
             raise ValueError(
-                f"{name}: expected the {field} of a calibration to be {wanted}, got {value!r}"
+                f"{name}: expected the {field} of a calibration to be {expected}, got {value!r}"
             )
 
 
@@ -308,23 +315,26 @@ MEASUREMENT_COV = np.diag([0.15, 0.01]) ** 2
 DROP_REASONS = ("robot sightings", "unknown barcodes", "repeated in a scan")
 
 
-class Recorded(NamedTuple):
-    """The content of the files of a robot; with a calibration odometry is delayed, and ranges are
-    corrected."""
+class RobotLines(NamedTuple):
+    """The lines of a robot; with a calibration, odometry is delayed and ranges are corrected."""
 
     odometry: Float[np.ndarray, "K 3"]
-    seen: Float[np.ndarray, "J 4"]
+    """(t, v, ω)"""
+    measurements: Float[np.ndarray, "J 4"]
+    """(t, barcode, range, bearing)"""
     truth: Float[np.ndarray, "G 4"] | None
+    """(t, x, y, θ)"""
     corrections: tuple[str, ...]
+    """descriptions of the changes to the files"""
 
 
-def read_lines(folder: Path, robot: int, calibration: RobotCalibration | None) -> Recorded:
-    """The lines of a robot, its true path, and descriptions of the corrections.
+def read_lines(folder: Path, robot: int, calibration: RobotCalibration | None) -> RobotLines:
+    """Read the lines of a robot.
 
     With a calibration, odometry is at the times when the robot moves, and ranges are corrected.
     Raises ValueError on a bearing beyond a right angle, behind the image plane of the camera.
     """
-    odometry, seen = read_robot(folder, robot)
+    odometry, measurements = read_robot(folder, robot)
     truth, corrections = read_truth(folder, robot), []
     if truth is not None:
         odometry, cut = cut_after(odometry, truth[-1, 0])
@@ -334,12 +344,12 @@ def read_lines(folder: Path, robot: int, calibration: RobotCalibration | None) -
             )
     if calibration is not None:
         odometry[:, 0] += calibration.delay
-        beyond = np.abs(seen[:, 3] - calibration.axis) >= np.pi / 2
+        beyond = np.abs(measurements[:, 3] - calibration.axis) >= np.pi / 2
         if beyond.any():
-            bearing = seen[beyond, 3][0]
+            bearing = measurements[beyond, 3][0]
             raise ValueError(f"Calibration: expected bearings below π/2, got {bearing}")
-        seen[:, 2] /= calibration.range_factor(seen[:, 3])
-    return Recorded(odometry, seen, truth, tuple(corrections))
+        measurements[:, 2] /= calibration.range_factor(measurements[:, 3])
+    return RobotLines(odometry, measurements, truth, tuple(corrections))
 
 
 def models_of(calibration: RobotCalibration | None) -> tuple[Motion, Sensor]:
@@ -349,19 +359,19 @@ def models_of(calibration: RobotCalibration | None) -> tuple[Motion, Sensor]:
     return calibration.motion, calibration.sensor
 
 
-def true_fields(files: Sequence[Recorded], time: Float[np.ndarray, "T"]) -> dict[str, Any]:
+def true_fields(files: Sequence[RobotLines], time: Float[np.ndarray, "T"]) -> dict[str, Any]:
     """The fields of a `Dataset` about true paths and the start; none without a true path."""
     if files[0].truth is None:
         return {}
-    paths, known = true_poses(files[0].truth, time)
-    found: dict[str, Any] = {"true_path": paths, "true_at": known}
-    if len(files) > 1 and all(lines.truth is not None for lines in files):
-        each = [true_poses(lines.truth, time) for lines in files if lines.truth is not None]
-        found["true_paths"] = np.stack([path for path, _ in each])
-        found["true_paths_at"] = np.stack([at for _, at in each])
-    if known[0]:
-        found |= {"pose": paths[0], "pose_cov": START_COV, "one_frame": True}
-    return found
+    path, is_known = true_poses(files[0].truth, time)
+    fields: dict[str, Any] = {"true_path": path, "true_at": is_known}
+    truths = [lines.truth for lines in files if lines.truth is not None]
+    if len(files) > 1 and len(truths) == len(files):
+        paths, are_known = zip(*(true_poses(truth, time) for truth in truths), strict=True)
+        fields |= {"true_paths": np.stack(paths), "true_paths_at": np.stack(are_known)}
+    if is_known[0]:
+        fields |= {"pose": path[0], "pose_cov": START_COV, "one_frame": True}
+    return fields
 
 
 def log_of(
@@ -375,8 +385,8 @@ def log_of(
     return Log.from_streams((odometry[:, 0], odometry[:, 1:]), (time[row], tag, z), hold, time)
 
 
-def associated(
-    seen: Float[np.ndarray, "J 4"],
+def associate(
+    measurements: Float[np.ndarray, "J 4"],
     time: Float[np.ndarray, "T"],
     subject_of: dict[int, int],
     names: tuple[int, ...],
@@ -387,9 +397,9 @@ def associated(
     """
     tag_of = {name: tag for tag, name in enumerate(names)}
     dropped = dict.fromkeys(DROP_REASONS, 0)
-    kept: dict[tuple[int, int], int] = {}
-    row = np.searchsorted(time, seen[:, 0])
-    for k, barcode in enumerate(seen[:, 1]):
+    kept: dict[tuple[int, int], int] = {}  # (row, tag) -> index of the measurement
+    row = np.searchsorted(time, measurements[:, 0])
+    for k, barcode in enumerate(measurements[:, 1]):
         subject = subject_of.get(int(barcode))
         if subject is None:
             dropped["unknown barcodes"] += 1

@@ -28,11 +28,12 @@ from jaxslam.sensors import RangeOnly
 _HEADER = 128
 _INTEGERS = {1: "i1", 2: "u1", 3: "i2", 4: "u2", 5: "i4", 6: "u4", 12: "i8", 13: "u8"}
 _NUMBERS = _INTEGERS | {7: "f4", 9: "f8"}
-"""NumPy's name of a type of data"""
+"""NumPy's name of each type of data"""
 _INT32, _UINT32, _MATRIX, _COMPRESSED = 5, 6, 14, 15
 _NUMERIC = range(6, 16)
 """classes of matrices that hold numbers: double, single, and integers"""
 _COMPLEX = 0x0800
+"""bit of a matrix's flags"""
 
 
 def read_matrices(path: Path) -> dict[str, np.ndarray]:
@@ -45,20 +46,20 @@ def read_matrices(path: Path) -> dict[str, np.ndarray]:
     if mark not in (b"IM", b"MI"):
         raise ValueError(f"{path}: cannot be read: expected a MAT-file of level 5 (save -v7)")
     order = "<" if mark == b"IM" else ">"
-    found: dict[str, np.ndarray] = {}
+    matrices: dict[str, np.ndarray] = {}
     at = _HEADER
     while at < len(content):
         try:
             kind, data, end = _element(content, at, order)
             if kind == _COMPRESSED:
-                end = at + 8 + len(data)  # these are not padded
+                end = at + 8 + len(data)  # compressed elements are not padded
                 kind, data, _ = _element(zlib.decompress(data), 0, order)
             if kind == _MATRIX and (matrix := _matrix(data, order)):
-                found[matrix[0]] = matrix[1]
+                matrices[matrix[0]] = matrix[1]
         except (ValueError, zlib.error) as problem:
             raise ValueError(f"{path}: damaged at byte {at}: {problem}") from problem
         at = end
-    return found
+    return matrices
 
 
 def _element(content: bytes, at: int, order: str) -> tuple[int, bytes, int]:
@@ -102,7 +103,7 @@ SOURCE = (
 )
 _TABLES = {"DR": 3, "TD": 4, "TL": 3, "GT": 4}
 MAX_NUMBER = 1e30
-"""Largest number of a table, so that sums in a filter stay finite."""
+"""Largest number of a table: squares and their sums are finite in a filter in float64."""
 _COLUMNS = "DR: t, distance, turn; TD: t, sender, receiver, range; TL: id, x, y; GT: t, x, y, θ"
 _RANGE_BIAS = (0.03, 0.069)
 """Offset [m] and scale by which the ranges of both files exceed the distances: the least-squares
@@ -147,9 +148,9 @@ def plaza(
     tables = _read(Path(path))
     odometry, ranges, survey, truth = (tables[name] for name in _TABLES)
     names = tuple(sorted(int(name) for name in survey[:, 0]))
-    for column, what in ((survey[:, 0], "beacon"), (ranges[:, 2], "receiver")):
+    for column, kind in ((survey[:, 0], "beacon"), (ranges[:, 2], "receiver")):
         if np.any(column != np.round(column)):
-            raise ValueError(f"{path}: a {what}'s number is not whole")
+            raise ValueError(f"{path}: a {kind}'s number is not whole")
     if len(set(names)) < len(names):
         raise ValueError(f"{path}: a beacon occurs twice in TL")
     unknown = sorted({int(name) for name in ranges[:, 2]} - set(names))
@@ -166,7 +167,7 @@ def plaza(
     inside = (ranges[:, 0] > begin) & (ranges[:, 0] <= end)
     edges = np.concatenate([[min(begin, odometry[0, 0])], odometry[:, 0]])
     in_gap = inside & ~between_lines(edges, ranges[:, 0], np.append(True, ~is_gap(odometry[:, 0])))
-    outside, inside = ~inside, inside & ~in_gap
+    outside, inside = ~inside, inside & ~in_gap  # of a gap counted apart
     times, row = np.unique(ranges[inside, 0], return_inverse=True)
     if len(times) == 0:
         raise ValueError(
@@ -174,6 +175,7 @@ def plaza(
             + ", outside of its gaps" * bool(in_gap.any())
         )
     tag = np.searchsorted(names, ranges[inside, 2].astype(int))
+    # (row, tag) as one number; `np.unique` returns the first index of each.
     first = np.unique(row * len(names) + tag, return_index=True)[1]
     offset, scale = range_bias
     z = (ranges[inside, 3] - offset) / (1 + scale)
@@ -187,7 +189,7 @@ def plaza(
     }
     if not len(positive):
         raise none_left(path, dropped)
-    truth_of_rows, known = known_poses(truth[:, 0], truth[:, 1:], times)
+    true_path, true_at = known_poses(truth[:, 0], truth[:, 1:], times)
     points = {int(name): (x, y) for name, x, y in survey}
     return Dataset(
         name="plaza",
@@ -198,12 +200,12 @@ def plaza(
             times,
         ),
         time=times,
-        motion=PoseIncrement(_by_travel),
+        motion=PoseIncrement(_travel_noise),
         sensor=RangeOnly(_RANGE_COV),
         tags=names,
         landmarks=np.array([points[name] for name in names]),
-        true_path=truth_of_rows,
-        true_at=None if known.all() else known,
+        true_path=true_path,
+        true_at=None if true_at.all() else true_at,
         dropped=dropped,
         corrections=(
             (f"ranges: {offset} m and {100 * scale} % subtracted",) if any(range_bias) else ()
@@ -233,9 +235,10 @@ def _read(path: Path) -> dict[str, Float[np.ndarray, "_ _"]]:
     return tables
 
 
-def _by_travel(pose: jax.Array, u: jax.Array) -> jax.Array:
+def _travel_noise(pose: jax.Array, u: jax.Array) -> jax.Array:
     """The noise covariance: `_TRAVEL_DENSITY` times the distance travelled."""
     square = u[0] ** 2 + u[1] ** 2
     moved = square > 0
+    # The inner `where` keeps the gradient of the root finite at a standstill.
     travel = jnp.where(moved, jnp.sqrt(jnp.where(moved, square, 1.0)), 0.0)
     return travel * jnp.diag(jnp.asarray(_TRAVEL_DENSITY, u.dtype))

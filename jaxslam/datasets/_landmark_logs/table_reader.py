@@ -24,7 +24,7 @@ from jaxslam.datasets._landmark_logs.table_settings import (
     Parametric,
     TableSettings,
 )
-from jaxslam.datasets._lines import DIGITS, LARGEST, none_left, read_bytes, stored
+from jaxslam.datasets._lines import DIGITS, LARGEST, none_left, read_bytes, stored_file
 from jaxslam.math._odometry_jumps import odometry_jumps, step_sizes, without_jumps
 
 MISSING = frozenset(
@@ -33,13 +33,15 @@ MISSING = frozenset(
 )
 """Cells without a value, as pandas reads them, in lower case."""
 
-_NAME = 100
-"""Characters of the longest name of a landmark."""
+_MAX_NAME = 100
+"""Largest number of characters of a landmark's name: a longer cell is a sign of a wrong column."""
 
 _SIGNED = re.compile(r"[+-]?(?:\d+[.,]\d*|[.,]\d+)(?:[eE][+-]?\d+)?", re.ASCII)
 """A number with one decimal sign."""
 _GROUPED = re.compile(r"[+-]?[1-9]\d{0,2}[.,]\d{3}")
-"""A number that is also one of thousands: 1,234."""
+"""A number that may also be grouped by thousands: 1,234."""
+
+_SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
 
 
 class CsvTable:
@@ -55,6 +57,35 @@ class CsvTable:
 
     def __init__(self, path: str | Path) -> None:
         self.path, data = read_bytes(path)
+        lines = self._split(self._decode(data))
+        if not lines:
+            raise ValueError(f"{self.path}:1: expected a header, as 't [s],v [m/s]', got no text")
+        self.head_line, header = lines[0]
+        self.lines = [number for number, _ in lines[1:]]
+        self.cells = [cells for _, cells in lines[1:]]
+        self.header = [" ".join(name.split()) for name in header]  # messages quote it
+        self.names = [split_unit(name)[0] for name in self.header]
+        if all(math.isfinite(_number(cell.replace(",", "."))) for cell in header):
+            raise self._error(
+                self.head_line, f"expected a header, as 't [s],v [m/s]', got {header[0]!r}"
+            )
+        if not self.cells:
+            raise self._error(self.head_line, "expected lines below the header, got none")
+        for place, name in enumerate(self.names):
+            if name in self.names[:place]:
+                raise self._error(self.head_line, f"the column {name!r} occurs twice", place)
+        for number, cells in zip(self.lines, self.cells, strict=True):
+            if len(cells) != len(self.header):
+                raise self._count_error(number, cells)
+        signs = {"," if "," in cell else "." for cell in self._decimals()}
+        self.decimal = "," if signs == {","} else "."
+        # A point is a decimal point, but not surely beside semicolons: where a comma is the decimal
+        # sign, Excel writes semicolons between cells and a point between thousands.
+        self._ambiguous = (self.decimal == "," or self.separator == ";") and all(
+            _GROUPED.fullmatch(cell) for cell in self._decimals()
+        )
+
+    def _decode(self, data: bytes) -> str:
         try:
             text = data.decode("utf-8-sig")
         except UnicodeDecodeError as problem:
@@ -64,8 +95,13 @@ class CsvTable:
             raise self._error(
                 text.count("\n", 0, text.index("\0")) + 1, "expected text, got a zero byte"
             )
-        above = 0
-        while text.lstrip(" \t\r\n").startswith("#"):  # with its quotes, which csv would pair
+        return text
+
+    def _split(self, text: str) -> list[tuple[int, list[str]]]:
+        """The cells of each line that has some, with its number; sets `separator`."""
+        above = 0  # number of lines above `text`
+        # Comments are cut off first: `csv` would pair a quotation mark in them with a later one.
+        while text.lstrip(" \t\r\n").startswith("#"):
             _, _, text = text.partition("\n")
             above += 1
         separator = None
@@ -92,46 +128,21 @@ class CsvTable:
         except csv.Error as problem:
             reason = f"expected cells separated by {_SEPARATORS[self.separator]}: {problem}"
             raise self._error(begins, reason) from problem
-        lines = [(number, cells) for number, cells in lines if any(cells)]
-        if not lines:
-            raise ValueError(f"{self.path}:1: expected a header, as 't [s],v [m/s]', got no text")
-        self.head_line, self.header = lines[0]
-        self.lines = [number for number, _ in lines[1:]]
-        self.cells = [cells for _, cells in lines[1:]]
-        if all(math.isfinite(_number(cell.replace(",", "."))) for cell in self.header):
-            raise self._error(
-                self.head_line, f"expected a header, as 't [s],v [m/s]', got {self.header[0]!r}"
-            )
-        if not self.cells:
-            raise self._error(self.head_line, "expected lines below the header, got none")
-        self.header = [" ".join(name.split()) for name in self.header]  # messages quote it
-        self.names = [split_unit(name)[0] for name in self.header]
-        for place, name in enumerate(self.names):
-            if name in self.names[:place]:
-                raise self._error(self.head_line, f"the column {name!r} occurs twice", place)
-        for number, cells in zip(self.lines, self.cells, strict=True):
-            if len(cells) != len(self.header):
-                wanted, hint = len(self.header), ""
-                if "\n" in "".join(cells):
-                    hint = "; a quotation mark is not closed on its line"
-                elif len(cells) > wanted and self.separator == ",":
-                    hint = "; write a number with a point: 0.5"
-                raise self._error(
-                    number,
-                    f"expected {wanted} cells, as in line {self.head_line}, got {len(cells)}{hint}",
-                )
+        return [(number, cells) for number, cells in lines if any(cells)]
 
-        signs = {"," if "," in cell else "." for cell in self._decimals()}
-        self.decimal = "," if signs == {","} else "."
-        # A point is a decimal point, but not surely beside semicolons: Excel writes both where a
-        # comma is the decimal sign, and a point is that of thousands.
-        self._ambiguous = (self.decimal == "," or self.separator == ";") and all(
-            _GROUPED.fullmatch(cell) for cell in self._decimals()
-        )
+    def _count_error(self, line: int, cells: list[str]) -> ValueError:
+        """The error about a line with another number of cells than the header."""
+        expected, hint = len(self.header), ""
+        if "\n" in "".join(cells):
+            hint = "; a quotation mark is not closed on its line"
+        elif len(cells) > expected and self.separator == ",":
+            hint = "; write a number with a point: 0.5"
+        reason = f"expected {expected} cells, as in line {self.head_line}, got {len(cells)}{hint}"
+        return self._error(line, reason)
 
     @property
     def dialect(self) -> str:
-        """What the separators are, and decimal signs, where they are not commas and points."""
+        """The separators and decimal signs in words; empty for commas and points."""
         decimals = ", decimal commas" * (self.decimal == ",")
         if self.separator == "," and not decimals:
             return ""
@@ -140,14 +151,14 @@ class CsvTable:
     def table(
         self, wanted: Sequence[str], why: str, optional: Sequence[str] = ()
     ) -> Columns[int | str]:
-        """The wanted columns ("v [m/s]"), in their units.
+        """The columns `wanted`, as "v [m/s]", in the units of their names.
 
         Raises ValueError on a column that is missing, or without a known unit, a cell that is not a
         finite number, and a tag that is a number, but not a whole one >= 0. A tag is unknown in a
         cell of `MISSING`, and of -1.
 
         Args:
-            why: what needs them, for messages.
+            why: what needs the columns, for messages.
             optional: columns in which a cell of `MISSING` is NaN.
         """
         places = {name: self._place(name, why) for name in wanted}
@@ -164,7 +175,7 @@ class CsvTable:
         """The columns of the file that are not wanted."""
         bare = {split_unit(name)[0] for name in wanted}
         return [
-            whole for whole, name in zip(self.header, self.names, strict=True) if name not in bare
+            column for column, name in zip(self.header, self.names, strict=True) if name not in bare
         ]
 
     def _place(self, name: str, why: str) -> int:
@@ -177,9 +188,9 @@ class CsvTable:
         if target is None:
             return place
         if unit is None or unit_divisor(unit, name) is None:
-            known = " or ".join(f"[{one}]" for one in (target, *UNITS.get(target, {})))
+            units = " or ".join(f"[{name}]" for name in (target, *UNITS.get(target, {})))
             raise self._error(
-                self.head_line, f"expected a unit {known}, got {self.header[place]!r}", place
+                self.head_line, f"expected a unit {units}, got {self.header[place]!r}", place
             )
         return place
 
@@ -213,8 +224,8 @@ class CsvTable:
             hint = " (write a point: 0.5, and no thousands separator)" if "," in cell else ""
             if self._ambiguous and _SIGNED.fullmatch(cell):
                 hint = " (decimals or thousands? separate cells by commas, write a point: 0.5)"
-            what = f"number within ±{LARGEST:g}" if np.isfinite(values[row]) else "finite number"
-            raise self._error(self.lines[row], f"expected a {what}, got {cell!r}{hint}", place)
+            kind = f"number within ±{LARGEST:g}" if np.isfinite(values[row]) else "finite number"
+            raise self._error(self.lines[row], f"expected a {kind}, got {cell!r}{hint}", place)
         return values
 
     def _tags(self, place: int) -> list[int | str | None]:
@@ -239,8 +250,10 @@ class CsvTable:
         if numeric and not (value.is_integer() and 0 <= value < 2**53):
             reason = f"expected a whole number >= 0, or nothing if unknown, or a name, got {cell!r}"
             raise self._error(line, reason, place)
-        if not numeric and not (cell.isprintable() and len(cell) <= _NAME):
-            reason = f"expected a name of at most {_NAME} characters in one line, got {cell!r:.80}"
+        if not numeric and not (cell.isprintable() and len(cell) <= _MAX_NAME):
+            reason = (
+                f"expected a name of at most {_MAX_NAME} characters in one line, got {cell!r:.80}"
+            )
             raise self._error(line, reason, place)
         return int(value) if numeric else cell
 
@@ -252,11 +265,11 @@ class CsvTable:
         return ValueError(f"{self.path}:{line}: {where}{reason}")
 
 
-_SEPARATORS = {",": "commas", ";": "semicolons", "\t": "tabs"}
-
-
 def _separators(header: str) -> list[str]:
-    """The characters that separate the cells of a header, without another such in a cell."""
+    """The characters that may separate the cells of a header.
+
+    Preferred are those that leave no other separator within a cell, as in "a;b,c".
+    """
 
     def cells(separator: str) -> list[str]:
         try:
@@ -264,28 +277,33 @@ def _separators(header: str) -> list[str]:
         except csv.Error:
             return []
 
-    split = {one: cells(one) for one in _SEPARATORS}
-    possible = [one for one, parts in split.items() if len(parts) > 1]
+    cells_by_separator = {separator: cells(separator) for separator in _SEPARATORS}
+    possible = [separator for separator, parts in cells_by_separator.items() if len(parts) > 1]
     clean = [
-        one
-        for one in possible
-        if not any(other in cell.strip() for other in possible for cell in split[one])
+        separator
+        for separator in possible
+        if not any(
+            character in cell.strip()
+            for character in possible
+            for cell in cells_by_separator[separator]
+        )
     ]
     return clean or possible
 
 
 def _number(cell: str) -> float:
-    """The number in a cell, or NaN. float() alone accepts 1_000."""
+    """The number in a cell, or NaN."""
     try:
-        return math.nan if "_" in cell else float(cell)
+        return math.nan if "_" in cell else float(cell)  # float() alone accepts 1_000
     except ValueError:
         return math.nan
 
 
 ODOMETRY, MEASUREMENTS = "odometry.csv", "measurements.csv"
 
-_LARGEST = 0.01
-"""Share of ranges that equal the largest, above which they are noted."""
+_MAX_SHARE_OF_LARGEST = 0.01
+"""Share of ranges that equal the largest one, above which a note asks for `max_range`: of a
+continuous measurement hardly two are equal."""
 
 
 def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
@@ -338,8 +356,10 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
     """
     folder = Path(folder)
     if not folder.is_dir():
-        found = "is a file" if folder.exists() else "does not exist"
-        raise ValueError(f"{folder} {found}: expected a folder with {ODOMETRY} and {MEASUREMENTS}")
+        problem = "is a file" if folder.exists() else "does not exist"
+        raise ValueError(
+            f"{folder} {problem}: expected a folder with {ODOMETRY} and {MEASUREMENTS}"
+        )
     for name, columns in ((ODOMETRY, "controls of the motion"), (MEASUREMENTS, "measurements")):
         if not any((folder / file).is_file() for file in (name, f"{name}.gz")):
             raise ValueError(
@@ -348,48 +368,32 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
             )
     settings = TableSettings(folder / "dataset.toml", fitted)
     odometry_file = CsvTable(folder / ODOMETRY)
-    seen_file = CsvTable(folder / MEASUREMENTS)
+    measurement_file = CsvTable(folder / MEASUREMENTS)
     clock = odometry_file.table((TIME,), "the time").columns[TIME]
     interval = float(np.median(np.diff(clock))) if len(clock) > 1 else 1.0
+    # Times that go back, or a median of 0, are refused when the tables are aligned.
     by_motion = settings.motion(odometry_file.header, abs(interval) or 1.0)
-    by_sensor = settings.sensor(seen_file.header)
-    motion, sensor, delay = by_motion.made, by_sensor.made, settings.delay()
-    moved = (TIME, *tables.odometry_columns(motion.controls, odometry_file.header))
-    measured = tables.measurement_columns(sensor.measurements, sensor.landmark)
-    odometry = odometry_file.table(moved, f"of the motion model {motion.name}")
-    jumps, path = np.zeros(len(clock), bool), np.zeros((0, 3))
-    if set(POSE) <= set(odometry.columns):
-        path = odometry.values(POSE)
-        jumps = odometry_jumps(path, clock)
-    seen = seen_file.table(measured, f"of the sensor {sensor.name}")
-    seen.columns[TIME] = seen.columns[TIME] - delay
+    by_sensor = settings.sensor(measurement_file.header)
+    motion, sensor, delay = by_motion.model, by_sensor.model, settings.delay()
+    odometry_names = (TIME, *tables.odometry_columns(motion.controls, odometry_file.header))
+    measurement_names = tables.measurement_columns(sensor.measurements, sensor.landmark)
+    odometry = odometry_file.table(odometry_names, f"of the motion model {motion.name}")
+    measurements = measurement_file.table(measurement_names, f"of the sensor {sensor.name}")
+    measurements.columns[TIME] = measurements.columns[TIME] - delay
     max_range, spacing = settings.max_range(), settings.spacing()
-    notes = [file.dialect for file in (odometry_file, seen_file) if file.dialect]
+    notes = [file.dialect for file in (odometry_file, measurement_file) if file.dialect]
     notes += [
         f"column {column!r} of {file.path.name} is not used"
-        for file, wanted in ((odometry_file, moved), (seen_file, measured))
-        for column in file.unused(wanted)
+        for file, names in ((odometry_file, odometry_names), (measurement_file, measurement_names))
+        for column in file.unused(names)
     ]
-    if moved[1:] == POSE and are_headings_in_degrees(odometry.values(POSE)):
-        notes.append(f"{odometry_file.path.name}: {_DEGREES_OF_PATH}")
-    if jumps.any():
-        k = int(np.argmax(jumps))
-        far, turn = step_sizes(path)[k]
-        notes.append(
-            f"{odometry.at(k, POSE[0])}: a jump of the odometry by {far:.3g} m and "
-            f"{np.rad2deg(turn):.3g}° in {clock[k] - clock[k - 1]:.3g} s is no motion, "
-            f"{int(jumps.sum()):,} in all: the step before it takes its place"
-        )
-        for name, column in zip(POSE, without_jumps(path, jumps).T, strict=True):
-            odometry.columns[name] = column
-    if gap := _longest_gap(odometry):
-        of_poses = "no pose is interpolated over" if moved[1:] == POSE else ""
-        notes.append(f"{gap}; {of_poses or 'the odometry is taken to hold over'} it")
-    notes += [note for file in (odometry, seen) if (note := _beyond_a_turn(file))]
-    if "range [m]" in seen.columns and not np.isfinite(max_range):
-        ranges = seen.columns["range [m]"]
+    from_poses = odometry_names[1:] == POSE
+    notes += _odometry_notes(odometry, odometry_file.path.name, from_poses)
+    notes += [note for columns in (odometry, measurements) if (note := _beyond_a_turn(columns))]
+    if "range [m]" in measurements.columns and not np.isfinite(max_range):
+        ranges = measurements.columns["range [m]"]
         largest = int((ranges == ranges.max()).sum())
-        if largest > max(10, _LARGEST * len(ranges)):
+        if largest > max(10, _MAX_SHARE_OF_LARGEST * len(ranges)):
             notes.append(
                 f"{largest:,} ranges are {ranges.max():.6g} m, the largest: if the sensor writes "
                 "it where it met nothing, set [sensor] max_range"
@@ -397,22 +401,24 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
     survey = _survey(folder / "landmarks.csv", notes)
     rows, tags, dropped = tables.align_tables(
         odometry,
-        [tables.Seen(seen, sensor.measurements, max_range=max_range, spacing=spacing)],
+        [tables.Seen(measurements, sensor.measurements, max_range=max_range, spacing=spacing)],
         motion.controls,
         tuple(survey or ()),
     )
     if not rows.valid.any():
-        raise none_left(f"{seen_file.path}:{seen_file.lines[0]}", dropped)
-    for row, tag in enumerate(seen.tags or ()):
+        raise none_left(f"{measurement_file.path}:{measurement_file.lines[0]}", dropped)
+    for row, tag in enumerate(measurements.tags or ()):
         # A tag that is not in the log is measured outside of the odometry alone, and counted.
         if survey is not None and tag in tags and tag not in survey:
-            raise ValueError(f"{seen.at(row, TAG)}: expected a tag of landmarks.csv, got {tag}")
-    truth, covered, of_truth = _truth(folder / "truth.csv", rows.time)
-    notes += of_truth
+            raise ValueError(
+                f"{measurements.at(row, TAG)}: expected a tag of landmarks.csv, got {tag}"
+            )
+    true_path, true_at, truth_notes = _truth(folder / "truth.csv", rows.time)
+    notes += truth_notes
     start, one_frame = settings.start(), True
     if start is None:
-        one_frame = covered is not None and bool(covered[0])
-        start = truth[0] if truth is not None and one_frame else np.zeros(3)
+        one_frame = true_at is not None and bool(true_at[0])
+        start = true_path[0] if true_path is not None and one_frame else np.zeros(3)
         shown = [float(f"{value:.6g}") for value in start]
         notes.append(f"[filter] start = {shown}" + ", the truth at the first row" * one_frame)
     if sensor.name in UNMEASURED and survey is not None and one_frame:
@@ -420,7 +426,7 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
             f"{', '.join(sensor.measurements)} alone: a filter starts each landmark from the prior "
             "[sensor] free; --filters localization takes those of landmarks.csv, and needs none"
         )
-    unknown = None in (seen.tags or ())
+    unknown = None in (measurements.tags or ())
     capacity = settings.capacity(len(tags), unknown)
     log = Log.from_rows(rows)
     adjustable = _adjustable(log, rows.time, by_motion, by_sensor, delay)
@@ -435,15 +441,45 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
         pose_cov=np.diag(settings.start_noise()) ** 2,
         filter_options=settings.filter_options(unknown),
         landmarks=None if survey is None else np.array([survey[tag] for tag in tags]),
-        true_path=truth,
-        true_at=covered,
+        true_path=true_path,
+        true_at=true_at,
         one_frame=one_frame,
         slots=capacity,
-        adjustable=adjustable._replace(cov=settings.uncertain(adjustable.parameters)),
+        adjustable=adjustable._replace(cov=settings.calibration_cov(adjustable.parameters)),
         dropped=dropped,
         assumed=tuple(settings.assumed + notes),
         source=settings.text("source", ""),
     )
+
+
+def _odometry_notes(odometry: Columns[int | str], file_name: str, from_poses: bool) -> list[str]:
+    """Replace jumps of the path of odometry, if it is one; notes on jumps, degrees and gaps.
+
+    from_poses: whether the controls are increments between poses.
+    """
+    notes = []
+    clock = odometry.columns[TIME]
+    if from_poses and are_headings_in_degrees(odometry.values(POSE)):
+        notes.append(f"{file_name}: {_DEGREES_OF_PATH}")
+    if set(POSE) <= set(odometry.columns):
+        path = odometry.values(POSE)
+        jumps = odometry_jumps(path, clock)
+        if jumps.any():
+            k = int(np.argmax(jumps))
+            length, turn = step_sizes(path)[k]
+            notes.append(
+                f"{odometry.at(k, POSE[0])}: a jump of the odometry by {length:.3g} m and "
+                f"{np.rad2deg(turn):.3g}° in {clock[k] - clock[k - 1]:.3g} s is no motion, "
+                f"{int(jumps.sum()):,} in all: the step before it takes its place"
+            )
+            for name, column in zip(POSE, without_jumps(path, jumps).T, strict=True):
+                odometry.columns[name] = column
+    if gap := _longest_gap(odometry):
+        rule = (
+            "no pose is interpolated over" if from_poses else "the odometry is taken to hold over"
+        )
+        notes.append(f"{gap}; {rule} it")
+    return notes
 
 
 def _adjustable(
@@ -456,13 +492,14 @@ def _adjustable(
     """Log and models as functions of the parameters of both, and of the delay if there is one."""
     count, size = len(motion.parameters), len(motion.parameters) + len(sensor.parameters)
     parameters = motion.parameters + sensor.parameters
-    controls = motion.made.controls
+    controls = motion.model.controls
+    # Without Δt among the controls a row cannot be divided at a delayed measurement.
     if controls[-1:] == (tables.INTERVAL,):
         parameters += (Parameter("delay [s]", delay, "delay", ("sensor", "delay")),)
 
     def at(p: jax.Array) -> tuple[Log, Motion, Sensor]:
-        moved = log if p.shape[0] == size else delayed(log, time, controls, p[size] - delay)
-        return moved, motion.make(p[:count]), sensor.make(p[count:size])
+        shifted = log if p.shape[0] == size else delayed(log, time, controls, p[size] - delay)
+        return shifted, motion.at(p[:count]), sensor.at(p[count:size])
 
     return Adjustable(parameters, at)
 
@@ -502,46 +539,46 @@ def _beyond_a_turn(table: Columns[int | str]) -> str:
 
 def _survey(path: Path, notes: list[str]) -> dict[int | str, tuple[float, float]] | None:
     """The position of each tag, and notes added; None without a file."""
-    if stored(path) is None:
+    if stored_file(path) is None:
         return None
     file = CsvTable(path)
     notes += [file.dialect] if file.dialect else []
-    found = file.table((TAG, *POSE[:2]), "of landmarks")
+    columns = file.table((TAG, *POSE[:2]), "of landmarks")
     survey: dict[int | str, tuple[float, float]] = {}
-    for row, tag in enumerate(found.tags or ()):
+    for row, tag in enumerate(columns.tags or ()):
         if tag is None or tag in survey:
             got = "nothing" if tag is None else f"{tag} again"
             raise ValueError(
-                f"{found.at(row, TAG)}: expected a tag that no other line has, got {got}"
+                f"{columns.at(row, TAG)}: expected a tag that no other line has, got {got}"
             )
-        survey[tag] = tuple(found.values(POSE[:2])[row])
+        survey[tag] = tuple(columns.values(POSE[:2])[row])
     return survey
 
 
 def _truth(path: Path, time: np.ndarray) -> tuple[np.ndarray | None, np.ndarray | None, list[str]]:
-    """The true pose at each row (T, 3), whether it is known (T,), and notes."""
-    if stored(path) is None:
+    """The true pose at each row (T, 3), a mask of the rows that have one (T,), and notes."""
+    if stored_file(path) is None:
         return None, None, []
     file = CsvTable(path)
-    found = file.table((TIME, *POSE), "of a true path", optional=POSE)
-    tables.check_times(found, strict=True)
-    clock, pose = found.columns[TIME], found.values(POSE)
+    columns = file.table((TIME, *POSE), "of a true path", optional=POSE)
+    tables.check_times(columns, strict=True)
+    clock, pose = columns.columns[TIME], columns.values(POSE)
     if time[0] > clock[-1] or time[-1] < clock[0]:
         raise ValueError(
-            f"{found.at(0, TIME)}: expected times within those of the log, {time[0]:.12g} to "
+            f"{columns.at(0, TIME)}: expected times within those of the log, {time[0]:.12g} to "
             f"{time[-1]:.12g}, got {clock[0]:.12g} to {clock[-1]:.12g}"
         )
-    truth, known = known_poses(clock, pose, time)
+    true_path, true_at = known_poses(clock, pose, time)
     notes = [file.dialect] if file.dialect else []
     if lost := int((~np.isfinite(pose).all(axis=1)).sum()):
         notes.append(f"{file.path.name}: {lost:,} of {len(pose):,} lines have no pose")
-    if gap := _longest_gap(found):
+    if gap := _longest_gap(columns):
         notes.append(f"{gap}: no pose is interpolated over it")
-    if unknown := int((~known).sum()):
+    if unknown := int((~true_at).sum()):
         notes.append(
             f"{unknown:,} of {len(time):,} rows have no true pose: before the first or after the "
             f"last line of {file.path.name}, in a gap of it, or beside a line without a pose"
         )
     if are_headings_in_degrees(pose):
         notes.append(f"{file.path.name}: {_DEGREES_OF_PATH}")
-    return truth, known, notes
+    return true_path, true_at, notes

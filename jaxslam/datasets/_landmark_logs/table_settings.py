@@ -40,41 +40,43 @@ _DEFAULT_MODELS = ("unicycle", "pose_increment", "range_bearing")
 
 
 class Parametric(NamedTuple, Generic[_Model]):
-    """A model as a function of its parameters, and with those of the file."""
+    """A model as a function of its parameters, and the model of the file."""
 
     parameters: tuple[Parameter, ...]
-    make: Callable[[JaxOrNumPy], _Model]
-    """values, an array -> model"""
-    made: _Model
-    """the model of the file, without the systematic errors that it does not state"""
+    at: Callable[[JaxOrNumPy], _Model]
+    """array of values -> model"""
+    model: _Model
+    """the model with the values of the file, without systematic errors that the file does not
+    state"""
 
 
 def fitting_model(
     section: str,
     registry: Mapping[str, Callable[..., Motion | Sensor]],
-    given: Sequence[str],
+    header: Sequence[str],
     path: Path,
 ) -> str:
-    """The model whose columns are given, by most columns and then by `_DEFAULT_MODELS`."""
-    bare = {split_unit(name)[0] for name in given}
-    fitting, known = [], []
+    """The model whose columns are in the header, by most columns and then by `_DEFAULT_MODELS`."""
+    columns_of_file = {split_unit(name)[0] for name in header}
+    fitting, described = [], []
     for name, factory in registry.items():
         model = factory(of_no_noise)
-        names = (
-            odometry_columns(model.controls, given)
+        columns = (
+            odometry_columns(model.controls, header)
             if isinstance(model, Motion)
             else model.measurements
         )
-        known.append(f"{name} ({', '.join(names)})")
-        if {split_unit(one)[0] for one in names} <= bare:
-            fitting.append((len(names), name in _DEFAULT_MODELS, name))
+        described.append(f"{name} ({', '.join(columns)})")
+        if {split_unit(column)[0] for column in columns} <= columns_of_file:
+            fitting.append((len(columns), name in _DEFAULT_MODELS, name))
     if not fitting:
         raise ValueError(
             f"{path}: [{section}] model: expected one, since no model has the columns "
-            f"{', '.join(given)}; known: {'; '.join(known)}"
+            f"{', '.join(header)}; known: {'; '.join(described)}"
         )
-    most = max(fitting)[:2]
-    return next(name for *rank, name in fitting if tuple(rank) == most)
+    # Of equal models the first in the registry, which `max` over the names would not be.
+    best = max(fitting)[:2]
+    return next(name for *rank, name in fitting if tuple(rank) == best)
 
 
 def of_no_noise(*_: object) -> NoReturn:
@@ -83,10 +85,12 @@ def of_no_noise(*_: object) -> NoReturn:
 
 
 GATE = 0.99
-"""Default probability of the gate of an association."""
+"""Default probability of the gate of an association: one correct measurement of a hundred is lost,
+and few wrong ones pass."""
 
 NEW_GATE = 0.9999
-"""Probability of the gate beyond which a measurement is of a new landmark."""
+"""Probability of the gate beyond which a measurement is of a new landmark. What lies between the
+two gates is neither used nor new, so a correct measurement starts a second landmark once in 10⁴."""
 
 METHODS: dict[str, Callable[..., Associate]] = {
     "nearest": Nearest,
@@ -113,28 +117,29 @@ def association_options(method: object, gate: Any) -> dict[str, Any]:
         raise InvalidField("filter", "associate", reason)
     if method == "known":
         return {} if gate is None else {"gate": gate}
-    inner = GATE if gate is None else gate
-    return {"associate": METHODS[method](inner, max(inner, NEW_GATE))}
+    probability = GATE if gate is None else gate
+    return {"associate": METHODS[method](probability, max(probability, NEW_GATE))}
 
 
 FITTED = "fit.toml"
-"""The file of fitted numbers, which replace those of `dataset.toml`."""
+"""Name of the file of fitted numbers, which replace the numbers of `dataset.toml`."""
 
 
 def fitted_text(parameters: Sequence[Parameter], cov: np.ndarray) -> str:
     """The text of `FITTED`: parameters by section and key, and the covariance of those with one."""
-    places = {parameter.place: None for parameter in parameters}
+    places = dict.fromkeys(parameter.place for parameter in parameters)
     sections: dict[str, list[str]] = {section: [] for section, _ in places}
     for section, key in places:
-        held = [one for one in parameters if one.place == (section, key)]
-        numbers = ", ".join(f"{one.value:.6g}" for one in held)
-        names = ", ".join(one.name.removeprefix(f"{section} ") for one in held)
+        at_key = [parameter for parameter in parameters if parameter.place == (section, key)]
+        numbers = ", ".join(f"{parameter.value:.6g}" for parameter in at_key)
+        names = ", ".join(parameter.name.removeprefix(f"{section} ") for parameter in at_key)
         sections[section].append(f"{key} = [{numbers}]  # {names}\n")
-    known = np.flatnonzero(np.diag(cov))
-    if known.size:
-        names = ", ".join(f'"{parameters[i].name}"' for i in known.tolist())
+    uncertain = np.flatnonzero(np.diag(cov))
+    if uncertain.size:
+        names = ", ".join(f'"{parameters[i].name}"' for i in uncertain.tolist())
         rows = "".join(
-            f"  [{', '.join(f'{value:.9g}' for value in row)}],\n" for row in cov[known][:, known]
+            f"  [{', '.join(f'{value:.9g}' for value in row)}],\n"
+            for row in cov[np.ix_(uncertain, uncertain)]
         )
         sections["calibration"] = [f"parameters = [{names}]\n", f"covariance = [\n{rows}]\n"]
     return "\n".join(f"[{name}]\n" + "".join(lines) for name, lines in sections.items())
@@ -142,33 +147,27 @@ def fitted_text(parameters: Sequence[Parameter], cov: np.ndarray) -> str:
 
 def _line_number(text: str, section: str, key: str) -> int | None:
     """The line, from 1, of a key in a section ("": at the top), or of the section, or None."""
-    current, head = "", None
+    current, heading_line = "", None
     for number, line in enumerate(text.split("\n"), 1):
         if heading := re.match(r"\s*\[\s*(\w+)\s*\]", line):
             current = heading[1]
-            if head is None and current == (section or key):
-                head = number
+            if heading_line is None and current == (section or key):
+                heading_line = number
         elif current == section and re.match(rf"\s*{re.escape(key)}\s*=", line):
             return number
-    return head
+    return heading_line
 
 
 _Value = TypeVar("_Value")
 
 UNMEASURED = {"range_only": "bearing [rad]", "bearing_only": "range [m]"}
-"""What a sensor does not measure, and its option `free` is the prior of."""
-
-
-def _listed(value: object) -> object:
-    """A default as in TOML: lists in place of tuples, six digits."""
-    if isinstance(value, tuple):
-        return [_listed(part) for part in value]
-    return float(f"{value:.6g}") if isinstance(value, float) else value
-
+"""The quantity that a sensor does not measure, by the name of the sensor; the option `free` of the
+sensor is its prior."""
 
 _MOTION_NOISE = {"m/s": 0.1, "rad/s": 0.1, "m": 0.02, "rad": 0.02}
+"""Default standard deviations of odometry by unit."""
 _MEASUREMENT_NOISE = {"m": 0.1, "rad": 0.05, "1": 1.0}
-"""Default standard deviations by unit."""
+"""Default standard deviations of measurements by unit."""
 ROOM = 100
 """Default number of landmarks, where identities are unknown."""
 RANGE_BEARING = ("range [m]", "bearing [rad]")
@@ -178,9 +177,11 @@ _ODOMETRY_ERRORS = {
     "wheels": (("outer [m]", "curvature [rad/m]"), (0.0, 0.0)),
     "heading": (("[rad]",), (0.0,)),
 }
-"""Keys of [motion] of `motion.Corrected`: names of their numbers, and those without an error."""
+"""Keys of [motion] for `motion.Corrected`: the names of the numbers, and their values without an
+error."""
 _RANGE_ERRORS = {"range": (("scale", "offset [m]"), (1.0, 0.0)), "axis": (("[rad]",), (0.0,))}
-"""Keys of [sensor] of `sensors.Corrected`, likewise."""
+"""Keys of [sensor] for `sensors.Corrected`: the names of the numbers, and their values without an
+error."""
 
 
 @record
@@ -188,11 +189,13 @@ class _TableNoise:
     """The noise of a line of odometry, whatever rows divide it; see `TableSettings.motion`."""
 
     deviations: JaxOrNumPy
+    """standard deviations over one interval"""
     interval: float
+    """time between lines of odometry [s]"""
     per_time: bool = static()
     """whether the last control is Δt"""
     of_increments: bool = static()
-    """whether they grow with Δt; else velocities, whose noise shrinks"""
+    """whether the covariance grows with Δt, as of increments; else it shrinks, as of velocities"""
 
     def __call__(self, pose: jax.Array, u: jax.Array) -> jax.Array:
         cov = jnp.diag(jnp.asarray(self.deviations, u.dtype) ** 2)
@@ -200,6 +203,7 @@ class _TableNoise:
             return cov * u[-1] / self.interval
         if self.per_time:
             moving = u[-1] > 0
+            # The inner `where` keeps gradients finite at Δt = 0.
             return cov * jnp.where(moving, self.interval / jnp.where(moving, u[-1], 1.0), 0.0)
         return cov
 
@@ -235,10 +239,11 @@ def _read(path: Path) -> tuple[str, dict[str, Any]]:
     except FileNotFoundError:
         return "", {}
     except tomllib.TOMLDecodeError as problem:
-        what, line = str(problem), text.count("\n") + 1
-        if at := re.search(r" \(at line (\d+), column \d+\)$", what):
-            what, line = what[: at.start()], int(at[1])
-        raise ValueError(f"{path}:{line}: expected TOML: {what}") from problem
+        # Before Python 3.14 only the text has the line: "… (at line 3, column 7)".
+        reason, line = str(problem), text.count("\n") + 1
+        if place := re.search(r" \(at line (\d+), column \d+\)$", reason):
+            reason, line = reason[: place.start()], int(place[1])
+        raise ValueError(f"{path}:{line}: expected TOML: {reason}") from problem
     except RecursionError as problem:
         raise ValueError(f"{path}: expected TOML, got brackets in brackets") from problem
     except (OSError, ValueError) as problem:  # not text, or a whole number of over 4,300 digits
@@ -246,8 +251,9 @@ def _read(path: Path) -> tuple[str, dict[str, Any]]:
 
 
 class TableSettings:
-    """The settings of a folder, with its fitted numbers if wanted; `assumed` lists the defaults
-    taken so far.
+    """The settings of a folder, with its fitted numbers unless `fitted` is False.
+
+    `assumed` lists the defaults that replaced missing settings so far.
 
     Raises ValueError on a file that is not TOML, and on an unknown section or key.
     """
@@ -258,84 +264,78 @@ class TableSettings:
         self._text, self.content = _read(path)
         if not path.exists():
             self.assumed.append(f"no {path.name}")
-        known = ("name", "source", "motion", "sensor", "filter", "calibration")
-        self._check_keys("", self.content, known)
-        for name in known:
+        names = ("name", "source", "motion", "sensor", "filter", "calibration")
+        self._check_keys("", self.content, names)
+        for name in names:
             kind = str if name in ("name", "source") else dict
             if not isinstance(self.content.get(name, kind()), kind):
-                wanted = "text" if kind is str else f"a section [{name}]"
-                raise ValueError(f"{self._at('', name)}: expected {wanted}")
-        numbers = path.with_name(FITTED)
-        found = _read(numbers)[1] if fitted else {}
-        for section in sorted(found.keys() & {"motion", "sensor", "calibration"}):
-            if not isinstance(found[section], dict):
-                raise ValueError(f"{numbers}: expected a section [{section}]")
-            self.content[section] = self.content.get(section, {}) | found[section]
-            self.assumed.append(f"[{section}] {', '.join(found[section])} of {FITTED}")
+                expected = "text" if kind is str else f"a section [{name}]"
+                raise ValueError(f"{self._at('', name)}: expected {expected}")
+        fit_path = path.with_name(FITTED)
+        numbers = _read(fit_path)[1] if fitted else {}
+        for section in sorted(numbers.keys() & {"motion", "sensor", "calibration"}):
+            if not isinstance(numbers[section], dict):
+                raise ValueError(f"{fit_path}: expected a section [{section}]")
+            self.content[section] = self.content.get(section, {}) | numbers[section]
+            self.assumed.append(f"[{section}] {', '.join(numbers[section])} of {FITTED}")
 
     def text(self, name: str, default: str) -> str:
         """The name or the source of the data."""
         return str(self.content.get(name, default))
 
-    def motion(self, given: Sequence[str], interval: float) -> Parametric[Motion]:
-        """The motion model; its noise is that of a line of odometry, however rows divide it.
+    def motion(self, header: Sequence[str], interval: float) -> Parametric[Motion]:
+        """The motion model; its noise is the noise of a line of odometry, however rows divide it.
 
         Velocities have the covariance σ² interval/Δt over Δt, white noise. Poses give increments
         with covariance σ² Δt/interval, and Δt as a last control. Other increments have σ².
 
         Args:
-            given: the columns of the odometry.
+            header: the columns of the odometry.
             interval: the time between its lines [s].
         """
-        factory, options = self._model("motion", motion.REGISTRY, given, (*_ODOMETRY_ERRORS,))
+        factory, options = self._model("motion", motion.REGISTRY, header, (*_ODOMETRY_ERRORS,))
         errors = {key: options.pop(key) for key in _ODOMETRY_ERRORS if key in options}
-        shell = self._built("motion", factory, options, of_no_noise)
-        from_poses = odometry_columns(shell.controls, given) == POSE
-        with_interval = INTERVAL in shell.controls
-        count, correctable = len(shell.noises), odometry_errors.can_correct(shell)
-        parameters = self._noise("motion", shell.noises, _MOTION_NOISE)
+        bare = self._build("motion", factory, options, of_no_noise)
+        from_poses = odometry_columns(bare.controls, header) == POSE
+        with_interval = INTERVAL in bare.controls
+        count, correctable = len(bare.noises), odometry_errors.can_correct(bare)
+        parameters = self._noise("motion", bare.noises, _MOTION_NOISE)
         parameters += self._errors("motion", _ODOMETRY_ERRORS if correctable else {}, errors)
 
-        def plain(p: JaxOrNumPy) -> Motion:
+        # p is the noise (count,), then scale (2,), wheels (2,) and heading if correctable.
+        def uncorrected(p: JaxOrNumPy) -> Motion:
             noise = _TableNoise(p[:count], interval, from_poses or with_interval, from_poses)
-            model = self._built("motion", factory, options, noise)
+            model = self._build("motion", factory, options, noise)
             return _WithInterval(model, noise) if from_poses else model
 
-        def model(p: JaxOrNumPy) -> Motion:
+        def corrected(p: JaxOrNumPy) -> Motion:
             if not correctable:
-                return plain(p)
+                return uncorrected(p)
             scale, wheels = p[count : count + 2], p[count + 2 : count + 4]
-            return motion.Corrected(plain(p), scale, wheels, p[count + 4])
+            return motion.Corrected(uncorrected(p), scale, wheels, p[count + 4])
 
-        make = model if errors else plain
-        return Parametric(parameters, model, make(np.array([one.value for one in parameters])))
+        values = np.array([parameter.value for parameter in parameters])
+        return Parametric(parameters, corrected, (corrected if errors else uncorrected)(values))
 
-    def sensor(self, given: Sequence[str]) -> Parametric[Sensor]:
-        """The sensor. given: the columns of the measurements."""
-        more = (*_RANGE_ERRORS, "across", "delay", "max_range")
-        factory, options = self._model("sensor", sensors.REGISTRY, given, more)
+    def sensor(self, header: Sequence[str]) -> Parametric[Sensor]:
+        """The sensor. header: the columns of the measurements."""
+        further = (*_RANGE_ERRORS, "across", "delay", "max_range")
+        factory, options = self._model("sensor", sensors.REGISTRY, header, further)
         errors = {key: options.pop(key) for key in _RANGE_ERRORS if key in options}
         across = options.pop("across", None)
-        for key in ("delay", "max_range"):  # of the log
+        for key in ("delay", "max_range"):  # settings of the log, not arguments of the model
             options.pop(key, None)
         mount, has_mount = None, "mount" in inspect.signature(factory).parameters
         if "mount" in options:
             mount = self._numbers("sensor", "mount", options.pop("mount"), POSE)
-        shell = self._built("sensor", factory, options, of_no_noise)
-        names = shell.measurements
+        bare = self._build("sensor", factory, options, of_no_noise)
+        names = bare.measurements
         parameters = self._noise("sensor", names, _MEASUREMENT_NOISE)
-        if not all(one.value for one in parameters):
+        if not all(parameter.value for parameter in parameters):
             raise ValueError(f"{self._at('sensor', 'noise')}: expected numbers above 0")
         if across is not None:
-            (spread,) = self._numbers("sensor", "across", across, ("[m]",))
-            if names != RANGE_BEARING or spread < 0:
-                raise ValueError(
-                    f"{self._at('sensor', 'across')}: expected a number >= 0, of a sensor of "
-                    f"{' and '.join(RANGE_BEARING)}, got {spread:g} of {', '.join(names)}"
-                )
-            where = "sensor", "across"
-            parameters += (Parameter("sensor across [m]", spread, "noise", where),)
-        at = len(parameters)
+            parameters += (self._across(across, names),)
+        before_mount = len(parameters)
         if has_mount:
             if mount is None:
                 mount = self._default("sensor", "mount", [0.0, 0.0, 0.0])
@@ -343,32 +343,46 @@ class TableSettings:
                 Parameter(f"mount {name}", value, "mount", ("sensor", "mount"))
                 for name, value in zip(POSE, mount, strict=True)
             )
-        after, correctable = len(parameters), range_errors.can_correct(shell)
-        known = {key: one for key, one in _RANGE_ERRORS.items() if key == "range" or key in errors}
-        parameters += self._errors("sensor", known if correctable else {}, errors)
+        before_errors, correctable = len(parameters), range_errors.can_correct(bare)
+        # `range` can always be fitted, the axis only where the file states it.
+        adjustable = {
+            key: row for key, row in _RANGE_ERRORS.items() if key == "range" or key in errors
+        }
+        parameters += self._errors("sensor", adjustable if correctable else {}, errors)
 
-        def plain(p: JaxOrNumPy) -> Sensor:
+        # p is the noise (m,), across, mount (3,), range (2,) and axis, each if there is one.
+        def uncorrected(p: JaxOrNumPy) -> Sensor:
             # NumPy for plain numbers, so that nothing is compiled.
             noise: NoiseCov = p[: len(names), None] ** 2 * np.eye(len(names))
             if across is not None:
                 noise = sensors.RangeBearingNoise(p[0], p[1], across=p[2])
-            more = options | {"mount": p[at : at + 3]} if has_mount else options
-            return self._built("sensor", factory, more, noise)
+            place = {"mount": p[before_mount : before_mount + 3]} if has_mount else {}
+            return self._build("sensor", factory, options | place, noise)
 
-        def model(p: JaxOrNumPy) -> Sensor:
+        def corrected(p: JaxOrNumPy) -> Sensor:
             if not correctable:
-                return plain(p)
-            axis = p[after + 2] if "axis" in errors else None
+                return uncorrected(p)
+            axis = p[before_errors + 2] if "axis" in errors else None
             try:
-                return sensors.Corrected(plain(p), p[after : after + 2], axis)
+                return sensors.Corrected(uncorrected(p), p[before_errors : before_errors + 2], axis)
             except ValueError as problem:
                 raise ValueError(f"{self.path}: [sensor] {problem}") from problem
 
-        make = model if errors else plain
-        return Parametric(parameters, model, make(np.array([one.value for one in parameters])))
+        values = np.array([parameter.value for parameter in parameters])
+        return Parametric(parameters, corrected, (corrected if errors else uncorrected)(values))
+
+    def _across(self, across: object, measurements: tuple[str, ...]) -> Parameter:
+        """The standard deviation across the line of sight, which range and bearing share."""
+        (spread,) = self._numbers("sensor", "across", across, ("[m]",))
+        if measurements != RANGE_BEARING or spread < 0:
+            raise ValueError(
+                f"{self._at('sensor', 'across')}: expected a number >= 0, of a sensor of "
+                f"{' and '.join(RANGE_BEARING)}, got {spread:g} of {', '.join(measurements)}"
+            )
+        return Parameter("sensor across [m]", spread, "noise", ("sensor", "across"))
 
     def delay(self) -> float:
-        """By how much measurements are stamped later than they happened [s]."""
+        """The time by which measurements are stamped later than they happened [s]."""
         return self._number("sensor", "delay", 0.0)
 
     def max_range(self) -> float:
@@ -379,29 +393,29 @@ class TableSettings:
         """The least time between two measurements of a landmark that are used [s]."""
         return self._positive("filter", "spacing", 0.0)
 
-    def uncertain(self, parameters: tuple[Parameter, ...]) -> np.ndarray | None:
+    def calibration_cov(self, parameters: tuple[Parameter, ...]) -> np.ndarray | None:
         """The covariance of the parameters in [calibration] (P, P), 0 of others; None without."""
         section = self.content.get("calibration")
         if section is None:
             return None
         self._check_keys("calibration", section, ("parameters", "covariance"))
-        names, given = section.get("parameters"), section.get("covariance")
-        known = [parameter.name for parameter in parameters]
-        if not isinstance(names, list) or not names or not set(names) <= set(known):
+        names, matrix = section.get("parameters"), section.get("covariance")
+        all_names = [parameter.name for parameter in parameters]
+        if not isinstance(names, list) or not names or not set(names) <= set(all_names):
             raise ValueError(
-                f"{self._at('calibration', 'parameters')}: expected some of {', '.join(known)}, "
-                f"got {names!r}"
+                f"{self._at('calibration', 'parameters')}: expected some of "
+                f"{', '.join(all_names)}, got {names!r}"
             )
-        if not isinstance(given, list) or len(given) != len(names):
+        if not isinstance(matrix, list) or len(matrix) != len(names):
             raise ValueError(
                 f"{self._at('calibration', 'covariance')}: expected {len(names)} rows of numbers"
             )
-        rows = np.array([self._numbers("calibration", "covariance", row, names) for row in given])
+        rows = np.array([self._numbers("calibration", "covariance", row, names) for row in matrix])
         if asymmetric(rows, 1e-6) or indefinite(rows, 1e-6):  # written with six digits
             raise ValueError(f"{self._at('calibration', 'covariance')}: expected a covariance")
-        cov = np.zeros((len(known), len(known)))
-        at = [known.index(name) for name in names]
-        cov[np.ix_(at, at)] = rows
+        cov = np.zeros((len(all_names), len(all_names)))
+        places = [all_names.index(name) for name in names]
+        cov[np.ix_(places, places)] = rows
         return cov
 
     def filter_options(self, unknown: bool) -> dict[str, Any]:
@@ -428,119 +442,125 @@ class TableSettings:
 
     def capacity(self, tags: int, unknown: bool) -> int:
         """The number of landmark slots. tags: number of landmarks with a name."""
-        given = self._filter().get("capacity")
-        if given is None:
+        capacity = self._filter().get("capacity")
+        if capacity is None:
             return int(self._default("filter", "capacity", max(tags, 1) + ROOM * unknown))
-        if type(given) is not int or given < max(tags, 1):
+        if type(capacity) is not int or capacity < max(tags, 1):  # a bool is an int, too
             raise ValueError(
                 f"{self._at('filter', 'capacity')}: expected a whole number of at least "
-                f"{max(tags, 1)}, the number of tags, got {given!r}"
+                f"{max(tags, 1)}, the number of tags, got {capacity!r}"
             )
-        return given
+        return capacity
 
     def start(self) -> np.ndarray | None:
         """The pose (3,) before the first row; None if the file has none."""
-        return self._three("start")
+        return self._pose("start")
 
     def start_noise(self) -> np.ndarray:
-        """The standard deviations (3,) of that pose."""
-        given = self._three("start_noise")
-        if given is None:
+        """The standard deviations (3,) of the pose at the start."""
+        deviations = self._pose("start_noise")
+        if deviations is None:
             return np.array(self._default("filter", "start_noise", [0.0, 0.0, 0.0]))
-        if (given < 0).any():
+        if (deviations < 0).any():
             raise ValueError(f"{self._at('filter', 'start_noise')}: expected numbers of at least 0")
-        return given
+        return deviations
 
     def _filter(self) -> dict[str, object]:
         section: dict[str, object] = self.content.get("filter", {})
         self._check_keys("filter", section, _FILTER)
         return section
 
-    def _three(self, key: str) -> np.ndarray | None:
-        given = self._filter().get(key)
-        if given is None:
-            return None
-        return np.array(self._numbers("filter", key, given, POSE))
+    def _pose(self, key: str) -> np.ndarray | None:
+        value = self._filter().get(key)
+        return None if value is None else np.array(self._numbers("filter", key, value, POSE))
 
     def _model(
         self,
         section: str,
         registry: Mapping[str, Callable[..., _Model]],
-        given: Sequence[str],
-        more: tuple[str, ...],
+        header: Sequence[str],
+        further: tuple[str, ...],
     ) -> tuple[Callable[..., _Model], dict[str, object]]:
-        """The factory named by a section, or else by the columns, its options and `more`."""
+        """The factory of the model, which the section names or the columns determine, and options.
+
+        further: keys that the section may have beside the arguments of the model.
+        """
         options: dict[str, object] = dict(self.content.get(section, {}))
         name = options.pop("model", None)
         if name is None:
             name = self._default(
-                section, "model", fitting_model(section, registry, given, self.path)
+                section, "model", fitting_model(section, registry, header, self.path)
             )
         if not isinstance(name, str) or name not in registry:
             raise ValueError(
                 f"{self._at(section, 'model')}: expected one of {', '.join(registry)}, got {name!r}"
             )
         parameters = inspect.signature(registry[name]).parameters
-        known = [key for key in parameters if key != "noise_cov"]
-        self._check_keys(section, options, ("model", "noise", *known, *more))
+        arguments = [key for key in parameters if key != "noise_cov"]
+        self._check_keys(section, options, ("model", "noise", *arguments, *further))
         options.pop("noise", None)
-        for key in known:
-            if key not in options and key != "mount":
-                default = parameters[key].default
-                shown = "none" if default is None else _listed(default)
-                of = ""
-                if key == "free" and name in UNMEASURED:
-                    of = (
-                        f" (prior mean and variance of the {UNMEASURED[name]}, which is not "
-                        "measured: see docs/methods/bearings_and_ranges.md)"
-                    )
-                self.assumed.append(f"[{section}] {key} = {shown}{of}")
+        for key in arguments:
+            if key in options or key == "mount":
+                continue
+            default = parameters[key].default
+            note = f"[{section}] {key} = {'none' if default is None else _as_toml(default)}"
+            if key == "free" and name in UNMEASURED:
+                note += (
+                    f" (prior mean and variance of the {UNMEASURED[name]}, which is not "
+                    "measured: see docs/methods/bearings_and_ranges.md)"
+                )
+            self.assumed.append(note)
         return registry[name], options
 
     def _noise(
         self, section: str, names: tuple[str, ...], defaults: Mapping[str, float]
     ) -> tuple[Parameter, ...]:
         """The standard deviations of the noise of a model, in its order."""
-        given = self.content.get(section, {}).get("noise")
-        if given is None:
-            found = [defaults.get(split_unit(name)[1] or "", 0.1) for name in names]
-            self.assumed.append(f"[{section}] noise = {found} ({', '.join(names)})")
+        noise = self.content.get(section, {}).get("noise")
+        if noise is None:
+            deviations = [defaults.get(split_unit(name)[1] or "", 0.1) for name in names]
+            self.assumed.append(f"[{section}] noise = {deviations} ({', '.join(names)})")
         else:
-            found = self._numbers(section, "noise", given, names)
-            if min(found) < 0:
+            deviations = self._numbers(section, "noise", noise, names)
+            if min(deviations) < 0:
                 raise ValueError(
-                    f"{self._at(section, 'noise')}: expected standard deviations >= 0, got {given}"
+                    f"{self._at(section, 'noise')}: expected standard deviations >= 0, got {noise}"
                 )
         return tuple(
             Parameter(f"{section} {name}", value, "noise", (section, "noise"))
-            for name, value in zip(names, found, strict=True)
+            for name, value in zip(names, deviations, strict=True)
         )
 
     def _errors(
         self,
         section: str,
-        known: Mapping[str, tuple[tuple[str, ...], tuple[float, ...]]],
-        given: Mapping[str, object],
+        adjustable: Mapping[str, tuple[tuple[str, ...], tuple[float, ...]]],
+        errors: Mapping[str, object],
     ) -> tuple[Parameter, ...]:
-        """The systematic errors of a model, those of the settings or none."""
-        parameters: list[Parameter] = []
-        for key in given:
-            if key not in known:
-                wanted = {"motion": "controls of travel and turn", "sensor": "a range first"}
+        """The systematic errors of a model: the values of the settings, or those without an error.
+
+        Args:
+            adjustable: by key the names of the numbers, and their values without an error.
+            errors: the values in the settings, by key.
+        """
+        for key in errors:
+            if key not in adjustable:
+                model = {"motion": "controls of travel and turn", "sensor": "a range first"}
                 raise ValueError(
-                    f"{self._at(section, key)}: expected a model with {wanted[section]}"
+                    f"{self._at(section, key)}: expected a model with {model[section]}"
                 )
-        for key, (names, right) in known.items():
-            values = self._numbers(section, key, given.get(key, list(right)), names)
-            for name, value, without in zip(names, values, right, strict=True):
-                if without == 1.0 and value <= 0:
+        parameters: list[Parameter] = []
+        for key, (names, neutral) in adjustable.items():
+            values = self._numbers(section, key, errors.get(key, list(neutral)), names)
+            for name, value, without_error in zip(names, values, neutral, strict=True):
+                if without_error == 1.0 and value <= 0:  # a factor
                     raise ValueError(f"{self._at(section, key)}: expected a {name} above 0")
                 parameters.append(Parameter(f"{key} {name}", value, key, (section, key)))
         return tuple(parameters)
 
     def _number(self, section: str, key: str, default: float) -> float:
-        given = self.content.get(section, {}).get(key)
-        return default if given is None else self._numbers(section, key, given, ("[s] or [m]",))[0]
+        value = self.content.get(section, {}).get(key)
+        return default if value is None else self._numbers(section, key, value, ("[s] or [m]",))[0]
 
     def _positive(self, section: str, key: str, default: float) -> float:
         value = self._number(section, key, default)
@@ -548,28 +568,28 @@ class TableSettings:
             raise ValueError(f"{self._at(section, key)}: expected a number >= 0, got {value:g}")
         return value
 
-    def _numbers(self, section: str, key: str, given: object, names: Sequence[str]) -> list[float]:
-        """So many numbers in a list; one may also be without it."""
-        if len(names) == 1 and is_number(given):
-            given = [given]
+    def _numbers(self, section: str, key: str, value: object, names: Sequence[str]) -> list[float]:
+        """The numbers of a list, one for each name; a single one may stand without a list."""
+        if len(names) == 1 and is_number(value):
+            value = [value]
         if (
-            not isinstance(given, list)
-            or len(given) != len(names)
-            or not all(map(is_number, given))
+            not isinstance(value, list)
+            or len(value) != len(names)
+            or not all(map(is_number, value))
         ):
             raise ValueError(
                 f"{self._at(section, key)}: expected {len(names)} number{'s' * (len(names) > 1)} "
-                f"({', '.join(names)}), got {given!r}"
+                f"({', '.join(names)}), got {value!r}"
             )
-        numbers = [float(value) for value in given]
-        for unit, value in zip(names, numbers, strict=True):
-            if "[rad]" in unit and abs(value) > TURN and key != "covariance":
+        numbers = [float(number) for number in value]
+        for name, number in zip(names, numbers, strict=True):
+            if "[rad]" in name and abs(number) > TURN and key != "covariance":
                 self.assumed.append(
-                    f"[{section}] {key}: {unit} = {value:g} is beyond 2π: degrees? write radians"
+                    f"[{section}] {key}: {name} = {number:g} is beyond 2π: degrees? write radians"
                 )
         return numbers
 
-    def _built(
+    def _build(
         self,
         section: str,
         factory: Callable[..., _Model],
@@ -589,14 +609,22 @@ class TableSettings:
         return value
 
     def _check_keys(
-        self, section: str, content: Mapping[str, object], known: Sequence[str]
+        self, section: str, content: Mapping[str, object], expected: Sequence[str]
     ) -> None:
         for key in content:
-            if key not in known:
-                raise ValueError(f"{self._at(section, key)}: expected one of {', '.join(known)}")
+            if key not in expected:
+                raise ValueError(f"{self._at(section, key)}: expected one of {', '.join(expected)}")
 
     def _at(self, section: str, key: str) -> str:
         """The place of a key, at the beginning of a message."""
         line = _line_number(self._text, section, key)
-        where = f"{self.path}:" + (f"{line}: " if line else " ")
-        return where + (f"[{section}] " if section else "") + key
+        return (
+            f"{self.path}:{f'{line}: ' if line else ' '}{f'[{section}] ' if section else ''}{key}"
+        )
+
+
+def _as_toml(value: object) -> object:
+    """A default as in TOML: lists in place of tuples, six digits."""
+    if isinstance(value, tuple):
+        return [_as_toml(part) for part in value]
+    return float(f"{value:.6g}") if isinstance(value, float) else value

@@ -44,16 +44,16 @@ Layer: TypeAlias = Callable[[Axes], Draw]
 """Draws the fixed artists on the axes, and returns the function that draws frame k."""
 
 _DPI = 110
-"""dots an inch: a film as wide as a page has 788 pixels"""
+"""Dots an inch: a film as wide as a page has 788 pixels."""
 
 _HEAD = 0.42
-"""height of title and text [in]"""
+"""Height of title and text [in]."""
 
 _SECONDS, _FASTEST, _SLOWEST = 10.0, 25.0, 2.0
 """A film lasts 10 s, unless it would have more than 25 or fewer than 2 frames a second."""
 
 _EMBEDDED = 100.0
-"""largest size of the player [MB], beyond which Matplotlib leaves out frames"""
+"""Largest size of the player [MB], beyond which Matplotlib leaves out frames."""
 
 _LEVELS = (17 * np.rint(np.arange(256) / 17)).astype(np.uint8)
 """The 16 levels of a colour in frames: hardly visible, and PNG files are half as large."""
@@ -90,12 +90,12 @@ class Scene:
     frames: int
     main: Panel
     beside: Panel | None = None
-    """in the upper right corner, above the legend"""
+    """a panel in the upper right corner, above the legend"""
     caption: Callable[[int], str] = lambda k: f"frame {k + 1}"
     """the text above frame k"""
     title: str = ""
     note: str = ""
-    """which steps of a longer run are shown; "" for all"""
+    """the steps of a longer run that are shown, in words; "" for all"""
 
 
 class Film(FuncAnimation):
@@ -169,9 +169,9 @@ class Film(FuncAnimation):
 
 
 def mp4_problem() -> str | None:
-    """Why no MP4 can be written, or None: ffmpeg is missing, does not start, or has no H.264.
+    """The reason why no MP4 can be written: ffmpeg is missing, does not start, or has no H.264.
 
-    Two black frames are written.
+    None if ffmpeg can write two black frames.
     """
     if not FFMpegWriter.isAvailable():
         return "ffmpeg is not installed"
@@ -192,9 +192,9 @@ def mp4_problem() -> str | None:
 
 
 def _reason(error: BaseException) -> str:
-    """Why a program failed: the last line that it wrote, or the error."""
-    wrote = getattr(error, "stderr", None) or ""
-    text = wrote.decode(errors="replace") if isinstance(wrote, bytes) else wrote
+    """The reason of a failed program: the last line of its standard error, or the error."""
+    output = getattr(error, "stderr", None) or ""
+    text = output.decode(errors="replace") if isinstance(output, bytes) else output
     return next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "") or (
         first_line(error)
     )
@@ -263,11 +263,11 @@ def _furnish(axes: Axes, panel: Panel) -> tuple[list[Draw], list[Artist]]:
         titled(axes, panel.title)
     before = set(axes.get_children())
     draws = [layer(axes) for layer in panel.layers]
-    made = [artist for artist in axes.get_children() if artist not in before]
-    for artist in made:
+    moving = [artist for artist in axes.get_children() if artist not in before]
+    for artist in moving:
         artist.set_animated(True)
         artist.set_in_layout(False)
-    return draws, sorted(made, key=lambda artist: artist.get_zorder())
+    return draws, sorted(moving, key=lambda artist: artist.get_zorder())
 
 
 def _legend(main: Axes, beside: Axes) -> None:
@@ -351,13 +351,13 @@ def rings(
 ) -> Layer:
     """The layer of 3 σ ellipses in each frame; indefinite covariances are left out."""
     return line_of(
-        lambda k: _apart(ellipses(means[k][shown[k]], covs[k][shown[k]], points=48)), **look
+        lambda k: _join(ellipses(means[k][shown[k]], covs[k][shown[k]], points=48)), **look
     )
 
 
 def lines_between(ends: Sequence[Float[np.ndarray, "E 2 2"]], **look: Any) -> Layer:
     """The layer of lines between pairs of points that differ from frame to frame."""
-    return line_of(lambda k: _apart(ends[k]), **look)
+    return line_of(lambda k: _join(ends[k]), **look)
 
 
 def weighted_segments(
@@ -381,7 +381,7 @@ def weighted_segments(
             heavy = np.sqrt(weights[k])
             lines.set_segments(list(ends[k]))
             lines.set_linewidth(list(width * (0.15 + 0.85 * heavy)))
-            lines.set_color([to_rgba(color, 0.2 + 0.6 * each) for each in heavy])
+            lines.set_color([to_rgba(color, 0.2 + 0.6 * value) for value in heavy])
 
         return draw
 
@@ -391,7 +391,7 @@ def weighted_segments(
 def cloud(
     points: Float[np.ndarray, "F P 2"], weight: Float[np.ndarray, "F P"], **look: Any
 ) -> Layer:
-    """The layer of particles, with areas by their weights; without those of weight 0."""
+    """The layer of particles of positive weight, with areas in proportion to their weights."""
     areas = 4.0 * weight * weight.shape[1]
 
     def layer(axes: Axes) -> Draw:
@@ -407,7 +407,7 @@ def cloud(
     return layer
 
 
-def _apart(lines: Float[np.ndarray, "E C 2"]) -> Float[np.ndarray, "D 2"]:
+def _join(lines: Float[np.ndarray, "E C 2"]) -> Float[np.ndarray, "D 2"]:
     """Lines joined into one with NaN between them, so that they are drawn at once."""
     gap = np.full((len(lines), 1, 2), np.nan)
     return np.concatenate([lines, gap], axis=1).reshape(-1, 2)

@@ -32,7 +32,7 @@ _EDGES: dict[str, Look] = {
     "loop edges": {"color": FAINT, "lw": 0.5, "zorder": 2.0},
     "path": {"color": COLORS[0], "lw": 0.9, "zorder": 3.0},
 }
-"""How edges look: the path is between poses of successive ids."""
+"""Looks of edges; the path is between poses of successive ids."""
 
 
 @own_settings()
@@ -53,25 +53,33 @@ def graph_figure(
     one variable alone are not drawn.
 
     Args:
-        before, after: the same graph with different values.
-        squared: eᵀ Ω e of each row after, of `graphs.squared_residuals`.
-        factors: of the tables; by default those of files.
+        before: the graph before the optimization.
+        after: the same graph with the optimized values.
+        squared: eᵀ Ω e of each row after, from `graphs.squared_residuals`.
+        factors: factors of the tables; by default those of files.
         worst: number of rows marked in both panels: those with the largest eᵀ Ω e for its size.
-        subtitles: of the panels. width: [in].
+        subtitles: titles of the panels.
+        width: width of the figure [in].
     """
     factors = factors_of("graph_figure", after, factors)
     ratios = [
         (float(value) / len(factors[key].errors), key, row)
-        for key in _drawn(after, factors)
+        for key in _edge_tables(after, factors)
         for row, value in enumerate(np.asarray(squared[key]))
     ]
-    largest = sorted((each for each in ratios if each[0] > 0), key=lambda each: -each[0])[:worst]
+    positive = (row for row in ratios if row[0] > 0)
+    largest = sorted(positive, key=lambda row: -row[0])[:worst]
     figure, panels = panels_of(width, 0.52 * width, 1, 2, share=(False, False))
     for axes, graph, text in zip(panels, (before, after), subtitles, strict=True):
         _draw(axes, graph, factors)
         if largest:
-            ends = [_ends(graph, factors[key], key)[row] for _, key, row in largest]
-            _mark(axes, np.array(ends))
+            ends = np.array([_ends(graph, factors[key], key)[row] for _, key, row in largest])
+            axes.add_collection(
+                LineCollection(list(ends), colors=COLORS[1], linewidths=1.4, zorder=5)
+            )
+            ring: Look = {"ls": "none", "mfc": "none", "mec": COLORS[1], "mew": 0.9, "ms": 5}
+            label = f"{len(ends)} largest residuals"
+            axes.plot(*ends.mean(axis=1).T, marker="o", label=label, zorder=5, **ring)
         titled(axes, text)
         axes.set_xlabel("x [m]")
     panels[0].set_ylabel("y [m]")
@@ -79,31 +87,31 @@ def graph_figure(
     return figure
 
 
-def _drawn(graph: Graph, factors: Mapping[str, Factor]) -> list[str]:
-    """The tables of edges between two variables, which are drawn."""
+def _edge_tables(graph: Graph, factors: Mapping[str, Factor]) -> list[str]:
+    """The names of the tables of edges between two variables."""
     return [key for key in graph.tables if len(factors[key].variables) == 2]
 
 
 def _ends(graph: Graph, factor: Factor, key: str) -> Float[np.ndarray, "E 2 2"]:
     """The positions that the edges of a table join."""
     poses, who = np.asarray(graph.poses)[:, :2], np.asarray(graph.tables[key].who)
-    other = poses if factor.variables == ("pose", "pose") else np.asarray(graph.points)[:, :2]
-    return np.stack([poses[who[:, 0]], other[who[:, 1]]], axis=1)
+    second = poses if factor.variables == ("pose", "pose") else np.asarray(graph.points)[:, :2]
+    return np.stack([poses[who[:, 0]], second[who[:, 1]]], axis=1)
 
 
 def _edges(graph: Graph, factors: Mapping[str, Factor]) -> dict[str, Float[np.ndarray, "E 2 2"]]:
     """The ends of all edges, by the names of `_EDGES`."""
-    found = {name: [np.zeros((0, 2, 2))] for name in _EDGES}
-    for key in _drawn(graph, factors):
+    ends_by_name = {name: [np.zeros((0, 2, 2))] for name in _EDGES}
+    for key in _edge_tables(graph, factors):
         table, ends = graph.tables[key], _ends(graph, factors[key], key)
         valid = np.asarray(table.valid)
         if factors[key].variables == ("pose", "pose"):
             along = is_successive(graph, np.asarray(table.who))
-            found["path"].append(ends[valid & along])
-            found["loop edges"].append(ends[valid & ~along])
+            ends_by_name["path"].append(ends[valid & along])
+            ends_by_name["loop edges"].append(ends[valid & ~along])
         else:
-            found["measurements of points"].append(ends[valid])
-    return {name: np.concatenate(each) for name, each in found.items()}
+            ends_by_name["measurements of points"].append(ends[valid])
+    return {name: np.concatenate(parts) for name, parts in ends_by_name.items()}
 
 
 def _draw(axes: Axes, graph: Graph, factors: Mapping[str, Factor]) -> None:
@@ -121,14 +129,6 @@ def _draw(axes: Axes, graph: Graph, factors: Mapping[str, Factor]) -> None:
     axes.margins(0.04)
 
 
-def _mark(axes: Axes, ends: Float[np.ndarray, "E 2 2"]) -> None:
-    """Mark edges with large residuals."""
-    axes.add_collection(LineCollection(list(ends), colors=COLORS[1], linewidths=1.4, zorder=5))
-    ring: Look = {"ls": "none", "mfc": "none", "mec": COLORS[1], "mew": 0.9, "ms": 5, "zorder": 5}
-    label = f"{len(ends)} largest residuals"
-    axes.plot(*ends.mean(axis=1).T, marker="o", label=label, **ring)
-
-
 def graph_scene(
     iterates: Sequence[Graph],
     chi2: Sequence[float],
@@ -144,10 +144,10 @@ def graph_scene(
     path, others are loop edges.
 
     Args:
-        iterates: the same graph with different values, F of them.
-        chi2: of each.
-        steps: the number of the iteration of each; default 0, 1, …
-        factors: of the tables; by default those of files.
+        iterates: F graphs that differ in their values alone.
+        chi2: χ² of each iterate.
+        steps: the number of the iteration of each iterate; default 0, 1, …
+        factors: factors of the tables; by default those of files.
     Raises:
         ValueError: without iterates, or another number of χ².
     """
@@ -159,11 +159,11 @@ def graph_scene(
     factors = factors_of("graph_scene", iterates[0], factors)
     poses = np.stack([np.asarray(graph.poses)[:, :2] for graph in iterates])
     points = np.stack([np.asarray(graph.points)[:, :2] for graph in iterates])
-    every = [_edges(graph, factors) for graph in iterates]
+    edges = [_edges(graph, factors) for graph in iterates]
     layers: list[Layer] = [still(poses[-1], color=SHADE, lw=2.5, label="path at the end", zorder=1)]
     for name, look in _EDGES.items():
-        if len(every[0][name]):
-            layers.append(lines_between([edges[name] for edges in every], label=name, **look))
+        if len(edges[0][name]):
+            layers.append(lines_between([ends[name] for ends in edges], label=name, **look))
     if points.shape[1]:
         dots: Look = {"marker": ".", "ms": 3, "color": COLORS[2], "label": "points", "zorder": 4}
         layers.append(marks(points, np.ones(points.shape[:2], bool), **dots))
@@ -175,11 +175,12 @@ def graph_scene(
         when = f"iteration {step}" if step else "start"
         return f"{when}, χ² = {chi2[k]:.6g}"
 
-    # The limits hold the first and the last iterate, and of the others the bulk.
-    places = np.concatenate([poses, points], axis=1)
-    ends, rest = places[[0, -1]].reshape(-1, 2), places.reshape(-1, 2)
-    least = np.minimum(ends.min(axis=0), np.quantile(rest, 0.01, axis=0))
-    most = np.maximum(ends.max(axis=0), np.quantile(rest, 0.99, axis=0))
-    margin = 0.04 * max(float((most - least).max()), 1.0)
-    x, y = ((float(a - margin), float(b + margin)) for a, b in zip(least, most, strict=True))
+    # The limits hold the first and the last iterate, and of the others the bulk: a diverging
+    # iterate leaves the panel.
+    positions = np.concatenate([poses, points], axis=1)
+    ends, bulk = positions[[0, -1]].reshape(-1, 2), positions.reshape(-1, 2)
+    low = np.minimum(ends.min(axis=0), np.quantile(bulk, 0.01, axis=0))
+    high = np.maximum(ends.max(axis=0), np.quantile(bulk, 0.99, axis=0))
+    margin = 0.04 * max(float((high - low).max()), 1.0)
+    x, y = ((float(a - margin), float(b + margin)) for a, b in zip(low, high, strict=True))
     return Scene(len(iterates), Panel(layers, x, y), None, caption, title, note)

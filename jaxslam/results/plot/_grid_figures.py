@@ -55,8 +55,8 @@ def grid_figure(
         poses: (T, 2 or 3) drawn as a path with its end.
         beams: a scan from the last pose.
         others: other paths by name, drawn thin, as a reference.
-        label: of the scale of a field.
-        width: [in].
+        label: text beside the scale of a field.
+        width: width of the figure [in].
     Raises:
         ValueError: beams without poses of three numbers.
     """
@@ -65,7 +65,7 @@ def grid_figure(
         raise ValueError("grid_figure: beams are from the last of poses (x, y, θ)")
     values = np.asarray(grid[0])
     x, y = _corners(grid, *(np.arange(n + 1) for n in values.shape))
-    inner = width - (0.6 if isinstance(grid, Grid) else 1.3)
+    inner = width - (0.6 if isinstance(grid, Grid) else 1.3)  # beside labels, or a scale, too
     height = inner * np.ptp(y) / np.ptp(x) + 0.8
     figure, (axes,) = panels_of(width, min(height, 9.0), 1)
     axes.grid(visible=False)
@@ -88,8 +88,8 @@ def grid_figure(
         bar.ax.tick_params(labelsize=TEXT)
         bar.outline.set_linewidth(0.6)
         handles = []
-    for (name, other), color in zip((others or {}).items(), COLORS[1:], strict=False):
-        axes.plot(*np.asarray(other)[:, :2].T, color=color, lw=0.7, label=name, zorder=4)
+    for (name, reference), color in zip((others or {}).items(), COLORS[1:], strict=False):
+        axes.plot(*np.asarray(reference)[:, :2].T, color=color, lw=0.7, label=name, zorder=4)
     if path is not None:
         axes.plot(*path[:, :2].T, color=COLORS[0], lw=1.2, label="path", zorder=3)
         end: Look = {
@@ -122,6 +122,7 @@ def shades_of_occupancy() -> Colormap:
 
 def shown_occupancy(log_odds: np.ndarray) -> np.ma.MaskedArray:
     """The probability of each cell; unknown cells are masked."""
+    # 1 / (1 + exp(-l)), which does not overflow.
     return np.ma.masked_array(0.5 * (1 + np.tanh(log_odds / 2)), mask=log_odds == 0)
 
 
@@ -150,10 +151,10 @@ def topology_figure(
     """Places in colours, the skeleton with its junctions, doors, and the graph of places.
 
     Args:
-        places: of `topology.topological_map`.
+        places: result of `topology.topological_map`.
         route: drawn along the skeleton.
         weights: (P,) probability of each place, written beside its number.
-        width: [in].
+        width: width of the figure [in].
     """
     grid = places.grid
     label = places.label
@@ -166,22 +167,22 @@ def topology_figure(
     axes.grid(visible=False)
     colours = ListedColormap(_PALE)
     mesh: Look = {"rasterized": True, "zorder": 0}
-    shown = np.ma.masked_array(_coloured(places)[label], mask=label < 0)
+    shown = np.ma.masked_array(_colors_of(places)[label], mask=label < 0)
     axes.pcolormesh(x, y, shown[part], cmap=colours, vmin=-0.5, vmax=len(_PALE) - 0.5, **mesh)
     walls = np.ma.masked_array(np.ones(label.shape), mask=~occupied)
     black = ListedColormap(["#555555"])
     axes.pcolormesh(x, y, walls[part], cmap=black, **mesh)
-    where = cell_centers(grid)
-    skeleton = where[places.skeleton.cells.reshape(-1)]
+    centers = cell_centers(grid)
+    skeleton = centers[places.skeleton.cells.reshape(-1)]
     axes.plot(*skeleton.T, ".", color=INK, ms=1.0, label="skeleton", zorder=2)
-    junctions = where[places.skeleton.junctions.reshape(-1)]
+    junctions = centers[places.skeleton.junctions.reshape(-1)]
     axes.plot(*junctions.T, "o", color=INK, mfc="white", ms=3.5, label="junctions", zorder=4)
-    name = "adjacent"
+    label_once = "adjacent"
     for door in places.doors:
         for place in door.places:
             pair = np.stack([places.center[place], door.position])
-            axes.plot(*pair.T, color=COLORS[0], lw=1.0, ls=(0, (4, 2)), label=name, zorder=3)
-            name = "_"
+            axes.plot(*pair.T, color=COLORS[0], lw=1.0, ls=(0, (4, 2)), label=label_once, zorder=3)
+            label_once = "_"
     at = np.array([door.position for door in places.doors]).reshape(-1, 2)
     axes.plot(*at.T, "s", color=COLORS[1], mec="white", ms=6, ls="none", label="doors", zorder=5)
     if route is not None:
@@ -195,19 +196,22 @@ def topology_figure(
     return figure
 
 
-def _coloured(places: TopologicalMap) -> np.ndarray:
-    """A colour for each place, different from its neighbours' if there are enough."""
-    adjacent, colour = places.adjacent, np.full(len(places.center) + 1, -1)
+def _colors_of(places: TopologicalMap) -> np.ndarray:
+    """The colour of each place, different from its neighbours' if there are enough; then -1.
+
+    Greedily, places with most neighbours first; of the free colours the least used one.
+    """
+    adjacent, color = places.adjacent, np.full(len(places.center) + 1, -1)
     for k in np.argsort(-adjacent.sum(axis=1), kind="stable"):
-        taken = set(colour[:-1][adjacent[k]])
-        free = [c for c in range(len(_PALE)) if c not in taken]
-        used = np.bincount(colour[colour >= 0], minlength=len(_PALE))
-        colour[k] = min(free, key=lambda c: (used[c], c)) if free else k % len(_PALE)
-    return colour
+        of_neighbors = set(color[:-1][adjacent[k]])
+        free = [c for c in range(len(_PALE)) if c not in of_neighbors]
+        uses = np.bincount(color[color >= 0], minlength=len(_PALE))
+        color[k] = min(free, key=lambda c: (uses[c], c)) if free else k % len(_PALE)
+    return color  # the entry -1 is for cells without a place, whose label is -1
 
 
 CELLS = 400
-"""along a side of a map as drawn: walls of one cell stay visible"""
+"""Largest number of cells along a side of a map as it is drawn: walls of one cell stay visible."""
 
 
 @own_settings()
@@ -220,7 +224,10 @@ def loops_figure(
 ) -> Figure:
     """The paths of laser odometry and after closing, side by side, with the loops that were kept.
 
-    reference: (K, 3) poses, drawn in grey, aligned with each path. width: [in].
+    Args:
+        solved: result of `laser_slam.solve`.
+        reference: (K, 3) poses, drawn in grey, aligned with each path.
+        width: width of the figure [in].
     """
     across, up = np.ptp(solved.poses[:, :2], axis=0) + 1e-6
     height = 0.46 * width * float(np.clip(up / across, 0.4, 1.5)) + 0.9
@@ -229,10 +236,16 @@ def loops_figure(
     ends = np.stack([solved.loops.first[kept], solved.loops.second[kept]], axis=1)
     paths = (solved.odometry, "laser odometry"), (solved.poses, "after closing")
     for axes, (path, text) in zip(panels, paths, strict=True):
-        known = None
+        points = path[:, :2]
         if reference is not None:
-            known = transform(ate(path, np.asarray(reference)).frame, np.asarray(reference))
-        _draw_loops(axes, path[:, :2], ends, known)
+            aligned = transform(ate(path, np.asarray(reference)).frame, np.asarray(reference))
+            axes.plot(*aligned[:, :2].T, color=FAINT, lw=1.6, label="reference", zorder=1)
+        lines: Look = {"colors": COLORS[1], "linewidths": 1.2, "alpha": 0.8, "zorder": 3.5}
+        axes.add_collection(LineCollection(list(points[ends]), label="loops", **lines))
+        axes.plot(*points.T, color=COLORS[0], lw=0.8, label="path", zorder=3)
+        start: Look = {"ls": "none", "color": INK, "mfc": "white", "mew": 1.2, "ms": 5}
+        axes.plot(*points[0], marker="o", label="first pose", zorder=4, **start)
+        axes.set_aspect("equal", adjustable="datalim")
         titled(axes, text)
         axes.set_xlabel("x [m]")
     panels[0].set_ylabel("y [m]")
@@ -240,28 +253,13 @@ def loops_figure(
     return figure
 
 
-def _draw_loops(
-    axes: Axes, path: np.ndarray, ends: np.ndarray, reference: np.ndarray | None
-) -> None:
-    if reference is not None:
-        axes.plot(*reference[:, :2].T, color=FAINT, lw=1.6, label="reference", zorder=1)
-    lines = LineCollection(
-        list(path[ends]), colors=COLORS[1], linewidths=1.2, alpha=0.8, label="loops", zorder=3.5
-    )
-    axes.add_collection(lines)
-    axes.plot(*path.T, color=COLORS[0], lw=0.8, label="path", zorder=3)
-    start: Look = {"ls": "none", "color": INK, "mfc": "white", "mew": 1.2, "ms": 5}
-    axes.plot(*path[0], marker="o", label="first pose", zorder=4, **start)
-    axes.set_aspect("equal", adjustable="datalim")
-
-
 @own_settings()
 def maps_before_after(solved: Solved, *, title: str = "", width: float = PAGE) -> Figure:
     """The maps of laser odometry alone and after closing, side by side. width: [in]."""
-    known = np.argwhere(np.asarray(solved.map.observed) | np.asarray(solved.map_before.observed))
-    if not len(known):
-        known = np.array([[0, 0]])
-    low, high = known.min(axis=0), known.max(axis=0) + 1
+    cells = np.argwhere(np.asarray(solved.map.observed) | np.asarray(solved.map_before.observed))
+    if not len(cells):
+        cells = np.array([[0, 0]])
+    low, high = cells.min(axis=0), cells.max(axis=0) + 1
     height = min(0.46 * width * float((high - low)[0] / (high - low)[1]), 9.0) + 0.7
     figure, panels = panels_of(width, height, 1, 2, share=(False, False))
     maps = (solved.map_before, "laser odometry"), (solved.map, "after closing")
@@ -285,11 +283,11 @@ def maps_before_after(solved: Solved, *, title: str = "", width: float = PAGE) -
 def _shade(log_odds: np.ndarray, block: int) -> np.ndarray:
     """The image of a map by blocks of cells: white is free, black has a wall, grey is unknown."""
     rows, columns = (-(-n // block) * block for n in log_odds.shape)
-    whole = np.zeros((rows, columns))
-    whole[: log_odds.shape[0], : log_odds.shape[1]] = log_odds
-    parts = whole.reshape(rows // block, block, columns // block, block)
-    most, least = parts.max(axis=(1, 3)), parts.min(axis=(1, 3))
-    odds = np.where(most > 0, most, least)
+    padded = np.zeros((rows, columns))
+    padded[: log_odds.shape[0], : log_odds.shape[1]] = log_odds
+    blocks = padded.reshape(rows // block, block, columns // block, block)  # cells on axes 1 and 3
+    largest, smallest = blocks.max(axis=(1, 3)), blocks.min(axis=(1, 3))
+    odds = np.where(largest > 0, largest, smallest)  # an occupied cell decides
     return np.where(odds == 0, 0.8, 0.5 * (1 - np.tanh(0.5 * odds)))
 
 
@@ -305,9 +303,11 @@ def map_scene(
     """The scene of F maps of one frame, each with the path that made it; the robot is at its end.
 
     Args:
-        log_odds: of each map; 0 is unknown.
-        origin: of the maps, without yaw. resolution: [m].
-        paths: of each map, in the same order. captions: the text of each.
+        log_odds: cells of each map; 0 is unknown.
+        origin: origin of the maps, without yaw.
+        resolution: side of a cell [m].
+        paths: the path of each map.
+        captions: the text of each map.
     Raises:
         ValueError: without maps, other numbers of paths or captions, or a rotated frame.
     """
@@ -326,18 +326,12 @@ def map_scene(
     size = 0.03 * max(x[1] - x[0], y[1] - y[0])
     robot = triangle(ends, size, fc=COLORS[0], ec="white", lw=0.6, zorder=5)
     path = line_of(lambda k: paths[k][:, :2], color=COLORS[0], lw=1.0, label="path", zorder=3)
-    layers = [_image(log_odds, (*x, *y)), path, robot]
-    return Scene(count, Panel(layers, x, y), None, lambda k: captions[k], title)
 
-
-def _image(
-    log_odds: Sequence[Float[np.ndarray, "H W"]], extent: tuple[float, float, float, float]
-) -> Layer:
-    def layer(axes: Axes) -> Draw:
+    def image(axes: Axes) -> Draw:
         axes.grid(visible=False)
-        image = axes.imshow(
+        cells = axes.imshow(
             shown_occupancy(log_odds[0]),
-            extent=extent,
+            extent=(*x, *y),
             origin="lower",
             interpolation="nearest",
             zorder=1,
@@ -345,6 +339,7 @@ def _image(
             vmin=0,
             vmax=1,
         )
-        return lambda k: image.set_data(shown_occupancy(log_odds[k]))
+        return lambda k: cells.set_data(shown_occupancy(log_odds[k]))
 
-    return layer
+    layers: list[Layer] = [image, path, robot]
+    return Scene(count, Panel(layers, x, y), None, lambda k: captions[k], title)

@@ -24,16 +24,16 @@ from jaxslam.results.plot._style import (
     SHADE,
     Look,
     caption,
+    escape_name,
     every_handle,
     own_settings,
     panels_of,
-    plain,
     titled,
 )
 from jaxslam.simulation._wall_geometry import Walls, wall_lines
 
 Limits = tuple[tuple[float, float], tuple[float, float]]
-"""of x and of y"""
+"""Limits of x and of y."""
 
 
 def ellipses(
@@ -49,6 +49,9 @@ def ellipses(
     """
     covs = np.asarray(covs, np.float64)
     finite = np.isfinite(covs).all(axis=(1, 2))
+    # L of all P = [[a, b], [b, c]] at once: [[first, 0], [below, second]]. `np.linalg.cholesky`
+    # refuses the whole batch for one singular P. The tolerance is the rounding of a filter in
+    # float32.
     a, b, c = (np.where(finite, covs[:, i, j], 0.0) for i, j in ((0, 0), (1, 0), (1, 1)))
     tolerance = 1e-6 * np.maximum(np.abs(a), np.abs(c))
     first = np.sqrt(np.maximum(a, 0.0))
@@ -87,22 +90,22 @@ def ellipse(
 
 def extent(clouds: Sequence[np.ndarray]) -> float:
     """The larger side of the bounding box of some points, or 1 if it is 0."""
-    return float(np.nanmax(np.ptp(_finite(clouds), axis=0))) or 1.0
+    return float(np.nanmax(np.ptp(_finite_points(clouds), axis=0))) or 1.0
 
 
 def square_limits(clouds: Sequence[np.ndarray]) -> Limits:
     """The limits of a square panel about some points, with a margin."""
-    every = _finite(clouds)
-    x, y = (every.min(axis=0) + every.max(axis=0)) / 2
-    half = 0.56 * extent(clouds)
+    points = _finite_points(clouds)
+    x, y = (points.min(axis=0) + points.max(axis=0)) / 2
+    half = 0.56 * extent(clouds)  # a margin of 6 % on each side
     return (x - half, x + half), (y - half, y + half)
 
 
-def _finite(clouds: Sequence[np.ndarray]) -> np.ndarray:
-    """The finite points of some, or else the origin."""
-    every = np.concatenate(clouds)
-    every = every[np.isfinite(every).all(axis=1)]
-    return every if len(every) else np.zeros((1, 2))
+def _finite_points(clouds: Sequence[np.ndarray]) -> np.ndarray:
+    """The finite points, or else the origin."""
+    points = np.concatenate(clouds)
+    points = points[np.isfinite(points).all(axis=1)]
+    return points if len(points) else np.zeros((1, 2))
 
 
 _ARROW = Path([(1.2, 0.0), (-0.6, 0.6), (-0.25, 0.0), (-0.6, -0.6), (1.2, 0.0)])
@@ -112,10 +115,11 @@ _NEAR = 1.5
 
 _OTHERS = tuple(HUES[i] for i in (3, 4, 5, 2))
 _DASHES = ((0, (4, 5)), (0, (1.5, 3)), (0, (6, 3, 1.5, 3)))
-"""Looks of the paths of other filters over the first one's: twelve, with gaps to see it."""
+"""Colours and dashes of the paths of other filters: twelve combinations, whose gaps show the path
+of the first filter below."""
 
 _UPRIGHT = 15
-"""largest number of landmarks whose names are written horizontally"""
+"""Largest number of landmarks whose names are written horizontally."""
 
 
 @own_settings()
@@ -162,11 +166,11 @@ def map_figure(
         path = np.asarray(dead_reckoning)[:, :2]
         axes.plot(*path.T, color=FAINT, lw=1.0, ls=(0, (1, 1.2)), label="dead reckoning", zorder=2)
         shown += [path] if extent([*shown, path]) < _NEAR * extent(shown) else []
-    for i, (name, other) in enumerate((others or {}).items()):
+    for i, (name, other_estimate) in enumerate((others or {}).items()):
         color, dashes = _OTHERS[i % len(_OTHERS)], _DASHES[i % len(_DASHES)]
-        path = np.asarray(other.pose)[:, :2]
-        axes.plot(*path.T, lw=1.3, label=plain(name), zorder=3.6, color=color, ls=dashes)
-        points = np.asarray(other.points[-1])[np.asarray(other.alive[-1])]
+        path = np.asarray(other_estimate.pose)[:, :2]
+        axes.plot(*path.T, lw=1.3, label=escape_name(name), zorder=3.6, color=color, ls=dashes)
+        points = np.asarray(other_estimate.points[-1])[np.asarray(other_estimate.alive[-1])]
         axes.plot(*points.T, ".", color=color, ms=3, zorder=5.2)
     _limit(axes, shown)
     if names is not None:
@@ -200,7 +204,7 @@ def run_map_figure(campaign: Campaign, *, title: str = "", width: float = PAGE) 
         shown = _draw_truth(axes, np.asarray(truth.pose), np.asarray(truth.landmarks)[:, :2])
         _draw_estimate(axes, estimate)
         _limit(axes, shown)
-        titled(axes, plain(name))
+        titled(axes, escape_name(name))
     for axes in panels[len(campaign.first) :]:
         axes.set_axis_off()
     for i, axes in enumerate(panels[: len(campaign.first)]):
@@ -240,20 +244,19 @@ def _draw_estimate(axes: Axes, estimate: Estimate) -> list[np.ndarray]:
     covs = np.asarray(estimate.point_covs[-1])[alive]
     axes.plot(*pose[:, :2].T, color=COLORS[0], lw=1.3, label="estimated path", zorder=3)
     axes.plot(*points.T, ".", color=COLORS[1], ms=4.5, label="estimated landmarks", zorder=5)
-    label = "3 σ ellipses"
-    here, here_cov = pose[-1:, :2], np.asarray(estimate.pose_cov[-1:])[:, :2, :2]
-    refused = 0
-    for means, around, color, named in (
-        (here, here_cov, COLORS[0], "3 σ ellipse, pose"),
-        (points, covs, COLORS[1], label),
+    position, position_cov = pose[-1:, :2], np.asarray(estimate.pose_cov[-1:])[:, :2, :2]
+    indefinite = 0
+    for means, cov, color, label in (
+        (position, position_cov, COLORS[0], "3 σ ellipse, pose"),
+        (points, covs, COLORS[1], "3 σ ellipses"),
     ):
-        contours = ellipses(means, around)
+        contours = ellipses(means, cov)
         good = ~np.isnan(contours).all(axis=(1, 2))
-        refused += int((~good).sum())
+        indefinite += int((~good).sum())
         for contour in contours[good]:
-            axes.plot(*contour.T, color=color, lw=0.9, label=named, zorder=3)
-    if refused:
-        axes.set_title(f"{refused} without ellipse", loc="right", fontsize=7, color=INK)
+            axes.plot(*contour.T, color=color, lw=0.9, label=label, zorder=3)
+    if indefinite:
+        axes.set_title(f"{indefinite} without ellipse", loc="right", fontsize=7, color=INK)
     ends: Look = {"ls": "none", "color": INK, "zorder": 6}
     axes.plot(*pose[0, :2], marker="o", mfc="white", mew=1.2, ms=5, label="start", **ends)
     turned = MarkerStyle(_ARROW, transform=Affine2D().rotate(np.nan_to_num(pose[-1, 2])))
@@ -286,7 +289,7 @@ def _draw_residuals(
     claimed = "3 σ claimed in its direction"
     axes.bar(at, claim, 0.7, color=SHADE, label=claimed)
     axes.plot(at, far, "D", color=COLORS[2], ms=4.5, mec="white", mew=0.4, label=label)
-    axes.set_xticks(at, [plain(str(names[tag[i]])) for i in tagged])
+    axes.set_xticks(at, [escape_name(str(names[tag[i]])) for i in tagged])
     if len(tagged) > _UPRIGHT:
         axes.tick_params(axis="x", rotation=90)
     axes.grid(axis="x", visible=False)
@@ -315,17 +318,19 @@ def walls_figure(
     the line. Of walls that were not measured only the true ones are drawn.
 
     Args:
-        estimate: (T, …); the map is the last one. Tags are the rows of the walls.
-        walls: true ones, in the frame of the map.
-        path: (T, 2 or 3) true one.
+        estimate: (T, …); the last map is drawn. Tags are the rows of the walls.
+        walls: the true walls, in the frame of the map.
+        path: (T, 2 or 3) the true path.
     Raises:
         ValueError: if the walls have no segments, or a tag is not one of them.
     """
-    of = wall_lines(walls)[1]
+    wall_of_segment = wall_lines(walls)[1]
     alive = np.asarray(estimate.alive[-1])
     tags = np.asarray(estimate.tag[-1])[alive]
-    if len(tags) and not (tags.min() >= 0 and tags.max() <= of.max()):
-        raise ValueError(f"walls_figure: expected tags from 0 to {of.max()}, got {tags}")
+    if len(tags) and not (tags.min() >= 0 and tags.max() <= wall_of_segment.max()):
+        raise ValueError(
+            f"walls_figure: expected tags from 0 to {wall_of_segment.max()}, got {tags}"
+        )
     feet = np.asarray(estimate.points[-1])[alive]
     covs = np.asarray(estimate.point_covs[-1])[alive]
     ends, bands = [], []
@@ -333,15 +338,16 @@ def walls_figure(
         r = np.hypot(*foot)
         normal = foot / r
         along = np.array([-normal[1], normal[0]])
-        for segment in np.asarray(walls.segments)[of == tag]:
-            at = segment @ along
-            across = r * normal[None] + at[:, None] * along[None]
-            # The line is off by dr - at dα there, and the foot by (dr, r dα) in the line's frame.
-            slope = normal[None] - (at / r)[:, None] * along[None]
-            sigma = 3 * np.sqrt(np.einsum("ki,ij,kj->k", slope, cov, slope))
-            off = sigma[:, None] * normal[None]
-            ends.append(across)
-            bands.append(np.concatenate([across + off, (across - off)[::-1]]))
+        for segment in np.asarray(walls.segments)[wall_of_segment == tag]:
+            t = segment @ along  # the ends of the segment, along the line from its foot
+            projected = r * normal[None] + t[:, None] * along[None]
+            # An error (dr, r dα) of the foot, in the frame of the line, moves the line by dr - t dα
+            # at t.
+            jacobian = normal[None] - (t / r)[:, None] * along[None]
+            sigma = 3 * np.sqrt(np.einsum("ki,ij,kj->k", jacobian, cov, jacobian))
+            offset = sigma[:, None] * normal[None]
+            ends.append(projected)
+            bands.append(np.concatenate([projected + offset, (projected - offset)[::-1]]))
     segments = np.asarray(walls.segments)
     low, high = segments.reshape(-1, 2).min(axis=0), segments.reshape(-1, 2).max(axis=0)
     inner = width - 0.6
@@ -357,8 +363,10 @@ def walls_figure(
         LineCollection(ends, color=COLORS[1], lw=0.9, label="estimated lines", zorder=3)
     )
     if path is not None:
-        true = np.asarray(path)
-        axes.plot(*true[:, :2].T, color=INK, lw=1.0, ls=(0, (4, 2)), label="true path", zorder=3.5)
+        true_path = np.asarray(path)
+        axes.plot(
+            *true_path[:, :2].T, color=INK, lw=1.0, ls=(0, (4, 2)), label="true path", zorder=3.5
+        )
     pose = np.asarray(estimate.pose)
     axes.plot(*pose[:, :2].T, color=COLORS[0], lw=1.2, label="estimated path", zorder=4)
     axes.plot(*pose[0, :2], "o", color=INK, mfc="white", mew=1.2, ms=5, label="start", zorder=5)

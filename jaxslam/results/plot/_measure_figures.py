@@ -37,10 +37,10 @@ from jaxslam.results.plot._style import (
     band,
     caption,
     curve,
+    escape_name,
     look,
     own_settings,
     panels_of,
-    plain,
     step_limits,
 )
 
@@ -68,11 +68,14 @@ def nees_figure(
     titles = [REGISTRY[f"nees_{block}"].axis for block in blocks]
     figure, rows = sheet(campaign, titles, width=width)
     step = np.arange(1, campaign.steps + 1)
+    most_runs = max(campaign.filters.values(), key=lambda summary: summary.counts["runs"])
     for axes, block in zip(rows[0].panels, blocks, strict=True):
         nees_scale(axes, campaign, block)
     for row in rows:
         for axes, block in zip(row.panels, blocks, strict=True):
-            _draw_band(axes, campaign, block)
+            low, high = (most_runs.curves[f"nees_{block}_{end}"] for end in ("low", "high"))
+            band(axes, step, low, high, "95 % band")
+            axes.axhline(DOF[block], color=INK, lw=0.8, zorder=1.5, label="honest")
             for name, i in row.names.items():
                 summary = campaign.filters[name]
                 label = f"{name} ({summary.verdict}{'*' * bool(summary.doubts)})"
@@ -90,20 +93,19 @@ def rmse_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     Other measures with the figure "rmse" have a panel, too.
 
     More than five filters are drawn by kind. Filters that fuse no measurement, that are inaccurate,
-    or
-    whose error is over three times the median of the others do not set the scale: larger
-    values have marks at the edge, and the largest one is written above. width [in].
+    or whose error is over three times the median do not set the scale: larger values have marks at
+    the edge, and the largest value is written above. width [in].
     """
-    every = list(campaign.filters.values())
-    shown = [one for one in in_figure("rmse") if any(one.key in s.curves for s in every)]
-    figure, rows = sheet(campaign, [one.axis for one in shown], width=width)
+    summaries = list(campaign.filters.values())
+    measures = [m for m in in_figure("rmse") if any(m.key in s.curves for s in summaries)]
+    figure, rows = sheet(campaign, [measure.axis for measure in measures], width=width)
     step = np.arange(1, campaign.steps + 1)
     setters = scale_setters(campaign)
     nothing = np.full(campaign.steps, np.nan)
-    for j, measure in enumerate(shown):
+    for j, measure in enumerate(measures):
         curves = {n: s.curves.get(measure.key, nothing) for n, s in campaign.filters.items()}
         key = bound_curve(measure)
-        bounds = [s.curves[key] for s in every if key in s.curves][:1]
+        bounds = [s.curves[key] for s in summaries if key in s.curves][:1]
         top = common_top({name: _peak(values) for name, values in curves.items()}, setters)
         top = max(top, *map(_peak, bounds), 0.0)
         for row in rows:
@@ -112,10 +114,10 @@ def rmse_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
             for name, i in row.names.items():
                 curve(axes, i, step, curves[name], name)
             for bound in bounds:
-                label = "conditional Cramér-Rao bound"
-                axes.plot(
-                    step, bound, color=INK, lw=2.0, label=label, zorder=2.5, marker=_lone(bound)
-                )
+                # A single value would be no line.
+                marker = "o" if np.isfinite(bound).sum() == 1 else ""
+                style: Look = {"color": INK, "lw": 2.0, "zorder": 2.5, "marker": marker}
+                axes.plot(step, bound, label="conditional Cramér-Rao bound", **style)
             mark_beyond(axes)
     add_legends(figure, rows, title_of(campaign, "error, average over"), "step")
     return figure
@@ -156,21 +158,23 @@ def coverage_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
 
 @own_settings()
 def whiteness_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
-    """Autocorrelation of normalized innovations against the lag; that of a consistent filter is 0.
+    """Autocorrelation of normalized innovations against the lag; 0 for a consistent filter.
 
     The band is that of white innovations, the widest of the filters. A filter without innovations
     is named, without a curve. Curves are shifted a little sideways, so that none hides another.
     More than five filters are drawn by kind. width [in].
     """
     figure, rows = sheet(campaign, ["autocorrelation"], width=width, height=2.4)
-    every = campaign.filters.values()
-    widest = max(every, key=lambda s: np.nan_to_num(s.autocorrelation_band[0])).autocorrelation_band
-    inner = 1.5 * _peak(widest) or 0.1
-    extreme = max(inner, *(_peak(np.abs(s.autocorrelation)) for s in every))
+    summaries = campaign.filters.values()
+    bands = (s.autocorrelation_band for s in summaries)
+    widest = max(bands, key=lambda half_width: np.nan_to_num(half_width[0]))
+    least = 1.5 * _peak(widest) or 0.1  # the band is seen
+    extreme = max(least, *(_peak(np.abs(s.autocorrelation)) for s in summaries))
     for row in rows:
         (axes,) = row.panels
         axes.axhline(0.0, color=INK, lw=0.8, zorder=1.5)
         lags = np.arange(1, len(widest) + 1)
+        # The band ends half a lag beside the first and the last one, so that one lag has a band.
         ends = np.concatenate([[lags[0] - 0.5], lags, [lags[-1] + 0.5]])
         wide = np.interp(ends, lags, widest)
         band(axes, ends, -wide, wide, "95 % band")
@@ -197,10 +201,10 @@ def gained_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     kind. width [in].
     """
     check_record("gained_figure", "the first argument", campaign, Campaign)
-    key, what = "rotation_information", REGISTRY["rotation_information"].axis
+    key = "rotation_information"
     curves = {name: s.curves[key] for name, s in campaign.filters.items() if key in s.curves}
     others = [name for name in campaign.filters if name not in curves]
-    figure, rows = sheet(campaign, [what], width=width, height=2.6, only=curves)
+    figure, rows = sheet(campaign, [REGISTRY[key].axis], width=width, height=2.6, only=curves)
     top = 3 * max([1.0, *(_peak(values) for values in curves.values())])
     decades = np.log10(top / _NOTHING)
     strip = decades * _STRIP / (1 - _STRIP)
@@ -219,17 +223,9 @@ def gained_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
         text = "no filter has an observability monitor (filters.Monitored)"
         axes.text(0.5, 0.6, text, transform=axes.transAxes, ha="center", fontsize=8)
     title = title_of(campaign, "information gained on a turn of the whole frame,")
-    title += f". Not monitored: {', '.join(map(plain, others))}" * bool(others and curves)
+    title += f". Not monitored: {', '.join(map(escape_name, others))}" * bool(others and curves)
     add_legends(figure, rows, title, "step")
     return figure
-
-
-def _draw_band(axes: Axes, campaign: Campaign, block: str) -> None:
-    """Draw the 95 % band of the NEES, and its dof."""
-    most = max(campaign.filters.values(), key=lambda summary: summary.counts["runs"]).curves
-    step = np.arange(1, campaign.steps + 1)
-    band(axes, step, most[f"nees_{block}_low"], most[f"nees_{block}_high"], "95 % band")
-    axes.axhline(DOF[block], color=INK, lw=0.8, zorder=1.5, label="honest")
 
 
 def _label_powers(axes: Axes, strip: float, decades: float) -> None:
@@ -246,11 +242,6 @@ def _label_powers(axes: Axes, strip: float, decades: float) -> None:
 def _peak(values: np.ndarray) -> float:
     """The largest finite value that is not negative, or 0."""
     return float(np.max(values, initial=0.0, where=np.isfinite(values)))
-
-
-def _lone(values: np.ndarray) -> str:
-    """The marker of a line, if a single value is finite; else none."""
-    return "o" if np.isfinite(values).sum() == 1 else ""
 
 
 _ERROR, _NEES = "rmse_position", "nees_pose"
@@ -281,7 +272,7 @@ def cost_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     times = {name: 1e6 * campaign.step_seconds.get(name, np.nan) for name in campaign.filters}
     numbers, few = numbers_of(list(times)), len(times) <= TOGETHER
     groups = [("", list(times))] if few else kinds_of(list(times))
-    rows = len(times) + len(groups) - 1  # an empty one between two kinds
+    rows = len(times) + len(groups) - 1  # an empty row between two kinds
     width = width if few else max(width, PAGE)
     figure, panels = panels_of(width, 0.145 * rows + 0.9, 1, 3, share=(False, True))
     for axes in panels:
@@ -298,7 +289,7 @@ def cost_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
             _point(panels[0], i, at, name, Average(times[name], np.nan, np.nan))
             for axes, key in zip(panels[1:], _LABELS, strict=True):
                 _point(axes, i, at, name, measures.get(key, _NONE))
-            names.append(plain(name))
+            names.append(escape_name(name))
             heights.append(at)
             at += 1
         at += 1
@@ -314,13 +305,13 @@ def cost_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     for axes, text in zip(panels, titles, strict=True):
         axes.set_xlabel(text if width >= PAGE else text.replace(" [", "\n[").replace(" (", "\n("))
     honest = panels[2].axvline(DOF["pose"], color=INK, lw=0.8, zorder=1.5, label="honest")
-    what = f"error and NEES, with {percentage(EACH, 1)} intervals, and the time of a step,"
-    caption(figure, title_of(campaign, what), [honest])
+    subject = f"error and NEES, with {percentage(EACH, 1)} intervals, and the time of a step,"
+    caption(figure, title_of(campaign, subject), [honest])
     return figure
 
 
 def _point(axes: Axes, i: int, at: float, name: str, measure: Average) -> None:
-    """Draw a measure with its interval at a height; beyond the scale a triangle with its value."""
+    """Draw a measure with its interval at a height; a triangle with its value beyond the scale."""
     value = measure.value
     if not np.isfinite(value):
         return
@@ -342,7 +333,7 @@ def _point(axes: Axes, i: int, at: float, name: str, measure: Average) -> None:
         )
         return
     mark: Look = {key: style[key] for key in ("color", "marker", "mec", "mew")}
-    axes.plot(value, at, ms=5.0, label=plain(name), **mark)
+    axes.plot(value, at, ms=5.0, label=escape_name(name), **mark)
 
 
 def _interval(axes: Axes, at: float, measure: Average, color: str) -> None:
@@ -360,13 +351,14 @@ def _interval(axes: Axes, at: float, measure: Average, color: str) -> None:
 
 def _values(campaign: Campaign, key: str) -> np.ndarray:
     """The numbers that set the scale of a measure: values, and ends of intervals."""
-    found = np.array([s.measures.get(key, _NONE) for s in campaign.filters.values()])
-    if key == _NEES:
-        found = np.minimum([*found, [DOF["pose"]] * 3], _CAP * DOF["pose"])
-    values: np.ndarray = found[np.isfinite(found[:, 0]) & (found[:, 0] > 0), 0]
+    # Rows (value, low, high).
+    averages = np.array([s.measures.get(key, _NONE) for s in campaign.filters.values()])
+    if key == _NEES:  # the honest value is on the scale, too
+        averages = np.minimum([*averages, [DOF["pose"]] * 3], _CAP * DOF["pose"])
+    values: np.ndarray = averages[np.isfinite(averages[:, 0]) & (averages[:, 0] > 0), 0]
     if not values.size:
         return values
-    ends = found[:, 1:][np.isfinite(found[:, 1:])]
+    ends = averages[:, 1:][np.isfinite(averages[:, 1:])]
     return np.concatenate([values, ends.clip(values.min() / _WIDE, _WIDE * values.max())])
 
 

@@ -21,14 +21,14 @@ from jaxslam.results.plot._style import (
     TEXT,
     caption,
     curves_of,
+    escape_name,
     ordinate,
     panels_of,
-    plain,
     titled,
 )
 
 TOGETHER = 5
-"""largest number of curves in a panel"""
+"""Largest number of curves in a panel: five marks differ without colour."""
 
 
 class Row(NamedTuple):
@@ -36,19 +36,19 @@ class Row(NamedTuple):
 
     kind: str
     names: dict[str, int]
-    """each with its number (`numbers_of`)"""
+    """the number of each filter (`numbers_of`) by its name"""
     panels: list[Axes]
-    """one for each quantity"""
+    """a panel for each quantity"""
 
 
 def kinds_of(names: Sequence[str]) -> list[tuple[str, list[str]]]:
-    """Groups (kind, names) of at most five filters: those of `catalog.KINDS`, then others."""
-    known = {name: kind for kind, members in KINDS.items() for name in members}
-    found = []
+    """Groups (kind, names) of at most five filters: the kinds of `catalog.KINDS`, then others."""
+    kind_of = {name: kind for kind, members in KINDS.items() for name in members}
+    groups = []
     for kind in [*KINDS, "others"]:
-        chosen = [name for name in names if known.get(name, "others") == kind]
-        found += [(kind, chosen[at : at + TOGETHER]) for at in range(0, len(chosen), TOGETHER)]
-    return found
+        members = [name for name in names if kind_of.get(name, "others") == kind]
+        groups += [(kind, members[i : i + TOGETHER]) for i in range(0, len(members), TOGETHER)]
+    return groups
 
 
 def numbers_of(names: Sequence[str]) -> dict[str, int]:
@@ -144,32 +144,32 @@ def add_legends(figure: Figure, rows: Sequence[Row], title: str, across: str) ->
     caption(figure, title, [handle for handle in everything if handle not in curves])
 
 
-def title_of(campaign: Campaign, what: str) -> str:
-    """The title of a figure: the scenario, what is shown, and the number of runs."""
+def title_of(campaign: Campaign, subject: str) -> str:
+    """The title of a figure: the scenario, the subject, and the number of runs."""
     runs = f"{campaign.runs:,} run{'s' if campaign.runs != 1 else ''}"
-    return f"{plain(campaign.scenario)}: {what} {runs}"
+    return f"{escape_name(campaign.scenario)}: {subject} {runs}"
 
 
 _FAR = 3.0
-"""A filter whose curve exceeds this multiple of the median does not set a scale."""
+"""Multiple of the median beyond which the curve of a filter does not set a scale."""
 
-_NEES = (1 / 10, 10.0, 100.0)
-"""lowest end of a scale of NEES, and least and greatest upper end, in multiples of dof"""
+_NEES_ENDS = (1 / 10, 10.0, 100.0)
+"""Lowest lower end of a scale of NEES, and lowest and highest upper end, in multiples of dof."""
 
 _BAND = 0.06
-"""share of the height of a panel that the 95 % band fills at least, where the scale allows it"""
+"""Share of the height of a panel that the 95 % band fills at least, where the scale allows it."""
 
 _POWERS = 6
-"""largest number of powers of ten for which a logarithmic axis labels all of them"""
+"""Largest number of powers of ten for which a logarithmic axis labels all of them."""
 
 BEYOND = "beyond"
 """`gid` of the marks of values beyond an axis."""
 
 _NO_MARK = "", " ", "None", "none"
-"""Matplotlib's names for a line without markers"""
+"""Matplotlib's names for a line without markers."""
 
 _PLACES = 12
-"""number of marks along an edge"""
+"""Number of marks along an edge."""
 
 
 def scale_setters(campaign: Campaign) -> list[str]:
@@ -208,16 +208,18 @@ def nees_scale(axes: Axes, campaign: Campaign, block: str) -> None:
     """
     dof = DOF[block]
 
-    def every(end: str) -> np.ndarray:
+    def positive_values(end: str) -> np.ndarray:
         curves = (summary.curves[f"nees_{block}{end}"] for summary in campaign.filters.values())
-        found = np.concatenate([np.ravel(values) for values in curves])
-        return found[np.isfinite(found) & (found > 0)]
+        values = np.concatenate([np.ravel(curve) for curve in curves])
+        return values[np.isfinite(values) & (values > 0)]
 
-    values, below, above = every(""), every("_low"), every("_high")
+    values, below, above = positive_values(""), positive_values("_low"), positive_values("_high")
     shown = np.concatenate([values, below, above, [dof / 1.5, dof * 1.5]])
-    low = max(shown.min(), _NEES[0] * dof)
-    decades = np.log(np.median(above) / np.median(below)) / _BAND if below.size else np.inf
-    cap = dof * np.clip(low / dof * np.exp(min(decades, 50.0)), _NEES[1], _NEES[2])
+    low = max(shown.min(), _NEES_ENDS[0] * dof)
+    # The length of the axis, as a logarithm, over which the band fills the share `_BAND`. At most
+    # exp(50), which does not overflow.
+    length = np.log(np.median(above) / np.median(below)) / _BAND if below.size else np.inf
+    cap = dof * np.clip(low / dof * np.exp(min(length, 50.0)), *_NEES_ENDS[1:])
     set_positive(axes, low, min(shown.max(), cap))
 
 
@@ -247,16 +249,17 @@ def set_positive(
     length, label = (axes.bbox.height, 11) if which == "y" else (axes.bbox.width, 28)  # [pt]
     length *= 72 / axes.figure.dpi
     axis.set_major_locator(LogLocator(numticks=int(np.clip(length / label, 2, _POWERS))))
-    axis.set_major_formatter(_short)
+    axis.set_major_formatter(_tick_label)
     decade = length / np.log10(high / low)
+    # Labels at 2 and 5, or at 3, where they are farther apart than a label is long.
     digits = next((d for d in ("25", "3") if np.log10(int(d[0])) * decade > label), "")
     if digits:
-        axis.set_minor_formatter(lambda x, _: _short(x) if f"{x:.0e}"[0] in digits else "")
+        axis.set_minor_formatter(lambda x, _: _tick_label(x) if f"{x:.0e}"[0] in digits else "")
     else:
         axis.set_minor_locator(NullLocator())
 
 
-def _short(x: float, _: float = 0.0) -> str:
+def _tick_label(x: float, _: float = 0.0) -> str:
     return f"{x:g}" if 1e-3 <= abs(x) < 1e5 else power(x)
 
 
@@ -291,14 +294,15 @@ def mark_beyond(axes: Axes) -> None:
             places = np.interp((np.arange(_PLACES) + offset) / _PLACES, [0, 1], [left, right])
         near = np.abs(x[:, None] - places).argmin(axis=0)
         marker = str(line.get_marker())
-        for out, edge, arrow in ((y > high, 1.0, "$\u2191$"), (y < low, 0.0, "$\u2193$")):
-            if not out.any():
+        for beyond, edge, arrow in ((y > high, 1.0, "$\u2191$"), (y < low, 0.0, "$\u2193$")):
+            if not beyond.any():
                 continue
-            at = np.unique(near[out[near]])
-            at = at if at.size else np.flatnonzero(out)[:1]
+            # Of the regular places those beyond; the first such value if no place is.
+            marked = np.unique(near[beyond[near]])
+            marked = marked if marked.size else np.flatnonzero(beyond)[:1]
             axes.plot(
-                x[at],
-                np.full(len(at), edge),
+                x[marked],
+                np.full(len(marked), edge),
                 marker=arrow if marker in _NO_MARK else marker,
                 linestyle="none",
                 transform=axes.get_xaxis_transform(),

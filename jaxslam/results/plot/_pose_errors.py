@@ -16,21 +16,21 @@ from jaxslam.results.plot._style import (
     INK,
     PAGE,
     caption,
+    escape_name,
     ordinate,
     own_settings,
     panels_of,
-    plain,
     step_limits,
     titled,
 )
+
+_QUANTITIES = ("x error [m]", "y error [m]", "heading error [°]")
 
 _SHORT = ("x [m]", "y [m]", "θ [°]")
 """The quantities in a narrow figure."""
 
 _NARROW = 5.0
-
-_QUANTITIES = ("x error [m]", "y error [m]", "heading error [°]")
-
+"""Width below which a figure is narrow [in]."""
 
 _SMALL = 0.1
 """Errors and bounds below this share of a common scale have a separate scale."""
@@ -56,9 +56,9 @@ def errors_figure(
 def run_errors_figure(campaign: Campaign, *, title: str = "", width: float = PAGE) -> Figure:
     """Errors of run 0 of every filter of `Campaign.first`, one row each, as in `errors_figure`.
 
-    The scales are equal, except for panels that would use less than a tenth of theirs: these have a
-    separate one, with bold numbers. Filters that do not set a scale (`rmse_figure`) leave the
-    panels at an arrow. Raises ValueError if the campaign has no run 0.
+    The scales are equal, except for panels that would use less than a tenth of the common scale:
+    these have a separate one, with bold numbers. Filters that do not set a scale (`rmse_figure`)
+    leave the panels at an arrow. Raises ValueError if the campaign has no run 0.
     """
     check_record("run_errors_figure", "the first argument", campaign, Campaign)
     if not campaign.first:
@@ -66,20 +66,21 @@ def run_errors_figure(campaign: Campaign, *, title: str = "", width: float = PAG
     if len(campaign.first) == 1:
         ((truth, estimate),) = campaign.first.values()
         return errors_figure(estimate, truth, title=title, width=width)
-    found = {n: _errors(estimate, truth) for n, (truth, estimate) in campaign.first.items()}
+    # Errors and bounds by filter, each (T, 3).
+    curves = {n: _errors(estimate, truth) for n, (truth, estimate) in campaign.first.items()}
     setters = scale_setters(campaign)
     peaks = {
         name: np.max(np.abs(both), axis=(0, 1), where=np.isfinite(both), initial=0.0)
-        for name, both in found.items()
+        for name, both in curves.items()
     }
     tops = [common_top({name: peak[i] for name, peak in peaks.items()}, setters) for i in range(3)]
-    figure, panels = panels_of(width, 0.8 * len(found) + 0.8, len(found), 3)
+    figure, panels = panels_of(width, 0.8 * len(curves) + 0.8, len(curves), 3)
     for i, axes in enumerate(panels[:3]):
         name = _QUANTITIES[i] if width > _NARROW else _SHORT[i]
         titled(axes, f"{name}\n")  # above what `mark_beyond` writes
         if width < _NARROW:
             axes.locator_params(axis="x", nbins=2, min_n_ticks=1)
-    for j, (name, (error, bound)) in enumerate(found.items()):
+    for j, (name, (error, bound)) in enumerate(curves.items()):
         for i, axes in enumerate(panels[3 * j : 3 * j + 3]):
             peak, common = peaks[name][i], tops[i]
             top = peak if 0 < peak < _SMALL * common else common
@@ -88,7 +89,7 @@ def run_errors_figure(campaign: Campaign, *, title: str = "", width: float = PAG
                 axes.set_yticks([-top, 0.0, top], [f"−{top:.2g}", "0", f"{top:.2g}"], weight="bold")
             _draw(axes, error[:, i], bound[:, i])
             mark_beyond(axes)
-        words = plain(name).replace("_", "_ ")
+        words = escape_name(name).replace("_", "_ ")  # a name may break after _
         wrapped = textwrap.wrap(words, 12, break_long_words=False)
         lines = [line.replace("_ ", "_") for line in wrapped]
         panels[3 * j].set_ylabel("\n".join(lines), rotation=0, ha="right", va="center")
@@ -101,7 +102,7 @@ def run_errors_figure(campaign: Campaign, *, title: str = "", width: float = PAG
 def _errors(estimate: Estimate, truth: Truth) -> tuple[np.ndarray, np.ndarray]:
     """The errors (T, 3), truth minus estimate, and 3 σ, in metres and degrees."""
     error = np.asarray(truth.pose) - np.asarray(estimate.pose)
-    error[:, 2] = np.mod(error[:, 2] + np.pi, 2 * np.pi) - np.pi
+    error[:, 2] = np.mod(error[:, 2] + np.pi, 2 * np.pi) - np.pi  # in [-π, π)
     variance = np.diagonal(np.asarray(estimate.pose_cov), axis1=1, axis2=2)
     scale = np.array([1.0, 1.0, np.rad2deg(1.0)])
     return scale * error, 3 * scale * np.sqrt(np.maximum(variance, 0.0))

@@ -43,13 +43,13 @@ from jaxslam.simulation._worlds import World, run_keys, with_positions, world_of
 _ROBOT_LINK, _LINK = COLORS[5], COLORS[3]
 
 _CUT_FOR = 8
-"""number of frames in which a link that was cut is still shown"""
+"""Number of frames in which a link that was cut is still shown."""
 
-_SEEN = 0.2
-"""A link to the robot is drawn as if it were at least so strong."""
+_MIN_STRENGTH = 0.2
+"""Least strength with which a link to the robot is drawn."""
 
 _WEAK = 1e-9
-"""strength of a link that is rounding alone"""
+"""Strength of a link that is rounding alone."""
 
 
 class Cloud(NamedTuple):
@@ -86,8 +86,8 @@ def probe(state: PyTree) -> Cloud | Links | Hypotheses | None:
     if isinstance(state, SlamParticles | PoseParticles) and state.log_weight.ndim:
         return Cloud(state.pose, jnp.exp(state.log_weight))
     if isinstance(state, SparseState):
-        every = jnp.arange(state.alive.shape[0], dtype=jnp.int32)
-        return _links(local_information(state, every), 2)
+        slots = jnp.arange(state.alive.shape[0], dtype=jnp.int32)
+        return _links(local_information(state, slots), 2)
     if isinstance(state, CanonicalState):
         return _links(state.omega, state.landmarks.shape[1])
     if isinstance(state, DelayedState):
@@ -96,7 +96,7 @@ def probe(state: PyTree) -> Cloud | Links | Hypotheses | None:
 
 
 def _hypotheses(state: DelayedState) -> Hypotheses:
-    """The hypotheses of a state, whose slots follow those of the landmarks."""
+    """The hypotheses of a state: after the slots of the landmarks, before the stored poses."""
     joint, count = state.joint, state.persistence.shape[0]
     first = joint.alive.shape[0] - state.taken_at.shape[0] - count
     slot = first + np.arange(count)
@@ -107,15 +107,16 @@ def _hypotheses(state: DelayedState) -> Hypotheses:
 
 def _links(omega: Float[Array, "D D"], size: int) -> Links:
     """The links of Ω of a robot and landmarks of `size` parameters."""
-    # NumPy's arrays are constants, and cost no operation.
+    # NumPy's arrays are constants, and cost no operation. Row 0 of `rows` is the robot's position,
+    # row 1 + slot the position of a landmark, whose parameters begin with it.
     landmarks = 3 + np.arange((omega.shape[0] - 3) // size)[:, None] * size + np.arange(2)
     rows = np.concatenate([np.arange(2)[None], landmarks])
-    blocks = omega[rows[:, None, :, None], rows[None, :, None, :]]
+    blocks = omega[rows[:, None, :, None], rows[None, :, None, :]]  # (K, K, 2, 2)
     norm = jnp.sqrt((blocks**2).sum(axis=(2, 3)))
     diagonal = jnp.sqrt(jnp.diagonal(norm))
-    apart = ~np.eye(len(rows), dtype=bool)
+    differ = ~np.eye(len(rows), dtype=bool)
     return Links(
-        jnp.where(apart, norm / (diagonal[:, None] * diagonal[None, :]), 0.0).astype(jnp.float32)
+        jnp.where(differ, norm / (diagonal[:, None] * diagonal[None, :]), 0.0).astype(jnp.float32)
     )
 
 
@@ -162,7 +163,7 @@ def link_layers(seen: object, estimate: Estimate) -> list[Layer]:
         between.append(ends[i > 0])
         robot.append(ends[i == 0])
         weights["between"].append(weight[i > 0])
-        weights["robot"].append(np.maximum(weight[i == 0], _SEEN))
+        weights["robot"].append(np.maximum(weight[i == 0], _MIN_STRENGTH))
         alive = np.append(True, estimate.alive[k])
         gone = recent & ~linked & alive[:, None] & alive[None, :]
         cut.append(nodes[np.stack(np.nonzero(gone), axis=1)])
@@ -178,7 +179,7 @@ def link_layers(seen: object, estimate: Estimate) -> list[Layer]:
 
 
 MOST = 100
-"""default of the largest number of frames"""
+"""Default of the largest number of frames: at ten a second a film lasts 10 s."""
 
 
 def frame_steps(
@@ -186,8 +187,9 @@ def frame_steps(
 ) -> Int[np.ndarray, "F"]:
     """The steps 0 … steps - 1 that are shown: all, or `most` of them, evenly in time.
 
-    The first and the last are shown. time: of each step, which does not go back; default: evenly in
-    steps. In a gap of the times a step is shown several times.
+    The first and the last are shown. In a gap of the times a step is shown several times.
+
+    time: the time of each step, which does not go back; default: the number of the step.
 
     Raises ValueError without a step, on a `most` below 1, or on other times.
     """
@@ -214,13 +216,13 @@ class History(NamedTuple):
     step: Int[np.ndarray, "F"]
     """the step of each frame, from 0"""
     estimate: Estimate
-    """with leading F"""
+    """the whole estimate, with leading F"""
     tag: Int[np.ndarray, "T M"]
-    """of the measurements"""
+    """tag of each measurement"""
     status: Int[np.ndarray, "T M"]
     slot: Int[np.ndarray, "T M"]
     seen: Cloud | Links | Hypotheses | None = None
-    """with leading F"""
+    """the result of `probe`, with leading F"""
 
 
 def history_of(trace: Trace, log: Log, frames: int = MOST) -> History:
@@ -249,11 +251,11 @@ def history_of(trace: Trace, log: Log, frames: int = MOST) -> History:
     return History(path, steps, estimate, tag, status, slot, seen)
 
 
-class Measured(NamedTuple):
+class FrameBeams(NamedTuple):
     """The measurements since the previous frame, for each of F frames."""
 
     beams: dict[str, list[Float[np.ndarray, "E 2 2"]]]
-    """by outcome: from the robot to the landmark, if that is in the map"""
+    """ends by outcome: the robot, and the landmark if it is in the map"""
     counts: dict[str, Int[np.ndarray, "F"]]
     """number of measurements, by outcome"""
 
@@ -266,7 +268,7 @@ _OUTCOMES = {
 }
 
 
-def measured(history: History) -> Measured:
+def beams_of(history: History) -> FrameBeams:
     """The beams and counts of a history.
 
     A beam begins where the robot was estimated in that step, and ends at the landmark's estimate in
@@ -285,24 +287,25 @@ def measured(history: History) -> Measured:
         by_tag = np.where(match.any(axis=-1), match.argmax(axis=-1), -1) if named.size else -1
         target = np.where(slot >= 0, slot, by_tag)
         in_map = (target >= 0) & (target < len(alive))
+        # The entry False at the end is for targets that are not in the map.
         in_map &= np.append(alive, False)[np.where(in_map, target, -1)]
         for name, outcomes in _OUTCOMES.items():
             chosen = np.isin(status, outcomes)
             counts[name].append(int(chosen.sum()))
-            row, at = np.nonzero(chosen & in_map)
-            ends = [history.path[rows][row, :2], np.asarray(points)[target[row, at]]]
+            row, place = np.nonzero(chosen & in_map)
+            ends = [history.path[rows][row, :2], np.asarray(points)[target[row, place]]]
             beams[name].append(np.stack(ends, axis=1))
-    return Measured(beams, {name: np.array(found) for name, found in counts.items()})
+    return FrameBeams(beams, {name: np.array(numbers) for name, numbers in counts.items()})
 
 
 _NEAR = 1.5
 """Largest factor by which the estimate extends the limits of the truth."""
 
 _ROBOT = 0.035
-"""length of the robot from its position to its tip, as a share of the map's side"""
+"""Length of the robot from its position to its tip, as a share of the map's side."""
 
 _MANY = 60
-"""With more landmarks their marks are smaller."""
+"""Number of landmarks above which their marks are smaller."""
 
 _BEAMS: dict[str, Look] = {
     "fused": {"color": COLORS[2], "lw": 0.8, "ls": "-"},
@@ -328,7 +331,7 @@ def run_scene(
 
     Args:
         true_points: (N, 2) landmarks [m], in the frame of the map.
-        true_path: (T, 3) poses, NaN where not known, in the same.
+        true_path: (T, 3) poses in the frame of the map, NaN where not known.
     Raises:
         ValueError: on points or a path of other shapes.
     """
@@ -342,13 +345,13 @@ def run_scene(
             f"animate: expected a true path of shape ({steps}, 3), got {np.shape(true_path)}"
         )
     true = None if true_path is None else np.asarray(true_path, float)
-    found = measured(history)
+    beams = beams_of(history)
     limits = _limits(history, true_points, true)
     side = limits[0][1] - limits[0][0]
     layers = [
         *_truth(history, true_points, true, _ROBOT * side),
         *link_layers(history.seen, history.estimate),
-        *_beams(found),
+        *_beams(beams),
         *hypothesis_layers(history.seen),
         *_map(history),
         *_robot(history, _ROBOT * side),
@@ -356,8 +359,8 @@ def run_scene(
     return Scene(
         len(history.step),
         Panel(layers, *limits),
-        _nearby(history, true),
-        _text(history, found),
+        _error_panel(history, true),
+        _text(history, beams),
         title,
         f"{len(history.step):,} of {steps:,} steps are shown, evenly in time"
         * (len(history.step) < steps),
@@ -365,17 +368,17 @@ def run_scene(
 
 
 def _limits(history: History, points: np.ndarray | None, path: np.ndarray | None) -> Limits:
-    """The limits of the map: those of the truth, or else the estimate, extended by near points."""
+    """The limits of the map: the truth, or else the estimate, extended by near points."""
     alive = history.estimate.alive
     mapped = np.asarray(history.estimate.points)[alive]
     covs = np.asarray(history.estimate.point_covs)[alive]
     reach = 3 * np.sqrt(np.maximum(np.diagonal(covs, axis1=1, axis2=2), 0.0))
     estimated = [history.path[:, :2], mapped]
-    clouds = [np.asarray(each, float)[:, :2] for each in (points, path) if each is not None]
-    clouds = clouds or estimated
-    for more in (*estimated, np.concatenate([mapped - reach, mapped + reach])):
-        if extent([*clouds, more]) <= _NEAR * extent(clouds):
-            clouds = [*clouds, more]
+    truth = [array for array in (points, path) if array is not None]
+    clouds = [np.asarray(array, float)[:, :2] for array in truth] or estimated
+    for array in (*estimated, np.concatenate([mapped - reach, mapped + reach])):
+        if extent([*clouds, array]) <= _NEAR * extent(clouds):
+            clouds = [*clouds, array]
     return square_limits(clouds)
 
 
@@ -396,12 +399,12 @@ def _truth(
     return layers
 
 
-def _beams(found: Measured) -> list[Layer]:
-    """The layers of the beams to measured landmarks, of the kinds that occur."""
+def _beams(of_frames: FrameBeams) -> list[Layer]:
+    """The layers of the beams to measured landmarks, of the outcomes that occur."""
     return [
-        lines_between(found.beams[name], label=f"measured, {name}", zorder=3, **look)
+        lines_between(of_frames.beams[name], label=f"measured, {name}", zorder=3, **look)
         for name, look in _BEAMS.items()
-        if any(map(len, found.beams[name]))
+        if any(map(len, of_frames.beams[name]))
     ]
 
 
@@ -428,43 +431,44 @@ def _robot(history: History, size: float) -> list[Layer]:
     layers = [track(history.path, history.step, label="estimate: path, robot", **line)]
     if isinstance(history.seen, Cloud):
         layers.append(particle_layer(history.seen, np.zeros((len(pose), 2)), "particles"))
-    here = np.ones((len(pose), 1), bool)
+    always = np.ones((len(pose), 1), bool)
     return [
         *layers,
         triangle(pose, size, **robot),
-        rings(pose[:, None, :2], cov[:, None, :2, :2], here, label="_", **ring),
+        rings(pose[:, None, :2], cov[:, None, :2, :2], always, label="_", **ring),
     ]
 
 
-def _nearby(history: History, path: np.ndarray | None) -> Panel:
+def _error_panel(history: History, path: np.ndarray | None) -> Panel:
     """The robot's position as seen from its estimate: the ellipse, the truth, particles."""
     pose, cov = (np.asarray(part) for part in history.estimate[:2])
     cov = cov[:, None, :2, :2]
-    middle, here = np.zeros((len(pose), 1, 2)), np.ones((len(pose), 1), bool)
-    contours = ellipses(middle[:, 0], cov[:, 0])
+    center, always = np.zeros((len(pose), 1, 2)), np.ones((len(pose), 1), bool)
+    contours = ellipses(center[:, 0], cov[:, 0])
     reach = np.abs(contours[np.isfinite(contours)]).max(initial=0.0)
     ring: Look = {"color": COLORS[0], "lw": 1.0, "ls": (0, (3, 1)), "zorder": 4}
-    layers = [rings(middle, cov, here, label="robot, 3 σ", **ring)]
+    layers = [rings(center, cov, always, label="robot, 3 σ", **ring)]
     dot: Look = {"color": COLORS[0], "marker": "+", "ms": 7, "mew": 1.2, "zorder": 5}
-    layers.append(marks(middle, here, label="_", **dot))
+    layers.append(marks(center, always, label="_", **dot))
     if isinstance(history.seen, Cloud):
         layers.insert(0, particle_layer(history.seen, pose[:, :2], "_"))
-        away = np.abs(np.asarray(history.seen.pose)[..., :2] - pose[:, None, :2])
-        away = np.append(away[np.isfinite(away)], 0.0)
-        reach = max(reach, float(np.quantile(away, 0.995)))
+        spread = np.abs(np.asarray(history.seen.pose)[..., :2] - pose[:, None, :2])
+        spread = np.append(spread[np.isfinite(spread)], 0.0)
+        reach = max(reach, float(np.quantile(spread, 0.995)))
     if path is not None:
-        off = path[history.step, None, :2] - pose[:, None, :2]
-        known = np.isfinite(off).all(axis=2)
-        far = np.abs(off[known]).max(initial=0.0)
-        reach = max(reach, min(far, 3 * reach) if reach > 0 else far)
+        error = path[history.step, None, :2] - pose[:, None, :2]
+        is_known = np.isfinite(error).all(axis=2)
+        largest = np.abs(error[is_known]).max(initial=0.0)
+        # Errors up to three times the ellipses are on the scale, larger ones at its edge.
+        reach = max(reach, min(largest, 3 * reach) if reach > 0 else largest)
         half = 1.08 * reach or 1.0
-        out = known & (np.abs(off).max(axis=2) > half)
+        beyond = is_known & (np.abs(error).max(axis=2) > half)
         cross: Look = {"marker": "X", "ms": 6.5, "zorder": 6, "clip_on": False}
-        layers.append(marks(off, known & ~out, label="true position", color=INK, **cross))
-        if out.any():
-            edge = np.clip(off, -half, half)
+        layers.append(marks(error, is_known & ~beyond, label="true position", color=INK, **cross))
+        if beyond.any():
+            edge = np.clip(error, -half, half)
             look: Look = {"label": "true position beyond", "mfc": "white", "mec": INK}
-            layers.append(marks(edge, out, **look, **cross))
+            layers.append(marks(edge, beyond, **look, **cross))
     half = 1.08 * reach or 1.0
     return Panel(
         layers,
@@ -474,8 +478,8 @@ def _nearby(history: History, path: np.ndarray | None) -> Panel:
     )
 
 
-def _text(history: History, found: Measured) -> Callable[[int], str]:
-    """The line above frame k: its step, and the outcomes of the measurements since the last."""
+def _text(history: History, beams: FrameBeams) -> Callable[[int], str]:
+    """The line above frame k: its step, and the outcomes of the measurements since frame k - 1."""
     total = len(history.path)
     lost = []
     for covs, alive in zip(history.estimate.point_covs, history.estimate.alive, strict=True):
@@ -483,11 +487,11 @@ def _text(history: History, found: Measured) -> Callable[[int], str]:
         lost.append(int(np.isnan(contours).all(axis=(1, 2)).sum()))
 
     def caption(k: int) -> str:
-        counts = {name: int(of[k]) for name, of in found.counts.items()}
+        counts = {name: int(numbers[k]) for name, numbers in beams.counts.items()}
         shown = [f"{count} {name}" for name, count in counts.items() if count or name != "stored"]
         parts = [f"step {history.step[k] + 1:,} of {total:,}"]
-        many = sum(counts.values())
-        parts.append(f"{many} measurement{'s' * (many != 1)}: {', '.join(shown)}")
+        measured = sum(counts.values())
+        parts.append(f"{measured} measurement{'s' * (measured != 1)}: {', '.join(shown)}")
         if isinstance(history.seen, Hypotheses):
             count = int((np.asarray(history.seen.persistence[k]) > 0).sum())
             parts.append(f"{count} hypothes{'is' if count == 1 else 'es'}")
@@ -520,8 +524,9 @@ def animate(
     `film.scene.note` says so.
 
     Args:
-        trace, log: of `run`, T steps.
-        truth: of a simulated world; or
+        trace: result of `run`, T steps.
+        log: the log of the trace.
+        truth: the truth of a simulated world; or
         true_points: (N, 2) landmarks [m], and
         true_path: (T, 3) poses, NaN where unknown, in the frame of the map.
         frames: the largest number of frames.
@@ -560,16 +565,18 @@ def animate_world(
 
     Args:
         candidate: a filter, or a function of the truth, as `monte_carlo` takes them.
-        key: of the campaign. number: of the run. dtype: of the filter, by default that of JAX.
-        options: of `animate`.
+        key: key of the campaign.
+        number: number of the run.
+        dtype: dtype of the filter, by default that of JAX.
+        options: further arguments of `animate`.
     """
     check_record("animate_world", "scenario", scenario, World)
     truth, log = cast_floats(world_of_run(scenario, key, number), dtype)
-    of_filter = run_keys(key, number)[1]
+    filter_key = run_keys(key, number)[1]
     method = method_of(candidate, truth)
     if isinstance(method, Filter):
-        trace = run(method, log, scenario.pose, scenario.pose_cov, of_filter, probe=probe)
+        trace = run(method, log, scenario.pose, scenario.pose_cov, filter_key, probe=probe)
     else:
-        trace = method(log, of_filter)
-    shown = with_positions(scenario.sensor, truth)
-    return animate(trace, log, shown, **({"title": scenario.name} | options))
+        trace = method(log, filter_key)
+    point_truth = with_positions(scenario.sensor, truth)
+    return animate(trace, log, point_truth, **({"title": scenario.name} | options))

@@ -19,7 +19,7 @@ from jaxslam.core._optional import loading
 Share: TypeAlias = bool | Literal["none", "all", "row", "col"]
 
 Look: TypeAlias = dict[str, Any]
-"""How an artist looks: Matplotlib's properties by name, whose types it does not declare."""
+"""Look of an artist: Matplotlib's properties by name, whose types Matplotlib does not declare."""
 
 PAGE, COLUMN = 7.16, 3.5
 """Widths [in] of the text and of a column of a two-column paper."""
@@ -43,13 +43,13 @@ CURVE = "curve"
 """`gid` of the lines of filters."""
 
 _FEW = 12
-"""Largest number of values of a curve with a mark at each."""
+"""Largest number of values of a curve with a mark at each; a longer one has some six marks."""
 
 _NO_DATE = {"pdf": {"CreationDate": None}, "svg": {"Date": None}}
 
 
 def look(i: int) -> Look:
-    """Options of the line of filter number i: colour, dashes and mark, each another.
+    """Options of the line of filter number i: colour, dashes and mark.
 
     Thirty differ in colour and dashes; five differ in dashes and marks alone, without colour.
     """
@@ -63,7 +63,7 @@ def look(i: int) -> Look:
 
 
 def check_font() -> None:
-    """Raise `Unusable` where Matplotlib has no font to write with: its own is gone, or damaged."""
+    """Raise `Unusable` if Matplotlib has no font to write with: its own is missing or damaged."""
     with loading("figures", "matplotlib"):
         get_font(findfont(FontProperties()))
 
@@ -73,7 +73,7 @@ def own_settings() -> Iterator[None]:
     """A block, or by @own_settings() a function, in which Matplotlib has its defaults and ours.
 
     A figure does not depend on the user's matplotlibrc: neither on LaTeX, nor on fonts, sizes, or
-    decimal commas. The settings are those of the user afterwards.
+    decimal commas. The settings of the user are restored at the end.
     """
     ffmpeg = matplotlib.rcParams["animation.ffmpeg_path"]  # where a program is, not how it looks
     with matplotlib.rc_context():
@@ -86,7 +86,7 @@ def own_settings() -> Iterator[None]:
 
 @own_settings()
 def encode(figure: Figure, kind: str, dpi: float = 200) -> bytes:
-    """The figure as a file of a kind, png, pdf or svg; the same bytes every time."""
+    """The figure as a file of a kind, png, pdf or svg; equal figures give equal bytes."""
     out = io.BytesIO()
     figure.savefig(out, format=kind, dpi=dpi, metadata=_NO_DATE.get(kind))
     return out.getvalue()
@@ -175,7 +175,7 @@ def panels_of(
 
 def ordinate(axes: Axes, text: str, height: float) -> None:
     """Label the ordinate; in two lines if the panel is too low for one, height [in]."""
-    if len(text) * 4.5 > 0.9 * 72 * height:
+    if len(text) * 4.5 > 0.9 * 72 * height:  # 4.5 pt a letter, 72 pt an inch
         text = text.replace(" (", "\n(").replace(" [", "\n[")
     axes.set_ylabel(text)
 
@@ -188,24 +188,25 @@ def titled(axes: Axes, text: str) -> None:
 def curve(
     axes: Axes, i: int, x: np.ndarray, y: np.ndarray, label: str, *, absent: str = "no values"
 ) -> None:
-    """Draw the curve of filter number i with marks, shifted against those of its neighbours.
+    """Draw the curve of filter number i with marks, shifted against the marks of its neighbours.
 
     absent: the entry in the legend of a curve without a finite value.
     """
-    label, finite = plain(label), np.isfinite(x) & np.isfinite(y)
+    label, finite = escape_name(label), np.isfinite(x) & np.isfinite(y)
     if not finite.any():
         axes.plot([], [], ls="none", label=f"{label}: {absent}", gid=CURVE)
         return
-    every: tuple[int, int] | None = None
+    mark_every: tuple[int, int] | None = None  # first value and interval
     if finite.sum() > _FEW:
-        apart = max(len(y) // 6, 1)
-        every = (int(apart * (0.1 + 0.4 * i % 1)), apart)
+        interval = max(len(y) // 6, 1)
+        # Marks of neighbouring filters are 0.4 intervals apart.
+        mark_every = (int(interval * (0.1 + 0.4 * i % 1)), interval)
     axes.plot(
         x,
         y,
         lw=1.1,
         ms=3.6,
-        markevery=every,
+        markevery=mark_every,
         label=label,
         gid=CURVE,
         zorder=3 + 0.01 * i,
@@ -224,7 +225,7 @@ def band(axes: Axes, x: np.ndarray, low: np.ndarray, high: np.ndarray, label: st
     axes.fill_between(x, low, high, label=label, zorder=1, **look)
 
 
-def plain(name: str) -> str:
+def escape_name(name: str) -> str:
     """A name escaped for Matplotlib: without formulas, and not hidden from the legend."""
     name = name.replace("$", r"\$")
     return f" {name}" if name.startswith("_") else name
@@ -233,19 +234,20 @@ def plain(name: str) -> str:
 def caption(figure: Figure, title: str, handles: Sequence[Artist] | None = None) -> None:
     """Add title and legend above the panels; the figure grows with their lines.
 
-    handles: default all with a label of the first panel.
+    handles: of the legend; by default those with a label in the first panel.
     """
     handles = figure.axes[0].get_legend_handles_labels()[0] if handles is None else handles
     labels = [str(handle.get_label()) for handle in handles]
     width = 72 * figure.get_figwidth()
+    # As many columns as fit: a letter is some 4.3 pt wide, a handle with its gaps 36 pt.
     columns = 1
-    for more in range(2, min(len(labels), 6) + 1):
-        parts = np.array_split(np.array([len(label) for label in labels]), more)
+    for count in range(2, min(len(labels), 6) + 1):
+        parts = np.array_split(np.array([len(label) for label in labels]), count)
         if sum(4.3 * part.max() + 36 for part in parts) < width:
-            columns = more
-    lines = textwrap.wrap(title, int(width / 4.9))
-    more_lines = -(-len(labels) // columns) - 1 + max(len(lines) - 1, 0)
-    figure.set_figheight(figure.get_figheight() + 0.16 * more_lines)
+            columns = count
+    lines = textwrap.wrap(title, int(width / 4.9))  # letters of the title are larger
+    extra_lines = -(-len(labels) // columns) - 1 + max(len(lines) - 1, 0)
+    figure.set_figheight(figure.get_figheight() + 0.16 * extra_lines)
     figure.legend(
         handles,
         labels,
@@ -265,8 +267,8 @@ def caption(figure: Figure, title: str, handles: Sequence[Artist] | None = None)
 
 def every_handle(panels: Sequence[Axes]) -> list[Artist]:
     """The handles for the legend of some panels, the last one of each label."""
-    found = [handle for axes in panels for handle in axes.get_legend_handles_labels()[0]]
-    return list({handle.get_label(): handle for handle in found}.values())
+    handles = [handle for axes in panels for handle in axes.get_legend_handles_labels()[0]]
+    return list({handle.get_label(): handle for handle in handles}.values())
 
 
 def step_limits(steps: int) -> tuple[float, float]:

@@ -8,7 +8,13 @@ from PIL import Image
 
 from jaxslam import grids, plot
 from jaxslam.core.types import Beams
-from jaxslam.results.plot._style import png
+
+
+def png(figure, dpi):
+    file = io.BytesIO()
+    figure.savefig(file, format="png", dpi=dpi)
+    return file.getvalue()
+
 
 GRID = grids.Grid(
     np.array([[2.0, -2.0, 0.0], [2.0, 2.0, -1.0]]), np.array([1.0, 2.0, np.pi / 2]), np.float64(0.5)

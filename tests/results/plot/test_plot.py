@@ -15,11 +15,12 @@ from jaxslam.consistency import Average
 from jaxslam.consistency._measures.coverage import LEVELS
 from jaxslam.consistency._measures.nees import DOF
 from jaxslam.consistency._run_scores import LAGS
+from jaxslam.results.plot import SHADE, TEXT, look, panels_of
 from jaxslam.results.plot._landmarks import run_map_figure
 from jaxslam.results.plot._measure_figures import INTERVAL
 from jaxslam.results.plot._panels import BEYOND, kinds_of, numbers_of, set_positive
 from jaxslam.results.plot._pose_errors import run_errors_figure
-from jaxslam.results.plot._style import HUES, SHADE, TEXT, curves_of, describe, look, panels_of
+from jaxslam.results.plot._style import HUES, curves_of, describe
 
 FIVE = ("dead_reckoning", "ekf", "fej", "right_invariant", "fastslam1")
 TWELVE = (*FIVE, "localization", "ideal", "oc", "ukf", "seif", "batch_map", "fastslam2")

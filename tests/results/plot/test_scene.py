@@ -19,7 +19,6 @@ from jaxslam.filters._particles.slam_particles import initial_slam_particles
 from jaxslam.results.plot._film import still
 from jaxslam.results.plot._grid_figures import map_scene
 from jaxslam.results.plot._run_film import MOST, Cloud, Hypotheses, Links, history_of, run_scene
-from jaxslam.results.plot._style import panels_of
 
 STEPS = 3
 # Landmark 2 is new in the last step; a measurement of landmark 1 fails the gate there.
@@ -53,7 +52,7 @@ def scene_of(steps=STEPS, seen=None, frames=MOST, **more):
 
 def staged(panel):
     """The axes of a panel, and what sets them to frame k."""
-    _, (axes,) = panels_of(4.0, 4.0, 1)
+    _, (axes,) = plot.panels_of(4.0, 4.0, 1)
     draws = [layer(axes) for layer in panel.layers]
     return axes, lambda k: [draw(k) for draw in draws]
 

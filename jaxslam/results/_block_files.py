@@ -1,4 +1,4 @@
-"""The folder of a campaign's finished blocks of runs, from which a campaign can be resumed."""
+"""The files of a store of runs: blocks and the manifest, each written completely or not at all."""
 
 import contextlib
 import errno
@@ -11,14 +11,12 @@ import os
 import re
 import secrets
 import zipfile
-from collections.abc import Iterator, Mapping
-from dataclasses import dataclass, field, replace
+from collections.abc import Mapping
 from pathlib import Path
 from typing import NamedTuple
 
 import numpy as np
 
-from jaxslam.consistency.campaign._pieces import missing_pieces
 from jaxslam.results._files import Json
 
 FORMAT = 4
@@ -28,11 +26,13 @@ MANIFEST = "manifest.json"
 """File with the format, the settings, the identity, their digest, and the number of runs."""
 
 _DIGEST = re.compile("[0-9a-f]{16}")
-"""Digest of a part of an identity; its digits tell a user nothing."""
+"""Digest of a part of an identity; messages leave its digits out."""
 
-_ABOUT = "_block"  # the entry of the npz that describes the block
+_ABOUT = "_block"
+"""Entry of the npz that describes the block."""
 _NAME = re.compile(r"block-(\d{8,})-(\d{8,})\.npz", re.ASCII)
-_KINDS = "biufcSU"  # of dtypes that npz keeps without pickle
+_KINDS = "biufcSU"
+"""Kinds of dtypes that npz keeps without pickle."""
 
 
 class Block(NamedTuple):
@@ -52,7 +52,10 @@ def write_block(
     size, where the disk fails; after any error, an interrupt too, the folder is as it was before.
 
     Args:
-        folder, first, arrays, runs: what to write, and where.
+        folder: the folder of the blocks.
+        first: number of the first run.
+        arrays: the results by name.
+        runs: number of runs.
         campaign: the digest of the campaign.
     """
     first, runs = operator.index(first), operator.index(runs)
@@ -73,7 +76,7 @@ def write_block(
 
 
 def read_block(path: Path, campaign: str) -> Block:
-    """The block in a file; raises ValueError with the file and what is wrong with it.
+    """The block in a file; raises ValueError with the file and the reason.
 
     campaign: the digest of the campaign that the block must belong to.
     """
@@ -96,10 +99,10 @@ def read_block(path: Path, campaign: str) -> Block:
     try:
         about = json.loads(arrays.pop(_ABOUT).tobytes())
         first, runs, checksum = about["first"], about["runs"], about.pop("sha256")
-        settings, found = about["settings"], _checksum(about, arrays)
+        settings, computed = about["settings"], _checksum(about, arrays)
     except (KeyError, TypeError, AttributeError, ValueError, RecursionError) as error:
         raise ValueError(f"{path}: an npz, but not a block of a campaign") from error
-    if checksum != found:
+    if checksum != computed:
         raise ValueError(f"{path}: its content does not match its checksum")
     if settings != campaign:
         raise ValueError(f"{path}: belongs to another campaign, or to other settings")
@@ -181,6 +184,7 @@ def canonical_json(value: object) -> str:
 
 def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
     """The bytes that `np.savez` writes, for any names, without pickle and without dates."""
+    # `np.savez` takes names as keyword arguments, and has some of its own, as `file`.
     out = io.BytesIO()
     with zipfile.ZipFile(out, "w") as npz:
         for name, array in arrays.items():
@@ -228,8 +232,8 @@ def write_manifest(
     new: bool = False,
 ) -> None:
     """Write the manifest of a folder; new: raises FileExistsError where there is one."""
-    own = {"settings": settings, "campaign": campaign}
-    manifest = {"format": FORMAT, "digest": digest_of(own), "runs": runs, **own}
+    content = {"settings": settings, "campaign": campaign}
+    manifest = {"format": FORMAT, "digest": digest_of(content), "runs": runs, **content}
     text = json.dumps(manifest, indent=2, ensure_ascii=False) + "\n"
     write_atomically(folder / MANIFEST, text.encode(), new)
 
@@ -246,210 +250,43 @@ def digest_of(settings: Mapping[str, object]) -> str:
 
 
 def differences_of(
-    there: Mapping[str, object], here: Mapping[str, object], above: str = ""
+    stored: Mapping[str, object], current: Mapping[str, object], prefix: str = ""
 ) -> list[str]:
-    """A sentence for each setting that differs, in nested settings, too."""
-    found = []
-    for key in {**there, **here}:
-        values = [side[key] for side in (there, here) if key in side]
-        inner = [value for value in values if isinstance(value, dict)]
-        if len(inner) == 2:
-            found += differences_of(inner[0], inner[1], f"{above}{key}.")
+    """A sentence for each setting that differs, in nested settings, too.
+
+    prefix: the keys above these settings.
+    """
+    sentences = []
+    for key in {**stored, **current}:
+        values = [side[key] for side in (stored, current) if key in side]
+        nested = [value for value in values if isinstance(value, dict)]
+        if len(nested) == 2:
+            sentences += differences_of(nested[0], nested[1], f"{prefix}{key}.")
         elif len(values) < 2 or canonical_json(values[0]) != canonical_json(values[1]):
-            plain = all(isinstance(value, str) for value in values)
-            unknown = plain and all(_DIGEST.fullmatch(str(value)) for value in values)
+            are_texts = all(isinstance(value, str) for value in values)
+            are_digests = are_texts and all(_DIGEST.fullmatch(str(value)) for value in values)
             old, new = (
                 "absent"
                 if key not in side
                 else "present"
-                if unknown
+                if are_digests
                 else str(side[key])
-                if plain
+                if are_texts
                 else json.dumps(side[key], ensure_ascii=False)
-                for side in (there, here)
+                for side in (stored, current)
             )
-            if len(values) == 2 and unknown:
-                how = "has other numbers or other code than in the stored runs"
+            if len(values) == 2 and are_digests:
+                difference = "has other numbers or other code than in the stored runs"
             else:
-                how = f"{old} there, {new} here"
-            found.append(f"{above}{key}: {how}")
-    return found
+                difference = f"{old} there, {new} here"
+            sentences.append(f"{prefix}{key}: {difference}")
+    return sentences
 
 
-@dataclass(frozen=True)
-class Store:
-    """Finished blocks of a campaign in a folder; make one with `open` or `resume`.
-
-    Several processes may save into one folder. Killed processes leave hidden files `.block-….tmp`,
-    which are never read.
-    """
-
-    folder: Path
-    settings: Mapping[str, object]
-    runs: int | None = None
-    """number of runs that the campaign is to have, if known; it may be extended"""
-    campaign: dict[str, str] = field(default_factory=dict)
-    """the identity of the campaign that claimed the folder; empty until one does"""
-    set_aside: list[str] = field(default_factory=list)
-    """a sentence on each file that `blocks` found bad and renamed"""
-
-    def claim(self, identity: Mapping[str, str]) -> None:
-        """Note in a new folder the campaign it belongs to; check it in any other folder.
-
-        The number of runs is noted, too, which may extend the campaign. Raises ValueError that
-        names every difference of identities, as "key: … there, … here", and what to do then.
-        """
-        mine = {str(name): str(value) for name, value in identity.items()}
-        if not (self.folder / MANIFEST).exists():
-            with contextlib.suppress(FileExistsError):
-                write_manifest(self.folder, self.settings, mine, self.runs, new=True)
-        there = resume(self.folder, self.settings)  # another process may have claimed it since
-        if there.campaign and (found := differences_of(there.campaign, mine)):
-            raise ValueError(
-                f"{self.folder} holds another campaign: {'; '.join(found)}; choose another "
-                "folder, or replace its runs (in the command, --overwrite)"
-            )
-        runs = there.runs if self.runs is None else self.runs
-        if not there.campaign or runs != there.runs:
-            write_manifest(self.folder, there.settings, mine, runs)
-        self.campaign.clear()
-        self.campaign.update(mine)
-
-    def save(self, first: int, arrays: Mapping[str, np.ndarray], runs: int) -> Path:
-        """Write runs first … first + runs - 1 to a file and return its path; see `write_block`."""
-        return write_block(self.folder, first, arrays, runs, self._digest())
-
-    def load(self, path: Path) -> Block:
-        """The block in a file; raises ValueError with the file and what is wrong with it."""
-        return read_block(path, self._digest())
-
-    def spans(self) -> list[tuple[int, int]]:
-        """The runs (first, runs) of each block by its name; only `blocks` reads the files."""
-        named = (runs_of_name(path) for path in self.folder.glob("block-*.npz"))
-        return sorted((first, last - first) for first, last in filter(None, named))
-
-    def done(self) -> int:
-        """Number of finished runs, by the names of the blocks."""
-        spans = self.spans()
-        end = max((first + runs for first, runs in spans), default=0)
-        return end - sum(count for _, count in missing_pieces(spans, end, max(end, 1)))
-
-    def blocks(self) -> Iterator[Block]:
-        """The valid blocks in order of their runs, read one at a time; no run occurs twice.
-
-        Of two blocks that share a run the one that starts first is taken; of two that start
-        together, the longer. Any other file is renamed to NAME.bad and noted in `set_aside`.
-        """
-        end = 0
-        for path in sorted(self.folder.glob("block-*.npz"), key=block_order):
-            named = runs_of_name(path)
-            try:
-                if named and named[0] < end:
-                    raise ValueError(
-                        f"{path}: repeats runs of the block before it, which ends at {end}"
-                    )
-                block = self.load(path)
-            except FileNotFoundError:
-                continue  # another process has renamed it
-            except ValueError as error:
-                self._put_aside(path, error)
-                continue
-            end = block.first + block.runs
-            yield block
-            del block  # to free memory before the next is read
-
-    def _digest(self) -> str:
-        """The digest that ties blocks to this campaign and its settings."""
-        return digest_of({"settings": self.settings, "campaign": self.campaign})
-
-    def _put_aside(self, path: Path, reason: ValueError) -> None:
-        """Rename a bad file, and note why."""
-        name, number = f"{path.name}.bad", 1
-        while (path.parent / name).exists():
-            name, number = f"{path.name}.bad{number}", number + 1
-        with contextlib.suppress(FileNotFoundError):
-            path.rename(path.parent / name)
-        self.set_aside.append(f"{reason}; not used, renamed to {name}")
-
-
-def open(
-    folder: str | os.PathLike[str],
-    settings: Mapping[str, object] | None = None,
-    runs: int | None = None,
-) -> Store:
-    """The store of the campaign in a folder: of that which it holds, or of a new one.
-
-    `monte_carlo(keep=…)` notes the identity of the campaign in it, and refuses another one.
-    Independent processes may open one folder, and compute a part of the campaign each.
-
-    Args:
-        folder: the folder, which is created if needed.
-        settings: further settings that must agree when the campaign is opened again, of JSON's
-            types.
-        runs: number of runs that the campaign is to have; a larger number than before extends it
-            from the next `claim` on.
-    Raises:
-        ValueError: where the campaign is to have more runs, and as `resume` on what is there.
-    """
-    folder, own = _folder(folder), as_stored(settings or {})
-    if not (folder / MANIFEST).exists():
-        folder.mkdir(parents=True, exist_ok=True)
-        return Store(folder, own, runs)
-    kept = resume(folder, own)
-    if runs is not None and runs < (kept.runs or 0):
-        raise ValueError(
-            f"{folder}: the campaign is to have {kept.runs} runs: expected at least as many, got "
-            f"{runs}"
-        )
-    return kept if runs is None else replace(kept, runs=runs)
-
-
-def resume(folder: str | os.PathLike[str], settings: Mapping[str, object] | None = None) -> Store:
-    """The store of the campaign that a folder holds.
-
-    Args:
-        folder: the folder.
-        settings: if given, they must equal those of the manifest.
-    Raises:
-        ValueError: if there is no campaign, if its manifest cannot be read, and on any difference
-            of settings, naming all.
-    """
-    folder = _folder(folder)
-    manifest, path = read_manifest(folder), folder / MANIFEST
-    if manifest["format"] != FORMAT:
-        raise ValueError(
-            f"{path}: expected format {FORMAT}, got {manifest['format']}: begin a new campaign"
-        )
-    own, campaign, runs = (manifest.get(key) for key in ("settings", "campaign", "runs"))
-    if (
-        not isinstance(own, dict)
-        or not isinstance(campaign, dict)
-        or not isinstance(runs, int | None)
-        or not _is_original(manifest)
-    ):
-        raise ValueError(
-            f"{path}: it was changed since the campaign began: put the original back, or begin a "
-            "new campaign in another folder"
-        )
-    if settings is not None and (found := differences_of(own, as_stored(settings))):
-        raise ValueError(f"{folder} holds another campaign: {'; '.join(found)}")
-    return Store(folder, own, runs, campaign)
-
-
-def _is_original(manifest: Json) -> bool:
+def is_original(manifest: Json) -> bool:
     """Whether settings and campaign of a manifest have its digest."""
-    own = {key: manifest.get(key) for key in ("settings", "campaign")}
+    content = {key: manifest.get(key) for key in ("settings", "campaign")}
     try:
-        return manifest.get("digest") == digest_of(own)
+        return manifest.get("digest") == digest_of(content)
     except ValueError:  # a number that JSON does not have
         return False
-
-
-def _folder(folder: str | os.PathLike[str]) -> Path:
-    """A folder as a path; raises ValueError on another type."""
-    try:
-        return Path(folder)
-    except TypeError:
-        raise ValueError(
-            f"store: expected a folder, as a path or a string, got {folder!r}"
-        ) from None
