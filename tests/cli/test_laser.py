@@ -16,7 +16,7 @@ from ring_of_rooms import FAR, ranges_of
 
 from jaxslam import _cli as cli
 from jaxslam import datasets, grids
-from jaxslam._cli.recorded import localize
+from jaxslam._cli.recorded import localize, memory
 from jaxslam._cli.recorded.laser_log import read_log
 from jaxslam._cli.recorded.make_map import SCANS_AT_ONCE
 from jaxslam.core.types import Estimate
@@ -393,3 +393,17 @@ def test_a_map_or_a_start_that_is_none_is_refused(
     run = ["localize", here, log_file.path, "--out", out]
     refused([*run, *options], message)
     assert not out.exists()
+
+
+def test_memory_is_returned_after_each_compilation_in_the_block(monkeypatch):
+    calls = []
+    monkeypatch.setattr(memory, "trim", lambda: calls.append(None))
+    with memory.memory_returned():
+        jax.jit(lambda x: x + 0.25)(np.ones(3))
+    count = len(calls)
+    jax.jit(lambda x: x + 0.5)(np.ones(3))
+    assert count == len(calls) == 1
+
+
+def test_memory_can_be_returned():
+    memory.trim()

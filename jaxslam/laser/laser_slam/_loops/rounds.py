@@ -69,6 +69,12 @@ class Matches(NamedTuple):
     """KEPT, POOR or AMBIGUOUS"""
 
 
+_NO_CANDIDATES = Candidates(
+    np.zeros(0, int), np.zeros(0, int), np.zeros((0, 3)), np.zeros(0, bool), np.zeros(0, bool)
+)
+_NO_MATCHES = Matches(np.zeros((0, 3)), np.zeros((0, 3, 3)), np.zeros(0), np.zeros(0, int))
+
+
 def close_loops(
     scans: Scans,
     odometry: Odometry,
@@ -100,7 +106,7 @@ def close_loops(
     looks = np.concatenate([descriptors(ends_at[part], valid[part]) for part in parts])
     graph = graph_of(at, keyframe, chain)
     solution: graphs.Solution | None = None
-    candidates, matches = _nothing()
+    candidates, matches = _NO_CANDIDATES, _NO_MATCHES
     loops, kept = _judge(candidates, matches, at, total)
     tried: set[tuple[int, int, bool]] = set()
     closed: set[tuple[int, int]] = set()
@@ -246,13 +252,6 @@ def _judge(
         outcome=outcome,
     )
     return loops, outcome == LoopOutcome.KEPT
-
-
-def _nothing() -> tuple[Candidates, Matches]:
-    """No candidates and no matches."""
-    index, flag, pose = np.zeros(0, int), np.zeros(0, bool), np.zeros((0, 3))
-    matches = Matches(pose, np.zeros((0, 3, 3)), np.zeros(0), index)
-    return Candidates(index, index, pose, flag, flag), matches
 
 
 def _concatenate(a: _Columns, b: _Columns) -> _Columns:
