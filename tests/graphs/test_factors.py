@@ -89,8 +89,8 @@ def test_the_residual_of_a_motion_is_its_noise(make):
         by = jax.jacfwd(lambda x, y: factor.residual((x, y), u), argnums=(0, 1))(x, second)
         return residual, by, model.jacobians(x, u, w)
 
-    found, (by_first, by_second), (by_pose, _, by_noise) = all_of(first, u, w)
-    np.testing.assert_allclose(found, w, atol=1e-13)
+    noise, (by_first, by_second), (by_pose, _, by_noise) = all_of(first, u, w)
+    np.testing.assert_allclose(noise, w, atol=1e-13)
     np.testing.assert_allclose(by_second, np.linalg.inv(by_noise), atol=1e-11)
     np.testing.assert_allclose(by_first, -np.linalg.inv(by_noise) @ by_pose, atol=1e-11)
 

@@ -180,18 +180,20 @@ def test_the_order_of_poses_and_rows_has_no_influence(tables):
         who=np.array([[6], [3]]), z=twice["prior"].z + [[0], [1]]
     )
     graph = small_graphs.only(drawn._replace(tables=twice), *tables)
-    other = shuffled(graph)
-    for found in (graph, other):
-        held = graphs.with_gauge(found)
+    reordered = shuffled(graph)
+    for start in (graph, reordered):
+        held = graphs.with_gauge(start)
         expected = [] if "prior" in tables else [10]
         assert held.pose_id[held.fixed_pose].tolist() == expected
-        apart = graphs.with_loops_apart(found).tables
-        who = found.pose_id[apart["relative_pose/loops"].who]
+        apart = graphs.with_loops_apart(start).tables
+        who = start.pose_id[apart["relative_pose/loops"].who]
         assert sorted(who.tolist()) == [[12, 16], [15, 11], [17, 10]]
-        who = found.pose_id[apart["relative_pose"].who]
+        who = start.pose_id[apart["relative_pose"].who]
         assert sorted(who.tolist()) == sorted([[i, i + 1] for i in [*range(10, 17), 10, 11, 12]])
     for name in PLACING:
-        one, two = (starts.STARTS[name](each) for each in (graph, other))
-        order = np.argsort(two.pose_id)
-        np.testing.assert_allclose(two.poses[order], one.poses, atol=1e-12)
-        np.testing.assert_allclose(two.points[np.argsort(two.point_id)], one.points, atol=1e-12)
+        first, second = (starts.STARTS[name](start) for start in (graph, reordered))
+        order = np.argsort(second.pose_id)
+        np.testing.assert_allclose(second.poses[order], first.poses, atol=1e-12)
+        np.testing.assert_allclose(
+            second.points[np.argsort(second.point_id)], first.points, atol=1e-12
+        )

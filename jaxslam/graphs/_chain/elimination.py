@@ -257,7 +257,7 @@ def _solve_upper(factor: Array, rhs: Array) -> Array:
 
 def chain_marginals(
     chain: Chain, policy: Policy
-) -> tuple[Float[Array, "T+1 3"], Float[Array, "T+1 3 3"], Float[Array, "D D"]]:
+) -> tuple[Float[Array, "poses 3"], Float[Array, "poses 3 3"], Float[Array, "D D"]]:
     """The marginals of a chain, in O(T N) plus one triangular system of 3T columns.
 
     They are δx from the start on, the covariance of each pose, and the joint covariance of the last

@@ -103,9 +103,9 @@ def test_float32_and_gradients(short):
     slope, double = jax.jit(jax.jacfwd(partial(last, log=few), has_aux=True))(sigma)
     assert np.isfinite(slope).all()
     assert np.all(np.abs(slope).max(axis=0) > 0)
-    found, _ = jax.jit(last)(*worlds.narrow((sigma, few)))
-    assert found.dtype == np.float32
-    np.testing.assert_allclose(found, double, atol=2e-4)
+    single, _ = jax.jit(last)(*worlds.narrow((sigma, few)))
+    assert single.dtype == np.float32
+    np.testing.assert_allclose(single, double, atol=2e-4)
 
 
 @refused(
@@ -120,9 +120,9 @@ def test_float32_and_gradients(short):
     ),
 )
 def test_what_does_not_fit_is_refused(options):
-    given = {"motion": worlds.ring().motion, "sensor": worlds.ring().sensor}
-    given |= {"capacity": 3, "slots": 3} | options
-    FixedLag(**given)
+    fields = {"motion": worlds.ring().motion, "sensor": worlds.ring().sensor}
+    fields |= {"capacity": 3, "slots": 3} | options
+    FixedLag(**fields)
 
 
 def test_a_scan_that_is_too_large_is_refused(short):

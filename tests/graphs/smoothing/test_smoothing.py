@@ -149,13 +149,13 @@ START = (0.3, -0.2, 0.1)
 def test_a_linear_log_is_dense_least_squares(kind, close):
     path, covs, landmarks, map_cov, cost = dense_linear(linear_log(), START)
     trace = solve_linear(kind)[1]
-    found, order = by_tag(trace, 3)
+    by_tags, order = by_tag(trace, 3)
     for actual, wanted in (
         (trace.estimate.pose, path[1:]),
         (trace.estimate.pose_cov, covs[1:]),
         (trace.final.start, path[0]),
         (trace.final.start_cov, covs[0]),
-        (found, landmarks),
+        (by_tags, landmarks),
     ):
         assert actual.dtype == kind
         np.testing.assert_allclose(actual, wanted, rtol=0, atol=close)

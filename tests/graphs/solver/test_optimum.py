@@ -76,9 +76,9 @@ def test_endings():
 def test_graphs_of_about_the_same_size_share_their_programs():
     """Of other poses, loops and pairs; what is found is of the graph's own sizes."""
 
-    table, whole = ring(1).tables["relative_pose"], ring(1)._replace(tables={})
+    table, graph_of_poses = ring(1).tables["relative_pose"], ring(1)._replace(tables={})
     rows = np.flatnonzero((table.who < 19).all(axis=1))
-    smaller = jax.tree.map(lambda x: x[:19], whole)
+    smaller = jax.tree.map(lambda x: x[:19], graph_of_poses)
     smaller.tables["relative_pose"] = jax.tree.map(lambda x: x[rows], table)
 
     def solved(graph, pairs):
@@ -308,23 +308,23 @@ def larger(graph, more=12):
 @pytest.mark.parametrize("kernel", swept([None, KERNEL], KERNEL))
 def test_the_numbers_are_those_without_room(kernel):
     graph = with_loops(ring(spread=3.0))
-    alone, found = (graphs.optimize(graph, kernel=kernel, room=room) for room in (0, ROOM))
-    np.testing.assert_allclose(found.graph.poses, alone.graph.poses, rtol=0, atol=1e-9)
-    np.testing.assert_allclose(found.chi2, alone.chi2, rtol=1e-9)
-    assert found.singular == alone.singular == -1
-    assert found.graph.poses.shape == (SIZE, 3)
-    at = alone.graph
-    for name, weight in alone.weights.items():
-        np.testing.assert_allclose(found.weights[name], weight, rtol=0, atol=1e-9)
-    alone, found = (graphs.marginals(alone, pairs=PAIRS, room=room) for room in (0, ROOM))
-    scale = np.abs(alone.poses).max()
-    assert scale > 0 and found.pairs.shape == alone.pairs.shape
-    np.testing.assert_allclose(found.poses, alone.poses, rtol=0, atol=1e-9 * scale)
-    np.testing.assert_allclose(found.pairs, alone.pairs, rtol=0, atol=1e-9 * scale)
-    alone, found = (graphs.squared_residuals(at, room=room) for room in (0, ROOM))
-    for name, square in alone.items():
-        assert len(found[name]) == len(graph.tables[name].z)
-        np.testing.assert_allclose(found[name], square, rtol=1e-9, atol=1e-12)
+    without, with_room = (graphs.optimize(graph, kernel=kernel, room=room) for room in (0, ROOM))
+    np.testing.assert_allclose(with_room.graph.poses, without.graph.poses, rtol=0, atol=1e-9)
+    np.testing.assert_allclose(with_room.chi2, without.chi2, rtol=1e-9)
+    assert with_room.singular == without.singular == -1
+    assert with_room.graph.poses.shape == (SIZE, 3)
+    at = without.graph
+    for name, weight in without.weights.items():
+        np.testing.assert_allclose(with_room.weights[name], weight, rtol=0, atol=1e-9)
+    without, with_room = (graphs.marginals(without, pairs=PAIRS, room=room) for room in (0, ROOM))
+    scale = np.abs(without.poses).max()
+    assert scale > 0 and with_room.pairs.shape == without.pairs.shape
+    np.testing.assert_allclose(with_room.poses, without.poses, rtol=0, atol=1e-9 * scale)
+    np.testing.assert_allclose(with_room.pairs, without.pairs, rtol=0, atol=1e-9 * scale)
+    without, with_room = (graphs.squared_residuals(at, room=room) for room in (0, ROOM))
+    for name, square in without.items():
+        assert len(with_room[name]) == len(graph.tables[name].z)
+        np.testing.assert_allclose(with_room[name], square, rtol=1e-9, atol=1e-12)
 
 
 @pytest.mark.sweep
@@ -365,8 +365,8 @@ def test_a_plan_with_room_is_shared_too():
 def test_a_graph_that_is_larger_than_the_room_is_solved_all_the_same():
     graph = larger(with_loops(ring(seed=3)), 80)
     assert len(graph.poses) > ROOM
-    alone, found = (graphs.optimize(graph, room=room) for room in (0, ROOM))
-    np.testing.assert_allclose(found.graph.poses, alone.graph.poses, rtol=0, atol=1e-8)
+    alone, with_room = (graphs.optimize(graph, room=room) for room in (0, ROOM))
+    np.testing.assert_allclose(with_room.graph.poses, alone.graph.poses, rtol=0, atol=1e-8)
 
 
 @pytest.mark.sweep
