@@ -3,7 +3,7 @@
 import numpy as np
 
 from benchmarks.real_data import DATA
-from jaxslam import grids
+from jaxslam import datasets, grids
 
 
 def maps():
@@ -18,5 +18,5 @@ def maps():
     found = {"2000 × 2000": (grids.Grid(log_odds, np.zeros(3), np.float64(0.05)), 30.0)}
     real = DATA / "maps" / "turtlebot3_world.yaml"
     if real.exists():
-        found["turtlebot3_world"] = (grids.read_map(real), 3.5)
+        found["turtlebot3_world"] = (datasets.read_map(real), 3.5)
     return found

@@ -247,11 +247,11 @@ class FrozenDict(dict[Any, Any]):
     @classmethod
     def of(cls, name: str, value: Mapping[Any, Any]) -> "FrozenDict":
         """A dict, and those in it, frozen; ValueError, which begins with the name, on an array."""
-        made = {k: cls.of(name, v) if isinstance(v, Mapping) else v for k, v in value.items()}
-        for key, each in made.items():
-            if isinstance(each, np.ndarray | jax.Array | list):
+        frozen = {k: cls.of(name, v) if isinstance(v, Mapping) else v for k, v in value.items()}
+        for key, entry in frozen.items():
+            if isinstance(entry, np.ndarray | jax.Array | list):
                 raise ValueError(f"{name}: {key}: expected a value that is compared by ==")
-        return cls(made)
+        return cls(frozen)
 
     def __hash__(self) -> int:  # type: ignore[override]
         return hash(frozenset(self.items()))

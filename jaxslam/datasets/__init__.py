@@ -1,7 +1,8 @@
 """Readers of public data sets, and of your data in CSV files (`table`); they return a `Dataset`.
 
 `READERS` has the readers by name, for the command line; each takes a path and, for a data set of
-several robots, the number of a robot. `read_graph` and `write_graph` are for files of pose graphs.
+several robots, the number of a robot. `read_graph` and `write_graph` are for files
+of pose graphs, `read_map` and `write_map` for those of ROS maps.
 """
 
 from collections.abc import Callable
@@ -21,6 +22,7 @@ from jaxslam.datasets._laser_logs.carmen_reader import StampedRelations, carmen,
 from jaxslam.datasets._laser_logs.laser_record import LaserLog
 from jaxslam.datasets._laser_logs.rosbag_reader import BagContents, rosbag, rosbag_contents
 from jaxslam.datasets._noise_fit import DatasetFit, fit
+from jaxslam.datasets._ros_map import read_map, write_map
 from jaxslam.datasets._uncertain_constants import AddedCov, consider_constants
 
 READERS: dict[str, Callable[..., Dataset]] = Named(
@@ -58,12 +60,14 @@ __all__ = [
     "mrclam_team",
     "plaza",
     "read_graph",
+    "read_map",
     "relation_file",
     "rosbag",
     "rosbag_contents",
     "table",
     "victoria_park",
     "write_graph",
+    "write_map",
 ]
 
 publish(__name__)

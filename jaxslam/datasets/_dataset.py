@@ -11,8 +11,8 @@ from jaxtyping import Bool, Float
 from jaxslam.core._validation import check_log
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import Log
-from jaxslam.filters.multi_robot.team import Robot
 from jaxslam.sensors._suite import Suite
+from jaxslam.sensors._team import Robot
 
 
 class Parameter(NamedTuple):

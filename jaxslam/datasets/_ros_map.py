@@ -105,8 +105,32 @@ _UNKNOWN = 205
 """The shade of unknown cells: p = 50/255 is between the usual thresholds."""
 
 
-def load(path: str | Path) -> Grid:
-    """The grid in a map file; see `grids.read_map`."""
+def read_map(path: str | Path) -> Grid:
+    """The occupancy grid in a map file of ROS, `NAME.yaml` with its image; arrays are NumPy's.
+
+    | key | meaning |
+    |---|---|
+    | `image` | a PGM (P5 or P2), PNG or BMP file, relative to the folder of the YAML file |
+    | `resolution` | side of a cell [m] |
+    | `origin` | [x, y, yaw], pose of the lower left corner of the lower left cell [m, m, rad] |
+    | `negate` | 0: dark is occupied, p = 1 - shade; 1: p = shade; shade in [0, 1] |
+    | `occupied_thresh`, `free_thresh` | above, below which p a cell is occupied, free |
+    | `mode` | `trinary` (default): all else is unknown; `scale`: all else is in between |
+
+    Another key, as `map_type`, is named in a warning. Shades have 8 or 16 bits; a colour counts as
+    the mean of its channels.
+
+    An occupied cell gets log-odds of ln 509 (p = 1 - 0.5/255, half a level of grey), a free one the
+    negative of it, an unknown one 0. In mode `scale` a cell between the thresholds has the
+    probability (p - free_thresh)/(occupied_thresh - free_thresh), bounded in the same way.
+
+    Source: the map format of the ROS package `map_server`, wiki.ros.org/map_server.
+
+    Raises:
+        ValueError: `path:line: reason` for what is not YAML, a key that is missing or occurs twice,
+            a resolution that is not above 0, an invalid origin, thresholds out of order, a
+            mode `raw`, and an image that is missing, transparent, of another format, or damaged.
+    """
     head = _Header(path)
     resolution = head.number("resolution")
     if not resolution > 0:
@@ -130,8 +154,16 @@ def load(path: str | Path) -> Grid:
     return Grid(_log_odds(p)[::-1].copy(), np.array(origin), np.array(resolution))
 
 
-def save(path: str | Path, grid: Grid, mode: str) -> list[Path]:
-    """Write a map file and its image; see `grids.write_map`."""
+def write_map(path: str | Path, grid: Grid, *, mode: str = "trinary") -> list[Path]:
+    """Write a grid as a ROS map, `NAME.yaml` and `NAME.pgm`; returns their paths.
+
+    Mode `trinary` has black, white and grey 205 for log-odds above, below and equal to 0: what was
+    read from a trinary map is read again as the same numbers. Mode `scale` has the probability in
+    255 levels, or in 254, of which one is ½, where that alone gives the same grid again or where
+    cells are unknown; its thresholds are 1 and 0. Either both files are written or none.
+
+    Raises ValueError on a grid that is none, another mode, and a path that does not end in .yaml.
+    """
     path = Path(path)
     if path.suffix != ".yaml" or path.stem == "":
         raise ValueError(f"write_map: expected a path NAME.yaml, got {path}")

@@ -13,9 +13,8 @@ from jaxslam._public import publish
 from jaxslam.core._record import FrozenDict, hold_function, record, set_field, static
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import Log, Scan, Truth
-from jaxslam.filters.multi_robot._team import TeamMotion, check_team, sensors_of, sizes
-from jaxslam.filters.multi_robot.team import Robot
 from jaxslam.math import se2
+from jaxslam.sensors._team import Robot, TeamMotion, check_team, sensors_of, sizes
 from jaxslam.simulation._scans import Visible, everywhere, part_scan, side_by_side
 from jaxslam.simulation._worlds import World, drive, random_pose
 

@@ -5,6 +5,7 @@ from collections.abc import Mapping
 import numpy as np
 from numpy.typing import ArrayLike
 
+from jaxslam._public import publish
 from jaxslam.laser.grids._grid import Grid
 from jaxslam.simulation._wall_geometry import Walls, is_free
 
@@ -102,3 +103,6 @@ def rasterize(
     solid = np.where(solid == 0.5, 0.5 + 1e-9, solid)
     origin = np.array([*(turn_back @ low), yaw])
     return Grid(np.log(solid) - np.log1p(-solid), origin, np.array(resolution))
+
+
+publish(__name__)

@@ -71,7 +71,7 @@ def test_a_map_at_known_poses_is_one_that_ros_reads(log_file, tmp_path, capsys):
     assert {path.name for path in out.iterdir()} == {
         *("map.yaml", "map.pgm", "map.png", "trajectory.csv", "trajectory.tum", "summary.json")
     }
-    grid = grids.read_map(out / "map.yaml")
+    grid = datasets.read_map(out / "map.yaml")
     centres = np.asarray(grids.centers(grid))
     free = np.asarray(grid.log_odds) < 0
     assert free.sum() > 1000
@@ -169,7 +169,7 @@ def test_laser_slam_writes_a_film_of_the_map_growing(
 def room_map(log_file, tmp_path_factory):
     """A map of the room, as another program would have made it."""
     path = tmp_path_factory.mktemp("map") / "room.yaml"
-    grids.write_map(path, rasterize(log_file.walls, 0.1))
+    datasets.write_map(path, rasterize(log_file.walls, 0.1))
     return path
 
 
@@ -226,7 +226,7 @@ def test_a_map_by_a_laser_on_a_mount(log_file, mounted, tmp_path):
     out = tmp_path / "out"
     options = ["--resolution", "0.1"]
     assert run("map", mounted.path, out, *options) == 0
-    grid = grids.read_map(out / "map.yaml")
+    grid = datasets.read_map(out / "map.yaml")
     free = np.asarray(grid.log_odds) < 0
     assert free.sum() > 1000
     assert is_free(log_file.walls, np.asarray(grids.centers(grid))[free]).mean() > 0.98
@@ -237,7 +237,7 @@ def test_a_map_by_a_laser_on_a_mount(log_file, mounted, tmp_path):
     np.testing.assert_allclose([x, y, np.deg2rad(heading)], mounted.mount, atol=1e-6)
     given = [f"{mounted.mount[0]}", f"{mounted.mount[1]}", f"{np.rad2deg(mounted.mount[2])}"]
     assert run("map", mounted.path, tmp_path / "given", *options, "--mount", ",".join(given)) == 0
-    again = grids.read_map(tmp_path / "given" / "map.yaml")
+    again = datasets.read_map(tmp_path / "given" / "map.yaml")
     assert (again.log_odds == grid.log_odds).mean() > 0.99
 
 
@@ -306,7 +306,7 @@ def check_as_ros_reads_it(path):
     shade = np.asarray(Image.open(path.parent / of["image"]))[::-1]  # the first row is on top
     p = (255 - shade) / 255.0
     occupied, free = p > of["occupied_thresh"], p < of["free_thresh"]
-    grid = grids.read_map(path)
+    grid = datasets.read_map(path)
     np.testing.assert_array_equal(occupied, np.asarray(grid.log_odds) > 0)
     np.testing.assert_array_equal(free, np.asarray(grid.log_odds) < 0)
     assert occupied.any() and free.any() and not (occupied | free).all()

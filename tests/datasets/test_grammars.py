@@ -10,7 +10,7 @@ from recordings import BONN, MRCLAM, TEAM
 from test_mutated import YAML, assert_map, assert_whole
 from test_table import OWN, SETTINGS, TRUTH
 
-from jaxslam import datasets, grids
+from jaxslam import datasets
 from jaxslam.datasets._laser_logs.carmen_odometry import odometry_of_file
 
 COV = "0.01 0 0 0.04 0.001 0.09"
@@ -132,7 +132,7 @@ GRAMMARS = {
                 [f"P2 3 2 9 {' '.join('123456')}", "P5\n3 2\n127\nabcdef", "P5 3 2 65535 abcdefabcdef"]
             ),
         },
-        lambda path: grids.read_map(path / "map.yaml"),
+        lambda path: datasets.read_map(path / "map.yaml"),
         lambda grid: assert_map(grid, None),
     ),
     "bonn": (

@@ -16,7 +16,7 @@ from recordings import BONN, DATA, MRCLAM, TEAM, VICTORIA, write
 from test_plaza import written
 from test_table import OWN, SETTINGS, TRUTH
 
-from jaxslam import datasets, grids
+from jaxslam import datasets
 from jaxslam.datasets import _g2o as g2o
 
 TABLE = OWN | TRUTH | SETTINGS
@@ -118,8 +118,12 @@ OTHERS = {
     "g2o": ({"graph.g2o": GRAPH}, g2o.load, assert_graph),
     "edges alone": ({"graph.g2o": EDGES}, g2o.load, assert_graph),
     "carmen": ({"room.log": LASER}, datasets.carmen, assert_laser_log),
-    "map": ({"map.yaml": YAML, "map.pgm": "P5\n3 2\n127\nabcdef"}, grids.read_map, assert_map),
-    "text map": ({"map.yaml": YAML, "map.pgm": "P2 3 2 9 1 2 3 4 5 6"}, grids.read_map, assert_map),
+    "map": ({"map.yaml": YAML, "map.pgm": "P5\n3 2\n127\nabcdef"}, datasets.read_map, assert_map),
+    "text map": (
+        {"map.yaml": YAML, "map.pgm": "P2 3 2 9 1 2 3 4 5 6"},
+        datasets.read_map,
+        assert_map,
+    ),
 }
 
 
@@ -190,8 +194,8 @@ REAL = {
     "toro": ("graphs/FRH_P_toro.graph", g2o.load),
     "carmen": ("laser_graphs/mit-cscail.log.gz", datasets.carmen),
     "relations": ("relations/mit-csail.relations.gz", datasets.relation_file),
-    "map": ("maps/turtlebot3_world.yaml", grids.read_map),
-    "image": ("maps/turtlebot3_world.pgm", grids.read_map),
+    "map": ("maps/turtlebot3_world.yaml", datasets.read_map),
+    "image": ("maps/turtlebot3_world.pgm", datasets.read_map),
     "bonn": ("bonn/sensor_data.dat", lambda path: datasets.bonn(path.parent)),
     "mrclam": ("mrclam1/Robot1_Measurement.dat", lambda path: datasets.mrclam(path.parent, 1)),
 }

@@ -93,7 +93,12 @@ def add_options(parser: argparse.ArgumentParser, work: Work, *, map_is_made: boo
         "(default: 50)",
     )
     parser.add_argument(
-        "--every", type=int, metavar="N", default=1, help="use each n-th scan (default: 1)"
+        "--every",
+        dest="stride",
+        type=int,
+        metavar="N",
+        default=1,
+        help="use each n-th scan (default: 1)",
     )
     parser.add_argument(
         "--scans",
@@ -176,7 +181,7 @@ def read_log(options: argparse.Namespace) -> tuple[LaserLog, dict[str, int]]:
     )
     total = len(log.time)
     first, last = _interval(options.scans, total)
-    keep = np.arange(first, last)[:: options.every]
+    keep = np.arange(first, last)[:: options.stride]
     if not len(keep):
         raise ValueError(f"--scans: {options.scans} has none of the {total} scans of {log.source}")
     # Odometry between two selected scans is known if that of any step between them is, and none

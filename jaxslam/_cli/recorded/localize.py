@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float, PyTree
 
-from jaxslam import motion
+from jaxslam import datasets, motion
 from jaxslam._cli.campaigns.piecewise import PiecewiseRun, run_in_pieces
 from jaxslam._cli.recorded import laser_log
 from jaxslam.consistency.campaign._progress import Progress
@@ -96,7 +96,7 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> laser_log.Jo
     """
     if is_bag(options.map):
         raise ValueError(f"expected a map of ROS, NAME.yaml, got {options.map}")
-    grid = grids.read_map(options.map)
+    grid = datasets.read_map(options.map)
     if not np.any(np.asarray(grid.log_odds) < 0):
         raise ValueError(f"{options.map}: the map has no free cell")
     start = options.start or ("file" if log.placed else "global")

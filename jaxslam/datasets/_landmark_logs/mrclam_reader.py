@@ -26,9 +26,8 @@ from jaxslam.datasets._landmark_logs.mrclam_robot import (
     true_fields,
 )
 from jaxslam.datasets._lines import none_left, stored_file
-from jaxslam.filters.multi_robot._team import TeamMotion, sensors_of
-from jaxslam.filters.multi_robot.team import Robot
 from jaxslam.sensors import Part, Suite
+from jaxslam.sensors._team import Robot, TeamMotion, sensors_of
 
 
 def mrclam(

@@ -5,7 +5,7 @@
 With the gain K = P Hᵀ S⁻¹ = Vᵀ L⁻ᵀ this is x ← x ⊞ K ν and P ← P - K S Kᵀ, symmetric as it stands.
 `correct` does this for a whole scan, `correct_in_turn` for each measurement at the estimate that
 those before it left. Both use the sparsity of H, which involves the robot and one landmark
-(`kernels`).
+(`whitening`).
 """
 
 from collections.abc import Callable
@@ -20,9 +20,9 @@ from jaxslam.core import slots
 from jaxslam.core._numbers import gate_quantile
 from jaxslam.core.protocols import Chart, LinearizationPoint, Linearizer, Sensor
 from jaxslam.core.slots import Joint
-from jaxslam.filters._ekf.kernels import factor_of, project, projected_cov, whiten, whitened_by
 from jaxslam.filters._ekf.linear_system import basis_of_each, chart_jacobians
 from jaxslam.filters._ekf.map_coordinates import at_slot, retracted
+from jaxslam.filters._ekf.whitening import factor_of, project, projected_cov, whiten, whitened_by
 from jaxslam.linearize._first_order import predicted_noise
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import Number

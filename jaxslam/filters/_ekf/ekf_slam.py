@@ -2,7 +2,7 @@
 
 A step predicts, `propagate` (14)-(17), and updates by each sensor of the robot, `update_by_sensor`:
 associate, correct (`correction`, (26)-(30)), initialize (31)-(38), report. Beside this file, the
-plain filter needs `correction` and `kernels`; `linear_system` is for charts and the observability
+plain filter needs `correction` and `whitening`; `linear_system` is for charts and the observability
 monitor, `map_coordinates` for charts and inverse depths, `predicted_measurements` for associations
 that compare a measurement with every landmark.
 """

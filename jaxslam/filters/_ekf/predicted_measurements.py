@@ -8,9 +8,9 @@ from jaxslam.association._rules import predicted
 from jaxslam.core.protocols import LinearizationPoint, Prediction, Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.filters._ekf.correction import KalmanFilter
-from jaxslam.filters._ekf.kernels import projected_cov
 from jaxslam.filters._ekf.linear_system import chart_jacobians
 from jaxslam.filters._ekf.map_coordinates import at_slot
+from jaxslam.filters._ekf.whitening import projected_cov
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._xla import materialize
 

@@ -14,9 +14,9 @@ from jaxslam.core._record import hold_function, record, set_field, static
 from jaxslam.core.protocols import Associate, Filter, Sensor
 from jaxslam.filters._ekf.checks import check_choice, check_map_options
 from jaxslam.filters._ekf.correction import CorrectionOrder, Covariance
-from jaxslam.filters.multi_robot._team import check_team, sizes
 from jaxslam.filters.multi_robot.team import Robot
 from jaxslam.math._arrays import Number
+from jaxslam.sensors._team import check_team, sizes
 
 SIZE = 3
 """Numbers of a slot: x, y and the heading of a robot; of a landmark the third is padding."""

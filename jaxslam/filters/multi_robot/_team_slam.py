@@ -12,7 +12,6 @@ from jaxslam.core.types import Estimate, Info, Scan, Status
 from jaxslam.filters._ekf.ekf_slam import EkfSlam, update_by_sensor
 from jaxslam.filters._reporting import joined_info
 from jaxslam.filters.multi_robot._pose_initialization import best_initialization, observed_points
-from jaxslam.filters.multi_robot._team import sizes
 from jaxslam.filters.multi_robot._team_filter import SIZE, TeamFilter
 from jaxslam.filters.multi_robot._team_state import (
     InitialPose,
@@ -26,6 +25,7 @@ from jaxslam.math import se2
 from jaxslam.math._xla import where_any
 from jaxslam.math.angles import wrap
 from jaxslam.sensors._suite import on_ground, split_scan
+from jaxslam.sensors._team import sizes
 
 
 @record

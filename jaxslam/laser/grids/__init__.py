@@ -8,9 +8,7 @@ from jaxslam.laser.grids._grid import (
     Grid,
     centers,
     interpolate,
-    read_map,
     to_cells,
-    write_map,
 )
 from jaxslam.laser.grids._grid_localization import GridLocalization, beam_log
 from jaxslam.laser.grids._pose_clusters import Clusters, clusters
@@ -51,11 +49,9 @@ __all__ = [
     "log_likelihood",
     "occupancy",
     "ray_map",
-    "read_map",
     "reflection",
     "resample",
     "to_cells",
-    "write_map",
 ]
 
 publish(__name__)

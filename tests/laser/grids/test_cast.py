@@ -8,7 +8,7 @@ import recordings
 from cases import refused, swept
 from reference.plane import from_frame
 
-from jaxslam import grids
+from jaxslam import datasets, grids
 from jaxslam.simulation._wall_geometry import exact_ranges, is_free
 from jaxslam.simulation.walls import make_walls, rasterize
 
@@ -223,7 +223,7 @@ def test_the_derivative_by_the_pose_is_that_of_a_wall(method):
 
 def test_rays_pass_no_wall_of_a_map_that_was_read():
     """By default; one of 57 passes a wall by more than half a metre with "surface"."""
-    grid = grids.read_map(recordings.folder("maps") / "turtlebot3_world.yaml")
+    grid = datasets.read_map(recordings.folder("maps") / "turtlebot3_world.yaml")
     rng, cell, count = np.random.default_rng(0), float(grid.resolution), 5000
     free = np.argwhere(grid.log_odds < 0)
     at = free[rng.integers(len(free), size=count)][:, ::-1] + rng.random((count, 2))

@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 import recordings
 
-from jaxslam import grids
+from jaxslam import datasets
 from jaxslam.datasets._ros_map import CERTAIN
 
 YAML = """# a map
@@ -41,7 +41,7 @@ def logit(p):
 
 
 def test_a_trinary_map_by_hand(tmp_path):
-    grid = grids.read_map(made(tmp_path))
+    grid = datasets.read_map(made(tmp_path))
     o = CERTAIN
     np.testing.assert_array_equal(grid.log_odds, [[0, -o, o], [o, -o, 0]])  # the last row first
     np.testing.assert_array_equal(grid.origin, [-1.5, 2.0, 0.25])
@@ -52,22 +52,22 @@ def test_a_trinary_map_by_hand(tmp_path):
 
 def test_scale_and_negate_by_hand(tmp_path):
     yaml = YAML.replace("negate: 0", "mode: scale\nnegate: true")
-    grid = grids.read_map(made(tmp_path, yaml))
+    grid = datasets.read_map(made(tmp_path, yaml))
     p = (100 / 255 - 0.196) / (0.65 - 0.196)
     o = CERTAIN
     np.testing.assert_allclose(grid.log_odds, [[logit(p), o, -o], [-o, o, o]], atol=1e-12)
 
 
 def test_text_images_wide_shades_and_lists_in_lines(tmp_path):
-    expected = grids.read_map(made(tmp_path))
+    expected = datasets.read_map(made(tmp_path))
     text = b"P2 # text\n3 2\n255\n0 254 205\n# half way\n100 255 10\n"
-    same(grids.read_map(made(tmp_path, image=text)), expected)
+    same(datasets.read_map(made(tmp_path, image=text)), expected)
     wide = b"P5 3 2 65535\n" + np.array(SHADES, ">u2").__mul__(257).astype(">u2").tobytes()
-    same(grids.read_map(made(tmp_path, image=wide)), expected)
+    same(datasets.read_map(made(tmp_path, image=wide)), expected)
     lines = YAML.replace("[-1.5, 2.0, 0.25]", "\n- -1.5\n- 2.0\n- 0.25").replace(
         "map.pgm", '"map.pgm"'
     )
-    same(grids.read_map(made(tmp_path, lines)), expected)
+    same(datasets.read_map(made(tmp_path, lines)), expected)
 
 
 @pytest.mark.parametrize(
@@ -80,11 +80,11 @@ def test_text_images_wide_shades_and_lists_in_lines(tmp_path):
 )
 def test_what_other_programs_write_is_read_and_their_keys_are_named(tmp_path, origin):
     """YAML as map_saver, slam_toolbox, nav2 and Cartographer write it, with keys of their own."""
-    expected = grids.read_map(made(tmp_path))
+    expected = datasets.read_map(made(tmp_path))
     text = YAML.replace("[-1.5, 2.0, 0.25]", origin)
     text = f"%YAML 1.1\n---\nmap_type: occupancy\n{text}info: {{frame: map, layers: [a, b]}}\n"
     with pytest.warns(UserWarning, match="is not read") as told:
-        same(grids.read_map(made(tmp_path, text)), expected)
+        same(datasets.read_map(made(tmp_path, text)), expected)
     keys = [str(one.message).partition("map.yaml")[2] for one in told]
     assert keys[0] == ":3: key 'map_type' is not read"
     assert [key.partition(": ")[2] for key in keys[1:]] == ["key 'info' is not read"]
@@ -101,44 +101,44 @@ def test_images_of_other_formats(tmp_path, mode):
     else:
         drawn = image.fromarray(shades).convert("L" if mode == "BMP" else mode)
     drawn.save(tmp_path / name)
-    expected = grids.read_map(made(tmp_path))
-    same(grids.read_map(made(tmp_path, YAML.replace("map.pgm", name))), expected)
+    expected = datasets.read_map(made(tmp_path))
+    same(datasets.read_map(made(tmp_path, YAML.replace("map.pgm", name))), expected)
     if mode == "RGBA":
         drawn.putalpha(100)
         drawn.save(tmp_path / name)
         with pytest.raises(ValueError, match=r"map\.png: expected an image that is opaque"):
-            grids.read_map(made(tmp_path, YAML.replace("map.pgm", name)))
+            datasets.read_map(made(tmp_path, YAML.replace("map.pgm", name)))
 
 
 @pytest.mark.parametrize("mode", ["trinary", "scale"])
 def test_round_trips_are_exact(tmp_path, mode):
-    first = grids.read_map(made(tmp_path))
+    first = datasets.read_map(made(tmp_path))
     out = tmp_path / "out"
-    paths = grids.write_map(out / "again.yaml", first, mode=mode)
+    paths = datasets.write_map(out / "again.yaml", first, mode=mode)
     assert [path.name for path in paths] == ["again.yaml", "again.pgm"]
-    same(grids.read_map(out / "again.yaml"), first)
+    same(datasets.read_map(out / "again.yaml"), first)
 
 
 @pytest.mark.parametrize("top", [254, 255])
 def test_every_level_of_a_scaled_map_survives(tmp_path, top):
     image = f"P5 {top + 1} 1 {top}\n".encode() + bytes(range(top + 1))
     yaml = YAML.replace("0.65", "1").replace("0.196", "0").replace("negate", "mode: scale\nnegate")
-    grid = grids.read_map(made(tmp_path, yaml, image))
+    grid = datasets.read_map(made(tmp_path, yaml, image))
     assert np.sum(~grid.observed) == (top == 254)
     assert len(np.unique(grid.log_odds)) == top + 1
-    _, pgm = grids.write_map(tmp_path / "b.yaml", grid, mode="scale")
+    _, pgm = datasets.write_map(tmp_path / "b.yaml", grid, mode="scale")
     assert pgm.read_bytes() == f"P5\n{top + 1} 1\n{top}\n".encode() + bytes(range(top + 1))
-    same(grids.read_map(tmp_path / "b.yaml"), grid)
+    same(datasets.read_map(tmp_path / "b.yaml"), grid)
 
 
 def test_the_map_of_turtlebot(tmp_path):
     path = recordings.folder("maps") / "turtlebot3_world.yaml"
-    grid = grids.read_map(path)
+    grid = datasets.read_map(path)
     counts = [int(np.sum(c)) for c in (grid.log_odds > 0, grid.log_odds < 0, grid.log_odds == 0)]
     assert counts == [870, 7903, 138683]
     np.testing.assert_array_equal(grid.origin, [-10.0, -10.0, 0.0])
-    grids.write_map(tmp_path / "map.yaml", grid)
-    same(grids.read_map(tmp_path / "map.yaml"), grid)
+    datasets.write_map(tmp_path / "map.yaml", grid)
+    same(datasets.read_map(tmp_path / "map.yaml"), grid)
 
 
 @pytest.mark.parametrize(
@@ -166,12 +166,12 @@ def test_the_map_of_turtlebot(tmp_path):
 )
 def test_a_bad_yaml_is_refused_with_its_line(tmp_path, old, new, line, reason):
     path = made(tmp_path, YAML.replace(old, new))
-    recordings.assert_error(path, line, reason, lambda: grids.read_map(path))
+    recordings.assert_error(path, line, reason, lambda: datasets.read_map(path))
 
 
 def test_a_byte_order_mark_is_no_key_and_other_ends_of_lines_are_read(tmp_path):
-    assert grids.read_map(made(tmp_path, "\r\r" + YAML)).resolution == 0.05
-    assert grids.read_map(made(tmp_path, "\ufeff" + YAML)).resolution == 0.05
+    assert datasets.read_map(made(tmp_path, "\r\r" + YAML)).resolution == 0.05
+    assert datasets.read_map(made(tmp_path, "\ufeff" + YAML)).resolution == 0.05
 
 
 @pytest.mark.parametrize(
@@ -191,25 +191,25 @@ def test_a_byte_order_mark_is_no_key_and_other_ends_of_lines_are_read(tmp_path):
 def test_a_bad_image_is_refused(tmp_path, image, reason):
     path = made(tmp_path, image=image)
     with pytest.raises(ValueError) as caught:  # noqa: PT011 the message is looked at below
-        grids.read_map(path)
+        datasets.read_map(path)
     assert str(caught.value).startswith(f"{tmp_path / 'map.pgm'}: ")
     assert reason in str(caught.value)
 
 
 @pytest.mark.parametrize("name", ["a #1", "b: c", "d's", "#", "two words"])
 def test_a_name_that_yaml_would_misread_is_quoted(tmp_path, name):
-    grid = grids.read_map(made(tmp_path))
-    path, _ = grids.write_map(tmp_path / f"{name}.yaml", grid)
-    same(grids.read_map(path), grid)
+    grid = datasets.read_map(made(tmp_path))
+    path, _ = datasets.write_map(tmp_path / f"{name}.yaml", grid)
+    same(datasets.read_map(path), grid)
 
 
 def test_a_file_that_is_not_there(tmp_path):
     with pytest.raises((ValueError, OSError), match=r"none\.yaml"):
-        grids.read_map(tmp_path / "none.yaml")
+        datasets.read_map(tmp_path / "none.yaml")
 
 
 def test_what_cannot_be_written_is_refused_and_nothing_is_left(tmp_path):
-    grid = grids.read_map(made(tmp_path))
+    grid = datasets.read_map(made(tmp_path))
     for path, wrong, mode, reason in [
         ("a.yaml", grid._replace(log_odds=np.full((2, 2), np.nan)), "trinary", "unknown is 0"),
         ("a.yaml", grid._replace(log_odds=np.zeros((0, 2))), "trinary", "expected log-odds"),
@@ -220,9 +220,9 @@ def test_what_cannot_be_written_is_refused_and_nothing_is_left(tmp_path):
         ("a.pgm", grid, "trinary", "expected a path NAME.yaml"),
     ]:
         with pytest.raises(ValueError, match=f"write_map: .*{reason}"):
-            grids.write_map(tmp_path / "new" / path, wrong, mode=mode)
+            datasets.write_map(tmp_path / "new" / path, wrong, mode=mode)
     assert not (tmp_path / "new").exists()
     (tmp_path / "b.pgm").mkdir()
     with pytest.raises(IsADirectoryError, match=r"b\.pgm cannot be written: it is a folder"):
-        grids.write_map(tmp_path / "b.yaml", grid)
+        datasets.write_map(tmp_path / "b.yaml", grid)
     assert not (tmp_path / "b.yaml").exists()

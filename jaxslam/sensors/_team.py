@@ -1,15 +1,36 @@
-"""The tags of a team, the layout of its controls and scans, and its models for one robot."""
+"""The robots of a team: their tags, the layout of controls and scans, and models for one robot."""
 
 from collections.abc import Sequence
 
 import numpy as np
 from jaxtyping import Array
+from numpy.typing import ArrayLike
 
-from jaxslam.core._record import record, static
+from jaxslam.core._record import field, record, static
+from jaxslam.core._reprs import describe
 from jaxslam.core.protocols import Motion
-from jaxslam.filters.multi_robot.team import Robot
+from jaxslam.core.validation import covariance, finite, instance_of, or_none
 from jaxslam.math._arrays import Control, Pose, ProcessNoise
 from jaxslam.sensors._suite import Part, Suite
+
+
+def _check_start(value: tuple[ArrayLike, ArrayLike]) -> tuple[ArrayLike, ArrayLike]:
+    """The check of a pose and its covariance."""
+    if not isinstance(value, tuple) or len(value) != 2:
+        raise ValueError(f"expected a pose and its covariance, got {describe(value)}")
+    return finite(3)(value[0]), covariance(3)(value[1])
+
+
+@record
+class Robot:
+    """One robot of a team. Raises ValueError on sensors without a suite, or an invalid start."""
+
+    motion: Motion = field(check=instance_of(Motion))
+    sensors: Suite = field(check=instance_of(Suite))
+    """a suite, also of a single sensor"""
+    start: tuple[ArrayLike, ArrayLike] | None = field(default=None, check=or_none(_check_start))
+    """pose (3,) before the first control in the frame of robot 0, and its covariance (3, 3); None
+    if unknown, and of robot 0"""
 
 
 def check_team(
