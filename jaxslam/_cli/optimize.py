@@ -30,6 +30,7 @@ from jaxslam._cli.common import (
 from jaxslam.consistency.campaign._progress import Progress
 from jaxslam.core._numbers import check_count
 from jaxslam.core.types import JaxOrNumPy
+from jaxslam.core.validation import InvalidField
 from jaxslam.datasets import _g2o as g2o
 from jaxslam.graphs import Ending, Graph
 from jaxslam.graphs._checks import label, variables_in
@@ -319,8 +320,8 @@ def _certificate(graph: Graph, converged: bool, plain: bool) -> Json:
     began = time.perf_counter()
     try:
         proof = jax.block_until_ready(graphs.certificate(graph))
-    except ValueError as error:
-        return {"certificate": f"none: {str(error).removeprefix('graphs.certificate: ')}"}
+    except InvalidField as error:
+        return {"certificate": f"none: {error.reason}"}
     return {
         "certificate": "the chordal optimum next to it is global"
         if proof.certified

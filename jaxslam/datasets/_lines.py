@@ -9,6 +9,8 @@ from pathlib import Path
 DIGITS = 18
 """Digits of the largest whole number that is read; it fits 64 bits."""
 
+from jaxslam.core.validation import InvalidFile
+
 LARGEST = 1e60
 """Largest number that is read: products of five such numbers are finite in float64."""
 
@@ -62,12 +64,12 @@ class TextFile:
             if fields and not (self.comment and fields[0].startswith(self.comment)):
                 yield number, fields
 
-    def error(self, line: int, reason: str) -> ValueError:
-        """A ValueError about a line, for the caller to raise."""
-        return ValueError(f"{self.path}:{line}: {reason}")
+    def error(self, line: int, reason: str) -> InvalidFile:
+        """An InvalidFile about a line, for the caller to raise."""
+        return InvalidFile(self.path, reason, line)
 
-    def end_error(self, reason: str) -> ValueError:
-        """A ValueError about the end of the file, for the caller to raise."""
+    def end_error(self, reason: str) -> InvalidFile:
+        """An InvalidFile about the end of the file, for the caller to raise."""
         return self.error(max(len(self.lines) - (self.lines[-1] == ""), 1), reason)
 
     def numbers(self, line: int, fields: Sequence[str], names: Sequence[str]) -> list[float]:

@@ -16,6 +16,7 @@ import numpy as np
 import yaml
 from numpy.typing import NDArray
 
+from jaxslam.core.validation import InvalidFile
 from jaxslam.datasets._lines import DIGITS, TextFile, read_bytes
 from jaxslam.laser.grids._grid import Grid, check_grid
 from jaxslam.results._files import Files, write_files
@@ -251,8 +252,8 @@ class _Header:
             if key not in self.nodes:
                 raise self.file.end_error(f"{key} is missing")
 
-    def error(self, key: str, reason: str) -> ValueError:
-        """A ValueError about the line of a value, for the caller to raise."""
+    def error(self, key: str, reason: str) -> InvalidFile:
+        """An InvalidFile about the line of a value, for the caller to raise."""
         line = self.nodes[key].start_mark.line + 1
         return self.file.error(line, " ".join(reason.split()))  # a value may go over lines
 
@@ -276,10 +277,9 @@ class _Header:
         line = node.start_mark.line + 1
         try:
             return self.file.numbers(line, fields, names)
-        except ValueError as problem:
-            reason = str(problem).removeprefix(f"{self.file.path}:{line}: ")
+        except InvalidFile as problem:
             expected = f"expected {key}: [{', '.join(names)}], got [{', '.join(fields)}]"
-            raise self.error(key, f"{expected}: {reason}") from problem
+            raise self.error(key, f"{expected}: {problem.reason}") from problem
 
     def choice(self, key: str, choices: dict[str, _Value], default: str | None = None) -> _Value:
         """The meaning of the value of a key."""

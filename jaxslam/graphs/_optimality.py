@@ -15,6 +15,7 @@ from jaxtyping import Array, Bool, Float
 from jaxslam.core._numbers import is_concrete
 from jaxslam.core._record import record
 from jaxslam.core.types import JaxOrNumPy
+from jaxslam.core.validation import InvalidField
 from jaxslam.graphs._checks import check_graph
 from jaxslam.graphs._factor import PRIOR, Chordal, Factor
 from jaxslam.graphs._graph import Graph
@@ -238,9 +239,11 @@ def certificate(
     model = model_of(caller, graph, factors)
     for name, factor in model.factors.items():
         if factor.chordal is None:
-            raise ValueError(
-                f"{caller}: the table {name!r} has no chordal cost: its factor is {factor.name}, "
-                "and relative poses, relative positions and priors have one"
+            raise InvalidField(
+                caller,
+                "",
+                f"the table {name!r} has no chordal cost: its factor is {factor.name}, "
+                "and relative poses, relative positions and priors have one",
             )
     check_graph(caller, graph, model.factors)
     plan = plan_for(caller, graph, model.factors, plan)
@@ -252,9 +255,11 @@ def certificate(
                 table = graph.tables[name]
                 held[np.asarray(table.who)[np.asarray(table.valid), 0]] = True
         if held.sum() != 1:
-            raise ValueError(
-                f"{caller}: expected one pose that is fixed or has a prior, got {held.sum()}; the "
-                "dual is of a graph that is free but for that"
+            raise InvalidField(
+                caller,
+                "",
+                f"expected one pose that is fixed or has a prior, got {held.sum()}; the "
+                "dual is of a graph that is free but for that",
             )
     proof: Certificate = _certificate(model, graph, plan)
     return proof

@@ -8,9 +8,10 @@ from cases import swept
 
 from jaxslam import motion, sensors
 from jaxslam.core.protocols import Motion
+from jaxslam.verify import build
 from jaxslam.verify._comparison import compare_methods
 from jaxslam.verify._examination import examine, functions_of
-from jaxslam.verify._verifier import FLOAT32_TOLERANCE, TOLERANCE, build
+from jaxslam.verify._verifier import FLOAT32_TOLERANCE, TOLERANCE
 
 MODELS = motion.REGISTRY | sensors.REGISTRY
 
@@ -22,16 +23,18 @@ MODELS = motion.REGISTRY | sensors.REGISTRY
 def made(request):
     """A registered model, all that was computed about it, and what that was judged to be."""
     model = build(MODELS[request.param])
-    examined = examine(model, functions_of(model))
+    evaluated, checks, *_ = examine(model, functions_of(model))
     findings = [
-        f for one in examined.evaluated for f in compare_methods(one, TOLERANCE, FLOAT32_TOLERANCE)
+        finding
+        for function in evaluated
+        for finding in compare_methods(function, TOLERANCE, FLOAT32_TOLERANCE)
     ]
     return SimpleNamespace(
         model=model,
         findings=findings,
-        checks=examined.checks,
-        evaluated=examined.evaluated,
-        labels=[one.samples.labels for one in examined.evaluated],
+        checks=checks,
+        evaluated=evaluated,
+        labels=[function.samples.labels for function in evaluated],
     )
 
 

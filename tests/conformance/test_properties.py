@@ -10,7 +10,7 @@ from cases import swept
 from hypothesis import given, settings
 
 from jaxslam import motion, se2, sensors
-from jaxslam.verify._verifier import build
+from jaxslam.verify import build
 
 law = settings(max_examples=60, deadline=None, derandomize=True)
 

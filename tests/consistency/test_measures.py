@@ -22,11 +22,10 @@ from jaxslam.consistency._measures.observability import unobservable_directions
 from jaxslam.consistency._run_scores import LAGS
 from jaxslam.consistency._summary import summarize
 from jaxslam.core.types import Estimate, Info, Log, Scan, Status, Trace, Truth
+from jaxslam.filters import ParticleInfo, Pruned
 from jaxslam.filters._ekf.map_coordinates import ToPoints
 from jaxslam.filters._ekf.monitor import Monitor
 from jaxslam.filters._particles.pose_particles import weighted_pose_moments
-from jaxslam.filters._particles.slam_particles import ParticleInfo
-from jaxslam.filters._reporting import Pruned
 from jaxslam.filters.map_management._merging import Merged
 from jaxslam.simulation.spurious import Spurious
 

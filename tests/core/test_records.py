@@ -15,7 +15,7 @@ from layouts import kept_programs, wrong_layouts
 from own_models import motion_of, sensor_of
 
 import jaxslam
-from jaxslam import catalog, filters, motion, run, sensors, simulate, smoothing
+from jaxslam import World, catalog, filters, motion, run, sensors, simulate, smoothing
 from jaxslam.core._record import is_record
 from jaxslam.core.protocols import Filter, Motion
 from jaxslam.core.record import field, function_of, record, static
@@ -31,7 +31,6 @@ from jaxslam.core.validation import (
     positive,
 )
 from jaxslam.motion import OdometryNoise
-from jaxslam.simulation._worlds import World
 
 KEY = jax.random.key(0)
 R = np.diag([0.04, 0.01])

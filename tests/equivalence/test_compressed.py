@@ -10,8 +10,7 @@ import pytest
 from cases import refused, swept
 from worlds import draw
 
-from jaxslam import charts, linearize, sensors
-from jaxslam._driver import run
+from jaxslam import charts, linearize, run, sensors
 from jaxslam.core.types import Status
 from jaxslam.filters import CompressedEkfSlam, EkfSlam
 from jaxslam.filters._ekf.compressed_ekf_slam import opened, up_to_date

@@ -11,12 +11,10 @@ from cases import swept
 from own_models import changed
 from worlds import narrow
 
-from jaxslam import charts, linearize, motion, sensors
-from jaxslam._driver import run
+from jaxslam import Scenario, charts, linearize, motion, run, sensors, simulate
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Scan, Status
 from jaxslam.filters import EkfSlam
-from jaxslam.simulation._worlds import Scenario, simulate
 
 Q, R = np.diag([0.05, 0.03]) ** 2, np.array([[0.01, 0.001], [0.001, 0.0025]])
 MOUNT = (0.2, -0.1, 0.4)

@@ -11,8 +11,7 @@ import pytest
 from cases import refused, swept
 from worlds import draw
 
-from jaxslam import filters, sensors
-from jaxslam._driver import run
+from jaxslam import filters, run, sensors
 from jaxslam.core.types import Status
 from jaxslam.simulation.scenarios import BetweenRanges, cloister
 

@@ -11,8 +11,7 @@ from cases import swept
 from reference import ekf_slam as plain
 from worlds import draw
 
-from jaxslam import sensors
-from jaxslam._driver import run
+from jaxslam import run, sensors
 from jaxslam.core.types import Status
 from jaxslam.filters import EkfSlam
 from jaxslam.simulation.scenarios import circle, cloister

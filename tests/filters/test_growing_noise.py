@@ -12,13 +12,12 @@ import scipy.stats
 from cases import swept
 from reference import ekf_slam as plain
 
-from jaxslam import charts, filters, monte_carlo, motion, run, sensors, simulate
+from jaxslam import Scenario, charts, filters, monte_carlo, motion, run, sensors, simulate
 from jaxslam.association import MaximumLikelihood, Nearest
 from jaxslam.calibration import fit_noise
 from jaxslam.consistency._bound import jacobians_at_truth
 from jaxslam.core.types import Scan, Status
 from jaxslam.graphs.smoothing import FixedLag
-from jaxslam.simulation._worlds import Scenario
 
 KEY = jax.random.key(0)
 POINTS = np.array([[3.0, 1.0], [-1.0, 4.0], [-3.0, -1.0], [2.0, -3.0]])

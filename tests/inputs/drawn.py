@@ -4,11 +4,10 @@ import dataclasses
 
 import numpy as np
 
-from jaxslam.consistency import Average
+from jaxslam.consistency import Average, Summary
 from jaxslam.consistency._measures.coverage import LEVELS
 from jaxslam.consistency._measures.nees import DOF
 from jaxslam.consistency._run_scores import LAGS
-from jaxslam.consistency._summary import Summary
 from jaxslam.consistency.campaign import Campaign
 from jaxslam.core.types import Estimate, Truth
 

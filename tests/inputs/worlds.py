@@ -10,12 +10,11 @@ import jax.numpy as jnp
 import numpy as np
 from own_models import changed
 
-from jaxslam import filters, linearize, motion, sensors
+from jaxslam import Scenario, filters, linearize, motion, sensors, simulate
 from jaxslam.consistency.campaign import monte_carlo
 from jaxslam.core.record import record
 from jaxslam.core.types import Status
 from jaxslam.math.stats import t_quantile
-from jaxslam.simulation._worlds import Scenario, simulate
 
 
 def ring(steps: int = 100, seed: int = 3) -> Scenario:

@@ -10,12 +10,10 @@ import scipy.stats
 from cases import swept
 from reference.plane import turn, wrap
 
-from jaxslam import charts, motion, sensors
-from jaxslam._driver import run
+from jaxslam import Scenario, charts, motion, run, sensors, simulate
 from jaxslam.core._validation import check_log
 from jaxslam.core.types import Log, Scan, Status
 from jaxslam.filters import EkfSlam
-from jaxslam.simulation._worlds import Scenario, simulate
 
 KEY = jax.random.key(0)
 STEPS, PLACES = 50, 3

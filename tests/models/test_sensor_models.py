@@ -8,13 +8,11 @@ from cases import refused
 from reference.plane import from_frame, mounted, to_frame, wrap
 
 import jaxslam
-from jaxslam import charts, filters, linearize, motion, sensors
-from jaxslam._driver import run
+from jaxslam import Scenario, charts, filters, linearize, motion, run, sensors, simulate
 from jaxslam.core.types import Scan
 from jaxslam.filters import EkfSlam
 from jaxslam.filters.map_management.relocalization import seen_points
 from jaxslam.sensors._line import facing
-from jaxslam.simulation._worlds import Scenario, simulate
 
 MOUNT = np.array([0.4, -0.3, 0.9])
 VARIANCE = np.array([[0.02**2]])

@@ -8,11 +8,10 @@ import pytest
 from own_models import changed
 from reference.plane import to_frame
 
-from jaxslam import motion, run
+from jaxslam import motion, run, simulate
 from jaxslam.filters import EkfSlam
-from jaxslam.motion._substeps import Substeps
-from jaxslam.simulation._worlds import simulate
-from jaxslam.simulation.scenarios._drives import webmap
+from jaxslam.motion import Substeps
+from jaxslam.simulation.scenarios import webmap
 
 Q = np.array([[0.04, 0.003], [0.003, 0.01]])
 COUNT = 3

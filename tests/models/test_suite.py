@@ -13,11 +13,10 @@ from own_models import changed
 from worlds import draw, narrow, ring
 
 import jaxslam
-from jaxslam import charts, filters, linearize, motion, sensors
+from jaxslam import Scenario, charts, filters, linearize, motion, sensors
 from jaxslam.core.types import Status
 from jaxslam.filters import EkfSlam
 from jaxslam.sensors import Part, Suite
-from jaxslam.simulation._worlds import Scenario
 from jaxslam.simulation.scenarios import BetweenRanges
 from jaxslam.simulation.spurious import Spurious
 

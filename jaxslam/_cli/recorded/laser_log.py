@@ -94,7 +94,6 @@ def add_options(parser: argparse.ArgumentParser, work: Work, *, map_is_made: boo
     )
     parser.add_argument(
         "--every",
-        dest="stride",
         type=int,
         metavar="N",
         default=1,
@@ -181,7 +180,7 @@ def read_log(options: argparse.Namespace) -> tuple[LaserLog, dict[str, int]]:
     )
     total = len(log.time)
     first, last = _interval(options.scans, total)
-    keep = np.arange(first, last)[:: options.stride]
+    keep = np.arange(first, last)[:: options.every]
     if not len(keep):
         raise ValueError(f"--scans: {options.scans} has none of the {total} scans of {log.source}")
     # Odometry between two selected scans is known if that of any step between them is, and none

@@ -14,6 +14,7 @@ from jaxslam._cli.recorded.memory import memory_returned, trim
 from jaxslam.consistency import metrics
 from jaxslam.consistency.campaign._progress import Progress
 from jaxslam.core.types import Estimate
+from jaxslam.core.validation import InvalidField
 from jaxslam.datasets import LaserLog, relation_file
 from jaxslam.datasets import _g2o as g2o
 from jaxslam.datasets import _ros_map as ros_map
@@ -267,9 +268,8 @@ def read_relations(path: str, log: LaserLog) -> tuple[metrics.Relations, int]:
         return metrics.relations_at_stamps(
             log.time, file.first, file.second, file.pose, tolerance=TOLERANCE
         )
-    except ValueError as problem:
-        reason = str(problem).removeprefix("given: ")
-        raise ValueError(f"--relations: {file.source}: {reason}") from problem
+    except InvalidField as problem:
+        raise ValueError(f"--relations: {file.source}: {problem.reason}") from problem
 
 
 def relation_scores(relations: metrics.Relations, log: LaserLog, solved: Solved) -> dict[str, Json]:

@@ -9,6 +9,7 @@ from numpy.typing import ArrayLike
 
 from jaxslam.consistency.metrics._paths import PathErrors, pose_pair, poses_of
 from jaxslam.core.logs._streams import is_gap
+from jaxslam.core.validation import InvalidField
 from jaxslam.math.numpy_poses import between, wrapped
 
 Spacing = float | Sequence[float] | None
@@ -142,23 +143,28 @@ def relations_at_stamps(
     """
     stamps, of = np.asarray(time, np.float64), poses_of("relations_at_stamps", pose)
     if stamps.ndim != 1 or not len(stamps) or not np.isfinite(stamps).all():
-        raise ValueError(f"relations_at_stamps: expected finite stamps (K,), got {stamps.shape}")
+        raise InvalidField(
+            "relations_at_stamps", "", f"expected finite stamps (K,), got {stamps.shape}"
+        )
     if not tolerance >= 0:
-        raise ValueError(
-            f"relations_at_stamps: expected a tolerance of at least 0 s, got {tolerance}"
+        raise InvalidField(
+            "relations_at_stamps", "", f"expected a tolerance of at least 0 s, got {tolerance}"
         )
     order = np.argsort(stamps, kind="stable")
     ordered = stamps[order]
     for end in (np.asarray(first, np.float64), np.asarray(second, np.float64)):
         if end.shape != (len(of),):
-            raise ValueError(
-                f"relations_at_stamps: expected {len(of)} stamps of relations, got {end.shape}"
+            raise InvalidField(
+                "relations_at_stamps",
+                "",
+                f"expected {len(of)} stamps of relations, got {end.shape}",
             )
         if not (finite := np.isfinite(end)).all():
             row = int(finite.argmin())
-            raise ValueError(
-                "relations_at_stamps: expected finite stamps of relations, got "
-                f"{end[row]} in row {row}"
+            raise InvalidField(
+                "relations_at_stamps",
+                "",
+                f"expected finite stamps of relations, got {end[row]} in row {row}",
             )
     ends = np.stack([first, second]).astype(np.float64)
     after = np.clip(np.searchsorted(ordered, ends), 0, len(ordered) - 1)
@@ -167,10 +173,12 @@ def relations_at_stamps(
     place = np.searchsorted(ordered, ordered[place])  # the first of the same stamp
     near = (np.abs(ordered[place] - ends) <= tolerance).all(axis=0)
     if not near.any():
-        raise ValueError(
-            f"relations_at_stamps: none of {len(of):,} relations, from {ends.min():.6f} s to "
+        raise InvalidField(
+            "relations_at_stamps",
+            "",
+            f"none of {len(of):,} relations, from {ends.min():.6f} s to "
             f"{ends.max():.6f} s, joins the path, from {ordered[0]:.6f} s to {ordered[-1]:.6f} s, "
-            f"within {tolerance:g} s at both ends"
+            f"within {tolerance:g} s at both ends",
         )
     rows = order[place]
     return Relations(rows[0][near], rows[1][near], of[near]), int((~near).sum())

@@ -18,6 +18,7 @@ from jaxslam.core.logs._streams import is_gap, known_poses
 from jaxslam.core.logs._tables import POSE, TAG, TIME, UNITS, Columns, split_unit, unit_divisor
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import Log
+from jaxslam.core.validation import InvalidFile
 from jaxslam.datasets._dataset import Adjustable, Dataset, Parameter
 from jaxslam.datasets._landmark_logs.table_settings import (
     UNMEASURED,
@@ -260,9 +261,9 @@ class CsvTable:
     def _column(self, place: int) -> str:
         return f"column {place + 1} ({self.header[place]})"
 
-    def _error(self, line: int, reason: str, place: int | None = None) -> ValueError:
-        where = "" if place is None else f"{self._column(place)}: "
-        return ValueError(f"{self.path}:{line}: {where}{reason}")
+    def _error(self, line: int, reason: str, place: int | None = None) -> InvalidFile:
+        column = None if place is None else self._column(place)
+        return InvalidFile(self.path, reason, line, column)
 
 
 def _separators(header: str) -> list[str]:

@@ -26,6 +26,7 @@ from jaxslam import filters, store
 from jaxslam._cli.campaigns import engines
 from jaxslam.consistency.campaign import (
     Incomplete,
+    Processes,
     monte_carlo,
 )
 from jaxslam.consistency.campaign import (
@@ -35,7 +36,7 @@ from jaxslam.consistency.campaign import (
     _remote as remote,
 )
 from jaxslam.consistency.campaign._block import CampaignPlan
-from jaxslam.consistency.campaign._remote import Processes, compute_block, pack
+from jaxslam.consistency.campaign._remote import compute_block, pack
 from jaxslam.core.record import record
 
 WORLD = worlds.ring(20)

@@ -10,12 +10,10 @@ import pytest
 import scipy.stats
 from cases import refused
 
-from jaxslam import motion, sensors, slots
-from jaxslam._driver import run
+from jaxslam import motion, run, sensors, simulate, slots
 from jaxslam.core.types import Log, Scan, Status
 from jaxslam.filters import EkfSlam
 from jaxslam.math.stats import sigma_gate
-from jaxslam.simulation._worlds import simulate
 from jaxslam.simulation.scenarios import cloister
 
 Q, R = np.diag([0.05, 0.03]) ** 2, np.diag([0.1, 0.05]) ** 2

@@ -10,14 +10,12 @@ import pytest
 import worlds
 from worlds import draw, narrow
 
-from jaxslam import charts, linearize, motion, sensors
-from jaxslam._driver import run
+from jaxslam import charts, linearize, motion, run, sensors, simulate
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Status
 from jaxslam.filters import EkfSlam
 from jaxslam.filters._ekf.correction import correct_in_turn
 from jaxslam.math.stats import sigma_gate
-from jaxslam.simulation._worlds import simulate
 from jaxslam.simulation.scenarios import circle, cloister
 
 KEY = jax.random.key(0)

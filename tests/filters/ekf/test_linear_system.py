@@ -10,8 +10,7 @@ import pytest
 import worlds
 from cases import refused, swept
 
-from jaxslam import catalog, charts, filters, life, linearize, sensors
-from jaxslam._driver import run
+from jaxslam import catalog, charts, filters, life, linearize, run, sensors
 from jaxslam.core.record import record
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Scan

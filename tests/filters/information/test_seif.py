@@ -10,8 +10,7 @@ import pytest
 from cases import refused
 from worlds import draw, narrow
 
-from jaxslam import catalog, filters, scenarios, sensors
-from jaxslam._driver import run
+from jaxslam import catalog, filters, run, scenarios, sensors
 from jaxslam.charts import Euclidean
 from jaxslam.core.protocols import Filter
 from jaxslam.core.record import record

@@ -405,7 +405,7 @@ def signs():
     (lambda: TeamSlam([crew(1)[0], compass_only()], 3), "robot 1 needs a start"),
     (
         lambda: team.Robot(motion.Increment(Q), ring().sensor),
-        "a motion and a Suite, got Increment and RangeBearing",
+        "sensors: expected a Suite, got a RangeBearing",
     ),
     (lambda: dataclasses.replace(crew(1)[0], start=((0, 0), NOTHING)), "shape"),
     (lambda: world(crew(2), tags=(3, 9)), "expected tags of robots from"),

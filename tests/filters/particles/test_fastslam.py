@@ -12,8 +12,7 @@ import worlds
 from cases import refused, swept
 from reference.plane import from_frame
 
-from jaxslam import association, life, motion, resampling, sensors
-from jaxslam._driver import run
+from jaxslam import association, life, motion, resampling, run, sensors
 from jaxslam.consistency._measures.counts import counts_of
 from jaxslam.core.types import Scan, Status
 from jaxslam.filters import FastSlam
