@@ -6,10 +6,10 @@ import zlib
 from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
 
+from jaxslam.core.validation import InvalidFile
+
 DIGITS = 18
 """Digits of the largest whole number that is read; it fits 64 bits."""
-
-from jaxslam.core.validation import InvalidFile
 
 LARGEST = 1e60
 """Largest number that is read: products of five such numbers are finite in float64."""
