@@ -1,14 +1,24 @@
 """The models and options of `DelayedSlam`, which its steps take; three of them are records."""
 
 import dataclasses
+import math
 from typing import Literal, get_args
 
 from jaxslam.association._rules import Known
 from jaxslam.charts import Euclidean
-from jaxslam.core import _validation as validation
-from jaxslam.core._numbers import check_count, is_concrete
-from jaxslam.core._record import hold_function, record, set_field, static
+from jaxslam.core._record import field, function_of, record, set_field, static
+from jaxslam.core._validation import motion_model, sensor_model
 from jaxslam.core.protocols import Associate, Filter, Motion, Sensor
+from jaxslam.core.validation import (
+    InvalidField,
+    at_least,
+    in_range,
+    instance_of,
+    one_of,
+    or_none,
+    positive,
+    probability,
+)
 from jaxslam.filters._delayed.state import SIZE, TableLayout
 from jaxslam.filters._delayed.triangulation import Triangulation, triangulation_of
 from jaxslam.math._arrays import Number
@@ -16,6 +26,8 @@ from jaxslam.math.stats import chi2_quantile
 from jaxslam.sensors._suite import on_ground
 
 Distance = Literal["mahalanobis", "bhattacharyya"]
+
+_not_negative = in_range(0.0, math.inf)
 
 
 @record
@@ -26,15 +38,11 @@ class StoredMeasurements:
         ValueError: on a capacity below 1 or a negative spacing.
     """
 
-    capacity: int = static(default=32)
+    capacity: int = static(default=32, check=at_least(1))
     """W; in a full table the oldest stored measurement is marginalized out"""
-    spacing: Number = 0.2
+    spacing: Number = field(default=0.2, check=_not_negative)
     """[m] least distance between the positions of stored measurements of one identity; a nearer
     measurement is `Status.DEFERRED`"""
-
-    def __post_init__(self) -> None:
-        check_count("StoredMeasurements: capacity", self.capacity)
-        _check_not_negative(self, "spacing")
 
 
 @record
@@ -46,34 +54,23 @@ class Hypotheses:
             unknown distance.
     """
 
-    capacity: int = static(default=16)
+    capacity: int = static(default=16, check=at_least(1))
     """C; in a full table intersections are refused, and counted"""
-    spread: Number = 0.3
+    spread: Number = field(default=0.3, check=positive)
     """[1] largest standard deviation of an intersection relative to the sensor, over the distance,
     with which a hypothesis may begin; with a larger one it is not Gaussian"""
-    distance: Distance = static(default="mahalanobis")
+    distance: Distance = static(default="mahalanobis", check=one_of(*get_args(Distance)))
     """distance between intersection and hypothesis, Gaussians relative to the sensor: d² of
     "mahalanobis", or "bhattacharyya\""""
-    same: Number | None = None
+    same: Number | None = field(default=None, check=or_none(positive))
     """[1] distance from a hypothesis below which an intersection is that hypothesis; default
     the 99 % quantile of chi-square with two degrees of freedom for mahalanobis, 0.5 for
     bhattacharyya"""
-    decay: Number = 0.5
+    decay: Number = field(default=0.5, check=_not_negative)
     """persistence lost by each measurement of its tag that does not confirm it. A hypothesis is
     deleted at 0: it survives persistence / decay outliers in a row"""
-    patience: int = static(default=200)
+    patience: int = static(default=200, check=at_least(1))
     """scans without confirmation after which a hypothesis is deleted"""
-
-    def __post_init__(self) -> None:
-        check_count("Hypotheses: capacity", self.capacity)
-        check_count("Hypotheses: patience", self.patience)
-        _check_positive(self, "spread", "same")
-        _check_not_negative(self, "decay")
-        if self.distance not in get_args(Distance):
-            raise ValueError(
-                f"Hypotheses: expected distance {' or '.join(get_args(Distance))}, got "
-                f"{self.distance!r}"
-            )
 
     @property
     def same_below(self) -> Number:
@@ -91,56 +88,39 @@ class Promotion:
         ValueError: on a count below 1, a persistence or spread not above 0, or a negative lead.
     """
 
-    persistence: Number = 4.0
+    persistence: Number = field(default=4.0, check=positive)
     """least persistence: 1 of the intersection, and 1 of each confirmation"""
-    lead: Number = 2.0
+    lead: Number = field(default=2.0, check=_not_negative)
     """least difference of its persistence to that of each hypothesis that excludes it"""
-    spread: Number = 0.3
+    spread: Number = field(default=0.3, check=positive)
     """[1] largest standard deviation of its position relative to the sensor, over its range"""
-    per_scan: int = static(default=2)
+    per_scan: int = static(default=2, check=at_least(1))
     """largest number of promotions a scan"""
-
-    def __post_init__(self) -> None:
-        check_count("Promotion: per_scan", self.per_scan)
-        _check_positive(self, "persistence", "spread")
-        _check_not_negative(self, "lead")
-
-
-def _check_positive(record: object, *fields: str) -> None:
-    for field in fields:
-        value = getattr(record, field)
-        if value is not None and is_concrete(value) and not value > 0:
-            name = type(record).__name__
-            raise ValueError(f"{name}: expected {field} above 0, got {value}")
-
-
-def _check_not_negative(record: object, *fields: str) -> None:
-    for field in fields:
-        value = getattr(record, field)
-        if is_concrete(value) and not value >= 0:
-            name = type(record).__name__
-            raise ValueError(f"{name}: expected {field} of at least 0, got {value}")
 
 
 @record
 class DelayedFilter(Filter):
     """The models and options of `DelayedSlam`, and what follows from them."""
 
-    motion: Motion
-    sensor: Sensor
+    motion: Motion = field(check=motion_model)
+    sensor: Sensor = field(check=sensor_model)
     """a sensor of one bearing or one range of points"""
-    capacity: int = static()
+    capacity: int = static(check=at_least(1))
     """landmarks N"""
     _: dataclasses.KW_ONLY
-    triangulation: Triangulation = None  # type: ignore[assignment]
+    triangulation: Triangulation = field(  # type: ignore[assignment]
+        default=None, check=or_none(instance_of(Triangulation))
+    )
     """the intersection of stored measurements; default that of rays or of circles, by what the
     sensor measures"""
-    stored: StoredMeasurements = StoredMeasurements()
-    hypotheses: Hypotheses = Hypotheses()
-    promotion: Promotion = Promotion()
-    gate: Number | None = None
+    stored: StoredMeasurements = field(
+        default=StoredMeasurements(), check=instance_of(StoredMeasurements)
+    )
+    hypotheses: Hypotheses = field(default=Hypotheses(), check=instance_of(Hypotheses))
+    promotion: Promotion = field(default=Promotion(), check=instance_of(Promotion))
+    gate: Number | None = field(default=None, check=or_none(probability))
     """the probability that a correct comparison passes, by γ = χ²(1, gate); default 0.99"""
-    associate: Associate = Known()
+    associate: Associate = field(default=Known(), check=function_of("prediction", "scan"))
     """the landmark of each measurement. With `Known` only measurements of one tag intersect. With
     any different method, the measurements it declares new intersect all stored ones, and tags only
     name the landmarks"""
@@ -148,31 +128,15 @@ class DelayedFilter(Filter):
 
     def __post_init__(self) -> None:
         name, sensor = type(self).__name__, self.sensor
-        validation.check_models(name, self.motion, sensor)
-        validation.check_parts(name, associate=self.associate)
-        hold_function(self, "associate", "prediction, scan")
+        got = f"{sensor.name} with {sensor.measurements}"
         if len(sensor.measurements) != 1 or not sensor.of_points:
-            raise ValueError(
-                f"{name}: expected a sensor of one bearing or one range of points (x, y), got "
-                f"{sensor.name} with {sensor.measurements} of {sensor.landmark}"
-            )
-        validation.check_count(f"{name}: capacity", self.capacity)
-        validation.check_gate(name, self.gate)
+            reason = "expected a sensor of one bearing or one range of points (x, y), got "
+            raise InvalidField(name, "sensor", f"{reason}{got} of {sensor.landmark}")
         triangulation = self.triangulation or triangulation_of(sensor)
         set_field(self, "triangulation", triangulation)
-        kinds = {
-            "triangulation": Triangulation,
-            "stored": StoredMeasurements,
-            "hypotheses": Hypotheses,
-            "promotion": Promotion,
-        }
-        for field, kind in kinds.items():
-            validation.check_record(name, field, getattr(self, field), kind)
         if sensor.measurements != (triangulation.measurement,):
-            raise ValueError(
-                f"{name}: expected a sensor of one {triangulation.measurement}, got "
-                f"{sensor.name} with {sensor.measurements}"
-            )
+            reason = f"expected a sensor of one {triangulation.measurement}, got {got}"
+            raise InvalidField(name, "sensor", reason)
         super().__post_init__()
 
     @property

@@ -3,26 +3,8 @@
 import jax
 import jax.numpy as jnp
 
-from jaxslam.core._numbers import check_count, check_gate
 from jaxslam.core.protocols import Chart, Linearizer, Sensor
-from jaxslam.math._arrays import Number
 from jaxslam.sensors._suite import Suite
-
-
-def check_map_options(filter: str, capacity: int, gate: Number | None, births: int | None) -> None:
-    """Raise ValueError, which names the filter, on a capacity or births below 1, or a gate that is
-    no probability."""
-    check_count(f"{filter}: capacity", capacity)
-    if births is not None:
-        check_count(f"{filter}: births", births)
-    check_gate(filter, gate)
-
-
-def check_choice(filter: str, field: str, value: str, choices: tuple[str, ...]) -> None:
-    """Raise ValueError unless the filter has this choice of an option."""
-    if value not in choices:
-        expected = " or ".join(f'"{choice}"' for choice in choices)
-        raise ValueError(f"{filter}: expected {field} {expected}, got {value!r}")
 
 
 def check_iterations(filter: str, linearize: Linearizer, iterations: int) -> None:

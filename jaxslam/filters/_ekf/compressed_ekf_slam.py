@@ -7,13 +7,12 @@ import jax
 import jax.numpy as jnp
 
 from jaxslam.association._rules import Known
-from jaxslam.core import _validation as validation
 from jaxslam.core import slots
-from jaxslam.core._numbers import check_count
-from jaxslam.core._record import record, static
+from jaxslam.core._record import field, record, static
 from jaxslam.core.protocols import Sensor, Wrapper
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan
+from jaxslam.core.validation import at_least, instance_of
 from jaxslam.filters._ekf.ekf_slam import EkfSlam
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._xla import where_any
@@ -63,11 +62,11 @@ class CompressedEkfSlam(Wrapper):
     more measurement slots than the area, from `update`.
     """
 
-    filter: EkfSlam
+    filter: EkfSlam = field(check=instance_of(EkfSlam))
     """in the Euclidean chart, of one sensor of landmarks, with a linearizer without memory
     (AtEstimate, Unscented), associating by tags, without a life and the covariance
     "square_root\""""
-    area: int = static()
+    area: int = static(check=at_least(1))
     """number K of landmarks in the area; at least the measurement slots of a scan"""
     square_root = False
     landmark = ()
@@ -75,8 +74,6 @@ class CompressedEkfSlam(Wrapper):
     def __post_init__(self) -> None:
         super().__post_init__()
         name, filter = "CompressedEkfSlam", self.filter
-        validation.check_record(name, "filter", filter, EkfSlam)
-        check_count(f"{name}: area", self.area)
         sensor = filter.sensor
         joint = jax.eval_shape(filter.init, jnp.zeros(3), jnp.eye(3))
         for feature, is_unfit in {

@@ -6,9 +6,9 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
-from jaxslam.core._numbers import check_count
 from jaxslam.core._record import record, static
 from jaxslam.core.types import Estimate, Info, Scan
+from jaxslam.core.validation import InvalidField, at_least
 from jaxslam.filters._information import canonical, tag_innovation
 from jaxslam.filters._information.active_set import (
     activate,
@@ -73,14 +73,14 @@ class Seif(InformationFilter):
     """
 
     _: dataclasses.KW_ONLY
-    active: int = static()
+    active: int = static(check=at_least(1))
     """most active landmarks, at least as many as a scan has measurement slots; capped at the
     capacity"""
-    links: int = static()
+    links: int = static(check=at_least(1))
     """most links K of a landmark to others while one of both is passive"""
-    passive: int = static(default=10)
+    passive: int = static(default=10, check=at_least(1))
     """landmarks whose means are recovered in rotation each scan, in addition to the active ones"""
-    sweeps: int = static(default=1)
+    sweeps: int = static(default=1, check=at_least(1))
     """rounds of mean recovery a scan: passive landmarks, then the active block"""
     conservative: bool = static(default=False)
     """how a full list drops its weakest link. False: overconfidently, Ω
@@ -90,13 +90,10 @@ class Seif(InformationFilter):
     """`estimate` inverts Ω of all landmarks, O(N³), instead of Markov blankets"""
 
     def __post_init__(self) -> None:
-        for option in ("active", "links", "passive", "sweeps"):
-            check_count(f"Seif: {option}", getattr(self, option))
         super().__post_init__()
         if not self.sensor.of_points:
-            raise ValueError(
-                f"Seif: expected landmarks (x, y), got {self.sensor.landmark} of {self.sensor.name}"
-            )
+            reason = f"expected landmarks (x, y), got {self.sensor.landmark} of {self.sensor.name}"
+            raise InvalidField("Seif", "sensor", reason)
 
     @property
     def active_size(self) -> int:

@@ -10,12 +10,13 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.charts import Euclidean
-from jaxslam.core import _validation as validation
 from jaxslam.core import slots
-from jaxslam.core._numbers import check_count, check_gate, check_positive, gate_quantile
-from jaxslam.core._record import record, static
+from jaxslam.core._numbers import gate_quantile
+from jaxslam.core._record import field, record, static
+from jaxslam.core._validation import motion_model, sensor_model
 from jaxslam.core.protocols import Filter, Motion, Sensor
 from jaxslam.core.types import Scan
+from jaxslam.core.validation import InvalidField, at_least, or_none, positive, probability
 from jaxslam.linearize._first_order import observe_jacobians, predicted_noise
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import Number
@@ -31,33 +32,28 @@ class InformationFilter(Filter):
     suite, or a sensor that has no landmarks or whose landmarks become points.
     """
 
-    motion: Motion
-    sensor: Sensor
+    motion: Motion = field(check=motion_model)
+    sensor: Sensor = field(check=sensor_model)
     """the models; Jacobians come from `jax.jacfwd`, at the estimate"""
-    capacity: int = static()
+    capacity: int = static(check=at_least(1))
     """landmark slots N; a new landmark in a full map is `Status.OVERFLOW`"""
     _: dataclasses.KW_ONLY
-    gate: Number | None = None
+    gate: Number | None = field(default=None, check=or_none(probability))
     """See `EkfSlam.gate`."""
-    floor: Number = 1e-4
+    floor: Number = field(default=1e-4, check=positive)
     """standard deviation [m, rad] added to a singular pose_cov, which has no inverse"""
     chart = Euclidean()
 
     def __post_init__(self) -> None:
         name, sensor = type(self).__name__, self.sensor
-        validation.check_models(name, self.motion, sensor)
-        check_count(f"{name}: capacity", self.capacity)
-        check_gate(name, self.gate)
-        check_positive(name, floor=self.floor)
         if isinstance(sensor, Suite):
-            raise ValueError(f"{name}: expected one sensor, not a suite")
-        if len(sensor.landmark) == 0:
-            raise ValueError(f"{name}: expected a sensor of landmarks, got {sensor.name}")
+            raise InvalidField(name, "sensor", "expected one sensor, not a suite")
+        if sensor.absolute:
+            reason = f"expected a sensor of landmarks, got {sensor.name}"
+            raise InvalidField(name, "sensor", reason)
         if sensor.reduced is not None:
-            raise ValueError(
-                f"{name}: the landmarks of {sensor.name} are converted to points, which is not "
-                "supported"
-            )
+            reason = f"the landmarks of {sensor.name} are converted to points: not supported"
+            raise InvalidField(name, "sensor", reason)
         super().__post_init__()
 
 

@@ -11,11 +11,12 @@ from numpy.typing import ArrayLike
 
 from jaxslam.association._rules import Known
 from jaxslam.charts import Euclidean
-from jaxslam.core import _validation as validation
-from jaxslam.core._record import record, static
+from jaxslam.core._record import field, function_of, record, static
+from jaxslam.core._validation import sensor_model
 from jaxslam.core.protocols import Associate, Filter, Life, Sensor, Wrapper
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan
+from jaxslam.core.validation import at_least, instance_of, or_none, probability
 from jaxslam.filters._particles.landmark_ekf import update_map
 from jaxslam.filters._particles.particle_map import ParticleMapFilter
 from jaxslam.filters._particles.proposal import associate_particle, propose_pose
@@ -45,25 +46,21 @@ class Mapping(ParticleMapFilter):
     that is a suite, absolute, or whose landmarks turn into points.
     """
 
-    sensor: Sensor
+    sensor: Sensor = field(check=sensor_model)
     """a sensor of landmarks; Jacobians come from `jax.jacfwd`"""
-    capacity: int = static()
+    capacity: int = static(check=at_least(1))
     """landmark slots N"""
     _: dataclasses.KW_ONLY
-    associate: Associate = Known()
+    associate: Associate = field(default=Known(), check=function_of("prediction", "scan"))
     """See `EkfSlam.associate`."""
-    gate: Number | None = None
+    gate: Number | None = field(default=None, check=or_none(probability))
     """See `EkfSlam.gate`."""
-    births: int | None = static(default=None)
+    births: int | None = static(default=None, check=or_none(at_least(1)))
     """See `EkfSlam.births`."""
-    life: Life | None = None
+    life: Life | None = field(default=None, check=or_none(instance_of(Life)))
     """See `EkfSlam.life`."""
     controls = ("x [m]", "y [m]", "theta [rad]")
     chart = Euclidean()
-
-    def __post_init__(self) -> None:
-        validation.check_sensor("Mapping", self.sensor)
-        super().__post_init__()
 
     def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> SlamParticles:
         exact, size = jnp.zeros_like(pose_cov), len(self.sensor.landmark)

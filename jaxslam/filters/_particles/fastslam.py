@@ -11,13 +11,14 @@ from jaxtyping import Bool, Float, Int
 
 from jaxslam.association._rules import Known
 from jaxslam.charts import Euclidean
-from jaxslam.core import _validation as validation
-from jaxslam.core._record import record, static
+from jaxslam.core._record import field, function_of, record, static
+from jaxslam.core._validation import motion_model, sensor_model
 from jaxslam.core.protocols import Associate, Differentiable, Life, Motion, Resample, Sensor
 from jaxslam.core.types import Estimate, Info, Scan
+from jaxslam.core.validation import at_least, in_range, instance_of, one_of, or_none, probability
 from jaxslam.filters._particles.landmark_ekf import update_map
 from jaxslam.filters._particles.particle_map import ParticleMapFilter
-from jaxslam.filters._particles.pose_particles import check_resampling, weighted_nis
+from jaxslam.filters._particles.pose_particles import weighted_nis
 from jaxslam.filters._particles.proposal import (
     PoseProposal,
     associate_particle,
@@ -74,46 +75,40 @@ class FastSlam(ParticleMapFilter):
     sensor that is a suite, absolute, or whose landmarks turn into points.
     """
 
-    motion: Motion
-    sensor: Sensor
+    motion: Motion = field(check=motion_model)
+    sensor: Sensor = field(check=sensor_model)
     """the models; Jacobians come from `jax.jacfwd`"""
-    capacity: int = static()
+    capacity: int = static(check=at_least(1))
     """landmark slots N of each particle. A new landmark that finds a particle's map full is dropped
     there (`Status.OVERFLOW`, and `SlamParticles.lost` for each particle)"""
-    particles: int = static()
+    particles: int = static(check=at_least(1))
     """P, at least 1"""
     _: dataclasses.KW_ONLY
-    proposal: Literal["motion", "measurement"] = static(default="measurement")
+    proposal: Literal["motion", "measurement"] = static(
+        default="measurement", check=one_of("motion", "measurement")
+    )
     """distribution from which poses are drawn"""
-    resample: Resample | Differentiable = systematic
+    resample: Resample | Differentiable = field(
+        default=systematic, check=function_of("log_weights", "key")
+    )
     """one of `jaxslam.resampling`. Through `StopGradient` of one, the gradient of
     `Info.log_likelihood` is consistent; through `Soft` it is biased, and more so without either,
     since the effect of resampling is then ignored"""
-    threshold: Number = 0.5
+    threshold: Number = field(default=0.5, check=in_range(0.0, 1.0))
     """ESS below which to resample, as a share of P; 0 never resamples, 1 in every step with unequal
     weights"""
-    associate: Associate = Known()
+    associate: Associate = field(default=Known(), check=function_of("prediction", "scan"))
     """the landmark of each measurement; a method other than `Known` decides by each particle's
     map"""
-    gate: Number | None = None
+    gate: Number | None = field(default=None, check=or_none(probability))
     """See `EkfSlam.gate`."""
-    births: int | None = static(default=None)
+    births: int | None = static(default=None, check=or_none(at_least(1)))
     """largest number of new landmarks a scan and particle, the rest `Status.DEFERRED`"""
-    life: Life | None = None
+    life: Life | None = field(default=None, check=or_none(instance_of(Life)))
     """rule that removes landmarks from each particle's map (`jaxslam.life`), e.g. by negative
     evidence: `life.Existence` keeps log-odds (P, N) in `SlamParticles.life`"""
     name = "fastslam"
     chart = Euclidean()
-
-    def __post_init__(self) -> None:
-        validation.check_models("FastSlam", self.motion, self.sensor)
-        validation.check_count("FastSlam: particles", self.particles)
-        check_resampling(self)
-        if self.proposal not in ("motion", "measurement"):
-            raise ValueError(
-                f'FastSlam: expected proposal "motion" or "measurement", got {self.proposal!r}'
-            )
-        super().__post_init__()
 
     def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> SlamParticles:
         size = len(self.sensor.landmark)

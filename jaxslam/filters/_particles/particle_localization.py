@@ -12,11 +12,12 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam.association._rules import Known, predicted
-from jaxslam.core import _validation as validation
 from jaxslam.core._numbers import gate_quantile
-from jaxslam.core._record import hold_function, record, static
+from jaxslam.core._record import field, function_of, record, static
+from jaxslam.core._validation import motion_model, sensor_model
 from jaxslam.core.protocols import Associate, Motion, Prediction, Sensor
 from jaxslam.core.types import Estimate, Info, Scan
+from jaxslam.core.validation import InvalidField, at_least, or_none, probability
 from jaxslam.filters._known_map import hold_map, map_tags
 from jaxslam.filters._particles.pose_particles import Box, PoseParticles, draw_start, weighted_nis
 from jaxslam.filters._particles.pose_steps import MonteCarloFilter
@@ -75,32 +76,28 @@ class ParticleLocalization(MonteCarloFilter):
     gate not above 0 and below 1.
     """
 
-    motion: Motion
-    sensor: Sensor
+    motion: Motion = field(check=motion_model)
+    sensor: Sensor = field(check=sensor_model)
     """any sensor; in a `sensors.Suite`, absolute sensors enter the weights too"""
     landmarks: ArrayLike
     """(N, L) the map, in the sensor's parameters"""
-    particles: int = static()
+    particles: int = static(check=at_least(1))
     """the capacity P, at least 1"""
     _: dataclasses.KW_ONLY
     tags: tuple[int, ...] | None = static(default=None)
     """N different tags of the landmarks; default the row numbers"""
-    associate: Associate = Known()
+    associate: Associate = field(default=Known(), check=function_of("prediction", "scan"))
     """the landmark of each measurement; a method other than by tag decides for each particle, by
     its pose alone (MaximumLikelihood(None): the most likely landmark)"""
-    gate: Number | None = None
+    gate: Number | None = field(default=None, check=or_none(probability))
     """See `EkfSlam.gate`; a measurement beyond the gate counts with d² = γ, and is reported as
     rejected"""
 
     def __post_init__(self) -> None:
-        name = type(self).__name__
-        validation.check_models(name, self.motion, self.sensor)
-        validation.check_parts(name, associate=self.associate)
-        hold_function(self, "associate", "prediction, scan")
-        validation.check_gate(name, self.gate)
         hold_map(self)
         if self.start == "uniform" and self.box is None:
-            raise ValueError(f"{name}: expected a box with a uniform start, got none")
+            name = type(self).__name__
+            raise InvalidField(name, "box", "expected one with a uniform start, got None")
         super().__post_init__()
 
     @property

@@ -1,8 +1,7 @@
 """A filter with a map of independent landmarks in each particle: its options, and their checks."""
 
-from jaxslam.core import _validation as validation
-from jaxslam.core._record import hold_function
 from jaxslam.core.protocols import Associate, Filter, Life, Sensor
+from jaxslam.core.validation import InvalidField
 from jaxslam.math._arrays import Number
 from jaxslam.sensors._suite import Suite
 
@@ -23,16 +22,12 @@ class ParticleMapFilter(Filter):
     life: Life | None
 
     def __post_init__(self) -> None:
-        name, sensor = type(self).__name__, self.sensor
-        validation.check_parts(name, associate=self.associate, life=self.life)
-        hold_function(self, "associate", "prediction, scan")
-        validation.check_count(f"{name}: capacity", self.capacity)
-        if self.births is not None:
-            validation.check_count(f"{name}: births", self.births)
-        validation.check_gate(name, self.gate)
+        sensor = self.sensor
         if isinstance(sensor, Suite) or not sensor.landmark or sensor.reduced is not None:
-            raise ValueError(
-                f"{name}: expected one sensor of landmarks, not a suite, an absolute sensor or "
-                f"landmarks that are converted to points, got {sensor.name}"
+            raise InvalidField(
+                type(self).__name__,
+                "sensor",
+                "expected one sensor of landmarks, not a suite, an absolute sensor or landmarks "
+                f"that are converted to points, got {sensor.name}",
             )
         super().__post_init__()

@@ -4,7 +4,7 @@ A start from anywhere, and recovery, draw poses from a `Region`: the places that
 """
 
 import math
-from typing import Any, NamedTuple
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -15,7 +15,7 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam.core._numbers import held_array, is_concrete
-from jaxslam.core._record import hold_function, record, set_field
+from jaxslam.core._record import record
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._xla import change_where
 from jaxslam.math.angles import wrap
@@ -104,33 +104,16 @@ class Box(Region):
         return mean, jnp.diag(variance)
 
 
-def hold_box(filter: Any) -> None:
-    """Check and hold the field box (2, 2) of a filter, in `__post_init__`.
-
-    Raises ValueError, which begins with its class, where it is not finite or has no inside.
-    """
-    if filter.box is None:
-        return
-    ends = held_array(filter.box)
-    values = np.asarray(ends) if is_concrete(ends) else None
-    good = np.shape(ends) == (2, 2)
-    if values is not None:
-        good = good and bool(np.isfinite(values).all() and (values[1] > values[0]).all())
-    if not good:
-        raise ValueError(
-            f"{type(filter).__name__}: expected a box of shape (2, 2), its lowest and highest "
-            f"(x, y), got {filter.box!r}"
-        )
-    set_field(filter, "box", ends)
-
-
-def check_resampling(filter: Any) -> None:
-    """Check the fields resample and threshold in a filter's `__post_init__`."""
-    hold_function(filter, "resample", "log_weights, key")
-    threshold = filter.threshold
-    if is_concrete(threshold) and not 0 <= threshold <= 1:
-        name = type(filter).__name__
-        raise ValueError(f"{name}: expected a threshold from 0 to 1, got {threshold}")
+def box_ends(value: ArrayLike) -> ArrayLike:
+    """The check of a box (2, 2): its lowest and highest (x, y), finite, with an inside."""
+    ends = held_array(value)
+    numbers = np.asarray(ends) if is_concrete(ends) else None
+    is_box = np.shape(ends) == (2, 2)
+    if numbers is not None:
+        is_box = is_box and bool(np.isfinite(numbers).all() and (numbers[1] > numbers[0]).all())
+    if not is_box:
+        raise ValueError(f"expected shape (2, 2), its lowest and highest (x, y), got {value!r}")
+    return ends
 
 
 class ParticleEvents(NamedTuple):

@@ -14,19 +14,18 @@ from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
 from jaxslam.charts import Euclidean
-from jaxslam.core import _validation as validation
 from jaxslam.core._numbers import is_concrete
-from jaxslam.core._record import record, static
+from jaxslam.core._record import field, function_of, record, static
 from jaxslam.core.protocols import Differentiable, Filter, Motion, Resample
 from jaxslam.core.types import Estimate
+from jaxslam.core.validation import InvalidField, at_least, in_range, one_of, or_none
 from jaxslam.filters._particles.pose_particles import (
     ParticleEvents,
     PoseParticles,
     Region,
     active_mask,
-    check_resampling,
+    box_ends,
     draw_start,
-    hold_box,
     initial_pose_particles,
     no_events,
     pose_particle_moments,
@@ -115,6 +114,15 @@ _BINS = (0.5, 0.5, math.radians(15))
 _ERROR, _CONFIDENCE = 0.05, 0.99
 
 
+def _check_rates(rates: tuple[Number, Number]) -> tuple[Number, Number]:
+    """The check of the rates of two averages."""
+    if not isinstance(rates, tuple | list) or len(rates) != 2:
+        raise ValueError(f"expected (slow, fast), got {rates!r}")
+    if is_concrete(rates) and not 0 < rates[0] <= rates[1] <= 1:
+        raise ValueError(f"expected (slow, fast) with 0 < slow <= fast <= 1, got {rates!r}")
+    return rates[0], rates[1]
+
+
 class _Particles(Filter):
     """The declarations of a subclass of `MonteCarloFilter`."""
 
@@ -134,43 +142,35 @@ class MonteCarloFilter(_Particles):
     """
 
     _: dataclasses.KW_ONLY
-    start: Literal["gaussian", "uniform"] = static(default="gaussian")
+    start: Literal["gaussian", "uniform"] = static(
+        default="gaussian", check=one_of("gaussian", "uniform")
+    )
     """"gaussian", the pose and covariance given to `run` (the latter may be zero), or "uniform",
     anywhere with any heading, for any initial pose (global localization)"""
-    box: ArrayLike | None = None
+    box: ArrayLike | None = field(default=None, check=or_none(box_ends))
     """(2, 2) the lowest and the highest (x, y) [m] where the robot may be"""
-    resample: Resample | Differentiable = systematic
+    resample: Resample | Differentiable = field(
+        default=systematic, check=function_of("log_weights", "key")
+    )
     """one of `jaxslam.resampling`; also `Soft` or `StopGradient` of one"""
-    threshold: Number = 1.0
+    threshold: Number = field(default=1.0, check=in_range(0.0, 1.0))
     """ESS below which to resample, as a share of the particles in use; 1 resamples (and chooses
     their number) in every step with unequal weights, 0 only to inject. If odometry is more precise
     than the scans, copies stay together, and a lower threshold makes the covariance more
     consistent"""
-    least: int | None = static(default=None)
+    least: int | None = static(default=None, check=or_none(at_least(1)))
     """least number of particles in use; default 50, or the capacity if that is less. With
     least = particles their number is fixed"""
-    forget: tuple[Number, Number] | None = (0.01, 0.1)
+    forget: tuple[Number, Number] | None = field(default=(0.01, 0.1), check=or_none(_check_rates))
     """α_slow, α_fast with 0 < α_slow <= α_fast <= 1; None injects nothing"""
     chart = Euclidean()
 
     def __post_init__(self) -> None:
-        name, rates = type(self).__name__, self.forget
-        validation.check_count(f"{name}: particles", self.particles)
-        check_resampling(self)
-        hold_box(self)
-        if self.least is not None:
-            validation.check_count(f"{name}: least", self.least)
-            if self.least > self.particles:
-                raise ValueError(
-                    f"{name}: expected least <= particles = {self.particles}, got {self.least}"
-                )
-        if self.start not in ("gaussian", "uniform"):
-            raise ValueError(f'{name}: expected start "gaussian" or "uniform", got {self.start!r}')
-        if rates is not None and len(rates) != 2:
-            raise ValueError(f"{name}: expected forget = (slow, fast), got {rates!r}")
-        if rates is not None and is_concrete(rates) and not 0 < rates[0] <= rates[1] <= 1:
-            raise ValueError(
-                f"{name}: expected forget = (slow, fast) with 0 < slow <= fast <= 1, got {rates!r}"
+        if self.least is not None and self.least > self.particles:
+            raise InvalidField(
+                type(self).__name__,
+                "least",
+                f"expected at most particles = {self.particles}, got {self.least}",
             )
         super().__post_init__()
 

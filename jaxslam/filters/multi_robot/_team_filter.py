@@ -9,10 +9,9 @@ import numpy as np
 from jaxslam.association._rules import Known
 from jaxslam.charts import Euclidean
 from jaxslam.core import _validation as validation
-from jaxslam.core._numbers import check_count
-from jaxslam.core._record import hold_function, record, set_field, static
+from jaxslam.core._record import field, function_of, record, set_field, static
 from jaxslam.core.protocols import Associate, Filter, Sensor
-from jaxslam.filters._ekf.checks import check_choice, check_map_options
+from jaxslam.core.validation import at_least, one_of, or_none, probability
 from jaxslam.filters._ekf.correction import CorrectionOrder, Covariance
 from jaxslam.filters.multi_robot.team import Robot
 from jaxslam.math._arrays import Number
@@ -29,42 +28,37 @@ class TeamFilter(Filter):
     robots: tuple[Robot, ...]
     """`team.Robot`s, in a list or tuple; robot 0 starts where the run does, the others relative to
     it"""
-    capacity: int = static()
+    capacity: int = static(check=at_least(1))
     """landmark slots N"""
     _: dataclasses.KW_ONLY
     tags: tuple[int, ...] | None = static(default=None)
     """R tags that mean robots; default N, N + 1, …"""
     report: int = static(default=0)
     """the robot of `estimate`; `team.poses` has all"""
-    associate: Associate = Known()
+    associate: Associate = field(default=Known(), check=function_of("prediction", "scan"))
     """See `EkfSlam.associate`."""
-    correction: CorrectionOrder = static(default="sequential")
+    correction: CorrectionOrder = static(
+        default="sequential", check=one_of(*get_args(CorrectionOrder))
+    )
     """See `EkfSlam.correction`."""
-    gate: Number | None = None
+    gate: Number | None = field(default=None, check=or_none(probability))
     """See `EkfSlam.gate`."""
-    iterations: int = static(default=1)
+    iterations: int = static(default=1, check=at_least(1))
     """See `EkfSlam.iterations`."""
-    covariance: Covariance = static(default="plain")
+    covariance: Covariance = static(default="plain", check=one_of("plain", "joseph"))
     """"plain" or "joseph"; see `EkfSlam.covariance`."""
-    births: int | None = static(default=None)
+    births: int | None = static(default=None, check=or_none(at_least(1)))
     """See `EkfSlam.births`; a limit for each sensor."""
     chart = Euclidean()
 
     def __post_init__(self) -> None:
         name, robots = "TeamSlam", self.robots
-        check_count(f"{name}: capacity", self.capacity)
         tags = check_team(name, robots, self.tags, self.capacity)
         set_field(self, "robots", tuple(robots))
         if self.tags is not None:
             set_field(self, "tags", tags)
         for robot in robots:
             validation.check_models(name, robot.motion, robot.sensors)
-        validation.check_parts(name, associate=self.associate)
-        hold_function(self, "associate", "prediction, scan")
-        check_map_options(name, self.capacity, self.gate, self.births)
-        check_count(f"{name}: iterations", self.iterations)
-        check_choice(name, "correction", self.correction, get_args(CorrectionOrder))
-        check_choice(name, "covariance", self.covariance, ("plain", "joseph"))
         if type(self.report) is not int or not 0 <= self.report < len(robots):
             raise ValueError(
                 f"{name}: expected report from 0 to {len(robots) - 1}, got {self.report!r}"

@@ -9,13 +9,12 @@ from jaxtyping import Array, Bool, Float
 
 from jaxslam.association._rules import Known
 from jaxslam.charts import Euclidean
-from jaxslam.core import _validation as validation
-from jaxslam.core._numbers import check_count
-from jaxslam.core._record import hold_function, record, static
+from jaxslam.core._record import field, function_of, record, static
+from jaxslam.core._validation import motion_model, sensor_model
 from jaxslam.core.protocols import Associate, Filter, Motion, Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan, Status
-from jaxslam.filters._ekf.checks import check_map_options
+from jaxslam.core.validation import at_least, or_none, probability
 from jaxslam.filters._ekf.ekf_slam import EkfSlam
 from jaxslam.graphs._chain.window import (
     WindowIterate,
@@ -73,35 +72,30 @@ class FixedLag(Filter):
     iterations below 1; from `update`, on a scan of more measurement slots.
     """
 
-    motion: Motion
-    sensor: Sensor
+    motion: Motion = field(check=motion_model)
+    sensor: Sensor = field(check=sensor_model)
     """the models; Jacobians come from `jax.jacfwd`. A measurement must determine its landmark and
     have as many numbers (K = 0, Z = L)"""
-    capacity: int = static()
+    capacity: int = static(check=at_least(1))
     """landmark slots N"""
-    slots: int = static()
+    slots: int = static(check=at_least(1))
     """most measurement slots M of a scan; the window stores scans"""
     _: dataclasses.KW_ONLY
-    window: int = static(default=5)
+    window: int = static(default=5, check=at_least(1))
     """motions and scans W that are optimized"""
     first_estimates: bool = static(default=False)
     """whether Jacobians by a variable of the prior are taken where that was linearized; needs
     landmarks (x, y)"""
-    iterations: int = static(default=2)
+    iterations: int = static(default=2, check=at_least(1))
     """Gauss-Newton steps at each scan"""
-    associate: Associate = Known()
-    gate: Number | None = None
-    births: int | None = static(default=None)
+    associate: Associate = field(default=Known(), check=function_of("prediction", "scan"))
+    gate: Number | None = field(default=None, check=or_none(probability))
+    births: int | None = static(default=None, check=or_none(at_least(1)))
     """these three as the fields of `EkfSlam`. NIS is that of the innovations of EKF-SLAM"""
     chart = Euclidean()
 
     def __post_init__(self) -> None:
         name, sensor = type(self).__name__, self.sensor
-        validation.check_models(name, self.motion, sensor)
-        validation.check_parts(name, associate=self.associate)
-        hold_function(self, "associate", "prediction, scan")
-        check_map_options(name, self.capacity, self.gate, self.births)
-        validation.check_count(f"{name}: iterations", self.iterations)
         same = len(sensor.measurements) == len(sensor.landmark)
         several = isinstance(sensor, Suite) or sensor.reduced is not None
         if several or sensor.free.mean.shape[0] or not same:
@@ -113,8 +107,6 @@ class FixedLag(Filter):
             raise ValueError(
                 f"{name}: expected landmarks (x, y) for first_estimates, got {sensor.landmark}"
             )
-        check_count(f"{name}: slots", self.slots)
-        check_count(f"{name}: window", self.window)
         super().__post_init__()
 
     @property

@@ -10,13 +10,13 @@ from numpy.typing import ArrayLike
 
 from jaxslam._driver import check_run, run
 from jaxslam.association._rules import Known
-from jaxslam.core import _validation as validation
 from jaxslam.core._numbers import held_array
-from jaxslam.core._record import hold_function, record, set_field, static
+from jaxslam.core._record import field, function_of, record, set_field, static
+from jaxslam.core._validation import motion_model, sensor_model
 from jaxslam.core.protocols import Associate, Component, Filter, Motion, Sensor, Wrapper
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Log, Scan, Trace
-from jaxslam.filters._ekf.checks import check_map_options
+from jaxslam.core.validation import at_least, or_none, probability
 from jaxslam.filters._ekf.ekf_slam import EkfSlam
 from jaxslam.math._arrays import Number
 from jaxslam.math._xla import hot_jit
@@ -94,26 +94,23 @@ class LogEstimator(Component):
     and, when called, as `run` does.
     """
 
-    motion: Motion
-    sensor: Sensor
+    motion: Motion = field(check=motion_model)
+    sensor: Sensor = field(check=sensor_model)
     """the models; Jacobians come from `jax.jacfwd`"""
-    capacity: int = static()
+    capacity: int = static(check=at_least(1))
     """landmark slots N"""
     pose: ArrayLike = dataclasses.field()
     """(3,) of the robot before the first control"""
     pose_cov: ArrayLike = dataclasses.field()
     """(3, 3)"""
     _: dataclasses.KW_ONLY
-    associate: Associate = Known()
-    gate: Number | None = None
-    births: int | None = static(default=None)
+    associate: Associate = field(default=Known(), check=function_of("prediction", "scan"))
+    gate: Number | None = field(default=None, check=or_none(probability))
+    births: int | None = static(default=None, check=or_none(at_least(1)))
     """these three as the fields of `EkfSlam`"""
 
     def __post_init__(self) -> None:
         name, sensor = type(self).__name__, self.sensor
-        validation.check_models(name, self.motion, sensor)
-        validation.check_parts(name, associate=self.associate)
-        hold_function(self, "associate", "prediction, scan")
         if isinstance(sensor, Suite) or sensor.reduced is not None:
             raise ValueError(
                 f"{name}: expected one sensor of landmarks, not a suite or landmarks that are "
@@ -124,9 +121,8 @@ class LogEstimator(Component):
                 f"{name}: expected landmarks that measurement and prior determine, got "
                 f"{sensor.landmark} of {sensor.name}"
             )
-        for field in ("pose", "pose_cov"):
-            set_field(self, field, held_array(getattr(self, field)))
-        check_map_options(name, self.capacity, self.gate, self.births)
+        for start in ("pose", "pose_cov"):
+            set_field(self, start, held_array(getattr(self, start)))
         self._check(LogEstimator, {"solve": "log, key"})
 
     def solve(self, log: Log, key: Array) -> Trace:

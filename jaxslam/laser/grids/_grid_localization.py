@@ -24,7 +24,6 @@ from jaxslam.filters._particles.pose_particles import (
     Region,
     active_mask,
     draw_start,
-    hold_box,
 )
 from jaxslam.filters._particles.pose_steps import MonteCarloFilter
 from jaxslam.filters._reporting import info_of, status_of, with_extra
@@ -208,7 +207,6 @@ class GridLocalization(MonteCarloFilter):
         check_motion(name, self.motion)
         validation.check_count(f"{name}: stride", self.stride)
         check_positive(name, exponent=self.exponent)
-        hold_box(self)
         box = None if self.box is None else np.asarray(self.box)
         set_field(self, "region", _free_space(name, self.grid, box))
         set_field(self, "prepared", self.model.prepare(self.grid))
