@@ -108,9 +108,7 @@ class DelayedFilter(Filter):
     capacity: int = static(check=at_least(1))
     """landmarks N"""
     _: dataclasses.KW_ONLY
-    triangulation: Triangulation = field(  # type: ignore[assignment]
-        default=None, check=or_none(instance_of(Triangulation))
-    )
+    triangulation: Triangulation = field(default=None, check=or_none(instance_of(Triangulation)))
     """the intersection of stored measurements; default that of rays or of circles, by what the
     sensor measures"""
     stored: StoredMeasurements = field(
