@@ -251,7 +251,6 @@ def segments(
             continue
         n = np.array([np.cos(line[1]), np.sin(line[1])])
         ends = _ends_of(angle[run[[0, -1]]], distance[run[[0, -1]]])
-        # Projected onto the line.
         ends = ends - (ends @ n - line[0])[:, None] * n
         rows.append((line, cov, ends, len(run), chi2))
         counted += len(run)

@@ -197,7 +197,7 @@ def slots_where(
 def delete_slots(layout: TableLayout, state: DelayedState, dead: Bool[Array, "S"]) -> DelayedState:
     """The state with these slots marginalized out, and removed from the parents of hypotheses."""
     parents = state.parents
-    # No parent is -1; as an index it is 0, and what is read there is masked.
+    # -1, for no parent, becomes index 0; what is read there is masked.
     orphaned = (parents >= 0) & dead[jnp.maximum(parents, 0)]
     persistence = jnp.where(dead[layout.of_hypotheses], 0.0, state.persistence)
     return state._replace(

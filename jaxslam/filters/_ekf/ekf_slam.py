@@ -261,7 +261,7 @@ def update_by_sensor(
     association, matched = associate_scan(
         filter.associate, sensor, scan, lambda: prediction_of(filter, sensor, joint)
     )
-    # No slot is -1; as an index it is 0, and what is read there is masked by `matched`.
+    # -1, for no slot, becomes index 0; what is read there is masked by `matched`.
     slot = jnp.maximum(association.slot, 0)
     by_scan = filter.correction == "joint" and len(scan.tag) > 0
     correct_by = correct if by_scan else correct_in_turn

@@ -59,7 +59,7 @@ def motion_update(
     after, by_pose, noise = first_order.motion_at(motion, pose, u, pose)
     root = linalg.root_psd(noise)
     back = linalg.inverse(by_pose)
-    # F concerns the robot alone: its rows and columns change, O(D) and not O(D³).
+    # F concerns the robot alone: only its rows and columns change.
     phi = omega.at[:3].set(back.T @ omega[:3])
     phi = phi.at[:, :3].set(phi[:, :3] @ back)
     residual = residual.at[:3].set(back.T @ residual[:3])

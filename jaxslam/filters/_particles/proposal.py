@@ -35,7 +35,7 @@ def sample_motion(
     normals = jax.random.normal(key, (pose.shape[0], len(motion.noises)), pose.dtype)
 
     def move(pose: Float[Array, "3"], normal: Float[Array, "W"]) -> Float[Array, "3"]:
-        # Q may be singular, as of a motion without sideways noise.
+        # Q may be singular: a noise may have the variance zero.
         return motion.step(pose, u, linalg.root_psd(motion.noise_cov(pose, u)) @ normal)
 
     return jax.vmap(move)(pose, normals)
