@@ -91,6 +91,7 @@ def _problem(
     slot = order[:, : min(candidates, n)].astype(jnp.int32)
     at = jnp.arange(m)[:, None], slot
     some = compatible.any(axis=1)
+    # Sums from the end: how many pairs a branch at level i can still make at most.
     left = jnp.append(jnp.cumsum(some[::-1])[::-1], 0)
     return _Problem(
         slot=slot,
@@ -164,6 +165,7 @@ def _search(problem: _Problem, budget: int) -> _Search:
         chosen = at.chosen.at[i].set(slot)
         start_row = i * size_z  # of measurement i in L⁻¹ and L⁻¹ ν; zeros without a pair
         keep = (deeper & (option < k)).astype(dtype)
+        # 0 * start_row: both indices must be of one dtype.
         inverse = jax.lax.dynamic_update_slice(at.inverse, keep * rows, (start_row, 0 * start_row))
         whitened = jax.lax.dynamic_update_slice(at.whitened, keep * white, (start_row,))
         following = jnp.minimum(i + 1, m - 1)

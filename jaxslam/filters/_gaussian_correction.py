@@ -40,8 +40,10 @@ def correct_gaussian(
     xi = linalg.matmul(terms.whitened[None], v)[0]
     if not joseph:
         return GaussianCorrection(xi, cov - linalg.gram(v, v), terms)
+    # K = P Hᵀ S⁻¹ = Vᵀ L⁻¹, so Lᵀ Kᵀ = V: backward substitution, by the flipped system.
     gain = linalg.solve_lower(terms.factor[::-1, ::-1].T, v[::-1])[::-1].T
     left = cov - gain @ hp
+    # (I - KH) P Hᵀ, with H P Hᵀ = S - R.
     left_h = hp.T - gain @ (s - noise)
     cov = linalg.symmetrize(left - left_h @ gain.T + gain @ noise @ gain.T)
     return GaussianCorrection(xi, cov, terms)

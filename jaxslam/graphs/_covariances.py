@@ -143,6 +143,7 @@ def _invert(model: Model, plan: Plan, graph: Graph) -> Marginals:
         axis=1,
     )
     regular = factored.regular
+    # The first False of each graph, in the order of the columns.
     culprit = plan.order[jnp.argmin(regular, axis=0)].astype(jnp.int32)
     return Marginals(
         poses=diagonal[:poses, :3, :3],

@@ -54,6 +54,7 @@ def _pose_rows(z: Array) -> Rows:
     """
     o, i = jnp.zeros_like(z[:, 0]), jnp.ones_like(z[:, 0])
     x, y, c, s = z[:, 0], z[:, 1], jnp.cos(z[:, 2]), jnp.sin(z[:, 2])
+    # The product t u is [x, -y; y, x] times u as a vector, exp(iφ) u is [c, -s; s, c] times it.
     by_first = [[-i, o, -x, y], [o, -i, -y, -x], [o, o, -c, s], [o, o, -s, -c]]
     by_second = [[i, o, o, o], [o, i, o, o], [o, o, i, o], [o, o, o, i]]
     return [by_first, by_second]

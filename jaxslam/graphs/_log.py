@@ -258,6 +258,7 @@ def _has_full_rank(by_noise: Float[Array, "T 3 3"]) -> Bool[Array, "T"]:
     length = jnp.linalg.norm(by_noise, axis=1, keepdims=True)
     a, b, c = jnp.moveaxis(by_noise / jnp.where(length > 0, length, 1.0), 2, 0)
     least = max(_STILL, 10 * float(jnp.finfo(by_noise.dtype).eps))
+    # The volume that the columns span, at unit length.
     return jnp.abs((a * jnp.cross(b, c)).sum(axis=1)) > least
 
 
@@ -287,6 +288,7 @@ def _place_points(
     seen = first < total
     row = jnp.where(seen, first, 0)
     flat = z.reshape(total, -1)
+    # Number t·M + m is measurement m of scan t.
     places = jax.vmap(lambda x, z: sensor.invert(x, z, mean))(path[row // slots], flat[row])
     return jnp.where(seen[:, None], places, 0.0), seen
 

@@ -279,6 +279,7 @@ def _prove(model: Model, plan: Plan, graph: Graph) -> Certificate:
     variables, data = variables_of(solution.graph), data_of(surrogate, plan.column)
     blocks, multipliers, unit_lambda = dual(chordal, plan, variables, data)
     shift, proved = _proved_shift(plan, blocks, unit_lambda, solution.chi2, poses)
+    # No poses cost less than Σλ - N η, since |u|² = 1 for each of the N.
     gap = solution.chi2 - multipliers.sum(axis=0) + poses * shift
     away = solution.graph.poses - graph.poses
     turned = jnp.arctan2(jnp.sin(away[:, 2]), jnp.cos(away[:, 2]))

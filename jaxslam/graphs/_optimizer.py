@@ -114,6 +114,7 @@ def attach_derivatives(model: Model, plan: Plan, graph: Graph, solution: Solutio
         step = _solve(plan, blocks[..., 0], gradient[..., 0])
         return retract(at, -step[..., None], plan)
 
+    # Only the derivative of this step is used: the optimum itself is that of the solution.
     end = newton(variables)
     if model.holds:
         end = jax.lax.fori_loop(1, _HELD_STEPS, lambda _, at: newton(at), end)

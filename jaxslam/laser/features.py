@@ -65,6 +65,7 @@ def fit_line(
         raise ValueError(f"fit_line: expected beams that end at different points, got {len(angle)}")
     e = np.stack([np.cos(angle), np.sin(angle)], axis=1)
     middle = points.mean(axis=0)
+    # Start at total least squares: the normal is the direction of least spread, into the wall.
     n = np.linalg.svd(points - middle, full_matrices=len(points) < 2)[2][1]
     n = n * (1.0 if (e @ n).sum() >= 0 else -1.0)
     line = np.array([n @ middle, np.arctan2(n[1], n[0])])
@@ -78,6 +79,7 @@ def fit_line(
             raise ValueError("fit_line: expected beams whose ends are not in line with the laser")
         weight = 1 / ((toward * sigma) ** 2 + (met * across * sigma_angle) ** 2)
         off = toward * distance - line[0]
+        # ∂(d n·e - r)/∂(r, α) at the range d at which the beam meets the line.
         slope = np.stack([-np.ones_like(met), met * across], axis=1)
         information = (weight[:, None] * slope).T @ slope
         line = line - np.linalg.solve(information, slope.T @ (weight * off))
@@ -103,6 +105,7 @@ def _misfit_of_parabola(
     (x, y), (along, toward) = ((rows @ axes.T).T for rows in (points, e))
     x = x - x.mean()
     scale = np.abs(x).max()
+    # |x/scale| <= 1, so that the columns are of one size.
     powers = np.stack([np.ones_like(x), x / scale, (x / scale) ** 2], axis=1)
     slope, off = np.zeros_like(x), y
     for _ in range(_ITERATIONS):
@@ -240,6 +243,7 @@ def segments(
     rows, counted = [], 0
     for k, piece in enumerate(pieces):
         run = piece[trim : len(piece) - trim]
+        # arcs[-1] is the last piece, whose successor is the first.
         if len(run) < least or arcs[k] or arcs[k - 1]:
             continue
         line, cov, chi2 = line_of(run)

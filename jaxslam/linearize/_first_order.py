@@ -64,6 +64,7 @@ def motion_at(
     """The motion f(pose, u, 0), with ∂f/∂pose (3, 3) and W Q Wᵀ (3, 3) taken at another pose."""
     by_pose, by_noise = motion_jacobians(motion, at, u)
     moved = motion.step(pose, u, jnp.zeros(by_noise.shape[1], pose.dtype))
+    # Q is taken at the estimate, also where F and W are taken at another pose.
     noise = motion.noise_cov(pose, u)
     return moved, by_pose, matmul(matmul(by_noise, noise), by_noise.T)
 
@@ -87,12 +88,14 @@ def invert_at(
     """
     mean, cov_s = (jnp.asarray(part, z.dtype) for part in sensor.free)
     by_pose, by_z, by_s = invert_jacobians(sensor, at_pose, at_z, mean)
+    # R at z, as there is no prediction of a new landmark.
     cov = by_z @ sensor.noise_cov(z) @ by_z.T + by_s @ cov_s @ by_s.T
     return sensor.invert(pose, z, mean), by_pose, cov
 
 
 def with_lever_arm(by_pose: Float[Array, "L 3"], offset: Float[Array, "2"]) -> Float[Array, "L 3"]:
     """The derivative of a point by the pose (·, 3), with an offset (2,) added to the lever arm."""
+    # ∂(R a)/∂θ = J R a, J = [0, -1; 1, 0]: linear in the arm.
     return by_pose.at[:2, 2].add(jnp.stack([-offset[1], offset[0]]))
 
 

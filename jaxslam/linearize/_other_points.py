@@ -41,6 +41,7 @@ class AtTruth(Linearizer):
         old, new = self._pose(point.joint.lin, point), self._pose(point.joint.lin + 1, point)
         moved, by_pose, noise = first_order.motion_at(motion, point.pose, u, old)
         ahead = motion.step(old, u, jnp.zeros(len(motion.noises), old.dtype))
+        # From the displacement of the control alone to the true one, noise included.
         return moved, with_lever_arm(by_pose, new[:2] - ahead[:2]), noise, point.joint.lin + 1
 
     def observe(
@@ -58,6 +59,7 @@ class AtTruth(Linearizer):
 
     def _pose(self, step: Array, point: LinearizationPoint) -> Array:
         """The true pose (3,) after a number of steps, in the dtype of the run."""
+        # Row t of the truth is the pose after motion t + 1; before the first it is the start.
         after = jnp.asarray(self.truth.pose)[jnp.maximum(step - 1, 0)]
         pose = jnp.where(step > 0, after, jnp.asarray(self.truth.start))
         return pose.astype(point.pose.dtype)
@@ -105,6 +107,7 @@ class FirstEstimate(Linearizer):
     ) -> tuple[Array, Array, Array, First]:
         first = point.joint.lin
         moved, by_pose, noise = first_order.motion_at(motion, point.pose, u, point.pose)
+        # From J(p̂_{k+1} - p̂_k⁺) to J(p̂_{k+1} - p̂_k).
         by_pose = with_lever_arm(by_pose, point.pose[:2] - first.pose[:2])
         return moved, by_pose, noise, first._replace(pose=moved)
 
@@ -169,7 +172,9 @@ class Observability(Linearizer):
         shift = arms.sum(axis=0) / (1 + joint.alive.sum(dtype=arms.dtype))
         # Of numbers whose squares overflow, the EKF's point.
         shift = jnp.where(jnp.abs(shift) <= largest(shift), shift, 0.0)
+        # α_{k+1} = α_k + p̂_{k+1} - p*, and p* = p̂_k⁺ + shift.
         robot = old.robot + moved[:2] - joint.pose[:2] - shift
+        # From J(p̂_{k+1} - p̂_k⁺) to J(p̂_{k+1} - p*).
         return moved, with_lever_arm(by_pose, -shift), noise, old._replace(pose=moved, robot=robot)
 
     def observe(

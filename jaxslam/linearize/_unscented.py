@@ -62,6 +62,7 @@ class Unscented(Linearizer):
             start = chart.retract_pose(pose, xi[:3])
             return chart.local_pose(moved, motion.step(start, u, xi[3:]))
 
+        # The noise of the motion is independent of the error of the pose.
         fit = self._fit(f, jax.scipy.linalg.block_diag(root, root_noise))
         by_pose = by_variables(fit.slope[:, :3], root)
         noise = linalg.matmul(fit.slope[:, 3:], fit.slope[:, 3:].T) + fit.rest
@@ -98,6 +99,7 @@ class Unscented(Linearizer):
             basis = chart.basis(pose, landmark)
             if basis.landmark is not None:
                 by_landmark = by_landmark @ linalg.inverse(basis.landmark)
+            # From errors to coordinates: dx = E_x⁻¹ δx and dl = E_l⁻¹ (δl - c dx).
             by_pose = (by_pose - by_landmark @ basis.cross) @ linalg.inverse(basis.pose)
         return centre + fit.mean, by_pose, by_landmark, fit.rest
 
@@ -112,6 +114,7 @@ class Unscented(Linearizer):
         noise_roots = [linalg.root_psd(sensor.noise_cov(z)), linalg.root_psd(cov_s)]
 
         def g(xi: Array) -> Array:
+            # Only the pose is perturbed; there is no landmark yet.
             start, _ = chart.retract(pose, zero, xi[:3], zero)
             landmark = sensor.invert(start, z + xi[3 : 3 + size_z], mean + xi[3 + size_z :])
             return chart.local(pose, centre, start, landmark)[1]
@@ -123,6 +126,7 @@ class Unscented(Linearizer):
             basis = chart.basis(pose, centre)
             if basis.landmark is not None:
                 by_pose, cov = basis.landmark @ by_pose, basis.landmark @ cov @ basis.landmark.T
+            # δl = c dx + E_l dl of the fitted dl, and dx = E_x⁻¹ δx.
             by_pose = (basis.cross + by_pose) @ linalg.inverse(basis.pose)
         return centre, by_pose, cov
 

@@ -37,6 +37,7 @@ def assign(cost: Array) -> Array:
         raise ValueError(f"assign: expected at least as many columns as rows, got {cost.shape}")
     if m == 0:
         return jnp.zeros(0, jnp.int32)
+    # Columns are integers, which have no derivative by the cost.
     cost = jax.lax.stop_gradient(cost)
     unassigned, dual = jnp.full(n, -1, jnp.int32), jnp.zeros(n, cost.dtype)
 

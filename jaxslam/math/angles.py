@@ -58,6 +58,7 @@ def sin_cos(x: jax.Array) -> tuple[jax.Array, jax.Array]:
     square = rest * rest
     sine = rest + rest * (square * horner(square, _SINE))
     cosine = 1 + square * horner(square, _COSINE)
+    # (sin, cos) after 0 to 3 quarter turns: (s, c), (c, -s), (-s, -c), (-c, s).
     quarter = turns - 4 * jnp.floor(turns / 4)
     odd = (quarter == 1) | (quarter == 3)
     s, c = jnp.where(odd, cosine, sine), jnp.where(odd, sine, cosine)

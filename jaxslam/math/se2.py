@@ -272,6 +272,7 @@ def _(primals: tuple[Scalar], tangents: tuple[Scalar]) -> tuple[Scalar, Scalar]:
 def _half_cot_slope(x: Scalar) -> Scalar:
     u = (x / (2 * np.pi)) ** 2
     series = horner(u, [(n + 1) * term for n, term in enumerate(_ZETA_LESS_1)])
+    # du/dx = x/(2π²); d/du of (1 - 3u)/(1 - u) is -2/(1 - u)², of the sum uⁿ⁻¹ with a factor n.
     return -x / np.pi**2 * (1 / (1 - u) ** 2 + series)
 
 

@@ -60,10 +60,13 @@ def _traced_quantile(p: Float[Array, "*B"], dof: int) -> Float[Array, "*B"]:
     """The quantile of a JAX array, by inverse functions where there are any."""
     valid = (p > 0) & (p <= 1)
     below_one = 1 - float(jnp.finfo(p.dtype).epsneg)
+    # ½ in place of an invalid p, for finite derivatives; its quantile is not used.
     p = jnp.where(valid, jnp.minimum(p, below_one), 0.5)
     if dof == 1:
+        # The square of a normal: half of 1 - p on either side.
         x = ndtri((1 - p) / 2) ** 2
     elif dof == 2:
+        # P(χ²₂ <= x) = 1 - exp(-x/2).
         x = -2 * jnp.log1p(-p)
     else:
         x = 2 * _half_quantile(p, dof)

@@ -63,9 +63,11 @@ def merge(a: Frame, b: Frame) -> tuple[Frame, Array]:
     Where the sum is singular, a is returned.
     """
     solved, regular = linalg.solve_psd(a.cov + b.cov, a.cov)
+    # ((P_a + P_b)⁻¹ P_a)ᵀ = P_a (P_a + P_b)⁻¹, both symmetric.
     gain = jnp.where(regular, solved.T, 0.0)
     pose = a.pose + gain @ _difference(b, a)
     pose = jnp.concatenate([pose[:2], wrap(pose[2:])])
+    # Joseph's form: a sum of two positive semi-definite terms.
     left = jnp.eye(3, dtype=gain.dtype) - gain
     cov = left @ a.cov @ left.T + gain @ b.cov @ gain.T
     return Frame(pose, linalg.symmetrize(cov)), regular

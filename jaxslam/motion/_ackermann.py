@@ -74,6 +74,7 @@ class Ackermann(Motion):
             [-b, a, jnp.ones_like(a)]
         )
         by_alpha = v * slope * (1 + tan**2) / jnp.asarray(self.wheelbase, u.dtype)
+        # The twist is Δt v times the direction: columns by v_e, α and Δt.
         by_rates = jnp.stack([dt * gain * direction, dt * by_alpha, v * direction], axis=1)
         by_control = by_move @ by_twist @ by_rates
         return by_pose, by_control, by_control[:, :2]

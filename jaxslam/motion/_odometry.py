@@ -46,6 +46,7 @@ class Odometry(Motion):
     def jacobians(self, pose: Pose, u: Control, w: ProcessNoise) -> StepJacobians:
         h, d = pose[2] + u[0] + w[0], u[1] + w[1]
         c, s = jnp.cos(h), jnp.sin(h)
+        # ∂(x, y, θ)/∂h, with (x, y) moved by d (cos h, sin h).
         turned = jnp.stack([-d * s, d * c, jnp.ones_like(d)])  # by θ and by rot1 alike
         by_pose = jnp.eye(3, dtype=pose.dtype).at[:, 2].set(turned)
         by_noise = jnp.zeros((3, 3), pose.dtype).at[:, 0].set(turned)

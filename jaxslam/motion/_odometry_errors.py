@@ -70,6 +70,7 @@ class Corrected(Motion):
         return self.motion.noises
 
     def step(self, pose: Pose, u: Control, w: ProcessNoise) -> Pose:
+        # Into the direction in which the robot drives, and back to its axes.
         moved = self.motion.step(self._turned(pose, 1.0), self.control(u), w)
         return self._turned(moved, -1.0)
 

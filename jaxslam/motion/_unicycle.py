@@ -41,6 +41,7 @@ class Unicycle(Motion):
         by_pose = by_pose.at[0, 2].set(-v * dt * s).at[1, 2].set(v * dt * c)
         by_noise = jnp.zeros((3, 2), pose.dtype)
         by_noise = by_noise.at[0, 0].set(dt * c).at[1, 0].set(dt * s).at[2, 1].set(dt)
+        # Noise is added to v and ω, so ∂/∂u is ∂/∂w with a column for Δt.
         by_dt = jnp.stack([v * c, v * s, omega])
         return by_pose, jnp.concatenate([by_noise, by_dt[:, None]], axis=1), by_noise
 
@@ -66,5 +67,6 @@ class WhiteNoise:
             jnp.asarray(value, u.dtype) for value in (self.travel, self.turn, self.turn_share)
         )
         moving = u[2] > 0  # else 1/Δt, and its gradient, would be infinite
+        # Of velocities, hence over Δt: the displacement is Δt times them, its variance grows as Δt.
         density = jnp.diag(jnp.stack([travel**2, turn**2 + (share * u[1]) ** 2]))
         return density * jnp.where(moving, 1 / jnp.where(moving, u[2], 1.0), 0.0)

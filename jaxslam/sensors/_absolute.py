@@ -28,6 +28,7 @@ class Absolute(Sensor):
 
     def observe_jacobians(self, pose: Pose, landmark: Landmark) -> ObserveJacobians:
         by_pose = self.frame_jacobian(pose)[self.rows]
+        # (Z, 0): there is no landmark to differentiate by.
         return by_pose, by_pose[:, :0]
 
     def invert(self, pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:

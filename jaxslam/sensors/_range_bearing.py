@@ -43,6 +43,7 @@ class RangeBearing(Sensor):
     def observe_jacobians(self, pose: Pose, landmark: Landmark) -> ObserveJacobians:
         frame = self.frame(pose)
         by_frame, by_point = se2.to_frame_jacobians(frame, landmark)
+        # The chain of polar ∘ to_frame ∘ (pose ∘ mount).
         (outer,) = se2.polar_jacobians(se2.to_frame(frame, landmark))
         return outer @ by_frame @ self.frame_jacobian(pose), outer @ by_point
 
@@ -79,5 +80,6 @@ class RangeBearingNoise:
             for value in (self.range, self.bearing, self.share, self.across)
         )
         square = z[0] ** 2 + across**2
+        # Without `across`, at the sensor, 0/0.
         apart = jnp.where(square > 0, across**2 / jnp.where(square > 0, square, 1.0), 0.0)
         return jnp.diag(jnp.stack([range**2 + (share * z[0]) ** 2, bearing**2 + apart]))

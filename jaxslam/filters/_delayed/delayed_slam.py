@@ -101,6 +101,7 @@ class DelayedSlam(DelayedFilter):
 
     def estimate(self, state: DelayedState) -> Estimate:
         joint, capacity, size = state.joint, self.capacity, 3 + SIZE * self.capacity
+        # Landmarks are the first slots of the table, so their P is its leading block.
         landmarks = joint._replace(
             landmarks=joint.landmarks[:capacity],
             cov=joint.cov[:size, :size],

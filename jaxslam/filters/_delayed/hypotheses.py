@@ -56,6 +56,7 @@ def point_residuals(
     blocks = covariance_blocks(joint)
     rows = blocks[points][:, :2]  # (p, 2, S, 3)
     p_xx, p_xs = rows[jnp.arange(points.shape[0]), :, points, :2], rows[:, :, stored]
+    # (q, 3, 3), the diagonal blocks.
     p_ss = blocks[stored, :, stored]
     variance = jnp.einsum("pqi,pij,pqj->pq", by_point, p_xx, by_point)
     variance = variance + jnp.einsum("pqi,qij,pqj->pq", by_stored, p_ss, by_stored)
@@ -73,10 +74,12 @@ class UncertainPoints(NamedTuple):
 def relative_to_robot(joint: Joint, layout: TableLayout) -> UncertainPoints:
     """The positions of the hypotheses (C,) relative to the robot's position."""
     first, count = layout.landmarks, layout.hypotheses
+    # (C, 2, S, 3) -> (C, 2, 2): of each hypothesis the (x, y) of its diagonal block.
     blocks = covariance_blocks(joint)[first : first + count][:, :2]
     blocks = blocks[jnp.arange(count), :, first + jnp.arange(count), :2]
     cross = joint.cov[:2, 3:].reshape(2, layout.slots, SIZE)[:, first : first + count, :2]
     cross = cross.transpose(1, 0, 2)
+    # cov(x - t) = P_xx + P_tt - P_tx - P_xt: what robot and hypothesis share cancels.
     cov = blocks + joint.cov[None, :2, :2] - cross - cross.transpose(0, 2, 1)
     return UncertainPoints(joint.landmarks[layout.of_hypotheses, :2] - joint.pose[None, :2], cov)
 
@@ -87,6 +90,7 @@ def relative_spread(points: UncertainPoints) -> Float[Array, "*n"]:
     middle = 0.5 * (cov[..., 0, 0] + cov[..., 1, 1])
     half = 0.5 * (cov[..., 0, 0] - cov[..., 1, 1])
     square = half**2 + cov[..., 0, 1] * cov[..., 1, 0]
+    # The larger eigenvalue of a symmetric 2×2 matrix, in closed form.
     largest = middle + safe_root(square)
     length = (mean**2).sum(axis=-1)
     return safe_root(largest) / jnp.sqrt(jnp.where(length > 0, length, 1.0))

@@ -170,6 +170,7 @@ def empty_state(
 def covariance_blocks(joint: Joint) -> Float[Array, "S 3 S 3"]:
     """The covariance of the table by slots, without the robot."""
     capacity = joint.alive.shape[0]
+    # Slot and parameter of the row, slot and parameter of the column.
     return joint.cov[3:, 3:].reshape(capacity, SIZE, capacity, SIZE)
 
 
@@ -196,6 +197,7 @@ def slots_where(
 def delete_slots(layout: TableLayout, state: DelayedState, dead: Bool[Array, "S"]) -> DelayedState:
     """The state with these slots marginalized out, and removed from the parents of hypotheses."""
     parents = state.parents
+    # -1, for no parent, becomes index 0; what is read there is masked.
     orphaned = (parents >= 0) & dead[jnp.maximum(parents, 0)]
     persistence = jnp.where(dead[layout.of_hypotheses], 0.0, state.persistence)
     return state._replace(

@@ -88,6 +88,7 @@ class Rays(Triangulation):
         sine = _cross(toward_a, toward_b)
         crossing = jnp.abs(sine) >= jnp.sin(self.parallax)
         safe = jnp.where(crossing, sine, 1.0)
+        # 1 in place of a small sine: lengths and their derivatives stay finite where none cross.
         along_a, along_b = _cross(delta, toward_b) / safe, _cross(delta, toward_a) / safe
         point = a[:2] + along_a * toward_a
         return point[None], (crossing & (along_a > 0) & (along_b > 0))[None]
@@ -142,6 +143,7 @@ class Circles(Triangulation):
         return s[2] - se2.polar(point - s[:2])[0]
 
     def mirror_solutions(self, a: Stored, b: Stored, point: Point) -> Float[Array, "B 2"]:
+        # The two intersections are mirrored about the line of the centres.
         axis = b[:2] - a[:2]
         square = (axis**2).sum()
         offset = point - a[:2]

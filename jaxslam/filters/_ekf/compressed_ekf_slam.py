@@ -112,6 +112,7 @@ class CompressedEkfSlam(Wrapper):
             )
         state = _with_area_of(scan, state, self.filter.sensor, self.filter.births)
         inside, info = self._local.update(state.area, scan, key)
+        # Slots of the area into slots of the map.
         in_map = jnp.where(info.slot >= 0, state.slot[jnp.maximum(info.slot, 0)], -1)
         return _with_updated_area(state, inside), info._replace(slot=in_map)
 
@@ -124,6 +125,7 @@ class CompressedEkfSlam(Wrapper):
             with_robot: jax.Array,
         ) -> Estimate:
             cov = jnp.block([[robot, with_robot], [with_robot.T, landmark_cov]])
+            # A map of this one landmark: an estimate needs no covariance of two landmarks.
             place = state.area.pose, landmark[None], cov, alive[None], tag[None]
             return self.filter.estimate(Joint(*place, ()))
 
@@ -144,6 +146,7 @@ class CompressedEkfSlam(Wrapper):
     def _local(self) -> EkfSlam:
         """The filter of the area, with slots for the postponed update."""
         area = min(self.area, self.filter.capacity)
+        # A capacity is a shape, so the filter of the area is another record with the same models.
         spare = _postponed_slots(area, len(self.filter.sensor.landmark))
         return dataclasses.replace(self.filter, capacity=area + spare)
 
@@ -159,6 +162,7 @@ def up_to_date(state: _Compressed) -> Joint:
     at = _rows(state.slot, joint.landmarks.shape[1])
     before = joint.cov[at]
     phi, psi, _ = _postponed_update(state)
+    # P_BB; the rows and columns of A that this touches too are overwritten below, P_AB by Φ P_AB,0.
     cov = joint.cov - linalg.symmetrize(before.T @ (psi @ before))
     now = (phi @ before).at[:, at].set(state.area.cov[: len(at), : len(at)])
     return joint._replace(
@@ -177,9 +181,11 @@ def _with_area_of(scan: Scan, state: _Compressed, sensor: Sensor, most: int | No
     tagged = scan.valid & (scan.tag >= 0)
     slot, in_map = slots.find(joint.tag, joint.alive, scan.tag)
     seen = jnp.zeros(joint.alive.shape, bool).at[slot].max(tagged & in_map)
+    # Counts repeated tags twice, and so may open an area too early, never too late.
     new = jnp.minimum((tagged & ~in_map).sum(), scan.tag.shape[0] if most is None else most)
     room, room_anywhere = (~state.area.alive).sum(), (~joint.alive).sum()
     outside = seen & ~jnp.zeros(joint.alive.shape, bool).at[state.slot].set(True)
+    # Another area helps new landmarks only if the map has more room than this one.
     leave = outside.any() | ((new > room) & (room_anywhere > room))
 
     def reopen(state: _Compressed) -> _Compressed:
@@ -207,6 +213,7 @@ def _moved_map(state: _Compressed) -> jax.Array:
     """The current landmarks (N, L)."""
     landmarks, area = state.full.landmarks, state.slot.shape[0]
     theta = _postponed_update(state)[2]
+    # P_BA,0 θ for all landmarks, O(K·N); those of the area are set to its own.
     moved = (theta @ state.full.cov[_rows(state.slot, landmarks.shape[1])])[3:]
     return (
         (landmarks + moved.reshape(landmarks.shape)).at[state.slot].set(state.area.landmarks[:area])
@@ -228,6 +235,7 @@ def _marginals(state: _Compressed) -> tuple[jax.Array, jax.Array]:
 
     phi, psi, _ = _postponed_update(state)
     before, inside = state.full.cov[at], state.area.cov[: len(at), : len(at)]
+    # The diagonal blocks of P_BA,0 Ψ P_AB,0 alone, O(K²·N).
     lost = jnp.einsum("nal,nak->nlk", by_landmark(before), by_landmark(psi @ before))
     alone = with_itself(state.full.cov, capacity) - lost
     with_robot = by_landmark(phi[:3] @ before)
@@ -241,6 +249,7 @@ def _postponed_update(state: _Compressed) -> tuple[jax.Array, jax.Array, jax.Arr
     """The postponed update Φ, Ψ (W, W) and θ (W,), W = 3 + K·L."""
     area, count = state.area, state.slot.shape[0]
     width = 3 + count * area.landmarks.shape[1]
+    # The last of the spare slots may be used in part.
     theta = area.landmarks[count:].reshape(-1)[:width]
     return (
         area.cov[:width, width : 2 * width],
@@ -254,6 +263,7 @@ def _opened_at(joint: Joint, slot: jax.Array) -> _Compressed:
     count, size = slot.shape[0], joint.landmarks.shape[1]
     at, spare = _rows(slot, size), _postponed_slots(count, size)
     inside = joint.cov[at][:, at]
+    # Φ = 1, Ψ = 0, θ = 0; Φ of a dead slot is 0, since a landmark that starts there adds to zeros.
     living = jnp.concatenate([jnp.ones(3, bool), jnp.repeat(joint.alive[slot], size)])
     phi = jnp.diag(living.astype(inside.dtype))
     cov = jnp.zeros((len(at) + spare * size,) * 2, inside.dtype)
@@ -262,6 +272,7 @@ def _opened_at(joint: Joint, slot: jax.Array) -> _Compressed:
         pose=joint.pose,
         landmarks=jnp.concatenate([joint.landmarks[slot], jnp.zeros((spare, size), inside.dtype)]),
         cov=cov,
+        # Alive, so that no new landmark takes these slots; without a tag that a scan can have.
         alive=jnp.concatenate([joint.alive[slot], jnp.ones(spare, bool)]),
         tag=jnp.concatenate([joint.tag[slot], jnp.full(spare, _NONE, joint.tag.dtype)]),
         lin=joint.lin,
@@ -272,13 +283,17 @@ def _opened_at(joint: Joint, slot: jax.Array) -> _Compressed:
 def _chosen_area(
     joint: Joint, area: int, sensor: Sensor, seen: jax.Array, new: jax.Array
 ) -> jax.Array:
-    """The slots (own,) of a new area, ascending: those seen, free ones, the nearest to the pose."""
+    """The slots (K,) of a new area, ascending: those seen, free ones, the nearest to the pose."""
     points = jax.vmap(sensor.position)(joint.landmarks)
     distance = ((points - joint.pose[None, :2]) ** 2).sum(axis=1)
     # A quarter of the area is reserved for new landmarks, each of which would need a new area.
     spare = jnp.cumsum(~joint.alive) <= jnp.maximum(new, area // 4)
+    # Free slots in the order in which the whole map would fill them; more of them than the reserve
+    # only where the map has too few landmarks for the area.
     rank = jnp.select([seen, ~joint.alive & spare, joint.alive], [0, 1, 2], 3)
     distance = jnp.where(joint.alive, distance, 0.0)
+    # By rank, then distance (the last key is the first); ascending, as `slots.allocate` takes them,
+    # so that a new landmark gets the slot that it would get in the whole map.
     return jnp.sort(jnp.lexsort((distance, rank))[:area]).astype(jnp.int32)
 
 
@@ -289,5 +304,5 @@ def _rows(slot: jax.Array, size: int) -> jax.Array:
 
 
 def _postponed_slots(area: int, size: int) -> int:
-    """The number of landmark slots that hold 3 + own·size variables."""
+    """The number of landmark slots that hold 3 + K·size variables."""
     return -(-(3 + area * size) // size)

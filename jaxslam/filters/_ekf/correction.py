@@ -2,7 +2,7 @@
 
     ν = z ⊖ h(R, l)    S = H P Hᵀ + R(ẑ) = L Lᵀ    V = L⁻¹ H P    x ← x ⊞ Vᵀ L⁻¹ ν    P ← P - Vᵀ V
 
-With the gain K = P Hᵀ S⁻¹ = Vᵀ L⁻ᵀ this is x ← x ⊞ K ν and P ← P - K S Kᵀ, symmetric as it stands.
+With the gain K = P Hᵀ S⁻¹ = Vᵀ L⁻¹ this is x ← x ⊞ K ν and P ← P - K S Kᵀ, symmetric as it stands.
 `correct` does this for a whole scan, `correct_in_turn` for each measurement at the estimate that
 those before it left. Both use the sparsity of H, which involves the robot and one landmark
 (`whitening`).
@@ -175,9 +175,10 @@ def _innovate(
     further columns, of other errors.
     """
     m, size_z = z.shape
-    same = jnp.eye(m, dtype=z.dtype)[:, None, :, None]
+    same = jnp.eye(m, dtype=z.dtype)[:, None, :, None]  # (m, 1, m, 1): same * R is block diagonal
     xi: jax.Array | None = None
     for i in range(filter.iterations):
+        # (26), with H of (25) by the pose and one landmark.
         h_nu, z_hat, rest, jacobian = _linearize(
             filter, sensor, joint, slot, rows.local, z, memory, xi
         )
@@ -187,12 +188,17 @@ def _innovate(
         # (m·Z) D entries, each of which P - Vᵀ V needs D times.
         hp = hx = no_inline(project, h_nu, rows.robot, rows.landmark)
         if filter.covariance == "square_root":
+            # Of a root X only H X is at hand: H P = (H X) Xᵀ, O(D²) a row.
             hp = materialize((hx.reshape(m * size_z, -1) @ joint.cov.T).reshape(hx.shape))
+        # (27): H P Hᵀ + R for all pairs of measurements.
         s = projected_cov(hp, by_pose, by_landmark, slot, joint.landmarks.shape[0])
         s = s + same * noise[:, :, None]
+        # (m, Z, Z): index arrays on both sides of a slice put their axis first.
         s_ii = s[jnp.arange(m), :, jnp.arange(m)]
+        # Stored: each of the D columns of L⁻¹ H P needs it.
         inverse, definite = no_inline(jax.vmap(linalg.whitener), s_ii)
         if i == 0:
+            # Gated against the prior, so that a later pass cannot change which are fused.
             prior_nu, prior_s, prior_definite = nu, s_ii, definite
             distance = (whitened_by(inverse, nu[:, :, None]) ** 2).sum(axis=(1, 2))
             # A finite measurement whose d² overflows is outside any gate.
@@ -200,6 +206,7 @@ def _innovate(
             fuse = matched & inside & definite
         hp = hp.reshape(m * size_z, -1)
         factored = factor_of(s, inverse, definite, fuse)
+        # (28), (29): K ν = Vᵀ L⁻¹ ν; K itself is never formed.
         v, whitened = whiten(factored, fuse, hp, nu)
         xi = linalg.gram(v, whitened[:, None])[:, 0]
         if i == 0:
@@ -270,13 +277,16 @@ def _linearize(
         return filter.linearize.observe(at_slot(sensor, state, at), point)
 
     z_hat, by_pose, by_landmark, rest = jax.vmap(observe)(slot_in_state, landmark, local_cov)
+    # z ⊖ ẑ, with angles wrapped: the sensor's own difference.
     nu = jax.vmap(sensor.residual)(z, z_hat)
     jacobian = by_pose, by_landmark
+    # The monitor takes H by coordinates; P is of errors in the chart, so the gain needs H by these.
     if chart.basis is not None:
         by_pose, by_landmark = chart_jacobians(
             chart, joint.pose, prior, by_pose, by_landmark, moved
         )
     if moved is not None:
+        # Back to the prior: z - h(x_i) + H ξ_i.
         nu = nu + jnp.einsum("mzi,i->mz", by_pose, moved[0])
         nu = nu + jnp.einsum("mzi,mi->mz", by_landmark, moved[1])
     # One array, and so one kernel and not three.
@@ -295,6 +305,7 @@ def _corrected_cov(
     """
     v, factor, noise, fuse = innovation.v, innovation.factor, innovation.noise, innovation.fuse
     if form == "plain":
+        # (30), as K S Kᵀ = Vᵀ V: symmetric as it stands.
         return cov - linalg.self_gram(v)
     m, size_z = noise.shape[:2]
     rows = m * size_z
@@ -302,13 +313,16 @@ def _corrected_cov(
     if form == "joseph":
         # In O(D²): first the factor on the left, then that on the right.
         fused_noise = jnp.where(fuse[:, None, None, None], same * noise[:, :, None], 0.0)
+        # K = P Hᵀ S⁻¹ = Vᵀ L⁻¹, so Lᵀ Kᵀ = V: backward substitution, by the flipped system.
         gain = linalg.solve_lower(factor[::-1, ::-1].T, v[::-1])[::-1].T
         noise = fused_noise.reshape(rows, rows)
         left = cov - gain @ innovation.hp
+        # (I - KH) P Hᵀ, with H P Hᵀ = S - R. Where not fused, S is the identity, but K is zero.
         left_h = innovation.hp.T - gain @ (innovation.s.reshape(rows, rows) - noise)
         return linalg.symmetrize(left - left_h @ gain.T + gain @ noise @ gain.T)
     root = jax.vmap(lambda cov: linalg.cholesky(cov)[0])(noise)
     unit = jnp.eye(size_z, dtype=noise.dtype)
+    # (m, Z, m, Z); a unit pivot where not fused, so that L + N is regular. V is zero there.
     root = same * jnp.where(fuse[:, None, None], root, unit)[:, :, None]
     root = factor + root.reshape(rows, rows)
     hx = innovation.hx.reshape(rows, -1)
@@ -370,6 +384,7 @@ def correct_in_turn(
     cached = size <= CACHED
     group_size = max(1, min(_GROUP if cached else _GROUP_BEYOND, z.shape[0]))
     if cached:
+        # Padded once for the whole scan; columns of zeros stay zero.
         joint = joint._replace(cov=jnp.pad(joint.cov, ((0, 0), (0, -size % _LANES))))
     joint, corrections = in_groups(correct_group, joint, measurements, group_size, nothing)
     return joint._replace(cov=joint.cov[:, :size]), corrections
@@ -387,7 +402,7 @@ def in_groups(
     nothing: the `Correction` of measurements without a match.
     """
     m = len(measurements[0])
-    groups = -(-m // group_size)
+    groups = -(-m // group_size)  # ⌈m/g⌉
 
     def padded(values: jax.Array) -> jax.Array:
         """The values in groups, (⌈m/g⌉, g, …), with zeros (not matched) at the end."""
@@ -422,9 +437,12 @@ def _correct_group(
     """
     slot = group[1]
     size_l, size = joint.landmarks.shape[1], joint.cov.shape[0]
+    # Slot i owns rows 3 + i·L to 3 + (i+1)·L of P. Of a landmark that the group measures twice, the
+    # local map has two copies; a correction moves both by the same numbers.
     of_landmarks = 3 + slot[:, None] * size_l + jnp.arange(size_l, dtype=slot.dtype)[None, :]
     at = jnp.concatenate([jnp.arange(3), of_landmarks.reshape(-1)])
     rows = joint.cov[at]
+    # M, the product of the corrections so far, begins as the identity.
     local = joint._replace(
         landmarks=joint.landmarks[slot],
         cov=jnp.concatenate([rows[:, at], jnp.eye(len(at), dtype=rows.dtype)], axis=1),
@@ -440,6 +458,7 @@ def _correct_group(
         P of the local map and the matrix M beside it are corrected as one:
         [P M] ← [P M] - Vᵀ [V reach].
         """
+        # One measurement as m = 1; it is of landmark i of the local map, and of slot in the map.
         i, (z, slot, matched) = jax.tree.map(lambda leaf: leaf[None], measurement)
         width = local.cov.shape[0]
         memory = joint._replace(pose=local.pose), slot
@@ -448,17 +467,20 @@ def _correct_group(
         )
         v, reach = innovation.v[:, :width], innovation.v[:, width:]
         pose, landmarks = retracted(filter.chart, local, innovation.xi[:width])
+        # V has the columns of [P M], so M is corrected by the same product as P.
         cov = local.cov - linalg.gram(v, innovation.v)
         correction = jax.tree.map(lambda leaf: leaf[0], innovation.correction)
         local = local._replace(pose=pose, landmarks=landmarks, cov=cov)
         return local, (reach, innovation.whitened, correction)
 
     # A gradient stores the input of each step, and recomputes the rest.
+    # (prevent_cse is for use outside a scan, where XLA would merge that with the original.)
     local, (reach, whitened, corrections) = jax.lax.scan(
         jax.checkpoint(correct_local, prevent_cse=False),
         local,
         (jnp.arange(len(slot)), group),
     )
+    # (g·Z, D) entries, each of which P - Vᵀ V needs D times.
     v = no_inline(linalg.matmul, reach.reshape(-1, len(at)), rows)
     landmarks = _moved_map(joint, v[:, :size], whitened, filter.chart)
     cov = joint.cov - linalg.gram(v[:, :size], v)
@@ -478,6 +500,7 @@ def _moved_map(
         pose, landmarks = retracted(chart, joint, linalg.gram(v, whitened[:, None])[:, 0])
         return joint._replace(pose=pose, landmarks=landmarks), None
 
+    # (g, Z, D): a retraction that is not additive is done one measurement at a time.
     by_measurement = v.reshape(*whitened.shape, -1)
     return jax.lax.scan(move, joint, (by_measurement, whitened))[0].landmarks
 
@@ -487,6 +510,7 @@ def no_correction(joint: Joint, measurements: Measurements, chart: Chart) -> Cor
     z = measurements[0]
     (m, size), width = z.shape, 3 + joint.landmarks.shape[1]
     dtype = jnp.result_type(z, joint.pose, joint.cov)
+    # As promoted in the corrected branch: both branches of a `cond` must have one dtype.
     numbers, flags = jnp.zeros(m, dtype), jnp.zeros(m, bool)
     return Correction(
         z_hat=jnp.zeros((m, size), dtype),

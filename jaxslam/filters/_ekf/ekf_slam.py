@@ -179,21 +179,26 @@ def propagate(filter: EkfSlam, joint: Joint, u: Float[Array, "U"]) -> tuple[Join
     """
     chart = filter.chart
     point = LinearizationPoint(joint, chart, joint.pose, slots.robot_cov(joint, filter.square_root))
+    # (14) is the mean; f = F and noise = W Q Wᵀ are the Jacobian and the noise of (15).
     pose, f, noise, lin = filter.linearize.motion(filter.motion, u, point)
     if chart.basis is None:
         transition = Transition(f, None, None, jnp.eye(3, dtype=noise.dtype), None)
     else:
+        # Stored: each landmark's block of the transition needs it.
         pose = materialize(pose)
         transition = transition_in_chart(chart, f, joint, pose)
     if filter.square_root:
+        # Wide root [A X, G √N], (D, D + 3); reflections from the right make it (D, D) again.
         added = transition.lift(len(joint.cov)) @ linalg.cholesky(noise)[0]
         root = jnp.concatenate([transition.times(joint.cov), added], axis=1)
         cov = linalg.triangular_root(root)
     elif chart.basis is None:
+        # (15), (16): the three rows of the robot alone, O(N); P of the map stays as it is.
         robot_rows = linalg.matmul(f, joint.cov[:3])
         robot_cov = linalg.symmetrize(linalg.matmul(robot_rows[:, :3], f.T) + noise)
         # Stored separately from P, from which it is computed, so that P is written in place.
         rows = materialize(jnp.concatenate([robot_cov, robot_rows[:, 3:]], axis=1))
+        # (17): the columns are the same numbers, so P stays symmetric to the bit.
         cov = jnp.asarray(joint.cov).at[:3].set(rows).at[:, :3].set(rows.T)
     else:
         cov = moved_cov(joint.cov, transition, noise)
@@ -230,6 +235,7 @@ def _update(
         )
         info = with_extra(info, "points", map_coordinates.ToPoints(is_reduced))
         system = (*system, reduction)
+    # After the corrections: whether a landmark lives on depends on what this scan measured.
     if filter.life is not None:
         memory, dead = filter.life.after(joint, info, partial(filter.estimate, joint))
         joint = without_landmarks(filter, joint._replace(life=memory), dead)
@@ -255,16 +261,20 @@ def update_by_sensor(
     association, matched = associate_scan(
         filter.associate, sensor, scan, lambda: prediction_of(filter, sensor, joint)
     )
+    # -1, for no slot, becomes index 0; what is read there is masked by `matched`.
     slot = jnp.maximum(association.slot, 0)
     by_scan = filter.correction == "joint" and len(scan.tag) > 0
     correct_by = correct if by_scan else correct_in_turn
     joint, correction = correct_by(filter, sensor, joint, scan.z, slot, matched)
+    # Measurements outside the gate or with a singular S had no effect in the correction.
     fused = matched & correction.inside & correction.positive
     measured = slots.slot_mask(association.slot, fused, len(joint.alive))
+    # After the correction, so that a new landmark starts from the corrected pose, as in the guide.
     joint, new, evicted, by_pose = initialize(
         filter, sensor, joint, scan, association.is_new, measured, births, reserved
     )
     info = report_scan(scan, association, matched, correction, new)
+    # For the monitor; without it, `jit` drops these lines.
     noise = jax.vmap(partial(predicted_noise, sensor))(correction.z_hat, scan.z, fused)
     system = (
         LinearMeasurements(correction.jacobian, correction.basis, noise, slot, fused),
@@ -314,14 +324,17 @@ def initialize(
         return joint, nothing._replace(deferred=is_new), kept, no_slope
 
     def start(joint: Joint) -> _Initialized:
+        # Each measurement of `is_new` is repeated, deferred, granted, or finds the map full.
         repeated = is_new & slots.seen_before(scan.tag, is_new)
         wanted = is_new & ~repeated
         rank = jnp.cumsum(wanted)
+        # The rank counts from 1, and is constant over the measurements that are not wanted.
         deferred = none if births is None else wanted & (rank > births)
         wanted = wanted & ~deferred
         evicted = kept
         if filter.life is not None and filter.life.make_room is not None:
             needed = wanted.sum() - (~joint.alive).sum()
+            # Not above 0 while there are free slots enough: then nothing is evicted.
             evicted = filter.life.make_room(joint, needed, measured)
             joint = without_landmarks(filter, joint, evicted)
         occupied = joint.alive if reserved is None else joint.alive | reserved
@@ -333,6 +346,7 @@ def initialize(
             at, has_slot = last_true_column(is_kth)
             slot, granted = slots.allocate(occupied, has_slot)
             joint, by_pose = augment(filter, sensor, joint, scan.z[at], scan.tag[at], slot, granted)
+            # Back from the births (k) to the measurements (M).
             k = jnp.clip(rank - 1, 0, births - 1)
             slot, granted, by_pose = slot[k], wanted & granted[k], by_pose[k]
         return joint, NewLandmarks(slot, granted, deferred, repeated), evicted, by_pose
@@ -361,10 +375,12 @@ def augment(
     def invert(
         z: Float[Array, "Z"], tag: Int[Array, ""]
     ) -> tuple[Float[Array, "L"], Float[Array, "L 3"], Float[Array, "L L"]]:
+        # (32); G_R of (33); and what (44) adds to G_R P_RR G_Rᵀ, by the noises of z and s.
         landmark, by_pose, cov = filter.linearize.invert(sensor, z, tag, point)
         return landmark, *landmark_errors_in_chart(chart, joint.pose, landmark, by_pose, cov)
 
     landmark, by_pose, landmark_covs = jax.vmap(invert)(z, tag)
+    # (35)-(38): P_LL and P_Lx into rows and columns of padding, whose size does not change.
     joint = slots.scatter(
         joint, slot, granted, landmark, by_pose, landmark_covs, tag, square_root=square_root
     )

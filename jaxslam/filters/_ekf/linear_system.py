@@ -38,6 +38,7 @@ class Transition(NamedTuple):
         robot = linalg.matmul(self.robot, matrix[:3])
         if self.cross is None:
             return matrix.at[:3].set(robot)
+        # a_i dx + B_i dl_i: the landmarks' rows need the robot's as they were.
         turned = self.turn(matrix)[3:]
         by_robot = linalg.matmul(self.cross.reshape(turned.shape[0], 3), matrix[:3])
         return jnp.concatenate([robot, by_robot + turned])
@@ -47,6 +48,7 @@ class Transition(NamedTuple):
         if self.landmark is None:
             return matrix
         capacity, size = self.landmark.shape[:2]
+        # (N, L, k): rows of P by landmark and entry.
         rows = matrix[3:].reshape(capacity, size, -1)
         turned = linalg.total(
             self.landmark[:, :, k, None] * rows[:, k, None, :] for k in range(size)
@@ -108,6 +110,8 @@ def transition_in_chart(
     errors of dead slots do not change.
     """
     assert chart.basis is not None
+    # With E = [E_x 0; c E_l] of a landmark, which does not move itself,
+    # dl' = E_l'⁻¹ (c dx + E_l dl - c' dx').
     over_map = jax.vmap(chart.basis, in_axes=(None, 0))
     before: Basis = over_map(joint.pose, joint.landmarks)
     after: Basis = over_map(pose, joint.landmarks)
@@ -142,6 +146,7 @@ def moved_cov(
     half = cov[:3] + 0.5 * linalg.matmul(cov[:3, :3], b.T)
     change = linalg.gram_both(*materialize((b.T, half)))
     if noise is not None:
+        # G N Gᵀ by the root of N, (D, 3): positive semi-definite and symmetric as it stands.
         added = linalg.matmul(moved.lift(cov.shape[0]), linalg.cholesky(noise)[0]).T
         change = change + linalg.self_gram(materialize(added))
     return cov + change
@@ -160,6 +165,8 @@ def chart_jacobians(
     if moved is None:
         basis = jax.vmap(chart.basis, in_axes=(None, 0))(pose, landmarks)
     else:
+        # The basis is the derivative at zero; at ξ_i that of the new pose and then of the new
+        # landmark, each by (dx, dl). The pose does not depend on dl.
         by_dx, by_dl = jax.vmap(
             jax.jacfwd(chart.retract, argnums=(2, 3)), in_axes=(None, 0, None, 0)
         )(pose, landmarks, *moved)
@@ -182,6 +189,7 @@ def landmark_errors_in_chart(
     if chart.basis is None:
         return by_pose, cov
     basis = chart.basis(pose, landmark)
+    # l = g(R, z), by errors: c dx + E_l dl = G E_x dx + noise, solved for dl.
     by_pose = by_pose @ basis.pose - basis.cross
     if basis.landmark is None:
         return by_pose, cov
@@ -200,5 +208,6 @@ def basis_of_each(
     landmark = basis.landmark
     if landmark is None:
         landmark = jnp.broadcast_to(jnp.eye(size, dtype=pose.dtype), (m, size, size))
+    # [E_x 0; c E_l] for each measurement.
     top = jnp.concatenate([basis.pose, jnp.zeros((m, 3, size), pose.dtype)], axis=2)
     return jnp.concatenate([top, jnp.concatenate([basis.cross, landmark], axis=2)], axis=1)

@@ -93,10 +93,12 @@ def reduce(joint: Joint, which: Bool[Array, "N"], sensor: Sensor, square_root: b
     size = joint.landmarks.shape[1]
     points = jax.vmap(sensor.position)(joint.landmarks)
     turned = reduction(joint, which, sensor).turn
+    # Unit variance in place of the coordinates that are dropped: the invariant of padding.
     padding = jnp.concatenate(
         [jnp.zeros(3, bool), (which[:, None] & (jnp.arange(size) >= 2)[None, :]).reshape(-1)]
     )
     unit = jnp.diag(padding.astype(points.dtype))
+    # U = diag(padding) = U Uᵀ, so [J X, U] is a root of J P Jᵀ + U.
     if square_root:
         cov = linalg.triangular_root(jnp.concatenate([turned(joint.cov), unit], axis=1))
     else:
@@ -116,6 +118,7 @@ def reduction(joint: Joint, which: Bool[Array, "N"], sensor: Sensor) -> Transiti
     capacity, size = joint.landmarks.shape
     by_landmark = jax.vmap(jax.jacfwd(sensor.position))(joint.landmarks)
     still = jnp.eye(3, dtype=by_landmark.dtype)
+    # Zero rows below J (2, L) make it square: the rows of the coordinates that are dropped.
     freed = jnp.pad(by_landmark, [(0, 0), (0, size - 2), (0, 0)])
     gain = jnp.where(which[:, None, None], freed, jnp.eye(size, dtype=still.dtype))
     return Transition(still, jnp.zeros((capacity, size, 3), still.dtype), gain, still, None)
@@ -145,6 +148,7 @@ def estimate_of(
             basis = chart.basis(joint.pose, landmark)
             if basis.landmark is not None:
                 cov, by_robot = basis.landmark @ cov @ basis.landmark.T, basis.landmark @ by_robot
+            # [c E_l] P [c E_l]ᵀ of pose and landmark: the mixed terms, then c P_RR cᵀ.
             cross = basis.cross @ by_robot.T
             cov = cov + cross + cross.T
             cov = cov + basis.cross @ pose_cov @ basis.cross.T
@@ -175,6 +179,7 @@ def cov_of_coordinates(
         return cov
     basis = jax.vmap(chart.basis, in_axes=(None, 0))(joint.pose, joint.landmarks)
     alive = joint.alive[:, None, None]
+    # Padding stays as it is, whatever the basis at a landmark of zeros.
     cross = jnp.where(alive, basis.cross, 0.0)
     landmark = basis.landmark
     if landmark is not None:
@@ -190,6 +195,7 @@ def with_cov_of_coordinates(
         basis = jax.vmap(chart.basis, in_axes=(None, 0))(joint.pose, joint.landmarks)
         alive = joint.alive[:, None, None]
         undo = linalg.inverse(basis.pose[0])
+        # E⁻¹ = [E_x⁻¹ 0; -E_l⁻¹ c E_x⁻¹, E_l⁻¹].
         cross, landmark = -basis.cross @ undo, None
         if basis.landmark is not None:
             landmark = jax.vmap(linalg.inverse)(basis.landmark)
@@ -208,4 +214,5 @@ def retracted(
     poses, landmarks = over_landmarks(
         joint.pose, joint.landmarks, xi[:3], xi[3:].reshape(joint.landmarks.shape)
     )
+    # dx alone moves a dead landmark too in some charts: the direction of a ray turns with the map.
     return poses[0], jnp.where(joint.alive[:, None], landmarks, 0.0)

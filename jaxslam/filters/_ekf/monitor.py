@@ -12,6 +12,7 @@ from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.filters._ekf.linear_system import LinearLandmarks, LinearMeasurements, LinearSystem
 from jaxslam.math import _linalg as linalg
 
+# Floor of a variance, for a measurement without noise: its root, 1e-15, is a float32 that divides.
 _TINY = 1e-30
 
 
@@ -67,10 +68,13 @@ class Monitored(Wrapper):
 
     def init(self, pose: Array, pose_cov: Array) -> MonitoredState:
         state, chart = self.filter.init(pose, pose_cov), self.chart
+        # The derivative of the pose by a rotation about the origin; that of a landmark follows from
+        # it, since the directions of a new landmark are linear in those of the robot.
         turn = jnp.stack([-pose[1], pose[0], jnp.ones_like(pose[0])])
         if chart.basis is not None:
             turn = linalg.inverse(chart.pose_basis(pose)) @ turn
         nothing = jnp.zeros((3, 3), pose.dtype)
+        # (D, 3): the identity for the robot; rows of landmarks are set when they are started.
         directions = jnp.eye(state.cov.shape[0], 3, dtype=pose.dtype)
         return MonitoredState(state, Monitor(directions, nothing, nothing[0], turn))
 
@@ -101,17 +105,20 @@ def after(monitor: Monitor, system: LinearSystem) -> Monitor:
 def _with_information(monitor: Monitor, seen: LinearMeasurements) -> Monitor:
     """The monitor with the information of these measurements added."""
     rows = _rows(seen.slot, seen.jacobian.shape[2] - 3)
+    # (m, 3 + L, 3): what robot and landmark of each measurement change along each direction.
     robot = jnp.broadcast_to(monitor.directions[:3], (len(rows), 3, 3))
     local = jnp.concatenate([robot, monitor.directions[rows]], axis=1)
     if seen.basis is not None:
         local = _product(seen.basis, local)
     signed = _product(seen.jacobian, local)
+    # Absolute values of the same product: |H| |n| bounds what rounding can make of H n = 0.
     size = _product(jnp.abs(seen.jacobian), jnp.abs(local))
 
     def whiten(cov: Float[Array, "Z Z"], y: Float[Array, "Z k"]) -> Float[Array, "Z k"]:
         return linalg.solve_lower(linalg.cholesky(cov)[0], y)
 
     signed = jax.vmap(whiten)(seen.noise, signed)
+    # By each entry's σ alone: only a scale, which needs no correlations.
     variances = jnp.diagonal(seen.noise, axis1=1, axis2=2)
     size = size / jnp.sqrt(jnp.maximum(variances, _TINY))[:, :, None]
     signed, size = (jnp.where(seen.fused[:, None, None], part, 0.0) for part in (signed, size))
@@ -124,6 +131,7 @@ def _with_information(monitor: Monitor, seen: LinearMeasurements) -> Monitor:
 
 def _with_landmarks(directions: Float[Array, "D k"], new: LinearLandmarks) -> Float[Array, "D k"]:
     """The directions with rows of new landmarks."""
+    # A row beyond the last, which `mode="drop"` ignores, where no landmark was started.
     rows = jnp.where(new.granted[:, None], _rows(new.slot, new.by_pose.shape[1]), len(directions))
     return directions.at[rows].set(new.by_pose @ directions[:3], mode="drop")
 

@@ -47,6 +47,8 @@ def projected_cov(
     cov = linalg.total(hp[:, :, k, None, None] * by_pose[None, None, :, :, k] for k in range(3))
     if size_l == 0:
         return cov
+    # Columns of H P by landmark: measurement and entry, then slot and entry (m, Z, N, L); of these
+    # the landmark of each measurement, (m, Z, m, L).
     by_slot = hp[:, :, 3 : 3 + capacity * size_l].reshape(m, size_z, capacity, size_l)
     at_landmark = by_slot[:, :, slot]
     return cov + linalg.total(
@@ -80,10 +82,12 @@ def factor_of(
     inverse, definite: L_ii⁻¹ of each S_ii alone, and whether S_ii is positive definite.
     """
     m, size_z = s.shape[:2]
-    same = jnp.eye(m, dtype=s.dtype)[:, None, :, None]
+    same = jnp.eye(m, dtype=s.dtype)[:, None, :, None]  # (m, 1, m, 1)
     both = fuse[:, None, None, None] & fuse[None, None, :, None]
+    # The identity where not fused, apart from all others: then S is regular if its fused part is.
     unit = jnp.eye(size_z, dtype=s.dtype)
     s = materialize(jnp.where(both, s, same * unit[None, :, None]))
+    # (m, Z, m, Z) -> (K, K): row i·Z + j is entry j of measurement i.
     factor = materialize(linalg.cholesky(s.reshape(m * size_z, m * size_z))[0])
     pivots = jnp.diagonal(factor).reshape(m, size_z)
     # Measurements that are regular one by one can still be singular together.
@@ -91,6 +95,7 @@ def factor_of(
     # A row without a pivot is zero and so has no effect, without a mask.
     factor = jnp.where(jnp.repeat(fuse & regular, size_z)[:, None], factor, 0.0)
     if m == 1:  # S is S_ii, whose L⁻¹ is at hand: the pivots of L need not be computed
+        # The pivots of L⁻¹ are one over those of L, so the sign turns.
         log_det = -log_det_of_pivots(jnp.diagonal(inverse, axis1=1, axis2=2))
     else:
         log_det = log_det_of_pivots(pivots)

@@ -59,6 +59,7 @@ def motion_update(
     after, by_pose, noise = first_order.motion_at(motion, pose, u, pose)
     root = linalg.root_psd(noise)
     back = linalg.inverse(by_pose)
+    # F concerns the robot alone: only its rows and columns change.
     phi = omega.at[:3].set(back.T @ omega[:3])
     phi = phi.at[:, :3].set(phi[:, :3] @ back)
     residual = residual.at[:3].set(back.T @ residual[:3])
@@ -66,6 +67,7 @@ def motion_update(
     by_noise = root.T @ phi[:3]
     inner = jnp.eye(3, dtype=omega.dtype) + by_noise[:, :3] @ root
     gain = (linalg.inverse(linalg.symmetrize(inner)) @ by_noise).T
+    # (I - G Sᵀ) Φ, and below its product with (I - G Sᵀ)ᵀ.
     left = phi - gain @ by_noise
     omega = left - (left[:, :3] @ root) @ gain.T + gain @ gain.T
     return after, linalg.symmetrize(omega), residual - gain @ (root.T @ residual[:3])
@@ -119,6 +121,7 @@ def initialize_landmarks(
     initialized = wanted & positive
     unit = jnp.broadcast_to(jnp.eye(size, dtype=omega.dtype), cov.shape)
     both = jax.vmap(linalg.solve_lower)(root, jnp.concatenate([-by_pose, unit], axis=2))
+    # Rows of zeros add nothing to Jᵀ C⁻¹ J.
     both = jnp.where(initialized[:, None, None], both, 0.0)
     rows = stack_jacobians(both[:, :, :3], both[:, :, 3:], index, count)
     slots = jnp.arange(count, dtype=index.dtype)

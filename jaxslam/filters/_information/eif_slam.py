@@ -133,6 +133,8 @@ class InPieces(Wrapper):
 
         def deal(leaf: jax.Array) -> jax.Array:
             wide = jnp.pad(leaf, [(0, pieces * size - m), *[(0, 0)] * (leaf.ndim - 1)])
+            # Slot i is in column i mod pieces of (size, pieces): the padding at the end of a scan
+            # is spread over all pieces.
             return wide.reshape(size, pieces, *leaf.shape[1:]).swapaxes(0, 1)
 
         def update(state: PyTree, piece: tuple[Scan, jax.Array]) -> tuple[PyTree, Info]:

@@ -38,6 +38,7 @@ def _move_landmarks(
     links = state.links.at[slot].get(mode="fill", fill_value=0)
     # A later write to the lists depends on the slots, so it comes after this without a copy.
     row, links, active = materialize((row, links, state.active))
+    # Ω_ji δ_i for each neighbour j, and Ω_ji = Ω_ijᵀ.
     change = jnp.einsum("mkij,mi->mkj", links, step).reshape(-1, 2)
     return state._replace(
         active=active,
@@ -103,6 +104,7 @@ def local_information(state: SparseState, slot: Int[Array, "B"]) -> Float[Array,
     present = slot < n
     rows = state.neighbours.at[slot].get(mode="fill", fill_value=n)
     links = state.links.at[slot].get(mode="fill", fill_value=0)
+    # (B, K, B): which of the slots each entry of a list names; links to others drop out.
     match = (rows[:, :, None] == slot[None, None, :]) & present[None, None, :]
     blocks = jnp.einsum("bkij,bkc->bcij", links, match.astype(links.dtype))
     at = (slot[:, None] == state.active[None, :]) & present[:, None]
@@ -152,6 +154,7 @@ def whole_marginals(state: SparseState) -> tuple[Float[Array, "3 3"], Float[Arra
     omega = local_information(state, jnp.arange(count, dtype=jnp.int32))
     cov = linalg.inverse_psd(omega)
     k = jnp.arange(count)
+    # (N, 2, N, 2), its diagonal blocks.
     points = cov[3:, 3:].reshape(count, 2, count, 2)[k, :, k]
     return cov[:3, :3], points
 

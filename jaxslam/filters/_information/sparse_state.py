@@ -131,6 +131,7 @@ def linked_to_robot(omega: Float[Array, "D D"]) -> Bool[Array, "A"]:
 def landmark_blocks(omega: Float[Array, "D D"]) -> Float[Array, "A A 2 2"]:
     """The blocks of Ω of the active landmarks."""
     count = (omega.shape[0] - 3) // 2
+    # (i, row, j, column) -> (i, j, row, column).
     return omega[3:, 3:].reshape(count, 2, count, 2).transpose(0, 2, 1, 3)
 
 
@@ -166,13 +167,16 @@ def sparsify(
     leaves = jnp.concatenate([jnp.zeros(3, bool), jnp.repeat(leaving, 2)])
     by_robot = omega[:, :3]
     eye = jnp.eye(len(omega), dtype=omega.dtype)
+    # The identity in place of all that stays: the number of leaving landmarks is no static shape.
     of_leaving = jnp.where(leaves[:, None] & leaves[None, :], omega, eye)
     to_leaving = jnp.where(leaves[:, None], by_robot, 0.0)
     g = by_robot - omega @ linalg.solve_psd(of_leaving, to_leaving)[0]
+    # Zero but for rounding, since m0 is marginalized out.
     g = jnp.where(leaves[:, None], 0.0, g)
     root_x, root_sigma = linalg.whitener(omega[:3, :3])[0], linalg.whitener(g[:3])[0]
     new = omega + linalg.self_gram(root_sigma @ g.T) - linalg.self_gram(root_x @ by_robot.T)
     robot = jnp.arange(len(omega)) < 3
+    # Exact zeros in place of rounding: `linked_to_robot` asks whether a block is zero.
     cut = (leaves[:, None] & robot[None, :]) | (leaves[None, :] & robot[:, None])
     # The roots are inverse factors, so these are log-determinants of Σ⁻¹ and Ω_x⁻¹.
     nats = jnp.maximum(0.5 * (log_det_of(root_sigma) - log_det_of(root_x)), 0.0)
@@ -235,9 +239,11 @@ def drop_link(
     if conservative:
         at_i = diagonal.at[i].get(mode="fill", fill_value=0)
         at_j = diagonal.at[j].get(mode="fill", fill_value=0)
+        # Ω_ii - 2U ≻ 0: at least half of Ω_ii is left in each direction after U is subtracted.
         spare = linalg.cholesky(at_i - 2 * u)[1] & linalg.cholesky(at_j - 2 * v)[1]
         sign = jnp.where(spare, -sign, sign)
     diagonal = diagonal.at[i].add(sign * u, mode="drop").at[j].add(sign * v, mode="drop")
+    # 1 where nothing is dropped: √ has no finite derivative at zero.
     norm = jnp.sqrt(jnp.where(on, (link**2).sum(), 1.0))
     return diagonal, counts._replace(
         dropped=counts.dropped + on.astype(jnp.int32),

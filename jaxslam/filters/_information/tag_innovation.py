@@ -156,6 +156,7 @@ def innovations(
     half = linalg.solve_lower(factor, jacobian.T)
     same = jnp.eye(m, dtype=z.dtype)[:, None, :, None]
     joint_cov = (half.T @ half).reshape(m, size, m, size) + same * noise[:, :, None]
+    # (m, Z, Z): index arrays on both sides of a slice put their axis first.
     s = joint_cov[jnp.arange(m), :, jnp.arange(m)]
     alone = jax.vmap(gaussian_terms)(nu, s)
     noise_factor, noise_positive = jax.vmap(linalg.cholesky)(noise)
@@ -207,9 +208,11 @@ def _densities_in_turn(
     m, size = innovation.shape
     both = fused[:, None, None, None] & fused[None, None, :, None]
     eye = jnp.eye(m * size, dtype=innovation.dtype)
+    # The identity where not fused, apart from all others: ν = 0 there adds neither d² nor log |S|.
     fused_cov = jnp.where(both, joint_cov, eye.reshape(joint_cov.shape))
     inverse_factor = linalg.whitener_by_rows(fused_cov.reshape(eye.shape))[0]
     distance = (inverse_factor @ innovation.reshape(-1)).reshape(m, size) ** 2
+    # The pivots of L⁻¹ are one over those of L, so the sign turns.
     log_det = -log_det_of_pivots(jnp.diagonal(inverse_factor).reshape(m, size))
     nis = distance.sum(axis=1)
     return nis, log_density(nis, log_det, size)

@@ -140,6 +140,7 @@ def as_prior(
             "root, and with Jacobians at the estimate"
         )
     blocks = jnp.where(state.alive[:, None, None], state.covs, jnp.eye(size, dtype=kind)[None])
+    # The rows of P of each landmark; only diagonal blocks are set: an uncorrelated prior.
     rows = 3 + jnp.arange(capacity)[:, None] * size + jnp.arange(size)[None, :]
     return joint._replace(
         landmarks=state.landmarks,

@@ -171,6 +171,8 @@ def _weigh(
     """Log-weights log w_p p(scan | particle) with Σ w = 1, the log-likelihood of the measurements
     with landmarks, and whether all weights underflowed."""
     log_matched = state.log_weight + proposal.log_matched
+    # The terms of measurements without a landmark compare particles; they are no densities, so the
+    # log-likelihood is without them.
     log_weight, _, some = normalized(log_matched + proposal.log_unmatched)
     return log_weight, normalized(log_matched)[1], ~some
 

@@ -274,6 +274,7 @@ def _predict_measurements(
         return jax.vmap(sensor.observe, (None, 0))(pose, landmarks), None
 
     def cross() -> Float[Array, "N Z N Z"]:
+        # H P Hᵀ = 0: neither pose nor map has an error, so no two measurements are correlated.
         return jnp.zeros((count, size, count, size), pose.dtype)
 
     return predicted(sensor, tags, jnp.ones(count, bool), measurements, cross)

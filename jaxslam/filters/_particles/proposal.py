@@ -35,6 +35,7 @@ def sample_motion(
     normals = jax.random.normal(key, (pose.shape[0], len(motion.noises)), pose.dtype)
 
     def move(pose: Float[Array, "3"], normal: Float[Array, "W"]) -> Float[Array, "3"]:
+        # Q may be singular: a noise may have the variance zero.
         return motion.step(pose, u, linalg.root_psd(motion.noise_cov(pose, u)) @ normal)
 
     return jax.vmap(move)(pose, normals)
@@ -118,6 +119,7 @@ def propose_pose(
         nu = sensor.residual(z, z_hat)
         hp = linalg.matmul(by_pose, p)
         s = linalg.matmul(hp, by_pose.T) + noise
+        # The landmark is integrated out: given the path, its error is independent of the pose's.
         s = linalg.symmetrize(s + linalg.matmul(linalg.matmul(by_landmark, cov), by_landmark.T))
         terms = gaussian_terms(nu, s)
         inside, counted, nis = gate_distance(terms.distance, gamma)
@@ -129,6 +131,7 @@ def propose_pose(
         x = jnp.concatenate([x[:2], wrap(x[2:])])
         p = p - linalg.gram(v, v)
         log_density_matched = log_density(counted, terms.log_det, size_z)
+        # R(z): a measurement that is not matched has no prediction (`predicted_noise`).
         log_det_noise = log_det_of(linalg.cholesky(noise)[0])
         log_density_unmatched = log_density(d2_unmatched, log_det_noise, size_z)
         log_matched = log_matched + jnp.where(of_map, log_density_matched, 0.0)

@@ -32,6 +32,7 @@ def particle_association(
     """The association of the valid measurements of a scan."""
     association = Association(*associate(prediction, scan))
     return ParticleAssociation(
+        # -1, for no slot, becomes index 0; what is read there is masked by `matched`.
         slot=jnp.maximum(association.slot, 0),
         matched=scan.valid & (association.slot >= 0) & ~association.is_new,
         is_new=scan.valid & association.is_new,

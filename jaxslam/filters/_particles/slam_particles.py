@@ -165,6 +165,7 @@ def slam_estimate(state: SlamParticles, sensor: Sensor) -> Estimate:
 
     # Coordinate by coordinate: XLA processes (P, N) much faster than (P, N, 2, 2).
     def average(values: Float[Array, "P N"]) -> Float[Array, "N"]:
+        # A weight of zero times a number that is not finite would be NaN.
         return jnp.where(w > 0, w * values, 0.0).sum(axis=0)
 
     def mixture_cov(i: int, j: int) -> Float[Array, "N"]:

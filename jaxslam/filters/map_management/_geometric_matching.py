@@ -116,6 +116,7 @@ def _residuals(
     factor, positive = linalg.cholesky(linalg.symmetrize(cov.reshape(2 * m, 2 * m)))
     error = jnp.where(paired[:, None], z @ rotation.T + pose[None, :2] - goal, 0.0)
     eye = jnp.broadcast_to(jnp.eye(2, dtype=z.dtype), (m, 2, 2))
+    # ∂(R z)/∂θ is R z turned by 90°; at r = 0, R z is the goal less the translation.
     by_turn = quarter_turned(goal - pose[None, :2])[:, :, None]
     jacobian = jnp.where(paired[:, None, None], jnp.concatenate([eye, by_turn], 2), 0.0)
     blocks = cov[jnp.arange(m), :, jnp.arange(m)]
@@ -260,6 +261,7 @@ def _hypotheses(points: PointSets, limits: _SearchLimits) -> _Hypotheses:
 
 def _merit(count: Int[Array, "*batch"], distance: Float[Array, "*batch"]) -> Float[Array, "*batch"]:
     """The score of a match: the number of pairs first, then the distance, mapped to 0 … 1."""
+    # Below 1, so that no distance outweighs a pair.
     return count - distance / (1 + distance)
 
 
@@ -270,6 +272,7 @@ def _finalists(hypotheses: _Hypotheses) -> Int[Array, "K"]:
     The best of all alone may be one hypothesis, which each of its pairs leads to.
     """
     merit = _merit(hypotheses.explained, hypotheses.distance)
+    # Row p, column c is number p·C + c of the flat array.
     heads = merit.argmax(axis=1) + jnp.arange(merit.shape[0]) * merit.shape[1]
     merit = merit.reshape(-1)
     return jnp.concatenate([heads, jax.lax.top_k(merit, min(_FINALISTS, len(merit)))[1]])

@@ -70,6 +70,7 @@ def successive_duplicate(
         k = jnp.arange(capacity)
         traces = jnp.trace(cov[k, :, k], axis1=1, axis2=2)
         mixed = cov[:, 0, :, 0] + cov[:, 1, :, 1]
+        # Its mean over x and y is to be at most spread², hence the 2 below.
         variance = traces[:, None] + traces[None, :] - 2 * mixed
         i, j, distance = closest_pair(joint, chart, reach, pairs & (variance <= 2 * spread**2))
         first = times.born[i] <= times.born[j]
@@ -198,6 +199,7 @@ def _recent_cluster(
     recent = joint.alive & (times.now - times.last <= settings.window)
     recent = recent & (times.seen >= settings.sightings)
     # By the time of the last measurement, then by the slot.
+    # A number of its own for each slot, in int32 for 2³¹/N scans.
     order = jnp.where(recent, times.last, -1) * capacity + jnp.arange(capacity)
     _, cluster = jax.lax.top_k(order, min(settings.cluster, capacity))
     later = times.born[cluster][:, None] > times.last[None, :]
@@ -269,6 +271,7 @@ def _joint_distance(
 ) -> Float[Array, ""]:
     """The joint distance δᵀ cov(δ)⁻¹ δ of all pairs, including the drift."""
     m, paired, at = match.slot.shape[0], match.slot >= 0, jnp.maximum(match.slot, 0)
+    # (M, 2, M, 2): recent landmark and entry, old landmark of each pair and entry.
     crossed = points.cross_cov[:, :, at]
     cov = points.cluster_cov + points.map_cov[at][:, :, at]
     cov = with_unit_blocks(cov - crossed - crossed.transpose(2, 3, 0, 1), paired)

@@ -192,9 +192,11 @@ def closest_pair(
     # (landmark i, landmark j, parameter of i, parameter of j).
     with_robot = jnp.einsum("nij,jmk,mlk->nmil", by_robot, cross, by_landmark)
     of_landmarks = jnp.einsum("nij,njmk,mlk->nmil", by_landmark, blocks, by_landmark)
+    # The term of landmark i and the pose of j is that of the pose of i and landmark j, mirrored.
     cov = of_landmarks + with_robot + with_robot.transpose(1, 0, 3, 2)
     cov = cov + jnp.einsum("nij,jk,mlk->nmil", by_robot, robot, by_robot)
     diagonal = cov[jnp.arange(capacity), jnp.arange(capacity)]
+    # C_ii + C_jj - C_ij - C_ji, of all pairs: O(N²), as P itself.
     delta_covs = diagonal[:, None] + diagonal[None, :] - cov - cov.transpose(1, 0, 2, 3)
     pairs = joint.alive[:, None] & joint.alive[None, :]
     pairs = pairs & (jnp.arange(capacity)[:, None] < jnp.arange(capacity)[None, :])
@@ -240,6 +242,7 @@ def merge_landmarks(
     # A factor of zero gives V = 0, which changes nothing.
     factor = jnp.where(ok, factor, 0.0)
     v = linalg.solve_lower(factor, with_all)
+    # L⁻¹ (0 - δ): what is measured is δ = 0.
     white = linalg.solve_lower(factor, joint.landmarks[j] - joint.landmarks[i])
     xi = linalg.gram(v, white[:, None])[:, 0]
     pose, landmarks = retracted(chart, joint, xi)

@@ -208,6 +208,7 @@ def relocated(
     paired = (slot >= 0)[:, None]
     rows = jnp.where(paired[:, :, None], map_cov[jnp.maximum(slot, 0)].reshape(m, 2, -1), 0.0)
     # With Σ = L Lᵀ: L⁻¹ P_mM, L⁻¹ J and L⁻¹ r.
+    # (m, 2, N·2) -> (2m, 2N), as the rows of Σ.
     rows = linalg.solve_lower(alignment.factor, rows.reshape(2 * m, -1))
     by_pose = linalg.solve_lower(alignment.factor, alignment.jacobian)
     white = linalg.solve_lower(alignment.factor, alignment.residual)

@@ -181,6 +181,7 @@ def by_mutual_sight(
         (range_v, bearing_v), (range_w, bearing_w) = se2.polar(v), se2.polar(w)
         r = share * range_v + (1 - share) * range_w
         position = se2.rectangular(jnp.stack([r, bearing_v]))
+        # b sees a in the direction bearing_v + π of the frame of a, at bearing_w from its heading.
         turn = bearing_v + jnp.pi - bearing_w
         return se2.compose(pose_a, jnp.stack([position[0], position[1], turn]))
 
@@ -211,6 +212,7 @@ def by_two_landmarks(
         return se2.align(seen, points)
 
     by_points, by_seen = jax.jacfwd(pose, argnums=(0, 1))(points, seen)
+    # (3, landmark, coordinate) -> (3, 4), as the rows of both landmarks.
     by_points = by_points.reshape(3, 4)
     noise = jnp.einsum("ikl,klm,jkm->ij", by_seen, seen_cov, by_seen)
     noise = symmetrize(by_points @ cov @ by_points.T + noise)
@@ -233,6 +235,7 @@ def _distance_variance(point: Float[Array, "2"], cov: Float[Array, "2 2"]) -> Fl
     square = (point**2).sum()
     positive = square > 0
     along = point @ cov @ point / jnp.where(positive, square, 1.0)
+    # Two distances without noise then have equal weights, and not 0/0.
     return jnp.where(along > 0, along, jnp.finfo(point.dtype).tiny)
 
 

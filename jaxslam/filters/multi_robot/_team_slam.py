@@ -111,6 +111,7 @@ class TeamSlam(TeamFilter):
             pose=means[report],
             pose_cov=covs[report],
             points=state.landmarks[:capacity, :2],
+            # Slot and entry of the row, then of the column: the (x, y) of each diagonal block.
             point_covs=blocks.reshape(capacity, SIZE, capacity, SIZE)[k, :2, k, :2],
             alive=state.alive[:capacity],
             tag=state.tag[:capacity],

@@ -39,6 +39,7 @@ def with_robot(filter: TeamFilter, joint: Joint, robot: int, new: InitialPose) -
     cov = joint.cov.at[rows].set(new.rows).at[:, rows].set(new.rows.T)
     return joint._replace(
         landmarks=joint.landmarks.at[slot].set(new.pose),
+        # Last: new.rows are covariances with what was in the map before, zero in these columns.
         cov=cov.at[rows, rows].set(new.cov),
         alive=joint.alive.at[slot].set(True),
         tag=joint.tag.at[slot].set(filter.robot_tags[robot]),

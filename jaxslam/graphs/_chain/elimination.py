@@ -155,6 +155,7 @@ def eliminate(chain: Chain, alive: Bool[Array, "N"]) -> Policy:
     decrement = decrement + gained
     landmarks, factor, regular = to_go.map_y, to_go.map, jnp.asarray(True)
     if wide > 0:
+        # Unit information at dead slots, whose y is zero: the factor is regular, and their δm zero.
         dead = jnp.repeat(~alive, size).astype(kind)
         factor, regular = linalg.cholesky(linalg.symmetrize(to_go.map) + jnp.diag(dead))
         half = linalg.solve_lower(factor, to_go.map_y)

@@ -239,6 +239,7 @@ def marginalize_oldest(
     off = jnp.where(joint.alive[:, None], joint.landmarks - at.landmarks, 0.0)
     deviation = jnp.concatenate([mean, off.reshape(-1)])
     seen = jacobian @ cov
+    # The rows are in units of their noise: S = H P Hᵀ + 1.
     factor, _ = linalg.cholesky(seen @ jacobian.T + jnp.eye(r.size, dtype=r.dtype))
     white = linalg.solve_lower(factor, seen)
     innovation = linalg.solve_lower(factor, r.reshape(-1) - jacobian @ deviation)
@@ -264,6 +265,7 @@ def marginalize_oldest(
         new,
         start,
         -undo @ step.pose_rows,
+        # B⁻¹ v, of unit noise v.
         undo @ undo.swapaxes(1, 2),
         tag[slot],
     )

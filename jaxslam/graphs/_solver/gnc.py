@@ -145,5 +145,6 @@ def _weight(ratio: Float[Array, "E B"], control: Float[Array, "1 B"]) -> Float[A
     """The weight of rows by s/c² and μ (`minimize_truncated`)."""
     low, high = control / (control + 1), (control + 1) / control
     safe = jnp.where(ratio > 0, ratio, 1.0)
+    # c √(μ(μ + 1)/s) - μ, by s/c²; 1 at the lower threshold and 0 at the upper.
     between = jnp.sqrt(control * (control + 1) / safe) - control
     return jnp.where(ratio <= low, 1.0, jnp.where(ratio >= high, 0.0, between))

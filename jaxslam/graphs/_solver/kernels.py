@@ -54,12 +54,14 @@ class Huber(_OfWidth):
     def cost(self, s: Array) -> Array:
         width, square = self._widths(s)
         near = s <= square
+        # k² in place of a small s, where the root is not used: it has no finite derivative at zero.
         root = jnp.sqrt(jnp.where(near, square, s))
         return jnp.where(near, s, 2 * width * root - square)
 
     def weight(self, s: Array) -> Array:
         width, square = self._widths(s)
         near = s <= square
+        # ρ' = k/√s beyond k²; 1 in place of a small s, as in `cost`.
         return jnp.where(near, 1.0, width / jnp.sqrt(jnp.where(near, 1.0, s)))
 
 

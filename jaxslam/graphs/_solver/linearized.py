@@ -186,6 +186,7 @@ def linearize(model: Model, plan: Plan, variables: Variables, data: Data) -> Sys
 def _assemble(plan: Plan, blocks: list[Array], data: Data) -> Float[Array, "M d d B"]:
     """The blocks of the matrix, from those of the rows of each table, (E K K, d, d, B)."""
     matrix = sum_rows(plan.information, jnp.concatenate(blocks))
+    # Row, column and gradient of a fixed entry are zero; with a 1 its increment is zero.
     held = plan.on_diagonal[:, None, None] & ~data.free[plan.block_column]
     unit = jnp.eye(matrix.shape[1], dtype=matrix.dtype)[None, ..., None]
     return matrix + jnp.where(held[:, None], unit, 0.0)
@@ -278,6 +279,7 @@ def _jacobians(
         by = by_coordinate(k)
         if kind == "pose":
             sin, cos = (y[:, None] for y in sin_cos(x[:, 2]))
+            # t moves by R(θ) δt: derivatives along the frame, (cos, sin) and (-sin, cos).
             by_increment = [cos * by[0] + sin * by[1], cos * by[1] - sin * by[0], by[2]]
         else:
             by_increment = list(by)
@@ -305,6 +307,7 @@ def data_of(graph: Graph, column: Array) -> Data:
         {
             name: jnp.where(
                 rows.valid[:, None, None],
+                # χ² depends on the symmetric part alone; gradient and blocks take Ω as symmetric.
                 0.5 * (rows.information + jnp.swapaxes(rows.information, 1, 2)),
                 0.0,
             )

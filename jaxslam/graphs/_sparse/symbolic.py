@@ -26,6 +26,7 @@ def _minimum_degree(
     links = links + links.T
     dominant = scipy.sparse.diags_array(1.0 + np.asarray(abs(links).sum(axis=0)).ravel()) + links
     options = {"SymmetricMode": True}
+    # With a threshold of 0 each pivot is on the diagonal: the order is that of the pattern.
     factors = scipy.sparse.linalg.splu(
         dominant.tocsc(), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0, options=options
     )
@@ -67,6 +68,7 @@ class Pattern:
     def find(self, rows: Ints, columns: Ints) -> Ints:
         """The blocks at rows and columns; raises ValueError where there is none."""
         size = len(self.order)
+        # A number for each block, ascending since the blocks are sorted by column, then row.
         keys = self.columns * size + self.rows
         wanted = columns * size + rows
         blocks: Ints = np.searchsorted(keys, wanted).astype(np.int32)  # half the memory

@@ -121,6 +121,7 @@ class FixedLag(Filter):
         system = linearize_window(
             motion, self.sensor, state.prior, state.steps, state.at, self.first_estimates
         )
+        # The oldest step leaves before the new motion enters: W steps at every scan.
         prior = marginalize_oldest(state.prior, system, state.steps, state.at, joint.tag)
         state = _finite_or(state._replace(prior=prior), self._started_at(state.joint))
         root = linalg.root_psd(motion.noise_cov(state.joint.pose, u))
@@ -143,6 +144,7 @@ class FixedLag(Filter):
         info = info._replace(status=status.astype(info.status.dtype))
         steps = _with_scan(state.steps, scan, info)
         born = joint.alive & ~state.joint.alive
+        # New landmarks start where EKF-SLAM has them; the others where the window has them.
         landmarks = jnp.where(born[:, None], joint.landmarks, state.at.landmarks)
         at = state.at._replace(landmarks=landmarks)
         for _ in range(self.iterations):
@@ -200,6 +202,7 @@ def shift(
     """The window without its oldest step, and with a new motion to a predicted pose (3,)."""
 
     def append(rows: Array, new: Array | bool | float) -> Array:
+        # All rows move up by one: fixed shapes, newest last.
         return jnp.roll(rows, -1, axis=0).at[-1].set(new)
 
     after = WindowSteps(

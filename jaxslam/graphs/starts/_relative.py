@@ -46,6 +46,7 @@ def measured_relative_poses(graph: Graph, factors: Factors | None) -> Relative:
         )
         if not isinstance(factor, BetweenPoses):
             z, by_error = map(np.asarray, _measured_poses(factor, z))
+            # Jᵀ Ω J, J the derivative of the residual by the error of the relative pose.
             information = np.einsum("eri,ers,esj->eij", by_error, information, by_error)
         parts.append(
             Relative(who[:, 0], who[:, 1], np.asarray(z, float), np.asarray(information, float))
@@ -64,6 +65,7 @@ def _order_by_id(
 
     The first row for a variable places it; so the place does not depend on the order in a file.
     """
+    # `lexsort` takes the last key first: the id of the first pose.
     return np.lexsort((*z.T, np.linalg.norm(z, axis=1), *ranks(graph)[who].T[::-1]))
 
 
@@ -121,6 +123,7 @@ def anchors_of(
 
 def with_poses(graph: Graph, poses: Float[np.ndarray, "N 3"]) -> Graph:
     """The graph at other poses, angles wrapped; fixed ones stay as they are, to the bit."""
+    # In (-π, π]: `mod` gives [0, 2π).
     poses[:, 2] = np.pi - np.mod(np.pi - poses[:, 2], 2 * np.pi)
     fixed = np.asarray(graph.fixed_pose)
     poses[fixed] = np.asarray(graph.poses)[fixed]

@@ -121,6 +121,7 @@ def interpolate(field: Field, points: ArrayLike) -> Float[Array, "*n"]:
     points = jnp.asarray(points)
     if points.ndim == 0 or points.shape[-1] != 2:
         raise ValueError(f"interpolate: expected points (x, y), got shape {points.shape}")
+    # Half a cell: entry (i, j) is the value at the centre (j + ½, i + ½).
     return interpolated(field.values, to_cells(field.origin, field.resolution, points) - 0.5)
 
 

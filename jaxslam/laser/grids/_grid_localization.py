@@ -242,6 +242,7 @@ def _is_blocked(grid: Grid, pose: Float[Array, "P 3"]) -> Bool[Array, "P"]:
     height, width = grid.log_odds.shape
     at = jnp.floor(to_cells(jnp.asarray(grid.origin), grid.resolution, pose[:, :2]))
     inside = (at >= 0).all(axis=1) & (at[:, 0] < width) & (at[:, 1] < height)
+    # (x, y) is (column, row); any cell for a pose off the map.
     j, i = jnp.where(inside[:, None], at, 0.0).astype(jnp.int32).T
     return ~inside | (jnp.asarray(grid.log_odds > 0)[i, j])
 

@@ -137,6 +137,7 @@ def least(of: Quadratic) -> Float[Array, "3"]:
     turn_pull = pulled(of.turn)
     inverse = linalg.inverse(of.shift + pulled(of.shift) * eye)
     s = linalg.symmetrize(of.turn + turn_pull * eye - of.cross.T @ inverse @ of.cross)
+    # The pull is towards r = (1, 0), no turn, and t = 0.
     h = -2 * (of.turn_slope + turn_pull * eye[0] - of.cross.T @ inverse @ of.shift_slope)
     r = _on_circle(s, h)
     shift = inverse @ (of.shift_slope - of.cross @ r)

@@ -216,6 +216,7 @@ def field_residuals(
     arm = points.position @ se2.rotation(pose[2]).T
     moved = arm + pose[None, :2]
     d, pull = jax.vjp(lambda p: interpolate(of, p), moved)
+    # d of a point depends on that point alone, so one pull of ones gives the slopes of all.
     (slope,) = pull(jnp.ones_like(d))
     turn = slope[:, 1] * arm[:, 0] - slope[:, 0] * arm[:, 1]
     return d, jnp.concatenate([slope, turn[:, None]], axis=1)

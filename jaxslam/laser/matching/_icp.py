@@ -183,6 +183,7 @@ class Icp(Matcher):
                 least(with_prior),
                 step_within(quadratic, middle, onto, pose),
             )
+            # The motion turns about the middle: p ← R (p - m) + m + t.
             pivot = se2.from_frame(moved, pose[:2] - middle) + middle
             after = jnp.concatenate([pivot, wrap(pose[2] + moved[2])[None]])
             # A limit cycle of two steps, where pairs alternate, has ended as well.

@@ -94,6 +94,7 @@ def topological_map(
 
     def root(cell: int) -> int:
         while parent[cell] != cell:
+            # Path halving: later searches from here are shorter.
             parent[cell] = parent[parent[cell]]
             cell = parent[cell]
         return cell
@@ -176,6 +177,7 @@ def neighbours(cells: Bool[np.ndarray, "H W"]) -> "scipy.sparse.csr_matrix":
     index = np.arange(height * width).reshape(height, width)
     rows, columns, weights = [], [], []
     for i, j in _HALF:
+        # Two views of one shape, (i, j) apart; j may be negative.
         cell = index[: height - i, max(0, -j) : width - max(0, j)]
         shifted = index[i:, max(0, j) : width - max(0, -j)]
         both = cells.reshape(-1)[cell] & cells.reshape(-1)[shifted]

@@ -53,6 +53,7 @@ def route(places: TopologicalMap, start: ArrayLike, goal: ArrayLike) -> Route:
     )
     if not np.isfinite(distance[at[1]]):
         raise ValueError(f"route: no way leads from place {labels[0]} to place {labels[1]}")
+    # From the goal back to the start, by the predecessors.
     way = [at[1]]
     while way[-1] != at[0]:
         way.append(int(before[way[-1]]))
@@ -107,5 +108,6 @@ def place_weights(
     weight = np.exp(logs - logs.max())
     weight /= weight.sum()
     label = place_of(places, table)
+    # The label -1, of no place, is counted first.
     sums = np.bincount(label + 1, weight, minlength=len(places.center) + 1)
     return sums[1:], float(sums[0])

@@ -41,6 +41,7 @@ def skeleton(grid: Grid, *, clearance: float = 0.2) -> Skeleton:
     check_grid("skeleton", grid)
     if not clearance > 0:
         raise ValueError(f"skeleton: expected a clearance above 0, got {clearance}")
+    # A border of walls, so that each free cell has eight neighbours in the flat array.
     free = np.pad(np.asarray(grid.log_odds) < 0, 1)
     walls = Grid(np.where(free, -1.0, 1.0), grid.origin, grid.resolution)
     field = distance_field(walls)
@@ -56,6 +57,7 @@ def skeleton(grid: Grid, *, clearance: float = 0.2) -> Skeleton:
     _thin(cells, away, np.zeros_like(cells), ends=True)
     inner = slice(1, -1), slice(1, -1)
     around = np.stack([np.roll(cells, (-i, -j), (0, 1)) for i, j in _AROUND])
+    # A branch begins where, in order around, a neighbour is absent and the next is present.
     branches = (~around & np.roll(around, -1, axis=0)).sum(axis=0)
     return Skeleton(cells[inner], (cells & (branches >= 3))[inner], away[inner])
 

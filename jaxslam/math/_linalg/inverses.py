@@ -43,6 +43,7 @@ def whitener(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Arr
         rows[j][j] = jnp.where(good, jax.lax.rsqrt(jnp.where(good, pivot, 1.0)), 0.0)
         ratios.append(size * rows[j][j] ** 2)
         for k in range(j):
+            # Row j of L W = 1, solved for W_jk.
             rows[j][k] = -rows[j][j] * total(factor[j][i] * rows[i][k] for i in range(k, j))
         for i in range(j + 1, n):
             rest = matrix[i, j] - sum((factor[i][k] * factor[j][k] for k in range(j)), zero)
@@ -76,6 +77,7 @@ def whitener_by_rows(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], 
         pivot = rest[j, j]
         good = pivot > tolerance * size[j]
         scale = jnp.where(good, jax.lax.rsqrt(jnp.where(good, pivot, 1.0)), 0.0)
+        # Elimination of [A 1]: row j of what began as the identity ends as row j of L⁻¹.
         below, scaled = jnp.where(index > j, rest[:, j] * scale, 0.0), ahead[j] * scale
         return (
             rest - below[:, None] * below[None, :],
@@ -84,6 +86,7 @@ def whitener_by_rows(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], 
         ), (scaled, good)
 
     eye, size = jnp.eye(n, dtype=matrix.dtype), jax.lax.stop_gradient(jnp.abs(jnp.diag(matrix)))
+    # Sizes only decide which pivots count as zero, so no gradient goes through them.
     rows, good = jax.lax.scan(row, (matrix, eye, size), index)[1]
     return rows, good.all()
 
@@ -98,6 +101,7 @@ def inverse(matrix: Float[Array, "n n"]) -> Float[Array, "n n"]:
         det = a[0, 0] * a[1, 1] - a[0, 1] * a[1, 0]
         return jnp.stack([jnp.stack([a[1, 1], -a[0, 1]]), jnp.stack([-a[1, 0], a[0, 0]])]) / det
     if n == 3:
+        # The columns of adj A are cross products of the rows of A; det A = a_0 · (a_1 × a_2).
         cofactors = jnp.stack(
             [jnp.cross(a[1], a[2]), jnp.cross(a[2], a[0]), jnp.cross(a[0], a[1])], axis=1
         )

@@ -76,6 +76,7 @@ def match_controls(of: Odometry | Solved) -> Float[np.ndarray, "N 9"]:
         raise ValueError(f"match_controls: expected Odometry or Solved, got {type(of).__name__}")
     controls = np.zeros((len(of.keyframe), 9))
     controls[1:, :3] = z
+    # Row by row: xx, yx, yy, tx, ty, tt, as `MatchMotion` reads them.
     row, column = np.tril_indices(3)
     controls[1:, 3:] = np.linalg.cholesky(cov)[:, row, column]
     return controls

@@ -505,10 +505,12 @@ def place_unmatched(odometry: Odometry, scans: Scans, steps: Steps, settings: Se
     for scan in np.flatnonzero(~placed & scans.usable):
         if not placed[scan:].any():
             continue  # nothing after it
+        # The nearest scans with a place on both sides: `argmax` is the first True.
         before = scan - 1 - int(np.argmax(placed[:scan][::-1]))
         after = scan + int(np.argmax(placed[scan:]))
         way = poses.between(path[before], path[after])
         middle = poses.compose(path[before], (scan - before) / (after - before) * way)
+        # keys[row - 1] is the last keyframe before the scan.
         row, half = int(np.searchsorted(keys, scan)), settings.reference // 2
         base = keys[row - 1]
         around = keys[max(row - half, 0) : row + half]

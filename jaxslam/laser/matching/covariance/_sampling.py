@@ -77,6 +77,7 @@ class Lattice(MatchCovariance):
             far = (shift * (bound @ shift)).sum()
             cost = prior_cost(match.prior, match.pose + shift)
             if match.prior is not None:
+                # The scans count only along what they determine, prior and window along all.
                 shift = match.determined @ shift
             cost = cost + matcher.cost(prepared, points, match.pose + shift, alone)
             return -cost / variance - 0.5 * far
