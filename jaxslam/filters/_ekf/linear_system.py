@@ -167,10 +167,10 @@ def chart_jacobians(
     else:
         # The basis is the derivative at zero; at ξ_i that of the new pose and then of the new
         # landmark, each by (dx, dl). The pose does not depend on dl.
-        by_dx, by_dl = jax.vmap(
+        of_pose, of_landmark = jax.vmap(
             jax.jacfwd(chart.retract, argnums=(2, 3)), in_axes=(None, 0, None, 0)
         )(pose, landmarks, *moved)
-        basis = Basis(by_dx[0], by_dl[0], by_dl[1])
+        basis = Basis(of_pose[0], of_landmark[0], of_landmark[1])
     products = jax.vmap(linalg.matmul)
     by_chart = products(by_pose, basis.pose) + products(by_landmark, basis.cross)
     if basis.landmark is None:
