@@ -16,9 +16,6 @@ from ring_of_rooms import FAR, ranges_of
 
 from jaxslam import _cli as cli
 from jaxslam import datasets, grids
-from jaxslam._cli.recorded import localize, memory
-from jaxslam._cli.recorded.laser_log import read_log
-from jaxslam._cli.recorded.make_map import SCANS_AT_ONCE
 from jaxslam.core.types import Estimate
 from jaxslam.math import numpy_poses as poses
 from jaxslam.results import plot, report
@@ -27,7 +24,7 @@ from jaxslam.simulation.laser import scan_world
 from jaxslam.simulation.scenarios import square
 from jaxslam.simulation.walls import make_walls, rasterize
 
-BEAMS, STEPS = 25, SCANS_AT_ONCE + 6
+BEAMS, STEPS = 25, cli.make_map.SCANS_AT_ONCE + 6
 FIT = "beams of the last 10 scans within 0.3 m of the map's range, share"
 
 
@@ -264,7 +261,7 @@ def test_odometry_of_a_file_takes_the_place_of_the_logs(log_file, tmp_path):
         "scans": ":",
         "every": 2,
     }
-    log, _ = read_log(SimpleNamespace(**asked, **rest))
+    log, _ = cli.laser_log.read_log(SimpleNamespace(**asked, **rest))
     np.testing.assert_allclose(log.raw[:, 0], np.arange(0, STEPS, 2) / 10)
     assert log.odometry_known.shape == (STEPS // 2,)
 
@@ -352,7 +349,7 @@ def test_the_robot_of_a_bag_is_localized(
         log = bags.first(datasets.carmen(log_file.path, max_range=10.0), STEPS)
         given = bags.write(tmp_path, [m for m in bags.of_log(log) if m.topic != "/odom"])
         solved = SimpleNamespace(odometry=log.raw)  # 25 beams are too few for laser odometry
-        monkeypatch.setattr(localize.laser_slam, "solve", lambda log: solved)
+        monkeypatch.setattr(cli.localize.laser_slam, "solve", lambda log: solved)
     x, y, heading = log_file.pose[0]
     start = f"{x},{y},{np.rad2deg(heading)}"
     options = ["--max-range", "10", "--particles", "500", "--start", start, "--out", out]
@@ -397,8 +394,8 @@ def test_a_map_or_a_start_that_is_none_is_refused(
 
 def test_memory_is_returned_after_each_compilation_in_the_block(monkeypatch):
     calls = []
-    monkeypatch.setattr(memory, "trim", lambda: calls.append(None))
-    with memory.memory_returned():
+    monkeypatch.setattr(cli.recorded.memory, "trim", lambda: calls.append(None))
+    with cli.recorded.memory.memory_returned():
         jax.jit(lambda x: x + 0.25)(np.ones(3))
     count = len(calls)
     jax.jit(lambda x: x + 0.5)(np.ones(3))
@@ -406,4 +403,4 @@ def test_memory_is_returned_after_each_compilation_in_the_block(monkeypatch):
 
 
 def test_memory_can_be_returned():
-    memory.trim()
+    cli.recorded.memory.trim()

@@ -8,10 +8,7 @@ from cases import swept
 
 from jaxslam import motion, sensors
 from jaxslam.core.protocols import Motion
-from jaxslam.verify import build
-from jaxslam.verify._comparison import compare_methods
-from jaxslam.verify._examination import examine, functions_of
-from jaxslam.verify._verifier import FLOAT32_TOLERANCE, TOLERANCE
+from jaxslam.verify import _comparison, _examination, _verifier, build
 
 MODELS = motion.REGISTRY | sensors.REGISTRY
 
@@ -23,11 +20,13 @@ MODELS = motion.REGISTRY | sensors.REGISTRY
 def made(request):
     """A registered model, all that was computed about it, and what that was judged to be."""
     model = build(MODELS[request.param])
-    evaluated, checks, *_ = examine(model, functions_of(model))
+    evaluated, checks, *_ = _examination.examine(model, _examination.functions_of(model))
     findings = [
         finding
         for function in evaluated
-        for finding in compare_methods(function, TOLERANCE, FLOAT32_TOLERANCE)
+        for finding in _comparison.compare_methods(
+            function, _verifier.TOLERANCE, _verifier.FLOAT32_TOLERANCE
+        )
     ]
     return SimpleNamespace(
         model=model,
@@ -127,8 +126,10 @@ def test_every_wrong_entry_is_caught_and_named(made):
                 changed = evaluation._replace(methods=evaluation.methods | {"hand": mutant})
                 by_argument = list(evaluated.by_argument)
                 by_argument[k] = changed
-                findings = compare_methods(
-                    evaluated._replace(by_argument=tuple(by_argument)), TOLERANCE, FLOAT32_TOLERANCE
+                findings = _comparison.compare_methods(
+                    evaluated._replace(by_argument=tuple(by_argument)),
+                    _verifier.TOLERANCE,
+                    _verifier.FLOAT32_TOLERANCE,
                 )
                 assert [f.passed for f in findings] == [n != k for n in range(len(findings))]
                 (wrong,) = findings[k].wrong_entries

@@ -13,8 +13,7 @@ from cases import refused
 
 import jaxslam
 from jaxslam import filters, plot, store
-from jaxslam.consistency import Measure, register
-from jaxslam.consistency._measures import REGISTRY
+from jaxslam.consistency import Measure, _measures, register
 from jaxslam.results import _report as report
 from jaxslam.results._page import campaign_page
 
@@ -37,7 +36,7 @@ def registered():
     register(Measure("claimed", "claimed σ", claimed_sigma, unit="m", positive=True, figure="rmse"))
     register(Measure("farthest", "farthest", farthest, honest=0.25, note=("far", "largest error")))
     yield
-    del REGISTRY["claimed"], REGISTRY["farthest"]
+    del _measures.REGISTRY["claimed"], _measures.REGISTRY["farthest"]
 
 
 def test_a_measure_of_ones_own_is_everywhere(registered, tmp_path):
@@ -70,13 +69,13 @@ def test_a_measure_of_ones_own_is_everywhere(registered, tmp_path):
     assert plot.rmse_figure(campaign).axes[-1].get_ylabel() == "claimed σ [m]"
 
     jaxslam.monte_carlo(WORLD, RECKONING, 6, worlds.key(), **options)
-    del REGISTRY["claimed"]
+    del _measures.REGISTRY["claimed"]
     with pytest.raises(ValueError, match=r"measure claimed: .* there, absent here"):
         jaxslam.monte_carlo(WORLD, RECKONING, 6, worlds.key(), **options)
     again = jaxslam.load(tmp_path).filters["reckoning"]  # without the file that registers it
     np.testing.assert_array_equal(again.curves["claimed"], claimed)
     assert again.measures["claimed"].value == average.value
-    REGISTRY["claimed"] = Measure("claimed", "claimed σ", claimed_sigma)
+    _measures.REGISTRY["claimed"] = Measure("claimed", "claimed σ", claimed_sigma)
 
 
 def _rows(text):

@@ -4,10 +4,7 @@ import dataclasses
 
 import numpy as np
 
-from jaxslam.consistency import Average, Summary
-from jaxslam.consistency._measures.coverage import LEVELS
-from jaxslam.consistency._measures.nees import DOF
-from jaxslam.consistency._run_scores import LAGS
+from jaxslam.consistency import Average, Summary, _measures, _run_scores
 from jaxslam.consistency.campaign import Campaign
 from jaxslam.core.types import Estimate, Truth
 
@@ -25,7 +22,7 @@ def summary(name, seed=0, steps=STEPS):
     worse, far = WORSE.get(name, 1.1), FARTHER.get(name, 1.0 + 0.05 * seed)
     reckons = name == "dead_reckoning"
     curves = {}
-    for block, dof in DOF.items():
+    for block, dof in _measures.nees.DOF.items():
         noise = rng.chisquare(RUNS * dof, steps) / RUNS
         curves[f"nees_{block}"] = noise * np.exp(np.log(worse) * grows)
         curves[f"nees_{block}_low"] = np.full(steps, 0.7 * dof)
@@ -42,9 +39,13 @@ def summary(name, seed=0, steps=STEPS):
         nis_band=None,
         inside={},
         curves=curves,
-        coverage={block: np.asarray(LEVELS) ** worse for block in DOF},
-        autocorrelation=np.full(LAGS, np.nan) if reckons else rng.normal(0, 0.01, LAGS),
-        autocorrelation_band=np.full(LAGS, np.inf if reckons else 0.02),
+        coverage={
+            block: np.asarray(_measures.coverage.LEVELS) ** worse for block in _measures.nees.DOF
+        },
+        autocorrelation=np.full(_run_scores.LAGS, np.nan)
+        if reckons
+        else rng.normal(0, 0.01, _run_scores.LAGS),
+        autocorrelation_band=np.full(_run_scores.LAGS, np.inf if reckons else 0.02),
         counts={"runs": RUNS, "fused": 0 if reckons else 900},
         per_run={},
         not_finite_runs=[],

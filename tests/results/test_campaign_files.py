@@ -17,12 +17,10 @@ from test_page import EVIL, GOOD, RUNS, STEPS, Reader, campaign, summary
 from jaxslam import plot
 from jaxslam.consistency import Average
 from jaxslam.core.types import Estimate, Truth
-from jaxslam.results import _campaign_files as campaign_files
-from jaxslam.results import _report as report
+from jaxslam.results import _campaign_files, _report
 from jaxslam.results.plot import _style
-from jaxslam.results.plot._style import encode
 
-FIGURES = {*campaign_files.FIGURES}
+FIGURES = {*_campaign_files.FIGURES}
 NUMBERS = {"consistency.json", "consistency.csv", "measures.csv"}
 
 
@@ -54,7 +52,7 @@ def found():
 
 
 def test_printed_it_is_the_table_and_in_a_line_its_verdicts(found):
-    assert str(found) == report.campaign_table(found)
+    assert str(found) == _report.campaign_table(found)
     size = f"{RUNS} runs × {STEPS} steps, float32"
     assert " ".join(repr(found).split()) == (
         f"Campaign(world {EVIL}, {size}, good=consistent, other=optimistic)"
@@ -89,7 +87,7 @@ def test_the_report_is_written_as_the_command_writes_it(found, tmp_path):
     assert (
         names
         == {path.name for path in paths}
-        == {*campaign_files.file_names(("png", "pdf", "svg"))}
+        == {*_campaign_files.file_names(("png", "pdf", "svg"))}
     )
     assert {path.stem for path in out.glob("*.pdf")} == FIGURES
     heads = {"png": b"\x89PNG", "pdf": b"%PDF", "svg": b"<?xml"}
@@ -159,7 +157,7 @@ def test_a_figure_that_fails_is_left_out_and_told(found, tmp_path, undrawn, monk
 def test_a_folder_that_cannot_be_used_is_refused_before_anything_is_drawn(
     found, tmp_path, monkeypatch
 ):
-    monkeypatch.setattr(campaign_files, "_drawings", lambda *a: pytest.fail("drawn"))
+    monkeypatch.setattr(_campaign_files, "_drawings", lambda *a: pytest.fail("drawn"))
     monkeypatch.chdir(tmp_path)
     for folder in ("", " ", None):
         with pytest.raises(ValueError, match=r"^Campaign.save: expected a folder, got "):
@@ -186,7 +184,7 @@ def test_figures_of_another_campaign_do_not_stay_beside_the_report(found, tmp_pa
 
 def test_a_figure_is_the_same_bytes_each_time(found):
     for kind in ("pdf", "svg"):
-        first, again = (encode(plot.nees_figure(found), kind) for _ in range(2))
+        first, again = (_style.encode(plot.nees_figure(found), kind) for _ in range(2))
         assert first == again
 
 
@@ -208,7 +206,7 @@ OTHER_SETTINGS = {
 def test_a_figure_does_not_depend_on_the_users_settings_and_leaves_them(found):
     def drawn():
         map_figure = plot.map_figure(run_zero()[1], title="$x$ and 1.5")
-        return encode(plot.nees_figure(found), "svg"), encode(map_figure, "png")
+        return _style.encode(plot.nees_figure(found), "svg"), _style.encode(map_figure, "png")
 
     usual = drawn()
     with matplotlib.rc_context(OTHER_SETTINGS):

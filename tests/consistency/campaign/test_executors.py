@@ -23,20 +23,14 @@ import worlds
 import jaxslam
 from jaxslam import _cli as cli
 from jaxslam import filters, store
-from jaxslam._cli.campaigns import engines
 from jaxslam.consistency.campaign import (
     Incomplete,
     Processes,
+    _block,
+    _flight,
+    _remote,
     monte_carlo,
 )
-from jaxslam.consistency.campaign import (
-    _flight as flight,
-)
-from jaxslam.consistency.campaign import (
-    _remote as remote,
-)
-from jaxslam.consistency.campaign._block import CampaignPlan
-from jaxslam.consistency.campaign._remote import compute_block, pack
 from jaxslam.core.record import record
 
 WORLD = worlds.ring(20)
@@ -86,7 +80,7 @@ class Jobs(ThreadPoolExecutor):
 
 @pytest.mark.parametrize("kind", [ThreadPoolExecutor, Jobs])
 def test_an_executor_gives_the_bits_of_one_process(kind, whole, tmp_path):
-    said, compiled = [], remote._runner.cache_info().misses
+    said, compiled = [], _remote._runner.cache_info().misses
     with kind(2) as executor:
         found = campaign_of(
             executor=executor,
@@ -95,7 +89,7 @@ def test_an_executor_gives_the_bits_of_one_process(kind, whole, tmp_path):
         )
     worlds.assert_same_bits(found, whole)
     assert said[-1] == (22, 22) and len(said) == 6
-    assert remote._runner.cache_info().misses <= compiled + 1  # two threads compile once
+    assert _remote._runner.cache_info().misses <= compiled + 1  # two threads compile once
     assert found.compile_seconds > 0 and set(found.step_seconds) == {"reckoning"}
     for one, other in zip(found.first["reckoning"], whole.first["reckoning"], strict=True):
         np.testing.assert_array_equal(one.pose, other.pose)
@@ -113,12 +107,12 @@ def test_a_block_whose_worker_dies_or_fails_is_computed_again(whole):
 
 
 def test_a_block_that_is_late_is_computed_again(whole, monkeypatch):
-    monkeypatch.setattr(flight, "_LATE", 0.2)
+    monkeypatch.setattr(_flight, "_LATE", 0.2)
     executor = Unreliable(None, "lost")
     with pytest.warns(UserWarning, match="no result after"):
         worlds.assert_same_bits(campaign_of(executor=executor), whole)
     assert executor.calls.count(4) == 2
-    monkeypatch.setattr(flight, "_LATE", 0.05)
+    monkeypatch.setattr(_flight, "_LATE", 0.05)
     lost = Unreliable(None, *["lost"] * 30)
     with warnings.catch_warnings(), pytest.raises(Incomplete, match="4 of 22 runs done"):
         warnings.simplefilter("ignore")
@@ -207,9 +201,11 @@ def test_a_class_of_a_script_is_a_record_in_another_process(tmp_path):
 
 def test_a_block_is_small_on_its_way():
     device = jax.devices()[:1]
-    content = pack(CampaignPlan(WORLD, {"reckoning": RECKONING}, worlds.key(), device, 4))
+    content = _remote.pack(
+        _block.CampaignPlan(WORLD, {"reckoning": RECKONING}, worlds.key(), device, 4)
+    )
     assert len(content) < 8000
-    result = compute_block(content, 0, 4)
+    result = _remote.compute_block(content, 0, 4)
     assert len(pickle.dumps(result._replace(first={}))) < 20_000
 
 
@@ -371,7 +367,7 @@ def test_an_engine_that_cannot_be_used_is_named(
 def test_a_service_that_is_not_dasks_ends_the_command(tmp_path, capsys, monkeypatch):
     """Dask's own time limit does not hold while it reads another protocol."""
     broken.optional("distributed")
-    monkeypatch.setattr(engines, "_TIMEOUT", 1)
+    monkeypatch.setattr(cli.campaigns.engines, "_TIMEOUT", 1)
     with ThreadingHTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler) as server:
         Thread(target=server.serve_forever, daemon=True).start()
         options = ["--executor", f"dask://127.0.0.1:{server.server_port}"]
@@ -386,6 +382,6 @@ def test_what_a_worker_lacks_is_named():
         with pytest.raises(
             ValueError, match=r"a worker cannot read what is sent .*owhere"
         ) as caught:
-            compute_block(content, 0, 4)
+            _remote.compute_block(content, 0, 4)
         assert "\n" not in str(caught.value)
         assert pickle.loads(pickle.dumps(caught.value)).args == caught.value.args

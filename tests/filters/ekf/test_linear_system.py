@@ -15,8 +15,7 @@ from jaxslam.core.record import record
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Scan
 from jaxslam.filters import Closing, EkfSlam, Filter, Monitored, Wrapper
-from jaxslam.filters._ekf.correction import correct
-from jaxslam.filters._ekf.predicted_measurements import prediction_of
+from jaxslam.filters._ekf import correction, predicted_measurements
 from jaxslam.linearize import FirstEstimate
 
 SENSOR = sensors.RangeBearing(np.diag([0.1, 0.02]) ** 2, mount=(0.2, -0.1, 0.4))
@@ -74,7 +73,7 @@ def test_pairs_and_cross_covariances_are_those_of_dense_algebra(name, square_roo
 
     @jax.jit
     def look(held, scan):
-        prediction = prediction_of(ekf, SENSOR, held)
+        prediction = predicted_measurements.prediction_of(ekf, SENSOR, held)
         return prediction.pairs(scan), prediction.cross()
 
     pairs, cross = jax.device_get(look(held, scan))
@@ -101,8 +100,8 @@ def test_a_scan_judged_for_association_is_judged_alike_in_the_correction():
 
     @jax.jit
     def judged(joint, scan):
-        pairs = prediction_of(ekf, SENSOR, joint).pairs(scan)
-        return pairs, correct(ekf, SENSOR, joint, scan.z, slot, scan.valid)[1]
+        pairs = predicted_measurements.prediction_of(ekf, SENSOR, joint).pairs(scan)
+        return pairs, correction.correct(ekf, SENSOR, joint, scan.z, slot, scan.valid)[1]
 
     pairs, done = jax.device_get(judged(joint, scan))
     np.testing.assert_allclose(pairs.innovation[each, slot], done.innovation, atol=1e-12)

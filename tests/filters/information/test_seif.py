@@ -15,21 +15,14 @@ from jaxslam.charts import Euclidean
 from jaxslam.core.protocols import Filter
 from jaxslam.core.record import record
 from jaxslam.core.types import Scan, Status
-from jaxslam.filters._information import active_set, sparse_state
-from jaxslam.filters._information.eif_slam import InPieces
-from jaxslam.filters._information.marginals import (
-    blanket_cov,
-    blanket_marginals,
-    local_information,
-    recover_passive_means,
-)
+from jaxslam.filters._information import active_set, eif_slam, marginals, sparse_state
 from jaxslam.filters._reporting import nothing_of
 from jaxslam.simulation.scenarios import BetweenRanges, cloister
 
 COUNT = 36
 """landmarks of the cloister"""
 
-dense = jax.jit(lambda state: local_information(state, jnp.arange(state.alive.shape[0])))
+dense = jax.jit(lambda state: marginals.local_information(state, jnp.arange(state.alive.shape[0])))
 
 
 def canonical(state):
@@ -154,7 +147,7 @@ def sparsified(omega, plus, zero):
 def test_every_step_is_the_dense_formula():
     """Motion, sparsification, measurement and birth, in Ω and ξ, by dense NumPy."""
     f, predict, update = made()
-    relax = jax.jit(functools.partial(recover_passive_means, count=5))
+    relax = jax.jit(functools.partial(marginals.recover_passive_means, count=5))
     noise = np.diag([0.1, np.deg2rad(1.0)]) ** 2
     state, cut, born = start(f), 0, 0
     for u, scan in rows():
@@ -230,8 +223,8 @@ def test_whole_map_and_markov_blankets():
     omega = filters.whole_information(state).toarray()
     np.testing.assert_allclose(omega, dense(state), atol=1e-12 * np.abs(omega).max())
     cov = np.linalg.inv(omega)
-    found = np.asarray(jax.jit(blanket_marginals)(state)[1])
-    cov_of, chosen = jax.jit(blanket_cov), set(np.asarray(state.active))
+    found = np.asarray(jax.jit(marginals.blanket_marginals)(state)[1])
+    cov_of, chosen = jax.jit(marginals.blanket_cov), set(np.asarray(state.active))
     neighbours = np.asarray(state.neighbours)
     for slot in np.flatnonzero(state.alive):
         at = [0, 1, 2, 3 + 2 * slot, 4 + 2 * slot]
@@ -473,7 +466,7 @@ class Toy(Filter):
 
 
 def test_a_scan_in_pieces_loses_and_moves_nothing():
-    seen = InPieces(Toy(), 3)
+    seen = eif_slam.InPieces(Toy(), 3)
     tag = jnp.asarray([7, 3, 9, 1, 4, 8, 0])
     scan = Scan(jnp.stack([tag, -tag], axis=1) * 1.0 + 1.0, tag, tag != 9)
     state, info = jax.jit(seen.update)(jnp.zeros(()), scan, jax.random.key(0))

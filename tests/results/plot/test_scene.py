@@ -16,9 +16,7 @@ from jaxslam.filters._delayed.state import TableLayout, empty_state
 from jaxslam.filters._information.eif_slam import CanonicalState
 from jaxslam.filters._information.sparse_state import empty_map
 from jaxslam.filters._particles.slam_particles import initial_slam_particles
-from jaxslam.results.plot._film import still
-from jaxslam.results.plot._grid_figures import map_scene
-from jaxslam.results.plot._run_film import MOST, Cloud, Hypotheses, Links, history_of, run_scene
+from jaxslam.results.plot import _film, _grid_figures, _run_film
 
 STEPS = 3
 # Landmark 2 is new in the last step; a measurement of landmark 1 fails the gate there.
@@ -44,10 +42,14 @@ def run_of(steps=STEPS, seen=None):
     return Trace(grown, info, None, seen), Log(np.zeros((steps, 2)), scan), truth
 
 
-def scene_of(steps=STEPS, seen=None, frames=MOST, **more):
+def scene_of(steps=STEPS, seen=None, frames=_run_film.MOST, **more):
     trace, log, truth = run_of(steps, seen)
     true = {"true_points": truth.landmarks, "true_path": truth.pose} | more
-    return run_scene(history_of(trace, log, frames), **true), trace.estimate, truth
+    return (
+        _run_film.run_scene(_run_film.history_of(trace, log, frames), **true),
+        trace.estimate,
+        truth,
+    )
 
 
 def staged(panel):
@@ -175,14 +177,18 @@ def test_limits_are_those_of_the_truth_unless_the_estimate_is_near():
         assert low < values.min() and values.max() < high
     trace, log, truth = run_of()
     lost = trace._replace(estimate=trace.estimate._replace(pose=trace.estimate.pose * 100))
-    scene = run_scene(history_of(lost, log), true_points=truth.landmarks, true_path=truth.pose)
+    scene = _run_film.run_scene(
+        _run_film.history_of(lost, log), true_points=truth.landmarks, true_path=truth.pose
+    )
     assert np.ptp(scene.main.xlim) < 12
-    assert np.ptp(run_scene(history_of(lost, log)).main.xlim) > 200
+    assert np.ptp(_run_film.run_scene(_run_film.history_of(lost, log)).main.xlim) > 200
 
 
 def test_particles_are_drawn_by_weight():
     rng = np.random.default_rng(0)
-    seen = Cloud(rng.normal(size=(STEPS, 4, 3)), np.tile([0.5, 0.25, 0.25, 0.0], (STEPS, 1)))
+    seen = _run_film.Cloud(
+        rng.normal(size=(STEPS, 4, 3)), np.tile([0.5, 0.25, 0.25, 0.0], (STEPS, 1))
+    )
     scene, estimate, _ = scene_of(seen=seen)
     for panel, origin in ((scene.main, 0.0), (scene.beside, estimate.pose[1, :2])):
         axes, draw = staged(panel)
@@ -196,7 +202,7 @@ def test_links_appear_and_are_cut():
     strength = np.zeros((STEPS, 4, 4))
     strength[0, 0, 1] = strength[1, 0, 1] = strength[1, 1, 2] = 0.25
     strength[2, 1, 2] = 1.0
-    scene, estimate, _ = scene_of(seen=Links(strength + np.swapaxes(strength, 1, 2)))
+    scene, estimate, _ = scene_of(seen=_run_film.Links(strength + np.swapaxes(strength, 1, 2)))
     axes, draw = staged(scene.main)
     between, robot = (
         next(each for each in axes.collections if each.get_label() == label)
@@ -216,7 +222,7 @@ def test_links_appear_and_are_cut():
 def test_hypotheses_are_drawn_until_they_are_landmarks():
     points = np.arange(STEPS * 4.0).reshape(STEPS, 2, 2)
     covs = np.tile(0.04 * np.eye(2), (STEPS, 2, 1, 1))
-    seen = Hypotheses(points, covs, np.array([[0.0, 0.0], [1.0, 3.0], [0.0, 1.5]]))
+    seen = _run_film.Hypotheses(points, covs, np.array([[0.0, 0.0], [1.0, 3.0], [0.0, 1.5]]))
     scene, *_ = scene_of(seen=seen)
     axes, draw = staged(scene.main)
     (marked,) = [each for each in axes.lines if each.get_marker() == "D"]
@@ -260,7 +266,9 @@ def test_another_film_is_another_layer():
         image = axes.imshow(images[0], cmap="gray", vmin=0, vmax=1, extent=(0, 1, 0, 1))
         return lambda k: image.set_data(images[k])
 
-    panel = plot.Panel([growing, still(np.array([[0.5, 0.5]]), color="white")], (0, 1), (0, 1))
+    panel = plot.Panel(
+        [growing, _film.still(np.array([[0.5, 0.5]]), color="white")], (0, 1), (0, 1)
+    )
     film = plot.Film(plot.Scene(3, panel), width=4.0, fps=4)
     middle = [picture[110, 100, 0] for picture in pictures(film)]
     assert [film.scene.caption(k) for k in range(3)] == ["frame 1", "frame 2", "frame 3"]
@@ -394,7 +402,7 @@ def test_mapping_from_a_known_path_is_filmed():
 def test_a_map_scene_has_as_many_paths_as_maps():
     origin, path = np.zeros(3), np.zeros((2, 3))
     maps = [np.zeros((2, 3)), np.ones((2, 3))]
-    scene = map_scene(maps, origin, 0.5, [path, path], ["one", "two"])
+    scene = _grid_figures.map_scene(maps, origin, 0.5, [path, path], ["one", "two"])
     assert scene.frames == 2 and scene.caption(1) == "two"
     assert scene.main.xlim == (0.0, 1.5) and scene.main.ylim == (0.0, 1.0)
     for wrong, message in (
@@ -403,4 +411,4 @@ def test_a_map_scene_has_as_many_paths_as_maps():
         ((maps, np.ones(3), 0.5, [path, path], ["one", "two"]), "without yaw"),
     ):
         with pytest.raises(ValueError, match=message):
-            map_scene(*wrong)
+            _grid_figures.map_scene(*wrong)
