@@ -12,6 +12,7 @@ import pytest
 import yaml
 from matplotlib.animation import FFMpegWriter
 from PIL import Image
+from reference.walls import is_free
 from ring_of_rooms import FAR, ranges_of
 
 from jaxslam import _cli as cli
@@ -19,7 +20,6 @@ from jaxslam import datasets, grids
 from jaxslam.core.types import Estimate
 from jaxslam.math import numpy_poses as poses
 from jaxslam.results import plot, report
-from jaxslam.simulation._wall_geometry import is_free
 from jaxslam.simulation.laser import scan_world
 from jaxslam.simulation.scenarios import square
 from jaxslam.simulation.walls import make_walls, rasterize

@@ -4,13 +4,13 @@ import itertools
 
 import jax.numpy as jnp
 import numpy as np
+from worlds import unmatched
 
 from jaxslam import charts
 from jaxslam._cli.campaigns import piecewise
 from jaxslam.core.protocols import Filter
 from jaxslam.core.record import record
 from jaxslam.core.types import Estimate, Log, Scan
-from jaxslam.filters._reporting import nothing_of
 
 STEPS = 11
 
@@ -32,7 +32,7 @@ def toy(traced):
             return pose + u
 
         def update(self, pose, scan, key):
-            return pose, nothing_of(scan)._replace(log_likelihood=pose[0])
+            return pose, unmatched(scan)._replace(log_likelihood=pose[0])
 
         def estimate(self, pose):
             return Estimate(

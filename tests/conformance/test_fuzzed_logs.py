@@ -20,7 +20,7 @@ from jaxslam import catalog, run
 from jaxslam.core import _numbers, _validation
 from jaxslam.core.protocols import Filter
 from jaxslam.core.types import Log, Scan, Status
-from jaxslam.graphs.smoothing._forward_pass import LogEstimator
+from jaxslam.graphs.smoothing import BatchMap, Smoother
 
 WIDE = int(os.environ.get("JAXSLAM_FUZZ", "1"))
 STEPS, PLACES, LANDMARKS, LOGS = 4, 3, 4, 48
@@ -56,7 +56,7 @@ def made(name, steps=STEPS):
     """A filter of the catalogue, given the true map or path where it needs one."""
     options = {} if WIDE > 1 else TOGETHER.get(name, {})
     candidate = catalog.ALL[name](WORLD, **options)
-    if isinstance(candidate, Filter | LogEstimator):
+    if isinstance(candidate, Filter | BatchMap | Smoother):
         return candidate
     truth = worlds.draw(WORLD)[0]
     if name == "mapping":  # the poses are its controls

@@ -10,11 +10,10 @@ import pytest
 import scipy.stats
 import worlds
 from cases import refused
-from test_consistency import STEPS, plain_nees, scored, summed, synthetic
+from test_consistency import STEPS, plain_nees, scored, summary_of, synthetic
 
 from jaxslam import charts, consistency, motion, sensors, simulate
 from jaxslam.consistency import _bound, _measures, _run_scores, block_nees
-from jaxslam.consistency._summary import summarize
 from jaxslam.core.types import Estimate, Info, Log, Scan, Status, Trace, Truth
 from jaxslam.filters import ParticleInfo, Pruned, _ekf, _particles
 from jaxslam.filters.map_management import _merging
@@ -25,7 +24,7 @@ STATUSES = [status.name.lower() for status in (*_measures.counts.KEPT, *_measure
 
 def test_coverage_is_the_share_of_truth_inside_the_ellipsoids():
     trace, truth, error = synthetic(np.random.default_rng(0), runs=40)
-    summary = summarize(summed(trace, truth))
+    summary = summary_of(trace, truth)
     nees = plain_nees(error, trace.estimate.pose_cov)
     for p, share in zip(_measures.coverage.LEVELS, summary.coverage["pose"], strict=True):
         np.testing.assert_allclose(share, np.mean(nees <= scipy.stats.chi2.ppf(p, 3)), rtol=1e-12)
@@ -148,7 +147,7 @@ def correlated(rng, rho, runs=30, steps=200, slots=3):
 @pytest.mark.parametrize("rho", [0.0, 0.4])
 def test_the_autocorrelation_of_innovations_is_found_lag_by_lag(rho):
     trace, truth = correlated(np.random.default_rng(3), rho)
-    summary = summarize(summed(trace, truth))
+    summary = summary_of(trace, truth)
     pairs = 30 * 199 * 3 * 2
     expected = rho ** np.arange(1, _run_scores.LAGS + 1)
     # Five standard errors of a product of two normals, and of an AR(1) sum where correlated.
@@ -166,7 +165,7 @@ def test_runs_shorter_than_a_lag_have_no_autocorrelation_there():
     trace, truth, _ = synthetic(np.random.default_rng(4), runs=3)
     short = jax.tree.map(lambda leaf: leaf[:, :4], (trace, truth._replace(start=truth.pose)))
     short_truth = short[1]._replace(start=truth.start, landmarks=truth.landmarks)
-    summary = summarize(summed(short[0], short_truth))
+    summary = summary_of(short[0], short_truth)
     assert np.isnan(summary.autocorrelation[3:]).all()
 
 
@@ -175,7 +174,7 @@ def test_landmark_nees_and_own_coordinates():
     covs = np.random.default_rng(6).normal(size=(6, STEPS, 3, 2, 2))
     covs = covs @ covs.swapaxes(-1, -2) + 0.1 * np.eye(2)
     trace = trace._replace(estimate=trace.estimate._replace(point_covs=covs))
-    summary = summarize(summed(trace, truth))
+    summary = summary_of(trace, truth)
     kept = [0, 2]  # slots with tags 2 and 0
     off = truth.landmarks[:, None, [2, 0]] - trace.estimate.points[:, :, kept]
     nees = np.einsum(
@@ -299,7 +298,7 @@ def test_runs_that_are_not_finite_are_named():
     trace, truth, _ = synthetic(np.random.default_rng(7), runs=10)
     trace.estimate.pose[5, 3, 0] = np.nan
     trace.info.nis[2, 1, 0] = np.inf
-    summary = summarize(summed(trace, truth))
+    summary = summary_of(trace, truth)
     assert summary.not_finite_runs == [2, 5]
     for name in ("nees_pose", "noncredibility", "inclination"):  # by the number of the run
         assert len(summary.per_run[name]) == 10

@@ -9,6 +9,8 @@ from jaxslam.consistency.campaign import Campaign
 from jaxslam.core.types import Estimate, Truth
 
 STEPS, RUNS = 200, 32
+DOF, LEVELS, LAGS = _measures.nees.DOF, _measures.coverage.LEVELS, _run_scores.LAGS
+"""The blocks of NEES, the levels of coverage and the lags of innovations that a `Summary` has."""
 LANDMARKS = np.array([[4.0, 1.0], [0.0, 5.0], [-4.0, 0.0]])
 SLOW = {"fastslam1": 2e3, "dead_reckoning": 2.0}
 WORSE = {"fastslam1": 1e27, "fastslam2": 1e3, "ekf": 4.0, "seif": 12.0, "iterated": 3.8}
@@ -22,7 +24,7 @@ def summary(name, seed=0, steps=STEPS):
     worse, far = WORSE.get(name, 1.1), FARTHER.get(name, 1.0 + 0.05 * seed)
     reckons = name == "dead_reckoning"
     curves = {}
-    for block, dof in _measures.nees.DOF.items():
+    for block, dof in DOF.items():
         noise = rng.chisquare(RUNS * dof, steps) / RUNS
         curves[f"nees_{block}"] = noise * np.exp(np.log(worse) * grows)
         curves[f"nees_{block}_low"] = np.full(steps, 0.7 * dof)
@@ -39,13 +41,9 @@ def summary(name, seed=0, steps=STEPS):
         nis_band=None,
         inside={},
         curves=curves,
-        coverage={
-            block: np.asarray(_measures.coverage.LEVELS) ** worse for block in _measures.nees.DOF
-        },
-        autocorrelation=np.full(_run_scores.LAGS, np.nan)
-        if reckons
-        else rng.normal(0, 0.01, _run_scores.LAGS),
-        autocorrelation_band=np.full(_run_scores.LAGS, np.inf if reckons else 0.02),
+        coverage={block: np.asarray(LEVELS) ** worse for block in DOF},
+        autocorrelation=np.full(LAGS, np.nan) if reckons else rng.normal(0, 0.01, LAGS),
+        autocorrelation_band=np.full(LAGS, np.inf if reckons else 0.02),
         counts={"runs": RUNS, "fused": 0 if reckons else 900},
         per_run={},
         not_finite_runs=[],

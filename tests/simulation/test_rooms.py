@@ -11,7 +11,7 @@ import worlds
 from cases import refused, swept
 
 from jaxslam import catalog, run, simulate
-from jaxslam.simulation._wall_geometry import exact_ranges, is_free, wall_lines
+from jaxslam.simulation._wall_geometry import is_free, wall_lines
 from jaxslam.simulation.laser import Laser, scan, scan_information, scan_world, true_ranges
 from jaxslam.simulation.scenarios import (
     ROOMS,
@@ -48,11 +48,12 @@ def test_exact_ranges_are_intersections_with_every_wall(differences):
     rng = np.random.default_rng(0)
     pose = np.column_stack([rng.uniform(-1, 1, (20, 2)), rng.uniform(-3, 3, 20)])
     angles = np.linspace(-3, 3, 25)
+    laser = Laser(angles, max_range=4.5)
     both = jax.jit(
         jax.vmap(
             lambda p: (
-                exact_ranges(world, p, angles, 4.5),
-                jax.jacfwd(exact_ranges, 1)(world, p, angles, 4.5),
+                true_ranges(laser, world, p),
+                jax.jacfwd(true_ranges, 2)(laser, world, p),
             )
         )
     )
@@ -70,11 +71,7 @@ def test_the_robot_drives_in_free_space_and_its_scans_are_the_lasers(name):
     log = scan_world(world, jax.random.key(0))
     assert np.all(is_free(world.walls, np.asarray(log.pose)[:, :2]))
     laser = world.laser
-    exact = np.array(
-        jax.jit(jax.vmap(lambda p: exact_ranges(world.walls, p, laser.angles, laser.max_range)))(
-            log.pose
-        )
-    )
+    exact = np.array(jax.jit(jax.vmap(lambda p: true_ranges(laser, world.walls, p)))(log.pose))
     valid = np.asarray(log.beams.valid)
     n = valid.size
     assert abs((~valid).mean() - laser.dropout) < 5 * np.sqrt(laser.dropout / n)
@@ -128,7 +125,7 @@ def test_maximum_likelihood_estimates_reach_the_cramer_rao_bound():
     bound = scan_information(laser, world.walls, pose).bound
 
     def ranges(pose):
-        return exact_ranges(world.walls, pose, laser.angles, laser.max_range)
+        return true_ranges(laser, world.walls, pose)
 
     def estimate(key):
         beams = scan(laser, world.walls, pose, key)

@@ -5,8 +5,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from command import run_command
 
-from jaxslam import _cli as cli
 from jaxslam.verify._inputs import user_files
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -22,7 +22,7 @@ def verify(tmp_path, capsys):
         return on(str(path) + name)
 
     def on(target):
-        status = cli.main(["verify", target, "--out", str(tmp_path / "out")])
+        status = run_command(["verify", target, "--out", str(tmp_path / "out")])
         printed = capsys.readouterr()
         result = tmp_path / "out" / "verify.json"
         content = json.loads(result.read_text(encoding="utf-8")) if result.exists() else None

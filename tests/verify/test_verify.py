@@ -308,9 +308,8 @@ def test_lengths_are_those_of_the_states():
     states = (np.ones((4, 2)), np.ones((4, 5)))
     function = _inputs.functions.plain_function(lambda a, b: a * b[:2], None, states=states)
     assert {a.name: len(a.entries) for a in function.arguments} == {"a": 2, "b": 5}
-    sized = _inputs.functions.plain_function(
-        lambda u: u, None, {"u": np.int64(2)}
-    )  # from the shape of an array
+    # A size from the shape of an array.
+    sized = _inputs.functions.plain_function(lambda u: u, None, {"u": np.int64(2)})
     assert sized.arguments[0].entries == ("u[0]", "u[1]")
 
 

@@ -9,8 +9,8 @@ from pathlib import Path
 import jax
 import pytest
 import worlds
+from command import run_command
 
-from jaxslam import _cli as cli
 from jaxslam import filters, store
 from jaxslam.consistency.campaign import monte_carlo
 from jaxslam.results import _campaign_files as campaign_files
@@ -131,7 +131,7 @@ def undrawn():
 
 
 def command(out, *more):
-    return cli.main(["consistency", *ASKED, "--runs", "13", "--out", str(out), *more])
+    return run_command(["consistency", *ASKED, "--runs", "13", "--out", str(out), *more])
 
 
 def results(out):
@@ -175,8 +175,8 @@ def test_the_command_computes_a_part(tmp_path, capsys, in_one_go):
         assert f"--part: expected I/N with 1 <= I <= N, as 3/16, got '{part}'" in (
             capsys.readouterr().err
         )
-    assert cli.main(["consistency", "--resume", str(out), "--part", "1/9"]) == 0
-    assert cli.main(["consistency", "--resume", str(out)]) == 0  # with the devices of the parts
+    assert run_command(["consistency", "--resume", str(out), "--part", "1/9"]) == 0
+    assert run_command(["consistency", "--resume", str(out)]) == 0  # with the devices of the parts
     assert results(out) == results(in_one_go)
     assert command(in_one_go, "--devices", "1", "--part", "1/2") == 2
     assert (
@@ -202,5 +202,5 @@ def test_the_job_array_of_the_documentation(tmp_path, in_one_go):
     out = tmp_path / "campaign"
     spans = store.resume(out / "blocks").spans()
     assert [first for first, _ in spans] == [0, 4, 6, 10, 12]
-    assert cli.main(["consistency", "--resume", str(out)]) == 0
+    assert run_command(["consistency", "--resume", str(out)]) == 0
     assert results(out) == results(in_one_go)

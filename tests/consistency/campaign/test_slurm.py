@@ -10,8 +10,8 @@ from pathlib import Path
 
 import jax
 import pytest
+from command import run_command
 
-from jaxslam import _cli as cli
 from jaxslam import store
 
 PROGRAMS = ("munged", "mungekey", "slurmctld", "slurmd", "sbatch", "squeue", "scancel")
@@ -120,7 +120,9 @@ def slurm(tmp_path_factory):
 def test_the_job_array_sums_to_the_same_bits_though_a_task_is_cancelled(slurm, tmp_path):
     jax.devices()  # before the command can ask for another number of them
     assert (
-        cli.main(["consistency", *ASKED, *RUNS, "--devices", "1", "--out", str(tmp_path / "whole")])
+        run_command(
+            ["consistency", *ASKED, *RUNS, "--devices", "1", "--out", str(tmp_path / "whole")]
+        )
         == 0
     )
     job = slurm("sbatch", "--parsable", "--cpus-per-task=1", SCRIPT, *ASKED, *RUNS, cwd=tmp_path)

@@ -8,7 +8,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import refused
-from worlds import draw, narrow
+from worlds import draw, narrow, unmatched
 
 from jaxslam import catalog, filters, run, scenarios, sensors
 from jaxslam.charts import Euclidean
@@ -16,7 +16,6 @@ from jaxslam.core.protocols import Filter
 from jaxslam.core.record import record
 from jaxslam.core.types import Scan, Status
 from jaxslam.filters._information import active_set, eif_slam, marginals, sparse_state
-from jaxslam.filters._reporting import nothing_of
 from jaxslam.simulation.scenarios import BetweenRanges, cloister
 
 COUNT = 36
@@ -458,7 +457,7 @@ class Toy(Filter):
 
     def update(self, state, scan, key):
         assert scan.tag.shape == (3,)
-        info = nothing_of(scan)._replace(slot=scan.tag, log_likelihood=scan.z.sum())
+        info = unmatched(scan)._replace(slot=scan.tag, log_likelihood=scan.z.sum())
         return state + jnp.where(scan.valid, scan.z[:, 0], 0.0).sum(), info
 
     def estimate(self, state):

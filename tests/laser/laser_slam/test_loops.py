@@ -7,7 +7,8 @@ import pytest
 from ring_of_rooms import SETTINGS, driven
 
 from jaxslam import graphs, laser_slam, metrics
-from jaxslam.laser.laser_slam import _assembly, _end_covariances, _loops, _score
+from jaxslam.laser.laser_slam import _assembly, _end_covariances, _score
+from jaxslam.laser.laser_slam._loops import loop_candidates, pairwise
 from jaxslam.math import numpy_poses as poses
 
 
@@ -58,10 +59,10 @@ def test_a_false_loop_agrees_with_no_true_one(chain):
     cov = np.broadcast_to(1e-4 * np.eye(3), (5, 3, 3))
     z = poses.between(path[first], path[second]) + 0.01 * random.normal(size=(5, 3))
     z[4] += [3.0, -3.0, 0.8]
-    agree = _loops.pairwise.pairwise_consistency(path, total, first, second, z, cov, 0.999)
+    agree = pairwise.pairwise_consistency(path, total, first, second, z, cov, 0.999)
     assert agree[:4, :4].all() and not agree[4, :4].any()
     assert (agree == agree.T).all()
-    np.testing.assert_array_equal(_loops.pairwise.clique(agree, np.ones(5)), [1, 1, 1, 1, 0])
+    np.testing.assert_array_equal(pairwise.clique(agree, np.ones(5)), [1, 1, 1, 1, 0])
 
 
 @pytest.mark.sweep
@@ -78,9 +79,7 @@ def test_true_loops_agree_as_often_as_their_probability_says(chain):
         drawn = poses.chain(path[0], poses.compose(steps, error))
         z = poses.compose(true, 1e-3 * random.normal(size=(2, 3)))
         total = _end_covariances.along(drawn, 1e-3 * covs)
-        agreed += _loops.pairwise.pairwise_consistency(drawn, total, first, second, z, cov, 0.9)[
-            0, 1
-        ]
+        agreed += pairwise.pairwise_consistency(drawn, total, first, second, z, cov, 0.9)[0, 1]
     assert abs(agreed / 300 - 0.9) < 3 * np.sqrt(0.9 * 0.1 / 300)
 
 
@@ -90,25 +89,25 @@ def test_the_clique_is_one_and_large():
     inside = np.arange(25)
     agree[np.ix_(inside, inside)] = True
     agree |= agree.T
-    solved = _loops.pairwise.clique(agree, np.ones(60))
+    solved = pairwise.clique(agree, np.ones(60))
     assert solved.sum() >= 25
     members = np.flatnonzero(solved)
     assert (agree[np.ix_(members, members)] | np.eye(len(members), dtype=bool)).all()
-    assert not _loops.pairwise.clique(np.zeros((0, 0), bool), np.zeros(0)).any()
+    assert not pairwise.clique(np.zeros((0, 0), bool), np.zeros(0)).any()
 
 
 def test_a_descriptor_does_not_see_the_heading():
     random = np.random.default_rng(6)
     far, at = random.uniform(1, 10, (2, 80)), random.uniform(0, 2 * np.pi, (2, 80))
-    turned = at + 2 * np.pi / _loops.loop_candidates.SECTORS * 7
+    turned = at + 2 * np.pi / loop_candidates.SECTORS * 7
 
     def of(angle):
         points = far[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-        return _loops.loop_candidates.descriptors(points, np.ones((2, 80), bool))
+        return loop_candidates.descriptors(points, np.ones((2, 80), bool))
 
     np.testing.assert_allclose(of(at), of(turned), atol=1e-9)
     assert of(at)[0] @ of(at)[1] < 0.95
-    assert not _loops.loop_candidates.descriptors(np.zeros((1, 4, 2)), np.zeros((1, 4), bool)).any()
+    assert not loop_candidates.descriptors(np.zeros((1, 4, 2)), np.zeros((1, 4), bool)).any()
 
 
 # --- Covariances of relative poses by the graph, against dense NumPy, and relations of the true p--

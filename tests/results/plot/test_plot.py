@@ -393,9 +393,8 @@ def test_five_filters_fit_a_page_and_a_column_in_letters_of_one_size(five, draw,
 
 @pytest.mark.parametrize("draw", swept(FIGURES, plot.nees_figure))
 def test_twenty_filters_can_be_read_and_nothing_overlaps(every, draw):
-    rows = (
-        draw is _pose_errors.run_errors_figure
-    )  # three panels a filter: slow to lay out, and all alike
+    # Three panels a filter: slow to lay out, and all alike.
+    rows = draw is _pose_errors.run_errors_figure
     figure = draw(drawn.campaign(list(ALL)[:7]) if rows else every)
     figure.draw_without_rendering()
     page = figure.bbox

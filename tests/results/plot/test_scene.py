@@ -10,12 +10,8 @@ import pytest
 import worlds
 
 import jaxslam
-from jaxslam import catalog, filters, plot
+from jaxslam import catalog, filters, motion, plot, sensors
 from jaxslam.core.types import Info, Log, Scan, Status, Trace
-from jaxslam.filters._delayed.state import TableLayout, empty_state
-from jaxslam.filters._information.eif_slam import CanonicalState
-from jaxslam.filters._information.sparse_state import empty_map
-from jaxslam.filters._particles.slam_particles import initial_slam_particles
 from jaxslam.results.plot import _film, _grid_figures, _run_film
 
 STEPS = 3
@@ -321,9 +317,12 @@ def test_a_run_that_is_not_finite_is_drawn_as_far_as_it_goes_and_says_so():
 # --- what is seen of a filter's state -----------------------------------------------------------
 
 
+MODELS = motion.Increment(np.eye(2)), sensors.RangeBearing(np.eye(2))
+
+
 def test_of_particles_their_poses_and_weights_are_seen():
-    start = np.ones(3), np.zeros((3, 3))
-    seen = jax.jit(lambda: plot.probe(initial_slam_particles(*map(jnp.asarray, start), 4, 2, 2)))()
+    filter = filters.FastSlam(*MODELS, capacity=2, particles=4)
+    seen = jax.jit(lambda: plot.probe(filter.init(jnp.ones(3), jnp.zeros((3, 3)))))()
     np.testing.assert_array_equal(seen.pose, np.ones((4, 3)))
     np.testing.assert_allclose(seen.weight, 0.25)
     assert plot.probe(np.zeros(3)) is None
@@ -339,35 +338,45 @@ def test_of_information_the_links_are_seen_dense_and_sparse():
     size = np.array([[np.linalg.norm(omega[a, b]) for b in rows] for a in rows])
     expected = size / np.sqrt(np.outer(np.diag(size), np.diag(size)))
     np.fill_diagonal(expected, 0.0)
-    dense = CanonicalState(
-        np.zeros(3), np.zeros((3, 2)), omega, np.zeros(9), np.ones(3, bool), np.arange(3), 0
-    )
+    start = jnp.zeros(3), jnp.eye(3)
+    dense = filters.EifSlam(*MODELS, capacity=3).init(*start)
+    dense = dense._replace(omega=omega, alive=np.ones(3, bool), tag=np.arange(3))
     find = jax.jit(plot.probe)
     np.testing.assert_allclose(find(dense).strength, expected, rtol=1e-5)
     # Landmarks 0 and 1 are active; 2 is passive, and linked by its list.
-    sparse = empty_map(np.zeros(3), omega[:3, :3], capacity=3, active=2, links=2)._replace(
-        alive=np.ones(3, bool),
-        active=np.array([0, 1]),
-        omega=omega[:7, :7],
-        diagonal=np.stack([np.eye(2), np.eye(2), omega[7:, 7:]]),
-        neighbours=np.array([[2, 3], [2, 3], [0, 1]]),
-        links=np.stack(
-            [
-                [omega[3:5, 7:], np.zeros((2, 2))],
-                [omega[5:7, 7:], np.zeros((2, 2))],
-                [omega[7:, 3:5], omega[7:, 5:7]],
-            ]
-        ),
+    sparse = (
+        filters.Seif(*MODELS, capacity=3, active=2, links=2)
+        .init(*start)
+        ._replace(
+            alive=np.ones(3, bool),
+            active=np.array([0, 1]),
+            omega=omega[:7, :7],
+            diagonal=np.stack([np.eye(2), np.eye(2), omega[7:, 7:]]),
+            neighbours=np.array([[2, 3], [2, 3], [0, 1]]),
+            links=np.stack(
+                [
+                    [omega[3:5, 7:], np.zeros((2, 2))],
+                    [omega[5:7, 7:], np.zeros((2, 2))],
+                    [omega[7:, 3:5], omega[7:, 5:7]],
+                ]
+            ),
+        )
     )
     np.testing.assert_allclose(find(sparse).strength, expected, rtol=1e-5)
 
 
 def test_of_delayed_initialization_the_hypotheses_are_seen():
-    layout = TableLayout(landmarks=2, hypotheses=3, stored=4)
-    state = empty_state(layout, jnp.zeros(3), jnp.zeros((3, 3)))
+    filter = filters.DelayedSlam(
+        MODELS[0],
+        sensors.BearingOnly(np.eye(1)),
+        capacity=2,
+        stored=filters.StoredMeasurements(capacity=4),
+        hypotheses=filters.Hypotheses(capacity=3),
+    )
+    state = filter.init(jnp.zeros(3), jnp.zeros((3, 3)))
     rng = np.random.default_rng(2)
     cov = np.cov(rng.normal(size=(30, 60)))
-    table = rng.normal(size=(layout.slots, 3))
+    table = rng.normal(size=state.joint.landmarks.shape)
     alive = np.array([1, 1, 1, 0, 1, 1, 1, 0, 0], bool)
     joint = state.joint._replace(landmarks=table, cov=cov, alive=alive)
     seen = jax.jit(plot.probe)(state._replace(joint=joint, persistence=jnp.array([1.0, 5.0, 2.5])))
