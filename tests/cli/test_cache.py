@@ -108,11 +108,11 @@ def warned(capsys):
 
 def test_a_folder_that_cannot_be_is_said_and_done_without(tmp_path, capsys, monkeypatch):
     (tmp_path / "file").write_text("")
-    asked = tmp_path / "file" / "cache"
-    with cli.cache.program_cache(asked):
+    cache_folder = tmp_path / "file" / "cache"
+    with cli.cache.program_cache(cache_folder):
         one_program()
     (line,) = warned(capsys)
-    assert f"cannot be kept in {asked} (" in line
+    assert f"cannot be kept in {cache_folder} (" in line
     assert "continuing without" in line
 
     def homeless():
@@ -132,10 +132,10 @@ def test_a_damaged_program_is_said_and_compiled_anew(tmp_path, capsys, spoil):
 
     assert both() == 0
     for path in entries(tmp_path):
-        whole = path.read_bytes()
+        content = path.read_bytes()
         path.write_bytes(
             {
-                "truncated": whole[: len(whole) // 2],
+                "truncated": content[: len(content) // 2],
                 "empty": b"",
                 "noise": bytes(range(256)),
                 "of another version": zlib.compress(b"\0\0\0\1" + b"another version's " * 9),

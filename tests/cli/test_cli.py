@@ -23,9 +23,9 @@ QUICK = ["consistency", "--scenario", "circle", "--steps", "8", "--runs", "3"]
 def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys, monkeypatch, undrawn):
     out, filmed = tmp_path / "results", []
     monkeypatch.setattr(cli.consistency, "_write_films", lambda *a: filmed.append(a) or 0)
-    asked = ["--filters", "dead_reckoning,localization", "--no-bound", "--seed", "4", "--animate"]
+    options = ["--filters", "dead_reckoning,localization", "--no-bound", "--seed", "4", "--animate"]
     shape = ["--block", "1", "--devices", "1"]
-    assert cli.main([*QUICK, *asked, *shape, "--out", str(out)]) == 0
+    assert cli.main([*QUICK, *options, *shape, "--out", str(out)]) == 0
     printed = capsys.readouterr().out
     assert "verdict" in printed
     assert "published" not in printed  # of 2500 steps, and these are 8
@@ -46,10 +46,10 @@ def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys, monk
         *(f"{n}.png" for n in ("nees", "rmse", "cost", "coverage", "whiteness", "gained")),
         *(f"{n}.png" for n in ("errors", "map")),
     }
-    found = json.loads((out / "consistency.json").read_text())
-    assert (found["runs"], found["steps"], found["seed"]) == (3, 8, 4)
-    assert list(found["filters"]) == ["dead_reckoning", "localization"]
-    assert found["command"].startswith("jaxslam consistency --scenario circle")
+    result = json.loads((out / "consistency.json").read_text())
+    assert (result["runs"], result["steps"], result["seed"]) == (3, 8, 4)
+    assert list(result["filters"]) == ["dead_reckoning", "localization"]
+    assert result["command"].startswith("jaxslam consistency --scenario circle")
     ((folder, world, filters, *rest),) = filmed
     assert (folder, world.name, list(filters), rest) == (
         out,
@@ -117,11 +117,11 @@ def test_bad_input_exits_with_2_and_writes_nothing(tmp_path, refused, change, me
 
 
 def test_no_more_devices_are_made_than_there_are_cores(monkeypatch):
-    told = {}
-    monkeypatch.setattr(jax.config, "update", told.__setitem__)
-    for asked, made in (("99", cli.common.cores()), ("1", 1), ("all", cli.common.cores())):
-        cli.common.set_device_count(asked)
-        assert told == {"jax_num_cpu_devices": made}
+    updates = {}
+    monkeypatch.setattr(jax.config, "update", updates.__setitem__)
+    for devices, count in (("99", cli.common.cores()), ("1", 1), ("all", cli.common.cores())):
+        cli.common.set_device_count(devices)
+        assert updates == {"jax_num_cpu_devices": count}
 
 
 @pytest.mark.parametrize("asked", ["all", "fastslam1,fastslam2,particle_localization"])

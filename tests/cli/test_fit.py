@@ -84,7 +84,9 @@ def test_the_noises_of_a_folder_are_fitted_and_written(tmp_path, capsys):
     assert (out / "fit.toml").read_text() == (tmp_path / "fit.toml").read_text()
     fitted = datasets.table(tmp_path)
     assert fitted.motion.name == "velocity" and "[sensor] noise of fit.toml" in fitted.assumed
-    after = {one.name: one.value for one in fitted.adjustable.parameters}["sensor range [m]"]
+    after = {parameter.name: parameter.value for parameter in fitted.adjustable.parameters}[
+        "sensor range [m]"
+    ]
     np.testing.assert_allclose(after, said["parameters"]["sensor range [m]"]["after"], rtol=1e-3)
     assert (out / "fit.toml").read_text().startswith("[motion]\nnoise = [")
     comment = "  # v [m/s], omega [rad/s], gamma [rad/s]\n\n[sensor]\nnoise = ["

@@ -252,7 +252,7 @@ def test_a_robot_is_localized_by_a_laser_on_a_mount(mounted, room_map, tmp_path)
 def test_odometry_of_a_file_takes_the_place_of_the_logs(log_file, tmp_path):
     text = "".join(f"{100 + 0.25 * k} {k / 10} 0 0\n" for k in range(STEPS))
     (tmp_path / "odometry.txt").write_text(text)
-    asked = {"path": log_file.path, "odometry": tmp_path / "odometry.txt"}
+    paths = {"path": log_file.path, "odometry": tmp_path / "odometry.txt"}
     rest = {
         "max_range": 10.0,
         "laser": None,
@@ -261,7 +261,7 @@ def test_odometry_of_a_file_takes_the_place_of_the_logs(log_file, tmp_path):
         "scans": ":",
         "every": 2,
     }
-    log, _ = cli.laser_log.read_log(SimpleNamespace(**asked, **rest))
+    log, _ = cli.laser_log.read_log(SimpleNamespace(**paths, **rest))
     np.testing.assert_allclose(log.raw[:, 0], np.arange(0, STEPS, 2) / 10)
     assert log.odometry_known.shape == (STEPS // 2,)
 
@@ -344,16 +344,16 @@ def test_a_bag_gives_the_files_that_its_log_gives(bag, log_file, tmp_path, undra
 def test_the_robot_of_a_bag_is_localized(
     bag, log_file, room_map, tmp_path, undrawn, monkeypatch, odometry
 ):
-    given, out = bag, tmp_path / "out"
+    recording, out = bag, tmp_path / "out"
     if not odometry:
         log = bags.first(datasets.carmen(log_file.path, max_range=10.0), STEPS)
-        given = bags.write(tmp_path, [m for m in bags.of_log(log) if m.topic != "/odom"])
+        recording = bags.write(tmp_path, [m for m in bags.of_log(log) if m.topic != "/odom"])
         solved = SimpleNamespace(odometry=log.raw)  # 25 beams are too few for laser odometry
         monkeypatch.setattr(cli.localize.laser_slam, "solve", lambda log: solved)
     x, y, heading = log_file.pose[0]
     start = f"{x},{y},{np.rad2deg(heading)}"
     options = ["--max-range", "10", "--particles", "500", "--start", start, "--out", out]
-    assert command("run", "--dataset", "rosbag", given, "--localize", room_map, *options) == 0
+    assert command("run", "--dataset", "rosbag", recording, "--localize", room_map, *options) == 0
     rows = np.loadtxt(out / "trajectory.csv", delimiter=",", skiprows=1)
     error = np.hypot(*(rows[:, 1:3] - log_file.pose[:, :2]).T)
     assert np.median(error) < 0.3 and error[-1] < 0.3

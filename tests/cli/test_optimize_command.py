@@ -178,8 +178,10 @@ def test_gtsam_reads_what_is_written(tmp_path, undrawn, fixed):
 def test_an_optimum_without_a_proof_says_what_to_try(monkeypatch):
     proof = SimpleNamespace(certified=False, chi2=2.0, gap=1.0, position=0.1, heading=0.1)
     monkeypatch.setattr(graphs, "certificate", lambda graph: proof)
-    told = cli.optimize._certificate(small(), converged=True, plain=True)
-    assert told["certificate"].startswith("not certified: ") and "--start" in told["certificate"]
+    summary = cli.optimize._certificate(small(), converged=True, plain=True)
+    assert (
+        summary["certificate"].startswith("not certified: ") and "--start" in summary["certificate"]
+    )
 
 
 def test_too_few_steps_are_no_success(file, tmp_path, capsys):

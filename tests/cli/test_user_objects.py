@@ -76,11 +76,11 @@ def mine(tmp_path):
 def test_filters_of_a_file_stand_beside_those_of_the_catalog(mine, capsys):
     files = cli.user_objects.UserObjects()
     world = scenarios.circle(3)
-    asked = f"ekf, {mine}:blind,{mine}:ready,{mine}:alike,{mine}:named"
-    found = files.filters(asked, world)
-    assert list(found) == ["ekf", "blind", "ready", "alike", "named"]  # as they were asked for
-    assert all(isinstance(found[name], Filter) for name in ("ekf", "blind", "ready"))
-    assert isinstance(found["alike"](None), Filter)
+    names = f"ekf, {mine}:blind,{mine}:ready,{mine}:alike,{mine}:named"
+    filters = files.filters(names, world)
+    assert list(filters) == ["ekf", "blind", "ready", "alike", "named"]  # as they were asked for
+    assert all(isinstance(filters[name], Filter) for name in ("ekf", "blind", "ready"))
+    assert isinstance(filters["alike"](None), Filter)
     assert capsys.readouterr().out == "loaded\n"  # once
     assert list(files.filters(f"{mine}:plain,{mine}:wide", world)) == ["plain", "wide"]
     assert list(files.filters("all", world)) == list(catalog.ALL)

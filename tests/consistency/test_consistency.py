@@ -73,11 +73,11 @@ def scored(trace, truth, chart_error_of=None):
 
 
 def summed(trace, truth, limit=1e9):
-    each = scored(trace, truth)
+    scores_of_runs = scored(trace, truth)
     tally = _tally.Tally()
     # In two parts, as blocks come.
     for first, part in ((2, slice(2, None)), (0, slice(0, 2))):
-        scores = jax.tree.map(lambda leaf, part=part: np.asarray(leaf)[part], each)
+        scores = jax.tree.map(lambda leaf, part=part: np.asarray(leaf)[part], scores_of_runs)
         if len(scores.finite) > 0:
             tally.add(first, len(scores.finite), _tally.condense(scores, first, limit))
     return tally

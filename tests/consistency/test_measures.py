@@ -30,10 +30,10 @@ def test_coverage_is_the_share_of_truth_inside_the_ellipsoids():
         np.testing.assert_allclose(share, np.mean(nees <= scipy.stats.chi2.ppf(p, 3)), rtol=1e-12)
     inside = np.mean(nees <= scipy.stats.chi2.ppf(0.95, 3), axis=1)
     interval = scipy.stats.t.interval(0.95**0.5, 39, inside.mean(), scipy.stats.sem(inside))
-    found = summary.measures["coverage_95_pose"]
-    np.testing.assert_allclose(found, (inside.mean(), *interval), rtol=1e-9)
+    average = summary.measures["coverage_95_pose"]
+    np.testing.assert_allclose(average, (inside.mean(), *interval), rtol=1e-9)
     # Honest errors: 480 independent steps at 0.95, five standard errors.
-    assert abs(found.value - 0.95) < 5 * np.sqrt(0.95 * 0.05 / nees.size)
+    assert abs(average.value - 0.95) < 5 * np.sqrt(0.95 * 0.05 / nees.size)
 
 
 @pytest.mark.parametrize("claimed", [1.0, 0.1, 10.0])
@@ -182,13 +182,13 @@ def test_landmark_nees_and_own_coordinates():
     )
     np.testing.assert_allclose(summary.measures["nees_landmarks"].value, nees.mean(), rtol=1e-9)
 
-    own = jax.jit(
+    chart_errors = jax.jit(
         jax.vmap(
             partial(_measures.nees.chart_error_of, charts.RightInvariant(), worlds.ring().sensor)
         )
     )
-    total, steps = scored(trace, truth, own).measures["nees_own"]
-    found = total / steps
+    total, steps = scored(trace, truth, chart_errors).measures["nees_own"]
+    per_run = total / steps
     local = jax.jit(jax.vmap(charts.RightInvariant().local, (0, None, 0, None)))
     for run in range(6):
         xi = local(trace.estimate.pose[run], np.zeros(2), truth.pose[run], np.zeros(2))[0]
@@ -198,7 +198,7 @@ def test_landmark_nees_and_own_coordinates():
             lever = np.array([[1, 0, -y], [0, 1, x], [0, 0, 1.0]])
             p_own = np.linalg.inv(lever) @ trace.estimate.pose_cov[run, t] @ np.linalg.inv(lever).T
             total += xi[t] @ np.linalg.solve(p_own, xi[t])
-        np.testing.assert_allclose(found[run], total / STEPS, rtol=1e-7)
+        np.testing.assert_allclose(per_run[run], total / STEPS, rtol=1e-7)
 
 
 def test_the_bounds_obey_tichavskys_recursion():
@@ -228,12 +228,12 @@ def test_the_bounds_obey_tichavskys_recursion():
     steps, least = consistency.posterior_bound(world, truths, logs)
     assert (np.linalg.eigvalsh(bounds[:, steps].mean(axis=0) - least)[1:] > 0).all()
     alone = jax.tree.map(lambda leaf: leaf[:1], (truths, logs))
-    steps, own = consistency.posterior_bound(world, *alone, steps=[0, 7, 14])
-    np.testing.assert_allclose(own, bounds[0, steps], rtol=1e-7, atol=1e-12)
+    steps, alone_bound = consistency.posterior_bound(world, *alone, steps=[0, 7, 14])
+    np.testing.assert_allclose(alone_bound, bounds[0, steps], rtol=1e-7, atol=1e-12)
     truth, bound = jax.tree.map(lambda leaf: leaf[0], truths), bounds[0]
     jacobians = jax.jit(partial(_bound.jacobians_at_truth, world))
-    found = jax.device_get(jacobians(truth, jax.tree.map(lambda leaf: leaf[0], logs)))
-    last = _bound.final_covariance(found, world.pose_cov)
+    linearized = jax.device_get(jacobians(truth, jax.tree.map(lambda leaf: leaf[0], logs)))
+    last = _bound.final_covariance(linearized, world.pose_cov)
     np.testing.assert_allclose(last, bound[-1], rtol=1e-4, atol=1e-9)
     n = 3 + 12
     j = np.zeros((n, n))  # the map is unknown beforehand: no information
@@ -268,7 +268,7 @@ def test_what_is_called_a_bound_bounds():
     x = np.random.default_rng(4).normal(size=200_000)
     slope, jacobian = np.ones((len(x), 1, 1)), 3 * x[:, None, None] ** 2
     noise, prior = np.array([[sigma**2]]), np.eye(1)
-    given = np.sqrt(np.mean(1 / (1 + jacobian**2 / sigma**2)))
+    conditional = np.sqrt(np.mean(1 / (1 + jacobian**2 / sigma**2)))
     proper = np.sqrt(_bound.van_trees(slope, jacobian, noise, prior)[0, 0])
     np.testing.assert_allclose(proper, 1 / np.sqrt(1 + 27 / sigma**2), rtol=0.02)
     # The posterior mean by quadrature, of fewer draws.
@@ -279,7 +279,7 @@ def test_what_is_called_a_bound_bounds():
     density = np.exp(log_density - log_density.max(axis=1, keepdims=True))
     mean = (density @ grid) / density.sum(axis=1)
     rmse = np.sqrt(np.mean((mean - draws) ** 2))
-    np.testing.assert_allclose([proper, rmse, given], [0.0019, 0.066, 0.236], rtol=0.15)
+    np.testing.assert_allclose([proper, rmse, conditional], [0.0019, 0.066, 0.236], rtol=0.15)
 
 
 @refused(
@@ -325,13 +325,13 @@ def test_what_filters_report_of_themselves_is_counted():
     }
     trace, _, _ = synthetic(np.random.default_rng(0), runs=2)
     info = jax.tree.map(lambda leaf: leaf[:, :3], trace.info)
-    found = _measures.counts.counts_of(info._replace(extra=extra, exhausted=flags))
-    events = {name: each.tolist() for name, each in found.items() if name not in STATUSES}
+    totals = _measures.counts.counts_of(info._replace(extra=extra, exhausted=flags))
+    events = {name: happened.tolist() for name, happened in totals.items() if name not in STATUSES}
     thrice = {key: [6, 0] for key in ("resampled", "underflow", "invalid")}
     once = {key: [2, 0] for key in ("merged", "reduced", "exhausted")}
     assert events == {"removed": [4, 0], **once, **thrice, "odd": [2, 0]}
     assert list(events) == [*(name for name in _measures.counts.MEANINGS if name in events), "odd"]
-    assert (found["fused"] == 3).all() and (found["born"] == 0).all()
+    assert (totals["fused"] == 3).all() and (totals["born"] == 0).all()
 
 
 def test_poses_on_a_plane_have_no_nees():

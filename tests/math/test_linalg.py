@@ -468,15 +468,15 @@ def test_a_square_and_its_slopes_are_those_of_the_product(rows):
 
 
 def test_a_key_is_one_prng_key():
-    one = jax.random.key(0)
-    for key in (one, jax.random.PRNGKey(0), np.asarray(jax.random.PRNGKey(0))):
+    single = jax.random.key(0)
+    for key in (single, jax.random.PRNGKey(0), np.asarray(jax.random.PRNGKey(0))):
         validation.require("it", "", key, validation.prng_key)
-    jax.eval_shape(lambda key: validation.require("it", "", key, validation.prng_key), one)
+    jax.eval_shape(lambda key: validation.require("it", "", key, validation.prng_key), single)
     for key, shown in (
         (0, "got 0"),
         (None, "got None"),
         (np.zeros(2), r"an array of float64 of shape \(2,\)"),
-        (jax.random.split(one, 3), r"one PRNG key, got keys of shape \(3,\)"),
+        (jax.random.split(single, 3), r"one PRNG key, got keys of shape \(3,\)"),
     ):
         with pytest.raises(ValueError, match=f"it: expected .*{shown}"):
             validation.require("it", "", key, validation.prng_key)

@@ -293,8 +293,8 @@ def test_enough_is_foxs_loop():
             if m >= least and m >= bound[len(seen)]:
                 wanted, few = m, False
                 break
-        found, short = enough(moved, least, error)
-        assert (int(found), bool(short)) == (wanted, few)
+        count, short = enough(moved, least, error)
+        assert (int(count), bool(short)) == (wanted, few)
 
 
 def test_headings_on_both_sides_of_the_seam_and_poses_far_away_have_bins():

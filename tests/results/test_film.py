@@ -124,19 +124,19 @@ ENCODERLESS = "#!/bin/sh\necho 'Unknown encoder h264' >&2\nexit 1\n"
 
 
 @pytest.mark.parametrize(
-    ("script", "told"),
+    ("script", "message"),
     [
         (ENCODERLESS, "Unknown encoder h264"),
         ("#!/bin/sh\nexec 0<&-\nexit 127\n", "127"),
     ],
 )
-def test_an_ffmpeg_that_fails_is_one_line(three, tmp_path, monkeypatch, script, told):
+def test_an_ffmpeg_that_fails_is_one_line(three, tmp_path, monkeypatch, script, message):
     broken.program(monkeypatch, tmp_path, "ffmpeg", script)
     assert _film.mp4_problem().startswith("ffmpeg: ")
     for writer in (None, "ffmpeg"):  # the latter only when the frames are drawn
         with pytest.raises(ValueError, match=r"(?s)^Film.save: .*: save a .gif$") as caught:
             three.save(tmp_path / "a.mp4", writer)
-        assert "\n" not in str(caught.value) and told in str(caught.value)
+        assert "\n" not in str(caught.value) and message in str(caught.value)
 
 
 def test_an_ffmpeg_that_does_not_start_or_is_not_there_is_named(tmp_path, monkeypatch):

@@ -163,16 +163,18 @@ def test_filters_verdicts_and_measures_stand_in_the_table(read):
     labels = [cells[0] for cells in read.rows]
     assert "heading NEES" not in labels  # no filter has it
     assert "rejected" not in labels  # nothing was
-    measured = [one.title.strip() for one in _measures.BUILT_IN if one.key in GOOD]
+    measured = [measure.title.strip() for measure in _measures.BUILT_IN if measure.key in GOOD]
     assert [label for label in labels if label in measured] == measured
 
 
 def test_every_label_of_the_table_is_shown_where_it_is_measured():
-    every = {one.key: Average(1.0, 0.5, 1.5) for one in _measures.BUILT_IN}
-    reader = Reader(_page.campaign_page(campaign(a=summary("undecided", every)), "", None, {}, {}))
+    averages = {measure.key: Average(1.0, 0.5, 1.5) for measure in _measures.BUILT_IN}
+    reader = Reader(
+        _page.campaign_page(campaign(a=summary("undecided", averages)), "", None, {}, {})
+    )
     labels = [cells[0] for cells in reader.rows]
-    for one in _measures.BUILT_IN:
-        assert (one.title.strip() in labels) == one.row
+    for measure in _measures.BUILT_IN:
+        assert (measure.title.strip() in labels) == measure.row
     assert "Figures" not in reader.words
     assert "consistency of 1 filter" in "".join(reader.words)
 

@@ -57,9 +57,9 @@ def test_exact_ranges_are_intersections_with_every_wall(differences):
             )
         )
     )
-    found, slopes = both(pose)
+    ranges, slopes = both(pose)
     exact = [[reference_range(world, x, y, h + a, 4.5) for a in angles] for x, y, h in pose]
-    np.testing.assert_allclose(found, exact, atol=1e-12)
+    np.testing.assert_allclose(ranges, exact, atol=1e-12)
     error = np.abs(slopes - differences(lambda p: both(p)[0], (pose,), 0, 1e-7)).max(axis=2)
     assert np.mean(error < 1e-5) > 0.99  # but where a beam passes an edge between the two sides
     assert np.all(np.isfinite(slopes))
@@ -130,14 +130,14 @@ def test_maximum_likelihood_estimates_reach_the_cramer_rao_bound():
     def estimate(key):
         beams = scan(laser, world.walls, pose, key)
         weight = beams.valid / laser.sigma**2
-        found = jax.numpy.asarray(pose) + 0.02
+        estimated = jax.numpy.asarray(pose) + 0.02
         for _ in range(3):
-            g = jax.jacfwd(ranges)(found)
+            g = jax.jacfwd(ranges)(estimated)
             step = jax.scipy.linalg.solve(
-                g.T @ (weight[:, None] * g), g.T @ (weight * (beams.range - ranges(found)))
+                g.T @ (weight[:, None] * g), g.T @ (weight * (beams.range - ranges(estimated)))
             )
-            found = found + step
-        return found
+            estimated = estimated + step
+        return estimated
 
     error = np.asarray(jax.jit(jax.vmap(estimate))(jax.random.split(jax.random.key(1), 400))) - pose
     nees = np.einsum("ni,ij,nj->n", error, np.linalg.inv(bound), error)

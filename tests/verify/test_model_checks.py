@@ -300,7 +300,7 @@ def test_a_round_trip_off_by_a_turn_says_that_the_unit_is_missing():
 
     names = "range [m]", "bearing"
     unnamed = changed(
-        UNMOUNTED, measurements=names, observe=unwrapped, residual=lambda z, other: z - other
+        UNMOUNTED, measurements=names, observe=unwrapped, residual=lambda z, z_hat: z - z_hat
     )
     drawn = _inputs.samples.sensor_samples(unnamed, 24, 0)
     checks = {check.name: check for check in _properties.sensor_checks(unnamed, *drawn)}

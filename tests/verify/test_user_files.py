@@ -29,8 +29,8 @@ def verify(tmp_path, capsys):
         return status, printed.out, printed.err, content
 
     def says(text, status, *parts):
-        found, out, _, _ = go(text)
-        assert found == status, out
+        returned, out, _, _ = go(text)
+        assert returned == status, out
         for part in parts:
             assert part in out
         return out

@@ -83,20 +83,20 @@ def test_a_changed_campaign_is_refused_by_what_changed(folder, changed, named):
 
 
 def test_another_precision_platform_version_or_bound_is_another_campaign(folder, monkeypatch):
-    there = store.resume(folder).campaign
-    asked = campaign()
+    stored = store.resume(folder).campaign
+    parts = campaign()
 
     def changed(platform="cpu", **options):
-        found = digests.identity(**asked, platform=platform, **options)
-        assert found.keys() == there.keys()
-        return {name for name in found if found[name] != there[name]}
+        identity = digests.identity(**parts, platform=platform, **options)
+        assert identity.keys() == stored.keys()
+        return {name for name in identity if identity[name] != stored[name]}
 
     assert changed() == set()
     assert changed(platform="gpu") == {"platform"}
     assert changed(bound=True) == {"bound"}
     with jax.enable_x64(False):
         assert "dtype" in changed()
-    monkeypatch.setattr(digests, "version", lambda name: {"jax": "0.1"}.get(name, there[name]))
+    monkeypatch.setattr(digests, "version", lambda name: {"jax": "0.1"}.get(name, stored[name]))
     assert changed() == {"jax"}
 
 
@@ -151,26 +151,26 @@ def helped(x):
 
 def test_a_digest_of_a_function_is_of_its_code_and_of_what_it_refers_to(monkeypatch):
     table = np.arange(3.0)
-    one = digests.digest(made_by(2.0, table))
-    assert one == digests.digest(made_by(2.0, table.copy()))
+    digest = digests.digest(made_by(2.0, table))
+    assert digest == digests.digest(made_by(2.0, table.copy()))
     others = [
         digests.digest(made_by(np.nextafter(2.0, 3.0), table)),
         digests.digest(made_by(2.0, np.nextafter(table, 9))),
         digests.digest(lambda x: x),
     ]
     monkeypatch.setitem(globals(), "helped", lambda x: x + 2.0)
-    assert len({one, *others, digests.digest(made_by(2.0, table))}) == 5
+    assert len({digest, *others, digests.digest(made_by(2.0, table))}) == 5
     assert digests.digest(np.sin) != digests.digest(np.cos)
 
 
 def test_a_digest_of_a_class_is_of_its_constants_methods_and_of_sets_in_its_code():
-    def made(scale, among, by=1.0):
+    def class_of(scale, among, by=1.0):
         @record
         class Scaled(filters.Wrapper):
             factor = scale
 
             @staticmethod
-            def known(tag):
+            def contains(tag):
                 return tag in among
 
             def predict(self, state, u, key):
@@ -178,7 +178,7 @@ def test_a_digest_of_a_class_is_of_its_constants_methods_and_of_sets_in_its_code
 
         return Scaled
 
-    one, two = frozenset({1, 2}), frozenset({2, 3})
-    assert digests.digest(made(1.0, one)) == digests.digest(made(1.0, frozenset({2, 1})))
-    others = (1.0, one), (2.0, one), (1.0, two), (1.0, one, 2.0)
-    assert len({digests.digest(made(*each)) for each in others}) == 4
+    first, second = frozenset({1, 2}), frozenset({2, 3})
+    assert digests.digest(class_of(1.0, first)) == digests.digest(class_of(1.0, frozenset({2, 1})))
+    others = (1.0, first), (2.0, first), (1.0, second), (1.0, first, 2.0)
+    assert len({digests.digest(class_of(*arguments)) for arguments in others}) == 4

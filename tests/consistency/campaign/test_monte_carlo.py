@@ -355,9 +355,9 @@ def test_a_filter_of_beams_without_innovations_runs_in_a_world_that_draws_a_log_
             )
             return joint, info
 
-    found = worlds.campaign(world, {"silent": Silent(reckoning)}, 3).filters["silent"]
-    assert found.counts["fused"] > 0 and found.counts["not_finite"] == 0
-    assert all(np.isfinite(m.value) for m in found.measures.values())
+    summary = worlds.campaign(world, {"silent": Silent(reckoning)}, 3).filters["silent"]
+    assert summary.counts["fused"] > 0 and summary.counts["not_finite"] == 0
+    assert all(np.isfinite(m.value) for m in summary.measures.values())
 
 
 def test_a_world_without_noise_does_not_diverge():
@@ -383,8 +383,8 @@ def test_a_sensor_without_noise_is_told_where_it_left_nothing_to_judge():
             return joint, info._replace(status=jnp.full_like(info.status, Status.SINGULAR))
 
     candidates = {"a": reckoning, "b": Singular(reckoning)}
-    found = worlds.campaign(still, candidates, 2)
-    a, b = (found.filters[name].doubts for name in candidates)
+    campaign = worlds.campaign(still, candidates, 2)
+    a, b = (campaign.filters[name].doubts for name in candidates)
     assert not any("without noise" in doubt for doubt in a)
     assert "bearing [rad] of range_bearing without noise" in b[-1]
     assert f"{2 * still.steps * len(still.landmarks):,} measurements were dropped and" in b[-1]
@@ -420,7 +420,7 @@ def test_a_world_that_gives_its_filter_little_is_told(change, word, told):
 
 
 @pytest.mark.parametrize(
-    ("noise", "told"),
+    ("noise", "names"),
     [
         (np.diag([0.1, 1e-9]), ""),
         (np.zeros((2, 2)), "range [m], bearing [rad] of range_bearing"),
@@ -429,11 +429,11 @@ def test_a_world_that_gives_its_filter_little_is_told(change, word, told):
         (lambda z: jnp.diag(z * jnp.array([1.0, 0.0])), "bearing [rad] of range_bearing"),
     ],
 )
-def test_measurements_without_noise_are_named(noise, told):
-    there = dataclasses.replace(WORLD, sensor=sensors.RangeBearing(noise))
-    assert _candidates.without_noise(there) == told
-    eyes = sensors.Suite(((sensors.Compass(np.eye(1)), 1), (there.sensor, 6)))
-    assert _candidates.without_noise(dataclasses.replace(WORLD, sensor=eyes)) == told
+def test_measurements_without_noise_are_named(noise, names):
+    world = dataclasses.replace(WORLD, sensor=sensors.RangeBearing(noise))
+    assert _candidates.without_noise(world) == names
+    eyes = sensors.Suite(((sensors.Compass(np.eye(1)), 1), (world.sensor, 6)))
+    assert _candidates.without_noise(dataclasses.replace(WORLD, sensor=eyes)) == names
 
 
 HONEST = {

@@ -73,10 +73,10 @@ class Begun(Exception):
 
 @pytest.mark.parametrize("terminal", [True, False])
 def test_a_campaign_has_a_bar_by_default_where_it_can_be_seen(capsys, monkeypatch, terminal):
-    told = []
+    bars = []
 
     def begun(self, plan, todo):
-        told.append(self.progress)
+        bars.append(self.progress)
         if self.progress is not None:
             self.progress(3, 10)
         raise Begun
@@ -92,9 +92,9 @@ def test_a_campaign_has_a_bar_by_default_where_it_can_be_seen(capsys, monkeypatc
 
     shown = go()
     assert ("ring, 1 filter: " in shown and "3/10 runs" in shown) == terminal
-    assert (told[-1] is not None) == terminal
+    assert (bars[-1] is not None) == terminal
     assert go(progress=False) == ""
-    assert told[-1] is None
+    assert bars[-1] is None
     assert go(progress=lambda *done: mine.append(done)) == ""
     assert mine == [(3, 10)]
 

@@ -46,11 +46,11 @@ def test_absolute_errors_by_hand():
 
 def test_alignment_takes_out_a_rigid_motion_alone():
     frame = np.array([5.0, -1.0, -2.9])
-    found = metrics.ate(SQUARE, compose(frame, SQUARE))
-    np.testing.assert_allclose(found.translation, 0, atol=1e-14)
-    np.testing.assert_allclose(found.rotation, 0, atol=1e-14)
+    errors = metrics.ate(SQUARE, compose(frame, SQUARE))
+    np.testing.assert_allclose(errors.translation, 0, atol=1e-14)
+    np.testing.assert_allclose(errors.rotation, 0, atol=1e-14)
     np.testing.assert_allclose(
-        compose(found.frame, compose(frame, SQUARE))[:, :2],
+        compose(errors.frame, compose(frame, SQUARE))[:, :2],
         SQUARE[:, :2],
         atol=1e-14,
     )
@@ -80,10 +80,10 @@ def test_relative_errors_by_hand():
     bad[2:, 1] += 0.2
     bad[2, 2] += 0.1
     bad = compose([7.0, 8.0, 1.0], bad)
-    found = metrics.rpe(SQUARE, bad, rows=1)
+    errors = metrics.rpe(SQUARE, bad, rows=1)
     # The turn of 0.1 rad swings the third leg by 2 sin 0.05.
-    np.testing.assert_allclose(found.translation, [0, 0.2, 2 * np.sin(0.05), 0], atol=1e-14)
-    np.testing.assert_allclose(found.rotation, [0, 0.1, 0.1, 0], atol=1e-14)
+    np.testing.assert_allclose(errors.translation, [0, 0.2, 2 * np.sin(0.05), 0], atol=1e-14)
+    np.testing.assert_allclose(errors.rotation, [0, 0.1, 0.1, 0], atol=1e-14)
     np.testing.assert_allclose(metrics.rpe(SQUARE, bad, metres=4.0).translation, 0.2, atol=1e-14)
 
 

@@ -523,18 +523,18 @@ def test_in_reverse_what_makes_a_landmark_is_as_forward():
         start = joint._replace(landmarks=landmarks, cov=cov)
         new = formed(kind, start, which)
         slots = jnp.array([2, 3])
-        found = hypotheses.point_residuals(new, KINDS[kind], slots, jnp.array([6, 7]))
-        part = found.value[:, 0], found.by_point[:, 0], found.by_stored[:, 0]
+        residuals = hypotheses.point_residuals(new, KINDS[kind], slots, jnp.array([6, 7]))
+        part = residuals.value[:, 0], residuals.by_point[:, 0], residuals.by_stored[:, 0]
         constraint = confirmation.constraints_of(new, slots, jnp.array([6, 6]), *part)
         corrected = confirmation.correct_hypotheses(
             new, LAYOUT, constraint, jnp.array([True, False])
         )
-        made = initialization.initial_estimate(
+        estimate = initialization.initial_estimate(
             start, KINDS[kind], jnp.array([1.1, 5.1]), stored, use
         )
-        entered = initialization.add_landmark(start, made, jnp.asarray(1), stored)
+        entered = initialization.add_landmark(start, estimate, jnp.asarray(1), stored)
         parts = [(x.landmarks**2).sum() + (x.cov**2).sum() for x in (corrected, entered)]
-        return sum(parts) + made.nis
+        return sum(parts) + estimate.nis
 
     at = joint.landmarks, joint.cov
     rng = np.random.default_rng(0)

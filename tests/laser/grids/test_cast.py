@@ -180,7 +180,7 @@ def test_ranges_are_those_of_exact_geometry_to_a_tenth_of_a_cell():
     near = cell * np.stack([np.cos(ANGLES), np.sin(ANGLES)], axis=1)
     spots = spots[is_free(world, spots[:, None] + 2 * near).all(axis=1)][:60]
     pose = np.column_stack([spots, rng.uniform(-3, 3, len(spots))])
-    found = np.asarray(grids.cast(rays, pose, ANGLES, 5.0))
+    ranges = np.asarray(grids.cast(rays, pose, ANGLES, 5.0))
     ahead = Laser(np.zeros(1), max_range=5.0)
     exact_of = jax.jit(
         jax.vmap(
@@ -195,18 +195,18 @@ def test_ranges_are_those_of_exact_geometry_to_a_tenth_of_a_cell():
 
     left, exact, right = (shifted(side) for side in (1, 0, -1))
     steady = (np.maximum(np.abs(left - exact), np.abs(right - exact)) < 2 * cell) & (exact < 5)
-    error = np.abs(found - exact)[steady] / cell
+    error = np.abs(ranges - exact)[steady] / cell
     assert steady.mean() > 0.7
     assert error.max() < 0.5
     assert np.median(error) < 0.1
     # The ends of all other beams lie on a wall as well, or the exact range was cut.
     heading = pose[:, 2, None] + ANGLES
-    ends = pose[:, None, :2] + found[..., None] * np.stack(
+    ends = pose[:, None, :2] + ranges[..., None] * np.stack(
         [np.cos(heading), np.sin(heading)], axis=-1
     )
     around = cell / 2 * np.stack([np.cos(ANGLES), np.sin(ANGLES)], axis=1)
     sides = is_free(world, ends[:, :, None] + around)
-    assert np.all(sides.any(axis=2) & ~sides.all(axis=2) | (found >= 5))
+    assert np.all(sides.any(axis=2) & ~sides.all(axis=2) | (ranges >= 5))
 
 
 @pytest.mark.parametrize("method", swept(["cells", "surface"], "surface"))

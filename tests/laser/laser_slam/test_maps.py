@@ -34,7 +34,7 @@ def both(log, monkeypatch, window, settings=SETTINGS):
     shape, origin, resolution = _log_map.frame_of(log, [log.raw], settings)
     beams = _log_map._used_beams(log, settings, np.ones(len(log.time), bool), slice(None))
     laser = poses.compose(log.raw, np.array(log.mount))
-    whole = grids.count(shape, origin, resolution, laser, beams, max_range=settings.max_range)
+    at_once = grids.count(shape, origin, resolution, laser, beams, max_range=settings.max_range)
     calls = []
     count = grids.count
 
@@ -45,42 +45,42 @@ def both(log, monkeypatch, window, settings=SETTINGS):
     monkeypatch.setattr(grids, "count", counting)
     counts = np.zeros((2, *shape), np.int32)
     _log_map._count(counts, origin, resolution, laser, beams, settings)
-    return counts, np.stack([whole.hits, whole.misses]), calls
+    return counts, np.stack([at_once.hits, at_once.misses]), calls
 
 
 def test_scans_that_do_not_fit_a_window_are_split(monkeypatch):
-    found, whole, windows = both(wandering(50, 40, 2.5), monkeypatch, 64)
+    in_windows, at_once, windows = both(wandering(50, 40, 2.5), monkeypatch, 64)
     assert (
         len(windows) > 4
         and set(windows) == {(64, 64)}
-        and whole[0].sum() > 500
-        and max(whole.shape) > 64
+        and at_once[0].sum() > 500
+        and max(at_once.shape) > 64
     )
-    np.testing.assert_array_equal(found, whole)
+    np.testing.assert_array_equal(in_windows, at_once)
 
 
 def test_so_are_long_logs_and_scans_of_many_beams(monkeypatch):
-    found, whole, windows = both(wandering(150, 400, 1.5), monkeypatch, 512)
+    in_windows, at_once, windows = both(wandering(150, 400, 1.5), monkeypatch, 512)
     assert len(windows) >= 6 and set(windows) == {(512, 512)}
-    np.testing.assert_array_equal(found, whole)
+    np.testing.assert_array_equal(in_windows, at_once)
 
 
 @pytest.mark.parametrize(("far", "side"), [(2.5, 64), (5.0, 128), (9.0, 256)])
 def test_a_scan_that_is_larger_than_a_window_has_a_larger_one(monkeypatch, far, side):
     log = wandering(3, 40, far)
-    found, whole, windows = both(log, monkeypatch, 64)
+    in_windows, at_once, windows = both(log, monkeypatch, 64)
     assert max(windows) == (side, side)
     assert _log_map.frame_of(log, [log.raw], SETTINGS)[2] == RESOLUTION
-    np.testing.assert_array_equal(found, whole)
+    np.testing.assert_array_equal(in_windows, at_once)
 
 
 def test_beams_along_the_axes_from_the_origin_are_counted_alike_in_every_window(monkeypatch):
     """Without care they lie on the borders of cells, and rounding decides."""
     _, log = driven()
     monkeypatch.setattr(_log_map, "ROWS", 8)
-    found, whole, windows = both(log, monkeypatch, 128)
+    in_windows, at_once, windows = both(log, monkeypatch, 128)
     assert len(windows) == 5 and not log.raw[0].any()
-    np.testing.assert_array_equal(found, whole)
+    np.testing.assert_array_equal(in_windows, at_once)
 
 
 def test_a_log_that_met_nothing_is_an_empty_map(monkeypatch):
@@ -99,10 +99,10 @@ def test_scans_that_are_not_usable_say_nothing(usable):
     some = log._replace(
         time=log.time[usable], raw=log.raw[usable], beams=Beams(*(b[usable] for b in log.beams))
     )
-    every = np.ones(usable.sum(), bool)
+    all_usable = np.ones(usable.sum(), bool)
     np.testing.assert_array_equal(
         _log_map.map_of(log, log.raw, usable, frame, settings).log_odds,
-        _log_map.map_of(some, some.raw, every, frame, settings).log_odds,
+        _log_map.map_of(some, some.raw, all_usable, frame, settings).log_odds,
     )
 
 
@@ -182,6 +182,6 @@ def test_a_mount_that_is_none_is_refused(mount):
 def test_a_mask_of_odometry_of_another_size_is_refused():
     _, log = driven(scans=3)
     _scan_points.check_laser_log("here", log._replace(odometry_known=np.ones(3, bool)))
-    for known in (np.ones(2, bool), np.ones((3, 1), bool), True):
+    for mask in (np.ones(2, bool), np.ones((3, 1), bool), True):
         with pytest.raises(ValueError, match="here: expected odometry_known of each of 3 scans"):
-            _scan_points.check_laser_log("here", log._replace(odometry_known=known))
+            _scan_points.check_laser_log("here", log._replace(odometry_known=mask))

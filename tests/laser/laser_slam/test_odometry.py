@@ -27,11 +27,11 @@ def drive():
     return true, log, scans_of(log)
 
 
-def solved(drive, raw=None, scans=None, known=None):
+def solved(drive, raw=None, scans=None, odometry_known=None):
     """The steps, and the odometry from the true first pose on."""
-    true, log, every = drive
-    scans = every if scans is None else scans
-    steps = steps_of(log.raw if raw is None else raw, log.time, scans.changed, known)
+    true, log, all_scans = drive
+    scans = all_scans if scans is None else scans
+    steps = steps_of(log.raw if raw is None else raw, log.time, scans.changed, odometry_known)
     return steps, odometry_of(scans, steps, true[0])
 
 
@@ -217,10 +217,10 @@ def test_a_scan_without_points_stays_where_raw_odometry_leads(drive, k):
 @pytest.mark.parametrize("k", swept([5, 16, 25], 16))
 def test_a_scan_that_matches_nothing_before_is_placed_by_what_comes_after(drive, monkeypatch, k):
     """Raw odometry is wrong at it alone. The others are as if it had no points."""
-    true, log, every = drive
+    true, log, all_scans = drive
     raw = log.raw.copy()
     raw[k] = poses.compose(raw[k], np.array([-0.4, 0.5, 0.3]))
-    refused = np.asarray(every.points.position)[k]
+    refused = np.asarray(all_scans.points.position)[k]
     match = _odometry.tracking._match_about
 
     def refusing(reference, points, *rest):
@@ -350,9 +350,9 @@ def test_odometry_is_frozen_where_it_says_nothing_while_scans_change():
     raw = poses.chain(np.zeros(3), step)
     # The composition of a pose with no step is rounded.
     raw[20:24] = raw[19]
-    changed, known = np.ones(LENGTH, bool), np.ones(LENGTH, bool)
+    changed, certain = np.ones(LENGTH, bool), np.ones(LENGTH, bool)
     at = np.isin(np.arange(LENGTH), [20, 21, 22, 23])
-    raw_steps = steps_of(raw, TIME, changed, known)
+    raw_steps = steps_of(raw, TIME, changed, certain)
     np.testing.assert_array_equal(raw_steps.frozen, at)
     np.testing.assert_array_equal(raw_steps.unknown, at)
     base = steps_of(raw, TIME).cov
@@ -361,7 +361,7 @@ def test_odometry_is_frozen_where_it_says_nothing_while_scans_change():
         assert raw_steps.cov[k, 0, 0] < raw_steps.reach[k, 0] ** 2
     np.testing.assert_array_equal(raw_steps.cov[~at], base[~at])
     # A robot at rest sees the same scan again.
-    assert not steps_of(raw, TIME, ~at, known).frozen.any()
+    assert not steps_of(raw, TIME, ~at, certain).frozen.any()
     assert not steps_of(raw, TIME, None, None).frozen.any()
     # Where nothing was logged, it is frozen whatever the scan shows, but not at the first scan.
     np.testing.assert_array_equal(steps_of(raw, TIME, ~at, ~at).frozen, at)
@@ -429,11 +429,11 @@ def test_a_jump_that_a_reader_found_is_one_where_the_step_is_too_long():
     raw[30:] = poses.compose(
         poses.compose(raw[30], np.array([1.0, 0, 0])), poses.between(raw[30], raw[30:])
     )
-    known = ~only(30)
-    raw_steps = steps_of(raw, TIME, None, known)
+    certain = ~only(30)
+    raw_steps = steps_of(raw, TIME, None, certain)
     np.testing.assert_array_equal(raw_steps.jump, only(30))
     assert not raw_steps.frozen.any()
-    np.testing.assert_array_equal(steps_of(path(), TIME, None, known).frozen, only(30))
+    np.testing.assert_array_equal(steps_of(path(), TIME, None, certain).frozen, only(30))
 
 
 def test_frozen_odometry_of_a_slow_robot_is_counted():
@@ -514,8 +514,8 @@ def through():
     program = jax.jit(_odometry.reference._seen_through)
 
     def of(scan, pose, reference=None):
-        whole = seen((0.0, 0.0, 0.0)) if reference is None else reference
-        return float(program(whole, scan, np.asarray(pose, np.float32)))
+        surface = seen((0.0, 0.0, 0.0)) if reference is None else reference
+        return float(program(surface, scan, np.asarray(pose, np.float32)))
 
     return of
 

@@ -79,13 +79,13 @@ def test_maps_of_a_film_grow_to_the_whole(drive):
     grown, until = _log_map.growing_maps(
         log, solved.odometry, SETTINGS, frames=4, others=[solved.poses]
     )
-    (whole,), _ = _log_map.growing_maps(
+    (final,), _ = _log_map.growing_maps(
         log, solved.odometry, SETTINGS, frames=1, others=[solved.poses]
     )
     assert until[-1] == len(log.time) and len(grown) == len(until) <= 4
-    np.testing.assert_array_equal(grown[-1].log_odds, whole.log_odds)
-    known = [(one.log_odds != 0).sum() for one in grown]
-    assert (np.diff(known) > 0).all()
+    np.testing.assert_array_equal(grown[-1].log_odds, final.log_odds)
+    cells = [(grid.log_odds != 0).sum() for grid in grown]
+    assert (np.diff(cells) > 0).all()
 
 
 def test_the_map_is_of_the_walls(drive):
@@ -129,11 +129,11 @@ def test_what_is_wrong_is_counted_and_the_run_goes_on(drive):
 def test_after_a_jump_a_match_is_right_or_refused(drive):
     """At each scan of the drive: the step from the one before is unknown, a metre and up to 90°."""
     true, log, _ = drive
-    every, refused = scans_of(log), 0
+    all_scans, refused = scans_of(log), 0
     for k in range(6, len(true)):
         at = np.arange(k - 5, k + 1)
         raw = log.raw[at] + np.where(at == k, 40.0, 0.0)[:, None] * [1, 0, 0]
-        scans = jax.tree.map(lambda part, at=at: np.asarray(part)[at], every)
+        scans = jax.tree.map(lambda part, at=at: np.asarray(part)[at], all_scans)
         odometry = odometry_of(scans, steps_of(raw), raw[0])
         z = poses.between(true[at[odometry.base[5]]], true[k])
         off = poses.between(odometry.z[5], z)
@@ -146,11 +146,11 @@ def test_after_a_jump_a_match_is_right_or_refused(drive):
 def test_a_match_with_another_place_is_in_doubt(drive):
     """At each scan of the drive: it is that of 17 scans later, of a corridor that looks alike."""
     true, log, _ = drive
-    every, matched, wrong, doubted = scans_of(log), 0, 0, 0
+    all_scans, matched, wrong, doubted = scans_of(log), 0, 0, 0
     for k in range(6, len(true)):
         at = np.arange(k - 5, k + 1)
         seen = np.append(at[:-1], (k + 17) % len(true))
-        scans = jax.tree.map(lambda part, seen=seen: np.asarray(part)[seen], every)
+        scans = jax.tree.map(lambda part, seen=seen: np.asarray(part)[seen], all_scans)
         steps = steps_of(log.raw[at])
         odometry = odometry_of(scans, steps, log.raw[k - 5])
         z = poses.between(true[at[odometry.base[5]]], true[k])
@@ -241,8 +241,8 @@ def test_bad_settings_are_refused(change):
 
 
 def test_its_files(drive, tmp_path):
-    _, log, found = drive
-    write_files(tmp_path, cli.slam.result_files(found))
+    _, log, solved = drive
+    write_files(tmp_path, cli.slam.result_files(solved))
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {
         "trajectory.csv",
@@ -254,9 +254,9 @@ def test_its_files(drive, tmp_path):
     }
     rows = np.loadtxt(tmp_path / "trajectory.tum")
     np.testing.assert_array_equal(rows[:, 0], log.time)
-    np.testing.assert_allclose(rows[:, 1:3], found.poses[:, :2], rtol=1e-8)
-    assert len((tmp_path / "loops.csv").read_text().splitlines()) == 1 + len(found.loops.outcome)
-    assert cli.slam.result_summary(found)["keyframes"] == len(found.keyframe)
+    np.testing.assert_allclose(rows[:, 1:3], solved.poses[:, :2], rtol=1e-8)
+    assert len((tmp_path / "loops.csv").read_text().splitlines()) == 1 + len(solved.loops.outcome)
+    assert cli.slam.result_summary(solved)["keyframes"] == len(solved.keyframe)
 
 
 def carmen_lines(true, log):
@@ -273,8 +273,8 @@ def carmen_lines(true, log):
 
 def test_the_command_scores_it_by_the_poses_in_the_file(drive, monkeypatch, tmp_path):
     """`jaxslam slam FILE`, with the result of above in place of a second one."""
-    true, log, found = drive
-    monkeypatch.setattr(laser_slam, "solve", lambda log, settings, progress: found)
+    true, log, solved = drive
+    monkeypatch.setattr(laser_slam, "solve", lambda log, settings, progress: solved)
     lines = carmen_lines(true, log)
     (tmp_path / "ring.log").write_text("\n".join(lines))
     out = tmp_path / "out"
@@ -282,7 +282,7 @@ def test_the_command_scores_it_by_the_poses_in_the_file(drive, monkeypatch, tmp_
     assert cli.main([*command, "--figures", "svg"]) == 0
     summary = json.loads((out / "summary.json").read_text())
     assert summary["mean relation error to 10 m [m]"] < 0.1
-    kept = laser_slam.closure_score(found, true).kept
+    kept = laser_slam.closure_score(solved, true).kept
     assert summary["loops kept that agree with the poses in the file"] == kept
     names = {path.name for path in out.iterdir()}
     assert {"trajectory.tum", "graph.g2o", "map.pgm", "map_before.svg", "graph.svg"} <= names
@@ -300,9 +300,9 @@ def relation_text(relations, time):
 
 
 def test_the_command_scores_it_by_relations(drive, monkeypatch, tmp_path, capsys):
-    true, log, found = drive
+    true, log, solved = drive
     time = 1e9 + 2.0 * log.time
-    monkeypatch.setattr(laser_slam, "solve", lambda log, settings, progress: found)
+    monkeypatch.setattr(laser_slam, "solve", lambda log, settings, progress: solved)
     lines = [
         " ".join([*line.split()[:-3], str(time[k // 2]), "host", "0"])
         for k, line in enumerate(carmen_lines(true, log))
@@ -315,23 +315,23 @@ def test_the_command_scores_it_by_relations(drive, monkeypatch, tmp_path, capsys
     (tmp_path / "ring.relations").write_text(text)
     out = tmp_path / "out"
     command = ["slam", str(tmp_path / "ring.log"), "--out", str(out)]
-    asked = ["--relations", str(tmp_path / "ring.relations"), "--figures", "svg"]
-    assert cli.main([*command, *asked]) == 0
+    options = ["--relations", str(tmp_path / "ring.relations"), "--figures", "svg"]
+    assert cli.main([*command, *options]) == 0
     summary = json.loads((out / "summary.json").read_text())["relations"]
     count = len(relations.first)
     assert (summary["joined"], summary["not joined"], summary["tolerance [s]"]) == (count, 1, 1e-4)
     assert summary["all"]["relations"] == count and summary["over 60 s apart"]["relations"] == far
     for name, some in (("all", relations), ("over 60 s apart", metrics.relations(true, rows=31))):
         for path, at in (
-            ("laser SLAM", found.poses),
-            ("laser odometry", found.odometry),
-            ("raw odometry", found.raw),
+            ("laser SLAM", solved.poses),
+            ("laser odometry", solved.odometry),
+            ("raw odometry", solved.raw),
         ):
             errors = metrics.relation_errors(some, at)
             expected = metrics.benchmark_figures(errors)
             for quantity, figures in summary[name][path].items():
-                given = figures["mean"], figures["std"]
-                np.testing.assert_allclose(given, expected[quantity], rtol=1e-6)
+                scores = figures["mean"], figures["std"]
+                np.testing.assert_allclose(scores, expected[quantity], rtol=1e-6)
     assert summary["all"]["in the 95 % ellipse"] == count
     assert summary["all"]["without a covariance"] == 0
     printed = capsys.readouterr().out
@@ -350,9 +350,9 @@ def test_relations_that_do_not_join_are_refused_before_the_work(
     out = tmp_path / "out"
     command = ["slam", str(tmp_path / "ring.log"), "--out", str(out)]
     assert cli.main([*command, "--relations", str(tmp_path / "ring.relations")]) == 2
-    (told,) = capsys.readouterr().err.splitlines()
-    assert "ring.relations: none of 2 relations, from 7.500000 s to 60.000000 s, " in told
-    assert told.endswith("from 0.000000 s to 39.000000 s, within 0.0001 s at both ends")
+    (message,) = capsys.readouterr().err.splitlines()
+    assert "ring.relations: none of 2 relations, from 7.500000 s to 60.000000 s, " in message
+    assert message.endswith("from 0.000000 s to 39.000000 s, within 0.0001 s at both ends")
     assert not out.exists()
 
 

@@ -156,15 +156,17 @@ def test_errors_are_drawn_within_their_claimed_bounds():
 
 def test_errors_and_maps_show_every_filter_on_scales_that_dead_reckoning_does_not_set():
     names = ["dead_reckoning", "ekf", "fej"]
-    found = drawn.campaign(names)
-    figure = _pose_errors.run_errors_figure(found, title="run 0")
+    campaign = drawn.campaign(names)
+    figure = _pose_errors.run_errors_figure(campaign, title="run 0")
     rows = np.array(figure.axes).reshape(3, 3)
     assert [row[0].get_ylabel().replace("\n", "") for row in rows] == names
     assert rows[0, 0].get_ylim() == rows[1, 0].get_ylim() == pytest.approx((-0.315, 0.315))
-    marked = [any(each.get_gid() == _panels.BEYOND for each in axes.lines) for axes in rows[:, 0]]
+    marked = [
+        any(artist.get_gid() == _panels.BEYOND for artist in axes.lines) for axes in rows[:, 0]
+    ]
     assert marked == [True, False, False]
     assert rows[0, 0].get_title("right") == "↓ to −4"
-    maps = _landmarks.run_map_figure(found, title="run 0")
+    maps = _landmarks.run_map_figure(campaign, title="run 0")
     shown = [axes for axes in maps.axes if axes.axison]
     assert [axes.get_title("left") for axes in shown] == names
     assert len({axes.get_xlim() for axes in shown}) == 1
@@ -172,28 +174,28 @@ def test_errors_and_maps_show_every_filter_on_scales_that_dead_reckoning_does_no
 
 
 def test_errors_far_below_the_others_have_a_scale_of_their_own():
-    found = drawn.campaign(["ekf", "fej", "localization"])
-    truth, estimate = found.first["localization"]
+    campaign = drawn.campaign(["ekf", "fej", "localization"])
+    truth, estimate = campaign.first["localization"]
     near = truth.pose + (np.asarray(estimate.pose) - truth.pose) / 100
     close = estimate._replace(pose=near, pose_cov=np.asarray(estimate.pose_cov) / 100**2)
-    first = found.first | {"localization": (truth, close)}
-    rows = _pose_errors.run_errors_figure(dataclasses.replace(found, first=first)).axes
-    common, own = rows[0].get_ylim()[1], rows[6].get_ylim()[1]
-    assert own == pytest.approx(common / 100)
+    first = campaign.first | {"localization": (truth, close)}
+    rows = _pose_errors.run_errors_figure(dataclasses.replace(campaign, first=first)).axes
+    common, narrow = rows[0].get_ylim()[1], rows[6].get_ylim()[1]
+    assert narrow == pytest.approx(common / 100)
     assert {label.get_weight() for label in rows[6].get_yticklabels()} == {"bold"}
 
 
 def test_a_run_of_one_filter_has_the_figure_of_one_and_none_is_refused():
-    found = drawn.campaign(["ekf"])
-    assert len(_pose_errors.run_errors_figure(found).axes) == 3
-    assert len(_landmarks.run_map_figure(found).axes) == 1
-    nothing = dataclasses.replace(found, first={})
+    campaign = drawn.campaign(["ekf"])
+    assert len(_pose_errors.run_errors_figure(campaign).axes) == 3
+    assert len(_landmarks.run_map_figure(campaign).axes) == 1
+    nothing = dataclasses.replace(campaign, first={})
     for draw in (_pose_errors.run_errors_figure, _landmarks.run_map_figure):
         with pytest.raises(ValueError, match=f"{draw.__name__}: the campaign holds no run 0"):
             draw(nothing)
         with pytest.raises(ValueError, match="the first argument: expected a Campaign, got"):
-            draw(found.first["ekf"])
+            draw(campaign.first["ekf"])
     with pytest.raises(
         ValueError, match="expected an Estimate, got a Trace; give its field estimate"
     ):
-        plot.map_figure(Trace(found.first["ekf"][1], None, None, None))
+        plot.map_figure(Trace(campaign.first["ekf"][1], None, None, None))

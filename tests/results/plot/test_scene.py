@@ -38,9 +38,9 @@ def run_of(steps=STEPS, seen=None):
     return Trace(grown, info, None, seen), Log(np.zeros((steps, 2)), scan), truth
 
 
-def scene_of(steps=STEPS, seen=None, frames=_run_film.MOST, **more):
+def scene_of(steps=STEPS, seen=None, frames=_run_film.MOST, **options):
     trace, log, truth = run_of(steps, seen)
-    true = {"true_points": truth.landmarks, "true_path": truth.pose} | more
+    true = {"true_points": truth.landmarks, "true_path": truth.pose} | options
     return (
         _run_film.run_scene(_run_film.history_of(trace, log, frames), **true),
         trace.estimate,
@@ -189,7 +189,7 @@ def test_particles_are_drawn_by_weight():
     for panel, origin in ((scene.main, 0.0), (scene.beside, estimate.pose[1, :2])):
         axes, draw = staged(panel)
         draw(1)
-        (dots,) = [each for each in axes.collections if len(each.get_offsets())]
+        (dots,) = [collection for collection in axes.collections if len(collection.get_offsets())]
         np.testing.assert_allclose(dots.get_offsets(), seen.pose[1, :3, :2] - origin)
         np.testing.assert_allclose(dots.get_sizes(), [8.0, 4.0, 4.0])
 
@@ -201,13 +201,13 @@ def test_links_appear_and_are_cut():
     scene, estimate, _ = scene_of(seen=_run_film.Links(strength + np.swapaxes(strength, 1, 2)))
     axes, draw = staged(scene.main)
     between, robot = (
-        next(each for each in axes.collections if each.get_label() == label)
+        next(collection for collection in axes.collections if collection.get_label() == label)
         for label in ("link of landmarks", "link to the robot")
     )
     for k, (of_robot, of_landmarks, cut) in enumerate([(1, 0, 0), (1, 1, 0), (0, 1, 1)]):
         draw(k)
-        here, points = estimate.pose[k, :2], estimate.points[k]
-        np.testing.assert_array_equal(robot.get_segments(), [[here, points[0]]] * of_robot)
+        position, points = estimate.pose[k, :2], estimate.points[k]
+        np.testing.assert_array_equal(robot.get_segments(), [[position, points[0]]] * of_robot)
         np.testing.assert_array_equal(
             between.get_segments(), [[points[0], points[1]]] * of_landmarks
         )
@@ -221,7 +221,7 @@ def test_hypotheses_are_drawn_until_they_are_landmarks():
     seen = _run_film.Hypotheses(points, covs, np.array([[0.0, 0.0], [1.0, 3.0], [0.0, 1.5]]))
     scene, *_ = scene_of(seen=seen)
     axes, draw = staged(scene.main)
-    (marked,) = [each for each in axes.lines if each.get_marker() == "D"]
+    (marked,) = [artist for artist in axes.lines if artist.get_marker() == "D"]
     for k, shown in enumerate([[], [0, 1], [1]]):
         draw(k)
         np.testing.assert_array_equal(marked.get_xydata(), points[k, shown])
