@@ -344,23 +344,20 @@ def test_of_information_the_links_are_seen_dense_and_sparse():
     find = jax.jit(plot.probe)
     np.testing.assert_allclose(find(dense).strength, expected, rtol=1e-5)
     # Landmarks 0 and 1 are active; 2 is passive, and linked by its list.
-    sparse = (
-        filters.Seif(*MODELS, capacity=3, active=2, links=2)
-        .init(*start)
-        ._replace(
-            alive=np.ones(3, bool),
-            active=np.array([0, 1]),
-            omega=omega[:7, :7],
-            diagonal=np.stack([np.eye(2), np.eye(2), omega[7:, 7:]]),
-            neighbours=np.array([[2, 3], [2, 3], [0, 1]]),
-            links=np.stack(
-                [
-                    [omega[3:5, 7:], np.zeros((2, 2))],
-                    [omega[5:7, 7:], np.zeros((2, 2))],
-                    [omega[7:, 3:5], omega[7:, 5:7]],
-                ]
-            ),
-        )
+    seif = filters.Seif(*MODELS, capacity=3, active=2, links=2)
+    sparse = seif.init(*start)._replace(
+        alive=np.ones(3, bool),
+        active=np.array([0, 1]),
+        omega=omega[:7, :7],
+        diagonal=np.stack([np.eye(2), np.eye(2), omega[7:, 7:]]),
+        neighbours=np.array([[2, 3], [2, 3], [0, 1]]),
+        links=np.stack(
+            [
+                [omega[3:5, 7:], np.zeros((2, 2))],
+                [omega[5:7, 7:], np.zeros((2, 2))],
+                [omega[7:, 3:5], omega[7:, 5:7]],
+            ]
+        ),
     )
     np.testing.assert_allclose(find(sparse).strength, expected, rtol=1e-5)
 
