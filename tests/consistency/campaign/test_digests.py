@@ -125,7 +125,7 @@ def test_a_gate_that_a_filter_closes_over_is_seen():
 ALONE = """
 import json, jax, test_digests as t
 jax.config.update("jax_enable_x64", True)
-found = t.identity(**t.campaign(make=t.worlds.ekf), platform="cpu")
+found = t.digests.identity(**t.campaign(make=t.worlds.ekf), platform="cpu")
 print(json.dumps(found))
 """
 

@@ -160,9 +160,9 @@ def test_odometry_that_is_frozen_for_some_steps_is_found_by_the_scans(drive, fir
     step = poses.between(log.raw[:-1], log.raw[1:])
     step[first - 1 : first + 3] = 0.0
     at = np.arange(first, first + 4)
-    known = ~np.isin(np.arange(COUNT), at)
-    steps, odometry = solved(drive, poses.chain(true[0], step), known=known)
-    np.testing.assert_array_equal(steps.frozen, ~known)
+    certain = ~np.isin(np.arange(COUNT), at)
+    steps, odometry = solved(drive, poses.chain(true[0], step), odometry_known=certain)
+    np.testing.assert_array_equal(steps.frozen, ~certain)
     assert odometry.matched[at].all()
     assert errors(odometry.poses, true)[0].max() < 0.2
     assert max(nees(odometry, true, k) for k in at) < 30
@@ -172,8 +172,8 @@ def test_odometry_that_is_frozen_on_the_whole_drive(drive):
     """Steps of a metre; at a corner the step before is no guess, and the place looks alike if it is
     turned by 90°, so that there a match may be wrong."""
     true, log, _ = drive
-    raw, known = np.zeros((COUNT, 3)), np.arange(COUNT) == 0
-    steps, odometry = solved(drive, raw, known=known)
+    raw, certain = np.zeros((COUNT, 3)), np.arange(COUNT) == 0
+    steps, odometry = solved(drive, raw, odometry_known=certain)
     assert steps.frozen[1:].all() and not steps.jump.any()
     off = np.array([relative_error(odometry, true, k) for k in range(1, COUNT)])
     right = (np.hypot(off[:, 0], off[:, 1]) < 0.2) & (np.abs(off[:, 2]) < np.deg2rad(6))
