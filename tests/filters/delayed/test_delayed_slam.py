@@ -588,17 +588,17 @@ def test_without_names_intersections_find_the_landmarks():
     (lambda: StoredMeasurements(capacity=0), "^StoredMeasurements: capacity"),
     (
         lambda: StoredMeasurements(spacing=-0.1),
-        "^StoredMeasurements: expected spacing of at least 0",
+        "^StoredMeasurements: spacing: expected a number from 0 to inf",
     ),
     (lambda: Hypotheses(capacity=0), "^Hypotheses: capacity"),
     (lambda: Hypotheses(patience=0.5), "^Hypotheses: patience"),
-    (lambda: Hypotheses(decay=-1), "^Hypotheses: expected decay of at least 0"),
-    (lambda: Hypotheses(spread=np.nan), "^Hypotheses: expected spread above 0"),
-    (lambda: Hypotheses(same=0), "^Hypotheses: expected same above 0"),
-    (lambda: Hypotheses(distance="euclid"), "^Hypotheses: expected distance .*, got 'euclid'"),
+    (lambda: Hypotheses(decay=-1), "^Hypotheses: decay: expected a number from 0 to inf"),
+    (lambda: Hypotheses(spread=np.nan), "^Hypotheses: spread: expected a number above 0"),
+    (lambda: Hypotheses(same=0), "^Hypotheses: same: expected a number above 0"),
+    (lambda: Hypotheses(distance="euclid"), "^Hypotheses: distance: expected .*, got 'euclid'"),
     (lambda: Promotion(per_scan=1.5), "^Promotion: per_scan"),
-    (lambda: Promotion(persistence=0), "^Promotion: expected persistence above 0"),
-    (lambda: Promotion(lead=-1), "^Promotion: expected lead of at least 0"),
+    (lambda: Promotion(persistence=0), "^Promotion: persistence: expected a number above 0"),
+    (lambda: Promotion(lead=-1), "^Promotion: lead: expected a number from 0 to inf"),
 )
 def test_bad_arguments_are_refused(make):
     make()
