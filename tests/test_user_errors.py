@@ -6,6 +6,7 @@ import numpy as np
 import pytest
 from cases import refused
 from own_models import changed, motion_of, sensor_of
+from worlds import unmatched
 
 import jaxslam
 from jaxslam import (
@@ -25,7 +26,6 @@ from jaxslam.core.protocols import Free
 from jaxslam.core.record import record
 from jaxslam.core.types import Estimate, Log, Scan
 from jaxslam.filters import Closing
-from jaxslam.filters import _reporting as reporting
 
 MOVE = motion.PoseIncrement(np.diag([1e-4, 1e-4, 1e-6]))
 SEES = sensors.RangeBearing(np.diag([1e-2, 1e-4]))
@@ -198,7 +198,7 @@ def test_charts_linearizers_and_filters_define_their_methods():
 
 
 ONE = Scan(jnp.zeros((1, 2)), jnp.zeros(1, int), jnp.ones(1, bool))
-INFO, STATE = reporting.nothing_of(ONE), jnp.zeros(3)
+INFO, STATE = unmatched(ONE), jnp.zeros(3)
 BELIEVED = Estimate(*(jnp.zeros(shape) for shape in [(3,), (3, 3), (2, 2), (2, 2, 2), (2,), (2,)]))
 
 

@@ -1,7 +1,7 @@
 import jax
 import pytest
+from command import run_command
 
-from jaxslam import _cli as cli
 from jaxslam.results.plot import _style
 
 
@@ -28,7 +28,7 @@ def refused(capsys):
 
     def check(arguments, *parts):
         capsys.readouterr()
-        assert cli.main(list(map(str, arguments))) == 2
+        assert run_command(arguments) == 2
         message = capsys.readouterr().err
         for part in parts:
             assert part in message

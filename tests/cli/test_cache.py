@@ -9,8 +9,6 @@ import jax
 import pytest
 
 from jaxslam import _cli as cli
-from jaxslam._cli import cache
-from jaxslam._cli.common import CompileClock
 
 OURS = {
     "jax_compilation_cache_dir",
@@ -28,7 +26,7 @@ def test_the_suite_writes_nothing_into_the_users_folder():
 def as_it_was(monkeypatch, tmp_path):
     """The test run may have a cache of its own; here JAX has been told of none."""
     monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "of the user"))
-    with cache.jax_settings(jax_compilation_cache_dir=None):
+    with cli.cache.jax_settings(jax_compilation_cache_dir=None):
         before = {name: getattr(jax.config, name) for name in OURS}
         yield
         assert {name: getattr(jax.config, name) for name in OURS} == before
@@ -40,7 +38,7 @@ def one_program(number=1.0):
     def add(x):
         return x + number
 
-    with CompileClock() as clock:
+    with cli.common.CompileClock() as clock:
         jax.jit(add).lower(1.0).compile()
     assert clock.programs == 1
     assert 0.0 < clock.compiling <= clock.seconds
@@ -53,30 +51,30 @@ def entries(folder):
 
 def test_programs_are_found_again(tmp_path):
     for cached in (0, 1):
-        with cache.program_cache(tmp_path / "a" / "b"):
+        with cli.cache.program_cache(tmp_path / "a" / "b"):
             assert one_program() == cached
     assert len(entries(tmp_path / "a" / "b")) == 1
-    with cache.program_cache(tmp_path / "other"):
+    with cli.cache.program_cache(tmp_path / "other"):
         assert one_program() == 0
     assert len(entries(tmp_path)) == 2
 
 
 def test_by_default_they_are_kept_in_the_users_folder_or_where_jax_was_told(tmp_path):
-    with cache.program_cache(None):
+    with cli.cache.program_cache(None):
         one_program()
     assert len(entries(tmp_path / "of the user" / "jaxslam")) == 1
-    with cache.jax_settings(
+    with cli.cache.jax_settings(
         jax_compilation_cache_dir=str(tmp_path / "told"),
         jax_persistent_cache_min_compile_time_secs=0.0,
     ):
-        with cache.program_cache(None):
+        with cli.cache.program_cache(None):
             one_program()
         assert len(entries(tmp_path / "told")) == 1
-        with cache.program_cache(None, off=True):
+        with cli.cache.program_cache(None, off=True):
             assert one_program() == 0
             assert one_program(2.0) == 0
         assert len(entries(tmp_path / "told")) == 1
-        with cache.program_cache(tmp_path / "asked"):
+        with cli.cache.program_cache(tmp_path / "asked"):
             one_program()
         assert len(entries(tmp_path / "asked")) == 1
     assert len(entries(tmp_path)) == 3
@@ -98,7 +96,7 @@ def test_the_users_folder_follows_the_platform(monkeypatch):
             for name, value in variables.items():
                 patch.setenv(name, value)
             patch.setattr(sys, "platform", system)
-            assert cache.user_folder() == expected
+            assert cli.cache.user_folder() == expected
 
 
 def warned(capsys):
@@ -110,18 +108,18 @@ def warned(capsys):
 
 def test_a_folder_that_cannot_be_is_said_and_done_without(tmp_path, capsys, monkeypatch):
     (tmp_path / "file").write_text("")
-    asked = tmp_path / "file" / "cache"
-    with cache.program_cache(asked):
+    cache_folder = tmp_path / "file" / "cache"
+    with cli.cache.program_cache(cache_folder):
         one_program()
     (line,) = warned(capsys)
-    assert f"cannot be kept in {asked} (" in line
+    assert f"cannot be kept in {cache_folder} (" in line
     assert "continuing without" in line
 
     def homeless():
         raise RuntimeError("Could not determine home directory.")
 
-    monkeypatch.setattr(cache, "user_folder", homeless)
-    with cache.program_cache(None):
+    monkeypatch.setattr(cli.cache, "user_folder", homeless)
+    with cli.cache.program_cache(None):
         one_program()
     assert "the user's cache folder (Could not determine home" in warned(capsys)[0]
 
@@ -129,15 +127,15 @@ def test_a_folder_that_cannot_be_is_said_and_done_without(tmp_path, capsys, monk
 @pytest.mark.parametrize("spoil", ["truncated", "empty", "noise", "of another version"])
 def test_a_damaged_program_is_said_and_compiled_anew(tmp_path, capsys, spoil):
     def both():
-        with cache.program_cache(tmp_path):
+        with cli.cache.program_cache(tmp_path):
             return one_program() + one_program(2.0)
 
     assert both() == 0
     for path in entries(tmp_path):
-        whole = path.read_bytes()
+        content = path.read_bytes()
         path.write_bytes(
             {
-                "truncated": whole[: len(whole) // 2],
+                "truncated": content[: len(content) // 2],
                 "empty": b"",
                 "noise": bytes(range(256)),
                 "of another version": zlib.compress(b"\0\0\0\1" + b"another version's " * 9),
@@ -154,8 +152,8 @@ def test_a_damaged_program_is_said_and_compiled_anew(tmp_path, capsys, spoil):
 def test_a_folder_that_jax_was_told_of_is_not_ours_to_mend(tmp_path, capsys):
     (tmp_path / "file").write_text("")
     with (
-        cache.jax_settings(jax_compilation_cache_dir=str(tmp_path / "file" / "below")),
-        cache.program_cache(None),
+        cli.cache.jax_settings(jax_compilation_cache_dir=str(tmp_path / "file" / "below")),
+        cli.cache.program_cache(None),
     ):
         assert one_program() + one_program(2.0) == 0
     (line,) = warned(capsys)
@@ -169,7 +167,7 @@ def test_a_full_disk_is_said_once_and_leaves_no_half_of_a_program(tmp_path, caps
         raise OSError(28, "No space left on device")
 
     monkeypatch.setattr(Path, "write_bytes", full)
-    with cache.program_cache(tmp_path):
+    with cli.cache.program_cache(tmp_path):
         assert one_program() + one_program(2.0) == 0
     (line,) = warned(capsys)
     assert "cannot be written (" in line
@@ -180,7 +178,7 @@ def test_a_full_disk_is_said_once_and_leaves_no_half_of_a_program(tmp_path, caps
 def test_other_warnings_are_left_alone(tmp_path):
     import warnings
 
-    with pytest.warns(UserWarning, match="something else"), cache.program_cache(tmp_path):
+    with pytest.warns(UserWarning, match="something else"), cli.cache.program_cache(tmp_path):
         warnings.warn("something else", stacklevel=1)
 
 
@@ -192,22 +190,22 @@ def test_what_was_not_used_for_longest_goes_first(tmp_path):
         path.write_bytes(bytes(100))
         os.utime(path, (1000 + used, 900))
     (folder / "mine.txt").write_bytes(bytes(1000))
-    cache.prune(tmp_path, 400)
+    cli.cache.prune(tmp_path, 400)
     assert len(entries(tmp_path)) == 4
-    cache.prune(tmp_path, 250)
+    cli.cache.prune(tmp_path, 250)
     assert [path.name for path in entries(tmp_path)] == ["a-cache", "c-cache"]
-    with cache.program_cache(tmp_path, bound=0):
+    with cli.cache.program_cache(tmp_path, bound=0):
         one_program()
     assert entries(tmp_path) == []
     assert (folder / "mine.txt").exists()
 
 
 def test_programs_of_another_version_or_processor_are_of_another_folder(tmp_path, monkeypatch):
-    monkeypatch.setattr(cache, "version", lambda name: "0.0.1")
-    with cache.program_cache(tmp_path):
+    monkeypatch.setattr(cli.cache, "version", lambda name: "0.0.1")
+    with cli.cache.program_cache(tmp_path):
         one_program()
     monkeypatch.undo()
-    with cache.program_cache(tmp_path):
+    with cli.cache.program_cache(tmp_path):
         assert one_program() == 0
     assert len({path.parent for path in entries(tmp_path)}) == 2
 

@@ -5,8 +5,8 @@ import re
 
 import numpy as np
 import pytest
+from command import run_command
 
-from jaxslam import _cli as cli
 from jaxslam import datasets
 
 TRUE = {
@@ -75,10 +75,10 @@ def test_the_errors_of_a_simulated_robot_are_found_and_their_uncertainty_is_coun
 ):
     """All parameters within χ² of their covariance, with p = 0.001; the pose NEES becomes honest."""
     folder, out = write(tmp_path), tmp_path / "out"
-    assert cli.main(["run", "--dataset", "table", str(folder), "--out", str(out)]) == 0
+    assert run_command(["run", "--dataset", "table", str(folder), "--out", str(out)]) == 0
     before = json.loads((out / "summary.json").read_text())
     calibrated = ["--calibrate", "scale,heading,range,delay", "--fix", "range scale"]
-    assert cli.main(["fit", str(folder), *calibrated, "--write", "--out", str(out)]) == 0
+    assert run_command(["fit", str(folder), *calibrated, "--write", "--out", str(out)]) == 0
     printed = capsys.readouterr().out
     assert "range scale = 1 was held" in printed and "NOT" not in printed
     said = json.loads((out / "fit.json").read_text())
@@ -96,7 +96,7 @@ def test_the_errors_of_a_simulated_robot_are_found_and_their_uncertainty_is_coun
     neutral = np.array([1.0, 1.0, 0.0, 0.0, 0.0])
     assert (np.abs([*TRUE.values()] - neutral) > 2 * np.sqrt(np.diag(cov))).all()
     assert not models.cov[names.index("range scale")].any()  # held
-    assert cli.main(["run", "--dataset", "table", str(folder), "--out", str(out)]) == 0
+    assert run_command(["run", "--dataset", "table", str(folder), "--out", str(out)]) == 0
     after = json.loads((out / "summary.json").read_text())
     assert after["uncertainty of constants"] == "added"
     assert after["dropped by the reader"]["measurements of the maximum range"] > 10
@@ -105,7 +105,7 @@ def test_the_errors_of_a_simulated_robot_are_found_and_their_uncertainty_is_coun
     # Without their uncertainty the covariance is smaller.
     constants, _, _ = (folder / "fit.toml").read_text().partition("\n[calibration]")
     (folder / "fit.toml").write_text(constants)
-    assert cli.main(["run", "--dataset", "table", str(folder), "--out", str(out)]) == 0
+    assert run_command(["run", "--dataset", "table", str(folder), "--out", str(out)]) == 0
     alone = json.loads((out / "summary.json").read_text())
     assert "uncertainty of constants" not in alone
     np.testing.assert_allclose(alone["final pose"], after["final pose"], rtol=1e-9)
@@ -195,7 +195,7 @@ def test_a_largest_range_that_repeats_is_noted(tmp_path):
 def test_what_is_seen_only_together_is_named_and_not_written(tmp_path, capsys):
     folder = write(tmp_path, 120)
     command = ["fit", str(folder), "--calibrate", "heading,mount"]
-    assert cli.main([*command, "--write", "--out", str(tmp_path / "o")]) == 0
+    assert run_command([*command, "--write", "--out", str(tmp_path / "o")]) == 0
     printed = capsys.readouterr().out
     assert "heading [rad]: the log does not determine it (only together with mount" in printed
     assert "was not written into" in printed and not (folder / "fit.toml").exists()

@@ -11,7 +11,6 @@ import pytest
 import jaxslam
 from jaxslam import _cli as cli
 from jaxslam import plot, store
-from jaxslam._cli.common import check_out
 from jaxslam.consistency.campaign import Interrupted
 from jaxslam.results import _report as report
 
@@ -171,13 +170,13 @@ def test_the_folder_of_another_command_is_left_alone(tmp_path, refused):
     """Both write map.png."""
     (tmp_path / "summary.json").write_text('{"command": "jaxslam run --dataset table mine"}')
     refused([*QUICK, "--out", tmp_path], f"{tmp_path} holds the results of jaxslam run: choose")
-    check_out(tmp_path, "run")
+    cli.common.check_out(tmp_path, "run")
     (tmp_path / "summary.json").unlink()
     (tmp_path / "consistency.json").write_text('{"command": ""}')  # saved from Python
-    check_out(tmp_path, "run")
+    cli.common.check_out(tmp_path, "run")
     (tmp_path / "consistency.json").write_text('{"command": "jaxslam consistency"}')
     with pytest.raises(ValueError, match=r"--out: .* the results of jaxslam consistency"):
-        check_out(tmp_path, "run")
+        cli.common.check_out(tmp_path, "run")
 
 
 def test_a_folder_of_something_else_is_left_alone(tmp_path, refused):

@@ -14,10 +14,8 @@ from worlds import three_parameters
 import jaxslam
 from jaxslam import _cli as cli
 from jaxslam import catalog, scenarios
-from jaxslam._cli import common
 from jaxslam.consistency.campaign import Interrupted
-from jaxslam.results import _campaign_files as campaign_files
-from jaxslam.results import _files as files
+from jaxslam.results import _campaign_files, _files
 
 QUICK = ["consistency", "--scenario", "circle", "--steps", "8", "--runs", "3"]
 
@@ -25,9 +23,9 @@ QUICK = ["consistency", "--scenario", "circle", "--steps", "8", "--runs", "3"]
 def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys, monkeypatch, undrawn):
     out, filmed = tmp_path / "results", []
     monkeypatch.setattr(cli.consistency, "_write_films", lambda *a: filmed.append(a) or 0)
-    asked = ["--filters", "dead_reckoning,localization", "--no-bound", "--seed", "4", "--animate"]
+    options = ["--filters", "dead_reckoning,localization", "--no-bound", "--seed", "4", "--animate"]
     shape = ["--block", "1", "--devices", "1"]
-    assert cli.main([*QUICK, *asked, *shape, "--out", str(out)]) == 0
+    assert cli.main([*QUICK, *options, *shape, "--out", str(out)]) == 0
     printed = capsys.readouterr().out
     assert "verdict" in printed
     assert "published" not in printed  # of 2500 steps, and these are 8
@@ -38,7 +36,7 @@ def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys, monk
         last,
     )
     names = {path.name for path in out.iterdir()}
-    assert names == {"blocks", *campaign_files.file_names(["png"])}
+    assert names == {"blocks", *_campaign_files.file_names(["png"])}
     assert names == {
         "blocks",
         "report.html",
@@ -48,10 +46,10 @@ def test_consistency_prints_a_table_and_writes_everything(tmp_path, capsys, monk
         *(f"{n}.png" for n in ("nees", "rmse", "cost", "coverage", "whiteness", "gained")),
         *(f"{n}.png" for n in ("errors", "map")),
     }
-    found = json.loads((out / "consistency.json").read_text())
-    assert (found["runs"], found["steps"], found["seed"]) == (3, 8, 4)
-    assert list(found["filters"]) == ["dead_reckoning", "localization"]
-    assert found["command"].startswith("jaxslam consistency --scenario circle")
+    result = json.loads((out / "consistency.json").read_text())
+    assert (result["runs"], result["steps"], result["seed"]) == (3, 8, 4)
+    assert list(result["filters"]) == ["dead_reckoning", "localization"]
+    assert result["command"].startswith("jaxslam consistency --scenario circle")
     ((folder, world, filters, *rest),) = filmed
     assert (folder, world.name, list(filters), rest) == (
         out,
@@ -119,11 +117,11 @@ def test_bad_input_exits_with_2_and_writes_nothing(tmp_path, refused, change, me
 
 
 def test_no_more_devices_are_made_than_there_are_cores(monkeypatch):
-    told = {}
-    monkeypatch.setattr(jax.config, "update", told.__setitem__)
-    for asked, made in (("99", common.cores()), ("1", 1), ("all", common.cores())):
-        common.set_device_count(asked)
-        assert told == {"jax_num_cpu_devices": made}
+    updates = {}
+    monkeypatch.setattr(jax.config, "update", updates.__setitem__)
+    for devices, count in (("99", cli.common.cores()), ("1", 1), ("all", cli.common.cores())):
+        cli.common.set_device_count(devices)
+        assert updates == {"jax_num_cpu_devices": count}
 
 
 @pytest.mark.parametrize("asked", ["all", "fastslam1,fastslam2,particle_localization"])
@@ -167,7 +165,7 @@ def test_an_unwritable_folder_exits_with_2_before_any_work(tmp_path, refused, mo
     def read_only(dir):
         raise PermissionError(13, "Permission denied", f"{dir}/tmpxyz")
 
-    monkeypatch.setattr(files.tempfile, "TemporaryFile", read_only)
+    monkeypatch.setattr(_files.tempfile, "TemporaryFile", read_only)
     out = tmp_path / "not" / "there"
     message = refused([*QUICK, "--out", out])
     assert message == f"jaxslam: results cannot be written to {out}: Permission denied\n"
@@ -251,7 +249,7 @@ def test_numbers_are_written_before_figures_and_one_that_fails_is_named(tmp_path
         raise RuntimeError("latex could not be found\nin a hundred lines")
 
     drawings = {"map": fails, "graph": lambda: {"graph.png": b"drawn"}}
-    assert common.write_results(tmp_path, {"map.csv": "numbers"}, drawings) == common.FAILED
+    assert cli.common.write_results(tmp_path, {"map.csv": "numbers"}, drawings) == cli.common.FAILED
     assert {path.name for path in tmp_path.iterdir()} == {"map.csv", "graph.png"}
     printed = capsys.readouterr()
     assert f"wrote {tmp_path / 'map.csv'}, {tmp_path / 'graph.png'}" in printed.out
@@ -264,10 +262,10 @@ def test_an_interrupt_while_a_figure_is_drawn_says_what_is_written(tmp_path, mon
         raise KeyboardInterrupt
 
     def command(options, _):
-        return common.write_results(options.out, {"a.csv": "1"}, {"map": interrupted})
+        return cli.common.write_results(options.out, {"a.csv": "1"}, {"map": interrupted})
 
     monkeypatch.setattr(cli.verify, "verify_models", command)
-    assert cli.main(["verify", "--out", str(tmp_path)]) == common.INTERRUPTED
+    assert cli.main(["verify", "--out", str(tmp_path)]) == cli.common.INTERRUPTED
     assert f"interrupted; wrote {tmp_path / 'a.csv'}" in capsys.readouterr().err
 
 

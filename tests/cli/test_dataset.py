@@ -10,8 +10,7 @@ from matplotlib.animation import FFMpegWriter
 
 from jaxslam import _cli as cli
 from jaxslam import catalog, datasets, filters
-from jaxslam._cli.recorded.filter_run import is_positive_definite, suspicions
-from jaxslam._cli.recorded.run import RunPlan, run_filters
+from jaxslam._cli.recorded import filter_run
 from jaxslam.results import plot
 
 
@@ -64,7 +63,7 @@ def test_a_plan_of_python_runs_as_the_command_does(tmp_path, undrawn):
     assert cli.main(["run", "--dataset", "bonn", str(folder), "--out", str(out)]) == 0
     data = datasets.bonn(folder)
     ekf = filters.EkfSlam(data.motion, data.sensor, data.capacity, **data.filter_options)
-    (run,) = run_filters(RunPlan(data, {"ekf": ekf})).values()
+    (run,) = cli.run.run_filters(cli.run.RunPlan(data, {"ekf": ekf})).values()
     summary = json.loads((out / "summary.json").read_text())
     same = {key: value for key, value in run.summary.items() if key != "seconds"}
     assert same == {key: summary[key] for key in same}
@@ -123,9 +122,9 @@ def test_the_help_names_whole_filters_and_only_those_of_a_data_set(monkeypatch, 
 
 
 def test_a_covariance_is_judged_on_the_host():
-    assert is_positive_definite(np.diag([1.0, 1e-12]))
-    assert not is_positive_definite(np.diag([1.0, -1e-12]))
-    assert not is_positive_definite(np.array([[1.0, np.nan], [np.nan, 1.0]]))
+    assert filter_run.is_positive_definite(np.diag([1.0, 1e-12]))
+    assert not filter_run.is_positive_definite(np.diag([1.0, -1e-12]))
+    assert not filter_run.is_positive_definite(np.array([[1.0, np.nan], [np.nan, 1.0]]))
 
 
 def write_table(tmp_path):
@@ -190,14 +189,16 @@ def test_a_run_that_nothing_honest_explains_says_so():
         "NIS / dof": 1.1,
         "pose NEES, median (2.37 is honest)": 3.0,
     }
-    assert suspicions(honest) == suspicions({"status": honest["status"]}) == []
+    assert (
+        filter_run.suspicions(honest) == filter_run.suspicions({"status": honest["status"]}) == []
+    )
     for changed, begins in (
         ({"NIS / dof": 160.0}, "NIS / dof is 160, where 1 is honest: models or units are wrong"),
         ({"status": {"fused": 10, "rejected": 90}}, "the gate rejects 90 of 100: models or units"),
         ({"pose NEES, median (2.37 is honest)": 1e4}, "pose NEES, median is 1e+04, where 2.37 is"),
         ({"landmark NEES (2 is honest)": 1e4}, "landmark NEES is 1e+04, where 2 is honest, thoug"),
     ):
-        (note,) = suspicions(honest | changed)
+        (note,) = filter_run.suspicions(honest | changed)
         assert note.startswith(begins)
 
 

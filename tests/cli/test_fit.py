@@ -5,8 +5,8 @@ import json
 
 import numpy as np
 import pytest
+from command import run_command
 
-from jaxslam import _cli as cli
 from jaxslam import datasets
 from jaxslam.core.types import Info, Status
 from jaxslam.datasets._noise_fit import autocorrelation
@@ -57,7 +57,7 @@ def write(folder, steps=150):
 def test_the_noises_of_a_folder_are_fitted_and_written(tmp_path, capsys):
     """Within 3.5 standard errors; an outlier at the gate is left out, a noise of 0 is held."""
     out = tmp_path / "out"
-    assert cli.main(["fit", str(write(tmp_path)), "--write", "--out", str(out)]) == 0
+    assert run_command(["fit", str(write(tmp_path)), "--write", "--out", str(out)]) == 0
     printed = capsys.readouterr().out
     assert "449 measurements used, others: 1 rejected" in printed
     assert "motion gamma [rad/s] = 0 was held" in printed
@@ -84,7 +84,9 @@ def test_the_noises_of_a_folder_are_fitted_and_written(tmp_path, capsys):
     assert (out / "fit.toml").read_text() == (tmp_path / "fit.toml").read_text()
     fitted = datasets.table(tmp_path)
     assert fitted.motion.name == "velocity" and "[sensor] noise of fit.toml" in fitted.assumed
-    after = {one.name: one.value for one in fitted.adjustable.parameters}["sensor range [m]"]
+    after = {parameter.name: parameter.value for parameter in fitted.adjustable.parameters}[
+        "sensor range [m]"
+    ]
     np.testing.assert_allclose(after, said["parameters"]["sensor range [m]"]["after"], rtol=1e-3)
     assert (out / "fit.toml").read_text().startswith("[motion]\nnoise = [")
     comment = "  # v [m/s], omega [rad/s], gamma [rad/s]\n\n[sensor]\nnoise = ["

@@ -12,22 +12,19 @@ import pytest
 import yaml
 from matplotlib.animation import FFMpegWriter
 from PIL import Image
+from reference.walls import is_free
 from ring_of_rooms import FAR, ranges_of
 
 from jaxslam import _cli as cli
 from jaxslam import datasets, grids
-from jaxslam._cli.recorded import localize, memory
-from jaxslam._cli.recorded.laser_log import read_log
-from jaxslam._cli.recorded.make_map import SCANS_AT_ONCE
 from jaxslam.core.types import Estimate
 from jaxslam.math import numpy_poses as poses
 from jaxslam.results import plot, report
-from jaxslam.simulation._wall_geometry import is_free
 from jaxslam.simulation.laser import scan_world
 from jaxslam.simulation.scenarios import square
 from jaxslam.simulation.walls import make_walls, rasterize
 
-BEAMS, STEPS = 25, SCANS_AT_ONCE + 6
+BEAMS, STEPS = 25, cli.make_map.SCANS_AT_ONCE + 6
 FIT = "beams of the last 10 scans within 0.3 m of the map's range, share"
 
 
@@ -255,7 +252,7 @@ def test_a_robot_is_localized_by_a_laser_on_a_mount(mounted, room_map, tmp_path)
 def test_odometry_of_a_file_takes_the_place_of_the_logs(log_file, tmp_path):
     text = "".join(f"{100 + 0.25 * k} {k / 10} 0 0\n" for k in range(STEPS))
     (tmp_path / "odometry.txt").write_text(text)
-    asked = {"path": log_file.path, "odometry": tmp_path / "odometry.txt"}
+    paths = {"path": log_file.path, "odometry": tmp_path / "odometry.txt"}
     rest = {
         "max_range": 10.0,
         "laser": None,
@@ -264,7 +261,7 @@ def test_odometry_of_a_file_takes_the_place_of_the_logs(log_file, tmp_path):
         "scans": ":",
         "every": 2,
     }
-    log, _ = read_log(SimpleNamespace(**asked, **rest))
+    log, _ = cli.laser_log.read_log(SimpleNamespace(**paths, **rest))
     np.testing.assert_allclose(log.raw[:, 0], np.arange(0, STEPS, 2) / 10)
     assert log.odometry_known.shape == (STEPS // 2,)
 
@@ -347,16 +344,16 @@ def test_a_bag_gives_the_files_that_its_log_gives(bag, log_file, tmp_path, undra
 def test_the_robot_of_a_bag_is_localized(
     bag, log_file, room_map, tmp_path, undrawn, monkeypatch, odometry
 ):
-    given, out = bag, tmp_path / "out"
+    recording, out = bag, tmp_path / "out"
     if not odometry:
         log = bags.first(datasets.carmen(log_file.path, max_range=10.0), STEPS)
-        given = bags.write(tmp_path, [m for m in bags.of_log(log) if m.topic != "/odom"])
+        recording = bags.write(tmp_path, [m for m in bags.of_log(log) if m.topic != "/odom"])
         solved = SimpleNamespace(odometry=log.raw)  # 25 beams are too few for laser odometry
-        monkeypatch.setattr(localize.laser_slam, "solve", lambda log: solved)
+        monkeypatch.setattr(cli.localize.laser_slam, "solve", lambda log: solved)
     x, y, heading = log_file.pose[0]
     start = f"{x},{y},{np.rad2deg(heading)}"
     options = ["--max-range", "10", "--particles", "500", "--start", start, "--out", out]
-    assert command("run", "--dataset", "rosbag", given, "--localize", room_map, *options) == 0
+    assert command("run", "--dataset", "rosbag", recording, "--localize", room_map, *options) == 0
     rows = np.loadtxt(out / "trajectory.csv", delimiter=",", skiprows=1)
     error = np.hypot(*(rows[:, 1:3] - log_file.pose[:, :2]).T)
     assert np.median(error) < 0.3 and error[-1] < 0.3
@@ -397,8 +394,8 @@ def test_a_map_or_a_start_that_is_none_is_refused(
 
 def test_memory_is_returned_after_each_compilation_in_the_block(monkeypatch):
     calls = []
-    monkeypatch.setattr(memory, "trim", lambda: calls.append(None))
-    with memory.memory_returned():
+    monkeypatch.setattr(cli.recorded.memory, "trim", lambda: calls.append(None))
+    with cli.recorded.memory.memory_returned():
         jax.jit(lambda x: x + 0.25)(np.ones(3))
     count = len(calls)
     jax.jit(lambda x: x + 0.5)(np.ones(3))
@@ -406,4 +403,4 @@ def test_memory_is_returned_after_each_compilation_in_the_block(monkeypatch):
 
 
 def test_memory_can_be_returned():
-    memory.trim()
+    cli.recorded.memory.trim()

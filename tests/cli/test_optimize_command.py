@@ -12,7 +12,6 @@ from reference import graph as plain
 
 from jaxslam import _cli as cli
 from jaxslam import datasets, graphs
-from jaxslam._cli import optimize
 from jaxslam.results import plot
 from jaxslam.results.plot import _film
 
@@ -110,8 +109,8 @@ def test_it_writes_the_optimum(file, tmp_path, capsys, monkeypatch):
 
 def test_a_plan_of_python_is_solved_as_the_command_solves_it(file):
     """By the program of the test above."""
-    plan = optimize.OptimizePlan(str(file), start="chordal")
-    optimum = optimize.solve(plan, optimize.read_problem(plan))
+    plan = cli.optimize.OptimizePlan(str(file), start="chordal")
+    optimum = cli.optimize.solve(plan, cli.optimize.read_problem(plan))
     chi2 = plain.optimum(small()._replace(fixed_pose=np.arange(8) == 0))[2]
     assert optimum.converged and list(optimum.cost_by_start) == ["chordal"]
     np.testing.assert_allclose([optimum.chi2, optimum.cost], chi2, rtol=1e-9)
@@ -119,7 +118,7 @@ def test_a_plan_of_python_is_solved_as_the_command_solves_it(file):
 
 def test_a_film_shows_the_iterations_of_one_solution():
     with pytest.raises(ValueError, match="--animate: the kernel truncated is solved in rounds"):
-        optimize.OptimizePlan("graph.g2o", kernel="truncated", animate=True)
+        cli.optimize.OptimizePlan("graph.g2o", kernel="truncated", animate=True)
 
 
 @pytest.mark.sweep
@@ -179,8 +178,10 @@ def test_gtsam_reads_what_is_written(tmp_path, undrawn, fixed):
 def test_an_optimum_without_a_proof_says_what_to_try(monkeypatch):
     proof = SimpleNamespace(certified=False, chi2=2.0, gap=1.0, position=0.1, heading=0.1)
     monkeypatch.setattr(graphs, "certificate", lambda graph: proof)
-    told = optimize._certificate(small(), converged=True, plain=True)
-    assert told["certificate"].startswith("not certified: ") and "--start" in told["certificate"]
+    summary = cli.optimize._certificate(small(), converged=True, plain=True)
+    assert (
+        summary["certificate"].startswith("not certified: ") and "--start" in summary["certificate"]
+    )
 
 
 def test_too_few_steps_are_no_success(file, tmp_path, capsys):

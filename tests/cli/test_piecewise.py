@@ -4,14 +4,13 @@ import itertools
 
 import jax.numpy as jnp
 import numpy as np
+from worlds import unmatched
 
 from jaxslam import charts
 from jaxslam._cli.campaigns import piecewise
-from jaxslam._cli.campaigns.piecewise import run_in_pieces
 from jaxslam.core.protocols import Filter
 from jaxslam.core.record import record
 from jaxslam.core.types import Estimate, Log, Scan
-from jaxslam.filters._reporting import nothing_of
 
 STEPS = 11
 
@@ -33,7 +32,7 @@ def toy(traced):
             return pose + u
 
         def update(self, pose, scan, key):
-            return pose, nothing_of(scan)._replace(log_likelihood=pose[0])
+            return pose, unmatched(scan)._replace(log_likelihood=pose[0])
 
         def estimate(self, pose):
             return Estimate(
@@ -60,7 +59,7 @@ def test_a_log_in_pieces_is_the_whole_log(monkeypatch):
     monkeypatch.setattr(piecewise, "PIECES", 2)
     looked = [4, 8, 11]
     traced, shown, seen = [], [], []
-    done = run_in_pieces(
+    done = piecewise.run_in_pieces(
         toy(traced),
         log_of(),
         np.ones(3),
@@ -88,7 +87,7 @@ def test_what_a_film_shows_is_kept_of_the_steps_to_watch_alone(monkeypatch):
     monkeypatch.setattr(piecewise, "PIECES", 3)
     at = np.array([0, 3, 4, 4, 10])
     start = np.ones(3), np.zeros((3, 3))
-    done = run_in_pieces(
+    done = piecewise.run_in_pieces(
         toy([]),
         log_of(),
         *start,

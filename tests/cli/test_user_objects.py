@@ -9,7 +9,6 @@ from own_models import changed
 import jaxslam
 from jaxslam import Scenario, catalog, scenarios
 from jaxslam import _cli as cli
-from jaxslam._cli.user_objects import UserObjects
 from jaxslam.core.protocols import Filter
 
 MINE = """
@@ -75,20 +74,20 @@ def mine(tmp_path):
 
 
 def test_filters_of_a_file_stand_beside_those_of_the_catalog(mine, capsys):
-    files = UserObjects()
+    files = cli.user_objects.UserObjects()
     world = scenarios.circle(3)
-    asked = f"ekf, {mine}:blind,{mine}:ready,{mine}:alike,{mine}:named"
-    found = files.filters(asked, world)
-    assert list(found) == ["ekf", "blind", "ready", "alike", "named"]  # as they were asked for
-    assert all(isinstance(found[name], Filter) for name in ("ekf", "blind", "ready"))
-    assert isinstance(found["alike"](None), Filter)
+    names = f"ekf, {mine}:blind,{mine}:ready,{mine}:alike,{mine}:named"
+    filters = files.filters(names, world)
+    assert list(filters) == ["ekf", "blind", "ready", "alike", "named"]  # as they were asked for
+    assert all(isinstance(filters[name], Filter) for name in ("ekf", "blind", "ready"))
+    assert isinstance(filters["alike"](None), Filter)
     assert capsys.readouterr().out == "loaded\n"  # once
     assert list(files.filters(f"{mine}:plain,{mine}:wide", world)) == ["plain", "wide"]
     assert list(files.filters("all", world)) == list(catalog.ALL)
 
 
 def test_a_scenario_of_a_file_may_be_a_function_of_its_steps(mine):
-    files = UserObjects()
+    files = cli.user_objects.UserObjects()
     assert files.scenario(f"{mine}:short", None).steps == 3
     assert files.scenario(f"{mine}:short", 7).steps == 7
     assert isinstance(files.scenario(f"{mine}:world", None), Scenario)
@@ -145,7 +144,7 @@ def test_what_cannot_be_used_is_refused_in_a_line_and_nothing_written(
 
 
 def test_a_filter_of_another_size_and_a_world_without_covariance_are_refused(mine):
-    files = UserObjects()
+    files = cli.user_objects.UserObjects()
     world = scenarios.circle(3)
     compass = changed(world.sensor, measurements=("heading [rad]",))
     with pytest.raises(
@@ -158,7 +157,7 @@ def test_a_filter_of_another_size_and_a_world_without_covariance_are_refused(min
         " noise_cov=lambda pose, u: -jaxslam.scenarios.circle(1).motion.noise_cov(pose, u)))"
     )
     with pytest.raises(ValueError, match="noise_cov of"):
-        UserObjects().scenario(f"{mine}:noisy", None)
+        cli.user_objects.UserObjects().scenario(f"{mine}:noisy", None)
 
 
 def test_a_filter_that_is_lost_in_some_runs_is_told_everywhere(mine, tmp_path, capsys, undrawn):

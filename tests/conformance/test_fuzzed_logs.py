@@ -17,16 +17,15 @@ from cases import swept
 from hypothesis import given, settings
 
 from jaxslam import catalog, run
-from jaxslam.core._numbers import largest
-from jaxslam.core._validation import check_log
+from jaxslam.core import _numbers, _validation
 from jaxslam.core.protocols import Filter
 from jaxslam.core.types import Log, Scan, Status
-from jaxslam.graphs.smoothing._forward_pass import LogEstimator
+from jaxslam.graphs.smoothing import BatchMap, Smoother
 
 WIDE = int(os.environ.get("JAXSLAM_FUZZ", "1"))
 STEPS, PLACES, LANDMARKS, LOGS = 4, 3, 4, 48
 WORLD = dataclasses.replace(worlds.ring(STEPS), landmarks=worlds.ring().landmarks[:LANDMARKS])
-MOST = largest(np.float64)
+MOST = _numbers.largest(np.float64)
 
 NUMBERS = [0.0, -0.0, 1e-300, 1e-160, 1e-30, 1e-9, -1.0, 1e3, 1e6, 1e20, -1e30, 4e61, -4e61]
 SIGNALS = [np.nan, np.inf, -np.inf, 5e61, 1e160, -1e300]
@@ -48,7 +47,7 @@ def logs(rng, count=LOGS, steps=STEPS, places=PLACES, dtype=np.float64, wild=Tru
         z = drawn(rng, z.shape, z, SIGNALS, 0.05)
     valid = rng.random(shape) < rng.choice([0.0, 0.3, 1.0], (count, 1, 1))
     tag = rng.integers(-1, LANDMARKS + 2, shape).astype(np.int32)
-    most = largest(np.zeros((), dtype))
+    most = _numbers.largest(np.zeros((), dtype))
     with np.errstate(over="ignore"):
         return Log(np.clip(control, -most, most).astype(dtype), Scan(z.astype(dtype), tag, valid))
 
@@ -57,7 +56,7 @@ def made(name, steps=STEPS):
     """A filter of the catalogue, given the true map or path where it needs one."""
     options = {} if WIDE > 1 else TOGETHER.get(name, {})
     candidate = catalog.ALL[name](WORLD, **options)
-    if isinstance(candidate, Filter | LogEstimator):
+    if isinstance(candidate, Filter | BatchMap | Smoother):
         return candidate
     truth = worlds.draw(WORLD)[0]
     if name == "mapping":  # the poses are its controls
@@ -86,7 +85,7 @@ def assert_told(log, estimate, info, tame):
     z, valid, status = np.asarray(log.scan.z), np.asarray(log.scan.valid), np.asarray(info.status)
     np.testing.assert_array_equal(status == Status.EMPTY, ~valid)
     assert np.isin(status, list(Status)).all()
-    lost = valid & ~(np.abs(z) <= largest(z)).all(axis=-1)
+    lost = valid & ~(np.abs(z) <= _numbers.largest(z)).all(axis=-1)
     assert (status[lost] == Status.REJECTED).all()
     for leaf in (*estimate, info.nis, info.innovation, info.innovation_cov, info.log_likelihood):
         assert np.isfinite(leaf).all()
@@ -184,7 +183,7 @@ def test_outside_a_trace_a_log_is_well_formed_or_refused_by_row_and_slot(data):
         (steps, places), np.int64, st.one_of(st.integers(-3, 3), st.integers(-(2**40), 2**40))
     )
     valid = array((steps, places), bool, st.booleans())
-    most = largest(control, z)
+    most = _numbers.largest(control, z)
     sane = [(np.abs(control) <= most).all(), (np.abs(z[valid]) <= most).all()]
     sane += [((tag[valid] >= -1) & (tag[valid] < 2**31)).all()]
     sane += [
@@ -195,7 +194,7 @@ def test_outside_a_trace_a_log_is_well_formed_or_refused_by_row_and_slot(data):
     ]
     log = Log(control, Scan(z, tag, valid))
     if all(sane):
-        check_log("run", log, control_size=2, measurement_size=2)
+        _validation.check_log("run", log, control_size=2, measurement_size=2)
         return
     with pytest.raises(ValueError, match=r"^run: log\.(control|scan\.(z|tag)).* \(row \d+"):
-        check_log("run", log, control_size=2, measurement_size=2)
+        _validation.check_log("run", log, control_size=2, measurement_size=2)

@@ -8,10 +8,7 @@ from cases import swept
 
 from jaxslam import motion, sensors
 from jaxslam.core.protocols import Motion
-from jaxslam.verify import build
-from jaxslam.verify._comparison import compare_methods
-from jaxslam.verify._examination import examine, functions_of
-from jaxslam.verify._verifier import FLOAT32_TOLERANCE, TOLERANCE
+from jaxslam.verify import _comparison, _examination, _verifier, build
 
 MODELS = motion.REGISTRY | sensors.REGISTRY
 
@@ -20,14 +17,16 @@ MODELS = motion.REGISTRY | sensors.REGISTRY
     scope="module",
     params=swept(MODELS, "unicycle", "range_bearing", "line"),
 )
-def made(request):
+def verified(request):
     """A registered model, all that was computed about it, and what that was judged to be."""
     model = build(MODELS[request.param])
-    evaluated, checks, *_ = examine(model, functions_of(model))
+    evaluated, checks, *_ = _examination.examine(model, _examination.functions_of(model))
     findings = [
         finding
         for function in evaluated
-        for finding in compare_methods(function, TOLERANCE, FLOAT32_TOLERANCE)
+        for finding in _comparison.compare_methods(
+            function, _verifier.TOLERANCE, _verifier.FLOAT32_TOLERANCE
+        )
     ]
     return SimpleNamespace(
         model=model,
@@ -53,31 +52,33 @@ OF_A_LANDMARK = (
 )
 
 
-def test_everything_is_verified(made):
-    assert [str(f.wrong_entries) for f in made.findings if not f.passed] == []
-    assert [(c.name, c.detail) for c in made.checks if not c.passed] == []
-    asked = {check.format(one.function.name) for one in made.evaluated for check in OF_EACH}
-    if isinstance(made.model, Motion):
-        asked |= set(OF_A_MOTION)
-        if made.model.perturb is not None:
-            asked.add("step(pose, u, w) = step(pose, perturb(u, w), 0)")
+def test_everything_is_verified(verified):
+    assert [str(f.wrong_entries) for f in verified.findings if not f.passed] == []
+    assert [(c.name, c.detail) for c in verified.checks if not c.passed] == []
+    required = {
+        check.format(examined.function.name) for examined in verified.evaluated for check in OF_EACH
+    }
+    if isinstance(verified.model, Motion):
+        required |= set(OF_A_MOTION)
+        if verified.model.perturb is not None:
+            required.add("step(pose, u, w) = step(pose, perturb(u, w), 0)")
     else:
-        asked |= {*OF_A_SENSOR, *(OF_A_LANDMARK if made.model.landmark else ())}
-        circular = any(name.endswith("[rad]") for name in made.model.measurements)
-        asked.add(DIFFERENCE.format(", wrapped on the circle" * circular))
-    assert asked <= {check.name for check in made.checks}
+        required |= {*OF_A_SENSOR, *(OF_A_LANDMARK if verified.model.landmark else ())}
+        circular = any(name.endswith("[rad]") for name in verified.model.measurements)
+        required.add(DIFFERENCE.format(", wrapped on the circle" * circular))
+    assert required <= {check.name for check in verified.checks}
 
 
-def test_hand_is_autodiff_at_every_sample(made):
+def test_hand_is_autodiff_at_every_sample(verified):
     """To 1e-12 in float64 and 1e-5 in float32, relative to the row; every argument is claimed.
 
     A line 1e5 m from the map's origin is known to 1e5 m times the rounding of its angle.
     """
-    far = getattr(made.model, "carry", None) is not None
+    far = getattr(verified.model, "carry", None) is not None
     double, single = (1e5 * 2**-53, 1e5 * 2**-24) if far else (1e-12, 1e-5)
-    functions = [e.function for e in made.evaluated if e.function.outputs]
-    assert len(made.findings) == sum(bool(a.entries) for f in functions for a in f.arguments)
-    for finding in made.findings:
+    functions = [e.function for e in verified.evaluated if e.function.outputs]
+    assert len(verified.findings) == sum(bool(a.entries) for f in functions for a in f.arguments)
+    for finding in verified.findings:
         assert finding.methods == ("jacfwd", "jacrev", "hand", "differences")
         assert finding.relative <= double
         assert finding.float32 <= single
@@ -86,19 +87,19 @@ def test_hand_is_autodiff_at_every_sample(made):
         assert finding.no_derivative <= 8
 
 
-def test_hard_states_are_among_the_samples(made):
-    labels = {label for group in made.labels for label in group}
+def test_hard_states_are_among_the_samples(verified):
+    labels = {label for group in verified.labels for label in group}
     for part in ("random", "pose theta = 3.142", "pose theta = -3.142", "large coordinates"):
         assert part in labels
-    if isinstance(made.model, Motion):
+    if isinstance(verified.model, Motion):
         assert "zero control" in labels
         assert "zero control and noise" in labels
-        rates = [c.split(" ")[0] for c in made.model.controls if c.endswith("[rad/s]")]
+        rates = [c.split(" ")[0] for c in verified.model.controls if c.endswith("[rad/s]")]
         assert all(f"control {rate} = 0" in labels for rate in rates)
-    elif made.model.landmark:
+    elif verified.model.landmark:
         at = ("close to the robot", "close to the sensor", "at the robot", "behind, on the seam")
         assert all(f"landmark {where}" in labels for where in at)
-        if "rho [1/m]" in made.model.landmark:
+        if "rho [1/m]" in verified.model.landmark:
             assert {"landmark rho = 0", "landmark rho = -0.5"} <= labels
 
 
@@ -118,17 +119,19 @@ def mutations(jacobian):
                 yield i, j, mutant
 
 
-def test_every_wrong_entry_is_caught_and_named(made):
+def test_every_wrong_entry_is_caught_and_named(verified):
     tried = 0
-    for evaluated in made.evaluated:
+    for evaluated in verified.evaluated:
         function = evaluated.function
         for k, evaluation in enumerate(evaluated.by_argument):
             for i, j, mutant in mutations(evaluation.methods["hand"]):
                 changed = evaluation._replace(methods=evaluation.methods | {"hand": mutant})
                 by_argument = list(evaluated.by_argument)
                 by_argument[k] = changed
-                findings = compare_methods(
-                    evaluated._replace(by_argument=tuple(by_argument)), TOLERANCE, FLOAT32_TOLERANCE
+                findings = _comparison.compare_methods(
+                    evaluated._replace(by_argument=tuple(by_argument)),
+                    _verifier.TOLERANCE,
+                    _verifier.FLOAT32_TOLERANCE,
                 )
                 assert [f.passed for f in findings] == [n != k for n in range(len(findings))]
                 (wrong,) = findings[k].wrong_entries

@@ -15,7 +15,7 @@ from jaxslam import catalog, charts, linearize, motion, run, sensors, simulate
 from jaxslam.core.protocols import Filter, LinearizationPoint
 from jaxslam.core.types import Status
 from jaxslam.filters import EkfSlam
-from jaxslam.graphs.smoothing._forward_pass import LogEstimator
+from jaxslam.graphs.smoothing import BatchMap, Smoother
 from jaxslam.simulation.scenarios import SCENARIOS, loop, stationary
 
 KEY = jax.random.key(0)
@@ -35,7 +35,7 @@ def drive(drawn, name, probe=None, **options):
     world, truth, log = drawn
     candidate = catalog.ALL[name](world, **options)
     filter = candidate
-    if not isinstance(candidate, Filter | LogEstimator):
+    if not isinstance(candidate, Filter | BatchMap | Smoother):
         filter = candidate(jax.tree.map(jnp.asarray, truth))
     if not isinstance(filter, Filter):  # an estimator of the whole log
         return jax.device_get(filter(log, KEY))

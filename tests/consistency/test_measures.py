@@ -10,40 +10,30 @@ import pytest
 import scipy.stats
 import worlds
 from cases import refused
-from test_consistency import STEPS, plain_nees, scored, summed, synthetic
+from test_consistency import STEPS, plain_nees, scored, summary_of, synthetic
 
 from jaxslam import charts, consistency, motion, sensors, simulate
-from jaxslam.consistency import block_nees
-from jaxslam.consistency._bound import final_covariance, jacobians_at_truth, van_trees
-from jaxslam.consistency._measures.counts import DROPS, KEPT, MEANINGS, counts_of
-from jaxslam.consistency._measures.coverage import LEVELS
-from jaxslam.consistency._measures.nees import chart_error_of
-from jaxslam.consistency._measures.observability import unobservable_directions
-from jaxslam.consistency._run_scores import LAGS
-from jaxslam.consistency._summary import summarize
+from jaxslam.consistency import _bound, _measures, _run_scores, block_nees
 from jaxslam.core.types import Estimate, Info, Log, Scan, Status, Trace, Truth
-from jaxslam.filters import ParticleInfo, Pruned
-from jaxslam.filters._ekf.map_coordinates import ToPoints
-from jaxslam.filters._ekf.monitor import Monitor
-from jaxslam.filters._particles.pose_particles import weighted_pose_moments
-from jaxslam.filters.map_management._merging import Merged
+from jaxslam.filters import ParticleInfo, Pruned, _ekf, _particles
+from jaxslam.filters.map_management import _merging
 from jaxslam.simulation.spurious import Spurious
 
-STATUSES = [status.name.lower() for status in (*KEPT, *DROPS)]
+STATUSES = [status.name.lower() for status in (*_measures.counts.KEPT, *_measures.counts.DROPS)]
 
 
 def test_coverage_is_the_share_of_truth_inside_the_ellipsoids():
     trace, truth, error = synthetic(np.random.default_rng(0), runs=40)
-    summary = summarize(summed(trace, truth))
+    summary = summary_of(trace, truth)
     nees = plain_nees(error, trace.estimate.pose_cov)
-    for p, share in zip(LEVELS, summary.coverage["pose"], strict=True):
+    for p, share in zip(_measures.coverage.LEVELS, summary.coverage["pose"], strict=True):
         np.testing.assert_allclose(share, np.mean(nees <= scipy.stats.chi2.ppf(p, 3)), rtol=1e-12)
     inside = np.mean(nees <= scipy.stats.chi2.ppf(0.95, 3), axis=1)
     interval = scipy.stats.t.interval(0.95**0.5, 39, inside.mean(), scipy.stats.sem(inside))
-    found = summary.measures["coverage_95_pose"]
-    np.testing.assert_allclose(found, (inside.mean(), *interval), rtol=1e-9)
+    average = summary.measures["coverage_95_pose"]
+    np.testing.assert_allclose(average, (inside.mean(), *interval), rtol=1e-9)
     # Honest errors: 480 independent steps at 0.95, five standard errors.
-    assert abs(found.value - 0.95) < 5 * np.sqrt(0.95 * 0.05 / nees.size)
+    assert abs(average.value - 0.95) < 5 * np.sqrt(0.95 * 0.05 / nees.size)
 
 
 @pytest.mark.parametrize("claimed", [1.0, 0.1, 10.0])
@@ -157,13 +147,13 @@ def correlated(rng, rho, runs=30, steps=200, slots=3):
 @pytest.mark.parametrize("rho", [0.0, 0.4])
 def test_the_autocorrelation_of_innovations_is_found_lag_by_lag(rho):
     trace, truth = correlated(np.random.default_rng(3), rho)
-    summary = summarize(summed(trace, truth))
+    summary = summary_of(trace, truth)
     pairs = 30 * 199 * 3 * 2
-    expected = rho ** np.arange(1, LAGS + 1)
+    expected = rho ** np.arange(1, _run_scores.LAGS + 1)
     # Five standard errors of a product of two normals, and of an AR(1) sum where correlated.
     spread = 5 * np.sqrt((1 + rho**2) / (1 - rho**2) / pairs)
     np.testing.assert_allclose(summary.autocorrelation, expected, atol=spread)
-    products = 30 * (200 - np.arange(1, LAGS + 1)) * 3 * 2
+    products = 30 * (200 - np.arange(1, _run_scores.LAGS + 1)) * 3 * 2
     np.testing.assert_allclose(
         summary.autocorrelation_band, 1.959964 / np.sqrt(products), rtol=1e-6
     )
@@ -175,7 +165,7 @@ def test_runs_shorter_than_a_lag_have_no_autocorrelation_there():
     trace, truth, _ = synthetic(np.random.default_rng(4), runs=3)
     short = jax.tree.map(lambda leaf: leaf[:, :4], (trace, truth._replace(start=truth.pose)))
     short_truth = short[1]._replace(start=truth.start, landmarks=truth.landmarks)
-    summary = summarize(summed(short[0], short_truth))
+    summary = summary_of(short[0], short_truth)
     assert np.isnan(summary.autocorrelation[3:]).all()
 
 
@@ -184,7 +174,7 @@ def test_landmark_nees_and_own_coordinates():
     covs = np.random.default_rng(6).normal(size=(6, STEPS, 3, 2, 2))
     covs = covs @ covs.swapaxes(-1, -2) + 0.1 * np.eye(2)
     trace = trace._replace(estimate=trace.estimate._replace(point_covs=covs))
-    summary = summarize(summed(trace, truth))
+    summary = summary_of(trace, truth)
     kept = [0, 2]  # slots with tags 2 and 0
     off = truth.landmarks[:, None, [2, 0]] - trace.estimate.points[:, :, kept]
     nees = np.einsum(
@@ -192,9 +182,13 @@ def test_landmark_nees_and_own_coordinates():
     )
     np.testing.assert_allclose(summary.measures["nees_landmarks"].value, nees.mean(), rtol=1e-9)
 
-    own = jax.jit(jax.vmap(partial(chart_error_of, charts.RightInvariant(), worlds.ring().sensor)))
-    total, steps = scored(trace, truth, own).measures["nees_own"]
-    found = total / steps
+    chart_errors = jax.jit(
+        jax.vmap(
+            partial(_measures.nees.chart_error_of, charts.RightInvariant(), worlds.ring().sensor)
+        )
+    )
+    total, steps = scored(trace, truth, chart_errors).measures["nees_own"]
+    per_run = total / steps
     local = jax.jit(jax.vmap(charts.RightInvariant().local, (0, None, 0, None)))
     for run in range(6):
         xi = local(trace.estimate.pose[run], np.zeros(2), truth.pose[run], np.zeros(2))[0]
@@ -204,7 +198,7 @@ def test_landmark_nees_and_own_coordinates():
             lever = np.array([[1, 0, -y], [0, 1, x], [0, 0, 1.0]])
             p_own = np.linalg.inv(lever) @ trace.estimate.pose_cov[run, t] @ np.linalg.inv(lever).T
             total += xi[t] @ np.linalg.solve(p_own, xi[t])
-        np.testing.assert_allclose(found[run], total / STEPS, rtol=1e-7)
+        np.testing.assert_allclose(per_run[run], total / STEPS, rtol=1e-7)
 
 
 def test_the_bounds_obey_tichavskys_recursion():
@@ -234,12 +228,12 @@ def test_the_bounds_obey_tichavskys_recursion():
     steps, least = consistency.posterior_bound(world, truths, logs)
     assert (np.linalg.eigvalsh(bounds[:, steps].mean(axis=0) - least)[1:] > 0).all()
     alone = jax.tree.map(lambda leaf: leaf[:1], (truths, logs))
-    steps, own = consistency.posterior_bound(world, *alone, steps=[0, 7, 14])
-    np.testing.assert_allclose(own, bounds[0, steps], rtol=1e-7, atol=1e-12)
+    steps, alone_bound = consistency.posterior_bound(world, *alone, steps=[0, 7, 14])
+    np.testing.assert_allclose(alone_bound, bounds[0, steps], rtol=1e-7, atol=1e-12)
     truth, bound = jax.tree.map(lambda leaf: leaf[0], truths), bounds[0]
-    jacobians = jax.jit(partial(jacobians_at_truth, world))
-    found = jax.device_get(jacobians(truth, jax.tree.map(lambda leaf: leaf[0], logs)))
-    last = final_covariance(found, world.pose_cov)
+    jacobians = jax.jit(partial(_bound.jacobians_at_truth, world))
+    linearized = jax.device_get(jacobians(truth, jax.tree.map(lambda leaf: leaf[0], logs)))
+    last = _bound.final_covariance(linearized, world.pose_cov)
     np.testing.assert_allclose(last, bound[-1], rtol=1e-4, atol=1e-9)
     n = 3 + 12
     j = np.zeros((n, n))  # the map is unknown beforehand: no information
@@ -274,8 +268,8 @@ def test_what_is_called_a_bound_bounds():
     x = np.random.default_rng(4).normal(size=200_000)
     slope, jacobian = np.ones((len(x), 1, 1)), 3 * x[:, None, None] ** 2
     noise, prior = np.array([[sigma**2]]), np.eye(1)
-    given = np.sqrt(np.mean(1 / (1 + jacobian**2 / sigma**2)))
-    proper = np.sqrt(van_trees(slope, jacobian, noise, prior)[0, 0])
+    conditional = np.sqrt(np.mean(1 / (1 + jacobian**2 / sigma**2)))
+    proper = np.sqrt(_bound.van_trees(slope, jacobian, noise, prior)[0, 0])
     np.testing.assert_allclose(proper, 1 / np.sqrt(1 + 27 / sigma**2), rtol=0.02)
     # The posterior mean by quadrature, of fewer draws.
     grid = np.linspace(-5, 5, 20_001)
@@ -285,7 +279,7 @@ def test_what_is_called_a_bound_bounds():
     density = np.exp(log_density - log_density.max(axis=1, keepdims=True))
     mean = (density @ grid) / density.sum(axis=1)
     rmse = np.sqrt(np.mean((mean - draws) ** 2))
-    np.testing.assert_allclose([proper, rmse, given], [0.0019, 0.066, 0.236], rtol=0.15)
+    np.testing.assert_allclose([proper, rmse, conditional], [0.0019, 0.066, 0.236], rtol=0.15)
 
 
 @refused(
@@ -304,7 +298,7 @@ def test_runs_that_are_not_finite_are_named():
     trace, truth, _ = synthetic(np.random.default_rng(7), runs=10)
     trace.estimate.pose[5, 3, 0] = np.nan
     trace.info.nis[2, 1, 0] = np.inf
-    summary = summarize(summed(trace, truth))
+    summary = summary_of(trace, truth)
     assert summary.not_finite_runs == [2, 5]
     for name in ("nees_pose", "noncredibility", "inclination"):  # by the number of the run
         assert len(summary.per_run[name]) == 10
@@ -323,21 +317,21 @@ def test_what_filters_report_of_themselves_is_counted():
     flags = np.array([[True, False, True], [False, False, False]])
     extra = {
         "pruning": Pruned(np.stack([flags, flags], axis=2)),
-        "merging": Merged(np.where(flags[..., None], [4, 5], -1)),
-        "points": ToPoints(flags[..., None]),
+        "merging": _merging.Merged(np.where(flags[..., None], [4, 5], -1)),
+        "points": _ekf.map_coordinates.ToPoints(flags[..., None]),
         "particles": ParticleInfo(*[3 * flags] * 4, active=flags),
         "mine": Mine(flags),
         "other": (flags,),
     }
     trace, _, _ = synthetic(np.random.default_rng(0), runs=2)
     info = jax.tree.map(lambda leaf: leaf[:, :3], trace.info)
-    found = counts_of(info._replace(extra=extra, exhausted=flags))
-    events = {name: each.tolist() for name, each in found.items() if name not in STATUSES}
+    totals = _measures.counts.counts_of(info._replace(extra=extra, exhausted=flags))
+    events = {name: happened.tolist() for name, happened in totals.items() if name not in STATUSES}
     thrice = {key: [6, 0] for key in ("resampled", "underflow", "invalid")}
     once = {key: [2, 0] for key in ("merged", "reduced", "exhausted")}
     assert events == {"removed": [4, 0], **once, **thrice, "odd": [2, 0]}
-    assert list(events) == [*(name for name in MEANINGS if name in events), "odd"]
-    assert (found["fused"] == 3).all() and (found["born"] == 0).all()
+    assert list(events) == [*(name for name in _measures.counts.MEANINGS if name in events), "odd"]
+    assert (totals["fused"] == 3).all() and (totals["born"] == 0).all()
 
 
 def test_poses_on_a_plane_have_no_nees():
@@ -345,7 +339,7 @@ def test_poses_on_a_plane_have_no_nees():
     rng = np.random.default_rng(3)
     poses = np.array([2.0, -1.0, 1.5]) + 3e-3 * rng.normal(size=(2000, 4, 3))
     share = np.log(rng.dirichlet(np.full(4, 2.0), 2000))
-    moments = jax.jit(jax.vmap(weighted_pose_moments))
+    moments = jax.jit(jax.vmap(_particles.pose_particles.weighted_pose_moments))
     for distinct, expected in ((3, 0.0), (4, 1.0)):
         weight = share[:, :distinct] - np.log(np.exp(share[:, :distinct]).sum(1, keepdims=True))
         best = weight.argmax(1)
@@ -363,5 +357,9 @@ def test_a_direction_is_unobservable_below_a_share_of_what_was_measured(dtype):
     scale = np.tile(np.array([1e5, 1e5, 4e7]), (3, 1))
     information = np.zeros((3, 3, 3))
     information[:, 2, 2] = gained * scale[:, 2]
-    monitor = Monitor(None, information.astype(dtype), scale.astype(dtype), np.ones((3, 3)))
-    np.testing.assert_array_equal(unobservable_directions(monitor), [3, 3, 2])
+    monitor = _ekf.monitor.Monitor(
+        None, information.astype(dtype), scale.astype(dtype), np.ones((3, 3))
+    )
+    np.testing.assert_array_equal(
+        _measures.observability.unobservable_directions(monitor), [3, 3, 2]
+    )

@@ -9,9 +9,7 @@ import scipy.stats
 
 from benchmarks.verdict import averages, problem, rejected, verdicts
 from jaxslam import Scenario, motion, sensors, stats
-from jaxslam.consistency import Average, judge
-from jaxslam.consistency._intervals import is_lopsided, positive_interval, spread
-from jaxslam.consistency._verdict import power_of
+from jaxslam.consistency import Average, _intervals, _verdict, judge
 from jaxslam.consistency.campaign import monte_carlo
 from jaxslam.consistency.campaign._candidates import check_noise
 
@@ -60,24 +58,28 @@ def test_r_understated_by_a_fifth_is_noticed_by_the_nis(compass):
 def test_an_interval_is_positive_scales_and_holds_its_mean():
     rng = np.random.default_rng(5)
     for values in (rng.chisquare(1, 8), np.exp(3 * rng.normal(size=20)), [1.0, 1e9], [2.0, 2.0]):
-        found = positive_interval(values)
-        assert 0 < found.low <= found.value <= found.high
-        np.testing.assert_allclose(positive_interval(7 * np.asarray(values)), 7 * np.array(found))
-    assert positive_interval([3.0]) == (3.0, 0.0, np.inf)
-    assert positive_interval([np.nan]) is None
-    assert positive_interval([0.0, 0.0]) == (0, 0, 0)
-    found = spread([2.0, 4.0, 6.0, 8.0], level=0.9, skewed=False)
+        interval = _intervals.positive_interval(values)
+        assert 0 < interval.low <= interval.value <= interval.high
+        np.testing.assert_allclose(
+            _intervals.positive_interval(7 * np.asarray(values)), 7 * np.array(interval)
+        )
+    assert _intervals.positive_interval([3.0]) == (3.0, 0.0, np.inf)
+    assert _intervals.positive_interval([np.nan]) is None
+    assert _intervals.positive_interval([0.0, 0.0]) == (0, 0, 0)
+    interval = _intervals.spread([2.0, 4.0, 6.0, 8.0], level=0.9, skewed=False)
     u = scipy.stats.sem([2, 4, 6, 8]) / 5
     q = scipy.stats.t.ppf(0.95, 3)
-    np.testing.assert_allclose(5 / found.low, 1 + q * u - u**2 / 2)
+    np.testing.assert_allclose(5 / interval.low, 1 + q * u - u**2 / 2)
 
 
 def test_many_runs_have_the_interval_of_the_normal():
     values = np.random.default_rng(6).chisquare(3, 100_000)
-    found = positive_interval(values)
+    interval = _intervals.positive_interval(values)
     half = scipy.stats.norm.ppf(0.5 + 0.95**0.5 / 2) * scipy.stats.sem(values)
-    np.testing.assert_allclose(found[1:], [found.value - half, found.value + half], rtol=1e-3)
-    assert not is_lopsided(found)
+    np.testing.assert_allclose(
+        interval[1:], [interval.value - half, interval.value + half], rtol=1e-3
+    )
+    assert not _intervals.is_lopsided(interval)
 
 
 @pytest.mark.parametrize(
@@ -118,17 +120,17 @@ def test_either_test_rejects_and_the_one_that_spoke_is_named(nees, nis, word, by
 
 def test_few_runs_say_what_they_would_have_noticed():
     nees = 3 * np.linspace(0.5, 1.5, 20)
-    found = judge({"nees_pose": nees}, COUNTS)
-    low, high = found.noticed["nees_pose"]
+    verdict = judge({"nees_pose": nees}, COUNTS)
+    low, high = verdict.noticed["nees_pose"]
     assert 1 < low < 3 < high < 5
-    said = power_of(found.noticed)
+    said = _verdict.power_of(verdict.noticed)
     assert said == f"90 % power to reject a pose NEES above {high:.3g} or below {low:.3g}"
-    more = judge({"nees_pose": np.repeat(nees, 25)}, COUNTS).noticed["nees_pose"]
-    assert low < more[0] < 3 < more[1] < high
+    noticed = judge({"nees_pose": np.repeat(nees, 25)}, COUNTS).noticed["nees_pose"]
+    assert low < noticed[0] < 3 < noticed[1] < high
     wide = judge({"nees_pose": np.array([1.0, 5.0, 3.0])}, COUNTS)
     assert wide.word == "undecided"
     assert wide.noticed["nees_pose"][1] > 6
-    assert power_of({"nees_pose": (0.0, np.inf)}) == ""
+    assert _verdict.power_of({"nees_pose": (0.0, np.inf)}) == ""
 
 
 def test_what_lies_within_a_hundredth_is_honest():
@@ -276,7 +278,7 @@ def test_a_noise_that_zero_has_none_of_is_taken_where_it_is():
 
 
 def test_lopsided_is_what_plus_minus_would_hide():
-    assert is_lopsided(Average(3.0, 2.0, 5.0))
-    assert is_lopsided(Average(3.0, 2.0, np.inf))
-    assert not is_lopsided(Average(3.0, 2.0, 4.1))
-    assert not is_lopsided(Average(3.0, 3.0, 3.0))
+    assert _intervals.is_lopsided(Average(3.0, 2.0, 5.0))
+    assert _intervals.is_lopsided(Average(3.0, 2.0, np.inf))
+    assert not _intervals.is_lopsided(Average(3.0, 2.0, 4.1))
+    assert not _intervals.is_lopsided(Average(3.0, 3.0, 3.0))

@@ -8,7 +8,6 @@ from cases import swept
 from recordings import EPOCH, MRCLAM, assert_log, assert_spoiled, folder, mapped, mrclam, write
 
 from jaxslam import datasets
-from jaxslam.datasets._landmark_logs.mrclam_robot import EXCHANGED
 
 
 def test_mrclam_by_hand(tmp_path):
@@ -126,6 +125,10 @@ def test_mrclam_files(robot, kept, of_robots, unknown, places):
     for row in range(1, data.steps, 997):
         latest = max((when for when in velocity if when <= data.time[row - 1]), default=None)
         assert tuple(data.log.control[row, :2]) == velocity.get(latest, (0, 0))
+
+
+EXCHANGED = 11, 17
+"""Subjects of data set 1 whose surveyed positions are those of one another."""
 
 
 def test_mrclam_survey_of_data_set_1_has_two_subjects_exchanged():

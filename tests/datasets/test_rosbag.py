@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 from bags import SECOND, fixed, odometry, quaternion, scan, transform
 from cases import refused, swept
+from command import run_command
 from recordings import folder
 from scipy.linalg import expm, logm
 
-from jaxslam import _cli as cli
 from jaxslam import datasets, laser_slam
 from jaxslam.math import numpy_poses as poses
 
@@ -602,7 +602,7 @@ def test_a_library_that_cannot_be_used_is_named(tmp_path, monkeypatch, capsys):
     broken.library(monkeypatch, tmp_path, "rosbags", {}, "0.10.1")
     with pytest.raises(ImportError, match=r"0.10.1 is too old, .* pip install 'jaxslam\[ros\]'$"):
         datasets.rosbag_contents(tmp_path)
-    assert cli.main(["slam", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
+    assert run_command(["slam", str(tmp_path), "--out", str(tmp_path / "out")]) == 2
     assert capsys.readouterr().err.count("\n") == 1
 
 

@@ -14,7 +14,6 @@ from own_models import changed
 from jaxslam import filters, motion, sensors
 from jaxslam.core.types import Scan, Status
 from jaxslam.filters import Hypotheses, StoredMeasurements, info_of, status_of
-from jaxslam.filters._reporting import nothing_of
 
 MASKS = (
     "valid", "matched", "positive", "inside",
@@ -79,8 +78,10 @@ def test_numbers_of_places_without_a_comparison_are_zero():
 
 
 def test_a_scan_left_alone_is_unmatched_where_there_is_one():
-    scan = Scan(jnp.ones((2, 3)), jnp.zeros(2, int), jnp.asarray([True, False]))
-    info = nothing_of(scan)
+    reckoning = filters.DeadReckoning(motion.Increment(np.eye(2)), sensors.RangeBearing(np.eye(2)))
+    state = reckoning.init(jnp.zeros(3), jnp.eye(3))
+    scan = Scan(jnp.ones((2, 2)), jnp.zeros(2, int), jnp.asarray([True, False]))
+    _, info = reckoning.update(state, scan, jax.random.key(0))
     assert list(info.status) == [Status.UNMATCHED, Status.EMPTY]
     assert not info.nis.any() and not info.innovation.any() and list(info.slot) == [-1, -1]
 

@@ -4,14 +4,13 @@ import dataclasses
 
 import numpy as np
 
-from jaxslam.consistency import Average, Summary
-from jaxslam.consistency._measures.coverage import LEVELS
-from jaxslam.consistency._measures.nees import DOF
-from jaxslam.consistency._run_scores import LAGS
+from jaxslam.consistency import Average, Summary, _measures, _run_scores
 from jaxslam.consistency.campaign import Campaign
 from jaxslam.core.types import Estimate, Truth
 
 STEPS, RUNS = 200, 32
+DOF, LEVELS, LAGS = _measures.nees.DOF, _measures.coverage.LEVELS, _run_scores.LAGS
+"""The blocks of NEES, the levels of coverage and the lags of innovations that a `Summary` has."""
 LANDMARKS = np.array([[4.0, 1.0], [0.0, 5.0], [-4.0, 0.0]])
 SLOW = {"fastslam1": 2e3, "dead_reckoning": 2.0}
 WORSE = {"fastslam1": 1e27, "fastslam2": 1e3, "ekf": 4.0, "seif": 12.0, "iterated": 3.8}

@@ -3,7 +3,7 @@
 import numpy as np
 
 from jaxslam.core.types import Beams
-from jaxslam.laser.laser_slam import ScanLog, Settings
+from jaxslam.laser.laser_slam import ScanLog, Settings, _odometry, _scan_points
 from jaxslam.math import numpy_poses as poses
 
 SETTINGS = Settings(
@@ -64,3 +64,21 @@ def errors(estimate, true):
     """(position [m], heading [rad]) of each pose, both from the same first pose."""
     off = poses.between(true, estimate)
     return np.hypot(off[:, 0], off[:, 1]), np.abs(off[:, 2])
+
+
+# --- the steps of `laser_slam.solve`, with the settings of the ring -------------------------------
+
+
+def scans_of(log):
+    """The scans of a log as points in the robot's frame."""
+    return _scan_points.scans_of(log, SETTINGS)
+
+
+def steps_of(raw, *parts, settings=SETTINGS):
+    """The steps of raw odometry (T, 3); parts: time, changed, known, as far as the log has them."""
+    return _odometry.raw.steps_of(raw, settings, *parts)
+
+
+def odometry_of(scans, steps, first, *progress):
+    """The laser odometry of scans and raw steps, from the first pose on."""
+    return _odometry.log_odometry.laser_odometry(scans, steps, SETTINGS, first, *progress)

@@ -175,6 +175,22 @@ def nameless(log):
     return log._replace(scan=log.scan._replace(tag=np.full_like(log.scan.tag, -1)))
 
 
+def unmatched(scan):
+    """The `Info` of a scan that a filter ignores."""
+    places, size = scan.z.shape
+    return filters.info_of(
+        filters.status_of(scan.valid),
+        jnp.zeros_like(scan.valid),
+        size=0,
+        slot=jnp.full(places, -1),
+        nis=jnp.zeros(places, scan.z.dtype),
+        innovation=jnp.zeros_like(scan.z),
+        innovation_cov=jnp.zeros((places, size, size), scan.z.dtype),
+        log_likelihood=jnp.zeros((), scan.z.dtype),
+        exhausted=jnp.asarray(False),
+    )
+
+
 def draw(scenario, seed=1):
     """A truth and a log of the scenario, in NumPy."""
     return jax.device_get(simulate(scenario, jax.random.key(seed)))

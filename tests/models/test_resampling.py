@@ -11,14 +11,12 @@ import pytest
 import scipy.stats
 from cases import swept
 
-from jaxslam.resampling import REGISTRY, Soft, StopGradient, kld_bound, systematic
-from jaxslam.resampling import _kld as kld
-from jaxslam.resampling._weights import at_points, effective_size, normalized, survivors, weights_of
+from jaxslam.resampling import REGISTRY, Soft, StopGradient, _kld, _weights, kld_bound, systematic
 
 WEIGHTS = np.array([0.02, 0.0, 0.35, 0.1, 0.03, 0.25, 0.05, 0.2])
 
 
-NORMALIZED = jax.jit(normalized)
+NORMALIZED = jax.jit(_weights.normalized)
 
 
 @cache
@@ -116,14 +114,14 @@ def test_normalized_weights_against_plain_arithmetic():
     np.testing.assert_allclose(total, np.log(w.sum()) - 1000, rtol=1e-14)
     assert some
     np.testing.assert_allclose(
-        jax.jit(effective_size)(out), w.sum() ** 2 / (w**2).sum(), rtol=1e-13
+        jax.jit(_weights.effective_size)(out), w.sum() ** 2 / (w**2).sum(), rtol=1e-13
     )
-    np.testing.assert_allclose(jax.jit(weights_of)(np.full(4, np.nan)), 0.25)
+    np.testing.assert_allclose(jax.jit(_weights.weights_of)(np.full(4, np.nan)), 0.25)
 
 
 def test_gradients_of_the_weights_are_finite():
     """Also where some or all weigh nothing."""
-    slope_of = jax.jit(jax.grad(lambda x: normalized(x)[1] + effective_size(x)))
+    slope_of = jax.jit(jax.grad(lambda x: _weights.normalized(x)[1] + _weights.effective_size(x)))
     for log_weights in ([0.0, -np.inf, -3.0], [-np.inf] * 3, [0.0, np.nan, -1e308]):
         slope = slope_of(np.array(log_weights))
         assert np.all(np.isfinite(slope))
@@ -131,7 +129,7 @@ def test_gradients_of_the_weights_are_finite():
 
 def test_points_rounded_to_one_choose_the_last_that_weighs():
     weights = np.array([0.5, 0.5, 0.0])
-    chosen = jax.jit(at_points)(weights, np.array([0.0, 0.5, 1.0]))
+    chosen = jax.jit(_weights.at_points)(weights, np.array([0.0, 0.5, 1.0]))
     np.testing.assert_array_equal(chosen, [0, 1, 1])
 
 
@@ -167,8 +165,8 @@ def estimated(a, key, method, count):
         key_noise, key_resample = jax.random.split(key)
         x = a * x + Q * jax.random.normal(key_noise, x.shape)
         fit = -0.5 * ((z - x) / R) ** 2 - math.log(R * math.sqrt(2 * math.pi))
-        weight, total, _ = normalized(log_w + fit)
-        ancestor, log_w = survivors(method, weight, key_resample)
+        weight, total, _ = _weights.normalized(log_w + fit)
+        ancestor, log_w = _weights.survivors(method, weight, key_resample)
         return (x[ancestor], log_w), total
 
     rows = jnp.asarray(Z), jax.random.split(key, len(Z))
@@ -285,7 +283,7 @@ def test_enough_is_foxs_loop():
     rng = np.random.default_rng(2)
     pose = np.column_stack([rng.normal(size=(600, 2)), rng.uniform(-np.pi, np.pi, 600)])
     size = (0.5, 0.7, math.radians(25))
-    enough = jax.jit(lambda moved, *of: kld.enough(kld.bins_of(moved, size), *of, 0.99))
+    enough = jax.jit(lambda moved, *of: _kld.enough(_kld.bins_of(moved, size), *of, 0.99))
     for spread, least, error in ((1.0, 20, 0.5), (0.2, 20, 0.1), (0.01, 33, 0.05), (3.0, 5, 0.05)):
         moved = pose * [spread, spread, 1.0]
         bound = np.asarray(BOUND(np.arange(601), error, 0.99))
@@ -295,15 +293,15 @@ def test_enough_is_foxs_loop():
             if m >= least and m >= bound[len(seen)]:
                 wanted, few = m, False
                 break
-        found, short = enough(moved, least, error)
-        assert (int(found), bool(short)) == (wanted, few)
+        count, short = enough(moved, least, error)
+        assert (int(count), bool(short)) == (wanted, few)
 
 
 def test_headings_on_both_sides_of_the_seam_and_poses_far_away_have_bins():
     size = (1.0, 1.0, 2 * math.pi / 6)
     pose = np.array([[0, 0, np.pi], [0, 0, -np.pi], [1e300, -1e300, 0.0], [-0.5, 0.5, 0.0]])
-    bins = np.asarray(jax.jit(partial(kld.bins_of, size=size))(pose))
-    occupied = jax.jit(kld.occupied)
+    bins = np.asarray(jax.jit(partial(_kld.bins_of, size=size))(pose))
+    occupied = jax.jit(_kld.occupied)
     np.testing.assert_array_equal(bins[:2], [[0, 0, 5], [0, 0, 0]])
     np.testing.assert_array_equal(bins[3], [-1, 0, 3])
     np.testing.assert_array_equal(occupied(bins), [1, 2, 3, 4])

@@ -12,9 +12,7 @@ from matplotlib.animation import FFMpegWriter
 from PIL import Image
 
 from jaxslam import plot
-from jaxslam.results.plot import _style
-from jaxslam.results.plot._film import mp4_problem
-from jaxslam.results.plot._run_film import MOST, frame_steps
+from jaxslam.results.plot import _film, _run_film, _style
 
 COLORS = [(204, 0, 0), (0, 204, 0), (0, 0, 204)]
 
@@ -47,20 +45,20 @@ def test_a_film_does_not_depend_on_the_users_settings(three):
 
 @pytest.mark.parametrize(("steps", "most"), [(1, 1), (3, 3), (3, 10)])
 def test_every_step_of_a_short_run_is_a_frame(steps, most):
-    np.testing.assert_array_equal(frame_steps(steps, most), np.arange(steps))
+    np.testing.assert_array_equal(_run_film.frame_steps(steps, most), np.arange(steps))
 
 
 def test_a_long_run_is_shown_evenly_from_the_first_step_to_the_last():
-    at = frame_steps(6969, 250)
+    at = _run_film.frame_steps(6969, 250)
     assert len(at) == 250 and at[0] == 0 and at[-1] == 6968
     assert set(np.diff(at)) == {27, 28}
-    assert list(frame_steps(5, 1)) == [4]
-    assert len(frame_steps(6969)) == MOST
+    assert list(_run_film.frame_steps(5, 1)) == [4]
+    assert len(_run_film.frame_steps(6969)) == _run_film.MOST
 
 
 def test_frames_are_even_in_time_where_times_are_given():
     time = np.array([0.0, 0.1, 0.2, 0.3, 0.4, 4.0, 7.9, 8.0])
-    at = frame_steps(8, 5, time)  # at 0, 2, 4, 6, 8 s
+    at = _run_film.frame_steps(8, 5, time)  # at 0, 2, 4, 6, 8 s
     np.testing.assert_array_equal(at, [0, 4, 5, 5, 7])
 
 
@@ -76,7 +74,7 @@ def test_frames_are_even_in_time_where_times_are_given():
 )
 def test_steps_that_cannot_be_chosen_are_refused(arguments, message):
     with pytest.raises(ValueError, match=message):
-        frame_steps(*arguments)
+        _run_film.frame_steps(*arguments)
 
 
 @pytest.mark.parametrize(("frames", "fps"), [(1, 2), (30, 3), (100, 10), (250, 25), (1000, 25)])
@@ -126,26 +124,26 @@ ENCODERLESS = "#!/bin/sh\necho 'Unknown encoder h264' >&2\nexit 1\n"
 
 
 @pytest.mark.parametrize(
-    ("script", "told"),
+    ("script", "message"),
     [
         (ENCODERLESS, "Unknown encoder h264"),
         ("#!/bin/sh\nexec 0<&-\nexit 127\n", "127"),
     ],
 )
-def test_an_ffmpeg_that_fails_is_one_line(three, tmp_path, monkeypatch, script, told):
+def test_an_ffmpeg_that_fails_is_one_line(three, tmp_path, monkeypatch, script, message):
     broken.program(monkeypatch, tmp_path, "ffmpeg", script)
-    assert mp4_problem().startswith("ffmpeg: ")
+    assert _film.mp4_problem().startswith("ffmpeg: ")
     for writer in (None, "ffmpeg"):  # the latter only when the frames are drawn
         with pytest.raises(ValueError, match=r"(?s)^Film.save: .*: save a .gif$") as caught:
             three.save(tmp_path / "a.mp4", writer)
-        assert "\n" not in str(caught.value) and told in str(caught.value)
+        assert "\n" not in str(caught.value) and message in str(caught.value)
 
 
 def test_an_ffmpeg_that_does_not_start_or_is_not_there_is_named(tmp_path, monkeypatch):
     broken.program(monkeypatch, tmp_path, "ffmpeg", "#!/no/such/shell\n")
-    assert "Error: [Errno" in mp4_problem()
+    assert "Error: [Errno" in _film.mp4_problem()
     monkeypatch.setenv("PATH", str(tmp_path / "nothing"))
-    assert mp4_problem() == "ffmpeg is not installed"
+    assert _film.mp4_problem() == "ffmpeg is not installed"
 
 
 def test_without_a_font_nothing_is_drawn(tmp_path, monkeypatch):

@@ -118,11 +118,11 @@ def test_odd_manifests(data, kept):
 @pytest.fixture(scope="module")
 def finished(tmp_path_factory):
     """The folder of a campaign of two runs, as the command writes it."""
-    from jaxslam import _cli as cli
+    from command import run_command
 
     out = tmp_path_factory.mktemp("finished")
     options = ["--runs", "2", "--steps", "5", "--filters", "dead_reckoning", "--out", str(out)]
-    assert cli.main(["consistency", *options]) == 0
+    assert run_command(["consistency", *options]) == 0
     return out
 
 

@@ -4,17 +4,14 @@ import base64
 import dataclasses
 from html.parser import HTMLParser
 
+import drawn
 import numpy as np
 import pytest
 
 from jaxslam import plot
-from jaxslam.consistency import Average, Summary
-from jaxslam.consistency._measures import BUILT_IN
-from jaxslam.consistency._measures.coverage import LEVELS
-from jaxslam.consistency._measures.nees import DOF
+from jaxslam.consistency import Average, Summary, _measures
 from jaxslam.consistency.campaign import Campaign
-from jaxslam.results._page import campaign_page
-from jaxslam.results._table import VERDICTS
+from jaxslam.results import _page, _table
 
 STEPS, RUNS = 7, 30
 EVIL = "<script>alert(1)</script>&\"'"
@@ -24,7 +21,7 @@ VOID = {"meta", "img", "br", "wbr", "hr", "link", "input"}
 def summary(verdict, measures, lost=()):
     ones = np.ones(STEPS)
     curves = {"rmse_position": ones, "rmse_heading_deg": ones}
-    for block, dof in DOF.items():
+    for block, dof in drawn.DOF.items():
         curves |= {f"nees_{block}": dof * ones}
         curves |= {f"nees_{block}_low": 0.5 * dof * ones, f"nees_{block}_high": 1.5 * dof * ones}
     return Summary(
@@ -33,7 +30,7 @@ def summary(verdict, measures, lost=()):
         nis_band=(0.9, 1.1),
         inside={"pose": 0.75},
         curves=curves,
-        coverage={block: np.asarray(LEVELS) for block in DOF},
+        coverage={block: np.asarray(drawn.LEVELS) for block in drawn.DOF},
         autocorrelation=np.zeros(10),
         autocorrelation_band=np.full(10, 0.01),
         counts={"runs": RUNS - len(lost), "not_finite": len(lost), "divergent": 0, "rejected": 0},
@@ -106,7 +103,7 @@ def text():
         **{EVIL: summary("optimistic", {"nees_pose": Average(9.0, 8.0, 10.0)}, lost=(4, 17))},
         lost=summary("diverged", {}),
     )
-    return campaign_page(
+    return _page.campaign_page(
         world,
         f"jaxslam consistency {EVIL}",
         1234,
@@ -166,16 +163,18 @@ def test_filters_verdicts_and_measures_stand_in_the_table(read):
     labels = [cells[0] for cells in read.rows]
     assert "heading NEES" not in labels  # no filter has it
     assert "rejected" not in labels  # nothing was
-    measured = [one.title.strip() for one in BUILT_IN if one.key in GOOD]
+    measured = [measure.title.strip() for measure in _measures.BUILT_IN if measure.key in GOOD]
     assert [label for label in labels if label in measured] == measured
 
 
 def test_every_label_of_the_table_is_shown_where_it_is_measured():
-    every = {one.key: Average(1.0, 0.5, 1.5) for one in BUILT_IN}
-    reader = Reader(campaign_page(campaign(a=summary("undecided", every)), "", None, {}, {}))
+    averages = {measure.key: Average(1.0, 0.5, 1.5) for measure in _measures.BUILT_IN}
+    reader = Reader(
+        _page.campaign_page(campaign(a=summary("undecided", averages)), "", None, {}, {})
+    )
     labels = [cells[0] for cells in reader.rows]
-    for one in BUILT_IN:
-        assert (one.title.strip() in labels) == one.row
+    for measure in _measures.BUILT_IN:
+        assert (measure.title.strip() in labels) == measure.row
     assert "Figures" not in reader.words
     assert "consistency of 1 filter" in "".join(reader.words)
 
@@ -183,7 +182,7 @@ def test_every_label_of_the_table_is_shown_where_it_is_measured():
 def test_notes_of_the_measures_stand_below_them():
     of = dataclasses.replace(summary("consistent", GOOD), honest_nis=0.95)
     of.counts.update(born=3, fused=9, rejected=2)
-    reader = Reader(campaign_page(campaign(a=of), "", None, {}, {}))
+    reader = Reader(_page.campaign_page(campaign(a=of), "", None, {}, {}))
     words = " ".join("".join(reader.words).split())
     assert "an honest NIS / dof lies between 0.950 (a) and 1" in words
     assert "initialized, measurements that started a landmark" in words
@@ -196,7 +195,7 @@ def test_parameters_and_conventions_are_in_words(read):
         assert said in words
     assert "3 min, 10.0 s of it compilation" in words
     assert "not divided by its degrees of freedom" in words
-    for verdict, (_, meaning) in VERDICTS.items():
+    for verdict, (_, meaning) in _table.VERDICTS.items():
         assert verdict in words
         assert meaning in words
 

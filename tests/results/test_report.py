@@ -10,11 +10,9 @@ import pytest
 import worlds
 
 from jaxslam import catalog
-from jaxslam.consistency import Average
-from jaxslam.consistency._measures import BUILT_IN
+from jaxslam.consistency import Average, _measures
 from jaxslam.core.types import Estimate
-from jaxslam.results import _files as files
-from jaxslam.results import _report as report
+from jaxslam.results import _files, _report
 from jaxslam.results.report import trajectory_tum
 
 WORLD = worlds.ring()
@@ -27,10 +25,10 @@ def campaign():
 
 
 def test_the_table_shows_every_measure_and_verdict(campaign):
-    text = report.campaign_table(campaign)
+    text = _report.campaign_table(campaign)
     measured = {key for summary in campaign.filters.values() for key in summary.measures}
-    for one in BUILT_IN:
-        assert (one.title in text) == (one.key in measured and one.row)
+    for measure in _measures.BUILT_IN:
+        assert (measure.title in text) == (measure.key in measured and measure.row)
     assert len(measured) > 10
     for name, summary in campaign.filters.items():
         assert name in text
@@ -43,14 +41,14 @@ def test_the_notes_explain_the_gate_the_likelihood_and_the_counts(campaign):
     ekf = campaign.filters["ekf"]
     counts = ekf.counts | {"rejected": 7, "fused": ekf.counts["fused"] - 7}
     gated = dataclasses.replace(ekf, honest_nis=0.9454, counts=counts)
-    told = report.campaign_table(dataclasses.replace(campaign, filters={"a": ekf, "b": gated}))
-    assert max(map(len, told.splitlines())) <= 88
-    text = " ".join(told.split())
+    table = _report.campaign_table(dataclasses.replace(campaign, filters={"a": ekf, "b": gated}))
+    assert max(map(len, table.splitlines())) <= 88
+    text = " ".join(table.split())
     assert "gate: a gate drops the largest innovations" in text and "0.945 (b) and 1" in text
     assert "log-likelihood: comparable only between filters that fused the same" in text
     assert "initialized, measurements that started a landmark" in text
     assert "born" not in text
-    alone = report.campaign_table(dataclasses.replace(campaign, filters={"a": ekf}))
+    alone = _report.campaign_table(dataclasses.replace(campaign, filters={"a": ekf}))
     assert "gate:" not in alone and "log-likelihood:" not in alone
 
 
@@ -58,23 +56,23 @@ def test_measures_that_their_names_do_not_explain_have_a_note(campaign):
     ekf = campaign.filters["ekf"]
     of_many_runs = dict.fromkeys(("noncredibility", "inclination"), Average(1.0, 0.5, 1.5))
     filters = {"a": dataclasses.replace(ekf, measures=ekf.measures | of_many_runs)}
-    table = report.campaign_table(dataclasses.replace(campaign, filters=filters))
+    table = _report.campaign_table(dataclasses.replace(campaign, filters=filters))
     terms = {line.split(": ")[0] for line in table.splitlines()}
     assert {"noncredibility", "inclination", "innovation autocorrelation"} <= terms
     assert "rotation information" not in terms  # this filter has none
 
 
 def test_filters_of_which_the_same_is_said_share_a_sentence(campaign):
-    one = dataclasses.replace(
+    honest = dataclasses.replace(
         campaign.filters["ekf"],
         verdict="consistent",
         noticed={"nees_pose": (1.0, 5.0), "nis_per_dof": (0.9, np.inf)},
         doubts=("a doubt",),
     )
-    other = dataclasses.replace(one, noticed={"nees_pose": (0.0, 6.0)})
-    both = dataclasses.replace(campaign, filters={"a": one, "b": one, "c": other})
+    powerless = dataclasses.replace(honest, noticed={"nees_pose": (0.0, 6.0)})
+    both = dataclasses.replace(campaign, filters={"a": honest, "b": honest, "c": powerless})
     power = "not rejected, with 90 % power to reject a pose NEES"
-    assert report.sentences_on_verdicts(both) == [
+    assert _report.sentences_on_verdicts(both) == [
         f"{power} and a NIS / dof outside: a [1, 5] and [0.9, inf]; b [1, 5] and [0.9, inf]",
         f"{power} outside: c [0, 6]",
         "a, b, c*: a doubt",
@@ -90,34 +88,34 @@ def test_what_a_filter_does_not_estimate_has_no_number():
 
 
 def test_json_holds_the_measures_and_no_nan(campaign):
-    found = json.loads(report.as_json(campaign, "jaxslam …", 5), parse_constant=pytest.fail)
-    assert found["seed"] == 5
-    assert found["runs"] == 3
+    result = json.loads(_report.as_json(campaign, "jaxslam …", 5), parse_constant=pytest.fail)
+    assert result["seed"] == 5
+    assert result["runs"] == 3
     for name, summary in campaign.filters.items():
-        there = found["filters"][name]
-        assert there["verdict"] == summary.verdict
-        assert there["measures"]["rmse_position"]["value"] == pytest.approx(
+        entry = result["filters"][name]
+        assert entry["verdict"] == summary.verdict
+        assert entry["measures"]["rmse_position"]["value"] == pytest.approx(
             summary.measures["rmse_position"].value
         )
-        assert there["counts"] == summary.counts
+        assert entry["counts"] == summary.counts
 
 
 def test_csv_holds_the_curves(campaign):
-    rows = list(csv.DictReader(io.StringIO(report.as_csv(campaign))))
+    rows = list(csv.DictReader(io.StringIO(_report.as_csv(campaign))))
     assert len(rows) == 2 * WORLD.steps
     curve = campaign.filters["other"].curves["nees_pose"]
-    found = [r["nees_pose"] for r in rows if r["filter"] == "other"]
-    assert found[0] == ""  # the covariance is singular after one step
-    np.testing.assert_allclose([float(x) for x in found[1:]], curve[1:], rtol=1e-8)
+    column = [r["nees_pose"] for r in rows if r["filter"] == "other"]
+    assert column[0] == ""  # the covariance is singular after one step
+    np.testing.assert_allclose([float(x) for x in column[1:]], curve[1:], rtol=1e-8)
 
 
 def test_a_filter_that_lacks_a_curve_has_empty_cells(campaign):
-    first, other = campaign.filters.values()
+    first, second = campaign.filters.values()
     less = {key: values for key, values in first.curves.items() if key != "nees_pose"}
-    lacking = dataclasses.replace(other, curves=less)
+    lacking = dataclasses.replace(second, curves=less)
     for filters in ({"whole": first, "less": lacking}, {"less": lacking, "whole": first}):
         part = dataclasses.replace(campaign, filters=filters)
-        rows = list(csv.DictReader(io.StringIO(report.as_csv(part))))
+        rows = list(csv.DictReader(io.StringIO(_report.as_csv(part))))
         assert set(rows[0]) == {"filter", "step", *first.curves}
         assert all(row["nees_pose"] == "" for row in rows if row["filter"] == "less")
         assert any(row["nees_pose"] for row in rows if row["filter"] == "whole")
@@ -130,9 +128,9 @@ def test_files_appear_whole_or_not_at_all(tmp_path):
 
     out = tmp_path / "deep" / "out"
     with pytest.raises(KeyboardInterrupt):
-        files.write_files(out, {"a.txt": "text", "b.png": broken})
+        _files.write_files(out, {"a.txt": "text", "b.png": broken})
     assert not list(out.glob("*")) or not out.exists()
-    written = files.write_files(out, {"a.txt": "text", "b.txt": lambda path: path.write_text("b")})
+    written = _files.write_files(out, {"a.txt": "text", "b.txt": lambda path: path.write_text("b")})
     assert [path.read_text() for path in written] == ["text", "b"]
     assert sorted(path.name for path in out.iterdir()) == ["a.txt", "b.txt"]
 
@@ -140,8 +138,8 @@ def test_files_appear_whole_or_not_at_all(tmp_path):
 def test_an_unwritable_folder_is_refused_beforehand(tmp_path):
     (tmp_path / "file").write_text("")
     with pytest.raises(OSError, match="not a folder"):
-        files.check_writable(tmp_path / "file" / "out")
-    files.check_writable(tmp_path / "not" / "yet" / "there")
+        _files.check_writable(tmp_path / "file" / "out")
+    _files.check_writable(tmp_path / "not" / "yet" / "there")
     assert not (tmp_path / "not").exists()
 
 

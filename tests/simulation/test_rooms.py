@@ -11,7 +11,7 @@ import worlds
 from cases import refused, swept
 
 from jaxslam import catalog, run, simulate
-from jaxslam.simulation._wall_geometry import exact_ranges, is_free, wall_lines
+from jaxslam.simulation._wall_geometry import is_free, wall_lines
 from jaxslam.simulation.laser import Laser, scan, scan_information, scan_world, true_ranges
 from jaxslam.simulation.scenarios import (
     ROOMS,
@@ -48,17 +48,18 @@ def test_exact_ranges_are_intersections_with_every_wall(differences):
     rng = np.random.default_rng(0)
     pose = np.column_stack([rng.uniform(-1, 1, (20, 2)), rng.uniform(-3, 3, 20)])
     angles = np.linspace(-3, 3, 25)
+    laser = Laser(angles, max_range=4.5)
     both = jax.jit(
         jax.vmap(
             lambda p: (
-                exact_ranges(world, p, angles, 4.5),
-                jax.jacfwd(exact_ranges, 1)(world, p, angles, 4.5),
+                true_ranges(laser, world, p),
+                jax.jacfwd(true_ranges, 2)(laser, world, p),
             )
         )
     )
-    found, slopes = both(pose)
+    ranges, slopes = both(pose)
     exact = [[reference_range(world, x, y, h + a, 4.5) for a in angles] for x, y, h in pose]
-    np.testing.assert_allclose(found, exact, atol=1e-12)
+    np.testing.assert_allclose(ranges, exact, atol=1e-12)
     error = np.abs(slopes - differences(lambda p: both(p)[0], (pose,), 0, 1e-7)).max(axis=2)
     assert np.mean(error < 1e-5) > 0.99  # but where a beam passes an edge between the two sides
     assert np.all(np.isfinite(slopes))
@@ -70,11 +71,7 @@ def test_the_robot_drives_in_free_space_and_its_scans_are_the_lasers(name):
     log = scan_world(world, jax.random.key(0))
     assert np.all(is_free(world.walls, np.asarray(log.pose)[:, :2]))
     laser = world.laser
-    exact = np.array(
-        jax.jit(jax.vmap(lambda p: exact_ranges(world.walls, p, laser.angles, laser.max_range)))(
-            log.pose
-        )
-    )
+    exact = np.array(jax.jit(jax.vmap(lambda p: true_ranges(laser, world.walls, p)))(log.pose))
     valid = np.asarray(log.beams.valid)
     n = valid.size
     assert abs((~valid).mean() - laser.dropout) < 5 * np.sqrt(laser.dropout / n)
@@ -128,19 +125,19 @@ def test_maximum_likelihood_estimates_reach_the_cramer_rao_bound():
     bound = scan_information(laser, world.walls, pose).bound
 
     def ranges(pose):
-        return exact_ranges(world.walls, pose, laser.angles, laser.max_range)
+        return true_ranges(laser, world.walls, pose)
 
     def estimate(key):
         beams = scan(laser, world.walls, pose, key)
         weight = beams.valid / laser.sigma**2
-        found = jax.numpy.asarray(pose) + 0.02
+        estimated = jax.numpy.asarray(pose) + 0.02
         for _ in range(3):
-            g = jax.jacfwd(ranges)(found)
+            g = jax.jacfwd(ranges)(estimated)
             step = jax.scipy.linalg.solve(
-                g.T @ (weight[:, None] * g), g.T @ (weight * (beams.range - ranges(found)))
+                g.T @ (weight[:, None] * g), g.T @ (weight * (beams.range - ranges(estimated)))
             )
-            found = found + step
-        return found
+            estimated = estimated + step
+        return estimated
 
     error = np.asarray(jax.jit(jax.vmap(estimate))(jax.random.split(jax.random.key(1), 400))) - pose
     nees = np.einsum("ni,ij,nj->n", error, np.linalg.inv(bound), error)

@@ -17,11 +17,7 @@ from jaxslam.core.record import record
 from jaxslam.laser.grids import beam_models
 from jaxslam.math import se2
 from jaxslam.math.angles import wrap
-from jaxslam.verify import Check, Report, build, verify_jacobians
-from jaxslam.verify import _properties as properties
-from jaxslam.verify._inputs import samples, user_files
-from jaxslam.verify._inputs.functions import motion_functions
-from jaxslam.verify._inputs.user_files import UnusableFile, load, verify_file
+from jaxslam.verify import Check, Report, _inputs, _properties, build, verify_jacobians
 
 LASER = build(sensors.RangeBearing)
 CAMERA = build(sensors.BearingOnly)
@@ -106,9 +102,11 @@ OF_FUNCTIONS = {
 @pytest.fixture(scope="module")
 def states():
     """Of the models, as `verify_jacobians` draws them."""
-    functions = motion_functions(INCREMENT)
-    moved = samples.argument_samples(functions[0].arguments, 24, 0)
-    seen = {sensor.name: samples.sensor_samples(sensor, 24, 0) for sensor in (LASER, CAMERA)}
+    functions = _inputs.functions.motion_functions(INCREMENT)
+    moved = _inputs.samples.argument_samples(functions[0].arguments, 24, 0)
+    seen = {
+        sensor.name: _inputs.samples.sensor_samples(sensor, 24, 0) for sensor in (LASER, CAMERA)
+    }
     return {"increment": (moved,), **seen}
 
 
@@ -116,7 +114,7 @@ def states():
 def test_a_fault_beside_the_jacobians_is_found(fault, states):
     model, changes, names = BESIDE_JACOBIANS[fault]
     wrong = changed(model, **changes)
-    checks = properties.sensor_checks if isinstance(model, Sensor) else properties.motion_checks
+    checks = _properties.sensor_checks if isinstance(model, Sensor) else _properties.motion_checks
     with np.errstate(all="ignore"):
         assert [c.name for c in checks(wrong, *states[model.name]) if not c.passed] == names
 
@@ -243,8 +241,8 @@ def test_the_states_of_a_sensor_are_those_of_its_inverse_too():
     assert report.passed, report
     assert [f.samples for f in report.findings] == [10] * 4
     assert np.isfinite(report.linearity)
-    drawn = samples.sensor_samples(mast_camera(), 24, 0)
-    assert [c.name for c in properties.sensor_checks(mast_camera(), *drawn) if not c.passed] == []
+    drawn = _inputs.samples.sensor_samples(mast_camera(), 24, 0)
+    assert [c.name for c in _properties.sensor_checks(mast_camera(), *drawn) if not c.passed] == []
 
 
 def stereo(support):
@@ -272,7 +270,7 @@ def test_a_measurement_outside_its_support_is_not_tried():
     assert "invert and its derivatives are finite" in failed(verify_jacobians(unlimited, count=4))
     report = verify_jacobians(limited, count=4)
     assert report.passed, report
-    drawn = [samples.sensor_samples(model, 4, 0) for model in (unlimited, limited)]
+    drawn = [_inputs.samples.sensor_samples(model, 4, 0) for model in (unlimited, limited)]
     np.testing.assert_equal(drawn[1][0].values, drawn[0][0].values)  # of `observe` all remain
     z = drawn[1][1].values[1]
     assert (z[:, 1] > 0).all() and (z[:, 0] == 0).any() and (np.abs(z[:, 0]) > 3.14159).any()
@@ -289,8 +287,8 @@ def test_a_support_that_is_none_is_refused(support):
 
 def test_a_failed_round_trip_names_entry_and_state():
     camera = mast_camera(-1.0)
-    drawn = samples.sensor_samples(camera, 24, 0)
-    checks = {check.name: check for check in properties.sensor_checks(camera, *drawn)}
+    drawn = _inputs.samples.sensor_samples(camera, 24, 0)
+    checks = {check.name: check for check in _properties.sensor_checks(camera, *drawn)}
     assert checks[INVERTED].detail.startswith("bearing [rad] is off by ")
     assert ", at pose = (" in checks[INVERTED].detail
 
@@ -302,10 +300,10 @@ def test_a_round_trip_off_by_a_turn_says_that_the_unit_is_missing():
 
     names = "range [m]", "bearing"
     unnamed = changed(
-        UNMOUNTED, measurements=names, observe=unwrapped, residual=lambda z, other: z - other
+        UNMOUNTED, measurements=names, observe=unwrapped, residual=lambda z, z_hat: z - z_hat
     )
-    drawn = samples.sensor_samples(unnamed, 24, 0)
-    checks = {check.name: check for check in properties.sensor_checks(unnamed, *drawn)}
+    drawn = _inputs.samples.sensor_samples(unnamed, 24, 0)
+    checks = {check.name: check for check in _properties.sensor_checks(unnamed, *drawn)}
     assert checks[INVERTED].detail.startswith(
         "bearing is off by 2π (an angle's name ends in [rad])"
     )
@@ -344,12 +342,14 @@ def test_a_file_may_define_a_beam_model_whose_jacobian_is_held(tmp_path):
         "mine = LikelihoodField(0.2, max_range=40.0)\nwrong = Wrong(0.2, max_range=40.0)\n",
         encoding="utf-8",
     )
-    right, wrong = verify_file(str(path), partial(verify_jacobians, count=4))
+    right, wrong = _inputs.user_files.verify_file(str(path), partial(verify_jacobians, count=4))
     assert (right.model, right.kind, right.passed) == ("mine", "beam model", True), str(right)
     assert not wrong.passed
     assert "hand disagrees" in str(wrong)
-    with pytest.raises(UnusableFile, match=r"expected dataclasses to be .* a BeamModel, or"):
-        load(f"{path}:dataclasses")
+    with pytest.raises(
+        _inputs.user_files.UnusableFile, match=r"expected dataclasses to be .* a BeamModel, or"
+    ):
+        _inputs.user_files.load(f"{path}:dataclasses")
     (target,) = (a for a in cli._parser()._actions if isinstance(a.choices, dict))
     assert "grids.BeamModel" in target.choices["verify"].format_help()
 
@@ -384,7 +384,7 @@ def test_a_wrong_entry_of_a_factor_is_named():
 def test_a_file_has_factors_by_themselves_by_factories_and_classes(tmp_path, text, name, factor):
     path = tmp_path / "mine.py"
     path.write_text(f"from jaxslam import graphs\nfrom jaxslam.core.record import record\n{text}")
-    assert [(t.name, t.model.name) for t in user_files.load(str(path))] == [(name, factor)]
+    assert [(t.name, t.model.name) for t in _inputs.user_files.load(str(path))] == [(name, factor)]
 
 
 def test_a_class_in_the_place_of_a_factor_is_to_be_called():

@@ -5,8 +5,8 @@ import sys
 from pathlib import Path
 
 import pytest
+from command import run_command
 
-from jaxslam._cli import main
 from jaxslam.verify._inputs import user_files
 
 EXAMPLES = Path(__file__).parents[2] / "examples"
@@ -22,15 +22,15 @@ def verify(tmp_path, capsys):
         return on(str(path) + name)
 
     def on(target):
-        status = main(["verify", target, "--out", str(tmp_path / "out")])
+        status = run_command(["verify", target, "--out", str(tmp_path / "out")])
         printed = capsys.readouterr()
         result = tmp_path / "out" / "verify.json"
         content = json.loads(result.read_text(encoding="utf-8")) if result.exists() else None
         return status, printed.out, printed.err, content
 
     def says(text, status, *parts):
-        found, out, _, _ = go(text)
-        assert found == status, out
+        returned, out, _, _ = go(text)
+        assert returned == status, out
         for part in parts:
             assert part in out
         return out

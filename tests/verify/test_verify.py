@@ -13,9 +13,7 @@ from own_models import changed
 from verified import by_name, failed
 
 from jaxslam import sensors
-from jaxslam.verify import _differences as differences
-from jaxslam.verify import build, verify_jacobians
-from jaxslam.verify._inputs.functions import plain_function
+from jaxslam.verify import _differences, _inputs, build, verify_jacobians
 
 
 def observe(pose, landmark):
@@ -308,9 +306,10 @@ def test_bad_requests_are_refused(call):
 
 def test_lengths_are_those_of_the_states():
     states = (np.ones((4, 2)), np.ones((4, 5)))
-    function = plain_function(lambda a, b: a * b[:2], None, states=states)
+    function = _inputs.functions.plain_function(lambda a, b: a * b[:2], None, states=states)
     assert {a.name: len(a.entries) for a in function.arguments} == {"a": 2, "b": 5}
-    sized = plain_function(lambda u: u, None, {"u": np.int64(2)})  # from the shape of an array
+    # A size from the shape of an array.
+    sized = _inputs.functions.plain_function(lambda u: u, None, {"u": np.int64(2)})
     assert sized.arguments[0].entries == ("u[0]", "u[1]")
 
 
@@ -323,7 +322,7 @@ def test_lengths_are_those_of_the_states():
 )
 def test_a_length_that_is_not_known_is_asked_for(name, place):
     with pytest.raises(ValueError, match=r"the length of 'b' is not known") as error:
-        plain_function(lambda pose, b: b, None, name=name)
+        _inputs.functions.plain_function(lambda pose, b: b, None, name=name)
     message = str(error.value)
     assert "\n" not in message and place in message
 
@@ -383,7 +382,7 @@ def smooth_jacobian(x):
 def test_quotients_and_their_error():
     rng = np.random.default_rng(0)
     x = np.stack([rng.normal(size=50), rng.uniform(1, 2, 50)], axis=1)
-    value, error, kink = differences.quotients(smooth, (x,), 0, np.full(2, np.inf))
+    value, error, kink = _differences.quotients(smooth, (x,), 0, np.full(2, np.inf))
     off = np.abs(value - smooth_jacobian(x))
     assert off.max() < 1e-10
     assert error.max() < 1e-8
@@ -397,7 +396,7 @@ def test_quotients_know_where_there_is_no_derivative():
     def root(x):
         return np.sqrt(np.abs(x))
 
-    value, error, kink = differences.quotients(root, (x,), 0, np.full(1, np.inf))
+    value, error, kink = _differences.quotients(root, (x,), 0, np.full(1, np.inf))
     assert np.all(~(error[:2, 0, 0] < 1e-3 * np.abs(value[:2, 0, 0])))
     np.testing.assert_allclose(value[2, 0, 0], 0.5, atol=1e-10)
 
@@ -407,7 +406,7 @@ def test_quotients_cross_the_seam_of_a_circle():
         return np.angle(np.exp(1j * 2 * x))
 
     x = np.array([[np.pi / 2], [-np.pi / 2 + 1e-9], [0.3]])
-    value, _, kink = differences.quotients(wrapped, (x,), 0, np.array([2 * np.pi]))
+    value, _, kink = _differences.quotients(wrapped, (x,), 0, np.array([2 * np.pi]))
     np.testing.assert_allclose(value, 2, atol=1e-9)
     assert not kink.any()
 
@@ -416,7 +415,7 @@ def test_quotients_see_a_kink_where_they_converge():
     def f(x):
         return np.stack([np.abs(x[:, 0]), x[:, 0] * np.abs(x[:, 0])], axis=1)
 
-    value, error, kink = differences.quotients(
+    value, error, kink = _differences.quotients(
         f, (np.array([[0.0], [1e-3]]),), 0, np.full(2, np.inf)
     )
     np.testing.assert_array_equal(kink[:, :, 0], [[True, False], [False, False]])
@@ -426,14 +425,14 @@ def test_a_fast_turn_is_not_aliased():
     def heading(x):
         return np.angle(np.exp(1j * 1000 * x))
 
-    value, _, _ = differences.quotients(heading, (np.array([[0.3]]),), 0, np.array([2 * np.pi]))
+    value, _, _ = _differences.quotients(heading, (np.array([[0.3]]),), 0, np.array([2 * np.pi]))
     np.testing.assert_allclose(value, 1000, rtol=1e-7)
 
 
 def test_complex_step_is_exact():
     x = np.array([[0.7, 1.3]])
     np.testing.assert_allclose(
-        differences.complex_step(smooth, (x,), 0), smooth_jacobian(x), rtol=1e-15
+        _differences.complex_step(smooth, (x,), 0), smooth_jacobian(x), rtol=1e-15
     )
 
 

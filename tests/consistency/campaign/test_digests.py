@@ -14,7 +14,6 @@ import worlds
 from jaxslam import filters, sensors, store
 from jaxslam.consistency.campaign import _digests as digests
 from jaxslam.consistency.campaign import monte_carlo
-from jaxslam.consistency.campaign._digests import digest, identity
 from jaxslam.core.record import record
 
 
@@ -51,7 +50,7 @@ ELSEWHERE = np.asarray(worlds.ring(12).landmarks) + [1e-15, 0.0]
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
     kept = store.open(tmp_path_factory.mktemp("claimed"))
-    kept.claim(identity(**campaign(), platform="cpu"))
+    kept.claim(digests.identity(**campaign(), platform="cpu"))
     return kept.folder
 
 
@@ -84,26 +83,26 @@ def test_a_changed_campaign_is_refused_by_what_changed(folder, changed, named):
 
 
 def test_another_precision_platform_version_or_bound_is_another_campaign(folder, monkeypatch):
-    there = store.resume(folder).campaign
-    asked = campaign()
+    stored = store.resume(folder).campaign
+    parts = campaign()
 
     def changed(platform="cpu", **options):
-        found = identity(**asked, platform=platform, **options)
-        assert found.keys() == there.keys()
-        return {name for name in found if found[name] != there[name]}
+        identity = digests.identity(**parts, platform=platform, **options)
+        assert identity.keys() == stored.keys()
+        return {name for name in identity if identity[name] != stored[name]}
 
     assert changed() == set()
     assert changed(platform="gpu") == {"platform"}
     assert changed(bound=True) == {"bound"}
     with jax.enable_x64(False):
         assert "dtype" in changed()
-    monkeypatch.setattr(digests, "version", lambda name: {"jax": "0.1"}.get(name, there[name]))
+    monkeypatch.setattr(digests, "version", lambda name: {"jax": "0.1"}.get(name, stored[name]))
     assert changed() == {"jax"}
 
 
 def test_fewer_runs_than_are_kept_are_refused(tmp_path):
     kept = store.open(tmp_path)
-    kept.claim(identity(**campaign(), platform="cpu"))
+    kept.claim(digests.identity(**campaign(), platform="cpu"))
     kept.save(0, {"0/x": np.zeros(2)}, 2)
     kept.save(2, {"0/x": np.zeros(2)}, 2)
     with pytest.raises(
@@ -115,7 +114,7 @@ def test_fewer_runs_than_are_kept_are_refused(tmp_path):
 def test_a_gate_that_a_filter_closes_over_is_seen():
     scenario = world()
     ekfs = [
-        identity(
+        digests.identity(
             scenario, {"it": worlds.ekf(scenario, gate=gate)}, jax.random.key(0), platform="cpu"
         )["filter it"]
         for gate in (0.99, 0.99, 0.99 + 1e-12)
@@ -126,7 +125,7 @@ def test_a_gate_that_a_filter_closes_over_is_seen():
 ALONE = """
 import json, jax, test_digests as t
 jax.config.update("jax_enable_x64", True)
-found = t.identity(**t.campaign(make=t.worlds.ekf), platform="cpu")
+found = t.digests.identity(**t.campaign(make=t.worlds.ekf), platform="cpu")
 print(json.dumps(found))
 """
 
@@ -139,7 +138,7 @@ def test_the_same_campaign_in_another_process_has_the_same_identity():
         text=True,
         check=True,
     )
-    assert json.loads(done.stdout) == identity(**campaign(make=worlds.ekf), platform="cpu")
+    assert json.loads(done.stdout) == digests.identity(**campaign(make=worlds.ekf), platform="cpu")
 
 
 def made_by(scale, table):
@@ -152,26 +151,26 @@ def helped(x):
 
 def test_a_digest_of_a_function_is_of_its_code_and_of_what_it_refers_to(monkeypatch):
     table = np.arange(3.0)
-    one = digest(made_by(2.0, table))
-    assert one == digest(made_by(2.0, table.copy()))
+    digest = digests.digest(made_by(2.0, table))
+    assert digest == digests.digest(made_by(2.0, table.copy()))
     others = [
-        digest(made_by(np.nextafter(2.0, 3.0), table)),
-        digest(made_by(2.0, np.nextafter(table, 9))),
-        digest(lambda x: x),
+        digests.digest(made_by(np.nextafter(2.0, 3.0), table)),
+        digests.digest(made_by(2.0, np.nextafter(table, 9))),
+        digests.digest(lambda x: x),
     ]
     monkeypatch.setitem(globals(), "helped", lambda x: x + 2.0)
-    assert len({one, *others, digest(made_by(2.0, table))}) == 5
-    assert digest(np.sin) != digest(np.cos)
+    assert len({digest, *others, digests.digest(made_by(2.0, table))}) == 5
+    assert digests.digest(np.sin) != digests.digest(np.cos)
 
 
 def test_a_digest_of_a_class_is_of_its_constants_methods_and_of_sets_in_its_code():
-    def made(scale, among, by=1.0):
+    def class_of(scale, among, by=1.0):
         @record
         class Scaled(filters.Wrapper):
             factor = scale
 
             @staticmethod
-            def known(tag):
+            def contains(tag):
                 return tag in among
 
             def predict(self, state, u, key):
@@ -179,7 +178,7 @@ def test_a_digest_of_a_class_is_of_its_constants_methods_and_of_sets_in_its_code
 
         return Scaled
 
-    one, two = frozenset({1, 2}), frozenset({2, 3})
-    assert digest(made(1.0, one)) == digest(made(1.0, frozenset({2, 1})))
-    others = (1.0, one), (2.0, one), (1.0, two), (1.0, one, 2.0)
-    assert len({digest(made(*each)) for each in others}) == 4
+    first, second = frozenset({1, 2}), frozenset({2, 3})
+    assert digests.digest(class_of(1.0, first)) == digests.digest(class_of(1.0, frozenset({2, 1})))
+    others = (1.0, first), (2.0, first), (1.0, second), (1.0, first, 2.0)
+    assert len({digests.digest(class_of(*arguments)) for arguments in others}) == 4

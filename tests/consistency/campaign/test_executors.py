@@ -23,20 +23,14 @@ import worlds
 import jaxslam
 from jaxslam import _cli as cli
 from jaxslam import filters, store
-from jaxslam._cli.campaigns import engines
 from jaxslam.consistency.campaign import (
     Incomplete,
     Processes,
+    _block,
+    _flight,
+    _remote,
     monte_carlo,
 )
-from jaxslam.consistency.campaign import (
-    _flight as flight,
-)
-from jaxslam.consistency.campaign import (
-    _remote as remote,
-)
-from jaxslam.consistency.campaign._block import CampaignPlan
-from jaxslam.consistency.campaign._remote import compute_block, pack
 from jaxslam.core.record import record
 
 WORLD = worlds.ring(20)
@@ -49,7 +43,7 @@ def campaign_of(runs=22, **options):
 
 
 @pytest.fixture(scope="module")
-def whole():
+def undivided():
     return campaign_of(devices=jax.devices()[:1])
 
 
@@ -85,47 +79,51 @@ class Jobs(ThreadPoolExecutor):
 
 
 @pytest.mark.parametrize("kind", [ThreadPoolExecutor, Jobs])
-def test_an_executor_gives_the_bits_of_one_process(kind, whole, tmp_path):
-    said, compiled = [], remote._runner.cache_info().misses
+def test_an_executor_gives_the_bits_of_one_process(kind, undivided, tmp_path):
+    said, compiled = [], _remote._runner.cache_info().misses
     with kind(2) as executor:
-        found = campaign_of(
+        campaign = campaign_of(
             executor=executor,
             keep=store.open(tmp_path),
             progress=lambda *done: said.append(done),
         )
-    worlds.assert_same_bits(found, whole)
+    worlds.assert_same_bits(campaign, undivided)
     assert said[-1] == (22, 22) and len(said) == 6
-    assert remote._runner.cache_info().misses <= compiled + 1  # two threads compile once
-    assert found.compile_seconds > 0 and set(found.step_seconds) == {"reckoning"}
-    for one, other in zip(found.first["reckoning"], whole.first["reckoning"], strict=True):
-        np.testing.assert_array_equal(one.pose, other.pose)
+    assert _remote._runner.cache_info().misses <= compiled + 1  # two threads compile once
+    assert campaign.compile_seconds > 0 and set(campaign.step_seconds) == {"reckoning"}
+    for result, expected in zip(
+        campaign.first["reckoning"], undivided.first["reckoning"], strict=True
+    ):
+        np.testing.assert_array_equal(result.pose, expected.pose)
     # What is kept is not computed again, here or there.
-    worlds.assert_same_bits(campaign_of(keep=store.resume(tmp_path), executor=Unreliable()), whole)
+    worlds.assert_same_bits(
+        campaign_of(keep=store.resume(tmp_path), executor=Unreliable()), undivided
+    )
 
 
-def test_a_block_whose_worker_dies_or_fails_is_computed_again(whole):
+def test_a_block_whose_worker_dies_or_fails_is_computed_again(undivided):
     executor = Unreliable(OSError("gone"), None, "cancelled", OSError("gone"), None, None)
     with pytest.warns(UserWarning, match="computed once more") as warned:
-        found = campaign_of(executor=executor, workers=1)
-    worlds.assert_same_bits(found, whole)
+        campaign = campaign_of(executor=executor, workers=1)
+    worlds.assert_same_bits(campaign, undivided)
     assert len(warned) == 3 and len(executor.calls) == 6 + 3
     assert "runs 0 to 3 are computed once more (OSError: gone)" in str(warned[0].message)
 
 
-def test_a_block_that_is_late_is_computed_again(whole, monkeypatch):
-    monkeypatch.setattr(flight, "_LATE", 0.2)
+def test_a_block_that_is_late_is_computed_again(undivided, monkeypatch):
+    monkeypatch.setattr(_flight, "_LATE", 0.2)
     executor = Unreliable(None, "lost")
     with pytest.warns(UserWarning, match="no result after"):
-        worlds.assert_same_bits(campaign_of(executor=executor), whole)
+        worlds.assert_same_bits(campaign_of(executor=executor), undivided)
     assert executor.calls.count(4) == 2
-    monkeypatch.setattr(flight, "_LATE", 0.05)
+    monkeypatch.setattr(_flight, "_LATE", 0.05)
     lost = Unreliable(None, *["lost"] * 30)
     with warnings.catch_warnings(), pytest.raises(Incomplete, match="4 of 22 runs done"):
         warnings.simplefilter("ignore")
         campaign_of(executor=lost)
 
 
-def test_a_campaign_that_cannot_be_finished_says_what_it_has(whole, tmp_path):
+def test_a_campaign_that_cannot_be_finished_says_what_it_has(undivided, tmp_path):
     executor = Unreliable(None, None, *[OSError("gone")] * 50)
     keep = store.open(tmp_path)
     with warnings.catch_warnings(), pytest.raises(Incomplete, match="OSError: gone") as stopped:
@@ -133,7 +131,9 @@ def test_a_campaign_that_cannot_be_finished_says_what_it_has(whole, tmp_path):
         campaign_of(executor=executor, workers=1, keep=keep)
     assert "8 of 22 runs done" in str(stopped.value)
     assert stopped.value.campaign.runs == 8 and keep.done() == 8
-    worlds.assert_same_bits(campaign_of(executor=Unreliable(), keep=store.resume(tmp_path)), whole)
+    worlds.assert_same_bits(
+        campaign_of(executor=Unreliable(), keep=store.resume(tmp_path)), undivided
+    )
 
 
 def test_a_pool_that_breaks_at_once_asks_for_the_guard_of_a_script():
@@ -207,9 +207,11 @@ def test_a_class_of_a_script_is_a_record_in_another_process(tmp_path):
 
 def test_a_block_is_small_on_its_way():
     device = jax.devices()[:1]
-    content = pack(CampaignPlan(WORLD, {"reckoning": RECKONING}, worlds.key(), device, 4))
+    content = _remote.pack(
+        _block.CampaignPlan(WORLD, {"reckoning": RECKONING}, worlds.key(), device, 4)
+    )
     assert len(content) < 8000
-    result = compute_block(content, 0, 4)
+    result = _remote.compute_block(content, 0, 4)
     assert len(pickle.dumps(result._replace(first={}))) < 20_000
 
 
@@ -224,18 +226,18 @@ def killed(done, runs, before=frozenset()):
 
 
 @pytest.mark.sweep
-def test_processes_of_which_one_is_killed(whole, tmp_path):
+def test_processes_of_which_one_is_killed(undivided, tmp_path):
     before = frozenset(multiprocessing.active_children())
     executor = Processes(2)
     try:
         with warnings.catch_warnings():
             warnings.simplefilter("ignore")
-            found = campaign_of(
+            campaign = campaign_of(
                 executor=executor, progress=lambda *done: killed(*done, before=before)
             )
     finally:
         executor.shutdown()
-    worlds.assert_same_bits(found, whole)
+    worlds.assert_same_bits(campaign, undivided)
     with (
         ProcessPoolExecutor(1, get_context("spawn")) as pool,
         warnings.catch_warnings(),
@@ -246,7 +248,7 @@ def test_processes_of_which_one_is_killed(whole, tmp_path):
 
 
 @pytest.mark.sweep
-def test_dask_with_a_worker_killed(whole):
+def test_dask_with_a_worker_killed(undivided):
     distributed = broken.optional("distributed")
     with (
         distributed.LocalCluster(
@@ -262,9 +264,9 @@ def test_dask_with_a_worker_killed(whole):
                 killing.append(os.kill(pids[0], signal.SIGKILL))
 
         executor = client.get_executor(pure=False)
-        found = campaign_of(400, executor=executor, progress=progress)
+        campaign = campaign_of(400, executor=executor, progress=progress)
     assert killing
-    worlds.assert_same_bits(found, campaign_of(400, devices=jax.devices()[:1]))
+    worlds.assert_same_bits(campaign, campaign_of(400, devices=jax.devices()[:1]))
 
 
 ASKED = ["--scenario", "circle", "--filters", "dead_reckoning", "--steps", "12", "--block", "2"]
@@ -371,7 +373,7 @@ def test_an_engine_that_cannot_be_used_is_named(
 def test_a_service_that_is_not_dasks_ends_the_command(tmp_path, capsys, monkeypatch):
     """Dask's own time limit does not hold while it reads another protocol."""
     broken.optional("distributed")
-    monkeypatch.setattr(engines, "_TIMEOUT", 1)
+    monkeypatch.setattr(cli.campaigns.engines, "_TIMEOUT", 1)
     with ThreadingHTTPServer(("127.0.0.1", 0), BaseHTTPRequestHandler) as server:
         Thread(target=server.serve_forever, daemon=True).start()
         options = ["--executor", f"dask://127.0.0.1:{server.server_port}"]
@@ -386,6 +388,6 @@ def test_what_a_worker_lacks_is_named():
         with pytest.raises(
             ValueError, match=r"a worker cannot read what is sent .*owhere"
         ) as caught:
-            compute_block(content, 0, 4)
+            _remote.compute_block(content, 0, 4)
         assert "\n" not in str(caught.value)
         assert pickle.loads(pickle.dumps(caught.value)).args == caught.value.args

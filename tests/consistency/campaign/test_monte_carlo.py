@@ -13,16 +13,16 @@ from cases import refused, swept
 
 import jaxslam
 from jaxslam import Scenario, catalog, filters, grids, motion, run, sensors, simulate, store
-from jaxslam.consistency._measures.counts import DROPS, KEPT
-from jaxslam.consistency.campaign import Interrupted, monte_carlo
-from jaxslam.consistency.campaign import _work as work
-from jaxslam.consistency.campaign._block_programs import fitting_block
-from jaxslam.consistency.campaign._candidates import without_noise
-from jaxslam.consistency.campaign._pieces import missing_pieces
+from jaxslam.consistency.campaign import (
+    Interrupted,
+    _block_programs,
+    _candidates,
+    _pieces,
+    _work,
+    monte_carlo,
+)
 from jaxslam.core.record import record
 from jaxslam.core.types import Status, Truth
-from jaxslam.filters import _reporting as reporting
-from jaxslam.laser.grids._grid_localization import info_of_beams
 from jaxslam.simulation.laser import scan_world
 from jaxslam.simulation.scenarios import BetweenRanges, square
 
@@ -59,7 +59,7 @@ def test_blocks_follow_the_memory_of_an_accelerator():
     def fits(platform, memory):
         stats = None if memory is None else {"bytes_limit": memory}
         device = SimpleNamespace(platform=platform, memory_stats=lambda: stats)
-        return fitting_block(WORLD, {"ekf": worlds.ekf(WORLD)}, device)
+        return _block_programs.fitting_block(WORLD, {"ekf": worlds.ekf(WORLD)}, device)
 
     assert fits("cpu", None) == 16
     assert fits("gpu", None) == 1024
@@ -90,10 +90,10 @@ def test_other_blocks_change_what_rounding_does(in_fours, block):
 
 
 def test_pieces_lie_within_the_blocks_of_their_numbers():
-    assert missing_pieces([], 10, 4) == [(0, 4), (4, 4), (8, 2)]
-    assert missing_pieces([(0, 3), (6, 1)], 10, 4) == [(3, 1), (4, 2), (7, 1), (8, 2)]
-    assert missing_pieces([(0, 20)], 10, 4) == []
-    assert missing_pieces([(0, 10)], 13, 8) == [(10, 3)]
+    assert _pieces.missing_pieces([], 10, 4) == [(0, 4), (4, 4), (8, 2)]
+    assert _pieces.missing_pieces([(0, 3), (6, 1)], 10, 4) == [(3, 1), (4, 2), (7, 1), (8, 2)]
+    assert _pieces.missing_pieces([(0, 20)], 10, 4) == []
+    assert _pieces.missing_pieces([(0, 10)], 13, 8) == [(10, 3)]
 
 
 class Spy:
@@ -151,7 +151,7 @@ def test_an_interrupt_before_any_block_has_no_campaign(monkeypatch):
     def interrupted(*arguments):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(work, "BlockRunner", interrupted)
+    monkeypatch.setattr(_work, "BlockRunner", interrupted)
     with pytest.raises(Interrupted, match="0 of 10") as stopped:
         campaign_of()
     assert stopped.value.campaign is None
@@ -159,7 +159,7 @@ def test_an_interrupt_before_any_block_has_no_campaign(monkeypatch):
 
 def test_out_of_memory_tries_smaller_blocks(monkeypatch, in_fours):
     tried = []
-    runner = work.BlockRunner
+    runner = _work.BlockRunner
 
     def little_memory(plan):
         tried.append(plan.wide)
@@ -167,7 +167,7 @@ def test_out_of_memory_tries_smaller_blocks(monkeypatch, in_fours):
             raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory allocating 1 byte")
         return runner(plan)
 
-    monkeypatch.setattr(work, "BlockRunner", little_memory)
+    monkeypatch.setattr(_work, "BlockRunner", little_memory)
     with pytest.warns(UserWarning, match="continuing with block=") as warned:
         campaign = campaign_of(block=18)
     assert (tried, len(warned)) == ([18, 9, 4], 2)
@@ -178,7 +178,7 @@ def test_out_of_memory_for_one_run_says_so(monkeypatch):
     def no_memory(*arguments):
         raise jax.errors.JaxRuntimeError("RESOURCE_EXHAUSTED: Out of memory")
 
-    monkeypatch.setattr(work, "BlockRunner", no_memory)
+    monkeypatch.setattr(_work, "BlockRunner", no_memory)
     with pytest.raises(MemoryError, match="block=1"):
         campaign_of(block=1)
 
@@ -187,7 +187,7 @@ def test_other_errors_of_the_runtime_are_not_taken_for_memory(monkeypatch):
     def broken(*arguments):
         raise jax.errors.JaxRuntimeError("INTERNAL: something else")
 
-    monkeypatch.setattr(work, "BlockRunner", broken)
+    monkeypatch.setattr(_work, "BlockRunner", broken)
     with pytest.raises(jax.errors.JaxRuntimeError, match="something else"):
         campaign_of()
 
@@ -342,11 +342,22 @@ def test_a_filter_of_beams_without_innovations_runs_in_a_world_that_draws_a_log_
     @record
     class Silent(filters.Wrapper):
         def update(self, joint, scan, key):
-            return joint, info_of_beams(scan, 1, jnp.zeros(()), jnp.asarray(True))
+            beams = len(scan.valid)
+            info = filters.info_of(
+                filters.status_of(scan.valid, matched=scan.valid, inside=scan.z[:, 0] > 0),
+                scan.valid,
+                size=0,
+                slot=jnp.full(beams, -1),
+                nis=jnp.zeros(beams),
+                innovation=jnp.zeros((beams, 0)),
+                innovation_cov=jnp.zeros((beams, 0, 0)),
+                log_likelihood=jnp.zeros(()),
+            )
+            return joint, info
 
-    found = worlds.campaign(world, {"silent": Silent(reckoning)}, 3).filters["silent"]
-    assert found.counts["fused"] > 0 and found.counts["not_finite"] == 0
-    assert all(np.isfinite(m.value) for m in found.measures.values())
+    summary = worlds.campaign(world, {"silent": Silent(reckoning)}, 3).filters["silent"]
+    assert summary.counts["fused"] > 0 and summary.counts["not_finite"] == 0
+    assert all(np.isfinite(m.value) for m in summary.measures.values())
 
 
 def test_a_world_without_noise_does_not_diverge():
@@ -368,12 +379,12 @@ def test_a_sensor_without_noise_is_told_where_it_left_nothing_to_judge():
     @record
     class Singular(filters.Wrapper):
         def update(self, joint, scan, key):
-            info = reporting.nothing_of(scan)
+            info = worlds.unmatched(scan)
             return joint, info._replace(status=jnp.full_like(info.status, Status.SINGULAR))
 
     candidates = {"a": reckoning, "b": Singular(reckoning)}
-    found = worlds.campaign(still, candidates, 2)
-    a, b = (found.filters[name].doubts for name in candidates)
+    campaign = worlds.campaign(still, candidates, 2)
+    a, b = (campaign.filters[name].doubts for name in candidates)
     assert not any("without noise" in doubt for doubt in a)
     assert "bearing [rad] of range_bearing without noise" in b[-1]
     assert f"{2 * still.steps * len(still.landmarks):,} measurements were dropped and" in b[-1]
@@ -384,7 +395,9 @@ def test_every_filter_accounts_for_every_measurement(name):
     """A status in its Info for each that the logs hold."""
     counts = worlds.campaign(WORLD, {"it": catalog.ALL[name](WORLD)}, 2).filters["it"].counts
     assert counts["measured"] == 2 * WORLD.steps * len(WORLD.landmarks)
-    assert counts["measured"] == sum(counts[status.name.lower()] for status in KEPT + DROPS)
+    assert counts["measured"] == sum(
+        counts[status.name.lower()] for status in Status if status != Status.EMPTY
+    )
 
 
 @pytest.mark.parametrize(
@@ -407,7 +420,7 @@ def test_a_world_that_gives_its_filter_little_is_told(change, word, told):
 
 
 @pytest.mark.parametrize(
-    ("noise", "told"),
+    ("noise", "names"),
     [
         (np.diag([0.1, 1e-9]), ""),
         (np.zeros((2, 2)), "range [m], bearing [rad] of range_bearing"),
@@ -416,11 +429,11 @@ def test_a_world_that_gives_its_filter_little_is_told(change, word, told):
         (lambda z: jnp.diag(z * jnp.array([1.0, 0.0])), "bearing [rad] of range_bearing"),
     ],
 )
-def test_measurements_without_noise_are_named(noise, told):
-    there = dataclasses.replace(WORLD, sensor=sensors.RangeBearing(noise))
-    assert without_noise(there) == told
-    eyes = sensors.Suite(((sensors.Compass(np.eye(1)), 1), (there.sensor, 6)))
-    assert without_noise(dataclasses.replace(WORLD, sensor=eyes)) == told
+def test_measurements_without_noise_are_named(noise, names):
+    world = dataclasses.replace(WORLD, sensor=sensors.RangeBearing(noise))
+    assert _candidates.without_noise(world) == names
+    eyes = sensors.Suite(((sensors.Compass(np.eye(1)), 1), (world.sensor, 6)))
+    assert _candidates.without_noise(dataclasses.replace(WORLD, sensor=eyes)) == names
 
 
 HONEST = {

@@ -9,8 +9,8 @@ from pathlib import Path
 import jax
 import pytest
 import worlds
+from command import run_command
 
-from jaxslam import _cli as cli
 from jaxslam import filters, store
 from jaxslam.consistency.campaign import monte_carlo
 from jaxslam.results import _campaign_files as campaign_files
@@ -130,8 +130,8 @@ def undrawn():
         yield
 
 
-def command(out, *more):
-    return cli.main(["consistency", *ASKED, "--runs", "13", "--out", str(out), *more])
+def command(out, *options):
+    return run_command(["consistency", *ASKED, "--runs", "13", "--out", str(out), *options])
 
 
 def results(out):
@@ -158,7 +158,7 @@ def test_the_command_computes_a_part(tmp_path, capsys, in_one_go):
     assert not (out / "consistency.json").exists()
     assert command(out, "--devices", "1", "--part", "9/9") == 0
     assert "part 9 of 9 has no block of the 13 runs" in capsys.readouterr().out
-    for options, told in (
+    for options, message in (
         (["--devices", "1", "--seed", "3"], "--seed is 0 there, 3 here: choose another folder"),
         (["--devices", "2"], "--devices is 1 there, 2 here"),
         (["--devices", "1", "--block", "4"], "--block is 2 there, 4 here"),
@@ -169,14 +169,14 @@ def test_the_command_computes_a_part(tmp_path, capsys, in_one_go):
         (["--devices", "1", "--overwrite"], "--part: expected no --overwrite"),
     ):
         assert command(out, "--part", "1/3", *options) == 2
-        assert told in capsys.readouterr().err
+        assert message in capsys.readouterr().err
     for part in ("0/3", "4/3", "3", "a/3"):
         assert command(out, "--part", part) == 2
         assert f"--part: expected I/N with 1 <= I <= N, as 3/16, got '{part}'" in (
             capsys.readouterr().err
         )
-    assert cli.main(["consistency", "--resume", str(out), "--part", "1/9"]) == 0
-    assert cli.main(["consistency", "--resume", str(out)]) == 0  # with the devices of the parts
+    assert run_command(["consistency", "--resume", str(out), "--part", "1/9"]) == 0
+    assert run_command(["consistency", "--resume", str(out)]) == 0  # with the devices of the parts
     assert results(out) == results(in_one_go)
     assert command(in_one_go, "--devices", "1", "--part", "1/2") == 2
     assert (
@@ -189,18 +189,18 @@ def test_the_job_array_of_the_documentation(tmp_path, in_one_go):
     """Its script, by processes at once in place of SLURM's jobs; one of three never comes."""
     (tmp_path / "jaxslam").write_text(f'#!/bin/sh\nexec {sys.executable} -m jaxslam "$@"\n')
     (tmp_path / "jaxslam").chmod(0o755)
-    more = [*ASKED, "--runs", "13"]
+    words = [*ASKED, "--runs", "13"]
     jobs = []
     for i in (1, 3):
-        told = {"ARRAY_TASK_ID": i, "ARRAY_TASK_COUNT": 3, "CPUS_PER_TASK": 1}
-        told["SUBMIT_DIR"] = tmp_path
-        env = os.environ | {f"SLURM_{name}": str(value) for name, value in told.items()}
+        variables = {"ARRAY_TASK_ID": i, "ARRAY_TASK_COUNT": 3, "CPUS_PER_TASK": 1}
+        variables["SUBMIT_DIR"] = tmp_path
+        env = os.environ | {f"SLURM_{name}": str(value) for name, value in variables.items()}
         env["PATH"] = f"{tmp_path}:{env['PATH']}"
-        jobs.append(subprocess.Popen(["bash", SCRIPT, *more], env=env, stdout=subprocess.PIPE))
+        jobs.append(subprocess.Popen(["bash", SCRIPT, *words], env=env, stdout=subprocess.PIPE))
     said = [job.communicate(timeout=300)[0].decode() for job in jobs]
     assert [job.returncode for job in jobs] == [0, 0], said
     out = tmp_path / "campaign"
     spans = store.resume(out / "blocks").spans()
     assert [first for first, _ in spans] == [0, 4, 6, 10, 12]
-    assert cli.main(["consistency", "--resume", str(out)]) == 0
+    assert run_command(["consistency", "--resume", str(out)]) == 0
     assert results(out) == results(in_one_go)

@@ -6,16 +6,14 @@ from types import SimpleNamespace
 import pytest
 import worlds
 
-from jaxslam.consistency.campaign import _progress as progress
-from jaxslam.consistency.campaign import monte_carlo
-from jaxslam.consistency.campaign._work import Work
+from jaxslam.consistency.campaign import _progress, _work, monte_carlo
 
 
 def test_a_bar_tells_how_fast_it_goes_and_how_long_that_takes(capsys, monkeypatch):
     monkeypatch.setattr(sys.stderr, "isatty", lambda: True, raising=False)
     clock = iter([100.0, 130.0, 131.0, 132.0, 150.0])
-    monkeypatch.setattr(progress.time, "perf_counter", lambda: next(clock))
-    with progress.Progress("circle") as bar:
+    monkeypatch.setattr(_progress.time, "perf_counter", lambda: next(clock))
+    with _progress.Progress("circle") as bar:
         for done in (64, 64, 128, 140):
             bar(done, 10_000)
     first, same, second, third = (
@@ -25,8 +23,8 @@ def test_a_bar_tells_how_fast_it_goes_and_how_long_that_takes(capsys, monkeypatc
     assert same.endswith("64/10,000 runs, 31 s\r")  # no rate of nothing
     assert second.endswith("128/10,000 runs, 32 s, 32 a second, 5 min 8 s left\r")
     assert third.endswith("140/10,000 runs, 50 s, 3.8 a second, 43 min 15 s left\r")
-    assert progress._duration(59.6) == "1 min 0 s"
-    assert progress._duration(7322) == "2 h 2 min"
+    assert _progress._duration(59.6) == "1 min 0 s"
+    assert _progress._duration(7322) == "2 h 2 min"
 
 
 class Cell:
@@ -51,7 +49,7 @@ class Cell:
 def test_in_a_notebook_one_line_is_replaced_and_gone_at_the_end(capsys, monkeypatch):
     cell = Cell()
     monkeypatch.setitem(sys.modules, "IPython", cell)
-    with progress.Progress("circle") as bar:
+    with _progress.Progress("circle") as bar:
         assert bar.shown
         bar(64, 100)
     assert cell.shown[:2] == ["", "circle: compiling …"]
@@ -63,7 +61,7 @@ def test_in_a_notebook_one_line_is_replaced_and_gone_at_the_end(capsys, monkeypa
 @pytest.mark.parametrize("ipython", [None, Cell(kernel=False)])
 def test_in_a_pipe_nothing_is_written(capsys, monkeypatch, ipython):
     monkeypatch.setitem(sys.modules, "IPython", ipython)
-    with progress.Progress("circle") as bar:
+    with _progress.Progress("circle") as bar:
         assert not bar.shown
         bar(64, 100)
     assert capsys.readouterr() == ("", "")
@@ -75,15 +73,15 @@ class Begun(Exception):
 
 @pytest.mark.parametrize("terminal", [True, False])
 def test_a_campaign_has_a_bar_by_default_where_it_can_be_seen(capsys, monkeypatch, terminal):
-    told = []
+    bars = []
 
     def begun(self, plan, todo):
-        told.append(self.progress)
+        bars.append(self.progress)
         if self.progress is not None:
             self.progress(3, 10)
         raise Begun
 
-    monkeypatch.setattr(Work, "compute", begun)
+    monkeypatch.setattr(_work.Work, "compute", begun)
     monkeypatch.setattr(sys.stderr, "isatty", lambda: terminal, raising=False)
     world, mine = worlds.ring(5), []
 
@@ -94,9 +92,9 @@ def test_a_campaign_has_a_bar_by_default_where_it_can_be_seen(capsys, monkeypatc
 
     shown = go()
     assert ("ring, 1 filter: " in shown and "3/10 runs" in shown) == terminal
-    assert (told[-1] is not None) == terminal
+    assert (bars[-1] is not None) == terminal
     assert go(progress=False) == ""
-    assert told[-1] is None
+    assert bars[-1] is None
     assert go(progress=lambda *done: mine.append(done)) == ""
     assert mine == [(3, 10)]
 

@@ -10,8 +10,8 @@ from pathlib import Path
 
 import jax
 import pytest
+from command import run_command
 
-from jaxslam import _cli as cli
 from jaxslam import store
 
 PROGRAMS = ("munged", "mungekey", "slurmctld", "slurmd", "sbatch", "squeue", "scancel")
@@ -120,7 +120,9 @@ def slurm(tmp_path_factory):
 def test_the_job_array_sums_to_the_same_bits_though_a_task_is_cancelled(slurm, tmp_path):
     jax.devices()  # before the command can ask for another number of them
     assert (
-        cli.main(["consistency", *ASKED, *RUNS, "--devices", "1", "--out", str(tmp_path / "whole")])
+        run_command(
+            ["consistency", *ASKED, *RUNS, "--devices", "1", "--out", str(tmp_path / "whole")]
+        )
         == 0
     )
     job = slurm("sbatch", "--parsable", "--cpus-per-task=1", SCRIPT, *ASKED, *RUNS, cwd=tmp_path)
@@ -135,8 +137,8 @@ def test_the_job_array_sums_to_the_same_bits_though_a_task_is_cancelled(slurm, t
     until(lambda: last not in slurm("squeue", "-h", "-o", "%i").split(), 600)
     blocks = store.resume(tmp_path / "campaign" / "blocks")
     assert blocks.done() == 32 and len(blocks.spans()) == 16
-    found = (tmp_path / "campaign" / "consistency.csv").read_text()
-    assert found == (tmp_path / "whole" / "consistency.csv").read_text()
+    curves = (tmp_path / "campaign" / "consistency.csv").read_text()
+    assert curves == (tmp_path / "whole" / "consistency.csv").read_text()
     said = {path.stem.rpartition("_")[2]: path.read_text() for path in tmp_path.glob("slurm-*_*")}
     assert len(said) == 16 and "CANCELLED" in said.pop("2")
     assert not [text for text in said.values() if "is done" not in text]

@@ -23,16 +23,18 @@ from jaxslam.filters import (
     Promotion,
     StoredMeasurements,
 )
-from jaxslam.filters._delayed.confirmation import constraints_of, correct_hypotheses
-from jaxslam.filters._delayed.hypotheses import UncertainPoints, closer_than, point_residuals
-from jaxslam.filters._delayed.initialization import add_landmark, initial_estimate
-from jaxslam.filters._delayed.intersection import add_hypotheses
-from jaxslam.filters._delayed.state import TableLayout
-from jaxslam.filters._delayed.triangulation import Circles, Rays, triangulation_of
+from jaxslam.filters._delayed import (
+    confirmation,
+    hypotheses,
+    initialization,
+    intersection,
+    state,
+    triangulation,
+)
 
 CAMERA = sensors.BearingOnly([[0.01**2]])
 BEACON = sensors.RangeOnly([[0.05**2]])
-KINDS = {"rays": Rays(), "circles": Circles()}
+KINDS = {"rays": triangulation.Rays(), "circles": triangulation.Circles()}
 EACH_KIND = pytest.mark.parametrize("kind", swept(KINDS, "rays"))
 RESIDUAL = {kind: jax.jit(jax.vmap(model.residual)) for kind, model in KINDS.items()}
 
@@ -111,20 +113,20 @@ def test_a_measurement_is_stored_where_the_sensor_is_mounted(kind):
     pose, point = np.array([1.0, 2.0, 2.5]), np.array([-3.0, 4.0])
     place = from_frame(pose, mount[:2])
     seen = KINDS[kind].store(sensor, jnp.asarray(pose), sensor.observe(pose, point))
-    assert type(triangulation_of(sensor)) is type(KINDS[kind])
+    assert type(triangulation.triangulation_of(sensor)) is type(KINDS[kind])
     np.testing.assert_allclose(seen, seen_by(kind, place[None], point)[0], atol=1e-12)
 
 
 # --- hypotheses in the table --------------------------------------------------------------------
 
-LAYOUT = TableLayout(2, 2, 4)
-ADD_HYPOTHESES = jax.jit(add_hypotheses, static_argnums=(1, 2))
-RESIDUALS = jax.jit(point_residuals, static_argnums=1)
-CONSTRAINTS = jax.jit(constraints_of)
-CORRECT = jax.jit(correct_hypotheses, static_argnums=1)
-ESTIMATE = jax.jit(initial_estimate, static_argnums=1)
-ADD_LANDMARK = jax.jit(add_landmark)
-CLOSER = jax.jit(closer_than, static_argnums=0)
+LAYOUT = state.TableLayout(2, 2, 4)
+ADD_HYPOTHESES = jax.jit(intersection.add_hypotheses, static_argnums=(1, 2))
+RESIDUALS = jax.jit(hypotheses.point_residuals, static_argnums=1)
+CONSTRAINTS = jax.jit(confirmation.constraints_of)
+CORRECT = jax.jit(confirmation.correct_hypotheses, static_argnums=1)
+ESTIMATE = jax.jit(initialization.initial_estimate, static_argnums=1)
+ADD_LANDMARK = jax.jit(initialization.add_landmark)
+CLOSER = jax.jit(hypotheses.closer_than, static_argnums=0)
 
 
 def table(kind, seed=0, scale=0.01):
@@ -289,7 +291,10 @@ def test_gaussians_are_told_apart_by_either_distance():
     d2 = np.array([0.25 / 0.08, 0.25 / 0.4, 4 / 0.02])
     log_det = [0.0, np.log(5) - np.log(3), 0.0]
     bhattacharyya = d2 / 4 + np.array(log_det)
-    gaussians = UncertainPoints(points, cov[None]), UncertainPoints(others, other_covs)
+    gaussians = (
+        hypotheses.UncertainPoints(points, cov[None]),
+        hypotheses.UncertainPoints(others, other_covs),
+    )
     for distance, by_hand in (("mahalanobis", d2), ("bhattacharyya", bhattacharyya)):
         for limit in (0.3, 0.7, 1.0, 4.0):
             near = CLOSER(distance, limit, *gaussians)
@@ -518,14 +523,18 @@ def test_in_reverse_what_makes_a_landmark_is_as_forward():
         start = joint._replace(landmarks=landmarks, cov=cov)
         new = formed(kind, start, which)
         slots = jnp.array([2, 3])
-        found = point_residuals(new, KINDS[kind], slots, jnp.array([6, 7]))
-        part = found.value[:, 0], found.by_point[:, 0], found.by_stored[:, 0]
-        constraint = constraints_of(new, slots, jnp.array([6, 6]), *part)
-        corrected = correct_hypotheses(new, LAYOUT, constraint, jnp.array([True, False]))
-        made = initial_estimate(start, KINDS[kind], jnp.array([1.1, 5.1]), stored, use)
-        entered = add_landmark(start, made, jnp.asarray(1), stored)
+        residuals = hypotheses.point_residuals(new, KINDS[kind], slots, jnp.array([6, 7]))
+        part = residuals.value[:, 0], residuals.by_point[:, 0], residuals.by_stored[:, 0]
+        constraint = confirmation.constraints_of(new, slots, jnp.array([6, 6]), *part)
+        corrected = confirmation.correct_hypotheses(
+            new, LAYOUT, constraint, jnp.array([True, False])
+        )
+        estimate = initialization.initial_estimate(
+            start, KINDS[kind], jnp.array([1.1, 5.1]), stored, use
+        )
+        entered = initialization.add_landmark(start, estimate, jnp.asarray(1), stored)
         parts = [(x.landmarks**2).sum() + (x.cov**2).sum() for x in (corrected, entered)]
-        return sum(parts) + made.nis
+        return sum(parts) + estimate.nis
 
     at = joint.landmarks, joint.cov
     rng = np.random.default_rng(0)
@@ -568,28 +577,28 @@ def test_without_names_intersections_find_the_landmarks():
     (lambda: slam(capacity=0), "DelayedSlam: capacity"),
     (lambda: slam(gate=0), "DelayedSlam: gate: expected a probability above 0 and below 1"),
     (lambda: slam(triangulation=3), "DelayedSlam: triangulation: expected a Triangulation"),
-    (lambda: slam(triangulation=Rays), "got the class Rays: call it"),
+    (lambda: slam(triangulation=triangulation.Rays), "got the class Rays: call it"),
     (lambda: slam(stored=32), "DelayedSlam: stored: expected a StoredMeasurements, got 32"),
     (lambda: slam(hypotheses=16), "DelayedSlam: hypotheses: expected a Hypotheses, got 16"),
     (lambda: slam(promotion=2), "DelayedSlam: promotion: expected a Promotion, got 2"),
-    (lambda: slam(BEACON, triangulation=Rays()), "one bearing"),
-    (lambda: slam(triangulation=Circles()), "one range"),
-    (lambda: Rays(parallax=2.0), "^Rays: expected parallax in"),
-    (lambda: Circles(angle=0.0), "^Circles: expected angle in"),
+    (lambda: slam(BEACON, triangulation=triangulation.Rays()), "one bearing"),
+    (lambda: slam(triangulation=triangulation.Circles()), "one range"),
+    (lambda: triangulation.Rays(parallax=2.0), "^Rays: expected parallax in"),
+    (lambda: triangulation.Circles(angle=0.0), "^Circles: expected angle in"),
     (lambda: StoredMeasurements(capacity=0), "^StoredMeasurements: capacity"),
     (
         lambda: StoredMeasurements(spacing=-0.1),
-        "^StoredMeasurements: expected spacing of at least 0",
+        "^StoredMeasurements: spacing: expected a number from 0 to inf",
     ),
     (lambda: Hypotheses(capacity=0), "^Hypotheses: capacity"),
     (lambda: Hypotheses(patience=0.5), "^Hypotheses: patience"),
-    (lambda: Hypotheses(decay=-1), "^Hypotheses: expected decay of at least 0"),
-    (lambda: Hypotheses(spread=np.nan), "^Hypotheses: expected spread above 0"),
-    (lambda: Hypotheses(same=0), "^Hypotheses: expected same above 0"),
-    (lambda: Hypotheses(distance="euclid"), "^Hypotheses: expected distance .*, got 'euclid'"),
+    (lambda: Hypotheses(decay=-1), "^Hypotheses: decay: expected a number from 0 to inf"),
+    (lambda: Hypotheses(spread=np.nan), "^Hypotheses: spread: expected a number above 0"),
+    (lambda: Hypotheses(same=0), "^Hypotheses: same: expected a number above 0"),
+    (lambda: Hypotheses(distance="euclid"), "^Hypotheses: distance: expected .*, got 'euclid'"),
     (lambda: Promotion(per_scan=1.5), "^Promotion: per_scan"),
-    (lambda: Promotion(persistence=0), "^Promotion: expected persistence above 0"),
-    (lambda: Promotion(lead=-1), "^Promotion: expected lead of at least 0"),
+    (lambda: Promotion(persistence=0), "^Promotion: persistence: expected a number above 0"),
+    (lambda: Promotion(lead=-1), "^Promotion: lead: expected a number from 0 to inf"),
 )
 def test_bad_arguments_are_refused(make):
     make()

@@ -15,8 +15,7 @@ from jaxslam.core.record import record
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Scan
 from jaxslam.filters import Closing, EkfSlam, Filter, Monitored, Wrapper
-from jaxslam.filters._ekf.correction import correct
-from jaxslam.filters._ekf.predicted_measurements import prediction_of
+from jaxslam.filters._ekf import correction, predicted_measurements
 from jaxslam.linearize import FirstEstimate
 
 SENSOR = sensors.RangeBearing(np.diag([0.1, 0.02]) ** 2, mount=(0.2, -0.1, 0.4))
@@ -74,18 +73,18 @@ def test_pairs_and_cross_covariances_are_those_of_dense_algebra(name, square_roo
 
     @jax.jit
     def look(held, scan):
-        prediction = prediction_of(ekf, SENSOR, held)
+        prediction = predicted_measurements.prediction_of(ekf, SENSOR, held)
         return prediction.pairs(scan), prediction.cross()
 
     pairs, cross = jax.device_get(look(held, scan))
     h = np.asarray(dense(name)(joint))
-    whole = (h @ joint.cov @ h.T).reshape(COUNT, 2, COUNT, 2)
-    np.testing.assert_allclose(cross, whole, atol=1e-12)
+    products = (h @ joint.cov @ h.T).reshape(COUNT, 2, COUNT, 2)
+    np.testing.assert_allclose(cross, products, atol=1e-12)
     observed = OBSERVE(joint.pose, joint.landmarks)
     for i in range(3):
         noise = np.asarray(SENSOR.noise_cov(scan.z[i]))
         for j, nu in enumerate(np.asarray(RESIDUAL(scan.z[i], observed))):
-            cov = whole[j, :, j] + noise
+            cov = products[j, :, j] + noise
             np.testing.assert_allclose(pairs.innovation[i, j], nu, atol=1e-12)
             np.testing.assert_allclose(pairs.cov[i, j], cov, atol=1e-12)
             np.testing.assert_allclose(pairs.distance[i, j], nu @ np.linalg.solve(cov, nu))
@@ -97,16 +96,16 @@ def test_a_scan_judged_for_association_is_judged_alike_in_the_correction():
     joint = some_joint()
     scan = some_scan(joint)
     ekf = EkfSlam(WORLD.motion, SENSOR, COUNT, linearize=linearize.Unscented())
-    slot, each = np.array([3, 0, 1]), np.arange(3)
+    slot, measurement = np.array([3, 0, 1]), np.arange(3)
 
     @jax.jit
     def judged(joint, scan):
-        pairs = prediction_of(ekf, SENSOR, joint).pairs(scan)
-        return pairs, correct(ekf, SENSOR, joint, scan.z, slot, scan.valid)[1]
+        pairs = predicted_measurements.prediction_of(ekf, SENSOR, joint).pairs(scan)
+        return pairs, correction.correct(ekf, SENSOR, joint, scan.z, slot, scan.valid)[1]
 
     pairs, done = jax.device_get(judged(joint, scan))
-    np.testing.assert_allclose(pairs.innovation[each, slot], done.innovation, atol=1e-12)
-    np.testing.assert_allclose(pairs.cov[each, slot], done.innovation_cov, atol=1e-12)
+    np.testing.assert_allclose(pairs.innovation[measurement, slot], done.innovation, atol=1e-12)
+    np.testing.assert_allclose(pairs.cov[measurement, slot], done.innovation_cov, atol=1e-12)
 
 
 # --- The observability monitor as a wrapper: of what it is refused, and of maps that are managed --

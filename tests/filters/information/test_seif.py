@@ -8,28 +8,20 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 from cases import refused
-from worlds import draw, narrow
+from worlds import draw, narrow, unmatched
 
 from jaxslam import catalog, filters, run, scenarios, sensors
 from jaxslam.charts import Euclidean
 from jaxslam.core.protocols import Filter
 from jaxslam.core.record import record
 from jaxslam.core.types import Scan, Status
-from jaxslam.filters._information import active_set, sparse_state
-from jaxslam.filters._information.eif_slam import InPieces
-from jaxslam.filters._information.marginals import (
-    blanket_cov,
-    blanket_marginals,
-    local_information,
-    recover_passive_means,
-)
-from jaxslam.filters._reporting import nothing_of
+from jaxslam.filters._information import active_set, eif_slam, marginals, sparse_state
 from jaxslam.simulation.scenarios import BetweenRanges, cloister
 
 COUNT = 36
 """landmarks of the cloister"""
 
-dense = jax.jit(lambda state: local_information(state, jnp.arange(state.alive.shape[0])))
+dense = jax.jit(lambda state: marginals.local_information(state, jnp.arange(state.alive.shape[0])))
 
 
 def canonical(state):
@@ -105,7 +97,7 @@ def world(steps=40):
 
 
 @functools.cache
-def made(active=10, links=COUNT - 1, passive=5):
+def compiled_seif(active=10, links=COUNT - 1, passive=5):
     scene, _ = world()
     f = filters.Seif(scene.motion, scene.sensor, COUNT, active=active, links=links, passive=passive)
     return f, jax.jit(f.predict), jax.jit(f.update)
@@ -121,7 +113,7 @@ FEW = {"links": 8, "passive": COUNT}
 
 @functools.cache
 def driven(upto=40, **options):
-    f, predict, update = made(**options)
+    f, predict, update = compiled_seif(**options)
     state = start(f)
     for u, scan in rows(upto):
         state, _ = update(predict(state, u, KEY), scan, KEY)
@@ -153,8 +145,8 @@ def sparsified(omega, plus, zero):
 
 def test_every_step_is_the_dense_formula():
     """Motion, sparsification, measurement and birth, in Ω and ξ, by dense NumPy."""
-    f, predict, update = made()
-    relax = jax.jit(functools.partial(recover_passive_means, count=5))
+    f, predict, update = compiled_seif()
+    relax = jax.jit(functools.partial(marginals.recover_passive_means, count=5))
     noise = np.diag([0.1, np.deg2rad(1.0)]) ** 2
     state, cut, born = start(f), 0, 0
     for u, scan in rows():
@@ -170,11 +162,11 @@ def test_every_step_is_the_dense_formula():
         cov = np.linalg.inv(phi)
         cov[:3, :3] += q
         after = np.linalg.inv(cov)
-        there = np.linalg.solve(omega, xi) - mean  # the mean, as an error
+        error = np.linalg.solve(omega, xi) - mean  # the mean, as an error
         omega_bar, xi_bar, mean_bar = canonical(moved)
-        there = g @ there + mean_bar
+        error = g @ error + mean_bar
         close(omega_bar, after, 1e-9)
-        close(xi_bar, after @ there, 1e-8)
+        close(xi_bar, after @ error, 1e-8)
         # mean recovery moves μ and leaves Ω and ξ
         state = relax(moved)
         omega, xi, mean = canonical(state)
@@ -214,15 +206,15 @@ def test_mean_recovery_converges_to_the_whole_mean():
     residual = np.concatenate([state.pose_residual, np.ravel(state.landmark_residual)])
     step = np.linalg.solve(filters.whole_information(state).toarray(), residual)
     pose, landmarks = state.pose + step[:3], state.landmarks + step[3:].reshape(-1, 2)
-    f, _, update = made(**FEW)
+    f, _, update = compiled_seif(**FEW)
     _, scan = next(rows(1))
     nothing = scan._replace(valid=np.zeros_like(scan.valid))
     for _ in range(1500):
         state, _ = update(state, nothing, KEY)
     np.testing.assert_allclose(state.pose, pose, atol=1e-4)
     alive = np.asarray(state.alive)
-    found = np.asarray(state.landmarks)
-    np.testing.assert_allclose(found[alive], np.asarray(landmarks)[alive], atol=1e-4)
+    recovered = np.asarray(state.landmarks)
+    np.testing.assert_allclose(recovered[alive], np.asarray(landmarks)[alive], atol=1e-4)
 
 
 def test_whole_map_and_markov_blankets():
@@ -230,15 +222,15 @@ def test_whole_map_and_markov_blankets():
     omega = filters.whole_information(state).toarray()
     np.testing.assert_allclose(omega, dense(state), atol=1e-12 * np.abs(omega).max())
     cov = np.linalg.inv(omega)
-    found = np.asarray(jax.jit(blanket_marginals)(state)[1])
-    cov_of, chosen = jax.jit(blanket_cov), set(np.asarray(state.active))
+    marginal_covs = np.asarray(jax.jit(marginals.blanket_marginals)(state)[1])
+    cov_of, chosen = jax.jit(marginals.blanket_cov), set(np.asarray(state.active))
     neighbours = np.asarray(state.neighbours)
     for slot in np.flatnonzero(state.alive):
         at = [0, 1, 2, 3 + 2 * slot, 4 + 2 * slot]
         local = np.asarray(cov_of(state, slot))
         # given more, it is less: never above the marginal covariance
         assert np.linalg.eigvalsh(cov[np.ix_(at, at)] - local)[0] > -1e-9
-        np.testing.assert_allclose(found[slot], local[3:, 3:], atol=1e-12)
+        np.testing.assert_allclose(marginal_covs[slot], local[3:, 3:], atol=1e-12)
         # and it is the inverse of the block of the blanket
         row = neighbours[slot]
         members = sorted({int(slot), *row[row < COUNT], *chosen} - {COUNT})
@@ -350,23 +342,23 @@ def test_few_links_stay_definite_and_are_counted():
 
 
 def test_statuses_of_strange_scans():
-    f, predict, update = made()
+    f, predict, update = compiled_seif()
     state = driven(upto=10)
     _, scan = list(rows(11))[-1]
     tag = np.array(scan.tag)
-    there = np.flatnonzero(np.asarray(scan.valid))
-    tag[there[:2]] = [-1, COUNT + 3]
+    valid = np.flatnonzero(np.asarray(scan.valid))
+    tag[valid[:2]] = [-1, COUNT + 3]
     after, info = update(state, scan._replace(tag=jnp.asarray(tag)), KEY)
-    assert int(info.status[there[0]]) == Status.UNMATCHED
-    assert int(info.status[there[1]]) == Status.OVERFLOW
-    tag[there[0]] = tag[there[2]]
+    assert int(info.status[valid[0]]) == Status.UNMATCHED
+    assert int(info.status[valid[1]]) == Status.OVERFLOW
+    tag[valid[0]] = tag[valid[2]]
     after, info = update(state, scan._replace(tag=jnp.asarray(tag)), KEY)
-    assert int(info.status[there[2]]) == Status.REPEATED
+    assert int(info.status[valid[2]]) == Status.REPEATED
     assert int(after.counts.refused) == 0
 
 
 def test_lost_definiteness_is_refused_and_counted():
-    f, predict, update = made()
+    f, predict, update = compiled_seif()
     state = driven(upto=10)
     _, scan = list(rows(11))[-1]
     bad = state._replace(omega=state.omega.at[0, 0].set(-1.0))
@@ -380,7 +372,7 @@ def test_lost_definiteness_is_refused_and_counted():
 @pytest.mark.sweep
 def test_float32_keeps_its_type_and_its_definiteness():
     scene, log = world()
-    f, predict, update = made()
+    f, predict, update = compiled_seif()
 
     state, wide = start(f, jnp.float32), start(f)
     for u, scan in rows():
@@ -465,7 +457,7 @@ class Toy(Filter):
 
     def update(self, state, scan, key):
         assert scan.tag.shape == (3,)
-        info = nothing_of(scan)._replace(slot=scan.tag, log_likelihood=scan.z.sum())
+        info = unmatched(scan)._replace(slot=scan.tag, log_likelihood=scan.z.sum())
         return state + jnp.where(scan.valid, scan.z[:, 0], 0.0).sum(), info
 
     def estimate(self, state):
@@ -473,7 +465,7 @@ class Toy(Filter):
 
 
 def test_a_scan_in_pieces_loses_and_moves_nothing():
-    seen = InPieces(Toy(), 3)
+    seen = eif_slam.InPieces(Toy(), 3)
     tag = jnp.asarray([7, 3, 9, 1, 4, 8, 0])
     scan = Scan(jnp.stack([tag, -tag], axis=1) * 1.0 + 1.0, tag, tag != 9)
     state, info = jax.jit(seen.update)(jnp.zeros(()), scan, jax.random.key(0))

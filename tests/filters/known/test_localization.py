@@ -11,7 +11,6 @@ from cases import refused, swept
 from worlds import draw, judged, nameless, narrow, ring
 
 from jaxslam import association, charts, linearize, run, sensors, simulate
-from jaxslam._driver import check_run
 from jaxslam.core.types import Scan, Status
 from jaxslam.filters import (
     DeadReckoning,
@@ -176,7 +175,8 @@ def test_a_map_of_fewer_landmarks_than_the_log_has_is_refused():
         with pytest.raises(ValueError, match=r"^run: .* landmark 5, the map of .* has 4, 0 to 3; "):
             run(filter, log, START, SPREAD, KEY)
     for options in ({"tags": range(4)}, {"associate": association.Nearest(GATE)}):
-        check_run("run", Localization(*parts, **options), log, START, SPREAD)
+        filter = Localization(*parts, **options)
+        jax.eval_shape(lambda key, filter=filter: run(filter, log, START, SPREAD, key), KEY)
 
 
 @pytest.mark.sweep

@@ -15,8 +15,7 @@ from jaxslam.core.protocols import Pairs, Prediction
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Info, Scan
 from jaxslam.filters import Closing, EifSlam, EkfSlam, LoopSettings
-from jaxslam.filters.map_management._loop_closure import close_loop
-from jaxslam.filters.map_management._merging import merge_landmarks
+from jaxslam.filters.map_management import _loop_closure, _merging
 from jaxslam.life import Recency, Times
 
 EUCLIDEAN = charts.Euclidean()
@@ -55,11 +54,13 @@ def two_visits(seed=0, drift=4.0, shape=0.05, symmetric=False):
 
 def look(joint, **options):
     """By a program for all values of the options that are no integers."""
-    closed = partial(close_loop, chart=EUCLIDEAN, settings=LoopSettings(**(OPTIONS | options)))
+    closed = partial(
+        _loop_closure.close_loop, chart=EUCLIDEAN, settings=LoopSettings(**(OPTIONS | options))
+    )
     return jax.jit(closed)(joint)
 
 
-MERGE = jax.jit(lambda joint, k, m: merge_landmarks(joint, EUCLIDEAN, k, m))
+MERGE = jax.jit(lambda joint, k, m: _merging.merge_landmarks(joint, EUCLIDEAN, k, m))
 
 
 @pytest.mark.parametrize("seed", swept(range(3), 0))

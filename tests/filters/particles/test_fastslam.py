@@ -13,7 +13,6 @@ from cases import refused, swept
 from reference.plane import from_frame
 
 from jaxslam import association, life, motion, resampling, run, sensors
-from jaxslam.consistency._measures.counts import counts_of
 from jaxslam.core.types import Scan, Status
 from jaxslam.filters import FastSlam
 from jaxslam.filters._particles import pose_particles, slam_particles
@@ -374,15 +373,15 @@ def test_negative_evidence_removes_a_landmark_from_every_map():
 def test_it_resamples_where_the_threshold_says_and_it_is_counted():
     # ESS is at least 1, so this is never; 0 itself would be another program.
     never, often = (driven(proposal="motion", threshold=t)[0] for t in (1e-9, 0.5))
-    told, of_never = often.info.extra["particles"], never.info.extra["particles"]
+    of_often, of_never = often.info.extra["particles"], never.info.extra["particles"]
     assert not np.any(of_never.resampled)
-    np.testing.assert_array_equal(told.resampled, told.ess < COUNT / 2)
-    assert 0 < np.sum(told.resampled) < STEPS
-    assert np.all((told.ess > 1 - 1e-9) & (told.ess < COUNT + 1e-9))
-    assert of_never.ess[-1] < told.ess[-1]
-    assert np.ptp(often.final.log_weight) == 0 or not told.resampled[-1]
-    counts = counts_of(jax.tree.map(lambda leaf: leaf[None], often.info))  # of one run
-    assert (counts["resampled"], counts["underflow"]) == (told.resampled.sum(), 0)
+    np.testing.assert_array_equal(of_often.resampled, of_often.ess < COUNT / 2)
+    assert 0 < np.sum(of_often.resampled) < STEPS
+    assert np.all((of_often.ess > 1 - 1e-9) & (of_often.ess < COUNT + 1e-9))
+    assert of_never.ess[-1] < of_often.ess[-1]
+    assert np.ptp(often.final.log_weight) == 0 or not of_often.resampled[-1]
+    counts = {name: int(np.sum(happened)) for name, happened in of_often.counts().items()}
+    assert (counts["resampled"], counts["underflow"]) == (of_often.resampled.sum(), 0)
 
 
 @jax.jit
@@ -479,9 +478,9 @@ def test_gradients_are_finite_where_the_pose_is_known_exactly(proposal):
     ({"particles": 2.5}, "particles: expected an integer"),
     ({"capacity": 0}, "capacity: expected an integer"),
     ({"births": 0}, "births: expected an integer"),
-    ({"proposal": "optimal"}, 'expected proposal "motion" or "measurement"'),
-    ({"threshold": 1.5}, "threshold from 0 to 1"),
-    ({"threshold": np.nan}, "threshold from 0 to 1"),
+    ({"proposal": "optimal"}, 'proposal: expected "motion" or "measurement"'),
+    ({"threshold": 1.5}, "threshold: expected a number from 0 to 1"),
+    ({"threshold": np.nan}, "threshold: expected a number from 0 to 1"),
     ({"gate": 0.0}, "gate: expected a probability above 0 and below 1"),
     ({"resample": "systematic"}, "resample: expected a function"),
     ({"life": "existence"}, "life: expected a Life"),

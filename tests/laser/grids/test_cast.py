@@ -7,9 +7,10 @@ import pytest
 import recordings
 from cases import refused, swept
 from reference.plane import from_frame
+from reference.walls import is_free
 
 from jaxslam import datasets, grids
-from jaxslam.simulation._wall_geometry import exact_ranges, is_free
+from jaxslam.simulation.laser import Laser, true_ranges
 from jaxslam.simulation.walls import make_walls, rasterize
 
 ANGLES = np.linspace(-np.pi, np.pi, 37)[:-1] + 0.05
@@ -179,10 +180,11 @@ def test_ranges_are_those_of_exact_geometry_to_a_tenth_of_a_cell():
     near = cell * np.stack([np.cos(ANGLES), np.sin(ANGLES)], axis=1)
     spots = spots[is_free(world, spots[:, None] + 2 * near).all(axis=1)][:60]
     pose = np.column_stack([spots, rng.uniform(-3, 3, len(spots))])
-    found = np.asarray(grids.cast(rays, pose, ANGLES, 5.0))
+    ranges = np.asarray(grids.cast(rays, pose, ANGLES, 5.0))
+    ahead = Laser(np.zeros(1), max_range=5.0)
     exact_of = jax.jit(
         jax.vmap(
-            lambda p: jax.vmap(lambda q, a: exact_ranges(world, q, a[None], 5.0)[0])(p, ANGLES)
+            lambda p: jax.vmap(lambda q, a: true_ranges(ahead, world, q.at[2].add(a))[0])(p, ANGLES)
         )
     )
 
@@ -193,18 +195,18 @@ def test_ranges_are_those_of_exact_geometry_to_a_tenth_of_a_cell():
 
     left, exact, right = (shifted(side) for side in (1, 0, -1))
     steady = (np.maximum(np.abs(left - exact), np.abs(right - exact)) < 2 * cell) & (exact < 5)
-    error = np.abs(found - exact)[steady] / cell
+    error = np.abs(ranges - exact)[steady] / cell
     assert steady.mean() > 0.7
     assert error.max() < 0.5
     assert np.median(error) < 0.1
     # The ends of all other beams lie on a wall as well, or the exact range was cut.
     heading = pose[:, 2, None] + ANGLES
-    ends = pose[:, None, :2] + found[..., None] * np.stack(
+    ends = pose[:, None, :2] + ranges[..., None] * np.stack(
         [np.cos(heading), np.sin(heading)], axis=-1
     )
     around = cell / 2 * np.stack([np.cos(ANGLES), np.sin(ANGLES)], axis=1)
     sides = is_free(world, ends[:, :, None] + around)
-    assert np.all(sides.any(axis=2) & ~sides.all(axis=2) | (found >= 5))
+    assert np.all(sides.any(axis=2) & ~sides.all(axis=2) | (ranges >= 5))
 
 
 @pytest.mark.parametrize("method", swept(["cells", "surface"], "surface"))
@@ -213,7 +215,8 @@ def test_the_derivative_by_the_pose_is_that_of_a_wall(method):
     rays = grids.ray_map(rasterize(world, cell, yaw=0.3), method=method)
     pose = np.array([[3.0, 2.1, 0.4], [2.6, 3.9, -1.0], [5.7, 2.2, 2.0]])
     slopes = jax.jit(jax.vmap(jax.jacfwd(lambda p: grids.cast(rays, p, ANGLES, 9.0))))(pose)
-    exact = jax.jit(jax.vmap(jax.jacfwd(lambda p: exact_ranges(world, p, ANGLES, 9.0))))(pose)
+    laser = Laser(ANGLES, max_range=9.0)
+    exact = jax.jit(jax.vmap(jax.jacfwd(lambda p: true_ranges(laser, world, p))))(pose)
     level = np.linalg.norm(np.asarray(exact)[..., :2], axis=-1) < 2  # less than 60° from the normal
     error = np.abs(slopes - exact)[level] / [1.0, 1.0, 2.0]  # by the heading as by a shift at 2 m
     assert level.mean() > 0.7

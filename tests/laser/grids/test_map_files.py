@@ -8,7 +8,6 @@ import pytest
 import recordings
 
 from jaxslam import datasets
-from jaxslam.datasets._ros_map import CERTAIN
 
 YAML = """# a map
 image: map.pgm
@@ -34,6 +33,10 @@ def made(folder, yaml=YAML, image=None):
 def same(a, b):
     for one, two in zip(a, b, strict=True):
         np.testing.assert_array_equal(one, two)
+
+
+CERTAIN = math.log(509)
+"""The log-odds of occupied cells: half a shade of 255 is left."""
 
 
 def logit(p):

@@ -7,11 +7,8 @@ import pytest
 from ring_of_rooms import SETTINGS, driven
 
 from jaxslam import graphs, laser_slam, metrics
-from jaxslam.laser.laser_slam import _end_covariances as end_covariances
-from jaxslam.laser.laser_slam import _score as module
-from jaxslam.laser.laser_slam._assembly import ROOM, graph_of, relative_covs, table_of
-from jaxslam.laser.laser_slam._loops.loop_candidates import SECTORS, descriptors
-from jaxslam.laser.laser_slam._loops.pairwise import clique, pairwise_consistency
+from jaxslam.laser.laser_slam import _assembly, _end_covariances, _score
+from jaxslam.laser.laser_slam._loops import loop_candidates, pairwise
 from jaxslam.math import numpy_poses as poses
 
 
@@ -23,34 +20,34 @@ def chain():
     root = 0.05 * random.normal(size=(11, 3, 3))
     covs = root @ np.swapaxes(root, 1, 2) + 1e-4 * np.eye(3)
     path = poses.chain(np.array([1.0, -2.0, 0.7]), steps)
-    return path, steps, covs, end_covariances.along(path, covs)
+    return path, steps, covs, _end_covariances.along(path, covs)
 
 
 def test_covariance_along_a_chain_step_by_step(chain):
     path, steps, covs, total = chain
     cov = np.zeros((3, 3))
     for k in range(4, 9):
-        cov = end_covariances.composed_cov(cov, steps[k], covs[k])
+        cov = _end_covariances.composed_cov(cov, steps[k], covs[k])
     np.testing.assert_allclose(
-        end_covariances.relative_cov(total, path, np.array(4), np.array(9)), cov, rtol=1e-9
+        _end_covariances.relative_cov(total, path, np.array(4), np.array(9)), cov, rtol=1e-9
     )
     z = poses.between(path[4], path[9])
-    back = end_covariances.relative_cov(total, path, np.array(9), np.array(4))
-    np.testing.assert_allclose(end_covariances.move(cov, poses.inverse(z)), back, rtol=1e-9)
+    back = _end_covariances.relative_cov(total, path, np.array(9), np.array(4))
+    np.testing.assert_allclose(_end_covariances.move(cov, poses.inverse(z)), back, rtol=1e-9)
     np.testing.assert_allclose(
-        end_covariances.at_end(end_covariances.of_coordinates(cov, z), z), cov, rtol=1e-9
+        _end_covariances.at_end(_end_covariances.of_coordinates(cov, z), z), cov, rtol=1e-9
     )
 
 
 def test_covariance_along_a_chain_is_that_of_the_graph(chain):
     path, steps, covs, total = chain
     index = np.arange(len(path))
-    graph = graph_of(path, index, table_of(index[:-1], index[1:], steps, covs))
-    solved = graphs.optimize(graph, room=ROOM, iterations=0)
+    graph = _assembly.graph_of(path, index, _assembly.table_of(index[:-1], index[1:], steps, covs))
+    solved = graphs.optimize(graph, room=_assembly.ROOM, iterations=0)
     pairs = np.array([[2, 7], [0, 11]])
     np.testing.assert_allclose(
-        relative_covs(solved, pairs),
-        end_covariances.relative_cov(total, path, *pairs.T),
+        _assembly.relative_covs(solved, pairs),
+        _end_covariances.relative_cov(total, path, *pairs.T),
         rtol=1e-6,
     )
 
@@ -62,10 +59,10 @@ def test_a_false_loop_agrees_with_no_true_one(chain):
     cov = np.broadcast_to(1e-4 * np.eye(3), (5, 3, 3))
     z = poses.between(path[first], path[second]) + 0.01 * random.normal(size=(5, 3))
     z[4] += [3.0, -3.0, 0.8]
-    agree = pairwise_consistency(path, total, first, second, z, cov, 0.999)
+    agree = pairwise.pairwise_consistency(path, total, first, second, z, cov, 0.999)
     assert agree[:4, :4].all() and not agree[4, :4].any()
     assert (agree == agree.T).all()
-    np.testing.assert_array_equal(clique(agree, np.ones(5)), [1, 1, 1, 1, 0])
+    np.testing.assert_array_equal(pairwise.clique(agree, np.ones(5)), [1, 1, 1, 1, 0])
 
 
 @pytest.mark.sweep
@@ -81,8 +78,8 @@ def test_true_loops_agree_as_often_as_their_probability_says(chain):
         error = (root @ random.normal(size=(11, 3, 1)))[..., 0]
         drawn = poses.chain(path[0], poses.compose(steps, error))
         z = poses.compose(true, 1e-3 * random.normal(size=(2, 3)))
-        total = end_covariances.along(drawn, 1e-3 * covs)
-        agreed += pairwise_consistency(drawn, total, first, second, z, cov, 0.9)[0, 1]
+        total = _end_covariances.along(drawn, 1e-3 * covs)
+        agreed += pairwise.pairwise_consistency(drawn, total, first, second, z, cov, 0.9)[0, 1]
     assert abs(agreed / 300 - 0.9) < 3 * np.sqrt(0.9 * 0.1 / 300)
 
 
@@ -92,25 +89,25 @@ def test_the_clique_is_one_and_large():
     inside = np.arange(25)
     agree[np.ix_(inside, inside)] = True
     agree |= agree.T
-    solved = clique(agree, np.ones(60))
+    solved = pairwise.clique(agree, np.ones(60))
     assert solved.sum() >= 25
     members = np.flatnonzero(solved)
     assert (agree[np.ix_(members, members)] | np.eye(len(members), dtype=bool)).all()
-    assert not clique(np.zeros((0, 0), bool), np.zeros(0)).any()
+    assert not pairwise.clique(np.zeros((0, 0), bool), np.zeros(0)).any()
 
 
 def test_a_descriptor_does_not_see_the_heading():
     random = np.random.default_rng(6)
     far, at = random.uniform(1, 10, (2, 80)), random.uniform(0, 2 * np.pi, (2, 80))
-    turned = at + 2 * np.pi / SECTORS * 7
+    turned = at + 2 * np.pi / loop_candidates.SECTORS * 7
 
     def of(angle):
         points = far[..., None] * np.stack([np.cos(angle), np.sin(angle)], axis=-1)
-        return descriptors(points, np.ones((2, 80), bool))
+        return loop_candidates.descriptors(points, np.ones((2, 80), bool))
 
     np.testing.assert_allclose(of(at), of(turned), atol=1e-9)
     assert of(at)[0] @ of(at)[1] < 0.95
-    assert not descriptors(np.zeros((1, 4, 2)), np.zeros((1, 4), bool)).any()
+    assert not loop_candidates.descriptors(np.zeros((1, 4, 2)), np.zeros((1, 4), bool)).any()
 
 
 # --- Covariances of relative poses by the graph, against dense NumPy, and relations of the true p--
@@ -173,7 +170,7 @@ def test_the_covariances_are_those_of_the_dense_inverse(drive, monkeypatch):
     between = np.setdiff1d(np.arange(count), solved.keyframe)
     assert len(solved.keyframe) > 8 and len(between) > 8 and solved.base[3] == 1
     scans = np.arange(1, count)
-    of_path = end_covariances.of_coordinates(
+    of_path = _end_covariances.of_coordinates(
         laser_slam.relation_covs(solved, 0 * scans, scans), solved.poses[1:]
     )
     np.testing.assert_allclose(of_path, solved.cov[1:], rtol=1e-6, atol=1e-12)
@@ -186,7 +183,7 @@ def test_the_covariances_are_those_of_the_dense_inverse(drive, monkeypatch):
     solved = solved._replace(base=base, z=z, z_cov=z_cov, poses=path)
     ends = [0, *solved.keyframe[[3, -1]], 1, 3, 5, 39]
     pairs = np.array([(i, j) for i in ends for j in ends if i != j])
-    monkeypatch.setattr(module, "TOGETHER", 7)
+    monkeypatch.setattr(_score, "TOGETHER", 7)
     covs = laser_slam.relation_covs(solved, *pairs.T)
     for (i, j), cov in zip(pairs, covs, strict=True):
         np.testing.assert_allclose(cov, dense(solved, i, j), rtol=1e-6, atol=1e-6 * cov.max())

@@ -5,15 +5,11 @@ import dataclasses
 import numpy as np
 import pytest
 from cases import swept
-from ring_of_rooms import SETTINGS, driven, errors, walls
+from ring_of_rooms import SETTINGS, driven, errors, odometry_of, scans_of, steps_of, walls
 
 from jaxslam import grids, laser_slam
 from jaxslam.core.types import Beams
-from jaxslam.laser.laser_slam import ScanLog
-from jaxslam.laser.laser_slam import _log_map as log_map
-from jaxslam.laser.laser_slam._odometry.log_odometry import laser_odometry
-from jaxslam.laser.laser_slam._odometry.raw import steps_of
-from jaxslam.laser.laser_slam._scan_points import check_laser_log, scans_of
+from jaxslam.laser.laser_slam import ScanLog, _log_map, _scan_points
 from jaxslam.math import numpy_poses as poses
 
 RESOLUTION = 0.1
@@ -34,11 +30,11 @@ def wandering(scans, beams, far, seed=0):
 
 def both(log, monkeypatch, window, settings=SETTINGS):
     """(hits, misses), counted in windows and at once; and the shapes of the windows."""
-    monkeypatch.setattr(log_map, "WINDOW", window)
-    shape, origin, resolution = log_map.frame_of(log, [log.raw], settings)
-    beams = log_map._used_beams(log, settings, np.ones(len(log.time), bool), slice(None))
+    monkeypatch.setattr(_log_map, "WINDOW", window)
+    shape, origin, resolution = _log_map.frame_of(log, [log.raw], settings)
+    beams = _log_map._used_beams(log, settings, np.ones(len(log.time), bool), slice(None))
     laser = poses.compose(log.raw, np.array(log.mount))
-    whole = grids.count(shape, origin, resolution, laser, beams, max_range=settings.max_range)
+    at_once = grids.count(shape, origin, resolution, laser, beams, max_range=settings.max_range)
     calls = []
     count = grids.count
 
@@ -48,50 +44,50 @@ def both(log, monkeypatch, window, settings=SETTINGS):
 
     monkeypatch.setattr(grids, "count", counting)
     counts = np.zeros((2, *shape), np.int32)
-    log_map._count(counts, origin, resolution, laser, beams, settings)
-    return counts, np.stack([whole.hits, whole.misses]), calls
+    _log_map._count(counts, origin, resolution, laser, beams, settings)
+    return counts, np.stack([at_once.hits, at_once.misses]), calls
 
 
 def test_scans_that_do_not_fit_a_window_are_split(monkeypatch):
-    found, whole, windows = both(wandering(50, 40, 2.5), monkeypatch, 64)
+    in_windows, at_once, windows = both(wandering(50, 40, 2.5), monkeypatch, 64)
     assert (
         len(windows) > 4
         and set(windows) == {(64, 64)}
-        and whole[0].sum() > 500
-        and max(whole.shape) > 64
+        and at_once[0].sum() > 500
+        and max(at_once.shape) > 64
     )
-    np.testing.assert_array_equal(found, whole)
+    np.testing.assert_array_equal(in_windows, at_once)
 
 
 def test_so_are_long_logs_and_scans_of_many_beams(monkeypatch):
-    found, whole, windows = both(wandering(150, 400, 1.5), monkeypatch, 512)
+    in_windows, at_once, windows = both(wandering(150, 400, 1.5), monkeypatch, 512)
     assert len(windows) >= 6 and set(windows) == {(512, 512)}
-    np.testing.assert_array_equal(found, whole)
+    np.testing.assert_array_equal(in_windows, at_once)
 
 
 @pytest.mark.parametrize(("far", "side"), [(2.5, 64), (5.0, 128), (9.0, 256)])
 def test_a_scan_that_is_larger_than_a_window_has_a_larger_one(monkeypatch, far, side):
     log = wandering(3, 40, far)
-    found, whole, windows = both(log, monkeypatch, 64)
+    in_windows, at_once, windows = both(log, monkeypatch, 64)
     assert max(windows) == (side, side)
-    assert log_map.frame_of(log, [log.raw], SETTINGS)[2] == RESOLUTION
-    np.testing.assert_array_equal(found, whole)
+    assert _log_map.frame_of(log, [log.raw], SETTINGS)[2] == RESOLUTION
+    np.testing.assert_array_equal(in_windows, at_once)
 
 
 def test_beams_along_the_axes_from_the_origin_are_counted_alike_in_every_window(monkeypatch):
     """Without care they lie on the borders of cells, and rounding decides."""
     _, log = driven()
-    monkeypatch.setattr(log_map, "ROWS", 8)
-    found, whole, windows = both(log, monkeypatch, 128)
+    monkeypatch.setattr(_log_map, "ROWS", 8)
+    in_windows, at_once, windows = both(log, monkeypatch, 128)
     assert len(windows) == 5 and not log.raw[0].any()
-    np.testing.assert_array_equal(found, whole)
+    np.testing.assert_array_equal(in_windows, at_once)
 
 
 def test_a_log_that_met_nothing_is_an_empty_map(monkeypatch):
     log = wandering(3, 40, 2.5)
     nothing = log._replace(beams=log.beams._replace(valid=np.zeros((3, 40), bool)))
-    frame = log_map.frame_of(log, [log.raw], SETTINGS)
-    grid = log_map.map_of(nothing, log.raw, np.ones(3, bool), frame, SETTINGS)
+    frame = _log_map.frame_of(log, [log.raw], SETTINGS)
+    grid = _log_map.map_of(nothing, log.raw, np.ones(3, bool), frame, SETTINGS)
     assert not grid.log_odds.any()
 
 
@@ -99,14 +95,14 @@ def test_a_log_that_met_nothing_is_an_empty_map(monkeypatch):
 def test_scans_that_are_not_usable_say_nothing(usable):
     log, usable = wandering(3, 40, 2.5), np.array(usable)
     settings = dataclasses.replace(SETTINGS, resolution=2 * RESOLUTION)
-    frame = log_map.frame_of(log, [log.raw], settings)
+    frame = _log_map.frame_of(log, [log.raw], settings)
     some = log._replace(
         time=log.time[usable], raw=log.raw[usable], beams=Beams(*(b[usable] for b in log.beams))
     )
-    every = np.ones(usable.sum(), bool)
+    all_usable = np.ones(usable.sum(), bool)
     np.testing.assert_array_equal(
-        log_map.map_of(log, log.raw, usable, frame, settings).log_odds,
-        log_map.map_of(some, some.raw, every, frame, settings).log_odds,
+        _log_map.map_of(log, log.raw, usable, frame, settings).log_odds,
+        _log_map.map_of(some, some.raw, all_usable, frame, settings).log_odds,
     )
 
 
@@ -117,8 +113,8 @@ MOUNTS = [(0.3, -0.1, np.pi / 2), (0.0, 0.0, np.pi)]
 
 
 def odometry(log, first):
-    scans = scans_of(log, SETTINGS)
-    return laser_odometry(scans, steps_of(log.raw, SETTINGS, log.time), SETTINGS, first)
+    scans = scans_of(log)
+    return odometry_of(scans, steps_of(log.raw, log.time), first)
 
 
 def distance_from_walls(points):
@@ -150,7 +146,7 @@ def test_the_path_is_the_robots_and_the_map_is_of_the_walls(k):
     # In a map that is drawn as if the laser were the robot's middle the walls are elsewhere.
     frame = grid.log_odds.shape, grid.origin, float(grid.resolution)
     usable = np.ones(len(true), bool)
-    wrong = log_map.map_of(
+    wrong = _log_map.map_of(
         log._replace(mount=(0.0, 0.0, 0.0)), solved.poses, usable, frame, SETTINGS
     )
     off = np.argwhere(wrong.log_odds > 0)[:, ::-1] * 0.1 + 0.05 + grid.origin[:2]
@@ -168,7 +164,7 @@ def test_without_its_mount_the_path_is_wrong(k):
 def test_points_are_in_the_robots_frame():
     """At the first pose, the origin, they lie on the walls."""
     _, log = driven(scans=2, mount=MOUNTS[0])
-    scans = scans_of(log, SETTINGS)
+    scans = scans_of(log)
     valid = np.asarray(scans.points.valid)[0]
     points = np.asarray(scans.points.position, float)[0][valid]
     assert valid.sum() > 30 and distance_from_walls(points).max() < 0.06
@@ -180,12 +176,12 @@ def test_points_are_in_the_robots_frame():
 def test_a_mount_that_is_none_is_refused(mount):
     _, log = driven(scans=3)
     with pytest.raises(ValueError, match="here: expected a mount of three finite numbers, got"):
-        check_laser_log("here", log._replace(mount=mount))
+        _scan_points.check_laser_log("here", log._replace(mount=mount))
 
 
 def test_a_mask_of_odometry_of_another_size_is_refused():
     _, log = driven(scans=3)
-    check_laser_log("here", log._replace(odometry_known=np.ones(3, bool)))
-    for known in (np.ones(2, bool), np.ones((3, 1), bool), True):
+    _scan_points.check_laser_log("here", log._replace(odometry_known=np.ones(3, bool)))
+    for mask in (np.ones(2, bool), np.ones((3, 1), bool), True):
         with pytest.raises(ValueError, match="here: expected odometry_known of each of 3 scans"):
-            check_laser_log("here", log._replace(odometry_known=known))
+            _scan_points.check_laser_log("here", log._replace(odometry_known=mask))

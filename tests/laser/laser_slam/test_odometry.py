@@ -6,15 +6,11 @@ import jax
 import numpy as np
 import pytest
 from cases import swept
-from ring_of_rooms import SETTINGS, driven, errors, ranges_of
+from ring_of_rooms import SETTINGS, driven, errors, odometry_of, ranges_of, scans_of, steps_of
 
 from jaxslam import laser_slam
 from jaxslam.core.types import Beams
-from jaxslam.laser.laser_slam._odometry import log_odometry, tracking
-from jaxslam.laser.laser_slam._odometry.log_odometry import laser_odometry
-from jaxslam.laser.laser_slam._odometry.raw import FARTHEST, steps_of
-from jaxslam.laser.laser_slam._odometry.reference import _seen_through
-from jaxslam.laser.laser_slam._scan_points import scans_of
+from jaxslam.laser.laser_slam import _odometry
 from jaxslam.laser.matching import Points
 from jaxslam.math import numpy_poses as poses
 from jaxslam.math._odometry_jumps import odometry_jumps, without_jumps
@@ -28,15 +24,15 @@ CORNERS = [6, 12, 18, 24, 30, 36]
 def drive():
     """(true path, log, its scans)"""
     true, log = driven(COUNT)
-    return true, log, scans_of(log, SETTINGS)
+    return true, log, scans_of(log)
 
 
-def solved(drive, raw=None, scans=None, known=None):
+def solved(drive, raw=None, scans=None, odometry_known=None):
     """The steps, and the odometry from the true first pose on."""
-    true, log, every = drive
-    scans = every if scans is None else scans
-    steps = steps_of(log.raw if raw is None else raw, SETTINGS, log.time, scans.changed, known)
-    return steps, laser_odometry(scans, steps, SETTINGS, true[0])
+    true, log, all_scans = drive
+    scans = all_scans if scans is None else scans
+    steps = steps_of(log.raw if raw is None else raw, log.time, scans.changed, odometry_known)
+    return steps, odometry_of(scans, steps, true[0])
 
 
 def nees(odometry, true, k):
@@ -72,7 +68,7 @@ def check_late(drive, k, share):
 def test_a_log_in_pieces_has_the_path_of_one(drive, monkeypatch):
     true, _, _ = drive
     _, unbroken = solved(drive)
-    monkeypatch.setattr(log_odometry, "PIECE", 13)
+    monkeypatch.setattr(_odometry.log_odometry, "PIECE", 13)
     _, odometry = solved(drive)
     inner = sorted({13, 26} & set(odometry.keyframe.tolist()))
     assert inner == [13, 26], "the first scan of a piece is a keyframe"
@@ -87,8 +83,8 @@ def test_a_log_in_pieces_has_the_path_of_one(drive, monkeypatch):
 @pytest.mark.sweep
 def test_an_interrupt_ends_all_pieces(drive, monkeypatch):
     _, log, scans = drive
-    monkeypatch.setattr(log_odometry, "PIECE", 10)
-    steps, calls = steps_of(log.raw, SETTINGS), []
+    monkeypatch.setattr(_odometry.log_odometry, "PIECE", 10)
+    steps, calls = steps_of(log.raw), []
 
     def progress(done, of):
         calls.append(done)
@@ -96,7 +92,7 @@ def test_an_interrupt_ends_all_pieces(drive, monkeypatch):
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        laser_odometry(scans, steps, SETTINGS, log.raw[0], progress)
+        odometry_of(scans, steps, log.raw[0], progress)
     assert len(calls) < 10
 
 
@@ -164,9 +160,9 @@ def test_odometry_that_is_frozen_for_some_steps_is_found_by_the_scans(drive, fir
     step = poses.between(log.raw[:-1], log.raw[1:])
     step[first - 1 : first + 3] = 0.0
     at = np.arange(first, first + 4)
-    known = ~np.isin(np.arange(COUNT), at)
-    steps, odometry = solved(drive, poses.chain(true[0], step), known=known)
-    np.testing.assert_array_equal(steps.frozen, ~known)
+    certain = ~np.isin(np.arange(COUNT), at)
+    steps, odometry = solved(drive, poses.chain(true[0], step), odometry_known=certain)
+    np.testing.assert_array_equal(steps.frozen, ~certain)
     assert odometry.matched[at].all()
     assert errors(odometry.poses, true)[0].max() < 0.2
     assert max(nees(odometry, true, k) for k in at) < 30
@@ -176,8 +172,8 @@ def test_odometry_that_is_frozen_on_the_whole_drive(drive):
     """Steps of a metre; at a corner the step before is no guess, and the place looks alike if it is
     turned by 90°, so that there a match may be wrong."""
     true, log, _ = drive
-    raw, known = np.zeros((COUNT, 3)), np.arange(COUNT) == 0
-    steps, odometry = solved(drive, raw, known=known)
+    raw, certain = np.zeros((COUNT, 3)), np.arange(COUNT) == 0
+    steps, odometry = solved(drive, raw, odometry_known=certain)
     assert steps.frozen[1:].all() and not steps.jump.any()
     off = np.array([relative_error(odometry, true, k) for k in range(1, COUNT)])
     right = (np.hypot(off[:, 0], off[:, 1]) < 0.2) & (np.abs(off[:, 2]) < np.deg2rad(6))
@@ -221,18 +217,18 @@ def test_a_scan_without_points_stays_where_raw_odometry_leads(drive, k):
 @pytest.mark.parametrize("k", swept([5, 16, 25], 16))
 def test_a_scan_that_matches_nothing_before_is_placed_by_what_comes_after(drive, monkeypatch, k):
     """Raw odometry is wrong at it alone. The others are as if it had no points."""
-    true, log, every = drive
+    true, log, all_scans = drive
     raw = log.raw.copy()
     raw[k] = poses.compose(raw[k], np.array([-0.4, 0.5, 0.3]))
-    refused = np.asarray(every.points.position)[k]
-    match = tracking._match_about
+    refused = np.asarray(all_scans.points.position)[k]
+    match = _odometry.tracking._match_about
 
     def refusing(reference, points, *rest):
         odometry = match(reference, points, *rest)
         same = np.array_equal(points.position, refused)
         return odometry._replace(accepted=odometry.accepted and not same)
 
-    monkeypatch.setattr(tracking, "_match_about", refusing)
+    monkeypatch.setattr(_odometry.tracking, "_match_about", refusing)
     _, odometry = solved(drive, raw)
     assert k not in odometry.keyframe and odometry.matched[k]
     assert np.linalg.norm(poses.between(raw[k - 1], raw[k]) - [1.0, 0.0, 0.0]) > 0.4
@@ -240,7 +236,7 @@ def test_a_scan_that_matches_nothing_before_is_placed_by_what_comes_after(drive,
     assert np.hypot(*relative_error(odometry, true, k)[:2]) < 0.1
     assert nees(odometry, true, k) < 20
     # With nothing but the scans before it, it stays where raw odometry leads.
-    monkeypatch.setattr(log_odometry, "place_unmatched", lambda *_: None)
+    monkeypatch.setattr(_odometry.log_odometry, "place_unmatched", lambda *_: None)
     _, alone = solved(drive, raw)
     assert k not in alone.keyframe and not alone.matched[k]
     others = np.arange(COUNT) != k
@@ -281,10 +277,10 @@ def diagonal(reach):
 @pytest.mark.parametrize("k", [1, 7, 30, LENGTH - 2])
 def test_a_message_that_comes_late_is_found_where_it_was_missing(k):
     raw = late(path(), k)
-    raw_steps = steps_of(raw, SETTINGS, TIME)
+    raw_steps = steps_of(raw, TIME)
     np.testing.assert_array_equal(raw_steps.lags, only(k))
     assert not raw_steps.unknown.any() and not raw_steps.gap.any()
-    untimed = steps_of(raw, SETTINGS)
+    untimed = steps_of(raw)
     np.testing.assert_array_equal(raw_steps.step, untimed.step)
     np.testing.assert_allclose(
         raw_steps.cov[k] - untimed.cov[k], diagonal(raw_steps.reach[k]), rtol=1e-9
@@ -300,7 +296,7 @@ def test_a_turn_that_comes_late_is_found(k):
     raw = path(turn=0.4)
     step = steps(raw)
     step[k - 1, 2], step[k, 2] = 0.01, step[k - 1, 2] + step[k, 2]
-    raw_steps = steps_of(poses.chain(raw[0], step), SETTINGS, TIME)
+    raw_steps = steps_of(poses.chain(raw[0], step), TIME)
     np.testing.assert_array_equal(raw_steps.lags, only(k))
 
 
@@ -310,7 +306,7 @@ def test_a_message_that_comes_late_at_a_gap_in_the_stamps_is_found():
     time[k:] += 0.8  # two steps' time, of which the log says nothing, and three after it
     step[k - 1], step[k, 0] = [0.05, 0.0, 0.01], 3 * 0.7 - 0.05
     settings = dataclasses.replace(SETTINGS, jump=10.0)
-    raw_steps = steps_of(poses.chain(np.zeros(3), step), settings, time)
+    raw_steps = steps_of(poses.chain(np.zeros(3), step), time, settings=settings)
     np.testing.assert_array_equal(raw_steps.lags, only(k))
     assert raw_steps.reach[k, 0] == pytest.approx(2 * 1.5 * 0.7, rel=0.1)
 
@@ -318,9 +314,11 @@ def test_a_message_that_comes_late_at_a_gap_in_the_stamps_is_found():
 def test_without_stamps_no_step_is_late_and_all_that_is_searched_can_be_reached():
     raw = late(path(), 30)
     for time in (None, np.full(LENGTH, 7.0)):
-        raw_steps = steps_of(raw, SETTINGS, time)
+        raw_steps = steps_of(raw, time)
         assert not raw_steps.lags.any() and not raw_steps.gap.any()
-        np.testing.assert_array_equal(raw_steps.reach, np.broadcast_to(FARTHEST, (LENGTH, 2)))
+        np.testing.assert_array_equal(
+            raw_steps.reach, np.broadcast_to(_odometry.raw.FARTHEST, (LENGTH, 2))
+        )
 
 
 def test_a_robot_that_stops_and_starts_and_turns_on_the_spot_is_not_late():
@@ -332,17 +330,17 @@ def test_a_robot_that_stops_and_starts_and_turns_on_the_spot_is_not_late():
     step[(step != 0).any(axis=1)] *= 1 + 0.05 * random.normal(size=((step != 0).any(1).sum(), 1))
     raw = poses.chain(np.zeros(3), step)
     time = 0.5 * np.arange(len(raw)) + 0.02 * random.normal(size=len(raw))
-    raw_steps = steps_of(raw, SETTINGS, time, np.zeros(len(raw), bool))
+    raw_steps = steps_of(raw, time, np.zeros(len(raw), bool))
     assert not raw_steps.lags.any() and not raw_steps.unknown.any()
     # And at full speed from one scan to the next, as a log of key scans has it.
     step = step[(step != slow).any(axis=1)]
     raw = poses.chain(np.zeros(3), step)
-    assert not steps_of(raw, SETTINGS, np.arange(len(raw)) * 0.5).lags.any()
+    assert not steps_of(raw, np.arange(len(raw)) * 0.5).lags.any()
 
 
 def test_the_ring_is_not_late():
     _, log = driven()
-    raw_steps = steps_of(log.raw, SETTINGS, log.time, np.ones(len(log.time), bool))
+    raw_steps = steps_of(log.raw, log.time, np.ones(len(log.time), bool))
     assert not raw_steps.lags.any() and not raw_steps.unknown.any() and not raw_steps.gap.any()
 
 
@@ -352,22 +350,22 @@ def test_odometry_is_frozen_where_it_says_nothing_while_scans_change():
     raw = poses.chain(np.zeros(3), step)
     # The composition of a pose with no step is rounded.
     raw[20:24] = raw[19]
-    changed, known = np.ones(LENGTH, bool), np.ones(LENGTH, bool)
+    changed, certain = np.ones(LENGTH, bool), np.ones(LENGTH, bool)
     at = np.isin(np.arange(LENGTH), [20, 21, 22, 23])
-    raw_steps = steps_of(raw, SETTINGS, TIME, changed, known)
+    raw_steps = steps_of(raw, TIME, changed, certain)
     np.testing.assert_array_equal(raw_steps.frozen, at)
     np.testing.assert_array_equal(raw_steps.unknown, at)
-    base = steps_of(raw, SETTINGS, TIME).cov
+    base = steps_of(raw, TIME).cov
     for k in (20, 23):
         assert (raw_steps.cov[k] - base[k]).diagonal().min() > 0
         assert raw_steps.cov[k, 0, 0] < raw_steps.reach[k, 0] ** 2
     np.testing.assert_array_equal(raw_steps.cov[~at], base[~at])
     # A robot at rest sees the same scan again.
-    assert not steps_of(raw, SETTINGS, TIME, ~at, known).frozen.any()
-    assert not steps_of(raw, SETTINGS, TIME, None, None).frozen.any()
+    assert not steps_of(raw, TIME, ~at, certain).frozen.any()
+    assert not steps_of(raw, TIME, None, None).frozen.any()
     # Where nothing was logged, it is frozen whatever the scan shows, but not at the first scan.
-    np.testing.assert_array_equal(steps_of(raw, SETTINGS, TIME, ~at, ~at).frozen, at)
-    none = steps_of(raw, SETTINGS, TIME, None, np.zeros(LENGTH, bool))
+    np.testing.assert_array_equal(steps_of(raw, TIME, ~at, ~at).frozen, at)
+    none = steps_of(raw, TIME, None, np.zeros(LENGTH, bool))
     np.testing.assert_array_equal(none.frozen, ~only(0))
 
 
@@ -431,11 +429,11 @@ def test_a_jump_that_a_reader_found_is_one_where_the_step_is_too_long():
     raw[30:] = poses.compose(
         poses.compose(raw[30], np.array([1.0, 0, 0])), poses.between(raw[30], raw[30:])
     )
-    known = ~only(30)
-    raw_steps = steps_of(raw, SETTINGS, TIME, None, known)
+    certain = ~only(30)
+    raw_steps = steps_of(raw, TIME, None, certain)
     np.testing.assert_array_equal(raw_steps.jump, only(30))
     assert not raw_steps.frozen.any()
-    np.testing.assert_array_equal(steps_of(path(), SETTINGS, TIME, None, known).frozen, only(30))
+    np.testing.assert_array_equal(steps_of(path(), TIME, None, certain).frozen, only(30))
 
 
 def test_frozen_odometry_of_a_slow_robot_is_counted():
@@ -443,9 +441,9 @@ def test_frozen_odometry_of_a_slow_robot_is_counted():
     raw = path()
     raw[20:40] = raw[19]
     changed = np.where(np.arange(LENGTH) >= 4, 4, 0)
-    raw_steps = steps_of(raw, SETTINGS, TIME, changed)
+    raw_steps = steps_of(raw, TIME, changed)
     np.testing.assert_array_equal(raw_steps.frozen, np.isin(np.arange(LENGTH), np.arange(20, 40)))
-    assert not steps_of(raw, SETTINGS, TIME, np.zeros(LENGTH, int)).frozen.any()
+    assert not steps_of(raw, TIME, np.zeros(LENGTH, int)).frozen.any()
 
 
 def test_scans_of_a_slow_robot_differ_from_those_some_back():
@@ -455,16 +453,16 @@ def test_scans_of_a_slow_robot_differ_from_those_some_back():
     ranges = np.array([ranges_of(pose, angles, WALLS) for pose in true])
     beams = Beams(ranges, np.broadcast_to(angles, ranges.shape), np.ones(ranges.shape, bool))
     log = laser_slam.ScanLog(np.arange(30.0), beams, 0 * true, 8.0)
-    changed = scans_of(log, SETTINGS).changed
+    changed = scans_of(log).changed
     assert not changed[1:10].any() and (changed[20:] > 1).all() and changed.max() <= 8
-    frozen = steps_of(0 * true, SETTINGS, log.time, changed).frozen
+    frozen = steps_of(0 * true, log.time, changed).frozen
     assert frozen[11:].all() and not frozen[:7].any()
 
 
 def test_a_jump_is_no_step_and_may_lead_anywhere():
     raw = path()
     raw[30:] += [3.2, -2.0, 0.0]
-    raw_steps = steps_of(raw, SETTINGS, TIME, np.ones(LENGTH, bool))
+    raw_steps = steps_of(raw, TIME, np.ones(LENGTH, bool))
     assert not raw_steps.reset.any()
     np.testing.assert_array_equal(raw_steps.jump, only(30))
     np.testing.assert_array_equal(raw_steps.unknown, only(30))
@@ -477,10 +475,10 @@ def test_the_reach_grows_with_the_time_and_ends_where_is_searched():
     time = TIME.copy()
     time[40:] += 0.8
     time[50:] += 100.0
-    raw_steps = steps_of(path(turn=0.1), SETTINGS, time)
-    assert (raw_steps.reach <= FARTHEST).all() and (raw_steps.reach > 0).all()
+    raw_steps = steps_of(path(turn=0.1), time)
+    assert (raw_steps.reach <= _odometry.raw.FARTHEST).all() and (raw_steps.reach > 0).all()
     np.testing.assert_allclose(raw_steps.reach[40], 2 * raw_steps.reach[39], rtol=1e-9)
-    np.testing.assert_array_equal(raw_steps.reach[50], FARTHEST)
+    np.testing.assert_array_equal(raw_steps.reach[50], _odometry.raw.FARTHEST)
     np.testing.assert_array_equal(raw_steps.gap, only(50))
     assert raw_steps.reach[39, 0] == pytest.approx(1.5 * 0.7, rel=0.1)
     assert raw_steps.reach[39, 1] == pytest.approx(1.5 * 0.1, rel=0.2)
@@ -489,10 +487,10 @@ def test_the_reach_grows_with_the_time_and_ends_where_is_searched():
 def test_a_step_that_is_faster_than_can_be_and_makes_up_for_none_has_wrong_stamps():
     raw, time = path(), TIME.copy()
     time[30] = time[29] + 0.1
-    raw_steps = steps_of(raw, SETTINGS, time)
+    raw_steps = steps_of(raw, time)
     assert not raw_steps.lags.any()
-    np.testing.assert_array_equal(raw_steps.reach[30], FARTHEST)
-    assert (raw_steps.reach[29] < FARTHEST[0]).all()
+    np.testing.assert_array_equal(raw_steps.reach[30], _odometry.raw.FARTHEST)
+    assert (raw_steps.reach[29] < _odometry.raw.FARTHEST[0]).all()
 
 
 # --- The share of a place's walls that the beams of a scan would pass through ---------------------
@@ -513,11 +511,11 @@ def seen(pose, walls=WALLS, beams=BEAMS):
 
 @pytest.fixture(scope="module")
 def through():
-    program = jax.jit(_seen_through)
+    program = jax.jit(_odometry.reference._seen_through)
 
     def of(scan, pose, reference=None):
-        whole = seen((0.0, 0.0, 0.0)) if reference is None else reference
-        return float(program(whole, scan, np.asarray(pose, np.float32)))
+        surface = seen((0.0, 0.0, 0.0)) if reference is None else reference
+        return float(program(surface, scan, np.asarray(pose, np.float32)))
 
     return of
 

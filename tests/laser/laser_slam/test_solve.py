@@ -7,19 +7,17 @@ import jax
 import numpy as np
 import pytest
 from cases import refused
-from ring_of_rooms import FAR, SETTINGS, driven, errors
+from ring_of_rooms import FAR, SETTINGS, driven, errors, odometry_of, scans_of, steps_of
 from worlds import nothing_compiled
 
+from jaxslam import _cli as cli
 from jaxslam import filters, laser_slam, metrics, run, sensors
-from jaxslam._cli import main
-from jaxslam._cli.recorded import slam as results
 from jaxslam.core.types import Beams, Log, Scan
-from jaxslam.laser.laser_slam import LoopOutcome
-from jaxslam.laser.laser_slam import _end_covariances as end_covariances
-from jaxslam.laser.laser_slam._log_map import growing_maps
-from jaxslam.laser.laser_slam._odometry.log_odometry import laser_odometry
-from jaxslam.laser.laser_slam._odometry.raw import steps_of
-from jaxslam.laser.laser_slam._scan_points import scans_of
+from jaxslam.laser.laser_slam import (
+    LoopOutcome,
+    _end_covariances,
+    _log_map,
+)
 from jaxslam.math import numpy_poses as poses
 from jaxslam.results._files import write_files
 
@@ -56,8 +54,8 @@ def test_the_covariances_are_of_the_right_size(drive):
 def test_a_filter_is_driven_by_the_matches(drive):
     """It follows laser odometry, and its covariance is that of the chain of matches."""
     _, log, solved = drive
-    of = scans_of(log, SETTINGS), steps_of(log.raw, SETTINGS)
-    odometry = laser_odometry(*of, SETTINGS, log.raw[0])
+    of = scans_of(log), steps_of(log.raw)
+    odometry = odometry_of(*of, log.raw[0])
     keys = odometry.keyframe
     control = laser_slam.match_controls(odometry)
     np.testing.assert_allclose(laser_slam.match_controls(solved), control, rtol=1e-6, atol=1e-12)
@@ -69,8 +67,8 @@ def test_a_filter_is_driven_by_the_matches(drive):
     np.testing.assert_allclose(path.pose, odometry.poses[keys], atol=1e-9)
     cov = np.zeros((3, 3))
     for row, key in enumerate(keys[1:], 1):
-        cov = end_covariances.composed_cov(cov, odometry.z[key], odometry.cov[key])
-        expected = end_covariances.of_coordinates(cov, odometry.poses[key])
+        cov = _end_covariances.composed_cov(cov, odometry.z[key], odometry.cov[key])
+        expected = _end_covariances.of_coordinates(cov, odometry.poses[key])
         np.testing.assert_allclose(path.pose_cov[row], expected, rtol=1e-9, atol=1e-15)
     with pytest.raises(ValueError, match="match_controls: expected Odometry or Solved, got int"):
         laser_slam.match_controls(1)
@@ -78,12 +76,16 @@ def test_a_filter_is_driven_by_the_matches(drive):
 
 def test_maps_of_a_film_grow_to_the_whole(drive):
     _, log, solved = drive
-    grown, until = growing_maps(log, solved.odometry, SETTINGS, frames=4, others=[solved.poses])
-    (whole,), _ = growing_maps(log, solved.odometry, SETTINGS, frames=1, others=[solved.poses])
+    grown, until = _log_map.growing_maps(
+        log, solved.odometry, SETTINGS, frames=4, others=[solved.poses]
+    )
+    (final,), _ = _log_map.growing_maps(
+        log, solved.odometry, SETTINGS, frames=1, others=[solved.poses]
+    )
     assert until[-1] == len(log.time) and len(grown) == len(until) <= 4
-    np.testing.assert_array_equal(grown[-1].log_odds, whole.log_odds)
-    known = [(one.log_odds != 0).sum() for one in grown]
-    assert (np.diff(known) > 0).all()
+    np.testing.assert_array_equal(grown[-1].log_odds, final.log_odds)
+    cells = [(grid.log_odds != 0).sum() for grid in grown]
+    assert (np.diff(cells) > 0).all()
 
 
 def test_the_map_is_of_the_walls(drive):
@@ -127,12 +129,12 @@ def test_what_is_wrong_is_counted_and_the_run_goes_on(drive):
 def test_after_a_jump_a_match_is_right_or_refused(drive):
     """At each scan of the drive: the step from the one before is unknown, a metre and up to 90°."""
     true, log, _ = drive
-    every, refused = scans_of(log, SETTINGS), 0
+    all_scans, refused = scans_of(log), 0
     for k in range(6, len(true)):
         at = np.arange(k - 5, k + 1)
         raw = log.raw[at] + np.where(at == k, 40.0, 0.0)[:, None] * [1, 0, 0]
-        scans = jax.tree.map(lambda part, at=at: np.asarray(part)[at], every)
-        odometry = laser_odometry(scans, steps_of(raw, SETTINGS), SETTINGS, raw[0])
+        scans = jax.tree.map(lambda part, at=at: np.asarray(part)[at], all_scans)
+        odometry = odometry_of(scans, steps_of(raw), raw[0])
         z = poses.between(true[at[odometry.base[5]]], true[k])
         off = poses.between(odometry.z[5], z)
         assert np.hypot(off[0], off[1]) < 0.2 or not odometry.matched[5], k
@@ -144,13 +146,13 @@ def test_after_a_jump_a_match_is_right_or_refused(drive):
 def test_a_match_with_another_place_is_in_doubt(drive):
     """At each scan of the drive: it is that of 17 scans later, of a corridor that looks alike."""
     true, log, _ = drive
-    every, matched, wrong, doubted = scans_of(log, SETTINGS), 0, 0, 0
+    all_scans, matched, wrong, doubted = scans_of(log), 0, 0, 0
     for k in range(6, len(true)):
         at = np.arange(k - 5, k + 1)
         seen = np.append(at[:-1], (k + 17) % len(true))
-        scans = jax.tree.map(lambda part, seen=seen: np.asarray(part)[seen], every)
-        steps = steps_of(log.raw[at], SETTINGS)
-        odometry = laser_odometry(scans, steps, SETTINGS, log.raw[k - 5])
+        scans = jax.tree.map(lambda part, seen=seen: np.asarray(part)[seen], all_scans)
+        steps = steps_of(log.raw[at])
+        odometry = odometry_of(scans, steps, log.raw[k - 5])
         z = poses.between(true[at[odometry.base[5]]], true[k])
         off = poses.between(odometry.z[5], z)
         matched += odometry.matched[5]
@@ -186,7 +188,11 @@ def test_matches_beyond_raw_odometry_that_stands_still_are_in_doubt(drive):
     steps = poses.between(log.raw[:-1], log.raw[1:])
     steps[10:20] = 0.0
     raw = poses.chain(log.raw[0], steps)
-    odometry = laser_odometry(scans_of(log, SETTINGS), steps_of(raw, SETTINGS), SETTINGS, raw[0])
+    odometry = odometry_of(
+        scans_of(log),
+        steps_of(raw),
+        raw[0],
+    )
     assert odometry.doubted[11:21].sum() >= 4 and not odometry.doubted[:11].any()
 
 
@@ -235,8 +241,8 @@ def test_bad_settings_are_refused(change):
 
 
 def test_its_files(drive, tmp_path):
-    _, log, found = drive
-    write_files(tmp_path, results.result_files(found))
+    _, log, solved = drive
+    write_files(tmp_path, cli.slam.result_files(solved))
     names = {path.name for path in tmp_path.iterdir()}
     assert names == {
         "trajectory.csv",
@@ -248,9 +254,9 @@ def test_its_files(drive, tmp_path):
     }
     rows = np.loadtxt(tmp_path / "trajectory.tum")
     np.testing.assert_array_equal(rows[:, 0], log.time)
-    np.testing.assert_allclose(rows[:, 1:3], found.poses[:, :2], rtol=1e-8)
-    assert len((tmp_path / "loops.csv").read_text().splitlines()) == 1 + len(found.loops.outcome)
-    assert results.result_summary(found)["keyframes"] == len(found.keyframe)
+    np.testing.assert_allclose(rows[:, 1:3], solved.poses[:, :2], rtol=1e-8)
+    assert len((tmp_path / "loops.csv").read_text().splitlines()) == 1 + len(solved.loops.outcome)
+    assert cli.slam.result_summary(solved)["keyframes"] == len(solved.keyframe)
 
 
 def carmen_lines(true, log):
@@ -267,22 +273,22 @@ def carmen_lines(true, log):
 
 def test_the_command_scores_it_by_the_poses_in_the_file(drive, monkeypatch, tmp_path):
     """`jaxslam slam FILE`, with the result of above in place of a second one."""
-    true, log, found = drive
-    monkeypatch.setattr(laser_slam, "solve", lambda log, settings, progress: found)
+    true, log, solved = drive
+    monkeypatch.setattr(laser_slam, "solve", lambda log, settings, progress: solved)
     lines = carmen_lines(true, log)
     (tmp_path / "ring.log").write_text("\n".join(lines))
     out = tmp_path / "out"
     command = ["slam", str(tmp_path / "ring.log"), "--out", str(out)]
-    assert main([*command, "--figures", "svg"]) == 0
+    assert cli.main([*command, "--figures", "svg"]) == 0
     summary = json.loads((out / "summary.json").read_text())
     assert summary["mean relation error to 10 m [m]"] < 0.1
-    kept = laser_slam.closure_score(found, true).kept
+    kept = laser_slam.closure_score(solved, true).kept
     assert summary["loops kept that agree with the poses in the file"] == kept
     names = {path.name for path in out.iterdir()}
     assert {"trajectory.tum", "graph.g2o", "map.pgm", "map_before.svg", "graph.svg"} <= names
     # Without odometry the poses in the file are all that is known of it, and score nothing.
     (tmp_path / "ring.log").write_text("\n".join(lines[1::2]))
-    assert main([*command, "--figures", "svg"]) == 0
+    assert cli.main([*command, "--figures", "svg"]) == 0
     summary = json.loads((out / "summary.json").read_text())
     assert summary["score"].startswith("none: ") and "ATE, RMSE [m]" not in summary
 
@@ -294,9 +300,9 @@ def relation_text(relations, time):
 
 
 def test_the_command_scores_it_by_relations(drive, monkeypatch, tmp_path, capsys):
-    true, log, found = drive
+    true, log, solved = drive
     time = 1e9 + 2.0 * log.time
-    monkeypatch.setattr(laser_slam, "solve", lambda log, settings, progress: found)
+    monkeypatch.setattr(laser_slam, "solve", lambda log, settings, progress: solved)
     lines = [
         " ".join([*line.split()[:-3], str(time[k // 2]), "host", "0"])
         for k, line in enumerate(carmen_lines(true, log))
@@ -309,23 +315,23 @@ def test_the_command_scores_it_by_relations(drive, monkeypatch, tmp_path, capsys
     (tmp_path / "ring.relations").write_text(text)
     out = tmp_path / "out"
     command = ["slam", str(tmp_path / "ring.log"), "--out", str(out)]
-    asked = ["--relations", str(tmp_path / "ring.relations"), "--figures", "svg"]
-    assert main([*command, *asked]) == 0
+    options = ["--relations", str(tmp_path / "ring.relations"), "--figures", "svg"]
+    assert cli.main([*command, *options]) == 0
     summary = json.loads((out / "summary.json").read_text())["relations"]
     count = len(relations.first)
     assert (summary["joined"], summary["not joined"], summary["tolerance [s]"]) == (count, 1, 1e-4)
     assert summary["all"]["relations"] == count and summary["over 60 s apart"]["relations"] == far
     for name, some in (("all", relations), ("over 60 s apart", metrics.relations(true, rows=31))):
         for path, at in (
-            ("laser SLAM", found.poses),
-            ("laser odometry", found.odometry),
-            ("raw odometry", found.raw),
+            ("laser SLAM", solved.poses),
+            ("laser odometry", solved.odometry),
+            ("raw odometry", solved.raw),
         ):
             errors = metrics.relation_errors(some, at)
             expected = metrics.benchmark_figures(errors)
             for quantity, figures in summary[name][path].items():
-                given = figures["mean"], figures["std"]
-                np.testing.assert_allclose(given, expected[quantity], rtol=1e-6)
+                scores = figures["mean"], figures["std"]
+                np.testing.assert_allclose(scores, expected[quantity], rtol=1e-6)
     assert summary["all"]["in the 95 % ellipse"] == count
     assert summary["all"]["without a covariance"] == 0
     printed = capsys.readouterr().out
@@ -343,10 +349,10 @@ def test_relations_that_do_not_join_are_refused_before_the_work(
     (tmp_path / "ring.relations").write_text("7.5 8.5 0 0 0 0 0 0\n50 60 0 0 0 0 0 0\n")
     out = tmp_path / "out"
     command = ["slam", str(tmp_path / "ring.log"), "--out", str(out)]
-    assert main([*command, "--relations", str(tmp_path / "ring.relations")]) == 2
-    (told,) = capsys.readouterr().err.splitlines()
-    assert "ring.relations: none of 2 relations, from 7.500000 s to 60.000000 s, " in told
-    assert told.endswith("from 0.000000 s to 39.000000 s, within 0.0001 s at both ends")
+    assert cli.main([*command, "--relations", str(tmp_path / "ring.relations")]) == 2
+    (message,) = capsys.readouterr().err.splitlines()
+    assert "ring.relations: none of 2 relations, from 7.500000 s to 60.000000 s, " in message
+    assert message.endswith("from 0.000000 s to 39.000000 s, within 0.0001 s at both ends")
     assert not out.exists()
 
 

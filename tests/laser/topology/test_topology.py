@@ -5,10 +5,10 @@ import functools
 import numpy as np
 import pytest
 from cases import refused
+from reference.walls import is_free
 
 from jaxslam import grids, topology
 from jaxslam.simulation import walls
-from jaxslam.simulation._wall_geometry import is_free
 from jaxslam.simulation.scenarios import office
 
 ROOMS = np.array(

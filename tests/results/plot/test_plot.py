@@ -12,15 +12,17 @@ from matplotlib.colors import to_rgb
 from jaxslam import plot
 from jaxslam.catalog import ALL, KINDS
 from jaxslam.consistency import Average
-from jaxslam.consistency._measures.coverage import LEVELS
-from jaxslam.consistency._measures.nees import DOF
-from jaxslam.consistency._run_scores import LAGS
-from jaxslam.results.plot import SHADE, TEXT, look, panels_of
-from jaxslam.results.plot._landmarks import run_map_figure
-from jaxslam.results.plot._measure_figures import INTERVAL
-from jaxslam.results.plot._panels import BEYOND, kinds_of, numbers_of, set_positive
-from jaxslam.results.plot._pose_errors import run_errors_figure
-from jaxslam.results.plot._style import HUES, curves_of, describe
+from jaxslam.results.plot import (
+    SHADE,
+    TEXT,
+    _landmarks,
+    _measure_figures,
+    _panels,
+    _pose_errors,
+    _style,
+    look,
+    panels_of,
+)
 
 FIVE = ("dead_reckoning", "ekf", "fej", "right_invariant", "fastslam1")
 TWELVE = (*FIVE, "localization", "ideal", "oc", "ukf", "seif", "batch_map", "fastslam2")
@@ -31,7 +33,7 @@ OVER_STEPS = (
     plot.whiteness_figure,
     plot.gained_figure,
 )
-FIGURES = (*OVER_STEPS, plot.cost_figure, run_errors_figure, run_map_figure)
+FIGURES = (*OVER_STEPS, plot.cost_figure, _pose_errors.run_errors_figure, _landmarks.run_map_figure)
 
 
 @pytest.fixture(scope="module")
@@ -40,17 +42,21 @@ def five():
 
 
 @pytest.fixture(scope="module")
-def every():
+def campaign_of_all():
     return drawn.campaign(ALL)
 
 
 def line(axes, label):
-    (found,) = [each for each in curves_of(axes) if each.get_label().split(" (")[0] == label]
-    return found
+    (curve,) = [
+        candidate
+        for candidate in _style.curves_of(axes)
+        if candidate.get_label().split(" (")[0] == label
+    ]
+    return curve
 
 
 def beyond(axes):
-    return [each for each in axes.lines if each.get_gid() == BEYOND]
+    return [artist for artist in axes.lines if artist.get_gid() == _panels.BEYOND]
 
 
 def panels(figure):
@@ -91,7 +97,7 @@ def test_filters_are_told_apart_by_colour_and_without():
 )
 def test_an_ordinate_is_logarithmic_beyond_a_decade_and_has_numbers(low, high, scale):
     _, (axes,) = panels_of(5.0, 3.0, 1)
-    set_positive(axes, low, high)
+    _panels.set_positive(axes, low, high)
     assert axes.get_yscale() == scale
     bottom, top = axes.get_ylim()
     assert bottom < low < high < top
@@ -111,21 +117,24 @@ def drawn_looks(figure):
 
 @pytest.mark.parametrize("names", swept([FIVE, [*TWELVE]], FIVE))
 def test_a_filter_has_one_look_in_all_figures(names):
-    found = drawn.campaign(names)
-    numbers = numbers_of(names)
+    campaign = drawn.campaign(names)
+    numbers = _panels.numbers_of(names)
     expected = {n: (look(i)["color"], look(i)["marker"]) for n, i in numbers.items()}
     assert len(set(expected.values())) == len(names)
     for draw in (*OVER_STEPS, plot.cost_figure):
-        seen = drawn_looks(draw(found))
+        seen = drawn_looks(draw(campaign))
         assert len(seen) >= len(names) / 2
         assert {(name, *expected[name]) for name, *_ in seen} == seen
-    for _, mine in kinds_of(list(names)):
+    for _, mine in _panels.kinds_of(list(names)):
         assert len({look(numbers[name])["marker"] for name in mine}) == len(mine)
 
 
 def test_filters_stand_out_from_the_band():
     band = 1 - 0.35 * (1 - np.array(to_rgb(SHADE)))
-    assert min((_luminance(band) + 0.05) / (_luminance(to_rgb(hue)) + 0.05) for hue in HUES) > 2.3
+    assert (
+        min((_luminance(band) + 0.05) / (_luminance(to_rgb(hue)) + 0.05) for hue in _style.HUES)
+        > 2.3
+    )
 
 
 def _luminance(rgb):
@@ -134,13 +143,13 @@ def _luminance(rgb):
 
 
 def test_every_filter_of_the_family_has_one_kind():
-    every = [name for names in KINDS.values() for name in names]
-    assert sorted(every) == sorted(ALL) and max(map(len, KINDS.values())) <= 5
+    all_names = [name for names in KINDS.values() for name in names]
+    assert sorted(all_names) == sorted(ALL) and max(map(len, KINDS.values())) <= 5
 
 
 def test_kinds_keep_their_order_and_others_come_last_in_fives():
     names = [*(f"mine{i}" for i in range(7)), "fastslam2", "ukf", "ekf"]
-    assert kinds_of(names) == [
+    assert _panels.kinds_of(names) == [
         ("Kalman filter", ["ekf"]),
         ("unscented", ["ukf"]),
         ("particles", ["fastslam2"]),
@@ -153,26 +162,28 @@ def test_kinds_keep_their_order_and_others_come_last_in_fives():
     ("draw", "columns"),
     swept(zip(OVER_STEPS, (3, 2, 3, 1, 1), strict=True), (plot.nees_figure, 3)),
 )
-def test_twenty_filters_are_drawn_by_kind(every, draw, columns):
-    rows = kinds(draw(every), columns)
-    there = {kind: list(names) for kind, names in KINDS.items()}
+def test_twenty_filters_are_drawn_by_kind(campaign_of_all, draw, columns):
+    rows = kinds(draw(campaign_of_all), columns)
+    expected = {kind: list(names) for kind, names in KINDS.items()}
     if draw is plot.gained_figure:
-        watched = [n for n, s in every.filters.items() if "rotation_information" in s.curves]
-        there = dict(kinds_of(watched))
-    assert [kind for kind, *_ in rows] == list(there)
+        watched = [
+            n for n, s in campaign_of_all.filters.items() if "rotation_information" in s.curves
+        ]
+        expected = dict(_panels.kinds_of(watched))
+    assert [kind for kind, *_ in rows] == list(expected)
     for kind, axes, names in rows:
-        assert [name.split(":")[0] for name in names] == there[kind]
-        assert all(len(curves_of(each)) == len(names) for each in axes)
+        assert [name.split(":")[0] for name in names] == expected[kind]
+        assert all(len(_style.curves_of(panel)) == len(names) for panel in axes)
 
 
 def test_nees_is_drawn_with_its_band_and_verdicts(five):
     figure = plot.nees_figure(five)
     assert [axes.get_ylabel() for axes in figure.axes] == [
-        f"{block} NEES (dof {dof})" for block, dof in DOF.items()
+        f"{block} NEES (dof {dof})" for block, dof in drawn.DOF.items()
     ]
     expected = ["95 % band", "honest", "dead_reckoning (consistent)", "ekf (optimistic)"]
     assert named(figure)[:4] == expected
-    for axes, block in zip(figure.axes, DOF, strict=True):
+    for axes, block in zip(figure.axes, drawn.DOF, strict=True):
         np.testing.assert_array_equal(
             line(axes, "ekf").get_ydata(), five.filters["ekf"].curves[f"nees_{block}"]
         )
@@ -185,10 +196,12 @@ def test_the_band_is_seen_whatever_a_degenerate_covariance_gives(names):
     figure = plot.nees_figure(drawn.campaign(names))
     shown = panels(figure)
     extreme = [
-        axes for axes in shown if any(c.get_label()[:9] == "fastslam1" for c in curves_of(axes))
+        axes
+        for axes in shown
+        if any(c.get_label()[:9] == "fastslam1" for c in _style.curves_of(axes))
     ]
     for at, axes in enumerate(shown):
-        dof = list(DOF.values())[at % 3]
+        dof = list(drawn.DOF.values())[at % 3]
         (band,) = axes.collections
         heights = band.get_paths()[0].vertices[:, 1]
         low, high = axes.get_ylim()
@@ -205,10 +218,10 @@ def test_the_band_is_seen_whatever_a_degenerate_covariance_gives(names):
     assert len(extreme) == 3
 
 
-def test_low_panels_of_nees_have_the_powers_of_ten_and_the_honest_one(every):
-    figure = plot.nees_figure(every)
+def test_low_panels_of_nees_have_the_powers_of_ten_and_the_honest_one(campaign_of_all):
+    figure = plot.nees_figure(campaign_of_all)
     figure.draw_without_rendering()
-    for axes, dof in zip(panels(figure)[:3], DOF.values(), strict=True):
+    for axes, dof in zip(panels(figure)[:3], drawn.DOF.values(), strict=True):
         low, high = axes.get_ylim()
         shown = [tick for tick in axes.get_yticks() if low <= tick <= high]
         assert {10.0, 100.0} <= set(shown)
@@ -239,13 +252,13 @@ def test_dead_reckoning_does_not_set_the_scale_of_errors(five):
 def test_coverage_is_drawn_about_the_diagonal(five):
     figure = plot.coverage_figure(five)
     figure.draw_without_rendering()
-    for axes, (block, dof) in zip(figure.axes, DOF.items(), strict=True):
+    for axes, (block, dof) in zip(figure.axes, drawn.DOF.items(), strict=True):
         assert axes.get_title("left") == f"{block} (dof {dof})"
         assert axes.get_box_aspect() == 1
         gap = figure.legends[0].get_window_extent().y0 - axes.get_tightbbox().y1
         assert 0 < gap < 0.15 * figure.dpi
         np.testing.assert_array_equal(*axes.lines[0].get_data())
-        np.testing.assert_array_equal(line(axes, "ekf").get_xdata(), LEVELS)
+        np.testing.assert_array_equal(line(axes, "ekf").get_xdata(), drawn.LEVELS)
         share = line(axes, "ekf").get_ydata()
         np.testing.assert_array_equal(share, five.filters["ekf"].coverage[block])
 
@@ -255,7 +268,7 @@ def test_whiteness_is_drawn_about_zero_and_says_who_has_no_innovations(five):
     (axes,) = figure.axes
     for name in FIVE[1:]:
         curve = line(axes, name)
-        np.testing.assert_allclose(curve.get_xdata(), np.arange(1, LAGS + 1), atol=0.25)
+        np.testing.assert_allclose(curve.get_xdata(), np.arange(1, drawn.LAGS + 1), atol=0.25)
         np.testing.assert_array_equal(curve.get_ydata(), five.filters[name].autocorrelation)
     assert axes.get_ylim()[0] == -axes.get_ylim()[1]
     assert "dead_reckoning: no innovations" in named(figure)
@@ -290,41 +303,41 @@ def test_points_of_cost_stay_off_the_frame(five):
 
 @pytest.mark.parametrize("names", swept([FIVE[:3], [*TWELVE]], FIVE[:3]))
 def test_intervals_of_cost_set_the_scale_and_have_an_arrow_where_they_leave_it(names):
-    found = drawn.campaign(names)
+    campaign = drawn.campaign(names)
     measures = {
         "dead_reckoning": Average(1.0, 0.3, 4.0),
         "ekf": Average(0.5, 0.4, np.inf),
         "fej": Average(0.5, 1e-4, 2.0),
     }
-    for name, s in found.filters.items():
+    for name, s in campaign.filters.items():
         s.measures["rmse_position"] = measures.get(name, Average(0.5, 0.4, 0.6))
-    figure = plot.cost_figure(found)
+    figure = plot.cost_figure(campaign)
     axes = figure.axes[1]
     low, high = axes.get_xlim()
     assert low < 0.3 and 4.0 < high < 10
-    drawn_there = [each for each in axes.lines if each.get_gid() == INTERVAL]
-    lines = [each.get_xdata() for each in drawn_there if len(each.get_xdata()) == 2]
+    drawn_there = [artist for artist in axes.lines if artist.get_gid() == _measure_figures.INTERVAL]
+    lines = [artist.get_xdata() for artist in drawn_there if len(artist.get_xdata()) == 2]
     assert len(lines) == len(names)
     for ends in ([0.3, 4.0], [0.4, high], [low, 2.0]):
         assert any(np.allclose(line, ends) for line in lines)
     arrows = {
-        each.get_marker(): each.get_xdata()[0]
-        for each in drawn_there
-        if each.get_marker() != "None"
+        artist.get_marker(): artist.get_xdata()[0]
+        for artist in drawn_there
+        if artist.get_marker() != "None"
     }
     assert arrows == {"<": low, ">": high}
 
 
-def test_many_filters_are_listed_by_cost(every):
-    figure = plot.cost_figure(every)
+def test_many_filters_are_listed_by_cost(campaign_of_all):
+    figure = plot.cost_figure(campaign_of_all)
     times, errors, nees = figure.axes[:3]
     listed = [text.get_text() for text in times.get_yticklabels()]
-    assert listed == [name for _, names in kinds_of(list(ALL)) for name in names]
+    assert listed == [name for _, names in _panels.kinds_of(list(ALL)) for name in names]
     for axes in (times, errors):
         left, right = axes.get_xlim()
-        points = [each for each in axes.lines if each.get_label() in ALL]
+        points = [point for point in axes.lines if point.get_label() in ALL]
         assert len(points) == len(ALL)
-        assert all(left < each.get_xdata()[0] < right for each in points)
+        assert all(left < point.get_xdata()[0] < right for point in points)
     assert nees.get_xlim()[1] < 1e3
     assert r"$3\cdot 10^{27}$" in [text.get_text() for text in nees.texts]
 
@@ -385,9 +398,10 @@ def test_five_filters_fit_a_page_and_a_column_in_letters_of_one_size(five, draw,
 
 
 @pytest.mark.parametrize("draw", swept(FIGURES, plot.nees_figure))
-def test_twenty_filters_can_be_read_and_nothing_overlaps(every, draw):
-    rows = draw is run_errors_figure  # three panels a filter: slow to lay out, and all alike
-    figure = draw(drawn.campaign(list(ALL)[:7]) if rows else every)
+def test_twenty_filters_can_be_read_and_nothing_overlaps(campaign_of_all, draw):
+    # Three panels a filter: slow to lay out, and all alike.
+    rows = draw is _pose_errors.run_errors_figure
+    figure = draw(drawn.campaign(list(ALL)[:7]) if rows else campaign_of_all)
     figure.draw_without_rendering()
     page = figure.bbox
     for axes in figure.axes:
@@ -410,36 +424,36 @@ def _apart(shown):
 @pytest.mark.parametrize("draw", [*OVER_STEPS, plot.cost_figure])
 @pytest.mark.parametrize("count", swept([1, 6], 1))
 def test_filters_without_a_number_and_single_steps_can_be_drawn(draw, count):
-    there = drawn.summary("ekf")
+    ekf = drawn.summary("ekf")
     lost = dataclasses.replace(
-        there,
-        curves={name: np.full_like(curve, np.nan) for name, curve in there.curves.items()},
-        coverage={block: np.full_like(share, np.nan) for block, share in there.coverage.items()},
-        autocorrelation=np.full(LAGS, np.nan),
-        counts=there.counts | {"runs": 0},
+        ekf,
+        curves={name: np.full_like(curve, np.nan) for name, curve in ekf.curves.items()},
+        coverage={block: np.full_like(share, np.nan) for block, share in ekf.coverage.items()},
+        autocorrelation=np.full(drawn.LAGS, np.nan),
+        counts=ekf.counts | {"runs": 0},
         measures={},
     )
-    once = dataclasses.replace(there, curves={n: curve[2:3] for n, curve in there.curves.items()})
-    more = {f"mine{i}": there for i in range(count - 1)}
+    once = dataclasses.replace(ekf, curves={n: curve[2:3] for n, curve in ekf.curves.items()})
+    others = {f"mine{i}": ekf for i in range(count - 1)}
     for steps, filters in (
         (drawn.STEPS, {"$lost_": lost}),
-        (drawn.STEPS, {"_a$": lost} | more),
+        (drawn.STEPS, {"_a$": lost} | others),
         (1, {f"a{i}": once for i in range(count)}),
     ):
         times = dict.fromkeys(filters, 1e-4)
-        found = drawn.campaign([], steps, filters=filters, step_seconds=times)
-        figure = draw(found)
+        campaign = drawn.campaign([], steps, filters=filters, step_seconds=times)
+        figure = draw(campaign)
         figure.draw_without_rendering()
         if draw is not plot.cost_figure:  # there they are tick labels
-            assert all(name in describe(figure) for name in filters)
+            assert all(name in _style.describe(figure) for name in filters)
 
 
 def test_a_figure_is_described_in_words(five):
-    said = describe(plot.coverage_figure(five))
+    said = _style.describe(plot.coverage_figure(five))
     assert "share of truth within" in said
     assert "against probability p" in said
     assert "Drawn: honest, dead_reckoning, ekf, fej," in said
-    assert "true path" in describe(run_map_figure(five))
+    assert "true path" in _style.describe(_landmarks.run_map_figure(five))
 
 
 def test_a_notebook_shows_a_figure_as_it_is():

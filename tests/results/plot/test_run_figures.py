@@ -10,10 +10,7 @@ from cases import swept
 
 from jaxslam import plot
 from jaxslam.core.types import Trace
-from jaxslam.results.plot._landmarks import run_map_figure
-from jaxslam.results.plot._panels import BEYOND
-from jaxslam.results.plot._pose_errors import run_errors_figure
-from jaxslam.results.plot._style import curves_of, png
+from jaxslam.results.plot import _landmarks, _panels, _pose_errors, _style
 
 
 @pytest.mark.parametrize("n_sigma", [1.0, 3.0])
@@ -72,7 +69,7 @@ def test_a_map_has_equal_aspect_units_a_start_and_an_end():
     assert expected <= set(named(figure)) and len(named(figure)) == len(set(named(figure)))
     for label, at in (("start", 0), ("end", -1)):
         np.testing.assert_array_equal(line(axes, label).get_xydata()[0], estimate.pose[at, :2])
-    assert png(figure, 40).startswith(b"\x89PNG")
+    assert _style.png(figure, 40).startswith(b"\x89PNG")
 
 
 def test_paths_that_coincide_can_all_be_seen_in_a_map():
@@ -90,7 +87,7 @@ def test_paths_that_coincide_can_all_be_seen_in_a_map():
 
 @pytest.mark.parametrize("count", swept([3, 5, 7, 11], 5))
 def test_the_lowest_map_of_each_column_has_the_abscissa(count):
-    figure = run_map_figure(drawn.campaign([f"filter{i}" for i in range(count)]))
+    figure = _landmarks.run_map_figure(drawn.campaign([f"filter{i}" for i in range(count)]))
     figure.draw_without_rendering()
     shown = [axes for axes in figure.axes if axes.axison]
     columns = 3 if count <= 9 else 4
@@ -106,7 +103,7 @@ def test_the_lowest_map_of_each_column_has_the_abscissa(count):
 def test_maps_without_landmarks_and_with_broken_covariances_can_be_drawn():
     _, estimate = drawn.run_of("ekf")
     nothing = estimate._replace(alive=np.zeros_like(estimate.alive))
-    assert png(plot.map_figure(nothing), 40).startswith(b"\x89PNG")
+    assert _style.png(plot.map_figure(nothing), 40).startswith(b"\x89PNG")
     covs = estimate.point_covs.copy()
     covs[-1, 0] = np.nan
     figure = plot.map_figure(estimate._replace(point_covs=covs))
@@ -150,7 +147,7 @@ def test_errors_are_drawn_within_their_claimed_bounds():
     figure = plot.errors_figure(estimate, turned)
     expected = ["x error [m]", "y error [m]", "heading error [°]"]
     assert [axes.get_ylabel() for axes in figure.axes] == expected
-    x, _, heading = (curves_of(axes)[0].get_ydata() for axes in figure.axes)
+    x, _, heading = (_style.curves_of(axes)[0].get_ydata() for axes in figure.axes)
     np.testing.assert_allclose(x, -0.1)
     np.testing.assert_allclose(heading, 0.0, atol=1e-9)
     edges = figure.axes[0].collections[0].get_paths()[0].vertices[:, 1]
@@ -159,15 +156,17 @@ def test_errors_are_drawn_within_their_claimed_bounds():
 
 def test_errors_and_maps_show_every_filter_on_scales_that_dead_reckoning_does_not_set():
     names = ["dead_reckoning", "ekf", "fej"]
-    found = drawn.campaign(names)
-    figure = run_errors_figure(found, title="run 0")
+    campaign = drawn.campaign(names)
+    figure = _pose_errors.run_errors_figure(campaign, title="run 0")
     rows = np.array(figure.axes).reshape(3, 3)
     assert [row[0].get_ylabel().replace("\n", "") for row in rows] == names
     assert rows[0, 0].get_ylim() == rows[1, 0].get_ylim() == pytest.approx((-0.315, 0.315))
-    marked = [any(each.get_gid() == BEYOND for each in axes.lines) for axes in rows[:, 0]]
+    marked = [
+        any(artist.get_gid() == _panels.BEYOND for artist in axes.lines) for axes in rows[:, 0]
+    ]
     assert marked == [True, False, False]
     assert rows[0, 0].get_title("right") == "↓ to −4"
-    maps = run_map_figure(found, title="run 0")
+    maps = _landmarks.run_map_figure(campaign, title="run 0")
     shown = [axes for axes in maps.axes if axes.axison]
     assert [axes.get_title("left") for axes in shown] == names
     assert len({axes.get_xlim() for axes in shown}) == 1
@@ -175,28 +174,28 @@ def test_errors_and_maps_show_every_filter_on_scales_that_dead_reckoning_does_no
 
 
 def test_errors_far_below_the_others_have_a_scale_of_their_own():
-    found = drawn.campaign(["ekf", "fej", "localization"])
-    truth, estimate = found.first["localization"]
+    campaign = drawn.campaign(["ekf", "fej", "localization"])
+    truth, estimate = campaign.first["localization"]
     near = truth.pose + (np.asarray(estimate.pose) - truth.pose) / 100
     close = estimate._replace(pose=near, pose_cov=np.asarray(estimate.pose_cov) / 100**2)
-    first = found.first | {"localization": (truth, close)}
-    rows = run_errors_figure(dataclasses.replace(found, first=first)).axes
-    common, own = rows[0].get_ylim()[1], rows[6].get_ylim()[1]
-    assert own == pytest.approx(common / 100)
+    first = campaign.first | {"localization": (truth, close)}
+    rows = _pose_errors.run_errors_figure(dataclasses.replace(campaign, first=first)).axes
+    common, narrow = rows[0].get_ylim()[1], rows[6].get_ylim()[1]
+    assert narrow == pytest.approx(common / 100)
     assert {label.get_weight() for label in rows[6].get_yticklabels()} == {"bold"}
 
 
 def test_a_run_of_one_filter_has_the_figure_of_one_and_none_is_refused():
-    found = drawn.campaign(["ekf"])
-    assert len(run_errors_figure(found).axes) == 3
-    assert len(run_map_figure(found).axes) == 1
-    nothing = dataclasses.replace(found, first={})
-    for draw in (run_errors_figure, run_map_figure):
+    campaign = drawn.campaign(["ekf"])
+    assert len(_pose_errors.run_errors_figure(campaign).axes) == 3
+    assert len(_landmarks.run_map_figure(campaign).axes) == 1
+    nothing = dataclasses.replace(campaign, first={})
+    for draw in (_pose_errors.run_errors_figure, _landmarks.run_map_figure):
         with pytest.raises(ValueError, match=f"{draw.__name__}: the campaign holds no run 0"):
             draw(nothing)
         with pytest.raises(ValueError, match="the first argument: expected a Campaign, got"):
-            draw(found.first["ekf"])
+            draw(campaign.first["ekf"])
     with pytest.raises(
         ValueError, match="expected an Estimate, got a Trace; give its field estimate"
     ):
-        plot.map_figure(Trace(found.first["ekf"][1], None, None, None))
+        plot.map_figure(Trace(campaign.first["ekf"][1], None, None, None))

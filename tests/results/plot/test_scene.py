@@ -10,15 +10,9 @@ import pytest
 import worlds
 
 import jaxslam
-from jaxslam import catalog, filters, plot
+from jaxslam import catalog, filters, motion, plot, sensors
 from jaxslam.core.types import Info, Log, Scan, Status, Trace
-from jaxslam.filters._delayed.state import TableLayout, empty_state
-from jaxslam.filters._information.eif_slam import CanonicalState
-from jaxslam.filters._information.sparse_state import empty_map
-from jaxslam.filters._particles.slam_particles import initial_slam_particles
-from jaxslam.results.plot._film import still
-from jaxslam.results.plot._grid_figures import map_scene
-from jaxslam.results.plot._run_film import MOST, Cloud, Hypotheses, Links, history_of, run_scene
+from jaxslam.results.plot import _film, _grid_figures, _run_film
 
 STEPS = 3
 # Landmark 2 is new in the last step; a measurement of landmark 1 fails the gate there.
@@ -44,10 +38,14 @@ def run_of(steps=STEPS, seen=None):
     return Trace(grown, info, None, seen), Log(np.zeros((steps, 2)), scan), truth
 
 
-def scene_of(steps=STEPS, seen=None, frames=MOST, **more):
+def scene_of(steps=STEPS, seen=None, frames=_run_film.MOST, **options):
     trace, log, truth = run_of(steps, seen)
-    true = {"true_points": truth.landmarks, "true_path": truth.pose} | more
-    return run_scene(history_of(trace, log, frames), **true), trace.estimate, truth
+    true = {"true_points": truth.landmarks, "true_path": truth.pose} | options
+    return (
+        _run_film.run_scene(_run_film.history_of(trace, log, frames), **true),
+        trace.estimate,
+        truth,
+    )
 
 
 def staged(panel):
@@ -175,19 +173,23 @@ def test_limits_are_those_of_the_truth_unless_the_estimate_is_near():
         assert low < values.min() and values.max() < high
     trace, log, truth = run_of()
     lost = trace._replace(estimate=trace.estimate._replace(pose=trace.estimate.pose * 100))
-    scene = run_scene(history_of(lost, log), true_points=truth.landmarks, true_path=truth.pose)
+    scene = _run_film.run_scene(
+        _run_film.history_of(lost, log), true_points=truth.landmarks, true_path=truth.pose
+    )
     assert np.ptp(scene.main.xlim) < 12
-    assert np.ptp(run_scene(history_of(lost, log)).main.xlim) > 200
+    assert np.ptp(_run_film.run_scene(_run_film.history_of(lost, log)).main.xlim) > 200
 
 
 def test_particles_are_drawn_by_weight():
     rng = np.random.default_rng(0)
-    seen = Cloud(rng.normal(size=(STEPS, 4, 3)), np.tile([0.5, 0.25, 0.25, 0.0], (STEPS, 1)))
+    seen = _run_film.Cloud(
+        rng.normal(size=(STEPS, 4, 3)), np.tile([0.5, 0.25, 0.25, 0.0], (STEPS, 1))
+    )
     scene, estimate, _ = scene_of(seen=seen)
     for panel, origin in ((scene.main, 0.0), (scene.beside, estimate.pose[1, :2])):
         axes, draw = staged(panel)
         draw(1)
-        (dots,) = [each for each in axes.collections if len(each.get_offsets())]
+        (dots,) = [collection for collection in axes.collections if len(collection.get_offsets())]
         np.testing.assert_allclose(dots.get_offsets(), seen.pose[1, :3, :2] - origin)
         np.testing.assert_allclose(dots.get_sizes(), [8.0, 4.0, 4.0])
 
@@ -196,16 +198,16 @@ def test_links_appear_and_are_cut():
     strength = np.zeros((STEPS, 4, 4))
     strength[0, 0, 1] = strength[1, 0, 1] = strength[1, 1, 2] = 0.25
     strength[2, 1, 2] = 1.0
-    scene, estimate, _ = scene_of(seen=Links(strength + np.swapaxes(strength, 1, 2)))
+    scene, estimate, _ = scene_of(seen=_run_film.Links(strength + np.swapaxes(strength, 1, 2)))
     axes, draw = staged(scene.main)
     between, robot = (
-        next(each for each in axes.collections if each.get_label() == label)
+        next(collection for collection in axes.collections if collection.get_label() == label)
         for label in ("link of landmarks", "link to the robot")
     )
     for k, (of_robot, of_landmarks, cut) in enumerate([(1, 0, 0), (1, 1, 0), (0, 1, 1)]):
         draw(k)
-        here, points = estimate.pose[k, :2], estimate.points[k]
-        np.testing.assert_array_equal(robot.get_segments(), [[here, points[0]]] * of_robot)
+        position, points = estimate.pose[k, :2], estimate.points[k]
+        np.testing.assert_array_equal(robot.get_segments(), [[position, points[0]]] * of_robot)
         np.testing.assert_array_equal(
             between.get_segments(), [[points[0], points[1]]] * of_landmarks
         )
@@ -216,10 +218,10 @@ def test_links_appear_and_are_cut():
 def test_hypotheses_are_drawn_until_they_are_landmarks():
     points = np.arange(STEPS * 4.0).reshape(STEPS, 2, 2)
     covs = np.tile(0.04 * np.eye(2), (STEPS, 2, 1, 1))
-    seen = Hypotheses(points, covs, np.array([[0.0, 0.0], [1.0, 3.0], [0.0, 1.5]]))
+    seen = _run_film.Hypotheses(points, covs, np.array([[0.0, 0.0], [1.0, 3.0], [0.0, 1.5]]))
     scene, *_ = scene_of(seen=seen)
     axes, draw = staged(scene.main)
-    (marked,) = [each for each in axes.lines if each.get_marker() == "D"]
+    (marked,) = [artist for artist in axes.lines if artist.get_marker() == "D"]
     for k, shown in enumerate([[], [0, 1], [1]]):
         draw(k)
         np.testing.assert_array_equal(marked.get_xydata(), points[k, shown])
@@ -260,7 +262,9 @@ def test_another_film_is_another_layer():
         image = axes.imshow(images[0], cmap="gray", vmin=0, vmax=1, extent=(0, 1, 0, 1))
         return lambda k: image.set_data(images[k])
 
-    panel = plot.Panel([growing, still(np.array([[0.5, 0.5]]), color="white")], (0, 1), (0, 1))
+    panel = plot.Panel(
+        [growing, _film.still(np.array([[0.5, 0.5]]), color="white")], (0, 1), (0, 1)
+    )
     film = plot.Film(plot.Scene(3, panel), width=4.0, fps=4)
     middle = [picture[110, 100, 0] for picture in pictures(film)]
     assert [film.scene.caption(k) for k in range(3)] == ["frame 1", "frame 2", "frame 3"]
@@ -313,9 +317,12 @@ def test_a_run_that_is_not_finite_is_drawn_as_far_as_it_goes_and_says_so():
 # --- what is seen of a filter's state -----------------------------------------------------------
 
 
+MODELS = motion.Increment(np.eye(2)), sensors.RangeBearing(np.eye(2))
+
+
 def test_of_particles_their_poses_and_weights_are_seen():
-    start = np.ones(3), np.zeros((3, 3))
-    seen = jax.jit(lambda: plot.probe(initial_slam_particles(*map(jnp.asarray, start), 4, 2, 2)))()
+    filter = filters.FastSlam(*MODELS, capacity=2, particles=4)
+    seen = jax.jit(lambda: plot.probe(filter.init(jnp.ones(3), jnp.zeros((3, 3)))))()
     np.testing.assert_array_equal(seen.pose, np.ones((4, 3)))
     np.testing.assert_allclose(seen.weight, 0.25)
     assert plot.probe(np.zeros(3)) is None
@@ -331,13 +338,14 @@ def test_of_information_the_links_are_seen_dense_and_sparse():
     size = np.array([[np.linalg.norm(omega[a, b]) for b in rows] for a in rows])
     expected = size / np.sqrt(np.outer(np.diag(size), np.diag(size)))
     np.fill_diagonal(expected, 0.0)
-    dense = CanonicalState(
-        np.zeros(3), np.zeros((3, 2)), omega, np.zeros(9), np.ones(3, bool), np.arange(3), 0
-    )
+    start = jnp.zeros(3), jnp.eye(3)
+    dense = filters.EifSlam(*MODELS, capacity=3).init(*start)
+    dense = dense._replace(omega=omega, alive=np.ones(3, bool), tag=np.arange(3))
     find = jax.jit(plot.probe)
     np.testing.assert_allclose(find(dense).strength, expected, rtol=1e-5)
     # Landmarks 0 and 1 are active; 2 is passive, and linked by its list.
-    sparse = empty_map(np.zeros(3), omega[:3, :3], capacity=3, active=2, links=2)._replace(
+    seif = filters.Seif(*MODELS, capacity=3, active=2, links=2)
+    sparse = seif.init(*start)._replace(
         alive=np.ones(3, bool),
         active=np.array([0, 1]),
         omega=omega[:7, :7],
@@ -355,11 +363,17 @@ def test_of_information_the_links_are_seen_dense_and_sparse():
 
 
 def test_of_delayed_initialization_the_hypotheses_are_seen():
-    layout = TableLayout(landmarks=2, hypotheses=3, stored=4)
-    state = empty_state(layout, jnp.zeros(3), jnp.zeros((3, 3)))
+    filter = filters.DelayedSlam(
+        MODELS[0],
+        sensors.BearingOnly(np.eye(1)),
+        capacity=2,
+        stored=filters.StoredMeasurements(capacity=4),
+        hypotheses=filters.Hypotheses(capacity=3),
+    )
+    state = filter.init(jnp.zeros(3), jnp.zeros((3, 3)))
     rng = np.random.default_rng(2)
     cov = np.cov(rng.normal(size=(30, 60)))
-    table = rng.normal(size=(layout.slots, 3))
+    table = rng.normal(size=state.joint.landmarks.shape)
     alive = np.array([1, 1, 1, 0, 1, 1, 1, 0, 0], bool)
     joint = state.joint._replace(landmarks=table, cov=cov, alive=alive)
     seen = jax.jit(plot.probe)(state._replace(joint=joint, persistence=jnp.array([1.0, 5.0, 2.5])))
@@ -394,7 +408,7 @@ def test_mapping_from_a_known_path_is_filmed():
 def test_a_map_scene_has_as_many_paths_as_maps():
     origin, path = np.zeros(3), np.zeros((2, 3))
     maps = [np.zeros((2, 3)), np.ones((2, 3))]
-    scene = map_scene(maps, origin, 0.5, [path, path], ["one", "two"])
+    scene = _grid_figures.map_scene(maps, origin, 0.5, [path, path], ["one", "two"])
     assert scene.frames == 2 and scene.caption(1) == "two"
     assert scene.main.xlim == (0.0, 1.5) and scene.main.ylim == (0.0, 1.0)
     for wrong, message in (
@@ -403,4 +417,4 @@ def test_a_map_scene_has_as_many_paths_as_maps():
         ((maps, np.ones(3), 0.5, [path, path], ["one", "two"]), "without yaw"),
     ):
         with pytest.raises(ValueError, match=message):
-            map_scene(*wrong)
+            _grid_figures.map_scene(*wrong)
