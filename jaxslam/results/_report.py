@@ -24,8 +24,18 @@ _WIDTH = 88
 def campaign_table(campaign: Campaign) -> str:
     """The campaign as text tables of at most five filters, one column each, with notes below."""
     names = list(campaign.filters)
-    parts = [names[i : i + _COLUMNS] for i in range(0, len(names), _COLUMNS)]
-    text = "\n\n".join(_columns(campaign, part) for part in parts)
+    tables = []
+    for i in range(0, len(names), _COLUMNS):
+        rows = [["", "honest", *names[i : i + _COLUMNS]]]
+        for row in rows_of(campaign, names[i : i + _COLUMNS]):
+            rows.append([row.label, row.honest, *map(cell_text, row.cells)])
+            if row.published:
+                values = ("" if value is None else short(value) for value in row.published)
+                rows.append(["  published", "", *values])
+        table = text_table(rows)
+        table.insert(1, "-" * len(table[0]))
+        tables.append("\n".join(table))
+    text = "\n\n".join(tables)
     title = f"{campaign.scenario}: {campaign.size}"
     verdicts = {summary.verdict for summary in campaign.filters.values()}
     notes = [
@@ -166,19 +176,6 @@ def as_csv(campaign: Campaign) -> str:
         columns = [map(_csv_number, s.curves.get(key, nothing).tolist()) for key in keys]
         rows += [[name, str(step + 1), *row] for step, row in enumerate(zip(*columns, strict=True))]
     return csv_text(["filter", "step", *keys], rows)
-
-
-def _columns(campaign: Campaign, names: list[str]) -> str:
-    """The table of some filters."""
-    lines = [["", "honest", *names]]
-    for row in rows_of(campaign, names):
-        lines.append([row.label, row.honest, *map(cell_text, row.cells)])
-        if row.published:
-            values = ("" if value is None else short(value) for value in row.published)
-            lines.append(["  published", "", *values])
-    text = text_table(lines)
-    text.insert(1, "-" * len(text[0]))
-    return "\n".join(text)
 
 
 def _finite_or_none(values: Iterable[float]) -> list[float | None]:

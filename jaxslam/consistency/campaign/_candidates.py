@@ -173,7 +173,11 @@ def check_fits(name: str, candidate: Candidate, scenario: World) -> None:
         ("controls", candidate.controls, scenario.motion.controls),
         ("measurements", candidate.measurements, scenario.sensor.measurements),
     ):
-        if len(expected) != len(present) or not all(map(_have_one_unit, expected, present)):
+        # An entry without a unit fits any.
+        pairs = zip(expected, present, strict=False)
+        units = [{split_unit(a)[1], split_unit(b)[1]} for a, b in pairs]
+        fit = all(len(pair) == 1 or None in pair for pair in units)
+        if len(expected) != len(present) or not fit:
             raise ValueError(
                 f"monte_carlo: filter {name} takes {field} ({', '.join(expected)}), "
                 f"the scenario {scenario.name} gives ({', '.join(present)})"
@@ -185,12 +189,6 @@ def check_fits(name: str, candidate: Candidate, scenario: World) -> None:
             f"monte_carlo: filter {name} has a map of {size} landmarks, the scenario "
             f"{scenario.name} has {count}; a map of some of them needs their tags"
         )
-
-
-def _have_one_unit(a: str, b: str) -> bool:
-    """Whether two names have the same unit; True where either has none."""
-    units = {split_unit(name)[1] for name in (a, b)}
-    return len(units) == 1 or None in units
 
 
 def check_called(name: str, candidate: Callable[..., object]) -> None:
