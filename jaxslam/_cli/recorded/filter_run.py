@@ -128,6 +128,13 @@ def _summary(result: PiecewiseRun, unplaced: int, constants: str, seconds: float
     """
     nis = np.where(result.status == Status.FUSED, result.nis, 0.0).sum()
     dof = int(result.dof.sum())
+    definite = "not checked"
+    if result.checked:
+        definite = f"at {sum(result.passed)} of {len(result.passed)} checked steps"
+        failed = [k for k, passed in zip(result.checked, result.passed, strict=True) if not passed]
+        if failed:
+            ellipsis = ", …" if len(failed) > 5 else ""
+            definite += f", not at {', '.join(map(str, failed[:5]))}{ellipsis}"
     innovations = {  # of filters that have innovations
         "NIS / dof": float(nis / max(dof, 1)),
         "log-likelihood": float(result.log_likelihood.sum()),
@@ -139,23 +146,11 @@ def _summary(result: PiecewiseRun, unplaced: int, constants: str, seconds: float
         },
         **({"measurements without a true pose, left out": unplaced} if unplaced else {}),
         **(innovations if dof else {}),
-        "P positive definite": _definiteness(result),
+        "P positive definite": definite,
         **({"uncertainty of constants": constants} if constants else {}),
         "final pose": [float(value) for value in result.last.pose],
         "seconds": round(seconds, 2),
     }
-
-
-def _definiteness(result: PiecewiseRun) -> str:
-    """The number of checked steps with positive definite P, and the first without, as text."""
-    if not result.checked:
-        return "not checked"
-    failed = [step for step, good in zip(result.checked, result.passed, strict=True) if not good]
-    count = f"at {sum(result.passed)} of {len(result.passed)} checked steps"
-    if not failed:
-        return count
-    ellipsis = ", …" if len(failed) > 5 else ""
-    return f"{count}, not at {', '.join(map(str, failed[:5]))}{ellipsis}"
 
 
 def suspicions(summary: Json) -> list[str]:

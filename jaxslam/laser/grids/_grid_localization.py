@@ -222,7 +222,12 @@ class GridLocalization(MonteCarloFilter):
         # Without `no_inline` XLA computes it again in each of its consumers.
         fit = no_inline(fit_of, state.pose, in_dtype(self.prepared, state.pose.dtype), beams)
         # After the likelihood, which is finite there: ∞ must not enter its derivative.
-        blocked = _is_blocked(self.grid, state.pose)
+        height, width = self.grid.log_odds.shape
+        origin, resolution = jnp.asarray(self.grid.origin), self.grid.resolution
+        cell = jnp.floor(to_cells(origin, resolution, state.pose[:, :2]))
+        on_map = (cell >= 0).all(axis=1) & (cell[:, 0] < width) & (cell[:, 1] < height)
+        j, i = jnp.where(on_map[:, None], cell, 0.0).astype(jnp.int32).T
+        blocked = ~on_map | (jnp.asarray(self.grid.log_odds > 0)[i, j])
         fit = jnp.where(blocked, jnp.inf, fit)
         misfit = jnp.where(blocked, jnp.inf, jnp.asarray(self.exponent, fit.dtype) * fit)
         evidence = normalized(state.log_weight - misfit)[1]
@@ -235,15 +240,6 @@ class GridLocalization(MonteCarloFilter):
     def estimate(self, state: PoseParticles) -> Estimate:
         no_points = jnp.zeros((0, 2), state.pose.dtype)
         return self.pose_estimate(state, no_points, jnp.zeros(0, jnp.int32))
-
-
-def _is_blocked(grid: Grid, pose: Float[Array, "P 3"]) -> Bool[Array, "P"]:
-    """The mask of the poses off the map or in an occupied cell."""
-    height, width = grid.log_odds.shape
-    at = jnp.floor(to_cells(jnp.asarray(grid.origin), grid.resolution, pose[:, :2]))
-    inside = (at >= 0).all(axis=1) & (at[:, 0] < width) & (at[:, 1] < height)
-    j, i = jnp.where(inside[:, None], at, 0.0).astype(jnp.int32).T
-    return ~inside | (jnp.asarray(grid.log_odds > 0)[i, j])
 
 
 def info_of_beams(
