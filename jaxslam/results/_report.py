@@ -12,7 +12,7 @@ from jaxslam.consistency._measures.coverage import LEVELS
 from jaxslam.consistency._verdict import POWER, TESTS, TOLERANCE, honest_values
 from jaxslam.consistency.campaign import Campaign
 from jaxslam.results._files import csv_text, json_number, json_text, text_table, versions
-from jaxslam.results._table import VERDICTS, Cell, cell_text, lost_runs, notes_on, rows_of, short
+from jaxslam.results._table import VERDICTS, cell_text, lost_runs, notes_on, rows_of, short
 
 _COLUMNS = 5
 """Largest number of filters beside each other."""
@@ -151,20 +151,18 @@ def table_csv(campaign: Campaign) -> str:
     """
     names = list(campaign.filters)
     ends = [f"{name}{end}" for name in names for end in ("", " low", " high")]
-    rows = [
-        [row.label.strip(), row.honest, *(text for cell in row.cells for text in _csv_cells(cell))]
-        for row in rows_of(campaign, names)
-    ]
+    rows = []
+    for row in rows_of(campaign, names):
+        texts = [row.label.strip(), row.honest]
+        for cell in row.cells:  # the value and the ends of its interval
+            if isinstance(cell, Average):
+                texts += [_csv_number(value) for value in cell]
+            elif cell is None or isinstance(cell, Summary):
+                texts += [cell.verdict if cell else "", "", ""]
+            else:
+                texts += [cell.text if cell.value is None else _csv_number(cell.value), "", ""]
+        rows.append(texts)
     return csv_text(["measure", "honest", *ends], rows)
-
-
-def _csv_cells(cell: Cell) -> list[str]:
-    """A cell as three columns of CSV: the value and the ends of its interval."""
-    if isinstance(cell, Average):
-        return [_csv_number(value) for value in cell]
-    if cell is None or isinstance(cell, Summary):
-        return [cell.verdict if cell else "", "", ""]
-    return [cell.text if cell.value is None else _csv_number(cell.value), "", ""]
 
 
 def as_csv(campaign: Campaign) -> str:

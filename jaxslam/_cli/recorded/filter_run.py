@@ -16,7 +16,7 @@ from jaxslam.core.slots import Joint
 from jaxslam.core.types import Log, Status
 from jaxslam.datasets import Dataset
 from jaxslam.datasets._evaluation import Evaluation, evaluate, joint_map_cov
-from jaxslam.datasets._uncertain_constants import AddedCov, consider_constants
+from jaxslam.datasets._uncertain_constants import consider_constants
 from jaxslam.math._definite import indefinite
 from jaxslam.results._files import Json
 
@@ -75,7 +75,16 @@ def run_filter(
         added = consider_constants(data, lambda *models: chosen_filters(data, name, models)[name])
         if added is not None:
             constants = "added"
-            result = _add_cov(result, added)
+            # (N, 2, N, 2) -> (N, 2, 2): the blocks of each landmark with itself.
+            point_covs = np.moveaxis(np.diagonal(added.points, axis1=0, axis2=2), -1, 0)
+            path, last = result.path, result.last
+            result = result._replace(
+                path=path._replace(pose_cov=path.pose_cov + added.pose),
+                last=last._replace(
+                    pose_cov=last.pose_cov + added.pose[-1],
+                    point_covs=last.point_covs + point_covs,
+                ),
+            )
             map_cov = None if map_cov is None else map_cov + added.points
     evaluation = evaluate(data, result.path, result.last, map_cov)
     summary = _summary(result, unplaced, constants, seconds) | evaluation.errors
@@ -83,19 +92,6 @@ def run_filter(
         summary |= evaluation.map_test.rows()
     notes = suspicions(summary)
     return FilterRun(result, evaluation, summary | ({"notes": notes} if notes else {}))
-
-
-def _add_cov(result: PiecewiseRun, added: AddedCov) -> PiecewiseRun:
-    """The run with the covariances that uncertain constants add to its path and its last map."""
-    # (N, 2, N, 2) -> (N, 2, 2): the blocks of each landmark with itself.
-    point_covs = np.moveaxis(np.diagonal(added.points, axis1=0, axis2=2), -1, 0)
-    path, last = result.path, result.last
-    return result._replace(
-        path=path._replace(pose_cov=path.pose_cov + added.pose),
-        last=last._replace(
-            pose_cov=last.pose_cov + added.pose[-1], point_covs=last.point_covs + point_covs
-        ),
-    )
 
 
 def on_true_poses(data: Dataset) -> tuple[Log, int]:
