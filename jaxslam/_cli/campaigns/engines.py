@@ -39,8 +39,8 @@ def engine(value: str | None) -> Iterator[tuple[Executor | None, int | None]]:
             ranks = MPI.COMM_WORLD.Get_size()
         if ranks < 2:
             raise ValueError(f"--executor: expected two ranks of MPI or more: {_MPI}")
-        with MPIPoolExecutor() as pool:
-            yield pool, 2 * pool.num_workers
+        with MPIPoolExecutor() as executor:
+            yield executor, 2 * executor.num_workers
     elif match := re.fullmatch(r"dask://(.+:\d+)", value, re.ASCII):
         with _dask_client(match[1]) as client:
             yield client.get_executor(pure=False), 2 * sum(client.nthreads().values())
