@@ -131,16 +131,6 @@ def _options(scenario: World, overrides: dict[str, Any], *names: str) -> dict[st
     return {name: options[name] for name in names if name in options}
 
 
-def _localization(scenario: World, **options: Any) -> Callable[[Truth], Filter]:
-    used = _options(scenario, options, "correction", "gate", "iterations")
-    return _InTrueMap(Localization(scenario.motion, scenario.sensor, scenario.landmarks, **used))
-
-
-def _mapping(scenario: World, **options: Any) -> Callable[[Truth], Estimator]:
-    """Mapping from the true path. Its pose has no NEES: it is exact."""
-    return _OnTruePath(on_given_poses(scenario, **options), np.asarray(scenario.pose))
-
-
 def _fastslam(
     scenario: World, proposal: Literal["motion", "measurement"], **options: Any
 ) -> Filter:
@@ -254,8 +244,18 @@ _BY_KIND: dict[str, dict[str, Callable[..., Candidate]]] = {
     },
     "baselines": {
         "dead_reckoning": lambda world, **options: DeadReckoning(world.motion, world.sensor),
-        "localization": _localization,
-        "mapping": _mapping,
+        "localization": lambda world, **options: _InTrueMap(
+            Localization(
+                world.motion,
+                world.sensor,
+                world.landmarks,
+                **_options(world, options, "correction", "gate", "iterations"),
+            )
+        ),
+        # Its pose has no NEES: it is exact.
+        "mapping": lambda world, **options: _OnTruePath(
+            on_given_poses(world, **options), np.asarray(world.pose)
+        ),
     },
 }
 """Filters by kind and name. Baselines are the worst and the best cases of a SLAM filter: no

@@ -214,7 +214,15 @@ def optimize_graph(options: argparse.Namespace, command: str) -> int:
     status = write_optimum(options.out, plan, optimum, summary)
     if optimum.converged:
         return status
-    print(f"jaxslam: {optimum.status}{_advice(optimum)}", file=sys.stderr)
+    advice, ending = "", int(optimum.solution.status)
+    if ending != Ending.SINGULAR:  # whose status is enough
+        untried = ", ".join(name for name in STARTS if name not in optimum.cost_by_start)
+        longer = ", more --iterations" * (ending == Ending.EXHAUSTED)
+        advice = (
+            f": no minimum was reached; try another start (--start {untried}){longer}, "
+            "or --kernel if loops may be false"
+        )
+    print(f"jaxslam: {optimum.status}{advice}", file=sys.stderr)
     return NOT_CONVERGED
 
 
@@ -338,6 +346,17 @@ def summarize(plan: OptimizePlan, optimum: Optimum, command: str) -> Json:
     """The entries of the summary, in the order in which they are printed."""
     problem, graph, solution = optimum.problem, optimum.graph, optimum.solution
     plain = "" if plan.kernel is None else " without the kernel"
+    # `graphs.with_gauge` fixes a pose only in a graph without a gauge.
+    fixed_pose = problem.graph.fixed_pose
+    if not np.array_equal(fixed_pose, problem.loaded.graph.fixed_pose):
+        gauge = (
+            f"pose {int(problem.graph.pose_id[fixed_pose.argmax()])} is fixed, "
+            "since the file fixes none"
+        )
+    else:
+        poses, points = int(fixed_pose.sum()), int(problem.graph.fixed_point.sum())
+        fixed = [f"{poses} poses"] * (poses > 0) + [f"{points} points"] * (points > 0)
+        gauge = " and ".join(fixed) + " fixed by the file" if fixed else "by priors"
     return {
         "file": str(plan.path),
         "command": command,
@@ -347,7 +366,7 @@ def summarize(plan: OptimizePlan, optimum: Optimum, command: str) -> Json:
         "edges": {key: int(table.valid.sum()) for key, table in graph.tables.items()},
         "skipped lines": problem.loaded.skipped,
         "placed along the edges": problem.loaded.placed,
-        "gauge": _gauge(problem),
+        "gauge": gauge,
         "start": optimum.start,
         "kernel": plan.kernel or "none",
         **(_robust_entries(optimum, problem.kernels) if problem.kernels else {}),
@@ -381,33 +400,6 @@ def _robust_entries(optimum: Optimum, kernels: Mapping[str, graphs.Kernel]) -> J
         **{f"robust cost from {n}": json_number(c) for n, c in optimum.cost_by_start.items()},
         **{f"robust cost from {n}": f"none: {why}" for n, why in optimum.impossible.items()},
     }
-
-
-def _gauge(problem: Problem) -> str:
-    """The gauge in words: the fixed poses and points, or the priors."""
-    # `graphs.with_gauge` fixes a pose only in a graph without a gauge.
-    fixed_pose = problem.graph.fixed_pose
-    if not np.array_equal(fixed_pose, problem.loaded.graph.fixed_pose):
-        return (
-            f"pose {int(problem.graph.pose_id[fixed_pose.argmax()])} is fixed, "
-            "since the file fixes none"
-        )
-    poses, points = int(fixed_pose.sum()), int(problem.graph.fixed_point.sum())
-    fixed = [f"{poses} poses"] * (poses > 0) + [f"{points} points"] * (points > 0)
-    return " and ".join(fixed) + " fixed by the file" if fixed else "by priors"
-
-
-def _advice(optimum: Optimum) -> str:
-    """Advice if no minimum was reached; empty for a singular graph, whose status is enough."""
-    status = int(optimum.solution.status)
-    if status == Ending.SINGULAR:
-        return ""
-    untried = ", ".join(name for name in STARTS if name not in optimum.cost_by_start)
-    longer = ", more --iterations" * (status == Ending.EXHAUSTED)
-    return (
-        f": no minimum was reached; try another start (--start {untried}){longer}, "
-        "or --kernel if loops may be false"
-    )
 
 
 def worst_rows(

@@ -57,7 +57,21 @@ class JointCompatibility:
         quantiles = [chi2_quantile(self.probability, k * size_z) for k in range(1, m + 1)]
         levels = jnp.asarray([0.0, *quantiles], pairs.distance.dtype)
         cross = jax.lax.stop_gradient(prediction.cross())
-        problem = _problem(pairs, cross, levels, self.candidates)
+        compatible = pairs.possible & (pairs.distance <= levels[1])
+        order = jnp.argsort(jnp.where(compatible, pairs.distance, jnp.inf), axis=1)
+        slot = order[:, : min(self.candidates, order.shape[1])].astype(jnp.int32)
+        at = jnp.arange(m)[:, None], slot
+        left = jnp.append(jnp.cumsum(compatible.any(axis=1)[::-1])[::-1], 0)
+        problem = _Problem(
+            slot=slot,
+            is_compatible=compatible[at],
+            innovation=pairs.innovation[at],
+            cov=pairs.cov[at],
+            cross=cross,
+            levels=levels,
+            left=left,
+            cut=(compatible.sum(axis=1) > slot.shape[1]).any(),
+        )
         search = _search(problem, self.budget)
         exhausted = (search.level >= 0) | problem.cut
         far = far_from_all(pairs, scan, self.probability, self.new_gate)
@@ -80,29 +94,6 @@ class _Problem(NamedTuple):
     """number of measurements from the i-th on that have candidates"""
     cut: Bool[Array, ""]
     """whether a measurement had more than K candidates"""
-
-
-def _problem(
-    pairs: Pairs, cross: Float[Array, "N Z N Z"], levels: Float[Array, "levels"], candidates: int
-) -> _Problem:
-    m, n = pairs.distance.shape
-    compatible = pairs.possible & (pairs.distance <= levels[1])
-    order = jnp.argsort(jnp.where(compatible, pairs.distance, jnp.inf), axis=1)
-    slot = order[:, : min(candidates, n)].astype(jnp.int32)
-    at = jnp.arange(m)[:, None], slot
-    some = compatible.any(axis=1)
-    # Sums from the end: how many pairs a branch at level i can still make at most.
-    left = jnp.append(jnp.cumsum(some[::-1])[::-1], 0)
-    return _Problem(
-        slot=slot,
-        is_compatible=compatible[at],
-        innovation=pairs.innovation[at],
-        cov=pairs.cov[at],
-        cross=cross,
-        levels=levels,
-        left=left,
-        cut=(compatible.sum(axis=1) > slot.shape[1]).any(),
-    )
 
 
 class _Search(NamedTuple):

@@ -195,7 +195,18 @@ def consider_cov(
         raise ValueError(
             f"consider_cov: expected parameters of shape (P,), finite, got {parameters!r}"
         )
-    c = _covariance(cov, p.size)
+    c = np.asarray(cov, np.float64)
+    c = c.reshape(1, 1) if c.ndim == 0 and p.size == 1 else c
+    if c.shape != (p.size, p.size):
+        raise ValueError(
+            f"consider_cov: expected a covariance of shape {(p.size, p.size)}, got one of {c.shape}"
+        )
+    if not np.isfinite(c).all():
+        raise ValueError("consider_cov: expected a covariance, got one that is not finite")
+    if asymmetric(c, 1e-6):  # written with six digits
+        raise ValueError("consider_cov: expected a covariance, got one that is not symmetric")
+    if indefinite(c, 1e-6):
+        raise ValueError("consider_cov: expected a covariance, got one with a negative eigenvalue")
 
     jacobians, values = jax.device_get(_differentiate(as_record(result), p))
     if not all(np.isfinite(leaf).all() for leaf in jax.tree.leaves((jacobians, values))):
@@ -228,20 +239,3 @@ def _differentiate(
 
     derivative: tuple[PyTree, PyTree] = jax.jacfwd(both, has_aux=True)(p)
     return derivative
-
-
-def _covariance(cov: ArrayLike, size: int) -> Float[np.ndarray, "P P"]:
-    """The covariance of so many parameters, as an array; raises ValueError on an invalid one."""
-    c = np.asarray(cov, np.float64)
-    c = c.reshape(1, 1) if c.ndim == 0 and size == 1 else c
-    if c.shape != (size, size):
-        raise ValueError(
-            f"consider_cov: expected a covariance of shape {(size, size)}, got one of {c.shape}"
-        )
-    if not np.isfinite(c).all():
-        raise ValueError("consider_cov: expected a covariance, got one that is not finite")
-    if asymmetric(c, 1e-6):  # written with six digits
-        raise ValueError("consider_cov: expected a covariance, got one that is not symmetric")
-    if indefinite(c, 1e-6):
-        raise ValueError("consider_cov: expected a covariance, got one with a negative eigenvalue")
-    return c

@@ -11,7 +11,7 @@ from typing import NamedTuple
 
 import numpy as np
 
-from jaxslam.consistency._intervals import EACH, LEVEL, Spread, percentage, spread
+from jaxslam.consistency._intervals import EACH, LEVEL, percentage, spread
 from jaxslam.consistency._measures.counts import DROPS, KEPT
 from jaxslam.consistency._measures.nees import DOF
 from jaxslam.core.types import Status
@@ -91,7 +91,10 @@ def judge(
             0 (of measured: all that have a status).
         nis_dof: the degrees of freedom of all NIS together.
     """
-    doubts, honest_nis = doubts_on(per_run, counts, nis_dof), _after_gate(counts, nis_dof)
+    doubts, honest_nis = doubts_on(per_run, counts, nis_dof), 1.0
+    fused, rejected = counts.get("fused", 0), counts.get("rejected", 0)
+    if fused and rejected and nis_dof > 0:  # as if all that failed the gate did so by their size
+        honest_nis = truncated_chi2_mean(rejected / (fused + rejected), nis_dof / fused)
     runs = counts["runs"] + counts["not_finite"]
     if counts["not_finite"] + counts.get("divergent", 0) > 0.5 * runs:
         return Verdict("diverged", (), {}, doubts, honest_nis)
@@ -103,8 +106,17 @@ def judge(
         of_nees = name == "nees_pose"
         average = spread(values, EACH, skewed=of_nees)
         assert average is not None
-        honest = honest_values(honest_nis)[name]
-        signs[name], noticed[name] = _side(average, *honest), _noticeable(average, *honest)
+        low, high = honest_values(honest_nis)[name]
+        signs[name] = 0
+        if average.low > high and average.high > high * (1 + TOLERANCE):
+            signs[name] = 1
+        elif average.high < low and average.low < low / (1 + TOLERANCE):
+            signs[name] = -1
+        # An average m is rejected beyond high·(m/μ at the lower end); the mean of which a share
+        # `POWER` lies beyond that is z standard errors farther, at the same relative spread.
+        margin = normal_quantile(POWER) * average.error
+        least, most = low * average.below, high * max(average.above, 1 + TOLERANCE)
+        noticed[name] = least / (1 + margin), most / (1 - margin) if margin < 1 else np.inf
         # Narrow enough to reject a NEES of twice the honest one.
         if of_nees and average.above <= 2:
             is_wide = False
@@ -135,32 +147,6 @@ def power_of(noticed: Mapping[str, tuple[float, float]]) -> str:
         if beyond:
             parts.append(f"a {TESTS[name]} {' or '.join(beyond)}")
     return f"{percentage(POWER)} power to reject {', '.join(parts)}" if parts else ""
-
-
-def _side(average: Spread, low: float, high: float) -> int:
-    """The sign of a rejection: 1 for an interval above the honest value, -1 for below, else 0."""
-    if average.low > high and average.high > high * (1 + TOLERANCE):
-        return 1
-    return -1 if average.high < low and average.low < low / (1 + TOLERANCE) else 0
-
-
-def _noticeable(average: Spread, low: float, high: float) -> tuple[float, float]:
-    """Averages that are noticed with probability `POWER`, of a relative spread as found.
-
-    An average m is rejected beyond high·(m/μ at the lower end); the mean of which a share `POWER`
-    lies beyond that is z standard errors farther.
-    """
-    margin = normal_quantile(POWER) * average.error
-    least, most = low * average.below, high * max(average.above, 1 + TOLERANCE)
-    return least / (1 + margin), most / (1 - margin) if margin < 1 else np.inf
-
-
-def _after_gate(counts: Mapping[str, int], nis_dof: float) -> float:
-    """The NIS/dof that is honest when all that failed the gate did so by its size."""
-    fused, rejected = counts.get("fused", 0), counts.get("rejected", 0)
-    if not (fused and rejected and nis_dof > 0):
-        return 1.0
-    return truncated_chi2_mean(rejected / (fused + rejected), nis_dof / fused)
 
 
 def is_faulty(counts: Mapping[str, int]) -> bool:

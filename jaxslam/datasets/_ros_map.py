@@ -185,8 +185,12 @@ def map_files(stem: str, grid: Grid, mode: str = "trinary") -> Files:
         occupied, free = 1.0, 0.0
         image, levels = _levels(log_odds)
     numbers = ", ".join(repr(float(value)) for value in np.asarray(grid.origin))
+    name = f"{stem}.pgm"
+    # YAML needs quotes unless a text has letters, digits and a few signs alone.
+    if not (name[0].isalnum() and all(sign.isalnum() or sign in " ._-/" for sign in name)):
+        name = "'" + name.replace("'", "''") + "'"
     text = (
-        f"image: {_scalar(f'{stem}.pgm')}\nmode: {mode}\nresolution: {float(grid.resolution)!r}\n"
+        f"image: {name}\nmode: {mode}\nresolution: {float(grid.resolution)!r}\n"
         f"origin: [{numbers}]\nnegate: 0\noccupied_thresh: {occupied}\nfree_thresh: {free}\n"
     )
     height, width = image.shape  # the first row is on top
@@ -289,9 +293,3 @@ class _Header:
         if value not in choices:
             raise self.error(key, f"expected {key} to be {' or '.join(choices)}, got {value}")
         return choices[value]
-
-
-def _scalar(text: str) -> str:
-    """A text in YAML: in quotes unless it has letters, digits and a few signs alone."""
-    plain = text[0].isalnum() and all(letter.isalnum() or letter in " ._-/" for letter in text)
-    return text if plain else "'" + text.replace("'", "''") + "'"

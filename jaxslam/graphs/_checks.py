@@ -48,7 +48,14 @@ def check_graph(name: str, graph: Graph, factors: Mapping[str, Factor]) -> None:
             raise ValueError(
                 f"{name}: table {key!r} has no factor; there are: {', '.join(factors) or 'none'}"
             )
-        _check_sizes(f"{name}: table {key!r}", table, factors[key])
+        prefix, factor = f"{name}: table {key!r}", factors[key]
+        rows = np.shape(table.who)[0]
+        k, z, r = (len(part) for part in (factor.variables, factor.measurements, factor.errors))
+        wanted = {"who": (rows, k), "z": (rows, z), "information": (rows, r, r), "valid": (rows,)}
+        for field, shape in wanted.items():
+            if (got := np.shape(getattr(table, field))) != shape:
+                raise ValueError(f"{prefix}: expected {field} of shape {shape}, got {got}")
+        _check_kind(prefix, who=(table.who, np.integer), valid=(table.valid, np.bool_))
     if not is_concrete(graph):
         return
     check_numbers(name, graph, factors)
@@ -118,17 +125,6 @@ def label(graph: Graph, variable: int) -> str:
     if variable < poses:
         return f"pose {int(graph.pose_id[variable])}"
     return f"point {int(graph.point_id[variable - poses])}"
-
-
-def _check_sizes(prefix: str, table: Table, factor: Factor) -> None:
-    """Raise ValueError, which begins with a prefix, on arrays of other sizes than the factor's."""
-    rows = np.shape(table.who)[0]
-    k, z, r = (len(part) for part in (factor.variables, factor.measurements, factor.errors))
-    wanted = {"who": (rows, k), "z": (rows, z), "information": (rows, r, r), "valid": (rows,)}
-    for field, shape in wanted.items():
-        if (got := np.shape(getattr(table, field))) != shape:
-            raise ValueError(f"{prefix}: expected {field} of shape {shape}, got {got}")
-    _check_kind(prefix, who=(table.who, np.integer), valid=(table.valid, np.bool_))
 
 
 def _check_kind(prefix: str, **values: tuple[JaxOrNumPy, type]) -> None:

@@ -125,8 +125,13 @@ def _invert(model: Model, plan: Plan, graph: Graph) -> Marginals:
     diagonal = blocks[plan.inverse.diagonal[plan.column]]  # by variable
     diagonal = _mask(diagonal, *[data.free[plan.column]] * 2)
     poses, size = len(graph.poses), graph.points.shape[1]
-    # From increments in the frame of a pose to world coordinates.
-    turn = _turns(graph, data.free.shape[1])
+    # From increments in the frame of a pose to world coordinates: R(θ) for its position.
+    width, batch = data.free.shape[1], graph.poses.shape[-1]
+    unit = jnp.eye(width, dtype=graph.poses.dtype)[None, ..., None]
+    units = jnp.broadcast_to(unit, (poses + len(graph.points), width, width, batch))
+    cos, sin = jnp.cos(graph.poses[:, 2]), jnp.sin(graph.poses[:, 2])
+    rotation = jnp.stack([jnp.stack([cos, -sin], axis=1), jnp.stack([sin, cos], axis=1)], axis=1)
+    turn = units.at[:poses, :2, :2].set(rotation)
     diagonal = by_transposed(by(turn, diagonal), turn)
     first, second = plan.pairs[:, 0], plan.pairs[:, 1]
     cross = blocks[plan.inverse.pairs]
@@ -158,13 +163,3 @@ def _mask(
 ) -> Float[Array, "k d d B"]:
     """The blocks, zero where a row or a column is not estimated."""
     return jnp.where(rows[:, :, None] & columns[:, None], blocks, 0.0)
-
-
-def _turns(graph: Graph, width: int) -> Float[Array, "n d d B"]:
-    """The derivative of each variable by its increments: R(θ) for the position of a pose."""
-    poses, points, batch = len(graph.poses), len(graph.points), graph.poses.shape[-1]
-    unit = jnp.eye(width, dtype=graph.poses.dtype)[None, ..., None]
-    units = jnp.broadcast_to(unit, (poses + points, width, width, batch))
-    cos, sin = jnp.cos(graph.poses[:, 2]), jnp.sin(graph.poses[:, 2])
-    rotation = jnp.stack([jnp.stack([cos, -sin], axis=1), jnp.stack([sin, cos], axis=1)], axis=1)
-    return units.at[:poses, :2, :2].set(rotation)

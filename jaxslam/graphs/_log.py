@@ -91,7 +91,11 @@ def of_log(
         )
     exact = len(motion.noises) == 3 and slack is None
     motion_factor = FromMotion(motion) if exact else NominalMotion(motion)
-    sensor_factor = FromSensor(sensor, own_noise=_has_varying_noise(sensor))
+    # R may depend on z unless the noise of the innermost sensor is a constant.
+    innermost = sensor
+    while isinstance(innermost, Wrapped) and type(innermost).noise_cov is Wrapped.noise_cov:
+        innermost = innermost.sensor
+    sensor_factor = FromSensor(sensor, own_noise=not isinstance(innermost.noise_cov, Constant))
     factors: dict[str, Factor] = {"motion": motion_factor, "sensor": sensor_factor}
     validation.check_covariance(f"{name}: pose_cov", pose_cov, 3)
     size_u, size_z = len(motion.controls), len(sensor.measurements)
@@ -119,13 +123,6 @@ class _Regular(NamedTuple):
     sensor: Bool[Array, "T M"]
     moving: Bool[Array, "T"]
     """whether the noise moves the pose in all directions"""
-
-
-def _has_varying_noise(sensor: Sensor) -> bool:
-    """Whether R may depend on z: the noise of the innermost sensor is no constant."""
-    while isinstance(sensor, Wrapped) and type(sensor).noise_cov is Wrapped.noise_cov:
-        sensor = sensor.sensor
-    return not isinstance(sensor.noise_cov, Constant)
 
 
 def _points_of(

@@ -71,7 +71,14 @@ def write_block(
     about["sha256"] = _checksum(about, entries)
     entries[_ABOUT] = np.frombuffer(canonical_json(about).encode(), np.uint8)
     path = folder / f"block-{first:08d}-{first + runs:08d}.npz"
-    write_atomically(path, _npz(entries))
+    # As `np.savez` writes them, without pickle and without dates. `np.savez` takes names as keyword
+    # arguments, and has some of its own, as `file`.
+    content = io.BytesIO()
+    with zipfile.ZipFile(content, "w") as npz:
+        for name, array in entries.items():
+            with npz.open(f"{name}.npy", "w", force_zip64=True) as entry:
+                np.lib.format.write_array(entry, array, allow_pickle=False)
+    write_atomically(path, content.getvalue())
     return path
 
 
@@ -180,17 +187,6 @@ def _link(hidden: Path, path: Path) -> None:
 def canonical_json(value: object) -> str:
     """JSON with sorted keys, the same for equal values; raises ValueError on NaN and infinity."""
     return json.dumps(value, sort_keys=True, allow_nan=False)
-
-
-def _npz(arrays: Mapping[str, np.ndarray]) -> bytes:
-    """The bytes that `np.savez` writes, for any names, without pickle and without dates."""
-    # `np.savez` takes names as keyword arguments, and has some of its own, as `file`.
-    out = io.BytesIO()
-    with zipfile.ZipFile(out, "w") as npz:
-        for name, array in arrays.items():
-            with npz.open(f"{name}.npy", "w", force_zip64=True) as entry:
-                np.lib.format.write_array(entry, array, allow_pickle=False)
-    return out.getvalue()
 
 
 def _checksum(about: Mapping[str, object], arrays: Mapping[str, np.ndarray]) -> str:

@@ -12,7 +12,7 @@ from jaxslam.consistency._measures.coverage import LEVELS
 from jaxslam.consistency._verdict import POWER, TESTS, TOLERANCE, honest_values
 from jaxslam.consistency.campaign import Campaign
 from jaxslam.results._files import csv_text, json_number, json_text, text_table, versions
-from jaxslam.results._table import VERDICTS, Cell, cell_text, lost_runs, notes_on, rows_of, short
+from jaxslam.results._table import VERDICTS, cell_text, lost_runs, notes_on, rows_of, short
 
 _COLUMNS = 5
 """Largest number of filters beside each other."""
@@ -24,8 +24,18 @@ _WIDTH = 88
 def campaign_table(campaign: Campaign) -> str:
     """The campaign as text tables of at most five filters, one column each, with notes below."""
     names = list(campaign.filters)
-    parts = [names[i : i + _COLUMNS] for i in range(0, len(names), _COLUMNS)]
-    text = "\n\n".join(_columns(campaign, part) for part in parts)
+    tables = []
+    for i in range(0, len(names), _COLUMNS):
+        rows = [["", "honest", *names[i : i + _COLUMNS]]]
+        for row in rows_of(campaign, names[i : i + _COLUMNS]):
+            rows.append([row.label, row.honest, *map(cell_text, row.cells)])
+            if row.published:
+                values = ("" if value is None else short(value) for value in row.published)
+                rows.append(["  published", "", *values])
+        table = text_table(rows)
+        table.insert(1, "-" * len(table[0]))
+        tables.append("\n".join(table))
+    text = "\n\n".join(tables)
     title = f"{campaign.scenario}: {campaign.size}"
     verdicts = {summary.verdict for summary in campaign.filters.values()}
     notes = [
@@ -141,20 +151,18 @@ def table_csv(campaign: Campaign) -> str:
     """
     names = list(campaign.filters)
     ends = [f"{name}{end}" for name in names for end in ("", " low", " high")]
-    rows = [
-        [row.label.strip(), row.honest, *(text for cell in row.cells for text in _csv_cells(cell))]
-        for row in rows_of(campaign, names)
-    ]
+    rows = []
+    for row in rows_of(campaign, names):
+        texts = [row.label.strip(), row.honest]
+        for cell in row.cells:  # the value and the ends of its interval
+            if isinstance(cell, Average):
+                texts += [_csv_number(value) for value in cell]
+            elif cell is None or isinstance(cell, Summary):
+                texts += [cell.verdict if cell else "", "", ""]
+            else:
+                texts += [cell.text if cell.value is None else _csv_number(cell.value), "", ""]
+        rows.append(texts)
     return csv_text(["measure", "honest", *ends], rows)
-
-
-def _csv_cells(cell: Cell) -> list[str]:
-    """A cell as three columns of CSV: the value and the ends of its interval."""
-    if isinstance(cell, Average):
-        return [_csv_number(value) for value in cell]
-    if cell is None or isinstance(cell, Summary):
-        return [cell.verdict if cell else "", "", ""]
-    return [cell.text if cell.value is None else _csv_number(cell.value), "", ""]
 
 
 def as_csv(campaign: Campaign) -> str:
@@ -166,19 +174,6 @@ def as_csv(campaign: Campaign) -> str:
         columns = [map(_csv_number, s.curves.get(key, nothing).tolist()) for key in keys]
         rows += [[name, str(step + 1), *row] for step, row in enumerate(zip(*columns, strict=True))]
     return csv_text(["filter", "step", *keys], rows)
-
-
-def _columns(campaign: Campaign, names: list[str]) -> str:
-    """The table of some filters."""
-    lines = [["", "honest", *names]]
-    for row in rows_of(campaign, names):
-        lines.append([row.label, row.honest, *map(cell_text, row.cells)])
-        if row.published:
-            values = ("" if value is None else short(value) for value in row.published)
-            lines.append(["  published", "", *values])
-    text = text_table(lines)
-    text.insert(1, "-" * len(text[0]))
-    return "\n".join(text)
 
 
 def _finite_or_none(values: Iterable[float]) -> list[float | None]:

@@ -109,41 +109,26 @@ def rows_of(campaign: Campaign, names: Sequence[str]) -> list[Row]:
         if has_published or any(cell is not None for cell in cells):
             honest = "" if measure.honest is None else f"{measure.honest:g}"
             rows.append(Row(measure.title, honest, cells, published if has_published else ()))
-    return rows + _bands(summaries) + _counts(campaign, names)
-
-
-def _bands(summaries: Sequence[Summary]) -> list[Row]:
-    """The rows of the bands of honest filters, and of the share of steps within them."""
+    # The bands of honest filters, and the share of steps within them.
     nis = [s.nis_band and Figure("[{:.4f}, {:.4f}]".format(*s.nis_band)) for s in summaries]
     half_widths = [s.autocorrelation_band[0] for s in summaries]
     white = [Figure(f"± {half:.4f}") if np.isfinite(half) else None for half in half_widths]
-    rows = [
-        Row(f"NIS / dof, {percentage(LEVEL)} band", "", nis, group="Bands"),
-        Row(f"autocorrelation, {percentage(LEVEL)} band", "", white, group="Bands"),
-    ]
+    rows.append(Row(f"NIS / dof, {percentage(LEVEL)} band", "", nis, group="Bands"))
+    rows.append(Row(f"autocorrelation, {percentage(LEVEL)} band", "", white, group="Bands"))
     for block in DOF:
         shares = [s.inside.get(block) for s in summaries]
-        cells = [None if share is None else Figure(percentage(share, 1), share) for share in shares]
-        rows.append(Row(f"steps in {block} band", percentage(LEVEL, 1), cells, group="Bands"))
-    return rows
-
-
-def _counts(campaign: Campaign, names: Sequence[str]) -> list[Row]:
-    """The rows of the time of a step, and of counts that are not 0 for all filters."""
-    rows = []
+        figures = [None if p is None else Figure(percentage(p, 1), p) for p in shares]
+        rows.append(Row(f"steps in {block} band", percentage(LEVEL, 1), figures, group="Bands"))
+    # The time of a step, and counts that are not 0 for all filters.
     times = [campaign.step_seconds.get(name) for name in names]
     if any(times):
-        cells = [
-            None if seconds is None else Figure(f"{1e6 * seconds:.3g}", 1e6 * seconds)
-            for seconds in times
-        ]
-        rows.append(Row("time of a step [µs]", "", cells, group="Time and counts"))
-    counts_of_filters = [campaign.filters[name].counts for name in names]
-    for key in dict.fromkeys(key for counts in counts_of_filters for key in counts):
-        numbers = [counts.get(key) for counts in counts_of_filters]
+        figures = [None if t is None else Figure(f"{1e6 * t:.3g}", 1e6 * t) for t in times]
+        rows.append(Row("time of a step [µs]", "", figures, group="Time and counts"))
+    for key in dict.fromkeys(key for s in summaries for key in s.counts):
+        numbers = [s.counts.get(key) for s in summaries]
         if key not in _NEVER and (key in _ALWAYS or any(numbers)):
-            cells = [None if n is None else Figure(f"{n:,}", n) for n in numbers]
-            rows.append(Row(count_label(key), "", cells, group="Time and counts"))
+            figures = [None if n is None else Figure(f"{n:,}", n) for n in numbers]
+            rows.append(Row(count_label(key), "", figures, group="Time and counts"))
     return rows
 
 

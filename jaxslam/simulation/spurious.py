@@ -3,7 +3,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 
 from jaxslam.core._numbers import is_concrete
 from jaxslam.core._record import record, static
@@ -77,11 +77,15 @@ class Spurious:
         share = self.clutter / max(self.places, 1)
         occurs = jax.random.bernoulli(key_clutter, share, (self.places,))
         no_tag = jnp.full(self.places, -1, scan.tag.dtype)
+        # A wrong tag is that of the next wrong slot.
+        wrong_first = jnp.argsort(~mislabelled, stable=True)
+        following = jnp.cumsum(mislabelled) % jnp.maximum(mislabelled.sum(), 1)
+        tag = jnp.where(mislabelled, scan.tag[wrong_first[following]], scan.tag)
         spoilt = Scan(
             z=jnp.concatenate(
                 [jnp.where(valid[:, None], z, 0.0), jnp.where(occurs[:, None], false[m:], 0.0)]
             ),
-            tag=jnp.concatenate([jnp.where(valid, _permute(scan.tag, mislabelled), -1), no_tag]),
+            tag=jnp.concatenate([jnp.where(valid, tag, -1), no_tag]),
             valid=jnp.concatenate([valid, occurs]),
         )
         return spoilt, jnp.concatenate([origin, no_tag])
@@ -102,10 +106,3 @@ class Spurious:
             return sensor.residual(noisy, jnp.zeros_like(noisy))
 
         return jax.vmap(measure)(points, normals)
-
-
-def _permute(tag: Int[Array, "M"], wrong: Bool[Array, "M"]) -> Int[Array, "M"]:
-    """The tags, each wrong one replaced by the tag of the next wrong slot."""
-    slots = jnp.argsort(~wrong, stable=True)  # the wrong ones first
-    following = jnp.cumsum(wrong) % jnp.maximum(wrong.sum(), 1)
-    return jnp.where(wrong, tag[slots[following]], tag)

@@ -4,7 +4,7 @@ from typing import NamedTuple, TypeAlias
 
 import jax
 import numpy as np
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Bool, Float
 
 from jaxslam.verify._findings import Finding, WorstState, WrongEntry
 from jaxslam.verify._inputs.samples import LARGE, NOMINAL, Samples
@@ -31,19 +31,7 @@ def compare_methods(
     """
     if evaluated.values is None:
         return []
-    finite = np.all(np.isfinite(evaluated.values), axis=1)
-    evaluated = _at_states(evaluated, np.flatnonzero(finite))
-    return [
-        _finding(evaluated, k, tolerance, float32_tolerance)
-        for k, evaluation in enumerate(evaluated.by_argument)
-        if evaluated.function.outputs and evaluated.function.arguments[k].entries
-        if evaluation.methods and len(evaluation.methods) + (evaluation.quotient is not None) > 1
-    ]
-
-
-def _at_states(evaluated: Evaluated, rows: Int[np.ndarray, "R"]) -> Evaluated:
-    """The evaluation at some of its states."""
-    samples = evaluated.samples
+    rows = np.flatnonzero(np.all(np.isfinite(evaluated.values), axis=1))
     by_argument = tuple(
         Jacobians(
             {how: jacobian[rows] for how, jacobian in evaluation.methods.items()},
@@ -54,8 +42,15 @@ def _at_states(evaluated: Evaluated, rows: Int[np.ndarray, "R"]) -> Evaluated:
         )
         for evaluation in evaluated.by_argument
     )
-    kept = Samples(tuple(a[rows] for a in samples.values), tuple(samples.labels[i] for i in rows))
-    return evaluated._replace(samples=kept, by_argument=by_argument)
+    values, labels = evaluated.samples
+    samples = Samples(tuple(value[rows] for value in values), tuple(labels[i] for i in rows))
+    evaluated = evaluated._replace(samples=samples, by_argument=by_argument)
+    return [
+        _finding(evaluated, k, tolerance, float32_tolerance)
+        for k, evaluation in enumerate(evaluated.by_argument)
+        if evaluated.function.outputs and evaluated.function.arguments[k].entries
+        if evaluation.methods and len(evaluation.methods) + (evaluation.quotient is not None) > 1
+    ]
 
 
 class _Compared(NamedTuple):

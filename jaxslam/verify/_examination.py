@@ -48,7 +48,12 @@ def examine(
     """
     with float64(), np.errstate(all="ignore"):
         model = _with_limited_loops(model, functions)
-        sampled = _samples_of(functions, model, count, seed)
+        sampled: tuple[Samples, ...] = ()
+        if isinstance(model, Sensor):
+            with contextlib.suppress(Exception, SystemExit):
+                sampled = samples.sensor_samples(model, count, seed)
+        if not sampled:  # states drawn by units alone, also of a sensor whose `embed` fails
+            sampled = tuple(samples.argument_samples(f.arguments, count, seed) for f in functions)
         if states is not None:
             sampled = (states, *sampled[1:])
             if isinstance(model, Sensor) and model.landmark:
@@ -129,14 +134,3 @@ def _typical_linearity(model: Model, first: Evaluated) -> float | None:
         return float(np.median(np.asarray(quick_jit(jax.vmap(index))(*states))))
     except (Exception, SystemExit):  # the checks report what is wrong with the model
         return None
-
-
-def _samples_of(
-    functions: tuple[Function, ...], model: Model, count: int, seed: int
-) -> tuple[Samples, ...]:
-    """The states at which each function is evaluated."""
-    if isinstance(model, Sensor):
-        # A sensor whose `embed` fails is tried at states drawn by units alone.
-        with contextlib.suppress(Exception, SystemExit):
-            return samples.sensor_samples(model, count, seed)
-    return tuple(samples.argument_samples(f.arguments, count, seed) for f in functions)

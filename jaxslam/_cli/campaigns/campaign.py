@@ -65,7 +65,16 @@ def spec_of(options: argparse.Namespace) -> Spec:
             check_count(f"--{name}", count)
     if not 0 <= campaign.seed < 2**32:
         raise ValueError(f"--seed: expected an integer from 0 to 2³²-1, got {campaign.seed}")
-    part = _part(options)
+    part = None
+    if options.part is not None:
+        match = re.fullmatch(r"(\d+)/(\d+)", options.part, re.ASCII)
+        if match is None or not 1 <= int(match[1]) <= int(match[2]):
+            raise ValueError(
+                f"--part: expected I/N with 1 <= I <= N, as 3/16, got {options.part!r}"
+            )
+        if options.overwrite:
+            raise ValueError("--part: expected no --overwrite with it")
+        part = int(match[1]), int(match[2])
     check_out(out, "consistency", draws=part is None)
     most = settings.get("devices")  # missing parts are computed as the parts would be
     assert isinstance(most, int | None)
@@ -125,18 +134,6 @@ def _campaign(
     block = kept.settings.get("block") if options.block is None else options.block
     assert isinstance(block, int | None)
     return CampaignOptions(**(stored | {"runs": kept.runs} | chosen)), kept.settings, block
-
-
-def _part(options: argparse.Namespace) -> tuple[int, int] | None:
-    """The part (i, n) of the runs that --part names; ValueError on other text."""
-    if options.part is None:
-        return None
-    match = re.fullmatch(r"(\d+)/(\d+)", options.part, re.ASCII)
-    if match is None or not 1 <= int(match[1]) <= int(match[2]):
-        raise ValueError(f"--part: expected I/N with 1 <= I <= N, as 3/16, got {options.part!r}")
-    if options.overwrite:
-        raise ValueError("--part: expected no --overwrite with it")
-    return int(match[1]), int(match[2])
 
 
 def _differences(stored: Mapping[str, object], options: Mapping[str, object]) -> str:

@@ -32,8 +32,15 @@ def engine(value: str | None) -> Iterator[tuple[Executor | None, int | None]]:
         finally:
             pool.shutdown()
     elif value == "mpi":
-        with _mpi_pool() as pool:
-            yield pool, 2 * pool.num_workers
+        with loading("--executor", "mpi4py"):
+            from mpi4py import MPI
+            from mpi4py.futures import MPIPoolExecutor
+
+            ranks = MPI.COMM_WORLD.Get_size()
+        if ranks < 2:
+            raise ValueError(f"--executor: expected two ranks of MPI or more: {_MPI}")
+        with MPIPoolExecutor() as executor:
+            yield executor, 2 * executor.num_workers
     elif match := re.fullmatch(r"dask://(.+:\d+)", value, re.ASCII):
         with _dask_client(match[1]) as client:
             yield client.get_executor(pure=False), 2 * sum(client.nthreads().values())
@@ -41,18 +48,6 @@ def engine(value: str | None) -> Iterator[tuple[Executor | None, int | None]]:
         raise ValueError(
             f"--executor: expected processes:N, dask://HOST:PORT or mpi, got {value!r}"
         )
-
-
-def _mpi_pool() -> Any:
-    """The pool of the ranks of mpiexec."""
-    with loading("--executor", "mpi4py"):
-        from mpi4py import MPI
-        from mpi4py.futures import MPIPoolExecutor
-
-        ranks = MPI.COMM_WORLD.Get_size()
-    if ranks < 2:
-        raise ValueError(f"--executor: expected two ranks of MPI or more: {_MPI}")
-    return MPIPoolExecutor()
 
 
 def _dask_client(address: str) -> Any:

@@ -16,7 +16,7 @@ from jaxslam.core.slots import Joint
 from jaxslam.core.types import Log, Status
 from jaxslam.datasets import Dataset
 from jaxslam.datasets._evaluation import Evaluation, evaluate, joint_map_cov
-from jaxslam.datasets._uncertain_constants import AddedCov, consider_constants
+from jaxslam.datasets._uncertain_constants import consider_constants
 from jaxslam.math._definite import indefinite
 from jaxslam.results._files import Json
 
@@ -75,7 +75,16 @@ def run_filter(
         added = consider_constants(data, lambda *models: chosen_filters(data, name, models)[name])
         if added is not None:
             constants = "added"
-            result = _add_cov(result, added)
+            # (N, 2, N, 2) -> (N, 2, 2): the blocks of each landmark with itself.
+            point_covs = np.moveaxis(np.diagonal(added.points, axis1=0, axis2=2), -1, 0)
+            path, last = result.path, result.last
+            result = result._replace(
+                path=path._replace(pose_cov=path.pose_cov + added.pose),
+                last=last._replace(
+                    pose_cov=last.pose_cov + added.pose[-1],
+                    point_covs=last.point_covs + point_covs,
+                ),
+            )
             map_cov = None if map_cov is None else map_cov + added.points
     evaluation = evaluate(data, result.path, result.last, map_cov)
     summary = _summary(result, unplaced, constants, seconds) | evaluation.errors
@@ -83,19 +92,6 @@ def run_filter(
         summary |= evaluation.map_test.rows()
     notes = suspicions(summary)
     return FilterRun(result, evaluation, summary | ({"notes": notes} if notes else {}))
-
-
-def _add_cov(result: PiecewiseRun, added: AddedCov) -> PiecewiseRun:
-    """The run with the covariances that uncertain constants add to its path and its last map."""
-    # (N, 2, N, 2) -> (N, 2, 2): the blocks of each landmark with itself.
-    point_covs = np.moveaxis(np.diagonal(added.points, axis1=0, axis2=2), -1, 0)
-    path, last = result.path, result.last
-    return result._replace(
-        path=path._replace(pose_cov=path.pose_cov + added.pose),
-        last=last._replace(
-            pose_cov=last.pose_cov + added.pose[-1], point_covs=last.point_covs + point_covs
-        ),
-    )
 
 
 def on_true_poses(data: Dataset) -> tuple[Log, int]:
@@ -128,6 +124,13 @@ def _summary(result: PiecewiseRun, unplaced: int, constants: str, seconds: float
     """
     nis = np.where(result.status == Status.FUSED, result.nis, 0.0).sum()
     dof = int(result.dof.sum())
+    definite = "not checked"
+    if result.checked:
+        definite = f"at {sum(result.passed)} of {len(result.passed)} checked steps"
+        failed = [k for k, passed in zip(result.checked, result.passed, strict=True) if not passed]
+        if failed:
+            ellipsis = ", …" if len(failed) > 5 else ""
+            definite += f", not at {', '.join(map(str, failed[:5]))}{ellipsis}"
     innovations = {  # of filters that have innovations
         "NIS / dof": float(nis / max(dof, 1)),
         "log-likelihood": float(result.log_likelihood.sum()),
@@ -139,23 +142,11 @@ def _summary(result: PiecewiseRun, unplaced: int, constants: str, seconds: float
         },
         **({"measurements without a true pose, left out": unplaced} if unplaced else {}),
         **(innovations if dof else {}),
-        "P positive definite": _definiteness(result),
+        "P positive definite": definite,
         **({"uncertainty of constants": constants} if constants else {}),
         "final pose": [float(value) for value in result.last.pose],
         "seconds": round(seconds, 2),
     }
-
-
-def _definiteness(result: PiecewiseRun) -> str:
-    """The number of checked steps with positive definite P, and the first without, as text."""
-    if not result.checked:
-        return "not checked"
-    failed = [step for step, good in zip(result.checked, result.passed, strict=True) if not good]
-    count = f"at {sum(result.passed)} of {len(result.passed)} checked steps"
-    if not failed:
-        return count
-    ellipsis = ", …" if len(failed) > 5 else ""
-    return f"{count}, not at {', '.join(map(str, failed[:5]))}{ellipsis}"
 
 
 def suspicions(summary: Json) -> list[str]:

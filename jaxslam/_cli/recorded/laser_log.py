@@ -179,7 +179,17 @@ def read_log(options: argparse.Namespace) -> tuple[LaserLog, dict[str, int]]:
         mount=mount,
     )
     total = len(log.time)
-    first, last = _interval(options.scans, total)
+    ends = options.scans.split(":")
+    try:
+        if len(ends) != 2:
+            raise ValueError
+        bounds = slice(*(int(end) if end.strip() else None for end in ends))
+    except ValueError:
+        raise ValueError(
+            f"--scans: expected A:B, two numbers of scans, got {options.scans!r}"
+        ) from None
+    first, last, _ = bounds.indices(total)
+    last = max(first, last)
     keep = np.arange(first, last)[:: options.every]
     if not len(keep):
         raise ValueError(f"--scans: {options.scans} has none of the {total} scans of {log.source}")
@@ -221,19 +231,6 @@ def bag_text(path: str) -> str:
     lines += [f"frames {pair}: {text}" for pair, text in bag.frames.items()]
     lines += bag.notes
     return "\n".join(lines)
-
-
-def _interval(text: str, total: int) -> tuple[int, int]:
-    """The range of scans A:B, as a slice in Python."""
-    ends = text.split(":")
-    try:
-        if len(ends) != 2:
-            raise ValueError
-        first, last = (int(end) if end.strip() else None for end in ends)
-    except ValueError:
-        raise ValueError(f"--scans: expected A:B, two numbers of scans, got {text!r}") from None
-    start, stop, _ = slice(first, last).indices(total)
-    return start, max(start, stop)
 
 
 def check_poses(log: LaserLog) -> None:

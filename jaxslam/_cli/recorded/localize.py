@@ -100,7 +100,12 @@ def run_localization(log: LaserLog, options: argparse.Namespace) -> laser_log.Jo
     if not np.any(np.asarray(grid.log_odds) < 0):
         raise ValueError(f"{options.map}: the map has no free cell")
     start = options.start or ("file" if log.placed else "global")
-    pose = _start(start, log)
+    pose = None
+    if start == "file":
+        laser_log.check_poses(log)
+        pose = np.asarray(log.corrected[0])
+    elif start != "global":
+        pose = laser_log.pose_of("--start", start, "file, global or ")
     if pose is not None:
         x, y, heading = pose
         cell = grids.to_cells(jnp.asarray(grid.origin), grid.resolution, jnp.asarray(pose[:2]))
@@ -222,16 +227,6 @@ def _summary(result: PiecewiseRun, particles: int, fit: float) -> Json:
         ),
         "final pose [m, m, rad]": [float(value) for value in result.path.pose[-1]],
     }
-
-
-def _start(text: str, log: LaserLog) -> np.ndarray | None:
-    """The pose (3,) at the start; None for anywhere."""
-    if text == "global":
-        return None
-    if text == "file":
-        laser_log.check_poses(log)
-        return np.asarray(log.corrected[0])
-    return laser_log.pose_of("--start", text, "file, global or ")
 
 
 def share_as_predicted(grid: Grid, poses: Float[np.ndarray, "n 3"], log: LaserLog) -> float:

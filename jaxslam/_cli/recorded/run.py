@@ -198,12 +198,19 @@ def _figure(data: Dataset, runs: Mapping[str, FilterRun], formats: tuple[str, ..
 
     (name, first), *others = runs.items()
     evaluation = first.evaluation
+    nominal = jnp.zeros(len(data.motion.noises))
+
+    def step(pose: jax.Array, control: jax.Array) -> tuple[jax.Array, jax.Array]:
+        pose = data.motion.step(pose, control, nominal)
+        return pose, pose
+
+    drive = jax.jit(lambda pose, controls: jax.lax.scan(step, pose, controls)[1])
     figure = plot.map_figure(
         _path_with_map(first),
         true_points=evaluation.points,
         names=None if evaluation.points is None else data.tags,
         true_path=_true_path(data, evaluation),
-        dead_reckoning=_dead_reckoning(data),
+        dead_reckoning=np.asarray(drive(jnp.asarray(data.pose), jnp.asarray(data.log.control))),
         others={label: _path_with_map(run) for label, run in others},
         title=f"{data.name}: {name} with ellipses" if others else data.name,
     )
@@ -226,18 +233,6 @@ def _true_path(data: Dataset, evaluation: Evaluation) -> Float[np.ndarray, "T 3"
     path = np.full((data.steps, 3), np.nan)
     path[slice(None) if data.true_at is None else data.true_at] = evaluation.path
     return path
-
-
-def _dead_reckoning(data: Dataset) -> Float[np.ndarray, "T 3"]:
-    """The path by the controls alone, without noise."""
-    nominal = jnp.zeros(len(data.motion.noises))
-
-    def step(pose: jax.Array, control: jax.Array) -> tuple[jax.Array, jax.Array]:
-        pose = data.motion.step(pose, control, nominal)
-        return pose, pose
-
-    drive = jax.jit(lambda pose, controls: jax.lax.scan(step, pose, controls)[1])
-    return np.asarray(drive(jnp.asarray(data.pose), jnp.asarray(data.log.control)))
 
 
 def _films(data: Dataset, runs: Mapping[str, FilterRun]) -> Files:

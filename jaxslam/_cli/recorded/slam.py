@@ -133,6 +133,18 @@ def result_files(solved: Solved) -> Files:
         alive=np.zeros((count, 0), bool),
         tag=np.zeros((count, 0), int),
     )
+    loops = [
+        [
+            str(int(first)),
+            str(int(second)),
+            *(f"{value:.9g}" for value in z),
+            f"{score:.4f}",
+            "appearance" if looks else "place",
+            LoopOutcome(int(outcome)).name.lower(),
+        ]
+        for first, second, z, _, score, looks, outcome in zip(*solved.loops, strict=True)
+    ]
+    head = ["first", "second", "x [m]", "y [m]", "theta [rad]", "inliers", "found by", "outcome"]
     return {
         "trajectory.csv": report.trajectory_csv(solved.time, path),
         "trajectory.tum": report.trajectory_tum(solved.time, path),
@@ -140,7 +152,7 @@ def result_files(solved: Solved) -> Files:
         "graph.g2o": g2o.text_of(
             solved.graph._replace(fixed_pose=np.zeros_like(solved.graph.fixed_pose))
         ),
-        "loops.csv": _loops_csv(solved),
+        "loops.csv": csv_text(head, loops),
         **ros_map.map_files("map", solved.map),
     }
 
@@ -195,43 +207,23 @@ def film(log: LaserLog, solved: Solved, settings: Settings) -> "Film":
 
 def result_summary(solved: Solved) -> dict[str, object]:
     """The numbers of a result, for the table that is printed and for `summary.json`."""
+    residuals = "none: without a loop nothing contradicts the matches"
+    if solved.dof > 0:
+        ratio = float(np.sqrt(solved.chi2 / solved.dof))
+        times, relation = (ratio, "larger") if ratio > 1 else (1 / max(ratio, 1e-9), "smaller")
+        size = f"{times:.1f} times {relation} than" if times > 1.05 else "as large as"
+        residuals = (
+            f"{size} the σ of its edges; the covariance of the path is tested by a true path only"
+        )
     return {
         **solved.counts,
         "chi2": solved.chi2,
         "degrees of freedom": solved.dof,
         "chi2 / degrees of freedom": solved.chi2 / solved.dof if solved.dof > 0 else None,
-        "residuals of the graph": _residuals(solved),
+        "residuals of the graph": residuals,
         **laser_log.map_size(solved.map),
         **{f"seconds, {stage}": round(value, 2) for stage, value in solved.seconds.items()},
     }
-
-
-def _residuals(solved: Solved) -> str:
-    """The size of the residuals of the edges against their σ; no statement on the path."""
-    if solved.dof <= 0:
-        return "none: without a loop nothing contradicts the matches"
-    ratio = float(np.sqrt(solved.chi2 / solved.dof))
-    times, relation = (ratio, "larger") if ratio > 1 else (1 / max(ratio, 1e-9), "smaller")
-    size = f"{times:.1f} times {relation} than" if times > 1.05 else "as large as"
-    return f"{size} the σ of its edges; the covariance of the path is tested by a true path only"
-
-
-def _loops_csv(solved: Solved) -> str:
-    """The candidates of loops, one per row."""
-    loops = solved.loops
-    rows = [
-        [
-            str(int(first)),
-            str(int(second)),
-            *(f"{value:.9g}" for value in z),
-            f"{score:.4f}",
-            "appearance" if looks else "place",
-            LoopOutcome(int(outcome)).name.lower(),
-        ]
-        for first, second, z, _, score, looks, outcome in zip(*loops, strict=True)
-    ]
-    head = ["first", "second", "x [m]", "y [m]", "theta [rad]", "inliers", "found by", "outcome"]
-    return csv_text(head, rows)
 
 
 def _scores(log: LaserLog, solved: laser_slam.Solved) -> dict[str, object]:

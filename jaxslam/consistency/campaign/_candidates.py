@@ -76,7 +76,11 @@ def without_noise(scenario: World) -> str:
     exact_sensors = []
     for model in _sensors(scenario):
         for z in (_number(np.zeros(len(model.measurements))), _first_measurement(model, scenario)):
-            exact = _exact(model, np.asarray(_noise_cov(model, z)))
+            cov, names = np.asarray(_noise_cov(model, z)), model.measurements
+            sigma = np.sqrt(np.diagonal(cov))
+            exact = ", ".join(n for n, s in zip(names, sigma, strict=True) if s == 0)
+            if not exact and not invertible(cov):
+                exact = f"a combination of {', '.join(names)}"
             if not exact:
                 break
         if exact:
@@ -97,15 +101,6 @@ def least_noise(scenario: World) -> float:
         covs = [np.asarray(_noise_cov(model, z), np.float64) for z in places]
         least.append(max(float(np.linalg.eigvalsh(cov).min(initial=np.inf)) for cov in covs))
     return max(min(least, default=0.0), 0.0)
-
-
-def _exact(sensor: Sensor, cov: np.ndarray) -> str:
-    """The measurements of variance 0; a combination of them if no single one has variance 0."""
-    sigma = np.sqrt(np.diagonal(cov))
-    if (sigma == 0).any():
-        exact = (n for n, s in zip(sensor.measurements, sigma, strict=True) if s == 0)
-        return ", ".join(exact)
-    return "" if invertible(cov) else f"a combination of {', '.join(sensor.measurements)}"
 
 
 def _sensors(scenario: World) -> list[Sensor]:
@@ -173,7 +168,11 @@ def check_fits(name: str, candidate: Candidate, scenario: World) -> None:
         ("controls", candidate.controls, scenario.motion.controls),
         ("measurements", candidate.measurements, scenario.sensor.measurements),
     ):
-        if len(expected) != len(present) or not all(map(_have_one_unit, expected, present)):
+        # An entry without a unit fits any.
+        pairs = zip(expected, present, strict=False)
+        units = [{split_unit(a)[1], split_unit(b)[1]} for a, b in pairs]
+        fit = all(len(pair) == 1 or None in pair for pair in units)
+        if len(expected) != len(present) or not fit:
             raise ValueError(
                 f"monte_carlo: filter {name} takes {field} ({', '.join(expected)}), "
                 f"the scenario {scenario.name} gives ({', '.join(present)})"
@@ -185,12 +184,6 @@ def check_fits(name: str, candidate: Candidate, scenario: World) -> None:
             f"monte_carlo: filter {name} has a map of {size} landmarks, the scenario "
             f"{scenario.name} has {count}; a map of some of them needs their tags"
         )
-
-
-def _have_one_unit(a: str, b: str) -> bool:
-    """Whether two names have the same unit; True where either has none."""
-    units = {split_unit(name)[1] for name in (a, b)}
-    return len(units) == 1 or None in units
 
 
 def check_called(name: str, candidate: Callable[..., object]) -> None:

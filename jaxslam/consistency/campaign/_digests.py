@@ -114,7 +114,12 @@ def _text(value: object, within: tuple[object, ...]) -> str:
     inner = getattr(value, "__wrapped__", getattr(value, "__func__", value))
     if isinstance(inner, FunctionType):
         bound = _text(getattr(value, "__self__", None), within)
-        return f"{bound} {_text_of_function(inner, within)}"
+        if not _of_user(inner) or inner in within:
+            return f"{bound} {_name(inner)}"
+        closure = inspect.getclosurevars(inner)
+        values = {**closure.globals, **closure.nonlocals}
+        parts = (inner.__code__, inner.__defaults__, inner.__kwdefaults__, values)
+        return f"{bound} {_text(parts, (*within, inner))}"
     if isinstance(value, CodeType):
         return str([value.co_code.hex(), value.co_names, _text(value.co_consts, within)])
     return _name(value)
@@ -139,16 +144,6 @@ def _text_of_class(cls: type, within: tuple[object, ...]) -> str:
     }
     within = (*within, cls)
     return f"{cls.__qualname__} {_text((methods, constants, cls.__bases__), within)}"
-
-
-def _text_of_function(function: FunctionType, within: tuple[object, ...]) -> str:
-    if not _of_user(function) or function in within:
-        return _name(function)
-    within = (*within, function)
-    held = inspect.getclosurevars(function)
-    values = {**held.globals, **held.nonlocals}
-    parts = (function.__code__, function.__defaults__, function.__kwdefaults__, values)
-    return _text(parts, within)
 
 
 def _of_user(function: FunctionType) -> bool:

@@ -36,8 +36,33 @@ def read_landmarks(
 
     errata: exchange the positions of `EXCHANGED`, if they are those of the file.
     """
-    subject_of, names = _read_barcodes(TextFile(folder / "Barcodes.dat", "#"))
-    points = _read_survey(TextFile(folder / "Landmark_Groundtruth.dat", "#"), names)
+    file = TextFile(folder / "Barcodes.dat", "#")
+    subject_of: dict[int, int] = {}
+    for line, fields in file:
+        file.expect(line, fields, ("subject", "barcode"))
+        subject = file.identity(line, fields[0], "subject")
+        barcode = file.identity(line, fields[1], "barcode")
+        if barcode in subject_of or subject in subject_of.values():
+            raise file.error(line, f"subject {subject} or barcode {barcode} occurs twice")
+        subject_of[barcode] = subject
+    names = tuple(sorted(set(subject_of.values()) - set(ROBOTS)))
+    if not names:
+        raise file.end_error("no landmark in the file")
+
+    file = TextFile(folder / "Landmark_Groundtruth.dat", "#")
+    points: dict[int, list[float]] = {}
+    for line, fields in file:
+        columns = ("subject", "x", "y", "sigma_x", "sigma_y")
+        _, x, y, _, _ = file.numbers(line, fields, columns)
+        subject = file.identity(line, fields[0], "subject")
+        if subject not in names:
+            raise file.error(line, f"subject {subject} is not a landmark in Barcodes.dat")
+        if subject in points:
+            raise file.error(line, f"subject {subject} occurs twice")
+        points[subject] = [x, y]
+    missing = [name for name in names if name not in points]
+    if missing:
+        raise file.end_error(f"no position of subject {missing[0]} in the file")
     corrections: tuple[str, ...] = ()
     if errata and all(points.get(subject) == at for subject, at in EXCHANGED.items()):
         first, second = EXCHANGED
@@ -83,40 +108,6 @@ def _read_in_time(file: TextFile, names: tuple[str, ...]) -> Float[np.ndarray, "
     if not table:
         raise file.end_error("no data in the file")
     return np.array(table)
-
-
-def _read_barcodes(file: TextFile) -> tuple[dict[int, int], tuple[int, ...]]:
-    """The subject of each barcode, and the landmarks' subjects in rising order."""
-    subject_of: dict[int, int] = {}
-    for line, fields in file:
-        file.expect(line, fields, ("subject", "barcode"))
-        subject = file.identity(line, fields[0], "subject")
-        barcode = file.identity(line, fields[1], "barcode")
-        if barcode in subject_of or subject in subject_of.values():
-            raise file.error(line, f"subject {subject} or barcode {barcode} occurs twice")
-        subject_of[barcode] = subject
-    names = tuple(sorted(set(subject_of.values()) - set(ROBOTS)))
-    if not names:
-        raise file.end_error("no landmark in the file")
-    return subject_of, names
-
-
-def _read_survey(file: TextFile, names: tuple[int, ...]) -> dict[int, list[float]]:
-    """The surveyed position of every landmark."""
-    points: dict[int, list[float]] = {}
-    for line, fields in file:
-        columns = ("subject", "x", "y", "sigma_x", "sigma_y")
-        _, x, y, _, _ = file.numbers(line, fields, columns)
-        subject = file.identity(line, fields[0], "subject")
-        if subject not in names:
-            raise file.error(line, f"subject {subject} is not a landmark in Barcodes.dat")
-        if subject in points:
-            raise file.error(line, f"subject {subject} occurs twice")
-        points[subject] = [x, y]
-    missing = [name for name in names if name not in points]
-    if missing:
-        raise file.end_error(f"no position of subject {missing[0]} in the file")
-    return points
 
 
 class RobotCalibration(NamedTuple):

@@ -123,7 +123,16 @@ def open_bag(path: str | Path) -> Iterator[Bag]:
     except Exception as problem:  # of SQLite, zstd, struct, … where a bag is damaged
         raise _unreadable(path, problem) from problem
     try:
-        _check_succession(path, files, reader.readers)
+        # Each part of a recording begins about when the part before it ends.
+        order = sorted(range(len(files)), key=lambda k: reader.readers[k].start_time)
+        for before, after in pairwise(order):
+            pause = (reader.readers[after].start_time - reader.readers[before].end_time) * 1e-9
+            if not -_OVERLAP <= pause <= _PAUSE:
+                raise ValueError(
+                    f"{path}: expected parts of one recording, and {files[after].name} begins "
+                    f"{abs(pause):,.1f} s {'after' if pause > 0 else 'before'} "
+                    f"{files[before].name} ends; name one of them"
+                )
         yield Bag(path, reader, types, notes)
     finally:
         reader.close()
@@ -175,19 +184,6 @@ def _parts(path: Path) -> tuple[list[Path], list[str]]:
     if missing := sorted(set(range(max(parts))) - set(parts)):
         notes.append(f"parts that are missing in the folder: {', '.join(map(str, missing))}")
     return [parts[number] for number in sorted(parts)], notes
-
-
-def _check_succession(path: Path, files: list[Path], readers: Any) -> None:
-    """Raise ValueError unless each part of a recording begins about when that before it ends."""
-    order = sorted(range(len(files)), key=lambda k: readers[k].start_time)
-    for before, after in pairwise(order):
-        pause = (readers[after].start_time - readers[before].end_time) * 1e-9
-        if not -_OVERLAP <= pause <= _PAUSE:
-            raise ValueError(
-                f"{path}: expected parts of one recording, and {files[after].name} begins "
-                f"{abs(pause):,.1f} s {'after' if pause > 0 else 'before'} {files[before].name} "
-                "ends; name one of them"
-            )
 
 
 def is_bag(path: str | Path) -> bool:

@@ -124,10 +124,15 @@ def rosbag(
             raise bag.error(
                 f"expected a topic of {LASER_SCAN} with messages, got {_listed(bag.topics)}"
             )
-        wheels = None if _is_pair(odometry) else _chosen(bag, "odometry", (ODOMETRY,), odometry)
+        wheels = None
+        if odometry is None or ":" not in odometry:  # not two frames, as `odom:base_link`
+            wheels = _chosen(bag, "odometry", (ODOMETRY,), odometry)
         messages = _read(bag, laser, wheels, corrections)
         transforms = messages.transforms
-        frame = _frame_of(bag, laser, messages.scans)
+        frame, *others = sorted({scan.frame for scan in messages.scans})
+        if others:
+            frames = ", ".join([frame, *others])
+            raise bag.error(f"{laser}: expected scans of one frame, got {frames}")
         if wheels is None or not Frames(transforms).connects(messages.base, frame):
             transforms = transforms + _transforms(bag, static=False)
         if wheels is None:
@@ -304,11 +309,6 @@ def _chosen(bag: Bag, argument: str, kinds: tuple[str, ...], name: str | None) -
     return topic.name
 
 
-def _is_pair(odometry: str | None) -> bool:
-    """Whether odometry is given as two frames, as `odom:base_link`."""
-    return odometry is not None and ":" in odometry
-
-
 def _read(bag: Bag, laser: str, wheels: str | None, corrections: list[str]) -> _Messages:
     """The scans, the odometry of a topic if one is named, and the static transforms."""
     scans: list[_ScanMessage] = []
@@ -370,14 +370,6 @@ def _ascending(scan: _ScanMessage, upside_down: bool) -> _ScanMessage:
     if len(angles) > 1 and angles[1] < angles[0]:
         return scan._replace(angles=angles[::-1], ranges=scan.ranges[::-1])
     return scan._replace(angles=angles)
-
-
-def _frame_of(bag: Bag, topic: str, scans: Sequence[_ScanMessage]) -> str:
-    """The frame of the scans."""
-    frames = sorted({scan.frame for scan in scans})
-    if len(frames) > 1:
-        raise bag.error(f"{topic}: expected scans of one frame, got {', '.join(frames)}")
-    return frames[0]
 
 
 def _transforms(bag: Bag, static: bool) -> list[Transform]:

@@ -89,7 +89,9 @@ def minimize_truncated(
     def next_round(state: _Round) -> _Round:
         """The optimum with the weights, then the weights there."""
         before = state.solution
-        binary = jnp.stack([_are_binary(w) for w in state.weights.values()]).all(axis=0)
+        binary = jnp.stack([((w == 0) | (w == 1)).all(axis=0) for w in state.weights.values()]).all(
+            axis=0
+        )
         tolerances = jnp.where(binary, tolerance, loose)
         solution = minimize_weighted(before.graph, state.weights, tolerances)
         first = state.rounds == 0
@@ -134,11 +136,6 @@ def minimize_truncated(
         weights=row_weights(model, plan.who, variables, data),
         status=jnp.where(converged & ~end.settled, Ending.EXHAUSTED, solution.status),
     )
-
-
-def _are_binary(weight: Float[Array, "E B"]) -> Bool[Array, "B"]:
-    """Whether all weights of a table are zeros and ones."""
-    return ((weight == 0) | (weight == 1)).all(axis=0)
 
 
 def _weight(ratio: Float[Array, "E B"], control: Float[Array, "1 B"]) -> Float[Array, "E B"]:

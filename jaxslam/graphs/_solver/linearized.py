@@ -203,7 +203,11 @@ def half_hessian(
         kernel, count = model.kernels.get(name), len(factor.variables)
 
         def half_cost(steps: Array, involved: tuple[Array, ...], z: Array, info: Array) -> Array:
-            e = factor.residual(_move(factor, steps, involved), z)  # noqa: B023
+            moved = tuple(
+                se2.boxplus(x, step[:3]) if kind == "pose" else x + step[: len(x)]
+                for kind, x, step in zip(factor.variables, involved, steps, strict=True)  # noqa: B023
+            )
+            e = factor.residual(moved, z)  # noqa: B023
             s = e @ info @ e
             return 0.5 * (s if kernel is None else kernel.cost(s))  # noqa: B023
 
@@ -225,16 +229,6 @@ def variable_numbers(factor: Factor, who: Array, poses: int) -> Array:
     """The numbers of the variables of rows (E, K); points are counted on from the poses."""
     shift = np.array([[poses * (kind == "point") for kind in factor.variables]], np.int32)
     return who + shift
-
-
-def _move(
-    factor: Factor, steps: Float[Array, "K d"], involved: tuple[Array, ...]
-) -> tuple[Array, ...]:
-    """The variables of a row moved by increments."""
-    return tuple(
-        se2.boxplus(x, step[:3]) if kind == "pose" else x + step[: len(x)]
-        for kind, x, step in zip(factor.variables, involved, steps, strict=True)
-    )
 
 
 @jax.custom_jvp

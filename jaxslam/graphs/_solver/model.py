@@ -75,7 +75,12 @@ def factors_of(name: str, graph: Graph, factors: Mapping[str, Factor] | None) ->
             raise ValueError(
                 f"{name}: table {key!r} has no factor; there are: {', '.join(by_name) or 'none'}"
             )
-        if (got := _residual_shape(factor, np.shape(graph.points)[-1])) != (len(factor.errors),):
+        sizes, number = {"pose": 3, "point": np.shape(graph.points)[-1]}, jnp.result_type(float)
+        involved = tuple(jax.ShapeDtypeStruct((sizes[kind],), number) for kind in factor.variables)
+        z = jax.ShapeDtypeStruct((len(factor.measurements),), number)
+        residual = jax.eval_shape(_residual, factor, involved, z)
+        got = getattr(residual, "shape", type(residual).__name__)
+        if got != (len(factor.errors),):
             raise ValueError(
                 f"{name}: the factor {factor.name!r} of table {key!r}: expected a residual of "
                 f"shape ({len(factor.errors)},), as its errors tell "
@@ -92,15 +97,6 @@ def _check_instance(name: str, value: object, kind: type, example: str) -> None:
     if not isinstance(value, kind):
         got = f"the class {value.__name__}" if isinstance(value, type) else repr(value)
         raise ValueError(f"{name}: expected a {kind.__name__}, as {example}, got {got}")
-
-
-def _residual_shape(factor: Factor, point_size: int) -> object:
-    """The shape of a factor's residual, or the name of its type if it is not an array."""
-    sizes, number = {"pose": 3, "point": point_size}, jnp.result_type(float)
-    involved = tuple(jax.ShapeDtypeStruct((sizes[kind],), number) for kind in factor.variables)
-    z = jax.ShapeDtypeStruct((len(factor.measurements),), number)
-    residual = jax.eval_shape(_residual, factor, involved, z)
-    return getattr(residual, "shape", type(residual).__name__)
 
 
 @partial(jax.jit, inline=True)

@@ -142,7 +142,15 @@ class FixedLag(Filter):
         joint, info = self._ekf.update(state.joint, kept, key)
         status = jnp.where(lost, jnp.int32(Status.SINGULAR), info.status)
         info = info._replace(status=status.astype(info.status.dtype))
-        steps = _with_scan(state.steps, scan, info)
+        # The window has the measurements that were fused or started landmarks.
+        used = (info.status == Status.FUSED) | (info.status == Status.BORN)
+        z = jnp.where(scan.valid[:, None], scan.z, 0.0)
+        slot, count = jnp.maximum(info.slot, 0), scan.z.shape[0]
+        steps = state.steps._replace(
+            z=state.steps.z.at[-1, :count].set(z),
+            slot=state.steps.slot.at[-1, :count].set(slot),
+            used=state.steps.used.at[-1, :count].set(used),
+        )
         born = joint.alive & ~state.joint.alive
         # New landmarks start where EKF-SLAM has them; the others where the window has them.
         landmarks = jnp.where(born[:, None], joint.landmarks, state.at.landmarks)
@@ -214,18 +222,6 @@ def shift(
         used=append(steps.used, False),
     )
     return after, at._replace(path=append(at.path, pose), noise=append(at.noise, 0.0))
-
-
-def _with_scan(steps: WindowSteps, scan: Scan, info: Info) -> WindowSteps:
-    """The window with the measurements of its newest scan that were fused or started landmarks."""
-    used = (info.status == Status.FUSED) | (info.status == Status.BORN)
-    z = jnp.where(scan.valid[:, None], scan.z, 0.0)
-    slot, count = jnp.maximum(info.slot, 0), scan.z.shape[0]
-    return steps._replace(
-        z=steps.z.at[-1, :count].set(z),
-        slot=steps.slot.at[-1, :count].set(slot),
-        used=steps.used.at[-1, :count].set(used),
-    )
 
 
 def _with_newest(joint: Joint, at: WindowIterate, cov: Float[Array, "D D"]) -> Joint:

@@ -65,28 +65,12 @@ def count(
         ValueError: a shape, a frame, a mount, poses and beams that do not fit; outside a trace, no
             usable beam, or a usable pose that is not finite.
     """
-    _check_shape(shape)
-    check_frame("count", origin, resolution)
-    check_mount("count", mount)
-    _check_scans(poses, beams, max_range)
-    free = max_range if no_return is None else no_return
-    if not 0 <= free <= max_range:
-        raise ValueError(f"count: expected no_return from 0 to {max_range}, got {no_return}")
-    frame = jnp.asarray(origin, float), jnp.asarray(resolution, float)
-    eye = jnp.asarray(mount, float)
-    size = int(shape[0]), int(shape[1])
-    return _count(size, *frame, poses, beams, max_range, free, eye)
-
-
-def _check_shape(shape: tuple[int, int]) -> None:
-    """Raise ValueError unless the shape (H, W) of a map is two integers of at least 1."""
     if np.shape(shape) != (2,) or not all(isinstance(n, Integral) and n >= 1 for n in shape):
         raise ValueError(
             f"count: expected a shape (H, W), integers, of at least one cell, got {shape!r}"
         )
-
-
-def _check_scans(poses: JaxOrNumPy, beams: Beams, max_range: float) -> None:
+    check_frame("count", origin, resolution)
+    check_mount("count", mount)
     if not isinstance(beams, Beams):
         raise ValueError(f"count: expected Beams, got {type(beams).__name__}")
     if not all(hasattr(part, "dtype") for part in beams):
@@ -101,12 +85,18 @@ def _check_scans(poses: JaxOrNumPy, beams: Beams, max_range: float) -> None:
             f"{np.shape(poses)}"
         )
     check_positive("count", max_range=max_range)
-    if not is_concrete(beams, poses):
-        return
-    if not np.all(np.isfinite(poses)):
-        raise ValueError("count: expected finite poses")
-    if not np.any(usable_beams(Beams(*map(np.asarray, beams)))):
-        raise ValueError("count: no scan has a valid beam")
+    if is_concrete(beams, poses):
+        if not np.all(np.isfinite(poses)):
+            raise ValueError("count: expected finite poses")
+        if not np.any(usable_beams(Beams(*map(np.asarray, beams)))):
+            raise ValueError("count: no scan has a valid beam")
+    free = max_range if no_return is None else no_return
+    if not 0 <= free <= max_range:
+        raise ValueError(f"count: expected no_return from 0 to {max_range}, got {no_return}")
+    frame = jnp.asarray(origin, float), jnp.asarray(resolution, float)
+    eye = jnp.asarray(mount, float)
+    size = int(shape[0]), int(shape[1])
+    return _count(size, *frame, poses, beams, max_range, free, eye)
 
 
 @partial(hot_jit, static_argnames=("shape",))

@@ -19,6 +19,7 @@ from jaxslam.core._record import record, set_field, static
 from jaxslam.core._validation import check_motion
 from jaxslam.core.protocols import Motion
 from jaxslam.core.types import Beams, Estimate, Info, Log, Scan
+from jaxslam.core.validation import at_least
 from jaxslam.filters._particles.pose_particles import (
     PoseParticles,
     Region,
@@ -183,7 +184,7 @@ class GridLocalization(MonteCarloFilter):
     """as `LikelihoodField` or `RayCast`"""
     motion: Motion
     """motion model; for odometry `motion.Odometry` with `odometry_controls`"""
-    particles: int = static()
+    particles: int = static(check=at_least(1))
     """capacity P, at least 1; a step has P · B/stride look-ups"""
     _: dataclasses.KW_ONLY
     exponent: Number = 0.1
@@ -222,7 +223,12 @@ class GridLocalization(MonteCarloFilter):
         # Without `no_inline` XLA computes it again in each of its consumers.
         fit = no_inline(fit_of, state.pose, in_dtype(self.prepared, state.pose.dtype), beams)
         # After the likelihood, which is finite there: ∞ must not enter its derivative.
-        blocked = _is_blocked(self.grid, state.pose)
+        height, width = self.grid.log_odds.shape
+        origin, resolution = jnp.asarray(self.grid.origin), self.grid.resolution
+        cell = jnp.floor(to_cells(origin, resolution, state.pose[:, :2]))
+        on_map = (cell >= 0).all(axis=1) & (cell[:, 0] < width) & (cell[:, 1] < height)
+        j, i = jnp.where(on_map[:, None], cell, 0.0).astype(jnp.int32).T
+        blocked = ~on_map | (jnp.asarray(self.grid.log_odds > 0)[i, j])
         fit = jnp.where(blocked, jnp.inf, fit)
         misfit = jnp.where(blocked, jnp.inf, jnp.asarray(self.exponent, fit.dtype) * fit)
         evidence = normalized(state.log_weight - misfit)[1]
@@ -235,16 +241,6 @@ class GridLocalization(MonteCarloFilter):
     def estimate(self, state: PoseParticles) -> Estimate:
         no_points = jnp.zeros((0, 2), state.pose.dtype)
         return self.pose_estimate(state, no_points, jnp.zeros(0, jnp.int32))
-
-
-def _is_blocked(grid: Grid, pose: Float[Array, "P 3"]) -> Bool[Array, "P"]:
-    """The mask of the poses off the map or in an occupied cell."""
-    height, width = grid.log_odds.shape
-    at = jnp.floor(to_cells(jnp.asarray(grid.origin), grid.resolution, pose[:, :2]))
-    inside = (at >= 0).all(axis=1) & (at[:, 0] < width) & (at[:, 1] < height)
-    # (x, y) is (column, row); any cell for a pose off the map.
-    j, i = jnp.where(inside[:, None], at, 0.0).astype(jnp.int32).T
-    return ~inside | (jnp.asarray(grid.log_odds > 0)[i, j])
 
 
 def info_of_beams(

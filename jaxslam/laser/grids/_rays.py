@@ -83,7 +83,14 @@ def check_method(name: str, method: str) -> None:
 @partial(jax.jit, static_argnames=("method", "skip"), inline=True)
 def _ray_map(grid: Grid, method: str, skip: bool) -> RayMap:
     solid = jnp.where(grid.observed, grid.probability, 0.0) - 0.5
-    stops = solid > 0 if method == "cells" else _squares_with_surface(solid)
+    if method == "cells":
+        stops = solid > 0
+    else:
+        # The squares between four centres of cells in which a surface may be, (H+1, W+1). The cells
+        # at the border are repeated, so that the squares cover the map.
+        edged = jnp.pad(solid, 1, mode="edge")
+        across = jnp.maximum(edged[:, 1:], edged[:, :-1])
+        stops = jnp.maximum(across[1:], across[:-1]) > 0
     ahead = jnp.zeros(stops.shape, jnp.uint8)
     if skip:
         # Beyond the border all counts as occupied: no step leads off the map. The distance between
@@ -96,16 +103,6 @@ def _ray_map(grid: Grid, method: str, skip: bool) -> RayMap:
         ahead = jnp.minimum(jnp.floor(4.0 * away), MOST).astype(jnp.uint8)
     ahead = jnp.pad(jnp.where(stops, jnp.uint8(STOP), ahead), 1, constant_values=OFF)
     return RayMap(solid, ahead, jnp.asarray(grid.origin), jnp.asarray(grid.resolution, solid.dtype))
-
-
-def _squares_with_surface(solid: Float[Array, "H W"]) -> Array:
-    """The mask (H+1, W+1) of squares between four centres of cells in which a surface may be.
-
-    The cells at the border are repeated, so that the squares cover the map.
-    """
-    edged = jnp.pad(solid, 1, mode="edge")
-    across = jnp.maximum(edged[:, 1:], edged[:, :-1])
-    return jnp.maximum(across[1:], across[:-1]) > 0
 
 
 def cast(
@@ -160,14 +157,6 @@ def cast(
         raise ValueError(f"cast: expected a Grid or a RayMap, got {type(grid).__name__}")
     check_real("cast", pose=pose, angles=angles, max_range=max_range)
     pose, angles = jnp.asarray(pose), jnp.asarray(angles)
-    _check_rays(pose, angles, max_range)
-    if isinstance(grid, Grid):
-        grid = ray_map(grid, skip=False)
-    _check_on_map(grid, pose)
-    return _cast(grid, pose, angles, max_range)
-
-
-def _check_rays(pose: Array, angles: Array, max_range: ArrayLike) -> None:
     if pose.ndim < 1 or pose.shape[-1] != 3:
         raise ValueError(f"cast: expected poses (x, y, θ), got shape {shape_text(pose)}")
     if angles.ndim != 1 or angles.size == 0:
@@ -178,6 +167,10 @@ def _check_rays(pose: Array, angles: Array, max_range: ArrayLike) -> None:
         np.shape(max_range) == () and 0 < float(np.asarray(max_range)) < np.inf
     ):
         raise ValueError(f"cast: expected one max_range above 0, got {max_range!r}")
+    if isinstance(grid, Grid):
+        grid = ray_map(grid, skip=False)
+    _check_on_map(grid, pose)
+    return _cast(grid, pose, angles, max_range)
 
 
 def _check_on_map(grid: RayMap, pose: Array) -> None:

@@ -90,8 +90,10 @@ def scans_of(log: LogOfScans, settings: Settings) -> Scans:
     stride = -(-beams // WIDTH)  # so that a scan fits the program
     # The spacing of the beams by some of the scans: `ROWS` at most.
     sampled = slice(None, None, -(-count // ROWS))
-    angles, valid = np.asarray(log.beams.angle)[sampled], np.asarray(log.beams.valid)[sampled] > 0
-    spacing = max(_spacing(angles[:, ::stride], valid[:, ::stride]), 1e-3)
+    angles = np.asarray(log.beams.angle)[sampled][:, ::stride]
+    valid = (np.asarray(log.beams.valid)[sampled] > 0)[:, ::stride]
+    between = np.abs(np.diff(angles, axis=1))[valid[:, 1:] & valid[:, :-1]]
+    spacing = max(float(np.median(between)) if between.size else _USUAL_SPACING, 1e-3)
     span = np.int32(np.clip(round(SPAN / spacing), 2, _MAX_NEIGHBOURS))
     thinning = -(-len(range(0, beams, stride)) // settings.beams)
     changed = []
@@ -149,12 +151,6 @@ def _surfaces(points: Points, span: Int[Array, ""]) -> Surface:
         return surface(scan, span, GAP, most=_MAX_NEIGHBOURS)
 
     return jax.vmap(surface_of)(points)
-
-
-def _spacing(angles: np.ndarray, valid: np.ndarray) -> float:
-    """The median angle between neighbouring beams [rad]."""
-    steps = np.abs(np.diff(angles, axis=1))[valid[:, 1:] & valid[:, :-1]]
-    return float(np.median(steps)) if steps.size else _USUAL_SPACING
 
 
 def _has_changed(

@@ -5,7 +5,7 @@ from typing import NamedTuple, TypeAlias
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Float
 
 from jaxslam.core._numbers import check_count, check_positive
 from jaxslam.core._record import record, static
@@ -184,7 +184,12 @@ class FieldMatcher(Matcher):
         self, of: Field, points: Points, pose: Array, prior: Prior | None
     ) -> _Linearization:
         residual, jacobian = field_residuals(of, points, pose)
-        used = points.valid & _on_map(of, points, pose) & (residual < self.reach)
+        # Beyond the grid the field has the values of its border.
+        moved = points.position @ se2.rotation(pose[2]).T + pose[None, :2]
+        cell = to_cells(of.origin, of.resolution, moved)
+        size = jnp.asarray(of.values.shape[::-1], cell.dtype)
+        on_map = jnp.all((cell >= 0) & (cell <= size[None]), axis=1)
+        used = points.valid & on_map & (residual < self.reach)
         weight = weights(residual, used, self.kernel, self.scale)
         curvature, slope = information_of(jacobian, weight), (weight * residual) @ jacobian
         cost = self._robust_cost(residual, points) + 2 * prior_cost(prior, pose)
@@ -196,14 +201,6 @@ class FieldMatcher(Matcher):
         if self.kernel is not None:
             square = self.scale**2 * self.kernel.cost(square / self.scale**2)
         return jnp.where(points.valid, square, 0.0).sum()
-
-
-def _on_map(of: Field, points: Points, pose: Float[Array, "3"]) -> Bool[Array, "N"]:
-    """The mask of the points on the grid; beyond, the field has the values of the border."""
-    moved = points.position @ se2.rotation(pose[2]).T + pose[None, :2]
-    cell = to_cells(of.origin, of.resolution, moved)
-    size = jnp.asarray(of.values.shape[::-1], cell.dtype)
-    return jnp.all((cell >= 0) & (cell <= size[None]), axis=1)
 
 
 def field_residuals(

@@ -131,7 +131,23 @@ def match(
     """
     batch = _batch_of(matcher, reference, points, start)
     if prior is not None:
-        _check_prior(prior, batch)
+        if not isinstance(prior, Prior):
+            raise ValueError(f"match: expected a Prior, got {type(prior).__name__}")
+        if np.shape(prior.pose) != (*batch, 3) or np.shape(prior.information) != (*batch, 3, 3):
+            size = " x ".join(str(axis) for axis in (*batch, 3))
+            raise ValueError(
+                f"match: expected a prior of a pose {size} and an information {size} x 3, got "
+                f"{shape_text(prior.pose)} and {shape_text(prior.information)}"
+            )
+        if is_concrete(prior):
+            mean, information = np.asarray(prior.pose), np.asarray(prior.information)
+            if not (np.all(np.isfinite(mean)) and np.all(np.isfinite(information))):
+                raise ValueError("match: expected a finite prior")
+            # 1e-4: the inverse of a covariance in float32 may have few digits.
+            if asymmetric(information, 1e-4).any() or indefinite(information, 1e-4).any():
+                raise ValueError(
+                    "match: expected a symmetric information of the prior, positive semi-definite"
+                )
     with jax.numpy_dtype_promotion("standard"):  # the user may have refused promotion: "strict"
         dtype = jnp.result_type(points.position, *floats(reference), jnp.float32)
     start = jnp.asarray(start, dtype)
@@ -193,26 +209,6 @@ def _batch_of(
     if is_concrete(start) and not np.all(np.isfinite(np.asarray(start))):
         raise ValueError(f"match: expected a finite start, got {np.asarray(start)}")
     return batch
-
-
-def _check_prior(prior: object, batch: tuple[int, ...]) -> None:
-    if not isinstance(prior, Prior):
-        raise ValueError(f"match: expected a Prior, got {type(prior).__name__}")
-    if np.shape(prior.pose) != (*batch, 3) or np.shape(prior.information) != (*batch, 3, 3):
-        shape = " x ".join(str(size) for size in (*batch, 3))
-        raise ValueError(
-            f"match: expected a prior of a pose {shape} and an information {shape} x 3, got "
-            f"{shape_text(prior.pose)} and {shape_text(prior.information)}"
-        )
-    if is_concrete(prior):
-        information = np.asarray(prior.information)
-        if not (np.all(np.isfinite(np.asarray(prior.pose))) and np.all(np.isfinite(information))):
-            raise ValueError("match: expected a finite prior")
-        # 1e-4: the inverse of a covariance in float32 may have few digits.
-        if asymmetric(information, 1e-4).any() or indefinite(information, 1e-4).any():
-            raise ValueError(
-                "match: expected a symmetric information of the prior, positive semi-definite"
-            )
 
 
 def _check_points(name: str, of: object, batch: tuple[int, ...] = ()) -> None:

@@ -39,8 +39,12 @@ def route(places: TopologicalMap, start: ArrayLike, goal: ArrayLike) -> Route:
     for name, end, label in zip(("start", "goal"), ends, labels, strict=True):
         if label < 0:
             raise ValueError(f"route: the {name} {end} is in no place of the map")
-    if _in_sight(places, ends):
-        return Route((int(labels[0]),), ends, float(np.linalg.norm(ends[1] - ends[0])))
+    straight = float(np.linalg.norm(ends[1] - ends[0]))
+    count = 2 + int(2 * straight / float(places.grid.resolution))  # half a cell apart
+    share = np.linspace(0.0, 1.0, count)[:, None]
+    crossed = place_of(places, (1 - share) * ends[:1] + share * ends[1:])
+    if crossed[0] >= 0 and (crossed == crossed[0]).all():
+        return Route((int(labels[0]),), ends, straight)
     cells = places.skeleton.cells.reshape(-1)
     where = cell_centers(places.grid)
     at = []
@@ -63,15 +67,6 @@ def route(places: TopologicalMap, start: ArrayLike, goal: ArrayLike) -> Route:
     changes = np.flatnonzero(np.diff(passed)) + 1
     length = float(np.linalg.norm(np.diff(path, axis=0), axis=1).sum())
     return Route(tuple(int(p) for p in [passed[0], *passed[changes]]), path, length)
-
-
-def _in_sight(places: TopologicalMap, ends: Float[np.ndarray, "2 2"]) -> bool:
-    """Whether the straight line between two points stays in the place of the first."""
-    gap = float(np.linalg.norm(ends[1] - ends[0]))
-    count = 2 + int(2 * gap / float(places.grid.resolution))  # half a cell apart
-    share = np.linspace(0.0, 1.0, count)[:, None]
-    seen = place_of(places, (1 - share) * ends[:1] + share * ends[1:])
-    return bool(seen[0] >= 0 and (seen == seen[0]).all())
 
 
 def place_of(places: TopologicalMap, points: ArrayLike) -> Int[np.ndarray, "n"]:

@@ -148,11 +148,18 @@ class Film(FuncAnimation):
         Raises:
             ValueError: on another ending, or .mp4 where ffmpeg is missing or fails.
         """
-        if writer is None and Path(filename).suffix == ".html":
+        kind = Path(filename).suffix
+        if writer is None and kind == ".html":
             Path(filename).write_text(self.to_jshtml(), encoding="utf-8")
             return
+        if not writer:
+            if kind not in (".gif", ".mp4"):
+                raise ValueError(f"Film.save: expected a name in .gif, .html, .mp4, got {filename}")
+            if kind == ".mp4" and (problem := mp4_problem()):
+                raise Unusable(f"Film.save: {filename} cannot be written ({problem}): save a .gif")
+            writer = "pillow" if kind == ".gif" else "ffmpeg"
         try:
-            super().save(filename, writer or _writer_of(filename), *arguments, **options)
+            super().save(filename, writer, *arguments, **options)
         except (subprocess.CalledProcessError, BrokenPipeError) as error:
             raise Unusable(
                 f"Film.save: {filename} cannot be written ({_reason(error)}): save a .gif"
@@ -198,16 +205,6 @@ def _reason(error: BaseException) -> str:
     return next((line.strip() for line in reversed(text.splitlines()) if line.strip()), "") or (
         first_line(error)
     )
-
-
-def _writer_of(filename: str | Path) -> str:
-    """The name of Matplotlib's writer for a file; ValueError without one."""
-    kind = Path(filename).suffix
-    if kind not in (".gif", ".mp4"):
-        raise ValueError(f"Film.save: expected a name in .gif, .html, .mp4, got {filename}")
-    if kind == ".mp4" and (problem := mp4_problem()):
-        raise Unusable(f"Film.save: {filename} cannot be written ({problem}): save a .gif")
-    return "pillow" if kind == ".gif" else "ffmpeg"
 
 
 class _Stage:

@@ -5,7 +5,6 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Float
-from matplotlib.axes import Axes
 from matplotlib.collections import LineCollection
 from matplotlib.figure import Figure
 
@@ -71,7 +70,18 @@ def graph_figure(
     largest = sorted(positive, key=lambda row: -row[0])[:worst]
     figure, panels = panels_of(width, 0.52 * width, 1, 2, share=(False, False))
     for axes, graph, text in zip(panels, (before, after), subtitles, strict=True):
-        _draw(axes, graph, factors)
+        for name, ends in _edges(graph, factors).items():
+            if len(ends):
+                edges = LineCollection(list(ends), alpha=0.8, label=name, **_EDGES[name])
+                axes.add_collection(edges)
+                axes.update_datalim(ends.reshape(-1, 2))
+        if len(graph.points):
+            points = np.asarray(graph.points)[:, :2]
+            axes.plot(*points.T, ".", color=COLORS[2], ms=3, label="points", zorder=4)
+        start: Look = {"ls": "none", "color": INK, "mfc": "white", "mew": 1.2, "ms": 5, "zorder": 6}
+        axes.plot(*np.asarray(graph.poses)[0, :2], marker="o", label="first pose", **start)
+        axes.set_aspect("equal", adjustable="datalim")
+        axes.margins(0.04)
         if largest:
             ends = np.array([_ends(graph, factors[key], key)[row] for _, key, row in largest])
             axes.add_collection(
@@ -112,21 +122,6 @@ def _edges(graph: Graph, factors: Mapping[str, Factor]) -> dict[str, Float[np.nd
         else:
             ends_by_name["measurements of points"].append(ends[valid])
     return {name: np.concatenate(parts) for name, parts in ends_by_name.items()}
-
-
-def _draw(axes: Axes, graph: Graph, factors: Mapping[str, Factor]) -> None:
-    """Draw path, loop edges and points."""
-    for name, ends in _edges(graph, factors).items():
-        if len(ends):
-            axes.add_collection(LineCollection(list(ends), alpha=0.8, label=name, **_EDGES[name]))
-            axes.update_datalim(ends.reshape(-1, 2))
-    if len(graph.points):
-        points = np.asarray(graph.points)[:, :2]
-        axes.plot(*points.T, ".", color=COLORS[2], ms=3, label="points", zorder=4)
-    start: Look = {"ls": "none", "color": INK, "mfc": "white", "mew": 1.2, "ms": 5, "zorder": 6}
-    axes.plot(*np.asarray(graph.poses)[0, :2], marker="o", label="first pose", **start)
-    axes.set_aspect("equal", adjustable="datalim")
-    axes.margins(0.04)
 
 
 def graph_scene(

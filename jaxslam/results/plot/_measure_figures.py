@@ -218,7 +218,14 @@ def gained_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
         axes.axhspan(_NOTHING * 10**-strip, _NOTHING, color=RULE, alpha=0.5, lw=0, zorder=1)
         axes.axhline(_NOTHING, color=INK, lw=0.5, zorder=1.5)
         axes.set(yscale="log", xlim=step_limits(campaign.steps), ylim=(_NOTHING * 10**-strip, top))
-        _label_powers(axes, strip, decades)
+        # Three or four powers of ten, and the strip.
+        apart = max(2, int(np.ceil((decades - 1) / 4)))
+        powers = np.arange(-6 + apart, -6 + decades, apart)
+        axes.set_yticks(
+            [_NOTHING * 10 ** (-strip / 2), *(10.0**powers)],
+            ["$< 10^{-6}$", *(f"$10^{{{k:.0f}}}$" for k in powers)],
+        )
+        axes.set_yticks([], minor=True)
     if not curves:
         text = "no filter has an observability monitor (filters.Monitored)"
         axes.text(0.5, 0.6, text, transform=axes.transAxes, ha="center", fontsize=8)
@@ -226,17 +233,6 @@ def gained_figure(campaign: Campaign, *, width: float = PAGE) -> Figure:
     title += f". Not monitored: {', '.join(map(escape_name, others))}" * bool(others and curves)
     add_legends(figure, rows, title, "step")
     return figure
-
-
-def _label_powers(axes: Axes, strip: float, decades: float) -> None:
-    """Label the ordinate with three or four powers of ten, and the strip."""
-    apart = max(2, int(np.ceil((decades - 1) / 4)))
-    powers = np.arange(-6 + apart, -6 + decades, apart)
-    axes.set_yticks(
-        [_NOTHING * 10 ** (-strip / 2), *(10.0**powers)],
-        ["$< 10^{-6}$", *(f"$10^{{{k:.0f}}}$" for k in powers)],
-    )
-    axes.set_yticks([], minor=True)
 
 
 def _peak(values: np.ndarray) -> float:
@@ -315,9 +311,16 @@ def _point(axes: Axes, i: int, at: float, name: str, measure: Average) -> None:
     value = measure.value
     if not np.isfinite(value):
         return
-    _, right = axes.get_xlim()
+    left, right = axes.get_xlim()
     style = look(i)
-    _interval(axes, at, measure, style["color"])
+    if np.isfinite(measure.low):
+        line: Look = {"color": style["color"], "gid": INTERVAL, "zorder": 2.8}
+        axes.plot(np.clip(measure[1:], left, right), np.full(2, at), lw=1.0, **line)
+        # An arrow where the interval leaves the scale.
+        if measure.low < left:
+            axes.plot(left, at, "<", ms=3.5, mew=0, clip_on=False, **line)
+        if measure.high > right:
+            axes.plot(right, at, ">", ms=3.5, mew=0, clip_on=False, **line)
     if value > right:
         axes.plot(right, at, ">", color=style["color"], mec=INK, mew=0.4, ms=5.0, clip_on=False)
         axes.annotate(
@@ -334,19 +337,6 @@ def _point(axes: Axes, i: int, at: float, name: str, measure: Average) -> None:
         return
     mark: Look = {key: style[key] for key in ("color", "marker", "mec", "mew")}
     axes.plot(value, at, ms=5.0, label=escape_name(name), **mark)
-
-
-def _interval(axes: Axes, at: float, measure: Average, color: str) -> None:
-    """Draw the interval of a measure at a height; an arrow where it leaves the scale."""
-    if not np.isfinite([measure.value, measure.low]).all():
-        return
-    ends = axes.get_xlim()
-    style: Look = {"color": color, "gid": INTERVAL, "zorder": 2.8}
-    axes.plot(np.clip(measure[1:], *ends), np.full(2, at), lw=1.0, **style)
-    cut = (measure.low < ends[0], measure.high > ends[1])
-    for end, mark, beyond in zip(ends, "<>", cut, strict=True):
-        if beyond:
-            axes.plot(end, at, mark, ms=3.5, mew=0, clip_on=False, **style)
 
 
 def _values(campaign: Campaign, key: str) -> np.ndarray:

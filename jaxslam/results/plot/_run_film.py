@@ -91,18 +91,14 @@ def probe(state: PyTree) -> Cloud | Links | Hypotheses | None:
     if isinstance(state, CanonicalState):
         return _links(state.omega, state.landmarks.shape[1])
     if isinstance(state, DelayedState):
-        return _hypotheses(state)
+        # The hypotheses are after the slots of the landmarks, before the stored poses.
+        joint, count = state.joint, state.persistence.shape[0]
+        first = joint.alive.shape[0] - state.taken_at.shape[0] - count
+        slot = first + np.arange(count)
+        covs = covariance_blocks(joint)[slot, :2, slot, :2]
+        persistence = jnp.where(joint.alive[slot], state.persistence, 0.0)
+        return Hypotheses(joint.landmarks[slot, :2], covs, persistence)
     return None
-
-
-def _hypotheses(state: DelayedState) -> Hypotheses:
-    """The hypotheses of a state: after the slots of the landmarks, before the stored poses."""
-    joint, count = state.joint, state.persistence.shape[0]
-    first = joint.alive.shape[0] - state.taken_at.shape[0] - count
-    slot = first + np.arange(count)
-    covs = covariance_blocks(joint)[slot, :2, slot, :2]
-    persistence = jnp.where(joint.alive[slot], state.persistence, 0.0)
-    return Hypotheses(joint.landmarks[slot, :2], covs, persistence)
 
 
 def _links(omega: Float[Array, "D D"], size: int) -> Links:
@@ -351,7 +347,11 @@ def run_scene(
     layers = [
         *_truth(history, true_points, true, _ROBOT * side),
         *link_layers(history.seen, history.estimate),
-        *_beams(beams),
+        *(
+            lines_between(beams.beams[name], label=f"measured, {name}", zorder=3, **look)
+            for name, look in _BEAMS.items()
+            if any(map(len, beams.beams[name]))
+        ),
         *hypothesis_layers(history.seen),
         *_map(history),
         *_robot(history, _ROBOT * side),
@@ -397,15 +397,6 @@ def _truth(
         robot: Look = {"fc": "none", "ec": FAINT, "lw": 1.2, "zorder": 5.5}
         layers.append(triangle(path[history.step], size, **robot))
     return layers
-
-
-def _beams(of_frames: FrameBeams) -> list[Layer]:
-    """The layers of the beams to measured landmarks, of the outcomes that occur."""
-    return [
-        lines_between(of_frames.beams[name], label=f"measured, {name}", zorder=3, **look)
-        for name, look in _BEAMS.items()
-        if any(map(len, of_frames.beams[name]))
-    ]
 
 
 def _map(history: History) -> list[Layer]:

@@ -87,19 +87,15 @@ def beam_samples(model: BeamModel, count: int, seed: int) -> Samples:
     rng = np.random.default_rng(seed)
     headings = np.concatenate([rng.uniform(-np.pi, np.pi, count), _HEADINGS])
     labels = ("random",) * count + tuple(f"pose theta = {h:.4g}" for h in _HEADINGS)
-    pose = np.array([_apart(rng, heading, mount) for heading in headings])
+    poses = []
+    for heading in headings:
+        pose = np.array([*rng.uniform(-3, 3, 2), heading])
+        while not _ranges(pose[None], mount)[1].min() > _CORNER:  # a beam ends near a corner
+            pose = np.array([*rng.uniform(-3, 3, 2), heading])
+        poses.append(pose)
+    pose = np.array(poses)
     ranges = _ranges(pose, mount)[0] + 0.15 * rng.normal(size=(len(pose), len(_ANGLES)))
     return Samples((pose, ranges), labels)
-
-
-def _apart(
-    rng: np.random.Generator, heading: float, mount: Float[np.ndarray, "3"]
-) -> Float[np.ndarray, "3"]:
-    """A pose with this heading from which no beam ends near a corner of the room."""
-    while True:
-        pose = np.array([*rng.uniform(-3, 3, 2), heading])
-        if _ranges(pose[None], mount)[1].min() > _CORNER:
-            return pose
 
 
 def _ranges(

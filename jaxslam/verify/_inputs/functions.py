@@ -242,9 +242,13 @@ def plain_function(
         named |= {p: _number_names(p, shape[1]) for p, shape in pairs if named[p] is None}
     complete = {p: entries for p, entries in named.items() if entries is not None}
     if missing := [p for p in named if p not in complete]:
+        line = ", ".join(f'"{parameter}": ("v [m/s]", "omega [rad/s]")' for parameter in missing)
+        example = f"arguments={{{line}}} in Python; in a file define a function, which has a name"
+        if name.isidentifier():
+            example = f"{name}_arguments = {{{line}}} in the file, or arguments= in Python"
         raise ValueError(
             f"{name}: the length of {', '.join(map(repr, missing))} is not known. Name the "
-            f"entries, each with its unit: {_example(name, missing)}"
+            f"entries, each with its unit: {example}"
         )
     arguments_of = tuple(Argument(p, entries) for p, entries in complete.items())
     return Function(name, call, arguments_of, tuple(outputs or ()), jacobian)
@@ -286,14 +290,6 @@ def _entries(
 
 def _number_names(parameter: str, count: int) -> tuple[str, ...]:
     return tuple(f"{parameter}[{k}]" for k in range(count))
-
-
-def _example(name: str, parameters: Sequence[str]) -> str:
-    """Where a user names the entries of a function's arguments, of two entries each."""
-    line = ", ".join(f'"{parameter}": ("v [m/s]", "omega [rad/s]")' for parameter in parameters)
-    if name.isidentifier():
-        return f"{name}_arguments = {{{line}}} in the file, or arguments= in Python"
-    return f"arguments={{{line}}} in Python; in a file define a function, which has a name"
 
 
 def makes_a_model(factory: Callable[..., object]) -> bool:

@@ -97,10 +97,17 @@ def load(target: str) -> list[_Target]:
         targets[0] = dataclasses.replace(targets[0], notes=(*targets[0].notes, note))
     if name:
         if not targets and keys:
+            value = vars(module)[name]
+            hint = f", got a {type(value).__name__}"
+            if callable(value):
+                hint = (
+                    f": define {name}{_CLAIMS[0]}, or call jaxslam.verify_jacobians({name}) from "
+                    "Python, which needs none"
+                )
             raise UnusableFile(
                 f"{path.name}: expected {name} to be a Motion, a Sensor, a class of one whose only "
                 "required field is noise_cov, a factory of one, a Factor, a BeamModel, or a "
-                f"function with its Jacobian{_without_claim(name, vars(module)[name])}"
+                f"function with its Jacobian{hint}"
             )
         if not targets:
             raise UnusableFile(f"{path.name}: there is no {name!r} to verify{names_in(module)}")
@@ -210,16 +217,6 @@ def names_in(module: ModuleType) -> str:
         )
     ]
     return f"; it defines: {', '.join(names)}" if names else "; it defines nothing"
-
-
-def _without_claim(name: str, value: object) -> str:
-    """What to do with a function that has no Jacobian; of another object its type."""
-    if not callable(value):
-        return f", got a {type(value).__name__}"
-    return (
-        f": define {name}{_CLAIMS[0]}, or call jaxslam.verify_jacobians({name}) from Python, which "
-        "needs none"
-    )
 
 
 def _target(module: ModuleType, name: str) -> _Target | None:

@@ -130,7 +130,15 @@ def laser_odometry(
     """
     count = len(scans.usable)
     borders = _borders(scans, steps)
-    _compile(scans, settings)
+    # Compile the programs of the pieces first, and in parallel the wider search, which is needed
+    # later, if at all: nobody waits for it.
+    row, origin = np.zeros(1, int), np.zeros((1, 3))
+    reference = reference_of(scans, row, origin, origin[0], settings.scans_of_reference)
+    arguments = reference, rows_of(scans.points, 0), origin[0], np.eye(3), NO_FLOOR, settings
+    match(NEAR, *arguments)
+    wider_search = ThreadPoolExecutor(1)
+    wider_search.submit(match, FAR, *arguments)
+    wider_search.shutdown(wait=False)
     # From 2: the first scan has no match, and is done at the start.
     progress_count, lock = itertools.count(2), threading.Lock()
     stopped = threading.Event()
@@ -196,15 +204,3 @@ def _join(
         parts.append(part._replace(keyframe=piece.keyframe + begin))
     odometry = Odometry(*(np.concatenate(columns) for columns in zip(*parts, strict=True)))
     return odometry._replace(keyframe=np.unique(odometry.keyframe))
-
-
-def _compile(scans: Scans, settings: Settings) -> None:
-    """Compile the programs of the pieces, and in parallel the wider search."""
-    row, start = np.zeros(1, int), np.zeros((1, 3))
-    reference = reference_of(scans, row, start, start[0], settings.scans_of_reference)
-    arguments = reference, rows_of(scans.points, 0), start[0], np.eye(3), NO_FLOOR, settings
-    match(NEAR, *arguments)
-    # The wider search is needed later, if at all: nobody waits for it.
-    pool = ThreadPoolExecutor(1)
-    pool.submit(match, FAR, *arguments)
-    pool.shutdown(wait=False)
