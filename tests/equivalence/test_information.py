@@ -162,7 +162,7 @@ def test_gradients_and_batches():
 @refused(
     ({"capacity": 0}, "capacity"),
     ({"gate": 0.0}, "gate: expected a probability above 0 and below 1"),
-    ({"floor": 0.0}, "floor above 0"),
+    ({"floor": 0.0}, "floor: expected a number above 0"),
     ({"sensor": sensors.Compass([[1e-4]])}, "a sensor of landmarks"),
 )
 def test_refusals(changes):

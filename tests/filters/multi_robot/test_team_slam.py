@@ -400,7 +400,7 @@ def signs():
     (lambda: TeamSlam(crew(2), 0), "capacity"),
     (lambda: TeamSlam(crew(2), 3, report=2), "expected report from 0 to"),
     (lambda: TeamSlam(crew(2), 3, gate=0.0), "gate: expected a probability above 0 and below 1"),
-    (lambda: TeamSlam(crew(2), 3, correction="at once"), "expected correction"),
+    (lambda: TeamSlam(crew(2), 3, correction="at once"), "correction: expected"),
     (lambda: TeamSlam([signs()], 3), "expected landmarks \\(x, y\\)"),
     (lambda: TeamSlam([crew(1)[0], compass_only()], 3), "robot 1 needs a start"),
     (
