@@ -160,7 +160,9 @@ def open_store(spec: Spec) -> store.Store:
         read_manifest(folder)  # raises where the folder is not a campaign's
         shutil.rmtree(folder)
     if not settings:
-        if folder.exists() and not all(map(is_unfinished, folder.iterdir())):
+        # Another part may have begun the campaign since the plan was made; `store.open` compares.
+        is_joined = spec.part is not None and (folder / MANIFEST).exists()
+        if folder.exists() and not is_joined and not all(map(is_unfinished, folder.iterdir())):
             raise ValueError(
                 f"--out: {folder} holds files that are no campaign's: choose another folder"
             )
