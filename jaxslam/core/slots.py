@@ -226,7 +226,7 @@ def _write_in_place(
     landmark_cov: Float[Array, "N L L"],
     square_root: bool,
 ) -> Float[Array, "D D"]:
-    """The same covariance, with the rows and columns of one new landmark after the other."""
+    """The covariance of `_add_in_one_pass`, written one new landmark after the other."""
     size = landmark_cov.shape[1]
     # Before the loop: the rows of the robot change as landmarks are written.
     half = materialize(cov[:3] if square_root else _half_of(cov, gain))

@@ -9,13 +9,13 @@ from jaxslam.math._gaussians import GaussianTerms, gaussian_terms
 
 
 class GaussianCorrection(NamedTuple):
-    """The Kalman correction of x ~ N(x̂, P) by a measurement of innovation ν = z - H x + …."""
+    """The Kalman correction of x ~ N(x̂, P) by a measurement with innovation ν."""
 
     xi: Float[Array, "D"]
     """K ν, to add to the mean"""
     cov: Float[Array, "D D"]
     terms: GaussianTerms
-    """of N(ν; 0, S)"""
+    """distance, factor and density of N(ν; 0, S)"""
 
 
 def correct_gaussian(

@@ -124,13 +124,13 @@ class NewLandmarks(NamedTuple):
     """The outcome of the measurements without a landmark in the map, (M,) each."""
 
     slot: jax.Array
-    """of the landmark, where granted"""
+    """slot of the landmark, where granted"""
     granted: jax.Array
     """a landmark was started"""
     deferred: jax.Array
     """beyond `births`"""
     repeated: jax.Array
-    """of a tag that occurs earlier in the scan"""
+    """its tag occurs earlier in the scan"""
 
 
 class Innovations(Protocol):

@@ -89,9 +89,11 @@ class FixedLag(Filter):
     iterations: int = static(default=2, check=at_least(1))
     """Gauss-Newton steps at each scan"""
     associate: Associate = field(default=Known(), check=function_of("prediction", "scan"))
+    """See `EkfSlam.associate`."""
     gate: Number | None = field(default=None, check=or_none(probability))
+    """See `EkfSlam.gate`; NIS is of the innovations of EKF-SLAM, not of the window."""
     births: int | None = static(default=None, check=or_none(at_least(1)))
-    """these three as the fields of `EkfSlam`. NIS is that of the innovations of EKF-SLAM"""
+    """See `EkfSlam.births`."""
     chart = Euclidean()
 
     def __post_init__(self) -> None:

@@ -105,9 +105,11 @@ class LogEstimator(Component):
     """(3, 3)"""
     _: dataclasses.KW_ONLY
     associate: Associate = field(default=Known(), check=function_of("prediction", "scan"))
+    """See `EkfSlam.associate`."""
     gate: Number | None = field(default=None, check=or_none(probability))
+    """See `EkfSlam.gate`."""
     births: int | None = static(default=None, check=or_none(at_least(1)))
-    """these three as the fields of `EkfSlam`"""
+    """See `EkfSlam.births`."""
 
     def __post_init__(self) -> None:
         name, sensor = type(self).__name__, self.sensor
