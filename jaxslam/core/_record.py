@@ -238,7 +238,7 @@ def _is_number(value: Any) -> bool:
     return isinstance(value, np.ndarray) and value.dtype.kind in "biufcV"
 
 
-# --- for worlds and filters that do not declare their checks yet ---------------------------------
+# --- for worlds, which do not declare their checks ------------------------------------------------
 
 
 class FrozenDict(dict[Any, Any]):

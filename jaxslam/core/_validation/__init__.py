@@ -3,17 +3,14 @@
 from jaxslam.core._numbers import (
     check_count,
     check_covariance,
-    check_gate,
     check_key,
     is_concrete,
     shape_text,
 )
 from jaxslam.core._validation.logs import check_log
 from jaxslam.core._validation.models import (
-    check_associate,
     check_models,
     check_motion,
-    check_parts,
     check_record,
     check_sensor,
     checked_estimate,
@@ -25,15 +22,12 @@ from jaxslam.core._validation.models import (
 )
 
 __all__ = [
-    "check_associate",
     "check_count",
     "check_covariance",
-    "check_gate",
     "check_key",
     "check_log",
     "check_models",
     "check_motion",
-    "check_parts",
     "check_record",
     "check_sensor",
     "checked_estimate",

@@ -19,9 +19,8 @@ from numpy.typing import ArrayLike
 
 from jaxslam.core._names import unfit_signature
 from jaxslam.core._numbers import check_array, shape_text
-from jaxslam.core._record import function_of
 from jaxslam.core._reprs import with_article
-from jaxslam.core.protocols import Chart, Life, Linearizer, Motion, Sensor
+from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.core.validation import InvalidField, instance_of, require
 
@@ -149,33 +148,10 @@ def _sound(value: Any, check: Callable[[str, object], None]) -> Any:
     return value
 
 
-def check_parts(
-    name: str,
-    chart: object = None,
-    linearize: object = None,
-    associate: object = None,
-    life: object = None,
-) -> None:
-    """Raise ValueError unless each part has its type; one that is None is absent."""
-    if chart is not None:
-        check_record(name, "chart", chart, Chart)
-    if linearize is not None:
-        check_record(name, "linearize", linearize, Linearizer)
-    if associate is not None:
-        check_associate(name, associate)
-    if life is not None:
-        check_record(name, "life", life, Life)
-
-
 def check_record(name: str, field: str, value: object, kind: type[_Record]) -> _Record:
     """The value, if it is such a record; InvalidField if not, as on a class that was not called."""
     record: _Record = require(name, field, value, instance_of(kind))
     return record
-
-
-def check_associate(name: str, associate: object) -> None:
-    """Raise InvalidField unless this is a function of (prediction, scan)."""
-    require(name, "associate", associate, function_of("prediction", "scan"))
 
 
 def _numbers(*shape: int) -> jax.ShapeDtypeStruct:
