@@ -276,7 +276,7 @@ def _registered(model: Motion | Sensor, registry: Mapping[str, object]) -> str |
 
 def _arguments(model: Motion | Sensor) -> dict[str, object]:
     """The fields of a model of the library besides noise and mount."""
-    names = [field.name for field in dataclasses.fields(model)]  # type: ignore[arg-type]
+    names = [field.name for field in dataclasses.fields(model)]
     return {name: getattr(model, name) for name in names if name not in ("noise_cov", "mount")}
 
 
