@@ -5,6 +5,7 @@ import json
 from command import run_command
 
 from jaxslam import datasets
+from jaxslam._cli.campaigns import draws as command
 
 MINE = """
 import dataclasses
@@ -17,8 +18,8 @@ def own(steps=3):
 
 def test_draws_are_written_and_continued(tmp_path, capsys, refused):
     out = tmp_path / "draws"
-    command = ["draws", "--scenario", "circle", "--steps", "3", "--out", out]
-    assert run_command([*command, "--runs", "2", "--seed", "4"]) == 0
+    words = ["draws", "--scenario", "circle", "--steps", "3", "--out", out]
+    assert run_command([*words, "--runs", "2", "--seed", "4"]) == 0
     said = capsys.readouterr().out
     assert f"wrote 2 runs of circle, 3 steps each, to {out}" in said and "README.md" in said
     assert sorted(path.name for path in out.iterdir()) == [
@@ -33,12 +34,23 @@ def test_draws_are_written_and_continued(tmp_path, capsys, refused):
     assert options == {"scenario": "circle", "runs": 2, "steps": 3, "seed": 4}
     assert stored["dtype"] == "float64"
     assert datasets.table(out / "runs/0001").steps == 4  # with the start
-    assert run_command([*command, "--runs", "3", "--seed", "4"]) == 0
+    assert run_command([*words, "--runs", "3", "--seed", "4"]) == 0
     assert (out / "truth/0002/truth.csv").exists()
     refused(
-        [*command, "--runs", "3"],
+        [*words, "--runs", "3"],
         "holds other draws: key is threefry2x32 0:4 there, threefry2x32 0:0 here",
     )
+
+
+def test_an_interrupt_says_what_is_done(tmp_path, capsys, monkeypatch):
+    def interrupted(*arguments, progress, **options):
+        progress(7, 20)
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(command, "write_draws", interrupted)
+    assert run_command(["draws", "--runs", "20", "--out", tmp_path / "draws"]) == 130
+    said = capsys.readouterr().err
+    assert f"{tmp_path / 'draws'} has 7 of 20 runs; the same command goes on" in said
 
 
 def test_draws_refuse_bad_options_and_worlds(tmp_path, refused):

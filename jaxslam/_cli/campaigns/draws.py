@@ -45,15 +45,28 @@ def write_tables(options: argparse.Namespace, command: str) -> int:
     user = UserObjects()
     world = user.scenario(chosen.scenario, chosen.steps)
     check_tables(world)
+    written = 0
     with user.located_errors(), Progress(world.name) as progress:
-        write_draws(
-            world,
-            chosen.runs,
-            jax.random.key(chosen.seed),
-            options.out,
-            options={name: getattr(chosen, name) for name in names} | {"command": command},
-            progress=progress,
-        )
+
+        def count(finished: int, runs: int) -> None:
+            nonlocal written
+            written = finished
+            progress(finished, runs)
+
+        try:
+            write_draws(
+                world,
+                chosen.runs,
+                jax.random.key(chosen.seed),
+                options.out,
+                options={name: getattr(chosen, name) for name in names} | {"command": command},
+                progress=count,
+            )
+        except KeyboardInterrupt:
+            text = (
+                f"{options.out} has {written:,} of {chosen.runs:,} runs; the same command goes on"
+            )
+            raise KeyboardInterrupt(text if written else "") from None
     print(
         f"wrote {chosen.runs:,} runs of {world.name}, {world.steps:,} steps each, to "
         f"{options.out}; {options.out / 'README.md'} describes them"
