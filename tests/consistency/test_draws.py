@@ -171,6 +171,36 @@ def test_every_world_of_points_is_written(name, tmp_path):
     np.testing.assert_array_equal(surveyed[:, 1:], truth.landmarks)
 
 
+@pytest.mark.parametrize(
+    ("sensor", "landmarks"),
+    [
+        (sensors.Compass([[0.01]]), np.zeros((1, 0))),
+        (sensors.PositionFix(np.eye(2), mount=(0.3, 0.1, 0.0)), np.zeros((1, 0))),
+        (sensors.RangeBearingSignature(0.01 * np.eye(3)), [[3.0, 4.0, 0.5], [1.0, -2.0, 0.2]]),
+        (sensors.BearingInverseDepth([[0.01]], min_distance=0.5), [[0.0, 0.0, 0.3, 0.25]]),
+    ],
+    ids=lambda value: getattr(value, "name", ""),
+)
+def test_sensors_of_the_robot_itself_and_of_other_landmarks(sensor, landmarks, tmp_path):
+    world = jaxslam.Scenario("few", CIRCLE.motion, sensor, landmarks, CIRCLE.controls[:3])
+    write_draws(world, 1, KEY, tmp_path / "draws")
+    data, true = folder_of(tmp_path / "draws")
+    ((truth, log),) = draws(world, 1, KEY)
+    np.testing.assert_array_equal(true[:, 1:], truth.pose)
+    np.testing.assert_array_equal(data.log.scan.z[1:], log.scan.z)
+    assert type(data.sensor) is type(sensor)
+    np.testing.assert_allclose(
+        data.sensor.noise_cov(log.scan.z[0, 0]), sensor.noise_cov(log.scan.z[0, 0])
+    )
+    survey = tmp_path / "draws/truth/0000/landmarks.csv"
+    assert survey.exists() == bool(sensor.landmark)
+    if sensor.landmark:
+        points = np.loadtxt(survey, delimiter=",", skiprows=1, ndmin=2)[:, 1:]
+        expected = [sensor.position(jnp.asarray(landmark)) for landmark in truth.landmarks]
+        np.testing.assert_allclose(points, expected, rtol=1e-12)
+    assert "## Measurements" in (tmp_path / "draws/README.md").read_text()
+
+
 def texts(folder):
     return {
         str(path.relative_to(folder)): path.read_text()
