@@ -6,12 +6,12 @@ from typing import NamedTuple, TypeAlias
 import numpy as np
 
 from jaxslam.consistency import Average, Summary
-from jaxslam.consistency._intervals import LEVEL, is_lopsided, percentage
-from jaxslam.consistency._measures import measures_of
+from jaxslam.consistency._intervals import EACH, LEVEL, is_lopsided, percentage
+from jaxslam.consistency._measures import REGISTRY, measures_of
 from jaxslam.consistency._measures.counts import MEANINGS, count_label
 from jaxslam.consistency._measures.nees import DOF
 from jaxslam.consistency._verdict import TESTS
-from jaxslam.consistency.campaign import Campaign
+from jaxslam.consistency.campaign import Campaign, Comparison
 
 VERDICTS = {
     "consistent": ("✓", "neither test rejects, which is not a proof"),
@@ -71,6 +71,8 @@ class Row(NamedTuple):
     """published value of each filter; empty if no filter has one"""
     group: str = ""
     """heading above the rows, on a page"""
+    level: float = EACH
+    """level of the intervals"""
 
 
 def cell_text(cell: Cell) -> str:
@@ -175,3 +177,57 @@ def lost_runs(campaign: Campaign) -> list[tuple[str, str]]:
             numbers = ", ".join(map(str, lost[:20])) + (", …" if len(lost) > 20 else "")
             phrases.append((name, f"was not finite in runs {numbers}"))
     return phrases
+
+
+def heads_of_pairs(comparison: Comparison) -> list[str]:
+    """The heads of the cells of `rows_of_pairs`."""
+    return [comparison.first, comparison.second, "difference", "better in", "narrower by"]
+
+
+def rows_of_pairs(comparison: Comparison) -> list[Row]:
+    """The rows of the table of two filters, with a cell per head of `heads_of_pairs`."""
+    rows = []
+    for key, pair in comparison.measures.items():
+        measure, share, factor = REGISTRY[key], pair.share, pair.narrower
+        cells: tuple[Cell, ...] = (
+            Figure(short(pair.first), pair.first),
+            Figure(short(pair.second), pair.second),
+            pair.difference,
+            None if share is None else Figure(percentage(share), share),
+            None if np.isnan(factor) else Figure(f"{factor:.3g} ×".replace("inf", "∞"), factor),
+        )
+        honest = "" if measure.honest is None else f"{measure.honest:g}"
+        rows.append(Row(measure.title, honest, cells, level=LEVEL))
+    return rows
+
+
+def notes_on_pairs(comparisons: Sequence[Comparison]) -> list[tuple[str, str]]:
+    """Notes on the columns of `rows_of_pairs`, and the doubts: terms, each with a sentence."""
+    shown = {key: pair for each in comparisons for key, pair in each.measures.items()}
+    doubts = [
+        (f"{each.first} - {each.second}", doubt) for each in comparisons for doubt in each.doubts
+    ]
+    if not shown:
+        return doubts
+    larger = [REGISTRY[key].label for key in shown if REGISTRY[key].better == "larger"]
+    by_delta = ", that of an RMSE by the delta method" if "rmse_position" in shown else ""
+    return [
+        (
+            "difference",
+            "the first filter minus the second, run by run on the same draws; ± is half its "
+            f"{percentage(LEVEL)} interval, by Student's t over the runs{by_delta}",
+        ),
+        (
+            "better in",
+            "the share of runs in which the first has the smaller error"
+            + f" or the larger {', '.join(larger)}" * bool(larger)
+            + ", ties counted half; NEES and NIS are honest on average, of which a single run says "
+            "nothing",
+        ),
+        (
+            "narrower by",
+            "width of the interval of two campaigns of as many runs, each on draws of its own, "
+            "over the width of this one; its square is the factor of the runs they would need",
+        ),
+        *doubts,
+    ]

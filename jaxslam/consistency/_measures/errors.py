@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from jaxslam.consistency._intervals import Average, positive_interval
-from jaxslam.consistency._measures.measure import Measure, Runs, RunScores, Sums, ratio
+from jaxslam.consistency._measures.measure import Better, Measure, Runs, RunScores, Sums, ratio
 
 
 @dataclass(frozen=True, eq=False)
@@ -17,13 +17,18 @@ class Rmse(Measure):
     scale: float = 1.0
     """factor from the root of the squares to the unit"""
     coordinates: tuple[int, int] | None = None
-    """range [first, end) of the pose's coordinates, at all steps; None: points of the final map"""
+    """range [first, end) of the pose's coordinates; None: points of the final map"""
+    final: bool = False
+    """of the last step alone"""
+    better: Better = "smaller"
 
     def of_runs(self, runs: Runs) -> RunScores:
         """The squares, summed over the steps or over the landmarks."""
         if self.coordinates is None:
             return RunScores(*np.asarray(runs.statistics.landmark_squares).T)
         squares = (runs.error[..., slice(*self.coordinates)] ** 2).sum(axis=2)
+        if self.final:
+            return RunScores(squares[:, -1], 1)
         return RunScores(squares.sum(axis=1), squares.shape[1], {self.column: squares})
 
     def average(self, per_run: np.ndarray, sums: Sums) -> Average | None:
@@ -32,6 +37,16 @@ class Rmse(Measure):
         return mean_square and Average(
             *(self.scale * float(np.sqrt(value)) for value in mean_square)
         )
+
+    def pseudo_values(self, per_run: np.ndarray) -> np.ndarray:
+        """Numbers of the runs whose mean is the RMSE, by the delta method.
+
+        With r² = mean of the squares s, √(r² + δ) = r + δ/(2r) to first order: (r² + s)/(2r).
+        """
+        mean_square = per_run.mean()
+        root = np.sqrt(mean_square)
+        values: np.ndarray = self.scale * (mean_square + per_run) / (2 * root if root > 0 else 1.0)
+        return values
 
     def curves(self, sums: Sums, runs: int) -> dict[str, np.ndarray]:
         """The error at each step, over all runs."""
@@ -66,6 +81,15 @@ MEASURES = (
     Measure("bound_ratio_position", "  over conditional bound", honest=1, note=_BOUND),
     HEADING,
     Measure("bound_ratio_heading", "  over conditional bound", honest=1),
+    Rmse(
+        "rmse_final",
+        "final position RMSE",
+        unit="m",
+        coordinates=(0, 2),
+        final=True,
+        column="square_final",
+        row=False,
+    ),
     Rmse("rmse_landmarks", "landmark RMSE", unit="m", column="square_landmarks"),
 )
 
