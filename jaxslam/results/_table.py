@@ -12,6 +12,7 @@ from jaxslam.consistency._measures.counts import MEANINGS, count_label
 from jaxslam.consistency._measures.nees import DOF
 from jaxslam.consistency._verdict import TESTS
 from jaxslam.consistency.campaign import Campaign, Comparison
+from jaxslam.math.stats import normal_quantile
 
 VERDICTS = {
     "consistent": ("✓", "neither test rejects, which is not a proof"),
@@ -189,12 +190,13 @@ def rows_of_pairs(comparison: Comparison) -> list[Row]:
     rows = []
     for key, pair in comparison.measures.items():
         measure, share, factor = REGISTRY[key], pair.share, pair.narrower
+        times = f"{factor:#.3g}".rstrip(".") if factor < np.inf else "∞"  # all three digits
         cells: tuple[Cell, ...] = (
             Figure(short(pair.first), pair.first),
             Figure(short(pair.second), pair.second),
             pair.difference,
             None if share is None else Figure(percentage(share), share),
-            None if np.isnan(factor) else Figure(f"{factor:.3g} ×".replace("inf", "∞"), factor),
+            None if np.isnan(factor) else Figure(f"{times} ×", factor),
         )
         honest = "" if measure.honest is None else f"{measure.honest:g}"
         rows.append(Row(measure.title, honest, cells, level=LEVEL))
@@ -209,25 +211,29 @@ def notes_on_pairs(comparisons: Sequence[Comparison]) -> list[tuple[str, str]]:
     ]
     if not shown:
         return doubts
-    larger = [REGISTRY[key].label for key in shown if REGISTRY[key].better == "larger"]
-    by_delta = ", that of an RMSE by the delta method" if "rmse_position" in shown else ""
+    measures = [REGISTRY[key] for key in shown]
+    larger = [each.label.split(": ")[-1] for each in measures if each.better == "larger"]
+    runs = min(pair.runs for pair in shown.values())
+    half = min(normal_quantile(0.5 + LEVEL / 2) * 0.5 / np.sqrt(runs), 0.5)  # of a fair coin
+    jackknife = ", of an RMSE by the jackknife" if "rmse_position" in shown else ""
     return [
         (
             "difference",
             "the first filter minus the second, run by run on the same draws; ± is half its "
-            f"{percentage(LEVEL)} interval, by Student's t over the runs{by_delta}",
+            f"{percentage(LEVEL)} interval, by Student's t over the runs{jackknife}",
         ),
         (
             "better in",
             "the share of runs in which the first has the smaller error"
             + f" or the larger {', '.join(larger)}" * bool(larger)
-            + ", ties counted half; NEES and NIS are honest on average, of which a single run says "
-            "nothing",
+            + f", ties counted half; of {runs:,} runs, {percentage(0.5 - half)} to "
+            f"{percentage(0.5 + half)} may be chance. NEES and NIS have no share: a filter is "
+            "honest on average, not in a run",
         ),
         (
             "narrower by",
-            "width of the interval of two campaigns of as many runs, each on draws of its own, "
-            "over the width of this one; its square is the factor of the runs they would need",
+            "how many times wider the interval of two campaigns of as many runs would be, each on "
+            "draws of its own; for the same width they need the square of it times as many runs",
         ),
         *doubts,
     ]

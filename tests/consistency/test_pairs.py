@@ -96,8 +96,16 @@ def test_differences_are_those_of_a_paired_t_test(campaign):
             scale = np.rad2deg(1.0) if key.endswith("deg") else 1.0
             roots = [scale * np.sqrt(np.mean(squares)) for squares in (a, b)]
             np.testing.assert_allclose([pair.first, pair.second], roots)
-            # d√m = dm / (2 √m); the constant part of each does not change the interval's width.
-            a, b = (scale**2 * s / (2 * root) for s, root in zip((a, b), roots, strict=True))
+            # The jackknife: RUNS times the RMSE less RUNS - 1 times that without a run.
+            a, b = (
+                np.array(
+                    [
+                        RUNS * root - (RUNS - 1) * scale * np.sqrt(np.mean(np.delete(squares, i)))
+                        for i in range(RUNS)
+                    ]
+                )
+                for squares, root in zip((a, b), roots, strict=True)
+            )
             center = roots[0] - roots[1]
         else:
             np.testing.assert_allclose([pair.first, pair.second], [a.mean(), b.mean()])
@@ -172,7 +180,9 @@ def test_what_makes_an_interval_doubtful_is_said(campaign):
         (doubt,) = made_up(columns, values.shape[1]).compare("a", "b").doubts
         assert doubt.startswith(sentence)
     counts = {"a": {"counts": {"fused": 7}}, "b": {"counts": {"fused": 1200}}}
-    columns = {name: {"log_likelihood": row} for name, row in zip("ab", few.repeat(5, 1), strict=True)}
+    columns = {
+        name: {"log_likelihood": row} for name, row in zip("ab", few.repeat(5, 1), strict=True)
+    }
     (doubt,) = made_up(columns, 25, **counts).compare("a", "b").doubts
     assert doubt.startswith("log-likelihood: a fused 7 measurements and b 1,200; comparable only")
     assert [doubt[:15] for doubt in campaign.compare("ekf", "other").doubts] == ["12 runs are few"]
@@ -195,9 +205,7 @@ def test_names_that_are_none_are_refused(campaign, names, message):
 def test_a_single_run_is_refused_and_in_the_table_has_no_differences():
     columns = {name: {"log_likelihood": np.array([1.0])} for name in ("a", "b")}
     single = made_up(columns, 1)
-    with pytest.raises(
-        ValueError, match="at least 2 runs that both a and b finished, got 1 of 1$"
-    ):
+    with pytest.raises(ValueError, match=r"at least 2 runs that both a and b finished, got 1 of 1$"):
         single.compare("a", "b")
     compared = _report.campaign_table(dataclasses.replace(single, reference="b"))
     assert "a - b: there are no differences, since under two runs are left" in compared
@@ -219,5 +227,5 @@ def test_every_other_filter_of_a_sweep_is_compared_with_the_reference(campaign):
 
 
 def test_a_measure_says_which_of_two_is_better():
-    with pytest.raises(ValueError, match="^measure mine: better: expected one of"):
+    with pytest.raises(ValueError, match=r"^measure mine: better: expected one of"):
         Measure("mine", "mine", better="lower")

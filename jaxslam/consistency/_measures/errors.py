@@ -39,13 +39,17 @@ class Rmse(Measure):
         )
 
     def pseudo_values(self, per_run: np.ndarray) -> np.ndarray:
-        """Numbers of the runs whose mean is the RMSE, by the delta method.
+        """Tukey's pseudo-values of the jackknife: r + (n - 1)(mean of r₋ - r₋ᵢ), with r the RMSE of
+        the n runs and r₋ᵢ that without run i; not corrected for bias, so that their mean is r.
 
-        With r² = mean of the squares s, √(r² + δ) = r + δ/(2r) to first order: (r² + s)/(2r).
+        The delta method, s/(2r) of a square s, leaves out 0 too often: 7.7 % of campaigns of 10
+        runs without a difference against 6.5 %, where squares have a degree of freedom each.
         """
-        mean_square = per_run.mean()
-        root = np.sqrt(mean_square)
-        values: np.ndarray = self.scale * (mean_square + per_run) / (2 * root if root > 0 else 1.0)
+        n = len(per_run)
+        # Rounding may leave less than nothing where one square is nearly all of the sum.
+        others = np.maximum(per_run.sum() - per_run, 0.0) / (n - 1)
+        without, root = np.sqrt(others), np.sqrt(per_run.mean())
+        values: np.ndarray = self.scale * (root + (n - 1) * (without.mean() - without))
         return values
 
     def curves(self, sums: Sums, runs: int) -> dict[str, np.ndarray]:

@@ -151,8 +151,8 @@ class Measure:
         return positive_interval(per_run) if self.positive else interval(per_run)
 
     def pseudo_values(self, per_run: Float[np.ndarray, "R"]) -> Float[np.ndarray, "R"]:
-        """Numbers of the runs whose mean is the average, and whose spread gives its standard error:
-        the numbers themselves, unless the average is another function of them than the mean."""
+        """Numbers of two or more runs, with the average as their mean, whose spread gives its
+        standard error: the numbers themselves, unless the average is another function of them."""
         return per_run
 
     def curves(self, sums: Sums, runs: int) -> dict[str, np.ndarray]:
