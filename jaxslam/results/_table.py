@@ -5,7 +5,7 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from jaxslam.consistency import Average, Summary
+from jaxslam.consistency import Average, PairedDifference, Summary
 from jaxslam.consistency._intervals import EACH, LEVEL, is_lopsided, percentage
 from jaxslam.consistency._measures import REGISTRY, measures_of
 from jaxslam.consistency._measures.counts import MEANINGS, count_label
@@ -205,14 +205,16 @@ def rows_of_pairs(comparison: Comparison) -> list[Row]:
 
 def notes_on_pairs(comparisons: Sequence[Comparison]) -> list[tuple[str, str]]:
     """Notes on the columns of `rows_of_pairs`, and the doubts: terms, each with a sentence."""
-    shown = {key: pair for each in comparisons for key, pair in each.measures.items()}
-    doubts = [
-        (f"{each.first} - {each.second}", doubt) for each in comparisons for doubt in each.doubts
-    ]
+    shown: dict[str, PairedDifference] = {}
+    doubts = []
+    for comparison in comparisons:
+        shown |= comparison.measures
+        term = f"{comparison.first} - {comparison.second}"
+        doubts += [(term, doubt) for doubt in comparison.doubts]
     if not shown:
         return doubts
     measures = [REGISTRY[key] for key in shown]
-    larger = [each.label.split(": ")[-1] for each in measures if each.better == "larger"]
+    larger = [m.label.split(": ")[-1] for m in measures if m.better == "larger"]
     runs = min(pair.runs for pair in shown.values())
     half = min(normal_quantile(0.5 + LEVEL / 2) * 0.5 / np.sqrt(runs), 0.5)  # of a fair coin
     jackknife = ", of an RMSE by the jackknife" if "rmse_position" in shown else ""

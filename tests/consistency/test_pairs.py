@@ -205,7 +205,9 @@ def test_names_that_are_none_are_refused(campaign, names, message):
 def test_a_single_run_is_refused_and_in_the_table_has_no_differences():
     columns = {name: {"log_likelihood": np.array([1.0])} for name in ("a", "b")}
     single = made_up(columns, 1)
-    with pytest.raises(ValueError, match=r"at least 2 runs that both a and b finished, got 1 of 1$"):
+    with pytest.raises(
+        ValueError, match=r"at least 2 runs that both a and b finished, got 1 of 1$"
+    ):
         single.compare("a", "b")
     compared = _report.campaign_table(dataclasses.replace(single, reference="b"))
     assert "a - b: there are no differences, since under two runs are left" in compared
@@ -218,7 +220,7 @@ def test_every_other_filter_of_a_sweep_is_compared_with_the_reference(campaign):
     swept = dataclasses.replace(
         campaign, filters={"1": ekf, "2": other, "4": other}, reference="1", published={}
     )
-    assert [(each.first, each.second) for each in swept.comparisons] == [("2", "1"), ("4", "1")]
+    assert [(pair.first, pair.second) for pair in swept.comparisons] == [("2", "1"), ("4", "1")]
     text = str(swept)
     assert text.count(f"{RUNS} runs in pairs") == 2
     assert campaign.comparisons == [] and "in pairs" not in str(campaign)
