@@ -13,6 +13,7 @@ from jaxslam.consistency._pairs import PairedDifference, compare_runs
 from jaxslam.core._names import Named, closest_name
 from jaxslam.core._optional import loading
 from jaxslam.core.types import Estimate, Truth
+from jaxslam.core.validation import InvalidField
 
 
 @dataclass(frozen=True, repr=False)
@@ -55,8 +56,8 @@ class Campaign:
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "filters", Named(self.filters))
-        if self.reference:
-            self._check_name("Campaign: reference", self.reference)
+        if self.reference and self.reference not in self.filters:
+            raise InvalidField("Campaign", "reference", self._unknown(self.reference))
 
     @property
     def size(self) -> str:
@@ -126,7 +127,8 @@ class Campaign:
                 are left.
         """
         for name in (first, second):
-            self._check_name("Campaign.compare", name)
+            if not isinstance(name, str) or name not in self.filters:
+                raise ValueError(f"Campaign.compare: {self._unknown(name)}")
         if first == second:
             raise ValueError(f"Campaign.compare: expected two filters, got {first!r} twice")
         comparison = self._comparison(first, second)
@@ -139,7 +141,7 @@ class Campaign:
 
     @property
     def comparisons(self) -> "list[Comparison]":
-        """Of every other filter with `reference`; those with under two runs have no measures."""
+        """Comparisons of every other filter with `reference`; one of under two runs has no measures."""
         others = (name for name in self.filters if name != self.reference)
         return [self._comparison(name, self.reference) for name in others if self.reference]
 
@@ -156,12 +158,10 @@ class Campaign:
             doubts=doubts,
         )
 
-    def _check_name(self, caller: str, name: object) -> None:
-        if not isinstance(name, str) or name not in self.filters:
-            raise ValueError(
-                f"{caller}: expected one of {', '.join(self.filters)}, got {name!r}"
-                f"{closest_name(name, self.filters)}"
-            )
+    def _unknown(self, name: object) -> str:
+        """A phrase on a name that no filter has."""
+        names = ", ".join(self.filters)
+        return f"expected one of {names}, got {name!r}{closest_name(name, self.filters)}"
 
     def to_dataframe(self) -> Any:
         """A pandas DataFrame with a row for each run of each filter.
