@@ -141,7 +141,7 @@ class Campaign:
 
     @property
     def comparisons(self) -> "list[Comparison]":
-        """Comparisons of every other filter with `reference`; one of under two runs has no measures."""
+        """Comparisons of every other filter with `reference`; without measures below two runs."""
         others = (name for name in self.filters if name != self.reference)
         return [self._comparison(name, self.reference) for name in others if self.reference]
 
