@@ -1,8 +1,10 @@
 """The campaigns that README and the pages quote.
 
 Each is `jaxslam consistency` with the scenario, the filters and the seed that are printed above its
-table.
+table; every other filter is compared with the first.
 """
+
+from dataclasses import replace
 
 import jax
 
@@ -26,12 +28,21 @@ def measure(quick: bool = False) -> list[Metric]:
         world = SCENARIOS[scenario]()
         filters = {name: catalog.ALL[name](world, watch=True) for name in names}
         campaign = monte_carlo(world, filters, runs, jax.random.key(seed), progress=False)
-        print(f"--scenario {scenario} --filters {','.join(names)} --runs {runs} --seed {seed}")
-        print(campaign, end="\n\n")
+        chosen = f"--filters {','.join(names)} --compare {names[0]}"
+        print(f"--scenario {scenario} {chosen} --runs {runs} --seed {seed}")
+        print(replace(campaign, reference=names[0]), end="\n\n")
         metrics += [
             Metric(f"{scenario}: {name}, pose NEES", summary.measures["nees_pose"].value)
             for name, summary in campaign.filters.items()
         ]
+        for name in names[1:]:
+            pair = campaign.compare(name, names[0]).measures["rmse_position"]
+            of = f"{scenario}: {name} - {names[0]}, position RMSE"
+            interval = "95 % interval [{1:.3g}, {2:.3g}]".format(*pair.difference)
+            metrics += [
+                Metric(f"{of} [m]", pair.difference.value, note=interval),
+                Metric(f"{of}: interval narrower by", pair.narrower),
+            ]
     return metrics
 
 

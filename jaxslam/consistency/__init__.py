@@ -15,6 +15,7 @@ from jaxslam.consistency._measures import Measure, register
 from jaxslam.consistency._measures.coverage import credibility
 from jaxslam.consistency._measures.measure import Nees, Runs, RunScores, RunStatistics
 from jaxslam.consistency._measures.nees import block_nees, pose_error
+from jaxslam.consistency._pairs import PairedDifference
 from jaxslam.consistency._run_scores import Score, score
 from jaxslam.consistency._summary import Summary
 from jaxslam.consistency._verdict import Verdict, judge
@@ -25,6 +26,7 @@ __all__ = [
     "LocalizationSummary",
     "Measure",
     "Nees",
+    "PairedDifference",
     "RunScores",
     "RunStatistics",
     "Runs",

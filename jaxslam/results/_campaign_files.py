@@ -12,7 +12,7 @@ from warnings import warn
 
 from jaxslam._public import publish
 from jaxslam.consistency._tally import Tally
-from jaxslam.consistency.campaign import Campaign
+from jaxslam.consistency.campaign import Campaign, Comparison
 from jaxslam.consistency.campaign._block import BOUND
 from jaxslam.consistency.campaign._harness import summaries_of
 from jaxslam.consistency.campaign._kept import add_kept
@@ -149,7 +149,7 @@ def load(folder: str | Path) -> Campaign:
     kept, path = store.resume(folder / BLOCKS), folder / RESULT
     try:
         result = json.loads(path.read_text(encoding="utf-8"))
-        doubts = _doubts_of(result, kept.campaign)
+        doubts, reference = _doubts_of(result, kept.campaign), reference_of(result)
     except (OSError, ValueError, LookupError, TypeError, AttributeError, RecursionError) as error:
         raise ValueError(
             f"{path}: expected the results of a campaign: jaxslam consistency --resume {folder} "
@@ -170,6 +170,7 @@ def load(folder: str | Path) -> Campaign:
             name: replace(summary, doubts=doubts[name]) for name, summary in summaries.items()
         },
         run_numbers=tallies[BOUND].numbers(),
+        reference=reference,
     )
 
 
@@ -189,11 +190,18 @@ def _doubts_of(result: Any, campaign: Mapping[str, str]) -> dict[str, tuple[str,
         or not all(isinstance(entry["doubts"], list) for entry in filters.values())
         or not all(map(is_number, numbers))
         or not all(type(result[name]) is int and result[name] >= 1 for name in ("runs", "steps"))
+        or reference_of(result) not in ("", *doubts)
         or ", ".join(doubts) != campaign.get("filters", ", ".join(doubts))
         or str(result["steps"]) != campaign.get("steps", str(result["steps"]))
     ):
         raise ValueError("not the results of this campaign")
     return doubts
+
+
+def reference_of(result: Any) -> str:
+    """The filter with which the JSON of a report compares every other; "" for none."""
+    reference: str = result.get("pairs", {}).get("reference", "")
+    return reference
 
 
 def notebook(campaign: Campaign) -> str:
@@ -207,6 +215,13 @@ def notebook(campaign: Campaign) -> str:
         caption, draw = drawings[name]
         figures[name] = caption, draw()
     return page.fragment(campaign, figures, partial(png, dpi=110))
+
+
+def comparison_in_notebook(comparison: Comparison) -> str:
+    """Two filters on the same draws as a fragment of HTML."""
+    from jaxslam.results import _page as page  # matplotlib is slow to load
+
+    return page.comparison_fragment(comparison)
 
 
 def _drawings(

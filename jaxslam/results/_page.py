@@ -4,7 +4,7 @@ Figures are embedded. The page has no scripts, and forbids the browser to load a
 """
 
 import base64
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from html import escape
 from importlib.resources import files
 from itertools import groupby
@@ -14,10 +14,10 @@ import numpy as np
 from jaxslam.consistency import Average, Summary
 from jaxslam.consistency._intervals import EACH, LEVEL, percentage
 from jaxslam.consistency._verdict import TESTS
-from jaxslam.consistency.campaign import Campaign
+from jaxslam.consistency.campaign import Campaign, Comparison
 from jaxslam.results import _report as report
 from jaxslam.results import _table as table
-from jaxslam.results._table import VERDICTS, cell_text, short
+from jaxslam.results._table import VERDICTS, cell_text, heads_of_pairs, short
 from jaxslam.results.plot import Figure
 from jaxslam.results.plot._style import describe, png
 
@@ -71,6 +71,9 @@ def campaign_page(
     sections = {
         "Verdicts": verdict_list(campaign),
         "Measures": measures_table(campaign) + measure_notes(campaign),
+        f"Compared with {with_word_breaks(campaign.reference)}, in pairs": pairs_tables(
+            campaign.comparisons
+        ),
         "How to read it": _conventions(campaign),
         "Figures": _figures(figures, draw),
         "Parameters": _parameters(campaign, command, seed, versions),
@@ -124,7 +127,19 @@ def fragment(
 <details><summary>All measures</summary>
 {measures_table(campaign)}
 {measure_notes(campaign)}
+{pairs_tables(campaign.comparisons)}
 </details>
+</div>
+"""
+
+
+def comparison_fragment(comparison: Comparison) -> str:
+    """Two filters on the same draws as HTML for a notebook."""
+    title = escape(f"{comparison.scenario}: {comparison.first} − {comparison.second}")
+    return f"""<div class="jaxslam">
+<style>{FRAGMENT_CSS}</style>
+<p><strong>{title}</strong></p>
+{pairs_tables([comparison])}
 </div>
 """
 
@@ -229,10 +244,32 @@ def measures_table(campaign: Campaign) -> str:
         title = f'<th colspan="{len(names) + 2}" scope="rowgroup">{group}</th>'
         lines = [f'<tr class="group">{title}</tr>'] * bool(group) + [_row(row) for row in rows]
         parts.append("<tbody>" + "\n".join(lines) + "</tbody>")
-    body = "\n".join(parts)
+    return _scrolled("Measures of every filter", "measure", head, "\n".join(parts))
+
+
+def pairs_tables(comparisons: Sequence[Comparison]) -> str:
+    """A table of measures for each comparison, and notes below them, as HTML."""
+    tables = []
+    for comparison in comparisons:
+        heads = heads_of_pairs(comparison)
+        head = "".join(f'<th scope="col">{with_word_breaks(name)}</th>' for name in heads)
+        body = "\n".join(map(_row, table.rows_of_pairs(comparison)))
+        tables.append(
+            _scrolled(
+                f"{comparison.first} and {comparison.second} in pairs",
+                with_noun(comparison.runs, "run") + " in pairs",
+                head,
+                f"<tbody>{body}</tbody>",
+            )
+        )
+    return "\n".join([*tables, _notes(table.notes_on_pairs(comparisons))])
+
+
+def _scrolled(label: str, corner: str, head: str, body: str) -> str:
+    """A table as HTML, which scrolls where it is too wide."""
     return (
-        '<div class="scroll" tabindex="0" role="region" aria-label="Measures of every filter">'
-        f'<table><thead><tr><th scope="col">measure</th><th scope="col">honest</th>{head}</tr>'
+        f'<div class="scroll" tabindex="0" role="region" aria-label="{escape(label)}">'
+        f'<table><thead><tr><th scope="col">{corner}</th><th scope="col">honest</th>{head}</tr>'
         f"</thead>\n{body}</table></div>"
     )
 
@@ -241,21 +278,24 @@ def _row(row: table.Row) -> str:
     """A row of the table as HTML."""
     kind = ' class="sub"' if row.label.startswith(" ") else ""
     published = row.published or [None] * len(row.cells)
-    cells = (_cell(cell, value) for cell, value in zip(row.cells, published, strict=True))
+    cells = (
+        _cell(cell, value, row.level) for cell, value in zip(row.cells, published, strict=True)
+    )
     return (
         f'<tr><th scope="row"{kind}>{escape(row.label.strip())}</th>'
         f'<td class="honest">{escape(_without_breaks(row.honest))}</td>{"".join(cells)}</tr>'
     )
 
 
-def _cell(cell: table.Cell, published: float | None) -> str:
+def _cell(cell: table.Cell, published: float | None, level: float) -> str:
     """A cell of the table as HTML; the pointer on a measure shows its interval."""
     title, text = "", escape(_without_breaks(cell_text(cell)))
     if isinstance(cell, Summary):
         text = badge(cell.verdict, cell)
     elif isinstance(cell, Average) and np.isfinite(cell.high):
         ends = f"{cell.low:.5g} to {cell.high:.5g}"
-        title = f' title="{_without_breaks(percentage(EACH, 1))} interval {ends}"'
+        digits = 1 if level == EACH else 0
+        title = f' title="{_without_breaks(percentage(level, digits))} interval {ends}"'
     if published is not None:
         text += f'<span class="published">published {short(published)}</span>'
     return f"<td{title}>{text}</td>"
@@ -268,9 +308,14 @@ def _without_breaks(text: str) -> str:
 
 def measure_notes(campaign: Campaign) -> str:
     """The notes on the measures, as HTML."""
+    return _notes(table.notes_on(campaign))
+
+
+def _notes(notes: Iterable[tuple[str, str]]) -> str:
+    """Terms, each with a sentence, as HTML."""
     return "\n".join(
         f'<p class="note"><strong>{escape(term)}</strong>: {escape(sentence)}.</p>'
-        for term, sentence in table.notes_on(campaign)
+        for term, sentence in notes
     )
 
 

@@ -10,9 +10,19 @@ from jaxslam.consistency import Average, Summary
 from jaxslam.consistency._intervals import EACH, LEVEL, percentage
 from jaxslam.consistency._measures.coverage import LEVELS
 from jaxslam.consistency._verdict import POWER, TESTS, TOLERANCE, honest_values
-from jaxslam.consistency.campaign import Campaign
+from jaxslam.consistency.campaign import Campaign, Comparison
 from jaxslam.results._files import csv_text, json_number, json_text, text_table, versions
-from jaxslam.results._table import VERDICTS, cell_text, lost_runs, notes_on, rows_of, short
+from jaxslam.results._table import (
+    VERDICTS,
+    cell_text,
+    heads_of_pairs,
+    lost_runs,
+    notes_on,
+    notes_on_pairs,
+    rows_of,
+    rows_of_pairs,
+    short,
+)
 
 _COLUMNS = 5
 """Largest number of filters beside each other."""
@@ -35,6 +45,7 @@ def campaign_table(campaign: Campaign) -> str:
         table = text_table(rows)
         table.insert(1, "-" * len(table[0]))
         tables.append("\n".join(table))
+    tables += [_pairs_table(comparison) for comparison in campaign.comparisons]
     text = "\n\n".join(tables)
     title = f"{campaign.scenario}: {campaign.size}"
     verdicts = {summary.verdict for summary in campaign.filters.values()}
@@ -48,7 +59,8 @@ def campaign_table(campaign: Campaign) -> str:
         f"inaccurate: final position error over {campaign.divergence_limit:.3g} m, 5 σ of the "
         "ideal EKF; divergent: also over 5 σ of what the filter claims.",
     ]
-    notes += [f"{term}: {sentence}." for term, sentence in notes_on(campaign)]
+    pairs = notes_on_pairs(campaign.comparisons)
+    notes += [f"{term}: {sentence}." for term, sentence in notes_on(campaign) + pairs]
     notes += sentences_on_verdicts(campaign)
     notes += [f"{name} {phrase}" for name, phrase in lost_runs(campaign)]
     if campaign.dtype == "float32":
@@ -62,6 +74,23 @@ def campaign_table(campaign: Campaign) -> str:
         )
     lines = (line for note in notes for line in textwrap.wrap(note, _WIDTH))
     return "\n".join([title, "", text, "", *lines])
+
+
+def comparison_text(comparison: Comparison) -> str:
+    """Two filters on the same draws as a text table, with notes below."""
+    title = f"{comparison.scenario}: {comparison.first} - {comparison.second}"
+    notes = [f"{term}: {sentence}." for term, sentence in notes_on_pairs([comparison])]
+    lines = (line for note in notes for line in textwrap.wrap(note, _WIDTH))
+    return "\n".join([title, "", _pairs_table(comparison), "", *lines])
+
+
+def _pairs_table(comparison: Comparison) -> str:
+    rows = [[f"{comparison.runs:,} runs in pairs", "honest", *heads_of_pairs(comparison)]]
+    for row in rows_of_pairs(comparison):
+        rows.append([row.label, row.honest, *map(cell_text, row.cells)])
+    table = text_table(rows)
+    table.insert(1, "-" * len(table[0]))
+    return "\n".join(table)
 
 
 def sentences_on_verdicts(campaign: Campaign) -> list[str]:
@@ -141,7 +170,32 @@ def as_json(campaign: Campaign, command: str = "", seed: int | None = None) -> s
         "step_seconds": campaign.step_seconds,
         "versions": versions(),
     }
-    return json_text(head | {"filters": filters})
+    pairs = {
+        "reference": campaign.reference,
+        "level": LEVEL,
+        "filters": {
+            comparison.first: {
+                "runs": comparison.runs,
+                "doubts": comparison.doubts,
+                "measures": {
+                    key: {
+                        "average": json_number(pair.first),
+                        "average_of_reference": json_number(pair.second),
+                        "difference": dict(
+                            zip(Average._fields, _finite_or_none(pair.difference), strict=True)
+                        ),
+                        "better_in": pair.share,
+                        "narrower_by": json_number(pair.narrower),
+                        "runs": pair.runs,
+                    }
+                    for key, pair in comparison.measures.items()
+                },
+            }
+            for comparison in campaign.comparisons
+        },
+    }
+    compared = {"pairs": pairs} if campaign.reference else {}
+    return json_text(head | {"filters": filters} | compared)
 
 
 def table_csv(campaign: Campaign) -> str:

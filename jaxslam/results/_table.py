@@ -5,13 +5,14 @@ from typing import NamedTuple, TypeAlias
 
 import numpy as np
 
-from jaxslam.consistency import Average, Summary
-from jaxslam.consistency._intervals import LEVEL, is_lopsided, percentage
-from jaxslam.consistency._measures import measures_of
+from jaxslam.consistency import Average, PairedDifference, Summary
+from jaxslam.consistency._intervals import EACH, LEVEL, is_lopsided, percentage
+from jaxslam.consistency._measures import REGISTRY, measures_of
 from jaxslam.consistency._measures.counts import MEANINGS, count_label
 from jaxslam.consistency._measures.nees import DOF
 from jaxslam.consistency._verdict import TESTS
-from jaxslam.consistency.campaign import Campaign
+from jaxslam.consistency.campaign import Campaign, Comparison
+from jaxslam.math.stats import normal_quantile
 
 VERDICTS = {
     "consistent": ("✓", "neither test rejects, which is not a proof"),
@@ -71,6 +72,8 @@ class Row(NamedTuple):
     """published value of each filter; empty if no filter has one"""
     group: str = ""
     """heading above the rows, on a page"""
+    level: float = EACH
+    """level of the intervals"""
 
 
 def cell_text(cell: Cell) -> str:
@@ -175,3 +178,64 @@ def lost_runs(campaign: Campaign) -> list[tuple[str, str]]:
             numbers = ", ".join(map(str, lost[:20])) + (", …" if len(lost) > 20 else "")
             phrases.append((name, f"was not finite in runs {numbers}"))
     return phrases
+
+
+def heads_of_pairs(comparison: Comparison) -> list[str]:
+    """The heads of the cells of `rows_of_pairs`."""
+    return [comparison.first, comparison.second, "difference", "better in", "narrower by"]
+
+
+def rows_of_pairs(comparison: Comparison) -> list[Row]:
+    """The rows of the table of two filters, with a cell per head of `heads_of_pairs`."""
+    rows = []
+    for key, pair in comparison.measures.items():
+        measure, share, factor = REGISTRY[key], pair.share, pair.narrower
+        times = f"{factor:#.3g}".rstrip(".") if factor < np.inf else "∞"  # all three digits
+        cells: tuple[Cell, ...] = (
+            Figure(short(pair.first), pair.first),
+            Figure(short(pair.second), pair.second),
+            pair.difference,
+            None if share is None else Figure(percentage(share), share),
+            None if np.isnan(factor) else Figure(f"{times} ×", factor),
+        )
+        honest = "" if measure.honest is None else f"{measure.honest:g}"
+        rows.append(Row(measure.title, honest, cells, level=LEVEL))
+    return rows
+
+
+def notes_on_pairs(comparisons: Sequence[Comparison]) -> list[tuple[str, str]]:
+    """Notes on the columns of `rows_of_pairs`, and the doubts: terms, each with a sentence."""
+    shown: dict[str, PairedDifference] = {}
+    doubts = []
+    for comparison in comparisons:
+        shown |= comparison.measures
+        term = f"{comparison.first} - {comparison.second}"
+        doubts += [(term, doubt) for doubt in comparison.doubts]
+    if not shown:
+        return doubts
+    measures = [REGISTRY[key] for key in shown]
+    larger = [m.label.split(": ")[-1] for m in measures if m.better == "larger"]
+    runs = min(pair.runs for pair in shown.values())
+    half = min(normal_quantile(0.5 + LEVEL / 2) * 0.5 / np.sqrt(runs), 0.5)  # of a fair coin
+    jackknife = ", of an RMSE by the jackknife" if "rmse_position" in shown else ""
+    return [
+        (
+            "difference",
+            "the first filter minus the second, run by run on the same draws; ± is half its "
+            f"{percentage(LEVEL)} interval, by Student's t over the runs{jackknife}",
+        ),
+        (
+            "better in",
+            "the share of runs in which the first has the smaller error"
+            + f" or the larger {', '.join(larger)}" * bool(larger)
+            + f", ties counted half; of {runs:,} runs, {percentage(0.5 - half)} to "
+            f"{percentage(0.5 + half)} may be chance. NEES and NIS have no share: a filter is "
+            "honest on average, not in a run",
+        ),
+        (
+            "narrower by",
+            "how many times wider the interval of two campaigns of as many runs would be, each on "
+            "draws of its own; for the same width they need the square of it times as many runs",
+        ),
+        *doubts,
+    ]

@@ -109,6 +109,27 @@ def test_a_campaign_is_resumed_by_its_folder_alone(tmp_path, capsys, refused, un
     assert (out / "consistency.csv").read_text() == csv
     assert f"{damaged.name}.bad" in kept(out)
 
+    # Filters are compared in the folder of a finished campaign; what is asked later replaces it.
+    ends = "wrote ", " holds this campaign, finished: nothing was run and nothing written;"
+    for compare, other, end in (
+        (("--compare", "localization"), "dead_reckoning", ends[0]),
+        ((), "dead_reckoning", ends[1]),
+        (("--compare", "dead_reckoning"), "localization", ends[0]),
+    ):
+        assert cli.main([*again, *compare]) == 0
+        said = capsys.readouterr().out
+        assert end in said and "3 runs in pairs" in said
+        assert list(json.loads((out / "consistency.json").read_text())["pairs"]["filters"]) == [
+            other
+        ]
+    loaded = jaxslam.load(out)
+    assert loaded.reference == "dead_reckoning" and str(loaded) in said
+    pair = loaded.compare("localization", "dead_reckoning").measures["rmse_final"]
+    np.testing.assert_allclose(pair.runs, 3)
+    assert "in pairs" in (out / "report.html").read_text()
+    near = "--compare: expected one of --filters, dead_reckoning, localization, got 'localisation'"
+    refused([*again, "--compare", "localisation"], f"{near} (did you mean localization?)")
+
     difference = "--seed is 0 there, 3 here; --filters is dead_reckoning,localization there, ekf"
     parts = (difference, f"--resume: {out} holds another campaign")
     refused([*again, "--seed", "3", "--filters", "ekf"], *parts)
@@ -120,7 +141,7 @@ def test_a_campaign_is_resumed_by_its_folder_alone(tmp_path, capsys, refused, un
     assert extended["runs"] == 5
     fresh = tmp_path / "fresh"
     assert cli.main([*asked, "--runs", "5", "--out", str(fresh)]) == 0
-    assert extended == results(fresh)
+    assert extended == results(fresh) and "pairs" not in extended
     parts = ("--runs: ", "is to have 5 runs: expected at least as many, got 4")
     refused([*again, "--runs", "4"], *parts)
     assert store.resume(out / "blocks").runs == 5

@@ -108,6 +108,16 @@ def test_a_platform_without_its_device_is_one_line(capsys, monkeypatch, refused)
         (["--filters", "ekf,"], "or all, got 'ekf,'"),
         (["--cache", ""], "--cache: expected a folder, got ''"),
         (["--resume", " "], "--resume: expected a folder, got ' '"),
+        (
+            ["--compare", "ekv"],
+            "--compare: expected one of --filters, dead_reckoning, ekf, got 'ekv' (did you mean "
+            "ekf?)",
+        ),
+        (
+            ["--filters", "ekf", "--compare", "ekf"],
+            "--compare: expected two --filters or more, got 1",
+        ),
+        (["--compare", "ekf", "--runs", "1"], "--compare: expected two --runs or more, got 1"),
         (["--devices", "abacus"], "--devices: expected all, a number, or one of cpu"),
     ],
 )

@@ -189,6 +189,31 @@ def test_notes_of_the_measures_stand_below_them():
     assert row(reader, "initialized")[2] == "3"
 
 
+def test_filters_in_pairs_have_a_table_each_and_notes():
+    numbers = np.random.default_rng(0).normal(size=(3, RUNS))
+    filters = {
+        name: dataclasses.replace(summary("consistent", GOOD), per_run={"log_likelihood": row})
+        for name, row in zip(("a_b", "good", EVIL), numbers, strict=True)
+    }
+    of = dataclasses.replace(campaign(**filters), reference="a_b")
+    reader = Reader(_page.campaign_page(of, "", None, {}, {}))
+    assert reader.open == []
+    heads = [cells for cells in reader.rows if cells[0] == f"{RUNS} runs in pairs"]
+    ends = ["difference", "better in", "narrower by"]
+    assert [head[1:] for head in heads] == [["honest", n, "a_b", *ends] for n in ("good", EVIL)]
+    rows = [cells for cells in reader.rows if cells[0] == "log-likelihood"]
+    assert [len(cells) for cells in rows] == [5, 7, 7]
+    value, low, high = of.compare(EVIL, "a_b").measures["log_likelihood"].difference
+    assert rows[2][4] == f"{value:.4g} ± {(high - low) / 2:.2g}"
+    space = "\N{NO-BREAK SPACE}"
+    titles = [value for _, name, value in reader.attributes if name == "title"]
+    assert f"95{space}% interval {low:.5g} to {high:.5g}" in titles
+    words = " ".join("".join(reader.words).split())
+    assert "Compared with a_b, in pairs" in words and "better in: the share of runs" in words
+    notebook = Reader(of.compare("good", "a_b")._repr_html_())
+    assert notebook.open == [] and notebook.rows[1][0] == "log-likelihood"
+
+
 def test_parameters_and_conventions_are_in_words(read):
     words = " ".join("".join(read.words).split())
     for said in ("1234", "jax 9.8.7", "A & B, https://doi.org/10.1/2", "4.5 m", "float32"):

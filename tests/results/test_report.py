@@ -100,6 +100,22 @@ def test_json_holds_the_measures_and_no_nan(campaign):
         assert entry["counts"] == summary.counts
 
 
+def test_json_holds_the_differences_from_the_reference(campaign):
+    assert "pairs" not in json.loads(_report.as_json(campaign))
+    compared = dataclasses.replace(campaign, reference="ekf")
+    pairs = json.loads(_report.as_json(compared), parse_constant=pytest.fail)["pairs"]
+    assert (pairs["reference"], pairs["level"], list(pairs["filters"])) == ("ekf", 0.95, ["other"])
+    entry, comparison = pairs["filters"]["other"], campaign.compare("other", "ekf")
+    assert (entry["runs"], entry["doubts"]) == (comparison.runs, list(comparison.doubts))
+    for key, pair in comparison.measures.items():
+        written = entry["measures"][key]
+        assert tuple(written["difference"].values()) == pair.difference
+        assert (written["better_in"], written["runs"]) == (pair.share, pair.runs)
+        assert written["average"] - written["average_of_reference"] == pytest.approx(
+            pair.difference.value, abs=1e-9
+        )
+
+
 def test_csv_holds_the_curves(campaign):
     rows = list(csv.DictReader(io.StringIO(_report.as_csv(campaign))))
     assert len(rows) == 2 * WORLD.steps

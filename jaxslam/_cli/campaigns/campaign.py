@@ -77,6 +77,8 @@ class Spec:
     figures: tuple[str, ...]
     """formats of the figures"""
     animate: bool
+    compare: str | None
+    """the filter with which every other is compared"""
     overwrite: bool
     settings: Mapping[str, object] = field(default_factory=dict)
     """settings stored by the campaign that is continued; empty for a new one"""
@@ -114,6 +116,7 @@ def spec_of(options: argparse.Namespace) -> Spec:
         part=part,
         figures=formats,
         animate=options.animate,
+        compare=options.compare,
         overwrite=options.overwrite,
         settings=settings,
     )

@@ -36,6 +36,7 @@ from jaxslam.consistency._verdict import is_faulty
 from jaxslam.consistency.campaign import Campaign, Incomplete, Interrupted, monte_carlo
 from jaxslam.consistency.campaign._block_programs import drive_run, fitting_block
 from jaxslam.consistency.campaign._candidates import cast_floats
+from jaxslam.core._names import closest_name
 from jaxslam.core.protocols import Candidate
 from jaxslam.results import _campaign_files as campaign_files
 from jaxslam.results._campaign_files import FORMATS
@@ -72,6 +73,12 @@ def add_options(parser: argparse.ArgumentParser) -> None:
     )
     add_figures(parser, FORMATS, "; the page always has its own")
     add_animate(parser, "of run 0 of each filter")
+    parser.add_argument(
+        "--compare",
+        metavar="NAME",
+        help="also compare every other filter with this one of --filters, run by run on the same "
+        "draws: differences with intervals, in the table and on the page",
+    )
     earlier = parser.add_mutually_exclusive_group()
     earlier.add_argument(
         "--resume",
@@ -122,6 +129,15 @@ def run_campaign(options: argparse.Namespace, command: str) -> int:
     scenario = user.scenario(spec.campaign.scenario, spec.campaign.steps)
     filters = user.filters(spec.campaign.filters, scenario)
     runs, part = spec.campaign.runs, spec.part
+    if spec.compare is not None:
+        if spec.compare not in filters:
+            raise ValueError(
+                f"--compare: expected one of --filters, {', '.join(filters)}, got "
+                f"{spec.compare!r}{closest_name(spec.compare, filters)}"
+            )
+        for option, count in (("filters", len(filters)), ("runs", runs)):
+            if count < 2:
+                raise ValueError(f"--compare: expected two --{option} or more, got {count}")
     if part is not None:
         block = spec.block or fitting_block(scenario, filters, spec.devices[0])
         spec = replace(spec, block=block)
@@ -155,7 +171,7 @@ def run_campaign(options: argparse.Namespace, command: str) -> int:
             raise ValueError(stop) from stop
         if not isinstance(stop, Interrupted | Incomplete) or stop.campaign is None:
             raise
-        print(stop.campaign)
+        print(replace(stop.campaign, reference=spec.compare or ""))
         is_interrupted = isinstance(stop, Interrupted)
         print(
             f"\njaxslam: {'interrupted, ' * is_interrupted}{stop}; --resume {spec.out} "
@@ -192,11 +208,16 @@ def _write(
     The files of a campaign that was finished earlier stay as they are.
     """
     out, seed = spec.out, spec.campaign.seed
-    names = campaign_files.file_names(spec.figures)
+    names, reference = campaign_files.file_names(spec.figures), spec.compare
     if earlier is not None:
         command = str(earlier["command"])
         times: dict[str, Any] = {name: earlier[name] for name in campaign_files.TIMES}
         campaign = replace(campaign, **times)
+        stored = campaign_files.reference_of(earlier)
+        reference = stored if spec.compare is None else spec.compare
+        if reference != stored:
+            earlier = None  # its files have no such comparison
+    campaign = replace(campaign, reference=reference or "")
     print(campaign)
 
     def film() -> int:

@@ -8,9 +8,9 @@ from jaxslam.consistency._measures.measure import Measure
 from jaxslam.core.types import Status, Trace
 
 MEASURES = (
-    Measure("precision", "associations: precision", honest=1),
-    Measure("recall", "associations: recall", honest=1),
-    Measure("false_landmarks", "false landmarks", honest=0),
+    Measure("precision", "associations: precision", honest=1, better="larger"),
+    Measure("recall", "associations: recall", honest=1, better="larger"),
+    Measure("false_landmarks", "false landmarks", honest=0, better="smaller"),
 )
 
 

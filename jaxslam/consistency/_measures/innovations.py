@@ -52,7 +52,7 @@ class LogLikelihood(Measure):
         return RunScores(total, np.asarray(info.dof).any(axis=(1, 2)))
 
 
-NIS = Nis("nis_per_dof", "NIS / dof", honest=1, positive=True, figure="nees")
+NIS = Nis("nis_per_dof", "NIS / dof", honest=1, positive=True, figure="nees", better="honest")
 
 AUTOCORRELATION = Autocorrelation(
     "autocorrelation",
@@ -65,7 +65,7 @@ AUTOCORRELATION = Autocorrelation(
     ),
 )
 
-LOG_LIKELIHOOD = LogLikelihood("log_likelihood", "log-likelihood")
+LOG_LIKELIHOOD = LogLikelihood("log_likelihood", "log-likelihood", better="larger")
 
 
 def nis_band(total_dof: float) -> tuple[float, float] | None:

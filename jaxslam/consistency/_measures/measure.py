@@ -8,13 +8,16 @@ package where it is made of what all measures share (`Runs`).
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import NamedTuple
+from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from jaxtyping import Array, Bool, Float, PyTree
 
 from jaxslam.consistency._intervals import Average, interval, positive_interval
 from jaxslam.core.types import Trace, Truth
+
+Better = Literal["", "smaller", "larger", "honest"]
+"""Which of two estimators a measure prefers; see `Measure.better`."""
 
 Sums = Mapping[str, np.ndarray]
 """Sums over all runs of a campaign, by name."""
@@ -101,8 +104,17 @@ class Measure:
     """label of that panel; default label and unit"""
     column: str = ""
     """name of each run's number in `Summary.per_run`; default the key"""
+    better: Better = ""
+    """which of two estimators `Campaign.compare` calls better in a run: the one with the smaller
+    or the larger number. "honest": their averages are compared with `honest`, and no run alone
+    says which is better. "": not compared"""
 
     def __post_init__(self) -> None:
+        if self.better not in get_args(Better):
+            raise ValueError(
+                f"measure {self.key}: better: expected one of {get_args(Better)}, got "
+                f"{self.better!r}"
+            )
         object.__setattr__(self, "column", self.column or self.key)
         object.__setattr__(self, "axis", self.axis or self.title)
 
@@ -137,6 +149,11 @@ class Measure:
     def average(self, per_run: Float[np.ndarray, "R"], sums: Sums) -> Average | None:
         """The average over all runs with its interval; None where no run has a number."""
         return positive_interval(per_run) if self.positive else interval(per_run)
+
+    def pseudo_values(self, per_run: Float[np.ndarray, "R"]) -> Float[np.ndarray, "R"]:
+        """Numbers of two or more runs, with the average as their mean, whose spread gives its
+        standard error: the numbers themselves, unless the average is another function of them."""
+        return per_run
 
     def curves(self, sums: Sums, runs: int) -> dict[str, np.ndarray]:
         """The curves (T,) over the steps, averages over the runs, by name; {} without sums."""

@@ -57,6 +57,7 @@ MEASURES = tuple(
         block=block,
         figure="nees" if block in DOF else "",
         axis=f"{block} NEES (dof {dof})",
+        better="honest" if block == "pose" else "",
     )
     for block, label, dof in (
         ("pose", "pose NEES (x, y, θ)", DOF["pose"]),

@@ -9,9 +9,11 @@ from typing import Any
 import numpy as np
 
 from jaxslam.consistency import Summary
-from jaxslam.core._names import Named
+from jaxslam.consistency._pairs import PairedDifference, compare_runs
+from jaxslam.core._names import Named, closest_name
 from jaxslam.core._optional import loading
 from jaxslam.core.types import Estimate, Truth
+from jaxslam.core.validation import InvalidField
 
 
 @dataclass(frozen=True, repr=False)
@@ -48,9 +50,14 @@ class Campaign:
     run_numbers: np.ndarray = field(default_factory=lambda: np.arange(0))
     """(runs,) the number of each run, in the order of `Summary.per_run`; run i has key
     fold_in(key, i)"""
+    reference: str = ""
+    """the filter with which table, page and files compare every other, in pairs; "": none.
+    `dataclasses.replace(campaign, reference="ekf")` sets it, and `--compare`"""
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "filters", Named(self.filters))
+        if self.reference and self.reference not in self.filters:
+            raise InvalidField("Campaign", "reference", self._unknown(self.reference))
 
     @property
     def size(self) -> str:
@@ -109,6 +116,53 @@ class Campaign:
 
         return campaign_files.save_campaign(self, folder, figures, overwrite)
 
+    def compare(self, first: str, second: str) -> "Comparison":
+        """The differences of two filters over the runs, first - second.
+
+        Both have the same draws, so the difference of a run does not have their luck: its interval
+        is narrower than that of two campaigns. Runs that one of the two lost are left out.
+
+        Raises:
+            ValueError: on a name that no filter has, the same name twice, and where under two runs
+                are left.
+        """
+        for name in (first, second):
+            if not isinstance(name, str) or name not in self.filters:
+                raise ValueError(f"Campaign.compare: {self._unknown(name)}")
+        if first == second:
+            raise ValueError(f"Campaign.compare: expected two filters, got {first!r} twice")
+        comparison = self._comparison(first, second)
+        if comparison.runs < 2:
+            raise ValueError(
+                f"Campaign.compare: expected at least 2 runs that both {first} and {second} "
+                f"finished, got {comparison.runs} of {self.runs}"
+            )
+        return comparison
+
+    @property
+    def comparisons(self) -> "list[Comparison]":
+        """Comparisons of every other filter with `reference`; without measures below two runs."""
+        others = (name for name in self.filters if name != self.reference)
+        return [self._comparison(name, self.reference) for name in others if self.reference]
+
+    def _comparison(self, first: str, second: str) -> "Comparison":
+        pair = self.filters[first], self.filters[second]
+        runs, measures, doubts = compare_runs((first, second), *pair, self.runs)
+        return Comparison(
+            scenario=self.scenario,
+            first=first,
+            second=second,
+            runs=runs,
+            lost={first: pair[0].not_finite_runs, second: pair[1].not_finite_runs},
+            measures=measures,
+            doubts=doubts,
+        )
+
+    def _unknown(self, name: object) -> str:
+        """A phrase on a name that no filter has."""
+        names = ", ".join(self.filters)
+        return f"expected one of {names}, got {name!r}{closest_name(name, self.filters)}"
+
     def to_dataframe(self) -> Any:
         """A pandas DataFrame with a row for each run of each filter.
 
@@ -137,6 +191,40 @@ class Campaign:
         for name in names:
             columns[name] = np.concatenate([s.per_run.get(name, absent) for s in filters.values()])
         return columns
+
+
+@dataclass(frozen=True, repr=False)
+class Comparison:
+    """Two filters of a campaign over the same draws: `Campaign.compare`. It prints as a table."""
+
+    scenario: str
+    first: str
+    second: str
+    runs: int
+    """number of the runs that neither lost; the others are left out"""
+    lost: dict[str, list[int]]
+    """numbers of the runs that a filter lost, by its name: its numbers were not finite"""
+    measures: dict[str, PairedDifference]
+    """by key of `Summary.measures`, in the order of tables: of each measure that both have"""
+    doubts: tuple[str, ...]
+    """sentences that qualify the differences"""
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "measures", Named(self.measures))
+
+    def __repr__(self) -> str:
+        return f"Comparison({self.scenario}, {self.first} - {self.second}, {self.runs} runs)"
+
+    def __str__(self) -> str:
+        from jaxslam.results import _report as report
+
+        return report.comparison_text(self)
+
+    def _repr_html_(self) -> str:
+        """The table and its notes as HTML, for a notebook."""
+        from jaxslam.results import _campaign_files as campaign_files
+
+        return campaign_files.comparison_in_notebook(self)
 
 
 class Interrupted(KeyboardInterrupt):
