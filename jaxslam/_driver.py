@@ -9,7 +9,14 @@ import numpy as np
 from jaxtyping import PyTree
 from numpy.typing import ArrayLike
 
-from jaxslam._origin import FAR, far_origin, holds_far_numbers, moved, returned, shifted
+from jaxslam._origin import (
+    FAR,
+    far_origin,
+    holds_far_numbers,
+    move_near_origin,
+    shift_positions,
+    to_map_coordinates,
+)
 from jaxslam._public import publish
 from jaxslam._rounding import doubt_on_run
 from jaxslam.association._rules import Known
@@ -85,11 +92,11 @@ def run(
         origin = None
         if probe is None and jnp.result_type(log.control, log.scan.z) == jnp.float32:
             origin = far_origin(pose, least=FAR)
-        near = filter if origin is None else moved(filter, origin)
+        near = filter if origin is None else move_near_origin(filter, origin)
         if origin is None or near is None or holds_far_numbers(log.control, origin):
             near, origin, start = filter, None, pose
         else:
-            start = shifted(pose, -origin)
+            start = shift_positions(pose, -origin)
         trace = _drive_alone(near, log, start, pose_cov, key, probe)
         arguments = near, log, start, pose_cov, key
         if doubt := doubt_on_run(
@@ -98,7 +105,7 @@ def run(
             warnings.warn(f"run: {filter.name}: {doubt}", stacklevel=2)
         if origin is None:
             return trace
-        return trace._replace(estimate=returned(jax.device_get(trace.estimate), origin))
+        return trace._replace(estimate=to_map_coordinates(jax.device_get(trace.estimate), origin))
 
 
 def check_run(name: str, filter: Filter, log: Log, pose: ArrayLike, pose_cov: ArrayLike) -> None:

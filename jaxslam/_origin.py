@@ -53,7 +53,7 @@ def far_origin(pose: ArrayLike, points: ArrayLike = (), least: float = 0.0) -> O
     return start if nearest > max(width, least) else None
 
 
-def moved(of: _T, origin: Origin, controls: ArrayLike | None = None) -> _T | None:
+def move_near_origin(of: _T, origin: Origin, controls: ArrayLike | None = None) -> _T | None:
     """A world, a filter or an estimator with positions relative to an origin; None if it depends
     on where it is, as far as can be told.
 
@@ -61,7 +61,7 @@ def moved(of: _T, origin: Origin, controls: ArrayLike | None = None) -> _T | Non
     """
     if not _is_ours(of, []):
         return None
-    near: _T = _relative(of, origin)
+    near: _T = _subtract_origin(of, origin)
     return near if may_move(near, origin, controls) else None
 
 
@@ -158,33 +158,33 @@ def _change(
     return jnp.stack([jnp.abs(far - near).max(initial=0.0) for near, far in pairs]).max()
 
 
-def _relative(of: Any, origin: Origin) -> Any:
+def _subtract_origin(of: Any, origin: Origin) -> Any:
     """The record, or the truth, with the positions among its fields relative to an origin."""
     if isinstance(of, Truth):
         places = of.pose, of.landmarks, of.start
-        pose, landmarks, start = (shifted(place, -origin) for place in places)
+        pose, landmarks, start = (shift_positions(place, -origin) for place in places)
         return of._replace(pose=pose, landmarks=landmarks, start=start)
     names = {field.name for field in dataclasses.fields(of)}
     changed: dict[str, Any] = {
-        name: shifted(getattr(of, name), -origin) for name in names & {"pose", "landmarks"}
+        name: shift_positions(getattr(of, name), -origin) for name in names & {"pose", "landmarks"}
     }
     if "truth" in names:
-        changed["truth"] = _relative(of.truth, origin)
+        changed["truth"] = _subtract_origin(of.truth, origin)
     return dataclasses.replace(of, **changed)
 
 
-def shifted(positions: ArrayLike, by: Origin) -> np.ndarray:
+def shift_positions(positions: ArrayLike, by: Origin) -> np.ndarray:
     """Arrays (…, K) whose first two columns are a position, moved, in float64."""
     values = np.array(jax.device_get(positions), np.float64)
     values[..., :2] += by
     return values
 
 
-def returned(of: _T, origin: Origin) -> _T:
+def to_map_coordinates(of: _T, origin: Origin) -> _T:
     """A truth or an estimate relative to an origin, in the coordinates of the map, in float64."""
     if isinstance(of, Truth):
-        truth: _T = _relative(of, -origin)
+        truth: _T = _subtract_origin(of, -origin)
         return truth
     assert isinstance(of, Estimate)
-    points = np.where(np.asarray(of.alive)[..., None], shifted(of.points, origin), 0.0)
-    return of._replace(pose=shifted(of.pose, origin), points=points)
+    points = np.where(np.asarray(of.alive)[..., None], shift_positions(of.points, origin), 0.0)
+    return of._replace(pose=shift_positions(of.pose, origin), points=points)

@@ -22,7 +22,7 @@ from jaxslam import run, simulate
 from jaxslam.catalog import FILTERS
 from jaxslam.core.slots import Joint
 from jaxslam.filters import CompressedEkfSlam, EkfSlam
-from jaxslam.filters._ekf.compressed_ekf_slam import opened
+from jaxslam.filters._ekf.compressed_ekf_slam import open_area
 from jaxslam.math._xla import hot_options
 from jaxslam.simulation.scenarios import cloister
 
@@ -242,7 +242,7 @@ def compressed(scenario, log):
         joint = map_of(count, scenario)
         plain = EkfSlam(scenario.motion, scenario.sensor, count, **options)
         filter = CompressedEkfSlam(plain, area=AREA)
-        by_landmarks.append(seconds_a_step(filter, opened(joint, AREA), log))
+        by_landmarks.append(seconds_a_step(filter, open_area(joint, AREA), log))
     return by_landmarks, seconds_a_step(plain, joint, log)
 
 

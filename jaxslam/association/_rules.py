@@ -18,7 +18,7 @@ from jaxslam.core.types import Scan
 from jaxslam.core.validation import InvalidField, one_of, or_none, positive, probability
 from jaxslam.math._arrays import Number, is_concrete
 from jaxslam.math._assignment import assign
-from jaxslam.math._gaussians import gaussian_terms
+from jaxslam.math._gaussians import gaussian_terms, is_inside
 
 
 def gate_probability(value: Number | None) -> Number | None:
@@ -46,7 +46,7 @@ def check_new_gate(owner: str, gate: Number | None, new_gate: Number | None) -> 
 def within_gate(pairs: Pairs, gate: Number | None) -> Bool[Array, "M N"]:
     """Which possible pairs are within the gate; without one, those of finite d²."""
     gamma = gate_quantile(gate, pairs.innovation.shape[2])
-    near = jnp.isfinite(pairs.distance) if gamma is None else pairs.distance <= gamma
+    near = is_inside(pairs.distance, gamma)
     return pairs.possible & near
 
 
@@ -211,7 +211,7 @@ class Certain:
         return Association(*self.associate(certain, scan))
 
 
-def predicted(
+def prediction_from(
     sensor: Sensor,
     tag: Int[Array, "N"],
     alive: Bool[Array, "N"],

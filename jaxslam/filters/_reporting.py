@@ -131,6 +131,8 @@ class NewLandmarks(NamedTuple):
     """beyond `births`"""
     repeated: jax.Array
     """its tag occurs earlier in the scan"""
+    stored: Mask = None
+    """kept for a later initialization; None of a filter that initializes at once"""
 
 
 class Innovations(Protocol):
@@ -151,7 +153,7 @@ class Innovations(Protocol):
 
 
 def report_scan(
-    scan: Scan,
+    valid: jax.Array,
     association: Association,
     matched: jax.Array,
     innovations: Innovations,
@@ -161,7 +163,7 @@ def report_scan(
     outcome = {} if new is None else {"new": association.is_new, **new._asdict()}
     born = outcome.pop("slot", None)
     status = status_of(
-        scan.valid,
+        valid,
         matched=matched,
         positive=innovations.positive,
         inside=innovations.inside,
@@ -170,7 +172,7 @@ def report_scan(
     return info_of(
         status,
         matched,
-        size=scan.z.shape[1],
+        size=innovations.innovation.shape[1],
         slot=association.slot,
         born=born,
         nis=innovations.nis,
@@ -202,7 +204,7 @@ def nothing_of(scan: Scan) -> Info:
     )
 
 
-def joined_info(infos: list[Info], size_z: int) -> Info:
+def join_infos(infos: list[Info], size_z: int) -> Info:
     """The `Info` of the scans of several sensors, padded with zeros to innovations of size_z."""
     if len(infos) == 1:
         return infos[0]

@@ -200,7 +200,12 @@ def _graph_of(
     by_noise = jax.vmap(lambda x, u: motion_jacobians(motion, x, u)[1])(path[:-1], control)
     moving = jnp.ones(len(control), bool)
     if slack is None:
-        moving = _has_full_rank(by_noise)
+        # The volume that the columns of ∂f/∂w span, at unit length: not 0 if they move the pose in
+        # all directions.
+        length = jnp.linalg.norm(by_noise, axis=1, keepdims=True)
+        first, second, third = jnp.moveaxis(by_noise / jnp.where(length > 0, length, 1.0), 2, 0)
+        least = max(_STILL, 10 * float(jnp.finfo(by_noise.dtype).eps))
+        moving = jnp.abs((first * jnp.cross(second, third)).sum(axis=1)) > least
     else:
         over_steps = jax.vmap(_pose_noise, (0, 0, 0, None))
         motion_cov = over_steps(path[1:], by_noise, motion_cov, slack)
@@ -248,15 +253,6 @@ def _pose_noise(
     local = turned.T @ by_noise
     soft = slack.astype(pose.dtype) ** 2 * jnp.eye(3, dtype=pose.dtype)
     return local @ noise_cov @ local.T + soft
-
-
-def _has_full_rank(by_noise: Float[Array, "T 3 3"]) -> Bool[Array, "T"]:
-    """Whether matrices are regular, for any lengths of their columns."""
-    length = jnp.linalg.norm(by_noise, axis=1, keepdims=True)
-    a, b, c = jnp.moveaxis(by_noise / jnp.where(length > 0, length, 1.0), 2, 0)
-    least = max(_STILL, 10 * float(jnp.finfo(by_noise.dtype).eps))
-    # The volume that the columns span, at unit length.
-    return jnp.abs((a * jnp.cross(b, c)).sum(axis=1)) > least
 
 
 def _information(cov: Float[Array, "R R"]) -> tuple[Float[Array, "R R"], Bool[Array, ""]]:

@@ -14,7 +14,6 @@ from jaxtyping import Array, Bool, Float
 
 from jaxslam.core._numbers import is_concrete
 from jaxslam.core._record import record
-from jaxslam.core.types import JaxOrNumPy
 from jaxslam.core.validation import InvalidField
 from jaxslam.graphs._checks import check_graph
 from jaxslam.graphs._factor import PRIOR, Chordal, Factor
@@ -65,17 +64,6 @@ class _Relaxed(Factor):
         return self.chordal.residual(variables, z)
 
 
-def _chordal_weights(
-    form: Chordal, information: Float[JaxOrNumPy, "E R R B"]
-) -> Float[Array, "E S B"]:
-    """The weights τ, τ, κ, κ or τ, τ of the chordal residuals; zero for a prior."""
-    tau = 0.5 * (information[:, 0, 0] + information[:, 1, 1])
-    if form.rows is None:
-        return jnp.zeros_like(tau)[:, None]
-    kappa = [information[:, 2, 2]] * (form.size - 2)
-    return jnp.stack([tau, tau, *kappa], axis=1)
-
-
 def dual(
     chordal: Model, plan: Plan, variables: Variables, data: Data
 ) -> tuple[Float[Array, "M 4 4 B"], Float[Array, "N B"], Float[Array, "M 4 4 1"]]:
@@ -98,7 +86,13 @@ def dual(
     """
     poses, dtype = len(variables.poses), variables.poses.dtype
     count, batch = len(plan.order), variables.poses.shape[-1]
-    v = _chordal_variables(variables)
+    # v of poses before points; zeros for u of a point. The first pose is the origin: the cost does
+    # not depend on it, and smaller numbers round less.
+    pose, point = variables
+    v = jnp.zeros((count, 4, batch), dtype)
+    v = v.at[:poses, :2].set(pose[:, :2] - pose[:1, :2])
+    v = v.at[:poses, 2:].set(jnp.stack([jnp.cos(pose[:, 2]), jnp.sin(pose[:, 2])], axis=1))
+    v = v.at[poses:, :2].set(point[:, :2] - pose[:1, :2])
     is_pose = jnp.arange(count) < poses
     # Which of the four numbers of each column are free, (n, 4, B): those of a position as in the
     # graph, u of every pose, the held one included.
@@ -147,19 +141,6 @@ def dual(
     m = m + jnp.where(on_diagonal & ~free[plan.block_column][:, None], unit, 0.0)
     by_block = by_variable[plan.order][plan.block_column][:, None, None]
     return m - unit_lambda * by_block, multipliers, unit_lambda
-
-
-def _chordal_variables(variables: Variables) -> Float[Array, "n 4 B"]:
-    """The numbers v of each variable, poses before points; zeros for u of a point.
-
-    The first pose is the origin: the cost does not depend on it, and smaller numbers round less.
-    """
-    poses, points = variables
-    count = len(poses)
-    v = jnp.zeros((count + len(points), 4, poses.shape[-1]), poses.dtype)
-    v = v.at[:count, :2].set(poses[:, :2] - poses[:1, :2])
-    v = v.at[:count, 2:].set(jnp.stack([jnp.cos(poses[:, 2]), jnp.sin(poses[:, 2])], axis=1))
-    return v.at[count:, :2].set(points[:, :2] - poses[:1, :2])
 
 
 _FIRST_GAP = 1e-6
@@ -306,7 +287,13 @@ def _chordal_problem(model: Model, plan: Plan, graph: Graph) -> tuple[Model, Gra
         assert factor.chordal is not None
         if factor.chordal is PRIOR:
             held = held.at[plan.who[name][:, 0]].max(table.valid)
-        weights = _chordal_weights(factor.chordal, table.information)
+        # τ, τ, κ, κ or τ, τ of the chordal residuals; zero for a prior.
+        tau = 0.5 * (table.information[:, 0, 0] + table.information[:, 1, 1])
+        if factor.chordal.rows is None:
+            weights = jnp.zeros_like(tau)[:, None]
+        else:
+            kappa = [table.information[:, 2, 2]] * (factor.chordal.size - 2)
+            weights = jnp.stack([tau, tau, *kappa], axis=1)
         unit = jnp.eye(weights.shape[1], dtype=graph.poses.dtype)[None, ..., None]
         tables[name] = table._replace(information=unit * weights[:, None])
     chordal = Model({name: _Relaxed(factor) for name, factor in model.factors.items()}, {})

@@ -234,7 +234,7 @@ def segments(
     def is_arc(k: int) -> bool:
         """Whether a piece and its successor belong to a common arc."""
         after = (k + 1) % len(pieces)
-        if after == k or not _adjacent(pieces[k][-1], pieces[after][0], angle):
+        if after == k or not _are_neighbours(pieces[k][-1], pieces[after][0], angle):
             return False
         together = parabola_misfit(np.concatenate([pieces[k], pieces[after]]))
         return together <= misfit[k] + misfit[after] + gain
@@ -331,7 +331,7 @@ def _merge(
         after = (k + 1) % len(pieces)
         gap = fits[after][0] - fits[k][0]
         gap[1] = np.arctan2(np.sin(gap[1]), np.cos(gap[1]))
-        near = _adjacent(pieces[k][-1], pieces[after][0], angle)
+        near = _are_neighbours(pieces[k][-1], pieces[after][0], angle)
         if near and gap @ np.linalg.solve(fits[k][1] + fits[after][1], gap) <= _MERGE_GATE:
             joined = np.concatenate([pieces[k], pieces[after]])
             pieces[k], fits[k] = joined, fit(joined)
@@ -344,6 +344,6 @@ def _merge(
     return pieces
 
 
-def _adjacent(last: int, first: int, angle: np.ndarray) -> bool:
+def _are_neighbours(last: int, first: int, angle: np.ndarray) -> bool:
     """Whether two beams are neighbours in direction, but for a few that are missing."""
     return bool(np.mod(angle[first] - angle[last], 2 * np.pi) < _SLANT)

@@ -19,8 +19,8 @@ def asymmetric(
 
     tolerance: the share, where that is above rounding.
     """
-    off = np.abs(_scaled(matrix - np.swapaxes(matrix, -1, -2), _sizes(matrix, 0.0)[0]))
-    return np.asarray((off > _allowed(matrix, tolerance)).any(axis=(-1, -2)))
+    off = np.abs(_scale(matrix - np.swapaxes(matrix, -1, -2), _sizes(matrix, 0.0)[0]))
+    return np.asarray((off > _tolerance(matrix, tolerance)).any(axis=(-1, -2)))
 
 
 def indefinite(
@@ -36,8 +36,8 @@ def indefinite(
     variance = np.diagonal(matrix, axis1=-2, axis2=-1)
     # A variance of -1e-17 next to 1 is 0.
     raised = matrix - np.where(variance < 0, variance, 0)[..., None] * np.eye(matrix.shape[-1])
-    eigenvalues = np.linalg.eigvalsh(_scaled(raised, size))
-    negative = (eigenvalues < -_allowed(matrix, tolerance)).any(axis=-1)
+    eigenvalues = np.linalg.eigvalsh(_scale(raised, size))
+    negative = (eigenvalues < -_tolerance(matrix, tolerance)).any(axis=-1)
     return np.asarray((variance < -rounding).any(axis=-1) | negative)
 
 
@@ -45,10 +45,10 @@ def invertible(matrix: Float[np.ndarray, "*batch n n"]) -> Bool[np.ndarray, "*ba
     """Whether symmetric matrices are positive definite and have an inverse of some digits."""
     variance = np.diagonal(matrix, axis1=-2, axis2=-1)
     unit = np.where(variance > 0, variance, 1.0)
-    scaled = _scaled(matrix, np.sqrt(unit.astype(np.float64)))
+    scaled = _scale(matrix, np.sqrt(unit.astype(np.float64)))
     eigenvalues = np.linalg.eigvalsh(scaled)
     return np.asarray(
-        (variance > 0).all(axis=-1) & (eigenvalues > _allowed(matrix, 0.0)).all(axis=-1)
+        (variance > 0).all(axis=-1) & (eigenvalues > _tolerance(matrix, 0.0)).all(axis=-1)
     )
 
 
@@ -62,7 +62,7 @@ def _sizes(
     return np.sqrt(np.where(variance > 0, variance, 1.0)), rounding
 
 
-def _scaled(
+def _scale(
     matrix: Float[np.ndarray, "*batch n n"], size: Float[np.ndarray, "*batch n"]
 ) -> Float[np.ndarray, "*batch n n"]:
     return np.asarray(matrix / size[..., :, None] / size[..., None, :])
@@ -72,5 +72,5 @@ def _eps(matrix: np.ndarray) -> float:
     return float(np.finfo(matrix.dtype if matrix.dtype.kind == "f" else np.float64).eps)
 
 
-def _allowed(matrix: Float[np.ndarray, "*batch n n"], tolerance: float) -> float:
+def _tolerance(matrix: Float[np.ndarray, "*batch n n"], tolerance: float) -> float:
     return float(max(tolerance, _ROUNDED * matrix.shape[-1] * _eps(matrix)))

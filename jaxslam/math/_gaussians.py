@@ -8,7 +8,7 @@ from jax import Array
 from jaxtyping import Bool, Float
 
 from jaxslam.math import _linalg as linalg
-from jaxslam.math._arrays import Scalar
+from jaxslam.math._arrays import Number, Scalar
 
 _LOG_2PI = math.log(2 * math.pi)
 
@@ -55,6 +55,14 @@ def log_density(
 ) -> Float[Array, "..."]:
     """The log-density of errors of `size` entries, by their d² and log |cov|."""
     return -0.5 * (distance + log_det + size * _LOG_2PI)
+
+
+def is_inside(distance: Float[Array, "*batch"], gamma: Number | None) -> Bool[Array, "*batch"]:
+    """Mask of the squared distances d² within the gate γ; None: of those that are finite.
+
+    A finite error whose d² overflows is outside any gate, and so is a NaN.
+    """
+    return jnp.isfinite(distance) if gamma is None else distance <= gamma
 
 
 def mahalanobis_squared(

@@ -45,7 +45,9 @@ def odometry_jumps(
     median = float(np.median(interval[interval > 0])) if timed else 1.0
     speed = size / np.maximum(interval, median)[:, None]
     limit = _POSSIBLE if timed else np.zeros(2)
-    usual = np.array([_usual(speed[:, k], _POSSIBLE[k] if timed else np.inf) for k in range(2)])
+    usual = np.array(
+        [_usual_speed(speed[:, k], _POSSIBLE[k] if timed else np.inf) for k in range(2)]
+    )
     is_large = size > _LEAST
     jump[1:] = (is_large & (speed > np.maximum(limit, _TIMES_USUAL * usual))).any(axis=1)
     at_zero = np.stack([np.hypot(path[:, 0], path[:, 1]), np.abs(poses.wrapped(path[:, 2]))], 1)
@@ -72,7 +74,7 @@ def step_sizes(path: Float[np.ndarray, "n 3"]) -> Float[np.ndarray, "n 2"]:
     return np.stack([np.hypot(step[:, 0], step[:, 1]), np.abs(step[:, 2])], axis=1)
 
 
-def _usual(speed: Float[np.ndarray, "n"], possible: float) -> float:
+def _usual_speed(speed: Float[np.ndarray, "n"], possible: float) -> float:
     """The 95 % quantile of the speeds of steps with motion, without impossible ones if these are
     few. Of fewer than `_MIN_STEPS` zero in a log at rest, whose limit then counts alone; else ∞."""
     moving = speed[speed > 1e-9]

@@ -148,10 +148,10 @@ def change_where(flag: jax.Array, change: Callable[[_T], _T], state: _T) -> _T:
     Computed only where the flag is set in any run of the batch.
     """
 
-    def changed(state: _T) -> _T:
+    def change_flagged(state: _T) -> _T:
         return cast(_T, jax.tree.map(lambda a, b: jnp.where(flag, a, b), change(state), state))
 
-    return where_any(flag, changed, lambda state: state, state)
+    return where_any(flag, change_flagged, lambda state: state, state)
 
 
 def hot_jit(
@@ -164,7 +164,7 @@ def hot_jit(
     within = jax.jit(function, static_argnames=static_argnames, inline=True)
 
     @functools.cache  # at the first call, since to ask for the backend starts it
-    def alone() -> Callable[..., _T]:
+    def compile_alone() -> Callable[..., _T]:
         options = hot_options(jax.default_backend())
         compiled = jax.jit(function, static_argnames=static_argnames, compiler_options=options)
         return cast(Callable[..., _T], compiled)
@@ -174,7 +174,7 @@ def hot_jit(
         # A new array is a tracer where a trace is active, also where all arguments are constants.
         leaves = jax.tree.leaves((jnp.asarray(0.0), arguments))
         traced = any(isinstance(leaf, jax.core.Tracer) for leaf in leaves)
-        return cast(_T, (within if traced else alone())(*arguments))
+        return cast(_T, (within if traced else compile_alone())(*arguments))
 
     return call
 

@@ -91,11 +91,11 @@ class Corrected(Motion):
 
     def step(self, pose: Pose, u: Control, w: ProcessNoise) -> Pose:
         # Into the direction in which the robot drives, and back to its axes.
-        moved = self.motion.step(self._turned(pose, 1.0), self.control(u), w)
-        return self._turned(moved, -1.0)
+        moved = self.motion.step(self._turn_pose(pose, 1.0), self.control(u), w)
+        return self._turn_pose(moved, -1.0)
 
     def noise_cov(self, pose: Pose, u: Control) -> Array:
-        cov: Array = self.motion.noise_cov(self._turned(pose, 1.0), self.control(u))
+        cov: Array = self.motion.noise_cov(self._turn_pose(pose, 1.0), self.control(u))
         return cov
 
     def control(self, u: Control) -> Control:
@@ -111,6 +111,6 @@ class Corrected(Motion):
                 corrected[k] = scale[0] * u[k]
         return jnp.stack(corrected)
 
-    def _turned(self, pose: Pose, sign: float) -> Pose:
+    def _turn_pose(self, pose: Pose, sign: float) -> Pose:
         heading = sign * jnp.asarray(self.heading, pose.dtype)
         return se2.compose(pose, jnp.stack([0.0 * heading, 0.0 * heading, heading]))

@@ -108,7 +108,7 @@ class BearingInverseDepth(Sensor):
         if self.to_point is None:
             return None
         points = BearingOnly(self.noise_cov, self.mount, free=((1.0,), ((1.0,),)))
-        return Reduced(points, self._ready)
+        return Reduced(points, self._is_linear)
 
     def _sight(self, frame: Array, landmark: Landmark) -> tuple[Array, Array]:
         """The vector v, and the sensor's frame moved to the map's origin."""
@@ -156,7 +156,7 @@ class BearingInverseDepth(Sensor):
         eye = jnp.eye(4, dtype=pose.dtype)
         return eye[:, :3] @ self.frame_jacobian(pose), eye[:, 2:3], eye[:, 3:]
 
-    def _ready(self, pose: Pose, landmark: Landmark, cov: Array) -> Array:
+    def _is_linear(self, pose: Pose, landmark: Landmark, cov: Array) -> Array:
         inverse = jnp.where(landmark[3] > 0, landmark[3], 1.0)
         # v is along the line of sight, scaled by ρ: d = |v|/ρ, cos γ = v·(cos α, sin α)/|v|.
         v = landmark[3] * (landmark[:2] - self.frame(pose)[:2]) + _direction(landmark[2])

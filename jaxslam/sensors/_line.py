@@ -35,7 +35,7 @@ class Line(Sensor):
     faces of a thin wall and different landmarks, z has one value, a distance of the sensor's side
     is positive, and nothing is singular where r passes zero, in the map or as the robot passes the
     line. Whoever measures lines says on which side the robot is (`features.segments` does);
-    `facing` gives z of either sign the positive distance.
+    `turn_to_positive_distance` gives z of either sign the positive distance.
 
     A line is no place: `carried` says how it changes with the frame (a turn by φ and a shift by t
     give α + φ and r + n·t), `position` is the point n r nearest to the map's origin, and `embed`
@@ -56,7 +56,7 @@ class Line(Sensor):
 
     def observe(self, pose: Pose, landmark: Landmark) -> Measurement:
         frame = self.frame(pose)
-        distance = landmark[0] - _along(landmark[1], frame)
+        distance = landmark[0] - _distance_along(landmark[1], frame)
         return jnp.stack([distance, wrap(landmark[1] - frame[2])])
 
     def invert(self, pose: Pose, z: Measurement, s: Unmeasured) -> Landmark:
@@ -90,16 +90,16 @@ class Line(Sensor):
 def _line_from_frame(frame: Pose, landmark: Landmark) -> Landmark:
     """A line (r, α) of a frame in the coordinates that its pose is in: (r + n·t, α + θ)."""
     alpha = landmark[1] + frame[2]
-    return jnp.stack([landmark[0] + _along(alpha, frame), wrap(alpha)])
+    return jnp.stack([landmark[0] + _distance_along(alpha, frame), wrap(alpha)])
 
 
-def facing(z: Measurement) -> Measurement:
+def turn_to_positive_distance(z: Measurement) -> Measurement:
     """The one of (r, α) and (-r, α + π), the same set of points, with the distance r >= 0."""
     behind = z[0] < 0
     return jnp.stack([jnp.abs(z[0]), wrap(z[1] + jnp.where(behind, jnp.pi, 0.0))])
 
 
-def _along(alpha: Array, frame: Pose) -> Array:
+def _distance_along(alpha: Array, frame: Pose) -> Array:
     """The distance n·t along the normal n = (cos α, sin α)."""
     return jnp.cos(alpha) * frame[0] + jnp.sin(alpha) * frame[1]
 

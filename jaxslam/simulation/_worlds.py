@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
-from jaxslam._origin import FAR, far_origin, moved, returned
+from jaxslam._origin import FAR, far_origin, move_near_origin, to_map_coordinates
 from jaxslam._public import publish
 from jaxslam.core._numbers import check_covariance, check_key, held_array, is_concrete
 from jaxslam.core._record import FrozenDict, hold_function, record, set_field, static
@@ -220,12 +220,12 @@ def simulate(scenario: World, key: Array) -> tuple[Truth, Log]:
         # A new array is a tracer where a trace is active, also where all arguments are constants.
         if jnp.result_type(float) == jnp.float32 and is_concrete(scenario, key, jnp.zeros(())):
             origin = far_origin(scenario.pose, scenario.landmarks, FAR)
-            near = None if origin is None else moved(scenario, origin, scenario.controls)
+            near = None if origin is None else move_near_origin(scenario, origin, scenario.controls)
         if near is None or origin is None:
             history: tuple[Truth, Log] = _draw(scenario, key)
             return history
         truth, log = _draw(near, key)
-        return returned(jax.device_get(truth), origin), log
+        return to_map_coordinates(jax.device_get(truth), origin), log
 
 
 @partial(jax.jit, inline=True)

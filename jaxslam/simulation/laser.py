@@ -217,7 +217,9 @@ def scan_information(
     bound = scaled * inverse @ scaled.T
     free = scaled[:, ~seen].T
     free = free / np.linalg.norm(free, axis=1, keepdims=True)
-    return Observability(information, bound, free, tuple(_name(d, place, unit[2]) for d in free))
+    return Observability(
+        information, bound, free, tuple(_describe(d, place, unit[2]) for d in free)
+    )
 
 
 @partial(jax.jit, inline=True)
@@ -230,7 +232,7 @@ def _ranges_and_slopes(laser: Laser, walls: Walls, pose: Array) -> tuple[Array, 
     return ranges(pose), jax.jacfwd(ranges)(pose)
 
 
-def _name(
+def _describe(
     direction: Float[np.ndarray, "3"], pose: Float[np.ndarray, "3"], per_length: float
 ) -> str:
     """The text for a motion: with turn ω a rotation about t + (-dy, dx)/ω, else a translation."""

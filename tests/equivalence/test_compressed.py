@@ -13,7 +13,7 @@ from worlds import draw
 from jaxslam import charts, linearize, run, sensors
 from jaxslam.core.types import Status
 from jaxslam.filters import CompressedEkfSlam, EkfSlam
-from jaxslam.filters._ekf.compressed_ekf_slam import opened, up_to_date
+from jaxslam.filters._ekf.compressed_ekf_slam import open_area, up_to_date
 from jaxslam.simulation.scenarios import cloister
 
 KEY = jax.random.key(4)
@@ -111,7 +111,7 @@ def test_from_a_map_at_hand():
             state = small.predict(state, row.control, KEY)
             return small.update(state, row.scan, KEY)
 
-        return up_to_date(jax.lax.scan(step, opened(joint, PLACES), rest)[0])
+        return up_to_date(jax.lax.scan(step, open_area(joint, PLACES), rest)[0])
 
     assert_same(final, go_on(joint))
 

@@ -1,7 +1,7 @@
 """The life of a landmark: evidence for and against it, and what a filter does when it ends."""
 
 import math
-from functools import cache
+from functools import cache, partial
 
 import jax
 import jax.numpy as jnp
@@ -13,7 +13,7 @@ from worlds import narrow
 from jaxslam import life, motion, run, sensors, slots
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Log, Scan, Status
-from jaxslam.filters import EkfSlam
+from jaxslam.filters import EkfSlam, Mapping
 from jaxslam.life import Evidence
 
 MOTION = motion.Increment(np.diag([0.02, 0.01]) ** 2)
@@ -231,6 +231,25 @@ def test_a_landmark_that_the_scan_measured_stays_in_a_full_map():
     removed = [[False, False], [False, True], [False] * 2]
     np.testing.assert_array_equal(removed_in(trace)[-3:], removed)
     np.testing.assert_array_equal(trace.estimate.tag[-1], [0, 2])
+
+
+def test_a_full_map_loses_only_as_many_landmarks_as_start():
+    """A repeated and a deferred measurement need no slot."""
+    rule = life.Existence(always, replace=True)
+    log = log_of([[0, 1, -1], [0, 1, -1], [2, 2, 3]])
+    path = np.zeros((3, 3))  # the control of mapping is the pose
+    for filter, control in (
+        (managed(rule, 2, births=1), log.control),
+        (Mapping(SENSOR, 2, life=rule, births=1), path),
+    ):
+        start = np.zeros(3), np.eye(3) * 1e-4, KEY
+        # Jitted: outside of a trace `run` refuses a log in which a tag repeats within a scan.
+        trace = jax.jit(partial(run, filter))(log._replace(control=control), *start)
+        wanted = [Status.BORN, Status.REPEATED, Status.DEFERRED]
+        assert list(trace.info.status[-1]) == wanted, filter.name
+        # 0 was measured once more than 1, and is more likely to exist.
+        np.testing.assert_array_equal(removed_in(trace)[-1], [False, True], filter.name)
+        np.testing.assert_array_equal(trace.estimate.tag[-1], [0, 2], filter.name)
 
 
 def test_what_is_no_manager_is_refused():

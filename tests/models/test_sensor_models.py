@@ -12,7 +12,7 @@ from jaxslam import Scenario, charts, filters, linearize, motion, run, sensors, 
 from jaxslam.core.types import Scan
 from jaxslam.filters import EkfSlam
 from jaxslam.filters.map_management.relocalization import seen_points
-from jaxslam.sensors._line import facing
+from jaxslam.sensors._line import turn_to_positive_distance
 
 MOUNT = np.array([0.4, -0.3, 0.9])
 VARIANCE = np.array([[0.02**2]])
@@ -418,10 +418,10 @@ def test_nothing_happens_where_the_robot_passes_the_line_or_the_map_the_origin()
 
 def test_both_signs_are_one_set_of_points():
     z = np.array([-1.5, 3.0])
-    same = np.asarray(facing(z))
+    same = np.asarray(turn_to_positive_distance(z))
     np.testing.assert_allclose(same, [1.5, 3.0 - np.pi], atol=1e-15)
     np.testing.assert_allclose(points_of(same, [0.0]), points_of(z, [0.0]), atol=1e-12)
-    np.testing.assert_array_equal(facing(same), same)
+    np.testing.assert_array_equal(turn_to_positive_distance(same), same)
 
 
 @refused(

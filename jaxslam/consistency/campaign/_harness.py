@@ -17,7 +17,7 @@ import jax
 import numpy as np
 from jax.typing import DTypeLike
 
-from jaxslam._origin import far_origin, may_move, moved, returned
+from jaxslam._origin import far_origin, may_move, move_near_origin, to_map_coordinates
 from jaxslam.consistency import Summary
 from jaxslam.consistency._digests import identity
 from jaxslam.consistency._summary import summarize
@@ -255,7 +255,7 @@ def _summed_up(
     """
 
     def in_map(tree: _T) -> _T:
-        return tree if origin is None else returned(tree, origin)
+        return tree if origin is None else to_map_coordinates(tree, origin)
 
     scenario = plan.scenario
     finished, limit, summaries = summaries_of(tallies)
@@ -294,7 +294,7 @@ def _near_the_origin(
     it is.
     """
     origin = far_origin(scenario.pose, scenario.landmarks)
-    if origin is None or (near := moved(scenario, origin, scenario.controls)) is None:
+    if origin is None or (near := move_near_origin(scenario, origin, scenario.controls)) is None:
         return scenario, filters, None
     truth = Truth(
         pose=np.tile(np.asarray(near.pose), (near.steps, 1)),
@@ -306,7 +306,7 @@ def _near_the_origin(
     for name, candidate in filters.items():
         near_filter: Candidate | None
         if isinstance(candidate, Filter | LogEstimator):
-            near_filter = moved(candidate, origin, scenario.controls)
+            near_filter = move_near_origin(candidate, origin, scenario.controls)
         else:  # a function of the truth, which is relative
             try:
                 method = method_of(candidate, truth)

@@ -9,7 +9,6 @@ from jaxtyping import Bool, Float, Int
 
 from jaxslam.core import slots
 from jaxslam.core._record import record
-from jaxslam.core.protocols import Association
 from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.filters._delayed.confirmation import confirm_hypotheses
 from jaxslam.filters._delayed.delayed_filter import DelayedFilter
@@ -25,11 +24,11 @@ from jaxslam.filters._delayed.state import (
     is_newer,
     slots_where,
 )
-from jaxslam.filters._ekf.correction import Correction, correct_in_turn
+from jaxslam.filters._ekf.correction import correct_in_turn
 from jaxslam.filters._ekf.ekf_slam import EkfSlam, associate_scan
 from jaxslam.filters._ekf.map_coordinates import estimate_of
 from jaxslam.filters._ekf.predicted_measurements import prediction_of
-from jaxslam.filters._reporting import info_of, status_of
+from jaxslam.filters._reporting import NewLandmarks, report_scan
 from jaxslam.math._xla import where_any
 
 
@@ -77,9 +76,20 @@ class DelayedSlam(DelayedFilter):
         # Padding may hold any number, and is multiplied by zero below.
         scan = scan._replace(z=jnp.where(scan.valid[:, None], scan.z, 0.0))
         state = state._replace(clock=state.clock + 1)
-        association, matched = _associate(self, state, scan)
-        state, correction = _correct(self, state, scan, association, matched)
-        new = _new_measurements(self, scan, association)
+        ekf, sensor = self._ekf, self.sensor_of_table
+        # Hypotheses and stored measurements are not landmarks.
+        is_landmark = jnp.arange(self.layout.slots) < self.capacity
+        landmarks = state.joint._replace(alive=state.joint.alive & is_landmark)
+        association, matched = associate_scan(
+            self.associate, sensor, scan, lambda: prediction_of(ekf, sensor, landmarks)
+        )
+        slot = jnp.maximum(association.slot, 0)
+        joint, correction = correct_in_turn(ekf, sensor, state.joint, scan.z, slot, matched)
+        state = state._replace(joint=joint)
+        is_new, tag = association.is_new, scan.tag
+        repeated = slots.seen_before(tag, is_new) if self.by_tag else jnp.zeros_like(is_new)
+        identity = tag if self.by_tag else jnp.full_like(tag, -1)
+        new = NewMeasurements(scan.z, identity, tag, is_new, repeated)
 
         def initialize(
             state: DelayedState,
@@ -97,7 +107,14 @@ class DelayedSlam(DelayedFilter):
         # The steps take an argmin over the measurements, of which there must be one.
         steps = initialize if len(scan.tag) > 0 else leave
         state, (stored, promoted) = where_any(new.wanted.any(), steps, leave, state)
-        return state, _report(scan, association, matched, correction, new, stored, promoted)
+        outcome = NewLandmarks(
+            slot=promoted.slot,
+            granted=promoted.slot >= 0,
+            deferred=new.wanted & ~stored & ~promoted.refused,
+            repeated=new.repeated,
+            stored=stored & ~promoted.refused,
+        )
+        return state, report_scan(scan.valid, association, matched, correction, outcome)
 
     def estimate(self, state: DelayedState) -> Estimate:
         joint, capacity, size = state.joint, self.capacity, 3 + SIZE * self.capacity
@@ -120,49 +137,6 @@ class DelayedSlam(DelayedFilter):
             associate=self.associate,
             gate=self.probability,
         )
-
-
-def _associate(
-    filter: DelayedSlam, state: DelayedState, scan: Scan
-) -> tuple[Association, Bool[Array, "M"]]:
-    """The landmark slot of each measurement, and the mask of the measurements that have one.
-
-    Hypotheses and stored measurements are not landmarks.
-    """
-    is_landmark = jnp.arange(filter.layout.slots) < filter.capacity
-    landmarks = state.joint._replace(alive=state.joint.alive & is_landmark)
-    ekf, sensor = filter._ekf, filter.sensor_of_table
-    return associate_scan(
-        filter.associate, sensor, scan, lambda: prediction_of(ekf, sensor, landmarks)
-    )
-
-
-def _correct(
-    filter: DelayedSlam,
-    state: DelayedState,
-    scan: Scan,
-    association: Association,
-    matched: Bool[Array, "M"],
-) -> tuple[DelayedState, Correction]:
-    """The state corrected by the measurements of landmarks of the map that are within the gate."""
-    slot = jnp.maximum(association.slot, 0)
-    joint, correction = correct_in_turn(
-        filter._ekf, filter.sensor_of_table, state.joint, scan.z, slot, matched
-    )
-    return state._replace(joint=joint), correction
-
-
-def _new_measurements(
-    filter: DelayedFilter, scan: Scan, association: Association
-) -> NewMeasurements:
-    """The measurements of a scan that association declares new."""
-    is_new = scan.valid & association.is_new
-    if filter.by_tag:
-        return NewMeasurements(
-            scan.z, scan.tag, scan.tag, is_new, slots.seen_before(scan.tag, is_new)
-        )
-    unknown = jnp.full_like(scan.tag, -1)
-    return NewMeasurements(scan.z, unknown, scan.tag, is_new, jnp.zeros_like(is_new))
 
 
 def _store_measurements(
@@ -202,38 +176,3 @@ def _store_measurements(
         counts=state.counts._replace(evicted=add_to(state.counts.evicted, evicted)),
     )
     return state, slot, stored
-
-
-def _report(
-    scan: Scan,
-    association: Association,
-    matched: Bool[Array, "M"],
-    correction: Correction,
-    new: NewMeasurements,
-    stored: Bool[Array, "M"],
-    promoted: Promoted,
-) -> Info:
-    """The `Info` of a scan: what became of each of its measurements."""
-    status = status_of(
-        scan.valid,
-        matched=matched,
-        positive=correction.positive,
-        inside=correction.inside,
-        new=new.is_new,
-        repeated=new.repeated,
-        granted=promoted.slot >= 0,
-        deferred=new.wanted & ~stored & ~promoted.refused,
-        stored=stored & ~promoted.refused,
-    )
-    return info_of(
-        status,
-        matched,
-        size=1,
-        slot=association.slot,
-        born=promoted.slot,
-        nis=correction.nis,
-        innovation=correction.innovation,
-        innovation_cov=correction.innovation_cov,
-        log_likelihood=correction.log_likelihood.sum(),
-        exhausted=jnp.asarray(association.exhausted),
-    )

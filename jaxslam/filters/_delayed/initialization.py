@@ -75,7 +75,7 @@ def initial_estimate(
     blocks = covariance_blocks(joint)[stored][:, :, stored]
     both, unit = use[:, None] & use[None, :], jnp.eye(m, dtype=s.dtype)
 
-    def whitened(
+    def whiten_residuals(
         point: Float[Array, "2"],
     ) -> tuple[
         Float[Array, "m"], Float[Array, "m 3"], Float[Array, "m 2"], Float[Array, "m m"], Array
@@ -91,7 +91,7 @@ def initial_estimate(
 
     def gauss_newton(before: PyTree, _: None) -> tuple[PyTree, None]:
         point = before[0]
-        terms = whitened(point)
+        terms = whiten_residuals(point)
         value, _by_stored, by_point, _inverse_root, positive = terms
         step, regular = linalg.solve_psd(by_point.T @ by_point, by_point.T @ value)
         return (point - jnp.where(regular & positive, step, 0.0), point, terms), None

@@ -3,7 +3,7 @@
 For the most persistent hypothesis that this scan confirmed, at most `per_scan` times:
 
 1. `_candidate`: it is persistent enough, more so than its alternatives, and its spread is small;
-2. `_measurements_of`: its stored measurements; `_outer_measurements`: up to eight of them;
+2. `_promote`: its stored measurements, and up to eight of them, the oldest and the newest;
 3. `_locate`: the maximum-likelihood position, and a decision: accept it, wait, or refuse it;
 4. `add_landmark` where accepted; its stored measurements and excluded hypotheses are deleted.
 """
@@ -135,8 +135,20 @@ def _promote(
     slot, tag: of the landmark that it may become.
     """
     layout, joint = filter.layout, state.joint
-    same_tag, stored = _measurements_of(filter, state, chosen)
-    used, use = _outer_measurements(filter, state, stored)
+    hypothesis = layout.landmarks + chosen
+    same_tag = joint.alive[layout.of_stored]
+    same_tag = same_tag & (joint.tag[layout.of_stored] == joint.tag[hypothesis])
+    residuals = point_residuals(joint, filter.triangulation, hypothesis[None], layout.stored_slots)
+    # After the correction by its measurements g has almost no variance: that of the noise is
+    # added, for rounding and curvature.
+    variance = residuals.variance[0] + state.noise_var
+    stored = same_tag & (residuals.value[0] ** 2 <= filter.gamma * variance)
+    # Of these the oldest and the newest, which were taken from the positions farthest apart: ranks
+    # from the oldest, 1 … n; the larger one of the ranks from both ends is outermost.
+    rank = (stored[None, :] & ~is_newer(state.taken_at)).sum(axis=1)
+    outer = jnp.where(stored, jnp.maximum(rank, stored.sum() + 1 - rank), 0)
+    best = jax.lax.top_k(outer, min(_USED, layout.stored))[1]
+    used, use = layout.stored_slots[best], stored[best]
     estimate, accepted, undecided = _locate(filter, state, chosen, used, use)
     # In a batch, the runs without a promotion stay exactly as they are.
     accepted, undecided = materialize((accepted & tried, undecided | ~tried))
@@ -158,36 +170,6 @@ def _promote(
     )
     dead = slots_where(layout, hypotheses=(rivals | itself) & ~undecided, stored=used_up)
     return delete_slots(layout, state._replace(counts=counts), dead)
-
-
-def _measurements_of(
-    filter: DelayedFilter, state: DelayedState, chosen: Int[Array, ""]
-) -> tuple[Bool[Array, "W"], Bool[Array, "W"]]:
-    """Masks of the stored measurements with the tag of a hypothesis, and of those it explains."""
-    layout, joint = filter.layout, state.joint
-    hypothesis = layout.landmarks + chosen
-    same_tag = joint.alive[layout.of_stored]
-    same_tag = same_tag & (joint.tag[layout.of_stored] == joint.tag[hypothesis])
-    residuals = point_residuals(joint, filter.triangulation, hypothesis[None], layout.stored_slots)
-    # After the correction by its measurements g has almost no variance: that of the noise is
-    # added, for rounding and curvature.
-    variance = residuals.variance[0] + state.noise_var
-    return same_tag, same_tag & (residuals.value[0] ** 2 <= filter.gamma * variance)
-
-
-def _outer_measurements(
-    filter: DelayedFilter, state: DelayedState, stored: Bool[Array, "W"]
-) -> tuple[Int[Array, "m"], Bool[Array, "m"]]:
-    """The slots of the oldest and the newest of some stored measurements, and the mask of the slots
-    in use.
-
-    They were taken from the positions farthest apart.
-    """
-    # Ranks from the oldest, 1 … n; the larger one of the ranks from both ends is outermost.
-    rank = (stored[None, :] & ~is_newer(state.taken_at)).sum(axis=1)
-    outer = jnp.where(stored, jnp.maximum(rank, stored.sum() + 1 - rank), 0)
-    best = jax.lax.top_k(outer, min(_USED, filter.layout.stored))[1]
-    return filter.layout.stored_slots[best], stored[best]
 
 
 def _locate(

@@ -56,7 +56,7 @@ class CompressedEkfSlam(Wrapper):
 
     The state is a `_Compressed`. `estimate` gives the moments of all landmarks, O(K²·N); moments
     that are not used cost nothing under `jit`. `up_to_date` gives the whole map as a `Joint`, and
-    `opened` makes a state of one.
+    `open_area` makes a state of one.
 
     Raises ValueError on an area below 1 or an `EkfSlam` that is not as here; and, when a scan has
     more measurement slots than the area, from `update`.
@@ -99,7 +99,7 @@ class CompressedEkfSlam(Wrapper):
         return "compressed_ekf_slam"
 
     def init(self, pose: jax.Array, pose_cov: jax.Array) -> _Compressed:
-        return opened(self.filter.init(pose, pose_cov), self.area)
+        return open_area(self.filter.init(pose, pose_cov), self.area)
 
     def predict(self, state: _Compressed, u: jax.Array, key: jax.Array) -> _Compressed:
         return state._replace(area=self._local.predict(state.area, u, key))
@@ -111,10 +111,15 @@ class CompressedEkfSlam(Wrapper):
                 f"a scan, got {self.area}"
             )
         state = _with_area_of(scan, state, self.filter.sensor, self.filter.births)
-        inside, info = self._local.update(state.area, scan, key)
+        area, info = self._local.update(state.area, scan, key)
         # Slots of the area into slots of the map.
         in_map = jnp.where(info.slot >= 0, state.slot[jnp.maximum(info.slot, 0)], -1)
-        return _with_updated_area(state, inside), info._replace(slot=in_map)
+        joint, count = state.full, state.slot.shape[0]
+        joint = joint._replace(
+            alive=joint.alive.at[state.slot].set(area.alive[:count]),
+            tag=joint.tag.at[state.slot].set(area.tag[:count]),
+        )
+        return state._replace(full=joint, area=area), info._replace(slot=in_map)
 
     def estimate(self, state: _Compressed) -> Estimate:
         def estimate_landmark(
@@ -131,7 +136,7 @@ class CompressedEkfSlam(Wrapper):
 
         robot, joint = state.area.cov[:3, :3], state.full
         landmarks = jax.vmap(estimate_landmark)(
-            _moved_map(state), joint.alive, joint.tag, *_marginals(state)
+            _move_map(state), joint.alive, joint.tag, *_marginals(state)
         )
         return Estimate(
             pose=state.area.pose,
@@ -151,9 +156,9 @@ class CompressedEkfSlam(Wrapper):
         return dataclasses.replace(self.filter, capacity=area + spare)
 
 
-def opened(joint: Joint, area: int) -> _Compressed:
+def open_area(joint: Joint, area: int) -> _Compressed:
     """A state of `CompressedEkfSlam` of a map, the area (min(area, N)) at its first slots."""
-    return _opened_at(joint, jnp.arange(min(area, joint.landmarks.shape[0]), dtype=jnp.int32))
+    return _open_at(joint, jnp.arange(min(area, joint.landmarks.shape[0]), dtype=jnp.int32))
 
 
 def up_to_date(state: _Compressed) -> Joint:
@@ -167,7 +172,7 @@ def up_to_date(state: _Compressed) -> Joint:
     now = (phi @ before).at[:, at].set(state.area.cov[: len(at), : len(at)])
     return joint._replace(
         pose=state.area.pose,
-        landmarks=_moved_map(state),
+        landmarks=_move_map(state),
         cov=cov.at[at].set(now).at[:, at].set(now.T),
     )
 
@@ -191,7 +196,7 @@ def _with_area_of(scan: Scan, state: _Compressed, sensor: Sensor, most: int | No
     def reopen(state: _Compressed) -> _Compressed:
         joint = up_to_date(state)
         # The result of a run must not depend on other runs of the batch.
-        opened = _opened_at(joint, _chosen_area(joint, area, sensor, seen, new))
+        opened = _open_at(joint, _choose_area(joint, area, sensor, seen, new))
         chosen: _Compressed = jax.tree.map(lambda a, b: jnp.where(leave, a, b), opened, state)
         return chosen
 
@@ -199,17 +204,7 @@ def _with_area_of(scan: Scan, state: _Compressed, sensor: Sensor, most: int | No
     return after
 
 
-def _with_updated_area(state: _Compressed, area: Joint) -> _Compressed:
-    """The state with its area updated, and tags and alive slots of the map as in the area."""
-    joint, count = state.full, state.slot.shape[0]
-    joint = joint._replace(
-        alive=joint.alive.at[state.slot].set(area.alive[:count]),
-        tag=joint.tag.at[state.slot].set(area.tag[:count]),
-    )
-    return state._replace(full=joint, area=area)
-
-
-def _moved_map(state: _Compressed) -> jax.Array:
+def _move_map(state: _Compressed) -> jax.Array:
     """The current landmarks (N, L)."""
     landmarks, area = state.full.landmarks, state.slot.shape[0]
     theta = _postponed_update(state)[2]
@@ -258,7 +253,7 @@ def _postponed_update(state: _Compressed) -> tuple[jax.Array, jax.Array, jax.Arr
     )
 
 
-def _opened_at(joint: Joint, slot: jax.Array) -> _Compressed:
+def _open_at(joint: Joint, slot: jax.Array) -> _Compressed:
     """The state with nothing postponed and the landmarks of slots (K,) as its area."""
     count, size = slot.shape[0], joint.landmarks.shape[1]
     at, spare = _rows(slot, size), _postponed_slots(count, size)
@@ -280,7 +275,7 @@ def _opened_at(joint: Joint, slot: jax.Array) -> _Compressed:
     return _Compressed(joint, area, slot)
 
 
-def _chosen_area(
+def _choose_area(
     joint: Joint, area: int, sensor: Sensor, seen: jax.Array, new: jax.Array
 ) -> jax.Array:
     """The slots (K,) of a new area, ascending: those seen, free ones, the nearest to the pose."""

@@ -21,12 +21,12 @@ from jaxslam.core._numbers import gate_quantile
 from jaxslam.core.protocols import Chart, LinearizationPoint, Linearizer, Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.filters._ekf.linear_system import basis_of_each, chart_jacobians
-from jaxslam.filters._ekf.map_coordinates import at_slot, retracted
-from jaxslam.filters._ekf.whitening import factor_of, project, projected_cov, whiten, whitened_by
+from jaxslam.filters._ekf.map_coordinates import at_slot, retract_map
+from jaxslam.filters._ekf.whitening import factor_of, project, projected_cov, whiten, whiten_by
 from jaxslam.linearize._first_order import predicted_noise
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import Number
-from jaxslam.math._gaussians import log_density
+from jaxslam.math._gaussians import is_inside, log_density
 from jaxslam.math._xla import CACHED, materialize, no_inline, where_any
 
 CorrectionOrder = Literal["sequential", "joint"]
@@ -73,6 +73,32 @@ class Correction(NamedTuple):
     """the coordinates by the errors in the chart; None is the identity"""
 
 
+def report_fused(
+    prior: Correction,
+    fuse: Bool[Array, "m"],
+    whitened: Float[Array, "K"],
+    log_det: Float[Array, "m"],
+    regular: Bool[Array, "m"],
+) -> Correction:
+    """The `Correction` with NIS and log-likelihood of the fused measurements by their joint S.
+
+    Args:
+        prior: the correction of each measurement alone, whose nis is d² = νᵀ S_ii⁻¹ ν.
+        fuse: mask of the measurements that are matched, inside the gate and positive alone.
+        whitened, log_det, regular: L⁻¹ ν of S = L Lᵀ of the fused measurements; log |S_ii| of each
+            given those before it; and whether its pivots of L are positive.
+    """
+    m, size_z = prior.innovation.shape
+    nis = (whitened.reshape(m, size_z) ** 2).sum(axis=1)
+    positive = prior.positive & regular
+    density = log_density(nis, log_det, size_z)
+    return prior._replace(
+        nis=jnp.where(fuse, nis, prior.nis),
+        log_likelihood=jnp.where(fuse & positive, density, 0.0),
+        positive=positive,
+    )
+
+
 def correct(
     filter: KalmanFilter,
     sensor: Sensor,
@@ -104,27 +130,10 @@ def _correct(
     gamma: Number | None,
 ) -> tuple[Joint, Correction]:
     """The joint corrected at once, with the largest d² within the gate at hand."""
-    rows = _rows_of(joint, slot, filter.covariance == "square_root")
-    innovation = _innovate(filter, sensor, joint, slot, rows, z, matched, (joint, slot), gamma)
-    cov = _corrected_cov(joint.cov, innovation, filter.covariance)
-    pose, landmarks = retracted(filter.chart, joint, innovation.xi)
+    innovation = _innovate(filter, sensor, joint, slot, z, matched, (joint, slot), gamma)
+    cov = _correct_cov(joint.cov, innovation, filter.covariance)
+    pose, landmarks = retract_map(filter.chart, joint, innovation.xi)
     return joint._replace(pose=pose, landmarks=landmarks, cov=cov), innovation.correction
-
-
-class _Rows(NamedTuple):
-    """The rows of P, or of its square root, that m measurements involve."""
-
-    robot: Float[Array, "3 D"]
-    landmark: Float[Array, "m L D"]
-    local: Float[Array, "m 3+L 3+L"]
-    """P of the robot and the landmark"""
-
-
-def _rows_of(joint: Joint, slot: Int[Array, "m"], square_root: bool = False) -> _Rows:
-    """The rows of measurements of the landmarks in slot (m,)."""
-    landmark = jax.vmap(slots.gather, in_axes=(None, 0))(joint, slot)[1]
-    local = jax.vmap(partial(slots.local_cov, joint, square_root=square_root))(slot)
-    return _Rows(joint.cov[:3], landmark, local)
 
 
 class _Innovation(NamedTuple):
@@ -156,7 +165,6 @@ def _innovate(
     sensor: Sensor,
     joint: Joint,
     slot: Int[Array, "m"],
-    rows: _Rows,
     z: Float[Array, "m Z"],
     matched: Bool[Array, "m"],
     memory: tuple[Joint, Int[Array, "m"]],
@@ -174,20 +182,24 @@ def _innovate(
     memory: the state with the linearizer's memory, and the landmarks' slots (m,) there. P may have
     further columns, of other errors.
     """
+    square_root = filter.covariance == "square_root"
+    landmark_rows = jax.vmap(slots.gather, in_axes=(None, 0))(joint, slot)[1]
+    # P (m, 3+L, 3+L) of the robot and the landmark of each measurement.
+    local_cov = jax.vmap(partial(slots.local_cov, joint, square_root=square_root))(slot)
     m, size_z = z.shape
     same = jnp.eye(m, dtype=z.dtype)[:, None, :, None]  # (m, 1, m, 1): same * R is block diagonal
     xi: jax.Array | None = None
     for i in range(filter.iterations):
         # (26), with H of (25) by the pose and one landmark.
         h_nu, z_hat, rest, jacobian = _linearize(
-            filter, sensor, joint, slot, rows.local, z, memory, xi
+            filter, sensor, joint, slot, local_cov, z, memory, xi
         )
         by_pose, by_landmark, nu = h_nu[:, :, :3], h_nu[:, :, 3:-1], h_nu[:, :, -1]
         if i == 0:
             noise = jax.vmap(partial(predicted_noise, sensor))(z_hat, z, matched) + rest
         # (m·Z) D entries, each of which P - Vᵀ V needs D times.
-        hp = hx = no_inline(project, h_nu, rows.robot, rows.landmark)
-        if filter.covariance == "square_root":
+        hp = hx = no_inline(project, h_nu, joint.cov[:3], landmark_rows)
+        if square_root:
             # Of a root X only H X is at hand: H P = (H X) Xᵀ, O(D²) a row.
             hp = materialize((hx.reshape(m * size_z, -1) @ joint.cov.T).reshape(hx.shape))
         # (27): H P Hᵀ + R for all pairs of measurements.
@@ -199,32 +211,26 @@ def _innovate(
         inverse, definite = no_inline(jax.vmap(linalg.whitener), s_ii)
         if i == 0:
             # Gated against the prior, so that a later pass cannot change which are fused.
-            prior_nu, prior_s, prior_definite = nu, s_ii, definite
-            distance = (whitened_by(inverse, nu[:, :, None]) ** 2).sum(axis=(1, 2))
-            # A finite measurement whose d² overflows is outside any gate.
-            inside = jnp.isfinite(distance) if gamma is None else distance <= gamma
-            fuse = matched & inside & definite
+            distance = (whiten_by(inverse, nu[:, :, None]) ** 2).sum(axis=(1, 2))
+            prior = Correction(
+                z_hat=z_hat,
+                innovation=nu,
+                innovation_cov=s_ii,
+                nis=distance,
+                log_likelihood=jnp.zeros_like(distance),
+                inside=is_inside(distance, gamma),
+                positive=definite,
+                jacobian=jnp.concatenate(jacobian, axis=2),
+                basis=basis_of_each(filter.chart, joint.pose, joint.landmarks[slot]),
+            )
+            fuse = matched & prior.inside & definite
         hp = hp.reshape(m * size_z, -1)
         factored = factor_of(s, inverse, definite, fuse)
         # (28), (29): K ν = Vᵀ L⁻¹ ν; K itself is never formed.
         v, whitened = whiten(factored, fuse, hp, nu)
         xi = linalg.gram(v, whitened[:, None])[:, 0]
         if i == 0:
-            # NIS of fused measurements from their joint S, of the others from S_ii.
-            nis = (whitened.reshape(m, size_z) ** 2).sum(axis=1)
-            positive = prior_definite & factored.regular
-            density = log_density(nis, factored.log_det, size_z)
-            correction = Correction(
-                z_hat=z_hat,
-                innovation=prior_nu,
-                innovation_cov=prior_s,
-                nis=jnp.where(fuse, nis, distance),
-                log_likelihood=jnp.where(fuse & positive, density, 0.0),
-                inside=inside,
-                positive=positive,
-                jacobian=jnp.concatenate(jacobian, axis=2),
-                basis=basis_of_each(filter.chart, joint.pose, joint.landmarks[slot]),
-            )
+            correction = report_fused(prior, fuse, whitened, factored.log_det, factored.regular)
     assert xi is not None
     return _Innovation(
         xi=xi,
@@ -255,7 +261,7 @@ def _linearize(
     Float[Array, "m Z Z"],
     tuple[Float[Array, "m Z 3"], Float[Array, "m Z L"]],
 ]:
-    """The linearization z ≈ ẑ + H (ξ - ξ_i) at the prior retracted by ξ_i; None: at the prior.
+    """The linearization z ≈ ẑ + H (ξ - ξ_i) at the prior retract_map by ξ_i; None: at the prior.
 
     Returns H by the errors with ν = z - ẑ + H ξ_i beside it, so that the solution is ξ, relative to
     the prior; ẑ; the linearizer's addition to R; and H by the coordinates of pose and landmark.
@@ -294,7 +300,7 @@ def _linearize(
     return h_nu, z_hat, rest, jacobian
 
 
-def _corrected_cov(
+def _correct_cov(
     cov: Float[Array, "D D"], innovation: _Innovation, form: Covariance
 ) -> Float[Array, "D D"]:
     """The covariance P, or its root X, after the correction.
@@ -404,7 +410,7 @@ def in_groups(
     m = len(measurements[0])
     groups = -(-m // group_size)  # ⌈m/g⌉
 
-    def padded(values: jax.Array) -> jax.Array:
+    def pad(values: jax.Array) -> jax.Array:
         """The values in groups, (⌈m/g⌉, g, …), with zeros (not matched) at the end."""
         full = jnp.pad(values, [(0, groups * group_size - m), *[(0, 0)] * (values.ndim - 1)])
         return full.reshape(groups, group_size, *values.shape[1:])
@@ -413,12 +419,12 @@ def in_groups(
         unused, matched = nothing(group), group[2]
         return where_any(matched.any(), lambda s: work(s, group), lambda s: (s, unused), state)
 
-    state, corrections = jax.lax.scan(step, state, jax.tree.map(padded, measurements))
+    state, corrections = jax.lax.scan(step, state, jax.tree.map(pad, measurements))
 
-    def joined(values: jax.Array) -> jax.Array:
+    def join(values: jax.Array) -> jax.Array:
         return values.reshape(groups * group_size, *values.shape[2:])[:m]
 
-    return state, jax.tree.map(joined, corrections)
+    return state, jax.tree.map(join, corrections)
 
 
 def _correct_group(
@@ -462,11 +468,9 @@ def _correct_group(
         i, (z, slot, matched) = jax.tree.map(lambda leaf: leaf[None], measurement)
         width = local.cov.shape[0]
         memory = joint._replace(pose=local.pose), slot
-        innovation = _innovate(
-            filter, sensor, local, i, _rows_of(local, i), z, matched, memory, gamma
-        )
+        innovation = _innovate(filter, sensor, local, i, z, matched, memory, gamma)
         v, reach = innovation.v[:, :width], innovation.v[:, width:]
-        pose, landmarks = retracted(filter.chart, local, innovation.xi[:width])
+        pose, landmarks = retract_map(filter.chart, local, innovation.xi[:width])
         # V has the columns of [P M], so M is corrected by the same product as P.
         cov = local.cov - linalg.gram(v, innovation.v)
         correction = jax.tree.map(lambda leaf: leaf[0], innovation.correction)
@@ -482,22 +486,22 @@ def _correct_group(
     )
     # (g·Z, D) entries, each of which P - Vᵀ V needs D times.
     v = no_inline(linalg.matmul, reach.reshape(-1, len(at)), rows)
-    landmarks = _moved_map(joint, v[:, :size], whitened, filter.chart)
+    landmarks = _move_map(joint, v[:, :size], whitened, filter.chart)
     cov = joint.cov - linalg.gram(v[:, :size], v)
     return joint._replace(pose=local.pose, landmarks=landmarks, cov=cov), corrections
 
 
-def _moved_map(
+def _move_map(
     joint: Joint, v: Float[Array, "K D"], whitened: Float[Array, "g Z"], chart: Chart
 ) -> Float[Array, "N L"]:
     """The landmarks after corrections V (g·Z, D), L⁻¹ ν, one after the other."""
     if chart.basis is None:  # retractions are additive
         xi = linalg.gram(v, whitened.reshape(-1, 1))[:, 0]
-        return retracted(chart, joint, xi)[1]
+        return retract_map(chart, joint, xi)[1]
 
     def move(joint: Joint, correction: tuple[jax.Array, jax.Array]) -> tuple[Joint, None]:
         v, whitened = correction
-        pose, landmarks = retracted(chart, joint, linalg.gram(v, whitened[:, None])[:, 0])
+        pose, landmarks = retract_map(chart, joint, linalg.gram(v, whitened[:, None])[:, 0])
         return joint._replace(pose=pose, landmarks=landmarks), None
 
     # (g, Z, D): a retraction that is not additive is done one measurement at a time.

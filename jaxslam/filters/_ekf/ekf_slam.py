@@ -38,12 +38,7 @@ from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.core.validation import at_least, instance_of, one_of, or_none, probability
 from jaxslam.filters._ekf import map_coordinates
 from jaxslam.filters._ekf.checks import check_fit
-from jaxslam.filters._ekf.correction import (
-    CorrectionOrder,
-    Covariance,
-    correct,
-    correct_in_turn,
-)
+from jaxslam.filters._ekf.correction import CorrectionOrder, Covariance, correct, correct_in_turn
 from jaxslam.filters._ekf.linear_system import (
     LinearizedSteps,
     LinearLandmarks,
@@ -57,7 +52,7 @@ from jaxslam.filters._ekf.linear_system import (
 from jaxslam.filters._ekf.predicted_measurements import prediction_of
 from jaxslam.filters._reporting import (
     NewLandmarks,
-    joined_info,
+    join_infos,
     nothing_of,
     report_scan,
     with_extra,
@@ -140,7 +135,9 @@ class EkfSlam(Filter):
     def linearized(self) -> LinearizedSteps | None:
         """The steps with their linear system; None of a class that overrides one."""
         plain = type(self).predict is EkfSlam.predict and type(self).update is EkfSlam.update
-        return LinearizedSteps(partial(_predict, self), partial(_update, self)) if plain else None
+        if not plain:
+            return None
+        return LinearizedSteps(lambda s, u, _: propagate(self, s, u), partial(_update, self))
 
     def init(self, pose: Float[Array, "3"], pose_cov: Float[Array, "3 3"]) -> Joint:
         chart, size_l = self.chart, len(self.sensor.landmark)
@@ -170,7 +167,7 @@ class EkfSlam(Filter):
         )
 
 
-def propagate(filter: EkfSlam, joint: Joint, u: Float[Array, "U"]) -> tuple[Joint, Transition]:
+def propagate(filter: EkfSlam, joint: Joint, u: Float[Array, "U"]) -> tuple[Joint, LinearSystem]:
     """The state after the robot's motion, and the transition of its errors: Solà (14)-(17).
 
     R ← f(R, u, 0), P_RR ← F P_RR Fᵀ + N, N = W Q Wᵀ, P_RM ← F P_RM; O(N). In another chart the
@@ -202,15 +199,7 @@ def propagate(filter: EkfSlam, joint: Joint, u: Float[Array, "U"]) -> tuple[Join
         cov = jnp.asarray(joint.cov).at[:3].set(rows).at[:, :3].set(rows.T)
     else:
         cov = moved_cov(joint.cov, transition, noise)
-    return joint._replace(pose=pose, cov=cov, lin=lin), transition
-
-
-def _predict(
-    filter: EkfSlam, joint: Joint, u: Float[Array, "U"], key: Array
-) -> tuple[Joint, LinearSystem]:
-    """`EkfSlam.predict` with its linear system."""
-    joint, transition = propagate(filter, joint, u)
-    return joint, (transition,)
+    return joint._replace(pose=pose, cov=cov, lin=lin), (transition,)
 
 
 def _update(
@@ -228,9 +217,9 @@ def _update(
         )
         infos.append(info)
         evicted, system = evicted | removed, system + sensor_system
-    info = joined_info(infos, scan.z.shape[1])
+    info = join_infos(infos, scan.z.shape[1])
     if filter.sensor.reduced is not None:
-        joint, is_reduced, reduction = map_coordinates.reduced_where_ready(
+        joint, is_reduced, reduction = map_coordinates.reduce_where_ready(
             joint, filter.sensor, filter.square_root
         )
         info = with_extra(info, "points", map_coordinates.ToPoints(is_reduced))
@@ -273,7 +262,7 @@ def update_by_sensor(
     joint, new, evicted, by_pose = initialize(
         filter, sensor, joint, scan, association.is_new, measured, births, reserved
     )
-    info = report_scan(scan, association, matched, correction, new)
+    info = report_scan(scan.valid, association, matched, correction, new)
     # For the monitor; without it, `jit` drops these lines.
     noise = jax.vmap(partial(predicted_noise, sensor))(correction.z_hat, scan.z, fused)
     system = (

@@ -60,27 +60,21 @@ def at_slot(sensor: Sensor, joint: Joint, slot: Int[Array, ""]) -> Sensor:
     return sensor if joint.reduced is None else _measured_points(sensor, joint.reduced[slot])
 
 
-def reduced_where_ready(
+def reduce_where_ready(
     joint: Joint, sensor: Sensor, square_root: bool
 ) -> tuple[Joint, Bool[Array, "N"], Transition]:
     """The map with all landmarks reduced that may become points, which, and the transition."""
-    which = ready(joint, sensor, square_root)
-
-    def reduced(joint: Joint) -> Joint:
-        return reduce(joint, which, sensor, square_root)
-
-    after = where_any(which.any(), reduced, lambda joint: joint, joint)
-    return after, which, reduction(joint, which, sensor)
-
-
-def ready(joint: Joint, sensor: Sensor, square_root: bool) -> Bool[Array, "N"]:
-    """Which landmarks may become points now."""
     assert sensor.reduced is not None
     slot = jnp.arange(joint.landmarks.shape[0])
     covs = jax.vmap(partial(slots.local_cov, joint, square_root=square_root))(slot)[:, 3:, 3:]
     linear = jax.vmap(sensor.reduced.ready, (None, 0, 0))(joint.pose, joint.landmarks, covs)
-    good: jax.Array = linear & joint.alive & ~joint.reduced
-    return good
+    which: jax.Array = linear & joint.alive & ~joint.reduced
+
+    def reduce_ready(joint: Joint) -> Joint:
+        return reduce(joint, which, sensor, square_root)
+
+    after = where_any(which.any(), reduce_ready, lambda joint: joint, joint)
+    return after, which, reduction(joint, which, sensor)
 
 
 def reduce(joint: Joint, which: Bool[Array, "N"], sensor: Sensor, square_root: bool) -> Joint:
@@ -206,7 +200,7 @@ def with_cov_of_coordinates(
     return joint._replace(cov=linalg.root_psd(cov) if square_root else cov)
 
 
-def retracted(
+def retract_map(
     chart: Chart, joint: Joint, xi: Float[Array, "D"]
 ) -> tuple[Float[Array, "3"], Float[Array, "N L"]]:
     """Pose (3,) and landmarks (N, L) moved by errors ξ (D,)."""

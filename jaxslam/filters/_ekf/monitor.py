@@ -96,7 +96,13 @@ def after(monitor: Monitor, system: LinearSystem) -> Monitor:
         if isinstance(part, LinearMeasurements):
             monitor = _with_information(monitor, part)
         elif isinstance(part, LinearLandmarks):
-            monitor = monitor._replace(directions=_with_landmarks(monitor.directions, part))
+            # Rows of new landmarks; beyond the last, which `mode="drop"` ignores, where no landmark
+            # was started.
+            directions = monitor.directions
+            rows = _rows(part.slot, part.by_pose.shape[1])
+            rows = jnp.where(part.granted[:, None], rows, len(directions))
+            new = part.by_pose @ directions[:3]
+            monitor = monitor._replace(directions=directions.at[rows].set(new, mode="drop"))
         else:
             monitor = monitor._replace(directions=part.times(monitor.directions))
     return monitor
@@ -127,13 +133,6 @@ def _with_information(monitor: Monitor, seen: LinearMeasurements) -> Monitor:
         + (signed[:, :, :, None] * signed[:, :, None, :]).sum(axis=(0, 1)),
         scale=monitor.scale + (size**2).sum(axis=(0, 1)),
     )
-
-
-def _with_landmarks(directions: Float[Array, "D k"], new: LinearLandmarks) -> Float[Array, "D k"]:
-    """The directions with rows of new landmarks."""
-    # A row beyond the last, which `mode="drop"` ignores, where no landmark was started.
-    rows = jnp.where(new.granted[:, None], _rows(new.slot, new.by_pose.shape[1]), len(directions))
-    return directions.at[rows].set(new.by_pose @ directions[:3], mode="drop")
 
 
 def _rows(slot: Array, size: int) -> Array:

@@ -4,7 +4,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxslam.association._rules import predicted
+from jaxslam.association._rules import prediction_from
 from jaxslam.core.protocols import LinearizationPoint, Prediction, Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.filters._ekf.correction import KalmanFilter
@@ -24,8 +24,17 @@ def prediction_of(filter: KalmanFilter, sensor: Sensor, joint: Joint) -> Predict
         Float[Array, "N Z"], Float[Array, "N Z 3"], Float[Array, "N Z L"], Float[Array, "N Z Z"]
     ]:
         """The predicted ẑ, H by errors of pose and landmark, and H P Hᵀ, for each landmark."""
+        # The blocks of P: of the robot, of it with each landmark, and of each landmark.
         slots = jnp.arange(capacity)
-        robot, cross, landmarks = materialize(_blocks(joint, square_root))
+        if square_root:
+            robot, rows = joint.cov[:3], joint.cov[3:].reshape(capacity, size, -1)
+            cross = jnp.einsum("ik,nlk->nil", robot, rows)
+            robot, landmarks = robot @ robot.T, jnp.einsum("nlk,nmk->nlm", rows, rows)
+        else:
+            landmarks = joint.cov[3:, 3:].reshape(capacity, size, capacity, size)[slots, :, slots]
+            cross = joint.cov[:3, 3:].reshape(3, capacity, size).transpose(1, 0, 2)
+            robot = joint.cov[:3, :3]
+        robot, cross, landmarks = materialize((robot, cross, landmarks))
         top = jnp.concatenate([jnp.broadcast_to(robot, (capacity, 3, 3)), cross], axis=2)
         bottom = jnp.concatenate([cross.transpose(0, 2, 1), landmarks], axis=2)
         local = jnp.concatenate([top, bottom], axis=1)
@@ -60,19 +69,4 @@ def prediction_of(filter: KalmanFilter, sensor: Sensor, joint: Joint) -> Predict
             hp = hp + by_landmark[:, :, k, None] * rows[:, None, k]
         return projected_cov(hp, by_pose, by_landmark, jnp.arange(capacity), capacity)
 
-    return predicted(sensor, joint.tag, joint.alive, measurements, cross)
-
-
-def _blocks(
-    joint: Joint, square_root: bool
-) -> tuple[Float[Array, "3 3"], Float[Array, "N 3 L"], Float[Array, "N L L"]]:
-    """The blocks of P: of the robot, of it with each landmark, and of each landmark."""
-    capacity, size = joint.landmarks.shape
-    if square_root:
-        robot, rows = joint.cov[:3], joint.cov[3:].reshape(capacity, size, -1)
-        cross = jnp.einsum("ik,nlk->nil", robot, rows)
-        return robot @ robot.T, cross, jnp.einsum("nlk,nmk->nlm", rows, rows)
-    slots = jnp.arange(capacity)
-    landmark = joint.cov[3:, 3:].reshape(capacity, size, capacity, size)[slots, :, slots]
-    cross = joint.cov[:3, 3:].reshape(3, capacity, size).transpose(1, 0, 2)
-    return joint.cov[:3, :3], cross, landmark
+    return prediction_from(sensor, joint.tag, joint.alive, measurements, cross)

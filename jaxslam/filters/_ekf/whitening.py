@@ -121,7 +121,7 @@ def _multiply(
     inverse: Float[Array, "1 Z Z"], hp: Float[Array, "Z D"], nu: Float[Array, "1 Z"]
 ) -> tuple[Float[Array, "Z D"], Float[Array, "Z"]]:
     """The whitened L⁻¹ H P and L⁻¹ ν of one measurement, by L⁻¹."""
-    return whitened_by(inverse, hp[None])[0], whitened_by(inverse, nu[:, :, None]).reshape(-1)
+    return whiten_by(inverse, hp[None])[0], whiten_by(inverse, nu[:, :, None]).reshape(-1)
 
 
 def _substitute(
@@ -134,8 +134,6 @@ def _substitute(
 
 
 @linalg.kept_whole
-def whitened_by(
-    inverse: Float[Array, "m Z Z"], rhs: Float[Array, "m Z k"]
-) -> Float[Array, "m Z k"]:
+def whiten_by(inverse: Float[Array, "m Z Z"], rhs: Float[Array, "m Z k"]) -> Float[Array, "m Z k"]:
     """The product L⁻¹ B of each measurement, as a sum of Z outer products."""
     return linalg.total(inverse[:, :, k, None] * rhs[:, k, None] for k in range(inverse.shape[1]))

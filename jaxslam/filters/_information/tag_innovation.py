@@ -20,7 +20,7 @@ from jaxslam.core.validation import InvalidField, at_least, or_none, positive, p
 from jaxslam.linearize._first_order import observe_jacobians, predicted_noise
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import Number
-from jaxslam.math._gaussians import gaussian_terms, log_density, log_det_of_pivots
+from jaxslam.math._gaussians import gaussian_terms, is_inside, log_density, log_det_of_pivots
 from jaxslam.sensors._suite import Suite
 
 
@@ -161,7 +161,7 @@ def innovations(
     alone = jax.vmap(gaussian_terms)(nu, s)
     noise_factor, noise_positive = jax.vmap(linalg.cholesky)(noise)
     positive = alone.positive & noise_positive & omega_positive
-    inside = jnp.isfinite(alone.distance) if gamma is None else alone.distance <= gamma
+    inside = is_inside(alone.distance, gamma)
     fused = matched & inside & positive
 
     fused_nu = jnp.where(fused[:, None], nu, 0.0)

@@ -7,10 +7,10 @@ from typing import Literal, get_args
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Float, Int
 from numpy.typing import ArrayLike
 
-from jaxslam.association._rules import Known, predicted
+from jaxslam.association._rules import Known, prediction_from
 from jaxslam.charts import Euclidean
 from jaxslam.core._numbers import gate_quantile
 from jaxslam.core._record import field, function_of, record, static
@@ -29,15 +29,22 @@ from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan
 from jaxslam.core.validation import at_least, instance_of, one_of, or_none, probability
 from jaxslam.filters._ekf.checks import check_iterations
-from jaxslam.filters._ekf.correction import Correction, CorrectionOrder, in_groups, no_correction
+from jaxslam.filters._ekf.correction import (
+    Correction,
+    CorrectionOrder,
+    Measurements,
+    in_groups,
+    no_correction,
+    report_fused,
+)
 from jaxslam.filters._ekf.ekf_slam import associate_scan
 from jaxslam.filters._gaussian_correction import correct_gaussian
 from jaxslam.filters._known_map import hold_map, map_tags
-from jaxslam.filters._reporting import joined_info, nothing_of, report_scan
+from jaxslam.filters._reporting import join_infos, nothing_of, report_scan
 from jaxslam.linearize._first_order import AtEstimate, predicted_noise
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import Number
-from jaxslam.math._gaussians import gaussian_terms, log_density, log_det_of_pivots
+from jaxslam.math._gaussians import gaussian_terms, is_inside, log_det_of_pivots
 
 
 @record
@@ -132,10 +139,18 @@ class Localization(Filter):
             )
             # A landmark that is not in the map starts none.
             association = association._replace(is_new=jnp.zeros_like(association.is_new))
-            slot = jnp.maximum(association.slot, 0)
-            state, correction = _correct(self, sensor, state, part.z, slot, matched)
-            infos.append(report_scan(part, association, matched, correction))
-        return state, joined_info(infos, scan.z.shape[1])
+            measurements = part.z, jnp.maximum(association.slot, 0), matched
+            gamma = gate_quantile(self.gate, len(sensor.measurements))
+            correct = partial(_correct, self, sensor, gamma)
+            if self.correction == "joint" and len(part.tag) > 0:
+                state, correction = correct(state, measurements)
+            else:
+                # H is by the pose alone, as of landmarks without parameters.
+                robot = state._replace(landmarks=state.landmarks[:, :0])
+                unmatched = partial(no_correction, robot, chart=Euclidean())
+                state, correction = in_groups(correct, state, measurements, 1, unmatched)
+            infos.append(report_scan(part.valid, association, matched, correction))
+        return state, join_infos(infos, scan.z.shape[1])
 
     def estimate(self, state: Joint) -> Estimate:
         cov = state.cov
@@ -170,7 +185,7 @@ def _predict_map(filter: Localization, sensor: Sensor, state: Joint) -> Predicti
         h = linearize()[1]
         return jnp.einsum("izx,xy,jwy->izjw", h, state.cov, h)
 
-    return predicted(sensor, state.tag, state.alive, measurements, cross)
+    return prediction_from(sensor, state.tag, state.alive, measurements, cross)
 
 
 def _linearize(
@@ -196,40 +211,16 @@ def _linearize(
 def _correct(
     filter: Localization,
     sensor: Sensor,
-    state: Joint,
-    z: Float[Array, "M Z"],
-    slot: Int[Array, "M"],
-    matched: Bool[Array, "M"],
-) -> tuple[Joint, Correction]:
-    """The state corrected by the whole scan at once, or by one measurement after the other."""
-    gamma = gate_quantile(filter.gate, len(sensor.measurements))
-
-    def correct(
-        state: Joint,
-        measurements: tuple[Float[Array, "m Z"], Int[Array, "m"], Bool[Array, "m"]],
-    ) -> tuple[Joint, Correction]:
-        return _correct_at_once(filter, sensor, state, *measurements, gamma)
-
-    if filter.correction == "joint" and len(z) > 0:
-        return correct(state, (z, slot, matched))
-    nothing = partial(no_correction, state._replace(landmarks=state.landmarks[:, :0]))
-    return in_groups(correct, state, (z, slot, matched), 1, partial(nothing, chart=Euclidean()))
-
-
-def _correct_at_once(
-    filter: Localization,
-    sensor: Sensor,
-    state: Joint,
-    z: Float[Array, "m Z"],
-    slot: Int[Array, "m"],
-    matched: Bool[Array, "m"],
     gamma: Number | None,
+    state: Joint,
+    measurements: Measurements,
 ) -> tuple[Joint, Correction]:
     """The state corrected by m measurements at once, Solà (26)-(30) with H by the pose alone.
 
     The gate, R(ẑ) and the reported numbers are those of the first iteration; see
     `correction.correct`.
     """
+    z, slot, matched = measurements
     chart, (m, size_z) = filter.chart, z.shape
     pose, xi = state.pose, jnp.zeros_like(state.pose)
     for i in range(filter.iterations):
@@ -241,10 +232,18 @@ def _correct_at_once(
             noise = jax.vmap(partial(predicted_noise, sensor))(z_hat, z, matched) + rest
             s_ii = linalg.symmetrize(h @ state.cov @ h.transpose(0, 2, 1) + noise)
             alone = jax.vmap(gaussian_terms)(nu, s_ii)
-            # A finite measurement whose d² overflows is outside any gate.
-            inside = jnp.isfinite(alone.distance) if gamma is None else alone.distance <= gamma
-            fuse = matched & inside & alone.positive
-            prior_nu = nu
+            prior = Correction(
+                z_hat=z_hat,
+                innovation=nu,
+                innovation_cov=s_ii,
+                nis=alone.distance,
+                log_likelihood=jnp.zeros_like(alone.distance),
+                inside=is_inside(alone.distance, gamma),
+                positive=alone.positive,
+                jacobian=jacobian,
+                basis=None,
+            )
+            fuse = matched & prior.inside & prior.positive
             # R of the scan, block diagonal: (m, Z, m, Z) as a (K, K) matrix, K = m·Z. A measurement
             # that is not fused has ν = 0, H = 0 and R = 1, and so no effect on the others.
             blocks = jnp.where(fuse[:, None, None], noise, jnp.eye(size_z, dtype=noise.dtype))
@@ -260,22 +259,9 @@ def _correct_at_once(
             joseph=filter.covariance == "joseph",
         )
         if i == 0:
-            # NIS of fused measurements from their joint S, of the others from S_ii.
-            nis = (correction.terms.whitened.reshape(m, size_z) ** 2).sum(axis=1)
             pivots = jnp.diagonal(correction.terms.factor).reshape(m, size_z)
-            positive = alone.positive & (pivots > 0).all(axis=1)
-            density = log_density(nis, log_det_of_pivots(pivots), size_z)
-            report = Correction(
-                z_hat=z_hat,
-                innovation=prior_nu,
-                innovation_cov=s_ii,
-                nis=jnp.where(fuse, nis, alone.distance),
-                log_likelihood=jnp.where(fuse & positive, density, 0.0),
-                inside=inside,
-                positive=positive,
-                jacobian=jacobian,
-                basis=None,
-            )
+            log_det, regular = log_det_of_pivots(pivots), (pivots > 0).all(axis=1)
+            report = report_fused(prior, fuse, correction.terms.whitened, log_det, regular)
         xi = correction.xi
         pose = chart.retract_pose(state.pose, xi)
     return state._replace(pose=pose, cov=correction.cov), report

@@ -7,7 +7,7 @@ from typing import Literal
 import jax
 import jax.numpy as jnp
 from jax import Array
-from jaxtyping import Bool, Float, Int
+from jaxtyping import Float
 
 from jaxslam.association._rules import Known
 from jaxslam.charts import Euclidean
@@ -20,7 +20,6 @@ from jaxslam.filters._particles.landmark_ekf import update_map
 from jaxslam.filters._particles.particle_map import ParticleMapFilter
 from jaxslam.filters._particles.pose_particles import weighted_nis
 from jaxslam.filters._particles.proposal import (
-    PoseProposal,
     associate_particle,
     predict_pose,
     propose_pose,
@@ -133,11 +132,15 @@ class FastSlam(ParticleMapFilter):
         association = jax.vmap(partial(associate_particle, self, scan=scan))(state)
         proposal, innovations = jax.vmap(partial(propose_pose, self, scan=scan))(state, association)
         state = with_finite_poses(state, proposal.pose, proposal.pose_cov)
-        log_weight, log_likelihood, underflow = _weigh(state, proposal)
+        # w_p ← w_p p(scan | particle), Σ w = 1. Terms of measurements without a landmark compare
+        # particles; they are no densities, so the log-likelihood is without them.
+        log_matched = state.log_weight + proposal.log_matched
+        log_weight, _, some = normalized(log_matched + proposal.log_unmatched)
+        log_likelihood = normalized(log_matched)[1]
         nis = weighted_nis(innovations.nis, association.matched, log_weight)
         ess = 1.0 / jnp.exp(2 * log_weight).sum()
         resampled = ess < self.threshold * self.particles
-        particles = ParticleInfo(ess, resampled, underflow, invalid=state.invalid.sum())
+        particles = ParticleInfo(ess, resampled, ~some, invalid=state.invalid.sum())
         # The weight is marginal over the pose, so resampling comes before the draw: copies of one
         # particle get different poses. Association and innovations move with their particle.
         (state, association, innovations, weight_before), log_weight = resampled_where(
@@ -158,36 +161,13 @@ class FastSlam(ParticleMapFilter):
         )
         # After resampling all weights are equal.
         best = jnp.argmax(weight_before).astype(jnp.int32)
-        info = _report(infos, best, nis, log_likelihood, association.exhausted)
+        info: Info = jax.tree.map(lambda leaf: leaf[best], infos)
+        info = info._replace(
+            nis=jnp.where(has_distance(info.status), nis, 0.0),
+            log_likelihood=log_likelihood,
+            exhausted=association.exhausted.any(),
+        )
         return state._replace(best=best), with_extra(info, "particles", particles)
 
     def estimate(self, state: SlamParticles) -> Estimate:
         return slam_estimate(state, self.sensor)
-
-
-def _weigh(
-    state: SlamParticles, proposal: PoseProposal
-) -> tuple[Float[Array, "P"], Float[Array, ""], Bool[Array, ""]]:
-    """Log-weights log w_p p(scan | particle) with Σ w = 1, the log-likelihood of the measurements
-    with landmarks, and whether all weights underflowed."""
-    log_matched = state.log_weight + proposal.log_matched
-    # The terms of measurements without a landmark compare particles; they are no densities, so the
-    # log-likelihood is without them.
-    log_weight, _, some = normalized(log_matched + proposal.log_unmatched)
-    return log_weight, normalized(log_matched)[1], ~some
-
-
-def _report(
-    infos: Info,
-    best: Int[Array, ""],
-    nis: Float[Array, "M"],
-    log_likelihood: Float[Array, ""],
-    exhausted: Bool[Array, "P"],
-) -> Info:
-    """The `Info` of the best particle of `infos`, with the numbers of all particles."""
-    info: Info = jax.tree.map(lambda leaf: leaf[best], infos)
-    return info._replace(
-        nis=jnp.where(has_distance(info.status), nis, 0.0),
-        log_likelihood=log_likelihood,
-        exhausted=exhausted.any(),
-    )

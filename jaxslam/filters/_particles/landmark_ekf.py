@@ -3,15 +3,17 @@
 All functions act on one particle; `FastSlam` vmaps them, `Mapping` has only one.
 """
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float, Int
 
 from jaxslam.core import slots
-from jaxslam.core.protocols import Life, Sensor
+from jaxslam.core.protocols import Sensor
 from jaxslam.core.slots import Joint
-from jaxslam.core.types import Estimate, Info, Scan, Status
+from jaxslam.core.types import Info, Scan, Status
 from jaxslam.filters._gaussian_correction import correct_gaussian
 from jaxslam.filters._particles.particle_map import ParticleMapFilter
 from jaxslam.filters._particles.proposal import ParticleInnovations
@@ -35,9 +37,12 @@ def update_map(
     The log-likelihood of the `Info` is left at 0.
     """
     # Landmarks are corrected before eviction, so that `Life` makes room by the current map.
-    particle = _correct_landmarks(filter.sensor, particle, association.slot, innovations.used, scan)
-    particle, evicted = _evict_for_new(filter.life, particle, association, innovations.used)
-    particle, new = _initialize_landmarks(filter, particle, association.is_new, scan)
+    slot, used, life = association.slot, innovations.used, filter.life
+    particle = _correct_landmarks(filter.sensor, particle, slot, used, scan)
+    measured = slots.slot_mask(slot, used, len(particle.alive))
+    particle, new, evicted = _initialize_landmarks(
+        filter, particle, association.is_new, measured, scan
+    )
     status = status_of(
         scan.valid,
         matched=association.matched,
@@ -54,7 +59,7 @@ def update_map(
         status,
         association.matched,
         size=scan.z.shape[1],
-        slot=association.slot,
+        slot=slot,
         born=new.slot,
         nis=innovations.nis,
         innovation=innovations.innovation,
@@ -62,7 +67,12 @@ def update_map(
         log_likelihood=jnp.zeros((), scan.z.dtype),
         exhausted=association.exhausted,
     )
-    return _remove_landmarks(filter, particle, info, evicted)
+    if life is None:
+        return particle, info
+    estimate = partial(slam_estimate, as_only_particle(particle), filter.sensor)
+    memory, dead = life.after(_as_joint(particle), info, estimate)
+    particle = _without_landmarks(particle._replace(life=memory), dead)
+    return particle, with_removed(info, evicted | dead)
 
 
 def _correct_landmarks(
@@ -93,32 +103,36 @@ def _correct_landmarks(
     )
 
 
-def _evict_for_new(
-    life: Life | None,
-    particle: SlamParticles,
-    association: ParticleAssociation,
-    used: Bool[Array, "M"],
-) -> tuple[SlamParticles, Bool[Array, "N"]]:
-    """The particle without the landmarks evicted for new ones, and the mask of these landmarks."""
-    alive = particle.alive
-    if life is None or life.make_room is None:
-        return particle, jnp.zeros_like(alive)
-    needed = association.is_new.sum() - (~alive).sum()
-    measured = slots.slot_mask(association.slot, used, len(alive))
-    evicted = life.make_room(_as_joint(particle), needed, measured)
-    return _without_landmarks(particle, evicted), evicted
-
-
 def _initialize_landmarks(
-    filter: ParticleMapFilter, particle: SlamParticles, is_new: Bool[Array, "M"], scan: Scan
-) -> tuple[SlamParticles, NewLandmarks]:
+    filter: ParticleMapFilter,
+    particle: SlamParticles,
+    is_new: Bool[Array, "M"],
+    measured: Bool[Array, "N"],
+    scan: Scan,
+) -> tuple[SlamParticles, NewLandmarks, Bool[Array, "N"]]:
     """The particle with new landmarks in free slots, in the order of the scan, as many as fit.
 
     l = g(x, z, s̄), C = G_z R G_zᵀ + G_s S G_sᵀ: the pose of a particle has no error.
+
+    measured: landmarks that the scan corrected, which do not make room for new ones. Returns also
+    the slots (N,) that were emptied to make room.
     """
     dtype, m = particle.landmarks.dtype, is_new.shape[0]
     capacity, size = particle.landmarks.shape
     births = m if filter.births is None else filter.births
+
+    def requests() -> tuple[Bool[Array, "M"], Bool[Array, "M"], Bool[Array, "M"]]:
+        """The measurements that start a landmark if a slot is free, the repeated, the deferred."""
+        repeated = is_new & slots.seen_before(scan.tag, is_new)
+        wanted = is_new & ~repeated
+        deferred = wanted & (jnp.cumsum(wanted) > births)
+        return wanted & ~deferred, repeated, deferred
+
+    evicted = jnp.zeros_like(particle.alive)
+    if filter.life is not None and filter.life.make_room is not None:
+        needed = requests()[0].sum() - (~particle.alive).sum()
+        evicted = filter.life.make_room(_as_joint(particle), needed, measured)
+        particle = _without_landmarks(particle, evicted)
 
     def initialize(particle: SlamParticles) -> tuple[NewLandmarks, Array, Array]:
         def invert(z: Float[Array, "Z"]) -> tuple[Float[Array, "L"], Float[Array, "L L"]]:
@@ -127,10 +141,8 @@ def _initialize_landmarks(
             )
             return landmark, linalg.symmetrize(cov)
 
-        repeated = is_new & slots.seen_before(scan.tag, is_new)
-        wanted = is_new & ~repeated
-        deferred = wanted & (jnp.cumsum(wanted) > births)
-        slot, granted = slots.allocate(particle.alive, wanted & ~deferred)
+        wanted, repeated, deferred = requests()
+        slot, granted = slots.allocate(particle.alive, wanted)
         return NewLandmarks(slot, granted, deferred, repeated), *jax.vmap(invert)(scan.z)
 
     def leave(particle: SlamParticles) -> tuple[NewLandmarks, Array, Array]:
@@ -146,23 +158,7 @@ def _initialize_landmarks(
         alive=particle.alive.at[into].set(True, mode="drop"),
         tag=particle.tag.at[into].set(scan.tag.astype(jnp.int32), mode="drop"),
     )
-    return particle, new
-
-
-def _remove_landmarks(
-    filter: ParticleMapFilter, particle: SlamParticles, info: Info, evicted: Bool[Array, "N"]
-) -> tuple[SlamParticles, Info]:
-    """The particle without the landmarks that its `Life` removes; `Pruned.removed` marks them."""
-    life = filter.life
-    if life is None:
-        return particle, info
-
-    def estimate() -> Estimate:
-        return slam_estimate(as_only_particle(particle), filter.sensor)
-
-    memory, dead = life.after(_as_joint(particle), info, estimate)
-    particle = _without_landmarks(particle._replace(life=memory), dead)
-    return particle, with_removed(info, evicted | dead)
+    return particle, new, evicted
 
 
 def _as_joint(particle: SlamParticles) -> Joint:

@@ -11,7 +11,7 @@ from jax import Array
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
-from jaxslam.association._rules import Known, predicted
+from jaxslam.association._rules import Known, prediction_from
 from jaxslam.core._numbers import gate_quantile
 from jaxslam.core._record import field, function_of, record, static
 from jaxslam.core._validation import motion_model, sensor_model
@@ -277,7 +277,7 @@ def _predict_measurements(
         # H P Hᵀ = 0: neither pose nor map has an error, so no two measurements are correlated.
         return jnp.zeros((count, size, count, size), pose.dtype)
 
-    return predicted(sensor, tags, jnp.ones(count, bool), measurements, cross)
+    return prediction_from(sensor, tags, jnp.ones(count, bool), measurements, cross)
 
 
 def _report(

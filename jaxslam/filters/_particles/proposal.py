@@ -10,7 +10,7 @@ import jax.numpy as jnp
 from jax import Array
 from jaxtyping import Bool, Float
 
-from jaxslam.association._rules import predicted
+from jaxslam.association._rules import prediction_from
 from jaxslam.core._numbers import gate_quantile
 from jaxslam.core.protocols import Motion, Prediction, Sensor
 from jaxslam.core.types import Scan
@@ -177,4 +177,4 @@ def _predict_measurements(particle: SlamParticles, sensor: Sensor) -> Prediction
         j = jnp.arange(particle.alive.shape[0])
         return shared.at[j, :, j, :].add(landmark_cov)
 
-    return predicted(sensor, particle.tag, particle.alive, measurements, cross)
+    return prediction_from(sensor, particle.tag, particle.alive, measurements, cross)

@@ -9,6 +9,7 @@ from jaxtyping import Bool, Float, Int
 from jaxslam.core.protocols import Associate, Association, Prediction
 from jaxslam.core.types import Scan
 from jaxslam.math._arrays import Number
+from jaxslam.math._gaussians import is_inside
 from jaxslam.math.stats import chi2_quantile
 
 # The probability that a measurement of a landmark lies within d², without a gate.
@@ -67,7 +68,7 @@ def gate_distance(
     finite = jnp.isfinite(distance)
     if gamma is not None:
         gamma = jnp.asarray(gamma, distance.dtype)
-    inside = finite if gamma is None else finite & (distance <= gamma)
+    inside = is_inside(distance, gamma)
     counted = distance if gamma is None else jnp.where(inside, distance, gamma)
     # Half of it, so that a mean over particles with weights that sum to 1 + eps stays finite.
     largest = 0.5 * float(jnp.finfo(distance.dtype).max)

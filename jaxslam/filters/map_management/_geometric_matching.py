@@ -20,7 +20,7 @@ from jaxslam.filters.map_management._point_pairs import (
     extend_pair,
     longest_pairs,
     mahalanobis_of_pairs,
-    quarter_turned,
+    quarter_turn,
 )
 from jaxslam.math import _linalg as linalg
 from jaxslam.math import se2
@@ -75,7 +75,7 @@ def align_points(points: PointSets, slot: Int[Array, "M"]) -> _Alignment:
     centred = start - step
     shift = map_centroid + centred[:2] - se2.rotation(centred[2]) @ centroid
     heading = jnp.arctan2(jnp.sin(centred[2:]), jnp.cos(centred[2:]))
-    by_turn = jnp.where(paired[:, None], quarter_turned(target - shift[None, :]), 0.0)
+    by_turn = jnp.where(paired[:, None], quarter_turn(target - shift[None, :]), 0.0)
     return _Alignment(
         pose=jnp.concatenate([shift, heading]),
         distance=((whitened - by_pose @ step) ** 2).sum(),
@@ -117,7 +117,7 @@ def _residuals(
     error = jnp.where(paired[:, None], z @ rotation.T + pose[None, :2] - goal, 0.0)
     eye = jnp.broadcast_to(jnp.eye(2, dtype=z.dtype), (m, 2, 2))
     # ∂(R z)/∂θ is R z turned by 90°; at r = 0, R z is the goal less the translation.
-    by_turn = quarter_turned(goal - pose[None, :2])[:, :, None]
+    by_turn = quarter_turn(goal - pose[None, :2])[:, :, None]
     jacobian = jnp.where(paired[:, None, None], jnp.concatenate([eye, by_turn], 2), 0.0)
     blocks = cov[jnp.arange(m), :, jnp.arange(m)]
     return error.reshape(-1), jacobian.reshape(2 * m, 3), blocks, factor, positive
@@ -226,7 +226,14 @@ def match_points(points: PointSets, limits: _SearchLimits) -> GeometricMatch:
     No hypothesis (explained = 0, slots -1, the identity) where no two distances agree.
     """
     hypotheses = _hypotheses(points, limits)
-    finalists = hypotheses.slot.reshape(-1, len(points.cluster))[_finalists(hypotheses)]
+    # The best of each cluster pair, then the best of all: the best of all alone may be one
+    # hypothesis, which each of its pairs leads to.
+    merit = _merit(hypotheses.explained, hypotheses.distance)
+    # Row p, column c is number p·C + c of the flat array.
+    heads = merit.argmax(axis=1) + jnp.arange(merit.shape[0]) * merit.shape[1]
+    merit = merit.reshape(-1)
+    rest = jax.lax.top_k(merit, min(_FINALISTS, len(merit)))[1]
+    finalists = hypotheses.slot.reshape(-1, len(points.cluster))[jnp.concatenate([heads, rest])]
     fits = jax.vmap(lambda slot: _fit_hypothesis(points, slot, limits))(finalists)
     best: GeometricMatch = jax.tree.map(
         lambda leaf: leaf[jnp.argmax(_merit(fits.explained, fits.distance))], fits
@@ -263,19 +270,6 @@ def _merit(count: Int[Array, "*batch"], distance: Float[Array, "*batch"]) -> Flo
     """The score of a match: the number of pairs first, then the distance, mapped to 0 … 1."""
     # Below 1, so that no distance outweighs a pair.
     return count - distance / (1 + distance)
-
-
-def _finalists(hypotheses: _Hypotheses) -> Int[Array, "K"]:
-    """The flat indices (P·C) of the hypotheses to fit: the best of each cluster pair, then the best
-    of all.
-
-    The best of all alone may be one hypothesis, which each of its pairs leads to.
-    """
-    merit = _merit(hypotheses.explained, hypotheses.distance)
-    # Row p, column c is number p·C + c of the flat array.
-    heads = merit.argmax(axis=1) + jnp.arange(merit.shape[0]) * merit.shape[1]
-    merit = merit.reshape(-1)
-    return jnp.concatenate([heads, jax.lax.top_k(merit, min(_FINALISTS, len(merit)))[1]])
 
 
 def _fit_hypothesis(

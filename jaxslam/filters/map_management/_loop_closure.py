@@ -171,39 +171,38 @@ def close_loop(joint: Joint, chart: Chart, settings: LoopSettings) -> tuple[Join
             refuses.
     """
     check_recency("close_loop", joint)
-    recent, candidates = _recent_cluster(joint, settings)
+    times: Times = joint.life
+    capacity = joint.landmarks.shape[0]
+    is_recent = joint.alive & (times.now - times.last <= settings.window)
+    is_recent = is_recent & (times.seen >= settings.sightings)
+    # The cluster: by the time of the last measurement, then by the slot.
+    # A number of its own for each slot, in int32 for 2³¹/N scans.
+    order = jnp.where(is_recent, times.last, -1) * capacity + jnp.arange(capacity)
+    _, recent = jax.lax.top_k(order, min(settings.cluster, capacity))
+    later = times.born[recent][:, None] > times.last[None, :]
+    candidates = is_recent[recent][:, None] & joint.alive[None, :] & later
     # Each test before the search costs less than the search: most scans end here.
     old, report = change_where(
         candidates.any(axis=1).sum() >= settings.least,
         lambda _: _match_cluster(joint, chart, recent, candidates, settings),
         (jnp.full(recent.shape, -1, jnp.int32), no_closing()),
     )
-    joint = change_where(
-        report.merged > 0, lambda joint: _merge_all(joint, chart, old, recent), joint
-    )
-    return joint, report
+
+    def merge(joint: Joint, pair: tuple[Array, Array]) -> tuple[Joint, None]:
+        kept, freed = pair
+        # A landmark merged into itself is not changed.
+        return merge_histories(joint, chart, jnp.where(kept >= 0, kept, freed), freed), None
+
+    def merge_all(joint: Joint) -> Joint:
+        return jax.lax.scan(merge, joint, (old, recent))[0]
+
+    return change_where(report.merged > 0, merge_all, joint), report
 
 
 def no_closing() -> LoopReport:
     """The report where nothing was searched for."""
     none, no = jnp.zeros((), jnp.int32), jnp.asarray(False)
     return LoopReport(none, none, no, none, no, no, none)
-
-
-def _recent_cluster(
-    joint: Joint, settings: LoopSettings
-) -> tuple[Int[Array, "M"], Bool[Array, "M N"]]:
-    """The slots of the M recent landmarks measured last, and their candidate old landmarks."""
-    times: Times = joint.life
-    capacity = joint.landmarks.shape[0]
-    recent = joint.alive & (times.now - times.last <= settings.window)
-    recent = recent & (times.seen >= settings.sightings)
-    # By the time of the last measurement, then by the slot.
-    # A number of its own for each slot, in int32 for 2³¹/N scans.
-    order = jnp.where(recent, times.last, -1) * capacity + jnp.arange(capacity)
-    _, cluster = jax.lax.top_k(order, min(settings.cluster, capacity))
-    later = times.born[cluster][:, None] > times.last[None, :]
-    return cluster, recent[cluster][:, None] & joint.alive[None, :] & later
 
 
 def _match_cluster(
@@ -253,17 +252,6 @@ def _match_cluster(
 
     nothing = jnp.full(m, -1, jnp.int32), no_closing()
     return change_where(allowed.any(axis=1).sum() >= settings.least, compare, nothing)
-
-
-def _merge_all(joint: Joint, chart: Chart, old: Int[Array, "M"], recent: Int[Array, "M"]) -> Joint:
-    """The map with each recent landmark merged into its old one, pair by pair; -1 for none."""
-
-    def merge(joint: Joint, pair: tuple[Array, Array]) -> tuple[Joint, None]:
-        kept, freed = pair
-        # A landmark merged into itself is not changed.
-        return merge_histories(joint, chart, jnp.where(kept >= 0, kept, freed), freed), None
-
-    return jax.lax.scan(merge, joint, (old, recent))[0]
 
 
 def _joint_distance(

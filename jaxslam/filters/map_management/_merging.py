@@ -18,7 +18,7 @@ from jaxslam.core.protocols import Chart, Filter, Wrapper
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Info, Scan, Status
 from jaxslam.filters._ekf.linear_system import LinearizedSteps, LinearSystem
-from jaxslam.filters._ekf.map_coordinates import retracted
+from jaxslam.filters._ekf.map_coordinates import retract_map
 from jaxslam.filters._reporting import with_extra
 from jaxslam.math import _linalg as linalg
 from jaxslam.math._arrays import Number
@@ -245,7 +245,7 @@ def merge_landmarks(
     # L⁻¹ (0 - δ): what is measured is δ = 0.
     white = linalg.solve_lower(factor, joint.landmarks[j] - joint.landmarks[i])
     xi = linalg.gram(v, white[:, None])[:, 0]
-    pose, landmarks = retracted(chart, joint, xi)
+    pose, landmarks = retract_map(chart, joint, xi)
     cov = rows - linalg.gram(v, v)
     if square_root:
         cov = linalg.root_psd(cov)

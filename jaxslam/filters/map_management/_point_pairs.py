@@ -138,7 +138,7 @@ def _frame_of_pair(points: PointSets, ends: Int[Array, "2"], slots: Int[Array, "
     c, d = (u * v).sum(), u[0] * v[1] - u[1] * v[0]
     rotation = jnp.stack([jnp.stack([c, -d]), jnp.stack([d, c])])
     arm = (points.cluster - (0.5 * (z_a + z_b))[None, :]) @ rotation.T
-    swing = quarter_turned(arm)[:, :, None] * quarter_turned(v)[None, None, :]
+    swing = quarter_turn(arm)[:, :, None] * quarter_turn(v)[None, None, :]
     half = 0.5 * jnp.eye(2, dtype=arm.dtype)[None]
     by_map = jnp.stack([half - swing / r, half + swing / r], axis=1)
     by_ends = jnp.stack([-half + swing / s, -half - swing / s], axis=1) @ rotation
@@ -176,7 +176,7 @@ def _moved_covs(
     return covs, with_map.transpose(0, 2, 1, 3)
 
 
-def quarter_turned(points: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2"]:
+def quarter_turn(points: Float[Array, "*batch 2"]) -> Float[Array, "*batch 2"]:
     """Vectors rotated by 90°."""
     return jnp.stack([-points[..., 1], points[..., 0]], axis=-1)
 

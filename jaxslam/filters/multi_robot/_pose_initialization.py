@@ -6,6 +6,7 @@ landmark): correlated with the whole joint state. Every measurement is converted
 frame of its robot, for any sensor.
 """
 
+from functools import partial
 from typing import NamedTuple
 
 import jax
@@ -13,7 +14,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
 from jaxslam.core import slots
-from jaxslam.core.protocols import Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Scan
 from jaxslam.filters.multi_robot._team_filter import SIZE, TeamFilter, measures_points
@@ -98,7 +98,12 @@ def _landmark_candidate(
     """The pose from the two measured landmarks of the map that are farthest apart."""
     points, capacity = observed[robot], filter.capacity
     slot, in_map = slots.find(joint.tag[:capacity], joint.alive[:capacity], points.tag)
-    i, j, two = _farthest_pair(points.point, in_map & points.valid)
+    usable = in_map & points.valid
+    between = ((points.point[:, None] - points.point[None, :]) ** 2).sum(-1)
+    size = between.shape
+    both = usable[:, None] & usable[None, :] & jnp.triu(jnp.ones(size, bool), 1)
+    i, j = jnp.unravel_index(jnp.argmax(jnp.where(both, between, -1.0)), size)
+    two = both[i, j] & (between[i, j] > 0)
     measured, landmarks = jnp.stack([i, j]), jnp.stack([slot[i], slot[j]])
     # The rows x, y of both landmarks.
     at = (3 + landmarks[:, None] * SIZE + jnp.arange(2)[None, :]).reshape(-1)
@@ -131,7 +136,12 @@ def observed_points(sensors: Suite, scan: Scan) -> _ObservedPoints:
     observed = []
     for part, part_scan in zip(sensors.parts, split_scan(scan, sensors.places), strict=True):
         if measures_points(part.sensor):
-            points, covs = _points_of(part.sensor, part_scan)
+            z = part_scan.z[:, : len(part.sensor.measurements)]
+            # Absent measurements are replaced by a value at which every model is smooth.
+            z = jnp.where(part_scan.valid[:, None], z, 1.0)
+            invert = jax.vmap(partial(first_order.invert_at, part.sensor), (None, 0, None, 0))
+            origin = jnp.zeros(3, z.dtype)
+            points, _, covs = invert(origin, z, origin, z)
             valid = part_scan.valid & (part_scan.tag >= 0)
         else:
             m, dtype = part.places, scan.z.dtype
@@ -139,20 +149,6 @@ def observed_points(sensors: Suite, scan: Scan) -> _ObservedPoints:
             valid = jnp.zeros(m, bool)
         observed.append(_ObservedPoints(points, covs, part_scan.tag, valid))
     return _ObservedPoints(*(jnp.concatenate(leaves) for leaves in zip(*observed, strict=True)))
-
-
-def _points_of(sensor: Sensor, scan: Scan) -> tuple[Float[Array, "M 2"], Float[Array, "M 2 2"]]:
-    """Points in the robot's frame, with covariances, of measurements that determine them."""
-    z = scan.z[:, : len(sensor.measurements)]
-    origin = jnp.zeros(3, z.dtype)
-
-    def invert(z: Array) -> tuple[Array, Array]:
-        point, _, cov = first_order.invert_at(sensor, origin, z, origin, z)
-        return point, cov
-
-    # Absent measurements are replaced by a value at which every model is smooth.
-    points: tuple[Array, Array] = jax.vmap(invert)(jnp.where(scan.valid[:, None], z, 1.0))
-    return points
 
 
 def by_mutual_sight(
@@ -217,17 +213,6 @@ def by_two_landmarks(
     noise = jnp.einsum("ikl,klm,jkm->ij", by_seen, seen_cov, by_seen)
     noise = symmetrize(by_points @ cov @ by_points.T + noise)
     return _wrap_heading(pose(points, seen)), by_points @ rows, noise
-
-
-def _farthest_pair(
-    points: Float[Array, "M 2"], usable: Bool[Array, "M"]
-) -> tuple[Int[Array, ""], Int[Array, ""], Bool[Array, ""]]:
-    """Indices i < j of the usable points farthest from each other, and whether two differ."""
-    m = points.shape[0]
-    between = ((points[:, None] - points[None, :]) ** 2).sum(-1)
-    both = usable[:, None] & usable[None, :] & jnp.triu(jnp.ones((m, m), bool), 1)
-    i, j = jnp.unravel_index(jnp.argmax(jnp.where(both, between, -1.0)), (m, m))
-    return i, j, both[i, j] & (between[i, j] > 0)
 
 
 def _distance_variance(point: Float[Array, "2"], cov: Float[Array, "2 2"]) -> Float[Array, ""]:

@@ -1,5 +1,7 @@
 """EKF-SLAM of several robots in one joint state (Solà's loop over robots, sensors, landmarks)."""
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
@@ -10,7 +12,7 @@ from jaxslam.core._record import record
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Info, Scan, Status
 from jaxslam.filters._ekf.ekf_slam import EkfSlam, update_by_sensor
-from jaxslam.filters._reporting import joined_info
+from jaxslam.filters._reporting import join_infos
 from jaxslam.filters.multi_robot._pose_initialization import best_initialization, observed_points
 from jaxslam.filters.multi_robot._team_filter import SIZE, TeamFilter
 from jaxslam.filters.multi_robot._team_state import (
@@ -74,7 +76,12 @@ class TeamSlam(TeamFilter):
 
     def predict(self, state: Joint, u: Float[Array, "U"], key: Array) -> Joint:
         for b, control in enumerate(jnp.split(u, sizes(self.robots)[0][:-1])):
-            state = _predict_robot(self, state, b, control, key)
+            ahead = self.ekf_of(b).predict(seen_from(self, state, b), control, key)
+            ahead = seen_from_first(self, ahead, b, state)
+            if b in self.unstarted:  # it moves once it has a pose in the map
+                in_map = state.alive[self.slot_of(b)]
+                ahead = jax.tree.map(partial(jnp.where, in_map), ahead, state)
+            state = ahead
         return state
 
     def update(self, state: Joint, scan: Scan, key: Array) -> tuple[Joint, Info]:
@@ -99,8 +106,13 @@ class TeamSlam(TeamFilter):
             state, infos[b] = _correct_by_robot(self, state, b, scans[b])
         for b, masks in used.items():
             for a, mask in enumerate(masks):
-                infos[a] = _mark_born(infos[a], mask, self.slot_of(b))
-        return state, joined_info([infos[b] for b in range(len(self.robots))], size_z)
+                # These measurements initialized robot b.
+                info, slot = infos[a], infos[a].slot
+                infos[a] = info._replace(
+                    status=jnp.where(mask, Status.BORN, info.status).astype(jnp.int32),
+                    slot=jnp.where(mask, self.slot_of(b), slot).astype(slot.dtype),
+                )
+        return state, join_infos([infos[b] for b in range(len(self.robots))], size_z)
 
     def estimate(self, state: Joint) -> Estimate:
         capacity, report = self.capacity, self.report
@@ -140,19 +152,6 @@ class _WrappedHeadings(Euclidean):
     def retract(self, pose: Array, landmark: Array, dx: Array, dl: Array) -> tuple[Array, Array]:
         pose, landmark = super().retract(pose, landmark, dx, dl)
         return pose, jnp.concatenate([landmark[:2], wrap(landmark[2:])])
-
-
-def _predict_robot(
-    filter: TeamSlam, joint: Joint, robot: int, u: Float[Array, "U"], key: Array
-) -> Joint:
-    """The state after the prediction of one robot, if it is in the map."""
-    after = filter.ekf_of(robot).predict(seen_from(filter, joint, robot), u, key)
-    after = seen_from_first(filter, after, robot, joint)
-    if robot in filter.started:  # always in the map
-        return after
-    in_map = joint.alive[filter.slot_of(robot)]
-    moved: Joint = jax.tree.map(lambda new, old: jnp.where(in_map, new, old), after, joint)
-    return moved
 
 
 def _initialize_robot(
@@ -198,15 +197,7 @@ def _correct_by_robot(filter: TeamSlam, joint: Joint, robot: int, scan: Scan) ->
             ekf, sensor, after, part_scan, births, reserved=is_robot
         )
         infos.append(info)
-    info = joined_info(infos, scan.z.shape[1])
+    info = join_infos(infos, scan.z.shape[1])
     status = jnp.where(scan.valid & unknown, Status.UNMATCHED, info.status)
     info = info._replace(status=status.astype(jnp.int32))
     return seen_from_first(filter, after, robot, joint), info
-
-
-def _mark_born(info: Info, used: Bool[Array, "M"], slot: int) -> Info:
-    """The `Info` with these measurements marked as having initialized the robot in a slot."""
-    return info._replace(
-        status=jnp.where(used, Status.BORN, info.status).astype(jnp.int32),
-        slot=jnp.where(used, slot, info.slot).astype(info.slot.dtype),
-    )

@@ -182,7 +182,15 @@ def eliminate_steps(
         after, decrement = carry
         after = _add_measurements(after, step, capacity)
         after, gain, gained = _eliminate_noise(after, step.by_noise, step.noise)
-        return (_by_pose_before(after, step), decrement + gained), gain
+        # As a function of the pose before the motion: a = F δx + c.
+        before = CostToGo(
+            pose=linalg.symmetrize(step.by_pose.T @ after.pose @ step.by_pose),
+            cross=linalg.matmul(step.by_pose.T, after.cross),
+            map=after.map,
+            pose_y=step.by_pose.T @ (after.pose_y - after.pose @ step.drift),
+            map_y=after.map_y - step.drift @ after.cross,
+        )
+        return (before, decrement + gained), gain
 
     no_cost = CostToGo(
         pose=jnp.zeros((3, 3), kind),
@@ -194,17 +202,6 @@ def eliminate_steps(
     end = no_cost, jnp.zeros((), kind)
     (to_go, decrement), gains = jax.lax.scan(back, end, steps, reverse=True)
     return to_go, gains, decrement
-
-
-def _by_pose_before(after: CostToGo, step: LinearizedStep) -> CostToGo:
-    """The cost to go as a function of the pose before a motion, a = F δx + c."""
-    return CostToGo(
-        pose=linalg.symmetrize(step.by_pose.T @ after.pose @ step.by_pose),
-        cross=linalg.matmul(step.by_pose.T, after.cross),
-        map=after.map,
-        pose_y=step.by_pose.T @ (after.pose_y - after.pose @ step.drift),
-        map_y=after.map_y - step.drift @ after.cross,
-    )
 
 
 def _add_measurements(to_go: CostToGo, step: LinearizedStep, capacity: int) -> CostToGo:

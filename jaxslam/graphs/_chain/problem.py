@@ -203,7 +203,14 @@ def optimize_chain(
         policy = eliminate(search.chain, alive)
         converged = jnp.asarray(False)
         if tolerance is not None:
-            converged = _has_converged(search, policy, tolerance)
+            # The next step is shorter than the tolerance, in posterior standard deviations. A step
+            # of √eps is rounding of the gradient; so is one whose decrease of the cost is below
+            # rounding and that is hardly shorter than the last. The first step is always made.
+            eps = float(jnp.finfo(search.cost.dtype).eps)
+            least = jnp.maximum(tolerance, eps**0.5)
+            idle = policy.decrement > _IDLE * search.policy.decrement
+            idle = idle & (policy.decrement <= eps * search.cost)
+            converged = (search.steps > 0) & ((policy.decrement <= least**2) | idle)
         may_step = (search.steps < iterations) & ~converged
         after, lower = _line_search(motion, sensor, problem, search, policy)
         moved = may_step & lower
@@ -229,7 +236,14 @@ def optimize_chain(
         )
         return after_step, moved
 
-    begin = _before_first_step(start, chain, alive, iterations)
+    # Before the first step no chain is solved, and the cost is infinite.
+    kind = chain.steps.residual.dtype
+    unsolved = jax.tree.map(
+        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(eliminate, chain, alive)
+    )
+    far, none = jnp.asarray(jnp.inf, kind), jnp.zeros((), jnp.int32)
+    costs = jnp.full(iterations, jnp.inf, kind)
+    begin = Iterations(start, chain, unsolved, far, costs, none, none + Ending.EXHAUSTED)
     # One iteration more than steps: the last solves the chain at the final iterate.
     if tolerance is None:
         fixed: Iterations = jax.lax.fori_loop(
@@ -240,32 +254,6 @@ def optimize_chain(
         lambda carry: carry[1], lambda carry: step(carry[0]), (begin, jnp.asarray(True))
     )[0]
     return end
-
-
-def _before_first_step(
-    start: Iterate, chain: Chain, alive: Bool[Array, "N"], iterations: int
-) -> Iterations:
-    """The search before the first step: no chain solved, and infinite cost."""
-    kind = chain.steps.residual.dtype
-    unsolved = jax.tree.map(
-        lambda leaf: jnp.zeros(leaf.shape, leaf.dtype), jax.eval_shape(eliminate, chain, alive)
-    )
-    far, none = jnp.asarray(jnp.inf, kind), jnp.zeros((), jnp.int32)
-    costs = jnp.full(iterations, jnp.inf, kind)
-    return Iterations(start, chain, unsolved, far, costs, none, none + Ending.EXHAUSTED)
-
-
-def _has_converged(search: Iterations, policy: Policy, tolerance: float) -> Bool[Array, ""]:
-    """Whether the next step is shorter than the tolerance, in posterior standard deviations.
-
-    A step of √eps is rounding of the gradient; so is one whose decrease of the cost is below
-    rounding and that is hardly shorter than the last. The first step is always made.
-    """
-    eps = float(jnp.finfo(search.cost.dtype).eps)
-    least = jnp.maximum(tolerance, eps**0.5)
-    idle = policy.decrement > _IDLE * search.policy.decrement
-    idle = idle & (policy.decrement <= eps * search.cost)
-    return (search.steps > 0) & ((policy.decrement <= least**2) | idle)
 
 
 def _rounding_of_cost(search: Iterations) -> Float[Array, ""]:

@@ -7,14 +7,12 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
-from numpy.typing import ArrayLike
 
 from jaxslam.core._numbers import check_count
 from jaxslam.core._record import record, static
-from jaxslam.core.protocols import Motion, Sensor
+from jaxslam.core.protocols import Sensor
 from jaxslam.core.slots import Joint
 from jaxslam.core.types import Estimate, Log, Trace
-from jaxslam.graphs._chain.elimination import Chain
 from jaxslam.graphs._chain.problem import Iterate, Iterations, Problem, optimize_chain
 from jaxslam.graphs._solver.search import Ending
 from jaxslam.graphs.smoothing._forward_pass import ForwardPass, LogEstimator, log_in_one_dtype
@@ -111,7 +109,19 @@ class BatchMap(LogEstimator):
     def solve(self, log: Log, key: Array) -> Trace:
         motion, sensor, passed = self.motion, self.sensor, self._forward(log, key)
         log = log_in_one_dtype(log)
-        problem, start, chain = _problem_of(motion, sensor, passed, log, self.pose, self.pose_cov)
+        kind = log.control.dtype
+        mean, cov = jnp.asarray(self.pose, kind), jnp.asarray(self.pose_cov, kind)
+        # The initial iterate is the filter's path, with its chain. The optimum does not depend on
+        # it, so it has no derivative by it.
+        initial = jax.lax.stop_gradient(passed)
+        roots = noise_roots(motion, initial, log.control)
+        chain, used = jax.lax.stop_gradient(chain_of(motion, sensor, initial, log, cov, roots))
+        z = jnp.where(used[:, :, None], log.scan.z, 0.0)
+        root = start_of(cov).root
+        problem = Problem(mean, root, log.control, roots, z, chain.steps.slot, used)
+        path = jnp.concatenate([mean[None], initial.corrected])
+        landmarks = initial.trace.final.landmarks
+        start = Iterate(chain.start.noise, chain.steps.noise, path, landmarks)
         search = optimize_chain(
             motion,
             sensor,
@@ -128,29 +138,6 @@ class BatchMap(LogEstimator):
             exhausted = info.exhausted.at[-1].max(search.ending != Ending.CONVERGED)
             info = info._replace(exhausted=exhausted)
         return Trace(estimate, info, solved, None)
-
-
-def _problem_of(
-    motion: Motion,
-    sensor: Sensor,
-    passed: ForwardPass,
-    log: Log,
-    pose: ArrayLike,
-    pose_cov: ArrayLike,
-) -> tuple[Problem, Iterate, Chain]:
-    """The problem of a log, and the initial iterate: the filter's path, with its chain."""
-    kind = log.control.dtype
-    mean, cov = jnp.asarray(pose, kind), jnp.asarray(pose_cov, kind)
-    # The optimum does not depend on the initial iterate, so it has no derivative by it.
-    passed = jax.lax.stop_gradient(passed)
-    roots = noise_roots(motion, passed, log.control)
-    chain, used = jax.lax.stop_gradient(chain_of(motion, sensor, passed, log, cov, roots))
-    z = jnp.where(used[:, :, None], log.scan.z, 0.0)
-    root = start_of(cov).root
-    problem = Problem(mean, root, log.control, roots, z, chain.steps.slot, used)
-    path = jnp.concatenate([mean[None], passed.corrected])
-    landmarks = passed.trace.final.landmarks
-    return problem, Iterate(chain.start.noise, chain.steps.noise, path, landmarks), chain
 
 
 def _at_end(

@@ -161,7 +161,13 @@ class FixedLag(Filter):
             system = linearize_window(motion, sensor, state.prior, steps, at, self.first_estimates)
             solved = solve_window(state.prior, system, at, joint.alive)
             at = step_window(motion, steps, at, solved)
-        newest = _with_newest(joint, at, newest_cov(system, solved))
+        # The newest pose and the map of the window; unit variance at dead slots.
+        alive = jnp.repeat(joint.alive, joint.landmarks.shape[1])
+        alive = jnp.concatenate([jnp.ones(3, bool), alive])
+        cov = newest_cov(system, solved)
+        cov = jnp.where(alive[:, None] & alive[None], cov, jnp.eye(len(alive), dtype=cov.dtype))
+        landmarks = jnp.where(joint.alive[:, None], at.landmarks, 0.0)
+        newest = joint._replace(pose=at.path[-1], landmarks=landmarks, cov=cov)
         after = _WindowState(newest, state.prior, steps, at)
         exhausted = jnp.asarray(info.exhausted) | ~_is_finite(after)
         return _finite_or(after, self._started_at(joint)), info._replace(exhausted=exhausted)
@@ -224,12 +230,3 @@ def shift(
         used=append(steps.used, False),
     )
     return after, at._replace(path=append(at.path, pose), noise=append(at.noise, 0.0))
-
-
-def _with_newest(joint: Joint, at: WindowIterate, cov: Float[Array, "D D"]) -> Joint:
-    """The joint with the newest pose and the map of a window; unit variance at dead slots."""
-    alive = jnp.repeat(joint.alive, joint.landmarks.shape[1])
-    alive = jnp.concatenate([jnp.ones(3, bool), alive])
-    padded = jnp.where(alive[:, None] & alive[None], cov, jnp.eye(len(alive), dtype=cov.dtype))
-    landmarks = jnp.where(joint.alive[:, None], at.landmarks, 0.0)
-    return joint._replace(pose=at.path[-1], landmarks=landmarks, cov=padded)

@@ -110,58 +110,38 @@ def _count(
     free: Array,
     mount: Array,
 ) -> Counts:
-    def add(total: PyTree, row: tuple[Array, Beams]) -> tuple[PyTree, None]:
+    height, width = shape
+
+    def add_scan(total: PyTree, row: tuple[Array, Beams]) -> tuple[PyTree, None]:
         hits, misses, outside, unusable = total
         pose, scan = row
         eye = se2.compose(pose, mount)
-        hits, misses, lost = _add_scan(
-            hits, misses, shape, origin, resolution, eye, scan, max_range, free
-        )
-        usable = usable_beams(scan)
-        return (hits, misses, outside + lost, unusable + (~usable).sum(dtype=jnp.int32)), None
+        met, far = scan.returns(jnp.asarray(max_range))
+        usable = met | far
+        length = jnp.where(met, scan.range, jnp.where(far, free, 0.0))
+        heading = eye[2] + jnp.where(usable, scan.angle, 0.0)
+        e = jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=-1)
+        ends = to_cells(origin, resolution, eye[None, :2] + length[:, None] * e)
+        start = to_cells(origin, resolution, eye[:2])
+        inside = (start >= 0).all() & (start[0] < width) & (start[1] < height)
+        # Without free space before a beam of max_range it has no effect, not even on the laser's
+        # cell.
+        live = inside & usable & ~(far & (jnp.asarray(free) <= 0))
+        misses, last = _cross(misses, jnp.broadcast_to(start, ends.shape), ends, live, shape)
+        on_map = (ends >= 0).all(axis=1) & (ends[:, 0] < width) & (ends[:, 1] < height)
+        at = jnp.where(live & on_map, last, len(hits))
+        hits = hits.at[at].add((~far).astype(jnp.int32), mode="drop")
+        misses = misses.at[at].add(far.astype(jnp.int32), mode="drop")
+        # The usable beams of a scan from a pose off the map.
+        lost = jnp.where(inside, 0, usable.sum(dtype=jnp.int32))
+        unusable = unusable + (~usable_beams(scan)).sum(dtype=jnp.int32)
+        return (hits, misses, outside + lost, unusable), None
 
     # Flat tables with an index beyond the end for what is not counted: scatters of mode "drop".
-    empty = jnp.zeros(shape[0] * shape[1], jnp.int32)
+    empty = jnp.zeros(height * width, jnp.int32)
     zero = jnp.zeros((), jnp.int32)
-    total, _ = jax.lax.scan(add, (empty, empty, zero, zero), (poses, beams))
+    total, _ = jax.lax.scan(add_scan, (empty, empty, zero, zero), (poses, beams))
     return Counts(total[0].reshape(shape), total[1].reshape(shape), origin, resolution, *total[2:])
-
-
-def _add_scan(
-    hits: Int[Array, "HW"],
-    misses: Int[Array, "HW"],
-    shape: tuple[int, int],
-    origin: Float[Array, "3"],
-    resolution: Array,
-    eye: Float[Array, "3"],
-    scan: Beams,
-    max_range: Number,
-    free: ArrayLike,
-) -> tuple[Int[Array, "HW"], Int[Array, "HW"], Int[Array, ""]]:
-    """The counts with a further scan, and its number of usable beams if its pose is off the map.
-
-    Args:
-        eye: pose of the laser. free: as `no_return` of `count`.
-    """
-    height, width = shape
-    nowhere = hits.shape[0]
-    met, far = scan.returns(jnp.asarray(max_range))
-    usable = met | far
-    length = jnp.where(met, scan.range, jnp.where(far, free, 0.0))
-    heading = eye[2] + jnp.where(usable, scan.angle, 0.0)
-    e = jnp.stack([jnp.cos(heading), jnp.sin(heading)], axis=-1)
-    ends = to_cells(origin, resolution, eye[None, :2] + length[:, None] * e)
-    start = to_cells(origin, resolution, eye[:2])
-    inside = (start >= 0).all() & (start[0] < width) & (start[1] < height)
-    # Without free space before a beam of max_range it has no effect, not even on the laser's cell.
-    live = inside & usable & ~(far & (jnp.asarray(free) <= 0))
-    misses, last = _cross(misses, jnp.broadcast_to(start, ends.shape), ends, live, shape)
-    on_map = (ends >= 0).all(axis=1) & (ends[:, 0] < width) & (ends[:, 1] < height)
-    at = jnp.where(live & on_map, last, nowhere)
-    hits = hits.at[at].add((~far).astype(jnp.int32), mode="drop")
-    misses = misses.at[at].add(far.astype(jnp.int32), mode="drop")
-    lost = jnp.where(inside, 0, usable.sum(dtype=jnp.int32))
-    return hits, misses, lost
 
 
 def _cross(

@@ -122,10 +122,10 @@ def interpolate(field: Field, points: ArrayLike) -> Float[Array, "*n"]:
     if points.ndim == 0 or points.shape[-1] != 2:
         raise ValueError(f"interpolate: expected points (x, y), got shape {points.shape}")
     # Half a cell: entry (i, j) is the value at the centre (j + ½, i + ½).
-    return interpolated(field.values, to_cells(field.origin, field.resolution, points) - 0.5)
+    return interpolate_cells(field.values, to_cells(field.origin, field.resolution, points) - 0.5)
 
 
-def interpolated(values: Float[Array, "H W"], at: Float[Array, "*n 2"]) -> Float[Array, "*n"]:
+def interpolate_cells(values: Float[Array, "H W"], at: Float[Array, "*n 2"]) -> Float[Array, "*n"]:
     """The bilinear interpolation of a table at (x, y) = (column, row) coordinates.
 
     f = a (1-u)(1-v) + b u (1-v) + c (1-u) v + d u v on the unit square of the four entries around.

@@ -11,7 +11,7 @@ from numpy.typing import ArrayLike
 
 from jaxslam.core._numbers import check_real, is_concrete, shape_text
 from jaxslam.laser.grids._distance import squared_distances
-from jaxslam.laser.grids._grid import Grid, check_grid, interpolated, to_cells
+from jaxslam.laser.grids._grid import Grid, check_grid, interpolate_cells, to_cells
 from jaxslam.laser.grids._traversal import MOST, OFF, STOP, march
 from jaxslam.math._xla import hot_jit
 
@@ -49,29 +49,20 @@ def ray_map(grid: Grid, *, method: str | None = None, skip: bool = True) -> RayM
     """
     check_grid("ray_map", grid)
     if method is None:
-        method = "surface" if _has_grades(grid) else "cells"
+        method = "cells"
+        # p may be the share of a cell that is solid with more than three log-odds, so at least two
+        # between the ends, all of them known: in a map made from scans p is the certainty of a
+        # cell, and "surface" goes too far. Found without sorting millions of cells.
+        if is_concrete(grid.log_odds) and not np.any(np.asarray(grid.log_odds) == 0):
+            log_odds = np.asarray(grid.log_odds)
+            between = log_odds[(log_odds > log_odds.min()) & (log_odds < log_odds.max())]
+            if between.size and between.min() < between.max():
+                method = "surface"
     check_method("ray_map", method)
     if is_concrete(grid.log_odds) and not np.any(np.asarray(grid.log_odds) < 0):
         raise ValueError("ray_map: the map has no free cell (log-odds below 0)")
     rays: RayMap = _ray_map(grid, method, skip)
     return rays
-
-
-def _has_grades(grid: Grid) -> bool:
-    """Whether p may be the share of a cell that is solid.
-
-    It is not with three log-odds or fewer, nor where cells are unknown, as in a map made from
-    scans, whose p is the certainty of a cell. There "surface" goes too far (`cast`). Within a
-    trace the values are not known.
-    """
-    if not is_concrete(grid.log_odds):
-        return False
-    log_odds = np.asarray(grid.log_odds)
-    if np.any(log_odds == 0):
-        return False
-    # More than three values: at least two between the ends. Without sorting millions of cells.
-    between = log_odds[(log_odds > log_odds.min()) & (log_odds < log_odds.max())]
-    return bool(between.size and between.min() < between.max())
 
 
 def check_method(name: str, method: str) -> None:
@@ -252,4 +243,6 @@ def _slope(solid: Float[Array, "H W"], at: Float[Array, "R 2"]) -> Float[Array, 
     The bilinear slope at the point itself changes from cell to cell along a slanted wall.
     """
     places = at[:, None, :] - 0.5 + jnp.asarray(_AROUND, at.dtype)[None]
-    return jnp.einsum("rk,ka->ra", interpolated(solid, places), jnp.asarray(_WEIGHTS, at.dtype))
+    return jnp.einsum(
+        "rk,ka->ra", interpolate_cells(solid, places), jnp.asarray(_WEIGHTS, at.dtype)
+    )

@@ -95,10 +95,10 @@ def correlation(a: Grid, b: Grid) -> Float[Array, ""]:
     total = weight.sum()
     total = jnp.where(total > 0, total, 1.0)
 
-    def centred(values: Array) -> Array:
+    def center(values: Array) -> Array:
         return values - (weight * values).sum() / total
 
-    off_a, off_b = centred(a.probability), centred(probability_b)
+    off_a, off_b = center(a.probability), center(probability_b)
     product = (weight * off_a * off_a).sum() * (weight * off_b * off_b).sum()
     varies = product > 1e-12 * total**2  # probabilities that vary by a thousandth; rounding: 1e-28
     r = (weight * off_a * off_b).sum() / jnp.sqrt(jnp.where(varies, product, 1.0))

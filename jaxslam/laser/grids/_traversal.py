@@ -156,8 +156,8 @@ def _march_together(
             square = _entries(ahead, at.x, at.y)
             crosses = _crossings(rays, at)
             goes = moving & (square < OFF) & (jnp.minimum(*crosses) < limit)
-            after = _next(rays, at, crosses, square.astype(x.dtype) * 0.25)
-            return _where(goes, after, at), goes, stopped | (moving & (square == STOP))
+            after = _next_square(rays, at, crosses, square.astype(x.dtype) * 0.25)
+            return _select(goes, after, at), goes, stopped | (moving & (square == STOP))
 
         begin = at, moving, jnp.zeros_like(moving)
         if corners is not None and jax.default_backend() != "cpu":
@@ -175,10 +175,10 @@ def _march_together(
             at, moving, stopped = free(at, moving)
             crosses = _crossings(rays, at)
             leaves = jnp.minimum(*crosses)
-            meets = _meets(_parabola(corners, rays, at), leaves - at.length)
+            meets = _has_root(_parabola(corners, rays, at), leaves - at.length)
             goes = stopped & ~meets & (leaves < limit)
-            after = _next(rays, at, crosses, jnp.zeros_like(leaves))
-            return _where(goes, after, at), moving | goes, hit | (stopped & meets)
+            after = _next_square(rays, at, crosses, jnp.zeros_like(leaves))
+            return _select(goes, after, at), moving | goes, hit | (stopped & meets)
 
         begin = first, inside, jnp.zeros_like(inside)
         at, _, hit = jax.lax.while_loop(any_moves, visit, begin)
@@ -195,7 +195,7 @@ def _entries(table: Array, x: Array, y: Array) -> Array:
     return table.reshape(-1).at[flat].get(mode="promise_in_bounds", wrap_negative_indices=False)
 
 
-def _where(goes: Array, after: _Square, at: _Square) -> _Square:
+def _select(goes: Array, after: _Square, at: _Square) -> _Square:
     """The square after a step for rays that go, else the square before."""
     return _Square(*(jnp.where(goes, a, b) for a, b in zip(after, at, strict=True)))
 
@@ -208,7 +208,7 @@ def _crossings(rays: _Rays, at: _Square) -> tuple[Array, Array]:
     return exit_x, exit_y
 
 
-def _next(rays: _Rays, at: _Square, crosses: tuple[Array, Array], ahead: Array) -> _Square:
+def _next_square(rays: _Rays, at: _Square, crosses: tuple[Array, Array], ahead: Array) -> _Square:
     """The square after a step: over the free distance, or the neighbour if that is farther."""
     exit_x, exit_y = crosses
     leaves, jump = jnp.minimum(exit_x, exit_y), at.length + ahead
@@ -239,7 +239,7 @@ def _parabola(corners: Array, rays: _Rays, at: _Square) -> tuple[Array, Array, A
     return f00 + b * u + c * v + e * u * v, linear, e * rays.dx * rays.dy
 
 
-def _meets(parabola: tuple[Array, Array, Array], length: Array) -> Array:
+def _has_root(parabola: tuple[Array, Array, Array], length: Array) -> Array:
     """Whether a parabola is above 0 at s = 0, at the length, or between."""
     value, slope, curve = parabola
     steepest = -2.0 * curve * length

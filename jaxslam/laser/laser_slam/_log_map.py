@@ -10,7 +10,7 @@ from jaxslam.core.types import Beams
 from jaxslam.laser import grids
 from jaxslam.laser.grids import Counts, Grid
 from jaxslam.laser.laser_slam._records import LogOfScans, Settings
-from jaxslam.laser.laser_slam._scan_points import ROWS, WIDTH, met_something
+from jaxslam.laser.laser_slam._scan_points import ROWS, WIDTH, hits_of
 from jaxslam.math import numpy_poses as poses
 
 _MAX_CELLS = 4_000
@@ -183,7 +183,7 @@ def growing_maps(
 def _used_beams(log: LogOfScans, settings: Settings, usable: np.ndarray, rows: slice) -> Beams:
     """The beams of a slice of scans for a map; beams of unusable scans are without a hit."""
     beams = Beams(*(np.asarray(part)[rows] for part in log.beams))
-    ranges, angles, met = (np.asarray(part) for part in met_something(beams, log.max_range))
+    ranges, angles, met = (np.asarray(part) for part in hits_of(beams, log.max_range))
     seen = met & usable[rows, None]
     ranges = np.where(seen, np.minimum(ranges, settings.max_range), 0.0)
     return Beams(ranges, angles, seen)

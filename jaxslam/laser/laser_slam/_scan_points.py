@@ -75,7 +75,7 @@ def check_laser_log(name: str, log: LogOfScans) -> None:
         raise ValueError(f"{name}: expected a max_range above 0, got {log.max_range}")
 
 
-def met_something(beams: Beams, max_range: float) -> Beams:
+def hits_of(beams: Beams, max_range: float) -> Beams:
     """The beams of scans, of which only those with a hit stay valid; others have range 0."""
     beams = Beams(*(np.asarray(part) for part in beams))
     met = np.asarray(beams.returns(max_range)[0])
@@ -100,17 +100,22 @@ def scans_of(log: LogOfScans, settings: Settings) -> Scans:
     scans: Any = None
     for begin in range(0, count, ROWS):  # a part at a time, since a log may be long
         last = max(begin - _BACK, 0)  # scans before this part, which its first scans compare with
-        near = met_something(
+        near = hits_of(
             Beams(*(np.asarray(part)[last : begin + ROWS] for part in log.beams)), log.max_range
         )
-        differs = _has_changed(np.asarray(near.range), np.asarray(near.valid))
-        changed.append(differs[begin - last :])
-        rows = Beams(*(np.asarray(part)[begin - last :, ::stride] for part in near))
-        points = _points(rows, np.asarray(log.mount), settings.max_range)
-        size, width = points.valid.shape
+        since = _scans_since_change(np.asarray(near.range), np.asarray(near.valid))
+        changed.append(since[begin - last :])
+        # The ends of the beams that met something nearer than max_range, in the robot's frame.
+        ranges, angles, met = (np.asarray(part)[begin - last :, ::stride] for part in near)
+        met = met & (ranges < settings.max_range)
+        x, y, heading = np.asarray(log.mount, float)
+        rays = np.stack([np.cos(heading + angles), np.sin(heading + angles)], axis=-1)
+        ends = np.where(met[..., None], [x, y] + ranges[..., None] * rays, 0.0)
+        size, width = met.shape
         # Filled up to `ROWS` scans of `WIDTH` beams by points that are not valid.
         fill = [(0, ROWS - size), (0, WIDTH - width)]
-        padded: Any = [np.pad(part, fill + [(0, 0)] * (part.ndim - 2)) for part in points]
+        parts = ends.astype(np.float32), rays.astype(np.float32), met
+        padded: Any = [np.pad(part, fill + [(0, 0)] * (part.ndim - 2)) for part in parts]
         filled = Points(*padded)
         lines = jax.tree.map(np.asarray, _surfaces(filled, span))
         # Beams that fill a scan up come last: they are cut off, or stay without a point.
@@ -128,17 +133,6 @@ def scans_of(log: LogOfScans, settings: Settings) -> Scans:
     return Scans(points, lines, usable, np.concatenate(changed))
 
 
-def _points(beams: Beams, mount: Float[np.ndarray, "3"], max_range: float) -> Points:
-    """The ends of the beams that met something nearer than max_range, in the robot's frame."""
-    ranges, angles, met = (np.asarray(part) for part in beams)
-    near = met & (ranges < max_range)
-    x, y, heading = np.asarray(mount, float)
-    rays = np.stack([np.cos(heading + angles), np.sin(heading + angles)], axis=-1)
-    position = np.where(near[..., None], [x, y] + ranges[..., None] * rays, 0.0)
-    parts: Any = position.astype(np.float32), rays.astype(np.float32), near
-    return Points(*parts)
-
-
 def _thin(part: np.ndarray, stride: int, width: int) -> np.ndarray:
     """Each n-th of the beams, cut or filled up to a width."""
     beams = part[:, ::stride][:, :width]
@@ -153,10 +147,10 @@ def _surfaces(points: Points, span: Int[Array, ""]) -> Surface:
     return jax.vmap(surface_of)(points)
 
 
-def _has_changed(
+def _scans_since_change(
     ranges: Float[np.ndarray, "K B"], met: Bool[np.ndarray, "K B"]
 ) -> Int[np.ndarray, "K"]:
-    """`Scans.changed`; 1 for the first."""
+    """How many scans back the last one is that differs (`Scans.changed`); 1 for the first."""
     changed = np.zeros(len(ranges), int)
     # From the farthest to the nearest, so that the nearest that differs counts.
     for back in range(min(_BACK, len(ranges) - 1), 0, -1):

@@ -29,7 +29,7 @@ class Quadratic(NamedTuple):
     """d"""
 
 
-def added(first: Quadratic, second: Quadratic) -> Quadratic:
+def add(first: Quadratic, second: Quadratic) -> Quadratic:
     """The sum of two costs."""
     return Quadratic(*(a + b for a, b in zip(first, second, strict=True)))
 
@@ -110,7 +110,7 @@ def linearized(of: Quadratic) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
     return curvature, jnp.concatenate([of.cross[:, 0] - of.shift_slope, turning[None]])
 
 
-def least(of: Quadratic) -> Float[Array, "3"]:
+def minimizer(of: Quadratic) -> Float[Array, "3"]:
     """The motion (t, θ) of the least cost, exactly.
 
     The minimum over t is at A t = a - B r; what remains is min rᵀ S r + hᵀ r over |r| = 1, S = D -
@@ -130,12 +130,12 @@ def least(of: Quadratic) -> Float[Array, "3"]:
     eye = jnp.eye(2, dtype=of.shift.dtype)
     pull = float(jnp.finfo(of.shift.dtype).eps) ** 0.75
 
-    def pulled(matrix: Array) -> Array:
+    def pull_of(matrix: Array) -> Array:
         trace = jnp.trace(matrix)
         return jnp.asarray(pull * jnp.where(trace > 0, trace, 1.0))
 
-    turn_pull = pulled(of.turn)
-    inverse = linalg.inverse(of.shift + pulled(of.shift) * eye)
+    turn_pull = pull_of(of.turn)
+    inverse = linalg.inverse(of.shift + pull_of(of.shift) * eye)
     s = linalg.symmetrize(of.turn + turn_pull * eye - of.cross.T @ inverse @ of.cross)
     # The pull is towards r = (1, 0), no turn, and t = 0.
     h = -2 * (of.turn_slope + turn_pull * eye[0] - of.cross.T @ inverse @ of.shift_slope)
@@ -145,7 +145,7 @@ def least(of: Quadratic) -> Float[Array, "3"]:
 
 
 def _on_circle(s: Float[Array, "2 2"], h: Float[Array, "2"]) -> Float[Array, "2"]:
-    """The unit vector r of the least rᵀ S r + hᵀ r, by the secular equation of `least`."""
+    """The unit vector r of the least rᵀ S r + hᵀ r, by the secular equation of `minimizer`."""
     mean, half, off = 0.5 * (s[0, 0] + s[1, 1]), 0.5 * (s[0, 0] - s[1, 1]), s[0, 1]
     square = half**2 + off**2
     apart = square > 0

@@ -17,12 +17,12 @@ from jaxslam.laser.matching._outcome import (
     Limits,
     Pairs,
     SearchEnd,
-    determined,
     fuse_prior,
     information_of,
     length_of,
     make_match,
     mean_score,
+    project_to_determined,
 )
 from jaxslam.laser.matching._point_sets import Points, Prior, prior_cost, prior_terms
 from jaxslam.laser.matching._surfaces import surface, surface_information, weights
@@ -118,9 +118,9 @@ class FieldMatcher(Matcher):
 
         def onto_of(pose: Array, at: _Linearization) -> Array:
             information = surface_information(lines, pose, at.weight)
-            return determined(information, length, matcher.least_condition)
+            return project_to_determined(information, length, matcher.least_condition)
 
-        def moved(pose: Array, move: Array) -> Array:
+        def move_pose(pose: Array, move: Array) -> Array:
             return jnp.concatenate([pose[:2] + move[:2], wrap(pose[2] + move[2])[None]])
 
         def step(state: _State) -> _State:
@@ -133,7 +133,7 @@ class FieldMatcher(Matcher):
             onto = onto_of(pose, at)
             curvature, slope = fuse_prior(damped, at.slope, prior_terms(prior, pose), onto, length)
             move, _ = linalg.solve_psd(curvature, -slope)
-            tried = moved(pose, move)
+            tried = move_pose(pose, move)
             trial = matcher._linearize(prepared, points, tried, prior)
             # A refused step counts as small as well: then μ is so large that no step helps.
             better = trial.cost < at.cost
@@ -154,7 +154,7 @@ class FieldMatcher(Matcher):
             held = jnp.diag(jnp.stack([jnp.ones_like(length), jnp.ones_like(length), length**2]))
             terms = free.T @ information @ free, free.T @ slope
             curvature, slope = fuse_prior(held, 0 * slope, terms, onto, length)
-            begin = moved(start, linalg.solve_psd(curvature, -slope)[0])
+            begin = move_pose(start, linalg.solve_psd(curvature, -slope)[0])
         first = (
             jnp.zeros((), jnp.int32),
             begin,

@@ -14,9 +14,9 @@ from jaxslam.core._record import record, static
 from jaxslam.graphs._solver.kernels import Kernel
 from jaxslam.laser.matching._closed_form import (
     Quadratic,
-    added,
-    least,
+    add,
     linearized,
+    minimizer,
     of_lines,
     of_points,
     of_prior,
@@ -26,12 +26,12 @@ from jaxslam.laser.matching._outcome import (
     Limits,
     Pairs,
     SearchEnd,
-    determined,
     fuse_prior,
     information_along,
     length_of,
     make_match,
     mean_score,
+    project_to_determined,
 )
 from jaxslam.laser.matching._point_sets import Points, Prior, prior_cost, prior_terms
 from jaxslam.laser.matching._surfaces import GAP, SPAN, Surface, nearest_points, surface, weights
@@ -174,13 +174,13 @@ class Icp(Matcher):
             quadratic = icp.quadratic(prepared, pairs, middle)
             with_prior = quadratic
             if prior is not None:
-                with_prior = added(quadratic, of_prior(prior, pose, middle))
+                with_prior = add(quadratic, of_prior(prior, pose, middle))
             information = _information(prepared, pairs, pose[:2], settings.lone)
-            onto = determined(information, length, limits.condition)
+            onto = project_to_determined(information, length, limits.condition)
             # The exact step where the scans determine all of it, else that of Gauss and Newton.
             moved = jnp.where(
                 (onto == jnp.eye(3, dtype=onto.dtype)).all(),
-                least(with_prior),
+                minimizer(with_prior),
                 step_within(quadratic, middle, onto, pose),
             )
             # The motion turns about the middle: p ← R (p - m) + m + t.
@@ -260,7 +260,7 @@ def _information(
 class PointToPoint(Icp):
     """ICP: the pose that minimizes Σ w |T ∘ p_i - q_j(i)|², q_j(i) the nearest point.
 
-    Each step is the exact minimum for its pairs (`closed_form.least`); its error falls by a
+    Each step is the exact minimum for its pairs (`closed_form.minimizer`); its error falls by a
     constant factor a step. Besl & McKay 1992, "A method for registration of 3-D shapes", IEEE
     PAMI 14; Lu & Milios 1997. Lines serve only the status.
     """
@@ -294,7 +294,7 @@ class PointToLine(Icp):
     """PL-ICP: the pose that minimizes Σ w (n_j · (T ∘ p_i - m_j))², j(i) the nearest point.
 
     The line (m_j, n_j) is fitted to point j of the reference and its neighbours (`Surface`); each
-    step is the exact minimum for its pairs (`closed_form.least`), so that it converges
+    step is the exact minimum for its pairs (`closed_form.minimizer`), so that it converges
     quadratically. Censi 2008, "An ICP variant using a point-to-line metric", ICRA, where the line
     joins the two nearest points. Without a line, the residual is `lone` |T ∘ p_i - q_j|.
     """
@@ -323,7 +323,7 @@ class PointToLine(Icp):
         if lone is None:
             return lines
         points = of_points(source, about(of.position[j], by_point), lone**2 * by_point)
-        return added(lines, points)
+        return add(lines, points)
 
     def cost_of_pairs(
         self, of: Surface, moved: Array, partner: Array, weight: Array

@@ -88,7 +88,7 @@ def make_match(
         information=information,
         weakest=weakest,
         condition=condition,
-        determined=determined(information, length, limits.condition),
+        determined=project_to_determined(information, length, limits.condition),
         pair=jnp.where(took_part, jnp.asarray(pairs.partner, jnp.int32), -1),
         weight=pairs.weight,
         prior=prior,
@@ -154,7 +154,7 @@ def _weakest_direction(
     return jnp.where(positive, condition, 0.0), eigenvector(a, least) * scale
 
 
-def determined(
+def project_to_determined(
     information: Float[Array, "3 3"], length: Float[Array, ""], least: Number | None
 ) -> Float[Array, "3 3"]:
     """The projection D of a motion onto the determined directions; the identity if `least` is None.
@@ -198,8 +198,8 @@ def fuse_prior(
 ) -> tuple[Float[Array, "3 3"], Float[Array, "3"]]:
     """The curvature Dᵀ A D + Λ and the slope Dᵀ g + Λ e of a step with a prior.
 
-    What the scans do not determine (D of `determined`) is the prior's alone, however little it
-    says.
+    What the scans do not determine (D of `project_to_determined`) is the prior's alone, however
+    little it says.
 
     Args:
         curvature, slope: A and g, of the scans.

@@ -92,8 +92,10 @@ def surface(
     direction = 0.5 * jnp.arctan2(cross, flat)
     largest, least = 0.5 * (xx + yy + root), jnp.maximum(0.5 * (xx + yy - root), 0.0)
     variance = least / jnp.maximum(n - 2, 1)
-    # A threshold: no derivative goes through the median.
-    usual = jax.lax.stop_gradient(_median(variance, ~has_no_line))
+    # The median of the points with a line; a threshold, through which no derivative goes.
+    ordered = jnp.sort(jnp.where(has_no_line, jnp.inf, variance))
+    usual = ordered[jnp.maximum((~has_no_line).sum() - 1, 0) // 2]
+    usual = jax.lax.stop_gradient(jnp.where((~has_no_line).any(), usual, 0.0))
     return Surface(
         position=jnp.where(valid[:, None], p, _FAR),
         middle=jnp.where(has_no_line[:, None], p, middle),
@@ -120,13 +122,6 @@ def surface_information(
     turn = se2.rotation(pose[2]).T
     arm = jnp.where((weight > 0)[:, None], of.position @ turn, 0.0)
     return information_along(of.normal @ turn, of.tilt, arm, jnp.where(of.straight, weight, 0.0))
-
-
-def _median(values: Float[Array, "M"], valid: Bool[Array, "M"]) -> Float[Array, ""]:
-    """The median of the valid values; 0 without a valid value."""
-    ordered = jnp.sort(jnp.where(valid, values, jnp.inf))
-    middle = ordered[jnp.maximum(valid.sum() - 1, 0) // 2]
-    return jnp.where(valid.any(), middle, 0.0)
 
 
 _FAR = 1e6

@@ -73,7 +73,7 @@ def _thin(
     kept: never removed; with `ends`, neither are cells with one neighbour or none.
     """
     width = cells.shape[1]
-    flat, table = cells.reshape(-1), _removable(ends)
+    flat, table = cells.reshape(-1), _removal_table(ends)
     steps = [i * width + j for i, j in _AROUND]
     candidates = np.flatnonzero(cells & ~kept)
     candidates = candidates[np.argsort(away.reshape(-1)[candidates], kind="stable")]
@@ -96,7 +96,7 @@ def _thin(
     flat[:] = np.frombuffer(bytes(present), np.uint8) > 0
 
 
-def _removable(ends: bool) -> list[bool]:
+def _removal_table(ends: bool) -> list[bool]:
     """Whether a cell can go without a change of topology, by the code of its eight neighbours.
 
     Bit k of the code is neighbour k of `_AROUND`. It can if Yokoi's number for 8-connected cells is

@@ -54,7 +54,7 @@ def cholesky(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Arr
     if n == 0:
         return matrix, jnp.asarray(True)
     if n > UNROLLED:
-        factor = _factor(mirrored(matrix))
+        factor = _factor(mirror(matrix))
         return factor, factor[0, 0] > 0
     return _cholesky(matrix)
 
@@ -91,12 +91,12 @@ def _cholesky_slope(primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
     good = jnp.diagonal(factor) > 0
     # 1 on the diagonal of a zero column, so that L is regular; its slope is masked below.
     regular = factor + jnp.diag((~good).astype(factor.dtype))
-    inner = solve_lower(regular, solve_lower(regular, mirrored(tangents[0])).T)
+    inner = solve_lower(regular, solve_lower(regular, mirror(tangents[0])).T)
     slope = regular @ jnp.where(good, lower_half(inner), 0.0)
     return (factor, positive), (slope, np.zeros(positive.shape, jax.dtypes.float0))
 
 
-def mirrored(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
+def mirror(matrix: Float[Array, "*batch n n"]) -> Float[Array, "*batch n n"]:
     """The symmetric matrix with this lower triangle."""
     return jnp.tril(matrix) + jnp.tril(matrix, -1).T
 

@@ -11,7 +11,7 @@ from jaxslam.math._linalg.factors import (
     UNROLLED,
     cholesky,
     lower_half,
-    mirrored,
+    mirror,
     pivot_tolerance,
     solve_lower,
 )
@@ -55,7 +55,7 @@ def whitener(matrix: Float[Array, "n n"]) -> tuple[Float[Array, "n n"], Bool[Arr
 def _whitener_slope(primals: PyTree, tangents: PyTree) -> tuple[PyTree, PyTree]:
     """dW = -Φ(W dA Wᵀ) W, with rows and columns of zeros where a pivot is zero."""
     white, positive = whitener(*primals)
-    slope = -lower_half(white @ mirrored(tangents[0]) @ white.T) @ white
+    slope = -lower_half(white @ mirror(tangents[0]) @ white.T) @ white
     return (white, positive), (slope, np.zeros(positive.shape, jax.dtypes.float0))
 
 

@@ -105,14 +105,14 @@ def webmap(steps: int | None = None, loops: int = 2) -> Scenario:
         controls=controls.reshape(len(scans), -1),
         pose=path[0],
         noise_on="odometry",
-        visible=_visible,
+        visible=_is_visible,
         places=fullest,
         filter_options={"correction": "joint"},
         source='after Bailey et al., "Consistency of the EKF-SLAM Algorithm", IROS 2006; our map',
     )
 
 
-def _visible(pose: jax.Array, landmark: jax.Array) -> jax.Array:
+def _is_visible(pose: jax.Array, landmark: jax.Array) -> jax.Array:
     """The field of view: within 30 m, in the half-plane ahead of the robot."""
     dx, dy = landmark[0] - pose[0], landmark[1] - pose[1]
     ahead = dx * jnp.cos(pose[2]) + dy * jnp.sin(pose[2]) > 0

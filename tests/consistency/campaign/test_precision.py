@@ -164,9 +164,9 @@ def test_what_depends_on_its_place_is_not_moved():
         "a state": (filters.StartingAt(EKF, state), False),
     }
     for name, (what, moves) in (worlds | of_models | others).items():
-        assert (_origin.moved(what, UTM) is not None) == moves, name
+        assert (_origin.move_near_origin(what, UTM) is not None) == moves, name
     known = filters.Localization(FAR.motion, FAR.sensor, FAR.landmarks)
-    np.testing.assert_allclose(_origin.moved(known, UTM).landmarks, POINTS, atol=1e-8)
+    np.testing.assert_allclose(_origin.move_near_origin(known, UTM).landmarks, POINTS, atol=1e-8)
 
 
 def north(pose, landmark):

@@ -511,7 +511,7 @@ def seen(pose, walls=WALLS, beams=BEAMS):
 
 @pytest.fixture(scope="module")
 def through():
-    program = jax.jit(_odometry.reference._seen_through)
+    program = jax.jit(_odometry.reference._share_seen_through)
 
     def of(scan, pose, reference=None):
         surface = seen((0.0, 0.0, 0.0)) if reference is None else reference

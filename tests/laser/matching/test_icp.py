@@ -16,7 +16,7 @@ from jaxslam import matching
 from jaxslam.core.types import Beams
 from jaxslam.graphs import Huber
 from jaxslam.laser.matching import IcpSettings, MatchStatus, Points, Prior, _point_sets
-from jaxslam.laser.matching._closed_form import added, least, of_lines, of_points, of_prior
+from jaxslam.laser.matching._closed_form import add, minimizer, of_lines, of_points, of_prior
 
 COUNT, GOOD = 8, 4
 SPAN, GAP, REACH = 2, 0.8, 0.5
@@ -298,11 +298,11 @@ def clouds():
 
 
 def align_to_lines(*given):
-    return least(of_lines(*given))
+    return minimizer(of_lines(*given))
 
 
 def align_points(*given):
-    return least(of_points(*given))
+    return minimizer(of_points(*given))
 
 
 def test_a_prior_is_a_term_of_the_cost():
@@ -314,8 +314,8 @@ def test_a_prior_is_a_term_of_the_cost():
 
     @jax.jit
     def found(prior):
-        both = added(of_lines(source, target, normal, weight), of_prior(prior, pose, middle))
-        return least(both)
+        both = add(of_lines(source, target, normal, weight), of_prior(prior, pose, middle))
+        return minimizer(both)
 
     arm = pose[:2] - middle
     best = np.inf, None

@@ -61,7 +61,7 @@ class LikelihoodField(BeamModel):
 
     def log_likelihoods(self, prepared: PyTree, pose: Array, beams: Beams) -> Float[Array, "B"]:
         far, ends = self._ends(pose, beams)
-        log_near = jnp.log(self._total(self._near(interpolate(prepared, ends))))
+        log_near = jnp.log(self._density(self._hit_density(interpolate(prepared, ends))))
         maximum = jnp.asarray(self.maximum)
         # A weight of 0 is left out (log 1), and its logarithm must have a finite derivative.
         silent = maximum == 0
@@ -72,8 +72,8 @@ class LikelihoodField(BeamModel):
         # log(n + r) by d is -n d/σ²/(n + r); the end moves by dt, and by dθ across the arm to it.
         far, ends = self._ends(pose, beams)
         d = interpolate(prepared, ends)
-        near, sigma = self._near(d), jnp.asarray(self.sigma, d.dtype)
-        by_end = (-near * d / sigma**2 / self._total(near))[:, None] * slope(prepared, ends)
+        near, sigma = self._hit_density(d), jnp.asarray(self.sigma, d.dtype)
+        by_end = (-near * d / sigma**2 / self._density(near))[:, None] * slope(prepared, ends)
         arm = ends - pose[None, :2]
         turning = by_end[:, 1] * arm[:, 0] - by_end[:, 0] * arm[:, 1]
         return jnp.where(far[:, None], 0.0, jnp.concatenate([by_end, turning[:, None]], axis=1))
@@ -89,12 +89,12 @@ class LikelihoodField(BeamModel):
         ends = jnp.stack([eye[0] + c * ahead - s * left, eye[1] + s * ahead + c * left], -1)
         return far, ends
 
-    def _near(self, d: Float[Array, "B"]) -> Float[Array, "B"]:
+    def _hit_density(self, d: Float[Array, "B"]) -> Float[Array, "B"]:
         """hit · N(d; 0, σ²)."""
         hit, sigma = jnp.asarray(self.hit, d.dtype), jnp.asarray(self.sigma, d.dtype)
         return hit * jnp.exp(-0.5 * (d / sigma) ** 2) / (sigma * math.sqrt(2 * math.pi))
 
-    def _total(self, near: Float[Array, "B"]) -> Float[Array, "B"]:
+    def _density(self, near: Float[Array, "B"]) -> Float[Array, "B"]:
         """The density with random/max_range; never 0, so that its logarithm is finite."""
         anywhere = jnp.asarray(self.random, near.dtype) / jnp.asarray(self.max_range, near.dtype)
         return jnp.maximum(near + anywhere, jnp.finfo(near.dtype).tiny)

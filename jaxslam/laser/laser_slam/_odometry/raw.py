@@ -118,7 +118,7 @@ def steps_of(
     frozen[0] = False
     duration = np.zeros(len(raw)) if time is None else np.diff(time, prepend=time[:1])
     size = np.stack([np.hypot(step[:, 0], step[:, 1]), np.abs(step[:, 2])], axis=1)
-    usual_reach, lags, odd = _by_speeds(size, duration, jump | frozen)
+    usual_reach, lags, odd = _judge_speeds(size, duration, jump | frozen)
     reach = np.where(odd[:, None], FARTHEST, usual_reach)
     # A frozen step has no length, unless a reader marked a jump between two messages, of which the
     # step is a part.
@@ -144,7 +144,7 @@ def reach_cov(reach: Float[np.ndarray, "... 2"]) -> Float[np.ndarray, "... 3 3"]
     return np.asarray(sigma[..., None] ** 2 * np.eye(3))
 
 
-def _by_speeds(
+def _judge_speeds(
     size: Float[np.ndarray, "K 2"], duration: Float[np.ndarray, "K"], useless: np.ndarray
 ) -> tuple[Float[np.ndarray, "K 2"], Bool[np.ndarray, "K"], Bool[np.ndarray, "K"]]:
     """The largest distance and turn of the robot in each step, which steps lag, and which are odd.

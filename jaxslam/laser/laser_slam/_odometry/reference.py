@@ -229,12 +229,12 @@ def _match(
     refined: Match = WALLS.match(reference.surface, scan, searched.pose, fine)
     refined = _NEAR_WALLS.match(reference.surface, scan, refined.pose, fine)
     ambiguous = (searched.status == MatchStatus.AMBIGUOUS).astype(guess.dtype)
-    through = _seen_through(reference.points, scan, refined.pose)
+    through = _share_seen_through(reference.points, scan, refined.pose)
     scores = jnp.stack([refined.inliers, refined.residual, ambiguous, through])
     return jnp.concatenate([refined.pose, refined.information.reshape(-1), scores])
 
 
-def _seen_through(reference: Points, scan: Points, pose: Array) -> Array:
+def _share_seen_through(reference: Points, scan: Points, pose: Array) -> Array:
     """The share of the reference's points in view that lie in front of the scan's points.
 
     At the right pose the beams of a scan pass through no wall of the reference, except for objects

@@ -427,7 +427,11 @@ def _match_about(
             wide_cov = _INFLATION * prior_cov + bound
             wide = match(FAR, reference, points, guess.pose, wide_cov, NO_FLOOR, settings)
             better = _is_sure(wide) and _quality(wide) > _quality(fit) + _MIN_GAIN
-            if better and _is_within_reach(wide.pose, guess, raw.reach):
+            # Raw odometry may be off by the robot's reach plus 2 σ of its own.
+            off, sigma = poses.between(guess.pose, wide.pose), np.sqrt(guess.cov.diagonal())
+            near = np.hypot(off[0], off[1]) <= raw.reach[0] + 2 * sigma[:2].max()
+            near = near and abs(off[2]) <= raw.reach[1] + 2 * sigma[2]
+            if better and near:
                 fit = wide
                 prior_cov = prior_cov + bound if raw.gap else prior_cov
         accepted = _is_likely(fit)
@@ -458,15 +462,6 @@ def _is_likely(fit: ScanMatch) -> bool:
 def _is_sure(fit: ScanMatch) -> bool:
     """Whether a match may be believed without raw odometry: as good as that of a loop."""
     return fit.inliers >= LOOP_INLIERS and fit.through <= _MAX_THROUGH and not fit.ambiguous
-
-
-def _is_within_reach(
-    pose: Float[np.ndarray, "3"], guess: RelativeEstimate, reach: Float[np.ndarray, "2"]
-) -> bool:
-    """Whether raw odometry is off by no more than the robot's reach plus 2 σ of raw odometry."""
-    off, sigma = poses.between(guess.pose, pose), np.sqrt(guess.cov.diagonal())
-    near = np.hypot(off[0], off[1]) <= reach[0] + 2 * sigma[:2].max()
-    return bool(near and abs(off[2]) <= reach[1] + 2 * sigma[2])
 
 
 def _contradicts(pose: Float[np.ndarray, "3"], guess: RelativeEstimate) -> bool:

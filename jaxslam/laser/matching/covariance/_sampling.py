@@ -160,8 +160,13 @@ class Sampling(MatchCovariance):
             begin = start + root @ jax.random.normal(key_start, (3,), dtype)
             prior = match.prior
             if prior is not None:
-                spread = sigma * _inverse_root(prior.information)
-                drawn = spread @ jax.random.normal(key_prior, (3,), dtype)
+                # The root Wᵀ with WᵀW = (Λ + 1e-6 tr(Λ) I)⁻¹, which is finite if Λ is singular.
+                floor = 1e-6 * jnp.trace(prior.information)
+                floor = jnp.where(floor > 0, floor, 1.0) * jnp.eye(3, dtype=prior.information.dtype)
+                information = linalg.symmetrize(prior.information) + floor
+                drawn = (sigma * linalg.whitener(information)[0].T) @ jax.random.normal(
+                    key_prior, (3,), dtype
+                )
                 prior = prior._replace(pose=prior.pose + drawn)
             return matcher.match(matcher.prepare(noisy), scan, begin, prior).pose
 
@@ -173,13 +178,6 @@ class Sampling(MatchCovariance):
 def _hold_start_cov(of: Unscented | Sampling) -> None:
     check_covariance(type(of).__name__, of.start_cov, 3)
     set_field(of, "start_cov", held_array(of.start_cov))
-
-
-def _inverse_root(information: Float[Array, "3 3"]) -> Float[Array, "3 3"]:
-    """The root Wᵀ with WᵀW = (Λ + 1e-6 tr(Λ) I)⁻¹, which is finite if Λ is singular."""
-    floor = 1e-6 * jnp.trace(information)
-    floor = jnp.where(floor > 0, floor, 1.0) * jnp.eye(3, dtype=information.dtype)
-    return linalg.whitener(linalg.symmetrize(information) + floor)[0].T
 
 
 def _pose_differences(poses: Float[Array, "S 3"], middle: Float[Array, "3"]) -> Float[Array, "S 3"]:
