@@ -14,7 +14,7 @@ import numpy as np
 from jaxslam.calibration import delayed
 from jaxslam.core._units import TURN, are_headings_in_degrees
 from jaxslam.core.logs import _tables as tables
-from jaxslam.core.logs._streams import is_gap, known_poses
+from jaxslam.core.logs._streams import is_gap, known_poses, true_path_faults
 from jaxslam.core.logs._tables import POSE, TAG, TIME, UNITS, Columns, split_unit, unit_divisor
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import Log
@@ -302,6 +302,9 @@ def _number(cell: str) -> float:
 
 ODOMETRY, MEASUREMENTS = "odometry.csv", "measurements.csv"
 
+_LATEST = 1e11
+"""Stamp [s] that no clock has; milliseconds since 1970 are above 1e12."""
+
 _MAX_SHARE_OF_LARGEST = 0.01
 """Share of ranges that equal the largest one, above which a note asks for `max_range`: of a
 continuous measurement hardly two are equal."""
@@ -340,8 +343,9 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
     settings have defaults, listed in `Dataset.assumed`. The log is `Log.from_records`. The
     noise of the motion is that of a line of odometry; a row that is shorter or longer has white
     noise of the same density. The true pose of a row is interpolated between two lines of the
-    truth, but not in a gap, an interval above ten times their median: there, and before and after
-    the truth, it is unknown (`Dataset.true_at`). The start is that of the truth if it covers the
+    truth, but not in a gap, an interval above ten times their median, nor over a jump, nor where a
+    tracker repeats a pose beside a jump: there, and before and after the truth, it is unknown
+    (`Dataset.true_at`). The start is that of the truth if it covers the
     first row; then all is in one frame. Other columns are not used, and listed. A CSV file may be
     packed by gzip, as `truth.csv.gz`; of both the plain one is read.
 
@@ -390,7 +394,8 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
     ]
     from_poses = odometry_names[1:] == POSE
     notes += _odometry_notes(odometry, odometry_file.path.name, from_poses)
-    notes += [note for columns in (odometry, measurements) if (note := _beyond_a_turn(columns))]
+    for columns in (odometry, measurements):
+        notes += filter(None, (_beyond_a_turn(columns), _late_stamps(columns)))
     if "range [m]" in measurements.columns and not np.isfinite(max_range):
         ranges = measurements.columns["range [m]"]
         largest = int((ranges == ranges.max()).sum())
@@ -538,6 +543,18 @@ def _beyond_a_turn(table: Columns[int | str]) -> str:
     return ""
 
 
+def _late_stamps(table: Columns[int | str]) -> str:
+    """A note on stamps of [s] that are later than `_LATEST`."""
+    when = table.columns[TIME]
+    if not (when > _LATEST).any():
+        return ""
+    row = int(np.argmax(when))
+    return (
+        f"{table.at(row, TIME)}: {when[row]:.6g} s is over three thousand years since 1970: "
+        "milliseconds, microseconds or nanoseconds? then write [ms], [us] or [ns] in the header"
+    )
+
+
 def _survey(path: Path, notes: list[str]) -> dict[int | str, tuple[float, float]] | None:
     """The position of each tag, and notes added; None without a file."""
     if stored_file(path) is None:
@@ -575,10 +592,22 @@ def _truth(path: Path, time: np.ndarray) -> tuple[np.ndarray | None, np.ndarray 
         notes.append(f"{file.path.name}: {lost:,} of {len(pose):,} lines have no pose")
     if gap := _longest_gap(columns):
         notes.append(f"{gap}: no pose is interpolated over it")
+    jump, repeated = true_path_faults(clock, pose)
+    if jump.any():
+        k = int(np.argmax(jump))
+        length, turn = step_sizes(pose[k - 1 : k + 1])[1]
+        notes.append(
+            f"{columns.at(k, POSE[0])}: a jump by {length:.3g} m and {np.rad2deg(turn):.3g}° in "
+            f"{clock[k] - clock[k - 1]:.3g} s is no motion, {int(jump.sum()):,} in all: no pose is "
+            "interpolated over it"
+            + f"; {int(repeated.sum()):,} lines beside jumps repeat a pose and are not used"
+            * bool(repeated.any())
+        )
     if unknown := int((~true_at).sum()):
         notes.append(
             f"{unknown:,} of {len(time):,} rows have no true pose: before the first or after the "
-            f"last line of {file.path.name}, in a gap of it, or beside a line without a pose"
+            f"last line of {file.path.name}, in a gap or a jump of it, or beside a line without a "
+            "pose"
         )
     if are_headings_in_degrees(pose):
         notes.append(f"{file.path.name}: {_DEGREES_OF_PATH}")
