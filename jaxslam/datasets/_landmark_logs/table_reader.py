@@ -12,7 +12,7 @@ import jax
 import numpy as np
 
 from jaxslam.calibration import delayed
-from jaxslam.core._units import TURN, are_headings_in_degrees
+from jaxslam.core._units import are_headings_in_degrees
 from jaxslam.core.logs import _tables as tables
 from jaxslam.core.logs._streams import is_gap, known_poses, true_path_faults
 from jaxslam.core.logs._tables import POSE, TAG, TIME, UNITS, Columns, split_unit, unit_divisor
@@ -26,7 +26,7 @@ from jaxslam.datasets._landmark_logs.table_settings import (
     TableSettings,
 )
 from jaxslam.datasets._lines import DIGITS, LARGEST, none_left, read_bytes, stored_file
-from jaxslam.math._odometry_jumps import odometry_jumps, step_sizes, without_jumps
+from jaxslam.math._odometry_jumps import step_sizes
 
 MISSING = frozenset(
     {"", "nan", "-nan", "<na>", "na", "n/a", "#n/a", "#na", "null", "none"}
@@ -302,9 +302,6 @@ def _number(cell: str) -> float:
 
 ODOMETRY, MEASUREMENTS = "odometry.csv", "measurements.csv"
 
-_LATEST = 1e11
-"""Stamp [s] that no clock has; milliseconds since 1970 are above 1e12."""
-
 _MAX_SHARE_OF_LARGEST = 0.01
 """Share of ranges that equal the largest one, above which a note asks for `max_range`: of a
 continuous measurement hardly two are equal."""
@@ -393,9 +390,9 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
         for column in file.unused(names)
     ]
     from_poses = odometry_names[1:] == POSE
-    notes += _odometry_notes(odometry, odometry_file.path.name, from_poses)
+    notes += _odometry_notes(odometry, from_poses)
     for columns in (odometry, measurements):
-        notes += filter(None, (_beyond_a_turn(columns), _late_stamps(columns)))
+        notes += [f"{note} in the header" for note in tables.wrong_units(columns)]
     if "range [m]" in measurements.columns and not np.isfinite(max_range):
         ranges = measurements.columns["range [m]"]
         largest = int((ranges == ranges.max()).sum())
@@ -458,28 +455,14 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
     )
 
 
-def _odometry_notes(odometry: Columns[int | str], file_name: str, from_poses: bool) -> list[str]:
-    """Replace jumps of the path of odometry, if it is one; notes on jumps, degrees and gaps.
+def _odometry_notes(odometry: Columns[int | str], from_poses: bool) -> list[str]:
+    """Replace jumps of the path of odometry, if it is one; notes on jumps and gaps.
 
     from_poses: whether the controls are increments between poses.
     """
     notes = []
-    clock = odometry.columns[TIME]
-    if from_poses and are_headings_in_degrees(odometry.values(POSE)):
-        notes.append(f"{file_name}: {_DEGREES_OF_PATH}")
-    if set(POSE) <= set(odometry.columns):
-        path = odometry.values(POSE)
-        jumps = odometry_jumps(path, clock)
-        if jumps.any():
-            k = int(np.argmax(jumps))
-            length, turn = step_sizes(path)[k]
-            notes.append(
-                f"{odometry.at(k, POSE[0])}: a jump of the odometry by {length:.3g} m and "
-                f"{np.rad2deg(turn):.3g}° in {clock[k] - clock[k - 1]:.3g} s is no motion, "
-                f"{int(jumps.sum()):,} in all: the step before it takes its place"
-            )
-            for name, column in zip(POSE, without_jumps(path, jumps).T, strict=True):
-                odometry.columns[name] = column
+    if jump := tables.replace_jumps(odometry):
+        notes.append(jump)
     if gap := _longest_gap(odometry):
         rule = (
             "no pose is interpolated over" if from_poses else "the odometry is taken to hold over"
@@ -510,12 +493,6 @@ def _adjustable(
     return Adjustable(parameters, at)
 
 
-_DEGREES_OF_PATH = (
-    "theta [rad] contradicts the directions between the positions, which fit it as degrees: "
-    "write [deg] in the header"
-)
-
-
 def _longest_gap(table: Columns[int | str]) -> str:
     """The place and the length of the longest gap between lines; empty without one."""
     clock = table.columns[TIME]
@@ -526,32 +503,6 @@ def _longest_gap(table: Columns[int | str]) -> str:
     return (
         f"{table.at(k + 1, TIME)}: {steps[k]:.6g} s since the line before, the median is "
         f"{np.median(steps):.6g} s"
-    )
-
-
-def _beyond_a_turn(table: Columns[int | str]) -> str:
-    """A note on a column of [rad] or [rad/s], but for headings, with numbers beyond 2π."""
-    for name, values in table.columns.items():
-        unit = split_unit(name)[1] or ""
-        beyond = np.abs(values) > TURN
-        if unit in ("rad", "rad/s") and name != POSE[2] and beyond.any():
-            row, degrees = int(np.argmax(np.abs(values))), unit.replace("rad", "deg")
-            return (
-                f"{table.at(row, name)}: {int(beyond.sum()):,} of {len(values):,} numbers are "
-                f"beyond 2π, up to {values[row]:.6g}: degrees? then write [{degrees}] in the header"
-            )
-    return ""
-
-
-def _late_stamps(table: Columns[int | str]) -> str:
-    """A note on stamps of [s] that are later than `_LATEST`."""
-    when = table.columns[TIME]
-    if not (when > _LATEST).any():
-        return ""
-    row = int(np.argmax(when))
-    return (
-        f"{table.at(row, TIME)}: {when[row]:.6g} s is over three thousand years since 1970: "
-        "milliseconds, microseconds or nanoseconds? then write [ms], [us] or [ns] in the header"
     )
 
 
@@ -610,5 +561,5 @@ def _truth(path: Path, time: np.ndarray) -> tuple[np.ndarray | None, np.ndarray 
             "pose"
         )
     if are_headings_in_degrees(pose):
-        notes.append(f"{file.path.name}: {_DEGREES_OF_PATH}")
+        notes.append(f"{file.path.name}: {tables.DEGREES_OF_PATH} in the header")
     return true_path, true_at, notes
