@@ -102,7 +102,7 @@ class Loaded(NamedTuple):
             for angle in (table.z[:, -1],)
             if key != "relative_position" and (beyond := np.abs(angle) > TURN).any()
         ]
-        if not self.placed and are_headings_in_degrees(self.graph.poses):
+        if not self.placed and are_headings_in_degrees(np.asarray(self.graph.poses)):
             notes.append(
                 "headings of the poses contradict the directions between successive positions, "
                 "which fit them as degrees: write radians"

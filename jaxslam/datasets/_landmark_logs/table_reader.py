@@ -391,8 +391,11 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
     ]
     from_poses = odometry_names[1:] == POSE
     notes += _odometry_notes(odometry, from_poses)
-    for columns in (odometry, measurements):
-        notes += [f"{note} in the header" for note in tables.wrong_units(columns)]
+    notes += [
+        f"{sign} in the header"
+        for part in (odometry, measurements)
+        for sign in tables.wrong_units(part)
+    ]
     if "range [m]" in measurements.columns and not np.isfinite(max_range):
         ranges = measurements.columns["range [m]"]
         largest = int((ranges == ranges.max()).sum())
