@@ -366,6 +366,7 @@ def summarize(plan: OptimizePlan, optimum: Optimum, command: str) -> Json:
         "edges": {key: int(table.valid.sum()) for key, table in graph.tables.items()},
         "skipped lines": problem.loaded.skipped,
         "placed along the edges": problem.loaded.placed,
+        **({"notes": "; ".join(notes)} if (notes := problem.loaded.notes) else {}),
         "gauge": gauge,
         "start": optimum.start,
         "kernel": plan.kernel or "none",

@@ -4,6 +4,7 @@ Where a record has the field, its check is declared beside it (`core.validation`
 """
 
 import math
+from numbers import Integral
 from typing import Any
 
 import jax
@@ -39,6 +40,7 @@ __all__ = [
     "held_array",
     "is_concrete",
     "is_number",
+    "is_whole",
     "largest",
     "shape_text",
 ]
@@ -50,6 +52,11 @@ def is_number(value: object) -> bool:
         return isinstance(value, int | float) and type(value) is not bool and math.isfinite(value)
     except OverflowError:  # a whole number that no float holds
         return False
+
+
+def is_whole(value: object) -> bool:
+    """Whether a value is a whole number of Python or NumPy; a bool is none."""
+    return isinstance(value, Integral) and not isinstance(value, bool)
 
 
 def largest(*values: ArrayLike) -> float:

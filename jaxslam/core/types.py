@@ -5,6 +5,7 @@ T steps, M measurement slots a step, N landmark slots, Z measurement size, L lan
 Masks and status codes, never NaN, mark absent data.
 """
 
+import warnings
 from collections.abc import Sequence
 from enum import IntEnum
 from typing import NamedTuple, TypeAlias
@@ -152,6 +153,10 @@ class Log(NamedTuple):
             ValueError: with row and column, on a missing column, a value that is not finite,
                 times that go back (of odometry: or repeat), a tag twice at a time, or more
                 measurements at a time than the suite has slots.
+        Warns:
+            UserWarning: on angles or turn rates beyond 2π, which may be in degrees, on stamps that
+                may be in milliseconds or nanoseconds, and on jumps of a path of poses, as where
+                odometry was set to zero: the step before a jump takes its place.
         """
         name, controls = "Log.from_records", motion.controls
         moved = tables.columns_of(
@@ -193,6 +198,11 @@ class Log(NamedTuple):
             names = tables.measurement_columns(model.measurements, model.landmark)
             table = tables.columns_of(argument, source, lambda _, names=names: names)  # type: ignore[misc]
             seen.append(tables.Seen(table, model.measurements, places))
+        for table in (moved, *(part.table for part in seen)):
+            for sign in tables.wrong_units(table):
+                warnings.warn(f"{sign} in the column's name", stacklevel=2)
+        if jump := tables.replace_jumps(moved):
+            warnings.warn(jump, stacklevel=2)
         rows, tags, dropped = tables.align_tables(moved, seen, controls)
         return Recording(cls.from_rows(rows), rows.time, tags, dropped)
 

@@ -286,7 +286,7 @@ def prng_key(value: Any) -> Any:
         if shape != ():
             raise ValueError(f"expected one PRNG key, got keys of shape {shape}")
     elif dtype != np.uint32 or shape is None or len(shape) != 1:
-        got = repr(value) if dtype is None else f"an array of {dtype} of shape {shape}"
+        got = describe(value) if dtype is None else f"an array of {dtype} of shape {shape}"
         raise ValueError(f"expected a PRNG key, as jax.random.key(0), got {got}")
     return value
 

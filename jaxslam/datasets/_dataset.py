@@ -71,8 +71,8 @@ class Dataset:
     landmarks: Float[np.ndarray, "N 2"] | None = None
     """surveyed positions [m] by tag, in the frame of the survey (`one_frame`); None if unknown"""
     true_path: Float[np.ndarray, "T 3"] | None = None
-    """true pose at each row [m, m, rad], in the frame of `landmarks`; None if unknown. A row
-    without a true pose (`true_at`) has the last known pose, or the first known one"""
+    """true pose at each row [m, m, rad], in the frame of `landmarks`, NaN in a row without a true
+    pose (`true_at`); None if unknown"""
     true_at: Bool[np.ndarray, "T"] | None = None
     """mask of the rows with a true pose; None if all have one"""
     true_paths: Float[np.ndarray, "R T 3"] | None = None

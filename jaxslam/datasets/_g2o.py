@@ -7,6 +7,7 @@ from typing import NamedTuple
 
 import numpy as np
 
+from jaxslam.core._units import TURN, are_headings_in_degrees
 from jaxslam.datasets._lines import TextFile
 from jaxslam.graphs._checks import check_numbers, is_indefinite
 from jaxslam.graphs._factor import REGISTRY
@@ -91,6 +92,23 @@ class Loaded(NamedTuple):
     placed: int
     """number of poses and points without a line, placed along the edges"""
 
+    @property
+    def notes(self) -> tuple[str, ...]:
+        """Signs that angles are in degrees, one sentence each."""
+        notes = [
+            f"{int(beyond.sum()):,} of {len(angle):,} angles of {key} are beyond 2π, up to "
+            f"{np.abs(angle).max():.6g}: degrees? write radians"
+            for key, table in self.graph.tables.items()
+            for angle in (table.z[:, -1],)
+            if key != "relative_position" and (beyond := np.abs(angle) > TURN).any()
+        ]
+        if not self.placed and are_headings_in_degrees(np.asarray(self.graph.poses)):
+            notes.append(
+                "headings of the poses contradict the directions between successive positions, "
+                "which fit them as degrees: write radians"
+            )
+        return tuple(notes)
+
 
 class _Row(NamedTuple):
     """The line of an edge."""
@@ -117,8 +135,8 @@ def read_graph(path: str | Path) -> Graph:
         EDGE_BEARING_SE2_XY  i l bearing I11                           bearing
 
     Poses and points are in the order of the file; the last five name tables. A line `EQUIV i j` of
-    TORO makes two vertices one: that of the smaller id stays with its pose and has the edges of
-    both, but for edges between them, which are left out.
+    TORO makes two vertices one: that of the smaller id stays with its pose, or that of the vertex
+    that is fixed, and has the edges of both, but for edges between them, which are left out.
     Numbers are those of the file. Comments (`#`), scans (`ROBOTLASER1`), notes (`VERTEX_TAG`,
     `VERTEX_ELLIPSE`) and offsets of sensors (`PARAMS_SE2OFFSET`, to which no edge that is read
     refers) are skipped; the command `jaxslam optimize` counts them. In a file without vertices,
@@ -216,8 +234,9 @@ def _merge(
     """The rows and the fixed vertices of a file in which lines EQUIV i j make vertices one.
 
     Of vertices that are equal, through any number of lines, the one with the smallest id stays with
-    its pose; the others leave `vertices`. An edge within them is left out. Also the counts. Raises
-    ValueError on a vertex that is not in the file, and on a pose that equals a point.
+    its pose, or with that of one that is fixed; the others leave `vertices`. An edge within them is
+    left out. Also the counts. Raises ValueError on a vertex that is not in the file, on a pose that
+    equals a point, and on equal vertices that are fixed at two places.
     """
     kinds = {vertex: kind for kind, named in vertices.items() for vertex in named}
     named = set(kinds) or {vertex for table in rows.values() for row in table for vertex in row.ids}
@@ -238,6 +257,18 @@ def _merge(
         low, high = sorted((smallest(i), smallest(j)))
         if low != high:
             parent[high] = low
+    held: dict[int, int] = {}
+    for line, vertex in fixed:
+        kept_id = smallest(vertex)
+        if (kind := kinds.get(vertex)) is None:
+            continue  # `_assemble` says so
+        named_pose = vertices[kind][vertex]
+        if vertices[kind][held.setdefault(kept_id, vertex)] != named_pose:
+            raise file.error(
+                line, f"vertices {held[kept_id]} and {vertex} are equal, and fixed at two places"
+            )
+    for kept_id, vertex in held.items():
+        vertices[kinds[kept_id]][kept_id] = vertices[kinds[vertex]][vertex]
     for vertex in parent:
         if vertex in kinds:
             del vertices[kinds[vertex]][vertex]

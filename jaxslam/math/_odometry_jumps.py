@@ -1,4 +1,7 @@
-"""Steps of odometry that are no motion: it was set to zero on the way, or to another pose."""
+"""Steps of a path that are no motion: odometry that was set to zero, or to another pose, on the
+way, and a tracker that lost the robot."""
+
+from itertools import pairwise
 
 import numpy as np
 from jaxtyping import Bool, Float
@@ -55,6 +58,27 @@ def odometry_jumps(
     fast = (speed > _TIMES_USUAL_TO_ZERO * usual) | (interval > LONG * median)[:, None]
     jump[1:] |= zero[1:] & ~zero[:-1] & (is_large & fast).any(axis=1)
     return jump
+
+
+def lost_lines(
+    path: Float[np.ndarray, "n 3"], jump: Bool[np.ndarray, "n"]
+) -> Bool[np.ndarray, "n"]:
+    """Which lines of a true path a tracker wrote while it had lost the robot.
+
+    It repeats a pose, its last one or zero, so that the path jumps before or after. Lost are lines
+    that repeat the pose before a jump, but for the first of them, lines that repeat the pose after
+    a jump, and a pose alone between two jumps.
+
+    Args:
+        jump: of each line, as from `odometry_jumps`.
+    """
+    lost = np.zeros(len(path), bool)
+    changes = [0, *np.flatnonzero((path[1:] != path[:-1]).any(axis=1)) + 1, len(path)]
+    for begin, end in pairwise(changes):  # lines of one pose
+        before, after = jump[begin], end < len(path) and jump[end]
+        lost[begin:end] = before and (after or end - begin > 1)
+        lost[begin + 1 : end] |= after
+    return lost
 
 
 def without_jumps(

@@ -6,6 +6,7 @@ import numpy as np
 from jaxtyping import Array
 from numpy.typing import ArrayLike
 
+from jaxslam.core._numbers import is_whole
 from jaxslam.core._record import field, record, static
 from jaxslam.core._reprs import describe
 from jaxslam.core.protocols import Motion
@@ -51,7 +52,7 @@ def check_team(
     tags = tuple(range(landmarks, landmarks + count)) if tags is None else tuple(tags)
     if len(tags) != count or len(set(tags)) != count:
         raise ValueError(f"{name}: expected {count} different tags of robots, got {tags}")
-    if any(type(tag) is not int or tag < 0 for tag in tags):
+    if any(not is_whole(tag) or tag < 0 for tag in tags):
         raise ValueError(f"{name}: expected tags of robots that are integers >= 0, got {tags}")
     return tags
 

@@ -148,9 +148,14 @@ def recorded_world(
     for name_of_field in ("pose", "landmarks", "start"):
         finite = np.isfinite(getattr(truth, name_of_field))
         if not finite.all():
-            run = np.argwhere(~finite)[0][0]
+            run, *place = np.argwhere(~finite)[0]
+            row, hint = "", ""
+            if name_of_field == "pose":
+                row = f", row {place[0]}"
+                hint = ": cut the log to rows with a true pose"
             raise ValueError(
-                f"recorded_world: true {name_of_field} of run {run}: expected finite numbers"
+                f"recorded_world: true {name_of_field} of run {run}{row}: expected finite numbers"
+                f"{hint}"
             )
     if wrong := [i for i, path in enumerate(truth.pose) if are_headings_in_degrees(path)]:
         warnings.warn(

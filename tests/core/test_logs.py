@@ -323,6 +323,33 @@ def test_arrays_of_jax_are_tables_columns_rows_and_numbers():
         )
 
 
+def test_angles_in_degrees_and_stamps_in_milliseconds_are_told():
+    """A reading of bearings in degrees, and one by their name, which has no sign of it."""
+    rows = {"t": [1.0, 1.5], "tag": [1, 2], "range": [1.0, 2.0]}
+    with pytest.warns(UserWarning, match=r"row 1, column bearing: 1 of 2 numbers are beyond 2π, up to 90: .* \[deg\]"):  # fmt: skip
+        Log.from_records(ODOMETRY, {**rows, "bearing": [3.0, 90.0]}, DRIVE, EYE)
+    Log.from_records(ODOMETRY, {**rows, "bearing [deg]": [3.0, 90.0]}, DRIVE, EYE)
+    late = [(1.7e12 + 1000 * t, *rest) for t, *rest in ODOMETRY]
+    stamps = {**rows, "t": [late[0][0]] * 2, "bearing": [0.1, 0.2]}
+    with pytest.warns(UserWarning, match=r"since 1970: .* \[ms\]") as told:
+        Log.from_records(late, stamps, DRIVE, EYE)
+    assert len(told) == 2
+
+
+def test_a_path_that_is_set_to_zero_makes_no_step():
+    """The robot drives on by the step before."""
+    x = [0.1 * k if k < 30 else 0.1 * (k - 30) for k in range(60)]
+    path = {"t": np.arange(60) * 0.2, "x": np.array(x) + 4.0 * (np.arange(60) < 30), "y": np.zeros(60), "theta": np.zeros(60)}  # fmt: skip
+    motion = PoseIncrement(np.eye(3))
+    seen = [(1.0, 7, 1.0, 0.0)]
+    with pytest.warns(UserWarning, match=r"odometry, row 30, column x: a jump of the odometry by 6.9 m .* is no motion"):  # fmt: skip
+        log = Log.from_records(path, seen, motion, EYE).log
+    np.testing.assert_allclose(log.control[1:, 0], 0.1, rtol=1e-12)
+    degrees = path | {"x": np.cos(0.2 * path["t"]), "y": np.sin(0.2 * path["t"]), "theta": 90 + np.rad2deg(0.2 * path["t"])}  # fmt: skip
+    with pytest.warns(UserWarning, match=r"theta: .* which fit it as degrees: write \[deg\] in the column's name"):  # fmt: skip
+        Log.from_records(degrees, seen, motion, EYE)
+
+
 def test_whole_numbers_of_nanoseconds_are_divided_as_such():
     """Of 19 digits float64 holds 16: a quotient by 1e9 would be 128 ns off before it is rounded."""
     stamps = [1_700_000_000_123_456_789 + 200_000_000 * k for k in range(3)]

@@ -356,6 +356,15 @@ def test_the_last_static_transform_counts(tmp_path):
     )
     same = DRIVE[0]._replace(recorded=TIMES[1])
     assert read(tmp_path, [*DRIVE, same]).corrections == ()
+    elsewhere = [
+        fixed(parent, child, (x, 0, 0), quaternion(0))._replace(recorded=TIMES[1])
+        for parent, child, x in (("base_link", "plate", 0.0), ("plate", "laser", 0.3))
+    ]
+    log = read(tmp_path, [*DRIVE, *elsewhere])
+    np.testing.assert_allclose(log.mount, [0.3, 0, 0], atol=1e-12)
+    assert log.corrections == (
+        "laser has static transforms from base_link and from plate: the last one is used",
+    )
 
 
 def named(parent, child):

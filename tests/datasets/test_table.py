@@ -5,10 +5,12 @@ import re
 from pathlib import Path
 
 import chex
+import jax
 import numpy as np
 import pytest
 from recordings import write
 
+import jaxslam
 from jaxslam import datasets
 from jaxslam.association import Nearest
 from jaxslam.core.types import Estimate
@@ -406,9 +408,7 @@ def test_no_true_pose_is_interpolated_over_a_hole(tmp_path, name):
     assert data.rows_without_truth == (~known).sum()
     exact = np.stack([np.sin(0.3 * data.time), 1 - np.cos(0.3 * data.time)], axis=1)
     np.testing.assert_allclose(data.true_path[known, :2], exact[known], atol=0.02)
-    # Elsewhere it is a pose of the file.
-    held = data.true_path[~known, None, 0] - CIRCLE[:, 0]
-    assert not held.size or (np.abs(held).min(axis=1) < 1e-8).all()
+    assert np.isnan(data.true_path[~known]).all()
     said = [note for note in data.assumed if "have no true pose" in note]
     assert [note.split(" rows")[0] for note in said] == (
         [f"{(~known).sum()} of {len(known)}"] if unknown else []
@@ -419,6 +419,50 @@ def test_no_true_pose_is_interpolated_over_a_hole(tmp_path, name):
     assert any("1 of" not in n and "lines have no pose" in n for n in data.assumed) == (
         empty is not None
     )
+
+
+LOST = {
+    "its last pose": (lambda k: CIRCLE[99], range(100, 200)),
+    "zero": (lambda k: np.zeros(3), range(100, 200)),
+    "zero to the end": (lambda k: np.zeros(3), range(100, 301)),
+    "another frame": (lambda k: compose(np.array([9.0, 0, 0]), CIRCLE[k]), []),
+    "one line": (lambda k: CIRCLE[150] + [5, 0, 0], range(150, 151)),
+}
+
+
+@pytest.mark.parametrize("name", LOST)
+def test_what_a_tracker_repeats_while_it_has_lost_the_robot_is_no_truth(tmp_path, name):
+    """It jumps at the end; neither over the jumps nor at the lines has a row a true pose."""
+    written, lost = LOST[name]
+    truth = CIRCLE.copy()
+    for k in lost or range(100, 200):
+        truth[k] = written(k)
+    on_a_circle(tmp_path, truth)
+    data = datasets.table(tmp_path)
+    known = ~np.isin(data.time, DRIVE[list(lost)])
+    known[data.time == 14.95] = not {149, 150} & {*lost}
+    np.testing.assert_array_equal(data.true_at, known)
+    (note,) = [note for note in data.assumed if "is no motion" in note]
+    assert ("repeat a pose" in note) == bool(lost)
+    if lost:
+        assert f"; {len(lost)} lines beside jumps" in note
+    exact = np.stack([np.sin(0.3 * data.time), 1 - np.cos(0.3 * data.time)], axis=1)
+    if lost:
+        np.testing.assert_allclose(data.true_path[known, :2], exact[known], atol=0.02)
+
+
+def test_a_true_path_with_a_hole_is_no_world_and_no_control(tmp_path):
+    """`recorded_world` and `Mapping` would take a pose that is held over the hole for the truth."""
+    text = on_a_circle(tmp_path).joinpath("truth.csv").read_text().splitlines(keepends=True)
+    (tmp_path / "truth.csv").write_text("".join(text[:101] + text[250:]))
+    data = datasets.table(tmp_path)
+    places = np.zeros((data.capacity, 2))
+    with pytest.raises(ValueError, match=r"^recorded_world: true pose of run 0, row 100: expected .* cut the log"):  # fmt: skip
+        jaxslam.recorded_world(data.motion, data.sensor, [data.log], [data.true_path], places)
+    mapping = jaxslam.filters.Mapping(data.sensor, data.capacity)
+    log = data.log._replace(control=data.true_path)
+    with pytest.raises(ValueError, match="control"):
+        jaxslam.run(mapping, log, data.pose, data.pose_cov, jax.random.key(0))
 
 
 def test_errors_are_those_of_the_rows_with_a_truth(tmp_path):
@@ -490,6 +534,21 @@ def test_degrees_under_rad_are_noted(tmp_path, name):
 def test_radians_and_other_robots_are_not_noted(tmp_path, path):
     data = datasets.table(on_a_circle(tmp_path, path))
     assert not any("contradicts" in note or "beyond" in note for note in data.assumed)
+
+
+def test_stamps_and_deviations_in_other_units_are_noted(tmp_path):
+    """Nanoseconds since 1970 under [s], and two degrees under [rad]."""
+    on_a_circle(tmp_path)
+    (tmp_path / "dataset.toml").write_text(
+        '[sensor]\nmodel = "range_bearing"\nnoise = [0.1, 2.0]\n'
+    )
+    notes = [note for note in datasets.table(tmp_path).assumed if "degrees?" in note]
+    assert notes == ["[sensor] noise: bearing [rad] = 2 is a standard deviation of 115°: degrees? write radians"]  # fmt: skip
+    for name in ("odometry", "measurements", "truth"):
+        text = (tmp_path / f"{name}.csv").read_text().splitlines()
+        moved = [f"{1.7e18 + 1e9 * float(t):.0f},{rest}" for t, rest in (line.split(",", 1) for line in text[1:])]  # fmt: skip
+        (tmp_path / f"{name}.csv").write_text("\n".join([text[0], *moved]))
+    assert sum("nanoseconds?" in note for note in datasets.table(tmp_path).assumed) == 2
 
 
 def test_tags_are_names_and_whole_numbers_as_pandas_writes_them(tmp_path):

@@ -243,7 +243,7 @@ def equal_vertices(form, equal, edges):
 
 @pytest.mark.parametrize("form", ["first", "last", "edges alone"])
 def test_equivalent_vertices_are_one(tmp_path, form):
-    """A chain 5 = 3 = 2 and a line twice: as a file that has 2 in place of 3 and 5."""
+    """A chain 5 = 3 = 2 and a line twice: as a file that has 2, with the pose of the fixed 5."""
     moves = {(1, 2): 1.0, (2, 3): 2.0, (3, 4): 3.0, (5, 9): 4.0, (4, 5): 5.0}
     edges = [f"EDGE_SE2 {i} {j} {x} 0 0.5 {UNIT}" for (i, j), x in moves.items()]
     equal = ["EQUIV 5 3", "EQUIV 3 2", "EQUIV 2 3", "EQUIV 4 4"]
@@ -255,7 +255,8 @@ def test_equivalent_vertices_are_one(tmp_path, form):
         if (i, j) != (2, 3)
     ]
     text = equal_vertices(form, [], same).replace("XY 5", "XY 2").replace("SE2 3 0 0 0", "SE2 2 0 0 0")  # fmt: skip
-    text = "\n".join(line for line in text.replace("FIX 5", "FIX 2").split("\n") if line not in (RING[3], RING[5]))  # fmt: skip
+    text = text.replace("FIX 5", "FIX 2").replace(RING[2], "VERTEX_SE2 2 5 0 0.5")
+    text = "\n".join(line for line in text.split("\n") if line not in (RING[3], RING[5]))
     assert_same(loaded.graph, datasets.read_graph(wrote(tmp_path, text)))
     assert loaded.skipped == {
         "equivalences": 4,
@@ -273,11 +274,30 @@ def test_equivalent_vertices_are_one(tmp_path, form):
     ("EQUIV 1 x", ":14: id is not a whole number >= 0: 'x'"),
     ("EQUIV 1 7", ":14: vertex 7 is not defined in the file"),
     ("EQUIV 1 8", ":14: one of the vertices 1 and 8 is a pose, the other a point"),
+    ("EQUIV 1 5\nFIX 1", ":15: vertices 5 and 1 are equal, and fixed at two places"),
     escaped=True,
 )
 def test_what_cannot_be_equivalent_is_refused(line, tmp_path):
     edges = [f"EDGE_SE2 {i} {i + 1} 1 0 0 {UNIT}" for i in (1, 2, 3)]
     datasets.read_graph(wrote(tmp_path, equal_vertices("last", [line], edges)))
+
+
+def test_angles_in_degrees_are_noted(tmp_path):
+    """A circle in steps of 15°; an edge of a radian is no sign, nor is an unwrapped heading."""
+    turn = np.linspace(0, 6 * np.pi, 73)
+
+    def notes(of_pose, of_edge):
+        poses = [f"VERTEX_SE2 {k} {np.sin(a)} {1 - np.cos(a)} {of_pose * a}" for k, a in enumerate(turn)]  # fmt: skip
+        edges = [f"EDGE_SE2 {k} {k + 1} 0.26 0 {of_edge * turn[1]} {UNIT}" for k in range(72)]
+        return g2o.load(wrote(tmp_path, "\n".join([*poses, *edges]))).notes
+
+    degrees = 180 / np.pi
+    assert notes(1, 1) == ()
+    assert [note[:14] for note in notes(degrees, 1)] == ["headings of th"]
+    assert notes(1, degrees)[0].startswith(
+        "72 of 72 angles of relative_pose are beyond 2π, up to 15:"
+    )
+    assert len(notes(degrees, degrees)) == 2
 
 
 def test_a_file_whose_edges_are_all_within_equal_vertices_is_refused(tmp_path):

@@ -79,7 +79,7 @@ def _filter_of(name: str, candidate: Candidate, data: Dataset) -> Filter:
         name in KINDS["information"] or name == "localization"
     ):
         raise ValueError(f"--filters: {name} needs the tag of every measurement")
-    if name == "mapping" and data.true_path is None:
+    if name == "mapping" and data.rows_without_truth == data.steps:
         raise ValueError("--filters: mapping needs the true path of the robot")
     if isinstance(candidate, Filter):
         return candidate

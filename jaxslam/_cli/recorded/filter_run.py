@@ -23,6 +23,8 @@ from jaxslam.results._files import Json
 MAX_NIS_PER_DOF, MAX_NEES_RATIO = 30.0, 100.0
 """NIS / dof, and the NEES of pose or landmarks over the honest one, above which noises are not the
 cause: innovations of 5 σ, errors of 10 σ."""
+FITTING_NIS_PER_DOF = 3.0
+"""NIS / dof up to which innovations fit, with noises that may be somewhat small."""
 
 WRONG_UNITS = "models or units are wrong (degrees under [rad], millimetres under [m], the mount)"
 
@@ -167,9 +169,12 @@ def suspicions(summary: Json) -> list[str]:
         else:
             continue
         if (nees := float(str(value))) > honest * MAX_NEES_RATIO:
+            large = f"{name.partition(' (')[0]} is {nees:.4g}, where {honest:g} is honest"
+            if nis > FITTING_NIS_PER_DOF:
+                notes.append(f"{large}, and NIS / dof is {nis:.4g}: {WRONG_UNITS}")
+                continue
             notes.append(
-                f"{name.partition(' (')[0]} is {nees:.4g}, where {honest:g} is honest, though "
-                f"the innovations fit: the {reference} may have other units (degrees under "
-                "[rad], millimetres under [m]), stamps or axes than the log"
+                f"{large}, though the innovations fit: the {reference} may have other units "
+                "(degrees under [rad], millimetres under [m]), stamps or axes than the log"
             )
     return notes

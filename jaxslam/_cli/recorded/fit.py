@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from jaxslam._cli import cache
-from jaxslam._cli.common import add_out
+from jaxslam._cli.common import add_out, summary_table
 from jaxslam.datasets import Dataset, DatasetFit, fit, table
 from jaxslam.datasets._landmark_logs.table_settings import FITTED, fitted_text
 from jaxslam.results._files import (
@@ -56,6 +56,8 @@ def fit_folder(options: argparse.Namespace, command: str) -> int:
         for text in (options.fix, options.calibrate)
     )
     result = fit(data, calibrate=calibrated, fixed=fixed)
+    if data.assumed:
+        print(summary_table({"": {"defaults taken": list(data.assumed)}}), end="\n\n")
     print(_table(data, result))
     groups = [parameter.group for parameter in result.parameters]
     # fit.toml replaces the numbers of the groups that were to be fitted, held ones among them too.

@@ -3,6 +3,8 @@
 import os
 from collections.abc import Iterable
 
+from jaxslam.core._numbers import is_whole
+
 
 def missing_pieces(
     finished: Iterable[tuple[int, int]], runs: int, block: int
@@ -28,7 +30,7 @@ def missing_pieces(
 
 def check_part(name: str, part: object) -> None:
     """Raise ValueError, which begins with a name, unless part is (i, n) with 1 <= i <= n."""
-    is_pair = isinstance(part, tuple) and len(part) == 2 and all(type(n) is int for n in part)
+    is_pair = isinstance(part, tuple) and len(part) == 2 and all(map(is_whole, part))
     if not is_pair or not 1 <= part[0] <= part[1]:  # type: ignore[index]
         raise ValueError(f"{name}: expected (i, n) with 1 <= i <= n, got {part!r}")
 

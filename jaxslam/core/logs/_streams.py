@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Bool, Float, Int
 from numpy.typing import ArrayLike
 
+from jaxslam.math._odometry_jumps import lost_lines, odometry_jumps
 from jaxslam.math.numpy_poses import between
 
 Rule = Callable[[np.ndarray, np.ndarray, np.ndarray], np.ndarray]
@@ -171,22 +172,33 @@ def known_poses(
     rows: Float[np.ndarray, "T"],
     longest: float | None = None,
 ) -> tuple[Float[np.ndarray, "T 3"], Bool[np.ndarray, "T"]]:
-    """Poses at some times as `interpolate_poses`, and in which rows they are known.
+    """Poses at some times as `interpolate_poses`, and in which rows they are known; else NaN.
 
-    A pose is unknown before the first line, after the last, in a gap (`is_gap`), and next to a line
-    that is not finite. It is then the last known one, of leading rows the first.
+    A pose is unknown before the first line, after the last, in a gap (`is_gap`), over a jump that
+    is no motion, and next to a line that is not finite or was written while the robot was lost.
     """
     finite = np.isfinite(pose).all(axis=1)
     if not finite.any():
-        return np.zeros((len(rows), 3)), np.zeros(len(rows), bool)
-    joined = ~is_gap(clock, longest) & finite[:-1] & finite[1:]
+        return np.full((len(rows), 3), np.nan), np.zeros(len(rows), bool)
+    jump, lost = true_path_faults(clock, pose)
+    finite &= ~lost
+    joined = ~is_gap(clock, longest) & ~jump[1:] & finite[:-1] & finite[1:]
     unusable = clock[~finite]
     is_known = between_lines(clock, rows, joined) & ~np.isin(rows, unusable)
     path = interpolate_poses(clock[finite], pose[finite], rows)
-    latest = np.maximum.accumulate(
-        np.where(is_known, np.arange(len(rows)), int(np.argmax(is_known)))
-    )
-    return path[latest], is_known
+    return np.where(is_known[:, None], path, np.nan), is_known
+
+
+def true_path_faults(
+    clock: Float[np.ndarray, "K"], pose: Float[np.ndarray, "K 3"]
+) -> tuple[Bool[np.ndarray, "K"], Bool[np.ndarray, "K"]]:
+    """Which finite lines of a true path are reached by a jump, and which a tracker wrote that had
+    lost the robot (`lost_lines`)."""
+    finite = np.isfinite(pose).all(axis=1)
+    jump, lost = np.zeros((2, len(clock)), bool)
+    jump[finite] = odometry_jumps(pose[finite], clock[finite])
+    lost[finite] = lost_lines(pose[finite], jump[finite])
+    return jump, lost
 
 
 def relative(

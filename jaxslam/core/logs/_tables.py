@@ -8,9 +8,11 @@ import jax
 import numpy as np
 from jaxtyping import Bool, Float, Int
 
+from jaxslam.core._units import TURN, are_headings_in_degrees
 from jaxslam.core.logs import _streams as streams
 from jaxslam.core.validation import InvalidField
 from jaxslam.math._arrays import is_concrete
+from jaxslam.math._odometry_jumps import odometry_jumps, step_sizes, without_jumps
 
 UNITS: dict[str, dict[str, float]] = {
     "rad": {"deg": 180 / math.pi},
@@ -270,6 +272,62 @@ def check_times(table: Columns[_Name], *, strict: bool) -> None:
         before, at = time[back[0] : back[0] + 2].tolist()
         wanted = f"above {before}" if strict else f"of at least {before}"
         raise ValueError(f"{table.at(int(back[0]) + 1, TIME)}: expected a time {wanted}, got {at}")
+
+
+DEGREES_OF_PATH = (
+    "theta [rad] contradicts the directions between the positions, which fit it as degrees: "
+    "write [deg]"
+)
+
+_LATEST = 1e11
+"""Stamp [s] that no clock has; milliseconds since 1970 are above 1e12."""
+
+
+def wrong_units(table: Columns[_Name]) -> list[str]:
+    """Signs that numbers are in other units than those of their columns, a sentence each.
+
+    Angles and turn rates, but for headings, beyond 2π, of the first such column; headings that fit
+    a path in degrees; stamps later than any clock has. A sentence ends with the unit to write.
+    """
+    signs, when = [], table.columns[TIME]
+    for name, values in table.columns.items():
+        unit = split_unit(name)[1] or ""
+        beyond = np.abs(values) > TURN
+        if unit in ("rad", "rad/s") and name != POSE[2] and beyond.any():
+            row, degrees = int(np.argmax(np.abs(values))), unit.replace("rad", "deg")
+            signs.append(
+                f"{table.at(row, name)}: {int(beyond.sum()):,} of {len(values):,} numbers are "
+                f"beyond 2π, up to {values[row]:.6g}: degrees? then write [{degrees}]"
+            )
+            break
+    if set(POSE) <= set(table.columns) and are_headings_in_degrees(table.values(POSE)):
+        signs.append(f"{table.at(0, POSE[2])}: {DEGREES_OF_PATH}")
+    if (when > _LATEST).any():
+        row = int(np.argmax(when))
+        signs.append(
+            f"{table.at(row, TIME)}: {when[row]:.6g} s is over three thousand years since 1970: "
+            "milliseconds, microseconds or nanoseconds? then write [ms], [us] or [ns]"
+        )
+    return signs
+
+
+def replace_jumps(odometry: Columns[_Name]) -> str:
+    """Replace the jumps of odometry that is a path of poses, and say so; "" without a jump."""
+    if not set(POSE) <= set(odometry.columns):
+        return ""
+    path, clock = odometry.values(POSE), odometry.columns[TIME]
+    jumps = odometry_jumps(path, clock)
+    if not jumps.any():
+        return ""
+    k = int(np.argmax(jumps))
+    length, turn = step_sizes(path)[k]
+    for name, column in zip(POSE, without_jumps(path, jumps).T, strict=True):
+        odometry.columns[name] = column
+    return (
+        f"{odometry.at(k, POSE[0])}: a jump of the odometry by {length:.3g} m and "
+        f"{np.rad2deg(turn):.3g}° in {clock[k] - clock[k - 1]:.3g} s is no motion, "
+        f"{int(jumps.sum()):,} in all: the step before it takes its place"
+    )
 
 
 def ordered(names: set[_Name | None]) -> list[_Name]:

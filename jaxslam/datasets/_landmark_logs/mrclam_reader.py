@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from jaxslam.core._noise import NoiseCov
+from jaxslam.core._numbers import is_whole
 from jaxslam.core.logs._streams import Rows, hold
 from jaxslam.core.types import Log
 from jaxslam.datasets._dataset import Dataset
@@ -87,7 +88,7 @@ def mrclam(
             range, or a subject without survey; on a robot other than 1 to 5, and on a calibration
             of another kind.
     """
-    if type(robot) is not int or robot not in ROBOTS:
+    if not is_whole(robot) or robot not in ROBOTS:
         raise ValueError(f"mrclam: expected a robot from 1 to 5, got {robot!r}")
     if calibration is not None:
         check_calibration("mrclam", calibration)
@@ -151,7 +152,7 @@ def mrclam_team(
             calibrations, and unless robots are different numbers from 1 to 5.
     """
     numbers = tuple(robots)
-    good = all(type(robot) is int and robot in ROBOTS for robot in numbers)
+    good = all(is_whole(robot) and robot in ROBOTS for robot in numbers)
     if not numbers or not good or len(set(numbers)) != len(numbers):
         raise ValueError(f"mrclam_team: expected different robots from 1 to 5, got {robots!r}")
     subject_of, names, points, corrections = read_landmarks(Path(folder), errata)

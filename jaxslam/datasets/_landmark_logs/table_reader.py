@@ -12,9 +12,9 @@ import jax
 import numpy as np
 
 from jaxslam.calibration import delayed
-from jaxslam.core._units import TURN, are_headings_in_degrees
+from jaxslam.core._units import are_headings_in_degrees
 from jaxslam.core.logs import _tables as tables
-from jaxslam.core.logs._streams import is_gap, known_poses
+from jaxslam.core.logs._streams import is_gap, known_poses, true_path_faults
 from jaxslam.core.logs._tables import POSE, TAG, TIME, UNITS, Columns, split_unit, unit_divisor
 from jaxslam.core.protocols import Motion, Sensor
 from jaxslam.core.types import Log
@@ -26,7 +26,7 @@ from jaxslam.datasets._landmark_logs.table_settings import (
     TableSettings,
 )
 from jaxslam.datasets._lines import DIGITS, LARGEST, none_left, read_bytes, stored_file
-from jaxslam.math._odometry_jumps import odometry_jumps, step_sizes, without_jumps
+from jaxslam.math._odometry_jumps import step_sizes
 
 MISSING = frozenset(
     {"", "nan", "-nan", "<na>", "na", "n/a", "#n/a", "#na", "null", "none"}
@@ -340,8 +340,9 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
     settings have defaults, listed in `Dataset.assumed`. The log is `Log.from_records`. The
     noise of the motion is that of a line of odometry; a row that is shorter or longer has white
     noise of the same density. The true pose of a row is interpolated between two lines of the
-    truth, but not in a gap, an interval above ten times their median: there, and before and after
-    the truth, it is unknown (`Dataset.true_at`). The start is that of the truth if it covers the
+    truth, but not in a gap, an interval above ten times their median, nor over a jump, nor where a
+    tracker repeats a pose beside a jump: there, and before and after the truth, it is unknown
+    (`Dataset.true_at`). The start is that of the truth if it covers the
     first row; then all is in one frame. Other columns are not used, and listed. A CSV file may be
     packed by gzip, as `truth.csv.gz`; of both the plain one is read.
 
@@ -389,8 +390,12 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
         for column in file.unused(names)
     ]
     from_poses = odometry_names[1:] == POSE
-    notes += _odometry_notes(odometry, odometry_file.path.name, from_poses)
-    notes += [note for columns in (odometry, measurements) if (note := _beyond_a_turn(columns))]
+    notes += _odometry_notes(odometry, from_poses)
+    notes += [
+        f"{sign} in the header"
+        for part in (odometry, measurements)
+        for sign in tables.wrong_units(part)
+    ]
     if "range [m]" in measurements.columns and not np.isfinite(max_range):
         ranges = measurements.columns["range [m]"]
         largest = int((ranges == ranges.max()).sum())
@@ -453,28 +458,14 @@ def table(folder: str | Path, *, fitted: bool = True) -> Dataset:
     )
 
 
-def _odometry_notes(odometry: Columns[int | str], file_name: str, from_poses: bool) -> list[str]:
-    """Replace jumps of the path of odometry, if it is one; notes on jumps, degrees and gaps.
+def _odometry_notes(odometry: Columns[int | str], from_poses: bool) -> list[str]:
+    """Replace jumps of the path of odometry, if it is one; notes on jumps and gaps.
 
     from_poses: whether the controls are increments between poses.
     """
     notes = []
-    clock = odometry.columns[TIME]
-    if from_poses and are_headings_in_degrees(odometry.values(POSE)):
-        notes.append(f"{file_name}: {_DEGREES_OF_PATH}")
-    if set(POSE) <= set(odometry.columns):
-        path = odometry.values(POSE)
-        jumps = odometry_jumps(path, clock)
-        if jumps.any():
-            k = int(np.argmax(jumps))
-            length, turn = step_sizes(path)[k]
-            notes.append(
-                f"{odometry.at(k, POSE[0])}: a jump of the odometry by {length:.3g} m and "
-                f"{np.rad2deg(turn):.3g}° in {clock[k] - clock[k - 1]:.3g} s is no motion, "
-                f"{int(jumps.sum()):,} in all: the step before it takes its place"
-            )
-            for name, column in zip(POSE, without_jumps(path, jumps).T, strict=True):
-                odometry.columns[name] = column
+    if jump := tables.replace_jumps(odometry):
+        notes.append(jump)
     if gap := _longest_gap(odometry):
         rule = (
             "no pose is interpolated over" if from_poses else "the odometry is taken to hold over"
@@ -505,12 +496,6 @@ def _adjustable(
     return Adjustable(parameters, at)
 
 
-_DEGREES_OF_PATH = (
-    "theta [rad] contradicts the directions between the positions, which fit it as degrees: "
-    "write [deg] in the header"
-)
-
-
 def _longest_gap(table: Columns[int | str]) -> str:
     """The place and the length of the longest gap between lines; empty without one."""
     clock = table.columns[TIME]
@@ -522,20 +507,6 @@ def _longest_gap(table: Columns[int | str]) -> str:
         f"{table.at(k + 1, TIME)}: {steps[k]:.6g} s since the line before, the median is "
         f"{np.median(steps):.6g} s"
     )
-
-
-def _beyond_a_turn(table: Columns[int | str]) -> str:
-    """A note on a column of [rad] or [rad/s], but for headings, with numbers beyond 2π."""
-    for name, values in table.columns.items():
-        unit = split_unit(name)[1] or ""
-        beyond = np.abs(values) > TURN
-        if unit in ("rad", "rad/s") and name != POSE[2] and beyond.any():
-            row, degrees = int(np.argmax(np.abs(values))), unit.replace("rad", "deg")
-            return (
-                f"{table.at(row, name)}: {int(beyond.sum()):,} of {len(values):,} numbers are "
-                f"beyond 2π, up to {values[row]:.6g}: degrees? then write [{degrees}] in the header"
-            )
-    return ""
 
 
 def _survey(path: Path, notes: list[str]) -> dict[int | str, tuple[float, float]] | None:
@@ -575,11 +546,23 @@ def _truth(path: Path, time: np.ndarray) -> tuple[np.ndarray | None, np.ndarray 
         notes.append(f"{file.path.name}: {lost:,} of {len(pose):,} lines have no pose")
     if gap := _longest_gap(columns):
         notes.append(f"{gap}: no pose is interpolated over it")
+    jump, repeated = true_path_faults(clock, pose)
+    if jump.any():
+        k = int(np.argmax(jump))
+        length, turn = step_sizes(pose[k - 1 : k + 1])[1]
+        notes.append(
+            f"{columns.at(k, POSE[0])}: a jump by {length:.3g} m and {np.rad2deg(turn):.3g}° in "
+            f"{clock[k] - clock[k - 1]:.3g} s is no motion, {int(jump.sum()):,} in all: no pose is "
+            "interpolated over it"
+            + f"; {int(repeated.sum()):,} lines beside jumps repeat a pose and are not used"
+            * bool(repeated.any())
+        )
     if unknown := int((~true_at).sum()):
         notes.append(
             f"{unknown:,} of {len(time):,} rows have no true pose: before the first or after the "
-            f"last line of {file.path.name}, in a gap of it, or beside a line without a pose"
+            f"last line of {file.path.name}, in a gap or a jump of it, or beside a line without a "
+            "pose"
         )
     if are_headings_in_degrees(pose):
-        notes.append(f"{file.path.name}: {_DEGREES_OF_PATH}")
+        notes.append(f"{file.path.name}: {tables.DEGREES_OF_PATH} in the header")
     return true_path, true_at, notes

@@ -177,6 +177,9 @@ _MOTION_NOISE = {"m/s": 0.1, "rad/s": 0.1, "m": 0.02, "rad": 0.02}
 """Default standard deviations of odometry by unit."""
 _MEASUREMENT_NOISE = {"m": 0.1, "rad": 0.05, "1": 1.0}
 """Default standard deviations of measurements by unit."""
+_LARGEST_DEVIATION = 1.0
+"""[rad] standard deviation of an angle above which it says nearly nothing, and may be of degrees"""
+
 ROOM = 100
 """Default number of landmarks, where identities are unknown."""
 RANGE_BEARING = ("range [m]", "bearing [rad]")
@@ -622,6 +625,11 @@ class TableSettings:
             if "[rad]" in name and abs(number) > TURN and "covariance" not in key:
                 self.assumed.append(
                     f"[{section}] {key}: {name} = {number:g} is beyond 2π: degrees? write radians"
+                )
+            elif "[rad]" in name and number > _LARGEST_DEVIATION and key == "noise":
+                self.assumed.append(
+                    f"[{section}] {key}: {name} = {number:g} is a standard deviation of "
+                    f"{np.rad2deg(number):.3g}°: degrees? write radians"
                 )
         return numbers
 

@@ -178,6 +178,12 @@ class Frames:
         """
         parent = self._to[child][-1].parent
         transforms = [edge for edge in self._to[child] if edge.parent == parent]
+        others = {edge.parent for edge in self._to[child] if edge.static} - {parent}
+        if others and transforms[-1].static:
+            corrections.append(
+                f"{child} has static transforms from {', '.join(sorted(others))} and from {parent}:"
+                " the last one is used"
+            )
         pose = _matrices(np.array([edge.pose for edge in transforms]))
         if not np.isfinite(pose).all():
             bad = transforms[int(np.argmax(~np.isfinite(pose).all(axis=(1, 2))))].pose.tolist()
