@@ -153,7 +153,7 @@ class Checked:
 
     def __post_init__(self):
         if is_concrete(self.width) and self.count > self.width:  # numbers, by their checks
-            raise InvalidField("Checked", "", "expected count <= width")
+            raise InvalidField("", "expected count <= width")
 
 
 @record
@@ -166,7 +166,7 @@ class Below(Checked):
     def __post_init__(self):
         super().__post_init__()
         if self.extra == 3:
-            raise InvalidField("Below", "extra", "expected no 3")
+            raise InvalidField("extra", "expected no 3")
 
 
 @pytest.mark.parametrize(
@@ -412,11 +412,17 @@ def test_a_gradient_of_a_world_is_a_world():
 
 
 @refused(
-    ({"landmarks": np.zeros((2, 3))}, r"Scenario 'ring': landmarks: expected shape \(N, 2\)"),
-    ({"pose_cov": -np.eye(3)}, "Scenario 'ring': pose_cov"),
+    (
+        {"landmarks": np.zeros((2, 3))},
+        r"Scenario: landmarks: expected shape \(N, 2\) with N >= 1, got \(2, 3\)",
+    ),
+    (
+        {"pose_cov": -np.eye(3)},
+        r"Scenario: pose_cov: the covariance is not positive semi-definite \(negative",
+    ),
     ({"visible": 3.0}, r"Scenario: visible: expected a function of \(pose, l\), got 3.0"),
     ({"filter_options": {"gate": np.ones(2)}}, "filter_options: gate: expected a value"),
-    ({"noise_on": "wheels"}, "expected noise_on"),
+    ({"noise_on": "wheels"}, 'noise_on: expected "robot" or'),
 )
 def test_a_world_names_what_is_wrong_in_it(change):
     dataclasses.replace(worlds.ring(3), **change)

@@ -13,7 +13,7 @@ import jax
 
 from jaxslam._cli.common import OUT, check_out, chosen_devices
 from jaxslam.consistency.campaign._pieces import missing_pieces
-from jaxslam.core._numbers import check_count
+from jaxslam.core.validation import at_least, or_none, require
 from jaxslam.results import _campaign_files as campaign_files
 from jaxslam.results import store
 from jaxslam.results._block_files import MANIFEST, is_unfinished, read_manifest
@@ -59,10 +59,9 @@ def spec_of(options: argparse.Namespace) -> Spec:
     """
     campaign, settings, block = _campaign(options)
     out = options.resume or options.out or OUT
-    formats = campaign_files.check_figure_formats("--figures", options.figures.split(","))
+    formats = require("--figures", options.figures.split(","), campaign_files.formats_of_figures)
     for name, count in (("steps", campaign.steps), ("runs", campaign.runs), ("block", block)):
-        if count is not None:
-            check_count(f"--{name}", count)
+        require(f"--{name}", count, or_none(at_least(1)))
     if not 0 <= campaign.seed < 2**32:
         raise ValueError(f"--seed: expected an integer from 0 to 2³²-1, got {campaign.seed}")
     part = None

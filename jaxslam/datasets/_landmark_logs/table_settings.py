@@ -21,13 +21,13 @@ from jaxslam.association import (
     Nearest,
 )
 from jaxslam.core._noise import NoiseCov
-from jaxslam.core._numbers import check_gate, is_number
+from jaxslam.core._numbers import is_number
 from jaxslam.core._record import record, static
 from jaxslam.core._units import TURN
 from jaxslam.core.logs._tables import INTERVAL, POSE, odometry_columns, split_unit
 from jaxslam.core.protocols import Associate, Motion, Sensor
 from jaxslam.core.types import JaxOrNumPy
-from jaxslam.core.validation import InvalidField
+from jaxslam.core.validation import InvalidField, or_none, probability, require
 from jaxslam.datasets._dataset import Parameter
 from jaxslam.math._definite import asymmetric, indefinite
 from jaxslam.motion import _odometry_errors as odometry_errors
@@ -111,14 +111,13 @@ def association_options(method: object, gate: Any) -> dict[str, Any]:
         method: one of `METHODS`.
         gate: the probability that a correct measurement passes.
     """
-    check_gate("filter", gate)
+    require("gate", gate, or_none(probability))
     if not isinstance(method, str) or method not in METHODS:
-        reason = f"expected one of {', '.join(METHODS)}, got {method!r}"
-        raise InvalidField("filter", "associate", reason)
+        raise InvalidField("associate", f"expected one of {', '.join(METHODS)}, got {method!r}")
     if method == "known":
         return {} if gate is None else {"gate": gate}
-    probability = GATE if gate is None else gate
-    return {"associate": METHODS[method](probability, max(probability, NEW_GATE))}
+    own_gate = GATE if gate is None else gate
+    return {"associate": METHODS[method](own_gate, max(own_gate, NEW_GATE))}
 
 
 FITTED = "fit.toml"

@@ -290,7 +290,7 @@ def test_arrays_that_do_not_belong_together_are_refused():
         with pytest.raises(ValueError, match=message):
             plot.animate(*arguments, **more)
     nothing = jax.tree.map(lambda leaf: leaf[:0], (trace, log))
-    with pytest.raises(ValueError, match="animate: expected at least one step, got 0"):
+    with pytest.raises(ValueError, match="animate: steps: expected an integer >= 1, got 0"):
         plot.animate(*nothing)
     batch = jax.tree.map(lambda leaf: leaf[None], trace)
     with pytest.raises(
