@@ -331,7 +331,7 @@ def compressed(**options):
     ),
     (
         lambda: Closing(filters.EkfSlam(MOVE, SEES, 3), settings={"least": 3}),
-        "^Closing: settings: expected a LoopSettings",
+        "^Closing: settings: expected LoopSettings",
     ),
     (
         lambda: motion_of(step=lambda pose, u, w: pose, controls=(), noises=()),

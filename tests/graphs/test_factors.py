@@ -129,9 +129,7 @@ def test_a_variable_is_a_pose_or_a_point():
         made(graphs.Factor, variables=("place",), residual=lambda v, z: z, **names)
     with pytest.raises(ValueError, match="Own: residual: expected a method"):
         made(graphs.Factor, variables=("pose",), **names)
-    with pytest.raises(
-        ValueError, match="FromSensor: expected sensor to be a Sensor, got the class"
-    ):
+    with pytest.raises(ValueError, match="FromSensor: sensor: expected a Sensor, got the class"):
         graphs.FromSensor(sensors.Compass)
 
 
