@@ -9,7 +9,7 @@ check takes the name of its caller. What JAX traces is checked for its shape and
     with refusals_of("simulate"):
         require("scenario", scenario, instance_of(World))
         if late:
-            raise InvalidField("start", f"expected …, got …")
+            raise InvalidField("start", "expected …, got …")
 """
 
 import math

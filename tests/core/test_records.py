@@ -3,6 +3,7 @@
 import copy
 import dataclasses
 import pickle
+from pathlib import Path
 
 import chex
 import jax
@@ -29,6 +30,8 @@ from jaxslam.core.validation import (
     one_of,
     or_none,
     positive,
+    refusals_of,
+    require,
 )
 from jaxslam.motion import OdometryNoise
 
@@ -208,6 +211,23 @@ def test_a_check_converts_and_is_not_run_where_jax_rebuilds():
     assert again.mount is made.mount and again.rule is made.rule
     assert jax.tree.map(lambda leaf: -leaf, made).width == -2.0
     assert jax.jit(lambda width: Checked(width, count=1).width)(2.0) == 2.0
+
+
+def test_a_function_owns_what_its_checks_refuse():
+    """Of nested ones the inner; a record within keeps its own, and no frame is added."""
+
+    def length(value):
+        require("length", value, positive)
+
+    for value, owner, name in ((Checked, "Checked", "width"), (length, "inner", "of.length")):
+        with pytest.raises(InvalidField) as caught, refusals_of("outer"), refusals_of("inner"):
+            require("of", -1.0, value)
+        assert (caught.value.owner, caught.value.field) == (owner, name)
+        assert str(pickle.loads(pickle.dumps(caught.value))).startswith(f"{owner}: {name}: ")
+        files = [Path(str(entry.path)) for entry in caught.traceback]
+        assert files[0] == Path(__file__) and "contextlib.py" not in {file.name for file in files}
+    with pytest.raises(ValueError, match=r"^plain$"), refusals_of("outer"):
+        raise ValueError("plain")
 
 
 def test_an_error_of_a_file_says_the_place():
