@@ -234,8 +234,8 @@ def test_what_cannot_be_written_is_refused_and_nothing_is_left(tmp_path):
             "resolution: expected a number above 0",
         ),
         ("a.yaml", "grid", "trinary", "expected a Grid"),
-        ("a.yaml", grid, "raw", "expected mode"),
-        ("a.pgm", grid, "trinary", "expected a path NAME.yaml"),
+        ("a.yaml", grid, "raw", "mode: expected"),
+        ("a.pgm", grid, "trinary", "path: expected NAME.yaml"),
     ]:
         with pytest.raises(ValueError, match=f"write_map: .*{reason}"):
             datasets.write_map(tmp_path / "new" / path, wrong, mode=mode)
